@@ -1,0 +1,171 @@
+"""Shared by the tests of the model: float64, one small campaign, and compiled functions that many tests use.
+
+Compile time rules the run time of these tests: whatever needs the whole optical chain goes through `evaluate` or
+through `likelihood.density_and_gradient`, which are compiled once per session for the one 512 bucket.
+pyproject.toml has every array checked against its annotation (jaxtyping's import hook, at trace time).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tvsbayes.campaign import Campaign, PlanStep
+from tvsbayes.rigs import Rig, read_rig
+from tvsbayes.simulation import SimulatedCampaign, Truth, simulate
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+@pytest.fixture
+def x64():
+    """float64 for one test; the library itself never changes a global setting."""
+    import jax
+
+    with jax.enable_x64(True):
+        yield
+
+
+@pytest.fixture(scope="session")
+def mounted_rig() -> Rig:
+    """The shipped rig whose extrinsics are known to 0.03 rad and 5 mm."""
+    return read_rig(ROOT / "data" / "rigs" / "mounted" / "rig.toml")
+
+
+@dataclass(frozen=True)
+class Dozen:
+    """A dozen spots in three segments, with everything a campaign may hold.
+
+    Attributes:
+        campaign: known, unknown and half-known approaches, spots that share a stop while the other axis moves,
+            two looks per stop, aperture readings at some spots, correlated pixels at others.
+        truth: the rig it was simulated on.
+        z: coordinates of the true rig.
+        space: its priors as JAX arrays.
+        arrays: the campaign as JAX arrays.
+    """
+
+    campaign: Campaign
+    truth: Truth
+    z: np.ndarray
+    space: Any
+    arrays: Any
+
+
+def dozen_plan() -> tuple[PlanStep, ...]:
+    """Moves of one axis between looks, single steps that leave play half taken up, two rehomings."""
+    orders = (
+        *(("home", 0, 0), ("place", "d1"), ("look",), ("move", 60, 0), ("look",), ("move", 60, 40), ("look",)),
+        *(("place", "d2"), ("look",), ("move", 60, -40), ("look",), ("move", 61, -40), ("look",)),
+        *(("home", 0, 0), ("look",), ("move", 2, 0), ("look",), ("move", 2, -3), ("look",), ("move", 90, 30)),
+        *(("move", 90, 50), ("look",), ("place", "d1"), ("look",)),
+        *(("home", 20, 10), ("look",), ("move", 20, 12), ("look",), ("move", -30, 12), ("look",)),
+    )
+    return tuple(
+        PlanStep(number, action, target=rest[0]) if action == "place" else PlanStep(number, action, *rest)
+        for number, (action, *rest) in enumerate(orders)
+    )
+
+
+def dozen_campaign(rig: Rig) -> SimulatedCampaign:
+    """Simulate the dozen; approaches, readings and correlations are then edited in."""
+    simulated = simulate(rig, dozen_plan(), seed=11, aperture=True)
+    campaign = simulated.campaign
+    homes = [move.move for move in campaign.moves if move.pan_approach]
+    moves = list(campaign.moves)
+    moves[homes[1]] = replace(moves[homes[1]], pan_approach="unknown", tilt_approach="unknown")
+    moves[homes[2]] = replace(moves[homes[2]], tilt_approach="unknown")
+    spots = [
+        replace(
+            spot,
+            aperture_deg=None if i % 3 == 0 else spot.aperture_deg,
+            su_left_px=0.06 + 0.01 * (i % 4),
+            sv_right_px=0.11,
+            ruv_left=0.4 if i % 2 else 0.0,
+            ruv_right=-0.3 if i % 4 == 1 else 0.0,
+        )
+        for i, spot in enumerate(campaign.spots)
+    ]
+    edited = replace(campaign, moves=tuple(moves), spots=tuple(spots))
+    return SimulatedCampaign(edited, simulated.truth)
+
+
+def coordinates(space: Any, truth: Truth) -> np.ndarray:
+    """Coordinates z of a true rig: the inverse of `ParameterSpace.physical`, by scipy's distributions."""
+    from scipy.stats import halfnorm, norm
+
+    from tvsbayes.parameters import KINDS, RIG_NAMES
+
+    z = []
+    for name, value, u, kind in zip(RIG_NAMES, space.value, space.u, space.kind, strict=True):
+        true = truth.parameters[name]
+        if u == 0:
+            z.append(0.0)
+        elif KINDS[int(kind)] == "half-normal":
+            z.append(norm.isf(halfnorm.sf(true, scale=u)))
+        elif KINDS[int(kind)] == "log-normal":
+            z.append(np.log(true / value) / u)
+        else:
+            z.append((true - value) / u)
+    stereo = np.linalg.pinv(np.asarray(space.stereo_root)) @ (truth.stereo.vector - np.asarray(space.stereo_mean))
+    return np.concatenate([z, stereo])
+
+
+@pytest.fixture(scope="session")
+def dozen(mounted_rig: Rig) -> Dozen:
+    """The campaign that the tests of likelihood and stops share."""
+    import jax
+    import jax.numpy as jnp
+
+    from tvsbayes.likelihood import campaign_arrays
+    from tvsbayes.parameters import parameter_space
+
+    simulated = dozen_campaign(mounted_rig)
+    campaign = simulated.campaign
+    assert all(spot.status == "ok" for spot in campaign.spots)
+    space = parameter_space(campaign.rig, campaign.stereo)
+    with jax.enable_x64(True):
+        return Dozen(
+            campaign,
+            simulated.truth,
+            coordinates(space, simulated.truth),
+            jax.tree.map(jnp.asarray, space),
+            jax.tree.map(jnp.asarray, campaign_arrays(campaign)),
+        )
+
+
+@dataclass(frozen=True)
+class Evaluated:
+    """Everything between coordinates and log likelihood, as NumPy arrays: see the library's own records."""
+
+    model: Any
+    angles: Any
+    terms: Any
+    innovations: Any
+
+
+@pytest.fixture(scope="session")
+def evaluate():
+    """(z, space, arrays) -> Evaluated, compiled once per bucket."""
+    import jax
+    import jax.numpy as jnp
+
+    from tvsbayes.likelihood import innovations, spot_residuals
+    from tvsbayes.positioner import mirror_angles
+
+    @jax.jit
+    def compiled(z, space, arrays):
+        model = space.model(z)
+        angles = mirror_angles(model.transmission, model.tilt_zero_rad, arrays.moves)
+        terms = spot_residuals(model, angles, arrays, jnp.ones(()), False)
+        return model, angles, terms, innovations(model, arrays)
+
+    def run(z, space, arrays) -> Evaluated:
+        with jax.enable_x64(True):
+            return Evaluated(*jax.tree.map(np.asarray, compiled(jnp.asarray(z), space, arrays)))
+
+    return run

@@ -1,0 +1,334 @@
+"""The paper's estimator: worked example, triangulation, selection of experiments, statistics, GUM.
+
+Frame S in mm, pixels, degrees. Cameras are projected by the twin's own optics, which share nothing with
+OpenCV's triangulation.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tvsbayes.campaign import Campaign, Move, Spot
+from tvsbayes.classic import (
+    classic,
+    distort,
+    four_point_angle_deg,
+    four_point_ratios,
+    ratio_deg_per_step,
+    select_experiments,
+    stereo_variance,
+    triangulate,
+    undistort,
+)
+from tvsbayes.files import NothingToEstimate
+from tvsbayes.optics import project
+from tvsbayes.rigs import DECLARED_PRIORS, DEFAULT_PRIORS, Prior, RigTable, Stereo, rotation_matrix
+
+ROUNDING_MM = 1e-7
+"""Rounding of 1e-13 px through the depth gain Z^2/(f B) of 1 to 2 mm/px and the DLT's SVD, times 10^5."""
+ROUNDING_DEG = 1e-8
+"""The same over 100 mm of depth difference: 1e-7 mm / 100 mm = 6e-8 deg, divided by N = 200, times 30."""
+
+
+def make_stereo(covariance: np.ndarray | None = None) -> Stereo:
+    """A pair with strong barrel distortion, f 800 px, 85 mm apart."""
+    return Stereo(
+        image_width=1280,
+        image_height=720,
+        M1=np.array([[802.0, 0.0, 645.0], [0.0, 801.0, 355.0], [0.0, 0.0, 1.0]]),
+        D1=np.array([-0.32, 0.11, 0.0004, -0.0006, -0.015]),
+        M2=np.array([[798.0, 0.0, 633.0], [0.0, 799.0, 362.0], [0.0, 0.0, 1.0]]),
+        D2=np.array([-0.31, 0.10, -0.0003, 0.0005, -0.012]),
+        R=rotation_matrix(np.array([0.004, -0.006, 0.003])),
+        T=np.array([-85.2, 0.3, -0.4]),
+        parameter_covariance=np.zeros((24, 24)) if covariance is None else covariance,
+        rms_px=0.2,
+    )
+
+
+def calibration_covariance() -> np.ndarray:
+    """A covariance with correlated fx, fy and free k1, R, T; the rest fixed (zero rows)."""
+    sd = np.zeros(24)
+    sd[[0, 1, 9, 10]], sd[[4, 13]], sd[18:21], sd[21:24] = 1.2, 0.002, 2e-4, 0.05
+    correlation = np.eye(24)
+    correlation[0, 1] = correlation[1, 0] = correlation[9, 10] = correlation[10, 9] = 0.95
+    return correlation * np.outer(sd, sd)
+
+
+def four_points(
+    theta_i_deg: float, theta_f_deg: float, axis: str, depths_mm: tuple[float, float] = (175.0, 275.0)
+) -> np.ndarray:
+    """Points 1 to 4 in S of two beams through (0, -60, 0) with the given slopes in the axis' plane."""
+    column = {"pan": 1, "tilt": 2}[axis]
+    points = np.zeros((4, 3))
+    near, far = depths_mm
+    points[:, 0] = near, far, far, near
+    points[:, 1] = -60.0
+    for row, theta in enumerate((theta_i_deg, theta_i_deg, theta_f_deg, theta_f_deg)):
+        points[row, column] += points[row, 0] * np.tan(np.radians(theta))
+    return points
+
+
+def make_campaign(
+    experiments: list[tuple[str, int, float, float]],
+    covariance: np.ndarray | None = None,
+    focal_u: float = 0.0,
+) -> Campaign:
+    """Noise-free campaign of (axis, steps, theta_i, theta_f); each starts at counters 0, 0."""
+    stereo = make_stereo(covariance)
+    moves = [Move(0, 0, 0.0, 0, 0, "left", "up")]
+    spots: list[Spot] = []
+    for number, (axis, steps, theta_i, theta_f) in enumerate(experiments):
+        start = len(moves) - 1
+        counters = (steps, 0) if axis == "pan" else (0, steps)
+        moves.append(Move(start + 1, 0, float(start), *counters))
+        moves.append(Move(start + 2, 0, float(start), 0, 0))
+        pixels = project(four_points(theta_i, theta_f, axis), stereo)
+        assert np.isfinite(pixels).all()
+        for point, row in enumerate(pixels, 1):
+            move, target = start + (point > 2), "d1" if point in (1, 4) else "d2"
+            spots.append(Spot(len(spots), move, target, number, point, *map(float, row), *(0.08,) * 4))
+    priors = {**DEFAULT_PRIORS, **DECLARED_PRIORS, "focal_scale": Prior(1.0, focal_u)}
+    return Campaign(tuple(moves), tuple(spots), stereo, RigTable(priors))
+
+
+def test_worked_example_of_the_paper():
+    """18.53 deg, 30.41 deg, 200 steps: 0.0594 deg/step as printed, by formula and from four spots."""
+    assert round(ratio_deg_per_step(18.53, 30.41, 200), 4) == 0.0594
+    result = classic(make_campaign([("pan", 200, 18.53, 30.41)]))
+    (experiment,) = result.experiments
+    assert experiment.theta_i_deg == pytest.approx(18.53, abs=200 * ROUNDING_DEG)
+    assert experiment.theta_f_deg == pytest.approx(30.41, abs=200 * ROUNDING_DEG)
+    assert round(experiment.deg_per_step, 4) == 0.0594
+    assert experiment.direction == "left"
+
+
+def test_undistortion_converges_to_the_corners():
+    """Re-distorting returns every pixel of the image, corners included."""
+    stereo = make_stereo()
+    pixels = np.stack(np.meshgrid(np.linspace(0, 1279, 15), np.linspace(0, 719, 9)), axis=-1).reshape(-1, 2)
+    normalised = undistort(pixels, stereo.M1, stereo.D1)
+    returned = distort(normalised, stereo.D1) @ stereo.M1[:2, :2].T + stereo.M1[:2, 2]
+    assert np.max(np.abs(returned - pixels)) < 1e-9
+    five = distort(normalised, stereo.D1 * 0) @ stereo.M1[:2, :2].T + stereo.M1[:2, 2]
+    assert np.max(np.abs(five - pixels)) > 100, "the distortion of this test is strong at the corners"
+
+
+def test_undistortion_reports_a_pixel_without_origin():
+    """Beyond the radius where the polynomial turns back there is no answer: NaN, not a guess."""
+    camera = np.array([[800.0, 0.0, 640.0], [0.0, 800.0, 360.0], [0.0, 0.0, 1.0]])
+    folding = np.array([-0.5, 0.0, 0.0, 0.0, 0.0])  # r (1 - r^2/2) peaks at 0.544
+    result = undistort(np.array([[640.0 + 800 * 0.5, 360.0], [640.0 + 800 * 0.6, 360.0]]), camera, folding)
+    assert np.isfinite(result[0]).all() and np.isnan(result[1]).all()
+
+
+@pytest.mark.parametrize("focal_scale", [1.0, 1.004])
+def test_triangulation_inverts_projection(focal_scale: float):
+    """Points all over the shared field come back, with the same focal scale on both sides."""
+    rng = np.random.default_rng(1)
+    stereo = make_stereo()
+    points = np.column_stack(
+        (rng.uniform(170, 500, 400), rng.uniform(-200, 100, 400), rng.uniform(-120, 120, 400))
+    )
+    pixels = project(points, stereo, focal_scale)
+    seen = np.isfinite(pixels).all(axis=1)
+    assert seen.sum() > 150
+    assert np.abs(triangulate(stereo, pixels[seen], focal_scale) - points[seen]).max() < ROUNDING_MM
+
+
+def test_projection_agrees_with_opencv():
+    """The frame change and the distortion of the test's own optics are OpenCV's."""
+    import cv2
+
+    stereo = make_stereo()
+    points = np.array([[175.0, -60.0, 10.0], [275.0, 20.0, -40.0], [300.0, -80.0, 60.0]])
+    camera = np.column_stack((-points[:, 1], -points[:, 2], points[:, 0]))
+    zero, none = np.zeros((3, 1)), np.zeros((3, 1))
+    rotation, _ = cv2.Rodrigues(stereo.R)
+    left = cv2.projectPoints(camera, zero, none, stereo.M1, stereo.D1)[0].reshape(-1, 2)
+    right = cv2.projectPoints(camera, rotation, stereo.T.reshape(3, 1), stereo.M2, stereo.D2)[0].reshape(
+        -1, 2
+    )
+    assert np.abs(project(points, stereo) - np.hstack((left, right))).max() < 1e-9
+
+
+def test_directions_follow_the_sign_of_the_move():
+    """Left and up are positive counters; every sane ratio is positive."""
+    result = classic(
+        make_campaign(
+            [
+                ("pan", 200, 0.0, 12.0),
+                ("pan", -200, 12.0, 0.0),
+                ("tilt", 200, -7.0, 7.0),
+                ("tilt", -200, 7.0, -7.0),
+            ]
+        )
+    )
+    assert [(e.direction, e.steps) for e in result.experiments] == [
+        ("left", 200), ("right", -200), ("up", 200), ("down", -200)
+    ]  # fmt: skip
+    ratios = [e.deg_per_step for e in result.experiments]
+    assert ratios == pytest.approx([0.06, 0.06, 0.07, 0.07], abs=ROUNDING_DEG)
+
+
+def test_tilt_is_read_in_the_xz_plane_of_the_stereo_frame():
+    """A beam at azimuth az shows tan(el)/cos(az): the paper's reading, kept as it is."""
+    azimuth, elevations = np.radians(27.0), np.radians([2.0, 12.0])
+    beam = np.stack(
+        [[np.cos(e) * np.cos(azimuth), np.cos(e) * np.sin(azimuth), np.sin(e)] for e in elevations]
+    )
+    points = np.stack([beam[0] * 100, beam[0] * 300, beam[1] * 300, beam[1] * 100])
+    angles = four_point_angle_deg(points, "tilt")
+    expected = np.degrees(np.arctan(np.tan(elevations) / np.cos(azimuth)))
+    assert [angles.theta_i_deg, angles.theta_f_deg] == pytest.approx(expected, abs=1e-12)
+
+
+def test_statistics_of_known_ratios():
+    """Mean, sd (n - 1), u = s/sqrt(n) and Student's interval in closed form for three known angles."""
+    result = classic(make_campaign([("pan", 200, 10.0, 10.0 + d) for d in (11.8, 12.0, 12.5)]))
+    left = result.directions["left"]
+    ratios = np.array([11.8, 12.0, 12.5]) / 200
+    deviation = ratios - ratios.sum() / 3
+    sd = np.sqrt((deviation**2).sum() / 2)
+    assert left.n == 3
+    assert left.mean_deg_per_step == pytest.approx(ratios.sum() / 3, abs=ROUNDING_DEG)
+    assert left.sd_deg_per_step == pytest.approx(sd, abs=ROUNDING_DEG)
+    assert left.u_type_a_deg_per_step == pytest.approx(sd / np.sqrt(3), abs=ROUNDING_DEG)
+    half = 4.302652729911275 * sd / np.sqrt(3)  # t of 2 degrees of freedom, 0.975: tables
+    assert left.interval95_type_a == pytest.approx(
+        (ratios.mean() - half, ratios.mean() + half), abs=ROUNDING_DEG * 5
+    )
+    # A fixed calibration adds nothing: GUM is type A, with its n - 1 degrees of freedom.
+    assert left.u_gum_deg_per_step == pytest.approx(left.u_type_a_deg_per_step, rel=1e-12)
+    assert left.effective_dof == pytest.approx(2.0, rel=1e-9)
+    assert [result.directions[name] for name in ("right", "up", "down")] == [None, None, None]
+
+
+def test_one_experiment_has_a_mean_and_no_sd():
+    """With n = 1, what needs two experiments is null, never NaN."""
+    document = classic(make_campaign([("tilt", 100, 0.0, 7.0)], calibration_covariance())).as_json()
+    up = document["directions"]["up"]
+    assert up["n"] == 1 and up["mean_deg_per_step"] == pytest.approx(0.07, abs=ROUNDING_DEG)
+    assert up["sd_deg_per_step"] is up["u_type_a_deg_per_step"] is up["interval95_gum"] is None
+    assert "NaN" not in json.dumps(document)
+
+
+def test_gum_agrees_with_monte_carlo_over_calibrations():
+    """J C J^T against the spread of the mean over 1500 drawn calibrations and focal scales."""
+    covariance = calibration_covariance()
+    campaign = make_campaign([("pan", 200, 18.5, 30.4), ("pan", 200, 18.6, 30.3)], covariance, focal_u=0.002)
+    left = classic(campaign).directions["left"]
+    chosen = select_experiments(campaign)
+    rng = np.random.default_rng(3)
+    vectors = rng.multivariate_normal(campaign.stereo.vector, covariance, size=1500, method="eigh")
+    scales = 1 + 0.002 * rng.standard_normal(1500)
+    means = [
+        four_point_ratios(chosen.pixels, chosen.steps, chosen.axis, campaign.stereo.with_vector(v), f).mean()
+        for v, f in zip(vectors, scales, strict=True)
+    ]
+    # An sd of 1500 draws has a relative sd of 1/sqrt(3000) = 1.8 %; four of them.
+    assert left.u_stereo_deg_per_step == pytest.approx(np.std(means, ddof=1), rel=4 * 0.018)
+    assert left.u_gum_deg_per_step == pytest.approx(
+        np.hypot(left.u_type_a_deg_per_step, left.u_stereo_deg_per_step)
+    )
+    assert left.effective_dof == pytest.approx(
+        (left.u_gum_deg_per_step / left.u_type_a_deg_per_step) ** 4, rel=1e-9
+    )
+    width_a, width_gum = (np.ptp(i) for i in (left.interval95_type_a, left.interval95_gum))
+    factor_gum = width_gum / left.u_gum_deg_per_step
+    assert factor_gum < width_a / left.u_type_a_deg_per_step, "more degrees of freedom, a smaller factor"
+
+
+def test_focal_error_shifts_the_ratio_as_no_repeat_can_show():
+    """Ideal parallel cameras: a focal length 0.5 % too large divides every tangent by 1.005."""
+    ideal = replace(make_stereo(), D1=np.zeros(5), D2=np.zeros(5), R=np.eye(3), T=np.array([-85.0, 0.0, 0.0]))
+    pixels = project(four_points(18.5, 30.4, "pan"), ideal).reshape(1, 4, 4)
+    ratio = four_point_ratios(pixels, np.array([200]), "pan", ideal, 1.005)[0]
+    seen = np.degrees(np.arctan(np.tan(np.radians([18.5, 30.4])) / 1.005))
+    # The near and far points share the intercept, which scales with depth and leaves the slope alone.
+    assert ratio == pytest.approx((seen[1] - seen[0]) / 200, abs=ROUNDING_DEG)
+    assert ratio / 0.0595 - 1 == pytest.approx(-0.0033, abs=0.00005)  # research/domain.md 4, two digits
+
+
+def test_fixed_parameters_are_skipped():
+    """A zero row costs no evaluation and adds no variance."""
+    calls = []
+
+    def function(stereo: Stereo, focal_scale: float) -> float:
+        calls.append(focal_scale)
+        return 3.0 * stereo.vector[0]
+
+    covariance = np.zeros((24, 24))
+    covariance[0, 0] = 4.0
+    assert stereo_variance(function, make_stereo(covariance), 0.0) == pytest.approx(36.0, rel=1e-9)
+    assert len(calls) == 2
+
+
+def _changed(campaign: Campaign, row: int, **changes) -> Campaign:
+    """The campaign with one spot changed."""
+    spots = list(campaign.spots)
+    spots[row] = replace(spots[row], **changes)
+    return replace(campaign, spots=tuple(spots))
+
+
+def test_incomplete_experiments_are_skipped_with_a_reason():
+    """Each kind of incomplete experiment names its own reason; the good ones stay."""
+    campaign = make_campaign([("pan", 200, 10.0, 22.0)] * 9)
+    none = dict.fromkeys(("u_left_px", "v_left_px", "u_right_px", "v_right_px"))
+    campaign = _changed(campaign, 4 * 1 + 2, status="undetected", **none)
+    campaign = _changed(campaign, 4 * 2 + 3, experiment=None)
+    campaign = _changed(campaign, 4 * 3 + 0, point=2)
+    campaign = _changed(campaign, 4 * 4 + 1, move=1)
+    campaign = _changed(campaign, 4 * 5 + 2, move=0)
+    moves = list(campaign.moves)
+    moves[13] = replace(moves[13], tilt_steps=5)
+    moves[15] = replace(moves[15], pan_steps=0)
+    moves[17:] = [replace(move, segment=1) for move in moves[17:]]
+    campaign = replace(campaign, moves=tuple(moves))
+    result = classic(campaign)
+    reasons = {skipped.experiment: skipped.reason for skipped in result.skipped}
+    assert [e.experiment for e in result.experiments] == [0]
+    assert reasons == {
+        1: "point 3 is not usable: status undetected",
+        2: "point 4 is missing",
+        3: "point 1 is missing",
+        4: "points 1 and 2 were seen at different counters",
+        5: "points 3 and 4 were seen at different counters",
+        6: "both axes moved between points 2 and 3 (pan +200, tilt +5 steps)",
+        7: "no axis moved between points 2 and 3",
+        8: "the positioner was homed within the experiment",
+    }
+    assert len(result.as_json()["skipped"]) == 8
+
+
+def test_nothing_to_estimate():
+    """No complete experiment: an error with exit code 3 that names the first reason."""
+    campaign = make_campaign([("pan", 200, 10.0, 22.0)])
+    with pytest.raises(NothingToEstimate, match="point 4 is missing") as caught:
+        classic(_changed(campaign, 3, experiment=None))
+    assert caught.value.exit_code == 3
+    with pytest.raises(NothingToEstimate):
+        classic(replace(campaign, spots=()))
+
+
+def test_json_is_the_contract():
+    """Keys of DESIGN 8, and a document that any JSON reader takes."""
+    document = json.loads(
+        json.dumps(
+            classic(make_campaign([("pan", 200, 10.0, 22.0), ("pan", 200, 10.0, 22.1)])).as_json(),
+            allow_nan=False,
+        )
+    )
+    assert set(document["directions"]) == {"left", "right", "up", "down"}
+    assert document["directions"]["right"] is None
+    assert {
+        "n", "mean_deg_per_step", "sd_deg_per_step", "u_type_a_deg_per_step", "interval95_type_a",
+        "u_gum_deg_per_step", "interval95_gum",
+    } <= set(document["directions"]["left"])  # fmt: skip
+    assert set(document["experiments"][0]) == {
+        "experiment", "direction", "steps", "theta_i_deg", "theta_f_deg", "deg_per_step",
+    }  # fmt: skip

@@ -1,0 +1,475 @@
+"""Every command, its documents and its exit codes, in this process; one subprocess for what `--help` loads.
+
+One fit compiles the model (the paper twin, the small campaigns and the grid share one bucket), all others reuse it.
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tvsbayes.campaign import Campaign, PlanStep, read_campaign, write_campaign, write_plan
+from tvsbayes.cli import run
+from tvsbayes.files import shipped_data
+from tvsbayes.protocols import grid_protocol
+from tvsbayes.simulation import simulate
+
+DATA = shipped_data()
+MOUNTED = DATA / "rigs" / "mounted"
+PAPER_TWIN = DATA / "twins" / "paper_twin"
+DIRECTIONS = ("left", "right", "up", "down")
+ESTIMATE_KEYS = {"value", "sd", "interval95", "prior_sd", "contraction", "rhat", "ess_bulk", "ess_tail"}
+
+
+def no_constant(name: str) -> None:
+    raise AssertionError(f"{name} is no JSON")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def own_compilation_cache(tmp_path_factory):
+    """`fit` and `demo` point JAX at a folder of this test run; afterwards JAX is as it was."""
+    import jax
+    from jax.experimental.compilation_cache import compilation_cache
+
+    names = ("jax_compilation_cache_dir", "jax_persistent_cache_min_compile_time_secs")
+    before = {name: jax.config.values[name] for name in names}
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("TVSBAYES_CACHE", str(tmp_path_factory.mktemp("cache")))
+        yield
+    for name, value in before.items():
+        jax.config.update(name, value)
+    compilation_cache.reset_cache()
+
+
+@pytest.fixture
+def ask(capsys):
+    """Run a command with --json: exit code, and the one document on stdout."""
+
+    def run_json(*arguments: object) -> tuple[int, dict[str, Any]]:
+        code = run([*map(str, arguments), "--json"])
+        captured = capsys.readouterr()
+        assert "Traceback" not in captured.err
+        return code, json.loads(captured.out, parse_constant=no_constant)
+
+    return run_json
+
+
+@pytest.fixture
+def say(capsys):
+    """Run a command for people: exit code, stdout, stderr."""
+
+    def run_text(*arguments: object) -> tuple[int, str, str]:
+        code = run([*map(str, arguments)])
+        return code, *capsys.readouterr()
+
+    return run_text
+
+
+def steps(*orders: tuple) -> tuple[PlanStep, ...]:
+    """Orders as a plan: ("place", target), ("look",), ("home" or "move", pan, tilt)."""
+    return tuple(
+        PlanStep(number, action, target=rest[0]) if action == "place" else PlanStep(number, action, *rest)
+        for number, (action, *rest) in enumerate(orders)
+    )
+
+
+def two_sheets(*counters: tuple[int, int]) -> tuple[PlanStep, ...]:
+    """Each stop looked at twice on both sheets; both axes homed at 0."""
+    looks = (("place", "d1"), ("look",), ("look",), ("place", "d2"), ("look",), ("look",))
+    return steps(("home", 0, 0), *looks, *(order for pair in counters for order in (("move", *pair), *looks)))
+
+
+@pytest.fixture(scope="module")
+def small(mounted_rig) -> Campaign:
+    """24 spots: three by two poses on two sheets, each from either side of both axes."""
+    plan = grid_protocol(targets=("d1", "d2"), pan_steps=(0, 100, 200), tilt_steps=(-60, 60))
+    return simulate(mounted_rig, plan, seed=3).campaign
+
+
+@pytest.fixture
+def folder(small, tmp_path) -> Path:
+    """A copy of the small campaign that a test may spoil."""
+    write_campaign(small, tmp_path / "campaign")
+    return tmp_path / "campaign"
+
+
+def assert_error(document: dict[str, Any], code: str) -> dict[str, Any]:
+    error = document["error"]
+    assert {"code", "file", "line", "message", "remedy"} <= set(error)
+    assert error["code"] == code
+    assert error["message"]
+    assert error["remedy"]
+    return error
+
+
+def test_check_reads_campaign_rig_and_plan(ask, say):
+    code, document = ask("check", PAPER_TWIN)
+    assert code == 0
+    assert document == {
+        "kind": "campaign",
+        "moves": 244,
+        "segments": 1,
+        "spots": 384,
+        "ok_spots": 384,
+        "refused": {},
+        "aperture_readings": 0,
+        "experiments": 96,
+        "warnings": [],
+    }
+    code, document = ask("check", MOUNTED / "rig.toml")
+    assert (code, document["kind"], document["sheets_mm"]["d1"]) == (0, "rig", 175.0)
+    code, document = ask("check", MOUNTED / "paper.csv")
+    assert (code, document["kind"], document["look"], document["home"]) == (0, "plan", 384, 1)
+    code, out, _ = say("check", PAPER_TWIN)
+    assert code == 0
+    assert "spots: 384" in out
+    assert out.endswith(", 0 warnings\n")
+
+
+def test_check_warns_without_failing(ask, say, small, tmp_path):
+    """Weak directions alone are exit 0 (DESIGN 8)."""
+    stereo = replace(small.stereo, parameter_covariance=np.zeros((24, 24)))
+    write_campaign(replace(small, stereo=stereo), tmp_path / "exact")
+    code, document = ask("check", tmp_path / "exact")
+    assert code == 0
+    assert len(document["warnings"]) == 1
+    assert "covariance is zero" in document["warnings"][0]
+    assert "warning: the stereo covariance is zero" in say("check", tmp_path / "exact")[1]
+
+
+def test_classic_document_has_the_contracts_keys(ask):
+    code, document = ask("classic", PAPER_TWIN)
+    assert code == 0
+    assert set(document) == {"directions", "experiments", "skipped"}
+    contract = {
+        "n",
+        "mean_deg_per_step",
+        "sd_deg_per_step",
+        "u_type_a_deg_per_step",
+        "interval95_type_a",
+        "u_gum_deg_per_step",
+        "interval95_gum",
+    }
+    assert list(document["directions"]) == list(DIRECTIONS)
+    for result in document["directions"].values():
+        # Two more than DESIGN 8 names.
+        assert set(result) == contract | {"u_stereo_deg_per_step", "effective_dof"}
+        assert result["n"] == 24
+        low, high = result["interval95_type_a"]
+        assert low < result["mean_deg_per_step"] < high
+    assert len(document["experiments"]) == 96
+    keys = {"experiment", "direction", "steps", "theta_i_deg", "theta_f_deg", "deg_per_step"}
+    assert all(set(e) == keys for e in document["experiments"])
+
+
+def test_classic_gives_null_for_a_direction_without_experiments(ask, say, tmp_path):
+    twin = read_campaign(PAPER_TWIN)
+    left_only = tuple(s for s in twin.spots if s.experiment < 24)
+    write_campaign(replace(twin, spots=left_only), tmp_path / "left")
+    code, document = ask("classic", tmp_path / "left")
+    assert code == 0
+    assert document["directions"]["left"]["n"] == 24
+    assert [document["directions"][d] for d in DIRECTIONS[1:]] == [None] * 3
+    assert "no experiment" in say("classic", tmp_path / "left")[1]
+
+
+def test_classic_without_a_complete_experiment_has_nothing_to_estimate(ask, folder):
+    code, document = ask("classic", folder)
+    assert code == 3
+    assert set(document) == {"error"}
+
+
+def test_simulate_writes_a_campaign_and_repeats_itself(ask, tmp_path):
+    plan = tmp_path / "plan.csv"
+    write_plan(two_sheets((100, 30)), plan)
+    documents = []
+    for name, seed in (("a", 7), ("b", 7), ("c", 8)):
+        code, document = ask("simulate", MOUNTED / "rig.toml", plan, tmp_path / name, "--aperture", "--seed", seed)
+        assert code == 0
+        documents.append(document)
+    assert documents[0] == {"campaign": str(tmp_path / "a"), "moves": 2, "spots": 8, "ok": 8, "seed": 7}
+    names = {"campaign.toml", "stereo.json", "moves.csv", "spots.csv", "truth.json"}
+    assert {path.name for path in (tmp_path / "a").iterdir()} == names
+    for name in names:
+        assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
+    assert (tmp_path / "a" / "spots.csv").read_bytes() != (tmp_path / "c" / "spots.csv").read_bytes()
+    assert all(spot.aperture_deg is not None for spot in read_campaign(tmp_path / "a").spots)
+    code, document = ask("simulate", MOUNTED / "rig.toml", plan, tmp_path / "a")
+    assert code == 2
+    assert_error(document, "occupied")
+
+
+def test_new_campaign_lacks_only_its_stereo_calibration(ask, say, tmp_path):
+    out = tmp_path / "mine"
+    code, document = ask("new", out)
+    assert code == 0
+    assert sorted(document["files"]) == ["campaign.toml", "moves.csv", "rig.toml", "spots.csv"]
+    code, document = ask("check", out)
+    assert code == 2
+    assert assert_error(document, "missing-file")["file"] == "stereo.json"
+    (out / "stereo.json").write_bytes((MOUNTED / "stereo.json").read_bytes())
+    code, document = ask("check", out)
+    assert code == 0
+    assert (document["moves"], document["spots"]) == (1, 0)
+    assert ask("check", out / "rig.toml")[0] == 0
+    code, text, log = say("new", out)
+    assert (code, text) == (2, "")
+    assert "nothing is overwritten" in log
+
+
+def test_fit_document_has_the_contracts_keys_and_its_files(ask, folder):
+    code, document = ask("fit", folder, "--no-sample", "--seed", 4)
+    assert code == 0
+    assert (document["estimator"], document["converged"], document["seed"]) == ("laplace", True, 4)
+    assert list(document["effective_deg_per_step"]) == list(DIRECTIONS)
+    assert set(document["reference_pose_deg"]) == {"pan", "tilt"}
+    required = {
+        *("degrees_per_step.pan", "degrees_per_step.tilt"),
+        *(f"degrees_per_step.{d}" for d in DIRECTIONS),
+        *("ratio_contrast_deg_per_step.pan", "ratio_contrast_deg_per_step.tilt"),
+        *("backlash_deg.pan", "backlash_deg.tilt", "tilt_zero_deg"),
+        *("mirror_offset_mm", "effective_mirror_offset_mm", "mirror1_error_deg", "mirror2_error_deg"),
+        *("laser_tilt_deg.x", "laser_tilt_deg.y", "laser_offset_mm.x", "laser_offset_mm.y"),
+        *("tilt_axis_skew_deg", "tilt_axis_offset_mm.x", "tilt_axis_offset_mm.z"),
+        *(f"extrinsics.{kind}.{axis}" for kind in ("rotation_rad", "translation_mm") for axis in "xyz"),
+        *(f"stop_sd_deg.{d}" for d in DIRECTIONS),
+        *("pixel_scale", "focal_scale", "stereo.left.fx"),
+    }
+    # Without aperture readings a, C0 and the aperture's zero and noise are not estimated.
+    assert required <= set(document["parameters"])
+    assert not {"baseline_mm", "pan_zero_emission_deg", "aperture_zero_deg", "aperture_sd_deg"} & set(
+        document["parameters"]
+    )
+    for estimate in (*document["parameters"].values(), *document["effective_deg_per_step"].values()):
+        assert set(estimate) == ESTIMATE_KEYS
+        low, high = estimate["interval95"]
+        assert low <= estimate["value"] <= high
+        assert estimate["rhat"] is estimate["ess_bulk"] is estimate["ess_tail"] is None
+    for direction in DIRECTIONS:
+        assert document["effective_deg_per_step"][direction]["contraction"] > 0.9
+    assert {"chi2", "dof", "pixel_scale"} <= set(document["noise"])
+    assert document["noise"]["pixel_scale"] == document["parameters"]["pixel_scale"]["value"]
+    assert all({"text", "loadings"} <= set(weak) for weak in document["weak_directions"])
+    assert all({"move", "spots", "quantity", "factor", "text"} == set(e) for e in document["leverage"])
+    assert document["excluded_spots"] == []
+    assert document["files"] == {
+        "draws": str(folder / "results" / "draws.npz"),
+        "fit": str(folder / "results" / "fit.json"),
+    }
+    saved = json.loads((folder / "results" / "fit.json").read_text(), parse_constant=no_constant)
+    assert saved["format"] == "tvsbayes-fit/1"
+    assert {key: saved[key] for key in document if key != "files"} == {k: v for k, v in document.items() if k != "files"}
+    with np.load(folder / "results" / "draws.npz", allow_pickle=False) as draws:
+        assert draws["effective_deg_per_step"].shape == (len(draws["physical"]), 4)
+        column = list(draws["names"]).index("backlash_deg.pan")
+        sd = document["parameters"]["backlash_deg.pan"]["sd"]
+        assert draws["physical"][:, column].std() == pytest.approx(sd, rel=1e-9)
+
+
+def test_fit_for_people_names_value_interval_and_origin(say, folder, tmp_path):
+    out = tmp_path / "elsewhere"
+    code, text, log = say("fit", folder, "--out", out)
+    assert code == 0
+    assert "as with --no-sample" in log
+    row = next(line for line in text.splitlines() if line.startswith("effective left"))
+    assert row.split()[-1] == "data"
+    assert f"written: {out / 'fit.json'}" in text
+    assert (out / "draws.npz").is_file()
+    assert not (folder / "results").exists()
+
+
+def test_per_axis_fit_has_one_gear_ratio_per_axis(ask, folder):
+    code, document = ask("fit", folder, "--no-sample", "--per-axis")
+    assert code == 0
+    parameters = document["parameters"]
+    assert parameters["degrees_per_step.left"]["value"] == parameters["degrees_per_step.right"]["value"]
+    contrast = parameters["ratio_contrast_deg_per_step.tilt"]
+    assert (contrast["value"], contrast["sd"], contrast["prior_sd"], contrast["contraction"]) == (0.0, 0.0, 0.0, None)
+
+
+def test_robust_fit_names_the_spot_it_leaves_out(ask, small, tmp_path):
+    spots = list(small.spots)
+    # 40 stated sds.
+    spots[9] = replace(spots[9], v_left_px=spots[9].v_left_px + 40 * spots[9].sv_left_px)
+    write_campaign(replace(small, spots=tuple(spots)), tmp_path / "odd")
+    code, document = ask("fit", tmp_path / "odd", "--no-sample", "--robust")
+    assert code == 0
+    assert document["excluded_spots"] == [spots[9].spot]
+
+
+def test_a_direction_never_moved_is_null_and_one_side_is_weak(ask, say, mounted_rig, tmp_path):
+    plan = two_sheets((40, 0), (80, 30), (120, 30), (160, 60), (200, 90))
+    write_campaign(simulate(mounted_rig, plan, seed=5).campaign, tmp_path / "one way")
+    code, document = ask("fit", tmp_path / "one way", "--no-sample")
+    assert code == 0
+    effective = document["effective_deg_per_step"]
+    assert effective["right"] is effective["down"] is None
+    assert effective["left"]["contraction"] > 0.9
+    texts = [weak["text"] for weak in document["weak_directions"]]
+    assert [text for text in texts if "pan ratio and pan backlash" in text and "from one side" in text]
+    assert "never moved" in say("fit", tmp_path / "one way", "--no-sample")[1]
+
+
+def test_too_few_spots_are_nothing_to_estimate(ask, small, tmp_path):
+    write_campaign(replace(small, spots=small.spots[:7]), tmp_path / "few")
+    code, document = ask("fit", tmp_path / "few", "--no-sample")
+    assert code == 3
+    assert_error(document, "too-few-spots")
+    assert not (tmp_path / "few" / "results").exists()
+
+
+def test_spots_at_one_stop_inform_no_headline(ask, mounted_rig, tmp_path):
+    """Both axes move, but only after the last look."""
+    looks = [("place", "d1"), *[("look",)] * 5, ("place", "d2"), *[("look",)] * 5]
+    plan = steps(("home", 0, 0), *looks, ("move", 100, 50), ("move", 0, 0))
+    write_campaign(simulate(mounted_rig, plan, seed=6).campaign, tmp_path / "still")
+    code, document = ask("fit", tmp_path / "still", "--no-sample")
+    assert code == 3
+    assert_error(document, "uninformed")
+    # The document is there all the same, and says where the values come from.
+    assert all(e["contraction"] < 0.1 for e in document["effective_deg_per_step"].values())
+
+
+def test_a_fit_that_did_not_converge_is_exit_4(ask, say, folder, monkeypatch):
+    import tvsbayes.joint
+
+    real = tvsbayes.joint.fit
+
+    def astray(*arguments, **options):
+        return replace(real(*arguments, **options), converged=False, problems=("it went astray",))
+
+    monkeypatch.setattr(tvsbayes.joint, "fit", astray)
+    code, document = ask("fit", folder, "--no-sample")
+    assert code == 4
+    assert document["converged"] is False
+    assert "it went astray" in assert_error(document, "not-converged")["message"]
+    code, _, log = say("fit", folder, "--no-sample")
+    assert code == 4
+    assert "NOT CONVERGED: it went astray" in log
+
+
+def test_demo_shows_classic_and_joint_beside_the_truth(ask, tmp_path):
+    out = tmp_path / "kept"
+    code, document = ask("demo", out)
+    assert code == 0
+    assert set(document) == {"classic", "fit", "truth"}
+    fit, truth = document["fit"], document["truth"]
+    intervals = {d: fit["effective_deg_per_step"][d]["interval95"] for d in DIRECTIONS}
+    names = ("backlash_deg.pan", "backlash_deg.tilt", "effective_mirror_offset_mm")
+    intervals |= {name: fit["parameters"][name]["interval95"] for name in names}
+    assert set(truth) == set(intervals)
+    for name, (low, high) in intervals.items():
+        assert low < truth[name] < high, name
+    # The claim that the demo exists for: type A intervals of the classic estimator miss.
+    for direction, result in document["classic"]["directions"].items():
+        low, high = result["interval95_type_a"]
+        assert not low < truth[direction] < high
+    # What the joint model expects the classic estimator to say is what it says.
+    for direction, result in document["classic"]["directions"].items():
+        predicted = fit["classic_predicted_deg_per_step"][direction]
+        assert abs(predicted["value"] - result["mean_deg_per_step"]) < 3 * result["u_type_a_deg_per_step"]
+    assert (out / "truth.json").is_file()
+    assert (out / "results" / "fit.json").is_file()
+    assert ask("demo", out)[0] == 2
+
+
+SPOILED = {
+    "underscore": ("spots.csv", lambda text: text.replace(",ok", ",ok,9_4.7", 1), None),
+    "missing move": ("spots.csv", lambda text: text.replace("\n0,", "\n0,99", 1), None),
+    "NUL": ("moves.csv", lambda text: text + "\0", "control-character"),
+    "unknown key": ("campaign.toml", lambda text: "colour = 'red'\n" + text, "unknown-key"),
+    "no TOML": ("campaign.toml", lambda text: text + "\n[[", None),
+    "NaN in JSON": ("stereo.json", lambda text: text.replace("1280", "NaN", 1), None),
+    "deep JSON": ("stereo.json", lambda text: "[" * 100_000, None),
+}
+
+
+@pytest.mark.parametrize("name", SPOILED)
+@pytest.mark.parametrize("command", ["check", "classic", "fit"])
+def test_hostile_files_are_taught_errors(ask, say, folder, command, name):
+    file, spoil, error_code = SPOILED[name]
+    text = (folder / file).read_text()
+    assert spoil(text) != text
+    (folder / file).write_text(spoil(text))
+    code, document = ask(command, folder)
+    assert code == 2
+    assert set(document) == {"error"}
+    error = assert_error(document, error_code or document["error"]["code"])
+    assert error["file"] == file
+    code, out, log = say(command, folder)
+    assert (code, out) == (2, "")
+    assert log.startswith(f"error: {file}")
+    assert "Traceback" not in log
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("fit", "x", "--nope"),
+        ("frobnicate",),
+        ("classic",),
+        ("simulate", "a", "b", "c", "--seed", "-1"),
+        ("simulate", "a", "b", "c", "--seed", "many"),
+    ],
+)
+def test_wrong_usage_is_bad_input(ask, say, arguments):
+    code, document = ask(*arguments)
+    assert code == 2
+    assert set(document) == {"error"}
+    assert_error(document, "usage")
+    code, out, log = say(*arguments)
+    assert (code, out) == (2, "")
+    assert log
+
+
+@pytest.mark.parametrize("command", ["check", "classic", "fit"])
+def test_a_folder_that_is_not_there_is_bad_input(ask, tmp_path, command):
+    code, document = ask(command, tmp_path / "nowhere")
+    assert code == 2
+    assert_error(document, "missing-file")
+
+
+def test_control_characters_of_a_name_do_not_reach_the_terminal(say, tmp_path):
+    code, out, log = say("check", tmp_path / "a\x1b[31mb")
+    assert code == 2
+    assert "\x1b" not in out + log
+
+
+def test_interrupt_is_130(say, monkeypatch):
+    def interrupted(path):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("tvsbayes.campaign.read_campaign", interrupted)
+    code, out, log = say("classic", PAPER_TWIN)
+    assert (code, out) == (130, "")
+    assert "interrupted" in log
+
+
+def test_a_bug_is_no_bad_input(monkeypatch):
+    """Only errors a user can act on become exit codes; anything else must not be hidden."""
+
+    def broken(path):
+        raise RuntimeError("a bug")
+
+    monkeypatch.setattr("tvsbayes.campaign.read_campaign", broken)
+    with pytest.raises(RuntimeError, match="a bug"):
+        run(["classic", str(PAPER_TWIN)])
+
+
+def test_help_loads_nothing_heavy_and_lists_the_commands():
+    heavy = ("jax", "cv2", "scipy", "numpy", "rich.table", "arviz", "emcee", "matplotlib", "equinox")
+    code = (
+        "import sys; from tvsbayes.cli import run; code = run(['--help']); "
+        f"print([name for name in {heavy!r} if name in sys.modules], code, file=sys.stderr)"
+    )
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert result.stderr.strip() == "[] 0"
+    for command in ("demo", "new", "simulate", "check", "classic", "fit"):
+        assert f"  {command} " in result.stdout

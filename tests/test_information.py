@@ -1,0 +1,149 @@
+"""What a fit says of itself: headlines, contraction, weak directions, leverage, the classic predicted."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tvsbayes.campaign import Campaign
+from tvsbayes.classic import classic
+from tvsbayes.information import CONTRACTION_LIMIT, FitSummary, summarise
+from tvsbayes.joint import fit
+from tvsbayes.parameters import INDEX, NAMES, RECEIVER_NAMES
+from tvsbayes.protocols import four_point_protocol, paper_protocol
+from tvsbayes.simulation import simulate
+
+
+@pytest.fixture(scope="module")
+def paper(mounted_rig) -> Campaign:
+    """The paper's go-and-return protocol with six repeats: one |N|, the first start is the homing itself."""
+    return simulate(mounted_rig, paper_protocol(repeats=6), seed=8).campaign
+
+
+@pytest.fixture(scope="module")
+def fitted(paper):
+    return fit(paper)
+
+
+@pytest.fixture(scope="module")
+def summary(fitted) -> FitSummary:
+    return summarise(fitted)
+
+
+def test_every_parameter_of_the_contract_is_there_and_only_those(summary):
+    expected = set(NAMES) - set(RECEIVER_NAMES)
+    expected |= {f"degrees_per_step.{d}" for d in ("left", "right", "up", "down")} | {"effective_mirror_offset_mm"}
+    assert set(summary.parameters) == expected
+
+
+def test_intervals_hold_their_value_and_match_their_sd(summary):
+    for name, estimate in summary.parameters.items():
+        low, high = estimate.interval95
+        assert low <= estimate.value <= high, name
+        if name.startswith(("extrinsics", "stereo", "degrees_per_step")):
+            # Linear in Gaussian coordinates: 2 x 1.96 sd. Derived ones come from 2048 draws (3 % of an end).
+            assert high - low == pytest.approx(2 * 1.96 * estimate.sd, rel=0.1), name
+
+
+def test_backlash_intervals_stay_positive(summary):
+    assert summary.parameters["backlash_deg.pan"].interval95[0] > 0
+    assert summary.parameters["backlash_deg.tilt"].interval95[0] > 0
+
+
+def test_contraction_tells_data_from_prior(summary):
+    assert all(e.contraction > 0.99 for e in summary.effective.values())
+    # A rotation of the whole beam about the laser's own axis is a gauge: the mirror offset stays the prior's.
+    assert summary.parameters["tilt_axis_offset_mm.x"].contraction < CONTRACTION_LIMIT
+    assert not summary.parameters["tilt_axis_offset_mm.x"].informed
+    assert summary.headline_informed
+
+
+def test_one_step_count_is_named_as_a_weak_direction(summary):
+    texts = [weak.text for weak in summary.weak_directions]
+    pan = next(t for t in texts if t.startswith("pan ratio and pan backlash move together"))
+    assert "only one |N| = 200; add N = 100 or a cleared approach" in pan
+
+
+def test_two_step_counts_and_cleared_approaches_are_not(mounted_rig):
+    approaches = {d: ("reversed", "cleared") for d in ("left", "right", "up", "down")}
+    plan = four_point_protocol(repeats=8, steps=(100, 200), approaches=approaches)
+    texts = [w.text for w in summarise(fit(simulate(mounted_rig, plan, seed=8).campaign)).weak_directions]
+    assert not any("ratio and" in text and "only one" in text for text in texts)
+
+
+def test_the_recorded_approach_of_move_0_is_named_as_leverage(summary):
+    entry = next(e for e in summary.leverage if e.quantity == "effective left")
+    assert entry.move == 0
+    assert "its recorded approach (left, up)" in entry.text
+    assert entry.factor > 2
+
+
+def test_leverage_is_what_a_fit_without_the_stop_finds(paper, summary, fitted):
+    entry = next(e for e in summary.leverage if e.quantity == "effective left")
+    rest = tuple(s for s in paper.spots if s.spot not in entry.spots)
+    without = fit(replace(paper, spots=rest))
+    sd = fitted.draws.effective_deg_per_step[:, 0].std()
+    # Linear prediction against a refit whose noise scales and mode move a little: a third.
+    assert without.draws.effective_deg_per_step[:, 0].std() / sd == pytest.approx(entry.factor, rel=0.35)
+
+
+def test_the_classic_answer_is_predicted(paper, summary):
+    reported = classic(paper).directions
+    for direction, predicted in summary.classic_predicted.items():
+        result = reported[direction]
+        # The classic mean scatters by its type A u about what the model expects.
+        distance = abs(result.mean_deg_per_step - predicted.value)
+        assert distance < 5 * np.hypot(result.u_type_a_deg_per_step, predicted.sd), direction
+
+
+def test_the_prediction_holds_the_classic_bias(paper, summary):
+    predicted, effective = summary.classic_predicted["left"], summary.effective["left"]
+    backlash = summary.parameters["backlash_deg.pan"].value
+    # Left starts are reversals: k N - b, but for the first; the rest of the gap is the tangent of the elevation.
+    assert predicted.value - effective.value == pytest.approx(-backlash / 200, rel=0.5)
+
+
+def test_dof_counts_spots_less_what_they_determine(summary, paper):
+    residuals = 3 * len(paper.spots)
+    assert residuals - 60 < summary.dof < residuals - 10
+    # 1e-4 bounds of chi-square over dof by its normal approximation.
+    assert abs(summary.chi2 / summary.dof - 1) < 4 * np.sqrt(2 / summary.dof)
+
+
+def test_an_axis_that_never_moved_is_null_and_named(paper):
+    tilted = {m.move for m in paper.moves if m.tilt_steps != 0}
+    pan_only = replace(
+        paper,
+        moves=tuple(replace(m, tilt_steps=0) for m in paper.moves),
+        spots=tuple(s for s in paper.spots if s.move not in tilted),
+    )
+    summary = summarise(fit(pan_only))
+    assert summary.effective["up"] is None
+    assert summary.effective["down"] is None
+    assert summary.effective["left"] is not None
+    assert summary.contrasts["tilt"] is None
+    assert any("tilt axis was never moved" in weak.text for weak in summary.weak_directions)
+
+
+def test_aperture_readings_bring_their_parameters(mounted_rig):
+    plan = four_point_protocol(repeats=3, steps=(100, 200))
+    fitted = fit(simulate(mounted_rig, plan, seed=4, aperture=True).campaign)
+    parameters = summarise(fitted).parameters
+    assert set(RECEIVER_NAMES) <= set(parameters)
+    # Readings of 0.02 deg tell C0 (0.2 deg) and zero (0.1 deg) apart better than their priors do together.
+    assert parameters["pan_zero_emission_deg"].contraction > 0.5
+    assert fitted.free[INDEX["pan_zero_emission_deg"]]
+
+
+def test_json_has_the_contract_keys_and_no_nan(summary):
+    document = summary.as_json()
+    text = json.dumps(document, allow_nan=False)
+    assert json.loads(text)["estimator"] == "laplace"
+    keys = {"converged", "effective_deg_per_step", "reference_pose_deg", "parameters", "noise", "weak_directions"}
+    assert keys | {"leverage", "excluded_spots"} <= set(document)
+    entry = {"value", "sd", "interval95", "prior_sd", "contraction", "rhat", "ess_bulk", "ess_tail"}
+    assert set(document["parameters"]["backlash_deg.pan"]) == entry
+    assert document["parameters"]["backlash_deg.pan"]["rhat"] is None

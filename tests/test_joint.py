@@ -1,0 +1,224 @@
+"""The joint estimator: finds the truth, says how sure it is, blames the right spot, compiles once (DESIGN 4.2)."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import replace
+from itertools import pairwise
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from tvsbayes.campaign import Campaign
+from tvsbayes.files import NothingToEstimate, shipped_data
+from tvsbayes.joint import fit, laplace_draws
+from tvsbayes.likelihood import ordered_spots
+from tvsbayes.optics import effective_deg_per_step, effective_mirror_offset_mm
+from tvsbayes.parameters import INDEX, NAMES
+from tvsbayes.protocols import four_point_protocol
+from tvsbayes.rigs import Prior, read_rig
+from tvsbayes.simulation import SimulatedCampaign, simulate
+
+SD = 1.0
+"""One posterior standard deviation."""
+FAR = 5 * SD
+"""A true value lies farther than this from a right estimate in 6 of 10 million cases."""
+SAME = 0.02 * SD
+"""Two fits of the same data: the Newton steps end within 1e-4 sd of the mode, whatever path led there; the mode's
+own uncertainty from the Hessian's finite differences is of the same order."""
+
+
+@pytest.fixture(scope="module")
+def simulated(mounted_rig) -> SimulatedCampaign:
+    """Six repeats of every direction with |N| = 100 and 200: 96 spots."""
+    plan = four_point_protocol(repeats=6, steps=(100, 200))
+    return simulate(mounted_rig, plan, seed=21)
+
+
+@pytest.fixture(scope="module")
+def fitted(simulated):
+    return fit(simulated.campaign)
+
+
+def with_priors(campaign: Campaign, **priors: Prior) -> Campaign:
+    named = {name.replace("__", "."): prior for name, prior in priors.items()}
+    return replace(campaign, rig=replace(campaign.rig, priors={**campaign.rig.priors, **named}))
+
+
+def test_truth_is_found_within_its_uncertainty(simulated, fitted):
+    assert fitted.converged, fitted.problems
+    pose = tuple(np.degrees(fitted.reference_pose_rad))
+    true = simulated.truth.parameters
+    ratios = effective_deg_per_step(true, pose)
+    sd = fitted.draws.effective_deg_per_step.std(axis=0)
+    z = (fitted.mode.effective_deg_per_step - [ratios[d] for d in ("left", "right", "up", "down")]) / sd
+    assert np.all(np.abs(z) < FAR)
+    for name in ("backlash_deg.pan", "backlash_deg.tilt", "mirror_offset_mm", "extrinsics.rotation_rad.z"):
+        index = INDEX[name]
+        error = fitted.mode.physical[index] - true.get(name, np.nan)
+        assert abs(error) < FAR * fitted.draws.physical[:, index].std(), name
+    offset = effective_mirror_offset_mm(true, pose)
+    spread = fitted.draws.effective_mirror_offset_mm.std()
+    assert abs(fitted.mode.effective_mirror_offset_mm - offset) < FAR * spread
+
+
+def test_the_data_shrink_the_ratios_a_hundredfold(fitted):
+    prior = fitted.prior_draws.effective_deg_per_step.std(axis=0)
+    posterior = fitted.draws.effective_deg_per_step.std(axis=0)
+    # The prior says 0.01 deg/step, stereo and focal scale leave 0.3 to 0.5 % of 0.06.
+    assert np.all(posterior < prior / 30)
+
+
+def test_a_far_start_is_annealed_to_the_same_mode(simulated, fitted):
+    # The nominal rig knows its mounting to 0.5 rad and 100 mm; the true one stands 0.32 rad and 100 mm away.
+    wide = {f"extrinsics.rotation_rad.{a}": Prior(0.0, 0.5) for a in "xyz"}
+    wide |= {f"extrinsics.translation_mm.{a}": Prior(0.0, 100.0) for a in "xyz"}
+    campaign = simulated.campaign
+    campaign = replace(campaign, rig=replace(campaign.rig, priors={**campaign.rig.priors, **wide}))
+    far = fit(campaign)
+    assert far.converged, far.problems
+    sd = far.draws.effective_deg_per_step.std(axis=0)
+    # The mounted prior adds information of its own, so the modes differ by less than a standard deviation.
+    difference = far.mode.effective_deg_per_step - fitted.mode.effective_deg_per_step
+    assert np.all(np.abs(difference) < SD * sd)
+    assert far.chi2 == pytest.approx(fitted.chi2, rel=0.05)
+
+
+def test_a_second_campaign_of_another_size_compiles_nothing(simulated, fitted, caplog):
+    campaign = simulated.campaign
+    shorter = replace(campaign, spots=campaign.spots[:-7], moves=campaign.moves)
+    with jax.log_compiles(True), caplog.at_level(logging.WARNING):
+        again = fit(shorter)
+    compiled = [r.getMessage() for r in caplog.records if "Compiling" in r.getMessage()]
+    heavy = [m for m in compiled if any(n in m for n in ("marquardt", "density", "linearise", "derived"))]
+    assert again.converged
+    assert heavy == []
+
+
+def test_the_order_of_rows_does_not_matter(simulated, fitted):
+    shuffled = np.random.default_rng(3).permutation(len(simulated.campaign.spots))
+    campaign = replace(simulated.campaign, spots=tuple(simulated.campaign.spots[i] for i in shuffled))
+    again = fit(campaign)
+    np.testing.assert_array_equal(again.z, fitted.z)
+
+
+def test_an_outlier_is_blamed_on_the_right_spot_of_its_stop(simulated):
+    spots = ordered_spots(simulated.campaign)
+    # The first of two spots taken at one stop, away from the ends of the campaign.
+    first = next(a for a, b in pairwise(spots[20:]) if a.move == b.move)
+    moved = replace(first, u_left_px=first.u_left_px + 4.0, u_right_px=first.u_right_px + 4.0)
+    campaign = simulated.campaign
+    spoiled = tuple(moved if s.spot == first.spot else s for s in campaign.spots)
+    robust = fit(replace(campaign, spots=spoiled), robust=True)
+    assert robust.converged, robust.problems
+    assert robust.excluded_spots == (first.spot,)
+    without = fit(replace(campaign, spots=tuple(s for s in campaign.spots if s.spot != first.spot)))
+    sd = without.draws.effective_deg_per_step.std(axis=0)
+    difference = robust.mode.effective_deg_per_step - without.mode.effective_deg_per_step
+    # Huber weights of the clean spots move an estimate by a fraction of its sd (95 % efficiency).
+    assert np.all(np.abs(difference) < 0.5 * SD * sd)
+
+
+def test_the_plain_fit_names_the_outlier_as_suspect(simulated):
+    campaign = simulated.campaign
+    victim = ordered_spots(campaign)[30]
+    moved = replace(victim, v_left_px=victim.v_left_px + 3.0)
+    spoiled = tuple(moved if s.spot == victim.spot else s for s in campaign.spots)
+    result = fit(replace(campaign, spots=spoiled))
+    assert victim.spot in result.suspect_spots
+    assert result.excluded_spots == ()
+
+
+def test_robust_on_clean_data_excludes_nothing(simulated, fitted):
+    robust = fit(simulated.campaign, robust=True)
+    assert robust.excluded_spots == ()
+    sd = fitted.draws.effective_deg_per_step.std(axis=0)
+    difference = robust.mode.effective_deg_per_step - fitted.mode.effective_deg_per_step
+    assert np.all(np.abs(difference) < 0.5 * SD * sd)
+
+
+def test_the_per_axis_model_has_one_ratio(simulated):
+    result = fit(simulated.campaign, per_axis=True)
+    left, right, up, down = result.draws.effective_deg_per_step.T
+    np.testing.assert_array_equal(left, right)
+    np.testing.assert_array_equal(up, down)
+    for axis in ("pan", "tilt"):
+        assert not result.free[INDEX[f"ratio_contrast_deg_per_step.{axis}"]]
+
+
+def test_a_fixed_parameter_stays_and_the_rest_follows(simulated, fitted):
+    campaign = with_priors(simulated.campaign, mirror_offset_mm=Prior(35.0, 0.0))
+    result = fit(campaign)
+    assert np.all(result.draws.physical[:, INDEX["mirror_offset_mm"]] == 35.0)
+    # The translation along y takes over what the mirror offset may not say.
+    y = INDEX["extrinsics.translation_mm.y"]
+    assert result.draws.physical[:, y].std() < fitted.draws.physical[:, y].std()
+
+
+def test_the_mode_is_a_stationary_maximum(fitted):
+    from tvsbayes.likelihood import density_and_gradient
+
+    with jax.enable_x64(True):
+        value, gradient = density_and_gradient(jnp.asarray(fitted.z), fitted.space, fitted.arrays)
+        root = np.linalg.cholesky(fitted.covariance)
+        # Squared length of the remaining Newton step in sds: the fit stops at 1e-8.
+        assert np.sum((root.T @ np.asarray(gradient))[fitted.free] ** 2) < 1e-6 * SD**2
+        assert float(value) == pytest.approx(fitted.log_density)
+        for column in root.T[fitted.free][::7]:
+            for sign in (-1, 1):
+                nearby, _ = density_and_gradient(
+                    jnp.asarray(fitted.z + sign * 0.5 * column), fitted.space, fitted.arrays
+                )
+                # One half sd away a Gaussian falls by 1/8; half or twice that bounds its non-Gaussian shape.
+                assert 1 / 16 < float(value - nearby) < 1 / 4
+
+
+def test_laplace_draws_have_exactly_their_moments():
+    rng = np.random.default_rng(5)
+    z, factor = rng.standard_normal(len(NAMES)), rng.standard_normal((len(NAMES), len(NAMES)))
+    covariance = factor @ factor.T + np.eye(len(NAMES))
+    draws = laplace_draws(z, covariance, seed=1)
+    rounding = 1e-10 * np.abs(covariance).max()
+    np.testing.assert_allclose(draws.mean(axis=0), z, atol=rounding)
+    np.testing.assert_allclose(np.cov(draws, rowvar=False, ddof=0), covariance, atol=rounding)
+    np.testing.assert_array_equal(draws, laplace_draws(z, covariance, seed=1))
+
+
+def test_pixel_noise_and_stop_errors_are_recovered(simulated, fitted):
+    true = simulated.truth.parameters
+    for name in ("pixel_scale", "stop_sd_deg.left", "stop_sd_deg.right", "stop_sd_deg.up", "stop_sd_deg.down"):
+        index = INDEX[name]
+        spread = np.log(fitted.draws.physical[:, index]).std()
+        assert abs(np.log(fitted.mode.physical[index] / true[name])) < FAR * spread, name
+
+
+def test_too_few_spots_are_refused_by_number(simulated):
+    campaign = replace(simulated.campaign, spots=simulated.campaign.spots[:5])
+    with pytest.raises(NothingToEstimate, match="5 spots have status ok") as caught:
+        fit(campaign)
+    assert caught.value.exit_code == 3
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("protocol", ["paper", "mixed", "grid"])
+def test_coverage_of_forty_rigs(protocol, mounted_rig):
+    """A short form of `experiments/coverage.py`; bounds of the full study stand there."""
+    from scipy import stats
+
+    from tvsbayes.campaign import read_plan
+
+    plan = read_plan(shipped_data() / "rigs" / "mounted" / f"{protocol}.csv")
+    rig = read_rig(shipped_data() / "rigs" / "mounted" / "rig.toml")
+    z = []
+    for seed in range(1000, 1040):
+        simulated = simulate(rig, plan, seed, aperture=protocol == "grid")
+        result = fit(simulated.campaign)
+        assert result.converged
+        true = effective_deg_per_step(simulated.truth.parameters, tuple(np.degrees(result.reference_pose_rad)))
+        sd = result.draws.effective_deg_per_step.std(axis=0)
+        z.append((result.mode.effective_deg_per_step - list(true.values())) / sd)
+    squares = np.sum(np.square(z), axis=0)
+    low, high = stats.chi2.ppf([5e-5, 1 - 5e-5], len(z))
+    assert np.all((squares > low) & (squares < high))

@@ -1,0 +1,252 @@
+"""Gears, play, mirrors: their laws, their derivatives, their behaviour far from any real rig (DESIGN 3.1, 3.2)."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from tvsbayes.positioner import (
+    UNIFORM_SD,
+    MoveArrays,
+    Optics,
+    Transmission,
+    beam,
+    beam_angles,
+    mirror_angles,
+)
+
+pytestmark = pytest.mark.usefixtures("x64")
+
+ANGLE_ROUNDING_RAD = 1e-14
+"""A hundred additions of angles of order one."""
+RELATIVE_DERIVATIVE = 1e-7
+"""The issue's bound on derivatives; differences of fourth order with 1e-3 steps stay below 1e-10."""
+MOVES = 24
+LENGTH = 32
+
+
+def optics_of(values) -> Optics:
+    """Ten numbers -> Optics: L mm, e1, e2, laser tilt (2) rad, laser offset (2) mm, skew rad, axis offset (2) mm."""
+    return Optics(
+        mirror_offset_mm=values[0],
+        mirror1_error_rad=values[1],
+        mirror2_error_rad=values[2],
+        laser_tilt_rad=values[3:5],
+        laser_offset_mm=values[5:7],
+        tilt_axis_skew_rad=values[7],
+        tilt_axis_offset_mm=values[8:10],
+    )
+
+
+OPTICS_SD = np.array([5.0, *np.radians([0.5] * 4), 0.5, 0.5, np.radians(0.5), 0.5, 0.5])
+NOMINAL = np.array([30.0, *[0.0] * 9])
+
+
+def transmission_of(values) -> tuple[Transmission, jax.Array]:
+    """Seven numbers -> Transmission (ratios, contrasts rad/step, backlash rad) and tilt zero, rad."""
+    return Transmission(values[0:2], values[2:4], values[4:6]), values[6]
+
+
+@pytest.fixture(scope="module")
+def chain():
+    """Beam (origin, direction) of a batch of [optics (10), psi, beta] and its Jacobian."""
+
+    def one(values):
+        ray = beam(optics_of(values[:10]), values[10], values[11])
+        return jnp.concatenate([ray.origin_mm, ray.direction])
+
+    both = jax.jit(jax.vmap(lambda v: (one(v), jax.jacfwd(one)(v))))
+    single = jax.jit(jax.vmap(one))
+
+    def run(values, jacobian=False):
+        with jax.enable_x64(True):
+            return jax.tree.map(np.asarray, (both if jacobian else single)(jnp.asarray(values)))
+
+    return run
+
+
+@pytest.fixture(scope="module")
+def gears():
+    """Angles and play sds for (values (7,), steps, first, approach), and the Jacobian of the angles."""
+
+    def one(values, moves):
+        result = mirror_angles(*transmission_of(values), moves)
+        return result.angle_rad, result.play_sd_rad
+
+    jacobian = jax.jacfwd(lambda v, m: one(v, m)[0])
+    compiled = jax.jit(lambda v, m: (*one(v, m), jacobian(v, m)))
+
+    def run(values, steps, first, approach):
+        """Moves are padded to one length by repeating the last row."""
+        steps, first, approach = (np.asarray(x, dtype=t) for x, t in ((steps, float), (first, bool), (approach, float)))
+        pad = LENGTH - len(steps)
+        moves = MoveArrays(
+            jnp.asarray(np.concatenate([steps, np.repeat(steps[-1:], pad, axis=0)])),
+            jnp.asarray(np.concatenate([first, np.zeros(pad, bool)])),
+            jnp.asarray(np.concatenate([approach, np.zeros((pad, 2))])),
+        )
+        with jax.enable_x64(True):
+            return [np.asarray(x) for x in compiled(jnp.asarray(values), moves)]
+
+    return run
+
+
+def random_states(count: int, seed: int) -> np.ndarray:
+    """[optics, psi, beta] within three prior standard deviations, poses within +-40 and +-25 deg."""
+    rng = np.random.default_rng(seed)
+    optics = NOMINAL + OPTICS_SD * np.clip(rng.standard_normal((count, 10)), -3, 3)
+    poses = np.radians(rng.uniform([-40.0, -25.0], [40.0, 25.0], (count, 2)))
+    return np.hstack([optics, poses])
+
+
+def random_moves(rng) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Counters, first rows and approaches of three segments with long, short and one-axis moves."""
+    jumps = rng.choice([-200, -30, -2, 0, 1, 5, 60, 200], (MOVES, 2))
+    first = np.zeros(MOVES, bool)
+    first[[0, 9, 17]] = True
+    approach = np.where(first[:, None], rng.choice([-1, 0, 1], (MOVES, 2)), 0)
+    return np.cumsum(jumps, axis=0), first, approach
+
+
+def random_gears(rng) -> np.ndarray:
+    return np.concatenate(
+        [
+            np.radians(rng.normal([0.06, 0.07], 0.01)),
+            np.radians(rng.normal(0, 1e-3, 2)),
+            np.radians(np.abs(rng.normal(0, 0.5, 2))),
+            np.radians(rng.normal(0, 2, 1)),
+        ]
+    )
+
+
+def fourth_order(function, values: np.ndarray, steps: np.ndarray) -> np.ndarray:
+    """Central differences of fourth order along each of the last axis' entries."""
+    columns = []
+    for k, step in enumerate(steps):
+        nudge = np.zeros(values.shape[-1])
+        nudge[k] = step
+        near, far = (function(values + m * nudge) - function(values - m * nudge) for m in (1, 2))
+        columns.append((8 * near - far) / (12 * step))
+    return np.stack(columns, axis=-1)
+
+
+def test_beam_jacobian_against_differences(chain):
+    states = random_states(50, seed=1)
+    _, jacobian = chain(states, jacobian=True)
+    differences = fourth_order(
+        chain, states, np.array([1.0, 1e-3, 1e-3, 1e-3, 1e-3, 1.0, 1.0, 1e-3, 1.0, 1.0, 1e-3, 1e-3])
+    )
+    # Relative to the size of each column's block: mm for the origin, pure numbers for the direction.
+    for rows in (slice(0, 3), slice(3, 6)):
+        scale = np.abs(jacobian[:, rows]).max(axis=(0, 1))
+        error = np.abs(jacobian[:, rows] - differences[:, rows]).max(axis=(0, 1))
+        assert np.all(error <= RELATIVE_DERIVATIVE * np.maximum(scale, 1e-3 * scale.max()))
+
+
+def test_mirror_angle_jacobian_against_differences(gears):
+    """Angles are piecewise linear in every parameter: differences are exact up to rounding between kinks."""
+    steps = np.array([1e-9] * 4 + [1e-8] * 3)
+    for seed in range(10):
+        rng = np.random.default_rng(seed)
+        values, moves = random_gears(rng), random_moves(rng)
+        jacobian = gears(values, *moves)[2][:MOVES]
+        differences = fourth_order(lambda v, m=moves: gears(v, *m)[0][:MOVES], values, steps)
+        # Angles of order 1 rad: 1e-16 / 1e-9 of rounding against slopes of up to 1000 steps.
+        scale = np.maximum(1.0, np.abs(jacobian).max(axis=(0, 1)))
+        assert np.all(np.abs(jacobian - differences).max(axis=(0, 1)) < RELATIVE_DERIVATIVE * scale)
+
+
+def test_everything_is_finite_far_from_any_rig(chain, gears):
+    """Mirror errors to 30 deg, laser tilts to 30 deg, poses to 60 deg: a solver may stray there."""
+    rng = np.random.default_rng(3)
+    states = random_states(200, seed=4)
+    states[:, 1:5] = np.radians(rng.uniform(-30, 30, (200, 4)))
+    states[:, 10:] = np.radians(rng.uniform(-60, 60, (200, 2)))
+    rays, jacobian = chain(states, jacobian=True)
+    assert np.isfinite(rays).all() and np.isfinite(jacobian).all()
+    np.testing.assert_allclose(np.linalg.norm(rays[:, 3:], axis=1), 1.0, atol=ANGLE_ROUNDING_RAD)
+    for values in (np.zeros(7), 1e3 * random_gears(rng), -random_gears(rng)):
+        assert all(np.isfinite(part).all() for part in gears(values, *random_moves(rng)))
+
+
+@pytest.mark.parametrize(("axis", "sign"), [(0, 1), (0, -1), (1, 1), (1, -1)])
+def test_contrast_is_positive_minus_negative_ratio(gears, axis, sign):
+    """k_left = k + c/2, k_right = k - c/2; up and down likewise; the other axis has no part in it."""
+    values = np.array([1.0e-3, 1.2e-3, 1e-4, 3e-4, 0.0, 0.0, 0.0])
+    steps = np.zeros((2, 2))
+    steps[1, axis] = 100 * sign
+    angle = gears(values, steps, [True, False], [[1, 1], [0, 0]])[0][1]
+    expected = np.zeros(2)
+    expected[axis] = 100 * sign * (values[axis] + sign * values[2 + axis] / 2)
+    np.testing.assert_allclose(angle, expected, atol=ANGLE_ROUNDING_RAD)
+
+
+def test_first_row_of_a_segment_rehomes_with_the_mean_ratio(gears):
+    """Whatever happened before: q = k n, not the history's sum; play as its approach says."""
+    k, c, b = 1e-3, 2e-4, 8e-3
+    values = np.array([k, k, c, c, b, b, 0.0])
+    before = [[0, 0], [300, -300], [100, 50]]
+    steps = [*before, [40, 40], [40, 40]]
+    first = [True, False, False, True, False]
+    approach = [[1, 1], [0, 0], [0, 0], [1, -1], [0, 0]]
+    angle = gears(values, steps, first, approach)[0]
+    np.testing.assert_allclose(angle[3], [40 * k - b / 2, 40 * k + b / 2], atol=ANGLE_ROUNDING_RAD)
+    np.testing.assert_allclose(angle[4], angle[3], atol=ANGLE_ROUNDING_RAD)
+    alone = gears(values, steps[3:], first[3:], approach[3:])[0]
+    np.testing.assert_allclose(angle[3:5], alone[:2], atol=ANGLE_ROUNDING_RAD)
+
+
+@pytest.mark.parametrize(("approach", "side"), [(1, -0.5), (-1, 0.5), (0, 0.0)])
+def test_approach_takes_up_the_play(gears, approach, side):
+    """Left, up: y = q - b/2; right, down: q + b/2; unknown: the middle, with a uniform's deviation."""
+    b = 8e-3
+    values = np.array([1e-3, 1e-3, 0.0, 0.0, b, 2 * b, 0.1])
+    angle, play_sd, _ = gears(values, [[10, 20]], [True], [[approach, approach]])
+    np.testing.assert_allclose(angle[0], [0.01 + side * b, 0.02 + 2 * side * b + 0.1], atol=ANGLE_ROUNDING_RAD)
+    width = np.array([b, 2 * b]) * (approach == 0)
+    np.testing.assert_allclose(play_sd[0], width / np.sqrt(12), atol=ANGLE_ROUNDING_RAD)
+    assert np.isclose(UNIFORM_SD, np.std(np.linspace(0, 1, 100_001)), atol=1e-5)  # of a grid of 1e5 points
+
+
+def test_unknown_play_closes_as_moves_take_it_up(gears):
+    """After a move of w from an unknown start the output lies in a band narrower by w, until it closes."""
+    b, k = 8e-3, 1e-3
+    values = np.array([k, k, 0.0, 0.0, b, b, 0.0])
+    steps = [[0, 0], [3, 0], [1, 0], [1, 10]]
+    angle, play_sd, _ = gears(values, steps, [True, False, False, False], [[0, 0]] * 4)
+    # q = 3 k pushes outputs below q - b/2 up: the band is [3k - b/2, b/2]; q = k does not touch it.
+    for row in (1, 2):
+        np.testing.assert_allclose(angle[row, 0], 1.5 * k, atol=ANGLE_ROUNDING_RAD)
+        np.testing.assert_allclose(play_sd[row, 0], UNIFORM_SD * (b - 3 * k), atol=ANGLE_ROUNDING_RAD)
+    # 10 steps up exceed the play of 8 steps: the tilt is known from then on, the pan as before.
+    np.testing.assert_allclose(angle[3], [1.5 * k, 10 * k - b / 2], atol=ANGLE_ROUNDING_RAD)
+    np.testing.assert_allclose(play_sd[3], [UNIFORM_SD * (b - 3 * k), 0.0], atol=ANGLE_ROUNDING_RAD)
+
+
+def test_padding_keeps_the_last_angles(gears):
+    rng = np.random.default_rng(8)
+    angle, play_sd, _ = gears(random_gears(rng), *random_moves(rng))
+    assert np.all(angle[MOVES:] == angle[MOVES - 1]) and np.all(play_sd[MOVES:] == play_sd[MOVES - 1])
+
+
+def test_nominal_chain_leaves_at_minus_l_and_turns_with_the_stages(chain):
+    """No errors: origin (0, -L, 0) turned by psi, azimuth psi, elevation beta."""
+    psi, beta = np.radians([[0.0, 12.0, -33.0], [0.0, 7.0, -15.0]])
+    states = np.hstack([np.tile(NOMINAL, (3, 1)), psi[:, None], beta[:, None]])
+    rays = chain(states)
+    origin = 30.0 * np.column_stack([np.sin(psi), -np.cos(psi), np.zeros(3)])
+    direction = np.column_stack([np.cos(beta) * np.cos(psi), np.cos(beta) * np.sin(psi), np.sin(beta)])
+    np.testing.assert_allclose(rays[:, :3], origin, atol=30 * ANGLE_ROUNDING_RAD)
+    np.testing.assert_allclose(rays[:, 3:], direction, atol=ANGLE_ROUNDING_RAD)
+
+
+def test_beam_angles_of_the_nominal_chain():
+    """Unit Jacobian, azimuth psi, elevation beta, effective mirror offset +L at every pose."""
+    compute = jax.jit(jax.vmap(lambda v: beam_angles(optics_of(v[:10]), v[10], v[11])))
+    poses = np.radians([[0.0, 0.0], [25.0, 10.0], [-40.0, -20.0]])
+    angles = compute(jnp.asarray(np.hstack([np.tile(NOMINAL, (3, 1)), poses])))
+    np.testing.assert_allclose(angles.effective_mirror_offset_mm, 30.0, atol=30 * ANGLE_ROUNDING_RAD)
+    np.testing.assert_allclose(np.stack([angles.azimuth_rad, angles.elevation_rad], 1), poses, atol=ANGLE_ROUNDING_RAD)
+    np.testing.assert_allclose(angles.jacobian, np.broadcast_to(np.eye(2), (3, 2, 2)), atol=ANGLE_ROUNDING_RAD)

@@ -1,0 +1,133 @@
+"""The digital twin (NumPy, own formulas) and the estimators' model (JAX) are the same physics.
+
+A hundred true rigs drawn from the shipped mounted rig, every prior quantity anew.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from tvsbayes import optics
+from tvsbayes.cameras import project
+from tvsbayes.likelihood import aperture_angle
+from tvsbayes.parameters import RIG_NAMES, model_of
+from tvsbayes.positioner import MoveArrays, beam, beam_angles, mirror_angles
+from tvsbayes.simulation import draw_truth
+
+pytestmark = pytest.mark.usefixtures("x64")
+
+RIGS, POSES, MOVES = 100, 8, 40
+LENGTH_MM = 1e-9
+"""The issue's bound: 1e-12 of a metre, a thousand times rounding."""
+PIXEL_PX = 1e-9
+ANGLE_RAD = LENGTH_MM / 1000.0
+"""What moves a spot at 1 m by that length."""
+
+
+@pytest.fixture(scope="module")
+def truths(mounted_rig):
+    rng = np.random.default_rng(77)
+    return [draw_truth(mounted_rig, rng) for _ in range(RIGS)]
+
+
+@pytest.fixture(scope="module")
+def values(truths) -> np.ndarray:
+    """(rigs, 57) in the units of NAMES."""
+    return np.array([[*(t.parameters[n] for n in RIG_NAMES), *t.stereo.vector] for t in truths])
+
+
+@pytest.fixture(scope="module")
+def poses_rad() -> np.ndarray:
+    """(rigs, poses, 2): pan and tilt over the whole field."""
+    return np.radians(np.random.default_rng(78).uniform([-40.0, -25.0], [40.0, 25.0], (RIGS, POSES, 2)))
+
+
+def batched(function, *arrays):
+    """Compile and map over the rigs, in float64."""
+    with jax.enable_x64(True):
+        return jax.tree.map(np.asarray, jax.jit(jax.vmap(function))(*map(jnp.asarray, arrays)))
+
+
+def test_mirror_chain(truths, values, poses_rad):
+    rays = batched(lambda v, p: beam(model_of(v).optics, p[:, 0], p[:, 1]), values, poses_rad)
+    for rig, truth in enumerate(truths):
+        origin, direction = optics.mirror_chain(*poses_rad[rig].T, truth.parameters)
+        assert np.abs(rays.origin_mm[rig].T - origin).max() < LENGTH_MM
+        assert np.abs(rays.direction[rig].T - direction).max() < ANGLE_RAD
+
+
+def test_cameras(truths, values):
+    """Random points of the sheets' volume; the twin sees all of them that stand in both images."""
+    points = np.random.default_rng(79).uniform([160.0, -60.0, -50.0], [400.0, 40.0, 50.0], (RIGS, 20, 3))
+    pixels = batched(lambda v, p: project(model_of(v).cameras, p.T).T, values, points)
+    seen = 0
+    for rig, truth in enumerate(truths):
+        expected = optics.project(points[rig], truth.stereo, truth.parameters["focal_scale"])
+        in_view = np.isfinite(expected).all(axis=1)
+        assert np.abs(pixels[rig] - expected)[in_view].max() < PIXEL_PX
+        seen += in_view.sum()
+    assert seen > 0.9 * RIGS * 20
+
+
+def test_gears_and_play(truths, values):
+    """Random moves in two segments, known approaches; the twin's home offset is the filter's, not the model's."""
+    rng = np.random.default_rng(80)
+    jumps = rng.choice([-200, -60, -3, -1, 0, 1, 2, 7, 100, 200], (RIGS, MOVES, 2))
+    counters = np.cumsum(jumps, axis=1).astype(float)
+    first = np.zeros((RIGS, MOVES), bool)
+    first[:, [0, MOVES // 2]] = True
+    approach = np.where(first[..., None], rng.choice([-1.0, 1.0], (RIGS, MOVES, 2)), 0.0)
+
+    def angles(v, steps, first, approach):
+        model = model_of(v)
+        return mirror_angles(model.transmission, model.tilt_zero_rad, MoveArrays(steps, first, approach))
+
+    found = batched(angles, values, counters, first, approach)
+    assert np.all(found.play_sd_rad == 0)
+    for rig, truth in enumerate(truths):
+        p = truth.parameters
+        for axis, name in enumerate(("pan", "tilt")):
+            ratios = p[f"degrees_per_step.{name}"], p[f"ratio_contrast_deg_per_step.{name}"]
+            start = -0.5 * approach[rig, :, axis]
+            args = counters[rig, :, axis], first[rig], start, np.zeros(MOVES), ratios, p[f"backlash_deg.{name}"]
+            expected = np.radians(optics.transmission(*args) + (p["tilt_zero_deg"] if axis else 0.0))
+            assert np.abs(found.angle_rad[rig, :, axis] - expected).max() < ANGLE_RAD
+
+
+@pytest.mark.parametrize("convention", ["in-plane", "azimuth"])
+def test_aperture_angle(truths, values, convention):
+    points = np.random.default_rng(81).uniform([150.0, -250.0, -80.0], [1000.0, 100.0, 80.0], (RIGS, 20, 3))
+
+    def angle(v, p):
+        return aperture_angle(model_of(v).receiver, p.T, jnp.asarray(convention == "azimuth"))
+
+    found = batched(angle, values, points)
+    for rig, truth in enumerate(truths):
+        baseline_mm = truth.parameters["baseline_mm"]
+        in_t = optics.to_tvs(points[rig], baseline_mm, truth.parameters["pan_zero_emission_deg"])
+        expected = np.radians(optics.aperture_angle_deg(in_t, baseline_mm, convention))
+        assert np.abs(found[rig] - expected).max() < ANGLE_RAD
+
+
+def test_headlines(truths, values, poses_rad):
+    """Effective degrees per step and effective mirror offset at a pose per rig."""
+
+    def headlines(v, pose):
+        model = model_of(v)
+        angles = beam_angles(model.optics, pose[0], pose[1])
+        both = jnp.stack([model.transmission.directional_ratio(jnp.full(2, sign)) for sign in (True, False)])
+        ratios = jnp.rad2deg((both * jnp.diagonal(angles.jacobian)).T.ravel())
+        return ratios, angles.effective_mirror_offset_mm, angles.jacobian
+
+    ratios, offset_mm, jacobian = batched(headlines, values, poses_rad[:, 0])
+    for rig, truth in enumerate(truths):
+        pose_deg = tuple(np.degrees(poses_rad[rig, 0]))
+        expected = optics.effective_deg_per_step(truth.parameters, pose_deg)
+        # The twin differences its own chain: 1e-9 of a slope, hence of 0.07 deg per step.
+        assert np.abs(ratios[rig] - list(expected.values())).max() < 1e-9 * 0.1
+        assert np.abs(jacobian[rig] - optics.beam_jacobian(truth.parameters, pose_deg)).max() < 1e-9
+        assert list(expected) == ["left", "right", "up", "down"]
+        assert abs(offset_mm[rig] - optics.effective_mirror_offset_mm(truth.parameters, pose_deg)) < LENGTH_MM

@@ -1,0 +1,25 @@
+"""tvsbayes: what one motor step of a geared laser positioner does to the beam, and how sure that is."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from tvsbayes.campaign import read_campaign as read_campaign
+
+if TYPE_CHECKING:
+    from tvsbayes.joint import fit as fit
+
+__all__ = ["fit", "read_campaign"]
+
+
+def __getattr__(name: str) -> object:
+    """Load what is asked for when it is first asked for: the estimator brings JAX."""
+    if name == "fit":
+        from tvsbayes.joint import fit
+
+        return fit
+    if name == "__version__":
+        from importlib.metadata import version
+
+        return version("tvsbayes")
+    raise AttributeError(f"module 'tvsbayes' has no attribute {name!r}")

@@ -1,0 +1,453 @@
+"""Strict files at the border: teaching errors, capped bytes and text, CSV tables, atomic writes, shipped data.
+
+Everything a stranger's folder can contain enters the package here. A reader either returns checked
+values or raises `InputError` with file, line, column, what was found, what is allowed and what to do;
+sizes are capped before anything is parsed. CSV tables are read here, TOML and JSON
+in `tvsbayes.documents`. Numbers obey an own ASCII pattern: `float` alone would take "9_4.7", "infinity" and Arabic
+digits.
+
+No JAX, no knowledge of what a campaign is. Lines count from 1.
+"""
+
+from __future__ import annotations
+
+import csv
+import difflib
+import io
+import math
+import os
+import re
+import secrets
+import stat
+from collections.abc import Iterable, Iterator, Sequence
+from functools import partial
+from importlib import resources
+from pathlib import Path
+
+
+class TvsError(Exception):
+    """An error that a user can act on; the command line turns it into an exit code.
+
+    Attributes:
+        code: short stable identifier, e.g. "number", "unknown-key".
+        exit_code: what the process returns (DESIGN section 8).
+        file: name of the file as the user knows it, or None.
+        line: line number, 1-based, or None.
+        column: name of the column or dotted key, or None.
+        found: what stood there, shortened, control characters escaped.
+        allowed: what may stand there.
+        remedy: what the user can do now.
+    """
+
+    exit_code = 1
+
+    def __init__(
+        self,
+        code: str,
+        message: str,
+        *,
+        file: str | None = None,
+        line: int | None = None,
+        column: str | None = None,
+        found: str | None = None,
+        allowed: str | None = None,
+        remedy: str | None = None,
+    ):
+        super().__init__(message)
+        self.code = code
+        self.message = message
+        self.file = file
+        self.line = line
+        self.column = column
+        self.found = found
+        self.allowed = allowed
+        self.remedy = remedy
+
+
+class InputError(TvsError):
+    """A file, option or value that cannot be used as it is (exit 2)."""
+
+    exit_code = 2
+
+
+class NothingToEstimate(TvsError):
+    """The data are readable but hold nothing to estimate from (exit 3)."""
+
+    exit_code = 3
+
+
+class NotConverged(TvsError):
+    """An estimator did not reach its convergence criterion (exit 4)."""
+
+    exit_code = 4
+
+
+INTEGER = re.compile(r"[+-]?[0-9]{1,18}")
+_CONTROL = re.compile(r"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f]")
+
+
+def escaped(text: str, limit: int = 60) -> str:
+    """Text from a file made fit to print: what is not printable is escaped, what is long is cut."""
+    cut = text if len(text) <= limit else text[:limit] + "..."
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in cut)
+
+
+def shown(value: object) -> str:
+    """A value as an error message quotes it."""
+    if isinstance(value, str):
+        return f'"{escaped(value)}"'
+    if isinstance(value, dict):
+        return "a table with " + (escaped(", ".join(map(str, value))) or "no keys")
+    if isinstance(value, list):
+        return f"a list of {len(value)}"
+    if isinstance(value, bool):
+        return str(value).lower()
+    # An integer beyond Python's limit of digits cannot be printed at all.
+    huge = isinstance(value, int) and abs(value) >= 10**60
+    return "an integer of more than 60 digits" if huge else escaped(str(value))
+
+
+def refusal(
+    code: str,
+    *,
+    file: str,
+    found: str,
+    allowed: str,
+    remedy: str,
+    line: int | None = None,
+    column: str | None = None,
+) -> InputError:
+    """Builds the `InputError` whose message says where, what was found, what is allowed and what to do."""
+    where = file + (f" line {line}" if line else "") + (f", {escaped(column)}" if column else "")
+    message = f"{where}: found {found}; allowed: {allowed}; {remedy}"
+    where_parts = {"file": file, "line": line, "column": column}
+    return InputError(code, message, **where_parts, found=found, allowed=allowed, remedy=remedy)
+
+
+def closest(name: str, names: Iterable[str]) -> str:
+    """The remedy for an unknown name: the nearest allowed one, where any is near."""
+    near = difflib.get_close_matches(name[:100], list(names), n=1, cutoff=0.5)
+    return f"did you mean {near[0]}?" if near else "remove it, or correct the spelling"
+
+
+def read_bytes(path: Path, cap: int, folder: Path | None = None) -> bytes:
+    """Reads a regular file of at most `cap` bytes.
+
+    Args:
+        path: the file.
+        cap: largest size, bytes; checked before reading.
+        folder: where given, the file must lie inside it after following links.
+
+    Raises:
+        InputError: missing, unreadable, not a regular file, outside `folder` or too large.
+    """
+    path = Path(path)
+    file = escaped(path.name) or escaped(str(path))
+
+    def bad(code: str, found: str, remedy: str) -> InputError:
+        allowed = f"a readable file of at most {cap} bytes"
+        return refusal(code, file=file, found=found, allowed=allowed, remedy=remedy)
+
+    try:
+        real = path.resolve(strict=True)
+        if folder is not None and not real.is_relative_to(Path(folder).resolve()):
+            raise bad("path", "a link that leaves the folder", "put the file itself into the folder")
+        # Without O_NONBLOCK the opening of a pipe would wait for a writer for ever.
+        flags = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_NOFOLLOW", 0)
+        descriptor = os.open(real, flags | getattr(os, "O_BINARY", 0))
+        try:
+            status = os.fstat(descriptor)
+            if not stat.S_ISREG(status.st_mode):
+                raise bad("not-a-file", "a folder, pipe or device", "name a regular file")
+            if status.st_size > cap:
+                raise bad("size", f"{status.st_size} bytes", "split the data or remove what is not needed")
+            with open(descriptor, "rb", closefd=False) as stream:
+                data = stream.read(cap + 1)
+        finally:
+            os.close(descriptor)
+    except FileNotFoundError as error:
+        remedy = f"create it, or correct {escaped(str(path), 200)}"
+        raise bad("missing-file", "no such file", remedy) from error
+    except (OSError, ValueError) as error:
+        reason = escaped(getattr(error, "strerror", None) or str(error))
+        raise bad("unreadable", reason, "check the path and its permissions") from error
+    if len(data) > cap:
+        raise bad("size", f"more than {cap} bytes", "split the data or remove what is not needed")
+    return data
+
+
+def decode(data: bytes, file: str) -> str:
+    """UTF-8 text with or without BOM; refuses other encodings, NUL and other control characters."""
+    bad = partial(refusal, file=file)
+    utf16 = data.startswith((b"\xff\xfe", b"\xfe\xff"))
+    try:
+        text = data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        line = None if utf16 else data.count(b"\n", 0, error.start) + 1
+        found = "UTF-16" if utf16 else f"the byte 0x{data[error.start]:02x}"
+        allowed, remedy = "UTF-8 text", "save it as UTF-8"
+        raise bad("encoding", line=line, found=found, allowed=allowed, remedy=remedy) from error
+    if control := _CONTROL.search(text):
+        line, found = text.count("\n", 0, control.start()) + 1, shown(control.group())
+        raise bad("control-character", line=line, found=found, allowed="printable text", remedy="remove it")
+    return text
+
+
+def write_atomically(path: Path, data: bytes) -> None:
+    """Replaces `path` by `data` so that a reader, or a crash, sees the old file or the new, never a part.
+
+    Raises:
+        InputError: the folder is missing, full or not writable; the old file is untouched.
+    """
+    path = Path(path)
+    temporary = path.with_name(f".{path.name}.{secrets.token_hex(6)}.tmp")
+    try:
+        try:
+            with open(temporary, "xb") as stream:
+                stream.write(data)
+                stream.flush()
+                os.fsync(stream.fileno())
+            os.replace(temporary, path)
+        except BaseException:
+            temporary.unlink(missing_ok=True)
+            raise
+        if os.name == "posix":
+            # The new name itself is durable only once its folder is.
+            folder = os.open(path.parent, os.O_RDONLY)
+            try:
+                os.fsync(folder)
+            finally:
+                os.close(folder)
+    except OSError as error:
+        found, allowed = escaped(error.strerror or str(error)), "a writable folder with free space"
+        remedy, file = "name another place or free this one", escaped(str(path), 200)
+        raise refusal("write", file=file, found=found, allowed=allowed, remedy=remedy) from error
+
+
+def make_folder(folder: Path, *, empty: bool = False) -> None:
+    """Create a folder and those above it.
+
+    Args:
+        folder: where to.
+        empty: refuse a folder that holds anything: nothing is overwritten.
+
+    Raises:
+        InputError: it cannot be created, or holds something.
+    """
+    place = escaped(str(folder), 200)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        occupied = empty and any(folder.iterdir())
+    except OSError as error:
+        found, allowed = escaped(error.strerror or str(error)), "a new or empty folder"
+        raise refusal("write", file=place, found=found, allowed=allowed, remedy="name another") from error
+    if occupied:
+        allowed, remedy = "a new or empty folder", "name another folder; nothing is overwritten"
+        raise refusal("occupied", file=place, found="a folder with files", allowed=allowed, remedy=remedy)
+
+
+def shipped_data() -> Path:
+    """The folder of twins, rigs, templates and reference values that travels with the package.
+
+    In a wheel it lies inside the package; in a checkout (also an editable install) beside it.
+    """
+    inside = Path(str(resources.files("tvsbayes") / "data"))
+    return inside if inside.is_dir() else Path(__file__).resolve().parents[1] / "data"
+
+
+CSV_BYTES_MAX = 128 * 1024 * 1024
+CSV_ROWS_MAX = 500_000
+CSV_LINE_CHARS_MAX = 16_384
+
+NUMBER = re.compile(r"[+-]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][+-]?[0-9]+)?")
+
+
+def number_remedy(cell: str) -> str:
+    """What to do about a cell that is no plain number."""
+    if cell.startswith(("=", "@")):
+        return "save the value, not the formula"
+    if cell.strip().lower().lstrip("+-") in ("nan", "inf", "infinity"):
+        return "give the value, or leave the cell empty with the reason of refusal in status"
+    if "," in cell:
+        return "write a decimal point, not a comma"
+    if "_" in cell or any(c.isspace() for c in cell):
+        return "write the digits without underscores or spaces"
+    if not cell.isascii():
+        return "write it in the digits 0 to 9"
+    return "write a decimal number such as 9.47"
+
+
+def _plain(cells: Sequence[str], kind: type[float] | type[int], low: float, high: float) -> list | None:
+    """The numbers of a column without a single odd cell, fast; else None, and each cell is looked at."""
+    # Of what these characters can spell, float() and int() take exactly NUMBER and INTEGER.
+    if not cells or not set().union(*cells) <= set("0123456789+-" if kind is int else "0123456789+-.eE"):
+        return None
+    try:
+        values = list(map(kind, cells))
+    except ValueError:
+        return None
+    return values if low <= min(values) and max(values) <= high else None
+
+
+class Table:
+    """A checked CSV table: cells by column name, each with its line for the errors.
+
+    Attributes:
+        file: name of the file.
+        lines: line number of every row.
+        columns: cells of every column present, as text.
+    """
+
+    def __init__(self, file: str, lines: list[int], columns: dict[str, Sequence[str]]):
+        self.file, self.lines, self.columns = file, lines, columns
+
+    def __len__(self) -> int:
+        return len(self.lines)
+
+    def refuse(
+        self, row: int, column: str, code: str, allowed: str, remedy: str, found: str | None = None
+    ) -> InputError:
+        """The error of one cell; `found` defaults to what stands in it."""
+        if found is None:
+            found = shown(self.columns[column][row]) if self.columns[column][row] else "an empty cell"
+        place = {"file": self.file, "line": self.lines[row], "column": column}
+        return refusal(code, **place, found=found, allowed=allowed, remedy=remedy)
+
+    def numbers(self, column: str, low: float, high: float, empty: bool = False) -> list[float | None]:
+        """Finite numbers in [low, high]; None for an empty cell where `empty` allows it."""
+        if (plain := _plain(self.columns[column], float, low, high)) is not None:
+            return plain
+        values: list[float | None] = []
+        match, isfinite = NUMBER.fullmatch, math.isfinite
+        for row, cell in enumerate(self.columns[column]):
+            if not cell and empty:
+                values.append(None)
+                continue
+            value = float(cell) if match(cell) else math.nan
+            if not (isfinite(value) and low <= value <= high):
+                allowed = f"a finite decimal number from {low:g} to {high:g}{', or an empty cell' * empty}"
+                remedy = "mind the unit of the column" if isfinite(value) else number_remedy(cell)
+                raise self.refuse(row, column, "number", allowed, remedy)
+            values.append(value)
+        return values
+
+    def integers(self, column: str, low: int, high: int, empty: bool = False) -> list[int | None]:
+        """Whole numbers in [low, high]; None for an empty cell where `empty` allows it."""
+        if (plain := _plain(self.columns[column], int, low, high)) is not None:
+            return plain
+        values: list[int | None] = []
+        for row, cell in enumerate(self.columns[column]):
+            if not cell and empty:
+                values.append(None)
+                continue
+            value = int(cell) if INTEGER.fullmatch(cell) else None
+            if value is None or not low <= value <= high:
+                allowed = f"a whole number from {low} to {high}{', or an empty cell' * empty}"
+                remedy = "write a whole number, no point" if NUMBER.fullmatch(cell) else number_remedy(cell)
+                raise self.refuse(row, column, "integer", allowed, remedy)
+            values.append(value)
+        return values
+
+    def texts(self, column: str, chars_max: int = 100, empty: bool = True) -> list[str]:
+        """Printable text that a spreadsheet does not take for a formula."""
+        allowed = f"printable text of at most {chars_max} characters that does not begin with = + - @"
+        for row, cell in enumerate(self.columns[column]):
+            if len(cell) > chars_max or not cell.isprintable() or cell.startswith(("=", "+", "-", "@")):
+                raise self.refuse(row, column, "text", allowed, "shorten or reword it")
+            if not cell and not empty:
+                raise self.refuse(row, column, "missing", allowed, "fill the cell in")
+        return list(self.columns[column])
+
+    def check_counting(self, column: str, values: Sequence[int | None]) -> None:
+        """Refuses a column that does not count 0, 1, 2 ..."""
+        for row, value in enumerate(values):
+            if value != row:
+                raise self.refuse(row, column, "order", f"{row}", "number the rows 0, 1, 2 ... in time order")
+
+    def check_unique(self, column: str, values: Sequence[object], what: str) -> None:
+        """Refuses a value that stands twice; None does not count."""
+        seen: dict[object, int] = {}
+        for row, value in enumerate(values):
+            if value is not None and seen.setdefault(value, row) != row:
+                found = f"{shown(self.columns[column][row])} again (first on line {self.lines[seen[value]]})"
+                raise self.refuse(row, column, "duplicate", what, "renumber one of them", found)
+
+
+def _csv_rows(text: str, file: str) -> Iterator[tuple[int, list[str]]]:
+    """Rows of a CSV text with the line on which each begins."""
+    bad = partial(refusal, file=file)
+
+    def capped_lines() -> Iterator[str]:
+        for number, line in enumerate(io.StringIO(text, newline=""), start=1):
+            if len(line) > CSV_LINE_CHARS_MAX:
+                found, allowed = f"{len(line)} characters in one line", f"at most {CSV_LINE_CHARS_MAX}"
+                raise bad("size", line=number, found=found, allowed=allowed, remedy="one row per line")
+            yield line
+
+    reader = csv.reader(capped_lines(), strict=True)
+    start = 1
+    try:
+        for row in reader:
+            if reader.line_num > start:
+                raise csv.Error("a line break inside a cell")
+            yield start, row
+            start = reader.line_num + 1
+    except csv.Error as error:
+        allowed, remedy = "comma-separated cells, one row per line", 'close every quote " in its own line'
+        found = escaped(str(error), 120)
+        raise bad("csv", line=start, found=found, allowed=allowed, remedy=remedy) from error
+
+
+def parse_table(data: bytes, file: str, columns: Sequence[str], optional: Sequence[str] = ()) -> Table:
+    """A CSV table with exactly `columns` and any of `optional`, found by name in any order.
+
+    Raises:
+        InputError: not UTF-8, control characters, no or a wrong header, rows of another length than it.
+    """
+    bad = partial(refusal, file=file)
+    rows = _csv_rows(decode(data, file), file)
+    _, header = next(rows, (1, []))
+    allowed = "the columns " + ",".join(columns) + (f" and optionally {','.join(optional)}" * bool(optional))
+    bad_header = partial(bad, line=1, allowed=allowed)
+    if not header:
+        raise bad_header("empty", found="no header", remedy="write the column names into the first line")
+    if len(header) == 1 and re.search(r"[;\t]", header[0]):
+        raise bad_header("csv", found=shown(header[0]), remedy="use commas between cells, decimal points")
+    known = (*columns, *optional)
+    for name in header:
+        if name not in known:
+            found, remedy = f"an unknown column {shown(name)}", closest(name, known)
+            raise bad_header("unknown-column", column=name, found=found, remedy=remedy)
+        if header.count(name) > 1:
+            raise bad_header("duplicate-column", column=name, found="the column twice", remedy="remove one")
+    for name in columns:
+        if name not in header:
+            raise bad_header("missing-column", column=name, found="no such column", remedy=f"add {name}")
+
+    lines: list[int] = []
+    cells: list[list[str]] = []
+    blank = None
+    for line, row in rows:
+        if not row:
+            blank = blank or line
+            continue
+        if blank is not None or len(row) != len(header):
+            found, cells_allowed = "an empty line" if blank else f"{len(row)} cells", f"{len(header)} cells"
+            remedy = "one cell per column; a decimal comma splits a number in two: write a point"
+            raise bad("row-length", line=blank or line, found=found, allowed=cells_allowed, remedy=remedy)
+        if len(lines) >= CSV_ROWS_MAX:
+            found, rows_allowed = "a row more", f"at most {CSV_ROWS_MAX} rows"
+            raise bad("size", line=line, found=found, allowed=rows_allowed, remedy="split the campaign")
+        lines.append(line)
+        cells.append(row)
+    by_column = list(zip(*cells, strict=True)) or [()] * len(header)
+    return Table(file, lines, dict(zip(header, by_column, strict=True)))
+
+
+def csv_bytes(columns: Sequence[str], rows: Iterable[Sequence[object]]) -> bytes:
+    """A CSV file: None is an empty cell, floats keep every digit."""
+    stream = io.StringIO(newline="")
+    writer = csv.writer(stream, lineterminator="\n")
+    writer.writerow(columns)
+    writer.writerows(rows)
+    return stream.getvalue().encode()

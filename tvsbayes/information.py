@@ -1,0 +1,360 @@
+"""What a fit knows: headlines, contraction, weak directions in words, leverage of stops, the classic predicted.
+
+Works on a finished `JointFit`; computes no new fit and needs no JAX of its own. Units are those of DESIGN 8.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from tvsbayes.classic import DIRECTIONS, four_point_ratios, select_experiments
+from tvsbayes.joint import NORMAL_95, JointFit
+from tvsbayes.parameters import INDEX, NAMES, RECEIVER_NAMES, RIG_NAMES
+from tvsbayes.protocols import observed_stops, separation
+from tvsbayes.stops import standard_deviations_without
+
+CONTRACTION_LIMIT = 0.1
+"""Below it a value is called set by the prior (DESIGN 8)."""
+LEVERAGE_LIMIT = 2.0
+"""A stop is named if a headline's sd would grow by more than this factor without it (DESIGN 4.2)."""
+EXCHANGE_LIMIT = 0.5
+"""Correlation of ratio and backlash above which a quarter of the ratio's variance is exchange with the backlash."""
+LOADING_LIMIT = 0.3
+WEAK_VARIANCE = 0.5
+"""A direction of parameter space is weak if more than this share of its prior variance is left."""
+LISTED = 8
+CLASSIC_DRAWS = 256
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """One estimated quantity; `contraction` = 1 - var_post / var_prior, None where nothing is estimated."""
+
+    value: float
+    sd: float
+    interval95: tuple[float, float]
+    prior_sd: float | None
+    contraction: float | None
+
+    def as_json(self) -> dict[str, object]:
+        """With the diagnostics of a sampler as null (DESIGN 8)."""
+        return {
+            **asdict(self),
+            "interval95": list(self.interval95),
+            "rhat": None,
+            "ess_bulk": None,
+            "ess_tail": None,
+        }
+
+    @property
+    def informed(self) -> bool:
+        """Whether the data, not the prior, set the value."""
+        return self.contraction is not None and self.contraction >= CONTRACTION_LIMIT
+
+
+@dataclass(frozen=True)
+class WeakDirection:
+    """A mixture of parameters that the data leave to the prior; loadings are in prior sds."""
+
+    text: str
+    loadings: dict[str, float]
+
+
+@dataclass(frozen=True)
+class Leverage:
+    """A stop without which the sd of `quantity` would grow by `factor` (None: beyond all bounds)."""
+
+    move: int
+    spots: tuple[int, ...]
+    quantity: str
+    factor: float | None
+    text: str
+
+
+@dataclass(frozen=True)
+class FitSummary:
+    """A joint fit in the contract's terms (DESIGN 8).
+
+    Attributes:
+        converged: whether the mode was reached.
+        problems: sentences on what failed.
+        effective: left, right, up, down in deg/step; None for a direction that was never moved.
+        contrasts: effective left - right and up - down, deg/step.
+        reference_pose_deg: pan and tilt at which the effective ratios hold.
+        jacobian: d(azimuth, elevation)/d(pan, tilt) there.
+        parameters: every estimated or derived parameter by its name.
+        chi2: squared standardised innovations; dof: their number less the parameters they determine.
+        weak_directions: what the campaign cannot separate, in words.
+        leverage: stops on which a headline hangs.
+        classic_predicted: what the classic estimator should report if the model is right, per direction.
+        excluded_spots: left out by the robust option.
+        suspect_spots: used, but in disagreement with all others.
+    """
+
+    converged: bool
+    problems: tuple[str, ...]
+    effective: dict[str, Estimate | None]
+    contrasts: dict[str, Estimate | None]
+    reference_pose_deg: dict[str, float]
+    jacobian: tuple[tuple[float, float], tuple[float, float]]
+    parameters: dict[str, Estimate]
+    chi2: float
+    dof: float
+    weak_directions: tuple[WeakDirection, ...]
+    leverage: tuple[Leverage, ...]
+    classic_predicted: dict[str, Estimate | None]
+    excluded_spots: tuple[int, ...]
+    suspect_spots: tuple[int, ...]
+
+    @property
+    def headline_informed(self) -> bool:
+        """Whether the data informed any effective ratio."""
+        return any(e is not None and e.informed for e in self.effective.values())
+
+    def as_json(self) -> dict[str, object]:
+        """The contract's keys, without those that the caller adds (`files`)."""
+
+        def of(estimates):
+            return {name: None if e is None else e.as_json() for name, e in estimates.items()}
+
+        parameters = of(self.parameters)
+        return {
+            "estimator": "laplace",
+            "converged": self.converged,
+            "problems": list(self.problems),
+            "effective_deg_per_step": of(self.effective),
+            "effective_contrast_deg_per_step": of(self.contrasts),
+            "reference_pose_deg": self.reference_pose_deg,
+            "effective_jacobian": [list(row) for row in self.jacobian],
+            "parameters": parameters,
+            "noise": {
+                "chi2": self.chi2,
+                "dof": self.dof,
+                "pixel_scale": self.parameters["pixel_scale"].value,
+                "stop_sd_deg": {d: self.parameters[f"stop_sd_deg.{d}"].value for d in DIRECTIONS},
+            },
+            "weak_directions": [asdict(w) for w in self.weak_directions],
+            "leverage": [{**asdict(entry), "spots": list(entry.spots)} for entry in self.leverage],
+            "classic_predicted_deg_per_step": of(self.classic_predicted),
+            "excluded_spots": list(self.excluded_spots),
+            "suspect_spots": list(self.suspect_spots),
+        }
+
+
+def _estimate(mode: float, draws: np.ndarray, prior_draws: np.ndarray) -> Estimate:
+    """From draws: equal-tailed interval, sample standard deviations."""
+    sd, prior_sd = float(np.std(draws)), float(np.std(prior_draws))
+    low, high = np.quantile(draws, [0.025, 0.975])
+    contraction = float(1 - (sd / prior_sd) ** 2) if prior_sd > 0 else None
+    return Estimate(float(mode), sd, (float(low), float(high)), prior_sd, contraction)
+
+
+def _parameters(fit: JointFit) -> dict[str, Estimate]:
+    """Parameters with a coordinate: interval ends are exact images of z -+ 1.96 sd under monotone maps."""
+    physical, prior = fit.draws.physical, fit.prior_draws.physical
+    low, high = fit.ends95
+    has_readings = bool(np.any(np.asarray(fit.arrays.spots.has_aperture) > 0))
+    estimates = {}
+    for index, name in enumerate(NAMES):
+        if name in RECEIVER_NAMES and not has_readings:
+            continue
+        estimate = _estimate(fit.mode.physical[index], physical[:, index], prior[:, index])
+        if index >= len(RIG_NAMES):
+            # Stereo parameters mix coordinates linearly.
+            ends = (estimate.value - NORMAL_95 * estimate.sd, estimate.value + NORMAL_95 * estimate.sd)
+        else:
+            ends = (float(low[index]), float(high[index]))
+        estimates[name] = Estimate(estimate.value, estimate.sd, ends, estimate.prior_sd, estimate.contraction)
+    return estimates
+
+
+def _derived(fit: JointFit) -> dict[str, Estimate]:
+    """Per-direction gear ratios and the effective mirror offset."""
+    estimates = {}
+    for axis, positive, negative in (("pan", "left", "right"), ("tilt", "up", "down")):
+        ratio, contrast = INDEX[f"degrees_per_step.{axis}"], INDEX[f"ratio_contrast_deg_per_step.{axis}"]
+        for direction, sign in ((positive, 0.5), (negative, -0.5)):
+            values = (d.physical[..., ratio] + sign * d.physical[..., contrast] for d in _three(fit))
+            estimates[f"degrees_per_step.{direction}"] = _estimate(*values)
+    estimates["effective_mirror_offset_mm"] = _estimate(*(d.effective_mirror_offset_mm for d in _three(fit)))
+    return estimates
+
+
+def _three(fit: JointFit):
+    return fit.mode, fit.draws, fit.prior_draws
+
+
+def _moved_directions(fit: JointFit) -> set[str]:
+    """Directions in which the campaign ever moved."""
+    moved = set()
+    moves = fit.campaign.moves
+    for previous, move in pairwise(moves):
+        if move.pan_approach:
+            continue
+        pan, tilt = move.pan_steps - previous.pan_steps, move.tilt_steps - previous.tilt_steps
+        moved |= {d for d, yes in zip(DIRECTIONS, (pan > 0, pan < 0, tilt > 0, tilt < 0), strict=True) if yes}
+    return moved
+
+
+def _backlash_direction(fit: JointFit, axis: str, direction: str) -> WeakDirection | None:
+    """Ratio and backlash of an axis, if they move together or the stops cannot separate them."""
+    index = INDEX[f"backlash_deg.{axis}"]
+    if not fit.free[index]:
+        return None
+    ratio = fit.draws.effective_deg_per_step[:, DIRECTIONS.index(direction)]
+    correlation = float(np.corrcoef(ratio, fit.draws.physical[:, index])[0, 1])
+    used = {s.move for s in fit.campaign.spots if s.status == "ok" and s.spot not in fit.excluded_spots}
+    reason = separation(observed_stops(fit.campaign.moves, used, axis), axis)
+    if reason is None and abs(correlation) < EXCHANGE_LIMIT:
+        return None
+    reason = reason or "the legs differ too little; add a cleared approach or longer legs"
+    text = f"{axis} ratio and {axis} backlash move together (correlation {correlation:+.2f}): {reason}"
+    return WeakDirection(text, {f"effective.{direction}": 1.0, f"backlash_deg.{axis}": correlation})
+
+
+def _weak_directions(fit: JointFit, moved: set[str]) -> tuple[WeakDirection, ...]:
+    found = []
+    for axis, pair in (("pan", ("left", "right")), ("tilt", ("up", "down"))):
+        if not moved & set(pair):
+            text = f"the {axis} axis was never moved: its ratio and backlash are the prior's; add moves on that axis"
+            found.append(WeakDirection(text, {f"degrees_per_step.{axis}": 1.0}))
+            continue
+        weak = _backlash_direction(fit, axis, pair[0] if pair[0] in moved else pair[1])
+        if weak is not None:
+            found.append(weak)
+    noise = {"pixel_scale", *(n for n in NAMES if n.startswith(("stop_sd", "stereo")))}
+    rows = np.array([i for i, name in enumerate(NAMES) if fit.free[i] and name not in noise])
+    if rows.size == 0:
+        return tuple(found)
+    eigenvalues, vectors = np.linalg.eigh(fit.covariance[np.ix_(rows, rows)])
+    for value, vector in list(zip(eigenvalues, vectors.T, strict=True))[::-1]:
+        if value < WEAK_VARIANCE or len(found) >= LISTED:
+            break
+        order = np.argsort(-np.abs(vector))
+        loadings = {NAMES[rows[i]]: float(vector[i]) for i in order if abs(vector[i]) > LOADING_LIMIT}
+        if not loadings:
+            loadings = {NAMES[rows[order[0]]]: float(vector[order[0]])}
+        names = list(loadings)
+        verb = "is" if len(names) == 1 else "move together and are"
+        listed = names[0] if len(names) == 1 else ", ".join(names[:-1]) + " and " + names[-1]
+        # Probit-type maps keep a variance within rounding of the prior's: more than 100 % is not a finding.
+        share = min(100.0, 100 * value)
+        text = f"{listed} {verb} set by the prior: {share:.0f} % of its variance is left; state it better or accept it"
+        found.append(WeakDirection(text, loadings))
+    return tuple(found)
+
+
+def _leverage(fit: JointFit, moved: set[str]) -> tuple[Leverage, ...]:
+    """Stops without which a headline's sd would more than double."""
+    quantities = {
+        f"effective {d}": fit.draws.effective_deg_per_step[:, k] for k, d in enumerate(DIRECTIONS) if d in moved
+    }
+    for axis in ("pan", "tilt"):
+        index = INDEX[f"backlash_deg.{axis}"]
+        # In coordinates, where the backlash is Gaussian.
+        quantities[f"backlash {axis}"] = fit.draws_z[:, index]
+    values = np.stack(list(quantities.values()), axis=1)
+    centred = fit.draws_z - fit.draws_z.mean(axis=0)
+    # Regression on the moment-matched draws: the gradient of the linear part.
+    cross = (values - values.mean(axis=0)).T @ centred / len(centred)
+    gradients = np.linalg.solve(fit.covariance, cross.T).T
+    sd = np.sqrt(np.einsum("qi,ij,qj->q", gradients, fit.covariance, gradients))
+    ids = [s for s in sorted((s for s in fit.campaign.spots if s.status == "ok"), key=lambda s: (s.move, s.spot))]
+    entries = []
+    for group in fit.information.groups:
+        members = [s for s in ids[group.rows] if s.spot not in fit.excluded_spots]
+        if not members:
+            continue
+        factors = standard_deviations_without(group, fit.covariance, gradients) / sd
+        for name, factor in zip(quantities, factors, strict=True):
+            if factor > LEVERAGE_LIMIT or not np.isfinite(factor):
+                move = fit.campaign.moves[members[0].move]
+                approach = ""
+                if move.pan_approach:
+                    approach = f" and its recorded approach ({move.pan_approach}, {move.tilt_approach})"
+                size = f"{factor:.1f} times" if np.isfinite(factor) else "beyond all bounds"
+                text = f"without move {move.move}{approach} the sd of {name} would grow {size}"
+                spots = tuple(s.spot for s in members)
+                entries.append(Leverage(move.move, spots, name, float(factor) if np.isfinite(factor) else None, text))
+    entries.sort(key=lambda e: -(e.factor if e.factor is not None else np.inf))
+    return tuple(entries[:LISTED])
+
+
+def _classic_predicted(fit: JointFit) -> dict[str, Estimate | None]:
+    """Mean of each direction as the classic estimator would compute it from ideal spots of the fitted model.
+
+    Pixels follow the parameters linearly from the mode; the classic's stereo calibration stays the stated one.
+    """
+    selection = select_experiments(fit.campaign)
+    result: dict[str, Estimate | None] = dict.fromkeys(DIRECTIONS)
+    if not len(selection.experiments):
+        return result
+    ordered = sorted((s for s in fit.campaign.spots if s.status == "ok"), key=lambda s: (s.move, s.spot))
+    row_of = {spot.spot: row for row, spot in enumerate(ordered)}
+    ids = np.array([s.spot for s in fit.campaign.spots])
+    rows = np.vectorize(row_of.get)(ids[selection.spot_rows])
+    pixels = fit.linearised.predicted[rows][..., :4]
+    push = fit.linearised.predicted_jacobian[rows][..., :4, :]
+
+    def ratios(pixels):
+        return four_point_ratios(pixels, selection.steps, selection.axis, fit.campaign.stereo)
+
+    at_mode = ratios(pixels)
+    moves = fit.draws_z[:CLASSIC_DRAWS] - fit.z
+    draws = np.stack([ratios(pixels + push @ dz) for dz in moves])
+    for direction in DIRECTIONS:
+        chosen = selection.direction == direction
+        if chosen.any():
+            values = draws[:, chosen].mean(axis=1)
+            sd = float(values.std())
+            low, high = np.quantile(values, [0.025, 0.975])
+            result[direction] = Estimate(float(at_mode[chosen].mean()), sd, (float(low), float(high)), None, None)
+    return result
+
+
+def summarise(fit: JointFit) -> FitSummary:
+    """Put a fit into the contract's terms.
+
+    Args:
+        fit: a joint fit, converged or not.
+
+    Returns:
+        Headlines, parameters and diagnostics.
+    """
+    moved = _moved_directions(fit)
+    mode, draws, prior = _three(fit)
+    effective = {
+        d: _estimate(*(x.effective_deg_per_step[..., k] for x in (mode, draws, prior))) if d in moved else None
+        for k, d in enumerate(DIRECTIONS)
+    }
+    contrasts = {}
+    for axis, first in (("pan", 0), ("tilt", 2)):
+        both = {DIRECTIONS[first], DIRECTIONS[first + 1]} <= moved
+        differences = (
+            x.effective_deg_per_step[..., first] - x.effective_deg_per_step[..., first + 1]
+            for x in (mode, draws, prior)
+        )
+        contrasts[axis] = _estimate(*differences) if both else None
+    readings = np.asarray(fit.arrays.spots.has_aperture * fit.arrays.spots.valid).sum()
+    observations = 3 * float(np.asarray(fit.arrays.spots.valid).sum()) + float(readings)
+    determined = float(np.trace(fit.information.fisher @ fit.covariance))
+    pan, tilt = np.degrees(fit.reference_pose_rad)
+    return FitSummary(
+        converged=fit.converged,
+        problems=fit.problems,
+        effective=effective,
+        contrasts=contrasts,
+        reference_pose_deg={"pan": float(pan), "tilt": float(tilt)},
+        jacobian=tuple(tuple(float(x) for x in row) for row in mode.jacobian),
+        parameters={**_parameters(fit), **_derived(fit)},
+        chi2=fit.chi2,
+        dof=observations - determined,
+        weak_directions=_weak_directions(fit, moved),
+        leverage=_leverage(fit, moved),
+        classic_predicted=_classic_predicted(fit),
+        excluded_spots=fit.excluded_spots,
+        suspect_spots=fit.suspect_spots,
+    )

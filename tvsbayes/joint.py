@@ -1,0 +1,485 @@
+"""The joint estimator: every parameter from every spot, with a Laplace covariance (DESIGN 4.2).
+
+Annealed Levenberg-Marquardt for geometry and stereo, alternating with the noise scales; then Newton steps on the
+full log density and the inverse Hessian there. Everything happens in the coordinates of `tvsbayes.parameters`
+(prior N(0, 1) each); results are handed out in the units of DESIGN 8: deg, mm, px, rad where a name says so.
+"""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+from scipy import optimize, stats
+
+from tvsbayes.campaign import Campaign
+from tvsbayes.files import NothingToEstimate
+from tvsbayes.geometry import Scalar
+from tvsbayes.likelihood import (
+    CampaignArrays,
+    campaign_arrays,
+    density_and_gradient,
+    innovations,
+    ordered_spots,
+    spot_residuals,
+    stop_variances,
+)
+from tvsbayes.parameters import NAMES, NOISE_NAMES, ParameterSpace, free_mask, parameter_space
+from tvsbayes.positioner import beam_angles, mirror_angles
+from tvsbayes.rigs import HOME_SD_DEG, Prior, RigTable
+from tvsbayes.solver import levenberg_marquardt
+from tvsbayes.stops import LinearSpots, StopInformation, leave_one_out_chi2, stop_information
+
+ANNEALING = (60.0, 10.0, 2.0, 1.0)
+"""Factors on the pixel noise before it takes its own value: plain Levenberg-Marquardt from the nominal rig goes
+astray when the extrinsics are off by 0.3 rad and 60 mm (DESIGN 4.2)."""
+STAGE_TOLERANCE = 1e-3
+STAGE_STEPS = 12
+"""Levenberg-Marquardt only has to reach the basin: its frozen Jacobian (`spot_residuals`) is not exact at the level
+of the noise, where it would stall; the Newton steps on the full density finish the work."""
+SMALLEST_CAMPAIGN = 8
+"""Spots below which no fit is tried: two beams at two depths, seen before and after one move on each axis."""
+NOISE_SETTLED = 0.05
+"""Change of every noise coordinate (prior sds) below which the alternation stops: half a posterior sd."""
+NEWTON_STEP = 1e-4
+"""Finite-difference step of the Hessian in posterior standard deviations: third derivatives are of order one
+there, so the error is 1e-4; the gradient's rounding (1e-9) is amplified to 1e-5."""
+NEWTON_SETTLED = 1e-8
+"""Squared Newton step, in posterior sds, at which the mode is reached."""
+HESSIAN_KEPT = 0.1
+"""The Hessian is taken anew if the mode moved farther than this many sds since it was computed."""
+CONTRASTS = ("ratio_contrast_deg_per_step.pan", "ratio_contrast_deg_per_step.tilt")
+LAPLACE_DRAWS = 2048
+NORMAL_95 = 1.959963984540054
+"""Two-sided 95 % quantile of the normal distribution."""
+GATE_PROBABILITY = 1e-6
+"""A clean spot is excluded by the robust option with this probability."""
+HUBER_CORE = 0.8214
+"""Share of clean spots with full weight: P(|z| < 1.345), the constant of 95 % efficiency (Huber 1964)."""
+
+
+class Fixed(eqx.Module):
+    """What a least-squares stage holds: coordinates kept at a value, and the factor on the noise."""
+
+    held: Bool[Array, " parameters"]
+    value: Float[Array, " parameters"]
+    inflation: Scalar
+
+
+def stage_residuals(
+    z: Float[Array, " parameters"], args: tuple[ParameterSpace, CampaignArrays, Fixed]
+) -> Float[Array, " residuals"]:
+    """[standardised innovations; prior residuals] with the noise scales held (DESIGN 4.2)."""
+    space, arrays, fixed = args
+    full = jnp.where(fixed.held, fixed.value, z)
+    errors = innovations(space.model(full), arrays, fixed.inflation, frozen=True).standardised
+    return jnp.concatenate([errors.ravel(), jnp.where(fixed.held, z - fixed.value, z)])
+
+
+class Linearised(eqx.Module):
+    """The campaign linearised at a point; first axis of the Jacobians is the spot."""
+
+    residual: Float[Array, "spots 4"]
+    slope: Float[Array, "spots 4 2"]
+    play_sd_rad: Float[Array, "spots 2"]
+    mirror_angles_rad: Float[Array, "spots 2"]
+    predicted: Float[Array, "spots 5"]
+    stop_variance: Float[Array, "spots 2"]
+    residual_jacobian: Float[Array, "spots 4 parameters"]
+    predicted_jacobian: Float[Array, "spots 5 parameters"]
+
+
+@eqx.filter_jit
+def linearise(z: Float[Array, " parameters"], space: ParameterSpace, arrays: CampaignArrays) -> Linearised:
+    """Residuals, ideal observations at the observed ranges, and d/d(coordinates) of both."""
+
+    def forward(z):
+        model = space.model(z)
+        angles = mirror_angles(model.transmission, model.tilt_zero_rad, arrays.moves)
+        terms = spot_residuals(model, angles, arrays, jnp.ones(()), frozen=True)
+        return (terms.residual, terms.predicted), (terms, angles)
+
+    (residual, predicted), push, (terms, angles) = jax.linearize(forward, z, has_aux=True)
+    residual_jacobian, predicted_jacobian = jax.vmap(push, out_axes=-1)(jnp.eye(z.size))
+    index = arrays.spots.move_index
+    stop_sd_rad = space.model(z).noise.stop_sd_rad
+    return Linearised(
+        residual=residual,
+        slope=terms.slope,
+        play_sd_rad=angles.play_sd_rad[index],
+        mirror_angles_rad=angles.angle_rad[index],
+        predicted=predicted,
+        stop_variance=stop_variances(stop_sd_rad, arrays.spots),
+        residual_jacobian=residual_jacobian,
+        predicted_jacobian=predicted_jacobian,
+    )
+
+
+class Derived(eqx.Module):
+    """Headlines at one pose for one point of parameter space, in the units of DESIGN 8.
+
+    `effective_deg_per_step` is ordered left, right, up, down; `jacobian` is d(azimuth, elevation)/d(pan, tilt).
+    """
+
+    physical: Float[Array, " parameters"]
+    effective_deg_per_step: Float[Array, "4"]
+    jacobian: Float[Array, "2 2"]
+    effective_mirror_offset_mm: Scalar
+
+
+@eqx.filter_jit
+def derived_quantities(
+    z: Float[Array, "draws parameters"], space: ParameterSpace, reference_pose_rad: Float[Array, "2"]
+) -> Derived:
+    """Headlines of many points at once (DESIGN 3.2); every field has the leading axis `draws`."""
+
+    def one(z):
+        physical = space.physical(z)
+        model = space.model(z)
+        angles = beam_angles(model.optics, reference_pose_rad[0], reference_pose_rad[1])
+        ratio = model.transmission.ratio_rad_per_step
+        half = 0.5 * model.transmission.contrast_rad_per_step
+        slope = jnp.diagonal(angles.jacobian)
+        effective = jnp.stack([(ratio + half) * slope, (ratio - half) * slope], axis=1).ravel() * (180 / jnp.pi)
+        return Derived(physical, effective, angles.jacobian, angles.effective_mirror_offset_mm)
+
+    return jax.vmap(one)(z)
+
+
+@dataclass(frozen=True)
+class JointFit:
+    """Mode and Laplace approximation of the posterior.
+
+    Attributes:
+        campaign: what was fitted.
+        space: priors as arrays.
+        arrays: the campaign as arrays, with the weights of the robust option.
+        z: mode in prior coordinates, shape (p,).
+        covariance: inverse negative Hessian there, shape (p, p); the identity where nothing is estimated.
+        log_density: log posterior density at the mode, without `likelihood.log_constant`.
+        linearised: the campaign linearised at the mode, without padding.
+        information: leave-one-out quantities per stop.
+        chi2: squared standardised innovations of the spots used.
+        reference_pose_rad: mean mirror angles (pan, tilt) over the spots used.
+        free: parameters that are estimated, shape (p,).
+        draws_z: Laplace draws, shape (draws, p), with mean and covariance exactly those of the approximation.
+        draws: headlines and parameters of the draws.
+        prior_draws: the same under the priors, at the same pose.
+        mode: headlines and parameters at the mode (fields without leading axis).
+        ends95: parameters at z - 1.96 sd and z + 1.96 sd, shape (2, p): interval ends under monotone maps.
+        excluded_spots: ids of spots the robust option left out.
+        suspect_spots: ids of spots used although a clean spot would look so less often than `GATE_PROBABILITY`.
+        converged: the mode was reached and is a maximum.
+        problems: sentences on what failed; empty when converged.
+    """
+
+    campaign: Campaign
+    space: ParameterSpace
+    arrays: CampaignArrays
+    z: np.ndarray
+    covariance: np.ndarray
+    log_density: float
+    linearised: Linearised
+    information: StopInformation
+    chi2: float
+    reference_pose_rad: np.ndarray
+    free: np.ndarray
+    draws_z: np.ndarray
+    draws: Derived
+    prior_draws: Derived
+    mode: Derived
+    ends95: np.ndarray
+    excluded_spots: tuple[int, ...]
+    suspect_spots: tuple[int, ...]
+    converged: bool
+    problems: tuple[str, ...] = ()
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Contract names of the coordinates and of the columns of `draws.physical`."""
+        return NAMES
+
+
+@dataclass(frozen=True)
+class Mode:
+    """Outcome of the Newton steps: `covariance` is the inverse Hessian over all coordinates."""
+
+    z: np.ndarray
+    covariance: np.ndarray
+    negative_log_density: float
+    problems: tuple[str, ...]
+
+
+class Problem:
+    """One campaign in front of the compiled functions."""
+
+    def __init__(self, campaign: Campaign, table: RigTable):
+        self.spots = ordered_spots(campaign)
+        self.space = parameter_space(table, campaign.stereo)
+        self.arrays = campaign_arrays(campaign)
+        self.free = free_mask(self.space, any(s.aperture_deg is not None for s in self.spots))
+        is_noise = np.isin(NAMES, NOISE_NAMES)
+        self.noise = np.flatnonzero(is_noise & self.free)
+        self.held = is_noise | ~self.free
+
+    def compile_aside(self, executor: ThreadPoolExecutor) -> None:
+        """Start the compilations that later steps need while the first stage runs on the other core."""
+
+        def work():
+            with jax.enable_x64(True):
+                z = jnp.zeros(len(NAMES))
+                density_and_gradient(z, self.space, self.arrays)
+                linearise(z, self.space, self.arrays)
+
+        executor.submit(work)
+
+    def least_squares(self, z: np.ndarray, inflation: float) -> np.ndarray:
+        """Geometry and stereo for given noise scales."""
+        fixed = Fixed(jnp.asarray(self.held), jnp.asarray(z), jnp.asarray(inflation))
+        args = (self.space, self.arrays, fixed)
+        tolerance = jnp.asarray(STAGE_TOLERANCE)
+        return np.array(levenberg_marquardt(stage_residuals, jnp.asarray(z), args, tolerance, STAGE_STEPS))
+
+    def objective(self, z: np.ndarray) -> tuple[float, np.ndarray]:
+        """Negative log density and its gradient."""
+        value, slope = density_and_gradient(jnp.asarray(z), self.space, self.arrays)
+        return -float(value), -np.asarray(slope)
+
+    def noise_scales(self, z: np.ndarray) -> np.ndarray:
+        """Best noise scales for given geometry, under their priors."""
+
+        def part(values):
+            full = z.copy()
+            full[self.noise] = values
+            value, slope = self.objective(full)
+            return value, slope[self.noise]
+
+        result = z.copy()
+        if self.noise.size:
+            # Eight prior standard deviations: a factor 3000 on a stop sd, 55 on the pixel scale.
+            bounds = [(-8.0, 8.0)] * self.noise.size
+            result[self.noise] = optimize.minimize(part, z[self.noise], jac=True, method="L-BFGS-B", bounds=bounds).x
+        return result
+
+    def alternate(self, z: np.ndarray) -> np.ndarray:
+        """Geometry and noise scales in turn until the noise settles (DESIGN 4.2)."""
+        for _ in range(6):
+            previous = z
+            z = self.least_squares(self.noise_scales(z), 1.0)
+            if np.max(np.abs(z - previous)[self.noise], initial=0.0) < NOISE_SETTLED:
+                break
+        return z
+
+    def linear_spots(self, z: np.ndarray) -> tuple[Linearised, LinearSpots]:
+        """The campaign linearised at a point, without padding."""
+        count = len(self.spots)
+        full = linearise(jnp.asarray(z), self.space, self.arrays)
+        lin = jax.tree.map(lambda x: np.asarray(x)[:count], full)
+        spots = jax.tree.map(lambda x: np.asarray(x)[:count], self.arrays.spots)
+        home_variance = np.where(spots.homed, np.radians(HOME_SD_DEG) ** 2, 0.0)[:, None] * np.ones(2)
+        segment = spots.new_segment[:, None] & np.ones(2, dtype=bool)
+        return lin, LinearSpots(
+            residual=lin.residual,
+            load=np.concatenate([lin.slope, lin.slope, lin.slope * lin.play_sd_rad[:, None, :]], axis=2),
+            renewed=np.concatenate([spots.redraw, segment, segment], axis=1),
+            variance=np.concatenate([lin.stop_variance, home_variance, np.ones((count, 2))], axis=1),
+            jacobian=np.where(self.held, 0.0, -lin.residual_jacobian),
+            move=spots.move_index,
+        )
+
+    def newton(self, z: np.ndarray) -> Mode:
+        """Newton steps on the full density, in coordinates whitened by the information at the start."""
+        free = np.flatnonzero(self.free)
+        value, slope = self.objective(z)
+        curvature = stop_information(self.linear_spots(z)[1]).fisher + np.eye(len(NAMES))
+        for index in self.noise:
+            nudge = np.zeros(len(NAMES))
+            nudge[index] = NEWTON_STEP
+            curvature[index, index] = max(1.0, (self.objective(z + nudge)[1] - slope)[index] / NEWTON_STEP)
+        root = np.linalg.inv(np.linalg.cholesky(curvature[np.ix_(free, free)])).T
+        problems: list[str] = []
+        for _ in range(6):
+            start = z
+            columns = []
+            for column in root.T:
+                nudged = z.copy()
+                nudged[free] += NEWTON_STEP * column
+                columns.append((self.objective(nudged)[1] - slope)[free] / NEWTON_STEP)
+            hessian = root.T @ np.stack(columns, axis=1)
+            eigenvalues, vectors = np.linalg.eigh(0.5 * (hessian + hessian.T))
+            # Far from the mode the density may be flat or convex along a direction: step by the expected scale.
+            inverse = (vectors / np.maximum(np.abs(eigenvalues), 0.1)) @ vectors.T
+            settled = False
+            for _ in range(12):
+                step = -inverse @ (root.T @ slope[free])
+                if step @ step < NEWTON_SETTLED:
+                    settled = True
+                    break
+                for halving in range(12):
+                    trial = z.copy()
+                    trial[free] += root @ step / 2**halving
+                    trial_value, trial_slope = self.objective(trial)
+                    if np.isfinite(trial_value) and trial_value < value + 1e-9 * abs(value):
+                        break
+                else:
+                    break
+                z, value, slope = trial, trial_value, trial_slope
+            root_inverse_move = np.linalg.solve(root, (z - start)[free])
+            if settled and np.linalg.norm(root_inverse_move) < HESSIAN_KEPT:
+                break
+            root = root @ (vectors / np.sqrt(np.maximum(np.abs(eigenvalues), 0.1))) @ vectors.T
+        else:
+            problems.append("the Newton steps on the full density did not settle")
+        if eigenvalues[0] <= 0:
+            problems.append("the density has no maximum here: its Hessian is not negative definite")
+        whitened = (vectors / np.maximum(eigenvalues, 1e-3)) @ vectors.T
+        covariance = np.eye(len(NAMES))
+        covariance[np.ix_(free, free)] = root @ whitened @ root.T
+        return Mode(z, covariance, value, tuple(problems))
+
+
+def laplace_draws(z: np.ndarray, covariance: np.ndarray, seed: int) -> np.ndarray:
+    """Normal draws whose sample mean and covariance are exactly the given ones.
+
+    Antithetic pairs fix the mean, a Cholesky factor of the sample covariance fixes the rest: standard deviations of
+    linear quantities then carry no Monte Carlo error.
+    """
+    half = np.random.default_rng(seed).standard_normal((LAPLACE_DRAWS // 2, z.size))
+    normal = np.concatenate([half, -half])
+    normal = normal @ np.linalg.inv(np.linalg.cholesky(normal.T @ normal / len(normal))).T
+    return z + normal @ np.linalg.cholesky(covariance).T
+
+
+def _chi2_quantile(readings: np.ndarray, probability: float) -> np.ndarray:
+    return stats.chi2.isf(probability, 3 + readings)
+
+
+def _robust_weights(problem: Problem, z: np.ndarray) -> tuple[CampaignArrays, np.ndarray, float]:
+    """One round of the robust option: gate and Huber weights from leave-one-out residuals.
+
+    Returns:
+        Arrays with new weights, the mask of used spots, and the largest change of a weight.
+    """
+    spots = problem.arrays.spots
+    count = len(problem.spots)
+    valid, weight = np.array(spots.valid[:count]), np.array(spots.weight[:count])
+    readings = np.asarray(spots.has_aperture[:count])
+    # Distances are measured as if the spot had full weight.
+    chi2 = leave_one_out_chi2(stop_information(problem.linear_spots(z)[1])) / weight
+    used = valid > 0
+    # The noise scales were fitted with the outliers in: the median restores the scale of the clean spots.
+    scale2 = np.median(chi2[used] / _chi2_quantile(readings[used], 0.5))
+    chi2 = chi2 / max(scale2, 1e-12)
+    over = used & (chi2 > _chi2_quantile(readings, GATE_PROBABILITY))
+    # A bad spot makes its neighbours look bad: only the worst of each run is blamed in one round.
+    for index in np.flatnonzero(over):
+        run = slice(max(index - 2, 0), index + 3)
+        if chi2[index] >= np.max(np.where(used[run], chi2[run], 0.0)):
+            valid[index] = 0.0
+    core = _chi2_quantile(readings, 1 - HUBER_CORE)
+    new_weight = np.where(valid > 0, np.sqrt(np.minimum(1.0, core / np.maximum(chi2, 1e-12))), 1.0)
+    change = float(np.max(np.abs(new_weight - weight) + (valid != used)))
+
+    def padded(array, values):
+        return jnp.asarray(np.concatenate([values, np.asarray(array)[count:]]))
+
+    arrays = eqx.tree_at(
+        lambda a: (a.spots.valid, a.spots.weight),
+        problem.arrays,
+        (padded(spots.valid, valid), padded(spots.weight, new_weight)),
+    )
+    return arrays, valid > 0, change
+
+
+def fit(campaign: Campaign, *, robust: bool = False, per_axis: bool = False, seed: int = 0) -> JointFit:
+    """Fit the joint model to every usable spot (DESIGN 4).
+
+    Args:
+        campaign: a checked campaign.
+        robust: downweight and exclude spots that disagree with all others (Huber weights and a gate on
+            leave-one-out residuals).
+        per_axis: one ratio per axis, the contrasts fixed at 0 (DESIGN 3.1).
+        seed: seed of the Laplace draws.
+
+    Returns:
+        Mode, Laplace approximation and diagnostics; look at `converged` before using it.
+
+    Raises:
+        NothingToEstimate: if the campaign has fewer than `SMALLEST_CAMPAIGN` usable spots or no move.
+    """
+    spots = ordered_spots(campaign)
+    if len(spots) < SMALLEST_CAMPAIGN:
+        raise NothingToEstimate(
+            "too-few-spots",
+            f"spots.csv: {len(spots)} spots have status ok; the joint fit needs at least {SMALLEST_CAMPAIGN}",
+            file="spots.csv",
+            remedy="observe more stops, or detect the refused spots again",
+        )
+    with jax.enable_x64(True), ThreadPoolExecutor(1) as executor:
+        table = campaign.rig
+        if per_axis:
+            table = replace(table, priors={**table.priors, **dict.fromkeys(CONTRASTS, Prior(0.0, 0.0))})
+        problem = Problem(campaign, table)
+        problem.compile_aside(executor)
+        z = np.zeros(len(NAMES))
+        for inflation in ANNEALING:
+            z = problem.least_squares(z, inflation)
+        z = problem.alternate(z)
+        used = np.ones(len(spots), dtype=bool)
+        if robust:
+            for _ in range(20):
+                problem.arrays, used, change = _robust_weights(problem, z)
+                if change < 0.02:
+                    break
+                z = problem.alternate(z)
+        mode = problem.newton(z)
+        return _result(campaign, problem, mode, used, seed)
+
+
+def _result(campaign: Campaign, problem: Problem, mode: Mode, used: np.ndarray, seed: int) -> JointFit:
+    """Everything that is computed at the mode."""
+    lin, linear = problem.linear_spots(mode.z)
+    information = stop_information(linear)
+    chi2_spots = leave_one_out_chi2(information)
+    readings = np.asarray(problem.arrays.spots.has_aperture[: len(problem.spots)])
+    suspect = used & (chi2_spots > _chi2_quantile(readings, GATE_PROBABILITY))
+    pose = lin.mirror_angles_rad[used].mean(axis=0)
+    draws_z = laplace_draws(mode.z, mode.covariance, seed)
+    identity = np.eye(len(NAMES))
+    prior_z = laplace_draws(np.zeros(len(NAMES)), identity, seed + 1)
+    at_mode_and_draws = derived_quantities(jnp.asarray(np.vstack([mode.z, draws_z])), problem.space, jnp.asarray(pose))
+    prior = derived_quantities(jnp.asarray(np.vstack([mode.z, prior_z])), problem.space, jnp.asarray(pose))
+    reach = NORMAL_95 * np.sqrt(np.diag(mode.covariance))
+    ends = derived_quantities(
+        jnp.asarray(np.vstack([mode.z - reach, mode.z + reach, prior_z[1:]])),
+        problem.space,
+        jnp.asarray(pose),
+    )
+    ids = np.array([s.spot for s in problem.spots])
+    return JointFit(
+        campaign=campaign,
+        space=problem.space,
+        arrays=problem.arrays,
+        z=mode.z,
+        covariance=mode.covariance,
+        log_density=-mode.negative_log_density,
+        linearised=lin,
+        information=information,
+        chi2=sum(float(linear.residual[g.rows].ravel() @ g.residual) for g in information.groups),
+        reference_pose_rad=pose,
+        free=problem.free,
+        draws_z=draws_z,
+        draws=jax.tree.map(lambda x: np.asarray(x)[1:], at_mode_and_draws),
+        prior_draws=jax.tree.map(lambda x: np.asarray(x)[1:], prior),
+        mode=jax.tree.map(lambda x: np.asarray(x)[0], at_mode_and_draws),
+        ends95=np.asarray(ends.physical)[:2],
+        excluded_spots=tuple(int(i) for i in ids[~used]),
+        suspect_spots=tuple(int(i) for i in ids[suspect]),
+        converged=not mode.problems,
+        problems=mode.problems,
+    )

@@ -1,0 +1,396 @@
+"""Likelihood of all spots of a campaign: flat ranges, marginal stop errors and home offsets (DESIGN 4.1).
+
+Each spot gives four pixels and perhaps an aperture angle. Its range along the beam is unknown and flat in image
+displacement: the part of the residual along d(pixels)/d(range) is projected out. Stop errors (persistent while
+their axis stands still), home offsets and unknown play at the start of a segment are Gaussian states of a Kalman
+filter in time order. Angles rad, lengths mm; residuals are in units of their stated standard deviations.
+
+State of the filter: stop error (pan, tilt), home offset (pan, tilt), position in the unknown play band (pan, tilt)
+in units of its standard deviation.
+"""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from tvsbayes.cameras import project
+from tvsbayes.campaign import APPROACH_SIGN, Campaign, Move, Spot
+from tvsbayes.classic import triangulate
+from tvsbayes.geometry import (
+    Scalar,
+    along_batch,
+    dot,
+    materialise,
+    rotate_about_z,
+    rotation_matrix,
+    transform,
+)
+from tvsbayes.parameters import Model, ParameterSpace, Receiver
+from tvsbayes.positioner import MirrorAngles, MoveArrays, beam, mirror_angles
+from tvsbayes.rigs import HOME_SD_DEG, RigTable
+
+SMALLEST_BUCKET = 512
+"""Spots and moves are padded to this size or the next power of two above it: campaigns of ordinary size
+share one compiled function."""
+COMPONENTS = 4
+"""Residuals that remain of a spot's five observations after its range is projected out; the last is zero
+without an aperture reading."""
+STATES = 6
+
+
+class SpotArrays(eqx.Module):
+    """Spots with status ok in time order, padded.
+
+    `whitening` maps a pixel residual to stated standard deviations. `weight` scales a spot's information
+    (1, or below for the robust option), `valid` is 0 for padding and excluded spots. `redraw[axis]` says that the
+    stop error of the axis was drawn anew since the previous spot, with variance
+    `redraw_mix[axis] @ (sd_right^2, sd_left^2)` (or down, up).
+    """
+
+    move_index: Int[Array, " spots"]
+    pixels: Float[Array, "spots 4"]
+    whitening: Float[Array, "spots 4 4"]
+    aperture_rad: Float[Array, " spots"]
+    has_aperture: Float[Array, " spots"]
+    triangulated_mm: Float[Array, "spots 3"]
+    valid: Float[Array, " spots"]
+    weight: Float[Array, " spots"]
+    redraw: Bool[Array, "spots 2"]
+    redraw_mix: Float[Array, "spots 2 2"]
+    new_segment: Bool[Array, " spots"]
+    homed: Bool[Array, " spots"]
+
+
+class CampaignArrays(eqx.Module):
+    """A campaign as arguments of jitted functions."""
+
+    moves: MoveArrays
+    spots: SpotArrays
+    azimuth_convention: Bool[Array, ""]
+
+
+def bucket(count: int) -> int:
+    """Padded length for `count` rows."""
+    size = SMALLEST_BUCKET
+    while size < count:
+        size *= 2
+    return size
+
+
+def ordered_spots(campaign: Campaign) -> list[Spot]:
+    """Spots with status ok in the order in which the filter meets them."""
+    return sorted((s for s in campaign.spots if s.status == "ok"), key=lambda s: (s.move, s.spot))
+
+
+def move_arrays(moves: tuple[Move, ...]) -> MoveArrays:
+    """Pad the moves; padding repeats the last counters and therefore changes nothing."""
+    size = bucket(len(moves))
+    steps = np.zeros((size, 2))
+    steps[: len(moves)] = [(m.pan_steps, m.tilt_steps) for m in moves]
+    steps[len(moves) :] = steps[len(moves) - 1]
+    first = np.zeros(size, dtype=bool)
+    first[: len(moves)] = [bool(m.pan_approach) for m in moves]
+    approach = np.zeros((size, 2))
+    approach[: len(moves)] = [
+        (APPROACH_SIGN.get(m.pan_approach, 0), APPROACH_SIGN.get(m.tilt_approach, 0)) for m in moves
+    ]
+    return MoveArrays(jnp.asarray(steps), jnp.asarray(first), jnp.asarray(approach))
+
+
+def _stop_mix(sign: int) -> tuple[float, float]:
+    """Share of each direction's variance in a stop error: one of them, or half of both where unknown."""
+    return (0.5, 0.5) if sign == 0 else (float(sign < 0), float(sign > 0))
+
+
+def _redraws(moves: tuple[Move, ...], spots: list[Spot]) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Which stop errors are new at each spot, from which direction, and where segments begin."""
+    count = len(spots)
+    redraw, mix = np.zeros((count, 2), dtype=bool), np.zeros((count, 2, 2))
+    new_segment, homed = np.zeros(count, dtype=bool), np.zeros(count, dtype=bool)
+    seen = -1
+    for row, spot in enumerate(spots):
+        for index in range(seen + 1, spot.move + 1):
+            move = moves[index]
+            if move.pan_approach:
+                signs = (APPROACH_SIGN[move.pan_approach], APPROACH_SIGN[move.tilt_approach])
+                redraw[row], mix[row] = True, [_stop_mix(s) for s in signs]
+                new_segment[row], homed[row] = True, move.segment > 0
+                continue
+            previous = moves[index - 1]
+            deltas = (move.pan_steps - previous.pan_steps, move.tilt_steps - previous.tilt_steps)
+            for axis, delta in enumerate(deltas):
+                if delta:
+                    redraw[row, axis], mix[row, axis] = True, _stop_mix(delta)
+        seen = spot.move
+    return redraw, mix, new_segment, homed
+
+
+def pixel_covariance(spot: Spot) -> np.ndarray:
+    """Stated covariance of (u_left, v_left, u_right, v_right), px^2."""
+    su_l, sv_l, su_r, sv_r = spot.su_left_px, spot.sv_left_px, spot.su_right_px, spot.sv_right_px
+    covariance = np.diag(np.square([su_l, sv_l, su_r, sv_r]))
+    covariance[0, 1] = covariance[1, 0] = spot.ruv_left * su_l * sv_l
+    covariance[2, 3] = covariance[3, 2] = spot.ruv_right * su_r * sv_r
+    return covariance
+
+
+def campaign_arrays(campaign: Campaign) -> CampaignArrays:
+    """Pack a campaign for the jitted functions.
+
+    Args:
+        campaign: a checked campaign with at least one spot of status ok.
+
+    Returns:
+        Arrays padded to `bucket` sizes.
+    """
+    spots = ordered_spots(campaign)
+    count, size = len(spots), bucket(len(spots))
+
+    def padded(rows, shape, fill=0.0, dtype=np.float64):
+        array = np.full((size, *shape), fill, dtype=dtype)
+        array[:count] = rows
+        return jnp.asarray(array)
+
+    pixels = np.array([(s.u_left_px, s.v_left_px, s.u_right_px, s.v_right_px) for s in spots])
+    covariance = np.stack([pixel_covariance(s) for s in spots])
+    whitening = np.linalg.inv(np.linalg.cholesky(covariance))
+    redraw, mix, new_segment, homed = _redraws(campaign.moves, spots)
+    aperture = [np.nan if s.aperture_deg is None else s.aperture_deg for s in spots]
+    with jax.enable_x64(True):
+        spot_arrays = SpotArrays(
+            move_index=padded([s.move for s in spots], (), spots[-1].move, np.int32),
+            pixels=padded(pixels, (4,), 0.0),
+            whitening=padded(whitening, (4, 4), np.eye(4)),
+            aperture_rad=padded(np.nan_to_num(np.radians(aperture)), ()),
+            has_aperture=padded(np.isfinite(aperture), ()),
+            triangulated_mm=padded(triangulate(campaign.stereo, pixels), (3,), (500.0, 0.0, 0.0)),
+            valid=padded(1.0, ()),
+            weight=padded(1.0, (), 1.0),
+            redraw=padded(redraw, (2,), False, bool),
+            redraw_mix=padded(mix, (2, 2)),
+            new_segment=padded(new_segment, (), False, bool),
+            homed=padded(homed, (), False, bool),
+        )
+        return CampaignArrays(
+            move_arrays(campaign.moves), spot_arrays, jnp.asarray(campaign.rig.aperture_convention == "azimuth")
+        )
+
+
+def log_constant(campaign: Campaign, table: RigTable) -> float:
+    """Terms of the log likelihood that no parameter changes: 2 pi and the stated pixel covariances."""
+    spots = ordered_spots(campaign)
+    readings = sum(s.aperture_deg is not None for s in spots)
+    logdet = sum(np.linalg.slogdet(pixel_covariance(s))[1] for s in spots)
+    return -0.5 * (3 * len(spots) + readings) * np.log(2 * np.pi) - 0.5 * logdet
+
+
+def aperture_angle(
+    receiver: Receiver, points_p_mm: Float[Array, "3 *batch"], azimuth_convention: Bool[Array, ""]
+) -> Float[Array, "*batch"]:
+    """Angle B at the aperture between +y of frame T and the spot, or its projection on x-y (DESIGN 5)."""
+    turned = rotate_about_z(receiver.pan_zero_emission_rad - jnp.pi / 2, points_p_mm)
+    lateral2 = turned[0] ** 2 + jnp.where(azimuth_convention, 0.0, 1.0) * turned[2] ** 2
+    # A spot on the baseline itself has no direction; the floor keeps the derivative finite there.
+    return jnp.arctan2(jnp.sqrt(jnp.maximum(lateral2, 1e-12)), turned[1] + receiver.baseline_mm)
+
+
+def observe(
+    model: Model, pose: Float[Array, "3 *batch"], azimuth_convention: Bool[Array, ""]
+) -> Float[Array, "5 *batch"]:
+    """What ideal looks return.
+
+    Args:
+        model: parameters.
+        pose: first axis pan (rad), tilt (rad), range along the beam (mm).
+        azimuth_convention: convention of the aperture's reading.
+
+    Returns:
+        First axis u_left, v_left, u_right, v_right (px), aperture reading (rad).
+    """
+    pan, tilt, range_mm = pose
+    ray = beam(model.optics, pan, tilt)
+    points_p = materialise(ray.origin_mm + range_mm * ray.direction)
+    extrinsics = model.extrinsics
+    points_s = transform(rotation_matrix(extrinsics.rotation_rad), points_p)
+    points_s = materialise(points_s + along_batch(extrinsics.translation_mm, pan))
+    angle = aperture_angle(model.receiver, points_p, azimuth_convention) + model.receiver.aperture_zero_rad
+    return jnp.concatenate([project(model.cameras, points_s), angle[None]])
+
+
+def nearest_range(
+    model: Model,
+    pan: Float[Array, "*batch"],
+    tilt: Float[Array, "*batch"],
+    points_s_mm: Float[Array, "3 *batch"],
+) -> Float[Array, "*batch"]:
+    """Ranges at which the beams pass closest to points of frame S, mm."""
+    ray = beam(model.optics, pan, tilt)
+    extrinsics = model.extrinsics
+    from_origin = points_s_mm - along_batch(extrinsics.translation_mm, pan)
+    points_p = transform(rotation_matrix(extrinsics.rotation_rad).T, from_origin)
+    return dot(points_p - ray.origin_mm, ray.direction)
+
+
+class SpotResiduals(eqx.Module):
+    """All spots after their ranges are projected out, in units of their noise (stated sd x pixel scale).
+
+    `residual` = observed - predicted; `slope` = d(predicted)/d(pan, tilt); `log_scale` holds each spot's
+    -3 log(pixel_scale) and, with an aperture reading, what the fifth observation adds: zero for padding.
+    `predicted` is the ideal observation (px, rad) at the triangulated point's range.
+    """
+
+    residual: Float[Array, "spots 4"]
+    slope: Float[Array, "spots 4 2"]
+    log_scale: Float[Array, " spots"]
+    predicted: Float[Array, "spots 5"]
+
+
+def spot_residuals(
+    model: Model, angles: MirrorAngles, arrays: CampaignArrays, inflation: Scalar, frozen: bool
+) -> SpotResiduals:
+    """Linearise every spot about the triangulated point's range (DESIGN 4.1).
+
+    Args:
+        model: parameters.
+        angles: mirror angles of all moves.
+        arrays: the campaign.
+        inflation: factor on the noise while the fit is annealed.
+        frozen: hold slopes and projection fixed under differentiation. The optimum of a least-squares
+            residual is unchanged to first order in the residual (Kaufman's variant of variable projection)
+            and its Jacobian needs no second derivative.
+
+    Returns:
+        Residuals, slopes and log scales.
+    """
+    spots, azimuth = arrays.spots, arrays.azimuth_convention
+    hold = jax.lax.stop_gradient if frozen else (lambda tree: tree)
+    pan, tilt = angles.angle_rad[spots.move_index].T
+    at_model, at_pan, at_tilt = hold((model, pan, tilt))
+    ranges_mm = nearest_range(at_model, at_pan, at_tilt, spots.triangulated_mm.T)
+
+    predicted, slope_of = jax.linearize(
+        lambda pose: observe(at_model, pose, azimuth), jnp.stack([at_pan, at_tilt, ranges_mm])
+    )
+    basis = jnp.broadcast_to(jnp.eye(3)[:, :, None], (3, 3, pan.size))
+    slopes = jax.vmap(slope_of)(basis)
+    if frozen:
+        predicted = observe(model, jnp.stack([pan, tilt, ranges_mm]), azimuth)
+    misfit = jnp.concatenate([spots.pixels.T, spots.aperture_rad[None]]) - predicted
+    # Angles are compared on the circle.
+    turns = jnp.round(misfit[4] / (2 * jnp.pi)) * (2 * jnp.pi)
+    misfit = misfit - jnp.concatenate([jnp.zeros((4, pan.size)), turns[None]])
+
+    pixel_noise = 1 / (model.noise.pixel_scale * inflation)
+    aperture_noise = 1 / (model.receiver.aperture_sd_rad * inflation)
+    root_weight = jnp.sqrt(spots.weight) * spots.valid
+
+    def whitened(vectors: Float[Array, "n 5 spots"]) -> Float[Array, "n 5 spots"]:
+        pixels = jnp.sum(spots.whitening.transpose(1, 2, 0) * vectors[:, None, :4], axis=2) * (
+            pixel_noise * root_weight
+        )
+        return jnp.concatenate([pixels, vectors[:, 4:] * (aperture_noise * root_weight * spots.has_aperture)], 1)
+
+    misfit, slopes = materialise((whitened(misfit[None]), hold(whitened(slopes))))
+    # Padding has no slope; any fixed direction keeps the projection finite there.
+    along = slopes[2] + (1 - spots.valid) * np.eye(5)[0][:, None]
+    pixel_part = jnp.sum(along[:4] ** 2, axis=0)
+    aperture_part = along[4] ** 2
+    along = along / jnp.sqrt(pixel_part + aperture_part)
+    # A Householder reflection takes the range direction to the first axis; the other four coordinates are an
+    # orthonormal basis of its complement. The sign avoids cancellation.
+    along = materialise(along)
+    mirror = along + jnp.where(along[0] < 0, -1.0, 1.0) * np.eye(5)[0][:, None]
+    vectors = jnp.concatenate([misfit, slopes[:2]])
+    share = jnp.sum(mirror * vectors, axis=1) / (0.5 * jnp.sum(mirror**2, axis=0))
+    remaining = (vectors - share[:, None] * mirror)[:, 1:]
+
+    # Four pixels give s^-4, their range integral s; the aperture's noise takes part in that integral.
+    log_scale = 3 * jnp.log(pixel_noise) - 0.5 * jnp.log1p(aperture_part / pixel_part)
+    log_scale += spots.has_aperture * jnp.log(aperture_noise)
+    return SpotResiduals(remaining[0].T, remaining[1:].transpose(2, 1, 0), log_scale * spots.valid, predicted.T)
+
+
+def stop_variances(stop_sd_rad: Float[Array, "2 2"], spots: SpotArrays) -> Float[Array, "spots 2"]:
+    """Variance of the stop errors (pan, tilt) that are new at each spot, by the direction of their move."""
+    return jnp.sum(spots.redraw_mix * stop_sd_rad**2, axis=2)
+
+
+class Innovations(eqx.Module):
+    """Standardised one-step prediction errors, N(0, 1) and independent under the model.
+
+    `log_density` is the campaign's log likelihood without the terms of `log_constant`.
+    """
+
+    standardised: Float[Array, "spots 4"]
+    log_density: Scalar
+
+
+def innovations(
+    model: Model, arrays: CampaignArrays, inflation: Scalar | float = 1.0, frozen: bool = False
+) -> Innovations:
+    """Run the filter over all spots in time order.
+
+    Args:
+        model: parameters.
+        arrays: the campaign.
+        inflation: factor on pixel and aperture noise (annealing).
+        frozen: see `spot_residuals`.
+
+    Returns:
+        Standardised innovations and log likelihood; cost linear in the number of spots.
+    """
+    spots = arrays.spots
+    angles = mirror_angles(model.transmission, model.tilt_zero_rad, arrays.moves)
+    inflation = jnp.asarray(inflation, dtype=float)
+    terms = spot_residuals(model, angles, arrays, inflation, frozen)
+    play_sd = angles.play_sd_rad[spots.move_index]
+    if frozen:
+        play_sd = jax.lax.stop_gradient(play_sd)
+    load = jnp.concatenate([terms.slope, terms.slope, terms.slope * play_sd[:, None]], axis=2)
+    stop_variance = stop_variances(model.noise.stop_sd_rad, spots)
+    home_variance = jnp.where(spots.homed, (HOME_SD_DEG * jnp.pi / 180) ** 2, 0.0)
+
+    def look(state, row):
+        mean, covariance = state
+        residual, load, redraw, stop_variance, new_segment, home_variance = row
+        segment = jnp.stack([new_segment, new_segment])
+        renewed = jnp.concatenate([redraw, segment, segment])
+        keep = jnp.where(renewed, 0.0, 1.0)
+        variance = jnp.concatenate([stop_variance, jnp.stack([home_variance, home_variance]), jnp.ones(2)])
+        mean = mean * keep
+        covariance = covariance * (keep[:, None] * keep) + jnp.diag(variance * (1 - keep))
+        errors, variances = [], []
+        # The remaining components have independent unit noise: four scalar updates, no matrix inverse.
+        for component in range(COMPONENTS):
+            # Sums instead of products: a call into a matrix library costs more than six numbers.
+            gain = jnp.sum(covariance * load[component], axis=1)
+            variance_ahead = 1 + jnp.sum(load[component] * gain)
+            error = residual[component] - jnp.sum(load[component] * mean)
+            mean = mean + gain * (error / variance_ahead)
+            covariance = covariance - gain[:, None] * (gain / variance_ahead)
+            errors.append(error / jnp.sqrt(variance_ahead))
+            variances.append(variance_ahead)
+        return (mean, covariance), (jnp.stack(errors), jnp.sum(jnp.log(jnp.stack(variances))))
+
+    start = (jnp.zeros(STATES), jnp.zeros((STATES, STATES)))
+    rows = (terms.residual, load, spots.redraw, stop_variance, spots.new_segment, home_variance)
+    _, (standardised, log_variance) = jax.lax.scan(look, start, rows)
+    log_density = jnp.sum(terms.log_scale) - 0.5 * jnp.sum(log_variance) - 0.5 * jnp.sum(standardised**2)
+    return Innovations(standardised, log_density)
+
+
+def log_density(z: Float[Array, " parameters"], space: ParameterSpace, arrays: CampaignArrays) -> Scalar:
+    """Log posterior density of the coordinates, up to a constant: likelihood and standard-normal priors."""
+    return innovations(space.model(z), arrays).log_density - 0.5 * jnp.dot(z, z)
+
+
+@eqx.filter_jit
+def density_and_gradient(
+    z: Float[Array, " parameters"], space: ParameterSpace, arrays: CampaignArrays
+) -> tuple[Scalar, Float[Array, " parameters"]]:
+    """`log_density` and its gradient; the one compiled function that the Newton steps and Hessians share."""
+    return jax.value_and_grad(log_density)(z, space, arrays)

@@ -1,0 +1,182 @@
+"""The parameter vector: one standard-normal coordinate per parameter, and the model it stands for.
+
+Every parameter of DESIGN 8 has a coordinate z with prior N(0, 1): normal priors are value + u z, half-normals
+u Phi^-1((1 + Phi(z)) / 2) (DESIGN 4.1: no boundary, no mirrored mode), log-normals value exp(u z); the 24 stereo
+parameters are mean + root z with root root^T their full covariance. u = 0 fixes a parameter whatever its z, so
+that one compiled function serves every choice of fixed parameters. Units are those of the names.
+"""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.scipy.special import ndtr, ndtri
+from jaxtyping import Array, Bool, Float, Int
+
+from tvsbayes.cameras import StereoCameras
+from tvsbayes.geometry import Scalar, Vector
+from tvsbayes.positioner import Optics, Transmission
+from tvsbayes.rigs import DECLARED_PRIORS, DEFAULT_PRIORS, STEREO_PARAMETER_NAMES, RigTable, Stereo
+
+NAMES: tuple[str, ...] = (*DEFAULT_PRIORS, *DECLARED_PRIORS, *STEREO_PARAMETER_NAMES)
+"""Contract names (DESIGN 8) in the order of the coordinates."""
+RIG_NAMES: tuple[str, ...] = (*DEFAULT_PRIORS, *DECLARED_PRIORS)
+NOISE_NAMES: tuple[str, ...] = (
+    *(f"stop_sd_deg.{direction}" for direction in ("left", "right", "up", "down")),
+    "pixel_scale",
+    "aperture_sd_deg",
+)
+"""Scales that the point estimate alternates with geometry and stereo (DESIGN 4.2)."""
+RECEIVER_NAMES: tuple[str, ...] = (
+    "baseline_mm",
+    "pan_zero_emission_deg",
+    "aperture_zero_deg",
+    "aperture_sd_deg",
+)
+"""Observable only through aperture readings."""
+
+INDEX: dict[str, int] = {name: index for index, name in enumerate(NAMES)}
+KINDS = ("normal", "half-normal", "log-normal")
+
+
+class Extrinsics(eqx.Module):
+    """T_SP: frame P to frame S, p_S = R(rotation) p_P + translation."""
+
+    rotation_rad: Vector
+    translation_mm: Vector
+
+
+class Receiver(eqx.Module):
+    """The rotating aperture: baseline a, emission angle C0 at pan angle 0, zero and sd of its readings."""
+
+    baseline_mm: Scalar
+    pan_zero_emission_rad: Scalar
+    aperture_zero_rad: Scalar
+    aperture_sd_rad: Scalar
+
+
+class Noise(eqx.Module):
+    """Stop standard deviations by [axis, (right/down, left/up)] and the factor on the stated pixel sds."""
+
+    stop_sd_rad: Float[Array, "2 2"]
+    pixel_scale: Scalar
+
+
+class Model(eqx.Module):
+    """Everything that the forward model and the likelihood need, in rad and mm."""
+
+    transmission: Transmission
+    optics: Optics
+    tilt_zero_rad: Scalar
+    extrinsics: Extrinsics
+    cameras: StereoCameras
+    receiver: Receiver
+    noise: Noise
+
+
+class ParameterSpace(eqx.Module):
+    """Priors of one rig as arrays; an argument of the jitted functions, never a constant in them."""
+
+    value: Float[Array, " rig"]
+    u: Float[Array, " rig"]
+    kind: Int[Array, " rig"]
+    stereo_mean: Float[Array, "24"]
+    stereo_root: Float[Array, "24 24"]
+
+    def physical(self, z: Float[Array, " parameters"]) -> Float[Array, " parameters"]:
+        """Coordinates -> values in the units of `NAMES`."""
+        rig_z, stereo_z = z[: len(RIG_NAMES)], z[len(RIG_NAMES) :]
+        half, log = self.kind == 1, self.kind == 2
+        # Unused branches are fed harmless numbers: `where` lets their infinities into the gradient.
+        w = jnp.where(half, rig_z, 0.0)
+        # 1 - (1 + Phi(w)) / 2 = Phi(-w) / 2 keeps its digits where Phi(w) rounds to 1.
+        half_normal = -self.u * ndtri(0.5 * ndtr(-w))
+        log_normal = self.value * jnp.exp(jnp.where(log, self.u, 0.0) * rig_z)
+        rig = jnp.where(half, half_normal, jnp.where(log, log_normal, self.value + self.u * rig_z))
+        return jnp.concatenate([rig, self.stereo_mean + self.stereo_root @ stereo_z])
+
+    def model(self, z: Float[Array, " parameters"]) -> Model:
+        """Coordinates -> model."""
+        return model_of(self.physical(z))
+
+
+RAD_NAMES = tuple(name for name in RIG_NAMES if "deg" in name)
+SCALE = np.array([np.pi / 180 if name in RAD_NAMES else 1.0 for name in NAMES])
+"""Contract units -> rad and mm."""
+
+
+def model_of(physical: Float[Array, " parameters"]) -> Model:
+    """Assemble the model from values in the units of `NAMES` (deg -> rad happens here and nowhere else)."""
+    values = physical * SCALE
+
+    def block(first: str, length: int):
+        return values[INDEX[first] : INDEX[first] + length]
+
+    def one(name: str):
+        return values[INDEX[name]]
+
+    intrinsics = jnp.reshape(block("stereo.left.fx", 18), (2, 9))
+    return Model(
+        transmission=Transmission(
+            ratio_rad_per_step=block("degrees_per_step.pan", 2),
+            contrast_rad_per_step=block("ratio_contrast_deg_per_step.pan", 2),
+            backlash_rad=block("backlash_deg.pan", 2),
+        ),
+        optics=Optics(
+            mirror_offset_mm=one("mirror_offset_mm"),
+            mirror1_error_rad=one("mirror1_error_deg"),
+            mirror2_error_rad=one("mirror2_error_deg"),
+            laser_tilt_rad=block("laser_tilt_deg.x", 2),
+            laser_offset_mm=block("laser_offset_mm.x", 2),
+            tilt_axis_skew_rad=one("tilt_axis_skew_deg"),
+            tilt_axis_offset_mm=block("tilt_axis_offset_mm.x", 2),
+        ),
+        tilt_zero_rad=one("tilt_zero_deg"),
+        extrinsics=Extrinsics(block("extrinsics.rotation_rad.x", 3), block("extrinsics.translation_mm.x", 3)),
+        cameras=StereoCameras(
+            focal_px=intrinsics[:, 0:2],
+            centre_px=intrinsics[:, 2:4],
+            radial=intrinsics[:, np.array([4, 5, 8])],
+            tangential=intrinsics[:, 6:8],
+            rotation_rad=block("stereo.rotation_rad.x", 3),
+            translation_mm=block("stereo.translation_mm.x", 3),
+            focal_scale=one("focal_scale"),
+        ),
+        receiver=Receiver(*block("baseline_mm", 4)),
+        noise=Noise(
+            stop_sd_rad=jnp.reshape(block("stop_sd_deg.left", 4), (2, 2))[:, ::-1],
+            pixel_scale=one("pixel_scale"),
+        ),
+    )
+
+
+def parameter_space(table: RigTable, stereo: Stereo) -> ParameterSpace:
+    """Priors of `[rig]` and of the stereo calibration as arrays."""
+    priors = [table.priors[name] for name in RIG_NAMES]
+    covariance = np.asarray(stereo.parameter_covariance, dtype=np.float64)
+    scale = np.sqrt(np.diag(covariance))
+    # Standard deviations span 1e-5 (rad) to 1 (px): the root is taken of the correlation matrix. Zero rows
+    # (fixed parameters) stay zero.
+    safe = np.where(scale > 0, scale, 1.0)
+    eigenvalues, vectors = np.linalg.eigh(covariance / np.outer(safe, safe))
+    # The symmetric root keeps coordinate j closest to parameter j.
+    root = scale[:, None] * (vectors * np.sqrt(np.clip(eigenvalues, 0.0, None))) @ vectors.T
+    with jax.enable_x64(True):
+        return ParameterSpace(
+            value=jnp.array([p.value for p in priors]),
+            u=jnp.array([p.u for p in priors]),
+            kind=jnp.array([KINDS.index(p.distribution) for p in priors]),
+            stereo_mean=jnp.asarray(stereo.vector),
+            stereo_root=jnp.asarray(root),
+        )
+
+
+def free_mask(space: ParameterSpace, has_aperture: bool) -> Bool[np.ndarray, " parameters"]:
+    """Parameters that are estimated: u > 0, and the receiver's only where there are aperture readings."""
+    rig = np.asarray(space.u) > 0
+    if not has_aperture:
+        rig[[INDEX[name] for name in RECEIVER_NAMES]] = False
+    stereo = np.abs(np.asarray(space.stereo_root)).sum(axis=1) > 0
+    return np.concatenate([rig, stereo])

@@ -1,0 +1,178 @@
+"""The positioner: commanded counters -> mirror angles -> laser beam (DESIGN 3.1 and 3.2).
+
+Frame P: z along the pan axis, up; x along the nominal beam at pan angle 0; y left; origin where the nominal
+laser meets mirror 1. Frame Q is P turned by the pan angle. mm and rad; pan positive = left, tilt positive = up.
+Arrays over axes are ordered (pan, tilt).
+"""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from tvsbayes.geometry import Scalar, along_batch, intersect_plane, materialise, reflect, rotate_about_z
+
+UNIFORM_SD = 1 / 12**0.5
+"""Standard deviation of a uniform distribution of unit width."""
+
+
+class Transmission(eqx.Module):
+    """Gears of both axes: mean ratio, left-minus-right (up-minus-down) contrast and play."""
+
+    ratio_rad_per_step: Float[Array, "2"]
+    contrast_rad_per_step: Float[Array, "2"]
+    backlash_rad: Float[Array, "2"]
+
+    def directional_ratio(self, positive: Bool[Array, "2"]) -> Float[Array, "2"]:
+        """Ratio of left and up moves (`positive`) or right and down moves, rad per step."""
+        return self.ratio_rad_per_step + jnp.where(positive, 0.5, -0.5) * self.contrast_rad_per_step
+
+
+class MoveArrays(eqx.Module):
+    """Moves of a campaign, padded; `approach` is +1 left/up, -1 right/down, 0 unknown, read at `first` rows."""
+
+    steps: Float[Array, "moves 2"]
+    first: Bool[Array, " moves"]
+    approach: Float[Array, "moves 2"]
+
+
+class MirrorAngles(eqx.Module):
+    """Mirror angles after each move, without stop error and home offset.
+
+    Where the approach of a segment's first row is unknown the play may lie anywhere in its band: `angle_rad`
+    is then the middle of the possible angles and `play_sd_rad` the standard deviation of a uniform
+    distribution over them (zero as soon as a move has taken the play up).
+    """
+
+    angle_rad: Float[Array, "moves 2"]
+    play_sd_rad: Float[Array, "moves 2"]
+
+
+def play(angle_rad: Array, input_rad: Array, backlash_rad: Array) -> Array:
+    """Play operator: the output stays until the input drags it along (DESIGN 3.1)."""
+    return jnp.clip(angle_rad, input_rad - backlash_rad / 2, input_rad + backlash_rad / 2)
+
+
+def mirror_angles(transmission: Transmission, tilt_zero_rad: Scalar, moves: MoveArrays) -> MirrorAngles:
+    """Follow the counters through gears and play.
+
+    Args:
+        transmission: gears of both axes.
+        tilt_zero_rad: tilt mirror angle at mid-play and counter zero.
+        moves: absolute counters in time order.
+
+    Returns:
+        Mirror angles (pan, tilt) after each move.
+    """
+    half = transmission.backlash_rad / 2
+
+    def after_move(state, move):
+        previous_steps, q, low, high = state
+        steps, first, approach = move
+        delta = steps - previous_steps
+        q_moved = q + transmission.directional_ratio(delta > 0) * delta
+        q_homed = transmission.ratio_rad_per_step * steps
+        q = jnp.where(first, q_homed, q_moved)
+        # Play is monotone in its state: the two ends of the band bound every history in between.
+        low = jnp.where(first, jnp.where(approach < 0, q + half, q - half), jnp.clip(low, q - half, q + half))
+        high = jnp.where(first, jnp.where(approach > 0, q - half, q + half), jnp.clip(high, q - half, q + half))
+        return (steps, q, low, high), (0.5 * (low + high), UNIFORM_SD * (high - low))
+
+    zero = jnp.zeros(2)
+    _, (angle_rad, play_sd_rad) = jax.lax.scan(
+        after_move, (zero, zero, zero, zero), (moves.steps, moves.first, moves.approach)
+    )
+    return MirrorAngles(angle_rad + jnp.stack([jnp.zeros(()), tilt_zero_rad]), play_sd_rad)
+
+
+class Optics(eqx.Module):
+    """Laser and the two mirrors, with every deviation from the nominal 45-degree chain (DESIGN 3.2)."""
+
+    mirror_offset_mm: Scalar
+    mirror1_error_rad: Scalar
+    mirror2_error_rad: Scalar
+    laser_tilt_rad: Float[Array, "2"]
+    laser_offset_mm: Float[Array, "2"]
+    tilt_axis_skew_rad: Scalar
+    tilt_axis_offset_mm: Float[Array, "2"]
+
+
+class Beam(eqx.Module):
+    """Rays in frame P: they leave mirror 2 at `origin_mm` along the unit vectors `direction`."""
+
+    origin_mm: Float[Array, "3 *batch"]
+    direction: Float[Array, "3 *batch"]
+
+
+def beam(optics: Optics, pan_rad: Float[Array, "*batch"], tilt_rad: Float[Array, "*batch"]) -> Beam:
+    """Trace the laser over both mirrors (DESIGN 3.2; the signs are part of the contract).
+
+    Args:
+        optics: laser and mirrors.
+        pan_rad: angles psi of the pan stage.
+        tilt_rad: angles beta of the tilt stage.
+
+    Returns:
+        The rays in frame P.
+    """
+    zero, one = jnp.zeros(()), jnp.ones(())
+    tangents = jnp.tan(optics.laser_tilt_rad)
+    laser = jnp.concatenate([tangents, -one[None]]) / jnp.sqrt(1 + jnp.dot(tangents, tangents))
+    laser_origin = jnp.concatenate([optics.laser_offset_mm, zero[None]])
+    # The laser stands still in P; in the pan stage's frame Q it turns backwards.
+    laser, laser_origin = materialise(
+        (
+            rotate_about_z(-pan_rad, along_batch(laser, pan_rad)),
+            rotate_about_z(-pan_rad, along_batch(laser_origin, pan_rad)),
+        )
+    )
+
+    mirror1 = jnp.pi / 4 + optics.mirror1_error_rad
+    normal1 = along_batch(jnp.stack([zero, -jnp.sin(mirror1), jnp.cos(mirror1)]), pan_rad)
+    hit1 = intersect_plane(laser_origin, laser, jnp.zeros_like(normal1), normal1)
+    between = reflect(laser, normal1)
+    hit1, between = materialise((hit1, between))
+
+    ax, az = optics.tilt_axis_offset_mm
+    centre = along_batch(jnp.stack([ax, -optics.mirror_offset_mm, az]), pan_rad)
+    sin_skew, cos_skew = jnp.sin(optics.tilt_axis_skew_rad), jnp.cos(optics.tilt_axis_skew_rad)
+    mirror2 = jnp.pi / 4 + optics.mirror2_error_rad
+    ahead = jnp.sin(mirror2) * jnp.array([1.0, 0.0, 0.0])
+    above = jnp.sin(mirror2) * jnp.stack([zero, -sin_skew, cos_skew])
+    axial = jnp.cos(mirror2) * jnp.stack([zero, cos_skew, sin_skew])
+    ahead, above, axial = (along_batch(v, pan_rad) for v in (ahead, above, axial))
+    normal2 = materialise(jnp.cos(tilt_rad) * ahead + jnp.sin(tilt_rad) * above + axial)
+    hit2 = materialise(intersect_plane(hit1, between, centre, normal2))
+    outgoing = materialise(reflect(between, normal2))
+    return Beam(*materialise((rotate_about_z(pan_rad, hit2), rotate_about_z(pan_rad, outgoing))))
+
+
+class BeamAngles(eqx.Module):
+    """Azimuth atan2(d_y, d_x) and elevation asin(d_z) of the beam in frame P with their Jacobian.
+
+    `jacobian[i, j]` is d(azimuth, elevation)_i / d(pan, tilt)_j. `effective_mirror_offset_mm` is the signed
+    distance of the beam line from the pan axis: the horizontal moment d_y o_x - d_x o_y over |d_xy|, +L for
+    the nominal chain.
+    """
+
+    azimuth_rad: Scalar
+    elevation_rad: Scalar
+    jacobian: Float[Array, "2 2"]
+    effective_mirror_offset_mm: Scalar
+
+
+def beam_angles(optics: Optics, pan_rad: Scalar, tilt_rad: Scalar) -> BeamAngles:
+    """Direction of the beam and its local slope against the mirror angles at one pose (DESIGN 3.2)."""
+
+    def azimuth_elevation(angles):
+        d = beam(optics, angles[0], angles[1]).direction
+        return jnp.stack([jnp.arctan2(d[1], d[0]), jnp.arctan2(d[2], jnp.hypot(d[0], d[1]))])
+
+    pose = jnp.stack([pan_rad, tilt_rad])
+    azimuth, elevation = azimuth_elevation(pose)
+    ray = beam(optics, pan_rad, tilt_rad)
+    o, d = ray.origin_mm, ray.direction
+    offset = (d[1] * o[0] - d[0] * o[1]) / jnp.hypot(d[0], d[1])
+    return BeamAngles(azimuth, elevation, jax.jacfwd(azimuth_elevation)(pose), offset)

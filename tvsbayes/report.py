@@ -1,0 +1,193 @@
+"""What people and programs get to see of an estimate: text tables, `value(u)`, the files in `results/`.
+
+Formats only; every number is computed elsewhere. Units are those of DESIGN 8.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import math
+import shlex
+import sys
+from importlib.metadata import version
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from tvsbayes.campaign import input_hashes
+from tvsbayes.classic import DIRECTIONS, ClassicResult
+from tvsbayes.files import make_folder, write_atomically
+
+if TYPE_CHECKING:
+    from tvsbayes.information import Estimate, FitSummary
+    from tvsbayes.joint import JointFit
+
+FIT_FORMAT = "tvsbayes-fit/1"
+KEY_PARAMETERS = (
+    ("backlash_deg.pan", "backlash pan", "deg"),
+    ("backlash_deg.tilt", "backlash tilt", "deg"),
+    ("effective_mirror_offset_mm", "mirror offset (effective)", "mm"),
+    ("mirror_offset_mm", "mirror offset L", "mm"),
+    ("extrinsics.rotation_rad.x", "extrinsics rotation x", "rad"),
+    ("extrinsics.rotation_rad.y", "extrinsics rotation y", "rad"),
+    ("extrinsics.rotation_rad.z", "extrinsics rotation z", "rad"),
+    ("extrinsics.translation_mm.x", "extrinsics translation x", "mm"),
+    ("extrinsics.translation_mm.y", "extrinsics translation y", "mm"),
+    ("extrinsics.translation_mm.z", "extrinsics translation z", "mm"),
+    ("stop_sd_deg.left", "stop sd left", "deg"),
+    ("stop_sd_deg.right", "stop sd right", "deg"),
+    ("stop_sd_deg.up", "stop sd up", "deg"),
+    ("stop_sd_deg.down", "stop sd down", "deg"),
+    ("pixel_scale", "pixel noise / stated", ""),
+)
+
+
+def concise(value: float, sd: float) -> str:
+    """`0.059394(81)`: the standard uncertainty's two digits in units of the last place (GUM 7.2.2).
+
+    From 1 on the uncertainty keeps its decimal point, as in `21.3(1.5)`.
+    """
+    if not 0 < sd < math.inf:
+        return f"{value:.6g}"
+    # Of the rounded sd: 0.0996 has the digits 10, not 100.
+    mantissa, exponent = f"{sd:.1e}".split("e")
+    decimals = max(0, 1 - int(exponent))
+    digits = mantissa.replace(".", "") if int(exponent) < 0 else f"{float(f'{sd:.1e}'):.{decimals}f}"
+    return f"{value:.{decimals}f}({digits})"
+
+
+def interval_text(low: float, high: float, sd: float) -> str:
+    """Interval ends to one digit more than the standard uncertainty's second."""
+    decimals = max(0, 2 - math.floor(math.log10(sd))) if sd > 0 else 6
+    return f"[{low:.{decimals}f}, {high:.{decimals}f}]"
+
+
+def text_table(title: str, columns: list[str], rows: list[list[str]]) -> str:
+    """A table without lines, for terminals and files alike."""
+    table = Table(title=title, title_justify="left", title_style="", box=None, pad_edge=False)
+    for number, column in enumerate(columns):
+        table.add_column(column, justify="left" if number == 0 else "right", no_wrap=True)
+    for row in rows:
+        table.add_row(*(Text(cell) for cell in row))
+    stream = io.StringIO()
+    # Plain text whatever FORCE_COLOR and the like say: it also goes into files.
+    Console(file=stream, width=120, highlight=False, color_system=None, force_terminal=False).print(table)
+    return "\n".join(line.rstrip() for line in stream.getvalue().splitlines())
+
+
+def classic_text(result: ClassicResult) -> str:
+    """The classic estimator's table."""
+    rows = []
+    for direction in DIRECTIONS:
+        r = result.directions[direction]
+        if r is None:
+            rows.append([direction, "0", "no experiment", "", "", ""])
+            continue
+        optional = (r.sd_deg_per_step, r.u_type_a_deg_per_step)
+        sd, u = ("-" if x is None else f"{x:.6f}" for x in optional)
+        gum = "-" if r.interval95_gum is None else interval_text(*r.interval95_gum, r.u_gum_deg_per_step)
+        rows.append([direction, str(r.n), f"{r.mean_deg_per_step:.6f}", sd, u, gum])
+    columns = ["direction", "n", "mean deg/step", "sd", "u type A", "95 % interval (GUM)"]
+    return text_table("classic four-point estimator", columns, rows)
+
+
+def estimate_row(label: str, estimate: Estimate | None, unit: str) -> list[str]:
+    """Cells of one quantity: value(u), unit, interval, and whether data or prior set it."""
+    if estimate is None:
+        return [label, "never moved", unit, "", ""]
+    origin = "fixed" if estimate.contraction is None else ("data" if estimate.informed else "prior")
+    interval = interval_text(*estimate.interval95, estimate.sd)
+    return [label, concise(estimate.value, estimate.sd), unit, interval, origin]
+
+
+def fit_text(summary: FitSummary) -> str:
+    """The joint estimator's table and everything the reader must know about it."""
+    pose = summary.reference_pose_deg
+    rows = [estimate_row(f"effective {d}", summary.effective[d], "deg/step") for d in DIRECTIONS]
+    for axis, label in (("pan", "left - right"), ("tilt", "up - down")):
+        if summary.contrasts[axis] is not None:
+            rows.append(estimate_row(label, summary.contrasts[axis], "deg/step"))
+    rows += [estimate_row(label, summary.parameters[name], unit) for name, label, unit in KEY_PARAMETERS]
+    title = f"joint estimator (Laplace) at pan {pose['pan']:.2f} deg, tilt {pose['tilt']:.2f} deg"
+    lines = [text_table(title, ["quantity", "value(u)", "unit", "95 % interval", "set by"], rows)]
+    lines.append(f"chi2 {summary.chi2:.1f} for {summary.dof:.1f} degrees of freedom")
+    lines += [f"weak: {weak.text}" for weak in summary.weak_directions]
+    lines += [f"leverage: {entry.text}" for entry in summary.leverage]
+    if summary.excluded_spots:
+        lines.append(f"excluded spots: {', '.join(map(str, summary.excluded_spots))}")
+    if summary.suspect_spots:
+        listed = ", ".join(map(str, summary.suspect_spots[:20]))
+        lines.append(f"spots that disagree with all others: {listed}; look at them, or fit with --robust")
+    return "\n".join(lines)
+
+
+def demo_text(classic_result: ClassicResult, summary: FitSummary, truth: dict[str, float]) -> str:
+    """Both estimators beside the truth of a simulated campaign."""
+
+    def holds(interval, true):
+        return "-" if interval is None else ("yes" if interval[0] <= true <= interval[1] else "NO")
+
+    rows = []
+    for direction in DIRECTIONS:
+        c, j = classic_result.directions[direction], summary.effective[direction]
+        if c is None or j is None:
+            continue
+        true = truth[direction]
+        shown = concise(c.mean_deg_per_step, c.u_type_a_deg_per_step or 0.0)
+        cells = [direction, shown, holds(c.interval95_type_a, true), concise(j.value, j.sd)]
+        rows.append([*cells, holds(j.interval95, true), f"{true:.6f}"])
+    columns = ["deg/step", "classic, type A", "holds truth", "joint", "holds truth", "truth"]
+    ratios = text_table("degrees of beam per motor step, value(u)", columns, rows)
+    rows = []
+    for name, label, unit in KEY_PARAMETERS[:3]:
+        e, true = summary.parameters[name], truth[name]
+        rows.append([f"{label}, {unit}", concise(e.value, e.sd), holds(e.interval95, true), f"{true:.4f}"])
+    others = text_table("what the classic estimator cannot see", ["", "joint", "holds truth", "truth"], rows)
+    return f"{ratios}\n\n{others}"
+
+
+def fit_document(fit: JointFit, summary: FitSummary, seed: int) -> dict[str, object]:
+    """The content of `results/fit.json` (DESIGN 7): estimates, covariance with names, provenance."""
+    names = list(summary.parameters)
+    packages = ("tvsbayes", "jax", "optimistix", "equinox", "numpy", "scipy", "opencv-python-headless")
+    estimated = [index for index, name in enumerate(fit.names) if name in names]
+    covariance = np.cov(fit.draws.physical[:, estimated], rowvar=False)
+    return {
+        "format": FIT_FORMAT,
+        **summary.as_json(),
+        "covariance": {"names": [fit.names[i] for i in estimated], "matrix": covariance.tolist()},
+        "inputs": input_hashes(fit.campaign),
+        "versions": {"python": sys.version.split()[0], **{name: version(name) for name in packages}},
+        "seed": seed,
+        "command": shlex.join(["tvsbayes", *sys.argv[1:]]),
+    }
+
+
+def write_results(fit: JointFit, summary: FitSummary, folder: Path, seed: int) -> dict[str, str]:
+    """Write `fit.json` and `draws.npz`, each whole or not at all.
+
+    Returns:
+        Paths by "fit" and "draws".
+
+    Raises:
+        InputError: the folder cannot be written.
+    """
+    buffer = io.BytesIO()
+    np.savez_compressed(
+        buffer,
+        names=np.array(fit.names),
+        physical=fit.draws.physical,
+        effective_deg_per_step=fit.draws.effective_deg_per_step,
+        reference_pose_rad=fit.reference_pose_rad,
+    )
+    document = json.dumps(fit_document(fit, summary, seed), indent=1, allow_nan=False)
+    contents = {"draws": ("draws.npz", buffer.getvalue()), "fit": ("fit.json", document.encode())}
+    make_folder(folder)
+    for name, data in contents.values():
+        write_atomically(folder / name, data)
+    return {key: str(folder / name) for key, (name, _) in contents.items()}
