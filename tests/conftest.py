@@ -7,6 +7,11 @@ pyproject.toml has every array checked against its annotation (jaxtyping's impor
 
 from __future__ import annotations
 
+import os
+
+# Before NumPy is imported: OpenBLAS' waiting threads would take the time of XLA's (see `tvsbayes.cli.main`).
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any

@@ -10,8 +10,8 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-
 from small_campaign import small_campaign
+
 from tvsbayes.campaign import input_hashes
 from tvsbayes.classic import ClassicResult, DirectionResult
 from tvsbayes.files import InputError
@@ -120,6 +120,7 @@ def small_summary() -> FitSummary:
         classic_predicted=dict.fromkeys(("left", "right", "up", "down")),
         excluded_spots=(17,),
         suspect_spots=tuple(range(30)),
+        prior_conflicts=(),
     )
 
 

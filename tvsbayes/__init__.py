@@ -4,16 +4,19 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from tvsbayes.campaign import read_campaign as read_campaign
-
 if TYPE_CHECKING:
+    from tvsbayes.campaign import read_campaign as read_campaign
     from tvsbayes.joint import fit as fit
 
 __all__ = ["fit", "read_campaign"]
 
 
 def __getattr__(name: str) -> object:
-    """Load what is asked for when it is first asked for: the estimator brings JAX."""
+    """Load what is asked for when it is first asked for: readers bring NumPy, the estimator brings JAX."""
+    if name == "read_campaign":
+        from tvsbayes.campaign import read_campaign
+
+        return read_campaign
     if name == "fit":
         from tvsbayes.joint import fit
 

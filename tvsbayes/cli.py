@@ -7,6 +7,7 @@ Heavy modules are imported inside the commands that need them; `tvsbayes --help`
 from __future__ import annotations
 
 import json
+import os
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -27,6 +28,7 @@ from tvsbayes.files import (
 if TYPE_CHECKING:
     from tvsbayes.information import FitSummary
 
+INTERRUPTED = 130
 DEMO_NOTE = "The twin's move history is our assumption, made so that the classic answer is the paper's Table 1."
 
 app = typer.Typer(
@@ -252,7 +254,8 @@ def run(arguments: list[str]) -> int:
     """Run one command and return its exit code; no traceback reaches a user."""
     wants_json = "--json" in arguments
     try:
-        app(arguments, prog_name="tvsbayes", standalone_mode=False)
+        # Typer returns the code of its own Exit, into which it also turns Ctrl-C; commands return None.
+        code = app(arguments, prog_name="tvsbayes", standalone_mode=False) or 0
     except TvsError as error:
         if wants_json:
             print_json(_error_document(error))
@@ -264,8 +267,7 @@ def run(arguments: list[str]) -> int:
     except typer.Exit as ending:
         return ending.exit_code
     except (KeyboardInterrupt, typer.Abort):
-        report_line("interrupted")
-        return 130
+        code = INTERRUPTED
     except Exception as error:
         # Wrong options are bad input like any other; typer's own classes carry the text to show.
         if not hasattr(error, "format_message"):
@@ -275,9 +277,14 @@ def run(arguments: list[str]) -> int:
         else:
             error.show()
         return InputError.exit_code
-    return 0
+    if code == INTERRUPTED:
+        report_line("interrupted")
+    return code
 
 
 def main() -> None:
     """Entry point of the `tvsbayes` script."""
+    # Read when NumPy is first imported. The matrices here are small: OpenBLAS' second thread only waits, and its
+    # busy waiting doubles the time of XLA's threads (`experiments/speed.md`).
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     sys.exit(run(sys.argv[1:]))

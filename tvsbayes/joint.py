@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Float
 from scipy import optimize, stats
 
 from tvsbayes.campaign import Campaign
-from tvsbayes.files import NothingToEstimate
+from tvsbayes.files import NotConverged, NothingToEstimate
 from tvsbayes.geometry import Scalar
 from tvsbayes.likelihood import (
     CampaignArrays,
@@ -29,16 +29,16 @@ from tvsbayes.likelihood import (
     spot_residuals,
     stop_variances,
 )
-from tvsbayes.parameters import NAMES, NOISE_NAMES, ParameterSpace, free_mask, parameter_space
+from tvsbayes.parameters import INDEX, NAMES, NOISE_NAMES, ParameterSpace, free_mask, parameter_space
 from tvsbayes.positioner import beam_angles, mirror_angles
 from tvsbayes.rigs import HOME_SD_DEG, Prior, RigTable
-from tvsbayes.solver import levenberg_marquardt
+from tvsbayes.solver import NEWTON_STEP, Mode, laplace_draws, levenberg_marquardt, newton_mode
 from tvsbayes.stops import LinearSpots, StopInformation, leave_one_out_chi2, stop_information
 
 ANNEALING = (60.0, 10.0, 2.0, 1.0)
 """Factors on the pixel noise before it takes its own value: plain Levenberg-Marquardt from the nominal rig goes
 astray when the extrinsics are off by 0.3 rad and 60 mm (DESIGN 4.2)."""
-STAGE_TOLERANCE = 1e-3
+STAGE_TOLERANCE = 1e-2
 STAGE_STEPS = 12
 """Levenberg-Marquardt only has to reach the basin: its frozen Jacobian (`spot_residuals`) is not exact at the level
 of the noise, where it would stall; the Newton steps on the full density finish the work."""
@@ -46,17 +46,12 @@ SMALLEST_CAMPAIGN = 8
 """Spots below which no fit is tried: two beams at two depths, seen before and after one move on each axis."""
 NOISE_SETTLED = 0.05
 """Change of every noise coordinate (prior sds) below which the alternation stops: half a posterior sd."""
-NEWTON_STEP = 1e-4
-"""Finite-difference step of the Hessian in posterior standard deviations: third derivatives are of order one
-there, so the error is 1e-4; the gradient's rounding (1e-9) is amplified to 1e-5."""
-NEWTON_SETTLED = 1e-8
-"""Squared Newton step, in posterior sds, at which the mode is reached."""
-HESSIAN_KEPT = 0.1
-"""The Hessian is taken anew if the mode moved farther than this many sds since it was computed."""
 CONTRASTS = ("ratio_contrast_deg_per_step.pan", "ratio_contrast_deg_per_step.tilt")
-LAPLACE_DRAWS = 2048
 NORMAL_95 = 1.959963984540054
 """Two-sided 95 % quantile of the normal distribution."""
+MISFIT_LIMIT = 6.0
+"""Prior sds of the pixel scale (a factor 20 by default) beyond which the mode explains no spot: a wrong basin, swapped
+cameras or wrong counters, not noise."""
 GATE_PROBABILITY = 1e-6
 """A clean spot is excluded by the robust option with this probability."""
 HUBER_CORE = 0.8214
@@ -205,16 +200,6 @@ class JointFit:
         return NAMES
 
 
-@dataclass(frozen=True)
-class Mode:
-    """Outcome of the Newton steps: `covariance` is the inverse Hessian over all coordinates."""
-
-    z: np.ndarray
-    covariance: np.ndarray
-    negative_log_density: float
-    problems: tuple[str, ...]
-
-
 class Problem:
     """One campaign in front of the compiled functions."""
 
@@ -292,67 +277,15 @@ class Problem:
             move=spots.move_index,
         )
 
-    def newton(self, z: np.ndarray) -> Mode:
-        """Newton steps on the full density, in coordinates whitened by the information at the start."""
-        free = np.flatnonzero(self.free)
-        value, slope = self.objective(z)
-        curvature = stop_information(self.linear_spots(z)[1]).fisher + np.eye(len(NAMES))
+    def curvature(self, z: np.ndarray) -> np.ndarray:
+        """Expected information of the coordinates: Fisher's of geometry and stereo, measured for the noise."""
+        value = stop_information(self.linear_spots(z)[1]).fisher + np.eye(len(NAMES))
+        slope = self.objective(z)[1]
         for index in self.noise:
-            nudge = np.zeros(len(NAMES))
-            nudge[index] = NEWTON_STEP
-            curvature[index, index] = max(1.0, (self.objective(z + nudge)[1] - slope)[index] / NEWTON_STEP)
-        root = np.linalg.inv(np.linalg.cholesky(curvature[np.ix_(free, free)])).T
-        problems: list[str] = []
-        for _ in range(6):
-            start = z
-            columns = []
-            for column in root.T:
-                nudged = z.copy()
-                nudged[free] += NEWTON_STEP * column
-                columns.append((self.objective(nudged)[1] - slope)[free] / NEWTON_STEP)
-            hessian = root.T @ np.stack(columns, axis=1)
-            eigenvalues, vectors = np.linalg.eigh(0.5 * (hessian + hessian.T))
-            # Far from the mode the density may be flat or convex along a direction: step by the expected scale.
-            inverse = (vectors / np.maximum(np.abs(eigenvalues), 0.1)) @ vectors.T
-            settled = False
-            for _ in range(12):
-                step = -inverse @ (root.T @ slope[free])
-                if step @ step < NEWTON_SETTLED:
-                    settled = True
-                    break
-                for halving in range(12):
-                    trial = z.copy()
-                    trial[free] += root @ step / 2**halving
-                    trial_value, trial_slope = self.objective(trial)
-                    if np.isfinite(trial_value) and trial_value < value + 1e-9 * abs(value):
-                        break
-                else:
-                    break
-                z, value, slope = trial, trial_value, trial_slope
-            root_inverse_move = np.linalg.solve(root, (z - start)[free])
-            if settled and np.linalg.norm(root_inverse_move) < HESSIAN_KEPT:
-                break
-            root = root @ (vectors / np.sqrt(np.maximum(np.abs(eigenvalues), 0.1))) @ vectors.T
-        else:
-            problems.append("the Newton steps on the full density did not settle")
-        if eigenvalues[0] <= 0:
-            problems.append("the density has no maximum here: its Hessian is not negative definite")
-        whitened = (vectors / np.maximum(eigenvalues, 1e-3)) @ vectors.T
-        covariance = np.eye(len(NAMES))
-        covariance[np.ix_(free, free)] = root @ whitened @ root.T
-        return Mode(z, covariance, value, tuple(problems))
-
-
-def laplace_draws(z: np.ndarray, covariance: np.ndarray, seed: int) -> np.ndarray:
-    """Normal draws whose sample mean and covariance are exactly the given ones.
-
-    Antithetic pairs fix the mean, a Cholesky factor of the sample covariance fixes the rest: standard deviations of
-    linear quantities then carry no Monte Carlo error.
-    """
-    half = np.random.default_rng(seed).standard_normal((LAPLACE_DRAWS // 2, z.size))
-    normal = np.concatenate([half, -half])
-    normal = normal @ np.linalg.inv(np.linalg.cholesky(normal.T @ normal / len(normal))).T
-    return z + normal @ np.linalg.cholesky(covariance).T
+            nudged = z.copy()
+            nudged[index] += NEWTON_STEP
+            value[index, index] = max(1.0, (self.objective(nudged)[1] - slope)[index] / NEWTON_STEP)
+        return value
 
 
 def _chi2_quantile(readings: np.ndarray, probability: float) -> np.ndarray:
@@ -410,7 +343,8 @@ def fit(campaign: Campaign, *, robust: bool = False, per_axis: bool = False, see
         Mode, Laplace approximation and diagnostics; look at `converged` before using it.
 
     Raises:
-        NothingToEstimate: if the campaign has fewer than `SMALLEST_CAMPAIGN` usable spots or no move.
+        NothingToEstimate: if the campaign has fewer than `SMALLEST_CAMPAIGN` usable spots.
+        NotConverged: if the fit diverged; a fit that ended badly is returned with `converged` False.
     """
     spots = ordered_spots(campaign)
     if len(spots) < SMALLEST_CAMPAIGN:
@@ -437,7 +371,13 @@ def fit(campaign: Campaign, *, robust: bool = False, per_axis: bool = False, see
                 if change < 0.02:
                     break
                 z = problem.alternate(z)
-        mode = problem.newton(z)
+        if not np.all(np.isfinite(problem.objective(z)[1])):
+            raise NotConverged(
+                "diverged",
+                "the fit left the region where the model is finite",
+                remedy="check for swapped cameras or wrong counters, or state the extrinsics better in [rig.prior]",
+            )
+        mode = newton_mode(problem.objective, z, problem.free, problem.curvature(z))
         return _result(campaign, problem, mode, used, seed)
 
 
@@ -461,6 +401,10 @@ def _result(campaign: Campaign, problem: Problem, mode: Mode, used: np.ndarray, 
         jnp.asarray(pose),
     )
     ids = np.array([s.spot for s in problem.spots])
+    problems = mode.problems
+    misfit = float(at_mode_and_draws.physical[0, INDEX["pixel_scale"]])
+    if mode.z[INDEX["pixel_scale"]] > MISFIT_LIMIT:
+        problems += (f"the spots miss the fitted beams by {misfit:.0f} times their stated uncertainty",)
     return JointFit(
         campaign=campaign,
         space=problem.space,
@@ -480,6 +424,6 @@ def _result(campaign: Campaign, problem: Problem, mode: Mode, used: np.ndarray, 
         ends95=np.asarray(ends.physical)[:2],
         excluded_spots=tuple(int(i) for i in ids[~used]),
         suspect_spots=tuple(int(i) for i in ids[suspect]),
-        converged=not mode.problems,
-        problems=mode.problems,
+        converged=not problems,
+        problems=problems,
     )

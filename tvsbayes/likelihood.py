@@ -11,6 +11,8 @@ in units of its standard deviation.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -31,7 +33,7 @@ from tvsbayes.geometry import (
 )
 from tvsbayes.parameters import Model, ParameterSpace, Receiver
 from tvsbayes.positioner import MirrorAngles, MoveArrays, beam, mirror_angles
-from tvsbayes.rigs import HOME_SD_DEG, RigTable
+from tvsbayes.rigs import HOME_SD_DEG
 
 SMALLEST_BUCKET = 512
 """Spots and moves are padded to this size or the next power of two above it: campaigns of ordinary size
@@ -106,27 +108,41 @@ def _stop_mix(sign: int) -> tuple[float, float]:
     return (0.5, 0.5) if sign == 0 else (float(sign < 0), float(sign > 0))
 
 
-def _redraws(moves: tuple[Move, ...], spots: list[Spot]) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Which stop errors are new at each spot, from which direction, and where segments begin."""
+@dataclass(frozen=True)
+class Redraws:
+    """Which states are new at each spot, arrays over spots; fields as in `SpotArrays`."""
+
+    redraw: np.ndarray
+    redraw_mix: np.ndarray
+    new_segment: np.ndarray
+    homed: np.ndarray
+
+
+def redraws(moves: tuple[Move, ...], spots: list[Spot]) -> Redraws:
+    """Follow the moves between spots: an axis' stop error is new once its own counter has changed (DESIGN 3.1)."""
     count = len(spots)
-    redraw, mix = np.zeros((count, 2), dtype=bool), np.zeros((count, 2, 2))
-    new_segment, homed = np.zeros(count, dtype=bool), np.zeros(count, dtype=bool)
+    new = Redraws(
+        redraw=np.zeros((count, 2), dtype=bool),
+        redraw_mix=np.zeros((count, 2, 2)),
+        new_segment=np.zeros(count, dtype=bool),
+        homed=np.zeros(count, dtype=bool),
+    )
     seen = -1
     for row, spot in enumerate(spots):
         for index in range(seen + 1, spot.move + 1):
             move = moves[index]
             if move.pan_approach:
                 signs = (APPROACH_SIGN[move.pan_approach], APPROACH_SIGN[move.tilt_approach])
-                redraw[row], mix[row] = True, [_stop_mix(s) for s in signs]
-                new_segment[row], homed[row] = True, move.segment > 0
+                new.redraw[row], new.redraw_mix[row] = True, [_stop_mix(s) for s in signs]
+                new.new_segment[row], new.homed[row] = True, move.segment > 0
                 continue
             previous = moves[index - 1]
             deltas = (move.pan_steps - previous.pan_steps, move.tilt_steps - previous.tilt_steps)
             for axis, delta in enumerate(deltas):
                 if delta:
-                    redraw[row, axis], mix[row, axis] = True, _stop_mix(delta)
+                    new.redraw[row, axis], new.redraw_mix[row, axis] = True, _stop_mix(delta)
         seen = spot.move
-    return redraw, mix, new_segment, homed
+    return new
 
 
 def pixel_covariance(spot: Spot) -> np.ndarray:
@@ -158,7 +174,7 @@ def campaign_arrays(campaign: Campaign) -> CampaignArrays:
     pixels = np.array([(s.u_left_px, s.v_left_px, s.u_right_px, s.v_right_px) for s in spots])
     covariance = np.stack([pixel_covariance(s) for s in spots])
     whitening = np.linalg.inv(np.linalg.cholesky(covariance))
-    redraw, mix, new_segment, homed = _redraws(campaign.moves, spots)
+    new = redraws(campaign.moves, spots)
     aperture = [np.nan if s.aperture_deg is None else s.aperture_deg for s in spots]
     with jax.enable_x64(True):
         spot_arrays = SpotArrays(
@@ -170,17 +186,17 @@ def campaign_arrays(campaign: Campaign) -> CampaignArrays:
             triangulated_mm=padded(triangulate(campaign.stereo, pixels), (3,), (500.0, 0.0, 0.0)),
             valid=padded(1.0, ()),
             weight=padded(1.0, (), 1.0),
-            redraw=padded(redraw, (2,), False, bool),
-            redraw_mix=padded(mix, (2, 2)),
-            new_segment=padded(new_segment, (), False, bool),
-            homed=padded(homed, (), False, bool),
+            redraw=padded(new.redraw, (2,), False, bool),
+            redraw_mix=padded(new.redraw_mix, (2, 2)),
+            new_segment=padded(new.new_segment, (), False, bool),
+            homed=padded(new.homed, (), False, bool),
         )
         return CampaignArrays(
             move_arrays(campaign.moves), spot_arrays, jnp.asarray(campaign.rig.aperture_convention == "azimuth")
         )
 
 
-def log_constant(campaign: Campaign, table: RigTable) -> float:
+def log_constant(campaign: Campaign) -> float:
     """Terms of the log likelihood that no parameter changes: 2 pi and the stated pixel covariances."""
     spots = ordered_spots(campaign)
     readings = sum(s.aperture_deg is not None for s in spots)

@@ -24,8 +24,9 @@ PAN_RANGE_STEPS = (0, 200)
 TILT_RANGE_STEPS = (-100, 100)
 NEAREST_SHEET_MM, FARTHEST_SHEET_MM = 20.0, 100_000.0
 """Depths between which a sheet can stand: nearer than a lens barrel, or beyond a hall, is a mismatched pair."""
-INSEPARABLE = 0.9
-"""Correlation of ratio and backlash above which four fifths of the ratio's variance is exchange with the backlash."""
+INSEPARABLE, INSEPARABLE_ONE_LENGTH = 0.9, 0.7
+"""Correlation of ratio and backlash above which four fifths (half, where every leg has one length) of the ratio's
+variance is exchange with the backlash. Equal numbers of cleared and reversed legs of one length give 0.55."""
 SHALLOW = 1.2
 """Ratio of the largest to the smallest depth below which the sheet stood at one place (the paper's: 1.6)."""
 OVERSHOOT_STEPS = 40
@@ -233,9 +234,9 @@ def separation(stops: Sequence[Stop], axis: str) -> str | None:
     else:
         covariance = np.linalg.inv(information)
         correlation = abs(covariance[0, 1]) / np.sqrt(covariance[0, 0] * covariance[1, 1])
-    if correlation < INSEPARABLE:
-        return None
     lengths = Counter(abs(b.steps - a.steps) for a, b in pairwise(stops) if a.steps != b.steps)
+    if correlation < (INSEPARABLE_ONE_LENGTH if len(lengths) == 1 else INSEPARABLE):
+        return None
     common = lengths.most_common(1)[0][0]
     only = f"only one |N| = {common}" if len(lengths) == 1 else f"nearly every leg has |N| = {common} and reverses"
     return f"{only}; add N = {max(common // 2, 1)} or a cleared approach"

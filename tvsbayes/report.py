@@ -116,8 +116,12 @@ def fit_text(summary: FitSummary) -> str:
     title = f"joint estimator (Laplace) at pan {pose['pan']:.2f} deg, tilt {pose['tilt']:.2f} deg"
     lines = [text_table(title, ["quantity", "value(u)", "unit", "95 % interval", "set by"], rows)]
     lines.append(f"chi2 {summary.chi2:.1f} for {summary.dof:.1f} degrees of freedom")
+    predicted = [f"{d} {concise(e.value, e.sd)}" for d, e in summary.classic_predicted.items() if e is not None]
+    if predicted:
+        lines.append(f"the classic estimator should report, deg/step: {', '.join(predicted)}")
     lines += [f"weak: {weak.text}" for weak in summary.weak_directions]
     lines += [f"leverage: {entry.text}" for entry in summary.leverage]
+    lines += [f"prior conflict: {text}" for text in summary.prior_conflicts]
     if summary.excluded_spots:
         lines.append(f"excluded spots: {', '.join(map(str, summary.excluded_spots))}")
     if summary.suspect_spots:

@@ -1,4 +1,4 @@
-"""Nonlinear least squares through optimistix, with the checks that a success flag does not make.
+"""Least squares through optimistix with the checks that a success flag does not make, Newton steps, Laplace draws.
 
 `LevenbergMarquardt` reports success on wrong answers at loose tolerances (research/statistics.md section 1): a
 result counts as converged only if its scaled gradient is small and a restart from a perturbed point returns.
@@ -25,11 +25,24 @@ TIGHT = 1e-12
 """Relative and absolute tolerance that solved 44 of 44 StRD fits; 1e-8 still accepted one wrong answer."""
 SCALED_GRADIENT_LIMIT = 1e-8
 """Largest |J_j . r| / (|J_j| |r|) of a stationary point."""
+POLISHING_STEPS = 5
+POLISHABLE_GRADIENT = 1e-6
+"""Scaled gradients that Gauss-Newton steps may still reduce; above it the run has not arrived."""
 RESTART_PERTURBATION = 1e-3
 """Relative perturbation of the restart."""
 RESTART_AGREEMENT_SD = 1e-2
 """A restart that ends within this many standard errors of the first solution has returned to it."""
 
+NEWTON_STEP = 1e-4
+"""Finite-difference step of the Hessian in posterior standard deviations: third derivatives are of order one
+there, so the error is 1e-4; the gradient's rounding (1e-9) is amplified to 1e-5."""
+NEWTON_SETTLED = 1e-8
+"""Squared Newton step, in posterior sds, at which the mode is reached."""
+HESSIAN_KEPT = 0.1
+"""The Hessian is taken anew if the mode moved farther than this many sds since it was computed."""
+LAPLACE_DRAWS = 2048
+
+Objective = Callable[[np.ndarray], tuple[float, np.ndarray]]
 Residual = Callable[[Float[Array, " parameters"], PyTree], Float[Array, " residuals"]]
 
 
@@ -122,6 +135,88 @@ def levenberg_marquardt(
     return solution.value
 
 
+@dataclass(frozen=True)
+class Mode:
+    """Outcome of the Newton steps: `covariance` is the inverse Hessian over all coordinates."""
+
+    z: np.ndarray
+    covariance: np.ndarray
+    negative_log_density: float
+    problems: tuple[str, ...]
+
+
+def newton_mode(objective: Objective, start: np.ndarray, free: np.ndarray, curvature: np.ndarray) -> Mode:
+    """Newton steps to the minimum of a negative log density, with its Hessian by differences of the gradient.
+
+    The differences are taken in coordinates whitened by `curvature`: the Hessian is near the identity there, and
+    directions that differ by eight orders of magnitude in stiffness are equally well resolved.
+
+    Args:
+        objective: negative log density and its gradient.
+        start: near the mode, shape (p,).
+        free: coordinates that move; the others keep their place and unit variance.
+        curvature: positive definite guess of the Hessian, shape (p, p).
+
+    Returns:
+        The mode and its covariance.
+    """
+    rows = np.flatnonzero(free)
+    z = start
+    value, slope = objective(z)
+    root = np.linalg.inv(np.linalg.cholesky(curvature[np.ix_(rows, rows)])).T
+    problems: list[str] = []
+    for _ in range(6):
+        begin = z
+        columns = []
+        for column in root.T:
+            nudged = z.copy()
+            nudged[rows] += NEWTON_STEP * column
+            columns.append((objective(nudged)[1] - slope)[rows] / NEWTON_STEP)
+        hessian = root.T @ np.stack(columns, axis=1)
+        eigenvalues, vectors = np.linalg.eigh(0.5 * (hessian + hessian.T))
+        # Far from the mode the density may be flat or convex along a direction: step by the expected scale.
+        inverse = (vectors / np.maximum(np.abs(eigenvalues), 0.1)) @ vectors.T
+        settled = False
+        for _ in range(12):
+            step = -inverse @ (root.T @ slope[rows])
+            if step @ step < NEWTON_SETTLED:
+                settled = True
+                break
+            for halving in range(12):
+                trial = z.copy()
+                trial[rows] += root @ step / 2**halving
+                trial_value, trial_slope = objective(trial)
+                if np.isfinite(trial_value) and trial_value < value + 1e-9 * abs(value):
+                    break
+            else:
+                break
+            z, value, slope = trial, trial_value, trial_slope
+        root_inverse_move = np.linalg.solve(root, (z - begin)[rows])
+        if settled and np.linalg.norm(root_inverse_move) < HESSIAN_KEPT:
+            break
+        root = root @ (vectors / np.sqrt(np.maximum(np.abs(eigenvalues), 0.1))) @ vectors.T
+    else:
+        problems.append("the Newton steps on the full density did not settle")
+    if eigenvalues[0] <= 0:
+        problems.append("the density has no maximum here: its Hessian is not negative definite")
+    whitened = (vectors / np.maximum(eigenvalues, 1e-3)) @ vectors.T
+    covariance = np.eye(z.size)
+    covariance[np.ix_(rows, rows)] = root @ whitened @ root.T
+    return Mode(z, covariance, value, tuple(problems))
+
+
+def laplace_draws(z: np.ndarray, covariance: np.ndarray, seed: int) -> np.ndarray:
+    """Normal draws whose sample mean and covariance are exactly the given ones.
+
+    Antithetic pairs fix the mean, a Cholesky factor of the sample covariance fixes the rest: standard deviations of
+    linear quantities then carry no Monte Carlo error.
+    """
+    half = np.random.default_rng(seed).standard_normal((LAPLACE_DRAWS // 2, z.size))
+    normal = np.concatenate([half, -half])
+    normal = normal @ np.linalg.inv(np.linalg.cholesky(normal.T @ normal / len(normal))).T
+    return z + normal @ np.linalg.cholesky(covariance).T
+
+
 def scaled_gradient(jacobian: np.ndarray, residuals: np.ndarray) -> float:
     """Largest |J_j . r| / (|J_j| |r|); 0 where residuals or a column vanish."""
     norms = np.linalg.norm(jacobian, axis=0) * np.linalg.norm(residuals)
@@ -152,7 +247,7 @@ def least_squares_covariance(jacobian: np.ndarray) -> np.ndarray:
 
 
 def solve_least_squares(
-    residual: Residual, start: np.ndarray, args: PyTree = None, *, max_steps: int = 2000, restart: bool = True
+    residual: Residual, start: np.ndarray, args: PyTree = None, *, max_steps: int = 10_000, restart: bool = True
 ) -> LeastSquares:
     """Fit and check (research/statistics.md section 1).
 
@@ -186,6 +281,16 @@ def solve_least_squares(
             if residuals2 @ residuals2 < residuals @ residuals:
                 value, residuals, jacobian = again, residuals2, jacobian2
         gradient = scaled_gradient(jacobian, residuals)
+        # The sum of squares is flat to rounding within 1e-8 of its minimum; Gauss-Newton steps see the gradient.
+        for _ in range(POLISHING_STEPS):
+            if not SCALED_GRADIENT_LIMIT < gradient < POLISHABLE_GRADIENT:
+                break
+            trial = value - np.linalg.lstsq(jacobian, residuals, rcond=None)[0]
+            residuals2, jacobian2 = (np.asarray(x) for x in linearised(residual, jnp.asarray(trial), args))
+            if not scaled_gradient(jacobian2, residuals2) < gradient:
+                break
+            value, residuals, jacobian = trial, residuals2, jacobian2
+            gradient = scaled_gradient(jacobian, residuals)
         if not np.all(np.isfinite(residuals)):
             problems.append("residuals are not finite")
         # At a perfect fit the residuals are rounding errors and their direction means nothing.

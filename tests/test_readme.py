@@ -1,0 +1,76 @@
+"""The README's promises that a machine can check: example, printed answer, commands, modules, set-up."""
+
+from __future__ import annotations
+
+import doctest
+import re
+import tomllib
+from pathlib import Path
+
+import pytest
+from test_layers import LEVELS, module_paths
+
+from tvsbayes.cli import app
+
+ROOT = Path(__file__).resolve().parents[1]
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+
+
+def section(title: str) -> str:
+    """Text between a heading of the second level and the next."""
+    return README.split(f"\n## {title}\n")[1].split("\n## ")[0]
+
+
+def first_column(text: str) -> list[str]:
+    return re.findall(r"^\| `(\w+)", text, flags=re.MULTILINE)
+
+
+def test_python_example_does_what_it_says(monkeypatch):
+    monkeypatch.chdir(ROOT)
+    code = re.search(r"```pycon\n(.*?)```", README, flags=re.DOTALL).group(1)
+    example = doctest.DocTestParser().get_doctest(code, {}, "README.md", "README.md", 0)
+    report: list[str] = []
+    results = doctest.DocTestRunner(verbose=False).run(example, out=report.append)
+    assert results.attempted >= 5
+    assert not results.failed, "".join(report)
+
+
+def test_first_screen_has_two_set_up_commands_and_the_printed_answer():
+    commands = re.findall(r"```sh\n(.*?)\n```", README.split("\n## ")[0], flags=re.DOTALL)
+    assert [command.count("\n") for command in commands] == [0, 0]
+    assert all(command.startswith("python3 -m venv .venv && .venv/bin/pip install ") for command in commands)
+    assert commands[0].endswith("tvsbayes demo")
+    assert "-c .ci/constraints.txt" in commands[1]
+    assert "joint  holds truth     truth" in README.split("\n## ")[0]
+
+
+def test_commands_are_those_that_exist():
+    assert first_column(section("Commands")) == [command.callback.__name__ for command in app.registered_commands]
+
+
+def test_module_map_is_complete_and_in_import_order():
+    names = first_column(section("Modules"))
+    assert sorted(names) == sorted(module_paths())
+    level = {name: number for number, level in enumerate(LEVELS) for name in level}
+    assert [level[name] for name in names] == sorted(level[name] for name in names)
+
+
+@pytest.mark.parametrize("page", ["README.md", "experiments/README.md", "data/twins/README.md"])
+def test_local_links_and_named_scripts_exist(page):
+    text = (ROOT / page).read_text(encoding="utf-8")
+    for target in re.findall(r"\]\(([^)#]+)\)", text):
+        # Tables of experiments are written by the command in their own row.
+        made = any(f"> experiments/{target}" in line for line in text.splitlines())
+        assert made or (ROOT / page).parent.joinpath(target).exists(), target
+    for script in re.findall(r"experiments/\w+\.py|tests/\w+\.py", text):
+        assert (ROOT / script).is_file(), script
+
+
+def test_constraints_pin_every_direct_dependency():
+    """A missing pin would test whatever the day brings."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    lines = (ROOT / ".ci" / "constraints.txt").read_text(encoding="utf-8").splitlines()
+    pins = dict(line.split("==") for line in lines if not line.startswith("#"))
+    wanted = project["dependencies"] + project["optional-dependencies"]["test"]
+    names = [re.match(r"[\w-]+", requirement).group() for requirement in wanted]
+    assert [name for name in names if name not in pins] == []
