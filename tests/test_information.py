@@ -19,8 +19,8 @@ from tvsbayes.simulation import simulate
 
 @pytest.fixture(scope="module")
 def paper(mounted_rig) -> Campaign:
-    """The paper's go-and-return protocol with six repeats: one |N|, the first start is the homing itself."""
-    return simulate(mounted_rig, paper_protocol(repeats=6), seed=8).campaign
+    """The paper's go-and-return protocol: one |N|, the first start is the homing itself."""
+    return simulate(mounted_rig, paper_protocol(), seed=8).campaign
 
 
 @pytest.fixture(scope="module")
@@ -55,39 +55,54 @@ def test_backlash_intervals_stay_positive(summary):
 
 def test_contraction_tells_data_from_prior(summary):
     assert all(e.contraction > 0.99 for e in summary.effective.values())
-    # A rotation of the whole beam about the laser's own axis is a gauge: the mirror offset stays the prior's.
-    assert summary.parameters["tilt_axis_offset_mm.x"].contraction < CONTRACTION_LIMIT
-    assert not summary.parameters["tilt_axis_offset_mm.x"].informed
+    # Nearly a gauge against the laser's offset and the extrinsics (research/domain.md section 7).
+    assert summary.parameters["tilt_axis_offset_mm.x"].contraction < 0.2
+    for name, estimate in summary.parameters.items():
+        assert estimate.informed == (estimate.contraction is not None and estimate.contraction >= CONTRACTION_LIMIT), (
+            name
+        )
     assert summary.headline_informed
 
 
 def test_one_step_count_is_named_as_a_weak_direction(summary):
     texts = [weak.text for weak in summary.weak_directions]
     pan = next(t for t in texts if t.startswith("pan ratio and pan backlash move together"))
-    assert "only one |N| = 200; add N = 100 or a cleared approach" in pan
+    # The tilt phase parks the pan axis at 100 once: nearly, not only.
+    assert "nearly every leg has |N| = 200 and reverses; add N = 100 or a cleared approach" in pan
 
 
 def test_two_step_counts_and_cleared_approaches_are_not(mounted_rig):
     approaches = {d: ("reversed", "cleared") for d in ("left", "right", "up", "down")}
     plan = four_point_protocol(repeats=8, steps=(100, 200), approaches=approaches)
     texts = [w.text for w in summarise(fit(simulate(mounted_rig, plan, seed=8).campaign)).weak_directions]
-    assert not any("ratio and" in text and "only one" in text for text in texts)
+    assert not any("every leg has" in text or "only one |N|" in text for text in texts)
 
 
-def test_the_recorded_approach_of_move_0_is_named_as_leverage(summary):
+@pytest.fixture(scope="module")
+def pan_only(mounted_rig) -> Campaign:
+    """Left and right alone: after the homing every leg reverses, so move 0 alone tells ratio from backlash."""
+    campaign = simulate(mounted_rig, paper_protocol(repeats=12), seed=8).campaign
+    last = next(m.move for m in campaign.moves if m.tilt_steps != 0)
+    return replace(
+        campaign,
+        moves=campaign.moves[: last - 1],
+        spots=tuple(s for s in campaign.spots if s.move < last - 1),
+    )
+
+
+def test_the_recorded_approach_of_move_0_is_named_as_leverage(pan_only):
+    fitted = fit(pan_only)
+    summary = summarise(fitted)
     entry = next(e for e in summary.leverage if e.quantity == "effective left")
     assert entry.move == 0
     assert "its recorded approach (left, up)" in entry.text
     assert entry.factor > 2
-
-
-def test_leverage_is_what_a_fit_without_the_stop_finds(paper, summary, fitted):
-    entry = next(e for e in summary.leverage if e.quantity == "effective left")
-    rest = tuple(s for s in paper.spots if s.spot not in entry.spots)
-    without = fit(replace(paper, spots=rest))
-    sd = fitted.draws.effective_deg_per_step[:, 0].std()
-    # Linear prediction against a refit whose noise scales and mode move a little: a third.
-    assert without.draws.effective_deg_per_step[:, 0].std() / sd == pytest.approx(entry.factor, rel=0.35)
+    assert summary.effective["up"] is None
+    # A refit without its spots loses as much to within a factor of two: the linear prediction does not see that
+    # the half-normal prior bounds a backlash which nothing else holds any more.
+    without = fit(replace(pan_only, spots=tuple(s for s in pan_only.spots if s.spot not in entry.spots)))
+    grown = without.draws.effective_deg_per_step[:, 0].std() / fitted.draws.effective_deg_per_step[:, 0].std()
+    assert 0.5 < grown / entry.factor < 2
 
 
 def test_the_classic_answer_is_predicted(paper, summary):
@@ -133,8 +148,8 @@ def test_aperture_readings_bring_their_parameters(mounted_rig):
     fitted = fit(simulate(mounted_rig, plan, seed=4, aperture=True).campaign)
     parameters = summarise(fitted).parameters
     assert set(RECEIVER_NAMES) <= set(parameters)
-    # Readings of 0.02 deg tell C0 (0.2 deg) and zero (0.1 deg) apart better than their priors do together.
-    assert parameters["pan_zero_emission_deg"].contraction > 0.5
+    # Readings of 0.02 deg see C0 (0.2 deg) only together with the zero (0.1 deg) and the axes' offsets.
+    assert parameters["pan_zero_emission_deg"].informed
     assert fitted.free[INDEX["pan_zero_emission_deg"]]
 
 
