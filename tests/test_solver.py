@@ -64,8 +64,6 @@ MODELS = {
     "Roszman1": lambda b, x: b[0] - b[1] * x - jnp.arctan(b[2] / (x - b[3])) / jnp.pi,
     "Thurber": lambda b, x: _rational(b, x, 3),
 }
-HARD = ("BoxBOD", "Bennett5", "Eckerle4", "MGH09", "MGH10", "MGH17", "Rat42", "Thurber")
-"""NIST's hardest and those that general solvers get wrong: always run."""
 
 
 def _residual(model):
@@ -131,15 +129,11 @@ def score(name: str, start: int) -> Score:
     return Score(digits(fit.value, problem.certified), errors, fit.converged, fit.problems)
 
 
-def cases():
-    for name in MODELS:
-        marks = () if name in HARD else (pytest.mark.slow,)
-        for start in (0, 1):
-            yield pytest.param(name, start, marks=marks, id=f"{name}-start{start + 1}")
+CASES = [pytest.param(name, start, id=f"{name}-start{start + 1}") for name in MODELS for start in (0, 1)]
 
 
 @pytest.mark.usefixtures("x64")
-@pytest.mark.parametrize(("name", "start"), list(cases()))
+@pytest.mark.parametrize(("name", "start"), CASES)
 def test_strd(name, start):
     result = score(name, start)
     print(f"{name:10s} start {start + 1}: {result.parameters:5.1f} {result.errors:5.1f} digits {result.problems}")
