@@ -14,6 +14,7 @@ from tvsbayes.information import CONTRACTION_LIMIT, FitSummary, summarise
 from tvsbayes.joint import fit
 from tvsbayes.parameters import INDEX, NAMES, RECEIVER_NAMES
 from tvsbayes.protocols import four_point_protocol, paper_protocol
+from tvsbayes.rigs import Prior
 from tvsbayes.simulation import simulate
 
 
@@ -151,6 +152,15 @@ def test_aperture_readings_bring_their_parameters(mounted_rig):
     # Readings of 0.02 deg see C0 (0.2 deg) only together with the zero (0.1 deg) and the axes' offsets.
     assert parameters["pan_zero_emission_deg"].informed
     assert fitted.free[INDEX["pan_zero_emission_deg"]]
+
+
+def test_a_prior_that_the_data_contradict_is_named(paper, summary):
+    assert summary.prior_conflicts == ()
+    wrong = Prior(summary.parameters["degrees_per_step.pan"].value + 0.01, 1e-4)
+    priors = {**paper.rig.priors, "degrees_per_step.pan": wrong}
+    contradicted = summarise(fit(replace(paper, rig=replace(paper.rig, priors=priors))))
+    # A tight wrong prior pushes what is softer: the ratio keeps its value and others are named in its place.
+    assert any("prior sds from its prior's centre" in text for text in contradicted.prior_conflicts)
 
 
 def test_json_has_the_contract_keys_and_no_nan(summary):

@@ -90,8 +90,13 @@ def test_a_far_start_is_annealed_to_the_same_mode(simulated, fitted):
 def test_a_second_campaign_of_another_size_compiles_nothing(simulated, fitted, caplog):
     campaign = simulated.campaign
     shorter = replace(campaign, spots=campaign.spots[:-7], moves=campaign.moves)
-    with jax.log_compiles(True), caplog.at_level(logging.WARNING):
-        again = fit(shorter)
+    # The configuration, not `jax.log_compiles`: that holds for one thread, and half of a fit compiles aside.
+    jax.config.update("jax_log_compiles", True)
+    try:
+        with caplog.at_level(logging.WARNING):
+            again = fit(shorter)
+    finally:
+        jax.config.update("jax_log_compiles", False)
     compiled = [r.getMessage() for r in caplog.records if "Compiling" in r.getMessage()]
     heavy = [m for m in compiled if any(n in m for n in ("marquardt", "density", "linearise", "derived"))]
     assert again.converged

@@ -285,6 +285,6 @@ def run(arguments: list[str]) -> int:
 def main() -> None:
     """Entry point of the `tvsbayes` script."""
     # Read when NumPy is first imported. The matrices here are small: OpenBLAS' second thread only waits, and its
-    # busy waiting doubles the time of XLA's threads (`experiments/speed.md`).
+    # busy waiting takes the time of XLA's threads, tenfold where two fits share two cores.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     sys.exit(run(sys.argv[1:]))

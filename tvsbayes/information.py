@@ -12,6 +12,7 @@ import numpy as np
 
 from tvsbayes.classic import DIRECTIONS, four_point_ratios, select_experiments
 from tvsbayes.joint import NORMAL_95, JointFit
+from tvsbayes.likelihood import ordered_spots
 from tvsbayes.parameters import INDEX, NAMES, RECEIVER_NAMES, RIG_NAMES
 from tvsbayes.protocols import observed_stops, separation
 from tvsbayes.stops import standard_deviations_without
@@ -270,10 +271,10 @@ def _leverage(fit: JointFit, moved: set[str]) -> tuple[Leverage, ...]:
     cross = (values - values.mean(axis=0)).T @ centred / len(centred)
     gradients = np.linalg.solve(fit.covariance, cross.T).T
     sd = np.sqrt(np.einsum("qi,ij,qj->q", gradients, fit.covariance, gradients))
-    ids = [s for s in sorted((s for s in fit.campaign.spots if s.status == "ok"), key=lambda s: (s.move, s.spot))]
+    ordered = ordered_spots(fit.campaign)
     entries = []
     for group in fit.information.groups:
-        members = [s for s in ids[group.rows] if s.spot not in fit.excluded_spots]
+        members = [s for s in ordered[group.rows] if s.spot not in fit.excluded_spots]
         if not members:
             continue
         factors = standard_deviations_without(group, fit.covariance, gradients) / sd
@@ -300,7 +301,7 @@ def _classic_predicted(fit: JointFit) -> dict[str, Estimate | None]:
     result: dict[str, Estimate | None] = dict.fromkeys(DIRECTIONS)
     if not len(selection.experiments):
         return result
-    ordered = sorted((s for s in fit.campaign.spots if s.status == "ok"), key=lambda s: (s.move, s.spot))
+    ordered = ordered_spots(fit.campaign)
     row_of = {spot.spot: row for row, spot in enumerate(ordered)}
     ids = np.array([s.spot for s in fit.campaign.spots])
     rows = np.vectorize(row_of.get)(ids[selection.spot_rows])

@@ -82,7 +82,7 @@ def damped_solver(tolerance: Float[Array, ""]) -> optx.LevenbergMarquardt:
     """Levenberg-Marquardt whose damping falls tenfold after every step that the linear model predicted well.
 
     By default optimistix asks for 99 % agreement and divides by 3.5: in directions that only a prior holds, where
-    the damping is as large as the curvature, it then creeps (`experiments/speed.py` counts the steps).
+    the damping is as large as the curvature, it then creeps.
     """
     solver = optx.LevenbergMarquardt(rtol=tolerance, atol=tolerance, linear_solver=lx.QR())
     search = optx.ClassicalTrustRegion(high_cutoff=0.75, low_cutoff=0.1, high_constant=10.0, low_constant=0.2)
