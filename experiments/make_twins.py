@@ -17,10 +17,9 @@ import numpy as np
 
 from tvsbayes.campaign import PlanStep, read_campaign, write_plan
 from tvsbayes.classic import DIRECTIONS, classic, four_point_ratios, select_experiments
-from tvsbayes.optics import project
 from tvsbayes.protocols import PROTOCOLS
 from tvsbayes.rigs import Rig, Stereo, read_rig, rotation_matrix, write_stereo
-from tvsbayes.simulation import SimulatedCampaign, Truth, draw_truth, simulate, with_derived
+from tvsbayes.simulation import SimulatedCampaign, Truth, draw_truth, project, simulate, with_derived
 
 DATA = Path(__file__).resolve().parents[1] / "data"
 SHEETS_MM = {"d1": 175.0, "d2": 275.0, "d3": 375.0}

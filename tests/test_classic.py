@@ -25,8 +25,8 @@ from tvsbayes.classic import (
     undistort,
 )
 from tvsbayes.files import NothingToEstimate
-from tvsbayes.optics import project
 from tvsbayes.rigs import DECLARED_PRIORS, DEFAULT_PRIORS, Prior, RigTable, Stereo, rotation_matrix
+from tvsbayes.simulation import project
 
 ROUNDING_MM = 1e-7
 """Rounding of 1e-13 px through the depth gain Z^2/(f B) of 1 to 2 mm/px and the DLT's SVD, times 10^5."""

@@ -7,8 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from tvsbayes.cameras import project
-from tvsbayes.geometry import rotate_about_z, rotation_matrix
+from tvsbayes.geometry import project, rotate_about_z, rotation_matrix
 from tvsbayes.likelihood import aperture_angle, observe
 from tvsbayes.parameters import INDEX, NAMES, Receiver, model_of, parameter_space
 from tvsbayes.positioner import MoveArrays, Transmission, beam, beam_angles, mirror_angles

@@ -15,11 +15,10 @@ from tvsbayes.campaign import Campaign
 from tvsbayes.files import NothingToEstimate, shipped_data
 from tvsbayes.joint import fit
 from tvsbayes.likelihood import ordered_spots
-from tvsbayes.optics import effective_deg_per_step, effective_mirror_offset_mm
 from tvsbayes.parameters import INDEX, NAMES
 from tvsbayes.protocols import four_point_protocol
 from tvsbayes.rigs import Prior, read_rig
-from tvsbayes.simulation import SimulatedCampaign, simulate
+from tvsbayes.simulation import SimulatedCampaign, effective_deg_per_step, effective_mirror_offset_mm, simulate
 from tvsbayes.solver import laplace_draws
 
 SD = 1.0

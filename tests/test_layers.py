@@ -15,9 +15,9 @@ LEVELS: tuple[tuple[str, ...], ...] = (
     ("documents",),
     ("stereo",),
     ("rigs",),
-    ("campaign", "optics"),
+    ("campaign",),
     ("geometry", "classic", "simulation"),
-    ("positioner", "cameras", "protocols"),
+    ("positioner", "protocols"),
     ("parameters", "report"),
     ("likelihood", "stops", "solver"),
     ("joint",),
@@ -26,11 +26,11 @@ LEVELS: tuple[tuple[str, ...], ...] = (
 )
 """From bottom to top: a module imports only modules of lower levels."""
 WITHOUT_JAX = (
-    *("files", "documents", "stereo", "rigs", "campaign", "classic", "optics", "simulation", "protocols"),
+    *("files", "documents", "stereo", "rigs", "campaign", "classic", "simulation", "protocols"),
     *("stops", "report"),
 )
 MODEL = {
-    *("geometry", "positioner", "cameras", "parameters", "likelihood", "stops", "solver", "joint"),
+    *("geometry", "positioner", "parameters", "likelihood", "stops", "solver", "joint"),
     *("information", "classic"),
 }
 JAX_FAMILY = {"jax", "jaxlib", "equinox", "optimistix", "lineax", "jaxtyping"}
@@ -124,9 +124,8 @@ def test_readers_classic_and_twin_reach_no_jax(imports, inner, name):
         assert not {other.split(".")[0] for other in imports[module]} & JAX_FAMILY, module
 
 
-@pytest.mark.parametrize("name", ["simulation", "optics"])
-def test_twin_shares_no_formula_with_the_estimators(inner, name):
-    assert not reachable(inner, name) & MODEL
+def test_twin_shares_no_formula_with_the_estimators(inner):
+    assert not reachable(inner, "simulation") & MODEL
 
 
 def test_importing_the_estimator_changes_no_jax_setting():

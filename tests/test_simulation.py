@@ -15,18 +15,6 @@ import pytest
 
 from tvsbayes.campaign import PlanStep
 from tvsbayes.files import InputError
-from tvsbayes.optics import (
-    aperture_angle_deg,
-    beam_jacobian,
-    effective_deg_per_step,
-    effective_mirror_offset_mm,
-    mirror_chain,
-    play,
-    project,
-    stop_errors,
-    to_tvs,
-    transmission,
-)
 from tvsbayes.protocols import DIRECTION_SIGNS, PROTOCOLS, four_point_protocol, grid_protocol
 from tvsbayes.rigs import (
     DECLARED_PRIORS,
@@ -39,7 +27,21 @@ from tvsbayes.rigs import (
     Stereo,
     rotation_matrix,
 )
-from tvsbayes.simulation import Truth, draw_truth, simulate
+from tvsbayes.simulation import (
+    Truth,
+    aperture_angle_deg,
+    beam_jacobian,
+    draw_truth,
+    effective_deg_per_step,
+    effective_mirror_offset_mm,
+    mirror_chain,
+    play,
+    project,
+    simulate,
+    stop_errors,
+    to_tvs,
+    transmission,
+)
 
 NOMINAL = {name: prior.value for name, prior in (DEFAULT_PRIORS | DECLARED_PRIORS).items()}
 VECTOR = NOMINAL | {

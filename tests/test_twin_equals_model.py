@@ -10,8 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from tvsbayes import optics
-from tvsbayes.cameras import project
+from tvsbayes import simulation
+from tvsbayes.geometry import project
 from tvsbayes.likelihood import aperture_angle
 from tvsbayes.parameters import RIG_NAMES, model_of
 from tvsbayes.positioner import MoveArrays, beam, beam_angles, mirror_angles
@@ -54,7 +54,7 @@ def batched(function, *arrays):
 def test_mirror_chain(truths, values, poses_rad):
     rays = batched(lambda v, p: beam(model_of(v).optics, p[:, 0], p[:, 1]), values, poses_rad)
     for rig, truth in enumerate(truths):
-        origin, direction = optics.mirror_chain(*poses_rad[rig].T, truth.parameters)
+        origin, direction = simulation.mirror_chain(*poses_rad[rig].T, truth.parameters)
         assert np.abs(rays.origin_mm[rig].T - origin).max() < LENGTH_MM
         assert np.abs(rays.direction[rig].T - direction).max() < ANGLE_RAD
 
@@ -65,7 +65,7 @@ def test_cameras(truths, values):
     pixels = batched(lambda v, p: project(model_of(v).cameras, p.T).T, values, points)
     seen = 0
     for rig, truth in enumerate(truths):
-        expected = optics.project(points[rig], truth.stereo, truth.parameters["focal_scale"])
+        expected = simulation.project(points[rig], truth.stereo, truth.parameters["focal_scale"])
         in_view = np.isfinite(expected).all(axis=1)
         assert np.abs(pixels[rig] - expected)[in_view].max() < PIXEL_PX
         seen += in_view.sum()
@@ -93,7 +93,7 @@ def test_gears_and_play(truths, values):
             ratios = p[f"degrees_per_step.{name}"], p[f"ratio_contrast_deg_per_step.{name}"]
             start = -0.5 * approach[rig, :, axis]
             args = counters[rig, :, axis], first[rig], start, np.zeros(MOVES), ratios, p[f"backlash_deg.{name}"]
-            expected = np.radians(optics.transmission(*args) + (p["tilt_zero_deg"] if axis else 0.0))
+            expected = np.radians(simulation.transmission(*args) + (p["tilt_zero_deg"] if axis else 0.0))
             assert np.abs(found.angle_rad[rig, :, axis] - expected).max() < ANGLE_RAD
 
 
@@ -107,8 +107,8 @@ def test_aperture_angle(truths, values, convention):
     found = batched(angle, values, points)
     for rig, truth in enumerate(truths):
         baseline_mm = truth.parameters["baseline_mm"]
-        in_t = optics.to_tvs(points[rig], baseline_mm, truth.parameters["pan_zero_emission_deg"])
-        expected = np.radians(optics.aperture_angle_deg(in_t, baseline_mm, convention))
+        in_t = simulation.to_tvs(points[rig], baseline_mm, truth.parameters["pan_zero_emission_deg"])
+        expected = np.radians(simulation.aperture_angle_deg(in_t, baseline_mm, convention))
         assert np.abs(found[rig] - expected).max() < ANGLE_RAD
 
 
@@ -125,9 +125,9 @@ def test_headlines(truths, values, poses_rad):
     ratios, offset_mm, jacobian = batched(headlines, values, poses_rad[:, 0])
     for rig, truth in enumerate(truths):
         pose_deg = tuple(np.degrees(poses_rad[rig, 0]))
-        expected = optics.effective_deg_per_step(truth.parameters, pose_deg)
+        expected = simulation.effective_deg_per_step(truth.parameters, pose_deg)
         # The twin differences its own chain: 1e-9 of a slope, hence of 0.07 deg per step.
         assert np.abs(ratios[rig] - list(expected.values())).max() < 1e-9 * 0.1
-        assert np.abs(jacobian[rig] - optics.beam_jacobian(truth.parameters, pose_deg)).max() < 1e-9
+        assert np.abs(jacobian[rig] - simulation.beam_jacobian(truth.parameters, pose_deg)).max() < 1e-9
         assert list(expected) == ["left", "right", "up", "down"]
-        assert abs(offset_mm[rig] - optics.effective_mirror_offset_mm(truth.parameters, pose_deg)) < LENGTH_MM
+        assert abs(offset_mm[rig] - simulation.effective_mirror_offset_mm(truth.parameters, pose_deg)) < LENGTH_MM

@@ -123,9 +123,8 @@ def demo(
         from tvsbayes.classic import classic as estimate_classic
         from tvsbayes.information import summarise
         from tvsbayes.joint import fit as fit_joint
-        from tvsbayes.optics import effective_deg_per_step, effective_mirror_offset_mm
         from tvsbayes.report import demo_text, write_results
-        from tvsbayes.simulation import read_truth
+        from tvsbayes.simulation import effective_deg_per_step, effective_mirror_offset_mm, read_truth
         from tvsbayes.solver import use_compilation_cache
 
         use_compilation_cache()

@@ -19,7 +19,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from tvsbayes.cameras import project
 from tvsbayes.campaign import APPROACH_SIGN, Campaign, Move, Spot
 from tvsbayes.classic import triangulate
 from tvsbayes.geometry import (
@@ -27,6 +26,7 @@ from tvsbayes.geometry import (
     along_batch,
     dot,
     materialise,
+    project,
     rotate_about_z,
     rotation_matrix,
     transform,

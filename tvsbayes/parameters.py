@@ -15,8 +15,7 @@ import numpy as np
 from jax.scipy.special import ndtr, ndtri
 from jaxtyping import Array, Bool, Float, Int
 
-from tvsbayes.cameras import StereoCameras
-from tvsbayes.geometry import Scalar, Vector
+from tvsbayes.geometry import Scalar, StereoCameras, Vector
 from tvsbayes.positioner import Optics, Transmission
 from tvsbayes.rigs import DECLARED_PRIORS, DEFAULT_PRIORS, STEREO_PARAMETER_NAMES, RigTable, Stereo
 
