@@ -107,10 +107,11 @@ def coordinates(space: Any, truth: Truth) -> np.ndarray:
 
     z = []
     for name, value, u, kind in zip(RIG_NAMES, space.value, space.u, space.kind, strict=True):
-        true = truth.parameters[name]
         if u == 0:
             z.append(0.0)
-        elif KINDS[int(kind)] == "half-normal":
+            continue
+        true = truth.parameters[name]
+        if KINDS[int(kind)] == "half-normal":
             z.append(norm.isf(halfnorm.sf(true, scale=u)))
         elif KINDS[int(kind)] == "log-normal":
             z.append(np.log(true / value) / u)

@@ -146,6 +146,29 @@ def test_hashes_cover_the_data_and_not_the_names(tmp_path):
         assert {key for key in reference if changed[key] != reference[key]} == {name}
 
 
+def test_transmission_error_is_written_read_and_hashed(tmp_path):
+    campaign = small_campaign()
+    seen = {input_hashes(campaign)["rig"]}
+    for number, (priors, periods) in enumerate(
+        [
+            ({}, {"pan": 30.0}),
+            ({}, {"pan": 40.0}),
+            ({"harmonic_deg.pan.2.cos": Prior(0.01, 0.1)}, {"pan": 30.0}),
+            ({"harmonic_deg.tilt.1.sin": Prior(0.0, 0.1)}, {"pan": 30.0, "tilt": 360.0}),
+        ]
+    ):
+        table = dataclasses.replace(
+            campaign.rig, priors={**campaign.rig.priors, **priors}, harmonic_period_deg=periods
+        )
+        wobbling = dataclasses.replace(campaign, rig=table)
+        write_campaign(wobbling, tmp_path / str(number))
+        again = read_campaign(tmp_path / str(number))
+        assert_same(wobbling, again)
+        assert again.rig == table
+        seen.add(input_hashes(again)["rig"])
+    assert len(seen) == 5
+
+
 @pytest.mark.parametrize(
     ("name", "moves", "spots"), [("rig_a", 195, 384), ("rig_b", 145, 144), ("rig_c", 195, 384)]
 )

@@ -23,7 +23,14 @@ from tvsbayes.parameters import (
     model_of,
     parameter_space,
 )
-from tvsbayes.rigs import DECLARED_PRIORS, DEFAULT_PRIORS, STEREO_PARAMETER_NAMES, Prior, RigTable
+from tvsbayes.rigs import (
+    DECLARED_PRIORS,
+    DEFAULT_PRIORS,
+    HARMONIC_PRIORS,
+    STEREO_PARAMETER_NAMES,
+    Prior,
+    RigTable,
+)
 
 pytestmark = pytest.mark.usefixtures("x64")
 
@@ -60,8 +67,8 @@ def physical():
 
 
 def test_names_are_the_contracts():
-    assert NAMES == (*DEFAULT_PRIORS, *DECLARED_PRIORS, *STEREO_PARAMETER_NAMES)
-    assert len(set(NAMES)) == len(NAMES) == 57
+    assert NAMES == (*DEFAULT_PRIORS, *DECLARED_PRIORS, *HARMONIC_PRIORS, *STEREO_PARAMETER_NAMES)
+    assert len(set(NAMES)) == len(NAMES) == 65
     assert all(NAMES[index] == name for name, index in INDEX.items())
 
 
@@ -129,10 +136,10 @@ def test_u_zero_fixes_every_kind(physical):
 def test_free_parameters():
     """Those with u > 0; the receiver's only with readings; zero rows of the stereo covariance never."""
     space = parameter_space(table(), small_stereo())
-    fixed_stereo = {"stereo.left.k3", "stereo.right.k3"}
+    fixed = {"stereo.left.k3", "stereo.right.k3", *HARMONIC_PRIORS}
     for has_aperture in (True, False):
         free = {name for name, yes in zip(NAMES, free_mask(space, has_aperture), strict=True) if yes}
-        assert set(NAMES) - free == fixed_stereo | (set() if has_aperture else set(RECEIVER_NAMES))
+        assert set(NAMES) - free == fixed | (set() if has_aperture else set(RECEIVER_NAMES))
     assert set(NOISE_NAMES) <= set(RIG_NAMES)
 
 
@@ -192,6 +199,12 @@ FIELDS: dict[str, tuple[str, tuple[int, ...], float]] = {
         )
         for column, name in enumerate(names)
     },
+    **{
+        f"harmonic_deg.{axis}.{order}.{part}": ("transmission.harmonics.amplitude_rad", (i, order - 1, j), DEG)
+        for i, axis in enumerate(("pan", "tilt"))
+        for order in (1, 2)
+        for j, part in enumerate(("cos", "sin"))
+    },
     **{f"stereo.rotation_rad.{a}": ("cameras.rotation_rad", (i,), 1.0) for i, a in enumerate("xyz")},
     **{f"stereo.translation_mm.{a}": ("cameras.translation_mm", (i,), 1.0) for i, a in enumerate("xyz")},
 }
@@ -208,6 +221,8 @@ def test_every_name_drives_its_field_and_nothing_else():
     base = 10.0 + np.arange(len(NAMES))
     rows = np.vstack([base, base + np.eye(len(NAMES))])
     models = leaves(eqx.filter_jit(jax.vmap(model_of))(jnp.asarray(rows)))
+    for known in ("period_rad", "on_wheel"):
+        models.pop(f"transmission.harmonics.{known}")
     assert sum(leaf[0].size for leaf in models.values()) == len(NAMES)
     for row, name in enumerate(NAMES, start=1):
         path, index, unit = FIELDS[name]
@@ -218,3 +233,18 @@ def test_every_name_drives_its_field_and_nothing_else():
                 expected[index] = unit
                 assert values[0][index] == pytest.approx(base[row - 1] * unit, rel=1e-15)
             np.testing.assert_allclose(change, expected, atol=1e-13, err_msg=f"{name} -> {field}")
+
+
+@pytest.mark.parametrize(
+    ("stated", "period_deg", "on_wheel"),
+    [
+        ({}, [360.0, 360.0], [True, True]),
+        ({"tilt": 22.5}, [360.0, 22.5], [True, False]),
+        ({"pan": 12.0, "tilt": 360.0}, [12.0, 360.0], [False, True]),
+    ],
+)
+def test_a_full_turn_is_the_wheels_period_and_less_the_pinions(stated, period_deg, on_wheel):
+    space = parameter_space(RigTable(harmonic_period_deg=stated), small_stereo())
+    harmonics = space.model(jnp.zeros(len(NAMES))).transmission.harmonics
+    np.testing.assert_allclose(harmonics.period_rad, np.radians(period_deg), rtol=1e-15)
+    assert harmonics.on_wheel.tolist() == on_wheel

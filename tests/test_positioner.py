@@ -9,6 +9,7 @@ import pytest
 
 from tvsbayes.positioner import (
     UNIFORM_SD,
+    Harmonics,
     MoveArrays,
     Optics,
     Transmission,
@@ -42,11 +43,19 @@ def optics_of(values) -> Optics:
 
 OPTICS_SD = np.array([5.0, *np.radians([0.5] * 4), 0.5, 0.5, np.radians(0.5), 0.5, 0.5])
 NOMINAL = np.array([30.0, *[0.0] * 9])
+PINION_RAD = np.pi / 2
+GEARS = 15
 
 
 def transmission_of(values) -> tuple[Transmission, jax.Array]:
-    """Seven numbers -> Transmission (ratios, contrasts rad/step, backlash rad) and tilt zero, rad."""
-    return Transmission(values[0:2], values[2:4], values[4:6]), values[6]
+    """Fifteen numbers -> Transmission (ratios, contrasts rad/step, backlash rad) and tilt zero, rad; harmonics, rad.
+
+    The pan's error is its pinion's, four periods per turn; the tilt's is its wheel's.
+    """
+    harmonics = Harmonics(
+        jnp.reshape(values[7:], (2, 2, 2)), jnp.array([PINION_RAD, 2 * jnp.pi]), jnp.array([False, True])
+    )
+    return Transmission(values[0:2], values[2:4], values[4:6], harmonics), values[6]
 
 
 @pytest.fixture(scope="module")
@@ -69,7 +78,10 @@ def chain():
 
 @pytest.fixture(scope="module")
 def gears():
-    """Angles and play sds for (values (7,), steps, first, approach), and the Jacobian of the angles."""
+    """Angles and play sds for (values (7 or 15,), steps, first, approach), and the Jacobian of the angles.
+
+    Without harmonics they are 0.
+    """
 
     def one(values, moves):
         result = mirror_angles(*transmission_of(values), moves)
@@ -88,7 +100,7 @@ def gears():
             jnp.asarray(np.concatenate([approach, np.zeros((pad, 2))])),
         )
         with jax.enable_x64(True):
-            return [np.asarray(x) for x in compiled(jnp.asarray(values), moves)]
+            return [np.asarray(x) for x in compiled(jnp.asarray(np.pad(values, (0, GEARS - len(values)))), moves)]
 
     return run
 
@@ -117,6 +129,7 @@ def random_gears(rng) -> np.ndarray:
             np.radians(rng.normal(0, 1e-3, 2)),
             np.radians(np.abs(rng.normal(0, 0.5, 2))),
             np.radians(rng.normal(0, 2, 1)),
+            np.radians(rng.normal(0, 0.1, 8)),
         ]
     )
 
@@ -146,8 +159,8 @@ def test_beam_jacobian_against_differences(chain):
 
 
 def test_mirror_angle_jacobian_against_differences(gears):
-    """Angles are piecewise linear in every parameter: differences are exact up to rounding between kinks."""
-    steps = np.array([1e-9] * 4 + [1e-8] * 3)
+    """Angles are piecewise smooth in every parameter: differences are exact up to rounding between kinks."""
+    steps = np.array([1e-9] * 4 + [1e-8] * 3 + [1e-6] * 8)
     for seed in range(10):
         rng = np.random.default_rng(seed)
         values, moves = random_gears(rng), random_moves(rng)
@@ -167,7 +180,7 @@ def test_everything_is_finite_far_from_any_rig(chain, gears):
     rays, jacobian = chain(states, jacobian=True)
     assert np.isfinite(rays).all() and np.isfinite(jacobian).all()
     np.testing.assert_allclose(np.linalg.norm(rays[:, 3:], axis=1), 1.0, atol=ANGLE_ROUNDING_RAD)
-    for values in (np.zeros(7), 1e3 * random_gears(rng), -random_gears(rng)):
+    for values in (np.zeros(GEARS), 1e3 * random_gears(rng), -random_gears(rng)):
         assert all(np.isfinite(part).all() for part in gears(values, *random_moves(rng)))
 
 
@@ -223,6 +236,55 @@ def test_unknown_play_closes_as_moves_take_it_up(gears):
     # 10 steps up exceed the play of 8 steps: the tilt is known from then on, the pan as before.
     np.testing.assert_allclose(angle[3], [1.5 * k, 10 * k - b / 2], atol=ANGLE_ROUNDING_RAD)
     np.testing.assert_allclose(play_sd[3], [UNIFORM_SD * (b - 3 * k), 0.0], atol=ANGLE_ROUNDING_RAD)
+
+
+H1C, H1S, H2C, H2S = 0.10, 0.20, 0.03, 0.04
+"""An axis' harmonics in the examples by hand, deg."""
+WOBBLE_RAD = np.radians([H1C, H1S, H2C, H2S])
+
+
+def test_pinion_error_enters_before_the_play(gears):
+    """By hand: counters of a quarter period, whose phases are 0, 90, 180 and again 90 deg; play of 0.4 deg."""
+    values = np.concatenate([np.radians([22.5, 1, 0, 0, 0.4, 0.4, 0]), WOBBLE_RAD, np.zeros(4)])
+    steps = np.column_stack([[0, 1, 2, 1], np.zeros(4)])
+    angle = np.degrees(gears(values, steps, [True, False, False, False], [[1, 1]] * 4)[0][:4, 0])
+    forward, back = -0.2, 0.2
+    at_90 = 22.5 + H1S - H2C
+    expected = [H1C + H2C + forward, at_90 + forward, 45 - H1C + H2C + forward, at_90 + back]
+    np.testing.assert_allclose(angle, expected, atol=100 * ANGLE_ROUNDING_RAD)
+
+
+def test_wheel_error_enters_behind_the_play(gears):
+    """By hand: play of 0.4 deg holds the wheel at 90 deg, where the phase is 90 deg, while the input is elsewhere."""
+    values = np.concatenate([np.radians([1, 0.1, 0, 0, 0.4, 0.4, 5]), np.zeros(4), WOBBLE_RAD])
+    steps = np.column_stack([np.zeros(3), [902, 900, 897]])
+    angle = np.degrees(gears(values, steps, [True, False, False], [[1, 1]] * 3)[0][:3, 1])
+    # Inputs of 90.2 and 90.0 leave the wheel at 90; 89.7 drags it to 89.9.
+    phase = np.radians(89.9)
+    moved = H1C * np.cos(phase) + H1S * np.sin(phase) + H2C * np.cos(2 * phase) + H2S * np.sin(2 * phase)
+    expected = [95 + H1S - H2C, 95 + H1S - H2C, 94.9 + moved]
+    np.testing.assert_allclose(angle, expected, atol=100 * ANGLE_ROUNDING_RAD)
+
+
+def test_unknown_play_takes_the_error_at_the_middle_of_its_band(gears):
+    """The band stays as wide as the play whatever the error; at mid-play both members have turned by q."""
+    values = np.concatenate([np.radians([22.5, 90, 0, 0, 0.4, 0.4, 0]), WOBBLE_RAD, WOBBLE_RAD])
+    angle, play_sd, _ = gears(values, [[1, 1]], [True], [[0, 0]])
+    expected = np.radians([22.5 + H1S - H2C, 90 + H1S - H2C])
+    np.testing.assert_allclose(angle[0], expected, atol=ANGLE_ROUNDING_RAD)
+    np.testing.assert_allclose(play_sd[0], UNIFORM_SD * np.radians(0.4), atol=ANGLE_ROUNDING_RAD)
+
+
+def test_no_error_is_no_error_bit_by_bit(gears):
+    """Amplitudes of 0 give the gears without transmission error, wherever the error would have entered."""
+    rng = np.random.default_rng(9)
+    values, (steps, first, approach) = random_gears(rng)[:7], random_moves(rng)
+    angle, play_sd, _ = gears(values, steps, first, approach)
+    plain = Transmission(*(jnp.asarray(values[i : i + 2]) for i in (0, 2, 4)))
+    moves = MoveArrays(jnp.asarray(steps, float), jnp.asarray(first), jnp.asarray(approach, float))
+    expected = jax.jit(mirror_angles)(plain, jnp.asarray(values[6]), moves)
+    np.testing.assert_array_equal(angle[:MOVES], expected.angle_rad)
+    np.testing.assert_array_equal(play_sd[:MOVES], expected.play_sd_rad)
 
 
 def test_padding_keeps_the_last_angles(gears):

@@ -15,6 +15,8 @@ from tvsbayes.files import InputError
 from tvsbayes.rigs import (
     DECLARED_PRIORS,
     DEFAULT_PRIORS,
+    HARMONIC_PRIORS,
+    RIG_PRIORS,
     STEREO_PARAMETER_NAMES,
     Prior,
     RigTable,
@@ -205,6 +207,38 @@ def test_rig_table_round_trip():
     }
     table = RigTable(priors, "azimuth")
     assert rig_table(rig_table_toml(table)) == table
+    assert "harmonic" not in rig_table_toml(table), "a table without a period has nothing to say of them"
+    stated = {name: Prior(0.01 * i, 0.02) for i, name in enumerate(HARMONIC_PRIORS)}
+    for periods in ({"pan": 22.5}, {"tilt": 360.0}, {"pan": 360.0, "tilt": 1.25}):
+        own = {name: prior for name, prior in stated.items() if name.split(".")[1] in periods}
+        table = RigTable({**priors, **own}, "azimuth", periods)
+        assert rig_table(rig_table_toml(table)) == table
+
+
+def test_harmonics_in_every_spelling():
+    quoted = rig_table(
+        '[rig]\n"harmonic_period_deg.pan" = { value = 30, u = 0 }\n'
+        '[rig.prior]\n"harmonic_deg.pan.2.sin" = { value = 0.0, u = 0.05 }\n'
+    )
+    dotted = rig_table(
+        "[rig]\nharmonic_period_deg.pan = { value = 30, u = 0 }\n"
+        "[rig.prior]\nharmonic_deg.pan.2.sin = { value = 0.0, u = 0.05 }\n"
+    )
+    assert quoted == dotted
+    assert quoted.harmonic_period_deg == {"pan": 30.0}
+    assert quoted.priors["harmonic_deg.pan.2.sin"] == Prior(0.0, 0.05)
+    assert quoted.priors["harmonic_deg.pan.1.sin"] == Prior(0.0, 0.0)
+
+
+def test_a_table_completes_its_priors_and_refuses_harmonics_without_a_period():
+    assert RigTable({"mirror_offset_mm": Prior(31.0, 1.0)}).priors == {
+        **RIG_PRIORS,
+        "mirror_offset_mm": Prior(31.0, 1.0),
+    }
+    for prior in (Prior(0.05, 0.0), Prior(0.0, 0.1)):
+        with pytest.raises(InputError, match=r"harmonic_deg\.tilt\.1\.cos has no period") as caught:
+            RigTable({"harmonic_deg.tilt.1.cos": prior}, harmonic_period_deg={"pan": 360.0})
+        assert '"harmonic_period_deg.tilt" = { value = P, u = 0.0 }' in caught.value.remedy
 
 
 RIG_REFUSED = {
@@ -225,6 +259,46 @@ RIG_REFUSED = {
     ),
     "stereo": ("[rig.prior]\n'stereo.left.fx' = { value = 800, u = 1 }", 2, "come from stereo.json"),
     "stereo, dotted": ("[rig.prior]\nstereo.left.fx = { value = 800, u = 1 }", 2, "come from stereo.json"),
+    "harmonic without period": (
+        "[rig.prior]\n'harmonic_deg.pan.1.cos' = { value = 0, u = 0.1 }",
+        2,
+        r'add "harmonic_period_deg.pan" = \{ value = P, u = 0.0 \} to \[rig\]',
+    ),
+    "fixed harmonic without period, dotted": (
+        "[rig]\nharmonic_period_deg.pan = { value = 360, u = 0 }\n"
+        "[rig.prior]\nharmonic_deg.tilt.2.sin = { value = 0.1, u = 0 }",
+        4,
+        "harmonic_period_deg.tilt",
+    ),
+    "uncertain period": (
+        "[rig]\n'harmonic_period_deg.pan' = { value = 30, u = 0.1 }",
+        2,
+        "tooth counts give the period exactly",
+    ),
+    "period 0": ("[rig]\n'harmonic_period_deg.pan' = { value = 0, u = 0 }", 2, "to 360"),
+    "period of two turns": ("[rig]\n'harmonic_period_deg.pan' = { value = 720, u = 0 }", 2, "to 360"),
+    "period as number": ("[rig]\n'harmonic_period_deg.pan' = 30", 2, "u = 0 states"),
+    "period in prior": (
+        "[rig.prior]\n'harmonic_period_deg.pan' = { value = 30, u = 0 }",
+        2,
+        r"belongs into \[rig\] itself",
+    ),
+    "period of no axis": (
+        "[rig]\n'harmonic_period_deg.pen' = { value = 30, u = 0 }",
+        2,
+        "did you mean harmonic_period_deg.pan",
+    ),
+    "harmonic in rig": ("[rig]\n'harmonic_deg.pan.1.cos' = { value = 0, u = 0 }", 2, r"belongs into \[rig.prior\]"),
+    "third harmonic": (
+        "[rig.prior]\n'harmonic_deg.pan.3.cos' = { value = 0, u = 0.1 }",
+        2,
+        "did you mean harmonic_deg.pan.",
+    ),
+    "harmonic in radians or steps": (
+        "[rig.prior]\n'harmonic_deg.pan.1.cos' = { value = 0, u = 100 }",
+        2,
+        "from 0 to 10",
+    ),
     "declared in prior": (
         "[rig.prior]\nbaseline_mm = { value = 200, u = 0 }",
         2,
@@ -323,7 +397,7 @@ def test_rig_file(tmp_path):
     assert rig.truth["backlash_deg.pan"] == Prior(0.0, 0.3, "half-normal")
     assert rig.table.priors["backlash_deg.pan"] == DEFAULT_PRIORS["backlash_deg.pan"]
     assert rig.truth["focal_scale"] == Prior(1.002, 0.0)
-    assert set(rig.truth) == {*DEFAULT_PRIORS, *DECLARED_PRIORS}
+    assert set(rig.truth) == set(RIG_PRIORS)
     assert rig.sheets_mm == {"d1": 175.0, "far wall": 1000.5}
     assert rig.positioner["baud"] == 115200 and rig.positioner["pan_min_steps"] == -2000
     assert rig.cameras == {
@@ -342,7 +416,28 @@ def test_rig_file(tmp_path):
     assert minimal.table == RigTable() and minimal.truth == minimal.table.priors and minimal.sheets_mm == {}
 
 
+def test_a_true_rig_may_have_a_transmission_error_that_no_prior_admits(tmp_path):
+    text = RIG_FILE.replace("[rig.prior]", "harmonic_period_deg.tilt = { value = 45.0, u = 0.0 }\n[rig.prior]")
+    text = text.replace("[truth]", "[truth]\n'harmonic_deg.tilt.1.sin' = { value = 0.0, u = 0.1 }")
+    rig = read_rig(write_rig(tmp_path, text))
+    assert rig.truth["harmonic_deg.tilt.1.sin"] == Prior(0.0, 0.1)
+    assert rig.table.priors["harmonic_deg.tilt.1.sin"] == Prior(0.0, 0.0)
+    assert rig.table.harmonic_period_deg == {"tilt": 45.0}
+
+
 RIG_FILE_REFUSED = {
+    "true harmonic without period": (
+        "[truth]",
+        "[truth]\n'harmonic_deg.pan.1.sin' = { value = 0.1, u = 0 }",
+        9,
+        "truth.harmonic_deg.pan.1.sin",
+    ),
+    "true period": (
+        "[truth]",
+        "[truth]\n'harmonic_period_deg.pan' = { value = 30, u = 0 }",
+        9,
+        "truth.harmonic_period_deg.pan",
+    ),
     "format": ('"tvsbayes-rig/1"', '"tvsbayes-campaign/1"', 1, "format"),
     "unknown key": ("name =", "title =", 2, "title"),
     "unknown table": ("[costs]", "[prices]", 28, "prices"),

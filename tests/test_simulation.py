@@ -19,6 +19,7 @@ from tvsbayes.protocols import DIRECTION_SIGNS, PROTOCOLS, four_point_protocol, 
 from tvsbayes.rigs import (
     DECLARED_PRIORS,
     DEFAULT_PRIORS,
+    HARMONIC_PRIORS,
     HOME_SD_DEG,
     STEREO_PARAMETER_NAMES,
     Prior,
@@ -322,6 +323,36 @@ def test_same_seed_same_campaign_other_seed_another():
     one, two, other = (simulate(rig, plan, seed, aperture=True) for seed in (8, 8, 9))
     assert one.campaign.spots == two.campaign.spots and one.truth.parameters == two.truth.parameters
     assert one.campaign.spots != other.campaign.spots
+
+
+def test_transmission_error_leaves_every_other_draw_as_it_was():
+    """The same rig, stop errors, sheets and noise, whose mirrors stand off by the error of the wheel."""
+    rig, plan = make_rig(), small_plan()
+    names = [name for name in HARMONIC_PRIORS if ".tilt." in name]
+    wobbling = replace(
+        rig,
+        table=replace(rig.table, harmonic_period_deg={"tilt": 360.0}),
+        truth={**rig.truth, **dict.fromkeys(names, Prior(0.0, 0.1))},
+    )
+    plain, error = simulate(rig, plan, 8).truth, simulate(wobbling, plan, 8).truth
+    assert {n for n in plain.parameters if plain.parameters[n] != error.parameters[n]} == set(names)
+    assert np.array_equal(plain.stereo.vector, error.stereo.vector)
+    assert plain.stop_errors_deg == error.stop_errors_deg and plain.home_offsets_deg == error.home_offsets_deg
+    shift = np.subtract(error.mirror_angles_deg, plain.mirror_angles_deg)
+    resting = np.subtract(plain.mirror_angles_deg, plain.stop_errors_deg)[:, 1]
+    wheel = np.radians(resting - plain.parameters["tilt_zero_deg"])
+    c1, s1, c2, s2 = (error.parameters[name] for name in names)
+    expected = c1 * np.cos(wheel) + s1 * np.sin(wheel) + c2 * np.cos(2 * wheel) + s2 * np.sin(2 * wheel)
+    assert shift[:, 1] == pytest.approx(expected, abs=1e-12) and np.abs(shift[:, 1]).max() > 0.01
+    assert not shift[:, 0].any()
+
+
+def test_true_transmission_error_needs_its_period():
+    rig = make_rig()
+    truth = draw_truth(rig, np.random.default_rng(1))
+    wobbling = replace(truth, parameters={**truth.parameters, "harmonic_deg.pan.1.sin": 0.1})
+    with pytest.raises(InputError, match=r"harmonic_deg\.pan\.1\.sin has no period"):
+        simulate(rig, small_plan(), 8, wobbling)
 
 
 def test_streams_are_independent():

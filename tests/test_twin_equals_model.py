@@ -1,9 +1,11 @@
 """The digital twin (NumPy, own formulas) and the estimators' model (JAX) are the same physics.
 
-A hundred true rigs drawn from the shipped mounted rig, every prior quantity anew.
+A hundred true rigs drawn from the shipped mounted rig, every prior quantity anew, with transmission errors.
 """
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
@@ -15,6 +17,7 @@ from tvsbayes.geometry import project
 from tvsbayes.likelihood import aperture_angle
 from tvsbayes.parameters import RIG_NAMES, model_of
 from tvsbayes.positioner import MoveArrays, beam, beam_angles, mirror_angles
+from tvsbayes.rigs import HARMONIC_PRIORS, Prior
 from tvsbayes.simulation import draw_truth
 
 pytestmark = pytest.mark.usefixtures("x64")
@@ -30,12 +33,13 @@ ANGLE_RAD = LENGTH_MM / 1000.0
 @pytest.fixture(scope="module")
 def truths(mounted_rig):
     rng = np.random.default_rng(77)
-    return [draw_truth(mounted_rig, rng) for _ in range(RIGS)]
+    wobbling = replace(mounted_rig, truth={**mounted_rig.truth, **dict.fromkeys(HARMONIC_PRIORS, Prior(0.0, 0.1))})
+    return [draw_truth(wobbling, rng) for _ in range(RIGS)]
 
 
 @pytest.fixture(scope="module")
 def values(truths) -> np.ndarray:
-    """(rigs, 57) in the units of NAMES."""
+    """(rigs, 65) in the units of NAMES."""
     return np.array([[*(t.parameters[n] for n in RIG_NAMES), *t.stereo.vector] for t in truths])
 
 
@@ -72,8 +76,12 @@ def test_cameras(truths, values):
     assert seen > 0.9 * RIGS * 20
 
 
-def test_gears_and_play(truths, values):
-    """Random moves in two segments, known approaches; the twin's home offset is the filter's, not the model's."""
+@pytest.mark.parametrize("period_deg", [(30.0, 360.0), (360.0, 12.5)])
+def test_gears_and_play(truths, values, period_deg):
+    """Random moves in two segments, known approaches, the pinion's error on one axis and the wheel's on the other.
+
+    The twin's home offset is the filter's, not the model's.
+    """
     rng = np.random.default_rng(80)
     jumps = rng.choice([-200, -60, -3, -1, 0, 1, 2, 7, 100, 200], (RIGS, MOVES, 2))
     counters = np.cumsum(jumps, axis=1).astype(float)
@@ -82,7 +90,7 @@ def test_gears_and_play(truths, values):
     approach = np.where(first[..., None], rng.choice([-1.0, 1.0], (RIGS, MOVES, 2)), 0.0)
 
     def angles(v, steps, first, approach):
-        model = model_of(v)
+        model = model_of(v, np.array(period_deg))
         return mirror_angles(model.transmission, model.tilt_zero_rad, MoveArrays(steps, first, approach))
 
     found = batched(angles, values, counters, first, approach)
@@ -93,7 +101,8 @@ def test_gears_and_play(truths, values):
             ratios = p[f"degrees_per_step.{name}"], p[f"ratio_contrast_deg_per_step.{name}"]
             start = -0.5 * approach[rig, :, axis]
             args = counters[rig, :, axis], first[rig], start, np.zeros(MOVES), ratios, p[f"backlash_deg.{name}"]
-            expected = np.radians(simulation.transmission(*args) + (p["tilt_zero_deg"] if axis else 0.0))
+            wobble = simulation.harmonics_deg(p, name), period_deg[axis]
+            expected = np.radians(simulation.transmission(*args, *wobble) + (p["tilt_zero_deg"] if axis else 0.0))
             assert np.abs(found.angle_rad[rig, :, axis] - expected).max() < ANGLE_RAD
 
 

@@ -16,12 +16,12 @@ from jax.scipy.special import ndtr, ndtri
 from jaxtyping import Array, Bool, Float, Int
 
 from tvsbayes.geometry import Scalar, StereoCameras, Vector
-from tvsbayes.positioner import Optics, Transmission
-from tvsbayes.rigs import DECLARED_PRIORS, DEFAULT_PRIORS, STEREO_PARAMETER_NAMES, RigTable, Stereo
+from tvsbayes.positioner import Harmonics, Optics, Transmission
+from tvsbayes.rigs import FULL_TURN_DEG, RIG_PRIORS, STEREO_PARAMETER_NAMES, RigTable, Stereo
 
-NAMES: tuple[str, ...] = (*DEFAULT_PRIORS, *DECLARED_PRIORS, *STEREO_PARAMETER_NAMES)
+RIG_NAMES: tuple[str, ...] = tuple(RIG_PRIORS)
+NAMES: tuple[str, ...] = (*RIG_NAMES, *STEREO_PARAMETER_NAMES)
 """Contract names (DESIGN 8) in the order of the coordinates."""
-RIG_NAMES: tuple[str, ...] = (*DEFAULT_PRIORS, *DECLARED_PRIORS)
 NOISE_NAMES: tuple[str, ...] = (
     *(f"stop_sd_deg.{direction}" for direction in ("left", "right", "up", "down")),
     "pixel_scale",
@@ -38,6 +38,8 @@ RECEIVER_NAMES: tuple[str, ...] = (
 
 INDEX: dict[str, int] = {name: index for index, name in enumerate(NAMES)}
 KINDS = ("normal", "half-normal", "log-normal")
+NO_PERIOD_DEG = np.full(2, FULL_TURN_DEG)
+"""Stands for the periods of transmission errors that nobody stated; harmless, since those errors are 0."""
 
 
 class Extrinsics(eqx.Module):
@@ -76,13 +78,18 @@ class Model(eqx.Module):
 
 
 class ParameterSpace(eqx.Module):
-    """Priors of one rig as arrays; an argument of the jitted functions, never a constant in them."""
+    """Priors of one rig as arrays; an argument of the jitted functions, never a constant in them.
+
+    `harmonic_period_deg` holds the periods of the transmission errors of (pan, tilt), as `NO_PERIOD_DEG` where none
+    is stated.
+    """
 
     value: Float[Array, " rig"]
     u: Float[Array, " rig"]
     kind: Int[Array, " rig"]
     stereo_mean: Float[Array, "24"]
     stereo_root: Float[Array, "24 24"]
+    harmonic_period_deg: Float[Array, "2"]
 
     def physical(self, z: Float[Array, " parameters"]) -> Float[Array, " parameters"]:
         """Coordinates -> values in the units of `NAMES`."""
@@ -98,7 +105,7 @@ class ParameterSpace(eqx.Module):
 
     def model(self, z: Float[Array, " parameters"]) -> Model:
         """Coordinates -> model."""
-        return model_of(self.physical(z))
+        return model_of(self.physical(z), self.harmonic_period_deg)
 
 
 RAD_NAMES = tuple(name for name in RIG_NAMES if "deg" in name)
@@ -106,9 +113,20 @@ SCALE = np.array([np.pi / 180 if name in RAD_NAMES else 1.0 for name in NAMES])
 """Contract units -> rad and mm."""
 
 
-def model_of(physical: Float[Array, " parameters"]) -> Model:
-    """Assemble the model from values in the units of `NAMES` (deg -> rad happens here and nowhere else)."""
+def model_of(
+    physical: Float[Array, " parameters"], harmonic_period_deg: Float[Array | np.ndarray, "2"] = NO_PERIOD_DEG
+) -> Model:
+    """Assemble the model (deg -> rad happens here and nowhere else).
+
+    Args:
+        physical: values in the units of `NAMES`.
+        harmonic_period_deg: periods of the transmission error (pan, tilt), see `ParameterSpace`.
+
+    Returns:
+        The model in rad and mm.
+    """
     values = physical * SCALE
+    period_deg = jnp.asarray(harmonic_period_deg)
 
     def block(first: str, length: int):
         return values[INDEX[first] : INDEX[first] + length]
@@ -122,6 +140,11 @@ def model_of(physical: Float[Array, " parameters"]) -> Model:
             ratio_rad_per_step=block("degrees_per_step.pan", 2),
             contrast_rad_per_step=block("ratio_contrast_deg_per_step.pan", 2),
             backlash_rad=block("backlash_deg.pan", 2),
+            harmonics=Harmonics(
+                amplitude_rad=jnp.reshape(block("harmonic_deg.pan.1.cos", 8), (2, 2, 2)),
+                period_rad=period_deg * (jnp.pi / 180),
+                on_wheel=period_deg == FULL_TURN_DEG,
+            ),
         ),
         optics=Optics(
             mirror_offset_mm=one("mirror_offset_mm"),
@@ -169,6 +192,7 @@ def parameter_space(table: RigTable, stereo: Stereo) -> ParameterSpace:
             kind=jnp.array([KINDS.index(p.distribution) for p in priors]),
             stereo_mean=jnp.asarray(stereo.vector),
             stereo_root=jnp.asarray(root),
+            harmonic_period_deg=jnp.array([table.harmonic_period_deg.get(a, FULL_TURN_DEG) for a in ("pan", "tilt")]),
         )
 
 

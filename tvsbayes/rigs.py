@@ -6,13 +6,13 @@ image px with the integer at the centre of a pixel. No JAX.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path, PureWindowsPath
 from typing import Literal
 
 from tvsbayes.documents import TOML_BYTES_MAX, Keys, parse_toml, toml_line
-from tvsbayes.files import closest, escaped, read_bytes
+from tvsbayes.files import InputError, closest, escaped, read_bytes
 from tvsbayes.stereo import (
     STEREO_PARAMETER_NAMES,
     Stereo,
@@ -25,7 +25,9 @@ from tvsbayes.stereo import (
 __all__ = [
     "DECLARED_PRIORS",
     "DEFAULT_PRIORS",
+    "HARMONIC_PRIORS",
     "HOME_SD_DEG",
+    "RIG_PRIORS",
     "STEREO_PARAMETER_NAMES",
     "Distribution",
     "Prior",
@@ -98,6 +100,21 @@ DECLARED_PRIORS: dict[str, Prior] = {
 }
 """Entries of `[rig]` itself, with the defaults of DESIGN 7."""
 
+HARMONIC_ORDERS = (1, 2)
+HARMONIC_PRIORS: dict[str, Prior] = {
+    f"harmonic_deg.{axis}.{order}.{part}": Prior(0.0, 0.0)
+    for axis in ("pan", "tilt")
+    for order in HARMONIC_ORDERS
+    for part in ("cos", "sin")
+}
+"""Transmission error by axis, order and phase, part of `[rig.prior]` (DESIGN 3.1); none unless asked for."""
+
+RIG_PRIORS: dict[str, Prior] = {**DEFAULT_PRIORS, **DECLARED_PRIORS, **HARMONIC_PRIORS}
+"""Every prior of a rig with its default, in the order of the parameter vector."""
+
+FULL_TURN_DEG = 360.0
+"""Period of the wheel (the output member); a shorter one is the pinion's."""
+
 HOME_SD_DEG = 0.05
 """Standard deviation of the home offset of every segment after the first (DESIGN 3.2, fixed)."""
 
@@ -106,12 +123,21 @@ HOME_SD_DEG = 0.05
 class RigTable:
     """The `[rig]` table of a campaign or rig file: every prior the estimators use.
 
-    `priors` maps every name of `DEFAULT_PRIORS` and `DECLARED_PRIORS` to its `Prior`; entries absent
-    from the file hold the default.
+    `priors` maps every name of `RIG_PRIORS` to its `Prior`; names left out take the default.
+    `harmonic_period_deg` maps "pan" and "tilt", where declared, to the period of the transmission error in
+    degrees of the output: `FULL_TURN_DEG` for the wheel, less for the pinion.
+
+    Raises:
+        InputError: harmonics of an axis without a period.
     """
 
-    priors: dict[str, Prior] = field(default_factory=lambda: {**DEFAULT_PRIORS, **DECLARED_PRIORS})
+    priors: dict[str, Prior] = field(default_factory=dict)
     aperture_convention: Literal["in-plane", "azimuth"] = "in-plane"
+    harmonic_period_deg: dict[str, float] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "priors", {**RIG_PRIORS, **self.priors})
+        require_periods(self.priors, self.harmonic_period_deg)
 
 
 @dataclass(frozen=True)
@@ -158,9 +184,42 @@ _RANGES: dict[str, tuple[float, float, float]] = {
     "pan_zero_emission_deg": (0.0, 180.0, 180.0),
     "aperture_zero_deg": (-180.0, 180.0, 180.0),
     "aperture_sd_deg": (1e-6, 10.0, 5.0),
+    "harmonic_deg": (-10.0, 10.0, 10.0),
 }
-_ALL_PRIORS = {**DEFAULT_PRIORS, **DECLARED_PRIORS}
-_GROUPS = {name.rsplit(".", n)[0] for name in (*_ALL_PRIORS, *STEREO_PARAMETER_NAMES) for n in (1, 2)}
+_PRIOR_NAMES = (*DEFAULT_PRIORS, *HARMONIC_PRIORS)
+_PERIOD_NAMES = {f"harmonic_period_deg.{axis}": axis for axis in ("pan", "tilt")}
+_PERIOD_MIN_DEG = 1e-6
+_GROUPS = {name.rsplit(".", n)[0] for name in (*RIG_PRIORS, *_PERIOD_NAMES, *STEREO_PARAMETER_NAMES) for n in (1, 2, 3)}
+
+
+def _harmonic_without_period(priors: Mapping[str, Prior], period_deg: Mapping[str, float]) -> str | None:
+    """The first harmonic that is not fixed at 0 on an axis whose period nobody stated."""
+    for name in HARMONIC_PRIORS:
+        prior = priors.get(name)
+        if prior is not None and (prior.value != 0 or prior.u != 0) and name.split(".")[1] not in period_deg:
+            return name
+    return None
+
+
+def _period_remedy(name: str) -> str:
+    axis = name.split(".")[1]
+    return (
+        f'add "harmonic_period_deg.{axis}" = {{ value = P, u = 0.0 }} to [rig]: degrees of the output per turn of the '
+        f"faulty member, {FULL_TURN_DEG:g} for the wheel, {FULL_TURN_DEG:g} x teeth of the pinion / teeth of the wheel "
+        "for the pinion"
+    )
+
+
+def require_periods(priors: Mapping[str, Prior], period_deg: Mapping[str, float]) -> None:
+    """Refuse harmonics whose period is unknown: they would be an error at no known angle.
+
+    Raises:
+        InputError: a harmonic with a value or u other than 0 on an axis without a period.
+    """
+    name = _harmonic_without_period(priors, period_deg)
+    if name is not None:
+        message = f"{name} has no period"
+        raise InputError("missing-period", message, column=name, remedy=_period_remedy(name))
 
 
 def _explanation(name: str, allowed: tuple[str, ...]) -> str:
@@ -168,7 +227,9 @@ def _explanation(name: str, allowed: tuple[str, ...]) -> str:
     stem, _, last = name.partition(".")
     if name in DECLARED_PRIORS:
         return "it belongs into [rig] itself, not into [rig.prior]"
-    if name in DEFAULT_PRIORS:
+    if name in _PERIOD_NAMES:
+        return "it belongs into [rig] itself: tooth counts fix it, so it has no prior and no other truth"
+    if name in _PRIOR_NAMES:
         return "it belongs into [rig.prior]"
     if stem == "degrees_per_step" and last in ("left", "right", "up", "down"):
         axis = "pan" if last in ("left", "right") else "tilt"
@@ -200,7 +261,10 @@ def _parse_priors(table: Keys, allowed: tuple[str, ...]) -> dict[str, Prior]:
             raise keys.refuse(key, "unknown-key", names, _explanation(name, allowed), found)
         if name in priors:
             raise keys.refuse(key, "duplicate-key", "every name once", "remove one", f"{name} twice")
-        distribution = _ALL_PRIORS[name].distribution
+        if name in _PERIOD_NAMES:
+            priors[name] = Prior(_parse_period(keys, key), 0.0)
+            continue
+        distribution = RIG_PRIORS[name].distribution
         low, high, u_max = _RANGES[name.partition(".")[0]]
         if name.startswith("extrinsics.rotation_rad"):
             low, high, u_max = -3.15, 3.15, 3.15
@@ -209,31 +273,60 @@ def _parse_priors(table: Keys, allowed: tuple[str, ...]) -> dict[str, Prior]:
     return priors
 
 
+def _parse_period(keys: Keys, key: str) -> float:
+    """A period in degrees of the output; exact, since it follows from tooth counts."""
+    period_deg, u = keys.quantity(key, _PERIOD_MIN_DEG, FULL_TURN_DEG, FULL_TURN_DEG)
+    if u != 0:
+        remedy = "write u = 0.0: tooth counts give the period exactly (the wheel's is 360)"
+        raise keys.refuse(key, "period-uncertain", "a period with u = 0", remedy)
+    return period_deg
+
+
+def _check_periods(table: Keys, priors: Mapping[str, Prior], period_deg: Mapping[str, float]) -> None:
+    """`require_periods` with the place in the file."""
+    name = _harmonic_without_period(priors, period_deg)
+    if name is not None:
+        allowed = "harmonics of an axis whose period is stated"
+        raise table.refuse(name, "missing-period", allowed, _period_remedy(name), "a harmonic without a period")
+
+
 def parse_rig_table(table: Keys) -> RigTable:
     """The `[rig]` table with its `[rig.prior]`; absent entries take their defaults.
 
     Raises:
         InputError: unknown or misplaced names, entries that are not { value, u }, values out of range,
-            a half-normal with a value other than 0.
+            a half-normal with a value other than 0, harmonics without a period, a period with u > 0.
     """
     own = {k: v for k, v in table.values.items() if k not in ("aperture_convention", "prior")}
-    declared = _parse_priors(Keys(own, table.file, table.text, table.path), tuple(DECLARED_PRIORS))
-    prior = _parse_priors(table.table("prior"), tuple(DEFAULT_PRIORS))
+    own_keys = Keys(own, table.file, table.text, table.path)
+    declared = _parse_priors(own_keys, (*DECLARED_PRIORS, *_PERIOD_NAMES))
+    period_deg = {axis: declared.pop(name).value for name, axis in _PERIOD_NAMES.items() if name in declared}
+    prior = _parse_priors(table.table("prior"), _PRIOR_NAMES)
+    _check_periods(table.table("prior"), prior, period_deg)
     key = "aperture_convention"
     azimuth = key in table and table.word(key, ("in-plane", "azimuth")) == "azimuth"
-    return RigTable({**_ALL_PRIORS, **prior, **declared}, "azimuth" if azimuth else "in-plane")
+    return RigTable({**prior, **declared}, "azimuth" if azimuth else "in-plane", period_deg)
 
 
 def rig_table_toml(table: RigTable) -> str:
-    """`[rig]` and `[rig.prior]` with every entry, also those at their defaults, so that a file says all."""
+    """`[rig]` and `[rig.prior]` with every entry, also those at their defaults, so that a file says all.
+
+    Harmonics stand only where they mean something: on an axis with a period.
+    """
 
     def entry(name: str) -> str:
         prior = table.priors[name]
         return toml_line(name, {"value": float(prior.value), "u": float(prior.u)})
 
     convention = toml_line("aperture_convention", table.aperture_convention)
+    periods = [
+        toml_line(name, {"value": float(table.harmonic_period_deg[axis]), "u": 0.0})
+        for name, axis in _PERIOD_NAMES.items()
+        if axis in table.harmonic_period_deg
+    ]
+    harmonics = [entry(name) for name in HARMONIC_PRIORS if name.split(".")[1] in table.harmonic_period_deg]
     declared, priors = map(entry, DECLARED_PRIORS), map(entry, DEFAULT_PRIORS)
-    return "\n".join(["[rig]", *declared, convention, "[rig.prior]", *priors]) + "\n"
+    return "\n".join(["[rig]", *declared, *periods, convention, "[rig.prior]", *priors, *harmonics]) + "\n"
 
 
 _COSTS_S = {"move_s": 1.5, "look_s": 1.0, "placement_s": 60.0}
@@ -312,10 +405,12 @@ def read_rig(path: Path) -> Rig:
             raise sheets.refuse(name, "text", "a printable name of 1 to 100 characters", "rename the sheet")
     costs = keys.table("costs")
     costs.only(_COSTS_S)
+    truth = {**table.priors, **_parse_priors(keys.table("truth"), tuple(RIG_PRIORS))}
+    _check_periods(keys.table("truth"), truth, table.harmonic_period_deg)
     return Rig(
         table=table,
         stereo=stereo,
-        truth={**table.priors, **_parse_priors(keys.table("truth"), tuple(_ALL_PRIORS))},
+        truth=truth,
         sheets_mm={name: sheets.number(name, 50.0, 100_000.0) for name in sheets.values},
         positioner=_parse_positioner(keys.table("positioner")),
         cameras=_parse_cameras(keys.table("cameras"), stereo),

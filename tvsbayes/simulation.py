@@ -24,11 +24,15 @@ from tvsbayes.files import InputError, read_bytes, write_atomically
 from tvsbayes.rigs import (
     DECLARED_PRIORS,
     DEFAULT_PRIORS,
+    FULL_TURN_DEG,
+    HARMONIC_ORDERS,
+    HARMONIC_PRIORS,
     HOME_SD_DEG,
     STEREO_PARAMETER_NAMES,
     Prior,
     Rig,
     Stereo,
+    require_periods,
     rotation_matrix,
 )
 
@@ -61,6 +65,8 @@ def transmission(
     home_deg: np.ndarray,
     ratios_deg_per_step: tuple[float, float],
     backlash_deg: float,
+    harmonics_deg: Sequence[complex] = (),
+    period_deg: float = FULL_TURN_DEG,
 ) -> np.ndarray:
     """Output angle (n,) in degrees of one axis after each move, stop errors excluded (DESIGN 3.1).
 
@@ -71,16 +77,28 @@ def transmission(
         home_deg: (n,) home offset of the row's segment.
         ratios_deg_per_step: mean ratio and contrast; positive moves turn by mean + contrast / 2 per step.
         backlash_deg: full width of the play.
+        harmonics_deg: cosine part - i sine part of the transmission error for orders 1, 2 ...
+        period_deg: its period in degrees of the output: a full turn for the wheel, behind the play; less for the
+            pinion, before it.
     """
     mean, contrast = ratios_deg_per_step
+    wheel = period_deg == FULL_TURN_DEG
     output = np.empty(len(counters))
     starts = [*np.flatnonzero(first), len(counters)]
     for begin, end in pairwise(starts):
         steps = np.diff(counters[begin:end])
         turned = steps * np.where(steps > 0, mean + contrast / 2, mean - contrast / 2)
         q = mean * counters[begin] + home_deg[begin] + np.concatenate(([0.0], np.cumsum(turned)))
+        if not wheel:
+            q = q + _wobble(q, harmonics_deg, period_deg)
         output[begin:end] = play(q, q[0] + start_fraction[begin] * backlash_deg, backlash_deg)
-    return output
+    return output + _wobble(output, harmonics_deg, period_deg) if wheel else output
+
+
+def _wobble(angle_deg: np.ndarray, harmonics_deg: Sequence[complex], period_deg: float) -> np.ndarray:
+    """Transmission error at angles: the real part of sum_o (c_o - i s_o) e^(i o phase)."""
+    turn = np.exp(2j * np.pi * np.asarray(angle_deg) / period_deg)
+    return sum((part * turn**order for order, part in enumerate(harmonics_deg, start=1)), np.zeros(len(turn))).real
 
 
 def stop_errors(
@@ -216,7 +234,10 @@ def beam_jacobian(geometry: Mapping[str, float], pose_deg: tuple[float, float]) 
 def effective_deg_per_step(
     parameters: Mapping[str, float], reference_pose_deg: tuple[float, float]
 ) -> dict[str, float]:
-    """Degrees of the beam per step at a pose: k_dir d(az)/d(psi) and k_dir d(el)/d(beta) (DESIGN 3.2)."""
+    """Degrees of the beam per step at a pose: k_dir d(az)/d(psi) and k_dir d(el)/d(beta) (DESIGN 3.2).
+
+    The mean over a period of the transmission error, without its local slope.
+    """
     jacobian = beam_jacobian(parameters, reference_pose_deg)
     slopes = {"left": jacobian[0, 0], "right": jacobian[0, 0], "up": jacobian[1, 1], "down": jacobian[1, 1]}
     return {name: float(parameters[f"degrees_per_step.{name}"] * slope) for name, slope in slopes.items()}
@@ -342,6 +363,8 @@ def draw_truth(rig: Rig, rng: np.random.Generator) -> Truth:
     # Through the eigenvectors: fixed parameters give a semi-definite covariance that Cholesky refuses.
     variances, vectors = np.linalg.eigh(np.asarray(rig.stereo.parameter_covariance, float))
     offset = vectors @ (np.sqrt(np.clip(variances, 0.0, None)) * rng.standard_normal(len(variances)))
+    # Last: rigs without transmission error are the same rigs whatever is drawn here.
+    parameters |= {name: _draw(rig.truth.get(name, rig.table.priors[name]), rng) for name in HARMONIC_PRIORS}
     return Truth(with_derived(parameters), rig.stereo.with_vector(rig.stereo.vector + offset))
 
 
@@ -353,6 +376,12 @@ def _draw(prior: Prior, rng: np.random.Generator) -> float:
     if prior.distribution == "half-normal":
         return float(prior.value + prior.u * abs(z))
     return float(prior.value + prior.u * z)
+
+
+def harmonics_deg(parameters: Mapping[str, float], axis: str) -> list[complex]:
+    """Transmission error of an axis as `transmission` takes it; a rig that names none has none."""
+    names = [f"harmonic_deg.{axis}.{order}" for order in HARMONIC_ORDERS]
+    return [complex(parameters.get(f"{name}.cos", 0.0), -parameters.get(f"{name}.sin", 0.0)) for name in names]
 
 
 def with_derived(parameters: Mapping[str, float]) -> dict[str, float]:
@@ -440,7 +469,8 @@ def simulate(
         header: further keys of campaign.toml.
 
     Raises:
-        InputError: the plan looks before a sheet is placed, or names a sheet the rig does not have.
+        InputError: the plan looks before a sheet is placed, or names a sheet the rig does not have; the true
+            rig has a transmission error whose period the declared one does not state.
     """
     streams = dict(
         zip(
@@ -453,7 +483,9 @@ def simulate(
         truth = draw_truth(rig, streams["truth"])
     sd_px = float(rig.cameras.get("spot_sd_px", SPOT_SD_PX) if spot_sd_px is None else spot_sd_px)
     log = _run_plan(plan, rig, home_approach)
-    truth, resting_deg = _drive(log.moves, truth, streams["stops"], streams["homes"])
+    fixed = {name: Prior(value, 0.0) for name, value in truth.parameters.items() if name in HARMONIC_PRIORS}
+    require_periods(fixed, rig.table.harmonic_period_deg)
+    truth, resting_deg = _drive(log.moves, truth, rig.table.harmonic_period_deg, streams["stops"], streams["homes"])
     points_S, points_P = _light(log, rig, truth, streams["sheets"])
     p = truth.parameters
     pixels = project(points_S, truth.stereo, p["focal_scale"])
@@ -478,7 +510,11 @@ def simulate(
 
 
 def _drive(
-    moves: list[Move], truth: Truth, stops: np.random.Generator, homes: np.random.Generator
+    moves: list[Move],
+    truth: Truth,
+    harmonic_period_deg: Mapping[str, float],
+    stops: np.random.Generator,
+    homes: np.random.Generator,
 ) -> tuple[Truth, np.ndarray]:
     """Realise the mirror angles of all moves; also return (n, 2) angles without stop errors, degrees."""
     p = truth.parameters
@@ -498,7 +534,16 @@ def _drive(
         start = np.array([side.get(name, draw) for name, draw in zip(approach, start_draws[:, i], strict=True)])
         ratios = p[f"degrees_per_step.{axis}"], p[f"ratio_contrast_deg_per_step.{axis}"]
         backlash = p[f"backlash_deg.{axis}"]
-        resting[:, i] = transmission(counters[:, i], first, start, home_draws[segments, i], ratios, backlash)
+        resting[:, i] = transmission(
+            counters[:, i],
+            first,
+            start,
+            home_draws[segments, i],
+            ratios,
+            backlash,
+            harmonics_deg(p, axis),
+            harmonic_period_deg.get(axis, FULL_TURN_DEG),
+        )
         sds = {"+": p[f"stop_sd_deg.{positive}"], "-": p[f"stop_sd_deg.{negative}"]}
         errors[:, i] = stop_errors(counters[:, i], first, approach, stop_draws[:, i], sds)
     resting[:, 1] += p["tilt_zero_deg"]
