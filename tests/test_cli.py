@@ -295,6 +295,20 @@ def test_per_axis_fit_has_one_gear_ratio_per_axis(ask, folder):
     assert (contrast["value"], contrast["sd"], contrast["prior_sd"], contrast["contraction"]) == (0.0, 0.0, 0.0, None)
 
 
+def test_fit_without_backlash_and_with_harmonics(ask, small, folder, tmp_path):
+    code, document = ask("fit", folder, "--no-sample", "--harmonics")
+    assert code == 2 and "harmonic_period_deg.pan" in document["error"]["remedy"]
+    table = replace(small.rig, harmonic_period_deg={"tilt": 360.0})
+    write_campaign(replace(small, rig=table), tmp_path / "wheel")
+    code, document = ask("fit", tmp_path / "wheel", "--no-sample", "--harmonics", "--no-backlash")
+    assert code == 0
+    parameters = document["parameters"]
+    assert {name for name in parameters if name.startswith("harmonic_deg")} == {
+        f"harmonic_deg.tilt.{order}.{part}" for order in (1, 2) for part in ("cos", "sin")
+    }
+    assert parameters["backlash_deg.pan"]["value"] == parameters["backlash_deg.tilt"]["sd"] == 0.0
+
+
 def test_robust_fit_names_the_spot_it_leaves_out(ask, small, tmp_path):
     spots = list(small.spots)
     # 40 stated sds.

@@ -14,7 +14,8 @@ from tvsbayes.information import CONTRACTION_LIMIT, FitSummary, summarise
 from tvsbayes.joint import fit
 from tvsbayes.parameters import INDEX, NAMES, RECEIVER_NAMES
 from tvsbayes.protocols import four_point_protocol, paper_protocol
-from tvsbayes.rigs import Prior
+from tvsbayes.report import fit_text
+from tvsbayes.rigs import HARMONIC_PRIORS, Prior
 from tvsbayes.simulation import simulate
 
 
@@ -35,7 +36,7 @@ def summary(fitted) -> FitSummary:
 
 
 def test_every_parameter_of_the_contract_is_there_and_only_those(summary):
-    expected = set(NAMES) - set(RECEIVER_NAMES)
+    expected = set(NAMES) - set(RECEIVER_NAMES) - set(HARMONIC_PRIORS)
     expected |= {f"degrees_per_step.{d}" for d in ("left", "right", "up", "down")} | {"effective_mirror_offset_mm"}
     assert set(summary.parameters) == expected
 
@@ -152,6 +153,33 @@ def test_aperture_readings_bring_their_parameters(mounted_rig):
     # Readings of 0.02 deg see C0 (0.2 deg) only together with the zero (0.1 deg) and the axes' offsets.
     assert parameters["pan_zero_emission_deg"].informed
     assert fitted.free[INDEX["pan_zero_emission_deg"]]
+
+
+def test_gears_without_play_are_not_called_weak_for_it(paper):
+    """Of one |N| the ratio cannot be told from play; of gears said to have none it can."""
+    summary = summarise(fit(paper, no_backlash=True))
+    assert not any("backlash" in weak.text for weak in summary.weak_directions)
+    assert not any("backlash" in entry.quantity for entry in summary.leverage)
+    for axis in ("pan", "tilt"):
+        fixed = summary.parameters[f"backlash_deg.{axis}"]
+        assert (fixed.value, fixed.sd, fixed.interval95, fixed.contraction) == (0.0, 0.0, (0.0, 0.0), None)
+    assert "nan" not in fit_text(summary)
+    json.dumps(summary.as_json(), allow_nan=False)
+
+
+def test_harmonics_are_listed_where_they_are_free_or_known(paper):
+    table = replace(
+        paper.rig,
+        priors={**paper.rig.priors, "harmonic_deg.tilt.1.cos": Prior(0.05, 0.0)},
+        harmonic_period_deg={"pan": 7.0, "tilt": 360.0},
+    )
+    stated = replace(paper, rig=replace(table, priors={**table.priors, "harmonic_deg.pan.1.sin": Prior(0.0, 0.05)}))
+    parameters = summarise(fit(stated)).parameters
+    listed = {name: parameters[name] for name in HARMONIC_PRIORS if name in parameters}
+    assert set(listed) == {"harmonic_deg.pan.1.sin", "harmonic_deg.tilt.1.cos"}
+    assert listed["harmonic_deg.tilt.1.cos"].value == pytest.approx(0.05)
+    assert listed["harmonic_deg.tilt.1.cos"].contraction is None
+    assert listed["harmonic_deg.pan.1.sin"].prior_sd == pytest.approx(0.05)
 
 
 def test_a_prior_that_the_data_contradict_is_named(paper, summary):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from contextlib import contextmanager
 from dataclasses import replace
 from itertools import pairwise
 
@@ -12,12 +13,12 @@ import numpy as np
 import pytest
 
 from tvsbayes.campaign import Campaign
-from tvsbayes.files import NothingToEstimate, shipped_data
-from tvsbayes.joint import fit
+from tvsbayes.files import InputError, NothingToEstimate, shipped_data
+from tvsbayes.joint import HARMONIC_SD_DEG, fit, model_choice
 from tvsbayes.likelihood import ordered_spots
 from tvsbayes.parameters import INDEX, NAMES
-from tvsbayes.protocols import four_point_protocol
-from tvsbayes.rigs import Prior, read_rig
+from tvsbayes.protocols import four_point_protocol, grid_protocol
+from tvsbayes.rigs import HARMONIC_PRIORS, Prior, RigTable, read_rig
 from tvsbayes.simulation import SimulatedCampaign, effective_deg_per_step, effective_mirror_offset_mm, simulate
 from tvsbayes.solver import laplace_draws
 
@@ -86,20 +87,26 @@ def test_a_far_start_is_annealed_to_the_same_mode(simulated, fitted):
     assert far.chi2 == pytest.approx(fitted.chi2, rel=0.05)
 
 
-def test_a_second_campaign_of_another_size_compiles_nothing(simulated, fitted, caplog):
-    campaign = simulated.campaign
-    shorter = replace(campaign, spots=campaign.spots[:-7], moves=campaign.moves)
+@contextmanager
+def compiling_nothing(caplog):
+    """Fails if a model function is compiled inside."""
     # The configuration, not `jax.log_compiles`: that holds for one thread, and half of a fit compiles aside.
     jax.config.update("jax_log_compiles", True)
     try:
         with caplog.at_level(logging.WARNING):
-            again = fit(shorter)
+            yield
     finally:
         jax.config.update("jax_log_compiles", False)
     compiled = [r.getMessage() for r in caplog.records if "Compiling" in r.getMessage()]
-    heavy = [m for m in compiled if any(n in m for n in ("marquardt", "density", "linearise", "derived"))]
+    assert [m for m in compiled if any(n in m for n in ("marquardt", "density", "linearise", "derived"))] == []
+
+
+def test_a_second_campaign_of_another_size_compiles_nothing(simulated, fitted, caplog):
+    campaign = simulated.campaign
+    shorter = replace(campaign, spots=campaign.spots[:-7], moves=campaign.moves)
+    with compiling_nothing(caplog):
+        again = fit(shorter)
     assert again.converged
-    assert heavy == []
 
 
 def test_the_order_of_rows_does_not_matter(simulated, fitted):
@@ -151,6 +158,81 @@ def test_the_per_axis_model_has_one_ratio(simulated):
     np.testing.assert_array_equal(up, down)
     for axis in ("pan", "tilt"):
         assert not result.free[INDEX[f"ratio_contrast_deg_per_step.{axis}"]]
+
+
+PAN_ERROR_DEG = {"harmonic_deg.pan.1.cos": 0.06, "harmonic_deg.pan.1.sin": 0.08}
+"""An amplitude of 0.1 deg, twice the rig's median stop error."""
+
+
+@pytest.fixture(scope="module")
+def wobbling(mounted_rig) -> SimulatedCampaign:
+    """A pinion of 6 deg per turn under a grid of 15 pan angles, 1.2 deg apart, over three turns."""
+    stop_sds = {f"stop_sd_deg.{d}": Prior(0.02, 0.0, "log-normal") for d in ("left", "right", "up", "down")}
+    errors = {name: Prior(value, 0.0) for name, value in PAN_ERROR_DEG.items()}
+    rig = replace(
+        mounted_rig,
+        table=replace(mounted_rig.table, harmonic_period_deg={"pan": 6.0}),
+        truth={**mounted_rig.truth, **stop_sds, **errors},
+    )
+    plan = grid_protocol(targets=("d1", "d3"), pan_steps=range(-40, 241, 20), tilt_steps=(-60, 0, 60))
+    return simulate(rig, plan, seed=5)
+
+
+def test_a_pinions_error_is_found_and_without_it_the_stops_scatter(simulated, fitted, wobbling, caplog):
+    with compiling_nothing(caplog):
+        plain, freed = fit(wobbling.campaign), fit(wobbling.campaign, harmonics=True)
+    assert plain.converged and freed.converged, (plain.problems, freed.problems)
+    for name in HARMONIC_PRIORS:
+        index = INDEX[name]
+        assert freed.free[index] == (".pan." in name) and not plain.free[index], name
+        error = freed.mode.physical[index] - PAN_ERROR_DEG.get(name, 0.0)
+        assert abs(error) <= 4 * SD * freed.draws.physical[:, index].std(), name
+    amplitude_sd = freed.draws.physical[:, INDEX["harmonic_deg.pan.1.sin"]].std()
+    assert amplitude_sd < 0.1 * PAN_ERROR_DEG["harmonic_deg.pan.1.sin"], "the campaign knows it to a tenth"
+    pan = [INDEX["stop_sd_deg.left"], INDEX["stop_sd_deg.right"]]
+    # What the plain model must call chance: 0.1 deg / sqrt(2) beside 0.02 deg.
+    np.testing.assert_allclose(freed.mode.physical[pan], 0.02, rtol=0.4)
+    np.testing.assert_allclose(plain.mode.physical[pan], 0.074, rtol=0.4)
+    assert freed.log_density - plain.log_density > 100
+    # 1e-4 bounds by the normal approximation of chi-square; residuals less some fifty parameters.
+    dof = 3 * len(wobbling.campaign.spots) - 50
+    assert abs(freed.chi2 / dof - 1) < 4 * np.sqrt(2 / dof)
+
+
+def test_harmonics_need_a_period_to_be_freed(simulated):
+    with pytest.raises(InputError, match="no axis states the period") as caught:
+        fit(simulated.campaign, harmonics=True)
+    assert '"harmonic_period_deg.pan" = { value = 360.0, u = 0.0 }' in caught.value.remedy
+
+
+def test_the_choice_of_a_model_keeps_what_the_rig_states():
+    stated = {"harmonic_deg.pan.2.cos": Prior(0.02, 0.005), "harmonic_deg.pan.2.sin": Prior(0.03, 0.0)}
+    table = RigTable(stated, harmonic_period_deg={"pan": 30.0})
+    plain = {"per_axis": False, "harmonics": False, "no_backlash": False}
+    assert model_choice(table, **plain) == table
+    chosen = model_choice(table, **{**plain, "harmonics": True})
+    asked = {"harmonic_deg.pan.1.cos", "harmonic_deg.pan.1.sin"}
+    assert {n for n in HARMONIC_PRIORS if chosen.priors[n] == Prior(0.0, HARMONIC_SD_DEG)} == asked
+    assert all(chosen.priors[name] == prior for name, prior in stated.items())
+    assert all(p == Prior(0.0, 0.0) for n, p in chosen.priors.items() if n.startswith("harmonic_deg.tilt"))
+    bare = model_choice(table, **{**plain, "no_backlash": True, "per_axis": True}).priors
+    changed = {name for name, prior in bare.items() if prior != table.priors[name]}
+    stems = ("backlash_deg", "ratio_contrast_deg_per_step")
+    assert changed == {f"{stem}.{axis}" for stem in stems for axis in ("pan", "tilt")}
+    assert all(bare[name].u == 0 for name in changed)
+
+
+def test_gears_without_play_put_it_into_the_stops(simulated, fitted):
+    result = fit(simulated.campaign, no_backlash=True)
+    assert result.converged, result.problems
+    for axis in ("pan", "tilt"):
+        index = INDEX[f"backlash_deg.{axis}"]
+        assert not result.free[index]
+        assert np.all(result.draws.physical[:, index] == 0.0) and result.mode.physical[index] == 0.0
+    assert np.all(np.isfinite(result.covariance)) and np.isfinite(result.chi2)
+    assert result.log_density < fitted.log_density - 10
+    sds = [INDEX[f"stop_sd_deg.{d}"] for d in ("left", "right", "up", "down")]
+    assert np.max(result.mode.physical[sds] / fitted.mode.physical[sds]) > 2
 
 
 def test_a_fixed_parameter_stays_and_the_rest_follows(simulated, fitted):

@@ -226,6 +226,8 @@ def fit(
     no_sample: Annotated[bool, typer.Option("--no-sample", help="Laplace approximation only.")] = False,
     robust: Annotated[bool, typer.Option("--robust", help="Downweight and exclude outlying spots, by name.")] = False,
     per_axis: Annotated[bool, typer.Option("--per-axis", help="One ratio per axis: contrasts fixed at 0.")] = False,
+    harmonics: Annotated[bool, typer.Option("--harmonics", help="Free transmission errors of known period.")] = False,
+    no_backlash: Annotated[bool, typer.Option("--no-backlash", help="No play: backlash fixed at 0.")] = False,
     out: Annotated[Path | None, typer.Option("--out", help="Folder for results (default CAMPAIGN/results).")] = None,
     seed: Seed = 0,
     as_json: Json = False,
@@ -242,7 +244,8 @@ def fit(
     from tvsbayes.solver import use_compilation_cache
 
     use_compilation_cache()
-    result = fit_joint(data, robust=robust, per_axis=per_axis, seed=seed)
+    model = {"per_axis": per_axis, "harmonics": harmonics, "no_backlash": no_backlash}
+    result = fit_joint(data, robust=robust, **model, seed=seed)
     summary = summarise(result)
     files = write_results(result, summary, out or campaign / "results", seed)
     document = {**summary.as_json(), "seed": seed, "files": files}

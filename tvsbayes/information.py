@@ -15,6 +15,7 @@ from tvsbayes.joint import NORMAL_95, JointFit
 from tvsbayes.likelihood import ordered_spots
 from tvsbayes.parameters import INDEX, NAMES, RECEIVER_NAMES, RIG_NAMES
 from tvsbayes.protocols import observed_stops, separation
+from tvsbayes.rigs import HARMONIC_PRIORS
 from tvsbayes.stops import standard_deviations_without
 
 CONTRACTION_LIMIT = 0.1
@@ -152,7 +153,8 @@ class FitSummary:
 
 def _estimate(mode: float, draws: np.ndarray, prior_draws: np.ndarray) -> Estimate:
     """From draws: equal-tailed interval, sample standard deviations."""
-    sd, prior_sd = float(np.std(draws)), float(np.std(prior_draws))
+    # The mean of equal numbers may be off by a rounding: what is fixed would scatter by 1e-17 of itself.
+    sd, prior_sd = (float(np.std(x)) if np.ptp(x) > 0 else 0.0 for x in (draws, prior_draws))
     low, high = np.quantile(draws, [0.025, 0.975])
     contraction = float(1 - (sd / prior_sd) ** 2) if prior_sd > 0 else None
     return Estimate(float(mode), sd, (float(low), float(high)), prior_sd, contraction)
@@ -166,6 +168,8 @@ def _parameters(fit: JointFit) -> dict[str, Estimate]:
     estimates = {}
     for index, name in enumerate(NAMES):
         if name in RECEIVER_NAMES and not has_readings:
+            continue
+        if name in HARMONIC_PRIORS and not fit.free[index] and fit.mode.physical[index] == 0:
             continue
         estimate = _estimate(fit.mode.physical[index], physical[:, index], prior[:, index])
         if index >= len(RIG_NAMES):

@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Float
 from scipy import optimize, stats
 
 from tvsbayes.campaign import Campaign
-from tvsbayes.files import NotConverged, NothingToEstimate
+from tvsbayes.files import InputError, NotConverged, NothingToEstimate
 from tvsbayes.geometry import Scalar
 from tvsbayes.likelihood import (
     CampaignArrays,
@@ -31,7 +31,7 @@ from tvsbayes.likelihood import (
 )
 from tvsbayes.parameters import INDEX, NAMES, NOISE_NAMES, ParameterSpace, free_mask, parameter_space
 from tvsbayes.positioner import beam_angles, mirror_angles
-from tvsbayes.rigs import HOME_SD_DEG, Prior, RigTable
+from tvsbayes.rigs import HARMONIC_PRIORS, HOME_SD_DEG, Prior, RigTable
 from tvsbayes.solver import NEWTON_STEP, Mode, laplace_draws, levenberg_marquardt, newton_mode
 from tvsbayes.stops import LinearSpots, StopInformation, leave_one_out_chi2, stop_information
 
@@ -47,6 +47,9 @@ SMALLEST_CAMPAIGN = 8
 NOISE_SETTLED = 0.05
 """Change of every noise coordinate (prior sds) below which the alternation stops: half a posterior sd."""
 CONTRASTS = ("ratio_contrast_deg_per_step.pan", "ratio_contrast_deg_per_step.tilt")
+BACKLASHES = ("backlash_deg.pan", "backlash_deg.tilt")
+HARMONIC_SD_DEG = 0.1
+"""Prior standard deviation of every part of a freed transmission error (DESIGN 3.1)."""
 NORMAL_95 = 1.959963984540054
 """Two-sided 95 % quantile of the normal distribution."""
 MISFIT_LIMIT = 6.0
@@ -118,7 +121,8 @@ def linearise(z: Float[Array, " parameters"], space: ParameterSpace, arrays: Cam
 class Derived(eqx.Module):
     """Headlines at one pose for one point of parameter space, in the units of DESIGN 8.
 
-    `effective_deg_per_step` is ordered left, right, up, down; `jacobian` is d(azimuth, elevation)/d(pan, tilt).
+    `effective_deg_per_step` is ordered left, right, up, down: gear ratio times the slope of the mirrors, the mean over
+    a period of the transmission error, without its local slope. `jacobian` is d(azimuth, elevation)/d(pan, tilt).
     """
 
     physical: Float[Array, " parameters"]
@@ -329,7 +333,42 @@ def _robust_weights(problem: Problem, z: np.ndarray) -> tuple[CampaignArrays, np
     return arrays, valid > 0, change
 
 
-def fit(campaign: Campaign, *, robust: bool = False, per_axis: bool = False, seed: int = 0) -> JointFit:
+def model_choice(table: RigTable, *, per_axis: bool, harmonics: bool, no_backlash: bool) -> RigTable:
+    """The priors of a simpler or richer model of the gears; options as in `fit`.
+
+    Raises:
+        InputError: harmonics are wanted and no axis states the period of its error.
+    """
+    changed: dict[str, Prior] = {}
+    if per_axis:
+        changed |= dict.fromkeys(CONTRASTS, Prior(0.0, 0.0))
+    if no_backlash:
+        changed |= dict.fromkeys(BACKLASHES, Prior(0.0, 0.0, "half-normal"))
+    if harmonics:
+        if not table.harmonic_period_deg:
+            raise InputError(
+                "missing-period",
+                "no axis states the period of its transmission error",
+                file="campaign.toml",
+                column="rig.harmonic_period_deg",
+                allowed="a period in degrees of the output, 360 for the wheel, less for the pinion",
+                remedy='add "harmonic_period_deg.pan" = { value = 360.0, u = 0.0 } (or tilt) to [rig]',
+            )
+        for name, unasked in HARMONIC_PRIORS.items():
+            if name.split(".")[1] in table.harmonic_period_deg and table.priors[name] == unasked:
+                changed[name] = Prior(0.0, HARMONIC_SD_DEG)
+    return replace(table, priors={**table.priors, **changed})
+
+
+def fit(
+    campaign: Campaign,
+    *,
+    robust: bool = False,
+    per_axis: bool = False,
+    harmonics: bool = False,
+    no_backlash: bool = False,
+    seed: int = 0,
+) -> JointFit:
     """Fit the joint model to every usable spot (DESIGN 4).
 
     Args:
@@ -337,15 +376,20 @@ def fit(campaign: Campaign, *, robust: bool = False, per_axis: bool = False, see
         robust: downweight and exclude spots that disagree with all others (Huber weights and a gate on
             leave-one-out residuals).
         per_axis: one ratio per axis, the contrasts fixed at 0 (DESIGN 3.1).
+        harmonics: free the transmission error of every axis with a stated period, N(0, 0.1 deg) each, where
+            `[rig.prior]` says nothing else; a harmonic stated as exactly 0 counts as nothing said.
+        no_backlash: gears without play, both backlashes fixed at 0.
         seed: seed of the Laplace draws.
 
     Returns:
         Mode, Laplace approximation and diagnostics; look at `converged` before using it.
 
     Raises:
+        InputError: if harmonics are wanted and no axis states their period.
         NothingToEstimate: if the campaign has fewer than `SMALLEST_CAMPAIGN` usable spots.
         NotConverged: if the fit diverged; a fit that ended badly is returned with `converged` False.
     """
+    table = model_choice(campaign.rig, per_axis=per_axis, harmonics=harmonics, no_backlash=no_backlash)
     spots = ordered_spots(campaign)
     if len(spots) < SMALLEST_CAMPAIGN:
         raise NothingToEstimate(
@@ -355,9 +399,6 @@ def fit(campaign: Campaign, *, robust: bool = False, per_axis: bool = False, see
             remedy="observe more stops, or detect the refused spots again",
         )
     with jax.enable_x64(True), ThreadPoolExecutor(1) as executor:
-        table = campaign.rig
-        if per_axis:
-            table = replace(table, priors={**table.priors, **dict.fromkeys(CONTRASTS, Prior(0.0, 0.0))})
         problem = Problem(campaign, table)
         problem.compile_aside(executor)
         z = np.zeros(len(NAMES))
