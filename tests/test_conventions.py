@@ -53,7 +53,7 @@ def with_values(values: np.ndarray, **changes: float) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def looks():
-    """(values (57,), poses (n <= 6, 3: pan, tilt rad, range mm)) -> ray origins, directions, observations."""
+    """(values (65,), poses (n <= 6, 3: pan, tilt rad, range mm)) -> ray origins, directions, observations."""
 
     def one(values, poses):
         model = model_of(values)
