@@ -19,18 +19,22 @@ LEVELS: tuple[tuple[str, ...], ...] = (
     ("geometry", "classic", "simulation"),
     ("positioner", "protocols"),
     ("parameters", "report"),
-    ("likelihood", "stops", "solver"),
+    ("likelihood", "solver"),
+    ("stops",),
     ("joint",),
+    ("ensemble",),
+    ("posterior",),
     ("information",),
     ("cli",),
 )
 """From bottom to top: a module imports only modules of lower levels."""
 WITHOUT_JAX = (
     *("files", "documents", "stereo", "rigs", "campaign", "classic", "simulation", "protocols"),
-    *("stops", "report"),
+    "report",
 )
 MODEL = {
     *("geometry", "positioner", "parameters", "likelihood", "stops", "solver", "joint"),
+    *("ensemble", "posterior"),
     *("information", "classic"),
 }
 JAX_FAMILY = {"jax", "jaxlib", "equinox", "optimistix", "lineax", "jaxtyping"}

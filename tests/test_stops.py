@@ -4,10 +4,19 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from tvsbayes.stops import LinearSpots, leave_one_out_chi2, standard_deviations_without, stop_information
+from tvsbayes.likelihood import evaluate
+from tvsbayes.stops import (
+    LinearSpots,
+    leave_one_out_chi2,
+    move_log_density,
+    standard_deviations_without,
+    stop_information,
+)
 
 DENSE = 1e-8
 """Relative agreement with dense algebra: condition numbers of 1e4 leave 1e-12."""
@@ -145,3 +154,26 @@ def test_outlier_of_a_stop_is_blamed_on_its_spot(seed, blamed):
     assert np.argmax(distance) == pair[blamed]
     # Median of chi2 with 4 degrees of freedom is 3.4; a clean spot exceeds 30 once in 2e5.
     assert distance[pair[blamed]] > 30 > np.median(leave_one_out_chi2(stop_information(replace(spots, residual=clean))))
+
+
+def test_log_density_of_a_move_is_what_the_campaign_loses_without_it(x64, dozen):
+    """The log density log p(all) - log p(all but the spots of one move), by taking each move out of the filter in turn.
+
+    Home offsets, unknown play, stop errors that outlive moves of the other axis, two looks at one stop.
+    """
+    rng = np.random.default_rng(5)
+    z = jnp.asarray(dozen.z + 0.1 * rng.standard_normal((2, dozen.z.size)))
+    spots = dozen.arrays.spots
+    count = int(np.sum(np.asarray(spots.valid)))
+    index = np.asarray(spots.move_index)[:count]
+    found = np.asarray(move_log_density(z, dozen.space, dozen.arrays))
+    assert np.all(found[:, count:] == 0)
+    whole = np.asarray(evaluate(z, dozen.space, dozen.arrays).log_density)
+    assert len(set(index)) < count
+    for move in set(index):
+        valid = np.asarray(spots.valid).copy()
+        valid[:count][index == move] = 0.0
+        rest = eqx.tree_at(lambda a: a.spots.valid, dozen.arrays, jnp.asarray(valid))
+        lost = whole - np.asarray(evaluate(z, dozen.space, rest).log_density)
+        # Sums of a few hundred terms of order 100: rounding leaves 1e-9.
+        np.testing.assert_allclose(found[:, :count][:, index == move].sum(axis=1), lost, atol=1e-7)

@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from tvsbayes.campaign import read_campaign as read_campaign
     from tvsbayes.joint import fit as fit
+    from tvsbayes.posterior import sample as sample
 
-__all__ = ["fit", "read_campaign"]
+__all__ = ["fit", "read_campaign", "sample"]
 
 
 def __getattr__(name: str) -> object:
@@ -21,6 +22,10 @@ def __getattr__(name: str) -> object:
         from tvsbayes.joint import fit
 
         return fit
+    if name == "sample":
+        from tvsbayes.posterior import sample
+
+        return sample
     if name == "__version__":
         from importlib.metadata import version
 

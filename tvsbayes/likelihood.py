@@ -196,12 +196,19 @@ def campaign_arrays(campaign: Campaign) -> CampaignArrays:
         )
 
 
+def spot_constants(campaign: Campaign) -> np.ndarray:
+    """Terms of each ordered spot's log likelihood that no parameter changes: 2 pi and its stated covariance."""
+    return np.array(
+        [
+            -0.5 * ((3 + (s.aperture_deg is not None)) * np.log(2 * np.pi) + np.linalg.slogdet(pixel_covariance(s))[1])
+            for s in ordered_spots(campaign)
+        ]
+    )
+
+
 def log_constant(campaign: Campaign) -> float:
     """Terms of the log likelihood that no parameter changes: 2 pi and the stated pixel covariances."""
-    spots = ordered_spots(campaign)
-    readings = sum(s.aperture_deg is not None for s in spots)
-    logdet = sum(np.linalg.slogdet(pixel_covariance(s))[1] for s in spots)
-    return -0.5 * (3 * len(spots) + readings) * np.log(2 * np.pi) - 0.5 * logdet
+    return float(np.sum(spot_constants(campaign)))
 
 
 def aperture_angle(
@@ -335,6 +342,92 @@ def stop_variances(stop_sd_rad: Float[Array, "2 2"], spots: SpotArrays) -> Float
     return jnp.sum(spots.redraw_mix * stop_sd_rad**2, axis=2)
 
 
+class FilterRows(eqx.Module):
+    """What the filter meets at each spot, in time order: its residual, how its states move it, which are new.
+
+    `load` = d(predicted)/d(state), `keep` is 0 for a state drawn anew since the previous spot and 1 otherwise,
+    `variance` the variance it is then drawn with.
+    """
+
+    residual: Float[Array, "*spots 4"]
+    load: Float[Array, "*spots 4 6"]
+    keep: Float[Array, "*spots 6"]
+    variance: Float[Array, "*spots 6"]
+
+
+class Belief(eqx.Module):
+    """Mean and covariance of the filter's state."""
+
+    mean: Float[Array, "6"]
+    covariance: Float[Array, "6 6"]
+
+    def renewed(self, row: FilterRows) -> Belief:
+        """The state as the spot finds it, before the spot is looked at."""
+        new = jnp.diag(row.variance * (1 - row.keep))
+        return Belief(self.mean * row.keep, self.covariance * (row.keep[:, None] * row.keep) + new)
+
+
+class Look(eqx.Module):
+    """A spot seen by the filter: the state after it, standardised errors and the log of their variances' product."""
+
+    belief: Belief
+    standardised: Float[Array, "4"]
+    log_variance: Scalar
+
+
+def look(belief: Belief, row: FilterRows) -> Look:
+    """Update with one spot: its components have independent unit noise, so four scalar updates and no inverse."""
+    mean, covariance = belief.mean, belief.covariance
+    errors, variances = [], []
+    for component in range(COMPONENTS):
+        # Sums instead of products: a call into a matrix library costs more than six numbers.
+        gain = jnp.sum(covariance * row.load[component], axis=1)
+        variance_ahead = 1 + jnp.sum(row.load[component] * gain)
+        error = row.residual[component] - jnp.sum(row.load[component] * mean)
+        mean = mean + gain * (error / variance_ahead)
+        covariance = covariance - gain[:, None] * (gain / variance_ahead)
+        errors.append(error / jnp.sqrt(variance_ahead))
+        variances.append(variance_ahead)
+    return Look(Belief(mean, covariance), jnp.stack(errors), jnp.sum(jnp.log(jnp.stack(variances))))
+
+
+def no_belief() -> Belief:
+    """Before the first spot, whose states are all new."""
+    return Belief(jnp.zeros(STATES), jnp.zeros((STATES, STATES)))
+
+
+class FilterInput(eqx.Module):
+    """Rows of the filter and what each spot adds to the log density whatever its state."""
+
+    rows: FilterRows
+    log_scale: Float[Array, " spots"]
+
+
+def filter_input(
+    model: Model, arrays: CampaignArrays, inflation: Scalar | float = 1.0, frozen: bool = False
+) -> FilterInput:
+    """Linearise all spots for the filter; arguments as for `innovations`."""
+    spots = arrays.spots
+    angles = mirror_angles(model.transmission, model.tilt_zero_rad, arrays.moves)
+    terms = spot_residuals(model, angles, arrays, jnp.asarray(inflation, dtype=float), frozen)
+    play_sd = angles.play_sd_rad[spots.move_index]
+    if frozen:
+        play_sd = jax.lax.stop_gradient(play_sd)
+    load = jnp.concatenate([terms.slope, terms.slope, terms.slope * play_sd[:, None]], axis=2)
+    home_variance = jnp.where(spots.homed, (HOME_SD_DEG * jnp.pi / 180) ** 2, 0.0)[:, None]
+    segment = jnp.broadcast_to(spots.new_segment[:, None], (spots.valid.size, 2))
+    renewed = jnp.concatenate([spots.redraw, segment, segment], axis=1)
+    variance = jnp.concatenate(
+        [
+            stop_variances(model.noise.stop_sd_rad, spots),
+            jnp.broadcast_to(home_variance, segment.shape),
+            jnp.ones(segment.shape),
+        ],
+        axis=1,
+    )
+    return FilterInput(FilterRows(terms.residual, load, jnp.where(renewed, 0.0, 1.0), variance), terms.log_scale)
+
+
 class Innovations(eqx.Module):
     """Standardised one-step prediction errors, N(0, 1) and independent under the model.
 
@@ -359,43 +452,14 @@ def innovations(
     Returns:
         Standardised innovations and log likelihood; cost linear in the number of spots.
     """
-    spots = arrays.spots
-    angles = mirror_angles(model.transmission, model.tilt_zero_rad, arrays.moves)
-    inflation = jnp.asarray(inflation, dtype=float)
-    terms = spot_residuals(model, angles, arrays, inflation, frozen)
-    play_sd = angles.play_sd_rad[spots.move_index]
-    if frozen:
-        play_sd = jax.lax.stop_gradient(play_sd)
-    load = jnp.concatenate([terms.slope, terms.slope, terms.slope * play_sd[:, None]], axis=2)
-    stop_variance = stop_variances(model.noise.stop_sd_rad, spots)
-    home_variance = jnp.where(spots.homed, (HOME_SD_DEG * jnp.pi / 180) ** 2, 0.0)
+    given = filter_input(model, arrays, inflation, frozen)
 
-    def look(state, row):
-        mean, covariance = state
-        residual, load, redraw, stop_variance, new_segment, home_variance = row
-        segment = jnp.stack([new_segment, new_segment])
-        renewed = jnp.concatenate([redraw, segment, segment])
-        keep = jnp.where(renewed, 0.0, 1.0)
-        variance = jnp.concatenate([stop_variance, jnp.stack([home_variance, home_variance]), jnp.ones(2)])
-        mean = mean * keep
-        covariance = covariance * (keep[:, None] * keep) + jnp.diag(variance * (1 - keep))
-        errors, variances = [], []
-        # The remaining components have independent unit noise: four scalar updates, no matrix inverse.
-        for component in range(COMPONENTS):
-            # Sums instead of products: a call into a matrix library costs more than six numbers.
-            gain = jnp.sum(covariance * load[component], axis=1)
-            variance_ahead = 1 + jnp.sum(load[component] * gain)
-            error = residual[component] - jnp.sum(load[component] * mean)
-            mean = mean + gain * (error / variance_ahead)
-            covariance = covariance - gain[:, None] * (gain / variance_ahead)
-            errors.append(error / jnp.sqrt(variance_ahead))
-            variances.append(variance_ahead)
-        return (mean, covariance), (jnp.stack(errors), jnp.sum(jnp.log(jnp.stack(variances))))
+    def step(belief, row):
+        seen = look(belief.renewed(row), row)
+        return seen.belief, (seen.standardised, seen.log_variance)
 
-    start = (jnp.zeros(STATES), jnp.zeros((STATES, STATES)))
-    rows = (terms.residual, load, spots.redraw, stop_variance, spots.new_segment, home_variance)
-    _, (standardised, log_variance) = jax.lax.scan(look, start, rows)
-    log_density = jnp.sum(terms.log_scale) - 0.5 * jnp.sum(log_variance) - 0.5 * jnp.sum(standardised**2)
+    _, (standardised, log_variance) = jax.lax.scan(step, no_belief(), given.rows)
+    log_density = jnp.sum(given.log_scale) - 0.5 * jnp.sum(log_variance) - 0.5 * jnp.sum(standardised**2)
     return Innovations(standardised, log_density)
 
 
@@ -410,3 +474,50 @@ def density_and_gradient(
 ) -> tuple[Scalar, Float[Array, " parameters"]]:
     """`log_density` and its gradient; the one compiled function that the Newton steps and Hessians share."""
     return jax.value_and_grad(log_density)(z, space, arrays)
+
+
+class Evaluation(eqx.Module):
+    """Log posterior density and standardised innovations; many points give every field a leading axis."""
+
+    log_density: Float[Array, "*batch"]
+    standardised: Float[Array, "*batch spots 4"]
+
+
+@eqx.filter_jit
+def evaluate(z: Float[Array, "batch parameters"], space: ParameterSpace, arrays: CampaignArrays) -> Evaluation:
+    """`log_density` of many points in one call; call it with one batch size, each compiles anew."""
+
+    def one(z):
+        seen = innovations(space.model(z), arrays)
+        return Evaluation(seen.log_density - 0.5 * jnp.dot(z, z), seen.standardised)
+
+    return jax.vmap(one)(z)
+
+
+@eqx.filter_jit
+def observe_with_stop_errors(
+    z: Float[Array, "batch parameters"],
+    stop_error_rad: Float[Array, "batch spots 2"],
+    space: ParameterSpace,
+    arrays: CampaignArrays,
+) -> Float[Array, "batch spots 5"]:
+    """Noiseless looks at the ranges of the observed spots, the mirrors off by given angles (pan, tilt).
+
+    Args:
+        z: coordinates.
+        stop_error_rad: added to the mirror angles, rad; stop error, home offset and position in the play.
+        space: priors.
+        arrays: the campaign.
+
+    Returns:
+        u_left, v_left, u_right, v_right (px), aperture reading (rad).
+    """
+
+    def one(z, error):
+        model = space.model(z)
+        angles = mirror_angles(model.transmission, model.tilt_zero_rad, arrays.moves)
+        pan, tilt = angles.angle_rad[arrays.spots.move_index].T + error.T
+        ranges_mm = nearest_range(model, pan, tilt, arrays.spots.triangulated_mm.T)
+        return observe(model, jnp.stack([pan, tilt, ranges_mm]), arrays.azimuth_convention).T
+
+    return jax.vmap(one)(z, stop_error_rad)

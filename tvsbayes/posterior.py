@@ -1,0 +1,602 @@
+"""The posterior: sampled until it has converged, diagnosed, carried into any quantity, kept for ArviZ (DESIGN 4.3).
+
+`sample` runs the ensemble of `tvsbayes.ensemble` on a fit. Arrays of draws are ordered (chain, draw, ...); a chain is
+a walker. Units are those of DESIGN 8 (deg, mm, px). Convergence is judged on the stored draws, so that what ArviZ
+computes from `posterior.nc` is what was judged.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import time
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+
+import emcee
+import jax
+import jax.numpy as jnp
+import numpy as np
+from arviz_stats.base import array_stats
+
+from tvsbayes.campaign import input_hashes
+from tvsbayes.classic import DIRECTIONS
+from tvsbayes.ensemble import Independence, Pilot, Target, Transport, in_batches, moves, pilot, transport
+from tvsbayes.files import InputError, NotConverged, write_atomically
+from tvsbayes.joint import Derived, JointFit, derived_quantities
+from tvsbayes.parameters import NAMES
+
+CHAIN_FORMAT = "tvsbayes-chain/1"
+RHAT_LIMIT = 1.01
+ESS_LIMIT = 1000
+TAU_LIMIT = 50
+"""Limits of DESIGN 4.3: rank R-hat by walker, bulk and tail effective draws, steps in autocorrelation times."""
+STUCK_ACCEPTANCE = 0.25
+"""A walker is stuck that accepts less than this share of what the median walker accepts ..."""
+STUCK_DEVIATION = 8.0
+"""... or whose mean log density lies this many median absolute deviations off."""
+FIRST_CHECK = 300
+GROWTH = 1.3
+"""Steps at the first look at convergence, and growth of the chain from one look to the next."""
+BLOCK = 50
+CHECKPOINT_SECONDS = 20.0
+STORED_DRAWS = 256
+"""Draws stored per walker at most twice: R-hat by walker needs about 150 effective draws of each."""
+DERIVED_BATCH = 2049
+"""The batch in which the fit computes its headlines: the compilation is shared."""
+
+
+@dataclass(frozen=True)
+class Convergence:
+    """Whether a chain may be used, and why not.
+
+    Attributes:
+        steps: length of the chain; discarded: first steps left out; thin: one in so many is stored.
+        tau_steps: longest integrated autocorrelation time.
+        rhat, ess_bulk, ess_tail: by contract name, of every sampled or derived quantity.
+        acceptance: share of accepted moves by walker.
+        stuck_walkers: walkers that hardly moved or live at another density.
+        invalid: evaluations that gave no number.
+        pareto_k: tail index of target / proposal in the pilot draws; above 0.7 the Laplace fit is a poor guide.
+        missing: sentences on what is not reached; empty when converged.
+    """
+
+    steps: int
+    discarded: int
+    thin: int
+    tau_steps: float
+    rhat: dict[str, float]
+    ess_bulk: dict[str, float]
+    ess_tail: dict[str, float]
+    acceptance: np.ndarray
+    stuck_walkers: tuple[int, ...]
+    invalid: int
+    pareto_k: float
+    missing: tuple[str, ...]
+
+    @property
+    def converged(self) -> bool:
+        """All limits of DESIGN 4.3 are met."""
+        return not self.missing
+
+    def as_json(self) -> dict[str, object]:
+        """For fit.json, key `sampling`."""
+        worst = max(self.rhat, key=self.rhat.get)
+        fewest = min(self.ess_bulk, key=self.ess_bulk.get)
+        tail = min(self.ess_tail, key=self.ess_tail.get)
+        return {
+            "converged": self.converged,
+            "missing": list(self.missing),
+            "walkers": len(self.acceptance),
+            "steps": self.steps,
+            "discarded": self.discarded,
+            "thin": self.thin,
+            "tau_steps": self.tau_steps,
+            "worst_rhat": {"quantity": worst, "value": self.rhat[worst]},
+            "least_ess_bulk": {"quantity": fewest, "value": self.ess_bulk[fewest]},
+            "least_ess_tail": {"quantity": tail, "value": self.ess_tail[tail]},
+            "acceptance": float(self.acceptance.mean()),
+            "least_acceptance": float(self.acceptance.min()),
+            "stuck_walkers": list(self.stuck_walkers),
+            "invalid_evaluations": self.invalid,
+            "proposal_pareto_k": self.pareto_k,
+        }
+
+
+@dataclass(frozen=True)
+class Progress:
+    """What a progress display shows.
+
+    `worst_ess` is None before the first check; seconds since the start, and left until the next check.
+    """
+
+    steps: int
+    expected_steps: int
+    worst_ess: float | None
+    seconds: float
+    seconds_left: float
+
+
+class Draws(Mapping[str, np.ndarray]):
+    """Posterior draws by name: every parameter of DESIGN 8, and derived quantities, each of shape (n,).
+
+    Derived: `degrees_per_step.left|right|up|down`, `effective_deg_per_step.left|right|up|down`,
+    `effective_mirror_offset_mm`.
+    """
+
+    def __init__(self, draws: Derived):
+        physical = draws.physical.reshape(-1, draws.physical.shape[-1])
+        self._columns = dict(zip(NAMES, physical.T, strict=True))
+        for axis, positive, negative in (("pan", "left", "right"), ("tilt", "up", "down")):
+            ratio, half = (
+                self._columns[f"degrees_per_step.{axis}"],
+                self._columns[f"ratio_contrast_deg_per_step.{axis}"] / 2,
+            )
+            self._columns[f"degrees_per_step.{positive}"] = ratio + half
+            self._columns[f"degrees_per_step.{negative}"] = ratio - half
+        effective = draws.effective_deg_per_step.reshape(-1, len(DIRECTIONS))
+        self._columns |= {f"effective_deg_per_step.{d}": effective[:, k] for k, d in enumerate(DIRECTIONS)}
+        self._columns["effective_mirror_offset_mm"] = draws.effective_mirror_offset_mm.ravel()
+
+    def __getitem__(self, name: str) -> np.ndarray:
+        """Draws of one quantity."""
+        if name not in self._columns:
+            raise KeyError(f"no quantity {name!r}; there are: {', '.join(self._columns)}")
+        return self._columns[name]
+
+    def __iter__(self) -> Iterator[str]:
+        """Names."""
+        return iter(self._columns)
+
+    def __len__(self) -> int:
+        """Number of quantities."""
+        return len(self._columns)
+
+
+@dataclass(frozen=True)
+class Propagated:
+    """A quantity under the posterior; every field has the quantity's own shape.
+
+    Attributes:
+        mean, sd: of the posterior.
+        interval95: equal-tailed, first axis (low, high).
+        mcse_mean, mcse_sd, mcse_interval95: Monte Carlo standard errors of the above.
+        ess: bulk effective draws behind them.
+        draws: the values, shape (chain, draw, ...).
+    """
+
+    mean: np.ndarray
+    sd: np.ndarray
+    interval95: np.ndarray
+    mcse_mean: np.ndarray
+    mcse_sd: np.ndarray
+    mcse_interval95: np.ndarray
+    ess: np.ndarray
+    draws: np.ndarray
+
+
+@dataclass(frozen=True)
+class Posterior:
+    """A sampled posterior; look at `converged` before using it.
+
+    Attributes:
+        fit: the fit whose posterior it is.
+        z: stored draws of the prior-normal coordinates, shape (chain, draw, p).
+        log_density: their log posterior density, without `likelihood.log_constant`, shape (chain, draw).
+        draws: parameters and headlines in the units of DESIGN 8, fields with leading axes (chain, draw).
+        convergence: the diagnosis.
+        seed: of the chain.
+        seconds: spent sampling, earlier runs of a resumed chain included.
+    """
+
+    fit: JointFit
+    z: np.ndarray
+    log_density: np.ndarray
+    draws: Derived
+    convergence: Convergence
+    seed: int
+    seconds: float
+
+    @property
+    def converged(self) -> bool:
+        """All limits of DESIGN 4.3 are met."""
+        return self.convergence.converged
+
+    @property
+    def by_name(self) -> Draws:
+        """All draws by contract name, chains joined."""
+        return Draws(self.draws)
+
+    def propagate(self, function: Callable[[Draws], np.ndarray]) -> Propagated:
+        """Carry the posterior into a quantity of your own.
+
+        Args:
+            function: takes `Draws`, a mapping from name to an array (n,), and returns an array (n,) or (n, ...), for
+                instance `lambda p: 200 * p["degrees_per_step.left"] - p["backlash_deg.pan"]`.
+
+        Returns:
+            Mean, sd, interval and their Monte Carlo errors (JCGM 101 clause 7, with correlated draws).
+
+        Raises:
+            ValueError: the function returned another number of rows, or values that are not finite.
+        """
+        values = np.asarray(function(self.by_name), dtype=float)
+        chains, draws = self.z.shape[:2]
+        if values.ndim == 0 or len(values) != chains * draws:
+            raise ValueError(
+                f"the function returned shape {values.shape}; its first axis must be the {chains * draws} draws it was "
+                "given: compute with whole arrays, not with their means"
+            )
+        if not np.all(np.isfinite(values)):
+            share = np.mean(~np.isfinite(values.reshape(len(values), -1)).all(axis=1))
+            raise ValueError(f"the function has no finite value for {100 * share:.2g} % of the draws")
+        return propagated(values.reshape(chains, draws, *values.shape[1:]))
+
+    def effective_deg_per_step(self, pan_deg: float, tilt_deg: float) -> Propagated:
+        """Effective degrees per step (left, right, up, down) at any pose of the mirrors (DESIGN 3.2)."""
+        with jax.enable_x64(True):
+            return propagated(derived_at(self.fit, self.z, np.radians([pan_deg, tilt_deg])).effective_deg_per_step)
+
+    def lost_motion_deg(self, direction: str, steps: np.ndarray) -> Propagated:
+        """Mirror angle that a move of `steps` loses after a reversal: min(k N, b) (play operator, DESIGN 3.1).
+
+        Args:
+            direction: left, right, up or down.
+            steps: numbers of steps N >= 0, shape (n,).
+
+        Returns:
+            Fields of shape (n,), deg; divided by N it is what a four-point estimate is short by.
+        """
+        if direction not in DIRECTIONS:
+            raise ValueError(f"direction {direction!r}; allowed: {', '.join(DIRECTIONS)}")
+        axis = "pan" if direction in ("left", "right") else "tilt"
+        count = np.asarray(steps, dtype=float)
+        return self.propagate(
+            lambda p: np.minimum(
+                np.multiply.outer(p[f"degrees_per_step.{direction}"], count), p[f"backlash_deg.{axis}"][:, None]
+            )
+        )
+
+
+def propagated(values: np.ndarray) -> Propagated:
+    """Summary of draws (chain, draw, ...)."""
+    tails = (0.025, 0.975)
+    quantiles = np.quantile(values, tails, axis=(0, 1))
+    flat = values.reshape(*values.shape[:2], -1)
+    # A quantity that no draw changes has no effective number of draws and no Monte Carlo error.
+    moving = np.ptp(flat, axis=(0, 1)) > 0
+
+    def each(statistic: Callable[..., np.ndarray], otherwise: float, **options) -> np.ndarray:
+        result = np.full(flat.shape[2], otherwise)
+        if moving.any():
+            result[moving] = statistic(flat[..., moving], chain_axis=0, draw_axis=1, **options)
+        return result.reshape(values.shape[2:])
+
+    errors = [each(array_stats.mcse, 0.0, method="quantile", prob=prob) for prob in tails]
+    return Propagated(
+        mean=values.mean(axis=(0, 1)),
+        sd=values.std(axis=(0, 1)),
+        interval95=quantiles,
+        mcse_mean=each(array_stats.mcse, 0.0, method="mean"),
+        mcse_sd=each(array_stats.mcse, 0.0, method="sd"),
+        mcse_interval95=np.stack(errors),
+        ess=each(array_stats.ess, float(values.shape[0] * values.shape[1]), method="bulk"),
+        draws=values,
+    )
+
+
+def derived_at(fit: JointFit, z: np.ndarray, pose_rad: np.ndarray) -> Derived:
+    """Parameters and headlines of draws (chain, draw, p) at a pose (pan, tilt)."""
+    shape = z.shape[:2]
+    pose = jnp.asarray(pose_rad)
+    flat = in_batches(
+        lambda block: derived_quantities(block, fit.space, pose), z.reshape(-1, z.shape[-1]), DERIVED_BATCH
+    )
+    return jax.tree.map(lambda x: x.reshape(*shape, *x.shape[1:]), flat)
+
+
+@dataclass(frozen=True)
+class Chain:
+    """Everything a run has done, in w: enough to continue it bit for bit.
+
+    Attributes:
+        w: positions, shape (steps, walkers, d); log_density: relative to the mode, shape (steps, walkers).
+        accepted: accepted moves by walker.
+        random_state: NumPy's legacy generator after the last step.
+        invalid: evaluations that gave no number.
+        seconds: spent so far.
+    """
+
+    w: np.ndarray
+    log_density: np.ndarray
+    accepted: np.ndarray
+    random_state: tuple
+    invalid: int
+    seconds: float
+
+
+def fingerprint(fit: JointFit) -> str:
+    """Hash of what a chain depends on: data, weights, model options and priors, versions of what computes it."""
+    digest = hashlib.sha256(json.dumps(input_hashes(fit.campaign), sort_keys=True).encode())
+    for array in (*jax.tree.leaves(fit.space), *jax.tree.leaves(fit.arrays), fit.free):
+        array = np.asarray(array)
+        digest.update(f"{array.dtype} {array.shape}".encode() + np.ascontiguousarray(array).tobytes())
+    for package in ("tvsbayes", "emcee", "jax", "numpy"):
+        digest.update(f"{package} {version(package)}".encode())
+    return digest.hexdigest()
+
+
+def _checkpoint(path: Path, fit: JointFit, route: Transport, start: Pilot, chain: Chain, seed: int) -> None:
+    buffer = io.BytesIO()
+    kind, keys, position, has_gauss, gauss = chain.random_state
+    np.savez(
+        buffer,
+        format=CHAIN_FORMAT,
+        fingerprint=fingerprint(fit),
+        seed=seed,
+        **{f"transport_{k}": getattr(route, k) for k in ("mode", "free", "root", "narrow", "bend")},
+        proposal_mean=start.proposal.mean,
+        proposal_sd=start.proposal.sd,
+        start=start.start,
+        log_weights=start.log_weights,
+        w=chain.w,
+        log_density=chain.log_density,
+        accepted=chain.accepted,
+        invalid=chain.invalid,
+        seconds=chain.seconds,
+        random_kind=kind,
+        random_keys=keys,
+        random_rest=np.array([position, has_gauss, gauss]),
+    )
+    write_atomically(path, buffer.getvalue())
+
+
+def _stored(path: Path, fit: JointFit, seed: int) -> tuple[Transport, Pilot, Chain]:
+    """Read a checkpoint; refuse one of other data, model, priors, versions or seed."""
+    name = path.name
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            stored = {key: file[key] for key in file.files}
+        if str(stored["format"]) != CHAIN_FORMAT:
+            raise ValueError(f"format {stored['format']}")
+    except FileNotFoundError as error:
+        raise InputError(
+            "no-chain", f"{name}: there is no chain to resume", file=name, remedy="run without --resume"
+        ) from error
+    except Exception as error:
+        raise InputError(
+            "damaged-chain",
+            f"{name} is not a chain that tvsbayes wrote: {error}",
+            file=name,
+            allowed=f"format {CHAIN_FORMAT}",
+            remedy="run without --resume; the chain starts anew",
+        ) from error
+    if str(stored["fingerprint"]) != fingerprint(fit) or int(stored["seed"]) != seed:
+        raise InputError(
+            "other-chain",
+            f"{name} was sampled from other data, another model, other priors, another seed or other versions",
+            file=name,
+            allowed="the chain of the same campaign, options and versions",
+            remedy="run without --resume, or restore the inputs and options it was started with",
+        )
+    position, has_gauss, gauss = stored["random_rest"]
+    random_state = (str(stored["random_kind"]), stored["random_keys"], int(position), int(has_gauss), float(gauss))
+    route = Transport(*(stored[f"transport_{k}"] for k in ("mode", "free", "root", "narrow", "bend")))
+    proposal = Independence(stored["proposal_mean"], stored["proposal_sd"])
+    chain = Chain(
+        stored["w"],
+        stored["log_density"],
+        stored["accepted"],
+        random_state,
+        int(stored["invalid"]),
+        float(stored["seconds"]),
+    )
+    return route, Pilot(proposal, stored["start"], stored["log_weights"]), chain
+
+
+def _tau(w: np.ndarray) -> float:
+    """Longest integrated autocorrelation time of positions (steps, walkers, d), steps."""
+    return float(np.max(emcee.autocorr.integrated_time(w, tol=0, quiet=True)))
+
+
+def diagnose(fit: JointFit, route: Transport, start: Pilot, chain: Chain, seed: int) -> Posterior:
+    """Leave out the warm-up, thin, and judge what is left."""
+    steps = len(chain.w)
+    discarded = min(steps // 4, max(20, int(5 * _tau(chain.w))))
+    kept = chain.w[discarded:]
+    thin = max(1, len(kept) // STORED_DRAWS)
+    stored = kept[::thin].transpose(1, 0, 2)
+    walkers, draws, dimension = stored.shape
+    z = route.to_z(stored.reshape(-1, dimension)).reshape(walkers, draws, -1)
+    log_density = chain.log_density[discarded:][::thin].T + fit.log_density
+    derived = derived_at(fit, z, fit.reference_pose_rad)
+    free = np.flatnonzero(fit.free)
+    names = [NAMES[i] for i in free] + [f"effective_deg_per_step.{d}" for d in DIRECTIONS]
+    names += ["effective_mirror_offset_mm", "log_density"]
+    values = np.concatenate(
+        [
+            derived.physical[..., free],
+            derived.effective_deg_per_step,
+            derived.effective_mirror_offset_mm[..., None],
+            log_density[..., None],
+        ],
+        axis=2,
+    )
+    axes = {"chain_axis": 0, "draw_axis": 1}
+    rhat = array_stats.rhat(values, method="rank", **axes)
+    ess_bulk = array_stats.ess(values, method="bulk", **axes)
+    ess_tail = array_stats.ess(values, method="tail", prob=(0.05, 0.95), **axes)
+    tau = _tau(kept)
+    acceptance = chain.accepted / steps
+    means = chain.log_density[discarded:].mean(axis=0)
+    deviation = np.abs(means - np.median(means))
+    stuck = acceptance < STUCK_ACCEPTANCE * np.median(acceptance)
+    stuck |= deviation > STUCK_DEVIATION * max(float(np.median(deviation)), 1e-12)
+    missing = []
+    if not np.max(rhat) <= RHAT_LIMIT:
+        missing.append(f"R-hat of {names[int(np.nanargmax(rhat))]} is {np.max(rhat):.3f}, wanted {RHAT_LIMIT}")
+    for kind, ess in (("bulk", ess_bulk), ("tail", ess_tail)):
+        if not np.min(ess) >= ESS_LIMIT:
+            least = int(np.nanargmin(ess))
+            missing.append(f"{names[least]} has {ess[least]:.0f} {kind} effective draws, wanted {ESS_LIMIT}")
+    if not len(kept) >= TAU_LIMIT * tau:
+        missing.append(f"{len(kept)} steps are {len(kept) / tau:.0f} autocorrelation times, wanted {TAU_LIMIT}")
+    if stuck.any():
+        missing.append(f"stuck walkers: {', '.join(map(str, np.flatnonzero(stuck)))}")
+    finite = start.log_weights[np.isfinite(start.log_weights)]
+    convergence = Convergence(
+        steps=steps,
+        discarded=discarded,
+        thin=thin,
+        tau_steps=tau,
+        rhat=dict(zip(names, map(float, rhat), strict=True)),
+        ess_bulk=dict(zip(names, map(float, ess_bulk), strict=True)),
+        ess_tail=dict(zip(names, map(float, ess_tail), strict=True)),
+        acceptance=acceptance,
+        stuck_walkers=tuple(int(i) for i in np.flatnonzero(stuck)),
+        invalid=chain.invalid,
+        pareto_k=float(array_stats.psislw(finite)[1]),
+        missing=tuple(missing),
+    )
+    return Posterior(fit, z, log_density, derived, convergence, seed, chain.seconds)
+
+
+def sample(
+    fit: JointFit,
+    *,
+    max_minutes: float = 10.0,
+    seed: int = 0,
+    checkpoint: Path | None = None,
+    resume: bool = False,
+    progress: Callable[[Progress], None] | None = None,
+) -> Posterior:
+    """Sample the posterior of a fit until it has converged or the time is over (DESIGN 4.3).
+
+    Args:
+        fit: a converged fit.
+        max_minutes: time for this call; the chain is extended until all limits are met.
+        seed: of everything random. The same fit, seed and versions give the same chain bit for bit.
+        checkpoint: file in which the chain is kept as it grows (written whole or not at all), also on Ctrl-C.
+        resume: continue the chain of `checkpoint`.
+        progress: called after every block of steps.
+
+    Returns:
+        The posterior; with `converged` False its intervals must not be used.
+
+    Raises:
+        NotConverged: the fit has not converged, or its density is not finite around the mode.
+        InputError: `resume` without a usable chain.
+        ValueError: max_minutes is not positive.
+    """
+    if not fit.converged:
+        raise NotConverged(
+            "not-converged",
+            "NOT CONVERGED: " + "; ".join(fit.problems),
+            remedy="a posterior needs a mode to start from",
+        )
+    if not max_minutes > 0:
+        raise ValueError(f"max_minutes is {max_minutes}; it must be positive")
+    began = time.monotonic()
+    with jax.enable_x64(True):
+        if resume:
+            if checkpoint is None:
+                raise ValueError("resume needs the checkpoint to continue")
+            route, start, chain = _stored(checkpoint, fit, seed)
+        else:
+            route = transport(fit)
+            try:
+                start = pilot(Target(fit, route), seed)
+            except FloatingPointError as error:
+                raise NotConverged("no-density", str(error), remedy="see the weak directions of --no-sample") from error
+            walkers = len(start.start)
+            state = np.random.RandomState(seed).get_state()
+            empty = np.zeros((0, walkers, route.dimension))
+            chain = Chain(empty, np.zeros((0, walkers)), np.zeros(walkers), state, 0, 0.0)
+        run = _Run(fit, route, start, chain, seed, checkpoint, progress, began)
+        return run.until_converged(60 * max_minutes)
+
+
+class _Run:
+    """One call of `sample`: emcee in blocks, checks on a schedule that depends on the chain alone."""
+
+    def __init__(self, fit, route, start, chain, seed, checkpoint, progress, began):
+        self.fit, self.route, self.start, self.seed = fit, route, start, seed
+        self.checkpoint, self.progress, self.began = checkpoint, progress, began
+        self.before, self.saved_at = chain, began
+        self.target = Target(fit, route)
+        walkers, dimension = start.start.shape
+        self.sampler = emcee.EnsembleSampler(
+            walkers, dimension, self.target, moves=moves(start.proposal), vectorize=True
+        )
+
+    def chain(self) -> Chain:
+        """All steps so far, earlier runs included."""
+        done = self.sampler.iteration
+        seconds = self.before.seconds + time.monotonic() - self.began
+        if done == 0:
+            return self.before
+        backend = self.sampler.backend
+        return Chain(
+            np.concatenate([self.before.w, backend.get_chain()]),
+            np.concatenate([self.before.log_density, backend.get_log_prob()]),
+            self.before.accepted + backend.accepted,
+            backend.random_state,
+            self.before.invalid + self.target.invalid,
+            seconds,
+        )
+
+    def save(self) -> None:
+        """Write the checkpoint, if one is kept."""
+        if self.checkpoint is not None:
+            _checkpoint(self.checkpoint, self.fit, self.route, self.start, self.chain(), self.seed)
+        self.saved_at = time.monotonic()
+
+    def advance(self, steps: int) -> None:
+        """Continue from the last whole step; the generator goes on where it stood."""
+        if self.sampler.iteration:
+            state = self.sampler.get_last_sample()
+        elif len(self.before.w):
+            state = emcee.State(
+                self.before.w[-1], log_prob=self.before.log_density[-1], random_state=self.before.random_state
+            )
+        else:
+            state = emcee.State(self.start.start, random_state=self.before.random_state)
+        for _ in self.sampler.sample(state, iterations=steps, skip_initial_state_check=True):
+            pass
+
+    def until_converged(self, seconds: float) -> Posterior:
+        """Extend, look, extend."""
+        goal, worst_ess = FIRST_CHECK, None
+        done = len(self.before.w)
+        while goal <= done:
+            goal = int(goal * GROWTH)
+        if done:
+            posterior = diagnose(self.fit, self.route, self.start, self.before, self.seed)
+            if posterior.converged:
+                return posterior
+        try:
+            while True:
+                steps = min(BLOCK, goal - done)
+                self.advance(steps)
+                done += steps
+                elapsed = time.monotonic() - self.began
+                over = elapsed > seconds
+                if done >= goal or over:
+                    posterior = diagnose(self.fit, self.route, self.start, self.chain(), self.seed)
+                    worst_ess = min(posterior.convergence.ess_bulk.values())
+                    if posterior.converged or over:
+                        self.save()
+                        return posterior
+                    goal = int(goal * GROWTH)
+                elif time.monotonic() - self.saved_at > CHECKPOINT_SECONDS:
+                    self.save()
+                if self.progress is not None:
+                    left = (goal - done) * elapsed / max(done - len(self.before.w), 1)
+                    self.progress(Progress(done, goal, worst_ess, elapsed, min(left, seconds - elapsed)))
+        except KeyboardInterrupt:
+            self.save()
+            raise
+
