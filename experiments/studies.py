@@ -1,0 +1,121 @@
+"""Shared by the simulation studies: resumable rows, pinned workers, a small plan, headlines against the truth."""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+import os
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from coverage import SINGLE_THREADED, read_rows
+
+PAN_SWEEP = (0, 70, 140, 200, 140, 70, 0, 70, 140, 200, 140, 70)
+TILT_SWEEP = (-60, -20, 20, 60, 20, -20, -60, -20, 20, 60, 20, -20)
+CROSSING = 100, -20
+"""Tilt while panning is the second number, pan while tilting the first."""
+
+
+def small_plan(sheets: Sequence[str]):
+    """24 spots per sheet: both axes swept there and back twice; 24 moves per sheet after one homing."""
+    from tvsbayes.campaign import PlanStep
+
+    orders = [("home", 0, 0)]
+    for sheet in sheets:
+        orders.append(("place", None, None, sheet))
+        for pan, tilt in [(p, CROSSING[1]) for p in PAN_SWEEP] + [(CROSSING[0], t) for t in TILT_SWEEP]:
+            orders += [("move", pan, tilt), ("look",)]
+    return tuple(PlanStep(number, *order) for number, order in enumerate(orders))
+
+
+def mounted_rig():
+    """The shipped rig whose extrinsics are known to 0.03 rad and 5 mm."""
+    from tvsbayes.files import shipped_data
+    from tvsbayes.rigs import read_rig
+
+    return read_rig(shipped_data() / "rigs" / "mounted" / "rig.toml")
+
+
+def shipped_plan(protocol: str):
+    """A plan of the mounted rig."""
+    from tvsbayes.campaign import read_plan
+    from tvsbayes.files import shipped_data
+
+    return read_plan(shipped_data() / "rigs" / "mounted" / f"{protocol}.csv")
+
+
+def headlines(draws) -> dict[str, np.ndarray]:
+    """Headline quantities of `tvsbayes.joint.Derived`, whose leading axes are kept."""
+    from tvsbayes.parameters import INDEX
+
+    ratio, physical = np.asarray(draws.effective_deg_per_step), np.asarray(draws.physical)
+    return {
+        **{f"effective {d}": ratio[..., k] for k, d in enumerate(("left", "right", "up", "down"))},
+        "contrast pan": ratio[..., 0] - ratio[..., 1],
+        "contrast tilt": ratio[..., 2] - ratio[..., 3],
+        "backlash pan": physical[..., INDEX["backlash_deg.pan"]],
+        "backlash tilt": physical[..., INDEX["backlash_deg.tilt"]],
+        "effective mirror offset": np.asarray(draws.effective_mirror_offset_mm),
+    }
+
+
+def true_headlines(parameters: Mapping[str, float], pose_rad: np.ndarray) -> dict[str, float]:
+    """The same of a true rig, by the twin's formulas, at the pose of the fit."""
+    from tvsbayes.simulation import effective_deg_per_step, effective_mirror_offset_mm
+
+    pose = tuple(np.degrees(pose_rad))
+    ratio = effective_deg_per_step(parameters, pose)
+    return {
+        **{f"effective {d}": ratio[d] for d in ("left", "right", "up", "down")},
+        "contrast pan": ratio["left"] - ratio["right"],
+        "contrast tilt": ratio["up"] - ratio["down"],
+        "backlash pan": parameters["backlash_deg.pan"],
+        "backlash tilt": parameters["backlash_deg.tilt"],
+        "effective mirror offset": effective_mirror_offset_mm(parameters, pose),
+    }
+
+
+def judged(draws, centre, prior_draws, parameters: Mapping[str, float], pose_rad: np.ndarray) -> dict[str, dict]:
+    """PIT, z and contraction of every headline; `centre` is a `Derived` without leading axes, None the draws' mean."""
+    true, prior = true_headlines(parameters, pose_rad), headlines(prior_draws)
+    middle = None if centre is None else headlines(centre)
+    result = {}
+    for name, values in headlines(draws).items():
+        values = values.ravel()
+        at = float(values.mean() if middle is None else middle[name])
+        result[name] = {
+            "pit": float(np.mean(values < true[name])),
+            "z": float((at - true[name]) / values.std()),
+            "contraction": float(1 - values.var() / prior[name].var()),
+        }
+    return result
+
+
+def _pin(cores) -> None:
+    os.sched_setaffinity(0, {cores.get()})
+
+
+def run_rows(one: Callable, tasks: Sequence[tuple], rows: Path, keys: Sequence[str], cores: Sequence[int]) -> None:
+    """Append `one(task)` as JSON lines until every task is there, one single-threaded worker per core.
+
+    Args:
+        one: a module-level function from task to row; the row holds the task's parts under `keys`.
+        tasks: in the order in which they are done.
+        rows: JSON lines, read first: what is there is not done again.
+        keys: names of a task's parts.
+        cores: processor numbers.
+    """
+    rows.parent.mkdir(parents=True, exist_ok=True)
+    done = {tuple(r.get(k) for k in keys) for r in read_rows(rows)}
+    # Read by XLA and OpenBLAS when a worker starts.
+    os.environ.update(SINGLE_THREADED)
+    context = multiprocessing.get_context("spawn")
+    queue = context.Queue()
+    for core in cores:
+        queue.put(core)
+    left = [task for task in tasks if tuple(task) not in done]
+    with context.Pool(len(cores), initializer=_pin, initargs=(queue,)) as pool, rows.open("a") as file:
+        for row in pool.imap_unordered(one, left):
+            file.write(json.dumps(row) + "\n")
+            file.flush()
