@@ -18,13 +18,13 @@ LEVELS: tuple[tuple[str, ...], ...] = (
     ("campaign",),
     ("geometry", "classic", "simulation"),
     ("positioner", "protocols"),
-    ("parameters", "report"),
+    ("parameters",),
     ("likelihood", "solver"),
     ("stops",),
     ("joint",),
     ("ensemble",),
     ("posterior",),
-    ("information",),
+    ("information", "report"),
     ("cli",),
 )
 """From bottom to top: a module imports only modules of lower levels."""

@@ -9,6 +9,8 @@ from __future__ import annotations
 import json
 import os
 import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -27,6 +29,7 @@ from tvsbayes.files import (
 
 if TYPE_CHECKING:
     from tvsbayes.information import FitSummary
+    from tvsbayes.posterior import Progress
 
 INTERRUPTED = 130
 DEMO_NOTE = "The twin's move history is our assumption, made so that the classic answer is the paper's Table 1."
@@ -89,6 +92,12 @@ def _finish(document: dict[str, Any], text: str, as_json: bool, error: TvsError 
 
 def _unusable(summary: FitSummary) -> TvsError | None:
     """Why a fit that ran to its end must not be used: not converged (4) or nothing learned (3)."""
+    if not summary.converged and summary.sampling is not None and not summary.sampling["converged"]:
+        return NotConverged(
+            "unconverged",
+            "UNCONVERGED: " + "; ".join(summary.sampling["missing"]) + ". The table is the Laplace approximation",
+            remedy="run again with --resume and more --max-minutes",
+        )
     if not summary.converged:
         return NotConverged(
             "not-converged",
@@ -224,6 +233,10 @@ def classic(campaign: CampaignFolder, as_json: Json = False) -> None:
 def fit(
     campaign: CampaignFolder,
     no_sample: Annotated[bool, typer.Option("--no-sample", help="Laplace approximation only.")] = False,
+    max_minutes: Annotated[
+        float, typer.Option("--max-minutes", min=0.01, help="Time for sampling; unconverged by then: exit 4.")
+    ] = 10.0,
+    resume: Annotated[bool, typer.Option("--resume", help="Continue the chain of an earlier run.")] = False,
     robust: Annotated[bool, typer.Option("--robust", help="Downweight and exclude outlying spots, by name.")] = False,
     per_axis: Annotated[bool, typer.Option("--per-axis", help="One ratio per axis: contrasts fixed at 0.")] = False,
     harmonics: Annotated[bool, typer.Option("--harmonics", help="Free transmission errors of known period.")] = False,
@@ -232,24 +245,72 @@ def fit(
     seed: Seed = 0,
     as_json: Json = False,
 ) -> None:
-    """Fit the joint model to every spot: ratios, backlash, mirror offset, extrinsics, with uncertainty."""
+    """Fit the joint model to every spot and sample its posterior: ratios, backlash, mirror offset, extrinsics."""
     from tvsbayes.campaign import read_campaign
 
+    if resume and no_sample:
+        raise InputError("usage", "--resume continues a chain and --no-sample makes none", remedy="give one of them")
     data = read_campaign(campaign)
-    if not no_sample:
-        report_line("this version gives the Laplace approximation of the posterior, as with --no-sample")
     from tvsbayes.information import summarise
     from tvsbayes.joint import fit as fit_joint
     from tvsbayes.report import fit_text, write_results
     from tvsbayes.solver import use_compilation_cache
 
     use_compilation_cache()
+    folder = out or campaign / "results"
     model = {"per_axis": per_axis, "harmonics": harmonics, "no_backlash": no_backlash}
     result = fit_joint(data, robust=robust, **model, seed=seed)
-    summary = summarise(result)
-    files = write_results(result, summary, out or campaign / "results", seed)
+    summary, posterior, more = summarise(result), None, {}
+    # A sample of what must not be used anyway would only take the user's time.
+    if not no_sample and _unusable(summary) is None:
+        from tvsbayes.posterior import sample, write_posterior
+
+        make_folder(folder)
+        with _sampling_progress() as progress:
+            posterior = sample(
+                result,
+                max_minutes=max_minutes,
+                seed=seed,
+                checkpoint=folder / "chain.npz",
+                resume=resume,
+                progress=progress,
+            )
+        summary = summarise(result, posterior)
+        if posterior.converged:
+            report_line("computing log likelihoods and predictions for posterior.nc ...")
+            write_posterior(posterior, folder / "posterior.nc")
+            more = {"posterior": str(folder / "posterior.nc")}
+        more["chain"] = str(folder / "chain.npz")
+    files = {**write_results(result, summary, folder, seed, posterior), **more}
     document = {**summary.as_json(), "seed": seed, "files": files}
-    _finish(document, f"{fit_text(summary)}\nwritten: {files['fit']}", as_json, _unusable(summary))
+    _finish(document, f"{fit_text(summary)}\nwritten: {', '.join(files.values())}", as_json, _unusable(summary))
+
+
+@contextmanager
+def _sampling_progress() -> Iterator[Callable[[Progress], None] | None]:
+    """A bar on a terminal, nothing elsewhere; Ctrl-C says how to go on."""
+    from rich.console import Console
+    from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
+    from rich.progress import Progress as Bar
+
+    console = Console(stderr=True)
+    columns = TextColumn("sampling"), BarColumn(), TextColumn("{task.fields[note]}"), TimeElapsedColumn()
+    try:
+        if not console.is_terminal:
+            yield None
+            return
+        with Bar(*columns, console=console, transient=True) as bar:
+            task = bar.add_task("sampling", total=None, note="preparing")
+
+            def show(state: Progress) -> None:
+                ess = "" if state.worst_ess is None else f", least effective draws {state.worst_ess:.0f}"
+                note = f"step {state.steps}{ess}, next look in {max(state.seconds_left, 0):.0f} s"
+                bar.update(task, completed=state.steps, total=state.expected_steps, note=note)
+
+            yield show
+    except KeyboardInterrupt:
+        report_line("the chain so far is kept in chain.npz; go on with --resume")
+        raise
 
 
 def run(arguments: list[str]) -> int:

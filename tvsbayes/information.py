@@ -1,19 +1,23 @@
 """What a fit knows: headlines, contraction, weak directions in words, leverage of stops, the classic predicted.
 
-Works on a finished `JointFit`; computes no new fit and needs no JAX of its own. Units are those of DESIGN 8.
+Works on a finished `JointFit`, and on a `Posterior` where there is one; computes no new fit. Units are those of
+DESIGN 8.
 """
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
 from itertools import pairwise
 
+import jax
 import numpy as np
 
 from tvsbayes.classic import DIRECTIONS, four_point_ratios, select_experiments
-from tvsbayes.joint import NORMAL_95, JointFit
+from tvsbayes.joint import NORMAL_95, Derived, JointFit
 from tvsbayes.likelihood import ordered_spots
 from tvsbayes.parameters import INDEX, NAMES, RECEIVER_NAMES, RIG_NAMES
+from tvsbayes.posterior import Posterior, ideal_pixels
 from tvsbayes.protocols import observed_stops, separation
 from tvsbayes.rigs import HARMONIC_PRIORS
 from tvsbayes.stops import standard_deviations_without
@@ -29,29 +33,35 @@ WEAK_VARIANCE = 0.5
 """A direction of parameter space is weak if more than this share of its prior variance is left."""
 CONFLICT_LIMIT = 4.0
 """Prior standard deviations; of fifty parameters one lies beyond it in 3 of 1000 honest campaigns."""
+SENSITIVE_SHIFT = 0.2
+"""Change of a headline, in its sds, when a prior is doubled or halved, from which it is listed."""
+SENSITIVE_SD = 0.1
+"""Relative change of a headline's sd from which it is listed."""
+SENSITIVITIES_LISTED = 16
 LISTED = 8
 CLASSIC_DRAWS = 256
+CURVE_POINTS = 7
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """One estimated quantity; `contraction` = 1 - var_post / var_prior, None where nothing is estimated."""
+    """One estimated quantity; `contraction` = 1 - var_post / var_prior, None where nothing is estimated.
+
+    `value` is the mode of a Laplace approximation or the mean of a posterior; the last three are a sampler's.
+    """
 
     value: float
     sd: float
     interval95: tuple[float, float]
     prior_sd: float | None
     contraction: float | None
+    rhat: float | None = None
+    ess_bulk: float | None = None
+    ess_tail: float | None = None
 
     def as_json(self) -> dict[str, object]:
-        """With the diagnostics of a sampler as null (DESIGN 8)."""
-        return {
-            **asdict(self),
-            "interval95": list(self.interval95),
-            "rhat": None,
-            "ess_bulk": None,
-            "ess_tail": None,
-        }
+        """The sampler's diagnostics are null where nothing was sampled (DESIGN 8)."""
+        return {**asdict(self), "interval95": list(self.interval95)}
 
     @property
     def informed(self) -> bool:
@@ -79,6 +89,20 @@ class Leverage:
 
 
 @dataclass(frozen=True)
+class PriorSensitivity:
+    """What a headline would do if the u of one prior were multiplied by `factor`.
+
+    `shift_sd` is the change of the value in its present sds, `sd_ratio` the new sd over the present one.
+    """
+
+    parameter: str
+    quantity: str
+    factor: float
+    shift_sd: float
+    sd_ratio: float
+
+
+@dataclass(frozen=True)
 class FitSummary:
     """A joint fit in the contract's terms (DESIGN 8).
 
@@ -97,6 +121,10 @@ class FitSummary:
         excluded_spots: left out by the robust option.
         suspect_spots: used, but in disagreement with all others.
         prior_conflicts: parameters that the data pull far from what was stated, in words.
+        prior_sensitivity: priors that would move a headline if they were twice or half as wide.
+        estimator: "posterior" if a converged sample stands behind the numbers, else "laplace".
+        sampling: diagnosis of the chain, None where nothing was sampled.
+        curves: effective ratios over the range and lost motion against steps; only from a posterior.
     """
 
     converged: bool
@@ -114,6 +142,10 @@ class FitSummary:
     excluded_spots: tuple[int, ...]
     suspect_spots: tuple[int, ...]
     prior_conflicts: tuple[str, ...]
+    prior_sensitivity: tuple[PriorSensitivity, ...]
+    estimator: str = "laplace"
+    sampling: dict[str, object] | None = None
+    curves: dict[str, object] | None = None
 
     @property
     def headline_informed(self) -> bool:
@@ -128,7 +160,7 @@ class FitSummary:
 
         parameters = of(self.parameters)
         return {
-            "estimator": "laplace",
+            "estimator": self.estimator,
             "converged": self.converged,
             "problems": list(self.problems),
             "effective_deg_per_step": of(self.effective),
@@ -148,6 +180,9 @@ class FitSummary:
             "excluded_spots": list(self.excluded_spots),
             "suspect_spots": list(self.suspect_spots),
             "prior_conflicts": list(self.prior_conflicts),
+            "prior_sensitivity": [asdict(entry) for entry in self.prior_sensitivity],
+            "sampling": self.sampling,
+            "curves": self.curves,
         }
 
 
@@ -160,9 +195,35 @@ def _estimate(mode: float, draws: np.ndarray, prior_draws: np.ndarray) -> Estima
     return Estimate(float(mode), sd, (float(low), float(high)), prior_sd, contraction)
 
 
-def _parameters(fit: JointFit) -> dict[str, Estimate]:
-    """Parameters with a coordinate: interval ends are exact images of z -+ 1.96 sd under monotone maps."""
-    physical, prior = fit.draws.physical, fit.prior_draws.physical
+class _Source:
+    """Where the numbers come from: the Laplace approximation, or a posterior and its diagnosis."""
+
+    def __init__(self, fit: JointFit, posterior: Posterior | None):
+        self.fit, self.posterior = fit, posterior
+        self.prior = fit.prior_draws
+        if posterior is None:
+            self.centre, self.draws = fit.mode, fit.draws
+        else:
+            self.draws = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), posterior.draws)
+            self.centre = jax.tree.map(lambda x: x.mean(axis=0), self.draws)
+
+    def estimate(self, name: str, of: Callable[[Derived], np.ndarray]) -> Estimate:
+        """A quantity that is linear in the fields of `Derived`, with the sampler's diagnosis of `name`."""
+        plain = _estimate(*(of(draws) for draws in (self.centre, self.draws, self.prior)))
+        if self.posterior is None:
+            return plain
+        found = self.posterior.convergence
+        return replace(
+            plain,
+            rhat=found.rhat.get(name),
+            ess_bulk=found.ess_bulk.get(name),
+            ess_tail=found.ess_tail.get(name),
+        )
+
+
+def _parameters(source: _Source) -> dict[str, Estimate]:
+    """Parameters with a coordinate; Laplace interval ends are exact images of z -+ 1.96 sd under monotone maps."""
+    fit = source.fit
     low, high = fit.ends95
     has_readings = bool(np.any(np.asarray(fit.arrays.spots.has_aperture) > 0))
     estimates = {}
@@ -171,30 +232,32 @@ def _parameters(fit: JointFit) -> dict[str, Estimate]:
             continue
         if name in HARMONIC_PRIORS and not fit.free[index] and fit.mode.physical[index] == 0:
             continue
-        estimate = _estimate(fit.mode.physical[index], physical[:, index], prior[:, index])
+        estimate = source.estimate(name, lambda d, i=index: d.physical[..., i])
+        if source.posterior is not None:
+            estimates[name] = estimate
+            continue
         if index >= len(RIG_NAMES):
             # Stereo parameters mix coordinates linearly.
             ends = (estimate.value - NORMAL_95 * estimate.sd, estimate.value + NORMAL_95 * estimate.sd)
         else:
             ends = (float(low[index]), float(high[index]))
-        estimates[name] = Estimate(estimate.value, estimate.sd, ends, estimate.prior_sd, estimate.contraction)
+        estimates[name] = replace(estimate, interval95=ends)
     return estimates
 
 
-def _derived(fit: JointFit) -> dict[str, Estimate]:
+def _derived(source: _Source) -> dict[str, Estimate]:
     """Per-direction gear ratios and the effective mirror offset."""
     estimates = {}
     for axis, positive, negative in (("pan", "left", "right"), ("tilt", "up", "down")):
         ratio, contrast = INDEX[f"degrees_per_step.{axis}"], INDEX[f"ratio_contrast_deg_per_step.{axis}"]
         for direction, sign in ((positive, 0.5), (negative, -0.5)):
-            values = (d.physical[..., ratio] + sign * d.physical[..., contrast] for d in _three(fit))
-            estimates[f"degrees_per_step.{direction}"] = _estimate(*values)
-    estimates["effective_mirror_offset_mm"] = _estimate(*(d.effective_mirror_offset_mm for d in _three(fit)))
+            name = f"degrees_per_step.{direction}"
+            estimates[name] = source.estimate(
+                name, lambda d, r=ratio, c=contrast, s=sign: d.physical[..., r] + s * d.physical[..., c]
+            )
+    name = "effective_mirror_offset_mm"
+    estimates[name] = source.estimate(name, lambda d: d.effective_mirror_offset_mm)
     return estimates
-
-
-def _three(fit: JointFit):
-    return fit.mode, fit.draws, fit.prior_draws
 
 
 def _moved_directions(fit: JointFit) -> set[str]:
@@ -260,20 +323,55 @@ def _weak_directions(fit: JointFit, moved: set[str]) -> tuple[WeakDirection, ...
     return tuple(found)
 
 
-def _leverage(fit: JointFit, moved: set[str]) -> tuple[Leverage, ...]:
-    """Stops without which a headline's sd would more than double."""
+def _headline_gradients(fit: JointFit, moved: set[str]) -> tuple[list[str], np.ndarray]:
+    """Effective ratios and backlashes with d(quantity)/d(coordinates), shape (q, p)."""
     quantities = {
         f"effective {d}": fit.draws.effective_deg_per_step[:, k] for k, d in enumerate(DIRECTIONS) if d in moved
     }
     for axis in ("pan", "tilt"):
-        index = INDEX[f"backlash_deg.{axis}"]
         # In coordinates, where the backlash is Gaussian.
-        quantities[f"backlash {axis}"] = fit.draws_z[:, index]
+        quantities[f"backlash {axis}"] = fit.draws_z[:, INDEX[f"backlash_deg.{axis}"]]
     values = np.stack(list(quantities.values()), axis=1)
     centred = fit.draws_z - fit.draws_z.mean(axis=0)
     # Regression on the moment-matched draws: the gradient of the linear part.
     cross = (values - values.mean(axis=0)).T @ centred / len(centred)
-    gradients = np.linalg.solve(fit.covariance, cross.T).T
+    return list(quantities), np.linalg.solve(fit.covariance, cross.T).T
+
+
+def _prior_sensitivity(fit: JointFit, moved: set[str]) -> tuple[PriorSensitivity, ...]:
+    """Each prior in turn doubled and halved in u, to first order about the mode (a refit of the linear model).
+
+    Twice the u divides the prior's precision 1 of a coordinate by four. The stereo calibration is one prior: all its
+    coordinates are scaled together. A half-normal is treated as normal in its coordinate.
+    """
+    quantities, gradients = _headline_gradients(fit, moved)
+    rows = np.flatnonzero(fit.free)
+    hessian = np.linalg.inv(fit.covariance[np.ix_(rows, rows)])
+    gradients = gradients[:, rows]
+    sd = np.sqrt(np.einsum("qi,ij,qj->q", gradients, fit.covariance[np.ix_(rows, rows)], gradients))
+    pull = hessian @ fit.z[rows]
+    names = np.array(NAMES)[rows]
+    groups = {name: np.flatnonzero(names == name) for name in names if not name.startswith("stereo.")}
+    groups["stereo calibration"] = np.flatnonzero(np.char.startswith(names, "stereo."))
+    found = []
+    for parameter, members in groups.items():
+        for factor in (2.0, 0.5):
+            changed = hessian.copy()
+            changed[members, members] += factor**-2 - 1
+            values, vectors = np.linalg.eigh(changed)
+            inverse = (vectors / np.maximum(values, 1e-6)) @ vectors.T
+            shift = gradients @ (inverse @ pull - fit.z[rows]) / sd
+            ratio = np.sqrt(np.einsum("qi,ij,qj->q", gradients, inverse, gradients)) / sd
+            for k, quantity in enumerate(quantities):
+                if abs(shift[k]) > SENSITIVE_SHIFT or abs(np.log(ratio[k])) > np.log1p(SENSITIVE_SD):
+                    found.append(PriorSensitivity(parameter, quantity, factor, float(shift[k]), float(ratio[k])))
+    found.sort(key=lambda e: -max(abs(e.shift_sd), abs(np.log(e.sd_ratio))))
+    return tuple(found[:SENSITIVITIES_LISTED])
+
+
+def _leverage(fit: JointFit, moved: set[str]) -> tuple[Leverage, ...]:
+    """Stops without which a headline's sd would more than double."""
+    quantities, gradients = _headline_gradients(fit, moved)
     sd = np.sqrt(np.einsum("qi,ij,qj->q", gradients, fit.covariance, gradients))
     ordered = ordered_spots(fit.campaign)
     entries = []
@@ -296,11 +394,13 @@ def _leverage(fit: JointFit, moved: set[str]) -> tuple[Leverage, ...]:
     return tuple(entries[:LISTED])
 
 
-def _classic_predicted(fit: JointFit) -> dict[str, Estimate | None]:
+def _classic_predicted(source: _Source) -> dict[str, Estimate | None]:
     """Mean of each direction as the classic estimator would compute it from ideal spots of the fitted model.
 
-    Pixels follow the parameters linearly from the mode; the classic's stereo calibration stays the stated one.
+    Under the Laplace approximation pixels follow the parameters linearly from the mode, under a posterior they are
+    those of each draw; the classic's stereo calibration stays the stated one.
     """
+    fit = source.fit
     selection = select_experiments(fit.campaign)
     result: dict[str, Estimate | None] = dict.fromkeys(DIRECTIONS)
     if not len(selection.experiments):
@@ -309,22 +409,25 @@ def _classic_predicted(fit: JointFit) -> dict[str, Estimate | None]:
     row_of = {spot.spot: row for row, spot in enumerate(ordered)}
     ids = np.array([s.spot for s in fit.campaign.spots])
     rows = np.vectorize(row_of.get)(ids[selection.spot_rows])
-    pixels = fit.linearised.predicted[rows][..., :4]
-    push = fit.linearised.predicted_jacobian[rows][..., :4, :]
 
     def ratios(pixels):
         return four_point_ratios(pixels, selection.steps, selection.axis, fit.campaign.stereo)
 
-    at_mode = ratios(pixels)
-    moves = fit.draws_z[:CLASSIC_DRAWS] - fit.z
-    draws = np.stack([ratios(pixels + push @ dz) for dz in moves])
+    if source.posterior is None:
+        pixels = fit.linearised.predicted[rows][..., :4]
+        push = fit.linearised.predicted_jacobian[rows][..., :4, :]
+        centre = ratios(pixels)
+        draws = np.stack([ratios(pixels + push @ dz) for dz in fit.draws_z[:CLASSIC_DRAWS] - fit.z])
+    else:
+        draws = np.stack([ratios(pixels[rows]) for pixels in ideal_pixels(source.posterior, CLASSIC_DRAWS)])
+        centre = draws.mean(axis=0)
     for direction in DIRECTIONS:
         chosen = selection.direction == direction
         if chosen.any():
             values = draws[:, chosen].mean(axis=1)
             sd = float(values.std())
             low, high = np.quantile(values, [0.025, 0.975])
-            result[direction] = Estimate(float(at_mode[chosen].mean()), sd, (float(low), float(high)), None, None)
+            result[direction] = Estimate(float(centre[chosen].mean()), sd, (float(low), float(high)), None, None)
     return result
 
 
@@ -340,47 +443,105 @@ def _prior_conflicts(fit: JointFit) -> tuple[str, ...]:
     return tuple(found)
 
 
-def summarise(fit: JointFit) -> FitSummary:
+def _curves(posterior: Posterior, moved: set[str]) -> dict[str, object]:
+    """Effective ratios along both axes over the range that was seen, and lost motion at the step counts used."""
+    fit = posterior.fit
+    angles = np.degrees(fit.linearised.mirror_angles_rad)
+    middle = np.degrees(fit.reference_pose_rad)
+    along = {}
+    for axis, name in enumerate(("pan", "tilt")):
+        rows = []
+        for angle in np.linspace(angles[:, axis].min(), angles[:, axis].max(), CURVE_POINTS):
+            pose = middle.copy()
+            pose[axis] = angle
+            found = posterior.effective_deg_per_step(*map(float, pose))
+            entry = {"pan_deg": float(pose[0]), "tilt_deg": float(pose[1])}
+            for k, direction in enumerate(DIRECTIONS):
+                if direction in moved:
+                    entry[direction] = {
+                        "value": float(found.mean[k]),
+                        "sd": float(found.sd[k]),
+                        "interval95": found.interval95[:, k].tolist(),
+                    }
+            rows.append(entry)
+        along[name] = rows
+    used: dict[str, set[int]] = {d: set() for d in DIRECTIONS}
+    for previous, move in pairwise(fit.campaign.moves):
+        if not move.pan_approach:
+            deltas = (move.pan_steps - previous.pan_steps, move.tilt_steps - previous.tilt_steps)
+            for delta, (positive, negative) in zip(deltas, (("left", "right"), ("up", "down")), strict=True):
+                if delta:
+                    used[positive if delta > 0 else negative].add(abs(delta))
+    lost = {}
+    for direction in sorted(moved, key=DIRECTIONS.index):
+        steps = sorted(used[direction])
+        steps = [steps[i] for i in np.unique(np.linspace(0, len(steps) - 1, min(CURVE_POINTS, len(steps))).astype(int))]
+        found = posterior.lost_motion_deg(direction, np.array(steps))
+        lost[direction] = [
+            {
+                "steps": int(n),
+                "value_deg": float(found.mean[k]),
+                "sd_deg": float(found.sd[k]),
+                "interval95_deg": found.interval95[:, k].tolist(),
+            }
+            for k, n in enumerate(steps)
+        ]
+    return {"effective_deg_per_step": along, "lost_motion": lost}
+
+
+def summarise(fit: JointFit, posterior: Posterior | None = None) -> FitSummary:
     """Put a fit into the contract's terms.
 
     Args:
         fit: a joint fit, converged or not.
+        posterior: its sample. One that has not converged lends no number: what is returned is then the Laplace
+            approximation, labelled so, and not converged.
 
     Returns:
         Headlines, parameters and diagnostics.
     """
     moved = _moved_directions(fit)
-    mode, draws, prior = _three(fit)
+    usable = posterior if posterior is not None and posterior.converged else None
+    source = _Source(fit, usable)
     effective = {
-        d: _estimate(*(x.effective_deg_per_step[..., k] for x in (mode, draws, prior))) if d in moved else None
+        d: source.estimate(f"effective_deg_per_step.{d}", lambda x, k=k: x.effective_deg_per_step[..., k])
+        if d in moved
+        else None
         for k, d in enumerate(DIRECTIONS)
     }
     contrasts = {}
     for axis, first in (("pan", 0), ("tilt", 2)):
         both = {DIRECTIONS[first], DIRECTIONS[first + 1]} <= moved
-        differences = (
-            x.effective_deg_per_step[..., first] - x.effective_deg_per_step[..., first + 1]
-            for x in (mode, draws, prior)
+        difference = source.estimate(
+            f"effective_contrast_deg_per_step.{axis}",
+            lambda x, k=first: x.effective_deg_per_step[..., k] - x.effective_deg_per_step[..., k + 1],
         )
-        contrasts[axis] = _estimate(*differences) if both else None
+        contrasts[axis] = difference if both else None
     readings = np.asarray(fit.arrays.spots.has_aperture * fit.arrays.spots.valid).sum()
     observations = 3 * float(np.asarray(fit.arrays.spots.valid).sum()) + float(readings)
     determined = float(np.trace(fit.information.fisher @ fit.covariance))
     pan, tilt = np.degrees(fit.reference_pose_rad)
+    problems = fit.problems
+    if posterior is not None:
+        problems += tuple(f"UNCONVERGED: {sentence}" for sentence in posterior.convergence.missing)
     return FitSummary(
-        converged=fit.converged,
-        problems=fit.problems,
+        converged=fit.converged and (posterior is None or posterior.converged),
+        problems=problems,
         effective=effective,
         contrasts=contrasts,
         reference_pose_deg={"pan": float(pan), "tilt": float(tilt)},
-        jacobian=tuple(tuple(float(x) for x in row) for row in mode.jacobian),
-        parameters={**_parameters(fit), **_derived(fit)},
+        jacobian=tuple(tuple(float(x) for x in row) for row in source.centre.jacobian),
+        parameters={**_parameters(source), **_derived(source)},
         chi2=fit.chi2,
         dof=observations - determined,
         weak_directions=_weak_directions(fit, moved),
         leverage=_leverage(fit, moved),
-        classic_predicted=_classic_predicted(fit),
+        classic_predicted=_classic_predicted(source),
         excluded_spots=fit.excluded_spots,
         suspect_spots=fit.suspect_spots,
         prior_conflicts=_prior_conflicts(fit),
+        prior_sensitivity=_prior_sensitivity(fit, moved),
+        estimator="laplace" if usable is None else "posterior",
+        sampling=None if posterior is None else posterior.convergence.as_json(),
+        curves=None if usable is None else _curves(usable, moved),
     )

@@ -10,6 +10,7 @@ from __future__ import annotations
 import hashlib
 import io
 import json
+import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
@@ -20,16 +21,22 @@ import emcee
 import jax
 import jax.numpy as jnp
 import numpy as np
+import xarray as xr
 from arviz_stats.base import array_stats
 
 from tvsbayes.campaign import input_hashes
 from tvsbayes.classic import DIRECTIONS
-from tvsbayes.ensemble import Independence, Pilot, Target, Transport, in_batches, moves, pilot, transport
+from tvsbayes.ensemble import BATCH, Independence, Pilot, Target, Transport, in_batches, moves, pilot, transport
 from tvsbayes.files import InputError, NotConverged, write_atomically
 from tvsbayes.joint import Derived, JointFit, derived_quantities
-from tvsbayes.parameters import NAMES
+from tvsbayes.likelihood import observe_with_stop_errors, ordered_spots, spot_constants
+from tvsbayes.parameters import INDEX, NAMES
+from tvsbayes.rigs import HARMONIC_PRIORS, HOME_SD_DEG, STEREO_PARAMETER_NAMES
+from tvsbayes.stops import move_log_density
 
 CHAIN_FORMAT = "tvsbayes-chain/1"
+POSTERIOR_FORMAT = "tvsbayes-posterior/1"
+PIXELS = ("u_left", "v_left", "u_right", "v_right")
 RHAT_LIMIT = 1.01
 ESS_LIMIT = 1000
 TAU_LIMIT = 50
@@ -124,7 +131,7 @@ class Draws(Mapping[str, np.ndarray]):
     """Posterior draws by name: every parameter of DESIGN 8, and derived quantities, each of shape (n,).
 
     Derived: `degrees_per_step.left|right|up|down`, `effective_deg_per_step.left|right|up|down`,
-    `effective_mirror_offset_mm`.
+    `effective_contrast_deg_per_step.pan|tilt` (left - right, up - down), `effective_mirror_offset_mm`.
     """
 
     def __init__(self, draws: Derived):
@@ -139,6 +146,8 @@ class Draws(Mapping[str, np.ndarray]):
             self._columns[f"degrees_per_step.{negative}"] = ratio - half
         effective = draws.effective_deg_per_step.reshape(-1, len(DIRECTIONS))
         self._columns |= {f"effective_deg_per_step.{d}": effective[:, k] for k, d in enumerate(DIRECTIONS)}
+        for axis, first in (("pan", 0), ("tilt", 2)):
+            self._columns[f"effective_contrast_deg_per_step.{axis}"] = effective[:, first] - effective[:, first + 1]
         self._columns["effective_mirror_offset_mm"] = draws.effective_mirror_offset_mm.ravel()
 
     def __getitem__(self, name: str) -> np.ndarray:
@@ -259,6 +268,231 @@ class Posterior:
                 np.multiply.outer(p[f"degrees_per_step.{direction}"], count), p[f"backlash_deg.{axis}"][:, None]
             )
         )
+
+
+@dataclass(frozen=True)
+class Variable:
+    """A variable of posterior.nc: its dimensions beyond (chain, draw) and the contract names behind it."""
+
+    dims: tuple[str, ...]
+    names: np.ndarray
+
+
+def _variable(dims: tuple[str, ...], pattern: str) -> Variable:
+    """Fill `{}` in a pattern with the coordinates of the dimensions."""
+    shape = tuple(len(COORDS[dim]) for dim in dims)
+    names = [pattern.format(*(COORDS[d][i] for d, i in zip(dims, index, strict=True))) for index in np.ndindex(shape)]
+    return Variable(dims, np.array(names).reshape(shape))
+
+
+COORDS: dict[str, tuple[str, ...]] = {
+    "direction": DIRECTIONS,
+    "axis": ("pan", "tilt"),
+    "laser_axis": ("x", "y"),
+    "tilt_axis_component": ("x", "z"),
+    "component": ("x", "y", "z"),
+    "harmonic": tuple(name.removeprefix("harmonic_deg.") for name in HARMONIC_PRIORS),
+    "stereo_parameter": tuple(name.removeprefix("stereo.") for name in STEREO_PARAMETER_NAMES),
+}
+VARIABLES: dict[str, Variable] = {
+    "effective_deg_per_step": _variable(("direction",), "effective_deg_per_step.{}"),
+    "degrees_per_step": _variable(("direction",), "degrees_per_step.{}"),
+    "mean_degrees_per_step": _variable(("axis",), "degrees_per_step.{}"),
+    "ratio_contrast_deg_per_step": _variable(("axis",), "ratio_contrast_deg_per_step.{}"),
+    "backlash_deg": _variable(("axis",), "backlash_deg.{}"),
+    "effective_mirror_offset_mm": _variable((), "effective_mirror_offset_mm"),
+    **{
+        name: _variable((), name)
+        for name in (
+            *("mirror_offset_mm", "tilt_zero_deg", "mirror1_error_deg", "mirror2_error_deg", "tilt_axis_skew_deg"),
+            *("pixel_scale", "focal_scale", "baseline_mm", "pan_zero_emission_deg"),
+            *("aperture_zero_deg", "aperture_sd_deg"),
+        )
+    },
+    "laser_tilt_deg": _variable(("laser_axis",), "laser_tilt_deg.{}"),
+    "laser_offset_mm": _variable(("laser_axis",), "laser_offset_mm.{}"),
+    "tilt_axis_offset_mm": _variable(("tilt_axis_component",), "tilt_axis_offset_mm.{}"),
+    "extrinsics_rotation_rad": _variable(("component",), "extrinsics.rotation_rad.{}"),
+    "extrinsics_translation_mm": _variable(("component",), "extrinsics.translation_mm.{}"),
+    "stop_sd_deg": _variable(("direction",), "stop_sd_deg.{}"),
+    "harmonic_deg": _variable(("harmonic",), "harmonic_deg.{}"),
+    "stereo": _variable(("stereo_parameter",), "stereo.{}"),
+}
+"""Variables of posterior.nc. `degrees_per_step` by direction; the mean ratio of an axis is `mean_degrees_per_step`."""
+
+
+def _variables(draws: Derived, varying: set[str], shape: tuple[int, int]) -> dict[str, xr.DataArray]:
+    """All variables that vary, with named dimensions; fixed entries of a dimension are left out."""
+    columns = Draws(draws)
+    result = {}
+    for variable, spec in VARIABLES.items():
+        chosen = np.array([name in varying for name in spec.names.ravel()])
+        if not chosen.any():
+            continue
+        values = np.stack([columns[name] for name in spec.names.ravel()[chosen]], axis=-1)
+        if spec.dims:
+            labels = [label for label, yes in zip(COORDS[spec.dims[0]], chosen, strict=True) if yes]
+            coords = {"chain": np.arange(shape[0]), "draw": np.arange(shape[1]), spec.dims[0]: labels}
+            result[variable] = xr.DataArray(values.reshape(*shape, -1), coords, ("chain", "draw", *spec.dims))
+        else:
+            coords = {"chain": np.arange(shape[0]), "draw": np.arange(shape[1])}
+            result[variable] = xr.DataArray(values.reshape(shape), coords, ("chain", "draw"))
+    return result
+
+
+def _dataset(variables: Mapping[str, xr.DataArray]) -> xr.Dataset:
+    """Join variables; a coordinate of which some have fewer entries is kept apart under the variable's name."""
+    full = {}
+    for name, array in variables.items():
+        for dim in array.dims[2:]:
+            if array.sizes[dim] < len(COORDS.get(dim, ())):
+                array = array.rename({dim: f"{name}_{dim}"})
+        full[name] = array
+    return xr.Dataset(full)
+
+
+def move_log_likelihood(posterior: Posterior) -> xr.DataArray:
+    """Log p(spots of a move | all other spots, parameters), dimensions (chain, draw, move); constants included."""
+    fit = posterior.fit
+    spots = ordered_spots(fit.campaign)
+    used = np.asarray(fit.arrays.spots.valid)[: len(spots)] > 0
+    z = posterior.z.reshape(-1, posterior.z.shape[-1])
+    with jax.enable_x64(True):
+        by_spot = in_batches(lambda block: move_log_density(block, fit.space, fit.arrays), z)[:, : len(spots)]
+    by_spot = by_spot + spot_constants(fit.campaign)
+    index = np.array([spot.move for spot in spots])
+    moves_seen = np.unique(index[used])
+    values = np.stack([by_spot[:, used & (index == move)].sum(axis=1) for move in moves_seen], axis=1)
+    chains, draws = posterior.z.shape[:2]
+    coords = {"chain": np.arange(chains), "draw": np.arange(draws), "move": moves_seen}
+    return xr.DataArray(values.reshape(chains, draws, -1), coords, ("chain", "draw", "move"))
+
+
+def looks(fit: JointFit, z: np.ndarray, stop_error_rad: np.ndarray) -> np.ndarray:
+    """Noiseless pixels of all ordered spots, shape (draws, spots, 4), for coordinates (draws, p)."""
+    count, blocks = len(ordered_spots(fit.campaign)), []
+    with jax.enable_x64(True):
+        for start in range(0, len(z), BATCH):
+            rows = np.arange(len(z))[start : start + BATCH]
+            filled = np.resize(rows, BATCH)
+            seen = observe_with_stop_errors(
+                jnp.asarray(z[filled]), jnp.asarray(stop_error_rad[filled]), fit.space, fit.arrays
+            )
+            blocks.append(np.asarray(seen)[: len(rows), :count, :4])
+    return np.concatenate(blocks)
+
+
+def ideal_pixels(posterior: Posterior, draws: int) -> np.ndarray:
+    """Pixels without noise and stop errors for evenly chosen draws, shape (draws, spots, 4)."""
+    z = posterior.z.reshape(-1, posterior.z.shape[-1])
+    chosen = z[np.linspace(0, len(z) - 1, draws).astype(int)]
+    return looks(posterior.fit, chosen, np.zeros((draws, len(posterior.fit.arrays.spots.valid), 2)))
+
+
+def predictive_pixels(posterior: Posterior, draws_per_chain: int = 8) -> xr.DataArray:
+    """The same looks taken again: stop errors, home offsets, play and pixel noise drawn anew, ranges as observed.
+
+    Returns:
+        Dimensions (chain, draw, spot, pixel); the draws are a subset of the posterior's, by its own coordinate.
+    """
+    fit = posterior.fit
+    spots = ordered_spots(fit.campaign)
+    count = len(spots)
+    generator = np.random.default_rng([posterior.seed, 1])
+    chains, draws = posterior.z.shape[:2]
+    chosen = np.unique(np.linspace(0, draws - 1, min(draws_per_chain, draws)).astype(int))
+    z = posterior.z[:, chosen].reshape(-1, posterior.z.shape[-1])
+    arrays = jax.tree.map(np.asarray, fit.arrays.spots)
+    sd_deg = posterior.draws.physical[:, chosen][..., [INDEX[f"stop_sd_deg.{d}"] for d in DIRECTIONS]]
+    # Per axis (right, left) and (down, up), as `redraw_mix` orders them.
+    sd_rad = np.radians(sd_deg.reshape(len(z), 2, 2)[..., ::-1])
+    variance = np.sum(arrays.redraw_mix[None] * sd_rad[:, None] ** 2, axis=3)
+    fresh = np.sqrt(variance) * generator.standard_normal(variance.shape)
+    size = len(arrays.valid)
+    rows = np.arange(size)[:, None]
+    error = np.take_along_axis(fresh, np.maximum.accumulate(np.where(arrays.redraw, rows, 0), axis=0)[None], axis=1)
+    home = np.radians(HOME_SD_DEG) * generator.standard_normal((len(z), size, 2)) * arrays.homed[:, None]
+    segment = np.maximum.accumulate(np.where(arrays.new_segment, np.arange(size), 0))
+    error = error + home[:, segment]
+    pixel_scale = posterior.draws.physical[:, chosen][..., INDEX["pixel_scale"]].reshape(-1, 1, 1)
+    ideal = looks(fit, z, error)
+    root = np.linalg.inv(arrays.whitening[:count])
+    noise = np.einsum("sij,nsj->nsi", root, generator.standard_normal(ideal.shape))
+    values = (ideal + pixel_scale * noise).reshape(chains, len(chosen), count, 4)
+    coords = {"chain": np.arange(chains), "draw": chosen, "spot": [s.spot for s in spots], "pixel": list(PIXELS)}
+    return xr.DataArray(values.astype(np.float32), coords, ("chain", "draw", "spot", "pixel"))
+
+
+def data_tree(posterior: Posterior) -> xr.DataTree:
+    """Everything ArviZ works on, in its groups.
+
+    Posterior, prior, posterior_predictive, log_likelihood, observed_data and sample_stats.
+
+    Args:
+        posterior: a sampled posterior.
+
+    Returns:
+        A tree for `az.summary`, `az.loo`, `az.compare` and ArviZ's plots. The unit of the log likelihood is a move.
+    """
+    fit = posterior.fit
+    shape = posterior.z.shape[:2]
+    varying = {NAMES[i] for i in np.flatnonzero(fit.free)} | {"effective_mirror_offset_mm"}
+    for axis, pair in (("pan", ("left", "right")), ("tilt", ("up", "down"))):
+        if varying & {f"degrees_per_step.{axis}", f"ratio_contrast_deg_per_step.{axis}"}:
+            varying |= {f"degrees_per_step.{d}" for d in pair} | {f"effective_deg_per_step.{d}" for d in pair}
+    prior_draws = jax.tree.map(lambda x: np.asarray(x)[None], fit.prior_draws)
+    spots = ordered_spots(fit.campaign)
+    pixels = np.array([(s.u_left_px, s.v_left_px, s.u_right_px, s.v_right_px) for s in spots])
+    coords = {"chain": np.arange(shape[0]), "draw": np.arange(shape[1])}
+    stats = {
+        "lp": xr.DataArray(posterior.log_density, coords, ("chain", "draw")),
+        "acceptance_rate": xr.DataArray(posterior.convergence.acceptance, {"chain": coords["chain"]}, ("chain",)),
+    }
+    observed = xr.DataArray(
+        pixels, {"spot": [s.spot for s in spots], "pixel": list(PIXELS)}, ("spot", "pixel"), name="pixels"
+    )
+    tree = xr.DataTree.from_dict(
+        {
+            "posterior": _dataset(_variables(posterior.draws, varying, shape)),
+            "prior": _dataset(_variables(prior_draws, varying, prior_draws.physical.shape[:2])),
+            "posterior_predictive": predictive_pixels(posterior).to_dataset(name="pixels"),
+            "log_likelihood": move_log_likelihood(posterior).to_dataset(name="pixels"),
+            "observed_data": observed.to_dataset(),
+            "sample_stats": xr.Dataset(stats),
+        }
+    )
+    convergence = posterior.convergence
+    tree.attrs = {
+        "format": POSTERIOR_FORMAT,
+        "sampling_library": "emcee",
+        "sampling_time": posterior.seconds,
+        "seed": posterior.seed,
+        "converged": int(convergence.converged),
+        "steps": convergence.steps,
+        "discarded": convergence.discarded,
+        "thin": convergence.thin,
+        "versions": json.dumps({name: version(name) for name in ("tvsbayes", "emcee", "arviz", "jax", "numpy")}),
+        "inputs": json.dumps(input_hashes(fit.campaign)),
+        "fingerprint": fingerprint(fit),
+        "reference_pose_deg": np.degrees(fit.reference_pose_rad),
+        "log_likelihood_unit": "spots of a move given all other spots",
+    }
+    return tree
+
+
+def write_posterior(posterior: Posterior, path: Path) -> None:
+    """Write `posterior.nc` (netCDF-4), whole or not at all.
+
+    Raises:
+        InputError: the folder cannot be written.
+    """
+    tree = data_tree(posterior)
+    packed = {"zlib": True, "complevel": 4, "shuffle": True}
+    encoding = {f"/{name}": dict.fromkeys(group.data_vars, packed) for name, group in tree.children.items()}
+    with tempfile.TemporaryDirectory(prefix="tvsbayes-") as scratch:
+        file = Path(scratch) / "posterior.nc"
+        tree.to_netcdf(file, engine="h5netcdf", encoding=encoding)
+        write_atomically(path, file.read_bytes())
 
 
 def propagated(values: np.ndarray) -> Propagated:
@@ -413,18 +647,10 @@ def diagnose(fit: JointFit, route: Transport, start: Pilot, chain: Chain, seed: 
     z = route.to_z(stored.reshape(-1, dimension)).reshape(walkers, draws, -1)
     log_density = chain.log_density[discarded:][::thin].T + fit.log_density
     derived = derived_at(fit, z, fit.reference_pose_rad)
-    free = np.flatnonzero(fit.free)
-    names = [NAMES[i] for i in free] + [f"effective_deg_per_step.{d}" for d in DIRECTIONS]
-    names += ["effective_mirror_offset_mm", "log_density"]
-    values = np.concatenate(
-        [
-            derived.physical[..., free],
-            derived.effective_deg_per_step,
-            derived.effective_mirror_offset_mm[..., None],
-            log_density[..., None],
-        ],
-        axis=2,
-    )
+    columns = {**Draws(derived), "log_density": log_density.ravel()}
+    fixed = {NAMES[i] for i in np.flatnonzero(~fit.free)}
+    names = [name for name, column in columns.items() if name not in fixed and np.ptp(column) > 0]
+    values = np.stack([columns[name].reshape(walkers, draws) for name in names], axis=2)
     axes = {"chain_axis": 0, "draw_axis": 1}
     rhat = array_stats.rhat(values, method="rank", **axes)
     ess_bulk = array_stats.ess(values, method="bulk", **axes)
@@ -446,6 +672,7 @@ def diagnose(fit: JointFit, route: Transport, start: Pilot, chain: Chain, seed: 
         missing.append(f"{len(kept)} steps are {len(kept) / tau:.0f} autocorrelation times, wanted {TAU_LIMIT}")
     if stuck.any():
         missing.append(f"stuck walkers: {', '.join(map(str, np.flatnonzero(stuck)))}")
+    # ArviZ takes the negative of the log weights, as `loo` hands them over.
     finite = start.log_weights[np.isfinite(start.log_weights)]
     convergence = Convergence(
         steps=steps,
@@ -458,7 +685,7 @@ def diagnose(fit: JointFit, route: Transport, start: Pilot, chain: Chain, seed: 
         acceptance=acceptance,
         stuck_walkers=tuple(int(i) for i in np.flatnonzero(stuck)),
         invalid=chain.invalid,
-        pareto_k=float(array_stats.psislw(finite)[1]),
+        pareto_k=float(array_stats.psislw(-finite)[1]),
         missing=tuple(missing),
     )
     return Posterior(fit, z, log_density, derived, convergence, seed, chain.seconds)

@@ -10,6 +10,7 @@ import json
 import math
 import shlex
 import sys
+from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -25,9 +26,12 @@ from tvsbayes.files import make_folder, write_atomically
 
 if TYPE_CHECKING:
     from tvsbayes.information import Estimate, FitSummary
-    from tvsbayes.joint import JointFit
+    from tvsbayes.joint import Derived, JointFit
+    from tvsbayes.posterior import Posterior
 
 FIT_FORMAT = "tvsbayes-fit/1"
+DRAWS_KEPT = 4096
+"""Posterior draws in draws.npz, evenly chosen; posterior.nc holds them all."""
 KEY_PARAMETERS = (
     ("backlash_deg.pan", "backlash pan", "deg"),
     ("backlash_deg.tilt", "backlash tilt", "deg"),
@@ -113,12 +117,23 @@ def fit_text(summary: FitSummary) -> str:
         if summary.contrasts[axis] is not None:
             rows.append(estimate_row(label, summary.contrasts[axis], "deg/step"))
     rows += [estimate_row(label, summary.parameters[name], unit) for name, label, unit in KEY_PARAMETERS]
-    title = f"joint estimator (Laplace) at pan {pose['pan']:.2f} deg, tilt {pose['tilt']:.2f} deg"
+    kind = {"laplace": "Laplace", "posterior": "posterior"}[summary.estimator]
+    title = f"joint estimator ({kind}) at pan {pose['pan']:.2f} deg, tilt {pose['tilt']:.2f} deg"
     lines = [text_table(title, ["quantity", "value(u)", "unit", "95 % interval", "set by"], rows)]
     lines.append(f"chi2 {summary.chi2:.1f} for {summary.dof:.1f} degrees of freedom")
     predicted = [f"{d} {concise(e.value, e.sd)}" for d, e in summary.classic_predicted.items() if e is not None]
     if predicted:
         lines.append(f"the classic estimator should report, deg/step: {', '.join(predicted)}")
+    if summary.sampling is not None:
+        lines.append(sampling_line(summary.sampling))
+    if summary.curves is not None:
+        lines += lost_motion_lines(summary.curves["lost_motion"])
+    for entry in summary.prior_sensitivity:
+        word = "twice" if entry.factor > 1 else "half"
+        lines.append(
+            f"prior: with {word} the u of {entry.parameter}, {entry.quantity} moves {entry.shift_sd:+.2f} sd and its "
+            f"sd changes by a factor {entry.sd_ratio:.2f}"
+        )
     lines += [f"weak: {weak.text}" for weak in summary.weak_directions]
     lines += [f"leverage: {entry.text}" for entry in summary.leverage]
     lines += [f"prior conflict: {text}" for text in summary.prior_conflicts]
@@ -128,6 +143,24 @@ def fit_text(summary: FitSummary) -> str:
         listed = ", ".join(map(str, summary.suspect_spots[:20]))
         lines.append(f"spots that disagree with all others: {listed}; look at them, or fit with --robust")
     return "\n".join(lines)
+
+
+def sampling_line(sampling: dict[str, object]) -> str:
+    """What stands behind a posterior, in one line."""
+    rhat, ess, tail = (sampling[k] for k in ("worst_rhat", "least_ess_bulk", "least_ess_tail"))
+    text = f"{sampling['walkers']} walkers, {sampling['steps']} steps ({sampling['discarded']} left out); worst R-hat "
+    text += f"{rhat['value']:.3f} ({rhat['quantity']}), least effective draws {ess['value']:.0f} "
+    text += f"({ess['quantity']}) and {tail['value']:.0f} in the tails ({tail['quantity']})"
+    return text if sampling["converged"] else f"UNCONVERGED, the table is Laplace's: {text}"
+
+
+def lost_motion_lines(lost: dict[str, list[dict[str, float]]]) -> list[str]:
+    """Lost motion after a reversal, for the step counts that were used."""
+    return [
+        f"lost motion {direction}, deg: "
+        + ", ".join(f"{e['steps']} steps {concise(e['value_deg'], e['sd_deg'])}" for e in entries)
+        for direction, entries in lost.items()
+    ]
 
 
 def demo_text(classic_result: ClassicResult, summary: FitSummary, truth: dict[str, float]) -> str:
@@ -155,12 +188,15 @@ def demo_text(classic_result: ClassicResult, summary: FitSummary, truth: dict[st
     return f"{ratios}\n\n{others}"
 
 
-def fit_document(fit: JointFit, summary: FitSummary, seed: int) -> dict[str, object]:
+def fit_document(
+    fit: JointFit, summary: FitSummary, seed: int, posterior: Posterior | None = None
+) -> dict[str, object]:
     """The content of `results/fit.json` (DESIGN 7): estimates, covariance with names, provenance."""
     names = list(summary.parameters)
-    packages = ("tvsbayes", "jax", "optimistix", "equinox", "numpy", "scipy", "opencv-python-headless")
+    packages = ("tvsbayes", "jax", "optimistix", "equinox", "emcee", "arviz", "numpy", "scipy")
+    packages += ("opencv-python-headless",)
     estimated = [index for index, name in enumerate(fit.names) if name in names]
-    covariance = np.cov(fit.draws.physical[:, estimated], rowvar=False)
+    covariance = np.cov(_numbers(fit, summary, posterior).physical[:, estimated], rowvar=False)
     return {
         "format": FIT_FORMAT,
         **summary.as_json(),
@@ -172,8 +208,23 @@ def fit_document(fit: JointFit, summary: FitSummary, seed: int) -> dict[str, obj
     }
 
 
-def write_results(fit: JointFit, summary: FitSummary, folder: Path, seed: int) -> dict[str, str]:
+def _numbers(fit: JointFit, summary: FitSummary, posterior: Posterior | None) -> Derived:
+    """Draws behind the summary, fields with one leading axis: at most `DRAWS_KEPT` of a posterior's."""
+    if posterior is None or summary.estimator != "posterior":
+        return fit.draws
+    shape = posterior.z.shape[:2]
+    chosen = np.linspace(0, shape[0] * shape[1] - 1, min(DRAWS_KEPT, shape[0] * shape[1])).astype(int)
+    fields = ("physical", "effective_deg_per_step", "jacobian", "effective_mirror_offset_mm")
+    flat = {name: getattr(posterior.draws, name) for name in fields}
+    return replace(fit.draws, **{k: v.reshape(-1, *v.shape[2:])[chosen] for k, v in flat.items()})
+
+
+def write_results(
+    fit: JointFit, summary: FitSummary, folder: Path, seed: int, posterior: Posterior | None = None
+) -> dict[str, str]:
     """Write `fit.json` and `draws.npz`, each whole or not at all.
+
+    The draws are the posterior's where a converged one is given, else the Laplace approximation's.
 
     Returns:
         Paths by "fit" and "draws".
@@ -182,14 +233,16 @@ def write_results(fit: JointFit, summary: FitSummary, folder: Path, seed: int) -
         InputError: the folder cannot be written.
     """
     buffer = io.BytesIO()
+    draws = _numbers(fit, summary, posterior)
     np.savez_compressed(
         buffer,
         names=np.array(fit.names),
-        physical=fit.draws.physical,
-        effective_deg_per_step=fit.draws.effective_deg_per_step,
+        estimator=summary.estimator,
+        physical=draws.physical,
+        effective_deg_per_step=draws.effective_deg_per_step,
         reference_pose_rad=fit.reference_pose_rad,
     )
-    document = json.dumps(fit_document(fit, summary, seed), indent=1, allow_nan=False)
+    document = json.dumps(fit_document(fit, summary, seed, posterior), indent=1, allow_nan=False)
     contents = {"draws": ("draws.npz", buffer.getvalue()), "fit": ("fit.json", document.encode())}
     make_folder(folder)
     for name, data in contents.values():
