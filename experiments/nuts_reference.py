@@ -1,7 +1,7 @@
 """What is the exact posterior of the two twins? NUTS references, and what a draw costs.
 
-    taskset -c 1 python experiments/nuts_reference.py paper      # 11 CPU minutes, a third of it compilation
-    taskset -c 1 python experiments/nuts_reference.py grid --warmup 300 --draws 1000
+    taskset -c 1 python experiments/nuts_reference.py paper      # 11 CPU minutes
+    taskset -c 1 python experiments/nuts_reference.py grid --warmup 300 --draws 720     # 5
     taskset -c 1 python experiments/nuts_reference.py paper --speed --chains 1 --warmup 200 --limit 90
 
 The first two write `data/reference/posterior_{paper,grid}.json`: mean, sd and quantiles of every free parameter and
