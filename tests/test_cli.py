@@ -276,14 +276,46 @@ def test_fit_document_has_the_contracts_keys_and_its_files(ask, folder):
 
 def test_fit_for_people_names_value_interval_and_origin(say, folder, tmp_path):
     out = tmp_path / "elsewhere"
-    code, text, log = say("fit", folder, "--out", out)
+    code, text, _ = say("fit", folder, "--no-sample", "--out", out)
     assert code == 0
-    assert "as with --no-sample" in log
     row = next(line for line in text.splitlines() if line.startswith("effective left"))
     assert row.split()[-1] == "data"
-    assert f"written: {out / 'fit.json'}" in text
+    assert str(out / "fit.json") in text
     assert (out / "draws.npz").is_file()
     assert not (folder / "results").exists()
+
+
+def test_fit_samples_writes_for_arviz_and_refuses_what_has_not_converged(ask, folder, monkeypatch):
+    """The limits are loosened: what is tested is the way from options to files, not convergence."""
+    import arviz
+
+    from tvsbayes import posterior
+
+    for name, value in {"FIRST_CHECK": 40, "BLOCK": 20, "ESS_LIMIT": 50, "RHAT_LIMIT": 3.0, "TAU_LIMIT": 1}.items():
+        monkeypatch.setattr(posterior, name, value)
+    code, document = ask("fit", folder, "--seed", 2)
+    assert (code, document["estimator"], document["converged"]) == (0, "posterior", True)
+    left = document["effective_deg_per_step"]["left"]
+    assert left["interval95"][0] < left["value"] < left["interval95"][1]
+    assert left["ess_bulk"] >= 50 and left["rhat"] <= 3.0
+    assert document["parameters"]["degrees_per_step.left"]["ess_tail"] > 0
+    assert set(document["files"]) == {"fit", "draws", "posterior", "chain"}
+    assert {"effective_deg_per_step", "lost_motion"} == set(document["curves"])
+    tree = arviz.from_netcdf(document["files"]["posterior"])
+    assert list(tree["posterior"]["degrees_per_step"].dims) == ["chain", "draw", "direction"]
+    assert list(tree["posterior"]["backlash_deg"].dims) == ["chain", "draw", "axis"]
+    assert {"prior", "posterior_predictive", "log_likelihood", "observed_data", "sample_stats"} <= set(tree.children)
+    mean = tree["posterior"]["effective_deg_per_step"].sel(direction="left").mean().item()
+    assert mean == pytest.approx(left["value"], rel=1e-12)
+    assert arviz.summary(tree, var_names=["backlash_deg"]).shape[0] == 2
+
+    monkeypatch.setattr(posterior, "ESS_LIMIT", 10**9)
+    code, document = ask("fit", folder, "--seed", 2, "--resume", "--max-minutes", "0.01")
+    assert (code, document["estimator"], document["converged"]) == (4, "laplace", False)
+    assert document["error"]["code"] == "unconverged"
+    assert document["sampling"]["steps"] > 40
+    code, document = ask("fit", folder, "--seed", 3, "--resume")
+    assert (code, document["error"]["code"]) == (2, "other-chain")
 
 
 def test_per_axis_fit_has_one_gear_ratio_per_axis(ask, folder):

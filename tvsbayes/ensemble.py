@@ -1,9 +1,10 @@
 """Sampling a posterior with emcee in coordinates in which it is nearly standard normal (DESIGN 4.3).
 
 Three layers of coordinates: z, the prior-normal coordinates of `tvsbayes.parameters`; y, whitened by the Laplace
-covariance; w = y less a quadratic shear. Wide directions (laser tilt, mirror errors) bend the ridges on which the
-narrow ones (extrinsics, ratios) lie: the shear moves each narrow coordinate by a quadratic form of the wider ones,
-which straightens the ridges and has Jacobian 1. Walkers live in w. NumPy outside the compiled density.
+covariance; w, in which walkers live. Wide directions (laser tilt, mirror errors) bend the ridges on which the narrow
+ones (extrinsics, ratios) lie: a shear moves each narrow coordinate by a quadratic form of the wider ones. Noise
+scales widen what they limit (stop sd the ratios): a stretch scales those by an exponential of the noise coordinates.
+NumPy outside the compiled density.
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ SHARES = (0.85, 0.1, 0.05)
 
 @dataclass(frozen=True)
 class Transport:
-    """The map w -> z, volume-preserving up to the constant |det root|.
+    """The map w -> z; its Jacobian is |det root| exp(`log_jacobian`).
 
     Attributes:
         mode: z at w = 0, shape (p,).
@@ -50,6 +51,7 @@ class Transport:
         root: lower-triangular Cholesky factor of their covariance in that order, shape (d, d).
         narrow: places in `free` that the shear moves, ascending, shape (k,).
         bend: its quadratic forms, nonzero only among places before the narrow one, shape (k, d, d).
+        stretch: log of the factor on a place per unit of an earlier noise coordinate, shape (d, d).
     """
 
     mode: np.ndarray
@@ -57,6 +59,7 @@ class Transport:
     root: np.ndarray
     narrow: np.ndarray
     bend: np.ndarray
+    stretch: np.ndarray
 
     @property
     def dimension(self) -> int:
@@ -69,9 +72,13 @@ class Transport:
         z[:, self.free] += y @ self.root.T
         return z
 
+    def log_jacobian(self, w: np.ndarray) -> np.ndarray:
+        """Log |dy/dw| of w (n, d): noise coordinates are the same in w and y, the shear keeps volumes."""
+        return w @ self.stretch.sum(axis=0)
+
     def to_z(self, w: np.ndarray) -> np.ndarray:
         """W (n, d) -> z (n, p)."""
-        y = np.array(w, dtype=float)
+        y = w * np.exp(w @ self.stretch.T)
         for place, form in zip(self.narrow, self.bend, strict=True):
             before = y[:, :place]
             y[:, place] -= 0.5 * np.sum((before @ form[:place, :place]) * before, axis=1)
@@ -80,11 +87,12 @@ class Transport:
     def to_w(self, z: np.ndarray) -> np.ndarray:
         """Z (n, p) -> w (n, d); the inverse of `to_z` on the sampled columns."""
         y = np.linalg.solve(self.root, (z - self.mode)[:, self.free].T).T
-        w = y.copy()
+        straight = y.copy()
         for place, form in zip(self.narrow, self.bend, strict=True):
             before = y[:, :place]
-            w[:, place] += 0.5 * np.sum((before @ form[:place, :place]) * before, axis=1)
-        return w
+            straight[:, place] += 0.5 * np.sum((before @ form[:place, :place]) * before, axis=1)
+        # Noise coordinates are neither bent nor stretched: they are known before anything is undone.
+        return straight * np.exp(-straight @ self.stretch.T)
 
 
 def in_batches(function: Callable[[np.ndarray], object], points: np.ndarray, size: int = BATCH) -> object:
@@ -135,7 +143,7 @@ def transport(fit: JointFit) -> Transport:
     is_noise = np.isin(np.array(NAMES)[free], NOISE_NAMES)
     geometry = np.flatnonzero(~is_noise)
     narrow = np.flatnonzero((np.diag(root) < NARROW) & ~is_noise)
-    straight = Transport(fit.z, free, root, narrow[:0], np.zeros((0, count, count)))
+    straight = Transport(fit.z, free, root, narrow[:0], np.zeros((0, count, count)), np.zeros((count, count)))
 
     def residuals(y: np.ndarray) -> np.ndarray:
         seen = in_batches(lambda z: evaluate(z, fit.space, fit.arrays).standardised, straight.from_whitened(y))
@@ -157,9 +165,18 @@ def transport(fit: JointFit) -> Transport:
             curvature = (both[: len(some)] + both[len(some) :] - 2 * centre) @ jacobian.T / SHEAR_STEP**2
             mixed = 0.5 * (curvature - own[some[:, 0]] - own[some[:, 1]])
             bend[:, some[:, 0], some[:, 1]] = bend[:, some[:, 1], some[:, 0]] = mixed.T
+        # The data's share of the information 1 of each coordinate, when a noise coordinate goes up or down.
+        stretch = np.zeros((count, count))
+        for noise in np.flatnonzero(is_noise):
+            share = []
+            for shifted in (steps[noise], -steps[noise]):
+                later = geometry[geometry > noise]
+                slope = residuals(steps[later] + shifted) - residuals(-steps[later] + shifted)
+                share.append(np.sum((slope / (2 * SHEAR_STEP)) ** 2, axis=1))
+            stretch[later, noise] = -0.5 * (share[0] - share[1]) / (2 * SHEAR_STEP)
     for place, form in zip(narrow, bend, strict=True):
         form[place:], form[:, place:] = 0.0, 0.0
-    return Transport(fit.z, free, root, narrow, bend)
+    return Transport(fit.z, free, root, narrow, bend, np.clip(stretch, -0.5, 0.5))
 
 
 class Target:
@@ -170,12 +187,12 @@ class Target:
         self.invalid = 0
 
     def __call__(self, w: np.ndarray) -> np.ndarray:
-        """Log density of w (n, d), relative to the mode; -inf where the model has no value."""
+        """Log density of w (n, d), relative to z's at the mode; -inf where the model has no value."""
         z = self.path.to_z(w)
         value = in_batches(lambda block: evaluate(block, self.fit.space, self.fit.arrays).log_density, z)
         invalid = np.isnan(value)
         self.invalid += int(invalid.sum())
-        return np.where(invalid, -np.inf, value - self.fit.log_density)
+        return np.where(invalid, -np.inf, value - self.fit.log_density + self.path.log_jacobian(w))
 
 
 @dataclass(frozen=True)

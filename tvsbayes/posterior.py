@@ -571,7 +571,7 @@ def _checkpoint(path: Path, fit: JointFit, route: Transport, start: Pilot, chain
         format=CHAIN_FORMAT,
         fingerprint=fingerprint(fit),
         seed=seed,
-        **{f"transport_{k}": getattr(route, k) for k in ("mode", "free", "root", "narrow", "bend")},
+        **{f"transport_{k}": getattr(route, k) for k in ("mode", "free", "root", "narrow", "bend", "stretch")},
         proposal_mean=start.proposal.mean,
         proposal_sd=start.proposal.sd,
         start=start.start,
@@ -618,7 +618,7 @@ def _stored(path: Path, fit: JointFit, seed: int) -> tuple[Transport, Pilot, Cha
         )
     position, has_gauss, gauss = stored["random_rest"]
     random_state = (str(stored["random_kind"]), stored["random_keys"], int(position), int(has_gauss), float(gauss))
-    route = Transport(*(stored[f"transport_{k}"] for k in ("mode", "free", "root", "narrow", "bend")))
+    route = Transport(*(stored[f"transport_{k}"] for k in ("mode", "free", "root", "narrow", "bend", "stretch")))
     proposal = Independence(stored["proposal_mean"], stored["proposal_sd"])
     chain = Chain(
         stored["w"],
@@ -632,20 +632,26 @@ def _stored(path: Path, fit: JointFit, seed: int) -> tuple[Transport, Pilot, Cha
 
 
 def _tau(w: np.ndarray) -> float:
-    """Longest integrated autocorrelation time of positions (steps, walkers, d), steps."""
-    return float(np.max(emcee.autocorr.integrated_time(w, tol=0, quiet=True)))
+    """Longest integrated autocorrelation time of positions (steps, walkers, d), steps; infinite if none moved.
+
+    A walker that never moved has no autocorrelation; it is found by its acceptance.
+    """
+    moved = np.ptp(w[:, :, 0], axis=0) > 0
+    if not moved.any():
+        return float("inf")
+    return float(np.max(emcee.autocorr.integrated_time(w[:, moved], tol=0, quiet=True)))
 
 
 def diagnose(fit: JointFit, route: Transport, start: Pilot, chain: Chain, seed: int) -> Posterior:
     """Leave out the warm-up, thin, and judge what is left."""
     steps = len(chain.w)
-    discarded = min(steps // 4, max(20, int(5 * _tau(chain.w))))
+    discarded = int(min(steps // 4, max(20.0, 5 * _tau(chain.w))))
     kept = chain.w[discarded:]
     thin = max(1, len(kept) // STORED_DRAWS)
     stored = kept[::thin].transpose(1, 0, 2)
     walkers, draws, dimension = stored.shape
     z = route.to_z(stored.reshape(-1, dimension)).reshape(walkers, draws, -1)
-    log_density = chain.log_density[discarded:][::thin].T + fit.log_density
+    log_density = chain.log_density[discarded:][::thin].T + fit.log_density - route.log_jacobian(stored)
     derived = derived_at(fit, z, fit.reference_pose_rad)
     columns = {**Draws(derived), "log_density": log_density.ravel()}
     fixed = {NAMES[i] for i in np.flatnonzero(~fit.free)}
