@@ -1,7 +1,7 @@
 """Do the sampled intervals hold the truth, and what do both estimators do with data that break the model?
 
-    python experiments/posterior_coverage.py run --n 24 --cores 0 1        # minutes per rig and core, resumable
-    python experiments/posterior_coverage.py broken --n 60 --cores 0 1     # seconds per rig and core, resumable
+    python experiments/posterior_coverage.py run --n 24 --cores 0 1        # about 10 min per rig and core, resumable
+    python experiments/posterior_coverage.py broken --n 60 --cores 0 1     # 7 s per rig and core, resumable
     python experiments/posterior_coverage.py table > experiments/posterior_coverage.md
 
 `run` draws rig i of the paper's and the grid protocol with seed i, every prior quantity anew, fits it and samples its
@@ -66,6 +66,7 @@ def clean_rig(task: tuple[str, int]) -> dict[str, object]:
         row["fit_s"] = time.perf_counter() - start
         posterior = sample(result, seed=seed, max_minutes=MAX_MINUTES)
         row["sampled"] = bool(posterior.converged)
+        row["problems"] = [*result.problems, *posterior.convergence.missing]
         row["posterior"] = judged(posterior.draws, None, result.prior_draws, truth, result.reference_pose_rad)
     except Exception as error:
         row["problems"] = [*row.get("problems", []), repr(error)]
@@ -140,6 +141,16 @@ def broken_rig(task: tuple[str, int]) -> dict[str, object]:
     return row
 
 
+def _widths(rows: list[dict]) -> dict[tuple[int, str], float]:
+    """Posterior sd over prior sd of the plain fit of every clean rig, by seed and quantity."""
+    return {
+        (r["seed"], name): np.sqrt(1 - entry["contraction"])
+        for r in rows
+        if r["condition"] == "clean" and r["plain"]["converged"]
+        for name, entry in r["plain"]["values"].items()
+    }
+
+
 def _header(names: str) -> None:
     columns = " | ".join(f"{100 * level:.0f} %" for level in LEVELS)
     print(f"| {names} | RMS z | {columns} | verdict |")
@@ -161,6 +172,9 @@ def _cells(entries: list[dict]) -> tuple[str, str]:
 def table_clean(rows: list[dict]) -> None:
     """Laplace beside posterior on the rigs where both converged."""
     print("## Clean data: Laplace and posterior on the same rigs\n")
+    if not rows:
+        print("Not run yet.\n")
+        return
     for protocol in PROTOCOLS:
         chosen = [r for r in rows if r["protocol"] == protocol]
         good = [r for r in chosen if r["converged"] and r["sampled"]]
@@ -185,6 +199,8 @@ def table_broken(rows: list[dict]) -> None:
     """Plain beside robust under every broken condition."""
     print("## Data that break the model: Laplace, plain and robust\n")
     print("96 spots per rig: both axes swept there and back twice at four placements (d1, d2, d3, d2).\n")
+    print("`sd` is the median width of the interval over that of the plain fit of the same rig, clean.\n")
+    widths = _widths(rows)
     for condition, words in BROKEN.items():
         chosen = [r for r in rows if r["condition"] == condition]
         if not chosen:
@@ -200,12 +216,19 @@ def table_broken(rows: list[dict]) -> None:
                 f"{suspect:.2f} suspect per rig, median {seconds:.1f} s"
             )
         print()
-        _header("quantity | fit")
-        _limits(min(map(len, good.values())), "| ")
+        _header("quantity | fit | sd")
+        _limits(min(map(len, good.values())), "| | ")
         for name in HEADLINES:
             for by, entries in good.items():
                 cells, word = _cells([e["values"][name] for e in entries])
-                print(f"| {name} | {by} | {cells} | {word} |")
+                width = np.median(
+                    [
+                        np.sqrt(1 - r[by]["values"][name]["contraction"]) / widths[r["seed"], name]
+                        for r in chosen
+                        if r[by]["converged"] and (r["seed"], name) in widths
+                    ]
+                )
+                print(f"| {name} | {by} | {width:.2f} | {cells} | {word} |")
         print()
         for r in chosen:
             for by in good:

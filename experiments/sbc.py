@@ -4,8 +4,10 @@
     python experiments/sbc.py run --variants "prior x3" "camera dropped" --n 50 --cores 0 1
     python experiments/sbc.py table > experiments/sbc.md     # also writes experiments/sbc.png
 
-Every simulation draws a rig from the priors of `data/rigs/mounted` (seed i), runs the 48 spots of
-`studies.small_plan`, fits, samples, and ranks the truth among 255 draws spread over all walkers (Talts et al.,
+Rows are appended to `experiments/output/sbc.jsonl`; delete that file when the sampler has changed.
+
+Every simulation draws a rig from the priors of `data/rigs/mounted` (seed i), runs the 60 spots of
+`studies.dense_plan`, fits, samples, and ranks the truth among 255 draws spread over all walkers (Talts et al.,
 arXiv:1804.06788). Ranked are all free parameters, the effective ratios and mirror offset, and the joint log-likelihood
 and log-posterior of the true model, which see what single parameters hide (Modrak et al., doi 10.1214/23-BA1404).
 `table` turns ranks into PIT = (rank + U) / 256 with seeded U and tests their ECDF with the simultaneous band of
@@ -26,7 +28,7 @@ from pathlib import Path
 import numpy as np
 from coverage import read_rows
 from scipy import stats
-from studies import mounted_rig, run_rows, small_plan
+from studies import dense_plan, mounted_rig, run_rows
 
 OUTPUT = Path(__file__).parent / "output"
 ROWS = OUTPUT / "sbc.jsonl"
@@ -36,7 +38,7 @@ DRAWS = 255
 SHRINK = 0.8
 WIDER = 3.0
 WORSE = 1000.0
-MAX_MINUTES = 5.0
+MAX_MINUTES = 8.0
 CLEAN, SHRUNK, PRIOR, CAMERA = "clean", f"sd x {SHRINK}", "prior x3", "camera dropped"
 VARIANTS = (CLEAN, PRIOR, CAMERA)
 """Simulated separately; the shrunk draws come with the clean ones."""
@@ -97,7 +99,7 @@ def one_simulation(task: tuple[str, int]) -> dict[str, object]:
     from tvsbayes.solver import use_compilation_cache
 
     use_compilation_cache()
-    simulated = simulate(mounted_rig(), small_plan(SHEETS), seed)
+    simulated = simulate(mounted_rig(), dense_plan(SHEETS), seed)
     row: dict[str, object] = {"variant": variant, "seed": seed, "converged": False, "problems": []}
     row["unseen"] = sum(s.status != "ok" for s in simulated.campaign.spots)
     start = time.perf_counter()
@@ -223,7 +225,7 @@ def table() -> None:
     designs += [(v, [r for r in rows if r["variant"] == v], "ranks") for v in (PRIOR, CAMERA)]
     print("# Simulation-based calibration of the sampler\n")
     print(
-        "Written by `python experiments/sbc.py table` after `python experiments/sbc.py run`; rig i has seed i. 48 spots"
+        "Written by `python experiments/sbc.py table` after `python experiments/sbc.py run`; rig i has seed i. 60 spots"
     )
     print("of the mounted rig, every prior quantity anew, no aperture readings; two shared cores.\n")
     columns = ("draws", "simulations", "without ranks", "quantities", "criterion p", "least p, of", "p log-likelihood")

@@ -13,6 +13,7 @@ from coverage import SINGLE_THREADED, read_rows
 
 PAN_SWEEP = (0, 70, 140, 200, 140, 70, 0, 70, 140, 200, 140, 70)
 TILT_SWEEP = (-60, -20, 20, 60, 20, -20, -60, -20, 20, 60, 20, -20)
+TILT_STEPS = (-60, -36, -12, 12, 36, 60, 36, 12, -12, -36)
 CROSSING = 100, -20
 """Tilt while panning is the second number, pan while tilting the first."""
 
@@ -26,6 +27,18 @@ def small_plan(sheets: Sequence[str]):
         orders.append(("place", None, None, sheet))
         for pan, tilt in [(p, CROSSING[1]) for p in PAN_SWEEP] + [(CROSSING[0], t) for t in TILT_SWEEP]:
             orders += [("move", pan, tilt), ("look",)]
+    return tuple(PlanStep(number, *order) for number, order in enumerate(orders))
+
+
+def dense_plan(sheets: Sequence[str]):
+    """30 spots per sheet, both axes driven between any two: every spot tells a stop of each axis; 60 spots for two."""
+    from tvsbayes.campaign import PlanStep
+
+    orders = [("home", 0, 0)]
+    for sheet in sheets:
+        orders.append(("place", None, None, sheet))
+        for look in range(30):
+            orders += [("move", PAN_SWEEP[look % 6], TILT_STEPS[look % 10]), ("look",)]
     return tuple(PlanStep(number, *order) for number, order in enumerate(orders))
 
 
