@@ -247,7 +247,10 @@ def table() -> None:
         passes = failing == 0 and (title != CLEAN or lost <= FAILURES * len(chosen))
         cells = (title, len(chosen), lost, len(p), f"{limit:.1e}", f"{p[least]:.1e}, {least}")
         cells += (f"{p['log-likelihood']:.1e}", f"{p['log-posterior']:.1e}", failing)
-        cells += ("passes" if passes else "FAILS", "passes" if title == CLEAN else "FAILS")
+        verdict = "passes" if passes else "FAILS"
+        if len(chosen) < FAULT_SIMULATIONS:
+            verdict = "too few to judge"
+        cells += (verdict, "passes" if title == CLEAN else "FAILS")
         print("| " + " | ".join(map(str, cells)) + " |")
         if title == CLEAN:
             kept = band, pit, p, limit
