@@ -285,6 +285,7 @@ def test_fit_for_people_names_value_interval_and_origin(say, folder, tmp_path):
     assert not (folder / "results").exists()
 
 
+@pytest.mark.slow
 def test_fit_samples_writes_for_arviz_and_refuses_what_has_not_converged(ask, folder, monkeypatch):
     """The limits are loosened: what is tested is the way from options to files, not convergence."""
     import arviz

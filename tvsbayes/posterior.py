@@ -219,6 +219,12 @@ class Posterior:
         """All draws by contract name, chains joined."""
         return Draws(self.draws)
 
+    def thinned(self, count: int) -> Derived:
+        """At most `count` evenly chosen draws, chains joined: every field with one leading axis."""
+        total = self.z.shape[0] * self.z.shape[1]
+        chosen = np.linspace(0, total - 1, min(count, total)).astype(int)
+        return jax.tree.map(lambda x: x.reshape(total, *x.shape[2:])[chosen], self.draws)
+
     def propagate(self, function: Callable[[Draws], np.ndarray]) -> Propagated:
         """Carry the posterior into a quantity of your own.
 
@@ -592,7 +598,7 @@ def _stored(path: Path, fit: JointFit, seed: int) -> tuple[Transport, Pilot, Cha
     """Read a checkpoint; refuse one of other data, model, priors, versions or seed."""
     name = path.name
     try:
-        with np.load(path, allow_pickle=False) as file:
+        with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as file:
             stored = {key: file[key] for key in file.files}
         if str(stored["format"]) != CHAIN_FORMAT:
             raise ValueError(f"format {stored['format']}")
@@ -804,9 +810,11 @@ class _Run:
         """Extend, look, extend."""
         goal, worst_ess = FIRST_CHECK, None
         done = len(self.before.w)
-        while goal <= done:
+        while goal < done:
             goal = int(goal * GROWTH)
-        if done:
+        # A chain interrupted between two looks is first brought to the next: it ends where an unbroken run ends.
+        if goal == done:
+            goal = int(goal * GROWTH)
             posterior = diagnose(self.fit, self.route, self.start, self.before, self.seed)
             if posterior.converged:
                 return posterior

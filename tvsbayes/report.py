@@ -10,7 +10,6 @@ import json
 import math
 import shlex
 import sys
-from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -212,11 +211,7 @@ def _numbers(fit: JointFit, summary: FitSummary, posterior: Posterior | None) ->
     """Draws behind the summary, fields with one leading axis: at most `DRAWS_KEPT` of a posterior's."""
     if posterior is None or summary.estimator != "posterior":
         return fit.draws
-    shape = posterior.z.shape[:2]
-    chosen = np.linspace(0, shape[0] * shape[1] - 1, min(DRAWS_KEPT, shape[0] * shape[1])).astype(int)
-    fields = ("physical", "effective_deg_per_step", "jacobian", "effective_mirror_offset_mm")
-    flat = {name: getattr(posterior.draws, name) for name in fields}
-    return replace(fit.draws, **{k: v.reshape(-1, *v.shape[2:])[chosen] for k, v in flat.items()})
+    return posterior.thinned(DRAWS_KEPT)
 
 
 def write_results(
