@@ -121,6 +121,7 @@ def small_summary() -> FitSummary:
         excluded_spots=(17,),
         suspect_spots=tuple(range(30)),
         prior_conflicts=(),
+        prior_sensitivity=(),
     )
 
 
