@@ -287,29 +287,30 @@ def fit(
 
 
 @contextmanager
-def _sampling_progress() -> Iterator[Callable[[Progress], None] | None]:
+def _sampling_progress() -> Iterator[Callable[[Progress], None]]:
     """A bar on a terminal, nothing elsewhere; Ctrl-C says how to go on."""
     from rich.console import Console
     from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
     from rich.progress import Progress as Bar
 
-    console = Console(stderr=True)
+    console, kept = Console(stderr=True), False
     columns = TextColumn("sampling"), BarColumn(), TextColumn("{task.fields[note]}"), TimeElapsedColumn()
     try:
-        if not console.is_terminal:
-            yield None
-            return
-        with Bar(*columns, console=console, transient=True) as bar:
+        with Bar(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
             task = bar.add_task("sampling", total=None, note="preparing")
 
             def show(state: Progress) -> None:
+                nonlocal kept
+                kept = True
                 ess = "" if state.worst_ess is None else f", least effective draws {state.worst_ess:.0f}"
                 note = f"step {state.steps}{ess}, next look in {max(state.seconds_left, 0):.0f} s"
                 bar.update(task, completed=state.steps, total=state.expected_steps, note=note)
 
             yield show
     except KeyboardInterrupt:
-        report_line("the chain so far is kept in chain.npz; go on with --resume")
+        # Before the first block of steps there is no chain to keep.
+        if kept:
+            report_line("the chain so far is kept in chain.npz; go on with --resume")
         raise
 
 

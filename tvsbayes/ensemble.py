@@ -67,17 +67,17 @@ class Transport:
         return len(self.free)
 
     def from_whitened(self, y: np.ndarray) -> np.ndarray:
-        """Y (n, d) -> z (n, p)."""
+        """From y (n, d) to z (n, p)."""
         z = np.repeat(self.mode[None], len(y), axis=0)
         z[:, self.free] += y @ self.root.T
         return z
 
     def log_jacobian(self, w: np.ndarray) -> np.ndarray:
-        """Log |dy/dw| of w (n, d): noise coordinates are the same in w and y, the shear keeps volumes."""
+        """The log of |dy/dw| at w (n, d): noise coordinates are the same in w and y, the shear keeps volumes."""
         return w @ self.stretch.sum(axis=0)
 
     def to_z(self, w: np.ndarray) -> np.ndarray:
-        """W (n, d) -> z (n, p)."""
+        """From w (n, d) to z (n, p)."""
         y = w * np.exp(w @ self.stretch.T)
         for place, form in zip(self.narrow, self.bend, strict=True):
             before = y[:, :place]
@@ -85,7 +85,7 @@ class Transport:
         return self.from_whitened(y)
 
     def to_w(self, z: np.ndarray) -> np.ndarray:
-        """Z (n, p) -> w (n, d); the inverse of `to_z` on the sampled columns."""
+        """From z (n, p) to w (n, d); the inverse of `to_z` on the sampled columns."""
         y = np.linalg.solve(self.root, (z - self.mode)[:, self.free].T).T
         straight = y.copy()
         for place, form in zip(self.narrow, self.bend, strict=True):
@@ -168,9 +168,8 @@ def transport(fit: JointFit) -> Transport:
         # The data's share of the information 1 of each coordinate, when a noise coordinate goes up or down.
         stretch = np.zeros((count, count))
         for noise in np.flatnonzero(is_noise):
-            share = []
+            later, share = geometry[geometry > noise], []
             for shifted in (steps[noise], -steps[noise]):
-                later = geometry[geometry > noise]
                 slope = residuals(steps[later] + shifted) - residuals(-steps[later] + shifted)
                 share.append(np.sum((slope / (2 * SHEAR_STEP)) ** 2, axis=1))
             stretch[later, noise] = -0.5 * (share[0] - share[1]) / (2 * SHEAR_STEP)
@@ -224,7 +223,7 @@ class Independence:
         return self.mean + self.sd * normal / np.where(heavy, stretch, 1.0)[:, None]
 
     def __call__(self, w: np.ndarray, generator: np.random.RandomState) -> tuple[np.ndarray, np.ndarray]:
-        """Emcee's protocol for a Metropolis-Hastings proposal."""
+        """The protocol of `emcee.moves.MHMove`."""
         proposed = self.draw(len(w), generator)
         return proposed, self.log_density(w) - self.log_density(proposed)
 
@@ -232,7 +231,7 @@ class Independence:
 def moves(proposal: Independence) -> list[tuple[emcee.moves.Move, float]]:
     """The moves and their shares; never emcee 3.1.6's snooker or full-covariance Gaussian (both are biased)."""
     # Fewer walkers than twice the dimension let differential evolution explore a subspace only; the
-    # independence proposal leaves it at every other step.
+    # independence proposal leaves it at six steps of seven.
     evolution = emcee.moves.DEMove(live_dangerously=True), emcee.moves.DEMove(gamma0=1.0, live_dangerously=True)
     return list(zip((emcee.moves.MHMove(proposal), *evolution), SHARES, strict=True))
 

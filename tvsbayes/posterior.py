@@ -51,7 +51,7 @@ GROWTH = 1.3
 BLOCK = 50
 CHECKPOINT_SECONDS = 20.0
 STORED_DRAWS = 256
-"""Draws stored per walker at most twice: R-hat by walker needs about 150 effective draws of each."""
+"""Draws stored per walker: from this many to twice as many. R-hat by walker needs about 150 effective draws of each."""
 DERIVED_BATCH = 2049
 """The batch in which the fit computes its headlines: the compilation is shared."""
 

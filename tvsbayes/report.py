@@ -187,15 +187,13 @@ def demo_text(classic_result: ClassicResult, summary: FitSummary, truth: dict[st
     return f"{ratios}\n\n{others}"
 
 
-def fit_document(
-    fit: JointFit, summary: FitSummary, seed: int, posterior: Posterior | None = None
-) -> dict[str, object]:
-    """The content of `results/fit.json` (DESIGN 7): estimates, covariance with names, provenance."""
+def fit_document(fit: JointFit, summary: FitSummary, seed: int, draws: Derived) -> dict[str, object]:
+    """The content of `results/fit.json` (DESIGN 7): estimates, covariance of `draws` with names, provenance."""
     names = list(summary.parameters)
     packages = ("tvsbayes", "jax", "optimistix", "equinox", "emcee", "arviz", "numpy", "scipy")
     packages += ("opencv-python-headless",)
     estimated = [index for index, name in enumerate(fit.names) if name in names]
-    covariance = np.cov(_numbers(fit, summary, posterior).physical[:, estimated], rowvar=False)
+    covariance = np.cov(draws.physical[:, estimated], rowvar=False)
     return {
         "format": FIT_FORMAT,
         **summary.as_json(),
@@ -205,13 +203,6 @@ def fit_document(
         "seed": seed,
         "command": shlex.join(["tvsbayes", *sys.argv[1:]]),
     }
-
-
-def _numbers(fit: JointFit, summary: FitSummary, posterior: Posterior | None) -> Derived:
-    """Draws behind the summary, fields with one leading axis: at most `DRAWS_KEPT` of a posterior's."""
-    if posterior is None or summary.estimator != "posterior":
-        return fit.draws
-    return posterior.thinned(DRAWS_KEPT)
 
 
 def write_results(
@@ -228,7 +219,9 @@ def write_results(
         InputError: the folder cannot be written.
     """
     buffer = io.BytesIO()
-    draws = _numbers(fit, summary, posterior)
+    draws = fit.draws
+    if posterior is not None and summary.estimator == "posterior":
+        draws = posterior.thinned(DRAWS_KEPT)
     np.savez_compressed(
         buffer,
         names=np.array(fit.names),
@@ -237,7 +230,7 @@ def write_results(
         effective_deg_per_step=draws.effective_deg_per_step,
         reference_pose_rad=fit.reference_pose_rad,
     )
-    document = json.dumps(fit_document(fit, summary, seed, posterior), indent=1, allow_nan=False)
+    document = json.dumps(fit_document(fit, summary, seed, draws), indent=1, allow_nan=False)
     contents = {"draws": ("draws.npz", buffer.getvalue()), "fit": ("fit.json", document.encode())}
     make_folder(folder)
     for name, data in contents.values():
