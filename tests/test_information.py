@@ -200,3 +200,17 @@ def test_json_has_the_contract_keys_and_no_nan(summary):
     entry = {"value", "sd", "interval95", "prior_sd", "contraction", "rhat", "ess_bulk", "ess_tail"}
     assert set(document["parameters"]["backlash_deg.pan"]) == entry
     assert document["parameters"]["backlash_deg.pan"]["rhat"] is None
+
+
+def test_prior_sensitivity_is_what_a_refit_finds(paper, fitted, summary):
+    """The stereo calibration twice as uncertain: predicted to first order, and fitted."""
+    doubled = {e.quantity: e for e in summary.prior_sensitivity if (e.parameter, e.factor) == ("stereo calibration", 2.0)}
+    stereo = replace(paper.stereo, parameter_covariance=4.0 * np.asarray(paper.stereo.parameter_covariance))
+    refit = fit(replace(paper, stereo=stereo))
+    for k, direction in enumerate(("left", "right", "up", "down")):
+        predicted = doubled[f"effective {direction}"]
+        before, after = (f.draws.effective_deg_per_step[:, k] for f in (fitted, refit))
+        sd = before.std()
+        # The change itself is a tenth of an sd; second order leaves a third of that, the refit's own pose less.
+        assert predicted.shift_sd == pytest.approx((after.mean() - before.mean()) / sd, abs=0.05)
+        assert predicted.sd_ratio == pytest.approx(after.std() / sd, abs=0.03)

@@ -364,7 +364,7 @@ def _prior_sensitivity(fit: JointFit, moved: set[str]) -> tuple[PriorSensitivity
             ratio = np.sqrt(np.einsum("qi,ij,qj->q", gradients, inverse, gradients)) / sd
             for k, quantity in enumerate(quantities):
                 if abs(shift[k]) > SENSITIVE_SHIFT or abs(np.log(ratio[k])) > np.log1p(SENSITIVE_SD):
-                    found.append(PriorSensitivity(parameter, quantity, factor, float(shift[k]), float(ratio[k])))
+                    found.append(PriorSensitivity(str(parameter), quantity, factor, float(shift[k]), float(ratio[k])))
     found.sort(key=lambda e: -max(abs(e.shift_sd), abs(np.log(e.sd_ratio))))
     return tuple(found[:SENSITIVITIES_LISTED])
 
