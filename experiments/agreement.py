@@ -39,11 +39,14 @@ STRETCH_STEPS = 400
 def compare(posterior, reference: dict[str, dict[str, float]]) -> list[str]:
     """Table lines: the worst quantity of each kind."""
     columns, shape = posterior.by_name, posterior.z.shape[:2]
-    differences = {"mean, sds": {}, "sd, %": {}, **{f"{q}, Monte Carlo errors": {} for q in QUANTILES}}
+    kinds = ("mean, sds", "sd, %", "sd, Monte Carlo errors", *(f"{q}, Monte Carlo errors" for q in QUANTILES))
+    differences = {kind: {} for kind in kinds}
     for name, there in reference.items():
         draws = columns[name].reshape(shape)
         differences["mean, sds"][name] = abs(draws.mean() - there["mean"]) / there["sd"]
         differences["sd, %"][name] = 100 * abs(draws.std() / there["sd"] - 1)
+        error = np.hypot(float(array_stats.mcse(draws, method="sd", **AXES)), there["sd_mcse"])
+        differences["sd, Monte Carlo errors"][name] = abs(draws.std() - there["sd"]) / error
         for key, probability in QUANTILES.items():
             own = float(array_stats.mcse(draws, method="quantile", prob=probability, **AXES))
             error = np.hypot(own, there[f"{key}_mcse"])
