@@ -27,7 +27,7 @@ from tvsbayes.campaign import input_hashes, read_campaign
 from tvsbayes.ensemble import Target, pilot, transport
 from tvsbayes.files import shipped_data
 from tvsbayes.joint import fit
-from tvsbayes.parameters import NAMES
+from tvsbayes.model import NAMES
 from tvsbayes.posterior import sample
 from tvsbayes.solver import use_compilation_cache
 
@@ -61,9 +61,7 @@ def compare(posterior, reference: dict[str, dict[str, float]]) -> list[str]:
 
 def stretch(joint, start: np.ndarray, path) -> tuple[float, float, float]:
     """Worst bulk effective draws, CPU and wall seconds of emcee's default move, Laplace-whitened coordinates."""
-    straight = replace(
-        path, narrow=path.narrow[:0], bend=path.bend[:0], stretch=np.zeros_like(path.stretch)
-    )
+    straight = replace(path, narrow=path.narrow[:0], bend=path.bend[:0], stretch=np.zeros_like(path.stretch))
     whitened = straight.to_w(path.to_z(start))
     walkers = 2 * len(whitened)
     generator = np.random.default_rng(3)

@@ -94,7 +94,7 @@ def one_rig(task: tuple[str, int]) -> dict[str, object]:
             "contraction": float(1 - draws.var() / prior.var()),
         }
 
-    from tvsbayes.parameters import INDEX
+    from tvsbayes.model import INDEX
 
     for k, direction in enumerate(("left", "right", "up", "down")):
         judge(f"effective {direction}", true_ratio[direction], lambda d, k=k: d.effective_deg_per_step[..., k])

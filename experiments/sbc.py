@@ -54,7 +54,7 @@ def coordinates(space, physical: np.ndarray) -> np.ndarray:
 
     Fixed parameters get 0, directions in which the cameras' covariance is singular too.
     """
-    from tvsbayes.parameters import KINDS, RIG_NAMES
+    from tvsbayes.model import KINDS, RIG_NAMES
 
     z = np.zeros_like(physical)
     for i, (value, u, kind) in enumerate(zip(space.value, space.u, space.kind, strict=True)):
@@ -129,7 +129,7 @@ def ranks(simulated, result, z: np.ndarray) -> dict[str, int]:
 
     from tvsbayes.ensemble import in_batches
     from tvsbayes.likelihood import campaign_arrays, evaluate
-    from tvsbayes.parameters import NAMES, RIG_NAMES, parameter_space
+    from tvsbayes.model import NAMES, RIG_NAMES, parameter_space
     from tvsbayes.posterior import derived_at
     from tvsbayes.simulation import effective_deg_per_step, effective_mirror_offset_mm
 

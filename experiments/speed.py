@@ -34,7 +34,7 @@ from scipy import optimize
 from tvsbayes.campaign import read_campaign, write_campaign
 from tvsbayes.files import shipped_data
 from tvsbayes.joint import Fixed, Problem, fit, stage_residuals
-from tvsbayes.parameters import NAMES
+from tvsbayes.model import NAMES
 from tvsbayes.protocols import mixed_protocol
 from tvsbayes.rigs import read_rig
 from tvsbayes.simulation import simulate

@@ -60,7 +60,7 @@ def shipped_plan(protocol: str):
 
 def headlines(draws) -> dict[str, np.ndarray]:
     """Headline quantities of `tvsbayes.joint.Derived`, whose leading axes are kept."""
-    from tvsbayes.parameters import INDEX
+    from tvsbayes.model import INDEX
 
     ratio, physical = np.asarray(draws.effective_deg_per_step), np.asarray(draws.physical)
     return {

@@ -103,7 +103,7 @@ def coordinates(space: Any, truth: Truth) -> np.ndarray:
     """Coordinates z of a true rig: the inverse of `ParameterSpace.physical`, by scipy's distributions."""
     from scipy.stats import halfnorm, norm
 
-    from tvsbayes.parameters import KINDS, RIG_NAMES
+    from tvsbayes.model import KINDS, RIG_NAMES
 
     z = []
     for name, value, u, kind in zip(RIG_NAMES, space.value, space.u, space.kind, strict=True):
@@ -128,7 +128,7 @@ def dozen(mounted_rig: Rig) -> Dozen:
     import jax.numpy as jnp
 
     from tvsbayes.likelihood import campaign_arrays
-    from tvsbayes.parameters import parameter_space
+    from tvsbayes.model import parameter_space
 
     simulated = dozen_campaign(mounted_rig)
     campaign = simulated.campaign
@@ -161,7 +161,7 @@ def evaluate():
     import jax.numpy as jnp
 
     from tvsbayes.likelihood import innovations, spot_residuals
-    from tvsbayes.positioner import mirror_angles
+    from tvsbayes.model import mirror_angles
 
     @jax.jit
     def compiled(z, space, arrays):

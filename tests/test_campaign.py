@@ -55,10 +55,7 @@ def test_round_trip_is_identical(tmp_path):
 
 def test_numpy_scalars_are_written_as_numbers(tmp_path):
     campaign = small_campaign()
-    spots = [
-        dataclasses.replace(s, aperture_deg=np.float64(50.0) / 3, spot=np.int64(s.spot))
-        for s in campaign.spots
-    ]
+    spots = [dataclasses.replace(s, aperture_deg=np.float64(50.0) / 3, spot=np.int64(s.spot)) for s in campaign.spots]
     priors = {**campaign.rig.priors, "focal_scale": Prior(np.float64(1.001), np.float64(0.0))}
     header = {"seed": np.int64(3)}
     numpy_like = Campaign(campaign.moves, tuple(spots), campaign.stereo, RigTable(priors), header)
@@ -135,9 +132,7 @@ def test_hashes_cover_the_data_and_not_the_names(tmp_path):
     last_digit = np.nextafter(campaign.spots[0].u_left_px, np.inf)
     changes = {
         "moves": {"moves": (*campaign.moves[:-1], dataclasses.replace(campaign.moves[-1], pan_steps=-101))},
-        "spots": {
-            "spots": (dataclasses.replace(campaign.spots[0], u_left_px=last_digit), *campaign.spots[1:])
-        },
+        "spots": {"spots": (dataclasses.replace(campaign.spots[0], u_left_px=last_digit), *campaign.spots[1:])},
         "stereo": {"stereo": dataclasses.replace(campaign.stereo, parameter_covariance=covariance)},
         "rig": {"rig": RigTable(priors, campaign.rig.aperture_convention)},
     }
@@ -157,9 +152,7 @@ def test_transmission_error_is_written_read_and_hashed(tmp_path):
             ({"harmonic_deg.tilt.1.sin": Prior(0.0, 0.1)}, {"pan": 30.0, "tilt": 360.0}),
         ]
     ):
-        table = dataclasses.replace(
-            campaign.rig, priors={**campaign.rig.priors, **priors}, harmonic_period_deg=periods
-        )
+        table = dataclasses.replace(campaign.rig, priors={**campaign.rig.priors, **priors}, harmonic_period_deg=periods)
         wobbling = dataclasses.replace(campaign, rig=table)
         write_campaign(wobbling, tmp_path / str(number))
         again = read_campaign(tmp_path / str(number))
@@ -169,9 +162,7 @@ def test_transmission_error_is_written_read_and_hashed(tmp_path):
     assert len(seen) == 5
 
 
-@pytest.mark.parametrize(
-    ("name", "moves", "spots"), [("rig_a", 195, 384), ("rig_b", 145, 144), ("rig_c", 195, 384)]
-)
+@pytest.mark.parametrize(("name", "moves", "spots"), [("rig_a", 195, 384), ("rig_b", 145, 144), ("rig_c", 195, 384)])
 def test_campaigns_of_unknown_rigs(tmp_path, name, moves, spots):
     if not (UNKNOWN_RIGS / name).is_dir():
         pytest.skip(f"{UNKNOWN_RIGS / name} is not part of the repository")

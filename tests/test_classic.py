@@ -131,9 +131,7 @@ def test_triangulation_inverts_projection(focal_scale: float):
     """Points all over the shared field come back, with the same focal scale on both sides."""
     rng = np.random.default_rng(1)
     stereo = make_stereo()
-    points = np.column_stack(
-        (rng.uniform(170, 500, 400), rng.uniform(-200, 100, 400), rng.uniform(-120, 120, 400))
-    )
+    points = np.column_stack((rng.uniform(170, 500, 400), rng.uniform(-200, 100, 400), rng.uniform(-120, 120, 400)))
     pixels = project(points, stereo, focal_scale)
     seen = np.isfinite(pixels).all(axis=1)
     assert seen.sum() > 150
@@ -150,9 +148,7 @@ def test_projection_agrees_with_opencv():
     zero, none = np.zeros((3, 1)), np.zeros((3, 1))
     rotation, _ = cv2.Rodrigues(stereo.R)
     left = cv2.projectPoints(camera, zero, none, stereo.M1, stereo.D1)[0].reshape(-1, 2)
-    right = cv2.projectPoints(camera, rotation, stereo.T.reshape(3, 1), stereo.M2, stereo.D2)[0].reshape(
-        -1, 2
-    )
+    right = cv2.projectPoints(camera, rotation, stereo.T.reshape(3, 1), stereo.M2, stereo.D2)[0].reshape(-1, 2)
     assert np.abs(project(points, stereo) - np.hstack((left, right))).max() < 1e-9
 
 
@@ -178,9 +174,7 @@ def test_directions_follow_the_sign_of_the_move():
 def test_tilt_is_read_in_the_xz_plane_of_the_stereo_frame():
     """A beam at azimuth az shows tan(el)/cos(az): the paper's reading, kept as it is."""
     azimuth, elevations = np.radians(27.0), np.radians([2.0, 12.0])
-    beam = np.stack(
-        [[np.cos(e) * np.cos(azimuth), np.cos(e) * np.sin(azimuth), np.sin(e)] for e in elevations]
-    )
+    beam = np.stack([[np.cos(e) * np.cos(azimuth), np.cos(e) * np.sin(azimuth), np.sin(e)] for e in elevations])
     points = np.stack([beam[0] * 100, beam[0] * 300, beam[1] * 300, beam[1] * 100])
     angles = four_point_angle_deg(points, "tilt")
     expected = np.degrees(np.arctan(np.tan(elevations) / np.cos(azimuth)))
@@ -199,9 +193,7 @@ def test_statistics_of_known_ratios():
     assert left.sd_deg_per_step == pytest.approx(sd, abs=ROUNDING_DEG)
     assert left.u_type_a_deg_per_step == pytest.approx(sd / np.sqrt(3), abs=ROUNDING_DEG)
     half = 4.302652729911275 * sd / np.sqrt(3)  # t of 2 degrees of freedom, 0.975: tables
-    assert left.interval95_type_a == pytest.approx(
-        (ratios.mean() - half, ratios.mean() + half), abs=ROUNDING_DEG * 5
-    )
+    assert left.interval95_type_a == pytest.approx((ratios.mean() - half, ratios.mean() + half), abs=ROUNDING_DEG * 5)
     # A fixed calibration adds nothing: GUM is type A, with its n - 1 degrees of freedom.
     assert left.u_gum_deg_per_step == pytest.approx(left.u_type_a_deg_per_step, rel=1e-12)
     assert left.effective_dof == pytest.approx(2.0, rel=1e-9)
@@ -232,12 +224,8 @@ def test_gum_agrees_with_monte_carlo_over_calibrations():
     ]
     # An sd of 1500 draws has a relative sd of 1/sqrt(3000) = 1.8 %; four of them.
     assert left.u_stereo_deg_per_step == pytest.approx(np.std(means, ddof=1), rel=4 * 0.018)
-    assert left.u_gum_deg_per_step == pytest.approx(
-        np.hypot(left.u_type_a_deg_per_step, left.u_stereo_deg_per_step)
-    )
-    assert left.effective_dof == pytest.approx(
-        (left.u_gum_deg_per_step / left.u_type_a_deg_per_step) ** 4, rel=1e-9
-    )
+    assert left.u_gum_deg_per_step == pytest.approx(np.hypot(left.u_type_a_deg_per_step, left.u_stereo_deg_per_step))
+    assert left.effective_dof == pytest.approx((left.u_gum_deg_per_step / left.u_type_a_deg_per_step) ** 4, rel=1e-9)
     width_a, width_gum = (np.ptp(i) for i in (left.interval95_type_a, left.interval95_gum))
     factor_gum = width_gum / left.u_gum_deg_per_step
     assert factor_gum < width_a / left.u_type_a_deg_per_step, "more degrees of freedom, a smaller factor"

@@ -7,10 +7,22 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from tvsbayes.geometry import project, rotate_about_z, rotation_matrix
 from tvsbayes.likelihood import aperture_angle, observe
-from tvsbayes.parameters import INDEX, NAMES, Receiver, model_of, parameter_space
-from tvsbayes.positioner import MoveArrays, Transmission, beam, beam_angles, mirror_angles
+from tvsbayes.model import (
+    INDEX,
+    NAMES,
+    MoveArrays,
+    Receiver,
+    Transmission,
+    beam,
+    beam_angles,
+    mirror_angles,
+    model_of,
+    parameter_space,
+    project,
+    rotate_about_z,
+    rotation_matrix,
+)
 from tvsbayes.rigs import RigTable
 
 pytestmark = pytest.mark.usefixtures("x64")

@@ -10,16 +10,20 @@ from pathlib import Path
 
 import pytest
 
-from tvsbayes.documents import JSON_BYTES_MAX, TOML_BYTES_MAX, parse_json, parse_toml, toml_line
 from tvsbayes.files import (
     CSV_LINE_CHARS_MAX,
+    JSON_BYTES_MAX,
+    TOML_BYTES_MAX,
     InputError,
     TvsError,
     csv_bytes,
     decode,
+    parse_json,
     parse_table,
+    parse_toml,
     read_bytes,
     shipped_data,
+    toml_line,
     write_atomically,
 )
 

@@ -15,8 +15,7 @@ import pytest
 from small_campaign import small_campaign
 
 from tvsbayes.campaign import parse_header, parse_moves, parse_spots, read_campaign, write_campaign
-from tvsbayes.documents import parse_toml
-from tvsbayes.files import InputError
+from tvsbayes.files import InputError, parse_toml
 from tvsbayes.rigs import parse_rig_table
 from tvsbayes.stereo import parse_stereo
 

@@ -12,7 +12,7 @@ from tvsbayes.campaign import Campaign
 from tvsbayes.classic import classic
 from tvsbayes.information import CONTRACTION_LIMIT, FitSummary, summarise
 from tvsbayes.joint import fit
-from tvsbayes.parameters import INDEX, NAMES, RECEIVER_NAMES
+from tvsbayes.model import INDEX, NAMES, RECEIVER_NAMES
 from tvsbayes.protocols import four_point_protocol, paper_protocol
 from tvsbayes.report import fit_text
 from tvsbayes.rigs import HARMONIC_PRIORS, Prior
@@ -204,7 +204,9 @@ def test_json_has_the_contract_keys_and_no_nan(summary):
 
 def test_prior_sensitivity_is_what_a_refit_finds(paper, fitted, summary):
     """The stereo calibration twice as uncertain: predicted to first order, and fitted."""
-    doubled = {e.quantity: e for e in summary.prior_sensitivity if (e.parameter, e.factor) == ("stereo calibration", 2.0)}
+    doubled = {
+        e.quantity: e for e in summary.prior_sensitivity if (e.parameter, e.factor) == ("stereo calibration", 2.0)
+    }
     stereo = replace(paper.stereo, parameter_covariance=4.0 * np.asarray(paper.stereo.parameter_covariance))
     refit = fit(replace(paper, stereo=stereo))
     for k, direction in enumerate(("left", "right", "up", "down")):

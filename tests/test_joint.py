@@ -16,7 +16,7 @@ from tvsbayes.campaign import Campaign
 from tvsbayes.files import InputError, NothingToEstimate, shipped_data
 from tvsbayes.joint import HARMONIC_SD_DEG, fit, model_choice
 from tvsbayes.likelihood import ordered_spots
-from tvsbayes.parameters import INDEX, NAMES
+from tvsbayes.model import INDEX, NAMES
 from tvsbayes.protocols import four_point_protocol, grid_protocol
 from tvsbayes.rigs import HARMONIC_PRIORS, Prior, RigTable, read_rig
 from tvsbayes.simulation import SimulatedCampaign, effective_deg_per_step, effective_mirror_offset_mm, simulate

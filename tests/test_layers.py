@@ -12,13 +12,11 @@ import pytest
 PACKAGE = Path(__file__).resolve().parents[1] / "tvsbayes"
 LEVELS: tuple[tuple[str, ...], ...] = (
     ("files",),
-    ("documents",),
     ("stereo",),
     ("rigs",),
     ("campaign",),
-    ("geometry", "classic", "simulation"),
-    ("positioner", "protocols"),
-    ("parameters",),
+    ("model", "classic", "simulation"),
+    ("protocols",),
     ("likelihood", "solver"),
     ("stops",),
     ("joint",),
@@ -29,11 +27,11 @@ LEVELS: tuple[tuple[str, ...], ...] = (
 )
 """From bottom to top: a module imports only modules of lower levels."""
 WITHOUT_JAX = (
-    *("files", "documents", "stereo", "rigs", "campaign", "classic", "simulation", "protocols"),
+    *("files", "stereo", "rigs", "campaign", "classic", "simulation", "protocols"),
     "report",
 )
 MODEL = {
-    *("geometry", "positioner", "parameters", "likelihood", "stops", "solver", "joint"),
+    *("model", "likelihood", "stops", "solver", "joint"),
     *("ensemble", "posterior"),
     *("information", "classic"),
 }

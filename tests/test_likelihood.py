@@ -13,7 +13,7 @@ import pytest
 
 from tvsbayes import likelihood
 from tvsbayes.likelihood import campaign_arrays, density_and_gradient, log_constant, ordered_spots
-from tvsbayes.parameters import INDEX, NAMES, RIG_NAMES
+from tvsbayes.model import INDEX, NAMES, RIG_NAMES
 from tvsbayes.rigs import HOME_SD_DEG, rotation_matrix
 from tvsbayes.simulation import aperture_angle_deg, mirror_chain, play, project, to_tvs
 

@@ -12,7 +12,7 @@ import pytest
 from scipy import stats
 from small_campaign import small_stereo
 
-from tvsbayes.parameters import (
+from tvsbayes.model import (
     INDEX,
     KINDS,
     NAMES,

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from tvsbayes.positioner import (
+from tvsbayes.model import (
     UNIFORM_SD,
     Harmonics,
     MoveArrays,

@@ -152,8 +152,7 @@ def test_step_counts_are_taken_in_turn(mounted_rig):
     ends = {s.experiment: campaign.moves[s.move] for s in campaign.spots if s.point == 3}
     starts = {s.experiment: campaign.moves[s.move] for s in campaign.spots if s.point == 2}
     lengths = [
-        abs(ends[e].pan_steps - starts[e].pan_steps) + abs(ends[e].tilt_steps - starts[e].tilt_steps)
-        for e in range(8)
+        abs(ends[e].pan_steps - starts[e].pan_steps) + abs(ends[e].tilt_steps - starts[e].tilt_steps) for e in range(8)
     ]
     assert lengths == [100, 200] * 4
 

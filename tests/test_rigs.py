@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 from small_campaign import small_stereo
 
-from tvsbayes.documents import parse_toml
-from tvsbayes.files import InputError
+from tvsbayes.files import InputError, parse_toml
 from tvsbayes.rigs import (
     DECLARED_PRIORS,
     DEFAULT_PRIORS,
@@ -59,9 +58,7 @@ def test_rotation_vector_inverts_rotation_matrix(length):
 def test_rotation_vector_takes_the_nearest_rotation():
     matrix = rotation_matrix(np.array([0.1, 0.2, -0.3]))
     # A symmetric stretch does not turn: the polar factor is the rotation itself.
-    assert rotation_vector(matrix @ np.diag([1 + 1e-7, 1 - 1e-7, 1.0])) == pytest.approx(
-        [0.1, 0.2, -0.3], abs=ROUNDING
-    )
+    assert rotation_vector(matrix @ np.diag([1 + 1e-7, 1 - 1e-7, 1.0])) == pytest.approx([0.1, 0.2, -0.3], abs=ROUNDING)
 
 
 def test_stereo_vector_has_the_names_order_and_inverts():
@@ -200,9 +197,7 @@ def test_rig_table_defaults_and_both_spellings():
 
 def test_rig_table_round_trip():
     priors = {
-        name: Prior(
-            p.value if p.distribution == "half-normal" else p.value * 1.1 + 0.001, p.u / 3, p.distribution
-        )
+        name: Prior(p.value if p.distribution == "half-normal" else p.value * 1.1 + 0.001, p.u / 3, p.distribution)
         for name, p in {**DEFAULT_PRIORS, **DECLARED_PRIORS}.items()
     }
     table = RigTable(priors, "azimuth")

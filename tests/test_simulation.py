@@ -163,9 +163,7 @@ def test_effective_ratios_and_offset_of_the_nominal_rig():
     parameters |= {"degrees_per_step.up": 0.0701, "degrees_per_step.down": 0.0699}
     effective = effective_deg_per_step(parameters, (12.0, 7.0))
     # Differences of angles of order 0.1 rad over 2e-5 rad: rounding 1e-16 / 2e-5 = 1e-11, times ten.
-    assert effective == pytest.approx(
-        {"left": 0.0601, "right": 0.0599, "up": 0.0701, "down": 0.0699}, rel=1e-10
-    )
+    assert effective == pytest.approx({"left": 0.0601, "right": 0.0599, "up": 0.0701, "down": 0.0699}, rel=1e-10)
     assert effective_mirror_offset_mm(parameters, (12.0, 7.0)) == pytest.approx(30.0, abs=1e-10)
     tilted = parameters | {"laser_tilt_deg.x": 1.0}
     slope = effective_deg_per_step(tilted, (12.0, 7.0))["left"] / 0.0601
@@ -279,9 +277,7 @@ def test_truth_is_drawn_around_the_stated_values_never_at_them():
     assert p["degrees_per_step.left"] - p["degrees_per_step.right"] == pytest.approx(
         p["ratio_contrast_deg_per_step.pan"]
     )
-    assert p["degrees_per_step.up"] + p["degrees_per_step.down"] == pytest.approx(
-        2 * p["degrees_per_step.tilt"]
-    )
+    assert p["degrees_per_step.up"] + p["degrees_per_step.down"] == pytest.approx(2 * p["degrees_per_step.tilt"])
 
 
 def test_draws_follow_their_distributions():
@@ -293,9 +289,7 @@ def test_draws_follow_their_distributions():
     assert backlash.min() >= 0
     assert np.sqrt(np.mean(backlash**2)) == pytest.approx(0.5, rel=four_se)
     log_stop = np.log([t.parameters["stop_sd_deg.left"] / 0.04 for t in truths])
-    assert np.mean(log_stop) == pytest.approx(0.0, abs=four_se) and np.std(log_stop) == pytest.approx(
-        1, rel=four_se
-    )
+    assert np.mean(log_stop) == pytest.approx(0.0, abs=four_se) and np.std(log_stop) == pytest.approx(1, rel=four_se)
     focal = np.array([t.parameters["focal_scale"] for t in truths])
     assert np.mean(focal) == pytest.approx(1.0, abs=0.002 * four_se)
     fx = np.array([t.stereo.vector[0] for t in truths])
@@ -312,9 +306,7 @@ def test_truth_round_trip():
     # The rotation goes through its matrix once: rounding only.
     assert np.abs(again.stereo.vector - truth.stereo.vector).max() < 1e-12
     assert set(document["stereo"]) == set(STEREO_PARAMETER_NAMES)
-    assert document["effective_deg_per_step"] == effective_deg_per_step(
-        truth.parameters, truth.reference_pose_deg
-    )
+    assert document["effective_deg_per_step"] == effective_deg_per_step(truth.parameters, truth.reference_pose_deg)
 
 
 def test_same_seed_same_campaign_other_seed_another():
@@ -364,9 +356,7 @@ def test_streams_are_independent():
     assert stripped == without.campaign.spots
     assert all(spot.aperture_deg is not None for spot in with_readings.campaign.spots if spot.status == "ok")
     given = draw_truth(rig, np.random.default_rng(1))
-    assert simulate(rig, plan, 8, given).campaign.spots == without.campaign.spots, (
-        "u = 0: any draw is the same rig"
-    )
+    assert simulate(rig, plan, 8, given).campaign.spots == without.campaign.spots, "u = 0: any draw is the same rig"
     noisier = simulate(rig, plan, 8, given, spot_sd_px=0.16)
     assert noisier.truth.stop_errors_deg == without.truth.stop_errors_deg
 
@@ -433,8 +423,7 @@ def test_every_placement_stands_anew():
     rig = make_rig(truth_u=0.0)
     orders = [("home",), ("place", "d1"), ("look",), ("look",), ("place", "d1"), ("look",)]
     plan = [
-        PlanStep(i, a, 0 if a == "home" else None, 0 if a == "home" else None, *t)
-        for i, (a, *t) in enumerate(orders)
+        PlanStep(i, a, 0 if a == "home" else None, 0 if a == "home" else None, *t) for i, (a, *t) in enumerate(orders)
     ]
     spots = simulate(rig, plan, 6, spot_sd_px=1e-9).campaign.spots
     disparity = [spot.u_left_px - spot.u_right_px for spot in spots]
@@ -475,9 +464,7 @@ def test_a_spot_out_of_view_is_undetected():
     assert spots[0].u_left_px is spots[0].su_right_px is spots[1].aperture_deg is None
     points = np.array([[-175.0, 0.0, 0.0], [175.0, 0.0, 0.0], [175.0, -500.0, 0.0]])
     assert np.isfinite(project(points, rig.stereo)).all(axis=1).tolist() == [False, True, False]
-    folding = replace(
-        rig.stereo, D1=np.array([-0.5, 0.0, 0.0, 0.0, 0.0]), D2=np.array([-0.5, 0.0, 0.0, 0.0, 0.0])
-    )
+    folding = replace(rig.stereo, D1=np.array([-0.5, 0.0, 0.0, 0.0, 0.0]), D2=np.array([-0.5, 0.0, 0.0, 0.0, 0.0]))
     # r = 1.4 is beyond the turn at 0.82, where the polynomial leads back to r = 0.03.
     assert np.isnan(project(np.array([[100.0, -140.0, 0.0]]), folding)).all()
 
@@ -520,9 +507,7 @@ def test_four_point_plans(name: str):
         seen.append(tuple(np.subtract(four[2][2], four[1][2])))
     sizes = {(200,), (100, 200)}
     for direction, (axis, sign) in DIRECTION_SIGNS.items():
-        mine = [
-            s[axis == "tilt"] for s in seen if np.sign(s[axis == "tilt"]) == sign and s[axis == "pan"] == 0
-        ]
+        mine = [s[axis == "tilt"] for s in seen if np.sign(s[axis == "tilt"]) == sign and s[axis == "pan"] == 0]
         assert len(mine) == 24, direction
         assert tuple(sorted({abs(s) for s in mine})) in sizes
 

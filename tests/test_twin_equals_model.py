@@ -13,10 +13,8 @@ import numpy as np
 import pytest
 
 from tvsbayes import simulation
-from tvsbayes.geometry import project
 from tvsbayes.likelihood import aperture_angle
-from tvsbayes.parameters import RIG_NAMES, model_of
-from tvsbayes.positioner import MoveArrays, beam, beam_angles, mirror_angles
+from tvsbayes.model import RIG_NAMES, MoveArrays, beam, beam_angles, mirror_angles, model_of, project
 from tvsbayes.rigs import HARMONIC_PRIORS, Prior
 from tvsbayes.simulation import draw_truth
 

@@ -96,9 +96,7 @@ def test_paper_twin_has_equal_gears_and_says_what_is_assumed():
         assert p[f"backlash_deg.{axis}"] == pytest.approx(lost_deg, rel=0.15), axis
     assert p["stop_sd_deg.left"] > 5 * p["stop_sd_deg.right"]
     assert "OUR ASSUMPTION" in truth.note and "OUR ASSUMPTION" in campaign.header["notes"]
-    assert "our assumption, not known from the paper" in (DATA / "twins" / "README.md").read_text(
-        encoding="utf-8"
-    )
+    assert "our assumption, not known from the paper" in (DATA / "twins" / "README.md").read_text(encoding="utf-8")
 
 
 @pytest.mark.parametrize("name", TWINS)
@@ -144,9 +142,7 @@ def test_grid_twin_has_three_sheets_both_sides_and_readings():
 def test_every_spot_of_every_drawn_rig_is_in_view(name: str):
     """200 rigs drawn from all priors of the mounted rig; 1000 of 1000 were in view when it was chosen."""
     rig, plan = mounted(), read_plan(DATA / "rigs" / "mounted" / f"{name}.csv")
-    lost = [
-        seed for seed in range(200) if any(s.status != "ok" for s in simulate(rig, plan, seed).campaign.spots)
-    ]
+    lost = [seed for seed in range(200) if any(s.status != "ok" for s in simulate(rig, plan, seed).campaign.spots)]
     assert lost == []
 
 

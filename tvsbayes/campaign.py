@@ -13,16 +13,20 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
-from tvsbayes.documents import JSON_BYTES_MAX, TOML_BYTES_MAX, Keys, parse_toml, toml_line
 from tvsbayes.files import (
     CSV_BYTES_MAX,
+    JSON_BYTES_MAX,
+    TOML_BYTES_MAX,
+    Keys,
     Table,
     csv_bytes,
     escaped,
     make_folder,
     parse_table,
+    parse_toml,
     read_bytes,
     refusal,
+    toml_line,
     write_atomically,
 )
 from tvsbayes.rigs import RigTable, Stereo, parse_rig_table, rig_table_toml

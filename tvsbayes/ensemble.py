@@ -1,6 +1,6 @@
 """Sampling a posterior with emcee in coordinates in which it is nearly standard normal (DESIGN 4.3).
 
-Three layers of coordinates: z, the prior-normal coordinates of `tvsbayes.parameters`; y, whitened by the Laplace
+Three layers of coordinates: z, the prior-normal coordinates of `tvsbayes.model`; y, whitened by the Laplace
 covariance; w, in which walkers live. Wide directions (laser tilt, mirror errors) bend the ridges on which the narrow
 ones (extrinsics, ratios) lie: a shear moves each narrow coordinate by a quadratic form of the wider ones. Noise
 scales widen what they limit (stop sd the ratios): a stretch scales those by an exponential of the noise coordinates.
@@ -20,7 +20,7 @@ from scipy import special
 
 from tvsbayes.joint import JointFit
 from tvsbayes.likelihood import evaluate
-from tvsbayes.parameters import NAMES, NOISE_NAMES
+from tvsbayes.model import NAMES, NOISE_NAMES
 
 BATCH = 32
 """Points per call of the compiled density: half an ensemble of 64, the calls of a differential-evolution step."""

@@ -16,7 +16,7 @@ import numpy as np
 from tvsbayes.classic import DIRECTIONS, four_point_ratios, select_experiments
 from tvsbayes.joint import NORMAL_95, Derived, JointFit
 from tvsbayes.likelihood import ordered_spots
-from tvsbayes.parameters import INDEX, NAMES, RECEIVER_NAMES, RIG_NAMES
+from tvsbayes.model import INDEX, NAMES, RECEIVER_NAMES, RIG_NAMES
 from tvsbayes.posterior import Posterior, ideal_pixels
 from tvsbayes.protocols import observed_stops, separation
 from tvsbayes.rigs import HARMONIC_PRIORS

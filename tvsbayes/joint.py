@@ -1,7 +1,7 @@
 """The joint estimator: every parameter from every spot, with a Laplace covariance (DESIGN 4.2).
 
 Annealed Levenberg-Marquardt for geometry and stereo, alternating with the noise scales; then Newton steps on the
-full log density and the inverse Hessian there. Everything happens in the coordinates of `tvsbayes.parameters`
+full log density and the inverse Hessian there. Everything happens in the coordinates of `tvsbayes.model`
 (prior N(0, 1) each); results are handed out in the units of DESIGN 8: deg, mm, px, rad where a name says so.
 """
 
@@ -19,7 +19,6 @@ from scipy import optimize, stats
 
 from tvsbayes.campaign import Campaign
 from tvsbayes.files import InputError, NotConverged, NothingToEstimate
-from tvsbayes.geometry import Scalar
 from tvsbayes.likelihood import (
     CampaignArrays,
     campaign_arrays,
@@ -29,8 +28,17 @@ from tvsbayes.likelihood import (
     spot_residuals,
     stop_variances,
 )
-from tvsbayes.parameters import INDEX, NAMES, NOISE_NAMES, ParameterSpace, free_mask, parameter_space
-from tvsbayes.positioner import beam_angles, mirror_angles
+from tvsbayes.model import (
+    INDEX,
+    NAMES,
+    NOISE_NAMES,
+    ParameterSpace,
+    Scalar,
+    beam_angles,
+    free_mask,
+    mirror_angles,
+    parameter_space,
+)
 from tvsbayes.rigs import HARMONIC_PRIORS, HOME_SD_DEG, Prior, RigTable
 from tvsbayes.solver import NEWTON_STEP, Mode, laplace_draws, levenberg_marquardt, newton_mode
 from tvsbayes.stops import LinearSpots, StopInformation, leave_one_out_chi2, stop_information

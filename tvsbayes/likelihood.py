@@ -21,18 +21,23 @@ from jaxtyping import Array, Bool, Float, Int
 
 from tvsbayes.campaign import APPROACH_SIGN, Campaign, Move, Spot
 from tvsbayes.classic import triangulate
-from tvsbayes.geometry import (
+from tvsbayes.model import (
+    MirrorAngles,
+    Model,
+    MoveArrays,
+    ParameterSpace,
+    Receiver,
     Scalar,
     along_batch,
+    beam,
     dot,
     materialise,
+    mirror_angles,
     project,
     rotate_about_z,
     rotation_matrix,
     transform,
 )
-from tvsbayes.parameters import Model, ParameterSpace, Receiver
-from tvsbayes.positioner import MirrorAngles, MoveArrays, beam, mirror_angles
 from tvsbayes.rigs import HOME_SD_DEG
 
 SMALLEST_BUCKET = 512

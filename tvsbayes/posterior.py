@@ -30,7 +30,7 @@ from tvsbayes.ensemble import BATCH, Independence, Pilot, Target, Transport, in_
 from tvsbayes.files import InputError, NotConverged, write_atomically
 from tvsbayes.joint import Derived, JointFit, derived_quantities
 from tvsbayes.likelihood import observe_with_stop_errors, ordered_spots, spot_constants
-from tvsbayes.parameters import INDEX, NAMES
+from tvsbayes.model import INDEX, NAMES
 from tvsbayes.rigs import HARMONIC_PRIORS, HOME_SD_DEG, STEREO_PARAMETER_NAMES
 from tvsbayes.stops import move_log_density
 
@@ -840,4 +840,3 @@ class _Run:
         except KeyboardInterrupt:
             self.save()
             raise
-

@@ -11,8 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path, PureWindowsPath
 from typing import Literal
 
-from tvsbayes.documents import TOML_BYTES_MAX, Keys, parse_toml, toml_line
-from tvsbayes.files import InputError, closest, escaped, read_bytes
+from tvsbayes.files import TOML_BYTES_MAX, InputError, Keys, closest, escaped, parse_toml, read_bytes, toml_line
 from tvsbayes.stereo import (
     STEREO_PARAMETER_NAMES,
     Stereo,

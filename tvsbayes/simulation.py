@@ -19,8 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from tvsbayes.campaign import Campaign, Move, PlanStep, Spot, write_campaign
-from tvsbayes.documents import JSON_BYTES_MAX, parse_json
-from tvsbayes.files import InputError, read_bytes, write_atomically
+from tvsbayes.files import JSON_BYTES_MAX, InputError, parse_json, read_bytes, write_atomically
 from tvsbayes.rigs import (
     DECLARED_PRIORS,
     DEFAULT_PRIORS,

@@ -14,8 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from tvsbayes.documents import JSON_BYTES_MAX, Keys, parse_json
-from tvsbayes.files import InputError, escaped, read_bytes, shown, write_atomically
+from tvsbayes.files import JSON_BYTES_MAX, InputError, Keys, escaped, parse_json, read_bytes, shown, write_atomically
 
 STEREO_PARAMETER_NAMES: tuple[str, ...] = (
     *(f"stereo.left.{p}" for p in ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")),

@@ -28,7 +28,7 @@ from tvsbayes.likelihood import (
     look,
     no_belief,
 )
-from tvsbayes.parameters import ParameterSpace
+from tvsbayes.model import ParameterSpace
 
 RANK_TOLERANCE = 1e-12
 """Share of a state's precision below which what other states leave of it is rounding, not information."""
