@@ -80,7 +80,7 @@ def bias(chain: np.ndarray) -> str:
 
 def off_target(dimension: int) -> Independence:
     """A proposal whose mean and sds are not the target's."""
-    return Independence(np.full(dimension, 0.3), np.linspace(1.0, 1.2, dimension))
+    return Independence(np.full(dimension, 0.3), np.linspace(1.0, 1.2, dimension), np.arange(dimension) % 3 == 1)
 
 
 @pytest.mark.parametrize("dimension", INDEPENDENT_STEPS)
@@ -134,8 +134,9 @@ def test_walkers_outnumber_the_dimensions_in_whole_batches():
         assert walkers % (2 * BATCH) == 0
 
 
-def test_the_proposal_density_is_normalised_and_has_the_moments_of_its_draws():
-    proposal = Independence(np.array([0.7]), np.array([1.3]))
+@pytest.mark.parametrize("heavy", [False, True])
+def test_the_proposal_density_is_normalised_and_has_the_moments_of_its_draws(heavy):
+    proposal = Independence(np.array([0.7]), np.array([1.3]), np.array([heavy]))
     # A t with 5 degrees of freedom has 1e-12 of its mass beyond 400 sds.
     x = np.linspace(-600.0, 600.0, 600_001)
     density = np.exp(proposal.log_density(x[:, None]))
@@ -152,7 +153,9 @@ def test_the_proposal_density_is_normalised_and_has_the_moments_of_its_draws():
 
 def test_the_proposal_density_and_draws_agree_in_many_dimensions():
     dimension = 8
-    proposal = Independence(np.linspace(-1, 1, dimension), np.linspace(0.5, 2.0, dimension))
+    proposal = Independence(
+        np.linspace(-1, 1, dimension), np.linspace(0.5, 2.0, dimension), np.arange(dimension) % 2 == 1
+    )
     w = proposal.draw(100_000, np.random.RandomState(4))
     for shrink in (0.7, 0.9):
         other = -0.5 * np.sum(((w - proposal.mean) / (shrink * proposal.sd)) ** 2, axis=1)

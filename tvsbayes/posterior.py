@@ -44,7 +44,8 @@ TAU_LIMIT = 50
 STUCK_ACCEPTANCE = 0.25
 """A walker is stuck that accepts less than this share of what the median walker accepts ..."""
 STUCK_DEVIATION = 8.0
-"""... or whose mean log density lies this many median absolute deviations off."""
+"""... or whose mean log density lies this many median absolute deviations, and a standard deviation of a single draw,
+off the others': the means of long chains spread so little that one rare excursion would fail the first alone."""
 FIRST_CHECK = 300
 GROWTH = 1.3
 """Steps at the first look at convergence, and growth of the chain from one look to the next."""
@@ -625,7 +626,7 @@ def _stored(path: Path, fit: JointFit, seed: int) -> tuple[Transport, Pilot, Cha
     position, has_gauss, gauss = stored["random_rest"]
     random_state = (str(stored["random_kind"]), stored["random_keys"], int(position), int(has_gauss), float(gauss))
     route = Transport(*(stored[f"transport_{k}"] for k in ("mode", "free", "root", "narrow", "bend", "stretch")))
-    proposal = Independence(stored["proposal_mean"], stored["proposal_sd"])
+    proposal = Independence(stored["proposal_mean"], stored["proposal_sd"], route.heavy)
     chain = Chain(
         stored["w"],
         stored["log_density"],
@@ -672,7 +673,8 @@ def diagnose(fit: JointFit, route: Transport, start: Pilot, chain: Chain, seed: 
     means = chain.log_density[discarded:].mean(axis=0)
     deviation = np.abs(means - np.median(means))
     stuck = acceptance < STUCK_ACCEPTANCE * np.median(acceptance)
-    stuck |= deviation > STUCK_DEVIATION * max(float(np.median(deviation)), 1e-12)
+    single_draw = float(np.median(chain.log_density[discarded:].std(axis=0)))
+    stuck |= deviation > max(STUCK_DEVIATION * float(np.median(deviation)), single_draw)
     missing = []
     if not np.max(rhat) <= RHAT_LIMIT:
         missing.append(f"R-hat of {names[int(np.nanargmax(rhat))]} is {np.max(rhat):.3f}, wanted {RHAT_LIMIT}")
