@@ -16,8 +16,7 @@ from small_campaign import small_campaign
 
 from tvsbayes.campaign import parse_header, parse_moves, parse_spots, read_campaign, write_campaign
 from tvsbayes.files import InputError, parse_toml
-from tvsbayes.rigs import parse_rig_table
-from tvsbayes.stereo import parse_stereo
+from tvsbayes.rigs import parse_rig_table, parse_stereo
 
 FILES = ("campaign.toml", "stereo.json", "moves.csv", "spots.csv")
 Edit = Callable[[bytes], bytes]

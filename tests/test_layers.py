@@ -12,9 +12,9 @@ import pytest
 PACKAGE = Path(__file__).resolve().parents[1] / "tvsbayes"
 LEVELS: tuple[tuple[str, ...], ...] = (
     ("files",),
-    ("stereo",),
     ("rigs",),
     ("campaign",),
+    ("calibration",),
     ("model", "classic", "simulation"),
     ("protocols",),
     ("likelihood", "solver"),
@@ -22,18 +22,21 @@ LEVELS: tuple[tuple[str, ...], ...] = (
     ("joint",),
     ("ensemble",),
     ("posterior",),
-    ("information", "report"),
+    ("propagation", "information"),
+    ("coordinates",),
+    ("accuracy",),
+    ("report",),
     ("cli",),
 )
 """From bottom to top: a module imports only modules of lower levels."""
 WITHOUT_JAX = (
-    *("files", "stereo", "rigs", "campaign", "classic", "simulation", "protocols"),
+    *("files", "rigs", "campaign", "calibration", "classic", "simulation", "protocols"),
     "report",
 )
 MODEL = {
     *("model", "likelihood", "stops", "solver", "joint"),
     *("ensemble", "posterior"),
-    *("information", "classic"),
+    *("information", "classic", "calibration", "propagation", "coordinates", "accuracy"),
 }
 JAX_FAMILY = {"jax", "jaxlib", "equinox", "optimistix", "lineax", "jaxtyping"}
 MODULES_MAX = 20

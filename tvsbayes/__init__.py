@@ -2,30 +2,32 @@
 
 from __future__ import annotations
 
+from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from tvsbayes.accuracy import calibration_of as calibration_of
+    from tvsbayes.calibration import load_calibration as load_calibration
     from tvsbayes.campaign import read_campaign as read_campaign
+    from tvsbayes.coordinates import locate as locate
     from tvsbayes.joint import fit as fit
     from tvsbayes.posterior import sample as sample
 
-__all__ = ["fit", "read_campaign", "sample"]
+_HOME = {
+    "calibration_of": "accuracy",
+    "fit": "joint",
+    "load_calibration": "calibration",
+    "locate": "coordinates",
+    "read_campaign": "campaign",
+    "sample": "posterior",
+}
+__all__ = list(_HOME)
 
 
 def __getattr__(name: str) -> object:
     """Load what is asked for when it is first asked for: readers bring NumPy, the estimator brings JAX."""
-    if name == "read_campaign":
-        from tvsbayes.campaign import read_campaign
-
-        return read_campaign
-    if name == "fit":
-        from tvsbayes.joint import fit
-
-        return fit
-    if name == "sample":
-        from tvsbayes.posterior import sample
-
-        return sample
+    if name in _HOME:
+        return getattr(import_module(f"tvsbayes.{_HOME[name]}"), name)
     if name == "__version__":
         from importlib.metadata import version
 

@@ -29,8 +29,7 @@ from tvsbayes.files import (
     toml_line,
     write_atomically,
 )
-from tvsbayes.rigs import RigTable, Stereo, parse_rig_table, rig_table_toml
-from tvsbayes.stereo import parse_stereo, stereo_bytes
+from tvsbayes.rigs import RigTable, Stereo, parse_rig_table, parse_stereo, rig_table_toml, stereo_bytes
 
 APPROACH_SIGN = {"left": 1, "up": 1, "right": -1, "down": -1, "unknown": 0}
 """Sense of motion of an approach (DESIGN 2)."""

@@ -7,6 +7,7 @@ Heavy modules are imported inside the commands that need them; `tvsbayes --help`
 from __future__ import annotations
 
 import json
+import math
 import os
 import sys
 from collections.abc import Callable, Iterator
@@ -17,17 +18,21 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from tvsbayes.files import (
+    CSV_BYTES_MAX,
     InputError,
     NotConverged,
     NothingToEstimate,
     TvsError,
     escaped,
     make_folder,
+    parse_table,
+    read_bytes,
     shipped_data,
     write_atomically,
 )
 
 if TYPE_CHECKING:
+    from tvsbayes.calibration import Calibration
     from tvsbayes.information import FitSummary
     from tvsbayes.posterior import Progress
 
@@ -128,6 +133,7 @@ def demo(
         make_folder(folder, empty=True)
         shutil.copytree(source, folder, dirs_exist_ok=True)
         report_line("paper twin: 96 four-point experiments of a simulated rig with known truth; fitting ...")
+        from tvsbayes.accuracy import calibration_of
         from tvsbayes.campaign import read_campaign
         from tvsbayes.classic import classic as estimate_classic
         from tvsbayes.information import summarise
@@ -143,7 +149,8 @@ def demo(
         result = fit_joint(campaign)
         summary = summarise(result)
         if out is not None:
-            write_results(result, summary, folder / "results", seed=0)
+            calibration = calibration_of(result) if result.converged else None
+            write_results(result, summary, folder / "results", 0, calibration)
     pose = (summary.reference_pose_deg["pan"], summary.reference_pose_deg["tilt"])
     truth = {
         **effective_deg_per_step(true, pose),
@@ -251,6 +258,7 @@ def fit(
     if resume and no_sample:
         raise InputError("usage", "--resume continues a chain and --no-sample makes none", remedy="give one of them")
     data = read_campaign(campaign)
+    from tvsbayes.accuracy import DRAWS_KEPT, calibration_of
     from tvsbayes.information import summarise
     from tvsbayes.joint import fit as fit_joint
     from tvsbayes.report import fit_text, write_results
@@ -281,9 +289,176 @@ def fit(
             write_posterior(posterior, folder / "posterior.nc")
             more = {"posterior": str(folder / "posterior.nc")}
         more["chain"] = str(folder / "chain.npz")
-    files = {**write_results(result, summary, folder, seed, posterior), **more}
+    calibration = calibration_of(result, posterior, seed=seed) if result.converged else None
+    draws = posterior.thinned(DRAWS_KEPT) if summary.estimator == "posterior" else None
+    files = {**write_results(result, summary, folder, seed, calibration, draws), **more}
     document = {**summary.as_json(), "seed": seed, "files": files}
     _finish(document, f"{fit_text(summary)}\nwritten: {', '.join(files.values())}", as_json, _unusable(summary))
+
+
+def _calibration(folder: Path) -> Calibration:
+    """The calibration in `results/` where its hashes agree with the campaign; else fit first (DESIGN 8)."""
+    from tvsbayes.calibration import stored_calibration
+    from tvsbayes.campaign import read_campaign
+
+    campaign = read_campaign(folder)
+    found = stored_calibration(campaign)
+    if found is not None:
+        return found
+    report_line("results/ are missing or older than the campaign: fitting first (Laplace approximation) ...")
+    from tvsbayes.accuracy import calibration_of
+    from tvsbayes.joint import fit as fit_joint
+
+    result = fit_joint(campaign)
+    if not result.converged:
+        raise NotConverged(
+            "not-converged",
+            "NOT CONVERGED: " + "; ".join(result.problems),
+            remedy="see `tvsbayes fit`; coordinates need a fit that has converged",
+        )
+    return calibration_of(result)
+
+
+POINT_COLUMNS = ("pan_steps", "tilt_steps", "pan_approach", "tilt_approach", "aperture_deg")
+STEPS_MAX, ANGLE_MAX_DEG = 1e8, 360.0
+
+
+def _read_points(path: Path) -> tuple[list[float], list[float], list[float], list[tuple[str, str]]]:
+    """Counters, readings and approaches of a CSV of points."""
+    from tvsbayes.calibration import SIDES
+
+    table = parse_table(read_bytes(path, CSV_BYTES_MAX), escaped(path.name), POINT_COLUMNS)
+    if not len(table):
+        raise InputError("empty", f"{escaped(path.name)}: no points", file=escaped(path.name), remedy="add rows")
+    for axis in ("pan", "tilt"):
+        allowed = (*SIDES[axis][::-1], "unknown")
+        for row, word in enumerate(table.columns[f"{axis}_approach"]):
+            if word not in allowed:
+                remedy = "name the direction of the last move of the axis"
+                raise table.refuse(row, f"{axis}_approach", "approach", ", ".join(allowed), remedy)
+    counters = [table.numbers(name, -STEPS_MAX, STEPS_MAX) for name in ("pan_steps", "tilt_steps")]
+    readings = table.numbers("aperture_deg", -ANGLE_MAX_DEG, ANGLE_MAX_DEG)
+    pairs = list(zip(table.columns["pan_approach"], table.columns["tilt_approach"], strict=True))
+    return *counters, readings, pairs
+
+
+def _finite(**values: float | None) -> None:
+    """Refuse NaN and infinity, which option parsing lets through."""
+    for name, value in values.items():
+        if value is not None and not math.isfinite(value):
+            option = "--" + name.replace("_", "-")
+            raise InputError("number", f"{option} is {value}", column=option, allowed="a finite number")
+
+
+@app.command()
+def locate(
+    campaign: CampaignFolder,
+    pan_steps: Annotated[float | None, typer.Option("--pan-steps", help="Absolute counter.")] = None,
+    tilt_steps: Annotated[float | None, typer.Option("--tilt-steps", help="Absolute counter.")] = None,
+    pan_approach: Annotated[str, typer.Option("--pan-approach", help="left, right or unknown.")] = "left",
+    tilt_approach: Annotated[str, typer.Option("--tilt-approach", help="up, down or unknown.")] = "up",
+    aperture_deg: Annotated[float | None, typer.Option("--aperture-deg", help="Reading B of the aperture.")] = None,
+    points: Annotated[Path | None, typer.Option("--points", help="CSV of points with these five columns.")] = None,
+    draws: Annotated[int, typer.Option("--draws", min=500, max=100_000, help="Draws per point.")] = 1000,
+    budget: Annotated[
+        bool, typer.Option("--budget", help="Also what the uncertainty of the point consists of.")
+    ] = False,
+    seed: Seed = 0,
+    as_json: Json = False,
+) -> None:
+    """Where the scanner points, in millimetres of frame T, with covariance and 95 % half widths."""
+    single = (pan_steps, tilt_steps, aperture_deg)
+    if (points is None) == any(value is None for value in single):
+        remedy = "give --pan-steps, --tilt-steps and --aperture-deg, or --points FILE.csv"
+        raise InputError("usage", "locate needs one point or a file of points", remedy=remedy)
+    if budget and points is not None:
+        raise InputError("usage", "--budget is for one point", remedy="leave out --points")
+    _finite(pan_steps=pan_steps, tilt_steps=tilt_steps, aperture_deg=aperture_deg)
+    where = (*single, (pan_approach, tilt_approach)) if points is None else _read_points(points)
+    from tvsbayes.calibration import sides_of
+
+    if points is None:
+        sides_of((pan_approach, tilt_approach))
+    calibration = _calibration(campaign)
+    from tvsbayes.coordinates import locate as locate_points
+    from tvsbayes.report import locations_text
+    from tvsbayes.solver import use_compilation_cache
+
+    use_compilation_cache()
+    found = locate_points(calibration, *where, draws=draws, seed=seed)
+    if points is not None:
+        entries = [found.as_json(k) for k in range(len(found.refused))]
+        document = {"estimator": found.estimator, "draws": found.draws, "points": entries}
+        _finish(document, locations_text(found), as_json)
+        return
+    if found.refused[0] is not None:
+        raise found.refused[0]
+    document = {"estimator": found.estimator, "draws": found.draws, **found.as_json(0)}
+    text = locations_text(found)
+    if budget:
+        from tvsbayes.accuracy import budget as point_budget
+        from tvsbayes.coordinates import settings_of
+        from tvsbayes.report import budget_text
+
+        parts = point_budget(calibration, settings_of(*where))
+        document["budget"] = parts.as_json()
+        text += f"\n\n{budget_text(parts)}"
+    _finish(document, text, as_json)
+
+
+@app.command("steps-for")
+def steps_for(
+    campaign: CampaignFolder,
+    x_mm: Annotated[float | None, typer.Option("--x-mm", help="Wanted point, frame T.")] = None,
+    y_mm: Annotated[float | None, typer.Option("--y-mm")] = None,
+    z_mm: Annotated[float | None, typer.Option("--z-mm")] = None,
+    azimuth_deg: Annotated[float | None, typer.Option("--azimuth-deg", help="Wanted direction: C - 90 deg.")] = None,
+    elevation_deg: Annotated[float | None, typer.Option("--elevation-deg")] = None,
+    pan_approach: Annotated[str | None, typer.Option("--pan-approach", help="left or right (default: left).")] = None,
+    tilt_approach: Annotated[str | None, typer.Option("--tilt-approach", help="up or down (default: up).")] = None,
+    rig: Annotated[Path | None, typer.Option("--rig", help="Rig file whose [positioner] limits are kept.")] = None,
+    export: Annotated[str | None, typer.Option("--export", help="header or json: the calibration itself.")] = None,
+    as_json: Json = False,
+) -> None:
+    """Counters that send the beam to a point or along a direction, and the approach that removes backlash."""
+    _finite(x_mm=x_mm, y_mm=y_mm, z_mm=z_mm, azimuth_deg=azimuth_deg, elevation_deg=elevation_deg)
+    point = None if None in (x_mm, y_mm, z_mm) else (x_mm, y_mm, z_mm)
+    direction = None if None in (azimuth_deg, elevation_deg) else (azimuth_deg, elevation_deg)
+    given = sum(value is not None for value in (x_mm, y_mm, z_mm, azimuth_deg, elevation_deg))
+    if export not in (None, "header", "json"):
+        raise InputError("usage", f"--export {escaped(export)}", allowed="header, json", remedy="name one of them")
+    if given != (0 if export else 3 if point else 2 if direction else -1):
+        remedy = "give --x-mm --y-mm --z-mm, or --azimuth-deg --elevation-deg, or --export alone"
+        raise InputError("usage", "steps-for needs one target", remedy=remedy)
+    limits = None if rig is None else _limits(rig)
+    calibration = _calibration(campaign)
+    from tvsbayes.calibration import calibration_header, calibration_json
+
+    if export:
+        document = calibration_json(calibration)
+        text = calibration_header(calibration) if export == "header" else json.dumps(document, indent=1)
+        _finish({"header": text} if as_json and export == "header" else document, text.rstrip("\n"), as_json)
+        return
+    from tvsbayes.report import steps_text
+
+    azimuth, elevation = direction or (None, None)
+    sides = None if pan_approach is tilt_approach is None else (pan_approach or "left", tilt_approach or "up")
+    found = calibration.steps_for(point, azimuth_deg=azimuth, elevation_deg=elevation, approach=sides, limits=limits)
+    if not calibration.covers(found.pan_steps, found.tilt_steps):
+        report_line("warning: these counters lie outside those of the campaign: the calibration extrapolates")
+    document = {"estimator": calibration.estimator, **found.as_json()}
+    _finish(document, steps_text(found), as_json)
+
+
+def _limits(path: Path) -> dict[str, tuple[float, float]]:
+    """Counter limits by axis from [positioner] of a rig file."""
+    from tvsbayes.rigs import read_rig
+
+    stated = read_rig(path).positioner
+    return {
+        axis: (stated.get(f"{axis}_min_steps", -math.inf), stated.get(f"{axis}_max_steps", math.inf))
+        for axis in ("pan", "tilt")
+    }
 
 
 @contextmanager

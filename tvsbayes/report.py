@@ -19,18 +19,18 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from tvsbayes.calibration import Calibration, Steps, calibration_bytes
 from tvsbayes.campaign import input_hashes
 from tvsbayes.classic import DIRECTIONS, ClassicResult
 from tvsbayes.files import make_folder, write_atomically
 
 if TYPE_CHECKING:
+    from tvsbayes.accuracy import Budget
+    from tvsbayes.coordinates import Locations
     from tvsbayes.information import Estimate, FitSummary
     from tvsbayes.joint import Derived, JointFit
-    from tvsbayes.posterior import Posterior
 
 FIT_FORMAT = "tvsbayes-fit/1"
-DRAWS_KEPT = 4096
-"""Posterior draws in draws.npz, evenly chosen; posterior.nc holds them all."""
 KEY_PARAMETERS = (
     ("backlash_deg.pan", "backlash pan", "deg"),
     ("backlash_deg.tilt", "backlash tilt", "deg"),
@@ -206,11 +206,22 @@ def fit_document(fit: JointFit, summary: FitSummary, seed: int, draws: Derived) 
 
 
 def write_results(
-    fit: JointFit, summary: FitSummary, folder: Path, seed: int, posterior: Posterior | None = None
+    fit: JointFit,
+    summary: FitSummary,
+    folder: Path,
+    seed: int,
+    calibration: Calibration | None = None,
+    draws: Derived | None = None,
 ) -> dict[str, str]:
     """Write `fit.json` and `draws.npz`, each whole or not at all.
 
-    The draws are the posterior's where a converged one is given, else the Laplace approximation's.
+    Args:
+        fit: the fit.
+        summary: what is said of it.
+        folder: is made where it does not exist.
+        seed: of everything random.
+        calibration: what `locate` and `steps-for` read back; None for a fit that must not be used.
+        draws: behind the summary, one leading axis; None for the Laplace approximation's.
 
     Returns:
         Paths by "fit" and "draws".
@@ -218,21 +229,76 @@ def write_results(
     Raises:
         InputError: the folder cannot be written.
     """
-    buffer = io.BytesIO()
-    draws = fit.draws
-    if posterior is not None and summary.estimator == "posterior":
-        draws = posterior.thinned(DRAWS_KEPT)
-    np.savez_compressed(
-        buffer,
-        names=np.array(fit.names),
-        estimator=summary.estimator,
-        physical=draws.physical,
-        effective_deg_per_step=draws.effective_deg_per_step,
-        reference_pose_rad=fit.reference_pose_rad,
-    )
+    draws = fit.draws if draws is None else draws
+    arrays = {
+        "names": np.array(fit.names),
+        "estimator": np.array(summary.estimator),
+        "physical": draws.physical,
+        "effective_deg_per_step": draws.effective_deg_per_step,
+        "reference_pose_rad": fit.reference_pose_rad,
+    }
+    if calibration is None:
+        buffer = io.BytesIO()
+        np.savez_compressed(buffer, **arrays)
+        content = buffer.getvalue()
+    else:
+        del arrays["estimator"]
+        content = calibration_bytes(calibration, **arrays)
     document = json.dumps(fit_document(fit, summary, seed, draws), indent=1, allow_nan=False)
-    contents = {"draws": ("draws.npz", buffer.getvalue()), "fit": ("fit.json", document.encode())}
+    contents = {"draws": ("draws.npz", content), "fit": ("fit.json", document.encode())}
     make_folder(folder)
     for name, data in contents.values():
         write_atomically(folder / name, data)
     return {key: str(folder / name) for key, (name, _) in contents.items()}
+
+
+def locations_text(found: Locations) -> str:
+    """Points with their uncertainty."""
+    rows = []
+    for index, error in enumerate(found.refused):
+        if error is not None:
+            rows.append([str(index), f"refused: {error.code}", "", "", "", ""])
+            continue
+        sd = np.sqrt(np.diag(found.covariance_mm2[index]))
+        cells = [concise(float(x), float(u)) for x, u in zip(found.xyz_mm[index], sd, strict=True)]
+        half = " ".join(f"{u:.2g}" for u in found.u95_mm[index])
+        law = found.validation
+        verdict = "validated" if law.validated[index].all() else "not validated"
+        rows.append([str(index), *cells, half, f"{verdict} at {law.digits} digits"])
+    columns = ["point", "x(u) mm", "y(u) mm", "z(u) mm", "U95 mm", "linear propagation"]
+    return text_table(f"frame T, {found.draws} draws ({found.estimator})", columns, rows)
+
+
+def budget_text(budget: Budget) -> str:
+    """Uncertainty budget of a point: causes by share, then the parameters that contribute most."""
+    order = np.argsort(-budget.share)
+    rows = []
+    for k in order[budget.share[order] >= 0.0005]:
+        parts = [f"{np.sqrt(v):.3g}" for v in budget.variance_mm2[k]]
+        rows.append([budget.causes[k], f"{100 * budget.share[k]:.1f}", *parts])
+    causes = text_table("uncertainty by cause", ["cause", "share %", "u(x) mm", "u(y) mm", "u(z) mm"], rows)
+    size = np.linalg.norm(budget.contribution_mm, axis=1)
+    rows = [
+        [budget.parameters[k], *(f"{v:+.3g}" for v in budget.contribution_mm[k])]
+        for k in np.argsort(-size)[:10]
+        if size[k] > 0
+    ]
+    title = "by parameter, one standard uncertainty each (correlated: they do not add up)"
+    return f"{causes}\n\n{text_table(title, ['parameter', 'x mm', 'y mm', 'z mm'], rows)}"
+
+
+def steps_text(steps: Steps) -> str:
+    """Counters, the way there, and what remains."""
+    pan, tilt = steps.approach
+    lines = [
+        f"go to      pan {steps.via_pan_steps}, tilt {steps.via_tilt_steps} steps (takes up the backlash)",
+        f"then to    pan {steps.pan_steps}, tilt {steps.tilt_steps} steps, moving {pan} and {tilt}",
+    ]
+    if steps.xyz_mm is not None:
+        half = ", ".join(f"{u:.2g}" for u in steps.u95_mm)
+        lines.append(f"whole steps leave {steps.rounding_mm:.3g} mm; beam there +- ({half}) mm (95 %)")
+        lines.append(f"the aperture should read {steps.aperture_deg:.3f} deg")
+    else:
+        half = ", ".join(f"{u:.2g}" for u in steps.u95_deg)
+        lines.append(f"whole steps leave {steps.rounding_deg:.3g} deg; azimuth and elevation +- ({half}) deg (95 %)")
+    return "\n".join(lines)

@@ -1,46 +1,260 @@
-"""The instrument as declared: parameter names and priors, the `[rig]` table, rig files.
+"""The instrument as declared: parameter names and priors, rig files, and the stereo pair with its calibration.
 
-Frames and units: DESIGN section 2. mm, degrees where a name says `_deg`, radians where it says `_rad`,
-image px with the integer at the centre of a pixel. No JAX.
+Frames and units: DESIGN section 2. mm, degrees where a name says `_deg`, radians where it says `_rad`, image px with
+the integer at the centre of a pixel. Stereo in OpenCV's conventions: camera axes x right, y down, z along the view;
+x_right = R x_left + T; Rodrigues vectors (DESIGN 3.3 and 7). No JAX.
 """
 
 from __future__ import annotations
 
+import json
+import math
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path, PureWindowsPath
 from typing import Literal
 
-from tvsbayes.files import TOML_BYTES_MAX, InputError, Keys, closest, escaped, parse_toml, read_bytes, toml_line
-from tvsbayes.stereo import (
-    STEREO_PARAMETER_NAMES,
-    Stereo,
-    read_stereo,
-    rotation_matrix,
-    rotation_vector,
-    write_stereo,
+import numpy as np
+
+from tvsbayes.files import (
+    JSON_BYTES_MAX,
+    TOML_BYTES_MAX,
+    InputError,
+    Keys,
+    closest,
+    escaped,
+    parse_json,
+    parse_toml,
+    read_bytes,
+    shown,
+    toml_line,
+    write_atomically,
 )
 
-__all__ = [
-    "DECLARED_PRIORS",
-    "DEFAULT_PRIORS",
-    "HARMONIC_PRIORS",
-    "HOME_SD_DEG",
-    "RIG_PRIORS",
-    "STEREO_PARAMETER_NAMES",
-    "Distribution",
-    "Prior",
-    "Rig",
-    "RigTable",
-    "Stereo",
-    "parse_rig_table",
-    "read_rig",
-    "read_stereo",
-    "rig_table_toml",
-    "rotation_matrix",
-    "rotation_vector",
-    "write_stereo",
-]
+STEREO_PARAMETER_NAMES: tuple[str, ...] = (
+    *(f"stereo.left.{p}" for p in ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")),
+    *(f"stereo.right.{p}" for p in ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")),
+    *(f"stereo.rotation_rad.{a}" for a in "xyz"),
+    *(f"stereo.translation_mm.{a}" for a in "xyz"),
+)
+"""The 24 stereo parameters in the order of `parameter_covariance` (DESIGN 7)."""
+
+
+@dataclass(frozen=True)
+class Stereo:
+    """A stereo calibration in OpenCV's convention: x_right = R x_left + T (DESIGN 3.3 and 7).
+
+    `D1`, `D2` are k1 k2 p1 p2 k3. `parameter_covariance` orders the 24 parameters as
+    `STEREO_PARAMETER_NAMES` (rotation as Rodrigues vector, rad; translation in mm).
+    """
+
+    image_width: int
+    image_height: int
+    M1: np.ndarray
+    D1: np.ndarray
+    M2: np.ndarray
+    D2: np.ndarray
+    R: np.ndarray
+    T: np.ndarray
+    parameter_covariance: np.ndarray
+    rms_px: float
+    assumed: bool = False
+
+    @property
+    def vector(self) -> np.ndarray:
+        """The 24 parameters, shape (24,), in the order of `STEREO_PARAMETER_NAMES`."""
+        cameras = [(*M[[0, 1, 0, 1], [0, 1, 2, 2]], *D) for M, D in ((self.M1, self.D1), (self.M2, self.D2))]
+        return np.array([*cameras[0], *cameras[1], *rotation_vector(self.R), *self.T])
+
+    def with_vector(self, vector: np.ndarray) -> Stereo:
+        """The same rig with other parameters; image size and covariance stay.
+
+        Args:
+            vector: shape (24,), in the order of `STEREO_PARAMETER_NAMES`.
+        """
+        vector = np.asarray(vector, dtype=float)
+
+        def matrix(fx: float, fy: float, cx: float, cy: float) -> np.ndarray:
+            return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+
+        return replace(
+            self,
+            M1=matrix(*vector[0:4]),
+            D1=vector[4:9].copy(),
+            M2=matrix(*vector[9:13]),
+            D2=vector[13:18].copy(),
+            R=rotation_matrix(vector[18:21]),
+            T=vector[21:24].copy(),
+        )
+
+
+def rotation_matrix(rotation_vector_rad: np.ndarray) -> np.ndarray:
+    """Rodrigues' formula, smooth through zero. `rotation_vector_rad` (3,) -> (3, 3)."""
+    x, y, z = rotation_vector_rad
+    angle = math.sqrt(x * x + y * y + z * z)
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    # np.sinc(t / pi) = sin(t) / t, finite at 0; (1 - cos t) / t^2 = sinc(t / 2)^2 / 2.
+    first, second = np.sinc(angle / np.pi), 0.5 * np.sinc(angle / (2 * np.pi)) ** 2
+    return np.eye(3) + first * cross + second * cross @ cross
+
+
+def rotation_vector(matrix: np.ndarray) -> np.ndarray:
+    """The Rodrigues vector, rad, shape (3,), norm at most pi, of the rotation nearest to `matrix` (3, 3).
+
+    Through the unit quaternion's largest component, so it is accurate at 0 and at pi alike.
+    """
+    u, _, vt = np.linalg.svd(np.asarray(matrix, dtype=float))
+    r = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+    # Rows of 4 q q^T (w, x, y, z): the one with the largest diagonal is far from cancellation.
+    products = np.array(
+        [
+            [1 + r[0, 0] + r[1, 1] + r[2, 2], r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]],
+            [r[2, 1] - r[1, 2], 1 + r[0, 0] - r[1, 1] - r[2, 2], r[0, 1] + r[1, 0], r[0, 2] + r[2, 0]],
+            [r[0, 2] - r[2, 0], r[0, 1] + r[1, 0], 1 - r[0, 0] + r[1, 1] - r[2, 2], r[1, 2] + r[2, 1]],
+            [r[1, 0] - r[0, 1], r[0, 2] + r[2, 0], r[1, 2] + r[2, 1], 1 - r[0, 0] - r[1, 1] + r[2, 2]],
+        ]
+    )
+    q = products[np.argmax(np.diag(products))]
+    q = q / np.linalg.norm(q) * (1.0 if q[0] >= 0 else -1.0)
+    length = float(np.linalg.norm(q[1:]))
+    return 2.0 * q[1:] if length < 1e-12 else q[1:] * (2.0 * math.atan2(length, q[0]) / length)
+
+
+_STEREO_KEYS = (
+    *("format", "image_width", "image_height", "M1", "D1", "M2", "D2", "R", "T"),
+    *("parameter_covariance", "rms_px", "assumed"),
+)
+_ENTRY_MAX = 1e12
+_ROTATION_TOLERANCE = 1e-6
+_EIGENVALUE_TOLERANCE = 1e-8
+
+
+def _array(keys: Keys, key: str, *shapes: tuple[int, ...]) -> np.ndarray:
+    """The finite numbers under `key`, in one of `shapes`, returned in the first of them."""
+    wanted = " or ".join("x".join(map(str, shape)) for shape in shapes)
+    allowed = f"finite numbers in a list of {wanted}"
+    value = keys.values.get(key)
+    rows = value if isinstance(value, list) else [None]
+    nested = bool(rows) and all(isinstance(row, list) for row in rows)
+    entries = [entry for row in rows for entry in row] if nested else rows
+    for entry in entries:
+        if isinstance(entry, bool) or not isinstance(entry, int | float) or not abs(entry) <= _ENTRY_MAX:
+            found = shown(entry) if isinstance(value, list) else None
+            raise keys.refuse(key, "matrix", allowed, "one list per row, every entry a number", found)
+    lengths = {len(row) for row in rows} if nested else {0}
+    shape = (len(rows), *lengths) if nested else (len(rows),)
+    if len(lengths) != 1 or shape not in shapes:
+        found = "rows of different lengths" if len(lengths) != 1 else "x".join(map(str, shape))
+        raise keys.refuse(key, "shape", allowed, "write OpenCV's matrix, one list per row", found)
+    return np.array(entries, dtype=float).reshape(shapes[0])
+
+
+def _camera_matrix(keys: Keys, key: str) -> np.ndarray:
+    matrix = _array(keys, key, (3, 3))
+    pattern_holds = np.array_equal(matrix[[0, 1, 2, 2, 2], [1, 0, 0, 1, 2]], [0, 0, 0, 0, 1])
+    if not (pattern_holds and matrix[0, 0] > 0 and matrix[1, 1] > 0):
+        allowed = "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]] with fx, fy > 0, px"
+        found = escaped(json.dumps(matrix.tolist()), 120)
+        raise keys.refuse(key, "camera-matrix", allowed, "give OpenCV's camera matrix without skew", found)
+    return matrix
+
+
+def _check_covariance(keys: Keys, key: str, covariance: np.ndarray) -> None:
+    """Symmetric and positive semi-definite after scaling each row by its standard deviation."""
+    allowed = "a symmetric positive semi-definite 24x24 matrix; a zero row fixes a parameter"
+
+    def bad(found: str) -> InputError:
+        return keys.refuse(key, "covariance", allowed, "take it from the calibration of M, D, R, T", found)
+
+    variances = np.diag(covariance)
+    if (variances < 0).any():
+        name = STEREO_PARAMETER_NAMES[int(np.argmin(variances))]
+        raise bad(f"the negative variance {variances.min():.6g} of {name}")
+    free = variances > 0
+    if covariance[~free].any() or covariance[:, ~free].any():
+        raise bad("a covariance with a parameter of variance 0")
+    sds = np.sqrt(variances[free])
+    with np.errstate(over="ignore"):
+        correlation = covariance[np.ix_(free, free)] / sds[:, None] / sds[None, :]
+    if not (np.abs(correlation) <= 1 + 1e-6).all():
+        raise bad(f"a correlation of {np.abs(correlation).max():.6g}")
+    if not (np.abs(correlation - correlation.T) <= 1e-9).all():
+        raise bad("a matrix that is not symmetric")
+    smallest = float(np.linalg.eigvalsh(correlation).min()) if free.any() else 0.0
+    if smallest < -_EIGENVALUE_TOLERANCE:
+        raise bad(f"a smallest eigenvalue of {smallest:.3g} of the correlation matrix")
+
+
+def parse_stereo(data: bytes, file: str) -> Stereo:
+    """A checked stereo calibration from the bytes of `stereo.json`; see `read_stereo`."""
+    keys = parse_json(data, file)
+    keys.word("format", ("tvsbayes-stereo/1",))
+    keys.only(_STEREO_KEYS)
+    width, height = keys.integer("image_width", 1, 65_535), keys.integer("image_height", 1, 65_535)
+    rotation = _array(keys, "R", (3, 3))
+    deviation = max(np.abs(rotation @ rotation.T - np.eye(3)).max(), abs(np.linalg.det(rotation) - 1.0))
+    if deviation > _ROTATION_TOLERANCE:
+        allowed = f"R R^T = 1 and det R = +1 to {_ROTATION_TOLERANCE:g}"
+        found = f"a matrix that misses it by {deviation:.3g}"
+        raise keys.refuse("R", "rotation", allowed, "give R of x_right = R x_left + T, all digits", found)
+    translation = _array(keys, "T", (3,), (3, 1))
+    if not 0 < np.linalg.norm(translation) <= 1e5:
+        allowed = "a translation longer than 0 and at most 100000 mm"
+        raise keys.refuse("T", "translation", allowed, "give T in mm", escaped(str(translation.tolist())))
+    covariance = _array(keys, "parameter_covariance", (24, 24))
+    _check_covariance(keys, "parameter_covariance", covariance)
+    return Stereo(
+        image_width=width,
+        image_height=height,
+        M1=_camera_matrix(keys, "M1"),
+        D1=_array(keys, "D1", (5,), (1, 5), (5, 1)),
+        M2=_camera_matrix(keys, "M2"),
+        D2=_array(keys, "D2", (5,), (1, 5), (5, 1)),
+        R=rotation,
+        T=translation,
+        parameter_covariance=covariance,
+        rms_px=keys.number("rms_px", 0.0, 1e4),
+        assumed="assumed" in keys and keys.flag("assumed"),
+    )
+
+
+def read_stereo(path: Path, folder: Path | None = None) -> Stereo:
+    """Reads `stereo.json` (format tvsbayes-stereo/1, DESIGN 7).
+
+    Args:
+        path: the file.
+        folder: where given, the file must lie inside it after following links.
+
+    Raises:
+        InputError: unreadable, wrong shapes, no rotation, a covariance that is none, unknown keys.
+    """
+    return parse_stereo(read_bytes(path, JSON_BYTES_MAX, folder), escaped(Path(path).name))
+
+
+def stereo_bytes(stereo: Stereo) -> bytes:
+    """The content of `stereo.json`, one matrix row per line, every digit kept.
+
+    Raises:
+        InputError: `stereo` holds what `read_stereo` would refuse.
+    """
+    lines = []
+    for key in _STEREO_KEYS:
+        value = "tvsbayes-stereo/1" if key == "format" else getattr(stereo, key)
+        if isinstance(value, np.ndarray) and value.ndim == 2:
+            rows = ",\n  ".join(json.dumps(row) for row in value.tolist())
+            lines.append(f' "{key}": [\n  {rows}]')
+        else:
+            plain = value.tolist() if isinstance(value, np.ndarray | np.generic) else value
+            lines.append(f' "{key}": {json.dumps(plain)}')
+    data = ("{\n" + ",\n".join(lines) + "\n}\n").encode()
+    parse_stereo(data, "stereo.json")
+    return data
+
+
+def write_stereo(stereo: Stereo, path: Path) -> None:
+    """Writes `stereo.json` atomically; `read_stereo` gives back the same numbers."""
+    write_atomically(path, stereo_bytes(stereo))
+
 
 Distribution = Literal["normal", "half-normal", "log-normal"]
 

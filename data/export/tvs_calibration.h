@@ -1,0 +1,120 @@
+/* Laser positioner calibration, written by tvsbayes (steps-for --export header). C99, no allocation.
+ * @EXPECTED_ERROR@
+ * Frame T: origin mid-baseline, x depth, y along the baseline towards the positioner, z up; mm.
+ * Counters are absolute steps after homing; a side is +1 (reached left or up) or -1 (right or down).
+ * To arrive on a side, start TVS_OVERSHOOT_*_STEPS before the target on the other side of it.
+ */
+#ifndef TVS_CALIBRATION_H
+#define TVS_CALIBRATION_H
+
+#include <math.h>
+
+@VALUES@
+
+#define TVS_RAD 0.017453292519943295
+
+static double tvs_error_deg(double angle_deg, double period_deg, double c1, double s1, double c2, double s2)
+{
+    double phase = 360.0 * TVS_RAD * angle_deg / period_deg;
+    return c1 * cos(phase) + s1 * sin(phase) + c2 * cos(2 * phase) + s2 * sin(2 * phase);
+}
+
+static double tvs_output_deg(double steps, int side, double ratio, double backlash, double period_deg, double c1,
+                             double s1, double c2, double s2)
+{
+    double angle = ratio * steps;
+    if (period_deg > 0 && period_deg < 360.0)
+        angle += tvs_error_deg(angle, period_deg, c1, s1, c2, s2);
+    angle -= 0.5 * side * backlash;
+    if (period_deg >= 360.0)
+        angle += tvs_error_deg(angle, period_deg, c1, s1, c2, s2);
+    return angle;
+}
+
+/* Mirror angles in degrees. */
+static double tvs_pan_deg(double steps, int side)
+{
+    return tvs_output_deg(steps, side, TVS_DEGREES_PER_STEP_PAN, TVS_BACKLASH_DEG_PAN, TVS_PERIOD_PAN_DEG,
+                          TVS_HARMONIC_DEG_PAN_1_COS, TVS_HARMONIC_DEG_PAN_1_SIN, TVS_HARMONIC_DEG_PAN_2_COS,
+                          TVS_HARMONIC_DEG_PAN_2_SIN);
+}
+
+static double tvs_tilt_deg(double steps, int side)
+{
+    return TVS_TILT_ZERO_DEG + tvs_output_deg(steps, side, TVS_DEGREES_PER_STEP_TILT, TVS_BACKLASH_DEG_TILT,
+                                              TVS_PERIOD_TILT_DEG, TVS_HARMONIC_DEG_TILT_1_COS,
+                                              TVS_HARMONIC_DEG_TILT_1_SIN, TVS_HARMONIC_DEG_TILT_2_COS,
+                                              TVS_HARMONIC_DEG_TILT_2_SIN);
+}
+
+static void tvs_reflect(double p[3], double d[3], const double at[3], const double n[3])
+{
+    double along = d[0] * n[0] + d[1] * n[1] + d[2] * n[2];
+    double reach = ((at[0] - p[0]) * n[0] + (at[1] - p[1]) * n[1] + (at[2] - p[2]) * n[2]) / along;
+    for (int i = 0; i < 3; i++) {
+        p[i] += reach * d[i];
+        d[i] -= 2 * along * n[i];
+    }
+}
+
+static void tvs_turn(double v[3], double angle)
+{
+    double x = cos(angle) * v[0] - sin(angle) * v[1];
+    v[1] = sin(angle) * v[0] + cos(angle) * v[1];
+    v[0] = x;
+}
+
+/* The beam at counters that were reached from the given sides: origin in mm and unit direction, frame T. */
+static void tvs_beam(double pan_steps, double tilt_steps, int pan_side, int tilt_side, double origin[3],
+                     double direction[3])
+{
+    double psi = TVS_RAD * tvs_pan_deg(pan_steps, pan_side), beta = TVS_RAD * tvs_tilt_deg(tilt_steps, tilt_side);
+    double tx = tan(TVS_RAD * TVS_LASER_TILT_DEG_X), ty = tan(TVS_RAD * TVS_LASER_TILT_DEG_Y);
+    double length = sqrt(1 + tx * tx + ty * ty);
+    double m1 = TVS_RAD * (45 + TVS_MIRROR1_ERROR_DEG), m2 = TVS_RAD * (45 + TVS_MIRROR2_ERROR_DEG);
+    double skew = TVS_RAD * TVS_TILT_AXIS_SKEW_DEG;
+    double p[3] = {TVS_LASER_OFFSET_MM_X, TVS_LASER_OFFSET_MM_Y, 0}, d[3] = {tx / length, ty / length, -1 / length};
+    const double zero[3] = {0, 0, 0}, n1[3] = {0, -sin(m1), cos(m1)};
+    const double centre[3] = {TVS_TILT_AXIS_OFFSET_MM_X, -TVS_MIRROR_OFFSET_MM, TVS_TILT_AXIS_OFFSET_MM_Z};
+    const double n2[3] = {sin(m2) * cos(beta), cos(m2) * cos(skew) - sin(m2) * sin(beta) * sin(skew),
+                          cos(m2) * sin(skew) + sin(m2) * sin(beta) * cos(skew)};
+    double turn = psi + TVS_RAD * (TVS_PAN_ZERO_EMISSION_DEG - 90);
+    tvs_turn(p, -psi);
+    tvs_turn(d, -psi);
+    tvs_reflect(p, d, zero, n1);
+    tvs_reflect(p, d, centre, n2);
+    tvs_turn(p, turn);
+    tvs_turn(d, turn);
+    p[1] += 0.5 * TVS_BASELINE_MM;
+    for (int i = 0; i < 3; i++) {
+        origin[i] = p[i];
+        direction[i] = d[i];
+    }
+}
+
+/* The point where the beam meets what the aperture read, frame T, mm; returns 0 where they do not meet. */
+static int tvs_locate(double pan_steps, double tilt_steps, int pan_side, int tilt_side, double aperture_deg,
+                      double xyz[3])
+{
+    double o[3], d[3], reach;
+    double b = TVS_RAD * (aperture_deg - TVS_APERTURE_ZERO_DEG), sb = sin(b), cb = cos(b);
+    tvs_beam(pan_steps, tilt_steps, pan_side, tilt_side, o, d);
+    double y = o[1] + 0.5 * TVS_BASELINE_MM;
+    if (TVS_AZIMUTH_CONVENTION) {
+        reach = (y * sb - o[0] * cb) / (d[0] * cb - d[1] * sb);
+    } else {
+        double mx = y * d[2] - o[2] * d[1], my = o[2] * d[0] - o[0] * d[2], mz = o[0] * d[1] - y * d[0];
+        double inside = (mx * mx + mz * mz) * sb * sb - my * my * cb * cb;
+        if (inside < 0)
+            return 0;
+        reach = (y * y - cb * cb * (o[0] * o[0] + y * y + o[2] * o[2])) /
+                (cb * sqrt(inside) - (y * d[1] - cb * cb * (o[0] * d[0] + y * d[1] + o[2] * d[2])));
+    }
+    if (!(reach > 0) || isinf(reach))
+        return 0;
+    for (int i = 0; i < 3; i++)
+        xyz[i] = o[i] + reach * d[i];
+    return 1;
+}
+
+#endif

@@ -1,0 +1,765 @@
+"""A calibration to drive with: rays, coordinates and counters from stored draws, in NumPy alone (DESIGN 5 and 8).
+
+What a robot loads: no JAX, no fit, less than a millisecond a call. The optics are written out in components, so that
+the same lines serve one pose in Python floats and many parameter sets in arrays; `tests/test_calibration.py` holds
+them to the JAX model. Frame T: origin mid-baseline, x depth, y along the baseline towards the positioner at +a/2,
+z up. mm; degrees where a name says `_deg`; counters in steps, absolute, after homing.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+
+from tvsbayes.campaign import APPROACH_SIGN, Campaign, input_hashes
+from tvsbayes.files import InputError, closest, escaped, parse_json, read_bytes, shipped_data
+from tvsbayes.rigs import FULL_TURN_DEG, HARMONIC_PRIORS
+
+CALIBRATION_FORMAT = "tvsbayes-calibration/1"
+INPUT_NAMES: tuple[str, ...] = (
+    *("degrees_per_step.pan", "degrees_per_step.tilt", "backlash_deg.pan", "backlash_deg.tilt"),
+    *HARMONIC_PRIORS,
+    *("tilt_zero_deg", "mirror_offset_mm", "mirror1_error_deg", "mirror2_error_deg"),
+    *("laser_tilt_deg.x", "laser_tilt_deg.y", "laser_offset_mm.x", "laser_offset_mm.y"),
+    *("tilt_axis_skew_deg", "tilt_axis_offset_mm.x", "tilt_axis_offset_mm.z"),
+    *("baseline_mm", "pan_zero_emission_deg", "aperture_zero_deg"),
+)
+"""What a coordinate depends on. Contrasts do not enter: after homing a counter stands for its mean ratio."""
+NOISE_NAMES = (*(f"stop_sd_deg.{d}" for d in ("left", "right", "up", "down")), "aperture_sd_deg")
+AXES = ("pan", "tilt")
+SIDES = {"pan": ("right", "left"), "tilt": ("down", "up")}
+"""Approach sides of an axis, negative first."""
+NORMAL_95 = 1.959963984540054
+"""Two-sided 95 % quantile of the normal distribution."""
+CLEARED_PROBABILITY = 0.99
+"""With this probability an overshoot takes up all the play."""
+DIFFERENCE = 0.05
+"""Half width of the central differences in standard deviations: truncation and rounding both below 1e-5."""
+AIM_STEPS, AIM_RAD = 40, 1e-11
+RESULTS_BYTES_MAX = 64 * 1024 * 1024
+_TO_RAD = math.pi / 180
+
+
+@dataclass(frozen=True)
+class Ray:
+    """A beam in frame T: it leaves the positioner at `origin_mm` (3,) along the unit vector `direction` (3,)."""
+
+    origin_mm: np.ndarray
+    direction: np.ndarray
+
+
+@dataclass(frozen=True)
+class Located:
+    """A point of frame T by linear propagation: estimate (3,), covariance (3, 3) and 95 % half widths (3,)."""
+
+    xyz_mm: np.ndarray
+    covariance_mm2: np.ndarray
+    u95_mm: np.ndarray
+
+
+@dataclass(frozen=True)
+class Steps:
+    """Counters that send the beam where it is wanted.
+
+    Attributes:
+        pan_steps, tilt_steps: absolute counters.
+        approach: last move of each axis, (left or right, up or down).
+        via_pan_steps, via_tilt_steps: go there first: the move on from there takes up all play with a probability of
+            `CLEARED_PROBABILITY`.
+        ray: the beam at these counters.
+        xyz_mm: the point on it that is nearest to the wanted one, or None for a wanted direction.
+        aperture_deg: what the aperture should read there, or None.
+        rounding_mm, rounding_deg: distance from the wanted point or direction that whole steps leave.
+        u95_mm, u95_deg: 95 % half widths of the beam's position at the point (3,), or of its azimuth and elevation.
+    """
+
+    pan_steps: int
+    tilt_steps: int
+    approach: tuple[str, str]
+    via_pan_steps: int
+    via_tilt_steps: int
+    ray: Ray
+    xyz_mm: np.ndarray | None
+    aperture_deg: float | None
+    rounding_mm: float | None
+    rounding_deg: float | None
+    u95_mm: np.ndarray | None
+    u95_deg: np.ndarray | None
+
+    def as_json(self) -> dict[str, object]:
+        """The document of `steps-for`."""
+
+        def plain(value):
+            return value.tolist() if isinstance(value, np.ndarray) else value
+
+        document = {key: plain(value) for key, value in vars(self).items() if key not in ("ray", "approach")}
+        document["approach"] = dict(zip(AXES, self.approach, strict=True))
+        document["ray"] = {key: plain(value) for key, value in vars(self.ray).items()}
+        return document
+
+
+def _harmonic(values: Mapping[str, object], axis: str, angle_deg, period_deg: float, m):
+    """Transmission error at an angle, degrees (DESIGN 3.1)."""
+    total = 0.0
+    for order in (1, 2):
+        phase = 2 * math.pi * order * angle_deg / period_deg
+        total = total + values[f"harmonic_deg.{axis}.{order}.cos"] * m.cos(phase)
+        total = total + values[f"harmonic_deg.{axis}.{order}.sin"] * m.sin(phase)
+    return total
+
+
+def output_deg(values: Mapping[str, object], axis: str, steps, side: float, period_deg: float | None, m=np):
+    """Mirror angle of an axis after homing: q = k n, play taken up on the approach side (DESIGN 3.1).
+
+    Args:
+        values: parameters by name; floats, or arrays of one shape.
+        axis: pan or tilt.
+        steps: absolute counter.
+        side: +1 reached left or up, -1 right or down, 0 somewhere in the play.
+        period_deg: period of the transmission error, None without one.
+        m: `math` for floats, `numpy` for arrays.
+    """
+    q = values[f"degrees_per_step.{axis}"] * steps
+    if period_deg is not None and period_deg != FULL_TURN_DEG:
+        q = q + _harmonic(values, axis, q, period_deg, m)
+    output = q - 0.5 * side * values[f"backlash_deg.{axis}"]
+    if period_deg == FULL_TURN_DEG:
+        output = output + _harmonic(values, axis, output, period_deg, m)
+    return output if axis == "pan" else output + values["tilt_zero_deg"]
+
+
+def beam_components(values: Mapping[str, object], pan_deg, tilt_deg, m=np) -> tuple[tuple, tuple]:
+    """Origin (x, y, z) and direction (x, y, z) of the beam in frame T for mirror angles (DESIGN 3.2 and 2).
+
+    The laser is reflected in the turned pan stage and everything turned back at the end. Arguments as in
+    `output_deg`.
+    """
+    sin, cos, tan, sqrt = m.sin, m.cos, m.tan, m.sqrt
+    psi, beta = pan_deg * _TO_RAD, tilt_deg * _TO_RAD
+    sin_psi, cos_psi = sin(psi), cos(psi)
+    tx, ty = tan(values["laser_tilt_deg.x"] * _TO_RAD), tan(values["laser_tilt_deg.y"] * _TO_RAD)
+    length = sqrt(1.0 + tx * tx + ty * ty)
+    ox, oy = values["laser_offset_mm.x"], values["laser_offset_mm.y"]
+    x, y, z = cos_psi * ox + sin_psi * oy, cos_psi * oy - sin_psi * ox, 0.0
+    u, v, w = (cos_psi * tx + sin_psi * ty) / length, (cos_psi * ty - sin_psi * tx) / length, -1.0 / length
+
+    first = (45.0 + values["mirror1_error_deg"]) * _TO_RAD
+    ny, nz = -sin(first), cos(first)
+    along = v * ny + w * nz
+    reach = -(y * ny) / along
+    x, y, z = x + reach * u, y + reach * v, reach * w
+    v, w = v - 2 * along * ny, w - 2 * along * nz
+
+    second, skew = (45.0 + values["mirror2_error_deg"]) * _TO_RAD, values["tilt_axis_skew_deg"] * _TO_RAD
+    sin_m, cos_m, sin_s, cos_s = sin(second), cos(second), sin(skew), cos(skew)
+    nx, up = sin_m * cos(beta), sin_m * sin(beta)
+    ny, nz = cos_m * cos_s - up * sin_s, cos_m * sin_s + up * cos_s
+    along = u * nx + v * ny + w * nz
+    cx, cy, cz = values["tilt_axis_offset_mm.x"], -values["mirror_offset_mm"], values["tilt_axis_offset_mm.z"]
+    reach = ((cx - x) * nx + (cy - y) * ny + (cz - z) * nz) / along
+    x, y, z = x + reach * u, y + reach * v, z + reach * w
+    u, v, w = u - 2 * along * nx, v - 2 * along * ny, w - 2 * along * nz
+
+    turn = psi + (values["pan_zero_emission_deg"] - 90.0) * _TO_RAD
+    sin_t, cos_t = sin(turn), cos(turn)
+    origin = cos_t * x - sin_t * y, sin_t * x + cos_t * y + 0.5 * values["baseline_mm"], z
+    return origin, (cos_t * u - sin_t * v, sin_t * u + cos_t * v, w)
+
+
+def range_components(origin: tuple, direction: tuple, baseline_mm, aperture_deg, azimuth: bool, m=np):
+    """Range along the beam at which the aperture sees it under angle B, mm (derivation: `coordinates.meeting`).
+
+    Not a number where the beam misses the cone of B; zero or negative where it meets only its backward extension.
+    """
+    x, y, z = origin
+    u, v, w = direction
+    y = y + 0.5 * baseline_mm
+    sin_b, cos_b = m.sin(aperture_deg * _TO_RAD), m.cos(aperture_deg * _TO_RAD)
+    if azimuth:
+        return (y * sin_b - x * cos_b) / (u * cos_b - v * sin_b)
+    mx, my, mz = y * w - z * v, z * u - x * w, x * v - y * u
+    inside = (mx * mx + mz * mz) * sin_b * sin_b - my * my * cos_b * cos_b
+    if m is math:
+        if inside < 0:
+            return math.nan
+        root = math.sqrt(inside)
+    else:
+        with np.errstate(invalid="ignore"):
+            root = np.sqrt(inside)
+    across = x * u + y * v + z * w
+    reach = y * y - cos_b * cos_b * (x * x + y * y + z * z)
+    return reach / (cos_b * root - (y * v - cos_b * cos_b * across))
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """Estimates and uncertainty of everything that a coordinate depends on.
+
+    Attributes:
+        mean: best estimates, shape (inputs,), ordered as `INPUT_NAMES`, units of the names.
+        covariance: their covariance, shape (inputs, inputs).
+        noise_variance: mean variance of each of `NOISE_NAMES`, deg^2.
+        overshoot_steps: by axis, steps that take up all play with a probability of `CLEARED_PROBABILITY`.
+        azimuth: the aperture reads the azimuth of the spot, not the angle in the plane of beam and baseline.
+        period_deg: period of the transmission error by axis, where there is one.
+        estimator: "posterior" or "laplace".
+        range_steps: lowest and highest counter per axis in the campaign, shape (2, 2).
+        inputs_sha256: hashes of the campaign's data.
+        inputs: draws (n, inputs) behind the moments; none where only the moments were kept.
+        noise: draws (n, 5) of `NOISE_NAMES`, likewise.
+        causes: names of the causes of uncertainty behind `cause_covariance`; empty where unknown.
+        cause_covariance: what each contributes to `covariance`, shape (causes, inputs, inputs).
+    """
+
+    mean: np.ndarray
+    covariance: np.ndarray
+    noise_variance: Mapping[str, float]
+    overshoot_steps: Mapping[str, int]
+    azimuth: bool = False
+    period_deg: Mapping[str, float] = field(default_factory=dict)
+    estimator: str = "posterior"
+    range_steps: np.ndarray = field(default_factory=lambda: np.zeros((2, 2)))
+    inputs_sha256: Mapping[str, str] = field(default_factory=dict)
+    inputs: np.ndarray = field(default_factory=lambda: np.zeros((0, len(INPUT_NAMES))))
+    noise: np.ndarray = field(default_factory=lambda: np.zeros((0, len(NOISE_NAMES))))
+    causes: tuple[str, ...] = ()
+    cause_covariance: np.ndarray = field(default_factory=lambda: np.zeros((0, len(INPUT_NAMES), len(INPUT_NAMES))))
+
+    @cached_property
+    def estimates(self) -> dict[str, float]:
+        """Best estimates by name."""
+        return dict(zip(INPUT_NAMES, self.mean.tolist(), strict=True))
+
+    @cached_property
+    def _differences(self) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+        """Half widths (m,) and, by name, the values of the central differences: 2 m sets, plus then minus."""
+        sd = np.sqrt(np.diag(self.covariance))
+        varied = np.flatnonzero(sd > 0)
+        half = DIFFERENCE * sd[varied]
+        shift = np.zeros((len(varied), len(INPUT_NAMES)))
+        shift[np.arange(len(varied)), varied] = half
+        sets = np.concatenate([self.mean + shift, self.mean - shift])
+        return half, dict(zip(INPUT_NAMES, sets.T, strict=True))
+
+    @cached_property
+    def _varied_covariance(self) -> np.ndarray:
+        varied = np.diag(self.covariance) > 0
+        return self.covariance[np.ix_(varied, varied)]
+
+    def covers(self, pan_steps: float, tilt_steps: float) -> bool:
+        """Whether the campaign reached these counters."""
+        return all(low <= n <= high for n, (low, high) in zip((pan_steps, tilt_steps), self.range_steps, strict=True))
+
+    def _angles(self, values: Mapping[str, object], steps: tuple, sides: tuple, m=np) -> tuple:
+        return tuple(
+            output_deg(values, axis, n, side, self.period_deg.get(axis), m)
+            for axis, n, side in zip(AXES, steps, sides, strict=True)
+        )
+
+    def ray(self, pan_steps: float, tilt_steps: float, approach: tuple[str, str] = ("left", "up")) -> Ray:
+        """The beam at counters that were reached from a side.
+
+        Args:
+            pan_steps: absolute counter.
+            tilt_steps: absolute counter.
+            approach: last move of (pan, tilt): left or right, up or down, or unknown.
+
+        Raises:
+            InputError: an approach that does not exist.
+        """
+        angles = self._angles(self.estimates, (pan_steps, tilt_steps), sides_of(approach), math)
+        origin, direction = beam_components(self.estimates, *angles, math)
+        return Ray(np.array(origin), np.array(direction))
+
+    def locate(
+        self,
+        pan_steps: float,
+        tilt_steps: float,
+        aperture_deg: float,
+        approach: tuple[str, str] = ("left", "up"),
+    ) -> Located:
+        """The point that beam and aperture reading agree on, with its covariance by the law of propagation (GUM 5.2).
+
+        Stop errors, aperture noise and the uncertainty of every parameter are in it. `tvsbayes.locate` carries the
+        draws themselves through the geometry instead.
+
+        Args:
+            pan_steps: absolute counter.
+            tilt_steps: absolute counter.
+            aperture_deg: reading B.
+            approach: as in `ray`.
+
+        Raises:
+            InputError: an approach that does not exist, or beam and line of sight do not meet.
+        """
+        sides = sides_of(approach)
+        steps = (float(pan_steps), float(tilt_steps))
+        estimate = self._points(self.estimates, steps, sides, (0.0, 0.0), aperture_deg, math)
+        if not math.isfinite(estimate[0]):
+            raise no_meeting(pan_steps, tilt_steps, aperture_deg)
+        half, sets = self._differences
+        moved = np.array(self._points(sets, steps, sides, (0.0, 0.0), aperture_deg))
+        count = len(half)
+        jacobian = (moved[:, :count] - moved[:, count:]) / (2 * half)
+        covariance = jacobian @ self._varied_covariance @ jacobian.T
+        for variance, slope in self._noise_terms(steps, sides, aperture_deg):
+            covariance += variance * np.outer(slope, slope)
+        if not np.all(np.isfinite(covariance)):
+            raise no_meeting(pan_steps, tilt_steps, aperture_deg)
+        return Located(np.array(estimate), covariance, NORMAL_95 * np.sqrt(np.diag(covariance)))
+
+    def _points(self, values, steps, sides, extra_deg, aperture_deg, m=np) -> tuple:
+        """Points (x, y, z); not a number where there is none in front of the scanner."""
+        pan_deg, tilt_deg = self._angles(values, steps, sides, m)
+        origin, direction = beam_components(values, pan_deg + extra_deg[0], tilt_deg + extra_deg[1], m)
+        true_deg = aperture_deg - values["aperture_zero_deg"]
+        reach = range_components(origin, direction, values["baseline_mm"], true_deg, self.azimuth, m)
+        reach = (reach if reach > 0 else math.nan) if m is math else np.where(reach > 0, reach, np.nan)
+        return tuple(o + reach * d for o, d in zip(origin, direction, strict=True))
+
+    def _pointing_variance(self, sides: tuple[float, float]) -> list[float]:
+        """Variance of each mirror angle at one stop: stop error, and play where the side is unknown."""
+        result = []
+        for axis, side in zip(AXES, sides, strict=True):
+            low, high = (self.noise_variance[f"stop_sd_deg.{name}"] for name in SIDES[axis])
+            play = self.estimates[f"backlash_deg.{axis}"]
+            result.append(high if side > 0 else low if side < 0 else 0.5 * (low + high) + play**2 / 12)
+        return result
+
+    def _noise_terms(self, steps, sides, aperture_deg) -> list[tuple[float, np.ndarray]]:
+        """(variance, d(point)/d(noise)) of the two stop errors and of the aperture's noise."""
+        step = 1e-4
+        shifts = ((step, 0.0, 0.0), (0.0, step, 0.0), (0.0, 0.0, step))
+        terms = []
+        variances = [*self._pointing_variance(sides), self.noise_variance["aperture_sd_deg"]]
+        for variance, (pan, tilt, aperture) in zip(variances, shifts, strict=True):
+            plus = self._points(self.estimates, steps, sides, (pan, tilt), aperture_deg + aperture, math)
+            minus = self._points(self.estimates, steps, sides, (-pan, -tilt), aperture_deg - aperture, math)
+            terms.append((variance, (np.array(plus) - np.array(minus)) / (2 * step)))
+        return terms
+
+    def steps_for(
+        self,
+        xyz_mm: tuple[float, float, float] | np.ndarray | None = None,
+        *,
+        azimuth_deg: float | None = None,
+        elevation_deg: float | None = None,
+        approach: tuple[str, str] | None = None,
+        limits: Mapping[str, tuple[float, float]] | None = None,
+    ) -> Steps:
+        """Counters that send the beam to a point, or along a direction, of frame T.
+
+        Args:
+            xyz_mm: wanted point; or give a wanted direction by
+            azimuth_deg: atan2(d_y, d_x), the emission angle C less 90 deg, and
+            elevation_deg: asin(d_z).
+            approach: side from which each axis arrives; None takes left and up where the limits allow.
+            limits: lowest and highest counter by axis ("pan", "tilt").
+
+        Raises:
+            InputError: neither or both targets, no mirror angle reaches it, or it lies outside the limits.
+        """
+        if (xyz_mm is None) == (azimuth_deg is None or elevation_deg is None):
+            remedy = "give a point, or azimuth and elevation"
+            raise InputError("no-target", "steps_for needs one target, a point or a direction", remedy=remedy)
+        target = None if xyz_mm is None else np.asarray(xyz_mm, dtype=float)
+        angles = self._aim(target, azimuth_deg, elevation_deg)
+        chosen, counters, via = [], [], []
+        for axis, angle_deg in zip(AXES, angles, strict=True):
+            wanted = None if approach is None else approach[AXES.index(axis)]
+            side, steps, first = self._counter(axis, angle_deg, wanted, (limits or {}).get(axis))
+            chosen.append(side)
+            counters.append(steps)
+            via.append(first)
+        ray = self.ray(*counters, approach=(chosen[0], chosen[1]))
+        shared = (*counters, (chosen[0], chosen[1]), *via, ray)
+        sides = sides_of((chosen[0], chosen[1]))
+        o, d = ray.origin_mm, ray.direction
+        if target is None:
+            wanted_direction = direction_of(azimuth_deg, elevation_deg)
+            rounding = math.degrees(math.atan2(np.linalg.norm(np.cross(d, wanted_direction)), d @ wanted_direction))
+            return Steps(*shared, None, None, None, rounding, None, self._ray_u95(counters, sides, None))
+        reach = float((target - o) @ d)
+        point = o + reach * d
+        aperture = self._reading(point)
+        u95 = self._ray_u95(counters, sides, reach)
+        return Steps(*shared, point, aperture, float(np.linalg.norm(target - point)), None, u95, None)
+
+    def _reading(self, point: np.ndarray) -> float:
+        """What the aperture reads for a point of frame T, degrees."""
+        x, y, z = point + np.array([0.0, 0.5 * self.estimates["baseline_mm"], 0.0])
+        lateral = x if self.azimuth else math.hypot(x, z)
+        return math.degrees(math.atan2(lateral, y)) + self.estimates["aperture_zero_deg"]
+
+    def _aim(self, target: np.ndarray | None, azimuth_deg, elevation_deg) -> tuple[float, float]:
+        """Mirror angles whose beam passes through a point or along a direction, degrees.
+
+        A mirror angle moves the beam by nearly as much, so that plain correction converges.
+        """
+        pan_deg = tilt_deg = 0.0
+        for _ in range(AIM_STEPS):
+            o, d = beam_components(self.estimates, pan_deg, tilt_deg, math)
+            if target is None:
+                goal = (azimuth_deg, elevation_deg)
+            else:
+                x, y, z = (float(t) - c for t, c in zip(target, o, strict=True))
+                goal = (math.degrees(math.atan2(y, x)), math.degrees(math.atan2(z, math.hypot(x, y))))
+            azimuth = math.remainder(goal[0] - math.degrees(math.atan2(d[1], d[0])), 360.0)
+            elevation = goal[1] - math.degrees(math.atan2(d[2], math.hypot(d[0], d[1])))
+            if max(abs(azimuth), abs(elevation)) < math.degrees(AIM_RAD):
+                return pan_deg, tilt_deg
+            pan_deg, tilt_deg = pan_deg + azimuth, tilt_deg + elevation
+            if abs(tilt_deg) > 90:
+                break
+        raise InputError(
+            "out-of-reach",
+            "no mirror angles send the beam there",
+            allowed="points in front of the scanner and farther from it than the mirrors, elevations below 80 deg",
+            remedy="check the target's frame: x depth, y along the baseline towards the positioner, z up, mm",
+        )
+
+    def _counter(self, axis: str, angle_deg: float, side: str | None, limits) -> tuple[str, int, int]:
+        """Side, counter and the counter to go to first; the other side where limits forbid the preferred one."""
+        negative, positive = SIDES[axis]
+        low, high = (-math.inf, math.inf) if limits is None else limits
+        overshoot = self.overshoot_steps[axis]
+        tried = (positive, negative) if side is None else (side,)
+        for name in tried:
+            if name not in SIDES[axis]:
+                raise bad_approach(axis, name)
+            sign = APPROACH_SIGN[name]
+            steps = self._steps_at(axis, angle_deg, sign)
+            ratio_sign = 1 if self.estimates[f"degrees_per_step.{axis}"] > 0 else -1
+            first = steps - sign * ratio_sign * overshoot
+            if low <= steps <= high and low <= first <= high:
+                return name, steps, first
+        raise InputError(
+            "outside-limits",
+            f"{axis}: the target needs counter {steps}, approached from {first}",
+            column=axis,
+            found=f"{steps} and {first}",
+            allowed=f"{low:g} to {high:g}",
+            remedy="choose a target inside the limits, or widen them in [positioner] if the machine allows",
+        )
+
+    def _steps_at(self, axis: str, angle_deg: float, sign: int) -> int:
+        """The counter whose mirror angle is nearest to the wanted one."""
+        ratio = self.estimates[f"degrees_per_step.{axis}"]
+        steps = 0.0
+        for _ in range(AIM_STEPS):
+            at = output_deg(self.estimates, axis, steps, sign, self.period_deg.get(axis), math)
+            change = (angle_deg - at) / ratio
+            steps += change
+            if abs(change) < 1e-9:
+                break
+        return round(steps)
+
+    def _ray_u95(self, steps, sides, reach: float | None) -> np.ndarray:
+        """95 % half widths of the beam at a range (3,), mm, or of its azimuth and elevation (2,), degrees."""
+
+        def measure(values, extra_deg, m=np):
+            pan_deg, tilt_deg = self._angles(values, tuple(map(float, steps)), sides, m)
+            o, d = beam_components(values, pan_deg + extra_deg[0], tilt_deg + extra_deg[1], m)
+            if reach is not None:
+                return np.array([a + reach * b for a, b in zip(o, d, strict=True)])
+            return np.degrees([np.arctan2(d[1], d[0]), np.arcsin(d[2])])
+
+        half, sets = self._differences
+        moved = measure(sets, (0.0, 0.0))
+        jacobian = (moved[:, : len(half)] - moved[:, len(half) :]) / (2 * half)
+        covariance = jacobian @ self._varied_covariance @ jacobian.T
+        for axis, variance in enumerate(self._pointing_variance(sides)):
+            shift = np.zeros(2)
+            shift[axis] = 1e-4
+            slope = (measure(self.estimates, shift, math) - measure(self.estimates, -shift, math)) / 2e-4
+            covariance += variance * np.outer(slope, slope)
+        return NORMAL_95 * np.sqrt(np.diag(covariance))
+
+
+def direction_of(azimuth_deg: float, elevation_deg: float) -> np.ndarray:
+    """Unit vector (3,) of a direction in frame T."""
+    azimuth, elevation = math.radians(azimuth_deg), math.radians(elevation_deg)
+    level = math.cos(elevation)
+    return np.array([level * math.cos(azimuth), level * math.sin(azimuth), math.sin(elevation)])
+
+
+def bad_approach(axis: str, name: object) -> InputError:
+    """The refusal of an approach that the axis does not have."""
+    allowed = (*SIDES[axis][::-1], "unknown")
+    return InputError(
+        "approach",
+        f"{axis} approach {escaped(str(name))!r}; allowed: {', '.join(allowed)}",
+        column=f"{axis}_approach",
+        found=escaped(str(name)),
+        allowed=", ".join(allowed),
+        remedy=closest(str(name), allowed) or "name the direction of the last move of the axis",
+    )
+
+
+def sides_of(approach: tuple[str, str]) -> tuple[float, float]:
+    """+1, -1 or 0 for the approach of (pan, tilt)."""
+    for axis, name in zip(AXES, approach, strict=True):
+        if name not in (*SIDES[axis], "unknown"):
+            raise bad_approach(axis, name)
+    return float(APPROACH_SIGN[approach[0]]), float(APPROACH_SIGN[approach[1]])
+
+
+def no_meeting(pan_steps: float, tilt_steps: float, aperture_deg: float) -> InputError:
+    """The refusal of a beam and a line of sight that have no point in common."""
+    return InputError(
+        "diverging",
+        f"pan {pan_steps:g}, tilt {tilt_steps:g} steps, aperture {aperture_deg:g} deg: beam and line of sight diverge "
+        "or graze each other",
+        column="aperture_deg",
+        found=f"{aperture_deg:g}",
+        allowed="readings B with B + C clearly below 180 deg, C the beam's own angle to the baseline",
+        remedy="check reading and counters; such a target is too far, or behind the scanner",
+    )
+
+
+def receiver_priors(campaign: Campaign) -> dict[str, tuple[float, float]]:
+    """Value and u of what only aperture readings could tell, where the campaign has none."""
+    if any(s.aperture_deg is not None for s in campaign.spots if s.status == "ok"):
+        return {}
+    names = ("baseline_mm", "pan_zero_emission_deg", "aperture_zero_deg")
+    return {name: (campaign.rig.priors[name].value, campaign.rig.priors[name].u) for name in names}
+
+
+def calibration_of_draws(
+    names: tuple[str, ...],
+    physical: np.ndarray,
+    campaign: Campaign,
+    estimator: str,
+    seed: int,
+    causes: tuple[str, ...] = (),
+    cause_covariance: np.ndarray | None = None,
+) -> Calibration:
+    """Choose the columns that coordinates depend on.
+
+    Baseline, C0 and the aperture's zero take their priors where no reading told them: a sampler holds them still.
+
+    Args:
+        names: contract names of the columns of `physical`.
+        physical: draws (n, names) in the units of the names.
+        campaign: what was fitted.
+        estimator: "posterior" or "laplace".
+        seed: of the draws from priors.
+        causes: as in `Calibration`.
+        cause_covariance: as in `Calibration`.
+    """
+    column = {name: physical[:, i] for i, name in enumerate(names)}
+    generator = np.random.default_rng([seed, 5])
+    for name, (value, u) in receiver_priors(campaign).items():
+        drawn = generator.standard_normal(len(physical))
+        # Exactly the stated mean and u: the prior is known, its few draws need not be noise.
+        column[name] = value + u * (drawn - drawn.mean()) / drawn.std()
+    inputs = np.stack([column[name] for name in INPUT_NAMES], axis=1)
+    noise = np.stack([column[name] for name in NOISE_NAMES], axis=1)
+    counters = np.array([(m.pan_steps, m.tilt_steps) for m in campaign.moves], dtype=float)
+    return Calibration(
+        mean=inputs.mean(axis=0),
+        covariance=np.cov(inputs, rowvar=False),
+        noise_variance=dict(zip(NOISE_NAMES, (noise**2).mean(axis=0).tolist(), strict=True)),
+        overshoot_steps={axis: _overshoot_steps(column, axis) for axis in AXES},
+        azimuth=campaign.rig.aperture_convention == "azimuth",
+        period_deg=dict(campaign.rig.harmonic_period_deg),
+        estimator=estimator,
+        range_steps=np.stack([counters.min(axis=0), counters.max(axis=0)], axis=1),
+        inputs_sha256=input_hashes(campaign),
+        inputs=inputs,
+        noise=noise,
+        **({} if cause_covariance is None else {"causes": causes, "cause_covariance": cause_covariance}),
+    )
+
+
+def _overshoot_steps(column: Mapping[str, np.ndarray], axis: str) -> int:
+    play_steps = column[f"backlash_deg.{axis}"] / np.abs(column[f"degrees_per_step.{axis}"])
+    return math.ceil(np.quantile(play_steps, CLEARED_PROBABILITY))
+
+
+_ARRAYS = ("mean", "covariance", "range_steps", "inputs", "noise", "cause_covariance")
+
+
+def calibration_bytes(calibration: Calibration, **more: np.ndarray) -> bytes:
+    """The content of `draws.npz`: a calibration and further arrays."""
+    texts = {name: getattr(calibration, name) for name in ("noise_variance", "overshoot_steps", "period_deg")}
+    texts |= {"inputs_sha256": calibration.inputs_sha256, "causes": list(calibration.causes)}
+    buffer = io.BytesIO()
+    np.savez_compressed(
+        buffer,
+        format=CALIBRATION_FORMAT,
+        input_names=np.array(INPUT_NAMES),
+        noise_names=np.array(NOISE_NAMES),
+        estimator=calibration.estimator,
+        azimuth=calibration.azimuth,
+        tables=json.dumps(texts),
+        **{name: getattr(calibration, name) for name in _ARRAYS},
+        **more,
+    )
+    return buffer.getvalue()
+
+
+def calibration_json(calibration: Calibration) -> dict[str, object]:
+    """A calibration without its draws, for a ROS node or another language; `load_calibration` reads it."""
+    return {
+        "format": CALIBRATION_FORMAT,
+        "estimator": calibration.estimator,
+        "aperture_convention": "azimuth" if calibration.azimuth else "in-plane",
+        "harmonic_period_deg": dict(calibration.period_deg),
+        "estimates": calibration.estimates,
+        "covariance": {"names": list(INPUT_NAMES), "matrix": calibration.covariance.tolist()},
+        "noise_variance_deg2": dict(calibration.noise_variance),
+        "overshoot_steps": dict(calibration.overshoot_steps),
+        "range_steps": dict(zip(AXES, calibration.range_steps.tolist(), strict=True)),
+        "inputs": dict(calibration.inputs_sha256),
+        "expected_error": expected_error(calibration),
+    }
+
+
+def expected_error(calibration: Calibration) -> dict[str, object]:
+    """95 % half widths that remain with this calibration, at the middle of the counters it was made with.
+
+    Of the beam's direction, and of its position at 1 m; every approach from left and up.
+    """
+    middle = [round(float(value)) for value in calibration.range_steps.mean(axis=1)]
+    angles = calibration._ray_u95(middle, (1.0, 1.0), None)
+    at_1_m = calibration._ray_u95(middle, (1.0, 1.0), 1000.0)
+    return {
+        "pan_steps": middle[0],
+        "tilt_steps": middle[1],
+        "u95_azimuth_deg": float(angles[0]),
+        "u95_elevation_deg": float(angles[1]),
+        "u95_at_1_m_mm": at_1_m.tolist(),
+    }
+
+
+def calibration_header(calibration: Calibration) -> str:
+    """A C header with the estimates and the beam as a function of the counters, for a Teensy and its like."""
+    template = (shipped_data() / "export" / "tvs_calibration.h").read_text()
+    error = expected_error(calibration)
+    macro = {name: "TVS_" + name.replace(".", "_").upper() for name in INPUT_NAMES}
+    lines = [f"#define {macro[name]} {value!r}" for name, value in calibration.estimates.items()]
+    for axis in AXES:
+        lines.append(f"#define TVS_PERIOD_{axis.upper()}_DEG {float(calibration.period_deg.get(axis, 0.0))!r}")
+        lines.append(f"#define TVS_OVERSHOOT_{axis.upper()}_STEPS {calibration.overshoot_steps[axis]}")
+    lines.append(f"#define TVS_AZIMUTH_CONVENTION {int(calibration.azimuth)}")
+    stated = (
+        f"Expected error ({calibration.estimator}, 95 %) at pan {error['pan_steps']}, tilt {error['tilt_steps']} "
+        f"steps: azimuth {error['u95_azimuth_deg']:.3f} deg, elevation {error['u95_elevation_deg']:.3f} deg; "
+        f"at 1 m {max(error['u95_at_1_m_mm']):.2f} mm."
+    )
+    return template.replace("@EXPECTED_ERROR@", stated).replace("@VALUES@", "\n".join(lines))
+
+
+def load_calibration(path: Path | str) -> Calibration:
+    """Load what a robot needs, with NumPy alone.
+
+    Args:
+        path: a campaign folder with `results/`, its `results` folder, a `draws.npz`, or the JSON that
+            `tvsbayes steps-for CAMPAIGN --export json` prints.
+
+    Returns:
+        A calibration with `.ray`, `.locate` and `.steps_for`; from JSON without the draws.
+
+    Raises:
+        InputError: there is no such file, or it is not what tvsbayes wrote.
+    """
+    path = Path(path)
+    if path.is_dir():
+        inner = path / "results" / "draws.npz"
+        path = inner if inner.exists() or not (path / "draws.npz").exists() else path / "draws.npz"
+    if path.suffix == ".json":
+        return _from_json(path)
+    return read_draws(path)
+
+
+def _damaged(path: Path, reason: object) -> InputError:
+    return InputError(
+        "damaged-results",
+        f"{escaped(path.name)} is not a calibration that tvsbayes wrote: {reason}",
+        file=escaped(path.name),
+        allowed=f"format {CALIBRATION_FORMAT}",
+        remedy="run `tvsbayes fit` on the campaign again",
+    )
+
+
+def _shaped(calibration: Calibration) -> Calibration:
+    """Refuse arrays of other shapes or with values that are not finite."""
+    n, count = len(calibration.inputs), len(INPUT_NAMES)
+    shapes = {"mean": (count,), "covariance": (count, count), "range_steps": (2, 2), "inputs": (n, count)}
+    shapes |= {"noise": (n, len(NOISE_NAMES)), "cause_covariance": (len(calibration.causes), count, count)}
+    for name, shape in shapes.items():
+        array = getattr(calibration, name)
+        if array.shape != shape or array.dtype != np.float64 or not np.all(np.isfinite(array)):
+            raise ValueError(f"{name} has shape {array.shape}, wanted {shape} of finite numbers")
+    if not set(NOISE_NAMES) <= set(calibration.noise_variance) or not set(AXES) <= set(calibration.overshoot_steps):
+        raise ValueError("a noise variance or an overshoot is missing")
+    return calibration
+
+
+def read_draws(path: Path) -> Calibration:
+    """Read `draws.npz`; errors as in `load_calibration`."""
+    data = read_bytes(path, RESULTS_BYTES_MAX)
+    try:
+        with np.load(io.BytesIO(data), allow_pickle=False) as file:
+            if "format" not in file.files and "physical" in file.files:
+                raise ValueError("the fit behind it did not converge")
+            if str(file["format"]) != CALIBRATION_FORMAT or tuple(file["input_names"]) != INPUT_NAMES:
+                raise ValueError(f"format {str(file['format'])[:60]!r} or other columns")
+            tables = json.loads(str(file["tables"]))
+            return _shaped(
+                Calibration(
+                    **{name: file[name] for name in _ARRAYS},
+                    **{name: tables[name] for name in ("noise_variance", "overshoot_steps", "period_deg")},
+                    azimuth=bool(file["azimuth"]),
+                    estimator=str(file["estimator"]),
+                    inputs_sha256=tables["inputs_sha256"],
+                    causes=tuple(tables["causes"]),
+                )
+            )
+    except Exception as error:
+        raise _damaged(path, error) from error
+
+
+def _from_json(path: Path) -> Calibration:
+    keys = parse_json(read_bytes(path, RESULTS_BYTES_MAX), escaped(path.name))
+    keys.word("format", (CALIBRATION_FORMAT,))
+    try:
+        d = keys.values
+        if tuple(d["covariance"]["names"]) != INPUT_NAMES:
+            raise ValueError("the covariance names other inputs")
+        return _shaped(
+            Calibration(
+                mean=np.array([d["estimates"][name] for name in INPUT_NAMES], dtype=float),
+                covariance=np.array(d["covariance"]["matrix"], dtype=float),
+                noise_variance={name: float(value) for name, value in d["noise_variance_deg2"].items()},
+                overshoot_steps={axis: int(value) for axis, value in d["overshoot_steps"].items()},
+                azimuth=d["aperture_convention"] == "azimuth",
+                period_deg={axis: float(value) for axis, value in d["harmonic_period_deg"].items()},
+                estimator=str(d["estimator"]),
+                range_steps=np.array([d["range_steps"][axis] for axis in AXES], dtype=float),
+                inputs_sha256=dict(d["inputs"]),
+            )
+        )
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise _damaged(path, error) from error
+
+
+def stored_calibration(campaign: Campaign) -> Calibration | None:
+    """The calibration in `results/` of a campaign folder, if it was made from exactly these data and priors.
+
+    Raises:
+        InputError: there are results, but damaged.
+    """
+    path = None if campaign.path is None else campaign.path / "results" / "draws.npz"
+    if path is None or not path.exists():
+        return None
+    calibration = read_draws(path)
+    return calibration if calibration.inputs_sha256 == input_hashes(campaign) else None

@@ -1,0 +1,461 @@
+"""TVS coordinates: where beam and aperture reading meet, in mm, and how sure that is (paper eq. 1-3; DESIGN 5).
+
+Frame T: origin mid-baseline, x depth, y along the baseline towards the positioner at +a/2, z up; the aperture stands
+at (0, -a/2, 0). mm and rad inside; degrees where a name says `_deg`. The emission angle C and the aperture angle B are
+interior angles of the triangle whose third corner is the spot.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from tvsbayes.calibration import AXES, INPUT_NAMES, NOISE_NAMES, Calibration, no_meeting, sides_of
+from tvsbayes.files import InputError
+from tvsbayes.model import (
+    FULL_TURN_DEG,
+    INDEX,
+    NAMES,
+    Model,
+    Scalar,
+    along_batch,
+    beam,
+    dot,
+    model_of,
+    rotate_about_z,
+)
+from tvsbayes.propagation import NORMAL_95, Linear, Validation, linear, validate
+
+DRAWS = 1000
+"""Draws carried to a point unless the caller wants others; DESIGN 5 asks for 500 at least."""
+DIVERGING_SHARE = 1e-3
+"""Share of draws without a point above which a point is refused (DESIGN 5)."""
+POINTS = 256
+"""Points per call of the compiled functions."""
+NOISES = 5
+"""Unit noises of a look: stop error and place in the play (pan, tilt), aperture."""
+INPUT_COLUMNS = np.array([INDEX[name] for name in (*INPUT_NAMES, *NOISE_NAMES)])
+
+
+def published_point(
+    B_deg: float | np.ndarray,
+    C_deg: float | np.ndarray,
+    beta_deg: float | np.ndarray,
+    baseline_mm: float,
+    *,
+    as_printed: bool = False,
+) -> np.ndarray:
+    """The paper's equations (1)-(3), B and C in the plane that is tilted by beta about the baseline.
+
+    y = a (1/2 - sin B cos C / sin(B + C)) holds for every B and C. The paper prints a second branch for B > 90 deg,
+    y = -a (1/2 + sin B cos C / sin[180 - (B + C)]), which jumps by -a at B = 90 deg where C = 90 deg - small: it is
+    returned with `as_printed` only.
+
+    Args:
+        B_deg: angle at the aperture.
+        C_deg: angle at the positioner.
+        beta_deg: elevation.
+        baseline_mm: a.
+        as_printed: the paper's two branches.
+
+    Returns:
+        x, y, z in mm, first axis; infinite or behind the baseline where B + C >= 180 deg.
+    """
+    B, C, beta = (np.radians(np.asarray(angle, dtype=float)) for angle in (B_deg, C_deg, beta_deg))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        height = baseline_mm * np.sin(B) * np.sin(C) / np.sin(B + C)
+        share = np.sin(B) * np.cos(C) / np.sin(B + C)
+    y = baseline_mm * (0.5 - share)
+    if as_printed:
+        y = np.where(np.degrees(B) > 90.0, -baseline_mm * (0.5 + share), y)
+    return np.stack(np.broadcast_arrays(height * np.cos(beta), y, height * np.sin(beta)))
+
+
+class Meeting(eqx.Module):
+    """Where beams meet what the aperture saw: points (frame T, mm), ranges along the beams, and whether they do."""
+
+    xyz_mm: Float[Array, "3 *batch"]
+    range_mm: Float[Array, "*batch"]
+    meets: Bool[Array, "*batch"]
+
+
+def meeting(
+    origin_mm: Float[Array, "3 *batch"],
+    direction: Float[Array, "3 *batch"],
+    baseline_mm: Float[Array, "..."],
+    aperture_rad: Float[Array, "*batch"],
+    azimuth_convention: Bool[Array, ""],
+) -> Meeting:
+    """Meet beams with the cone, or vertical plane, of an aperture angle (DESIGN 5); closed form, differentiable.
+
+    With w the beam's origin seen from the aperture and c = cos B, the in-plane reading asks for (w + r d)_y =
+    c |w + r d|. Squared this is a quadratic in r whose discriminant is c^2 S^2, S^2 = |m|^2 sin^2 B - m_y^2 with the
+    moment m = w x d. The root on B's own nappe is r = (w_y^2 - c^2 |w|^2) / (c S - w_y d_y + c^2 w.d), which has no
+    0/0 at B = 90 deg, nor where the beam runs parallel to the cone's opposite side; the denominator vanishes where
+    beam and line of sight are parallel. On the baseline's plane it is a sin B / sin(B + C).
+
+    Args:
+        origin_mm: origins of the beams, frame T.
+        direction: unit directions.
+        baseline_mm: a.
+        aperture_rad: true angles B in (0, pi), without the aperture's zero.
+        azimuth_convention: B is the azimuth of the spot instead of the angle in the plane of baseline and spot.
+
+    Returns:
+        Points; `meets` is False where the beam misses the cone (grazing), only its backward extension meets it
+        (diverging), or the point lies on the other nappe.
+    """
+    w = origin_mm + jnp.stack([jnp.zeros_like(origin_mm[1]), 0.5 * baseline_mm + 0 * origin_mm[1], 0 * origin_mm[2]])
+    sin_b, cos_b = jnp.sin(aperture_rad), jnp.cos(aperture_rad)
+    moment = jnp.stack(
+        [
+            w[1] * direction[2] - w[2] * direction[1],
+            w[2] * direction[0] - w[0] * direction[2],
+            w[0] * direction[1] - w[1] * direction[0],
+        ]
+    )
+    inside = (moment[0] ** 2 + moment[2] ** 2) * sin_b**2 - (moment[1] * cos_b) ** 2
+    touches = inside > 0
+    # The root's derivative is infinite where the beam touches the cone; such beams are refused anyway.
+    root = jnp.sqrt(jnp.where(touches, inside, 1.0))
+    ahead = cos_b * root - w[1] * direction[1] + cos_b**2 * dot(w, direction)
+    cone = (w[1] ** 2 - cos_b**2 * dot(w, w)) / ahead
+    plane = (w[1] * sin_b - w[0] * cos_b) / (direction[0] * cos_b - direction[1] * sin_b)
+    range_mm = jnp.where(azimuth_convention, plane, cone)
+    seen = w + range_mm * direction
+    in_sight = jnp.where(azimuth_convention, seen[0] * sin_b, 0.0) + seen[1] * cos_b
+    meets = (azimuth_convention | touches) & (range_mm > 0) & (in_sight >= 0) & jnp.isfinite(range_mm)
+    return Meeting(origin_mm + range_mm * direction, range_mm, meets)
+
+
+class Settings(eqx.Module):
+    """Where the machine stood and what the aperture read: counters, sides (+1 left/up, -1, 0 unknown), reading."""
+
+    steps: Float[Array, "*points 2"]
+    side: Float[Array, "*points 2"]
+    aperture_rad: Float[Array, "*points"]
+
+
+class Beams(eqx.Module):
+    """Beams in frame T."""
+
+    origin_mm: Float[Array, "3 *batch"]
+    direction: Float[Array, "3 *batch"]
+
+
+def beams_at(model: Model, steps: Array, side: Array, noise: Float[Array, "noises"]) -> Beams:
+    """Beams of one rig at many settings after homing: q = k n, play taken up on the approach side (DESIGN 3.1).
+
+    Args:
+        model: parameters.
+        steps: counters, shape (points, 2).
+        side: approach sides, shape (points, 2).
+        noise: standard-normal stop errors (pan, tilt), then uniform places in the play in [-1/2, 1/2] (pan, tilt)
+            where the side is unknown, then the aperture's noise.
+    """
+    gears, known = model.transmission, side != 0
+    q = gears.ratio_rad_per_step * steps
+    driven = q + jnp.where(gears.harmonics.on_wheel, 0.0, gears.harmonics.error_rad(q))
+    output = driven - gears.backlash_rad * jnp.where(known, 0.5 * side, -noise[2:4])
+    output = output + jnp.where(gears.harmonics.on_wheel, gears.harmonics.error_rad(output), 0.0)
+    low, high = model.noise.stop_sd_rad[:, 0], model.noise.stop_sd_rad[:, 1]
+    stop_sd = jnp.where(side > 0, high, jnp.where(side < 0, low, jnp.sqrt(0.5 * (low**2 + high**2))))
+    angle = output + stop_sd * noise[:2]
+    return _in_frame_t(model, angle[..., 0], angle[..., 1] + model.tilt_zero_rad)
+
+
+def _in_frame_t(model: Model, pan_rad: Array, tilt_rad: Array) -> Beams:
+    ray = beam(model.optics, pan_rad, tilt_rad)
+    turn = model.receiver.pan_zero_emission_rad - jnp.pi / 2
+    origin = rotate_about_z(turn, ray.origin_mm) + along_batch(_half_baseline(model.receiver.baseline_mm), pan_rad)
+    return Beams(origin, rotate_about_z(turn, ray.direction))
+
+
+def _half_baseline(baseline_mm: Scalar) -> Float[Array, "3"]:
+    return jnp.stack([0 * baseline_mm, 0.5 * baseline_mm, 0 * baseline_mm])
+
+
+class Sources(eqx.Module):
+    """Estimates, covariance and draws of a calibration as arguments of the compiled functions.
+
+    `mean` and `covariance` are of [inputs, unit noises]; `inputs` are draws of `INPUT_NAMES` and `NOISE_NAMES`.
+    """
+
+    mean: Float[Array, " inputs"]
+    covariance: Float[Array, "inputs inputs"]
+    stop_sd_deg: Float[Array, "5"]
+    inputs: Float[Array, "draws columns"]
+    noise: Float[Array, "draws 5"]
+    period_deg: Float[Array, "2"]
+    azimuth_convention: Bool[Array, ""]
+
+
+def model_from(inputs: Float[Array, " columns"], period_deg: Float[Array, "2"]) -> Model:
+    """A model that knows what coordinates depend on; its cameras are empty."""
+    return model_of(jnp.zeros(len(NAMES)).at[INPUT_COLUMNS].set(inputs), period_deg)
+
+
+def sources(calibration: Calibration, draws: int, seed: int) -> Sources:
+    """Draws of parameters, evenly chosen, with noises of their own; the same for every point of a call.
+
+    Raises:
+        InputError: a calibration without draws.
+    """
+    stored = len(calibration.inputs)
+    if stored == 0:
+        raise InputError(
+            "no-draws",
+            "this calibration keeps moments only, as exported for a robot",
+            remedy="locate from the campaign folder, or use calibration.locate, which needs no draws",
+        )
+    generator = np.random.default_rng([seed, 6])
+    # Fewer draws than are stored: evenly chosen; more: all, again and again, with new noises.
+    chosen = np.arange(draws) % stored if draws > stored else np.linspace(0, stored - 1, draws).astype(int)
+    columns = np.concatenate([calibration.inputs, calibration.noise], axis=1)[chosen]
+    normal = generator.standard_normal((draws, NOISES))
+    noise = np.column_stack([normal[:, :2], generator.uniform(-0.5, 0.5, (draws, 2)), normal[:, 4]])
+    count = len(INPUT_NAMES)
+    covariance = np.zeros((count + NOISES, count + NOISES))
+    covariance[:count, :count] = calibration.covariance
+    covariance[range(count, count + NOISES), range(count, count + NOISES)] = (1, 1, 1 / 12, 1 / 12, 1)
+    with jax.enable_x64(True):
+        return Sources(
+            mean=jnp.asarray(np.concatenate([calibration.mean, np.zeros(NOISES)])),
+            covariance=jnp.asarray(covariance),
+            stop_sd_deg=jnp.asarray(np.sqrt([calibration.noise_variance[name] for name in NOISE_NAMES])),
+            inputs=jnp.asarray(columns),
+            noise=jnp.asarray(noise),
+            period_deg=jnp.asarray([calibration.period_deg.get(axis, FULL_TURN_DEG) for axis in AXES]),
+            azimuth_convention=jnp.asarray(calibration.azimuth),
+        )
+
+
+def _look(inputs: Array, noise: Array, settings: Settings, given: Sources) -> Meeting:
+    """Points of one rig at many settings."""
+    model = model_from(inputs, given.period_deg)
+    rays = beams_at(model, settings.steps, settings.side, noise)
+    receiver = model.receiver
+    true_rad = settings.aperture_rad - receiver.aperture_zero_rad - receiver.aperture_sd_rad * noise[4]
+    return meeting(rays.origin_mm, rays.direction, receiver.baseline_mm, true_rad, given.azimuth_convention)
+
+
+class Carried(eqx.Module):
+    """Draws of the points, shape (draws, 3, points), and whether each exists."""
+
+    xyz_mm: Float[Array, "draws 3 points"]
+    meets: Bool[Array, "draws points"]
+
+
+@eqx.filter_jit
+def carry(settings: Settings, given: Sources) -> Carried:
+    """Every draw through the geometry for every point."""
+
+    def one(inputs, noise):
+        found = _look(inputs, noise, settings, given)
+        return Carried(found.xyz_mm, found.meets)
+
+    return jax.vmap(one)(given.inputs, given.noise)
+
+
+@eqx.filter_jit
+def propagate(settings: Settings, given: Sources) -> Linear:
+    """The law of propagation at every point; fields get a leading axis `points`.
+
+    Inputs are `INPUT_NAMES` and the unit noises, whose sds are held at their root mean square.
+    """
+
+    def one(setting):
+        point = jax.tree.map(lambda x: x[None], setting)
+
+        def function(values):
+            inputs = jnp.concatenate([values[: len(INPUT_NAMES)], given.stop_sd_deg])
+            return _look(inputs, values[len(INPUT_NAMES) :], point, given).xyz_mm[:, 0]
+
+        return linear(function, given.mean, given.covariance)
+
+    return jax.vmap(one)(settings)
+
+
+@dataclass(frozen=True)
+class Locations:
+    """Points of frame T with their uncertainty; arrays over points, not a number where a point is refused.
+
+    Attributes:
+        xyz_mm: means of the draws, shape (n, 3).
+        covariance_mm2: shape (n, 3, 3).
+        interval95_mm: equal-tailed intervals, shape (n, 2, 3).
+        u95_mm: their half widths, shape (n, 3).
+        diverging_share: share of draws without a point, shape (n,).
+        linear_xyz_mm, linear_covariance_mm2: by the law of propagation, shapes (n, 3) and (n, 3, 3).
+        validation: of the law of propagation by the draws (JCGM 101 clause 8), fields of shape (n, 3).
+        refused: the refusal of each point, or None.
+        estimator: "posterior" or "laplace".
+        draws: number of draws.
+    """
+
+    xyz_mm: np.ndarray
+    covariance_mm2: np.ndarray
+    interval95_mm: np.ndarray
+    u95_mm: np.ndarray
+    diverging_share: np.ndarray
+    linear_xyz_mm: np.ndarray
+    linear_covariance_mm2: np.ndarray
+    validation: Validation
+    refused: tuple[InputError | None, ...]
+    estimator: str
+    draws: int
+
+    def as_json(self, index: int) -> dict[str, object]:
+        """One point; null where it is refused."""
+        error = self.refused[index]
+        if error is not None:
+            empty = dict.fromkeys(("xyz_mm", "covariance_mm2", "u95_mm"))
+            return {**empty, "refused": {"code": error.code, "message": error.message}}
+        u = np.sqrt(np.diag(self.linear_covariance_mm2[index]))
+        v = self.validation
+        return {
+            "xyz_mm": self.xyz_mm[index].tolist(),
+            "covariance_mm2": self.covariance_mm2[index].tolist(),
+            "u95_mm": self.u95_mm[index].tolist(),
+            "interval95_mm": self.interval95_mm[index].T.tolist(),
+            "diverging_share": float(self.diverging_share[index]),
+            "linear": {
+                "xyz_mm": self.linear_xyz_mm[index].tolist(),
+                "covariance_mm2": self.linear_covariance_mm2[index].tolist(),
+                "u95_mm": (NORMAL_95 * u).tolist(),
+                "digits": v.digits,
+                "validated": bool(v.validated[index].all()),
+                "decided": bool(v.decided[index].all()),
+                "deviation_mm": v.deviation[index].tolist(),
+                "tolerance_mm": v.tolerance[index].tolist(),
+            },
+        }
+
+
+def settings_of(
+    pan_steps: float | Sequence[float] | np.ndarray,
+    tilt_steps: float | Sequence[float] | np.ndarray,
+    aperture_deg: float | Sequence[float] | np.ndarray,
+    approach: tuple[str, str] | Sequence[tuple[str, str]] = ("left", "up"),
+) -> Settings:
+    """Settings of many points; arguments and errors as in `locate`."""
+    numbers = [np.atleast_1d(np.asarray(x, dtype=float)) for x in (pan_steps, tilt_steps, aperture_deg)]
+    pan, tilt, reading = np.broadcast_arrays(*numbers)
+    pairs = [approach] if len(approach) == 2 and isinstance(approach[0], str) else list(approach)
+    known = {pair: sides_of(pair) for pair in set(map(tuple, pairs))}
+    side = np.broadcast_to(np.array([known[tuple(pair)] for pair in pairs]), (len(pan), 2))
+    with jax.enable_x64(True):
+        return Settings(
+            steps=jnp.asarray(np.stack([pan, tilt], axis=1)),
+            side=jnp.asarray(side),
+            aperture_rad=jnp.asarray(np.radians(reading)),
+        )
+
+
+def _blocks(settings: Settings) -> Iterator[tuple[Settings, int]]:
+    """Equal blocks of settings, the last one filled up with its last point, and how many points of each count."""
+    count = len(settings.aperture_rad)
+    size = min(POINTS, 1 << max(count - 1, 0).bit_length())
+    for begin in range(0, count, size):
+        chosen = np.minimum(np.arange(begin, begin + size), count - 1)
+        yield jax.tree.map(lambda x, chosen=chosen: x[chosen], settings), min(size, count - begin)
+
+
+def locate_linear(calibration: Calibration, settings: Settings) -> Linear:
+    """The law of propagation alone: fields with a leading axis of points, not a number where there is no point.
+
+    No draws: a million points a minute. Validate some of them with `locate`.
+    """
+    given = sources(calibration, 1, 0)
+    with jax.enable_x64(True):
+        found = [
+            jax.tree.map(lambda x, n=n: np.asarray(x)[:n], propagate(block, given)) for block, n in _blocks(settings)
+        ]
+    return jax.tree.map(lambda *parts: np.concatenate(parts), *found)
+
+
+def locate(
+    calibration: Calibration,
+    pan_steps: float | Sequence[float] | np.ndarray,
+    tilt_steps: float | Sequence[float] | np.ndarray,
+    aperture_deg: float | Sequence[float] | np.ndarray,
+    approach: tuple[str, str] | Sequence[tuple[str, str]] = ("left", "up"),
+    *,
+    draws: int = DRAWS,
+    seed: int = 0,
+) -> Locations:
+    """Carry a calibration into points of frame T, draw by draw and by the law of propagation.
+
+    Args:
+        calibration: from `load_calibration` or `calibration_of`.
+        pan_steps: absolute counters, one or n.
+        tilt_steps: absolute counters, one or n.
+        aperture_deg: readings B, one or n.
+        approach: last move of (pan, tilt): left, right or unknown; up, down or unknown; one pair or n pairs.
+        draws: number of draws, at least 500.
+        seed: of stop errors and aperture noise; they are the same for every point, so that a point does not depend
+            on its neighbours in the list.
+
+    Returns:
+        Points with covariance and intervals; look at `refused`.
+
+    Raises:
+        InputError: a calibration without draws, or an approach that does not exist.
+        ValueError: fewer than 500 draws (DESIGN 5), or lists of different lengths.
+    """
+    if draws < 500:
+        raise ValueError(f"{draws} draws; a coordinate's interval needs at least 500 (DESIGN 5)")
+    settings = settings_of(pan_steps, tilt_steps, aperture_deg, approach)
+    given = sources(calibration, draws, seed)
+    parts = []
+    with jax.enable_x64(True):
+        for block, n in _blocks(settings):
+            carried, law = carry(block, given), propagate(block, given)
+            trimmed = jax.tree.map(lambda x, n=n: np.asarray(x)[..., :n], carried)
+            parts.append(_statistics(trimmed, jax.tree.map(lambda x, n=n: np.asarray(x)[:n], law), given))
+    joined = {name: np.concatenate([part[name] for part in parts]) for name in parts[0] if name != "validation"}
+    checks = [part["validation"] for part in parts]
+    fields = ("tolerance", "deviation", "error", "validated", "decided")
+    validation = Validation(2, **{name: np.concatenate([getattr(v, name) for v in checks]) for name in fields})
+    refused = tuple(
+        no_meeting(*map(float, settings.steps[i]), float(np.degrees(settings.aperture_rad[i]))) if bad else None
+        for i, bad in enumerate(~(joined["diverging_share"] <= DIVERGING_SHARE))
+    )
+    return Locations(**joined, validation=validation, refused=refused, estimator=calibration.estimator, draws=draws)
+
+
+def _statistics(carried: Carried, law: Linear, given: Sources) -> dict[str, object]:
+    """Moments, intervals and validation of one block of points."""
+    meets = carried.meets
+    lost = 1 - meets.mean(axis=0)
+    count = len(meets)
+    # The few draws without a point take the point's median place: at most one in a thousand, or the point is refused.
+    xyz = carried.xyz_mm
+    if not meets.all():
+        middle = np.nanmedian(np.where(meets[:, None], xyz, np.nan), axis=0) if meets.any() else 0.0
+        xyz = np.where(meets[:, None], xyz, np.nan_to_num(middle))
+    mean = xyz.mean(axis=0)
+    centred = xyz - mean
+    covariance = np.einsum("dip,djp->pij", centred, centred) / (count - 1)
+    inputs = np.concatenate([np.asarray(given.inputs)[:, : len(INPUT_NAMES)], np.asarray(given.noise)], axis=1)
+    u = np.sqrt(np.einsum("pii->pi", law.covariance))
+    linearised = law.value + np.einsum("pik,dk->dpi", law.jacobian, inputs - np.asarray(given.mean))
+    draws = np.ascontiguousarray(xyz.transpose(0, 2, 1))
+    interval = np.quantile(draws, (0.025, 0.975), axis=0)
+    empty = np.where(lost <= DIVERGING_SHARE, 0.0, np.nan)
+    return {
+        "xyz_mm": mean.T + empty[:, None],
+        "covariance_mm2": covariance + empty[:, None, None],
+        "interval95_mm": interval.transpose(1, 0, 2) + empty[:, None, None],
+        "u95_mm": 0.5 * (interval[1] - interval[0]) + empty[:, None],
+        "diverging_share": lost,
+        "linear_xyz_mm": law.value + empty[:, None],
+        "linear_covariance_mm2": law.covariance + empty[:, None, None],
+        "validation": validate(draws, linearised, law.value, u),
+    }
