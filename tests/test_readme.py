@@ -45,7 +45,8 @@ def test_first_screen_has_two_set_up_commands_and_the_printed_answer():
 
 
 def test_commands_are_those_that_exist():
-    assert first_column(section("Commands")) == [command.callback.__name__ for command in app.registered_commands]
+    names = [command.name or command.callback.__name__ for command in app.registered_commands]
+    assert first_column(section("Commands")) == names
 
 
 def test_module_map_is_complete_and_in_import_order():

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from small_campaign import small_campaign
 
+from tvsbayes.calibration import INPUT_NAMES, NOISE_NAMES, Calibration, load_calibration
 from tvsbayes.campaign import input_hashes
 from tvsbayes.classic import ClassicResult, DirectionResult
 from tvsbayes.files import InputError
@@ -206,6 +207,30 @@ def test_results_are_two_files_with_their_provenance(tmp_path):
     assert names == ["backlash_deg.pan", "not estimated", "pixel_scale"]
     expected = np.cov(physical[:, [0, 2]], rowvar=False)
     np.testing.assert_allclose(document["covariance"]["matrix"], expected, rtol=1e-12)
+
+
+def test_results_with_a_calibration_are_read_back(tmp_path):
+    count = len(INPUT_NAMES)
+    calibration = Calibration(
+        mean=np.arange(count, dtype=float),
+        covariance=np.eye(count),
+        noise_variance=dict.fromkeys(NOISE_NAMES, 0.01),
+        overshoot_steps={"pan": 3, "tilt": 4},
+        estimator="posterior",
+        inputs=np.ones((5, count)),
+        noise=np.ones((5, len(NOISE_NAMES))),
+    )
+    write_results(small_fit(), small_summary(), tmp_path, 0, calibration)
+    found = load_calibration(tmp_path)
+    assert (found.estimator, found.overshoot_steps["tilt"]) == ("posterior", 4)
+    np.testing.assert_array_equal(found.mean, calibration.mean)
+    np.testing.assert_array_equal(found.inputs, calibration.inputs)
+    with np.load(tmp_path / "draws.npz", allow_pickle=False) as draws:
+        assert draws["physical"].shape == (50, 3)
+        assert str(draws["estimator"]) == "posterior"
+    write_results(small_fit(), small_summary(), tmp_path, 0)
+    with pytest.raises(InputError, match="did not converge"):
+        load_calibration(tmp_path)
 
 
 def test_nan_is_written_nowhere(tmp_path):

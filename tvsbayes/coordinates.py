@@ -248,8 +248,8 @@ def _look(inputs: Array, noise: Array, settings: Settings, given: Sources) -> Me
 class Carried(eqx.Module):
     """Draws of the points, shape (draws, 3, points), and whether each exists."""
 
-    xyz_mm: Float[Array, "draws 3 points"]
-    meets: Bool[Array, "draws points"]
+    xyz_mm: Float[Array, "*draws 3 points"]
+    meets: Bool[Array, "*draws points"]
 
 
 @eqx.filter_jit
@@ -437,9 +437,10 @@ def _statistics(carried: Carried, law: Linear, given: Sources) -> dict[str, obje
     count = len(meets)
     # The few draws without a point take the point's median place: at most one in a thousand, or the point is refused.
     xyz = carried.xyz_mm
-    if not meets.all():
-        middle = np.nanmedian(np.where(meets[:, None], xyz, np.nan), axis=0) if meets.any() else 0.0
-        xyz = np.where(meets[:, None], xyz, np.nan_to_num(middle))
+    for point in np.flatnonzero(~meets.all(axis=0) & meets.any(axis=0)):
+        seen = meets[:, point]
+        xyz = xyz.copy() if xyz is carried.xyz_mm else xyz
+        xyz[~seen, :, point] = np.median(xyz[seen, :, point], axis=0)
     mean = xyz.mean(axis=0)
     centred = xyz - mean
     covariance = np.einsum("dip,djp->pij", centred, centred) / (count - 1)

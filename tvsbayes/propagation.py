@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
-from scipy import stats
+from scipy import special
 
 NORMAL_95 = 1.959963984540054
 """Two-sided 95 % quantile of the normal distribution."""
@@ -67,9 +67,8 @@ def effective_dof(contributions: np.ndarray, dof: np.ndarray) -> float:
 
 def coverage_factor(probability: float, dof: float = math.inf) -> float:
     """Two-sided coverage factor of Student's t (GUM G.3), truncating the degrees of freedom is the caller's (G.4.1)."""
-    return float(
-        stats.t.isf(0.5 * (1 - probability), dof) if math.isfinite(dof) else stats.norm.isf((1 - probability) / 2)
-    )
+    high = 0.5 * (1 + probability)
+    return float(special.stdtrit(dof, high) if math.isfinite(dof) else special.ndtri(high))
 
 
 def symmetric_interval(draws: np.ndarray, probability: float = 0.95) -> np.ndarray:
