@@ -3,8 +3,8 @@
     python experiments/locate_speed.py > experiments/locate_speed.md        (3 minutes on two quiet cores)
 
 The grid twin is fitted once (Laplace). Points lie all over its counters. Peer in the same run: a plain NumPy Monte
-Carlo by the twin's own optics, one point at a time with all draws at once, which is what a careful user would write.
-Compilation happens before the clocks start; the process-start figure includes imports, tracing and the compilation cache.
+Carlo by the twin's own optics, one draw at a time, which is what a careful user would write first. Compilation happens
+before the clocks start; the process-start figure includes imports, tracing and the compilation cache.
 """
 
 from __future__ import annotations
@@ -31,7 +31,6 @@ from tvsbayes.simulation import mirror_chain, to_tvs
 from tvsbayes.solver import use_compilation_cache
 
 DRAWS = 500
-PEER_POINTS = 200
 
 
 def points(calibration, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -134,7 +133,7 @@ def main() -> None:
         load_calibration(folder)
         print(f"- `load_calibration`: {1e3 * (time.perf_counter() - start):.0f} ms")
         arguments = ["locate", folder, "--pan-steps", 100, "--tilt-steps", 20, "--aperture-deg", 70, "--json"]
-        command = [sys.executable, "-m", "tvsbayes", *map(str, arguments)]
+        command = [str(Path(sys.executable).parent / "tvsbayes"), *map(str, arguments)]
         subprocess.run(command, check=True, capture_output=True)
         seconds = best(lambda: subprocess.run(command, check=True, capture_output=True), 5)
         print(f"- `tvsbayes locate` of one point from process start, compilation cached: {seconds:.2f} s")
