@@ -600,3 +600,13 @@ def test_one_wrong_end_is_enough(sign):
     verdict = judge(x + sign * 0.3 * (sign * x > 1.0), x, 0.0, 1.0)
     assert verdict.deviation == pytest.approx(0.3)
     assert not verdict.validated
+
+
+def test_digits_held_are_the_most_whose_tolerance_holds_the_deviation():
+    """Half a unit of the second digit of u = 0.5 is 0.005, of the first 0.05."""
+    x = stratified_normal(4)
+    ends = {}
+    for shift in (0.0, 0.0049, 0.0051, 0.049, 0.051):
+        verdict = judge(0.5 * x + shift, 0.5 * x, 0.0, 0.5)
+        ends[shift] = int(verdict.digits_held(np.array([0.5]))[0])
+    assert ends == {0.0: 2, 0.0049: 2, 0.0051: 1, 0.049: 1, 0.051: 0}

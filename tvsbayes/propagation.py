@@ -121,6 +121,13 @@ class Validation:
     validated: np.ndarray
     decided: np.ndarray
 
+    def digits_held(self, u: np.ndarray) -> np.ndarray:
+        """Significant digits of u, `digits` at most, to which the law holds; 0 where not even one."""
+        held = np.zeros(np.shape(u), dtype=int)
+        for digits in range(1, self.digits + 1):
+            held = np.where(self.deviation <= numerical_tolerance(u, digits), digits, held)
+        return held
+
 
 def validate(
     draws: np.ndarray,

@@ -262,9 +262,9 @@ def locations_text(found: Locations) -> str:
         sd = np.sqrt(np.diag(found.covariance_mm2[index]))
         cells = [concise(float(x), float(u)) for x, u in zip(found.xyz_mm[index], sd, strict=True)]
         half = " ".join(f"{u:.2g}" for u in found.u95_mm[index])
-        law = found.validation
-        verdict = "validated" if law.validated[index].all() else "not validated"
-        rows.append([str(index), *cells, half, f"{verdict} at {law.digits} digits"])
+        held = int(found.digits_held[index].min())
+        verdict = f"validated at {held} digit{'s' * (held > 1)}" if held else "not validated"
+        rows.append([str(index), *cells, half, verdict])
     columns = ["point", "x(u) mm", "y(u) mm", "z(u) mm", "U95 mm", "linear propagation"]
     return text_table(f"frame T, {found.draws} draws ({found.estimator})", columns, rows)
 
