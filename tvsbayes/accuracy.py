@@ -253,7 +253,7 @@ def error_map(
     shape = tuple(len(x) for x in axes)
     rms, bias, valid = {}, {}, np.ones(shape, dtype=bool)
     for name, error, meets in zip(names, np.asarray(found.error_mm), np.asarray(found.meets), strict=True):
-        share = 1 - meets.mean(axis=0)
+        share = (~meets).mean(axis=0)
         kept = np.where(meets[:, None], error, 0.0)
         count = np.maximum(meets.sum(axis=0), 1)
         usable = share <= DIVERGING_SHARE

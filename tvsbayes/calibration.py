@@ -11,6 +11,7 @@ from __future__ import annotations
 import io
 import json
 import math
+import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -44,6 +45,7 @@ DIFFERENCE = 0.05
 """Half width of the central differences in standard deviations: truncation and rounding both below 1e-5."""
 AIM_STEPS, AIM_RAD = 40, 1e-11
 RESULTS_BYTES_MAX = 64 * 1024 * 1024
+UNPACKED_BYTES_MAX = 4 * RESULTS_BYTES_MAX
 _TO_RAD = math.pi / 180
 
 
@@ -176,14 +178,18 @@ def beam_components(values: Mapping[str, object], pan_deg, tilt_deg, m=np) -> tu
 def range_components(origin: tuple, direction: tuple, baseline_mm, aperture_deg, azimuth: bool, m=np):
     """Range along the beam at which the aperture sees it under angle B, mm (derivation: `coordinates.meeting`).
 
-    Not a number where the beam misses the cone of B; zero or negative where it meets only its backward extension.
+    Not a number where the beam misses the cone or half-plane of B; zero or negative where it meets only its backward
+    extension.
     """
     x, y, z = origin
     u, v, w = direction
     y = y + 0.5 * baseline_mm
     sin_b, cos_b = m.sin(aperture_deg * _TO_RAD), m.cos(aperture_deg * _TO_RAD)
     if azimuth:
-        return (y * sin_b - x * cos_b) / (u * cos_b - v * sin_b)
+        reach = (y * sin_b - x * cos_b) / (u * cos_b - v * sin_b)
+        ahead = (x + reach * u) * sin_b + (y + reach * v) * cos_b
+        # The other half of B's plane is behind the aperture.
+        return (reach if ahead >= 0 else math.nan) if m is math else np.where(ahead >= 0, reach, np.nan)
     mx, my, mz = y * w - z * v, z * u - x * w, x * v - y * u
     inside = (mx * mx + mz * mz) * sin_b * sin_b - my * my * cos_b * cos_b
     if m is math:
@@ -301,6 +307,8 @@ class Calibration:
         """
         sides = sides_of(approach)
         steps = (float(pan_steps), float(tilt_steps))
+        if not all(map(math.isfinite, (*steps, aperture_deg))):
+            raise no_meeting(pan_steps, tilt_steps, aperture_deg)
         estimate = self._points(self.estimates, steps, sides, (0.0, 0.0), aperture_deg, math)
         if not math.isfinite(estimate[0]):
             raise no_meeting(pan_steps, tilt_steps, aperture_deg)
@@ -404,7 +412,8 @@ class Calibration:
         A mirror angle moves the beam by nearly as much, so that plain correction converges.
         """
         pan_deg = tilt_deg = 0.0
-        for _ in range(AIM_STEPS):
+        finite = np.all(np.isfinite((azimuth_deg, elevation_deg) if target is None else target))
+        for _ in range(AIM_STEPS if finite else 0):
             o, d = beam_components(self.estimates, pan_deg, tilt_deg, math)
             if target is None:
                 goal = (azimuth_deg, elevation_deg)
@@ -433,7 +442,7 @@ class Calibration:
         tried = (positive, negative) if side is None else (side,)
         for name in tried:
             if name not in SIDES[axis]:
-                raise bad_approach(axis, name)
+                raise bad_approach(axis, name, SIDES[axis][::-1])
             sign = APPROACH_SIGN[name]
             steps = self._steps_at(axis, angle_deg, sign)
             ratio_sign = 1 if self.estimates[f"degrees_per_step.{axis}"] > 0 else -1
@@ -490,9 +499,8 @@ def direction_of(azimuth_deg: float, elevation_deg: float) -> np.ndarray:
     return np.array([level * math.cos(azimuth), level * math.sin(azimuth), math.sin(elevation)])
 
 
-def bad_approach(axis: str, name: object) -> InputError:
-    """The refusal of an approach that the axis does not have."""
-    allowed = (*SIDES[axis][::-1], "unknown")
+def bad_approach(axis: str, name: object, allowed: tuple[str, ...]) -> InputError:
+    """The refusal of an approach that is not allowed for the axis."""
     return InputError(
         "approach",
         f"{axis} approach {escaped(str(name))!r}; allowed: {', '.join(allowed)}",
@@ -506,8 +514,9 @@ def bad_approach(axis: str, name: object) -> InputError:
 def sides_of(approach: tuple[str, str]) -> tuple[float, float]:
     """+1, -1 or 0 for the approach of (pan, tilt)."""
     for axis, name in zip(AXES, approach, strict=True):
-        if name not in (*SIDES[axis], "unknown"):
-            raise bad_approach(axis, name)
+        allowed = (*SIDES[axis][::-1], "unknown")
+        if name not in allowed:
+            raise bad_approach(axis, name, allowed)
     return float(APPROACH_SIGN[approach[0]]), float(APPROACH_SIGN[approach[1]])
 
 
@@ -701,6 +710,12 @@ def _shaped(calibration: Calibration) -> Calibration:
             raise ValueError(f"{name} has shape {array.shape}, wanted {shape} of finite numbers")
     if not set(NOISE_NAMES) <= set(calibration.noise_variance) or not set(AXES) <= set(calibration.overshoot_steps):
         raise ValueError("a noise variance or an overshoot is missing")
+    if not all(math.isfinite(variance) and variance >= 0 for variance in calibration.noise_variance.values()):
+        raise ValueError("a noise variance is no variance")
+    if not all(isinstance(steps, int) and steps >= 0 for steps in calibration.overshoot_steps.values()):
+        raise ValueError("an overshoot is no number of steps")
+    if not all(math.isfinite(period) and period > 0 for period in calibration.period_deg.values()):
+        raise ValueError("a period of a transmission error is not positive")
     return calibration
 
 
@@ -708,6 +723,9 @@ def read_draws(path: Path) -> Calibration:
     """Read `draws.npz`; errors as in `load_calibration`."""
     data = read_bytes(path, RESULTS_BYTES_MAX)
     try:
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            if sum(member.file_size for member in archive.infolist()) > UNPACKED_BYTES_MAX:
+                raise ValueError(f"more than {UNPACKED_BYTES_MAX} bytes when unpacked")
         with np.load(io.BytesIO(data), allow_pickle=False) as file:
             if "format" not in file.files and "physical" in file.files:
                 raise ValueError("the fit behind it did not converge")
@@ -731,6 +749,7 @@ def read_draws(path: Path) -> Calibration:
 def _from_json(path: Path) -> Calibration:
     keys = parse_json(read_bytes(path, RESULTS_BYTES_MAX), escaped(path.name))
     keys.word("format", (CALIBRATION_FORMAT,))
+    convention = keys.word("aperture_convention", ("in-plane", "azimuth"))
     try:
         d = keys.values
         if tuple(d["covariance"]["names"]) != INPUT_NAMES:
@@ -741,7 +760,7 @@ def _from_json(path: Path) -> Calibration:
                 covariance=np.array(d["covariance"]["matrix"], dtype=float),
                 noise_variance={name: float(value) for name, value in d["noise_variance_deg2"].items()},
                 overshoot_steps={axis: int(value) for axis, value in d["overshoot_steps"].items()},
-                azimuth=d["aperture_convention"] == "azimuth",
+                azimuth=convention == "azimuth",
                 period_deg={axis: float(value) for axis, value in d["harmonic_period_deg"].items()},
                 estimator=str(d["estimator"]),
                 range_steps=np.array([d["range_steps"][axis] for axis in AXES], dtype=float),

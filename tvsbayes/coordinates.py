@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import equinox as eqx
 import jax
@@ -36,6 +37,8 @@ DRAWS = 1000
 """Draws carried to a point unless the caller wants others; DESIGN 5 asks for 500 at least."""
 DIVERGING_SHARE = 1e-3
 """Share of draws without a point above which a point is refused (DESIGN 5)."""
+ROUNDING = 1e-12
+"""Of coordinates, relative to the range."""
 POINTS = 256
 """Points per call of the compiled functions."""
 NOISES = 5
@@ -130,7 +133,9 @@ def meeting(
     range_mm = jnp.where(azimuth_convention, plane, cone)
     seen = w + range_mm * direction
     in_sight = jnp.where(azimuth_convention, seen[0] * sin_b, 0.0) + seen[1] * cos_b
-    meets = (azimuth_convention | touches) & (range_mm > 0) & (in_sight >= 0) & jnp.isfinite(range_mm)
+    # At B = 90 deg both nappes are one plane, and y is nought but for rounding.
+    faces = in_sight >= -ROUNDING * jnp.abs(range_mm * cos_b)
+    meets = (azimuth_convention | touches) & (range_mm > 0) & faces & jnp.isfinite(range_mm)
     return Meeting(origin_mm + range_mm * direction, range_mm, meets)
 
 
@@ -311,6 +316,11 @@ class Locations:
     estimator: str
     draws: int
 
+    @cached_property
+    def digits_held(self) -> np.ndarray:
+        """Significant digits of u, two at most, to which the law of propagation holds, shape (n, 3)."""
+        return self.validation.digits_held(np.sqrt(np.diagonal(self.linear_covariance_mm2, 0, 1, 2)))
+
     def as_json(self, index: int) -> dict[str, object]:
         """One point; null where it is refused."""
         error = self.refused[index]
@@ -331,6 +341,7 @@ class Locations:
                 "u95_mm": (NORMAL_95 * u).tolist(),
                 "digits": v.digits,
                 "validated": bool(v.validated[index].all()),
+                "digits_held": int(self.digits_held[index].min()),
                 "decided": bool(v.decided[index].all()),
                 "deviation_mm": v.deviation[index].tolist(),
                 "tolerance_mm": v.tolerance[index].tolist(),
@@ -433,7 +444,7 @@ def locate(
 def _statistics(carried: Carried, law: Linear, given: Sources) -> dict[str, object]:
     """Moments, intervals and validation of one block of points."""
     meets = carried.meets
-    lost = 1 - meets.mean(axis=0)
+    lost = (~meets).mean(axis=0)
     count = len(meets)
     # The few draws without a point take the point's median place: at most one in a thousand, or the point is refused.
     xyz = carried.xyz_mm

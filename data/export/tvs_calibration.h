@@ -102,6 +102,8 @@ static int tvs_locate(double pan_steps, double tilt_steps, int pan_side, int til
     double y = o[1] + 0.5 * TVS_BASELINE_MM;
     if (TVS_AZIMUTH_CONVENTION) {
         reach = (y * sb - o[0] * cb) / (d[0] * cb - d[1] * sb);
+        if ((o[0] + reach * d[0]) * sb + (y + reach * d[1]) * cb < 0)
+            return 0;
     } else {
         double mx = y * d[2] - o[2] * d[1], my = o[2] * d[0] - o[0] * d[2], mz = o[0] * d[1] - y * d[0];
         double inside = (mx * mx + mz * mz) * sb * sb - my * my * cb * cb;
