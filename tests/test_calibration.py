@@ -183,14 +183,16 @@ def test_numpy_and_jax_refuse_the_same_settings(azimuth):
         found = carry(settings_of(pan, tilt, reading), sources(one, 1, 0))
     meets = np.asarray(found.meets)[0]
     assert 30 < meets.sum() < 226
+    codes = set()
     for i in range(256):
         try:
             point = one.locate(pan[i], tilt[i], reading[i]).xyz_mm
         except InputError as error:
-            assert error.code == "diverging"
+            codes.add(error.code)
             assert not meets[i], (pan[i], tilt[i], reading[i])
         else:
             assert meets[i], (pan[i], tilt[i], reading[i], point)
+    assert codes == ({"diverging"} if azimuth else {"diverging", "grazing"})
 
 
 @pytest.mark.parametrize("azimuth", [False, True])
@@ -200,7 +202,7 @@ def test_an_impossible_reading_is_refused(azimuth, reading):
     one = calibration(NOMINAL, {}, NO_NOISE_DEG, azimuth=azimuth)
     steps = 0 if reading != 89.99 else 200
     error = refusal(lambda: one.locate(steps, 0, reading))
-    assert error.code == "diverging"
+    assert error.code in ("diverging", "grazing")
     assert error.column == "aperture_deg" and error.remedy and error.allowed
 
 
@@ -632,7 +634,7 @@ def test_the_c_header_computes_the_same(tmp_path, periods, azimuth):
         if found:
             np.testing.assert_allclose(point, one.locate(pan, tilt, reading, approach).xyz_mm, atol=ROUNDING_MM)
         else:
-            assert refusal(lambda a=(pan, tilt, reading, approach): one.locate(*a)).code == "diverging"
+            assert refusal(lambda a=(pan, tilt, reading, approach): one.locate(*a)).code in ("diverging", "grazing")
             refused += 1
     assert refused >= 4
 

@@ -308,10 +308,10 @@ class Calibration:
         sides = sides_of(approach)
         steps = (float(pan_steps), float(tilt_steps))
         if not all(map(math.isfinite, (*steps, aperture_deg))):
-            raise no_meeting(pan_steps, tilt_steps, aperture_deg)
+            raise self.refusal(pan_steps, tilt_steps, aperture_deg, sides)
         estimate = self._points(self.estimates, steps, sides, (0.0, 0.0), aperture_deg, math)
         if not math.isfinite(estimate[0]):
-            raise no_meeting(pan_steps, tilt_steps, aperture_deg)
+            raise self.refusal(pan_steps, tilt_steps, aperture_deg, sides)
         half, sets = self._differences
         moved = np.array(self._points(sets, steps, sides, (0.0, 0.0), aperture_deg))
         count = len(half)
@@ -320,8 +320,39 @@ class Calibration:
         for variance, slope in self._noise_terms(steps, sides, aperture_deg):
             covariance += variance * np.outer(slope, slope)
         if not np.all(np.isfinite(covariance)):
-            raise no_meeting(pan_steps, tilt_steps, aperture_deg)
+            raise self.refusal(pan_steps, tilt_steps, aperture_deg, sides)
         return Located(np.array(estimate), covariance, NORMAL_95 * np.sqrt(np.diag(covariance)))
+
+    def refusal(
+        self, pan_steps: float, tilt_steps: float, aperture_deg: float, sides: tuple[float, float]
+    ) -> InputError:
+        """Why beam and line of sight of a look have no point in common, or none that can be told: by name.
+
+        "grazing" where the estimated beam passes the aperture's cone without touching it, else "diverging".
+        """
+        where = f"pan {pan_steps:g}, tilt {tilt_steps:g} steps, aperture {aperture_deg:g} deg"
+        given = {"column": "aperture_deg", "found": f"{aperture_deg:g}"}
+        if all(map(math.isfinite, (pan_steps, tilt_steps, aperture_deg))) and not self.azimuth:
+            values = self.estimates
+            origin, direction = beam_components(
+                values, *self._angles(values, (pan_steps, tilt_steps), sides, math), math
+            )
+            true_deg = aperture_deg - values["aperture_zero_deg"]
+            if math.isnan(range_components(origin, direction, values["baseline_mm"], true_deg, False, math)):
+                return InputError(
+                    "grazing",
+                    f"{where}: the beam passes the cone of all points seen under this angle without touching it",
+                    **given,
+                    allowed="readings away from 0 and 180 deg, of a beam in the plane of baseline and spot",
+                    remedy="check reading and counters; the beam runs past the baseline, not towards a spot",
+                )
+        return InputError(
+            "diverging",
+            f"{where}: beam and line of sight diverge",
+            **given,
+            allowed="readings B with B + C clearly below 180 deg, C the beam's own angle to the baseline",
+            remedy="check reading and counters; such a target is too far, or behind the scanner",
+        )
 
     def _points(self, values, steps, sides, extra_deg, aperture_deg, m=np) -> tuple:
         """Points (x, y, z); not a number where there is none in front of the scanner."""
@@ -518,19 +549,6 @@ def sides_of(approach: tuple[str, str]) -> tuple[float, float]:
         if name not in allowed:
             raise bad_approach(axis, name, allowed)
     return float(APPROACH_SIGN[approach[0]]), float(APPROACH_SIGN[approach[1]])
-
-
-def no_meeting(pan_steps: float, tilt_steps: float, aperture_deg: float) -> InputError:
-    """The refusal of a beam and a line of sight that have no point in common."""
-    return InputError(
-        "diverging",
-        f"pan {pan_steps:g}, tilt {tilt_steps:g} steps, aperture {aperture_deg:g} deg: beam and line of sight diverge "
-        "or graze each other",
-        column="aperture_deg",
-        found=f"{aperture_deg:g}",
-        allowed="readings B with B + C clearly below 180 deg, C the beam's own angle to the baseline",
-        remedy="check reading and counters; such a target is too far, or behind the scanner",
-    )
 
 
 def receiver_priors(campaign: Campaign) -> dict[str, tuple[float, float]]:

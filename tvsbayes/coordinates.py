@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from tvsbayes.calibration import AXES, INPUT_NAMES, NOISE_NAMES, Calibration, no_meeting, sides_of
+from tvsbayes.calibration import AXES, INPUT_NAMES, NOISE_NAMES, Calibration, sides_of
 from tvsbayes.files import InputError
 from tvsbayes.model import (
     FULL_TURN_DEG,
@@ -434,9 +434,11 @@ def locate(
     checks = [part["validation"] for part in parts]
     fields = ("tolerance", "deviation", "error", "validated", "decided")
     validation = Validation(2, **{name: np.concatenate([getattr(v, name) for v in checks]) for name in fields})
+    steps, side = np.asarray(settings.steps), np.asarray(settings.side)
+    reading = np.degrees(settings.aperture_rad)
+    lost = ~(joined["diverging_share"] <= DIVERGING_SHARE)
     refused = tuple(
-        no_meeting(*map(float, settings.steps[i]), float(np.degrees(settings.aperture_rad[i]))) if bad else None
-        for i, bad in enumerate(~(joined["diverging_share"] <= DIVERGING_SHARE))
+        calibration.refusal(*steps[i], float(reading[i]), tuple(side[i])) if bad else None for i, bad in enumerate(lost)
     )
     return Locations(**joined, validation=validation, refused=refused, estimator=calibration.estimator, draws=draws)
 
