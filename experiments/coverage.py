@@ -62,9 +62,9 @@ def one_rig(task: tuple[str, int]) -> dict[str, object]:
     from tvsbayes.classic import classic
     from tvsbayes.files import shipped_data
     from tvsbayes.joint import fit
+    from tvsbayes.model import use_compilation_cache
     from tvsbayes.rigs import read_rig
     from tvsbayes.simulation import effective_deg_per_step, effective_mirror_offset_mm, simulate
-    from tvsbayes.solver import use_compilation_cache
 
     use_compilation_cache()
     folder = shipped_data() / "rigs" / "mounted"

@@ -28,7 +28,7 @@ from tvsbayes.classic import classic
 from tvsbayes.coordinates import settings_of
 from tvsbayes.files import shipped_data
 from tvsbayes.joint import fit
-from tvsbayes.solver import use_compilation_cache
+from tvsbayes.model import use_compilation_cache
 
 RANGES_MM = (200.0, 300.0, 400.0, 500.0, 700.0, 1000.0, 1400.0)
 PICTURE = Path(__file__).with_suffix(".png")

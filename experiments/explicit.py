@@ -28,11 +28,10 @@ from tvsbayes import likelihood
 from tvsbayes.campaign import PlanStep
 from tvsbayes.joint import fit
 from tvsbayes.likelihood import campaign_arrays, nearest_range, observe, stop_variances
-from tvsbayes.model import NAMES, mirror_angles, parameter_space
+from tvsbayes.model import NAMES, mirror_angles, parameter_space, use_compilation_cache
 from tvsbayes.posterior import sample
 from tvsbayes.rigs import Prior
 from tvsbayes.simulation import simulate
-from tvsbayes.solver import use_compilation_cache
 
 KEPT = ("degrees_per_step", "ratio_contrast", "backlash", "tilt_zero", "stop_sd", "pixel_scale")
 STOPS = ((60, 40), (160, -40), (60, 40), (200, 40), (100, -40), (0, 0))

@@ -35,8 +35,7 @@ from numpyro.infer import NUTS
 from tvsbayes import likelihood
 from tvsbayes.campaign import input_hashes, read_campaign
 from tvsbayes.joint import JointFit, derived_quantities, fit
-from tvsbayes.model import NAMES, NOISE_NAMES
-from tvsbayes.solver import use_compilation_cache
+from tvsbayes.model import NAMES, NOISE_NAMES, use_compilation_cache
 
 ROOT = Path(__file__).parent.parent
 HEADLINES = (

@@ -58,8 +58,8 @@ def one_rig(task: tuple[int]) -> dict[str, object]:
     from tvsbayes.classic import classic
     from tvsbayes.coordinates import locate
     from tvsbayes.joint import fit
+    from tvsbayes.model import use_compilation_cache
     from tvsbayes.simulation import simulate
-    from tvsbayes.solver import use_compilation_cache
 
     use_compilation_cache()
     start = time.perf_counter()

@@ -50,9 +50,9 @@ def clean_rig(task: tuple[str, int]) -> dict[str, object]:
     # As in coverage.py: ordinary fits pad to 512 spots, here every campaign is alike.
     likelihood.SMALLEST_BUCKET = 96
     from tvsbayes.joint import fit
+    from tvsbayes.model import use_compilation_cache
     from tvsbayes.posterior import sample
     from tvsbayes.simulation import simulate
-    from tvsbayes.solver import use_compilation_cache
 
     use_compilation_cache()
     simulated = simulate(mounted_rig(), shipped_plan(protocol), seed, aperture=protocol == "grid")
@@ -119,7 +119,7 @@ def broken_rig(task: tuple[str, int]) -> dict[str, object]:
 
     likelihood.SMALLEST_BUCKET = 128
     from tvsbayes.joint import fit
-    from tvsbayes.solver import use_compilation_cache
+    from tvsbayes.model import use_compilation_cache
 
     use_compilation_cache()
     campaign, truth = broken_campaign(condition, seed)

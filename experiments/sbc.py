@@ -94,9 +94,9 @@ def one_simulation(task: tuple[str, int]) -> dict[str, object]:
     # A small campaign in a small bucket: ordinary ones pad to 512 spots to share a compilation.
     likelihood.SMALLEST_BUCKET = 64
     from tvsbayes.joint import fit
+    from tvsbayes.model import use_compilation_cache
     from tvsbayes.posterior import sample
     from tvsbayes.simulation import simulate
-    from tvsbayes.solver import use_compilation_cache
 
     use_compilation_cache()
     simulated = simulate(mounted_rig(), dense_plan(SHEETS), seed)

@@ -138,9 +138,9 @@ def demo(
         from tvsbayes.classic import classic as estimate_classic
         from tvsbayes.information import summarise
         from tvsbayes.joint import fit as fit_joint
+        from tvsbayes.model import use_compilation_cache
         from tvsbayes.report import demo_text, write_results
         from tvsbayes.simulation import effective_deg_per_step, effective_mirror_offset_mm, read_truth
-        from tvsbayes.solver import use_compilation_cache
 
         use_compilation_cache()
         campaign = read_campaign(folder)
@@ -261,8 +261,8 @@ def fit(
     from tvsbayes.accuracy import DRAWS_KEPT, calibration_of
     from tvsbayes.information import summarise
     from tvsbayes.joint import fit as fit_joint
+    from tvsbayes.model import use_compilation_cache
     from tvsbayes.report import fit_text, write_results
-    from tvsbayes.solver import use_compilation_cache
 
     use_compilation_cache()
     folder = out or campaign / "results"
@@ -381,8 +381,8 @@ def locate(
         sides_of((pan_approach, tilt_approach))
     calibration = _calibration(campaign)
     from tvsbayes.coordinates import locate as locate_points
+    from tvsbayes.model import use_compilation_cache
     from tvsbayes.report import locations_text
-    from tvsbayes.solver import use_compilation_cache
 
     use_compilation_cache()
     found = locate_points(calibration, *where, draws=draws, seed=seed)

@@ -275,16 +275,11 @@ def propagate(settings: Settings, given: Sources) -> Linear:
     Inputs are `INPUT_NAMES` and the unit noises, whose sds are held at their root mean square.
     """
 
-    def one(setting):
-        point = jax.tree.map(lambda x: x[None], setting)
+    def function(values):
+        inputs = jnp.concatenate([values[: len(INPUT_NAMES)], given.stop_sd_deg])
+        return _look(inputs, values[len(INPUT_NAMES) :], settings, given).xyz_mm.T
 
-        def function(values):
-            inputs = jnp.concatenate([values[: len(INPUT_NAMES)], given.stop_sd_deg])
-            return _look(inputs, values[len(INPUT_NAMES) :], point, given).xyz_mm[:, 0]
-
-        return linear(function, given.mean, given.covariance)
-
-    return jax.vmap(one)(settings)
+    return linear(function, given.mean, given.covariance)
 
 
 @dataclass(frozen=True)

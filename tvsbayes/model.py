@@ -17,12 +17,15 @@ one compiled function serves every choice of fixed parameters. Units of physical
 
 from __future__ import annotations
 
+import os
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.scipy.special import ndtr, ndtri
 from jaxtyping import Array, Bool, Float, Int
+from platformdirs import user_cache_path
 
 from tvsbayes.rigs import FULL_TURN_DEG, RIG_PRIORS, STEREO_PARAMETER_NAMES, RigTable, Stereo
 
@@ -43,6 +46,17 @@ there gets a finite gradient back, and no spot is ever seen there."""
 WIDEST_TAN2 = 4.0
 """Squared tangent (63 degrees) beyond which the distortion polynomial is held: it is fitted inside the image
 and folds outside it."""
+
+
+def use_compilation_cache() -> None:
+    """Keep compiled functions in the user's cache folder (or `TVSBAYES_CACHE`).
+
+    For programs such as the command line, which own their process: it changes a global setting of JAX, so nothing
+    in the library calls it.
+    """
+    folder = os.environ.get("TVSBAYES_CACHE") or str(user_cache_path("tvsbayes") / "jax")
+    jax.config.update("jax_compilation_cache_dir", folder)
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
 
 
 def materialise(tree):

@@ -8,7 +8,6 @@ chose; the covariance follows that choice. float64 throughout.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -19,7 +18,6 @@ import lineax as lx
 import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Float, PyTree
-from platformdirs import user_cache_path
 
 TIGHT = 1e-12
 """Relative and absolute tolerance that solved 44 of 44 StRD fits; 1e-8 still accepted one wrong answer."""
@@ -65,17 +63,6 @@ class LeastSquares:
     scaled_gradient: float
     converged: bool
     problems: tuple[str, ...]
-
-
-def use_compilation_cache() -> None:
-    """Keep compiled functions in the user's cache folder (or `TVSBAYES_CACHE`).
-
-    For programs such as the command line, which own their process: it changes a global setting of JAX, so nothing
-    in the library calls it.
-    """
-    folder = os.environ.get("TVSBAYES_CACHE") or str(user_cache_path("tvsbayes") / "jax")
-    jax.config.update("jax_compilation_cache_dir", folder)
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
 
 
 def damped_solver(tolerance: Float[Array, ""]) -> optx.LevenbergMarquardt:
