@@ -388,10 +388,10 @@ def test_spots_at_one_stop_inform_no_headline(ask, mounted_rig, tmp_path):
 def test_a_fit_that_did_not_converge_is_exit_4(ask, say, folder, monkeypatch):
     import tvsbayes.joint
 
-    real = tvsbayes.joint.fit
+    fitted = tvsbayes.joint.fit(read_campaign(folder))
 
     def astray(*arguments, **options):
-        return replace(real(*arguments, **options), converged=False, problems=("it went astray",))
+        return replace(fitted, converged=False, problems=("it went astray",))
 
     monkeypatch.setattr(tvsbayes.joint, "fit", astray)
     code, document = ask("fit", folder, "--no-sample")

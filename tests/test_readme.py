@@ -22,7 +22,7 @@ def section(title: str) -> str:
 
 
 def first_column(text: str) -> list[str]:
-    return re.findall(r"^\| `(\w+)", text, flags=re.MULTILINE)
+    return re.findall(r"^\| `([\w-]+)", text, flags=re.MULTILINE)
 
 
 def test_python_example_does_what_it_says(monkeypatch):
