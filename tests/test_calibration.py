@@ -311,10 +311,11 @@ def test_the_approach_is_obeyed_or_the_other_side_is_taken(bent):
 def test_targets_out_of_limits_or_reach_are_refused(bent):
     error = refusal(lambda: bent.steps_for((600.0, 40.0, 200.0), limits={"tilt": (-50, 50)}))
     assert (error.code, error.column, error.allowed) == ("outside-limits", "tilt", "-50 to 50") and error.remedy
-    for target in ((0.0, 100.0, 0.0), (math.nan, 0.0, 0.0), (5.0, 80.0, 900.0)):
+    for target in ((0.0, 100.0, 0.0), (math.nan, 0.0, 0.0), (5.0, 80.0, 900.0), (-400.0, 50.0, 10.0)):
         error = refusal(lambda target=target: bent.steps_for(target))
         assert error.code == "out-of-reach" and error.allowed and error.remedy
-    for wanted in ({"azimuth_deg": 0.0, "elevation_deg": 95.0}, {"azimuth_deg": math.inf, "elevation_deg": 0.0}):
+    for azimuth, elevation in ((0.0, 95.0), (math.inf, 0.0), (95.0, 0.0)):
+        wanted = {"azimuth_deg": azimuth, "elevation_deg": elevation}
         assert refusal(lambda wanted=wanted: bent.steps_for(**wanted)).code == "out-of-reach"
     for wanted in ({}, {"azimuth_deg": 1.0}, {"xyz_mm": (5, 0, 0), "azimuth_deg": 1.0, "elevation_deg": 1.0}):
         assert refusal(lambda wanted=wanted: bent.steps_for(**wanted)).code == "no-target"

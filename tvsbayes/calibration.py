@@ -444,7 +444,9 @@ class Calibration:
         """
         pan_deg = tilt_deg = 0.0
         finite = np.all(np.isfinite((azimuth_deg, elevation_deg) if target is None else target))
-        for _ in range(AIM_STEPS if finite else 0):
+        # Behind the baseline there is no triangle for the aperture to close.
+        ahead = finite and (abs(azimuth_deg) < 90 if target is None else target[0] > 0)
+        for _ in range(AIM_STEPS if ahead else 0):
             o, d = beam_components(self.estimates, pan_deg, tilt_deg, math)
             if target is None:
                 goal = (azimuth_deg, elevation_deg)

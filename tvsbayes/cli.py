@@ -358,7 +358,12 @@ def locate(
     pan_approach: Annotated[str, typer.Option("--pan-approach", help="left, right or unknown.")] = "left",
     tilt_approach: Annotated[str, typer.Option("--tilt-approach", help="up, down or unknown.")] = "up",
     aperture_deg: Annotated[float | None, typer.Option("--aperture-deg", help="Reading B of the aperture.")] = None,
-    points: Annotated[Path | None, typer.Option("--points", help="CSV of points with these five columns.")] = None,
+    points: Annotated[
+        Path | None,
+        typer.Option(
+            "--points", help="CSV with columns pan_steps, tilt_steps, pan_approach, tilt_approach, aperture_deg."
+        ),
+    ] = None,
     draws: Annotated[int, typer.Option("--draws", min=500, max=100_000, help="Draws per point.")] = 1000,
     budget: Annotated[
         bool, typer.Option("--budget", help="Also what the uncertainty of the point consists of.")
@@ -409,11 +414,11 @@ def locate(
 @app.command("steps-for")
 def steps_for(
     campaign: CampaignFolder,
-    x_mm: Annotated[float | None, typer.Option("--x-mm", help="Wanted point, frame T.")] = None,
-    y_mm: Annotated[float | None, typer.Option("--y-mm")] = None,
-    z_mm: Annotated[float | None, typer.Option("--z-mm")] = None,
+    x_mm: Annotated[float | None, typer.Option("--x-mm", help="Wanted point, frame T: depth.")] = None,
+    y_mm: Annotated[float | None, typer.Option("--y-mm", help="Along the baseline, towards the positioner.")] = None,
+    z_mm: Annotated[float | None, typer.Option("--z-mm", help="Up.")] = None,
     azimuth_deg: Annotated[float | None, typer.Option("--azimuth-deg", help="Wanted direction: C - 90 deg.")] = None,
-    elevation_deg: Annotated[float | None, typer.Option("--elevation-deg")] = None,
+    elevation_deg: Annotated[float | None, typer.Option("--elevation-deg", help="Above the horizontal.")] = None,
     pan_approach: Annotated[str | None, typer.Option("--pan-approach", help="left or right (default: left).")] = None,
     tilt_approach: Annotated[str | None, typer.Option("--tilt-approach", help="up or down (default: up).")] = None,
     rig: Annotated[Path | None, typer.Option("--rig", help="Rig file whose [positioner] limits are kept.")] = None,
