@@ -361,6 +361,12 @@ def with_diverging(count: int) -> Calibration:
     return replace(one, inputs=inputs)
 
 
+def test_the_law_alone_has_no_number_where_there_is_no_point():
+    found = locate_linear(calibration(BENT, SD, NOISE_DEG), settings_of([100.0, 100.0], [20.0, 20.0], [70.0, 150.0]))
+    for field in (found.value, found.jacobian, found.covariance):
+        assert np.isfinite(field[0]).all() and np.isnan(field[1]).all()
+
+
 @pytest.mark.parametrize(("count", "refused"), [(0, False), (1, False), (2, True), (DRAWS, True)])
 def test_more_than_a_thousandth_of_diverging_draws_refuses(count, refused):
     """One of 1000 is exactly the allowed share."""

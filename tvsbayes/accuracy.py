@@ -17,16 +17,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from tvsbayes.calibration import INPUT_NAMES, Calibration, calibration_of_draws
+from tvsbayes.calibration import INPUT_NAMES, Calibration, calibration_of_draws, direction_of
 from tvsbayes.classic import ClassicResult
 from tvsbayes.coordinates import (
     DIVERGING_SHARE,
     INPUT_COLUMNS,
     NOISES,
-    Beams,
     Settings,
     Sources,
     beams_at,
+    half_baseline,
     meeting,
     model_from,
     propagate,
@@ -34,7 +34,7 @@ from tvsbayes.coordinates import (
 )
 from tvsbayes.joint import JointFit
 from tvsbayes.likelihood import aperture_angle
-from tvsbayes.model import INDEX, NAMES, RIG_NAMES
+from tvsbayes.model import INDEX, NAMES, RIG_NAMES, Beam
 from tvsbayes.posterior import Posterior
 from tvsbayes.rigs import RIG_PRIORS, Prior
 
@@ -138,7 +138,7 @@ def simple_calibration(
     return SimpleCalibration(ratios, a - offset, 0.5 * a - offset, priors["pan_zero_emission_deg"].value)
 
 
-def simple_rays(simple: SimpleCalibration, steps: np.ndarray) -> Beams:
+def simple_rays(simple: SimpleCalibration, steps: np.ndarray) -> Beam:
     """Beams (points) of a simple calibration at counters (points, 2).
 
     The azimuth C0 + k n and the elevation k n are turned into a direction, so that either convention of the
@@ -148,12 +148,10 @@ def simple_rays(simple: SimpleCalibration, steps: np.ndarray) -> Beams:
     k = simple.deg_per_step
     pan = np.where(steps[:, 0] >= 0, k["left"], k["right"]) * steps[:, 0] + simple.pan_zero_emission_deg - 90.0
     tilt = np.where(steps[:, 1] >= 0, k["up"], k["down"]) * steps[:, 1]
-    azimuth, elevation = np.radians(pan), np.radians(tilt)
-    level = np.cos(elevation)
-    direction = np.stack([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)])
+    direction = direction_of(pan, tilt)
     origin = np.zeros_like(direction)
     origin[1] = simple.origin_y_mm
-    return Beams(jnp.asarray(origin), jnp.asarray(direction))
+    return Beam(jnp.asarray(origin), jnp.asarray(direction))
 
 
 @dataclass(frozen=True)
@@ -183,7 +181,7 @@ class _Errors(eqx.Module):
 
 
 @eqx.filter_jit
-def _errors(settings: Settings, range_mm: Array, known: tuple[Beams, ...], a_mm: Array, given: Sources) -> _Errors:
+def _errors(settings: Settings, range_mm: Array, known: tuple[Beam, ...], a_mm: Array, given: Sources) -> _Errors:
     """Errors of beams that are taken as known, on every draw of the rig."""
 
     def one(inputs, noise):
@@ -193,7 +191,7 @@ def _errors(settings: Settings, range_mm: Array, known: tuple[Beams, ...], a_mm:
         receiver = model.receiver
         # `aperture_angle` works in frame P; a rig whose frames coincide takes points of frame T moved to the pan axis.
         aligned = eqx.tree_at(lambda r: r.pan_zero_emission_rad, receiver, jnp.asarray(jnp.pi / 2))
-        moved = points - jnp.stack([jnp.zeros(()), 0.5 * receiver.baseline_mm, jnp.zeros(())])[:, None]
+        moved = points - half_baseline(receiver.baseline_mm, range_mm)
         angle = aperture_angle(aligned, moved, given.azimuth_convention)
         reading = angle + receiver.aperture_zero_rad + receiver.aperture_sd_rad * noise[4]
         found = [
@@ -208,9 +206,9 @@ def _errors(settings: Settings, range_mm: Array, known: tuple[Beams, ...], a_mm:
 
 def error_map(
     calibration: Calibration,
-    pan_steps: Sequence[float],
-    tilt_steps: Sequence[float],
-    range_mm: Sequence[float],
+    pan_steps: Sequence[float] | np.ndarray,
+    tilt_steps: Sequence[float] | np.ndarray,
+    range_mm: Sequence[float] | np.ndarray,
     *,
     simple: Mapping[str, SimpleCalibration],
     approach: tuple[float, float] = (1.0, 1.0),

@@ -12,7 +12,7 @@ import io
 import json
 import math
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -24,6 +24,8 @@ from tvsbayes.files import InputError, closest, escaped, parse_json, read_bytes,
 from tvsbayes.rigs import FULL_TURN_DEG, HARMONIC_PRIORS
 
 CALIBRATION_FORMAT = "tvsbayes-calibration/1"
+NO_CALIBRATION = "no-calibration"
+"""Code of the refusal of results that are whole but hold no calibration."""
 INPUT_NAMES: tuple[str, ...] = (
     *("degrees_per_step.pan", "degrees_per_step.tilt", "backlash_deg.pan", "backlash_deg.tilt"),
     *HARMONIC_PRIORS,
@@ -43,6 +45,8 @@ CLEARED_PROBABILITY = 0.99
 """With this probability an overshoot takes up all the play."""
 DIFFERENCE = 0.05
 """Half width of the central differences in standard deviations: truncation and rounding both below 1e-5."""
+NUDGE_DEG = 1e-4
+"""Half width of the central differences in stop errors and readings, whose sds are 0.01 deg and more."""
 AIM_STEPS, AIM_RAD = 40, 1e-11
 RESULTS_BYTES_MAX = 64 * 1024 * 1024
 UNPACKED_BYTES_MAX = 4 * RESULTS_BYTES_MAX
@@ -312,13 +316,12 @@ class Calibration:
         estimate = self._points(self.estimates, steps, sides, (0.0, 0.0), aperture_deg, math)
         if not math.isfinite(estimate[0]):
             raise self.refusal(pan_steps, tilt_steps, aperture_deg, sides)
-        half, sets = self._differences
-        moved = np.array(self._points(sets, steps, sides, (0.0, 0.0), aperture_deg))
-        count = len(half)
-        jacobian = (moved[:, :count] - moved[:, count:]) / (2 * half)
-        covariance = jacobian @ self._varied_covariance @ jacobian.T
-        for variance, slope in self._noise_terms(steps, sides, aperture_deg):
-            covariance += variance * np.outer(slope, slope)
+
+        def measure(values, extra_deg, m):
+            return self._points(values, steps, sides, extra_deg[:2], aperture_deg + extra_deg[2], m)
+
+        variances = (*self._pointing_variance(sides), self.noise_variance["aperture_sd_deg"])
+        covariance = self._propagated(measure, variances)
         if not np.all(np.isfinite(covariance)):
             raise self.refusal(pan_steps, tilt_steps, aperture_deg, sides)
         return Located(np.array(estimate), covariance, NORMAL_95 * np.sqrt(np.diag(covariance)))
@@ -363,26 +366,34 @@ class Calibration:
         reach = (reach if reach > 0 else math.nan) if m is math else np.where(reach > 0, reach, np.nan)
         return tuple(o + reach * d for o, d in zip(origin, direction, strict=True))
 
-    def _pointing_variance(self, sides: tuple[float, float]) -> list[float]:
+    def _pointing_variance(self, sides: tuple[float, float]) -> tuple[float, ...]:
         """Variance of each mirror angle at one stop: stop error, and play where the side is unknown."""
         result = []
         for axis, side in zip(AXES, sides, strict=True):
             low, high = (self.noise_variance[f"stop_sd_deg.{name}"] for name in SIDES[axis])
             play = self.estimates[f"backlash_deg.{axis}"]
             result.append(high if side > 0 else low if side < 0 else 0.5 * (low + high) + play**2 / 12)
-        return result
+        return tuple(result)
 
-    def _noise_terms(self, steps, sides, aperture_deg) -> list[tuple[float, np.ndarray]]:
-        """(variance, d(point)/d(noise)) of the two stop errors and of the aperture's noise."""
-        step = 1e-4
-        shifts = ((step, 0.0, 0.0), (0.0, step, 0.0), (0.0, 0.0, step))
-        terms = []
-        variances = [*self._pointing_variance(sides), self.noise_variance["aperture_sd_deg"]]
-        for variance, (pan, tilt, aperture) in zip(variances, shifts, strict=True):
-            plus = self._points(self.estimates, steps, sides, (pan, tilt), aperture_deg + aperture, math)
-            minus = self._points(self.estimates, steps, sides, (-pan, -tilt), aperture_deg - aperture, math)
-            terms.append((variance, (np.array(plus) - np.array(minus)) / (2 * step)))
-        return terms
+    def _propagated(self, measure: Callable[..., tuple], variances_deg2: tuple[float, ...]) -> np.ndarray:
+        """Covariance of a quantity by the law of propagation (GUM 5.2), by central differences.
+
+        Args:
+            measure: (values by name, angles in degrees added to pan, tilt and reading, `math` or `numpy`) -> the
+                quantity's components.
+            variances_deg2: of what is added to pan, tilt and, where the quantity has one, the reading.
+        """
+        half, sets = self._differences
+        moved = np.array(measure(sets, (0.0, 0.0, 0.0), np))
+        jacobian = (moved[:, : len(half)] - moved[:, len(half) :]) / (2 * half)
+        covariance = jacobian @ self._varied_covariance @ jacobian.T
+        for place, variance in enumerate(variances_deg2):
+            ahead = tuple(NUDGE_DEG if k == place else 0.0 for k in range(3))
+            behind = tuple(-x for x in ahead)
+            ends = [np.array(measure(self.estimates, extra, math)) for extra in (ahead, behind)]
+            slope = (ends[0] - ends[1]) / (2 * NUDGE_DEG)
+            covariance += variance * np.outer(slope, slope)
+        return covariance
 
     def steps_for(
         self,
@@ -505,31 +516,24 @@ class Calibration:
 
     def _ray_u95(self, steps, sides, reach: float | None) -> np.ndarray:
         """95 % half widths of the beam at a range (3,), mm, or of its azimuth and elevation (2,), degrees."""
+        counters = tuple(map(float, steps))
 
-        def measure(values, extra_deg, m=np):
-            pan_deg, tilt_deg = self._angles(values, tuple(map(float, steps)), sides, m)
+        def measure(values, extra_deg, m):
+            pan_deg, tilt_deg = self._angles(values, counters, sides, m)
             o, d = beam_components(values, pan_deg + extra_deg[0], tilt_deg + extra_deg[1], m)
             if reach is not None:
-                return np.array([a + reach * b for a, b in zip(o, d, strict=True)])
-            return np.degrees([np.arctan2(d[1], d[0]), np.arcsin(d[2])])
+                return tuple(a + reach * b for a, b in zip(o, d, strict=True))
+            return tuple(np.degrees([np.arctan2(d[1], d[0]), np.arcsin(d[2])]))
 
-        half, sets = self._differences
-        moved = measure(sets, (0.0, 0.0))
-        jacobian = (moved[:, : len(half)] - moved[:, len(half) :]) / (2 * half)
-        covariance = jacobian @ self._varied_covariance @ jacobian.T
-        for axis, variance in enumerate(self._pointing_variance(sides)):
-            shift = np.zeros(2)
-            shift[axis] = 1e-4
-            slope = (measure(self.estimates, shift, math) - measure(self.estimates, -shift, math)) / 2e-4
-            covariance += variance * np.outer(slope, slope)
+        covariance = self._propagated(measure, self._pointing_variance(sides))
         return NORMAL_95 * np.sqrt(np.diag(covariance))
 
 
-def direction_of(azimuth_deg: float, elevation_deg: float) -> np.ndarray:
-    """Unit vector (3,) of a direction in frame T."""
-    azimuth, elevation = math.radians(azimuth_deg), math.radians(elevation_deg)
-    level = math.cos(elevation)
-    return np.array([level * math.cos(azimuth), level * math.sin(azimuth), math.sin(elevation)])
+def direction_of(azimuth_deg: float | np.ndarray, elevation_deg: float | np.ndarray) -> np.ndarray:
+    """Unit vectors of directions in frame T, first axis x, y, z."""
+    azimuth, elevation = np.radians(azimuth_deg), np.radians(elevation_deg)
+    level = np.cos(elevation)
+    return np.stack([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)])
 
 
 def bad_approach(axis: str, name: object, allowed: tuple[str, ...]) -> InputError:
@@ -748,7 +752,13 @@ def read_draws(path: Path) -> Calibration:
                 raise ValueError(f"more than {UNPACKED_BYTES_MAX} bytes when unpacked")
         with np.load(io.BytesIO(data), allow_pickle=False) as file:
             if "format" not in file.files and "physical" in file.files:
-                raise ValueError("the fit behind it did not converge")
+                raise InputError(
+                    NO_CALIBRATION,
+                    f"{escaped(path.name)} holds draws and no calibration: the fit behind it did not converge, or an "
+                    "older tvsbayes made it",
+                    file=escaped(path.name),
+                    remedy="run `tvsbayes fit` on the campaign again",
+                )
             if str(file["format"]) != CALIBRATION_FORMAT or tuple(file["input_names"]) != INPUT_NAMES:
                 raise ValueError(f"format {str(file['format'])[:60]!r} or other columns")
             tables = json.loads(str(file["tables"]))
@@ -762,6 +772,8 @@ def read_draws(path: Path) -> Calibration:
                     causes=tuple(tables["causes"]),
                 )
             )
+    except InputError:
+        raise
     except Exception as error:
         raise _damaged(path, error) from error
 
@@ -794,11 +806,18 @@ def _from_json(path: Path) -> Calibration:
 def stored_calibration(campaign: Campaign) -> Calibration | None:
     """The calibration in `results/` of a campaign folder, if it was made from exactly these data and priors.
 
+    None also where the results hold no calibration (`NO_CALIBRATION`).
+
     Raises:
         InputError: there are results, but damaged.
     """
     path = None if campaign.path is None else campaign.path / "results" / "draws.npz"
     if path is None or not path.exists():
         return None
-    calibration = read_draws(path)
+    try:
+        calibration = read_draws(path)
+    except InputError as error:
+        if error.code == NO_CALIBRATION:
+            return None
+        raise
     return calibration if calibration.inputs_sha256 == input_hashes(campaign) else None

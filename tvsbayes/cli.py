@@ -308,7 +308,9 @@ def _calibration(folder: Path) -> Calibration:
     report_line("results/ are missing or older than the campaign: fitting first (Laplace approximation) ...")
     from tvsbayes.accuracy import calibration_of
     from tvsbayes.joint import fit as fit_joint
+    from tvsbayes.model import use_compilation_cache
 
+    use_compilation_cache()
     result = fit_joint(campaign)
     if not result.converged:
         raise NotConverged(

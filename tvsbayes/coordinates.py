@@ -17,12 +17,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from tvsbayes.calibration import AXES, INPUT_NAMES, NOISE_NAMES, Calibration, sides_of
+from tvsbayes.calibration import AXES, INPUT_NAMES, NOISE_NAMES, NORMAL_95, Calibration, sides_of
 from tvsbayes.files import InputError
 from tvsbayes.model import (
     FULL_TURN_DEG,
     INDEX,
     NAMES,
+    Beam,
     Model,
     Scalar,
     along_batch,
@@ -31,7 +32,7 @@ from tvsbayes.model import (
     model_of,
     rotate_about_z,
 )
-from tvsbayes.propagation import NORMAL_95, Linear, Validation, linear, validate
+from tvsbayes.propagation import Linear, Validation, linear, symmetric_interval, validate
 
 DRAWS = 1000
 """Draws carried to a point unless the caller wants others; DESIGN 5 asks for 500 at least."""
@@ -91,7 +92,7 @@ class Meeting(eqx.Module):
 def meeting(
     origin_mm: Float[Array, "3 *batch"],
     direction: Float[Array, "3 *batch"],
-    baseline_mm: Float[Array, "..."],
+    baseline_mm: Scalar,
     aperture_rad: Float[Array, "*batch"],
     azimuth_convention: Bool[Array, ""],
 ) -> Meeting:
@@ -101,7 +102,8 @@ def meeting(
     c |w + r d|. Squared this is a quadratic in r whose discriminant is c^2 S^2, S^2 = |m|^2 sin^2 B - m_y^2 with the
     moment m = w x d. The root on B's own nappe is r = (w_y^2 - c^2 |w|^2) / (c S - w_y d_y + c^2 w.d), which has no
     0/0 at B = 90 deg, nor where the beam runs parallel to the cone's opposite side; the denominator vanishes where
-    beam and line of sight are parallel. On the baseline's plane it is a sin B / sin(B + C).
+    beam and line of sight are parallel. On the baseline's plane it is a sin B / sin(B + C). It is the right root for
+    beams that start on the positioner's side of the aperture (w_y > 0).
 
     Args:
         origin_mm: origins of the beams, frame T.
@@ -114,7 +116,7 @@ def meeting(
         Points; `meets` is False where the beam misses the cone (grazing), only its backward extension meets it
         (diverging), or the point lies on the other nappe.
     """
-    w = origin_mm + jnp.stack([jnp.zeros_like(origin_mm[1]), 0.5 * baseline_mm + 0 * origin_mm[1], 0 * origin_mm[2]])
+    w = origin_mm + half_baseline(baseline_mm, origin_mm[0])
     sin_b, cos_b = jnp.sin(aperture_rad), jnp.cos(aperture_rad)
     moment = jnp.stack(
         [
@@ -147,15 +149,10 @@ class Settings(eqx.Module):
     aperture_rad: Float[Array, "*points"]
 
 
-class Beams(eqx.Module):
-    """Beams in frame T."""
+def beams_at(model: Model, steps: Array, side: Array, noise: Float[Array, "noises"]) -> Beam:
+    """Beams of one rig at many settings, frame T: q = k n after homing, play taken up on the approach side.
 
-    origin_mm: Float[Array, "3 *batch"]
-    direction: Float[Array, "3 *batch"]
-
-
-def beams_at(model: Model, steps: Array, side: Array, noise: Float[Array, "noises"]) -> Beams:
-    """Beams of one rig at many settings after homing: q = k n, play taken up on the approach side (DESIGN 3.1).
+    Source: DESIGN 3.1.
 
     Args:
         model: parameters.
@@ -175,15 +172,16 @@ def beams_at(model: Model, steps: Array, side: Array, noise: Float[Array, "noise
     return _in_frame_t(model, angle[..., 0], angle[..., 1] + model.tilt_zero_rad)
 
 
-def _in_frame_t(model: Model, pan_rad: Array, tilt_rad: Array) -> Beams:
+def _in_frame_t(model: Model, pan_rad: Array, tilt_rad: Array) -> Beam:
     ray = beam(model.optics, pan_rad, tilt_rad)
     turn = model.receiver.pan_zero_emission_rad - jnp.pi / 2
-    origin = rotate_about_z(turn, ray.origin_mm) + along_batch(_half_baseline(model.receiver.baseline_mm), pan_rad)
-    return Beams(origin, rotate_about_z(turn, ray.direction))
+    origin = rotate_about_z(turn, ray.origin_mm) + half_baseline(model.receiver.baseline_mm, pan_rad)
+    return Beam(origin, rotate_about_z(turn, ray.direction))
 
 
-def _half_baseline(baseline_mm: Scalar) -> Float[Array, "3"]:
-    return jnp.stack([0 * baseline_mm, 0.5 * baseline_mm, 0 * baseline_mm])
+def half_baseline(baseline_mm: Scalar, like: Float[Array, "*batch"]) -> Float[Array, "3 ..."]:
+    """(0, a/2, 0), from the middle of the baseline to the pan axis, for a batch like `like`."""
+    return along_batch(jnp.stack([jnp.zeros(()), 0.5 * baseline_mm, jnp.zeros(())]), like)
 
 
 class Sources(eqx.Module):
@@ -270,16 +268,19 @@ def carry(settings: Settings, given: Sources) -> Carried:
 
 @eqx.filter_jit
 def propagate(settings: Settings, given: Sources) -> Linear:
-    """The law of propagation at every point; fields get a leading axis `points`.
+    """The law of propagation at every point, not a number where there is none; fields get a leading axis `points`.
 
     Inputs are `INPUT_NAMES` and the unit noises, whose sds are held at their root mean square.
     """
 
     def function(values):
         inputs = jnp.concatenate([values[: len(INPUT_NAMES)], given.stop_sd_deg])
-        return _look(inputs, values[len(INPUT_NAMES) :], settings, given).xyz_mm.T
+        found = _look(inputs, values[len(INPUT_NAMES) :], settings, given)
+        return jnp.where(found.meets, found.xyz_mm, jnp.nan).T
 
-    return linear(function, given.mean, given.covariance)
+    law = linear(function, given.mean, given.covariance)
+    lost = jnp.where(jnp.isnan(law.value), jnp.nan, 0.0)[..., None]
+    return Linear(law.value, law.jacobian + lost, law.covariance + lost)
 
 
 @dataclass(frozen=True)
@@ -428,7 +429,8 @@ def locate(
     joined = {name: np.concatenate([part[name] for part in parts]) for name in parts[0] if name != "validation"}
     checks = [part["validation"] for part in parts]
     fields = ("tolerance", "deviation", "error", "validated", "decided")
-    validation = Validation(2, **{name: np.concatenate([getattr(v, name) for v in checks]) for name in fields})
+    together = {name: np.concatenate([getattr(check, name) for check in checks]) for name in fields}
+    validation = Validation(checks[0].digits, **together)
     steps, side = np.asarray(settings.steps), np.asarray(settings.side)
     reading = np.degrees(settings.aperture_rad)
     lost = ~(joined["diverging_share"] <= DIVERGING_SHARE)
@@ -456,7 +458,7 @@ def _statistics(carried: Carried, law: Linear, given: Sources) -> dict[str, obje
     u = np.sqrt(np.einsum("pii->pi", law.covariance))
     linearised = law.value + np.einsum("pik,dk->dpi", law.jacobian, inputs - np.asarray(given.mean))
     draws = np.ascontiguousarray(xyz.transpose(0, 2, 1))
-    interval = np.quantile(draws, (0.025, 0.975), axis=0)
+    interval = symmetric_interval(draws)
     empty = np.where(lost <= DIVERGING_SHARE, 0.0, np.nan)
     return {
         "xyz_mm": mean.T + empty[:, None],

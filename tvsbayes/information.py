@@ -13,8 +13,9 @@ from itertools import pairwise
 import jax
 import numpy as np
 
+from tvsbayes.calibration import NORMAL_95
 from tvsbayes.classic import DIRECTIONS, four_point_ratios, select_experiments
-from tvsbayes.joint import NORMAL_95, Derived, JointFit
+from tvsbayes.joint import Derived, JointFit
 from tvsbayes.likelihood import ordered_spots
 from tvsbayes.model import INDEX, NAMES, RECEIVER_NAMES, RIG_NAMES
 from tvsbayes.posterior import Posterior, ideal_pixels

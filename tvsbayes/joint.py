@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 from scipy import optimize, stats
 
+from tvsbayes.calibration import NORMAL_95
 from tvsbayes.campaign import Campaign
 from tvsbayes.files import InputError, NotConverged, NothingToEstimate
 from tvsbayes.likelihood import (
@@ -58,8 +59,6 @@ CONTRASTS = ("ratio_contrast_deg_per_step.pan", "ratio_contrast_deg_per_step.til
 BACKLASHES = ("backlash_deg.pan", "backlash_deg.tilt")
 HARMONIC_SD_DEG = 0.1
 """Prior standard deviation of every part of a freed transmission error (DESIGN 3.1)."""
-NORMAL_95 = 1.959963984540054
-"""Two-sided 95 % quantile of the normal distribution."""
 MISFIT_LIMIT = 6.0
 """Prior sds of the pixel scale (a factor 20 by default) beyond which the mode explains no spot: a wrong basin, swapped
 cameras or wrong counters, not noise."""

@@ -310,7 +310,7 @@ class Optics(eqx.Module):
 
 
 class Beam(eqx.Module):
-    """Rays in frame P: they leave mirror 2 at `origin_mm` along the unit vectors `direction`."""
+    """Rays, in frame P unless said otherwise: they leave mirror 2 at `origin_mm` along the unit vectors `direction`."""
 
     origin_mm: Float[Array, "3 *batch"]
     direction: Float[Array, "3 *batch"]

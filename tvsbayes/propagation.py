@@ -16,8 +16,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-NORMAL_95 = 1.959963984540054
-"""Two-sided 95 % quantile of the normal distribution."""
+from tvsbayes.calibration import NORMAL_95
+
 BLOCKS = 10
 """Parts of the draws whose scatter gives the Monte Carlo error of an interval's end."""
 BELIEVED = 4.0
