@@ -29,9 +29,9 @@ from tvsbayes.calibration import INPUT_NAMES, NOISE_NAMES, Calibration
 from tvsbayes.classic import ClassicResult, DirectionResult
 from tvsbayes.coordinates import INPUT_COLUMNS, locate_linear, meeting, published_point, settings_of
 from tvsbayes.joint import JointFit
+from tvsbayes.likelihood import StopGroup, StopInformation
 from tvsbayes.model import INDEX, NAMES, RIG_NAMES, parameter_space
 from tvsbayes.rigs import HARMONIC_PRIORS, RIG_PRIORS, Prior
-from tvsbayes.stops import StopGroup, StopInformation
 
 ROUNDING_MM = 1e-9
 """Of a hundred operations on lengths up to 1000 mm, magnified tenfold by a grazing line of sight."""

@@ -18,11 +18,10 @@ LEVELS: tuple[tuple[str, ...], ...] = (
     ("model", "classic", "simulation"),
     ("protocols",),
     ("likelihood", "solver"),
-    ("stops",),
     ("joint",),
     ("ensemble",),
     ("posterior",),
-    ("propagation", "information"),
+    ("information",),
     ("coordinates",),
     ("accuracy",),
     ("report",),
@@ -34,9 +33,9 @@ WITHOUT_JAX = (
     "report",
 )
 MODEL = {
-    *("model", "likelihood", "stops", "solver", "joint"),
+    *("model", "likelihood", "solver", "joint"),
     *("ensemble", "posterior"),
-    *("information", "classic", "calibration", "propagation", "coordinates", "accuracy"),
+    *("information", "classic", "calibration", "coordinates", "accuracy"),
 }
 JAX_FAMILY = {"jax", "jaxlib", "equinox", "optimistix", "lineax", "jaxtyping"}
 MODULES_MAX = 20

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from scipy import optimize, stats
 
-from tvsbayes.propagation import (
+from tvsbayes.coordinates import (
     NORMAL_95,
     coverage_factor,
     effective_dof,

@@ -9,9 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from tvsbayes.likelihood import evaluate
-from tvsbayes.stops import (
+from tvsbayes.likelihood import (
     LinearSpots,
+    evaluate,
     leave_one_out_chi2,
     move_log_density,
     standard_deviations_without,

@@ -16,12 +16,11 @@ import numpy as np
 from tvsbayes.calibration import NORMAL_95
 from tvsbayes.classic import DIRECTIONS, four_point_ratios, select_experiments
 from tvsbayes.joint import Derived, JointFit
-from tvsbayes.likelihood import ordered_spots
+from tvsbayes.likelihood import ordered_spots, standard_deviations_without
 from tvsbayes.model import INDEX, NAMES, RECEIVER_NAMES, RIG_NAMES
 from tvsbayes.posterior import Posterior, ideal_pixels
 from tvsbayes.protocols import observed_stops, separation
 from tvsbayes.rigs import HARMONIC_PRIORS
-from tvsbayes.stops import standard_deviations_without
 
 CONTRACTION_LIMIT = 0.1
 """Below it a value is called set by the prior (DESIGN 8)."""

@@ -22,11 +22,15 @@ from tvsbayes.campaign import Campaign
 from tvsbayes.files import InputError, NotConverged, NothingToEstimate
 from tvsbayes.likelihood import (
     CampaignArrays,
+    LinearSpots,
+    StopInformation,
     campaign_arrays,
     density_and_gradient,
     innovations,
+    leave_one_out_chi2,
     ordered_spots,
     spot_residuals,
+    stop_information,
     stop_variances,
 )
 from tvsbayes.model import (
@@ -42,7 +46,6 @@ from tvsbayes.model import (
 )
 from tvsbayes.rigs import HARMONIC_PRIORS, HOME_SD_DEG, Prior, RigTable
 from tvsbayes.solver import NEWTON_STEP, Mode, laplace_draws, levenberg_marquardt, newton_mode
-from tvsbayes.stops import LinearSpots, StopInformation, leave_one_out_chi2, stop_information
 
 ANNEALING = (60.0, 10.0, 2.0, 1.0)
 """Factors on the pixel noise before it takes its own value: plain Levenberg-Marquardt from the nominal rig goes

@@ -29,10 +29,9 @@ from tvsbayes.classic import DIRECTIONS
 from tvsbayes.ensemble import BATCH, Independence, Pilot, Target, Transport, in_batches, moves, pilot, transport
 from tvsbayes.files import InputError, NotConverged, write_atomically
 from tvsbayes.joint import Derived, JointFit, derived_quantities
-from tvsbayes.likelihood import observe_with_stop_errors, ordered_spots, spot_constants
+from tvsbayes.likelihood import move_log_density, observe_with_stop_errors, ordered_spots, spot_constants
 from tvsbayes.model import INDEX, NAMES
 from tvsbayes.rigs import HARMONIC_PRIORS, HOME_SD_DEG, STEREO_PARAMETER_NAMES
-from tvsbayes.stops import move_log_density
 
 CHAIN_FORMAT = "tvsbayes-chain/1"
 POSTERIOR_FORMAT = "tvsbayes-posterior/1"
