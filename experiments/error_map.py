@@ -22,11 +22,12 @@ matplotlib.use("Agg")
 import numpy as np
 from matplotlib import pyplot
 
-from tvsbayes.accuracy import budget, calibration_of, error_map, simple_calibration
 from tvsbayes.campaign import read_campaign
 from tvsbayes.classic import classic
+from tvsbayes.comparison import budget, error_map, simple_calibration
 from tvsbayes.coordinates import settings_of
 from tvsbayes.files import shipped_data
+from tvsbayes.information import calibration_of
 from tvsbayes.joint import fit
 from tvsbayes.model import use_compilation_cache
 

@@ -21,11 +21,11 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
 
-from tvsbayes.accuracy import calibration_of
 from tvsbayes.calibration import INPUT_NAMES, NOISE_NAMES, calibration_bytes, load_calibration
 from tvsbayes.campaign import read_campaign
 from tvsbayes.coordinates import locate, locate_linear, settings_of
 from tvsbayes.files import shipped_data
+from tvsbayes.information import calibration_of
 from tvsbayes.joint import fit
 from tvsbayes.model import use_compilation_cache
 from tvsbayes.simulation import mirror_chain, to_tvs

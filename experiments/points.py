@@ -54,9 +54,10 @@ def one_rig(task: tuple[int]) -> dict[str, object]:
 
     # As in coverage.py: ordinary fits pad to 512 spots, here every campaign is alike.
     likelihood.SMALLEST_BUCKET = 96
-    from tvsbayes.accuracy import calibration_of, simple_calibration, simple_rays
     from tvsbayes.classic import classic
+    from tvsbayes.comparison import simple_calibration, simple_rays
     from tvsbayes.coordinates import locate
+    from tvsbayes.information import calibration_of
     from tvsbayes.joint import fit
     from tvsbayes.model import use_compilation_cache
     from tvsbayes.simulation import simulate

@@ -23,7 +23,7 @@ LEVELS: tuple[tuple[str, ...], ...] = (
     ("posterior",),
     ("information",),
     ("coordinates",),
-    ("accuracy",),
+    ("comparison",),
     ("report",),
     ("cli",),
 )
@@ -35,7 +35,7 @@ WITHOUT_JAX = (
 MODEL = {
     *("model", "likelihood", "solver", "joint"),
     *("ensemble", "posterior"),
-    *("information", "classic", "calibration", "coordinates", "accuracy"),
+    *("information", "classic", "calibration", "coordinates", "comparison"),
 }
 JAX_FAMILY = {"jax", "jaxlib", "equinox", "optimistix", "lineax", "jaxtyping"}
 MODULES_MAX = 20

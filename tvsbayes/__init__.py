@@ -6,15 +6,15 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from tvsbayes.accuracy import calibration_of as calibration_of
     from tvsbayes.calibration import load_calibration as load_calibration
     from tvsbayes.campaign import read_campaign as read_campaign
     from tvsbayes.coordinates import locate as locate
+    from tvsbayes.information import calibration_of as calibration_of
     from tvsbayes.joint import fit as fit
     from tvsbayes.posterior import sample as sample
 
 _HOME = {
-    "calibration_of": "accuracy",
+    "calibration_of": "information",
     "fit": "joint",
     "load_calibration": "calibration",
     "locate": "coordinates",

@@ -133,10 +133,9 @@ def demo(
         make_folder(folder, empty=True)
         shutil.copytree(source, folder, dirs_exist_ok=True)
         report_line("paper twin: 96 four-point experiments of a simulated rig with known truth; fitting ...")
-        from tvsbayes.accuracy import calibration_of
         from tvsbayes.campaign import read_campaign
         from tvsbayes.classic import classic as estimate_classic
-        from tvsbayes.information import summarise
+        from tvsbayes.information import calibration_of, summarise
         from tvsbayes.joint import fit as fit_joint
         from tvsbayes.model import use_compilation_cache
         from tvsbayes.report import demo_text, write_results
@@ -258,8 +257,7 @@ def fit(
     if resume and no_sample:
         raise InputError("usage", "--resume continues a chain and --no-sample makes none", remedy="give one of them")
     data = read_campaign(campaign)
-    from tvsbayes.accuracy import DRAWS_KEPT, calibration_of
-    from tvsbayes.information import summarise
+    from tvsbayes.information import DRAWS_KEPT, calibration_of, summarise
     from tvsbayes.joint import fit as fit_joint
     from tvsbayes.model import use_compilation_cache
     from tvsbayes.report import fit_text, write_results
@@ -306,7 +304,7 @@ def _calibration(folder: Path) -> Calibration:
     if found is not None:
         return found
     report_line("results/ are missing or older than the campaign: fitting first (Laplace approximation) ...")
-    from tvsbayes.accuracy import calibration_of
+    from tvsbayes.information import calibration_of
     from tvsbayes.joint import fit as fit_joint
     from tvsbayes.model import use_compilation_cache
 
@@ -403,7 +401,7 @@ def locate(
     document = {"estimator": found.estimator, "draws": found.draws, **found.as_json(0)}
     text = locations_text(found)
     if budget:
-        from tvsbayes.accuracy import budget as point_budget
+        from tvsbayes.comparison import budget as point_budget
         from tvsbayes.coordinates import settings_of
         from tvsbayes.report import budget_text
 

@@ -1,4 +1,4 @@
-"""What a fit knows: headlines, contraction, weak directions in words, leverage of stops, the classic predicted.
+"""What a fit knows: headlines, contraction, weak directions, leverage of stops, causes of its covariance, calibration.
 
 Works on a finished `JointFit`, and on a `Posterior` where there is one; computes no new fit. Units are those of
 DESIGN 8.
@@ -11,9 +11,10 @@ from dataclasses import asdict, dataclass, replace
 from itertools import pairwise
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
-from tvsbayes.calibration import NORMAL_95
+from tvsbayes.calibration import INPUT_NAMES, NORMAL_95, Calibration, calibration_of_draws
 from tvsbayes.classic import DIRECTIONS, four_point_ratios, select_experiments
 from tvsbayes.joint import Derived, JointFit
 from tvsbayes.likelihood import ordered_spots, standard_deviations_without
@@ -41,6 +42,8 @@ SENSITIVITIES_LISTED = 16
 LISTED = 8
 CLASSIC_DRAWS = 256
 CURVE_POINTS = 7
+DRAWS_KEPT = 4096
+"""Posterior draws in a calibration, evenly chosen; posterior.nc holds them all."""
 
 
 @dataclass(frozen=True)
@@ -545,3 +548,65 @@ def summarise(fit: JointFit, posterior: Posterior | None = None) -> FitSummary:
         sampling=None if posterior is None else posterior.convergence.as_json(),
         curves=None if usable is None else _curves(usable, moved),
     )
+
+
+@dataclass(frozen=True)
+class Causes:
+    """What the covariance of the inputs of a coordinate comes from.
+
+    Attributes:
+        names: causes.
+        covariance: their parts, shape (causes, inputs, inputs), ordered as `calibration.INPUT_NAMES`; they add up.
+    """
+
+    names: tuple[str, ...]
+    covariance: np.ndarray
+
+
+def causes_of(fit: JointFit) -> Causes:
+    """Split the covariance of a fit by cause (DESIGN 5).
+
+    An estimate moves by S J^T C^-1 e when the data err by e, and by S e_j when prior j is off by its sd, S the
+    posterior covariance. With C = 1 + (stop errors) the parts S (C^-1 J)^T (C^-1 J) S, S (J^T C^-1 J - that) S and
+    S e_j e_j^T S add up to S. Expected information about geometry and cameras; noise scales are taken as known.
+    """
+    fisher = fit.information.fisher
+    posterior = np.linalg.inv(fisher + np.eye(len(NAMES)))
+    gain = np.concatenate([group.jacobian for group in fit.information.groups])
+    noise = gain.T @ gain
+    readings = bool(np.any(np.asarray(fit.arrays.spots.has_aperture) * np.asarray(fit.arrays.spots.valid)))
+    parts = {
+        "pixel and aperture noise" if readings else "pixel noise": noise,
+        "stop errors of the campaign": fisher - noise,
+    }
+    stems: dict[str, list[int]] = {"stereo calibration": list(range(len(RIG_NAMES), len(NAMES)))}
+    for name in RIG_NAMES:
+        stem = "focal scale" if name == "focal_scale" else f"prior of {name.split('.')[0]}"
+        stems.setdefault(stem, []).append(INDEX[name])
+    for stem, columns in stems.items():
+        share = np.zeros_like(fisher)
+        share[columns, columns] = 1.0
+        parts[stem] = share
+    inputs = [INDEX[name] for name in INPUT_NAMES]
+    with jax.enable_x64(True):
+        slope = np.asarray(jax.jacfwd(fit.space.physical)(jnp.asarray(fit.z)))[inputs]
+    spread = slope @ posterior
+    covariance = {name: spread @ part @ spread.T for name, part in parts.items()}
+    # A prior that was fixed, or that no coordinate hangs on, is no cause.
+    kept = {name: c for name, c in covariance.items() if np.any(np.diag(c) > 0)}
+    return Causes(tuple(kept), np.stack(list(kept.values())))
+
+
+def calibration_of(fit: JointFit, posterior: Posterior | None = None, *, seed: int = 0) -> Calibration:
+    """What coordinates need of a fit: the posterior's draws where one has converged, else the Laplace approximation's.
+
+    Args:
+        fit: a converged fit.
+        posterior: its sample.
+        seed: of the draws of baseline, C0 and aperture zero where no reading told them.
+    """
+    usable = posterior is not None and posterior.converged
+    draws = posterior.thinned(DRAWS_KEPT).physical if usable else fit.draws.physical
+    causes = causes_of(fit)
+    name = "posterior" if usable else "laplace"
+    return calibration_of_draws(fit.names, np.asarray(draws), fit.campaign, name, seed, causes.names, causes.covariance)

@@ -25,7 +25,7 @@ from tvsbayes.classic import DIRECTIONS, ClassicResult
 from tvsbayes.files import make_folder, write_atomically
 
 if TYPE_CHECKING:
-    from tvsbayes.accuracy import Budget
+    from tvsbayes.comparison import Budget
     from tvsbayes.coordinates import Locations
     from tvsbayes.information import Estimate, FitSummary
     from tvsbayes.joint import Derived, JointFit

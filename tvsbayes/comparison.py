@@ -17,11 +17,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from tvsbayes.calibration import INPUT_NAMES, Calibration, calibration_of_draws, direction_of
+from tvsbayes.calibration import INPUT_NAMES, Calibration, direction_of
 from tvsbayes.classic import ClassicResult
 from tvsbayes.coordinates import (
     DIVERGING_SHARE,
-    INPUT_COLUMNS,
     NOISES,
     Settings,
     Sources,
@@ -32,77 +31,12 @@ from tvsbayes.coordinates import (
     propagate,
     sources,
 )
-from tvsbayes.joint import JointFit
 from tvsbayes.likelihood import aperture_angle
-from tvsbayes.model import INDEX, NAMES, RIG_NAMES, Beam
-from tvsbayes.posterior import Posterior
+from tvsbayes.model import Beam
 from tvsbayes.rigs import RIG_PRIORS, Prior
 
-DRAWS_KEPT = 4096
-"""Posterior draws in a calibration, evenly chosen; posterior.nc holds them all."""
 STOP_HERE, APERTURE_HERE, PLAY_HERE = "stop error here", "aperture noise here", "unknown approach here"
 """Causes that belong to the one look and not to the calibration."""
-
-
-@dataclass(frozen=True)
-class Causes:
-    """What the covariance of the inputs of a coordinate comes from.
-
-    Attributes:
-        names: causes.
-        covariance: their parts, shape (causes, inputs, inputs), ordered as `calibration.INPUT_NAMES`; they add up.
-    """
-
-    names: tuple[str, ...]
-    covariance: np.ndarray
-
-
-def causes_of(fit: JointFit) -> Causes:
-    """Split the covariance of a fit by cause (DESIGN 5).
-
-    An estimate moves by S J^T C^-1 e when the data err by e, and by S e_j when prior j is off by its sd, S the
-    posterior covariance. With C = 1 + (stop errors) the parts S (C^-1 J)^T (C^-1 J) S, S (J^T C^-1 J - that) S and
-    S e_j e_j^T S add up to S. Expected information about geometry and cameras; noise scales are taken as known.
-    """
-    fisher = fit.information.fisher
-    posterior = np.linalg.inv(fisher + np.eye(len(NAMES)))
-    gain = np.concatenate([group.jacobian for group in fit.information.groups])
-    noise = gain.T @ gain
-    readings = bool(np.any(np.asarray(fit.arrays.spots.has_aperture) * np.asarray(fit.arrays.spots.valid)))
-    parts = {
-        "pixel and aperture noise" if readings else "pixel noise": noise,
-        "stop errors of the campaign": fisher - noise,
-    }
-    stems: dict[str, list[int]] = {"stereo calibration": list(range(len(RIG_NAMES), len(NAMES)))}
-    for name in RIG_NAMES:
-        stem = "focal scale" if name == "focal_scale" else f"prior of {name.split('.')[0]}"
-        stems.setdefault(stem, []).append(INDEX[name])
-    for stem, columns in stems.items():
-        share = np.zeros_like(fisher)
-        share[columns, columns] = 1.0
-        parts[stem] = share
-    with jax.enable_x64(True):
-        slope = np.asarray(jax.jacfwd(fit.space.physical)(jnp.asarray(fit.z)))[INPUT_COLUMNS[: len(INPUT_NAMES)]]
-    spread = slope @ posterior
-    covariance = {name: spread @ part @ spread.T for name, part in parts.items()}
-    # A prior that was fixed, or that no coordinate hangs on, is no cause.
-    kept = {name: c for name, c in covariance.items() if np.any(np.diag(c) > 0)}
-    return Causes(tuple(kept), np.stack(list(kept.values())))
-
-
-def calibration_of(fit: JointFit, posterior: Posterior | None = None, *, seed: int = 0) -> Calibration:
-    """What coordinates need of a fit: the posterior's draws where one has converged, else the Laplace approximation's.
-
-    Args:
-        fit: a converged fit.
-        posterior: its sample.
-        seed: of the draws of baseline, C0 and aperture zero where no reading told them.
-    """
-    usable = posterior is not None and posterior.converged
-    draws = posterior.thinned(DRAWS_KEPT).physical if usable else fit.draws.physical
-    causes = causes_of(fit)
-    name = "posterior" if usable else "laplace"
-    return calibration_of_draws(fit.names, np.asarray(draws), fit.campaign, name, seed, causes.names, causes.covariance)
 
 
 @dataclass(frozen=True)

@@ -13,21 +13,20 @@ from bent_rig import BENT, NO_NOISE_DEG, NOMINAL, calibration, twin_points, twin
 from small_campaign import small_campaign
 
 from tvsbayes import simulation
-from tvsbayes.accuracy import (
+from tvsbayes.calibration import INPUT_NAMES, NOISE_NAMES, Calibration
+from tvsbayes.classic import ClassicResult, DirectionResult
+from tvsbayes.comparison import (
     APERTURE_HERE,
     PLAY_HERE,
     STOP_HERE,
     SimpleCalibration,
     budget,
-    calibration_of,
-    causes_of,
     error_map,
     simple_calibration,
     simple_rays,
 )
-from tvsbayes.calibration import INPUT_NAMES, NOISE_NAMES, Calibration
-from tvsbayes.classic import ClassicResult, DirectionResult
 from tvsbayes.coordinates import INPUT_COLUMNS, locate_linear, meeting, published_point, settings_of
+from tvsbayes.information import calibration_of, causes_of
 from tvsbayes.joint import JointFit
 from tvsbayes.likelihood import StopGroup, StopInformation
 from tvsbayes.model import INDEX, NAMES, RIG_NAMES, parameter_space
