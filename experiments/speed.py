@@ -34,6 +34,7 @@ from scipy import optimize
 from tvsbayes.campaign import read_campaign, write_campaign
 from tvsbayes.files import shipped_data
 from tvsbayes.joint import Fixed, Problem, fit, stage_residuals
+from tvsbayes.likelihood import ordered_spots
 from tvsbayes.model import NAMES
 from tvsbayes.protocols import mixed_protocol
 from tvsbayes.rigs import read_rig
@@ -81,7 +82,7 @@ def warm_and_peers() -> None:
     fit(campaign)
     warm = [seconds(lambda: fit(campaign)) for _ in range(REPEATS)]
     with jax.enable_x64(True):
-        problem = Problem(campaign, campaign.rig)
+        problem = Problem(campaign, campaign.rig, np.ones(len(ordered_spots(campaign)), dtype=bool))
         start = np.zeros(len(NAMES))
         # The basin is reached by annealing; peers are compared on the last stage, where all of them converge.
         for inflation in (60.0, 10.0, 2.0):

@@ -12,6 +12,7 @@ import os
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -33,7 +34,9 @@ from tvsbayes.files import (
 
 if TYPE_CHECKING:
     from tvsbayes.calibration import Calibration
+    from tvsbayes.campaign import Campaign
     from tvsbayes.information import FitSummary
+    from tvsbayes.joint import JointFit
     from tvsbayes.posterior import Progress
 
 INTERRUPTED = 130
@@ -304,7 +307,14 @@ def _calibration(folder: Path) -> Calibration:
     if found is not None:
         return found
     report_line("results/ are missing or older than the campaign: fitting first (Laplace approximation) ...")
+    result = _converged_fit(campaign)
     from tvsbayes.information import calibration_of
+
+    return calibration_of(result)
+
+
+def _converged_fit(campaign: Campaign) -> JointFit:
+    """A fit for a command that needs one in passing."""
     from tvsbayes.joint import fit as fit_joint
     from tvsbayes.model import use_compilation_cache
 
@@ -314,9 +324,61 @@ def _calibration(folder: Path) -> Calibration:
         raise NotConverged(
             "not-converged",
             "NOT CONVERGED: " + "; ".join(result.problems),
-            remedy="see `tvsbayes fit`; coordinates need a fit that has converged",
+            remedy="see `tvsbayes fit`; this command needs a fit that has converged",
         )
-    return calibration_of(result)
+    return result
+
+
+@app.command()
+def compare(
+    campaign: CampaignFolder,
+    other: Annotated[Path | None, typer.Argument(metavar="[B]", help="Later campaign of the same instrument.")] = None,
+    by: Annotated[
+        str, typer.Option("--by", help="Left out together: steps or regions.")
+    ] = "steps",
+    seed: Seed = 0,
+    as_json: Json = False,
+) -> None:
+    """Classic against joint on experiments left out, and the gap term by term; with B, what has changed since."""
+    from tvsbayes.campaign import input_hashes, read_campaign
+
+    if by not in ("steps", "regions"):
+        raise InputError("usage", f"--by {escaped(by)}: allowed are steps and regions", remedy="choose one of them")
+    data = [read_campaign(folder) for folder in (campaign, *([other] if other is not None else ()))]
+    from tvsbayes.report import changes_text, gap_text, hold_out_text
+
+    report_line("fitting (Laplace approximation) ...")
+    fits = [_converged_fit(each) for each in data]
+    from tvsbayes.comparison import compare as compare_fits
+    from tvsbayes.comparison import explain_gap, hold_out
+
+    if other is not None:
+        changes = compare_fits(*fits)
+        _finish(changes.as_json(), changes_text(changes), as_json)
+        return
+    gaps = explain_gap(fits[0])
+    if not any(gaps.values()):
+        raise NothingToEstimate(
+            "no-experiments",
+            "the campaign has no complete four-point experiment: there is no classic estimate to compare with",
+            file="spots.csv",
+            remedy="number the looks in the columns experiment and point, or use `tvsbayes fit`",
+        )
+    held = hold_out(fits[0], by, seed)
+    document = {
+        "kind": "classic against joint",
+        "format": "tvsbayes-compare/1",
+        "estimator": "laplace",
+        "directions": {name: None if gap is None else asdict(gap) for name, gap in gaps.items()},
+        "held_out": held.as_json(),
+        "inputs": input_hashes(data[0]),
+        "seed": seed,
+    }
+    make_folder(campaign / "results")
+    path = campaign / "results" / "compare.json"
+    write_atomically(path, json.dumps(document, indent=1, allow_nan=False).encode())
+    text = f"{gap_text(gaps)}\n\n{hold_out_text(held)}\nwritten: {path}"
+    _finish({**document, "files": {"compare": str(path)}}, text, as_json)
 
 
 POINT_COLUMNS = ("pan_steps", "tilt_steps", "pan_approach", "tilt_approach", "aperture_deg")

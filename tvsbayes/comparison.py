@@ -1,24 +1,27 @@
-"""What a calibration is worth in millimetres: error maps of three estimators, and what the uncertainty consists of.
+"""Calibrations compared: classic against joint on angles left out, their gap explained, in millimetres, and over time.
 
-Frame T, mm; counters in steps. The draws of a calibration stand for the rigs that the data allow: on each of them the
-beam is followed to a range, the aperture reads it, and every estimator is asked where the spot is. Nominal and classic
-users are given what is fair (DESIGN 5): a baseline shortened by the mirror offset, its middle moved by half of that,
-and readings in the convention their equations expect.
+Frame T, mm; counters in steps; ratios in deg/step. In millimetres, the draws of a calibration stand for the rigs that
+the data allow: on each of them the beam is followed to a range, the aperture reads it, and every estimator is asked
+where the spot is. Nominal and classic users are given what is fair (DESIGN 5): a baseline shortened by the mirror
+offset, its middle moved by half of that, and readings in the convention their equations expect.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+import datetime
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
+from scipy import stats
 
-from tvsbayes.calibration import INPUT_NAMES, Calibration, direction_of
-from tvsbayes.classic import ClassicResult
+from tvsbayes.calibration import INPUT_NAMES, NORMAL_95, Calibration, direction_of
+from tvsbayes.campaign import Campaign
+from tvsbayes.classic import DIRECTIONS, ClassicResult, Selection, classic, four_point_ratios, select_experiments
 from tvsbayes.coordinates import (
     DIVERGING_SHARE,
     NOISES,
@@ -31,8 +34,11 @@ from tvsbayes.coordinates import (
     propagate,
     sources,
 )
-from tvsbayes.likelihood import aperture_angle
-from tvsbayes.model import Beam
+from tvsbayes.information import gradients
+from tvsbayes.joint import JointFit, derived_quantities, fit
+from tvsbayes.likelihood import aperture_angle, ordered_spots
+from tvsbayes.model import INDEX, NAMES, RIG_NAMES, Beam, ParameterSpace
+from tvsbayes.posterior import Posterior, looks, looks_again
 from tvsbayes.rigs import RIG_PRIORS, Prior
 
 STOP_HERE, APERTURE_HERE, PLAY_HERE = "stop error here", "aperture noise here", "unknown approach here"
@@ -280,3 +286,504 @@ def budget(calibration: Calibration, settings: Settings) -> Budget:
         correlation=np.asarray(given.covariance) / np.outer(safe, safe),
         covariance_mm2=law.covariance,
     )
+
+
+GAP_DRAWS = 256
+OPTICS = tuple(name for name in RIG_NAMES if name.startswith(("mirror1", "mirror2", "laser_", "tilt_axis_")))
+"""What bends the beam's way through the positioner; all zero in the nominal rig."""
+BACKLASH, STEREO_SCALE, SKEW, PROJECTION, CHANCE = (
+    "backlash over N",
+    "stereo scale and focal scale",
+    "skew of mirrors, laser and axes",
+    "projection and pose",
+    "chance",
+)
+"""Terms of the gap. The last is what the classic's own spots add: stop errors and pixel noise."""
+
+
+@dataclass(frozen=True)
+class GapTerm:
+    """A part of (classic mean - effective ratio), deg/step: mean or mode, standard deviation, 95 % interval."""
+
+    name: str
+    value: float
+    sd: float
+    interval95: tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Gap:
+    """Why the classic mean of one direction is not the effective ratio; all in deg/step.
+
+    Attributes:
+        classic: the classic estimator's mean.
+        joint: effective ratio at the reference pose.
+        total: classic - joint.
+        terms: its parts, which add up to `total`.
+    """
+
+    classic: float
+    joint: GapTerm
+    total: GapTerm
+    terms: tuple[GapTerm, ...]
+
+
+def _ideal(space: ParameterSpace, names: Sequence[str]) -> ParameterSpace:
+    """The priors with parameters fixed at their ideal values: 0, or 1 for the focal scale; cameras as stated."""
+    rows = jnp.asarray([INDEX[name] for name in names if name in RIG_NAMES])
+    ideal = jnp.asarray([1.0 if name == "focal_scale" else 0.0 for name in names if name in RIG_NAMES])
+    space = replace(space, value=space.value.at[rows].set(ideal), u=space.u.at[rows].set(0.0))
+    if "focal_scale" in names:
+        space = replace(space, stereo_root=jnp.zeros_like(space.stereo_root))
+    return space
+
+
+def explain_gap(found: JointFit, posterior: Posterior | None = None) -> dict[str, Gap | None]:
+    """The gap between both estimators, term by term (DESIGN 1).
+
+    On every draw the model takes the classic estimator's spots without noise, and again without backlash, then with
+    the stated cameras in place of the true ones, then with ideal optics. Each change of the classic mean is one
+    term; what then still separates it from the ratio of the ideal optics is projection: the tilt read as
+    atan(dZ/dX) off the X axis, the offset of the mirrors, poses other than the reference. Terms depend little on
+    their order, and they add up.
+
+    Args:
+        found: a converged fit of the campaign.
+        posterior: its sample, for its draws in place of the Laplace approximation's.
+
+    Returns:
+        By direction; None without complete experiments.
+    """
+    selection = select_experiments(found.campaign)
+    result: dict[str, Gap | None] = dict.fromkeys(DIRECTIONS)
+    if not len(selection.experiments):
+        return result
+    if posterior is None:
+        z = np.vstack([found.z, found.draws_z[:GAP_DRAWS]])
+    else:
+        every = posterior.z.reshape(-1, posterior.z.shape[-1])
+        z = every[np.linspace(0, len(every) - 1, GAP_DRAWS).astype(int)]
+    pixels_of = _experiment_pixels(found, selection)
+    with jax.enable_x64(True):
+        spaces = [found.space]
+        for names in (("backlash_deg.pan", "backlash_deg.tilt"), ("focal_scale",), OPTICS):
+            spaces.append(_ideal(spaces[-1], names))
+        pose = jnp.asarray(found.reference_pose_rad)
+        full, ideal = (
+            np.asarray(derived_quantities(jnp.asarray(z), space, pose).effective_deg_per_step)
+            for space in (spaces[0], spaces[-1])
+        )
+    quiet = np.zeros((len(z), len(found.arrays.spots.valid), 2))
+    ratios = []
+    for space in spaces:
+        pixels = pixels_of(looks(replace(found, space=space), z, quiet))
+        every = [four_point_ratios(p, selection.steps, selection.axis, found.campaign.stereo) for p in pixels]
+        ratios.append(np.stack(every))
+    measured = classic(found.campaign)
+    for k, direction in enumerate(DIRECTIONS):
+        chosen = selection.direction == direction
+        if not chosen.any():
+            continue
+        seen = measured.directions[direction].mean_deg_per_step
+        whole, unplayed, scaled, straight = (r[:, chosen].mean(axis=1) for r in ratios)
+        parts = {
+            BACKLASH: whole - unplayed,
+            STEREO_SCALE: unplayed - scaled,
+            SKEW: scaled - straight - (full[:, k] - ideal[:, k]),
+            PROJECTION: straight - ideal[:, k],
+            CHANCE: seen - whole,
+        }
+
+        def term(name: str, values: np.ndarray) -> GapTerm:
+            sampled = values if posterior is not None else values[1:]
+            low, high = np.quantile(sampled, [0.025, 0.975])
+            centre = sampled.mean() if posterior is not None else values[0]
+            return GapTerm(name, float(centre), float(sampled.std(ddof=1)), (float(low), float(high)))
+
+        terms = tuple(term(name, values) for name, values in parts.items())
+        joint = term("effective ratio", full[:, k])
+        result[direction] = Gap(seen, joint, term("classic - joint", seen - full[:, k]), terms)
+    return result
+
+
+def _experiment_pixels(found: JointFit, selection: Selection) -> Callable[[np.ndarray], np.ndarray]:
+    """Picks the four looks of each experiment, (draws, e, 4, 4), from those of all spots in the filter's order."""
+    row_of = {spot.spot: row for row, spot in enumerate(ordered_spots(found.campaign))}
+    ids = [[row_of[found.campaign.spots[r].spot] for r in four] for four in selection.spot_rows]
+    rows = np.array(ids, dtype=int).reshape(-1, 4)
+    return lambda pixels: pixels[:, rows]
+
+
+HOLD_OUT_DRAWS = 256
+REGIONS = 4
+BLOCKS_MIN = 3
+"""Fewest blocks whose scatter is worth an interval."""
+BETTER_CLASSIC, BETTER_JOINT, CANNOT_TELL = "classic predicts better", "joint predicts better", "cannot tell"
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """The four-point angle of one experiment as others foretold it, deg."""
+
+    experiment: int
+    fold: str
+    direction: str
+    steps: int
+    angle_deg: float
+    classic_deg: float
+    classic_u_deg: float
+    joint_deg: float
+    joint_u_deg: float
+
+
+@dataclass(frozen=True)
+class Score:
+    """How well one estimator foretold the angles.
+
+    Attributes:
+        rms_deg: root mean square error.
+        rms_block_deg: of the mean errors of the blocks (fold and direction): the part that repeats do not average.
+        coverage: share of angles inside the 95 % predictive intervals.
+        log_density: mean log predictive density (normal), per deg.
+    """
+
+    rms_deg: float
+    rms_block_deg: float
+    coverage: float
+    log_density: float
+
+
+@dataclass(frozen=True)
+class HoldOut:
+    """Classic against joint on experiments that neither had seen.
+
+    Attributes:
+        by: "steps" (a whole |N| left out) or "regions" (a part of the range of start counters).
+        predictions: of every experiment that could be foretold by both.
+        classic: score.
+        joint: score.
+        ratio: rms_block_deg of the classic / that of the joint.
+        interval95: of the ratio, for errors that go together (Pitman, Biometrika 31 (1939) 9; Morgan, ibid. 13;
+            about zero, blocks as independent normal pairs); None with fewer than `BLOCKS_MIN` blocks.
+        verdict: who predicts better, or "cannot tell".
+        reason: of the verdict.
+        unseen: standard uncertainty of each ratio that is common to all experiments, and so in no residual: stereo
+            calibration and focal scale, deg/step.
+    """
+
+    by: str
+    predictions: tuple[Prediction, ...]
+    classic: Score | None
+    joint: Score | None
+    ratio: float | None
+    interval95: tuple[float, float] | None
+    verdict: str
+    reason: str
+    unseen: dict[str, float]
+
+    def as_json(self) -> dict[str, object]:
+        """Plain types."""
+        return asdict(self)
+
+
+def folds_of(campaign: Campaign, selection: Selection, by: str) -> dict[str, np.ndarray]:
+    """Masks (e,) of the experiments that are left out together.
+
+    Raises:
+        ValueError: another scheme.
+    """
+    if by == "steps":
+        lengths = np.abs(selection.steps)
+        return {f"|N| = {n}": lengths == n for n in np.unique(lengths)}
+    if by != "regions":
+        raise ValueError(f'folds by "steps" or "regions", not {by!r}')
+    moves = {move.move: move for move in campaign.moves}
+    starts = [moves[campaign.spots[four[0]].move] for four in selection.spot_rows]
+    moved = np.array([m.pan_steps if a == "pan" else m.tilt_steps for m, a in zip(starts, selection.axis, strict=True)])
+    folds = {}
+    for axis in ("pan", "tilt"):
+        mine = selection.axis == axis
+        for part in np.array_split(np.unique(moved[mine]), min(REGIONS, len(np.unique(moved[mine])))):
+            if len(part):
+                name = f"{axis} from {part[0]}" + (f" to {part[-1]}" if len(part) > 1 else "")
+                folds[name] = mine & np.isin(moved, part)
+    return folds
+
+
+def hold_out(fit_of_all: JointFit, by: str = "steps", seed: int = 0) -> HoldOut:
+    """Leave experiments out, fold by fold, refit, and ask both estimators for their four-point angles.
+
+    The classic foretells N times its mean of the direction; its uncertainty is the scatter of angles about N times
+    the mean, and that of the mean. The joint foretells what the classic chain would measure on its beams, with
+    stop errors and pixel noise drawn anew: the same quantity for both. Noise common to all experiments (the cameras)
+    moves both predictions and the measured angle alike and is reported beside.
+
+    Args:
+        fit_of_all: a converged fit; its campaign and model are used.
+        by: "steps" or "regions", see `folds_of`.
+        seed: of the predictive draws.
+    """
+    campaign = fit_of_all.campaign
+    selection = select_experiments(campaign)
+    unseen = dict(zip(DIRECTIONS, _camera_u(fit_of_all).tolist(), strict=True))
+    folds = folds_of(campaign, selection, by)
+    lengths = np.unique(np.abs(selection.steps))
+
+    def undecided(reason: str) -> HoldOut:
+        return HoldOut(by, (), None, None, None, None, CANNOT_TELL, reason, unseen)
+
+    if not len(selection.experiments):
+        return undecided("there is no complete experiment")
+    if len(folds) < 2 or (by == "regions" and all(np.count_nonzero(f) == 0 for f in folds.values())):
+        what = f"all experiments have |N| = {lengths[0]}" if by == "steps" else "all experiments start at one counter"
+        return undecided(f"{what}: a constant lost motion looks like a ratio there; measure a second |N|")
+    with jax.enable_x64(True):
+        angle = np.asarray(
+            four_point_ratios(selection.pixels, selection.steps, selection.axis, campaign.stereo) * selection.steps
+        )
+    predictions: list[Prediction] = []
+    for index, (name, out) in enumerate(folds.items()):
+        foretold = _foretell_classic(angle, selection, out)
+        if not foretold:
+            continue
+        ids = frozenset(campaign.spots[r].spot for r in selection.spot_rows[out].ravel())
+        taught = _refit(fit_of_all, ids)
+        generator = np.random.default_rng([seed, index])
+        z = taught.draws_z[:HOLD_OUT_DRAWS]
+        pixels = looks_again(taught, z, taught.draws.physical[:HOLD_OUT_DRAWS], generator)
+        pixels = _experiment_pixels(taught, selection)(pixels)[:, out]
+        chosen = {"steps": selection.steps[out], "axis": selection.axis[out]}
+        draws = np.stack([four_point_ratios(p, stereo=campaign.stereo, **chosen) for p in pixels]) * chosen["steps"]
+        for k, e in enumerate(np.flatnonzero(out)):
+            if e in foretold:
+                predictions.append(
+                    Prediction(
+                        int(selection.experiments[e]),
+                        name,
+                        str(selection.direction[e]),
+                        int(selection.steps[e]),
+                        float(angle[e]),
+                        *foretold[e],
+                        float(draws[:, k].mean()),
+                        float(draws[:, k].std(ddof=1)),
+                    )
+                )
+    if not predictions:
+        return undecided("no direction has two experiments outside of every fold")
+    return _judge(by, predictions, lengths, unseen)
+
+
+def _refit(fit_of_all: JointFit, without: frozenset[int]) -> JointFit:
+    """The same model on fewer spots; its harmonics, contrasts and backlash are free where they were."""
+    held = replace(fit_of_all.campaign, rig=replace(fit_of_all.campaign.rig, priors=_priors_of(fit_of_all)))
+    return fit(held, without=without | set(fit_of_all.excluded_spots))
+
+
+def _priors_of(fit_of_all: JointFit) -> dict[str, Prior]:
+    """The priors that the fit used, which options may have changed from the campaign's."""
+    space = fit_of_all.space
+    table = fit_of_all.campaign.rig.priors
+    return {
+        name: replace(table[name], value=float(space.value[INDEX[name]]), u=float(space.u[INDEX[name]]))
+        for name in table
+    }
+
+
+def _foretell_classic(angle: np.ndarray, selection: Selection, out: np.ndarray) -> dict[int, tuple[float, float]]:
+    """Angle and standard uncertainty of each left-out experiment whose direction has two others, by row."""
+    found = {}
+    for direction in DIRECTIONS:
+        mine = selection.direction == direction
+        taught, asked = np.flatnonzero(mine & ~out), np.flatnonzero(mine & out)
+        if len(taught) < 2:
+            continue
+        ratios = angle[taught] / selection.steps[taught]
+        mean, sd = ratios.mean(), ratios.std(ddof=1)
+        noise = np.sum((angle[taught] - mean * selection.steps[taught]) ** 2) / (len(taught) - 1)
+        for e in asked:
+            steps = float(selection.steps[e])
+            found[int(e)] = (float(mean * steps), float(np.sqrt(noise + (steps * sd) ** 2 / len(taught))))
+    return found
+
+
+def _judge(by: str, predictions: list[Prediction], lengths: np.ndarray, unseen: dict[str, float]) -> HoldOut:
+    """Scores of both, and whether the difference is more than chance."""
+    angle, blocks = np.array([p.angle_deg for p in predictions]), [(p.fold, p.direction) for p in predictions]
+    of_block = {b: np.array([x == b for x in blocks]) for b in dict.fromkeys(blocks)}
+    scores, means = {}, {}
+    for name in ("classic", "joint"):
+        told = np.array([getattr(p, f"{name}_deg") for p in predictions])
+        u = np.array([getattr(p, f"{name}_u_deg") for p in predictions])
+        error = angle - told
+        means[name] = np.array([error[rows].mean() for rows in of_block.values()])
+        scores[name] = Score(
+            rms_deg=float(np.sqrt(np.mean(error**2))),
+            rms_block_deg=float(np.sqrt(np.mean(means[name] ** 2))),
+            coverage=float(np.mean(np.abs(error) <= NORMAL_95 * u)),
+            log_density=float(np.mean(stats.norm.logpdf(error, scale=u))),
+        )
+    blocks_seen = len(of_block)
+    ratio = scores["classic"].rms_block_deg / scores["joint"].rms_block_deg
+    interval, verdict = None, CANNOT_TELL
+    if len(lengths) == 1:
+        reason = f"all experiments have |N| = {lengths[0]}: a constant lost motion looks like a ratio in all of them"
+    elif blocks_seen < BLOCKS_MIN:
+        reason = f"{blocks_seen} blocks (fold and direction) tell nothing of their scatter"
+    else:
+        interval = _ratio_interval(means["classic"], means["joint"])
+        if interval[0] > 1:
+            verdict = BETTER_JOINT
+        elif interval[1] < 1:
+            verdict = BETTER_CLASSIC
+        reason = f"over {blocks_seen} blocks (fold and direction) the classic errs {ratio:.2g} times as much as the "
+        reason += f"joint, 95 % interval {interval[0]:.2g} to {interval[1]:.2g}"
+    return HoldOut(
+        by,
+        tuple(predictions),
+        scores["classic"],
+        scores["joint"],
+        float(ratio),
+        interval,
+        verdict,
+        reason,
+        unseen,
+    )
+
+
+def _ratio_interval(first: np.ndarray, second: np.ndarray) -> tuple[float, float]:
+    """95 % interval of rms(first) / rms(second) for pairs of errors with mean 0 and any correlation.
+
+    First and c second have equal mean squares if their sum and difference are uncorrelated: those c for which the
+    t test of that correlation (n - 1 degrees of freedom, means known to be 0) does not reject are the interval.
+    """
+    n = len(first)
+    ratio = np.sqrt(np.sum(first**2) / np.sum(second**2))
+    correlation = first @ second / np.sqrt(np.sum(first**2) * np.sum(second**2))
+    k = 1 + 2 * (1 - correlation**2) * stats.t.ppf(0.975, n - 1) ** 2 / (n - 1)
+    root = np.sqrt(k**2 - 1)
+    return float(ratio * np.sqrt(k - root)), float(ratio * np.sqrt(k + root))
+
+
+def _influence(found: JointFit, slopes: np.ndarray) -> np.ndarray:
+    """Shift (q, p) of quantities with gradients (q, p) if the prior of coordinate j is off by its sd: (S e_j)."""
+    return slopes @ np.linalg.inv(found.information.fisher + np.eye(len(NAMES)))
+
+
+CAMERAS = np.array([INDEX["focal_scale"], *range(len(RIG_NAMES), len(NAMES))])
+"""Coordinates of the stereo calibration and of the focal scale."""
+
+
+def _camera_u(found: JointFit) -> np.ndarray:
+    """Standard uncertainty (4,) of the effective ratios that stereo calibration and focal scale alone cause."""
+    shift = _influence(found, gradients(found, found.draws.effective_deg_per_step))[:, CAMERAS]
+    return np.sqrt(np.sum(shift**2, axis=1))
+
+
+@dataclass(frozen=True)
+class Change:
+    """One quantity of two calibrations.
+
+    Attributes:
+        quantity: contract name.
+        unit: of the values.
+        first, second: estimates of A and B.
+        difference: second - first.
+        u: its standard uncertainty; what both calibrations share is not in it.
+        normalised: difference / u.
+        significant: |normalised| beyond the limit at which chance alone passes in 1 of 20 comparisons (all
+            quantities together, Sidak).
+    """
+
+    quantity: str
+    unit: str
+    first: float
+    second: float
+    difference: float
+    u: float
+    normalised: float
+    significant: bool
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Two calibrations of one instrument at one pose.
+
+    Attributes:
+        reference_pose_deg: (pan, tilt) of A, at which both are compared.
+        changes: of the effective ratios and the backlashes.
+        shared_cameras: both campaigns state the same stereo calibration; its error is common.
+        days: from A to B where both state when they were made.
+        limit: of |normalised|.
+        verdict: in words.
+    """
+
+    reference_pose_deg: tuple[float, float]
+    changes: tuple[Change, ...]
+    shared_cameras: bool
+    days: float | None
+    limit: float
+    verdict: str
+
+    def as_json(self) -> dict[str, object]:
+        """Plain types."""
+        return {"kind": "two calibrations", **asdict(self)}
+
+
+def compare(first: JointFit, second: JointFit) -> Comparison:
+    """Whether an instrument has changed between two campaigns (normalised differences; ISO 13528 9.7 has the idea).
+
+    The u of a difference leaves out what both campaigns share: with the same stereo calibration, its error and that
+    of the focal scale move both estimates alike, by influences known from the fits. Everything else is taken as
+    independent.
+
+    Args:
+        first: converged fit of A.
+        second: converged fit of B.
+    """
+    pose = first.reference_pose_rad
+    cameras = first.campaign.stereo, second.campaign.stereo
+    shared = bool(
+        np.array_equal(cameras[0].vector, cameras[1].vector)
+        and np.array_equal(cameras[0].parameter_covariance, cameras[1].parameter_covariance)
+    )
+    values, influence, names, units = [], [], [], []
+    for found in (first, second):
+        with jax.enable_x64(True):
+            at_pose = derived_quantities(
+                jnp.asarray(np.vstack([found.z, found.draws_z])), found.space, jnp.asarray(pose)
+            )
+        backlash = np.asarray(at_pose.physical)[:, [INDEX["backlash_deg.pan"], INDEX["backlash_deg.tilt"]]]
+        rows = np.concatenate([np.asarray(at_pose.effective_deg_per_step), backlash], axis=1)
+        values.append(rows)
+        influence.append(_influence(found, gradients(found, rows[1:]))[:, CAMERAS])
+    names = [*(f"effective_deg_per_step.{d}" for d in DIRECTIONS), "backlash_deg.pan", "backlash_deg.tilt"]
+    units = ["deg/step"] * 4 + ["deg"] * 2
+    limit = float(stats.norm.isf(0.5 * (1 - 0.95 ** (1 / len(names)))))
+    variance = sum(v[1:].var(axis=0, ddof=1) for v in values)
+    if shared:
+        variance = variance - 2 * np.sum(influence[0] * influence[1], axis=1)
+    changes = []
+    for k, name in enumerate(names):
+        a, b = (float(v[0, k]) for v in values)
+        u = float(np.sqrt(max(variance[k], 0.0)))
+        ratio = (b - a) / u if u > 0 else (0.0 if a == b else float(np.copysign(np.inf, b - a)))
+        changes.append(Change(name, units[k], a, b, b - a, u, ratio, abs(ratio) > limit))
+    moved = [c for c in changes if c.significant]
+    listed = ", ".join(f"{c.quantity} by {c.difference:+.3g} {c.unit} ({c.normalised:+.1f} u)" for c in moved)
+    verdict = f"changed: {listed}" if moved else "no significant change"
+    days = _days_between(first.campaign, second.campaign)
+    pan, tilt = np.degrees(pose)
+    return Comparison((float(pan), float(tilt)), tuple(changes), shared, days, limit, verdict)
+
+
+def _days_between(first: Campaign, second: Campaign) -> float | None:
+    """Days between two campaigns that both say when they were made; dates count from midnight, UTC."""
+    made = []
+    for campaign in (first, second):
+        when = campaign.header.get("created")
+        if not isinstance(when, datetime.date):
+            return None
+        if not isinstance(when, datetime.datetime):
+            when = datetime.datetime.combine(when, datetime.time())
+        made.append(when if when.tzinfo else when.replace(tzinfo=datetime.UTC))
+    return (made[1] - made[0]).total_seconds() / 86400

@@ -6,15 +6,17 @@ DESIGN 8.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from itertools import pairwise
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy import stats
 
 from tvsbayes.calibration import INPUT_NAMES, NORMAL_95, Calibration, calibration_of_draws
+from tvsbayes.campaign import Move
 from tvsbayes.classic import DIRECTIONS, four_point_ratios, select_experiments
 from tvsbayes.joint import Derived, JointFit
 from tvsbayes.likelihood import ordered_spots, standard_deviations_without
@@ -334,11 +336,17 @@ def _headline_gradients(fit: JointFit, moved: set[str]) -> tuple[list[str], np.n
     for axis in ("pan", "tilt"):
         # In coordinates, where the backlash is Gaussian.
         quantities[f"backlash {axis}"] = fit.draws_z[:, INDEX[f"backlash_deg.{axis}"]]
-    values = np.stack(list(quantities.values()), axis=1)
+    return list(quantities), gradients(fit, np.stack(list(quantities.values()), axis=1))
+
+
+def gradients(fit: JointFit, values: np.ndarray) -> np.ndarray:
+    """d(quantity)/d(coordinates), shape (q, p), of quantities with values (draws, q) on the Laplace draws.
+
+    Regression on the moment-matched draws gives the gradient of the linear part, averaged over the posterior.
+    """
     centred = fit.draws_z - fit.draws_z.mean(axis=0)
-    # Regression on the moment-matched draws: the gradient of the linear part.
     cross = (values - values.mean(axis=0)).T @ centred / len(centred)
-    return list(quantities), np.linalg.solve(fit.covariance, cross.T).T
+    return np.linalg.solve(fit.covariance, cross.T).T
 
 
 def _prior_sensitivity(fit: JointFit, moved: set[str]) -> tuple[PriorSensitivity, ...]:
@@ -610,3 +618,172 @@ def calibration_of(fit: JointFit, posterior: Posterior | None = None, *, seed: i
     causes = causes_of(fit)
     name = "posterior" if usable else "laplace"
     return calibration_of_draws(fit.names, np.asarray(draws), fit.campaign, name, seed, causes.names, causes.covariance)
+
+
+CAUSE_BINS = 6
+CAUSE_LIMIT = 0.01
+"""Probability, all tests of a campaign together, with which clean residuals are called dependent on a cause."""
+STEP_PHASES = 4
+"""Full steps per electrical period of a two-phase stepper: what its currents repeat with."""
+
+
+@dataclass(frozen=True)
+class StopResidual:
+    """How far one rest of one axis lay from where the fitted model puts it.
+
+    Attributes:
+        axis: "pan" or "tilt".
+        spots: ids of the spots that saw it.
+        steps: counter.
+        direction: of the move that led there; "" where the approach is unknown.
+        leg_steps: length of that move, 0 for a homing.
+        depth_mm: X of its spots in frame S, by the stated cameras.
+        within: per spot, how far it lies from the mean of the rest's spots, in standard deviations of that difference
+            by pixel noise; empty for a single spot.
+        time_s: of the move after which it was first seen.
+        deviation_deg: observed - fitted mirror angle, stop error included.
+        u_deg: its standard deviation as the fitted noise has it (pixel noise and stop error).
+    """
+
+    axis: str
+    spots: tuple[int, ...]
+    steps: int
+    direction: str
+    leg_steps: int
+    depth_mm: tuple[float, ...]
+    within: tuple[float, ...]
+    time_s: float
+    deviation_deg: float
+    u_deg: float
+
+
+def stop_residuals(fit: JointFit) -> tuple[StopResidual, ...]:
+    """Deviations of all stops from the fitted model, both axes, in order.
+
+    At each spot the residual, range projected out, is explained by two angles (least squares); the spots of one rest
+    of an axis are averaged with the weights of their pixel noise. The common part of the calibration is in none of
+    them, and each deviation has lost a little to the fit: they scatter by slightly less than `u_deg`.
+    """
+    spots = ordered_spots(fit.campaign)
+    moves = fit.campaign.moves
+    rows = jax.tree.map(lambda x: np.asarray(x)[: len(spots)], fit.arrays.spots)
+    slope = fit.linearised.slope
+    normal = np.einsum("nia,nib->nab", slope, slope)
+    with np.errstate(all="ignore"):
+        covariance = np.linalg.pinv(normal)
+    angle = np.einsum("nab,nib,ni->na", covariance, slope, fit.linearised.residual)
+    found = []
+    for index, (axis, directions) in enumerate((("pan", ("left", "right")), ("tilt", ("up", "down")))):
+        rest = np.cumsum(rows.redraw[:, index] | rows.new_segment)
+        for number in np.unique(rest):
+            chosen = np.flatnonzero((rest == number) & (rows.valid > 0))
+            if not len(chosen):
+                continue
+            first = spots[chosen[0]].move
+            # Walk back to the move of this axis, or to the homing, that began the rest.
+            begun = first
+            while not moves[begun].pan_approach and _steps(moves[begun], axis) == _steps(moves[begun - 1], axis):
+                begun -= 1
+            approach = getattr(moves[begun], f"{axis}_approach")
+            leg = 0 if approach else _steps(moves[begun], axis) - _steps(moves[begun - 1], axis)
+            direction = approach.replace("unknown", "") if approach else directions[leg < 0]
+            mine, noise = angle[chosen, index], covariance[chosen, index, index]
+            weight = 1 / noise
+            mean = mine @ weight / weight.sum()
+            variance = 1 / weight.sum() + fit.linearised.stop_variance[chosen[0], index]
+            within = (mine - mean) / np.sqrt(noise - 1 / weight.sum()) if len(chosen) > 1 else ()
+            found.append(
+                StopResidual(
+                    axis=axis,
+                    spots=tuple(spots[i].spot for i in chosen),
+                    steps=_steps(moves[begun], axis),
+                    direction=direction,
+                    leg_steps=abs(leg),
+                    depth_mm=tuple(map(float, rows.triangulated_mm[chosen, 0])),
+                    within=tuple(map(float, within)),
+                    time_s=moves[first].time_s,
+                    deviation_deg=float(np.degrees(mean)),
+                    u_deg=float(np.degrees(np.sqrt(variance))),
+                )
+            )
+    return tuple(found)
+
+
+def _steps(move: Move, axis: str) -> int:
+    return move.pan_steps if axis == "pan" else move.tilt_steps
+
+
+@dataclass(frozen=True)
+class CauseGroup:
+    """Stops of one axis that share a value of a cause: mean of deviation / u, and its standard error."""
+
+    label: str
+    count: int
+    mean: float
+    standard_error: float
+
+
+@dataclass(frozen=True)
+class Cause:
+    """Whether the deviations of one axis depend on one thing.
+
+    `p` is the probability of group means as different as these if nothing depends on it (one-way analysis of
+    variance), None with fewer than two groups of two.
+    """
+
+    name: str
+    axis: str
+    groups: tuple[CauseGroup, ...]
+    p: float | None
+    suspicious: bool
+
+
+def residual_causes(residuals: Sequence[StopResidual]) -> tuple[Cause, ...]:
+    """Deviations of the stops grouped by depth, direction, N, step phase and time, pan and tilt apart.
+
+    Spots of one rest share its stop error: for depth they are held against each other, not against the model.
+    A cause is suspicious where its p is below `CAUSE_LIMIT` shared out among all tests (Bonferroni).
+    """
+    keys: dict[str, Callable[[StopResidual], float | str]] = {
+        "direction": lambda r: r.direction or "unknown",
+        "N": lambda r: r.leg_steps,
+        "step phase": lambda r: f"n mod {STEP_PHASES} = {r.steps % STEP_PHASES}",
+        "time": lambda r: r.time_s,
+    }
+    units = {"depth": " mm", "N": " steps", "time": " s"}
+    found = []
+    for axis in ("pan", "tilt"):
+        mine = [r for r in residuals if r.axis == axis]
+        scaled = np.array([r.deviation_deg / r.u_deg for r in mine])
+        looks = [
+            (depth, value)
+            for r in mine
+            for depth, value in zip(r.depth_mm, r.within or (r.deviation_deg / r.u_deg,), strict=True)
+        ]
+        tested = {"depth": ([depth for depth, _ in looks], np.array([value for _, value in looks]))}
+        tested |= {name: ([key(r) for r in mine], scaled) for name, key in keys.items()}
+        for name, (values, measured) in tested.items():
+            groups, members = [], []
+            for label, rows in _binned(values, units.get(name, "")):
+                part = measured[rows]
+                spread = float(part.std(ddof=1)) if len(part) > 1 else 1.0
+                groups.append(CauseGroup(label, len(part), float(part.mean()), spread / np.sqrt(len(part))))
+                members.append(part)
+            testable = [part for part in members if len(part) > 1 and np.ptp(part) > 0]
+            p = float(stats.f_oneway(*testable).pvalue) if len(testable) > 1 else None
+            found.append(Cause(name, axis, tuple(groups), p, False))
+    tests = sum(cause.p is not None for cause in found)
+    return tuple(replace(c, suspicious=c.p is not None and c.p * tests < CAUSE_LIMIT) for c in found)
+
+
+def _binned(values: Sequence[float | str], unit: str) -> list[tuple[str, np.ndarray]]:
+    """Groups of equal values; more than `CAUSE_BINS` numbers go into bins of about equal counts."""
+    array = np.array(values)
+    distinct = np.unique(array)
+    if len(distinct) <= CAUSE_BINS or array.dtype.kind not in "if":
+        return [(f"{v:.6g}{unit}" if unit else str(v), np.flatnonzero(array == v)) for v in distinct]
+    bins = []
+    for rows in np.array_split(np.argsort(array, kind="stable"), CAUSE_BINS):
+        if len(rows):
+            bins.append((f"{array[rows].min():.4g} to {array[rows].max():.4g}{unit}", rows))
+    return bins

@@ -7,6 +7,7 @@ full log density and the inverse Hessian there. Everything happens in the coordi
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
@@ -181,7 +182,7 @@ class JointFit:
         prior_draws: the same under the priors, at the same pose.
         mode: headlines and parameters at the mode (fields without leading axis).
         ends95: parameters at z - 1.96 sd and z + 1.96 sd, shape (2, p): interval ends under monotone maps.
-        excluded_spots: ids of spots the robust option left out.
+        excluded_spots: ids of spots that the robust option or the caller left out.
         suspect_spots: ids of spots used although a clean spot would look so less often than `GATE_PROBABILITY`.
         converged: the mode was reached and is a maximum.
         problems: sentences on what failed; empty when converged.
@@ -217,11 +218,15 @@ class JointFit:
 class Problem:
     """One campaign in front of the compiled functions."""
 
-    def __init__(self, campaign: Campaign, table: RigTable):
+    def __init__(self, campaign: Campaign, table: RigTable, used: np.ndarray):
         self.spots = ordered_spots(campaign)
         self.space = parameter_space(table, campaign.stereo)
-        self.arrays = campaign_arrays(campaign)
-        self.free = free_mask(self.space, any(s.aperture_deg is not None for s in self.spots))
+        arrays = campaign_arrays(campaign)
+        valid = np.array(arrays.spots.valid)
+        valid[: len(used)] *= used
+        self.arrays = eqx.tree_at(lambda a: a.spots.valid, arrays, jnp.asarray(valid))
+        readings = (spot.aperture_deg is not None for spot, use in zip(self.spots, used, strict=True) if use)
+        self.free = free_mask(self.space, any(readings))
         is_noise = np.isin(NAMES, NOISE_NAMES)
         self.noise = np.flatnonzero(is_noise & self.free)
         self.held = is_noise | ~self.free
@@ -377,6 +382,7 @@ def fit(
     per_axis: bool = False,
     harmonics: bool = False,
     no_backlash: bool = False,
+    without: Collection[int] = (),
     seed: int = 0,
 ) -> JointFit:
     """Fit the joint model to every usable spot (DESIGN 4).
@@ -389,6 +395,7 @@ def fit(
         harmonics: free the transmission error of every axis with a stated period, N(0, 0.1 deg) each, where
             `[rig.prior]` says nothing else; a harmonic stated as exactly 0 counts as nothing said.
         no_backlash: gears without play, both backlashes fixed at 0.
+        without: ids of spots that teach the fit nothing but can be predicted by it.
         seed: seed of the Laplace draws.
 
     Returns:
@@ -401,21 +408,21 @@ def fit(
     """
     table = model_choice(campaign.rig, per_axis=per_axis, harmonics=harmonics, no_backlash=no_backlash)
     spots = ordered_spots(campaign)
-    if len(spots) < SMALLEST_CAMPAIGN:
+    used = np.array([spot.spot not in without for spot in spots], dtype=bool)
+    if used.sum() < SMALLEST_CAMPAIGN:
         raise NothingToEstimate(
             "too-few-spots",
-            f"spots.csv: {len(spots)} spots have status ok; the joint fit needs at least {SMALLEST_CAMPAIGN}",
+            f"spots.csv: {used.sum()} spots can be used; the joint fit needs at least {SMALLEST_CAMPAIGN}",
             file="spots.csv",
             remedy="observe more stops, or detect the refused spots again",
         )
     with jax.enable_x64(True), ThreadPoolExecutor(1) as executor:
-        problem = Problem(campaign, table)
+        problem = Problem(campaign, table, used)
         problem.compile_aside(executor)
         z = np.zeros(len(NAMES))
         for inflation in ANNEALING:
             z = problem.least_squares(z, inflation)
         z = problem.alternate(z)
-        used = np.ones(len(spots), dtype=bool)
         if robust:
             for _ in range(20):
                 problem.arrays, used, change = _robust_weights(problem, z)

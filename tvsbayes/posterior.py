@@ -402,14 +402,25 @@ def predictive_pixels(posterior: Posterior, draws_per_chain: int = 8) -> xr.Data
         Dimensions (chain, draw, spot, pixel); the draws are a subset of the posterior's, by its own coordinate.
     """
     fit = posterior.fit
-    spots = ordered_spots(fit.campaign)
-    count = len(spots)
     generator = np.random.default_rng([posterior.seed, 1])
     chains, draws = posterior.z.shape[:2]
     chosen = np.unique(np.linspace(0, draws - 1, min(draws_per_chain, draws)).astype(int))
     z = posterior.z[:, chosen].reshape(-1, posterior.z.shape[-1])
+    physical = posterior.draws.physical[:, chosen].reshape(len(z), -1)
+    values = looks_again(fit, z, physical, generator).reshape(chains, len(chosen), -1, 4)
+    spots = [spot.spot for spot in ordered_spots(fit.campaign)]
+    coords = {"chain": np.arange(chains), "draw": chosen, "spot": spots, "pixel": list(PIXELS)}
+    return xr.DataArray(values.astype(np.float32), coords, ("chain", "draw", "spot", "pixel"))
+
+
+def looks_again(fit: JointFit, z: np.ndarray, physical: np.ndarray, generator: np.random.Generator) -> np.ndarray:
+    """Pixels (draws, spots, 4) of the same looks taken again at coordinates z (draws, p) with values `physical`.
+
+    Stop errors, home offsets, place in the play and pixel noise are drawn anew; ranges are those observed.
+    """
+    count = len(ordered_spots(fit.campaign))
     arrays = jax.tree.map(np.asarray, fit.arrays.spots)
-    sd_deg = posterior.draws.physical[:, chosen][..., [INDEX[f"stop_sd_deg.{d}"] for d in DIRECTIONS]]
+    sd_deg = physical[:, [INDEX[f"stop_sd_deg.{d}"] for d in DIRECTIONS]]
     # Per axis (right, left) and (down, up), as `redraw_mix` orders them.
     sd_rad = np.radians(sd_deg.reshape(len(z), 2, 2)[..., ::-1])
     variance = np.sum(arrays.redraw_mix[None] * sd_rad[:, None] ** 2, axis=3)
@@ -420,13 +431,14 @@ def predictive_pixels(posterior: Posterior, draws_per_chain: int = 8) -> xr.Data
     home = np.radians(HOME_SD_DEG) * generator.standard_normal((len(z), size, 2)) * arrays.homed[:, None]
     segment = np.maximum.accumulate(np.where(arrays.new_segment, np.arange(size), 0))
     error = error + home[:, segment]
-    pixel_scale = posterior.draws.physical[:, chosen][..., INDEX["pixel_scale"]].reshape(-1, 1, 1)
+    # Where the play stands is unknown after an unknown approach: Gaussian, as in the filter.
+    place = generator.standard_normal(home.shape)[:, segment]
+    error[:, :count] += fit.linearised.play_sd_rad * place[:, :count]
+    pixel_scale = physical[:, INDEX["pixel_scale"]].reshape(-1, 1, 1)
     ideal = looks(fit, z, error)
     root = np.linalg.inv(arrays.whitening[:count])
     noise = np.einsum("sij,nsj->nsi", root, generator.standard_normal(ideal.shape))
-    values = (ideal + pixel_scale * noise).reshape(chains, len(chosen), count, 4)
-    coords = {"chain": np.arange(chains), "draw": chosen, "spot": [s.spot for s in spots], "pixel": list(PIXELS)}
-    return xr.DataArray(values.astype(np.float32), coords, ("chain", "draw", "spot", "pixel"))
+    return ideal + pixel_scale * noise
 
 
 def data_tree(posterior: Posterior) -> xr.DataTree:

@@ -25,7 +25,7 @@ from tvsbayes.classic import DIRECTIONS, ClassicResult
 from tvsbayes.files import make_folder, write_atomically
 
 if TYPE_CHECKING:
-    from tvsbayes.comparison import Budget
+    from tvsbayes.comparison import Budget, Comparison, Gap, GapTerm, HoldOut
     from tvsbayes.coordinates import Locations
     from tvsbayes.information import Estimate, FitSummary
     from tvsbayes.joint import Derived, JointFit
@@ -302,3 +302,59 @@ def steps_text(steps: Steps) -> str:
         half = ", ".join(f"{u:.2g}" for u in steps.u95_deg)
         lines.append(f"whole steps leave {steps.rounding_deg:.3g} deg; azimuth and elevation +- ({half}) deg (95 %)")
     return "\n".join(lines)
+
+
+def gap_text(gaps: dict[str, Gap | None]) -> str:
+    """The gap between both estimators by its terms."""
+    found = {direction: gap for direction, gap in gaps.items() if gap is not None}
+    rows = [
+        ["classic mean", *(f"{gap.classic:.6f}" for gap in found.values())],
+        ["effective ratio (joint)", *(concise(gap.joint.value, gap.joint.sd) for gap in found.values())],
+        ["classic - joint", *(signed(gap.total) for gap in found.values())],
+    ]
+    for number, term in enumerate(next(iter(found.values())).terms):
+        rows.append([f"  {term.name}", *(signed(gap.terms[number]) for gap in found.values())])
+    return text_table("why the classic differs from the joint, deg/step, value(u)", ["", *found], rows)
+
+
+def signed(term: GapTerm) -> str:
+    """A difference with its sign, value(u)."""
+    text = concise(term.value, term.sd)
+    return text if text.startswith("-") else f"+{text}"
+
+
+def hold_out_text(held: HoldOut) -> str:
+    """Who foretells left-out angles better, and what no hold-out can see."""
+    lines = []
+    if held.classic is not None:
+        rows = [
+            [
+                name,
+                f"{score.rms_deg:.3f}",
+                f"{score.rms_block_deg:.3f}",
+                f"{100 * score.coverage:.0f} %",
+                f"{score.log_density:+.2f}",
+            ]
+            for name, score in (("classic", held.classic), ("joint", held.joint))
+        ]
+        title = f"angles of {len(held.predictions)} experiments left out by {held.by}, deg"
+        columns = ["", "rms error", "rms of block means", "inside 95 %", "log density"]
+        lines.append(text_table(title, columns, rows))
+    lines.append(f"held-out angles: {held.verdict}: {held.reason}")
+    common = ", ".join(f"{d} {u:.1e}" for d, u in held.unseen.items())
+    lines.append(f"not seen by any hold-out, common to all spots: u by stereo and focal scale, deg/step: {common}")
+    return "\n".join(lines)
+
+
+def changes_text(comparison: Comparison) -> str:
+    """Two calibrations of one instrument."""
+    rows = []
+    for c in comparison.changes:
+        cells = [c.quantity, f"{c.first:.6f}", f"{c.second:.6f}", concise(c.difference, c.u), c.unit]
+        rows.append([*cells, f"{c.normalised:+.2f}", "yes" if c.significant else "no"])
+    pan, tilt = comparison.reference_pose_deg
+    title = f"A and B at pan {pan:.2f} deg, tilt {tilt:.2f} deg"
+    table = text_table(title, ["quantity", "A", "B", "B - A (u)", "unit", "normalised", "significant"], rows)
+    days = "" if comparison.days is None else f" in {comparison.days:.1f} days"
+    cameras = "the same stereo calibration: its error is left out of u" if comparison.shared_cameras else "two cameras"
+    return f"{table}\n{comparison.verdict}{days} (limit {comparison.limit:.2f} u for all together; {cameras})"
