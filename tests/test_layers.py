@@ -24,7 +24,8 @@ LEVELS: tuple[tuple[str, ...], ...] = (
     ("information",),
     ("coordinates",),
     ("comparison",),
-    ("report",),
+    ("report", "plots"),
+    ("pages",),
     ("cli",),
 )
 """From bottom to top: a module imports only modules of lower levels."""

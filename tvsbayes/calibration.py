@@ -438,11 +438,11 @@ class Calibration:
             return Steps(*shared, None, None, None, rounding, None, self._ray_u95(counters, sides, None))
         reach = float((target - o) @ d)
         point = o + reach * d
-        aperture = self._reading(point)
+        aperture = self.reading(point)
         u95 = self._ray_u95(counters, sides, reach)
         return Steps(*shared, point, aperture, float(np.linalg.norm(target - point)), None, u95, None)
 
-    def _reading(self, point: np.ndarray) -> float:
+    def reading(self, point: np.ndarray) -> float:
         """What the aperture reads for a point of frame T, degrees."""
         x, y, z = point + np.array([0.0, 0.5 * self.estimates["baseline_mm"], 0.0])
         lateral = x if self.azimuth else math.hypot(x, z)
@@ -743,14 +743,19 @@ def _shaped(calibration: Calibration) -> Calibration:
     return calibration
 
 
+def _archive(path: Path) -> np.lib.npyio.NpzFile:
+    """An .npz whose size, packed and unpacked, is checked before anything is read from it."""
+    data = read_bytes(path, RESULTS_BYTES_MAX)
+    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        if sum(member.file_size for member in archive.infolist()) > UNPACKED_BYTES_MAX:
+            raise ValueError(f"more than {UNPACKED_BYTES_MAX} bytes when unpacked")
+    return np.load(io.BytesIO(data), allow_pickle=False)
+
+
 def read_draws(path: Path) -> Calibration:
     """Read `draws.npz`; errors as in `load_calibration`."""
-    data = read_bytes(path, RESULTS_BYTES_MAX)
     try:
-        with zipfile.ZipFile(io.BytesIO(data)) as archive:
-            if sum(member.file_size for member in archive.infolist()) > UNPACKED_BYTES_MAX:
-                raise ValueError(f"more than {UNPACKED_BYTES_MAX} bytes when unpacked")
-        with np.load(io.BytesIO(data), allow_pickle=False) as file:
+        with _archive(path) as file:
             if "format" not in file.files and "physical" in file.files:
                 raise InputError(
                     NO_CALIBRATION,
@@ -821,3 +826,20 @@ def stored_calibration(campaign: Campaign) -> Calibration | None:
             return None
         raise
     return calibration if calibration.inputs_sha256 == input_hashes(campaign) else None
+
+
+def stored_ratios(campaign: Campaign) -> np.ndarray:
+    """Draws (n, 4) of the effective ratios left, right, up, down in `results/`, deg/step.
+
+    Raises:
+        InputError: missing or damaged.
+    """
+    path = campaign.path / "results" / "draws.npz"
+    try:
+        with _archive(path) as file:
+            draws = np.array(file["effective_deg_per_step"], dtype=float)
+    except Exception as error:
+        raise _damaged(path, error) from error
+    if draws.ndim != 2 or draws.shape[1] != 4 or not np.all(np.isfinite(draws)):
+        raise _damaged(path, ValueError("effective_deg_per_step"))
+    return draws

@@ -1,7 +1,7 @@
 """The command line: reads options, calls the library, prints tables or one JSON document (DESIGN 8).
 
 Heavy modules are imported inside the commands that need them; `tvsbayes --help` loads none of them. Exit codes:
-0 done, 2 bad input, 3 nothing to estimate, 4 not converged, 130 interrupted.
+0 done, 1 done but a limit is not met, 2 bad input, 3 nothing to estimate, 4 not converged, 130 interrupted.
 """
 
 from __future__ import annotations
@@ -20,12 +20,14 @@ import typer
 
 from tvsbayes.files import (
     CSV_BYTES_MAX,
+    JSON_BYTES_MAX,
     InputError,
     NotConverged,
     NothingToEstimate,
     TvsError,
     escaped,
     make_folder,
+    parse_json,
     parse_table,
     read_bytes,
     shipped_data,
@@ -37,9 +39,13 @@ if TYPE_CHECKING:
     from tvsbayes.campaign import Campaign
     from tvsbayes.information import FitSummary
     from tvsbayes.joint import JointFit
-    from tvsbayes.posterior import Progress
+    from tvsbayes.posterior import Posterior, Progress
 
 INTERRUPTED = 130
+TARGET_MISSED = 1
+"""Done, but a limit or target that the user gave is not met."""
+RESIDUALS_LISTED = 4096
+"""Stops in `fit.json`, evenly chosen: a long campaign's file stays readable within its cap."""
 DEMO_NOTE = "The twin's move history is our assumption, made so that the classic answer is the paper's Table 1."
 
 app = typer.Typer(
@@ -292,9 +298,25 @@ def fit(
         more["chain"] = str(folder / "chain.npz")
     calibration = calibration_of(result, posterior, seed=seed) if result.converged else None
     draws = posterior.thinned(DRAWS_KEPT) if summary.estimator == "posterior" else None
-    files = {**write_results(result, summary, folder, seed, calibration, draws), **more}
+    usable = posterior if summary.estimator == "posterior" else None
+    files = {**write_results(result, summary, folder, seed, calibration, draws, _evidence(result, usable)), **more}
     document = {**summary.as_json(), "seed": seed, "files": files}
     _finish(document, f"{fit_text(summary)}\nwritten: {', '.join(files.values())}", as_json, _unusable(summary))
+
+
+def _evidence(fit: JointFit, posterior: Posterior | None) -> dict[str, object]:
+    """What `fit.json` holds for reports besides the estimates."""
+    from tvsbayes.comparison import explain_gap
+    from tvsbayes.information import residual_causes, stop_residuals
+
+    stops = stop_residuals(fit)
+    listed = stops[:: -(-len(stops) // RESIDUALS_LISTED) or 1]
+    gaps = explain_gap(fit, posterior) if fit.converged else {}
+    return {
+        "residuals": [asdict(stop) for stop in listed],
+        "residual_causes": [asdict(cause) for cause in residual_causes(stops)],
+        "gap": {d: None if gap is None else asdict(gap) for d, gap in gaps.items()} if any(gaps.values()) else None,
+    }
 
 
 def _calibration(folder: Path) -> Calibration:
@@ -330,12 +352,67 @@ def _converged_fit(campaign: Campaign) -> JointFit:
 
 
 @app.command()
+def report(
+    campaign: CampaignFolder,
+    limit_deg_per_step: Annotated[
+        float | None, typer.Option("--limit-deg-per-step", min=0, help="Largest error allowed of every ratio.")
+    ] = None,
+    limit_mm: Annotated[float | None, typer.Option("--limit-mm", min=0, help="Largest 3D error allowed.")] = None,
+    range_mm: Annotated[float, typer.Option("--range-mm", min=1, help="Range at which millimetres are stated.")] = 1e3,
+    pdf: Annotated[bool, typer.Option("--pdf", help="Also print to PDF with an installed Chromium.")] = False,
+    out: Annotated[Path | None, typer.Option("--out", help="File (default CAMPAIGN/results/report.html).")] = None,
+    as_json: Json = False,
+) -> None:
+    """The calibration report as one HTML page: verdict, results, residuals, error maps, budgets, provenance."""
+    from tvsbayes.calibration import load_calibration
+    from tvsbayes.campaign import read_campaign
+
+    data = read_campaign(campaign)
+    document = _fit_document(data, campaign)
+    from tvsbayes.model import use_compilation_cache
+    from tvsbayes.pages import gather, print_to_pdf, report_html
+
+    use_compilation_cache()
+    limits = {"limit_deg_per_step": limit_deg_per_step, "limit_mm": limit_mm}
+    evidence = gather(data, document, load_calibration(campaign), range_mm=range_mm, **limits)
+    path = out or campaign / "results" / "report.html"
+    write_atomically(path, report_html(evidence))
+    files = {"report": str(path)}
+    if pdf:
+        files["pdf"] = str(print_to_pdf(path))
+    lines = [
+        f"{c.quantity} within {c.limit:g} {c.unit}: {c.verdict} (P = {c.probability:.3f})" for c in evidence.criteria
+    ]
+    text = "\n".join([*lines, f"written: {', '.join(files.values())}"])
+    _finish({"criteria": [asdict(c) for c in evidence.criteria], "files": files}, text, as_json)
+    if any(c.verdict != "met" for c in evidence.criteria):
+        raise _Ended(TARGET_MISSED)
+
+
+def _fit_document(data: Campaign, folder: Path) -> dict[str, Any]:
+    """`results/fit.json` where it was made from exactly this campaign; else fit first (DESIGN 8)."""
+    from tvsbayes.calibration import stored_calibration
+
+    path = folder / "results" / "fit.json"
+    if stored_calibration(data) is not None and path.exists():
+        document = parse_json(read_bytes(path, JSON_BYTES_MAX), path.name).values
+        if "residuals" in document:
+            return document
+    report_line("results/ are missing or older than the campaign: fitting first (Laplace approximation) ...")
+    result = _converged_fit(data)
+    from tvsbayes.information import calibration_of, summarise
+    from tvsbayes.report import write_results
+
+    summary = summarise(result)
+    write_results(result, summary, folder / "results", 0, calibration_of(result), None, _evidence(result, None))
+    return parse_json(read_bytes(path, JSON_BYTES_MAX), path.name).values
+
+
+@app.command()
 def compare(
     campaign: CampaignFolder,
     other: Annotated[Path | None, typer.Argument(metavar="[B]", help="Later campaign of the same instrument.")] = None,
-    by: Annotated[
-        str, typer.Option("--by", help="Left out together: steps or regions.")
-    ] = "steps",
+    by: Annotated[str, typer.Option("--by", help="Left out together: steps or regions.")] = "steps",
     seed: Seed = 0,
     as_json: Json = False,
 ) -> None:

@@ -172,22 +172,8 @@ def error_map(
     """
     axes = [np.asarray(x, dtype=float) for x in (pan_steps, tilt_steps, range_mm)]
     pan, tilt, ranges = (x.ravel() for x in np.meshgrid(*axes, indexing="ij"))
-    given = sources(calibration, draws, seed)
     steps = np.stack([pan, tilt], axis=1)
-    with jax.enable_x64(True):
-        settings = Settings(
-            jnp.asarray(steps), jnp.tile(jnp.asarray(approach, dtype=float), (len(pan), 1)), jnp.zeros(len(pan))
-        )
-        best = jnp.concatenate([given.mean[: len(INPUT_NAMES)], given.stop_sd_deg])
-        estimate = model_from(best, given.period_deg)
-        joint = beams_at(estimate, settings.steps, settings.side, jnp.zeros(NOISES))
-        names = ("joint", *simple)
-        known = (joint, *(simple_rays(s, steps) for s in simple.values()))
-        a = calibration.estimates["baseline_mm"]
-        # `meeting` puts the aperture at half the distance it is given; a simple user's stands at origin - baseline.
-        bases = [a, *(2 * (s.baseline_mm - s.origin_y_mm) for s in simple.values())]
-        zeros = [np.radians(calibration.estimates["aperture_zero_deg"]), *(0.0 for _ in simple)]
-        found = _errors(settings, jnp.asarray(ranges), known, jnp.asarray([bases, zeros]), given)
+    names, found = _error_draws(calibration, steps, ranges, simple, approach, draws, seed)
     shape = tuple(len(x) for x in axes)
     rms, bias, valid = {}, {}, np.ones(shape, dtype=bool)
     for name, error, meets in zip(names, np.asarray(found.error_mm), np.asarray(found.meets), strict=True):
@@ -202,6 +188,90 @@ def error_map(
     (pan_low, pan_high), (tilt_low, tilt_high) = calibration.range_steps
     within = (pan >= pan_low) & (pan <= pan_high) & (tilt >= tilt_low) & (tilt <= tilt_high)
     return ErrorMap(*axes, rms_mm=rms, bias_mm=bias, inside=within.reshape(shape), valid=valid)
+
+
+def distances(
+    calibration: Calibration,
+    steps: tuple[float, float],
+    range_mm: float,
+    *,
+    simple: Mapping[str, SimpleCalibration],
+    draws: int = 4096,
+    seed: int = 0,
+) -> dict[str, np.ndarray]:
+    """How far each estimator's point lies from the true one, mm, over the rigs that the data allow.
+
+    Args:
+        calibration: with draws.
+        steps: counters (pan, tilt), reached moving left and up.
+        range_mm: along the beam.
+        simple: further calibrations by name.
+        draws: rigs.
+        seed: of their stop errors and aperture noise.
+
+    Returns:
+        Draws (n,) by estimator, "joint" first; infinite where beam and aperture do not meet.
+    """
+    names, found = _error_draws(calibration, np.array([steps]), np.array([range_mm]), simple, (1.0, 1.0), draws, seed)
+    length = np.linalg.norm(np.asarray(found.error_mm)[..., 0], axis=2)
+    return dict(zip(names, np.where(np.asarray(found.meets)[..., 0], length, np.inf), strict=True))
+
+
+MET, NOT_MET = "met", "not met"
+MET_PROBABILITY = 0.95
+
+
+@dataclass(frozen=True)
+class Criterion:
+    """Whether an error stays within a limit.
+
+    Attributes:
+        quantity: whose error.
+        limit: largest error allowed, in `unit`.
+        unit: of the limit.
+        probability: that the error lies within it.
+        verdict: "met" from a probability of 0.95 on, "not met" up to 0.05, else "cannot tell".
+    """
+
+    quantity: str
+    limit: float
+    unit: str
+    probability: float
+    verdict: str
+
+
+def criterion(quantity: str, errors: np.ndarray, limit: float, unit: str) -> Criterion:
+    """Judge draws of an error (n,) by a limit (decision rule stated beforehand, ISO/IEC 17025 7.8.6)."""
+    probability = float(np.mean(np.abs(errors) <= limit))
+    verdict = MET if probability >= MET_PROBABILITY else NOT_MET if probability <= 1 - MET_PROBABILITY else CANNOT_TELL
+    return Criterion(quantity, limit, unit, probability, verdict)
+
+
+def _error_draws(
+    calibration: Calibration,
+    steps: np.ndarray,
+    ranges: np.ndarray,
+    simple: Mapping[str, SimpleCalibration],
+    approach: tuple[float, float],
+    draws: int,
+    seed: int,
+) -> tuple[tuple[str, ...], _Errors]:
+    """Names of the estimators and their errors at settings (points, 2) and ranges (points,)."""
+    given = sources(calibration, draws, seed)
+    with jax.enable_x64(True):
+        sides = jnp.tile(jnp.asarray(approach, dtype=float), (len(steps), 1))
+        settings = Settings(jnp.asarray(steps, dtype=float), sides, jnp.zeros(len(steps)))
+        best = jnp.concatenate([given.mean[: len(INPUT_NAMES)], given.stop_sd_deg])
+        estimate = model_from(best, given.period_deg)
+        joint = beams_at(estimate, settings.steps, settings.side, jnp.zeros(NOISES))
+        names = ("joint", *simple)
+        known = (joint, *(simple_rays(s, steps) for s in simple.values()))
+        a = calibration.estimates["baseline_mm"]
+        # `meeting` puts the aperture at half the distance it is given; a simple user's stands at origin - baseline.
+        bases = [a, *(2 * (s.baseline_mm - s.origin_y_mm) for s in simple.values())]
+        zeros = [np.radians(calibration.estimates["aperture_zero_deg"]), *(0.0 for _ in simple)]
+        found = _errors(settings, jnp.asarray(ranges), known, jnp.asarray([bases, zeros]), given)
+    return names, found
 
 
 @dataclass(frozen=True)

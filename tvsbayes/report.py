@@ -10,6 +10,7 @@ import json
 import math
 import shlex
 import sys
+from collections.abc import Mapping
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -187,8 +188,13 @@ def demo_text(classic_result: ClassicResult, summary: FitSummary, truth: dict[st
     return f"{ratios}\n\n{others}"
 
 
-def fit_document(fit: JointFit, summary: FitSummary, seed: int, draws: Derived) -> dict[str, object]:
-    """The content of `results/fit.json` (DESIGN 7): estimates, covariance of `draws` with names, provenance."""
+def fit_document(
+    fit: JointFit, summary: FitSummary, seed: int, draws: Derived, evidence: Mapping[str, object] | None = None
+) -> dict[str, object]:
+    """The content of `results/fit.json` (DESIGN 7): estimates, covariance of `draws` with names, provenance.
+
+    `evidence` adds what reports show besides: residuals by cause, the gap to the classic estimator.
+    """
     names = list(summary.parameters)
     packages = ("tvsbayes", "jax", "optimistix", "equinox", "emcee", "arviz", "numpy", "scipy")
     packages += ("opencv-python-headless",)
@@ -198,6 +204,7 @@ def fit_document(fit: JointFit, summary: FitSummary, seed: int, draws: Derived) 
         "format": FIT_FORMAT,
         **summary.as_json(),
         "covariance": {"names": [fit.names[i] for i in estimated], "matrix": covariance.tolist()},
+        **(evidence or {}),
         "inputs": input_hashes(fit.campaign),
         "versions": {"python": sys.version.split()[0], **{name: version(name) for name in packages}},
         "seed": seed,
@@ -212,6 +219,7 @@ def write_results(
     seed: int,
     calibration: Calibration | None = None,
     draws: Derived | None = None,
+    evidence: Mapping[str, object] | None = None,
 ) -> dict[str, str]:
     """Write `fit.json` and `draws.npz`, each whole or not at all.
 
@@ -222,6 +230,7 @@ def write_results(
         seed: of everything random.
         calibration: what `locate` and `steps-for` read back; None for a fit that must not be used.
         draws: behind the summary, one leading axis; None for the Laplace approximation's.
+        evidence: further keys of `fit.json`, see `fit_document`.
 
     Returns:
         Paths by "fit" and "draws".
@@ -244,7 +253,7 @@ def write_results(
     else:
         del arrays["estimator"]
         content = calibration_bytes(calibration, **arrays)
-    document = json.dumps(fit_document(fit, summary, seed, draws), indent=1, allow_nan=False)
+    document = json.dumps(fit_document(fit, summary, seed, draws, evidence), indent=1, allow_nan=False)
     contents = {"draws": ("draws.npz", content), "fit": ("fit.json", document.encode())}
     make_folder(folder)
     for name, data in contents.values():
