@@ -408,7 +408,7 @@ def _ideal(space: ParameterSpace, names: Sequence[str]) -> ParameterSpace:
     return space
 
 
-def explain_gap(found: JointFit, posterior: Posterior | None = None) -> dict[str, Gap | None]:
+def explain_gap(found: JointFit, posterior: Posterior | None = None, draws: int = GAP_DRAWS) -> dict[str, Gap | None]:
     """The gap between both estimators, term by term (DESIGN 1).
 
     On every draw the model takes the classic estimator's spots without noise, and again without backlash, then with
@@ -420,6 +420,7 @@ def explain_gap(found: JointFit, posterior: Posterior | None = None) -> dict[str
     Args:
         found: a converged fit of the campaign.
         posterior: its sample, for its draws in place of the Laplace approximation's.
+        draws: that the intervals rest on, at least two.
 
     Returns:
         By direction; None without complete experiments.
@@ -429,10 +430,10 @@ def explain_gap(found: JointFit, posterior: Posterior | None = None) -> dict[str
     if not len(selection.experiments):
         return result
     if posterior is None:
-        z = np.vstack([found.z, found.draws_z[:GAP_DRAWS]])
+        z = np.vstack([found.z, found.draws_z[:draws]])
     else:
         every = posterior.z.reshape(-1, posterior.z.shape[-1])
-        z = every[np.linspace(0, len(every) - 1, GAP_DRAWS).astype(int)]
+        z = every[np.linspace(0, len(every) - 1, draws).astype(int)]
     pixels_of = _experiment_pixels(found, selection)
     with jax.enable_x64(True):
         spaces = [found.space]

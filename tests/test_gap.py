@@ -1,0 +1,276 @@
+"""Classic against joint: the gap term by term, left-out experiments, two calibrations, residuals by cause."""
+
+from __future__ import annotations
+
+import datetime
+import json
+from dataclasses import replace
+
+import jax
+import numpy as np
+import pytest
+from conftest import ROOT, coordinates
+from scipy import stats
+
+from tvsbayes.campaign import read_campaign
+from tvsbayes.classic import DIRECTIONS, classic, select_experiments
+from tvsbayes.comparison import (
+    BACKLASH,
+    BETTER_JOINT,
+    CANNOT_TELL,
+    CHANCE,
+    PROJECTION,
+    STEREO_SCALE,
+    Gap,
+    _ratio_interval,
+    compare,
+    criterion,
+    explain_gap,
+    folds_of,
+    hold_out,
+)
+from tvsbayes.information import CAUSE_LIMIT, StopResidual, residual_causes, stop_residuals
+from tvsbayes.joint import JointFit, fit
+from tvsbayes.protocols import four_point_protocol
+from tvsbayes.simulation import Truth, read_truth, simulate
+
+TWIN = ROOT / "data" / "twins" / "paper_twin"
+
+
+@pytest.fixture(scope="module")
+def paper_fit() -> JointFit:
+    """The shipped twin of the paper: equal gears, |N| = 200."""
+    return fit(read_campaign(TWIN))
+
+
+@pytest.fixture(scope="module")
+def paper_truth(paper_fit) -> Truth:
+    return read_truth(TWIN / "truth.json", paper_fit.campaign.stereo)
+
+
+@pytest.fixture(scope="module")
+def mixed_fit(mounted_rig) -> JointFit:
+    """Two step counts, reversed and cleared starts: the play is seen."""
+    protocol = four_point_protocol(repeats=6, steps=(100, 200))
+    return fit(simulate(mounted_rig, protocol, seed=3).campaign)
+
+
+@pytest.fixture(scope="module")
+def paper_gaps(paper_fit) -> dict[str, Gap]:
+    return explain_gap(paper_fit)
+
+
+def true_terms(found: JointFit, truth: Truth) -> dict[str, dict[str, float]]:
+    """Terms on the true rig: the first row of the Laplace draws is where the fit stands."""
+    space = jax.tree.map(np.asarray, found.space)
+    gaps = explain_gap(replace(found, z=coordinates(space, truth)), draws=2)
+    return {d: {t.name: t.value for t in g.terms} for d, g in gaps.items() if g is not None}
+
+
+def test_terms_add_up_to_the_gap(paper_fit, paper_gaps):
+    measured = classic(paper_fit.campaign)
+    for direction, gap in paper_gaps.items():
+        mean = measured.directions[direction].mean_deg_per_step
+        assert gap.classic == mean
+        # Sums of five doubles of 0.06 deg/step.
+        rounding = 5 * np.finfo(float).eps * 0.06
+        assert sum(term.value for term in gap.terms) == pytest.approx(gap.total.value, abs=10 * rounding)
+        assert gap.total.value == pytest.approx(mean - gap.joint.value, abs=rounding)
+
+
+def test_terms_name_the_true_causes_with_sign_and_size(paper_fit, paper_gaps, paper_truth):
+    """The twin's truth lies inside every 95 % interval; the backlash's size is b/N by hand."""
+    gaps, true = paper_gaps, true_terms(paper_fit, paper_truth)
+    for direction, gap in gaps.items():
+        for term in gap.terms:
+            low, high = term.interval95
+            # A term that the truth fixes to rounding has an interval as narrow as that.
+            slack = 1e-9
+            assert low - slack <= true[direction][term.name] <= high + slack, (direction, term.name)
+    by = {d: {t.name: t.value for t in g.terms} for d, g in gaps.items()}
+    lost = {axis: paper_truth.parameters[f"backlash_deg.{axis}"] / 200 for axis in ("pan", "tilt")}
+    # Left and down start against their direction and lose the play, right and up start cleared (the twin's notes).
+    assert true["left"][BACKLASH] == pytest.approx(-lost["pan"], rel=0.05)
+    assert abs(true["right"][BACKLASH]) < 0.02 * lost["pan"]
+    assert by["left"][BACKLASH] < -0.9 * lost["pan"] < 0
+    # Equal gears read as 1.12 in tilt: an azimuth near 27 deg (DESIGN 1.2).
+    for direction in ("up", "down"):
+        assert by[direction][PROJECTION] == pytest.approx(0.0064, abs=0.0008)
+    assert abs(by["left"][PROJECTION]) < 1e-4
+
+
+def test_stereo_term_follows_the_focal_scale(mixed_fit):
+    """Cameras whose focal length is 1 % longer than stated: angles seem about 1 % larger, with distortion up to 2 %."""
+    index = list(mixed_fit.names).index("focal_scale")
+    shifted = np.array(mixed_fit.z)
+    shifted[index] += 0.01 / float(mixed_fit.space.u[index])
+    plain, longer = (explain_gap(replace(mixed_fit, z=z), draws=2) for z in (mixed_fit.z, shifted))
+    for direction in DIRECTIONS:
+        first, second = ({t.name: t.value for t in g[direction].terms}[STEREO_SCALE] for g in (plain, longer))
+        assert 0.003 < (second - first) / 0.065 < 0.02
+
+
+def test_a_single_step_count_cannot_tell(paper_fit):
+    held = hold_out(paper_fit)
+    assert held.verdict == CANNOT_TELL and "|N| = 200" in held.reason and not held.predictions
+    assert set(held.unseen) == set(DIRECTIONS)
+    # Common uncertainty by cameras is a part of the ratio's.
+    for k, direction in enumerate(DIRECTIONS):
+        assert 0 < held.unseen[direction] < paper_fit.draws.effective_deg_per_step[:, k].std()
+
+
+def test_joint_foretells_a_step_count_it_never_saw(mixed_fit):
+    held = hold_out(mixed_fit)
+    assert held.verdict == BETTER_JOINT and held.interval95[0] > 1
+    assert held.joint.rms_block_deg < held.classic.rms_block_deg
+    assert len(held.predictions) == len(select_experiments(mixed_fit.campaign).experiments)
+    # 48 predictions whose stop errors pairs share: half of them count, 1e-4 two-sided.
+    least = stats.binom.ppf(1e-4, 24, 0.95) / 24
+    assert held.joint.coverage >= least
+    seen = {p.experiment: p.angle_deg / p.steps for p in held.predictions}
+    for experiment in classic(mixed_fit.campaign).experiments:
+        assert seen[experiment.experiment] == pytest.approx(experiment.deg_per_step, rel=1e-12)
+    json.dumps(held.as_json(), allow_nan=False)
+
+
+def test_left_out_spots_teach_nothing(mixed_fit):
+    """Spoiling experiments that a fit was told to leave out changes no bit of it."""
+    campaign = mixed_fit.campaign
+    selection = select_experiments(campaign)
+    out = frozenset(campaign.spots[r].spot for r in selection.spot_rows[np.abs(selection.steps) == 100].ravel())
+    spoiled = tuple(replace(s, u_left_px=s.u_left_px + 3.0) if s.spot in out else s for s in campaign.spots)
+    plain, other = fit(campaign, without=out), fit(replace(campaign, spots=spoiled), without=out)
+    assert set(plain.excluded_spots) == out
+    # Triangulated points of spots without weight still steer where their range is evaluated, nothing else.
+    np.testing.assert_allclose(other.z, plain.z, atol=1e-6)
+
+
+def test_folds_leave_every_experiment_out_once(mixed_fit):
+    selection = select_experiments(mixed_fit.campaign)
+    for by in ("steps", "regions"):
+        masks = np.array(list(folds_of(mixed_fit.campaign, selection, by).values()))
+        assert np.all(masks.sum(axis=0) == 1)
+    with pytest.raises(ValueError, match="regions"):
+        folds_of(mixed_fit.campaign, selection, "weeks")
+
+
+@pytest.mark.parametrize(("correlation", "true"), [(0.0, 1.0), (0.7, 1.0), (0.6, 3.0)])
+def test_interval_of_the_ratio_of_errors_covers(correlation, true):
+    """Exact for normal pairs with mean 0: 4000 seeded sets of 8 blocks, binomial bounds at 1e-4."""
+    sets = 4000
+    generator = np.random.default_rng([8, round(10 * correlation)])
+    first = generator.standard_normal((sets, 8))
+    second = correlation * first + np.sqrt(1 - correlation**2) * generator.standard_normal((sets, 8))
+    inside = 0
+    for a, b in zip(true * first, second, strict=True):
+        low, high = _ratio_interval(a, b)
+        inside += low <= true <= high
+    low, high = stats.binom.ppf([1e-4, 1 - 1e-4], sets, 0.95)
+    assert low <= inside <= high
+
+
+def test_a_calibration_has_not_changed_from_itself(mixed_fit):
+    same = compare(mixed_fit, mixed_fit)
+    assert same.shared_cameras and same.verdict == "no significant change" and same.days is None
+    for change in same.changes:
+        assert change.difference == 0.0 and change.normalised == 0.0 and change.u > 0
+    # A second pair of cameras: nothing is shared, every u grows.
+    stereo = replace(
+        mixed_fit.campaign.stereo, parameter_covariance=mixed_fit.campaign.stereo.parameter_covariance * 1.01
+    )
+    apart = compare(mixed_fit, replace(mixed_fit, campaign=replace(mixed_fit.campaign, stereo=stereo)))
+    assert not apart.shared_cameras
+    for one, other in zip(same.changes[:4], apart.changes[:4], strict=True):
+        assert other.u > 1.05 * one.u
+
+
+def test_a_changed_gear_is_named(mounted_rig, mixed_fit):
+    """The same rig with 2 % more degrees per pan step, measured again 30 days later."""
+    protocol = four_point_protocol(repeats=6, steps=(100, 200))
+    first = simulate(mounted_rig, protocol, seed=3)
+    parameters = dict(first.truth.parameters)
+    parameters["degrees_per_step.pan"] *= 1.02
+    second = simulate(mounted_rig, protocol, seed=4, truth=replace(first.truth, parameters=parameters)).campaign
+    made = datetime.datetime(2026, 1, 1, tzinfo=datetime.UTC)
+    dated = [
+        replace(campaign, header={**campaign.header, "created": made + datetime.timedelta(days=30 * k)})
+        for k, campaign in enumerate((mixed_fit.campaign, second))
+    ]
+    found = compare(replace(mixed_fit, campaign=dated[0]), replace(fit(second), campaign=dated[1]))
+    moved = {c.quantity for c in found.changes if c.significant}
+    assert moved == {"effective_deg_per_step.left", "effective_deg_per_step.right"}
+    assert found.days == 30.0 and found.verdict.startswith("changed: effective_deg_per_step.left by +")
+    for change in found.changes[:2]:
+        assert change.difference == pytest.approx(0.02 * change.first, abs=4 * change.u)
+
+
+@pytest.mark.parametrize(
+    ("share", "verdict"), [(1.0, "met"), (0.95, "met"), (0.94, "cannot tell"), (0.06, "cannot tell"), (0.05, "not met")]
+)
+def test_criterion_follows_its_rule(share, verdict):
+    errors = np.where(np.arange(1000) < 1000 * share, 0.5, -2.0)
+    judged = criterion("x", errors, 1.0, "mm")
+    assert (judged.probability, judged.verdict) == (pytest.approx(share), verdict)
+
+
+def test_residuals_of_a_clean_campaign_scatter_as_stated(paper_fit):
+    residuals = stop_residuals(paper_fit)
+    spots = [spot for r in residuals if r.axis == "pan" for spot in r.spots]
+    assert sorted(spots) == sorted(s.spot for s in paper_fit.campaign.spots if s.status == "ok")
+    scaled = np.array([r.deviation_deg / r.u_deg for r in residuals])
+    n, determined = len(scaled), len(scaled) // 8
+    # A little is lost to the fit: fewer degrees of freedom below, none above; 1e-4 on either side.
+    low, high = stats.chi2.ppf([1e-4, 1 - 1e-4], [n - determined, n])
+    assert low <= np.sum(scaled**2) <= high
+    assert not any(cause.suspicious for cause in residual_causes(residuals))
+    assert {r.direction for r in residuals} == set(DIRECTIONS)
+
+
+def stops(generator: np.random.Generator, count: int = 60) -> list[StopResidual]:
+    """Stops of one axis whose deviations depend on nothing."""
+    found = []
+    for k in range(count):
+        noise, looks = generator.standard_normal(), generator.standard_normal(2)
+        within = tuple((looks - looks.mean()) * np.sqrt(2))
+        direction = ("left", "right")[k % 2]
+        places = (175.0 + 0.1 * generator.random(), 275.0 + 0.1 * generator.random())
+        leg = int(generator.choice([50, 100, 200]))
+        found.append(
+            StopResidual("pan", (2 * k, 2 * k + 1), k, direction, leg, places, within, 10.0 * k, 0.03 * noise, 0.03)
+        )
+    return found
+
+
+PLANTED = {
+    "depth": lambda r: replace(r, within=(r.within[0] - 1.0, r.within[1] + 1.0)),
+    "direction": lambda r: replace(r, deviation_deg=r.deviation_deg + (0.03 if r.direction == "left" else -0.03)),
+    "N": lambda r: replace(r, deviation_deg=r.deviation_deg + (0.06 if r.leg_steps == 200 else 0.0)),
+    "step phase": lambda r: replace(r, deviation_deg=r.deviation_deg + 0.045 * np.cos(np.pi * r.steps / 2)),
+    "time": lambda r: replace(r, deviation_deg=r.deviation_deg + 2e-4 * (r.time_s - 300)),
+}
+
+
+@pytest.mark.parametrize("name", PLANTED)
+def test_a_planted_cause_is_found_and_no_other_blamed_alone(name):
+    found = residual_causes([PLANTED[name](r) for r in stops(np.random.default_rng(6), 120)])
+    assert {c.name for c in found if c.suspicious} >= {name}
+    # Counters alternate with directions here: a phase of two steps is a direction as well.
+    related = {"step phase": {"direction"}, "direction": {"step phase"}}.get(name, set())
+    assert {c.name for c in found if c.suspicious} <= {name} | related
+
+
+def test_false_alarms_of_causes_stay_rare():
+    """100 clean campaigns; at most as many alarms as 1 % allows at 1e-4."""
+    alarms = sum(
+        any(c.suspicious for c in residual_causes(stops(np.random.default_rng([1, seed])))) for seed in range(100)
+    )
+    assert alarms <= stats.binom.ppf(1 - 1e-4, 100, CAUSE_LIMIT)
+
+
+def test_terms_and_chance_are_about_what_the_classic_saw(mixed_fit):
+    """Chance is what its own stop errors and pixels add: within 4 of its standard uncertainties (type A)."""
+    measured = classic(mixed_fit.campaign)
+    for direction, gap in explain_gap(mixed_fit, draws=64).items():
+        chance = {t.name: t for t in gap.terms}[CHANCE]
+        spread = np.hypot(chance.sd, measured.directions[direction].u_type_a_deg_per_step)
+        assert abs(chance.value) < 4 * spread
