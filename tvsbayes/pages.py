@@ -25,6 +25,7 @@ import jax.numpy as jnp
 import numpy as np
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
+from matplotlib import rc_context
 
 from tvsbayes import plots
 from tvsbayes.calibration import stored_ratios
@@ -278,7 +279,9 @@ def report_html(evidence: Evidence) -> bytes:
 def figure_view(figure: Figure, alt: str, caption: str) -> FigureView:
     """A figure as SVG in a `data:` address; the same figure gives the same bytes."""
     buffer = io.BytesIO()
-    figure.savefig(buffer, format="svg", dpi=RASTER_DPI, metadata={"Date": None, "Creator": None})
+    # The identifiers in the file are drawn when it is written.
+    with rc_context(plots.STYLE):
+        figure.savefig(buffer, format="svg", dpi=RASTER_DPI, metadata={"Date": None, "Creator": None})
     width, height = (round(96 * inch) for inch in figure.get_size_inches())
     text = re.sub(rb">\s+<", b"><", buffer.getvalue())
     return FigureView(f"data:image/svg+xml;base64,{base64.b64encode(text).decode()}", alt, caption, width, height)

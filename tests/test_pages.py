@@ -1,0 +1,284 @@
+"""The report page: structure, policy, what strangers write into campaigns, and how Chromium shows it."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import json
+import re
+import shutil
+import subprocess
+import xml.etree.ElementTree as ET
+from dataclasses import replace
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import ROOT
+
+from tvsbayes import plots
+from tvsbayes.calibration import load_calibration
+from tvsbayes.campaign import read_campaign, write_campaign
+from tvsbayes.classic import DIRECTIONS, classic
+from tvsbayes.cli import run
+from tvsbayes.files import parse_json
+from tvsbayes.pages import BROWSERS, Evidence, gather, report_html
+
+TWIN = ROOT / "data" / "twins" / "paper_twin"
+BYTES_MAX = 3_000_000
+VOID = {"meta", "img", "br", "link", "input", "hr"}
+KNOWN = {
+    *("html", "head", "meta", "title", "style", "body", "header", "main", "footer", "section", "figure", "figcaption"),
+    *("h1", "h2", "p", "strong", "ul", "li", "dl", "dt", "dd", "div", "img"),
+    *("table", "caption", "thead", "tbody", "tr", "th", "td"),
+}
+
+
+class Nodes(HTMLParser):
+    """Every element with its attributes, and the text outside of the style sheet."""
+
+    def __init__(self, page: bytes):
+        super().__init__()
+        self.elements: list[tuple[str, dict[str, str | None]]] = []
+        self.open: list[str] = []
+        self.text: list[str] = []
+        self.feed(page.decode())
+
+    def handle_starttag(self, tag, attrs):
+        self.elements.append((tag, dict(attrs)))
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        if "style" not in self.open:
+            self.text.append(data)
+
+    def of(self, tag: str) -> list[dict[str, str | None]]:
+        return [attributes for name, attributes in self.elements if name == tag]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory) -> Path:
+    """The paper twin with the results that the report command makes where there are none."""
+    place = tmp_path_factory.mktemp("report") / "twin"
+    shutil.copytree(TWIN, place)
+    assert run(["report", str(place), "--limit-deg-per-step", "1e-3", "--limit-mm", "1", "--json"]) == 1
+    return place
+
+
+def evidence_of(place: Path) -> Evidence:
+    document = parse_json((place / "results" / "fit.json").read_bytes(), "fit.json").values
+    limits = {"range_mm": 1000.0, "limit_deg_per_step": 1e-3, "limit_mm": 1.0}
+    return gather(read_campaign(place), document, load_calibration(place), **limits)
+
+
+@pytest.fixture(scope="module")
+def evidence(folder) -> Evidence:
+    return evidence_of(folder)
+
+
+@pytest.fixture(scope="module")
+def page(evidence) -> bytes:
+    return report_html(evidence)
+
+
+def test_the_command_writes_this_page(folder, page):
+    assert (folder / "results" / "report.html").read_bytes() == page
+    assert len(page) < BYTES_MAX
+
+
+def test_the_page_is_alone_and_its_policy_allows_only_itself(page):
+    nodes = Nodes(page)
+    assert {tag for tag, _ in nodes.elements} <= KNOWN and not nodes.open
+    assert not any(name.startswith("on") for _, attributes in nodes.elements for name in attributes)
+    for name in ("href", "srcset", "action", "data", "style"):
+        assert not any(name in attributes for _, attributes in nodes.elements)
+    policy = next(m["content"] for m in nodes.of("meta") if m.get("http-equiv") == "Content-Security-Policy")
+    style = page.split(b"<style>")[1].split(b"</style>")[0]
+    digest = base64.b64encode(hashlib.sha256(style).digest()).decode()
+    assert (
+        policy == f"default-src 'none'; img-src data:; style-src 'sha256-{digest}'; base-uri 'none'; form-action 'none'"
+    )
+    assert b"url(" not in style and b"@import" not in style
+
+
+def test_pictures_are_data_with_words(page):
+    images = Nodes(page).of("img")
+    assert len(images) >= 14
+    for image in images:
+        kind, content = image["src"].split(",", 1)
+        assert kind == "data:image/svg+xml;base64" and len(image["alt"]) > 20
+        root = ET.fromstring(base64.b64decode(content))
+        for node in root.iter():
+            assert not node.tag.endswith(("script", "foreignObject", "animate"))
+            for name, value in node.attrib.items():
+                # References inside the picture, and rasters that it carries itself.
+                assert not name.endswith("href") or value.startswith(("#", "data:image/png;base64,"))
+
+
+def test_the_page_can_be_read_by_ear(page):
+    nodes = Nodes(page)
+    assert nodes.of("html")[0]["lang"] == "en"
+    assert [len(nodes.of(tag)) for tag in ("h1", "main", "title")] == [1, 1, 1]
+    ids = [a["id"] for _, a in nodes.elements if "id" in a]
+    assert len(ids) == len(set(ids)) and all(a["aria-labelledby"] in ids for a in nodes.of("section"))
+    assert len(nodes.of("caption")) == len(nodes.of("table")) > 10
+    assert all(th.get("scope") in ("row", "col") for th in nodes.of("th"))
+    assert len(nodes.of("figcaption")) == len(nodes.of("figure"))
+
+
+def test_numbers_of_the_page_are_the_libraries(page, evidence):
+    text = " ".join(Nodes(page).text)
+    for direction in DIRECTIONS:
+        joint = evidence.fit["effective_deg_per_step"][direction]
+        assert f"{joint['value']:.6f}"[:7] in text
+        assert f"{evidence.classic.directions[direction].mean_deg_per_step:.5f}"[:7] in text
+    assert not re.search(r"\b(nan|inf|None|undefined)\b", text)
+    for word in ("Not an accredited", "Not traceable", "synthetic", "End of report", "Seed"):
+        assert word in text
+    for sha in evidence.fit["inputs"].values():
+        assert sha in text
+    assert "Not met" in text and "P at least" in text
+
+
+def test_the_same_results_give_the_same_bytes(page, folder):
+    assert report_html(evidence_of(folder)) == page
+
+
+def test_a_campaign_without_experiments_says_so(evidence):
+    spots = tuple(replace(s, experiment=None, point=None) for s in evidence.campaign.spots)
+    plain = replace(evidence, classic=None, campaign=replace(evidence.campaign, spots=spots))
+    text = " ".join(Nodes(report_html(plain)).text)
+    assert "Classic: not applicable" in text and "no complete four-point experiment" in text
+
+
+def test_no_limit_no_verdict_and_no_convergence_no_use(evidence):
+    assert "No limit was stated" in " ".join(Nodes(report_html(replace(evidence, criteria=()))).text)
+    broken = replace(evidence, fit={**evidence.fit, "converged": False, "problems": ["the mode was not reached"]})
+    text = " ".join(Nodes(report_html(broken)).text)
+    assert "NOT CONVERGED" in text and "the mode was not reached" in text
+
+
+PAYLOADS = (
+    "<script>alert(1)</script>",
+    '"><img src=x onerror=alert(1)>',
+    "'><svg/onload=alert(1)>",
+    "</style><script>alert(1)</script>",
+    "</title><iframe src='javascript:alert(1)'></iframe>",
+    "{{ 7 * 7 }}{% for x in range(9) %}A{% endfor %}",
+    "]]><!--<a href=javascript:alert(1)>x</a>",
+    "&lt;script&gt;&#x3c;b&#x3e;",
+)
+
+
+@pytest.mark.parametrize("payload", PAYLOADS)
+def test_what_strangers_write_stays_text(folder, page, payload, tmp_path):
+    """Every text field of campaign.toml; results stay valid, for texts are outside the hash."""
+    campaign = read_campaign(folder)
+    header = {key: payload for key in ("name", "operator", "instrument", "serial", "method", "notes")}
+    header |= {"created": campaign.header["created"], "traceability": {"board_certificate": payload}}
+    place = tmp_path / "hostile"
+    write_campaign(replace(campaign, header=header), place)
+    shutil.copytree(folder / "results", place / "results")
+    hostile = evidence_of(place)
+    hostile = replace(hostile, fit={**hostile.fit, "command": payload, "prior_conflicts": [payload]})
+    found = report_html(hostile)
+    nodes, plain = Nodes(found), Nodes(page)
+    assert {tag for tag, _ in nodes.elements} <= KNOWN
+    assert [len(nodes.of(tag)) for tag in ("img", "style", "meta")] == [
+        len(plain.of(t)) for t in ("img", "style", "meta")
+    ]
+    assert not any(name.startswith("on") for _, attributes in nodes.elements for name in attributes)
+    text = "".join(nodes.text)
+    assert text.count(payload) >= 9
+
+
+def test_results_that_belong_to_other_data_are_not_reported(folder, tmp_path):
+    """compare.json of another campaign is left out."""
+    document = {"inputs": {"moves": "0"}, "held_out": {}}
+    (folder / "results" / "compare.json").write_text(json.dumps(document))
+    try:
+        assert evidence_of(folder).held_out is None
+    finally:
+        (folder / "results" / "compare.json").unlink()
+
+
+def test_the_papers_figures_for_any_campaign(evidence):
+    campaign, result = evidence.campaign, classic(evidence.campaign)
+    number = result.experiments[0].experiment
+    for figure in (
+        plots.trajectories(campaign, number),
+        plots.points_3d(campaign, number),
+        plots.points_3d(campaign),
+        plots.direction_scatter(result, "left", (0.062, 1e-4)),
+        plots.spot_overlay(
+            np.zeros((60, 80, 3), np.uint8),
+            (40.2, 30.1),
+            (0.05, 0.06),
+            contour_px=np.eye(3, 2),
+        ),
+    ):
+        assert figure.get_axes() and figure.get_size_inches()[0] == plots.WIDTH_IN
+    angles = plots.trajectories(campaign, number).axes[0].get_legend_handles_labels()[1]
+    first = result.experiments[0]
+    assert angles == [f"before: {first.theta_i_deg:.2f} deg", f"after: {first.theta_f_deg:.2f} deg"]
+    with pytest.raises(ValueError, match="not complete"):
+        plots.trajectories(campaign, 10_000)
+
+
+def luminance(colour: str) -> float:
+    """Relative luminance of an sRGB colour (WCAG 2.2)."""
+    digits = colour.lstrip("#")
+    digits = "".join(2 * c for c in digits) if len(digits) == 3 else digits
+    parts = np.array([int(digits[i : i + 2], 16) for i in (0, 2, 4)]) / 255
+    linear = np.where(parts <= 0.04045, parts / 12.92, ((parts + 0.055) / 1.055) ** 2.4)
+    return float(linear @ [0.2126, 0.7152, 0.0722])
+
+
+def test_text_stands_out_in_both_schemes():
+    """4.5:1 for every text colour on the page and on its cards (WCAG 2.2, 1.4.3)."""
+    css = (ROOT / "data" / "templates" / "report.css").read_text()
+    schemes = [dict(re.findall(r"--(\w+): (#[0-9a-f]+)", block)) for block in re.findall(r":root \{([^}]*)\}", css)]
+    assert len(schemes) == 2
+    for scheme in schemes:
+        for ink in ("ink", "faint", "met", "not", "tell"):
+            for ground in ("paper", "card"):
+                high, low = sorted((luminance(scheme[ink]), luminance(scheme[ground])), reverse=True)
+                assert (high + 0.05) / (low + 0.05) >= 4.5, (ink, ground)
+
+
+PROBE = """<!DOCTYPE html><html><body>
+<iframe id="f" src="report.html" style="width:{width}px;height:900px;border:0"></iframe>
+<script>
+document.getElementById("f").onload = function () {{
+  const d = this.contentDocument, images = Array.from(d.images);
+  const small = i => i.naturalWidth === 0 || i.getBoundingClientRect().width < 200;
+  const broken = images.filter(i => !i.complete || small(i)).length;
+  document.title = JSON.stringify({{wide: d.documentElement.scrollWidth, images: images.length, broken: broken,
+    scripts: d.scripts.length}});
+}};
+</script></body></html>"""
+
+
+@pytest.mark.parametrize("width", [360, 1280])
+def test_chromium_shows_the_page_without_overflow_or_complaint(folder, tmp_path, width):
+    browser = next(filter(None, map(shutil.which, BROWSERS)), None)
+    if browser is None:
+        pytest.skip("no Chromium or Chrome on the path (Debian's package: chromium)")
+    shutil.copy(folder / "results" / "report.html", tmp_path / "report.html")
+    (tmp_path / "probe.html").write_text(PROBE.format(width=width))
+    flags = ["--headless", "--no-sandbox", "--disable-gpu", "--no-first-run", "--disable-background-networking"]
+    flags += ["--disable-sync", "--disable-quic", "--allow-file-access-from-files", "--enable-logging=stderr"]
+    flags += [f"--user-data-dir={tmp_path / 'profile'}", "--window-size=1400,1000", "--virtual-time-budget=10000"]
+    target = (tmp_path / "probe.html").as_uri()
+    done = subprocess.run(
+        [browser, *flags, "--dump-dom", target], capture_output=True, text=True, timeout=120, check=True
+    )
+    found = json.loads(re.search(r"<title>(.*?)</title>", done.stdout)[1])
+    assert found["wide"] <= width and found["broken"] == 0 and found["scripts"] == 0
+    assert found["images"] == len(Nodes((tmp_path / "report.html").read_bytes()).of("img"))
+    assert "CONSOLE" not in done.stderr
