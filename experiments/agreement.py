@@ -24,11 +24,10 @@ import numpy as np
 from arviz_stats.base import array_stats
 
 from tvsbayes.campaign import input_hashes, read_campaign
-from tvsbayes.ensemble import Target, pilot, transport
 from tvsbayes.files import shipped_data
 from tvsbayes.joint import fit
 from tvsbayes.model import NAMES, use_compilation_cache
-from tvsbayes.posterior import sample
+from tvsbayes.posterior import Target, pilot, sample, transport
 
 AXES = {"chain_axis": 0, "draw_axis": 1}
 QUANTILES = {"q05": 0.05, "q50": 0.5, "q95": 0.95}

@@ -9,7 +9,7 @@ headline under `tvsbayes.likelihood.log_density`, each with its Monte Carlo stan
 chains in step, diagonal mass) samples w: a triangular quadratic shear w -> y of volume 1 takes the curvature out of
 the stiff directions, and z = mode + C y with C the Cholesky factor of the Laplace covariance. Coordinates change the
 cost of a draw, not the posterior. The shear is built here anew: a reference shares no sampling code with
-`tvsbayes.ensemble`, which it judges. `--speed` measures effective draws per second without the shear, dense mass.
+`tvsbayes.posterior`, which it judges. `--speed` measures effective draws per second without the shear, dense mass.
 """
 
 from __future__ import annotations

@@ -127,10 +127,9 @@ def ranks(simulated, result, z: np.ndarray) -> dict[str, int]:
     """Number of draws z (n, 65), coordinates of the fit, below the truth, for every quantity of the true model."""
     import jax
 
-    from tvsbayes.ensemble import in_batches
     from tvsbayes.likelihood import campaign_arrays, evaluate
     from tvsbayes.model import NAMES, RIG_NAMES, parameter_space
-    from tvsbayes.posterior import derived_at
+    from tvsbayes.posterior import derived_at, in_batches
     from tvsbayes.simulation import effective_deg_per_step, effective_mirror_offset_mm
 
     truth = simulated.truth

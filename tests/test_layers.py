@@ -19,7 +19,6 @@ LEVELS: tuple[tuple[str, ...], ...] = (
     ("protocols",),
     ("likelihood", "solver"),
     ("joint",),
-    ("ensemble",),
     ("posterior",),
     ("information",),
     ("coordinates",),
@@ -35,7 +34,7 @@ WITHOUT_JAX = (
 )
 MODEL = {
     *("model", "likelihood", "solver", "joint"),
-    *("ensemble", "posterior"),
+    "posterior",
     *("information", "classic", "calibration", "coordinates", "comparison"),
 }
 JAX_FAMILY = {"jax", "jaxlib", "equinox", "optimistix", "lineax", "jaxtyping"}
