@@ -1,4 +1,4 @@
-"""Stereo calibration from checkerboard pictures: corners, Zhang's start, bundle adjustment with its 24 x 24 covariance.
+"""Stereo calibration from checkerboard corners: Zhang's start, bundle adjustment with its 24 x 24 covariance.
 
 Frames: the board's x runs along its columns, y along its rows, z away from the viewer; poses are board to left camera
 (OpenCV's axes: x right, y down, z along the view), x_right = R x_left + T. mm, rad, px with the integer at a pixel's
@@ -13,15 +13,10 @@ adjustment: the least squares see 24 parameters whatever the number of views, an
 from __future__ import annotations
 
 import math
-import os
-import re
 import time
-from collections import Counter
-from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Literal
 
 import cv2
 import equinox as eqx
@@ -30,34 +25,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from tvsbayes.files import (
-    IMAGE_BYTES_MAX,
-    InputError,
-    NothingToEstimate,
-    NotConverged,
-    decode_image,
-    escaped,
-    image_size,
-    read_bytes,
-    refusal,
-)
+from tvsbayes.boards import SIDES, Board, Finder, View, Views, find_views
+from tvsbayes.files import NotConverged, NothingToEstimate, escaped
 from tvsbayes.model import CV_FROM_S, StereoCameras, project, rotation_matrix
 from tvsbayes.rigs import STEREO_PARAMETER_NAMES, Stereo, rotation_vector
 from tvsbayes.rigs import rotation_matrix as rotation_of
 from tvsbayes.solver import least_squares_covariance, linearised, solve_least_squares
-
-SIDES: tuple[Literal["left"], Literal["right"]] = ("left", "right")
-Finder = Literal["classic", "sector"]
-
-SUFFIXES = (".png", ".jpg", ".jpeg")
-SIDE_BY_SIDE_RATIO = 2.0
-"""Width over height from which a picture that is named neither left nor right holds both cameras' images."""
-REFINING_SHARE = 0.25
-"""Half the window of cornerSubPix over the smallest distance of two corners: the window must hold one corner only,
-and a wide one averages more noise. On OpenCV's pairs (22 to 37 px) fixed halves of 3, 5, 7, 9, 11 px leave 0.23,
-0.20, 0.18, 0.20, 0.41 px: the best is a quarter of the distance, and from half on neighbours pull."""
-REFINING_HALF_MIN, REFINING_HALF_MAX = 2, 11
-WORKERS_MAX = 8
 
 VIEWS_MIN = 3
 """Views per camera below which Zhang's method (2000) cannot find a focal length with both principal coordinates."""
@@ -79,301 +52,6 @@ VIEWS_ADVISED = 10
 TILT_ADVISED_DEG = 15.0
 COVERAGE_ADVISED = 0.6
 CORNER_SD_ADVISED_PX = 0.5
-
-
-@dataclass(frozen=True)
-class Board:
-    """A checkerboard by its inner corners.
-
-    Attributes:
-        columns: inner corners along the board's x.
-        rows: inner corners along y.
-        pitch_mm: side of a square.
-        pitch_u_mm: standard uncertainty of the mean pitch (GUM type B: certificate, ruler, printer).
-    """
-
-    columns: int
-    rows: int
-    pitch_mm: float
-    pitch_u_mm: float = 0.0
-
-    def __post_init__(self) -> None:
-        if not (3 <= self.columns <= 100 and 3 <= self.rows <= 100):
-            found = f"{self.columns} x {self.rows} inner corners"
-            raise _bad_option("--board", found, "3 to 100 inner corners each way", "count where four squares meet")
-        if not 0.01 <= self.pitch_mm <= 1e4:
-            raise _bad_option("--pitch-mm", f"{self.pitch_mm:g} mm", "0.01 to 10000 mm", "give the side of a square")
-        if not 0 <= self.pitch_u_mm < 0.1 * self.pitch_mm:
-            found = f"{self.pitch_u_mm:g} mm"
-            raise _bad_option("--pitch-u-mm", found, "0 to a tenth of the pitch", "give it for one square, not all")
-
-    @classmethod
-    def named(cls, size: str, pitch_mm: float, pitch_u_mm: float = 0.0) -> Board:
-        """From text such as "9x6".
-
-        Raises:
-            InputError: no such text, or impossible values.
-        """
-        match = re.fullmatch(r"([0-9]{1,3})\s*[xX*]\s*([0-9]{1,3})", size.strip())
-        if match is None:
-            raise _bad_option("--board", escaped(size), "COLUMNSxROWS of inner corners", "write for example 9x6")
-        return cls(int(match[1]), int(match[2]), pitch_mm, pitch_u_mm)
-
-    @property
-    def corners(self) -> int:
-        """Number of inner corners."""
-        return self.columns * self.rows
-
-    @property
-    def points_mm(self) -> np.ndarray:
-        """Inner corners in the board's frame, shape (corners, 3), row by row, z = 0, origin in the middle."""
-        grid = np.mgrid[: self.columns, : self.rows].T.reshape(-1, 2) - [(self.columns - 1) / 2, (self.rows - 1) / 2]
-        return np.column_stack([self.pitch_mm * grid, np.zeros(self.corners)])
-
-
-def _bad_option(option: str, found: str, allowed: str, remedy: str) -> InputError:
-    return InputError(
-        "usage", f"{option}: found {found}; allowed: {allowed}", column=option, found=found, allowed=allowed, remedy=remedy
-    )
-
-
-@dataclass(frozen=True)
-class View:
-    """Corners of the board at one pose: `left` and `right` of shape (corners, 2), px, row by row; None where unseen."""
-
-    name: str
-    left: np.ndarray | None
-    right: np.ndarray | None
-
-
-@dataclass(frozen=True)
-class Views:
-    """What a folder of pictures holds.
-
-    Attributes:
-        views: with the board in at least one picture, in the order of their names.
-        image_width: of one camera, px.
-        image_height: px.
-        unpaired: pictures of one camera without their counterpart; where they show the board, they are in `views`.
-        without_board: pictures in which no board was found.
-        other_size: pictures of another size than most; not used.
-        by_fallback: pictures whose board only the other finder found.
-        reordered: views whose right corners were turned to agree with the left ones.
-    """
-
-    views: tuple[View, ...]
-    image_width: int
-    image_height: int
-    unpaired: tuple[str, ...] = ()
-    without_board: tuple[str, ...] = ()
-    other_size: tuple[str, ...] = ()
-    by_fallback: tuple[str, ...] = ()
-    reordered: tuple[str, ...] = ()
-
-
-def find_corners(grey: np.ndarray, board: Board, finder: Finder = "classic") -> tuple[np.ndarray, bool] | None:
-    """Inner corners of a board in one picture.
-
-    `classic` is findChessboardCorners refined by cornerSubPix, `sector` findChessboardCornersSB (Duda and Frese
-    2018, sector based; slower). Where one fails, the other is tried.
-
-    Args:
-        grey: (height, width) uint8.
-        board: what to look for.
-        finder: which to try first.
-
-    Returns:
-        Corners (corners, 2), px, right-handed (x, then y, turn towards the image's own x, y), and whether the
-        fallback found them; None where neither did.
-    """
-    for attempt in (finder, "sector" if finder == "classic" else "classic"):
-        corners = _find_classic(grey, board) if attempt == "classic" else _find_sector(grey, board)
-        if corners is None or not np.isfinite(corners).all():
-            continue
-        grid = corners.reshape(board.rows, board.columns, 2)
-        along, across = (grid[:, -1] - grid[:, 0]).mean(0), (grid[-1] - grid[0]).mean(0)
-        # A board is not transparent: seen from the front, rows turn the same way in every picture.
-        if along[0] * across[1] - along[1] * across[0] < 0:
-            grid = grid[:, ::-1]
-        return grid.reshape(-1, 2), attempt != finder
-    return None
-
-
-def _find_classic(grey: np.ndarray, board: Board) -> np.ndarray | None:
-    found, corners = cv2.findChessboardCorners(grey, (board.columns, board.rows))
-    if not found or corners is None or np.size(corners) != 2 * board.corners:
-        return None
-    corners = np.asarray(corners, np.float32).reshape(-1, 2)
-    grid = corners.reshape(board.rows, board.columns, 2)
-    nearest = min(np.linalg.norm(np.diff(grid, axis=axis), axis=2).min() for axis in (0, 1))
-    half = int(np.clip(round(REFINING_SHARE * nearest), REFINING_HALF_MIN, REFINING_HALF_MAX))
-    criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 100, 1e-4)
-    refined = cv2.cornerSubPix(grey, corners.reshape(-1, 1, 2).copy(), (half, half), (-1, -1), criteria)
-    return np.asarray(refined, float).reshape(-1, 2)
-
-
-def _find_sector(grey: np.ndarray, board: Board) -> np.ndarray | None:
-    flags = cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY
-    found, corners = cv2.findChessboardCornersSB(grey, (board.columns, board.rows), flags=flags)
-    if not found or corners is None or np.size(corners) != 2 * board.corners:
-        return None
-    return np.asarray(corners, float).reshape(-1, 2)
-
-
-def _turns(board: Board) -> list[np.ndarray]:
-    """Corner orders that a finder may give to one picture of the board: half turns, for square ones quarter turns."""
-    index = np.arange(board.corners).reshape(board.rows, board.columns)
-    quarters = (0, 1, 2, 3) if board.rows == board.columns else (0, 2)
-    return [np.rot90(index, quarter).ravel() for quarter in quarters]
-
-
-def _first_colour(grey: np.ndarray, corners: np.ndarray, board: Board) -> bool:
-    """Whether the square behind the first corner is brighter than its neighbours, by all squares."""
-    grid = corners.reshape(board.rows, board.columns, 2)
-    middles = (grid[:-1, :-1] + grid[1:, :-1] + grid[:-1, 1:] + grid[1:, 1:]) / 4
-    u, v = np.clip(np.rint(middles).astype(int), 0, np.array(grey.shape[::-1]) - 1).transpose(2, 0, 1)
-    signs = 1 - 2 * (np.add.outer(np.arange(board.rows - 1), np.arange(board.columns - 1)) % 2)
-    values = grey[v, u].astype(float)
-    return bool(np.sum(signs * (values - values.mean())) > 0)
-
-
-@dataclass(frozen=True)
-class _Detection:
-    """Corners of one picture; `colours[k]` is the first square's under the k-th order of `_turns`."""
-
-    corners: np.ndarray
-    colours: tuple[bool, ...]
-    by_fallback: bool
-
-
-def _agreeing(left: _Detection, right: _Detection, board: Board) -> tuple[np.ndarray, bool]:
-    """Right corners in the order of the left ones, and whether they were turned.
-
-    The colours decide where the board's turned image differs from it (one of columns and rows odd, one even).
-    Otherwise the two cameras are taken to be turned by less than half of the board's symmetry against each other.
-    """
-    grids = [right.corners[turn].reshape(board.rows, board.columns, 2) for turn in _turns(board)]
-    kept = [k for k, colour in enumerate(right.colours) if colour == left.colours[0]] or list(range(len(grids)))
-    grid = left.corners.reshape(board.rows, board.columns, 2)
-    along = (grid[:, -1] - grid[:, 0]).mean(0)
-    best = max(kept, key=lambda k: float(along @ _unit((grids[k][:, -1] - grids[k][:, 0]).mean(0))))
-    return grids[best].reshape(-1, 2), best != 0
-
-
-def _unit(vector: np.ndarray) -> np.ndarray:
-    return vector / max(float(np.linalg.norm(vector)), 1e-12)
-
-
-def _natural(name: str) -> list[tuple[int, str]]:
-    """Sorts 2 before 10."""
-    return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"([0-9]{1,18})", name)]
-
-
-@dataclass(frozen=True)
-class _Picture:
-    """A file and whose images its equal parts, from left to right, are."""
-
-    view: str
-    path: Path
-    sides: tuple[str, ...]
-
-
-def _pictures(folder: Path, swap: bool) -> list[_Picture]:
-    """The pictures of a folder: `left*` and `right*`, or where there are none, wide frames of both cameras."""
-    try:
-        names = sorted((entry.name for entry in os.scandir(folder)), key=_natural)
-    except OSError as error:
-        place, remedy = escaped(str(folder), 200), "name the folder of the checkerboard pictures"
-        found, allowed = escaped(error.strerror or str(error)), "a readable folder"
-        raise refusal("unreadable", file=place, found=found, allowed=allowed, remedy=remedy) from error
-    images = [Path(folder) / name for name in names if name.lower().endswith(SUFFIXES) and not name.startswith(".")]
-    sided = [
-        _Picture(path.stem[len(side) :], path, (side,))
-        for path in images
-        for side in SIDES
-        if path.stem.lower().startswith(side)
-    ]
-    twice = [key for key, count in Counter((p.view, p.sides) for p in sided).items() if count > 1]
-    if twice:
-        (view, (side,)), remedy = twice[0], "keep one file per camera and view"
-        found = f"two pictures {escaped(side + view)}"
-        raise refusal("duplicate", file=escaped(str(folder), 200), found=found, allowed="one", remedy=remedy)
-    if sided:
-        return sided
-    return [_Picture(path.stem, path, SIDES[::-1] if swap else SIDES) for path in images]
-
-
-def find_views(folder: Path, board: Board, *, finder: Finder = "classic", swap: bool = False) -> Views:
-    """Finds the board in all pictures of a folder.
-
-    `left*` and `right*` (PNG, JPEG) are paired by the rest of the name without its suffix. Where no file has such a
-    name, pictures at least twice as wide as high are split in the middle. Other files are ignored.
-
-    Args:
-        folder: of the pictures.
-        board: what to look for.
-        finder: see `find_corners`.
-        swap: the left camera's image is the right half of a wide frame.
-
-    Raises:
-        InputError: no folder, an unreadable picture, or two for one camera and view.
-        NothingToEstimate: no picture of a camera.
-    """
-    folder = Path(folder)
-    contents = {picture: read_bytes(picture.path, IMAGE_BYTES_MAX, folder) for picture in _pictures(folder, swap)}
-    sizes = {p: image_size(data, escaped(p.path.name)) for p, data in contents.items()}
-    sizes = {p: s for p, s in sizes.items() if len(p.sides) == 1 or (s[0] >= SIDE_BY_SIDE_RATIO * s[1])}
-    if not sizes:
-        raise NothingToEstimate(
-            "no-pictures",
-            f"{escaped(str(folder), 200)}: no checkerboard picture",
-            allowed="left*.png with right*.png (or .jpg), or frames of both cameras side by side",
-            remedy="name the pictures left01.png, right01.png, left02.png ...",
-        )
-    counted = Counter((width // len(p.sides), height) for p, (width, height) in sizes.items())
-    size = max(counted, key=lambda s: (counted[s], s))
-    used = [p for p, (width, height) in sizes.items() if (width // len(p.sides), height) == size]
-
-    def detect(picture: _Picture) -> dict[str, _Detection | None]:
-        image = decode_image(contents[picture], escaped(picture.path.name))
-        grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
-        parts = (grey[:, k * size[0] : (k + 1) * size[0]] for k in range(len(picture.sides)))
-        return {side: _detection(np.ascontiguousarray(part), board, finder) for side, part in zip(picture.sides, parts, strict=True)}
-
-    found: dict[str, dict[str, _Detection]] = {}
-    names: dict[tuple[str, str], str] = {}
-    without, fallback = [], []
-    with ThreadPoolExecutor(min(WORKERS_MAX, os.cpu_count() or 1)) as pool:
-        for picture, detections in zip(used, pool.map(detect, used), strict=True):
-            for side, detection in detections.items():
-                name = picture.path.name + (f" ({side})" if len(picture.sides) > 1 else "")
-                names[picture.view, side] = name
-                if detection is None:
-                    without.append(name)
-                    continue
-                found.setdefault(picture.view, {})[side] = detection
-                if detection.by_fallback:
-                    fallback.append(name)
-    views, reordered = [], []
-    for name in sorted(found, key=_natural):
-        left, right = (found[name].get(side) for side in SIDES)
-        corners = None if right is None else right.corners
-        if left is not None and right is not None:
-            corners, turned = _agreeing(left, right, board)
-            reordered += [name] * turned
-        views.append(View(name, None if left is None else left.corners, corners))
-    unpaired = [n for (view, side), n in names.items() if (view, SIDES[side == "left"]) not in names]
-    other_size = [p.path.name for p in sizes if p not in used]
-    return Views(tuple(views), *size, *(tuple(x) for x in (unpaired, without, other_size, fallback, reordered)))
-
-
-def _detection(grey: np.ndarray, board: Board, finder: Finder) -> _Detection | None:
-    result = find_corners(grey, board, finder)
-    if result is None:
-        return None
-    corners, by_fallback = result
-    colours = tuple(_first_colour(grey, corners[turn], board) for turn in _turns(board))
-    return _Detection(corners, colours, by_fallback)
 
 
 class BoardArrays(eqx.Module):
@@ -453,13 +131,6 @@ def _over_views(function):
     return jax.vmap(function, in_axes=(0, None, 0, 0, None))
 
 
-@eqx.filter_jit
-def settled_poses(z: Float[Array, " free"], arrays: BoardArrays) -> Float[Array, "views 6"]:
-    """Every board's pose at its own optimum for the cameras at z."""
-    parameters = arrays.origin + arrays.root @ z
-    return _over_views(_settled_pose)(arrays.poses, parameters, arrays.corners_px, arrays.weight, arrays.points_mm)
-
-
 def reduced_residuals(z: Float[Array, " free"], arrays: BoardArrays) -> Float[Array, " residuals"]:
     """All residuals with every board at its optimum, px, as a function of the cameras alone.
 
@@ -482,7 +153,6 @@ class Adjustment:
     Attributes:
         vector: the 24 parameters in the order of `STEREO_PARAMETER_NAMES`.
         covariance: (24, 24), type A, under `noise_sd_px` alone: independent corners.
-        poses: boards to left camera, shape (views, 6).
         residuals_px: projected minus found, shape (views, 4, corners), NaN where no corner was seen.
         noise_sd_px: standard deviation of one corner coordinate, from the residuals.
         dof: degrees of freedom behind it: coordinates - camera parameters - 6 per view.
@@ -491,7 +161,6 @@ class Adjustment:
 
     vector: np.ndarray
     covariance: np.ndarray
-    poses: np.ndarray
     residuals_px: np.ndarray
     noise_sd_px: float
     dof: int
@@ -584,14 +253,12 @@ def bundle_adjustment(
             z_covariance = least_squares_covariance(first.jacobian[kept])
         except np.linalg.LinAlgError as error:
             raise _undetermined(str(error)) from error
-        found_poses = np.asarray(settled_poses(first.value, arrays))[: len(views)]
     residuals = np.where(weight > 0, first.residuals.reshape(weight.shape), np.nan)[: len(views), :, : board.corners]
     root = np.asarray(arrays.root)
     factor = correlation_factor(first.jacobian[kept], first.residuals[kept], view_of, noise_sd)
     return Adjustment(
         vector=start + root @ first.value,
         covariance=noise_sd**2 * root @ z_covariance @ root.T,
-        poses=found_poses,
         residuals_px=residuals,
         noise_sd_px=noise_sd,
         dof=dof,
@@ -603,7 +270,7 @@ def _undetermined(reason: str) -> NothingToEstimate:
     return NothingToEstimate(
         "undetermined",
         f"the views do not determine the cameras: {reason}",
-        remedy="add views: board tilted by 30 to 45 degrees about both axes, near and far, in every corner of the image",
+        remedy="add views: the board tilted by 30 to 45 deg about both axes, near and far, in every corner of the image",
     )
 
 
@@ -757,7 +424,7 @@ class _CameraStart:
 def _camera_start(
     corners: dict[int, np.ndarray], board: Board, size: tuple[int, int], side: str, fix_k3: bool
 ) -> _CameraStart:
-    """Zhang's method (cv2.calibrateCamera) on some views, then a pose for each by IPPE (Collins and Bartoli 2014)."""
+    """Zhang's method (cv2.calibrateCamera) on some views, then a pose for each."""
     if len(corners) < VIEWS_MIN:
         raise NothingToEstimate(
             "few-views",
@@ -774,10 +441,7 @@ def _camera_start(
         distortion = np.asarray(distortion, float).ravel()[:5]
         poses = {}
         for k in keys:
-            done, turn, shift = cv2.solvePnP(
-                board.points_mm, corners[k], matrix, distortion, flags=cv2.SOLVEPNP_IPPE
-            )
-            poses[k] = np.concatenate([np.ravel(turn), np.ravel(shift)]) if done else np.array([0, 0, 0, 0, 0, 1e3])
+            poses[k] = _board_pose(corners[k], board, matrix, distortion)
     except cv2.error as error:
         raise _undetermined(f"OpenCV found no start for the {side} camera ({escaped(str(error.err), 100)})") from error
     start = _CameraStart(np.asarray(matrix, float), distortion, poses)
@@ -871,7 +535,13 @@ def calibrate_stereo(
     covariance = done.correlation_factor * done.covariance + pitch
     empty = Stereo(*size, *(np.zeros(1) for _ in range(6)), 0.5 * (covariance + covariance.T), _rms(done.residuals_px))
     stereo = empty.with_vector(done.vector)
-    reports = tuple(_view_reports(views, done, outliers))
+    poses = [
+        _board_pose(view.left, board, stereo.M1, stereo.D1)
+        if view.left is not None
+        else _left_pose(_board_pose(view.right, board, stereo.M2, stereo.D2), stereo.R, stereo.T)
+        for view in views
+    ]
+    reports = tuple(_view_reports(views, done, poses, outliers))
     result = StereoCalibration(
         stereo=stereo,
         board=board,
@@ -890,7 +560,7 @@ def calibrate_stereo(
         warnings=(),
         seconds={"adjustment": time.perf_counter() - began},
     )
-    return replace(result, warnings=tuple(_plausibility(result, done.poses)))
+    return replace(result, warnings=tuple(_plausibility(result, poses)))
 
 
 def calibrate_folder(
@@ -911,6 +581,20 @@ def calibrate_folder(
     return replace(result, seconds=seconds | result.seconds)
 
 
+def _board_pose(corners: np.ndarray, board: Board, matrix: np.ndarray, distortion: np.ndarray) -> np.ndarray:
+    """Board to camera, shape (6,), from one picture by IPPE (Collins and Bartoli 2014)."""
+    done, turn, shift = cv2.solvePnP(board.points_mm, corners, matrix, distortion, flags=cv2.SOLVEPNP_IPPE)
+    if not done:
+        raise _undetermined("a board has no pose that OpenCV can find")
+    return np.concatenate([np.ravel(turn), np.ravel(shift)])
+
+
+def _left_pose(right_pose: np.ndarray, turn: np.ndarray, shift: np.ndarray) -> np.ndarray:
+    """Board to left camera from board to right camera; `turn` is R, `shift` T."""
+    rotation = rotation_vector(turn.T @ rotation_of(right_pose[:3]))
+    return np.concatenate([rotation, turn.T @ (right_pose[3:] - shift)])
+
+
 def _adjusted(views: Sequence[View], board: Board, size: tuple[int, int], free: np.ndarray) -> Adjustment:
     starts = [
         _camera_start(
@@ -923,13 +607,10 @@ def _adjusted(views: Sequence[View], board: Board, size: tuple[int, int], free: 
         for side in SIDES
     ]
     turn, shift = _relative(starts)
-    poses = []
-    for k in range(len(views)):
-        if k in starts[0].poses:
-            poses.append(starts[0].poses[k])
-            continue
-        seen, back = starts[1].poses[k], rotation_of(turn).T
-        poses.append(np.concatenate([rotation_vector(back @ rotation_of(seen[:3])), back @ (seen[3:] - shift)]))
+    poses = [
+        starts[0].poses[k] if k in starts[0].poses else _left_pose(starts[1].poses[k], rotation_of(turn), shift)
+        for k in range(len(views))
+    ]
     vector = np.concatenate([starts[0].vector, starts[1].vector, turn, shift])
     return bundle_adjustment(views, board, vector, np.array(poses), free)
 
@@ -951,8 +632,10 @@ def _normal(pose: np.ndarray) -> np.ndarray:
     return rotation_of(pose[:3])[:, 2]
 
 
-def _view_reports(views: Sequence[View], done: Adjustment, outliers: np.ndarray):
-    for view, residuals, pose, outlier in zip(views, done.residuals_px, done.poses, outliers, strict=True):
+def _view_reports(
+    views: Sequence[View], done: Adjustment, poses: Sequence[np.ndarray], outliers: np.ndarray
+) -> Iterator[ViewReport]:
+    for view, residuals, pose, outlier in zip(views, done.residuals_px, poses, outliers, strict=True):
         rms = [
             None if seen is None else _rms(residuals[rows])
             for seen, rows in ((view.left, slice(0, 2)), (view.right, slice(2, 4)))
@@ -990,7 +673,7 @@ def _triangulated_pitch(views: Sequence[View], board: Board, stereo: Stereo) -> 
     return float(lengths.mean()), float(lengths.std(ddof=1))
 
 
-def _plausibility(result: StereoCalibration, poses: np.ndarray) -> list[str]:
+def _plausibility(result: StereoCalibration, poses: Sequence[np.ndarray]) -> list[str]:
     """What a careful reader would ask about the views, in words."""
     warnings = []
     if result.pairs < VIEWS_ADVISED:
@@ -1018,9 +701,11 @@ def _plausibility(result: StereoCalibration, poses: np.ndarray) -> list[str]:
     size, vector = (result.stereo.image_width, result.stereo.image_height), result.stereo.vector
     for side, (fx, fy, cx, cy) in zip(SIDES, (vector[0:4], vector[9:13]), strict=True):
         if not (0.2 * size[0] < cx < 0.8 * size[0] and 0.2 * size[1] < cy < 0.8 * size[1]):
-            warnings.append(f"the {side} principal point ({cx:.0f}, {cy:.0f}) px lies far from the middle of the image")
+            warnings.append(f"the {side} principal point ({cx:.0f}, {cy:.0f}) px is far from the image's middle")
         if abs(fx / fy - 1) > 0.05:
-            warnings.append(f"the {side} fx and fy differ by {100 * abs(fx / fy - 1):.0f} %: pixels are seldom so oblong")
+            warnings.append(
+                f"the {side} fx and fy differ by {100 * abs(fx / fy - 1):.0f} %: pixels are seldom so oblong"
+            )
     if result.stereo.T[0] > 0:
         warnings.append("the right camera stands to the left of the left one: are the pictures swapped?")
     mean, sd = result.triangulated_pitch_mm
