@@ -22,10 +22,10 @@ from tvsbayes.files import (
     IMAGE_BYTES_MAX,
     InputError,
     NothingToEstimate,
-    decode_image,
     escaped,
     image_size,
     read_bytes,
+    read_image,
     refusal,
 )
 
@@ -41,6 +41,7 @@ and a wide one averages more noise. On OpenCV's pairs (22 to 37 px) fixed halves
 0.20, 0.18, 0.20, 0.41 px: the best is a quarter of the distance, and from half on neighbours pull."""
 REFINING_HALF_MIN, REFINING_HALF_MAX = 2, 11
 WORKERS_MAX = 8
+PICTURES_MAX = 2000
 
 
 @dataclass(frozen=True)
@@ -254,6 +255,10 @@ def _pictures(folder: Path, swap: bool) -> list[_Picture]:
         found, allowed = escaped(error.strerror or str(error)), "a readable folder"
         raise refusal("unreadable", file=place, found=found, allowed=allowed, remedy=remedy) from error
     images = [Path(folder) / name for name in names if name.lower().endswith(SUFFIXES) and not name.startswith(".")]
+    if len(images) > PICTURES_MAX:
+        place, remedy = escaped(str(folder), 200), "20 to 100 views are plenty; move the others away"
+        found, allowed = f"{len(images)} pictures", f"at most {PICTURES_MAX}"
+        raise refusal("size", file=place, found=found, allowed=allowed, remedy=remedy)
     sided = [
         _Picture(path.stem[len(side) :], path, (side,))
         for path in images
@@ -287,8 +292,11 @@ def find_views(folder: Path, board: Board, *, finder: Finder = "classic", swap: 
         NothingToEstimate: no picture of a camera.
     """
     folder = Path(folder)
-    contents = {picture: read_bytes(picture.path, IMAGE_BYTES_MAX, folder) for picture in _pictures(folder, swap)}
-    sizes = {p: image_size(data, escaped(p.path.name)) for p, data in contents.items()}
+    # Sizes first: the pictures of the majority are one calibration, and only those are decoded.
+    sizes = {
+        picture: image_size(read_bytes(picture.path, IMAGE_BYTES_MAX, folder), escaped(picture.path.name))
+        for picture in _pictures(folder, swap)
+    }
     sizes = {p: s for p, s in sizes.items() if len(p.sides) == 1 or (s[0] >= SIDE_BY_SIDE_RATIO * s[1])}
     if not sizes:
         raise NothingToEstimate(
@@ -302,8 +310,7 @@ def find_views(folder: Path, board: Board, *, finder: Finder = "classic", swap: 
     used = [p for p, (width, height) in sizes.items() if (width // len(p.sides), height) == size]
 
     def detect(picture: _Picture) -> dict[str, _Detection | None]:
-        image = decode_image(contents[picture], escaped(picture.path.name))
-        grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+        grey = cv2.cvtColor(read_image(picture.path, folder), cv2.COLOR_BGR2GRAY)
         parts = (grey[:, k * size[0] : (k + 1) * size[0]] for k in range(len(picture.sides)))
         return {
             side: _detection(np.ascontiguousarray(part), board, finder)
