@@ -435,19 +435,15 @@ def _camera_start(
     chosen = [keys[k] for k in np.unique(np.linspace(0, len(keys) - 1, START_VIEWS).astype(int))]
     points = board.points_mm.astype(np.float32)
     flags = cv2.CALIB_FIX_K3 if fix_k3 else 0
+    found = [np.ascontiguousarray(corners[k], np.float32) for k in chosen]
     try:
-        found = [corners[k].astype(np.float32) for k in chosen]
         _, matrix, distortion, *_ = cv2.calibrateCamera([points] * len(found), found, size, None, None, flags=flags)
-        distortion = np.asarray(distortion, float).ravel()[:5]
-        poses = {}
-        for k in keys:
-            poses[k] = _board_pose(corners[k], board, matrix, distortion)
     except cv2.error as error:
         raise _undetermined(f"OpenCV found no start for the {side} camera ({escaped(str(error.err), 100)})") from error
-    start = _CameraStart(np.asarray(matrix, float), distortion, poses)
-    if not (np.isfinite(start.vector).all() and np.isfinite([*poses.values()]).all()):
+    matrix, distortion = np.asarray(matrix, float), np.asarray(distortion, float).ravel()[:5]
+    if not (np.isfinite(matrix).all() and np.isfinite(distortion).all()):
         raise _undetermined(f"OpenCV found no finite start for the {side} camera")
-    return start
+    return _CameraStart(matrix, distortion, {k: _board_pose(corners[k], board, matrix, distortion) for k in keys})
 
 
 def _relative(start: Sequence[_CameraStart]) -> tuple[np.ndarray, np.ndarray]:
@@ -581,10 +577,15 @@ def calibrate_folder(
     return replace(result, seconds=seconds | result.seconds)
 
 
+def _pixels(corners: np.ndarray) -> np.ndarray:
+    """Corners (corners, 2) as every OpenCV takes them: contiguous, of rank 3."""
+    return np.ascontiguousarray(corners, float).reshape(-1, 1, 2)
+
+
 def _board_pose(corners: np.ndarray, board: Board, matrix: np.ndarray, distortion: np.ndarray) -> np.ndarray:
     """Board to camera, shape (6,), from one picture by IPPE (Collins and Bartoli 2014)."""
-    done, turn, shift = cv2.solvePnP(board.points_mm, corners, matrix, distortion, flags=cv2.SOLVEPNP_IPPE)
-    if not done:
+    done, turn, shift = cv2.solvePnP(board.points_mm, _pixels(corners), matrix, distortion, flags=cv2.SOLVEPNP_IPPE)
+    if not done or not (np.isfinite(turn).all() and np.isfinite(shift).all()):
         raise _undetermined("a board has no pose that OpenCV can find")
     return np.concatenate([np.ravel(turn), np.ravel(shift)])
 
@@ -663,7 +664,7 @@ def _triangulated_pitch(views: Sequence[View], board: Board, stereo: Stereo) -> 
         if view.left is None or view.right is None:
             continue
         rays = [
-            cv2.undistortPoints(seen.reshape(-1, 1, 2), M, D).reshape(-1, 2).T
+            cv2.undistortPoints(_pixels(seen), M, D).reshape(-1, 2).T
             for seen, M, D in ((view.left, stereo.M1, stereo.D1), (view.right, stereo.M2, stereo.D2))
         ]
         points = np.asarray(cv2.triangulatePoints(np.eye(3, 4), right, *rays))
