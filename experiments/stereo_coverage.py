@@ -178,14 +178,13 @@ def table() -> None:
     if HALVES.exists():
         found = json.loads(HALVES.read_text())
         stored, plain = (np.array([s[k] for s in found["splits"]]) / 24 for k in ("stored", "independent"))
-        print(
-            f"\nOpenCV's 13 real pairs (640 x 480): rms {found['rms_px']:.3f} px, factor {found['factor']:.1f}. Split at"
+        words = (
+            f"OpenCV's 13 real pairs (640 x 480): rms {found['rms_px']:.3f} px, factor {found['factor']:.1f}. Split at "
         )
-        print(
-            f"random {len(stored)} times into 6 and 7 views, the two calibrations differ by chi2/24 = {stored.mean():.2f} on"
-        )
-        print(f"average (median {np.median(stored):.2f}) under the stored covariances, by {plain.mean():.2f} (median")
-        print(f"{np.median(plain):.2f}) had corners been taken as independent.")
+        words += f"random {len(stored)} times into 6 and 7 views, the two calibrations differ by\nchi2/24 = "
+        words += f"{stored.mean():.2f} on average (median {np.median(stored):.2f}) under the stored covariances, by "
+        words += f"{plain.mean():.2f} (median {np.median(plain):.2f}) had corners been taken\nas independent."
+        print(f"\n{words}")
 
 
 def main() -> None:

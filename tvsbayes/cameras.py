@@ -63,7 +63,8 @@ class BoardArrays(eqx.Module):
         weight: 1 where a corner was seen, else 0.
         poses: start of every board's rotation vector and translation (board to left camera).
         origin: the 24 parameters at z = 0.
-        root: d(parameters)/dz; a fixed parameter has a zero row.
+        root: d(parameters)/dz; a fixed parameter has a zero row and column, so that every choice of fixed ones
+            shares one compilation.
     """
 
     points_mm: Float[Array, "3 corners"]
@@ -71,7 +72,7 @@ class BoardArrays(eqx.Module):
     weight: Float[Array, "views 4 corners"]
     poses: Float[Array, "views 6"]
     origin: Float[Array, "24"]
-    root: Float[Array, "24 free"]
+    root: Float[Array, "24 24"]
 
 
 def _cameras(parameters: Float[Array, "24"]) -> StereoCameras:
@@ -131,7 +132,7 @@ def _over_views(function):
     return jax.vmap(function, in_axes=(0, None, 0, 0, None))
 
 
-def reduced_residuals(z: Float[Array, " free"], arrays: BoardArrays) -> Float[Array, " residuals"]:
+def reduced_residuals(z: Float[Array, "24"], arrays: BoardArrays) -> Float[Array, " residuals"]:
     """All residuals with every board at its optimum, px, as a function of the cameras alone.
 
     Its derivative is (1 - P) J of the full problem: what a change of the cameras leaves after the boards have
@@ -228,17 +229,18 @@ def bundle_adjustment(
     if dof < 1:
         raise _undetermined("fewer corner coordinates than unknowns")
     with jax.enable_x64(True):
-        unit = np.eye(24)[:, free]
-        # Without cameras' steps in their own standard errors, a focal length and a k3 would share one damping.
-        arrays = BoardArrays(points, seen, weight, start_poses, np.asarray(start, float), unit)
-        zero = np.zeros(int(free.sum()))
+        arrays = BoardArrays(points, seen, weight, start_poses, np.asarray(start, float), np.diag(free.astype(float)))
+        zero = np.zeros(24)
         jacobian = np.asarray(linearised(reduced_residuals, jnp.asarray(zero), arrays)[1])
-        arrays = replace(arrays, root=unit @ _whitening(jacobian, np.flatnonzero(free)))
-        # Scaled to px of noise, a unit of z is about one standard error.
+        # Whitened at the start: a unit of z is one standard error for corners of 1 px. In their own units a focal
+        # length and a k3 would share one damping.
+        root = np.zeros((24, 24))
+        root[np.ix_(free, free)] = _whitening(jacobian[:, free], np.flatnonzero(free))
+        arrays = replace(arrays, root=root)
         first = solve_least_squares(reduced_residuals, zero, arrays, max_steps=200, restart=False)
         noise_sd = math.sqrt(float(first.residuals @ first.residuals) / dof)
         # Alternating signs, so that no parameter's shift can be taken up by another's.
-        shift = RESTART_SD * noise_sd * np.where(np.arange(zero.size) % 2, -1.0, 1.0)
+        shift = RESTART_SD * noise_sd * np.where(np.arange(24) % 2, -1.0, 1.0) * free
         second = solve_least_squares(reduced_residuals, first.value + shift, arrays, max_steps=200, restart=False)
         problems = list(first.problems)
         if np.abs(second.value - first.value).max() > RESTART_AGREEMENT_SD * noise_sd + 1e-9:
@@ -250,15 +252,14 @@ def bundle_adjustment(
                 remedy="look at the pictures for wrong boards, a wrong --board, or add tilted views",
             )
         try:
-            z_covariance = least_squares_covariance(first.jacobian[kept])
+            z_covariance = least_squares_covariance(first.jacobian[kept][:, free])
         except np.linalg.LinAlgError as error:
             raise _undetermined(str(error)) from error
     residuals = np.where(weight > 0, first.residuals.reshape(weight.shape), np.nan)[: len(views), :, : board.corners]
-    root = np.asarray(arrays.root)
-    factor = correlation_factor(first.jacobian[kept], first.residuals[kept], view_of, noise_sd)
+    factor = correlation_factor(first.jacobian[kept][:, free], first.residuals[kept], view_of, noise_sd)
     return Adjustment(
         vector=start + root @ first.value,
-        covariance=noise_sd**2 * root @ z_covariance @ root.T,
+        covariance=noise_sd**2 * root[:, free] @ z_covariance @ root[:, free].T,
         residuals_px=residuals,
         noise_sd_px=noise_sd,
         dof=dof,
