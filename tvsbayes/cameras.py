@@ -43,10 +43,14 @@ POSE_STEPS, POSE_TOLERANCE = 40, 1e-20
 RESTART_SD = 3.0
 """The repeated adjustment starts this many standard errors away in every parameter."""
 RESTART_AGREEMENT_SD = 1e-2
+EXACT_PX = 1e-7
 
 OUTLIER_Z, OUTLIER_SPREAD_MIN = 4.0, 0.2
 """A view is an outlier if the logarithm of its residual rms lies more than 4 robust standard deviations (1.4826 MAD,
 at least 0.2) above the median: never below 2.2 times the median rms. On clean views the logarithm scatters by 0.05."""
+MISMATCH_TIMES, MISMATCH_SHARE = 5.0, 0.01
+"""A view is no pair if its right corners miss the place that the left ones and the median of all relative poses
+predict by more than five times the median view and by more than 1 % of the image width."""
 VIEWS_ADVISED = 10
 """Zhang (2000), figure 3: the errors have fallen to a floor by about ten views."""
 TILT_ADVISED_DEG = 15.0
@@ -242,8 +246,9 @@ def bundle_adjustment(
         # Alternating signs, so that no parameter's shift can be taken up by another's.
         shift = RESTART_SD * noise_sd * np.where(np.arange(24) % 2, -1.0, 1.0) * free
         second = solve_least_squares(reduced_residuals, first.value + shift, arrays, max_steps=200, restart=False)
-        problems = list(first.problems)
-        if np.abs(second.value - first.value).max() > RESTART_AGREEMENT_SD * noise_sd + 1e-9:
+        # Exact corners leave rounding errors, whose direction means nothing.
+        problems = list(first.problems) if not noise_sd < EXACT_PX else []
+        if np.abs(second.value - first.value).max() > RESTART_AGREEMENT_SD * noise_sd + EXACT_PX:
             problems.append("a second adjustment from a start nearby ended elsewhere")
         if problems:
             raise NotConverged(
@@ -316,7 +321,7 @@ class StereoCalibration:
         coverage: share of the image inside the boards, by camera.
         triangulated_pitch_mm: mean and standard deviation of all sides of squares, triangulated.
         found: what the folder held; None where corners were given.
-        excluded: names of outlying views that were left out (`robust`).
+        excluded: names of outlying views that were left out: no pairs at all, or by `robust`.
         warnings: plausibility in words.
         seconds: wall time by stage.
     """
@@ -340,8 +345,8 @@ class StereoCalibration:
 
     @property
     def outliers(self) -> tuple[str, ...]:
-        """Names of the outlying views among those used."""
-        return tuple(view.name for view in self.views if view.outlier)
+        """Names of all outlying views, left out or not."""
+        return (*(view.name for view in self.views if view.outlier), *self.excluded)
 
     @property
     def pairs(self) -> int:
@@ -506,7 +511,8 @@ def calibrate_stereo(
         board: whose corners they are.
         size: image width and height, px.
         fix_k3: keep both k3 at 0.
-        robust: leave out outlying views and adjust again, once.
+        robust: leave out outlying views and adjust again, once. Views whose two pictures cannot show one board (of
+            two moments, say) are left out in any case: nothing fits them.
         found: what the folder held, for the report.
 
     Raises:
@@ -517,14 +523,19 @@ def calibrate_stereo(
     views = [view for view in views if view.left is not None or view.right is not None]
     free = np.ones(24, bool)
     free[[8, 17]] = not fix_k3
-    done = _adjusted(views, board, size, free)
-    outliers = _outliers(done)
-    excluded: tuple[str, ...] = ()
-    if robust and outliers.any():
-        excluded = tuple(view.name for view, out in zip(views, outliers, strict=True) if out)
-        views = [view for view, out in zip(views, outliers, strict=True) if not out]
-        done = _adjusted(views, board, size, free)
+    excluded: list[str] = []
+    start = _start(views, board, size, fix_k3)
+    leave_out = start.mismatched
+    while True:
+        if leave_out.any():
+            excluded += [view.name for view, out in zip(views, leave_out, strict=True) if out]
+            views = [view for view, out in zip(views, leave_out, strict=True) if not out]
+            start = _start(views, board, size, fix_k3)
+        done = bundle_adjustment(views, board, start.vector, start.poses, free)
         outliers = _outliers(done)
+        if not (robust and outliers.any()):
+            break
+        leave_out, robust = outliers, False
     pitch = np.zeros((24, 24))
     # The pixels know angles only: all lengths, T among them, are proportional to the pitch.
     shift = done.vector[21:] * (board.pitch_u_mm / board.pitch_mm)
@@ -553,7 +564,7 @@ def calibrate_stereo(
         coverage={side: _coverage([getattr(v, side) for v in views], board, size) for side in SIDES},
         triangulated_pitch_mm=_triangulated_pitch(views, board, stereo),
         found=found,
-        excluded=excluded,
+        excluded=tuple(excluded),
         warnings=(),
         seconds={"adjustment": time.perf_counter() - began},
     )
@@ -597,24 +608,35 @@ def _left_pose(right_pose: np.ndarray, turn: np.ndarray, shift: np.ndarray) -> n
     return np.concatenate([rotation, turn.T @ (right_pose[3:] - shift)])
 
 
-def _adjusted(views: Sequence[View], board: Board, size: tuple[int, int], free: np.ndarray) -> Adjustment:
-    starts = [
-        _camera_start(
-            {k: getattr(v, side) for k, v in enumerate(views) if getattr(v, side) is not None},
-            board,
-            size,
-            side,
-            not free[8],
-        )
-        for side in SIDES
-    ]
-    turn, shift = _relative(starts)
-    poses = [
-        starts[0].poses[k] if k in starts[0].poses else _left_pose(starts[1].poses[k], rotation_of(turn), shift)
-        for k in range(len(views))
-    ]
-    vector = np.concatenate([starts[0].vector, starts[1].vector, turn, shift])
-    return bundle_adjustment(views, board, vector, np.array(poses), free)
+@dataclass(frozen=True)
+class _Start:
+    """Where the adjustment starts: the 24 parameters, board poses (views, 6), and which views are no pair at all."""
+
+    vector: np.ndarray
+    poses: np.ndarray
+    mismatched: np.ndarray
+
+
+def _start(views: Sequence[View], board: Board, size: tuple[int, int], fix_k3: bool) -> _Start:
+    cameras = []
+    for side in SIDES:
+        corners = {k: getattr(v, side) for k, v in enumerate(views) if getattr(v, side) is not None}
+        cameras.append(_camera_start(corners, board, size, side, fix_k3))
+    left, right = cameras
+    turn, shift = _relative(cameras)
+    rotation = rotation_of(turn)
+    poses, misses = [], np.zeros(len(views))
+    for k, view in enumerate(views):
+        poses.append(left.poses[k] if k in left.poses else _left_pose(right.poses[k], rotation, shift))
+        if k in left.poses and k in right.poses:
+            pose = poses[k]
+            seen_from_right = rotation_vector(rotation @ rotation_of(pose[:3])), rotation @ pose[3:] + shift
+            pixels, _ = cv2.projectPoints(board.points_mm, *seen_from_right, right.matrix, right.distortion)
+            misses[k] = math.sqrt(np.mean(np.sum((np.reshape(pixels, (-1, 2)) - view.right) ** 2, axis=1)))
+    usual = float(np.median(misses[misses > 0])) if misses.any() else 0.0
+    mismatched = misses > max(MISMATCH_TIMES * usual, MISMATCH_SHARE * size[0])
+    vector = np.concatenate([left.vector, right.vector, turn, shift])
+    return _Start(vector, np.array(poses), mismatched)
 
 
 def _rms(residuals_px: np.ndarray) -> float:
@@ -715,9 +737,12 @@ def _plausibility(result: StereoCalibration, poses: Sequence[np.ndarray]) -> lis
         warnings.append(f"triangulated squares measure {mean:.3f} mm (sd {sd:.3f}), not {result.board.pitch_mm:g}")
     if result.board.pitch_u_mm == 0:
         warnings.append("the pitch is taken as exact: state its standard uncertainty with --pitch-u-mm")
-    if result.outliers:
+    if result.excluded:
         warnings.append(
-            f"outlying views: {escaped(', '.join(result.outliers), 400)}; look at their pictures, or leave them out "
-            "with --robust"
+            f"left out, since the two pictures contradict the rest: {escaped(', '.join(result.excluded), 400)}"
         )
+    kept = [view.name for view in result.views if view.outlier]
+    if kept:
+        names = escaped(", ".join(kept), 400)
+        warnings.append(f"outlying views: {names}; look at their pictures, or leave them out with --robust")
     return warnings

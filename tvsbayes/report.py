@@ -130,7 +130,7 @@ def stereo_calibration_text(result: StereoCalibration) -> str:
         stereo_text(result.stereo),
         text_table(f"{result.pairs} pairs, {len(result.views) - result.pairs} single views", columns, rows),
         f"rms over corners: both {result.stereo.rms_px:.3f}, left {px(result.left_rms_px)}, right "
-        f"{px(result.right_rms_px)} px; sd of one coordinate {result.noise_sd_px:.3f} px, {result.dof} degrees of freedom",
+        f"{px(result.right_rms_px)} px; one coordinate: sd {result.noise_sd_px:.3f} px, dof {result.dof}",
         "uncertainties hold for corner errors that the corners of a picture share: variances "
         f"{result.correlation_factor:.1f} times those of independent corners",
         f"baseline {concise(float(np.linalg.norm(result.stereo.T)), result.baseline_sd_mm)} mm; squares, triangulated: "
