@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import json
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -11,6 +12,7 @@ from types import ModuleType
 import cv2
 import numpy as np
 import pytest
+from drawn_boards import PAIR, POSES, pictures, write_pair
 from scipy import stats
 
 from tvsbayes.boards import Board, View, Views, find_views
@@ -20,8 +22,9 @@ from tvsbayes.cameras import (
     calibrate_stereo,
     correlation_factor,
 )
-from tvsbayes.files import NothingToEstimate
-from tvsbayes.rigs import STEREO_PARAMETER_NAMES, parse_stereo, stereo_bytes
+from tvsbayes.cli import run
+from tvsbayes.files import NothingToEstimate, read_bytes
+from tvsbayes.rigs import STEREO_PARAMETER_NAMES, parse_stereo, read_stereo, stereo_bytes
 
 OPENCV_PAIRS = Path("/usr/share/doc/opencv-doc/examples/data")
 BOARD = Board(9, 6, 25.0)
@@ -314,3 +317,71 @@ def test_correlation_factor_is_the_design_effect(shared):
     factor = correlation_factor(np.ones((count * each, 1)), residuals, views, float(residuals.std()))
     # A sum of 200 squares scatters by sqrt(2 / 200) = 10 %.
     assert abs(factor / (1 + (each - 1) * shared) - 1) < 0.4
+
+
+@pytest.fixture
+def ask(capsys, monkeypatch, tmp_path):
+    """Run `stereo` with --json; the compilation cache stays in this test's folder."""
+    import jax
+    from jax.experimental.compilation_cache import compilation_cache
+
+    names = ("jax_compilation_cache_dir", "jax_persistent_cache_min_compile_time_secs")
+    before = {name: jax.config.values[name] for name in names}
+    monkeypatch.setenv("TVSBAYES_CACHE", str(tmp_path / "cache"))
+
+    def run_json(*arguments: object) -> tuple[int, dict]:
+        code = run(["stereo", *map(str, arguments), "--json"])
+        return code, json.loads(capsys.readouterr().out)
+
+    yield run_json
+    for name, value in before.items():
+        jax.config.update(name, value)
+    compilation_cache.reset_cache()
+
+
+def test_command_writes_what_it_says(ask, tmp_path):
+    """Six perfect pictures of a known pair: baseline within its interval, files readable, exit 0."""
+    for k, pose in enumerate(POSES):
+        write_pair(tmp_path, str(k), pictures(pose))
+    out = tmp_path / "stereo.json"
+    code, document = ask(tmp_path, "--board", "7x6", "--pitch-mm", "25", "-o", out, "--export", "ros", "--fix-k3")
+    assert code == 0 and document["pairs"] == 6 and document["source"] == "pictures"
+    assert set(document["files"]) == {"stereo", "left.yaml", "right.yaml"}
+    assert all(Path(path).is_file() for path in document["files"].values())
+    assert any("few views" in warning for warning in document["warnings"])
+    stereo = read_stereo(out)
+    baseline = document["baseline_mm"]
+    assert abs(baseline["value"] - np.linalg.norm(PAIR.T)) < 4 * baseline["sd"]
+    assert document["parameters"]["stereo.left.fx"]["value"] == stereo.M1[0, 0]
+    code, again = ask("--import", out, "--export", "opencv", "-o", tmp_path / "copy.json")
+    assert code == 0 and again["source"] == "tvsbayes" and not again["assumed"]
+    assert read_bytes(tmp_path / "copy.json", 1 << 20) == read_bytes(out, 1 << 20)
+    code, third = ask(
+        *("--import", tmp_path / "intrinsics.yml", "--import", tmp_path / "extrinsics.yml"),
+        *("-o", tmp_path / "third.json"),
+    )
+    assert code == 0 and third["assumed"] and read_stereo(tmp_path / "third.json").assumed
+
+
+@pytest.mark.parametrize(
+    "arguments, code, word",
+    (
+        ([], 2, "usage"),
+        (["FOLDER"], 2, "usage"),
+        (["FOLDER", "--board", "7x6"], 2, "usage"),
+        (["FOLDER", "--board", "7x6", "--pitch-mm", "nan"], 2, "number"),
+        (["FOLDER", "--board", "7x6", "--pitch-mm", "25", "--export", "kalibr"], 2, "usage"),
+        (["FOLDER", "--board", "7x6", "--pitch-mm", "25", "--import", "x.yml"], 2, "usage"),
+        (["FOLDER", "--board", "7x6", "--pitch-mm", "25"], 3, "few-views"),
+        (["NOWHERE", "--board", "7x6", "--pitch-mm", "25"], 2, "unreadable"),
+        (["--import", "NOWHERE"], 2, "missing-file"),
+    ),
+)
+def test_command_refuses_with_the_right_code(ask, tmp_path, arguments, code, word):
+    folder = tmp_path / "one"
+    folder.mkdir()
+    write_pair(folder, "1", pictures(POSES[0]))
+    places = {"FOLDER": folder, "NOWHERE": tmp_path / "nowhere"}
+    found, document = ask(*(places.get(argument, argument) for argument in arguments))
+    assert (found, document["error"]["code"]) == (code, word)
+    assert document["error"]["remedy"] or word == "number"

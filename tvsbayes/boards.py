@@ -234,7 +234,7 @@ def _unit(vector: np.ndarray) -> np.ndarray:
 
 def _natural(name: str) -> list[tuple[int, str]]:
     """Sorts 2 before 10."""
-    return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"([0-9]{1,18})", name)]
+    return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"([0-9]{1,18})", name.lower())]
 
 
 @dataclass(frozen=True)
@@ -339,7 +339,8 @@ def find_views(folder: Path, board: Board, *, finder: Finder = "classic", swap: 
             corners, turned = _agreeing(left, right, board)
             reordered += [name] * turned
         views.append(View(name, None if left is None else left.corners, corners))
-    unpaired = [n for (view, side), n in names.items() if (view, SIDES[side == "left"]) not in names]
+    lonely = [n for (view, side), n in names.items() if (view, SIDES[side == "left"]) not in names]
+    unpaired = sorted(lonely, key=_natural)
     other_size = [p.path.name for p in sizes if p not in used]
     return Views(tuple(views), *size, *(tuple(x) for x in (unpaired, without, other_size, fallback, reordered)))
 
