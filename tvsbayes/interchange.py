@@ -38,7 +38,7 @@ M_TO_MM = 1000.0
 
 ASSUMED_FOCAL = 0.01
 """Standard uncertainty of fx, fy, cx, cy over the focal length."""
-ASSUMED_RADIAL = (0.03, 0.1, 0.1)
+ASSUMED_RADIAL = (0.04, 0.15, 0.15)
 """Standard uncertainty of the share of k1, k2, k3 in a corner's distance from the image centre."""
 ASSUMED_TANGENTIAL = 0.003
 """Standard uncertainty of p1 and p2, as a share of that distance."""
@@ -63,7 +63,7 @@ def assumed_covariance(stereo: Stereo) -> np.ndarray:
     """A pessimistic covariance (24, 24) for a calibration that came without one: independent parameters.
 
     Standard uncertainties: 1 % of the focal length for fx, fy, cx, cy; for k1, k2, k3 what moves an image corner by
-    3, 10 and 10 % of its distance from the centre, for p1 and p2 by 0.3 %; 10 mrad for each component of R, 2 % of
+    4, 15 and 15 % of its distance from the centre, for p1 and p2 by 0.3 %; 10 mrad for each component of R, 2 % of
     |T| for each component of T. In every direction of parameter space this is more than the covariance of 13 views
     at 640 x 480 (OpenCV's own pairs), errors shared by the corners of a picture included.
     """
