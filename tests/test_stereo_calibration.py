@@ -280,12 +280,7 @@ def test_plausibility_names_what_is_missing(study, drawn):
     for k, depth in enumerate((500.0, 520.0, 540.0, 560.0)):
         pose = np.array([0.01, 0.01 * k, 0.0, 42.5, 0.0, depth])
         flat.append(study.corners_of(replace(drawn[0], pose=pose), str(k), rng))
-    try:
-        words = " ".join(calibrate_stereo(flat, BOARD, SIZE).warnings)
-    except NothingToEstimate as error:
-        words = str(error) + error.remedy
-        assert "do not determine" in words
-        return
+    words = " ".join(calibrate_stereo(flat, BOARD, SIZE).warnings)
     for expected in ("few views: 4 pairs", "nearly parallel", "poor coverage", "--pitch-u-mm"):
         assert expected in words
 

@@ -43,7 +43,9 @@ POSE_STEPS, POSE_TOLERANCE = 40, 1e-20
 RESTART_SD = 3.0
 """The repeated adjustment starts this many standard errors away in every parameter."""
 RESTART_AGREEMENT_SD = 1e-2
+STATIONARY_SD = 1e-3
 EXACT_PX = 1e-7
+"""Exact corners leave rounding errors, whose direction means nothing."""
 
 OUTLIER_Z, OUTLIER_SPREAD_MIN = 4.0, 0.2
 """A view is an outlier if the logarithm of its residual rms lies more than 4 robust standard deviations (1.4826 MAD,
@@ -233,22 +235,29 @@ def bundle_adjustment(
     if dof < 1:
         raise _undetermined("fewer corner coordinates than unknowns")
     with jax.enable_x64(True):
-        arrays = BoardArrays(points, seen, weight, start_poses, np.asarray(start, float), np.diag(free.astype(float)))
+        unit = np.diag(free.astype(float))
+        arrays = BoardArrays(*map(jnp.asarray, (points, seen, weight, start_poses, np.asarray(start, float), unit)))
         zero = np.zeros(24)
         jacobian = np.asarray(linearised(reduced_residuals, jnp.asarray(zero), arrays)[1])
         # Whitened at the start: a unit of z is one standard error for corners of 1 px. In their own units a focal
         # length and a k3 would share one damping.
         root = np.zeros((24, 24))
         root[np.ix_(free, free)] = _whitening(jacobian[:, free], np.flatnonzero(free))
-        arrays = replace(arrays, root=root)
+        arrays = replace(arrays, root=jnp.asarray(root))
         first = solve_least_squares(reduced_residuals, zero, arrays, max_steps=200, restart=False)
         noise_sd = math.sqrt(float(first.residuals @ first.residuals) / dof)
         # Alternating signs, so that no parameter's shift can be taken up by another's.
         shift = RESTART_SD * noise_sd * np.where(np.arange(24) % 2, -1.0, 1.0) * free
         second = solve_least_squares(reduced_residuals, first.value + shift, arrays, max_steps=200, restart=False)
-        # Exact corners leave rounding errors, whose direction means nothing.
-        problems = list(first.problems) if not noise_sd < EXACT_PX else []
-        if np.abs(second.value - first.value).max() > RESTART_AGREEMENT_SD * noise_sd + EXACT_PX:
+        jacobian = first.jacobian[kept][:, free]
+        # What the linear model would still move, and where the repetition ended, both as distances in standard errors
+        # whatever the conditioning: |J dz| / s.
+        left = float(np.linalg.norm(np.linalg.qr(jacobian)[0].T @ first.residuals[kept]))
+        apart = float(np.linalg.norm(jacobian @ (second.value - first.value)[free]))
+        problems = []
+        if not left <= STATIONARY_SD * noise_sd + EXACT_PX:
+            problems.append(f"the next step would be {left / noise_sd:.2g} standard errors")
+        if not apart <= RESTART_AGREEMENT_SD * noise_sd + EXACT_PX:
             problems.append("a second adjustment from a start nearby ended elsewhere")
         if problems:
             raise NotConverged(
@@ -257,11 +266,11 @@ def bundle_adjustment(
                 remedy="look at the pictures for wrong boards, a wrong --board, or add tilted views",
             )
         try:
-            z_covariance = least_squares_covariance(first.jacobian[kept][:, free])
+            z_covariance = least_squares_covariance(jacobian)
         except np.linalg.LinAlgError as error:
             raise _undetermined(str(error)) from error
     residuals = np.where(weight > 0, first.residuals.reshape(weight.shape), np.nan)[: len(views), :, : board.corners]
-    factor = correlation_factor(first.jacobian[kept][:, free], first.residuals[kept], view_of, noise_sd)
+    factor = correlation_factor(jacobian, first.residuals[kept], view_of, noise_sd)
     return Adjustment(
         vector=start + root @ first.value,
         covariance=noise_sd**2 * root[:, free] @ z_covariance @ root[:, free].T,
