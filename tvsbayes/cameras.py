@@ -30,7 +30,7 @@ from tvsbayes.files import NotConverged, NothingToEstimate, escaped
 from tvsbayes.model import CV_FROM_S, StereoCameras, project, rotation_matrix
 from tvsbayes.rigs import STEREO_PARAMETER_NAMES, Stereo, rotation_vector
 from tvsbayes.rigs import rotation_matrix as rotation_of
-from tvsbayes.solver import least_squares_covariance, linearised, solve_least_squares
+from tvsbayes.solver import least_squares_covariance, levenberg_marquardt, linearised
 
 VIEWS_MIN = 3
 """Views per camera below which Zhang's method (2000) cannot find a focal length with both principal coordinates."""
@@ -40,6 +40,8 @@ VIEWS_PER_BUCKET, CORNERS_PER_BUCKET = 16, 32
 """Padding: calibrations of like size share one compilation."""
 POSE_STEPS, POSE_TOLERANCE = 40, 1e-20
 """Gauss-Newton steps of a pose, and the squared step, in units of rad and board sizes, at which it is settled."""
+TOLERANCE, STEPS_MAX = 1e-7, 200
+"""In whitened coordinates this ended within 1e-7 standard errors of the minimum; the end is checked all the same."""
 RESTART_SD = 3.0
 """The repeated adjustment starts this many standard errors away in every parameter."""
 RESTART_AGREEMENT_SD = 1e-2
@@ -204,7 +206,7 @@ def correlation_factor(jacobian: np.ndarray, residuals: np.ndarray, views: np.nd
 def bundle_adjustment(
     views: Sequence[View], board: Board, start: np.ndarray, poses: np.ndarray, free: np.ndarray
 ) -> Adjustment:
-    """Least squares of all corners over cameras and board poses, with the checks of `solve_least_squares`.
+    """Least squares of all corners over cameras and board poses, checked at its end and repeated from another start.
 
     Args:
         views: at least one.
@@ -244,16 +246,16 @@ def bundle_adjustment(
         root = np.zeros((24, 24))
         root[np.ix_(free, free)] = _whitening(jacobian[:, free], np.flatnonzero(free))
         arrays = replace(arrays, root=jnp.asarray(root))
-        first = solve_least_squares(reduced_residuals, zero, arrays, max_steps=200, restart=False)
-        noise_sd = math.sqrt(float(first.residuals @ first.residuals) / dof)
+        value, residuals, jacobian = _descended(zero, arrays)
+        noise_sd = math.sqrt(float(residuals @ residuals) / dof)
         # Alternating signs, so that no parameter's shift can be taken up by another's.
         shift = RESTART_SD * noise_sd * np.where(np.arange(24) % 2, -1.0, 1.0) * free
-        second = solve_least_squares(reduced_residuals, first.value + shift, arrays, max_steps=200, restart=False)
-        jacobian = first.jacobian[kept][:, free]
+        again = _descended(value + shift, arrays)[0]
+        jacobian, residuals = jacobian[kept][:, free], residuals[kept]
         # What the linear model would still move, and where the repetition ended, both as distances in standard errors
         # whatever the conditioning: |J dz| / s.
-        left = float(np.linalg.norm(np.linalg.qr(jacobian)[0].T @ first.residuals[kept]))
-        apart = float(np.linalg.norm(jacobian @ (second.value - first.value)[free]))
+        left = float(np.linalg.norm(np.linalg.qr(jacobian)[0].T @ residuals))
+        apart = float(np.linalg.norm(jacobian @ (again - value)[free]))
         problems = []
         if not left <= STATIONARY_SD * noise_sd + EXACT_PX:
             problems.append(f"the next step would be {left / noise_sd:.2g} standard errors")
@@ -269,16 +271,25 @@ def bundle_adjustment(
             z_covariance = least_squares_covariance(jacobian)
         except np.linalg.LinAlgError as error:
             raise _undetermined(str(error)) from error
-    residuals = np.where(weight > 0, first.residuals.reshape(weight.shape), np.nan)[: len(views), :, : board.corners]
-    factor = correlation_factor(jacobian, first.residuals[kept], view_of, noise_sd)
+    placed = np.full(weight.shape, np.nan)
+    placed[weight > 0] = residuals
+    factor = correlation_factor(jacobian, residuals, view_of, noise_sd)
     return Adjustment(
-        vector=start + root @ first.value,
+        vector=start + root @ value,
         covariance=noise_sd**2 * root[:, free] @ z_covariance @ root[:, free].T,
-        residuals_px=residuals,
+        residuals_px=placed[: len(views), :, : board.corners],
         noise_sd_px=noise_sd,
         dof=dof,
         correlation_factor=factor,
     )
+
+
+def _descended(z: np.ndarray, arrays: BoardArrays) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Where Levenberg-Marquardt ends, with residuals and Jacobian there."""
+    tolerance = jnp.asarray(TOLERANCE)
+    end = levenberg_marquardt(reduced_residuals, jnp.asarray(z), arrays, tolerance, STEPS_MAX)
+    residuals, jacobian = linearised(reduced_residuals, end, arrays)
+    return np.asarray(end), np.asarray(residuals), np.asarray(jacobian)
 
 
 def _undetermined(reason: str) -> NothingToEstimate:
