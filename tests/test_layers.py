@@ -12,12 +12,13 @@ import pytest
 PACKAGE = Path(__file__).resolve().parents[1] / "tvsbayes"
 LEVELS: tuple[tuple[str, ...], ...] = (
     ("files",),
-    ("rigs",),
-    ("campaign",),
+    ("rigs", "boards"),
+    ("campaign", "interchange"),
     ("calibration",),
     ("model", "classic", "simulation"),
     ("protocols",),
     ("likelihood", "solver"),
+    ("cameras",),
     ("joint",),
     ("posterior",),
     ("information",),
@@ -30,15 +31,15 @@ LEVELS: tuple[tuple[str, ...], ...] = (
 """From bottom to top: a module imports only modules of lower levels."""
 WITHOUT_JAX = (
     *("files", "rigs", "campaign", "calibration", "classic", "simulation", "protocols"),
-    "report",
+    *("boards", "interchange", "report"),
 )
 MODEL = {
     *("model", "likelihood", "solver", "joint"),
     "posterior",
-    *("information", "classic", "calibration", "coordinates", "comparison"),
+    *("cameras", "information", "classic", "calibration", "coordinates", "comparison"),
 }
 JAX_FAMILY = {"jax", "jaxlib", "equinox", "optimistix", "lineax", "jaxtyping"}
-MODULES_MAX = 20
+MODULES_MAX = 24
 
 
 def imported(tree: ast.AST, package: str = "tvsbayes") -> set[str]:

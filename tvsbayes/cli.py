@@ -206,6 +206,88 @@ def simulate(
     _finish(document, text, as_json)
 
 
+IMAGE_SIDE_MAX = 65_535
+
+
+@app.command()
+def stereo(
+    folder: Annotated[Path | None, typer.Argument(metavar="[FOLDER]", help="Folder of checkerboard pictures.")] = None,
+    board: Annotated[str | None, typer.Option("--board", help="Inner corners, columns x rows: 9x6.")] = None,
+    pitch_mm: Annotated[float | None, typer.Option("--pitch-mm", help="Side of a square.")] = None,
+    pitch_u_mm: Annotated[float, typer.Option("--pitch-u-mm", help="Its standard uncertainty (mean of all).")] = 0.0,
+    out: Annotated[Path | None, typer.Option("-o", "--out", help="stereo.json to write.")] = None,
+    imports: Annotated[
+        list[Path] | None,
+        typer.Option(
+            "--import", help="File of OpenCV, ROS or Kalibr, or stereo.json, instead of pictures; repeatable."
+        ),
+    ] = None,
+    export: Annotated[str | None, typer.Option("--export", help="opencv or ros: also for these, beside -o.")] = None,
+    finder: Annotated[str, typer.Option("--finder", help="classic or sector; the other is the fallback.")] = "classic",
+    swap: Annotated[
+        bool, typer.Option("--swap", help="Wide frames hold the left camera's image on the right.")
+    ] = False,
+    fix_k3: Annotated[bool, typer.Option("--fix-k3", help="Keep k3 at 0.")] = False,
+    robust: Annotated[bool, typer.Option("--robust", help="Leave out outlying views, by name.")] = False,
+    image_size: Annotated[str | None, typer.Option("--image-size", help="1280x720, where imports lack it.")] = None,
+    import_unit: Annotated[str, typer.Option("--import-unit", help="mm or m: unit of an imported OpenCV T.")] = "mm",
+    as_json: Json = False,
+) -> None:
+    """Calibrate the camera pair from checkerboard pictures, with the covariance of all 24 parameters; or import one."""
+    if export not in (None, "opencv", "ros") or finder not in ("classic", "sector") or import_unit not in ("mm", "m"):
+        remedy = "--export opencv or ros, --finder classic or sector, --import-unit mm or m"
+        raise InputError("usage", "an option has a value that it does not know", remedy=remedy)
+    if (folder is None) == (not imports) or (folder is not None and (board is None or pitch_mm is None)):
+        remedy = "give FOLDER with --board and --pitch-mm, or --import FILE"
+        raise InputError("usage", "stereo needs pictures of a board, or a calibration to import", remedy=remedy)
+    _finite(pitch_mm=pitch_mm, pitch_u_mm=pitch_u_mm)
+    from tvsbayes.interchange import exported, read_calibration
+    from tvsbayes.report import stereo_calibration_text, stereo_text
+    from tvsbayes.rigs import STEREO_PARAMETER_NAMES, stereo_bytes
+
+    if imports:
+        unit_mm = {"mm": 1.0, "m": 1000.0}[import_unit]
+        found = read_calibration(imports, _image_size(image_size), unit_mm=unit_mm)
+        pair, text = found.stereo, "\n".join([stereo_text(found.stereo), *(f"note: {note}" for note in found.notes)])
+        sds = [float(variance) ** 0.5 for variance in pair.parameter_covariance.diagonal()]
+        values = zip(STEREO_PARAMETER_NAMES, pair.vector.tolist(), sds, strict=True)
+        document: dict[str, Any] = {
+            **{"source": found.source, "image_width": pair.image_width, "image_height": pair.image_height},
+            "parameters": {name: {"value": value, "sd": sd} for name, value, sd in values},
+            **{"rms_px": pair.rms_px, "assumed": pair.assumed, "warnings": list(found.notes)},
+        }
+    else:
+        from tvsbayes.boards import Board
+        from tvsbayes.cameras import calibrate_folder
+        from tvsbayes.model import use_compilation_cache
+
+        use_compilation_cache()
+        pattern = Board.named(board, pitch_mm, pitch_u_mm)
+        result = calibrate_folder(folder, pattern, finder=finder, swap=swap, fix_k3=fix_k3, robust=robust)
+        pair, text = result.stereo, stereo_calibration_text(result)
+        document = {"source": "pictures", **result.as_json()}
+    files = {} if out is None else {"stereo": (out, stereo_bytes(pair))}
+    if export:
+        beside = Path() if out is None else out.parent
+        files |= {name: (beside / name, data) for name, data in exported(pair, export).items()}
+    for path, data in files.values():
+        write_atomically(path, data)
+    written = {name: str(path) for name, (path, _) in files.items()}
+    text += f"\nwritten: {', '.join(written.values())}" if written else "\nnothing written: give -o stereo.json"
+    _finish({**document, "files": written}, text, as_json)
+
+
+def _image_size(text: str | None) -> tuple[int, int] | None:
+    """Width and height from text such as 1280x720."""
+    if text is None:
+        return None
+    width, _, height = text.lower().partition("x")
+    sizes = [int(part) if part.isascii() and part.isdecimal() and len(part) < 6 else 0 for part in (width, height)]
+    if not all(0 < size <= IMAGE_SIDE_MAX for size in sizes):
+        raise InputError("usage", f"--image-size {escaped(text)}", allowed="WIDTHxHEIGHT", remedy="write 1280x720")
+    return sizes[0], sizes[1]
+
+
 @app.command()
 def check(
     path: Annotated[Path, typer.Argument(metavar="PATH", help="Campaign folder, rig file or plan.")],

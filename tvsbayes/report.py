@@ -23,13 +23,15 @@ from rich.text import Text
 from tvsbayes.calibration import Calibration, Steps, calibration_bytes
 from tvsbayes.campaign import input_hashes
 from tvsbayes.classic import DIRECTIONS, ClassicResult
-from tvsbayes.files import make_folder, write_atomically
+from tvsbayes.files import escaped, make_folder, write_atomically
 
 if TYPE_CHECKING:
+    from tvsbayes.cameras import StereoCalibration
     from tvsbayes.comparison import Budget, Comparison, Gap, GapTerm, HoldOut
     from tvsbayes.coordinates import Locations
     from tvsbayes.information import Estimate, FitSummary
     from tvsbayes.joint import Derived, JointFit
+    from tvsbayes.rigs import Stereo
 
 FIT_FORMAT = "tvsbayes-fit/1"
 KEY_PARAMETERS = (
@@ -98,6 +100,58 @@ def classic_text(result: ClassicResult) -> str:
         rows.append([direction, str(r.n), f"{r.mean_deg_per_step:.6f}", sd, u, gum])
     columns = ["direction", "n", "mean deg/step", "sd", "u type A", "95 % interval (GUM)"]
     return text_table("classic four-point estimator", columns, rows)
+
+
+def stereo_text(stereo: Stereo) -> str:
+    """The 24 parameters of a pair with their standard uncertainties, both cameras beside each other."""
+    sds = np.sqrt(np.diag(stereo.parameter_covariance))
+    cells = [concise(float(value), float(sd)) for value, sd in zip(stereo.vector, sds, strict=True)]
+    names = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
+    units = ("px",) * 4 + ("",) * 5
+    rows = [[name, cells[k], cells[9 + k], unit] for k, (name, unit) in enumerate(zip(names, units, strict=True))]
+    title = f"stereo pair, {stereo.image_width} x {stereo.image_height} px"
+    cameras = text_table(title, ["", "left(u)", "right(u)", "unit"], rows)
+    rows = [[axis, cells[18 + k], cells[21 + k]] for k, axis in enumerate("xyz")]
+    return f"{cameras}\n{text_table('x_right = R x_left + T', ['', 'rotation, rad', 'T, mm'], rows)}"
+
+
+def stereo_calibration_text(result: StereoCalibration) -> str:
+    """A calibration from checkerboards: parameters, views, and everything the reader must know about it."""
+
+    def px(value: float | None) -> str:
+        return "-" if value is None else f"{value:.3f}"
+
+    rows = []
+    for view in result.views:
+        cells = [px(view.left_rms_px), px(view.right_rms_px), f"{view.distance_mm:.0f}", f"{view.tilt_deg:.0f}"]
+        rows.append([escaped(view.name) or "-", *cells, "OUTLIER" if view.outlier else ""])
+    columns = ["view", "left rms px", "right rms px", "distance mm", "tilt deg", ""]
+    board, mean_sd = result.board, result.triangulated_pitch_mm
+    lines = [
+        stereo_text(result.stereo),
+        text_table(f"{result.pairs} pairs, {len(result.views) - result.pairs} single views", columns, rows),
+        f"rms over corners: both {result.stereo.rms_px:.3f}, left {px(result.left_rms_px)}, right "
+        f"{px(result.right_rms_px)} px; one coordinate: sd {result.noise_sd_px:.3f} px, dof {result.dof}",
+        "uncertainties hold for corner errors that the corners of a picture share: variances "
+        f"{result.correlation_factor:.1f} times those of independent corners",
+        f"baseline {concise(float(np.linalg.norm(result.stereo.T)), result.baseline_sd_mm)} mm; squares, triangulated: "
+        f"{mean_sd[0]:.3f} mm on average, sd {mean_sd[1]:.3f}, stated {board.pitch_mm:g}",
+        "boards cover "
+        + ", ".join(f"{100 * share:.0f} % of the {side} image" for side, share in result.coverage.items()),
+    ]
+    if (found := result.found) is not None:
+        lists = {
+            "without their counterpart": found.unpaired,
+            "no board found": found.without_board,
+            "another size, not used": found.other_size,
+            "found by the other finder": found.by_fallback,
+            "right corners turned to agree": found.reordered,
+        }
+        lines += [f"{what}: {escaped(', '.join(names), 400)}" for what, names in lists.items() if names]
+    if result.excluded:
+        lines.append(f"left out: {escaped(', '.join(result.excluded), 400)}")
+    lines += [f"warning: {warning}" for warning in result.warnings]
+    return "\n".join(lines)
 
 
 def estimate_row(label: str, estimate: Estimate | None, unit: str) -> list[str]:

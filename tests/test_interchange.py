@@ -1,0 +1,296 @@
+"""Calibrations of other tools: round trips, units, the assumed covariance, and what a stranger's YAML may not do."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from tvsbayes.files import InputError, shipped_data
+from tvsbayes.interchange import assumed_covariance, exported, parse_yaml, read_calibration
+from tvsbayes.rigs import Stereo, read_stereo, rotation_matrix, stereo_bytes
+
+OPENCV_DATA = Path("/usr/share/doc/opencv-doc/examples/data")
+KALIBR = """cam0:
+  cam_overlaps: [1]
+  camera_model: pinhole
+  distortion_coeffs: [-0.3, 0.1, 0.0003, -0.0005]
+  distortion_model: radtan
+  intrinsics: [801.0, 800.5, 642.0, 357.0]
+  resolution: [1280, 720]
+  rostopic: /left/image_raw
+cam1:
+  T_cn_cnm1:
+  - [0.9998000066665778, -0.0199986667, 0.0, -0.085]
+  - [0.0199986667, 0.9998000066665778, 0.0, 0.0002]
+  - [0.0, 0.0, 1.0, -0.0003]
+  - [0.0, 0.0, 0.0, 1.0]
+  cam_overlaps: [0]
+  camera_model: pinhole
+  distortion_coeffs: [-0.29, 0.095, -0.0002, 0.0004]
+  distortion_model: radtan
+  intrinsics: [798.5, 798.0, 636.0, 363.0]
+  resolution: [1280, 720]
+  rostopic: /right/image_raw
+"""
+OPENCV_SDS = {
+    "focal": 0.72,
+    "centre": 1.02,
+    "radial": (0.0121, 0.093, 0.2),
+    "tangential": 4.4e-4,
+    "rotation": 2.4e-3,
+    "translation": 0.33,
+}
+"""Largest standard uncertainties that `tvsbayes stereo` states for OpenCV's 13 pairs, 640 x 480, over both cameras."""
+
+
+@pytest.fixture(scope="module")
+def mounted() -> Stereo:
+    return read_stereo(shipped_data() / "rigs" / "mounted" / "stereo.json")
+
+
+def written(folder: Path, files: dict[str, bytes]) -> list[Path]:
+    for name, data in files.items():
+        (folder / name).write_bytes(data)
+    return [folder / name for name in files]
+
+
+def close(found: Stereo, stereo: Stereo, rotation_atol: float = 1e-12) -> None:
+    np.testing.assert_allclose(found.vector[:18], stereo.vector[:18], rtol=1e-14, atol=1e-15)
+    np.testing.assert_allclose(found.R, stereo.R, atol=rotation_atol)
+    np.testing.assert_allclose(found.T, stereo.T, atol=rotation_atol * 1e3)
+    assert (found.image_width, found.image_height) == (stereo.image_width, stereo.image_height)
+    assert found.assumed
+
+
+@pytest.mark.parametrize("form", ("opencv", "ros"))
+@pytest.mark.parametrize("backwards", (False, True))
+def test_what_is_exported_is_imported_again(mounted, tmp_path, form, backwards):
+    """Every digit of matrices and distortion; R and T of ROS through rectification to rounding."""
+    paths = written(tmp_path, exported(mounted, form))
+    found = read_calibration(paths[::-1] if backwards else paths)
+    assert found.source == form
+    close(found.stereo, mounted)
+    np.testing.assert_array_equal(found.stereo.parameter_covariance, assumed_covariance(found.stereo))
+    assert any("pessimistic" in note for note in found.notes)
+    assert found.stereo.assumed and b'"assumed": true' in stereo_bytes(found.stereo)
+
+
+def test_ros_export_is_in_metres(mounted):
+    """P[0][3] of the right camera is -fx x baseline in metres, 0 in the left one."""
+    files = exported(mounted, "ros")
+    left, right = (
+        np.array(parse_yaml(files[name], name).table("projection_matrix").values["data"]).reshape(3, 4)
+        for name in ("left.yaml", "right.yaml")
+    )
+    assert left[0, 3] == 0
+    assert abs(-right[0, 3] / right[0, 0] - np.linalg.norm(mounted.T) / 1000) < 1e-12
+
+
+def test_opencv_reads_what_is_exported(mounted, tmp_path):
+    for path in written(tmp_path, exported(mounted, "opencv")):
+        storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
+        for name, value in (("M1", mounted.M1), ("D2", mounted.D2[None]), ("R", mounted.R), ("T", mounted.T[:, None])):
+            node = storage.getNode(name)
+            if not node.empty():
+                np.testing.assert_array_equal(node.mat(), value)
+        storage.release()
+
+
+@pytest.mark.parametrize("header", (b"%YAML:1.0\n---\n", b"%YAML 1.2\n---\n", b""))
+def test_what_opencv_writes_is_read(mounted, tmp_path, header):
+    """Its own writer, one file, with the headers of 4.x and 5.x."""
+    path = tmp_path / "pair.yml"
+    storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
+    values = {"M1": mounted.M1, "D1": mounted.D1[None], "M2": mounted.M2, "D2": mounted.D2[None]}
+    for name, value in {**values, "R": mounted.R, "T": mounted.T[:, None]}.items():
+        storage.write(name, value)
+    storage.release()
+    body = path.read_bytes().split(b"---\n", 1)[1]
+    path.write_bytes(header + body)
+    with pytest.raises(InputError, match="--image-size"):
+        read_calibration([path])
+    close(read_calibration([path], (1280, 720)).stereo, mounted)
+
+
+def test_opencv_lengths_need_their_unit(mounted, tmp_path):
+    in_metres = replace(mounted, T=mounted.T / 1000)
+    paths = written(tmp_path, exported(in_metres, "opencv"))
+    with pytest.raises(InputError, match="--import-unit m"):
+        read_calibration(paths)
+    close(read_calibration(paths, unit_mm=1000.0).stereo, mounted)
+
+
+def test_kalibr_camchain(tmp_path):
+    (path,) = written(tmp_path, {"camchain.yaml": KALIBR.encode()})
+    found = read_calibration([path])
+    assert found.source == "kalibr" and found.stereo.assumed
+    np.testing.assert_allclose(found.stereo.T, [-85.0, 0.2, -0.3])
+    # The file's ten digits.
+    np.testing.assert_allclose(found.stereo.R, rotation_matrix(np.array([0, 0, 0.02])), atol=1e-9)
+    np.testing.assert_array_equal(found.stereo.D1, [-0.3, 0.1, 0.0003, -0.0005, 0.0])
+    np.testing.assert_array_equal(found.stereo.M2, [[798.5, 0, 636], [0, 798, 363], [0, 0, 1]])
+    assert found.stereo.parameter_covariance[8, 8] > 0
+
+
+def test_native_calibration_keeps_its_covariance(mounted, tmp_path):
+    (path,) = written(tmp_path, {"stereo.json": stereo_bytes(mounted)})
+    found = read_calibration([path])
+    assert found.source == "tvsbayes" and not found.stereo.assumed and found.notes == ()
+    np.testing.assert_array_equal(found.stereo.parameter_covariance, mounted.parameter_covariance)
+
+
+def test_assumed_covariance_exceeds_real_ones_in_every_direction(mounted):
+    """Against the shipped rig's, and against the largest sds of OpenCV's pairs whatever their correlations are."""
+
+    def largest(covariance: np.ndarray, stereo: Stereo) -> float:
+        scale = np.sqrt(np.diag(assumed_covariance(stereo)))
+        return float(np.linalg.eigvalsh(covariance / np.outer(scale, scale)).max())
+
+    assert largest(mounted.parameter_covariance, mounted) < 1
+    matrix = np.array([[535.0, 0, 340], [0, 535.0, 240], [0, 0, 1]])
+    small = replace(mounted, image_width=640, image_height=480, M1=matrix, M2=matrix, T=np.array([-83.2, 0.9, -0.1]))
+    s = OPENCV_SDS
+    camera = [*[s["focal"]] * 2, *[s["centre"]] * 2, *s["radial"][:2], *[s["tangential"]] * 2, s["radial"][2]]
+    sds = np.array([*camera, *camera, *[s["rotation"]] * 3, *[s["translation"]] * 3])
+    # The largest eigenvalue is at most the trace, whatever the correlations.
+    assert np.sum(sds**2 / np.diag(assumed_covariance(small))) < 1
+
+
+def test_opencvs_own_sample_files():
+    if not (OPENCV_DATA / "intrinsics.yml").is_file():
+        pytest.skip("Debian's package opencv-doc is not installed")
+    data = (OPENCV_DATA / "left_intrinsics.yml").read_bytes()
+    keys = parse_yaml(data, "left_intrinsics.yml")
+    assert keys.values["image_width"] == 640
+    assert keys.table("camera_matrix").values["data"][0] == 535.91573396163199
+    assert len(keys.table("extrinsic_parameters").values["data"]) == 78
+    with pytest.raises(InputError, match="one camera"):
+        read_calibration([OPENCV_DATA / "left_intrinsics.yml"])
+    with pytest.raises(InputError, match="R in 0 of the files"):
+        read_calibration([OPENCV_DATA / "intrinsics.yml"], (640, 480))
+
+
+HOSTILE = {
+    "tag": "M1: !!python/object/apply:os.system [ 'true' ]",
+    "anchor": "a: &x [1, 2]\nb: *x",
+    "alias": "b: *x",
+    "merge": "<<: {a: 1}",
+    "flow map": "a: {b: 1}",
+    "block text": "a: |\n  text",
+    "twice": "a: 1\na: 2",
+    "open list": "a: [1, 2",
+    "open list inside": "a: [[1, 2], 3\nb: 1",
+    "closing first": "a: 1]\nb: ]",
+    "two lists": "a: [1] [2]",
+    "deep": "a: [[[1]]]",
+    "deep keys": "a:\n  b:\n    c:\n      d:\n        e: 1",
+    "no comma": "a: [1 2]",
+    "two commas": "a: [1,,2]",
+    "not a number": "a: [1, .nan, .inf] junk",
+    "infinite": "a: 1e999",
+    "indent": "a:\n    b: 1\n  c: 2",
+    "tab": "a:\n\tb: 1",
+    "bare word": "just text",
+    "empty key": ": 1",
+    "empty item": "a:\n  - \n  - 1",
+    "escape": 'a: "\\x41"',
+    "second document": "a: 1\n%YAML:1.0\nb: 2",
+    "nothing": "# only a comment",
+    "control": "a: \x1b[31m",
+    "long": "a: [" + ", ".join(["1"] * 200_001) + "]",
+}
+
+
+@pytest.mark.parametrize("kind", HOSTILE)
+def test_other_yaml_is_refused_with_its_place(kind):
+    with pytest.raises(InputError) as caught:
+        parse_yaml(HOSTILE[kind].encode(), "file.yml")
+    assert caught.value.file == "file.yml" and caught.value.remedy
+    assert "\x1b" not in str(caught.value)
+
+
+def test_large_files_are_refused_before_parsing():
+    with pytest.raises(InputError, match="at most"):
+        parse_yaml(b"a: 1\n" * 1_000_000, "file.yml")
+
+
+CHANGES = {
+    "model": ("ros", "left.yaml", b"plumb_bob", b"equidistant", "plumb_bob"),
+    "no rotation": ("opencv", "extrinsics.yml", b"R: !!opencv-matrix", b"Rx: !!opencv-matrix", "R in 0"),
+    "short data": ("opencv", "intrinsics.yml", b"rows: 3", b"rows: 2", "3x3"),
+    "huge matrix": ("opencv", "intrinsics.yml", b"rows: 3", b"rows: 100000", "1000"),
+    "skewed": ("ros", "right.yaml", b"rectification_matrix:\n  rows: 3\n  cols: 3\n  data: [0.9", b"", ""),
+    "sizes": ("ros", "left.yaml", b"image_width: 1280", b"image_width: 1281", "no stereo pair"),
+    "text size": ("ros", "left.yaml", b"image_width: 1280", b"image_width: wide", "whole number"),
+}
+
+
+@pytest.mark.parametrize("kind", CHANGES)
+def test_contradictory_files_are_refused(mounted, tmp_path, kind):
+    form, name, old, new, word = CHANGES[kind]
+    files = exported(mounted, form)
+    if kind == "skewed":
+        old = b"rectification_matrix:\n  rows: 3\n  cols: 3\n  data: ["
+        new, word = old + b"2", "misses it by"
+    assert old in files[name]
+    files[name] = files[name].replace(old, new, 1)
+    with pytest.raises(InputError, match=word):
+        read_calibration(written(tmp_path, files))
+
+
+def test_one_ros_file_is_not_a_pair(mounted, tmp_path):
+    paths = written(tmp_path, exported(mounted, "ros"))
+    for some in (paths[:1], [paths[0], paths[0]]):
+        with pytest.raises(InputError, match=r"two camera_info|no stereo pair"):
+            read_calibration(some)
+
+
+@pytest.mark.parametrize(
+    "old, new",
+    (("radtan", "equidistant"), ("pinhole", "omni"), ("[1280, 720]", "[1280, 720, 3]"), ("cam1:", "cam2:")),
+)
+def test_other_kalibr_models_are_refused(tmp_path, old, new):
+    (path,) = written(tmp_path, {"camchain.yaml": KALIBR.replace(old, new, 1).encode()})
+    with pytest.raises(InputError, match=r"camchain\.yaml"):
+        read_calibration([path])
+
+
+def test_rational_distortion_is_refused_unless_it_is_none(mounted, tmp_path):
+    files = exported(mounted, "opencv")
+    five = ", ".join(map(repr, mounted.D1.tolist()))
+    for tail, allowed in (("0.0, 0.0, 0.0", True), ("0.1, 0.0, 0.0", False)):
+        text = files["intrinsics.yml"].decode().replace("cols: 5", "cols: 8", 1).replace(five, f"{five}, {tail}")
+        paths = written(tmp_path, {**files, "intrinsics.yml": text.encode()})
+        if allowed:
+            close(read_calibration(paths).stereo, mounted)
+        else:
+            with pytest.raises(InputError, match="not all beyond k3 zero"):
+                read_calibration(paths)
+
+
+def test_random_damage_ends_in_a_refusal_or_a_calibration(mounted, tmp_path):
+    """Six hundred seeded mutations of a good file: nothing but InputError comes out."""
+    rng = np.random.default_rng(0)
+    good = {form: exported(mounted, form) for form in ("opencv", "ros")} | {"kalibr": {"c.yaml": KALIBR.encode()}}
+    refused = 0
+    for k in range(600):
+        files = dict(good[("opencv", "ros", "kalibr")[k % 3]])
+        name = list(files)[int(rng.integers(len(files)))]
+        data = bytearray(files[name])
+        for _ in range(int(rng.integers(1, 4))):
+            at = int(rng.integers(len(data)))
+            if rng.random() < 0.3:
+                del data[at : at + int(rng.integers(1, 30))]
+            else:
+                data[at] = (
+                    int(rng.integers(256)) if rng.random() < 0.3 else ord(rng.choice(list("[],:-!&*{}'\" \n0e.")))
+                )
+        try:
+            read_calibration(written(tmp_path, {**files, name: bytes(data)}))
+        except InputError:
+            refused += 1
+    assert 60 < refused < 600
