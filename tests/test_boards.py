@@ -96,6 +96,19 @@ def test_turned_corner_orders_are_mended(tmp_path, monkeypatch, columns, rows, q
         np.testing.assert_array_equal(getattr(mended.views[0], side), getattr(straight.views[0], side))
 
 
+def test_mirrored_corner_orders_are_mended(monkeypatch):
+    """A finder that counts rows from right to left: x would turn into y the wrong way round."""
+    grey = pictures(POSES[0])[0]
+    straight, _ = boards.find_corners(grey, BOARD)
+    original = boards._find_classic
+
+    def mirrored(grey, board):
+        return original(grey, board).reshape(board.rows, board.columns, 2)[:, ::-1].reshape(-1, 2)
+
+    monkeypatch.setattr(boards, "_find_classic", mirrored)
+    np.testing.assert_array_equal(boards.find_corners(grey, BOARD)[0], straight)
+
+
 def test_colours_decide_for_a_camera_on_its_head(tmp_path):
     """The right picture turned by 180 degrees: direction alone would pair the wrong corners."""
     left, right = pictures(POSES[0])
