@@ -38,7 +38,7 @@ from tvsbayes.calibration import (
     output_deg,
 )
 from tvsbayes.campaign import APPROACH_SIGN, Campaign, Move, input_hashes
-from tvsbayes.files import InputError, NotConverged, escaped
+from tvsbayes.files import JSON_BYTES_MAX, InputError, Keys, NotConverged, escaped, parse_json, read_bytes
 
 if TYPE_CHECKING:
     from tvsbayes.comparison import Budget
@@ -378,9 +378,10 @@ def simulated_runs(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Deviations of ISO 230-2 test cycles on the rigs that the data allow.
 
-    Each run is homed at a turn-round point below the targets, goes up through them, turns round above them and comes
-    back; play is taken up at every target; every stop draws its error. The other axis rests in mid-play at the middle
-    of its counters.
+    A test is homed once at a turn-round point below the targets; each run goes up through them, turns round above
+    them and comes back; play is taken up at every target; every stop draws its error. Runs follow each other without
+    homing, so that unequal ratios of the two directions carry every run on by c times the travel. The other axis rests
+    in mid-play at the middle of its counters.
 
     Args:
         calibration: with draws.
@@ -406,8 +407,9 @@ def simulated_runs(
     middle = float(calibration.range_steps[AXES.index(other)].mean())
     other_deg = output_deg(values, other, middle, 0.0, calibration.period_deg.get(other))
     ratio = values[f"degrees_per_step.{axis}"]
-    # Upwards a step is k + c/2; downwards k - c/2 (DESIGN 3.1): what a run has gained stays until it is homed again.
-    gained = {1.0: 0.5 * contrast * (steps - low), -1.0: 0.5 * contrast * ((high - low) + (high - steps))}
+    # Upwards a step is k + c/2, downwards k - c/2 (DESIGN 3.1): a whole cycle of 2 L steps gains c L.
+    before = contrast * (high - low) * np.arange(runs)
+    gained = {1.0: before + 0.5 * contrast * (steps - low), -1.0: before + 0.5 * contrast * (2 * high - low - steps)}
     generator = np.random.default_rng([seed, 2302])
     result = []
     for side, name in ((1.0, SIDES[axis][1]), (-1.0, SIDES[axis][0])):
@@ -515,7 +517,8 @@ def positioning(
             reading_u = float(np.sqrt(np.mean(readings.u_deg**2)))
         if plug_in is not None:
             notes.append(
-                "plug-in: s holds pixel noise and home offsets beside stop errors; maxima of few runs are too large"
+                "plug-in: s holds pixel noise, home offsets and drift over the campaign beside stop errors; maxima of "
+                "few runs are too large"
             )
             if len(steps) < TARGETS or min(min(pair) for pair in counts) < RUNS:
                 fewest = min(min(pair) for pair in counts)
@@ -527,7 +530,7 @@ def positioning(
             notes.append(f"plug-in: {readings.play_left_out} stops left out whose play was not taken up for certain")
     if chosen:
         notes.append(
-            f"predicted: {tests} simulated tests of {runs} runs per side, homed before each run, drawn from the "
+            f"predicted: {tests} simulated tests of {runs} runs per side, homed once before each test, drawn from the "
             f"{calibration.estimator}"
         )
     else:
@@ -833,6 +836,48 @@ _FORBIDDEN = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]"
 """Characters that XML 1.0 cannot hold, escaped or not."""
 _RELEASE = re.compile(r"(?:[0-9]{1,3}\.){0,3}[0-9]{1,3}")
 _XSD_SECONDS = 60
+
+
+FIT_FORMATS = ("tvsbayes-fit/1",)
+"""Versions of `results/fit.json` that can be read; the schema of each is in `data/schemas`."""
+LARGEST = 1e9
+
+
+def _check_estimate(table: Keys, name: str) -> None:
+    """An estimate of `fit.json`, or null."""
+    if table.values.get(name, "") is None:
+        return
+    entry = table.table(name)
+    entry.number("value", -LARGEST, LARGEST)
+    entry.number("sd", 0.0, LARGEST)
+    ends = entry.values.get("interval95")
+    if not (isinstance(ends, list) and len(ends) == 2 and all(type(x) in (int, float) for x in ends)):
+        raise entry.refuse("interval95", "interval", "two finite numbers", "run `tvsbayes fit` again")
+
+
+def read_fit(path: Path | str) -> dict[str, object]:
+    """Read `results/fit.json` of any version; what a certificate is written from is checked.
+
+    Raises:
+        InputError: missing, damaged or of an unknown version, with the key.
+    """
+    keys = parse_json(read_bytes(Path(path), JSON_BYTES_MAX), escaped(Path(path).name))
+    keys.word("format", FIT_FORMATS)
+    keys.word("estimator", ("laplace", "posterior"))
+    keys.flag("converged")
+    keys.integer("seed", 0, 2**63 - 1)
+    keys.text_value("command", 20_000)
+    effective, parameters = keys.table("effective_deg_per_step"), keys.table("parameters")
+    for axis in AXES:
+        keys.table("reference_pose_deg").number(axis, -LARGEST, LARGEST)
+        for direction in SIDES[axis]:
+            _check_estimate(effective, direction)
+        _check_estimate(parameters, f"backlash_deg.{axis}")
+    for name in ("moves", "spots", "stereo", "rig"):
+        keys.table("inputs").text_value(name)
+    for name in ("python", "tvsbayes", *keys.table("versions").values):
+        keys.table("versions").text_value(name)
+    return keys.values
 
 
 def _plain(value: object) -> str:
