@@ -834,7 +834,7 @@ METHOD = (
 REFERENCES = ("doi:10.3390/metrology5040058", "JCGM 100:2008", "JCGM 101:2008")
 _FORBIDDEN = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 """Characters that XML 1.0 cannot hold, escaped or not."""
-_RELEASE = re.compile(r"(?:[0-9]{1,3}\.){0,3}[0-9]{1,3}")
+_RELEASE = re.compile(r"(?:[0-9]{1,3}\.){0,3}[0-9]{1,3}(?![0-9])")
 _XSD_SECONDS = 60
 
 
