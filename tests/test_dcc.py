@@ -94,7 +94,7 @@ LEAVES = {
     "countryCodeISO3166_1": "[A-Z]{2}",
     "countryCode": "[A-Z]{2}",
     **dict.fromkeys(("usedLangCodeISO639_1", "mandatoryLangCodeISO639_1"), "[a-z]{2}"),
-    **dict.fromkeys(("uniqueIdentifier", "role", "reference", "fileName", "mimeType", "content"), NOT_EMPTY),
+    **dict.fromkeys(("uniqueIdentifier", "role", "norm", "reference", "fileName", "mimeType", "content"), NOT_EMPTY),
     **dict.fromkeys(("beginPerformanceDate", "endPerformanceDate", "issueDate"), r"\d{4}-\d\d-\d\d"),
     "performanceLocation": "laboratory|customer|laboratoryBranch|customerBranch|other",
     "issuer": "manufacturer|calibrationLaboratory|customer|owner|other",

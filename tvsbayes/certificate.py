@@ -831,7 +831,7 @@ METHOD = (
     "standard measured them. Effective degrees of the beam per motor step hold at the stated pose of the mirrors. "
     "U is half the 95 % interval, k = U/u."
 )
-REFERENCES = ("doi:10.3390/metrology5040058", "JCGM 100:2008", "JCGM 101:2008")
+REFERENCE, NORMS = "doi:10.3390/metrology5040058", ("JCGM 100:2008", "JCGM 101:2008")
 _FORBIDDEN = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 """Characters that XML 1.0 cannot hold, escaped or not."""
 _RELEASE = re.compile(r"(?:[0-9]{1,3}\.){0,3}[0-9]{1,3}(?![0-9])")
@@ -1187,8 +1187,9 @@ def dcc_bytes(
     _words(method, "dcc:name", "joint estimate from stereo spots")
     texts = [METHOD, *(f"Method as named by the user: {t}" for t in [campaign.header.get("method")] if t)]
     _words(method, "dcc:description", *texts)
-    for reference in REFERENCES:
-        _add(method, "dcc:reference", reference)
+    for norm in NORMS:
+        _add(method, "dcc:norm", norm)
+    _add(method, "dcc:reference", REFERENCE)
     _software(part, "dcc:usedSoftware", document, id="software")
     _equipment(part, campaign)
     _conditions(part, campaign)
