@@ -11,7 +11,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from bent_rig import BENT
+from bent_rig import BENT, WOBBLE
 from bent_rig import calibration as bent_calibration
 from small_campaign import small_campaign
 
@@ -35,7 +35,7 @@ from tvsbayes.certificate import (
     unit_of,
 )
 from tvsbayes.rigs import RigTable
-from tvsbayes.simulation import effective_deg_per_step, with_derived
+from tvsbayes.simulation import effective_deg_per_step, harmonics_deg, mirror_chain, transmission, with_derived
 
 KEPT = Path(__file__).parent / "data"
 ROUNDING = 1e-9
@@ -194,6 +194,41 @@ def test_unequal_ratios_carry_every_run_on():
             step = targets[k] - targets[k + 1] if k + 1 < len(targets) else 0
             q += (0.06 - c / 2) * step
             assert down[0, k, run] == pytest.approx(q - 0.06 * targets[k], abs=1e-9)
+
+
+@pytest.mark.parametrize("period_deg", [360.0, 9.0])
+def test_a_run_on_a_bent_rig_is_the_twins(period_deg):
+    """Gears, play, transmission error and mirrors against the twin's own, along the counters of a test."""
+    rig = {**BENT, **WOBBLE}
+    one = replace(
+        known_calibration(**rig),
+        period_deg={"pan": period_deg, "tilt": period_deg},
+        range_steps=np.array([[-80.0, 280.0], [-40.0, 60.0]]),
+    )
+    targets, beyond = (-60, 20, 90, 160, 250), 40
+    for axis, name in enumerate(("pan", "tilt")):
+        up, down = simulated_runs(one, name, targets, 0.06, runs=2, tests=1)
+        path = [-60 - beyond, *(2 * [*targets, 250 + beyond, *targets[::-1], -60 - beyond])]
+        first = np.arange(len(path)) == 0
+        # The other axis: its counters' middle, in mid-play.
+        other = ("tilt", "pan")[axis]
+        middle = one.range_steps[1 - axis].mean()
+        angles = {}
+        for a, counters, homed, start in ((name, path, first, -0.5), (other, [middle], np.array([True]), 0.0)):
+            ratio, harmonics = (rig[f"degrees_per_step.{a}"], 0.0), harmonics_deg(rig, a)
+            zeros = np.zeros(len(counters))
+            play = rig[f"backlash_deg.{a}"]
+            angles[a] = transmission(
+                np.array(counters), homed, zeros + start, zeros, ratio, play, harmonics, period_deg
+            )
+        psi, beta = np.radians(angles["pan"]), np.radians(angles["tilt"] + rig["tilt_zero_deg"])
+        beam = mirror_chain(psi, beta, rig)[1]
+        seen = np.degrees(np.arctan2(beam[:, 1], beam[:, 0]) if name == "pan" else np.arcsin(beam[:, 2]))
+        deviation = seen - 0.06 * np.array(path)
+        runs = deviation[1:].reshape(2, 12)
+        # 1e-9 deg: rounding of angles up to 20 deg through two reflections.
+        np.testing.assert_allclose(up[0].T, runs[:, :5], atol=1e-9)
+        np.testing.assert_allclose(down[0].T, runs[:, 6:11][:, ::-1], atol=1e-9)
 
 
 def test_stop_errors_scatter_runs_by_side():

@@ -283,6 +283,17 @@ def test_a_skewed_quantity_gets_an_interval_and_an_unmoved_one_no_number():
     assert len(texts(root, ".//dcc:noQuantity/dcc:content")) == 3
 
 
+def test_no_coverage_factor_below_one_is_written():
+    """Of a heavy tail the 95 % interval may be shorter than u on either side; D-SI takes k >= 1 only."""
+    campaign, document = campaign_and_fit()
+    heavy = {**document["parameters"]["backlash_deg.pan"], "value": 0.5, "sd": 0.2, "interval95": [0.4, 0.6]}
+    parameters = {**document["parameters"], "backlash_deg.pan": heavy}
+    root = ET.fromstring(dcc_bytes(campaign, {**document, "parameters": parameters}, issued=ISSUED))
+    assert structure_problems(root) == []
+    (box,) = root.findall(".//si:coverageIntervalMU", {"si": "https://ptb.de/si"})
+    assert [child.text for child in box] == ["0.20", "0.40", "0.60", "0.95", "normal"]
+
+
 def test_a_fixed_quantity_has_no_uncertainty():
     campaign, document = campaign_and_fit()
     fixed = {**document["parameters"]["backlash_deg.pan"], "value": 0.0, "sd": 0.0, "interval95": [0.0, 0.0]}
