@@ -268,6 +268,10 @@ def test_bent_optics_bend_the_beam_not_the_counters():
     assert bent.predicted["mean_systematic_deg"].median > 0.01
     # 1 deg of laser tilt changes the slope by 1.7 % at most (DESIGN 3.2).
     assert bent.predicted["mean_reversal_deg"].median == pytest.approx(-0.2, rel=0.017)
+    # Unasked, targets follow the slope at the middle of the counters: pan 100, tilt 0.
+    values = known_calibration(**{"laser_tilt_deg.x": 1.0}).estimates
+    assert bent.deg_per_step == pytest.approx(beam_deg_per_step(values, "pan", (6.0, 0.0)), rel=1e-9)
+    assert bent.deg_per_step != pytest.approx(beam_deg_per_step(values, "pan", (0.0, 6.0)), rel=1e-6)
 
 
 def test_ratio_of_the_beam_is_the_twins():
@@ -306,6 +310,9 @@ def test_an_axis_that_never_moved_has_no_prediction():
         positioning(replace(still, inputs=np.zeros((0, len(INPUT_NAMES)))), "pan")
 
 
+STOPS = 27
+
+
 def stops_of(offsets_deg: np.ndarray, looks: int = 2, noise: float = 0.0) -> SimpleNamespace:
     """What `stop_readings` reads of a fit: a pan axis driven 0, 100, 200 up and down, at every stop `looks` looks.
 
@@ -315,8 +322,8 @@ def stops_of(offsets_deg: np.ndarray, looks: int = 2, noise: float = 0.0) -> Sim
     counters = [n for _ in range(4) for n in (0, 100, 200, 300, 200, 100)]
     moves = [Move(0, 0, 0.0, -100, 0, "left", "up")]
     moves += [Move(k + 1, 0, float(k), n, 0) for k, n in enumerate(counters)]
-    # A step too short to take up the play, at the end: its stop tells no side.
-    moves.append(Move(len(moves), 0, 99.0, 102, 0))
+    # Steps too short to take up the play of 5 steps, at the end: only together they do.
+    moves += [Move(len(moves) + k, 0, 99.0, n, 0) for k, n in enumerate((102, 104, 106))]
     rng = np.random.default_rng(8)
     spots, rows = [], []
     for move in moves[1:]:
@@ -328,6 +335,8 @@ def stops_of(offsets_deg: np.ndarray, looks: int = 2, noise: float = 0.0) -> Sim
     tilt_error = rng.normal(size=len(rows)) * 1e-3
     residual = np.einsum("nki,ni->nk", slope, np.stack([off, tilt_error], axis=1))
     residual += noise * rng.normal(size=residual.shape)
+    # The fit has left this spot out, and rightly.
+    residual[0] += 1e3
     sense = np.sign(np.diff([m.pan_steps for m in moves]))[np.array(rows) - 1]
     predicted = np.array([moves[r].pan_steps for r in rows]) * 0.06 - 0.15 * sense
     angles = np.radians(np.stack([predicted, np.zeros(len(rows))], axis=1))
@@ -343,13 +352,13 @@ def stops_of(offsets_deg: np.ndarray, looks: int = 2, noise: float = 0.0) -> Sim
 
 
 def test_stops_are_read_as_they_were():
-    offsets = np.random.default_rng(4).normal(0.0, 0.1, 25)
+    offsets = np.random.default_rng(4).normal(0.0, 0.1, STOPS)
     fit = stops_of(offsets)
     found = stop_readings(fit, "pan")
-    # Every stop but the last, whose step of 2 is shorter than the play; the other axis' errors leave no trace.
-    assert found.play_left_out == 1
-    assert len(found.steps) == 24
-    expected = found.steps * 0.06 - 0.15 * found.side + offsets[:24]
+    # All but 102 and 104, where the play may not be taken up; the other axis' errors leave no trace.
+    assert found.play_left_out == 2
+    assert found.steps.tolist() == [*(4 * [0, 100, 200, 300, 200, 100]), 106]
+    expected = found.steps * 0.06 - 0.15 * found.side + offsets[[*range(24), 26]]
     np.testing.assert_allclose(found.mirror_deg, expected, atol=1e-9)
     np.testing.assert_array_equal(found.side, np.sign(np.diff([-100, *found.steps])))
 
@@ -357,19 +366,19 @@ def test_stops_are_read_as_they_were():
 def test_reading_uncertainty_is_what_noise_does():
     errors, stated = [], []
     for seed in range(40):
-        fit = stops_of(np.zeros(25), noise=1.0)
+        fit = stops_of(np.zeros(STOPS), noise=1.0)
         rng = np.random.default_rng(seed)
         fit.linearised.residual = rng.normal(size=fit.linearised.residual.shape)
         found = stop_readings(fit, "pan")
         errors.append((found.mirror_deg - found.steps * 0.06 + 0.15 * found.side) / found.u_deg)
         stated.append(found.u_deg)
     z = np.concatenate(errors)
-    # 960 standard normal numbers: 1e-4 bounds of their rms.
+    # 1000 standard normal numbers: 1e-4 bounds of their rms.
     assert np.sqrt(np.mean(z**2)) == pytest.approx(1.0, abs=4 / np.sqrt(2 * z.size))
 
 
 def test_plug_in_figures_are_those_of_the_stops():
-    offsets = np.random.default_rng(6).normal(0.0, 0.05, 25)
+    offsets = np.random.default_rng(6).normal(0.0, 0.05, STOPS)
     fit = stops_of(offsets)
     table = positioning(known_calibration(**{"backlash_deg.pan": 0.3}), "pan", readings=stop_readings(fit, "pan"))
     assert table.missing is None
@@ -387,7 +396,7 @@ def test_plug_in_figures_are_those_of_the_stops():
 
 
 def test_too_few_stops_give_a_reason_and_no_table():
-    fit = stops_of(np.zeros(25))
+    fit = stops_of(np.zeros(STOPS))
     kept = tuple(s for s in fit.campaign.spots if s.move <= 6)
     fit.campaign = replace(fit.campaign, spots=kept)
     table = positioning(known_calibration(), "pan", readings=stop_readings(fit, "pan"), tests=5)

@@ -92,6 +92,7 @@ BROKEN = [
     ("effective_deg_per_step/forward", None),
     ("effective_contrast_deg_per_step/pan", 0.1),
     ("effective_jacobian", [[1.0, 0.0]]),
+    ("effective_jacobian", [[1.0], [0.0, 1.0]]),
     ("reference_pose_deg/pan", True),
     ("parameters/backlash_deg.pan", ...),
     ("parameters/backlash_deg.pan", None),
