@@ -6,7 +6,7 @@ import copy
 import importlib.util
 import json
 import math
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import pytest
@@ -59,6 +59,30 @@ def test_a_new_document_obeys_the_schema(tmp_path):
     document = json.loads((tmp_path / "fit.json").read_text())
     assert problems(document, schema_of(document)) == []
     assert read_fit(tmp_path / "fit.json") == document
+
+
+def test_what_reports_show_besides_obeys_the_schema():
+    """Keys that came within version 1, as the records behind them are written; older documents lack them."""
+    from tvsbayes.comparison import Gap, GapTerm
+    from tvsbayes.information import Cause, CauseGroup, StopResidual
+
+    term = GapTerm("backlash over N", -0.002, 1e-4, (-0.0022, -0.0018))
+    stop = StopResidual("pan", (3, 4), -100, "", 0, (175.0, 276.5), (-0.3, 0.3), 61.5, -0.01, 0.04)
+    cause = Cause("depth", "tilt", (CauseGroup("175 to 276 mm", 12, 0.1, 0.3),), None, False)
+    gap = {"left": asdict(Gap(0.059, term, term, (term,))), "right": None}
+    document = kept("fit-1-laplace.json")
+    schema = schema_of(document)
+    added = {"residuals": [asdict(stop)], "residual_causes": [asdict(cause)], "gap": gap}
+    written = json.loads(json.dumps({**document, **added}))
+    assert problems(written, schema) == []
+    assert problems({**written, "gap": None}, schema) == []
+    for path, value in (
+        ("gap/left/terms/0/sd", -1.0),
+        ("gap/forward", None),
+        ("residuals/0/axis", "z"),
+        ("residual_causes/0/p", 2.0),
+    ):
+        assert problems(changed(written, path, value), schema), path
 
 
 def changed(document: dict, path: str, value: object) -> dict:
