@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from schema_walk import problems
 
 from tvsbayes.campaign import Campaign, PlanStep, read_campaign, write_campaign, write_plan
 from tvsbayes.cli import run
@@ -266,6 +267,7 @@ def test_fit_document_has_the_contracts_keys_and_its_files(ask, folder):
     }
     saved = json.loads((folder / "results" / "fit.json").read_text(), parse_constant=no_constant)
     assert saved["format"] == "tvsbayes-fit/1"
+    assert problems(saved, json.loads((DATA / "schemas" / "fit-1.schema.json").read_text())) == []
     assert {**{key: saved[key] for key in document if key != "files"}, "files": document["files"]} == document
     with np.load(folder / "results" / "draws.npz", allow_pickle=False) as draws:
         assert draws["effective_deg_per_step"].shape == (len(draws["physical"]), 4)

@@ -15,7 +15,7 @@ LEVELS: tuple[tuple[str, ...], ...] = (
     ("rigs", "boards"),
     ("campaign", "interchange"),
     ("calibration",),
-    ("model", "classic", "simulation"),
+    ("model", "classic", "simulation", "certificate"),
     ("protocols",),
     ("likelihood", "solver"),
     ("cameras",),
@@ -31,7 +31,7 @@ LEVELS: tuple[tuple[str, ...], ...] = (
 """From bottom to top: a module imports only modules of lower levels."""
 WITHOUT_JAX = (
     *("files", "rigs", "campaign", "calibration", "classic", "simulation", "protocols"),
-    *("boards", "interchange", "report"),
+    *("boards", "interchange", "certificate", "report"),
 )
 MODEL = {
     *("model", "likelihood", "solver", "joint"),

@@ -20,7 +20,7 @@ from tvsbayes.campaign import Move
 from tvsbayes.classic import DIRECTIONS, four_point_ratios, select_experiments
 from tvsbayes.joint import Derived, JointFit
 from tvsbayes.likelihood import ordered_spots, standard_deviations_without
-from tvsbayes.model import INDEX, NAMES, RECEIVER_NAMES, RIG_NAMES
+from tvsbayes.model import INDEX, KINDS, NAMES, RECEIVER_NAMES, RIG_NAMES
 from tvsbayes.posterior import Posterior, ideal_pixels
 from tvsbayes.protocols import observed_stops, separation
 from tvsbayes.rigs import HARMONIC_PRIORS
@@ -787,3 +787,97 @@ def _binned(values: Sequence[float | str], unit: str) -> list[tuple[str, np.ndar
         if len(rows):
             bins.append((f"{array[rows].min():.4g} to {array[rows].max():.4g}{unit}", rows))
     return bins
+
+
+@dataclass(frozen=True)
+class HeadlineCauses:
+    """What the uncertainty of each headline consists of: rows of a GUM budget.
+
+    Attributes:
+        quantities: contract names: `effective_deg_per_step.left` ... of directions that moved, `backlash_deg.pan|tilt`.
+        names: causes: pixel noise, stop errors, the stereo calibration, and every prior by its parameter's name.
+        contribution: shape (quantities, causes), deg/step or deg. Of a prior: what one u of its centre does, signed;
+            of the others: the root of their part of the variance.
+        u: of the priors in the unit of the parameter (of a log-normal: of the logarithm), shape (causes,); NaN for the
+            others, which are no single quantity.
+        centre: mean of the prior (of a log-normal: of the logarithm), shape (causes,); NaN likewise.
+        distribution: of each cause.
+        dof: degrees of freedom behind u, shape (quantities, causes); infinite for what was stated (GUM G.4.3).
+    """
+
+    quantities: tuple[str, ...]
+    names: tuple[str, ...]
+    contribution: np.ndarray
+    u: np.ndarray
+    centre: np.ndarray
+    distribution: tuple[str, ...]
+    dof: np.ndarray
+
+
+def headline_causes(fit: JointFit) -> HeadlineCauses:
+    """Split the variance of ratios and backlashes by cause, as `causes_of` does for the inputs of a coordinate.
+
+    Linear part of each headline in the coordinates; expected information, noise scales taken as known. How well the
+    noise scales are known gives the degrees of freedom: nu = 1/(2 var(ln s)) (GUM G.4.2, eq. G.3).
+    """
+    moved = _moved_directions(fit)
+    columns = {
+        f"effective_deg_per_step.{d}": fit.draws.effective_deg_per_step[:, k]
+        for k, d in enumerate(DIRECTIONS)
+        if d in moved
+    }
+    for axis, pair in (("pan", DIRECTIONS[:2]), ("tilt", DIRECTIONS[2:])):
+        if moved & set(pair):
+            columns[f"backlash_deg.{axis}"] = fit.draws.physical[:, INDEX[f"backlash_deg.{axis}"]]
+    gradient = gradients(fit, np.stack(list(columns.values()), axis=1))
+    spread = gradient @ np.linalg.inv(fit.information.fisher + np.eye(len(NAMES)))
+    gain = np.concatenate([group.jacobian for group in fit.information.groups])
+    noise = gain.T @ gain
+
+    def root(part: np.ndarray) -> np.ndarray:
+        return np.sqrt(np.maximum(np.einsum("qi,ij,qj->q", spread, part, spread), 0.0))
+
+    def freedom(names: list[str]) -> float:
+        logs = [np.log(fit.draws.physical[:, INDEX[name]]) for name in names]
+        spreads = [float(np.var(x)) for x in logs if np.ptp(x) > 1e-9]
+        return min((0.5 / s for s in spreads), default=np.inf)
+
+    # The two directions of the axis that a quantity belongs to.
+    axes = {name: DIRECTIONS[:2] for name in ("pan", *DIRECTIONS[:2])}
+    axes |= {name: DIRECTIONS[2:] for name in ("tilt", *DIRECTIONS[2:])}
+    stops = [freedom([f"stop_sd_deg.{d}" for d in axes[q.split(".")[1]] if d in moved]) for q in columns]
+    readings = bool(np.any(np.asarray(fit.arrays.spots.has_aperture) * np.asarray(fit.arrays.spots.valid)))
+    pixels = "pixel and aperture noise" if readings else "pixel noise"
+    every = np.ones(len(columns))
+    cameras = np.linalg.norm(spread[:, len(RIG_NAMES) :], axis=1)
+    shaken = root(fit.information.fisher - noise)
+    # Name, contribution, u, centre, distribution, degrees of freedom.
+    rows = [
+        (pixels, root(noise), np.nan, np.nan, "normal", freedom(["pixel_scale"]) * every),
+        ("stop errors of the campaign", shaken, np.nan, np.nan, "normal", np.array(stops)),
+        ("stereo calibration", cameras, np.nan, np.nan, "normal", np.inf * every),
+    ]
+    space = fit.space
+    for name, value, u, kind in zip(
+        RIG_NAMES, *(np.asarray(x) for x in (space.value, space.u, space.kind)), strict=True
+    ):
+        if u == 0 or not np.any(spread[:, INDEX[name]]):
+            continue
+        shape, centre, width = KINDS[int(kind)], float(value), float(u)
+        if shape == "log-normal":
+            centre = float(np.log(centre))
+        elif shape == "half-normal":
+            # Mean and standard deviation of |x|, x ~ N(0, u^2).
+            centre, width = width * float(np.sqrt(2 / np.pi)), width * float(np.sqrt(1 - 2 / np.pi))
+        rows.append((name, spread[:, INDEX[name]], width, centre, shape, np.inf * every))
+    kept = [row for row in rows if np.any(row[1] != 0)]
+    names, contribution, widths, centres, shapes, dof = zip(*kept, strict=True)
+    return HeadlineCauses(
+        quantities=tuple(columns),
+        names=names,
+        contribution=np.stack(contribution, axis=1),
+        u=np.array(widths, dtype=float),
+        centre=np.array(centres, dtype=float),
+        distribution=shapes,
+        dof=np.stack(dof, axis=1),
+    )
