@@ -22,7 +22,6 @@ from tvsbayes.campaign import Campaign, input_hashes
 from tvsbayes.certificate import (
     COUNTRY_NOT_STATED,
     NOT_ACCREDITED,
-    AxisPositioning,
     check_dcc,
     dcc_bytes,
     positioning,
@@ -182,10 +181,10 @@ def texts(root: ET.Element, path: str) -> list[str]:
     return [e.text for e in root.findall(path, {"dcc": "https://ptb.de/dcc", "si": "https://ptb.de/si"})]
 
 
-def predicted_tables() -> dict[str, AxisPositioning]:
-    return {
-        "pan": positioning(known_calibration(**{"backlash_deg.pan": 0.3, "stop_sd_deg.left": 0.1}), "pan", tests=200)
-    }
+def predicted_tables() -> dict[str, object]:
+    """The key of `fit.json` that holds ISO 230-2-style tables."""
+    known = known_calibration(**{"backlash_deg.pan": 0.3, "stop_sd_deg.left": 0.1})
+    return {"positioning": [positioning(known, "pan", tests=200).as_json()]}
 
 
 def test_the_structure_is_the_schemas():
@@ -193,9 +192,7 @@ def test_the_structure_is_the_schemas():
         campaign, document = campaign_and_fit(**header)
         kept = {key: value for key, value in campaign.header.items() if value is not None}
         campaign = replace(campaign, header=kept)
-        data = dcc_bytes(
-            campaign, document, issued=ISSUED, positioning_by_axis=predicted_tables(), report=b"<html></html>"
-        )
+        data = dcc_bytes(campaign, document | predicted_tables(), issued=ISSUED, report=b"<html></html>")
         root = ET.fromstring(data)
         assert structure_problems(root) == []
         assert root.get("schemaVersion") == "3.3.0"
@@ -493,6 +490,6 @@ def test_a_schema_that_the_user_names_is_used(tmp_path, monkeypatch):
 @pytest.mark.skipif("TVSBAYES_DCC_SCHEMA" not in os.environ, reason="TVSBAYES_DCC_SCHEMA names no dcc.xsd")
 def test_ptbs_schema_where_it_is_at_hand():
     campaign, document = campaign_and_fit()
-    data = dcc_bytes(campaign, document, issued=ISSUED, positioning_by_axis=predicted_tables(), report=b"<html/>")
+    data = dcc_bytes(campaign, document | predicted_tables(), issued=ISSUED, report=b"<html/>")
     found = check_dcc(data, Path(os.environ["TVSBAYES_DCC_SCHEMA"]))
     assert found.valid is True, found

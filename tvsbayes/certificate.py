@@ -4,8 +4,8 @@ Beam angles in degrees, about the axis that turns (azimuth for pan, elevation fo
 name says so. Nothing is fitted here: fits, calibrations and `results/fit.json` come in, results and bytes go out.
 No JAX.
 
-The clause numbers of ISO 230-2:2006 are those that an independent implementation carries; neither edition's text was
-at hand (research/report.md section 3). GUM = JCGM 100:2008.
+Clause numbers 2.11 to 2.20 of ISO 230-2:2006 are those that an independent implementation carries; neither edition's
+text was at hand, and further definitions have no number here (research/report.md section 3). GUM = JCGM 100:2008.
 """
 
 from __future__ import annotations
@@ -64,21 +64,21 @@ NOT_COVERED = (
     "an error that all looks of the cameras share: it is in the predicted E, M and A through the ratio, and in no "
     "plug-in figure",
 )
-FIGURES: dict[str, tuple[str, str, str]] = {
-    "reversal_deg": ("B", "reversal error of the axis", "2.13"),
-    "mean_reversal_deg": ("mean B", "mean reversal error", "2.14"),
-    "repeatability_up_deg": ("R up", "unidirectional repeatability, up", "2.18"),
-    "repeatability_down_deg": ("R down", "unidirectional repeatability, down", "2.18"),
-    "repeatability_deg": ("R", "bidirectional repeatability", "2.19"),
-    "systematic_up_deg": ("E up", "unidirectional systematic deviation, up", "2.20"),
-    "systematic_down_deg": ("E down", "unidirectional systematic deviation, down", "2.20"),
-    "systematic_deg": ("E", "bidirectional systematic deviation", "2.21"),
-    "mean_systematic_deg": ("M", "mean bidirectional deviation", "2.22"),
-    "accuracy_up_deg": ("A up", "unidirectional accuracy, up", "2.23"),
-    "accuracy_down_deg": ("A down", "unidirectional accuracy, down", "2.23"),
-    "accuracy_deg": ("A", "bidirectional accuracy", "2.24"),
+FIGURES: dict[str, tuple[str, str]] = {
+    "reversal_deg": ("B", "reversal error of the axis"),
+    "mean_reversal_deg": ("mean B", "mean reversal error"),
+    "repeatability_up_deg": ("R up", "unidirectional repeatability, up"),
+    "repeatability_down_deg": ("R down", "unidirectional repeatability, down"),
+    "repeatability_deg": ("R", "bidirectional repeatability"),
+    "systematic_up_deg": ("E up", "unidirectional systematic deviation, up"),
+    "systematic_down_deg": ("E down", "unidirectional systematic deviation, down"),
+    "systematic_deg": ("E", "bidirectional systematic deviation"),
+    "mean_systematic_deg": ("M", "mean bidirectional deviation"),
+    "accuracy_up_deg": ("A up", "unidirectional accuracy, up"),
+    "accuracy_down_deg": ("A down", "unidirectional accuracy, down"),
+    "accuracy_deg": ("A", "bidirectional accuracy"),
 }
-"""Fields of `Positioning` that are one number per test: symbol, term, clause of ISO 230-2:2006."""
+"""Fields of `Positioning` that are one number per test: symbol and term of ISO 230-2."""
 
 
 @dataclass(frozen=True)
@@ -120,7 +120,7 @@ class Positioning:
 
 
 def iso230(up_deg: np.ndarray, down_deg: np.ndarray) -> Positioning:
-    """ISO 230-2 figures from positioning deviations x_ij = actual - target (2.5).
+    """ISO 230-2 figures from positioning deviations x_ij = actual - target.
 
     A common offset of all deviations changes no figure. "Up" is the approach from below (left, up).
 
@@ -140,7 +140,7 @@ def iso230(up_deg: np.ndarray, down_deg: np.ndarray) -> Positioning:
     for side in (up, down):
         if np.any(np.isinf(side)) or np.any(np.isfinite(side).sum(axis=-1) < RUNS_MIN):
             raise ValueError(f"every target needs at least {RUNS_MIN} finite runs from either side")
-    # 2.10 mean unidirectional deviation at a position, 2.15 its estimated standard uncertainty s.
+    # Mean unidirectional deviation at a position; 2.15 its estimated standard uncertainty s.
     mean_up, mean_down = np.nanmean(up, axis=-1), np.nanmean(down, axis=-1)
     sd_up, sd_down = np.nanstd(up, axis=-1, ddof=1), np.nanstd(down, axis=-1, ddof=1)
     # 2.11 mean bidirectional deviation, 2.12 reversal at a position.
@@ -535,7 +535,7 @@ def positioning(
         )
     else:
         notes.append(f"no prediction: the {axis} axis was never moved over a range")
-    notes.append("clauses of ISO 230-2:2006 as secondary sources give them")
+    notes.append("definitions of ISO 230-2 as secondary sources give them")
     return AxisPositioning(
         axis=axis,
         deg_per_step=ratio,
@@ -1127,7 +1127,6 @@ def dcc_bytes(
     laboratory: str = NOT_STATED,
     customer: str = NOT_STATED,
     country: str = COUNTRY_NOT_STATED,
-    positioning_by_axis: Mapping[str, AxisPositioning] | None = None,
     report: bytes | None = None,
 ) -> bytes:
     """DCC-schema XML of a fit: unsigned, not accredited, traceable only as far as the campaign declares.
@@ -1140,7 +1139,6 @@ def dcc_bytes(
         laboratory: name of who measured.
         customer: name of for whom.
         country: ISO 3166-1 code of the place, two capital letters.
-        positioning_by_axis: ISO 230-2-style tables to add, by axis.
         report: the HTML report to embed.
 
     Returns:
@@ -1202,8 +1200,8 @@ def dcc_bytes(
         moved = any(document["effective_deg_per_step"][d] is not None for d in SIDES[axis])
         entry = document["parameters"][f"backlash_deg.{axis}"] if moved else None
         _quantity(data, f"backlash of the {axis} axis", entry, "deg", estimator)
-    for axis, table in (positioning_by_axis or {}).items():
-        _positioning_result(results, axis, table)
+    for table in document.get("positioning", ()):
+        _positioning_result(results, table)
     if report is not None:
         embedded = _add(root, "dcc:document")
         _add(embedded, "dcc:fileName", "report.html")
@@ -1222,18 +1220,18 @@ def _result(results: ET.Element, name: str, *texts: str) -> ET.Element:
     return _add(result, "dcc:data")
 
 
-def _positioning_result(results: ET.Element, axis: str, table: AxisPositioning) -> None:
-    if table.predicted is None:
+def _positioning_result(results: ET.Element, table: Mapping[str, object]) -> None:
+    if table["predicted"] is None:
         return
-    notes = "; ".join(table.notes)
-    data = _result(results, f"ISO 230-2-style figures of the {axis} axis, posterior predictive", notes)
-    for name, (symbol, term, _) in FIGURES.items():
-        found = table.predicted[name]
+    notes = "; ".join(table["notes"])
+    data = _result(results, f"ISO 230-2-style figures of the {table['axis']} axis, posterior predictive", notes)
+    for name, (symbol, term) in FIGURES.items():
+        found = table["predicted"][name]
         quantity = _add(data, "dcc:quantity", refType="basic_measuredValue")
         _words(quantity, "dcc:name", f"{symbol}, {term}")
-        low, high = found.interval95
+        low, high = found["interval95"]
         # Medians and intervals of a simulation: the half width over 1.96 stands for u.
-        _real(quantity, UNIT_SI["deg"], found.median, (high - low) / (2 * NORMAL_95), (low, high), "simulated tests")
+        _real(quantity, UNIT_SI["deg"], found["median"], (high - low) / (2 * NORMAL_95), (low, high), "simulated tests")
 
 
 @dataclass(frozen=True)

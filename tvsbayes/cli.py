@@ -6,6 +6,7 @@ Heavy modules are imported inside the commands that need them; `tvsbayes --help`
 
 from __future__ import annotations
 
+import datetime
 import json
 import math
 import os
@@ -381,23 +382,36 @@ def fit(
     calibration = calibration_of(result, posterior, seed=seed) if result.converged else None
     draws = posterior.thinned(DRAWS_KEPT) if summary.estimator == "posterior" else None
     usable = posterior if summary.estimator == "posterior" else None
-    files = {**write_results(result, summary, folder, seed, calibration, draws, _evidence(result, usable)), **more}
+    files = {
+        **write_results(result, summary, folder, seed, calibration, draws, _evidence(result, summary, usable)),
+        **more,
+    }
     document = {**summary.as_json(), "seed": seed, "files": files}
     _finish(document, f"{fit_text(summary)}\nwritten: {', '.join(files.values())}", as_json, _unusable(summary))
 
 
-def _evidence(fit: JointFit, posterior: Posterior | None) -> dict[str, object]:
+def _evidence(fit: JointFit, summary: FitSummary, posterior: Posterior | None) -> dict[str, object]:
     """What `fit.json` holds for reports besides the estimates."""
+    from tvsbayes.certificate import headline_budget, positioning, stop_readings
     from tvsbayes.comparison import explain_gap
-    from tvsbayes.information import residual_causes, stop_residuals
+    from tvsbayes.information import calibration_of, headline_causes, residual_causes, stop_residuals
 
     stops = stop_residuals(fit)
     listed = stops[:: -(-len(stops) // RESIDUALS_LISTED) or 1]
-    gaps = explain_gap(fit, posterior) if fit.converged else {}
+    gaps, budgets, axes = {}, [], []
+    if fit.converged:
+        gaps = explain_gap(fit, posterior)
+        causes, calibration = headline_causes(fit), calibration_of(fit, posterior)
+        told = {**{f"effective_deg_per_step.{d}": e for d, e in summary.effective.items()}, **summary.parameters}
+        budgets = [headline_budget(causes, name, told[name]).as_json() for name in causes.quantities]
+        readings = {axis: stop_readings(fit, axis) for axis in ("pan", "tilt")}
+        axes = [positioning(calibration, axis, readings=own).as_json() for axis, own in readings.items()]
     return {
         "residuals": [asdict(stop) for stop in listed],
         "residual_causes": [asdict(cause) for cause in residual_causes(stops)],
         "gap": {d: None if gap is None else asdict(gap) for d, gap in gaps.items()} if any(gaps.values()) else None,
+        "budgets": budgets,
+        "positioning": axes,
     }
 
 
@@ -442,6 +456,10 @@ def report(
     limit_mm: Annotated[float | None, typer.Option("--limit-mm", min=0, help="Largest 3D error allowed.")] = None,
     range_mm: Annotated[float, typer.Option("--range-mm", min=1, help="Range at which millimetres are stated.")] = 1e3,
     pdf: Annotated[bool, typer.Option("--pdf", help="Also print to PDF with an installed Chromium.")] = False,
+    dcc: Annotated[bool, typer.Option("--dcc", help="Also write DCC-schema XML (unsigned, not accredited).")] = False,
+    laboratory: Annotated[str, typer.Option("--laboratory", help="Who measured, for --dcc.")] = "not stated",
+    customer: Annotated[str, typer.Option("--customer", help="For whom, for --dcc.")] = "not stated",
+    country: Annotated[str, typer.Option("--country", help="ISO 3166-1 code of the place, for --dcc.")] = "ZZ",
     out: Annotated[Path | None, typer.Option("--out", help="File (default CAMPAIGN/results/report.html).")] = None,
     as_json: Json = False,
 ) -> None:
@@ -451,6 +469,7 @@ def report(
 
     data = read_campaign(campaign)
     document = _fit_document(data, campaign)
+    from tvsbayes.certificate import dcc_bytes
     from tvsbayes.model import use_compilation_cache
     from tvsbayes.pages import gather, print_to_pdf, report_html
 
@@ -462,6 +481,12 @@ def report(
     files = {"report": str(path)}
     if pdf:
         files["pdf"] = str(print_to_pdf(path))
+    if dcc:
+        certificate = campaign / "results" / "dcc.xml"
+        places = {"laboratory": laboratory, "customer": customer, "country": country}
+        today = datetime.datetime.now(datetime.UTC).date()
+        write_atomically(certificate, dcc_bytes(data, document, issued=today, report=path.read_bytes(), **places))
+        files["dcc"] = str(certificate)
     lines = [
         f"{c.quantity} within {c.limit:g} {c.unit}: {c.verdict} (P = {c.probability:.3f})" for c in evidence.criteria
     ]
@@ -478,7 +503,7 @@ def _fit_document(data: Campaign, folder: Path) -> dict[str, Any]:
     path = folder / "results" / "fit.json"
     if stored_calibration(data) is not None and path.exists():
         document = parse_json(read_bytes(path, JSON_BYTES_MAX), path.name).values
-        if "residuals" in document:
+        if "budgets" in document:
             return document
     report_line("results/ are missing or older than the campaign: fitting first (Laplace approximation) ...")
     result = _converged_fit(data)
@@ -486,7 +511,9 @@ def _fit_document(data: Campaign, folder: Path) -> dict[str, Any]:
     from tvsbayes.report import write_results
 
     summary = summarise(result)
-    write_results(result, summary, folder / "results", 0, calibration_of(result), None, _evidence(result, None))
+    write_results(
+        result, summary, folder / "results", 0, calibration_of(result), None, _evidence(result, summary, None)
+    )
     return parse_json(read_bytes(path, JSON_BYTES_MAX), path.name).values
 
 

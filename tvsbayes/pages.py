@@ -29,6 +29,7 @@ from matplotlib import rc_context
 
 from tvsbayes import plots
 from tvsbayes.calibration import stored_ratios
+from tvsbayes.certificate import FIGURES
 from tvsbayes.classic import DIRECTIONS, ClassicResult, classic
 from tvsbayes.comparison import budget, criterion, distances, error_map, simple_calibration
 from tvsbayes.coordinates import Settings
@@ -48,7 +49,6 @@ if TYPE_CHECKING:
 
     from tvsbayes.calibration import Calibration
     from tvsbayes.campaign import Campaign
-    from tvsbayes.certificate import AxisPositioning, BudgetTable
     from tvsbayes.comparison import Budget, Criterion, ErrorMap
 
 CORRELATED = (
@@ -122,8 +122,6 @@ class Evidence:
         range_mm: stated range.
         maps: error maps.
         budget: of a point at that range.
-        headline_budgets: GUM tables of the effective ratios.
-        axes: ISO 230-2-style figures.
         calibration: what coordinates were computed from.
         plan: sentences on what to measure next.
     """
@@ -137,8 +135,6 @@ class Evidence:
     range_mm: float
     maps: ErrorMap
     budget: Budget | None
-    headline_budgets: Sequence[BudgetTable] = ()
-    axes: Sequence[AxisPositioning] = ()
     calibration: Calibration | None = None
     plan: Sequence[str] = ()
 
@@ -786,25 +782,24 @@ def _cell(value: float) -> str:
 
 def _budgets(e: Evidence) -> Section:
     tables, figures = [], []
-    for table in e.headline_budgets:
+    for table in e.fit["budgets"]:
         rows = [
             [
-                row.quantity,
-                row.kind,
-                row.distribution,
-                _blank(row.u, ".2g"),
-                "infinite" if row.dof is not None and not np.isfinite(row.dof) else _blank(row.dof, ".0f"),
-                _blank(row.sensitivity, ".3g"),
-                _blank(row.contribution, ".2e"),
-                f"{100 * row.share:.1f}",
+                row["quantity"],
+                row["kind"],
+                row["distribution"],
+                _blank(row["u"], ".2g"),
+                _freedom(row["dof"]) if row["u"] is not None else "",
+                _blank(row["sensitivity"], ".3g"),
+                _blank(row["contribution"], ".2e"),
+                f"{100 * row['share']:.1f}",
             ]
-            for row in table.rows
+            for row in table["rows"]
         ]
-        dof = "infinite" if not np.isfinite(table.dof) else f"{table.dof:.0f}"
         caption = (
-            f"Budget of {table.quantity}: {concise(table.estimate, table.u)} {table.unit}; effective "
-            f"degrees of freedom {dof}, k = {table.coverage_factor:.2f}, p = {100 * table.probability:.0f} "
-            f"%, U = {table.expanded:.2g} {table.unit}"
+            f"{table['quantity']}: {concise(table['estimate'], table['u'])} {table['unit']}; effective degrees of "
+            f"freedom {_freedom(table['dof'])}, k = {table['coverage_factor']:.2f}, "
+            f"p = {100 * table['probability']:.0f} %, U = {table['expanded']:.2g} {table['unit']}"
         )
         columns = ["source", "type", "distribution", "u", "dof", "sensitivity", "contribution", "share %"]
         tables.append(TableView(caption, columns, rows))
@@ -837,23 +832,32 @@ def _blank(value: float | None, form: str) -> str:
     return "" if value is None else format(value, form)
 
 
+def _freedom(dof: float | None) -> str:
+    return "infinite" if dof is None else f"{dof:.0f}"
+
+
 def _axes(e: Evidence) -> Section:
     tables, items = [], []
-    for axis in e.axes:
-        if axis.predicted is not None:
-            rows = [
-                [name, f"{p.median:.4f}", f"[{p.interval95[0]:.4f}, {p.interval95[1]:.4f}]"]
-                for name, p in axis.predicted.items()
+    for axis in e.fit["positioning"]:
+        rows = [
+            [
+                " ".join(reversed(FIGURES[name])),
+                f"{p['median']:.4f}",
+                f"[{p['interval95'][0]:.4f}, {p['interval95'][1]:.4f}]",
+                "" if axis["plug_in"] is None else _blank(axis["plug_in"].get(name), ".4f"),
             ]
+            for name, p in (axis["predicted"] or {}).items()
+        ]
+        if rows:
             caption = (
-                f"{axis.axis} axis: ISO 230-2-style figures as the posterior predicts them for "
-                f"{axis.runs} runs per side at {len(axis.target_steps)} targets, deg"
+                f"{axis['axis']} axis, deg: predicted for {axis['runs']} runs per side at {len(axis['target_steps'])} "
+                "targets, and as the campaign's own stops have it"
             )
-            tables.append(TableView(caption, ["figure", "median", "95 % interval"], rows))
-        if axis.missing:
-            items.append(f"{axis.axis}: {axis.missing}")
-        items += [note for note in axis.notes if note not in items]
-    text = [] if tables or items else ["Not computed."]
+            tables.append(TableView(caption, ["figure", "median", "95 % interval", "own stops"], rows))
+        if axis["missing"]:
+            items.append(f"{axis['axis']}, own stops: {axis['missing']}")
+        items += [note for note in axis["notes"] if note not in items]
+    text = [] if tables or items else ["Not computed: the fit has not converged."]
     return Section("ISO 230-2-style figures", text, items, tables)
 
 
