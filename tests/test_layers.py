@@ -16,7 +16,7 @@ LEVELS: tuple[tuple[str, ...], ...] = (
     ("campaign",),
     ("calibration",),
     ("model", "classic", "simulation"),
-    ("protocols",),
+    ("protocols", "spots"),
     ("likelihood", "solver"),
     ("stops",),
     ("joint",),
@@ -31,15 +31,15 @@ LEVELS: tuple[tuple[str, ...], ...] = (
 """From bottom to top: a module imports only modules of lower levels."""
 WITHOUT_JAX = (
     *("files", "rigs", "campaign", "calibration", "classic", "simulation", "protocols"),
-    "report",
+    *("spots", "report"),
 )
 MODEL = {
     *("model", "likelihood", "stops", "solver", "joint"),
     *("ensemble", "posterior"),
-    *("information", "classic", "calibration", "propagation", "coordinates", "accuracy"),
+    *("spots", "information", "classic", "calibration", "propagation", "coordinates", "accuracy"),
 }
 JAX_FAMILY = {"jax", "jaxlib", "equinox", "optimistix", "lineax", "jaxtyping"}
-MODULES_MAX = 20
+MODULES_MAX = 21
 
 
 def imported(tree: ast.AST, package: str = "tvsbayes") -> set[str]:

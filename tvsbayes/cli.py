@@ -213,6 +213,36 @@ def simulate(
 
 
 @app.command()
+def detect(
+    campaign: CampaignFolder,
+    method: Annotated[str, typer.Option("--method", help="fit, or contour: the paper's.")] = "fit",
+    speckle_contrast: Annotated[
+        float | None,
+        typer.Option("--speckle-contrast", min=0.0, max=2.0, help="Per pixel (default: learned; contour: 0.4)."),
+    ] = None,
+    overlay: Annotated[bool, typer.Option("--overlay", help="Pictures of every spot in results/overlay.")] = False,
+    as_json: Json = False,
+) -> None:
+    """Find the laser spots in frames/ and write their centres and uncertainties into spots.csv."""
+    _finite(speckle_contrast=speckle_contrast)
+    from tvsbayes.campaign import read_campaign, spots_bytes
+    from tvsbayes.report import detection_text
+    from tvsbayes.spots import detect as find
+
+    pictures = campaign / "results" / "overlay" if overlay else None
+    data = read_campaign(campaign)
+    with _counting("detecting") as show:
+        found = find(data, method, speckle_contrast=speckle_contrast, overlay=pictures, done=show)
+    write_atomically(campaign / "spots.csv", spots_bytes(found.campaign.spots))
+    document = {"campaign": str(campaign), **found.as_json()}
+    text = detection_text(found) + f"\nwritten: {escaped(str(campaign / 'spots.csv'), 200)}"
+    if overlay:
+        document["overlay"] = str(pictures)
+        text += f", {escaped(str(pictures), 200)}"
+    _finish(document, text, as_json)
+
+
+@app.command()
 def check(
     path: Annotated[Path, typer.Argument(metavar="PATH", help="Campaign folder, rig file or plan.")],
     as_json: Json = False,

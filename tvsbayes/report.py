@@ -23,12 +23,14 @@ from tvsbayes.calibration import Calibration, Steps, calibration_bytes
 from tvsbayes.campaign import input_hashes
 from tvsbayes.classic import DIRECTIONS, ClassicResult
 from tvsbayes.files import make_folder, write_atomically
+from tvsbayes.spots import REASONS
 
 if TYPE_CHECKING:
     from tvsbayes.accuracy import Budget
     from tvsbayes.coordinates import Locations
     from tvsbayes.information import Estimate, FitSummary
     from tvsbayes.joint import Derived, JointFit
+    from tvsbayes.spots import Detection
 
 FIT_FORMAT = "tvsbayes-fit/1"
 KEY_PARAMETERS = (
@@ -97,6 +99,23 @@ def classic_text(result: ClassicResult) -> str:
         rows.append([direction, str(r.n), f"{r.mean_deg_per_step:.6f}", sd, u, gum])
     columns = ["direction", "n", "mean deg/step", "sd", "u type A", "95 % interval (GUM)"]
     return text_table("classic four-point estimator", columns, rows)
+
+
+def detection_text(found: Detection) -> str:
+    """What `detect` found, as a table of statuses."""
+    rows = [[status, str(count), REASONS.get(status.split(" ")[0], "")] for status, count in found.statuses.items()]
+    rows += [["undetected", str(found.missing), "no frames"]] if found.missing else []
+    rows += [["as it was", str(found.kept), "refused by somebody else"]] if found.kept else []
+    noise = ", ".join(
+        f"{side} contrast {one.speckle_contrast:.2f}, gain {one.gain_dn:.3f} DN" for side, one in found.noise.items()
+    )
+    sd = (
+        ""
+        if found.median_sd_px is None
+        else f"median standard uncertainty of a coordinate {found.median_sd_px:.3f} px; "
+    )
+    title = f"{found.processed} looks"
+    return f"{text_table(title, ['status', 'looks', 'meaning'], rows)}\nmethod {found.method}; {sd}noise: {noise}"
 
 
 def estimate_row(label: str, estimate: Estimate | None, unit: str) -> list[str]:
