@@ -361,27 +361,30 @@ def _skew(fitted: _Fitted, patch: _Patch) -> np.ndarray:
 
 
 def learn_noise(skews: np.ndarray, speckle_contrast: float | None = None) -> SpotNoise:
-    """Gain and contrast of one camera: posterior means of gain and contrast^2 on a grid.
+    """Gain and contrast of one camera: posterior means of contrast and log gain on a grid.
+
+    Means of their squares would state too much where there is no speckle: the contrast's posterior begins at 0.
 
     Args:
         skews: (n, 4) as `_skew` makes them, of any number of spots.
         speckle_contrast: taken as known where given.
     """
-    away = np.linspace(-3, 3, 41)
-    gains = GAIN_MEDIAN_DN * np.exp(away * GAIN_SD_OF_LOG)[:, None]
+    away = np.linspace(-3, 3, 41)[:, None]
+    gains = GAIN_MEDIAN_DN * np.exp(away * GAIN_SD_OF_LOG)
     # Equal steps of the root: fine near 0; each point weighs what lies around it.
     contrasts = np.linspace(0, 1, 121) ** 2 * CONTRAST_MAX
     widths = np.gradient(contrasts)
     if speckle_contrast is not None:
         contrasts, widths = np.array([speckle_contrast]), np.ones(1)
     squares = contrasts**2
-    logs = np.log(widths) - squares / CONTRAST_SCALE**2 / 2 - away[:, None] ** 2 / 2
+    logs = np.log(widths) - squares / CONTRAST_SCALE**2 / 2 - away**2 / 2
     for measured, background, per_gain, per_contrast in skews:
         variance = background + per_gain * gains + per_contrast * squares
         logs -= (np.log(variance) + measured / variance) / 2
     weights = np.exp(logs - logs.max())
     weights /= weights.sum()
-    return SpotNoise(float(weights.sum(axis=1) @ gains.ravel()), sqrt(float(weights.sum(axis=0) @ squares)))
+    gain_dn = GAIN_MEDIAN_DN * float(np.exp(GAIN_SD_OF_LOG * (weights.sum(axis=1) @ away.ravel())))
+    return SpotNoise(gain_dn, float(weights.sum(axis=0) @ contrasts))
 
 
 def _centre(patch: _Patch | str, noise: SpotNoise) -> Centre:
