@@ -208,6 +208,7 @@ REFUSED = {
     "too-large": lamp,
     "border": lambda: picture(Footprint(np.array([2.0, 100.0]), 4 * SMALL, 180.0)),
     "clipped": lambda: picture(Footprint(HERE, 2 * SMALL, 3000.0)),
+    "misshapen": lambda: picture(Footprint(HERE, SMALL, 150.0), Footprint(HERE + np.array([7.0, 2.0]), SMALL, 60.0)),
     "elongated": lambda: picture(Footprint(HERE, np.diag([15.0**2, 2.0**2]), 180.0)),
 }
 

@@ -47,6 +47,7 @@ REASONS = {
     "border": "the spot reaches the border of the picture",
     "clipped": "the clipped area is over half the bright area",
     "elongated": "the spot is over four times as long as wide",
+    "misshapen": "skewed far beyond noise: a reflection, dust or an edge in the spot",
     "unfitted": "the fit did not settle",
     "epipolar": "left and right are not images of one point",
 }
@@ -74,8 +75,14 @@ vision, section 4)."""
 CONTRAST_SCALE, CONTRAST_MAX = 0.5, 2.0
 """Prior of the learned contrast: half-normal of this scale, up to here. Speckle may be absent; fully developed it has
 1, and its grain in px multiplies that."""
-PILOTS_MAX = 48
+PILOTS_MAX = 24
+"""Looks from which the weights of the fits are learned; uncertainties are stated from all."""
 LEARNING_ROUNDS = 3
+SKEWS_MAX = 4000
+SKEW_OUTLIER = 30.0
+"""A squared skew residual this many times its expectation teaches nothing about noise (normal: one in 10^7)."""
+SKEW_LIMIT = 80.0
+"""Largest sum of a spot's four standardised squared skew residuals (normal: one in 10^15; speckle has longer tails)."""
 _SHRINK = 4
 _CELL = 8
 
@@ -117,6 +124,8 @@ class Centre:
         axes_px: sds of the spot's image along its long and short axis.
         clipped_share: clipped area over bright area.
         outline_px: (n, 2) outline of the bright area, for pictures; may be empty.
+        parts_px2: (3, 2, 2) covariance from the background's noise, per gain and per contrast^2 (`fit`).
+        skews: (4, 4) as `learn_noise` takes them (`fit`).
     """
 
     status: str
@@ -125,6 +134,20 @@ class Centre:
     axes_px: tuple[float, float] = (0.0, 0.0)
     clipped_share: float = 0.0
     outline_px: np.ndarray | None = None
+    parts_px2: np.ndarray | None = None
+    skews: np.ndarray | None = None
+
+    def under(self, noise: SpotNoise) -> Centre:
+        """The same centre with the covariance that this noise gives it; misshapen where its skew is no noise."""
+        if self.parts_px2 is None or self.skews is None:
+            return self
+        units = np.array([1.0, noise.gain_dn, noise.speckle_contrast**2])
+        covariance = np.einsum("k,kij->ij", units, self.parts_px2)
+        skewed = float(np.sum(self.skews[:, 0] / (self.skews[:, 1:] @ units))) > SKEW_LIMIT
+        status = self.status
+        if status in ("ok", "misshapen"):
+            status = "misshapen" if skewed else "ok"
+        return replace(self, covariance_px2=covariance, status=status)
 
 
 @dataclass(frozen=True)
@@ -325,21 +348,18 @@ def _through_demosaicing(filters: np.ndarray, shape: tuple[int, int]) -> np.ndar
     return np.einsum("kij,kij->k", pictures, np.array(smooth))
 
 
-def _covariance(fitted: _Fitted, patch: _Patch, noise: SpotNoise) -> np.ndarray:
-    """Covariance (2, 2) of the centre: what the noise does through the weighted estimate, px^2."""
+def _covariance_parts(fitted: _Fitted, patch: _Patch) -> np.ndarray:
+    """Covariance (3, 2, 2) of the centre from the background's noise, per gain and per contrast^2, px^2."""
     weighted = fitted.jacobian * fitted.weights
     gains = np.linalg.solve(weighted @ fitted.jacobian.T, weighted)[1:3]
     gains = np.vstack((gains, gains.sum(axis=0)))  # var(u + v) gives the covariance
-    signal = np.maximum(fitted.signal, 0)
-    total = np.zeros(3)
-    for part, size in (
-        (gains, patch.background_variance),
-        (gains * np.sqrt(signal), noise.gain_dn),
-        (gains * signal, noise.speckle_contrast**2),
-    ):
-        total += size * _through_demosaicing(part, patch.grey.shape)
-    mixed = (total[2] - total[0] - total[1]) / 2
-    return np.array([[total[0], mixed], [mixed, total[1]]])
+    signal = fitted.signal
+    parts = []
+    for filters, size in ((gains, patch.background_variance), (gains * np.sqrt(signal), 1.0), (gains * signal, 1.0)):
+        u, v, both = size * _through_demosaicing(filters, patch.grey.shape)
+        mixed = (both - u - v) / 2
+        parts.append([[u, mixed], [mixed, v]])
+    return np.array(parts)
 
 
 def _skew(fitted: _Fitted, patch: _Patch) -> np.ndarray:
@@ -377,6 +397,10 @@ def learn_noise(skews: np.ndarray, speckle_contrast: float | None = None) -> Spo
     if speckle_contrast is not None:
         contrasts, widths = np.array([speckle_contrast]), np.ones(1)
     squares = contrasts**2
+    # A reflection in one spot must not widen all others.
+    expected = skews[:, 1] + skews[:, 2] * GAIN_MEDIAN_DN + skews[:, 3] * np.median(squares)
+    ratio = skews[:, 0] / expected
+    skews = skews[ratio <= SKEW_OUTLIER * np.median(ratio) / 0.455]  # 0.455: median of a squared normal value
     logs = np.log(widths) - squares / CONTRAST_SCALE**2 / 2 - away**2 / 2
     for measured, background, per_gain, per_contrast in skews:
         variance = background + per_gain * gains + per_contrast * squares
@@ -409,8 +433,8 @@ def _centre(patch: _Patch | str, noise: SpotNoise) -> Centre:
         status = "elongated"
     elif np.abs(fitted.centre_px - patch.start_px).max() > 3 * patch.start_sd_px + 2 * _SHRINK:
         status = "unfitted"
-    covariance = _covariance(fitted, patch, noise)
-    return Centre(status, fitted.centre_px, covariance, **known)
+    parts, skews = _covariance_parts(fitted, patch), _skew(fitted, patch)
+    return Centre(status, fitted.centre_px, None, **known, parts_px2=parts, skews=skews).under(noise)
 
 
 def _at_border(centre: np.ndarray, reach: np.ndarray | float, size: tuple[int, int]) -> str | None:
@@ -668,8 +692,8 @@ def detect(
     Args:
         campaign: read from a folder.
         method: "fit" or "contour".
-        speckle_contrast: contrast per independent pixel, taken as known; by default `fit` learns it from up to
-            48 looks per camera and `contour` takes 0.4.
+        speckle_contrast: contrast per independent pixel, taken as known; by default `fit` learns it from the
+            looks of each camera and `contour` takes 0.4.
         workers: threads; default one per core.
         overlay: folder for one picture per look: outline of the bright area and centre.
         done: called with the number of looks finished and their total.
@@ -728,13 +752,23 @@ def detect(
             write_atomically(overlay / f"{spot.spot:06d}.png", png_bytes(np.hstack(pictures)))
         return found[0], found[1]
 
+    pairs = []
+    for pair in _parallel(look, present, workers):
+        pairs.append(pair)
+        if done is not None:
+            done(len(pairs), len(present))
+    if method == "fit":
+        for number, side in enumerate(SIDES):
+            skews = [pair[number].skews for pair in pairs if pair[number].status in ("ok", "misshapen")]
+            if skews:
+                table = np.vstack(skews)
+                noise[side] = learn_noise(table[:: -(-len(table) // SKEWS_MAX)], speckle_contrast)
     spots, processed = list(campaign.spots), []
-    for count, (row, (left, right)) in enumerate(zip(present, _parallel(look, present, workers), strict=True), start=1):
+    for row, found in zip(present, pairs, strict=True):
+        left, right = (one.under(noise[side]) for side, one in zip(SIDES, found, strict=True))
         spots[row] = _row(spots[row], left, right)
         if spots[row].status == "ok":
             processed.append((row, np.concatenate((left.centre_px, right.centre_px)), left, right))
-        if done is not None:
-            done(count, len(present))
     covariances = np.zeros((len(processed), 4, 4))
     for place, (_, _, left, right) in enumerate(processed):
         covariances[place, :2, :2], covariances[place, 2:, 2:] = left.covariance_px2, right.covariance_px2
