@@ -21,19 +21,16 @@ import numpy as np
 
 OUTPUT = Path(__file__).parent / "output" / "detection.jsonl"
 WIDTH, HEIGHT = 200, 160
-SIZES_PX, PEAKS_DN, AMBIENTS_DN, CONTRASTS = (
-    (1.5, 2.5, 4.0),
-    (60.0, 180.0, 330.0, 600.0),
-    (12.0, 60.0),
-    (0.0, 0.2, 0.4, 0.6),
-)
+SIZES_PX, PEAKS_DN, AMBIENTS_DN = (1.5, 2.5, 4.0), (60.0, 180.0, 330.0, 600.0), (12.0, 60.0)
+CONTRASTS = (0.0, 0.4, 0.2, 0.6)
 PICTURES = 200
 METHODS = ("fit", "contour")
 
 
 def cells():
     """Every cell of the grid: (size, peak, ambient, contrast)."""
-    return itertools.product(SIZES_PX, PEAKS_DN, AMBIENTS_DN, CONTRASTS)
+    for contrast, *others in itertools.product(CONTRASTS, SIZES_PX, PEAKS_DN, AMBIENTS_DN):
+        yield (*others, contrast)
 
 
 def bound_px(mark, scene, sensor) -> float:

@@ -1,16 +1,15 @@
 """From pictures to the answer: does the truth of a rendered paper campaign lie inside the intervals?
 
-    python experiments/frames_to_fit.py [FOLDER] > experiments/frames_to_fit.md
+    python experiments/frames_to_fit.py FOLDER [mounted] [table1] > experiments/frames_to_fit.md
 
-Renders the paper's protocol (384 looks, 768 frames, 0.6 GB) into FOLDER (default: a temporary one), or takes the frames
-that are there; detects by both methods; classic and joint estimates of both beside the truth. The twins:
+Renders the paper's protocol (384 looks, 768 frames, 0.6 GB) into FOLDER, or takes the frames that are there; detects by
+both methods; classic and joint estimates of both beside the truth. The twins:
 `mounted`, drawn with seed 1, and `table1`, the shipped paper twin whose classic answer is the paper's Table 1.
 """
 
 from __future__ import annotations
 
 import sys
-import tempfile
 from dataclasses import replace
 from pathlib import Path
 
@@ -99,10 +98,8 @@ def main() -> None:
     print(
         "# From frames to the fit\n\n`python experiments/frames_to_fit.py`: both methods, classic and joint (Laplace)."
     )
-    with tempfile.TemporaryDirectory() as scratch:
-        folder = Path(sys.argv[1]) if len(sys.argv) > 1 else Path(scratch)
-        for twin in ("mounted", "table1"):
-            report(rendered(folder, twin), twin)
+    for twin in sys.argv[2:] or ("mounted", "table1"):
+        report(rendered(Path(sys.argv[1]), twin), twin)
 
 
 if __name__ == "__main__":

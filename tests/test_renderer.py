@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 
 import cv2
@@ -9,6 +10,8 @@ import numpy as np
 import pytest
 
 from tvsbayes.campaign import read_campaign, read_plan
+from tvsbayes.cli import run
+from tvsbayes.device import renderer
 from tvsbayes.device.renderer import (
     Board,
     BoardPose,
@@ -26,13 +29,13 @@ from tvsbayes.device.renderer import (
     render_spots,
     speckle,
     spot_irradiance,
-    write_frames,
 )
 from tvsbayes.files import read_image, shipped_data
 from tvsbayes.rigs import rotation_matrix
-from tvsbayes.simulation import project, simulate
+from tvsbayes.simulation import project, read_truth, simulate
 
 WIDTH, HEIGHT = 1280, 720
+MOUNTED = shipped_data() / "rigs" / "mounted"
 
 
 def centroid(window, light):
@@ -43,7 +46,7 @@ def centroid(window, light):
 
 @pytest.fixture(scope="module")
 def paper_plan():
-    return read_plan(shipped_data() / "rigs" / "mounted" / "paper.csv")
+    return read_plan(MOUNTED / "paper.csv")
 
 
 @pytest.fixture(scope="module")
@@ -181,25 +184,31 @@ def test_the_two_cameras_see_independent_speckle(mounted_rig):
     assert abs(np.corrcoef(*ratio)[0, 1]) < 5 / np.sqrt(100)  # 400 pixels, about 100 independent after demosaicing
 
 
-def test_write_frames_fills_a_campaign(mounted_rig, paper_plan, tmp_path):
-    simulated = simulate(mounted_rig, paper_plan[:5], 3).undetected()
-    simulated.write(tmp_path / "c")
-    seen = []
-    small = Scene(ambient_dn=0.0, ambient_gradient_dn=0.0, speckle_contrast=0.0)
-    pictures = write_frames(tmp_path / "c", simulated, 3, scene=small, views=1, done=lambda *n: seen.append(n))
+def test_simulate_writes_frames_that_detect_reads(mounted_rig, tmp_path, capsys, monkeypatch):
+    """Through the command line, at full size: names, sizes, statuses, and the true centres found again."""
+    monkeypatch.setattr(renderer, "BOARD_VIEWS", 1)
+    lines = (MOUNTED / "paper.csv").read_text().splitlines()[:6]
+    (tmp_path / "plan.csv").write_text("\n".join(lines) + "\n")
+    orders = ["simulate", str(MOUNTED / "rig.toml"), str(tmp_path / "plan.csv"), str(tmp_path / "c")]
+    assert run([*orders, "--frames", "--seed", "3", "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert (document["pictures"], document["in_view"], document["ok"]) == (6, 2, 0)
     campaign = read_campaign(tmp_path / "c")
-    assert pictures == 6
-    assert seen == [(1, 3), (2, 3), (3, 3)]
     assert {spot.status for spot in campaign.spots} == {"undetected"}
     assert all(spot.u_left_px is None and spot.su_right_px is None for spot in campaign.spots)
     names = sorted(path.name for path in (tmp_path / "c" / "frames").iterdir())
     assert names == ["000000_left.png", "000000_right.png", "000001_left.png", "000001_right.png"]
     assert sorted(path.name for path in (tmp_path / "c" / "boards").iterdir()) == ["left01.png", "right01.png"]
-    centre = project(simulated.light.points_mm, simulated.truth.stereo, simulated.truth.parameters["focal_scale"])
-    picture = read_image(tmp_path / "c" / "frames" / "000001_right.png", tmp_path / "c")
-    assert picture.shape == (HEIGHT, WIDTH, 3)
-    v, u = np.unravel_index(cv2.GaussianBlur(picture[..., 1], (0, 0), 3).argmax(), (HEIGHT, WIDTH))
-    assert np.abs([u, v] - centre[1, 2:]).max() < 2.0
+    assert read_image(tmp_path / "c" / "boards" / "right01.png", tmp_path / "c").shape == (HEIGHT, WIDTH, 3)
+    twin = simulate(mounted_rig, read_plan(tmp_path / "plan.csv"), 3)
+    assert twin.truth.parameters == read_truth(tmp_path / "c" / "truth.json", campaign.stereo).parameters
+    true = project(twin.light.points_mm, twin.truth.stereo, twin.truth.parameters["focal_scale"])
+    assert run(["detect", str(tmp_path / "c"), "--speckle-contrast", "0.4"]) == 0
+    for spot, where in zip(read_campaign(tmp_path / "c").spots, true, strict=True):
+        found = [spot.u_left_px, spot.v_left_px, spot.u_right_px, spot.v_right_px]
+        stated = [spot.su_left_px, spot.sv_left_px, spot.su_right_px, spot.sv_right_px]
+        assert np.abs((found - where) / stated).max() < 5
+        assert 0.02 < min(stated) < max(stated) < 0.12
 
 
 def test_boards_are_wholly_inside_both_images(mounted_rig):

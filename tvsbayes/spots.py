@@ -54,17 +54,20 @@ REASONS = {
 CLIPPED_DN = 250
 """A channel at or above this counts as clipped: white balance and JPEG leave full wells a little below 255."""
 CLIPPED_SHARE_MAX = 0.5
+"""Half the bright area: about three times overexposed."""
 BRIGHT_SHARE = 0.3
 """Level of the bright area and of the paper's contour between background and highest value."""
 SECOND_SHARE = 0.25
 AREA_MIN_PX = 4.0
 """Least area at half height, px^2: a hot pixel after demosaicing has 2."""
 AREA_MAX_SHARE = 0.03
+"""Of the picture; at 1280 x 720 px a spot of 50 px sd."""
 AXES_RATIO_MAX = 4.0
 """A sheet at 70 degrees to the beam gives 2.9."""
 BORDER_SDS = 3.0
-DETECTION_SIGMAS = 8.0
-DETECTION_MIN_DN = 2.0
+"""A spot cut off nearer than this has lost what tells its place."""
+DETECTION_SIGMAS, DETECTION_MIN_DN = 8.0, 2.0
+"""Least height of a spot over the background, of means of 4 x 4 px: in sds of them and in DN."""
 EPIPOLAR_SIGMAS, EPIPOLAR_FLOOR_PX = 6.0, 0.5
 """A pair is refused beyond six combined sds (spot and calibration), and never below half a pixel."""
 GAIN_MEDIAN_DN, GAIN_SD_OF_LOG = 0.05, 1.0
@@ -763,18 +766,18 @@ def detect(
             if skews:
                 table = np.vstack(skews)
                 noise[side] = learn_noise(table[:: -(-len(table) // SKEWS_MAX)], speckle_contrast)
-    spots, processed = list(campaign.spots), []
+    spots, good = list(campaign.spots), []
     for row, found in zip(present, pairs, strict=True):
         left, right = (one.under(noise[side]) for side, one in zip(SIDES, found, strict=True))
         spots[row] = _row(spots[row], left, right)
         if spots[row].status == "ok":
-            processed.append((row, np.concatenate((left.centre_px, right.centre_px)), left, right))
-    covariances = np.zeros((len(processed), 4, 4))
-    for place, (_, _, left, right) in enumerate(processed):
+            good.append((row, np.concatenate((left.centre_px, right.centre_px)), left, right))
+    covariances = np.zeros((len(good), 4, 4))
+    for place, (_, _, left, right) in enumerate(good):
         covariances[place, :2, :2], covariances[place, 2:, 2:] = left.covariance_px2, right.covariance_px2
-    pixels = np.array([entry[1] for entry in processed]).reshape(-1, 4)
+    pixels = np.array([entry[1] for entry in good]).reshape(-1, 4)
     for place in np.flatnonzero(epipolar_refused(pixels, covariances, stereo)):
-        row = processed[place][0]
+        row = good[place][0]
         spots[row] = replace(spots[row], status="epipolar")
     after = [spots[row] for row in present]
     stated = [s.su_left_px for s in after if s.status == "ok"] + [s.su_right_px for s in after if s.status == "ok"]

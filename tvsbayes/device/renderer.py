@@ -17,7 +17,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from os import cpu_count
 from pathlib import Path
@@ -456,8 +456,7 @@ def render_board(
     light = board_irradiance(camera, pose, board)
     light *= _ambient(camera.width, camera.height, 1.0, shading)
     light = cv2.GaussianBlur(light, (0, 0), sensor.blur_px) if sensor.blur_px > 0 else light
-    grey = Sensor(sensor.gain_dn_per_electron, sensor.read_noise_dn, sensor.black_dn, (1.0, 1.0, 1.0), sensor.blur_px)
-    return expose(light, grey, _stream("board", *seed))
+    return expose(light, replace(sensor, response=(1.0, 1.0, 1.0)), _stream("board", *seed))
 
 
 BORDER_PX = 8.0
@@ -506,7 +505,7 @@ def write_frames(
     scene: Scene | None = None,
     sensor: Sensor | None = None,
     board: Board | None = None,
-    views: int = BOARD_VIEWS,
+    views: int | None = None,
     done: Callable[[int, int], None] | None = None,
 ) -> int:
     """Write `frames/{spot:06d}_left.png`, `_right.png` of every look and `boards/left01.png`, `right01.png` ...
@@ -520,7 +519,7 @@ def write_frames(
         scene: light; default `Scene()`.
         sensor: both sensors; default `Sensor()`.
         board: the checkerboard; default the paper's.
-        views: how many board views; 0 writes no `boards/`.
+        views: how many board views, by default `BOARD_VIEWS`; 0 writes no `boards/`.
         done: called with the number of pairs written and their total.
 
     Returns:
@@ -530,6 +529,7 @@ def write_frames(
         InputError: the folder cannot be written.
     """
     scene, sensor, board = scene or Scene(), sensor or Sensor(), board or Board()
+    views = BOARD_VIEWS if views is None else views
     truth, light = simulated.truth, simulated.light
     infrared = cameras_of(truth.stereo, truth.parameters["focal_scale"])
     visible = cameras_of(truth.stereo)
