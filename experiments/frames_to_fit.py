@@ -56,7 +56,7 @@ def report(place: Path, twin: str) -> None:
     campaign = read_campaign(place)
     truth = read_truth(place / "truth.json", campaign.stereo)
     print(f"\n## {twin}\n")
-    for method in ("contour", "fit"):
+    for method in ("fit", "contour"):
         found = detect(campaign, method)
         noise = ", ".join(f"{side} {one.speckle_contrast:.2f}" for side, one in found.noise.items())
         print(
@@ -70,7 +70,7 @@ def report(place: Path, twin: str) -> None:
         print(
             "| quantity | truth | classic mean (sd) | 95 % type A | joint | 95 % | truth inside | z |\n|" + "---|" * 8
         )
-        rows = [(f"effective {d}", true[d], summary.effective_deg_per_step[d], by_hand[d]) for d in DIRECTIONS]
+        rows = [(f"effective {d}", true[d], summary.effective[d], by_hand[d]) for d in DIRECTIONS]
         names = ("backlash_deg.pan", "backlash_deg.tilt", "effective_mirror_offset_mm", "pixel_scale", "focal_scale")
         estimates = summary.parameters
         known = {**truth.parameters, "effective_mirror_offset_mm": effective_mirror_offset_mm(truth.parameters, pose)}

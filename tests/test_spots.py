@@ -126,6 +126,19 @@ def test_stated_sd_is_the_actual_error_with_speckle_and_clipped_cores(speckled, 
     assert np.sqrt(np.mean(errors**2)) < 0.08
 
 
+@pytest.mark.parametrize("contrast", [0.0, 0.4])
+def test_propagation_of_known_noise(contrast):
+    """200 pictures whose noise is known: what remains is how the fit passes it on."""
+    rng, scene, chi2 = np.random.default_rng(8), Scene(speckle_contrast=contrast), []
+    for number in range(200):
+        centre = np.array([40.0, 32.0]) + rng.uniform(-1, 1, 2)
+        made = render_spot(Footprint(centre, oval(rng, 2.0), 200.0), 80, 64, scene, Sensor(), (9, number, 0))
+        seen = find_spot(made, SpotNoise(Sensor().gain_dn_per_electron, contrast))
+        chi2.append((seen.centre_px - centre) @ np.linalg.solve(seen.covariance_px2, seen.centre_px - centre))
+    # 400 degrees of freedom: 1 / sqrt(800) of the sd; four of them, and 8 % for the small picture's background.
+    assert abs(np.sqrt(np.sum(chi2) / 400) - 1) < 4 / np.sqrt(800) + 0.08
+
+
 def test_what_is_learned_of_the_noise(found_plain, found_speckled):
     for side in ("left", "right"):
         assert found_plain.noise[side].speckle_contrast < 0.08
