@@ -1,10 +1,10 @@
 """How many frames a second does `detect` take, against only reading the same files?
 
-    python experiments/detect_speed.py CAMPAIGN > experiments/detect_speed.md
+    python experiments/detect_speed.py CAMPAIGN [TURNS] > experiments/detect_speed.md
 
 CAMPAIGN is a folder with frames (`tvsbayes simulate RIG PLAN CAMPAIGN --frames`). In one process and one run, with the
 same number of threads: `cv2.imread` of every frame, then the whole of `detect` (safe reading, finding, learning the
-noise, fitting, epipolar check; no overlay), three times in turn.
+noise, fitting, epipolar check; no overlay), TURNS (3) times in turn.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 
-def main(folder: Path) -> None:
+def main(folder: Path, turns: int) -> None:
     """Measure and print the table."""
     import cv2
 
@@ -36,7 +36,6 @@ def main(folder: Path) -> None:
     jobs = {
         "cv2.imread": reading,
         "detect": lambda workers: detect(campaign, workers=workers),
-        "detect --method contour": lambda workers: detect(campaign, "contour", workers=workers),
     }
     cores, size = os.cpu_count() or 1, f"{campaign.stereo.image_width} x {campaign.stereo.image_height}"
     reading(cores)
@@ -44,15 +43,13 @@ def main(folder: Path) -> None:
         "# Frames per second of `detect`\n\n`python experiments/detect_speed.py CAMPAIGN`: "
         f"{len(paths)} frames of {size} "
         f"px, {megabytes:.0f} MB of PNG in the file cache, OpenCV {cv2.__version__}, {cores} cores (load average "
-        f"{os.getloadavg()[0]:.1f}); medians of three runs in turn.\n"
+        f"{os.getloadavg()[0]:.1f}); medians of {turns} runs in turn.\n"
     )
     print("| threads | what | frames/s (wall) | frames per CPU second |\n|---|---|---|---|")
-    for workers in (1, cores):
+    for workers in (cores, 1):
         seen: dict[str, list[tuple[float, float]]] = {name: [] for name in jobs}
-        for turn in range(3):
+        for _ in range(turns):
             for name, job in jobs.items():
-                if turn and name.endswith("contour"):
-                    continue
                 wall, cpu = time.perf_counter(), time.process_time()
                 job(workers)
                 seen[name].append((len(paths) / (time.perf_counter() - wall), len(paths) / (time.process_time() - cpu)))
@@ -64,4 +61,4 @@ def main(folder: Path) -> None:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]))
+    main(Path(sys.argv[1]), int(sys.argv[2]) if len(sys.argv) > 2 else 3)

@@ -23,7 +23,7 @@ OUTPUT = Path(__file__).parent / "output" / "detection.jsonl"
 WIDTH, HEIGHT = 200, 160
 SIZES_PX, PEAKS_DN, AMBIENTS_DN = (1.5, 2.5, 4.0), (60.0, 180.0, 330.0, 600.0), (12.0, 60.0)
 CONTRASTS = (0.0, 0.4, 0.2, 0.6)
-PICTURES = 200
+PICTURES = 120
 METHODS = ("fit", "contour")
 
 
