@@ -96,7 +96,7 @@ def dozen_campaign(rig: Rig) -> SimulatedCampaign:
         for i, spot in enumerate(campaign.spots)
     ]
     edited = replace(campaign, moves=tuple(moves), spots=tuple(spots))
-    return SimulatedCampaign(edited, simulated.truth)
+    return SimulatedCampaign(edited, simulated.truth, simulated.light)
 
 
 def coordinates(space: Any, truth: Truth) -> np.ndarray:

@@ -16,7 +16,7 @@ LEVELS: tuple[tuple[str, ...], ...] = (
     ("campaign", "interchange"),
     ("calibration",),
     ("model", "classic", "simulation", "certificate"),
-    ("protocols",),
+    ("protocols", "spots"),
     ("likelihood", "solver"),
     ("cameras",),
     ("joint",),
@@ -31,12 +31,12 @@ LEVELS: tuple[tuple[str, ...], ...] = (
 """From bottom to top: a module imports only modules of lower levels."""
 WITHOUT_JAX = (
     *("files", "rigs", "campaign", "calibration", "classic", "simulation", "protocols"),
-    *("boards", "interchange", "certificate", "report"),
+    *("boards", "interchange", "spots", "certificate", "report"),
 )
 MODEL = {
     *("model", "likelihood", "solver", "joint"),
     "posterior",
-    *("cameras", "information", "classic", "calibration", "coordinates", "comparison"),
+    *("cameras", "spots", "information", "classic", "calibration", "coordinates", "comparison"),
 }
 JAX_FAMILY = {"jax", "jaxlib", "equinox", "optimistix", "lineax", "jaxtyping"}
 MODULES_MAX = 24

@@ -190,6 +190,10 @@ def simulate(
     plan: Annotated[Path, typer.Argument(metavar="PLAN", help="plan.csv.")],
     out: Annotated[Path, typer.Argument(metavar="OUT", help="Campaign folder to write.")],
     aperture: Annotated[bool, typer.Option("--aperture/--no-aperture", help="Looks also read the aperture.")] = False,
+    frames: Annotated[
+        bool,
+        typer.Option("--frames", help="Pictures for `detect` and `stereo`, no centroids."),
+    ] = False,
     seed: Seed = 0,
     as_json: Json = False,
 ) -> None:
@@ -199,11 +203,51 @@ def simulate(
     from tvsbayes.simulation import simulate as run_plan
 
     result = run_plan(read_rig(rig), read_plan(plan), seed, aperture=aperture)
-    result.write(out)
     moves, spots = len(result.campaign.moves), result.campaign.spots
     seen = sum(spot.status == "ok" for spot in spots)
     document = {"campaign": str(out), "moves": moves, "spots": len(spots), "ok": seen, "seed": seed}
     text = f"{escaped(str(out), 200)}: {moves} moves, {seen} of {len(spots)} spots seen; the truth is in truth.json"
+    if frames:
+        from tvsbayes.device.renderer import write_frames
+
+        result = result.undetected()
+        result.write(out)
+        with _counting("rendering") as show:
+            pictures = write_frames(out, result, seed, done=show)
+        document |= {"ok": 0, "in_view": seen, "pictures": pictures}
+        text += f"\n{pictures} pictures in frames/ and boards/; spots.csv waits for `tvsbayes detect`"
+    else:
+        result.write(out)
+    _finish(document, text, as_json)
+
+
+@app.command()
+def detect(
+    campaign: CampaignFolder,
+    method: Annotated[str, typer.Option("--method", help="fit, or contour: the paper's.")] = "fit",
+    speckle_contrast: Annotated[
+        float | None,
+        typer.Option("--speckle-contrast", min=0.0, max=2.0, help="Per pixel (default: learned; contour: 0.4)."),
+    ] = None,
+    overlay: Annotated[bool, typer.Option("--overlay", help="Pictures of every spot in results/overlay.")] = False,
+    as_json: Json = False,
+) -> None:
+    """Find the laser spots in frames/ and write their centres and uncertainties into spots.csv."""
+    _finite(speckle_contrast=speckle_contrast)
+    from tvsbayes.campaign import read_campaign, spots_bytes
+    from tvsbayes.report import detection_text
+    from tvsbayes.spots import detect as find
+
+    pictures = campaign / "results" / "overlay" if overlay else None
+    data = read_campaign(campaign)
+    with _counting("detecting") as show:
+        found = find(data, method, speckle_contrast=speckle_contrast, overlay=pictures, done=show)
+    write_atomically(campaign / "spots.csv", spots_bytes(found.campaign.spots))
+    document = {"campaign": str(campaign), **found.as_json()}
+    text = detection_text(found) + f"\nwritten: {escaped(str(campaign / 'spots.csv'), 200)}"
+    if overlay:
+        document["overlay"] = str(pictures)
+        text += f", {escaped(str(pictures), 200)}"
     _finish(document, text, as_json)
 
 
@@ -712,6 +756,20 @@ def _limits(path: Path) -> dict[str, tuple[float, float]]:
         axis: (stated.get(f"{axis}_min_steps", -math.inf), stated.get(f"{axis}_max_steps", math.inf))
         for axis in ("pan", "tilt")
     }
+
+
+@contextmanager
+def _counting(what: str) -> Iterator[Callable[[int, int], None]]:
+    """A bar for work of known length on a terminal, nothing elsewhere."""
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
+    from rich.progress import Progress as Bar
+
+    console = Console(stderr=True)
+    columns = TextColumn(what), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
+    with Bar(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+        task = bar.add_task(what, total=None)
+        yield lambda count, total: bar.update(task, completed=count, total=total)
 
 
 @contextmanager

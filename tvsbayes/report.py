@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from tvsbayes.information import Estimate, FitSummary
     from tvsbayes.joint import Derived, JointFit
     from tvsbayes.rigs import Stereo
+    from tvsbayes.spots import Detection
 
 FIT_FORMAT = "tvsbayes-fit/1"
 KEY_PARAMETERS = (
@@ -152,6 +153,25 @@ def stereo_calibration_text(result: StereoCalibration) -> str:
         lines.append(f"left out: {escaped(', '.join(result.excluded), 400)}")
     lines += [f"warning: {warning}" for warning in result.warnings]
     return "\n".join(lines)
+
+
+def detection_text(found: Detection) -> str:
+    """What `detect` found, as a table of statuses."""
+    from tvsbayes.spots import REASONS
+
+    rows = [[status, str(count), REASONS.get(status.split(" ")[0], "")] for status, count in found.statuses.items()]
+    rows += [["undetected", str(found.missing), "no frames"]] if found.missing else []
+    rows += [["as it was", str(found.kept), "refused by somebody else"]] if found.kept else []
+    noise = ", ".join(
+        f"{side} contrast {one.speckle_contrast:.2f}, gain {one.gain_dn:.3f} DN" for side, one in found.noise.items()
+    )
+    sd = (
+        ""
+        if found.median_sd_px is None
+        else f"median standard uncertainty of a coordinate {found.median_sd_px:.3f} px; "
+    )
+    title = f"{found.processed} looks"
+    return f"{text_table(title, ['status', 'looks', 'meaning'], rows)}\nmethod {found.method}; {sd}noise: {noise}"
 
 
 def estimate_row(label: str, estimate: Estimate | None, unit: str) -> list[str]:

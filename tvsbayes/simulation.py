@@ -179,20 +179,28 @@ def project(points_S_mm: np.ndarray, stereo: Stereo, focal_scale: float = 1.0) -
     x, y, z = np.asarray(points_S_mm, float).reshape(-1, 3).T
     left = np.column_stack((-y, -z, x))
     right = left @ np.asarray(stereo.R, float).T + np.asarray(stereo.T, float).ravel()
-    seen = []
-    for camera_points, matrix, coefficients in ((left, stereo.M1, stereo.D1), (right, stereo.M2, stereo.D2)):
-        k1, k2, p1, p2, k3 = np.asarray(coefficients, float).ravel()
-        with np.errstate(divide="ignore", invalid="ignore"):
-            a, b = (camera_points[:, :2] / camera_points[:, 2:]).T
-        r2 = a * a + b * b
-        radial = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3
-        u = a * radial + 2 * p1 * a * b + p2 * (r2 + 2 * a * a)
-        v = b * radial + p1 * (r2 + 2 * b * b) + 2 * p2 * a * b
-        u = focal_scale * matrix[0, 0] * u + matrix[0, 2]
-        v = focal_scale * matrix[1, 1] * v + matrix[1, 2]
-        good = (camera_points[:, 2] > 0) & (r2 < _turning_radius_squared(k1, k2, k3))
-        seen.append(np.where(good[:, None], np.column_stack((u, v)), np.nan))
-    return inside_images(np.hstack(seen), stereo)
+    views = ((left, stereo.M1, stereo.D1), (right, stereo.M2, stereo.D2))
+    return inside_images(np.hstack([project_camera(*view, focal_scale) for view in views]), stereo)
+
+
+def project_camera(
+    points_mm: np.ndarray, matrix: np.ndarray, coefficients: np.ndarray, focal_scale: float = 1.0
+) -> np.ndarray:
+    """Pixels (n, 2) of points (n, 3) in a camera's own axes (x right, y down, z along the view).
+
+    Beyond the image's borders too; NaN behind the camera and beyond the radius where distortion turns back.
+    """
+    k1, k2, p1, p2, k3 = np.asarray(coefficients, float).ravel()
+    with np.errstate(divide="ignore", invalid="ignore"):
+        a, b = (points_mm[:, :2] / points_mm[:, 2:]).T
+    r2 = a * a + b * b
+    radial = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3
+    u = a * radial + 2 * p1 * a * b + p2 * (r2 + 2 * a * a)
+    v = b * radial + p1 * (r2 + 2 * b * b) + 2 * p2 * a * b
+    u = focal_scale * matrix[0, 0] * u + matrix[0, 2]
+    v = focal_scale * matrix[1, 1] * v + matrix[1, 2]
+    good = (points_mm[:, 2] > 0) & (r2 < _turning_radius_squared(k1, k2, k3))
+    return np.where(good[:, None], np.column_stack((u, v)), np.nan)
 
 
 def inside_images(pixels: np.ndarray, stereo: Stereo) -> np.ndarray:
@@ -313,11 +321,33 @@ class Truth:
 
 
 @dataclass(frozen=True)
+class Light:
+    """Where the beam of each look met its sheet, in frame S: what a picture of it is made from.
+
+    Attributes:
+        points_mm: (n, 3) points on the sheet; NaN where the beam never meets it.
+        directions: (n, 3) unit vectors along the beam.
+        normals: (n, 3) normals of the sheet, of any length.
+    """
+
+    points_mm: np.ndarray
+    directions: np.ndarray
+    normals: np.ndarray
+
+
+@dataclass(frozen=True)
 class SimulatedCampaign:
-    """What the twin wrote: the campaign as a stranger would get it, and the truth behind it."""
+    """What the twin wrote: the campaign as a stranger would get it, and the truth and the light behind it."""
 
     campaign: Campaign
     truth: Truth
+    light: Light
+
+    def undetected(self) -> SimulatedCampaign:
+        """The same run before anybody has looked at its pictures: no pixels, status "undetected"."""
+        empty = dict.fromkeys(f"{s}{c}_{side}_px" for s in ("", "s") for c in "uv" for side in ("left", "right"))
+        spots = tuple(replace(spot, **empty, status="undetected") for spot in self.campaign.spots)
+        return replace(self, campaign=replace(self.campaign, spots=spots))
 
     def write(self, folder: str | Path) -> None:
         """Write the campaign folder and its truth.json."""
@@ -485,9 +515,9 @@ def simulate(
     fixed = {name: Prior(value, 0.0) for name, value in truth.parameters.items() if name in HARMONIC_PRIORS}
     require_periods(fixed, rig.table.harmonic_period_deg)
     truth, resting_deg = _drive(log.moves, truth, rig.table.harmonic_period_deg, streams["stops"], streams["homes"])
-    points_S, points_P = _light(log, rig, truth, streams["sheets"])
+    light, points_P = _light(log, rig, truth, streams["sheets"])
     p = truth.parameters
-    pixels = project(points_S, truth.stereo, p["focal_scale"])
+    pixels = project(light.points_mm, truth.stereo, p["focal_scale"])
     noise_px = p["pixel_scale"] * sd_px * streams["pixels"].standard_normal(pixels.shape)
     pixels = inside_images(pixels + noise_px, truth.stereo)
     readings: list[float | None] = [None] * len(pixels)
@@ -505,7 +535,7 @@ def simulate(
         truth = replace(truth, reference_pose_deg=tuple(map(float, resting_deg[seen].mean(axis=0))))
     full_header = {"name": "simulated campaign", "synthetic": True, "seed": int(seed), **(header or {})}
     campaign = Campaign(tuple(log.moves), spots, rig.stereo, rig.table, full_header)
-    return SimulatedCampaign(campaign, truth)
+    return SimulatedCampaign(campaign, truth, light)
 
 
 def _drive(
@@ -555,8 +585,8 @@ def _drive(
     return realised, resting
 
 
-def _light(log: _Log, rig: Rig, truth: Truth, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Where each look's beam meets its sheet: points (n, 3) in S and in P, mm; NaN where it never does."""
+def _light(log: _Log, rig: Rig, truth: Truth, rng: np.random.Generator) -> tuple[Light, np.ndarray]:
+    """Where each look's beam meets its sheet, and the same points (n, 3) in P, mm; NaN where it never does."""
     p = truth.parameters
     rotation = rotation_matrix(np.array([p[f"extrinsics.rotation_rad.{a}"] for a in "xyz"]))
     translation = np.array([p[f"extrinsics.translation_mm.{a}"] for a in "xyz"])
@@ -572,7 +602,7 @@ def _light(log: _Log, rig: Rig, truth: Truth, rng: np.random.Generator) -> tuple
     with np.errstate(divide="ignore"):
         distance = (depth[placement] - np.sum(origin * normal, axis=1)) / np.sum(direction * normal, axis=1)
     distance = np.where(distance > 0, distance, np.nan)[:, None]
-    return origin + distance * direction, origin_P + distance * direction_P
+    return Light(origin + distance * direction, direction, normal), origin_P + distance * direction_P
 
 
 def _spot(

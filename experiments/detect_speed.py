@@ -1,0 +1,64 @@
+"""How many frames a second does `detect` take, against only reading the same files?
+
+    python experiments/detect_speed.py CAMPAIGN [TURNS] > experiments/detect_speed.md
+
+CAMPAIGN is a folder with frames (`tvsbayes simulate RIG PLAN CAMPAIGN --frames`). In one process and one run, with the
+same number of threads: `cv2.imread` of every frame, then the whole of `detect` (safe reading, finding, learning the
+noise, fitting, epipolar check; no overlay), TURNS (3) times in turn.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+import time
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+
+
+def main(folder: Path, turns: int) -> None:
+    """Measure and print the table."""
+    import cv2
+
+    from tvsbayes.campaign import read_campaign
+    from tvsbayes.spots import detect
+
+    campaign = read_campaign(folder)
+    paths = sorted(str(path) for path in (folder / "frames").glob("*.png"))
+    megabytes = sum(os.path.getsize(path) for path in paths) / 1e6
+
+    def reading(workers: int) -> None:
+        with ThreadPoolExecutor(workers) as pool:
+            assert all(picture is not None for picture in pool.map(cv2.imread, paths))
+
+    jobs = {
+        "cv2.imread": reading,
+        "detect": lambda workers: detect(campaign, workers=workers),
+    }
+    cores, size = os.cpu_count() or 1, f"{campaign.stereo.image_width} x {campaign.stereo.image_height}"
+    reading(cores)
+    print(
+        "# Frames per second of `detect`\n\n`python experiments/detect_speed.py CAMPAIGN`: "
+        f"{len(paths)} frames of {size} "
+        f"px, {megabytes:.0f} MB of PNG in the file cache, OpenCV {cv2.__version__}, {cores} cores (load average "
+        f"{os.getloadavg()[0]:.1f}); medians of {turns} runs in turn.\n"
+    )
+    print("| threads | what | frames/s (wall) | frames per CPU second |\n|---|---|---|---|")
+    for workers in (cores, 1):
+        seen: dict[str, list[tuple[float, float]]] = {name: [] for name in jobs}
+        for _ in range(turns):
+            for name, job in jobs.items():
+                wall, cpu = time.perf_counter(), time.process_time()
+                job(workers)
+                seen[name].append((len(paths) / (time.perf_counter() - wall), len(paths) / (time.process_time() - cpu)))
+        rates = {name: np.median(values, axis=0) for name, values in seen.items()}
+        for name, (wall, cpu) in rates.items():
+            print(f"| {workers} | `{name}` | {wall:.1f} | {cpu:.1f} |")
+        share = rates["detect"] / rates["cv2.imread"]
+        print(f"| {workers} | detect / imread | {share[0]:.2f} | {share[1]:.2f} |", flush=True)
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]), int(sys.argv[2]) if len(sys.argv) > 2 else 3)

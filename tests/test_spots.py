@@ -1,0 +1,371 @@
+"""Spots in pictures: true centres within stated uncertainties, refusals by name, files in place, hostile frames.
+
+Pictures are rendered by the twin's cameras at 320 x 240 px, so that a test can afford dozens of looks.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from tvsbayes import spots as module
+from tvsbayes.campaign import Campaign, Move, Spot, read_campaign, write_campaign
+from tvsbayes.cli import run
+from tvsbayes.device.renderer import Footprint, Scene, Sensor, cameras_of, render_spot
+from tvsbayes.files import InputError, NothingToEstimate, png_bytes
+from tvsbayes.report import detection_text
+from tvsbayes.rigs import Stereo, rotation_matrix
+from tvsbayes.spots import REASONS, SpotNoise, detect, epipolar_refused, find_spot, learn_noise
+
+WIDTH, HEIGHT = 320, 240
+LOOKS = 40
+
+
+def small_pair() -> Stereo:
+    """Two cameras of 320 x 240 px, 85 mm apart, whose calibration is known to 0.1 px and 0.05 mm."""
+    matrix = np.array([[200.0, 0, 161.0], [0, 201.0, 118.0], [0, 0, 1.0]])
+    sds = np.array([*([0.1] * 4 + [1e-4] * 2 + [1e-5] * 2 + [1e-4]) * 2, *[1e-4] * 3, *[0.05] * 3])
+    return Stereo(
+        image_width=WIDTH,
+        image_height=HEIGHT,
+        M1=matrix,
+        D1=np.array([-0.3, 0.1, 3e-4, -5e-4, -0.01]),
+        M2=matrix + np.array([[-1.0, 0, 2], [0, -1, 3], [0, 0, 0]]),
+        D2=np.array([-0.29, 0.095, -2e-4, 4e-4, -0.009]),
+        R=rotation_matrix(np.array([0.004, -0.006, 0.003])),
+        T=np.array([-85.0, 0.2, -0.3]),
+        parameter_covariance=np.diag(sds**2),
+        rms_px=0.2,
+    )
+
+
+def oval(rng: np.random.Generator, sd: float) -> np.ndarray:
+    """Covariance of a spot 1.2 times as long as wide, turned at random."""
+    c, s = np.cos(angle := rng.uniform(0, np.pi)), np.sin(angle)
+    turn = np.array([[c, -s], [s, c]])
+    return turn @ np.diag([1.2 * sd**2, sd**2 / 1.2]) @ turn.T
+
+
+class Folder:
+    """A campaign folder with rendered frames and its true centres (n, 4)."""
+
+    def __init__(self, path, looks=LOOKS, sd=2.5, peak_dn=180.0, contrast=0.0, seed=1):
+        self.path, rng = path, np.random.default_rng(seed)
+        self.stereo = small_pair()
+        cameras = cameras_of(self.stereo)
+        points = np.column_stack(
+            (rng.uniform(-20, 90, looks), rng.uniform(-60, 60, looks), rng.uniform(200, 275, looks))
+        )
+        self.true_px = np.hstack([camera.project(points) for camera in (cameras.left, cameras.right)])
+        spots = [Spot(10 * k, 0, "d1", k // 4, k % 4 + 1, *[None] * 8, 50.0 + k, "undetected") for k in range(looks)]
+        moves = (Move(0, 0, 0.0, 0, 0, "left", "up"),)
+        write_campaign(Campaign(moves, tuple(spots[::-1]), self.stereo, header={"name": "rendered"}), path)
+        (path / "frames").mkdir()
+        scene = Scene(speckle_contrast=contrast)
+        for look in range(looks):
+            for camera, side in enumerate(("left", "right")):
+                mark = Footprint(self.true_px[look, 2 * camera : 2 * camera + 2], oval(rng, sd), peak_dn)
+                self.put(look, side, render_spot(mark, WIDTH, HEIGHT, scene, Sensor(), (seed, look, camera)))
+
+    def put(self, look: int, side: str, picture: np.ndarray) -> None:
+        (self.path / "frames" / f"{10 * look:06d}_{side}.png").write_bytes(png_bytes(picture))
+
+    def errors(self, found) -> tuple[np.ndarray, np.ndarray]:
+        """Errors and stated sds (n, 4) of the ok spots."""
+        ok = [s for s in found.campaign.spots if s.status == "ok"]
+        seen = np.array([[s.u_left_px, s.v_left_px, s.u_right_px, s.v_right_px] for s in ok])
+        stated = np.array([[s.su_left_px, s.sv_left_px, s.su_right_px, s.sv_right_px] for s in ok])
+        return seen - self.true_px[[s.spot // 10 for s in ok]], stated
+
+
+@pytest.fixture(scope="module")
+def plain(tmp_path_factory) -> Folder:
+    return Folder(tmp_path_factory.mktemp("plain") / "c")
+
+
+@pytest.fixture(scope="module")
+def speckled(tmp_path_factory) -> Folder:
+    return Folder(tmp_path_factory.mktemp("speckled") / "c", contrast=0.4, peak_dn=330.0, seed=2)
+
+
+@pytest.fixture(scope="module")
+def found_plain(plain):
+    return detect(read_campaign(plain.path))
+
+
+@pytest.fixture(scope="module")
+def found_speckled(speckled):
+    return detect(read_campaign(speckled.path))
+
+
+def check_sds(folder: Folder, found, tolerance: float) -> None:
+    """Root mean square of error over stated sd is 1 to the tolerance and what so few spots leave open."""
+    errors, stated = folder.errors(found)
+    assert len(errors) >= LOOKS - 2
+    ratio = np.sqrt(np.mean((errors / stated) ** 2))
+    # Relative sd of a root mean square of n normal values is 1 / sqrt(2 n); four of them.
+    open_by_chance = 4 / np.sqrt(2 * errors.size)
+    assert (1 - tolerance) * (1 - open_by_chance) < ratio < (1 + tolerance) * (1 + open_by_chance)
+
+
+def test_stated_sd_is_the_actual_error_without_speckle(plain, found_plain):
+    check_sds(plain, found_plain, 0.10)
+    assert np.sqrt(np.mean(plain.errors(found_plain)[0] ** 2)) < 0.02
+
+
+def test_stated_sd_is_the_actual_error_with_speckle_and_clipped_cores(speckled, found_speckled):
+    check_sds(speckled, found_speckled, 0.25)
+    errors, stated = speckled.errors(found_speckled)
+    mean = errors.mean(axis=0)
+    assert (np.abs(mean) < 4 * stated.mean(axis=0) / np.sqrt(len(errors))).all()
+    # The grey centroid would scatter by contrast / sqrt(8 pi) = 0.08 px; a weighted fit does better.
+    assert np.sqrt(np.mean(errors**2)) < 0.08
+
+
+@pytest.mark.parametrize("contrast", [0.0, 0.4])
+def test_propagation_of_known_noise(contrast):
+    """200 pictures whose noise is known: what remains is how the fit passes it on."""
+    rng, scene, chi2 = np.random.default_rng(8), Scene(speckle_contrast=contrast), []
+    for number in range(200):
+        centre = np.array([40.0, 32.0]) + rng.uniform(-1, 1, 2)
+        made = render_spot(Footprint(centre, oval(rng, 2.0), 200.0), 80, 64, scene, Sensor(), (9, number, 0))
+        seen = find_spot(made, SpotNoise(Sensor().gain_dn_per_electron, contrast))
+        chi2.append((seen.centre_px - centre) @ np.linalg.solve(seen.covariance_px2, seen.centre_px - centre))
+    # 400 degrees of freedom: 1 / sqrt(800) of the sd; four of them, and 8 % for the small picture's background.
+    assert abs(np.sqrt(np.sum(chi2) / 400) - 1) < 4 / np.sqrt(800) + 0.08
+
+
+def test_what_is_learned_of_the_noise(found_plain, found_speckled):
+    for side in ("left", "right"):
+        assert found_plain.noise[side].speckle_contrast < 0.08
+        assert found_speckled.noise[side].speckle_contrast == pytest.approx(0.4, rel=0.25)
+
+
+def test_the_paper_s_contour_is_several_times_worse_and_says_so(speckled, found_speckled):
+    contour = detect(read_campaign(speckled.path), "contour")
+    errors, stated = speckled.errors(contour)
+    assert len(errors) > LOOKS / 2
+    rms = np.sqrt(np.mean(errors**2))
+    assert rms > 2 * np.sqrt(np.mean(speckled.errors(found_speckled)[0] ** 2))
+    assert 0.6 < rms / np.sqrt(np.mean(stated**2)) < 1.6
+
+
+def test_contour_comes_back_to_raw_pixels():
+    """Against OpenCV's own way forward."""
+    stereo = small_pair()
+    raw = np.random.default_rng(1).uniform([20, 20], [300, 220], (50, 2))
+    for camera in module._rectified(stereo):
+        forward = cv2.undistortPoints(
+            raw[:, None], camera.matrix, camera.distortion, R=camera.rotation, P=camera.projection
+        ).reshape(-1, 2)
+        # undistortPoints stops after five iterations: hundredths of a pixel.
+        np.testing.assert_allclose(camera.raw(forward), raw, atol=0.05)
+
+
+def test_noise_through_demosaicing_has_the_correlation_that_is_assumed():
+    raw = np.clip(np.random.default_rng(1).normal(128, 12, (1000, 1000)), 0, 255).astype(np.uint8)
+    grey = module._grey(cv2.cvtColor(raw, cv2.COLOR_BayerRGGB2BGR))[4:-4, 4:-4] - raw.mean()
+    for i in range(3):
+        for j in range(3):
+            lag = np.mean(grey[i:, j:] * grey[: len(grey) - i, : len(grey) - j]) / raw.var()
+            # A million pixels; the truth is 0.28 at lag 0 and sums to 1.
+            assert lag == pytest.approx(module._CORRELATION[2 + i, 2 + j], abs=0.003)
+
+
+def test_noise_is_learned_from_skews_drawn_from_it():
+    rng = np.random.default_rng(3)
+    parts = np.column_stack((rng.uniform(1, 2, 400), rng.uniform(50, 200, 400), rng.uniform(5e3, 2e4, 400)))
+    for gain, contrast in ((0.04, 0.0), (0.05, 0.4)):
+        variance = parts @ [1.0, gain, contrast**2]
+        learned = learn_noise(np.column_stack((variance * rng.chisquare(1, 400), parts)))
+        # 400 squares tell a variance to sqrt(2 / 400) = 7 %; what of it is gain and what contrast^2 they tell less.
+        said = parts @ [1.0, learned.gain_dn, learned.speckle_contrast**2]
+        assert said.mean() == pytest.approx(variance.mean(), rel=4 * np.sqrt(2 / 400))
+    assert learned.speckle_contrast == pytest.approx(0.4, rel=0.2)
+    assert learn_noise(np.column_stack((variance, parts)), 0.3).speckle_contrast == pytest.approx(0.3)
+
+
+BLANK = np.full((HEIGHT, WIDTH), 10.0)
+SMALL = 2.5**2 * np.eye(2)
+
+
+def picture(*marks: Footprint, scene: Scene | None = None) -> np.ndarray:
+    """Several spots in one picture, without speckle."""
+    scene = scene or Scene(speckle_contrast=0.0)
+    made = [render_spot(mark, WIDTH, HEIGHT, scene, Sensor(), (1, k, 0)) for k, mark in enumerate(marks)]
+    return np.maximum.reduce(made)
+
+
+def lamp() -> np.ndarray:
+    dark = picture(None)
+    cv2.rectangle(dark, (100, 60), (180, 140), (230, 230, 230), -1)
+    return dark
+
+
+def hot_pixel() -> np.ndarray:
+    raw = np.full((HEIGHT, WIDTH), 12, np.uint8)
+    raw[100, 151] = 240
+    return cv2.cvtColor(raw, cv2.COLOR_BayerRGGB2BGR)
+
+
+HERE = np.array([150.3, 110.8])
+THERE = np.array([210.3, 120.8])
+REFUSED = {
+    "no-spot": lambda: picture(None),
+    "two-spots": lambda: picture(Footprint(HERE, SMALL, 180.0), Footprint(THERE, SMALL, 150.0)),
+    "too-small": hot_pixel,
+    "too-large": lamp,
+    "border": lambda: picture(Footprint(np.array([2.0, 100.0]), 4 * SMALL, 180.0)),
+    "clipped": lambda: picture(Footprint(HERE, 2 * SMALL, 3000.0)),
+    "misshapen": lambda: picture(Footprint(HERE, SMALL, 150.0), Footprint(HERE + np.array([7.0, 2.0]), SMALL, 60.0)),
+    "elongated": lambda: picture(Footprint(HERE, np.diag([15.0**2, 2.0**2]), 180.0)),
+}
+
+
+@pytest.mark.parametrize("reason", REFUSED)
+def test_every_refusal_has_its_name(reason):
+    assert find_spot(REFUSED[reason]()).status == reason
+
+
+def test_all_reasons_are_tested():
+    """`epipolar` below; `unfitted` has no picture of its own."""
+    assert set(REASONS) - set(REFUSED) == {"epipolar", "unfitted"}
+
+
+def test_a_weak_second_reflection_and_a_gradient_do_no_harm():
+    steep = Scene(speckle_contrast=0.0, ambient_dn=60.0, ambient_gradient_dn=100.0)
+    seen = find_spot(
+        picture(Footprint(HERE, SMALL, 180.0), Footprint(THERE, SMALL, 25.0), scene=steep), SpotNoise(0.04, 0)
+    )
+    assert seen.status == "ok"
+    assert np.abs(seen.centre_px - HERE).max() < 5 * np.sqrt(seen.covariance_px2.max())
+
+
+def test_a_clipped_core_is_normal_and_a_larger_one_widens_the_sd():
+    sds = []
+    for peak in (240.0, 400.0, 700.0):
+        seen = find_spot(picture(Footprint(HERE, SMALL, peak)), SpotNoise(0.04, 0.4))
+        assert seen.status == "ok"
+        sds.append(np.sqrt(np.trace(seen.covariance_px2)) * np.sqrt(peak))
+    assert sds[0] < sds[1] < sds[2]
+
+
+def test_correlation_follows_a_turned_spot():
+    """A long spot at 45 degrees is known worse along itself: u and v errors go together."""
+    turned = np.array([[20.0, 14.0], [14.0, 20.0]])
+    for sign in (1, -1):
+        cov = find_spot(
+            picture(Footprint(HERE, turned * [[1, sign], [sign, 1]], 180.0)), SpotNoise(0.04, 0)
+        ).covariance_px2
+        assert sign * cov[0, 1] > 0.1 * cov[0, 0]
+
+
+def test_a_pair_off_its_epipolar_lines_is_refused(plain, tmp_path):
+    covariances = np.broadcast_to(np.diag(np.full(4, 0.05**2)), (LOOKS, 4, 4))
+    assert not epipolar_refused(plain.true_px, covariances, plain.stereo).any()
+    for shift, refused in ((0.3, False), (3.0, True)):
+        moved = plain.true_px + np.array([0, shift, 0, 0])
+        assert (epipolar_refused(moved, covariances, plain.stereo) == refused).all()
+    folder = Folder(tmp_path / "c", looks=3)
+    swapped = cv2.imread(str(folder.path / "frames" / "000010_right.png"))
+    folder.put(1, "right", np.roll(swapped, 12, axis=0))
+    after = {spot.spot: spot.status for spot in detect(read_campaign(folder.path)).campaign.spots}
+    assert after == {0: "ok", 10: "epipolar", 20: "ok"}
+
+
+def test_an_uncertain_calibration_forgives_more(plain):
+    loose = replace(plain.stereo, parameter_covariance=plain.stereo.parameter_covariance * 1e4)
+    covariances = np.broadcast_to(np.diag(np.full(4, 0.05**2)), (LOOKS, 4, 4))
+    assert not epipolar_refused(plain.true_px + np.array([0, 3.0, 0, 0]), covariances, loose).any()
+
+
+def test_the_number_of_threads_changes_nothing(plain, found_plain):
+    assert detect(read_campaign(plain.path), workers=1).campaign.spots == found_plain.campaign.spots
+
+
+def test_in_place_same_rows_other_columns_untouched(tmp_path, capsys):
+    folder = Folder(tmp_path / "c", looks=5, contrast=0.4)
+    before = read_campaign(folder.path)
+    by_hand = replace(before.spots[0], status="sheet moved")
+    (folder.path / "spots.csv").write_bytes(module_bytes(before, by_hand))
+    (folder.path / "frames" / "000010_left.png").unlink()
+    folder.put(2, "right", picture(None))
+    (folder.path / "truth.json").write_text("not read")
+    assert run(["detect", str(folder.path), "--json", "--overlay"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    after = read_campaign(folder.path)
+    statuses = {spot.spot: spot.status for spot in after.spots}
+    assert statuses == {40: "sheet moved", 30: "ok", 20: "no-spot right", 10: "undetected", 0: "ok"}
+    assert [spot.spot for spot in after.spots] == [spot.spot for spot in before.spots]
+    for one, other in zip(before.spots, after.spots, strict=True):
+        for column in ("spot", "move", "target", "experiment", "point", "aperture_deg"):
+            assert getattr(one, column) == getattr(other, column)
+    assert document["ok"] == 2
+    assert document["refused"] == {"no-spot right": 1}
+    assert (document["missing"], document["kept"], document["spots"]) == (1, 1, 5)
+    assert sorted(path.name for path in (folder.path / "results" / "overlay").iterdir()) == [
+        f"0000{n}0.png" for n in (0, 2, 3)
+    ]
+    drawn = cv2.imread(str(folder.path / "results" / "overlay" / "000030.png")).astype(int)
+    assert ((drawn[..., 1] > 200) & (drawn[..., 0] < 80) & (drawn[..., 2] < 80)).sum() > 50, "green outline"
+    assert ((drawn[..., 2] > 200) & (drawn[..., 0] < 80) & (drawn[..., 1] < 80)).sum() > 20, "red centre"
+    # Detecting again gives the same file, and a repaired frame its spot.
+    once = (folder.path / "spots.csv").read_bytes()
+    assert run(["detect", str(folder.path)]) == 0
+    assert (folder.path / "spots.csv").read_bytes() == once
+    assert "no-spot right" in capsys.readouterr().out
+
+
+def module_bytes(campaign, first) -> bytes:
+    from tvsbayes.campaign import spots_bytes
+
+    return spots_bytes((first, *campaign.spots[1:]))
+
+
+def test_the_table_names_every_status(found_speckled):
+    text = detection_text(
+        replace(found_speckled, missing=3, kept=2, statuses={"ok": 9, "border left, no-spot right": 1})
+    )
+    for word in ("ok", "border left", "undetected", "refused by somebody else", "contrast"):
+        assert word in text
+
+
+@pytest.mark.parametrize("kind", ["link", "damaged", "size", "folder"])
+def test_hostile_frames_are_refused_and_nothing_is_written(kind, tmp_path):
+    folder = Folder(tmp_path / "c", looks=2)
+    frame = folder.path / "frames" / "000010_right.png"
+    before = (folder.path / "spots.csv").read_bytes()
+    if kind == "link":
+        outside = tmp_path / "outside.png"
+        outside.write_bytes(frame.read_bytes())
+        frame.unlink()
+        frame.symlink_to(outside)
+    elif kind == "damaged":
+        data = bytearray(frame.read_bytes())
+        data[len(data) // 2] ^= 1
+        frame.write_bytes(bytes(data))
+    elif kind == "size":
+        frame.write_bytes(png_bytes(np.zeros((100, 100, 3), np.uint8)))
+    else:
+        frame.unlink()
+        frame.mkdir()
+    for method in ("fit", "contour"):
+        with pytest.raises(InputError) as caught:
+            detect(read_campaign(folder.path), method)
+        assert caught.value.file == "000010_right.png"
+    assert run(["detect", str(folder.path)]) == 2
+    assert (folder.path / "spots.csv").read_bytes() == before
+
+
+def test_no_frames_and_wrong_methods_are_named(tmp_path):
+    folder = Folder(tmp_path / "c", looks=1)
+    with pytest.raises(InputError, match="no method 'blob'"):
+        detect(read_campaign(folder.path), "blob")
+    (folder.path / "frames" / "000000_left.png").unlink()
+    with pytest.raises(NothingToEstimate, match="frames/ holds pictures of none of the 1 rows"):
+        detect(read_campaign(folder.path))
+    assert run(["detect", str(folder.path)]) == 3

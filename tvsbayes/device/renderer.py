@@ -1,0 +1,569 @@
+"""The virtual cameras of the twin: pictures of a laser spot on a sheet, and of a checkerboard.
+
+The order is that of a real camera: irradiance at the sensor (spot, speckle, ambient light, optical blur, integrated
+over the pixel), Bayer mosaic, shot and read noise, clipping, 8 bits, demosaicing by OpenCV. Frames S (stereo) and the
+cameras' own axes as in DESIGN 2; mm; px with the integer at the centre of a pixel; DN = grey levels of 8 bits.
+Pictures are (height, width, 3) uint8, blue, green, red. Everything random follows from the seeds given, whatever the
+order or the number of threads.
+
+The spot is the image of a round Gaussian beam on an oblique sheet through the camera's linearised map at the point
+where the beam's axis meets the sheet: an elliptic Gaussian whose centroid IS the projection of that point. What the
+linear map leaves out (curvature of distortion and perspective across the spot) would shift a centroid by 0.002 px at
+a spot sd of 2 px and 0.01 px at 4 px (`experiments/detection.md`). NumPy and OpenCV only, never the model under test.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from os import cpu_count
+from pathlib import Path
+
+import numpy as np
+
+from tvsbayes.files import make_folder, png_bytes, write_atomically
+from tvsbayes.rigs import Stereo, rotation_matrix
+from tvsbayes.simulation import SimulatedCampaign, project_camera
+
+SIDES = ("left", "right")
+WINDOW_SDS = 6.0
+"""Half side of the rendered window in spot sds: a spot ten times overexposed ends at 4e-5 DN."""
+_STREAMS = {"speckle": 0, "noise": 1, "board": 2}
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """A low-cost colour sensor behind no IR-cut filter, its exposure included.
+
+    Attributes:
+        gain_dn_per_electron: 0.04 puts 255 DN at 6300 electrons, a pixel of about 2 um.
+        read_noise_dn: sd of everything that does not depend on light, in a raw pixel.
+        black_dn: level without light.
+        response: relative response of blue, green, red: dyes pass 808 nm about equally (Sensors 2020, 20(19),
+            5578), so that the spot is near white, slightly violet.
+        blur_px: sd of the lens' point spread.
+    """
+
+    gain_dn_per_electron: float = 0.04
+    read_noise_dn: float = 0.8
+    black_dn: float = 4.0
+    response: tuple[float, float, float] = (0.97, 0.92, 1.0)
+    blur_px: float = 0.7
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What laser and room put on the sheet.
+
+    Attributes:
+        beam_sd_mm: sd of the round Gaussian beam, across its axis.
+        peak_dn: irradiance at the centre for a sheet across the beam; an oblique one gets the cosine of it. Above
+            255 - black the core is clipped.
+        ambient_dn: ambient light at the image's centre.
+        ambient_gradient_dn: its change from the lower right to the upper left corner.
+        speckle_contrast: sd over mean of the speckle in one pixel; 0 = none.
+        speckle_grain_px: sd of the smoothing that gives speckle its grain; 0 = every pixel on its own.
+    """
+
+    beam_sd_mm: float = 0.8
+    peak_dn: float = 320.0
+    ambient_dn: float = 12.0
+    ambient_gradient_dn: float = 6.0
+    speckle_contrast: float = 0.4
+    speckle_grain_px: float = 0.0
+
+
+@dataclass(frozen=True)
+class Camera:
+    """One camera: `rotation`, `translation_mm` take points of the left camera's axes to its own."""
+
+    matrix: np.ndarray
+    distortion: np.ndarray
+    rotation: np.ndarray
+    translation_mm: np.ndarray
+    width: int
+    height: int
+
+    def project(self, points_mm: np.ndarray) -> np.ndarray:
+        """Pixels (n, 2) of points (n, 3) in the left camera's axes; NaN where no image forms."""
+        return project_camera(points_mm @ self.rotation.T + self.translation_mm, self.matrix, self.distortion)
+
+
+@dataclass(frozen=True)
+class CameraPair:
+    """The two cameras of a rig."""
+
+    left: Camera
+    right: Camera
+
+
+def cameras_of(stereo: Stereo, focal_scale: float = 1.0) -> CameraPair:
+    """Both cameras of a calibration; `focal_scale` multiplies fx and fy (1 in visible light, DESIGN 3.3)."""
+    scale = np.array([[focal_scale, 1.0, 1.0], [1.0, focal_scale, 1.0], [1.0, 1.0, 1.0]])
+    size = stereo.image_width, stereo.image_height
+    left = Camera(stereo.M1 * scale, np.asarray(stereo.D1, float).ravel(), np.eye(3), np.zeros(3), *size)
+    pose = np.asarray(stereo.R, float), np.asarray(stereo.T, float).ravel()
+    return CameraPair(left, Camera(stereo.M2 * scale, np.asarray(stereo.D2, float).ravel(), *pose, *size))
+
+
+@dataclass(frozen=True)
+class Footprint:
+    """The image of a spot before the sensor: an elliptic Gaussian.
+
+    Attributes:
+        centre_px: (2,) projection of the point where the beam's axis meets the sheet.
+        covariance_px2: (2, 2) of the irradiance, blur included, pixel integration not.
+        peak_dn: irradiance at the centre.
+    """
+
+    centre_px: np.ndarray
+    covariance_px2: np.ndarray
+    peak_dn: float
+
+
+@dataclass(frozen=True)
+class SpotFrames:
+    """Pictures of one look; a footprint is None where the camera cannot see the point at all."""
+
+    left: np.ndarray
+    right: np.ndarray
+    left_footprint: Footprint | None
+    right_footprint: Footprint | None
+
+
+def footprint(
+    camera: Camera,
+    point_S_mm: np.ndarray,
+    direction_S: np.ndarray,
+    normal_S: np.ndarray,
+    scene: Scene,
+    blur_px: float,
+) -> Footprint | None:
+    """Image of a beam on a sheet, or None where it never meets the sheet or forms no image.
+
+    Args:
+        camera: the camera.
+        point_S_mm: (3,) where the beam's axis meets the sheet, frame S.
+        direction_S: (3,) along the beam.
+        normal_S: (3,) of the sheet, any length.
+        scene: beam and exposure.
+        blur_px: sd of the lens' point spread.
+    """
+    axes = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])  # frame S -> left camera, DESIGN 2
+    point, beam, normal = (axes @ np.asarray(v, float) for v in (point_S_mm, direction_S, normal_S))
+    beam, normal = beam / np.linalg.norm(beam), normal / np.linalg.norm(normal)
+    if not np.isfinite(point).all():
+        return None
+    plane = np.linalg.svd(normal[None])[2][1:]  # (2, 3) orthonormal, in the sheet
+    across = plane @ (np.eye(3) - np.outer(beam, beam)) @ plane.T
+    sheet_covariance = scene.beam_sd_mm**2 * np.linalg.inv(across)
+    step_mm = 1e-3  # truncation 1e-9 of the slope at 100 mm, rounding 1e-10
+    seen = camera.project(point + np.vstack((np.zeros(3), step_mm * plane, -step_mm * plane)))
+    if not np.isfinite(seen).all():
+        return None
+    slope = (seen[1:3] - seen[3:5]).T / (2 * step_mm)
+    covariance = slope @ sheet_covariance @ slope.T + blur_px**2 * np.eye(2)
+    return Footprint(seen[0], covariance, scene.peak_dn * abs(float(beam @ normal)))
+
+
+_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(3)
+
+
+def spot_irradiance(spot: Footprint, width: int, height: int) -> tuple[tuple[slice, slice], np.ndarray]:
+    """Irradiance of a spot integrated over the pixels of a window: (rows, columns) of the image, and values.
+
+    Three Gauss-Legendre nodes per pixel and axis: exact to the fifth order of the irradiance within a pixel.
+    """
+    half = WINDOW_SDS * np.sqrt(np.diag(spot.covariance_px2)) + 1
+    low = np.clip(np.floor(spot.centre_px - half), 0, [width, height]).astype(int)
+    high = np.clip(np.ceil(spot.centre_px + half) + 1, 0, [width, height]).astype(int)
+    precision = np.linalg.inv(spot.covariance_px2)
+    u = np.arange(low[0], high[0]) - spot.centre_px[0]
+    v = np.arange(low[1], high[1])[:, None] - spot.centre_px[1]
+    total = np.zeros((max(high[1] - low[1], 0), max(high[0] - low[0], 0)))
+    for du, weight_u in zip(_NODES / 2, _WEIGHTS / 2, strict=True):
+        for dv, weight_v in zip(_NODES / 2, _WEIGHTS / 2, strict=True):
+            x, y = u + du, v + dv
+            form = precision[0, 0] * x * x + 2 * precision[0, 1] * x * y + precision[1, 1] * y * y
+            total += weight_u * weight_v * np.exp(-form / 2)
+    return (slice(low[1], high[1]), slice(low[0], high[0])), spot.peak_dn * total
+
+
+def speckle(shape: tuple[int, int], contrast: float, grain_px: float, rng: np.random.Generator) -> np.ndarray:
+    """Field of mean 1 and sd `contrast`: gamma-distributed, as the sum of independent speckle patterns is.
+
+    With a grain, independent values of higher contrast are smoothed down to the contrast wanted.
+    """
+    if contrast <= 0:
+        return np.ones(shape)
+    if grain_px <= 0:
+        return rng.standard_gamma(1 / contrast**2, shape) * contrast**2
+    import cv2
+
+    margin = math.ceil(4 * grain_px)
+    kernel = cv2.getGaussianKernel(2 * margin + 1, grain_px).ravel()
+    raw = contrast / float(np.sum(kernel**2))
+    field = rng.standard_gamma(1 / raw**2, (shape[0] + 2 * margin, shape[1] + 2 * margin)) * raw**2
+    smooth = cv2.sepFilter2D(field, cv2.CV_64F, kernel, kernel)
+    return smooth[margin : margin + shape[0], margin : margin + shape[1]]
+
+
+@lru_cache(maxsize=8)
+def _mosaic_response(width: int, height: int, response: tuple[float, float, float]) -> np.ndarray:
+    """Response (height, width) of an RGGB mosaic: red at even rows and columns."""
+    blue, green, red = response
+    tile = np.array([[red, green], [green, blue]], np.float32)
+    return np.tile(tile, ((height + 1) // 2, (width + 1) // 2))[:height, :width]
+
+
+@lru_cache(maxsize=8)
+def _ambient(width: int, height: int, level_dn: float, gradient_dn: float) -> np.ndarray:
+    u = np.linspace(-0.5, 0.5, width, dtype=np.float32)
+    v = np.linspace(-0.5, 0.5, height, dtype=np.float32)[:, None]
+    return np.maximum(level_dn - gradient_dn * (u + v) / 2, 0)
+
+
+def expose(irradiance_dn: np.ndarray, sensor: Sensor, rng: np.random.Generator | None) -> np.ndarray:
+    """The picture of an irradiance (height, width), in DN above black: mosaic, noise, clipping, 8 bits, colours.
+
+    Shot noise is drawn as normal: at the hundreds of electrons of any lit pixel it is. `rng` None: no noise.
+    """
+    import cv2
+
+    height, width = irradiance_dn.shape
+    raw = irradiance_dn.astype(np.float32) * _mosaic_response(width, height, sensor.response)
+    if rng is not None:
+        noise = rng.standard_normal(raw.shape, np.float32)
+        noise *= np.sqrt(np.float32(sensor.gain_dn_per_electron) * raw + np.float32(sensor.read_noise_dn**2))
+        raw += noise
+    raw += np.float32(sensor.black_dn)
+    levels = np.clip(np.rint(raw, out=raw), 0, 255, out=raw).astype(np.uint8)
+    return cv2.cvtColor(levels, cv2.COLOR_BayerRGGB2BGR)
+
+
+def _stream(name: str, *numbers: int) -> np.random.Generator:
+    return np.random.default_rng(np.random.SeedSequence([_STREAMS[name], *map(int, numbers)]))
+
+
+def render_spot(
+    spot: Footprint | None,
+    width: int,
+    height: int,
+    scene: Scene,
+    sensor: Sensor,
+    seed: Sequence[int],
+    frame: int = 0,
+) -> np.ndarray:
+    """One picture of a spot, or of the ambient light alone where `spot` is None.
+
+    Args:
+        spot: the spot's image before the sensor.
+        width: of the picture, px.
+        height: of the picture, px.
+        scene: ambient light and speckle.
+        sensor: the sensor.
+        seed: whole numbers that name the look and the camera: the speckle of a still scene.
+        frame: number of the exposure: frames of one look share the speckle, not the noise.
+    """
+    irradiance = _ambient(width, height, scene.ambient_dn, scene.ambient_gradient_dn).copy()
+    if spot is not None:
+        window, light = spot_irradiance(spot, width, height)
+        if light.size:
+            grains = speckle(light.shape, scene.speckle_contrast, scene.speckle_grain_px, _stream("speckle", *seed))
+            irradiance[window] += light * grains
+    return expose(irradiance, sensor, _stream("noise", *seed, frame))
+
+
+def render_spots(
+    cameras: CameraPair,
+    point_S_mm: np.ndarray,
+    direction_S: np.ndarray,
+    normal_S: np.ndarray,
+    scene: Scene,
+    sensor: Sensor,
+    seed: int,
+    spot: int,
+    frame: int = 0,
+) -> SpotFrames:
+    """Both pictures of one look; speckle and noise of the two cameras are independent.
+
+    Args:
+        cameras: the true cameras at the laser's wavelength (`cameras_of` with the focal scale).
+        point_S_mm: (3,) where the beam's axis meets the sheet, frame S; NaN: ambient light only.
+        direction_S: (3,) along the beam.
+        normal_S: (3,) of the sheet.
+        scene: beam, exposure, ambient light, speckle.
+        sensor: both sensors.
+        seed: of the campaign.
+        spot: number of the look.
+        frame: number of the exposure of this look.
+    """
+    marks, pictures = [], []
+    for number, camera in enumerate((cameras.left, cameras.right)):
+        mark = footprint(camera, point_S_mm, direction_S, normal_S, scene, sensor.blur_px)
+        marks.append(mark)
+        pictures.append(render_spot(mark, camera.width, camera.height, scene, sensor, (seed, spot, number), frame))
+    return SpotFrames(*pictures, *marks)
+
+
+@dataclass(frozen=True)
+class Board:
+    """A checkerboard by its INNER corners, as OpenCV counts them; corner (0, 0) is the board's origin.
+
+    Inner corner (i, j) lies at (i, j, 0) * pitch; squares reach one pitch further on every side, a white margin
+    `margin` pitches further still.
+    """
+
+    columns: int = 9
+    rows: int = 6
+    pitch_mm: float = 25.0
+    margin: float = 0.6
+    white_dn: float = 190.0
+    black_dn: float = 25.0
+    surround_dn: float = 70.0
+
+    def corners_mm(self) -> np.ndarray:
+        """Inner corners (rows * columns, 3) in the board's axes, row by row, as OpenCV's finder orders them."""
+        x, y = np.meshgrid(np.arange(self.columns), np.arange(self.rows))
+        return np.column_stack((x.ravel(), y.ravel(), np.zeros(x.size))) * self.pitch_mm
+
+
+@dataclass(frozen=True)
+class BoardPose:
+    """Where a board stands: `rotation` (3, 3), `translation_mm` (3,) take its axes to the left camera's."""
+
+    rotation: np.ndarray
+    translation_mm: np.ndarray
+
+
+def _fine_levels(x: np.ndarray, y: np.ndarray, board: Board) -> np.ndarray:
+    """Reflectance in DN at board coordinates in units of the pitch."""
+    squares = (x >= -1) & (x < board.columns) & (y >= -1) & (y < board.rows)
+    dark = (np.floor(x).astype(np.int64) + np.floor(y).astype(np.int64)) % 2 == 0
+    m = board.margin
+    paper = (x >= -1 - m) & (x < board.columns + m) & (y >= -1 - m) & (y < board.rows + m)
+    outside = np.where(paper, board.white_dn, board.surround_dn)
+    return np.where(squares, np.where(dark, board.black_dn, board.white_dn), outside)
+
+
+def _rays(camera: Camera) -> np.ndarray:
+    """Undistorted normalised coordinates (height, width, 2) of every pixel; NaN where the lens gives none."""
+    return _rays_of(
+        camera.width,
+        camera.height,
+        tuple(camera.matrix[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()),
+        tuple(camera.distortion.tolist()),
+    )
+
+
+@lru_cache(maxsize=4)
+def _rays_of(width: int, height: int, pinhole: tuple[float, ...], distortion: tuple[float, ...]) -> np.ndarray:
+    fx, fy, cx, cy = pinhole
+    k1, k2, p1, p2, k3 = distortion
+    u, v = np.meshgrid((np.arange(width) - cx) / fx, (np.arange(height) - cy) / fy)
+    x, y = u.copy(), v.copy()
+    for _ in range(30):  # Newton with the radial slope alone: linear convergence by the tangential part, 1e-4 a step
+        r2 = x * x + y * y
+        radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+        slope = radial + 2 * r2 * (k1 + r2 * (2 * k2 + r2 * 3 * k3))
+        miss_u = u - (x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x))
+        miss_v = v - (y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y)
+        # Along the radius the map stretches by `slope`, across it by `radial`.
+        with np.errstate(divide="ignore", invalid="ignore"):
+            along = (x * miss_u + y * miss_v) / np.where(r2 > 0, r2, 1.0) * (1 / slope - 1 / radial)
+            step_x, step_y = miss_u / radial + x * along, miss_v / radial + y * along
+        x, y = x + step_x, y + step_y
+        if np.nanmax(np.abs(miss_u) + np.abs(miss_v)) < 1e-12:
+            break
+    good = (np.abs(miss_u) + np.abs(miss_v) < 1e-9)[..., None]
+    return np.where(good, np.stack((x, y), axis=-1), np.nan)
+
+
+SUBPIXELS = 8
+"""Samples per axis in a pixel that an edge of the board may cross: levels to 1/64."""
+
+
+def board_irradiance(camera: Camera, pose: BoardPose, board: Board) -> np.ndarray:
+    """Irradiance (height, width) of a checkerboard in DN: area-sampled at its edges, without blur."""
+    rotation = camera.rotation @ pose.rotation
+    translation = camera.rotation @ pose.translation_mm + camera.translation_mm
+    homography = np.column_stack((rotation[:, 0], rotation[:, 1], translation))
+    back = np.linalg.inv(homography) / board.pitch_mm
+    window = _board_window(camera, pose, board)
+    picture = np.full((camera.height, camera.width), board.surround_dn)
+    rays = _rays(camera)[window]
+    if min(rays.shape[:2]) < 2:
+        return picture
+    projective = np.dstack((rays, np.ones(rays.shape[:2]))) @ back.T
+    with np.errstate(divide="ignore", invalid="ignore"):
+        plane = projective[..., :2] / (projective[..., 2:] * board.pitch_mm)
+    # Rays that meet the board's plane behind the camera see the surround.
+    plane = np.where(np.isfinite(plane) & (projective[..., 2:] > 0), plane, 1e6)
+    slope_u, slope_v = np.gradient(plane, axis=1), np.gradient(plane, axis=0)
+    reach = np.abs(slope_u) + np.abs(slope_v)
+    levels = _fine_levels(plane[..., 0], plane[..., 1], board)
+    m = board.margin
+    inside = (plane > -1 - m - reach) & (plane < np.array([board.columns, board.rows]) + m + reach)
+    edges = np.abs(plane - np.round(plane)) < reach
+    rims = (np.abs(plane + 1 + m) < reach) | (np.abs(plane - np.array([board.columns, board.rows]) - m) < reach)
+    rows, columns = np.nonzero(inside.all(axis=-1) & (edges | rims).any(axis=-1))
+    offsets = (np.arange(SUBPIXELS) + 0.5) / SUBPIXELS - 0.5
+    total = np.zeros(len(rows))
+    for du in offsets:
+        for dv in offsets:
+            x, y = (plane[rows, columns] + du * slope_u[rows, columns] + dv * slope_v[rows, columns]).T
+            total += _fine_levels(x, y, board)
+    levels[rows, columns] = total / SUBPIXELS**2
+    picture[window] = levels
+    return picture
+
+
+def _board_window(camera: Camera, pose: BoardPose, board: Board) -> tuple[slice, slice]:
+    """Rows and columns that the board's paper covers; the whole image where part of it forms none."""
+    m, along = board.margin, np.linspace(0.0, 1.0, 60)
+    x, y = (-1 - m + (count + 1 + 2 * m) * along for count in (board.columns, board.rows))
+    ends = [np.column_stack((x, np.full(60, edge))) for edge in y[[0, -1]]]
+    ends += [np.column_stack((np.full(60, edge), y)) for edge in x[[0, -1]]]
+    rim = np.column_stack((np.vstack(ends) * board.pitch_mm, np.zeros(240)))
+    seen = camera.project(rim @ pose.rotation.T + pose.translation_mm)
+    size = np.array([camera.width, camera.height])
+    if not np.isfinite(seen).all():
+        return slice(0, camera.height), slice(0, camera.width)
+    # Between two of the 60 points an edge bulges by less than a pixel; gradients need two more.
+    low = np.clip(np.floor(seen.min(axis=0)) - 4, 0, size).astype(int)
+    high = np.clip(np.ceil(seen.max(axis=0)) + 5, 0, size).astype(int)
+    return slice(low[1], high[1]), slice(low[0], high[0])
+
+
+def render_board(
+    camera: Camera, pose: BoardPose, board: Board, sensor: Sensor, seed: Sequence[int], shading: float = 0.15
+) -> np.ndarray:
+    """One picture of a checkerboard; its corners lie at `camera.project` of the board's corners.
+
+    Args:
+        camera: the camera, in visible light: focal scale 1.
+        pose: of the board to the left camera.
+        board: the board.
+        sensor: the sensor; in visible light its three colours respond alike here.
+        seed: whole numbers that name view and camera.
+        shading: relative fall of the light from the upper left to the lower right corner.
+    """
+    import cv2
+
+    light = board_irradiance(camera, pose, board)
+    light *= _ambient(camera.width, camera.height, 1.0, shading)
+    light = cv2.GaussianBlur(light, (0, 0), sensor.blur_px) if sensor.blur_px > 0 else light
+    return expose(light, replace(sensor, response=(1.0, 1.0, 1.0)), _stream("board", *seed))
+
+
+BORDER_PX = 8.0
+"""Least distance of a board's outer squares from the image's border."""
+DEPTHS_MM = (280.0, 520.0)
+TILT_MAX_DEG = 40.0
+
+
+def board_poses(cameras: CameraPair, board: Board, views: int, seed: int) -> list[BoardPose]:
+    """Poses that a careful user would take: tilted up to 40 degrees, all over the part that both cameras see.
+
+    Raises:
+        ValueError: the board fits hardly anywhere into both images.
+    """
+    rng = _stream("board", seed)
+    corners = board.corners_mm()
+    middle = corners.mean(axis=0)
+    reach = np.array([board.columns, board.rows]) * board.pitch_mm
+    rim = np.array([[x, y, 0.0] for x in (-board.pitch_mm, reach[0]) for y in (-board.pitch_mm, reach[1])])
+    left, right, found = cameras.left, cameras.right, []
+    for _ in range(200 * views):
+        depth = rng.uniform(*DEPTHS_MM)
+        aim = np.array([rng.uniform(0, left.width), rng.uniform(0, left.height), 1.0])
+        tilt, heading, roll = rng.uniform(0, np.radians(TILT_MAX_DEG)), rng.uniform(0, 2 * np.pi), rng.normal(0, 0.15)
+        turned = rotation_matrix(tilt * np.array([np.cos(heading), np.sin(heading), 0.0]))
+        turned = turned @ rotation_matrix(np.array([0.0, 0.0, roll]))
+        pose = BoardPose(turned, depth * np.linalg.solve(left.matrix, aim) - turned @ middle)
+        seen = np.hstack([c.project(rim @ pose.rotation.T + pose.translation_mm) for c in (left, right)])
+        last = np.tile([left.width - 1, left.height - 1], 2)
+        if np.isfinite(seen).all() and ((seen > BORDER_PX) & (seen < last - BORDER_PX)).all():
+            found.append(pose)
+            if len(found) == views:
+                return found
+    raise ValueError(f"a board of {reach[0]:g} x {reach[1]:g} mm fits into both images {len(found)} of {views} times")
+
+
+BOARD_VIEWS = 20
+"""Views of the checkerboard, as the paper took (section 2.3)."""
+
+
+def write_frames(
+    folder: Path,
+    simulated: SimulatedCampaign,
+    seed: int,
+    *,
+    scene: Scene | None = None,
+    sensor: Sensor | None = None,
+    board: Board | None = None,
+    views: int | None = None,
+    done: Callable[[int, int], None] | None = None,
+) -> int:
+    """Write `frames/{spot:06d}_left.png`, `_right.png` of every look and `boards/left01.png`, `right01.png` ...
+
+    Spots are seen by the true cameras at the laser's wavelength, boards in visible light (focal scale 1).
+
+    Args:
+        folder: the campaign's folder, which exists.
+        simulated: what the twin did.
+        seed: of speckle, noise and board poses.
+        scene: light; default `Scene()`.
+        sensor: both sensors; default `Sensor()`.
+        board: the checkerboard; default the paper's.
+        views: how many board views, by default `BOARD_VIEWS`; 0 writes no `boards/`.
+        done: called with the number of pairs written and their total.
+
+    Returns:
+        How many pictures were written.
+
+    Raises:
+        InputError: the folder cannot be written.
+    """
+    scene, sensor, board = scene or Scene(), sensor or Sensor(), board or Board()
+    views = BOARD_VIEWS if views is None else views
+    truth, light = simulated.truth, simulated.light
+    infrared = cameras_of(truth.stereo, truth.parameters["focal_scale"])
+    visible = cameras_of(truth.stereo)
+    poses = board_poses(visible, board, views, seed) if views else []
+    make_folder(folder / "frames")
+    if poses:
+        make_folder(folder / "boards")
+
+    def write(place: str, names: Sequence[str], pictures: Sequence[np.ndarray]) -> None:
+        for name, picture in zip(names, pictures, strict=True):
+            write_atomically(folder / place / name, png_bytes(picture))
+
+    def spot(row: int) -> None:
+        number = simulated.campaign.spots[row].spot
+        at = light.points_mm[row], light.directions[row], light.normals[row]
+        made = render_spots(infrared, *at, scene, sensor, seed, number)
+        write("frames", [f"{number:06d}_{side}.png" for side in SIDES], (made.left, made.right))
+
+    def view(number: int) -> None:
+        pair = enumerate((visible.left, visible.right))
+        made = [render_board(camera, poses[number], board, sensor, (seed, number, side)) for side, camera in pair]
+        write("boards", [f"{side}{number + 1:02d}.png" for side in SIDES], made)
+
+    def jobs() -> Iterator[tuple[Callable[[int], None], int]]:
+        yield from ((view, number) for number in range(len(poses)))
+        yield from ((spot, row) for row in range(len(simulated.campaign.spots)))
+
+    total = len(poses) + len(simulated.campaign.spots)
+    # NumPy's generators, OpenCV and the writing of files leave Python's lock: threads are enough.
+    pool = ThreadPoolExecutor(min(8, cpu_count() or 1))
+    try:
+        for count, _ in enumerate(pool.map(lambda job: job[0](job[1]), jobs()), start=1):
+            if done is not None:
+                done(count, total)
+    finally:
+        pool.shutdown(cancel_futures=True)
+    return 2 * total
