@@ -404,4 +404,6 @@ def test_firmware_travels_with_the_package():
     names += ["tvs_positioner/tvs_core.cpp", "native/replay.cpp"]
     assert [name for name in names if not (FIRMWARE / name).is_file()] == []
     core = "".join((FIRMWARE / "tvs_positioner" / f"tvs_core.{end}").read_text() for end in ("h", "cpp"))
+    line = request(0, "ID").decode().strip()
+    assert f"`{line}`" in (FIRMWARE / "README.md").read_text(), "what the user types to see the board answer"
     assert "Arduino.h" not in core and not {"malloc", "new ", "std::"} & set(core.split())
