@@ -50,6 +50,7 @@ class Mechanics:
         missing_steps: next steps that the motors will not do.
         laser_on: whether light comes out.
         moved: called with axis and signed steps after every stretch of motion in one sense.
+        found_home: called with the axis when homing has found its switch, at `home_steps`.
     """
 
     home_steps: tuple[int, int] = (-1_200, -700)
@@ -58,6 +59,7 @@ class Mechanics:
     missing_steps: list[int] = field(default_factory=lambda: [0, 0])
     laser_on: bool = False
     moved: Callable[[int, int], None] | None = None
+    found_home: Callable[[int], None] | None = None
     _stretch: list[int] = field(default_factory=lambda: [0, 0])
 
     def step(self, axis: int, sense: int) -> None:
@@ -400,6 +402,9 @@ class DeviceModel:
         home = self._settings["ht" if self._home_axis else "hp"]
         axis.home_deviation = axis.position - home if self._homed_before else 0
         axis.position = axis.target = home
+        self.mechanics.flush(self._home_axis)
+        if self.mechanics.found_home is not None:
+            self.mechanics.found_home(self._home_axis)
         if self._home_axis == 0:
             return self._home_one(1, now_us)
         self._homing = False
