@@ -29,9 +29,9 @@ from tvsbayes.device.protocol import SETTINGS
 from tvsbayes.device.record import (
     HOME_TOLERANCE_STEPS,
     Recorded,
+    Recorder,
     campaign_of,
     plan_sha256,
-    recorded,
     rig_sha256,
     write_derived,
 )
@@ -261,8 +261,10 @@ class Acquisition:
         self._annotate, self._details = annotate, dict(details or {})
         self._settle_s = float(rig.positioner.get("settle_s", SETTLE_S))
         self._retries, self._warnings, self._check_depth = 0, [], False
-        self._refresh()
-        self._time_s = max((move.time_s for move in self._done.moves), default=0.0)
+        self._recorder = Recorder()
+        for record in journal.records:
+            self._recorder.add(record)
+        self._time_s = max((move.time_s for move in self._recorder.moves), default=0.0)
         self._spot = self._next_spot()
 
     def run(self) -> Outcome:
@@ -292,18 +294,18 @@ class Acquisition:
             # The positioner is closed first: light matters more than the log.
             self.positioner.close()
             self._end(reason, exit_code)
-        self._refresh()
-        spots = self._done.spots
+        done = self._recorder.result()
+        spots = done.spots
         ok = sum(spot.status == "ok" for spot in spots)
         waiting = sum(spot.status == "undetected" for spot in spots)
-        lost = tuple(segment for segment, _ in self._done.lost)
+        lost = tuple(segment for segment, _ in done.lost)
         return Outcome(reason, len(spots), ok, len(spots) - ok - waiting, self._retries, lost, tuple(self._warnings))
 
     def _run(self) -> str:
         if not self.operator.accept(HAZARD):
             return "declined"
-        self.journal.append("start", utc=self._utc_text(), **self._details)
-        resumed = self._done
+        self._log("start", utc=self._utc_text(), **self._details)
+        resumed = self._recorder.result()
         if resumed.target:
             self._confirm_sheet(resumed)
         if resumed.moves and resumed.next_step < len(self.plan):
@@ -313,21 +315,20 @@ class Acquisition:
                 return "interrupted"
             self._tell(step)
             self._do(step)
-        if self._done.moves:
+        if self._recorder.moves:
             self._close_segment(self.positioner.home())
         return "done"
 
     def _end(self, reason: str, exit_code: int) -> None:
         """Writes down how it ended, as well as the disk allows."""
         try:
-            self.journal.append("stop", reason=reason, exit_code=exit_code, utc=self._utc_text())
+            self._log("stop", reason=reason, exit_code=exit_code, utc=self._utc_text())
         except DeviceFault:
             # A broken disk was the reason, and is on its way to the user already.
             pass
         finally:
             self.journal.close()
         try:
-            self._refresh()
             self._derive(always=True)
         except TvsError as error:
             # The journal has everything; --resume writes the tables again.
@@ -343,8 +344,10 @@ class Acquisition:
         else:
             self._look(step.step, step.experiment, step.point)
 
-    def _refresh(self) -> None:
-        self._done: Recorded = recorded(self.journal.records)
+    @property
+    def _done(self) -> Recorded:
+        """Where the run stands, without its moves and spots."""
+        return self._recorder.state
 
     def _now_s(self) -> float:
         """Seconds since the campaign was created, never going back, whatever the clock of the computer does."""
@@ -372,10 +375,10 @@ class Acquisition:
 
     def _close_segment(self, report: HomeReport) -> None:
         """What homing says about the segment that it ends."""
-        if not self._done.moves:
+        if not self._recorder.moves:
             return
         known = report.known or report.state.boot == self._done.boot
-        segment, deviation = self._done.moves[-1].segment, list(report.deviation_steps) if known else None
+        segment, deviation = self._recorder.moves[-1].segment, list(report.deviation_steps) if known else None
         self._log("verified", segment=segment, deviation_steps=deviation)
         if deviation is not None and max(map(abs, deviation)) > HOME_TOLERANCE_STEPS:
             self._warnings.append(
@@ -477,19 +480,18 @@ class Acquisition:
         self._move(last.pan_steps, last.tilt_steps, None)
 
     def _log(self, event: str, **data: object) -> None:
-        self.journal.append(event, **data)
-        self._refresh()
+        self._recorder.add(self.journal.append(event, **data))
         if event in ("homed", "verified"):
             self._derive(always=True)
 
     def _next_spot(self) -> int:
         """The first number that neither an event nor a frame of an interrupted look has."""
-        used = [spot.spot for spot in self._done.spots]
+        used = [spot.spot for spot in self._recorder.spots]
         used += [int(name.split("/")[1][:6]) for name in orphans(self.journal.folder, tuple(self.journal.records))]
         return max(used, default=-1) + 1
 
     def _derive(self, always: bool = False) -> None:
-        count = len(self._done.spots)
+        count = len(self._recorder.spots)
         if not always and count > DERIVED_EVERY and count % (count // DERIVED_EVERY):
             return
         header = {"name": str(self.journal.records[0].data.get("name", "acquired campaign"))}
@@ -498,13 +500,13 @@ class Acquisition:
         for name in ("synthetic", "seed"):
             if name in self.journal.records[0].data:
                 header[name] = self.journal.records[0].data[name]
-        campaign = campaign_of(self._done, self.rig, header)
+        campaign = campaign_of(self._recorder.result(), self.rig, header)
         if campaign is not None:
-            write_derived(campaign, self.journal.folder)
+            write_derived(campaign, self.journal.folder, tables_only=not always)
 
     def _tell(self, step: PlanStep) -> None:
         left = self.plan[step.step :]
-        spots = self._done.spots
+        spots = self._recorder.spots
         doing = {
             "home": "homing",
             "place": f"placing {step.target}",

@@ -83,69 +83,99 @@ def rig_sha256(rig: Rig) -> str:
     return hashlib.sha256(rig_table_toml(rig.table).encode() + stereo_bytes(rig.stereo) + tables.encode()).hexdigest()
 
 
+class Recorder:
+    """Follows a journal event by event.
+
+    Attributes:
+        moves: rows of moves.csv so far.
+        spots: rows of spots.csv so far, before it is known whether steps were lost.
+        state: the rest of a `Recorded`; its moves and spots are empty.
+    """
+
+    def __init__(self) -> None:
+        self.moves: list[Move] = []
+        self.spots: list[Spot] = []
+        self.state = Recorded()
+        self._lost: dict[int, tuple[int, int]] = {}
+        self._closed: set[int] = set()
+        self._ignored: list[int] = []
+        self._trusted = True
+
+    def add(self, record: Record) -> None:
+        """Takes the next event.
+
+        Raises:
+            InputError: one that contradicts those before, with its line.
+        """
+        try:
+            self._add(record)
+        except (KeyError, TypeError, ValueError, IndexError) as error:
+            allowed, remedy = f"the entries of the event {record.event}", "tvsbayes check FOLDER --repair-to NEW"
+            place = {"file": LOG, "line": record.line}
+            raise refusal("event", **place, found=f"{error!r}"[:80], allowed=allowed, remedy=remedy) from error
+
+    def _add(self, record: Record) -> None:
+        data, event = record.data, record.event
+        if event in ("moved", "looked") and not self._trusted:
+            self._ignored.append(record.line)
+            return
+        if event == "gap":
+            self._trusted = False
+        elif event == "start":
+            self._change(starts=self.state.starts + 1, ended=None)
+        elif event == "stop":
+            self._change(ended=str(data["reason"]))
+        elif event == "placed":
+            again = bool(data.get("again", False))
+            self._change(target=str(data["target"]), placements=self.state.placements + (not again))
+        elif event == "verified":
+            segment, deviation = int(data["segment"]), data["deviation_steps"]
+            self._closed.add(segment)
+            if deviation is not None and max(map(abs, deviation)) > HOME_TOLERANCE_STEPS:
+                self._lost[segment] = (int(deviation[0]), int(deviation[1]))
+        elif event == "homed":
+            self._trusted = True
+            segment = self.moves[-1].segment + 1 if self.moves else 0
+            self.moves.append(Move(len(self.moves), segment, *_head(data), *data["approach"]))
+            # Only a homing of the plan states counters; one of a resumed run repeats them.
+            self._change(boot=int(data["boot"]), home_steps=(int(data["pan_steps"]), int(data["tilt_steps"])))
+        elif event == "moved":
+            self.moves.append(Move(len(self.moves), self.moves[-1].segment, *_head(data)))
+        elif event == "looked":
+            self.spots.append(_spot(data, len(self.moves) - 1))
+        if data.get("step") is not None and event in ("homed", "moved", "placed", "looked"):
+            self._change(next_step=max(self.state.next_step, int(data["step"]) + 1))
+
+    def _change(self, **changes: object) -> None:
+        self.state = replace(self.state, **changes)
+
+    def result(self) -> Recorded:
+        """The campaign so far."""
+        segment_of = [move.segment for move in self.moves]
+        spots = tuple(
+            replace(spot, status=LOST_STEPS) if spot.status == "ok" and segment_of[spot.move] in self._lost else spot
+            for spot in self.spots
+        )
+        return replace(
+            self.state,
+            moves=tuple(self.moves),
+            spots=spots,
+            lost=tuple(sorted(self._lost.items())),
+            unverified=tuple(s for s in sorted(set(segment_of)) if s not in self._closed),
+            ignored_lines=tuple(self._ignored),
+        )
+
+
 def recorded(records: Iterable[Record]) -> Recorded:
     """The campaign in the events of a journal.
 
     Raises:
         InputError: events that contradict each other, with their line.
     """
-    moves: list[Move] = []
-    spots: list[Spot] = []
-    lost: dict[int, tuple[int, int]] = {}
-    closed: set[int] = set()
-    ignored: list[int] = []
-    state = Recorded()
-    trusted = True
+    recorder = Recorder()
     for record in records:
-        data = record.data
-        try:
-            if record.event == "gap":
-                trusted = False
-            elif record.event == "start":
-                state = replace(state, starts=state.starts + 1, ended=None)
-            elif record.event == "stop":
-                state = replace(state, ended=str(data["reason"]))
-            elif record.event in ("placed",):
-                again = bool(data.get("again", False))
-                state = replace(state, target=str(data["target"]), placements=state.placements + (0 if again else 1))
-            elif record.event == "verified":
-                segment, deviation = int(data["segment"]), data["deviation_steps"]
-                closed.add(segment)
-                if deviation is not None and max(map(abs, deviation)) > HOME_TOLERANCE_STEPS:
-                    lost[segment] = (int(deviation[0]), int(deviation[1]))
-            elif record.event == "homed":
-                trusted = True
-                row = Move(len(moves), moves[-1].segment + 1 if moves else 0, *_head(data), *data["approach"])
-                moves.append(row)
-                home = (int(data["pan_steps"]), int(data["tilt_steps"]))
-                state = replace(state, boot=int(data["boot"]), home_steps=home)
-            elif not trusted and record.event in ("moved", "looked"):
-                ignored.append(record.line)
-                continue
-            elif record.event == "moved":
-                moves.append(Move(len(moves), moves[-1].segment, *_head(data)))
-            elif record.event == "looked":
-                spots.append(_spot(data, len(moves) - 1))
-            if data.get("step") is not None and record.event in ("homed", "moved", "placed", "looked"):
-                state = replace(state, next_step=max(state.next_step, int(data["step"]) + 1))
-        except (KeyError, TypeError, ValueError, IndexError) as error:
-            allowed, remedy = f"the entries of the event {record.event}", "tvsbayes check FOLDER --repair-to NEW"
-            place = {"file": LOG, "line": record.line}
-            raise refusal("event", **place, found=f"{error!r}"[:80], allowed=allowed, remedy=remedy) from error
-    segment_of = [move.segment for move in moves]
-    final = tuple(
-        replace(spot, status=LOST_STEPS) if spot.status == "ok" and segment_of[spot.move] in lost else spot
-        for spot in spots
-    )
-    unverified = tuple(s for s in sorted(set(segment_of)) if s not in closed)
-    return replace(
-        state,
-        moves=tuple(moves),
-        spots=final,
-        lost=tuple(sorted(lost.items())),
-        unverified=unverified,
-        ignored_lines=tuple(ignored),
-    )
+        recorder.add(record)
+    return recorder.result()
 
 
 def _head(data: dict[str, object]) -> tuple[float, int, int]:
@@ -178,8 +208,8 @@ def campaign_of(record: Recorded, rig: Rig, header: dict[str, object]) -> Campai
     return Campaign(record.moves, record.spots, rig.stereo, rig.table, header)
 
 
-def write_derived(campaign: Campaign, folder: Path) -> None:
-    """Writes the four campaign files so that the folder is readable at any moment in between.
+def write_derived(campaign: Campaign, folder: Path, tables_only: bool = False) -> None:
+    """Writes the four campaign files, or the tables that grow, so that the folder is readable at any moment.
 
     Moves go before spots: a spot never names a move that is not there yet. Spots that `detect` has found since in
     frames that waited keep what it found. A file that is as it should be is not written again.
@@ -195,12 +225,9 @@ def write_derived(campaign: Campaign, folder: Path) -> None:
     ]
     moves, table = moves_bytes(campaign.moves), spots_bytes(spots)
     parse_spots(table, "spots.csv", len(parse_moves(moves)), campaign.stereo)
-    files = {
-        "stereo.json": stereo_bytes(campaign.stereo),
-        "moves.csv": moves,
-        "spots.csv": table,
-        "campaign.toml": campaign_toml(campaign),
-    }
+    files = {"moves.csv": moves, "spots.csv": table}
+    if not tables_only:
+        files = {"stereo.json": stereo_bytes(campaign.stereo), **files, "campaign.toml": campaign_toml(campaign)}
     for name, data in files.items():
         path = folder / name
         if not path.is_file() or path.read_bytes() != data:

@@ -16,7 +16,7 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from tvsbayes.campaign import PlanStep
+from tvsbayes.campaign import Campaign, PlanStep, parse_header, read_campaign
 from tvsbayes.device.acquisition import (
     Acquisition,
     Outcome,
@@ -27,12 +27,20 @@ from tvsbayes.device.acquisition import (
 )
 from tvsbayes.device.camera import StereoImage, VirtualCamera, open_cameras
 from tvsbayes.device.driver import Positioner, SerialPositioner, device_settings, serial_opener
-from tvsbayes.device.journal import LOG, read_journal
+from tvsbayes.device.journal import LOG, read_journal, repair, verify
 from tvsbayes.device.observation import CameraObserver, Detector, Observer, TwinObserver, wait_for_detection
-from tvsbayes.device.record import recorded
+from tvsbayes.device.record import recorded, write_derived
 from tvsbayes.device.twin import Instrument, Renderer, reference_pose_deg
-from tvsbayes.files import InputError, escaped, refusal, write_atomically
-from tvsbayes.rigs import Rig
+from tvsbayes.files import (
+    TOML_BYTES_MAX,
+    InputError,
+    escaped,
+    parse_toml,
+    read_bytes,
+    refusal,
+    write_atomically,
+)
+from tvsbayes.rigs import Rig, parse_rig_table, read_stereo
 from tvsbayes.simulation import SPOT_SD_PX
 
 LASER_CLASSES = ("1", "1M", "2", "2M", "3R", "3B", "4")
@@ -259,6 +267,60 @@ def _simulated(
             yield _Bench(positioner, CameraObserver(camera, detector), clock, utc, details, annotate)
         finally:
             camera.close()
+
+
+def check_journal(folder: Path) -> dict[str, object]:
+    """Verifies the journal of a campaign folder and compares the campaign files with it.
+
+    Raises:
+        InputError: damage, with line number.
+    """
+    document = verify(folder).as_json()
+    record = recorded(read_journal(folder).records)
+    warnings = [*document["warnings"]]
+    if record.ignored_lines:
+        first = record.ignored_lines[0]
+        warnings.append(f"{len(record.ignored_lines)} events after a gap do not count, from line {first} on")
+    for segment, deviation in record.lost:
+        warnings.append(f"segment {segment}: {deviation[0]} and {deviation[1]} steps were lost; its spots do not count")
+    if record.unverified:
+        names = ", ".join(map(str, record.unverified))
+        warnings.append(f"no homing closed the segments {names}: whether steps were lost in them is not known")
+    if record.moves:
+        present = read_campaign(folder)
+        behind = len(record.moves) - len(present.moves), len(record.spots) - len(present.spots)
+        if behind != (0, 0):
+            warnings.append(
+                f"moves.csv and spots.csv are {behind[0]} moves and {behind[1]} looks behind the journal: "
+                "acquire --resume writes them again"
+            )
+    return {**document, "warnings": warnings}
+
+
+def repair_campaign(folder: Path, to: Path) -> dict[str, object]:
+    """Copies what is whole of a journal, and writes the campaign that it holds, into a new folder.
+
+    Raises:
+        InputError: no journal, nothing whole, a folder that holds something, or campaign files that are damaged too.
+    """
+    if not (folder / LOG).is_file():
+        remedy = "only folders written by `tvsbayes acquire` have a journal to repair"
+        place = escaped(str(folder / LOG), 200)
+        raise refusal("missing-file", file=place, found="no journal", allowed="a journal", remedy=remedy)
+    # Rig, stereo and header stand in files of their own, written once and not touched since.
+    before = _settings_of(folder)
+    done = repair(folder, to)
+    record = recorded(read_journal(to).records)
+    if record.moves:
+        write_derived(Campaign(record.moves, record.spots, before.stereo, before.rig, before.header), to)
+    return {**done.as_json(), "moves": len(record.moves), "looks": len(record.spots)}
+
+
+def _settings_of(folder: Path) -> Campaign:
+    """Stereo calibration, rig and header of a campaign whose tables may be damaged."""
+    keys = parse_toml(read_bytes(folder / "campaign.toml", TOML_BYTES_MAX, folder), "campaign.toml")
+    stereo = read_stereo(folder / "stereo.json", folder=folder)
+    return Campaign((), (), stereo, parse_rig_table(keys.table("rig")), parse_header(keys))
 
 
 def write_truth(folder: Path, rig: Rig, instrument: Instrument) -> None:
