@@ -274,7 +274,8 @@ class Acquisition:
             DeviceFault: device, camera or disk failed; the journal says so too.
             KeyboardInterrupt: interrupted twice; laser off, journal closed.
         """
-        reason, exit_code = "done", 0
+        # What stands in the journal where an error of the program itself ends the run.
+        reason, exit_code = "crashed", 1
         try:
             with self._stop:
                 try:

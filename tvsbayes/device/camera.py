@@ -302,6 +302,8 @@ class VirtualCamera:
 
     render: Callable[[], StereoImage]
     frames_per_s: float = 30.0
+    failure: Exception | None = field(default=None, init=False)
+    """What `render` raised; it ends the stream, and is raised again when the camera is left."""
     _server: ThreadingHTTPServer | None = field(default=None, init=False, repr=False)
     _thread: threading.Thread | None = field(default=None, init=False, repr=False)
     _stop: threading.Event = field(default_factory=threading.Event, init=False, repr=False)
@@ -348,6 +350,8 @@ class VirtualCamera:
         # Waits for the streams, which end at the next frame.
         self._server.server_close()
         self._server = None
+        if self.failure is not None:
+            raise self.failure
 
     def _serve(self, request: BaseHTTPRequestHandler) -> None:
         if not request.path.endswith(".mjpg"):
@@ -360,7 +364,11 @@ class VirtualCamera:
         due_s = time.monotonic()
         try:
             while not self._stop.wait(max(due_s - time.monotonic(), 0.0)):
-                data = self.jpeg()
+                try:
+                    data = self.jpeg()
+                except Exception as error:
+                    self.failure = error
+                    return
                 head = b"--frame\r\nContent-Type: image/jpeg\r\nContent-Length: %d\r\n\r\n" % len(data)
                 request.wfile.write(head + data + b"\r\n")
                 # A late frame shifts the following ones: a sensor does not expose twice at once.

@@ -85,7 +85,7 @@ class Instrument:
         self.clock = clock or VirtualClock()
         self._stops, self._homes = self._stream("stops", start), self._stream("homes", start)
         self._pixels = self._stream("pixels", start)
-        self._first_home = [start == 0, start == 0]
+        self._first_home, self._from_switch = [start == 0, start == 0], [False, False]
         p = self.truth.parameters
         self._backlash = [p[f"backlash_deg.{axis}"] for axis in AXES]
         self._q = [0.0, 0.0]
@@ -119,14 +119,17 @@ class Instrument:
         """A stretch of motion: ratio of its sense, play, a new stop error (DESIGN 3.1)."""
         self.motions += 1
         p, sense = self.truth.parameters, SENSES[axis][0 if steps > 0 else 1]
-        self._q[axis] += steps * p[f"degrees_per_step.{sense}"]
+        # The first row of a segment stands at mean ratio x counters, whatever the way there from the switch.
+        ratio = AXES[axis] if self._from_switch[axis] else sense
+        self._from_switch[axis] = False
+        self._q[axis] += steps * p[f"degrees_per_step.{ratio}"]
         self._take_up(axis)
         self._eta[axis] = p[f"stop_sd_deg.{sense}"] * self._stops.standard_normal()
 
     def _found_home(self, axis: int) -> None:
         """Counters are set: from here on the angle is ratio x counters + home offset, 0 in the first segment."""
         offset = 0.0 if self._first_home[axis] else HOME_SD_DEG * self._homes.standard_normal()
-        self._first_home[axis] = False
+        self._first_home[axis], self._from_switch[axis] = False, True
         ratio = self.truth.parameters[f"degrees_per_step.{AXES[axis]}"]
         angle = ratio * self.mechanics.home_steps[axis] + offset
         self._y[axis] += angle - self._q[axis]
@@ -147,7 +150,8 @@ class Instrument:
         return float(sum(part * turn**order for order, part in enumerate(parts, start=1)).real) if parts else 0.0
 
     def state_deg(self) -> dict[str, tuple[float, float]]:
-        """Mirror angles (psi, beta) as they are, and the stop errors (pan, tilt) in them."""
+        """Mirror angles (psi, beta) as they are, and the stop errors (pan, tilt) in them; a segment has begun."""
+        self._from_switch = [False, False]
         angles = [self._y[i] + self._wobble(i, self._y[i], wheel=True) + self._eta[i] for i in (0, 1)]
         angles[1] += self.truth.parameters["tilt_zero_deg"]
         return {"mirror_angles_deg": (angles[0], angles[1]), "stop_errors_deg": (self._eta[0], self._eta[1])}
