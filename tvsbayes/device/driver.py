@@ -33,6 +33,8 @@ ATTEMPTS = 6
 """How often a request is sent before the device counts as dead."""
 REPLY_S = 0.5
 """Silence after which a request is sent again. A clean round trip takes about 1 ms on USB, 0.2 s at 9600 baud."""
+NAK_S = 0.05
+"""Silence after a negative acknowledgement that is enough."""
 REPLY_MAX_S = 3.0
 """Longest wait for one answer while bytes keep arriving: a slow line, or noise."""
 DRAIN_S, DRAIN_MAX_S = 0.05, 1.0
@@ -317,8 +319,9 @@ class SerialPositioner:
         raise _fault("no-answer", found, "check cable, supply and firmware; unplug and plug in again")
 
     def _await(self, sequence: int) -> Reply | None:
-        """The answer to `sequence`; None for silence or a negative acknowledgement."""
-        start = last = self._clock.monotonic()
+        """The answer to `sequence`; None for silence, at once after a negative acknowledgement."""
+        start = self._clock.monotonic()
+        deadline = start + REPLY_S
         while True:
             while (line := self._next_line()) is not None:
                 try:
@@ -329,14 +332,14 @@ class SerialPositioner:
                     if answer.sequence == sequence:
                         return answer
                 elif answer.kind == "nak":
-                    return None
-            now = self._clock.monotonic()
-            left_s = min(last + REPLY_S, start + REPLY_MAX_S) - now
+                    # Noise may draw many of them, and the answer may still follow.
+                    deadline = min(deadline, self._clock.monotonic() + NAK_S)
+            left_s = deadline - self._clock.monotonic()
             if left_s <= 0 or self._link is None:
                 return None
             data = self._link.read(left_s)
             if data:
-                last = self._clock.monotonic()
+                deadline = min(self._clock.monotonic() + REPLY_S, start + REPLY_MAX_S)
                 self._buffer += data
 
     def _next_line(self) -> bytes | None:
