@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import datetime
 import json
+import os
 import random
 import signal
 import subprocess
 import sys
+import threading
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -20,7 +22,7 @@ from tvsbayes.campaign import PlanStep, read_campaign, write_plan
 from tvsbayes.cli import run
 from tvsbayes.device import acquisition as engine
 from tvsbayes.device.acquisition import Acquisition, StopKey, _approach, begin, check_plan, outline
-from tvsbayes.device.camera import StereoImage
+from tvsbayes.device.camera import StereoImage, VirtualCamera
 from tvsbayes.device.journal import LOG, read_journal, verify
 from tvsbayes.device.observation import CameraObserver, Detection, TwinObserver
 from tvsbayes.device.protocol import request
@@ -38,6 +40,18 @@ HEADER = {"name": "test", "created": SIMULATED_START.isoformat(), "synthetic": T
 @pytest.fixture(scope="module")
 def rig():
     return read_rig(RIG_FILE)
+
+
+@pytest.fixture(scope="module")
+def small_rig(rig):
+    """The same rig with cameras of a quarter of the pixels per side: pictures that cost a sixteenth."""
+    scale = np.ones(24)
+    scale[[0, 1, 2, 3, 9, 10, 11, 12]] = 0.25
+    stereo = rig.stereo.with_vector(rig.stereo.vector * scale)
+    width, height = rig.stereo.image_width // 4, rig.stereo.image_height // 4
+    covariance = rig.stereo.parameter_covariance * np.outer(scale, scale)
+    stereo = replace(stereo, image_width=width, image_height=height, parameter_covariance=covariance)
+    return replace(rig, stereo=stereo)
 
 
 def small_plan(experiments: int = 2, rehome: bool = False) -> list[PlanStep]:
@@ -451,13 +465,13 @@ def centroids(lit: StereoImage, dark: StereoImage) -> Detection:
     return Detection("ok", tuple(pixels), (0.1,) * 4)
 
 
-def test_pictures_through_the_virtual_camera(rig, tmp_path):
+def test_pictures_through_the_virtual_camera(small_rig, tmp_path):
     """Renderer, MJPEG server, OpenCV, background, detection, journal: spots where the twin has them."""
     plan = [PlanStep(0, "home", 0, 0), PlanStep(1, "place", target="d1"), PlanStep(2, "look")]
     plan += [PlanStep(3, "move", 60, 10), PlanStep(4, "look")]
-    instrument = Instrument(rig, 7)
+    instrument = Instrument(small_rig, 7)
     rng = np.random.default_rng(0)
-    size = (rig.stereo.image_height, rig.stereo.image_width)
+    size = (small_rig.stereo.image_height, small_rig.stereo.image_width)
 
     def renderer(light, look, frame):
         pixels = simulation.project(
@@ -467,7 +481,7 @@ def test_pictures_through_the_virtual_camera(rig, tmp_path):
         return StereoImage(*(np.clip(p, 0, 255).astype(np.uint8) for p in pair))
 
     folder = tmp_path / "c"
-    outcome = acquire(rig, plan, folder, simulate=True, seed=7, renderer=renderer, detector=centroids)
+    outcome = acquire(small_rig, plan, folder, simulate=True, seed=7, renderer=renderer, detector=centroids)
     assert (outcome.ok, outcome.refused) == (2, 0)
     assert verify(folder).frames == 8
     names = sorted(p.name for p in (folder / "frames").iterdir())
@@ -478,7 +492,7 @@ def test_pictures_through_the_virtual_camera(rig, tmp_path):
         p = truth["parameters"]
         origin, direction = simulation.mirror_chain(*k, p)
         assert np.isfinite([*origin, *direction]).all()
-        still = Instrument(rig, 7)
+        still = Instrument(small_rig, 7)
         still._y, still._eta = list(np.degrees(k) - [0.0, p["tilt_zero_deg"]]), [0.0, 0.0]
         still.place("d1", 0)
         still.mechanics.laser_on = True
@@ -487,34 +501,166 @@ def test_pictures_through_the_virtual_camera(rig, tmp_path):
         assert np.abs(still.centroid_px() - pixels).max() < 0.1
 
 
-def test_frozen_camera_and_watchdog_are_faults(rig):
+@pytest.mark.skipif(not hasattr(os, "openpty"), reason="pseudo-terminals exist on POSIX only")
+def test_hardware_path_from_rig_file_to_campaign(small_rig, tmp_path):
+    """Pyserial on a pseudo-terminal, OpenCV on a stream, questions on a terminal: all as on the bench."""
+    size = (small_rig.stereo.image_height, small_rig.stereo.image_width)
+    instrument = Instrument(small_rig, 7)
+    rng, lit_in_motion = np.random.default_rng(0), []
+    moved = instrument.mechanics.moved
+    instrument.mechanics.moved = lambda *a: (lit_in_motion.append(instrument.mechanics.laser_on), moved(*a))
+    noise = rng.integers(0, 9, (4, *size, 3)).astype(np.uint8)
+    frame = [0]
+
+    def render():
+        frame[0] += 1
+        pixels, pair = instrument.centroid_px(), []
+        for k in (0, 2):
+            picture = 20 + noise[(frame[0] + k) % 4]
+            if np.isfinite(pixels[k]):
+                u, v = map(round, pixels[k : k + 2])
+                picture[v - 5 : v + 6, u - 5 : u + 6] += blob((11, 11), 5, 5, 180).astype(np.uint8)
+            pair.append(picture)
+        return StereoImage(*pair)
+
+    master, slave = os.openpty()
+    lines: list[bytes] = []
+    instrument.device.listener = lines.append
+
+    def serve():
+        while True:
+            try:
+                data = os.read(master, 4096)
+            except OSError:
+                return
+            # Every request finds the device 1 s later: motions end without anybody waiting.
+            instrument.clock.now_us += 1_000_000
+            instrument.device.model.advance(instrument.clock.now_us)
+            instrument.device.model.receive(data, instrument.clock.now_us)
+            while lines:
+                os.write(master, lines.pop(0))
+
+    threading.Thread(target=serve, daemon=True).start()
+    asked = []
+
+    def ask(question):
+        asked.append(question)
+        instrument.place("d1" if "d1" in question else "d2", len(asked))
+        return ""
+
+    plan = [PlanStep(0, "home", 0, 0), PlanStep(1, "place", target="d1"), PlanStep(2, "look")]
+    plan += [PlanStep(3, "move", 60, 10), PlanStep(4, "look"), PlanStep(5, "place", target="d2"), PlanStep(6, "look")]
+    with VirtualCamera(render, frames_per_s=50) as virtual:
+        table = {"driver": "serial", "port": os.ttyname(slave), "settle_s": 0.0}
+        real = replace(small_rig, positioner=table, cameras={"source": virtual.address, "spot_sd_px": 0.08})
+        said = []
+        outcome = acquire(real, plan, tmp_path / "c", laser_class="3B", detector=centroids, say=said.append, ask=ask)
+    os.close(slave)
+    os.close(master)
+    assert (outcome.reason, outcome.ok, len(asked)) == ("done", 3, 2), said
+    assert any("808 nm is invisible" in line for line in said)
+    assert not instrument.mechanics.laser_on and lit_in_motion and not any(lit_in_motion)
+    assert verify(tmp_path / "c").frames == 12 and len(read_campaign(tmp_path / "c").spots) == 3
+    assert "synthetic" not in read_campaign(tmp_path / "c").header
+    start = next(r for r in read_journal(tmp_path / "c").records if r.event == "start")
+    assert start.data["device"]["fw"] == "1.0.0" and "cameras" in start.data
+
+
+class Scripted:
+    """A camera whose n-th pair is `level(n)` grey all over, after `seconds` of exposure."""
+
+    def __init__(self, clock, level, seconds=0.1):
+        self.clock, self.level, self.seconds, self.count = clock, level, seconds, 0
+
+    def grab(self):
+        self.clock.sleep(self.seconds)
+        self.count += 1
+        picture = np.full((4, 4, 3), self.level(self.count), np.uint8)
+        return StereoImage(picture, picture)
+
+
+@pytest.mark.parametrize(
+    ("level", "seconds", "code"),
+    [
+        (lambda n: 7, 0.1, "frozen"),
+        (lambda n: n % 30, 2.5, "watchdog"),
+        (lambda n: 0 if n == 1 else 100, 0.1, "light"),
+    ],
+)
+def test_camera_that_lies_is_a_fault_and_the_laser_is_off(rig, level, seconds, code):
     instrument = Instrument(rig, 1)
     positioner = instrument.positioner()
     positioner.home()
-    positioner.move_to(0, 0)
-    picture = np.zeros((4, 4, 3), np.uint8)
+    with pytest.raises(DeviceFault) as caught:
+        CameraObserver(Scripted(instrument.clock, level, seconds)).observe(positioner, 0)
+    assert caught.value.code == code and not instrument.mechanics.laser_on
 
-    class Camera:
-        def __init__(self, seconds):
-            self.seconds, self.count = seconds, 0
 
-        def grab(self):
-            instrument.clock.sleep(self.seconds)
-            self.count += 1
-            return StereoImage(picture + self.count * (self.seconds > 1), picture)
-
-    for seconds, code in ((0.1, "frozen"), (2.5, "watchdog")):
-        with pytest.raises(DeviceFault) as caught:
-            CameraObserver(Camera(seconds)).observe(positioner, 0)
-        assert caught.value.code == code and not instrument.mechanics.laser_on
-    found = CameraObserver(type("C", (Camera,), {"grab": lambda s: _noise(s)})(0.1)).observe(positioner, 3)
-    assert found.detection.status == "undetected"
+def test_pictures_without_a_visible_spot_wait_for_detection(rig):
+    instrument = Instrument(rig, 1)
+    positioner = instrument.positioner()
+    positioner.home()
+    camera = Scripted(instrument.clock, lambda n: n % 30)
+    found = CameraObserver(camera).observe(positioner, 3)
+    assert found.detection.status == "undetected" and camera.count == 22
     assert sorted(found.pictures)[0] == "dark/000003_left.png" and len(found.pictures) == 4
 
 
-def _noise(camera):
-    camera.count += 1
-    return StereoImage(*(np.full((4, 4, 3), camera.count, np.uint8) for _ in "lr"))
+def test_changed_background_is_refused(rig):
+    instrument = Instrument(rig, 1)
+    positioner = instrument.positioner()
+    positioner.home()
+    camera = Scripted(instrument.clock, lambda n: 90 if n == 1 else n % 30)
+    assert CameraObserver(camera).observe(positioner, 3).detection.status == "unsteady"
+
+
+@pytest.mark.parametrize("depth", range(0, 12))
+def test_old_frames_never_become_a_spot_whatever_the_buffer(rig, depth):
+    """A camera without any flushing, with a buffer `depth` frames deep: light alone keeps the spots true."""
+    instrument = Instrument(rig, 1)
+    positioner = instrument.positioner()
+    positioner.home()
+    rng = np.random.default_rng(depth)
+    queue, moved_to = [], [0]
+
+    def expose():
+        picture = rng.integers(0, 6, (3, 40, 3)).astype(np.uint8)
+        if instrument.mechanics.laser_on:
+            picture[1, moved_to[0]] = 200
+        queue.append(picture)
+
+    class Camera:
+        def grab(self):
+            expose()
+            while len(queue) <= depth:
+                expose()
+            picture = queue.pop(0)
+            return StereoImage(picture, picture)
+
+    def detector(lit, dark):
+        light = lit.left[1].astype(int).sum(axis=1) - dark.left[1].astype(int).sum(axis=1)
+        u = float(light.argmax())
+        return Detection("ok", (u,) * 4, (0.1,) * 4) if light.max() > 300 else Detection("no-spot")
+
+    observer, found = CameraObserver(Camera(), detector, keep_pictures=False), []
+    for step in range(12):
+        positioner.move_to(3 * step, 0)
+        # The spot is where the positioner is.
+        moved_to[0] = 3 * step
+        for _ in range(engine.ATTEMPTS_PER_LOOK):
+            seen = observer.observe(positioner, step).detection
+            if seen.status == "ok":
+                found.append(seen.pixels_px[0])
+                assert seen.pixels_px[0] == 3 * step
+                break
+    assert found == [3.0 * step for step in range(12)]
+
+
+def test_folder_without_a_homing_is_told_so(rig, tmp_path, capsys):
+    begin(tmp_path / "c", rig, small_plan(), False, HEADER).close()
+    assert run(["check", str(tmp_path / "c"), "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert document["kind"] == "journal" and "no homing" in document["warnings"][-1]
 
 
 def test_commands(rig, tmp_path, capsys):

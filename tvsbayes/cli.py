@@ -231,10 +231,13 @@ def check(
             from tvsbayes.device.session import check_journal
 
             journal = check_journal(path)
-        document = check_campaign(read_campaign(path)).as_json()
-        if journal is not None:
-            document["warnings"] = [*journal.pop("warnings"), *document["warnings"]]
-            document["journal"] = journal
+        if journal is not None and not journal["moves"]:
+            document = {"kind": "journal", **journal}
+        else:
+            document = check_campaign(read_campaign(path)).as_json()
+            if journal is not None:
+                document["warnings"] = [*journal.pop("warnings"), *document["warnings"]]
+                document["journal"] = journal
     warnings = document["warnings"]
     lines = [f"{key}: {value}" for key, value in document.items() if key != "warnings"]
     lines += [f"warning: {warning}" for warning in warnings]
@@ -265,8 +268,8 @@ def acquire(
 
     instrument, steps = read_rig(rig), read_plan(plan)
     from tvsbayes.device.acquisition import check_plan, outline, seconds_of
+    from tvsbayes.device.session import LiveLine
     from tvsbayes.device.session import acquire as run_plan
-    from tvsbayes.device.session import live_line
 
     if dry_run:
         check_plan(instrument, steps)
@@ -274,14 +277,14 @@ def acquire(
         document: dict[str, Any] = {"steps": lines, "minutes": minutes}
         _finish(document, "\n".join([*lines, f"{len(lines)} steps, about {minutes:.0f} min"]), as_json)
         return
-    with live_line() as show:
+    with LiveLine() as line:
         options = {"simulate": simulate, "resume": resume, "laser_class": laser_class, "seed": seed}
-        outcome = run_plan(instrument, steps, out, **options, say=report_line, show=show)
+        outcome = run_plan(instrument, steps, out, **options, say=report_line, show=line.show, ask=line.ask)
     document = {"campaign": str(out), **outcome.as_json()}
     text = f"{escaped(str(out), 200)}: {outcome.reason}, {outcome.ok} of {outcome.looks} looks count"
     _finish(document, "\n".join([text, *(f"warning: {warning}" for warning in outcome.warnings)]), as_json)
-    if outcome.reason == "interrupted":
-        report_line("interrupted; go on with --resume")
+    if outcome.reason != "done":
+        report_line(f"{outcome.reason}; go on with --resume")
         raise _Ended(INTERRUPTED)
 
 

@@ -42,6 +42,9 @@ ATTEMPTS_PER_LOOK = 3
 PLACEMENTS_MAX = 3
 """How often the operator is asked for the same sheet before the run stops."""
 REFERENCE_LOOKS = 3
+REFERENCE_SHIFT_MAX_PX = 20.0
+"""Change of a reference spot after a resume that is worth a word. A stop error and a home offset of 0.1 degrees
+together move it by 2 px, a sheet put back within 1 mm by as much (f 700 px, 85 mm baseline, 175 mm)."""
 SETTLE_S = 0.3
 """Rest between motion and picture where the rig file states none: a light mechanism rings for about 0.1 s."""
 CLEARED_STEPS = 20
@@ -415,7 +418,11 @@ class Acquisition:
         found = observation.detection
         more: dict[str, object] = {}
         if reference is not None:
-            more = {"reference_of": reference.spot, "shift_px": _shift_px(reference, found.pixels_px)}
+            shift_px = _shift_px(reference, found.pixels_px)
+            more = {"reference_of": reference.spot, "shift_px": shift_px}
+            if shift_px is None or shift_px > REFERENCE_SHIFT_MAX_PX:
+                seen = "is not seen" if shift_px is None else f"has moved by {shift_px:.0f} px"
+                self._warnings.append(f"the reference spot {reference.spot} {seen}: have camera or sheet been moved?")
         self._log(
             "looked",
             step=step,

@@ -1,9 +1,11 @@
 """The stereo cameras on OpenCV, and a virtual one that serves whatever is rendered, over HTTP.
 
 A picture counts only if its exposure began after it was asked for. Drivers keep old frames in their buffers, and no
-frame says when it was exposed. So every `grab` first empties the buffers: a buffered frame is there at once, a live
-one has to be waited for; only behind the first waited-for frame, and those that may still be in the pipe, one is
-taken. A camera that never makes us wait is refused: its frames could be of any age.
+frame says when it was exposed. So every `grab` first empties the buffers: a buffered frame comes as fast as it can be
+decoded, a live one at the camera's own rate, which is measured at opening; only behind the first live frames, which
+may still have been in the pipe, one is taken. A camera that never makes us wait is refused: its frames could be of any
+age. Where decoding takes as long as the camera's period the two cannot be told apart; then the observer's proof by
+light holds (tvsbayes.device.observation).
 
 Pictures are (height, width, 3) uint8, blue, green, red, as OpenCV delivers them; raw pixels, nothing rectified.
 Seconds where a name says `_s`.
@@ -24,8 +26,11 @@ from tvsbayes.device.driver import Clock
 from tvsbayes.files import DeviceFault, InputError, escaped
 
 LIVE_S = 0.004
-"""A frame that had to be waited for longer than this was not in a buffer: cameras up to 100 frames/s wait 10 ms less
-the time since the last call; a buffered frame is copied in about 1 ms."""
+"""A frame that took less than this was in a buffer, whatever the rate: cameras up to 200 frames/s are slower."""
+LIVE_SHARE = 0.7
+"""Share of the camera's period that a frame must take to count as live."""
+RATE_FRAMES, RATE_S = 12, 0.4
+"""The rate is measured over at least so many frames and seconds at opening, and read off the last eight."""
 PIPELINE_FRAMES = 2
 """Live frames to leave out: one was being exposed when it was asked for, one may be on its way."""
 FLUSH_FRAMES_MAX = 250
@@ -145,6 +150,7 @@ class OpenCVCamera:
         try:
             for name, capture in zip(self._names, self._captures, strict=True):
                 self._fix(name, capture, exposure)
+            self._period_s = [self._measured_period_s(capture) for capture in self._captures]
         except BaseException:
             self.close()
             raise
@@ -207,14 +213,23 @@ class OpenCVCamera:
         Raises:
             DeviceFault: no frame, one of another size, or a camera that never makes us wait.
         """
-        for capture in self._captures:
-            self._flush(capture)
+        for capture, period_s in zip(self._captures, self._period_s, strict=True):
+            self._flush(capture, max(LIVE_S, LIVE_SHARE * period_s))
         for name, capture in zip(self._names, self._captures, strict=True):
             if not capture.grab():
                 raise _no_frame(name)
         return self._split([self._retrieve(n, c) for n, c in zip(self._names, self._captures, strict=True)])
 
-    def _flush(self, capture: Capture) -> None:
+    def _measured_period_s(self, capture: Capture) -> float:
+        """Time between two live frames, s."""
+        times = [self._clock.monotonic()]
+        while len(times) <= RATE_FRAMES or times[-1] - times[0] < RATE_S:
+            if len(times) > FLUSH_FRAMES_MAX or not capture.grab():
+                break
+            times.append(self._clock.monotonic())
+        return float(np.median(np.diff(times)[-8:])) if len(times) > 1 else 0.0
+
+    def _flush(self, capture: Capture, live_s: float) -> None:
         """Take frames until the next one was exposed after this call."""
         start = before = self._clock.monotonic()
         live = 0
@@ -222,7 +237,7 @@ class OpenCVCamera:
             if not capture.grab():
                 raise _no_frame(self._names[self._captures.index(capture)])
             now = self._clock.monotonic()
-            live += now - before > LIVE_S
+            live += now - before > live_s
             if live >= PIPELINE_FRAMES:
                 return
             if now - start > FLUSH_MAX_S:

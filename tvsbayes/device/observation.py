@@ -1,7 +1,11 @@
 """One look: a picture without laser light, one with it, and what a detector finds in them.
 
-The laser is on only between the two pictures, and off again whatever happens. Raw px with the integer at the centre
-of a pixel.
+The laser is on only between the two pictures, and off again whatever happens. Light also proves that no picture is
+older than the look, however deep the buffers are: pictures come in the order of their exposure, so after laser-on we
+wait for the spot to appear and after laser-off for it to vanish. A look then begins with no lit picture under way, and
+what shows a spot was exposed in it. That the spot vanishes shows, too, that the laser is off.
+
+Raw px with the integer at the centre of a pixel.
 """
 
 from __future__ import annotations
@@ -16,6 +20,13 @@ from tvsbayes.device.driver import Positioner
 from tvsbayes.device.twin import Instrument
 from tvsbayes.files import DeviceFault, png_bytes
 
+CHANGE_DN = 40
+"""Grey levels by which a pixel must change to count as lit, or as another scene: noise and JPEG stay below 10."""
+WAIT_GRABS = 20
+"""Grabs after which a spot that has not appeared never will: each takes at least three frames, and no driver or stream
+holds back sixty."""
+UNSTEADY = "unsteady"
+"""Status of a look whose background changed: somebody in the picture, or the light in the room."""
 UNDETECTED = "undetected"
 """Status of a look whose frames wait for a detection (DESIGN 7)."""
 
@@ -82,23 +93,19 @@ class CameraObserver:
         """See `Observer.observe`.
 
         Raises:
-            DeviceFault: the camera repeats one picture, or the laser went off while it was exposed.
+            DeviceFault: a camera repeats one picture, the laser went off while it was exposed, or does not go off.
         """
         positioner.laser(False)
         dark = self.camera.grab()
         try:
             positioner.laser(True)
-            lit = self.camera.grab()
-            state = positioner.state()
+            lit, on = self._lit(positioner, dark)
         finally:
             positioner.laser(False)
-        if not state.laser_on:
+        if not on:
             remedy = "raise the frame rate of the cameras, or the watchdog time of the firmware"
             raise DeviceFault("watchdog", f"the laser went off during the exposure; {remedy}", remedy=remedy)
-        # Sensor noise makes two exposures differ, whatever they show.
-        if np.array_equal(lit.left, dark.left) or np.array_equal(lit.right, dark.right):
-            remedy = "unplug the camera and plug it in again, then go on with --resume"
-            raise DeviceFault("frozen", f"a camera delivers the same picture again and again; {remedy}", remedy=remedy)
+        self._wait_for_darkness(dark)
         pictures = {}
         if self.keep_pictures:
             pairs = {"frames": lit, "dark": dark}
@@ -107,7 +114,41 @@ class CameraObserver:
                 for folder, pair in pairs.items()
                 for side in ("left", "right")
             }
-        return Observation(self.detector(lit, dark), pictures)
+        unsteady = max(_rises(lit, dark)) > CHANGE_DN
+        return Observation(Detection(UNSTEADY) if unsteady else self.detector(lit, dark), pictures)
+
+    def _lit(self, positioner: Positioner, dark: StereoImage) -> tuple[StereoImage, bool]:
+        """A picture exposed with the laser on, and whether the laser was on to its end."""
+        for number in range(WAIT_GRABS):
+            lit = self.camera.grab()
+            # Sensor noise makes two exposures differ, whatever they show.
+            if np.array_equal(lit.left, dark.left) or np.array_equal(lit.right, dark.right):
+                remedy = "unplug the camera and plug it in again, then go on with --resume"
+                message = f"a camera delivers the same picture again and again; {remedy}"
+                raise DeviceFault("frozen", message, remedy=remedy)
+            if min(_rises(dark, lit)) > CHANGE_DN:
+                if number:
+                    # Light came on during the first lit exposure, or in one still older: take a whole one.
+                    lit = self.camera.grab()
+                break
+            if not positioner.state().laser_on:
+                return lit, False
+        return lit, positioner.state().laser_on
+
+    def _wait_for_darkness(self, dark: StereoImage) -> None:
+        for _ in range(WAIT_GRABS):
+            if max(_rises(dark, self.camera.grab())) <= CHANGE_DN:
+                return
+        remedy = "cut the laser's supply at once; if it is off, something else in the room has become bright"
+        raise DeviceFault("light", f"the spot does not vanish with the laser off; {remedy}", remedy=remedy)
+
+
+def _rises(before: StereoImage, after: StereoImage) -> tuple[int, int]:
+    """The most by which a pixel grew brighter, left and right, grey levels."""
+    import cv2
+
+    pairs = (before.left, after.left), (before.right, after.right)
+    return tuple(int(cv2.subtract(new, old).max()) for old, new in pairs)
 
 
 @dataclass

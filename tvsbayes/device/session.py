@@ -119,6 +119,7 @@ class _Bench:
     utc: Callable[[], datetime.datetime]
     details: Mapping[str, object]
     annotate: Callable[[], Mapping[str, object]] = dict
+    warnings: tuple[str, ...] = ()
 
 
 def acquire(
@@ -134,6 +135,7 @@ def acquire(
     renderer: Renderer | None = None,
     say: Callable[[str], None] = lambda text: None,
     show: Callable[[Progress], None] = lambda progress: None,
+    ask: Callable[[str], str] = input,
 ) -> Outcome:
     """Runs a plan on the instrument of a rig file, or on its twin, into a campaign folder.
 
@@ -149,6 +151,7 @@ def acquire(
         renderer: makes the twin's pictures; without one a simulation states centroids.
         say: shows a line to the user.
         show: told about progress.
+        ask: shows a question and returns the answer.
 
     Raises:
         InputError: a plan this rig cannot run, another plan than before, nobody to ask.
@@ -182,8 +185,10 @@ def acquire(
         else:
             instrument = None
             bench = stack.enter_context(_hardware(rig, detector))
-            operator = TerminalOperator(stop, say, laser_class=laser_class)
+            operator = TerminalOperator(stop, say, ask, laser_class)
         stack.callback(bench.positioner.close)
+        for warning in bench.warnings:
+            say(f"warning: {warning}")
         journal = begin(folder, rig, plan, resume, header)
         stack.callback(journal.close)
         if journal.torn:
@@ -209,6 +214,10 @@ def acquire(
                 write_truth(folder, rig, instrument)
 
 
+def _utc_now() -> datetime.datetime:
+    return datetime.datetime.now(datetime.UTC)
+
+
 @contextmanager
 def _hardware(rig: Rig, detector: Detector) -> Iterator[_Bench]:
     """Positioner and cameras of a rig file."""
@@ -224,9 +233,10 @@ def _hardware(rig: Rig, detector: Detector) -> Iterator[_Bench]:
         positioner.close()
         raise
     try:
-        details = {"device": positioner.identity, "cameras": camera.settings().as_json()}
-        utc = lambda: datetime.datetime.now(datetime.UTC)  # noqa: E731
-        yield _Bench(positioner, CameraObserver(camera, detector), time, utc, details)
+        settings = camera.settings()
+        details = {"device": positioner.identity, "cameras": settings.as_json()}
+        observer = CameraObserver(camera, detector)
+        yield _Bench(positioner, observer, time, _utc_now, details, warnings=settings.warnings)
     finally:
         positioner.close()
         camera.close()
@@ -272,6 +282,8 @@ def _simulated(
 def check_journal(folder: Path) -> dict[str, object]:
     """Verifies the journal of a campaign folder and compares the campaign files with it.
 
+    `moves` and `looks` of the document count what the journal holds; without a move there is no campaign yet.
+
     Raises:
         InputError: damage, with line number.
     """
@@ -294,7 +306,9 @@ def check_journal(folder: Path) -> dict[str, object]:
                 f"moves.csv and spots.csv are {behind[0]} moves and {behind[1]} looks behind the journal: "
                 "acquire --resume writes them again"
             )
-    return {**document, "warnings": warnings}
+    else:
+        warnings.append("no homing has been logged: there is no campaign yet")
+    return {**document, "moves": len(record.moves), "looks": len(record.spots), "warnings": warnings}
 
 
 def repair_campaign(folder: Path, to: Path) -> dict[str, object]:
@@ -341,27 +355,41 @@ def write_truth(folder: Path, rig: Rig, instrument: Instrument) -> None:
     write_atomically(folder / "truth.json", text.encode())
 
 
-@contextmanager
-def live_line() -> Iterator[Callable[[Progress], None]]:
-    """A line that shows progress on a terminal, plain lines every tenth of the way elsewhere."""
-    from rich.console import Console
-    from rich.progress import BarColumn, TextColumn
-    from rich.progress import Progress as Bar
+class LiveLine:
+    """A line that shows progress on a terminal, plain lines every tenth of the way elsewhere; a context manager."""
 
-    console = Console(stderr=True)
-    columns = TextColumn("{task.fields[doing]}"), BarColumn(), TextColumn("{task.fields[note]}")
-    with Bar(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
-        task = bar.add_task("acquire", total=None, doing="", note="")
-        tenths = [0]
+    def __init__(self) -> None:
+        from rich.console import Console
+        from rich.progress import BarColumn, TextColumn
+        from rich.progress import Progress as Bar
 
-        def show(state: Progress) -> None:
-            minutes = state.seconds_left / 60
-            note = f"look {state.looks} of {state.looks_total}, {state.refused} refused, {state.retries} repeated, "
-            note += f"{minutes:.0f} min left"
-            bar.update(task, total=state.steps, completed=state.step, doing=state.doing, note=note)
-            tenth = 10 * state.step // max(state.steps, 1)
-            if not console.is_terminal and tenth > tenths[0]:
-                tenths[0] = tenth
-                console.print(f"{10 * tenth} %: {note}", highlight=False)
+        self._console = Console(stderr=True)
+        columns = TextColumn("{task.fields[doing]}"), BarColumn(), TextColumn("{task.fields[note]}")
+        self._bar = Bar(*columns, console=self._console, transient=True, disable=not self._console.is_terminal)
+        self._task = self._bar.add_task("acquire", total=None, doing="", note="")
+        self._tenths = 0
 
-        yield show
+    def __enter__(self) -> LiveLine:
+        self._bar.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._bar.stop()
+
+    def show(self, state: Progress) -> None:
+        """Takes the news."""
+        note = f"look {state.looks} of {state.looks_total}, {state.refused} refused, {state.retries} repeated, "
+        note += f"{state.seconds_left / 60:.0f} min left"
+        self._bar.update(self._task, total=state.steps, completed=state.step, doing=state.doing, note=note)
+        tenths = 10 * state.step // max(state.steps, 1)
+        if not self._console.is_terminal and tenths > self._tenths:
+            self._tenths = tenths
+            self._console.print(f"{10 * tenths} %: {note}", highlight=False)
+
+    def ask(self, question: str) -> str:
+        """`input` without the line running over the question."""
+        self._bar.stop()
+        try:
+            return input(question)
+        finally:
+            self._bar.start()
