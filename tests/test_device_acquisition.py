@@ -23,6 +23,7 @@ from tvsbayes.cli import run
 from tvsbayes.device import acquisition as engine
 from tvsbayes.device.acquisition import Acquisition, StopKey, _approach, begin, check_plan, outline
 from tvsbayes.device.camera import StereoImage, VirtualCamera
+from tvsbayes.device.estimate import RunningEstimate, directions_of
 from tvsbayes.device.journal import LOG, read_journal, verify
 from tvsbayes.device.observation import CameraObserver, Detection, TwinObserver
 from tvsbayes.device.protocol import request
@@ -420,6 +421,40 @@ def test_plans_that_the_rig_cannot_run_are_refused_before_anything_moves(rig):
     with pytest.raises(InputError, match="100 in step 7"):
         check_plan(narrow, plan)
     assert outline(rig, plan)[7] == "7: go to pan 100, tilt 0 (by +100, +0)"
+
+
+FIT = """
+import json, sys
+from pathlib import Path
+looks = len((Path(sys.argv[1]) / "spots.csv").read_text().splitlines()) - 1
+entry = {"value": 0.06, "sd": 0.012 / looks}
+print(json.dumps({"converged": looks != 15, "effective_deg_per_step": {"left": entry, "right": entry, "up": None}}))
+"""
+
+
+def test_run_ends_when_the_running_estimate_meets_its_target(rig, tmp_path):
+    """A stand-in whose u falls as 0.012 / looks: 5e-4 is met at 24 looks; fits at 12, 15 (fails), 18, 22, 27."""
+    plan, texts = small_plan(20), []
+    assert directions_of(plan) == {"left", "right"}
+    command = [sys.executable, "-c", FIT]
+    with RunningEstimate(tmp_path / "c", 5e-4, directions_of(plan), wait=True, command=command) as estimate:
+        run_ = Run(rig, tmp_path / "c", plan, estimate=estimate, show=lambda p: texts.append(p.estimate))
+        outcome = run_.engine.run()
+    assert (outcome.reason, outcome.looks, estimate.latest.looks) == ("target met", 27, 27) and run_.dark()
+    assert texts[0] == "" and texts[-1].startswith("left 0.060000 u 5.")
+    assert recorded(read_journal(tmp_path / "c").records).unverified == (), "the closing homing took place"
+    for needed in ({"left", "up"}, set()):
+        with RunningEstimate(tmp_path / "c", 1.0, needed, wait=True, command=command) as estimate:
+            assert not estimate.update(27) and estimate.latest is not None, "a direction without a figure is not met"
+
+
+def test_running_estimate_does_not_hold_up_the_run_and_dies_with_it(rig, tmp_path):
+    command = [sys.executable, "-c", "import threading; threading.Event().wait()"]
+    with RunningEstimate(tmp_path / "c", 1.0, {"left"}, command=command) as estimate:
+        assert Run(rig, tmp_path / "c", small_plan(5), estimate=estimate).engine.run().reason == "done"
+        child = estimate._process
+        assert child.poll() is None and estimate.latest is None
+    assert child.poll() is not None
 
 
 @pytest.mark.parametrize(

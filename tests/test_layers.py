@@ -31,7 +31,7 @@ LEVELS: tuple[tuple[str, ...], ...] = (
 """From bottom to top: a module imports only modules of lower levels."""
 DEVICE_LEVELS: tuple[tuple[str, ...], ...] = (
     ("protocol",),
-    ("model", "journal", "driver"),
+    ("model", "journal", "driver", "estimate"),
     ("virtual", "camera", "record"),
     ("twin",),
     ("observation",),

@@ -256,6 +256,10 @@ def acquire(
     laser_class: Annotated[
         str | None, typer.Option("--laser-class", help="Class on the laser's label: states the hazard is known.")
     ] = None,
+    target_u: Annotated[
+        float | None,
+        typer.Option("--target-u", min=0.0, help="Stop when every effective ratio is known to this u, deg/step."),
+    ] = None,
     seed: Seed = 0,
     as_json: Json = False,
 ) -> None:
@@ -279,13 +283,17 @@ def acquire(
         return
     with LiveLine() as line:
         options = {"simulate": simulate, "resume": resume, "laser_class": laser_class, "seed": seed}
+        options["target_u_deg_per_step"] = target_u
         outcome = run_plan(instrument, steps, out, **options, say=report_line, show=line.show, ask=line.ask)
     document = {"campaign": str(out), **outcome.as_json()}
     text = f"{escaped(str(out), 200)}: {outcome.reason}, {outcome.ok} of {outcome.looks} looks count"
     _finish(document, "\n".join([text, *(f"warning: {warning}" for warning in outcome.warnings)]), as_json)
-    if outcome.reason != "done":
+    if outcome.reason in ("interrupted", "declined"):
         report_line(f"{outcome.reason}; go on with --resume")
         raise _Ended(INTERRUPTED)
+    if target_u is not None and outcome.reason != "target met":
+        report_line("the plan is done and the target is not met: plan more with tvsbayes plan --given")
+        raise _Ended(1)
 
 
 @app.command()

@@ -23,6 +23,7 @@ import numpy as np
 
 from tvsbayes.campaign import APPROACH_SIGN, PlanStep, Spot
 from tvsbayes.device.driver import Clock, HomeReport, Positioner
+from tvsbayes.device.estimate import RunningEstimate
 from tvsbayes.device.journal import Journal, orphans
 from tvsbayes.device.observation import Observation, Observer
 from tvsbayes.device.protocol import SETTINGS
@@ -78,7 +79,11 @@ class Operator(Protocol):
 
 @dataclass(frozen=True)
 class Progress:
-    """Where a run stands: steps of the plan and looks done and in all, refused looks, repeated ones, seconds left."""
+    """Where a run stands.
+
+    Steps of the plan and looks done and in all, refused looks, repeated ones, seconds left, what is being done, and
+    the running estimate, "" for none.
+    """
 
     step: int
     steps: int
@@ -88,6 +93,7 @@ class Progress:
     retries: int
     seconds_left: float
     doing: str
+    estimate: str = ""
 
 
 @dataclass(frozen=True)
@@ -95,7 +101,7 @@ class Outcome:
     """How a run ended.
 
     Attributes:
-        reason: "done", "interrupted" or "declined".
+        reason: "done", "target met", "interrupted" or "declined".
         looks: looks of this campaign, of all its runs.
         ok: how many of them count.
         refused: how many found no usable spot.
@@ -240,6 +246,7 @@ class Acquisition:
         show: told about progress.
         annotate: further entries of every motion's event (the twin's true angles).
         details: what to write down of device and cameras at the start.
+        estimate: the running estimate; a run that meets its target ends.
     """
 
     def __init__(
@@ -257,7 +264,9 @@ class Acquisition:
         show: Callable[[Progress], None] = lambda progress: None,
         annotate: Callable[[], Mapping[str, object]] = dict,
         details: Mapping[str, object] | None = None,
+        estimate: RunningEstimate | None = None,
     ):
+        self._estimate = estimate
         self.rig, self.plan, self.journal = rig, tuple(plan), journal
         self.positioner, self.observer, self.operator = positioner, observer, operator
         self._clock, self._utc, self._stop, self._show = clock, utc, stop or StopKey(), show
@@ -319,9 +328,17 @@ class Acquisition:
                 return "interrupted"
             self._tell(step)
             self._do(step)
+            if step.action == "look" and self._estimate is not None and self._estimate.update(self._ok_looks()):
+                reason = "target met"
+                break
+        else:
+            reason = "done"
         if self._recorder.moves:
             self._close_segment(self.positioner.home())
-        return "done"
+        return reason
+
+    def _ok_looks(self) -> int:
+        return sum(spot.status == "ok" for spot in self._recorder.spots)
 
     def _end(self, reason: str, exit_code: int) -> None:
         """Writes down how it ended, as well as the disk allows."""
@@ -531,6 +548,7 @@ class Acquisition:
                 self._retries,
                 seconds_of(self.rig, left),
                 doing,
+                "" if self._estimate is None or self._estimate.latest is None else self._estimate.latest.text,
             )
         )
 

@@ -27,6 +27,7 @@ from tvsbayes.device.acquisition import (
 )
 from tvsbayes.device.camera import StereoImage, VirtualCamera, open_cameras
 from tvsbayes.device.driver import Positioner, SerialPositioner, device_settings, serial_opener
+from tvsbayes.device.estimate import RunningEstimate, directions_of
 from tvsbayes.device.journal import LOG, read_journal, repair, verify
 from tvsbayes.device.observation import CameraObserver, Detector, Observer, TwinObserver, wait_for_detection
 from tvsbayes.device.record import recorded, write_derived
@@ -131,6 +132,7 @@ def acquire(
     resume: bool = False,
     laser_class: str | None = None,
     seed: int = 0,
+    target_u_deg_per_step: float | None = None,
     detector: Detector = wait_for_detection,
     renderer: Renderer | None = None,
     say: Callable[[str], None] = lambda text: None,
@@ -147,6 +149,7 @@ def acquire(
         resume: go on with an interrupted run.
         laser_class: states that the hazard is known; without it the operator is asked once.
         seed: of a simulation.
+        target_u_deg_per_step: ends the run once the effective ratio of every direction of the plan is known so well.
         detector: finds spots in pictures; by default they wait as `undetected`.
         renderer: makes the twin's pictures; without one a simulation states centroids.
         say: shows a line to the user.
@@ -193,6 +196,11 @@ def acquire(
         stack.callback(journal.close)
         if journal.torn:
             say(f"{len(journal.torn)} bytes of an unfinished line were cut off and kept in log.torn-*")
+        estimate = None
+        if target_u_deg_per_step is not None:
+            directions = directions_of(plan)
+            estimate = RunningEstimate(folder, target_u_deg_per_step, directions, wait=simulate)
+            stack.enter_context(estimate)
         acquisition = Acquisition(
             rig,
             plan,
@@ -206,6 +214,7 @@ def acquire(
             show=show,
             annotate=bench.annotate,
             details=bench.details,
+            estimate=estimate,
         )
         try:
             return acquisition.run()
@@ -380,6 +389,8 @@ class LiveLine:
         """Takes the news."""
         note = f"look {state.looks} of {state.looks_total}, {state.refused} refused, {state.retries} repeated, "
         note += f"{state.seconds_left / 60:.0f} min left"
+        if state.estimate:
+            note += f"; deg/step {state.estimate}"
         self._bar.update(self._task, total=state.steps, completed=state.step, doing=state.doing, note=note)
         tenths = 10 * state.step // max(state.steps, 1)
         if not self._console.is_terminal and tenths > self._tenths:
