@@ -336,6 +336,15 @@ def test_resume_with_another_plan_rig_or_seed_is_refused(rig, tmp_path):
         acquire(rig, plan, tmp_path / "nowhere", simulate=True, resume=True)
 
 
+def test_frames_of_an_interrupted_look_are_never_overwritten(rig, tmp_path):
+    folder = tmp_path / "c"
+    Run(rig, folder, observer=lambda i: Failing(i, 2, lambda i: signal.raise_signal(signal.SIGINT))).engine.run()
+    (folder / "frames" / "000002_left.png").write_bytes(b"of a look that a crash cut off")
+    Run(rig, folder, resume=True, start=1).engine.run()
+    assert [s.spot for s in read_campaign(folder).spots][:4] == [0, 1, 3, 4]
+    assert verify(folder).orphans == ("frames/000002_left.png",)
+
+
 def test_clock_that_goes_back_leaves_the_times_in_order(rig, tmp_path):
     run_ = Run(rig, tmp_path / "c")
     times = iter([50.0, 40.0, 60.0, 10.0] + [70.0 + k for k in range(200)])

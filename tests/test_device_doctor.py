@@ -37,6 +37,7 @@ class Camera:
         return StereoImage(picture, picture)
 
     def close(self):
+        assert not self.device.mechanics.laser_on
         self.closed = True
 
 

@@ -69,6 +69,23 @@ def test_refusals_and_alarms_are_named(action, code):
     assert not device.mechanics.laser_on
 
 
+def test_motion_that_somebody_stopped_is_no_arrival():
+    """Even at the very counters ordered: done is what the device says of this motion, not where it stands."""
+    device = simulated()
+    positioner = connected(device)
+    positioner.home()
+    original = device.model._finish_if_at_rest
+
+    def stopped():
+        device.model._stopping = True
+        original()
+
+    device.model._finish_if_at_rest = stopped
+    with pytest.raises(DeviceFault) as caught:
+        positioner.move_to(50, 0)
+    assert caught.value.code == "stopped" and device.mechanics.true_steps[0] == 50
+
+
 def test_lost_steps_show_at_the_next_homing():
     device = simulated()
     positioner = connected(device)

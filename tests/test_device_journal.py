@@ -115,6 +115,7 @@ def test_lost_doubled_swapped_and_foreign_lines_are_found(folder, tmp_path):
         "lost": (3, lines[:2] + lines[3:]),
         "doubled": (4, lines[:3] + lines[2:]),
         "swapped": (3, [*lines[:2], lines[3], lines[2], *lines[4:]]),
+        "misnumbered": (4, [*lines[:3], encode(4, int(lines[2][:8], 16), "intent", {"step": 1}), *lines[4:]]),
         "foreign": (4, lines[:3] + other[3:4] + lines[4:]),
         "without its beginning": (1, lines[1:]),
     }

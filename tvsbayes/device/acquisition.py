@@ -294,8 +294,6 @@ class Acquisition:
                     reason = self._run()
                 except _Stopped:
                     reason = "interrupted"
-                finally:
-                    self.positioner.close()
             exit_code = 130 if reason == "interrupted" else 0
         except KeyboardInterrupt:
             reason, exit_code = "interrupted at once", 130
