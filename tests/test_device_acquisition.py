@@ -304,6 +304,8 @@ def test_resumed_after_any_look_every_look_is_there_once(rig, tmp_path, stop_at)
     assert campaign.moves[: len(before.moves)] == before.moves
     points = [(s.experiment, s.point) for s in campaign.spots if s.experiment is not None]
     assert points == [(s.experiment, s.point) for s in plan if s.action == "look"]
+    assert recorded(read_journal(folder).records).unverified == (0,), "another device start: nothing to compare with"
+    assert "segment 0 is not known" in check_journal(folder)["warnings"][0]
     references = [s for s in campaign.spots if s.experiment is None]
     on_target = {before.moves[s.move].pan_steps for s in before.spots if s.target == before.spots[-1].target}
     assert len(references) == len(on_target) and {m.segment for m in campaign.moves} == {0, 1}
@@ -334,6 +336,18 @@ def test_resume_with_another_plan_rig_or_seed_is_refused(rig, tmp_path):
     begin(folder, rig, plan, True, HEADER).close()
     with pytest.raises(InputError, match="no journal"):
         acquire(rig, plan, tmp_path / "nowhere", simulate=True, resume=True)
+
+
+def test_lost_steps_of_an_interrupted_run_are_found_by_the_next(rig, tmp_path):
+    """The device stayed on: its counters tell the resumed run's homing what happened before."""
+    folder, plan = tmp_path / "c", small_plan()
+    first = Run(rig, folder, plan, observer=lambda i: Failing(i, 4, lambda i: signal.raise_signal(signal.SIGINT)))
+    first.engine.run()
+    second = Run(rig, folder, plan, resume=True, start=1)
+    first.instrument.mechanics.true_steps[0] -= 6
+    second.engine.positioner = first.instrument.positioner()
+    assert second.engine.run().lost_segments == (0,)
+    assert {s.status for s in read_campaign(folder).spots[:4]} == {LOST_STEPS}
 
 
 def test_frames_of_an_interrupted_look_are_never_overwritten(rig, tmp_path):

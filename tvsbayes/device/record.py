@@ -52,7 +52,7 @@ class Recorded:
         boot: boot id of the device at its last homing, None before.
         home_steps: counters that the last `home` of the plan asked for.
         lost: segments in which steps were lost, with the deviation found.
-        unverified: segments that no homing closed.
+        unverified: segments whose closing homing could not tell, or did not take place.
         ignored_lines: lines after a gap that cannot be trusted.
         ended: the reason of the last `stop`, None while running or after a crash.
     """
@@ -130,8 +130,11 @@ class Recorder:
             self._change(target=str(data["target"]), placements=self.state.placements + (not again))
         elif event == "verified":
             segment, deviation = int(data["segment"]), data["deviation_steps"]
+            if deviation is None:
+                # A device that was restarted meanwhile has no counters to compare with.
+                return
             self._closed.add(segment)
-            if deviation is not None and max(map(abs, deviation)) > HOME_TOLERANCE_STEPS:
+            if max(map(abs, deviation)) > HOME_TOLERANCE_STEPS:
                 self._lost[segment] = (int(deviation[0]), int(deviation[1]))
         elif event == "homed":
             self._trusted = True

@@ -306,7 +306,9 @@ def check_journal(folder: Path) -> dict[str, object]:
         warnings.append(f"segment {segment}: {deviation[0]} and {deviation[1]} steps were lost; its spots do not count")
     if record.unverified:
         names = ", ".join(map(str, record.unverified))
-        warnings.append(f"no homing closed the segments {names}: whether steps were lost in them is not known")
+        warnings.append(
+            f"whether steps were lost in segment {names} is not known: the run or the device was interrupted"
+        )
     if record.moves:
         present = read_campaign(folder)
         behind = len(record.moves) - len(present.moves), len(record.spots) - len(present.spots)
