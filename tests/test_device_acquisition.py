@@ -608,7 +608,7 @@ def test_hardware_path_from_rig_file_to_campaign(small_rig, tmp_path):
 
     plan = [PlanStep(0, "home", 0, 0), PlanStep(1, "place", target="d1"), PlanStep(2, "look")]
     plan += [PlanStep(3, "move", 60, 10), PlanStep(4, "look"), PlanStep(5, "place", target="d2"), PlanStep(6, "look")]
-    with VirtualCamera(render, frames_per_s=50) as virtual:
+    with VirtualCamera(render, frames_per_s=30) as virtual:
         table = {"driver": "serial", "port": os.ttyname(slave), "settle_s": 0.0}
         real = replace(small_rig, positioner=table, cameras={"source": virtual.address, "spot_sd_px": 0.08})
         said = []
@@ -753,10 +753,10 @@ def test_commands(rig, tmp_path, capsys):
 KILLED = "import sys; from tvsbayes.cli import run; sys.exit(run(sys.argv[1:]))"
 
 
-def killed_runs(tmp_path: Path, kills: int, seed: int) -> int:
+def killed_runs(tmp_path: Path, kills: int, seed: int, experiments: int) -> int:
     """Kill `acquire --simulate` again and again, resuming each time, then let it finish: looks of the plan."""
     rng = random.Random(seed)
-    plan = small_plan(30)
+    plan = small_plan(experiments)
     write_plan(plan, tmp_path / "plan.csv")
     folder = tmp_path / "c"
     command = [sys.executable, "-c", KILLED, "acquire", str(RIG_FILE), str(tmp_path / "plan.csv"), str(folder)]
@@ -797,11 +797,11 @@ def killed_runs(tmp_path: Path, kills: int, seed: int) -> int:
 
 
 def test_killed_acquisition_is_resumed_without_a_loss(tmp_path):
-    assert killed_runs(tmp_path, 2, seed=1) == 120
+    assert killed_runs(tmp_path, 1, seed=1, experiments=15) == 60
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(4))
 def test_twenty_killed_acquisitions(tmp_path, seed):
     """Four campaigns, each killed five times or until it is done."""
-    assert killed_runs(tmp_path, 5, seed=100 + seed) == 120
+    assert killed_runs(tmp_path, 5, seed=100 + seed, experiments=60) == 240

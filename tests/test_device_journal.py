@@ -262,8 +262,9 @@ class FailingDisk(Disk):
         super().replace(source, target)
 
 
-@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EIO, errno.EROFS])
-@pytest.mark.parametrize("part", [0.0, 0.6, 1.0])
+@pytest.mark.parametrize(
+    ("number", "part"), [(errno.ENOSPC, 0.6), (errno.ENOSPC, 1.0), (errno.EIO, 0.0), (errno.EROFS, 0.0)]
+)
 def test_disk_error_at_every_call_stops_cleanly_and_loses_nothing(tmp_path, number, part):
     for at in itertools.count(1):
         folder, acknowledged = tmp_path / str(at), [0]
@@ -493,8 +494,8 @@ def killed_writers(folder: Path, kills: int, seed: int) -> tuple[int, int]:
 
 
 def test_killed_writers_lose_nothing(tmp_path):
-    total, _ = killed_writers(tmp_path / "run", 10, seed=1)
-    assert total > 10
+    total, _ = killed_writers(tmp_path / "run", 6, seed=1)
+    assert total > 6
 
 
 @pytest.mark.slow
