@@ -29,6 +29,20 @@ LEVELS: tuple[tuple[str, ...], ...] = (
     ("cli",),
 )
 """From bottom to top: a module imports only modules of lower levels."""
+DEVICE_LEVELS: tuple[tuple[str, ...], ...] = (
+    ("protocol",),
+    ("model", "journal", "driver", "estimate"),
+    ("virtual", "camera", "record"),
+    ("twin",),
+    ("observation",),
+    ("acquisition",),
+    ("session",),
+    ("doctor",),
+)
+"""The same inside `device/`, beside the middle: it may import the flat modules below the model, never JAX."""
+BELOW_DEVICE = {"files", "rigs", "campaign", "classic", "simulation", "spots"}
+DEVICE_OPTIONAL = {"renderer"}
+"""Modules of `device/` outside that order: they import no other of it."""
 WITHOUT_JAX = (
     *("files", "rigs", "campaign", "calibration", "classic", "simulation", "protocols"),
     *("boards", "interchange", "spots", "certificate", "report"),
@@ -121,6 +135,19 @@ def test_imports_point_downwards(inner):
 def test_no_cycles(inner):
     """Implied by the levels, and said on its own: a cycle is worse than a wrong level."""
     assert not [name for name in inner if name in reachable(inner, name)]
+
+
+def test_device_imports_point_downwards_and_reach_no_model():
+    paths = {path.stem: path for path in (PACKAGE / "device").glob("*.py") if path.stem != "__init__"}
+    level = {name: number for number, names in enumerate(DEVICE_LEVELS) for name in names}
+    assert set(paths) - DEVICE_OPTIONAL == set(level)
+    for name, path in paths.items():
+        found = imported(ast.parse(path.read_text()))
+        inside = {other.split(".")[2] for other in found if other.startswith("tvsbayes.device.")}
+        flat = {other.split(".")[1] for other in found if other.startswith("tvsbayes.")} - {"device"}
+        assert not [other for other in inside & set(level) if level[other] >= level.get(name, 0)], name
+        assert flat <= BELOW_DEVICE, name
+        assert not {other.split(".")[0] for other in found} & JAX_FAMILY, name
 
 
 @pytest.mark.parametrize("name", WITHOUT_JAX)

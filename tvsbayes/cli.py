@@ -1,7 +1,8 @@
 """The command line: reads options, calls the library, prints tables or one JSON document (DESIGN 8).
 
 Heavy modules are imported inside the commands that need them; `tvsbayes --help` loads none of them. Exit codes:
-0 done, 1 done but a limit is not met, 2 bad input, 3 nothing to estimate, 4 not converged, 130 interrupted.
+0 done, 1 done but a limit or target is not met, 2 bad input, 3 nothing to estimate, 4 not converged, 5 device fault,
+130 interrupted.
 """
 
 from __future__ import annotations
@@ -336,13 +337,23 @@ def _image_size(text: str | None) -> tuple[int, int] | None:
 @app.command()
 def check(
     path: Annotated[Path, typer.Argument(metavar="PATH", help="Campaign folder, rig file or plan.")],
+    repair_to: Annotated[
+        Path | None, typer.Option("--repair-to", help="New folder for what is whole of a damaged journal.")
+    ] = None,
     as_json: Json = False,
 ) -> None:
-    """Read a campaign, rig or plan strictly and say what it holds and what it cannot tell."""
+    """Read a campaign, rig, plan or journal strictly and say what it holds and what it cannot tell."""
     from tvsbayes.campaign import read_campaign, read_plan
     from tvsbayes.protocols import check_campaign
     from tvsbayes.rigs import read_rig
 
+    if repair_to is not None:
+        from tvsbayes.device.session import repair_campaign
+
+        document = repair_campaign(path, repair_to)
+        lines = [f"{key}: {value}" for key, value in document.items()]
+        _finish(document, "\n".join([*lines, f"{escaped(str(repair_to), 200)}: written"]), as_json)
+        return
     if path.suffix == ".csv":
         steps = read_plan(path)
         actions = {action: sum(s.action == action for s in steps) for action in ("home", "place", "move", "look")}
@@ -351,12 +362,97 @@ def check(
         rig = read_rig(path)
         document = {"kind": "rig", "sheets_mm": rig.sheets_mm, "costs_s": rig.costs_s, "warnings": []}
     else:
-        document = check_campaign(read_campaign(path)).as_json()
+        journal = None
+        if (path / "log.jsonl").is_file():
+            from tvsbayes.device.session import check_journal
+
+            journal = check_journal(path)
+        if journal is not None and not journal["moves"]:
+            document = {"kind": "journal", **journal}
+        else:
+            document = check_campaign(read_campaign(path)).as_json()
+            if journal is not None:
+                document["warnings"] = [*journal.pop("warnings"), *document["warnings"]]
+                document["journal"] = journal
     warnings = document["warnings"]
     lines = [f"{key}: {value}" for key, value in document.items() if key != "warnings"]
     lines += [f"warning: {warning}" for warning in warnings]
     lines.append(f"{escaped(str(path), 200)}: readable, {len(warnings)} warning{'s' * (len(warnings) != 1)}")
     _finish(document, "\n".join(lines), as_json)
+
+
+@app.command()
+def acquire(
+    rig: Annotated[Path, typer.Argument(metavar="RIG", help="Rig file.")],
+    plan: Annotated[Path, typer.Argument(metavar="PLAN", help="plan.csv.")],
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="Campaign folder to write.")],
+    simulate: Annotated[bool, typer.Option("--simulate", help="The digital twin instead of hardware.")] = False,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on with an interrupted run.")] = False,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="List what would happen; nothing moves.")] = False,
+    laser_class: Annotated[
+        str | None, typer.Option("--laser-class", help="Class on the laser's label: states the hazard is known.")
+    ] = None,
+    target_u: Annotated[
+        float | None,
+        typer.Option("--target-u", min=0.0, help="Stop when every effective ratio is known to this u, deg/step."),
+    ] = None,
+    seed: Seed = 0,
+    as_json: Json = False,
+) -> None:
+    """Drive positioner and cameras through a plan into a campaign; nothing is lost, whatever ends it.
+
+    LASER: 808 nm is invisible and likely class 3B. Goggles on, beam path shut in.
+    """
+    from tvsbayes.campaign import read_plan
+    from tvsbayes.rigs import read_rig
+
+    instrument, steps = read_rig(rig), read_plan(plan)
+    from tvsbayes.device.acquisition import check_plan, outline, seconds_of
+    from tvsbayes.device.session import LiveLine
+    from tvsbayes.device.session import acquire as run_plan
+
+    if dry_run:
+        check_plan(instrument, steps)
+        lines, minutes = outline(instrument, steps), seconds_of(instrument, steps) / 60
+        document: dict[str, Any] = {"steps": lines, "minutes": minutes}
+        _finish(document, "\n".join([*lines, f"{len(lines)} steps, about {minutes:.0f} min"]), as_json)
+        return
+    with LiveLine() as line:
+        options = {"simulate": simulate, "resume": resume, "laser_class": laser_class, "seed": seed}
+        options["target_u_deg_per_step"] = target_u
+        outcome = run_plan(instrument, steps, out, **options, say=report_line, show=line.show, ask=line.ask)
+    document = {"campaign": str(out), **outcome.as_json()}
+    text = f"{escaped(str(out), 200)}: {outcome.reason}, {outcome.ok} of {outcome.looks} looks count"
+    _finish(document, "\n".join([text, *(f"warning: {warning}" for warning in outcome.warnings)]), as_json)
+    if outcome.reason in ("interrupted", "declined"):
+        report_line(f"{outcome.reason}; go on with --resume")
+        raise _Ended(INTERRUPTED)
+    if target_u is not None and outcome.reason != "target met":
+        report_line("the plan is done and the target is not met: plan more with tvsbayes plan --given")
+        raise _Ended(1)
+
+
+@app.command()
+def doctor(
+    rig: Annotated[Path, typer.Argument(metavar="RIG", help="Rig file.")],
+    laser: Annotated[
+        bool, typer.Option("--laser", help="LASER ON for one picture, invisible and likely class 3B: goggles on.")
+    ] = False,
+    as_json: Json = False,
+) -> None:
+    """Check ports, firmware, cameras, exposure, focus, laser, timing and disk; nothing moves."""
+    from tvsbayes.device.doctor import examine
+    from tvsbayes.files import DeviceFault
+    from tvsbayes.rigs import read_rig
+
+    checks = examine(read_rig(rig), Path.cwd(), laser=laser)
+    lines = [f"{c.status:8} {c.name}: {c.found}" + (f"; {c.remedy}" if c.remedy else "") for c in checks]
+    faults = [c for c in checks if c.status == "fault"]
+    error = None
+    if faults:
+        message = f"{len(faults)} faults: {', '.join(c.name for c in faults)}"
+        error = DeviceFault("doctor", message, remedy=faults[0].remedy)
+    _finish({"checks": [c.as_json() for c in checks]}, "\n".join(lines), as_json, error)
 
 
 @app.command()

@@ -90,6 +90,12 @@ class NotConverged(TvsError):
     exit_code = 4
 
 
+class DeviceFault(TvsError):
+    """The positioner, a camera or the disk failed while an instrument was in use (exit 5)."""
+
+    exit_code = 5
+
+
 INTEGER = re.compile(r"[+-]?[0-9]{1,18}")
 _CONTROL = re.compile(r"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f]")
 

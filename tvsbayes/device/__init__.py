@@ -1,1 +1,9 @@
-"""The instrument at the other end of the cable, and the virtual one that stands in for it."""
+"""The instrument: protocol, firmware, driver, journal, engine; its cameras, real or rendered, and what they see."""
+
+from importlib import resources
+from pathlib import Path
+
+
+def firmware_folder() -> Path:
+    """Where the firmware's sources and its README with flashing instructions lie."""
+    return Path(str(resources.files("tvsbayes.device") / "firmware"))

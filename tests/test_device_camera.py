@@ -1,0 +1,188 @@
+"""Cameras: no frame older than the request, settings read back, the MJPEG path over the loopback."""
+
+from __future__ import annotations
+
+import itertools
+
+import cv2
+import numpy as np
+import pytest
+
+from tvsbayes.device.camera import OpenCVCamera, StereoImage, VirtualCamera, open_cameras, open_capture
+from tvsbayes.device.virtual import VirtualClock
+from tvsbayes.files import DeviceFault, InputError
+
+WIDTH, HEIGHT = 64, 48
+
+
+class FakeCapture:
+    """A camera of 30 frames/s with a buffer and a transfer delay; every picture holds the time of its exposure.
+
+    Pixel (0, 0) holds the exposure's start in ms, modulo 65536, in its first two channels.
+    """
+
+    decode_s = 0.001
+
+    def __init__(self, clock, buffered=4, transfer_s=0.02, period_s=1 / 30, width=2 * WIDTH, obeys=True):
+        self.clock, self.buffered, self.transfer_s, self.period_s = clock, buffered, transfer_s, period_s
+        self.width, self.obeys, self.properties, self.next = width, obeys, {}, 0
+        self.released = False
+
+    def grab(self):
+        newest = int((self.clock.monotonic() - self.transfer_s) / self.period_s) - 1
+        self.next = max(self.next, newest - self.buffered + 1)
+        ready_s = (self.next + 1) * self.period_s + self.transfer_s
+        self.clock.sleep(max(ready_s - self.clock.monotonic(), 0.0) + self.decode_s)
+        self.current = self.next
+        self.next += 1
+        return True
+
+    def retrieve(self):
+        picture = np.zeros((HEIGHT, self.width, 3), np.uint8)
+        exposed_ms = round(self.current * self.period_s * 1000)
+        picture[0, 0, :2] = exposed_ms % 256, exposed_ms // 256
+        return True, picture
+
+    def get(self, prop):
+        return self.properties.get(prop, 0.0)
+
+    def set(self, prop, value):
+        if self.obeys:
+            self.properties[prop] = value
+        return self.obeys
+
+    def release(self):
+        self.released = True
+
+
+def exposed_s(picture) -> float:
+    return (int(picture[0, 0, 0]) + 256 * int(picture[0, 0, 1])) / 1000
+
+
+@pytest.mark.parametrize("buffered", [1, 2, 4, 16, 60])
+@pytest.mark.parametrize("transfer_s", [0.0, 0.02, 0.03])
+@pytest.mark.parametrize("decode_s", [0.001, 0.015])
+def test_no_frame_is_older_than_the_request(buffered, transfer_s, decode_s):
+    clock = VirtualClock()
+    capture = FakeCapture(clock, buffered, transfer_s)
+    capture.decode_s = decode_s
+    camera = OpenCVCamera([capture], WIDTH, HEIGHT, clock=clock)
+    for pause_s in (0.0, 0.004, 0.011, 0.3, 5.0, 0.029, 0.033, 0.001):
+        clock.sleep(pause_s)
+        asked_s = clock.monotonic()
+        image = camera.grab()
+        assert exposed_s(image.left) >= asked_s - 0.001, (buffered, transfer_s, pause_s)
+        assert clock.monotonic() - asked_s < (2 * buffered + 5) / 30
+    camera.close()
+    assert capture.released
+
+
+def test_without_flushing_the_frames_would_be_old():
+    """The test above can fail: the plain next frame is older than its request."""
+    clock = VirtualClock()
+    capture = FakeCapture(clock)
+    clock.sleep(1.0)
+    capture.grab()
+    assert exposed_s(capture.retrieve()[1]) < 0.9
+
+
+def test_camera_that_never_waits_is_refused():
+    clock = VirtualClock()
+    camera = OpenCVCamera([FakeCapture(clock, period_s=1e-6)], WIDTH, HEIGHT, clock=clock)
+    with pytest.raises(DeviceFault) as caught:
+        camera.grab()
+    assert caught.value.code == "stale"
+
+
+def test_two_devices_are_flushed_both():
+    clock = VirtualClock()
+    pair = [FakeCapture(clock, 3, width=WIDTH), FakeCapture(clock, 40, 0.03, width=WIDTH)]
+    camera = OpenCVCamera(pair, WIDTH, HEIGHT, clock=clock)
+    clock.sleep(2.0)
+    asked_s = clock.monotonic()
+    image = camera.grab()
+    assert min(exposed_s(image.left), exposed_s(image.right)) >= asked_s - 0.001
+    assert image.left.shape == image.right.shape == (HEIGHT, WIDTH, 3)
+
+
+def test_side_by_side_is_split_in_the_middle():
+    clock = VirtualClock()
+    capture = FakeCapture(clock)
+    both = np.zeros((HEIGHT, 2 * WIDTH, 3), np.uint8)
+    both[:, :WIDTH], both[:, WIDTH:] = 10, 200
+    capture.retrieve = lambda: (True, both)
+    image = OpenCVCamera([capture], WIDTH, HEIGHT, clock=clock).grab()
+    assert (image.left == 10).all() and (image.right == 200).all()
+
+
+def test_settings_are_fixed_and_read_back():
+    clock = VirtualClock()
+    capture = FakeCapture(clock)
+    camera = OpenCVCamera([capture], WIDTH, HEIGHT, exposure=-6.0, clock=clock)
+    values = camera.settings().values
+    assert values["stereo.exposure"] == -6.0 and values["stereo.auto_exposure"] == 1.0
+    assert capture.properties[cv2.CAP_PROP_AUTO_WB] == 0 == capture.properties[cv2.CAP_PROP_AUTOFOCUS]
+    assert capture.properties[cv2.CAP_PROP_FRAME_WIDTH] == 2 * WIDTH and camera.settings().warnings == ()
+
+
+def test_what_cannot_be_fixed_is_said():
+    clock = VirtualClock()
+    camera = OpenCVCamera([FakeCapture(clock, obeys=False)], WIDTH, HEIGHT, clock=clock)
+    assert "automatic exposure, white balance, focus" in camera.settings().warnings[0]
+    with pytest.raises(DeviceFault) as caught:
+        OpenCVCamera([capture := FakeCapture(clock, obeys=False)], WIDTH, HEIGHT, exposure=10.0, clock=clock)
+    assert caught.value.code == "exposure" and capture.released
+
+
+def test_wrong_size_and_no_frame_are_named():
+    clock = VirtualClock()
+    camera = OpenCVCamera([FakeCapture(clock, width=WIDTH)], WIDTH, HEIGHT, clock=clock)
+    with pytest.raises(DeviceFault, match="64 x 48 px; 128 x 48 px were calibrated"):
+        camera.grab()
+    silent = FakeCapture(clock)
+    silent.grab = lambda: False  # from the first frame on
+    with pytest.raises(DeviceFault) as caught:
+        OpenCVCamera([silent], WIDTH, HEIGHT, clock=clock).grab()
+    assert caught.value.code == "no-frame"
+
+
+def test_cameras_of_a_rig_file():
+    clock, opened = VirtualClock(), []
+
+    def opener(source):
+        opened.append(source)
+        return FakeCapture(clock, width=WIDTH)
+
+    open_cameras({"left": 0, "right": "/dev/video2"}, WIDTH, HEIGHT, opener, clock)
+    assert opened == [0, "/dev/video2"]
+    for table in ({}, {"left": 0}, {"source": 0, "left": 0, "right": 1}):
+        with pytest.raises(InputError):
+            open_cameras(table, WIDTH, HEIGHT, opener, clock)
+    with pytest.raises(InputError):
+        open_capture("file:///etc/passwd")
+
+
+def test_stream_over_http_from_rendering_to_pictures():
+    """Every frame carries its number as grey level on both sides; a grab never returns one rendered before it."""
+    numbers, rendered = itertools.count(1), []
+
+    def render():
+        number = next(numbers)
+        rendered.append(number)
+        pair = [np.full((HEIGHT, WIDTH, 3), 3 * (number % 80) + offset, np.uint8) for offset in (0, 10)]
+        return StereoImage(*pair)
+
+    with VirtualCamera(render, frames_per_s=40) as virtual:
+        camera = open_cameras({"source": virtual.address}, WIDTH, HEIGHT)
+        for _ in range(3):
+            before = rendered[-1]
+            image = camera.grab()
+            left, right = image.left.mean(), image.right.mean()
+            # Grey levels survive a JPEG of quality 97 within one.
+            assert right - left == pytest.approx(10, abs=1)
+            number = round(left / 3)
+            assert (number - before) % 80 >= 1 and (number - before) % 80 < 40
+            assert image.left.std() < 1
+        camera.close()
+    with pytest.raises(DeviceFault):
+        open_capture("http://127.0.0.1:9/stereo.mjpg")

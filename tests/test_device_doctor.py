@@ -1,0 +1,125 @@
+"""The doctor: every finding comes with what to do, nothing moves, the laser ends off."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tvsbayes.device.camera import CameraSettings, StereoImage
+from tvsbayes.device.doctor import examine
+from tvsbayes.device.driver import SerialPositioner
+from tvsbayes.device.model import Mechanics
+from tvsbayes.device.virtual import ModelLink, SimulatedDevice, VirtualClock
+from tvsbayes.files import DeviceFault, shipped_data
+from tvsbayes.rigs import read_rig
+
+RIG = read_rig(shipped_data() / "rigs" / "mounted" / "rig.toml")
+
+
+class Camera:
+    """Pictures of a textured sheet at a mean grey level; a bright spot while the laser is on."""
+
+    def __init__(self, device, level=40.0, texture=10.0, spot=150, warnings=(), fail_at=99):
+        self.device, self.level, self.texture, self.spot = device, level, texture, spot
+        self.warnings, self.left, self.closed = warnings, fail_at, False
+
+    def settings(self):
+        return CameraSettings({"stereo.exposure": -6.0}, tuple(self.warnings))
+
+    def grab(self):
+        self.left -= 1
+        if self.left == 0:
+            raise DeviceFault("no-frame", "gone", remedy="plug it in")
+        picture = np.random.default_rng(1).normal(self.level, self.texture, (60, 80, 3))
+        if self.device.mechanics.laser_on:
+            picture[30, 40] += self.spot
+        picture = np.clip(picture, 0, 255).astype(np.uint8)
+        return StereoImage(picture, picture)
+
+    def close(self):
+        assert not self.device.mechanics.laser_on
+        self.closed = True
+
+
+def bench(**camera):
+    device = SimulatedDevice(VirtualClock(), Mechanics(home_steps=(-60, -40)))
+    return device, Camera(device, **camera)
+
+
+def found(device, camera, tmp_path, *, laser=False, homed=True):
+    """The checks by name, after a homing where wanted."""
+    links = lambda: ModelLink(device)  # noqa: E731
+    if homed:
+        first = SerialPositioner(links, {"hp": -60, "ht": -40}, device.clock)
+        first.home()
+        first.close()
+    before = list(device.mechanics.true_steps)
+    checks = examine(
+        RIG,
+        tmp_path / "not yet there",
+        laser=laser,
+        open_positioner=lambda: SerialPositioner(links, {}, device.clock),
+        open_camera=lambda: camera,
+        clock=device.clock,
+    )
+    assert device.mechanics.true_steps == before, "nothing moves"
+    assert not device.mechanics.laser_on
+    assert all(check.remedy for check in checks if check.status != "ok")
+    assert len({check.name for check in checks}) == len(checks)
+    return {check.name: check for check in checks}
+
+
+def test_healthy_instrument(tmp_path):
+    device, camera = bench()
+    checks = found(device, camera, tmp_path, laser=True)
+    assert {name for name, check in checks.items() if check.status != "ok"} == {"limits"}
+    assert checks["firmware"].found == "version 1.0.0" and "rises by" in checks["laser"].found
+    assert checks["timing"].found.startswith("0.6 ms, 0 of 20") and camera.closed
+
+
+@pytest.mark.parametrize(
+    ("camera", "name", "word"),
+    [
+        ({"level": 200.0}, "exposure left", "darken"),
+        ({"level": 0.0, "texture": 0.5}, "exposure right", "cap"),
+        ({"texture": 0.0}, "focus left", "focus"),
+        ({"warnings": ["stereo: focus cannot be fixed"]}, "camera settings", "camera's own"),
+        ({"spot": 5}, "laser", "infrared filter"),
+        ({"fail_at": 2}, "laser", "plug it in"),
+    ],
+)
+def test_bad_pictures_are_named_with_a_remedy(tmp_path, camera, name, word):
+    device, camera = bench(**camera)
+    check = found(device, camera, tmp_path, laser=True)[name]
+    assert check.status in ("warning", "fault") and word in check.remedy
+
+
+def test_laser_stays_off_unless_asked_for(tmp_path):
+    device, camera = bench()
+    seen = []
+    grab = camera.grab
+    camera.grab = lambda: (seen.append(device.mechanics.laser_on), grab())[1]
+    assert found(device, camera, tmp_path)["laser"].status == "skipped"
+    assert seen and not any(seen)
+
+
+def test_unhomed_positioner_refuses_the_laser(tmp_path):
+    device, camera = bench()
+    checks = found(device, camera, tmp_path, laser=True, homed=False)
+    assert (checks["homing"].status, checks["laser"].status) == ("warning", "fault")
+
+
+def test_dead_camera_and_dead_device(tmp_path):
+    device, camera = bench(fail_at=1)
+    checks = found(device, camera, tmp_path, laser=True)
+    assert (checks["cameras"].status, checks["laser"].status) == ("fault", "skipped") and camera.closed
+    device, camera = bench()
+    device.model.receive = lambda data, now_us: None
+    checks = found(device, camera, tmp_path, homed=False)
+    assert checks["firmware"].status == "fault" and camera.closed
+
+
+def test_rig_without_hardware_says_what_is_missing(tmp_path):
+    checks = {check.name: check for check in examine(RIG, tmp_path)}
+    assert "[positioner]" in checks["port"].remedy and checks["cameras"].status == "fault"
+    assert checks["disk flush"].status in ("ok", "warning") and list(tmp_path.iterdir()) == []

@@ -1,0 +1,239 @@
+"""The driver on the device model with a virtual clock: what it does, what it refuses, how it comes back."""
+
+from __future__ import annotations
+
+import os
+import threading
+
+import pytest
+
+from tvsbayes.device.driver import PositionLost, SerialPositioner, device_settings, serial_opener
+from tvsbayes.device.model import DeviceModel, Mechanics
+from tvsbayes.device.protocol import parse_answer, request
+from tvsbayes.device.virtual import ModelLink, SimulatedDevice, VirtualClock
+from tvsbayes.files import DeviceFault
+
+SETTINGS = {"hp": -60, "ht": -40, "pmin": -300, "pmax": 300, "wd": 2000}
+
+
+def simulated(**mechanics) -> SimulatedDevice:
+    return SimulatedDevice(VirtualClock(), Mechanics(**{"home_steps": (-60, -40), "limit_steps": 900, **mechanics}))
+
+
+def connected(device: SimulatedDevice, settings=None) -> SerialPositioner:
+    return SerialPositioner(lambda: ModelLink(device), SETTINGS if settings is None else settings, device.clock)
+
+
+def test_a_session_from_connection_to_close():
+    device = simulated()
+    positioner = connected(device)
+    assert positioner.identity["fw"] == "1.0.0" and positioner.repeats == 0
+    report = positioner.home()
+    assert not report.known and (report.state.pan_steps, report.state.tilt_steps) == (-60, -40)
+    state = positioner.move_to(200, -15)
+    assert (state.pan_steps, state.tilt_steps) == (200, -15) == tuple(device.mechanics.true_steps)
+    assert positioner.laser(True).laser_on and device.mechanics.laser_on
+    assert positioner.move_to(200, -15).pan_steps == 200, "a move of no steps is done at once"
+    positioner.close()
+    assert not device.mechanics.laser_on
+    positioner.close()
+
+
+def test_a_second_program_goes_on_in_the_same_sequence():
+    device = simulated()
+    first = connected(device)
+    first.home()
+    first.close()
+    second = connected(device)
+    assert second.home().known is False, "what happened before this connection is not known"
+    assert second.move_to(5, 5).tilt_steps == 5
+
+
+@pytest.mark.parametrize(
+    ("action", "code"),
+    [
+        (lambda p, d: p.move_to(1, 1), "refused-unhomed"),
+        (lambda p, d: p.laser(True), "refused-unhomed"),
+        (lambda p, d: (p.home(), p.move_to(301, 0)), "refused-limit"),
+        (lambda p, d: (p.home(), setattr(d.mechanics, "limit_steps", 100), p.move_to(200, 0)), "alarm-limit"),
+        (lambda p, d: (p.home(), d.power_on(), p.move_to(1, 1)), "reset"),
+    ],
+)
+def test_refusals_and_alarms_are_named(action, code):
+    device = simulated()
+    positioner = connected(device)
+    with pytest.raises(DeviceFault) as caught:
+        action(positioner, device)
+    assert caught.value.code == code and caught.value.exit_code == 5 and caught.value.remedy
+    positioner.close()
+    assert not device.mechanics.laser_on
+
+
+def test_motion_that_somebody_stopped_is_no_arrival():
+    """Even at the very counters ordered: done is what the device says of this motion, not where it stands."""
+    device = simulated()
+    positioner = connected(device)
+    positioner.home()
+    original = device.model._finish_if_at_rest
+
+    def stopped():
+        device.model._stopping = True
+        original()
+
+    device.model._finish_if_at_rest = stopped
+    with pytest.raises(DeviceFault) as caught:
+        positioner.move_to(50, 0)
+    assert caught.value.code == "stopped" and device.mechanics.true_steps[0] == 50
+
+
+def test_lost_steps_show_at_the_next_homing():
+    device = simulated()
+    positioner = connected(device)
+    positioner.home()
+    device.mechanics.missing_steps = [4, 0]
+    positioner.move_to(100, 0)
+    report = positioner.home()
+    assert report.known and report.deviation_steps == (4, 0)
+
+
+def test_wrong_protocol_version_is_named():
+    device = simulated()
+    device.model = DeviceModel(device.mechanics, 1, 0, device._send, protocol=2)
+    with pytest.raises(DeviceFault, match=r"firmware 1\.0\.0 speaks protocol 2, this program speaks 1"):
+        connected(device)
+
+
+def test_other_firmware_that_only_echoes_is_refused():
+    class Echo(ModelLink):
+        def to_device(self, data):
+            self.deliver(data, False, 10)
+
+    device = simulated()
+    with pytest.raises(DeviceFault) as caught:
+        SerialPositioner(lambda: Echo(device), {}, device.clock)
+    assert caught.value.code == "no-answer"
+
+
+def test_port_that_cannot_be_opened():
+    def gone():
+        raise OSError(2, "No such file or directory")
+
+    with pytest.raises(DeviceFault) as caught:
+        SerialPositioner(gone, {}, VirtualClock())
+    assert caught.value.code == "port" and "No such file" in caught.value.message
+
+
+class Plug:
+    """A line that can be pulled: every call fails until it is plugged in again."""
+
+    def __init__(self, device):
+        self.device, self.pulled_until_us = device, 0
+
+    def open(self):
+        plug = self
+        if plug.device.clock.now_us < plug.pulled_until_us:
+            raise OSError(2, "No such file or directory")
+
+        class Pulled(ModelLink):
+            def write(self, data):
+                plug.check()
+                super().write(data)
+
+            def read(self, timeout_s):
+                plug.check()
+                return super().read(timeout_s)
+
+        return Pulled(self.device)
+
+    def check(self):
+        if self.device.clock.now_us < self.pulled_until_us:
+            raise OSError(5, "Input/output error")
+
+
+@pytest.mark.parametrize("reset", [False, True])
+def test_unplugged_and_plugged_in_again(reset):
+    device = simulated()
+    plug = Plug(device)
+    positioner = SerialPositioner(plug.open, SETTINGS, device.clock)
+    positioner.home()
+    positioner.laser(True)
+    plug.pulled_until_us = device.clock.now_us + 5_000_000
+    if reset:
+        device.power_on()
+        with pytest.raises(PositionLost):
+            positioner.move_to(50, 0)
+    else:
+        assert positioner.move_to(50, 0).pan_steps == 50 == device.mechanics.true_steps[0]
+    assert not device.mechanics.laser_on, "the watchdog of the device saw to it meanwhile"
+
+
+def test_unplugged_for_good_is_said_in_time():
+    device = simulated()
+    plug = Plug(device)
+    positioner = SerialPositioner(plug.open, SETTINGS, device.clock)
+    positioner.home()
+    plug.pulled_until_us = 10**12
+    start = device.clock.monotonic()
+    with pytest.raises(DeviceFault) as caught:
+        positioner.move_to(50, 0)
+    assert caught.value.code == "unplugged" and device.clock.monotonic() - start < 15
+    positioner.close()
+
+
+def test_another_program_meanwhile_is_noticed():
+    device = simulated()
+    plug = Plug(device)
+    positioner = SerialPositioner(plug.open, SETTINGS, device.clock)
+    positioner.home()
+    plug.pulled_until_us = device.clock.now_us + 1_000_000
+    device.model.receive(request(500, "MA", 10, 10), device.clock.now_us)
+    with pytest.raises(PositionLost) as caught:
+        positioner.state()
+    assert caught.value.code == "foreign"
+
+
+def test_settings_of_a_rig_file():
+    table = {"driver": "serial", "pan_min_steps": -400, "tilt_max_steps": 10, "speed_steps_per_s": 1e6}
+    assert device_settings(table) == {"pmin": -400, "tmax": 10, "vmax": 20_000}
+
+
+@pytest.mark.skipif(not hasattr(os, "openpty"), reason="pseudo-terminals exist on POSIX only")
+def test_pyserial_on_a_pseudo_terminal():
+    """The same session over a real file descriptor and pyserial; the device's time runs with its bytes."""
+    master, slave = os.openpty()
+    lines: list[bytes] = []
+    device = simulated()
+    device.listener = lines.append
+
+    def serve():
+        # Every request finds the device 2 s later: motions end without anybody waiting.
+        while True:
+            try:
+                data = os.read(master, 4096)
+            except OSError:
+                return
+            device.clock.now_us += 2_000_000
+            device.model.advance(device.clock.now_us)
+            device.model.receive(data, device.clock.now_us)
+            while lines:
+                os.write(master, lines.pop(0))
+
+    thread = threading.Thread(target=serve, daemon=True)
+    thread.start()
+    settings = {**SETTINGS, "wd": 10_000}
+    positioner = SerialPositioner(serial_opener(os.ttyname(slave), 115200), settings)
+    positioner.home()
+    assert positioner.laser(True).laser_on
+    assert positioner.move_to(30, 12).pan_steps == 30
+    positioner.close()
+    assert device.mechanics.true_steps == [30, 12] and not device.mechanics.laser_on
+    os.close(slave)
+    os.close(master)
+
+
+def test_state_reads_as_the_model_says():
+    device = simulated()
+    lines: list[bytes] = []
+    device.listener = lines.append
+    device.model.receive(request(0, "ID"), 0)
+    assert parse_answer(lines[-1][:-1]).state == device.model.state

@@ -1,0 +1,592 @@
+"""The engine that runs a plan on an instrument: home, place, move, look, each on the disk before the next.
+
+A plan describes, the engine does. Whatever ends a run (the plan's end, Ctrl-C, a fault of device, camera or disk),
+the laser is switched off, the end is written down, and the folder is a readable campaign as soon as the first homing
+is logged. `recorded` tells from the journal what is done; a resumed run homes into a new segment, asks for the sheet,
+repeats reference looks and goes on with the first step that is not done.
+
+Counters in motor steps, seconds where a name says `_s`, px as in DESIGN 7.
+"""
+
+from __future__ import annotations
+
+import datetime
+import signal
+import threading
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import FrameType
+from typing import Protocol
+
+import numpy as np
+
+from tvsbayes.campaign import APPROACH_SIGN, PlanStep, Spot
+from tvsbayes.device.driver import Clock, HomeReport, Positioner
+from tvsbayes.device.estimate import RunningEstimate
+from tvsbayes.device.journal import Journal, orphans
+from tvsbayes.device.observation import Observation, Observer
+from tvsbayes.device.protocol import SETTINGS
+from tvsbayes.device.record import (
+    HOME_TOLERANCE_STEPS,
+    Recorded,
+    Recorder,
+    campaign_of,
+    plan_sha256,
+    rig_sha256,
+    write_derived,
+)
+from tvsbayes.files import DeviceFault, TvsError, refusal
+from tvsbayes.rigs import Rig
+
+ATTEMPTS_PER_LOOK = 3
+PLACEMENTS_MAX = 3
+"""How often the operator is asked for the same sheet before the run stops."""
+REFERENCE_LOOKS = 3
+REFERENCE_SHIFT_MAX_PX = 20.0
+"""Change of a reference spot after a resume that is worth a word. A stop error and a home offset of 0.1 degrees
+together move it by 2 px, a sheet put back within 1 mm by as much (f 700 px, 85 mm baseline, 175 mm)."""
+SETTLE_S = 0.3
+"""Rest between motion and picture where the rig file states none: a light mechanism rings for about 0.1 s."""
+CLEARED_STEPS = 20
+"""Fewer steps than these after homing may leave play: then the approach is unknown. 20 steps are 1.2 degrees at 0.06
+degrees per step, against 0.5 degrees of lost motion in the paper."""
+DERIVED_EVERY = 100
+"""Up to this many spots the campaign files are written after every look, then ever more rarely: at least 99 % of the
+looks are in them at any time, all of them in the journal."""
+DEPTH_SHARE = 0.25
+"""Share of the distance to the next target by which a sheet may be off before it counts as misplaced."""
+
+HAZARD = """LASER HAZARD. 808 nm is invisible and likely class 3B: beam and reflections can blind before you blink.
+Before you go on: goggles rated for 808 nm on everybody in the room; beam path shut in; no mirrors, watches, rings;
+door sign and key switch in place. The laser is on only while a picture is taken. Ctrl-C stops: once after the
+present look, twice at once. The firmware's watchdog is a last resort, no interlock."""
+
+
+class Operator(Protocol):
+    """The person at the instrument."""
+
+    def accept(self, hazard: str) -> bool:
+        """Whether the hazard has been read and the run may begin."""
+
+    def place(self, target: str, x_mm: float, placement: int, remark: str) -> bool:
+        """Put the sheet at a target (nominal X in frame S); False stops the run.
+
+        `placement` counts the placements of the plan; the same number again asks for the same place. `remark` says
+        why it is asked, "" for the plan's own.
+        """
+
+
+@dataclass(frozen=True)
+class Progress:
+    """Where a run stands.
+
+    Steps of the plan and looks done and in all, refused looks, repeated ones, seconds left, what is being done, and
+    the running estimate, "" for none.
+    """
+
+    step: int
+    steps: int
+    looks: int
+    looks_total: int
+    refused: int
+    retries: int
+    seconds_left: float
+    doing: str
+    estimate: str = ""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How a run ended.
+
+    Attributes:
+        reason: "done", "target met", "interrupted" or "declined".
+        looks: looks of this campaign, of all its runs.
+        ok: how many of them count.
+        refused: how many found no usable spot.
+        retries: looks repeated in this run.
+        lost_segments: segments in which steps were lost.
+        warnings: what the user should know.
+    """
+
+    reason: str
+    looks: int
+    ok: int
+    refused: int
+    retries: int
+    lost_segments: tuple[int, ...]
+    warnings: tuple[str, ...]
+
+    def as_json(self) -> dict[str, object]:
+        """The document of `tvsbayes acquire`."""
+        return {
+            "reason": self.reason,
+            "looks": self.looks,
+            "ok": self.ok,
+            "refused": self.refused,
+            "retries": self.retries,
+            "lost_segments": list(self.lost_segments),
+            "warnings": list(self.warnings),
+        }
+
+
+class StopKey:
+    """Ctrl-C: the first asks for an end after the present look, the second interrupts at once."""
+
+    def __init__(self, tell: Callable[[str], None] = lambda text: None):
+        self.requested = False
+        self.at_prompt = False
+        """While the operator is asked there is no look to finish: the first Ctrl-C interrupts the question."""
+        self._tell = tell
+        self._before: object = None
+
+    def __enter__(self) -> StopKey:
+        if threading.current_thread() is threading.main_thread():
+            self._before = signal.signal(signal.SIGINT, self._interrupt)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._before is not None:
+            signal.signal(signal.SIGINT, self._before)
+            self._before = None
+
+    def _interrupt(self, number: int, frame: FrameType | None) -> None:
+        if self.requested or self.at_prompt:
+            self.requested = True
+            raise KeyboardInterrupt
+        self.requested = True
+        self._tell("finishing the present look; Ctrl-C again stops at once")
+
+
+class _Stopped(Exception):
+    """Ends the plan early, in good order."""
+
+
+def check_plan(rig: Rig, plan: Sequence[PlanStep]) -> None:
+    """Refuses a plan that this rig cannot run, before anything moves.
+
+    Raises:
+        InputError: targets without a sheet position, counters outside the limits.
+    """
+    names = {"pan": ("pmin", "pmax"), "tilt": ("tmin", "tmax")}
+    for step in plan:
+        if step.action == "place" and step.target not in rig.sheets_mm:
+            allowed = ", ".join(rig.sheets_mm) or "a target named in [sheets]"
+            remedy = "add its nominal X to [sheets] of the rig file"
+            found = f"target {step.target} in step {step.step}"
+            raise refusal("unknown-target", file="plan", found=found, allowed=allowed, remedy=remedy, column="target")
+        for axis, counter in (("pan", step.pan_steps), ("tilt", step.tilt_steps)):
+            if counter is None:
+                continue
+            low, high = (
+                int(rig.positioner.get(f"{axis}_{end}_steps", SETTINGS[name][2]))
+                for end, name in zip(("min", "max"), names[axis], strict=True)
+            )
+            if not low <= counter <= high:
+                remedy = f"correct the plan, or {axis}_min_steps and {axis}_max_steps in [positioner]"
+                found, allowed = f"{counter} in step {step.step}", f"{low} to {high}, the soft limits"
+                column = f"{axis}_steps"
+                raise refusal("limit", file="plan", found=found, allowed=allowed, remedy=remedy, column=column)
+
+
+def seconds_of(rig: Rig, plan: Sequence[PlanStep]) -> float:
+    """What the steps will take by the costs of the rig file, s."""
+    keys = {"home": "move_s", "move": "move_s", "look": "look_s", "place": "placement_s"}
+    return sum(float(rig.costs_s[keys[step.action]]) for step in plan)
+
+
+def begin(folder: Path, rig: Rig, plan: Sequence[PlanStep], resume: bool, header: Mapping[str, object]) -> Journal:
+    """The journal to write: a new one, or the one to go on with.
+
+    Raises:
+        InputError: nothing to go on with, another plan or rig than before, or a folder that has a journal.
+    """
+    hashes = {"plan_sha256": plan_sha256(plan), "rig_sha256": rig_sha256(rig)}
+    if not resume:
+        if folder.is_dir() and any(folder.iterdir()):
+            remedy = "name another folder, or go on with --resume"
+            allowed = "a new or empty folder"
+            raise refusal("occupied", file=str(folder), found="a folder with files", allowed=allowed, remedy=remedy)
+        created = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
+        return Journal.create(folder, **{"created": created, **header}, **hashes)
+    journal = Journal.open(folder)
+    try:
+        for name, now in hashes.items():
+            before = journal.records[0].data.get(name)
+            if before != now:
+                what = name.partition("_")[0]
+                allowed = f"the {what} that this campaign began with (SHA-256 {before})"
+                remedy = f"give the unchanged {what}, or begin a new campaign in another folder"
+                raise refusal("changed", file=what, found=f"another {what}", allowed=allowed, remedy=remedy)
+        for name in ("synthetic", "seed"):
+            if journal.records[0].data.get(name) != header.get(name):
+                allowed = f"{name} {journal.records[0].data.get(name)}, as before"
+                remedy = "give the options of the first run"
+                raise refusal("changed", file=name, found=str(header.get(name)), allowed=allowed, remedy=remedy)
+    except BaseException:
+        journal.close()
+        raise
+    return journal
+
+
+class Acquisition:
+    """One run of a plan, from its first step or from where an earlier run ended.
+
+    Args:
+        rig: the rig.
+        plan: checked by `check_plan`.
+        journal: from `begin`; closed in the end.
+        positioner: connected; closed in the end.
+        observer: takes the looks.
+        operator: is asked before the laser and for every sheet.
+        clock: for settling.
+        utc: the time of day, for `time_s`.
+        stop: the stop key, in force while `run` runs.
+        show: told about progress.
+        annotate: further entries of every motion's event (the twin's true angles).
+        details: what to write down of device and cameras at the start.
+        estimate: the running estimate; a run that meets its target ends.
+    """
+
+    def __init__(
+        self,
+        rig: Rig,
+        plan: Sequence[PlanStep],
+        journal: Journal,
+        positioner: Positioner,
+        observer: Observer,
+        operator: Operator,
+        *,
+        clock: Clock,
+        utc: Callable[[], datetime.datetime],
+        stop: StopKey | None = None,
+        show: Callable[[Progress], None] = lambda progress: None,
+        annotate: Callable[[], Mapping[str, object]] = dict,
+        details: Mapping[str, object] | None = None,
+        estimate: RunningEstimate | None = None,
+    ):
+        self._estimate = estimate
+        self.rig, self.plan, self.journal = rig, tuple(plan), journal
+        self.positioner, self.observer, self.operator = positioner, observer, operator
+        self._clock, self._utc, self._stop, self._show = clock, utc, stop or StopKey(), show
+        self._annotate, self._details = annotate, dict(details or {})
+        self._settle_s = float(rig.positioner.get("settle_s", SETTLE_S))
+        self._retries, self._warnings, self._check_depth = 0, [], False
+        self._recorder = Recorder()
+        for record in journal.records:
+            self._recorder.add(record)
+        self._time_s = max((move.time_s for move in self._recorder.moves), default=0.0)
+        self._spot = self._next_spot()
+
+    def run(self) -> Outcome:
+        """Runs the plan to its end, or to the stop key.
+
+        Raises:
+            DeviceFault: device, camera or disk failed; the journal says so too.
+            KeyboardInterrupt: interrupted twice; laser off, journal closed.
+        """
+        # What stands in the journal where an error of the program itself ends the run.
+        reason, exit_code = "crashed", 1
+        try:
+            with self._stop:
+                try:
+                    reason = self._run()
+                except _Stopped:
+                    reason = "interrupted"
+            exit_code = 130 if reason == "interrupted" else 0
+        except KeyboardInterrupt:
+            reason, exit_code = "interrupted at once", 130
+            raise
+        except TvsError as error:
+            reason, exit_code = error.code, error.exit_code
+            raise
+        finally:
+            # The positioner is closed first: light matters more than the log.
+            self.positioner.close()
+            self._end(reason, exit_code)
+        done = self._recorder.result()
+        spots = done.spots
+        ok = sum(spot.status == "ok" for spot in spots)
+        waiting = sum(spot.status == "undetected" for spot in spots)
+        lost = tuple(segment for segment, _ in done.lost)
+        return Outcome(reason, len(spots), ok, len(spots) - ok - waiting, self._retries, lost, tuple(self._warnings))
+
+    def _run(self) -> str:
+        if not self.operator.accept(HAZARD):
+            return "declined"
+        self._log("start", utc=self._utc_text(), **self._details)
+        resumed = self._recorder.result()
+        if resumed.target:
+            self._confirm_sheet(resumed)
+        if resumed.moves and resumed.next_step < len(self.plan):
+            self._recover(resumed)
+        for step in self.plan[resumed.next_step :]:
+            if self._stop.requested:
+                return "interrupted"
+            self._tell(step)
+            self._do(step)
+            if step.action == "look" and self._estimate is not None and self._estimate.update(self._ok_looks()):
+                reason = "target met"
+                break
+        else:
+            reason = "done"
+        if self._recorder.moves:
+            self._close_segment(self.positioner.home())
+        return reason
+
+    def _ok_looks(self) -> int:
+        return sum(spot.status == "ok" for spot in self._recorder.spots)
+
+    def _end(self, reason: str, exit_code: int) -> None:
+        """Writes down how it ended, as well as the disk allows."""
+        try:
+            self._log("stop", reason=reason, exit_code=exit_code, utc=self._utc_text())
+        except DeviceFault:
+            # A broken disk was the reason, and is on its way to the user already.
+            pass
+        finally:
+            self.journal.close()
+        try:
+            self._derive(always=True)
+        except TvsError as error:
+            # The journal has everything; --resume writes the tables again.
+            self._warnings.append(f"the campaign files are behind the journal: {error.message}")
+
+    def _do(self, step: PlanStep) -> None:
+        if step.action == "home":
+            self._home(step.step, (int(step.pan_steps or 0), int(step.tilt_steps or 0)))
+        elif step.action == "place":
+            self._place(step.target, self._done.placements, "", step.step)
+        elif step.action == "move":
+            self._move(int(step.pan_steps or 0), int(step.tilt_steps or 0), step.step)
+        else:
+            self._look(step.step, step.experiment, step.point)
+
+    @property
+    def _done(self) -> Recorded:
+        """Where the run stands, without its moves and spots."""
+        return self._recorder.state
+
+    def _now_s(self) -> float:
+        """Seconds since the campaign was created, never going back, whatever the clock of the computer does."""
+        created = self.journal.records[0].data.get("created")
+        start = datetime.datetime.fromisoformat(str(created))
+        self._time_s = max(self._time_s, round((self._utc() - start).total_seconds(), 3))
+        return self._time_s
+
+    def _utc_text(self) -> str:
+        return self._utc().isoformat(timespec="milliseconds")
+
+    def _home(self, step: int | None, counters: tuple[int, int]) -> None:
+        self.journal.append("intent", step=step, action="home")
+        report = self.positioner.home()
+        self._close_segment(report)
+        switches = report.state.pan_steps, report.state.tilt_steps
+        state = self.positioner.move_to(*counters)
+        self._clock.sleep(self._settle_s)
+        approach = [
+            _approach(to - start, names)
+            for to, start, names in zip(counters, switches, (("left", "right"), ("up", "down")), strict=True)
+        ]
+        reached = {"pan_steps": state.pan_steps, "tilt_steps": state.tilt_steps, "boot": state.boot}
+        self._log("homed", step=step, time_s=self._now_s(), **reached, approach=approach, **self._annotate())
+
+    def _close_segment(self, report: HomeReport) -> None:
+        """What homing says about the segment that it ends."""
+        if not self._recorder.moves:
+            return
+        known = report.known or report.state.boot == self._done.boot
+        segment, deviation = self._recorder.moves[-1].segment, list(report.deviation_steps) if known else None
+        self._log("verified", segment=segment, deviation_steps=deviation)
+        if deviation is not None and max(map(abs, deviation)) > HOME_TOLERANCE_STEPS:
+            self._warnings.append(
+                f"segment {segment}: the home switches were found {deviation[0]} and {deviation[1]} steps off: steps "
+                "were lost, its spots do not count; lower the speed or free the mechanism"
+            )
+
+    def _place(self, target: str, placement: int, remark: str, step: int | None) -> None:
+        again = step is None
+        if not self.operator.place(target, self.rig.sheets_mm[target], placement, remark):
+            raise _Stopped
+        self._log("placed", step=step, target=target, again=again, utc=self._utc_text())
+        self._check_depth = True
+
+    def _move(self, pan: int, tilt: int, step: int | None, **more: object) -> None:
+        self.journal.append("intent", step=step, action="move", pan_steps=pan, tilt_steps=tilt)
+        state = self.positioner.move_to(pan, tilt)
+        self._clock.sleep(self._settle_s)
+        reached = {"pan_steps": state.pan_steps, "tilt_steps": state.tilt_steps}
+        self._log("moved", step=step, time_s=self._now_s(), **reached, **more, **self._annotate())
+
+    def _look(self, step: int | None, experiment: int | None, point: int | None, reference: Spot | None = None) -> None:
+        for _ in range(PLACEMENTS_MAX):
+            observation = self._observe()
+            wrong = self._misplaced(observation)
+            if wrong is None:
+                break
+            self._place(self._done.target, self._done.placements - 1, wrong, None)
+        else:
+            remedy = "check the sheet and [sheets] of the rig file, then go on with --resume"
+            raise DeviceFault("placement", f"the sheet is not where it should be: {wrong}; {remedy}", remedy=remedy)
+        frames = [self.journal.store(name, data).as_json() for name, data in observation.pictures.items()]
+        found = observation.detection
+        more: dict[str, object] = {}
+        if reference is not None:
+            shift_px = _shift_px(reference, found.pixels_px)
+            more = {"reference_of": reference.spot, "shift_px": shift_px}
+            if shift_px is None or shift_px > REFERENCE_SHIFT_MAX_PX:
+                seen = "is not seen" if shift_px is None else f"has moved by {shift_px:.0f} px"
+                self._warnings.append(f"the reference spot {reference.spot} {seen}: have camera or sheet been moved?")
+        self._log(
+            "looked",
+            step=step,
+            spot=self._spot,
+            target=self._done.target,
+            experiment=experiment,
+            point=point,
+            status=found.status,
+            pixels_px=found.pixels_px,
+            sds_px=found.sds_px,
+            correlations=found.correlations,
+            frames=frames,
+            time_s=self._now_s(),
+            **more,
+        )
+        self._spot += 1
+        self._derive()
+
+    def _observe(self) -> Observation:
+        """A look; one that finds no spot is repeated, the last one counts."""
+        for attempt in range(ATTEMPTS_PER_LOOK):
+            self._retries += attempt > 0
+            observation = self.observer.observe(self.positioner, self._spot)
+            if observation.detection.status in ("ok", "undetected") or self._stop.requested:
+                break
+        return observation
+
+    def _misplaced(self, observation: Observation) -> str | None:
+        """Why the sheet seems to stand elsewhere, judged by the first spot after it was placed."""
+        pixels = observation.detection.pixels_px
+        if not self._check_depth or observation.detection.status != "ok" or pixels is None:
+            return None
+        from tvsbayes.classic import triangulate
+
+        depth = float(triangulate(self.rig.stereo, np.array([pixels]))[0, 0])
+        nominal = self.rig.sheets_mm[self._done.target]
+        others = [abs(x - nominal) for x in self.rig.sheets_mm.values() if x != nominal]
+        tolerance = DEPTH_SHARE * min([*others, nominal])
+        if abs(depth - nominal) > tolerance:
+            return f"its spot lies at X = {depth:.0f} mm, {self._done.target} is at {nominal:.0f} mm"
+        self._check_depth = False
+        return None
+
+    def _confirm_sheet(self, before: Recorded) -> None:
+        self._place(before.target, before.placements - 1, "as before the interruption", None)
+
+    def _recover(self, before: Recorded) -> None:
+        """A new segment at the counters of the old one, reference looks on the way."""
+        if self.plan[before.next_step].action == "home":
+            return
+        last = before.moves[-1]
+        self._home(None, before.home_steps)
+        candidates: dict[tuple[int, int], Spot] = {}
+        for spot in reversed(before.spots):
+            if spot.status == "ok" and spot.target == before.target:
+                move = before.moves[spot.move]
+                candidates.setdefault((move.pan_steps, move.tilt_steps), spot)
+        for (pan, tilt), spot in list(candidates.items())[:REFERENCE_LOOKS]:
+            if self._stop.requested:
+                raise _Stopped
+            self._move(pan, tilt, None, reference=True)
+            self._look(None, None, None, reference=spot)
+        self._move(last.pan_steps, last.tilt_steps, None)
+
+    def _log(self, event: str, **data: object) -> None:
+        self._recorder.add(self.journal.append(event, **data))
+        if event in ("homed", "verified"):
+            self._derive(always=True)
+
+    def _next_spot(self) -> int:
+        """The first number that neither an event nor a frame of an interrupted look has."""
+        used = [spot.spot for spot in self._recorder.spots]
+        used += [int(name.split("/")[1][:6]) for name in orphans(self.journal.folder, tuple(self.journal.records))]
+        return max(used, default=-1) + 1
+
+    def _derive(self, always: bool = False) -> None:
+        count = len(self._recorder.spots)
+        if not always and count > DERIVED_EVERY and count % (count // DERIVED_EVERY):
+            return
+        header = {"name": str(self.journal.records[0].data.get("name", "acquired campaign"))}
+        created = datetime.datetime.fromisoformat(str(self.journal.records[0].data.get("created")))
+        header["created"] = created.astimezone(datetime.UTC)
+        for name in ("synthetic", "seed"):
+            if name in self.journal.records[0].data:
+                header[name] = self.journal.records[0].data[name]
+        campaign = campaign_of(self._recorder.result(), self.rig, header)
+        if campaign is not None:
+            write_derived(campaign, self.journal.folder, tables_only=not always)
+
+    def _tell(self, step: PlanStep) -> None:
+        left = self.plan[step.step :]
+        spots = self._recorder.spots
+        doing = {
+            "home": "homing",
+            "place": f"placing {step.target}",
+            "move": f"moving to {step.pan_steps}, {step.tilt_steps}",
+            "look": "looking",
+        }[step.action]
+        self._show(
+            Progress(
+                step.step,
+                len(self.plan),
+                sum(s.action == "look" for s in self.plan[: step.step]),
+                sum(s.action == "look" for s in self.plan),
+                sum(spot.status not in ("ok", "undetected") for spot in spots),
+                self._retries,
+                seconds_of(self.rig, left),
+                doing,
+                "" if self._estimate is None or self._estimate.latest is None else self._estimate.latest.text,
+            )
+        )
+
+
+def _approach(steps: int, names: tuple[str, str]) -> str:
+    """The side from which an axis stands after homing and a move of so many steps.
+
+    Homing itself ends in the negative sense, over more steps than any play.
+    """
+    if steps == 0:
+        return names[1]
+    name = names[0] if steps > 0 else names[1]
+    assert APPROACH_SIGN[name] * steps > 0
+    return name if abs(steps) >= CLEARED_STEPS or steps < 0 else "unknown"
+
+
+def _shift_px(before: Spot, now: Sequence[float] | None) -> float | None:
+    """Largest change of a coordinate since the reference, px."""
+    if now is None:
+        return None
+    return round(max(abs(a - b) for a, b in zip(_pixels(before), now, strict=True)), 3)
+
+
+def _pixels(spot: Spot) -> tuple[float, ...]:
+    return tuple(float(v or 0.0) for v in (spot.u_left_px, spot.v_left_px, spot.u_right_px, spot.v_right_px))
+
+
+def outline(rig: Rig, plan: Sequence[PlanStep]) -> list[str]:
+    """What a run would do, in words: the listing of `--dry-run`."""
+    lines, counters = [], (0, 0)
+    for step in plan:
+        if step.action in ("home", "move"):
+            after = (int(step.pan_steps or 0), int(step.tilt_steps or 0))
+            verb = "home, then go to" if step.action == "home" else "go to"
+            by = "" if step.action == "home" else f" (by {after[0] - counters[0]:+d}, {after[1] - counters[1]:+d})"
+            lines.append(f"{step.step}: {verb} pan {after[0]}, tilt {after[1]}{by}")
+            counters = after
+        elif step.action == "place":
+            lines.append(f"{step.step}: ask for the sheet at {step.target}, X = {rig.sheets_mm[step.target]:g} mm")
+        else:
+            name = "" if step.experiment is None else f", experiment {step.experiment} point {step.point}"
+            lines.append(f"{step.step}: look{name}")
+    return lines

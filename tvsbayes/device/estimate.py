@@ -1,0 +1,138 @@
+"""The running estimate of an acquisition: a fit in a process of its own, beside the instrument.
+
+The campaign folder is readable at any time, so `tvsbayes fit --no-sample` runs on it as it stands, one fit at a time.
+The acquisition neither waits for it nor shares memory with it: a compiler at work must not delay a laser switch. The
+figures are the effective degrees per step of the beam with their standard uncertainty from the Laplace approximation
+(DESIGN 3.2, 4.2), of the looks that were there when the fit began.
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from tvsbayes.campaign import PlanStep
+
+FIRST_LOOKS = 12
+"""Fewer looks than three experiments of four points say next to nothing."""
+GROWTH = 1.2
+"""The next fit begins when there are so many times more looks than at the last: their sum costs a few fits."""
+_COMMAND = "from tvsbayes.cli import main; main()"
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """Effective degrees per step and their standard uncertainties by direction, from so many looks."""
+
+    looks: int
+    deg_per_step: dict[str, float]
+    u_deg_per_step: dict[str, float]
+
+    @property
+    def text(self) -> str:
+        """For the live line."""
+        parts = (
+            f"{name} {self.deg_per_step[name]:.6f} u {self.u_deg_per_step[name]:.1e}" for name in self.deg_per_step
+        )
+        return ", ".join(parts)
+
+
+def directions_of(plan: Iterable[PlanStep]) -> set[str]:
+    """The directions in which a plan moves."""
+    found, before = set(), (0, 0)
+    for step in plan:
+        if step.action in ("home", "move"):
+            after = (int(step.pan_steps or 0), int(step.tilt_steps or 0))
+            if step.action == "move":
+                for change, names in zip(
+                    (after[0] - before[0], after[1] - before[1]), (("left", "right"), ("up", "down")), strict=True
+                ):
+                    found |= {names[0]} if change > 0 else {names[1]} if change < 0 else set()
+            before = after
+    return found
+
+
+class RunningEstimate:
+    """Fits the folder of a running acquisition again and again.
+
+    Args:
+        folder: the campaign folder.
+        target_u_deg_per_step: the uncertainty wanted of every direction.
+        directions: those that must meet it.
+        wait: whether to wait for every fit: in a simulation time stands still meanwhile.
+        command: in place of `tvsbayes fit`; the campaign folder and a scratch folder are appended.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        target_u_deg_per_step: float,
+        directions: Iterable[str],
+        *,
+        wait: bool = False,
+        command: Sequence[str] | None = None,
+    ):
+        self.folder, self.target, self.directions = Path(folder), float(target_u_deg_per_step), set(directions)
+        self.latest: Estimate | None = None
+        self._wait = wait
+        self._command = list(command) if command is not None else [sys.executable, "-c", _COMMAND, "fit"]
+        self._scratch = tempfile.TemporaryDirectory(prefix="tvsbayes-estimate-")
+        self._process: subprocess.Popen[bytes] | None = None
+        self._looks = 0
+
+    def __enter__(self) -> RunningEstimate:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._process is not None:
+            self._process.kill()
+            self._process.wait()
+        self._scratch.cleanup()
+
+    @property
+    def met(self) -> bool:
+        """Whether every direction of the plan is known as well as wanted."""
+        if self.latest is None:
+            return False
+        u = self.latest.u_deg_per_step
+        return bool(self.directions) and all(u.get(name, float("inf")) <= self.target for name in self.directions)
+
+    def update(self, looks: int) -> bool:
+        """Takes in a finished fit, begins the next one where it pays; whether the target is met."""
+        if self._process is not None and self._process.poll() is not None:
+            self._take()
+        if self._process is None and looks >= max(FIRST_LOOKS, GROWTH * self._looks):
+            self._begin(looks)
+            if self._wait:
+                assert self._process is not None
+                self._process.wait()
+                self._take()
+        return self.met
+
+    def _begin(self, looks: int) -> None:
+        self._looks = looks
+        results = Path(self._scratch.name) / "results"
+        arguments = [*self._command, str(self.folder), "--no-sample", "--json", "--out", str(results)]
+        with open(Path(self._scratch.name) / "fit.json", "wb") as stream:
+            self._process = subprocess.Popen(
+                arguments, stdout=stream, stderr=subprocess.DEVNULL, stdin=subprocess.DEVNULL, start_new_session=True
+            )
+
+    def _take(self) -> None:
+        """A fit that did not work says nothing: the next one has more looks."""
+        self._process = None
+        try:
+            document = json.loads((Path(self._scratch.name) / "fit.json").read_bytes())
+            found = {name: entry for name, entry in document["effective_deg_per_step"].items() if entry is not None}
+            if not document["converged"] or "error" in document:
+                return
+            values = {name: float(entry["value"]) for name, entry in found.items()}
+            sds = {name: float(entry["sd"]) for name, entry in found.items()}
+        except (OSError, ValueError, KeyError, TypeError, AttributeError):
+            return
+        self.latest = Estimate(self._looks, values, sds)
