@@ -30,6 +30,7 @@ from tvsbayes.device.protocol import request
 from tvsbayes.device.record import LOST_STEPS, recorded
 from tvsbayes.device.session import SIMULATED_START, SimulatedOperator, TerminalOperator, acquire, check_journal
 from tvsbayes.device.twin import Instrument
+from tvsbayes.device.vision import live_detector, twin_renderer
 from tvsbayes.files import DeviceFault, InputError, shipped_data
 from tvsbayes.rigs import read_rig
 from tvsbayes.simulation import draw_truth, read_truth, simulate
@@ -523,10 +524,24 @@ def centroids(lit: StereoImage, dark: StereoImage) -> Detection:
     return Detection("ok", tuple(pixels), (0.1,) * 4)
 
 
+def centroids_of_the_twin(rig, truth: dict, move: int) -> np.ndarray:
+    """Where the true cameras see the spot of sheet d1 after a move, without noise: (4,) px."""
+    k, p = np.radians(truth["mirror_angles_deg"][move]), truth["parameters"]
+    still = Instrument(rig, 7)
+    still._y, still._eta = list(np.degrees(k) - [0.0, p["tilt_zero_deg"]]), [0.0, 0.0]
+    still.place("d1", 0)
+    still.mechanics.laser_on = True
+    return still.centroid_px()
+
+
+TWO_LOOKS = (
+    *(PlanStep(0, "home", 0, 0), PlanStep(1, "place", target="d1"), PlanStep(2, "look")),
+    *(PlanStep(3, "move", 60, 10), PlanStep(4, "look")),
+)
+
+
 def test_pictures_through_the_virtual_camera(small_rig, tmp_path):
     """Renderer, MJPEG server, OpenCV, background, detection, journal: spots where the twin has them."""
-    plan = [PlanStep(0, "home", 0, 0), PlanStep(1, "place", target="d1"), PlanStep(2, "look")]
-    plan += [PlanStep(3, "move", 60, 10), PlanStep(4, "look")]
     instrument = Instrument(small_rig, 7)
     rng = np.random.default_rng(0)
     size = (small_rig.stereo.image_height, small_rig.stereo.image_width)
@@ -539,24 +554,45 @@ def test_pictures_through_the_virtual_camera(small_rig, tmp_path):
         return StereoImage(*(np.clip(p, 0, 255).astype(np.uint8) for p in pair))
 
     folder = tmp_path / "c"
-    outcome = acquire(small_rig, plan, folder, simulate=True, seed=7, renderer=renderer, detector=centroids)
+    outcome = acquire(small_rig, TWO_LOOKS, folder, simulate=True, seed=7, renderer=renderer, detector=centroids)
     assert (outcome.ok, outcome.refused) == (2, 0)
     assert verify(folder).frames == 8
     names = sorted(p.name for p in (folder / "frames").iterdir())
     assert names == ["000000_left.png", "000000_right.png", "000001_left.png", "000001_right.png"]
     campaign, truth = read_campaign(folder), json.loads((folder / "truth.json").read_text())
     for spot in campaign.spots:
-        k = np.radians(truth["mirror_angles_deg"][spot.move])
-        p = truth["parameters"]
-        origin, direction = simulation.mirror_chain(*k, p)
-        assert np.isfinite([*origin, *direction]).all()
-        still = Instrument(small_rig, 7)
-        still._y, still._eta = list(np.degrees(k) - [0.0, p["tilt_zero_deg"]]), [0.0, 0.0]
-        still.place("d1", 0)
-        still.mechanics.laser_on = True
         pixels = (spot.u_left_px, spot.v_left_px, spot.u_right_px, spot.v_right_px)
         # JPEG and the threshold move a centroid of a 2 px spot by less than 0.1 px.
-        assert np.abs(still.centroid_px() - pixels).max() < 0.1
+        assert np.abs(centroids_of_the_twin(small_rig, truth, spot.move) - pixels).max() < 0.1
+
+
+def test_rendered_pictures_are_detected_while_the_plan_runs(small_rig, tmp_path):
+    """What `acquire --simulate` does: the twin's cameras rendered, spots fitted with their uncertainty."""
+    folder = tmp_path / "c"
+    vision = {"renderer": twin_renderer(small_rig, 7), "detector": live_detector(small_rig.stereo)}
+    outcome = acquire(small_rig, TWO_LOOKS, folder, simulate=True, seed=7, **vision)
+    assert (outcome.ok, outcome.refused) == (2, 0)
+    truth = json.loads((folder / "truth.json").read_text())
+    for spot in read_campaign(folder).spots:
+        pixels = np.array([spot.u_left_px, spot.v_left_px, spot.u_right_px, spot.v_right_px])
+        sds = np.array([spot.su_left_px, spot.sv_left_px, spot.su_right_px, spot.sv_right_px])
+        assert 0.01 < sds.min() and sds.max() < 0.2
+        # Eight coordinates in all, five sds each: JPEG's blocks add to the noise that is stated.
+        assert np.all(np.abs(centroids_of_the_twin(small_rig, truth, spot.move) - pixels) < 5 * sds)
+
+
+def test_pictures_that_are_no_pair_are_refused(small_rig):
+    dark = np.zeros((small_rig.stereo.image_height, small_rig.stereo.image_width, 3), np.uint8)
+    light = Instrument(small_rig, 7)
+    light.place("d1", 0)
+    light.mechanics.laser_on = True
+    made = twin_renderer(small_rig, 7)(light.light(), 0, 0)
+    detector = live_detector(small_rig.stereo)
+    assert detector(made, made).status == "ok"
+    assert detector(StereoImage(dark, dark), made).status == "no-spot both"
+    assert detector(StereoImage(made.left, dark), made).status == "no-spot right"
+    lifted = np.roll(made.right, 20, axis=0)
+    assert detector(StereoImage(made.left, lifted), made).status == "epipolar"
 
 
 @pytest.mark.skipif(not hasattr(os, "openpty"), reason="pseudo-terminals exist on POSIX only")
@@ -726,9 +762,9 @@ def test_commands(rig, tmp_path, capsys):
     arguments = [str(RIG_FILE), str(tmp_path / "plan.csv"), str(tmp_path / "c")]
     assert run(["acquire", *arguments, "--dry-run", "--json"]) == 0
     assert len(json.loads(capsys.readouterr().out)["steps"]) == 11 and not (tmp_path / "c").exists()
-    assert run(["acquire", *arguments, "--simulate", "--json"]) == 0
+    assert run(["acquire", *arguments, "--simulate", "--centroids", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["ok"] == 4
-    assert run(["acquire", *arguments, "--simulate", "--json"]) == 2
+    assert run(["acquire", *arguments, "--simulate", "--centroids", "--json"]) == 2
     assert json.loads(capsys.readouterr().out)["error"]["code"] == "occupied"
     assert run(["acquire", *arguments[:2], str(tmp_path / "d"), "--json"]) == 2
     assert json.loads(capsys.readouterr().out)["error"]["code"] == "usage" and not (tmp_path / "d").exists()
@@ -764,7 +800,7 @@ def killed_runs(tmp_path: Path, kills: int, seed: int, experiments: int) -> int:
     for number in range(kills + 1):
         resume = ["--resume"] if number and (folder / LOG).exists() else []
         process = subprocess.Popen(
-            [*command, "--simulate", *resume],
+            [*command, "--simulate", "--centroids", *resume],
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             cwd=Path(__file__).parents[1],

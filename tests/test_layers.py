@@ -35,6 +35,7 @@ DEVICE_LEVELS: tuple[tuple[str, ...], ...] = (
     ("virtual", "camera", "record"),
     ("twin",),
     ("observation",),
+    ("vision",),
     ("acquisition",),
     ("session",),
     ("doctor",),

@@ -387,6 +387,9 @@ def acquire(
     plan: Annotated[Path, typer.Argument(metavar="PLAN", help="plan.csv.")],
     out: Annotated[Path, typer.Argument(metavar="OUT", help="Campaign folder to write.")],
     simulate: Annotated[bool, typer.Option("--simulate", help="The digital twin instead of hardware.")] = False,
+    centroids: Annotated[
+        bool, typer.Option("--centroids", help="With --simulate: the twin states centroids, no pictures are made.")
+    ] = False,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with an interrupted run.")] = False,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="List what would happen; nothing moves.")] = False,
     laser_class: Annotated[
@@ -418,8 +421,13 @@ def acquire(
         _finish(document, "\n".join([*lines, f"{len(lines)} steps, about {minutes:.0f} min"]), as_json)
         return
     with LiveLine() as line:
-        options = {"simulate": simulate, "resume": resume, "laser_class": laser_class, "seed": seed}
+        options: dict[str, Any] = {"simulate": simulate, "resume": resume, "laser_class": laser_class, "seed": seed}
         options["target_u_deg_per_step"] = target_u
+        if not centroids:
+            from tvsbayes.device.vision import live_detector, twin_renderer
+
+            options["detector"] = live_detector(instrument.stereo)
+            options["renderer"] = twin_renderer(instrument, seed) if simulate else None
         outcome = run_plan(instrument, steps, out, **options, say=report_line, show=line.show, ask=line.ask)
     document = {"campaign": str(out), **outcome.as_json()}
     text = f"{escaped(str(out), 200)}: {outcome.reason}, {outcome.ok} of {outcome.looks} looks count"

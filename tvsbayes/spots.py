@@ -623,7 +623,8 @@ class Detection:
         }
 
 
-def _status(left: Centre, right: Centre) -> str:
+def pair_status(left: Centre, right: Centre) -> str:
+    """The word "ok", or the reasons of both cameras with their sides, as `spots.csv` holds them."""
     bad = [(c.status, side) for c, side in zip((left, right), SIDES, strict=True) if c.status != "ok"]
     if len(bad) == 2 and bad[0][0] == bad[1][0]:
         return f"{bad[0][0]} both"
@@ -633,7 +634,7 @@ def _status(left: Centre, right: Centre) -> str:
 def _row(spot: Spot, left: Centre, right: Centre) -> Spot:
     """A row with what was found; pixels stay empty where a camera refused."""
     values: dict[str, float | None] = {}
-    status = _status(left, right)
+    status = pair_status(left, right)
     for side, one in zip(SIDES, (left, right), strict=True):
         good = status == "ok"
         sds = np.sqrt(np.diag(one.covariance_px2)) if good else (None, None)
