@@ -11,13 +11,13 @@ from __future__ import annotations
 import datetime
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from typing import TYPE_CHECKING
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
-from scipy import stats
 
 from tvsbayes.calibration import INPUT_NAMES, NORMAL_95, Calibration, direction_of
 from tvsbayes.campaign import Campaign
@@ -34,12 +34,13 @@ from tvsbayes.coordinates import (
     propagate,
     sources,
 )
-from tvsbayes.information import gradients
-from tvsbayes.joint import JointFit, derived_quantities, fit
 from tvsbayes.likelihood import aperture_angle, ordered_spots
 from tvsbayes.model import INDEX, NAMES, RIG_NAMES, Beam, ParameterSpace
-from tvsbayes.posterior import Posterior, looks, looks_again
 from tvsbayes.rigs import RIG_PRIORS, Prior
+
+if TYPE_CHECKING:
+    from tvsbayes.joint import JointFit
+    from tvsbayes.posterior import Posterior
 
 STOP_HERE, APERTURE_HERE, PLAY_HERE = "stop error here", "aperture noise here", "unknown approach here"
 """Causes that belong to the one look and not to the calibration."""
@@ -104,6 +105,7 @@ class ErrorMap:
         bias_mm: mean error vector, by estimator, shape (pan, tilt, range, 3).
         inside: counters within those of the campaign.
         valid: every estimator asked finds a point in all but `coordinates.DIVERGING_SHARE` of the draws.
+        distance_mm: 3D errors by estimator, arrays (draws, pan, tilt, range), infinite where there is no point.
     """
 
     pan_steps: np.ndarray
@@ -113,6 +115,7 @@ class ErrorMap:
     bias_mm: Mapping[str, np.ndarray]
     inside: np.ndarray
     valid: np.ndarray
+    distance_mm: Mapping[str, np.ndarray]
 
 
 class _Errors(eqx.Module):
@@ -173,9 +176,22 @@ def error_map(
     axes = [np.asarray(x, dtype=float) for x in (pan_steps, tilt_steps, range_mm)]
     pan, tilt, ranges = (x.ravel() for x in np.meshgrid(*axes, indexing="ij"))
     steps = np.stack([pan, tilt], axis=1)
-    names, found = _error_draws(calibration, steps, ranges, simple, approach, draws, seed)
+    given = sources(calibration, draws, seed)
+    with jax.enable_x64(True):
+        sides = jnp.tile(jnp.asarray(approach, dtype=float), (len(steps), 1))
+        settings = Settings(jnp.asarray(steps, dtype=float), sides, jnp.zeros(len(steps)))
+        best = jnp.concatenate([given.mean[: len(INPUT_NAMES)], given.stop_sd_deg])
+        estimate = model_from(best, given.period_deg)
+        joint = beams_at(estimate, settings.steps, settings.side, jnp.zeros(NOISES))
+        names = ("joint", *simple)
+        known = (joint, *(simple_rays(s, steps) for s in simple.values()))
+        a = calibration.estimates["baseline_mm"]
+        # `meeting` puts the aperture at half the distance it is given; a simple user's stands at origin - baseline.
+        bases = [a, *(2 * (s.baseline_mm - s.origin_y_mm) for s in simple.values())]
+        zeros = [np.radians(calibration.estimates["aperture_zero_deg"]), *(0.0 for _ in simple)]
+        found = _errors(settings, jnp.asarray(ranges), known, jnp.asarray([bases, zeros]), given)
     shape = tuple(len(x) for x in axes)
-    rms, bias, valid = {}, {}, np.ones(shape, dtype=bool)
+    rms, bias, distance, valid = {}, {}, {}, np.ones(shape, dtype=bool)
     for name, error, meets in zip(names, np.asarray(found.error_mm), np.asarray(found.meets), strict=True):
         share = (~meets).mean(axis=0)
         kept = np.where(meets[:, None], error, 0.0)
@@ -185,36 +201,12 @@ def error_map(
         rms[name] = np.where(usable, np.sqrt(square), np.nan).reshape(shape)
         bias[name] = np.where(usable, kept.sum(axis=0) / count, np.nan).T.reshape(*shape, 3)
         valid &= usable.reshape(shape)
+        length = np.where(meets, np.linalg.norm(error, axis=1), np.inf)
+        distance[name] = length.reshape(-1, *shape)
     (pan_low, pan_high), (tilt_low, tilt_high) = calibration.range_steps
     within = (pan >= pan_low) & (pan <= pan_high) & (tilt >= tilt_low) & (tilt <= tilt_high)
-    return ErrorMap(*axes, rms_mm=rms, bias_mm=bias, inside=within.reshape(shape), valid=valid)
-
-
-def distances(
-    calibration: Calibration,
-    steps: tuple[float, float],
-    range_mm: float,
-    *,
-    simple: Mapping[str, SimpleCalibration],
-    draws: int = 4096,
-    seed: int = 0,
-) -> dict[str, np.ndarray]:
-    """How far each estimator's point lies from the true one, mm, over the rigs that the data allow.
-
-    Args:
-        calibration: with draws.
-        steps: counters (pan, tilt), reached moving left and up.
-        range_mm: along the beam.
-        simple: further calibrations by name.
-        draws: rigs.
-        seed: of their stop errors and aperture noise.
-
-    Returns:
-        Draws (n,) by estimator, "joint" first; infinite where beam and aperture do not meet.
-    """
-    names, found = _error_draws(calibration, np.array([steps]), np.array([range_mm]), simple, (1.0, 1.0), draws, seed)
-    length = np.linalg.norm(np.asarray(found.error_mm)[..., 0], axis=2)
-    return dict(zip(names, np.where(np.asarray(found.meets)[..., 0], length, np.inf), strict=True))
+    inside = within.reshape(shape)
+    return ErrorMap(*axes, rms_mm=rms, bias_mm=bias, inside=inside, valid=valid, distance_mm=distance)
 
 
 MET, NOT_MET = "met", "not met"
@@ -245,33 +237,6 @@ def criterion(quantity: str, errors: np.ndarray, limit: float, unit: str) -> Cri
     probability = float(np.mean(np.abs(errors) <= limit))
     verdict = MET if probability >= MET_PROBABILITY else NOT_MET if probability <= 1 - MET_PROBABILITY else CANNOT_TELL
     return Criterion(quantity, limit, unit, probability, verdict)
-
-
-def _error_draws(
-    calibration: Calibration,
-    steps: np.ndarray,
-    ranges: np.ndarray,
-    simple: Mapping[str, SimpleCalibration],
-    approach: tuple[float, float],
-    draws: int,
-    seed: int,
-) -> tuple[tuple[str, ...], _Errors]:
-    """Names of the estimators and their errors at settings (points, 2) and ranges (points,)."""
-    given = sources(calibration, draws, seed)
-    with jax.enable_x64(True):
-        sides = jnp.tile(jnp.asarray(approach, dtype=float), (len(steps), 1))
-        settings = Settings(jnp.asarray(steps, dtype=float), sides, jnp.zeros(len(steps)))
-        best = jnp.concatenate([given.mean[: len(INPUT_NAMES)], given.stop_sd_deg])
-        estimate = model_from(best, given.period_deg)
-        joint = beams_at(estimate, settings.steps, settings.side, jnp.zeros(NOISES))
-        names = ("joint", *simple)
-        known = (joint, *(simple_rays(s, steps) for s in simple.values()))
-        a = calibration.estimates["baseline_mm"]
-        # `meeting` puts the aperture at half the distance it is given; a simple user's stands at origin - baseline.
-        bases = [a, *(2 * (s.baseline_mm - s.origin_y_mm) for s in simple.values())]
-        zeros = [np.radians(calibration.estimates["aperture_zero_deg"]), *(0.0 for _ in simple)]
-        found = _errors(settings, jnp.asarray(ranges), known, jnp.asarray([bases, zeros]), given)
-    return names, found
 
 
 @dataclass(frozen=True)
@@ -425,6 +390,9 @@ def explain_gap(found: JointFit, posterior: Posterior | None = None, draws: int 
     Returns:
         By direction; None without complete experiments.
     """
+    from tvsbayes.joint import derived_quantities
+    from tvsbayes.posterior import looks
+
     selection = select_experiments(found.campaign)
     result: dict[str, Gap | None] = dict.fromkeys(DIRECTIONS)
     if not len(selection.experiments):
@@ -594,6 +562,8 @@ def hold_out(fit_of_all: JointFit, by: str = "steps", seed: int = 0) -> HoldOut:
         by: "steps" or "regions", see `folds_of`.
         seed: of the predictive draws.
     """
+    from tvsbayes.posterior import looks_again
+
     campaign = fit_of_all.campaign
     selection = select_experiments(campaign)
     unseen = dict(zip(DIRECTIONS, _camera_u(fit_of_all).tolist(), strict=True))
@@ -646,6 +616,8 @@ def hold_out(fit_of_all: JointFit, by: str = "steps", seed: int = 0) -> HoldOut:
 
 def _refit(fit_of_all: JointFit, without: frozenset[int]) -> JointFit:
     """The same model on fewer spots; its harmonics, contrasts and backlash are free where they were."""
+    from tvsbayes.joint import fit
+
     held = replace(fit_of_all.campaign, rig=replace(fit_of_all.campaign.rig, priors=_priors_of(fit_of_all)))
     return fit(held, without=without | set(fit_of_all.excluded_spots))
 
@@ -679,6 +651,8 @@ def _foretell_classic(angle: np.ndarray, selection: Selection, out: np.ndarray) 
 
 def _judge(by: str, predictions: list[Prediction], lengths: np.ndarray, unseen: dict[str, float]) -> HoldOut:
     """Scores of both, and whether the difference is more than chance."""
+    from scipy import stats
+
     angle, blocks = np.array([p.angle_deg for p in predictions]), [(p.fold, p.direction) for p in predictions]
     of_block = {b: np.array([x == b for x in blocks]) for b in dict.fromkeys(blocks)}
     scores, means = {}, {}
@@ -727,6 +701,8 @@ def _ratio_interval(first: np.ndarray, second: np.ndarray) -> tuple[float, float
     First and c second have equal mean squares if their sum and difference are uncorrelated: those c for which the
     t test of that correlation (n - 1 degrees of freedom, means known to be 0) does not reject are the interval.
     """
+    from scipy import stats
+
     n = len(first)
     ratio = np.sqrt(np.sum(first**2) / np.sum(second**2))
     correlation = first @ second / np.sqrt(np.sum(first**2) * np.sum(second**2))
@@ -746,6 +722,8 @@ CAMERAS = np.array([INDEX["focal_scale"], *range(len(RIG_NAMES), len(NAMES))])
 
 def _camera_u(found: JointFit) -> np.ndarray:
     """Standard uncertainty (4,) of the effective ratios that stereo calibration and focal scale alone cause."""
+    from tvsbayes.information import gradients
+
     shift = _influence(found, gradients(found, found.draws.effective_deg_per_step))[:, CAMERAS]
     return np.sqrt(np.sum(shift**2, axis=1))
 
@@ -811,6 +789,11 @@ def compare(first: JointFit, second: JointFit) -> Comparison:
         first: converged fit of A.
         second: converged fit of B.
     """
+    from scipy import stats
+
+    from tvsbayes.information import gradients
+    from tvsbayes.joint import derived_quantities
+
     pose = first.reference_pose_rad
     cameras = first.campaign.stereo, second.campaign.stereo
     shared = bool(

@@ -31,7 +31,7 @@ from tvsbayes import plots
 from tvsbayes.calibration import stored_ratios
 from tvsbayes.certificate import FIGURES
 from tvsbayes.classic import DIRECTIONS, ClassicResult, classic
-from tvsbayes.comparison import budget, criterion, distances, error_map, simple_calibration
+from tvsbayes.comparison import budget, criterion, error_map, simple_calibration
 from tvsbayes.coordinates import Settings
 from tvsbayes.files import (
     JSON_BYTES_MAX,
@@ -156,6 +156,9 @@ class Page:
 
 
 MAP_CELLS = 5
+"""Per axis; odd, so that one lies in the middle."""
+MAP_DRAWS = 1000
+"""Rigs of the maps: a probability near 0.95 is then known to 0.007."""
 MAP_RANGES_MM = (300.0, 2000.0)
 """Ranges mapped besides the stated one: the scanner's near and far ends."""
 
@@ -188,7 +191,12 @@ def gather(
         simple["classic"] = simple_calibration(campaign.rig.priors, classic_result)
     (pan_low, pan_high), (tilt_low, tilt_high) = calibration.range_steps
     middle = 0.5 * (pan_low + pan_high), 0.5 * (tilt_low + tilt_high)
-    found = distances(calibration, middle, range_mm, simple=simple)
+    ranges = sorted({*MAP_RANGES_MM, range_mm})
+    pan, tilt = np.linspace(pan_low, pan_high, MAP_CELLS), np.linspace(tilt_low, tilt_high, MAP_CELLS)
+    maps = error_map(calibration, pan, tilt, ranges, simple=simple, draws=MAP_DRAWS)
+    # The middle cell of an odd number is the middle of the counters.
+    cell = MAP_CELLS // 2, MAP_CELLS // 2, ranges.index(range_mm)
+    found = {name: distance[:, *cell] for name, distance in maps.distance_mm.items()}
     criteria = []
     if limit_deg_per_step is not None:
         draws = stored_ratios(campaign)
@@ -199,8 +207,6 @@ def gather(
                 criteria.append(criterion(f"ratio {direction}", errors, limit_deg_per_step, "deg/step"))
     if limit_mm is not None:
         criteria.append(criterion(f"3D point at {range_mm:g} mm", found["joint"], limit_mm, "mm"))
-    ranges = sorted({*MAP_RANGES_MM, range_mm})
-    pan, tilt = np.linspace(pan_low, pan_high, MAP_CELLS), np.linspace(tilt_low, tilt_high, MAP_CELLS)
     ray = calibration.ray(*middle, ("left", "up"))
     reading = calibration.reading(np.asarray(ray.origin_mm) + range_mm * np.asarray(ray.direction))
     with jax.enable_x64(True):
@@ -218,7 +224,7 @@ def gather(
         criteria=criteria,
         distances_mm=found,
         range_mm=range_mm,
-        maps=error_map(calibration, pan, tilt, ranges, simple=simple),
+        maps=maps,
         budget=budget(calibration, settings),
         calibration=calibration,
     )
