@@ -16,10 +16,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tvsbayes.campaign import Campaign, PlanStep, read_campaign, write_campaign, write_plan
+from tvsbayes.campaign import Campaign, PlanStep, grid_protocol, read_campaign, write_campaign, write_plan
 from tvsbayes.cli import run
 from tvsbayes.files import shipped_data
-from tvsbayes.protocols import grid_protocol
 from tvsbayes.simulation import simulate
 
 DATA = shipped_data()

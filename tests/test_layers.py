@@ -16,26 +16,25 @@ LEVELS: tuple[tuple[str, ...], ...] = (
     ("campaign",),
     ("calibration",),
     ("model", "classic", "simulation"),
-    ("protocols",),
     ("likelihood", "solver"),
     ("joint",),
     ("ensemble",),
     ("posterior",),
     ("information",),
     ("coordinates",),
-    ("comparison",),
+    ("comparison", "planning"),
     ("report",),
     ("cli",),
 )
 """From bottom to top: a module imports only modules of lower levels."""
 WITHOUT_JAX = (
-    *("files", "rigs", "campaign", "calibration", "classic", "simulation", "protocols"),
+    *("files", "rigs", "campaign", "calibration", "classic", "simulation"),
     "report",
 )
 MODEL = {
     *("model", "likelihood", "solver", "joint"),
     *("ensemble", "posterior"),
-    *("information", "classic", "calibration", "coordinates", "comparison"),
+    *("information", "classic", "calibration", "coordinates", "comparison", "planning"),
 }
 JAX_FAMILY = {"jax", "jaxlib", "equinox", "optimistix", "lineax", "jaxtyping"}
 MODULES_MAX = 20

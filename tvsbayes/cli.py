@@ -204,7 +204,7 @@ def check(
 ) -> None:
     """Read a campaign, rig or plan strictly and say what it holds and what it cannot tell."""
     from tvsbayes.campaign import read_campaign, read_plan
-    from tvsbayes.protocols import check_campaign
+    from tvsbayes.classic import check_campaign
     from tvsbayes.rigs import read_rig
 
     if path.suffix == ".csv":

@@ -15,12 +15,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from tvsbayes.calibration import INPUT_NAMES, NORMAL_95, Calibration, calibration_of_draws
-from tvsbayes.classic import DIRECTIONS, four_point_ratios, select_experiments
+from tvsbayes.classic import DIRECTIONS, four_point_ratios, observed_stops, select_experiments, separation
 from tvsbayes.joint import Derived, JointFit
 from tvsbayes.likelihood import ordered_spots, standard_deviations_without
 from tvsbayes.model import INDEX, NAMES, RECEIVER_NAMES, RIG_NAMES
 from tvsbayes.posterior import Posterior, ideal_pixels
-from tvsbayes.protocols import observed_stops, separation
 from tvsbayes.rigs import HARMONIC_PRIORS
 
 CONTRACTION_LIMIT = 0.1
