@@ -22,7 +22,9 @@ LEVELS: tuple[tuple[str, ...], ...] = (
     ("posterior",),
     ("information",),
     ("coordinates",),
-    ("comparison", "planning"),
+    ("comparison", "design"),
+    ("planning",),
+    ("studies",),
     ("report",),
     ("cli",),
 )
@@ -34,7 +36,7 @@ WITHOUT_JAX = (
 MODEL = {
     *("model", "likelihood", "solver", "joint"),
     *("ensemble", "posterior"),
-    *("information", "classic", "calibration", "coordinates", "comparison", "planning"),
+    *("information", "classic", "calibration", "coordinates", "comparison", "design", "planning", "studies"),
 }
 JAX_FAMILY = {"jax", "jaxlib", "equinox", "optimistix", "lineax", "jaxtyping"}
 MODULES_MAX = 20

@@ -499,12 +499,12 @@ def four_point_protocol(
     return tuple(plan.steps)
 
 
-def paper_protocol(repeats: int = 24) -> tuple[PlanStep, ...]:
+def paper_protocol(repeats: int = 24, targets: tuple[str, str] = ("d1", "d2")) -> tuple[PlanStep, ...]:
     """The paper's protocol as it reads: one |N| = 200, plain go and return.
 
     Every start but the first, where the homing stands, is then reversed.
     """
-    return four_point_protocol(repeats)
+    return four_point_protocol(repeats, targets=targets)
 
 
 def twin_protocol(repeats: int = 24) -> tuple[PlanStep, ...]:
@@ -516,10 +516,11 @@ def twin_protocol(repeats: int = 24) -> tuple[PlanStep, ...]:
     return four_point_protocol(repeats, approaches={name: (how,) for name, how in history.items()})
 
 
-def mixed_protocol(repeats: int = 24) -> tuple[PlanStep, ...]:
+def mixed_protocol(repeats: int = 24, targets: tuple[str, str] = ("d1", "d2")) -> tuple[PlanStep, ...]:
     """The paper's experiments with |N| = 100 and 200 in turn, and two in six from cleared starts."""
     turns = ("reversed", "reversed", "reversed", "cleared", "cleared", "reversed")
-    return four_point_protocol(repeats, steps=(100, 200), approaches=dict.fromkeys(DIRECTION_SIGNS, turns))
+    approaches = dict.fromkeys(DIRECTION_SIGNS, turns)
+    return four_point_protocol(repeats, steps=(100, 200), approaches=approaches, targets=targets)
 
 
 def grid_protocol(
