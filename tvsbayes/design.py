@@ -881,20 +881,17 @@ def _sided(positions: np.ndarray, sheets: np.ndarray, limits: np.ndarray, oversh
     found = []
     for side in ((1, 1), (1, -1), (-1, 1), (-1, -1)):
         start = positions - np.array(side) * overshoot
-        good = np.all((start >= limits[:, 0]) & (start <= limits[:, 1]), axis=1)
+        both = np.stack([positions, start])
+        good = np.all((both >= limits[:, 0]) & (both <= limits[:, 1]), axis=(0, 2))
         found.append((positions[good], np.broadcast_to(side, (good.sum(), 2)), sheets[good]))
     return Looks(*(np.concatenate(parts) for parts in zip(*found, strict=True)))
 
 
-def candidates(knowledge: Knowledge, *, levels: tuple[int, int] = (PAN_LEVELS, TILT_LEVELS)) -> Candidates:
+def candidates(knowledge: Knowledge) -> Candidates:
     """Looks on a grid over what images and motor limits allow, on every sheet, from both sides of both axes.
 
     Where the limits allow, the same beams a full turn of pan away are candidates as well; counters never wrap. A
     candidate must be in both images in `VISIBLE_SHARE` of drawn instruments: a full turn only once the ratio is known.
-
-    Args:
-        knowledge: of the instrument.
-        levels: counters per axis.
 
     Raises:
         InputError: no sheets, or nothing that both cameras see.
@@ -909,7 +906,8 @@ def candidates(knowledge: Knowledge, *, levels: tuple[int, int] = (PAN_LEVELS, T
     physical = physical_at(knowledge.z, knowledge.space).value
     overshoot = overshoot_steps(knowledge)
     ratio = physical[[INDEX["degrees_per_step.pan"], INDEX["degrees_per_step.tilt"]]]
-    window = np.stack([np.maximum(limits[:, 0], -REACH_DEG / ratio), np.minimum(limits[:, 1], REACH_DEG / ratio)], 1)
+    reach = REACH_DEG / np.abs(ratio)
+    window = np.stack([np.maximum(limits[:, 0], -reach), np.minimum(limits[:, 1], reach)], axis=1)
     sheets = np.arange(len(rig.sheets_mm))
 
     def grid(pan: np.ndarray, tilt: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -934,7 +932,7 @@ def candidates(knowledge: Knowledge, *, levels: tuple[int, int] = (PAN_LEVELS, T
             remedy="check the extrinsics in [rig.prior], the sheets' X and the limits in [positioner]",
         )
     box = np.stack([coarse[at_centre].min(axis=0), coarse[at_centre].max(axis=0)], axis=1)
-    positions, sheet = grid(*(levels_of(axis, levels[axis], box) for axis in (0, 1)))
+    positions, sheet = grid(*(levels_of(axis, count, box) for axis, count in enumerate((PAN_LEVELS, TILT_LEVELS))))
     turn = round(FULL_TURN_DEG / abs(ratio[0]))
     turned = [
         (positions + np.array([sign * turn, 0]), sheet)

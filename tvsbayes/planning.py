@@ -204,13 +204,17 @@ class Assurance:
     """What fits of the designs of a family will report, over drawn truths; one evaluation of the looks per truth."""
 
     def __init__(self, family: Family, target: Target, draws: int, seed: int):
-        self.family, self.target = family, target
+        self.family, self.target, self.seed = family, target, seed
         self.truths = draw_truths(family.knowledge, draws, seed)
         self.noise = np.random.default_rng([seed, 37]).standard_normal((draws, 5))
         self.distinct, self.index = np.unique(family.picks, return_inverse=True)
         self.looks = family.found.looks[self.distinct]
         self.arrays = LookArrays(self.looks, family.knowledge, family.aperture)
         self._values: dict[int, np.ndarray] = {}
+
+    def of(self, family: Family) -> Assurance:
+        """The same instruments before other designs."""
+        return Assurance(family, self.target, len(self.truths), self.seed)
 
     def values(self, sizes: Sequence[int]) -> dict[int, np.ndarray]:
         """Reported uncertainty of the target at each truth, shape (draws,), by number of experiments."""
@@ -850,6 +854,39 @@ def _classic_value(forecast: ClassicForecast | None, target: Target, experiments
     return float(target.factor * np.median(u.max(axis=1)))
 
 
+def _refined(
+    family: Family,
+    seen: Seen,
+    target: Target,
+    at_centre: Sensitivity,
+    experiments: int,
+    criterion: str,
+    minutes: float | None,
+    assurance: Assurance,
+) -> tuple[Family, np.ndarray]:
+    """The design of n experiments after exchanges, with its reported values over the truths.
+
+    Exchanges suit the most probable instrument; they are kept only where they do not cost assurance or time.
+    """
+    knowledge, found = family.knowledge, family.found
+    greedy = replace(family, picks=family.picks[: LOOKS_PER_EXPERIMENT * experiments])
+    plain = assurance.values([experiments])[experiments]
+    if criterion != "c":
+        return greedy, plain
+    search = _search(knowledge, seen, at_centre.gradient, at_centre.own_variance, criterion)
+    here = np.isin(found.looks.sheet, found.looks.sheet[greedy.picks])
+    part = replace(search, rows=np.where(here[:, None, None], search.rows, 0.0))
+    exchanged = replace(greedy, picks=np.array(part.exchange(greedy.picks)))
+    if minutes is not None and plan_minutes(exchanged.arranged(experiments).steps, knowledge.rig) > minutes:
+        return greedy, plain
+    values = assurance.of(exchanged).values([experiments])[experiments]
+
+    def merit(reported: np.ndarray) -> tuple[float, float]:
+        return float(np.mean(reported <= target.limit)), -float(np.median(reported))
+
+    return (exchanged, values) if merit(values) > merit(plain) else (greedy, plain)
+
+
 def plan(
     rig: Rig,
     target: Target,
@@ -885,9 +922,29 @@ def plan(
     if given is not None and not given.converged:
         raise NotConverged("not-converged", "NOT CONVERGED: " + "; ".join(given.problems), remedy="see `tvsbayes fit`")
     knowledge = prior_knowledge(rig) if given is None else knowledge_of(given, rig)
+    options = {"criterion": criterion, "aperture": aperture, "largest": largest, "minutes": minutes}
+    campaign, pose = (None, None) if given is None else (given.campaign, given.reference_pose_rad)
+    return plan_from(knowledge, target, campaign, pose, draws=draws, seed=seed, **options)
+
+
+def plan_from(
+    knowledge: Knowledge,
+    target: Target,
+    campaign: Campaign | None = None,
+    pose_rad: np.ndarray | None = None,
+    *,
+    criterion: str,
+    aperture: bool,
+    largest: int,
+    minutes: float | None,
+    draws: int,
+    seed: int,
+) -> PlanResult:
+    """`plan` from what is known; effective ratios hold at `pose_rad`, by default in the middle of the candidates."""
+    rig, after_data = knowledge.rig, knowledge.after_data
     found = candidates(knowledge)
     seen = LookArrays(found.looks, knowledge, aperture).at(knowledge.z, knowledge.space)
-    pose = seen.mirror_angles_rad.mean(axis=0) if given is None else given.reference_pose_rad
+    pose = seen.mirror_angles_rad.mean(axis=0) if pose_rad is None else pose_rad
     at_centre = sensitivity(target, knowledge.z, knowledge.space, knowledge.rig.table, pose)
     now = at_centre.value(knowledge.covariance, target.factor)
     options = {"criterion": criterion, "aperture": aperture, "largest": largest, "minutes": minutes}
@@ -921,20 +978,10 @@ def plan(
         error = math.sqrt(surest * (1 - surest) / draws)
         curve.append(CurvePoint(n, durations[n], classic_value, best, surest, error))
 
-    greedy = family.picks[: LOOKS_PER_EXPERIMENT * experiments]
-    search = _search(knowledge, seen, at_centre.gradient, at_centre.own_variance, "c")
-    if criterion == "c":
-        here = np.isin(found.looks.sheet, found.looks.sheet[greedy])
-        exchanged = replace(search, rows=np.where(here[:, None, None], search.rows, 0.0)).exchange(greedy)
-        final = replace(family, picks=np.array(exchanged))
-    else:
-        final = replace(family, picks=greedy)
-    if plan_minutes(final.arranged(experiments).steps, rig) > (minutes or math.inf):
-        final = replace(family, picks=greedy)
+    final, checked = _refined(family, seen, target, at_centre, experiments, criterion, minutes, assurance)
     design = final.arranged(experiments)
     exact = information_of(design.steps, knowledge, aperture=aperture)
     expected = at_centre.value(covariance_of(knowledge.precision + exact.fisher), target.factor)
-    checked = Assurance(final, target, draws, seed).values([experiments])[experiments]
     share = float(np.mean(checked <= target.limit))
     largest_design = family.arranged(family.largest)
     largest_information = information_of_looks(
@@ -943,8 +990,8 @@ def plan(
     limit = limit_of(knowledge, largest_information, at_centre, target)
     noise = _pixel_part(exact.expectation)
     batches = _next(knowledge, found, seen, target, at_centre, now)
-    stop = stop_now(now, target, limit, batches, given is not None)
-    done = given is not None and now <= target.limit
+    stop = stop_now(now, target, limit, batches, after_data)
+    done = after_data and now <= target.limit
     chosen = Baseline("planned", len(exact.look_moves), int(exact.expectation.seen.sum()), exact.minutes, expected)
     return PlanResult(
         target=target,
@@ -964,7 +1011,7 @@ def plan(
         baselines=(chosen, *_baselines(knowledge, target, aperture)),
         next=batches,
         stop=stop,
-        classic=_classic_answer(knowledge, target, forecast, None if given is None else given.campaign),
+        classic=_classic_answer(knowledge, target, forecast, campaign),
         met=done or share >= ASSURED[0],
         notes=found.notes,
         draws=draws,
