@@ -92,7 +92,8 @@ SMALLEST_DESIGN = 128
 """Looks are padded to this size or a power of four above it; moves to twice that."""
 
 
-def _padded(count: int) -> int:
+def padded_size(count: int) -> int:
+    """Padded number of looks."""
     size = SMALLEST_DESIGN
     while size < count:
         size *= 4
@@ -234,7 +235,7 @@ def _design_arrays(
     moves: Sequence[Move], look_moves: Sequence[int], rig: Rig, *, homed_from: int, aperture: bool
 ) -> CampaignArrays:
     """Moves and looks without pixels; segments from `homed_from` on have an unknown home offset."""
-    size, count = _padded(max(len(look_moves), len(moves) // 2)), len(look_moves)
+    size, count = padded_size(max(len(look_moves), len(moves) // 2)), len(look_moves)
 
     def padded(rows, shape, fill, dtype=float, length=size):
         array = np.full((length, *shape), fill, dtype=dtype)

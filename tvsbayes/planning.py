@@ -613,7 +613,7 @@ def _smallest(meets: Callable[[int], bool], sizes: Sequence[int]) -> int | None:
     return above
 
 
-def _split(knowledge: Knowledge, data: np.ndarray, noise: np.ndarray | None, found: Sensitivity) -> dict[str, float]:
+def split_of(knowledge: Knowledge, data: np.ndarray, noise: np.ndarray | None, found: Sensitivity) -> dict[str, float]:
     """Share of each cause in the worst quantity's variance; see `information.causes_of`.
 
     Args:
@@ -662,7 +662,7 @@ def limit_of(knowledge: Knowledge, data: np.ndarray, found: Sensitivity, target:
     """
     many = MANY * data
     floor = found.value(covariance_of(knowledge.precision + many), target.factor)
-    shares = _split(knowledge, many, None, found)
+    shares = split_of(knowledge, many, None, found)
     cause = next(iter(shares))
     if floor <= target.limit:
         return Limit(floor, cause, shares, True, None)
@@ -1007,7 +1007,7 @@ def plan_from(
         n80=n80,
         n95=n95,
         limit=limit,
-        shares=_split(knowledge, exact.fisher, noise, at_centre),
+        shares=split_of(knowledge, exact.fisher, noise, at_centre),
         baselines=(chosen, *_baselines(knowledge, target, aperture)),
         next=batches,
         stop=stop,
