@@ -15,9 +15,8 @@ from pathlib import Path
 
 import numpy as np
 
-from tvsbayes.campaign import PlanStep, read_campaign, write_plan
+from tvsbayes.campaign import PROTOCOLS, PlanStep, read_campaign, write_plan
 from tvsbayes.classic import DIRECTIONS, classic, four_point_ratios, select_experiments
-from tvsbayes.protocols import PROTOCOLS
 from tvsbayes.rigs import Rig, Stereo, read_rig, rotation_matrix, write_stereo
 from tvsbayes.simulation import SimulatedCampaign, Truth, draw_truth, project, simulate, with_derived
 

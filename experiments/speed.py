@@ -31,12 +31,11 @@ import jax.numpy as jnp
 import numpy as np
 from scipy import optimize
 
-from tvsbayes.campaign import read_campaign, write_campaign
+from tvsbayes.campaign import mixed_protocol, read_campaign, write_campaign
 from tvsbayes.files import shipped_data
 from tvsbayes.joint import Fixed, Problem, fit, stage_residuals
 from tvsbayes.likelihood import ordered_spots
 from tvsbayes.model import NAMES
-from tvsbayes.protocols import mixed_protocol
 from tvsbayes.rigs import read_rig
 from tvsbayes.simulation import simulate
 from tvsbayes.solver import levenberg_marquardt, linearised

@@ -17,10 +17,9 @@ import numpy as np
 import pytest
 from schema_walk import problems
 
-from tvsbayes.campaign import Campaign, PlanStep, read_campaign, write_campaign, write_plan
+from tvsbayes.campaign import Campaign, PlanStep, grid_protocol, read_campaign, write_campaign, write_plan
 from tvsbayes.cli import run
 from tvsbayes.files import shipped_data
-from tvsbayes.protocols import grid_protocol
 from tvsbayes.simulation import simulate
 
 DATA = shipped_data()

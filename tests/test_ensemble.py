@@ -18,9 +18,9 @@ import numpy as np
 import pytest
 
 from tvsbayes import ensemble
+from tvsbayes.campaign import four_point_protocol
 from tvsbayes.joint import JointFit, fit
 from tvsbayes.posterior import BATCH, Independence, Target, Transport, by_width, in_batches, walkers_for
-from tvsbayes.protocols import four_point_protocol
 from tvsbayes.rigs import read_rig
 from tvsbayes.simulation import simulate
 

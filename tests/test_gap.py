@@ -12,7 +12,7 @@ import pytest
 from conftest import ROOT, coordinates
 from scipy import stats
 
-from tvsbayes.campaign import read_campaign
+from tvsbayes.campaign import four_point_protocol, read_campaign
 from tvsbayes.classic import DIRECTIONS, classic, select_experiments
 from tvsbayes.comparison import (
     BACKLASH,
@@ -31,7 +31,6 @@ from tvsbayes.comparison import (
 )
 from tvsbayes.information import CAUSE_LIMIT, StopResidual, residual_causes, stop_residuals
 from tvsbayes.joint import JointFit, fit
-from tvsbayes.protocols import four_point_protocol
 from tvsbayes.simulation import Truth, read_truth, simulate
 
 TWIN = ROOT / "data" / "twins" / "paper_twin"

@@ -8,12 +8,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tvsbayes.campaign import Campaign
+from tvsbayes.campaign import Campaign, four_point_protocol, paper_protocol
 from tvsbayes.classic import classic
 from tvsbayes.information import CONTRACTION_LIMIT, FitSummary, summarise
 from tvsbayes.joint import fit
 from tvsbayes.model import INDEX, NAMES, RECEIVER_NAMES
-from tvsbayes.protocols import four_point_protocol, paper_protocol
 from tvsbayes.report import fit_text
 from tvsbayes.rigs import HARMONIC_PRIORS, Prior
 from tvsbayes.simulation import simulate

@@ -12,12 +12,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from tvsbayes.campaign import Campaign
+from tvsbayes.campaign import Campaign, four_point_protocol, grid_protocol
 from tvsbayes.files import InputError, NothingToEstimate, shipped_data
 from tvsbayes.joint import HARMONIC_SD_DEG, fit, model_choice
 from tvsbayes.likelihood import ordered_spots
 from tvsbayes.model import INDEX, NAMES
-from tvsbayes.protocols import four_point_protocol, grid_protocol
 from tvsbayes.rigs import HARMONIC_PRIORS, Prior, RigTable, read_rig
 from tvsbayes.simulation import SimulatedCampaign, effective_deg_per_step, effective_mirror_offset_mm, simulate
 from tvsbayes.solver import laplace_draws

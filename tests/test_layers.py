@@ -16,14 +16,16 @@ LEVELS: tuple[tuple[str, ...], ...] = (
     ("campaign", "interchange"),
     ("calibration",),
     ("model", "classic", "simulation", "certificate"),
-    ("protocols", "spots"),
+    ("spots",),
     ("likelihood", "solver"),
     ("cameras",),
     ("joint",),
     ("posterior",),
     ("information",),
     ("coordinates",),
-    ("comparison",),
+    ("comparison", "design"),
+    ("planning",),
+    ("studies",),
     ("report", "plots"),
     ("pages",),
     ("cli",),
@@ -45,16 +47,17 @@ BELOW_DEVICE = {"files", "rigs", "campaign", "classic", "simulation", "spots"}
 DEVICE_OPTIONAL = {"renderer"}
 """Modules of `device/` outside that order: they import no other of it."""
 WITHOUT_JAX = (
-    *("files", "rigs", "campaign", "calibration", "classic", "simulation", "protocols"),
+    *("files", "rigs", "campaign", "calibration", "classic", "simulation"),
     *("boards", "interchange", "spots", "certificate", "report"),
 )
 MODEL = {
     *("model", "likelihood", "solver", "joint"),
     "posterior",
     *("cameras", "spots", "information", "classic", "calibration", "coordinates", "comparison"),
+    *("design", "planning", "studies"),
 }
 JAX_FAMILY = {"jax", "jaxlib", "equinox", "optimistix", "lineax", "jaxtyping"}
-MODULES_MAX = 24
+MODULES_MAX = 26
 
 
 def imported(tree: ast.AST, package: str = "tvsbayes") -> set[str]:

@@ -7,19 +7,20 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tvsbayes.campaign import Campaign, Move, read_campaign, read_plan, write_plan
-from tvsbayes.files import shipped_data
-from tvsbayes.protocols import (
+from tvsbayes.campaign import (
     DIRECTION_SIGNS,
     OVERSHOOT_STEPS,
     PROTOCOLS,
-    Stop,
-    check_campaign,
+    Campaign,
+    Move,
     four_point_protocol,
     grid_protocol,
-    observed_stops,
-    separation,
+    read_campaign,
+    read_plan,
+    write_plan,
 )
+from tvsbayes.classic import Stop, check_campaign, observed_stops, separation
+from tvsbayes.files import shipped_data
 from tvsbayes.simulation import simulate
 
 

@@ -13,9 +13,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tvsbayes.campaign import PlanStep
+from tvsbayes.campaign import DIRECTION_SIGNS, PROTOCOLS, PlanStep, four_point_protocol, grid_protocol
 from tvsbayes.files import InputError
-from tvsbayes.protocols import DIRECTION_SIGNS, PROTOCOLS, four_point_protocol, grid_protocol
 from tvsbayes.rigs import (
     DECLARED_PRIORS,
     DEFAULT_PRIORS,
@@ -572,6 +571,6 @@ def test_grid_sees_every_pose_from_both_sides():
 
 def test_the_twin_needs_no_jax():
     """Simulating and the classic estimator never import JAX (DESIGN 9)."""
-    modules = "tvsbayes.simulation, tvsbayes.protocols, tvsbayes.classic"
+    modules = "tvsbayes.simulation, tvsbayes.classic"
     code = f"import sys, {modules}; sys.exit('jax' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -11,10 +11,9 @@ from types import ModuleType
 import numpy as np
 import pytest
 
-from tvsbayes.campaign import Campaign, read_campaign, read_plan
+from tvsbayes.campaign import PROTOCOLS, Campaign, read_campaign, read_plan
 from tvsbayes.classic import classic, ratio_deg_per_step
 from tvsbayes.files import InputError, shipped_data
-from tvsbayes.protocols import PROTOCOLS
 from tvsbayes.rigs import DEFAULT_PRIORS, Rig, RigTable, read_rig
 from tvsbayes.simulation import draw_truth, read_truth, simulate
 
@@ -147,7 +146,7 @@ def test_every_spot_of_every_drawn_rig_is_in_view(name: str):
 
 
 def test_plans_are_the_protocols():
-    """The shipped plans are what `protocols` makes."""
+    """The shipped plans are what `campaign.PROTOCOLS` makes."""
     for name, make in PROTOCOLS.items():
         assert read_plan(DATA / "rigs" / "mounted" / f"{name}.csv") == make(), name
 

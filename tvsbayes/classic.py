@@ -5,23 +5,34 @@ of the moved axis; the difference of two arctangents over N. Frame S (X depth, Y
 pixels with the integer at the centre of a pixel. What the estimator cannot know (backlash, the tangent
 of a tilt read off its own azimuth) stays in its answer: that is what it is here for. No JAX.
 
+Also what can be said of a campaign before any fit: which stops its spots tell of, what they cannot separate.
+
 Source: Lopez-Medina et al., Metrology 2025, 5(4), 58, equations (4) to (8).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections import Counter
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import asdict, dataclass
+from itertools import pairwise
 from operator import attrgetter
 
 import numpy as np
 
-from tvsbayes.campaign import Campaign, Move, Spot
+from tvsbayes.campaign import APPROACH_SIGN, Campaign, Move, Spot
 from tvsbayes.files import NothingToEstimate
 from tvsbayes.rigs import Stereo
 
 DIRECTIONS = ("left", "right", "up", "down")
 PIXELS = attrgetter("u_left_px", "v_left_px", "u_right_px", "v_right_px")
+NEAREST_SHEET_MM, FARTHEST_SHEET_MM = 20.0, 100_000.0
+"""Depths between which a sheet can stand: nearer than a lens barrel, or beyond a hall, is a mismatched pair."""
+INSEPARABLE, INSEPARABLE_ONE_LENGTH = 0.9, 0.7
+"""Correlation of ratio and backlash above which four fifths (half, where every leg has one length) of the ratio's
+variance is exchange with the backlash. Equal numbers of cleared and reversed legs of one length give 0.55."""
+SHALLOW = 1.2
+"""Ratio of the largest to the smallest depth below which the sheet stood at one place (the paper's: 1.6)."""
 UNDISTORT_ITERATIONS = 200
 UNDISTORT_TOLERANCE_PX = 1e-9
 """Largest error of re-distorting an undistorted pixel: 10^4 times the rounding of 1000 px in float64."""
@@ -394,3 +405,138 @@ def stereo_variance(function: Callable[[Stereo, float], float], stereo: Stereo, 
         ahead, behind = (function(stereo, 1 + side * 0.1 * focal_scale_u) for side in (1, -1))
         variance += float((ahead - behind) / 0.2) ** 2
     return max(variance, 0.0)
+
+
+@dataclass(frozen=True)
+class Stop:
+    """A rest of one axis at which a usable spot was seen; `sign` is the sense of the move that led there."""
+
+    segment: int
+    steps: int
+    sign: int
+
+
+def observed_stops(moves: Sequence[Move], observed: Collection[int], axis: str) -> tuple[Stop, ...]:
+    """Rests of one axis, in order, that the spots tell of.
+
+    Args:
+        moves: all moves in order.
+        observed: numbers of the moves after which a usable spot was seen.
+        axis: "pan" or "tilt".
+    """
+    stops: list[Stop] = []
+    current, seen, previous = Stop(0, 0, 0), False, 0
+    for move in moves:
+        steps = move.pan_steps if axis == "pan" else move.tilt_steps
+        approach = move.pan_approach if axis == "pan" else move.tilt_approach
+        if approach:
+            current, seen = Stop(move.segment, steps, APPROACH_SIGN[approach]), False
+        elif steps != previous:
+            current, seen = Stop(move.segment, steps, 1 if steps > previous else -1), False
+        if move.move in observed and not seen:
+            stops.append(current)
+            seen = True
+        previous = steps
+    return tuple(stops)
+
+
+def separation(stops: Sequence[Stop], axis: str) -> str | None:
+    """Why a ratio and its backlash cannot be told apart well, and the smallest cure.
+
+    With equal errors at every stop the angle is zero(segment) + k n - b sign / 2: the correlation of k and b in
+    this straight line tells before any fit whether the stops separate them.
+
+    Returns:
+        A sentence, or None if nothing stands in the way.
+    """
+    steps = np.array([stop.steps for stop in stops], dtype=float)
+    signs = np.array([stop.sign for stop in stops], dtype=float)
+    if len({stop.steps for stop in stops}) < 2:
+        return f"the {axis} axis was seen at one counter only; look before and after moves of that axis"
+    if not (np.any(signs > 0) and np.any(signs < 0)):
+        return f"every stop of the {axis} axis was reached from one side; reach some from the other"
+    segments = np.array([stop.segment for stop in stops])
+    zeros = (segments[:, None] == np.unique(segments)).astype(float)
+    design = np.column_stack([steps / np.ptp(steps), -signs / 2, zeros])
+    information = design.T @ design
+    if np.linalg.matrix_rank(information) < len(information):
+        correlation = 1.0
+    else:
+        covariance = np.linalg.inv(information)
+        correlation = abs(covariance[0, 1]) / np.sqrt(covariance[0, 0] * covariance[1, 1])
+    lengths = Counter(abs(b.steps - a.steps) for a, b in pairwise(stops) if a.steps != b.steps)
+    if correlation < (INSEPARABLE_ONE_LENGTH if len(lengths) == 1 else INSEPARABLE):
+        return None
+    common = lengths.most_common(1)[0][0]
+    only = f"only one |N| = {common}" if len(lengths) == 1 else f"nearly every leg has |N| = {common} and reverses"
+    return f"{only}; add N = {max(common // 2, 1)} or a cleared approach"
+
+
+@dataclass(frozen=True)
+class CampaignCheck:
+    """What `check` says of a readable campaign: counts, and warnings in words."""
+
+    moves: int
+    segments: int
+    spots: int
+    ok_spots: int
+    refused: dict[str, int]
+    aperture_readings: int
+    experiments: int
+    warnings: tuple[str, ...]
+
+    def as_json(self) -> dict[str, object]:
+        """The document of `check --json`."""
+        return {"kind": "campaign", **asdict(self), "warnings": list(self.warnings)}
+
+
+def check_campaign(campaign: Campaign) -> CampaignCheck:
+    """Plausibility and identifiability of a campaign before any fit.
+
+    Args:
+        campaign: a campaign that its reader accepted.
+
+    Returns:
+        Counts and warnings; an empty tuple means that nothing stands in the way of a fit.
+    """
+    ok = [spot for spot in campaign.spots if spot.status == "ok"]
+    refused = Counter(spot.status for spot in campaign.spots if spot.status != "ok")
+    selection = select_experiments(campaign)
+    warnings = [f"experiment {s.experiment} is not complete: {s.reason}" for s in selection.skipped]
+    if not ok:
+        warnings.append("no spot has status ok: there is nothing to estimate from")
+    observed = {spot.move for spot in ok}
+    for axis in ("pan", "tilt") if ok else ():
+        reason = separation(observed_stops(campaign.moves, observed, axis), axis)
+        if reason is not None:
+            warnings.append(f"{axis} ratio and {axis} backlash are hard to tell apart: {reason}")
+    for move in campaign.moves:
+        if "unknown" in (move.pan_approach, move.tilt_approach):
+            warnings.append(f"segment {move.segment} begins with an unknown approach: its first reversal tells less")
+    if ok:
+        pixels = np.array([(s.u_left_px, s.v_left_px, s.u_right_px, s.v_right_px) for s in ok])
+        depth_mm = triangulate(campaign.stereo, pixels)[:, 0]
+        # Not-a-number (no undistorted point) is implausible as well.
+        odd = [s.spot for s, x in zip(ok, depth_mm, strict=True) if not NEAREST_SHEET_MM < x < FARTHEST_SHEET_MM]
+        if odd:
+            listed = ", ".join(map(str, odd[:10]))
+            limits = f"{NEAREST_SHEET_MM:g} to {FARTHEST_SHEET_MM:g} mm"
+            warnings.append(f"spots {listed} triangulate outside {limits}: are left and right swapped, or mismatched?")
+        elif depth_mm.max() < SHALLOW * depth_mm.min():
+            warnings.append("all spots lie at one depth: a second sheet position sharpens ratios threefold")
+    if campaign.stereo.assumed:
+        warnings.append("the stereo covariance is assumed, not estimated: uncertainties are only as good as it is")
+    if not np.any(campaign.stereo.parameter_covariance):
+        warnings.append(
+            "the stereo covariance is zero: its error (0.3 to 0.5 % of a ratio) is missing from every interval"
+        )
+    return CampaignCheck(
+        moves=len(campaign.moves),
+        segments=1 + campaign.moves[-1].segment,
+        spots=len(campaign.spots),
+        ok_spots=len(ok),
+        refused=dict(refused),
+        aperture_readings=sum(spot.aperture_deg is not None for spot in ok),
+        experiments=len(selection.experiments),
+        warnings=tuple(warnings),
+    )

@@ -337,6 +337,9 @@ def _image_size(text: str | None) -> tuple[int, int] | None:
 @app.command()
 def check(
     path: Annotated[Path, typer.Argument(metavar="PATH", help="Campaign folder, rig file or plan.")],
+    plan_file: Annotated[
+        Path | None, typer.Argument(metavar="[PLAN]", help="With a rig file: what can this plan not separate?")
+    ] = None,
     repair_to: Annotated[
         Path | None, typer.Option("--repair-to", help="New folder for what is whole of a damaged journal.")
     ] = None,
@@ -344,7 +347,7 @@ def check(
 ) -> None:
     """Read a campaign, rig, plan or journal strictly and say what it holds and what it cannot tell."""
     from tvsbayes.campaign import read_campaign, read_plan
-    from tvsbayes.protocols import check_campaign
+    from tvsbayes.classic import check_campaign
     from tvsbayes.rigs import read_rig
 
     if repair_to is not None:
@@ -354,10 +357,20 @@ def check(
         lines = [f"{key}: {value}" for key, value in document.items()]
         _finish(document, "\n".join([*lines, f"{escaped(str(repair_to), 200)}: written"]), as_json)
         return
-    if path.suffix == ".csv":
+    if plan_file is not None and path.suffix != ".toml":
+        remedy = "give the rig file first, then the plan"
+        raise InputError("usage", "a plan is checked together with a rig file", allowed="RIG PLAN", remedy=remedy)
+    if plan_file is not None:
+        rig, steps = read_rig(path), read_plan(plan_file)
+        from tvsbayes.model import use_compilation_cache
+        from tvsbayes.planning import check_plan
+
+        use_compilation_cache()
+        document: dict[str, Any] = check_plan(rig, steps).as_json()
+    elif path.suffix == ".csv":
         steps = read_plan(path)
         actions = {action: sum(s.action == action for s in steps) for action in ("home", "place", "move", "look")}
-        document: dict[str, Any] = {"kind": "plan", "steps": len(steps), **actions, "warnings": []}
+        document = {"kind": "plan", "steps": len(steps), **actions, "warnings": []}
     elif path.suffix == ".toml":
         rig = read_rig(path)
         document = {"kind": "rig", "sheets_mm": rig.sheets_mm, "costs_s": rig.costs_s, "warnings": []}
@@ -375,7 +388,7 @@ def check(
                 document["warnings"] = [*journal.pop("warnings"), *document["warnings"]]
                 document["journal"] = journal
     warnings = document["warnings"]
-    lines = [f"{key}: {value}" for key, value in document.items() if key != "warnings"]
+    lines = [f"{key}: {value}" for key, value in document.items() if key not in ("warnings", "faults")]
     lines += [f"warning: {warning}" for warning in warnings]
     lines.append(f"{escaped(str(path), 200)}: readable, {len(warnings)} warning{'s' * (len(warnings) != 1)}")
     _finish(document, "\n".join(lines), as_json)
@@ -849,6 +862,100 @@ def steps_for(
         report_line("warning: these counters lie outside those of the campaign: the calibration extrapolates")
     document = {"estimator": calibration.estimator, **found.as_json()}
     _finish(document, steps_text(found), as_json)
+
+
+TargetText = Annotated[
+    str | None,
+    typer.Option("--target", help="As 'u(worst) <= 2e-4 deg/step' or 'U95(x) at 1000,0,0 mm <= 60 mm'."),
+]
+
+
+@app.command()
+def plan(
+    rig: Annotated[Path, typer.Argument(metavar="RIG", help="Rig file.")],
+    given: Annotated[Path | None, typer.Option("--given", help="Campaign measured already: what next?")] = None,
+    target: TargetText = None,
+    minutes: Annotated[float | None, typer.Option("--minutes", min=0.1, help="Longest plan.")] = None,
+    output: Annotated[Path | None, typer.Option("-o", "--output", help="Write the plan here (plan.csv).")] = None,
+    criterion: Annotated[str, typer.Option("--criterion", help="c (the target), D or A (all headlines).")] = "c",
+    aperture: Annotated[bool, typer.Option("--aperture/--no-aperture", help="Looks also read the aperture.")] = False,
+    draws: Annotated[int, typer.Option("--draws", min=20, max=10_000, help="Instruments for the assurance.")] = 200,
+    seed: Seed = 0,
+    as_json: Json = False,
+) -> None:
+    """How many experiments, which ones, and when to stop; with data, what next."""
+    from tvsbayes.campaign import read_campaign, write_plan
+    from tvsbayes.rigs import read_rig
+
+    instrument, data = read_rig(rig), None if given is None else read_campaign(given)
+    from tvsbayes.design import CRITERIA, DEFAULT_TARGET, parse_target
+    from tvsbayes.joint import fit as fit_joint
+    from tvsbayes.model import use_compilation_cache
+    from tvsbayes.planning import plan as find_plan
+    from tvsbayes.planning import plan_text
+
+    wanted = parse_target(target or DEFAULT_TARGET)
+    if criterion not in CRITERIA:
+        found = escaped(criterion)
+        raise InputError("criterion", f"--criterion {found}", allowed=", ".join(CRITERIA), remedy="name one of them")
+    use_compilation_cache()
+    fitted = None
+    if data is not None:
+        # A plan needs curvature and priors of the fit, which fit.json does not hold.
+        report_line("fitting the campaign (Laplace approximation) ...")
+        fitted = fit_joint(data)
+    options = {"criterion": criterion, "aperture": aperture, "draws": draws, "seed": seed}
+    result = find_plan(instrument, wanted, given=fitted, minutes=minutes, **options)
+    text, document = plan_text(result), result.as_json()
+    if output is not None and result.steps:
+        write_plan(result.steps, output)
+        document["plan"] = str(output)
+        text += f"\nwritten: {escaped(str(output), 200)}"
+    _finish(document, text, as_json)
+    if target is not None and not result.met:
+        raise _Ended(TvsError.exit_code)
+
+
+@app.command()
+def study(
+    rig: Annotated[Path, typer.Argument(metavar="RIG", help="Rig file.")],
+    plan_file: Annotated[Path, typer.Argument(metavar="PLAN", help="plan.csv.")],
+    n: Annotated[int, typer.Option("--n", min=1, max=1_000_000, help="Simulated campaigns.")] = 100,
+    engine: Annotated[str, typer.Option("--engine", help="serial, processes or dask.")] = "serial",
+    workers: Annotated[int, typer.Option("--workers", min=1, max=1024, help="Worker processes.")] = 2,
+    scheduler: Annotated[str | None, typer.Option("--scheduler", help="Address of a Dask scheduler.")] = None,
+    rows: Annotated[Path | None, typer.Option("--rows", help="File of rows (default: PLAN with .study.jsonl).")] = None,
+    target: TargetText = None,
+    aperture: Annotated[bool, typer.Option("--aperture/--no-aperture", help="Looks also read the aperture.")] = False,
+    seed: Seed = 0,
+    as_json: Json = False,
+) -> None:
+    """Simulate a plan many times and fit every campaign: coverage, power, assurance. Run again to go on."""
+    from tvsbayes.campaign import read_plan
+    from tvsbayes.rigs import read_rig
+
+    instrument, steps = read_rig(rig), read_plan(plan_file)
+    from tvsbayes.design import ASSURED, DEFAULT_TARGET, parse_target
+    from tvsbayes.model import use_compilation_cache
+    from tvsbayes.studies import StudyJob, StudyRows, study_text
+    from tvsbayes.studies import study as run_study
+
+    use_compilation_cache()
+    job = StudyJob(instrument, steps, parse_target(target or DEFAULT_TARGET), seed, aperture)
+    kept = StudyRows(rows or plan_file.with_suffix(".study.jsonl"))
+    missing = n - sum(index < n for index in kept.of(job))
+    report_line(f"{n} campaigns, {missing} to go on engine {escaped(engine)}; rows in {escaped(str(kept.path), 200)}")
+
+    def progress(done: int, wanted: int) -> None:
+        if sys.stderr.isatty():
+            report_line(f"{done} of {wanted}")
+
+    options = {"engine": engine, "workers": workers, "address": scheduler}
+    result = run_study(job, n, kept, progress=progress, **options)
+    document = {**result.as_json(), "rows": str(kept.path), "engine": engine, "seed": seed}
+    _finish(document, study_text(result), as_json)
+    if target is not None and result.assurance < ASSURED[0]:
+        raise _Ended(TvsError.exit_code)
 
 
 def _limits(path: Path) -> dict[str, tuple[float, float]]:

@@ -17,12 +17,11 @@ from scipy import stats
 
 from tvsbayes.calibration import INPUT_NAMES, NORMAL_95, Calibration, calibration_of_draws
 from tvsbayes.campaign import Move
-from tvsbayes.classic import DIRECTIONS, four_point_ratios, select_experiments
+from tvsbayes.classic import DIRECTIONS, four_point_ratios, observed_stops, select_experiments, separation
 from tvsbayes.joint import Derived, JointFit
 from tvsbayes.likelihood import ordered_spots, standard_deviations_without
 from tvsbayes.model import INDEX, KINDS, NAMES, RECEIVER_NAMES, RIG_NAMES
 from tvsbayes.posterior import Posterior, ideal_pixels
-from tvsbayes.protocols import observed_stops, separation
 from tvsbayes.rigs import HARMONIC_PRIORS
 
 CONTRACTION_LIMIT = 0.1
@@ -571,6 +570,15 @@ class Causes:
     covariance: np.ndarray
 
 
+def prior_groups() -> dict[str, list[int]]:
+    """Coordinates of every prior that can be a cause of uncertainty; the stereo calibration is one of them."""
+    groups: dict[str, list[int]] = {"stereo calibration": list(range(len(RIG_NAMES), len(NAMES)))}
+    for name in RIG_NAMES:
+        stem = "focal scale" if name == "focal_scale" else f"prior of {name.split('.')[0]}"
+        groups.setdefault(stem, []).append(INDEX[name])
+    return groups
+
+
 def causes_of(fit: JointFit) -> Causes:
     """Split the covariance of a fit by cause (DESIGN 5).
 
@@ -587,11 +595,7 @@ def causes_of(fit: JointFit) -> Causes:
         "pixel and aperture noise" if readings else "pixel noise": noise,
         "stop errors of the campaign": fisher - noise,
     }
-    stems: dict[str, list[int]] = {"stereo calibration": list(range(len(RIG_NAMES), len(NAMES)))}
-    for name in RIG_NAMES:
-        stem = "focal scale" if name == "focal_scale" else f"prior of {name.split('.')[0]}"
-        stems.setdefault(stem, []).append(INDEX[name])
-    for stem, columns in stems.items():
+    for stem, columns in prior_groups().items():
         share = np.zeros_like(fisher)
         share[columns, columns] = 1.0
         parts[stem] = share

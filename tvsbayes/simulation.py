@@ -424,7 +424,7 @@ def with_derived(parameters: Mapping[str, float]) -> dict[str, float]:
 
 
 @dataclass
-class _Log:
+class PlanLog:
     """What the plan did, in time order, while it is being read."""
 
     moves: list[Move] = field(default_factory=list)
@@ -432,13 +432,13 @@ class _Log:
     targets: list[str] = field(default_factory=list)
 
 
-def _run_plan(plan: Iterable[PlanStep], rig: Rig, home_approach: tuple[str, str]) -> _Log:
+def run_plan(plan: Iterable[PlanStep], rig: Rig, home_approach: tuple[str, str]) -> PlanLog:
     """Turn plan steps into moves and looks (step, move, placement index).
 
     A plan that does not begin with `home` is taken as homed at counters 0, 0. Empty counters of a move
     keep the axis where it is.
     """
-    log, time_s, segment = _Log(), 0.0, -1
+    log, time_s, segment = PlanLog(), 0.0, -1
     for step in plan:
         if step.action == "home" or (not log.moves and step.action in ("move", "look")):
             segment += 1
@@ -511,7 +511,7 @@ def simulate(
     if truth is None:
         truth = draw_truth(rig, streams["truth"])
     sd_px = float(rig.cameras.get("spot_sd_px", SPOT_SD_PX) if spot_sd_px is None else spot_sd_px)
-    log = _run_plan(plan, rig, home_approach)
+    log = run_plan(plan, rig, home_approach)
     fixed = {name: Prior(value, 0.0) for name, value in truth.parameters.items() if name in HARMONIC_PRIORS}
     require_periods(fixed, rig.table.harmonic_period_deg)
     truth, resting_deg = _drive(log.moves, truth, rig.table.harmonic_period_deg, streams["stops"], streams["homes"])
@@ -585,7 +585,7 @@ def _drive(
     return realised, resting
 
 
-def _light(log: _Log, rig: Rig, truth: Truth, rng: np.random.Generator) -> tuple[Light, np.ndarray]:
+def _light(log: PlanLog, rig: Rig, truth: Truth, rng: np.random.Generator) -> tuple[Light, np.ndarray]:
     """Where each look's beam meets its sheet, and the same points (n, 3) in P, mm; NaN where it never does."""
     p = truth.parameters
     rotation = rotation_matrix(np.array([p[f"extrinsics.rotation_rad.{a}"] for a in "xyz"]))

@@ -1,0 +1,156 @@
+"""Does a fit come out as the planner said? Predicted sd against RMS error, and predicted assurance against a count.
+
+    python experiments/planning_prediction.py designs              # searches the planned designs, two minutes
+    python experiments/planning_prediction.py run --n 1000 --cores 0 1     # 3 s per campaign and core, resumable
+    python experiments/planning_prediction.py table > experiments/planning_prediction.md
+
+Four designs on the mounted rig: the paper's 96 experiments, the grid, and what `tvsbayes plan` recommends for its
+default target with an assurance of 80 % (`n80`) and of 95 % (`n95`). Campaign i of a design is drawn with a seed of
+its own, every prior quantity anew, simulated by the twin and fitted (Laplace). Compared are: the error of the estimate
+with the sd that the planner predicts AT that truth before any data (RMS of z, chi-square bounds at 1e-4); with the sd
+that the fit reports; and the share of fits that report the target as met with the assurance that the planner stated
+from its own draws (binomial bounds around the stated value, which has a Monte Carlo error itself). The last column
+repeats the first comparison with the predicted sd times 0.8: it must fail, or the test could not.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+
+import numpy as np
+from coverage import SHRINK, read_rows
+from scipy import stats
+from studies import mounted_rig, run_rows, shipped_plan
+
+OUTPUT = Path(__file__).parent / "output"
+ROWS, DESIGNS = OUTPUT / "planning_prediction.jsonl", OUTPUT / "planning_designs.json"
+NAMES = ("paper", "grid", "n80", "n95")
+SEED = 2025
+"""Of the campaigns; the planner's own draws have seed 0."""
+DRAWS = 400
+
+
+def designs(arguments: argparse.Namespace) -> None:
+    """Search both planned designs and keep them with their stated assurance."""
+    from tvsbayes.campaign import write_plan
+    from tvsbayes.design import DEFAULT_TARGET, parse_target
+    from tvsbayes.model import use_compilation_cache
+    from tvsbayes.planning import plan
+
+    use_compilation_cache()
+    OUTPUT.mkdir(parents=True, exist_ok=True)
+    target, rig, kept = parse_target(DEFAULT_TARGET), mounted_rig(), {}
+    both = plan(rig, target, draws=DRAWS)
+    for name, result in (("n95", both), ("n80", plan(rig, target, draws=DRAWS, largest=both.n80))):
+        write_plan(result.steps, OUTPUT / f"planning_{name}.csv")
+        fields = ("experiments", "looks", "minutes", "assurance", "assurance_se", "expected")
+        kept[name] = {field: getattr(result, field) for field in fields}
+    DESIGNS.write_text(json.dumps(kept, indent=1) + "\n")
+    print(json.dumps(kept, indent=1))
+
+
+def job_of(name: str):
+    """The study behind the rows of a design."""
+    from tvsbayes.campaign import read_plan
+    from tvsbayes.design import DEFAULT_TARGET, parse_target
+    from tvsbayes.studies import StudyJob
+
+    steps = shipped_plan(name) if name in ("paper", "grid") else read_plan(OUTPUT / f"planning_{name}.csv")
+    return StudyJob(mounted_rig(), steps, parse_target(DEFAULT_TARGET), SEED)
+
+
+def one_row(task: tuple[str, int]) -> dict[str, object]:
+    """A row of `tvsbayes study` with the design's name."""
+    from tvsbayes import likelihood
+
+    # As in coverage.py: ordinary fits pad to 512 spots, here every campaign of a design is alike.
+    likelihood.SMALLEST_BUCKET = 96
+    from tvsbayes.model import use_compilation_cache
+    from tvsbayes.studies import study_row
+
+    use_compilation_cache()
+    name, index = task
+    return {"name": name, **study_row(job_of(name), index)}
+
+
+def run(arguments: argparse.Namespace) -> None:
+    """Append rows until every (design, index) is there; designs in the inner loop, so that they stay balanced."""
+    tasks = [(name, index) for index in range(arguments.n) for name in arguments.designs]
+    run_rows(one_row, tasks, ROWS, ("name", "index"), arguments.cores)
+
+
+def table(arguments: argparse.Namespace) -> None:
+    """Markdown of everything that came out."""
+    from tvsbayes.design import QUANTITIES
+    from tvsbayes.studies import binomial_bounds, rms_bounds, share_interval95, study_result
+
+    rows, kept = read_rows(ROWS), json.loads(DESIGNS.read_text())
+    print("# Predicted and actual uncertainty of plans\n")
+    print("Written by `python experiments/planning_prediction.py table`; bounds at 1e-4.\n")
+    for name in NAMES:
+        job = job_of(name)
+        chosen = [r for r in rows if r["name"] == name and r["design"] == job.key]
+        if not chosen:
+            continue
+        result = study_result(job, chosen)
+        low, high = rms_bounds(result.converged)
+        looks = sum(step.action == "look" for step in job.steps)
+        print(f"## {name}: {looks} spots, {result.campaigns} campaigns, {result.converged} fits converged\n")
+        print(
+            f"| headline | RMS z, predicted sd ({low:.2f}-{high:.2f}) | RMS z, reported sd | predicted / RMS error ",
+            end="",
+        )
+        print(f"| 95 % interval holds truth | verdict | with sd x {SHRINK} |\n|---|---|---|---|---|---|---|")
+        for quantity in QUANTITIES:
+            h = result.headlines[quantity]
+            verdict = "within" if low <= h.rms_predicted <= high else "OUTSIDE"
+            shrunk = "fails" if not low <= h.rms_predicted / SHRINK <= high else "passes"
+            cells = (
+                f"{h.rms_predicted:.3f} | {h.rms_z:.3f} | {h.predicted_over_rms:.3f} | {100 * h.coverage['95']:.1f} %"
+            )
+            print(f"| {quantity} | {cells} | {verdict} | {shrunk} |")
+        print()
+    print("## Assurance\n")
+    print(
+        "| design | experiments | spots | minutes | stated | counted | 95 % interval | bounds of the stated | verdict |"
+    )
+    print("|---|---|---|---|---|---|---|---|---|")
+    for name in ("n80", "n95"):
+        job, stated = job_of(name), kept[name]
+        chosen = [r for r in rows if r["name"] == name and r["design"] == job.key]
+        if not chosen:
+            continue
+        result = study_result(job, chosen)
+        n, a, se = result.campaigns, stated["assurance"], stated["assurance_se"]
+        hits = round(result.assurance * n)
+        low, high = share_interval95(hits, n)
+        # The stated value is an estimate from draws: its error widens the bounds.
+        exact, wide = binomial_bounds(n, a), stats.norm.isf(0.5e-4) * se
+        bounds = max(0.0, exact[0] - wide), min(1.0, exact[1] + wide)
+        verdict = "within" if bounds[0] <= result.assurance <= bounds[1] else "OUTSIDE"
+        sizes = f"{stated['experiments']} | {stated['looks']} | {stated['minutes']:.1f}"
+        counted = f"{100 * result.assurance:.1f} % of {n} | {100 * low:.0f}-{100 * high:.0f} %"
+        said = f"{100 * a:.1f} +- {100 * se:.1f} %"
+        print(f"| {name} | {sizes} | {said} | {counted} | {100 * bounds[0]:.0f}-{100 * bounds[1]:.0f} % | {verdict} |")
+    failed = [r for r in rows if not r["converged"]]
+    seconds = np.median([r["seconds"] for r in rows])
+    print(f"\n{len(rows)} rows, median {seconds:.1f} s; {len(failed)} fits failed.")
+    for row in failed[:10]:
+        print(f"- {row['name']} {row['index']}: {'; '.join(row['problems'])}")
+
+
+def main() -> None:
+    """Command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("action", choices=("designs", "run", "table"))
+    parser.add_argument("--n", type=int, default=1000)
+    parser.add_argument("--cores", nargs="+", type=int, default=[0, 1])
+    parser.add_argument("--designs", nargs="+", default=NAMES, choices=NAMES)
+    arguments = parser.parse_args()
+    {"designs": designs, "run": run, "table": table}[arguments.action](arguments)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,516 @@
+"""Plans: what they will tell is what a fit of them knows; laws of information; targets, limits, when to stop.
+
+Everything runs in the one bucket of 512 looks, so that the expected looks are compiled once.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from conftest import dozen_plan
+
+from tvsbayes import design, planning, simulation
+from tvsbayes.campaign import PlanStep, four_point_protocol, grid_protocol, paper_protocol, read_plan, write_plan
+from tvsbayes.design import (
+    NOISE_COLUMNS,
+    PARAMETERS,
+    QUANTITIES,
+    LookArrays,
+    Looks,
+    Search,
+    Target,
+    arrange,
+    candidates,
+    covariance_of,
+    information_of,
+    information_of_looks,
+    parse_target,
+    plan_minutes,
+    prior_knowledge,
+    scores,
+    sensitivity,
+)
+from tvsbayes.files import InputError
+from tvsbayes.model import INDEX
+from tvsbayes.planning import Batch, Limit, check_plan, classic_count, limit_of, plan_from, stop_now, truth_in
+from tvsbayes.rigs import Prior, Rig
+from tvsbayes.simulation import Truth, draw_truth, run_plan, simulate
+
+ROUNDING = 1e-9
+"""Relative; sums of a thousand products in float64, condition numbers up to 1e5."""
+WORST = parse_target(design.DEFAULT_TARGET)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def small_searches():
+    """One bucket, few levels: the searches are the same, the grids coarser."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(design, "SMALLEST_DESIGN", 512)
+        for name, value in (("PAN_LEVELS", 4), ("TILT_LEVELS", 3), ("COARSE_PAN", 7), ("COARSE_TILT", 5)):
+            patch.setattr(design, name, value)
+        patch.setattr(design, "VISIBILITY_DRAWS", 8)
+        patch.setattr(planning, "CLASSIC_DRAWS", 5)
+        yield
+
+
+@pytest.fixture(scope="module")
+def knowledge(mounted_rig):
+    return prior_knowledge(mounted_rig)
+
+
+@pytest.fixture(scope="module")
+def found(knowledge):
+    return candidates(knowledge)
+
+
+@pytest.fixture(scope="module")
+def seen(knowledge, found):
+    return LookArrays(found.looks, knowledge, False).at(knowledge.z, knowledge.space)
+
+
+def with_priors(rig: Rig, **priors: Prior) -> Rig:
+    """A rig with other priors; names with __ for a dot."""
+    changed = {name.replace("__", "."): prior for name, prior in priors.items()}
+    return replace(
+        rig, table=replace(rig.table, priors={**rig.table.priors, **changed}), truth={**rig.truth, **changed}
+    )
+
+
+def u_of(steps, knowledge, z=None) -> np.ndarray:
+    """U of every headline after a plan, at the pose of its own looks."""
+    information = information_of(steps, knowledge)
+    at = [
+        sensitivity(
+            Target("", q, 1.0, 1.0, ""), knowledge.z, knowledge.space, knowledge.rig.table, information.pose_rad
+        )
+        for q in QUANTITIES
+    ]
+    covariance = covariance_of(knowledge.precision + information.fisher)
+    return np.array([s.value(covariance) for s in at])
+
+
+# Information.
+
+
+def test_a_plans_information_is_the_fits_own(mounted_rig, knowledge, monkeypatch):
+    """Same point, same looks: segments with home offsets, shared stops, half-open play (the dozen)."""
+    import jax
+
+    from tvsbayes.joint import Problem
+    from tvsbayes.likelihood import stop_information
+
+    monkeypatch.setattr(simulation, "SHEET_DEPTH_SD_MM", 0.0)
+    monkeypatch.setattr(simulation, "SHEET_TILT_SD_DEG", 0.0)
+    monkeypatch.setattr(simulation, "HOME_SD_DEG", 0.0)
+    # Cameras as stated: a campaign is triangulated with the stated ones, a plan's sheets stand where they stand.
+    drawn = draw_truth(mounted_rig, np.random.default_rng(3)).parameters | {"focal_scale": 1.0}
+    truth = truth_in(knowledge, drawn, mounted_rig.stereo.vector)
+    quiet = {name: 0.0 for name in drawn if name.startswith("stop_sd_deg")} | {"pixel_scale": 0.0}
+    run = simulate(mounted_rig, dozen_plan(), 4, Truth({**drawn, **quiet}, mounted_rig.stereo), aperture=True)
+    assert all(spot.status == "ok" for spot in run.campaign.spots)
+    problem = Problem(run.campaign, mounted_rig.table)
+    with jax.enable_x64(True):
+        own = stop_information(problem.linear_spots(truth.z)[1]).fisher
+    planned = information_of(dozen_plan(), knowledge, aperture=True, z=truth.z).fisher
+    scale = np.sqrt(np.diag(own))
+    safe = np.where(scale > 0, scale, 1.0)
+    # The spots are triangulated from pixels without noise: linear triangulation is exact to 1e-9 of its point.
+    assert np.abs(planned / np.outer(safe, safe) - own / np.outer(safe, safe)).max() < 1e-6
+    assert (scale[~NOISE_COLUMNS] > 0).sum() > 40
+
+
+def test_more_looks_never_raise_a_variance(knowledge):
+    """At a fixed point every added step of a plan adds a positive semi-definite matrix."""
+    steps = paper_protocol(2)
+    looks = [k for k, step in enumerate(steps) if step.action == "look"]
+    previous = np.diag(knowledge.covariance)
+    for count in (2, 5, 9, 16, 32):
+        information = information_of(steps[: looks[count - 1] + 1], knowledge).fisher
+        variance = np.diag(covariance_of(knowledge.precision + information))
+        assert np.all(variance <= previous * (1 + ROUNDING)), count
+        previous = variance
+    assert previous[INDEX["degrees_per_step.pan"]] < 0.01
+
+
+def test_looks_add_up_to_the_plan_they_make(knowledge, found, seen):
+    """The fast sum equals the filter's pass over the arranged plan, with and without an unknown home offset."""
+    picks = np.random.default_rng(5).integers(0, len(found.looks), 24)
+    arranged = arrange(found.looks[picks], knowledge.sheets, found.overshoot)
+    for after_data in (False, True):
+        known = replace(knowledge, after_data=after_data)
+        exact = information_of(arranged.steps, known).fisher
+        quick = information_of_looks(seen, picks, arranged.path, knowledge.space, after_data)
+        assert np.abs(quick - exact).max() < ROUNDING * np.abs(exact).max()
+
+
+def test_order_of_experiments_does_not_matter(knowledge, found, seen):
+    generator = np.random.default_rng(6)
+    picks = generator.permutation(len(found.looks))[:16]
+    at = sensitivity(WORST, knowledge.z, knowledge.space, knowledge.rig.table, seen.mirror_angles_rad.mean(axis=0))
+    values = []
+    for order in (picks, generator.permutation(picks)):
+        path = arrange(found.looks[order], knowledge.sheets, found.overshoot).path
+        information = information_of_looks(seen, order, path, knowledge.space, False)
+        values.append(at.value(covariance_of(knowledge.precision + information)))
+    assert values[1] == pytest.approx(values[0], rel=ROUNDING)
+
+
+def test_mirroring_a_counter_swaps_names(mounted_rig, knowledge):
+    """A motor that counts the other way: the same beams, left and right exchanged."""
+    steps = tuple(s for s in four_point_protocol(3, approaches={"left": ("reversed",)}))
+    assert steps[2].action != "look"
+    mirrored = tuple(
+        replace(s, pan_steps=-s.pan_steps) if s.action in ("move", "home") and s.pan_steps is not None else s
+        for s in steps
+    )
+    turned = prior_knowledge(with_priors(mounted_rig, degrees_per_step__pan=Prior(-0.06, 0.01)))
+    u, v = u_of(steps, knowledge), u_of(mirrored, turned)
+    names = list(QUANTITIES)
+    swapped = {"left": "right", "right": "left"}
+    expected = [u[names.index(swapped.get(name, name))] for name in names]
+    assert v == pytest.approx(expected, rel=1e-6)
+    assert abs(u[0] / u[1] - 1) > 1e-4, "left and right differ, or the law would be empty"
+
+
+def test_looks_that_miss_an_image_tell_nothing(knowledge):
+    """600 steps turn the beam by 36 degrees, out of the images."""
+    steps = list(paper_protocol(1))
+    more = (*steps, PlanStep(len(steps), "move", 1000, 0), PlanStep(len(steps) + 1, "look"))
+    information = information_of(more, knowledge)
+    assert not information.expectation.seen[-1]
+    assert information.expectation.seen[:-1].all()
+    assert information.fisher == pytest.approx(information_of(steps, knowledge).fisher, rel=ROUNDING)
+
+
+def test_truths_have_coordinates(mounted_rig, knowledge):
+    drawn = draw_truth(mounted_rig, np.random.default_rng(8))
+    truth = truth_in(knowledge, drawn.parameters, drawn.stereo.vector)
+    physical = design.physical_at(truth.z, truth.space).value
+    for name, index in INDEX.items():
+        true = drawn.parameters.get(name)
+        if true is not None:
+            assert physical[index] == pytest.approx(true, rel=ROUNDING, abs=ROUNDING), name
+    assert physical[-24:] == pytest.approx(drawn.stereo.vector, rel=ROUNDING, abs=1e-6)
+
+
+# Targets.
+
+
+def test_targets_are_read():
+    assert parse_target("u(left) <= 2e-4 deg/step") == Target("u(left) <= 2e-4 deg/step", "left", 1.0, 2e-4, "deg/step")
+    point = parse_target("  U95(x)  at 1000, 0,-2.5 mm <= 60 mm ")
+    assert (point.quantity, point.point_mm, point.limit) == ("x", (1000.0, 0.0, -2.5), 60.0)
+    assert point.factor == pytest.approx(1.96, abs=1e-3)
+    assert parse_target("u(backlash.tilt)<=.05deg").unit == "deg"
+
+
+@pytest.mark.parametrize(
+    ("text", "word"),
+    [
+        ("left <= 2e-4", "not of that form"),
+        ("u(left) < 2e-4 deg/step", "not of that form"),
+        ("u(left) <= 2e-4 mm", "in deg/step, not mm"),
+        ("u(leftt) <= 2e-4 deg/step", "no quantity leftt"),
+        ("u(left) <= 0 deg/step", "the limit 0"),
+        ("u(left) <= -1 deg/step", "the limit -1"),
+        ("u(left) <= 1e999 deg/step", "the limit inf"),
+        ("U95(x) <= 60 mm", "name the point"),
+        ("u(left) at 1,2,3 mm <= 2e-4 deg/step", "leave the point out"),
+        ("u(left) <= nan deg/step", "not of that form"),
+        ("u(left) <= \u0661 deg/step", "not of that form"),
+        ("u(left) <= 1 deg/step" + " " * 500, "not of that form"),
+        ("", "not of that form"),
+    ],
+)
+def test_other_targets_are_refused_with_what_is_allowed(text, word):
+    with pytest.raises(InputError) as refused:
+        parse_target(text)
+    assert word in refused.value.message
+    assert "U95(NAME) <= NUMBER UNIT" in refused.value.allowed
+
+
+def test_a_point_has_its_own_uncertainty(knowledge):
+    """A perfect calibration keeps stop and reading: dx = d^2 / b times their angles, b = a - L between the lines."""
+    target = parse_target("u(x) at 1000,0,0 mm <= 60 mm")
+    at = sensitivity(target, knowledge.z, knowledge.space, knowledge.rig.table, np.zeros(2))
+    base_mm, stop_rad, reading_rad = 200.0 - 30.0, math.radians(0.04), math.radians(0.02)
+    from_beam_mm2, from_aperture_mm2 = 1000.0**2 + 70.0**2, 1000.0**2 + 100.0**2
+    expected_mm = math.hypot(stop_rad * from_beam_mm2, reading_rad * from_aperture_mm2) / base_mm
+    # The tilt's stop enters x to second order; small angles of the triangle are left out: (b / d)^2 = 3 %.
+    assert at.value(np.zeros((PARAMETERS, PARAMETERS))) == pytest.approx(expected_mm, rel=0.03)
+    assert at.value(knowledge.covariance) > 10 * expected_mm
+
+
+# Search.
+
+
+def test_greedy_takes_the_best_look_and_exchange_never_worsens():
+    generator = np.random.default_rng(9)
+    rows, gradient = generator.normal(size=(12, 4, 6)), generator.normal(size=(2, 6))
+    search = Search(rows, np.diag([1.0, 2, 3, 4, 5, 6]), gradient, np.zeros(2))
+    one = [search.value([k]) for k in range(12)]
+    picks = search.greedy(4)
+    assert picks[0] == int(np.argmin(one))
+    assert search.after_one_more(search.covariance) == pytest.approx(one, rel=ROUNDING)
+    every = min(search.value([a, b, c]) for a in range(12) for b in range(a, 12) for c in range(b, 12))
+    exchanged = search.exchange(picks[:3])
+    assert every * (1 - ROUNDING) <= search.value(exchanged) <= search.value(picks[:3])
+    assert search.value(exchanged) < 1.05 * every
+
+
+def test_criteria_are_what_they_say():
+    covariance, reference = np.array([[4.0, 1.0], [1.0, 2.0]]), np.array([8.0, 2.0])
+    assert scores(covariance, reference, "c") == pytest.approx(4.0 + design.MEAN_WEIGHT * 3.0)
+    assert scores(covariance, reference, "A") == pytest.approx((4 / 8 + 2 / 2) / 2)
+    assert scores(covariance, reference, "D") == pytest.approx(math.log(7.0 / 16.0))
+
+
+def test_limits_are_kept(mounted_rig, found):
+    """Stated limits bind every counter of a plan, run-ups included; without them the grid's own range does."""
+    tight = {"pan_min_steps": 0, "pan_max_steps": 150, "tilt_min_steps": -70, "tilt_max_steps": 90}
+    known = prior_knowledge(replace(mounted_rig, positioner=tight))
+    inside = candidates(known)
+    arranged = arrange(inside.looks, known.sheets, inside.overshoot)
+    moves = np.array([(s.pan_steps, s.tilt_steps) for s in arranged.steps if s.action == "move"])
+    assert moves.min(axis=0) == pytest.approx([0, -70], abs=40) and (moves.min(axis=0) >= [0, -70]).all()
+    assert (moves.max(axis=0) <= [150, 90]).all()
+    assert not inside.notes
+    assert "pan_min_steps" in found.notes[0] and "pan -100 to 280" in found.notes[0]
+    assert np.abs(found.looks.steps).max() <= 280
+
+
+def test_every_look_is_reached_from_its_side(found, knowledge):
+    arranged = arrange(found.looks, knowledge.sheets, found.overshoot)
+    assert [s.target for s in arranged.steps if s.action == "place"] == list(knowledge.sheets)
+    counters, last, row = np.zeros(2, dtype=int), np.zeros(2, dtype=int), 0
+    for step in arranged.steps:
+        if step.action == "move":
+            last = np.array([step.pan_steps, step.tilt_steps]) - counters
+            counters = counters + last
+        elif step.action == "look":
+            look = arranged.order[row]
+            assert (counters == found.looks.steps[look]).all()
+            assert (last * found.looks.side[look] >= found.overshoot).all()
+            row += 1
+    assert row == len(found.looks)
+
+
+def test_a_full_turn_waits_until_the_ratio_is_known(mounted_rig):
+    """Two stops over 360 deg hold k to a stop error over 6000 steps, whatever the cameras; once the spot is found."""
+    limits = {"pan_min_steps": -100, "pan_max_steps": 7000, "tilt_min_steps": -130, "tilt_max_steps": 130}
+    wide = replace(mounted_rig, positioner=limits)
+    unknown = candidates(prior_knowledge(wide))
+    assert unknown.full_turns == 0
+    assert "not yet known well enough" in " ".join(unknown.notes)
+    sharp = prior_knowledge(with_priors(wide, degrees_per_step__pan=Prior(0.06, 1e-5)))
+    turned = candidates(sharp)
+    assert turned.full_turns > 0 and turned.looks.steps.max() <= 7000
+    vague = prior_knowledge(with_priors(wide, degrees_per_step__pan=Prior(0.06, 1e-3)))
+    away = np.flatnonzero(turned.looks.steps[:, 0] > 3000)[:2]
+    twins = turned.looks.steps[away] - np.array([6000, 0])
+    looks = Looks(
+        np.concatenate([turned.looks.steps[away], twins]),
+        np.tile(turned.looks.side[away], (2, 1)),
+        np.tile(turned.looks.sheet[away], 2),
+    )
+    steps = arrange(looks, vague.sheets, turned.overshoot).steps
+    ratio = parse_target("u(left) <= 1e-5 deg/step")
+    information = information_of(steps, vague)
+    covariance = covariance_of(vague.precision + information.fisher)
+    # The whole way out went left: it is k_left = k + c / 2 that the turn measures.
+    left = np.zeros(PARAMETERS)
+    left[[INDEX["degrees_per_step.pan"], INDEX["ratio_contrast_deg_per_step.pan"]]] = 1e-3, 1e-4
+    k = math.sqrt(left @ covariance @ left)
+    stop_deg = 0.04
+    assert k < 2 * stop_deg / 6000
+    at = sensitivity(ratio, vague.z, vague.space, vague.rig.table, information.pose_rad)
+    assert at.value(covariance) > 10 * k, "the slope of the beam still hangs on the mirrors"
+
+
+# The plan.
+
+
+@pytest.fixture(scope="module")
+def result(knowledge):
+    target = parse_target("u(worst) <= 5e-4 deg/step")
+    options = {"criterion": "c", "aperture": False, "largest": 12, "minutes": None}
+    return plan_from(knowledge, target, draws=20, seed=1, **options)
+
+
+def test_the_curve_is_monotone(result):
+    curve = result.curve
+    assert [p.experiments for p in curve] == sorted({p.experiments for p in curve})
+    for before, after in pairwise(curve):
+        assert after.minutes > before.minutes
+        assert after.joint <= before.joint
+        assert after.assurance >= before.assurance
+        assert before.classic is None or after.classic < before.classic
+    assert curve[-1].classic is not None
+    assert all(p.assurance_se == pytest.approx(math.sqrt(p.assurance * (1 - p.assurance) / 20)) for p in curve)
+    assert result.n80 <= result.n95 <= 12
+    reached = {p.experiments: p.assurance for p in curve}
+    assert reached[result.n80] >= 0.8 and reached[result.n95] >= 0.95
+
+
+def test_the_plan_runs_through_the_twin(result, mounted_rig, tmp_path):
+    write_plan(result.steps, tmp_path / "plan.csv")
+    steps = read_plan(tmp_path / "plan.csv")
+    assert steps == result.steps
+    assert sum(s.action == "look" for s in steps) == result.looks == 4 * result.experiments
+    assert result.minutes == pytest.approx(plan_minutes(steps, mounted_rig))
+    run = simulate(mounted_rig, steps, 3)
+    assert sum(s.status == "ok" for s in run.campaign.spots) >= 0.9 * result.looks
+
+
+def test_the_plan_beats_the_baselines(result):
+    by_name = {b.name: b for b in result.baselines}
+    assert set(by_name) == {"planned", "paper", "mixed", "grid"}
+    assert by_name["planned"].minutes < 0.1 * by_name["paper"].minutes
+    assert by_name["planned"].joint < by_name["paper"].joint
+    assert by_name["planned"].joint == result.expected <= result.target.limit
+    assert result.met and result.assurance >= 0.8
+
+
+def test_the_document_has_the_contracts_keys(result):
+    document = json.loads(json.dumps(result.as_json(), allow_nan=False))
+    assert {"target", "curve", "n80", "n95", "limited_by", "next", "stop"} <= set(document)
+    assert set(document["curve"][0]) == {"experiments", "minutes", "classic", "joint", "assurance", "assurance_se"}
+    assert {"actions", "gain_per_minute"} <= set(document["next"][0])
+    assert {a["action"] for a in document["next"][0]["actions"]} == {"home", "place", "move", "look"}
+    assert sum(document["variance_shares"].values()) == pytest.approx(1.0, abs=1e-6)
+    assert "floor" in planning.plan_text(result)
+
+
+def test_gain_per_minute_falls_in_order(result):
+    gains = [batch.gain_per_minute for batch in result.next]
+    assert gains == sorted(gains, reverse=True) and gains[0] > 0
+    assert all(b.gain_per_minute == pytest.approx(b.gain / b.minutes) for b in result.next)
+
+
+def test_a_target_below_the_floor_names_the_term_and_what_would_do(knowledge, found, seen):
+    """With exact cameras of unknown focal scale and one depth the scale limits everything, and its cure is enough."""
+    target = parse_target("u(left) <= 4e-5 deg/step")
+    picks = np.arange(len(found.looks))
+    path = arrange(found.looks, knowledge.sheets, found.overshoot).path
+    information = information_of_looks(seen, picks, path, knowledge.space, False)
+    at = sensitivity(target, knowledge.z, knowledge.space, knowledge.rig.table, np.zeros(2))
+    reachable = limit_of(knowledge, information, at, replace(target, limit=1.0))
+    assert reachable.reachable and reachable.needed is None
+    assert sum(reachable.shares.values()) == pytest.approx(1.0, abs=1e-6)
+    limit = limit_of(knowledge, information, at, replace(target, limit=0.5 * reachable.floor))
+    assert not limit.reachable
+    assert limit.cause == next(iter(limit.shares))
+    assert "it would do to know" in limit.needed
+
+
+def test_no_calibration_removes_the_stop_at_the_point(knowledge, seen, found):
+    target = parse_target("U95(x) at 1000,0,0 mm <= 0.5 mm")
+    at = sensitivity(target, knowledge.z, knowledge.space, knowledge.rig.table, np.zeros(2))
+    path = arrange(found.looks, knowledge.sheets, found.overshoot).path
+    information = information_of_looks(seen, np.arange(len(found.looks)), path, knowledge.space, False)
+    limit = limit_of(knowledge, information, at, target)
+    assert not limit.reachable and "at the point itself" in limit.needed
+
+
+def test_when_to_stop():
+    target, open_end = parse_target("u(left) <= 2e-4 deg/step"), Limit(1e-5, "focal scale", {}, True, None)
+    good, poor = (Batch((), 1.0, g, g, "") for g in (1e-5, 1e-8))
+    assert stop_now(1e-4, target, open_end, (good,), True).now
+    assert not stop_now(1e-4, target, open_end, (good,), False).now, "nothing was measured yet"
+    assert not stop_now(3e-4, target, open_end, (good,), True).now
+    assert stop_now(3e-4, target, open_end, (poor,), True).now
+    floor = replace(open_end, floor=2.5e-4, reachable=False)
+    assert stop_now(3e-4, target, floor, (good,), True).now
+    assert "floor" in stop_now(3e-4, target, floor, (good,), False).reason
+
+
+def test_after_data_the_next_session_starts_from_what_is_known(knowledge):
+    """A campaign of the paper's kind leaves the tilt: the next looks help most, and more than the first would again."""
+    taught = information_of(paper_protocol(4), knowledge)
+    known = replace(knowledge, precision=knowledge.precision + taught.fisher, after_data=True)
+    target = parse_target("u(worst) <= 2e-4 deg/step")
+    options = {"criterion": "c", "aperture": False, "largest": 4, "minutes": 6.0}
+    result = plan_from(known, target, None, taught.pose_rad, draws=20, seed=2, **options)
+    assert result.now > target.limit and not result.stop.now
+    assert result.expected < 0.7 * result.now
+    assert result.minutes <= 6.0
+    assert "the campaign and its priors" in result.shares
+    assert result.steps[0].action == "home"
+    enough = plan_from(known, replace(target, limit=1.0), None, taught.pose_rad, draws=20, seed=2, **options)
+    assert enough.stop.now and enough.met and enough.steps == ()
+
+
+def test_too_few_minutes_are_refused(knowledge):
+    options = {"criterion": "c", "aperture": False, "largest": 2, "minutes": 0.5}
+    with pytest.raises(InputError, match="one experiment of four looks takes"):
+        plan_from(knowledge, WORST, draws=20, seed=0, **options)
+
+
+@pytest.mark.parametrize(("sd", "half_width"), [(1.0, 1.0), (1.0, 0.42), (1.0, 3.0), (5e-4, 2e-4), (1.0, 0.02)])
+def test_the_classics_count_is_the_first_that_suffices(sd, half_width):
+    from scipy import stats
+
+    def suffices(n: int) -> bool:
+        return stats.t.ppf(0.975, n - 1) * sd / math.sqrt(n) <= half_width
+
+    n = classic_count(sd, half_width)
+    assert suffices(n)
+    assert n == 2 or not suffices(n - 1)
+
+
+# What a plan leaves together.
+
+
+def test_the_papers_protocol_leaves_ratio_and_backlash_together_and_is_cured(mounted_rig):
+    steps = paper_protocol(12)
+    check = check_plan(mounted_rig, steps)
+    assert {fault.axis for fault in check.faults} == {"pan", "tilt"}
+    for fault in check.faults:
+        assert "add N = 100 or a cleared approach" in fault.text
+        assert fault.addition and fault.after < 0.9 * fault.before
+        again = check_plan(mounted_rig, (*steps, *fault.addition))
+        assert fault.axis not in {f.axis for f in again.faults}
+    json.dumps(check.as_json(), allow_nan=False)
+
+
+def test_a_grid_is_not_blamed(mounted_rig):
+    check = check_plan(mounted_rig, grid_protocol(pan_steps=(0, 120, 240), tilt_steps=(-90, 0, 90)))
+    assert check.faults == () and check.warnings == ()
+
+
+def test_one_depth_and_one_side_are_named(mounted_rig):
+    orders = [("home", 0, 0), ("place", None, None, "d1")]
+    for pan in (40, 80, 120, 160, 200):
+        orders += [("move", pan, pan // 2 - 60), ("look",)]
+    steps = tuple(PlanStep(number, *order) for number, order in enumerate(orders))
+    text = "\n".join(check_plan(mounted_rig, steps).warnings)
+    assert "reached from one side" in text
+    assert "one depth" in text and "place d2, d3" in text
+
+
+def test_a_plan_beyond_the_limits_is_named(mounted_rig):
+    rig = replace(mounted_rig, positioner={"pan_min_steps": 0, "pan_max_steps": 150})
+    text = "\n".join(check_plan(rig, grid_protocol(pan_steps=(0, 240), tilt_steps=(-90, 90))).warnings)
+    assert "[positioner] allows 0 to 150" in text
+
+
+def test_a_plan_without_a_look_is_refused(mounted_rig):
+    with pytest.raises(InputError, match="looks at nothing"):
+        check_plan(mounted_rig, (PlanStep(0, "home", 0, 0),))
+
+
+def test_a_rig_without_sheets_is_refused(mounted_rig):
+    with pytest.raises(InputError, match="no sheets"):
+        candidates(prior_knowledge(replace(mounted_rig, sheets_mm={})))
+
+
+def test_moves_of_a_plan_are_those_the_twin_makes_of_it(mounted_rig, knowledge):
+    log = run_plan(paper_protocol(1), mounted_rig, ("left", "up"))
+    information = information_of(paper_protocol(1), knowledge)
+    assert information.moves == tuple(log.moves)
+    assert information.look_moves == tuple(look[1] for look in log.looks)

@@ -1,0 +1,188 @@
+"""Studies: rows that survive a kill, the same numbers on every engine, counts with their bounds."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tvsbayes import studies
+from tvsbayes.campaign import PlanStep
+from tvsbayes.design import QUANTITIES, parse_target
+from tvsbayes.files import InputError, NotConverged, TvsError
+from tvsbayes.studies import StudyJob, StudyRows, executor, study, study_result, study_text
+
+TARGET = parse_target("u(worst) <= 1e-3 deg/step")
+
+
+def sweep(sheets: tuple[str, ...] = ("d1", "d3")) -> tuple[PlanStep, ...]:
+    """24 looks from both sides of both axes."""
+    orders = [("home", 0, 0)]
+    for sheet in sheets:
+        orders.append(("place", None, None, sheet))
+        for k in range(12):
+            orders += [("move", (0, 100, 200, 100)[k % 4], (-60, 0, 60, 30, -30, -45)[k % 6]), ("look",)]
+    return tuple(PlanStep(number, *order) for number, order in enumerate(orders))
+
+
+@pytest.fixture
+def job(mounted_rig) -> StudyJob:
+    return StudyJob(mounted_rig, sweep(), TARGET, seed=7)
+
+
+def invented(job: StudyJob, index: int) -> dict:
+    """A row as `study_row` makes it, of a perfect estimator: errors and sds are known."""
+    error = float(np.random.default_rng([3, index]).standard_normal())
+    one = {"truth": 0.06, "value": 0.06 + 1e-4 * error, "sd": 1e-4, "interval95": [0.0, 1.0], "predicted_sd": 1e-4}
+    row = {"design": job.key, "index": index, "seed": job.campaign_seed(index), "converged": True, "problems": []}
+    pit = 0.5 * math.erfc(error / math.sqrt(2))
+    return {
+        **row,
+        "headlines": {name: {**one, "pit": pit} for name in QUANTITIES},
+        "target": 5e-4 if index % 4 else 2e-3,
+        "seconds": 1.0,
+    }
+
+
+@pytest.fixture
+def quick(monkeypatch):
+    """Rows without simulation and fit; the list of those made."""
+    made = []
+
+    def row(job, index):
+        made.append(index)
+        return invented(job, index)
+
+    monkeypatch.setattr(studies, "study_row", row)
+    return made
+
+
+def test_a_study_goes_on_where_it_was_killed(job, quick, tmp_path):
+    """The last row is torn, as a kill in the middle of a write leaves it: it is made again, the others are not."""
+    path = tmp_path / "rows.jsonl"
+    whole = study(job, 9, StudyRows(path))
+    data = path.read_bytes()
+    assert data.count(b"\n") == 9
+    cut = data[: data.rfind(b"\n", 0, -1) + 40]
+    path.write_bytes(cut)
+    quick.clear()
+    again = StudyRows(path)
+    assert again.torn == 39 + 0 * len(cut) or again.torn > 0
+    assert study(job, 9, again) == whole
+    assert quick == [8]
+    assert path.read_bytes() == data
+    quick.clear()
+    assert study(job, 9, StudyRows(path)) == whole and quick == []
+
+
+def test_one_file_keeps_designs_apart(job, quick, tmp_path, mounted_rig):
+    path = tmp_path / "rows.jsonl"
+    study(job, 3, StudyRows(path))
+    others = (
+        replace(job, seed=8),
+        replace(job, aperture=True),
+        replace(job, steps=sweep(("d1",))),
+        replace(job, target=parse_target("u(left) <= 1e-3 deg/step")),
+        replace(job, rig=replace(mounted_rig, sheets_mm={**mounted_rig.sheets_mm, "d1": 176.0})),
+        replace(job, rig=replace(mounted_rig, cameras={**mounted_rig.cameras, "spot_sd_px": 0.1})),
+        replace(
+            job, rig=replace(mounted_rig, truth={**mounted_rig.truth, "pixel_scale": mounted_rig.truth["focal_scale"]})
+        ),
+    )
+    assert len({job.key, *(other.key for other in others)}) == 1 + len(others)
+    for other in others:
+        assert StudyRows(path).of(other) == {}
+    assert sorted(StudyRows(path).of(job)) == [0, 1, 2]
+
+
+def test_seeds_do_not_depend_on_the_number_of_campaigns(job):
+    seeds = [job.campaign_seed(i) for i in range(200)]
+    assert len(set(seeds)) == 200 and all(0 <= s < 2**63 for s in seeds)
+    assert replace(job, seed=8).campaign_seed(0) != seeds[0]
+
+
+@pytest.mark.parametrize("line", ["{", "[]", "1", '{"format": "tvsbayes-study/1"}', '{"a": 1}'])
+def test_a_foreign_file_is_refused_with_its_line(job, quick, tmp_path, line):
+    path = tmp_path / "rows.jsonl"
+    study(job, 2, StudyRows(path))
+    path.write_text(path.read_text() + line + "\n")
+    with pytest.raises(InputError, match="line 3 is no row"):
+        StudyRows(path)
+
+
+def test_counts_of_a_perfect_estimator_are_within_bounds_and_of_a_boastful_one_outside(job):
+    rows = [invented(job, i) for i in range(400)]
+    result = study_result(job, rows)
+    left = result.headlines["left"]
+    assert left.within and all(h.within for h in result.headlines.values())
+    assert left.rms_z == pytest.approx(left.rms_predicted)
+    assert left.predicted_over_rms == pytest.approx(1 / left.rms_z)
+    assert result.assurance == 0.75
+    low, high = result.assurance_interval95
+    assert low < 0.75 < high and high - low == pytest.approx(4 * math.sqrt(0.75 * 0.25 / 400), rel=0.1)
+    boastful = [json.loads(json.dumps(row)) for row in rows]
+    for row in boastful:
+        for h in row["headlines"].values():
+            h["sd"] *= 0.8
+    assert not study_result(job, boastful).headlines["left"].within
+    assert "reported as met by 75.0 %" in study_text(result)
+    json.dumps(result.as_json(), allow_nan=False)
+
+
+def test_failures_count_against_the_assurance(job):
+    rows = [invented(job, i) for i in (1, 2, 3)]
+    failed = {"design": job.key, "index": 4, "converged": False, "problems": ["did not settle"], "seconds": 1.0}
+    result = study_result(job, [*rows, failed])
+    assert (result.campaigns, result.converged, result.assurance) == (4, 3, 0.75)
+    assert result.problems == ("campaign 4: did not settle",)
+    with pytest.raises(NotConverged, match="did not settle"):
+        study_result(job, [failed])
+
+
+def test_unknown_engines_are_refused(job):
+    with pytest.raises(InputError, match="no engine threads"), executor("threads"):
+        pass
+
+
+def test_a_dead_worker_is_told_with_what_to_do(job):
+    """A pool whose process has died says so in our words."""
+    from concurrent.futures.process import BrokenProcessPool
+
+    class Broken:
+        def submit(self, *_):
+            from concurrent.futures import Future
+
+            future = Future()
+            future.set_exception(BrokenProcessPool())
+            return future
+
+        def shutdown(self, **_):
+            pass
+
+    made = studies.ProcessExecutor(1)
+    made.pool.shutdown()
+    made.pool = Broken()
+    made.submit(job, 0)
+    with pytest.raises(TvsError, match="finished rows are kept") as told:
+        list(made.as_completed())
+    assert "run the same command again" in told.value.remedy
+
+
+@pytest.mark.slow
+def test_numbers_are_the_same_on_every_engine(job, tmp_path):
+    """Serial in this process with all its threads, two spawned single-threaded processes; resumed in between."""
+    serial = StudyRows(tmp_path / "serial.jsonl")
+    study(job, 4, serial, engine="serial")
+    processes = StudyRows(tmp_path / "processes.jsonl")
+    study(job, 2, processes, engine="serial")
+    study(job, 4, StudyRows(tmp_path / "processes.jsonl"), engine="processes", workers=2)
+
+    def numbers(path):
+        return {i: {k: v for k, v in r.items() if k != "seconds"} for i, r in StudyRows(path).of(job).items()}
+
+    one, other = numbers(tmp_path / "serial.jsonl"), numbers(tmp_path / "processes.jsonl")
+    assert one == other and sorted(one) == [0, 1, 2, 3]
+    assert all(row["converged"] for row in one.values())
