@@ -2,8 +2,8 @@
 
     python experiments/planning_speed.py > experiments/planning_speed.md       # two minutes
 
-Exact: a whole plan through the filter, `information_of`, after compilation; looks at many instruments, one by
-one and mapped by `jax.vmap`. Search: one step of the greedy choice scores every candidate beside what is chosen already.
+Exact: a whole plan through the filter, `information_of`, after compilation; looks at many instruments, one by one and
+mapped by `jax.vmap`. Search: one step of the greedy choice scores every candidate beside what is chosen already.
 """
 
 from __future__ import annotations

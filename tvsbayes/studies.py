@@ -25,7 +25,7 @@ from typing import Protocol
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy import stats
+from scipy import special, stats
 
 from tvsbayes.calibration import NORMAL_95
 from tvsbayes.campaign import (
@@ -142,6 +142,10 @@ def study_row(job: StudyJob, index: int) -> dict[str, object]:
     gradient = np.asarray(at_truth.gradient)
     predicted = covariance_of(knowledge.precision + information.fisher)
     predicted_sd = np.sqrt(np.einsum("qi,ij,qj->q", gradient, predicted, gradient))
+    for axis in ("pan", "tilt"):
+        column = INDEX[f"backlash_deg.{axis}"]
+        spread = half_normal_sd(truth.z[column], math.sqrt(predicted[column, column]))
+        predicted_sd[QUANTITIES.index(f"backlash.{axis}")] = spread * job.rig.table.priors[NAMES[column]].u
     true = true_headlines(run.truth.parameters, pose)
     draws = _headline_draws(result)
     value, sd = np.asarray(at_mode.value), draws.std(axis=0)
@@ -163,6 +167,19 @@ def study_row(job: StudyJob, index: int) -> dict[str, object]:
     except InputError:
         row["target"] = None
     return {**row, "seconds": time.perf_counter() - start}
+
+
+def half_normal_sd(mean: float, sd: float) -> float:
+    """Sd of a half-normal of scale 1 whose coordinate is N(mean, sd^2), by Gauss-Hermite quadrature.
+
+    Near no backlash the map from coordinate to backlash is flat on one side: a slope there would promise a certainty
+    that no fit has.
+    """
+    nodes, weights = np.polynomial.hermite_e.hermegauss(48)
+    values = -special.ndtri(0.5 * special.ndtr(-(mean + sd * nodes)))
+    weights = weights / weights.sum()
+    centre = weights @ values
+    return float(np.sqrt(weights @ (values - centre) ** 2))
 
 
 def _headline_draws(result: JointFit) -> np.ndarray:
