@@ -55,6 +55,7 @@ def small_searches():
             patch.setattr(design, name, value)
         patch.setattr(design, "VISIBILITY_DRAWS", 8)
         patch.setattr(planning, "CLASSIC_DRAWS", 5)
+        patch.setitem(planning.plan.__kwdefaults__, "largest", 8)
         yield
 
 
