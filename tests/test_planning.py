@@ -199,6 +199,41 @@ def test_truths_have_coordinates(mounted_rig, knowledge):
     assert physical[-24:] == pytest.approx(drawn.stereo.vector, rel=ROUNDING, abs=1e-6)
 
 
+def test_other_noise_scales_need_no_new_look(knowledge, found, seen):
+    """Looks whitened anew for other stop errors and pixels carry the information that looking again would give."""
+    family = planning.Family(knowledge, found, np.arange(len(found.looks)), False)
+    assurance = planning.Assurance(family, WORST, 1, 0)
+    truth = planning.DrawnTruth(knowledge.z, knowledge.space)
+    z = knowledge.z.copy()
+    z[[*planning.STOP_COLUMNS.ravel(), planning.PIXEL_COLUMN]] = (0.7, -1.1, 0.4, 1.3, -0.6)
+    again = assurance.arrays.at(z, knowledge.space).rows
+    quick = assurance._rescaled(assurance.arrays.at(truth.z, truth.space), truth, z).rows
+    one, other = (np.einsum("mij,mik->jk", rows, rows) for rows in (again, quick))
+    assert np.abs(one - other).max() < ROUNDING * np.abs(one).max()
+    before = np.einsum("mij,mik->jk", seen.rows, seen.rows)
+    assert np.abs(one - before).max() > 0.1 * np.abs(one).max(), "the scales matter, or the law would be empty"
+
+
+def test_a_noise_scale_is_believed_by_the_weight_of_the_stops(knowledge, found, seen):
+    """Thousands of stops tell the true sd; none leave the prior's median; the scatter is 1 / sqrt(2 n)."""
+    true = knowledge.z.copy()
+    columns = planning.STOP_COLUMNS.ravel()
+    true[columns] = 1.5
+    truth, exact = planning.DrawnTruth(true, knowledge.space), np.zeros((PARAMETERS, PARAMETERS))
+    many = np.tile(np.arange(len(found.looks)), 40)
+
+    def believed(chosen, noise):
+        taken = design.Seen(*(getattr(seen, n)[chosen] for n in ("rows", "slope", "seen", "mirror_angles_rad")))
+        side = found.looks.side[chosen]
+        return planning.believed(truth, taken, side, exact, knowledge, np.full(5, noise))[columns]
+
+    assert believed(many, 0.0) == pytest.approx(1.5, abs=0.01)
+    assert (np.abs(believed(many[:1], 0.0)) < 1.5).all()
+    per_direction = len(many) / 2
+    # Stops of 0.18 deg against pixels: what pixels leave open lowers the information by a few per cent.
+    assert believed(many, 1.0) - believed(many, 0.0) == pytest.approx(1 / math.sqrt(2 * per_direction), rel=0.1)
+
+
 # Targets.
 
 
@@ -262,6 +297,8 @@ def test_greedy_takes_the_best_look_and_exchange_never_worsens():
     exchanged = search.exchange(picks[:3])
     assert every * (1 - ROUNDING) <= search.value(exchanged) <= search.value(picks[:3])
     assert search.value(exchanged) < 1.05 * every
+    worst = 3 * [int(np.argmax(one))]
+    assert search.value(search.exchange(worst)) < 1.05 * every < 0.9 * search.value(worst)
 
 
 def test_criteria_are_what_they_say():
