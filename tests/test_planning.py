@@ -35,7 +35,7 @@ from tvsbayes.design import (
     scores,
     sensitivity,
 )
-from tvsbayes.files import InputError
+from tvsbayes.files import InputError, shipped_data
 from tvsbayes.model import INDEX
 from tvsbayes.planning import Batch, Limit, check_plan, classic_count, limit_of, plan_from, stop_now, truth_in
 from tvsbayes.rigs import Prior, Rig
@@ -55,6 +55,7 @@ def small_searches():
             patch.setattr(design, name, value)
         patch.setattr(design, "VISIBILITY_DRAWS", 8)
         patch.setattr(planning, "CLASSIC_DRAWS", 5)
+        patch.setitem(planning.plan.__kwdefaults__, "largest", 8)
         yield
 
 
@@ -198,6 +199,41 @@ def test_truths_have_coordinates(mounted_rig, knowledge):
     assert physical[-24:] == pytest.approx(drawn.stereo.vector, rel=ROUNDING, abs=1e-6)
 
 
+def test_other_noise_scales_need_no_new_look(knowledge, found, seen):
+    """Looks whitened anew for other stop errors and pixels carry the information that looking again would give."""
+    family = planning.Family(knowledge, found, np.arange(len(found.looks)), False)
+    assurance = planning.Assurance(family, WORST, 1, 0)
+    truth = planning.DrawnTruth(knowledge.z, knowledge.space)
+    z = knowledge.z.copy()
+    z[[*planning.STOP_COLUMNS.ravel(), planning.PIXEL_COLUMN]] = (0.7, -1.1, 0.4, 1.3, -0.6)
+    again = assurance.arrays.at(z, knowledge.space).rows
+    quick = assurance._rescaled(assurance.arrays.at(truth.z, truth.space), truth, z).rows
+    one, other = (np.einsum("mij,mik->jk", rows, rows) for rows in (again, quick))
+    assert np.abs(one - other).max() < ROUNDING * np.abs(one).max()
+    before = np.einsum("mij,mik->jk", seen.rows, seen.rows)
+    assert np.abs(one - before).max() > 0.1 * np.abs(one).max(), "the scales matter, or the law would be empty"
+
+
+def test_a_noise_scale_is_believed_by_the_weight_of_the_stops(knowledge, found, seen):
+    """Thousands of stops tell the true sd; none leave the prior's median; the scatter is 1 / sqrt(2 n)."""
+    true = knowledge.z.copy()
+    columns = planning.STOP_COLUMNS.ravel()
+    true[columns] = 1.5
+    truth, exact = planning.DrawnTruth(true, knowledge.space), np.zeros((PARAMETERS, PARAMETERS))
+    many = np.tile(np.arange(len(found.looks)), 40)
+
+    def believed(chosen, noise):
+        taken = design.Seen(*(getattr(seen, n)[chosen] for n in ("rows", "slope", "seen", "mirror_angles_rad")))
+        side = found.looks.side[chosen]
+        return planning.believed(truth, taken, side, exact, knowledge, np.full(5, noise))[columns]
+
+    assert believed(many, 0.0) == pytest.approx(1.5, abs=0.01)
+    assert (np.abs(believed(many[:1], 0.0)) < 1.5).all()
+    per_direction = len(many) / 2
+    # Stops of 0.18 deg against pixels: what pixels leave open lowers the information by a few per cent.
+    assert believed(many, 1.0) - believed(many, 0.0) == pytest.approx(1 / math.sqrt(2 * per_direction), rel=0.1)
+
+
 # Targets.
 
 
@@ -261,6 +297,8 @@ def test_greedy_takes_the_best_look_and_exchange_never_worsens():
     exchanged = search.exchange(picks[:3])
     assert every * (1 - ROUNDING) <= search.value(exchanged) <= search.value(picks[:3])
     assert search.value(exchanged) < 1.05 * every
+    worst = 3 * [int(np.argmax(one))]
+    assert search.value(search.exchange(worst)) < 1.05 * every < 0.9 * search.value(worst)
 
 
 def test_criteria_are_what_they_say():
@@ -302,14 +340,14 @@ def test_every_look_is_reached_from_its_side(found, knowledge):
 
 def test_a_full_turn_waits_until_the_ratio_is_known(mounted_rig):
     """Two stops over 360 deg hold k to a stop error over 6000 steps, whatever the cameras; once the spot is found."""
-    limits = {"pan_min_steps": -100, "pan_max_steps": 7000, "tilt_min_steps": -130, "tilt_max_steps": 130}
+    limits = {"pan_min_steps": -100, "pan_max_steps": 6100, "tilt_min_steps": -130, "tilt_max_steps": 130}
     wide = replace(mounted_rig, positioner=limits)
     unknown = candidates(prior_knowledge(wide))
     assert unknown.full_turns == 0
     assert "not yet known well enough" in " ".join(unknown.notes)
     sharp = prior_knowledge(with_priors(wide, degrees_per_step__pan=Prior(0.06, 1e-5)))
     turned = candidates(sharp)
-    assert turned.full_turns > 0 and turned.looks.steps.max() <= 7000
+    assert turned.full_turns > 0 and turned.looks.steps.max() <= 6100
     vague = prior_knowledge(with_priors(wide, degrees_per_step__pan=Prior(0.06, 1e-3)))
     away = np.flatnonzero(turned.looks.steps[:, 0] > 3000)[:2]
     twins = turned.looks.steps[away] - np.array([6000, 0])
@@ -514,3 +552,70 @@ def test_moves_of_a_plan_are_those_the_twin_makes_of_it(mounted_rig, knowledge):
     information = information_of(paper_protocol(1), knowledge)
     assert information.moves == tuple(log.moves)
     assert information.look_moves == tuple(look[1] for look in log.looks)
+
+
+# Commands.
+
+
+@pytest.fixture
+def ask(capsys, monkeypatch):
+    """Run a command with --json without touching JAX's settings: exit code and document."""
+    from tvsbayes import model
+    from tvsbayes.cli import run
+
+    monkeypatch.setattr(model, "use_compilation_cache", lambda: None)
+
+    def command(*arguments) -> tuple[int, dict]:
+        code = run([*map(str, arguments), "--json"])
+        return code, json.loads(capsys.readouterr().out)
+
+    return command
+
+
+MOUNTED = shipped_data() / "rigs" / "mounted"
+
+
+def test_plan_writes_a_plan_and_says_by_its_exit_code_whether_the_users_target_is_met(ask, tmp_path):
+    small = ("--draws", 20, "--minutes", 3, "-o", tmp_path / "plan.csv")
+    code, document = ask("plan", MOUNTED / "rig.toml", "--target", "u(left) <= 1e-7 deg/step", *small)
+    assert code == 1 and not document["met"] and document["n80"] is None
+    assert document["limited_by"]["reachable"] is False and document["limited_by"]["needed"]
+    assert sum(s.action == "look" for s in read_plan(tmp_path / "plan.csv")) == document["looks"]
+    assert document["minutes"] <= 3
+    code, document = ask("plan", MOUNTED / "rig.toml", *small)
+    assert code == 0 and not document["met"], "the default target is nobody's demand"
+    code, document = ask("plan", MOUNTED / "rig.toml", "--target", "u(left) <= 5e-3 deg/step", *small)
+    assert code == 0 and document["met"]
+
+
+@pytest.mark.parametrize("options", [("--target", "u(left) <= 1 mm"), ("--criterion", "E"), ("--minutes", "0.2")])
+def test_bad_options_of_plan_are_refused(ask, options):
+    code, document = ask("plan", MOUNTED / "rig.toml", "--draws", 20, *options)
+    assert code == 2
+    assert document["error"]["column"] == options[0]
+    assert document["error"]["allowed"] and document["error"]["remedy"]
+
+
+def test_check_takes_a_rig_with_a_plan(ask):
+    code, document = ask("check", MOUNTED / "rig.toml", MOUNTED / "grid.csv")
+    assert code == 0 and document["kind"] == "rig with plan" and document["warnings"] == []
+    assert set(document["expected"]) == set(QUANTITIES)
+    code, document = ask("check", MOUNTED / "grid.csv", MOUNTED / "grid.csv")
+    assert code == 2 and document["error"]["code"] == "usage"
+
+
+def test_study_counts_and_answers_for_the_users_target(ask, tmp_path, monkeypatch):
+    from test_studies import invented
+
+    from tvsbayes import studies
+
+    monkeypatch.setattr(studies, "study_row", invented)
+    rows = ("--n", 8, "--rows", tmp_path / "rows.jsonl")
+    target = ("--target", "u(worst) <= 1e-3 deg/step")
+    code, document = ask("study", MOUNTED / "rig.toml", MOUNTED / "grid.csv", *rows, *target)
+    assert code == 1 and document["assurance"] == 0.75, "three of four invented fits meet it, 80 % are asked"
+    assert document["campaigns"] == 8 and (tmp_path / "rows.jsonl").read_bytes().count(b"\n") == 8
+    code, _ = ask("study", MOUNTED / "rig.toml", MOUNTED / "grid.csv", *rows)
+    assert code == 0
+    code, document = ask("study", MOUNTED / "rig.toml", MOUNTED / "grid.csv", "--engine", "cloud")
+    assert code == 2 and document["error"]["column"] == "--engine"

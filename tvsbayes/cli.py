@@ -896,8 +896,8 @@ def plan(
 
     wanted = parse_target(target or DEFAULT_TARGET)
     if criterion not in CRITERIA:
-        found = escaped(criterion)
-        raise InputError("criterion", f"--criterion {found}", allowed=", ".join(CRITERIA), remedy="name one of them")
+        message, allowed = f"--criterion {escaped(criterion)}", ", ".join(CRITERIA)
+        raise InputError("criterion", message, column="--criterion", allowed=allowed, remedy="name one of them")
     use_compilation_cache()
     fitted = None
     if data is not None:
