@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from tvsbayes import ensemble
+from tvsbayes import posterior
 from tvsbayes.campaign import four_point_protocol
 from tvsbayes.joint import JointFit, fit
 from tvsbayes.posterior import BATCH, Independence, Target, Transport, by_width, in_batches, walkers_for
@@ -46,7 +46,7 @@ def small_fit() -> tuple[JointFit, Transport]:
     rig = replace(rig, stereo=replace(rig.stereo, parameter_covariance=np.zeros((24, 24))))
     fitted = fit(simulate(rig, four_point_protocol(repeats=4, steps=(100, 200)), seed=21).campaign)
     assert fitted.converged, fitted.problems
-    return fitted, ensemble.transport(fitted)
+    return fitted, posterior.transport(fitted)
 
 
 def run(moves: object, dimension: int, steps: int, walkers: int, seed: int = 1) -> np.ndarray:
@@ -86,7 +86,7 @@ def off_target(dimension: int) -> Independence:
 @pytest.mark.parametrize("dimension", INDEPENDENT_STEPS)
 @pytest.mark.parametrize("which", ["independence", "mixture"])
 def test_independence_and_the_mixture_keep_the_target(which, dimension):
-    mixture = ensemble.moves(off_target(dimension))
+    mixture = posterior.moves(off_target(dimension))
     moves = mixture[0][0] if which == "independence" else mixture
     assert bias(run(moves, dimension, INDEPENDENT_STEPS[dimension], walkers_for(dimension))) == ""
 
@@ -96,13 +96,13 @@ def test_independence_and_the_mixture_keep_the_target(which, dimension):
     ("which", "dimension"), [*[(1, d) for d in EVOLUTION_STEPS], *[(2, d) for d in EVOLUTION_STEPS if d < 20]]
 )
 def test_differential_evolution_keeps_the_target(which, dimension):
-    move, _ = ensemble.moves(off_target(dimension))[which]
+    move, _ = posterior.moves(off_target(dimension))[which]
     assert isinstance(move, emcee.moves.DEMove)
     assert bias(run(move, dimension, EVOLUTION_STEPS[dimension], max(64, 2 * dimension))) == ""
 
 
 def test_the_moves_are_the_three_that_are_tried_here():
-    mixture = ensemble.moves(off_target(3))
+    mixture = posterior.moves(off_target(3))
     assert [type(move) for move, _ in mixture] == [emcee.moves.MHMove, emcee.moves.DEMove, emcee.moves.DEMove]
     assert [move.gamma0 for move, _ in mixture[1:]] == [None, 1.0]
     assert sum(share for _, share in mixture) == pytest.approx(1.0, abs=len(mixture) * ROUNDING)
@@ -130,7 +130,7 @@ def test_walkers_that_move_together_are_seen():
 def test_walkers_outnumber_the_dimensions_in_whole_batches():
     for dimension in range(1, 200):
         walkers = walkers_for(dimension)
-        assert walkers > dimension and walkers >= ensemble.WALKERS
+        assert walkers > dimension and walkers >= posterior.WALKERS
         assert walkers % (2 * BATCH) == 0
 
 
@@ -246,7 +246,7 @@ def test_a_density_without_value_is_refused_and_counted(x64, monkeypatch):
     def evaluate(z, space, arrays):
         return SimpleNamespace(log_density=jnp.where(z[:, 3] > 50, jnp.nan, 5.0 - z[:, 0]))
 
-    monkeypatch.setattr(ensemble, "evaluate", evaluate)
+    monkeypatch.setattr(posterior, "evaluate", evaluate)
     target = Target(SimpleNamespace(space=None, arrays=None, log_density=2.0), path)
     value = target(w)
     expected = (5.0 - w[:, 0]) - 2.0

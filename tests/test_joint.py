@@ -282,7 +282,7 @@ def test_pixel_noise_and_stop_errors_are_recovered(simulated, fitted):
 
 def test_too_few_spots_are_refused_by_number(simulated):
     campaign = replace(simulated.campaign, spots=simulated.campaign.spots[:5])
-    with pytest.raises(NothingToEstimate, match="5 spots have status ok") as caught:
+    with pytest.raises(NothingToEstimate, match="5 spots can be used") as caught:
         fit(campaign)
     assert caught.value.exit_code == 3
 

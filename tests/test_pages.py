@@ -241,7 +241,7 @@ def luminance(colour: str) -> float:
 
 def test_text_stands_out_in_both_schemes():
     """4.5:1 for every text colour on the page and on its cards (WCAG 2.2, 1.4.3)."""
-    css = (ROOT / "data" / "templates" / "report.css").read_text()
+    css = (ROOT / "data" / "report" / "report.css").read_text()
     schemes = [dict(re.findall(r"--(\w+): (#[0-9a-f]+)", block)) for block in re.findall(r":root \{([^}]*)\}", css)]
     assert len(schemes) == 2
     for scheme in schemes:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from test_ensemble import ROUNDING, SIGMAS, small_fit
 
-from tvsbayes import ensemble, posterior
+from tvsbayes import posterior
 from tvsbayes.files import InputError, NotConverged
 from tvsbayes.posterior import sample
 
@@ -27,7 +27,7 @@ def limits(patch: pytest.MonkeyPatch, steps: int) -> None:
         patch.setattr(posterior, name, value)
     # The map takes seconds and no random number; the pilot needs few draws for a start.
     patch.setattr(posterior, "transport", lambda fit: small_fit()[1])
-    patch.setattr(ensemble, "PILOT_DRAWS", 512)
+    patch.setattr(posterior, "PILOT_DRAWS", 512)
 
 
 @pytest.fixture(scope="module")
@@ -117,7 +117,7 @@ def test_only_a_converged_fit_is_sampled(fitted):
 def test_what_is_missing_when_the_time_is_over_is_said(fitted, monkeypatch):
     monkeypatch.setattr(posterior, "BLOCK", BLOCK)
     monkeypatch.setattr(posterior, "transport", lambda fit: small_fit()[1])
-    monkeypatch.setattr(ensemble, "PILOT_DRAWS", 512)
+    monkeypatch.setattr(posterior, "PILOT_DRAWS", 512)
     result = sample(fitted, max_minutes=1e-9, seed=SEED)
     assert not result.converged and result.convergence.steps == BLOCK
     said = "; ".join(result.convergence.missing)

@@ -564,7 +564,8 @@ def _evidence(fit: JointFit, summary: FitSummary, posterior: Posterior | None) -
         gaps = explain_gap(fit, posterior)
         causes, calibration = headline_causes(fit), calibration_of(fit, posterior)
         told = {**{f"effective_deg_per_step.{d}": e for d, e in summary.effective.items()}, **summary.parameters}
-        budgets = [headline_budget(causes, name, told[name]).as_json() for name in causes.quantities]
+        # What a model holds fixed has no uncertainty to split.
+        budgets = [headline_budget(causes, q, told[q]).as_json() for q in causes.quantities if told[q].sd > 0]
         readings = {axis: stop_readings(fit, axis) for axis in ("pan", "tilt")}
         axes = [positioning(calibration, axis, readings=own).as_json() for axis, own in readings.items()]
     return {

@@ -550,7 +550,7 @@ def sensitivity(
         period_deg=table.harmonic_period_deg,
     )
     goal = machine.steps_for(target.point_mm)
-    settings = settings_of(goal.pan_steps, goal.tilt_steps, goal.aperture_deg, goal.approach)
+    settings = settings_of(float(goal.pan_steps), float(goal.tilt_steps), goal.aperture_deg, goal.approach)
     count = len(inputs)
     with jax.enable_x64(True):
         law = propagate(

@@ -265,7 +265,7 @@ def report_html(evidence: Evidence) -> bytes:
     Args:
         evidence: computed beforehand; nothing is computed here.
     """
-    folder = shipped_data() / "templates"
+    folder = shipped_data() / "report"
     environment = Environment(
         loader=FileSystemLoader(str(folder)), autoescape=True, undefined=StrictUndefined, trim_blocks=True
     )
