@@ -233,6 +233,13 @@ def table() -> None:
         cells += [f"{plain.mean() / 24:.2f}", f"{spread[worst]:.2f} ({STEREO_PARAMETER_NAMES[worst]})"]
         cells += [f"{100 * (np.abs(z) < 1.96).mean():.1f} %", f"{np.median(factor):.2f}", f"{np.median(seconds):.1f}"]
         print(f"| {' | '.join(cells)} |")
+    some = [row for row in rows if row["condition"] == "rendered" and "failed" not in row]
+    if some:
+        keys = ("corner_sd_px", "corner_mean_u_px", "corner_mean_v_px", "corner_max_px")
+        sd, u, v, largest = (np.array([row[key] for row in some]) for key in keys)
+        print(f"\n`rendered`: found less true corners have sd {np.median(sd):.3f} px (median of the rigs), mean error u")
+        print(f"{u.mean():+.4f}, v {v.mean():+.4f} px, largest {largest.max():.2f} px; outlying views, all kept: ", end="")
+        print(f"{sum(row['outliers'] for row in some)} of {sum(row['views'] for row in some)}.")
     if HALVES.exists():
         found = json.loads(HALVES.read_text())
         stored, plain = (np.array([s[k] for s in found["splits"]]) / 24 for k in ("stored", "independent"))

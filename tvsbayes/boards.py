@@ -179,8 +179,8 @@ def _find_classic(grey: np.ndarray, board: Board) -> np.ndarray | None:
     half = int(np.clip(round(REFINING_SHARE * nearest), REFINING_HALF_MIN, REFINING_HALF_MAX))
     criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 100, 1e-4)
     # A corner whose search leaves the window is given back as it came, off by pixels (steeply seen boards): widen
-    # the window then, up to the neighbours.
-    for size in range(half, max(half, int(WIDEST_SHARE * nearest)) + 1):
+    # the window then, up to the neighbours, whose distance is itself known to pixels only.
+    for size in range(half, max(half + 1, int(WIDEST_SHARE * nearest)) + 1):
         refined = cv2.cornerSubPix(grey, corners.reshape(-1, 1, 2).copy(), (size, size), (-1, -1), criteria)
         refined = np.asarray(refined).reshape(-1, 2)
         if (refined != corners).any(axis=1).all():
