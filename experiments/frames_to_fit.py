@@ -1,21 +1,181 @@
-"""From pictures to the answer: does the truth of a rendered paper campaign lie inside the intervals?
+"""From pictures to the answer: does the truth of rendered campaigns lie inside the intervals?
 
-    python experiments/frames_to_fit.py FOLDER [mounted] [table1] > experiments/frames_to_fit.md
+    python experiments/frames_to_fit.py run --n 12 --cores 0      # a minute each, resumable
+    python experiments/frames_to_fit.py table > experiments/frames_to_fit.md
+    python experiments/frames_to_fit.py paper FOLDER mounted table1 >> experiments/frames_to_fit.md
 
-Renders the paper's protocol (384 looks, 768 frames, 0.6 GB) into FOLDER, or takes the frames that are there; detects by
-both methods; classic and joint estimates of both beside the truth. The twins:
-`mounted`, drawn with seed 1, and `table1`, the shipped paper twin whose classic answer is the paper's Table 1.
+`run` draws rig i from `data/rigs/mounted` with seed i, every prior quantity anew as `tvsbayes simulate` does, and
+measures four-point experiments of |N| = 100 and 200 (64 looks), twice with the same stops and sheets: `centroids` are
+drawn by the twin, `frames` are rendered, written, read and detected by the method `fit`. Both are fitted (joint,
+Laplace); what differs between the two is what detection adds. Drawn centroids have the stated noise times the drawn
+pixel_scale; in frames the truth of pixel_scale is the rms of (found - true) / stated of that campaign.
+
+`paper` renders the paper's whole protocol (384 looks, 768 frames, 0.6 GB) into FOLDER, or takes the frames that are
+there; both methods; classic and joint estimates beside the truth. The twins: `mounted`, drawn with seed 1, and
+`table1`, the shipped paper twin whose classic answer is the paper's Table 1. Its protocol has one |N|: no fit can
+separate ratio and backlash there beyond the prior.
 """
 
 from __future__ import annotations
 
-import sys
+import argparse
 from dataclasses import replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 
 DIRECTIONS = ("left", "right", "up", "down")
+SOURCES = ("centroids", "frames")
+ROWS = Path(__file__).parent / "output" / "frames_to_fit.jsonl"
+BOUND = 1e-4
+"""Two-sided, of every count and rms in the table."""
+COORDINATES = ("u left", "v left", "u right", "v right")
+
+
+def observed(source: str, seed: int):
+    """A simulated campaign, what a stranger would fit, and found minus true centres (n, 4) with their sds."""
+    from studies import mounted_rig
+    from tvsbayes.protocols import four_point_protocol
+
+    from tvsbayes.campaign import read_campaign
+    from tvsbayes.device.renderer import write_frames
+    from tvsbayes.simulation import project, simulate
+    from tvsbayes.spots import detect
+
+    simulated = simulate(mounted_rig(), four_point_protocol(repeats=4, steps=(100, 200)), seed)
+    campaign = simulated.campaign
+    if source == "frames":
+        with TemporaryDirectory() as place:
+            folder = Path(place) / "campaign"
+            made = simulated.undetected()
+            made.write(folder)
+            write_frames(folder, made, seed, views=0)
+            # The cameras' sd of every coordinate as a user would have it: from the pictures alone.
+            campaign = replace(detect(read_campaign(folder)).campaign, path=None)
+    true = project(simulated.light.points_mm, simulated.truth.stereo, simulated.truth.parameters["focal_scale"])
+    good = [k for k, spot in enumerate(campaign.spots) if spot.status == "ok"]
+    names = [f"{c}_{side}_px" for side in ("left", "right") for c in "uv"]
+    found = np.array([[getattr(campaign.spots[k], name) for name in names] for k in good])
+    stated = np.array([[getattr(campaign.spots[k], f"s{name}") for name in names] for k in good])
+    return simulated, campaign, found - true[good], stated
+
+
+def one_campaign(task: tuple[str, int]) -> dict[str, object]:
+    """Observe and fit; whatever fails is recorded, never dropped."""
+    from tvsbayes import likelihood
+
+    # Here every campaign has 64 looks: less padding than ordinary fits.
+    likelihood.SMALLEST_BUCKET = 96
+    from tvsbayes.information import summarise
+    from tvsbayes.joint import fit
+    from tvsbayes.model import use_compilation_cache
+
+    use_compilation_cache()
+    source, seed = task
+    simulated, campaign, errors, stated = observed(source, seed)
+    known = known_truth(simulated.truth)
+    if source == "frames":
+        known["pixel_scale"] = float(np.sqrt(np.mean((errors / stated) ** 2)))
+    row: dict[str, object] = {
+        "source": source,
+        "seed": seed,
+        "looks": len(campaign.spots),
+        "ok": len(errors),
+        "median_sd_px": float(np.median(stated)),
+        "rms_px": np.sqrt((errors**2).mean(0)).tolist(),
+        "mean_px": errors.mean(0).tolist(),
+        "rms_z": np.sqrt(((errors / stated) ** 2).mean(0)).tolist(),
+    }
+    try:
+        summary = summarise(fit(campaign))
+    except Exception as error:
+        return {**row, "converged": False, "problems": [repr(error)]}
+    pose = (summary.reference_pose_deg["pan"], summary.reference_pose_deg["tilt"])
+    row["quantities"] = {
+        name: [true, one.value, one.sd, *one.interval95]
+        for name, true, one in compared(summary, {**known, **at_pose(simulated.truth, pose)})
+    }
+    return {**row, "converged": summary.converged, "problems": list(summary.problems)}
+
+
+def known_truth(truth) -> dict[str, float]:
+    """True values of what `compared` lists and the pose does not change."""
+    return {k: truth.parameters[k] for k in ("backlash_deg.pan", "backlash_deg.tilt", "focal_scale", "pixel_scale")}
+
+
+def at_pose(truth, pose: tuple[float, float]) -> dict[str, float]:
+    """True effective ratios and mirror offset at the pose of the fit."""
+    from tvsbayes.simulation import effective_deg_per_step, effective_mirror_offset_mm
+
+    ratio = effective_deg_per_step(truth.parameters, pose)
+    offset = effective_mirror_offset_mm(truth.parameters, pose)
+    return {**{f"effective {d}": ratio[d] for d in DIRECTIONS}, "effective_mirror_offset_mm": offset}
+
+
+def compared(summary, known: dict[str, float]):
+    """(name, truth, estimate) of every headline."""
+    for direction in DIRECTIONS:
+        yield f"effective {direction}", known[f"effective {direction}"], summary.effective[direction]
+    for name in ("backlash_deg.pan", "backlash_deg.tilt", "effective_mirror_offset_mm", "focal_scale", "pixel_scale"):
+        yield name, known[name], summary.parameters[name]
+
+
+def table() -> None:
+    """Markdown of the campaigns on stdout."""
+    from coverage import read_rows
+    from scipy import stats
+
+    rows = {source: [r for r in read_rows(ROWS) if r["source"] == source] for source in SOURCES}
+    good = {source: {r["seed"]: r for r in rows[source] if r["converged"]} for source in SOURCES}
+    both = sorted(set(good["centroids"]) & set(good["frames"]))
+    n = len(both)
+    print("# From frames to the fit\n")
+    print("Made by `experiments/frames_to_fit.py`; see there.\n")
+    failed = {source: len(rows[source]) - len(good[source]) for source in SOURCES}
+    looks = sum(r["looks"] for r in rows["frames"])
+    print(f"## {n} campaigns of {looks // len(rows['frames'])} looks, every rig drawn anew\n")
+    print(f"Not converged: {failed['centroids']} from centroids, {failed['frames']} from frames.", end=" ")
+    print(f"Found of {looks} looks: {sum(r['ok'] for r in rows['frames'])} in the frames, ", end="")
+    print(f"{sum(r['ok'] for r in rows['centroids'])} with drawn centroids inside both images.\n")
+    least = int(stats.binom.ppf(BOUND, n, 0.95))
+    low, high = np.sqrt(stats.chi2.ppf([BOUND / 2, 1 - BOUND / 2], n) / n)
+    print(f"Bounds at {BOUND:g} for {n} campaigns: {least} or more inside 95 %, rms z {low:.2f} to {high:.2f}.")
+    print(
+        "Difference: (frames - centroids) over the sd from frames, rms; sds: from frames over from centroids, median.\n"
+    )
+    titles = [
+        "quantity",
+        "centroids: inside 95 %",
+        "rms z",
+        "frames: inside 95 %",
+        "rms z",
+        "mean z",
+        "difference",
+        "sds",
+    ]
+    print(f"| {' | '.join(titles)} |\n|{'---|' * len(titles)}")
+    for name in good["frames"][both[0]]["quantities"]:
+        cells, values = [name], {}
+        for source in SOURCES:
+            true, value, sd, lower, upper = np.array([good[source][k]["quantities"][name] for k in both]).T
+            inside, z = int(((lower <= true) & (true <= upper)).sum()), (value - true) / sd
+            rms = float(np.sqrt((z**2).mean()))
+            marks = [" **!**" * bad for bad in (inside < least, not low <= rms <= high)]
+            cells += [f"{inside} of {n}{marks[0]}", f"{rms:.2f}{marks[1]}"]
+            values[source] = value, sd
+        cells.append(f"{z.mean():+.2f}")
+        (drawn, drawn_sd), (seen, seen_sd) = values["centroids"], values["frames"]
+        cells += [f"{np.sqrt((((seen - drawn) / seen_sd) ** 2).mean()):.2f}", f"{np.median(seen_sd / drawn_sd):.2f}"]
+        print(f"| {' | '.join(cells)} |")
+    print("\nFound against true centres:\n\n| coordinate | rms, px | mean, px | rms z |\n|---|---|---|---|")
+    for k, name in enumerate(COORDINATES):
+        count = np.array([r["ok"] for r in rows["frames"]])
+        rms, mean, z = (np.array([r[key][k] for r in rows["frames"]]) for key in ("rms_px", "mean_px", "rms_z"))
+        rms, z = (np.sqrt(np.average(x**2, weights=count)) for x in (rms, z))
+        print(f"| {name} | {rms:.4f} | {np.average(mean, weights=count):+.4f} | {z:.3f} |")
+    drawn, seen = (np.median([r["median_sd_px"] for r in rows[source]]) for source in SOURCES)
+    print(f"\nMedian stated sd: {seen:.3f} px, centroids {drawn:.3f} px.")
 
 
 def rendered(folder: Path, twin: str) -> Path:
@@ -50,12 +210,12 @@ def report(place: Path, twin: str) -> None:
     from tvsbayes.classic import classic
     from tvsbayes.information import summarise
     from tvsbayes.joint import fit
-    from tvsbayes.simulation import effective_deg_per_step, effective_mirror_offset_mm, read_truth
+    from tvsbayes.simulation import read_truth
     from tvsbayes.spots import detect
 
     campaign = read_campaign(place)
     truth = read_truth(place / "truth.json", campaign.stereo)
-    print(f"\n## {twin}\n")
+    print(f"\n## The paper's protocol, {twin}\n")
     for method in ("fit", "contour"):
         found = detect(campaign, method)
         noise = ", ".join(f"{side} {one.speckle_contrast:.2f}" for side, one in found.noise.items())
@@ -63,45 +223,51 @@ def report(place: Path, twin: str) -> None:
             f"`detect --method {method}`: {found.statuses}, median sd {found.median_sd_px:.3f} px, contrast {noise}\n"
         )
         by_hand = classic(found.campaign).directions
-        result = fit(found.campaign)
-        summary = summarise(result)
+        summary = summarise(fit(found.campaign))
         pose = (summary.reference_pose_deg["pan"], summary.reference_pose_deg["tilt"])
-        true = effective_deg_per_step(truth.parameters, pose)
         print(
             "| quantity | truth | classic mean (sd) | 95 % type A | joint | 95 % | truth inside | z |\n|" + "---|" * 8
         )
-        rows = [(f"effective {d}", true[d], summary.effective[d], by_hand[d]) for d in DIRECTIONS]
-        names = ("backlash_deg.pan", "backlash_deg.tilt", "effective_mirror_offset_mm", "pixel_scale", "focal_scale")
-        estimates = summary.parameters
-        known = {**truth.parameters, "effective_mirror_offset_mm": effective_mirror_offset_mm(truth.parameters, pose)}
-        known["pixel_scale"] = None
-        rows += [(name, known[name], estimates[name], None) for name in names]
-        for name, value, one, hand in rows:
+        for name, value, one in compared(summary, {**known_truth(truth), **at_pose(truth, pose)}):
             low, high = one.interval95
-            hands = "| | "
+            hand, hands = by_hand.get(name.removeprefix("effective ")), "| | "
             if hand is not None:
                 classic_low, classic_high = hand.interval95_type_a
                 hands = f"| {hand.mean_deg_per_step:.6f} ({hand.sd_deg_per_step:.6f}) "
                 hands += f"| {classic_low:.6f} to {classic_high:.6f} "
-            told = "" if value is None else f"{value:.6f}"
-            inside = "" if value is None else ("yes" if low <= value <= high else "NO")
-            z = "" if value is None else f"{(one.value - value) / one.sd:+.2f}"
-            print(f"| {name} | {told} {hands}| {one.value:.6f} | {low:.6f} to {high:.6f} | {inside} | {z} |")
+            if name == "pixel_scale":
+                # Not of the twin: the pictures make their own noise.
+                print(f"| {name} | {hands}| {one.value:.6f} | {low:.6f} to {high:.6f} | | |")
+                continue
+            inside, z = ("yes" if low <= value <= high else "NO"), (one.value - value) / one.sd
+            print(f"| {name} | {value:.6f} {hands}| {one.value:.6f} | {low:.6f} to {high:.6f} | {inside} | {z:+.2f} |")
         print(
-            f"\nconverged {summary.converged}, chi2 {summary.chi2:.1f} of {summary.dof} degrees of freedom\n",
+            f"\nconverged {summary.converged}, chi2 {summary.chi2:.1f} of {summary.dof:.1f} degrees of freedom\n",
             flush=True,
         )
 
 
 def main() -> None:
-    """Render, detect, estimate."""
-    print(
-        "# From frames to the fit\n\n`python experiments/frames_to_fit.py`: both methods, classic and joint (Laplace)."
-    )
-    for twin in sys.argv[2:] or ("mounted", "table1"):
-        report(rendered(Path(sys.argv[1]), twin), twin)
+    """Command line of the study."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("what", choices=("run", "table", "paper"))
+    parser.add_argument("folder", type=Path, nargs="?")
+    parser.add_argument("twins", nargs="*", default=["mounted", "table1"])
+    parser.add_argument("--n", type=int, default=12)
+    parser.add_argument("--cores", type=int, nargs="+", default=[0])
+    options = parser.parse_args()
+    if options.what == "run":
+        from studies import run_rows
+
+        # Seeds in the outer loop: an interrupted run leaves pairs.
+        tasks = [(source, seed) for seed in range(1, options.n + 1) for source in SOURCES]
+        run_rows(one_campaign, tasks, ROWS, ("source", "seed"), options.cores)
+    elif options.what == "table":
+        table()
+    else:
+        for twin in options.twins:
+            report(rendered(options.folder, twin), twin)
 
 
 if __name__ == "__main__":
-    np.set_printoptions(precision=4)
     main()

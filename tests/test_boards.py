@@ -12,7 +12,7 @@ import pytest
 from drawn_boards import BOARD, FOUND_PX, POSES, SIZE, pictures, true_corners, write_pair
 
 from tvsbayes import boards
-from tvsbayes.boards import Board, find_views
+from tvsbayes.boards import Board, find_corners, find_views
 from tvsbayes.files import InputError, NothingToEstimate
 
 
@@ -189,3 +189,13 @@ def test_board_reads_and_measures_itself():
     for bad in ({"pitch_mm": 0.0}, {"pitch_mm": np.nan}, {"pitch_u_mm": 3.0}, {"pitch_u_mm": -1.0}):
         with pytest.raises(InputError, match="--pitch"):
             replace(board, **bad)
+
+
+def test_corners_that_the_refining_gives_back_get_a_wider_window():
+    """A board at 65 degrees: with the narrow window cornerSubPix returns a corner as it came, 2.5 px off."""
+    pose = np.array([-0.387, 1.073, 0.189, -11.453, 19.857, 477.414])
+    right = true_corners(pose)[:, 2:]
+    found, by_fallback = find_corners(pictures(pose)[1], BOARD)
+    # The drawn board's warp leaves 0.4 px on squares of 10 px.
+    assert not by_fallback
+    assert min(np.abs(found - right).max(), np.abs(found[::-1] - right).max()) < 1.0

@@ -39,6 +39,8 @@ REFINING_SHARE = 0.25
 """Half the window of cornerSubPix over the smallest distance of two corners: the window must hold one corner only,
 and a wide one averages more noise. On OpenCV's pairs (22 to 37 px) fixed halves of 3, 5, 7, 9, 11 px leave 0.23,
 0.20, 0.18, 0.20, 0.41 px: the best is a quarter of the distance, and from half on neighbours pull."""
+WIDEST_SHARE = 0.5
+"""The same share, where the narrower window loses a corner: beyond it neighbours are inside."""
 REFINING_HALF_MIN, REFINING_HALF_MAX = 2, 11
 WORKERS_MAX = 8
 PICTURES_MAX = 2000
@@ -176,8 +178,14 @@ def _find_classic(grey: np.ndarray, board: Board) -> np.ndarray | None:
     nearest = min(np.linalg.norm(np.diff(grid, axis=axis), axis=2).min() for axis in (0, 1))
     half = int(np.clip(round(REFINING_SHARE * nearest), REFINING_HALF_MIN, REFINING_HALF_MAX))
     criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 100, 1e-4)
-    refined = cv2.cornerSubPix(grey, corners.reshape(-1, 1, 2).copy(), (half, half), (-1, -1), criteria)
-    return np.asarray(refined, float).reshape(-1, 2)
+    # A corner whose search leaves the window is given back as it came, off by pixels (steeply seen boards): widen
+    # the window then, up to the neighbours, whose distance is itself known to pixels only.
+    for size in range(half, max(half + 1, int(WIDEST_SHARE * nearest)) + 1):
+        refined = cv2.cornerSubPix(grey, corners.reshape(-1, 1, 2).copy(), (size, size), (-1, -1), criteria)
+        refined = np.asarray(refined).reshape(-1, 2)
+        if (refined != corners).any(axis=1).all():
+            break
+    return refined.astype(float)
 
 
 def _find_sector(grey: np.ndarray, board: Board) -> np.ndarray | None:
