@@ -237,8 +237,12 @@ def table() -> None:
     if some:
         keys = ("corner_sd_px", "corner_mean_u_px", "corner_mean_v_px", "corner_max_px")
         sd, u, v, largest = (np.array([row[key] for row in some]) for key in keys)
-        print(f"\n`rendered`: found less true corners have sd {np.median(sd):.3f} px (median of the rigs), mean error u")
-        print(f"{u.mean():+.4f}, v {v.mean():+.4f} px, largest {largest.max():.2f} px; outlying views, all kept: ", end="")
+        print(
+            f"\n`rendered`: found less true corners have sd {np.median(sd):.3f} px (median of the rigs), mean error u"
+        )
+        print(
+            f"{u.mean():+.4f}, v {v.mean():+.4f} px, largest {largest.max():.2f} px; outlying views, all kept: ", end=""
+        )
         print(f"{sum(row['outliers'] for row in some)} of {sum(row['views'] for row in some)}.")
     if HALVES.exists():
         found = json.loads(HALVES.read_text())
