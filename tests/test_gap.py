@@ -7,6 +7,7 @@ import json
 from dataclasses import replace
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from conftest import ROOT, coordinates
@@ -181,6 +182,22 @@ def test_a_calibration_has_not_changed_from_itself(mixed_fit):
     assert not apart.shared_cameras
     for one, other in zip(same.changes[:4], apart.changes[:4], strict=True):
         assert other.u > 1.05 * one.u
+
+
+def test_what_both_hold_fixed_is_compared_as_stated(mixed_fit):
+    """A backlash fixed in both fits has no u: equal statements are no change, others are one; JSON takes both."""
+    row = list(mixed_fit.names).index("backlash_deg.tilt")
+    fits = []
+    for value in (0.1, 0.1, 0.2):
+        stated, u, kind = (np.array(x) for x in (mixed_fit.space.value, mixed_fit.space.u, mixed_fit.space.kind))
+        stated[row], u[row], kind[row] = value, 0.0, 0
+        with jax.enable_x64(True):
+            space = replace(mixed_fit.space, value=jnp.asarray(stated), u=jnp.asarray(u), kind=jnp.asarray(kind))
+        fits.append(replace(mixed_fit, space=space))
+    same, other = (compare(fits[0], second).changes[-1] for second in fits[1:])
+    assert (same.normalised, same.significant) == (None, False)
+    assert (other.normalised, other.significant) == (None, True)
+    json.dumps(compare(fits[0], fits[2]).as_json(), allow_nan=False)
 
 
 def test_a_changed_gear_is_named(mounted_rig, mixed_fit):

@@ -22,14 +22,12 @@ import typer
 
 from tvsbayes.files import (
     CSV_BYTES_MAX,
-    JSON_BYTES_MAX,
     InputError,
     NotConverged,
     NothingToEstimate,
     TvsError,
     escaped,
     make_folder,
-    parse_json,
     parse_table,
     read_bytes,
     shipped_data,
@@ -544,25 +542,29 @@ def fit(
     draws = posterior.thinned(DRAWS_KEPT) if summary.estimator == "posterior" else None
     usable = posterior if summary.estimator == "posterior" else None
     files = {
-        **write_results(result, summary, folder, seed, calibration, draws, _evidence(result, summary, usable)),
+        **write_results(
+            result, summary, folder, seed, calibration, draws, _evidence(result, summary, usable, calibration)
+        ),
         **more,
     }
     document = {**summary.as_json(), "seed": seed, "files": files}
     _finish(document, f"{fit_text(summary)}\nwritten: {', '.join(files.values())}", as_json, _unusable(summary))
 
 
-def _evidence(fit: JointFit, summary: FitSummary, posterior: Posterior | None) -> dict[str, object]:
-    """What `fit.json` holds for reports besides the estimates."""
+def _evidence(
+    fit: JointFit, summary: FitSummary, posterior: Posterior | None, calibration: Calibration | None
+) -> dict[str, object]:
+    """What `fit.json` holds for reports besides the estimates; without a calibration residuals alone."""
     from tvsbayes.certificate import headline_budget, positioning, stop_readings
     from tvsbayes.comparison import explain_gap
-    from tvsbayes.information import calibration_of, headline_causes, residual_causes, stop_residuals
+    from tvsbayes.information import headline_causes, residual_causes, stop_residuals
 
     stops = stop_residuals(fit)
     listed = stops[:: -(-len(stops) // RESIDUALS_LISTED) or 1]
     gaps, budgets, axes = {}, [], []
-    if fit.converged:
+    if calibration is not None:
         gaps = explain_gap(fit, posterior)
-        causes, calibration = headline_causes(fit), calibration_of(fit, posterior)
+        causes = headline_causes(fit)
         told = {**{f"effective_deg_per_step.{d}": e for d, e in summary.effective.items()}, **summary.parameters}
         # What a model holds fixed has no uncertainty to split.
         budgets = [headline_budget(causes, q, told[q]).as_json() for q in causes.quantities if told[q].sd > 0]
@@ -661,10 +663,11 @@ def report(
 def _fit_document(data: Campaign, folder: Path) -> dict[str, Any]:
     """`results/fit.json` where it was made from exactly this campaign; else fit first (DESIGN 8)."""
     from tvsbayes.calibration import stored_calibration
+    from tvsbayes.certificate import read_fit
 
     path = folder / "results" / "fit.json"
     if stored_calibration(data) is not None and path.exists():
-        document = parse_json(read_bytes(path, JSON_BYTES_MAX), path.name).values
+        document = read_fit(path)
         if "budgets" in document:
             return document
     report_line("results/ are missing or older than the campaign: fitting first (Laplace approximation) ...")
@@ -672,11 +675,10 @@ def _fit_document(data: Campaign, folder: Path) -> dict[str, Any]:
     from tvsbayes.information import calibration_of, summarise
     from tvsbayes.report import write_results
 
-    summary = summarise(result)
-    write_results(
-        result, summary, folder / "results", 0, calibration_of(result), None, _evidence(result, summary, None)
-    )
-    return parse_json(read_bytes(path, JSON_BYTES_MAX), path.name).values
+    summary, calibration = summarise(result), calibration_of(result)
+    evidence = _evidence(result, summary, None, calibration)
+    write_results(result, summary, folder / "results", 0, calibration, None, evidence)
+    return read_fit(path)
 
 
 @app.command()

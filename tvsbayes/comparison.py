@@ -738,7 +738,7 @@ class Change:
         first, second: estimates of A and B.
         difference: second - first.
         u: its standard uncertainty; what both calibrations share is not in it.
-        normalised: difference / u.
+        normalised: difference / u; None where both calibrations hold the quantity fixed.
         significant: |normalised| beyond the limit at which chance alone passes in 1 of 20 comparisons (all
             quantities together, Sidak).
     """
@@ -749,7 +749,7 @@ class Change:
     second: float
     difference: float
     u: float
-    normalised: float
+    normalised: float | None
     significant: bool
 
 
@@ -800,7 +800,7 @@ def compare(first: JointFit, second: JointFit) -> Comparison:
         np.array_equal(cameras[0].vector, cameras[1].vector)
         and np.array_equal(cameras[0].parameter_covariance, cameras[1].parameter_covariance)
     )
-    values, influence, names, units = [], [], [], []
+    values, influence = [], []
     for found in (first, second):
         with jax.enable_x64(True):
             at_pose = derived_quantities(
@@ -819,11 +819,18 @@ def compare(first: JointFit, second: JointFit) -> Comparison:
     changes = []
     for k, name in enumerate(names):
         a, b = (float(v[0, k]) for v in values)
-        u = float(np.sqrt(max(variance[k], 0.0)))
-        ratio = (b - a) / u if u > 0 else (0.0 if a == b else float(np.copysign(np.inf, b - a)))
-        changes.append(Change(name, units[k], a, b, b - a, u, ratio, abs(ratio) > limit))
+        # What both hold fixed has changed if the statements differ; its variance is zero but for rounding.
+        fixed = all(np.ptp(v[1:, k]) == 0 for v in values)
+        u = 0.0 if fixed else float(np.sqrt(max(variance[k], 0.0)))
+        ratio = (b - a) / u if u > 0 else None
+        significant = a != b if ratio is None else abs(ratio) > limit
+        changes.append(Change(name, units[k], a, b, b - a, u, ratio, significant))
     moved = [c for c in changes if c.significant]
-    listed = ", ".join(f"{c.quantity} by {c.difference:+.3g} {c.unit} ({c.normalised:+.1f} u)" for c in moved)
+    listed = ", ".join(
+        f"{c.quantity} by {c.difference:+.3g} {c.unit} "
+        + ("(held fixed)" if c.normalised is None else f"({c.normalised:+.1f} u)")
+        for c in moved
+    )
     verdict = f"changed: {listed}" if moved else "no significant change"
     days = _days_between(first.campaign, second.campaign)
     pan, tilt = np.degrees(pose)

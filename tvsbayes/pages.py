@@ -122,8 +122,6 @@ class Evidence:
         range_mm: stated range.
         maps: error maps.
         budget: of a point at that range.
-        calibration: what coordinates were computed from.
-        plan: sentences on what to measure next.
     """
 
     campaign: Campaign
@@ -135,8 +133,6 @@ class Evidence:
     range_mm: float
     maps: ErrorMap
     budget: Budget | None
-    calibration: Calibration | None = None
-    plan: Sequence[str] = ()
 
 
 @dataclass(frozen=True)
@@ -226,7 +222,6 @@ def gather(
         range_mm=range_mm,
         maps=maps,
         budget=budget(calibration, settings),
-        calibration=calibration,
     )
 
 
@@ -868,17 +863,8 @@ def _axes(e: Evidence) -> Section:
 
 
 def _plan(e: Evidence) -> Section:
-    items = list(e.plan) or [w["text"] for w in e.fit["weak_directions"]]
-    text = (
-        []
-        if items
-        else [
-            (
-                "Nothing that is asked of the calibration is limited by a single cure; `tvsbayes "
-                "plan RIG --given CAMPAIGN` weighs further experiments."
-            )
-        ]
-    )
+    items = [w["text"] for w in e.fit["weak_directions"]]
+    text = ["The command plan with --given weighs further experiments: gain per minute, and when to stop."]
     return Section("What to measure next", text, items)
 
 

@@ -1085,8 +1085,6 @@ EXCHANGE_SHARE = 0.5
 the backlash: knowing the backlash would then lower u of the ratio by 30 % and more."""
 CURE_LOOKS = 12
 """Looks beyond which an addition is no small cure."""
-TARGET_SHARE = 0.25
-"""A second depth is advised where four looks there lower the default target by more than this share."""
 
 
 @dataclass(frozen=True)

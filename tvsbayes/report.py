@@ -434,7 +434,8 @@ def changes_text(comparison: Comparison) -> str:
     rows = []
     for c in comparison.changes:
         cells = [c.quantity, f"{c.first:.6f}", f"{c.second:.6f}", concise(c.difference, c.u), c.unit]
-        rows.append([*cells, f"{c.normalised:+.2f}", "yes" if c.significant else "no"])
+        normalised = "fixed" if c.normalised is None else f"{c.normalised:+.2f}"
+        rows.append([*cells, normalised, "yes" if c.significant else "no"])
     pan, tilt = comparison.reference_pose_deg
     title = f"A and B at pan {pan:.2f} deg, tilt {tilt:.2f} deg"
     table = text_table(title, ["quantity", "A", "B", "B - A (u)", "unit", "normalised", "significant"], rows)

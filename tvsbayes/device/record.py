@@ -35,7 +35,6 @@ HOME_TOLERANCE_STEPS = 2
 LOST_STEPS = "lost-steps"
 """Status of a spot in whose segment steps were lost."""
 PIXELS = ("u_left_px", "v_left_px", "u_right_px", "v_right_px")
-PIXEL_SDS = ("su_left_px", "sv_left_px", "su_right_px", "sv_right_px")
 
 
 @dataclass(frozen=True)
