@@ -23,7 +23,7 @@ def main(folder: Path, turns: int) -> None:
     import cv2
 
     from tvsbayes.campaign import read_campaign
-    from tvsbayes.spots import detect
+    from tvsbayes.device.spots import detect
 
     campaign = read_campaign(folder)
     paths = sorted(str(path) for path in (folder / "frames").glob("*.png"))

@@ -83,7 +83,7 @@ def flat_stereo():
 
 def run_cell(size, peak, ambient, contrast, seed: int) -> dict:
     """One cell: errors, stated sds and the bound."""
-    from tvsbayes import spots
+    from tvsbayes.device import spots
     from tvsbayes.device.renderer import Footprint, Scene, Sensor, render_spot
 
     rng = np.random.default_rng(seed)

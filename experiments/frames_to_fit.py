@@ -40,8 +40,8 @@ def observed(source: str, seed: int):
 
     from tvsbayes.campaign import read_campaign
     from tvsbayes.device.renderer import write_frames
+    from tvsbayes.device.spots import detect
     from tvsbayes.simulation import project, simulate
-    from tvsbayes.spots import detect
 
     simulated = simulate(mounted_rig(), four_point_protocol(repeats=4, steps=(100, 200)), seed)
     campaign = simulated.campaign
@@ -208,10 +208,10 @@ def report(place: Path, twin: str) -> None:
     """Detect, estimate and print."""
     from tvsbayes.campaign import read_campaign
     from tvsbayes.classic import classic
+    from tvsbayes.device.spots import detect
     from tvsbayes.information import summarise
     from tvsbayes.joint import fit
     from tvsbayes.simulation import read_truth
-    from tvsbayes.spots import detect
 
     campaign = read_campaign(place)
     truth = read_truth(place / "truth.json", campaign.stereo)

@@ -38,7 +38,7 @@ DRAWS = 255
 SHRINK = 0.8
 WIDER = 3.0
 WORSE = 1000.0
-MAX_MINUTES = 8.0
+MAX_MINUTES = 25.0
 CLEAN, SHRUNK, PRIOR, CAMERA = "clean", f"sd x {SHRINK}", "prior x3", "camera dropped"
 VARIANTS = (CLEAN, PRIOR, CAMERA)
 """Simulated separately; the shrunk draws come with the clean ones."""

@@ -33,12 +33,11 @@ from scipy import optimize
 
 from tvsbayes.campaign import mixed_protocol, read_campaign, write_campaign
 from tvsbayes.files import shipped_data
-from tvsbayes.joint import Fixed, Problem, fit, stage_residuals
+from tvsbayes.joint import Fixed, Problem, fit, levenberg_marquardt, residuals_and_jacobian, stage_residuals
 from tvsbayes.likelihood import ordered_spots
 from tvsbayes.model import NAMES
 from tvsbayes.rigs import read_rig
 from tvsbayes.simulation import simulate
-from tvsbayes.solver import levenberg_marquardt, linearised
 
 TWIN = shipped_data() / "twins" / "paper_twin"
 REPEATS = 5
@@ -99,7 +98,7 @@ def warm_and_peers() -> None:
             return np.asarray(jitted(jnp.asarray(z)))
 
         def jacobian(z):
-            return np.asarray(linearised(stage_residuals, jnp.asarray(z), args)[1])
+            return np.asarray(residuals_and_jacobian(stage_residuals, jnp.asarray(z), args)[1])
 
         def peer(jac):
             options = {"method": "lm", "xtol": 1e-6, "ftol": 1e-6, "gtol": 1e-6}

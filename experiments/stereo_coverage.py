@@ -23,7 +23,7 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from tvsbayes.boards import Board, View, find_views
+from tvsbayes.device.boards import Board, View, find_views
 from tvsbayes.files import TvsError, shipped_data
 from tvsbayes.rigs import STEREO_PARAMETER_NAMES, Stereo, read_stereo, rotation_matrix, rotation_vector
 from tvsbayes.simulation import project
@@ -151,7 +151,7 @@ def chi2(difference: np.ndarray, covariance: np.ndarray) -> float:
 
 def calibrate(task: tuple[str, int]) -> dict[str, object]:
     """One rig: chi-square of the true 24 parameters under the stored covariance, z of each, and the rest."""
-    from tvsbayes.cameras import calibrate_stereo
+    from tvsbayes.device.stereo import calibrate_stereo
 
     condition, seed = task
     drawn = scenes(seed, condition)
@@ -184,7 +184,7 @@ def calibrate(task: tuple[str, int]) -> dict[str, object]:
 
 def halves() -> None:
     """Calibrate random halves of OpenCV's pairs and compare them."""
-    from tvsbayes.cameras import calibrate_stereo
+    from tvsbayes.device.stereo import calibrate_stereo
 
     found = find_views(OPENCV_PAIRS, BOARD)
     size = (found.image_width, found.image_height)

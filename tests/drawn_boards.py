@@ -7,7 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from tvsbayes.boards import Board
+from tvsbayes.device.boards import Board
 from tvsbayes.rigs import Stereo, rotation_matrix
 from tvsbayes.simulation import project
 

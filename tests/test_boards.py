@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from drawn_boards import BOARD, FOUND_PX, POSES, SIZE, pictures, true_corners, write_pair
 
-from tvsbayes import boards
-from tvsbayes.boards import Board, find_corners, find_views
+from tvsbayes.device import boards
+from tvsbayes.device.boards import Board, find_corners, find_views
 from tvsbayes.files import InputError, NothingToEstimate
 
 

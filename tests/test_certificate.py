@@ -480,8 +480,8 @@ def linear_fit(mounted_rig):
     """The linear campaign of test_comparison with headlines that are linear in its coordinates: (fit, gradient)."""
     from test_comparison import fit_of, linear_problem
 
+    from tvsbayes.joint import laplace_draws
     from tvsbayes.model import INDEX, NAMES, RIG_NAMES
-    from tvsbayes.solver import laplace_draws
 
     jacobian, load = linear_problem()
     # What the rig fixes moves no spot.

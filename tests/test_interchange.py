@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 import pytest
 
+from tvsbayes.device.interchange import assumed_covariance, exported, parse_yaml, read_calibration
 from tvsbayes.files import InputError, shipped_data
-from tvsbayes.interchange import assumed_covariance, exported, parse_yaml, read_calibration
 from tvsbayes.rigs import Stereo, read_stereo, rotation_matrix, stereo_bytes
 
 OPENCV_DATA = Path("/usr/share/doc/opencv-doc/examples/data")

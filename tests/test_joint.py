@@ -14,12 +14,11 @@ import pytest
 
 from tvsbayes.campaign import Campaign, four_point_protocol, grid_protocol
 from tvsbayes.files import InputError, NothingToEstimate, shipped_data
-from tvsbayes.joint import HARMONIC_SD_DEG, fit, model_choice
+from tvsbayes.joint import HARMONIC_SD_DEG, fit, laplace_draws, model_choice
 from tvsbayes.likelihood import ordered_spots
 from tvsbayes.model import INDEX, NAMES
 from tvsbayes.rigs import HARMONIC_PRIORS, Prior, RigTable, read_rig
 from tvsbayes.simulation import SimulatedCampaign, effective_deg_per_step, effective_mirror_offset_mm, simulate
-from tvsbayes.solver import laplace_draws
 
 SD = 1.0
 """One posterior standard deviation."""

@@ -12,14 +12,14 @@ import cv2
 import numpy as np
 import pytest
 
-from tvsbayes import spots as module
 from tvsbayes.campaign import Campaign, Move, Spot, read_campaign, write_campaign
 from tvsbayes.cli import run
+from tvsbayes.device import spots as module
 from tvsbayes.device.renderer import Footprint, Scene, Sensor, cameras_of, render_spot
+from tvsbayes.device.spots import REASONS, SpotNoise, detect, epipolar_refused, find_spot, learn_noise
 from tvsbayes.files import InputError, NothingToEstimate, png_bytes
 from tvsbayes.report import detection_text
 from tvsbayes.rigs import Stereo, rotation_matrix
-from tvsbayes.spots import REASONS, SpotNoise, detect, epipolar_refused, find_spot, learn_noise
 
 WIDTH, HEIGHT = 320, 240
 LOOKS = 40

@@ -15,14 +15,14 @@ import pytest
 from drawn_boards import PAIR, POSES, pictures, write_pair
 from scipy import stats
 
-from tvsbayes.boards import Board, View, Views, find_views
-from tvsbayes.cameras import (
+from tvsbayes.cli import run
+from tvsbayes.device.boards import Board, View, Views, find_views
+from tvsbayes.device.stereo import (
     StereoCalibration,
     calibrate_camera,
     calibrate_stereo,
     correlation_factor,
 )
-from tvsbayes.cli import run
 from tvsbayes.files import NothingToEstimate, read_bytes
 from tvsbayes.rigs import STEREO_PARAMETER_NAMES, parse_stereo, read_stereo, stereo_bytes
 

@@ -234,8 +234,8 @@ def detect(
     """Find the laser spots in frames/ and write their centres and uncertainties into spots.csv."""
     _finite(speckle_contrast=speckle_contrast)
     from tvsbayes.campaign import read_campaign, spots_bytes
+    from tvsbayes.device.spots import detect as find
     from tvsbayes.report import detection_text
-    from tvsbayes.spots import detect as find
 
     pictures = campaign / "results" / "overlay" if overlay else None
     data = read_campaign(campaign)
@@ -285,7 +285,7 @@ def stereo(
         remedy = "give FOLDER with --board and --pitch-mm, or --import FILE"
         raise InputError("usage", "stereo needs pictures of a board, or a calibration to import", remedy=remedy)
     _finite(pitch_mm=pitch_mm, pitch_u_mm=pitch_u_mm)
-    from tvsbayes.interchange import exported, read_calibration
+    from tvsbayes.device.interchange import exported, read_calibration
     from tvsbayes.report import stereo_calibration_text, stereo_text
     from tvsbayes.rigs import STEREO_PARAMETER_NAMES, stereo_bytes
 
@@ -301,8 +301,8 @@ def stereo(
             **{"rms_px": pair.rms_px, "assumed": pair.assumed, "warnings": list(found.notes)},
         }
     else:
-        from tvsbayes.boards import Board
-        from tvsbayes.cameras import calibrate_folder
+        from tvsbayes.device.boards import Board
+        from tvsbayes.device.stereo import calibrate_folder
         from tvsbayes.model import use_compilation_cache
 
         use_compilation_cache()
@@ -634,8 +634,9 @@ def report(
     data = read_campaign(campaign)
     document = _fit_document(data, campaign)
     from tvsbayes.certificate import dcc_bytes
+    from tvsbayes.comparison import gather
     from tvsbayes.model import use_compilation_cache
-    from tvsbayes.pages import gather, print_to_pdf, report_html
+    from tvsbayes.report import print_to_pdf, report_html
 
     use_compilation_cache()
     limits = {"limit_deg_per_step": limit_deg_per_step, "limit_mm": limit_mm}

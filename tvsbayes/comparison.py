@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from tvsbayes.calibration import INPUT_NAMES, NORMAL_95, Calibration, direction_of
+from tvsbayes.calibration import INPUT_NAMES, NORMAL_95, Calibration, direction_of, stored_ratios
 from tvsbayes.campaign import Campaign
 from tvsbayes.classic import DIRECTIONS, ClassicResult, Selection, classic, four_point_ratios, select_experiments
 from tvsbayes.coordinates import (
@@ -34,6 +34,7 @@ from tvsbayes.coordinates import (
     propagate,
     sources,
 )
+from tvsbayes.files import JSON_BYTES_MAX, NothingToEstimate, parse_json, read_bytes
 from tvsbayes.likelihood import aperture_angle, ordered_spots
 from tvsbayes.model import INDEX, NAMES, RIG_NAMES, Beam, ParameterSpace
 from tvsbayes.rigs import RIG_PRIORS, Prior
@@ -848,3 +849,104 @@ def _days_between(first: Campaign, second: Campaign) -> float | None:
             when = datetime.datetime.combine(when, datetime.time())
         made.append(when if when.tzinfo else when.replace(tzinfo=datetime.UTC))
     return (made[1] - made[0]).total_seconds() / 86400
+
+
+MAP_CELLS = 5
+"""Per axis; odd, so that one lies in the middle."""
+MAP_DRAWS = 1000
+"""Rigs of the maps: a probability near 0.95 is then known to 0.007."""
+MAP_RANGES_MM = (300.0, 2000.0)
+"""Ranges mapped besides the stated one: the scanner's near and far ends."""
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """Everything a report shows.
+
+    Attributes:
+        campaign: what was measured.
+        fit: the document of `results/fit.json`.
+        classic: the paper's estimator; None without complete experiments.
+        held_out: the document of `results/compare.json`, None where `compare` was not run.
+        criteria: what was asked of the calibration, judged.
+        distances_mm: draws of the 3D error by estimator at `range_mm` and the middle of the counters.
+        range_mm: stated range.
+        maps: error maps.
+        budget: of a point at that range.
+    """
+
+    campaign: Campaign
+    fit: Mapping[str, object]
+    classic: ClassicResult | None
+    held_out: Mapping[str, object] | None
+    criteria: Sequence[Criterion]
+    distances_mm: Mapping[str, np.ndarray]
+    range_mm: float
+    maps: ErrorMap
+    budget: Budget | None
+
+
+def gather(
+    campaign: Campaign,
+    fit: Mapping[str, object],
+    calibration: Calibration,
+    *,
+    range_mm: float,
+    limit_deg_per_step: float | None = None,
+    limit_mm: float | None = None,
+) -> Evidence:
+    """Ask the library for everything a report shows.
+
+    Args:
+        campaign: what was measured.
+        fit: its `fit.json`.
+        calibration: its draws.
+        range_mm: at which millimetres are stated.
+        limit_deg_per_step: largest error allowed of every effective ratio.
+        limit_mm: largest 3D error allowed at that range, pan and tilt in the middle of the counters seen.
+    """
+    try:
+        classic_result = classic(campaign)
+    except NothingToEstimate:
+        classic_result = None
+    simple = {"nominal": simple_calibration(campaign.rig.priors)}
+    if classic_result is not None:
+        simple["classic"] = simple_calibration(campaign.rig.priors, classic_result)
+    (pan_low, pan_high), (tilt_low, tilt_high) = calibration.range_steps
+    middle = 0.5 * (pan_low + pan_high), 0.5 * (tilt_low + tilt_high)
+    ranges = sorted({*MAP_RANGES_MM, range_mm})
+    pan, tilt = np.linspace(pan_low, pan_high, MAP_CELLS), np.linspace(tilt_low, tilt_high, MAP_CELLS)
+    maps = error_map(calibration, pan, tilt, ranges, simple=simple, draws=MAP_DRAWS)
+    # The middle cell of an odd number is the middle of the counters.
+    cell = MAP_CELLS // 2, MAP_CELLS // 2, ranges.index(range_mm)
+    found = {name: distance[:, *cell] for name, distance in maps.distance_mm.items()}
+    criteria = []
+    if limit_deg_per_step is not None:
+        draws = stored_ratios(campaign)
+        for k, direction in enumerate(DIRECTIONS):
+            estimate = fit["effective_deg_per_step"].get(direction)
+            if estimate is not None:
+                errors = draws[:, k] - estimate["value"]
+                criteria.append(criterion(f"ratio {direction}", errors, limit_deg_per_step, "deg/step"))
+    if limit_mm is not None:
+        criteria.append(criterion(f"3D point at {range_mm:g} mm", found["joint"], limit_mm, "mm"))
+    ray = calibration.ray(*middle, ("left", "up"))
+    reading = calibration.reading(np.asarray(ray.origin_mm) + range_mm * np.asarray(ray.direction))
+    with jax.enable_x64(True):
+        settings = Settings(jnp.array([middle]), jnp.ones((1, 2)), jnp.radians(jnp.array([reading])))
+    path = campaign.path / "results" / "compare.json"
+    held_out = None
+    if path.exists():
+        stored = parse_json(read_bytes(path, JSON_BYTES_MAX), path.name).values
+        held_out = stored if stored.get("inputs") == fit["inputs"] else None
+    return Evidence(
+        campaign=campaign,
+        fit=fit,
+        classic=classic_result,
+        held_out=held_out,
+        criteria=criteria,
+        distances_mm=found,
+        range_mm=range_mm,
+        maps=maps,
+        budget=budget(calibration, settings),
+    )

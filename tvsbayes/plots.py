@@ -1,22 +1,21 @@
 """The paper's figures for any campaign, and the pictures of a calibration report, as matplotlib figures.
 
 Every function takes results and returns a `matplotlib.figure.Figure` that no window owns: nothing is shown, and no
-global setting of matplotlib is touched. Frame S (X depth, Y left, Z up) in mm; ratios in deg/step; angles in deg.
-Figures are one phone's width (4.6 inch) with text of 9 points. Colours are Okabe and Ito's (safe for colour-blind
-readers, jfly.uni-koeln.de/color); wherever a colour means something, a marker or a label says the same.
+global setting of matplotlib is touched; importing the module loads none of it. Frame S (X depth, Y left, Z up) in mm;
+ratios in deg/step; angles in deg. Figures are one phone's width (4.6 inch) with text of 9 points. Colours are Okabe
+and Ito's (safe for colour-blind readers, jfly.uni-koeln.de/color); wherever a colour means something, a marker or a
+label says the same.
 """
 
 from __future__ import annotations
 
+import io
+import re
 from collections.abc import Mapping, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from matplotlib import rc_context
-from matplotlib.colors import LinearSegmentedColormap
-from matplotlib.figure import Figure
-from matplotlib.patches import Rectangle
 
 from tvsbayes.classic import DIRECTIONS, ClassicResult, select_experiments, triangulate
 
@@ -24,6 +23,8 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from matplotlib.axes import Axes
+    from matplotlib.colors import Colormap
+    from matplotlib.figure import Figure
 
     from tvsbayes.campaign import Campaign, Spot
     from tvsbayes.comparison import Budget, ErrorMap
@@ -35,8 +36,10 @@ BLACK, ORANGE, SKY, GREEN, BLUE, RED, PURPLE, GREY = (
 )
 OF_ESTIMATOR = {"nominal": (GREY, "s"), "classic": (RED, "^"), "joint": (BLUE, "o")}
 """Colour and marker of each estimator in every figure."""
-DIVERGING = LinearSegmentedColormap.from_list("blue-white-vermilion", [BLUE, "#FFFFFF", RED])
-SEQUENTIAL = LinearSegmentedColormap.from_list("white-blue", ["#FFFFFF", SKY, BLUE, "#00263E"])
+DIVERGING, SEQUENTIAL = (BLUE, "#FFFFFF", RED), ("#FFFFFF", SKY, BLUE, "#00263E")
+"""Colours of maps, from the lowest to the highest value."""
+RASTER_DPI = 150
+"""Of the parts of a figure with hundreds of points."""
 STYLE = {
     "font.size": 9.0,
     "axes.titlesize": 9.5,
@@ -54,8 +57,28 @@ STYLE = {
 @contextmanager
 def _figure(height_in: float) -> Iterator[Figure]:
     """A figure in the house style; the caller fills it."""
+    from matplotlib import rc_context
+    from matplotlib.figure import Figure
+
     with rc_context(STYLE):
         yield Figure(figsize=(WIDTH_IN, height_in), layout="constrained")
+
+
+def _colours(stops: Sequence[str]) -> Colormap:
+    from matplotlib.colors import LinearSegmentedColormap
+
+    return LinearSegmentedColormap.from_list("-".join(stops), stops)
+
+
+def svg(figure: Figure) -> bytes:
+    """A figure as an SVG document; the same figure gives the same bytes."""
+    from matplotlib import rc_context
+
+    buffer = io.BytesIO()
+    # The identifiers in the file are drawn when it is written.
+    with rc_context(STYLE):
+        figure.savefig(buffer, format="svg", dpi=RASTER_DPI, metadata={"Date": None, "Creator": None})
+    return re.sub(rb">\s+<", b"><", buffer.getvalue())
 
 
 def _measured(campaign: Campaign) -> tuple[list[Spot], np.ndarray]:
@@ -226,6 +249,8 @@ def setup(
 
 def coverage(campaign: Campaign) -> Figure:
     """Where the data lie: counters seen, and spots in both images."""
+    from matplotlib.patches import Rectangle
+
     spots, _ = _measured(campaign)
     moves = {move.move: move for move in campaign.moves}
     counters = np.array([(moves[s.move].pan_steps, moves[s.move].tilt_steps) for s in spots]).reshape(-1, 2)
@@ -303,7 +328,7 @@ def correlations(names: Sequence[str], matrix: np.ndarray) -> Figure:
     count = len(names)
     with _figure(0.9 + 0.42 * count) as figure:
         axes = figure.add_subplot()
-        axes.imshow(matrix, cmap=DIVERGING, vmin=-1, vmax=1)
+        axes.imshow(matrix, cmap=_colours(DIVERGING), vmin=-1, vmax=1)
         for row in range(count):
             for column in range(count):
                 shade = "white" if abs(matrix[row, column]) > 0.8 else "black"
@@ -368,7 +393,9 @@ def error_maps(found: ErrorMap, range_index: int) -> Figure:
         panels = np.atleast_1d(figure.subplots(len(names), 1, sharex=True))
         for axes, name in zip(panels, names, strict=True):
             values = found.rms_mm[name][:, :, range_index].T
-            mesh = axes.pcolormesh(found.pan_steps, found.tilt_steps, values, cmap=SEQUENTIAL, rasterized=True)
+            mesh = axes.pcolormesh(
+                found.pan_steps, found.tilt_steps, values, cmap=_colours(SEQUENTIAL), rasterized=True
+            )
             figure.colorbar(mesh, ax=axes, label="mm")
             _cells(axes, found.pan_steps, found.tilt_steps, values)
             axes.set(ylabel="tilt, steps", title=f"{name}, range {found.range_mm[range_index]:.4g} mm")

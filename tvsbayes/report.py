@@ -1,38 +1,54 @@
-"""What people and programs get to see of an estimate: text tables, `value(u)`, the files in `results/`.
+"""What people and programs get to see of an estimate: text tables, `value(u)`, `results/`, the HTML report.
 
-Formats only; every number is computed elsewhere. Units are those of DESIGN 8.
+Formats only; every number is computed elsewhere. Units are those of DESIGN 8. The report is one page: no script,
+nothing fetched. Text of a campaign reaches it through jinja2's autoescape only; pictures are SVG inside `data:`
+images, which browsers open without scripts and without network. Its policy (CSP) allows exactly its own style sheet,
+by hash, and such images.
 """
 
 from __future__ import annotations
 
+import base64
+import hashlib
 import io
 import json
 import math
+import os
 import shlex
+import shutil
+import subprocess
 import sys
-from collections.abc import Mapping
+import tempfile
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from markupsafe import Markup
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from tvsbayes import plots
 from tvsbayes.calibration import Calibration, Steps, calibration_bytes
 from tvsbayes.campaign import input_hashes
+from tvsbayes.certificate import FIGURES
 from tvsbayes.classic import DIRECTIONS, ClassicResult
-from tvsbayes.files import escaped, make_folder, write_atomically
+from tvsbayes.files import TvsError, escaped, make_folder, shipped_data, write_atomically
 
 if TYPE_CHECKING:
-    from tvsbayes.cameras import StereoCalibration
-    from tvsbayes.comparison import Budget, Comparison, Gap, GapTerm, HoldOut
+    from matplotlib.figure import Figure
+
+    from tvsbayes.comparison import Budget, Comparison, Evidence, Gap, GapTerm, HoldOut
     from tvsbayes.coordinates import Locations
+    from tvsbayes.device.spots import Detection
+    from tvsbayes.device.stereo import StereoCalibration
     from tvsbayes.information import Estimate, FitSummary
     from tvsbayes.joint import Derived, JointFit
     from tvsbayes.rigs import Stereo
-    from tvsbayes.spots import Detection
 
 FIT_FORMAT = "tvsbayes-fit/1"
 KEY_PARAMETERS = (
@@ -157,7 +173,7 @@ def stereo_calibration_text(result: StereoCalibration) -> str:
 
 def detection_text(found: Detection) -> str:
     """What `detect` found, as a table of statuses."""
-    from tvsbayes.spots import REASONS
+    from tvsbayes.device.spots import REASONS
 
     rows = [[status, str(count), REASONS.get(status.split(" ")[0], "")] for status, count in found.statuses.items()]
     rows += [["undetected", str(found.missing), "no frames"]] if found.missing else []
@@ -442,3 +458,756 @@ def changes_text(comparison: Comparison) -> str:
     days = "" if comparison.days is None else f" in {comparison.days:.1f} days"
     cameras = "the same stereo calibration: its error is left out of u" if comparison.shared_cameras else "two cameras"
     return f"{table}\n{comparison.verdict}{days} (limit {comparison.limit:.2f} u for all together; {cameras})"
+
+
+CORRELATED = (
+    *("degrees_per_step.pan", "degrees_per_step.tilt", "backlash_deg.pan", "backlash_deg.tilt"),
+    *("mirror_offset_mm", "tilt_zero_deg", "laser_tilt_deg.x", "laser_tilt_deg.y", "focal_scale"),
+)
+"""Parameters of the correlation matrix, in order; those that were not estimated are left out."""
+BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome", "msedge")
+PDF_SECONDS = 120
+ESTIMATORS = {"laplace": "Laplace approximation at the mode", "posterior": "posterior sampled by emcee"}
+
+
+@dataclass(frozen=True)
+class TableView:
+    """A table of ready text; the first cell of a row is its header, and `pairs` have no other."""
+
+    caption: str
+    columns: Sequence[str]
+    rows: Sequence[Sequence[str]]
+
+    @property
+    def pairs(self) -> bool:
+        """Names with their values."""
+        return not self.columns
+
+
+@dataclass(frozen=True)
+class FigureView:
+    """A picture with what it says in words."""
+
+    source: str
+    alt: str
+    caption: str
+    width: int
+    height: int
+
+
+@dataclass(frozen=True)
+class Section:
+    """A part of the report."""
+
+    title: str
+    text: Sequence[str] = ()
+    items: Sequence[str] = ()
+    tables: Sequence[TableView | None] = ()
+    figures: Sequence[FigureView | None] = ()
+
+
+@dataclass(frozen=True)
+class Number:
+    """One of the three numbers at the top."""
+
+    label: str
+    value: str
+    note: str
+
+
+@dataclass(frozen=True)
+class Page:
+    """What the template is filled with."""
+
+    report_id: str
+    name: str
+    verdict: str
+    verdict_class: str
+    numbers: Sequence[Number]
+    criteria: TableView | None
+    traceable: str
+    warnings: Sequence[str]
+    versions: Mapping[str, str]
+    sections: Sequence[Section] = field(default_factory=tuple)
+
+
+def print_to_pdf(page: Path) -> Path:
+    """Print a report with an installed Chromium or Chrome; the PDF lies beside it.
+
+    Raises:
+        TvsError: none is installed, or it failed.
+    """
+    browser = next(filter(None, map(shutil.which, BROWSERS)), None)
+    target = page.with_suffix(".pdf")
+    remedy = f"open {page} in any browser and print it to PDF (A4)"
+    if browser is None:
+        raise TvsError("no-browser", f"--pdf needs one of {', '.join(BROWSERS)} on the path", remedy=remedy)
+    with tempfile.TemporaryDirectory(prefix="tvsbayes-") as scratch:
+        printed = Path(scratch) / "report.pdf"
+        flags = ["--headless", "--disable-gpu", "--no-first-run", "--disable-background-networking", "--disable-sync"]
+        if hasattr(os, "geteuid") and os.geteuid() == 0:
+            # Chromium's own walls cannot be built by root; the page is ours and holds no script.
+            flags.append("--no-sandbox")
+        flags += ["--no-pdf-header-footer", "--generate-pdf-document-outline", f"--user-data-dir={scratch}/profile"]
+        command = [browser, *flags, f"--print-to-pdf={printed}", page.resolve().as_uri()]
+        try:
+            done = subprocess.run(command, capture_output=True, timeout=PDF_SECONDS, check=False)
+        except (OSError, subprocess.TimeoutExpired) as error:
+            raise TvsError("pdf", f"{Path(browser).name} did not print the report", remedy=remedy) from error
+        if done.returncode or not printed.exists():
+            raise TvsError("pdf", f"{Path(browser).name} ended with code {done.returncode}", remedy=remedy)
+        write_atomically(target, printed.read_bytes())
+    return target
+
+
+def report_html(evidence: Evidence) -> bytes:
+    """The report, UTF-8.
+
+    Args:
+        evidence: computed beforehand; nothing is computed here.
+    """
+    folder = shipped_data() / "report"
+    environment = Environment(
+        loader=FileSystemLoader(str(folder)), autoescape=True, undefined=StrictUndefined, trim_blocks=True
+    )
+    page = _page(evidence)
+    css = (folder / "report.css").read_text(encoding="utf-8").replace("@ID@", page.report_id)
+    digest = base64.b64encode(hashlib.sha256(css.encode()).digest()).decode()
+    policy = f"default-src 'none'; img-src data:; style-src 'sha256-{digest}'; base-uri 'none'; form-action 'none'"
+    # The style sheet is ours; escaped quotes would change its hash.
+    html = environment.get_template("report.html").render(r=page, css=Markup(css), policy=policy)
+    return html.encode()
+
+
+def figure_view(figure: Figure, alt: str, caption: str) -> FigureView:
+    """A figure as SVG in a `data:` address; the same figure gives the same bytes."""
+    width, height = (round(96 * inch) for inch in figure.get_size_inches())
+    picture = base64.b64encode(plots.svg(figure)).decode()
+    return FigureView(f"data:image/svg+xml;base64,{picture}", alt, caption, width, height)
+
+
+def _page(e: Evidence) -> Page:
+    fit = e.fit
+    inputs = fit["inputs"]
+    report_id = (
+        hashlib.sha256(
+            repr((sorted(inputs.items()), fit["seed"], fit["versions"], fit["effective_deg_per_step"])).encode()
+        )
+        .hexdigest()[:12]
+        .upper()
+    )
+    header = e.campaign.header
+    verdict, kind = _verdict(e)
+    sections = [
+        _setup(e),
+        _results(e),
+        _identifiability(e),
+        _residuals(e),
+        _validation(e),
+        _maps(e),
+        _budgets(e),
+        _axes(e),
+        _plan(e),
+        _method(e),
+        _limits(e),
+    ]
+    rows = [[c.quantity, f"{c.limit:.3g} {c.unit}", f"{c.probability:.3f}", c.verdict] for c in e.criteria]
+    criteria = None
+    if rows:
+        caption = "Decision rule: met if P(|error| <= limit) >= 0.95, not met if <= 0.05, else cannot tell"
+        criteria = TableView(caption, ["error of", "limit", "probability", "verdict"], rows)
+    return Page(
+        report_id=report_id,
+        name=str(header.get("name") or "campaign without a name"),
+        verdict=verdict,
+        verdict_class=kind,
+        numbers=_numbers(e),
+        criteria=criteria,
+        traceable=_traceable(header),
+        warnings=_warnings(e),
+        versions=fit["versions"],
+        sections=sections,
+    )
+
+
+def _verdict(e: Evidence) -> tuple[str, str]:
+    """One line, and the class that colours it."""
+    if not e.fit["converged"]:
+        return "NOT CONVERGED: the numbers below must not be used", "not-met"
+    if not e.criteria:
+        return (
+            (
+                "No limit was stated: the results below are without a verdict (state one with "
+                "--limit-deg-per-step or --limit-mm)"
+            ),
+            "cannot-tell",
+        )
+    told = []
+    for verdict in ("not met", "cannot tell", "met"):
+        mine = [c for c in e.criteria if c.verdict == verdict]
+        limits = dict.fromkeys((c.limit, c.unit) for c in mine)
+        for limit, unit in limits:
+            part = [c for c in mine if (c.limit, c.unit) == (limit, unit)]
+            least = min(c.probability for c in part)
+            names = ", ".join(c.quantity for c in part)
+            told.append((verdict, f"{verdict}: {names} within {limit:.3g} {unit} (P at least {least:.3f})"))
+    text = "; ".join(sentence for _, sentence in told)
+    return text[0].upper() + text[1:], told[0][0].replace(" ", "-")
+
+
+def _numbers(e: Evidence) -> list[Number]:
+    """Worst ratio, how far off the classic is, millimetres at the stated range."""
+    ratios = {d: x for d, x in e.fit["effective_deg_per_step"].items() if x is not None}
+    numbers = []
+    if ratios:
+        worst = max(ratios, key=lambda d: ratios[d]["sd"] / abs(ratios[d]["value"]))
+        x = ratios[worst]
+        u = 0.5 * (x["interval95"][1] - x["interval95"][0])
+        note = f"effective deg/step; U = {u:.2g}, p = 95 %, k = {u / x['sd']:.2f}" if x["sd"] > 0 else "fixed"
+        numbers.append(Number(f"least certain ratio: {worst}", concise(x["value"], x["sd"]), note))
+    if e.classic is not None and ratios:
+        off = {
+            d: 100 * (r.mean_deg_per_step / ratios[d]["value"] - 1)
+            for d, r in e.classic.directions.items()
+            if r is not None and d in ratios
+        }
+        if off:
+            worst = max(off, key=lambda d: abs(off[d]))
+            numbers.append(Number(f"classic mean, {worst}", f"{off[worst]:+.1f} %", "away from the joint estimate"))
+    if len(numbers) < 2:
+        numbers.append(Number("classic mean", "not applicable", "no complete four-point experiment"))
+    joint = e.distances_mm["joint"]
+    others = ", ".join(f"{name} {_mm(np.quantile(v, 0.95))}" for name, v in e.distances_mm.items() if name != "joint")
+    note = f"95 % of 3D errors stay below this; {others}"
+    numbers.append(Number(f"joint, {e.range_mm:g} mm away", _mm(np.quantile(joint, 0.95)), note))
+    return numbers
+
+
+def _mm(value: float) -> str:
+    return f"{value:.2g} mm" if value < 100 else f"{value:.0f} mm"
+
+
+def _traceable(header: Mapping[str, object]) -> str:
+    stated = header.get("traceability") or {}
+    certificate = stated.get("board_certificate") if isinstance(stated, Mapping) else None
+    if certificate:
+        return f"Traceability of lengths as declared by the user: board certificate {certificate}."
+    return "Not traceable: no certificate of a length standard was declared."
+
+
+def _warnings(e: Evidence) -> list[str]:
+    found = [str(text) for text in e.fit["problems"]]
+    if e.fit["estimator"] == "laplace":
+        found.append(
+            "Intervals are those of the Laplace approximation at the mode; with few stops of a direction that of the "
+            "backlash is too short. The command fit without --no-sample samples the posterior."
+        )
+    if e.campaign.header.get("synthetic"):
+        found.append("The campaign is synthetic: made by the digital twin, not measured.")
+    if e.campaign.stereo.assumed:
+        found.append("The stereo calibration's covariance is assumed, not estimated.")
+    found += [f"Prior conflict: {text}" for text in e.fit["prior_conflicts"]]
+    if e.fit["suspect_spots"]:
+        listed = ", ".join(map(str, e.fit["suspect_spots"][:20]))
+        found.append(f"Spots that disagree with all others: {listed}.")
+    return found
+
+
+def _setup(e: Evidence) -> Section:
+    campaign, header = e.campaign, e.campaign.header
+    ok = sum(spot.status == "ok" for spot in campaign.spots)
+    targets = sorted({spot.target for spot in campaign.spots if spot.target})
+    rows = [
+        [label, str(header[key])]
+        for key, label in (
+            *(
+                ("instrument", "instrument"),
+                ("serial", "serial number"),
+                ("operator", "operator"),
+                ("method", "method"),
+            ),
+            *(("created", "measured or made"), ("notes", "notes")),
+        )
+        if header.get(key)
+    ]
+    rows += [
+        ["moves, segments", f"{len(campaign.moves)}, {1 + campaign.moves[-1].segment}"],
+        ["spots used, in all", f"{ok - len(e.fit['excluded_spots'])}, {len(campaign.spots)}"],
+        ["placements of the sheet", ", ".join(targets) or "not named"],
+    ]
+    environment = header.get("environment") or {}
+    for key, unit in (("temperature_degC", "degC"), ("humidity_percent", "%")):
+        stated = environment.get(key)
+        if stated:
+            rows.append([key.split("_")[0], f"{stated['value']:g} {unit}, u = {stated['u']:g} {unit}"])
+    parameters = e.fit["parameters"]
+    names = [f"extrinsics.translation_mm.{a}" for a in "xyz"]
+    where = [parameters[n]["value"] for n in names] if all(n in parameters for n in names) else None
+    baseline = campaign.rig.priors["baseline_mm"].value
+    figures = [
+        figure_view(
+            plots.setup(campaign, where, baseline),
+            "Positions of cameras, positioner and spots from above and from the side; the coordinates are in spots.csv "
+            "and in the table of results",
+            "The rig as estimated, frame S: left camera at the origin, X depth, Y left, Z up.",
+        ),
+        figure_view(
+            plots.coverage(campaign),
+            "Counters at which spots were seen, and where the spots lie in both images",
+            "Data coverage. What lies outside of it is extrapolated.",
+        ),
+    ]
+    return Section("Set-up and data", tables=[TableView("What was measured", [], rows)], figures=figures)
+
+
+def _results(e: Evidence) -> Section:
+    ratios, rows = e.fit["effective_deg_per_step"], []
+    for direction in DIRECTIONS:
+        joint = ratios.get(direction)
+        classic = None if e.classic is None else e.classic.directions[direction]
+        row = [direction]
+        if joint is None:
+            row += ["never moved", "", ""]
+        else:
+            low, high = joint["interval95"]
+            row += [
+                concise(joint["value"], joint["sd"]),
+                interval_text(low, high, joint["sd"]),
+                f"{0.5 * (high - low):.2g}",
+            ]
+        if e.classic is None:
+            row += ["not applicable", ""]
+        elif classic is None:
+            row += ["no experiment", ""]
+        else:
+            row += [concise(classic.mean_deg_per_step, classic.u_gum_deg_per_step or 0.0), str(classic.n)]
+        rows.append(row)
+    pose = e.fit["reference_pose_deg"]
+    columns = ["direction", "joint value(u)", "95 % interval", "U (k near 2)", "classic value(u)", "n"]
+    caption = (
+        f"Effective degrees of the beam per motor step at pan {pose['pan']:.2f} deg, tilt {pose['tilt']:.2f} "
+        "deg, deg/step"
+    )
+    tables = [TableView(caption, columns, rows), _parameters(e)]
+    joint_view = {d: None if x is None else (x["value"], tuple(x["interval95"])) for d, x in ratios.items()}
+    classic_view = {}
+    if e.classic is not None:
+        classic_view = {
+            d: None if r is None else (r.mean_deg_per_step, r.interval95_gum) for d, r in e.classic.directions.items()
+        }
+    figures = [
+        figure_view(
+            plots.intervals(joint_view, classic_view),
+            "Ratios of both estimators with 95 % intervals; values in the table above",
+            "Effective ratios, joint (circles) and classic (triangles).",
+        )
+    ]
+    text = [
+        (
+            "value(u): the digits in brackets are the standard uncertainty in units of the last "
+            "place, or with their decimal point the uncertainty itself."
+        )
+    ]
+    if e.classic is None:
+        text.append("Classic: not applicable, the campaign has no complete four-point experiment.")
+    else:
+        for direction in DIRECTIONS:
+            result = e.classic.directions[direction]
+            if result is None:
+                continue
+            joint = ratios.get(direction)
+            alt = f"{result.n} experiments moving {direction}: mean {result.mean_deg_per_step:.6f} deg/step"
+            if result.sd_deg_per_step is not None:
+                alt += f", standard deviation {result.sd_deg_per_step:.6f}"
+            pair = None if joint is None else (joint["value"], joint["sd"])
+            figures.append(
+                figure_view(
+                    plots.direction_scatter(e.classic, direction, pair),
+                    alt,
+                    f"Experiments moving {direction}, with the mean and bands of 1, 2 and 3 sigma.",
+                )
+            )
+    gaps = e.fit.get("gap")
+    if gaps:
+        tables.append(_gap_table(gaps))
+        figures.append(
+            figure_view(
+                plots.gap_terms(gaps),
+                "Terms of the difference between both estimators; values in the table above",
+                "Why the classic differs from the joint.",
+            )
+        )
+    if e.fit.get("curves"):
+        figures.append(
+            figure_view(
+                plots.ratio_curves(e.fit["curves"]["effective_deg_per_step"]),
+                "Effective ratios over the range of pan and tilt angles; values in fit.json",
+                "Effective ratios over the range that was seen.",
+            )
+        )
+    return Section("Results, classic beside joint", text, tables=tables, figures=figures)
+
+
+def _gap_table(gaps: Mapping[str, Mapping[str, object] | None]) -> TableView:
+    found = {d: g for d, g in gaps.items() if g is not None}
+    names = [term["name"] for term in next(iter(found.values()))["terms"]]
+
+    def cell(term: Mapping[str, float]) -> str:
+        text = concise(term["value"], term["sd"])
+        return text if text.startswith("-") else f"+{text}"
+
+    rows = [["classic - joint", *(cell(g["total"]) for g in found.values())]]
+    rows += [[name, *(cell(g["terms"][k]) for g in found.values())] for k, name in enumerate(names)]
+    return TableView("The gap between both estimators by its terms, deg/step", ["term", *found], rows)
+
+
+def _parameters(e: Evidence) -> TableView:
+    rows = []
+    for name, x in e.fit["parameters"].items():
+        if name.startswith("stereo.") or x["sd"] == 0:
+            continue
+        set_by = "" if x["contraction"] is None else ("data" if x["contraction"] >= 0.1 else "prior")
+        contraction = "" if x["contraction"] is None else f"{x['contraction']:.2f}"
+        diagnosis = "" if x["rhat"] is None else f"{x['rhat']:.3f}"
+        rows.append(
+            [
+                name,
+                concise(x["value"], x["sd"]),
+                interval_text(*x["interval95"], x["sd"]),
+                f"{x['prior_sd']:.2g}",
+                contraction,
+                set_by,
+                diagnosis,
+            ]
+        )
+    columns = ["parameter", "value(u)", "95 % interval", "u of the prior", "contraction", "set by", "R-hat"]
+    return TableView("Parameters of the joint model; the unit is in the name", columns, rows)
+
+
+def _identifiability(e: Evidence) -> Section:
+    covariance = e.fit["covariance"]
+    names, matrix = covariance["names"], np.array(covariance["matrix"])
+    kept = [n for n in CORRELATED if n in names and matrix[names.index(n), names.index(n)] > 0]
+    figures, rows = [], []
+    if len(kept) > 1:
+        index = [names.index(n) for n in kept]
+        part = matrix[np.ix_(index, index)]
+        sd = np.sqrt(np.diag(part))
+        correlation = part / np.outer(sd, sd)
+        for i in range(len(kept)):
+            for j in range(i):
+                if abs(correlation[i, j]) > 0.8:
+                    rows.append([f"{kept[j]} and {kept[i]}", f"{correlation[i, j]:+.3f}"])
+        figures.append(
+            figure_view(
+                plots.correlations(kept, correlation),
+                "Correlation matrix; every cell holds its value in per cent",
+                "Correlations of the posterior.",
+            )
+        )
+    items = [w["text"] for w in e.fit["weak_directions"]] + [entry["text"] for entry in e.fit["leverage"]]
+    sensitive = [
+        [
+            f"{x['parameter']}, {'twice' if x['factor'] > 1 else 'half'} its u",
+            x["quantity"],
+            f"{x['shift_sd']:+.2f}",
+            f"{x['sd_ratio']:.2f}",
+        ]
+        for x in e.fit["prior_sensitivity"]
+    ]
+    text = []
+    if not items:
+        text.append("Every direction that matters is set by the data; no single stop rules a headline.")
+    caption = "Headlines that another prior would move: by how many of their sds, and the factor on the sd"
+    columns = ["prior", "headline", "shift, sd", "sd, factor"]
+    priors = TableView(caption, columns, sensitive) if sensitive else None
+    table = TableView("Correlations beyond 0.8", ["parameters", "correlation"], rows) if rows else None
+    return Section("What the data tell apart", text, items, [table, priors], figures)
+
+
+def _residuals(e: Evidence) -> Section:
+    causes = e.fit.get("residual_causes") or []
+    noise = e.fit["noise"]
+    text = [
+        (
+            f"chi-square {noise['chi2']:.1f} for {noise['dof']:.1f} degrees of freedom; the pixel "
+            f"noise is {noise['pixel_scale']:.2f} times the stated one."
+        )
+    ]
+    rows = [
+        [
+            f"{c['axis']}: {c['name']}",
+            str(len(c["groups"])),
+            "not tested" if c["p"] is None else f"{c['p']:.3f}",
+            "SUSPICIOUS" if c["suspicious"] else "no sign",
+        ]
+        for c in causes
+    ]
+    tables = (
+        [TableView("Do the deviations of the stops depend on ...", ["cause", "groups", "p", "verdict"], rows)]
+        if rows
+        else []
+    )
+    groups = [
+        [f"{c['axis']}, {c['name']}: {g['label']}", str(g["count"]), f"{g['mean']:+.2f}", f"{g['standard_error']:.2f}"]
+        for c in causes
+        for g in c["groups"]
+        if len(c["groups"]) > 1
+    ]
+    if groups:
+        tables.append(
+            TableView(
+                "Mean deviation of stops in units of its standard deviation",
+                ["group", "count", "mean", "standard error"],
+                groups,
+            )
+        )
+    figures = []
+    for axis in ("pan", "tilt"):
+        if any(c["axis"] == axis for c in causes):
+            alt = f"Mean deviation by group, {axis} axis; values in the table above"
+            figures.append(figure_view(plots.causes(causes, axis), alt, f"{axis} axis: mean deviation by group."))
+        stops = [x for x in e.fit.get("residuals") or [] if x["axis"] == axis]
+        if stops:
+            figures.append(
+                figure_view(
+                    plots.residuals(stops, axis),
+                    (
+                        f"Deviations of {len(stops)} stops of the {axis} axis over time and counter; "
+                        "group means in the table above"
+                    ),
+                    f"Stops of the {axis} axis: observed minus fitted angle.",
+                )
+            )
+    return Section("Residuals by cause", text, tables=tables, figures=figures)
+
+
+def _validation(e: Evidence) -> Section:
+    text, items, tables = [], [], []
+    sampling = e.fit.get("sampling")
+    if sampling is None:
+        text.append("The posterior was not sampled: intervals are those of the Laplace approximation.")
+    else:
+        worst, bulk, tail = (sampling[k] for k in ("worst_rhat", "least_ess_bulk", "least_ess_tail"))
+        text.append(
+            f"{sampling['walkers']} walkers, {sampling['steps']} steps; worst R-hat {worst['value']:.3f} "
+            f"({worst['quantity']}); least effective draws {bulk['value']:.0f} in the bulk "
+            f"({bulk['quantity']}) and {tail['value']:.0f} in the tails ({tail['quantity']})."
+        )
+        items += [f"UNCONVERGED: {sentence}" for sentence in sampling["missing"]]
+    predicted = e.fit.get("classic_predicted_deg_per_step") or {}
+    rows = []
+    if e.classic is not None:
+        for direction in DIRECTIONS:
+            told, seen = predicted.get(direction), e.classic.directions[direction]
+            if told is not None and seen is not None:
+                spread = np.hypot(told["sd"], seen.u_type_a_deg_per_step or 0.0)
+                z = (seen.mean_deg_per_step - told["value"]) / spread if spread > 0 else 0.0
+                rows.append(
+                    [
+                        direction,
+                        concise(told["value"], told["sd"]),
+                        concise(seen.mean_deg_per_step, seen.u_type_a_deg_per_step or 0.0),
+                        f"{z:+.1f}",
+                    ]
+                )
+    if rows:
+        tables.append(
+            TableView(
+                "What the joint model says the classic estimator should report, and what it reports, deg/step",
+                ["direction", "foretold", "reported, type A", "difference / u"],
+                rows,
+            )
+        )
+    if e.held_out is None:
+        text.append(
+            "Held-out experiments: not computed; run the command compare on the campaign and make the report again."
+        )
+    else:
+        held = e.held_out["held_out"]
+        text.append(f"Held-out experiments: {held['verdict']}: {held['reason']}.")
+        if held["classic"] is not None:
+            rows = [
+                [
+                    name,
+                    f"{held[name]['rms_deg']:.3f}",
+                    f"{held[name]['rms_block_deg']:.3f}",
+                    f"{100 * held[name]['coverage']:.0f} %",
+                ]
+                for name in ("classic", "joint")
+            ]
+            tables.append(
+                TableView(
+                    "Angles of experiments that were left out, deg",
+                    ["estimator", "rms error", "rms of block means", "inside 95 % intervals"],
+                    rows,
+                )
+            )
+        rows = [[d, f"{u:.1e}"] for d, u in held["unseen"].items()]
+        tables.append(
+            TableView(
+                "What no hold-out sees: u by stereo calibration and focal scale, common to all spots, deg/step",
+                ["direction", "u"],
+                rows,
+            )
+        )
+    return Section("Validation", text, items, tables)
+
+
+def _maps(e: Evidence) -> Section:
+    figures = []
+    middle = len(e.maps.pan_steps) // 2, len(e.maps.tilt_steps) // 2
+    rows = []
+    for k, reach in enumerate(e.maps.range_mm):
+        rows.append([f"{reach:g}", *(_cell(e.maps.rms_mm[name][middle][k]) for name in e.maps.rms_mm)])
+    for k, reach in enumerate(e.maps.range_mm):
+        figures.append(
+            figure_view(
+                plots.error_maps(e.maps, k),
+                f"Root mean square error over pan and tilt at {reach:g} mm; every cell holds its value in mm",
+                f"3D error at {reach:g} mm, root mean square over the rigs that the data allow.",
+            )
+        )
+    at = f"pan {e.maps.pan_steps[middle[0]]:.0f}, tilt {e.maps.tilt_steps[middle[1]]:.0f} steps"
+    table = TableView(f"Root mean square 3D error in mm at {at}, by range in mm", ["range", *e.maps.rms_mm], rows)
+    text = [
+        (
+            "Nominal and classic users are given a baseline shortened by the mirror offset and "
+            "moved by half of it; noise of one look is included for all."
+        )
+    ]
+    return Section("Errors in 3D", text, tables=[table], figures=figures)
+
+
+def _cell(value: float) -> str:
+    return "no point" if not np.isfinite(value) else f"{value:.2g}" if value < 10 else f"{value:.0f}"
+
+
+def _budgets(e: Evidence) -> Section:
+    tables, figures = [], []
+    for table in e.fit["budgets"]:
+        rows = [
+            [
+                row["quantity"],
+                row["kind"],
+                row["distribution"],
+                _blank(row["u"], ".2g"),
+                _freedom(row["dof"]) if row["u"] is not None else "",
+                _blank(row["sensitivity"], ".3g"),
+                _blank(row["contribution"], ".2e"),
+                f"{100 * row['share']:.1f}",
+            ]
+            for row in table["rows"]
+        ]
+        caption = (
+            f"{table['quantity']}: {concise(table['estimate'], table['u'])} {table['unit']}; effective degrees of "
+            f"freedom {_freedom(table['dof'])}, k = {table['coverage_factor']:.2f}, "
+            f"p = {100 * table['probability']:.0f} %, U = {table['expanded']:.2g} {table['unit']}"
+        )
+        columns = ["source", "type", "distribution", "u", "dof", "sensitivity", "contribution", "share %"]
+        tables.append(TableView(caption, columns, rows))
+    if e.budget is not None:
+        u = np.sqrt(e.budget.variance_mm2)
+        order = np.argsort(-e.budget.share)
+        rows = [
+            [e.budget.causes[k], f"{100 * e.budget.share[k]:.1f}", *(f"{v:.2g}" for v in u[k])]
+            for k in order
+            if e.budget.share[k] >= 5e-4
+        ]
+        tables.append(
+            TableView(
+                f"Budget of a point {e.range_mm:g} mm away, by cause",
+                ["cause", "share %", "u(x) mm", "u(y) mm", "u(z) mm"],
+                rows,
+            )
+        )
+        figures.append(
+            figure_view(
+                plots.shares(e.budget),
+                "Shares of the variance by cause; values at the bars and in the table above",
+                f"What the uncertainty of a point {e.range_mm:g} mm away consists of.",
+            )
+        )
+    return Section("Uncertainty budgets", tables=tables, figures=figures)
+
+
+def _blank(value: float | None, form: str) -> str:
+    return "" if value is None else format(value, form)
+
+
+def _freedom(dof: float | None) -> str:
+    return "infinite" if dof is None else f"{dof:.0f}"
+
+
+def _axes(e: Evidence) -> Section:
+    tables, items = [], []
+    for axis in e.fit["positioning"]:
+        rows = [
+            [
+                " ".join(reversed(FIGURES[name])),
+                f"{p['median']:.4f}",
+                f"[{p['interval95'][0]:.4f}, {p['interval95'][1]:.4f}]",
+                "" if axis["plug_in"] is None else _blank(axis["plug_in"].get(name), ".4f"),
+            ]
+            for name, p in (axis["predicted"] or {}).items()
+        ]
+        if rows:
+            caption = (
+                f"{axis['axis']} axis, deg: predicted for {axis['runs']} runs per side at {len(axis['target_steps'])} "
+                "targets, and as the campaign's own stops have it"
+            )
+            tables.append(TableView(caption, ["figure", "median", "95 % interval", "own stops"], rows))
+        if axis["missing"]:
+            items.append(f"{axis['axis']}, own stops: {axis['missing']}")
+        items += [note for note in axis["notes"] if note not in items]
+    text = [] if tables or items else ["Not computed: the fit has not converged."]
+    return Section("ISO 230-2-style figures", text, items, tables)
+
+
+def _plan(e: Evidence) -> Section:
+    items = [w["text"] for w in e.fit["weak_directions"]]
+    text = ["The command plan with --given weighs further experiments: gain per minute, and when to stop."]
+    return Section("What to measure next", text, items)
+
+
+def _method(e: Evidence) -> Section:
+    fit, header = e.fit, e.campaign.header
+    text = [
+        (
+            "Joint model: two-mirror positioner with per-direction ratios, backlash, mirror offset "
+            "and misalignments, seen by a calibrated stereo pair; all spots at once; stop errors "
+            "integrated out; stereo calibration and focal scale uncertain within their stated "
+            "covariance. Classic: the four-point method of doi 10.3390/metrology5040058."
+        ),
+        (
+            f"Estimator: {ESTIMATORS[fit['estimator']]}. Intervals are equal-tailed "
+            "(JCGM 101:2008, 5.3.3), coverage probability 95 %."
+        ),
+        f"Command: {fit['command']}. Seed {fit['seed']}.",
+    ]
+    stated = header.get("traceability") or {}
+    rows = [["traceability", key, str(value)] for key, value in stated.items()]
+    rows += [["sha256", name, str(value)] for name, value in fit["inputs"].items()]
+    rows += [["version", name, str(value)] for name, value in fit["versions"].items()]
+    table = TableView("Traceability as declared, inputs, versions", ["", "name", "value"], rows)
+    return Section("Method, traceability, provenance", text, tables=[table])
+
+
+def _limits(e: Evidence) -> Section:
+    items = [
+        (
+            "The scale of all angles is that of the stereo calibration; an error of its board "
+            "or of the focal length at the laser's wavelength beyond the stated uncertainty is "
+            "in no residual."
+        ),
+        (
+            "Baseline, C0 and aperture zero cannot be seen in spots: without aperture readings "
+            "they are the user's statement."
+        ),
+        (
+            "Results hold for the range of counters and depths that was seen, at the temperature "
+            "of the campaign, moving slowly enough to lose no step."
+        ),
+        "Angles are inferred through cameras and model; no angle standard was compared.",
+    ]
+    return Section("Limitations", items=items)

@@ -10,9 +10,9 @@ import numpy as np
 from tvsbayes.device.camera import StereoImage
 from tvsbayes.device.observation import Detection, Detector
 from tvsbayes.device.renderer import Scene, Sensor, cameras_of, render_spots
+from tvsbayes.device.spots import epipolar_refused, find_spot, pair_status
 from tvsbayes.device.twin import Instrument, Light, Renderer
 from tvsbayes.rigs import Rig, Stereo
-from tvsbayes.spots import epipolar_refused, find_spot, pair_status
 
 
 def live_detector(stereo: Stereo) -> Detector:

@@ -22,8 +22,9 @@ from tvsbayes.calibration import load_calibration
 from tvsbayes.campaign import read_campaign, write_campaign
 from tvsbayes.classic import DIRECTIONS, classic
 from tvsbayes.cli import run
+from tvsbayes.comparison import Evidence, gather
 from tvsbayes.files import parse_json
-from tvsbayes.pages import BROWSERS, Evidence, FigureView, gather, report_html
+from tvsbayes.report import BROWSERS, FigureView, report_html
 
 TWIN = ROOT / "data" / "twins" / "paper_twin"
 BYTES_MAX = 3_000_000
@@ -90,7 +91,7 @@ def page(evidence) -> bytes:
 def no_pictures(monkeypatch):
     """Pictures are not what is looked at, and take seconds."""
     view = FigureView("data:image/svg+xml;base64,", "a picture that was left out", "left out", 1, 1)
-    monkeypatch.setattr("tvsbayes.pages.figure_view", lambda figure, alt, caption: view)
+    monkeypatch.setattr("tvsbayes.report.figure_view", lambda figure, alt, caption: view)
 
 
 def test_the_command_writes_this_page(folder, page):

@@ -25,12 +25,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from tvsbayes.boards import SIDES, Board, Finder, View, Views, find_views
+from tvsbayes.device.boards import SIDES, Board, Finder, View, Views, find_views
 from tvsbayes.files import NotConverged, NothingToEstimate, escaped
+from tvsbayes.joint import least_squares_covariance, levenberg_marquardt, residuals_and_jacobian
 from tvsbayes.model import CV_FROM_S, StereoCameras, project, rotation_matrix
 from tvsbayes.rigs import STEREO_PARAMETER_NAMES, Stereo, rotation_vector
 from tvsbayes.rigs import rotation_matrix as rotation_of
-from tvsbayes.solver import least_squares_covariance, levenberg_marquardt, linearised
 
 VIEWS_MIN = 3
 """Views per camera below which Zhang's method (2000) cannot find a focal length with both principal coordinates."""
@@ -240,7 +240,7 @@ def bundle_adjustment(
         unit = np.diag(free.astype(float))
         arrays = BoardArrays(*map(jnp.asarray, (points, seen, weight, start_poses, np.asarray(start, float), unit)))
         zero = np.zeros(24)
-        jacobian = np.asarray(linearised(reduced_residuals, jnp.asarray(zero), arrays)[1])
+        jacobian = np.asarray(residuals_and_jacobian(reduced_residuals, jnp.asarray(zero), arrays)[1])
         # Whitened at the start: a unit of z is one standard error for corners of 1 px. In their own units a focal
         # length and a k3 would share one damping.
         root = np.zeros((24, 24))
@@ -288,7 +288,7 @@ def _descended(z: np.ndarray, arrays: BoardArrays) -> tuple[np.ndarray, np.ndarr
     """Where Levenberg-Marquardt ends, with residuals and Jacobian there."""
     tolerance = jnp.asarray(TOLERANCE)
     end = levenberg_marquardt(reduced_residuals, jnp.asarray(z), arrays, tolerance, STEPS_MAX)
-    residuals, jacobian = linearised(reduced_residuals, end, arrays)
+    residuals, jacobian = residuals_and_jacobian(reduced_residuals, end, arrays)
     return np.asarray(end), np.asarray(residuals), np.asarray(jacobian)
 
 
