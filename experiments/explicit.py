@@ -1,13 +1,14 @@
 """Is it right to integrate stop errors and ranges out? On a dozen spots NUTS samples every one of them.
 
-    python experiments/explicit.py > experiments/explicit.md        (3 minutes; needs the `bench` extra)
+    python experiments/explicit.py > experiments/explicit.md        (10 minutes; needs the `bench` extra)
 
 A dozen spots of the mounted rig, six stops at two sheets, both axes with cleared and reversed moves. Optics, cameras
 and extrinsics are held, so that a dozen spots tell what is left: mean ratios, contrasts, backlashes, tilt zero, stop
-sds, pixel scale. NumPyro's NUTS samples these, every stop error and every range; a range is flat in image displacement,
-so the density carries |d(pixels)/d(range)| (DESIGN 4.1). It shares `observe` and the gears with the likelihood, not
-the filter, the projection, nor the linearisation about the triangulated point. `tvsbayes.sample` samples the marginal
-density.
+sds, pixel scale. NumPyro's NUTS samples these, every stop error and every range; a range is flat in image
+displacement, so the density carries |d(pixels)/d(range)| (DESIGN 4.1). NUTS moves in coordinates whitened at the mode
+of the marginal density; with a mass matrix of its own finding it spent 1000 gradients on every draw. It shares
+`observe` and the gears with the likelihood, not the filter, the projection, nor the linearisation about the
+triangulated point. `tvsbayes.sample` samples the marginal density.
 """
 
 from __future__ import annotations
@@ -35,7 +36,8 @@ from tvsbayes.simulation import simulate
 
 KEPT = ("degrees_per_step", "ratio_contrast", "backlash", "tilt_zero", "stop_sd", "pixel_scale")
 STOPS = ((60, 40), (160, -40), (60, 40), (200, 40), (100, -40), (0, 0))
-SEED, CHAINS, WARMUP, DRAWS = 11, 4, 1000, 2500
+SEED, CHAINS, WARMUP, DRAWS = 11, 4, 500, 2000
+NEWTON_STEPS = 100
 AXES = {"chain_axis": 0, "draw_axis": 1}
 QUANTILES = {"5 %": 0.05, "50 %": 0.5, "95 %": 0.95}
 
@@ -57,7 +59,7 @@ def dozen():
 
 
 def explicit_density(campaign, joint):
-    """Log density of (z of the free parameters, unit stop errors, ranges), and the number of each."""
+    """Log density of one vector (z of the free parameters, stop errors in sds of the mode, ranges) and its parts."""
     arrays, space = campaign_arrays(campaign), parameter_space(campaign.rig, campaign.stereo)
     count = sum(s.status == "ok" for s in campaign.spots)
     spots = jax.tree.map(lambda x: x[:count], arrays.spots)
@@ -70,15 +72,23 @@ def explicit_density(campaign, joint):
     at_mode = mirror_angles(mode.transmission, mode.tilt_zero_rad, arrays.moves).angle_rad[spots.move_index].T
     middle = nearest_range(mode, *at_mode, spots.triangulated_mm.T)
 
-    def density(theta):
+    variance_at_mode = stop_variances(mode.noise.stop_sd_rad, spots)
+    sizes = {"z": len(free), "pan": len(drawn_at[0]), "tilt": len(drawn_at[1]), "range_mm": count}
+    ends = np.cumsum([0, *sizes.values()])
+    parts = {name: slice(a, b) for name, a, b in zip(sizes, ends[:-1], ends[1:], strict=True)}
+
+    def density(vector):
+        theta = {name: vector[part] for name, part in parts.items()}
         z = jnp.asarray(joint.z).at[free].set(theta["z"])
         model = space.model(z)
         angles = mirror_angles(model.transmission, model.tilt_zero_rad, arrays.moves).angle_rad[spots.move_index].T
         variance = stop_variances(model.noise.stop_sd_rad, spots)
-        errors = [
-            (theta[name] * jnp.sqrt(variance[at, axis]))[where]
-            for axis, (name, at, where) in enumerate(zip(("pan", "tilt"), drawn_at, place, strict=True))
-        ]
+        errors, log_prior = [], -0.5 * jnp.sum(theta["z"] ** 2)
+        for axis, name in enumerate(("pan", "tilt")):
+            drawn = theta[name] * jnp.sqrt(variance_at_mode[drawn_at[axis], axis])
+            own = variance[drawn_at[axis], axis]
+            log_prior -= 0.5 * jnp.sum(drawn**2 / own + jnp.log(own))
+            errors.append(drawn[place[axis]])
         pose = jnp.stack([angles[0] + errors[0], angles[1] + errors[1], middle + theta["range_mm"]])
         towards = jnp.zeros_like(pose).at[2].set(1.0)
         seen, slope = jax.jvp(lambda p: observe(model, p, arrays.azimuth_convention)[:4], (pose,), (towards,))
@@ -87,10 +97,37 @@ def explicit_density(campaign, joint):
         s = model.noise.pixel_scale
         value = -0.5 * jnp.sum(residual**2) / s**2 - 4 * count * jnp.log(s)
         value += 0.5 * jnp.sum(jnp.log(jnp.sum(slope**2, axis=1)))
-        return value - 0.5 * sum(jnp.sum(theta[n] ** 2) for n in ("z", "pan", "tilt"))
+        return value + log_prior
 
-    sizes = {"z": len(free), "pan": len(drawn_at[0]), "tilt": len(drawn_at[1]), "range_mm": count}
-    return density, sizes
+    return density, parts
+
+
+def whitening(density, z: np.ndarray, covariance: np.ndarray, latent: int):
+    """Centre and root of coordinates in which the density is nearly standard normal.
+
+    At the mode of the marginal density, where stop errors and ranges have a mode of their own: the mode of all
+    together has stop sds of nought, as that of every hierarchy has.
+    """
+    known = len(z)
+    climb, curve = jax.jit(jax.value_and_grad(density)), jax.jit(jax.hessian(density))
+    at = jnp.asarray(np.concatenate([z, np.zeros(latent)]))
+    for _ in range(NEWTON_STEPS):
+        value, gradient = climb(at)
+        values, vectors = np.linalg.eigh(-np.asarray(curve(at))[known:, known:])
+        gain = vectors.T @ np.asarray(gradient)[known:]
+        step = np.concatenate([np.zeros(known), vectors @ (gain / np.maximum(np.abs(values), 1e-6 * values.max()))])
+        size = 1.0
+        while not climb(at + size * step)[0] >= value and size > 1e-10:
+            size *= 0.5
+        at = at + size * step
+        if np.abs(step).max() < 1e-8:
+            break
+    information = -np.asarray(curve(at))
+    values, vectors = np.linalg.eigh(information[known:, known:])
+    assert values.min() > 0, "no maximum"
+    own, root = vectors / np.sqrt(values), np.linalg.cholesky(covariance)
+    follow = -own @ (own.T @ information[known:, :known])
+    return np.asarray(at), np.block([[root, np.zeros((known, latent))], [follow @ root, own]])
 
 
 def main() -> None:
@@ -102,8 +139,11 @@ def main() -> None:
     posterior = sample(joint, seed=0)
     free = np.flatnonzero(joint.free)
     with jax.enable_x64(True):
-        density, sizes = explicit_density(campaign, joint)
-        kernel = NUTS(potential_fn=lambda theta: -density(theta), dense_mass=True, target_accept_prob=0.95)
+        density, parts = explicit_density(campaign, joint)
+        latent = parts["range_mm"].stop - len(free)
+        found = whitening(density, joint.z[free], joint.covariance[np.ix_(free, free)], latent)
+        centre, root = (jnp.asarray(x) for x in found)
+        kernel = NUTS(potential_fn=lambda e: -density(centre + root @ e), adapt_mass_matrix=False)
         chains = MCMC(
             kernel,
             num_warmup=WARMUP,
@@ -113,10 +153,11 @@ def main() -> None:
             progress_bar=False,
         )
         generator = np.random.default_rng(1)
-        start = {n: jnp.asarray(0.1 * generator.standard_normal((CHAINS, k))) for n, k in sizes.items()}
-        start["z"] = jnp.asarray(joint.z[free]) + start["z"]
-        chains.run(jax.random.key(2), init_params=start, extra_fields=("diverging",))
-        z = np.asarray(chains.get_samples(group_by_chain=True)["z"])
+        begin = jnp.asarray(generator.standard_normal((CHAINS, len(root))))
+        chains.run(jax.random.key(2), init_params=begin, extra_fields=("diverging",))
+        draws = np.asarray(chains.get_samples(group_by_chain=True))
+        z = (found[0] + draws @ found[1].T)[..., parts["z"]]
+    sizes = {name: part.stop - part.start for name, part in parts.items()}
     divergences = int(np.sum(chains.get_extra_fields()["diverging"]))
     own = posterior.z[..., free]
     rhat = array_stats.rhat(z, method="rank", **AXES)

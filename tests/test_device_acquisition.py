@@ -472,6 +472,17 @@ def test_run_ends_when_the_running_estimate_meets_its_target(rig, tmp_path):
             assert not estimate.update(27) and estimate.latest is not None, "a direction without a figure is not met"
 
 
+@pytest.mark.parametrize(("asked", "shown"), [(None, False), (True, True), (False, False)])
+def test_estimate_is_shown_without_a_target(rig, tmp_path, monkeypatch, asked, shown):
+    """What is known so far belongs into the live line whether or not it ends the run; simulations must ask for it."""
+    monkeypatch.setattr("tvsbayes.device.estimate._COMMAND", FIT.replace("argv[1]", "argv[2]"))
+    texts = []
+    show = lambda progress: texts.append(progress.estimate)  # noqa: E731
+    outcome = acquire(rig, small_plan(4), tmp_path / "c", simulate=True, seed=4, estimate=asked, show=show)
+    assert (outcome.reason, outcome.looks) == ("done", 16)
+    assert texts[-1] == ("left 0.060000 u 1.0e-03, right 0.060000 u 1.0e-03" if shown else "")
+
+
 def test_running_estimate_does_not_hold_up_the_run_and_dies_with_it(rig, tmp_path):
     command = [sys.executable, "-c", "import threading; threading.Event().wait()"]
     with RunningEstimate(tmp_path / "c", 1.0, {"left"}, command=command) as estimate:

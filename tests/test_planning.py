@@ -37,7 +37,18 @@ from tvsbayes.design import (
 )
 from tvsbayes.files import InputError, shipped_data
 from tvsbayes.model import INDEX
-from tvsbayes.planning import Batch, Limit, check_plan, classic_count, limit_of, plan_from, stop_now, truth_in
+from tvsbayes.planning import (
+    STOPS_ADVISED,
+    Batch,
+    Limit,
+    check_plan,
+    classic_count,
+    few_stops,
+    limit_of,
+    plan_from,
+    stop_now,
+    truth_in,
+)
 from tvsbayes.rigs import Prior, Rig
 from tvsbayes.simulation import Truth, draw_truth, run_plan, simulate
 
@@ -453,6 +464,12 @@ def test_no_calibration_removes_the_stop_at_the_point(knowledge, seen, found):
     information = information_of_looks(seen, np.arange(len(found.looks)), path, knowledge.space, False)
     limit = limit_of(knowledge, information, at, target)
     assert not limit.reachable and "at the point itself" in limit.needed
+
+
+def test_a_plan_for_one_ratio_says_what_it_leaves_open():
+    side = np.array([[1, 1]] * STOPS_ADVISED + [[-1, 1]] * (STOPS_ADVISED - 1))
+    notes = few_stops(Looks(np.zeros_like(side), side, np.zeros(len(side), dtype=int)))
+    assert [note.split(":")[0] for note in notes] == [f"only {STOPS_ADVISED - 1} stops right", "only 0 stops down"]
 
 
 def test_when_to_stop():

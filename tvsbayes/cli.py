@@ -410,6 +410,13 @@ def acquire(
         float | None,
         typer.Option("--target-u", min=0.0, help="Stop when every effective ratio is known to this u, deg/step."),
     ] = None,
+    estimate: Annotated[
+        bool | None,
+        typer.Option(
+            "--estimate/--no-estimate",
+            help="Fit the looks so far beside the run (default: on hardware; a simulation waits for each fit).",
+        ),
+    ] = None,
     seed: Seed = 0,
     as_json: Json = False,
 ) -> None:
@@ -433,7 +440,7 @@ def acquire(
         return
     with LiveLine() as line:
         options: dict[str, Any] = {"simulate": simulate, "resume": resume, "laser_class": laser_class, "seed": seed}
-        options["target_u_deg_per_step"] = target_u
+        options |= {"target_u_deg_per_step": target_u, "estimate": estimate}
         if not centroids:
             from tvsbayes.device.vision import live_detector, twin_renderer
 

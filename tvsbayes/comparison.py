@@ -93,7 +93,7 @@ def simple_rays(simple: SimpleCalibration, steps: np.ndarray) -> Beam:
     direction = direction_of(pan, tilt)
     origin = np.zeros_like(direction)
     origin[1] = simple.origin_y_mm
-    return Beam(jnp.asarray(origin), jnp.asarray(direction))
+    return Beam(origin, direction)
 
 
 @dataclass(frozen=True)
@@ -125,8 +125,11 @@ class _Errors(eqx.Module):
 
 
 @eqx.filter_jit
-def _errors(settings: Settings, range_mm: Array, known: tuple[Beam, ...], a_mm: Array, given: Sources) -> _Errors:
-    """Errors of beams that are taken as known, on every draw of the rig."""
+def _errors(
+    settings: Settings, range_mm: Array, best: Array, simple: tuple[Beam, ...], a_mm: Array, given: Sources
+) -> _Errors:
+    """Errors of beams that are taken as known, on every draw of the rig; first those of the best estimate."""
+    known = (beams_at(model_from(best, given.period_deg), settings.steps, settings.side, jnp.zeros(NOISES)), *simple)
 
     def one(inputs, noise):
         model = model_from(inputs, given.period_deg)
@@ -179,18 +182,17 @@ def error_map(
     steps = np.stack([pan, tilt], axis=1)
     given = sources(calibration, draws, seed)
     with jax.enable_x64(True):
-        sides = jnp.tile(jnp.asarray(approach, dtype=float), (len(steps), 1))
-        settings = Settings(jnp.asarray(steps, dtype=float), sides, jnp.zeros(len(steps)))
-        best = jnp.concatenate([given.mean[: len(INPUT_NAMES)], given.stop_sd_deg])
-        estimate = model_from(best, given.period_deg)
-        joint = beams_at(estimate, settings.steps, settings.side, jnp.zeros(NOISES))
+        sides = np.tile(np.asarray(approach, dtype=float), (len(steps), 1))
+        settings = Settings(*(jnp.asarray(x) for x in (steps, sides, np.zeros(len(steps)))))
+        best = np.concatenate([given.mean[: len(INPUT_NAMES)], given.stop_sd_deg])
         names = ("joint", *simple)
-        known = (joint, *(simple_rays(s, steps) for s in simple.values()))
         a = calibration.estimates["baseline_mm"]
         # `meeting` puts the aperture at half the distance it is given; a simple user's stands at origin - baseline.
         bases = [a, *(2 * (s.baseline_mm - s.origin_y_mm) for s in simple.values())]
         zeros = [np.radians(calibration.estimates["aperture_zero_deg"]), *(0.0 for _ in simple)]
-        found = _errors(settings, jnp.asarray(ranges), known, jnp.asarray([bases, zeros]), given)
+        rays = tuple(jax.tree.map(jnp.asarray, simple_rays(s, steps)) for s in simple.values())
+        arrays = (jnp.asarray(x) for x in (ranges, best))
+        found = _errors(settings, *arrays, rays, jnp.asarray(np.array([bases, zeros])), given)
     shape = tuple(len(x) for x in axes)
     rms, bias, distance, valid = {}, {}, {}, np.ones(shape, dtype=bool)
     for name, error, meets in zip(names, np.asarray(found.error_mm), np.asarray(found.meets), strict=True):

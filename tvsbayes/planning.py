@@ -536,6 +536,9 @@ def _rows_for_search(seen: Seen, knowledge: Knowledge) -> tuple[np.ndarray, np.n
     return seen.rows, full
 
 
+STOPS_ADVISED = 6
+"""Stops of a direction below which its stop sd is known no better than to 30 % (1 / sqrt(2 n)): Laplace intervals of
+that axis are then too short, and the sampler may not converge."""
 SUBSETS_MAX = 40
 
 
@@ -927,6 +930,20 @@ def plan(
     return plan_from(knowledge, target, campaign, pose, draws=draws, seed=seed, **options)
 
 
+def few_stops(looks: Looks) -> list[str]:
+    """Directions that a design reaches so rarely that a fit can say little about them, as notes."""
+    notes = []
+    for axis, sides in ((0, ("left", "right")), (1, ("up", "down"))):
+        for side, direction in zip((1, -1), sides, strict=True):
+            stops = int(np.sum(looks.side[:, axis] == side))
+            if stops < STOPS_ADVISED:
+                notes.append(
+                    f"only {stops} stops {direction}: this plan is for its target alone; for reliable intervals of "
+                    f"{direction} plan u(worst), which asks for every direction"
+                )
+    return notes
+
+
 def plan_from(
     knowledge: Knowledge,
     target: Target,
@@ -1013,7 +1030,7 @@ def plan_from(
         stop=stop,
         classic=_classic_answer(knowledge, target, forecast, campaign),
         met=done or share >= ASSURED[0],
-        notes=found.notes,
+        notes=(*found.notes, *([] if done else few_stops(final.looks(experiments)))),
         draws=draws,
         seed=seed,
         criterion=criterion,

@@ -62,7 +62,7 @@ class RunningEstimate:
 
     Args:
         folder: the campaign folder.
-        target_u_deg_per_step: the uncertainty wanted of every direction.
+        target_u_deg_per_step: the uncertainty wanted of every direction; None wants nothing and is never met.
         directions: those that must meet it.
         wait: whether to wait for every fit: in a simulation time stands still meanwhile.
         command: in place of `tvsbayes fit`; the campaign folder and a scratch folder are appended.
@@ -71,13 +71,13 @@ class RunningEstimate:
     def __init__(
         self,
         folder: Path,
-        target_u_deg_per_step: float,
+        target_u_deg_per_step: float | None,
         directions: Iterable[str],
         *,
         wait: bool = False,
         command: Sequence[str] | None = None,
     ):
-        self.folder, self.target, self.directions = Path(folder), float(target_u_deg_per_step), set(directions)
+        self.folder, self.target, self.directions = Path(folder), target_u_deg_per_step, set(directions)
         self.latest: Estimate | None = None
         self._wait = wait
         self._command = list(command) if command is not None else [sys.executable, "-c", _COMMAND, "fit"]
@@ -97,7 +97,7 @@ class RunningEstimate:
     @property
     def met(self) -> bool:
         """Whether every direction of the plan is known as well as wanted."""
-        if self.latest is None:
+        if self.latest is None or self.target is None:
             return False
         u = self.latest.u_deg_per_step
         return bool(self.directions) and all(u.get(name, float("inf")) <= self.target for name in self.directions)

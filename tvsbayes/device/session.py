@@ -133,6 +133,7 @@ def acquire(
     laser_class: str | None = None,
     seed: int = 0,
     target_u_deg_per_step: float | None = None,
+    estimate: bool | None = None,
     detector: Detector = wait_for_detection,
     renderer: Renderer | None = None,
     say: Callable[[str], None] = lambda text: None,
@@ -150,6 +151,8 @@ def acquire(
         laser_class: states that the hazard is known; without it the operator is asked once.
         seed: of a simulation.
         target_u_deg_per_step: ends the run once the effective ratio of every direction of the plan is known so well.
+        estimate: whether the looks so far are fitted beside the run; None: on hardware and for a target. A simulation
+            waits for every fit.
         detector: finds spots in pictures; by default they wait as `undetected`.
         renderer: makes the twin's pictures; without one a simulation states centroids.
         say: shows a line to the user.
@@ -196,11 +199,10 @@ def acquire(
         stack.callback(journal.close)
         if journal.torn:
             say(f"{len(journal.torn)} bytes of an unfinished line were cut off and kept in log.torn-*")
-        estimate = None
-        if target_u_deg_per_step is not None:
-            directions = directions_of(plan)
-            estimate = RunningEstimate(folder, target_u_deg_per_step, directions, wait=simulate)
-            stack.enter_context(estimate)
+        running = None
+        if target_u_deg_per_step is not None or (not simulate if estimate is None else estimate):
+            running = RunningEstimate(folder, target_u_deg_per_step, directions_of(plan), wait=simulate)
+            stack.enter_context(running)
         acquisition = Acquisition(
             rig,
             plan,
@@ -214,7 +216,7 @@ def acquire(
             show=show,
             annotate=bench.annotate,
             details=bench.details,
-            estimate=estimate,
+            estimate=running,
         )
         try:
             return acquisition.run()
