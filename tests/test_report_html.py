@@ -23,7 +23,7 @@ from tvsbayes.campaign import read_campaign, write_campaign
 from tvsbayes.classic import DIRECTIONS, classic
 from tvsbayes.cli import run
 from tvsbayes.comparison import Evidence, gather
-from tvsbayes.files import parse_json
+from tvsbayes.files import InputError, parse_json
 from tvsbayes.report import BROWSERS, FigureView, report_html
 
 TWIN = ROOT / "data" / "twins" / "paper_twin"
@@ -204,14 +204,46 @@ def test_what_strangers_write_stays_text(folder, page, shift, tmp_path, no_pictu
     assert all(text.count(payload) >= 2 for payload in payloads)
 
 
-def test_results_that_belong_to_other_data_are_not_reported(folder, tmp_path):
-    """compare.json of another campaign is left out."""
-    document = {"inputs": {"moves": "0"}, "held_out": {}}
-    (folder / "results" / "compare.json").write_text(json.dumps(document))
+STORED = {"compare.json": "held_out", "plan.json": "planned"}
+
+
+@pytest.mark.parametrize("name", STORED)
+def test_results_that_belong_to_other_data_are_not_reported(folder, name):
+    """Those of another campaign are left out."""
+    (folder / "results" / name).write_text(json.dumps({"inputs": {"moves": "0"}}))
     try:
-        assert evidence_of(folder).held_out is None
+        assert getattr(evidence_of(folder), STORED[name]) is None
     finally:
-        (folder / "results" / "compare.json").unlink()
+        (folder / "results" / name).unlink()
+
+
+@pytest.mark.parametrize("name", STORED)
+@pytest.mark.parametrize("content", [{}, {"held_out": None, "target": 3}, {"held_out": {"verdict": "x"}, "target": {}}])
+def test_results_that_no_command_wrote_are_refused_by_name(evidence, no_pictures, name, content):
+    with pytest.raises(InputError, match=f"results/{name}"):
+        report_html(replace(evidence, **{STORED[name]: content}))
+
+
+def test_next_experiments_are_those_of_the_plan(evidence, no_pictures):
+    batch = {"text": "sheet d9, <b>four</b> looks", "minutes": 2.5, "gain": 1.2e-5, "gain_per_minute": 4.8e-6}
+    planned = {
+        "target": {"text": "u(left) <= 2e-4 deg/step", "unit": "deg/step"},
+        "now": 3.1e-4,
+        "stop": {"now": False, "reason": "the target is not met", "rule": "a rule"},
+        "limited_by": {"needed": "focal scale to 0.1 %"},
+        "next": [batch],
+    }
+    text = report_html(replace(evidence, planned=planned)).decode()
+    for wanted in ("u(left) &lt;= 2e-4", "0.00031 deg/step", "focal scale to 0.1 %", "Go on measuring"):
+        assert wanted in text
+    row = text.split("sheet d9, &lt;b&gt;four&lt;/b&gt; looks")[1].split("</tr>")[0]
+    assert [cell in row for cell in ("2.5", "1.2e-05", "4.8e-06")] == [True] * 3
+
+
+def test_the_points_budget_is_shown_by_parameter_too(evidence, page):
+    shares = [row.share for row in evidence.point.rows]
+    assert sum(shares) == pytest.approx(1.0) and evidence.point.quantity[0] in "xyz"
+    assert f"1000 mm away: {evidence.point.quantity}" in page.decode()
 
 
 def test_the_papers_figures_for_any_campaign(evidence):

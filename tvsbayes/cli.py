@@ -43,6 +43,8 @@ if TYPE_CHECKING:
 
 INTERRUPTED = 130
 TARGET_MISSED = 1
+DCC_MESSAGES = 20
+"""Of a schema validator, shown at most."""
 """Done, but a limit or target that the user gave is not met."""
 RESIDUALS_LISTED = 4096
 """Stops in `fit.json`, evenly chosen: a long campaign's file stays readable within its cap."""
@@ -631,6 +633,9 @@ def report(
     laboratory: Annotated[str, typer.Option("--laboratory", help="Who measured, for --dcc.")] = "not stated",
     customer: Annotated[str, typer.Option("--customer", help="For whom, for --dcc.")] = "not stated",
     country: Annotated[str, typer.Option("--country", help="ISO 3166-1 code of the place, for --dcc.")] = "ZZ",
+    dcc_schema: Annotated[
+        Path | None, typer.Option("--dcc-schema", help="PTB's dcc.xsd on this machine: validate the XML against it.")
+    ] = None,
     out: Annotated[Path | None, typer.Option("--out", help="File (default CAMPAIGN/results/report.html).")] = None,
     as_json: Json = False,
 ) -> None:
@@ -640,7 +645,7 @@ def report(
 
     data = read_campaign(campaign)
     document = _fit_document(data, campaign)
-    from tvsbayes.certificate import dcc_bytes
+    from tvsbayes.certificate import check_dcc, dcc_bytes
     from tvsbayes.comparison import gather
     from tvsbayes.model import use_compilation_cache
     from tvsbayes.report import print_to_pdf, report_html
@@ -653,18 +658,25 @@ def report(
     files = {"report": str(path)}
     if pdf:
         files["pdf"] = str(print_to_pdf(path))
-    if dcc:
+    if dcc or dcc_schema:
         certificate = campaign / "results" / "dcc.xml"
         places = {"laboratory": laboratory, "customer": customer, "country": country}
         today = datetime.datetime.now(datetime.UTC).date()
-        write_atomically(certificate, dcc_bytes(data, document, issued=today, report=path.read_bytes(), **places))
+        content = dcc_bytes(data, document, issued=today, report=path.read_bytes(), **places)
+        write_atomically(certificate, content)
         files["dcc"] = str(certificate)
+    checked = check_dcc(content, dcc_schema) if dcc_schema else None
     lines = [
         f"{c.quantity} within {c.limit:g} {c.unit}: {c.verdict} (P = {c.probability:.3f})" for c in evidence.criteria
     ]
+    result: dict[str, Any] = {"criteria": [asdict(c) for c in evidence.criteria], "files": files}
+    if checked is not None:
+        verdict = {True: "valid", False: "NOT VALID", None: "could not be checked"}[checked.valid]
+        lines += [f"DCC by {checked.tool} against {dcc_schema}: {verdict}", *checked.messages[:DCC_MESSAGES]]
+        result["dcc_schema"] = asdict(checked)
     text = "\n".join([*lines, f"written: {', '.join(files.values())}"])
-    _finish({"criteria": [asdict(c) for c in evidence.criteria], "files": files}, text, as_json)
-    if any(c.verdict != "met" for c in evidence.criteria):
+    _finish(result, text, as_json)
+    if any(c.verdict != "met" for c in evidence.criteria) or (checked is not None and not checked.valid):
         raise _Ended(TARGET_MISSED)
 
 
@@ -895,7 +907,7 @@ def plan(
     as_json: Json = False,
 ) -> None:
     """How many experiments, which ones, and when to stop; with data, what next."""
-    from tvsbayes.campaign import read_campaign, write_plan
+    from tvsbayes.campaign import input_hashes, read_campaign, write_plan
     from tvsbayes.rigs import read_rig
 
     instrument, data = read_rig(rig), None if given is None else read_campaign(given)
@@ -922,6 +934,11 @@ def plan(
         write_plan(result.steps, output)
         document["plan"] = str(output)
         text += f"\nwritten: {escaped(str(output), 200)}"
+    if data is not None:
+        # Where the report looks for what to measure next.
+        make_folder(data.path / "results")
+        stored = {"format": "tvsbayes-plan/1", "inputs": input_hashes(data), **document}
+        write_atomically(data.path / "results" / "plan.json", json.dumps(stored, indent=1, allow_nan=False).encode())
     _finish(document, text, as_json)
     if target is not None and not result.met:
         raise _Ended(TvsError.exit_code)

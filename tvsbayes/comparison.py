@@ -21,6 +21,7 @@ from jaxtyping import Array, Bool, Float
 
 from tvsbayes.calibration import INPUT_NAMES, NORMAL_95, Calibration, direction_of, stored_ratios
 from tvsbayes.campaign import Campaign
+from tvsbayes.certificate import BudgetTable, coordinate_budget
 from tvsbayes.classic import DIRECTIONS, ClassicResult, Selection, classic, four_point_ratios, select_experiments
 from tvsbayes.coordinates import (
     DIVERGING_SHARE,
@@ -93,7 +94,7 @@ def simple_rays(simple: SimpleCalibration, steps: np.ndarray) -> Beam:
     direction = direction_of(pan, tilt)
     origin = np.zeros_like(direction)
     origin[1] = simple.origin_y_mm
-    return Beam(origin, direction)
+    return Beam(jnp.asarray(origin), jnp.asarray(direction))
 
 
 @dataclass(frozen=True)
@@ -190,7 +191,7 @@ def error_map(
         # `meeting` puts the aperture at half the distance it is given; a simple user's stands at origin - baseline.
         bases = [a, *(2 * (s.baseline_mm - s.origin_y_mm) for s in simple.values())]
         zeros = [np.radians(calibration.estimates["aperture_zero_deg"]), *(0.0 for _ in simple)]
-        rays = tuple(jax.tree.map(jnp.asarray, simple_rays(s, steps)) for s in simple.values())
+        rays = tuple(simple_rays(s, steps) for s in simple.values())
         arrays = (jnp.asarray(x) for x in (ranges, best))
         found = _errors(settings, *arrays, rays, jnp.asarray(np.array([bases, zeros])), given)
     shape = tuple(len(x) for x in axes)
@@ -869,23 +870,27 @@ class Evidence:
         campaign: what was measured.
         fit: the document of `results/fit.json`.
         classic: the paper's estimator; None without complete experiments.
-        held_out: the document of `results/compare.json`, None where `compare` was not run.
+        held_out: the document of `results/compare.json`, None where `compare` was not run on these data.
+        planned: the document of `results/plan.json`, None where `plan --given` was not run on these data.
         criteria: what was asked of the calibration, judged.
         distances_mm: draws of the 3D error by estimator at `range_mm` and the middle of the counters.
         range_mm: stated range.
         maps: error maps.
         budget: of a point at that range.
+        point: the same for its least certain coordinate, by parameter.
     """
 
     campaign: Campaign
     fit: Mapping[str, object]
     classic: ClassicResult | None
     held_out: Mapping[str, object] | None
+    planned: Mapping[str, object] | None
     criteria: Sequence[Criterion]
     distances_mm: Mapping[str, np.ndarray]
     range_mm: float
     maps: ErrorMap
     budget: Budget | None
+    point: BudgetTable | None
 
 
 def gather(
@@ -933,22 +938,31 @@ def gather(
     if limit_mm is not None:
         criteria.append(criterion(f"3D point at {range_mm:g} mm", found["joint"], limit_mm, "mm"))
     ray = calibration.ray(*middle, ("left", "up"))
-    reading = calibration.reading(np.asarray(ray.origin_mm) + range_mm * np.asarray(ray.direction))
+    point = np.asarray(ray.origin_mm) + range_mm * np.asarray(ray.direction)
+    reading = calibration.reading(point)
     with jax.enable_x64(True):
         settings = Settings(jnp.array([middle]), jnp.ones((1, 2)), jnp.radians(jnp.array([reading])))
-    path = campaign.path / "results" / "compare.json"
-    held_out = None
-    if path.exists():
-        stored = parse_json(read_bytes(path, JSON_BYTES_MAX), path.name).values
-        held_out = stored if stored.get("inputs") == fit["inputs"] else None
+    found_budget = budget(calibration, settings)
+    least = "xyz"[int(np.argmax(np.diag(found_budget.covariance_mm2)))]
     return Evidence(
         campaign=campaign,
         fit=fit,
         classic=classic_result,
-        held_out=held_out,
+        held_out=_stored(campaign, fit, "compare.json"),
+        planned=_stored(campaign, fit, "plan.json"),
         criteria=criteria,
         distances_mm=found,
         range_mm=range_mm,
         maps=maps,
-        budget=budget(calibration, settings),
+        budget=found_budget,
+        point=coordinate_budget(found_budget, calibration, point, least),
     )
+
+
+def _stored(campaign: Campaign, fit: Mapping[str, object], name: str) -> Mapping[str, object] | None:
+    """A document in `results/`, where it was made from the data of this fit."""
+    path = campaign.path / "results" / name
+    if not path.exists():
+        return None
+    stored = parse_json(read_bytes(path, JSON_BYTES_MAX), name).values
+    return stored if stored.get("inputs") == fit["inputs"] else None

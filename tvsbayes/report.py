@@ -19,7 +19,8 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
@@ -37,7 +38,7 @@ from tvsbayes.calibration import Calibration, Steps, calibration_bytes
 from tvsbayes.campaign import input_hashes
 from tvsbayes.certificate import FIGURES
 from tvsbayes.classic import DIRECTIONS, ClassicResult
-from tvsbayes.files import TvsError, escaped, make_folder, shipped_data, write_atomically
+from tvsbayes.files import TvsError, escaped, make_folder, refusal, shipped_data, write_atomically
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -467,6 +468,8 @@ CORRELATED = (
 """Parameters of the correlation matrix, in order; those that were not estimated are left out."""
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome", "msedge")
 PDF_SECONDS = 120
+SHARE_SHOWN = 5e-4
+"""Of a variance: smaller ones print as 0.0 %."""
 ESTIMATORS = {"laplace": "Laplace approximation at the mode", "posterior": "posterior sampled by emcee"}
 
 
@@ -1024,34 +1027,39 @@ def _validation(e: Evidence) -> Section:
             "Held-out experiments: not computed; run the command compare on the campaign and make the report again."
         )
     else:
-        held = e.held_out["held_out"]
-        text.append(f"Held-out experiments: {held['verdict']}: {held['reason']}.")
-        if held["classic"] is not None:
-            rows = [
-                [
-                    name,
-                    f"{held[name]['rms_deg']:.3f}",
-                    f"{held[name]['rms_block_deg']:.3f}",
-                    f"{100 * held[name]['coverage']:.0f} %",
-                ]
-                for name in ("classic", "joint")
+        with _stored_by("compare", "compare.json"):
+            text.append(_held_out(e.held_out["held_out"], tables))
+    return Section("Validation", text, items, tables)
+
+
+def _held_out(held: Mapping[str, object], tables: list[TableView]) -> str:
+    """Its tables are appended; the verdict is returned."""
+    if held["classic"] is not None:
+        rows = [
+            [
+                name,
+                f"{held[name]['rms_deg']:.3f}",
+                f"{held[name]['rms_block_deg']:.3f}",
+                f"{100 * held[name]['coverage']:.0f} %",
             ]
-            tables.append(
-                TableView(
-                    "Angles of experiments that were left out, deg",
-                    ["estimator", "rms error", "rms of block means", "inside 95 % intervals"],
-                    rows,
-                )
-            )
-        rows = [[d, f"{u:.1e}"] for d, u in held["unseen"].items()]
+            for name in ("classic", "joint")
+        ]
         tables.append(
             TableView(
-                "What no hold-out sees: u by stereo calibration and focal scale, common to all spots, deg/step",
-                ["direction", "u"],
+                "Angles of experiments that were left out, deg",
+                ["estimator", "rms error", "rms of block means", "inside 95 % intervals"],
                 rows,
             )
         )
-    return Section("Validation", text, items, tables)
+    rows = [[d, f"{u:.1e}"] for d, u in held["unseen"].items()]
+    tables.append(
+        TableView(
+            "What no hold-out sees: u by stereo calibration and focal scale, common to all spots, deg/step",
+            ["direction", "u"],
+            rows,
+        )
+    )
+    return f"Held-out experiments: {held['verdict']}: {held['reason']}."
 
 
 def _maps(e: Evidence) -> Section:
@@ -1085,34 +1093,14 @@ def _cell(value: float) -> str:
 
 def _budgets(e: Evidence) -> Section:
     tables, figures = [], []
-    for table in e.fit["budgets"]:
-        rows = [
-            [
-                row["quantity"],
-                row["kind"],
-                row["distribution"],
-                _blank(row["u"], ".2g"),
-                _freedom(row["dof"]) if row["u"] is not None else "",
-                _blank(row["sensitivity"], ".3g"),
-                _blank(row["contribution"], ".2e"),
-                f"{100 * row['share']:.1f}",
-            ]
-            for row in table["rows"]
-        ]
-        caption = (
-            f"{table['quantity']}: {concise(table['estimate'], table['u'])} {table['unit']}; effective degrees of "
-            f"freedom {_freedom(table['dof'])}, k = {table['coverage_factor']:.2f}, "
-            f"p = {100 * table['probability']:.0f} %, U = {table['expanded']:.2g} {table['unit']}"
-        )
-        columns = ["source", "type", "distribution", "u", "dof", "sensitivity", "contribution", "share %"]
-        tables.append(TableView(caption, columns, rows))
+    tables += [_gum_table(table) for table in e.fit["budgets"]]
     if e.budget is not None:
         u = np.sqrt(e.budget.variance_mm2)
         order = np.argsort(-e.budget.share)
         rows = [
             [e.budget.causes[k], f"{100 * e.budget.share[k]:.1f}", *(f"{v:.2g}" for v in u[k])]
             for k in order
-            if e.budget.share[k] >= 5e-4
+            if e.budget.share[k] >= SHARE_SHOWN
         ]
         tables.append(
             TableView(
@@ -1128,7 +1116,37 @@ def _budgets(e: Evidence) -> Section:
                 f"What the uncertainty of a point {e.range_mm:g} mm away consists of.",
             )
         )
+    if e.point is not None:
+        tables.append(_gum_table(e.point.as_json(), f"{e.range_mm:g} mm away: "))
     return Section("Uncertainty budgets", tables=tables, figures=figures)
+
+
+def _gum_table(table: Mapping[str, object], prefix: str = "") -> TableView:
+    """A budget as GUM 7.2.7 asks for it; sources that matter to no digit are counted in one line."""
+    shown = [row for row in table["rows"] if row["u"] is None or abs(row["share"]) >= SHARE_SHOWN]
+    rows = [
+        [
+            row["quantity"],
+            row["kind"],
+            row["distribution"],
+            _blank(row["u"], ".2g"),
+            _freedom(row["dof"]) if row["u"] is not None else "",
+            _blank(row["sensitivity"], ".3g"),
+            _blank(row["contribution"], ".2e"),
+            f"{100 * row['share']:.1f}",
+        ]
+        for row in shown
+    ]
+    if len(shown) < len(table["rows"]):
+        rest = [row["share"] for row in table["rows"] if row not in shown]
+        rows.insert(-1, [f"{len(rest)} smaller ones", "", "", "", "", "", "", f"{100 * sum(rest):.1f}"])
+    caption = (
+        f"{prefix}{table['quantity']}: {concise(table['estimate'], table['u'])} {table['unit']}; effective degrees of "
+        f"freedom {_freedom(table['dof'])}, k = {table['coverage_factor']:.2f}, "
+        f"p = {100 * table['probability']:.0f} %, U = {table['expanded']:.2g} {table['unit']}"
+    )
+    columns = ["source", "type", "distribution", "u", "dof", "sensitivity", "contribution", "share %"]
+    return TableView(caption, columns, rows)
 
 
 def _blank(value: float | None, form: str) -> str:
@@ -1164,10 +1182,44 @@ def _axes(e: Evidence) -> Section:
     return Section("ISO 230-2-style figures", text, items, tables)
 
 
+@contextmanager
+def _stored_by(command: str, name: str) -> Iterator[None]:
+    """Names the file of results whose content is not what the command of that name writes."""
+    try:
+        yield
+    except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
+        raise refusal(
+            "value",
+            file=f"results/{name}",
+            found=f"{type(error).__name__} {escaped(str(error))}",
+            allowed=f"what tvsbayes {command} writes",
+            remedy=f"run tvsbayes {command} again, or delete the file",
+        ) from error
+
+
 def _plan(e: Evidence) -> Section:
     items = [w["text"] for w in e.fit["weak_directions"]]
-    text = ["The command plan with --given weighs further experiments: gain per minute, and when to stop."]
-    return Section("What to measure next", text, items)
+    if e.planned is None:
+        text = [
+            "tvsbayes plan RIG --given CAMPAIGN weighs further experiments; a report made after it shows them here."
+        ]
+        return Section("What to measure next", text, items)
+    with _stored_by("plan --given", "plan.json"):
+        plan, unit = e.planned, e.planned["target"]["unit"]
+        stop = plan["stop"]
+        text = [
+            f"Wanted: {plan['target']['text']}; known now to {plan['now']:.2g} {unit}. "
+            f"{'Stop measuring' if stop['now'] else 'Go on measuring'}: {stop['reason']}. Rule: {stop['rule']}.",
+        ]
+        if plan["limited_by"]["needed"]:
+            text.append(plan["limited_by"]["needed"])
+        rows = [
+            [batch["text"], f"{batch['minutes']:.1f}", f"{batch['gain']:.2g}", f"{batch['gain_per_minute']:.2g}"]
+            for batch in plan["next"]
+        ]
+        columns = ["four looks", "minutes", f"gain, {unit}", f"gain a minute, {unit}"]
+        tables = [TableView("Next experiments, best first", columns, rows)] if rows else []
+    return Section("What to measure next", text, items, tables=tables)
 
 
 def _method(e: Evidence) -> Section:
