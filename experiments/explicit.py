@@ -35,8 +35,8 @@ from tvsbayes.rigs import Prior
 from tvsbayes.simulation import simulate
 
 KEPT = ("degrees_per_step", "ratio_contrast", "backlash", "tilt_zero", "stop_sd", "pixel_scale")
-STOPS = ((60, 40), (160, -40), (60, 40), (200, 40), (100, -40), (0, 0))
-SEED, CHAINS, WARMUP, DRAWS = 11, 4, 500, 2000
+STOPS = ((60, 40), (160, -60), (60, 20), (200, 80), (100, -30), (0, 0))
+SEED, CHAINS, WARMUP, DRAWS = 11, 4, 700, 2500
 NEWTON_STEPS = 100
 AXES = {"chain_axis": 0, "draw_axis": 1}
 QUANTILES = {"5 %": 0.05, "50 %": 0.5, "95 %": 0.95}
@@ -143,7 +143,9 @@ def main() -> None:
         latent = parts["range_mm"].stop - len(free)
         found = whitening(density, joint.z[free], joint.covariance[np.ix_(free, free)], latent)
         centre, root = (jnp.asarray(x) for x in found)
-        kernel = NUTS(potential_fn=lambda e: -density(centre + root @ e), adapt_mass_matrix=False)
+        kernel = NUTS(
+            potential_fn=lambda e: -density(centre + root @ e), adapt_mass_matrix=False, target_accept_prob=0.97
+        )
         chains = MCMC(
             kernel,
             num_warmup=WARMUP,

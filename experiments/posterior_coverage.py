@@ -8,7 +8,8 @@
 posterior: Laplace beside posterior on the same rigs. `broken` fits campaigns of 96 spots (`studies.small_plan`) with
 the Laplace approximation, plain and robust, after breaking the model: a share of the spots off by 10 stated sds in
 one camera, Student-t(4) pixel noise of the same variance, and a pinion error of 0.1 deg that the fit does not know.
-`table` prints RMS z and the coverage of central intervals; **!** marks a figure outside its two-sided bounds at 1e-4
+`table` begins with the small rigs of `sbc.py`, whose ranks hold the coverage of the posterior where stops are few. It
+prints RMS z and the coverage of central intervals; **!** marks a figure outside its two-sided bounds at 1e-4
 for that number of rigs. Nothing is left out for looking bad; rigs whose fit or sampler did not converge are counted
 in the headings and listed.
 """
@@ -22,6 +23,8 @@ from pathlib import Path
 
 import numpy as np
 from coverage import BOUND, HEADLINES, LEVELS, bounds, read_rows, verdict
+from sbc import CLEAN, DRAWS, FEW
+from sbc import ROWS as SBC_ROWS
 from scipy import stats
 from studies import judged, mounted_rig, run_rows, shipped_plan, small_plan
 
@@ -40,6 +43,12 @@ OUTLIER_SDS = 10.0
 PINION_DEG, PINION_PERIOD_DEG = 0.1, 36.0
 SHEETS = ("d1", "d2", "d3", "d2")
 MAX_MINUTES = 10.0
+SMALL = {CLEAN: "60 spots, about 30 stops in every direction", FEW: "24 spots, six stops in every direction"}
+SMALL_HEADLINES = (
+    *(f"effective_deg_per_step.{d}" for d in ("left", "right", "up", "down")),
+    *("ratio_contrast_deg_per_step.pan", "ratio_contrast_deg_per_step.tilt", "backlash_deg.pan", "backlash_deg.tilt"),
+    "effective_mirror_offset_mm",
+)
 
 
 def clean_rig(task: tuple[str, int]) -> dict[str, object]:
@@ -195,6 +204,31 @@ def table_clean(rows: list[dict]) -> None:
         print()
 
 
+def table_small(rows: list[dict]) -> None:
+    """The posterior's intervals on the small rigs of the simulation-based calibration, from the ranks of the truths."""
+    print("## Clean data, small campaigns: the posterior\n")
+    print(
+        f"Drawn rigs of `python experiments/sbc.py run`; intervals are those of the {DRAWS} draws kept of each rig. Rigs"
+    )
+    print("that did not converge stand in [its table](sbc.md).\n")
+    for variant, words in SMALL.items():
+        good = [r for r in rows if r["variant"] == variant and r["converged"]]
+        if not good:
+            continue
+        limits = [bounds(len(good), level) for level in LEVELS]
+        print(f"### {words}: {len(good)} rigs\n")
+        print(f"| quantity | {' | '.join(f'{100 * level:.0f} %' for level in LEVELS)} | verdict |")
+        print("|---|" + "---|" * (len(LEVELS) + 1))
+        cells = " | ".join(f"{100 * a:.0f}-{100 * b:.0f}" for a, b in limits)
+        print(f"| bounds at 1e-4, N = {len(good)} | {cells} | |")
+        for name in SMALL_HEADLINES:
+            pit = np.array([(r["ranks"][name] + 0.5) / (DRAWS + 1) for r in good])
+            held = [float(np.mean(np.abs(pit - 0.5) <= level / 2)) for level in LEVELS]
+            within = all(a <= h <= b for h, (a, b) in zip(held, limits, strict=True))
+            print(f"| {name} | {' | '.join(f'{100 * h:.1f}' for h in held)} | {'within' if within else 'OUTSIDE'} |")
+        print()
+
+
 def table_broken(rows: list[dict]) -> None:
     """Plain beside robust under every broken condition."""
     print("## Data that break the model: Laplace, plain and robust\n")
@@ -256,6 +290,7 @@ def main() -> None:
         print("# Coverage of the sampled posterior, and of the Laplace approximation on bad data\n")
         print("Written by `python experiments/posterior_coverage.py table`; what is in it and how it was made stands")
         print("in the script. **!** marks a figure outside its bounds at 1e-4; rig i has seed i. Two shared cores.\n")
+        table_small(read_rows(SBC_ROWS))
         table_clean(read_rows(CLEAN_ROWS))
         table_broken(read_rows(BROKEN_ROWS))
 

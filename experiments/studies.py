@@ -42,6 +42,19 @@ def dense_plan(sheets: Sequence[str]):
     return tuple(PlanStep(number, *order) for number, order in enumerate(orders))
 
 
+def few_plan(sheets: Sequence[str]):
+    """12 spots per sheet, each axis swept there and back once: six stops in every direction for two sheets."""
+    from tvsbayes.campaign import PlanStep
+
+    half = len(PAN_SWEEP) // 2
+    orders = [("home", 0, 0)]
+    for sheet in sheets:
+        orders.append(("place", None, None, sheet))
+        for pan, tilt in [(p, CROSSING[1]) for p in PAN_SWEEP[:half]] + [(CROSSING[0], t) for t in TILT_SWEEP[:half]]:
+            orders += [("move", pan, tilt), ("look",)]
+    return tuple(PlanStep(number, *order) for number, order in enumerate(orders))
+
+
 def mounted_rig():
     """The shipped rig whose extrinsics are known to 0.03 rad and 5 mm."""
     from tvsbayes.files import shipped_data
