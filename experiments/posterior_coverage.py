@@ -207,10 +207,8 @@ def table_clean(rows: list[dict]) -> None:
 def table_small(rows: list[dict]) -> None:
     """The posterior's intervals on the small rigs of the simulation-based calibration, from the ranks of the truths."""
     print("## Clean data, small campaigns: the posterior\n")
-    print(
-        f"Drawn rigs of `python experiments/sbc.py run`; intervals are those of the {DRAWS} draws kept of each rig. Rigs"
-    )
-    print("that did not converge stand in [its table](sbc.md).\n")
+    print(f"Drawn rigs of `python experiments/sbc.py run`; intervals are those of the {DRAWS} draws kept of each.")
+    print("Rigs that did not converge stand in [its table](sbc.md).\n")
     for variant, words in SMALL.items():
         good = [r for r in rows if r["variant"] == variant and r["converged"]]
         if not good:
