@@ -1,0 +1,311 @@
+"""How reliable is all this? The figures of coverage, faults, kills, mutations and planted bugs on one page.
+
+    python experiments/evidence.py device              # slow tests of protocol, journal and engine, about 25 minutes
+    python experiments/evidence.py table > experiments/EVIDENCE.md
+
+`table` computes every figure anew from the rows that the studies left in `experiments/output/` (git ignores them: run
+the command of a line to have its rows) and says of when they are. A line whose rows are not there says so.
+"""
+
+from __future__ import annotations
+
+import argparse
+import datetime
+import json
+import os
+import re
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from coverage import bounds, read_rows
+from scipy import stats
+
+ROOT = Path(__file__).resolve().parents[1]
+OUTPUT = Path(__file__).parent / "output"
+DEVICE = OUTPUT / "evidence_device.json"
+DEVICE_TESTS = (
+    "tests/test_device_faults.py",
+    "tests/test_device_journal.py",
+    "tests/test_device_acquisition.py",
+    "tests/test_device_protocol.py",
+)
+LEVEL, BOUND = 0.95, 1e-4
+
+
+@dataclass(frozen=True)
+class Line:
+    """A claim of reliability.
+
+    Attributes:
+        claim: what is claimed.
+        command: what makes the rows.
+        rows: their file in `experiments/output/`.
+        figure: computes the figure, and whether the claim holds, from the rows.
+    """
+
+    claim: str
+    command: str
+    rows: str
+    figure: Callable[[list[dict]], tuple[str, bool]]
+
+
+def held(inside: int, n: int) -> tuple[str, bool]:
+    """Coverage of 95 % intervals with the bounds that a true one leaves once in 10 000."""
+    low, high = bounds(n, LEVEL)
+    share = inside / n
+    return f"{100 * share:.1f} % of {n} ({100 * low:.1f} to {100 * high:.1f})", low <= share <= high
+
+
+def classic_coverage(rows: list[dict]) -> tuple[str, bool]:
+    """Share of classic type A intervals with the truth, by protocol; the claim is that they fail."""
+    found = {}
+    for protocol in sorted({r["protocol"] for r in rows}):
+        entries = [e for r in rows if r["protocol"] == protocol for e in (r.get("classic") or {}).values()]
+        if entries:
+            found[protocol] = np.mean([e["type_a"][0] <= e["true"] <= e["type_a"][1] for e in entries])
+    text = ", ".join(f"{name} {100 * share:.0f} %" for name, share in found.items())
+    return text, all(share < bounds(300, LEVEL)[0] for share in found.values())
+
+
+def joint_coverage(rows: list[dict]) -> tuple[str, bool]:
+    """Worst and best coverage of the joint 95 % intervals over protocols and headlines."""
+    shares, outside = {}, []
+    for protocol in sorted({r["protocol"] for r in rows}):
+        good = [r for r in rows if r["protocol"] == protocol and r["converged"]]
+        low, high = bounds(len(good), LEVEL)
+        for name in good[0]["joint"]:
+            entries = [r["joint"][name] for r in good]
+            if np.median([e["contraction"] for e in entries]) < 0.1:
+                continue
+            share = float(np.mean([abs(e["pit"] - 0.5) <= LEVEL / 2 for e in entries]))
+            shares[f"{name}, {protocol}"] = share
+            if not low <= share <= high:
+                outside.append(f"{name}, {protocol} {100 * share:.1f} %")
+    worst, best = min(shares, key=shares.get), max(shares, key=shares.get)
+    text = f"{len(shares)} intervals: {100 * shares[worst]:.1f} % ({worst}) to {100 * shares[best]:.1f} % ({best})"
+    return text + (f"; outside the bounds: {', '.join(outside)}" if outside else ""), not outside
+
+
+def points_coverage(rows: list[dict]) -> tuple[str, bool]:
+    """95 % ellipsoids of located points, inside and outside the campaign's counters."""
+    parts, well = [], True
+    for where in ("inside", "outside"):
+        entries = [r[where] for r in rows if r.get(where) and not r[where]["refused"]]
+        text, good = held(sum(e["ellipsoid"] for e in entries), len(entries))
+        parts.append(f"{where} {text}")
+        well &= good
+    return "; ".join(parts), well
+
+
+def ranks(rows: list[dict], variant: str) -> tuple[str, bool]:
+    """Least p of the simultaneous ECDF bands against its criterion."""
+    from sbc import ALPHA, Band, pit_values
+
+    chosen = [r for r in rows if r["variant"] == variant]
+    good = [r for r in chosen if r["converged"]]
+    if len(good) < 2:
+        raise FileNotFoundError(variant)
+    band, pit = Band(len(good)), pit_values(good, "ranks")
+    p = {name: band.p_value(values) for name, values in pit.items()}
+    least, limit = min(p, key=p.get), ALPHA / len(p)
+    text = f"{len(good)} of {len(chosen)} simulations, {len(p)} quantities, least p {p[least]:.1e} ({least}), "
+    return text + f"criterion {limit:.1e}; log-posterior {p['log-posterior']:.1e}", p[least] >= limit
+
+
+def planted_in_sampler(rows: list[dict]) -> tuple[str, bool]:
+    """Whether each planted fault of the calibration test fails it."""
+    parts, seen = [], True
+    for variant in ("prior x3", "camera dropped"):
+        text, passes = ranks(rows, variant)
+        parts.append(f"{variant}: {text}")
+        seen &= not passes
+    return "; ".join(parts), seen
+
+
+def cameras(rows: list[dict]) -> tuple[str, bool]:
+    """Chi-square of the true 24 parameters over 24, pooled over pictures and simulated corners."""
+    parts, well = [], True
+    for condition in sorted({r["condition"] for r in rows}):
+        values = np.array([r["chi2"] for r in rows if r["condition"] == condition])
+        low, high = stats.chi2.ppf([BOUND / 2, 1 - BOUND / 2], 24 * len(values)) / (24 * len(values))
+        mean = values.mean() / 24
+        well &= low <= mean <= high
+        parts.append(f"{condition} {mean:.2f} ({low:.2f} to {high:.2f}, N = {len(values)})")
+    return "; ".join(parts), well
+
+
+def detection(rows: list[dict]) -> tuple[str, bool]:
+    """Actual over stated standard deviation of the fitted centres."""
+    ratio = np.array([r["fit"]["ratio"] for r in rows])
+    text = f"median {np.median(ratio):.2f}, {ratio.min():.2f} to {ratio.max():.2f} over {len(ratio)} cells"
+    return text, bool(np.all(np.abs(np.log(ratio)) < np.log(1.25)))
+
+
+def plans(rows: list[dict]) -> tuple[str, bool]:
+    """RMS of (estimate - truth) over the sd predicted before any data, all headlines of all designs."""
+    parts, well = [], True
+    for name in dict.fromkeys(r["name"] for r in rows):
+        good = [r for r in rows if r["name"] == name and r["converged"]]
+        n = len(good)
+        low, high = np.sqrt(stats.chi2.ppf([BOUND / 2, 1 - BOUND / 2], n) / n)
+        rms = {}
+        for quantity in good[0]["headlines"]:
+            entries = [r["headlines"][quantity] for r in good]
+            rms[quantity] = float(
+                np.sqrt(np.mean([((e["value"] - e["truth"]) / e["predicted_sd"]) ** 2 for e in entries]))
+            )
+        outside = [f"{q} {v:.2f}" for q, v in rms.items() if not low <= v <= high]
+        well &= not outside
+        parts.append(
+            f"{name} {min(rms.values()):.2f} to {max(rms.values()):.2f} ({low:.2f} to {high:.2f}, N = {n})"
+            + (f", outside: {', '.join(outside)}" if outside else "")
+        )
+    return "; ".join(parts), well
+
+
+def device(rows: list[dict]) -> tuple[str, bool]:
+    """Sessions with faults, kills and journal changes of the slow tests."""
+    found = rows[0]
+    return f"{found['passed']} slow tests passed, {found['failed']} failed; {'; '.join(found['lines'])}", not found[
+        "failed"
+    ]
+
+
+def planted(rows: list[dict]) -> tuple[str, bool]:
+    """One-line bugs that the test suite catches."""
+    caught = sum(bool(r["caught"]) for r in rows)
+    return f"{caught} of {len(rows)} caught", caught == len(rows)
+
+
+LINES = (
+    Line(
+        "The classic 95 % type A interval misses the truth",
+        "python experiments/coverage.py run --n 300 --processes 2",
+        "coverage.jsonl",
+        classic_coverage,
+    ),
+    Line(
+        "The joint 95 % interval (Laplace) holds it",
+        "python experiments/coverage.py run --n 300 --processes 2",
+        "coverage.jsonl",
+        joint_coverage,
+    ),
+    Line(
+        "Ranks of truths among posterior draws are uniform",
+        "python experiments/sbc.py run --n 200 --cores 0 1",
+        "sbc.jsonl",
+        lambda r: ranks(r, "clean"),
+    ),
+    Line(
+        "... also with six stops in every direction",
+        'python experiments/sbc.py run --variants "few stops" --n 50 --cores 0 1',
+        "sbc.jsonl",
+        lambda r: ranks(r, "few stops"),
+    ),
+    Line(
+        "... and the test sees planted faults",
+        'python experiments/sbc.py run --variants "prior x3" "camera dropped" --n 50 --cores 0 1',
+        "sbc.jsonl",
+        planted_in_sampler,
+    ),
+    Line(
+        "95 % regions of located points hold them",
+        "python experiments/points.py run --n 1000 --cores 0 1",
+        "points.jsonl",
+        points_coverage,
+    ),
+    Line(
+        "The covariance of a stereo calibration is true",
+        "python experiments/stereo_coverage.py run --n 50 --cores 0 1",
+        "stereo_coverage.jsonl",
+        cameras,
+    ),
+    Line(
+        "The stated sd of a spot's centre is true", "python experiments/detection.py run", "detection.jsonl", detection
+    ),
+    Line(
+        "A plan predicts the error of its fit",
+        "python experiments/planning_prediction.py run --n 1000 --cores 0 1",
+        "planning_prediction.jsonl",
+        plans,
+    ),
+    Line(
+        "No fault, kill or changed byte makes a false record",
+        "python experiments/evidence.py device",
+        DEVICE.name,
+        device,
+    ),
+    Line(
+        "The tests see planted one-line bugs",
+        "python experiments/planted_faults.py run",
+        "planted_faults.jsonl",
+        planted,
+    ),
+)
+
+
+def run_device() -> None:
+    """The slow tests of the instrument, with what they print."""
+    command = [
+        sys.executable,
+        "-m",
+        "pytest",
+        "-q",
+        "-o",
+        "addopts=",
+        "-p",
+        "no:cacheprovider",
+        "-m",
+        "slow",
+        *DEVICE_TESTS,
+    ]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False, env={**os.environ})
+    lines = [line.strip() for line in done.stdout.splitlines()]
+    sessions = sum(int(n) for n in re.findall(r": (\d+) sessions", done.stdout))
+    kept = [f"{sessions} sessions with faults"] if sessions else []
+    kept += [line for line in lines if re.match(r"\d+ kills|\d+ (changes|bytes|flips)", line)]
+    counts = {word: int(n) for n, word in re.findall(r"(\d+) (passed|failed)", lines[-1] if lines else "")}
+    found = {"passed": counts.get("passed", 0), "failed": counts.get("failed", 0) + (done.returncode not in (0, 1))}
+    OUTPUT.mkdir(parents=True, exist_ok=True)
+    DEVICE.write_text(json.dumps({**found, "lines": kept, "tail": lines[-5:]}) + "\n")
+    print(DEVICE.read_text())
+
+
+def table() -> None:
+    """The page."""
+    head = subprocess.run(
+        ["git", "rev-parse", "--short", "HEAD"], cwd=ROOT, capture_output=True, text=True, check=False
+    )
+    today = datetime.datetime.now(datetime.UTC).date()
+    print("# Evidence\n")
+    print(f"Written by `python experiments/evidence.py table` on {today}, commit {head.stdout.strip() or 'unknown'}.")
+    print(
+        "Bounds in brackets are left by a true claim once in 10 000 times. What is behind a figure stands in its script"
+    )
+    print("and in [the list of experiments](README.md).\n")
+    print("| claim | figure | holds | rows of | command |\n|---|---|---|---|---|")
+    for line in LINES:
+        path = OUTPUT / line.rows
+        try:
+            rows = read_rows(path)
+            figure, holds = line.figure(rows) if rows else ("no rows", None)
+            day = datetime.datetime.fromtimestamp(path.stat().st_mtime, datetime.UTC).date() if rows else "-"
+        except FileNotFoundError:
+            figure, holds, day = "no rows", None, "-"
+        word = {True: "yes", False: "NO", None: "not run"}[holds]
+        print(f"| {line.claim} | {figure} | {word} | {day} | `{line.command}` |")
+
+
+def main() -> None:
+    """Command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("action", choices=("device", "table"))
+    {"device": run_device, "table": table}[parser.parse_args().action]()
+
+
+if __name__ == "__main__":
+    main()
