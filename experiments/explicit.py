@@ -92,8 +92,7 @@ def explicit_density(campaign, joint):
         pose = jnp.stack([angles[0] + errors[0], angles[1] + errors[1], middle + theta["range_mm"]])
         towards = jnp.zeros_like(pose).at[2].set(1.0)
         seen, slope = jax.jvp(lambda p: observe(model, p, arrays.azimuth_convention)[:4], (pose,), (towards,))
-        whiten = lambda v: jnp.einsum("sij,js->si", spots.whitening, v)  # noqa: E731
-        residual, slope = whiten(spots.pixels.T - seen), whiten(slope)
+        residual, slope = (jnp.einsum("sij,js->si", spots.whitening, v) for v in (spots.pixels.T - seen, slope))
         s = model.noise.pixel_scale
         value = -0.5 * jnp.sum(residual**2) / s**2 - 4 * count * jnp.log(s)
         value += 0.5 * jnp.sum(jnp.log(jnp.sum(slope**2, axis=1)))

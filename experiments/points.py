@@ -54,8 +54,6 @@ def one_rig(task: tuple[int]) -> dict[str, object]:
 
     # As in coverage.py: ordinary fits pad to 512 spots, here every campaign is alike.
     likelihood.SMALLEST_BUCKET = 96
-    from tvsbayes.classic import classic
-    from tvsbayes.comparison import simple_calibration, simple_rays
     from tvsbayes.coordinates import locate
     from tvsbayes.information import calibration_of
     from tvsbayes.joint import fit
@@ -93,17 +91,12 @@ def one_rig(task: tuple[int]) -> dict[str, object]:
     found = locate(calibration, counters[:, 0], counters[:, 1], readings, sides, seed=seed)
     error = found.xyz_mm - points
     hit = np.abs(points - found.interval95_mm.mean(axis=1)) <= found.u95_mm
-    with np.errstate(invalid="ignore"):
-        distance2 = np.einsum(
-            "pi,pij,pj->p",
-            error,
-            np.linalg.inv(np.nan_to_num(found.covariance_mm2) + np.where(np.isnan(error[:, :1, None]), np.eye(3), 0.0)),
-            error,
-        )
+    # Points that were refused have no error and no covariance: they lie in no ellipsoid.
+    distance2 = np.full(len(error), np.inf)
+    good = np.array([refused is None for refused in found.refused])
+    distance2[good] = np.einsum("pi,pij,pj->p", error[good], np.linalg.inv(found.covariance_mm2[good]), error[good])
     z = error / np.sqrt(np.einsum("pii->pi", found.covariance_mm2))
-    others = others_error(
-        calibration, simulated, rig, counters, readings, points, classic, simple_calibration, simple_rays
-    )
+    others = others_error(simulated.campaign, counters, readings, points)
     for k, kind in enumerate(KINDS):
         row[kind] = {
             "refused": found.refused[k] is not None,
@@ -124,20 +117,22 @@ def one_rig(task: tuple[int]) -> dict[str, object]:
     return {**row, "seconds": time.perf_counter() - start}
 
 
-def others_error(calibration, simulated, rig, counters, readings, points, classic, simple_calibration, simple_rays):
-    """Errors (points, 3) of the nominal and the classic calibration."""
+def others_error(campaign, counters, readings, points) -> dict[str, np.ndarray]:
+    """Errors (points, 3) of the nominal and the classic calibration, mm."""
     import jax
     import jax.numpy as jnp
 
+    from tvsbayes.classic import classic
+    from tvsbayes.comparison import simple_calibration, simple_rays
     from tvsbayes.coordinates import meeting
 
     result = {}
-    for name, estimate in (("nominal", None), ("classic", classic(simulated.campaign))):
-        simple = simple_calibration(rig.table.priors, estimate)
+    for name, estimate in (("nominal", None), ("classic", classic(campaign))):
+        simple = simple_calibration(campaign.rig.priors, estimate)
         with jax.enable_x64(True):
             rays = simple_rays(simple, counters)
             base = jnp.asarray(2 * (simple.baseline_mm - simple.origin_y_mm))
-            azimuth = jnp.asarray(rig.table.aperture_convention == "azimuth")
+            azimuth = jnp.asarray(campaign.rig.aperture_convention == "azimuth")
             met = meeting(rays.origin_mm, rays.direction, base, jnp.radians(jnp.asarray(readings)), azimuth)
         result[name] = np.where(np.asarray(met.meets)[:, None], np.asarray(met.xyz_mm).T, np.nan) - points
     return result

@@ -477,7 +477,10 @@ def test_estimate_is_shown_without_a_target(rig, tmp_path, monkeypatch, asked, s
     """What is known so far belongs into the live line whether or not it ends the run; simulations must ask for it."""
     monkeypatch.setattr("tvsbayes.device.estimate._COMMAND", FIT.replace("argv[1]", "argv[2]"))
     texts = []
-    show = lambda progress: texts.append(progress.estimate)  # noqa: E731
+
+    def show(progress):
+        texts.append(progress.estimate)
+
     outcome = acquire(rig, small_plan(4), tmp_path / "c", simulate=True, seed=4, estimate=asked, show=show)
     assert (outcome.reason, outcome.looks) == ("done", 16)
     assert texts[-1] == ("left 0.060000 u 1.0e-03, right 0.060000 u 1.0e-03" if shown else "")
