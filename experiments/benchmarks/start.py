@@ -1,0 +1,84 @@
+"""Commands from process start, with an empty and with a filled compilation cache, beside bare imports."""
+
+from __future__ import annotations
+
+import os
+import sys
+import tempfile
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from .measure import Bench, Case, Column, command_cost
+
+TITLE = "From process start"
+FLOOR, COMMANDS = "Floor: Python and its packages", "Commands"
+COLD_REPEATS = 3
+IMPORTS = (
+    "pass",
+    "import numpy",
+    "import scipy.optimize",
+    "import cv2",
+    "import jax",
+    "import numpyro",
+    "import arviz",
+)
+PROGRAM = [sys.executable, "-c", "from tvsbayes.cli import main; main()"]
+
+
+def measure(bench: Bench) -> None:
+    """Fresh processes only; the files they read are in the file cache."""
+    from tvsbayes.files import shipped_data
+
+    twin = str(shipped_data() / "twins" / "paper_twin")
+
+    def floor(code: str):
+        return lambda _: command_cost([sys.executable, "-c", code])[1]
+
+    with tempfile.TemporaryDirectory() as place:
+        out = Path(place)
+
+        def command(arguments: Sequence[str], cache: Path | None):
+            def row(_: int) -> dict[str, float]:
+                with tempfile.TemporaryDirectory() as empty:
+                    environment = {**os.environ, "TVSBAYES_CACHE": str(cache or empty)}
+                    return command_cost([*PROGRAM, *arguments], environment)[1]
+
+            return row
+
+        fit = ["fit", twin, "--no-sample", "--json", "--out", str(out / "fit")]
+        works = {
+            "tvsbayes --help": command(["--help"], out),
+            "tvsbayes check": command(["check", twin, "--json"], out),
+            "tvsbayes classic": command(["classic", twin, "--json", "--out", str(out / "classic")], out),
+            "tvsbayes fit --no-sample, cache filled": command(fit, out / "filled"),
+        }
+        quick = {code: floor(code) for code in IMPORTS}
+        if bench.missing(FLOOR, list(quick)):
+            for work in quick.values():
+                work(0)
+            bench.interleaved(FLOOR, quick)
+        cold = "tvsbayes fit --no-sample, cache empty"
+        if bench.missing(COMMANDS, list(works)):
+            for name in list(works)[:3]:
+                works[name](0)
+            # The run that fills the cache is a cold one.
+            bench.interleaved(COMMANDS, {cold: command(fit, out / "filled")}, 1)
+            if not (out / "filled").exists():
+                command(fit, out / "filled")(0)
+            bench.interleaved(COMMANDS, works)
+        bench.interleaved(COMMANDS, {cold: command(fit, None)}, min(bench.repeats, COLD_REPEATS))
+
+
+def cases(rows: Sequence[Mapping]) -> list[Case]:
+    """Tables of the part."""
+    columns = (Column("wall_s", "wall s"), Column("cpu_s", "CPU s"), Column("rss_mib", "peak memory, MiB", "{:.0f}"))
+    about = "On the shipped paper twin (384 spots), all cores."
+    return [
+        Case(FLOOR, "`python -c ...`, all cores.", columns, ours=""),
+        Case(COMMANDS, about, columns, ours=""),
+    ]
+
+
+def remarks(rows: Sequence[Mapping]) -> list[str]:
+    """None."""
+    return []
