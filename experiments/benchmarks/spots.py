@@ -20,8 +20,6 @@ PEERS = {
     "photutils centroid_com": "com",
     f"photutils centroid_com, above {BRIGHT:.0%} of the peak": "bright",
     "photutils centroid_2dg": "2dg",
-    "photutils centroid_1dg": "1dg",
-    "photutils centroid_quadratic": "quadratic",
 }
 
 
@@ -86,8 +84,6 @@ def measure(bench: Bench) -> None:
             "com": centroids.centroid_com,
             "bright": centroids.centroid_com,
             "2dg": centroids.centroid_2dg,
-            "1dg": centroids.centroid_1dg,
-            "quadratic": centroids.centroid_quadratic,
         }
 
         def peer(kind: str):
