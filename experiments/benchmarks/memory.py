@@ -37,7 +37,7 @@ def measure(bench: Bench) -> None:
                 *("stereo", str(out / "frames" / "boards"), "--board", "9x6", "--pitch-mm", "25"),
                 *("--out", str(out / "stereo.json")),
             ],
-            "classic (paper twin)": ["classic", str(data / "twins" / "paper_twin"), "--out", str(out / "classic")],
+            "classic (paper twin)": ["classic", str(data / "twins" / "paper_twin")],
             "fit --no-sample (grid twin)": ["fit", twin, "--no-sample", *results],
             "fit (grid twin, sampled)": ["fit", twin, "--out", str(out / "sampled")],
             "plan": ["plan", rig],

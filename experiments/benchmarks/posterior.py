@@ -95,7 +95,7 @@ def cases(rows: Sequence[Mapping]) -> list[Case]:
         "Worst bulk effective draws of all free parameters over the process' CPU seconds, compilation apart. "
         "`tvsbayes` is `sample` from the fit until its own limits are met, transport, pilot and diagnosis included. "
         f"NUTS ({CHAINS} chains in step, {WARMUP} + {DRAWS} draws each) samples Laplace-whitened coordinates, "
-        "sheared as built by `experiments/nuts_reference.py`; its seconds hold transport and warm-up, the last rate only "
+        "sheared by `experiments/nuts_reference.py`; its seconds hold transport and warm-up, the last rate only "
         "the draws; without the shear it did not finish its warm-up on a larger campaign (`experiments/nuts.md`). "
         "The stretch move makes 400 steps in Laplace-whitened coordinates from draws of our pilot; a quarter of its "
         "steps is left out, none of its seconds."

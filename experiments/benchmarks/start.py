@@ -49,7 +49,7 @@ def measure(bench: Bench) -> None:
         works = {
             "tvsbayes --help": command(["--help"], out),
             "tvsbayes check": command(["check", twin, "--json"], out),
-            "tvsbayes classic": command(["classic", twin, "--json", "--out", str(out / "classic")], out),
+            "tvsbayes classic": command(["classic", twin, "--json"], out),
             "tvsbayes fit --no-sample, cache filled": command(fit, out / "filled"),
         }
         quick = {code: floor(code) for code in IMPORTS}

@@ -29,7 +29,7 @@ def measure(bench: Bench) -> None:
 
     use_compilation_cache()
 
-    def engine(name: str):
+    def engine(name: str, campaigns: int = CAMPAIGNS):
         workers = WORKERS[name]
 
         def row(repeat: int) -> dict[str, object]:
@@ -39,7 +39,7 @@ def measure(bench: Bench) -> None:
                 begun = time.perf_counter()
                 study(
                     job,
-                    CAMPAIGNS,
+                    campaigns,
                     StudyRows(Path(folder) / "rows.jsonl"),
                     engine=name.split(",")[0],
                     workers=workers,
@@ -47,13 +47,13 @@ def measure(bench: Bench) -> None:
                 )
                 whole = time.perf_counter() - begun
             # Every worker's first campaign carries its start and the reading of compiled functions.
-            steady = (CAMPAIGNS - workers) / (times[-1] - times[workers - 1])
-            return {"rate": 60 * CAMPAIGNS / whole, "steady": 60 * steady, "first_s": times[0] - begun}
+            steady = (campaigns - workers) / max(times[-1] - times[workers - 1], 1e-9)
+            return {"rate": 60 * campaigns / whole, "steady": 60 * steady, "first_s": times[0] - begun}
 
         return row
 
     # Fills the compilation cache, so that no engine pays for it.
-    engine("processes, 2 workers")(0)
+    engine("processes, 2 workers", 2)(0)
     bench.interleaved(NAME, {name: engine(name) for name in WORKERS}, min(bench.repeats, REPEATS))
 
 
