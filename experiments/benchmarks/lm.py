@@ -14,12 +14,23 @@ TWIN = "paper_twin"
 COST = 2.0
 """In chi-square units: solutions whose costs differ by less are the same here, where 53 parameters are fitted; the
 log density differs by half of it."""
+TOLERANCE = 1e-6
+COMPILATION = "Compilation"
 STAGE, EXACT = "tvsbayes, as in the fit", "tvsbayes, exact Jacobian"
+SOLVERS = {
+    "scipy lm, the fit's Jacobian": ("lm", "fit"),
+    "scipy lm, exact Jacobian": ("lm", "exact"),
+    "scipy trf, exact Jacobian": ("trf", "exact"),
+    "scipy lm, finite differences": ("lm", "2-point"),
+}
 NAME = "Last stage of the paper twin, 384 spots"
 
 
 def measure(bench: Bench) -> None:
     """Time every solver from one start to its own end, without compilation; compilation apart."""
+    own = (STAGE, EXACT)
+    if not (bench.missing(NAME, (*own, *SOLVERS)) or bench.missing(COMPILATION, own, 1)):
+        return
     import jax
     import jax.numpy as jnp
     from scipy import optimize
@@ -75,18 +86,15 @@ def measure(bench: Bench) -> None:
             z, limit = jnp.asarray(start), jnp.asarray(tolerance)
             return lambda: np.asarray(levenberg_marquardt(residual, z, args, limit, steps))
 
-        def peer(method, jac, tolerance=1e-6):
-            options = {"method": method, "xtol": tolerance, "ftol": tolerance, "gtol": tolerance}
+        def peer(method, jac):
+            options = {"method": method, "xtol": TOLERANCE, "ftol": TOLERANCE, "gtol": TOLERANCE}
             return lambda: optimize.least_squares(residuals, start, jac=jac, **options).x
 
-        frozen, exact = jacobian_of(stage_residuals), jacobian_of(exact_residuals)
+        slopes = {"fit": jacobian_of(stage_residuals), "exact": jacobian_of(exact_residuals), "2-point": "2-point"}
         works = {
             STAGE: ours(stage_residuals, STAGE_TOLERANCE, STAGE_STEPS),
-            EXACT: ours(exact_residuals, 1e-6, 200),
-            "scipy lm, the fit's Jacobian": peer("lm", frozen),
-            "scipy lm, exact Jacobian": peer("lm", exact),
-            "scipy trf, exact Jacobian": peer("trf", exact),
-            "scipy lm, finite differences": peer("lm", "2-point"),
+            EXACT: ours(exact_residuals, TOLERANCE, 200),
+            **{name: peer(method, slopes[jac]) for name, (method, jac) in SOLVERS.items()},
         }
         for name, work in works.items():
             begun = time.process_time()
@@ -103,10 +111,10 @@ def measure(bench: Bench) -> None:
             return row
 
         bench.interleaved(NAME, {name: once(work) for name, work in works.items()})
-        for name in (STAGE, EXACT):
-            if not bench.there("Compilation", name):
+        for name in own:
+            if bench.missing(COMPILATION, (name,), 1):
                 warm = np.median([r["values"]["cpu_s"] for r in bench.rows if r["contender"] == name])
-                bench.keep("Compilation", name, 0, {"cpu_s": first[name] - float(warm)})
+                bench.keep(COMPILATION, name, 0, {"cpu_s": first[name] - float(warm)})
 
 
 def cases(rows: Sequence[Mapping]) -> list[Case]:
@@ -126,13 +134,15 @@ def cases(rows: Sequence[Mapping]) -> list[Case]:
     compiled = "CPU seconds of the first call less those of a warm one, without the compilation cache."
     return [
         Case(NAME, about, columns, "cpu_s", EXACT),
-        Case("Compilation", compiled, (Column("cpu_s", "CPU s"),), ours=""),
+        Case(COMPILATION, compiled, (Column("cpu_s", "CPU s"),), ours=""),
     ]
 
 
 def remarks(rows: Sequence[Mapping]) -> list[str]:
     """Which reached the same cost."""
     reached = {r["contender"]: r["values"]["chi2"] for r in rows if r["case"] == NAME}
+    if not reached:
+        return []
     least = min(reached.values())
     same = [name for name, cost in reached.items() if cost < least + COST]
     others = [f"{name} (+{cost - least:.1f})" for name, cost in reached.items() if name not in same]

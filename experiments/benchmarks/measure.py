@@ -91,7 +91,7 @@ class Bench:
         """Append one row."""
         row = {"part": self.part, "case": case, "contender": contender, "repeat": repeat, "values": dict(values)}
         row |= {"load": os.getloadavg()[0], "at": f"{datetime.datetime.now(datetime.UTC):%Y-%m-%d %H:%M}"}
-        row["commit"] = commit()
+        row |= {"commit": commit(), "cores": len(os.sched_getaffinity(0))}
         self.path.parent.mkdir(parents=True, exist_ok=True)
         with self.path.open("a") as file:
             file.write(json.dumps(row) + "\n")

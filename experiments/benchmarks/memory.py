@@ -56,7 +56,7 @@ def measure(bench: Bench) -> None:
 def cases(rows: Sequence[Mapping]) -> list[Case]:
     """Tables of the part."""
     columns = (Column("rss_mib", "peak memory, MiB", "{:.0f}"), Column("wall_s", "wall s"), Column("cpu_s", "CPU s"))
-    return [Case(NAME, "All cores, compilation cache as the user has it.", columns, ours="")]
+    return [Case(NAME, "Compilation cache as the user has it.", columns, ours="")]
 
 
 def remarks(rows: Sequence[Mapping]) -> list[str]:

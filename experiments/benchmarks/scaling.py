@@ -42,7 +42,7 @@ def cases(rows: Sequence[Mapping]) -> list[Case]:
         Column("cpu_s", "CPU s of the process"),
     )
     about = (
-        "Wall clock, all cores, Laplace only; the first fit holds the compilation, which the shape of a campaign "
+        "Wall clock, Laplace only; the first fit holds the compilation, which the shape of a campaign "
         "decides. From 10 000 spots on one fit was made, its warm time is the first."
     )
     return [Case(NAME, about, columns, ours="")]

@@ -72,9 +72,9 @@ def measure(bench: Bench) -> None:
 def cases(rows: Sequence[Mapping]) -> list[Case]:
     """Tables of the part."""
     columns = (Column("wall_s", "wall s"), Column("cpu_s", "CPU s"), Column("rss_mib", "peak memory, MiB", "{:.0f}"))
-    about = "On the shipped paper twin (384 spots), all cores."
+    about = "On the shipped paper twin (384 spots)."
     return [
-        Case(FLOOR, "`python -c ...`, all cores.", columns, ours=""),
+        Case(FLOOR, "`python -c ...`", columns, ours=""),
         Case(COMMANDS, about, columns, ours=""),
     ]
 
