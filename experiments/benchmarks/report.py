@@ -36,8 +36,8 @@ def write(path: Path, parts: list[str]) -> None:
     page += [
         "",
         "Numbers are medians of n repeats with quartiles in brackets. Contenders took turns, so that what else the "
-        "machine did hit all alike; ratios are taken within a repeat. Compared code ran on one thread, commands as users "
-        "start them.",
+        "machine did hit all alike; ratios are taken within a repeat. Compared code ran on one thread, commands ran as "
+        "users start them.",
         "",
     ]
     for part in parts:
