@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import subprocess
 import sys
 import tempfile
 from collections.abc import Mapping, Sequence
@@ -45,12 +46,20 @@ def measure(bench: Bench) -> None:
         if not bench.missing(NAME, list(commands), REPEATS):
             return
         # All of them, in order, even where some rows are there: they build on one another.
+        failed = []
         for name, arguments in commands.items():
-            values = command_cost([*PROGRAM, *arguments], limit_s=900.0)[1]
+            try:
+                values = command_cost([*PROGRAM, *arguments], limit_s=900.0)[1]
+            except subprocess.CalledProcessError as error:
+                failed.append(name)
+                print(f"memory | {name}: exit {error.returncode}; {error.stderr.strip()[-300:]}", flush=True)
+                continue
             if 0 not in bench.there(NAME, name):
                 bench.keep(NAME, name, 0, values)
         if 0 not in bench.there(NAME, "floor: import jax"):
             bench.keep(NAME, "floor: import jax", 0, command_cost([sys.executable, "-c", "import jax"])[1])
+        if failed:
+            raise SystemExit(f"failed: {', '.join(failed)}")
 
 
 def cases(rows: Sequence[Mapping]) -> list[Case]:
