@@ -14,6 +14,7 @@ import json
 import os
 import platform
 import subprocess
+import sys
 import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -25,7 +26,6 @@ import numpy as np
 ROOT = Path(__file__).resolve().parents[2]
 OUTPUT = ROOT / "experiments" / "output"
 PACKAGES = ("numpy", "scipy", "jax", "optimistix", "emcee", "numpyro", "opencv-python-headless", "photutils", "astropy")
-MIB = 1024**2
 
 
 @dataclass(frozen=True)
@@ -116,27 +116,18 @@ def command_cost(
         subprocess.CalledProcessError: it failed.
         subprocess.TimeoutExpired: it ran longer than `limit_s` and was killed.
     """
-    with tempfile.TemporaryFile() as out, tempfile.TemporaryFile() as err:
-        start = time.perf_counter()
-        child = subprocess.Popen(command, stdout=out, stderr=err, env=environment, cwd=ROOT)
-        while True:
-            # Polled every few ms: wait4 alone knows this child's memory, but has no time limit.
-            pid, status, usage = os.wait4(child.pid, os.WNOHANG)
-            wall = time.perf_counter() - start
-            if pid:
-                break
-            if wall > limit_s:
-                child.kill()
-                os.wait4(child.pid, 0)
-                child.returncode = -9
-                raise subprocess.TimeoutExpired(command, limit_s)
-            time.sleep(0.002 if wall < 5 else 0.05)
-        child.returncode = os.waitstatus_to_exitcode(status)
-        out.seek(0), err.seek(0)
-        text, problem = out.read().decode(errors="replace"), err.read().decode(errors="replace")
-    if child.returncode:
-        raise subprocess.CalledProcessError(child.returncode, command, text, problem[-2000:])
-    return text, {"wall_s": wall, "cpu_s": usage.ru_utime + usage.ru_stime, "rss_mib": usage.ru_maxrss * 1024 / MIB}
+    with tempfile.TemporaryDirectory() as place:
+        said = Path(place) / "cost.json"
+        launcher = [sys.executable, "-S", str(Path(__file__).with_name("child.py")), str(said), str(limit_s)]
+        done = subprocess.run(
+            [*launcher, *command], env=environment, cwd=ROOT, capture_output=True, text=True, errors="replace"
+        )
+        cost = json.loads(said.read_text())
+    if cost.pop("late"):
+        raise subprocess.TimeoutExpired(command, limit_s)
+    if code := cost.pop("code"):
+        raise subprocess.CalledProcessError(code, command, done.stdout, done.stderr[-2000:])
+    return done.stdout, cost
 
 
 def commit() -> str:

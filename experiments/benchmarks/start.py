@@ -45,28 +45,23 @@ def measure(bench: Bench) -> None:
 
             return row
 
-        fit = ["fit", twin, "--no-sample", "--json", "--out", str(out / "fit")]
-        works = {
+        floor_of = {code: floor(code) for code in IMPORTS}
+        short = {
             "tvsbayes --help": command(["--help"], out),
             "tvsbayes check": command(["check", twin, "--json"], out),
             "tvsbayes classic": command(["classic", twin, "--json"], out),
-            "tvsbayes fit --no-sample, cache filled": command(fit, out / "filled"),
         }
-        quick = {code: floor(code) for code in IMPORTS}
-        if bench.missing(FLOOR, list(quick)):
-            for work in quick.values():
-                work(0)
-            bench.interleaved(FLOOR, quick)
-        cold = "tvsbayes fit --no-sample, cache empty"
-        if bench.missing(COMMANDS, list(works)):
-            for name in list(works)[:3]:
-                works[name](0)
-            # The run that fills the cache is a cold one.
-            bench.interleaved(COMMANDS, {cold: command(fit, out / "filled")}, 1)
-            if not (out / "filled").exists():
-                command(fit, out / "filled")(0)
-            bench.interleaved(COMMANDS, works)
+        for case, works in ((FLOOR, floor_of), (COMMANDS, short)):
+            if bench.missing(case, list(works)):
+                for work in works.values():
+                    work(0)
+                bench.interleaved(case, works)
+        fit = ["fit", twin, "--no-sample", "--json", "--out", str(out / "fit")]
+        cold, warm = "tvsbayes fit --no-sample, cache empty", "tvsbayes fit --no-sample, cache filled"
         bench.interleaved(COMMANDS, {cold: command(fit, None)}, min(bench.repeats, COLD_REPEATS))
+        if bench.missing(COMMANDS, [warm]):
+            command(fit, out / "filled")(0)
+            bench.interleaved(COMMANDS, {warm: command(fit, out / "filled")})
 
 
 def cases(rows: Sequence[Mapping]) -> list[Case]:
