@@ -36,9 +36,8 @@ COORDINATES = ("u left", "v left", "u right", "v right")
 def observed(source: str, seed: int):
     """A simulated campaign, what a stranger would fit, and found minus true centres (n, 4) with their sds."""
     from studies import mounted_rig
-    from tvsbayes.protocols import four_point_protocol
 
-    from tvsbayes.campaign import read_campaign
+    from tvsbayes.campaign import four_point_protocol, read_campaign
     from tvsbayes.device.renderer import write_frames
     from tvsbayes.device.spots import detect
     from tvsbayes.simulation import project, simulate
