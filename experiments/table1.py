@@ -64,7 +64,9 @@ def table(paper: dict[str, tuple[int, float, float]]) -> None:
         sds.append([again[d].sd_deg_per_step for d in DIRECTIONS])
     means, sds = np.array(means), np.array(sds)
     print(f"\n## The same true rig, {AGAIN} campaigns under other seeds\n")
-    print("| direction | mean of the means | sd of the means | median u of type A | paper's mean, in these sds ", end="")
+    print(
+        "| direction | mean of the means | sd of the means | median u of type A | paper's mean, in these sds ", end=""
+    )
     print("| sd: median (2.5 to 97.5 %) |\n|---|---|---|---|---|---|")
     for k, name in enumerate(DIRECTIONS):
         spread = means[:, k].std(ddof=1)
@@ -73,7 +75,9 @@ def table(paper: dict[str, tuple[int, float, float]]) -> None:
         scatter = f"{middle:.6f} ({low:.6f} to {high:.6f})"
         type_a = middle / np.sqrt(found[name].n)
         print(f"| {name} | {means[:, k].mean():.6f} | {spread:.6f} | {type_a:.6f} | {apart:+.1f} | {scatter} |")
-    print("\nUp and down scatter more than their u of type A says: pan stands still for all 48 of them, so that one stop")
+    print(
+        "\nUp and down scatter more than their u of type A says: pan stands still for all 48 of them, so that one stop"
+    )
     print(f"error of pan ({truth.parameters['stop_sd_deg.left']:.2f} deg) is common to all and turns the azimuth.")
     true = truth.as_json()["effective_deg_per_step"]
     shown = ", ".join(f"{name} {true[name]:.5f}" for name in DIRECTIONS)
@@ -107,7 +111,9 @@ def worked_example(paper: dict[str, tuple[int, float, float]]) -> None:
     print(f"| {steps} | {chain:.8f} |")
     _, mean, sd = paper["left"]
     low, high = (chain - mean) / sd - 0.01 / steps / sd, (chain - mean) / sd + 0.01 / steps / sd
-    print(f"\nOne experiment against the Table's left: {low:+.2f} to {high:+.2f} of its sd (angles printed to 0.01 deg);")
+    print(
+        f"\nOne experiment against the Table's left: {low:+.2f} to {high:+.2f} of its sd (angles printed to 0.01 deg);"
+    )
     print(f"two-sided p of a single value {2 * stats.t.sf(abs(low + high) / 2, 23):.2f}.")
 
 
@@ -115,7 +121,9 @@ def main() -> None:
     """Print the page."""
     paper = paper_values()
     print("# Table 1 by the classic estimator\n")
-    print("Written by `python experiments/table1.py`; deg/step. The twin was solved to give the Table: see the script.\n")
+    print(
+        "Written by `python experiments/table1.py`; deg/step. The twin was solved to give the Table: see the script.\n"
+    )
     table(paper)
     worked_example(paper)
 
