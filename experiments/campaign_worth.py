@@ -54,7 +54,7 @@ def full_turn_plan(looks: int, turn_steps: int = TURN_STEPS):
         for at in (0, turn_steps)[:: 1 if number == 0 else -1]:
             for look in range(looks):
                 pan, tilt = poses[look % len(poses)]
-                side = 1 if (look // len(poses)) % 2 == 0 and looks > 8 or looks <= 8 and look % 2 == 0 else -1
+                side = 1 if ((look // len(poses)) % 2 == 0 and looks > 8) or (looks <= 8 and look % 2 == 0) else -1
                 run_up = side * OVERSHOOT_STEPS
                 orders += [("move", at + pan - run_up, tilt - run_up), ("move", at + pan, tilt), ("look",)]
     return tuple(PlanStep(k, *order) for k, order in enumerate(orders))

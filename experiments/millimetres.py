@@ -4,12 +4,13 @@
     python experiments/millimetres.py table > experiments/millimetres.md
 
 The shipped twins, whose truth is known, and drawn rigs (`data/rigs/mounted`, seed i), each under the mixed steps with
-aperture readings and under the paper's protocol without. After the campaign the machine is homed and sent to 5 x 5 counters
-within the campaign's, from random sides; the true beam with a stop error of its own meets a target at each range along
-it, the aperture reads it, and every calibration is asked for the point. Nominal and classic are the fair comparators of
-DESIGN 5 (`tvsbayes.comparison.simple_calibration`). Error: distance from the true point; stated: the root of the trace
-of the joint's covariance (Laplace, law of propagation), and its 95 % intervals for x, y, z and ellipsoid. Expected
-errors over all rigs that a campaign allows stand in error_map.md, coverage over 1000 rigs in points.md.
+aperture readings and under the paper's protocol without. After the campaign the machine is homed and sent to 5 x 5
+counters within the campaign's, from random sides; the true beam with a stop error of its own meets a target at each
+range along it, the aperture reads it, and every calibration is asked for the point. Nominal and classic are the fair
+comparators of DESIGN 5 (`tvsbayes.comparison.simple_calibration`). Error: distance from the true point; stated: the
+root of the trace of the joint's covariance (Laplace, law of propagation), and its 95 % intervals for x, y, z and
+ellipsoid. Expected errors over all rigs that a campaign allows stand in error_map.md, coverage over 1000 rigs in
+points.md.
 """
 
 from __future__ import annotations
@@ -150,7 +151,8 @@ def table() -> None:
             stated = np.median([_rms(_flat([r], "stated_mm", k)) for r in chosen])
             times = np.median(per_rig["classic"] / per_rig["joint"])
             middle = [r["ellipsoid"][k][CELLS**2 // 2] for r in chosen]
-            held = f"{sum(bool(m) for m in middle)} of {len(middle)} (bounds {low * len(middle):.0f} to {high * len(middle):.0f})"
+            n = len(middle)
+            held = f"{sum(bool(m) for m in middle)} of {n} (bounds {low * n:.0f} to {high * n:.0f})"
             print(f"| {reach / 1000:g} | {' | '.join(cells)} | {stated:.1f} | {times:.1f} | {held} |")
     draw(good)
 
