@@ -266,22 +266,22 @@ def fifth() -> None:
     row(
         "5. repeats of one move do not help",
         "no help",
-        f"four times as many: u times {gain['left']:.2f} (left), {gain['up']:.2f} (up); averaging alone would give 0.50",
+        f"four times as many: u times {gain['left']:.2f} (left), {gain['up']:.2f} (up); averaging would give 0.50",
         "holds" if min(gain.values()) > 0.9 else "does not hold",
     )
     print("\n## What lowers which part (claim 5)\n")
     print("Expected u of the effective ratio, 1e-4 deg/step, 96 experiments where nothing else is said.\n")
     print("| campaign | spots | direction | u | stereo and focal: share | as u | separation from backlash ", end="")
-    print("| u if backlash were known | contrast | no repeat lowers |\n|" + "---|" * 10)
+    print("| u if backlash were known | contrast | left after 100 such campaigns |\n|" + "---|" * 10)
     for (name, quantity), (spots, u, cameras, backlash, contrast, floor, without, camera_u) in results.items():
         print(
             f"| {name} | {spots} | {quantity} | {u:.2f} | {cameras:.0f} % | {camera_u:.2f} | {backlash:.0f} % ", end=""
         )
         print(f"| {without:.2f} | {contrast:.0f} % | {floor:.0f} % |")
     print(
-        "\nPan is better off than tilt in the plain protocol because its first start is the homing's, which is recorded"
+        "\nPan is better off than tilt in the plain protocol: its first start is the homing's, recorded as reached from"
     )
-    print("as reached from the left: the one cleared start of the campaign.")
+    print("the left, the one cleared start of the campaign.")
 
 
 def main() -> None:

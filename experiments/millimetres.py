@@ -166,10 +166,11 @@ def draw(rows) -> None:
 
     with rc_context(STYLE):
         figure = Figure(figsize=(WIDTH_IN, 5.6), layout="constrained")
-        panels = figure.subplots(2, 1, sharex=True, sharey=True)
+        panels, metres = figure.subplots(2, 1, sharex=True, sharey=True), np.array(RANGES_MM) / 1000
         for axes, protocol in zip(panels, PROTOCOLS, strict=True):
             chosen = [r for r in rows if r["name"] == protocol]
-            metres = np.array(RANGES_MM) / 1000
+            if not chosen:
+                continue
             for name, (colour, marker) in OF_ESTIMATOR.items():
                 per_rig = np.array(
                     [[_rms(_flat([r], "error_mm", k, name)) for k in range(len(metres))] for r in chosen]
