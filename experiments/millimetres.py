@@ -154,7 +154,10 @@ def table() -> None:
             n = len(middle)
             held = f"{sum(bool(m) for m in middle)} of {n} (bounds {low * n:.0f} to {high * n:.0f})"
             print(f"| {reach / 1000:g} | {' | '.join(cells)} | {stated:.1f} | {times:.1f} | {held} |")
-    draw(good)
+    if any(r["name"] in PROTOCOLS for r in good):
+        draw(good)
+    else:
+        print("\nDrawn rigs: not run yet.")
 
 
 def draw(rows) -> None:
