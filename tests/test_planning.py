@@ -136,6 +136,16 @@ def test_a_plans_information_is_the_fits_own(mounted_rig, knowledge, monkeypatch
     assert (scale[~NOISE_COLUMNS] > 0).sum() > 40
 
 
+@pytest.mark.parametrize("moves", [256, 257])
+def test_arrays_hold_every_move_of_a_plan(mounted_rig, moves):
+    """One move more than twice the smallest number of looks: a homing and two moves per look, 128 times."""
+    steps = [PlanStep(0, "home", 0, 0), PlanStep(1, "place", target="d1")]
+    steps += [PlanStep(n, "move", n, 0) for n in range(2, moves + 1)]
+    log = run_plan([*steps, PlanStep(moves + 1, "look")], mounted_rig, ("left", "up"))
+    arrays = design._design_arrays(log.moves, [moves - 1], mounted_rig, homed_from=1, aperture=False)
+    assert len(log.moves) == moves and np.array_equal(arrays.moves.steps[:moves, 0], [m.pan_steps for m in log.moves])
+
+
 def test_more_looks_never_raise_a_variance(knowledge):
     """At a fixed point every added step of a plan adds a positive semi-definite matrix."""
     steps = paper_protocol(2)

@@ -235,7 +235,8 @@ def _design_arrays(
     moves: Sequence[Move], look_moves: Sequence[int], rig: Rig, *, homed_from: int, aperture: bool
 ) -> CampaignArrays:
     """Moves and looks without pixels; segments from `homed_from` on have an unknown home offset."""
-    size, count = padded_size(max(len(look_moves), len(moves) // 2)), len(look_moves)
+    # Half the moves rounded up: there are twice as many places for them as for looks.
+    size, count = padded_size(max(len(look_moves), (len(moves) + 1) // 2)), len(look_moves)
 
     def padded(rows, shape, fill, dtype=float, length=size):
         array = np.full((length, *shape), fill, dtype=dtype)

@@ -1,0 +1,211 @@
+"""What a calibration is worth in millimetres at 0.3, 1, 2 and 5 m: nominal, classic and joint against the truth.
+
+    python experiments/millimetres.py run --n 20 --core 0         # 4 minutes, resumable
+    python experiments/millimetres.py table > experiments/millimetres.md
+
+The shipped twins, whose truth is known, and drawn rigs (`data/rigs/mounted`, seed i), each under the mixed steps with
+aperture readings and under the paper's protocol without. After the campaign the machine is homed and sent to 5 x 5
+counters within the campaign's, from random sides; the true beam with a stop error of its own meets a target at each
+range along it, the aperture reads it, and every calibration is asked for the point. Nominal and classic are the fair
+comparators of DESIGN 5 (`tvsbayes.comparison.simple_calibration`). Error: distance from the true point; stated: the
+root of the trace of the joint's covariance (Laplace, law of propagation), and its 95 % intervals for x, y, z and
+ellipsoid. Expected errors over all rigs that a campaign allows stand in error_map.md, coverage over 1000 rigs in
+points.md.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from pathlib import Path
+
+import numpy as np
+from coverage import bounds, read_rows
+from points import ELLIPSOID, others_error, true_look
+from studies import mounted_rig, run_rows, shipped_plan
+
+ROWS = Path(__file__).parent / "output" / "millimetres.jsonl"
+FIGURE = Path(__file__).with_suffix(".png")
+RANGES_MM = 300.0, 1000.0, 2000.0, 5000.0
+TWINS = ("paper_twin", "grid_twin")
+PROTOCOLS = ("paper", "mixed")
+CELLS = 5
+ESTIMATORS = ("nominal", "classic", "joint")
+
+
+def one_row(task: tuple[str, int]) -> dict[str, object]:
+    """Fit a shipped twin (seed -1) or a drawn rig's campaign; errors at all counters and ranges."""
+    from tvsbayes import likelihood
+
+    # As in coverage.py: ordinary fits pad to 512 spots.
+    likelihood.SMALLEST_BUCKET = 96
+    from tvsbayes.campaign import read_campaign
+    from tvsbayes.classic import classic
+    from tvsbayes.comparison import simple_calibration, simple_rays
+    from tvsbayes.coordinates import locate_linear, settings_of
+    from tvsbayes.files import shipped_data
+    from tvsbayes.information import calibration_of
+    from tvsbayes.joint import fit
+    from tvsbayes.model import use_compilation_cache
+    from tvsbayes.simulation import SimulatedCampaign, read_truth, simulate
+
+    use_compilation_cache()
+    name, seed = task
+    rig, start = mounted_rig(), time.process_time()
+    if name in TWINS:
+        folder = shipped_data() / "twins" / name
+        campaign = read_campaign(folder)
+        simulated = SimulatedCampaign(campaign, read_truth(folder / "truth.json", campaign.stereo), None)
+    else:
+        simulated = simulate(rig, shipped_plan(name), seed, aperture=name == "mixed")
+    row: dict[str, object] = {"name": name, "seed": seed, "converged": False}
+    try:
+        result = fit(simulated.campaign)
+        calibration = calibration_of(result, seed=max(seed, 0))
+    except Exception as error:
+        return {**row, "problem": repr(error)}
+    row["converged"] = bool(result.converged)
+    generator = np.random.default_rng([seed + 1, 9])
+    counters, sides, points, readings = [], [], [], []
+    grid = [np.linspace(*ends, CELLS).round() for ends in calibration.range_steps]
+    for pan in grid[0]:
+        for tilt in grid[1]:
+            for reach in RANGES_MM:
+                side = generator.choice([-1, 1], 2)
+                point, reading = true_look(simulated.truth, rig.table, (pan, tilt), side, reach, generator)
+                counters.append((pan, tilt))
+                sides.append((("right", "left")[int(side[0] > 0)], ("down", "up")[int(side[1] > 0)]))
+                points.append(point)
+                readings.append(reading)
+    counters, points = np.array(counters), np.array(points)
+    law = locate_linear(calibration, settings_of(counters[:, 0], counters[:, 1], readings, sides))
+    xyz, covariance = law.value, law.covariance
+    error = {"joint": xyz - points}
+    error |= others_error(
+        calibration, simulated, rig, counters, readings, points, classic, simple_calibration, simple_rays
+    )
+    sd = np.sqrt(np.einsum("pii->pi", covariance))
+    usable = np.isfinite(xyz).all(axis=1) & np.isfinite(covariance).all(axis=(1, 2))
+    far = np.full(len(points), np.nan)
+    far[usable] = np.einsum(
+        "pi,pij,pj->p", error["joint"][usable], np.linalg.inv(covariance[usable]), error["joint"][usable]
+    )
+
+    def by_range(values):
+        return [[None if np.isnan(v) else float(v) for v in values[k :: len(RANGES_MM)]] for k in range(len(RANGES_MM))]
+
+    row["error_mm"] = {n: by_range(np.linalg.norm(e, axis=1)) for n, e in error.items()}
+    row["stated_mm"] = by_range(np.where(usable, np.sqrt(np.einsum("pii->p", covariance)), np.nan))
+    row["inside"] = by_range(np.where(usable, (np.abs(error["joint"]) <= 1.96 * sd).mean(axis=1), np.nan))
+    row["ellipsoid"] = by_range(np.where(usable, far <= ELLIPSOID, np.nan))
+    return {**row, "cpu_s": time.process_time() - start}
+
+
+def _flat(rows, field: str, k: int, name: str | None = None) -> np.ndarray:
+    """Values of a field at a range over all rows, not a number where there is no point."""
+    parts = [(r[field] if name is None else r[field][name])[k] for r in rows]
+    return np.array([np.nan if v is None else v for part in parts for v in part])
+
+
+def _rms(values: np.ndarray) -> float:
+    return float(np.sqrt(np.nanmean(values**2)))
+
+
+def table() -> None:
+    """The page."""
+    rows = read_rows(ROWS)
+    good = [r for r in rows if r["converged"]]
+    print("# Millimetres: nominal, classic and joint against the truth\n")
+    print("Written by `python experiments/millimetres.py table`; mm of 3D distance; what was done stands there.\n")
+    print("## The shipped twins\n")
+    print("RMS over 25 poses; one rig each: a calibration's error is common to all its points.\n")
+    print("| twin | range, m | nominal | classic | joint | joint, stated | inside 95 %: x, y, z | ellipsoid |")
+    print("|" + "---|" * 8)
+    for twin in TWINS:
+        chosen = [r for r in good if r["name"] == twin]
+        for k, reach in enumerate(RANGES_MM if chosen else ()):
+            cells = [f"{_rms(_flat(chosen, 'error_mm', k, n)):.1f}" for n in ESTIMATORS]
+            missing = [int(np.isnan(_flat(chosen, "error_mm", k, n)).sum()) for n in ESTIMATORS]
+            cells = [f"{c} ({m} without)" if m else c for c, m in zip(cells, missing, strict=True)]
+            held, within = np.nanmean(_flat(chosen, "inside", k)), np.nanmean(_flat(chosen, "ellipsoid", k))
+            stated = _rms(_flat(chosen, "stated_mm", k))
+            name = twin.replace("_", " ")
+            print(f"| {name} | {reach / 1000:g} | {' | '.join(cells)} | {stated:.1f} ", end="")
+            print(f"| {100 * held:.0f} % | {100 * within:.0f} % |")
+    print("\nThe grid holds no four-point experiment: a classic user keeps the nominal ratios there.")
+    for protocol in PROTOCOLS:
+        every = [r for r in rows if r["name"] == protocol]
+        chosen = [r for r in every if r["converged"]]
+        if not chosen:
+            continue
+        what = "the paper's protocol" if protocol == "paper" else "mixed steps with aperture readings"
+        print(f"\n## Drawn rigs, {what}: {len(every)}, {len(chosen)} converged\n")
+        print("Median over the rigs of each rig's RMS over its 25 poses (least to largest rig). Intervals: one pose of")
+        print("each rig (the middle), since the poses of one rig share its error.\n")
+        print("| range, m | nominal | classic | joint | joint, stated | classic / joint | middle pose held |")
+        print("|" + "---|" * 7)
+        low, high = bounds(len(chosen), 0.95)
+        for k, reach in enumerate(RANGES_MM):
+            per_rig = {n: np.array([_rms(_flat([r], "error_mm", k, n)) for r in chosen]) for n in ESTIMATORS}
+            cells = [f"{np.median(v):.1f} ({v.min():.1f} to {v.max():.1f})" for v in per_rig.values()]
+            stated = np.median([_rms(_flat([r], "stated_mm", k)) for r in chosen])
+            times = np.median(per_rig["classic"] / per_rig["joint"])
+            middle = [r["ellipsoid"][k][CELLS**2 // 2] for r in chosen]
+            n = len(middle)
+            held = f"{sum(bool(m) for m in middle)} of {n} (bounds {low * n:.0f} to {high * n:.0f})"
+            print(f"| {reach / 1000:g} | {' | '.join(cells)} | {stated:.1f} | {times:.1f} | {held} |")
+    if any(r["name"] in PROTOCOLS for r in good):
+        draw(good)
+    else:
+        print("\nDrawn rigs: not run yet.")
+
+
+def draw(rows) -> None:
+    """RMS error of each estimator against range."""
+    from matplotlib import rc_context
+    from matplotlib.figure import Figure
+
+    from tvsbayes.plots import BLACK, OF_ESTIMATOR, STYLE, WIDTH_IN
+
+    with rc_context(STYLE):
+        figure = Figure(figsize=(WIDTH_IN, 5.6), layout="constrained")
+        panels, metres = figure.subplots(2, 1, sharex=True, sharey=True), np.array(RANGES_MM) / 1000
+        for axes, protocol in zip(panels, PROTOCOLS, strict=True):
+            chosen = [r for r in rows if r["name"] == protocol]
+            if not chosen:
+                continue
+            for name, (colour, marker) in OF_ESTIMATOR.items():
+                per_rig = np.array(
+                    [[_rms(_flat([r], "error_mm", k, name)) for k in range(len(metres))] for r in chosen]
+                )
+                low, middle, high = np.quantile(per_rig, (0.1, 0.5, 0.9), axis=0)
+                label = name if axes is panels[0] else None
+                axes.loglog(metres, middle, marker=marker, color=colour, markersize=4, label=label)
+                axes.fill_between(metres, low, high, color=colour, alpha=0.15, linewidth=0)
+            stated = np.median([[_rms(_flat([r], "stated_mm", k)) for k in range(len(metres))] for r in chosen], axis=0)
+            label = "joint, stated" if axes is panels[0] else None
+            axes.loglog(metres, stated, "--", color=BLACK, linewidth=1, label=label)
+            readings = "with" if protocol == "mixed" else "without"
+            axes.set(ylabel="RMS error, mm", title=f"{protocol}, {readings} aperture readings")
+        panels[-1].set(xlabel="range, m", xticks=metres, xticklabels=[f"{m:g}" for m in metres])
+        panels[-1].minorticks_off()
+        figure.legend(loc="outside lower center", ncols=4)
+        figure.savefig(FIGURE, dpi=130)
+
+
+def main() -> None:
+    """Command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("action", choices=("run", "table"))
+    parser.add_argument("--n", type=int, default=20)
+    parser.add_argument("--core", type=int, default=0)
+    arguments = parser.parse_args()
+    if arguments.action == "run":
+        tasks = [(twin, -1) for twin in TWINS] + [(p, seed) for seed in range(arguments.n) for p in PROTOCOLS]
+        run_rows(one_row, tasks, ROWS, ("name", "seed"), [arguments.core])
+    else:
+        table()
+
+
+if __name__ == "__main__":
+    main()
