@@ -26,6 +26,7 @@ import sys
 import tarfile
 import tempfile
 import time
+import traceback
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -1168,7 +1169,9 @@ def prepare(scratch: Path) -> None:
 def tested(root: Path, selection: Sequence[str]) -> dict[str, object]:
     """Run tests on a copy in a child of this process: whether one failed, the first that did, and the seconds."""
     start, output = time.monotonic(), root.parent / "output.txt"
-    command = ["-q", "-x", "-n", "0", "-rfE", "--tb=no", "-p", "no:cacheprovider", *selection]
+    command = ["-q", "-x", "-n", "0", "-rfE", "--tb=no", "-p", "no:cacheprovider"]
+    # Pytest's plugins are among what is shared, their own assertions are not looked at here.
+    command += ["-W", "ignore::pytest.PytestAssertRewriteWarning", *selection]
     with warnings.catch_warnings():
         # JAX warns of forks; nothing has been computed in this process, and no thread of its runs.
         warnings.simplefilter("ignore")
@@ -1186,7 +1189,10 @@ def tested(root: Path, selection: Sequence[str]) -> dict[str, object]:
             import pytest
 
             code = int(pytest.main(command))
+        except BaseException:
+            traceback.print_exc()
         finally:
+            sys.stderr.flush()
             sys.stdout.flush()
             os._exit(code)
     done, status = 0, 0
