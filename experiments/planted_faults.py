@@ -944,7 +944,7 @@ FAULTS = (
         'table.check_unique("spot", spots, "unique ids")',
         'table.check_unique("spot", [], "unique ids")',
         "two rows answer to one number",
-        ("campaign",),
+        ("hostile",),
     ),
     Fault(
         "moves out of order accepted",
@@ -952,7 +952,7 @@ FAULTS = (
         "if row and times_s[row] < times_s[row - 1]:",
         "if row and times_s[row] < times_s[0]:",
         "shuffled moves make another campaign",
-        ("campaign",),
+        ("hostile",),
     ),
     Fault(
         "mirrored stereo rotation accepted",
