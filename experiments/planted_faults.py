@@ -1001,7 +1001,8 @@ FAULTS = (
         "if reached != wanted or (state.pan_target_steps, state.tilt_target_steps) != wanted:",
         "if False:",
         "a stop elsewhere counts as arrival",
-        ("device_driver", "device_faults"),
+        ("device_limits",),
+        survived="run: no simulated device had said done at another place.",
     ),
     Fault(
         "driver: reset not noticed",
@@ -1025,7 +1026,8 @@ FAULTS = (
         'limits["tmin"] <= tilt <= limits["tmax"]',
         'limits["tmin"] <= tilt',
         "tilt runs into the stop",
-        ("device_protocol",),
+        ("device_limits",),
+        survived="run: the lower limit of tilt and the upper one of pan were tried, no other.",
     ),
     Fault(
         "device: laser stays on in alarm",
