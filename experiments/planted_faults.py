@@ -1232,7 +1232,7 @@ def tested(root: Path, selection: Sequence[str]) -> dict[str, object]:
     # 0: all passed, 1: a test failed; all else (no such test, no import) says nothing about the tests.
     if code not in (0, 1):
         raise RuntimeError(f"pytest ended with {code}:\n{text[-2000:]}")
-    first = re.search(r"^(?:FAILED|ERROR) (\S+)", text, re.MULTILINE)
+    first = re.search(r"^(?:FAILED|ERROR) (.+?)(?: - .*)?$", text, re.MULTILINE)
     return {"failed": code == 1, "first": first[1] if first else "", "seconds": seconds}
 
 
