@@ -1303,9 +1303,8 @@ def table(arguments: argparse.Namespace) -> int:
     print(f"**{caught} of {len(FAULTS)} faults caught**", end="")
     print(f", {len(done) - caught} survive, {len(FAULTS) - len(done)} not run;", end=" ")
     print(f"{minutes:.0f} minutes on one core, {len(clean)} clean runs of the tests included.", end=" ")
-    print(
-        f"{at_first} of the faults got past the tests likely to see them, in a run or by reading: listed below; each has a test now.\n"
-    )
+    print(f"{at_first} of the faults got past the tests likely to see them, in a run or by reading:", end=" ")
+    print("listed below; each has a test now.\n")
     print("| fault | file | harm | first failing test | s |\n|---|---|---|---|---|")
     for fault in FAULTS:
         row = found[fault.name]
