@@ -315,6 +315,10 @@ def test_bias_of_the_nominal_estimator_is_the_twins(azimuth, approach):
         bound = 10 * ROUNDING_MM * (1 + (np.linalg.norm(thought) / 1000.0) ** 2)
         np.testing.assert_allclose(found.bias_mm["nominal"][i, j, k], thought - point, atol=bound)
         assert found.rms_mm["nominal"][i, j, k] == pytest.approx(np.linalg.norm(thought - point), abs=bound)
+        # Every draw is the same rig.
+        np.testing.assert_allclose(
+            found.distance_mm["nominal"][:, i, j, k], np.linalg.norm(thought - point), atol=bound
+        )
         assert found.rms_mm["joint"][i, j, k] < 10 * ROUNDING_MM
     assert found.valid.sum() >= 18
     np.testing.assert_array_equal(found.pan_steps, PAN)

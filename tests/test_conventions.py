@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from statistics import NormalDist
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from tvsbayes import calibration, certificate, coordinates
 from tvsbayes.likelihood import aperture_angle, observe
 from tvsbayes.model import (
     INDEX,
@@ -205,3 +208,11 @@ def test_every_name_has_its_unit():
     units = ("_deg", "_mm", "_rad", "deg_per_step", "degrees_per_step")
     without = [n for n in NAMES if not any(u in n for u in units)]
     assert [n for n in without if not n.startswith("stereo.")] == ["pixel_scale", "focal_scale"]
+
+
+def test_95_percent_are_two_sided_and_normal():
+    """GUM 6.2 and table G.1: k = 1.96. Quantiles of the standard library, whatever the package takes them from."""
+    exact = NormalDist().inv_cdf(0.975)
+    assert calibration.NORMAL_95 == pytest.approx(exact, rel=1e-9)
+    for factor in (coordinates.coverage_factor(0.95), certificate.coverage_factor(np.inf, 0.95)):
+        assert factor == pytest.approx(exact, rel=1e-9)

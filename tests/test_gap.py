@@ -17,12 +17,15 @@ from tvsbayes.campaign import four_point_protocol, read_campaign
 from tvsbayes.classic import DIRECTIONS, classic, select_experiments
 from tvsbayes.comparison import (
     BACKLASH,
+    BETTER_CLASSIC,
     BETTER_JOINT,
     CANNOT_TELL,
     CHANCE,
     PROJECTION,
     STEREO_SCALE,
     Gap,
+    Prediction,
+    _judge,
     _ratio_interval,
     compare,
     criterion,
@@ -131,6 +134,44 @@ def test_joint_foretells_a_step_count_it_never_saw(mixed_fit):
     for experiment in classic(mixed_fit.campaign).experiments:
         assert seen[experiment.experiment] == pytest.approx(experiment.deg_per_step, rel=1e-12)
     json.dumps(held.as_json(), allow_nan=False)
+
+
+def test_scores_of_predictions_by_hand():
+    """Two folds of two: errors of the classic 3, 1, -2, -4 and of the joint 0.3, 0.1, -0.2, -0.4, all with u = 1."""
+    told = []
+    for e, (fold, direction, error) in enumerate(
+        (("a", "left", 3), ("a", "left", 1), ("b", "up", -2), ("b", "up", -4))
+    ):
+        told.append(Prediction(e, fold, direction, 100, 6.0 + error, 6.0, 1.0, 6.0 + 0.9 * error, 1.0))
+    held = _judge("steps", told, np.array([100, 200]), {})
+    assert held.classic.rms_deg == pytest.approx(np.sqrt(30 / 4)) and held.joint.rms_deg == pytest.approx(
+        np.sqrt(0.075)
+    )
+    # Means of the blocks: 2 and -3, a tenth of them for the joint.
+    assert held.classic.rms_block_deg == pytest.approx(np.sqrt(6.5)) and held.ratio == pytest.approx(10.0)
+    assert (held.classic.coverage, held.joint.coverage) == (0.25, 1.0)
+    for score, errors in ((held.classic, (3, 1, -2, -4)), (held.joint, (0.3, 0.1, -0.2, -0.4))):
+        density = [np.exp(-0.5 * x * x) / np.sqrt(2 * np.pi) for x in errors]
+        assert score.log_density == pytest.approx(np.mean(np.log(density)))
+    assert held.verdict == CANNOT_TELL and "2 blocks" in held.reason
+
+
+@pytest.mark.parametrize("verdict", [BETTER_JOINT, BETTER_CLASSIC])
+def test_the_better_predictor_is_named(verdict):
+    """Eight blocks; the joint's errors are a tenth of the classic's, or the reverse."""
+    errors = np.random.default_rng(1).normal(size=8)
+    near, far = 6.0 + 0.9 * errors, np.full(8, 6.0)
+    if verdict == BETTER_CLASSIC:
+        near, far = far, near
+    told = [
+        Prediction(e, f"fold {e}", "left", 100, 6.0 + error, float(far[e]), 1.0, float(near[e]), 1.0)
+        for e, error in enumerate(errors)
+    ]
+    held = _judge("steps", told, np.array([100, 200]), {})
+    assert held.verdict == verdict
+    assert held.ratio == pytest.approx(10.0 if verdict == BETTER_JOINT else 0.1)
+    # Proportional errors leave no doubt about their ratio; the correlation is 1 but for rounding.
+    assert held.interval95 == pytest.approx((held.ratio, held.ratio), rel=1e-6)
 
 
 def test_left_out_spots_teach_nothing(mixed_fit):

@@ -246,6 +246,18 @@ def test_home_offsets():
     assert np.std(offsets[1:]) == pytest.approx(HOME_SD_DEG, rel=4 / np.sqrt(2 * 798))
 
 
+def test_homing_ends_on_the_side_that_it_states():
+    """Reached left or up a mirror lags by half the play, reached right or down it leads by as much (DESIGN 3.1)."""
+    rig = make_rig(truth_u=0.0)
+    truth = draw_truth(rig, np.random.default_rng(0))
+    known = {f"stop_sd_deg.{d}": 0.0 for d in DIRECTION_SIGNS}
+    known |= {"backlash_deg.pan": 1.0, "backlash_deg.tilt": 0.6, "tilt_zero_deg": 0.25}
+    truth = replace(truth, parameters=truth.parameters | known)
+    for sides, angles_deg in ((("left", "up"), (-0.5, -0.05)), (("right", "down"), (0.5, 0.55))):
+        found = simulate(rig, [PlanStep(0, "home", 0, 0)], 1, truth, home_approach=sides).truth
+        assert found.mirror_angles_deg[0] == pytest.approx(angles_deg, abs=1e-12)
+
+
 def test_unknown_approach_is_uniform_in_the_band():
     """Mirror angles after homing with unknown approach fill the band of width b around mid-play."""
     rig = make_rig(truth_u=0.0)

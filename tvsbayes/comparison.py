@@ -710,7 +710,8 @@ def _ratio_interval(first: np.ndarray, second: np.ndarray) -> tuple[float, float
     n = len(first)
     ratio = np.sqrt(np.sum(first**2) / np.sum(second**2))
     correlation = first @ second / np.sqrt(np.sum(first**2) * np.sum(second**2))
-    k = 1 + 2 * (1 - correlation**2) * stats.t.ppf(0.975, n - 1) ** 2 / (n - 1)
+    # Of proportional errors the correlation may exceed 1 by rounding.
+    k = 1 + 2 * max(0.0, 1 - correlation**2) * stats.t.ppf(0.975, n - 1) ** 2 / (n - 1)
     root = np.sqrt(k**2 - 1)
     return float(ratio * np.sqrt(k - root)), float(ratio * np.sqrt(k + root))
 

@@ -1,0 +1,181 @@
+"""Verdicts on chains whose quality is known, and summaries of draws whose distribution is (DESIGN 4.3).
+
+No fit: chains are drawn, so that every limit is crossed alone, and nothing is compiled but a batch or two.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from tvsbayes import posterior
+from tvsbayes.model import INDEX, NAMES
+from tvsbayes.posterior import Chain, Posterior, Target, Transport, diagnose, propagated
+
+WALKERS, STEPS = 64, 400
+RATIO, BACKLASH = INDEX["degrees_per_step.pan"], INDEX["backlash_deg.pan"]
+STRETCH = 0.3
+"""Log of the factor on the first coordinate per unit of the second: the Jacobian of the map is exp(0.3 w_2)."""
+AT_MODE = 7.0
+SIGMAS = 5.0
+
+
+def route() -> Transport:
+    """The map z_1 = w_1 exp(0.3 w_2), z_2 = w_2 at two of the parameters."""
+    stretch = np.array([[0.0, STRETCH], [0.0, 0.0]])
+    none = np.zeros((0, 2, 2))
+    return Transport(np.zeros(len(NAMES)), np.array([RATIO, BACKLASH]), np.eye(2), np.zeros(0, int), none, stretch)
+
+
+def fit() -> SimpleNamespace:
+    """What a diagnosis reads of a fit."""
+    free = np.isin(np.arange(len(NAMES)), [RATIO, BACKLASH])
+    return SimpleNamespace(free=free, log_density=AT_MODE, reference_pose_rad=np.zeros(2), space=None, arrays=None)
+
+
+def log_normal_density(z: np.ndarray) -> np.ndarray:
+    """The target in z: standard normal in both coordinates, `AT_MODE` at the mode."""
+    return AT_MODE - 0.5 * (z[..., RATIO] ** 2 + z[..., BACKLASH] ** 2)
+
+
+def chain_of(z: np.ndarray) -> Chain:
+    """A chain (steps, walkers, 2) of z as the sampler would hold it: w, and the density that `Target` gives it."""
+    w = np.stack([z[..., 0] * np.exp(-STRETCH * z[..., 1]), z[..., 1]], axis=-1)
+    log_density = -0.5 * np.sum(z**2, axis=-1) + STRETCH * w[..., 1]
+    accepted = np.full(z.shape[1], 0.4 * len(z))
+    return Chain(w, log_density, accepted, (), 0, 1.0)
+
+
+def independent(steps: int = STEPS) -> np.ndarray:
+    return np.random.default_rng(1).standard_normal((steps, WALKERS, 2))
+
+
+def autoregressive(steps: int, walkers: int, memory: float) -> np.ndarray:
+    """Standard normal with autocorrelation `memory`^lag along the first axis, shape (steps, walkers, 2)."""
+    fresh = np.random.default_rng(2).standard_normal((steps, walkers, 2))
+    values = [fresh[0]]
+    for one in fresh[1:]:
+        values.append(memory * values[-1] + np.sqrt(1 - memory**2) * one)
+    return np.array(values)
+
+
+@pytest.fixture
+def judged(monkeypatch):
+    """Diagnosis of a chain, its headlines those of the two parameters alone."""
+
+    def derived_at(fit, z, pose):
+        zero = np.zeros(z.shape[:2])
+        return SimpleNamespace(
+            physical=z, effective_deg_per_step=np.zeros((*z.shape[:2], 4)), effective_mirror_offset_mm=zero
+        )
+
+    monkeypatch.setattr(posterior, "derived_at", derived_at)
+    weights = np.random.default_rng(3).standard_normal(500)
+
+    def judge(chain: Chain) -> Posterior:
+        return diagnose(fit(), route(), SimpleNamespace(log_weights=weights), chain, 0)
+
+    return judge
+
+
+def test_the_density_of_walkers_is_the_models_times_the_jacobian(x64, monkeypatch):
+    def evaluate(z, space, arrays):
+        return SimpleNamespace(log_density=AT_MODE - 0.5 * (z[:, RATIO] ** 2 + z[:, BACKLASH] ** 2))
+
+    monkeypatch.setattr(posterior, "evaluate", evaluate)
+    w = np.random.default_rng(4).standard_normal((50, 2))
+    value = Target(fit(), route())(w)
+    y = w[:, 0] * np.exp(STRETCH * w[:, 1])
+    np.testing.assert_allclose(value, -0.5 * (y**2 + w[:, 1] ** 2) + STRETCH * w[:, 1], rtol=1e-12, atol=1e-12)
+    # As a density of w it has the mass of the density of z: 2 pi, on a grid that reaches 6 sds of the second.
+    one, two = np.meshgrid(np.linspace(-40, 40, 161), np.linspace(-6, 6, 25), indexing="ij")
+    value = Target(fit(), route())(np.column_stack([one.ravel(), two.ravel()]))
+    assert np.exp(value).sum() * 0.5 * 0.5 == pytest.approx(2 * np.pi, rel=1e-3)
+
+
+def test_independent_draws_have_converged_and_keep_their_density(judged):
+    found = judged(chain_of(independent()))
+    assert found.converged, found.convergence.missing
+    assert found.convergence.stuck_walkers == ()
+    np.testing.assert_allclose(found.log_density, log_normal_density(found.z), rtol=1e-12)
+
+
+def test_walkers_of_other_means_are_told_by_r_hat(judged):
+    """Means that scatter by a quarter of an sd: R-hat is sqrt(1 + 1/16) = 1.03, over the limit and under a lax one."""
+    z = independent()
+    z[..., 1] += 0.25 * np.random.default_rng(5).standard_normal(WALKERS)
+    missing = "; ".join(judged(chain_of(z)).convergence.missing)
+    value = float(re.search(r"R-hat of \S+ is ([\d.]+), wanted 1.01", missing)[1])
+    # The scatter of 64 means is known to 9 %.
+    assert value == pytest.approx(1.03, abs=0.015)
+
+
+def test_too_few_effective_draws_are_told(judged):
+    """80 of 100 steps of 64 walkers with memory 0.9, nineteen steps to an independent draw: 270, of the tails more."""
+    missing = "; ".join(judged(chain_of(autoregressive(100, WALKERS, 0.9))).convergence.missing)
+    for kind in ("bulk", "tail"):
+        value = int(re.search(rf"has (\d+) {kind} effective draws, wanted 1000", missing)[1])
+        assert 100 < value < 1000
+
+
+def test_a_chain_of_few_autocorrelation_times_is_told(judged):
+    """Memory 0.9: 19 steps to an independent draw, 16 of them in the chain, known badly from so few."""
+    missing = "; ".join(judged(chain_of(autoregressive(STEPS, WALKERS, 0.9))).convergence.missing)
+    value = int(re.search(r"steps are (\d+) autocorrelation times, wanted 50", missing)[1])
+    assert 8 < value < 40
+
+
+def test_a_walker_is_stuck_that_hardly_moves_or_lives_at_another_density(judged):
+    chain = chain_of(independent())
+    idle, away = chain.accepted.copy(), chain.log_density.copy()
+    idle[7] *= 0.2
+    away[:, 9] -= 40.0
+    for changed, stuck in ((replace(chain, accepted=idle), 7), (replace(chain, log_density=away), 9)):
+        convergence = judged(changed).convergence
+        assert convergence.stuck_walkers == (stuck,)
+        assert convergence.missing[-1] == f"stuck walkers: {stuck}"
+
+
+def test_monte_carlo_errors_are_those_of_draws_with_memory():
+    """AR(1) of memory 0.6: a mean of n draws is as good as one of n / 4; ends of the interval are +-1.96."""
+    memory, draws, chains = 0.6, 1000, 32
+    found = propagated(autoregressive(draws, chains, memory)[..., 0].T)
+    expected = np.sqrt((1 + memory) / (1 - memory) / (draws * chains))
+    assert found.mcse_mean == pytest.approx(expected, rel=0.15)
+    assert abs(found.mean) < SIGMAS * expected and found.sd == pytest.approx(1.0, abs=SIGMAS * float(found.mcse_sd))
+    np.testing.assert_allclose(found.interval95, [-1.959964, 1.959964], atol=SIGMAS * found.mcse_interval95.max())
+    assert found.mcse_interval95.max() < 0.05, "no error would be seen"
+
+
+def test_the_longer_tail_is_the_worse_known():
+    """Independent exponentials: a quantile q of n draws has the sd sqrt(p (1 - p) / n) e^q."""
+    draws = np.random.default_rng(6).exponential(size=(20, 1000))
+    found = propagated(draws)
+    p = np.array([0.025, 0.975])
+    exact = -np.log1p(-p)
+    expected = np.sqrt(p * (1 - p) / draws.size) * np.exp(exact)
+    np.testing.assert_allclose(found.mcse_interval95, expected, rtol=0.4)
+    np.testing.assert_array_less(np.abs(found.interval95 - exact), SIGMAS * expected)
+
+
+def test_lost_motion_takes_ratio_and_backlash_of_its_own_axis():
+    """200 steps of 0.06 deg take up 0.3 deg of play, two take 0.12 deg of it; every direction, by hand."""
+    physical = np.zeros((2, 3, len(NAMES)))
+    values = {"degrees_per_step.pan": 0.06, "ratio_contrast_deg_per_step.pan": 0.002, "backlash_deg.pan": 0.3}
+    values |= {"degrees_per_step.tilt": 0.07, "ratio_contrast_deg_per_step.tilt": 0.004, "backlash_deg.tilt": 0.5}
+    for name, value in values.items():
+        physical[..., INDEX[name]] = value
+    shape = physical.shape[:2]
+    draws = SimpleNamespace(
+        physical=physical, effective_deg_per_step=np.zeros((*shape, 4)), effective_mirror_offset_mm=np.zeros(shape)
+    )
+    known = Posterior(None, physical, np.zeros(shape), draws, None, 0, 0.0)
+    expected = {"left": (0.122, 0.3), "right": (0.118, 0.3), "up": (0.144, 0.5), "down": (0.136, 0.5)}
+    for direction, lost in expected.items():
+        found = known.lost_motion_deg(direction, np.array([2, 200]))
+        np.testing.assert_allclose(found.mean, lost, rtol=1e-12)
+        np.testing.assert_allclose(found.interval95, [lost, lost], rtol=1e-12)

@@ -1,0 +1,93 @@
+"""Predictive looks scatter as the rig does: stop errors by direction, home offsets by segment, play (DESIGN 3.1)."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from tvsbayes import posterior
+from tvsbayes.likelihood import ordered_spots
+from tvsbayes.model import INDEX, NAMES
+from tvsbayes.rigs import HOME_SD_DEG
+
+DRAWS = 2000
+SDS_DEG = {"left": 0.16, "right": 0.02, "up": 0.08, "down": 0.04}
+PLAY_SD_DEG = 0.11
+
+
+def variances_by_hand(moves, spot) -> tuple[float, float]:
+    """Variance of both mirror angles at a spot, deg^2: the last move that turned the axis, and the segment's homing."""
+    result = []
+    for axis, (positive, negative) in (("pan", ("left", "right")), ("tilt", ("up", "down"))):
+        number = spot.move
+        while not moves[number].pan_approach and getattr(moves[number], f"{axis}_steps") == getattr(
+            moves[number - 1], f"{axis}_steps"
+        ):
+            number -= 1
+        move, home = moves[number], HOME_SD_DEG**2 * (moves[spot.move].segment > 0)
+        if move.pan_approach:
+            side = getattr(move, f"{axis}_approach")
+            stop = SDS_DEG[side] ** 2 if side in SDS_DEG else (SDS_DEG[positive] ** 2 + SDS_DEG[negative] ** 2) / 2
+        else:
+            forward = getattr(move, f"{axis}_steps") > getattr(moves[number - 1], f"{axis}_steps")
+            stop = SDS_DEG[positive if forward else negative] ** 2
+        result.append(stop + home)
+    return result[0], result[1]
+
+
+@pytest.fixture(scope="module")
+def errors_deg(dozen):
+    """Angles that the looks taken again are off by, shape (draws, spots, 2), and the play's sd at each spot."""
+    spots = ordered_spots(dozen.campaign)
+    play_deg = np.zeros((len(spots), 2))
+    # Two spots of one segment: where the play stands is one place for both.
+    play_deg[[4, 5], 1] = PLAY_SD_DEG
+    fit = SimpleNamespace(
+        campaign=dozen.campaign,
+        arrays=dozen.arrays,
+        linearised=SimpleNamespace(play_sd_rad=np.radians(play_deg)),
+    )
+    physical = np.ones((DRAWS, len(NAMES)))
+    for name, sd in SDS_DEG.items():
+        physical[:, INDEX[f"stop_sd_deg.{name}"]] = sd
+    physical[:, INDEX["pixel_scale"]] = 0.0
+    caught = []
+
+    def looks(fit, z, stop_error_rad):
+        caught.append(np.degrees(stop_error_rad[:, : len(spots)]))
+        return np.zeros((len(z), len(spots), 4))
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(posterior, "looks", looks)
+        z = np.zeros((DRAWS, 1))
+        assert not posterior.looks_again(fit, z, physical, np.random.default_rng(4)).any()
+    return caught[0], play_deg
+
+
+def test_every_look_scatters_by_its_direction_its_homing_and_its_play(dozen, errors_deg):
+    errors, play_deg = errors_deg
+    spots = ordered_spots(dozen.campaign)
+    expected = np.array([variances_by_hand(dozen.campaign.moves, spot) for spot in spots]) + play_deg**2
+    assert len(np.unique(expected.round(9))) > 5, "the campaign does not tell the directions apart"
+    # A variance from n normal numbers has the relative standard error sqrt(2 / n); five of them.
+    np.testing.assert_allclose(errors.var(axis=0), expected, rtol=5 * np.sqrt(2 / DRAWS))
+    assert np.abs(errors.mean(axis=0)).max() < 5 * np.sqrt(expected.max() / DRAWS)
+
+
+def test_an_error_is_held_while_its_axis_stands(dozen, errors_deg):
+    errors, _ = errors_deg
+    spots, moves = ordered_spots(dozen.campaign), dozen.campaign.moves
+    held = 0
+    for row in range(1, len(spots)):
+        between = moves[spots[row - 1].move : spots[row].move + 1]
+        for axis, name in enumerate(("pan_steps", "tilt_steps")):
+            same = len({getattr(m, name) for m in between}) == 1 and not any(m.pan_approach for m in between[1:])
+            change = np.abs(errors[:, row, axis] - errors[:, row - 1, axis]).max()
+            if same and row not in (4, 6):
+                assert change < 1e-12
+                held += 1
+            elif not same:
+                assert change > 0
+    assert held >= 5
