@@ -177,8 +177,8 @@ def device(rows: list[dict]) -> tuple[str, bool]:
 
 def planted(rows: list[dict]) -> tuple[str, bool]:
     """One-line bugs that the test suite catches."""
-    caught = sum(bool(r["caught"]) for r in rows)
-    return f"{caught} of {len(rows)} caught", caught == len(rows)
+    last = {r["name"]: r["failed"] for r in rows if r["name"] != "clean"}
+    return f"{sum(last.values())} of {len(last)} that were planted are caught", all(last.values())
 
 
 LINES = (
