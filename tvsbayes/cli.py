@@ -636,7 +636,7 @@ def report(
     from tvsbayes.certificate import dcc_bytes
     from tvsbayes.comparison import gather
     from tvsbayes.model import use_compilation_cache
-    from tvsbayes.report import print_to_pdf, report_html
+    from tvsbayes.report import print_to_pdf, report_html, validation_lines
 
     use_compilation_cache()
     limits = {"limit_deg_per_step": limit_deg_per_step, "limit_mm": limit_mm}
@@ -655,6 +655,9 @@ def report(
     lines = [
         f"{c.quantity} within {c.limit:g} {c.unit}: {c.verdict} (P = {c.probability:.3f})" for c in evidence.criteria
     ]
+    validation = document.get("validation")
+    if validation is not None and not validation["passed"]:
+        lines.insert(0, validation_lines(validation)[0])
     text = "\n".join([*lines, f"written: {', '.join(files.values())}"])
     _finish({"criteria": [asdict(c) for c in evidence.criteria], "files": files}, text, as_json)
     if any(c.verdict != "met" for c in evidence.criteria):

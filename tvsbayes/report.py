@@ -669,8 +669,9 @@ def _verdict(e: Evidence) -> tuple[str, str]:
     if not e.fit["converged"]:
         return "NOT CONVERGED: the numbers below must not be used", "not-met"
     validation = e.fit.get("validation")
-    if validation is not None and not validation["passed"]:
-        return f"{validation_lines(validation)[0]}; no limit is judged on such numbers", "not-met"
+    failed = "" if validation is None or validation["passed"] else validation_lines(validation)[0] + ". "
+    if failed and not e.criteria:
+        return f"{failed}No limit was stated", "cannot-tell"
     if not e.criteria:
         return (
             (
@@ -689,7 +690,8 @@ def _verdict(e: Evidence) -> tuple[str, str]:
             names = ", ".join(c.quantity for c in part)
             told.append((verdict, f"{verdict}: {names} within {limit:.3g} {unit} (P at least {least:.3f})"))
     text = "; ".join(sentence for _, sentence in told)
-    return text[0].upper() + text[1:], told[0][0].replace(" ", "-")
+    judged = "With that factor: " if failed else ""
+    return failed + judged + text[0].upper() + text[1:], told[0][0].replace(" ", "-")
 
 
 def _numbers(e: Evidence) -> list[Number]:
