@@ -55,9 +55,7 @@ def clean(mounted_rig) -> joint.JointFit:
 
 def with_residual(fit: joint.JointFit, residual: np.ndarray) -> joint.JointFit:
     """The same fit with other residuals, shape (n, 4)."""
-    linearised = eqx.tree_at(lambda lin: lin.residual, fit.linearised, residual)
-    spots = joint.linear_spots(linearised, fit.arrays, own_columns(fit))
-    return replace(fit, linearised=linearised, information=stop_information(spots))
+    return replace(fit, linearised=eqx.tree_at(lambda lin: lin.residual, fit.linearised, residual))
 
 
 def own_columns(fit: joint.JointFit) -> np.ndarray:
@@ -83,16 +81,16 @@ def test_what_the_fit_can_follow_is_not_seen(clean):
     residual = drawn(clean, 1)
     offset = own_columns(clean) @ (0.3 * np.random.default_rng(2).standard_normal(len(NAMES)))
     before, after = (validate(with_residual(clean, r)).tests for r in (residual, residual + offset))
-    first, second = ({t.name: t for t in tests if not t.name.startswith("single")} for tests in (before, after))
-    assert len(first) >= 7
+    first, second = ({t.name: t for t in tests} for tests in (before, after))
+    assert len(first) >= 8
     for name, test in first.items():
         # Directions that the spots tell less than 1e-4 prior sds are not followed: 0.3 sd of 50 of them.
         assert second[name].chi2 == pytest.approx(test.chi2, abs=0.3), name
 
 
 def test_p_values_are_uniform_and_false_alarms_rare(clean):
-    """Forty clean campaigns: one-place tests by Kolmogorov-Smirnov, all by the number of alarms, both at 1e-4."""
-    found = [validate(with_residual(clean, drawn(clean, seed))) for seed in range(40)]
+    """Twenty-five clean campaigns: one-place tests by Kolmogorov-Smirnov, all by the number of alarms, both at 1e-4."""
+    found = [validate(with_residual(clean, drawn(clean, seed))) for seed in range(25)]
     alarms = sum(not v.passed for v in found)
     assert alarms <= stats.binom.isf(1e-4, len(found), VALIDATION_LEVEL)
     by_name: dict[str, list[ValidationTest]] = {}

@@ -19,7 +19,7 @@ from tvsbayes.calibration import INPUT_NAMES, NORMAL_95, Calibration, calibratio
 from tvsbayes.campaign import Move
 from tvsbayes.classic import DIRECTIONS, four_point_ratios, observed_stops, select_experiments, separation
 from tvsbayes.joint import Derived, JointFit, linear_spots
-from tvsbayes.likelihood import leave_one_out_chi2, ordered_spots, standard_deviations_without, stop_information
+from tvsbayes.likelihood import StopGroup, ordered_spots, standard_deviations_without, stop_information
 from tvsbayes.model import INDEX, KINDS, NAMES, NOISE_NAMES, RECEIVER_NAMES, RIG_NAMES
 from tvsbayes.posterior import Posterior, ideal_pixels
 from tvsbayes.rigs import HARMONIC_PRIORS, STEREO_PARAMETER_NAMES
@@ -1029,16 +1029,17 @@ def validate(fit: JointFit) -> Validation:
     fisher, cross = information.fisher[:p, :p], information.fisher[:p, p:]
     values, vectors = np.linalg.eigh(fisher)
     kept = values > KNOWN_DIRECTION
-    followed = (vectors[:, kept] / values[kept]) @ (vectors[:, kept].T @ cross)
+    inverse = (vectors[:, kept] / values[kept]) @ vectors[:, kept].T
+    followed = inverse @ cross
     whole = np.diag(information.fisher)[p:]
     scale = 1 / np.sqrt(np.where(whole > 0, whole, 1.0))
+    found = [_single_spots(fit, information.groups, inverse, inverse @ score[:p])]
     score = (score[p:] - followed.T @ score[:p]) * scale
     variance = (information.fisher[p:, p:] - cross.T @ followed) * np.outer(scale, scale)
     _, gradient = _headline_gradients(fit, _moved_directions(fit))
     sd = np.sqrt(np.einsum("qi,ij,qj->q", gradient, fit.covariance, gradient))
     moved_by = gradient @ fit.covariance @ cross * scale / sd[:, None]
 
-    found = [_single_spots(fit)]
     start = 0
     for defect in defects:
         answers = []
@@ -1072,19 +1073,40 @@ class _Answer:
     places: int = 1
 
 
-def _single_spots(fit: JointFit) -> _Answer:
-    """The spot that all others foretell worst; how far it moves a headline is not asked (`--robust` drops it)."""
+def _single_spots(fit: JointFit, groups: Sequence[StopGroup], followed: np.ndarray, shift: np.ndarray) -> _Answer:
+    """The spot that all others foretell worst; how far it moves a headline is not asked (`--robust` drops it).
+
+    As `likelihood.leave_one_out_chi2`, less what the fit can follow.
+
+    Args:
+        fit: the fit.
+        groups: its stops; the first columns of their Jacobians belong to the coordinates.
+        followed: inverse information of the directions that the fit can follow, shape (p, p).
+        shift: step along them that the residuals still ask for, shape (p,).
+    """
     spots = ordered_spots(fit.campaign)
+    p = len(shift)
+    errors = np.concatenate([(g.residual - g.jacobian[:, :p] @ shift).reshape(-1, 4) for g in groups])
+    blocks = []
+    for group in groups:
+        own = group.jacobian[:, :p]
+        left = group.precision - own @ followed @ own.T
+        blocks += [left[k : k + 4, k : k + 4] for k in range(0, len(left), 4)]
+    values, vectors = np.linalg.eigh(np.stack(blocks))
+    kept = values > ABSORBED
+    along = np.einsum("nij,ni->nj", vectors, errors)
+    distances = np.sum(np.where(kept, along**2 / np.where(kept, values, 1.0), 0.0), axis=1)
     readings = np.asarray(fit.arrays.spots.has_aperture * fit.arrays.spots.valid)[: len(spots)]
-    distances = leave_one_out_chi2(fit.information)
-    chances = stats.chi2.logsf(distances, 3 + readings)
+    # Without a reading the fourth component is empty.
+    dof = np.maximum(kept.sum(axis=1) - (readings == 0), 1)
+    chances = stats.chi2.logsf(distances, dof)
     worst = int(np.argmin(chances))
     return _Answer(
         log_p=float(chances[worst] + np.log(len(spots))),
         name="single spots disagree with all others",
         where=f"most of all spot {spots[worst].spot}",
         chi2=float(distances[worst]),
-        dof=3 + int(readings[worst]),
+        dof=int(dof[worst]),
         shift_sd=0.0,
         places=len(spots),
     )
