@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from types import SimpleNamespace
 
 import equinox as eqx
 import jax
@@ -19,6 +20,7 @@ from test_report import small_summary
 
 from tvsbayes import joint
 from tvsbayes.campaign import PlanStep
+from tvsbayes.comparison import Criterion
 from tvsbayes.information import (
     VALIDATION_LEVEL,
     Validation,
@@ -29,7 +31,7 @@ from tvsbayes.information import (
 )
 from tvsbayes.likelihood import ordered_spots, stop_information
 from tvsbayes.model import INDEX, NAMES, NOISE_NAMES
-from tvsbayes.report import fit_text, validation_lines
+from tvsbayes.report import _verdict, fit_text, validation_lines
 from tvsbayes.simulation import simulate
 
 PAN = (0, 70, 141, 200, 142, 71)
@@ -99,6 +101,9 @@ def test_p_values_are_uniform_and_false_alarms_rare(clean):
             by_name.setdefault(test.name, []).append(test)
     drift = [t.p for t in by_name["the cameras drifted (pose or focal length)"]]
     assert stats.kstest(drift, "uniform").pvalue > 1e-4
+    # Cosine and sine; a shift and two gradients: nothing of them can be followed, nothing is counted twice.
+    for name, dof in (("the gears have a transmission error", 2), ("one camera moved against the other (epipolar)", 3)):
+        assert {t.dof for t in by_name[name]} == {dof}
     for name, tests in by_name.items():
         assert len(tests) == len(found), name
         # Shared levels are conservative: small p at most as often as they say.
@@ -195,6 +200,17 @@ def test_no_reader_of_the_text_can_miss_a_failure():
     passed = replace(FAILED, passed=True, cause="", inflation=1.0, tests=(replace(FAILED.tests[0], failed=False),))
     text = fit_text(replace(small_summary(), validation=passed))
     assert "VALIDATION" not in text and "validation: no sign of a model error in 1 tests" in text
+
+
+def test_no_reader_of_the_report_can_miss_a_failure():
+    fit = {"converged": True, "validation": FAILED.as_json()}
+    warning = validation_lines(FAILED.as_json())[0]
+    met = Criterion("ratio left", 1e-3, "deg/step", 0.99, "met")
+    for criteria, kind in (((), "cannot-tell"), ((met,), "met")):
+        text, shown = _verdict(SimpleNamespace(fit=fit, criteria=criteria))
+        assert text.startswith(warning) and shown == kind
+    text, _ = _verdict(SimpleNamespace(fit={"converged": True}, criteria=(met,)))
+    assert text.startswith("Met")
 
 
 def test_the_entry_obeys_the_schema():
