@@ -505,7 +505,7 @@ def test_a_failed_validation_is_declared_with_its_factor():
         "tests": [],
     }
     root = ET.fromstring(dcc_bytes(campaign, {**document, "validation": failed}, issued=ISSUED))
-    assert "multiply every one of them by 3.25" in declared(root)["validation"]
+    assert "multiply every one of them by 3.25" in declared(root)["validation"][0]
     for validation in (None, {**failed, "passed": True}):
         root = ET.fromstring(dcc_bytes(campaign, {**document, "validation": validation}, issued=ISSUED))
         assert "validation" not in declared(root)
