@@ -101,9 +101,6 @@ def test_p_values_are_uniform_and_false_alarms_rare(clean):
             by_name.setdefault(test.name, []).append(test)
     drift = [t.p for t in by_name["the cameras drifted (pose or focal length)"]]
     assert stats.kstest(drift, "uniform").pvalue > 1e-4
-    # Cosine and sine; a shift and two gradients: where the fit follows none of them, all of them count.
-    for name, dof in (("the gears have a transmission error", 2), ("one camera moved against the other (epipolar)", 3)):
-        assert max(t.dof for t in by_name[name]) == dof
     for name, tests in by_name.items():
         assert len(tests) == len(found), name
         # Shared levels are conservative: small p at most as often as they say.
