@@ -118,6 +118,46 @@ def judged(draws, centre, prior_draws, parameters: Mapping[str, float], pose_rad
     return result
 
 
+def coordinates(space, truth) -> np.ndarray:
+    """Coordinates z of a true rig: the inverse of `ParameterSpace.physical`, by scipy's distributions."""
+    from scipy.stats import halfnorm, norm
+
+    from tvsbayes.model import KINDS, RIG_NAMES
+
+    z = []
+    for name, value, u, kind in zip(RIG_NAMES, space.value, space.u, space.kind, strict=True):
+        true = truth.parameters[name]
+        if u == 0:
+            z.append(0.0)
+        elif KINDS[int(kind)] == "half-normal":
+            z.append(norm.isf(halfnorm.sf(true, scale=u)))
+        elif KINDS[int(kind)] == "log-normal":
+            z.append(np.log(true / value) / u)
+        else:
+            z.append((true - value) / u)
+    stereo = np.linalg.pinv(np.asarray(space.stereo_root)) @ (truth.stereo.vector - np.asarray(space.stereo_mean))
+    return np.concatenate([z, stereo])
+
+
+def fit_from_truth(campaign, truth):
+    """`joint.fit` without its search: Newton steps from the true rig to the mode, a third of the time.
+
+    The mode, its covariance and every diagnosis are those of the ordinary fit, to which it falls back where the steps
+    do not settle.
+    """
+    import jax
+
+    from tvsbayes import joint
+
+    with jax.enable_x64(True):
+        problem = joint.Problem(campaign, campaign.rig)
+        z = np.where(problem.free, np.clip(coordinates(problem.space, truth), -4.0, 4.0), 0.0)
+        mode = joint.newton_mode(problem.objective, z, problem.free, problem.curvature(z))
+        if not mode.problems:
+            return joint._result(campaign, problem, mode, np.ones(len(problem.spots), dtype=bool), 0)
+    return joint.fit(campaign)
+
+
 def _pin(cores) -> None:
     os.sched_setaffinity(0, {cores.get()})
 

@@ -493,3 +493,19 @@ def test_ptbs_schema_where_it_is_at_hand():
     data = dcc_bytes(campaign, document | predicted_tables(), issued=ISSUED, report=b"<html/>")
     found = check_dcc(data, Path(os.environ["TVSBAYES_DCC_SCHEMA"]))
     assert found.valid is True, found
+
+
+def test_a_failed_validation_is_declared_with_its_factor():
+    campaign, document = campaign_and_fit()
+    failed = {
+        "passed": False,
+        "level": 0.01,
+        "cause": "the cameras moved: from spot 9 on",
+        "inflation": 3.25,
+        "tests": [],
+    }
+    root = ET.fromstring(dcc_bytes(campaign, {**document, "validation": failed}, issued=ISSUED))
+    assert "multiply every one of them by 3.25" in declared(root)["validation"][0]
+    for validation in (None, {**failed, "passed": True}):
+        root = ET.fromstring(dcc_bytes(campaign, {**document, "validation": validation}, issued=ISSUED))
+        assert "validation" not in declared(root)

@@ -1044,6 +1044,10 @@ def _administrative(
     state("accreditation", NOT_ACCREDITED)
     state("traceability", *traceability(campaign))
     state("scope", ITEM_ONLY)
+    validation = document.get("validation")
+    if validation is not None and not validation["passed"]:
+        text = f"VALIDATION FAILED: {validation['cause']}. Uncertainties are stated as fitted; multiply every one of "
+        state("validation", f"{text}them by {validation['inflation']:.2f}.")
     if header.get("synthetic"):
         state("synthetic data", "The campaign was simulated: no instrument was measured.")
     if not recorded:

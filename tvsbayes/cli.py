@@ -648,7 +648,7 @@ def report(
     from tvsbayes.certificate import check_dcc, dcc_bytes
     from tvsbayes.comparison import gather
     from tvsbayes.model import use_compilation_cache
-    from tvsbayes.report import print_to_pdf, report_html
+    from tvsbayes.report import print_to_pdf, report_html, validation_lines
 
     use_compilation_cache()
     limits = {"limit_deg_per_step": limit_deg_per_step, "limit_mm": limit_mm}
@@ -674,6 +674,9 @@ def report(
         verdict = {True: "valid", False: "NOT VALID", None: "could not be checked"}[checked.valid]
         lines += [f"DCC by {checked.tool} against {dcc_schema}: {verdict}", *checked.messages[:DCC_MESSAGES]]
         result["dcc_schema"] = asdict(checked)
+    validation = document.get("validation")
+    if validation is not None and not validation["passed"]:
+        lines.insert(0, validation_lines(validation)[0])
     text = "\n".join([*lines, f"written: {', '.join(files.values())}"])
     _finish(result, text, as_json)
     if any(c.verdict != "met" for c in evidence.criteria) or (checked is not None and not checked.valid):

@@ -929,15 +929,17 @@ def gather(
     cell = MAP_CELLS // 2, MAP_CELLS // 2, ranges.index(range_mm)
     found = {name: distance[:, *cell] for name, distance in maps.distance_mm.items()}
     criteria = []
+    # Limits are judged with the uncertainty that a failed validation leaves (`information.Validation`).
+    inflation = float((fit.get("validation") or {}).get("inflation", 1.0))
     if limit_deg_per_step is not None:
         draws = stored_ratios(campaign)
         for k, direction in enumerate(DIRECTIONS):
             estimate = fit["effective_deg_per_step"].get(direction)
             if estimate is not None:
-                errors = draws[:, k] - estimate["value"]
+                errors = inflation * (draws[:, k] - estimate["value"])
                 criteria.append(criterion(f"ratio {direction}", errors, limit_deg_per_step, "deg/step"))
     if limit_mm is not None:
-        criteria.append(criterion(f"3D point at {range_mm:g} mm", found["joint"], limit_mm, "mm"))
+        criteria.append(criterion(f"3D point at {range_mm:g} mm", inflation * found["joint"], limit_mm, "mm"))
     ray = calibration.ray(*middle, ("left", "up"))
     point = np.asarray(ray.origin_mm) + range_mm * np.asarray(ray.direction)
     reading = calibration.reading(point)

@@ -487,6 +487,28 @@ class JointFit:
         return NAMES
 
 
+def linear_spots(lin: Linearised, arrays: CampaignArrays, jacobian: np.ndarray) -> LinearSpots:
+    """A linearised campaign as the smoother reads it.
+
+    Args:
+        lin: without padding.
+        arrays: the campaign it comes from.
+        jacobian: d(prediction)/d(whatever is asked about), shape (spots, 4, columns).
+    """
+    count = len(lin.residual)
+    spots = jax.tree.map(lambda x: np.asarray(x)[:count], arrays.spots)
+    home_variance = np.where(spots.homed, np.radians(HOME_SD_DEG) ** 2, 0.0)[:, None] * np.ones(2)
+    segment = spots.new_segment[:, None] & np.ones(2, dtype=bool)
+    return LinearSpots(
+        residual=lin.residual,
+        load=np.concatenate([lin.slope, lin.slope, lin.slope * lin.play_sd_rad[:, None, :]], axis=2),
+        renewed=np.concatenate([spots.redraw, segment, segment], axis=1),
+        variance=np.concatenate([lin.stop_variance, home_variance, np.ones((count, 2))], axis=1),
+        jacobian=jacobian,
+        move=spots.move_index,
+    )
+
+
 class Problem:
     """One campaign in front of the compiled functions."""
 
@@ -557,17 +579,7 @@ class Problem:
         count = len(self.spots)
         full = linearise(jnp.asarray(z), self.space, self.arrays)
         lin = jax.tree.map(lambda x: np.asarray(x)[:count], full)
-        spots = jax.tree.map(lambda x: np.asarray(x)[:count], self.arrays.spots)
-        home_variance = np.where(spots.homed, np.radians(HOME_SD_DEG) ** 2, 0.0)[:, None] * np.ones(2)
-        segment = spots.new_segment[:, None] & np.ones(2, dtype=bool)
-        return lin, LinearSpots(
-            residual=lin.residual,
-            load=np.concatenate([lin.slope, lin.slope, lin.slope * lin.play_sd_rad[:, None, :]], axis=2),
-            renewed=np.concatenate([spots.redraw, segment, segment], axis=1),
-            variance=np.concatenate([lin.stop_variance, home_variance, np.ones((count, 2))], axis=1),
-            jacobian=np.where(self.held, 0.0, -lin.residual_jacobian),
-            move=spots.move_index,
-        )
+        return lin, linear_spots(lin, self.arrays, np.where(self.held, 0.0, -lin.residual_jacobian))
 
     def curvature(self, z: np.ndarray) -> np.ndarray:
         """Expected information of the coordinates: Fisher's of geometry and stereo, measured for the noise."""

@@ -605,8 +605,7 @@ def stop_information(spots: LinearSpots) -> StopInformation:
     targets = np.concatenate([spots.residual[..., None], spots.jacobian], axis=2)
     slices = _group_rows(spots.renewed)
     mean, covariance = np.zeros((states, 1 + parameters)), np.zeros((states, states))
-    fisher = np.zeros((parameters, parameters))
-    forward = []
+    forward, aheads = [], []
     for rows in slices:
         keep = ~spots.renewed[rows.start]
         mean = mean * keep[:, None]
@@ -617,7 +616,7 @@ def stop_information(spots: LinearSpots) -> StopInformation:
         inverse = linalg.cho_solve(linalg.cho_factor(covariance_ahead), np.eye(len(load)))
         gain = covariance @ load.T @ inverse
         whitened = inverse @ ahead
-        fisher += ahead[:, 1:].T @ whitened[:, 1:]
+        aheads.append(ahead[:, 1:])
         forward.append((keep, load, inverse, gain, whitened))
         mean = mean + gain @ ahead
         covariance = covariance - gain @ load @ covariance
@@ -633,6 +632,9 @@ def stop_information(spots: LinearSpots) -> StopInformation:
         through = np.eye(states) - gain @ load
         score = (load.T @ disturbance + score) * keep[:, None]
         information = (load.T @ inverse @ load + through.T @ information @ through) * np.outer(keep, keep)
+    # One product of all rows: with many columns the sum over the groups would cost more than everything else.
+    whitened = np.concatenate([np.zeros((0, parameters)), *(entry[-1][:, 1:] for entry in forward)])
+    fisher = np.concatenate([np.zeros((0, parameters)), *aheads]).T @ whitened
     return StopInformation(tuple(groups[::-1]), fisher)
 
 

@@ -212,6 +212,12 @@ def fit_text(summary: FitSummary) -> str:
     title = f"joint estimator ({kind}) at pan {pose['pan']:.2f} deg, tilt {pose['tilt']:.2f} deg"
     lines = [text_table(title, ["quantity", "value(u)", "unit", "95 % interval", "set by"], rows)]
     lines.append(f"chi2 {summary.chi2:.1f} for {summary.dof:.1f} degrees of freedom")
+    if summary.validation is not None:
+        told = validation_lines(summary.validation.as_json())
+        lines += told
+        if not summary.validation.passed:
+            # Above and below the table: who reads either end of the text must meet it.
+            lines.insert(0, told[0])
     predicted = [f"{d} {concise(e.value, e.sd)}" for d, e in summary.classic_predicted.items() if e is not None]
     if predicted:
         lines.append(f"the classic estimator should report, deg/step: {', '.join(predicted)}")
@@ -234,6 +240,34 @@ def fit_text(summary: FitSummary) -> str:
         listed = ", ".join(map(str, summary.suspect_spots[:20]))
         lines.append(f"spots that disagree with all others: {listed}; look at them, or fit with --robust")
     return "\n".join(lines)
+
+
+def validation_lines(validation: Mapping[str, object]) -> list[str]:
+    """What the residuals say of the model: one line where they agree, else the warning and every test that failed.
+
+    Args:
+        validation: the entry of `fit.json`.
+    """
+    tests = validation["tests"]
+    if validation["passed"]:
+        if not tests:
+            return ["validation: nothing can be asked of so few spots"]
+        least = f"least p {tests[0]['p']:.2g} ({tests[0]['name']})"
+        return [
+            f"validation: no sign of a model error in {len(tests)} tests, {least}; shapes that gears, mirrors and "
+            "play can take themselves are not seen"
+        ]
+    warning = f"VALIDATION FAILED: {validation['cause']} (p {tests[0]['p']:.1e}); the table is as fitted, multiply "
+    warning += f"every u and half-width in it by {validation['inflation']:.2f}"
+    return [
+        warning,
+        *(
+            f"validation: {t['name']}, {t['where']}: chi2 {t['chi2']:.1f} for {t['dof']}, p {t['p']:.1e}; would move a "
+            f"headline by {t['shift_sd']:.1f} of its u"
+            for t in tests
+            if t["failed"]
+        ),
+    ]
 
 
 def sampling_line(sampling: dict[str, object]) -> str:
@@ -637,6 +671,10 @@ def _verdict(e: Evidence) -> tuple[str, str]:
     """One line, and the class that colours it."""
     if not e.fit["converged"]:
         return "NOT CONVERGED: the numbers below must not be used", "not-met"
+    validation = e.fit.get("validation")
+    failed = "" if validation is None or validation["passed"] else validation_lines(validation)[0] + ". "
+    if failed and not e.criteria:
+        return f"{failed}No limit was stated", "cannot-tell"
     if not e.criteria:
         return (
             (
@@ -655,7 +693,8 @@ def _verdict(e: Evidence) -> tuple[str, str]:
             names = ", ".join(c.quantity for c in part)
             told.append((verdict, f"{verdict}: {names} within {limit:.3g} {unit} (P at least {least:.3f})"))
     text = "; ".join(sentence for _, sentence in told)
-    return text[0].upper() + text[1:], told[0][0].replace(" ", "-")
+    judged = "With that factor: " if failed else ""
+    return failed + judged + text[0].upper() + text[1:], told[0][0].replace(" ", "-")
 
 
 def _numbers(e: Evidence) -> list[Number]:
@@ -667,6 +706,9 @@ def _numbers(e: Evidence) -> list[Number]:
         x = ratios[worst]
         u = 0.5 * (x["interval95"][1] - x["interval95"][0])
         note = f"effective deg/step; U = {u:.2g}, p = 95 %, k = {u / x['sd']:.2f}" if x["sd"] > 0 else "fixed"
+        factor = (e.fit.get("validation") or {}).get("inflation", 1.0)
+        if factor > 1:
+            note += f"; validation failed: use {factor:.2f} U = {factor * u:.2g}"
         numbers.append(Number(f"least certain ratio: {worst}", concise(x["value"], x["sd"]), note))
     if e.classic is not None and ratios:
         off = {
@@ -700,6 +742,9 @@ def _traceable(header: Mapping[str, object]) -> str:
 
 def _warnings(e: Evidence) -> list[str]:
     found = [str(text) for text in e.fit["problems"]]
+    validation = e.fit.get("validation")
+    if validation is not None and not validation["passed"]:
+        found += validation_lines(validation)
     if e.fit["estimator"] == "laplace":
         found.append(
             "Intervals are those of the Laplace approximation at the mode; with few stops of a direction that of the "
@@ -987,6 +1032,15 @@ def _residuals(e: Evidence) -> Section:
 
 def _validation(e: Evidence) -> Section:
     text, items, tables = [], [], []
+    validation = e.fit.get("validation")
+    if validation is None:
+        text.append("The results hold no tests for model errors: run the command fit again.")
+    else:
+        text.append(
+            f"A clean campaign fails the tests below with a probability of {100 * validation['level']:g} %, all "
+            f"together. Factor on every u: {validation['inflation']:.2f}."
+        )
+        tables.append(_tests(validation))
     sampling = e.fit.get("sampling")
     if sampling is None:
         text.append("The posterior was not sampled: intervals are those of the Laplace approximation.")
@@ -1060,6 +1114,23 @@ def _held_out(held: Mapping[str, object], tables: list[TableView]) -> str:
         )
     )
     return f"Held-out experiments: {held['verdict']}: {held['reason']}."
+
+
+def _tests(validation: Mapping[str, object]) -> TableView:
+    """Every test for a model error, the least p first."""
+    rows = [
+        [
+            t["name"],
+            t["where"],
+            f"{t['chi2']:.1f}",
+            str(t["dof"]),
+            f"{t['p']:.2g}",
+            "FAILED" if t["failed"] else "no sign",
+        ]
+        for t in validation["tests"]
+    ]
+    columns = ["sign of", "most at", "chi-square", "degrees of freedom", "p, all places", "verdict"]
+    return TableView("Tests for errors that the model does not have", columns, rows)
 
 
 def _maps(e: Evidence) -> Section:
