@@ -37,6 +37,8 @@ FLUSH_FRAMES_MAX = 250
 FLUSH_MAX_S = 10.0
 """The longest emptying of buffers, in frames and in seconds."""
 STREAM_TIMEOUT_MS = 5_000
+VIEWER_TIMEOUT_S = 10.0
+"""A viewer of the virtual camera that takes nothing for so long has gone."""
 JPEG_QUALITY = 97
 
 
@@ -344,6 +346,9 @@ class VirtualCamera:
         camera = self
 
         class Handler(BaseHTTPRequestHandler):
+            # Of the connection: without it a viewer that neither reads nor closes would hold `__exit__` for ever.
+            timeout = VIEWER_TIMEOUT_S
+
             def do_GET(self) -> None:
                 camera._serve(self)
 

@@ -356,7 +356,9 @@ def write_truth(folder: Path, rig: Rig, instrument: Instrument) -> None:
         return
     reading = read_journal(folder)
     record = recorded(reading.records)
-    motions = [r.data["twin"] for r in reading.records if r.event in ("homed", "moved") and "twin" in r.data]
+    # As in `recorded`: motions after a gap are no rows of moves.csv.
+    counted = [r for r in reading.records if r.line not in set(record.ignored_lines)]
+    motions = [r.data["twin"] for r in counted if r.event in ("homed", "moved") and "twin" in r.data]
     seen = [motions[spot.move] for spot in record.spots if spot.status == "ok" and spot.move < len(motions)]
     truth = replace(
         instrument.truth,
@@ -402,9 +404,10 @@ class LiveLine:
             self._console.print(f"{10 * tenths} %: {note}", highlight=False)
 
     def ask(self, question: str) -> str:
-        """`input` without the line running over the question."""
+        """`input` without the line running over the question, which goes to stderr: stdout is for the result."""
         self._bar.stop()
         try:
-            return input(question)
+            self._console.print(question, end="", markup=False, highlight=False)
+            return input()
         finally:
             self._bar.start()
