@@ -243,7 +243,9 @@ def begin(folder: Path, rig: Rig, plan: Sequence[PlanStep], resume: bool, header
         if folder.is_dir() and any(folder.iterdir()):
             remedy = "name another folder, or go on with --resume"
             allowed = "a new or empty folder"
-            raise refusal("occupied", file=escaped(str(folder), 200), found="a folder with files", allowed=allowed, remedy=remedy)
+            raise refusal(
+                "occupied", file=escaped(str(folder), 200), found="a folder with files", allowed=allowed, remedy=remedy
+            )
         created = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
         return Journal.create(folder, **{"created": created, **header}, **hashes)
     journal = Journal.open(folder)
