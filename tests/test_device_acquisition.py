@@ -407,6 +407,7 @@ def test_looks_that_a_repair_lost_are_taken_again(rig, tmp_path, event, number, 
     repair_campaign(tmp_path / "old", tmp_path / "new")
     before = read_campaign(tmp_path / "new")
     assert len(before.spots) == 12 - taken_again
+    assert any(f"in lines {damaged.line}, and" in w for w in check_journal(tmp_path / "new")["warnings"])
     outcome = acquire(rig, plan, tmp_path / "new", simulate=True, resume=True, seed=4)
     assert outcome.reason == "done"
     campaign = read_campaign(tmp_path / "new")

@@ -299,11 +299,15 @@ def check_journal(folder: Path) -> dict[str, object]:
         InputError: damage, with line number.
     """
     document = verify(folder).as_json()
-    record = recorded(read_journal(folder).records)
+    reading = read_journal(folder)
+    record = recorded(reading.records)
     warnings = [*document["warnings"]]
-    if record.ignored_lines:
-        first = record.ignored_lines[0]
-        warnings.append(f"{len(record.ignored_lines)} events after a gap do not count, from line {first} on")
+    gaps = [r.line for r in reading.records if r.event == "gap"]
+    if gaps:
+        warnings.append(
+            f"a repair left gaps in lines {', '.join(map(str, gaps[:5]))}{', ...' * (len(gaps) > 5)}, and "
+            f"{len(record.ignored_lines)} events after them do not count: acquire --resume takes lost looks again"
+        )
     for segment, deviation in record.lost:
         warnings.append(f"segment {segment}: {deviation[0]} and {deviation[1]} steps were lost; its spots do not count")
     if record.unverified:
