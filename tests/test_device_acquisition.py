@@ -28,7 +28,15 @@ from tvsbayes.device.journal import LOG, read_journal, verify
 from tvsbayes.device.observation import CameraObserver, Detection, TwinObserver
 from tvsbayes.device.protocol import request
 from tvsbayes.device.record import LOST_STEPS, recorded
-from tvsbayes.device.session import SIMULATED_START, SimulatedOperator, TerminalOperator, acquire, check_journal
+from tvsbayes.device.session import (
+    SIMULATED_START,
+    LiveLine,
+    SimulatedOperator,
+    TerminalOperator,
+    acquire,
+    check_journal,
+    repair_campaign,
+)
 from tvsbayes.device.twin import Instrument
 from tvsbayes.device.vision import live_detector, twin_renderer
 from tvsbayes.files import DeviceFault, InputError, shipped_data
@@ -224,6 +232,15 @@ EXITS = {
     "device reset": (lambda i: i.device.power_on(), DeviceFault),
     "device aborted": (lambda i: i.device.model.receive(request(4_000_000_000, "ABORT"), i.clock.now_us), DeviceFault),
     "exit": (lambda i: _raise(SystemExit(1)), SystemExit),
+    "another program": (
+        lambda i: i.device.model.receive(request(4_000_000_000, "L", 1), i.clock.now_us),
+        DeviceFault,
+    ),
+    **{
+        name: (lambda i, name=name: signal.raise_signal(getattr(signal, name)), KeyboardInterrupt)
+        for name in ("SIGTERM", "SIGHUP", "SIGBREAK")
+        if hasattr(signal, name)
+    },
 }
 
 
@@ -241,6 +258,41 @@ def test_laser_is_off_at_every_exit(rig, tmp_path, name):
     assert last.event == "stop" and (last.data["reason"] != "done")
     assert len(read_campaign(tmp_path / "c").spots) == (3 if name == "Ctrl-C" else 2)
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
+
+
+def test_third_ctrl_c_does_not_keep_the_laser_on(rig, tmp_path):
+    """People press it again and again; the one that hits the closing must not break it off."""
+    run_ = Run(rig, tmp_path / "c", observer=lambda i: Failing(i, 3, EXITS["Ctrl-C twice"][0]))
+    exchange = run_.positioner._exchange
+
+    def impatient(*words, **options):
+        if words == ("L", 0) and options:
+            signal.raise_signal(signal.SIGINT)
+        return exchange(*words, **options)
+
+    run_.positioner._exchange = impatient
+    with pytest.raises(KeyboardInterrupt):
+        run_.engine.run()
+    assert run_.dark()
+    assert read_journal(tmp_path / "c").records[-1].data["reason"] == "interrupted at once"
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGHUP"), reason="POSIX only")
+def test_nohup_is_respected(monkeypatch):
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        with StopKey():
+            signal.raise_signal(signal.SIGHUP)
+        assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGHUP, before)
+
+
+def test_stop_key_counts_even_where_its_word_cannot_be_written():
+    with StopKey(lambda text: _raise(RuntimeError("reentrant call inside a writer"))) as stop:
+        signal.raise_signal(signal.SIGINT)
+    assert stop.requested
 
 
 def test_laser_is_off_when_the_disk_fails(rig, tmp_path):
@@ -290,6 +342,18 @@ def test_laser_left_on_by_another_program_is_switched_off(rig, tmp_path):
     assert run_.dark()
 
 
+def assert_looks_as_planned(campaign, plan):
+    """Every look of the plan once, with the positioner and the sheet where the plan has them."""
+    looks = {(s.experiment, s.point): s for s in plan if s.action == "look"}
+    spots = [s for s in campaign.spots if s.point is not None]
+    assert sorted((s.experiment, s.point) for s in spots) == sorted(looks)
+    for spot in spots:
+        row = plan[: looks[spot.experiment, spot.point].step]
+        wanted = next(s for s in reversed(row) if s.action in ("home", "move"))
+        assert campaign.moves[spot.move].pan_steps == wanted.pan_steps
+        assert spot.target == next(s.target for s in reversed(row) if s.action == "place")
+
+
 @pytest.mark.parametrize("stop_at", range(1, 8))
 def test_resumed_after_any_look_every_look_is_there_once(rig, tmp_path, stop_at):
     folder, plan = tmp_path / "c", small_plan()
@@ -310,14 +374,81 @@ def test_resumed_after_any_look_every_look_is_there_once(rig, tmp_path, stop_at)
     references = [s for s in campaign.spots if s.experiment is None]
     on_target = {before.moves[s.move].pan_steps for s in before.spots if s.target == before.spots[-1].target}
     assert len(references) == len(on_target) and {m.segment for m in campaign.moves} == {0, 1}
-    for step, spot in zip([s for s in plan if s.action == "look"], (s for s in campaign.spots if s.point), strict=True):
-        row = plan[: step.step]
-        wanted = next(s for s in reversed(row) if s.action in ("home", "move"))
-        assert campaign.moves[spot.move].pan_steps == wanted.pan_steps
-        assert spot.target == next(s.target for s in reversed(row) if s.action == "place")
+    assert_looks_as_planned(campaign, plan)
     shifts = [r.data["shift_px"] for r in read_journal(folder).records if r.event == "looked" and "shift_px" in r.data]
     # New stop errors and home offset of 0.1 degrees together, 900 px per rad, at 175 to 275 mm: a few px.
     assert shifts and max(shifts) < 15
+
+
+def test_run_that_was_interrupted_while_it_resumed_goes_on_where_the_plan_stood(rig, tmp_path):
+    """The journal's last motion is then one to a reference look, not the plan's."""
+    folder, plan = tmp_path / "c", small_plan()
+    Run(rig, folder, plan, observer=lambda i: Failing(i, 3, EXITS["Ctrl-C"][0])).engine.run()
+    second = Run(rig, folder, plan, resume=True, start=1, observer=lambda i: Failing(i, 2, EXITS["camera fault"][0]))
+    with pytest.raises(DeviceFault):
+        second.engine.run()
+    assert read_campaign(folder).moves[-1].pan_steps == 0, "of the second reference look; the plan stood at 100"
+    assert Run(rig, folder, plan, resume=True, start=2).engine.run().reason == "done"
+    assert_looks_as_planned(read_campaign(folder), plan)
+
+
+@pytest.mark.parametrize(
+    ("event", "number", "left", "last_step"),
+    [
+        *(("homed", 0, 8, None), ("looked", 5, 9, None), ("placed", 4, 9, None), ("verified", 0, 12, None)),
+        # Ended by the stop key too, with the sheet elsewhere than where the lost look needs it.
+        ("looked", 3, 5, 16),
+    ],
+)
+def test_looks_that_a_repair_lost_are_taken_again(rig, tmp_path, event, number, left, last_step):
+    plan = small_plan(3, rehome=True)
+
+    def show(progress):
+        if progress.step == last_step:
+            signal.raise_signal(signal.SIGINT)
+
+    acquire(rig, plan, tmp_path / "old", simulate=True, seed=4, show=show)
+    damaged = [r for r in read_journal(tmp_path / "old").records if r.event == event][number]
+    log = tmp_path / "old" / LOG
+    lines = log.read_bytes().splitlines(keepends=True)
+    lines[damaged.line - 1] = b"#" + lines[damaged.line - 1][1:]
+    log.write_bytes(b"".join(lines))
+    repair_campaign(tmp_path / "old", tmp_path / "new")
+    before = read_campaign(tmp_path / "new")
+    assert len(before.spots) == left
+    assert any(f"in lines {damaged.line}, and" in w for w in check_journal(tmp_path / "new")["warnings"])
+    outcome = acquire(rig, plan, tmp_path / "new", simulate=True, resume=True, seed=4)
+    assert outcome.reason == "done"
+    campaign = read_campaign(tmp_path / "new")
+    assert campaign.spots[: len(before.spots)] == before.spots
+    assert_looks_as_planned(campaign, plan)
+    truth = read_truth(tmp_path / "new" / "truth.json", campaign.stereo)
+    ratio = truth.parameters["degrees_per_step.pan"]
+    away = [psi - ratio * m.pan_steps for (psi, _), m in zip(truth.mirror_angles_deg, campaign.moves, strict=True)]
+    # Play, stop errors, home offsets and contrast stay within 1.5 degrees; another row would be 6 degrees off.
+    assert np.abs(away).max() < 1.5
+
+
+def test_plan_begins_again_where_a_repair_lost_its_only_homing(rig, tmp_path):
+    """Sheets that were placed are in the journal still; without a homing nothing may move and nothing counts."""
+    plan = small_plan(1)
+    acquire(rig, plan, tmp_path / "old", simulate=True, seed=4)
+    log = tmp_path / "old" / LOG
+    log.write_bytes(log.read_bytes().replace(b'"event":"homed"', b'"event":"hOmed"'))
+    repair_campaign(tmp_path / "old", tmp_path / "new")
+    assert acquire(rig, plan, tmp_path / "new", simulate=True, resume=True, seed=4).looks == 4
+    assert_looks_as_planned(read_campaign(tmp_path / "new"), plan)
+
+
+def test_resuming_what_is_done_asks_for_nothing(rig, tmp_path):
+    Run(rig, tmp_path / "c").engine.run()
+
+    class Bothered(SimulatedOperator):
+        def place(self, *arguments):
+            raise AssertionError("there is nothing left to look at")
+
+    again = Run(rig, tmp_path / "c", resume=True, start=1, operator=lambda r: Bothered(r.instrument))
+    assert (again.engine.run().reason, len(read_campaign(tmp_path / "c").spots)) == ("done", 8)
 
 
 def test_resume_with_another_plan_rig_or_seed_is_refused(rig, tmp_path):
@@ -351,13 +482,27 @@ def test_lost_steps_of_an_interrupted_run_are_found_by_the_next(rig, tmp_path):
     assert {s.status for s in read_campaign(folder).spots[:4]} == {LOST_STEPS}
 
 
+def test_segment_that_an_alarm_ended_is_not_taken_for_verified(rig, tmp_path):
+    """In alarm the counters are lost; the homing that follows reports no deviation, but there is none to report."""
+    folder, plan = tmp_path / "c", small_plan()
+    first = Run(rig, folder, plan, observer=lambda i: Failing(i, 4, EXITS["device aborted"][0]))
+    with pytest.raises(DeviceFault):
+        first.engine.run()
+    first.instrument.mechanics.true_steps[0] -= 6
+    second = Run(rig, folder, plan, resume=True, start=1)
+    second.engine.positioner = first.instrument.positioner()
+    assert second.engine.run().lost_segments == ()
+    assert recorded(read_journal(folder).records).unverified == (0,)
+
+
 def test_frames_of_an_interrupted_look_are_never_overwritten(rig, tmp_path):
     folder = tmp_path / "c"
     Run(rig, folder, observer=lambda i: Failing(i, 2, lambda i: signal.raise_signal(signal.SIGINT))).engine.run()
     (folder / "frames" / "000002_left.png").write_bytes(b"of a look that a crash cut off")
+    (folder / "frames" / "screenshot.png").write_bytes(b"of the operator")
     Run(rig, folder, resume=True, start=1).engine.run()
     assert [s.spot for s in read_campaign(folder).spots][:4] == [0, 1, 3, 4]
-    assert verify(folder).orphans == ("frames/000002_left.png",)
+    assert verify(folder).orphans == ("frames/000002_left.png", "frames/screenshot.png")
 
 
 def test_clock_that_goes_back_leaves_the_times_in_order(rig, tmp_path):
@@ -495,6 +640,36 @@ def test_running_estimate_does_not_hold_up_the_run_and_dies_with_it(rig, tmp_pat
     assert child.poll() is not None
 
 
+def test_estimate_that_cannot_start_does_not_end_the_run(tmp_path):
+    for wait in (True, False):
+        with RunningEstimate(tmp_path, 1.0, {"left"}, wait=wait, command=[str(tmp_path / "nothing")]) as estimate:
+            assert not estimate.update(12) and estimate.latest is None
+
+
+def test_questions_go_to_stderr(monkeypatch, capsys):
+    """With --json stdout holds one document."""
+    monkeypatch.setattr("builtins.input", lambda: "yes")
+    assert LiveLine().ask("Type yes [now]: ") == "yes"
+    out, err = capsys.readouterr()
+    assert out == "" and "Type yes [now]: " in err
+
+
+def test_camera_that_looks_on_does_not_change_the_motion(rig):
+    """The way from the home switch follows the mean ratio (DESIGN 3.1), whatever a camera's thread asks meanwhile."""
+    ends = []
+    for watched in (False, True):
+        instrument = Instrument(rig, 5)
+        positioner = instrument.positioner()
+        positioner.home()
+        if watched:
+            instrument.light()
+        positioner.move_to(0, 0)
+        ends.append(instrument.state_deg())
+    assert ends[0] == ends[1]
+    p = instrument.truth.parameters
+    assert abs(p["degrees_per_step.left"] - p["degrees_per_step.pan"]) > 1e-6, "else nothing is shown"
+
+
 @pytest.mark.parametrize(
     ("steps", "name"), [(1200, "left"), (20, "left"), (19, "unknown"), (0, "right"), (-3, "right"), (-500, "right")]
 )
@@ -617,14 +792,15 @@ def test_hardware_path_from_rig_file_to_campaign(small_rig, tmp_path):
     rng, lit_in_motion = np.random.default_rng(0), []
     moved = instrument.mechanics.moved
     instrument.mechanics.moved = lambda *a: (lit_in_motion.append(instrument.mechanics.laser_on), moved(*a))
-    noise = rng.integers(0, 9, (4, *size, 3)).astype(np.uint8)
+    noise = rng.integers(0, 9, (*size, 3)).astype(np.uint8)
     frame = [0]
 
     def render():
         frame[0] += 1
         pixels, pair = instrument.centroid_px(), []
         for k in (0, 2):
-            picture = 20 + noise[(frame[0] + k) % 4]
+            # Never the same picture twice in a look, however many frames a busy computer needs: that would be a fault.
+            picture = 20 + np.roll(noise, frame[0], axis=k // 2)
             if np.isfinite(pixels[k]):
                 u, v = map(round, pixels[k : k + 2])
                 picture[v - 5 : v + 6, u - 5 : u + 6] += blob((11, 11), 5, 5, 180).astype(np.uint8)

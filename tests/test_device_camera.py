@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import socket
 
 import cv2
 import numpy as np
@@ -21,7 +22,7 @@ class FakeCapture:
     Pixel (0, 0) holds the exposure's start in ms, modulo 65536, in its first two channels.
     """
 
-    decode_s = 0.001
+    decode_s, backend = 0.001, "V4L2"
 
     def __init__(self, clock, buffered=4, transfer_s=0.02, period_s=1 / 30, width=2 * WIDTH, obeys=True):
         self.clock, self.buffered, self.transfer_s, self.period_s = clock, buffered, transfer_s, period_s
@@ -50,6 +51,9 @@ class FakeCapture:
         if self.obeys:
             self.properties[prop] = value
         return self.obeys
+
+    def getBackendName(self):
+        return self.backend
 
     def release(self):
         self.released = True
@@ -123,6 +127,28 @@ def test_settings_are_fixed_and_read_back():
     assert values["stereo.exposure"] == -6.0 and values["stereo.auto_exposure"] == 1.0
     assert capture.properties[cv2.CAP_PROP_AUTO_WB] == 0 == capture.properties[cv2.CAP_PROP_AUTOFOCUS]
     assert capture.properties[cv2.CAP_PROP_FRAME_WIDTH] == 2 * WIDTH and camera.settings().warnings == ()
+
+
+@pytest.mark.parametrize(("backend", "manual"), [("V4L2", 1), ("DSHOW", 0), ("MSMF", 0)])
+def test_automatic_exposure_is_off_on_every_backend(backend, manual):
+    """DirectShow takes 1 for automatic, Video4Linux for manual; there 0 is automatic."""
+    clock = VirtualClock()
+    capture = FakeCapture(clock)
+    capture.backend = backend
+    OpenCVCamera([capture], WIDTH, HEIGHT, clock=clock)
+    assert capture.properties[cv2.CAP_PROP_AUTO_EXPOSURE] == manual
+
+
+def test_viewer_that_says_nothing_does_not_hold_the_virtual_camera(monkeypatch):
+    monkeypatch.setattr("tvsbayes.device.camera.VIEWER_TIMEOUT_S", 0.2)
+    with VirtualCamera(lambda: None) as virtual:
+        host, port = virtual.address.split("/")[2].split(":")
+        silent = socket.create_connection((host, int(port)))
+        # Connections are accepted in order: an answer to the second means that the first is being served.
+        with socket.create_connection((host, int(port))) as other:
+            other.sendall(b"GET /nothing HTTP/1.0\r\n\r\n")
+            assert b"404" in other.recv(100)
+    silent.close()
 
 
 def test_what_cannot_be_fixed_is_said():

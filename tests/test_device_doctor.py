@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import signal
+
 import numpy as np
 import pytest
 
@@ -101,6 +103,23 @@ def test_laser_stays_off_unless_asked_for(tmp_path):
     camera.grab = lambda: (seen.append(device.mechanics.laser_on), grab())[1]
     assert found(device, camera, tmp_path)["laser"].status == "skipped"
     assert seen and not any(seen)
+
+
+@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM"])
+def test_laser_check_that_is_ended_from_outside_leaves_it_off(tmp_path, name):
+    device, camera = bench()
+    grab, lit = camera.grab, []
+
+    def ended():
+        lit.append(device.mechanics.laser_on)
+        if lit[-1]:
+            signal.raise_signal(getattr(signal, name))
+        return grab()
+
+    camera.grab = ended
+    with pytest.raises(KeyboardInterrupt):
+        found(device, camera, tmp_path, laser=True)
+    assert lit[-1] and not device.mechanics.laser_on and camera.closed
 
 
 def test_unhomed_positioner_refuses_the_laser(tmp_path):

@@ -96,6 +96,36 @@ def test_lost_steps_show_at_the_next_homing():
     assert report.known and report.deviation_steps == (4, 0)
 
 
+@pytest.mark.parametrize(("order", "compared"), [(None, True), ("ABORT", False)])
+def test_homing_after_an_alarm_compares_nothing(order, compared):
+    """The device stayed on; the counters of one in alarm say nothing, and its report of (0, 0) neither."""
+    device = simulated()
+    first = connected(device)
+    assert not first.home().compared
+    if order:
+        device.model.receive(request(4_000_000_000, order), device.clock.now_us)
+    device.mechanics.true_steps[0] -= 4
+    report = connected(device).home()
+    assert not report.known and report.compared is compared
+    assert report.deviation_steps == ((4, 0) if compared else (0, 0))
+
+
+@pytest.mark.parametrize("words", [("MA", 300, 0), ("HOME",)])
+def test_close_in_mid_motion_stops_the_motors(words):
+    device = simulated()
+    positioner = connected(device)
+    positioner.home()
+    positioner.move_to(0, 0)
+    positioner._command(*words)
+    positioner.close()
+    device.clock.sleep(0.3)
+    device.model.advance(device.clock.now_us)
+    rest = list(device.mechanics.true_steps)
+    device.clock.sleep(60.0)
+    device.model.advance(device.clock.now_us)
+    assert device.mechanics.true_steps == rest and -60 < rest[0] < 290
+
+
 def test_wrong_protocol_version_is_named():
     device = simulated()
     device.model = DeviceModel(device.mechanics, 1, 0, device._send, protocol=2)

@@ -24,7 +24,7 @@ import numpy as np
 from tvsbayes.campaign import APPROACH_SIGN, PlanStep, Spot
 from tvsbayes.device.driver import Clock, HomeReport, Positioner
 from tvsbayes.device.estimate import RunningEstimate
-from tvsbayes.device.journal import Journal, orphans
+from tvsbayes.device.journal import FRAME_NAME, Journal, orphans
 from tvsbayes.device.observation import Observation, Observer
 from tvsbayes.device.protocol import SETTINGS
 from tvsbayes.device.record import (
@@ -36,7 +36,7 @@ from tvsbayes.device.record import (
     rig_sha256,
     write_derived,
 )
-from tvsbayes.files import DeviceFault, TvsError, refusal
+from tvsbayes.files import DeviceFault, TvsError, escaped, refusal
 from tvsbayes.rigs import Rig
 
 ATTEMPTS_PER_LOOK = 3
@@ -132,35 +132,71 @@ class Outcome:
 
 
 class StopKey:
-    """Ctrl-C: the first asks for an end after the present look, the second interrupts at once."""
+    """Ctrl-C: the first asks for an end after the present look, the second interrupts at once.
+
+    What ends a process from outside (SIGTERM, SIGHUP of a closed terminal, Ctrl-Break on Windows) interrupts at once
+    too: without a handler the process would die with the laser on.
+    """
 
     def __init__(self, tell: Callable[[str], None] = lambda text: None):
         self.requested = False
         self.at_prompt = False
         """While the operator is asked there is no look to finish: the first Ctrl-C interrupts the question."""
+        self.closing = False
+        """While laser and journal are being put away nothing interrupts: a third Ctrl-C would leave the laser on."""
         self._tell = tell
-        self._before: object = None
+        self._before: dict[int, object] = {}
 
     def __enter__(self) -> StopKey:
         if threading.current_thread() is threading.main_thread():
-            self._before = signal.signal(signal.SIGINT, self._interrupt)
+            for number in (signal.SIGINT, *_TERMINATIONS):
+                before = signal.getsignal(number)
+                # nohup ignores SIGHUP so that the run outlives its terminal.
+                if number == signal.SIGINT or before is not signal.SIG_IGN:
+                    self._before[number] = signal.SIG_DFL if before is None else before
+                    signal.signal(number, self._interrupt)
         return self
 
     def __exit__(self, *_: object) -> None:
-        if self._before is not None:
-            signal.signal(signal.SIGINT, self._before)
-            self._before = None
+        while self._before:
+            number, before = self._before.popitem()
+            signal.signal(number, before)
 
     def _interrupt(self, number: int, frame: FrameType | None) -> None:
-        if self.requested or self.at_prompt:
+        if self.closing:
+            return
+        if number != signal.SIGINT or self.requested or self.at_prompt:
             self.requested = True
             raise KeyboardInterrupt
         self.requested = True
-        self._tell("finishing the present look; Ctrl-C again stops at once")
+        try:
+            self._tell("finishing the present look; Ctrl-C again stops at once")
+        except RuntimeError:
+            # The interrupted code was writing to the same stream, which then refuses: the key counts all the same.
+            pass
+
+
+_TERMINATIONS = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP", "SIGBREAK") if hasattr(signal, name))
+"""SIGHUP exists on POSIX only, SIGBREAK on Windows only."""
 
 
 class _Stopped(Exception):
     """Ends the plan early, in good order."""
+
+
+@dataclass(frozen=True)
+class _Scene:
+    """Sheet and counters at a step of a plan.
+
+    Attributes:
+        target: where the sheet stands, "" before the first placement.
+        placement: which placement of the plan that is, from 0; -1 before the first.
+        counters: (pan, tilt) of the motion before the last and of the last, fewer at the beginning.
+    """
+
+    target: str
+    placement: int
+    counters: tuple[tuple[int, int], ...]
 
 
 def check_plan(rig: Rig, plan: Sequence[PlanStep]) -> None:
@@ -207,7 +243,9 @@ def begin(folder: Path, rig: Rig, plan: Sequence[PlanStep], resume: bool, header
         if folder.is_dir() and any(folder.iterdir()):
             remedy = "name another folder, or go on with --resume"
             allowed = "a new or empty folder"
-            raise refusal("occupied", file=str(folder), found="a folder with files", allowed=allowed, remedy=remedy)
+            raise refusal(
+                "occupied", file=escaped(str(folder), 200), found="a folder with files", allowed=allowed, remedy=remedy
+            )
         created = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
         return Journal.create(folder, **{"created": created, **header}, **hashes)
     journal = Journal.open(folder)
@@ -273,6 +311,7 @@ class Acquisition:
         self._annotate, self._details = annotate, dict(details or {})
         self._settle_s = float(rig.positioner.get("settle_s", SETTLE_S))
         self._retries, self._warnings, self._check_depth = 0, [], False
+        self._placement = -1
         self._recorder = Recorder()
         for record in journal.records:
             self._recorder.add(record)
@@ -284,27 +323,30 @@ class Acquisition:
 
         Raises:
             DeviceFault: device, camera or disk failed; the journal says so too.
-            KeyboardInterrupt: interrupted twice; laser off, journal closed.
+            KeyboardInterrupt: interrupted twice, or ended from outside; laser off, journal closed.
         """
         # What stands in the journal where an error of the program itself ends the run.
         reason, exit_code = "crashed", 1
-        try:
-            with self._stop:
+        with self._stop:
+            try:
+                reason = self._run()
+                exit_code = 130 if reason == "interrupted" else 0
+            except _Stopped:
+                reason, exit_code = "interrupted", 130
+            except KeyboardInterrupt:
+                reason, exit_code = "interrupted at once", 130
+                raise
+            except TvsError as error:
+                reason, exit_code = error.code, error.exit_code
+                raise
+            finally:
+                # An assignment, no call: Python lets no signal in before it has taken effect.
+                self._stop.closing = True
+                # The positioner is closed first: light matters more than the log.
                 try:
-                    reason = self._run()
-                except _Stopped:
-                    reason = "interrupted"
-            exit_code = 130 if reason == "interrupted" else 0
-        except KeyboardInterrupt:
-            reason, exit_code = "interrupted at once", 130
-            raise
-        except TvsError as error:
-            reason, exit_code = error.code, error.exit_code
-            raise
-        finally:
-            # The positioner is closed first: light matters more than the log.
-            self.positioner.close()
-            self._end(reason, exit_code)
+                    self.positioner.close()
+                finally:
+                    self._end(reason, exit_code)
         done = self._recorder.result()
         spots = done.spots
         ok = sum(spot.status == "ok" for spot in spots)
@@ -317,11 +359,10 @@ class Acquisition:
             return "declined"
         self._log("start", utc=self._utc_text(), **self._details)
         resumed = self._recorder.result()
-        if resumed.target:
-            self._confirm_sheet(resumed)
-        if resumed.moves and resumed.next_step < len(self.plan):
-            self._recover(resumed)
-        for step in self.plan[resumed.next_step :]:
+        # Before the first homing nothing counts, whatever was placed.
+        next_row = resumed.next_step if resumed.moves else 0
+        self._recover(resumed, next_row)
+        for step in self.plan[next_row:]:
             if self._stop.requested:
                 return "interrupted"
             self._tell(step)
@@ -357,7 +398,7 @@ class Acquisition:
         if step.action == "home":
             self._home(step.step, (int(step.pan_steps or 0), int(step.tilt_steps or 0)))
         elif step.action == "place":
-            self._place(step.target, self._done.placements, "", step.step)
+            self._place(step.target, self._scene(step.step).placement + 1, "", step.step)
         elif step.action == "move":
             self._move(int(step.pan_steps or 0), int(step.tilt_steps or 0), step.step)
         else:
@@ -396,7 +437,7 @@ class Acquisition:
         """What homing says about the segment that it ends."""
         if not self._recorder.moves:
             return
-        known = report.known or report.state.boot == self._done.boot
+        known = report.known or (report.compared and report.state.boot == self._done.boot)
         segment, deviation = self._recorder.moves[-1].segment, list(report.deviation_steps) if known else None
         self._log("verified", segment=segment, deviation_steps=deviation)
         if deviation is not None and max(map(abs, deviation)) > HOME_TOLERANCE_STEPS:
@@ -410,7 +451,7 @@ class Acquisition:
         if not self.operator.place(target, self.rig.sheets_mm[target], placement, remark):
             raise _Stopped
         self._log("placed", step=step, target=target, again=again, utc=self._utc_text())
-        self._check_depth = True
+        self._placement, self._check_depth = placement, True
 
     def _move(self, pan: int, tilt: int, step: int | None, **more: object) -> None:
         self.journal.append("intent", step=step, action="move", pan_steps=pan, tilt_steps=tilt)
@@ -425,7 +466,7 @@ class Acquisition:
             wrong = self._misplaced(observation)
             if wrong is None:
                 break
-            self._place(self._done.target, self._done.placements - 1, wrong, None)
+            self._place(self._done.target, self._placement, wrong, None)
         else:
             remedy = "check the sheet and [sheets] of the rig file, then go on with --resume"
             raise DeviceFault("placement", f"the sheet is not where it should be: {wrong}; {remedy}", remedy=remedy)
@@ -481,26 +522,67 @@ class Acquisition:
         self._check_depth = False
         return None
 
-    def _confirm_sheet(self, before: Recorded) -> None:
-        self._place(before.target, before.placements - 1, "as before the interruption", None)
+    def _scene(self, row: int) -> _Scene:
+        """What the plan has made of sheet and counters when the step in this row begins."""
+        placed = [step.target for step in self.plan[:row] if step.action == "place"]
+        motions = [step for step in self.plan[:row] if step.action in ("home", "move")]
+        counters = [(int(step.pan_steps or 0), int(step.tilt_steps or 0)) for step in motions[-2:]]
+        return _Scene(placed[-1] if placed else "", len(placed) - 1, tuple(counters))
 
-    def _recover(self, before: Recorded) -> None:
-        """A new segment at the counters of the old one, reference looks on the way."""
-        if self.plan[before.next_step].action == "home":
+    def _recover(self, before: Recorded, next_row: int) -> None:
+        """Goes back to where the plan stood: the sheet, a new segment with reference looks, and what a repair lost.
+
+        Where the plan stood is read off the plan. What the journal has last may be a reference look that was
+        interrupted too.
+        """
+        rest, scene = self.plan[next_row:], self._scene(next_row)
+        lost = [s for s in self.plan[:next_row] if s.action == "look" and s.step not in before.looked_steps]
+        if not (rest or lost):
             return
-        last = before.moves[-1]
+        if scene.target:
+            self._place(scene.target, scene.placement, "as before the interruption", None)
+        homes_next = bool(rest) and rest[0].action == "home"
+        if not before.moves or (homes_next and not lost):
+            return
         self._home(None, before.home_steps)
+        self._look_at_references(before)
+        for step in lost:
+            self._retake(step)
+        if lost and rest and rest[0].action != "place":
+            self._put_sheet(scene, "as before the looks that were taken again")
+        if rest and not homes_next:
+            self._move(*scene.counters[-1], None)
+
+    def _look_at_references(self, before: Recorded) -> None:
+        """Looks again where the last spots on the present sheet were seen."""
         candidates: dict[tuple[int, int], Spot] = {}
         for spot in reversed(before.spots):
-            if spot.status == "ok" and spot.target == before.target:
+            if spot.status == "ok" and spot.target == self._done.target:
                 move = before.moves[spot.move]
                 candidates.setdefault((move.pan_steps, move.tilt_steps), spot)
         for (pan, tilt), spot in list(candidates.items())[:REFERENCE_LOOKS]:
-            if self._stop.requested:
-                raise _Stopped
+            self._heed_stop()
             self._move(pan, tilt, None, reference=True)
             self._look(None, None, None, reference=spot)
-        self._move(last.pan_steps, last.tilt_steps, None)
+
+    def _retake(self, step: PlanStep) -> None:
+        """Takes a look of the plan that a repair of the journal lost, reached as the plan reached it."""
+        self._heed_stop()
+        self._tell(step)
+        scene = self._scene(step.step)
+        self._put_sheet(scene, "for a look that was lost")
+        # From the counters before: the same sense, so the same side of the play.
+        for counters in scene.counters:
+            self._move(*counters, None)
+        self._look(step.step, step.experiment, step.point)
+
+    def _put_sheet(self, scene: _Scene, remark: str) -> None:
+        if scene.target and scene.target != self._done.target:
+            self._place(scene.target, scene.placement, remark, None)
+
+    def _heed_stop(self) -> None:
+        if self._stop.requested:
+            raise _Stopped
 
     def _log(self, event: str, **data: object) -> None:
         self._recorder.add(self.journal.append(event, **data))
@@ -510,7 +592,9 @@ class Acquisition:
     def _next_spot(self) -> int:
         """The first number that neither an event nor a frame of an interrupted look has."""
         used = [spot.spot for spot in self._recorder.spots]
-        used += [int(name.split("/")[1][:6]) for name in orphans(self.journal.folder, tuple(self.journal.records))]
+        names = orphans(self.journal.folder, tuple(self.journal.records))
+        # Other pictures, which somebody has put there, have no number.
+        used += [int(name.split("/")[1][:6]) for name in names if FRAME_NAME.fullmatch(name)]
         return max(used, default=-1) + 1
 
     def _derive(self, always: bool = False) -> None:

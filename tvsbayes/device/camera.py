@@ -37,6 +37,8 @@ FLUSH_FRAMES_MAX = 250
 FLUSH_MAX_S = 10.0
 """The longest emptying of buffers, in frames and in seconds."""
 STREAM_TIMEOUT_MS = 5_000
+VIEWER_TIMEOUT_S = 10.0
+"""A viewer of the virtual camera that takes nothing for so long has gone."""
 JPEG_QUALITY = 97
 
 
@@ -92,6 +94,9 @@ class Capture(Protocol):
 
     def set(self, prop: int, value: float) -> bool:
         """Set a property; whether the driver took it."""
+
+    def getBackendName(self) -> str:
+        """Through which of OpenCV's backends it is open."""
 
     def release(self) -> None:
         """Give the device back."""
@@ -167,10 +172,8 @@ class OpenCVCamera:
         capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)
         capture.set(cv2.CAP_PROP_FRAME_WIDTH, self._width * (1 if len(self._captures) == 2 else 2))
         capture.set(cv2.CAP_PROP_FRAME_HEIGHT, self._height)
-        # Manual exposure is 1 for Video4Linux and 0.25 for other backends.
-        manual = capture.set(cv2.CAP_PROP_AUTO_EXPOSURE, 1) or capture.set(cv2.CAP_PROP_AUTO_EXPOSURE, 0.25)
         fixed = {
-            "automatic exposure": manual,
+            "automatic exposure": capture.set(cv2.CAP_PROP_AUTO_EXPOSURE, _manual_exposure(capture)),
             "white balance": capture.set(cv2.CAP_PROP_AUTO_WB, 0),
             "focus": capture.set(cv2.CAP_PROP_AUTOFOCUS, 0),
         }
@@ -270,6 +273,14 @@ class OpenCVCamera:
         self._captures = []
 
 
+def _manual_exposure(capture: Capture) -> int:
+    """What CAP_PROP_AUTO_EXPOSURE calls manual: Video4Linux' own V4L2_EXPOSURE_MANUAL = 1 there, elsewhere no.
+
+    On Windows 1 would switch the automatic on (opencv pull request 22635).
+    """
+    return 1 if capture.getBackendName() == "V4L2" else 0
+
+
 def _no_frame(name: str) -> DeviceFault:
     remedy = "check its cable and USB port, and that no other program has it; then go on with --resume"
     return DeviceFault("no-frame", f"camera {name} delivers no frame; {remedy}", remedy=remedy)
@@ -344,6 +355,9 @@ class VirtualCamera:
         camera = self
 
         class Handler(BaseHTTPRequestHandler):
+            # Of the connection: without it a viewer that neither reads nor closes would hold `__exit__` for ever.
+            timeout = VIEWER_TIMEOUT_S
+
             def do_GET(self) -> None:
                 camera._serve(self)
 

@@ -16,6 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
+from tvsbayes.device.acquisition import StopKey
 from tvsbayes.device.camera import StereoCamera, StereoImage, open_cameras
 from tvsbayes.device.driver import Clock, SerialPositioner, device_settings, serial_opener, serial_ports
 from tvsbayes.device.journal import Disk
@@ -247,13 +248,18 @@ def _laser(positioner: SerialPositioner | None, camera: StereoCamera | None, wan
         return Check("laser", "skipped", "needs positioner and cameras", "cure the faults above first")
     if not wanted:
         return Check("laser", "skipped", "not asked for", "run doctor with --laser, goggles on")
+    stop = StopKey()
+    # There is no look worth finishing: the first Ctrl-C interrupts.
+    stop.requested = True
     try:
-        dark = camera.grab()
-        try:
-            positioner.laser(True)
-            lit = camera.grab()
-        finally:
-            positioner.laser(False)
+        with stop:
+            try:
+                dark = camera.grab()
+                positioner.laser(True)
+                lit = camera.grab()
+            finally:
+                stop.closing = True
+                positioner.laser(False)
     except TvsError as error:
         return _failed("laser", error)
     rises = [_rise(dark, lit, side) for side in ("left", "right")]

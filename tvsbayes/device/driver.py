@@ -31,6 +31,8 @@ from tvsbayes.files import DeviceFault, escaped
 
 ATTEMPTS = 6
 """How often a request is sent before the device counts as dead."""
+CLOSING_ATTEMPTS = 3
+"""The same when the line is given back anyway."""
 REPLY_S = 0.5
 """Silence after which a request is sent again. A clean round trip takes about 1 ms on USB, 0.2 s at 9600 baud."""
 NAK_S = 0.05
@@ -82,12 +84,15 @@ class HomeReport:
         state: the device afterwards: idle, counters at the home switches.
         deviation_steps: (pan, tilt) counter where each switch was found minus where it should have been, since the
             homing before; not zero after lost steps. (0, 0) for the first homing of a device.
-        known: whether there was a homing before, to which the deviation refers.
+        known: whether this connection homed before, to which the deviation refers.
+        compared: whether the device was homed at all when this homing began; if not (unhomed, in alarm) it reports
+            (0, 0) whatever happened.
     """
 
     state: DeviceState
     deviation_steps: tuple[int, int]
     known: bool
+    compared: bool
 
 
 class Positioner(Protocol):
@@ -106,7 +111,7 @@ class Positioner(Protocol):
         """Ask the device; also a sign of life for its laser watchdog."""
 
     def close(self) -> None:
-        """Laser off as well as possible, then the line closed; never raises."""
+        """Laser off and motors at rest as well as possible, then the line closed; never raises."""
 
 
 class SerialPositioner:
@@ -132,7 +137,7 @@ class SerialPositioner:
         self._link: Link | None = None
         self._buffer, self._dropping = bytearray(), False
         self._sequence, self._boot = 0, -1
-        self._homed_here = False
+        self._homed_here, self._compares = False, False
         self.repeats = 0
         """Requests sent again so far: the quality of the line."""
         try:
@@ -142,7 +147,7 @@ class SerialPositioner:
         try:
             self._drain()
             identity = self._identify()
-            self._boot = identity.state.boot
+            self._boot, self._compares = identity.state.boot, identity.state.status == "idle"
             self.identity = dict(identity.extra)
             for key, value in self._settings.items():
                 self._set(key, value)
@@ -153,12 +158,14 @@ class SerialPositioner:
 
     def home(self) -> HomeReport:
         """See `Positioner.home`."""
-        reply = self._command("HOME")
-        state = self._wait(reply, HOME_S)
-        known, self._homed_here = self._homed_here, True
+        known, compared = self._homed_here, self._compares
+        # A homing that is broken off leaves no counters to compare with.
+        self._homed_here = self._compares = False
+        state = self._wait(self._command("HOME"), HOME_S)
+        self._homed_here = self._compares = True
         if state.laser_on:
             raise _fault("laser", "the laser is on after homing", "cut the laser's supply and check the firmware")
-        return HomeReport(state, (state.pan_home_deviation_steps, state.tilt_home_deviation_steps), known)
+        return HomeReport(state, (state.pan_home_deviation_steps, state.tilt_home_deviation_steps), known, compared)
 
     def move_to(self, pan_steps: int, tilt_steps: int) -> DeviceState:
         """See `Positioner.move_to`.
@@ -202,13 +209,27 @@ class SerialPositioner:
             return
         try:
             if self._boot >= 0:
-                self._exchange("L", 0, attempts=3, reconnect=False)
+                self._switch_off()
         except (DeviceFault, OSError):
             # The device's own watchdog switches the laser off when it no longer hears from us.
             pass
         finally:
             self._link.close()
             self._link = None
+
+    def _switch_off(self) -> None:
+        """Laser off and motors at rest, with few attempts."""
+        few = {"attempts": CLOSING_ATTEMPTS, "reconnect": False}
+        reply = self._exchange("L", 0, **few)
+        if reply.error == "seq":
+            # Another program has counted on. Whatever it does, our laser goes off: take up its number.
+            last = self._exchange("ID", sequence=0, **few).extra.get("q", "")
+            if last.isdigit() and last.isascii():
+                self._sequence = int(last)
+                self._exchange("L", 0, **few)
+        elif reply.state.status == "moving":
+            # Interrupted in a motion: a blocked axis must not be driven on when nobody watches it any more.
+            self._exchange("STOP", **few)
 
     def _drain(self) -> None:
         """Throw away what an earlier conversation left on the line."""
@@ -258,14 +279,14 @@ class SerialPositioner:
 
     def _check(self, state: DeviceState) -> None:
         if state.boot != self._boot:
-            self._homed_here = False
+            self._homed_here = self._compares = False
             raise PositionLost(
                 "reset",
                 "positioner: the device was reset, its counters are lost",
                 remedy="check its supply and cable, then go on with --resume: it homes again",
             )
         if state.status == "alarm":
-            self._homed_here = False
+            self._homed_here = self._compares = False
             remedy = _ALARMS.get(state.last_error, "home again")
             raise _fault(f"alarm-{state.last_error}", f"the device is in alarm: {state.last_error}", remedy)
 

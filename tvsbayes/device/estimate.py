@@ -22,6 +22,8 @@ FIRST_LOOKS = 12
 """Fewer looks than three experiments of four points say next to nothing."""
 GROWTH = 1.2
 """The next fit begins when there are so many times more looks than at the last: their sum costs a few fits."""
+FIT_MAX_S = 3600.0
+"""Longest wait for a fit; one takes a minute or less."""
 _COMMAND = "from tvsbayes.cli import main; main()"
 
 
@@ -109,19 +111,30 @@ class RunningEstimate:
         if self._process is None and looks >= max(FIRST_LOOKS, GROWTH * self._looks):
             self._begin(looks)
             if self._wait:
-                assert self._process is not None
-                self._process.wait()
-                self._take()
+                self._wait_for_fit()
         return self.met
 
     def _begin(self, looks: int) -> None:
+        """Starts a fit; where no process can be started the run goes on without an estimate."""
         self._looks = looks
         results = Path(self._scratch.name) / "results"
         arguments = [*self._command, str(self.folder), "--no-sample", "--json", "--out", str(results)]
-        with open(Path(self._scratch.name) / "fit.json", "wb") as stream:
-            self._process = subprocess.Popen(
-                arguments, stdout=stream, stderr=subprocess.DEVNULL, stdin=subprocess.DEVNULL, start_new_session=True
-            )
+        quiet = {"stderr": subprocess.DEVNULL, "stdin": subprocess.DEVNULL}
+        try:
+            with open(Path(self._scratch.name) / "fit.json", "wb") as stream:
+                self._process = subprocess.Popen(arguments, stdout=stream, **quiet, start_new_session=True)
+        except OSError:
+            self._process = None
+
+    def _wait_for_fit(self) -> None:
+        if self._process is None:
+            return
+        try:
+            self._process.wait(FIT_MAX_S)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+        self._take()
 
     def _take(self) -> None:
         """A fit that did not work says nothing: the next one has more looks."""

@@ -44,7 +44,8 @@ class Recorded:
     Attributes:
         moves: rows of moves.csv; empty before the first homing.
         spots: rows of spots.csv.
-        next_step: first step of the plan that is not done.
+        next_step: first step of the plan behind the last one that is done.
+        looked_steps: steps of the plan whose looks are there; after a repair some before `next_step` may be missing.
         target: where the sheet stands, "" before the first placement.
         placements: how often the operator was asked to place it by the plan.
         starts: how often the acquisition was started.
@@ -59,6 +60,7 @@ class Recorded:
     moves: tuple[Move, ...] = ()
     spots: tuple[Spot, ...] = ()
     next_step: int = 0
+    looked_steps: frozenset[int] = frozenset()
     target: str = ""
     placements: int = 0
     starts: int = 0
@@ -88,7 +90,7 @@ class Recorder:
     Attributes:
         moves: rows of moves.csv so far.
         spots: rows of spots.csv so far, before it is known whether steps were lost.
-        state: the rest of a `Recorded`; its moves and spots are empty.
+        state: the rest of a `Recorded` that follows from the last event; what grows is empty.
     """
 
     def __init__(self) -> None:
@@ -98,6 +100,7 @@ class Recorder:
         self._lost: dict[int, tuple[int, int]] = {}
         self._closed: set[int] = set()
         self._ignored: list[int] = []
+        self._looked: set[int] = set()
         self._trusted = True
 
     def add(self, record: Record) -> None:
@@ -145,6 +148,8 @@ class Recorder:
             self.moves.append(Move(len(self.moves), self.moves[-1].segment, *_head(data)))
         elif event == "looked":
             self.spots.append(_spot(data, len(self.moves) - 1))
+            if data.get("step") is not None:
+                self._looked.add(int(data["step"]))
         if data.get("step") is not None and event in ("homed", "moved", "placed", "looked"):
             self._change(next_step=max(self.state.next_step, int(data["step"]) + 1))
 
@@ -162,6 +167,7 @@ class Recorder:
             self.state,
             moves=tuple(self.moves),
             spots=spots,
+            looked_steps=frozenset(self._looked),
             lost=tuple(sorted(self._lost.items())),
             unverified=tuple(s for s in sorted(set(segment_of)) if s not in self._closed),
             ignored_lines=tuple(self._ignored),

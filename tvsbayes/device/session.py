@@ -299,11 +299,15 @@ def check_journal(folder: Path) -> dict[str, object]:
         InputError: damage, with line number.
     """
     document = verify(folder).as_json()
-    record = recorded(read_journal(folder).records)
+    reading = read_journal(folder)
+    record = recorded(reading.records)
     warnings = [*document["warnings"]]
-    if record.ignored_lines:
-        first = record.ignored_lines[0]
-        warnings.append(f"{len(record.ignored_lines)} events after a gap do not count, from line {first} on")
+    gaps = [r.line for r in reading.records if r.event == "gap"]
+    if gaps:
+        warnings.append(
+            f"a repair left gaps in lines {', '.join(map(str, gaps[:5]))}{', ...' * (len(gaps) > 5)}, and "
+            f"{len(record.ignored_lines)} events after them do not count: acquire --resume takes lost looks again"
+        )
     for segment, deviation in record.lost:
         warnings.append(f"segment {segment}: {deviation[0]} and {deviation[1]} steps were lost; its spots do not count")
     if record.unverified:
@@ -356,7 +360,9 @@ def write_truth(folder: Path, rig: Rig, instrument: Instrument) -> None:
         return
     reading = read_journal(folder)
     record = recorded(reading.records)
-    motions = [r.data["twin"] for r in reading.records if r.event in ("homed", "moved") and "twin" in r.data]
+    # As in `recorded`: motions after a gap are no rows of moves.csv.
+    counted = [r for r in reading.records if r.line not in set(record.ignored_lines)]
+    motions = [r.data["twin"] for r in counted if r.event in ("homed", "moved") and "twin" in r.data]
     seen = [motions[spot.move] for spot in record.spots if spot.status == "ok" and spot.move < len(motions)]
     truth = replace(
         instrument.truth,
@@ -402,9 +408,10 @@ class LiveLine:
             self._console.print(f"{10 * tenths} %: {note}", highlight=False)
 
     def ask(self, question: str) -> str:
-        """`input` without the line running over the question."""
+        """`input` without the line running over the question, which goes to stderr: stdout is for the result."""
         self._bar.stop()
         try:
-            return input(question)
+            self._console.print(question, end="", markup=False, highlight=False)
+            return input()
         finally:
             self._bar.start()

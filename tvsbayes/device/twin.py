@@ -150,15 +150,20 @@ class Instrument:
         return float(sum(part * turn**order for order, part in enumerate(parts, start=1)).real) if parts else 0.0
 
     def state_deg(self) -> dict[str, tuple[float, float]]:
-        """Mirror angles (psi, beta) as they are, and the stop errors (pan, tilt) in them; a segment has begun."""
+        """Mirror angles (psi, beta) at a row of moves.csv, and the stop errors (pan, tilt) in them.
+
+        Ends the way from the home switch: to be called once per motion, by who drives it.
+        """
         self._from_switch = [False, False]
-        angles = [self._y[i] + self._wobble(i, self._y[i], wheel=True) + self._eta[i] for i in (0, 1)]
-        angles[1] += self.truth.parameters["tilt_zero_deg"]
-        return {"mirror_angles_deg": (angles[0], angles[1]), "stop_errors_deg": (self._eta[0], self._eta[1])}
+        return {"mirror_angles_deg": self._mirror_angles_deg(), "stop_errors_deg": (self._eta[0], self._eta[1])}
+
+    def _mirror_angles_deg(self) -> tuple[float, float]:
+        psi, beta = (self._y[i] + self._wobble(i, self._y[i], wheel=True) + self._eta[i] for i in (0, 1))
+        return psi, beta + self.truth.parameters["tilt_zero_deg"]
 
     def light(self) -> Light:
-        """What the laser does at this moment."""
-        psi, beta = np.radians(self.state_deg()["mirror_angles_deg"])
+        """What the laser does at this moment; changes nothing, so that a camera's thread may ask at any time."""
+        psi, beta = np.radians(self._mirror_angles_deg())
         origin_P, direction_P = mirror_chain(psi, beta, self.truth.parameters)
         origin, direction = self._rotation @ origin_P + self._translation, self._rotation @ direction_P
         point, normal = np.full(3, np.nan), np.array([1.0, 0.0, 0.0])
