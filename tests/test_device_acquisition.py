@@ -85,6 +85,14 @@ def small_plan(experiments: int = 2, rehome: bool = False) -> list[PlanStep]:
     return plan
 
 
+@pytest.fixture(autouse=True)
+def ctrl_c_works():
+    """A shell's background jobs are born with SIGINT ignored; these tests raise it."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
 class Run:
     """An acquisition whose parts a test can reach."""
 
@@ -449,6 +457,25 @@ def test_resuming_what_is_done_asks_for_nothing(rig, tmp_path):
 
     again = Run(rig, tmp_path / "c", resume=True, start=1, operator=lambda r: Bothered(r.instrument))
     assert (again.engine.run().reason, len(read_campaign(tmp_path / "c").spots)) == ("done", 8)
+
+
+def test_what_somebody_changed_since_is_kept_beside(rig, tmp_path):
+    """A refused spot, and a prior stated in campaign.toml: resuming writes these files again."""
+    Run(rig, tmp_path / "c", observer=lambda i: Failing(i, 3, EXITS["Ctrl-C"][0])).engine.run()
+    spots, header = tmp_path / "c" / "spots.csv", tmp_path / "c" / "campaign.toml"
+    edited = spots.read_text().replace(",ok", ",dust", 1)
+    assert edited != spots.read_text()
+    spots.write_text(edited)
+    stated = header.read_text() + "\n# mirror looked at on Monday\n"
+    header.write_text(stated)
+    outcome = Run(rig, tmp_path / "c", resume=True, start=1).engine.run()
+    assert (tmp_path / "c" / "spots.edited-1.csv").read_text() == edited
+    assert (tmp_path / "c" / "campaign.edited-1.toml").read_text() == stated
+    told = [w.split(" was")[0] for w in outcome.warnings if "edited" in w]
+    assert sorted(told) == ["campaign.toml", "spots.csv"]
+    assert not list((tmp_path / "c").glob("moves.edited*"))
+    again = Run(rig, tmp_path / "c", resume=True, start=2).engine.run()
+    assert not any("edited" in warning for warning in again.warnings) and len(list((tmp_path / "c").glob("*.edited-*"))) == 2
 
 
 def test_resume_with_another_plan_rig_or_seed_is_refused(rig, tmp_path):

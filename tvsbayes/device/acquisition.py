@@ -32,6 +32,7 @@ from tvsbayes.device.record import (
     Recorded,
     Recorder,
     campaign_of,
+    keep_edited,
     plan_sha256,
     rig_sha256,
     write_derived,
@@ -361,6 +362,8 @@ class Acquisition:
         resumed = self._recorder.result()
         # Before the first homing nothing counts, whatever was placed.
         next_row = resumed.next_step if resumed.moves else 0
+        if resumed.moves:
+            self._keep_edited()
         self._recover(resumed, next_row)
         for step in self.plan[next_row:]:
             if self._stop.requested:
@@ -597,19 +600,30 @@ class Acquisition:
         used += [int(name.split("/")[1][:6]) for name in names if FRAME_NAME.fullmatch(name)]
         return max(used, default=-1) + 1
 
+    def _keep_edited(self) -> None:
+        """Files that somebody has changed since the run was interrupted are about to be written again."""
+        campaign = self._campaign()
+        for copy in keep_edited(campaign, self.journal.folder) if campaign is not None else ():
+            original = copy.name.replace(f".{copy.name.split('.')[-2]}", "")
+            self._warnings.append(f"{original} was edited since: what stood in it is kept in {copy.name}")
+
     def _derive(self, always: bool = False) -> None:
         count = len(self._recorder.spots)
         if not always and count > DERIVED_EVERY and count % (count // DERIVED_EVERY):
             return
+        campaign = self._campaign()
+        if campaign is not None:
+            write_derived(campaign, self.journal.folder, tables_only=not always)
+
+    def _campaign(self) -> Campaign | None:
+        """What the journal holds so far, None before the first homing."""
         header = {"name": str(self.journal.records[0].data.get("name", "acquired campaign"))}
         created = datetime.datetime.fromisoformat(str(self.journal.records[0].data.get("created")))
         header["created"] = created.astimezone(datetime.UTC)
         for name in ("synthetic", "seed"):
             if name in self.journal.records[0].data:
                 header[name] = self.journal.records[0].data[name]
-        campaign = campaign_of(self._recorder.result(), self.rig, header)
-        if campaign is not None:
-            write_derived(campaign, self.journal.folder, tables_only=not always)
+        return campaign_of(self._recorder.result(), self.rig, header)
 
     def _tell(self, step: PlanStep) -> None:
         left = self.plan[step.step :]

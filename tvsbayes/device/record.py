@@ -226,6 +226,13 @@ def write_derived(campaign: Campaign, folder: Path, tables_only: bool = False) -
         InputError: the folder cannot be written.
     """
     folder = Path(folder)
+    for name, data in _files(campaign, folder, tables_only).items():
+        path = folder / name
+        if not path.is_file() or path.read_bytes() != data:
+            write_atomically(path, data)
+
+
+def _files(campaign: Campaign, folder: Path, tables_only: bool = False) -> dict[str, bytes]:
     detected = _detected(campaign, folder)
     spots = [
         detected[spot.spot] if spot.status == "undetected" and spot.spot in detected else spot
@@ -234,12 +241,38 @@ def write_derived(campaign: Campaign, folder: Path, tables_only: bool = False) -
     moves, table = moves_bytes(campaign.moves), spots_bytes(spots)
     parse_spots(table, "spots.csv", len(parse_moves(moves)), campaign.stereo)
     files = {"moves.csv": moves, "spots.csv": table}
-    if not tables_only:
-        files = {"stereo.json": stereo_bytes(campaign.stereo), **files, "campaign.toml": campaign_toml(campaign)}
-    for name, data in files.items():
+    if tables_only:
+        return files
+    return {"stereo.json": stereo_bytes(campaign.stereo), **files, "campaign.toml": campaign_toml(campaign)}
+
+
+def keep_edited(campaign: Campaign, folder: Path) -> list[Path]:
+    """Copies of campaign files that hold what is not in the journal, before they are written again.
+
+    Somebody may have refused spots, written readings, or stated priors since. Tables that only lack the latest rows
+    were left so by the run itself.
+
+    Args:
+        campaign: what the journal says.
+        folder: campaign folder.
+
+    Returns:
+        The copies made, `spots.edited-1.csv` and so on.
+    """
+    folder, kept = Path(folder), []
+    for name, data in _files(campaign, folder).items():
         path = folder / name
-        if not path.is_file() or path.read_bytes() != data:
-            write_atomically(path, data)
+        if not path.is_file():
+            continue
+        present = read_bytes(path, CSV_BYTES_MAX, folder)
+        if not set(present.splitlines()) - set(data.splitlines()):
+            continue
+        number = 1
+        while (copy := path.with_name(f"{path.stem}.edited-{number}{path.suffix}")).exists():
+            number += 1
+        write_atomically(copy, present)
+        kept.append(copy)
+    return kept
 
 
 def _detected(campaign: Campaign, folder: Path) -> dict[int, Spot]:
