@@ -475,7 +475,10 @@ def test_what_somebody_changed_since_is_kept_beside(rig, tmp_path):
     assert sorted(told) == ["campaign.toml", "spots.csv"]
     assert not list((tmp_path / "c").glob("moves.edited*"))
     again = Run(rig, tmp_path / "c", resume=True, start=2).engine.run()
-    assert not any("edited" in warning for warning in again.warnings) and len(list((tmp_path / "c").glob("*.edited-*"))) == 2
+    assert (
+        not any("edited" in warning for warning in again.warnings)
+        and len(list((tmp_path / "c").glob("*.edited-*"))) == 2
+    )
 
 
 def test_resume_with_another_plan_rig_or_seed_is_refused(rig, tmp_path):
