@@ -360,9 +360,6 @@ def information_of(
     return PlanInformation(rows.T @ rows, found, tuple(log.moves), look_moves, plan_minutes(steps, rig), pose)
 
 
-# Targets.
-
-
 @dataclass(frozen=True)
 class Target:
     """What the measurement is for: an uncertainty that shall not exceed a limit.
@@ -573,9 +570,6 @@ def sensitivity(
     own = jacobian[:, count:] ** 2
     here = {AT_POINT[0]: own[:, :2].sum(axis=1), AT_POINT[1]: own[:, 4]}
     return Sensitivity(jacobian[:, :count] @ slope[inputs], here)
-
-
-# Plans made of single looks.
 
 
 @dataclass(frozen=True)

@@ -86,8 +86,6 @@ from tvsbayes.simulation import (
     with_derived,
 )
 
-# What an analysis will report, over draws of the truth.
-
 
 @dataclass(frozen=True)
 class DrawnTruth:
@@ -269,9 +267,6 @@ class Assurance:
         return replace(seen, rows=np.linalg.solve(np.linalg.cholesky(new), raw))
 
 
-# The classic estimator's own answer.
-
-
 @dataclass(frozen=True)
 class ClassicForecast:
     """What the four-point estimator will do, arrays over draws of the instrument and `DIRECTIONS`, deg/step.
@@ -279,7 +274,7 @@ class ClassicForecast:
     Attributes:
         sd: standard deviation of one experiment, shape (draws, 4).
         error: its systematic error, estimate less effective ratio, shape (draws, 4).
-        stereo_u: uncertainty by stereo and focal scale, common to all experiments, shape (4,).
+        stereo_u: uncertainty by stereo and focal scale at the first of them, common to all experiments, shape (4,).
     """
 
     sd: np.ndarray
@@ -303,7 +298,7 @@ def classic_forecast(knowledge: Knowledge, truths: Sequence[DrawnTruth]) -> Clas
     near, far = knowledge.sheets[0], knowledge.sheets[1]
     plan = four_point_protocol(2, targets=(near, far))
     sds, errors = [], []
-    centre = None
+    first = None
     for truth in truths[:CLASSIC_DRAWS]:
         physical = physical_at(truth.z, truth.space).value
         parameters = dict(zip(NAMES, map(float, physical), strict=True))
@@ -328,10 +323,10 @@ def classic_forecast(knowledge: Knowledge, truths: Sequence[DrawnTruth]) -> Clas
         variance = by_pixel * spot_sd**2 + pair * (ratios[0] / true / steps) ** 2
         sds.append(np.sqrt(variance))
         errors.append(ratios[0] - true)
-        centre = centre if centre is not None else run.campaign
-    if centre is None:
+        first = run.campaign if first is None else first
+    if first is None:
         return None
-    found = classic(centre).directions
+    found = classic(first).directions
     stereo_u = np.array([found[d].u_stereo_deg_per_step for d in DIRECTIONS])
     return ClassicForecast(np.array(sds), np.array(errors), stereo_u)
 
@@ -348,9 +343,6 @@ def classic_count(sd: float, half_width: float) -> int:
             return n
         n = min(wanted, 2 * n)
     return n
-
-
-# The plan.
 
 
 @dataclass(frozen=True)
@@ -1165,8 +1157,6 @@ def plan_text(result: PlanResult) -> str:
     lines += [f"note: {note}" for note in result.notes]
     return "\n".join(lines)
 
-
-# Before measuring: what a plan leaves together.
 
 EXCHANGE_SHARE = 0.5
 """A ratio and a backlash are hard to tell apart where more than this share of the ratio's variance is exchange with
