@@ -405,6 +405,16 @@ def test_too_few_stops_give_a_reason_and_no_table():
     assert table.predicted is not None
 
 
+def test_an_axis_that_turns_far_is_asked_for_more_targets():
+    """More than 180 deg of travel want eight targets (research/report.md section 3), in the words as in the tests."""
+    fit = stops_of(np.zeros(STOPS))
+    calibration = known_calibration()
+    far = replace(calibration, range_steps=np.array([[0, 4000], calibration.range_steps[1]]))
+    table = positioning(far, "pan", readings=stop_readings(fit, "pan"), tests=5)
+    assert len(table.target_steps) == 8
+    assert any("ISO 230-2 asks for 8 targets" in note for note in table.notes)
+
+
 def test_end_gauge_of_the_gum():
     """GUM H.1: u_c = 32 nm with 16 effective degrees of freedom, k_99 = 2.92, U_99 = 93 nm."""
     sources = [

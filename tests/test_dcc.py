@@ -354,6 +354,17 @@ def test_dates_run_on_with_the_campaign_or_say_that_they_are_not_known():
     assert "dates" in declared(root)
 
 
+@pytest.mark.parametrize(("first_s", "last_s", "end"), [(1.768e9, 1.768e9 + 86400, 16), (-5.0, 1e12, 15)])
+def test_dates_follow_the_time_that_moves_took(first_s, last_s, end):
+    """Times may be those of a clock (seconds since 1970); a span beyond the calendar is no date."""
+    campaign, document = campaign_and_fit(created=datetime.datetime(2026, 1, 15, 10, tzinfo=datetime.UTC))
+    moves = (*(replace(m, time_s=first_s) for m in campaign.moves[:-1]), replace(campaign.moves[-1], time_s=last_s))
+    campaign = replace(campaign, moves=moves)
+    root = ET.fromstring(dcc_bytes(campaign, {**document, "inputs": input_hashes(campaign)}, issued=ISSUED))
+    assert texts(root, ".//dcc:beginPerformanceDate") == ["2026-01-15"]
+    assert texts(root, ".//dcc:endPerformanceDate") == [f"2026-01-{end}"]
+
+
 def test_the_same_inputs_and_date_give_the_same_bytes():
     campaign, document = campaign_and_fit()
     one = dcc_bytes(campaign, document, issued=ISSUED)

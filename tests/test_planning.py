@@ -46,6 +46,7 @@ from tvsbayes.planning import (
     few_stops,
     limit_of,
     plan_from,
+    share_error,
     stop_now,
     truth_in,
 )
@@ -276,6 +277,9 @@ def test_targets_are_read():
         ("u(left) <= 0 deg/step", "the limit 0"),
         ("u(left) <= -1 deg/step", "the limit -1"),
         ("u(left) <= 1e999 deg/step", "the limit inf"),
+        ("u(left) <= 1e-300 deg/step", "the limit 1e-300"),
+        ("U95(x) at 1e999,0,0 mm <= 60 mm", "too far away"),
+        ("U95(x) at 0,0,-2e9 mm <= 60 mm", "too far away"),
         ("U95(x) <= 60 mm", "name the point"),
         ("u(left) at 1,2,3 mm <= 2e-4 deg/step", "leave the point out"),
         ("u(left) <= nan deg/step", "not of that form"),
@@ -320,6 +324,18 @@ def test_greedy_takes_the_best_look_and_exchange_never_worsens():
     assert search.value(exchanged) < 1.05 * every
     worst = 3 * [int(np.argmax(one))]
     assert search.value(search.exchange(worst)) < 1.05 * every < 0.9 * search.value(worst)
+
+
+@pytest.mark.parametrize("criterion", design.CRITERIA)
+def test_a_quantity_without_variance_does_not_steer_a_search(criterion):
+    generator = np.random.default_rng(10)
+    rows, gradient = generator.normal(size=(12, 4, 6)), generator.normal(size=(3, 6))
+    gradient[1] = 0
+    with_fixed, without = (
+        Search(rows, np.eye(6), g, np.zeros(len(g)), criterion) for g in (gradient, gradient[[0, 2]])
+    )
+    assert with_fixed.greedy(4) == without.greedy(4)
+    assert math.isfinite(with_fixed.value([0, 1]))
 
 
 def test_criteria_are_what_they_say():
@@ -410,7 +426,7 @@ def test_the_curve_is_monotone(result):
         assert after.assurance >= before.assurance
         assert before.classic is None or after.classic < before.classic
     assert curve[-1].classic is not None
-    assert all(p.assurance_se == pytest.approx(math.sqrt(p.assurance * (1 - p.assurance) / 20)) for p in curve)
+    assert all(p.assurance_se == share_error(p.assurance, 20) for p in curve)
     assert result.n80 <= result.n95 <= 12
     reached = {p.experiments: p.assurance for p in curve}
     assert reached[result.n80] >= 0.8 and reached[result.n95] >= 0.95
@@ -443,6 +459,23 @@ def test_the_document_has_the_contracts_keys(result):
     assert {a["action"] for a in document["next"][0]["actions"]} == {"home", "place", "move", "look"}
     assert sum(document["variance_shares"].values()) == pytest.approx(1.0, abs=1e-6)
     assert "floor" in planning.plan_text(result)
+
+
+def test_the_text_names_the_plan_and_what_was_not_reached(result):
+    text = planning.plan_text(result)
+    assert f"the plan: n = {result.experiments}, {result.looks} looks" in text
+    last = result.curve[-1].experiments
+    assert f"assurance 95 %: not reached with up to {last} experiments" in planning.plan_text(replace(result, n95=None))
+
+
+def test_no_number_of_draws_makes_an_assurance_certain():
+    """At 0 and 1 the standard deviation of Beta(1/2, n + 1/2); between them the binomial's."""
+    from scipy import stats
+
+    for draws in (20, 200):
+        assert share_error(1.0, draws) == share_error(0.0, draws)
+        assert share_error(0.0, draws) == pytest.approx(stats.beta(0.5, draws + 0.5).std(), rel=1e-12)
+        assert share_error(0.8, draws) == pytest.approx(stats.binom(draws, 0.8).std() / draws, rel=1e-12)
 
 
 def test_gain_per_minute_falls_in_order(result):
@@ -508,6 +541,7 @@ def test_after_data_the_next_session_starts_from_what_is_known(knowledge):
     assert result.steps[0].action == "home"
     enough = plan_from(known, replace(target, limit=1.0), None, taught.pose_rad, draws=20, seed=2, **options)
     assert enough.stop.now and enough.met and enough.steps == ()
+    assert enough.assurance is None and "nothing is left to do" in planning.plan_text(enough)
 
 
 def test_too_few_minutes_are_refused(knowledge):
@@ -528,7 +562,53 @@ def test_the_classics_count_is_the_first_that_suffices(sd, half_width):
     assert n == 2 or not suffices(n - 1)
 
 
+def test_a_quantity_held_fixed_is_no_target(mounted_rig):
+    known = prior_knowledge(with_priors(mounted_rig, backlash_deg__pan=Prior(0.0, 0.0, "half-normal")))
+    options = {"aperture": False, "largest": 1, "minutes": None, "draws": 20, "seed": 0}
+    with pytest.raises(InputError, match=r"backlash.pan is held fixed"):
+        plan_from(known, parse_target("u(backlash.pan) <= 0.1 deg"), criterion="c", **options)
+
+
+def test_limits_too_narrow_for_a_run_up_are_refused_with_its_length(mounted_rig):
+    narrow = {"pan_min_steps": 0, "pan_max_steps": 20, "tilt_min_steps": -10, "tilt_max_steps": 10}
+    rig = replace(mounted_rig, positioner=narrow)
+    with pytest.raises(InputError, match="no look has room for a run-up of") as refused:
+        candidates(prior_knowledge(rig))
+    assert "[positioner]" in refused.value.remedy
+    check = check_plan(rig, (PlanStep(0, "place", target="d1"), PlanStep(1, "look")))
+    assert [f.addition for f in check.faults] == [(), ()]
+    assert any("no cure can be sought on this rig" in w for w in check.warnings)
+
+
 # What a plan leaves together.
+
+
+def test_where_a_plan_stands_follows_the_twin(mounted_rig):
+    """Empty counters keep an axis, homing ends left and up, and an axis that rests keeps its side."""
+    steps = (
+        *(PlanStep(0, "home", 0, 0), PlanStep(1, "place", target="d1"), PlanStep(2, "look")),
+        *(PlanStep(3, "move", 100, 40), PlanStep(4, "move", 50, None), PlanStep(5, "look")),
+    )
+    assert planning.described(steps) == "d1: (0, 0) by left, up; (50, 40) by right, up"
+    looks = Looks(np.array([[50, 60]]), np.array([[1, 1]]), np.array([0]))
+    addition = planning._extended(steps, looks, ("d1",), np.array([30, 10]))
+    # Tilt stands at 40: 20 steps up take up its play without a run-up; pan stands at its goal and needs one.
+    assert [(s.action, s.pan_steps, s.tilt_steps) for s in addition[:-1]] == [("move", 20, 40), ("move", 50, 60)]
+    assert planning.described(addition, steps) == "d1: (50, 60) by left, up"
+    moves = run_plan((*steps, *addition), mounted_rig, ("left", "up")).moves
+    assert [(m.pan_steps, m.tilt_steps) for m in moves] == [(0, 0), (100, 40), (50, 40), (20, 40), (50, 60)]
+
+
+@pytest.mark.parametrize("fixed", ["ratio_contrast_deg_per_step", "backlash_deg"])
+def test_what_the_rig_holds_fixed_has_no_contraction(mounted_rig, fixed):
+    """The model with one ratio per axis (DESIGN 3.1) is such a rig."""
+    given = mounted_rig.table.priors
+    rig = with_priors(mounted_rig, **{f"{fixed}__{a}": replace(given[f"{fixed}.{a}"], u=0.0) for a in ("pan", "tilt")})
+    check = check_plan(rig, grid_protocol(pan_steps=(0, 120, 240), tilt_steps=(-90, 0, 90)))
+    name = "contrast" if fixed.startswith("ratio") else "backlash"
+    document = json.loads(json.dumps(check.as_json(), allow_nan=False))
+    assert {k for k, share in document["contraction"].items() if share is None} == {f"{name}.pan", f"{name}.tilt"}
+    assert document["expected"][f"{name}.pan"] == 0 and not check.faults
 
 
 def test_the_papers_protocol_leaves_ratio_and_backlash_together_and_is_cured(mounted_rig):
@@ -562,6 +642,21 @@ def test_a_plan_beyond_the_limits_is_named(mounted_rig):
     rig = replace(mounted_rig, positioner={"pan_min_steps": 0, "pan_max_steps": 150})
     text = "\n".join(check_plan(rig, grid_protocol(pan_steps=(0, 240), tilt_steps=(-90, 90))).warnings)
     assert "[positioner] allows 0 to 150" in text
+
+
+def test_limits_of_each_axis_and_end_count_where_they_are_stated(mounted_rig):
+    plan = grid_protocol(pan_steps=(0, 240), tilt_steps=(-190, 190))
+    moves = run_plan(plan, mounted_rig, ("left", "up")).moves
+
+    def warned(**positioner) -> list[str]:
+        return planning._beyond_limits(replace(mounted_rig, positioner=positioner), moves)
+
+    assert warned() == []
+    assert warned(pan_min_steps=-1000, pan_max_steps=1000) == [], "tilt is not limited"
+    (tilt,) = warned(tilt_min_steps=-30, tilt_max_steps=30)
+    assert tilt.startswith("tilt moves from ") and tilt.endswith("[positioner] allows -30 to 30")
+    (pan,) = warned(pan_max_steps=100, tilt_min_steps=-1000)
+    assert pan.endswith("[positioner] allows up to 100")
 
 
 def test_a_plan_without_a_look_is_refused(mounted_rig):

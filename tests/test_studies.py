@@ -132,6 +132,19 @@ def test_counts_of_a_perfect_estimator_are_within_bounds_and_of_a_boastful_one_o
     json.dumps(result.as_json(), allow_nan=False)
 
 
+def test_what_the_priors_hold_fixed_is_not_counted(job):
+    """One ratio per axis: the contrasts are 0 with sd 0, and 0 / 0 is no RMS."""
+    rows = [invented(job, i) for i in range(40)]
+    for row in rows:
+        for name in ("contrast.pan", "contrast.tilt"):
+            fixed = {"truth": 0.0, "value": 0.0, "sd": 0.0, "interval95": [0.0, 0.0], "pit": 0.0, "predicted_sd": 0.0}
+            row["headlines"][name] = fixed
+    result = study_result(job, rows)
+    assert set(QUANTITIES) - set(result.headlines) == {"contrast.pan", "contrast.tilt"}
+    json.dumps(result.as_json(), allow_nan=False)
+    assert "contrast" not in study_text(result)
+
+
 def test_failures_count_against_the_assurance(job):
     rows = [invented(job, i) for i in (1, 2, 3)]
     failed = {"design": job.key, "index": 4, "converged": False, "problems": ["did not settle"], "seconds": 1.0}

@@ -51,7 +51,7 @@ RUNS = 5
 RUNS_MIN, TARGETS_MIN = 2, 2
 """A standard deviation needs two runs, a systematic deviation two targets."""
 LONG_TRAVEL_DEG, TARGETS, TARGETS_LONG = 180.0, 5, 8
-"""Targets of a rotary axis by its travel (research/report.md section 3, unverified)."""
+"""Targets of a rotary axis by its travel (research/report.md section 3, unverified): see `targets_wanted`."""
 SIMULATED_TESTS = 1000
 """Tests drawn for a predictive interval: its ends then scatter by 0.1 sd."""
 INDIRECT = (
@@ -345,6 +345,11 @@ class AxisPositioning:
         return json.loads(json.dumps(document, allow_nan=False))
 
 
+def targets_wanted(travel_deg: float) -> int:
+    """Number of targets that ISO 230-2 asks for over a travel of a rotary axis."""
+    return TARGETS_LONG if abs(travel_deg) > LONG_TRAVEL_DEG else TARGETS
+
+
 def target_steps(low: float, high: float, deg_per_step: float, seed: int = 0) -> tuple[int, ...]:
     """Target counters over a range: equal cells, a place in each that no gear tooth repeats.
 
@@ -359,7 +364,7 @@ def target_steps(low: float, high: float, deg_per_step: float, seed: int = 0) ->
     Returns:
         Rising counters, at least two where the range has three steps; empty for a smaller range.
     """
-    count = TARGETS_LONG if abs(high - low) * abs(deg_per_step) > LONG_TRAVEL_DEG else TARGETS
+    count = targets_wanted((high - low) * deg_per_step)
     places = np.arange(count) + 0.5 + np.random.default_rng([seed, 230]).uniform(-0.2, 0.2, count)
     found = sorted({round(low + (high - low) * p / count) for p in places} - {round(low), round(high)})
     return tuple(found) if len(found) >= TARGETS_MIN else ()
@@ -421,7 +426,7 @@ def simulated_runs(
 
 
 def _plug_in(
-    readings: StopReadings, deg_per_step: float
+    readings: StopReadings, deg_per_step: float, wanted: int
 ) -> tuple[Positioning | None, tuple[int, ...], tuple[tuple[int, int], ...], str | None]:
     """Figures of the campaign's stops: (figures, targets, runs, reason why there are none)."""
     runs = {
@@ -433,7 +438,7 @@ def _plug_in(
         both = f"{len(usable)} counter{'s' * (len(usable) != 1)}"
         reason = (
             f"{both} of the {readings.axis} axis with at least {RUNS_MIN} stops from either side; {TARGETS_MIN} "
-            f"are needed, ISO 230-2 asks for {TARGETS} with {RUNS} runs"
+            f"are needed, ISO 230-2 asks for {wanted} with {RUNS} runs"
         )
         return None, (), (), reason
     other = readings.reference_pose_deg[1 - AXES.index(readings.axis)]
@@ -512,7 +517,8 @@ def positioning(
     notes = [INDIRECT]
     reading_u = None
     if readings is not None:
-        plug_in, steps, counts, missing = _plug_in(readings, ratio)
+        wanted = targets_wanted((high - low) * ratio)
+        plug_in, steps, counts, missing = _plug_in(readings, ratio, wanted)
         if len(readings.u_deg):
             reading_u = float(np.sqrt(np.mean(readings.u_deg**2)))
         if plug_in is not None:
@@ -520,11 +526,11 @@ def positioning(
                 "plug-in: s holds pixel noise, home offsets and drift over the campaign beside stop errors; maxima of "
                 "few runs are too large"
             )
-            if len(steps) < TARGETS or min(min(pair) for pair in counts) < RUNS:
-                fewest = min(min(pair) for pair in counts)
+            fewest = min(min(pair) for pair in counts)
+            if len(steps) < wanted or fewest < RUNS:
                 notes.append(
                     f"plug-in: {len(steps)} targets, at least {fewest} runs per side; ISO 230-2 asks for "
-                    f"{TARGETS} targets and {RUNS} runs"
+                    f"{wanted} targets and {RUNS} runs"
                 )
         if readings.play_left_out:
             notes.append(f"plug-in: {readings.play_left_out} stops left out whose play was not taken up for certain")
@@ -969,8 +975,12 @@ def _dates(campaign: Campaign, issued: datetime.date) -> tuple[datetime.date, da
         return issued, issued, False
     if not isinstance(created, datetime.datetime):
         return created, created, True
-    last = campaign.moves[-1].time_s if campaign.moves else 0.0
-    return created.date(), (created + datetime.timedelta(seconds=last)).date(), True
+    # Times of moves count from any instant: a clock, or the start of the campaign.
+    seconds = campaign.moves[-1].time_s - campaign.moves[0].time_s if campaign.moves else 0.0
+    try:
+        return created.date(), (created + datetime.timedelta(seconds=seconds)).date(), True
+    except OverflowError:
+        return created.date(), created.date(), True
 
 
 def _contact(parent: ET.Element, tag: str, name: str, country: str, *, place: bool = True) -> ET.Element:

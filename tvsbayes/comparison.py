@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from tvsbayes.calibration import INPUT_NAMES, NORMAL_95, Calibration, direction_of, stored_ratios
+from tvsbayes.calibration import INPUT_NAMES, Calibration, direction_of, stored_ratios
 from tvsbayes.campaign import Campaign
 from tvsbayes.certificate import BudgetTable, coordinate_budget
 from tvsbayes.classic import DIRECTIONS, ClassicResult, Selection, classic, four_point_ratios, select_experiments
@@ -466,7 +466,11 @@ BETTER_CLASSIC, BETTER_JOINT, CANNOT_TELL = "classic predicts better", "joint pr
 
 @dataclass(frozen=True)
 class Prediction:
-    """The four-point angle of one experiment as others foretold it, deg."""
+    """The four-point angle of one experiment as others foretold it, deg.
+
+    `classic_u_deg` rests on the scatter of few experiments and has `classic_dof` degrees of freedom; `joint_u_deg` is
+    the spread of many predictive draws.
+    """
 
     experiment: int
     fold: str
@@ -475,6 +479,7 @@ class Prediction:
     angle_deg: float
     classic_deg: float
     classic_u_deg: float
+    classic_dof: int
     joint_deg: float
     joint_u_deg: float
 
@@ -486,8 +491,9 @@ class Score:
     Attributes:
         rms_deg: root mean square error.
         rms_block_deg: of the mean errors of the blocks (fold and direction): the part that repeats do not average.
-        coverage: share of angles inside the 95 % predictive intervals.
-        log_density: mean log predictive density (normal), per deg.
+        coverage: share of angles inside the 95 % predictive intervals: Student's t for the classic, whose scatter is
+            estimated from few experiments (GUM G.3.2), normal for the joint.
+        log_density: mean log predictive density of the same distributions, per deg.
     """
 
     rms_deg: float
@@ -546,10 +552,12 @@ def folds_of(campaign: Campaign, selection: Selection, by: str) -> dict[str, np.
     folds = {}
     for axis in ("pan", "tilt"):
         mine = selection.axis == axis
-        for part in np.array_split(np.unique(moved[mine]), min(REGIONS, len(np.unique(moved[mine])))):
-            if len(part):
-                name = f"{axis} from {part[0]}" + (f" to {part[-1]}" if len(part) > 1 else "")
-                folds[name] = mine & np.isin(moved, part)
+        counters = np.unique(moved[mine])
+        if not len(counters):
+            continue
+        for part in np.array_split(counters, min(REGIONS, len(counters))):
+            name = f"{axis} from {part[0]}" + (f" to {part[-1]}" if len(part) > 1 else "")
+            folds[name] = mine & np.isin(moved, part)
     return folds
 
 
@@ -571,7 +579,6 @@ def hold_out(fit_of_all: JointFit, by: str = "steps", seed: int = 0) -> HoldOut:
     campaign = fit_of_all.campaign
     selection = select_experiments(campaign)
     unseen = dict(zip(DIRECTIONS, _camera_u(fit_of_all).tolist(), strict=True))
-    folds = folds_of(campaign, selection, by)
     lengths = np.unique(np.abs(selection.steps))
 
     def undecided(reason: str) -> HoldOut:
@@ -579,7 +586,8 @@ def hold_out(fit_of_all: JointFit, by: str = "steps", seed: int = 0) -> HoldOut:
 
     if not len(selection.experiments):
         return undecided("there is no complete experiment")
-    if len(folds) < 2 or (by == "regions" and all(np.count_nonzero(f) == 0 for f in folds.values())):
+    folds = folds_of(campaign, selection, by)
+    if len(folds) < 2:
         what = f"all experiments have |N| = {lengths[0]}" if by == "steps" else "all experiments start at one counter"
         return undecided(f"{what}: a constant lost motion looks like a ratio there; measure a second |N|")
     with jax.enable_x64(True):
@@ -636,8 +644,8 @@ def _priors_of(fit_of_all: JointFit) -> dict[str, Prior]:
     }
 
 
-def _foretell_classic(angle: np.ndarray, selection: Selection, out: np.ndarray) -> dict[int, tuple[float, float]]:
-    """Angle and standard uncertainty of each left-out experiment whose direction has two others, by row."""
+def _foretell_classic(angle: np.ndarray, selection: Selection, out: np.ndarray) -> dict[int, tuple[float, float, int]]:
+    """Angle, standard uncertainty and its dof of each left-out experiment whose direction has two others, by row."""
     found = {}
     for direction in DIRECTIONS:
         mine = selection.direction == direction
@@ -649,7 +657,8 @@ def _foretell_classic(angle: np.ndarray, selection: Selection, out: np.ndarray) 
         noise = np.sum((angle[taught] - mean * selection.steps[taught]) ** 2) / (len(taught) - 1)
         for e in asked:
             steps = float(selection.steps[e])
-            found[int(e)] = (float(mean * steps), float(np.sqrt(noise + (steps * sd) ** 2 / len(taught))))
+            u = float(np.sqrt(noise + (steps * sd) ** 2 / len(taught)))
+            found[int(e)] = float(mean * steps), u, len(taught) - 1
     return found
 
 
@@ -660,6 +669,7 @@ def _judge(by: str, predictions: list[Prediction], lengths: np.ndarray, unseen: 
     angle, blocks = np.array([p.angle_deg for p in predictions]), [(p.fold, p.direction) for p in predictions]
     of_block = {b: np.array([x == b for x in blocks]) for b in dict.fromkeys(blocks)}
     scores, means = {}, {}
+    dof = {"classic": np.array([p.classic_dof for p in predictions]), "joint": np.inf}
     for name in ("classic", "joint"):
         told = np.array([getattr(p, f"{name}_deg") for p in predictions])
         u = np.array([getattr(p, f"{name}_u_deg") for p in predictions])
@@ -668,8 +678,8 @@ def _judge(by: str, predictions: list[Prediction], lengths: np.ndarray, unseen: 
         scores[name] = Score(
             rms_deg=float(np.sqrt(np.mean(error**2))),
             rms_block_deg=float(np.sqrt(np.mean(means[name] ** 2))),
-            coverage=float(np.mean(np.abs(error) <= NORMAL_95 * u)),
-            log_density=float(np.mean(stats.norm.logpdf(error, scale=u))),
+            coverage=float(np.mean(np.abs(error) <= stats.t.ppf(0.975, dof[name]) * u)),
+            log_density=float(np.mean(stats.t.logpdf(error, dof[name], scale=u))),
         )
     blocks_seen = len(of_block)
     ratio = scores["classic"].rms_block_deg / scores["joint"].rms_block_deg

@@ -361,9 +361,6 @@ def information_of(
     return PlanInformation(rows.T @ rows, found, tuple(log.moves), look_moves, plan_minutes(steps, rig), pose)
 
 
-# Targets.
-
-
 @dataclass(frozen=True)
 class Target:
     """What the measurement is for: an uncertainty that shall not exceed a limit.
@@ -411,6 +408,8 @@ _TARGET = re.compile(
     rf"\s*<=\s*(?P<limit>{_NUMBER})\s*(?P<unit>deg/step|deg|mm)\s*",
     re.ASCII,
 )
+SMALLEST_LIMIT, LARGEST_NUMBER = 1e-12, 1e9
+"""Limits and coordinates of a target: beyond these a number is a slip of the pen, and squares of it overflow."""
 TARGET_FORMS = (
     "u(NAME) <= NUMBER UNIT or U95(NAME) <= NUMBER UNIT with NAME left, right, up, down, worst, contrast.pan, "
     "contrast.tilt (deg/step), backlash.pan, backlash.tilt (deg), mirror_offset (mm); or u or U95 of x, y, z or xyz "
@@ -438,12 +437,14 @@ def parse_target(text: str) -> Target:
         raise refuse(f"no quantity {name}", "name one of the quantities")
     if unit != UNITS[name]:
         raise refuse(f"{name} is in {UNITS[name]}, not {unit}", f"state the limit in {UNITS[name]}")
-    if not 0 < limit < 1e9:
-        raise refuse(f"the limit {limit:g}", "state a limit greater than 0")
+    if not SMALLEST_LIMIT <= limit < LARGEST_NUMBER:
+        raise refuse(f"the limit {limit:g}", f"state a limit from {SMALLEST_LIMIT:g} to {LARGEST_NUMBER:g}")
     if (match["at"] is None) == (name in COORDINATES):
         remedy = "name the point: at 1000,0,0 mm" if name in COORDINATES else "leave the point out"
         raise refuse("a coordinate needs a point, and nothing else has one", remedy)
     point = None if match["at"] is None else tuple(float(x) for x in match["at"].split(","))
+    if point is not None and max(map(abs, point)) > LARGEST_NUMBER:
+        raise refuse("the point is too far away", f"state its coordinates within {LARGEST_NUMBER:g} mm")
     return Target(" ".join(text.split()), name, 1.0 if match["kind"] == "u" else NORMAL_95, limit, unit, point)
 
 
@@ -570,9 +571,6 @@ def sensitivity(
     own = jacobian[:, count:] ** 2
     here = {AT_POINT[0]: own[:, :2].sum(axis=1), AT_POINT[1]: own[:, 4]}
     return Sensitivity(jacobian[:, :count] @ slope[inputs], here)
-
-
-# Plans made of single looks.
 
 
 @dataclass(frozen=True)
@@ -726,7 +724,8 @@ MEAN_WEIGHT = 0.05
 def scores(variances: np.ndarray, reference: np.ndarray, criterion: str) -> np.ndarray:
     """What a search lowers, from covariances (..., q, q) of the quantities; shape (...).
 
-    "c": the worst variance; "D": log-determinant; "A": mean variance in units of `reference` (q,).
+    "c": the worst variance and `MEAN_WEIGHT` of the mean; "D": log-determinant; "A": mean variance in units of
+    `reference` (q,).
     """
     if criterion == "D":
         return np.linalg.slogdet(variances / np.sqrt(np.outer(reference, reference)))[1]
@@ -746,6 +745,8 @@ class Search:
         gradient: d(quantity)/d(column), shape (q, P).
         own: variance beside it, shape (q,).
         criterion: see `scores`.
+
+    A quantity that the priors hold fixed has no variance to lower and is left out.
     """
 
     rows: np.ndarray
@@ -756,6 +757,8 @@ class Search:
 
     def __post_init__(self) -> None:
         self.covariance = covariance_of(self.precision)
+        uncertain = np.diag(self._quantities(self.covariance)) > 0
+        self.gradient, self.own = self.gradient[uncertain], self.own[uncertain]
         self.reference = np.diag(self._quantities(self.covariance)).copy()
 
     def _quantities(self, covariance: np.ndarray) -> np.ndarray:
@@ -896,7 +899,7 @@ def candidates(knowledge: Knowledge) -> Candidates:
     candidate must be in both images in `VISIBLE_SHARE` of drawn instruments: a full turn only once the ratio is known.
 
     Raises:
-        InputError: no sheets, or nothing that both cameras see.
+        InputError: no sheets, nothing that both cameras see, or limits too narrow for a run-up.
     """
     rig = knowledge.rig
     if not rig.sheets_mm:
@@ -958,5 +961,14 @@ def candidates(knowledge: Knowledge) -> Candidates:
             "measure little and plan with --given"
         )
     looks = _sided(positions[good], sheet[good], limits, overshoot)
+    if not len(looks):
+        raise InputError(
+            "limits",
+            f"no look has room for a run-up of {overshoot[0]} pan and {overshoot[1]} tilt steps, which takes up the "
+            f"play, within pan {limits[0, 0]} to {limits[0, 1]} and tilt {limits[1, 0]} to {limits[1, 1]}",
+            file="rig.toml",
+            column="positioner",
+            remedy="widen the limits in [positioner], or state backlash and ratio more closely in [rig.prior]",
+        )
     turns = int(np.sum(np.abs(looks.steps[:, 0] - box[0].mean()) >= 0.5 * turn))
     return Candidates(looks, overshoot, limits, turns, tuple(notes))

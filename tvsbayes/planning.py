@@ -1,4 +1,4 @@
-"""How many looks, which ones, and when to stop; what a plan cannot separate(DESIGN 6 and 8).
+"""How many looks, which ones, and when to stop; what a plan cannot separate (DESIGN 6 and 8).
 
 `plan` searches the cheapest plan that meets a target (`tvsbayes.design`) and says with which probability it will, over
 draws of the instrument; `check_plan` says in words what a plan leaves together. Units are those of DESIGN 8, minutes
@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import reduce
 from itertools import combinations
 
 import equinox as eqx
@@ -18,9 +19,10 @@ import jax.numpy as jnp
 import numpy as np
 from scipy import special, stats
 
-from tvsbayes.calibration import NORMAL_95
+from tvsbayes.calibration import AXES, NORMAL_95, SIDES
 from tvsbayes.campaign import (
     Campaign,
+    Move,
     PlanStep,
     four_point_protocol,
     grid_protocol,
@@ -49,7 +51,6 @@ from tvsbayes.design import (
     Target,
     arrange,
     candidates,
-    counter_limits,
     covariance_of,
     draws_of,
     headlines,
@@ -77,14 +78,13 @@ from tvsbayes.model import (
 )
 from tvsbayes.rigs import Rig, RigTable
 from tvsbayes.simulation import (
+    HOME_APPROACH,
     Truth,
     draw_truth,
     effective_deg_per_step,
     simulate,
     with_derived,
 )
-
-# What an analysis will report, over draws of the truth.
 
 
 @dataclass(frozen=True)
@@ -267,9 +267,6 @@ class Assurance:
         return replace(seen, rows=np.linalg.solve(np.linalg.cholesky(new), raw))
 
 
-# The classic estimator's own answer.
-
-
 @dataclass(frozen=True)
 class ClassicForecast:
     """What the four-point estimator will do, arrays over draws of the instrument and `DIRECTIONS`, deg/step.
@@ -277,7 +274,7 @@ class ClassicForecast:
     Attributes:
         sd: standard deviation of one experiment, shape (draws, 4).
         error: its systematic error, estimate less effective ratio, shape (draws, 4).
-        stereo_u: uncertainty by stereo and focal scale, common to all experiments, shape (4,).
+        stereo_u: uncertainty by stereo and focal scale at the first of them, common to all experiments, shape (4,).
     """
 
     sd: np.ndarray
@@ -301,7 +298,7 @@ def classic_forecast(knowledge: Knowledge, truths: Sequence[DrawnTruth]) -> Clas
     near, far = knowledge.sheets[0], knowledge.sheets[1]
     plan = four_point_protocol(2, targets=(near, far))
     sds, errors = [], []
-    centre = None
+    first = None
     for truth in truths[:CLASSIC_DRAWS]:
         physical = physical_at(truth.z, truth.space).value
         parameters = dict(zip(NAMES, map(float, physical), strict=True))
@@ -326,10 +323,10 @@ def classic_forecast(knowledge: Knowledge, truths: Sequence[DrawnTruth]) -> Clas
         variance = by_pixel * spot_sd**2 + pair * (ratios[0] / true / steps) ** 2
         sds.append(np.sqrt(variance))
         errors.append(ratios[0] - true)
-        centre = centre if centre is not None else run.campaign
-    if centre is None:
+        first = run.campaign if first is None else first
+    if first is None:
         return None
-    found = classic(centre).directions
+    found = classic(first).directions
     stereo_u = np.array([found[d].u_stereo_deg_per_step for d in DIRECTIONS])
     return ClassicForecast(np.array(sds), np.array(errors), stereo_u)
 
@@ -348,12 +345,9 @@ def classic_count(sd: float, half_width: float) -> int:
     return n
 
 
-# The plan.
-
-
 @dataclass(frozen=True)
 class CurvePoint:
-    """What n experiments give: medians over draws of the instrument, in the target's unit.
+    """What up to n experiments give: medians over draws of the instrument, in the target's unit.
 
     `classic` is None where the four-point method does not estimate the quantity or n is too small for it.
     """
@@ -451,7 +445,8 @@ class PlanResult:
         steps: the recommended plan; empty where there is nothing left to do.
         experiments, looks, minutes: its size.
         expected: the target's value after it at the most probable instrument; `now`: before it.
-        assurance, assurance_se: probability that its fit reports the target as met, and Monte Carlo error.
+        assurance, assurance_se: probability that its fit reports the target as met, and Monte Carlo error; None where
+            there is nothing left to do.
         curve: by number of experiments.
         n80, n95: experiments for which the assurance is 80 % and 95 %, None if none.
         limit: what no number of looks removes.
@@ -649,7 +644,7 @@ def split_of(knowledge: Knowledge, data: np.ndarray, noise: np.ndarray | None, f
 def _state(table: RigTable, columns: Sequence[int], share: float) -> str:
     """The stated u of a prior, and what it would have to be."""
     if len(columns) == len(NAMES) - len(RIG_NAMES):
-        return f"the stereo calibration to {100 * share:.0f} % of its present uncertainty"
+        return f"the stereo calibration to {100 * share:.2g} % of its present uncertainty"
     names = [NAMES[c] for c in columns if table.priors[NAMES[c]].u > 0]
     return " and ".join(f"u({n}) = {share * table.priors[n].u:.2g} instead of {table.priors[n].u:.2g}" for n in names)
 
@@ -706,7 +701,7 @@ def limit_of(knowledge: Knowledge, data: np.ndarray, found: Sensitivity, target:
     return Limit(floor, cause, shares, False, "no single input stands in the way: widen the limits or add sheets")
 
 
-def _baselines(knowledge: Knowledge, target: Target, aperture: bool) -> list[Baseline]:
+def _baselines(knowledge: Knowledge, target: Target, aperture: bool, pose_rad: np.ndarray | None) -> list[Baseline]:
     """The paper's protocol, its mixture of step counts and starts, and the grid, on this rig's sheets."""
     sheets = knowledge.sheets
     plans: dict[str, tuple[PlanStep, ...]] = {}
@@ -714,34 +709,64 @@ def _baselines(knowledge: Knowledge, target: Target, aperture: bool) -> list[Bas
         plans["paper"] = paper_protocol(targets=sheets[:2])
         plans["mixed"] = mixed_protocol(targets=sheets[:2])
     plans["grid"] = grid_protocol(targets=sheets[:3])
-    return [judged(name, steps, knowledge, target, aperture) for name, steps in plans.items()]
+    return [judged(name, steps, knowledge, target, aperture, pose_rad) for name, steps in plans.items()]
 
 
-def judged(name: str, steps: Sequence[PlanStep], knowledge: Knowledge, target: Target, aperture: bool) -> Baseline:
-    """One plan at the most probable instrument."""
+def judged(
+    name: str,
+    steps: Sequence[PlanStep],
+    knowledge: Knowledge,
+    target: Target,
+    aperture: bool,
+    pose_rad: np.ndarray | None = None,
+) -> Baseline:
+    """One plan at the most probable instrument; ratios hold at `pose_rad`, by default the plan's own, as in a fit."""
     found = information_of(steps, knowledge, aperture=aperture)
-    at = sensitivity(target, knowledge.z, knowledge.space, knowledge.rig.table, found.pose_rad)
+    pose = found.pose_rad if pose_rad is None else pose_rad
+    at = sensitivity(target, knowledge.z, knowledge.space, knowledge.rig.table, pose)
     value = at.value(covariance_of(knowledge.precision + found.fisher), target.factor)
     seen = int(found.expectation.seen.sum())
     return Baseline(name, len(found.look_moves), seen, found.minutes, value)
 
 
-def described(steps: Sequence[PlanStep], before: Sequence[PlanStep] = ()) -> str:
-    """Looks of a short plan in words, after another plan."""
-    sheet, at, came, words = "", (0, 0), ("left", "up"), []
-    for step in before:
-        sheet = step.target if step.action == "place" else sheet
-        at = (step.pan_steps or 0, step.tilt_steps or 0) if step.action in ("move", "home") else at
-    for step in steps:
+@dataclass(frozen=True)
+class _Standing:
+    """Where a plan has come to: the sheet that stands, counters (pan, tilt), and the direction each axis came in."""
+
+    sheet: str = ""
+    at: tuple[int, int] = (0, 0)
+    came: tuple[str, str] = HOME_APPROACH
+
+    def after(self, step: PlanStep) -> _Standing:
+        """As `simulation.run_plan` takes a step: a move's empty counters keep the axis where it is."""
         if step.action == "place":
-            sheet = step.target
-        elif step.action in ("move", "home"):
-            now = (step.pan_steps or 0, step.tilt_steps or 0)
-            sides = tuple(b if now[a] > at[a] else c for a, b, c in ((0, "left", "right"), (1, "up", "down")))
-            at, came = now, sides
-        elif step.action == "look":
-            words.append(f"({at[0]}, {at[1]}) by {came[0]}, {came[1]}")
-    return f"{sheet}: " + "; ".join(words)
+            return replace(self, sheet=step.target)
+        if step.action == "home":
+            return replace(self, at=(step.pan_steps or 0, step.tilt_steps or 0), came=HOME_APPROACH)
+        if step.action != "move":
+            return self
+        ordered = (step.pan_steps, step.tilt_steps)
+        at = tuple(old if new is None else new for old, new in zip(self.at, ordered, strict=True))
+        came = tuple(
+            way if new == old else SIDES[axis][int(new > old)]
+            for axis, old, new, way in zip(AXES, self.at, at, self.came, strict=True)
+        )
+        return replace(self, at=at, came=came)
+
+
+def _standing(steps: Sequence[PlanStep]) -> _Standing:
+    """Where a plan ends."""
+    return reduce(_Standing.after, steps, _Standing())
+
+
+def described(steps: Sequence[PlanStep], before: Sequence[PlanStep] = ()) -> str:
+    """Looks of a short plan on one sheet in words, after another plan."""
+    now, words = _standing(before), []
+    for step in steps:
+        now = now.after(step)
+        if step.action == "look":
+            words.append(f"({now.at[0]}, {now.at[1]}) by {now.came[0]}, {now.came[1]}")
+    return f"{now.sheet}: " + "; ".join(words)
 
 
 def _next(
@@ -752,7 +777,7 @@ def _next(
     at_centre: Sensitivity,
     now: float,
 ) -> tuple[Batch, ...]:
-    """Four looks at every sheet, near the campaign's angles and a full turn away, by gain per minute."""
+    """Four looks at every sheet, chosen from all candidates and from those a full turn away, by gain per minute."""
     search = _search(knowledge, seen, at_centre.gradient, at_centre.own_variance, "c")
     middle = np.median(found.looks.steps[:, 0])
     turn = 0.5 * FULL_TURN_DEG / abs(physical_at(knowledge.z, knowledge.space).value[INDEX["degrees_per_step.pan"]])
@@ -796,9 +821,8 @@ def stop_now(now: float, target: Target, limit: Limit, batches: Sequence[Batch],
     if after_data and now <= target.limit:
         return Advice(True, f"the target is met: {shown}", rule)
     if not limit.reachable:
-        return Advice(
-            after_data, f"no number of looks meets the target: the floor is {limit.floor:.3g} {target.unit}", rule
-        )
+        reason = f"no number of looks meets the target: the floor is {limit.floor:.3g} {target.unit}"
+        return Advice(after_data, reason if after_data else f"{reason}; measure if that will do", rule)
     if best < worth:
         return Advice(True, f"the best next experiment lowers {shown} by only {best:.2g} {target.unit} a minute", rule)
     return Advice(False, f"{shown} now; the best next experiment lowers it by {best:.2g} {target.unit} a minute", rule)
@@ -930,6 +954,36 @@ def plan(
     return plan_from(knowledge, target, campaign, pose, draws=draws, seed=seed, **options)
 
 
+def share_error(share: float, draws: int) -> float:
+    """Monte Carlo standard error of a share: binomial, and where all draws agree that of Beta(1/2, draws + 1/2).
+
+    No number of draws makes 0 or 1 certain, as sqrt(p (1 - p) / n) would have it there; the Beta distribution is the
+    posterior under Jeffreys' prior.
+    """
+    if 0 < share < 1:
+        return math.sqrt(share * (1 - share) / draws)
+    return math.sqrt(0.5 * (draws + 0.5) / (draws + 2)) / (draws + 1)
+
+
+def _curve(
+    assurance: Assurance, forecast: ClassicForecast | None, durations: Mapping[int, float], sizes: Sequence[int]
+) -> tuple[CurvePoint, ...]:
+    """What up to n experiments give, for each size.
+
+    Noise scales estimated from few stops make single draws jump; a row states the best of all sizes up to its own,
+    so that more experiments never look worse. A best of estimates leans towards the hopeful side.
+    """
+    target, draws = assurance.target, len(assurance.truths)
+    rows, best, surest = [], math.inf, 0.0
+    for n in sorted(set(sizes)):
+        reported = assurance.values([n])[n]
+        best = min(best, float(np.median(reported)))
+        surest = max(surest, float(np.mean(reported <= target.limit)))
+        classic_value = _classic_value(forecast, target, n)
+        rows.append(CurvePoint(n, durations[n], classic_value, best, surest, share_error(surest, draws)))
+    return tuple(rows)
+
+
 def few_stops(looks: Looks) -> list[str]:
     """Directions that a design reaches so rarely that a fit can say little about them, as notes."""
     notes = []
@@ -937,9 +991,10 @@ def few_stops(looks: Looks) -> list[str]:
         for side, direction in zip((1, -1), sides, strict=True):
             stops = int(np.sum(looks.side[:, axis] == side))
             if stops < STOPS_ADVISED:
+                reached = f"{stops} stop{'s' * (stops != 1)} {direction}"
                 notes.append(
-                    f"only {stops} stops {direction}: this plan is for its target alone; for reliable intervals of "
-                    f"{direction} plan u(worst), which asks for every direction"
+                    f"only {reached}: this plan is for its target alone; for reliable intervals of {direction} plan "
+                    "u(worst), which asks for every direction"
                 )
     return notes
 
@@ -964,6 +1019,15 @@ def plan_from(
     pose = seen.mirror_angles_rad.mean(axis=0) if pose_rad is None else pose_rad
     at_centre = sensitivity(target, knowledge.z, knowledge.space, knowledge.rig.table, pose)
     now = at_centre.value(knowledge.covariance, target.factor)
+    if now == 0:
+        raise InputError(
+            "target",
+            f"{target.quantity} is held fixed by the rig (u = 0): its uncertainty is 0 whatever is measured",
+            column="--target",
+            found=target.text,
+            allowed="a quantity that is to be estimated",
+            remedy="state u > 0 for it in [rig.prior], or another target",
+        )
     options = {"criterion": criterion, "aperture": aperture, "largest": largest, "minutes": minutes}
     family = design_family(knowledge, found, seen, target, at_centre, **options)
     durations = {n: plan_minutes(family.arranged(n).steps, rig) for n in range(1, largest + 1)}
@@ -986,19 +1050,11 @@ def plan_from(
     n80, n95 = (_smallest(lambda n, level=level: met_share(n) >= level, sizes) for level in ASSURED)
     experiments = n95 or n80 or allowed[-1]
     forecast = classic_forecast(knowledge, assurance.truths)
-    curve, best, surest = [], math.inf, 0.0
-    for n in sorted({*sizes, *(x for x in (n80, n95) if x)}):
-        # Noise scales estimated from few stops make single draws jump: at most n experiments is what a row states.
-        best = min(best, float(np.median(assurance.values([n])[n])))
-        surest = max(surest, met_share(n))
-        classic_value = _classic_value(forecast, target, n)
-        error = math.sqrt(surest * (1 - surest) / draws)
-        curve.append(CurvePoint(n, durations[n], classic_value, best, surest, error))
-
+    curve = _curve(assurance, forecast, durations, [*sizes, *(n for n in (n80, n95) if n)])
     final, checked = _refined(family, seen, target, at_centre, experiments, criterion, minutes, assurance)
     design = final.arranged(experiments)
     exact = information_of(design.steps, knowledge, aperture=aperture)
-    expected = at_centre.value(covariance_of(knowledge.precision + exact.fisher), target.factor)
+    chosen = judged("planned", design.steps, knowledge, target, aperture, pose_rad)
     share = float(np.mean(checked <= target.limit))
     largest_design = family.arranged(family.largest)
     largest_information = information_of_looks(
@@ -1009,7 +1065,6 @@ def plan_from(
     batches = _next(knowledge, found, seen, target, at_centre, now)
     stop = stop_now(now, target, limit, batches, after_data)
     done = after_data and now <= target.limit
-    chosen = Baseline("planned", len(exact.look_moves), int(exact.expectation.seen.sum()), exact.minutes, expected)
     return PlanResult(
         target=target,
         steps=() if done else design.steps,
@@ -1017,15 +1072,15 @@ def plan_from(
         looks=0 if done else len(final.picks),
         minutes=0.0 if done else exact.minutes,
         now=now,
-        expected=now if done else expected,
-        assurance=share,
-        assurance_se=math.sqrt(share * (1 - share) / draws),
-        curve=tuple(curve),
+        expected=now if done else chosen.joint,
+        assurance=None if done else share,
+        assurance_se=None if done else share_error(share, draws),
+        curve=curve,
         n80=n80,
         n95=n95,
         limit=limit,
         shares=split_of(knowledge, exact.fisher, noise, at_centre),
-        baselines=(chosen, *_baselines(knowledge, target, aperture)),
+        baselines=(chosen, *_baselines(knowledge, target, aperture, pose_rad)),
         next=batches,
         stop=stop,
         classic=_classic_answer(knowledge, target, forecast, campaign),
@@ -1065,11 +1120,19 @@ def plan_text(result: PlanResult) -> str:
         classic_value = "-" if p.classic is None else f"{p.classic:.3g}"
         lines.append(
             f"{p.experiments:11d}  {p.minutes:7.1f}  {classic_value:>10}  {p.joint:>10.3g}  "
-            f"{100 * p.assurance:5.0f} +- {100 * p.assurance_se:.0f} %"
+            f"{100 * p.assurance:5.0f} +- {100 * p.assurance_se:.1f} %"
         )
     lines.append(f"(four looks each; medians over {result.draws} drawn instruments, {unit})")
+    none = f"not reached with up to {result.curve[-1].experiments} experiments"
     for level, n in zip(ASSURED, (result.n80, result.n95), strict=True):
-        lines.append(f"assurance {100 * level:.0f} %: {'no number of experiments tried' if n is None else f'n = {n}'}")
+        lines.append(f"assurance {100 * level:.0f} %: {none if n is None else f'n = {n}'}")
+    if result.assurance is None:
+        lines.append("the target is met already: nothing is left to do")
+    else:
+        lines.append(
+            f"the plan: n = {result.experiments}, {result.looks} looks in {result.minutes:.1f} minutes; assurance "
+            f"{100 * result.assurance:.0f} +- {100 * result.assurance_se:.1f} %"
+        )
     lines += ["", f"{'plan':10}  spots  in view  minutes  expected {unit}"]
     lines += [f"{b.name:10}  {b.spots:5d}  {b.seen:7d}  {b.minutes:7.1f}  {b.joint:.3g}" for b in result.baselines]
     shares = ", ".join(f"{name} {100 * s:.0f} %" for name, s in list(result.shares.items())[:5])
@@ -1094,8 +1157,6 @@ def plan_text(result: PlanResult) -> str:
     lines += [f"note: {note}" for note in result.notes]
     return "\n".join(lines)
 
-
-# Before measuring: what a plan leaves together.
 
 EXCHANGE_SHARE = 0.5
 """A ratio and a backlash are hard to tell apart where more than this share of the ratio's variance is exchange with
@@ -1130,7 +1191,7 @@ class PlanCheck:
         looks, seen: looks ordered, and in both images at the most probable instrument.
         minutes: by `[costs]`.
         expected: u of every headline after the plan, in its unit.
-        contraction: 1 - var_post / var_prior of every headline.
+        contraction: 1 - var_post / var_prior of every headline, None where the priors hold it fixed.
         faults: what the plan cannot separate.
         warnings: the same and more, as sentences.
     """
@@ -1139,7 +1200,7 @@ class PlanCheck:
     seen: int
     minutes: float
     expected: dict[str, float]
-    contraction: dict[str, float]
+    contraction: dict[str, float | None]
     faults: tuple[PlanFault, ...]
     warnings: tuple[str, ...]
 
@@ -1169,10 +1230,16 @@ class _Judged:
     gradient: np.ndarray
     prior: np.ndarray
 
+    def rows(self, axis: str) -> list[int]:
+        """Rows of the ratio and of the backlash of an axis."""
+        return [QUANTITIES.index("left" if axis == "pan" else "up"), QUANTITIES.index(f"backlash.{axis}")]
+
     def exchange(self, axis: str) -> float:
         """Share of the ratio's variance that knowing the backlash would remove."""
-        ratio, lost = (0, 6) if axis == "pan" else (2, 7)
+        ratio, lost = self.rows(axis)
         c = self.covariance
+        if self.prior[lost] == 0:
+            return 0.0
         return float(c[ratio, lost] ** 2 / (c[ratio, ratio] * c[lost, lost]))
 
     def u(self, axis: str) -> float:
@@ -1181,13 +1248,15 @@ class _Judged:
         return float(np.sqrt(np.diag(self.covariance)[rows].max()))
 
     def contraction(self) -> np.ndarray:
-        """Of every headline, shape (9,)."""
-        return 1 - np.diag(self.covariance) / self.prior
+        """Of every headline, shape (9,); NaN where its prior holds it fixed."""
+        left = np.diag(self.covariance)
+        return 1 - np.divide(left, self.prior, out=np.full(len(left), np.nan), where=self.prior > 0)
 
     def faulty(self, axis: str) -> bool:
         """The axis' ratio or backlash is the prior's, or they exchange."""
-        rows = [0, 6] if axis == "pan" else [2, 7]
-        return bool((self.contraction()[rows] < CONTRACTION_LIMIT).any() or self.exchange(axis) > EXCHANGE_SHARE)
+        return bool(
+            (self.contraction()[self.rows(axis)] < CONTRACTION_LIMIT).any() or self.exchange(axis) > EXCHANGE_SHARE
+        )
 
 
 def _judge(steps: Sequence[PlanStep], knowledge: Knowledge) -> _Judged:
@@ -1202,22 +1271,32 @@ def _judge(steps: Sequence[PlanStep], knowledge: Knowledge) -> _Judged:
 
 def _extended(steps: Sequence[PlanStep], looks: Looks, sheets: Sequence[str], overshoot: np.ndarray):
     """A plan with looks appended; no homing in between, and a placement only where another sheet is needed."""
-    last_move = next((s for s in reversed(steps) if s.action in ("move", "home")), PlanStep(0, "home", 0, 0))
-    placed = next((s.target for s in reversed(steps) if s.action == "place"), "")
-    at = (last_move.pan_steps or 0, last_move.tilt_steps or 0)
-    more = [s for s in arrange(looks, sheets, overshoot, at).steps if s.action != "home"]
-    if more and more[0].action == "place" and more[0].target == placed:
+    end = _standing(steps)
+    more = [s for s in arrange(looks, sheets, overshoot, end.at).steps if s.action != "home"]
+    if more and more[0].action == "place" and more[0].target == end.sheet:
         more = more[1:]
     return tuple(replace(s, step=len(steps) + k) for k, s in enumerate(more))
 
 
-def _cure(steps: Sequence[PlanStep], knowledge: Knowledge, found: Candidates, seen: Seen, axis: str, before: _Judged):
-    """Fewest looks after which the axis is no longer faulty; the sheet that stands is preferred."""
-    rows = [0, 6] if axis == "pan" else [2, 7]
+def _fault_text(plan: _Judged, axis: str) -> str:
+    """What a faulty axis leaves open."""
+    ratio, lost = plan.contraction()[plan.rows(axis)]
+    if ratio < CONTRACTION_LIMIT:
+        return f"the plan tells nothing of the {axis} ratio"
+    if lost < CONTRACTION_LIMIT:
+        return f"the plan tells nothing of the {axis} backlash"
+    share = 100 * plan.exchange(axis)
+    return f"{axis} ratio and {axis} backlash cannot be told apart well ({share:.0f} % of the variance is common)"
+
+
+def _cure(steps: Sequence[PlanStep], knowledge: Knowledge, found: Candidates, axis: str, before: _Judged):
+    """Fewest looks after which the axis is no longer faulty, on the sheet that stands; None if there are none."""
+    seen = LookArrays(found.looks, knowledge, False).at(knowledge.z, knowledge.space)
+    rows = before.rows(axis)
     own = np.zeros(len(rows))
     precision = knowledge.precision + before.information.fisher
     search = Search(seen.rows[..., :PARAMETERS], precision, before.gradient[rows], own, "A")
-    placed = next((s.target for s in reversed(steps) if s.action == "place"), "")
+    placed = _standing(steps).sheet
     here = found.looks.sheet == (knowledge.sheets.index(placed) if placed in knowledge.sheets else 0)
     part = replace(search, rows=np.where(here[:, None, None], search.rows, 0.0))
     picks = np.array(part.greedy(CURE_LOOKS))
@@ -1227,6 +1306,21 @@ def _cure(steps: Sequence[PlanStep], knowledge: Knowledge, found: Candidates, se
         if not after.faulty(axis):
             return addition, after
     return None
+
+
+def _beyond_limits(rig: Rig, moves: Sequence[Move]) -> list[str]:
+    """Axes that leave the limits which `[positioner]` states, as sentences."""
+    found = []
+    for axis in AXES:
+        counters = [getattr(move, f"{axis}_steps") for move in moves]
+        least, most = (rig.positioner.get(f"{axis}_{end}_steps") for end in ("min", "max"))
+        if (least is None or min(counters) >= least) and (most is None or max(counters) <= most):
+            continue
+        allowed = f"{least} to {most}"
+        if least is None or most is None:
+            allowed = f"up to {most}" if least is None else f"{least} and more"
+        found.append(f"{axis} moves from {min(counters)} to {max(counters)} steps; [positioner] allows {allowed}")
+    return found
 
 
 def check_plan(rig: Rig, steps: Sequence[PlanStep]) -> PlanCheck:
@@ -1250,39 +1344,20 @@ def check_plan(rig: Rig, steps: Sequence[PlanStep]) -> PlanCheck:
         warnings.append(
             f"{missed} of {len(information.look_moves)} looks miss an image at the most probable instrument"
         )
-    limits, _ = counter_limits(rig)
-    stated = [rig.positioner.get(k) is not None for k in ("pan_min_steps", "pan_max_steps")]
-    counters = np.array([(m.pan_steps, m.tilt_steps) for m in information.moves])
-    for index, axis in enumerate(("pan", "tilt")):
-        low, high = counters[:, index].min(), counters[:, index].max()
-        if all(stated) and (low < limits[index, 0] or high > limits[index, 1]):
-            allowed = f"{limits[index, 0]} to {limits[index, 1]}"
-            warnings.append(f"{axis} moves from {low} to {high} steps; [positioner] allows {allowed}")
-    found = seen = None
-    for axis in ("pan", "tilt"):
-        if not judged_plan.faulty(axis):
-            continue
-        if found is None:
+    warnings += _beyond_limits(rig, information.moves)
+    faulty = [axis for axis in AXES if judged_plan.faulty(axis)]
+    found = None
+    if faulty:
+        try:
             found = candidates(knowledge)
-            seen = LookArrays(found.looks, knowledge, False).at(knowledge.z, knowledge.space)
-        ratio, lost = (0, 6) if axis == "pan" else (2, 7)
+        except InputError as error:
+            warnings.append(f"no cure can be sought on this rig: {error.message}")
+    for axis in faulty:
         reason = separation(observed_stops(information.moves, observed, axis), axis)
-        if contraction[ratio] < CONTRACTION_LIMIT:
-            what = f"the plan tells nothing of the {axis} ratio"
-        elif contraction[lost] < CONTRACTION_LIMIT:
-            what = f"the plan tells nothing of the {axis} backlash"
-        else:
-            share = 100 * judged_plan.exchange(axis)
-            what = (
-                f"{axis} ratio and {axis} backlash cannot be told apart well ({share:.0f} % of the variance is common)"
-            )
-        text = what + (f": {reason}" if reason else "")
-        cure = _cure(steps, knowledge, found, seen, axis, judged_plan)
+        text = _fault_text(judged_plan, axis) + (f": {reason}" if reason else "")
+        cure = None if found is None else _cure(steps, knowledge, found, axis, judged_plan)
         before = judged_plan.u(axis)
-        if cure is None:
-            text += f"; no {CURE_LOOKS} looks cure it on this rig"
-            faults.append(PlanFault(axis, text, (), before, None))
-        else:
+        if cure is not None:
             addition, after = cure
             looks = sum(s.action == "look" for s in addition)
             text += (
@@ -1290,11 +1365,14 @@ def check_plan(rig: Rig, steps: Sequence[PlanStep]) -> PlanCheck:
                 f"{axis} ratio {before:.2g} -> {after.u(axis):.2g} deg/step"
             )
             faults.append(PlanFault(axis, text, addition, before, after.u(axis)))
+        else:
+            text += f"; no {CURE_LOOKS} looks cure it on this rig" if found is not None else ""
+            faults.append(PlanFault(axis, text, (), before, None))
         warnings.append(text)
     depths = {s.target for s in steps if s.action == "place"}
     if len({rig.sheets_mm[name] for name in depths}) == 1 and len(rig.sheets_mm) > 1:
         warnings.append(
-            "all looks are at one depth: a second sheet position sharpens ratios threefold; place "
+            "all looks are at one depth: a second sheet position sharpens ratios; place "
             + ", ".join(name for name in knowledge.sheets if name not in depths)
         )
     u = np.sqrt(np.diag(judged_plan.covariance))
@@ -1303,7 +1381,10 @@ def check_plan(rig: Rig, steps: Sequence[PlanStep]) -> PlanCheck:
         seen=len(information.look_moves) - missed,
         minutes=information.minutes,
         expected=dict(zip(QUANTITIES, map(float, u), strict=True)),
-        contraction=dict(zip(QUANTITIES, map(float, contraction), strict=True)),
+        contraction={
+            name: None if math.isnan(share) else float(share)
+            for name, share in zip(QUANTITIES, contraction, strict=True)
+        },
         faults=tuple(faults),
         warnings=tuple(warnings),
     )

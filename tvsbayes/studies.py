@@ -419,7 +419,6 @@ class HeadlineStudy:
         rms_z: RMS of (estimate - truth) / reported sd; `rms_bounds` likewise.
         rms_predicted: the same over the sd that the planner predicted at each truth.
         predicted_over_rms: root mean square of the predicted sd over RMS of (estimate - truth).
-
         power: share of campaigns whose estimate differs from its null (0, or the stated ratio) by 1.96 sd.
         sd: median reported sd.
     """
@@ -448,7 +447,7 @@ class StudyResult:
     Attributes:
         design: its hash.
         campaigns, converged: how many were simulated, and how many fits ended well.
-        headlines: by name.
+        headlines: by name; one that the priors hold fixed is not estimated and left out.
         target: what was wanted.
         assurance, assurance_interval95: share of ALL campaigns whose fit reports the target as met (Clopper-Pearson).
         reported: 5, 50 and 95 % quantiles of the reported value.
@@ -512,6 +511,8 @@ def study_result(job: StudyJob, rows: Sequence[Mapping[str, object]]) -> StudyRe
     found = {}
     for name in QUANTITIES:
         entries = [row["headlines"][name] for row in good]
+        if all(e["interval95"][0] == e["interval95"][1] for e in entries):
+            continue
         truth, value, sd, pit, predicted = (
             np.array([e[key] for e in entries]) for key in ("truth", "value", "sd", "pit", "predicted_sd")
         )
