@@ -105,10 +105,10 @@ def watched(arguments: list[str], place: Path) -> dict[str, object]:
                 child.kill()
             time.sleep(0.05)
     child.returncode = os.waitstatus_to_exitcode(status)
-    changed = {k for k in {**before, **(after := listing(place))} if before.get(k) != after.get(k)}
+    after = listing(place)
+    changed = {k for k in {*before, *after} if before.get(k) != after.get(k)}
     inside = str(place / "c") + os.sep
     elsewhere = [k for k in changed if not (k.startswith(inside) and k.removeprefix(inside).split(os.sep)[0] in OWN)]
-    # Beside TMPDIR and HOME nothing may stay either.
     text = log.read_text(errors="replace")
     return {
         "exit": child.returncode,
