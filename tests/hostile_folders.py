@@ -143,7 +143,8 @@ def good_folder(place: Path) -> Path:
     """A campaign with everything that a command reads: results, frames, boards, a rig, a plan, a journal of its own."""
     campaign = small_campaign()
     write_campaign(campaign, place)
-    for name in ("results", "frames", "boards", "journal"):
+    write_campaign(campaign, place / "journal")
+    for name in ("results", "frames", "boards"):
         (place / name).mkdir()
     hashes = input_hashes(read_campaign(place))
     document = json.loads((Path(__file__).parent / "data" / "fit-1-laplace.json").read_text()) | {"inputs": hashes}
@@ -395,7 +396,7 @@ def many_spots(rows: int, wide: bool = False) -> Edit:
 LOCATE = "locate @ --pan-steps 100 --tilt-steps 20 --aperture-deg 70"
 IMPORT = "stereo --import @/camera.yml --image-size 1280x720"
 BOARDS = "stereo @/boards --board 9x6 --pitch-mm 20"
-READ = ("check @", "classic @")
+READ, ESTIMATE = ("check @",), ("classic @",)
 CRAFTED: dict[str, Crafted] = {
     "png of 900 million pixels": Crafted(
         "decompression bomb", written("frames/000010_left.png", lambda: png(30000, 30000)), ("detect @",), large=True
@@ -480,14 +481,14 @@ CRAFTED: dict[str, Crafted] = {
     "posterior.nc and hdf5 that nobody reads": Crafted(
         "HDF5, NetCDF", written("results/posterior.nc", b"\x89HDF\r\n\x1a\n" + bytes(100)), READ, frozenset({0, 3})
     ),
-    "spots.csv links outside": Crafted("path traversal", linked("spots.csv", "outside.csv"), READ),
+    "spots.csv links outside": Crafted("path traversal", linked("spots.csv", "outside.csv"), ESTIMATE),
     "spots.csv links to a device": Crafted("path traversal", linked("spots.csv", "/dev/zero"), READ),
     "frame links outside": Crafted("path traversal", linked("frames/000010_left.png", "outside.png"), ("detect @",)),
     "frames folder links outside": Crafted("path traversal", linked("frames", "elsewhere"), ("detect @",)),
     "results folder links outside": Crafted(
         "path traversal", linked("results", "elsewhere"), ("detect @ --overlay", "fit @ --no-sample", "report @")
     ),
-    "moves.csv is a pipe": Crafted("path traversal", piped("moves.csv"), READ),
+    "moves.csv is a pipe": Crafted("path traversal", piped("moves.csv"), ESTIMATE),
     "frame is a pipe": Crafted("path traversal", piped("frames/000010_left.png"), ("detect @",)),
     "draws.npz is a pipe": Crafted("path traversal", piped("results/draws.npz"), (LOCATE,)),
     "frames in capitals": Crafted(
@@ -504,14 +505,14 @@ CRAFTED: dict[str, Crafted] = {
     "rig file of brackets": Crafted(
         "TOML", written("rig.toml", "a = " + "{b = " * 10_000), ("check @/rig.toml", "plan @/rig.toml --given @")
     ),
-    "json with NaN": Crafted("JSON", swapped("stereo.json", "802.0", "NaN"), READ),
+    "json with NaN": Crafted("JSON", swapped("stereo.json", "802.0", "NaN"), ESTIMATE),
     "json with 1e999": Crafted("JSON", swapped("stereo.json", "802.0", "1e999"), READ),
     "json key twice": Crafted("JSON", swapped("stereo.json", '"rms_px"', '"T"'), READ),
     "json of 100 000 brackets": Crafted("JSON", written("stereo.json", "[" * 100_000), READ),
     "json integer of 5000 digits": Crafted("JSON", swapped("stereo.json", "1280", "1" * 5000), READ),
     "csv field of 131 073 characters": Crafted("CSV, float()", swapped("spots.csv", "d1", "x" * 131_073), READ),
     "csv with NUL": Crafted("CSV, float()", swapped("spots.csv", "d1", "d\0"), READ),
-    "csv with 1_000": Crafted("CSV, float()", swapped("moves.csv", "1.5", "1_5"), READ),
+    "csv with 1_000": Crafted("CSV, float()", swapped("moves.csv", "1.5", "1_5"), ESTIMATE),
     "csv with arabic digits": Crafted("CSV, float()", swapped("moves.csv", "1.5", "\u0661"), READ),
     "csv with a formula": Crafted("CSV, float()", swapped("spots.csv", "d1", "=cmd|' /C calc'!A0"), READ),
     "plan of unknown actions": Crafted("CSV, float()", swapped("plan.csv", "home", "rm -rf"), ("check @/plan.csv",)),
