@@ -178,7 +178,10 @@ def read_bytes(path: Path, cap: int, folder: Path | None = None) -> bytes:
             if status.st_size > cap:
                 raise bad("size", f"{status.st_size} bytes", "split the data or remove what is not needed")
             with open(descriptor, "rb", closefd=False) as stream:
-                data = stream.read(cap + 1)
+                # As much as there is: a read of the cap would allocate the cap for every file.
+                data = stream.read(status.st_size + 1)
+                if len(data) > status.st_size:
+                    data += stream.read(cap + 1 - len(data))
         finally:
             os.close(descriptor)
     except FileNotFoundError as error:
