@@ -473,7 +473,7 @@ CRAFTED: dict[str, Crafted] = {
         large=True,
     ),
     "npz of bzip2 that lies about its size": Crafted(
-        "pickle, npz, npy", written("results/draws.npz", lambda: lying_bzip2(300)), (LOCATE,)
+        "pickle, npz, npy", written("results/draws.npz", lambda: lying_bzip2(30)), (LOCATE,)
     ),
     "npz with an escape in the estimator": Crafted(
         "pickle, npz, npy", draws_with(estimator=np.array("\x1b[2Jlaplace")), (LOCATE,)
@@ -582,7 +582,7 @@ CRAFTED: dict[str, Crafted] = {
     ),
     "a link and a bomb": Crafted(
         "pairs",
-        both(linked("results", "elsewhere"), written("results/draws.npz", lambda: lying_bzip2(300))),
+        both(linked("results", "elsewhere"), written("results/draws.npz", lambda: lying_bzip2(30))),
         (LOCATE, "report @"),
     ),
     "nan and deep brackets": Crafted(

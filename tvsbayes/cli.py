@@ -633,6 +633,7 @@ def report(
     from tvsbayes.campaign import read_campaign
 
     data = read_campaign(campaign)
+    results = output_place(campaign, "results")
     document = _fit_document(data, campaign)
     from tvsbayes.certificate import dcc_bytes
     from tvsbayes.comparison import gather
@@ -642,13 +643,13 @@ def report(
     use_compilation_cache()
     limits = {"limit_deg_per_step": limit_deg_per_step, "limit_mm": limit_mm}
     evidence = gather(data, document, load_calibration(campaign), range_mm=range_mm, **limits)
-    path = out or output_place(campaign, "results") / "report.html"
+    path = out or results / "report.html"
     write_atomically(path, report_html(evidence))
     files = {"report": str(path)}
     if pdf:
         files["pdf"] = str(print_to_pdf(path))
     if dcc:
-        certificate = output_place(campaign, "results") / "dcc.xml"
+        certificate = results / "dcc.xml"
         places = {"laboratory": laboratory, "customer": customer, "country": country}
         today = datetime.datetime.now(datetime.UTC).date()
         write_atomically(certificate, dcc_bytes(data, document, issued=today, report=path.read_bytes(), **places))
@@ -699,6 +700,7 @@ def compare(
     if by not in ("steps", "regions"):
         raise InputError("usage", f"--by {escaped(by)}: allowed are steps and regions", remedy="choose one of them")
     data = [read_campaign(folder) for folder in (campaign, *([other] if other is not None else ()))]
+    results = output_place(campaign, "results")
     from tvsbayes.report import changes_text, gap_text, hold_out_text
 
     report_line("fitting (Laplace approximation) ...")
@@ -728,7 +730,6 @@ def compare(
         "inputs": input_hashes(data[0]),
         "seed": seed,
     }
-    results = output_place(campaign, "results")
     make_folder(results)
     path = results / "compare.json"
     write_atomically(path, json.dumps(document, indent=1, allow_nan=False).encode())
