@@ -30,11 +30,13 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / "tests"))
 OUTPUT = ROOT / "experiments" / "output"
-FOLDERS, MUTATIONS = OUTPUT / "hostile-folders.jsonl", OUTPUT / "hostile-mutations.json"
+FOLDERS, MUTATIONS = OUTPUT / "hostile-folders.jsonl", OUTPUT / "hostile-mutations.jsonl"
 SEED = 20261121
 MEMORY_MAX, CPU_S_MAX = 1e9, 30.0
 WALL_S_MAX = 600
-SAMPLE, TRACED = 200, 2000
+CHUNK, PER_CHUNK, TRACED = 2500, 5, 50
+"""Mutations in a row; of these through the commands (200 of 100 000); of these with allocations traced."""
+MESSAGE_CHARS_MAX = 1200
 EXIT_CODES = {0, 2, 3, 4}
 OWN = ("spots.csv", "results")
 """What a command may write inside the campaign's folder."""
@@ -205,65 +207,73 @@ COMMAND_OF = {
 
 
 def run_mutations(n: int) -> None:
-    """All mutations in process, some with Python's allocations traced, a sample through the commands."""
+    """All mutations, a chunk a row: run again to go on."""
+    OUTPUT.mkdir(exist_ok=True)
+    done = {json.loads(line)["first"] for line in MUTATIONS.read_text().splitlines()} if MUTATIONS.exists() else set()
+    with MUTATIONS.open("a") as rows:
+        for first in range(0, n, CHUNK):
+            if first in done:
+                continue
+            row = run_chunk(range(first, min(first + CHUNK, n)))
+            rows.write(json.dumps(row) + "\n")
+            rows.flush()
+            print(f"to {first + CHUNK}: {len(row['defects'])} defects", *row["defects"][:5], sep="\n", file=sys.stderr)
+
+
+def run_chunk(numbers: range) -> dict[str, object]:
+    """Mutations in process, a few with Python's allocations traced, one of each kind and end through the commands."""
     from hostile_folders import TARGETS, good_folder, mutations
 
+    names = list(TARGETS)
     found: dict[str, dict] = {
         name: {"read": 0, "refused": 0, "codes": Counter(), "slowest_s": 0.0, "peak_bytes": 0} for name in TARGETS
     }
     defects: list[str] = []
-    sample, sampled = Counter(), []
+    sample: dict[tuple[str, bool], bytes] = {}
     with tempfile.TemporaryDirectory() as scratch:
         folder = good_folder(Path(scratch) / "c")
-        following = 0
-        before = time.process_time()
-        while following < n:
+        following, before = numbers.start, time.process_time()
+        while following < numbers.stop:
             try:
-                for outcome in mutations(folder, range(following, n), SEED):
+                for outcome in mutations(folder, range(following, numbers.stop), SEED):
                     seconds, before = time.process_time() - before, time.process_time()
                     following = outcome.number + 1
                     row = found[outcome.target]
                     row["slowest_s"] = max(row["slowest_s"], seconds)
-                    if outcome.error is None:
-                        row["read"] += 1
-                    else:
-                        row["refused"] += 1
+                    row["read" if outcome.error is None else "refused"] += 1
+                    if outcome.error is not None:
                         row["codes"][outcome.error.code] += 1
                         message = outcome.error.message
-                        if not (message.isprintable() and message.encode() and len(message) < 1200):
+                        if not (message.isprintable() and message.encode() and len(message) < MESSAGE_CHARS_MAX):
                             defects.append(f"mutation {outcome.number}: message {message[:100]!r}")
-                    kind = outcome.target, outcome.error is None
-                    if sample[kind] < SAMPLE // (2 * len(TARGETS)) + 1 and len(sampled) < SAMPLE:
-                        sample[kind] += 1
-                        sampled.append((outcome.target, outcome.data))
+                    sample.setdefault((outcome.target, outcome.error is None), outcome.data)
             except Exception as error:  # whatever else comes out is a defect
-                names = list(TARGETS)
                 defects.append(f"mutation {following} ({names[following % len(names)]}): {error!r}"[:300])
                 following += 1
-        for outcome in mutations(folder, range(min(n, TRACED)), SEED, traced=True):
+        for outcome in mutations(folder, numbers[:TRACED], SEED, traced=True):
             row = found[outcome.target]
             row["peak_bytes"] = max(row["peak_bytes"], outcome.peak_bytes or 0)
         own_peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
         codes: Counter = Counter()
         worst_s, worst_bytes = 0.0, 0
-        for target, data in sampled:
-            path = folder / TARGETS[target].file
-            good = path.read_bytes()
-            table = (folder / "spots.csv").read_bytes()
-            path.write_bytes(data)
+        # One kind and end after the other, so that the chunks together bring all of them.
+        kinds = sorted(sample)
+        start = numbers.start // CHUNK * PER_CHUNK
+        for k in range(start, start + min(PER_CHUNK, len(kinds))):
+            target, read = kinds[k % len(kinds)]
+            path, table_of_spots = folder / TARGETS[target].file, folder / "spots.csv"
+            kept = {path: path.read_bytes(), table_of_spots: table_of_spots.read_bytes()}
+            path.write_bytes(sample[target, read])
             command = COMMAND_OF.get(target, "classic @").replace("@", str(folder))
             code, said, seconds, peak = forked(shlex.split(command))
-            path.write_bytes(good)
-            (folder / "spots.csv").write_bytes(table if target != "spots.csv" else good)
+            for place, data in kept.items():
+                place.write_bytes(data)
             codes[code] += 1
             worst_s, worst_bytes = max(worst_s, seconds), max(worst_bytes, peak)
             if code not in EXIT_CODES or "Traceback" in said or "\x1b" in said:
                 defects.append(f"command {command.split()[0]} on {target}: exit {code}: {said[-200:]!r}")
-    document = {"n": n, "seed": SEED, "targets": found, "defects": defects, "own_peak_bytes": own_peak}
-    document |= {"sample": len(sampled), "sample_codes": codes, "sample_s": worst_s, "sample_bytes": worst_bytes}
-    OUTPUT.mkdir(exist_ok=True)
-    MUTATIONS.write_text(json.dumps(document, indent=1))
-    print(f"{n} mutations, {len(defects)} defects", *defects[:10], sep="\n", file=sys.stderr)
+    row = {"first": numbers.start, "n": len(numbers), "seed": SEED, "targets": found, "defects": defects}
+    return row | {"own_bytes": own_peak, "codes": codes, "command_s": worst_s, "command_bytes": worst_bytes}
 
 
 def table() -> None:
@@ -289,19 +299,26 @@ def table() -> None:
         command = r["command"].replace("@", "F")
         cells = f"{r['threat']} | {r['name']} | `{command}` | {r['exit']} | {r['cpu_s']:.1f}"
         print(f"| {cells} | {r['peak_bytes'] / 1e6:.0f} | {verdict} |")
-    m = json.loads(MUTATIONS.read_text())
-    codes = ", ".join(f"{code}: {count}" for code, count in sorted(m["sample_codes"].items()))
+    chunks = [json.loads(line) for line in MUTATIONS.read_text().splitlines()]
+    defects = [defect for chunk in chunks for defect in chunk["defects"]]
+    codes: Counter = sum((Counter(chunk["codes"]) for chunk in chunks), Counter())
+    own, through = (max(chunk[k] for chunk in chunks) / 1e6 for k in ("own_bytes", "command_bytes"))
+    listed = ", ".join(f"{code}: {count}" for code, count in sorted(codes.items()))
     print(
-        f"\n## Mutations\n\n{m['n']} seeded mutations (seed {m['seed']}) in process: {len(m['defects'])} defects; most "
-        f"memory of the process {m['own_peak_bytes'] / 1e6:.0f} MB. {m['sample']} of them through the commands: exit "
-        f"codes {codes}; at most {m['sample_s']:.1f} s and {m['sample_bytes'] / 1e6:.0f} MB.\n"
+        f"\n## Mutations\n\n{sum(c['n'] for c in chunks)} seeded mutations (seed {SEED}) in process: {len(defects)} "
+        f"defects; most memory of the process {own:.0f} MB. {codes.total()} of them through the commands, in processes "
+        f"forked from one: exit codes {listed}; at most {max(c['command_s'] for c in chunks):.1f} s and "
+        f"{through:.0f} MB.\n"
     )
-    print("| file | read | refused | commonest refusals | slowest, s | most allocated, MB |\n|---|---|---|---|---|---|")
-    for name, t in m["targets"].items():
-        common = ", ".join(f"{code} {count}" for code, count in Counter(t["codes"]).most_common(4))
-        figures = f"{t['slowest_s']:.2f} | {t['peak_bytes'] / 1e6:.1f}"
-        print(f"| {name} | {t['read']} | {t['refused']} | {common} | {figures} |")
-    for defect in m["defects"]:
+    print("| file | read | refused | commonest | slowest, CPU s | most allocated, MB |\n|---|---|---|---|---|---|")
+    for name in chunks[0]["targets"]:
+        parts = [chunk["targets"][name] for chunk in chunks]
+        common = sum((Counter(part["codes"]) for part in parts), Counter()).most_common(4)
+        counts = (sum(part[k] for part in parts) for k in ("read", "refused"))
+        slowest, most = (max(part[k] for part in parts) for k in ("slowest_s", "peak_bytes"))
+        texts = (name, *map(str, counts), ", ".join(f"{code} {count}" for code, count in common))
+        print(f"| {' | '.join(texts)} | {slowest:.2f} | {most / 1e6:.1f} |")
+    for defect in defects:
         print(f"\n- {defect}")
 
 
