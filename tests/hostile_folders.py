@@ -422,7 +422,13 @@ CRAFTED: dict[str, Crafted] = {
         "decompression bomb",
         both(*(written(f"boards/{s}01.png", lambda: png(7000, 7000)) for s in ("left", "right"))),
         (BOARDS,),
-        frozenset({2, 3}),
+        large=True,
+    ),
+    "boards of 24 million pixels": Crafted(
+        "decompression bomb",
+        both(*(written(f"boards/{s}01.png", lambda: png(6000, 4000)) for s in ("left", "right"))),
+        (BOARDS,),
+        frozenset({3}),
         large=True,
     ),
     "gif named png": Crafted(
