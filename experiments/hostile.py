@@ -283,6 +283,7 @@ def table() -> None:
     ).stdout.strip()
     rows = [json.loads(line) for line in FOLDERS.read_text().splitlines()]
     crafted = [r for r in rows if r["threat"] != "none"]
+    plain = [r for r in rows if r["threat"] == "none"]
     print("# Hostile input\n")
     print(f"{time.strftime('%Y-%m-%d')}, commit {commit}, Python {platform.python_version()}, {platform.machine()}.\n")
     print(
@@ -291,7 +292,7 @@ def table() -> None:
         f"character, less than {MEMORY_MAX / 1e9:g} GB and {CPU_S_MAX:g} s of processor time, nothing written but "
         f"`spots.csv` and `results/`. Most memory {max(r['peak_bytes'] for r in crafted) / 1e6:.0f} MB, longest "
         f"{max(r['cpu_s'] for r in crafted):.1f} s. Live nodes in reports: {sum(r['live'] for r in rows)}. The good "
-        f"folder through the same commands: most memory {max(r['peak_bytes'] for r in rows) / 1e6:.0f} MB.\n"
+        f"folder through the same commands: most memory {max(r['peak_bytes'] for r in plain) / 1e6:.0f} MB.\n"
     )
     print("| threat | folder | command | exit | CPU s | MB | |\n|---|---|---|---|---|---|---|")
     for r in rows:

@@ -424,9 +424,9 @@ CRAFTED: dict[str, Crafted] = {
         (BOARDS,),
         large=True,
     ),
-    "boards of 24 million pixels": Crafted(
+    "boards of 20 million pixels": Crafted(
         "decompression bomb",
-        both(*(written(f"boards/{s}01.png", lambda: png(6000, 4000)) for s in ("left", "right"))),
+        both(*(written(f"boards/{s}01.png", lambda: png(5000, 4000)) for s in ("left", "right"))),
         (BOARDS,),
         frozenset({3}),
         large=True,

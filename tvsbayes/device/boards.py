@@ -44,7 +44,7 @@ WIDEST_SHARE = 0.5
 REFINING_HALF_MIN, REFINING_HALF_MAX = 2, 11
 WORKERS_MAX = 8
 PICTURES_MAX = 2000
-PIXELS_MAX = 24_000_000
+PIXELS_MAX = 20_000_000
 """Of one picture, and of those that are searched at the same time: two of 49 million take 2.5 GB to search."""
 
 
