@@ -546,7 +546,7 @@ CRAFTED: dict[str, Crafted] = {
     "log of millions of entries": Crafted(
         "resource", written("journal/log.jsonl", log_of(3000, a=[[]] * 5000)), ("check @/journal",), large=True
     ),
-    "log that names one frame 100 000 times": Crafted("resource", same_frame_again, ("check @/journal",)),
+    "log that names one frame 100 000 times": Crafted("resource", same_frame_again, ("check @/journal",), large=True),
     "rig of 10 000 parameters": Crafted(
         "resource",
         written("campaign.toml", "[rig.prior]\n" + "".join(f"a{k}=1\n" for k in range(8000))),
