@@ -761,7 +761,7 @@ def read_draws(path: Path) -> Calibration:
             )
         if str(file["format"]) != CALIBRATION_FORMAT or file["input_names"].tolist() != list(INPUT_NAMES):
             raise ValueError(f"format {str(file['format'])[:60]!r} or other columns")
-        tables = parse_json(str(file["tables"]).encode(), escaped(path.name)).values
+        tables = _tables(str(file["tables"]), path)
         return _shaped(
             Calibration(
                 **{name: file[name] for name in _ARRAYS},
@@ -774,6 +774,13 @@ def read_draws(path: Path) -> Calibration:
         )
     except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
         raise _damaged(path, error) from error
+
+
+def _tables(text: str, path: Path) -> dict[str, object]:
+    try:
+        return parse_json(text.encode(), escaped(path.name)).values
+    except InputError as error:
+        raise _damaged(path, f"its tables are no JSON of tvsbayes: {error.found}") from error
 
 
 def _from_json(path: Path) -> Calibration:
