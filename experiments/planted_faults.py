@@ -563,8 +563,8 @@ FAULTS = (
     Fault(
         "log predictive density with the wrong sign",
         "comparison.py",
-        "log_density=float(np.mean(stats.norm.logpdf(error, scale=u)))",
-        "log_density=-float(np.mean(stats.norm.logpdf(error, scale=u)))",
+        "log_density=float(np.mean(stats.t.logpdf(error, dof[name], scale=u)))",
+        "log_density=-float(np.mean(stats.t.logpdf(error, dof[name], scale=u)))",
         "the worse predictor has the better score",
         ("gap.py::test_scores_of_predictions_by_hand",),
         survived="read: no test read this score.",

@@ -138,21 +138,24 @@ def test_joint_foretells_a_step_count_it_never_saw(mixed_fit):
 
 
 def test_scores_of_predictions_by_hand():
-    """Two folds of two: errors of the classic 3, 1, -2, -4 and of the joint 0.3, 0.1, -0.2, -0.4, all with u = 1."""
+    """Two folds of two: errors of the classic 3, 1, -2, -4 (3 degrees of freedom), of the joint a tenth; all u = 1."""
     told = []
     for e, (fold, direction, error) in enumerate(
         (("a", "left", 3), ("a", "left", 1), ("b", "up", -2), ("b", "up", -4))
     ):
-        told.append(Prediction(e, fold, direction, 100, 6.0 + error, 6.0, 1.0, 6.0 + 0.9 * error, 1.0))
+        told.append(Prediction(e, fold, direction, 100, 6.0 + error, 6.0, 1.0, 3, 6.0 + 0.9 * error, 1.0))
     held = _judge("steps", told, np.array([100, 200]), {})
     assert held.classic.rms_deg == pytest.approx(np.sqrt(30 / 4)) and held.joint.rms_deg == pytest.approx(
         np.sqrt(0.075)
     )
     # Means of the blocks: 2 and -3, a tenth of them for the joint.
     assert held.classic.rms_block_deg == pytest.approx(np.sqrt(6.5)) and held.ratio == pytest.approx(10.0)
-    assert (held.classic.coverage, held.joint.coverage) == (0.25, 1.0)
-    for score, errors in ((held.classic, (3, 1, -2, -4)), (held.joint, (0.3, 0.1, -0.2, -0.4))):
-        density = [np.exp(-0.5 * x * x) / np.sqrt(2 * np.pi) for x in errors]
+    # t(0.975, 3) = 3.18.
+    assert (held.classic.coverage, held.joint.coverage) == (0.75, 1.0)
+    # Student's density with 3 degrees of freedom is 6 sqrt 3 / (pi (3 + x^2)^2).
+    student = [6 * np.sqrt(3) / np.pi / (3 + x * x) ** 2 for x in (3, 1, -2, -4)]
+    normal = [np.exp(-0.5 * x * x) / np.sqrt(2 * np.pi) for x in (0.3, 0.1, -0.2, -0.4)]
+    for score, density in ((held.classic, student), (held.joint, normal)):
         assert score.log_density == pytest.approx(np.mean(np.log(density)))
     assert held.verdict == CANNOT_TELL and "2 blocks" in held.reason
 
@@ -165,7 +168,7 @@ def test_the_better_predictor_is_named(verdict):
     if verdict == BETTER_CLASSIC:
         near, far = far, near
     told = [
-        Prediction(e, f"fold {e}", "left", 100, 6.0 + error, float(far[e]), 1.0, float(near[e]), 1.0)
+        Prediction(e, f"fold {e}", "left", 100, 6.0 + error, float(far[e]), 1.0, 3, float(near[e]), 1.0)
         for e, error in enumerate(errors)
     ]
     held = _judge("steps", told, np.array([100, 200]), {})

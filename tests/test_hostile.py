@@ -5,18 +5,28 @@ The rows follow research/security.md section 1 (TOML, JSON, CSV, paths) and DESI
 
 from __future__ import annotations
 
+import json
 import os
 import re
+import shlex
+import shutil
+import tracemalloc
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
+from hostile_folders import CRAFTED, MEGABYTE, TARGETS, good_folder, mutations, png, sealed
 from small_campaign import small_campaign
 
-from tvsbayes.campaign import parse_header, parse_moves, parse_spots, read_campaign, write_campaign
-from tvsbayes.files import InputError, parse_toml
-from tvsbayes.rigs import parse_rig_table, parse_stereo
+import tvsbayes.device.journal as journal_module
+from tvsbayes import cli
+from tvsbayes.calibration import read_draws
+from tvsbayes.campaign import input_hashes, read_campaign, write_campaign
+from tvsbayes.cli import run
+from tvsbayes.device.journal import LOG_ENTRIES_MAX, LOG_EVENTS_MAX, Journal, read_journal, repair, verify
+from tvsbayes.device.spots import detect
+from tvsbayes.files import DeviceFault, InputError, NotConverged, output_place, read_arrays
 
 FILES = ("campaign.toml", "stereo.json", "moves.csv", "spots.csv")
 Edit = Callable[[bytes], bytes]
@@ -255,68 +265,218 @@ def test_a_link_to_the_folder_is_fine(folder, tmp_path):
     assert read_campaign(tmp_path / "link").moves == small_campaign().moves
 
 
-def mutate(data: bytes, rng: np.random.Generator) -> bytes:
-    """One to three random changes: bytes, cuts, repetitions, and tokens that parsers stumble over."""
-    tokens = (
-        *(b"nan", b"-inf", b"1e999", b"9_4.7", b"", b",", b"\n", b'"', b"'", b"[", b"{", b"]", b"}", b"."),
-        *(
-            b"\0",
-            b"\xff",
-            b"\xe2\x80\xae",
-            b"\xef\xbb\xbf",
-            b"\r",
-            b"=1+1",
-            b"-1",
-            b"0",
-            b"1" * 5000,
-            b"null",
-        ),
-        *(b"true", b"#", b"\\", b"\\u0000", b"[[", b'"""', b":", b"=", b"1e-400", b"0x1F", b"1979-05-27"),
-    )
-    for _ in range(rng.integers(1, 4)):
-        at = int(rng.integers(0, len(data) + 1))
-        length = int(rng.integers(0, 12))
-        kind = rng.integers(0, 5)
-        if kind == 0:
-            data = data[:at] + bytes([rng.integers(0, 256)]) + data[at + 1 :]
-        elif kind == 1:
-            data = data[:at] + data[at + length :]
-        elif kind == 2:
-            data = data[:at] + data[at : at + 40] * 2 + data[at:]
-        elif kind == 3:
-            data = data[:at] + tokens[rng.integers(0, len(tokens))] + data[at + length :]
-        else:
-            numbers = list(re.finditer(rb"-?\d+\.?\d*", data))
-            if numbers:
-                match = numbers[rng.integers(0, len(numbers))]
-                data = data[: match.start()] + tokens[rng.integers(0, len(tokens))] + data[match.end() :]
-    return data
+@pytest.fixture(scope="module")
+def good(tmp_path_factory) -> Path:
+    """A folder with a journal, results, frames and all else; every test leaves it as it is."""
+    return good_folder(tmp_path_factory.mktemp("good") / "c")
 
 
-def test_random_mutations_are_read_or_refused(folder):
-    """2000 seeded mutations of a good folder: success or `InputError`, whatever else is a defect."""
-    rng = np.random.default_rng(20260115)
-    good = {file: (folder / file).read_bytes() for file in FILES}
-    stereo = small_campaign().stereo
-
-    def read_toml(data: bytes) -> None:
-        keys = parse_toml(data, "campaign.toml")
-        parse_header(keys)
-        parse_rig_table(keys.table("rig"))
-
-    readers: dict[str, Callable[[bytes], object]] = {
-        "campaign.toml": read_toml,
-        "stereo.json": lambda data: parse_stereo(data, "stereo.json"),
-        "moves.csv": lambda data: parse_moves(data, "moves.csv"),
-        "spots.csv": lambda data: parse_spots(data, "spots.csv", 5, stereo),
-    }
-    refused = dict.fromkeys(FILES, 0)
-    for round_ in range(2000):
-        file = FILES[round_ % len(FILES)]
-        try:
-            readers[file](mutate(good[file], rng))
-        except InputError as error:
-            refused[file] += 1
-            assert error.file == file and error.message.isprintable(), error.message
+def test_random_mutations_are_read_or_refused(good):
+    """1300 seeded mutations of a good folder: success or a documented error, whatever else is a defect."""
+    refused = dict.fromkeys(TARGETS, 0)
+    for outcome in mutations(good, range(1300), 20260115):
+        if outcome.error is not None:
+            refused[outcome.target] += 1
+            message = outcome.error.message
+            assert message.isprintable() and message.encode() and len(message) < 1200, message
     # A changed digit or a changed name may pass; a test whose mutations never bite would always pass.
-    assert all(100 < count < 500 for count in refused.values()), refused
+    assert all(10 < count for count in refused.values()), refused
+
+
+def test_mutations_take_no_memory_to_speak_of(good):
+    """The files hold 0.1 MB; what reads them may take a hundred times as much, no more."""
+    peaks = [outcome.peak_bytes for outcome in mutations(good, range(130), 7, traced=True)]
+    assert max(peaks) < 20 * MEGABYTE
+
+
+def place_of(good: Path, tmp_path: Path) -> Path:
+    """A copy to make hostile; its parent holds nothing else."""
+    return Path(shutil.copytree(good, tmp_path / "in" / "c"))
+
+
+def outside(tmp_path: Path) -> dict[str, bytes]:
+    """What stands beside the folder."""
+    files = (path for path in (tmp_path / "in").rglob("*") if path.is_file())
+    inside = tmp_path / "in" / "c"
+    return {str(path): path.read_bytes() for path in files if not path.is_relative_to(inside)}
+
+
+LIGHT = {
+    name: crafted
+    for name, crafted in CRAFTED.items()
+    if not crafted.large
+    and crafted.codes == {2}
+    and any(c.startswith(("check @", "classic")) for c in crafted.commands)
+}
+
+
+@pytest.mark.parametrize("name", LIGHT)
+def test_crafted_folders_are_refused_by_the_commands(good, tmp_path, capsys, name):
+    folder = place_of(good, tmp_path)
+    LIGHT[name].edit(folder)
+    before = outside(tmp_path)
+    for command in LIGHT[name].commands:
+        if command.startswith(("check", "classic")):
+            code = run(shlex.split(command.replace("@", str(folder))))
+            said = capsys.readouterr()
+            assert code == 2 and "Traceback" not in said.err and "\x1b" not in said.out + said.err
+    assert outside(tmp_path) == before
+
+
+ARCHIVES = [name for name, crafted in CRAFTED.items() if crafted.threat == "pickle, npz, npy" and not crafted.large]
+
+
+@pytest.mark.parametrize("name", ARCHIVES)
+def test_archives_of_strangers_take_neither_memory_nor_commands(good, tmp_path, monkeypatch, name):
+    """Of 0.5 kB NumPy's own reader makes gigabytes, of 1 kB zipfile does."""
+    folder = place_of(good, tmp_path)
+    monkeypatch.chdir(tmp_path)
+    CRAFTED[name].edit(folder)
+    tracemalloc.start()
+    try:
+        with pytest.raises(InputError) as caught:
+            read_draws(folder / "results" / "draws.npz")
+        assert tracemalloc.get_traced_memory()[1] < 20 * MEGABYTE
+    finally:
+        tracemalloc.stop()
+    assert caught.value.code == "damaged-results" and caught.value.message.isprintable()
+    assert not (tmp_path / "pwned").exists()
+
+
+def test_arrays_come_back_as_they_were_written(tmp_path):
+    arrays = {
+        "fortran": np.asfortranarray(np.arange(6.0).reshape(2, 3)),
+        "text": np.array(["a", "bcd"]),
+        "flag": np.array(True),
+        "none": np.zeros((0, 4, 4)),
+        "counts": np.arange(5, dtype=np.uint32),
+    }
+    for save in (np.savez, np.savez_compressed):
+        save(tmp_path / "a.npz", **arrays)
+        again = read_arrays(tmp_path / "a.npz", MEGABYTE, MEGABYTE)
+        assert set(again) == set(arrays)
+        for name, array in arrays.items():
+            assert again[name].dtype == array.dtype
+            np.testing.assert_array_equal(again[name], array)
+    with pytest.raises(ValueError, match="unpacked"):
+        read_arrays(tmp_path / "a.npz", MEGABYTE, 100)
+
+
+def test_results_are_not_written_through_a_link(good, tmp_path):
+    """A stranger's `results` may lead into somebody's home."""
+    folder = place_of(good, tmp_path)
+    assert output_place(folder, "results", "overlay") == folder / "results" / "overlay"
+    CRAFTED["results folder links outside"].edit(folder)
+    for names in (("results",), ("results", "overlay")):
+        with pytest.raises(InputError) as caught:
+            output_place(folder, *names)
+        assert caught.value.code == "path" and "--out" in caught.value.message
+    before = outside(tmp_path)
+    assert run(["report", str(folder)]) == 2
+    assert run(["detect", str(folder), "--overlay"]) == 2
+    assert outside(tmp_path) == before
+
+
+def test_a_log_is_capped_in_events_and_entries(good, tmp_path):
+    folder = place_of(good, tmp_path)
+    for make, what in (
+        (lambda: b"\n" * (LOG_EVENTS_MAX + 1), "events"),
+        (lambda: b"[" * (LOG_ENTRIES_MAX + 1), "entries"),
+    ):
+        (folder / "journal" / "log.jsonl").write_bytes(make())
+        for read in (read_journal, lambda place: repair(place, tmp_path / "repaired")):
+            with pytest.raises(InputError, match=what) as caught:
+                read(folder / "journal")
+            assert caught.value.code == "size"
+    assert not (tmp_path / "repaired").exists()
+
+
+def test_a_full_journal_says_so_and_stays_readable(tmp_path, monkeypatch):
+    monkeypatch.setattr(journal_module, "LOG_EVENTS_MAX", 3)
+    journal = Journal.create(tmp_path / "run")
+    for step in range(2):
+        journal.append("intent", step=step)
+    with pytest.raises(DeviceFault) as caught:
+        journal.append("intent", step=2)
+    assert caught.value.code == "journal-full"
+    assert len(read_journal(tmp_path / "run").records) == 3
+
+
+def test_a_frame_named_twice_is_read_once(good, tmp_path):
+    folder = place_of(good, tmp_path) / "journal"
+    lines = (folder / "log.jsonl").read_bytes().split(b"\n")
+    looked = [k for k, line in enumerate(lines) if b"looked" in line]
+    lines[looked[1]] = lines[looked[1]].replace(b"000001_left", b"000000_left")
+    (folder / "log.jsonl").write_bytes(sealed(b"\n".join(lines)))
+    with pytest.raises(InputError, match="a frame that an event before it names"):
+        verify(folder)
+    done = repair(folder, tmp_path / "repaired")
+    assert done.lost_frames == ["frames/000000_left.png"]
+
+
+def test_a_report_is_not_made_from_the_fit_of_other_data(good, tmp_path, monkeypatch):
+    """`fit.json` of other data beside `draws.npz` of these: fit again, never combine."""
+    folder = place_of(good, tmp_path)
+    data = read_campaign(folder)
+    assert cli._fit_document(data, folder)["inputs"] == input_hashes(data)
+    CRAFTED["fit.json of other data"].edit(folder)
+
+    def fitted(campaign):
+        raise NotConverged("not-converged", "fitted anew", remedy="-")
+
+    monkeypatch.setattr(cli, "_converged_fit", fitted)
+    with pytest.raises(NotConverged, match="fitted anew"):
+        cli._fit_document(data, folder)
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "column"),
+    [
+        ("verdict", 5, "held_out.verdict"),
+        ("classic", None, "held_out.classic"),
+        ("joint", {"rms_deg": "0.1"}, "held_out.joint.rms_deg"),
+        ("unseen", {"<b>": 1.0}, "held_out.unseen"),
+        ("unseen", [], "held_out.unseen"),
+    ],
+)
+def test_a_damaged_comparison_is_refused_by_key(good, tmp_path, key, value, column):
+    from tvsbayes.comparison import _stored_hold_out
+
+    path = place_of(good, tmp_path) / "results" / "compare.json"
+    document = json.loads(path.read_text())
+    assert _stored_hold_out(path, document["inputs"]) == document
+    assert _stored_hold_out(path, {}) is None
+    document["held_out"][key] = value
+    path.write_text(json.dumps(document))
+    with pytest.raises(InputError) as caught:
+        _stored_hold_out(path, document["inputs"])
+    assert caught.value.column == column
+
+
+def test_frames_of_another_size_are_refused_before_they_are_decoded(good, tmp_path, monkeypatch):
+    folder = place_of(good, tmp_path)
+    (folder / "frames" / "000010_left.png").write_bytes(png(1000, 1000))
+
+    def decoded(data, file):
+        raise AssertionError("decoded")
+
+    monkeypatch.setattr("tvsbayes.device.spots.decode_image", decoded)
+    with pytest.raises(InputError) as caught:
+        detect(read_campaign(folder))
+    assert caught.value.code == "image-size"
+
+
+def test_boards_of_too_many_pixels_are_refused_before_they_are_decoded(tmp_path, monkeypatch):
+    from tvsbayes.device import boards
+
+    def decoded(path, folder):
+        raise AssertionError("decoded")
+
+    monkeypatch.setattr(boards, "read_image", decoded)
+    (tmp_path / "left01.png").write_bytes(png(5001, 4000, raw=b""))
+    with pytest.raises(InputError) as caught:
+        boards.find_views(tmp_path, boards.Board.named("9x6", 20.0))
+    assert caught.value.code == "image-size" and "20 million" in caught.value.message
+    (tmp_path / "left01.png").write_bytes(png(5000, 4000, raw=b""))
+    with pytest.raises(AssertionError, match="decoded"):
+        boards.find_views(tmp_path, boards.Board.named("9x6", 20.0))

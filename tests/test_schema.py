@@ -14,7 +14,7 @@ from schema_walk import problems
 from test_report import estimate, small_fit, small_summary
 
 from tvsbayes.certificate import FIT_FORMATS, read_fit
-from tvsbayes.files import InputError, shipped_data
+from tvsbayes.files import InputError, schema_problem, shipped_data
 from tvsbayes.report import FIT_FORMAT, write_results
 
 KEPT = Path(__file__).parent / "data"
@@ -47,6 +47,7 @@ def test_every_readable_version_has_a_schema_and_kept_documents():
 def test_old_documents_stay_valid_and_readable(path):
     document = json.loads(path.read_text())
     assert problems(document, schema_of(document)) == []
+    assert schema_problem(document, schema_of(document)) is None
     assert read_fit(path) == document
 
 
@@ -58,6 +59,7 @@ def test_a_new_document_obeys_the_schema(tmp_path):
     write_results(small_fit(), summary, tmp_path, seed=3)
     document = json.loads((tmp_path / "fit.json").read_text())
     assert problems(document, schema_of(document)) == []
+    assert schema_problem(document, schema_of(document)) is None
     assert read_fit(tmp_path / "fit.json") == document
 
 
@@ -153,6 +155,7 @@ def test_the_schema_refuses(path, value):
     # The line names the place: the changed value, or the table that lacks or must not hold it.
     stem = "$." + ".".join(p for p in path.split("/")[:-1] if not p.isdigit()) if "/" in path else "$"
     assert any(line.replace("[0]", "").startswith(stem.rstrip(".")) for line in found)
+    assert schema_problem(document, schema) is not None
 
 
 @pytest.mark.skipif(importlib.util.find_spec("jsonschema") is None, reason="jsonschema is not installed")
@@ -182,7 +185,7 @@ def test_the_walk_refuses_keywords_it_does_not_know():
         ("estimator", ["laplace"], "estimator"),
         ("effective_deg_per_step/left/value", "0.06", "effective_deg_per_step.left.value"),
         ("effective_deg_per_step/left/interval95", [1, "2"], "effective_deg_per_step.left.interval95"),
-        ("effective_deg_per_step/up", ..., "effective_deg_per_step.up.value"),
+        ("effective_deg_per_step/up", ..., "effective_deg_per_step.up"),
         ("parameters/backlash_deg.tilt/sd", -1.0, "parameters.backlash_deg.tilt.sd"),
         ("reference_pose_deg", [], "reference_pose_deg"),
         ("inputs/rig", 5, "inputs.rig"),

@@ -11,7 +11,6 @@ from __future__ import annotations
 import io
 import json
 import math
-import zipfile
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -20,7 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from tvsbayes.campaign import APPROACH_SIGN, Campaign, input_hashes
-from tvsbayes.files import InputError, closest, escaped, parse_json, read_bytes, shipped_data
+from tvsbayes.files import InputError, closest, escaped, parse_json, read_arrays, read_bytes, shipped_data
 from tvsbayes.rigs import FULL_TURN_DEG, HARMONIC_PRIORS
 
 CALIBRATION_FORMAT = "tvsbayes-calibration/1"
@@ -49,7 +48,8 @@ NUDGE_DEG = 1e-4
 """Half width of the central differences in stop errors and readings, whose sds are 0.01 deg and more."""
 AIM_STEPS, AIM_RAD = 40, 1e-11
 RESULTS_BYTES_MAX = 64 * 1024 * 1024
-UNPACKED_BYTES_MAX = 4 * RESULTS_BYTES_MAX
+UNPACKED_BYTES_MAX = 2 * RESULTS_BYTES_MAX
+NAME_CHARS_MAX = 200
 _TO_RAD = math.pi / 180
 
 
@@ -716,7 +716,7 @@ def load_calibration(path: Path | str) -> Calibration:
 def _damaged(path: Path, reason: object) -> InputError:
     return InputError(
         "damaged-results",
-        f"{escaped(path.name)} is not a calibration that tvsbayes wrote: {reason}",
+        f"{escaped(path.name)} is not a calibration that tvsbayes wrote: {escaped(str(reason), 200)}",
         file=escaped(path.name),
         allowed=f"format {CALIBRATION_FORMAT}",
         remedy="run `tvsbayes fit` on the campaign again",
@@ -732,6 +732,10 @@ def _shaped(calibration: Calibration) -> Calibration:
         array = getattr(calibration, name)
         if array.shape != shape or array.dtype != np.float64 or not np.all(np.isfinite(array)):
             raise ValueError(f"{name} has shape {array.shape}, wanted {shape} of finite numbers")
+    for text in (calibration.estimator, *calibration.causes):
+        # They are printed: on terminals, in reports.
+        if not (isinstance(text, str) and len(text) <= NAME_CHARS_MAX and text.isprintable()):
+            raise ValueError("a name of an estimator or cause is no plain text")
     if not set(NOISE_NAMES) <= set(calibration.noise_variance) or not set(AXES) <= set(calibration.overshoot_steps):
         raise ValueError("a noise variance or an overshoot is missing")
     if not all(math.isfinite(variance) and variance >= 0 for variance in calibration.noise_variance.values()):
@@ -743,44 +747,40 @@ def _shaped(calibration: Calibration) -> Calibration:
     return calibration
 
 
-def _archive(path: Path) -> np.lib.npyio.NpzFile:
-    """An .npz whose size, packed and unpacked, is checked before anything is read from it."""
-    data = read_bytes(path, RESULTS_BYTES_MAX)
-    with zipfile.ZipFile(io.BytesIO(data)) as archive:
-        if sum(member.file_size for member in archive.infolist()) > UNPACKED_BYTES_MAX:
-            raise ValueError(f"more than {UNPACKED_BYTES_MAX} bytes when unpacked")
-    return np.load(io.BytesIO(data), allow_pickle=False)
-
-
 def read_draws(path: Path) -> Calibration:
     """Read `draws.npz`; errors as in `load_calibration`."""
     try:
-        with _archive(path) as file:
-            if "format" not in file.files and "physical" in file.files:
-                raise InputError(
-                    NO_CALIBRATION,
-                    f"{escaped(path.name)} holds draws and no calibration: the fit behind it did not converge, or an "
-                    "older tvsbayes made it",
-                    file=escaped(path.name),
-                    remedy="run `tvsbayes fit` on the campaign again",
-                )
-            if str(file["format"]) != CALIBRATION_FORMAT or tuple(file["input_names"]) != INPUT_NAMES:
-                raise ValueError(f"format {str(file['format'])[:60]!r} or other columns")
-            tables = json.loads(str(file["tables"]))
-            return _shaped(
-                Calibration(
-                    **{name: file[name] for name in _ARRAYS},
-                    **{name: tables[name] for name in ("noise_variance", "overshoot_steps", "period_deg")},
-                    azimuth=bool(file["azimuth"]),
-                    estimator=str(file["estimator"]),
-                    inputs_sha256=tables["inputs_sha256"],
-                    causes=tuple(tables["causes"]),
-                )
+        file = read_arrays(path, RESULTS_BYTES_MAX, UNPACKED_BYTES_MAX)
+        if "format" not in file and "physical" in file:
+            raise InputError(
+                NO_CALIBRATION,
+                f"{escaped(path.name)} holds draws and no calibration: the fit behind it did not converge, or an "
+                "older tvsbayes made it",
+                file=escaped(path.name),
+                remedy="run `tvsbayes fit` on the campaign again",
             )
-    except InputError:
-        raise
-    except Exception as error:
+        if str(file["format"]) != CALIBRATION_FORMAT or file["input_names"].tolist() != list(INPUT_NAMES):
+            raise ValueError(f"format {str(file['format'])[:60]!r} or other columns")
+        tables = _tables(str(file["tables"]), path)
+        return _shaped(
+            Calibration(
+                **{name: file[name] for name in _ARRAYS},
+                **{name: tables[name] for name in ("noise_variance", "overshoot_steps", "period_deg")},
+                azimuth=bool(file["azimuth"]),
+                estimator=str(file["estimator"]),
+                inputs_sha256=tables["inputs_sha256"],
+                causes=tuple(tables["causes"]),
+            )
+        )
+    except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
         raise _damaged(path, error) from error
+
+
+def _tables(text: str, path: Path) -> dict[str, object]:
+    try:
+        return parse_json(text.encode(), escaped(path.name)).values
+    except InputError as error:
+        raise _damaged(path, f"its tables are no JSON of tvsbayes: {error.found}") from error
 
 
 def _from_json(path: Path) -> Calibration:
@@ -804,7 +804,7 @@ def _from_json(path: Path) -> Calibration:
                 inputs_sha256=dict(d["inputs"]),
             )
         )
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
+    except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
         raise _damaged(path, error) from error
 
 
@@ -836,9 +836,9 @@ def stored_ratios(campaign: Campaign) -> np.ndarray:
     """
     path = campaign.path / "results" / "draws.npz"
     try:
-        with _archive(path) as file:
-            draws = np.array(file["effective_deg_per_step"], dtype=float)
-    except Exception as error:
+        file = read_arrays(path, RESULTS_BYTES_MAX, UNPACKED_BYTES_MAX)
+        draws = np.array(file["effective_deg_per_step"], dtype=float)
+    except (KeyError, TypeError, ValueError) as error:
         raise _damaged(path, error) from error
     if draws.ndim != 2 or draws.shape[1] != 4 or not np.all(np.isfinite(draws)):
         raise _damaged(path, ValueError("effective_deg_per_step"))

@@ -22,6 +22,7 @@ import subprocess
 import xml.etree.ElementTree as ET
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -38,7 +39,18 @@ from tvsbayes.calibration import (
     output_deg,
 )
 from tvsbayes.campaign import APPROACH_SIGN, Campaign, Move, input_hashes
-from tvsbayes.files import JSON_BYTES_MAX, InputError, Keys, NotConverged, escaped, parse_json, read_bytes
+from tvsbayes.files import (
+    JSON_BYTES_MAX,
+    InputError,
+    Keys,
+    NotConverged,
+    escaped,
+    parse_json,
+    read_bytes,
+    schema_problem,
+    shipped_data,
+    shown,
+)
 
 if TYPE_CHECKING:
     from tvsbayes.comparison import Budget
@@ -846,43 +858,47 @@ _XSD_SECONDS = 60
 
 FIT_FORMATS = ("tvsbayes-fit/1",)
 """Versions of `results/fit.json` that can be read; the schema of each is in `data/schemas`."""
-LARGEST = 1e9
 
 
-def _check_estimate(table: Keys, name: str) -> None:
-    """An estimate of `fit.json`, or null."""
-    if table.values.get(name, "") is None:
-        return
-    entry = table.table(name)
-    entry.number("value", -LARGEST, LARGEST)
-    entry.number("sd", 0.0, LARGEST)
-    ends = entry.values.get("interval95")
-    if not (isinstance(ends, list) and len(ends) == 2 and all(type(x) in (int, float) for x in ends)):
-        raise entry.refuse("interval95", "interval", "two finite numbers", "run `tvsbayes fit` again")
+@cache
+def _fit_schema(version: str) -> dict[str, object]:
+    return json.loads((shipped_data() / "schemas" / f"fit-{version}.schema.json").read_text(encoding="utf-8"))
+
+
+def _check_agreement(keys: Keys) -> None:
+    """What no schema can say: sizes that belong together, names that others stand for."""
+    again = "run `tvsbayes fit` again"
+    covariance = keys.table("covariance")
+    count = len(covariance.values["names"])
+    if any(len(row) != count for row in [covariance.values["matrix"], *covariance.values["matrix"]]):
+        raise covariance.refuse("matrix", "shape", f"{count} rows of {count} numbers", again)
+    keys.integer("seed", 0, 2**63 - 1)
+    keys.text_value("command", 20_000)
+    for name in ("python", "tvsbayes", *keys.table("versions").values):
+        keys.table("versions").text_value(name)
 
 
 def read_fit(path: Path | str) -> dict[str, object]:
-    """Read `results/fit.json` of any version; what a certificate is written from is checked.
+    """Read `results/fit.json` of any version: what reports and certificates are written from, held to its schema.
 
     Raises:
         InputError: missing, damaged or of an unknown version, with the key.
     """
     keys = parse_json(read_bytes(Path(path), JSON_BYTES_MAX), escaped(Path(path).name))
-    keys.word("format", FIT_FORMATS)
-    keys.word("estimator", ("laplace", "posterior"))
-    keys.flag("converged")
-    keys.integer("seed", 0, 2**63 - 1)
-    keys.text_value("command", 20_000)
-    effective, parameters = keys.table("effective_deg_per_step"), keys.table("parameters")
-    for axis in AXES:
-        keys.table("reference_pose_deg").number(axis, -LARGEST, LARGEST)
-        for direction in SIDES[axis]:
-            _check_estimate(effective, direction)
-        _check_estimate(parameters, f"backlash_deg.{axis}")
-    for name in ("moves", "spots", "stereo", "rig"):
-        keys.table("inputs").text_value(name)
-    for name in ("python", "tvsbayes", *keys.table("versions").values):
-        keys.table("versions").text_value(name)
+    version = keys.word("format", FIT_FORMATS).removeprefix("tvsbayes-fit/")
+    if problem := schema_problem(keys.values, _fit_schema(version)):
+        place, allowed = problem
+        table, key, value = keys, place[0], keys.values
+        for part in place:
+            # An entry of a list is named by the key of the list.
+            if isinstance(value, list):
+                value = value[int(part)]
+                continue
+            if value is not keys.values:
+                table = Keys(value, keys.file, keys.text, (*table.path, key))
+            key, value = part, value.get(part, "nothing")
+        raise table.refuse(key, "schema", allowed, "run `tvsbayes fit` again", shown(value))
+    _check_agreement(keys)
     return keys.values
 
 

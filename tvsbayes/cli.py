@@ -28,6 +28,7 @@ from tvsbayes.files import (
     TvsError,
     escaped,
     make_folder,
+    output_place,
     parse_table,
     read_bytes,
     shipped_data,
@@ -239,7 +240,7 @@ def detect(
     from tvsbayes.device.spots import detect as find
     from tvsbayes.report import detection_text
 
-    pictures = campaign / "results" / "overlay" if overlay else None
+    pictures = output_place(campaign, "results", "overlay") if overlay else None
     data = read_campaign(campaign)
     with _counting("detecting") as show:
         found = find(data, method, speckle_contrast=speckle_contrast, overlay=pictures, done=show)
@@ -523,7 +524,7 @@ def fit(
     from tvsbayes.report import fit_text, write_results
 
     use_compilation_cache()
-    folder = out or campaign / "results"
+    folder = out or output_place(campaign, "results")
     model = {"per_axis": per_axis, "harmonics": harmonics, "no_backlash": no_backlash}
     result = fit_joint(data, robust=robust, **model, seed=seed)
     summary, posterior, more = summarise(result), None, {}
@@ -644,6 +645,7 @@ def report(
     from tvsbayes.campaign import read_campaign
 
     data = read_campaign(campaign)
+    results = output_place(campaign, "results")
     document = _fit_document(data, campaign)
     from tvsbayes.certificate import check_dcc, dcc_bytes
     from tvsbayes.comparison import gather
@@ -653,13 +655,13 @@ def report(
     use_compilation_cache()
     limits = {"limit_deg_per_step": limit_deg_per_step, "limit_mm": limit_mm}
     evidence = gather(data, document, load_calibration(campaign), range_mm=range_mm, **limits)
-    path = out or campaign / "results" / "report.html"
+    path = out or results / "report.html"
     write_atomically(path, report_html(evidence))
     files = {"report": str(path)}
     if pdf:
         files["pdf"] = str(print_to_pdf(path))
     if dcc or dcc_schema:
-        certificate = campaign / "results" / "dcc.xml"
+        certificate = results / "dcc.xml"
         places = {"laboratory": laboratory, "customer": customer, "country": country}
         today = datetime.datetime.now(datetime.UTC).date()
         content = dcc_bytes(data, document, issued=today, report=path.read_bytes(), **places)
@@ -686,12 +688,14 @@ def report(
 def _fit_document(data: Campaign, folder: Path) -> dict[str, Any]:
     """`results/fit.json` where it was made from exactly this campaign; else fit first (DESIGN 8)."""
     from tvsbayes.calibration import stored_calibration
+    from tvsbayes.campaign import input_hashes
     from tvsbayes.certificate import read_fit
 
     path = folder / "results" / "fit.json"
     if stored_calibration(data) is not None and path.exists():
         document = read_fit(path)
-        if "budgets" in document:
+        # An old fit.json beside new draws would be the report of other data.
+        if "budgets" in document and document["inputs"] == input_hashes(data):
             return document
     report_line("results/ are missing or older than the campaign: fitting first (Laplace approximation) ...")
     result = _converged_fit(data)
@@ -700,7 +704,7 @@ def _fit_document(data: Campaign, folder: Path) -> dict[str, Any]:
 
     summary, calibration = summarise(result), calibration_of(result)
     evidence = _evidence(result, summary, None, calibration)
-    write_results(result, summary, folder / "results", 0, calibration, None, evidence)
+    write_results(result, summary, output_place(folder, "results"), 0, calibration, None, evidence)
     return read_fit(path)
 
 
@@ -718,6 +722,7 @@ def compare(
     if by not in ("steps", "regions"):
         raise InputError("usage", f"--by {escaped(by)}: allowed are steps and regions", remedy="choose one of them")
     data = [read_campaign(folder) for folder in (campaign, *([other] if other is not None else ()))]
+    results = output_place(campaign, "results")
     from tvsbayes.report import changes_text, gap_text, hold_out_text
 
     report_line("fitting (Laplace approximation) ...")
@@ -747,8 +752,8 @@ def compare(
         "inputs": input_hashes(data[0]),
         "seed": seed,
     }
-    make_folder(campaign / "results")
-    path = campaign / "results" / "compare.json"
+    make_folder(results)
+    path = results / "compare.json"
     write_atomically(path, json.dumps(document, indent=1, allow_nan=False).encode())
     text = f"{gap_text(gaps)}\n\n{hold_out_text(held)}\nwritten: {path}"
     _finish({**document, "files": {"compare": str(path)}}, text, as_json)
@@ -939,9 +944,10 @@ def plan(
         text += f"\nwritten: {escaped(str(output), 200)}"
     if data is not None:
         # Where the report looks for what to measure next.
-        make_folder(data.path / "results")
+        results = output_place(data.path, "results")
+        make_folder(results)
         stored = {"format": "tvsbayes-plan/1", "inputs": input_hashes(data), **document}
-        write_atomically(data.path / "results" / "plan.json", json.dumps(stored, indent=1, allow_nan=False).encode())
+        write_atomically(results / "plan.json", json.dumps(stored, indent=1, allow_nan=False).encode())
     _finish(document, text, as_json)
     if target is not None and not result.met:
         raise _Ended(TvsError.exit_code)

@@ -904,6 +904,31 @@ class Evidence:
     point: BudgetTable | None
 
 
+def _stored_hold_out(path: Path, inputs: object) -> dict[str, object] | None:
+    """The document of `compare` where it was made from the same data and priors; what reports show is checked."""
+    if not path.exists():
+        return None
+    keys = parse_json(read_bytes(path, JSON_BYTES_MAX), path.name)
+    if keys.values.get("inputs") != inputs:
+        return None
+    held = keys.table("held_out")
+    held.text_value("verdict")
+    held.text_value("reason", 2000)
+    for name in ("classic", "joint"):
+        if held.values.get(name, "") is not None:
+            score = held.table(name)
+            for figure in ("rms_deg", "rms_block_deg"):
+                score.number(figure, 0.0, 1e6)
+            score.number("coverage", 0.0, 1.0)
+        elif held.values.get("classic") is not held.values.get("joint"):
+            raise held.refuse(name, "table", "scores of both estimators or of none", "run `tvsbayes compare` again")
+    for direction in held.table("unseen").values:
+        if direction not in DIRECTIONS:
+            raise held.refuse("unseen", "word", ", ".join(DIRECTIONS), "run `tvsbayes compare` again")
+        held.table("unseen").number(direction, 0.0, 1e6)
+    return keys.values
+
+
 def gather(
     campaign: Campaign,
     fit: Mapping[str, object],
@@ -961,7 +986,7 @@ def gather(
         campaign=campaign,
         fit=fit,
         classic=classic_result,
-        held_out=_stored(campaign, fit, "compare.json"),
+        held_out=_stored_hold_out(campaign.path / "results" / "compare.json", fit["inputs"]),
         planned=_stored(campaign, fit, "plan.json"),
         criteria=criteria,
         distances_mm=found,

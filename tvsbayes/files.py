@@ -1,4 +1,4 @@
-"""Strict files at the border: teaching errors, capped bytes, CSV, TOML, JSON, images, atomic writes, shipped data.
+"""Strict files at the border: teaching errors, capped bytes, CSV, TOML, JSON, arrays, images, atomic writes.
 
 Everything a stranger's folder can contain enters the package here. A reader either returns checked values or raises
 `InputError` with file, line, column, what was found, what is allowed and what to do; sizes are capped before anything
@@ -23,7 +23,9 @@ import re
 import secrets
 import stat
 import tomllib
-from collections.abc import Callable, Iterable, Iterator, Sequence
+import zipfile
+import zlib
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from importlib import resources
 from pathlib import Path
@@ -176,7 +178,10 @@ def read_bytes(path: Path, cap: int, folder: Path | None = None) -> bytes:
             if status.st_size > cap:
                 raise bad("size", f"{status.st_size} bytes", "split the data or remove what is not needed")
             with open(descriptor, "rb", closefd=False) as stream:
-                data = stream.read(cap + 1)
+                # As much as there is: a read of the cap would allocate the cap for every file.
+                data = stream.read(status.st_size + 1)
+                if len(data) > status.st_size:
+                    data += stream.read(cap + 1 - len(data))
         finally:
             os.close(descriptor)
     except FileNotFoundError as error:
@@ -260,6 +265,24 @@ def make_folder(folder: Path, *, empty: bool = False) -> None:
         raise refusal("occupied", file=place, found="a folder with files", allowed=allowed, remedy=remedy)
 
 
+def output_place(folder: Path, *names: str) -> Path:
+    """`folder / names`, a place for output that no link leads out of the folder.
+
+    Raises:
+        InputError: a link inside the folder leads elsewhere: a stranger's folder chooses no place to write to.
+    """
+    place = Path(folder).joinpath(*names)
+    try:
+        inside = place.resolve().is_relative_to(Path(folder).resolve())
+    except (OSError, RuntimeError):
+        inside = False
+    if not inside:
+        shown_place, allowed = escaped(str(place), 200), "a folder inside the campaign"
+        remedy = "remove the link, or name the place for results with --out where the command has it"
+        raise refusal("path", file=shown_place, found="a link that leaves it", allowed=allowed, remedy=remedy)
+    return place
+
+
 def shipped_data() -> Path:
     """The folder of twins, rigs, templates and reference values that travels with the package.
 
@@ -269,8 +292,9 @@ def shipped_data() -> Path:
     return inside if inside.is_dir() else Path(__file__).resolve().parents[1] / "data"
 
 
-CSV_BYTES_MAX = 128 * 1024 * 1024
-CSV_ROWS_MAX = 500_000
+CSV_BYTES_MAX = 64 * 1024 * 1024
+CSV_ROWS_MAX = 200_000
+"""At these caps a table of spots takes 0.6 GB and 6 s of processor time to read (experiments/hostile.md)."""
 CSV_LINE_CHARS_MAX = 16_384
 
 NUMBER = re.compile(r"[+-]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][+-]?[0-9]+)?")
@@ -387,12 +411,17 @@ class Table:
                 raise self.refuse(row, column, "duplicate", what, "renumber one of them", found)
 
 
+_CSV_LINE = re.compile(r"[^\r\n]*(?:\r\n?|\n)|[^\r\n]+")
+
+
 def _csv_rows(text: str, file: str) -> Iterator[tuple[int, list[str]]]:
     """Rows of a CSV text with the line on which each begins."""
     bad = partial(refusal, file=file)
 
     def capped_lines() -> Iterator[str]:
-        for number, line in enumerate(io.StringIO(text, newline=""), start=1):
+        # A StringIO would hold the text once more, with four bytes a character.
+        for number, found_line in enumerate(_CSV_LINE.finditer(text), start=1):
+            line = found_line.group()
             if len(line) > CSV_LINE_CHARS_MAX:
                 found, allowed = f"{len(line)} characters in one line", f"at most {CSV_LINE_CHARS_MAX}"
                 raise bad("size", line=number, found=found, allowed=allowed, remedy="one row per line")
@@ -716,6 +745,140 @@ def toml_line(key: str, value: object) -> str:
     """`key = value`, the key quoted where TOML asks for it."""
     bare = re.fullmatch(r"[A-Za-z0-9_-]+", key)
     return f"{key if bare else json.dumps(key, ensure_ascii=False)} = {toml_value(value)}"
+
+
+def schema_problem(value: object, schema: Mapping[str, object]) -> tuple[tuple[str, ...], str] | None:
+    """The first place at which parsed JSON breaks a JSON Schema (draft 2020-12), None where it is valid.
+
+    Args:
+        value: as `json.loads` gives it.
+        schema: of this package: `$ref` to its own `$defs`, `anyOf`, `type`, `const`, `enum`, limits of numbers and
+            of lengths, `pattern`, `items`, `properties`, `required`, `propertyNames`, `additionalProperties`.
+
+    Returns:
+        The keys that lead there, list entries by their number, and what is allowed.
+    """
+    return _schema_problem(value, schema, schema, ())
+
+
+_JSON_TYPES = {"object": dict, "array": list, "string": str, "number": int | float, "null": type(None)}
+
+
+def _has_type(value: object, name: str) -> bool:
+    """JSON's types: true is no number; 3.0 is an integer."""
+    if name == "boolean" or isinstance(value, bool):
+        return name == "boolean" and isinstance(value, bool)
+    if name == "integer":
+        return isinstance(value, int) or (isinstance(value, float) and value.is_integer())
+    return isinstance(value, _JSON_TYPES[name])
+
+
+def _schema_problem(value, schema, root, path) -> tuple[tuple[str, ...], str] | None:
+    if isinstance(schema, bool):
+        return None if schema else (path, "nothing")
+    if reference := schema.get("$ref"):
+        problem = _schema_problem(value, root["$defs"][reference.removeprefix("#/$defs/")], root, path)
+        if problem:
+            return problem
+    if "anyOf" in schema:
+        tried = [_schema_problem(value, option, root, path) for option in schema["anyOf"]]
+        if all(tried):
+            # The option that got furthest is the one that was meant.
+            return max(tried, key=lambda problem: len(problem[0]))
+    if types := schema.get("type"):
+        names = [types] if isinstance(types, str) else types
+        if not any(_has_type(value, name) for name in names):
+            return path, " or ".join(names)
+    if "const" in schema and value != schema["const"]:
+        return path, shown(schema["const"])
+    if "enum" in schema and value not in schema["enum"]:
+        return path, " or ".join(map(shown, schema["enum"]))
+    if isinstance(value, int | float) and not isinstance(value, bool):
+        if value < schema.get("minimum", value) or value <= schema.get("exclusiveMinimum", -math.inf):
+            return path, f"a number of at least {schema.get('minimum', schema.get('exclusiveMinimum'))}"
+        if value > schema.get("maximum", value):
+            return path, f"a number of at most {schema['maximum']}"
+    if isinstance(value, str) and "pattern" in schema and not re.search(schema["pattern"], value):
+        return path, f"text of the form {schema['pattern']}"
+    if isinstance(value, list):
+        if not schema.get("minItems", 0) <= len(value) <= schema.get("maxItems", len(value)):
+            return path, f"{schema.get('minItems', 0)} to {schema.get('maxItems', 'any number of')} entries"
+        if "items" in schema:
+            for number, item in enumerate(value):
+                if problem := _schema_problem(item, schema["items"], root, (*path, str(number))):
+                    return problem
+    if isinstance(value, dict):
+        properties = schema.get("properties", {})
+        for name in schema.get("required", ()):
+            if name not in value:
+                return (*path, name), "this key"
+        for name, item in value.items():
+            if problem := _schema_problem(name, schema.get("propertyNames", True), root, (*path, name)):
+                return problem
+            inner = properties.get(name, schema.get("additionalProperties", True))
+            if problem := _schema_problem(item, inner, root, (*path, name)):
+                return problem
+    return None
+
+
+ARRAYS_MAX = 256
+_NPY_HEADER = re.compile(
+    rb"\x93NUMPY\x01\x00(?P<length>..)\{'descr': '(?P<kind>[<>|][biufU][0-9]{1,8})', 'fortran_order': "
+    rb"(?P<fortran>True|False), 'shape': \((?P<shape>[0-9, ]{0,100})\),? ?\} *\n",
+    re.DOTALL,
+)
+"""Version 1.0 of the header (NEP 1) as NumPy writes it; no code is evaluated to read it, as NumPy itself does."""
+
+
+def _array_of(content: bytes, name: str) -> np.ndarray:
+    """The array of an .npy; ValueError for anything but numbers and text of exactly the size that its header states."""
+    import numpy as np
+
+    match = _NPY_HEADER.match(content)
+    if match is None or match.end() != 10 + int.from_bytes(match["length"], "little"):
+        raise ValueError(f"{name} is no array of numbers or text")
+    shape = tuple(int(length) for length in match["shape"].replace(b" ", b"").split(b",") if length)
+    try:
+        dtype = np.dtype(match["kind"].decode())
+    except TypeError as error:
+        raise ValueError(f"{name} is of the kind {match['kind'].decode()}") from error
+    if len(shape) > 8 or not dtype.itemsize or math.prod(shape) * dtype.itemsize != len(content) - match.end():
+        raise ValueError(f"{name} is not as long as its header says")
+    order = "F" if match["fortran"] == b"True" else "C"
+    return np.ndarray(shape, dtype, buffer=content, offset=match.end(), order=order).copy()
+
+
+def read_arrays(path: Path, bytes_max: int, unpacked_max: int) -> dict[str, np.ndarray]:
+    """The arrays of an .npz, by name; every size is checked against the header before anything is allocated.
+
+    `numpy.load` alone turns 0.5 kB into gigabytes: by entries of no width, and by bzip2 members, which zipfile
+    unpacks without a limit whatever size they state (experiments/hostile.md).
+
+    Raises:
+        InputError: what `read_bytes` refuses.
+        ValueError: no .npz of plain numbers and text as NumPy writes it, or more than `unpacked_max` bytes.
+    """
+    data = read_bytes(path, bytes_max)
+    arrays = {}
+    try:
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            members = archive.infolist()
+            if len(members) > ARRAYS_MAX or sum(member.file_size for member in members) > unpacked_max:
+                raise ValueError(f"more than {ARRAYS_MAX} arrays or {unpacked_max} bytes when unpacked")
+            for member in members:
+                if member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+                    raise ValueError("an array that is packed in another way than numpy packs it")
+                with archive.open(member) as stream:
+                    content = stream.read(member.file_size)
+                name = member.filename.removesuffix(".npy")
+                if name in arrays:
+                    raise ValueError(f"{escaped(name)} twice")
+                arrays[name] = _array_of(content, escaped(name))
+    except ValueError:
+        raise
+    except (OSError, EOFError, zipfile.BadZipFile, zlib.error, NotImplementedError, RuntimeError) as error:
+        raise ValueError(escaped(str(error), 120)) from error
+    return arrays
 
 
 IMAGE_BYTES_MAX = 64 * 1024 * 1024

@@ -32,7 +32,7 @@ from scipy import special
 
 from tvsbayes.campaign import input_hashes
 from tvsbayes.classic import DIRECTIONS
-from tvsbayes.files import InputError, NotConverged, write_atomically
+from tvsbayes.files import InputError, NotConverged, escaped, read_arrays, write_atomically
 from tvsbayes.joint import Derived, JointFit, derived_quantities
 from tvsbayes.likelihood import evaluate, move_log_density, observe_with_stop_errors, ordered_spots, spot_constants
 from tvsbayes.model import INDEX, NAMES, NOISE_NAMES
@@ -332,6 +332,8 @@ def pilot(target: Target, seed: int) -> Pilot:
 
 
 CHAIN_FORMAT = "tvsbayes-chain/1"
+CHAIN_BYTES_MAX = 2**32
+"""A chain is the user's own file: what was in memory when it was written fits there again."""
 POSTERIOR_FORMAT = "tvsbayes-posterior/1"
 PIXELS = ("u_left", "v_left", "u_right", "v_right")
 RHAT_LIMIT = 1.01
@@ -906,25 +908,39 @@ def _checkpoint(path: Path, fit: JointFit, route: Transport, start: Pilot, chain
 
 def _stored(path: Path, fit: JointFit, seed: int) -> tuple[Transport, Pilot, Chain]:
     """Read a checkpoint; refuse one of other data, model, priors, versions or seed."""
-    name = path.name
+    name = escaped(path.name)
+    if not path.exists():
+        raise InputError("no-chain", f"{name}: there is no chain to resume", file=name, remedy="run without --resume")
     try:
-        with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as file:
-            stored = {key: file[key] for key in file.files}
+        stored = read_arrays(path, CHAIN_BYTES_MAX, CHAIN_BYTES_MAX)
         if str(stored["format"]) != CHAIN_FORMAT:
-            raise ValueError(f"format {stored['format']}")
-    except FileNotFoundError as error:
-        raise InputError(
-            "no-chain", f"{name}: there is no chain to resume", file=name, remedy="run without --resume"
-        ) from error
-    except Exception as error:
+            raise ValueError(f"format {str(stored['format'])[:60]!r}")
+        same = str(stored["fingerprint"]) == fingerprint(fit) and int(stored["seed"]) == seed
+        position, has_gauss, gauss = stored["random_rest"]
+        random_state = (str(stored["random_kind"]), stored["random_keys"], int(position), int(has_gauss), float(gauss))
+        route = Transport(*(stored[f"transport_{k}"] for k in ("mode", "free", "root", "narrow", "bend", "stretch")))
+        proposal = Independence(stored["proposal_mean"], stored["proposal_sd"], route.heavy)
+        chain = Chain(
+            stored["w"],
+            stored["log_density"],
+            stored["accepted"],
+            random_state,
+            int(stored["invalid"]),
+            float(stored["seconds"]),
+        )
+        pilot = Pilot(proposal, stored["start"], stored["log_weights"])
+        steps, walkers, width = chain.w.shape
+        if chain.log_density.shape != (steps, walkers) or pilot.start.shape[1:] != (width,):
+            raise ValueError(f"{steps} steps of {walkers} walkers with parts of other lengths")
+    except (KeyError, TypeError, ValueError, IndexError, OverflowError) as error:
         raise InputError(
             "damaged-chain",
-            f"{name} is not a chain that tvsbayes wrote: {error}",
+            f"{name} is not a chain that tvsbayes wrote: {escaped(str(error), 200)}",
             file=name,
             allowed=f"format {CHAIN_FORMAT}",
             remedy="run without --resume; the chain starts anew",
         ) from error
-    if str(stored["fingerprint"]) != fingerprint(fit) or int(stored["seed"]) != seed:
+    if not same:
         raise InputError(
             "other-chain",
             f"{name} was sampled from other data, another model, other priors, another seed or other versions",
@@ -932,19 +948,7 @@ def _stored(path: Path, fit: JointFit, seed: int) -> tuple[Transport, Pilot, Cha
             allowed="the chain of the same campaign, options and versions",
             remedy="run without --resume, or restore the inputs and options it was started with",
         )
-    position, has_gauss, gauss = stored["random_rest"]
-    random_state = (str(stored["random_kind"]), stored["random_keys"], int(position), int(has_gauss), float(gauss))
-    route = Transport(*(stored[f"transport_{k}"] for k in ("mode", "free", "root", "narrow", "bend", "stretch")))
-    proposal = Independence(stored["proposal_mean"], stored["proposal_sd"], route.heavy)
-    chain = Chain(
-        stored["w"],
-        stored["log_density"],
-        stored["accepted"],
-        random_state,
-        int(stored["invalid"]),
-        float(stored["seconds"]),
-    )
-    return route, Pilot(proposal, stored["start"], stored["log_weights"]), chain
+    return route, pilot, chain
 
 
 def _tau(w: np.ndarray) -> float:

@@ -42,7 +42,7 @@ from tvsbayes.design import (
     prior_knowledge,
     sensitivity,
 )
-from tvsbayes.files import InputError, NotConverged, TvsError, escaped
+from tvsbayes.files import InputError, NotConverged, TvsError, escaped, read_bytes
 from tvsbayes.joint import JointFit, fit
 from tvsbayes.model import (
     INDEX,
@@ -57,6 +57,7 @@ from tvsbayes.simulation import (
 )
 
 STUDY_FORMAT = "tvsbayes-study/1"
+ROWS_BYTES_MAX = 128 * 1024 * 1024
 ENGINES = ("serial", "processes", "dask")
 ITERATIONS = 6
 """Of slope and width of a backlash: the width's error falls at least threefold each."""
@@ -367,7 +368,7 @@ class StudyRows:
 
     def __init__(self, path: Path) -> None:
         self.path = Path(path)
-        data = self.path.read_bytes() if self.path.exists() else b""
+        data = read_bytes(self.path, ROWS_BYTES_MAX) if self.path.exists() else b""
         whole = data[: data.rfind(b"\n") + 1]
         self.rows: dict[tuple[str, int], dict[str, object]] = {}
         for number, line in enumerate(whole.splitlines(), 1):

@@ -44,6 +44,8 @@ WIDEST_SHARE = 0.5
 REFINING_HALF_MIN, REFINING_HALF_MAX = 2, 11
 WORKERS_MAX = 8
 PICTURES_MAX = 2000
+PIXELS_MAX = 20_000_000
+"""Of one picture, and of those that are searched at the same time: two of 49 million take 2.5 GB to search."""
 
 
 @dataclass(frozen=True)
@@ -305,6 +307,11 @@ def find_views(folder: Path, board: Board, *, finder: Finder = "classic", swap: 
         picture: image_size(read_bytes(picture.path, IMAGE_BYTES_MAX, folder), escaped(picture.path.name))
         for picture in _pictures(folder, swap)
     }
+    for picture, (width, height) in sizes.items():
+        if width * height > PIXELS_MAX:
+            place, found = escaped(picture.path.name), f"{width} x {height} pixels"
+            allowed = f"at most {PIXELS_MAX // 1_000_000} million pixels"
+            raise refusal("image-size", file=place, found=found, allowed=allowed, remedy="record smaller pictures")
     sizes = {p: s for p, s in sizes.items() if len(p.sides) == 1 or (s[0] >= SIDE_BY_SIDE_RATIO * s[1])}
     if not sizes:
         raise NothingToEstimate(
@@ -328,7 +335,8 @@ def find_views(folder: Path, board: Board, *, finder: Finder = "classic", swap: 
     found: dict[str, dict[str, _Detection]] = {}
     names: dict[tuple[str, str], str] = {}
     without, fallback = [], []
-    with ThreadPoolExecutor(min(WORKERS_MAX, os.cpu_count() or 1)) as pool:
+    at_once = PIXELS_MAX // (size[0] * size[1] * max(len(p.sides) for p in used))
+    with ThreadPoolExecutor(max(1, min(WORKERS_MAX, os.cpu_count() or 1, at_once))) as pool:
         for picture, detections in zip(used, pool.map(detect, used), strict=True):
             for side, detection in detections.items():
                 name = picture.path.name + (f" ({side})" if len(picture.sides) > 1 else "")

@@ -37,7 +37,10 @@ from tvsbayes.files import (
 LOG = "log.jsonl"
 FORMAT = "tvsbayes-log/1"
 LINE_BYTES_MAX = 16_384
-LOG_BYTES_MAX = 256 * 1024 * 1024
+LOG_BYTES_MAX = 64 * 1024 * 1024
+LOG_EVENTS_MAX = 100_000
+LOG_ENTRIES_MAX = 5_000_000
+"""Commas and opening brackets: short entries take up to 40 times their text in memory (experiments/hostile.md)."""
 FRAME_BYTES_MAX = 128 * 1024 * 1024
 FRAME_FOLDERS = ("frames", "dark")
 """Pictures with the laser on and, for the background, off."""
@@ -189,6 +192,20 @@ def _is_torn(tail: bytes, number: int, previous: int) -> bool:
     return isinstance(_decode(tail[:-1], number, previous), str)
 
 
+def _read_log(folder: Path) -> bytes:
+    """The bytes of `log.jsonl`, capped in size, events and entries before anything is parsed."""
+    data = read_bytes(folder / LOG, LOG_BYTES_MAX, folder)
+    counts = {
+        "events": (data.count(b"\n"), LOG_EVENTS_MAX),
+        "entries": (sum(map(data.count, (b",", b"[", b"{"))), LOG_ENTRIES_MAX),
+    }
+    for what, (count, most) in counts.items():
+        if count > most:
+            found, allowed, remedy = f"{count} {what}", f"at most {most}", "split the run into several campaigns"
+            raise refusal("size", file=LOG, found=found, allowed=allowed, remedy=remedy)
+    return data
+
+
 def read_journal(folder: Path) -> Reading:
     """Reads `log.jsonl`; a torn last line is set apart, other damage is refused with its line.
 
@@ -196,7 +213,7 @@ def read_journal(folder: Path) -> Reading:
         InputError: missing, damaged, or not a journal of this format.
     """
     folder = Path(folder)
-    data = read_bytes(folder / LOG, LOG_BYTES_MAX, folder)
+    data = _read_log(folder)
     records: list[Record] = []
     position, previous = 0, 0
     while position < len(data):
@@ -262,10 +279,13 @@ def verify(folder: Path) -> Verification:
     """
     folder = Path(folder)
     reading = read_journal(folder)
+    named: set[str] = set()
     count = 0
     for record in reading.records:
         for frame in frames_of(record):
-            problem = _frame_problem(folder, frame)
+            # Each is read once: a log of thousands of lines that name one large file would take hours.
+            problem = "a frame that an event before it names" if frame.name in named else _frame_problem(folder, frame)
+            named.add(frame.name)
             if problem is not None:
                 place = {"file": LOG, "line": record.line, "column": frame.name}
                 allowed = "the frame that the event names, unchanged"
@@ -289,7 +309,7 @@ class Journal:
         self.torn = reading.torn
         """Bytes that were cut off when this journal was opened; they are kept in a file of their own."""
         self._descriptor: int | None = descriptor
-        self._crc, self._disk = reading.crc, disk
+        self._crc, self._size, self._disk = reading.crc, reading.size, disk
         self._dirty: set[Path] = set()
 
     @classmethod
@@ -380,11 +400,15 @@ class Journal:
         """
         line = encode(len(self.records), self._crc, event, data)
         with self._guarded() as descriptor:
+            if len(self.records) >= LOG_EVENTS_MAX or self._size + len(line) > LOG_BYTES_MAX:
+                message, remedy = "the journal is full", "begin a new campaign for the rest of the plan"
+                raise DeviceFault("journal-full", f"{message}; {remedy}", remedy=remedy)
             for folder in sorted(self._dirty):
                 self._flush_folder(folder)
             self._dirty.clear()
             self._write(descriptor, line)
             self._disk.fsync(descriptor)
+        self._size += len(line)
         self._crc = int(line[:8], 16)
         record = Record(len(self.records), event, json.loads(json.dumps(data)), len(self.records) + 1)
         self.records.append(record)
@@ -508,7 +532,7 @@ def repair(folder: Path, to: Path) -> Repair:
         InputError: nothing whole, or `to` holds something.
     """
     folder, to = Path(folder), Path(to)
-    data = read_bytes(folder / LOG, LOG_BYTES_MAX, folder)
+    data = _read_log(folder)
     lines = list(_whole_lines(data))
     done = Repair(torn_bytes=len(data) - data.rfind(b"\n") - 1)
     events = [(line, values, number) for line, values, number in lines if values is not None]
@@ -521,6 +545,7 @@ def repair(folder: Path, to: Path) -> Repair:
     created = {k: v for k, v in first.items() if k not in ("event", "format")}
     journal = Journal.create(to, **created, repaired=True)
     expected, ended = 1 if first else 0, False
+    named: set[str] = set()
     try:
         for line, values, number in events[1:] if first else events:
             if number != expected:
@@ -530,7 +555,9 @@ def repair(folder: Path, to: Path) -> Repair:
             record = Record(number, str(values["event"]), values, line)
             kept = []
             for frame in frames_of(record):
-                if _frame_problem(folder, frame) is None:
+                twice = frame.name in named
+                named.add(frame.name)
+                if not twice and _frame_problem(folder, frame) is None:
                     kept.append(journal.store(frame.name, read_bytes(folder / frame.name, FRAME_BYTES_MAX, folder)))
                 else:
                     done.lost_frames.append(frame.name)

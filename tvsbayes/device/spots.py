@@ -34,7 +34,19 @@ import numpy as np
 
 from tvsbayes.campaign import Campaign, Spot
 from tvsbayes.classic import distort, undistort
-from tvsbayes.files import InputError, NothingToEstimate, make_folder, png_bytes, read_image, refusal, write_atomically
+from tvsbayes.files import (
+    IMAGE_BYTES_MAX,
+    InputError,
+    NothingToEstimate,
+    decode_image,
+    escaped,
+    image_size,
+    make_folder,
+    png_bytes,
+    read_bytes,
+    refusal,
+    write_atomically,
+)
 from tvsbayes.rigs import Stereo
 
 METHODS = ("fit", "contour")
@@ -663,16 +675,18 @@ class _Frames:
 
     def read(self, spot: Spot, side: str) -> np.ndarray:
         path = self.path(spot, side)
-        picture = read_image(path, self.folder)
-        if picture.shape[1::-1] != self.size:
+        # Its size before it is decoded: a small file can hold 50 million pixels, on every thread.
+        data = read_bytes(path, IMAGE_BYTES_MAX, self.folder)
+        size = image_size(data, escaped(path.name))
+        if size != self.size:
             raise refusal(
                 "image-size",
                 file=path.name,
-                found=f"{picture.shape[1]} x {picture.shape[0]} pixels",
+                found=f"{size[0]} x {size[1]} pixels",
                 allowed=f"{self.size[0]} x {self.size[1]} as in stereo.json",
                 remedy="calibrate and observe at one image size",
             )
-        return picture
+        return decode_image(data, escaped(path.name))
 
 
 def _parallel(job: Callable, items: Sequence, workers: int) -> Iterator:
