@@ -93,7 +93,7 @@ def one_simulation(task: tuple[str, int]) -> dict[str, object]:
     from tvsbayes import likelihood
 
     # A small campaign in a small bucket: ordinary ones pad to 512 spots to share a compilation.
-    likelihood.SMALLEST_BUCKET = 64
+    likelihood.SMALLEST_BUCKET = 32 if variant == FEW else 64
     from tvsbayes.joint import fit
     from tvsbayes.model import use_compilation_cache
     from tvsbayes.posterior import sample
