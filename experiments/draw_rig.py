@@ -72,6 +72,7 @@ def beam_to_sheet(pan_deg: float, tilt_deg: float, sheet_mm: float) -> np.ndarra
 
 
 def arrow(axes: Axes, start: np.ndarray, end: np.ndarray, colour: str, width: float = 1.8) -> None:
+    """A straight arrow between page points."""
     style = patches.ArrowStyle("-|>", head_length=0.5, head_width=0.22)
     made = patches.FancyArrowPatch(start, end, arrowstyle=style, mutation_scale=13, shrinkA=0, shrinkB=0)
     made.set(color=colour, linewidth=width, zorder=6, joinstyle="miter")
@@ -88,15 +89,19 @@ def dimension(axes: Axes, start: np.ndarray, end: np.ndarray, text: str, offset:
     """A length between two page points with its text beside the middle."""
     style = {"arrowstyle": "<|-|>", "color": GREY, "lw": 0.9, "shrinkA": 0, "shrinkB": 0}
     axes.annotate("", end, start, arrowprops=style)
-    label(axes, (start + end) / 2 + offset, text, GREY)
+    label(axes, (start + end) / 2, offset, text, GREY)
 
 
-def label(axes: Axes, at: np.ndarray, text: str, colour: str = "black", **style) -> None:
+def label(
+    axes: Axes, at: np.ndarray, shift: tuple[float, float], text: str, colour: str = "black", **style: object
+) -> None:
+    """Words at a page point moved by `shift`."""
     style = {"ha": "center", "va": "center", "zorder": 8, **style}
-    axes.text(*at, text, color=colour, **style)
+    axes.text(*np.add(at, shift), text, color=colour, **style)
 
 
 def camera(axes: Axes, at: np.ndarray) -> None:
+    """A camera whose centre of projection is at a page point and which looks up the page."""
     body = np.array([[-11, -22], [11, -22], [11, -6], [4, -6], [8, 0], [-8, 0], [-4, -6], [-11, -6]])
     axes.add_patch(patches.Polygon(at + body, facecolor="#DDDDDD", edgecolor="black", lw=1, zorder=4))
 
@@ -106,7 +111,7 @@ def frame_from_above(axes: Axes, origin_s: np.ndarray, ends_s: np.ndarray, names
     origin = seen_from_above(origin_s)
     for end, name in zip(seen_from_above(ends_s), names, strict=True):
         arrow(axes, origin, end, colour)
-        label(axes, end + 9 * (end - origin) / np.linalg.norm(end - origin), name, colour, fontweight="bold")
+        label(axes, end, 9 * (end - origin) / np.linalg.norm(end - origin), name, colour, fontweight="bold")
     axes.add_patch(patches.Circle(origin, 4.6, facecolor="white", edgecolor=colour, lw=1.5, zorder=7))
     axes.add_patch(patches.Circle(origin, 1.5, facecolor=colour, zorder=8))
 
@@ -134,7 +139,7 @@ def panel_from_above(axes: Axes) -> None:
     for name, depth in SHEETS_MM.items():
         ends = seen_from_above([[depth, 40, 0], [depth, -380, 0]])
         axes.plot(*ends.T, color="black", lw=2.2, solid_capstyle="butt")
-        label(axes, ends[1] + [0, 9], f"white sheet {name}", ha="right")
+        label(axes, ends[1], (0, 9), f"white sheet {name}", ha="right")
 
     beams = {pan: seen_from_above(beam_to_sheet(pan, 0.0, SHEETS_MM["d2"])) for pan in (0.0, PAN_DEG)}
     pan_axis_again, second, spot = beams[PAN_DEG]
@@ -147,36 +152,36 @@ def panel_from_above(axes: Axes) -> None:
     near = seen_from_above(beam_to_sheet(PAN_DEG, 0.0, SHEETS_MM["d1"]))[2]
     for each in (spot, near):
         axes.plot(*each, "o", ms=6.5, color=BEAM, zorder=7)
-    label(axes, spot + [0, 13], "laser spot", BEAM)
-    label(axes, beams[0.0][2] + [5, 9], "beam at pan 0", BEAM, ha="left")
+    label(axes, spot, (0, 13), "laser spot", BEAM)
+    label(axes, beams[0.0][2], (5, 9), "beam at pan 0", BEAM, ha="left")
     straight = beams[0.0][2] - beams[0.0][1]
     arc = turned(second, straight, spot - second, 0.78 * np.linalg.norm(straight))
     curved(axes, arc[1:-1], POSITIONER)
-    label(axes, arc[0] + [9, 3], "pan $\\psi$ > 0: left,\ncounter grows", POSITIONER, ha="left", va="center")
+    label(axes, arc[0], (9, 3), "pan $\\psi$ > 0: left,\ncounter grows", POSITIONER, ha="left", va="center")
 
     for eye in (left, right):
         camera(axes, eye)
     frame_from_above(axes, np.zeros(3), np.array([[52, 0, 0], [0, 52, 0]]), ("X", "Y"), STEREO)
-    label(axes, left + [0, -31], "left camera", va="top")
-    label(axes, right + [0, -31], "right camera", va="top")
-    dimension(axes, left + [6, 0], right, f"{CAMERA_PITCH_MM:.0f} mm", (0, 8))
-    label(axes, left + [-34, -52], "S: stereo frame, Z up", STEREO, fontweight="bold", va="top", ha="left")
+    label(axes, left, (0, -31), "left camera", va="top")
+    label(axes, right, (0, -31), "right camera", va="top")
+    dimension(axes, left, right, f"{CAMERA_PITCH_MM:.0f} mm", (0, 8))
+    label(axes, left, (-34, -52), "S: stereo frame, Z up", STEREO, fontweight="bold", va="top", ha="left")
 
     ends = in_stereo([[58, 0, 0], [0, 44, 0]])
     frame_from_above(axes, T_SP_MM, ends, ("x", "y"), POSITIONER)
-    label(axes, pan_axis + [10, -31], "pan axis and mirror 1", va="top")
-    label(axes, pan_axis + [-58, -52], "P: positioner frame, z up", POSITIONER, fontweight="bold", va="top", ha="left")
-    label(axes, second + [4, -17], "mirror 2", ha="left", va="top")
+    label(axes, pan_axis, (10, -31), "pan axis and mirror 1", va="top")
+    label(axes, pan_axis, (-58, -52), "P: positioner frame, z up", POSITIONER, fontweight="bold", va="top", ha="left")
+    label(axes, second, (4, -17), "mirror 2", ha="left", va="top")
 
     middle_s = in_stereo(scanner_in_positioner([[0, 0, 0], [58, 0, 0], [0, 32, 0]]))
     axes.plot(*np.array([pan_axis, aperture]).T, color=SCANNER, lw=1.2, ls=(0, (7, 2, 1.5, 2)), zorder=2)
     frame_from_above(axes, middle_s[0], middle_s[1:], ("x", "y"), SCANNER)
     middle = seen_from_above(middle_s[0])
     text = "T: scanner frame, z up,\norigin in mid-baseline"
-    label(axes, aperture + [-72, -41], text, SCANNER, fontweight="bold", va="top", ha="left")
+    label(axes, aperture, (-72, -41), text, SCANNER, fontweight="bold", va="top", ha="left")
     box = patches.Rectangle(aperture - [9, 9], 18, 18, facecolor="#DDDDDD", edgecolor="black", lw=1, zorder=4)
     axes.add_patch(box)
-    label(axes, aperture + [-12, -13], "rotating aperture", va="top", ha="left")
+    label(axes, aperture, (-12, -13), "rotating aperture", va="top", ha="left")
     towards = middle - aperture
     for at, one, other, name, radius in (
         (aperture, towards, spot - aperture, "B", 34),
@@ -184,9 +189,9 @@ def panel_from_above(axes: Axes) -> None:
     ):
         page = turned(at, one, other, radius)
         axes.plot(*page.T, color=SCANNER, lw=1.4)
-        label(axes, at + (page[20] - at) * (radius + 11) / radius, name, SCANNER, fontweight="bold", fontsize=11)
+        label(axes, at, (page[20] - at) * (radius + 11) / radius, name, SCANNER, fontweight="bold", fontsize=11)
     below = np.array([-towards[1], towards[0]]) / np.linalg.norm(towards)
-    label(axes, (aperture + middle) / 2 + 10.5 * below, "a", SCANNER, fontweight="bold", fontsize=11)
+    label(axes, (aperture + middle) / 2, 10.5 * below, "a", SCANNER, fontweight="bold", fontsize=11)
     axes.set(xlim=(-82, 425), ylim=(-92, 300))
 
 
@@ -196,6 +201,7 @@ def panel_positioner(axes: Axes) -> None:
     raised_deg = 24.0
     chains = {tilt: mirror_chain(0.0, np.radians(tilt), geometry) for tilt in (0.0, raised_deg)}
     second = chains[0.0][0]
+    _, y, z = np.eye(3)
 
     def line(points: object, **style: object) -> None:
         axes.plot(*seen_obliquely(np.array(points, float)).T, **style)
@@ -215,7 +221,7 @@ def panel_positioner(axes: Axes) -> None:
 
     down, across, onward = np.array([0.0, 0, -1]), np.array([0.0, -1, 0]), chains[0.0][1]
     line([[0, 0, -76], [0, 0, 104]], color="black", lw=0.9, ls=(0, (8, 2, 1.5, 2)), zorder=1)
-    line([second + [0, 52, 0], second + [0, -50, 0]], color="black", lw=0.9, ls=(0, (8, 2, 1.5, 2)), zorder=1)
+    line([second + 52 * y, second - 50 * y], color="black", lw=0.9, ls=(0, (8, 2, 1.5, 2)), zorder=1)
     plate(np.zeros(3), down, across, False)
     plate(second, across, onward, True)  # seen from its back
     line([[0, 0, 60], [0, 0, 0], second, second + 112 * onward], color=BEAM, lw=2, zorder=5)
@@ -225,27 +231,27 @@ def panel_positioner(axes: Axes) -> None:
         arrow(axes, *seen_obliquely([second + 96 * direction, second + 114 * direction]), BEAM, 1.2)
     page = seen_obliquely([[0, 0, 60], [0, 0, 86]])
     axes.plot(*page.T, color="#444444", lw=11, solid_capstyle="butt", zorder=6)
-    label(axes, page.mean(axis=0) + [-12, 0], "laser", ha="right")
+    label(axes, page.mean(axis=0), (-12, 0), "laser", ha="right")
     axes.add_patch(patches.Circle(seen_obliquely(np.zeros(3)), 1.8, facecolor=POSITIONER, zorder=9))
 
     for end, name, shift in (([52, 0, 0], "x", (6, 3)), ([0, 52, 0], "y", (-6, 4)), ([0, 0, 50], "z", (7, 2))):
         head = seen_obliquely(np.array(end, float))
         arrow(axes, seen_obliquely(np.zeros(3)), head, POSITIONER)
-        label(axes, head + shift, name, POSITIONER, fontweight="bold")
+        label(axes, head, shift, name, POSITIONER, fontweight="bold")
     ring = np.radians(np.linspace(-150, 60, 60))
     circle = np.stack((21 * np.cos(ring), 21 * np.sin(ring), np.full(60, -58.0)), axis=-1)
     curved(axes, seen_obliquely(circle), POSITIONER)
     text = "pan $\\psi$ > 0: left, counter\ngrows, both mirrors turn"
-    label(axes, seen_obliquely([0, 0, -62]) + [22, -10], text, POSITIONER, ha="left", va="top")
-    label(axes, seen_obliquely([0, 0, 104]) + [0, 4], "pan axis", va="bottom")
+    label(axes, seen_obliquely([0, 0, -62]), (22, -10), text, POSITIONER, ha="left", va="top")
+    label(axes, seen_obliquely([0, 0, 104]), (0, 4), "pan axis", va="bottom")
     tilts = np.radians(np.linspace(1, raised_deg - 1, 30))
     lifts = second + 84 * mirror_chain(0.0, tilts, geometry)[1]
     curved(axes, seen_obliquely(lifts), POSITIONER)
-    label(axes, seen_obliquely(lifts[-1]) + [-4, 22], "tilt $\\beta$ > 0: up,\ncounter grows", POSITIONER, va="bottom")
-    label(axes, seen_obliquely([0, 0, 0]) + [-21, -10], "mirror 1", ha="right")
-    label(axes, seen_obliquely(second) + [19, -2], "mirror 2", ha="left")
-    label(axes, seen_obliquely(second + [0, -50, 0]) + [3, -1], "tilt axis", ha="left")
-    dimension(axes, *(seen_obliquely([[0, 0, -21], second + [0, 0, -21]])), "L", (-4, -6))
+    label(axes, seen_obliquely(lifts[-1]), (-4, 22), "tilt $\\beta$ > 0: up,\ncounter grows", POSITIONER, va="bottom")
+    label(axes, seen_obliquely([0, 0, 0]), (-21, -10), "mirror 1", ha="right")
+    label(axes, seen_obliquely(second), (19, -2), "mirror 2", ha="left")
+    label(axes, seen_obliquely(second - 50 * y), (3, -1), "tilt axis", ha="left")
+    dimension(axes, *(seen_obliquely([[0, 0, -21], second - 21 * z])), "L", (-4, -6))
     axes.set(xlim=(-66, 150), ylim=(-112, 118))
 
 
