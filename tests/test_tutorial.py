@@ -16,7 +16,7 @@ from tvsbayes.cli import run
 ROOT = Path(__file__).resolve().parents[1]
 PAGE = ROOT / "data" / "tutorial" / "README.md"
 TEXT = PAGE.read_text(encoding="utf-8")
-NUMBER = re.compile(r"-?\d+(?:\.\d+)?")
+NUMBER = re.compile(r"-?\d+(?:\.\d+)?(?:e-?\d+)?")
 QUICK = ("simulate", "check", "classic", "new")
 """Commands without a fit: they run by default."""
 ANYTHING = "..."
@@ -49,7 +49,8 @@ def same(line: str, expected: str) -> bool:
         return False
     pairs = zip(NUMBER.findall(line), NUMBER.findall(expected), strict=True)
     for found, wanted in pairs:
-        unit = 10.0 ** -len(wanted.partition(".")[2])
+        digits, _, exponent = wanted.partition("e")
+        unit = 10.0 ** (int(exponent or 0) - len(digits.partition(".")[2]))
         # Half a unit for the binary fractions of the digits themselves.
         if abs(float(found) - float(wanted)) > 1.5 * unit:
             return False
@@ -129,6 +130,8 @@ def test_the_whole_page_prints_what_it_says(tmp_path, monkeypatch, capsys):
         ("left 24 0.050935", "left 24 0.050938", False),
         ("left 24 0.0509", "right 24 0.0509", False),
         ("u 0.46(10)", "u 0.46(12)", False),
+        ("5.2e-06 a minute", "5.3e-06 a minute", True),
+        ("5.2e-06 a minute", "5.2e-05 a minute", False),
     ],
 )
 def test_lines_are_compared_by_words_and_numbers(found, wanted, agree):
