@@ -8,6 +8,7 @@ import tomllib
 from pathlib import Path
 
 import pytest
+import typer
 from test_layers import LEVELS, module_paths
 
 from tvsbayes.cli import app
@@ -56,10 +57,49 @@ def test_module_map_is_complete_and_in_import_order():
     assert [level[name] for name in names] == sorted(level[name] for name in names)
 
 
-@pytest.mark.parametrize("page", ["README.md", "experiments/README.md", "data/twins/README.md"])
+def test_options_named_in_the_table_of_commands_exist():
+    """And every command's help fits a terminal of 80 columns, with a summary that is not cut off in the list."""
+    group = typer.main.get_command(app)
+    rows = re.findall(r"^\| `([\w-]+)(.*)$", section("Commands"), flags=re.MULTILINE)
+    named = 0
+    for name, row in rows:
+        options = {option for parameter in group.commands[name].params for option in parameter.opts}
+        wanted = set(re.findall(r"(?<![\w`])--[a-z][\w-]*|(?<=`)--[a-z][\w-]*", row))
+        # What stands behind a backquoted name of another command belongs to that one.
+        assert wanted <= options, (name, wanted - options)
+        named += len(wanted)
+    assert named > 60
+    for name, command in group.commands.items():
+        assert not command.get_short_help_str(65).endswith("..."), name
+        text = command.get_help(command.context_class(command, info_name=f"tvsbayes {name}", terminal_width=80))
+        assert max(map(len, text.splitlines())) <= 80, name
+
+
+def slugs(text: str) -> set[str]:
+    """Anchors that the headings of a page make."""
+    headings = re.findall(r"^#+ (.*)$", text, flags=re.MULTILINE)
+    return {re.sub(r"[^\w -]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
+@pytest.mark.parametrize("page", ["README.md", "data/tutorial/README.md"])
+def test_links_to_headings_lead_to_one(page):
+    text = (ROOT / page).read_text(encoding="utf-8")
+    links = re.findall(r"\]\(([^)#]*)#([\w-]+)\)", text)
+    assert links
+    for target, anchor in links:
+        there = (ROOT / page).parent / target if target else ROOT / page
+        assert anchor in slugs(there.read_text(encoding="utf-8")), (target, anchor)
+
+
+PAGES = ["README.md", "experiments/README.md", "data/twins/README.md", "data/tutorial/README.md"]
+
+
+@pytest.mark.parametrize("page", PAGES)
 def test_local_links_and_named_scripts_exist(page):
     text = (ROOT / page).read_text(encoding="utf-8")
     for target in re.findall(r"\]\(([^)#]+)\)", text):
+        if target.startswith("https://"):
+            continue
         # Tables of experiments are written by the command in their own row.
         made = any(f"> experiments/{target}" in line for line in text.splitlines())
         assert made or (ROOT / page).parent.joinpath(target).exists(), target

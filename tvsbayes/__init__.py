@@ -1,4 +1,18 @@
-"""tvsbayes: what one motor step of a geared laser positioner does to the beam, and how sure that is."""
+"""tvsbayes: what one motor step of a geared laser positioner does to the beam, and how sure that is.
+
+From a campaign folder to a robot:
+
+    campaign = tvsbayes.read_campaign("mine")            # moves, spots, cameras, what is known of the rig
+    fit = tvsbayes.fit(campaign)                         # mode and Laplace approximation
+    posterior = tvsbayes.sample(fit)                     # its posterior; .propagate carries it into any quantity
+    calibration = tvsbayes.calibration_of(fit, posterior)
+    found = tvsbayes.locate(calibration, 100, 20, 70.0)  # counters and aperture reading -> mm, with covariance
+    calibration = tvsbayes.load_calibration("mine")      # the same from results/ after `tvsbayes fit mine`: NumPy alone
+
+mm, px, and degrees where a name says `deg`; frames and signs are in the README's table of conventions. Classic
+estimator, simulation, planning, comparison, figures: `tvsbayes.classic`, `.simulation`, `.planning`, `.comparison`,
+`.plots`. Refused input raises `tvsbayes.files.InputError`, which says where, what was found and what to do.
+"""
 
 from __future__ import annotations
 

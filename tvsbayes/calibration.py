@@ -699,7 +699,9 @@ def load_calibration(path: Path | str) -> Calibration:
             `tvsbayes steps-for CAMPAIGN --export json` prints.
 
     Returns:
-        A calibration with `.ray`, `.locate` and `.steps_for`; from JSON without the draws.
+        A calibration: `.ray(pan_steps, tilt_steps)` is the beam, `.locate(..., aperture_deg)` the point in mm with
+        its covariance, `.steps_for(xyz_mm)` the counters to go to; from JSON without the draws that
+        `tvsbayes.locate` needs.
 
     Raises:
         InputError: there is no such file, or it is not what tvsbayes wrote.

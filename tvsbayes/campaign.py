@@ -281,8 +281,15 @@ def _parse_files(files: dict[str, bytes], path: Path | None) -> Campaign:
     return Campaign(moves, spots, stereo, rig, header, path)
 
 
-def read_campaign(folder: Path) -> Campaign:
-    """Reads and checks a campaign folder (DESIGN 7). Never reads `truth.json`, frames or results.
+def read_campaign(folder: Path | str) -> Campaign:
+    """Reads and checks a campaign folder (DESIGN 7; the README lists its files). Never `truth.json`, frames or results.
+
+    Args:
+        folder: holds `campaign.toml`, `stereo.json`, `moves.csv` and `spots.csv`.
+
+    Returns:
+        Moves in time order, spots in the order of the file, the stereo pair and the `[rig]` table; input of `fit`,
+        `classic` and the plots.
 
     Raises:
         InputError: anything that is missing, malformed or contradicts itself, with file, line and column.

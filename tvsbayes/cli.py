@@ -44,9 +44,9 @@ if TYPE_CHECKING:
 
 INTERRUPTED = 130
 TARGET_MISSED = 1
+"""Done, but a limit or target that the user gave is not met."""
 DCC_MESSAGES = 20
 """Of a schema validator, shown at most."""
-"""Done, but a limit or target that the user gave is not met."""
 RESIDUALS_LISTED = 4096
 """Stops in `fit.json`, evenly chosen: a long campaign's file stays readable within its cap."""
 DEMO_NOTE = "The twin's move history is our assumption, made so that the classic answer is the paper's Table 1."
@@ -132,10 +132,10 @@ def _unusable(summary: FitSummary) -> TvsError | None:
 
 @app.command()
 def demo(
-    out: Annotated[Path | None, typer.Argument(metavar="[OUT]", help="Folder to keep the campaign in.")] = None,
+    out: Annotated[Path | None, typer.Argument(metavar="OUT", help="Folder to keep the campaign in.")] = None,
     as_json: Json = False,
 ) -> None:
-    """The whole way on the shipped paper twin: both estimators beside the truth."""
+    """Both estimators on the shipped paper twin, beside its truth."""
     import shutil
     import tempfile
 
@@ -175,7 +175,7 @@ def demo(
 
 @app.command()
 def new(out: Annotated[Path, typer.Argument(metavar="OUT", help="Folder to create.")], as_json: Json = False) -> None:
-    """An empty campaign with commented files, and a rig file to plan and simulate with."""
+    """An empty campaign with commented files, and a rig file. Fill them, or plan and simulate with the rig file."""
     make_folder(out, empty=True)
     templates = sorted((shipped_data() / "templates").iterdir())
     for template in templates:
@@ -199,7 +199,7 @@ def simulate(
     seed: Seed = 0,
     as_json: Json = False,
 ) -> None:
-    """The digital twin: draw a true rig, run a plan on it, write the campaign and truth.json."""
+    """The digital twin runs a plan on a true rig that it draws. Writes the campaign and truth.json."""
     from tvsbayes.campaign import read_plan
     from tvsbayes.rigs import read_rig
     from tvsbayes.simulation import simulate as run_plan
@@ -226,7 +226,7 @@ def simulate(
 @app.command()
 def detect(
     campaign: CampaignFolder,
-    method: Annotated[str, typer.Option("--method", help="fit, or contour: the paper's.")] = "fit",
+    method: Annotated[str, typer.Option("--method", help="fit, or contour (the paper's).")] = "fit",
     speckle_contrast: Annotated[
         float | None,
         typer.Option("--speckle-contrast", min=0.0, max=2.0, help="Per pixel (default: learned; contour: 0.4)."),
@@ -234,7 +234,7 @@ def detect(
     overlay: Annotated[bool, typer.Option("--overlay", help="Pictures of every spot in results/overlay.")] = False,
     as_json: Json = False,
 ) -> None:
-    """Find the laser spots in frames/ and write their centres and uncertainties into spots.csv."""
+    """Find the laser spots in a campaign's frames. Writes centres and uncertainties into spots.csv, in place."""
     _finite(speckle_contrast=speckle_contrast)
     from tvsbayes.campaign import read_campaign, spots_bytes
     from tvsbayes.device.spots import detect as find
@@ -258,7 +258,7 @@ IMAGE_SIDE_MAX = 65_535
 
 @app.command()
 def stereo(
-    folder: Annotated[Path | None, typer.Argument(metavar="[FOLDER]", help="Folder of checkerboard pictures.")] = None,
+    folder: Annotated[Path | None, typer.Argument(metavar="FOLDER", help="Folder of checkerboard pictures.")] = None,
     board: Annotated[str | None, typer.Option("--board", help="Inner corners, columns x rows: 9x6.")] = None,
     pitch_mm: Annotated[float | None, typer.Option("--pitch-mm", help="Side of a square.")] = None,
     pitch_u_mm: Annotated[float, typer.Option("--pitch-u-mm", help="Its standard uncertainty (mean of all).")] = 0.0,
@@ -280,7 +280,7 @@ def stereo(
     import_unit: Annotated[str, typer.Option("--import-unit", help="mm or m: unit of an imported OpenCV T.")] = "mm",
     as_json: Json = False,
 ) -> None:
-    """Calibrate the camera pair from checkerboard pictures, with the covariance of all 24 parameters; or import one."""
+    """Calibrate the camera pair from checkerboard pictures. With the covariance of all 24 parameters; or import one."""
     if export not in (None, "opencv", "ros") or finder not in ("classic", "sector") or import_unit not in ("mm", "m"):
         remedy = "--export opencv or ros, --finder classic or sector, --import-unit mm or m"
         raise InputError("usage", "an option has a value that it does not know", remedy=remedy)
@@ -339,14 +339,14 @@ def _image_size(text: str | None) -> tuple[int, int] | None:
 def check(
     path: Annotated[Path, typer.Argument(metavar="PATH", help="Campaign folder, rig file or plan.")],
     plan_file: Annotated[
-        Path | None, typer.Argument(metavar="[PLAN]", help="With a rig file: what can this plan not separate?")
+        Path | None, typer.Argument(metavar="PLAN", help="With a rig file: what can this plan not separate?")
     ] = None,
     repair_to: Annotated[
         Path | None, typer.Option("--repair-to", help="New folder for what is whole of a damaged journal.")
     ] = None,
     as_json: Json = False,
 ) -> None:
-    """Read a campaign, rig, plan or journal strictly and say what it holds and what it cannot tell."""
+    """What a campaign, rig, plan or journal holds and cannot tell. Reads strictly, changes nothing."""
     from tvsbayes.campaign import read_campaign, read_plan
     from tvsbayes.classic import check_campaign
     from tvsbayes.rigs import read_rig
@@ -417,13 +417,13 @@ def acquire(
         bool | None,
         typer.Option(
             "--estimate/--no-estimate",
-            help="Fit the looks so far beside the run (default: on hardware; a simulation waits for each fit).",
+            help="Fit the looks so far beside the run (default: on hardware only; a simulation waits for each fit).",
         ),
     ] = None,
     seed: Seed = 0,
     as_json: Json = False,
 ) -> None:
-    """Drive positioner and cameras through a plan into a campaign; nothing is lost, whatever ends it.
+    """Drive positioner and cameras through a plan into a campaign. Nothing is lost, whatever ends it.
 
     LASER: 808 nm is invisible and likely class 3B. Goggles on, beam path shut in.
     """
@@ -469,7 +469,10 @@ def doctor(
     ] = False,
     as_json: Json = False,
 ) -> None:
-    """Check ports, firmware, cameras, exposure, focus, laser, timing and disk; nothing moves."""
+    """Is the instrument fit for a campaign? Nothing moves.
+
+    Checks ports, firmware, cameras, exposure, focus, laser, timing and disk.
+    """
     from tvsbayes.device.doctor import examine
     from tvsbayes.files import DeviceFault
     from tvsbayes.rigs import read_rig
@@ -486,7 +489,7 @@ def doctor(
 
 @app.command()
 def classic(campaign: CampaignFolder, as_json: Json = False) -> None:
-    """The paper's four-point estimator: mean, sd, type A and GUM uncertainty per direction."""
+    """The paper's four-point estimator. Mean, sd, type A and GUM uncertainty per direction."""
     from tvsbayes.campaign import read_campaign
     from tvsbayes.classic import classic as estimate
     from tvsbayes.report import classic_text
@@ -512,7 +515,7 @@ def fit(
     seed: Seed = 0,
     as_json: Json = False,
 ) -> None:
-    """Fit the joint model to every spot and sample its posterior: ratios, backlash, mirror offset, extrinsics."""
+    """Fit the joint model to every spot and sample its posterior. Ratios, backlash, mirror offset, extrinsics."""
     from tvsbayes.campaign import read_campaign
 
     if resume and no_sample:
@@ -625,7 +628,8 @@ def _converged_fit(campaign: Campaign) -> JointFit:
 def report(
     campaign: CampaignFolder,
     limit_deg_per_step: Annotated[
-        float | None, typer.Option("--limit-deg-per-step", min=0, help="Largest error allowed of every ratio.")
+        float | None,
+        typer.Option("--limit-deg-per-step", min=0, help="Largest error allowed of any ratio: for a verdict."),
     ] = None,
     limit_mm: Annotated[float | None, typer.Option("--limit-mm", min=0, help="Largest 3D error allowed.")] = None,
     range_mm: Annotated[float, typer.Option("--range-mm", min=1, help="Range at which millimetres are stated.")] = 1e3,
@@ -640,7 +644,7 @@ def report(
     out: Annotated[Path | None, typer.Option("--out", help="File (default CAMPAIGN/results/report.html).")] = None,
     as_json: Json = False,
 ) -> None:
-    """The calibration report as one HTML page: verdict, results, residuals, error maps, budgets, provenance."""
+    """The calibration report as one HTML page. Verdict, results, residuals, error maps, budgets, provenance."""
     from tvsbayes.calibration import load_calibration
     from tvsbayes.campaign import read_campaign
 
@@ -711,12 +715,15 @@ def _fit_document(data: Campaign, folder: Path) -> dict[str, Any]:
 @app.command()
 def compare(
     campaign: CampaignFolder,
-    other: Annotated[Path | None, typer.Argument(metavar="[B]", help="Later campaign of the same instrument.")] = None,
+    other: Annotated[Path | None, typer.Argument(metavar="B", help="Later campaign of the same instrument.")] = None,
     by: Annotated[str, typer.Option("--by", help="Left out together: steps or regions.")] = "steps",
     seed: Seed = 0,
     as_json: Json = False,
 ) -> None:
-    """Classic against joint on experiments left out, and the gap term by term; with B, what has changed since."""
+    """Classic against joint on experiments that were left out.
+
+    The gap between the two estimators term by term; with a later campaign B, what has changed since.
+    """
     from tvsbayes.campaign import input_hashes, read_campaign
 
     if by not in ("steps", "regions"):
@@ -811,7 +818,7 @@ def locate(
     seed: Seed = 0,
     as_json: Json = False,
 ) -> None:
-    """Where the scanner points, in millimetres of frame T, with covariance and 95 % half widths."""
+    """Where the scanner points, in millimetres. Frame T, with covariance and 95 % half widths."""
     single = (pan_steps, tilt_steps, aperture_deg)
     if (points is None) == any(value is None for value in single):
         remedy = "give --pan-steps, --tilt-steps and --aperture-deg, or --points FILE.csv"
@@ -865,7 +872,7 @@ def steps_for(
     export: Annotated[str | None, typer.Option("--export", help="header or json: the calibration itself.")] = None,
     as_json: Json = False,
 ) -> None:
-    """Counters that send the beam to a point or along a direction, and the approach that removes backlash."""
+    """Counters that send the beam to a point or along a direction. With the approach that removes backlash."""
     _finite(x_mm=x_mm, y_mm=y_mm, z_mm=z_mm, azimuth_deg=azimuth_deg, elevation_deg=elevation_deg)
     point = None if None in (x_mm, y_mm, z_mm) else (x_mm, y_mm, z_mm)
     direction = None if None in (azimuth_deg, elevation_deg) else (azimuth_deg, elevation_deg)
@@ -914,7 +921,7 @@ def plan(
     seed: Seed = 0,
     as_json: Json = False,
 ) -> None:
-    """How many experiments, which ones, and when to stop; with data, what next."""
+    """How many experiments, which ones, and when to stop. With --given: what next."""
     from tvsbayes.campaign import input_hashes, read_campaign, write_plan
     from tvsbayes.rigs import read_rig
 
@@ -967,7 +974,7 @@ def study(
     seed: Seed = 0,
     as_json: Json = False,
 ) -> None:
-    """Simulate a plan many times and fit every campaign: coverage, power, assurance. Run again to go on."""
+    """Simulate a plan many times and fit every campaign. Coverage, power, assurance; run again to go on."""
     from tvsbayes.campaign import read_plan
     from tvsbayes.rigs import read_rig
 

@@ -676,8 +676,11 @@ def calibration_of(fit: JointFit, posterior: Posterior | None = None, *, seed: i
 
     Args:
         fit: a converged fit.
-        posterior: its sample.
+        posterior: its sample; left out, or unconverged, the Laplace draws are taken.
         seed: of the draws of baseline, C0 and aperture zero where no reading told them.
+
+    Returns:
+        A calibration for `locate`, with `.ray`, `.locate` and `.steps_for` of its own.
     """
     usable = posterior is not None and posterior.converged
     draws = posterior.thinned(DRAWS_KEPT).physical if usable else fit.draws.physical

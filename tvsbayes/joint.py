@@ -435,7 +435,10 @@ def derived_quantities(
 
 @dataclass(frozen=True)
 class JointFit:
-    """Mode and Laplace approximation of the posterior.
+    """Mode and Laplace approximation of the posterior: what `fit` returns.
+
+    Read it through `information.summarise` (values, intervals, diagnostics in words), `posterior.sample` (draws of the
+    posterior itself) or `information.calibration_of` (coordinates); the fields are what those are made of.
 
     Attributes:
         campaign: what was fitted.
@@ -672,8 +675,11 @@ def fit(
 ) -> JointFit:
     """Fit the joint model to every usable spot (DESIGN 4).
 
+    The first call in a process compiles the model, half a minute; `tvsbayes.information.summarise(fit(campaign))` is
+    the table that the command prints.
+
     Args:
-        campaign: a checked campaign.
+        campaign: from `read_campaign`.
         robust: downweight and exclude spots that disagree with all others (Huber weights and a gate on
             leave-one-out residuals).
         per_axis: one ratio per axis, the contrasts fixed at 0 (DESIGN 3.1).

@@ -529,11 +529,14 @@ class Posterior:
         """Carry the posterior into a quantity of your own.
 
         Args:
-            function: takes `Draws`, a mapping from name to an array (n,), and returns an array (n,) or (n, ...), for
-                instance `lambda p: 200 * p["degrees_per_step.left"] - p["backlash_deg.pan"]`.
+            function: is called once with all draws, a mapping from name to an array (n,) in the unit that the name
+                says, and returns one value per draw: an array (n,) or (n, ...). For instance what 200 steps to the
+                left turn after a reversal, deg: `lambda p: 200 * p["degrees_per_step.left"] - p["backlash_deg.pan"]`.
+                The names are those of `fit.json` and of `list(posterior.by_name)`.
 
         Returns:
-            Mean, sd, interval and their Monte Carlo errors (JCGM 101 clause 7, with correlated draws).
+            Mean, sd, interval and their Monte Carlo errors (JCGM 101 clause 7, with correlated draws), each of the
+            shape (...) of one value.
 
         Raises:
             ValueError: the function returned another number of rows, or values that are not finite.
@@ -1038,7 +1041,8 @@ def sample(
         progress: called after every block of steps.
 
     Returns:
-        The posterior; with `converged` False its intervals must not be used.
+        The posterior: `.propagate` for any quantity, `.by_name` for the draws; with `converged` False its intervals
+        must not be used. `write_posterior` makes a file for ArviZ of it.
 
     Raises:
         NotConverged: the fit has not converged, or its density is not finite around the mode.
