@@ -39,7 +39,7 @@ DRAWS = 255
 SHRINK = 0.8
 WIDER = 3.0
 WORSE = 1000.0
-MAX_MINUTES = 25.0
+MAX_MINUTES = 8.0
 CLEAN, FEW, SHRUNK, PRIOR, CAMERA = "clean", "few stops", f"sd x {SHRINK}", "prior x3", "camera dropped"
 VARIANTS = (CLEAN, FEW, PRIOR, CAMERA)
 """Simulated separately; the shrunk draws come with the clean ones."""
@@ -232,7 +232,7 @@ def table() -> None:
     print(
         "Written by `python experiments/sbc.py table` after `python experiments/sbc.py run`; rig i has seed i. 60 spots"
     )
-    print("of the mounted rig, every prior quantity anew, no aperture readings; two shared cores.\n")
+    print("of the mounted rig (24 for `few stops`), every prior quantity anew, no aperture readings; two shared cores.\n")
     columns = ("draws", "simulations", "without ranks", "quantities", "criterion p", "least p, of", "p log-likelihood")
     columns += ("p log-posterior", "quantities failing", "verdict", "wanted")
     print("| " + " | ".join(columns) + " |\n|" + "---|" * len(columns))
