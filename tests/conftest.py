@@ -8,12 +8,15 @@ pyproject.toml has every array checked against its annotation (jaxtyping's impor
 from __future__ import annotations
 
 import os
+from pathlib import Path
 
 # Before NumPy is imported: OpenBLAS' waiting threads would take the time of XLA's (see `tvsbayes.cli.main`).
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+# Before JAX is: what one process has compiled the other loads, and so does the next run. Keys are hashes of the code.
+os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(Path(__file__).resolve().parents[1] / ".pytest_cache" / "jax"))
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.2")
 
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np

@@ -6,6 +6,7 @@ One fit compiles the model (the paper twin, the small campaigns and the grid sha
 from __future__ import annotations
 
 import json
+import os
 import re
 import subprocess
 import sys
@@ -34,15 +35,15 @@ def no_constant(name: str) -> None:
 
 
 @pytest.fixture(scope="module", autouse=True)
-def own_compilation_cache(tmp_path_factory):
-    """`fit` and `demo` point JAX at a folder of this test run; afterwards JAX is as it was."""
+def own_compilation_cache():
+    """`fit` and `demo` point JAX at the folder of the tests; afterwards JAX is as it was."""
     import jax
     from jax.experimental.compilation_cache import compilation_cache
 
     names = ("jax_compilation_cache_dir", "jax_persistent_cache_min_compile_time_secs")
     before = {name: jax.config.values[name] for name in names}
     with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("TVSBAYES_CACHE", str(tmp_path_factory.mktemp("cache")))
+        patch.setenv("TVSBAYES_CACHE", os.environ["JAX_COMPILATION_CACHE_DIR"])
         yield
     for name, value in before.items():
         jax.config.update(name, value)
