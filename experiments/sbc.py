@@ -232,7 +232,9 @@ def table() -> None:
     print(
         "Written by `python experiments/sbc.py table` after `python experiments/sbc.py run`; rig i has seed i. 60 spots"
     )
-    print("of the mounted rig (24 for `few stops`), every prior quantity anew, no aperture readings; two shared cores.\n")
+    print(
+        "of the mounted rig (24 for `few stops`), every prior quantity anew, no aperture readings; two shared cores.\n"
+    )
     columns = ("draws", "simulations", "without ranks", "quantities", "criterion p", "least p, of", "p log-likelihood")
     columns += ("p log-posterior", "quantities failing", "verdict", "wanted")
     print("| " + " | ".join(columns) + " |\n|" + "---|" * len(columns))
