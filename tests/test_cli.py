@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from schema_walk import problems
+from test_schema import problems
 
 from tvsbayes.campaign import Campaign, PlanStep, grid_protocol, read_campaign, write_campaign, write_plan
 from tvsbayes.cli import run

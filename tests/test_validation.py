@@ -211,8 +211,7 @@ def test_no_reader_of_the_report_can_miss_a_failure():
 
 
 def test_the_entry_obeys_the_schema():
-    from schema_walk import problems
-    from test_schema import changed, kept, schema_of
+    from test_schema import changed, kept, problems, schema_of
 
     document = kept("fit-1-laplace.json")
     schema = schema_of(document)

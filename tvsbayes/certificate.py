@@ -23,6 +23,7 @@ import xml.etree.ElementTree as ET
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import cache
+from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -47,7 +48,6 @@ from tvsbayes.files import (
     escaped,
     parse_json,
     read_bytes,
-    schema_problem,
     shipped_data,
     shown,
 )
@@ -858,11 +858,43 @@ _XSD_SECONDS = 60
 
 FIT_FORMATS = ("tvsbayes-fit/1",)
 """Versions of `results/fit.json` that can be read; the schema of each is in `data/schemas`."""
+SCHEMA_PROBLEMS = 20
+"""Among which the one to name is chosen: a document of another making has thousands."""
 
 
 @cache
-def _fit_schema(version: str) -> dict[str, object]:
-    return json.loads((shipped_data() / "schemas" / f"fit-{version}.schema.json").read_text(encoding="utf-8"))
+def _fit_validator(version: str):
+    from jsonschema import Draft202012Validator
+
+    path = shipped_data() / "schemas" / f"fit-{version}.schema.json"
+    return Draft202012Validator(json.loads(path.read_text(encoding="utf-8")))
+
+
+def _schema_problem(values: object, version: str) -> tuple[list[str | int], str] | None:
+    """The place that most likely breaks the schema of `fit.json`, as keys and list indices, and what is allowed."""
+    from jsonschema.exceptions import best_match
+
+    error = best_match(islice(_fit_validator(version).iter_errors(values), SCHEMA_PROBLEMS))
+    if error is None:
+        return None
+    place, rule = list(error.absolute_path), error.validator_value
+    if "propertyNames" in error.absolute_schema_path:
+        # jsonschema gives the place of the table whose key is wrong.
+        place.append(error.instance)
+    match error.validator:
+        case "required":
+            return [*place, next(name for name in rule if name not in error.instance)], "this key"
+        case "additionalProperties":
+            known = error.schema.get("properties", {})
+            return [*place, next(name for name in error.instance if name not in known)], "no such key"
+        case "type":
+            return place, rule if isinstance(rule, str) else " or ".join(rule)
+        case "const":
+            return place, shown(rule)
+        case "enum":
+            return place, " or ".join(map(shown, rule))
+        case other:
+            return place, f"{other} {shown(rule)}"
 
 
 def _check_agreement(keys: Keys) -> None:
@@ -886,13 +918,13 @@ def read_fit(path: Path | str) -> dict[str, object]:
     """
     keys = parse_json(read_bytes(Path(path), JSON_BYTES_MAX), escaped(Path(path).name))
     version = keys.word("format", FIT_FORMATS).removeprefix("tvsbayes-fit/")
-    if problem := schema_problem(keys.values, _fit_schema(version)):
+    if problem := _schema_problem(keys.values, version):
         place, allowed = problem
         table, key, value = keys, place[0], keys.values
         for part in place:
             # An entry of a list is named by the key of the list.
-            if isinstance(value, list):
-                value = value[int(part)]
+            if isinstance(part, int):
+                value = value[part]
                 continue
             if value is not keys.values:
                 table = Keys(value, keys.file, keys.text, (*table.path, key))

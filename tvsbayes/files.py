@@ -25,7 +25,7 @@ import stat
 import tomllib
 import zipfile
 import zlib
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
 from importlib import resources
 from pathlib import Path
@@ -745,80 +745,6 @@ def toml_line(key: str, value: object) -> str:
     """`key = value`, the key quoted where TOML asks for it."""
     bare = re.fullmatch(r"[A-Za-z0-9_-]+", key)
     return f"{key if bare else json.dumps(key, ensure_ascii=False)} = {toml_value(value)}"
-
-
-def schema_problem(value: object, schema: Mapping[str, object]) -> tuple[tuple[str, ...], str] | None:
-    """The first place at which parsed JSON breaks a JSON Schema (draft 2020-12), None where it is valid.
-
-    Args:
-        value: as `json.loads` gives it.
-        schema: of this package: `$ref` to its own `$defs`, `anyOf`, `type`, `const`, `enum`, limits of numbers and
-            of lengths, `pattern`, `items`, `properties`, `required`, `propertyNames`, `additionalProperties`.
-
-    Returns:
-        The keys that lead there, list entries by their number, and what is allowed.
-    """
-    return _schema_problem(value, schema, schema, ())
-
-
-_JSON_TYPES = {"object": dict, "array": list, "string": str, "number": int | float, "null": type(None)}
-
-
-def _has_type(value: object, name: str) -> bool:
-    """JSON's types: true is no number; 3.0 is an integer."""
-    if name == "boolean" or isinstance(value, bool):
-        return name == "boolean" and isinstance(value, bool)
-    if name == "integer":
-        return isinstance(value, int) or (isinstance(value, float) and value.is_integer())
-    return isinstance(value, _JSON_TYPES[name])
-
-
-def _schema_problem(value, schema, root, path) -> tuple[tuple[str, ...], str] | None:
-    if isinstance(schema, bool):
-        return None if schema else (path, "nothing")
-    if reference := schema.get("$ref"):
-        problem = _schema_problem(value, root["$defs"][reference.removeprefix("#/$defs/")], root, path)
-        if problem:
-            return problem
-    if "anyOf" in schema:
-        tried = [_schema_problem(value, option, root, path) for option in schema["anyOf"]]
-        if all(tried):
-            # The option that got furthest is the one that was meant.
-            return max(tried, key=lambda problem: len(problem[0]))
-    if types := schema.get("type"):
-        names = [types] if isinstance(types, str) else types
-        if not any(_has_type(value, name) for name in names):
-            return path, " or ".join(names)
-    if "const" in schema and value != schema["const"]:
-        return path, shown(schema["const"])
-    if "enum" in schema and value not in schema["enum"]:
-        return path, " or ".join(map(shown, schema["enum"]))
-    if isinstance(value, int | float) and not isinstance(value, bool):
-        if value < schema.get("minimum", value) or value <= schema.get("exclusiveMinimum", -math.inf):
-            return path, f"a number of at least {schema.get('minimum', schema.get('exclusiveMinimum'))}"
-        if value > schema.get("maximum", value):
-            return path, f"a number of at most {schema['maximum']}"
-    if isinstance(value, str) and "pattern" in schema and not re.search(schema["pattern"], value):
-        return path, f"text of the form {schema['pattern']}"
-    if isinstance(value, list):
-        if not schema.get("minItems", 0) <= len(value) <= schema.get("maxItems", len(value)):
-            return path, f"{schema.get('minItems', 0)} to {schema.get('maxItems', 'any number of')} entries"
-        if "items" in schema:
-            for number, item in enumerate(value):
-                if problem := _schema_problem(item, schema["items"], root, (*path, str(number))):
-                    return problem
-    if isinstance(value, dict):
-        properties = schema.get("properties", {})
-        for name in schema.get("required", ()):
-            if name not in value:
-                return (*path, name), "this key"
-        for name, item in value.items():
-            if problem := _schema_problem(name, schema.get("propertyNames", True), root, (*path, name)):
-                return problem
-            inner = properties.get(name, schema.get("additionalProperties", True))
-            if problem := _schema_problem(item, inner, root, (*path, name)):
-                return problem
-    return None
 
 
 ARRAYS_MAX = 256
