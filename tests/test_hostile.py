@@ -442,14 +442,15 @@ def test_a_report_is_not_made_from_the_fit_of_other_data(good, tmp_path, monkeyp
 def test_a_damaged_comparison_is_refused_by_key(good, tmp_path, key, value, column):
     from tvsbayes.comparison import _stored_hold_out
 
-    path = place_of(good, tmp_path) / "results" / "compare.json"
+    folder = place_of(good, tmp_path)
+    path, data = folder / "results" / "compare.json", read_campaign(folder)
     document = json.loads(path.read_text())
-    assert _stored_hold_out(path, document["inputs"]) == document
-    assert _stored_hold_out(path, {}) is None
+    assert _stored_hold_out(data, document) == document
+    assert _stored_hold_out(data, {"inputs": {}}) is None
     document["held_out"][key] = value
     path.write_text(json.dumps(document))
     with pytest.raises(InputError) as caught:
-        _stored_hold_out(path, document["inputs"])
+        _stored_hold_out(data, document)
     assert caught.value.column == column
 
 

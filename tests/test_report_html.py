@@ -205,6 +205,15 @@ def test_what_strangers_write_stays_text(folder, page, shift, tmp_path, no_pictu
 
 
 STORED = {"compare.json": "held_out", "plan.json": "planned"}
+BATCH = {"text": "sheet d9, <b>four</b> looks", "minutes": 2.5, "gain": 1.2e-5, "gain_per_minute": 4.8e-6}
+PLANNED = {
+    "target": {"text": "u(left) <= 2e-4 deg/step", "unit": "deg/step"},
+    "now": 3.1e-4,
+    "stop": {"now": False, "reason": "the target is not met", "rule": "a rule"},
+    "limited_by": {"needed": "focal scale to 0.1 %"},
+    "next": [BATCH],
+}
+"""What `plan --given` writes, as far as reports show it."""
 
 
 @pytest.mark.parametrize("name", STORED)
@@ -219,20 +228,45 @@ def test_results_that_belong_to_other_data_are_not_reported(folder, name):
 
 @pytest.mark.parametrize("name", STORED)
 @pytest.mark.parametrize("content", [{}, {"held_out": None, "target": 3}, {"held_out": {"verdict": "x"}, "target": {}}])
-def test_results_that_no_command_wrote_are_refused_by_name(evidence, no_pictures, name, content):
-    with pytest.raises(InputError, match=f"results/{name}"):
-        report_html(replace(evidence, **{STORED[name]: content}))
+def test_results_that_no_command_wrote_are_refused_by_name(folder, evidence, name, content):
+    path = folder / "results" / name
+    path.write_text(json.dumps({"inputs": evidence.fit["inputs"], **content}))
+    try:
+        with pytest.raises(InputError, match=f"results/{name}"):
+            evidence_of(folder)
+    finally:
+        path.unlink()
 
 
-def test_next_experiments_are_those_of_the_plan(evidence, no_pictures):
-    batch = {"text": "sheet d9, <b>four</b> looks", "minutes": 2.5, "gain": 1.2e-5, "gain_per_minute": 4.8e-6}
-    planned = {
-        "target": {"text": "u(left) <= 2e-4 deg/step", "unit": "deg/step"},
-        "now": 3.1e-4,
-        "stop": {"now": False, "reason": "the target is not met", "rule": "a rule"},
-        "limited_by": {"needed": "focal scale to 0.1 %"},
-        "next": [batch],
-    }
+@pytest.mark.parametrize(
+    ("key", "value", "column"),
+    [
+        ("now", None, "now"),
+        ("target", {"text": 3, "unit": "mm"}, "target.text"),
+        ("stop", {"now": "no", "reason": "", "rule": ""}, "stop.now"),
+        ("limited_by", {"needed": ["a"]}, "limited_by.needed"),
+        ("next", {}, "next"),
+        ("next", [{**BATCH, "gain": "high"}], "next.gain"),
+    ],
+)
+def test_a_damaged_plan_is_refused_by_key(folder, evidence, key, value, column):
+    path = folder / "results" / "plan.json"
+    path.write_text(json.dumps({"inputs": evidence.fit["inputs"], **PLANNED, key: value}))
+    try:
+        with pytest.raises(InputError) as caught:
+            evidence_of(folder)
+        assert caught.value.column == column
+    finally:
+        path.unlink()
+
+
+def test_next_experiments_are_those_of_the_plan(folder, evidence, no_pictures):
+    path = folder / "results" / "plan.json"
+    path.write_text(json.dumps({"inputs": evidence.fit["inputs"], **PLANNED}))
+    try:
+        planned = evidence_of(folder).planned
+    finally:
+        path.unlink()
     text = report_html(replace(evidence, planned=planned)).decode()
     for wanted in ("u(left) &lt;= 2e-4", "0.00031 deg/step", "focal scale to 0.1 %", "Go on measuring"):
         assert wanted in text

@@ -35,7 +35,7 @@ from tvsbayes.coordinates import (
     propagate,
     sources,
 )
-from tvsbayes.files import JSON_BYTES_MAX, NothingToEstimate, parse_json, read_bytes
+from tvsbayes.files import JSON_BYTES_MAX, Keys, NothingToEstimate, parse_json, read_bytes
 from tvsbayes.likelihood import aperture_angle, ordered_spots
 from tvsbayes.model import INDEX, NAMES, RIG_NAMES, Beam, ParameterSpace
 from tvsbayes.rigs import RIG_PRIORS, Prior
@@ -904,12 +904,19 @@ class Evidence:
     point: BudgetTable | None
 
 
-def _stored_hold_out(path: Path, inputs: object) -> dict[str, object] | None:
-    """The document of `compare` where it was made from the same data and priors; what reports show is checked."""
+def _stored(campaign: Campaign, fit: Mapping[str, object], name: str) -> Keys | None:
+    """A document in `results/`, where it was made from the data and priors of this fit."""
+    path = campaign.path / "results" / name
     if not path.exists():
         return None
-    keys = parse_json(read_bytes(path, JSON_BYTES_MAX), path.name)
-    if keys.values.get("inputs") != inputs:
+    keys = parse_json(read_bytes(path, JSON_BYTES_MAX), f"results/{name}")
+    return keys if keys.values.get("inputs") == fit["inputs"] else None
+
+
+def _stored_hold_out(campaign: Campaign, fit: Mapping[str, object]) -> dict[str, object] | None:
+    """The document of `compare`; what reports show of it is checked."""
+    keys = _stored(campaign, fit, "compare.json")
+    if keys is None:
         return None
     held = keys.table("held_out")
     held.text_value("verdict")
@@ -926,6 +933,32 @@ def _stored_hold_out(path: Path, inputs: object) -> dict[str, object] | None:
         if direction not in DIRECTIONS:
             raise held.refuse("unseen", "word", ", ".join(DIRECTIONS), "run `tvsbayes compare` again")
         held.table("unseen").number(direction, 0.0, 1e6)
+    return keys.values
+
+
+def _stored_plan(campaign: Campaign, fit: Mapping[str, object]) -> dict[str, object] | None:
+    """The document of `plan --given`; what reports show of it is checked."""
+    keys = _stored(campaign, fit, "plan.json")
+    if keys is None:
+        return None
+    again = "run `tvsbayes plan --given` again"
+    for name in ("text", "unit"):
+        keys.table("target").text_value(name)
+    keys.number("now", 0.0, 1e6)
+    stop = keys.table("stop")
+    stop.flag("now")
+    stop.text_value("reason", 2000)
+    stop.text_value("rule", 2000)
+    if keys.table("limited_by").values.get("needed") is not None:
+        keys.table("limited_by").text_value("needed", 2000)
+    batches = keys.values.get("next")
+    if not isinstance(batches, list) or not all(isinstance(batch, dict) for batch in batches):
+        raise keys.refuse("next", "list", "a list of tables", again)
+    for batch in batches:
+        entry = Keys(batch, keys.file, keys.text, ("next",))
+        entry.text_value("text", 2000)
+        for name in ("minutes", "gain", "gain_per_minute"):
+            entry.number(name, -1e6, 1e6)
     return keys.values
 
 
@@ -986,8 +1019,8 @@ def gather(
         campaign=campaign,
         fit=fit,
         classic=classic_result,
-        held_out=_stored_hold_out(campaign.path / "results" / "compare.json", fit["inputs"]),
-        planned=_stored(campaign, fit, "plan.json"),
+        held_out=_stored_hold_out(campaign, fit),
+        planned=_stored_plan(campaign, fit),
         criteria=criteria,
         distances_mm=found,
         range_mm=range_mm,
@@ -995,12 +1028,3 @@ def gather(
         budget=found_budget,
         point=coordinate_budget(found_budget, calibration, point, least),
     )
-
-
-def _stored(campaign: Campaign, fit: Mapping[str, object], name: str) -> Mapping[str, object] | None:
-    """A document in `results/`, where it was made from the data of this fit."""
-    path = campaign.path / "results" / name
-    if not path.exists():
-        return None
-    stored = parse_json(read_bytes(path, JSON_BYTES_MAX), name).values
-    return stored if stored.get("inputs") == fit["inputs"] else None

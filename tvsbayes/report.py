@@ -19,8 +19,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
@@ -38,7 +37,7 @@ from tvsbayes.calibration import Calibration, Steps, calibration_bytes
 from tvsbayes.campaign import input_hashes
 from tvsbayes.certificate import FIGURES
 from tvsbayes.classic import DIRECTIONS, ClassicResult
-from tvsbayes.files import TvsError, escaped, make_folder, refusal, shipped_data, write_atomically
+from tvsbayes.files import TvsError, escaped, make_folder, shipped_data, write_atomically
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -1081,8 +1080,7 @@ def _validation(e: Evidence) -> Section:
             "Held-out experiments: not computed; run the command compare on the campaign and make the report again."
         )
     else:
-        with _stored_by("compare", "compare.json"):
-            text.append(_held_out(e.held_out["held_out"], tables))
+        text.append(_held_out(e.held_out["held_out"], tables))
     return Section("Validation", text, items, tables)
 
 
@@ -1253,21 +1251,6 @@ def _axes(e: Evidence) -> Section:
     return Section("ISO 230-2-style figures", text, items, tables)
 
 
-@contextmanager
-def _stored_by(command: str, name: str) -> Iterator[None]:
-    """Names the file of results whose content is not what the command of that name writes."""
-    try:
-        yield
-    except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
-        raise refusal(
-            "value",
-            file=f"results/{name}",
-            found=f"{type(error).__name__} {escaped(str(error))}",
-            allowed=f"what tvsbayes {command} writes",
-            remedy=f"run tvsbayes {command} again, or delete the file",
-        ) from error
-
-
 def _plan(e: Evidence) -> Section:
     items = [w["text"] for w in e.fit["weak_directions"]]
     if e.planned is None:
@@ -1275,21 +1258,20 @@ def _plan(e: Evidence) -> Section:
             "tvsbayes plan RIG --given CAMPAIGN weighs further experiments; a report made after it shows them here."
         ]
         return Section("What to measure next", text, items)
-    with _stored_by("plan --given", "plan.json"):
-        plan, unit = e.planned, e.planned["target"]["unit"]
-        stop = plan["stop"]
-        text = [
-            f"Wanted: {plan['target']['text']}; known now to {plan['now']:.2g} {unit}. "
-            f"{'Stop measuring' if stop['now'] else 'Go on measuring'}: {stop['reason']}. Rule: {stop['rule']}.",
-        ]
-        if plan["limited_by"]["needed"]:
-            text.append(plan["limited_by"]["needed"])
-        rows = [
-            [batch["text"], f"{batch['minutes']:.1f}", f"{batch['gain']:.2g}", f"{batch['gain_per_minute']:.2g}"]
-            for batch in plan["next"]
-        ]
-        columns = ["four looks", "minutes", f"gain, {unit}", f"gain a minute, {unit}"]
-        tables = [TableView("Next experiments, best first", columns, rows)] if rows else []
+    plan, unit = e.planned, e.planned["target"]["unit"]
+    stop = plan["stop"]
+    text = [
+        f"Wanted: {plan['target']['text']}; known now to {plan['now']:.2g} {unit}. "
+        f"{'Stop measuring' if stop['now'] else 'Go on measuring'}: {stop['reason']}. Rule: {stop['rule']}.",
+    ]
+    if plan["limited_by"]["needed"]:
+        text.append(plan["limited_by"]["needed"])
+    rows = [
+        [batch["text"], f"{batch['minutes']:.1f}", f"{batch['gain']:.2g}", f"{batch['gain_per_minute']:.2g}"]
+        for batch in plan["next"]
+    ]
+    columns = ["four looks", "minutes", f"gain, {unit}", f"gain a minute, {unit}"]
+    tables = [TableView("Next experiments, best first", columns, rows)] if rows else []
     return Section("What to measure next", text, items, tables=tables)
 
 
