@@ -29,7 +29,7 @@ from pathlib import Path
 import numpy as np
 from coverage import read_rows
 from scipy import stats
-from studies import dense_plan, few_plan, mounted_rig, run_rows
+from studies import dense_plan, mounted_rig, run_rows, small_plan
 
 OUTPUT = Path(__file__).parent / "output"
 ROWS = OUTPUT / "sbc.jsonl"
@@ -100,7 +100,7 @@ def one_simulation(task: tuple[str, int]) -> dict[str, object]:
     from tvsbayes.simulation import simulate
 
     use_compilation_cache()
-    simulated = simulate(mounted_rig(), few_plan(SHEETS) if variant == FEW else dense_plan(SHEETS), seed)
+    simulated = simulate(mounted_rig(), small_plan(SHEETS, sweeps=1) if variant == FEW else dense_plan(SHEETS), seed)
     row: dict[str, object] = {"variant": variant, "seed": seed, "converged": False, "problems": []}
     row["unseen"] = sum(s.status != "ok" for s in simulated.campaign.spots)
     start = time.perf_counter()

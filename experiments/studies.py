@@ -11,21 +11,25 @@ from pathlib import Path
 import numpy as np
 from coverage import SINGLE_THREADED, read_rows
 
-PAN_SWEEP = (0, 70, 140, 200, 140, 70, 0, 70, 140, 200, 140, 70)
-TILT_SWEEP = (-60, -20, 20, 60, 20, -20, -60, -20, 20, 60, 20, -20)
+PAN_SWEEP = (0, 70, 140, 200, 140, 70)
+TILT_SWEEP = (-60, -20, 20, 60, 20, -20)
 TILT_STEPS = (-60, -36, -12, 12, 36, 60, 36, 12, -12, -36)
 CROSSING = 100, -20
 """Tilt while panning is the second number, pan while tilting the first."""
 
 
-def small_plan(sheets: Sequence[str]):
-    """24 spots per sheet: both axes swept there and back twice; 24 moves per sheet after one homing."""
+def small_plan(sheets: Sequence[str], sweeps: int = 2):
+    """Both axes swept there and back `sweeps` times, 12 spots and moves per sweep and sheet, after one homing.
+
+    One sweep of two sheets gives six stops in every direction.
+    """
     from tvsbayes.campaign import PlanStep
 
     orders = [("home", 0, 0)]
     for sheet in sheets:
         orders.append(("place", None, None, sheet))
-        for pan, tilt in [(p, CROSSING[1]) for p in PAN_SWEEP] + [(CROSSING[0], t) for t in TILT_SWEEP]:
+        pans, tilts = PAN_SWEEP * sweeps, TILT_SWEEP * sweeps
+        for pan, tilt in [(p, CROSSING[1]) for p in pans] + [(CROSSING[0], t) for t in tilts]:
             orders += [("move", pan, tilt), ("look",)]
     return tuple(PlanStep(number, *order) for number, order in enumerate(orders))
 
@@ -38,20 +42,7 @@ def dense_plan(sheets: Sequence[str]):
     for sheet in sheets:
         orders.append(("place", None, None, sheet))
         for look in range(30):
-            orders += [("move", PAN_SWEEP[look % 6], TILT_STEPS[look % 10]), ("look",)]
-    return tuple(PlanStep(number, *order) for number, order in enumerate(orders))
-
-
-def few_plan(sheets: Sequence[str]):
-    """12 spots per sheet, each axis swept there and back once: six stops in every direction for two sheets."""
-    from tvsbayes.campaign import PlanStep
-
-    half = len(PAN_SWEEP) // 2
-    orders = [("home", 0, 0)]
-    for sheet in sheets:
-        orders.append(("place", None, None, sheet))
-        for pan, tilt in [(p, CROSSING[1]) for p in PAN_SWEEP[:half]] + [(CROSSING[0], t) for t in TILT_SWEEP[:half]]:
-            orders += [("move", pan, tilt), ("look",)]
+            orders += [("move", PAN_SWEEP[look % len(PAN_SWEEP)], TILT_STEPS[look % len(TILT_STEPS)]), ("look",)]
     return tuple(PlanStep(number, *order) for number, order in enumerate(orders))
 
 

@@ -9,6 +9,8 @@ from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from bent_rig import BENT, WOBBLE
@@ -34,6 +36,7 @@ from tvsbayes.certificate import (
     target_steps,
     unit_of,
 )
+from tvsbayes.joint import Linearised
 from tvsbayes.rigs import RigTable
 from tvsbayes.simulation import effective_deg_per_step, harmonics_deg, mirror_chain, transmission, with_derived
 
@@ -313,6 +316,17 @@ def test_an_axis_that_never_moved_has_no_prediction():
 STOPS = 27
 
 
+def linearised(residual: np.ndarray, slope: np.ndarray, angles: np.ndarray) -> Linearised:
+    """A linearised campaign of these spots; what stop readings do not need is 0."""
+    spots, count = len(residual), len(INPUT_NAMES)
+    shapes = {"play_sd_rad": (2,), "predicted": (5,), "stop_variance": (2,)}
+    shapes |= {"residual_jacobian": (4, count), "predicted_jacobian": (5, count)}
+    arrays = {"residual": residual, "slope": slope, "mirror_angles_rad": angles}
+    arrays |= {name: np.zeros((spots, *shape)) for name, shape in shapes.items()}
+    with jax.enable_x64(True):
+        return Linearised(**{name: jnp.asarray(array) for name, array in arrays.items()})
+
+
 def stops_of(offsets_deg: np.ndarray, looks: int = 2, noise: float = 0.0) -> SimpleNamespace:
     """What `stop_readings` reads of a fit: a pan axis driven 0, 100, 200 up and down, at every stop `looks` looks.
 
@@ -345,7 +359,7 @@ def stops_of(offsets_deg: np.ndarray, looks: int = 2, noise: float = 0.0) -> Sim
         names=INPUT_NAMES,
         mode=SimpleNamespace(physical=calibration.mean),
         campaign=campaign,
-        linearised=SimpleNamespace(residual=residual, slope=slope, mirror_angles_rad=angles),
+        linearised=linearised(residual, slope, angles),
         excluded_spots=(0,),
         reference_pose_rad=np.zeros(2),
     )
@@ -368,7 +382,8 @@ def test_reading_uncertainty_is_what_noise_does():
     for seed in range(40):
         fit = stops_of(np.zeros(STOPS), noise=1.0)
         rng = np.random.default_rng(seed)
-        fit.linearised.residual = rng.normal(size=fit.linearised.residual.shape)
+        residual = rng.normal(size=fit.linearised.residual.shape)
+        fit.linearised = linearised(residual, fit.linearised.slope, fit.linearised.mirror_angles_rad)
         found = stop_readings(fit, "pan")
         errors.append((found.mirror_deg - found.steps * 0.06 + 0.15 * found.side) / found.u_deg)
         stated.append(found.u_deg)

@@ -244,8 +244,8 @@ def _rests(moves: Sequence[Move], axis: str) -> list[_Rest]:
 def stop_readings(fit: JointFit, axis: str) -> StopReadings:
     """What the spots say of every stop of an axis, before any stop error is shrunk towards zero.
 
-    At each stop the mirror angle that fits its spots best, by least squares of the whitened residuals (range already
-    projected out, the other axis' angle free at every spot), added to the angle that counters and play predict.
+    At each stop the mirror angle that fits its spots best (`joint.SpotDeviations`, weighted by their noise), added to
+    the angle that counters and play predict.
 
     Args:
         fit: a converged fit.
@@ -259,24 +259,21 @@ def stop_readings(fit: JointFit, axis: str) -> StopReadings:
     spots = sorted((s for s in fit.campaign.spots if s.status == "ok"), key=lambda s: (s.move, s.spot))
     rests = _rests(fit.campaign.moves, axis)
     needed = values[f"backlash_deg.{axis}"] / abs(values[f"degrees_per_step.{axis}"])
-    slope, residual = np.asarray(fit.linearised.slope), np.asarray(fit.linearised.residual)
-    normal = np.einsum("nki,nkj->nij", slope, slope)
-    moment = np.einsum("nki,nk->ni", slope, residual)
-    other = 1 - index
+    seen = fit.linearised.spot_deviations()
     sums: dict[int, list[float]] = {}
     left_out = set()
     for row, spot in enumerate(spots):
         rest = rests[spot.move]
-        if spot.spot in fit.excluded_spots or normal[row, other, other] <= 0:
+        variance = float(seen.covariance_rad2[row, index, index])
+        if spot.spot in fit.excluded_spots or variance <= 0:
             continue
         if rest.side == 0 or rest.leg < needed:
             left_out.add(rest.number)
             continue
-        share = normal[row, index, other] / normal[row, other, other]
         entry = sums.setdefault(rest.number, [0.0, 0.0, float(fit.linearised.mirror_angles_rad[row, index])])
-        entry[0] += normal[row, index, index] - share * normal[row, index, other]
-        entry[1] += moment[row, index] - share * moment[row, other]
-    kept = [(rests[move], entry) for move, entry in sums.items() if entry[0] > 0]
+        entry[0] += 1 / variance
+        entry[1] += float(seen.deviation_rad[row, index]) / variance
+    kept = [(rests[move], entry) for move, entry in sums.items()]
     return StopReadings(
         axis=axis,
         steps=np.array([rest.steps for rest, _ in kept], dtype=int),

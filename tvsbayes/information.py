@@ -736,11 +736,7 @@ def stop_residuals(fit: JointFit) -> tuple[StopResidual, ...]:
     spots = ordered_spots(fit.campaign)
     moves = fit.campaign.moves
     rows = jax.tree.map(lambda x: np.asarray(x)[: len(spots)], fit.arrays.spots)
-    slope = fit.linearised.slope
-    normal = np.einsum("nia,nib->nab", slope, slope)
-    with np.errstate(all="ignore"):
-        covariance = np.linalg.pinv(normal)
-    angle = np.einsum("nab,nib,ni->na", covariance, slope, fit.linearised.residual)
+    seen = fit.linearised.spot_deviations()
     found = []
     for index, (axis, directions) in enumerate((("pan", ("left", "right")), ("tilt", ("up", "down")))):
         rest = np.cumsum(rows.redraw[:, index] | rows.new_segment)
@@ -756,7 +752,7 @@ def stop_residuals(fit: JointFit) -> tuple[StopResidual, ...]:
             approach = getattr(moves[begun], f"{axis}_approach")
             leg = 0 if approach else _steps(moves[begun], axis) - _steps(moves[begun - 1], axis)
             direction = approach.replace("unknown", "") if approach else directions[leg < 0]
-            mine, noise = angle[chosen, index], covariance[chosen, index, index]
+            mine, noise = seen.deviation_rad[chosen, index], seen.covariance_rad2[chosen, index, index]
             weight = 1 / noise
             mean = mine @ weight / weight.sum()
             variance = 1 / weight.sum() + fit.linearised.stop_variance[chosen[0], index]

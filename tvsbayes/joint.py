@@ -374,6 +374,26 @@ class Linearised(eqx.Module):
     residual_jacobian: Float[Array, "spots 4 parameters"]
     predicted_jacobian: Float[Array, "spots 5 parameters"]
 
+    def spot_deviations(self) -> SpotDeviations:
+        """Least squares of the whitened residuals, spot by spot; covariance 0 where a spot tells neither angle."""
+        slope = np.asarray(self.slope)
+        with np.errstate(all="ignore"):
+            covariance = np.linalg.pinv(np.einsum("nia,nib->nab", slope, slope))
+        return SpotDeviations(np.einsum("nab,nib,ni->na", covariance, slope, np.asarray(self.residual)), covariance)
+
+
+@dataclass(frozen=True)
+class SpotDeviations:
+    """Mirror angles (pan, tilt), seen minus predicted, every spot by itself, its range projected out.
+
+    Attributes:
+        deviation_rad: shape (spots, 2).
+        covariance_rad2: of the pixel noise, shape (spots, 2, 2).
+    """
+
+    deviation_rad: np.ndarray
+    covariance_rad2: np.ndarray
+
 
 @eqx.filter_jit
 def linearise(z: Float[Array, " parameters"], space: ParameterSpace, arrays: CampaignArrays) -> Linearised:

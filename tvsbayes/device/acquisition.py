@@ -603,9 +603,10 @@ class Acquisition:
     def _keep_edited(self) -> None:
         """Files that somebody has changed since the run was interrupted are about to be written again."""
         campaign = self._campaign()
-        for copy in keep_edited(campaign, self.journal.folder) if campaign is not None else ():
-            original = copy.name.replace(f".{copy.name.split('.')[-2]}", "")
-            self._warnings.append(f"{original} was edited since: what stood in it is kept in {copy.name}")
+        if campaign is None:
+            return
+        for name, copy in keep_edited(campaign, self.journal.folder).items():
+            self._warnings.append(f"{name} was edited since: what stood in it is kept in {copy.name}")
 
     def _derive(self, always: bool = False) -> None:
         count = len(self._recorder.spots)

@@ -246,7 +246,7 @@ def _files(campaign: Campaign, folder: Path, tables_only: bool = False) -> dict[
     return {"stereo.json": stereo_bytes(campaign.stereo), **files, "campaign.toml": campaign_toml(campaign)}
 
 
-def keep_edited(campaign: Campaign, folder: Path) -> list[Path]:
+def keep_edited(campaign: Campaign, folder: Path) -> dict[str, Path]:
     """Copies of campaign files that hold what is not in the journal, before they are written again.
 
     Somebody may have refused spots, written readings, or stated priors since. Tables that only lack the latest rows
@@ -257,9 +257,9 @@ def keep_edited(campaign: Campaign, folder: Path) -> list[Path]:
         folder: campaign folder.
 
     Returns:
-        The copies made, `spots.edited-1.csv` and so on.
+        The copies made, `spots.edited-1.csv` and so on, by the name of the file.
     """
-    folder, kept = Path(folder), []
+    folder, kept = Path(folder), {}
     for name, data in _files(campaign, folder).items():
         path = folder / name
         if not path.is_file():
@@ -271,7 +271,7 @@ def keep_edited(campaign: Campaign, folder: Path) -> list[Path]:
         while (copy := path.with_name(f"{path.stem}.edited-{number}{path.suffix}")).exists():
             number += 1
         write_atomically(copy, present)
-        kept.append(copy)
+        kept[name] = copy
     return kept
 
 
