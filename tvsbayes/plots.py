@@ -73,11 +73,15 @@ def _colours(stops: Sequence[str]) -> Colormap:
 def svg(figure: Figure) -> bytes:
     """A figure as an SVG document; the same figure gives the same bytes."""
     from matplotlib import rc_context
+    from matplotlib.backends.backend_svg import FigureCanvasSVG
 
-    buffer = io.BytesIO()
-    # The identifiers in the file are drawn when it is written.
+    buffer, dpi = io.BytesIO(), figure.dpi
+    # The identifiers in the file are drawn when it is written. The canvas draws once, where `savefig` draws a first
+    # time for the layout alone.
     with rc_context(STYLE):
-        figure.savefig(buffer, format="svg", dpi=RASTER_DPI, metadata={"Date": None, "Creator": None})
+        figure.dpi = RASTER_DPI
+        FigureCanvasSVG(figure).print_svg(buffer, metadata={"Date": None, "Creator": None})
+        figure.dpi = dpi
     return re.sub(rb">\s+<", b"><", buffer.getvalue())
 
 
