@@ -181,6 +181,33 @@ def planted(rows: list[dict]) -> tuple[str, bool]:
     return f"{sum(last.values())} of {len(last)} that were planted are caught", all(last.values())
 
 
+def folders(rows: list[dict]) -> tuple[str, bool]:
+    """Commands on crafted folders."""
+    from hostile import fine
+
+    crafted = [r for r in rows if r["threat"] != "none"]
+    good = sum(map(fine, crafted))
+    names = len({r["name"] for r in crafted})
+    return f"{good} of {len(crafted)} commands on {names} crafted folders did what they should", good == len(crafted)
+
+
+def mutations(rows: list[dict]) -> tuple[str, bool]:
+    """Defects that changed bytes of a good folder found."""
+    defects = sum(len(r["defects"]) for r in rows)
+    through = sum(sum(r["codes"].values()) for r in rows)
+    text = f"{defects} defects in {sum(r['n'] for r in rows)} seeded mutations, {through} of them through the commands"
+    return text, defects == 0
+
+
+def false_alarms(rows: list[dict]) -> tuple[str, bool]:
+    """Share of clean campaigns that fail their validation, with the bounds that its level leaves."""
+    good = [r for r in rows if r["defect"] == "clean" and r["converged"] and "validation" in r]
+    level, failed = good[0]["validation"]["level"], sum(not r["validation"]["passed"] for r in good)
+    limit = stats.binom.isf(BOUND, len(good), level)
+    text = f"{failed} of {len(good)} clean campaigns failed (level {100 * level:g} %, at most {limit:.0f})"
+    return text, failed <= limit
+
+
 LINES = (
     Line(
         "The classic 95 % type A interval misses the truth",
@@ -238,6 +265,24 @@ LINES = (
         "python experiments/evidence.py device",
         DEVICE.name,
         device,
+    ),
+    Line(
+        "A stranger's folder runs nothing, fills no memory, writes nowhere else",
+        "python experiments/hostile.py folders",
+        "hostile-folders.jsonl",
+        folders,
+    ),
+    Line(
+        "Changed bytes end in a documented error",
+        "python experiments/hostile.py mutations --n 100000",
+        "hostile-mutations.jsonl",
+        mutations,
+    ),
+    Line(
+        "Validation seldom accuses a clean campaign",
+        "python experiments/model_error.py run --clean 200 --seeds 20 --cores 0",
+        "model_error.jsonl",
+        false_alarms,
     ),
     Line(
         "The tests see planted one-line bugs",

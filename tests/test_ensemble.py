@@ -35,6 +35,8 @@ EVOLUTION_STEPS = {1: 1500, 5: 1600, 20: 1000, 40: 900}
 """Steps by dimension: autocorrelation times (quoted from runs of 2000 steps) are 1.3 to 27 steps with independence
 proposals and 5, 18, 59, 87 with differential evolution alone."""
 
+ONE_BY_ONE_STEPS = {1: 1500, 5: 1200, 20: 1200, 40: 900}
+
 
 @cache
 def small_fit() -> tuple[JointFit, Transport]:
@@ -101,10 +103,30 @@ def test_differential_evolution_keeps_the_target(which, dimension):
     assert bias(run(move, dimension, EVOLUTION_STEPS[dimension], max(64, 2 * dimension))) == ""
 
 
-def test_the_moves_are_the_three_that_are_tried_here():
+@pytest.mark.parametrize("dimension", ONE_BY_ONE_STEPS)
+def test_one_heavy_coordinate_at_a_time_keeps_the_target(dimension):
+    """With every coordinate heavy: the move leaves the others where they are."""
+    proposal = replace(off_target(dimension), heavy=np.ones(dimension, dtype=bool))
+    move, _ = posterior.moves(proposal)[3]
+    assert bias(run(move, dimension, ONE_BY_ONE_STEPS[dimension], walkers_for(dimension))) == ""
+
+
+def test_one_heavy_coordinate_leaves_the_others_alone():
+    proposal = off_target(6)
+    w = np.random.default_rng(13).normal(size=(200, 6))
+    proposed, _ = posterior.OneHeavy(proposal)(w, np.random.RandomState(14))
+    changed = proposed != w
+    assert np.all(changed.sum(axis=1) == 1)
+    np.testing.assert_array_equal(changed.any(axis=0), proposal.heavy)
+
+
+def test_the_moves_are_those_that_are_tried_here():
     mixture = posterior.moves(off_target(3))
-    assert [type(move) for move, _ in mixture] == [emcee.moves.MHMove, emcee.moves.DEMove, emcee.moves.DEMove]
-    assert [move.gamma0 for move, _ in mixture[1:]] == [None, 1.0]
+    kinds = [emcee.moves.MHMove, emcee.moves.DEMove, emcee.moves.DEMove, emcee.moves.MHMove]
+    assert [type(move) for move, _ in mixture] == kinds
+    assert [move.gamma0 for move, _ in mixture[1:3]] == [None, 1.0]
+    light = replace(off_target(3), heavy=np.zeros(3, dtype=bool))
+    assert [type(move) for move, _ in posterior.moves(light)] == kinds[:3]
     assert sum(share for _, share in mixture) == pytest.approx(1.0, abs=len(mixture) * ROUNDING)
 
 
@@ -235,10 +257,26 @@ def test_the_shear_straightens_the_posterior():
     assert spread[0] < spread[1] / 3, spread
 
 
+def test_the_stretch_keeps_the_curvature_far_from_the_mode():
+    """Where a stop scatters by four of its posterior sds more than at the mode, ratios are far wider; not in w."""
+    fitted, path = small_fit()
+    straight = replace(path, stretch=np.zeros_like(path.stretch))
+    node = len(posterior.STRETCH_NODES) - 2
+    which, place = np.unravel_index(np.argmax(path.stretch[:, node]), path.stretch[:, node].shape)
+    step = 0.5 * np.eye(path.dimension)[place]
+    w = np.stack([-step, np.zeros(path.dimension), step])
+    w[:, path.noise[which]] = posterior.STRETCH_NODES[node]
+    with jax.enable_x64(True):
+        curvature = [-(np.array([1, -2, 1]) @ Target(fitted, p)(w)) / 0.5**2 for p in (path, straight)]
+    # The information at the node comes from one-sided steps as long: halves of their error are left.
+    assert curvature[0] == pytest.approx(1.0, abs=0.3) and curvature[1] < 0.5, curvature
+
+
 def test_a_density_without_value_is_refused_and_counted(x64, monkeypatch):
     dimension, count = 3, BATCH + 5
-    none = np.zeros((0, 3, 3))
-    path = Transport(np.zeros(4), np.array([0, 1, 3]), np.eye(3), np.zeros(0, int), none, np.zeros((3, 3)))
+    none, empty = np.zeros((0, 3, 3)), np.zeros(0, int)
+    stretch = np.zeros((0, len(posterior.STRETCH_NODES), 3))
+    path = Transport(np.zeros(4), np.array([0, 1, 3]), np.eye(3), empty, none, empty, stretch)
     w = np.random.default_rng(11).normal(size=(count, dimension))
     without = np.array([0, 7, count - 1])
     w[without, 2] = 100.0

@@ -14,21 +14,22 @@ import pytest
 
 from tvsbayes import posterior
 from tvsbayes.model import INDEX, NAMES
-from tvsbayes.posterior import Chain, Posterior, Target, Transport, diagnose, propagated
+from tvsbayes.posterior import STRETCH_NODES, Chain, Posterior, Target, Transport, diagnose, propagated
 
 WALKERS, STEPS = 64, 400
 RATIO, BACKLASH = INDEX["degrees_per_step.pan"], INDEX["backlash_deg.pan"]
 STRETCH = 0.3
-"""Log of the factor on the first coordinate per unit of the second: the Jacobian of the map is exp(0.3 w_2)."""
+"""Log of the factor on the first coordinate per unit of the second above 0: the Jacobian is exp(0.3 max(w_2, 0))."""
 AT_MODE = 7.0
 SIGMAS = 5.0
 
 
 def route() -> Transport:
-    """The map z_1 = w_1 exp(0.3 w_2), z_2 = w_2 at two of the parameters."""
-    stretch = np.array([[0.0, STRETCH], [0.0, 0.0]])
+    """The map z_1 = w_1 exp(0.3 max(w_2, 0)), z_2 = w_2 at two of the parameters."""
+    stretch = STRETCH * np.array([[[node, 0.0] for node in STRETCH_NODES]])
     none = np.zeros((0, 2, 2))
-    return Transport(np.zeros(len(NAMES)), np.array([RATIO, BACKLASH]), np.eye(2), np.zeros(0, int), none, stretch)
+    free, noise = np.array([RATIO, BACKLASH]), np.array([1])
+    return Transport(np.zeros(len(NAMES)), free, np.eye(2), np.zeros(0, int), none, noise, stretch)
 
 
 def fit() -> SimpleNamespace:
@@ -44,8 +45,9 @@ def log_normal_density(z: np.ndarray) -> np.ndarray:
 
 def chain_of(z: np.ndarray) -> Chain:
     """A chain (steps, walkers, 2) of z as the sampler would hold it: w, and the density that `Target` gives it."""
-    w = np.stack([z[..., 0] * np.exp(-STRETCH * z[..., 1]), z[..., 1]], axis=-1)
-    log_density = -0.5 * np.sum(z**2, axis=-1) + STRETCH * w[..., 1]
+    log_factor = STRETCH * np.maximum(z[..., 1], 0.0)
+    w = np.stack([z[..., 0] * np.exp(-log_factor), z[..., 1]], axis=-1)
+    log_density = -0.5 * np.sum(z**2, axis=-1) + log_factor
     accepted = np.full(z.shape[1], 0.4 * len(z))
     return Chain(w, log_density, accepted, (), 0, 1.0)
 
@@ -89,8 +91,9 @@ def test_the_density_of_walkers_is_the_models_times_the_jacobian(x64, monkeypatc
     monkeypatch.setattr(posterior, "evaluate", evaluate)
     w = np.random.default_rng(4).standard_normal((50, 2))
     value = Target(fit(), route())(w)
-    y = w[:, 0] * np.exp(STRETCH * w[:, 1])
-    np.testing.assert_allclose(value, -0.5 * (y**2 + w[:, 1] ** 2) + STRETCH * w[:, 1], rtol=1e-12, atol=1e-12)
+    log_factor = STRETCH * np.maximum(w[:, 1], 0.0)
+    y = w[:, 0] * np.exp(log_factor)
+    np.testing.assert_allclose(value, -0.5 * (y**2 + w[:, 1] ** 2) + log_factor, rtol=1e-12, atol=1e-12)
     # As a density of w it has the mass of the density of z: 2 pi, on a grid that reaches 6 sds of the second.
     one, two = np.meshgrid(np.linspace(-40, 40, 161), np.linspace(-6, 6, 25), indexing="ij")
     value = Target(fit(), route())(np.column_stack([one.ravel(), two.ravel()]))

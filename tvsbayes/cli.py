@@ -949,6 +949,8 @@ def plan(
         write_plan(result.steps, output)
         document["plan"] = str(output)
         text += f"\nwritten: {escaped(str(output), 200)}"
+    elif output is not None:
+        text += f"\nnothing written to {escaped(str(output), 200)}: there is nothing more to measure"
     if data is not None:
         # Where the report looks for what to measure next.
         results = output_place(data.path, "results")

@@ -4,7 +4,7 @@ emcee samples in coordinates in which the posterior is nearly standard normal. T
 coordinates of `tvsbayes.model`; y, whitened by the Laplace covariance; w, in which walkers live. Wide directions (laser
 tilt, mirror errors) bend the ridges on which the narrow ones (extrinsics, ratios) lie: a shear moves each narrow
 coordinate by a quadratic form of the wider ones. Noise scales widen what they limit (stop sd the ratios): a stretch
-scales those by an exponential of the noise coordinates. NumPy outside the compiled density.
+scales those by a function of the noise coordinates. NumPy outside the compiled density.
 
 Arrays of draws are ordered (chain, draw, ...); a chain is a walker. Units are those of DESIGN 8 (deg, mm, px).
 Convergence is judged on the stored draws, so that what ArviZ computes from `posterior.nc` is what was judged.
@@ -46,7 +46,17 @@ NARROW = 0.05
 far enough for cubic terms to matter."""
 SHEAR_STEP = 0.5
 """Step of the second differences in posterior sds: the shear should hold over +-2 sd, not only at the mode."""
+STRETCH_NODES = (0.0, 2.0, 4.0, 6.0)
+"""Evenly spaced, in posterior sds by Laplace. With six stops in a direction the stop sd reaches the last, and ratios
+are six times as wide there as at the mode. They are hardly narrower where it is small: other stops limit them then."""
+STRETCH_LIMITS = 1e-2, 1e2
+"""Of the information of a coordinate, 1 at the mode."""
+TRANSPORT_ARRAYS = ("mode", "free", "root", "narrow", "bend", "noise", "stretch")
 PILOT_DRAWS = 2048
+PILOT_ROUNDS = 3
+"""The first is drawn about the mode, each further one from the proposal that the last one gave."""
+VARIANCE_RANGE, HEAVY_VARIANCE_RANGE = (0.8, 1.7), (0.8, 4.0)
+"""Of the proposal, relative to the Laplace approximation's."""
 HEAVY_DOF = 5.0
 HEAVY_SHARE = 0.1
 """Share of the proposals from a multivariate t: it bounds the ratio target / proposal in the tails. In fifty
@@ -56,8 +66,8 @@ HEAVY_NAMES = (*NOISE_NAMES, "backlash_deg.pan", "backlash_deg.tilt")
 of a stop sd), so each of them is always proposed from a t of its own."""
 INFLATION = 1.03
 """Factor on the proposal's sds: a proposal lighter than the target lets walkers freeze in its tails."""
-SHARES = (0.85, 0.1, 0.05)
-"""Independence proposal, differential evolution, differential evolution with full steps."""
+SHARES = (0.65, 0.1, 0.05, 0.2)
+"""Independence proposal, differential evolution, differential evolution with full steps, one heavy coordinate alone."""
 
 
 @dataclass(frozen=True)
@@ -70,7 +80,8 @@ class Transport:
         root: lower-triangular Cholesky factor of their covariance in that order, shape (d, d).
         narrow: places in `free` that the shear moves, ascending, shape (k,).
         bend: its quadratic forms, nonzero only among places before the narrow one, shape (k, d, d).
-        stretch: log of the factor on a place per unit of an earlier noise coordinate, shape (d, d).
+        noise: places in `free` of the noise coordinates, shape (q,).
+        stretch: log of the factor on every place at `STRETCH_NODES` of each noise coordinate, shape (q, nodes, d).
     """
 
     mode: np.ndarray
@@ -78,6 +89,7 @@ class Transport:
     root: np.ndarray
     narrow: np.ndarray
     bend: np.ndarray
+    noise: np.ndarray
     stretch: np.ndarray
 
     @property
@@ -96,13 +108,21 @@ class Transport:
         z[:, self.free] += y @ self.root.T
         return z
 
+    def log_scale(self, w: np.ndarray) -> np.ndarray:
+        """The log of the factors on w, both (..., d): 1 below the mode, straight lines between nodes, and beyond."""
+        at = np.maximum(w[..., self.noise], 0.0) / STRETCH_NODES[1]
+        node = np.minimum(at.astype(int), len(STRETCH_NODES) - 2)
+        noise = np.arange(len(self.noise))
+        low, high = self.stretch[noise, node], self.stretch[noise, node + 1]
+        return np.sum(low + (at - node)[..., None] * (high - low), axis=-2)
+
     def log_jacobian(self, w: np.ndarray) -> np.ndarray:
-        """The log of |dy/dw| at w (n, d): noise coordinates are the same in w and y, the shear keeps volumes."""
-        return w @ self.stretch.sum(axis=0)
+        """The log of |dy/dw| at w (..., d): noise coordinates are the same in w and y, the shear keeps volumes."""
+        return self.log_scale(w).sum(axis=-1)
 
     def to_z(self, w: np.ndarray) -> np.ndarray:
         """From w (n, d) to z (n, p)."""
-        y = w * np.exp(w @ self.stretch.T)
+        y = w * np.exp(self.log_scale(w))
         for place, form in zip(self.narrow, self.bend, strict=True):
             before = y[:, :place]
             y[:, place] -= 0.5 * np.sum((before @ form[:place, :place]) * before, axis=1)
@@ -116,7 +136,7 @@ class Transport:
             before = y[:, :place]
             straight[:, place] += 0.5 * np.sum((before @ form[:place, :place]) * before, axis=1)
         # Noise coordinates are neither bent nor stretched: they are known before anything is undone.
-        return straight * np.exp(-straight @ self.stretch.T)
+        return straight * np.exp(-self.log_scale(straight))
 
 
 def in_batches(function: Callable[[np.ndarray], object], points: np.ndarray, size: int = BATCH) -> object:
@@ -148,7 +168,7 @@ def by_width(covariance: np.ndarray) -> np.ndarray:
 
 
 def transport(fit: JointFit) -> Transport:
-    """Measure the bend of the ridges at a fit's mode.
+    """Measure the bend of the ridges at a fit's mode, and how wide they are at other noise scales.
 
     With r the standardised innovations and J their Jacobian in y, the narrow coordinate k has its optimum shifted by
     -y (J_k . d2r/dy2) y / 2: in y the Gauss-Newton Hessian is the identity. Second differences of r, all pairs in
@@ -167,7 +187,9 @@ def transport(fit: JointFit) -> Transport:
     is_noise = np.isin(np.array(NAMES)[free], NOISE_NAMES)
     geometry = np.flatnonzero(~is_noise)
     narrow = np.flatnonzero((np.diag(root) < NARROW) & ~is_noise)
-    straight = Transport(fit.z, free, root, narrow[:0], np.zeros((0, count, count)), np.zeros((count, count)))
+    noise = np.flatnonzero(is_noise)
+    flat = np.zeros((len(noise), len(STRETCH_NODES), count))
+    straight = Transport(fit.z, free, root, narrow[:0], np.zeros((0, count, count)), noise, flat)
 
     def residuals(y: np.ndarray) -> np.ndarray:
         seen = in_batches(lambda z: evaluate(z, fit.space, fit.arrays).standardised, straight.from_whitened(y))
@@ -189,17 +211,22 @@ def transport(fit: JointFit) -> Transport:
             curvature = (both[: len(some)] + both[len(some) :] - 2 * centre) @ jacobian.T / SHEAR_STEP**2
             mixed = 0.5 * (curvature - own[some[:, 0]] - own[some[:, 1]])
             bend[:, some[:, 0], some[:, 1]] = bend[:, some[:, 1], some[:, 0]] = mixed.T
-        # The data's share of the information 1 of each coordinate, when a noise coordinate goes up or down.
-        stretch = np.zeros((count, count))
-        for noise in np.flatnonzero(is_noise):
-            later, share = geometry[geometry > noise], []
-            for shifted in (steps[noise], -steps[noise]):
-                slope = residuals(steps[later] + shifted) - residuals(-steps[later] + shifted)
-                share.append(np.sum((slope / (2 * SHEAR_STEP)) ** 2, axis=1))
-            stretch[later, noise] = -0.5 * (share[0] - share[1]) / (2 * SHEAR_STEP)
+        # The data's share of the information 1 of each coordinate, as a noise coordinate goes up.
+        stretch = flat.copy()
+        for which, place in enumerate(noise):
+            later = geometry[geometry > place]
+            shares = []
+            for node in STRETCH_NODES:
+                at = np.zeros((1 + len(later), count))
+                at[:, place] = node
+                at[1:, later] += SHEAR_STEP * np.eye(len(later))
+                seen = residuals(at)
+                shares.append(np.sum(((seen[1:] - seen[0]) / SHEAR_STEP) ** 2, axis=1))
+            change = np.array(shares) - shares[0]
+            stretch[which][:, later] = -0.5 * np.log(np.clip(1 + change, *STRETCH_LIMITS))
     for place, form in zip(narrow, bend, strict=True):
         form[place:], form[:, place:] = 0.0, 0.0
-    return Transport(fit.z, free, root, narrow, bend, np.clip(stretch, -0.5, 0.5))
+    return Transport(fit.z, free, root, narrow, bend, noise, stretch)
 
 
 class Target:
@@ -266,12 +293,36 @@ class Independence:
         return proposed, self.log_density(w) - self.log_density(proposed)
 
 
+@dataclass(frozen=True)
+class OneHeavy:
+    """Proposes one heavy coordinate of each walker, drawn by lot, from its own t, whatever the others are.
+
+    A walker far out in a tail that few stops leave open comes back by itself, where a proposal of everything at once
+    would hardly be accepted: without this move one stood still for hundreds of steps.
+    """
+
+    proposal: Independence
+
+    def __call__(self, w: np.ndarray, generator: np.random.RandomState) -> tuple[np.ndarray, np.ndarray]:
+        """The protocol of `emcee.moves.MHMove`."""
+        places = np.flatnonzero(self.proposal.heavy)
+        chosen, rows = places[generator.randint(len(places), size=len(w))], np.arange(len(w))
+        mean, sd = self.proposal.mean[chosen], self.proposal.sd[chosen]
+        proposed = w.copy()
+        proposed[rows, chosen] = mean + sd * generator.standard_t(HEAVY_DOF, len(w))
+        distance2 = [((x[rows, chosen] - mean) / sd) ** 2 for x in (w, proposed)]
+        old, new = (-0.5 * (HEAVY_DOF + 1) * np.log1p(d / HEAVY_DOF) for d in distance2)
+        return proposed, old - new
+
+
 def moves(proposal: Independence) -> list[tuple[emcee.moves.Move, float]]:
     """The moves and their shares; never emcee 3.1.6's snooker or full-covariance Gaussian (both are biased)."""
     # Fewer walkers than twice the dimension let differential evolution explore a subspace only; the
     # independence proposal leaves it at six steps of seven.
     evolution = emcee.moves.DEMove(live_dangerously=True), emcee.moves.DEMove(gamma0=1.0, live_dangerously=True)
-    return list(zip((emcee.moves.MHMove(proposal), *evolution), SHARES, strict=True))
+    found = (emcee.moves.MHMove(proposal), *evolution, emcee.moves.MHMove(OneHeavy(proposal)))
+    # emcee takes weights; where nothing is heavy the last move has nothing to propose.
+    return list(zip(found, SHARES, strict=True))[: None if proposal.heavy.any() else -1]
 
 
 def walkers_for(dimension: int) -> int:
@@ -286,7 +337,7 @@ class Pilot:
     Attributes:
         proposal: centred where the posterior's mean is, which is not its mode.
         start: first positions, importance-resampled, shape (walkers, d).
-        log_weights: log (target / proposal about the mode) of the pilot draws.
+        log_weights: log (target / proposal) of the last round's draws.
     """
 
     proposal: Independence
@@ -307,31 +358,35 @@ def pilot(target: Target, seed: int) -> Pilot:
     generator = np.random.RandomState(seed)
     dimension = target.path.dimension
     heavy = target.path.heavy
-    about_mode = Independence(np.zeros(dimension), np.ones(dimension), heavy)
-    w = about_mode.draw(PILOT_DRAWS, generator)
-    log_target = target(w)
-    log_weights = log_target - about_mode.log_density(w)
-    finite = np.isfinite(log_weights)
-    if finite.sum() < walkers_for(dimension):
-        raise FloatingPointError("the posterior density is not finite around the mode")
-    # Where the target is normal, log(target / standard normal) is linear in w and w^2: the coefficients give its mean
-    # and sds. A regression on the draws that matter is far steadier than weighted moments.
-    matters = finite & (log_weights > np.max(log_weights[finite]) - 12)
-    mean, sd = np.zeros(dimension), np.ones(dimension)
-    if matters.sum() > 8 * dimension:
-        near = w[matters]
+    proposal = Independence(np.zeros(dimension), np.ones(dimension), heavy)
+    limits = np.where(heavy, np.array(HEAVY_VARIANCE_RANGE)[:, None], np.array(VARIANCE_RANGE)[:, None])
+    for _ in range(PILOT_ROUNDS):
+        w = proposal.draw(PILOT_DRAWS, generator)
+        log_target = target(w)
+        log_weights = log_target - proposal.log_density(w)
+        finite = np.isfinite(log_weights)
+        if finite.sum() < walkers_for(dimension):
+            raise FloatingPointError("the posterior density is not finite around the mode")
+        # Where the target is normal, log(target / normal of the proposal) is linear in w and w^2: the coefficients give
+        # its mean and sds. A regression on the draws that matter is far steadier than weighted moments.
+        matters = finite & (log_weights > np.max(log_weights[finite]) - 12)
+        if matters.sum() <= 8 * dimension:
+            break
+        near = (w[matters] - proposal.mean) / proposal.sd
         design = np.column_stack([np.ones(len(near)), near, near**2])
         ratio = log_target[matters] + 0.5 * np.sum(near**2, axis=1)
         slope, square = np.split(np.linalg.lstsq(design, ratio, rcond=None)[0][1:], 2)
-        variance = 1 / np.clip(1 - 2 * square, 0.6, 1.2)
-        mean, sd = np.clip(slope * variance, -1.0, 1.0), INFLATION * np.sqrt(variance)
+        variance = 1 / np.clip(1 - 2 * square, 0.6, 1.6)
+        mean = proposal.mean + proposal.sd * np.clip(slope * variance, -1.0, 1.0)
+        variance = np.clip(proposal.sd**2 * variance, *limits)
+        proposal = Independence(mean, INFLATION * np.sqrt(variance), heavy)
     # Gumbel's trick: the largest perturbed weights are a weighted sample without replacement.
     keys = np.where(finite, log_weights, -np.inf) + generator.gumbel(size=len(w))
     start = w[np.argsort(-keys)[: walkers_for(dimension)]]
-    return Pilot(Independence(mean, sd, heavy), start, log_weights)
+    return Pilot(proposal, start, log_weights)
 
 
-CHAIN_FORMAT = "tvsbayes-chain/1"
+CHAIN_FORMAT = "tvsbayes-chain/2"
 CHAIN_BYTES_MAX = 2**32
 """A chain is the user's own file: what was in memory when it was written fits there again."""
 POSTERIOR_FORMAT = "tvsbayes-posterior/1"
@@ -367,7 +422,7 @@ class Convergence:
         acceptance: share of accepted moves by walker.
         stuck_walkers: walkers that hardly moved or live at another density.
         invalid: evaluations that gave no number.
-        pareto_k: tail index of target / proposal in the pilot draws; above 0.7 the Laplace fit is a poor guide.
+        pareto_k: tail index of target / proposal in the last pilot draws; above 0.7 the proposal is a poor guide.
         missing: sentences on what is not reached; empty when converged.
     """
 
@@ -892,7 +947,7 @@ def _checkpoint(path: Path, fit: JointFit, route: Transport, start: Pilot, chain
         format=CHAIN_FORMAT,
         fingerprint=fingerprint(fit),
         seed=seed,
-        **{f"transport_{k}": getattr(route, k) for k in ("mode", "free", "root", "narrow", "bend", "stretch")},
+        **{f"transport_{k}": getattr(route, k) for k in TRANSPORT_ARRAYS},
         proposal_mean=start.proposal.mean,
         proposal_sd=start.proposal.sd,
         start=start.start,
@@ -921,7 +976,7 @@ def _stored(path: Path, fit: JointFit, seed: int) -> tuple[Transport, Pilot, Cha
         same = str(stored["fingerprint"]) == fingerprint(fit) and int(stored["seed"]) == seed
         position, has_gauss, gauss = stored["random_rest"]
         random_state = (str(stored["random_kind"]), stored["random_keys"], int(position), int(has_gauss), float(gauss))
-        route = Transport(*(stored[f"transport_{k}"] for k in ("mode", "free", "root", "narrow", "bend", "stretch")))
+        route = Transport(*(stored[f"transport_{k}"] for k in TRANSPORT_ARRAYS))
         proposal = Independence(stored["proposal_mean"], stored["proposal_sd"], route.heavy)
         chain = Chain(
             stored["w"],

@@ -256,6 +256,11 @@ class SerialExecutor:
             yield study_row(job, index)
 
 
+def _worker_died(what: str) -> TvsError:
+    remedy = "run the same command again: it goes on"
+    return TvsError("worker-died", f"{what}; finished rows are kept", remedy=remedy)
+
+
 class ProcessExecutor:
     """Spawned processes of this machine, one thread each; JAX must not be forked."""
 
@@ -278,8 +283,7 @@ class ProcessExecutor:
             for future in futures.as_completed(self._ordered):
                 yield future.result()
         except BrokenExecutor as error:
-            message = "a worker process of the study died (out of memory, or killed); finished rows are kept"
-            raise TvsError("worker-died", message, remedy="run the same command again: it goes on") from error
+            raise _worker_died("a worker process of the study died (out of memory, or killed)") from error
 
 
 class DaskExecutor:
@@ -294,11 +298,20 @@ class DaskExecutor:
         self._ordered.append(self.client.submit(_in_worker, job, index, pure=False, retries=3))
 
     def as_completed(self) -> Iterator[dict[str, object]]:
-        """Rows as they come."""
-        from distributed import as_completed
+        """Rows as they come.
 
-        for future in as_completed(self._ordered):
-            yield future.result()
+        Raises:
+            TvsError: every worker that took a row died, or the scheduler is gone; the rows so far are kept.
+        """
+        from distributed import KilledWorker, as_completed
+
+        try:
+            for future in as_completed(self._ordered):
+                yield future.result()
+        except KilledWorker as error:
+            raise _worker_died("every Dask worker that took a certain row died (out of memory, or killed)") from error
+        except futures.CancelledError as error:
+            raise _worker_died("the Dask scheduler is gone") from error
 
 
 @contextmanager
