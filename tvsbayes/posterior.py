@@ -46,9 +46,9 @@ NARROW = 0.05
 far enough for cubic terms to matter."""
 SHEAR_STEP = 0.5
 """Step of the second differences in posterior sds: the shear should hold over +-2 sd, not only at the mode."""
-STRETCH_NODES = (0.0, 2.0, 4.0, 6.0)
+STRETCH_NODES = (-2.0, 0.0, 2.0, 4.0, 6.0)
 """Evenly spaced, in posterior sds by Laplace. With six stops in a direction the stop sd reaches the last, and ratios
-are six times as wide there as at the mode. They are hardly narrower where it is small: other stops limit them then."""
+are six times as wide there as at the mode. Below the first they get no narrower: other stops limit them then."""
 STRETCH_LIMITS = 1e-2, 1e2
 """Of the information of a coordinate, 1 at the mode."""
 TRANSPORT_ARRAYS = ("mode", "free", "root", "narrow", "bend", "noise", "stretch")
@@ -66,8 +66,8 @@ HEAVY_NAMES = (*NOISE_NAMES, "backlash_deg.pan", "backlash_deg.tilt")
 of a stop sd), so each of them is always proposed from a t of its own."""
 INFLATION = 1.03
 """Factor on the proposal's sds: a proposal lighter than the target lets walkers freeze in its tails."""
-SHARES = (0.65, 0.1, 0.05, 0.2)
-"""Independence proposal, differential evolution, differential evolution with full steps, one heavy coordinate alone."""
+SHARES = (0.85, 0.1, 0.05)
+"""Independence proposal, differential evolution, differential evolution with full steps."""
 
 
 @dataclass(frozen=True)
@@ -109,8 +109,10 @@ class Transport:
         return z
 
     def log_scale(self, w: np.ndarray) -> np.ndarray:
-        """The log of the factors on w, both (..., d): 1 below the mode, straight lines between nodes, and beyond."""
-        at = np.maximum(w[..., self.noise], 0.0) / STRETCH_NODES[1]
+        """The log of the factors on w, both (..., d): straight lines between the nodes and above the last."""
+        at = (np.maximum(w[..., self.noise], STRETCH_NODES[0]) - STRETCH_NODES[0]) / (
+            STRETCH_NODES[1] - STRETCH_NODES[0]
+        )
         node = np.minimum(at.astype(int), len(STRETCH_NODES) - 2)
         noise = np.arange(len(self.noise))
         low, high = self.stretch[noise, node], self.stretch[noise, node + 1]
@@ -211,7 +213,7 @@ def transport(fit: JointFit) -> Transport:
             curvature = (both[: len(some)] + both[len(some) :] - 2 * centre) @ jacobian.T / SHEAR_STEP**2
             mixed = 0.5 * (curvature - own[some[:, 0]] - own[some[:, 1]])
             bend[:, some[:, 0], some[:, 1]] = bend[:, some[:, 1], some[:, 0]] = mixed.T
-        # The data's share of the information 1 of each coordinate, as a noise coordinate goes up.
+        # The data's share of the information 1 of each coordinate, as a noise coordinate goes up or down.
         stretch = flat.copy()
         for which, place in enumerate(noise):
             later = geometry[geometry > place]
@@ -222,7 +224,7 @@ def transport(fit: JointFit) -> Transport:
                 at[1:, later] += SHEAR_STEP * np.eye(len(later))
                 seen = residuals(at)
                 shares.append(np.sum(((seen[1:] - seen[0]) / SHEAR_STEP) ** 2, axis=1))
-            change = np.array(shares) - shares[0]
+            change = np.array(shares) - shares[STRETCH_NODES.index(0.0)]
             stretch[which][:, later] = -0.5 * np.log(np.clip(1 + change, *STRETCH_LIMITS))
     for place, form in zip(narrow, bend, strict=True):
         form[place:], form[:, place:] = 0.0, 0.0
@@ -293,36 +295,12 @@ class Independence:
         return proposed, self.log_density(w) - self.log_density(proposed)
 
 
-@dataclass(frozen=True)
-class OneHeavy:
-    """Proposes one heavy coordinate of each walker, drawn by lot, from its own t, whatever the others are.
-
-    A walker far out in a tail that few stops leave open comes back by itself, where a proposal of everything at once
-    would hardly be accepted: without this move one stood still for hundreds of steps.
-    """
-
-    proposal: Independence
-
-    def __call__(self, w: np.ndarray, generator: np.random.RandomState) -> tuple[np.ndarray, np.ndarray]:
-        """The protocol of `emcee.moves.MHMove`."""
-        places = np.flatnonzero(self.proposal.heavy)
-        chosen, rows = places[generator.randint(len(places), size=len(w))], np.arange(len(w))
-        mean, sd = self.proposal.mean[chosen], self.proposal.sd[chosen]
-        proposed = w.copy()
-        proposed[rows, chosen] = mean + sd * generator.standard_t(HEAVY_DOF, len(w))
-        distance2 = [((x[rows, chosen] - mean) / sd) ** 2 for x in (w, proposed)]
-        old, new = (-0.5 * (HEAVY_DOF + 1) * np.log1p(d / HEAVY_DOF) for d in distance2)
-        return proposed, old - new
-
-
 def moves(proposal: Independence) -> list[tuple[emcee.moves.Move, float]]:
     """The moves and their shares; never emcee 3.1.6's snooker or full-covariance Gaussian (both are biased)."""
     # Fewer walkers than twice the dimension let differential evolution explore a subspace only; the
     # independence proposal leaves it at six steps of seven.
     evolution = emcee.moves.DEMove(live_dangerously=True), emcee.moves.DEMove(gamma0=1.0, live_dangerously=True)
-    found = (emcee.moves.MHMove(proposal), *evolution, emcee.moves.MHMove(OneHeavy(proposal)))
-    # emcee takes weights; where nothing is heavy the last move has nothing to propose.
-    return list(zip(found, SHARES, strict=True))[: None if proposal.heavy.any() else -1]
+    return list(zip((emcee.moves.MHMove(proposal), *evolution), SHARES, strict=True))
 
 
 def walkers_for(dimension: int) -> int:
