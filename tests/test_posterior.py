@@ -11,13 +11,17 @@ from test_ensemble import ROUNDING, SIGMAS, small_fit
 
 from tvsbayes import posterior
 from tvsbayes.files import InputError, NotConverged
-from tvsbayes.posterior import sample
+from tvsbayes.posterior import Target, sample
 
 LONG, SHORT, BLOCK = 96, 12, 6
 SEED = 3
 NON_NORMAL = 0.2
 """Sds (and share of an sd) by which the posterior of the left ratio may differ from its Laplace approximation: the
 stop scatters, which widen it, have skewed posteriors; a chain of 190 steps shows 0.1 in both."""
+
+
+INTERRUPTED_CALL = 14
+"""Of the density: after the rounds of the pilot and some steps."""
 
 
 def limits(patch: pytest.MonkeyPatch, steps: int) -> None:
@@ -28,6 +32,18 @@ def limits(patch: pytest.MonkeyPatch, steps: int) -> None:
     # The map takes seconds and no random number; the pilot needs few draws for a start.
     patch.setattr(posterior, "transport", lambda fit: small_fit()[1])
     patch.setattr(posterior, "PILOT_DRAWS", 512)
+
+
+def only_when_long(patch: pytest.MonkeyPatch) -> None:
+    """`sample` looks at a resumed chain at once, and under `limits` any chain has converged."""
+    judge = posterior.diagnose
+
+    def strict(fit, route, start, chain, seed):
+        result = judge(fit, route, start, chain, seed)
+        missing = () if len(chain.w) >= SHORT else ("too short",)
+        return replace(result, convergence=replace(result.convergence, missing=missing))
+
+    patch.setattr(posterior, "diagnose", strict)
 
 
 @pytest.fixture(scope="module")
@@ -63,15 +79,7 @@ def test_a_seed_gives_one_chain_also_when_interrupted(fitted, long, tmp_path, mo
     with pytest.raises(KeyboardInterrupt):
         sample(fitted, seed=SEED, checkpoint=broken, progress=interrupt)
     assert len(stored(broken)["w"]) == BLOCK
-    # `sample` looks at a resumed chain at once, and under these limits any chain has converged.
-    judge = posterior.diagnose
-
-    def strict(fit, route, start, chain, seed):
-        result = judge(fit, route, start, chain, seed)
-        missing = () if len(chain.w) >= SHORT else ("too short",)
-        return replace(result, convergence=replace(result.convergence, missing=missing))
-
-    monkeypatch.setattr(posterior, "diagnose", strict)
+    only_when_long(monkeypatch)
     resumed = sample(fitted, seed=SEED, checkpoint=broken, resume=True)
     np.testing.assert_array_equal(resumed.z, unbroken.z)
     np.testing.assert_array_equal(resumed.log_density, unbroken.log_density)
@@ -80,6 +88,30 @@ def test_a_seed_gives_one_chain_also_when_interrupted(fitted, long, tmp_path, mo
         np.testing.assert_array_equal(parts[key], whole[key])
     for key in ("w", "log_density"):
         np.testing.assert_array_equal(whole[key], longer[key][:SHORT])
+
+
+def test_ctrl_c_in_the_middle_of_a_step_is_quiet_and_loses_no_step(fitted, tmp_path, monkeypatch, capfd):
+    limits(monkeypatch, SHORT)
+    unbroken = sample(fitted, seed=SEED)
+    whole, calls = Target.__call__, []
+
+    def interrupted(target, w):
+        calls.append(len(w))
+        if len(calls) == INTERRUPTED_CALL:
+            raise KeyboardInterrupt
+        return whole(target, w)
+
+    broken = tmp_path / "broken.npz"
+    with monkeypatch.context() as patch:
+        patch.setattr(Target, "__call__", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            sample(fitted, seed=SEED, checkpoint=broken)
+    assert 0 < len(stored(broken)["w"]) < SHORT
+    said = capfd.readouterr()
+    assert said.out == said.err == ""
+    only_when_long(monkeypatch)
+    resumed = sample(fitted, seed=SEED, checkpoint=broken, resume=True)
+    np.testing.assert_array_equal(resumed.z, unbroken.z)
 
 
 # numpy.load leaves the handle of a truncated archive to the garbage collector.

@@ -1122,6 +1122,8 @@ class _Run:
         self.sampler = emcee.EnsembleSampler(
             walkers, dimension, self.target, moves=moves(start.proposal), vectorize=True
         )
+        # emcee's wrapper prints the walkers and a traceback for every exception, Ctrl-C among them.
+        self.sampler.log_prob_fn = self.target
 
     def chain(self) -> Chain:
         """All steps so far, earlier runs included."""
