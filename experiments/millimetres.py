@@ -40,8 +40,6 @@ def one_row(task: tuple[str, int]) -> dict[str, object]:
     # As in coverage.py: ordinary fits pad to 512 spots.
     likelihood.SMALLEST_BUCKET = 96
     from tvsbayes.campaign import read_campaign
-    from tvsbayes.classic import classic
-    from tvsbayes.comparison import simple_calibration, simple_rays
     from tvsbayes.coordinates import locate_linear, settings_of
     from tvsbayes.files import shipped_data
     from tvsbayes.information import calibration_of
@@ -81,9 +79,7 @@ def one_row(task: tuple[str, int]) -> dict[str, object]:
     law = locate_linear(calibration, settings_of(counters[:, 0], counters[:, 1], readings, sides))
     xyz, covariance = law.value, law.covariance
     error = {"joint": xyz - points}
-    error |= others_error(
-        calibration, simulated, rig, counters, readings, points, classic, simple_calibration, simple_rays
-    )
+    error |= others_error(simulated.campaign, counters, readings, points)
     sd = np.sqrt(np.einsum("pii->pi", covariance))
     usable = np.isfinite(xyz).all(axis=1) & np.isfinite(covariance).all(axis=(1, 2))
     far = np.full(len(points), np.nan)
