@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import argparse
 import time
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -118,16 +119,19 @@ def one_rig(task: tuple[int]) -> dict[str, object]:
 
 
 def others_error(campaign, counters, readings, points) -> dict[str, np.ndarray]:
-    """Errors (points, 3) of the nominal and the classic calibration, mm."""
+    """Errors (points, 3) of the nominal and the classic calibration, mm; no numbers without complete experiments."""
     import jax
     import jax.numpy as jnp
 
     from tvsbayes.classic import classic
     from tvsbayes.comparison import simple_calibration, simple_rays
     from tvsbayes.coordinates import meeting
+    from tvsbayes.files import NothingToEstimate
 
-    result = {}
-    for name, estimate in (("nominal", None), ("classic", classic(campaign))):
+    estimates, result = {"nominal": None}, {"classic": np.full_like(points, np.nan)}
+    with suppress(NothingToEstimate):
+        estimates["classic"] = classic(campaign)
+    for name, estimate in estimates.items():
         simple = simple_calibration(campaign.rig.priors, estimate)
         with jax.enable_x64(True):
             rays = simple_rays(simple, counters)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import datetime
 import os
+import pickle
 import stat
 import tomllib
 from pathlib import Path
@@ -16,7 +17,10 @@ from tvsbayes.files import (
     IMAGE_PIXELS_MAX,
     JSON_BYTES_MAX,
     TOML_BYTES_MAX,
+    DeviceFault,
     InputError,
+    NotConverged,
+    NothingToEstimate,
     TvsError,
     csv_bytes,
     decode,
@@ -405,3 +409,11 @@ def test_deep_pngs_and_links_out_of_the_folder_are_refused(tmp_path):
     with pytest.raises(InputError) as caught:
         read_image(tmp_path / "in" / "a.png", tmp_path / "in")
     assert caught.value.code == "path"
+
+
+@pytest.mark.parametrize("kind", [TvsError, InputError, NothingToEstimate, NotConverged, DeviceFault])
+def test_errors_pass_between_processes_whole(kind):
+    """A pool that cannot unpickle its worker's error waits for ever."""
+    told = kind("code", "what was found", file="a.csv", line=3, column="u_px", found="x", allowed="y", remedy="z")
+    again = pickle.loads(pickle.dumps(told))
+    assert type(again) is kind and again.args == told.args and vars(again) == vars(told)

@@ -73,6 +73,11 @@ class TvsError(Exception):
         self.allowed = allowed
         self.remedy = remedy
 
+    def __reduce__(self):
+        # Exceptions are pickled by their positional arguments alone; a worker process of a pool has to tell ours whole.
+        named = ("file", "line", "column", "found", "allowed", "remedy")
+        return partial(type(self), **{name: getattr(self, name) for name in named}), (self.code, self.message)
+
 
 class InputError(TvsError):
     """A file, option or value that cannot be used as it is (exit 2)."""

@@ -1026,7 +1026,7 @@ def diagnose(fit: JointFit, route: Transport, start: Pilot, chain: Chain, seed: 
     stuck |= deviation > max(STUCK_DEVIATION * float(np.median(deviation)), single_draw)
     missing = []
     if not np.max(rhat) <= RHAT_LIMIT:
-        missing.append(f"R-hat of {names[int(np.nanargmax(rhat))]} is {np.max(rhat):.3f}, wanted {RHAT_LIMIT}")
+        missing.append(f"R-hat of {names[int(np.nanargmax(rhat))]} is {np.max(rhat):.4f}, wanted {RHAT_LIMIT}")
     for kind, ess in (("bulk", ess_bulk), ("tail", ess_tail)):
         if not np.min(ess) >= ESS_LIMIT:
             least = int(np.nanargmin(ess))
