@@ -36,7 +36,7 @@ from tvsbayes.design import (
     sensitivity,
 )
 from tvsbayes.files import InputError, shipped_data
-from tvsbayes.model import INDEX
+from tvsbayes.model import INDEX, RIG_NAMES
 from tvsbayes.planning import (
     STOPS_ADVISED,
     Batch,
@@ -254,6 +254,32 @@ def test_a_noise_scale_is_believed_by_the_weight_of_the_stops(knowledge, found, 
     per_direction = len(many) / 2
     # Stops of 0.18 deg against pixels: what pixels leave open lowers the information by a few per cent.
     assert believed(many, 1.0) - believed(many, 0.0) == pytest.approx(1 / math.sqrt(2 * per_direction), rel=0.1)
+
+
+def test_what_the_geometry_takes_from_the_stops_is_not_left_for_their_scatter(knowledge, found, seen):
+    """Less p for n: with every geometric coordinate determined by L looks, 1 - p / (2 L) of the information is left."""
+    columns = planning.STOP_COLUMNS.ravel()
+    true = knowledge.z.copy()
+    true[columns] = 1.5
+    truth = planning.DrawnTruth(true, knowledge.space)
+    chosen = np.resize(np.arange(len(found.looks)), 60)
+    taken = design.Seen(*(getattr(seen, n)[chosen] for n in ("rows", "slope", "seen", "mirror_angles_rad")))
+    side = found.looks.side[chosen]
+
+    def scatter(covariance):
+        low, high = (
+            planning.believed(truth, taken, side, covariance, knowledge, np.full(5, x))[columns] for x in (0.0, 1.0)
+        )
+        return high - low
+
+    exact = np.zeros((PARAMETERS, PARAMETERS))
+    geometry = ~design.NOISE_COLUMNS & (np.arange(PARAMETERS) < len(RIG_NAMES))
+    # Nothing is learned where the covariance is the prior's; a precision of 0 is a coordinate held fixed.
+    precision = np.diag(knowledge.precision)
+    unknown = np.diag(np.divide(1.0, precision, out=np.zeros(PARAMETERS), where=precision > 0))
+    left_over = 1 - np.sum(geometry & (precision > 0)) / (2 * seen.seen[chosen].sum())
+    # Scatter is 1 / sqrt(information) but for the prior, which 30 stops of a direction outweigh 50 times.
+    assert scatter(exact) / scatter(unknown) == pytest.approx(1 / math.sqrt(left_over), rel=0.03)
 
 
 # Targets.
@@ -550,7 +576,10 @@ def test_too_few_minutes_are_refused(knowledge):
         plan_from(knowledge, WORST, draws=20, seed=0, **options)
 
 
-@pytest.mark.parametrize(("sd", "half_width"), [(1.0, 1.0), (1.0, 0.42), (1.0, 3.0), (5e-4, 2e-4), (1.0, 0.02)])
+@pytest.mark.parametrize(
+    ("sd", "half_width"),
+    [(1.0, 1.0), (1.0, 0.53), (1.0, 0.82), (1.0, 1.45), (1.0, 0.42), (1.0, 3.0), (5e-4, 2e-4), (1.0, 0.02)],
+)
 def test_the_classics_count_is_the_first_that_suffices(sd, half_width):
     from scipy import stats
 

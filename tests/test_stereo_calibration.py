@@ -201,6 +201,15 @@ def test_covariance_is_the_schur_complement_of_the_whole_adjustment(study, drawn
     np.testing.assert_allclose(product, np.eye(24), atol=1e-4)
 
 
+def test_degrees_of_freedom_are_coordinates_less_unknowns(views, calibration):
+    """Four coordinates a corner and pair, less 24 parameters (k3 among them) and six per pose."""
+    coordinates = 4 * BOARD.corners * len(views)
+    assert calibration.dof == coordinates - 24 - 6 * len(views)
+    squares = calibration.left_rms_px**2 + calibration.right_rms_px**2
+    # OpenCV's rms is over corners, of which each has two coordinates.
+    assert calibration.noise_sd_px**2 * calibration.dof == pytest.approx(0.25 * coordinates * squares, rel=1e-9)
+
+
 def test_lengths_follow_the_pitch_and_nothing_else_does(views, calibration):
     doubled = calibrate_stereo(views, Board(9, 6, 50.0, 0.1), SIZE)
     np.testing.assert_allclose(doubled.stereo.T, 2 * calibration.stereo.T, rtol=1e-7)

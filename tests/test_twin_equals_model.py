@@ -13,8 +13,19 @@ import numpy as np
 import pytest
 
 from tvsbayes import simulation
+from tvsbayes.joint import derived_quantities
 from tvsbayes.likelihood import aperture_angle
-from tvsbayes.model import RIG_NAMES, MoveArrays, beam, beam_angles, mirror_angles, model_of, project
+from tvsbayes.model import (
+    NAMES,
+    RIG_NAMES,
+    MoveArrays,
+    beam,
+    beam_angles,
+    mirror_angles,
+    model_of,
+    parameter_space,
+    project,
+)
 from tvsbayes.rigs import HARMONIC_PRIORS, Prior
 from tvsbayes.simulation import draw_truth
 
@@ -117,6 +128,22 @@ def test_aperture_angle(truths, values, convention):
         in_t = simulation.to_tvs(points[rig], baseline_mm, truth.parameters["pan_zero_emission_deg"])
         expected = np.radians(simulation.aperture_angle_deg(in_t, baseline_mm, convention))
         assert np.abs(found[rig] - expected).max() < ANGLE_RAD
+
+
+def test_headlines_of_a_fit(mounted_rig, poses_rad):
+    """What a fit reports at any point of parameter space is the twin's headline for the rig of that point."""
+    with jax.enable_x64(True):
+        space = parameter_space(mounted_rig.table, mounted_rig.stereo)
+        z = np.random.default_rng(79).standard_normal((RIGS, len(NAMES)))
+        found = jax.tree.map(np.asarray, derived_quantities(jnp.asarray(z), space, jnp.asarray(poses_rad[0, 0])))
+    pose_deg = tuple(np.degrees(poses_rad[0, 0]))
+    for physical, ratios, offset_mm in zip(
+        found.physical, found.effective_deg_per_step, found.effective_mirror_offset_mm, strict=True
+    ):
+        rig = simulation.with_derived(dict(zip(RIG_NAMES, physical.tolist(), strict=False)))
+        expected = simulation.effective_deg_per_step(rig, pose_deg)
+        assert np.abs(ratios - list(expected.values())).max() < 1e-9 * 0.1
+        assert abs(offset_mm - simulation.effective_mirror_offset_mm(rig, pose_deg)) < LENGTH_MM
 
 
 def test_headlines(truths, values, poses_rad):
