@@ -120,9 +120,11 @@ def table() -> None:
     for twin in TWINS:
         chosen = [r for r in good if r["name"] == twin]
         for k, reach in enumerate(RANGES_MM if chosen else ()):
-            cells = [f"{_rms(_flat(chosen, 'error_mm', k, n)):.1f}" for n in ESTIMATORS]
-            missing = [int(np.isnan(_flat(chosen, "error_mm", k, n)).sum()) for n in ESTIMATORS]
-            cells = [f"{c} ({m} without)" if m else c for c, m in zip(cells, missing, strict=True)]
+            cells = []
+            for errors in (_flat(chosen, "error_mm", k, n) for n in ESTIMATORS):
+                missing = int(np.isnan(errors).sum())
+                without = f" ({missing} without)" if missing else ""
+                cells.append("-" if missing == len(errors) else f"{_rms(errors):.1f}{without}")
             held, within = np.nanmean(_flat(chosen, "inside", k)), np.nanmean(_flat(chosen, "ellipsoid", k))
             stated = _rms(_flat(chosen, "stated_mm", k))
             name = twin.replace("_", " ")
