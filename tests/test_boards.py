@@ -131,6 +131,18 @@ def test_other_finder_steps_in_by_name(six, monkeypatch, tmp_path):
     np.testing.assert_array_equal(direct.views[0].left, found.views[0].left)
 
 
+@pytest.mark.parametrize("share", [0.5, 0.2])
+def test_large_pictures_are_searched_in_a_smaller_copy(monkeypatch, share):
+    """The size of the copy is no whole part of the picture's; corners are refined in the picture itself."""
+    monkeypatch.setattr(boards, "SECTOR_PIXELS_MAX", int(share * SIZE[0] * SIZE[1]))
+    picture = pictures(POSES[0])[0][:-3, :-1]
+    corners, fallback = find_corners(np.ascontiguousarray(picture), BOARD, "sector")
+    assert not fallback
+    # A finder of one picture cannot know a half turn.
+    true = true_corners(POSES[0])[:, :2]
+    assert min(np.abs(order - true).max() for order in (corners, corners[::-1])) < FOUND_PX
+
+
 def bomb() -> bytes:
     """A PNG header that announces 30000 x 30000 pixels."""
     ok, data = cv2.imencode(".png", np.zeros((4, 4), np.uint8))
