@@ -14,6 +14,7 @@ from __future__ import annotations
 import argparse
 import hashlib
 import json
+import multiprocessing
 import os
 import platform
 import resource
@@ -136,9 +137,18 @@ def fine(row: dict) -> bool:
     )
 
 
+def build(folder: Path, crafted) -> None:
+    """A good folder, spoilt as `crafted` says."""
+    from hostile_folders import good_folder
+
+    good_folder(folder)
+    if crafted is not None:
+        crafted.edit(folder)
+
+
 def run_folders(only: str | None) -> None:
     """Every crafted folder through its commands; rows that are there are not made again."""
-    from hostile_folders import CRAFTED, good_folder
+    from hostile_folders import CRAFTED
 
     OUTPUT.mkdir(exist_ok=True)
     done = set()
@@ -155,14 +165,11 @@ def run_folders(only: str | None) -> None:
             place = Path(scratch) / str(number)
             (place / "home").mkdir(parents=True)
             (place / "tmp").mkdir()
-            built = os.fork()
-            if built == 0:
-                # In a child of its own: a process passes its peak memory on to those that it starts.
-                good_folder(place / "c")
-                if crafted is not None:
-                    crafted.edit(place / "c")
-                os._exit(0)
-            if os.waitpid(built, 0)[1]:
+            # In a child of its own: a process passes its peak memory on to those that it starts.
+            builder = multiprocessing.get_context("fork").Process(target=build, args=(place / "c", crafted))
+            builder.start()
+            builder.join()
+            if builder.exitcode:
                 raise RuntimeError(f"{name} could not be built")
             arguments = shlex.split(command.replace("@", str(place / "c")))
             row = {"name": name, "command": command, "threat": crafted.threat if crafted else "none"}

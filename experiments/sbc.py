@@ -29,7 +29,7 @@ from pathlib import Path
 import numpy as np
 from coverage import read_rows
 from scipy import stats
-from studies import dense_plan, mounted_rig, run_rows, small_plan
+from studies import coordinates, dense_plan, mounted_rig, physical_of, run_rows, small_plan
 
 OUTPUT = Path(__file__).parent / "output"
 ROWS = OUTPUT / "sbc.jsonl"
@@ -48,29 +48,6 @@ ALPHA = 0.05
 FAILURES = 0.02
 """Largest share of simulations without ranks: the failures of 1 in 50 could move no ECDF out of its band."""
 BAND_SEED, BAND_SAMPLES, PIT_SEED = 214, 20_000, 215
-
-
-def coordinates(space, physical: np.ndarray) -> np.ndarray:
-    """Prior coordinates z (n, 65) of physical values (n, 65): the inverse of the priors, by scipy's distributions.
-
-    Fixed parameters get 0, directions in which the cameras' covariance is singular too.
-    """
-    from tvsbayes.model import KINDS, RIG_NAMES
-
-    z = np.zeros_like(physical)
-    for i, (value, u, kind) in enumerate(zip(space.value, space.u, space.kind, strict=True)):
-        if u == 0:
-            continue
-        x = physical[:, i]
-        if KINDS[int(kind)] == "half-normal":
-            z[:, i] = stats.norm.isf(stats.halfnorm.sf(x, scale=u))
-        elif KINDS[int(kind)] == "log-normal":
-            z[:, i] = np.log(x / value) / u
-        else:
-            z[:, i] = (x - value) / u
-    cameras = slice(len(RIG_NAMES), None)
-    z[:, cameras] = (physical[:, cameras] - np.asarray(space.stereo_mean)) @ np.linalg.pinv(space.stereo_root).T
-    return z
 
 
 def faulty(campaign, variant: str):
@@ -129,7 +106,7 @@ def ranks(simulated, result, z: np.ndarray) -> dict[str, int]:
     import jax
 
     from tvsbayes.likelihood import campaign_arrays, evaluate
-    from tvsbayes.model import NAMES, RIG_NAMES, parameter_space
+    from tvsbayes.model import NAMES, parameter_space
     from tvsbayes.posterior import derived_at, in_batches
     from tvsbayes.simulation import effective_deg_per_step, effective_mirror_offset_mm
 
@@ -138,7 +115,7 @@ def ranks(simulated, result, z: np.ndarray) -> dict[str, int]:
     with jax.enable_x64(True):
         draws = derived_at(result, z[None], pose)
         physical = draws.physical[0]
-        true = np.array([*(truth.parameters[n] for n in RIG_NAMES), *truth.stereo.vector])
+        true = physical_of(truth)
         space = parameter_space(simulated.campaign.rig, simulated.campaign.stereo)
         arrays = campaign_arrays(simulated.campaign)
         both = coordinates(space, np.vstack([true, physical]))

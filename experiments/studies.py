@@ -62,35 +62,34 @@ def shipped_plan(protocol: str):
     return read_plan(shipped_data() / "rigs" / "mounted" / f"{protocol}.csv")
 
 
+HEADLINES = (
+    *(f"effective {direction}" for direction in ("left", "right", "up", "down")),
+    *("contrast pan", "contrast tilt", "backlash pan", "backlash tilt", "effective mirror offset"),
+)
+"""In the order of `tvsbayes.design.QUANTITIES`."""
+
+
 def headlines(draws) -> dict[str, np.ndarray]:
     """Headline quantities of `tvsbayes.joint.Derived`, whose leading axes are kept."""
     from tvsbayes.model import INDEX
 
     ratio, physical = np.asarray(draws.effective_deg_per_step), np.asarray(draws.physical)
-    return {
-        **{f"effective {d}": ratio[..., k] for k, d in enumerate(("left", "right", "up", "down"))},
-        "contrast pan": ratio[..., 0] - ratio[..., 1],
-        "contrast tilt": ratio[..., 2] - ratio[..., 3],
-        "backlash pan": physical[..., INDEX["backlash_deg.pan"]],
-        "backlash tilt": physical[..., INDEX["backlash_deg.tilt"]],
-        "effective mirror offset": np.asarray(draws.effective_mirror_offset_mm),
-    }
+    each = (
+        *np.moveaxis(ratio, -1, 0),
+        ratio[..., 0] - ratio[..., 1],
+        ratio[..., 2] - ratio[..., 3],
+        physical[..., INDEX["backlash_deg.pan"]],
+        physical[..., INDEX["backlash_deg.tilt"]],
+        np.asarray(draws.effective_mirror_offset_mm),
+    )
+    return dict(zip(HEADLINES, each, strict=True))
 
 
 def true_headlines(parameters: Mapping[str, float], pose_rad: np.ndarray) -> dict[str, float]:
     """The same of a true rig, by the twin's formulas, at the pose of the fit."""
-    from tvsbayes.simulation import effective_deg_per_step, effective_mirror_offset_mm
+    from tvsbayes.studies import true_headlines as values
 
-    pose = tuple(np.degrees(pose_rad))
-    ratio = effective_deg_per_step(parameters, pose)
-    return {
-        **{f"effective {d}": ratio[d] for d in ("left", "right", "up", "down")},
-        "contrast pan": ratio["left"] - ratio["right"],
-        "contrast tilt": ratio["up"] - ratio["down"],
-        "backlash pan": parameters["backlash_deg.pan"],
-        "backlash tilt": parameters["backlash_deg.tilt"],
-        "effective mirror offset": effective_mirror_offset_mm(parameters, pose),
-    }
+    return dict(zip(HEADLINES, values(parameters, pose_rad).tolist(), strict=True))
 
 
 def judged(draws, centre, prior_draws, parameters: Mapping[str, float], pose_rad: np.ndarray) -> dict[str, dict]:
@@ -109,25 +108,36 @@ def judged(draws, centre, prior_draws, parameters: Mapping[str, float], pose_rad
     return result
 
 
-def coordinates(space, truth) -> np.ndarray:
-    """Coordinates z of a true rig: the inverse of `ParameterSpace.physical`, by scipy's distributions."""
-    from scipy.stats import halfnorm, norm
+def physical_of(truth) -> np.ndarray:
+    """A true rig and its cameras in the order of `tvsbayes.model.NAMES`, shape (65,)."""
+    from tvsbayes.model import RIG_NAMES
+
+    return np.array([*(truth.parameters[name] for name in RIG_NAMES), *truth.stereo.vector])
+
+
+def coordinates(space, physical: np.ndarray) -> np.ndarray:
+    """Prior coordinates z (n, 65) of physical values (n, 65): the inverse of the priors, by scipy's distributions.
+
+    Fixed parameters get 0, directions in which the cameras' covariance is singular too.
+    """
+    from scipy import stats
 
     from tvsbayes.model import KINDS, RIG_NAMES
 
-    z = []
-    for name, value, u, kind in zip(RIG_NAMES, space.value, space.u, space.kind, strict=True):
-        true = truth.parameters[name]
+    z = np.zeros_like(physical)
+    for i, (value, u, kind) in enumerate(zip(space.value, space.u, space.kind, strict=True)):
         if u == 0:
-            z.append(0.0)
-        elif KINDS[int(kind)] == "half-normal":
-            z.append(norm.isf(halfnorm.sf(true, scale=u)))
+            continue
+        x = physical[:, i]
+        if KINDS[int(kind)] == "half-normal":
+            z[:, i] = stats.norm.isf(stats.halfnorm.sf(x, scale=u))
         elif KINDS[int(kind)] == "log-normal":
-            z.append(np.log(true / value) / u)
+            z[:, i] = np.log(x / value) / u
         else:
-            z.append((true - value) / u)
-    stereo = np.linalg.pinv(np.asarray(space.stereo_root)) @ (truth.stereo.vector - np.asarray(space.stereo_mean))
-    return np.concatenate([z, stereo])
+            z[:, i] = (x - value) / u
+    cameras = slice(len(RIG_NAMES), None)
+    z[:, cameras] = (physical[:, cameras] - np.asarray(space.stereo_mean)) @ np.linalg.pinv(space.stereo_root).T
+    return z
 
 
 def fit_from_truth(campaign, truth):
@@ -142,7 +152,7 @@ def fit_from_truth(campaign, truth):
 
     with jax.enable_x64(True):
         problem = joint.Problem(campaign, campaign.rig)
-        z = np.where(problem.free, np.clip(coordinates(problem.space, truth), -4.0, 4.0), 0.0)
+        z = np.where(problem.free, np.clip(coordinates(problem.space, physical_of(truth)[None])[0], -4.0, 4.0), 0.0)
         mode = joint.newton_mode(problem.objective, z, problem.free, problem.curvature(z))
         if not mode.problems:
             return joint._result(campaign, problem, mode, np.ones(len(problem.spots), dtype=bool), 0)

@@ -739,6 +739,19 @@ def test_plan_writes_a_plan_and_says_by_its_exit_code_whether_the_users_target_i
     assert code == 0 and document["met"]
 
 
+def test_a_plan_with_nothing_left_to_measure_says_that_it_wrote_none(capsys, tmp_path, monkeypatch):
+    from tvsbayes import model
+    from tvsbayes.cli import run
+
+    whole = planning.plan
+    monkeypatch.setattr(model, "use_compilation_cache", lambda: None)
+    monkeypatch.setattr(planning, "plan", lambda *given, **options: replace(whole(*given, **options), steps=()))
+    place = tmp_path / "plan.csv"
+    code = run([*map(str, ("plan", MOUNTED / "rig.toml", "--draws", 20, "--minutes", 3, "-o", place))])
+    assert code == 0 and not place.exists()
+    assert f"nothing written to {place}" in capsys.readouterr().out
+
+
 @pytest.mark.parametrize("options", [("--target", "u(left) <= 1 mm"), ("--criterion", "E"), ("--minutes", "0.2")])
 def test_bad_options_of_plan_are_refused(ask, options):
     code, document = ask("plan", MOUNTED / "rig.toml", "--draws", 20, *options)

@@ -917,15 +917,12 @@ def read_fit(path: Path | str) -> dict[str, object]:
     version = keys.word("format", FIT_FORMATS).removeprefix("tvsbayes-fit/")
     if problem := _schema_problem(keys.values, version):
         place, allowed = problem
-        table, key, value = keys, place[0], keys.values
+        value: object = keys.values
         for part in place:
-            # An entry of a list is named by the key of the list.
-            if isinstance(part, int):
-                value = value[part]
-                continue
-            if value is not keys.values:
-                table = Keys(value, keys.file, keys.text, (*table.path, key))
-            key, value = part, value.get(part, "nothing")
+            value = value[part] if isinstance(part, int) else value.get(part, "nothing")
+        # An entry of a list is named by the key of the list.
+        *path, key = (part for part in place if isinstance(part, str))
+        table = Keys({}, keys.file, keys.text, tuple(path))
         raise table.refuse(key, "schema", allowed, "run `tvsbayes fit` again", shown(value))
     _check_agreement(keys)
     return keys.values

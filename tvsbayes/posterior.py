@@ -18,7 +18,7 @@ import json
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from importlib.metadata import version
 from pathlib import Path
 
@@ -51,7 +51,6 @@ STRETCH_NODES = (-2.0, 0.0, 2.0, 4.0, 6.0)
 are six times as wide there as at the mode. Below the first they get no narrower: other stops limit them then."""
 STRETCH_LIMITS = 1e-2, 1e2
 """Of the information of a coordinate, 1 at the mode."""
-TRANSPORT_ARRAYS = ("mode", "free", "root", "narrow", "bend", "noise", "stretch")
 PILOT_DRAWS = 2048
 PILOT_ROUNDS = 3
 """The first is drawn about the mode, each further one from the proposal that the last one gave."""
@@ -925,7 +924,7 @@ def _checkpoint(path: Path, fit: JointFit, route: Transport, start: Pilot, chain
         format=CHAIN_FORMAT,
         fingerprint=fingerprint(fit),
         seed=seed,
-        **{f"transport_{k}": getattr(route, k) for k in TRANSPORT_ARRAYS},
+        **{f"transport_{f.name}": getattr(route, f.name) for f in fields(Transport)},
         proposal_mean=start.proposal.mean,
         proposal_sd=start.proposal.sd,
         start=start.start,
@@ -954,7 +953,7 @@ def _stored(path: Path, fit: JointFit, seed: int) -> tuple[Transport, Pilot, Cha
         same = str(stored["fingerprint"]) == fingerprint(fit) and int(stored["seed"]) == seed
         position, has_gauss, gauss = stored["random_rest"]
         random_state = (str(stored["random_kind"]), stored["random_keys"], int(position), int(has_gauss), float(gauss))
-        route = Transport(*(stored[f"transport_{k}"] for k in TRANSPORT_ARRAYS))
+        route = Transport(**{f.name: stored[f"transport_{f.name}"] for f in fields(Transport)})
         proposal = Independence(stored["proposal_mean"], stored["proposal_sd"], route.heavy)
         chain = Chain(
             stored["w"],

@@ -46,7 +46,7 @@ REFINING_HALF_MIN, REFINING_HALF_MAX = 2, 11
 WORKERS_MAX = 8
 PICTURES_MAX = 2000
 PIXELS_MAX = 20_000_000
-"""Of one picture, and of those that are searched at the same time: two of 49 million take 2.5 GB to search."""
+"""Of one picture, and of those that are searched at the same time: one of 20 million takes 0.8 GB to search."""
 SECTOR_PIXELS_MAX = 3_000_000
 """Larger pictures are searched by sectors in a smaller copy, then refined: 20 million pixels would take 3.8 GB and half
 a minute."""
