@@ -25,7 +25,6 @@ from matplotlib import pyplot
 from tvsbayes.campaign import read_campaign
 from tvsbayes.classic import classic
 from tvsbayes.comparison import budget, error_map, simple_calibration
-from tvsbayes.coordinates import settings_of
 from tvsbayes.files import shipped_data
 from tvsbayes.information import calibration_of
 from tvsbayes.joint import fit
@@ -59,8 +58,7 @@ def main() -> None:
             cells.append(f"{np.sqrt(np.mean(errors**2)):.1f}" if errors.size else "-")
         print(f"| {reach:.0f} | {' | '.join(cells)} | {valid.sum()} of {valid.size} |")
     print("\nRMS distance in mm over 5 x 5 poses within the counters of the campaign.\n")
-    settings = settings_of(*calibration.range_steps.mean(axis=1).round(), 70.0)
-    parts = budget(calibration, settings)
+    parts = budget(calibration, *calibration.range_steps.mean(axis=1).round(), 70.0)
     print("## What the uncertainty of one point consists of\n")
     print("Middle of the counters, aperture reading 70 deg.\n")
     print("| cause | share of the variance, % |\n|---|---|")

@@ -48,10 +48,11 @@ from tvsbayes.calibration import (
     expected_error,
     load_calibration,
     output_deg,
+    range_components,
     stored_calibration,
 )
 from tvsbayes.campaign import input_hashes
-from tvsbayes.coordinates import carry, locate_linear, settings_of, sources
+from tvsbayes.coordinates import carry, locate_linear, meeting, settings_of, sources
 from tvsbayes.files import InputError
 from tvsbayes.rigs import HARMONIC_PRIORS
 
@@ -59,10 +60,6 @@ ROUNDING_MM = 1e-9
 """Of a hundred operations on lengths up to 1000 mm, magnified tenfold by a grazing line of sight."""
 ROUNDING = 1e-12
 """Of a hundred operations on numbers of order 1."""
-DERIVATIVE = 1e-4
-"""Relative error of covariances by central differences of 0.05 sd: truncation and rounding below 1e-5 per slope."""
-WHEEL_SLOPE = 2 * math.pi * (0.08 + 0.05 + 2 * 0.03 + 2 * 0.06) / 360.0
-"""Largest slope of the pan wheel's error, degrees per degree."""
 SIDES = tuple(product(("left", "right", "unknown"), ("up", "down", "unknown")))
 PERIODS_DEG = {"pan": 360.0, "tilt": 40.0}
 """The wheel's error on one axis, the pinion's on the other."""
@@ -167,10 +164,44 @@ def test_locate_is_the_law_of_propagation_in_jax(rig, request):
         found = one.locate(pan, tilt, reading, approach)
         np.testing.assert_allclose(found.xyz_mm, law.value[i], atol=ROUNDING_MM)
         scale = np.sqrt(np.outer(np.diag(law.covariance[i]), np.diag(law.covariance[i])))
-        # NumPy adds the variance of an unknown place in the play behind the wheel's error, whose slope is left out.
-        left_out = 2 * WHEEL_SLOPE if one.period_deg and approach[0] == "unknown" else 0.0
-        assert np.abs((found.covariance_mm2 - law.covariance[i]) / scale).max() < DERIVATIVE + left_out
+        assert np.abs((found.covariance_mm2 - law.covariance[i]) / scale).max() < 100 * ROUNDING
         np.testing.assert_allclose(found.u95_mm, NORMAL_95 * np.sqrt(np.diag(found.covariance_mm2)), rtol=ROUNDING)
+
+
+@pytest.mark.parametrize("rig", ["bent", "wobbling"])
+def test_derivatives_are_the_jacobian_of_jax(rig, request):
+    """Of every input that varies and unit noise, an unknown place in the play before the wheel's error included."""
+    one = request.getfixturevalue(rig)
+    varies = np.diag(one.covariance_with_noise) > 0
+    assert varies.sum() >= 20
+    for pose, side in product(POSES, SIDES):
+        expected = locate_linear(one, settings_of(*pose, side)).jacobian[0][:, varies]
+        found = one.derivatives(*pose, side)[:, varies]
+        np.testing.assert_allclose(found, expected, rtol=ROUNDING, atol=ROUNDING * np.abs(expected).max())
+
+
+@pytest.mark.parametrize("azimuth", [False, True])
+def test_ranges_are_those_of_jax_from_anywhere(azimuth):
+    """Beams from all around: those that meet only the other nappe of the aperture's cone meet nothing."""
+    rng = np.random.default_rng(1)
+    origin = rng.normal(size=(3, 2000)) * 60 + np.array([[0.0], [100.0], [0.0]])
+    direction = rng.normal(size=(3, 2000))
+    direction /= np.linalg.norm(direction, axis=0)
+    angle_deg = rng.uniform(1, 179, 2000)
+    with jax.enable_x64(True):
+        arrays = [jax.numpy.asarray(x) for x in (origin, direction, 200.0, np.radians(angle_deg), azimuth)]
+        expected = meeting(*arrays)
+    meets = np.asarray(expected.meets)
+    assert 400 < meets.sum() < 1600
+    found = range_components(tuple(origin), tuple(direction), 200.0, angle_deg, azimuth)
+    with np.errstate(invalid="ignore"):
+        np.testing.assert_array_equal(found > 0, meets)
+    np.testing.assert_allclose(found[meets], np.asarray(expected.range_mm)[meets], rtol=1e3 * ROUNDING)
+    for k in range(100):
+        single = range_components(
+            tuple(origin[:, k].tolist()), tuple(direction[:, k].tolist()), 200.0, angle_deg[k], azimuth, math
+        )
+        assert single == pytest.approx(found[k], rel=1e3 * ROUNDING, nan_ok=True)
 
 
 @pytest.mark.parametrize("azimuth", [False, True])

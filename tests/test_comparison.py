@@ -26,6 +26,7 @@ from tvsbayes.comparison import (
     simple_rays,
 )
 from tvsbayes.coordinates import INPUT_COLUMNS, locate_linear, meeting, published_point, settings_of
+from tvsbayes.files import InputError
 from tvsbayes.information import calibration_of, causes_of
 from tvsbayes.joint import JointFit
 from tvsbayes.likelihood import StopGroup, StopInformation
@@ -186,7 +187,7 @@ POINT = (130.0, 90.0, 60.0, ("right", "unknown"))
 
 
 def test_budget_adds_up_to_the_covariance(caused):
-    found = budget(caused, settings_of(*POINT))
+    found = budget(caused, *POINT)
     law = locate_linear(caused, settings_of(*POINT))
     np.testing.assert_allclose(found.covariance_mm2, law.covariance[0], rtol=ALGEBRA)
     np.testing.assert_allclose(found.variance_mm2.sum(axis=0), np.diag(law.covariance[0]), rtol=ALGEBRA)
@@ -205,7 +206,7 @@ def test_budget_adds_up_to_the_covariance(caused):
 
 def test_each_cause_of_a_budget_is_its_own_propagation(caused):
     """Without the others, through the law: parts of the calibration and of this look."""
-    found = budget(caused, settings_of(*POINT))
+    found = budget(caused, *POINT)
     settled = dict.fromkeys(NOISE_NAMES, 1e-9)
 
     def alone(covariance: np.ndarray, noise_deg: dict[str, float], play: bool = False) -> np.ndarray:
@@ -224,11 +225,11 @@ def test_each_cause_of_a_budget_is_its_own_propagation(caused):
     np.testing.assert_allclose(found.variance_mm2[4], alone(nothing, readings), rtol=1e-6)
 
 
-def test_a_budget_is_for_one_point_with_causes(caused):
-    with pytest.raises(ValueError, match="one point"):
-        budget(caused, settings_of(np.zeros(2), np.zeros(2), np.full(2, 60.0)))
+def test_a_budget_needs_causes_and_a_point(caused):
     with pytest.raises(ValueError, match="causes"):
-        budget(calibration(), settings_of(*POINT))
+        budget(calibration(), *POINT)
+    with pytest.raises(InputError, match="diverge"):
+        budget(caused, 130.0, 90.0, 179.0)
 
 
 def direction_result(mean: float) -> DirectionResult:

@@ -476,9 +476,8 @@ def test_each_cause_alone_has_its_sensitivity(cause):
     scale = np.abs(expected).max()
     np.testing.assert_allclose(law.covariance[0] / scale, expected / scale, atol=1e-9)
     np.testing.assert_allclose(law.value[0], published_point(B_DEG, C_DEG, 0.0, A_MM), atol=ROUNDING_MM)
-    # Central differences: 1e-4, see `calibration.DIFFERENCE`.
     numpy = one.locate(steps, 0.0, B_DEG, approach).covariance_mm2
-    np.testing.assert_allclose(numpy / scale, expected / scale, atol=1e-4)
+    np.testing.assert_allclose(numpy / scale, expected / scale, atol=1e-9)
     found = locate(one, steps, 0.0, B_DEG, approach, draws=DRAWS)
     # 1.96 of a normal, 0.95 sqrt(3) of a uniform distribution; a half width of n draws errs by 2.67 / sqrt(2 n) sd.
     wide = 0.95 * math.sqrt(3) if cause == "play" else NORMAL_95

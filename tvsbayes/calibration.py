@@ -11,7 +11,7 @@ from __future__ import annotations
 import io
 import json
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -42,11 +42,16 @@ NORMAL_95 = 1.959963984540054
 """Two-sided 95 % quantile of the normal distribution."""
 CLEARED_PROBABILITY = 0.99
 """With this probability an overshoot takes up all the play."""
-DIFFERENCE = 0.05
-"""Half width of the central differences in standard deviations: truncation and rounding both below 1e-5."""
-NUDGE_DEG = 1e-4
-"""Half width of the central differences in stop errors and readings, whose sds are 0.01 deg and more."""
 AIM_STEPS, AIM_RAD = 40, 1e-11
+DIVERGING_SHARE = 1e-3
+"""Share of draws without a point above which a point is refused (DESIGN 5)."""
+ROUNDING = 1e-12
+"""Of coordinates, relative to the range."""
+NOISES = 5
+"""Unit noises of a look: stop error and place in the play (pan, tilt), aperture."""
+COMPLEX_STEP = 1e-30
+"""Imaginary step of derivatives: nothing is subtracted, so it may be as small as it likes (Squire and Trapp, SIAM
+Review 40 (1998) 110)."""
 RESULTS_BYTES_MAX = 64 * 1024 * 1024
 UNPACKED_BYTES_MAX = 2 * RESULTS_BYTES_MAX
 NAME_CHARS_MAX = 200
@@ -182,8 +187,8 @@ def beam_components(values: Mapping[str, object], pan_deg, tilt_deg, m=np) -> tu
 def range_components(origin: tuple, direction: tuple, baseline_mm, aperture_deg, azimuth: bool, m=np):
     """Range along the beam at which the aperture sees it under angle B, mm (derivation: `coordinates.meeting`).
 
-    Not a number where the beam misses the cone or half-plane of B; zero or negative where it meets only its backward
-    extension.
+    Not a number where the beam misses the cone or half-plane of B; zero, negative or minus infinite where only its
+    backward extension or the other nappe is met.
     """
     x, y, z = origin
     u, v, w = direction
@@ -205,7 +210,18 @@ def range_components(origin: tuple, direction: tuple, baseline_mm, aperture_deg,
             root = np.sqrt(inside)
     across = x * u + y * v + z * w
     reach = y * y - cos_b * cos_b * (x * x + y * y + z * z)
-    return reach / (cos_b * root - (y * v - cos_b * cos_b * across))
+    reach = reach / (cos_b * root - (y * v - cos_b * cos_b * across))
+    # At B = 90 deg both nappes are one plane, and y is nought but for rounding.
+    faces = (y + reach * v) * cos_b >= -ROUNDING * abs(reach * cos_b)
+    return (reach if faces else -math.inf) if m is math else np.where(faces | np.isnan(reach), reach, -np.inf)
+
+
+def aperture_angle_deg(point: tuple, baseline_mm, azimuth: bool, m=np):
+    """The angle B of a point (x, y, z) of frame T at the aperture, degrees, without the aperture's zero."""
+    x, y, z = point
+    lateral = x if azimuth else m.hypot(x, z)
+    arc_tangent = math.atan2 if m is math else np.arctan2
+    return arc_tangent(lateral, y + 0.5 * baseline_mm) / _TO_RAD
 
 
 @dataclass(frozen=True)
@@ -248,20 +264,20 @@ class Calibration:
         return dict(zip(INPUT_NAMES, self.mean.tolist(), strict=True))
 
     @cached_property
-    def _differences(self) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-        """Half widths (m,) and, by name, the values of the central differences: 2 m sets, plus then minus."""
-        sd = np.sqrt(np.diag(self.covariance))
-        varied = np.flatnonzero(sd > 0)
-        half = DIFFERENCE * sd[varied]
-        shift = np.zeros((len(varied), len(INPUT_NAMES)))
-        shift[np.arange(len(varied)), varied] = half
-        sets = np.concatenate([self.mean + shift, self.mean - shift])
-        return half, dict(zip(INPUT_NAMES, sets.T, strict=True))
+    def _moved(self) -> tuple[dict[str, np.ndarray | float], np.ndarray]:
+        """Parameters by name and unit noises of a look, each moved by an imaginary step in one of (inputs + NOISES)."""
+        count = len(INPUT_NAMES)
+        sets = np.concatenate([self.mean, np.zeros(NOISES)]) + 1j * COMPLEX_STEP * np.eye(count + NOISES)
+        values = dict(zip(INPUT_NAMES, sets[:, :count].T, strict=True))
+        return values | {name: math.sqrt(self.noise_variance[name]) for name in NOISE_NAMES}, sets[:, count:].T
 
     @cached_property
-    def _varied_covariance(self) -> np.ndarray:
-        varied = np.diag(self.covariance) > 0
-        return self.covariance[np.ix_(varied, varied)]
+    def covariance_with_noise(self) -> np.ndarray:
+        """Covariance of `INPUT_NAMES` and the unit noises of a look, shape (inputs + NOISES, inputs + NOISES)."""
+        count = len(INPUT_NAMES)
+        covariance = np.diag([*np.zeros(count), 1, 1, 1 / 12, 1 / 12, 1])
+        covariance[:count, :count] = self.covariance
+        return covariance
 
     def covers(self, pan_steps: float, tilt_steps: float) -> bool:
         """Whether the campaign reached these counters."""
@@ -313,18 +329,19 @@ class Calibration:
         steps = (float(pan_steps), float(tilt_steps))
         if not all(map(math.isfinite, (*steps, aperture_deg))):
             raise self.refusal(pan_steps, tilt_steps, aperture_deg, sides)
-        estimate = self._points(self.estimates, steps, sides, (0.0, 0.0), aperture_deg, math)
-        if not math.isfinite(estimate[0]):
+        ray, baseline_mm = self.ray(*steps, approach), self.estimates["baseline_mm"]
+        beam = tuple(ray.origin_mm.tolist()), tuple(ray.direction.tolist())
+        true_deg = aperture_deg - self.estimates["aperture_zero_deg"]
+        reach = range_components(*beam, baseline_mm, true_deg, self.azimuth, math)
+        if not 0 < reach < math.inf:
             raise self.refusal(pan_steps, tilt_steps, aperture_deg, sides)
+        estimate = ray.origin_mm + reach * ray.direction
 
-        def measure(values, extra_deg, m):
-            return self._points(values, steps, sides, extra_deg[:2], aperture_deg + extra_deg[2], m)
-
-        variances = (*self._pointing_variance(sides), self.noise_variance["aperture_sd_deg"])
-        covariance = self._propagated(measure, variances)
+        jacobian = self.derivatives(*steps, aperture_deg, approach)
+        covariance = jacobian @ self.covariance_with_noise @ jacobian.T
         if not np.all(np.isfinite(covariance)):
             raise self.refusal(pan_steps, tilt_steps, aperture_deg, sides)
-        return Located(np.array(estimate), covariance, NORMAL_95 * np.sqrt(np.diag(covariance)))
+        return Located(estimate, covariance, NORMAL_95 * np.sqrt(np.diag(covariance)))
 
     def refusal(
         self, pan_steps: float, tilt_steps: float, aperture_deg: float, sides: tuple[float, float]
@@ -357,43 +374,52 @@ class Calibration:
             remedy="check reading and counters; such a target is too far, or behind the scanner",
         )
 
-    def _points(self, values, steps, sides, extra_deg, aperture_deg, m=np) -> tuple:
-        """Points (x, y, z); not a number where there is none in front of the scanner."""
-        pan_deg, tilt_deg = self._angles(values, steps, sides, m)
-        origin, direction = beam_components(values, pan_deg + extra_deg[0], tilt_deg + extra_deg[1], m)
-        true_deg = aperture_deg - values["aperture_zero_deg"]
-        reach = range_components(origin, direction, values["baseline_mm"], true_deg, self.azimuth, m)
-        reach = (reach if reach > 0 else math.nan) if m is math else np.where(reach > 0, reach, np.nan)
-        return tuple(o + reach * d for o, d in zip(origin, direction, strict=True))
-
-    def _pointing_variance(self, sides: tuple[float, float]) -> tuple[float, ...]:
-        """Variance of each mirror angle at one stop: stop error, and play where the side is unknown."""
-        result = []
-        for axis, side in zip(AXES, sides, strict=True):
-            low, high = (self.noise_variance[f"stop_sd_deg.{name}"] for name in SIDES[axis])
-            play = self.estimates[f"backlash_deg.{axis}"]
-            result.append(high if side > 0 else low if side < 0 else 0.5 * (low + high) + play**2 / 12)
-        return tuple(result)
-
-    def _propagated(self, measure: Callable[..., tuple], variances_deg2: tuple[float, ...]) -> np.ndarray:
-        """Covariance of a quantity by the law of propagation (GUM 5.2), by central differences.
+    def noisy_angles(self, values: Mapping[str, object], noise: Sequence, steps: tuple, sides: tuple) -> tuple:
+        """Mirror angles (pan, tilt) with stop errors, and somewhere in the play where the side is unknown.
 
         Args:
-            measure: (values by name, angles in degrees added to pan, tilt and reading, `math` or `numpy`) -> the
-                quantity's components.
-            variances_deg2: of what is added to pan, tilt and, where the quantity has one, the reading.
+            values: by name, of `INPUT_NAMES` and `NOISE_NAMES`; arrays of one shape.
+            noise: `NOISES` unit noises, arrays of that shape (`Drawn`).
+            steps: counters (pan, tilt).
+            sides: approach sides (pan, tilt): +1 left or up, -1 right or down, 0 unknown.
         """
-        half, sets = self._differences
-        moved = np.array(measure(sets, (0.0, 0.0, 0.0), np))
-        jacobian = (moved[:, : len(half)] - moved[:, len(half) :]) / (2 * half)
-        covariance = jacobian @ self._varied_covariance @ jacobian.T
-        for place, variance in enumerate(variances_deg2):
-            ahead = tuple(NUDGE_DEG if k == place else 0.0 for k in range(3))
-            behind = tuple(-x for x in ahead)
-            ends = [np.array(measure(self.estimates, extra, math)) for extra in (ahead, behind)]
-            slope = (ends[0] - ends[1]) / (2 * NUDGE_DEG)
-            covariance += variance * np.outer(slope, slope)
-        return covariance
+        found = []
+        for k, (axis, side) in enumerate(zip(AXES, sides, strict=True)):
+            low, high = (values[f"stop_sd_deg.{name}"] for name in SIDES[axis])
+            stop_sd = high if side > 0 else low if side < 0 else np.sqrt(0.5 * (low**2 + high**2))
+            # Where the side is unknown, the play is taken up by any part of it.
+            place = side if side else -2 * noise[2 + k]
+            found.append(output_deg(values, axis, steps[k], place, self.period_deg.get(axis)) + stop_sd * noise[k])
+        return tuple(found)
+
+    def derivatives(
+        self, pan_steps: float, tilt_steps: float, aperture_deg: float, approach: tuple[str, str] = ("left", "up")
+    ) -> np.ndarray:
+        """Sensitivities of a point to `INPUT_NAMES` (their units) and to the unit noises of the look, mm.
+
+        Noises have the root mean square of their standard deviations.
+
+        Args:
+            pan_steps: absolute counter.
+            tilt_steps: absolute counter.
+            aperture_deg: reading B.
+            approach: last move of (pan, tilt): left or right, up or down, or unknown.
+
+        Returns:
+            Shape (3, inputs + NOISES).
+
+        Raises:
+            InputError: an approach that does not exist, or beam and line of sight do not meet.
+        """
+        sides = sides_of(approach)
+        values, noise = self._moved
+        angles = self.noisy_angles(values, noise, (pan_steps, tilt_steps), sides)
+        origin, direction = beam_components(values, *angles)
+        true_deg = aperture_deg - values["aperture_zero_deg"] - values["aperture_sd_deg"] * noise[4]
+        reach = range_components(origin, direction, values["baseline_mm"], true_deg, self.azimuth)
+        if not np.all(reach.real > 0):
+            raise self.refusal(pan_steps, tilt_steps, aperture_deg, sides)
+        return np.array([o + reach * d for o, d in zip(origin, direction, strict=True)]).imag / COMPLEX_STEP
 
     def steps_for(
         self,
@@ -444,9 +470,8 @@ class Calibration:
 
     def reading(self, point: np.ndarray) -> float:
         """What the aperture reads for a point of frame T, degrees."""
-        x, y, z = point + np.array([0.0, 0.5 * self.estimates["baseline_mm"], 0.0])
-        lateral = x if self.azimuth else math.hypot(x, z)
-        return math.degrees(math.atan2(lateral, y)) + self.estimates["aperture_zero_deg"]
+        angle = aperture_angle_deg(tuple(point), self.estimates["baseline_mm"], self.azimuth, math)
+        return angle + self.estimates["aperture_zero_deg"]
 
     def _aim(self, target: np.ndarray | None, azimuth_deg, elevation_deg) -> tuple[float, float]:
         """Mirror angles whose beam passes through a point or along a direction, degrees.
@@ -516,17 +541,51 @@ class Calibration:
 
     def _ray_u95(self, steps, sides, reach: float | None) -> np.ndarray:
         """95 % half widths of the beam at a range (3,), mm, or of its azimuth and elevation (2,), degrees."""
-        counters = tuple(map(float, steps))
+        values, noise = self._moved
+        origin, direction = beam_components(values, *self.noisy_angles(values, noise, tuple(map(float, steps)), sides))
+        if reach is not None:
+            found = np.array([o + reach * d for o, d in zip(origin, direction, strict=True)])
+        else:
+            # Of the azimuth atan2(y, x), whose derivatives those of atan(y / x) are.
+            found = np.array([np.arctan(direction[1] / direction[0]), np.arcsin(direction[2])]) / _TO_RAD
+        jacobian = found.imag / COMPLEX_STEP
+        return NORMAL_95 * np.sqrt(np.diag(jacobian @ self.covariance_with_noise @ jacobian.T))
 
-        def measure(values, extra_deg, m):
-            pan_deg, tilt_deg = self._angles(values, counters, sides, m)
-            o, d = beam_components(values, pan_deg + extra_deg[0], tilt_deg + extra_deg[1], m)
-            if reach is not None:
-                return tuple(a + reach * b for a, b in zip(o, d, strict=True))
-            return tuple(np.degrees([np.arctan2(d[1], d[0]), np.arcsin(d[2])]))
 
-        covariance = self._propagated(measure, self._pointing_variance(sides))
-        return NORMAL_95 * np.sqrt(np.diag(covariance))
+@dataclass(frozen=True)
+class Drawn:
+    """Rigs that the data allow, each with the unit noises of one look.
+
+    Attributes:
+        inputs: shape (draws, columns), ordered as `INPUT_NAMES`, then `NOISE_NAMES`.
+        noise: standard-normal stop errors (pan, tilt), uniform places in the play in [-1/2, 1/2] (pan, tilt), the
+            aperture's standard-normal noise, shape (draws, `NOISES`).
+    """
+
+    inputs: np.ndarray
+    noise: np.ndarray
+
+
+def drawn(calibration: Calibration, draws: int, seed: int) -> Drawn:
+    """Draws of parameters, evenly chosen, with noises of their own; the same for every point of a call.
+
+    Raises:
+        InputError: a calibration without draws.
+    """
+    stored = len(calibration.inputs)
+    if stored == 0:
+        raise InputError(
+            "no-draws",
+            "this calibration keeps moments only, as exported for a robot",
+            remedy="locate from the campaign folder, or use calibration.locate, which needs no draws",
+        )
+    generator = np.random.default_rng([seed, 6])
+    # Fewer draws than are stored: evenly chosen; more: all, again and again, with new noises.
+    chosen = np.arange(draws) % stored if draws > stored else np.linspace(0, stored - 1, draws).astype(int)
+    columns = np.concatenate([calibration.inputs, calibration.noise], axis=1)[chosen]
+    normal = generator.standard_normal((draws, NOISES))
+    noise = np.column_stack([normal[:, :2], generator.uniform(-0.5, 0.5, (draws, 2)), normal[:, 4]])
+    return Drawn(columns, noise)
 
 
 def direction_of(azimuth_deg: float | np.ndarray, elevation_deg: float | np.ndarray) -> np.ndarray:

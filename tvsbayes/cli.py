@@ -653,10 +653,8 @@ def report(
     document = _fit_document(data, campaign)
     from tvsbayes.certificate import check_dcc, dcc_bytes
     from tvsbayes.comparison import gather
-    from tvsbayes.model import use_compilation_cache
     from tvsbayes.report import print_to_pdf, report_html, validation_lines
 
-    use_compilation_cache()
     limits = {"limit_deg_per_step": limit_deg_per_step, "limit_mm": limit_mm}
     evidence = gather(data, document, load_calibration(campaign), range_mm=range_mm, **limits)
     path = out or results / "report.html"
@@ -849,10 +847,9 @@ def locate(
     text = locations_text(found)
     if budget:
         from tvsbayes.comparison import budget as point_budget
-        from tvsbayes.coordinates import settings_of
         from tvsbayes.report import budget_text
 
-        parts = point_budget(calibration, settings_of(*where))
+        parts = point_budget(calibration, *where)
         document["budget"] = parts.as_json()
         text += f"\n\n{budget_text(parts)}"
     _finish(document, text, as_json)

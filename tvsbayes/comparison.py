@@ -13,35 +13,32 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING
 
-import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
 
-from tvsbayes.calibration import INPUT_NAMES, Calibration, direction_of, stored_ratios
+from tvsbayes.calibration import (
+    AXES,
+    DIVERGING_SHARE,
+    INPUT_NAMES,
+    NOISE_NAMES,
+    Calibration,
+    Ray,
+    aperture_angle_deg,
+    beam_components,
+    direction_of,
+    drawn,
+    output_deg,
+    range_components,
+    stored_ratios,
+)
 from tvsbayes.campaign import Campaign
 from tvsbayes.certificate import BudgetTable, coordinate_budget
 from tvsbayes.classic import DIRECTIONS, ClassicResult, Selection, classic, four_point_ratios, select_experiments
-from tvsbayes.coordinates import (
-    DIVERGING_SHARE,
-    NOISES,
-    Settings,
-    Sources,
-    beams_at,
-    half_baseline,
-    meeting,
-    model_from,
-    propagate,
-    sources,
-)
 from tvsbayes.files import JSON_BYTES_MAX, Keys, NothingToEstimate, parse_json, read_bytes
-from tvsbayes.likelihood import aperture_angle, ordered_spots
-from tvsbayes.model import INDEX, NAMES, RIG_NAMES, Beam, ParameterSpace
 from tvsbayes.rigs import RIG_PRIORS, Prior
 
 if TYPE_CHECKING:
     from tvsbayes.joint import JointFit
+    from tvsbayes.model import ParameterSpace
     from tvsbayes.posterior import Posterior
 
 STOP_HERE, APERTURE_HERE, PLAY_HERE = "stop error here", "aperture noise here", "unknown approach here"
@@ -81,8 +78,8 @@ def simple_calibration(
     return SimpleCalibration(ratios, a - offset, 0.5 * a - offset, priors["pan_zero_emission_deg"].value)
 
 
-def simple_rays(simple: SimpleCalibration, steps: np.ndarray) -> Beam:
-    """Beams (points) of a simple calibration at counters (points, 2).
+def simple_rays(simple: SimpleCalibration, steps: np.ndarray) -> Ray:
+    """Beams, fields of shape (3, points), of a simple calibration at counters (points, 2).
 
     The azimuth C0 + k n and the elevation k n are turned into a direction, so that either convention of the
     aperture's angle meets it as it should.
@@ -94,7 +91,7 @@ def simple_rays(simple: SimpleCalibration, steps: np.ndarray) -> Beam:
     direction = direction_of(pan, tilt)
     origin = np.zeros_like(direction)
     origin[1] = simple.origin_y_mm
-    return Beam(jnp.asarray(origin), jnp.asarray(direction))
+    return Ray(origin, direction)
 
 
 @dataclass(frozen=True)
@@ -118,38 +115,6 @@ class ErrorMap:
     inside: np.ndarray
     valid: np.ndarray
     distance_mm: Mapping[str, np.ndarray]
-
-
-class _Errors(eqx.Module):
-    error_mm: Float[Array, "estimators draws 3 points"]
-    meets: Bool[Array, "estimators draws points"]
-
-
-@eqx.filter_jit
-def _errors(
-    settings: Settings, range_mm: Array, best: Array, simple: tuple[Beam, ...], a_mm: Array, given: Sources
-) -> _Errors:
-    """Errors of beams that are taken as known, on every draw of the rig; first those of the best estimate."""
-    known = (beams_at(model_from(best, given.period_deg), settings.steps, settings.side, jnp.zeros(NOISES)), *simple)
-
-    def one(inputs, noise):
-        model = model_from(inputs, given.period_deg)
-        true = beams_at(model, settings.steps, settings.side, noise)
-        points = true.origin_mm + range_mm * true.direction
-        receiver = model.receiver
-        # `aperture_angle` works in frame P; a rig whose frames coincide takes points of frame T moved to the pan axis.
-        aligned = eqx.tree_at(lambda r: r.pan_zero_emission_rad, receiver, jnp.asarray(jnp.pi / 2))
-        moved = points - half_baseline(receiver.baseline_mm, range_mm)
-        angle = aperture_angle(aligned, moved, given.azimuth_convention)
-        reading = angle + receiver.aperture_zero_rad + receiver.aperture_sd_rad * noise[4]
-        found = [
-            meeting(rays.origin_mm, rays.direction, a, reading - zero, given.azimuth_convention)
-            for rays, a, zero in zip(known, a_mm[0], a_mm[1], strict=True)
-        ]
-        return jnp.stack([f.xyz_mm - points for f in found]), jnp.stack([f.meets for f in found])
-
-    error, meets = jax.vmap(one)(given.inputs, given.noise)
-    return _Errors(error.transpose(1, 0, 2, 3), meets.transpose(1, 0, 2))
 
 
 def error_map(
@@ -181,31 +146,41 @@ def error_map(
     axes = [np.asarray(x, dtype=float) for x in (pan_steps, tilt_steps, range_mm)]
     pan, tilt, ranges = (x.ravel() for x in np.meshgrid(*axes, indexing="ij"))
     steps = np.stack([pan, tilt], axis=1)
-    given = sources(calibration, draws, seed)
-    with jax.enable_x64(True):
-        sides = np.tile(np.asarray(approach, dtype=float), (len(steps), 1))
-        settings = Settings(*(jnp.asarray(x) for x in (steps, sides, np.zeros(len(steps)))))
-        best = np.concatenate([given.mean[: len(INPUT_NAMES)], given.stop_sd_deg])
-        names = ("joint", *simple)
-        a = calibration.estimates["baseline_mm"]
-        # `meeting` puts the aperture at half the distance it is given; a simple user's stands at origin - baseline.
-        bases = [a, *(2 * (s.baseline_mm - s.origin_y_mm) for s in simple.values())]
-        zeros = [np.radians(calibration.estimates["aperture_zero_deg"]), *(0.0 for _ in simple)]
-        rays = tuple(simple_rays(s, steps) for s in simple.values())
-        arrays = (jnp.asarray(x) for x in (ranges, best))
-        found = _errors(settings, *arrays, rays, jnp.asarray(np.array([bases, zeros])), given)
+    rigs = drawn(calibration, draws, seed)
+    # Axes: draws, points.
+    values = dict(zip((*INPUT_NAMES, *NOISE_NAMES), rigs.inputs.T[..., None], strict=True))
+    noise = rigs.noise.T[..., None]
+    origin, direction = beam_components(values, *calibration.noisy_angles(values, noise, (pan, tilt), approach))
+    points = np.array([o + ranges * d for o, d in zip(origin, direction, strict=True)])
+    reading = aperture_angle_deg(tuple(points), values["baseline_mm"], calibration.azimuth)
+    reading = reading + values["aperture_zero_deg"] + values["aperture_sd_deg"] * noise[4]
+    best = calibration.estimates
+    angles = (
+        output_deg(best, axis, steps[:, k], approach[k], calibration.period_deg.get(axis))
+        for k, axis in enumerate(AXES)
+    )
+    looks = {"joint": (*beam_components(best, *angles), best["baseline_mm"], best["aperture_zero_deg"])}
+    for name, one in simple.items():
+        ray = simple_rays(one, steps)
+        # `range_components` puts the aperture at half the distance it is given; a simple user's stands at origin -
+        # baseline.
+        looks[name] = tuple(ray.origin_mm), tuple(ray.direction), 2 * (one.baseline_mm - one.origin_y_mm), 0.0
     shape = tuple(len(x) for x in axes)
     rms, bias, distance, valid = {}, {}, {}, np.ones(shape, dtype=bool)
-    for name, error, meets in zip(names, np.asarray(found.error_mm), np.asarray(found.meets), strict=True):
+    for name, (origin, direction, baseline_mm, zero_deg) in looks.items():
+        reach = range_components(origin, direction, baseline_mm, reading - zero_deg, calibration.azimuth)
+        meets = np.isfinite(reach) & (reach > 0)
+        reach = np.where(meets, reach, 0.0)
+        error = np.array([o + reach * d for o, d in zip(origin, direction, strict=True)]) - points
         share = (~meets).mean(axis=0)
-        kept = np.where(meets[:, None], error, 0.0)
+        kept = np.where(meets, error, 0.0)
         count = np.maximum(meets.sum(axis=0), 1)
         usable = share <= DIVERGING_SHARE
         square = np.sum(kept**2, axis=(0, 1)) / count
         rms[name] = np.where(usable, np.sqrt(square), np.nan).reshape(shape)
-        bias[name] = np.where(usable, kept.sum(axis=0) / count, np.nan).T.reshape(*shape, 3)
+        bias[name] = np.where(usable, kept.sum(axis=1) / count, np.nan).T.reshape(*shape, 3)
         valid &= usable.reshape(shape)
-        length = np.where(meets, np.linalg.norm(error, axis=1), np.inf)
+        length = np.where(meets, np.linalg.norm(error, axis=0), np.inf)
         distance[name] = length.reshape(-1, *shape)
     (pan_low, pan_high), (tilt_low, tilt_high) = calibration.range_steps
     within = (pan >= pan_low) & (pan <= pan_high) & (tilt >= tilt_low) & (tilt <= tilt_high)
@@ -282,31 +257,37 @@ class Budget:
         }
 
 
-def budget(calibration: Calibration, settings: Settings) -> Budget:
+def budget(
+    calibration: Calibration,
+    pan_steps: float,
+    tilt_steps: float,
+    aperture_deg: float,
+    approach: tuple[str, str] = ("left", "up"),
+) -> Budget:
     """The uncertainty budget of one point (GUM 7.2.7 asks for it): by cause, and by parameter with correlations.
 
     Args:
         calibration: with causes, as a fit keeps them.
-        settings: of one point.
+        pan_steps: absolute counter.
+        tilt_steps: absolute counter.
+        aperture_deg: reading B.
+        approach: last move of (pan, tilt): left or right, up or down, or unknown.
 
     Raises:
-        ValueError: more than one point, or a calibration that does not know its causes.
+        ValueError: a calibration that does not know its causes.
+        InputError: an approach that does not exist, or beam and line of sight do not meet.
     """
-    if len(settings.aperture_rad) != 1:
-        raise ValueError("a budget is for one point")
     if not calibration.causes:
         raise ValueError("this calibration does not know its causes: fit the campaign again")
-    given = sources(calibration, 1, 0)
-    with jax.enable_x64(True):
-        law = jax.tree.map(lambda x: np.asarray(x)[0], propagate(settings, given))
+    jacobian = calibration.derivatives(pan_steps, tilt_steps, aperture_deg, approach)
+    covariance = calibration.covariance_with_noise
     count = len(INPUT_NAMES)
-    calibrated, here = law.jacobian[:, :count], law.jacobian[:, count:]
+    calibrated, here = jacobian[:, :count], jacobian[:, count:]
     by_cause = [np.einsum("ij,jk,ik->i", calibrated, c, calibrated) for c in calibration.cause_covariance]
-    variances = np.diag(np.asarray(given.covariance))[count:]
-    own = here**2 * variances
+    own = here**2 * np.diag(covariance)[count:]
     by_cause += [own[:, :2].sum(axis=1), own[:, 2:4].sum(axis=1), own[:, 4]]
     variance = np.array(by_cause)
-    u = np.sqrt(np.diag(np.asarray(given.covariance)))
+    u = np.sqrt(np.diag(covariance))
     # What does not vary correlates with nothing.
     safe = np.where(u > 0, u, 1.0)
     noises = (
@@ -321,14 +302,14 @@ def budget(calibration: Calibration, settings: Settings) -> Budget:
         share=variance.sum(axis=1) / variance.sum(),
         variance_mm2=variance,
         parameters=(*INPUT_NAMES, *noises),
-        contribution_mm=(law.jacobian * u).T,
-        correlation=np.asarray(given.covariance) / np.outer(safe, safe),
-        covariance_mm2=law.covariance,
+        contribution_mm=(jacobian * u).T,
+        correlation=covariance / np.outer(safe, safe),
+        covariance_mm2=jacobian @ covariance @ jacobian.T,
     )
 
 
 GAP_DRAWS = 256
-OPTICS = tuple(name for name in RIG_NAMES if name.startswith(("mirror1", "mirror2", "laser_", "tilt_axis_")))
+OPTICS = tuple(name for name in RIG_PRIORS if name.startswith(("mirror1", "mirror2", "laser_", "tilt_axis_")))
 """What bends the beam's way through the positioner; all zero in the nominal rig."""
 BACKLASH, STEREO_SCALE, SKEW, PROJECTION, CHANCE = (
     "backlash over N",
@@ -369,6 +350,10 @@ class Gap:
 
 def _ideal(space: ParameterSpace, names: Sequence[str]) -> ParameterSpace:
     """The priors with parameters fixed at their ideal values: 0, or 1 for the focal scale; cameras as stated."""
+    import jax.numpy as jnp
+
+    from tvsbayes.model import INDEX, RIG_NAMES
+
     rows = jnp.asarray([INDEX[name] for name in names if name in RIG_NAMES])
     ideal = jnp.asarray([1.0 if name == "focal_scale" else 0.0 for name in names if name in RIG_NAMES])
     space = replace(space, value=space.value.at[rows].set(ideal), u=space.u.at[rows].set(0.0))
@@ -394,6 +379,9 @@ def explain_gap(found: JointFit, posterior: Posterior | None = None, draws: int 
     Returns:
         By direction; None without complete experiments.
     """
+    import jax
+    import jax.numpy as jnp
+
     from tvsbayes.joint import derived_quantities
     from tvsbayes.posterior import looks
 
@@ -451,6 +439,8 @@ def explain_gap(found: JointFit, posterior: Posterior | None = None, draws: int 
 
 def _experiment_pixels(found: JointFit, selection: Selection) -> Callable[[np.ndarray], np.ndarray]:
     """Picks the four looks of each experiment, (draws, e, 4, 4), from those of all spots in the filter's order."""
+    from tvsbayes.likelihood import ordered_spots
+
     row_of = {spot.spot: row for row, spot in enumerate(ordered_spots(found.campaign))}
     ids = [[row_of[found.campaign.spots[r].spot] for r in four] for four in selection.spot_rows]
     rows = np.array(ids, dtype=int).reshape(-1, 4)
@@ -590,10 +580,7 @@ def hold_out(fit_of_all: JointFit, by: str = "steps", seed: int = 0) -> HoldOut:
     if len(folds) < 2:
         what = f"all experiments have |N| = {lengths[0]}" if by == "steps" else "all experiments start at one counter"
         return undecided(f"{what}: a constant lost motion looks like a ratio there; measure a second |N|")
-    with jax.enable_x64(True):
-        angle = np.asarray(
-            four_point_ratios(selection.pixels, selection.steps, selection.axis, campaign.stereo) * selection.steps
-        )
+    angle = four_point_ratios(selection.pixels, selection.steps, selection.axis, campaign.stereo) * selection.steps
     predictions: list[Prediction] = []
     for index, (name, out) in enumerate(folds.items()):
         foretold = _foretell_classic(angle, selection, out)
@@ -636,6 +623,8 @@ def _refit(fit_of_all: JointFit, without: frozenset[int]) -> JointFit:
 
 def _priors_of(fit_of_all: JointFit) -> dict[str, Prior]:
     """The priors that the fit used, which options may have changed from the campaign's."""
+    from tvsbayes.model import INDEX
+
     space = fit_of_all.space
     table = fit_of_all.campaign.rig.priors
     return {
@@ -728,18 +717,22 @@ def _ratio_interval(first: np.ndarray, second: np.ndarray) -> tuple[float, float
 
 def _influence(found: JointFit, slopes: np.ndarray) -> np.ndarray:
     """Shift (q, p) of quantities with gradients (q, p) if the prior of coordinate j is off by its sd: (S e_j)."""
-    return slopes @ np.linalg.inv(found.information.fisher + np.eye(len(NAMES)))
+    fisher = found.information.fisher
+    return slopes @ np.linalg.inv(fisher + np.eye(len(fisher)))
 
 
-CAMERAS = np.array([INDEX["focal_scale"], *range(len(RIG_NAMES), len(NAMES))])
-"""Coordinates of the stereo calibration and of the focal scale."""
+def _camera_influence(found: JointFit, values: np.ndarray) -> np.ndarray:
+    """That of the stereo calibration's priors and the focal scale's on quantities whose draws are (n, q)."""
+    from tvsbayes.information import gradients
+    from tvsbayes.model import INDEX, NAMES, RIG_NAMES
+
+    cameras = [INDEX["focal_scale"], *range(len(RIG_NAMES), len(NAMES))]
+    return _influence(found, gradients(found, values))[:, cameras]
 
 
 def _camera_u(found: JointFit) -> np.ndarray:
     """Standard uncertainty (4,) of the effective ratios that stereo calibration and focal scale alone cause."""
-    from tvsbayes.information import gradients
-
-    shift = _influence(found, gradients(found, found.draws.effective_deg_per_step))[:, CAMERAS]
+    shift = _camera_influence(found, found.draws.effective_deg_per_step)
     return np.sqrt(np.sum(shift**2, axis=1))
 
 
@@ -804,10 +797,12 @@ def compare(first: JointFit, second: JointFit) -> Comparison:
         first: converged fit of A.
         second: converged fit of B.
     """
+    import jax
+    import jax.numpy as jnp
     from scipy import stats
 
-    from tvsbayes.information import gradients
     from tvsbayes.joint import derived_quantities
+    from tvsbayes.model import INDEX
 
     pose = first.reference_pose_rad
     cameras = first.campaign.stereo, second.campaign.stereo
@@ -824,7 +819,7 @@ def compare(first: JointFit, second: JointFit) -> Comparison:
         backlash = np.asarray(at_pose.physical)[:, [INDEX["backlash_deg.pan"], INDEX["backlash_deg.tilt"]]]
         rows = np.concatenate([np.asarray(at_pose.effective_deg_per_step), backlash], axis=1)
         values.append(rows)
-        influence.append(_influence(found, gradients(found, rows[1:]))[:, CAMERAS])
+        influence.append(_camera_influence(found, rows[1:]))
     names = [*(f"effective_deg_per_step.{d}" for d in DIRECTIONS), "backlash_deg.pan", "backlash_deg.tilt"]
     units = ["deg/step"] * 4 + ["deg"] * 2
     limit = float(stats.norm.isf(0.5 * (1 - 0.95 ** (1 / len(names)))))
@@ -1011,9 +1006,7 @@ def gather(
     ray = calibration.ray(*middle, ("left", "up"))
     point = np.asarray(ray.origin_mm) + range_mm * np.asarray(ray.direction)
     reading = calibration.reading(point)
-    with jax.enable_x64(True):
-        settings = Settings(jnp.array([middle]), jnp.ones((1, 2)), jnp.radians(jnp.array([reading])))
-    found_budget = budget(calibration, settings)
+    found_budget = budget(calibration, *middle, reading)
     least = "xyz"[int(np.argmax(np.diag(found_budget.covariance_mm2)))]
     return Evidence(
         campaign=campaign,

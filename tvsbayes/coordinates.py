@@ -22,7 +22,18 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from tvsbayes.calibration import AXES, INPUT_NAMES, NOISE_NAMES, NORMAL_95, Calibration, sides_of
+from tvsbayes.calibration import (
+    AXES,
+    DIVERGING_SHARE,
+    INPUT_NAMES,
+    NOISE_NAMES,
+    NOISES,
+    NORMAL_95,
+    ROUNDING,
+    Calibration,
+    drawn,
+    sides_of,
+)
 from tvsbayes.files import InputError
 from tvsbayes.model import (
     FULL_TURN_DEG,
@@ -209,14 +220,8 @@ def _with_error(statistic: Callable[..., np.ndarray], *draws: np.ndarray) -> tup
 
 DRAWS = 1000
 """Draws carried to a point unless the caller wants others; DESIGN 5 asks for 500 at least."""
-DIVERGING_SHARE = 1e-3
-"""Share of draws without a point above which a point is refused (DESIGN 5)."""
-ROUNDING = 1e-12
-"""Of coordinates, relative to the range."""
 POINTS = 256
 """Points per call of the compiled functions."""
-NOISES = 5
-"""Unit noises of a look: stop error and place in the play (pan, tilt), aperture."""
 INPUT_COLUMNS = np.array([INDEX[name] for name in (*INPUT_NAMES, *NOISE_NAMES)])
 
 
@@ -378,35 +383,15 @@ def model_from(inputs: Float[Array, " columns"], period_deg: Float[Array, "2"]) 
 
 
 def sources(calibration: Calibration, draws: int, seed: int) -> Sources:
-    """Draws of parameters, evenly chosen, with noises of their own; the same for every point of a call.
-
-    Raises:
-        InputError: a calibration without draws.
-    """
-    stored = len(calibration.inputs)
-    if stored == 0:
-        raise InputError(
-            "no-draws",
-            "this calibration keeps moments only, as exported for a robot",
-            remedy="locate from the campaign folder, or use calibration.locate, which needs no draws",
-        )
-    generator = np.random.default_rng([seed, 6])
-    # Fewer draws than are stored: evenly chosen; more: all, again and again, with new noises.
-    chosen = np.arange(draws) % stored if draws > stored else np.linspace(0, stored - 1, draws).astype(int)
-    columns = np.concatenate([calibration.inputs, calibration.noise], axis=1)[chosen]
-    normal = generator.standard_normal((draws, NOISES))
-    noise = np.column_stack([normal[:, :2], generator.uniform(-0.5, 0.5, (draws, 2)), normal[:, 4]])
-    count = len(INPUT_NAMES)
-    covariance = np.zeros((count + NOISES, count + NOISES))
-    covariance[:count, :count] = calibration.covariance
-    covariance[range(count, count + NOISES), range(count, count + NOISES)] = (1, 1, 1 / 12, 1 / 12, 1)
+    """A calibration for the compiled functions, with its draws; arguments and errors as in `calibration.drawn`."""
+    found = drawn(calibration, draws, seed)
     with jax.enable_x64(True):
         return Sources(
             mean=jnp.asarray(np.concatenate([calibration.mean, np.zeros(NOISES)])),
-            covariance=jnp.asarray(covariance),
+            covariance=jnp.asarray(calibration.covariance_with_noise),
             stop_sd_deg=jnp.asarray(np.sqrt([calibration.noise_variance[name] for name in NOISE_NAMES])),
-            inputs=jnp.asarray(columns),
-            noise=jnp.asarray(noise),
+            inputs=jnp.asarray(found.inputs),
+            noise=jnp.asarray(found.noise),
             period_deg=jnp.asarray([calibration.period_deg.get(axis, FULL_TURN_DEG) for axis in AXES]),
             azimuth_convention=jnp.asarray(calibration.azimuth),
         )
