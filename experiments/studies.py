@@ -18,18 +18,17 @@ CROSSING = 100, -20
 """Tilt while panning is the second number, pan while tilting the first."""
 
 
-def small_plan(sheets: Sequence[str], sweeps: int = 2):
-    """Both axes swept there and back `sweeps` times, 12 spots and moves per sweep and sheet, after one homing.
+def small_plan(sheets: Sequence[str]):
+    """Both axes swept there and back twice, 24 spots and moves per sheet, after one homing.
 
-    One sweep of two sheets gives six stops in every direction.
+    Two sheets give twelve stops in every direction.
     """
     from tvsbayes.campaign import PlanStep
 
     orders = [("home", 0, 0)]
     for sheet in sheets:
         orders.append(("place", None, None, sheet))
-        pans, tilts = PAN_SWEEP * sweeps, TILT_SWEEP * sweeps
-        for pan, tilt in [(p, CROSSING[1]) for p in pans] + [(CROSSING[0], t) for t in tilts]:
+        for pan, tilt in [(p, CROSSING[1]) for p in PAN_SWEEP * 2] + [(CROSSING[0], t) for t in TILT_SWEEP * 2]:
             orders += [("move", pan, tilt), ("look",)]
     return tuple(PlanStep(number, *order) for number, order in enumerate(orders))
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import sys
 import tempfile
 from collections.abc import Mapping, Sequence
@@ -62,6 +63,11 @@ def measure(bench: Bench) -> None:
         if bench.missing(COMMANDS, [warm]):
             command(fit, out / "filled")(0)
             bench.interleaved(COMMANDS, {warm: command(fit, out / "filled")})
+        report = "tvsbayes report"
+        if bench.missing(COMMANDS, [report]):
+            shutil.copytree(twin, out / "twin")
+            command(["fit", str(out / "twin"), "--no-sample", "--json"], out / "filled")(0)
+            bench.interleaved(COMMANDS, {report: command(["report", str(out / "twin"), "--json"], out / "filled")})
 
 
 def cases(rows: Sequence[Mapping]) -> list[Case]:
