@@ -14,7 +14,6 @@ from __future__ import annotations
 import json
 import os
 import time
-from dataclasses import replace
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
@@ -59,8 +58,8 @@ def compare(posterior, reference: dict[str, dict[str, float]]) -> list[str]:
 
 def stretch(joint, start: np.ndarray, path) -> tuple[float, float, float]:
     """Worst bulk effective draws, CPU and wall seconds of emcee's default move, Laplace-whitened coordinates."""
-    straight = replace(path, narrow=path.narrow[:0], bend=path.bend[:0], stretch=np.zeros_like(path.stretch))
-    whitened = straight.to_w(path.to_z(start))
+    straight = path.straight()
+    whitened = straight.to_w(path.mapped(start).z)
     walkers = 2 * len(whitened)
     generator = np.random.default_rng(3)
     whitened = np.concatenate([whitened, whitened + 0.1 * generator.standard_normal(whitened.shape)])
@@ -69,7 +68,7 @@ def stretch(joint, start: np.ndarray, path) -> tuple[float, float, float]:
     wall, cpu = time.perf_counter(), time.process_time()
     sampler.run_mcmc(state, STRETCH_STEPS, skip_initial_state_check=True)
     wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
-    kept = straight.to_z(sampler.get_chain()[STRETCH_STEPS // 4 :].reshape(-1, whitened.shape[1]))
+    kept = straight.mapped(sampler.get_chain()[STRETCH_STEPS // 4 :].reshape(-1, whitened.shape[1])).z
     kept = kept.reshape(-1, walkers, kept.shape[1])[..., np.flatnonzero(joint.free)].transpose(1, 0, 2)
     return float(np.min(array_stats.ess(kept, method="bulk", **AXES))), cpu, wall
 

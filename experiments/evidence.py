@@ -228,7 +228,7 @@ LINES = (
         lambda r: ranks(r, "clean"),
     ),
     Line(
-        "... also with six stops in every direction",
+        "... also with twelve stops in every direction",
         'python experiments/sbc.py run --variants "few stops" --n 50 --cores 0 1',
         "sbc.jsonl",
         lambda r: ranks(r, "few stops"),

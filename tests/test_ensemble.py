@@ -19,7 +19,9 @@ import pytest
 
 from tvsbayes import posterior
 from tvsbayes.campaign import four_point_protocol
-from tvsbayes.joint import JointFit, fit
+from tvsbayes.joint import JointFit, fit, linear_spots
+from tvsbayes.likelihood import stop_information
+from tvsbayes.model import INDEX
 from tvsbayes.posterior import BATCH, Independence, Target, Transport, by_width, in_batches, walkers_for
 from tvsbayes.rigs import read_rig
 from tvsbayes.simulation import simulate
@@ -28,6 +30,8 @@ SIGMAS = 5.0
 """Standard errors: a right value lies farther out in 6 of 10 million runs, and the runs are seeded."""
 RESOLVED = 0.05
 """Five standard errors of E[x.x]/d have to be below this, or the run could not see a bias of sd x0.97."""
+STOP_NAMES = (("stop_sd_deg.right", "stop_sd_deg.left"), ("stop_sd_deg.down", "stop_sd_deg.up"))
+"""By axis, in the order of `redraw_mix`."""
 ROUNDING = 2.0**-52
 """Relative spacing of float64."""
 INDEPENDENT_STEPS = {1: 1500, 5: 600, 20: 600, 40: 900}
@@ -47,6 +51,20 @@ def small_fit() -> tuple[JointFit, Transport]:
     fitted = fit(simulate(rig, four_point_protocol(repeats=4, steps=(100, 200)), seed=21).campaign)
     assert fitted.converged, fitted.problems
     return fitted, posterior.transport(fitted)
+
+
+@cache
+def small_table() -> Transport:
+    """The map of the same fit as with too many stops to follow each."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(posterior, "STATES_MAX", 0)
+        return posterior.transport(small_fit()[0])
+
+
+def small_path(whole: bool) -> Transport:
+    path = small_fit()[1] if whole else small_table()
+    assert (len(path.states) > 0) == whole == (not path.stretch.any())
+    return path
 
 
 def run(moves: object, dimension: int, steps: int, walkers: int, seed: int = 1) -> np.ndarray:
@@ -196,25 +214,27 @@ def test_coordinates_are_ordered_by_the_variance_left_to_them():
         assert np.argmax(left) == 0, place
 
 
-def test_to_w_undoes_to_z():
-    fitted, path = small_fit()
+@pytest.mark.parametrize("whole", [True, False])
+def test_to_w_undoes_the_map(whole):
+    fitted, path = small_fit()[0], small_path(whole)
     assert path.dimension == fitted.free.sum() and len(path.narrow) > 0
     w = np.random.default_rng(8).normal(size=(50, path.dimension))
-    back = path.to_w(path.to_z(w))
+    back = path.to_w(path.mapped(w).z)
     # A triangular solve amplifies rounding by the condition of the root; the shear adds terms as large as itself.
     sheared = np.abs(path.to_w(path.from_whitened(w))).max()
     assert np.abs(back - w).max() < ROUNDING * np.linalg.cond(path.root) * sheared * path.dimension
     fixed = ~fitted.free
-    np.testing.assert_array_equal(path.to_z(w)[:, fixed], np.repeat(fitted.z[None, fixed], 50, axis=0))
-    np.testing.assert_array_equal(path.to_z(np.zeros((1, path.dimension)))[0], fitted.z)
+    np.testing.assert_array_equal(path.mapped(w).z[:, fixed], np.repeat(fitted.z[None, fixed], 50, axis=0))
+    np.testing.assert_array_equal(path.mapped(np.zeros((1, path.dimension))).z[0], fitted.z)
 
 
-def test_the_jacobian_of_the_map_is_what_it_says():
-    _, path = small_fit()
+@pytest.mark.parametrize("whole", [True, False])
+def test_the_jacobian_of_the_map_is_what_it_says(whole):
+    path = small_path(whole)
     step = 1e-3
     for w in np.random.default_rng(9).normal(size=(3, path.dimension)):
         steps = step * np.eye(path.dimension)
-        slopes = (path.to_z(w + steps) - path.to_z(w - steps))[:, path.free].T / (2 * step)
+        slopes = (path.mapped(w + steps).z - path.mapped(w - steps).z)[:, path.free].T / (2 * step)
         straight = np.linalg.solve(path.root, slopes)
         assert np.abs(straight - np.eye(path.dimension)).max() > 0.1, "nothing is bent"
         sign, log_volume = np.linalg.slogdet(slopes)
@@ -222,7 +242,7 @@ def test_the_jacobian_of_the_map_is_what_it_says():
         error = (step**2 + ROUNDING / step * np.linalg.cond(path.root)) * np.abs(straight).sum()
         assert error < 1e-2
         assert sign == 1
-        expected = np.sum(np.log(np.diag(path.root))) + path.log_jacobian(w[None])[0]
+        expected = np.sum(np.log(np.diag(path.root))) + path.mapped(w[None]).log_jacobian[0]
         assert abs(log_volume - expected) < error
 
 
@@ -235,26 +255,72 @@ def test_the_shear_straightens_the_posterior():
     assert spread[0] < spread[1] / 3, spread
 
 
-def test_the_stretch_keeps_the_curvature_far_from_the_mode():
+def test_the_precision_at_other_noise_scales_is_the_smoothers():
+    """Woodbury's identity over all stop errors against the Fisher information of the filter and smoother."""
+    fitted, path = small_fit()
+    count = len(path.slope)
+    others = path.free[count:]
+    wide = path.root[count:, count:]
+    for w in np.random.default_rng(12).normal(size=(4, count)):
+        z = path.from_whitened(np.concatenate([w, np.zeros(len(others))])[None])[0]
+        with jax.enable_x64(True):
+            scales, mode = (np.asarray(fitted.space.physical(jnp.asarray(x))) for x in (z, fitted.z))
+        pixels = scales[INDEX["pixel_scale"]] / mode[INDEX["pixel_scale"]]
+        ratio = np.array([[scales[INDEX[n]] / mode[INDEX[n]] for n in sides] for sides in STOP_NAMES])
+        linear = linear_spots(fitted.linearised, fitted.arrays, -fitted.linearised.residual_jacobian)
+        spots = len(linear.residual)
+        mix = np.asarray(fitted.arrays.spots.redraw_mix)[:spots]
+        stops = np.radians(mode[[INDEX[n] for sides in STOP_NAMES for n in sides]]).reshape(2, 2) * ratio
+        variance = linear.variance.copy()
+        variance[:, :2] = np.sum(mix * stops**2, axis=2)
+        scaled = replace(linear, load=linear.load / pixels, jacobian=linear.jacobian / pixels, variance=variance)
+        expected = wide.T @ (np.eye(len(others)) + stop_information(scaled).fisher[np.ix_(others, others)]) @ wide
+        factor = path.conditional(w[None]).factor[0]
+        # The information spans ten decades in z; in y it is of order 1.
+        np.testing.assert_allclose(factor @ factor.T, expected, rtol=0, atol=1e-5 * np.abs(expected).max())
+        assert np.abs(expected - np.eye(len(others))).max() > 0.1, "the scales are those of the mode"
+
+
+def test_w_keeps_the_curvature_far_from_the_mode():
     """Where a stop scatters by four of its posterior sds more than at the mode, ratios are far wider; not in w."""
     fitted, path = small_fit()
-    straight = replace(path, stretch=np.zeros_like(path.stretch))
+    count = len(path.slope)
+    for which in np.flatnonzero(path.pixels == 0):
+        w = np.zeros((3, path.dimension))
+        w[:, which] = 4.0
+        factor = path.conditional(w[:1, :count]).factor[0]
+        # Along the direction of y that this stop sd widens most.
+        values, vectors = np.linalg.eigh(factor @ factor.T)
+        assert values[0] < 0.3
+        aside, curvature = 0.25 * vectors[:, 0], []
+        with jax.enable_x64(True):
+            for route, step in ((path, factor.T @ aside), (path.straight(), aside)):
+                moved = w.copy()
+                moved[:, count:] = np.outer([-1, 0, 1], step)
+                curvature.append(-(np.array([1, -2, 1]) @ Target(fitted, route)(moved)) / (step @ step))
+        # Of the linearised campaign; the true one is bent.
+        assert 0.5 < curvature[0] < 2, (which, curvature)
+        assert curvature[1] < 0.5, (which, curvature)
+
+
+def test_the_table_keeps_the_curvature_far_from_the_mode():
+    """The same, coordinate by coordinate."""
+    fitted, path = small_fit()[0], small_path(False)
     node = len(posterior.STRETCH_NODES) - 2
     which, place = np.unravel_index(np.argmax(path.stretch[:, node]), path.stretch[:, node].shape)
     step = 0.5 * np.eye(path.dimension)[place]
     w = np.stack([-step, np.zeros(path.dimension), step])
     w[:, path.noise[which]] = posterior.STRETCH_NODES[node]
     with jax.enable_x64(True):
-        curvature = [-(np.array([1, -2, 1]) @ Target(fitted, p)(w)) / 0.5**2 for p in (path, straight)]
+        curvature = [-(np.array([1, -2, 1]) @ Target(fitted, p)(w)) / 0.5**2 for p in (path, path.straight())]
     # The information at the node comes from one-sided steps as long: halves of their error are left.
     assert curvature[0] == pytest.approx(1.0, abs=0.3) and curvature[1] < 0.5, curvature
 
 
 def test_a_density_without_value_is_refused_and_counted(x64, monkeypatch):
     dimension, count = 3, BATCH + 5
-    none, empty = np.zeros((0, 3, 3)), np.zeros(0, int)
-    stretch = np.zeros((0, len(posterior.STRETCH_NODES), 3))
-    path = Transport(np.zeros(4), np.array([0, 1, 3]), np.eye(3), empty, none, empty, stretch)
+    path = replace(small_fit()[1].straight(), mode=np.zeros(4), free=np.array([0, 1, 3]), root=np.eye(3))
+    path = replace(path, noise=np.zeros(0, int), stretch=np.zeros((0, len(posterior.STRETCH_NODES), 3)))
     w = np.random.default_rng(11).normal(size=(count, dimension))
     without = np.array([0, 7, count - 1])
     w[without, 2] = 100.0

@@ -19,17 +19,29 @@ from tvsbayes.posterior import STRETCH_NODES, Chain, Posterior, Target, Transpor
 WALKERS, STEPS = 64, 400
 RATIO, BACKLASH = INDEX["degrees_per_step.pan"], INDEX["backlash_deg.pan"]
 STRETCH = 0.3
-"""Log of the factor on the first coordinate per unit of the second, which counts from -2 on."""
+"""Log of the factor on the second coordinate per unit of the first, which counts from -2 on."""
 AT_MODE = 7.0
 SIGMAS = 5.0
 
 
 def route() -> Transport:
-    """The map z_1 = w_1 exp(0.3 max(w_2, -2)), z_2 = w_2 at two of the parameters."""
-    stretch = STRETCH * np.array([[[node, 0.0] for node in STRETCH_NODES]])
-    none = np.zeros((0, 2, 2))
-    free, noise = np.array([RATIO, BACKLASH]), np.array([1])
-    return Transport(np.zeros(len(NAMES)), free, np.eye(2), np.zeros(0, int), none, noise, stretch)
+    """The map z_1 = w_1, z_2 = w_2 exp(0.3 max(w_1, -2)) at two of the parameters."""
+    empty = {"variance": (0, 1), "constant": (0,), "load": (1, 0), "states": (0, 0), "state_score": (0,)}
+    return Transport(
+        mode=np.zeros(len(NAMES)),
+        free=np.array([BACKLASH, RATIO]),
+        root=np.eye(2),
+        noise=np.array([0]),
+        narrow=np.zeros(0, int),
+        bend=np.zeros((0, 2, 2)),
+        slope=np.zeros((1, 1)),
+        pixels=np.zeros(1),
+        prior=np.zeros((1, 1)),
+        known=np.ones((1, 1)),
+        score=np.zeros(1),
+        stretch=STRETCH * np.array([[[0.0, node] for node in STRETCH_NODES]]),
+        **{name: np.zeros(shape) for name, shape in empty.items()},
+    )
 
 
 def fit() -> SimpleNamespace:
@@ -45,8 +57,8 @@ def log_normal_density(z: np.ndarray) -> np.ndarray:
 
 def chain_of(z: np.ndarray) -> Chain:
     """A chain (steps, walkers, 2) of z as the sampler would hold it: w, and the density that `Target` gives it."""
-    log_factor = STRETCH * np.maximum(z[..., 1], STRETCH_NODES[0])
-    w = np.stack([z[..., 0] * np.exp(-log_factor), z[..., 1]], axis=-1)
+    log_factor = STRETCH * np.maximum(z[..., 0], STRETCH_NODES[0])
+    w = np.stack([z[..., 0], z[..., 1] * np.exp(-log_factor)], axis=-1)
     log_density = -0.5 * np.sum(z**2, axis=-1) + log_factor
     accepted = np.full(z.shape[1], 0.4 * len(z))
     return Chain(w, log_density, accepted, (), 0, 1.0)
@@ -91,11 +103,11 @@ def test_the_density_of_walkers_is_the_models_times_the_jacobian(x64, monkeypatc
     monkeypatch.setattr(posterior, "evaluate", evaluate)
     w = np.random.default_rng(4).standard_normal((50, 2))
     value = Target(fit(), route())(w)
-    log_factor = STRETCH * np.maximum(w[:, 1], STRETCH_NODES[0])
-    y = w[:, 0] * np.exp(log_factor)
-    np.testing.assert_allclose(value, -0.5 * (y**2 + w[:, 1] ** 2) + log_factor, rtol=1e-12, atol=1e-12)
-    # As a density of w it has the mass of the density of z: 2 pi, on a grid that reaches 6 sds of the second.
-    one, two = np.meshgrid(np.linspace(-40, 40, 161), np.linspace(-6, 6, 25), indexing="ij")
+    log_factor = STRETCH * np.maximum(w[:, 0], STRETCH_NODES[0])
+    y = w[:, 1] * np.exp(log_factor)
+    np.testing.assert_allclose(value, -0.5 * (y**2 + w[:, 0] ** 2) + log_factor, rtol=1e-12, atol=1e-12)
+    # As a density of w it has the mass of the density of z: 2 pi, on a grid that reaches 6 sds of the first.
+    one, two = np.meshgrid(np.linspace(-6, 6, 25), np.linspace(-40, 40, 161), indexing="ij")
     value = Target(fit(), route())(np.column_stack([one.ravel(), two.ravel()]))
     assert np.exp(value).sum() * 0.5 * 0.5 == pytest.approx(2 * np.pi, rel=1e-3)
 

@@ -3,8 +3,9 @@
 emcee samples in coordinates in which the posterior is nearly standard normal. Three layers: z, the prior-normal
 coordinates of `tvsbayes.model`; y, whitened by the Laplace covariance; w, in which walkers live. Wide directions (laser
 tilt, mirror errors) bend the ridges on which the narrow ones (extrinsics, ratios) lie: a shear moves each narrow
-coordinate by a quadratic form of the wider ones. Noise scales widen what they limit (stop sd the ratios): a stretch
-scales those by a function of the noise coordinates. NumPy outside the compiled density.
+coordinate by a quadratic form of the wider ones. Noise scales widen and turn what they limit (a stop sd its ratio, the
+backlash and their sums): in w everything else is measured from the mean and by the covariance that the linearised
+campaign has at the noise scales of the walker. NumPy outside the compiled density.
 
 Arrays of draws are ordered (chain, draw, ...); a chain is a walker. Units are those of DESIGN 8 (deg, mm, px).
 Convergence is judged on the stored draws, so that what ArviZ computes from `posterior.nc` is what was judged.
@@ -18,7 +19,7 @@ import json
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from importlib.metadata import version
 from pathlib import Path
 
@@ -28,27 +29,40 @@ import jax.numpy as jnp
 import numpy as np
 import xarray as xr
 from arviz_stats.base import array_stats
-from scipy import special
+from scipy import linalg, special
 
+from tvsbayes.calibration import SIDES
 from tvsbayes.campaign import input_hashes
 from tvsbayes.classic import DIRECTIONS
 from tvsbayes.files import InputError, NotConverged, escaped, read_arrays, write_atomically
-from tvsbayes.joint import Derived, JointFit, derived_quantities
-from tvsbayes.likelihood import evaluate, move_log_density, observe_with_stop_errors, ordered_spots, spot_constants
+from tvsbayes.joint import Derived, JointFit, derived_quantities, linear_spots
+from tvsbayes.likelihood import (
+    LinearSpots,
+    evaluate,
+    move_log_density,
+    observe_with_stop_errors,
+    ordered_spots,
+    spot_constants,
+)
 from tvsbayes.model import INDEX, NAMES, NOISE_NAMES
 from tvsbayes.rigs import HARMONIC_PRIORS, HOME_SD_DEG, STEREO_PARAMETER_NAMES
 
 BATCH = 32
 """Points per call of the compiled density: half an ensemble of 64, the calls of a differential-evolution step."""
+BLOCK_ROWS = 256
+"""Points that are mapped at a time: their matrices take 64 MB at most."""
 WALKERS = 64
 NARROW = 0.05
 """Conditional posterior sd, in prior sds, below which a coordinate is moved by the shear. Wider ones would be moved
 far enough for cubic terms to matter."""
 SHEAR_STEP = 0.5
 """Step of the second differences in posterior sds: the shear should hold over +-2 sd, not only at the mode."""
+STATES_MAX = 64
+"""Most stop errors for which the whole covariance follows the noise scales of every walker. With more stops its
+matrices cost several times the density, the scales are known better, and widths from a table do."""
 STRETCH_NODES = (-2.0, 0.0, 2.0, 4.0, 6.0)
-"""Evenly spaced, in posterior sds by Laplace. With six stops in a direction the stop sd reaches the last, and ratios
-are six times as wide there as at the mode. Below the first they get no narrower: other stops limit them then."""
+"""Of that table, evenly spaced, in w of a noise coordinate. Below the first nothing gets narrower: other stops limit it
+then."""
 STRETCH_LIMITS = 1e-2, 1e2
 """Of the information of a coordinate, 1 at the mode."""
 PILOT_DRAWS = 2048
@@ -70,26 +84,77 @@ SHARES = (0.85, 0.1, 0.05)
 
 
 @dataclass(frozen=True)
+class Conditional:
+    """Geometry and cameras at given noise scales: w = factor' y - shift is standard normal.
+
+    The factor (n, g, g) of the precision of y is lower triangular; shift (n, g) = factor' x the mean of y.
+    """
+
+    factor: np.ndarray
+    shift: np.ndarray
+
+
+@dataclass(frozen=True)
+class Quadratic:
+    """A normal density by its precision (n, g, g) and its slope at nought (n, g)."""
+
+    precision: np.ndarray
+    score: np.ndarray
+
+
+@dataclass(frozen=True)
+class Mapped:
+    """Points z (n, p) and ln |dy/dw| there (n,)."""
+
+    z: np.ndarray
+    log_jacobian: np.ndarray
+
+
+@dataclass(frozen=True)
 class Transport:
-    """The map w -> z; its Jacobian is |det root| exp(`log_jacobian`).
+    """The map w -> z; its Jacobian is |det root| exp(`Mapped.log_jacobian`).
+
+    With stop errors e of variance S and pixels in units of their noise, the linearised residuals are r - J y - G e:
+    the precision of y is then prior + J'J - J'G (S^-1 + G'G)^-1 G'J (Woodbury), at any noise scales from the same
+    products. Beyond `STATES_MAX` stop errors (m = 0 here) only the widths follow, from a table for every scale.
 
     Attributes:
         mode: z at w = 0, shape (p,).
-        free: columns of z that are sampled, widest conditional sd first, shape (d,).
-        root: lower-triangular Cholesky factor of their covariance in that order, shape (d, d).
+        free: columns of z that are sampled, (d,): widest conditional sd first; if m > 0, noise coordinates before all.
+        root: lower-triangular factor of their covariance in that order, shape (d, d); if m > 0, of noise coordinates
+            and others apart, whose mean at other scales follows from r.
+        noise: places in `free` of the noise coordinates, shape (q,).
         narrow: places in `free` that the shear moves, ascending, shape (k,).
         bend: its quadratic forms, nonzero only among places before the narrow one, shape (k, d, d).
-        noise: places in `free` of the noise coordinates, shape (q,).
-        stretch: log of the factor on every place at `STRETCH_NODES` of each noise coordinate, shape (q, nodes, d).
+        stretch: if m is 0, log of the factor on every place at `STRETCH_NODES` of each noise coordinate, (q, nodes, d).
+        slope: ln of the noise scales over those at the mode, by w of the noise coordinates, shape (q, q).
+        pixels: 1 at the noise coordinate that scales all pixels, shape (q,).
+        variance: of every stop error at the mode, by the noise coordinate that scales it, shape (m, q).
+        constant: what scales with none, shape (m,).
+        prior: precision of y of the g other coordinates without data, shape (g, g).
+        known: J'J, what the data add if no stop errs, shape (g, g).
+        load: J'G, shape (g, m).
+        states: G'G, shape (m, m).
+        score, state_score: J'r, shape (g,), and G'r, shape (m,).
     """
 
     mode: np.ndarray
     free: np.ndarray
     root: np.ndarray
+    noise: np.ndarray
     narrow: np.ndarray
     bend: np.ndarray
-    noise: np.ndarray
     stretch: np.ndarray
+    slope: np.ndarray
+    pixels: np.ndarray
+    variance: np.ndarray
+    constant: np.ndarray
+    prior: np.ndarray
+    known: np.ndarray
+    load: np.ndarray
+    states: np.ndarray
+    score: np.ndarray
+    state_score: np.ndarray
 
     @property
     def dimension(self) -> int:
@@ -101,43 +166,97 @@ class Transport:
         """Coordinates of `HEAVY_NAMES`, shape (d,)."""
         return np.isin(np.array(NAMES)[self.free], HEAVY_NAMES)
 
+    def straight(self) -> Transport:
+        """The same without shear, and with the covariance of the mode everywhere: the Laplace approximation."""
+        return replace(
+            self,
+            narrow=self.narrow[:0],
+            bend=self.bend[:0],
+            stretch=np.zeros_like(self.stretch),
+            variance=self.variance[:0],
+            constant=self.constant[:0],
+            load=self.load[:, :0],
+            states=self.states[:0, :0],
+            state_score=self.state_score[:0],
+        )
+
     def from_whitened(self, y: np.ndarray) -> np.ndarray:
         """From y (n, d) to z (n, p)."""
         z = np.repeat(self.mode[None], len(y), axis=0)
         z[:, self.free] += y @ self.root.T
         return z
 
-    def log_scale(self, w: np.ndarray) -> np.ndarray:
-        """The log of the factors on w, both (..., d): straight lines between the nodes and above the last."""
-        at = (np.maximum(w[..., self.noise], STRETCH_NODES[0]) - STRETCH_NODES[0]) / (
-            STRETCH_NODES[1] - STRETCH_NODES[0]
-        )
+    def _quadratic(self, noise: np.ndarray) -> Quadratic:
+        """What the linearised campaign and the prior say of y at noise coordinates (n, q)."""
+        log_scale = noise @ self.slope.T
+        weight = np.exp(-2 * log_scale @ self.pixels)[:, None, None]
+        inner = weight * self.states
+        own = np.arange(len(self.states))
+        inner[:, own, own] += 1 / (np.exp(2 * log_scale) @ self.variance.T + self.constant)
+        right = np.column_stack([self.load.T, self.state_score])
+        solved = weight * np.linalg.solve(inner, np.broadcast_to(right, (len(noise), *right.shape)))
+        explained = weight * (self.load @ solved)
+        precision = self.prior + weight * self.known - explained[..., :-1]
+        return Quadratic(precision, weight[..., 0] * self.score - explained[..., -1])
+
+    def _log_width(self, noise: np.ndarray) -> np.ndarray:
+        """From the table, at noise coordinates (n, q), shape (n, d): lines between the nodes and above the last."""
+        first, second = STRETCH_NODES[:2]
+        at = (np.maximum(noise, first) - first) / (second - first)
         node = np.minimum(at.astype(int), len(STRETCH_NODES) - 2)
-        noise = np.arange(len(self.noise))
-        low, high = self.stretch[noise, node], self.stretch[noise, node + 1]
+        which = np.arange(len(self.noise))
+        low, high = self.stretch[which, node], self.stretch[which, node + 1]
         return np.sum(low + (at - node)[..., None] * (high - low), axis=-2)
 
-    def log_jacobian(self, w: np.ndarray) -> np.ndarray:
-        """The log of |dy/dw| at w (..., d): noise coordinates are the same in w and y, the shear keeps volumes."""
-        return self.log_scale(w).sum(axis=-1)
+    def conditional(self, noise: np.ndarray) -> Conditional:
+        """The normal density of y at noise coordinates (n, q), its mean at the mode where the scales are those.
 
-    def to_z(self, w: np.ndarray) -> np.ndarray:
-        """From w (n, d) to z (n, p)."""
-        y = w * np.exp(self.log_scale(w))
+        Without stop errors there is none: see `stretch`.
+        """
+        found, at_mode = self._quadratic(noise), self._quadratic(np.zeros((1, noise.shape[1])))
+        factor = np.linalg.cholesky(found.precision)
+        shift = np.linalg.solve(factor, (found.score - at_mode.score)[..., None])[..., 0]
+        return Conditional(factor, shift)
+
+    def mapped(self, w: np.ndarray) -> Mapped:
+        """From w (n, d) to z with the Jacobian; noise coordinates are the same in w and y, the shear keeps volumes."""
+        blocks = [self._mapped(block) for block in np.split(w, range(BLOCK_ROWS, len(w), BLOCK_ROWS))]
+        return Mapped(*(np.concatenate([getattr(b, f.name) for b in blocks]) for f in fields(Mapped)))
+
+    def _mapped(self, w: np.ndarray) -> Mapped:
+        count = len(self.noise)
+        noise, y = w[:, self.noise], w.copy()
+        if len(self.states):
+            found = self.conditional(noise)
+            straight = (w[:, count:] + found.shift)[..., None]
+            y[:, count:] = np.linalg.solve(np.swapaxes(found.factor, 1, 2), straight)[..., 0]
+            log_jacobian = -np.log(np.diagonal(found.factor, axis1=1, axis2=2)).sum(axis=1)
+        else:
+            log_width = self._log_width(noise)
+            y *= np.exp(log_width)
+            log_jacobian = log_width.sum(axis=1)
         for place, form in zip(self.narrow, self.bend, strict=True):
             before = y[:, :place]
             y[:, place] -= 0.5 * np.sum((before @ form[:place, :place]) * before, axis=1)
-        return self.from_whitened(y)
+        return Mapped(self.from_whitened(y), log_jacobian)
 
     def to_w(self, z: np.ndarray) -> np.ndarray:
-        """From z (n, p) to w (n, d); the inverse of `to_z` on the sampled columns."""
+        """From z (n, p) to w (n, d); the inverse of `mapped` on the sampled columns."""
         y = np.linalg.solve(self.root, (z - self.mode)[:, self.free].T).T
         straight = y.copy()
         for place, form in zip(self.narrow, self.bend, strict=True):
             before = y[:, :place]
             straight[:, place] += 0.5 * np.sum((before @ form[:place, :place]) * before, axis=1)
-        # Noise coordinates are neither bent nor stretched: they are known before anything is undone.
-        return straight * np.exp(-self.log_scale(straight))
+        # Noise coordinates are neither bent nor turned nor stretched: they are known before anything is undone.
+        count = len(self.noise)
+        noise = straight[:, self.noise]
+        if len(self.states):
+            found = self.conditional(noise)
+            turned = np.swapaxes(found.factor, 1, 2) @ straight[:, count:, None]
+            straight[:, count:] = turned[..., 0] - found.shift
+        else:
+            straight *= np.exp(-self._log_width(noise))
+        return straight
 
 
 def in_batches(function: Callable[[np.ndarray], object], points: np.ndarray, size: int = BATCH) -> object:
@@ -168,8 +287,48 @@ def by_width(covariance: np.ndarray) -> np.ndarray:
     return np.array(order)
 
 
+@dataclass(frozen=True)
+class StopStates:
+    """Every stop error, home offset and place in the play that a campaign drew, one column each.
+
+    Attributes:
+        load: d(predicted)/d(state) of the spots' components, shape (4 n, m).
+        variance: at the fit's noise scales, by direction (right, left, down, up), shape (m, 4).
+        constant: of states of another kind, shape (m,).
+    """
+
+    load: np.ndarray
+    variance: np.ndarray
+    constant: np.ndarray
+
+
+def stop_states(fit: JointFit, linear: LinearSpots) -> StopStates:
+    """Unroll the filter's six states: a column for each time that one is drawn anew."""
+    spots, states = linear.load.shape[0], linear.load.shape[2]
+    mix = np.asarray(fit.arrays.spots.redraw_mix)[:spots]
+    sd_deg = fit.mode.physical[[INDEX[f"stop_sd_deg.{name}"] for axis in SIDES for name in SIDES[axis]]]
+    variance_of = np.radians(sd_deg).reshape(2, 2) ** 2
+    columns, variance, constant = [], [], []
+    for state in range(states):
+        drawn = np.flatnonzero(linear.renewed[:, state])
+        for begin, end in zip(drawn, [*drawn[1:], spots], strict=True):
+            column = np.zeros((spots, 4))
+            column[begin:end] = linear.load[begin:end, :, state]
+            by_direction = np.zeros((2, 2))
+            if state < 2:
+                by_direction[state] = mix[begin, state] * variance_of[state]
+            rest = 0.0 if state < 2 else linear.variance[begin, state]
+            if column.any() and by_direction.sum() + rest > 0:
+                columns.append(column.ravel())
+                variance.append(by_direction.ravel())
+                constant.append(rest)
+    count = len(columns)
+    load = np.array(columns).reshape(count, 4 * spots).T
+    return StopStates(load, np.array(variance).reshape(count, 4), np.array(constant))
+
+
 def transport(fit: JointFit) -> Transport:
-    """Measure the bend of the ridges at a fit's mode, and how wide they are at other noise scales.
+    """Measure the bend of the ridges at a fit's mode, and how the noise scales set the covariance.
 
     With r the standardised innovations and J their Jacobian in y, the narrow coordinate k has its optimum shifted by
     -y (J_k . d2r/dy2) y / 2: in y the Gauss-Newton Hessian is the identity. Second differences of r, all pairs in
@@ -181,40 +340,79 @@ def transport(fit: JointFit) -> Transport:
     Returns:
         The map; the noise scales take no part in the shear.
     """
+    names = np.array(NAMES)
+    linear = linear_spots(fit.linearised, fit.arrays, -fit.linearised.residual_jacobian)
+    stops = stop_states(fit, linear)
+    whole = 0 < len(stops.constant) <= STATES_MAX
     free = np.flatnonzero(fit.free)
-    free = free[by_width(fit.covariance[np.ix_(free, free)])]
-    root = np.linalg.cholesky(fit.covariance[np.ix_(free, free)])
+    scales = np.isin(names[free], NOISE_NAMES)
+    if whole:
+        others = free[~scales]
+        covariance = np.linalg.inv(np.eye(len(others)) + fit.information.fisher[np.ix_(others, others)])
+        order = by_width(covariance)
+        free = np.concatenate([free[scales], others[order]])
+        root = linalg.block_diag(
+            np.linalg.cholesky(fit.covariance[np.ix_(free[: scales.sum()], free[: scales.sum()])]),
+            np.linalg.cholesky(covariance[np.ix_(order, order)]),
+        )
+    else:
+        free = free[by_width(fit.covariance[np.ix_(free, free)])]
+        root = np.linalg.cholesky(fit.covariance[np.ix_(free, free)])
+    scales = np.isin(names[free], NOISE_NAMES)
+    noise, geometry = np.flatnonzero(scales), np.flatnonzero(~scales)
+    narrow = np.flatnonzero((np.diag(root) < NARROW) & ~scales)
+    wide = root[np.ix_(geometry, geometry)]
+    jacobian = linear.jacobian.reshape(-1, len(names))[:, free[geometry]] @ wide
+    residual = linear.residual.ravel()
+    directions = [f"stop_sd_deg.{name}" for axis in SIDES for name in SIDES[axis]]
+    of_noise = np.array([[name == names[free[place]] for place in noise] for name in directions]).reshape(4, -1)
     count = len(free)
-    is_noise = np.isin(np.array(NAMES)[free], NOISE_NAMES)
-    geometry = np.flatnonzero(~is_noise)
-    narrow = np.flatnonzero((np.diag(root) < NARROW) & ~is_noise)
-    noise = np.flatnonzero(is_noise)
-    flat = np.zeros((len(noise), len(STRETCH_NODES), count))
-    straight = Transport(fit.z, free, root, narrow[:0], np.zeros((0, count, count)), noise, flat)
+    route = Transport(
+        mode=fit.z,
+        free=free,
+        root=root,
+        noise=noise,
+        narrow=narrow,
+        bend=np.zeros((len(narrow), count, count)),
+        stretch=np.zeros((len(noise), len(STRETCH_NODES), count)),
+        slope=np.asarray(fit.space.u)[free[noise]][:, None] * root[np.ix_(noise, noise)],
+        pixels=(names[free[noise]] == "pixel_scale").astype(float),
+        variance=stops.variance @ of_noise,
+        # Stop errors whose sd is not estimated keep their variance.
+        constant=stops.constant + stops.variance @ ~of_noise.any(axis=1),
+        prior=wide.T @ wide,
+        known=jacobian.T @ jacobian,
+        load=jacobian.T @ stops.load,
+        states=stops.load.T @ stops.load,
+        score=jacobian.T @ residual,
+        state_score=stops.load.T @ residual,
+    )
+    plain = route.straight()
+    if not whole:
+        route = replace(plain, narrow=route.narrow, bend=route.bend)
 
     def residuals(y: np.ndarray) -> np.ndarray:
-        seen = in_batches(lambda z: evaluate(z, fit.space, fit.arrays).standardised, straight.from_whitened(y))
+        seen = in_batches(lambda z: evaluate(z, fit.space, fit.arrays).standardised, plain.from_whitened(y))
         return np.nan_to_num(seen.reshape(len(y), -1))
 
+    bend, stretch = route.bend, route.stretch
     with jax.enable_x64(True):
         steps = SHEAR_STEP * np.eye(count)
         centre = residuals(np.zeros((1, count)))[0]
         ahead, behind = residuals(steps), residuals(-steps)
-        jacobian = (ahead - behind)[narrow] / (2 * SHEAR_STEP)
-        own = (ahead + behind - 2 * centre) @ jacobian.T / SHEAR_STEP**2
-        bend = np.zeros((len(narrow), count, count))
+        slopes = (ahead - behind)[narrow] / (2 * SHEAR_STEP)
+        own = (ahead + behind - 2 * centre) @ slopes.T / SHEAR_STEP**2
         bend[:, geometry, geometry] = own[geometry].T
         pairs = np.array([(i, j) for i in geometry for j in geometry if j < i]).reshape(-1, 2)
         for some in np.array_split(pairs, max(1, len(pairs) // 256)):
             y = np.zeros((len(some), count))
             np.put_along_axis(y, some, SHEAR_STEP, axis=1)
             both = residuals(np.concatenate([y, -y]))
-            curvature = (both[: len(some)] + both[len(some) :] - 2 * centre) @ jacobian.T / SHEAR_STEP**2
+            curvature = (both[: len(some)] + both[len(some) :] - 2 * centre) @ slopes.T / SHEAR_STEP**2
             mixed = 0.5 * (curvature - own[some[:, 0]] - own[some[:, 1]])
             bend[:, some[:, 0], some[:, 1]] = bend[:, some[:, 1], some[:, 0]] = mixed.T
         # The data's share of the information 1 of each coordinate, as a noise coordinate goes up or down.
-        stretch = flat.copy()
-        for which, place in enumerate(noise):
+        for which, place in enumerate(noise if not whole else ()):
             later = geometry[geometry > place]
             shares = []
             for node in STRETCH_NODES:
@@ -227,7 +425,7 @@ def transport(fit: JointFit) -> Transport:
             stretch[which][:, later] = -0.5 * np.log(np.clip(1 + change, *STRETCH_LIMITS))
     for place, form in zip(narrow, bend, strict=True):
         form[place:], form[:, place:] = 0.0, 0.0
-    return Transport(fit.z, free, root, narrow, bend, noise, stretch)
+    return route
 
 
 class Target:
@@ -239,11 +437,11 @@ class Target:
 
     def __call__(self, w: np.ndarray) -> np.ndarray:
         """Log density of w (n, d), relative to z's at the mode; -inf where the model has no value."""
-        z = self.path.to_z(w)
-        value = in_batches(lambda block: evaluate(block, self.fit.space, self.fit.arrays).log_density, z)
+        found = self.path.mapped(w)
+        value = in_batches(lambda block: evaluate(block, self.fit.space, self.fit.arrays).log_density, found.z)
         invalid = np.isnan(value)
         self.invalid += int(invalid.sum())
-        return np.where(invalid, -np.inf, value - self.fit.log_density + self.path.log_jacobian(w))
+        return np.where(invalid, -np.inf, value - self.fit.log_density + found.log_jacobian)
 
 
 def _t_constant(dimension: int) -> float:
@@ -363,7 +561,7 @@ def pilot(target: Target, seed: int) -> Pilot:
     return Pilot(proposal, start, log_weights)
 
 
-CHAIN_FORMAT = "tvsbayes-chain/2"
+CHAIN_FORMAT = "tvsbayes-chain/3"
 CHAIN_BYTES_MAX = 2**32
 """A chain is the user's own file: what was in memory when it was written fits there again."""
 POSTERIOR_FORMAT = "tvsbayes-posterior/1"
@@ -1005,8 +1203,9 @@ def diagnose(fit: JointFit, route: Transport, start: Pilot, chain: Chain, seed: 
     thin = max(1, len(kept) // STORED_DRAWS)
     stored = kept[::thin].transpose(1, 0, 2)
     walkers, draws, dimension = stored.shape
-    z = route.to_z(stored.reshape(-1, dimension)).reshape(walkers, draws, -1)
-    log_density = chain.log_density[discarded:][::thin].T + fit.log_density - route.log_jacobian(stored)
+    found = route.mapped(stored.reshape(-1, dimension))
+    z = found.z.reshape(walkers, draws, -1)
+    log_density = chain.log_density[discarded:][::thin].T + fit.log_density - found.log_jacobian.reshape(walkers, draws)
     derived = derived_at(fit, z, fit.reference_pose_rad)
     columns = {**Draws(derived), "log_density": log_density.ravel()}
     fixed = {NAMES[i] for i in np.flatnonzero(~fit.free)}
