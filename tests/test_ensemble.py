@@ -281,6 +281,18 @@ def test_the_precision_at_other_noise_scales_is_the_smoothers():
         assert np.abs(expected - np.eye(len(others))).max() > 0.1, "the scales are those of the mode"
 
 
+def test_too_many_stop_errors_get_no_columns(monkeypatch):
+    """A campaign of ten thousand spots would need gigabytes for them."""
+    fitted, path = small_fit()
+    linear = linear_spots(fitted.linearised, fitted.arrays, -fitted.linearised.residual_jacobian)
+    count = len(path.constant)
+    assert posterior.stop_states(fitted, linear).load.shape == (4 * len(linear.residual), count)
+    monkeypatch.setattr(posterior, "STATES_MAX", count - 1)
+    found = posterior.stop_states(fitted, linear)
+    assert found.load.shape == (4 * len(linear.residual), 0)
+    assert found.variance.shape == (0, 4) and found.constant.shape == (0,)
+
+
 def test_w_keeps_the_curvature_far_from_the_mode():
     """Where a stop scatters by four of its posterior sds more than at the mode, ratios are far wider; not in w."""
     fitted, path = small_fit()

@@ -20,6 +20,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, fields, replace
+from functools import cached_property
 from importlib.metadata import version
 from pathlib import Path
 
@@ -208,14 +209,18 @@ class Transport:
         low, high = self.stretch[which, node], self.stretch[which, node + 1]
         return np.sum(low + (at - node)[..., None] * (high - low), axis=-2)
 
+    @cached_property
+    def _score_at_mode(self) -> np.ndarray:
+        return self._quadratic(np.zeros((1, len(self.noise)))).score
+
     def conditional(self, noise: np.ndarray) -> Conditional:
         """The normal density of y at noise coordinates (n, q), its mean at the mode where the scales are those.
 
         Without stop errors there is none: see `stretch`.
         """
-        found, at_mode = self._quadratic(noise), self._quadratic(np.zeros((1, noise.shape[1])))
+        found = self._quadratic(noise)
         factor = np.linalg.cholesky(found.precision)
-        shift = np.linalg.solve(factor, (found.score - at_mode.score)[..., None])[..., 0]
+        shift = np.linalg.solve(factor, (found.score - self._score_at_mode)[..., None])[..., 0]
         return Conditional(factor, shift)
 
     def mapped(self, w: np.ndarray) -> Mapped:
@@ -303,28 +308,30 @@ class StopStates:
 
 
 def stop_states(fit: JointFit, linear: LinearSpots) -> StopStates:
-    """Unroll the filter's six states: a column for each time that one is drawn anew."""
+    """Unroll the filter's six states: a column for each time that one is drawn anew; none beyond `STATES_MAX`."""
     spots, states = linear.load.shape[0], linear.load.shape[2]
     mix = np.asarray(fit.arrays.spots.redraw_mix)[:spots]
     sd_deg = fit.mode.physical[[INDEX[f"stop_sd_deg.{name}"] for axis in SIDES for name in SIDES[axis]]]
     variance_of = np.radians(sd_deg).reshape(2, 2) ** 2
-    columns, variance, constant = [], [], []
+    places, variance, constant = [], [], []
     for state in range(states):
         drawn = np.flatnonzero(linear.renewed[:, state])
         for begin, end in zip(drawn, [*drawn[1:], spots], strict=True):
-            column = np.zeros((spots, 4))
-            column[begin:end] = linear.load[begin:end, :, state]
             by_direction = np.zeros((2, 2))
             if state < 2:
                 by_direction[state] = mix[begin, state] * variance_of[state]
             rest = 0.0 if state < 2 else linear.variance[begin, state]
-            if column.any() and by_direction.sum() + rest > 0:
-                columns.append(column.ravel())
+            if linear.load[begin:end, :, state].any() and by_direction.sum() + rest > 0:
+                places.append((slice(begin, end), state))
                 variance.append(by_direction.ravel())
                 constant.append(rest)
-    count = len(columns)
-    load = np.array(columns).reshape(count, 4 * spots).T
-    return StopStates(load, np.array(variance).reshape(count, 4), np.array(constant))
+    # Columns of every state of a long campaign would fill the memory.
+    count = len(places) if len(places) <= STATES_MAX else 0
+    load = np.zeros((spots, 4, count))
+    for column, (rows, state) in enumerate(places[:count]):
+        load[rows, :, column] = linear.load[rows, :, state]
+    variances = np.array(variance[:count]).reshape(count, 4)
+    return StopStates(load.reshape(4 * spots, count), variances, np.array(constant[:count]))
 
 
 def transport(fit: JointFit) -> Transport:
@@ -343,7 +350,7 @@ def transport(fit: JointFit) -> Transport:
     names = np.array(NAMES)
     linear = linear_spots(fit.linearised, fit.arrays, -fit.linearised.residual_jacobian)
     stops = stop_states(fit, linear)
-    whole = 0 < len(stops.constant) <= STATES_MAX
+    whole = len(stops.constant) > 0
     free = np.flatnonzero(fit.free)
     scales = np.isin(names[free], NOISE_NAMES)
     if whole:
@@ -388,8 +395,6 @@ def transport(fit: JointFit) -> Transport:
         state_score=stops.load.T @ residual,
     )
     plain = route.straight()
-    if not whole:
-        route = replace(plain, narrow=route.narrow, bend=route.bend)
 
     def residuals(y: np.ndarray) -> np.ndarray:
         seen = in_batches(lambda z: evaluate(z, fit.space, fit.arrays).standardised, plain.from_whitened(y))
