@@ -283,7 +283,8 @@ class Calibration:
         """Whether the campaign reached these counters."""
         return all(low <= n <= high for n, (low, high) in zip((pan_steps, tilt_steps), self.range_steps, strict=True))
 
-    def _angles(self, values: Mapping[str, object], steps: tuple, sides: tuple, m=np) -> tuple:
+    def angles(self, values: Mapping[str, object], steps: tuple, sides: tuple, m=np) -> tuple:
+        """Mirror angles (pan, tilt) of parameters by name at counters and approach sides; `m` as in `output_deg`."""
         return tuple(
             output_deg(values, axis, n, side, self.period_deg.get(axis), m)
             for axis, n, side in zip(AXES, steps, sides, strict=True)
@@ -300,7 +301,7 @@ class Calibration:
         Raises:
             InputError: an approach that does not exist.
         """
-        angles = self._angles(self.estimates, (pan_steps, tilt_steps), sides_of(approach), math)
+        angles = self.angles(self.estimates, (pan_steps, tilt_steps), sides_of(approach), math)
         origin, direction = beam_components(self.estimates, *angles, math)
         return Ray(np.array(origin), np.array(direction))
 
@@ -355,7 +356,7 @@ class Calibration:
         if all(map(math.isfinite, (pan_steps, tilt_steps, aperture_deg))) and not self.azimuth:
             values = self.estimates
             origin, direction = beam_components(
-                values, *self._angles(values, (pan_steps, tilt_steps), sides, math), math
+                values, *self.angles(values, (pan_steps, tilt_steps), sides, math), math
             )
             true_deg = aperture_deg - values["aperture_zero_deg"]
             if math.isnan(range_components(origin, direction, values["baseline_mm"], true_deg, False, math)):

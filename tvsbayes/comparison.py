@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tvsbayes.calibration import (
-    AXES,
     DIVERGING_SHARE,
     INPUT_NAMES,
     NOISE_NAMES,
@@ -26,7 +25,6 @@ from tvsbayes.calibration import (
     beam_components,
     direction_of,
     drawn,
-    output_deg,
     range_components,
     stored_ratios,
 )
@@ -155,11 +153,8 @@ def error_map(
     reading = aperture_angle_deg(tuple(points), values["baseline_mm"], calibration.azimuth)
     reading = reading + values["aperture_zero_deg"] + values["aperture_sd_deg"] * noise[4]
     best = calibration.estimates
-    angles = (
-        output_deg(best, axis, steps[:, k], approach[k], calibration.period_deg.get(axis))
-        for k, axis in enumerate(AXES)
-    )
-    looks = {"joint": (*beam_components(best, *angles), best["baseline_mm"], best["aperture_zero_deg"])}
+    beam = beam_components(best, *calibration.angles(best, (pan, tilt), approach))
+    looks = {"joint": (*beam, best["baseline_mm"], best["aperture_zero_deg"])}
     for name, one in simple.items():
         ray = simple_rays(one, steps)
         # `range_components` puts the aperture at half the distance it is given; a simple user's stands at origin -
