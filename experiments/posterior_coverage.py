@@ -43,7 +43,7 @@ OUTLIER_SDS = 10.0
 PINION_DEG, PINION_PERIOD_DEG = 0.1, 36.0
 SHEETS = ("d1", "d2", "d3", "d2")
 MAX_MINUTES = 10.0
-SMALL = {CLEAN: "60 spots, about 30 stops in every direction", FEW: "24 spots, six stops in every direction"}
+SMALL = {CLEAN: "60 spots, about 30 stops in every direction", FEW: "48 spots, twelve stops in every direction"}
 SMALL_HEADLINES = (
     *(f"effective_deg_per_step.{d}" for d in ("left", "right", "up", "down")),
     *("ratio_contrast_deg_per_step.pan", "ratio_contrast_deg_per_step.tilt", "backlash_deg.pan", "backlash_deg.tilt"),

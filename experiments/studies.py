@@ -154,7 +154,7 @@ def fit_from_truth(campaign, truth):
         z = np.where(problem.free, np.clip(coordinates(problem.space, physical_of(truth)[None])[0], -4.0, 4.0), 0.0)
         mode = joint.newton_mode(problem.objective, z, problem.free, problem.curvature(z))
         if not mode.problems:
-            return joint._result(campaign, problem, mode, np.ones(len(problem.spots), dtype=bool), 0)
+            return joint.fit_at(campaign, problem, mode, 0)
     return joint.fit(campaign)
 
 

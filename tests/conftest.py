@@ -27,6 +27,28 @@ from tvsbayes.rigs import Rig, read_rig
 from tvsbayes.simulation import SimulatedCampaign, Truth, simulate
 
 ROOT = Path(__file__).resolve().parents[1]
+COMPILES = "test_cli.py"
+LONG = (
+    *("test_planning.py", "test_report_html.py", "test_posterior.py", "test_gap.py", "test_information.py"),
+    *("test_ensemble.py", "test_solver.py", "test_likelihood.py", "test_comparison.py", "test_stops.py"),
+    *("test_stereo_calibration.py", "test_coordinates.py", "test_joint.py", "test_studies.py", "test_locate.py"),
+    *("test_calibration.py", "test_propagation.py", "test_readme.py", "test_positioner.py", "test_twins.py"),
+)
+"""Files that compile the model or much of it, about ten seconds or more, roughly the longest first."""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Order the files for two processes that take one file after the other.
+
+    One compiles the model while the other is at what needs no model, and then reads it from the cache; the long files
+    follow, so that neither is left alone with one at the end.
+    """
+
+    def turn(item: pytest.Item) -> int:
+        name = item.path.name
+        return 0 if name == COMPILES else 2 + LONG.index(name) if name in LONG else 1
+
+    items.sort(key=turn)
 
 
 @pytest.fixture

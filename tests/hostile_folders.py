@@ -511,6 +511,14 @@ CRAFTED: dict[str, Crafted] = {
     "rig file of brackets": Crafted(
         "TOML", written("rig.toml", "a = " + "{b = " * 10_000), ("check @/rig.toml", "plan @/rig.toml --given @")
     ),
+    "rig file whose port writes a file": Crafted(
+        "TOML",
+        lambda folder: (folder / "rig.toml").write_text(
+            (folder / "rig.toml").read_text()
+            + '\n[positioner]\ndriver = "teensy"\nport = "spy:///dev/ptmx?file=spied.txt"\n'
+        ),
+        ("check @/rig.toml", "doctor @/rig.toml"),
+    ),
     "json with NaN": Crafted("JSON", swapped("stereo.json", "802.0", "NaN"), ESTIMATE),
     "json with 1e999": Crafted("JSON", swapped("stereo.json", "802.0", "1e999"), READ),
     "json key twice": Crafted("JSON", swapped("stereo.json", '"rms_px"', '"T"'), READ),

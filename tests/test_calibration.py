@@ -54,7 +54,7 @@ from tvsbayes.calibration import (
 from tvsbayes.campaign import input_hashes
 from tvsbayes.coordinates import carry, locate_linear, meeting, settings_of, sources
 from tvsbayes.files import InputError
-from tvsbayes.rigs import HARMONIC_PRIORS
+from tvsbayes.rigs import HARMONIC_PRIORS, Prior
 
 ROUNDING_MM = 1e-9
 """Of a hundred operations on lengths up to 1000 mm, magnified tenfold by a grazing line of sight."""
@@ -415,6 +415,16 @@ def test_calibration_of_draws_takes_its_columns():
     assert (play_steps <= least).mean() >= 0.99 > (play_steps <= least - 1).mean()
 
 
+def test_the_apertures_noise_takes_its_prior_without_readings():
+    """A sampler holds it still; its log-normal prior has E s^2 = m^2 exp(2 u^2)."""
+    campaign = small_campaign()
+    priors = campaign.rig.priors | {"aperture_sd_deg": Prior(0.02, 0.8, "log-normal")}
+    unread = tuple(replace(spot, aperture_deg=None) for spot in campaign.spots)
+    one = drawn(replace(campaign, spots=unread, rig=replace(campaign.rig, priors=priors)))[1]
+    # 4000 draws of exp(1.6 w): sd of the mean is sqrt(exp(2.56) - 1) / sqrt(4000) = 5.5 % of it.
+    assert one.noise_variance["aperture_sd_deg"] == pytest.approx(0.02**2 * np.exp(2 * 0.8**2), rel=4 * 0.055)
+
+
 def test_what_only_readings_tell_takes_its_prior_without_them():
     campaign = small_campaign()
     silent = replace(campaign, spots=tuple(replace(s, aperture_deg=None) for s in campaign.spots))
@@ -428,14 +438,16 @@ def test_what_only_readings_tell_takes_its_prior_without_them():
     np.testing.assert_array_equal(one.inputs, again.inputs)
 
 
-def same(one: Calibration, other: Calibration, without: tuple[str, ...] = ()) -> None:
-    for name in (f.name for f in fields(Calibration) if f.name not in without):
-        a, b = getattr(one, name), getattr(other, name)
+def differing(one: Calibration, other: Calibration, without: tuple[str, ...] = ()) -> list[str]:
+    """Names of the fields that are not the same to the last bit, arrays in float64."""
+
+    def equal(a: object, b: object) -> bool:
         if isinstance(a, np.ndarray):
-            np.testing.assert_array_equal(a, b)
-            assert b.dtype == np.float64
-        else:
-            assert a == b, name
+            return b.dtype == np.float64 and np.array_equal(a, b)
+        return a == b
+
+    names = (f.name for f in fields(Calibration) if f.name not in without)
+    return [name for name in names if not equal(getattr(one, name), getattr(other, name))]
 
 
 def complete() -> Calibration:
@@ -451,7 +463,7 @@ def test_draws_file_brings_everything_back(tmp_path):
     path = tmp_path / "results" / "draws.npz"
     path.write_bytes(calibration_bytes(one, physical=np.zeros((3, 65))))
     for asked in (tmp_path, str(tmp_path), tmp_path / "results", path):
-        same(one, load_calibration(asked))
+        assert differing(one, load_calibration(asked)) == []
 
 
 def test_results_without_a_calibration_are_no_damage(tmp_path):
@@ -471,7 +483,7 @@ def test_json_export_brings_back_all_but_the_draws(tmp_path):
     path = tmp_path / "robot.json"
     path.write_text(json.dumps(calibration_json(one), allow_nan=False))
     other = load_calibration(path)
-    same(one, other, without=("inputs", "noise", "causes", "cause_covariance"))
+    assert differing(one, other, without=("inputs", "noise", "causes", "cause_covariance")) == []
     assert len(other.inputs) == len(other.noise) == len(other.causes) == 0
     assert other.locate(100, 50, 75.0).u95_mm == pytest.approx(one.locate(100, 50, 75.0).u95_mm, rel=ROUNDING)
     assert other.steps_for((600, 0, 0)).as_json() == one.steps_for((600, 0, 0)).as_json()
@@ -624,7 +636,7 @@ def test_stored_calibration_is_that_of_these_data(tmp_path):
     path = tmp_path / "results" / "draws.npz"
     one = replace(complete(), inputs_sha256=input_hashes(campaign))
     path.write_bytes(calibration_bytes(one))
-    same(one, stored_calibration(campaign))
+    assert differing(one, stored_calibration(campaign)) == []
     for name in one.inputs_sha256:
         path.write_bytes(calibration_bytes(replace(one, inputs_sha256=one.inputs_sha256 | {name: "f" * 64})))
         assert stored_calibration(campaign) is None, name

@@ -63,6 +63,22 @@ def test_numpy_scalars_are_written_as_numbers(tmp_path):
     assert_same(numpy_like, read_campaign(tmp_path / "c"))
 
 
+def test_a_look_that_found_nothing_may_be_taken_again(tmp_path):
+    """The same point of the experiment, and its correlations empty like its pixels; `classic` takes the one seen."""
+    campaign = small_campaign()
+    lost = dataclasses.replace(campaign.spots[6], experiment=3, point=1)
+    write_campaign(dataclasses.replace(campaign, spots=(*campaign.spots[:6], lost)), tmp_path / "c")
+    table = tmp_path / "c" / "spots.csv"
+    header, *rows = table.read_text().splitlines()
+    column = header.split(",").index("ruv_right")
+    cells = rows[-1].split(",")
+    assert cells[column] == "-0.5" and "undetected" in cells
+    cells[column] = ""
+    table.write_text("\n".join([header, *rows[:-1], ",".join(cells)]) + "\n")
+    again = read_campaign(tmp_path / "c").spots[-1]
+    assert (again.experiment, again.point, again.ruv_right) == (3, 1, 0.0)
+
+
 def test_write_refuses_a_folder_with_files(tmp_path):
     (tmp_path / "notes.txt").write_text("mine")
     with pytest.raises(InputError, match="nothing is overwritten"):

@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import shutil
 import subprocess
 import sys
 from dataclasses import replace
@@ -18,9 +19,20 @@ import numpy as np
 import pytest
 from test_schema import problems
 
-from tvsbayes.campaign import Campaign, PlanStep, grid_protocol, read_campaign, write_campaign, write_plan
+from tvsbayes import cli
+from tvsbayes.campaign import (
+    Campaign,
+    PlanStep,
+    grid_protocol,
+    mixed_protocol,
+    read_campaign,
+    write_campaign,
+    write_plan,
+)
+from tvsbayes.classic import select_experiments
 from tvsbayes.cli import run
 from tvsbayes.files import shipped_data
+from tvsbayes.rigs import Prior
 from tvsbayes.simulation import simulate
 
 DATA = shipped_data()
@@ -330,6 +342,31 @@ def test_per_axis_fit_has_one_gear_ratio_per_axis(ask, folder):
     assert (contrast["value"], contrast["sd"], contrast["prior_sd"], contrast["contraction"]) == (0.0, 0.0, 0.0, None)
 
 
+def test_what_a_fit_left_is_taken_up_again(folder, monkeypatch):
+    """`compare` and `plan --given` start from results/ (DESIGN 8): the same model, mode and draws, no second fit."""
+    from tvsbayes.calibration import stored_mode
+    from tvsbayes.information import calibration_of, summarise
+    from tvsbayes.joint import fit, restored
+    from tvsbayes.report import write_results
+
+    campaign = read_campaign(folder)
+    assert stored_mode(campaign) is None
+    fresh = fit(campaign, per_axis=True)
+    write_results(fresh, summarise(fresh), folder / "results", 0, calibration_of(fresh))
+    back = restored(campaign, stored_mode(campaign))
+    for name in ("z", "covariance", "draws_z", "free", "reference_pose_rad"):
+        np.testing.assert_array_equal(getattr(back, name), getattr(fresh, name))
+    np.testing.assert_array_equal(back.draws.effective_deg_per_step, fresh.draws.effective_deg_per_step)
+    assert (back.converged, back.log_density, back.chi2) == (True, fresh.log_density, fresh.chi2)
+    monkeypatch.setattr("tvsbayes.joint.fit", None)
+    assert cli._fit_of(campaign).converged
+    (folder / "moves.csv").write_bytes((folder / "moves.csv").read_bytes() + b"\n")
+    assert stored_mode(read_campaign(folder)) is not None, "a blank line changes nothing that was measured"
+    spots = (folder / "spots.csv").read_text().replace("d2", "d3")
+    (folder / "spots.csv").write_text(spots)
+    assert stored_mode(read_campaign(folder)) is None
+
+
 def test_fit_without_backlash_and_with_harmonics(ask, small, folder, tmp_path):
     code, document = ask("fit", folder, "--no-sample", "--harmonics")
     assert code == 2 and "harmonic_period_deg.pan" in document["error"]["remedy"]
@@ -385,6 +422,86 @@ def test_spots_at_one_stop_inform_no_headline(ask, mounted_rig, tmp_path):
     assert_error(document, "uninformed")
     # The document is there all the same, and says where the values come from.
     assert all(e["contraction"] < 0.1 for e in document["effective_deg_per_step"].values())
+
+
+def with_spots(campaign: Campaign, change) -> Campaign:
+    """Every spot changed."""
+    return replace(campaign, spots=tuple(map(change, campaign.spots)))
+
+
+def test_swapped_cameras_end_in_words_and_files(ask, mounted_rig, tmp_path):
+    """Predicted pixels beyond the lens model, draws far out: no number that JSON cannot hold."""
+
+    def swapped(s):
+        left, right = (s.u_left_px, s.v_left_px), (s.u_right_px, s.v_right_px)
+        changed = zip(("u_left_px", "v_left_px", "u_right_px", "v_right_px"), (*right, *left), strict=True)
+        return replace(s, **dict(changed))
+
+    four = simulate(mounted_rig, mixed_protocol(4), seed=3).campaign
+    write_campaign(with_spots(four, swapped), tmp_path / "swapped")
+    code, document = ask("fit", tmp_path / "swapped", "--no-sample")
+    assert code == 4 and "swapped cameras" in document["error"]["remedy"]
+    saved = json.loads((tmp_path / "swapped" / "results" / "fit.json").read_text(), parse_constant=no_constant)
+    assert problems(saved, json.loads((DATA / "schemas" / "fit-1.schema.json").read_text())) == []
+
+
+def test_a_spot_beyond_the_lens_and_one_twice_cost_themselves_only(ask, mounted_rig, tmp_path):
+    """One that cannot be undistorted is left out by name; experiments without a ratio have no gap."""
+    four = simulate(mounted_rig, mixed_protocol(2), seed=3).campaign
+    selection = select_experiments(four)
+    ups = set(selection.experiments[selection.direction == "up"].tolist())
+    firsts = {s.experiment: s for s in four.spots if s.point == 1}
+    lost = next(s.spot for s in four.spots if s.experiment not in ups)
+
+    def spoilt(s):
+        if s.spot == lost:
+            return replace(s, u_left_px=1279.0, v_left_px=719.0)
+        if s.experiment in ups and s.point == 2:
+            names = ("u_left_px", "v_left_px", "u_right_px", "v_right_px")
+            return replace(s, **{name: getattr(firsts[s.experiment], name) for name in names})
+        return s
+
+    stereo = replace(four.stereo, D1=np.array([-0.4, 0.0, 0.0, 0.0, 0.0]))
+    write_campaign(replace(with_spots(four, spoilt), stereo=stereo), tmp_path / "c")
+    code, document = ask("fit", tmp_path / "c", "--no-sample")
+    assert code == 0 and document["excluded_spots"] == [lost]
+    assert document["classic_predicted_deg_per_step"]["up"] is None
+    saved = json.loads((tmp_path / "c" / "results" / "fit.json").read_text())
+    assert saved["gap"]["up"] is None and saved["gap"]["down"] is not None
+
+
+def test_looks_at_one_stop_have_nothing_to_tell(ask, small, tmp_path):
+    seen = small.moves[small.spots[0].move]
+    only = replace(small.moves[0], pan_steps=seen.pan_steps, tilt_steps=seen.tilt_steps)
+    here = replace(small, moves=(only,), spots=tuple(s for s in small.spots if s.move == seen.move))
+    repeated = [replace(s, spot=k, move=0, u_left_px=s.u_left_px + 0.02 * k) for k, s in enumerate(here.spots * 12)]
+    write_campaign(replace(here, spots=tuple(repeated)), tmp_path / "c")
+    code, document = ask("fit", tmp_path / "c", "--no-sample")
+    assert (code, document["error"]["code"]) == (3, "uninformed")
+
+
+def test_all_fixed_is_nothing_to_estimate(ask, small, tmp_path):
+    priors = {name: replace(prior, u=0.0) for name, prior in small.rig.priors.items()}
+    stereo = replace(small.stereo, parameter_covariance=np.zeros((24, 24)))
+    write_campaign(replace(small, stereo=stereo, rig=replace(small.rig, priors=priors)), tmp_path / "c")
+    code, document = ask("fit", tmp_path / "c", "--no-sample")
+    assert (code, document["error"]["code"]) == (3, "nothing-free")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("u", "swap", "ends"), [(0.05, False, 0), (0.5, False, 0), (0.0, False, 0), (0.0, True, 4)])
+def test_noise_above_the_stated_is_no_misfit(ask, small, tmp_path, u, swap, ends):
+    """A misfit is a factor on the stated noise, however sure the noise was said to be; swapped cameras are one."""
+    rng = np.random.default_rng(1)
+
+    def louder(s):
+        names = ("u_left_px", "v_left_px", "u_right_px", "v_right_px")
+        pixels = [getattr(s, name) + 0.25 * rng.normal() for name in (names[2:] + names[:2] if swap else names)]
+        return replace(s, **dict(zip(names, pixels, strict=True)))
+
+    priors = {**small.rig.priors, "pixel_scale": Prior(1.0, u, "log-normal")}
+    write_campaign(with_spots(replace(small, rig=replace(small.rig, priors=priors)), louder), tmp_path / "c")
+    assert ask("fit", tmp_path / "c", "--no-sample")[0] == ends
 
 
 def test_a_fit_that_did_not_converge_is_exit_4(ask, say, folder, monkeypatch):
@@ -512,6 +629,59 @@ def test_control_characters_of_a_name_do_not_reach_the_terminal(say, tmp_path):
     code, out, log = say("check", tmp_path / "a\x1b[31mb")
     assert code == 2
     assert "\x1b" not in out + log
+
+
+def test_check_tells_a_folder_from_a_file(ask, folder, tmp_path):
+    shutil.copytree(folder, tmp_path / "camp.csv")
+    code, document = ask("check", tmp_path / "camp.csv")
+    assert code == 0 and document["spots"] > 0
+
+
+def test_a_report_for_a_browser_that_is_not_there_ends_at_once(ask, folder, monkeypatch):
+    monkeypatch.setattr("tvsbayes.report.BROWSERS", ())
+    monkeypatch.setattr("tvsbayes.cli._fit_document", None)
+    code, document = ask("report", folder, "--pdf")
+    assert (code, document["error"]["code"]) == (2, "no-browser")
+
+
+def test_what_cannot_be_kept_costs_nobody_the_result(tmp_path, capsys):
+    (tmp_path / "results").write_text("a file where the folder should be")
+    assert not cli._keep({}, tmp_path / "results" / "compare.json")
+    assert "warning: not kept" in capsys.readouterr().err
+    assert cli._keep({"a": 1}, tmp_path / "new" / "compare.json")
+    assert json.loads((tmp_path / "new" / "compare.json").read_text()) == {"a": 1}
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="Linux")
+@pytest.mark.parametrize("arguments", [("check", "FOLDER", "--json"), ("check", "nothing here", "--json")])
+def test_a_full_disk_behind_stdout_is_said_without_a_traceback(folder, arguments):
+    words = [str(folder) if word == "FOLDER" else word for word in arguments]
+    command = [sys.executable, "-c", "from tvsbayes.cli import main; main()", *words]
+    with open("/dev/full", "w") as full:
+        done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, check=False)
+    assert done.returncode == 2 and "No space left" in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+@pytest.mark.skipif(os.name != "posix", reason="pipes that break")
+def test_a_reader_that_has_gone_changes_no_exit_code(folder):
+    """As where Ctrl-C ends the `tee` behind a run, for both streams."""
+    command = [sys.executable, "-c", "from tvsbayes.cli import main; main()", "check", "nothing here"]
+    reader, writer = os.pipe()
+    os.close(reader)
+    done = subprocess.run(command, stdout=writer, stderr=writer, check=False)
+    with_json = subprocess.run([*command, "--json"], stdout=writer, stderr=subprocess.PIPE, text=True, check=False)
+    os.close(writer)
+    assert (done.returncode, with_json.returncode, with_json.stderr) == (2, 2, "")
+
+
+def test_interrupt_under_json_is_a_document_too(ask, monkeypatch):
+    def interrupted(path):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("tvsbayes.campaign.read_campaign", interrupted)
+    code, document = ask("check", "x")
+    assert (code, document["error"]["code"]) == (130, "interrupted")
 
 
 def test_interrupt_is_130(say, monkeypatch):

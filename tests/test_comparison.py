@@ -238,7 +238,8 @@ def direction_result(mean: float) -> DirectionResult:
 
 def test_simple_calibration_is_nominal_or_classic():
     nominal = simple_calibration()
-    assert nominal == SimpleCalibration({"left": 0.06, "right": 0.06, "up": 0.07, "down": 0.07}, 170.0, 70.0, 90.0)
+    assert nominal == SimpleCalibration({"left": 0.06, "right": 0.06, "up": 0.07, "down": 0.07}, 170.0, 70.0, 90.0, 0.0)
+    assert simple_calibration(RIG_PRIORS | {"aperture_zero_deg": Prior(5.0, 0.0)}).aperture_zero_deg == 5.0
     results = {"left": direction_result(0.0594), "right": None, "up": direction_result(0.069), "down": None}
     classic = simple_calibration(RIG_PRIORS | {"mirror_offset_mm": Prior(20.0, 1.0)}, ClassicResult(results, (), ()))
     assert classic.deg_per_step == {"left": 0.0594, "right": 0.06, "up": 0.069, "down": 0.07}
@@ -248,7 +249,7 @@ def test_simple_calibration_is_nominal_or_classic():
 @pytest.mark.parametrize(("pan", "tilt"), [(0, 0), (200, 0), (-150, 120), (100, -200)])
 def test_simple_rays_with_readings_are_the_published_equations(pan, tilt):
     """Baseline a - L, middle moved by -L/2; C and beta in the plane of beam and baseline, from the direction."""
-    simple = SimpleCalibration({"left": 0.06, "right": 0.05, "up": 0.07, "down": 0.08}, 170.0, 70.0, 88.0)
+    simple = SimpleCalibration({"left": 0.06, "right": 0.05, "up": 0.07, "down": 0.08}, 170.0, 70.0, 88.0, 0.0)
     rays = simple_rays(simple, np.array([[pan, tilt]]))
     azimuth = 88.0 - 90.0 + pan * (0.06 if pan > 0 else 0.05)
     elevation = tilt * (0.07 if tilt > 0 else 0.08)

@@ -297,8 +297,9 @@ def test_nohup_is_respected(monkeypatch):
         signal.signal(signal.SIGHUP, before)
 
 
-def test_stop_key_counts_even_where_its_word_cannot_be_written():
-    with StopKey(lambda text: _raise(RuntimeError("reentrant call inside a writer"))) as stop:
+@pytest.mark.parametrize("error", [RuntimeError("reentrant call inside a writer"), BrokenPipeError(32, "Broken pipe")])
+def test_stop_key_counts_even_where_its_word_cannot_be_written(error):
+    with StopKey(lambda text: _raise(error)) as stop:
         signal.raise_signal(signal.SIGINT)
     assert stop.requested
 
@@ -322,6 +323,26 @@ def test_laser_is_off_when_the_disk_fails(rig, tmp_path):
     assert run_.dark()
     records = read_journal(tmp_path / "c").records
     assert len(recorded(records).spots) >= 1
+
+
+@pytest.mark.parametrize("refusals", [3, 10_000])
+def test_a_table_that_somebody_has_open_does_not_end_the_run(rig, tmp_path, monkeypatch, refusals):
+    """On Windows `os.replace` refuses while a spreadsheet holds spots.csv; the journal has the look already."""
+    replace_, left = os.replace, [refusals]
+
+    def held(source, destination):
+        if Path(destination).name == "spots.csv" and left[0] > 0:
+            left[0] -= 1
+            raise PermissionError(13, "The process cannot access the file")
+        replace_(source, destination)
+
+    monkeypatch.setattr(os, "replace", held)
+    outcome = Run(rig, tmp_path / "c").engine.run()
+    assert (outcome.reason, outcome.looks) == ("done", 8)
+    assert [text for text in outcome.warnings if "behind the journal" in text] == list(outcome.warnings)
+    assert len(outcome.warnings) == (refusals > 8)
+    if not outcome.warnings:
+        assert len(read_campaign(tmp_path / "c").spots) == 8
 
 
 @pytest.mark.parametrize("exit_", ["declined", "no sheet"])

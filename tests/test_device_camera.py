@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import os
 import socket
 
 import cv2
@@ -186,10 +187,18 @@ def test_cameras_of_a_rig_file():
             open_cameras(table, WIDTH, HEIGHT, opener, clock)
     with pytest.raises(InputError):
         open_capture("file:///etc/passwd")
+    for source in ("99999999999", "\u00b2"):
+        with pytest.raises(DeviceFault, match="cannot be opened"):
+            open_capture(source)
 
 
-def test_stream_over_http_from_rendering_to_pictures():
-    """Every frame carries its number as grey level on both sides; a grab never returns one rendered before it."""
+def test_stream_over_http_from_rendering_to_pictures(monkeypatch):
+    """Every frame carries its number as grey level on both sides; a grab never returns one rendered before it.
+
+    Whatever proxy the environment names: FFmpeg would ask it for this computer's own address.
+    """
+    monkeypatch.setenv("http_proxy", "http://proxy.invalid:3128")
+    monkeypatch.delenv("no_proxy", raising=False)
     numbers, rendered = itertools.count(1), []
 
     def render():
@@ -210,5 +219,6 @@ def test_stream_over_http_from_rendering_to_pictures():
             assert (number - before) % 80 >= 1 and (number - before) % 80 < 40
             assert image.left.std() < 1
         camera.close()
+    assert "no_proxy" not in os.environ
     with pytest.raises(DeviceFault):
         open_capture("http://127.0.0.1:9/stereo.mjpg")

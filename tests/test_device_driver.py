@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import os
+import re
 import threading
 
 import pytest
 
 from tvsbayes.device.driver import PositionLost, SerialPositioner, device_settings, serial_opener
 from tvsbayes.device.model import DeviceModel, Mechanics
-from tvsbayes.device.protocol import parse_answer, request
+from tvsbayes.device.protocol import frame, parse_answer, request
 from tvsbayes.device.virtual import ModelLink, SimulatedDevice, VirtualClock
 from tvsbayes.files import DeviceFault
 
@@ -142,6 +143,33 @@ def test_other_firmware_that_only_echoes_is_refused():
     with pytest.raises(DeviceFault) as caught:
         SerialPositioner(lambda: Echo(device), {}, device.clock)
     assert caught.value.code == "no-answer"
+
+
+@pytest.mark.parametrize("last", ["9" * 95, "-1", "x", str(2**32)])
+def test_an_identity_without_a_sequence_is_refused(last):
+    """With a checksum that holds: another firmware, or one that has gone mad."""
+    device = simulated()
+    send, device.model._write = device.model._write, lambda line: None
+
+    def altered(line):
+        text = line[:-1].rpartition(b"*")[0].decode()
+        send(frame(re.sub(r" q=\d+", f" q={last}", text)))
+
+    device.model._write = altered
+    with pytest.raises(DeviceFault) as caught:
+        connected(device)
+    assert caught.value.code == "firmware"
+
+
+def test_a_ports_name_is_never_taken_as_an_address(tmp_path):
+    """With pyserial spy:// would write a file, alt:// call another class; other names end in its ValueError."""
+    pytest.importorskip("serial")
+    victim = tmp_path / "victim.txt"
+    for port in (f"spy:///dev/ptmx?file={victim}", "loop://?x=1", "alt://x?class=nope", "a\0b"):
+        with pytest.raises(DeviceFault) as caught:
+            SerialPositioner(serial_opener(port, 115_200), {}, VirtualClock())
+        assert caught.value.code == "port"
+    assert not victim.exists()
 
 
 def test_port_that_cannot_be_opened():

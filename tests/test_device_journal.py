@@ -6,6 +6,7 @@ import errno
 import itertools
 import os
 import random
+import stat
 import subprocess
 import sys
 from dataclasses import dataclass, field
@@ -184,6 +185,35 @@ def test_frame_names_cannot_leave_the_folder(folder):
     with pytest.raises(InputError) as caught:
         verify(folder)
     assert caught.value.line == 9
+
+
+@pytest.mark.skipif(os.name != "posix", reason="flock")
+def test_a_disk_without_locks_is_not_called_another_writer(folder, monkeypatch):
+    import fcntl
+
+    def none_left(*_arguments):
+        raise OSError(errno.ENOLCK, "No locks available")
+
+    monkeypatch.setattr(fcntl, "flock", none_left)
+    with pytest.raises(InputError, match="No locks available") as caught:
+        Journal.open(folder)
+    assert caught.value.code == "lock"
+
+
+@pytest.mark.skipif(os.name != "posix", reason="only POSIX flushes folders")
+def test_a_file_system_that_flushes_no_folders_will_do(tmp_path, monkeypatch):
+    flush = os.fsync
+
+    def files_only(descriptor):
+        if stat.S_ISDIR(os.fstat(descriptor).st_mode):
+            raise OSError(errno.EINVAL, "Invalid argument")
+        flush(descriptor)
+
+    monkeypatch.setattr(os, "fsync", files_only)
+    journal = Journal.create(tmp_path / "c")
+    journal.append("begun")
+    journal.close()
+    assert [record.event for record in read_journal(tmp_path / "c").records] == ["created", "begun"]
 
 
 def test_two_writers_are_refused(folder):

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import datetime
+import errno
 import os
 import pickle
 import stat
 import tomllib
+from contextlib import nullcontext
 from pathlib import Path
 
 import numpy as np
@@ -303,6 +305,23 @@ def test_interrupted_write_leaves_the_old_file_whole(tmp_path, monkeypatch, brok
         write_atomically(path, b"new content")
     assert path.read_bytes() == b"old"
     assert [p.name for p in tmp_path.iterdir()] == ["spots.csv"]
+
+
+@pytest.mark.skipif(os.name != "posix", reason="only POSIX flushes folders")
+@pytest.mark.parametrize(("number", "fails"), [(errno.EINVAL, False), (errno.ENOTSUP, False), (errno.EIO, True)])
+def test_a_folder_that_cannot_be_flushed(tmp_path, monkeypatch, number, fails):
+    """Some network shares flush files only; a disk that fails is another matter."""
+    flush = os.fsync
+
+    def files_only(descriptor):
+        if stat.S_ISDIR(os.fstat(descriptor).st_mode):
+            raise OSError(number, os.strerror(number))
+        flush(descriptor)
+
+    monkeypatch.setattr(os, "fsync", files_only)
+    with pytest.raises(InputError) if fails else nullcontext():
+        write_atomically(tmp_path / "a.json", b"1")
+    assert (tmp_path / "a.json").read_bytes() == b"1"
 
 
 def test_atomic_write_replaces_and_obeys_the_umask(tmp_path):

@@ -6,6 +6,7 @@ import datetime
 import json
 from dataclasses import replace
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -36,6 +37,7 @@ from tvsbayes.comparison import (
 )
 from tvsbayes.information import CAUSE_LIMIT, StopResidual, residual_causes, stop_residuals
 from tvsbayes.joint import JointFit, fit
+from tvsbayes.likelihood import ordered_spots
 from tvsbayes.simulation import Truth, read_truth, simulate
 
 TWIN = ROOT / "data" / "twins" / "paper_twin"
@@ -69,6 +71,26 @@ def true_terms(found: JointFit, truth: Truth) -> dict[str, dict[str, float]]:
     space = jax.tree.map(np.asarray, found.space)
     gaps = explain_gap(replace(found, z=coordinates(space, truth)), draws=2)
     return {d: {t.name: t.value for t in g.terms} for d, g in gaps.items() if g is not None}
+
+
+def test_a_rest_whose_first_spot_is_left_out_keeps_its_stop_error(paper_fit):
+    """The stop's variance belongs to the rest, not to whichever spot of it is used first."""
+    whole = {stop.spots: stop for stop in stop_residuals(paper_fit)}
+    spots = max(whole, key=len)
+    row = [spot.spot for spot in ordered_spots(paper_fit.campaign)].index(spots[0])
+    valid = np.array(paper_fit.arrays.spots.valid)
+    valid[row] = 0.0
+    without = replace(paper_fit, arrays=eqx.tree_at(lambda a: a.spots.valid, paper_fit.arrays, valid))
+    left = {stop.spots: stop for stop in stop_residuals(without)}
+    # A spot less adds pixel noise only.
+    assert whole[spots].u_deg <= left[spots[1:]].u_deg < 1.1 * whole[spots].u_deg
+
+
+def test_a_refit_that_failed_judges_nobody(mixed_fit, monkeypatch):
+    lost = replace(mixed_fit, converged=False, problems=("it went astray",))
+    monkeypatch.setattr("tvsbayes.comparison._refit", lambda *_: lost)
+    held = hold_out(mixed_fit)
+    assert held.verdict == CANNOT_TELL and "went astray" in held.reason
 
 
 def test_terms_add_up_to_the_gap(paper_fit, paper_gaps):

@@ -73,7 +73,10 @@ def test_distributions_hold_what_belongs_in_them(built):
         "data",
         "device",
     }
-    kept = {f"tvsbayes/data/{name}" for name in SHIPPED} | {"tvsbayes/device/firmware/README.md"}
+    kept = {f"tvsbayes/data/{name}" for name in SHIPPED}
+    flashed = ("tvs_positioner.ino", "tvs_core.h", "tvs_core.cpp")
+    kept |= {f"tvsbayes/device/firmware/tvs_positioner/{name}" for name in flashed}
+    kept |= {f"tvsbayes/device/firmware/{name}" for name in ("README.md", "native/replay.cpp")}
     assert kept <= set(wheel)
     with tarfile.open(built[".gz"]) as archive:
         source = [name.partition("/")[2] for name in archive.getnames()]

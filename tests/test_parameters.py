@@ -108,6 +108,14 @@ def test_slopes_against_differences(physical):
     assert np.all(error[scale > 0] / scale[scale > 0] < 1e-9)
 
 
+def test_a_stray_coordinate_of_a_half_normal_is_still_a_number(physical):
+    """A fit that goes astray may try what no prior holds; Phi(-40) underflows, and infinities reach the gradient."""
+    z = np.zeros((3, len(NAMES)))
+    z[:, INDEX["backlash_deg.pan"]] = [35.0, 40.0, 1e3]
+    values = physical(z, parameter_space(table(), small_stereo()))[0][:, INDEX["backlash_deg.pan"]]
+    assert np.all(np.isfinite(values)) and values[1] == values[2] > values[0] > 17.0
+
+
 def test_prior_draws_have_the_priors_distribution(physical):
     """Seeded Kolmogorov-Smirnov tests of 4000 draws: p above 1e-4."""
     z = np.random.default_rng(12).standard_normal((4000, len(NAMES)))

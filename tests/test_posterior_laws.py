@@ -14,7 +14,7 @@ import pytest
 
 from tvsbayes import posterior
 from tvsbayes.model import INDEX, NAMES
-from tvsbayes.posterior import STRETCH_NODES, Chain, Posterior, Target, Transport, diagnose, propagated
+from tvsbayes.posterior import STRETCH_NODES, Chain, Posterior, Target, Transport, by_width, diagnose, propagated
 
 WALKERS, STEPS = 64, 400
 RATIO, BACKLASH = INDEX["degrees_per_step.pan"], INDEX["backlash_deg.pan"]
@@ -175,6 +175,12 @@ def test_the_longer_tail_is_the_worse_known():
     expected = np.sqrt(p * (1 - p) / draws.size) * np.exp(exact)
     np.testing.assert_allclose(found.mcse_interval95, expected, rtol=0.4)
     np.testing.assert_array_less(np.abs(found.interval95 - exact), SIGMAS * expected)
+
+
+def test_no_coordinates_have_an_order():
+    """Where only the noise is estimated, nothing is left to whiten."""
+    order = by_width(np.zeros((0, 0)))
+    assert order.shape == (0,) and np.zeros(3)[order].shape == (0,)
 
 
 def test_lost_motion_takes_ratio_and_backlash_of_its_own_axis():

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from small_campaign import small_campaign
 
-from tvsbayes.calibration import INPUT_NAMES, NOISE_NAMES, Calibration, load_calibration
+from tvsbayes.calibration import INPUT_NAMES, NOISE_NAMES, Calibration, StoredMode, load_calibration
 from tvsbayes.campaign import input_hashes
 from tvsbayes.classic import ClassicResult, DirectionResult
 from tvsbayes.files import InputError
@@ -133,7 +133,9 @@ def small_fit() -> SimpleNamespace:
         effective_deg_per_step=np.full((50, 4), 0.06),
     )
     names = ("backlash_deg.pan", "not estimated", "pixel_scale")
-    return SimpleNamespace(names=names, draws=draws, reference_pose_rad=np.array([0.1, 0.0]), campaign=small_campaign())
+    stored = StoredMode(names, np.zeros(3), np.eye(3), -1.0, np.ones((2, 3)), np.ones(6), np.ones(6))
+    pose, campaign = np.array([0.1, 0.0]), small_campaign()
+    return SimpleNamespace(names=names, draws=draws, reference_pose_rad=pose, campaign=campaign, stored=stored)
 
 
 def test_rows_say_whether_data_or_prior_set_a_value():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -195,6 +196,19 @@ def test_rig_table_defaults_and_both_spellings():
     assert deep.priors["extrinsics.rotation_rad.z"] == Prior(1.0, 0.0)
 
 
+def test_any_parameter_may_stand_in_the_priors():
+    """DESIGN 7: also one whose own place is [rig]."""
+    one = rig_table("[rig]\nbaseline_mm = { value = 199, u = 0.2 }\nfocal_scale = { value = 1, u = 0.01 }")
+    other = rig_table("[rig.prior]\nbaseline_mm = { value = 199, u = 0.2 }\nfocal_scale = { value = 1, u = 0.01 }")
+    assert one == other and other.priors["baseline_mm"] == Prior(199.0, 0.2)
+
+
+def test_one_camera_of_both_pictures_may_be_a_number(tmp_path):
+    """As the template says."""
+    text = re.sub(r"(?m)^(source|left|right) = .*\n", "", RIG_FILE).replace("[cameras]", "[cameras]\nsource = 3")
+    assert read_rig(write_rig(tmp_path, text)).cameras["source"] == 3
+
+
 def test_rig_table_round_trip():
     priors = {
         name: Prior(p.value if p.distribution == "half-normal" else p.value * 1.1 + 0.001, p.u / 3, p.distribution)
@@ -294,10 +308,10 @@ RIG_REFUSED = {
         2,
         "from 0 to 10",
     ),
-    "declared in prior": (
-        "[rig.prior]\nbaseline_mm = { value = 200, u = 0 }",
-        2,
-        r"belongs into \[rig\] itself",
+    "declared twice": (
+        "[rig]\nbaseline_mm = { value = 200, u = 0 }\n[rig.prior]\nbaseline_mm = { value = 201, u = 0 }",
+        4,
+        "remove one",
     ),
     "prior in rig": ("[rig]\nmirror_offset_mm = { value = 30, u = 0 }", 2, r"belongs into \[rig.prior\]"),
     "misspelt": ("[rig]\nbaselin_mm = { value = 200, u = 0 }", 2, "did you mean baseline_mm"),
@@ -448,6 +462,7 @@ RIG_FILE_REFUSED = {
     "sheet close": ("d1 = 175", "d1 = 5", 12, "sheets.d1"),
     "sheet text": ("d1 = 175", "d1 = '175'", 12, "sheets.d1"),
     "sheet name": ("d1 = 175", '"d\\u001b" = 175', 11, "sheets.d\\x1b"),
+    "port": ('"/dev/ttyACM0"', "'spy:///dev/ptmx?file=a'", 16, "positioner.port"),
     "baud": ("115200", "-1", 17, "positioner.baud"),
     "limits": ("pan_max_steps = 2000", "pan_max_steps = -2001", 19, "positioner.pan_max_steps"),
     "positioner key": ("settle_s", "settle_ms", 20, "positioner.settle_ms"),

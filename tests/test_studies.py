@@ -207,6 +207,14 @@ def test_what_dask_lost_is_said_without_a_traceback(job, monkeypatch, raised, wh
     assert error.value.code == "worker-died" and "goes on" in error.value.remedy
 
 
+def test_rows_that_cannot_be_written_are_refused_before_the_first_fit(tmp_path):
+    with pytest.raises(InputError) as error:
+        StudyRows(tmp_path / "no such folder" / "rows.jsonl")
+    StudyRows(tmp_path / "rows.jsonl")
+    assert list(tmp_path.iterdir()) == [], "nothing is written before there is a row"
+    assert error.value.code == "write" and "--rows" in error.value.remedy
+
+
 def test_a_dead_worker_is_told_with_what_to_do(job):
     """A pool whose process has died says so in our words."""
     from concurrent.futures.process import BrokenProcessPool

@@ -52,7 +52,7 @@ def clean(mounted_rig) -> joint.JointFit:
         z = np.where(problem.free, coordinates(problem.space, simulated.truth), 0.0)
         fisher = stop_information(problem.linear_spots(z)[1]).fisher
         mode = joint.Mode(z, np.linalg.inv(fisher + np.eye(len(z))), 0.0, ())
-        return joint._result(simulated.campaign, problem, mode, np.ones(len(problem.spots), bool), 0)
+        return joint.fit_at(simulated.campaign, problem, mode, 0)
 
 
 def with_residual(fit: joint.JointFit, residual: np.ndarray) -> joint.JointFit:

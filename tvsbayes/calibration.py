@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from tvsbayes.campaign import APPROACH_SIGN, Campaign, input_hashes
-from tvsbayes.files import InputError, closest, escaped, parse_json, read_arrays, read_bytes, shipped_data
+from tvsbayes.files import InputError, escaped, parse_json, read_arrays, read_bytes, shipped_data
 from tvsbayes.rigs import FULL_TURN_DEG, HARMONIC_PRIORS
 
 CALIBRATION_FORMAT = "tvsbayes-calibration/1"
@@ -604,7 +604,7 @@ def bad_approach(axis: str, name: object, allowed: tuple[str, ...]) -> InputErro
         column=f"{axis}_approach",
         found=escaped(str(name)),
         allowed=", ".join(allowed),
-        remedy=closest(str(name), allowed) or "name the direction of the last move of the axis",
+        remedy="name the direction of the last move of the axis",
     )
 
 
@@ -636,7 +636,8 @@ def calibration_of_draws(
 ) -> Calibration:
     """Choose the columns that coordinates depend on.
 
-    Baseline, C0 and the aperture's zero take their priors where no reading told them: a sampler holds them still.
+    Baseline, C0, the aperture's zero and its noise take their priors where no reading told them: a sampler holds them
+    still.
 
     Args:
         names: contract names of the columns of `physical`.
@@ -649,10 +650,16 @@ def calibration_of_draws(
     """
     column = {name: physical[:, i] for i, name in enumerate(names)}
     generator = np.random.default_rng([seed, 5])
-    for name, (value, u) in receiver_priors(campaign).items():
-        drawn = generator.standard_normal(len(physical))
-        # Exactly the stated mean and u: the prior is known, its few draws need not be noise.
-        column[name] = value + u * (drawn - drawn.mean()) / drawn.std()
+
+    def standard() -> np.ndarray:
+        # Exactly mean 0 and sd 1: the prior is known, its few draws need not be noise.
+        found = generator.standard_normal(len(physical))
+        return (found - found.mean()) / found.std()
+
+    if untold := receiver_priors(campaign):
+        column |= {name: value + u * standard() for name, (value, u) in untold.items()}
+        prior = campaign.rig.priors["aperture_sd_deg"]
+        column["aperture_sd_deg"] = prior.value * np.exp(prior.u * standard())
     inputs = np.stack([column[name] for name in INPUT_NAMES], axis=1)
     noise = np.stack([column[name] for name in NOISE_NAMES], axis=1)
     counters = np.array([(m.pan_steps, m.tilt_steps) for m in campaign.moves], dtype=float)
@@ -905,3 +912,60 @@ def stored_ratios(campaign: Campaign) -> np.ndarray:
     if draws.ndim != 2 or draws.shape[1] != 4 or not np.all(np.isfinite(draws)):
         raise _damaged(path, ValueError("effective_deg_per_step"))
     return draws
+
+
+@dataclass(frozen=True)
+class StoredMode:
+    """Where a fit ended, as `draws.npz` keeps it: enough to go on without fitting again.
+
+    Attributes:
+        names: parameters, in the order of the coordinates.
+        z, covariance: mode and Laplace covariance in prior coordinates, shapes (p,) and (p, p).
+        log_density: at the mode.
+        prior: value and u of every parameter of the rig that the fit used, shape (2, r).
+        valid, weight: whether each spot, in the order of the fit, was used, and its weight; shape (spots,).
+    """
+
+    names: tuple[str, ...]
+    z: np.ndarray
+    covariance: np.ndarray
+    log_density: float
+    prior: np.ndarray
+    valid: np.ndarray
+    weight: np.ndarray
+
+
+_MODE_ARRAYS = ("z", "covariance", "prior", "valid", "weight")
+
+
+def mode_arrays(mode: StoredMode) -> dict[str, np.ndarray]:
+    """The arrays of `draws.npz` that `stored_mode` reads back; the names stand there already."""
+    return {f"mode_{name}": getattr(mode, name) for name in _MODE_ARRAYS} | {
+        "mode_log_density": np.array(mode.log_density)
+    }
+
+
+def stored_mode(campaign: Campaign) -> StoredMode | None:
+    """Where the fit in `results/` ended, if it was made from exactly these data and priors, and converged.
+
+    Raises:
+        InputError: there are results, but damaged.
+    """
+    if stored_calibration(campaign) is None:
+        return None
+    path = campaign.path / "results" / "draws.npz"
+    try:
+        file = read_arrays(path, RESULTS_BYTES_MAX, UNPACKED_BYTES_MAX)
+        if "mode_z" not in file:
+            return None
+        found = {name: np.array(file[f"mode_{name}"], dtype=float) for name in (*_MODE_ARRAYS, "log_density")}
+        names = tuple(file["names"].tolist())
+        count, spots = len(names), sum(spot.status == "ok" for spot in campaign.spots)
+        shapes = {"z": (count,), "covariance": (count, count), "valid": (spots,), "weight": (spots,), "log_density": ()}
+        if any(found[name].shape != shape for name, shape in shapes.items()) or found["prior"].shape[:1] != (2,):
+            raise ValueError("a mode of another shape")
+        if not all(np.isfinite(array).all() for array in found.values()):
+            raise ValueError("a mode that is not finite")
+        return StoredMode(names, **(found | {"log_density": float(found["log_density"])}))
+    except (KeyError, TypeError, ValueError) as error:
+        raise _damaged(path, error) from error

@@ -156,15 +156,17 @@ def parse_moves(data: bytes, file: str = "moves.csv") -> tuple[Move, ...]:
     return tuple(map(Move, moves, segments, times_s, pan, tilt, *approaches.values()))
 
 
-def _check_experiments(table: Table, experiments: Sequence[int | None], points: Sequence[int | None]) -> None:
-    """Refuses an experiment without point or the reverse, and the same point of an experiment twice."""
+def _check_experiments(
+    table: Table, experiments: Sequence[int | None], points: Sequence[int | None], counts: Sequence[bool]
+) -> None:
+    """Refuses an experiment without point or the reverse, and twice the same point of an experiment that counts."""
     pairs = list(zip(experiments, points, strict=True))
     for row, (experiment, point) in enumerate(pairs):
         if (experiment is None) != (point is None):
             column = "experiment" if experiment is None else "point"
             allowed = "experiment and point both given or both empty"
             raise table.refuse(row, column, "missing", allowed, "complete the pair or empty it")
-    keys = [None if pair == (None, None) else pair for pair in pairs]
+    keys = [pair if counted and pair != (None, None) else None for pair, counted in zip(pairs, counts, strict=True)]
     table.check_unique("point", keys, "every point of an experiment once")
 
 
@@ -186,8 +188,9 @@ def parse_spots(data: bytes, file: str, moves: int, stereo: Stereo) -> tuple[Spo
             allowed = f"a row of moves.csv: 0 to {moves - 1}"
             raise table.refuse(row, "move", "missing-move", allowed, "name the last move before the look")
     experiments, points = table.integers("experiment", 0, _ID_MAX, True), table.integers("point", 1, 4, True)
-    _check_experiments(table, experiments, points)
     statuses = table.texts("status", 200, empty=False)
+    # A look that found no spot may be taken again.
+    _check_experiments(table, experiments, points, [status == "ok" for status in statuses])
     size = {"u": float(stereo.image_width), "v": float(stereo.image_height)}
     pixels = [table.numbers(column, -1e6, 1e6, empty=True) for column in _PIXELS]
     sds = [table.numbers(column, 1e-4, 100.0, empty=True) for column in _PIXEL_SDS]
@@ -204,13 +207,22 @@ def parse_spots(data: bytes, file: str, moves: int, stereo: Stereo) -> tuple[Spo
                 remedy = "check the image size in stereo.json, or give the spot a refusal reason"
                 raise table.refuse(row, column, "outside-image", allowed, remedy)
     apertures = table.numbers("aperture_deg", -360.0, 360.0, empty=True)
-    # At a correlation of 1 the two coordinates of a centroid would be one.
-    correlations = [
-        table.numbers(column, -0.999999, 0.999999) if column in table.columns else [0.0] * len(table)
-        for column in _CORRELATIONS
-    ]
+    correlations = [_parse_correlations(table, column, statuses) for column in _CORRELATIONS]
     head = (spots, move_ids, table.texts("target"), experiments, points)
     return tuple(map(Spot, *head, *pixels, *sds, apertures, statuses, *correlations))
+
+
+def _parse_correlations(table: Table, column: str, statuses: Sequence[str]) -> list[float]:
+    """Correlations of u and v; 0 without the column, and where a row without a spot leaves the cell empty."""
+    if column not in table.columns:
+        return [0.0] * len(table)
+    # At a correlation of 1 the two coordinates of a centroid would be one.
+    values = table.numbers(column, -0.999999, 0.999999, empty=True)
+    for row, value in enumerate(values):
+        if value is None and statuses[row] == "ok":
+            allowed = "a finite decimal number from -0.999999 to 0.999999"
+            raise table.refuse(row, column, "number", allowed, "write 0 where it is not known")
+    return [value or 0.0 for value in values]
 
 
 _TEXT_CHARS = {
@@ -378,7 +390,7 @@ def parse_plan(data: bytes, file: str = "plan.csv") -> tuple[PlanStep, ...]:
     pan = table.integers("pan_steps", -_COUNTER_MAX, _COUNTER_MAX, empty=True)
     tilt = table.integers("tilt_steps", -_COUNTER_MAX, _COUNTER_MAX, empty=True)
     experiments, points = table.integers("experiment", 0, _ID_MAX, True), table.integers("point", 1, 4, True)
-    _check_experiments(table, experiments, points)
+    _check_experiments(table, experiments, points, [True] * len(table))
     placed = ""
     for row, action in enumerate(actions):
         if action not in (_PLAN_ACTIONS if row else ("home",)):

@@ -49,6 +49,7 @@ DCC_MESSAGES = 20
 """Of a schema validator, shown at most."""
 RESIDUALS_LISTED = 4096
 """Stops in `fit.json`, evenly chosen: a long campaign's file stays readable within its cap."""
+FITTING_FIRST = "results/ are missing or older than the campaign: fitting first (Laplace approximation) ..."
 DEMO_NOTE = "The twin's move history is our assumption, made so that the classic answer is the paper's Table 1."
 
 app = typer.Typer(
@@ -75,12 +76,32 @@ class _Ended(Exception):
 
 def report_line(text: str) -> None:
     """A line for people, on stderr; text from files may hold control characters."""
-    typer.echo("".join(c if c.isprintable() else "?" for c in text), err=True)
+    try:
+        typer.echo("".join(c if c.isprintable() else "?" for c in text), err=True)
+    except OSError:
+        # Ctrl-C ends the `tee` behind us too: nobody is left to be told, and the work goes on.
+        pass
+
+
+class _OutputFailed(Exception):
+    """Standard output took no more, as on a full disk."""
+
+
+def _print(text: str) -> None:
+    try:
+        typer.echo(text)
+    except OSError as error:
+        # What is still in its buffer must not fail again while Python ends.
+        sys.stdout = open(os.devnull, "w", encoding="utf-8")
+        if isinstance(error, BrokenPipeError):
+            # Whoever read has gone, like `head`; the work is done, and its exit code stands.
+            return
+        raise _OutputFailed(error.strerror or str(error)) from error
 
 
 def print_json(document: dict[str, Any]) -> None:
     """The one document on stdout; NaN is a bug, not a value."""
-    typer.echo(json.dumps(document, indent=1, allow_nan=False, ensure_ascii=True))
+    _print(json.dumps(document, indent=1, allow_nan=False, ensure_ascii=True))
 
 
 def _error_document(error: TvsError) -> dict[str, Any]:
@@ -100,7 +121,7 @@ def _finish(document: dict[str, Any], text: str, as_json: bool, error: TvsError 
     if as_json:
         print_json(document if error is None else {**document, **_error_document(error)})
     else:
-        typer.echo(text)
+        _print(text)
     if error is not None:
         if not as_json:
             _report_error(error)
@@ -368,11 +389,11 @@ def check(
 
         use_compilation_cache()
         document: dict[str, Any] = check_plan(rig, steps).as_json()
-    elif path.suffix == ".csv":
+    elif path.suffix == ".csv" and not path.is_dir():
         steps = read_plan(path)
         actions = {action: sum(s.action == action for s in steps) for action in ("home", "place", "move", "look")}
         document = {"kind": "plan", "steps": len(steps), **actions, "warnings": []}
-    elif path.suffix == ".toml":
+    elif path.suffix == ".toml" and not path.is_dir():
         rig = read_rig(path)
         document = {"kind": "rig", "sheets_mm": rig.sheets_mm, "costs_s": rig.costs_s, "warnings": []}
     else:
@@ -601,11 +622,26 @@ def _calibration(folder: Path) -> Calibration:
     found = stored_calibration(campaign)
     if found is not None:
         return found
-    report_line("results/ are missing or older than the campaign: fitting first (Laplace approximation) ...")
+    report_line(FITTING_FIRST)
     result = _converged_fit(campaign)
     from tvsbayes.information import calibration_of
 
     return calibration_of(result)
+
+
+def _fit_of(campaign: Campaign) -> JointFit:
+    """The fit in `results/` where its hashes agree with the campaign; else fit first (DESIGN 8)."""
+    from tvsbayes.calibration import stored_mode
+    from tvsbayes.joint import restored
+    from tvsbayes.model import use_compilation_cache
+
+    use_compilation_cache()
+    stored = stored_mode(campaign)
+    found = None if stored is None else restored(campaign, stored)
+    if found is not None:
+        return found
+    report_line(FITTING_FIRST)
+    return _converged_fit(campaign)
 
 
 def _converged_fit(campaign: Campaign) -> JointFit:
@@ -650,10 +686,13 @@ def report(
 
     data = read_campaign(campaign)
     results = output_place(campaign, "results")
+    from tvsbayes.report import find_browser, print_to_pdf, report_html, validation_lines
+
+    if pdf:
+        find_browser()
     document = _fit_document(data, campaign)
     from tvsbayes.certificate import check_dcc, dcc_bytes
     from tvsbayes.comparison import gather
-    from tvsbayes.report import print_to_pdf, report_html, validation_lines
 
     limits = {"limit_deg_per_step": limit_deg_per_step, "limit_mm": limit_mm}
     evidence = gather(data, document, load_calibration(campaign), range_mm=range_mm, **limits)
@@ -699,7 +738,7 @@ def _fit_document(data: Campaign, folder: Path) -> dict[str, Any]:
         # An old fit.json beside new draws would be the report of other data.
         if "budgets" in document and document["inputs"] == input_hashes(data):
             return document
-    report_line("results/ are missing or older than the campaign: fitting first (Laplace approximation) ...")
+    report_line(FITTING_FIRST)
     result = _converged_fit(data)
     from tvsbayes.information import calibration_of, summarise
     from tvsbayes.report import write_results
@@ -730,8 +769,7 @@ def compare(
     results = output_place(campaign, "results")
     from tvsbayes.report import changes_text, gap_text, hold_out_text
 
-    report_line("fitting (Laplace approximation) ...")
-    fits = [_converged_fit(each) for each in data]
+    fits = [_fit_of(each) for each in data]
     from tvsbayes.comparison import compare as compare_fits
     from tvsbayes.comparison import explain_gap, hold_out
 
@@ -757,11 +795,21 @@ def compare(
         "inputs": input_hashes(data[0]),
         "seed": seed,
     }
-    make_folder(results)
-    path = results / "compare.json"
-    write_atomically(path, json.dumps(document, indent=1, allow_nan=False).encode())
-    text = f"{gap_text(gaps)}\n\n{hold_out_text(held)}\nwritten: {path}"
-    _finish({**document, "files": {"compare": str(path)}}, text, as_json)
+    files, text = {}, f"{gap_text(gaps)}\n\n{hold_out_text(held)}"
+    if _keep(document, path := results / "compare.json"):
+        files, text = {"compare": str(path)}, f"{text}\nwritten: {path}"
+    _finish({**document, "files": files}, text, as_json)
+
+
+def _keep(document: dict[str, Any], path: Path) -> bool:
+    """Write what a later report will show; a folder that cannot be written costs nobody the result."""
+    try:
+        make_folder(path.parent)
+        write_atomically(path, json.dumps(document, indent=1, allow_nan=False).encode())
+    except InputError as error:
+        report_line(f"warning: not kept for the report: {error.message}")
+        return False
+    return True
 
 
 POINT_COLUMNS = ("pan_steps", "tilt_steps", "pan_approach", "tilt_approach", "aperture_deg")
@@ -792,7 +840,8 @@ def _finite(**values: float | None) -> None:
     for name, value in values.items():
         if value is not None and not math.isfinite(value):
             option = "--" + name.replace("_", "-")
-            raise InputError("number", f"{option} is {value}", column=option, allowed="a finite number")
+            allowed, remedy = "a finite number", "write a decimal number"
+            raise InputError("number", f"{option} is {value}", column=option, allowed=allowed, remedy=remedy)
 
 
 @app.command()
@@ -924,7 +973,6 @@ def plan(
 
     instrument, data = read_rig(rig), None if given is None else read_campaign(given)
     from tvsbayes.design import CRITERIA, DEFAULT_TARGET, parse_target
-    from tvsbayes.joint import fit as fit_joint
     from tvsbayes.model import use_compilation_cache
     from tvsbayes.planning import plan as find_plan
     from tvsbayes.planning import plan_text
@@ -934,11 +982,7 @@ def plan(
         message, allowed = f"--criterion {escaped(criterion)}", ", ".join(CRITERIA)
         raise InputError("criterion", message, column="--criterion", allowed=allowed, remedy="name one of them")
     use_compilation_cache()
-    fitted = None
-    if data is not None:
-        # A plan needs curvature and priors of the fit, which fit.json does not hold.
-        report_line("fitting the campaign (Laplace approximation) ...")
-        fitted = fit_joint(data)
+    fitted = None if data is None else _fit_of(data)
     options = {"criterion": criterion, "aperture": aperture, "draws": draws, "seed": seed}
     result = find_plan(instrument, wanted, given=fitted, minutes=minutes, **options)
     text, document = plan_text(result), result.as_json()
@@ -950,10 +994,8 @@ def plan(
         text += f"\nnothing written to {escaped(str(output), 200)}: there is nothing more to measure"
     if data is not None:
         # Where the report looks for what to measure next.
-        results = output_place(data.path, "results")
-        make_folder(results)
         stored = {"format": "tvsbayes-plan/1", "inputs": input_hashes(data), **document}
-        write_atomically(results / "plan.json", json.dumps(stored, indent=1, allow_nan=False).encode())
+        _keep(stored, output_place(data.path, "results") / "plan.json")
     _finish(document, text, as_json)
     if target is not None and not result.met:
         raise _Ended(TvsError.exit_code)
@@ -1056,6 +1098,14 @@ def _sampling_progress() -> Iterator[Callable[[Progress], None]]:
 
 def run(arguments: list[str]) -> int:
     """Run one command and return its exit code; no traceback reaches a user."""
+    try:
+        return _run(arguments)
+    except _OutputFailed as error:
+        report_line(f"error: the result cannot be written to standard output: {error}")
+        return InputError.exit_code
+
+
+def _run(arguments: list[str]) -> int:
     wants_json = "--json" in arguments
     try:
         # Typer returns the code of its own Exit, into which it also turns Ctrl-C; commands return None.
@@ -1082,6 +1132,8 @@ def run(arguments: list[str]) -> int:
             error.show()
         return InputError.exit_code
     if code == INTERRUPTED:
+        if wants_json:
+            print_json(_error_document(TvsError("interrupted", "interrupted", remedy="run it again")))
         report_line("interrupted")
     return code
 

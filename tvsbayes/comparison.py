@@ -52,12 +52,14 @@ class SimpleCalibration:
         baseline_mm: distance from the aperture to where the beam leaves the positioner, a - L.
         origin_y_mm: where it leaves it in frame T, a/2 - L: the middle between both is moved by -L/2.
         pan_zero_emission_deg: C0.
+        aperture_zero_deg: what the aperture's readings are corrected by.
     """
 
     deg_per_step: Mapping[str, float]
     baseline_mm: float
     origin_y_mm: float
     pan_zero_emission_deg: float
+    aperture_zero_deg: float
 
 
 def simple_calibration(
@@ -73,7 +75,8 @@ def simple_calibration(
         measured = {d: r.mean_deg_per_step for d, r in classic.directions.items() if r is not None}
         ratios |= measured
     a, offset = priors["baseline_mm"].value, priors["mirror_offset_mm"].value
-    return SimpleCalibration(ratios, a - offset, 0.5 * a - offset, priors["pan_zero_emission_deg"].value)
+    zeros = (priors["pan_zero_emission_deg"].value, priors["aperture_zero_deg"].value)
+    return SimpleCalibration(ratios, a - offset, 0.5 * a - offset, *zeros)
 
 
 def simple_rays(simple: SimpleCalibration, steps: np.ndarray) -> Ray:
@@ -159,7 +162,8 @@ def error_map(
         ray = simple_rays(one, steps)
         # `range_components` puts the aperture at half the distance it is given; a simple user's stands at origin -
         # baseline.
-        looks[name] = tuple(ray.origin_mm), tuple(ray.direction), 2 * (one.baseline_mm - one.origin_y_mm), 0.0
+        aperture = 2 * (one.baseline_mm - one.origin_y_mm), one.aperture_zero_deg
+        looks[name] = tuple(ray.origin_mm), tuple(ray.direction), *aperture
     shape = tuple(len(x) for x in axes)
     rms, bias, distance, valid = {}, {}, {}, np.ones(shape, dtype=bool)
     for name, (origin, direction, baseline_mm, zero_deg) in looks.items():
@@ -399,18 +403,24 @@ def explain_gap(found: JointFit, posterior: Posterior | None = None, draws: int 
             np.asarray(derived_quantities(jnp.asarray(z), space, pose).effective_deg_per_step)
             for space in (spaces[0], spaces[-1])
         )
+    try:
+        measured = classic(found.campaign)
+    except NothingToEstimate:
+        return result
     quiet = np.zeros((len(z), len(found.arrays.spots.valid), 2))
     ratios = []
     for space in spaces:
         pixels = pixels_of(looks(replace(found, space=space), z, quiet))
         every = [four_point_ratios(p, selection.steps, selection.axis, found.campaign.stereo) for p in pixels]
         ratios.append(np.stack(every))
-    measured = classic(found.campaign)
+    # An experiment whose spots lie on one another, or beyond the lens model, has no ratio.
+    sound = np.all([np.isfinite(r).all(axis=0) for r in ratios], axis=0)
     for k, direction in enumerate(DIRECTIONS):
-        chosen = selection.direction == direction
-        if not chosen.any():
+        chosen = (selection.direction == direction) & sound
+        found_classic = measured.directions[direction]
+        if not chosen.any() or found_classic is None:
             continue
-        seen = measured.directions[direction].mean_deg_per_step
+        seen = found_classic.mean_deg_per_step
         whole, unplayed, scaled, straight = (r[:, chosen].mean(axis=1) for r in ratios)
         parts = {
             BACKLASH: whole - unplayed,
@@ -583,6 +593,8 @@ def hold_out(fit_of_all: JointFit, by: str = "steps", seed: int = 0) -> HoldOut:
             continue
         ids = frozenset(campaign.spots[r].spot for r in selection.spot_rows[out].ravel())
         taught = _refit(fit_of_all, ids)
+        if not taught.converged:
+            return undecided(f"without the experiments {name} the fit does not converge: {'; '.join(taught.problems)}")
         generator = np.random.default_rng([seed, index])
         z = taught.draws_z[:HOLD_OUT_DRAWS]
         pixels = looks_again(taught, z, taught.draws.physical[:HOLD_OUT_DRAWS], generator)
@@ -610,22 +622,12 @@ def hold_out(fit_of_all: JointFit, by: str = "steps", seed: int = 0) -> HoldOut:
 
 def _refit(fit_of_all: JointFit, without: frozenset[int]) -> JointFit:
     """The same model on fewer spots; its harmonics, contrasts and backlash are free where they were."""
-    from tvsbayes.joint import fit
+    from tvsbayes.joint import fit, priors_used
 
-    held = replace(fit_of_all.campaign, rig=replace(fit_of_all.campaign.rig, priors=_priors_of(fit_of_all)))
+    rig, space = fit_of_all.campaign.rig, fit_of_all.space
+    priors = priors_used(rig.priors, np.asarray(space.value), np.asarray(space.u))
+    held = replace(fit_of_all.campaign, rig=replace(rig, priors=priors))
     return fit(held, without=without | set(fit_of_all.excluded_spots))
-
-
-def _priors_of(fit_of_all: JointFit) -> dict[str, Prior]:
-    """The priors that the fit used, which options may have changed from the campaign's."""
-    from tvsbayes.model import INDEX
-
-    space = fit_of_all.space
-    table = fit_of_all.campaign.rig.priors
-    return {
-        name: replace(table[name], value=float(space.value[INDEX[name]]), u=float(space.u[INDEX[name]]))
-        for name in table
-    }
 
 
 def _foretell_classic(angle: np.ndarray, selection: Selection, out: np.ndarray) -> dict[int, tuple[float, float, int]]:

@@ -580,6 +580,8 @@ def locate(
     if draws < 500:
         raise ValueError(f"{draws} draws; a coordinate's interval needs at least 500 (DESIGN 5)")
     settings = settings_of(pan_steps, tilt_steps, aperture_deg, approach)
+    if not len(settings.steps):
+        raise ValueError("no points: the lists are empty")
     given = sources(calibration, draws, seed)
     parts = []
     with jax.enable_x64(True):

@@ -14,6 +14,7 @@ from __future__ import annotations
 import csv
 import datetime
 import difflib
+import errno
 import io
 import json
 import math
@@ -217,11 +218,38 @@ def decode(data: bytes, file: str) -> str:
     return text
 
 
+FLUSHES_NO_FOLDER = frozenset({errno.EINVAL, errno.ENOTSUP})
+"""How a file system (some network shares) says that it can flush files only, fsync(2): its own order has to do."""
+
+
+def flush_folder(folder: Path, disk=os) -> None:
+    """Make the names in a folder durable, where the system can: only POSIX flushes folders.
+
+    Args:
+        folder: which.
+        disk: has `open`, `fsync` and `close` as the module `os` has.
+
+    Raises:
+        OSError: the disk failed.
+    """
+    if os.name != "posix":
+        return
+    descriptor = disk.open(folder, os.O_RDONLY)
+    try:
+        disk.fsync(descriptor)
+    except OSError as error:
+        if error.errno not in FLUSHES_NO_FOLDER:
+            raise
+    finally:
+        disk.close(descriptor)
+
+
 def write_atomically(path: Path, data: bytes) -> None:
     """Replaces `path` by `data` so that a reader, or a crash, sees the old file or the new, never a part.
 
     Raises:
-        InputError: the folder is missing, full or not writable; the old file is untouched.
+        InputError: the folder is missing, full or not writable; there stands the old file, or where only the flush
+            of the folder failed, the new one.
     """
     path = Path(path)
     temporary = path.with_name(f".{path.name}.{secrets.token_hex(6)}.tmp")
@@ -235,13 +263,8 @@ def write_atomically(path: Path, data: bytes) -> None:
         except BaseException:
             temporary.unlink(missing_ok=True)
             raise
-        if os.name == "posix":
-            # The new name itself is durable only once its folder is.
-            folder = os.open(path.parent, os.O_RDONLY)
-            try:
-                os.fsync(folder)
-            finally:
-                os.close(folder)
+        # The new name itself is durable only once its folder is.
+        flush_folder(path.parent)
     except OSError as error:
         found, allowed = escaped(error.strerror or str(error)), "a writable folder with free space"
         remedy, file = "name another place or free this one", escaped(str(path), 200)

@@ -396,6 +396,8 @@ def _headline_gradients(fit: JointFit, moved: set[str]) -> tuple[list[str], np.n
     for axis in ("pan", "tilt"):
         # In coordinates, where the backlash is Gaussian.
         quantities[f"backlash {axis}"] = fit.draws_z[:, INDEX[f"backlash_deg.{axis}"]]
+    # What the priors hold fixed scatters by roundings, which nothing may be measured by.
+    quantities = {name: v for name, v in quantities.items() if np.ptp(v) > 1e-12 * np.max(np.abs(v))}
     return list(quantities), gradients(fit, np.stack(list(quantities.values()), axis=1))
 
 
@@ -493,9 +495,11 @@ def _classic_predicted(source: _Source) -> dict[str, Estimate | None]:
         draws = np.stack([ratios(pixels[rows]) for pixels in ideal_pixels(source.posterior, CLASSIC_DRAWS)])
         centre = draws.mean(axis=0)
     for direction in DIRECTIONS:
-        chosen = selection.direction == direction
-        if chosen.any():
-            values = draws[:, chosen].mean(axis=1)
+        # Pixels far from the image, of a fit that went astray, cannot be undistorted: there is no ratio then.
+        chosen = (selection.direction == direction) & np.isfinite(centre)
+        values = draws[:, chosen].mean(axis=1) if chosen.any() else np.zeros(0)
+        values = values[np.isfinite(values)]
+        if len(values):
             sd = float(values.std())
             low, high = np.quantile(values, [0.025, 0.975])
             result[direction] = Estimate(float(centre[chosen].mean()), sd, (float(low), float(high)), None, None)
@@ -755,7 +759,9 @@ def stop_residuals(fit: JointFit) -> tuple[StopResidual, ...]:
             mine, noise = seen.deviation_rad[chosen, index], seen.covariance_rad2[chosen, index, index]
             weight = 1 / noise
             mean = mine @ weight / weight.sum()
-            variance = 1 / weight.sum() + fit.linearised.stop_variance[chosen[0], index]
+            # The row that drew the stop error has its variance, whether that spot is used or not.
+            drawn = np.flatnonzero(rest == number)[0]
+            variance = 1 / weight.sum() + fit.linearised.stop_variance[drawn, index]
             within = (mine - mean) / np.sqrt(noise - 1 / weight.sum()) if len(chosen) > 1 else ()
             found.append(
                 StopResidual(
@@ -1175,6 +1181,9 @@ def headline_causes(fit: JointFit) -> HeadlineCauses:
     for axis, pair in (("pan", DIRECTIONS[:2]), ("tilt", DIRECTIONS[2:])):
         if moved & set(pair):
             columns[f"backlash_deg.{axis}"] = fit.draws.physical[:, INDEX[f"backlash_deg.{axis}"]]
+    if not columns:
+        none = np.zeros((0, 0))
+        return HeadlineCauses((), (), none, np.zeros(0), np.zeros(0), (), none)
     gradient = gradients(fit, np.stack(list(columns.values()), axis=1))
     spread = gradient @ np.linalg.inv(fit.information.fisher + np.eye(len(NAMES)))
     gain = np.concatenate([group.jacobian for group in fit.information.groups])

@@ -13,7 +13,7 @@ caller chose; the covariance follows that choice. float64 throughout.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
@@ -26,7 +26,7 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float, PyTree
 from scipy import optimize, stats
 
-from tvsbayes.calibration import NORMAL_95
+from tvsbayes.calibration import NORMAL_95, StoredMode
 from tvsbayes.campaign import Campaign
 from tvsbayes.files import InputError, NotConverged, NothingToEstimate
 from tvsbayes.likelihood import (
@@ -35,6 +35,7 @@ from tvsbayes.likelihood import (
     StopInformation,
     campaign_arrays,
     density_and_gradient,
+    in_sight,
     innovations,
     leave_one_out_chi2,
     ordered_spots,
@@ -46,6 +47,7 @@ from tvsbayes.model import (
     INDEX,
     NAMES,
     NOISE_NAMES,
+    RIG_NAMES,
     ParameterSpace,
     Scalar,
     beam_angles,
@@ -93,9 +95,9 @@ CONTRASTS = ("ratio_contrast_deg_per_step.pan", "ratio_contrast_deg_per_step.til
 BACKLASHES = ("backlash_deg.pan", "backlash_deg.tilt")
 HARMONIC_SD_DEG = 0.1
 """Prior standard deviation of every part of a freed transmission error (DESIGN 3.1)."""
-MISFIT_LIMIT = 6.0
-"""Prior sds of the pixel scale (a factor 20 by default) beyond which the mode explains no spot: a wrong basin, swapped
-cameras or wrong counters, not noise."""
+MISFIT_LIMIT = 20.0
+"""Factor on the stated pixel noise beyond which the mode explains no spot: a wrong basin, swapped cameras or wrong
+counters, not noise."""
 GATE_PROBABILITY = 1e-6
 """A clean spot is excluded by the robust option with this probability."""
 HUBER_CORE = 0.8214
@@ -509,6 +511,19 @@ class JointFit:
         """Contract names of the coordinates and of the columns of `draws.physical`."""
         return NAMES
 
+    @property
+    def stored(self) -> StoredMode:
+        """What `restored` needs."""
+        count = len(self.linearised.residual)
+        return StoredMode(
+            self.names,
+            self.z,
+            self.covariance,
+            self.log_density,
+            np.stack([np.asarray(self.space.value), np.asarray(self.space.u)]),
+            *(np.asarray(x)[:count] for x in (self.arrays.spots.valid, self.arrays.spots.weight)),
+        )
+
 
 def linear_spots(lin: Linearised, arrays: CampaignArrays, jacobian: np.ndarray) -> LinearSpots:
     """A linearised campaign as the smoother reads it.
@@ -619,11 +634,11 @@ def _chi2_quantile(readings: np.ndarray, probability: float) -> np.ndarray:
     return stats.chi2.isf(probability, 3 + readings)
 
 
-def _robust_weights(problem: Problem, z: np.ndarray) -> tuple[CampaignArrays, np.ndarray, float]:
+def _robust_weights(problem: Problem, z: np.ndarray) -> tuple[CampaignArrays, float]:
     """One round of the robust option: gate and Huber weights from leave-one-out residuals.
 
     Returns:
-        Arrays with new weights, the mask of used spots, and the largest change of a weight.
+        Arrays with new weights, and the largest change of a weight.
     """
     spots = problem.arrays.spots
     count = len(problem.spots)
@@ -653,7 +668,7 @@ def _robust_weights(problem: Problem, z: np.ndarray) -> tuple[CampaignArrays, np
         problem.arrays,
         (padded(spots.valid, valid), padded(spots.weight, new_weight)),
     )
-    return arrays, valid > 0, change
+    return arrays, change
 
 
 def model_choice(table: RigTable, *, per_axis: bool, harmonics: bool, no_backlash: bool) -> RigTable:
@@ -714,12 +729,13 @@ def fit(
 
     Raises:
         InputError: if harmonics are wanted and no axis states their period.
-        NothingToEstimate: if the campaign has fewer than `SMALLEST_CAMPAIGN` usable spots.
+        NothingToEstimate: if the campaign has fewer than `SMALLEST_CAMPAIGN` usable spots, or all is fixed.
         NotConverged: if the fit diverged; a fit that ended badly is returned with `converged` False.
     """
     table = model_choice(campaign.rig, per_axis=per_axis, harmonics=harmonics, no_backlash=no_backlash)
     spots = ordered_spots(campaign)
-    used = np.array([spot.spot not in without for spot in spots], dtype=bool)
+    # A spot beyond what the lens model can undistort is in nobody's sight line.
+    used = np.array([spot.spot not in without for spot in spots], dtype=bool) & in_sight(campaign)
     if used.sum() < SMALLEST_CAMPAIGN:
         raise NothingToEstimate(
             "too-few-spots",
@@ -727,31 +743,81 @@ def fit(
             file="spots.csv",
             remedy="observe more stops, or detect the refused spots again",
         )
+    diverged = NotConverged(
+        "diverged",
+        "the fit left the region where the model is finite",
+        remedy="check for swapped cameras or wrong counters, or state the extrinsics better in [rig.prior]",
+    )
     with jax.enable_x64(True), ThreadPoolExecutor(1) as executor:
         problem = Problem(campaign, table, used)
+        if not problem.free.any():
+            raise NothingToEstimate(
+                "nothing-free",
+                "every parameter is stated as exactly known (u = 0), the cameras included",
+                file="campaign.toml",
+                remedy="state a u above 0 for what the campaign is to teach",
+            )
         problem.compile_aside(executor)
         z = np.zeros(len(NAMES))
-        for inflation in ANNEALING:
-            z = problem.least_squares(z, inflation)
-        z = problem.alternate(z)
-        if robust:
-            for _ in range(20):
-                problem.arrays, used, change = _robust_weights(problem, z)
-                if change < 0.02:
-                    break
-                z = problem.alternate(z)
-        if not np.all(np.isfinite(problem.objective(z)[1])):
-            raise NotConverged(
-                "diverged",
-                "the fit left the region where the model is finite",
-                remedy="check for swapped cameras or wrong counters, or state the extrinsics better in [rig.prior]",
-            )
-        mode = newton_mode(problem.objective, z, problem.free, problem.curvature(z))
-        return _result(campaign, problem, mode, used, seed)
+        try:
+            for inflation in ANNEALING:
+                z = problem.least_squares(z, inflation)
+            z = problem.alternate(z)
+            if robust:
+                for _ in range(20):
+                    problem.arrays, change = _robust_weights(problem, z)
+                    if change < 0.02:
+                        break
+                    z = problem.alternate(z)
+            if not np.all(np.isfinite(problem.objective(z)[1])):
+                raise diverged
+            mode = newton_mode(problem.objective, z, problem.free, problem.curvature(z))
+            return fit_at(campaign, problem, mode, seed)
+        except np.linalg.LinAlgError as error:
+            raise diverged from error
 
 
-def _result(campaign: Campaign, problem: Problem, mode: Mode, used: np.ndarray, seed: int) -> JointFit:
-    """Everything that is computed at the mode."""
+def priors_used(stated: Mapping[str, Prior], value: np.ndarray, u: np.ndarray) -> dict[str, Prior]:
+    """The priors of a fit, which its options may have changed from the stated ones; columns in order of `RIG_NAMES`."""
+    return {
+        name: replace(prior, value=float(value[INDEX[name]]), u=float(u[INDEX[name]])) for name, prior in stated.items()
+    }
+
+
+def restored(campaign: Campaign, stored: StoredMode, seed: int = 0) -> JointFit | None:
+    """The converged fit that ended at a stored mode, without fitting: its model, weights and Laplace draws.
+
+    Args:
+        campaign: the one it was made from.
+        stored: from `calibration.stored_mode`.
+        seed: of the Laplace draws; those of `fit` with the same seed.
+
+    Returns:
+        The fit; None where another version of tvsbayes named its parameters otherwise.
+    """
+    if stored.names != NAMES or stored.prior.shape[1] != len(RIG_NAMES):
+        return None
+    table = replace(campaign.rig, priors=priors_used(campaign.rig.priors, *stored.prior))
+    valid = stored.valid > 0
+    with jax.enable_x64(True):
+        problem = Problem(campaign, table, valid)
+        weight = np.array(problem.arrays.spots.weight)
+        weight[: len(valid)] = stored.weight
+        problem.arrays = eqx.tree_at(lambda a: a.spots.weight, problem.arrays, jnp.asarray(weight))
+        mode = Mode(stored.z, stored.covariance, -stored.log_density, ())
+        return fit_at(campaign, problem, mode, seed)
+
+
+def fit_at(campaign: Campaign, problem: Problem, mode: Mode, seed: int) -> JointFit:
+    """The fit that ends at a mode: residuals, information, Laplace draws and diagnoses there.
+
+    Args:
+        campaign: that `problem` was made from.
+        problem: model, priors and the weights of the spots.
+        mode: converged, or with the problems that `JointFit.problems` then states.
+        seed: of the Laplace draws.
+    """
+    used = np.asarray(problem.arrays.spots.valid[: len(problem.spots)]) > 0
     lin, linear = problem.linear_spots(mode.z)
     information = stop_information(linear)
     chi2_spots = leave_one_out_chi2(information)
@@ -771,8 +837,11 @@ def _result(campaign: Campaign, problem: Problem, mode: Mode, used: np.ndarray, 
     )
     ids = np.array([s.spot for s in problem.spots])
     problems = mode.problems
-    misfit = float(at_mode_and_draws.physical[0, INDEX["pixel_scale"]])
-    if mode.z[INDEX["pixel_scale"]] > MISFIT_LIMIT:
+    chi2 = sum(float(linear.residual[g.rows].ravel() @ g.residual) for g in information.groups)
+    # Where the scale is fixed the misfit stays in chi-square.
+    looks = max(float(np.sum(used * (3 + readings))), 1.0)
+    misfit = float(at_mode_and_draws.physical[0, INDEX["pixel_scale"]]) * max(1.0, np.sqrt(chi2 / looks))
+    if misfit > MISFIT_LIMIT:
         problems += (f"the spots miss the fitted beams by {misfit:.0f} times their stated uncertainty",)
     return JointFit(
         campaign=campaign,
@@ -783,7 +852,7 @@ def _result(campaign: Campaign, problem: Problem, mode: Mode, used: np.ndarray, 
         log_density=-mode.negative_log_density,
         linearised=lin,
         information=information,
-        chi2=sum(float(linear.residual[g.rows].ravel() @ g.residual) for g in information.groups),
+        chi2=chi2,
         reference_pose_rad=pose,
         free=problem.free,
         draws_z=draws_z,

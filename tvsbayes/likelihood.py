@@ -189,6 +189,9 @@ def campaign_arrays(campaign: Campaign) -> CampaignArrays:
     whitening = np.linalg.inv(np.linalg.cholesky(covariance))
     new = redraws(campaign.moves, spots)
     aperture = [np.nan if s.aperture_deg is None else s.aperture_deg for s in spots]
+    points_mm = triangulate(campaign.stereo, pixels)
+    seen = np.isfinite(points_mm).all(axis=1)
+    points_mm[~seen] = NOWHERE_MM
     with jax.enable_x64(True):
         spot_arrays = SpotArrays(
             move_index=padded([s.move for s in spots], (), spots[-1].move, np.int32),
@@ -196,8 +199,8 @@ def campaign_arrays(campaign: Campaign) -> CampaignArrays:
             whitening=padded(whitening, (4, 4), np.eye(4)),
             aperture_rad=padded(np.nan_to_num(np.radians(aperture)), ()),
             has_aperture=padded(np.isfinite(aperture), ()),
-            triangulated_mm=padded(triangulate(campaign.stereo, pixels), (3,), (500.0, 0.0, 0.0)),
-            valid=padded(1.0, ()),
+            triangulated_mm=padded(points_mm, (3,), NOWHERE_MM),
+            valid=padded(seen, ()),
             weight=padded(1.0, (), 1.0),
             redraw=padded(new.redraw, (2,), False, bool),
             redraw_mix=padded(new.redraw_mix, (2, 2)),
@@ -207,6 +210,16 @@ def campaign_arrays(campaign: Campaign) -> CampaignArrays:
         return CampaignArrays(
             move_arrays(campaign.moves), spot_arrays, jnp.asarray(campaign.rig.aperture_convention == "azimuth")
         )
+
+
+NOWHERE_MM = (500.0, 0.0, 0.0)
+"""Stands for the point of a look that counts for nothing: finite, and in front of the cameras."""
+
+
+def in_sight(campaign: Campaign) -> np.ndarray:
+    """Whether each ordered spot has a triangulated point: one beyond the reach of the lens model has none."""
+    pixels = np.array([(s.u_left_px, s.v_left_px, s.u_right_px, s.v_right_px) for s in ordered_spots(campaign)])
+    return np.isfinite(triangulate(campaign.stereo, pixels.reshape(-1, 4))).all(axis=1)
 
 
 def spot_constants(campaign: Campaign) -> np.ndarray:

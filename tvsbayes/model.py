@@ -465,7 +465,8 @@ class ParameterSpace(eqx.Module):
         rig_z, stereo_z = z[: len(RIG_NAMES)], z[len(RIG_NAMES) :]
         half, log = self.kind == 1, self.kind == 2
         # Unused branches are fed harmless numbers: `where` lets their infinities into the gradient.
-        w = jnp.where(half, rig_z, 0.0)
+        # Beyond 37 sd Phi underflows and its inverse has no value: a fit may stray there, and must come back.
+        w = jnp.where(half, jnp.minimum(rig_z, 36.0), 0.0)
         # 1 - (1 + Phi(w)) / 2 = Phi(-w) / 2 keeps its digits where Phi(w) rounds to 1.
         half_normal = -self.u * ndtri(0.5 * ndtr(-w))
         log_normal = self.value * jnp.exp(jnp.where(log, self.u, 0.0) * rig_z)

@@ -289,7 +289,7 @@ def by_width(covariance: np.ndarray) -> np.ndarray:
         widest = int(np.argmax(variances))
         order.append(widest)
         rest = rest - np.outer(rest[:, widest], rest[widest]) / rest[widest, widest]
-    return np.array(order)
+    return np.array(order, dtype=int)
 
 
 @dataclass(frozen=True)
@@ -806,7 +806,7 @@ class Posterior:
         if direction not in DIRECTIONS:
             raise ValueError(f"direction {direction!r}; allowed: {', '.join(DIRECTIONS)}")
         axis = "pan" if direction in ("left", "right") else "tilt"
-        count = np.asarray(steps, dtype=float)
+        count = np.atleast_1d(np.asarray(steps, dtype=float))
         return self.propagate(
             lambda p: np.minimum(
                 np.multiply.outer(p[f"degrees_per_step.{direction}"], count), p[f"backlash_deg.{axis}"][:, None]

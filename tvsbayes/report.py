@@ -33,11 +33,11 @@ from rich.table import Table
 from rich.text import Text
 
 from tvsbayes import plots
-from tvsbayes.calibration import Calibration, Steps, calibration_bytes
+from tvsbayes.calibration import Calibration, Steps, calibration_bytes, mode_arrays
 from tvsbayes.campaign import input_hashes
 from tvsbayes.certificate import FIGURES
 from tvsbayes.classic import DIRECTIONS, ClassicResult
-from tvsbayes.files import TvsError, escaped, make_folder, shipped_data, write_atomically
+from tvsbayes.files import InputError, escaped, make_folder, shipped_data, write_atomically
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -376,7 +376,7 @@ def write_results(
         content = buffer.getvalue()
     else:
         del arrays["estimator"]
-        content = calibration_bytes(calibration, **arrays)
+        content = calibration_bytes(calibration, **arrays, **mode_arrays(fit.stored))
     document = json.dumps(fit_document(fit, summary, seed, draws, evidence), indent=1, allow_nan=False)
     contents = {"draws": ("draws.npz", content), "fit": ("fit.json", document.encode())}
     make_folder(folder)
@@ -567,17 +567,28 @@ class Page:
     sections: Sequence[Section] = field(default_factory=tuple)
 
 
+def find_browser() -> str:
+    """The program that prints pages.
+
+    Raises:
+        InputError: none is installed.
+    """
+    browser = next(filter(None, map(shutil.which, BROWSERS)), None)
+    if browser is None:
+        message = f"--pdf needs one of {', '.join(BROWSERS)} on the path"
+        raise InputError("no-browser", message, remedy="print the page from any browser (A4)")
+    return browser
+
+
 def print_to_pdf(page: Path) -> Path:
     """Print a report with an installed Chromium or Chrome; the PDF lies beside it.
 
     Raises:
-        TvsError: none is installed, or it failed.
+        InputError: none is installed, or it failed.
     """
-    browser = next(filter(None, map(shutil.which, BROWSERS)), None)
+    browser = find_browser()
     target = page.with_suffix(".pdf")
     remedy = f"open {page} in any browser and print it to PDF (A4)"
-    if browser is None:
-        raise TvsError("no-browser", f"--pdf needs one of {', '.join(BROWSERS)} on the path", remedy=remedy)
     with tempfile.TemporaryDirectory(prefix="tvsbayes-") as scratch:
         printed = Path(scratch) / "report.pdf"
         flags = ["--headless", "--disable-gpu", "--no-first-run", "--disable-background-networking", "--disable-sync"]
@@ -589,9 +600,9 @@ def print_to_pdf(page: Path) -> Path:
         try:
             done = subprocess.run(command, capture_output=True, timeout=PDF_SECONDS, check=False)
         except (OSError, subprocess.TimeoutExpired) as error:
-            raise TvsError("pdf", f"{Path(browser).name} did not print the report", remedy=remedy) from error
+            raise InputError("pdf", f"{Path(browser).name} did not print the report", remedy=remedy) from error
         if done.returncode or not printed.exists():
-            raise TvsError("pdf", f"{Path(browser).name} ended with code {done.returncode}", remedy=remedy)
+            raise InputError("pdf", f"{Path(browser).name} ended with code {done.returncode}", remedy=remedy)
         write_atomically(target, printed.read_bytes())
     return target
 

@@ -438,8 +438,6 @@ def require_periods(priors: Mapping[str, Prior], period_deg: Mapping[str, float]
 def _explanation(name: str, allowed: tuple[str, ...]) -> str:
     """What to do about a name that may not stand where it does."""
     stem, _, last = name.partition(".")
-    if name in DECLARED_PRIORS:
-        return "it belongs into [rig] itself, not into [rig.prior]"
     if name in _PERIOD_NAMES:
         return "it belongs into [rig] itself: tooth counts fix it, so it has no prior and no other truth"
     if name in _PRIOR_NAMES:
@@ -514,7 +512,12 @@ def parse_rig_table(table: Keys) -> RigTable:
     own_keys = Keys(own, table.file, table.text, table.path)
     declared = _parse_priors(own_keys, (*DECLARED_PRIORS, *_PERIOD_NAMES))
     period_deg = {axis: declared.pop(name).value for name, axis in _PERIOD_NAMES.items() if name in declared}
-    prior = _parse_priors(table.table("prior"), _PRIOR_NAMES)
+    # Any parameter may stand in [rig.prior] (DESIGN 7), also one that has its place in [rig].
+    prior = _parse_priors(table.table("prior"), (*_PRIOR_NAMES, *DECLARED_PRIORS))
+    for name in declared:
+        if name in prior:
+            found = f"{name} in [rig] and in [rig.prior]"
+            raise table.table("prior").refuse(name, "duplicate-key", "every name once", "remove one", found)
     _check_periods(table.table("prior"), prior, period_deg)
     key = "aperture_convention"
     azimuth = key in table and table.word(key, ("in-plane", "azimuth")) == "azimuth"
@@ -551,6 +554,10 @@ def _parse_positioner(table: Keys) -> dict[str, object]:
     limits = ("pan_min_steps", "pan_max_steps", "tilt_min_steps", "tilt_max_steps")
     table.only(("driver", "port", "baud", *limits, "speed_steps_per_s", "settle_s"))
     values: dict[str, object] = {key: table.text_value(key) for key in ("driver", "port") if key in table}
+    # Serial libraries read an address as instructions: one of them writes a file of the address' choice.
+    if "://" in str(values.get("port", "")):
+        remedy = "give a port's name, such as /dev/ttyACM0 or COM3; `tvsbayes doctor` lists those there are"
+        raise table.refuse("port", "port", "the name of a serial port, no address", remedy)
     if "baud" in table:
         values["baud"] = table.integer("baud", 300, 10_000_000)
     steps = {key: table.integer(key, -_COUNTER_MAX, _COUNTER_MAX) for key in limits if key in table}
@@ -569,9 +576,7 @@ def _parse_cameras(table: Keys, stereo: Stereo) -> dict[str, object]:
     """`[cameras]`: source, devices, size (that of the calibration), exposure, spot uncertainty."""
     table.only(("source", "left", "right", "width", "height", "exposure", "spot_sd_px"))
     values: dict[str, object] = {"spot_sd_px": 0.08}
-    if "source" in table:
-        values["source"] = table.text_value("source")
-    for key in ("left", "right"):
+    for key in ("source", "left", "right"):
         if key in table:
             device = isinstance(table.values[key], str)
             values[key] = table.text_value(key) if device else table.integer(key, 0, 1000)

@@ -20,7 +20,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Protocol
+from typing import BinaryIO, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -42,7 +42,7 @@ from tvsbayes.design import (
     prior_knowledge,
     sensitivity,
 )
-from tvsbayes.files import InputError, NotConverged, TvsError, escaped, read_bytes
+from tvsbayes.files import InputError, NotConverged, TvsError, escaped, read_bytes, refusal
 from tvsbayes.joint import JointFit, fit
 from tvsbayes.model import (
     INDEX,
@@ -256,9 +256,9 @@ class SerialExecutor:
             yield study_row(job, index)
 
 
-def _worker_died(what: str) -> TvsError:
+def _worker_died(what: str) -> InputError:
     remedy = "run the same command again: it goes on"
-    return TvsError("worker-died", f"{what}; finished rows are kept", remedy=remedy)
+    return InputError("worker-died", f"{what}; finished rows are kept", remedy=remedy)
 
 
 class ProcessExecutor:
@@ -388,6 +388,22 @@ class StudyRows:
             row = self._row(line, number)
             self.rows[row["design"], row["index"]] = row
         self.torn = len(data) - len(whole)
+        # Before the first campaign is fitted, not after.
+        if not os.access(self.path if self.path.exists() else self.path.parent, os.W_OK):
+            raise self._unwritable("no right to write, or no such folder")
+
+    def _unwritable(self, found: str) -> InputError:
+        allowed, remedy = "a file that can be written", "name another with --rows"
+        return refusal("write", file=escaped(str(self.path), 200), found=found, allowed=allowed, remedy=remedy)
+
+    @contextmanager
+    def _open(self) -> Iterator[BinaryIO]:
+        """The file, for reading and writing; made where there is none."""
+        try:
+            with self.path.open("r+b" if self.path.exists() else "w+b") as file:
+                yield file
+        except OSError as error:
+            raise self._unwritable(escaped(error.strerror or str(error))) from error
 
     def _row(self, line: bytes, number: int) -> dict[str, object]:
         try:
@@ -413,7 +429,7 @@ class StudyRows:
         """Add a row and wait until the disk has it."""
         row = {"format": STUDY_FORMAT, **row}
         line = json.dumps(row, allow_nan=False).encode() + b"\n"
-        with self.path.open("r+b" if self.path.exists() else "w+b") as file:
+        with self._open() as file:
             if self.torn:
                 file.truncate(self.path.stat().st_size - self.torn)
                 self.torn = 0

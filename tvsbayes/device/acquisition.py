@@ -172,8 +172,9 @@ class StopKey:
         self.requested = True
         try:
             self._tell("finishing the present look; Ctrl-C again stops at once")
-        except RuntimeError:
-            # The interrupted code was writing to the same stream, which then refuses: the key counts all the same.
+        except (RuntimeError, OSError):
+            # The interrupted code was writing to the same stream, which then refuses, or the same key has ended the
+            # `tee` behind it: the key counts all the same.
             pass
 
 
@@ -312,6 +313,7 @@ class Acquisition:
         self._annotate, self._details = annotate, dict(details or {})
         self._settle_s = float(rig.positioner.get("settle_s", SETTLE_S))
         self._retries, self._warnings, self._check_depth = 0, [], False
+        self._behind = ""
         self._placement = -1
         self._recorder = Recorder()
         for record in journal.records:
@@ -391,11 +393,9 @@ class Acquisition:
             pass
         finally:
             self.journal.close()
-        try:
-            self._derive(always=True)
-        except TvsError as error:
-            # The journal has everything; --resume writes the tables again.
-            self._warnings.append(f"the campaign files are behind the journal: {error.message}")
+        self._derive(always=True)
+        if self._behind:
+            self._warnings.append(f"the campaign files are behind the journal: {self._behind}")
 
     def _do(self, step: PlanStep) -> None:
         if step.action == "home":
@@ -613,8 +613,15 @@ class Acquisition:
         if not always and count > DERIVED_EVERY and count % (count // DERIVED_EVERY):
             return
         campaign = self._campaign()
-        if campaign is not None:
+        if campaign is None:
+            return
+        try:
             write_derived(campaign, self.journal.folder, tables_only=not always)
+            self._behind = ""
+        except TvsError as error:
+            # Somebody has the table open, say. The journal has everything, and the next look tries again; after the
+            # last one --resume does.
+            self._behind = error.message
 
     def _campaign(self) -> Campaign | None:
         """What the journal holds so far, None before the first homing."""

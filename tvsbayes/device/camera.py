@@ -13,6 +13,7 @@ Seconds where a name says `_s`.
 
 from __future__ import annotations
 
+import os
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -110,7 +111,7 @@ def open_capture(source: str | int) -> Capture:
     """
     import cv2
 
-    if isinstance(source, str) and source.isdigit():
+    if isinstance(source, str) and source.isascii() and source.isdigit() and len(source) <= 4:
         source = int(source)
     if isinstance(source, str) and "://" in source:
         if not source.startswith(("http://", "https://", "rtsp://")):
@@ -334,6 +335,7 @@ class VirtualCamera:
     _thread: threading.Thread | None = field(default=None, init=False, repr=False)
     _stop: threading.Event = field(default_factory=threading.Event, init=False, repr=False)
     _lock: threading.Lock = field(default_factory=threading.Lock, init=False, repr=False)
+    _no_proxy: str | None = field(default=None, init=False, repr=False)
 
     @property
     def address(self) -> str:
@@ -365,6 +367,9 @@ class VirtualCamera:
                 """Requests are no news."""
 
         self._stop.clear()
+        # FFmpeg, which OpenCV opens the address with, asks the proxy of the environment even for this computer.
+        self._no_proxy = os.environ.get("no_proxy")
+        os.environ["no_proxy"] = ",".join(filter(None, (self._no_proxy, "127.0.0.1")))
         self._server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
         self._server.daemon_threads = False
         self._thread = threading.Thread(target=self._server.serve_forever, args=(0.05,), daemon=True)
@@ -379,6 +384,10 @@ class VirtualCamera:
         # Waits for the streams, which end at the next frame.
         self._server.server_close()
         self._server = None
+        if self._no_proxy is None:
+            os.environ.pop("no_proxy", None)
+        else:
+            os.environ["no_proxy"] = self._no_proxy
         if self.failure is not None:
             raise self.failure
 

@@ -26,6 +26,7 @@ from tvsbayes.device.protocol import (
     Reply,
     parse_answer,
     request,
+    unsigned,
 )
 from tvsbayes.files import DeviceFault, escaped
 
@@ -262,10 +263,10 @@ class SerialPositioner:
             found = f"firmware {firmware} speaks protocol {escaped(str(version))}, this program speaks {VERSION}"
             remedy = "flash the firmware shipped with tvsbayes: see README.md in its device/firmware folder"
             raise _fault("firmware", found, remedy)
-        last = reply.extra.get("q", "")
-        if not last.isdigit() or not last.isascii():
+        last = unsigned(reply.extra.get("q", ""))
+        if last is None:
             raise _fault("firmware", f"firmware {firmware} names no last sequence", "flash the shipped firmware")
-        self._sequence = max(self._sequence, int(last))
+        self._sequence = max(self._sequence, last)
         return reply
 
     def _command(self, *words: object) -> Reply:
@@ -444,10 +445,16 @@ class _SerialLink:
 
         # Exclusive: a second program on the line would eat our answers. A write time-out, else a stalled peer
         # would hold us for ever.
-        self._serial = serial.serial_for_url(port, baudrate=baud, timeout=0.1, write_timeout=1.0, do_not_open=True)
+        # Not `serial_for_url`, whose addresses run other code and one of which writes files.
+        self._serial = serial.Serial(None, baud, timeout=0.1, write_timeout=1.0)
         if hasattr(self._serial, "exclusive"):
             self._serial.exclusive = True
-        self._serial.open()
+        self._serial.port = port
+        try:
+            self._serial.open()
+        except ValueError as error:
+            # A name or speed that the system cannot even try, such as one with a NUL.
+            raise OSError(str(error)) from error
 
     def write(self, data: bytes) -> None:
         self._serial.write(data)

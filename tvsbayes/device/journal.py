@@ -14,6 +14,7 @@ Times in the events: UTC for people, `time_s` for the campaign (seconds since th
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import json
 import os
@@ -27,6 +28,7 @@ from tvsbayes.files import (
     DeviceFault,
     InputError,
     escaped,
+    flush_folder,
     make_folder,
     parse_json,
     read_bytes,
@@ -404,7 +406,7 @@ class Journal:
                 message, remedy = "the journal is full", "begin a new campaign for the rest of the plan"
                 raise DeviceFault("journal-full", f"{message}; {remedy}", remedy=remedy)
             for folder in sorted(self._dirty):
-                self._flush_folder(folder)
+                flush_folder(folder, self._disk)
             self._dirty.clear()
             self._write(descriptor, line)
             self._disk.fsync(descriptor)
@@ -427,16 +429,6 @@ class Journal:
         view = memoryview(data)
         while view:
             view = view[self._disk.write(descriptor, bytes(view)) :]
-
-    def _flush_folder(self, folder: Path) -> None:
-        # Only POSIX can flush a folder; elsewhere the file system's own journal has to do.
-        if os.name != "posix":
-            return
-        descriptor = self._disk.open(folder, os.O_RDONLY)
-        try:
-            self._disk.fsync(descriptor)
-        finally:
-            self._disk.close(descriptor)
 
 
 class _Guard:
@@ -477,6 +469,10 @@ def _lock(descriptor: int) -> None:
             os.lseek(descriptor, LOG_BYTES_MAX + 1, os.SEEK_SET)
             msvcrt.locking(descriptor, msvcrt.LK_NBLCK, 1)
     except OSError as error:
+        # What flock(2) and _locking say of a lock that somebody holds; anything else is a disk without locks.
+        if error.errno not in (errno.EWOULDBLOCK, errno.EACCES, errno.EDEADLK):
+            found, allowed = escaped(error.strerror or str(error)), "a disk that can lock files"
+            raise refusal("lock", file=LOG, found=found, allowed=allowed, remedy="use a local disk") from error
         allowed, remedy = "one program at a time", "wait for the other, or end it"
         raise refusal("locked", file=LOG, found="another writer", allowed=allowed, remedy=remedy) from error
 

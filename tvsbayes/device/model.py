@@ -126,7 +126,7 @@ class DeviceModel:
         self._last_request, self._last_reply = b"", b""
         self._stopping = self._homing = self._homed_before = False
         self._home_axis = self._home_clear = self._home_travel = 0
-        self._home_phase = "away"
+        self._home_limit, self._home_phase = False, "away"
         self._home_due_us, self._heard_us = _NEVER, now_us
         self._line = bytearray()
         self._overlong = False
@@ -369,6 +369,7 @@ class DeviceModel:
 
     def _home_one(self, axis: int, now_us: int) -> None:
         self._home_axis, self._home_travel = axis, 0
+        self._home_limit = self.mechanics.limit_switch(axis)
         self._enter_phase("away" if self.mechanics.home_switch(axis) else "fast", now_us)
 
     def _enter_phase(self, phase: str, now_us: int) -> None:
@@ -384,6 +385,11 @@ class DeviceModel:
         self.mechanics.step(self._home_axis, 1 if positive else -1)
         axis.position += 1 if positive else -1
         axis.target = axis.position
+        # Homing also leads back from an open limit; one that opens on the way means that no home switch will come.
+        limit = self.mechanics.limit_switch(self._home_axis)
+        if limit and not self._home_limit:
+            return self._halt("alarm", "limit")
+        self._home_limit = limit
         self._home_travel += 1
         if self._home_travel > HOME_TRAVEL_MAX_STEPS:
             return self._halt("alarm", "home")

@@ -227,9 +227,15 @@ def write_derived(campaign: Campaign, folder: Path, tables_only: bool = False) -
     """
     folder = Path(folder)
     for name, data in _files(campaign, folder, tables_only).items():
-        path = folder / name
-        if not path.is_file() or path.read_bytes() != data:
-            write_atomically(path, data)
+        if not _holds(folder / name, data):
+            write_atomically(folder / name, data)
+
+
+def _holds(path: Path, data: bytes) -> bool:
+    try:
+        return path.read_bytes() == data
+    except OSError:
+        return False
 
 
 def _files(campaign: Campaign, folder: Path, tables_only: bool = False) -> dict[str, bytes]:

@@ -723,7 +723,8 @@ def detect(
         NothingToEstimate: no row has both frames.
     """
     if method not in METHODS:
-        raise InputError("method", f"no method {method!r}", found=method, allowed=", ".join(METHODS))
+        remedy = "choose one of them"
+        raise InputError("method", f"no method {method!r}", found=method, allowed=", ".join(METHODS), remedy=remedy)
     if campaign.path is None:
         raise InputError("path", "a campaign that was not read from a folder has no frames")
     stereo = campaign.stereo

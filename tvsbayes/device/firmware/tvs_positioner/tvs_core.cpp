@@ -419,6 +419,7 @@ void Core::set_laser(bool on) {
 void Core::home_axis(int axis, uint64_t now_us) {
   home_axis_ = axis;
   home_travel_ = 0;
+  home_limit_ = hooks_.limit_switch(axis);
   home_phase(hooks_.home_switch(axis) ? kAway : kFast, now_us);
 }
 
@@ -435,6 +436,10 @@ void Core::home_step() {
   hooks_.step(home_axis_, positive);
   axis.position += positive ? 1 : -1;
   axis.target = axis.position;
+  // Homing also leads back from an open limit; one that opens on the way means that no home switch will come.
+  const bool limit = hooks_.limit_switch(home_axis_);
+  if (limit && !home_limit_) return halt(kAlarm, "limit");
+  home_limit_ = limit;
   if (++home_travel_ > kHomeTravelMax) return halt(kAlarm, "home");
   const bool pressed = hooks_.home_switch(home_axis_);
   if (positive && !pressed && --home_clear_ == 0) {

@@ -75,6 +75,7 @@ class Core {
   int home_axis_;
   Phase home_phase_;
   int32_t home_clear_, home_travel_;
+  bool home_limit_;
   uint64_t home_due_us_, heard_us_;
   char request_[kRequestMax + 2], last_request_[kRequestMax + 2], last_reply_[kReplyMax + 8];
   size_t request_size_, last_request_size_, last_reply_size_;
