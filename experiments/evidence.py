@@ -1,10 +1,11 @@
 """How reliable is all this? The figures of coverage, faults, kills, mutations and planted bugs on one page.
 
     python experiments/evidence.py device              # slow tests of protocol, journal and engine, about 25 minutes
-    python experiments/evidence.py table > experiments/EVIDENCE.md
+    python experiments/evidence.py table               # rewrites EVIDENCE.md
 
-`table` computes every figure anew from the rows that the studies left in `experiments/output/` (git ignores them: run
-the command of a line to have its rows) and says of when they are. A line whose rows are not there says so.
+`table` computes a figure anew from the rows that its study left in `experiments/output/` (git ignores them: run the
+command of a line to have its rows) and says of when and which commit they are. A line whose rows are not there stays
+as it stands in the page, with its own date and commit.
 """
 
 from __future__ import annotations
@@ -27,6 +28,8 @@ from scipy import stats
 ROOT = Path(__file__).resolve().parents[1]
 OUTPUT = Path(__file__).parent / "output"
 DEVICE = OUTPUT / "evidence_device.json"
+PAGE = Path(__file__).parent / "EVIDENCE.md"
+HEADINGS = ("claim", "figure", "holds", "rows of", "commit", "command")
 DEVICE_TESTS = (
     "tests/test_device_faults.py",
     "tests/test_device_journal.py",
@@ -323,30 +326,51 @@ def run_device() -> None:
     print(DEVICE.read_text())
 
 
+def standing(page: str) -> dict[str, str]:
+    """Lines of the page's table by their claim."""
+    lines = [line for line in page.splitlines() if line.startswith("| ")]
+    return {line.split(" | ")[0].removeprefix("| "): line for line in lines}
+
+
+def commit_at(moment: datetime.datetime) -> str:
+    """The last commit before a moment."""
+    command = ["git", "log", "-1", "--format=%h", f"--before={moment.isoformat()}"]
+    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False).stdout.strip() or "-"
+
+
+def computed(line: Line) -> str | None:
+    """The line of the table from its rows; None without any."""
+    path = OUTPUT / line.rows
+    try:
+        rows = read_rows(path)
+        if not rows:
+            return None
+        figure, holds = line.figure(rows)
+    except FileNotFoundError:
+        return None
+    made = datetime.datetime.fromtimestamp(path.stat().st_mtime, datetime.UTC)
+    word = {True: "yes", False: "NO", None: "-"}[holds]
+    return f"| {line.claim} | {figure} | {word} | {made.date()} | {commit_at(made)} | `{line.command}` |"
+
+
 def table() -> None:
-    """The page."""
-    head = subprocess.run(
-        ["git", "rev-parse", "--short", "HEAD"], cwd=ROOT, capture_output=True, text=True, check=False
-    )
-    today = datetime.datetime.now(datetime.UTC).date()
-    print("# Evidence\n")
-    print(f"Written by `python experiments/evidence.py table` on {today}, commit {head.stdout.strip() or 'unknown'}.")
-    print(
-        "Bounds in brackets are left by a true claim once in 10 000 times. What is behind a figure stands in its script"
-    )
-    print("and in [the list of experiments](README.md).\n")
-    print("| claim | figure | holds | rows of | command |\n|---|---|---|---|---|")
+    """Write the page."""
+    kept = standing(PAGE.read_text()) if PAGE.exists() else {}
+    page = [
+        "# Evidence",
+        "",
+        "Written by `python experiments/evidence.py table`. Bounds in brackets are left by a true claim once in 10 000",
+        "times. `commit` is the last one before the rows were finished. What is behind a figure stands in its script and",
+        "in [the list of experiments](README.md).",
+        "",
+        f"| {' | '.join(HEADINGS)} |",
+        "|---" * len(HEADINGS) + "|",
+    ]
     for line in LINES:
-        path = OUTPUT / line.rows
-        rows: list[dict] = []
-        try:
-            rows = read_rows(path)
-            figure, holds = line.figure(rows) if rows else ("no rows", None)
-            day = datetime.datetime.fromtimestamp(path.stat().st_mtime, datetime.UTC).date() if rows else "-"
-        except FileNotFoundError:
-            figure, holds, day = "no rows", None, "-"
-        word = {True: "yes", False: "NO", None: "-" if rows else "not run"}[holds]
-        print(f"| {line.claim} | {figure} | {word} | {day} | `{line.command}` |")
+        page.append(
+            computed(line) or kept.get(line.claim) or f"| {line.claim} | no rows | not run | - | - | `{line.command}` |"
+        )
+    PAGE.write_text("\n".join(page) + "\n")
 
 
 def main() -> None:
