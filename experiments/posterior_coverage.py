@@ -275,11 +275,12 @@ def main() -> None:
     parser.add_argument("action", choices=("run", "broken", "table"))
     parser.add_argument("--n", type=int, default=24)
     parser.add_argument("--cores", type=int, nargs="+", default=[0])
+    parser.add_argument("--protocols", nargs="+", choices=PROTOCOLS, default=PROTOCOLS)
     arguments = parser.parse_args()
     seeds = range(arguments.n)
     # Seeds in the outer loop: an interrupted run leaves balanced designs.
     if arguments.action == "run":
-        tasks = [(p, s) for s in seeds for p in PROTOCOLS]
+        tasks = [(p, s) for s in seeds for p in arguments.protocols]
         run_rows(clean_rig, tasks, CLEAN_ROWS, ("protocol", "seed"), arguments.cores)
     elif arguments.action == "broken":
         tasks = [(c, s) for s in seeds for c in BROKEN]

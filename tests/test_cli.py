@@ -715,3 +715,27 @@ def test_help_loads_nothing_heavy_and_lists_the_commands():
     assert result.stderr.strip() == "[] 0"
     for command in ("demo", "new", "simulate", "check", "classic", "fit"):
         assert f"  {command} " in result.stdout
+
+
+def test_whoever_waits_for_the_first_compilation_is_told(tmp_path, capsys, monkeypatch):
+    import jax
+
+    monkeypatch.setenv("TVSBAYES_CACHE", str(tmp_path))
+    monkeypatch.setattr(jax.config, "update", lambda *_: None)
+    cli._use_compilation_cache()
+    assert capsys.readouterr().err == "", "progress is for terminals"
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
+    cli._use_compilation_cache()
+    assert "first run" in capsys.readouterr().err
+    (tmp_path / "jit_fit-cache").touch()
+    cli._use_compilation_cache()
+    assert capsys.readouterr().err == ""
+
+
+def test_a_slow_computers_user_is_not_sent_to_the_authors_of_xla(monkeypatch):
+    monkeypatch.setenv("TF_CPP_MIN_LOG_LEVEL", "")
+    monkeypatch.delenv("TF_CPP_MIN_LOG_LEVEL")
+    monkeypatch.setattr(sys, "argv", ["tvsbayes", "--help"])
+    with pytest.raises(SystemExit):
+        cli.main()
+    assert os.environ["TF_CPP_MIN_LOG_LEVEL"] == "3"

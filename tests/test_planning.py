@@ -714,7 +714,7 @@ def ask(capsys, monkeypatch):
     from tvsbayes import model
     from tvsbayes.cli import run
 
-    monkeypatch.setattr(model, "use_compilation_cache", lambda: None)
+    monkeypatch.setattr(model, "use_compilation_cache", lambda: False)
 
     def command(*arguments) -> tuple[int, dict]:
         code = run([*map(str, arguments), "--json"])
@@ -744,7 +744,7 @@ def test_a_plan_with_nothing_left_to_measure_says_that_it_wrote_none(capsys, tmp
     from tvsbayes.cli import run
 
     whole = planning.plan
-    monkeypatch.setattr(model, "use_compilation_cache", lambda: None)
+    monkeypatch.setattr(model, "use_compilation_cache", lambda: False)
     monkeypatch.setattr(planning, "plan", lambda *given, **options: replace(whole(*given, **options), steps=()))
     place = tmp_path / "plan.csv"
     code = run([*map(str, ("plan", MOUNTED / "rig.toml", "--draws", 20, "--minutes", 3, "-o", place))])

@@ -83,6 +83,14 @@ def report_line(text: str) -> None:
         pass
 
 
+def _use_compilation_cache() -> None:
+    """`model.use_compilation_cache`, and a word to whoever waits for the first compilation."""
+    from tvsbayes.model import use_compilation_cache
+
+    if use_compilation_cache() and sys.stderr.isatty():
+        report_line("first run: the model is compiled, half a minute to two minutes; later runs take it from the cache")
+
+
 class _OutputFailed(Exception):
     """Standard output took no more, as on a full disk."""
 
@@ -170,11 +178,10 @@ def demo(
         from tvsbayes.classic import classic as estimate_classic
         from tvsbayes.information import calibration_of, summarise
         from tvsbayes.joint import fit as fit_joint
-        from tvsbayes.model import use_compilation_cache
         from tvsbayes.report import demo_text, write_results
         from tvsbayes.simulation import effective_deg_per_step, effective_mirror_offset_mm, read_truth
 
-        use_compilation_cache()
+        _use_compilation_cache()
         campaign = read_campaign(folder)
         true = read_truth(folder / "truth.json", campaign.stereo).parameters
         classic_result = estimate_classic(campaign)
@@ -327,9 +334,8 @@ def stereo(
     else:
         from tvsbayes.device.boards import Board
         from tvsbayes.device.stereo import calibrate_folder
-        from tvsbayes.model import use_compilation_cache
 
-        use_compilation_cache()
+        _use_compilation_cache()
         pattern = Board.named(board, pitch_mm, pitch_u_mm)
         result = calibrate_folder(folder, pattern, finder=finder, swap=swap, fix_k3=fix_k3, robust=robust)
         pair, text = result.stereo, stereo_calibration_text(result)
@@ -384,10 +390,9 @@ def check(
         raise InputError("usage", "a plan is checked together with a rig file", allowed="RIG PLAN", remedy=remedy)
     if plan_file is not None:
         rig, steps = read_rig(path), read_plan(plan_file)
-        from tvsbayes.model import use_compilation_cache
         from tvsbayes.planning import check_plan
 
-        use_compilation_cache()
+        _use_compilation_cache()
         document: dict[str, Any] = check_plan(rig, steps).as_json()
     elif path.suffix == ".csv" and not path.is_dir():
         steps = read_plan(path)
@@ -544,10 +549,9 @@ def fit(
     data = read_campaign(campaign)
     from tvsbayes.information import DRAWS_KEPT, calibration_of, summarise
     from tvsbayes.joint import fit as fit_joint
-    from tvsbayes.model import use_compilation_cache
     from tvsbayes.report import fit_text, write_results
 
-    use_compilation_cache()
+    _use_compilation_cache()
     folder = out or output_place(campaign, "results")
     model = {"per_axis": per_axis, "harmonics": harmonics, "no_backlash": no_backlash}
     result = fit_joint(data, robust=robust, **model, seed=seed)
@@ -633,9 +637,8 @@ def _fit_of(campaign: Campaign) -> JointFit:
     """The fit in `results/` where its hashes agree with the campaign; else fit first (DESIGN 8)."""
     from tvsbayes.calibration import stored_mode
     from tvsbayes.joint import restored
-    from tvsbayes.model import use_compilation_cache
 
-    use_compilation_cache()
+    _use_compilation_cache()
     stored = stored_mode(campaign)
     found = None if stored is None else restored(campaign, stored)
     if found is not None:
@@ -647,9 +650,8 @@ def _fit_of(campaign: Campaign) -> JointFit:
 def _converged_fit(campaign: Campaign) -> JointFit:
     """A fit for a command that needs one in passing."""
     from tvsbayes.joint import fit as fit_joint
-    from tvsbayes.model import use_compilation_cache
 
-    use_compilation_cache()
+    _use_compilation_cache()
     result = fit_joint(campaign)
     if not result.converged:
         raise NotConverged(
@@ -880,10 +882,9 @@ def locate(
         sides_of((pan_approach, tilt_approach))
     calibration = _calibration(campaign)
     from tvsbayes.coordinates import locate as locate_points
-    from tvsbayes.model import use_compilation_cache
     from tvsbayes.report import locations_text
 
-    use_compilation_cache()
+    _use_compilation_cache()
     found = locate_points(calibration, *where, draws=draws, seed=seed)
     if points is not None:
         entries = [found.as_json(k) for k in range(len(found.refused))]
@@ -973,7 +974,6 @@ def plan(
 
     instrument, data = read_rig(rig), None if given is None else read_campaign(given)
     from tvsbayes.design import CRITERIA, DEFAULT_TARGET, parse_target
-    from tvsbayes.model import use_compilation_cache
     from tvsbayes.planning import plan as find_plan
     from tvsbayes.planning import plan_text
 
@@ -981,7 +981,7 @@ def plan(
     if criterion not in CRITERIA:
         message, allowed = f"--criterion {escaped(criterion)}", ", ".join(CRITERIA)
         raise InputError("criterion", message, column="--criterion", allowed=allowed, remedy="name one of them")
-    use_compilation_cache()
+    _use_compilation_cache()
     fitted = None if data is None else _fit_of(data)
     options = {"criterion": criterion, "aperture": aperture, "draws": draws, "seed": seed}
     result = find_plan(instrument, wanted, given=fitted, minutes=minutes, **options)
@@ -1021,11 +1021,10 @@ def study(
 
     instrument, steps = read_rig(rig), read_plan(plan_file)
     from tvsbayes.design import ASSURED, DEFAULT_TARGET, parse_target
-    from tvsbayes.model import use_compilation_cache
     from tvsbayes.studies import StudyJob, StudyRows, study_text
     from tvsbayes.studies import study as run_study
 
-    use_compilation_cache()
+    _use_compilation_cache()
     job = StudyJob(instrument, steps, parse_target(target or DEFAULT_TARGET), seed, aperture)
     kept = StudyRows(rows or plan_file.with_suffix(".study.jsonl"))
     missing = n - sum(index < n for index in kept.of(job))
@@ -1143,4 +1142,6 @@ def main() -> None:
     # Read when NumPy is first imported. The matrices here are small: OpenBLAS' second thread only waits, and its
     # busy waiting takes the time of XLA's threads, tenfold where two fits share two cores.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    # XLA calls a compilation of more than two minutes, as on a small computer, an error to be filed with its authors.
+    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
     sys.exit(run(sys.argv[1:]))

@@ -18,6 +18,7 @@ one compiled function serves every choice of fixed parameters. Units of physical
 from __future__ import annotations
 
 import os
+from pathlib import Path
 
 import equinox as eqx
 import jax
@@ -48,15 +49,19 @@ WIDEST_TAN2 = 4.0
 and folds outside it."""
 
 
-def use_compilation_cache() -> None:
+def use_compilation_cache() -> bool:
     """Keep compiled functions in the user's cache folder (or `TVSBAYES_CACHE`).
 
     For programs such as the command line, which own their process: it changes a global setting of JAX, so nothing
     in the library calls it.
+
+    Returns:
+        Whether nothing is in the folder yet: the model has to be compiled first, half a minute to two minutes.
     """
-    folder = os.environ.get("TVSBAYES_CACHE") or str(user_cache_path("tvsbayes") / "jax")
-    jax.config.update("jax_compilation_cache_dir", folder)
+    folder = Path(os.environ.get("TVSBAYES_CACHE") or user_cache_path("tvsbayes") / "jax")
+    jax.config.update("jax_compilation_cache_dir", str(folder))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
+    return next(folder.glob("*-cache"), None) is None
 
 
 def materialise(tree):
