@@ -34,6 +34,7 @@ from tvsbayes import simulation
 from tvsbayes.calibration import (
     CALIBRATION_FORMAT,
     CLEARED_PROBABILITY,
+    DIVERGING_SHARE,
     INPUT_NAMES,
     NO_CALIBRATION,
     NOISE_NAMES,
@@ -52,7 +53,7 @@ from tvsbayes.calibration import (
     stored_calibration,
 )
 from tvsbayes.campaign import input_hashes
-from tvsbayes.coordinates import carry, locate_linear, meeting, settings_of, sources
+from tvsbayes.coordinates import carry, locate, locate_linear, meeting, settings_of, sources
 from tvsbayes.files import InputError
 from tvsbayes.rigs import HARMONIC_PRIORS, Prior
 
@@ -238,6 +239,39 @@ def test_an_impossible_reading_is_refused(azimuth, reading):
     assert error.column == "aperture_deg" and error.remedy and error.allowed
 
 
+def test_a_beam_along_the_line_of_sight_is_refused():
+    """Nominal rig, B + C = 180 deg exactly: no range, and no division by zero."""
+    for azimuth in (False, True):
+        one = calibration(NOMINAL, {}, azimuth=azimuth)
+        assert refusal(lambda one=one: one.locate(500, 0, 60.0)).code == "diverging"
+
+
+def test_points_that_too_many_draws_lose_are_refused_as_by_the_draws(bent):
+    """DESIGN 5: more than 0.1 % of draws diverge. The law of propagation asks range and u, the other counts draws."""
+    rng = np.random.default_rng(4)
+    count = 4000
+    inputs = np.array([NOMINAL[name] for name in INPUT_NAMES]) + np.zeros((count, 1))
+    sds = {"pan_zero_emission_deg": 0.2, "baseline_mm": 0.5, "degrees_per_step.pan": 1e-4}
+    for name, sd in sds.items():
+        inputs[:, INPUT_NAMES.index(name)] += sd * rng.standard_normal(count)
+    noise = np.full((count, len(NOISE_NAMES)), 0.05)
+    drawn = replace(
+        calibration(NOMINAL, {}, NO_NOISE_DEG),
+        mean=inputs.mean(axis=0),
+        covariance=np.cov(inputs, rowvar=False),
+        noise_variance=dict.fromkeys(NOISE_NAMES, 0.05**2),
+        inputs=inputs,
+        noise=noise,
+    )
+    for reading, meets in ((57.0, True), (59.0, True), (59.6, False), (59.9, False)):
+        share = locate(drawn, 500.0, 0.0, reading, draws=count).diverging_share[0]
+        assert (share <= DIVERGING_SHARE) == meets, (reading, share)
+        if meets:
+            assert np.isfinite(drawn.locate(500, 0, reading).u95_mm).all()
+        else:
+            assert refusal(lambda reading=reading: drawn.locate(500, 0, reading)).code == "diverging"
+
+
 def test_unknown_approaches_are_refused(bent):
     for approach, axis in ((("up", "up"), "pan"), (("left", "left"), "tilt"), (("left", "\x1b[31m"), "tilt")):
         for call in (
@@ -349,7 +383,15 @@ def test_targets_out_of_limits_or_reach_are_refused(bent):
     for azimuth, elevation in ((0.0, 95.0), (math.inf, 0.0), (95.0, 0.0)):
         wanted = {"azimuth_deg": azimuth, "elevation_deg": elevation}
         assert refusal(lambda wanted=wanted: bent.steps_for(**wanted)).code == "out-of-reach"
-    for wanted in ({}, {"azimuth_deg": 1.0}, {"xyz_mm": (5, 0, 0), "azimuth_deg": 1.0, "elevation_deg": 1.0}):
+    point = {"xyz_mm": (600.0, 40.0, 0.0)}
+    both = {"azimuth_deg": 1.0, "elevation_deg": 1.0}
+    for wanted in (
+        {},
+        {"azimuth_deg": 1.0},
+        point | both,
+        point | {"azimuth_deg": 40.0},
+        point | {"elevation_deg": 1.0},
+    ):
         assert refusal(lambda wanted=wanted: bent.steps_for(**wanted)).code == "no-target"
 
 
@@ -519,6 +561,7 @@ DAMAGES = {
     "another format": lambda a: a | {"format": np.array("tvsbayes-calibration/9")},
     "no format": lambda a: {name: value for name, value in a.items() if name != "format"},
     "other columns": lambda a: a | {"input_names": a["input_names"][::-1]},
+    "other noises": lambda a: a | {"noise_names": a["noise_names"][::-1]},
     "no mean": lambda a: {name: value for name, value in a.items() if name != "mean"},
     "no tables": lambda a: {name: value for name, value in a.items() if name != "tables"},
     "nan in the mean": lambda a: a | {"mean": poisoned(a["mean"], np.nan)},

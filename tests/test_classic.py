@@ -256,6 +256,21 @@ def test_fixed_parameters_are_skipped():
     assert len(calls) == 2
 
 
+def test_a_step_out_of_the_lens_model_is_shortened():
+    """sqrt(1 - x) at x = 0.99 with sd 1: a tenth of it leads beyond 1; the slope is -1 / (2 sqrt(0.01)) = -5."""
+    start = make_stereo().vector[0]
+
+    def function(stereo: Stereo, focal_scale: float) -> float:
+        with np.errstate(invalid="ignore"):
+            return float(np.sqrt(0.01 - (stereo.vector[0] - start) - 100 * (focal_scale - 1)))
+
+    covariance = np.zeros((24, 24))
+    covariance[0, 0] = 1.0
+    # Halved to less than the distance 0.01, a difference quotient of the root is up to a sixth off; here at most 6 %.
+    assert stereo_variance(function, make_stereo(covariance), 0.0) == pytest.approx(25.0, rel=0.25)
+    assert stereo_variance(function, make_stereo(0 * covariance), 0.01) == pytest.approx(25.0, rel=0.25)
+
+
 def _changed(campaign: Campaign, row: int, **changes) -> Campaign:
     """The campaign with one spot changed."""
     spots = list(campaign.spots)

@@ -230,6 +230,11 @@ def test_a_budget_needs_causes_and_a_point(caused):
         budget(calibration(), *POINT)
     with pytest.raises(InputError, match="diverge"):
         budget(caused, 130.0, 90.0, 179.0)
+    # Past the cone of all points under this angle: a complex step must not find an imaginary range there.
+    for call in (caused.locate, caused.derivatives, lambda *look: budget(caused, *look)):
+        with pytest.raises(InputError) as caught:
+            call(-500.0, 0.0, 0.1)
+        assert caught.value.code == "grazing"
 
 
 def direction_result(mean: float) -> DirectionResult:

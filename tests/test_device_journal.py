@@ -195,9 +195,15 @@ def test_a_disk_without_locks_is_not_called_another_writer(folder, monkeypatch):
         raise OSError(errno.ENOLCK, "No locks available")
 
     monkeypatch.setattr(fcntl, "flock", none_left)
-    with pytest.raises(InputError, match="No locks available") as caught:
-        Journal.open(folder)
-    assert caught.value.code == "lock"
+    for begin, place in ((Journal.open, folder), (Journal.create, folder.with_name("new"))):
+        handles = len(os.listdir("/proc/self/fd")) if Path("/proc/self/fd").exists() else 0
+        with pytest.raises(InputError, match="No locks available") as caught:
+            begin(place)
+        assert caught.value.code == "lock"
+        assert not handles or len(os.listdir("/proc/self/fd")) == handles
+    monkeypatch.undo()
+    # Nothing stays that would call the folder occupied once it is on a disk with locks.
+    Journal.create(folder.with_name("new")).close()
 
 
 @pytest.mark.skipif(os.name != "posix", reason="only POSIX flushes folders")

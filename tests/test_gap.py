@@ -35,7 +35,17 @@ from tvsbayes.comparison import (
     folds_of,
     hold_out,
 )
-from tvsbayes.information import CAUSE_LIMIT, StopResidual, residual_causes, stop_residuals
+from tvsbayes.files import NotConverged
+from tvsbayes.information import (
+    CAUSE_LIMIT,
+    StopResidual,
+    _Answer,
+    _holm,
+    log_chance,
+    recursive_residuals,
+    residual_causes,
+    stop_residuals,
+)
 from tvsbayes.joint import JointFit, fit
 from tvsbayes.likelihood import ordered_spots
 from tvsbayes.simulation import Truth, read_truth, simulate
@@ -232,6 +242,24 @@ def test_regions_of_a_campaign_that_moved_one_axis(mounted_rig):
     assert np.all(np.sum(list(folds.values()), axis=0) == 1)
 
 
+def test_experiments_beyond_the_lens_model_neither_teach_nor_are_asked():
+    rows, nothing = np.zeros((4, 4), dtype=int), np.zeros((4, 4, 4))
+    selection = Selection(np.arange(4), rows, nothing, np.full(4, 200), np.full(4, "pan"), ())
+    angle = np.array([12.0, 12.1, 11.9, np.nan])
+    told = _foretell_classic(angle, selection, np.array([True, False, False, False]))
+    assert told[0][0] == pytest.approx(12.0) and np.isfinite(told[0][1]) and told[0][2] == 1
+    assert _foretell_classic(angle, selection, np.array([False, False, False, True])) == {}
+
+
+def test_a_fold_without_a_fit_decides_nothing(mixed_fit, monkeypatch):
+    def lost(*_arguments):
+        raise NotConverged("diverged", "NOT CONVERGED: the fit ran away")
+
+    monkeypatch.setattr("tvsbayes.comparison._refit", lost)
+    held = hold_out(mixed_fit)
+    assert held.verdict == CANNOT_TELL and "the fit ran away" in held.reason and not held.predictions
+
+
 def test_few_experiments_foretell_with_the_width_of_their_own_scatter():
     """Two others of known ratio and normal scatter: Student's t with 1 dof covers 95 %, the normal would 71 %."""
     sets = 4000
@@ -343,7 +371,7 @@ def stops(generator: np.random.Generator, count: int = 60) -> list[StopResidual]
     found = []
     for k in range(count):
         noise, looks = generator.standard_normal(), generator.standard_normal(2)
-        within = tuple((looks - looks.mean()) * np.sqrt(2))
+        within = recursive_residuals(looks, np.ones(2), backwards=k % 2 == 1)
         direction = ("left", "right")[k % 2]
         places = (175.0 + 0.1 * generator.random(), 275.0 + 0.1 * generator.random())
         leg = int(generator.choice([50, 100, 200]))
@@ -354,7 +382,7 @@ def stops(generator: np.random.Generator, count: int = 60) -> list[StopResidual]
 
 
 PLANTED = {
-    "depth": lambda r: replace(r, within=(r.within[0] - 1.0, r.within[1] + 1.0)),
+    "depth": lambda r: replace(r, within=tuple(w and w + s for w, s in zip(r.within, (-1.0, 1.0), strict=True))),
     "direction": lambda r: replace(r, deviation_deg=r.deviation_deg + (0.03 if r.direction == "left" else -0.03)),
     "N": lambda r: replace(r, deviation_deg=r.deviation_deg + (0.06 if r.leg_steps == 200 else 0.0)),
     "step phase": lambda r: replace(r, deviation_deg=r.deviation_deg + 0.045 * np.cos(np.pi * r.steps / 2)),
@@ -372,11 +400,45 @@ def test_a_planted_cause_is_found_and_no_other_blamed_alone(name):
 
 
 def test_false_alarms_of_causes_stay_rare():
-    """100 clean campaigns; at most as many alarms as 1 % allows at 1e-4."""
-    alarms = sum(
-        any(c.suspicious for c in residual_causes(stops(np.random.default_rng([1, seed])))) for seed in range(100)
-    )
-    assert alarms <= stats.binom.ppf(1 - 1e-4, 100, CAUSE_LIMIT)
+    """500 clean campaigns; at most as many alarms as 1 % allows at 1e-4, and every p as common as any other."""
+    chances, alarms = {}, 0
+    for seed in range(500):
+        causes = residual_causes(stops(np.random.default_rng([1, seed])))
+        alarms += any(c.suspicious for c in causes)
+        for cause in causes:
+            chances.setdefault(cause.name, []).append(cause.p)
+    assert alarms <= stats.binom.ppf(1 - 1e-4, 500, CAUSE_LIMIT)
+    for name, p in chances.items():
+        if None not in p:
+            assert stats.kstest(p, "uniform").pvalue > 1e-4, name
+
+
+@pytest.mark.parametrize("backwards", [False, True])
+def test_recursive_residuals_are_independent_and_standard(backwards):
+    """Any common value, unlike variances: the n - 1 numbers have the unit matrix for covariance, by linear algebra."""
+    variances = np.array([0.5, 2.0, 1.0, 4.0])
+    rows = np.array([[w or 0.0 for w in recursive_residuals(e, variances, backwards=backwards)] for e in np.eye(4)]).T
+    first = -1 if backwards else 0
+    assert not rows[first].any()
+    kept = np.delete(rows, first, axis=0)
+    np.testing.assert_allclose(kept @ np.diag(variances) @ kept.T, np.eye(3), atol=1e-12)
+    np.testing.assert_allclose(kept.sum(axis=1), 0.0, atol=1e-12)
+    assert recursive_residuals(np.ones(1), np.ones(1), backwards=backwards) == ()
+
+
+def test_the_larger_of_two_gross_defects_is_the_cause():
+    """The chance of a chi-square with two degrees of freedom is exp(-x / 2), however small; others stay ordered."""
+    far = np.array([10.0, 1e3, 1e5, 1e7])
+    np.testing.assert_allclose(log_chance(far, 2), -far / 2, rtol=1e-12)
+    for dof in (1, 3, 6):
+        near = np.array([1.0, 30.0, 600.0])
+        np.testing.assert_allclose(log_chance(near, dof), stats.chi2.logsf(near, dof), rtol=1e-12)
+        # Continued from where the plain law still has digits: the asymptotic slope is -1/2.
+        ends = log_chance(np.array([1000.0, 2000.0, 1e5]), dof)
+        assert np.all(np.isfinite(ends)) and np.all(np.diff(ends) < 0)
+        assert (ends[1] - ends[0]) / 1000 == pytest.approx(-0.5, abs=3 / 1000)
+    spot, cameras = (_Answer(float(log_chance(x, 3)), str(x), "", x, 3, 0.0) for x in (1600.0, 1e5))
+    assert _holm([spot, cameras]).cause.startswith("100000.0")
 
 
 def test_terms_and_chance_are_about_what_the_classic_saw(mixed_fit):

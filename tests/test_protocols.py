@@ -100,6 +100,17 @@ def test_cleared_starts_separate():
     assert separation(observed_stops(moves, observed, "pan"), "pan") is None
 
 
+def test_homing_is_no_leg():
+    """A second segment homed at counter 40 says no more of a leg's length than the first did."""
+    one = pan_moves(*[0, 200] * 12)
+    homed = Move(len(one), 1, 100.0, 40, 0, "left", "up")
+    both = (*one, homed)
+    assert "only one |N| = 200" in separation(observed_stops(both, range(len(both)), "pan"), "pan")
+    # Two homings from either side, and nothing driven.
+    alone = (Move(0, 0, 0.0, 0, 0, "left", "up"), Move(1, 1, 1.0, 40, 0, "right", "up"))
+    assert "no leg of the pan axis" in separation(observed_stops(alone, range(2), "pan"), "pan")
+
+
 @pytest.mark.parametrize("counters", [(0, 50, 100, 200), (0, 0, 0, 200)])
 def test_one_side_only_is_named(counters):
     assert "reached from one side" in pan_separation(*counters)

@@ -20,6 +20,7 @@ from conftest import ROOT
 from tvsbayes import plots
 from tvsbayes.calibration import load_calibration
 from tvsbayes.campaign import read_campaign, write_campaign
+from tvsbayes.certificate import positioning, traceability
 from tvsbayes.classic import DIRECTIONS, classic
 from tvsbayes.cli import run
 from tvsbayes.comparison import Evidence, gather
@@ -146,7 +147,7 @@ def test_numbers_of_the_page_are_the_libraries(page, evidence):
         assert f"{joint['value']:.6f}"[:7] in text
         assert f"{evidence.classic.directions[direction].mean_deg_per_step:.5f}"[:7] in text
     assert not re.search(r"\b(nan|inf|None|undefined)\b", text)
-    for word in ("Not an accredited", "Not traceable", "synthetic", "End of report", "Seed"):
+    for word in ("Not an accredited", "Simulated data: not traceable", "synthetic", "End of report", "Seed"):
         assert word in text
     for sha in evidence.fit["inputs"].values():
         assert sha in text
@@ -155,6 +156,36 @@ def test_numbers_of_the_page_are_the_libraries(page, evidence):
 
 def test_the_same_results_give_the_same_bytes(page, folder):
     assert report_html(evidence_of(folder)) == page
+
+
+def test_traceability_is_what_the_certificate_says(evidence, no_pictures):
+    """No page may claim what the DCC of the same fit denies: simulated data, blanks for a certificate's number."""
+    header = {k: v for k, v in evidence.campaign.header.items() if k not in ("synthetic", "traceability")}
+    named = {"traceability": {"board_certificate": "PTB 123"}}
+    for more, begin, declared in (
+        (named, "As declared by the user and not verified here", True),
+        (named | {"synthetic": True}, "Simulated data: not traceable.", False),
+        ({"traceability": {"board_certificate": "   "}}, "Not traceable", False),
+        ({}, "Not traceable", False),
+    ):
+        campaign = replace(evidence.campaign, header=header | more)
+        text = " ".join(" ".join(Nodes(report_html(replace(evidence, campaign=campaign))).text).split())
+        said = traceability(campaign)
+        assert said.declared is declared and said.statement.startswith(begin)
+        assert said.statement in text and ("PTB 123" in text) == declared
+
+
+def test_axes_are_judged_with_the_fitted_contrast(folder, evidence):
+    """ISO 230-2 figures come from all that the fit knows of the gears: unequal ratios carry every run on."""
+    with np.load(folder / "results" / "draws.npz") as stored:
+        contrasts = {axis: stored[f"ratio_contrast_deg_per_step.{axis}"] for axis in ("pan", "tilt")}
+    for axis, table in zip(contrasts, evidence.fit["positioning"], strict=True):
+        told, untold = (
+            positioning(evidence.calibration, axis, contrast_deg_per_step=c).predicted for c in (contrasts[axis], None)
+        )
+        for name, figure in table["predicted"].items():
+            assert figure["median"] == pytest.approx(told[name].median, rel=1e-9), (axis, name)
+        assert table["predicted"]["accuracy_deg"]["median"] > 1.001 * untold["accuracy_deg"].median
 
 
 def test_a_campaign_without_experiments_says_so(evidence, no_pictures):

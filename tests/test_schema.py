@@ -71,7 +71,7 @@ def test_what_reports_show_besides_obeys_the_schema():
     from tvsbayes.information import Cause, CauseGroup, StopResidual
 
     term = GapTerm("backlash over N", -0.002, 1e-4, (-0.0022, -0.0018))
-    stop = StopResidual("pan", (3, 4), -100, "", 0, (175.0, 276.5), (-0.3, 0.3), 61.5, -0.01, 0.04)
+    stop = StopResidual("pan", (3, 4), -100, "", 0, (175.0, 276.5), (None, 0.3), 61.5, -0.01, 0.04)
     cause = Cause("depth", "tilt", (CauseGroup("175 to 276 mm", 12, 0.1, 0.3),), None, False)
     gap = {"left": asdict(Gap(0.059, term, term, (term,))), "right": None}
     document = kept("fit-1-laplace.json")

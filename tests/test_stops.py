@@ -102,6 +102,20 @@ def test_leave_one_out_is_the_prediction_by_all_others():
     np.testing.assert_allclose(leave_one_out_chi2(stop_information(spots)), expected, rtol=DENSE)
 
 
+def test_leave_one_out_of_weighted_spots_is_that_of_full_weight():
+    """Robust weights scale a spot's noise; its distance is told as if it alone had its full weight again."""
+    spots = campaign()
+    weight = np.random.default_rng(11).uniform(0.2, 1.0, len(spots.residual))
+    root = np.sqrt(weight)[:, None]
+    weighted = replace(spots, residual=root * spots.residual, load=root[..., None] * spots.load)
+    found = leave_one_out_chi2(stop_information(weighted), weight)
+    for k in range(len(weight)):
+        alone = root.copy()
+        alone[k] = 1.0
+        full = replace(spots, residual=alone * spots.residual, load=alone[..., None] * spots.load)
+        assert found[k] == pytest.approx(leave_one_out_chi2(stop_information(full))[k], rel=DENSE)
+
+
 def test_standard_deviations_without_a_stop_are_those_of_a_fit_without_it():
     """Priors N(0, 1) on every coordinate; each stop is taken out of the dense problem in turn."""
     spots = campaign()

@@ -81,7 +81,7 @@ def test_a_study_goes_on_where_it_was_killed(job, quick, tmp_path):
     assert study(job, 9, StudyRows(path)) == whole and quick == []
 
 
-def test_one_file_keeps_designs_apart(job, quick, tmp_path, mounted_rig):
+def test_one_file_keeps_designs_apart(job, quick, tmp_path, mounted_rig, monkeypatch):
     path = tmp_path / "rows.jsonl"
     study(job, 3, StudyRows(path))
     others = (
@@ -98,6 +98,9 @@ def test_one_file_keeps_designs_apart(job, quick, tmp_path, mounted_rig):
     assert len({job.key, *(other.key for other in others)}) == 1 + len(others)
     for other in others:
         assert StudyRows(path).of(other) == {}
+    # Rows of another release answer another question.
+    monkeypatch.setattr("tvsbayes.studies.version", lambda _package: "0.0.1")
+    assert StudyRows(path).of(replace(job)) == {}
     assert sorted(StudyRows(path).of(job)) == [0, 1, 2]
 
 

@@ -45,6 +45,8 @@ CLEARED_PROBABILITY = 0.99
 AIM_STEPS, AIM_RAD = 40, 1e-11
 DIVERGING_SHARE = 1e-3
 """Share of draws without a point above which a point is refused (DESIGN 5)."""
+DIVERGING_SDS = 3.0902323061678132
+"""Range over its standard deviation below which more than `DIVERGING_SHARE` of a normal 1/range is beyond infinity."""
 ROUNDING = 1e-12
 """Of coordinates, relative to the range."""
 NOISES = 5
@@ -195,7 +197,10 @@ def range_components(origin: tuple, direction: tuple, baseline_mm, aperture_deg,
     y = y + 0.5 * baseline_mm
     sin_b, cos_b = m.sin(aperture_deg * _TO_RAD), m.cos(aperture_deg * _TO_RAD)
     if azimuth:
-        reach = (y * sin_b - x * cos_b) / (u * cos_b - v * sin_b)
+        closing = u * cos_b - v * sin_b
+        if m is math and closing == 0:
+            return math.inf
+        reach = (y * sin_b - x * cos_b) / closing
         ahead = (x + reach * u) * sin_b + (y + reach * v) * cos_b
         # The other half of B's plane is behind the aperture.
         return (reach if ahead >= 0 else math.nan) if m is math else np.where(ahead >= 0, reach, np.nan)
@@ -206,13 +211,17 @@ def range_components(origin: tuple, direction: tuple, baseline_mm, aperture_deg,
             return math.nan
         root = math.sqrt(inside)
     else:
-        with np.errstate(invalid="ignore"):
-            root = np.sqrt(inside)
+        # A complex step would find a root of a negative number.
+        root = np.sqrt(np.where(np.real(inside) < 0, np.nan, inside))
     across = x * u + y * v + z * w
     reach = y * y - cos_b * cos_b * (x * x + y * y + z * z)
-    reach = reach / (cos_b * root - (y * v - cos_b * cos_b * across))
-    # At B = 90 deg both nappes are one plane, and y is nought but for rounding.
-    faces = (y + reach * v) * cos_b >= -ROUNDING * abs(reach * cos_b)
+    closing = cos_b * root - (y * v - cos_b * cos_b * across)
+    if m is math and closing == 0:
+        return math.inf
+    with np.errstate(divide="ignore", invalid="ignore"):
+        reach = reach / closing
+        # At B = 90 deg both nappes are one plane, and y is nought but for rounding.
+        faces = (y + reach * v) * cos_b >= -ROUNDING * abs(reach * cos_b)
     return (reach if faces else -math.inf) if m is math else np.where(faces | np.isnan(reach), reach, -np.inf)
 
 
@@ -324,7 +333,8 @@ class Calibration:
             approach: as in `ray`.
 
         Raises:
-            InputError: an approach that does not exist, or beam and line of sight do not meet.
+            InputError: an approach that does not exist, or beam and line of sight do not meet, or more than 0.1 % of
+                what the data allow would not (DESIGN 5).
         """
         sides = sides_of(approach)
         steps = (float(pan_steps), float(tilt_steps))
@@ -340,7 +350,9 @@ class Calibration:
 
         jacobian = self.derivatives(*steps, aperture_deg, approach)
         covariance = jacobian @ self.covariance_with_noise @ jacobian.T
-        if not np.all(np.isfinite(covariance)):
+        # The inverse of the range is nearly normal: its tail beyond zero is the share of draws that diverge.
+        least = DIVERGING_SDS * math.sqrt(max(ray.direction @ covariance @ ray.direction, 0.0))
+        if not (np.all(np.isfinite(covariance)) and reach > least):
             raise self.refusal(pan_steps, tilt_steps, aperture_deg, sides)
         return Located(estimate, covariance, NORMAL_95 * np.sqrt(np.diag(covariance)))
 
@@ -443,7 +455,8 @@ class Calibration:
         Raises:
             InputError: neither or both targets, no mirror angle reaches it, or it lies outside the limits.
         """
-        if (xyz_mm is None) == (azimuth_deg is None or elevation_deg is None):
+        angles_given = (azimuth_deg is not None, elevation_deg is not None)
+        if angles_given != ((False, False) if xyz_mm is not None else (True, True)):
             remedy = "give a point, or azimuth and elevation"
             raise InputError("no-target", "steps_for needs one target, a point or a direction", remedy=remedy)
         target = None if xyz_mm is None else np.asarray(xyz_mm, dtype=float)
@@ -828,7 +841,8 @@ def read_draws(path: Path) -> Calibration:
                 file=escaped(path.name),
                 remedy="run `tvsbayes fit` on the campaign again",
             )
-        if str(file["format"]) != CALIBRATION_FORMAT or file["input_names"].tolist() != list(INPUT_NAMES):
+        columns = (file["input_names"].tolist(), file["noise_names"].tolist())
+        if str(file["format"]) != CALIBRATION_FORMAT or columns != (list(INPUT_NAMES), list(NOISE_NAMES)):
             raise ValueError(f"format {str(file['format'])[:60]!r} or other columns")
         tables = _tables(str(file["tables"]), path)
         return _shaped(

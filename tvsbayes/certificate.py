@@ -546,7 +546,7 @@ def positioning(
     if chosen:
         notes.append(
             f"predicted: {tests} simulated tests of {runs} runs per side, homed once before each test, drawn from the "
-            f"{calibration.estimator}"
+            f"{calibration.estimator}; a difference between the ratios of the two directions carries run after run on"
         )
     else:
         notes.append(f"no prediction: the {axis} axis was never moved over a range")
@@ -1094,7 +1094,8 @@ def _administrative(
         _words(statement, "dcc:declaration", text)
 
     state("accreditation", NOT_ACCREDITED)
-    state("traceability", *traceability(campaign))
+    found = traceability(campaign)
+    state("traceability", found.statement, found.declared)
     state("scope", ITEM_ONLY)
     validation = document.get("validation")
     if validation is not None and not validation["passed"]:
@@ -1108,21 +1109,30 @@ def _administrative(
         state("country", f"The country was not stated; {COUNTRY_NOT_STATED} stands for it.")
 
 
-def traceability(campaign: Campaign) -> tuple[str, bool]:
-    """What may be said of traceability, and whether the length standard's certificate is named.
+@dataclass(frozen=True)
+class Traceability:
+    """What may be said of traceability.
 
-    The campaign's word is passed on, not checked; simulated data are never traceable.
+    Attributes:
+        statement: a sentence for certificates and reports.
+        declared: the campaign names the certificate of its length standard, which nobody checks here.
     """
+
+    statement: str
+    declared: bool
+
+
+def traceability(campaign: Campaign) -> Traceability:
+    """The campaign's word on its length standard, passed on, not checked; simulated data are never traceable."""
     declared = campaign.header.get("traceability", {})
     certificate = _plain(declared.get("board_certificate", ""))
     if campaign.header.get("synthetic"):
-        return "Simulated data: not traceable.", False
+        return Traceability("Simulated data: not traceable.", False)
     if certificate == NOT_STATED:
-        return (
-            "Not traceable: the campaign names no certificate of the length standard (the calibration board).",
-            False,
-        )
-    return f"As declared by the user and not verified here: length from the board with certificate {certificate}.", True
+        text = "Not traceable: the campaign names no certificate of the length standard (the calibration board)."
+        return Traceability(text, False)
+    text = f"As declared by the user and not verified here: length from the board with certificate {certificate}."
+    return Traceability(text, True)
 
 
 def _equipment(parent: ET.Element, campaign: Campaign) -> None:

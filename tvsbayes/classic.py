@@ -15,6 +15,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from itertools import pairwise
 from operator import attrgetter
 
@@ -33,6 +34,8 @@ INSEPARABLE, INSEPARABLE_ONE_LENGTH = 0.9, 0.7
 variance is exchange with the backlash. Equal numbers of cleared and reversed legs of one length give 0.55."""
 SHALLOW = 1.2
 """Ratio of the largest to the smallest depth below which the sheet stood at one place (the paper's: 1.6)."""
+STEP_HALVINGS = 40
+"""Of a difference quotient's step, until both ends lie in the lens model: a 10^-13th of a standard deviation."""
 UNDISTORT_ITERATIONS = 200
 UNDISTORT_TOLERANCE_PX = 1e-9
 """Largest error of re-distorting an undistorted pixel: 10^4 times the rounding of 1000 px in float64."""
@@ -389,21 +392,29 @@ def stereo_variance(function: Callable[[Stereo, float], float], stereo: Stereo, 
 
     Central differences with steps of one tenth of each parameter's standard deviation: small enough that
     the third derivative does not show, large enough against rounding. Fixed parameters (zero variance)
-    are skipped.
+    are skipped. A step that takes a pixel out of the lens model is halved until it does not.
     """
+
+    def slope(of: Callable[[float], float], step: float) -> float:
+        for _ in range(STEP_HALVINGS):
+            found = (of(step) - of(-step)) / (2 * step)
+            if np.isfinite(found):
+                break
+            step /= 2
+        return found
+
+    def moved(index: int, step: float) -> float:
+        vector = stereo.vector.copy()
+        vector[index] += step
+        return function(stereo.with_vector(vector), 1.0)
+
     covariance = np.asarray(stereo.parameter_covariance, float)
     gradient = np.zeros(len(covariance))
     for index in np.flatnonzero(np.diag(covariance) > 0):
-        step = 0.1 * np.sqrt(covariance[index, index])
-        ahead, behind = stereo.vector.copy(), stereo.vector.copy()
-        ahead[index] += step
-        behind[index] -= step
-        difference = function(stereo.with_vector(ahead), 1.0) - function(stereo.with_vector(behind), 1.0)
-        gradient[index] = difference / (2 * step)
+        gradient[index] = slope(partial(moved, index), 0.1 * np.sqrt(covariance[index, index]))
     variance = float(gradient @ covariance @ gradient)
     if focal_scale_u > 0:
-        ahead, behind = (function(stereo, 1 + side * 0.1 * focal_scale_u) for side in (1, -1))
-        variance += float((ahead - behind) / 0.2) ** 2
+        variance += (slope(lambda step: function(stereo, 1 + step), 0.1 * focal_scale_u) * focal_scale_u) ** 2
     return max(variance, 0.0)
 
 
@@ -464,7 +475,11 @@ def separation(stops: Sequence[Stop], axis: str) -> str | None:
     else:
         covariance = np.linalg.inv(information)
         correlation = abs(covariance[0, 1]) / np.sqrt(covariance[0, 0] * covariance[1, 1])
-    lengths = Counter(abs(b.steps - a.steps) for a, b in pairwise(stops) if a.steps != b.steps)
+    # No leg leads from one segment to the next: the counter was set by homing.
+    legs = [(a, b) for a, b in pairwise(stops) if a.segment == b.segment and a.steps != b.steps]
+    lengths = Counter(abs(b.steps - a.steps) for a, b in legs)
+    if not lengths:
+        return f"no leg of the {axis} axis was seen at both ends; look before and after moves of that axis"
     if correlation < (INSEPARABLE_ONE_LENGTH if len(lengths) == 1 else INSEPARABLE):
         return None
     common = lengths.most_common(1)[0][0]

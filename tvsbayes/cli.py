@@ -593,9 +593,11 @@ def _evidence(
     fit: JointFit, summary: FitSummary, posterior: Posterior | None, calibration: Calibration | None
 ) -> dict[str, object]:
     """What `fit.json` holds for reports besides the estimates; without a calibration residuals alone."""
+    import numpy as np
+
     from tvsbayes.certificate import headline_budget, positioning, stop_readings
     from tvsbayes.comparison import explain_gap
-    from tvsbayes.information import headline_causes, residual_causes, stop_residuals
+    from tvsbayes.information import DRAWS_KEPT, headline_causes, residual_causes, stop_residuals
 
     stops = stop_residuals(fit)
     listed = stops[:: -(-len(stops) // RESIDUALS_LISTED) or 1]
@@ -607,7 +609,11 @@ def _evidence(
         # What a model holds fixed has no uncertainty to split.
         budgets = [headline_budget(causes, q, told[q]).as_json() for q in causes.quantities if told[q].sd > 0]
         readings = {axis: stop_readings(fit, axis) for axis in ("pan", "tilt")}
-        axes = [positioning(calibration, axis, readings=own).as_json() for axis, own in readings.items()]
+        # Rows in the order of the calibration's inputs, which are taken from the same draws.
+        physical = np.asarray((fit.draws if posterior is None else posterior.thinned(DRAWS_KEPT)).physical)
+        for axis, own in readings.items():
+            contrast = physical[:, fit.names.index(f"ratio_contrast_deg_per_step.{axis}")]
+            axes.append(positioning(calibration, axis, readings=own, contrast_deg_per_step=contrast).as_json())
     return {
         "residuals": [asdict(stop) for stop in listed],
         "residual_causes": [asdict(cause) for cause in residual_causes(stops)],

@@ -31,7 +31,7 @@ from tvsbayes.calibration import (
 from tvsbayes.campaign import Campaign
 from tvsbayes.certificate import BudgetTable, coordinate_budget
 from tvsbayes.classic import DIRECTIONS, ClassicResult, Selection, classic, four_point_ratios, select_experiments
-from tvsbayes.files import JSON_BYTES_MAX, Keys, NothingToEstimate, parse_json, read_bytes
+from tvsbayes.files import JSON_BYTES_MAX, Keys, NothingToEstimate, TvsError, parse_json, read_bytes
 from tvsbayes.rigs import RIG_PRIORS, Prior
 
 if TYPE_CHECKING:
@@ -592,9 +592,13 @@ def hold_out(fit_of_all: JointFit, by: str = "steps", seed: int = 0) -> HoldOut:
         if not foretold:
             continue
         ids = frozenset(campaign.spots[r].spot for r in selection.spot_rows[out].ravel())
-        taught = _refit(fit_of_all, ids)
+        without = f"without the experiments {name}"
+        try:
+            taught = _refit(fit_of_all, ids)
+        except TvsError as error:
+            return undecided(f"{without} there is no fit: {error.message}")
         if not taught.converged:
-            return undecided(f"without the experiments {name} the fit does not converge: {'; '.join(taught.problems)}")
+            return undecided(f"{without} the fit does not converge: {'; '.join(taught.problems)}")
         generator = np.random.default_rng([seed, index])
         z = taught.draws_z[:HOLD_OUT_DRAWS]
         pixels = looks_again(taught, z, taught.draws.physical[:HOLD_OUT_DRAWS], generator)
@@ -602,7 +606,9 @@ def hold_out(fit_of_all: JointFit, by: str = "steps", seed: int = 0) -> HoldOut:
         chosen = {"steps": selection.steps[out], "axis": selection.axis[out]}
         draws = np.stack([four_point_ratios(p, stereo=campaign.stereo, **chosen) for p in pixels]) * chosen["steps"]
         for k, e in enumerate(np.flatnonzero(out)):
-            if e in foretold:
+            # Draws beyond the cameras' lens model tell no angle.
+            told = draws[np.isfinite(draws[:, k]), k]
+            if e in foretold and len(told) > 1:
                 predictions.append(
                     Prediction(
                         int(selection.experiments[e]),
@@ -611,8 +617,8 @@ def hold_out(fit_of_all: JointFit, by: str = "steps", seed: int = 0) -> HoldOut:
                         int(selection.steps[e]),
                         float(angle[e]),
                         *foretold[e],
-                        float(draws[:, k].mean()),
-                        float(draws[:, k].std(ddof=1)),
+                        float(told.mean()),
+                        float(told.std(ddof=1)),
                     )
                 )
     if not predictions:
@@ -631,10 +637,14 @@ def _refit(fit_of_all: JointFit, without: frozenset[int]) -> JointFit:
 
 
 def _foretell_classic(angle: np.ndarray, selection: Selection, out: np.ndarray) -> dict[int, tuple[float, float, int]]:
-    """Angle, standard uncertainty and its dof of each left-out experiment whose direction has two others, by row."""
+    """Angle, standard uncertainty and its dof of each left-out experiment whose direction has two others, by row.
+
+    Experiments without a finite angle (pixels beyond the lens model) neither teach nor are asked.
+    """
     found = {}
+    seen = np.isfinite(angle)
     for direction in DIRECTIONS:
-        mine = selection.direction == direction
+        mine = seen & (selection.direction == direction)
         taught, asked = np.flatnonzero(mine & ~out), np.flatnonzero(mine & out)
         if len(taught) < 2:
             continue

@@ -236,8 +236,8 @@ def published_point(
     """The paper's equations (1)-(3), B and C in the plane that is tilted by beta about the baseline.
 
     y = a (1/2 - sin B cos C / sin(B + C)) holds for every B and C. The paper prints a second branch for B > 90 deg,
-    y = -a (1/2 + sin B cos C / sin[180 - (B + C)]), which jumps by -a at B = 90 deg where C = 90 deg - small: it is
-    returned with `as_printed` only.
+    y = -a (1/2 + sin B cos C / sin[180 - (B + C)]), which jumps by -a at B = 90 deg: it is returned with
+    `as_printed` only.
 
     Args:
         B_deg: angle at the aperture.

@@ -13,7 +13,7 @@ from itertools import pairwise
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy import stats
+from scipy import special, stats
 
 from tvsbayes.calibration import INPUT_NAMES, NORMAL_95, Calibration, calibration_of_draws
 from tvsbayes.campaign import Move
@@ -343,6 +343,9 @@ def _backlash_direction(fit: JointFit, axis: str, direction: str) -> WeakDirecti
     if not fit.free[index]:
         return None
     ratio = fit.draws.effective_deg_per_step[:, DIRECTIONS.index(direction)]
+    if np.ptp(ratio) == 0:
+        # Held by the priors: nothing moves with the backlash.
+        return None
     correlation = float(np.corrcoef(ratio, fit.draws.physical[:, index])[0, 1])
     used = {s.move for s in fit.campaign.spots if s.status == "ok" and s.spot not in fit.excluded_spots}
     reason = separation(observed_stops(fit.campaign.moves, used, axis), axis)
@@ -711,8 +714,9 @@ class StopResidual:
         direction: of the move that led there; "" where the approach is unknown.
         leg_steps: length of that move, 0 for a homing.
         depth_mm: X of its spots in frame S, by the stated cameras.
-        within: per spot, how far it lies from the mean of the rest's spots, in standard deviations of that difference
-            by pixel noise; empty for a single spot.
+        within: per spot, how far it lies from the mean of the rest's spots gone through before it, in standard
+            deviations of that difference by pixel noise; None for the first, empty for a single spot. Every second
+            rest is gone through backwards, so that no place in a rest is always the one the others are held against.
         time_s: of the move after which it was first seen.
         deviation_deg: observed - fitted mirror angle, stop error included.
         u_deg: its standard deviation as the fitted noise has it (pixel noise and stop error).
@@ -724,7 +728,7 @@ class StopResidual:
     direction: str
     leg_steps: int
     depth_mm: tuple[float, ...]
-    within: tuple[float, ...]
+    within: tuple[float | None, ...]
     time_s: float
     deviation_deg: float
     u_deg: float
@@ -762,7 +766,7 @@ def stop_residuals(fit: JointFit) -> tuple[StopResidual, ...]:
             # The row that drew the stop error has its variance, whether that spot is used or not.
             drawn = np.flatnonzero(rest == number)[0]
             variance = 1 / weight.sum() + fit.linearised.stop_variance[drawn, index]
-            within = (mine - mean) / np.sqrt(noise - 1 / weight.sum()) if len(chosen) > 1 else ()
+            within = recursive_residuals(mine, noise, backwards=len(found) % 2 == 1)
             found.append(
                 StopResidual(
                     axis=axis,
@@ -771,12 +775,39 @@ def stop_residuals(fit: JointFit) -> tuple[StopResidual, ...]:
                     direction=direction,
                     leg_steps=abs(leg),
                     depth_mm=tuple(map(float, rows.triangulated_mm[chosen, 0])),
-                    within=tuple(map(float, within)),
+                    within=within,
                     time_s=moves[first].time_s,
                     deviation_deg=float(np.degrees(mean)),
                     u_deg=float(np.degrees(np.sqrt(variance))),
                 )
             )
+    return tuple(found)
+
+
+def recursive_residuals(values: np.ndarray, variances: np.ndarray, *, backwards: bool) -> tuple[float | None, ...]:
+    """Each value against the weighted mean of those before it, standardised.
+
+    Of independent values with one mean these are independent and N(0, 1) (Brown, Durbin and Evans, J. R. Stat. Soc. B
+    37, 1975, 149); distances from the mean of all are not: those of a pair are opposite.
+
+    Args:
+        values: shape (n,).
+        variances: of their noise, shape (n,).
+        backwards: begin with the last.
+
+    Returns:
+        n of them in the order of the values, None where there is nothing before; empty for fewer than two.
+    """
+    if len(values) < 2:
+        return ()
+    order = np.arange(len(values))[::-1] if backwards else np.arange(len(values))
+    found: list[float | None] = [None] * len(values)
+    total = weight = 0.0
+    for i in order:
+        if weight:
+            found[i] = float((values[i] - total / weight) / np.sqrt(variances[i] + 1 / weight))
+        total += values[i] / variances[i]
+        weight += 1 / variances[i]
     return tuple(found)
 
 
@@ -830,6 +861,7 @@ def residual_causes(residuals: Sequence[StopResidual]) -> tuple[Cause, ...]:
             (depth, value)
             for r in mine
             for depth, value in zip(r.depth_mm, r.within or (r.deviation_deg / r.u_deg,), strict=True)
+            if value is not None
         ]
         tested = {"depth": ([depth for depth, _ in looks], np.array([value for _, value in looks]))}
         tested |= {name: ([key(r) for r in mine], scaled) for name, key in keys.items()}
@@ -1058,11 +1090,24 @@ def validate(fit: JointFit) -> Validation:
                 chi2, dof = float(np.sum(along**2 / values[kept])), int(kept.sum())
                 size = (vectors[:, kept] / values[kept]) @ along
                 shift = float(np.max(np.abs(moved_by[:, rows] @ size)))
-                answers.append(_Answer(stats.chi2.logsf(chi2, dof), defect.name, place, chi2, dof, shift))
+                answers.append(_Answer(float(log_chance(chi2, dof)), defect.name, place, chi2, dof, shift))
         if answers:
             worst = min(answers, key=lambda a: a.log_p)
             found.append(replace(worst, log_p=worst.log_p + np.log(len(answers)), places=len(answers)))
     return _holm(found)
+
+
+def log_chance(chi2: np.ndarray | float, dof: np.ndarray | float) -> np.ndarray:
+    """Log probability of a chi-square of at least this size, also where the probability itself underflows.
+
+    Far out Q(a, x) = Gamma(a, x) / Gamma(a) with Gamma(a, x) = e^-x U(1 - a, 1 - a, x) (DLMF 8.5.3): two gross
+    defects must not tie at minus infinity, the worse one is the cause.
+    """
+    with np.errstate(divide="ignore"):
+        plain = stats.chi2.logsf(chi2, dof)
+    a, x = 0.5 * np.asarray(dof, dtype=float), 0.5 * np.asarray(chi2, dtype=float)
+    far = -x + np.log(special.hyperu(1 - a, 1 - a, x)) - special.gammaln(a)
+    return np.where(np.isfinite(plain), plain, far)
 
 
 @dataclass(frozen=True)
@@ -1104,7 +1149,7 @@ def _single_spots(fit: JointFit, groups: Sequence[StopGroup], followed: np.ndarr
     readings = np.asarray(fit.arrays.spots.has_aperture * fit.arrays.spots.valid)[: len(spots)]
     # Without a reading the fourth component is empty.
     dof = np.maximum(kept.sum(axis=1) - (readings == 0), 1)
-    chances = stats.chi2.logsf(distances, dof)
+    chances = log_chance(distances, dof)
     worst = int(np.argmin(chances))
     return _Answer(
         log_p=float(chances[worst] + np.log(len(spots))),

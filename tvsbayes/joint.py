@@ -644,8 +644,7 @@ def _robust_weights(problem: Problem, z: np.ndarray) -> tuple[CampaignArrays, fl
     count = len(problem.spots)
     valid, weight = np.array(spots.valid[:count]), np.array(spots.weight[:count])
     readings = np.asarray(spots.has_aperture[:count])
-    # Distances are measured as if the spot had full weight.
-    chi2 = leave_one_out_chi2(stop_information(problem.linear_spots(z)[1])) / weight
+    chi2 = leave_one_out_chi2(stop_information(problem.linear_spots(z)[1]), weight)
     used = valid > 0
     # The noise scales were fitted with the outliers in: the median restores the scale of the clean spots.
     scale2 = np.median(chi2[used] / _chi2_quantile(readings[used], 0.5))
@@ -820,7 +819,7 @@ def fit_at(campaign: Campaign, problem: Problem, mode: Mode, seed: int) -> Joint
     used = np.asarray(problem.arrays.spots.valid[: len(problem.spots)]) > 0
     lin, linear = problem.linear_spots(mode.z)
     information = stop_information(linear)
-    chi2_spots = leave_one_out_chi2(information)
+    chi2_spots = leave_one_out_chi2(information, np.asarray(problem.arrays.spots.weight[: len(problem.spots)]))
     readings = np.asarray(problem.arrays.spots.has_aperture[: len(problem.spots)])
     suspect = used & (chi2_spots > _chi2_quantile(readings, GATE_PROBABILITY))
     pose = lin.mirror_angles_rad[used].mean(axis=0)

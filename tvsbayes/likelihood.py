@@ -651,18 +651,27 @@ def stop_information(spots: LinearSpots) -> StopInformation:
     return StopInformation(tuple(groups[::-1]), fisher)
 
 
-def leave_one_out_chi2(information: StopInformation) -> np.ndarray:
+def leave_one_out_chi2(information: StopInformation, weight: np.ndarray | None = None) -> np.ndarray:
     """Squared distance of each spot from what all OTHER spots predict for it, shape (n,).
 
     It equals twice the gain in log density from leaving the spot out, up to the determinant: of two spots of a
     stop that disagree, the one without which the rest fits better has the larger value. That is the spot to blame.
+
+    Args:
+        information: of the linearised campaign.
+        weight: robust weights w that are in its residuals, shape (n,). Distances are those of spots of full weight:
+            of the covariance I + w P of a weighted innovation, P predicted, the noise alone is scaled back.
     """
+    weight = np.ones(sum(len(g.residual) // 4 for g in information.groups)) if weight is None else weight
     values = []
     for group in information.groups:
         for k in range(len(group.residual) // 4):
             part = slice(4 * k, 4 * k + 4)
             u, m = group.residual[part], group.precision[part, part]
-            values.append(u @ np.linalg.solve(m, u))
+            covariance = np.linalg.inv(m)
+            # e = sqrt(w) (spot - prediction); (I + P) w = covariance + (w - 1) I.
+            e = covariance @ u
+            values.append(e @ np.linalg.solve(covariance + (weight[len(values)] - 1) * np.eye(4), e))
     return np.array(values)
 
 

@@ -409,7 +409,7 @@ def transport(fit: JointFit) -> Transport:
         own = (ahead + behind - 2 * centre) @ slopes.T / SHEAR_STEP**2
         bend[:, geometry, geometry] = own[geometry].T
         pairs = np.array([(i, j) for i in geometry for j in geometry if j < i]).reshape(-1, 2)
-        for some in np.array_split(pairs, max(1, len(pairs) // 256)):
+        for some in np.array_split(pairs, max(1, len(pairs) // 256)) if len(pairs) else ():
             y = np.zeros((len(some), count))
             np.put_along_axis(y, some, SHEAR_STEP, axis=1)
             both = residuals(np.concatenate([y, -y]))

@@ -35,7 +35,7 @@ from rich.text import Text
 from tvsbayes import plots
 from tvsbayes.calibration import Calibration, Steps, calibration_bytes, mode_arrays
 from tvsbayes.campaign import input_hashes
-from tvsbayes.certificate import FIGURES
+from tvsbayes.certificate import FIGURES, traceability
 from tvsbayes.classic import DIRECTIONS, ClassicResult
 from tvsbayes.files import InputError, escaped, make_folder, shipped_data, write_atomically
 
@@ -670,7 +670,7 @@ def _page(e: Evidence) -> Page:
         verdict_class=kind,
         numbers=_numbers(e),
         criteria=criteria,
-        traceable=_traceable(header),
+        traceable=traceability(e.campaign).statement,
         warnings=_warnings(e),
         versions=fit["versions"],
         sections=sections,
@@ -740,14 +740,6 @@ def _numbers(e: Evidence) -> list[Number]:
 
 def _mm(value: float) -> str:
     return f"{value:.2g} mm" if value < 100 else f"{value:.0f} mm"
-
-
-def _traceable(header: Mapping[str, object]) -> str:
-    stated = header.get("traceability") or {}
-    certificate = stated.get("board_certificate") if isinstance(stated, Mapping) else None
-    if certificate:
-        return f"Traceability of lengths as declared by the user: board certificate {certificate}."
-    return "Not traceable: no certificate of a length standard was declared."
 
 
 def _warnings(e: Evidence) -> list[str]:

@@ -19,6 +19,7 @@ from concurrent.futures import BrokenExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
+from importlib.metadata import version
 from pathlib import Path
 from typing import BinaryIO, Protocol
 
@@ -86,10 +87,11 @@ class StudyJob:
 
     @cached_property
     def key(self) -> str:
-        """SHA-256 of everything that decides the rows: rig, truth, cameras, plan, target, seed, reading."""
+        """SHA-256 of everything that decides the rows: program, rig, truth, cameras, plan, target, seed, reading."""
         rig = self.rig
         parts = [
             STUDY_FORMAT,
+            version("tvsbayes"),
             rig_table_toml(rig.table),
             json.dumps({name: [p.value, p.u, p.distribution] for name, p in sorted(rig.truth.items())}),
             stereo_bytes(rig.stereo).decode(),

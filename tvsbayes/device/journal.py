@@ -14,6 +14,7 @@ Times in the events: UTC for people, `time_s` for the campaign (seconds since th
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import hashlib
 import json
@@ -333,10 +334,17 @@ class Journal:
         except OSError as error:
             raise _disk_fault(error) from error
         journal = cls(folder, descriptor, Reading((), b"", 0, 0), disk)
-        _lock(descriptor)
         # The names of the log and the frame folders, and that of the folder itself.
         journal._dirty |= {folder, folder.absolute().parent}
-        journal.append("created", format=FORMAT, **data)
+        try:
+            _lock(descriptor)
+            journal.append("created", format=FORMAT, **data)
+        except BaseException:
+            # Nothing was acknowledged: without its file the folder can be tried again.
+            journal.close()
+            with contextlib.suppress(OSError):
+                (folder / LOG).unlink()
+            raise
         return journal
 
     @classmethod
