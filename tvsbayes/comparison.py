@@ -373,7 +373,7 @@ def explain_gap(found: JointFit, posterior: Posterior | None = None, draws: int 
     Args:
         found: a converged fit of the campaign.
         posterior: its sample, for its draws in place of the Laplace approximation's.
-        draws: that the intervals rest on, at least two.
+        draws: that the intervals of the terms rest on, at least two; ratio and gap rest on all.
 
     Returns:
         By direction; None without complete experiments.
@@ -390,9 +390,11 @@ def explain_gap(found: JointFit, posterior: Posterior | None = None, draws: int 
         return result
     if posterior is None:
         z = np.vstack([found.z, found.draws_z[:draws]])
+        ratios_of_all = found.draws.effective_deg_per_step
     else:
         every = posterior.z.reshape(-1, posterior.z.shape[-1])
         z = every[np.linspace(0, len(every) - 1, draws).astype(int)]
+        ratios_of_all = posterior.draws.effective_deg_per_step.reshape(-1, len(DIRECTIONS))
     pixels_of = _experiment_pixels(found, selection)
     with jax.enable_x64(True):
         spaces = [found.space]
@@ -430,16 +432,29 @@ def explain_gap(found: JointFit, posterior: Posterior | None = None, draws: int 
             CHANCE: seen - whole,
         }
 
-        def term(name: str, values: np.ndarray) -> GapTerm:
-            sampled = values if posterior is not None else values[1:]
-            low, high = np.quantile(sampled, [0.025, 0.975])
-            centre = sampled.mean() if posterior is not None else values[0]
-            return GapTerm(name, float(centre), float(sampled.std(ddof=1)), (float(low), float(high)))
+        # The ratio itself as every table states it, from all draws; its mean is a control variate for those of the
+        # terms, which then add up to the gap.
+        ratio, own = ratios_of_all[:, k], full[:, k]
+        centre = own[0] if posterior is None else ratio.mean()
 
-        terms = tuple(term(name, values) for name, values in parts.items())
-        joint = term("effective ratio", full[:, k])
-        result[direction] = Gap(seen, joint, term("classic - joint", seen - full[:, k]), terms)
+        def term(name: str, values: np.ndarray, own: np.ndarray = own, centre: float = centre) -> GapTerm:
+            if posterior is None:
+                value, sampled = values[0], values[1:]
+            else:
+                slope = np.cov(values, own)[0, 1] / own.var(ddof=1) if np.ptp(own) > 0 else 0.0
+                value, sampled = values.mean() + slope * (centre - own.mean()), values
+            return GapTerm(name, float(value), float(sampled.std()), _middle95(sampled))
+
+        sd = float(ratio.std())
+        joint = GapTerm("effective ratio", float(centre), sd, _middle95(ratio))
+        total = GapTerm("classic - joint", float(seen - centre), sd, _middle95(seen - ratio))
+        result[direction] = Gap(seen, joint, total, tuple(term(name, values) for name, values in parts.items()))
     return result
+
+
+def _middle95(draws: np.ndarray) -> tuple[float, float]:
+    low, high = np.quantile(draws, [0.025, 0.975])
+    return float(low), float(high)
 
 
 def _experiment_pixels(found: JointFit, selection: Selection) -> Callable[[np.ndarray], np.ndarray]:
