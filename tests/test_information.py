@@ -107,6 +107,7 @@ def test_the_recorded_approach_of_move_0_is_named_as_leverage(pan_only):
 
 
 def test_the_classic_answer_is_predicted(paper, summary):
+    assert summary.few_stops == {}
     reported = classic(paper).directions
     for direction, predicted in summary.classic_predicted.items():
         result = reported[direction]
@@ -147,7 +148,10 @@ def test_an_axis_that_never_moved_is_null_and_named(paper):
 def test_aperture_readings_bring_their_parameters(mounted_rig):
     plan = four_point_protocol(repeats=3, steps=(100, 200))
     fitted = fit(simulate(mounted_rig, plan, seed=4, aperture=True).campaign)
-    parameters = summarise(fitted).parameters
+    summary = summarise(fitted)
+    # Counted by hand along the twelve and thirteen rests of the protocol, the homing (left, up) among them.
+    assert summary.few_stops == {"left": 7, "right": 5, "up": 7, "down": 6}
+    parameters = summary.parameters
     assert set(RECEIVER_NAMES) <= set(parameters)
     # Readings of 0.02 deg see C0 (0.2 deg) only together with the zero (0.1 deg) and the axes' offsets.
     assert parameters["pan_zero_emission_deg"].informed

@@ -145,6 +145,23 @@ def test_rows_say_whether_data_or_prior_set_a_value():
     assert estimate_row("x", None, "deg")[1] == "never moved"
 
 
+def test_a_fit_astray_shows_no_results():
+    """Where it stopped may help to find out why; no uncertainty and no diagnosis rests on it."""
+    astray = replace(small_summary(), converged=False, problems=("it ran away",), few_stops={"up": 3})
+    text = fit_text(astray)
+    assert text.splitlines()[0] == "NOT CONVERGED: it ran away"
+    assert "NOT results" in text and "95 %" not in text and "0.0621" not in text and "weak" not in text
+    assert "19 and 10 more" in text
+
+
+@pytest.mark.parametrize(("estimator", "word"), [("laplace", "too short; sample"), ("posterior", "intervals hold it")])
+def test_few_stops_are_said(estimator, word):
+    lines = fit_text(replace(small_summary(), few_stops={"up": 3, "down": 2}, estimator=estimator)).splitlines()
+    (line,) = (line for line in lines if line.startswith("few stops"))
+    assert "(up 3, down 2)" in line and word in line
+    assert "few stops" not in fit_text(small_summary())
+
+
 def test_fit_text_shows_what_the_reader_must_know():
     text = fit_text(small_summary())
     lines = {line.split("  ")[0]: line for line in text.splitlines()}
@@ -160,7 +177,7 @@ def test_fit_text_shows_what_the_reader_must_know():
     assert "excluded spots: 17\n" in text
     # A flood of ids helps nobody.
     assert "spots that disagree with all others: 0, 1, 2" in text
-    assert ", 19; look at them" in text
+    assert ", 19 and 10 more; look at them" in text
 
 
 def direction(mean: float, u: float | None) -> DirectionResult:

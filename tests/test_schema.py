@@ -76,13 +76,15 @@ def test_what_reports_show_besides_obeys_the_schema():
     gap = {"left": asdict(Gap(0.059, term, term, (term,))), "right": None}
     document = kept("fit-1-laplace.json")
     schema = schema_of(document)
-    added = {"residuals": [asdict(stop)], "residual_causes": [asdict(cause)], "gap": gap}
+    added = {"residuals": [asdict(stop)], "residual_causes": [asdict(cause)], "gap": gap, "few_stops": {"up": 3}}
     written = json.loads(json.dumps({**document, **added}))
     assert problems(written, schema) == []
     assert problems({**written, "gap": None}, schema) == []
     for path, value in (
         ("gap/left/terms/0/sd", -1.0),
         ("gap/forward", None),
+        ("few_stops/forward", 3),
+        ("few_stops/up", -1),
         ("residuals/0/axis", "z"),
         ("residual_causes/0/p", 2.0),
     ):

@@ -7,7 +7,7 @@ DESIGN 8.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from itertools import pairwise
 
 import jax
@@ -188,6 +188,7 @@ class FitSummary:
         sampling: diagnosis of the chain, None where nothing was sampled.
         curves: effective ratios over the range and lost motion against steps; only from a posterior.
         validation: whether the residuals look as the model says; None where nobody asked.
+        few_stops: directions in which so few stops were seen that their scatter is poorly known, with the number.
     """
 
     converged: bool
@@ -210,6 +211,7 @@ class FitSummary:
     sampling: dict[str, object] | None = None
     curves: dict[str, object] | None = None
     validation: Validation | None = None
+    few_stops: dict[str, int] = field(default_factory=dict)
 
     @property
     def headline_informed(self) -> bool:
@@ -248,6 +250,7 @@ class FitSummary:
             "sampling": self.sampling,
             "curves": self.curves,
             "validation": None if self.validation is None else self.validation.as_json(),
+            "few_stops": self.few_stops,
         }
 
 
@@ -623,7 +626,26 @@ def summarise(fit: JointFit, posterior: Posterior | None = None) -> FitSummary:
         sampling=None if posterior is None else posterior.convergence.as_json(),
         curves=None if usable is None else _curves(usable, moved),
         validation=validate(fit),
+        few_stops=few_stops(fit, moved),
     )
+
+
+FEW_STOPS = 12
+"""Fewer tell their own scatter so poorly that 1.96 standard deviations of it hold less than 93 % (Student's t)."""
+
+
+def few_stops(fit: JointFit, moved: set[str]) -> dict[str, int]:
+    """Directions that the campaign moved in and saw fewer than `FEW_STOPS` stops after, with their number."""
+    used = {s.move for s in fit.campaign.spots if s.status == "ok" and s.spot not in fit.excluded_spots}
+    found = {}
+    for axis, directions in (("pan", ("left", "right")), ("tilt", ("up", "down"))):
+        stops = observed_stops(fit.campaign.moves, used, axis)
+        for direction, sign in zip(directions, (1, -1), strict=True):
+            count = sum(stop.sign == sign for stop in stops)
+            free = fit.free[INDEX[f"stop_sd_deg.{direction}"]]
+            if direction in moved and free and count < FEW_STOPS:
+                found[direction] = count
+    return found
 
 
 @dataclass(frozen=True)

@@ -51,6 +51,7 @@ if TYPE_CHECKING:
     from tvsbayes.rigs import Stereo
 
 FIT_FORMAT = "tvsbayes-fit/1"
+SPOTS_LISTED = 20
 KEY_PARAMETERS = (
     ("backlash_deg.pan", "backlash pan", "deg"),
     ("backlash_deg.tilt", "backlash tilt", "deg"),
@@ -201,6 +202,8 @@ def estimate_row(label: str, estimate: Estimate | None, unit: str) -> list[str]:
 
 def fit_text(summary: FitSummary) -> str:
     """The joint estimator's table and everything the reader must know about it."""
+    if not summary.converged and summary.sampling is None:
+        return astray_text(summary)
     pose = summary.reference_pose_deg
     rows = [estimate_row(f"effective {d}", summary.effective[d], "deg/step") for d in DIRECTIONS]
     for axis, label in (("pan", "left - right"), ("tilt", "up - down")):
@@ -230,15 +233,43 @@ def fit_text(summary: FitSummary) -> str:
             f"prior: with {word} the u of {entry.parameter}, {entry.quantity} moves {entry.shift_sd:+.2f} sd and its "
             f"sd changes by a factor {entry.sd_ratio:.2f}"
         )
+    if summary.few_stops:
+        lines.append(few_stops_line(summary.few_stops, summary.estimator))
     lines += [f"weak: {weak.text}" for weak in summary.weak_directions]
     lines += [f"leverage: {entry.text}" for entry in summary.leverage]
     lines += [f"prior conflict: {text}" for text in summary.prior_conflicts]
     if summary.excluded_spots:
         lines.append(f"excluded spots: {', '.join(map(str, summary.excluded_spots))}")
     if summary.suspect_spots:
-        listed = ", ".join(map(str, summary.suspect_spots[:20]))
-        lines.append(f"spots that disagree with all others: {listed}; look at them, or fit with --robust")
+        lines.append(f"{suspect_line(summary.suspect_spots)}; look at them, or fit with --robust")
     return "\n".join(lines)
+
+
+def astray_text(summary: FitSummary) -> str:
+    """Where a fit that did not converge stopped: values without uncertainty, for whoever looks for the reason."""
+    rows = [[label, f"{summary.parameters[name].value:.4g}", unit] for name, label, unit in KEY_PARAMETERS]
+    table = text_table("where the fit stopped: NOT results", ["quantity", "value", "unit"], rows)
+    lines = [f"NOT CONVERGED: {'; '.join(summary.problems)}", table]
+    if summary.suspect_spots:
+        lines.append(suspect_line(summary.suspect_spots))
+    return "\n".join(lines)
+
+
+def suspect_line(spots: Sequence[int]) -> str:
+    """Spots that others foretell badly, at most `SPOTS_LISTED` by their ids."""
+    listed = ", ".join(map(str, spots[:SPOTS_LISTED]))
+    more = f" and {len(spots) - SPOTS_LISTED} more" if len(spots) > SPOTS_LISTED else ""
+    return f"spots that disagree with all others: {listed}{more}"
+
+
+def few_stops_line(few: Mapping[str, int], estimator: str) -> str:
+    """What few stops of a direction do to its intervals."""
+    named = ", ".join(f"{direction} {count}" for direction, count in few.items())
+    told = f"few stops ({named}): they hardly tell their own scatter"
+    if estimator == "posterior":
+        return f"{told}; the intervals hold it, more stops would shorten them"
+    told += ", and the Laplace intervals of ratio and backlash are too short"
+    return f"{told}; sample the posterior (fit without --no-sample), or add stops"
 
 
 def validation_lines(validation: Mapping[str, object]) -> list[str]:
@@ -757,9 +788,12 @@ def _warnings(e: Evidence) -> list[str]:
     if e.campaign.stereo.assumed:
         found.append("The stereo calibration's covariance is assumed, not estimated.")
     found += [f"Prior conflict: {text}" for text in e.fit["prior_conflicts"]]
+    if e.fit.get("few_stops"):
+        line = few_stops_line(e.fit["few_stops"], str(e.fit["estimator"]))
+        found.append(f"{line[0].upper()}{line[1:]}.")
     if e.fit["suspect_spots"]:
-        listed = ", ".join(map(str, e.fit["suspect_spots"][:20]))
-        found.append(f"Spots that disagree with all others: {listed}.")
+        line = suspect_line(e.fit["suspect_spots"])
+        found.append(f"{line[0].upper()}{line[1:]}.")
     return found
 
 
