@@ -47,7 +47,7 @@ def test_message_tells_place_found_allowed_and_remedy():
     error = caught.value
     assert error.message == (
         'spots.csv line 3, b: found "nan"; allowed: a finite decimal number from 0 to 10; '
-        "give the value, or leave the cell empty with the reason of refusal in status"
+        "write a finite number; the pixels of a spot that was not seen are empty, its status says why"
     )
     assert (error.code, error.file, error.line, error.column) == ("number", "spots.csv", 3, "b")
     assert isinstance(error, TvsError) and error.exit_code == 2

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -17,9 +18,11 @@ from tvsbayes.campaign import (
     grid_protocol,
     read_campaign,
     read_plan,
+    write_campaign,
     write_plan,
 )
 from tvsbayes.classic import Stop, check_campaign, observed_stops, separation
+from tvsbayes.cli import run
 from tvsbayes.files import shipped_data
 from tvsbayes.simulation import simulate
 
@@ -218,7 +221,38 @@ def test_swapped_cameras_are_suspected(paper_twin):
     )
     text = warnings_of(replace(paper_twin, spots=spots))
     assert "are left and right swapped" in text
-    assert "spots 0, 1, 2" in text
+    assert "spots 0, 1, 2, 3, 4, 5, 6, 7, 8, 9 and 374 more triangulate outside" in text
+
+
+def test_lengths_in_metres_and_angles_in_radians_are_suspected(paper_twin):
+    metres = replace(paper_twin.stereo, T=paper_twin.stereo.T / 1000)
+    assert "is it in metres?" in warnings_of(replace(paper_twin, stereo=metres))
+    grid = read_campaign(shipped_data() / "twins" / "grid_twin")
+    for change, words in (
+        (np.radians, "are they in radians?"),
+        (lambda reading: -reading, "outside 0 to 180 deg"),
+        (lambda reading: 180.0 + reading, "outside 0 to 180 deg"),
+    ):
+        spots = tuple(replace(s, aperture_deg=float(change(s.aperture_deg))) for s in grid.spots)
+        assert words in warnings_of(replace(grid, spots=spots))
+
+
+def test_a_status_that_misses_its_word_is_named(paper_twin):
+    first, second, *rest = paper_twin.spots
+    spots = (replace(first, status="OK"), replace(second, status="undetected"), *rest)
+    text = warnings_of(replace(paper_twin, spots=spots))
+    assert "spots 0 are left out: their status is not spelt ok" in text
+    assert "spots 1 are undetected and have pixels" in text
+
+
+def test_commands_that_estimate_repeat_what_no_rig_can_have_measured(paper_twin, tmp_path, capfd):
+    """Nothing makes a user run `check` first; stdout stays the document."""
+    spots = tuple(replace(s, u_left_px=s.u_right_px, u_right_px=s.u_left_px) for s in paper_twin.spots)
+    write_campaign(replace(paper_twin, spots=spots), tmp_path / "swapped")
+    run(["classic", str(tmp_path / "swapped"), "--json"])
+    printed = capfd.readouterr()
+    assert "warning: spots 0, 1" in printed.err and "swapped" in printed.err
+    json.loads(printed.out)
 
 
 def test_one_depth_is_named_and_two_are_not(paper_twin):
@@ -250,7 +284,7 @@ def test_incomplete_experiments_and_refused_spots_are_counted(paper_twin):
 
 
 def test_a_campaign_without_usable_spots_is_told_once(paper_twin):
-    spots = tuple(replace(s, status="undetected", experiment=None, point=None) for s in paper_twin.spots)
+    spots = tuple(replace(s, status="too dim", experiment=None, point=None) for s in paper_twin.spots)
     found = check_campaign(replace(paper_twin, spots=spots))
     assert found.ok_spots == 0
     assert found.warnings == ("no spot has status ok: there is nothing to estimate from",)

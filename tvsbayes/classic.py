@@ -29,6 +29,9 @@ DIRECTIONS = ("left", "right", "up", "down")
 PIXELS = attrgetter("u_left_px", "v_left_px", "u_right_px", "v_right_px")
 NEAREST_SHEET_MM, FARTHEST_SHEET_MM = 20.0, 100_000.0
 """Depths between which a sheet can stand: nearer than a lens barrel, or beyond a hall, is a mismatched pair."""
+SHORTEST_BASELINE_MM = 2.0
+"""Two lenses cannot stand closer; the longest baseline in metres that anybody calls a stereo pair is shorter."""
+SPOTS_LISTED = 10
 INSEPARABLE, INSEPARABLE_ONE_LENGTH = 0.9, 0.7
 """Correlation of ratio and backlash above which four fifths (half, where every leg has one length) of the ratio's
 variance is exchange with the backlash. Equal numbers of cleared and reversed legs of one length give 0.55."""
@@ -505,6 +508,46 @@ class CampaignCheck:
         return {"kind": "campaign", **asdict(self), "warnings": list(self.warnings)}
 
 
+def _depths_mm(campaign: Campaign, spots: Sequence[Spot]) -> np.ndarray:
+    return triangulate(campaign.stereo, np.array([PIXELS(spot) for spot in spots]))[:, 0]
+
+
+def _listed(spots: Sequence[int]) -> str:
+    more = f" and {len(spots) - SPOTS_LISTED} more" if len(spots) > SPOTS_LISTED else ""
+    return ", ".join(map(str, spots[:SPOTS_LISTED])) + more
+
+
+def implausible(campaign: Campaign) -> tuple[str, ...]:
+    """What no rig can have measured: wrong units, swapped cameras, words that miss their spelling."""
+    ok = [spot for spot in campaign.spots if spot.status == "ok"]
+    found = []
+    misspelt = [s.spot for s in campaign.spots if s.status != "ok" and s.status.strip().lower() == "ok"]
+    if misspelt:
+        found.append(f"spots {_listed(misspelt)} are left out: their status is not spelt ok, in small letters")
+    stray = [s.spot for s in campaign.spots if s.status == "undetected" and s.u_left_px is not None]
+    if stray:
+        found.append(f"spots {_listed(stray)} are undetected and have pixels, which nothing uses: ok, or refused?")
+    if not ok:
+        return tuple(found)
+    baseline_mm = float(np.linalg.norm(campaign.stereo.T))
+    if baseline_mm < SHORTEST_BASELINE_MM:
+        found.append(f"T of stereo.json is {baseline_mm:.3g} mm long: is it in metres? Lengths are mm")
+    # Not-a-number (no undistorted point) is implausible as well.
+    depths_mm = _depths_mm(campaign, ok)
+    odd = [s.spot for s, x in zip(ok, depths_mm, strict=True) if not NEAREST_SHEET_MM < x < FARTHEST_SHEET_MM]
+    if odd:
+        limits = f"{NEAREST_SHEET_MM:g} to {FARTHEST_SHEET_MM:g} mm"
+        question = "are left and right swapped, or mismatched?"
+        found.append(f"spots {_listed(odd)} triangulate outside {limits}: {question}")
+    readings = {s.spot: s.aperture_deg for s in ok if s.aperture_deg is not None}
+    beyond = [spot for spot, reading in readings.items() if not 0 < reading < 180]
+    if beyond:
+        found.append(f"aperture readings of spots {_listed(beyond)} lie outside 0 to 180 deg from the baseline")
+    elif readings and max(readings.values()) < np.pi:
+        found.append(f"all aperture readings lie below {np.pi:.2f}: are they in radians? aperture_deg is in degrees")
+    return tuple(found)
+
+
 def check_campaign(campaign: Campaign) -> CampaignCheck:
     """Plausibility and identifiability of a campaign before any fit.
 
@@ -528,16 +571,11 @@ def check_campaign(campaign: Campaign) -> CampaignCheck:
     for move in campaign.moves:
         if "unknown" in (move.pan_approach, move.tilt_approach):
             warnings.append(f"segment {move.segment} begins with an unknown approach: its first reversal tells less")
-    if ok:
-        pixels = np.array([(s.u_left_px, s.v_left_px, s.u_right_px, s.v_right_px) for s in ok])
-        depth_mm = triangulate(campaign.stereo, pixels)[:, 0]
-        # Not-a-number (no undistorted point) is implausible as well.
-        odd = [s.spot for s, x in zip(ok, depth_mm, strict=True) if not NEAREST_SHEET_MM < x < FARTHEST_SHEET_MM]
-        if odd:
-            listed = ", ".join(map(str, odd[:10]))
-            limits = f"{NEAREST_SHEET_MM:g} to {FARTHEST_SHEET_MM:g} mm"
-            warnings.append(f"spots {listed} triangulate outside {limits}: are left and right swapped, or mismatched?")
-        elif depth_mm.max() < SHALLOW * depth_mm.min():
+    odd = implausible(campaign)
+    warnings += odd
+    if ok and not odd:
+        depth_mm = _depths_mm(campaign, ok)
+        if depth_mm.max() < SHALLOW * depth_mm.min():
             warnings.append("all spots lie at one depth: a second sheet position sharpens ratios threefold")
     if campaign.stereo.assumed:
         warnings.append("the stereo covariance is assumed, not estimated: uncertainties are only as good as it is")

@@ -49,7 +49,10 @@ DCC_MESSAGES = 20
 """Of a schema validator, shown at most."""
 RESIDUALS_LISTED = 4096
 """Stops in `fit.json`, evenly chosen: a long campaign's file stays readable within its cap."""
-FITTING_FIRST = "results/ are missing or older than the campaign: fitting first (Laplace approximation) ..."
+FITTING_FIRST = (
+    "results/ are missing, older than the campaign, or of a fit that did not converge: fitting first "
+    "(Laplace approximation) ..."
+)
 DEMO_NOTE = "The twin's move history is our assumption, made so that the classic answer is the paper's Table 1."
 
 app = typer.Typer(
@@ -513,6 +516,14 @@ def doctor(
     _finish({"checks": [c.as_json() for c in checks]}, "\n".join(lines), as_json, error)
 
 
+def _warn_of(campaign: Campaign) -> None:
+    """What `check` says of data that no rig can have measured, for whoever did not ask it first."""
+    from tvsbayes.classic import implausible
+
+    for sentence in implausible(campaign):
+        report_line(f"warning: {sentence}")
+
+
 @app.command()
 def classic(campaign: CampaignFolder, as_json: Json = False) -> None:
     """The paper's four-point estimator. Mean, sd, type A and GUM uncertainty per direction."""
@@ -520,7 +531,9 @@ def classic(campaign: CampaignFolder, as_json: Json = False) -> None:
     from tvsbayes.classic import classic as estimate
     from tvsbayes.report import classic_text
 
-    result = estimate(read_campaign(campaign))
+    data = read_campaign(campaign)
+    _warn_of(data)
+    result = estimate(data)
     skipped = [f"experiment {s.experiment} skipped: {s.reason}" for s in result.skipped]
     _finish(result.as_json(), "\n".join([classic_text(result), *skipped]), as_json)
 
@@ -547,6 +560,7 @@ def fit(
     if resume and no_sample:
         raise InputError("usage", "--resume continues a chain and --no-sample makes none", remedy="give one of them")
     data = read_campaign(campaign)
+    _warn_of(data)
     from tvsbayes.information import DRAWS_KEPT, calibration_of, summarise
     from tvsbayes.joint import fit as fit_joint
     from tvsbayes.report import fit_text, write_results

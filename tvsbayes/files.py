@@ -152,6 +152,17 @@ def closest(name: str, names: Iterable[str]) -> str:
     return f"did you mean {near[0]}?" if near else "remove it, or correct the spelling"
 
 
+def other_format(found: str, allowed: Iterable[str]) -> str | None:
+    """The remedy for a file of another kind or version of ours; None where it is neither."""
+    kind, _, number = found[:100].rpartition("/")
+    known = {name.rpartition("/")[0] for name in allowed}
+    if not (kind.startswith("tvsbayes-") and number.isdecimal()):
+        return None
+    if kind in known:
+        return "another version of tvsbayes wrote it: use that one, or make the file again"
+    return f"this is a {escaped(kind)} file: name a {' or '.join(sorted(known))} file"
+
+
 def read_bytes(path: Path, cap: int, folder: Path | None = None) -> bytes:
     """Reads a regular file of at most `cap` bytes.
 
@@ -192,6 +203,8 @@ def read_bytes(path: Path, cap: int, folder: Path | None = None) -> bytes:
             os.close(descriptor)
     except FileNotFoundError as error:
         remedy = f"create it, or correct {escaped(str(path), 200)}"
+        if Path(path).name == "stereo.json":
+            remedy = f"`tvsbayes stereo` makes one of pictures or of OpenCV's, ROS' or Kalibr's calibration; {remedy}"
         raise bad("missing-file", "no such file", remedy) from error
     except (OSError, ValueError) as error:
         reason = escaped(getattr(error, "strerror", None) or str(error))
@@ -328,19 +341,19 @@ CSV_LINE_CHARS_MAX = 16_384
 NUMBER = re.compile(r"[+-]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][+-]?[0-9]+)?")
 
 
-def number_remedy(cell: str) -> str:
-    """What to do about a cell that is no plain number."""
+def number_remedy(cell: str, *, whole: bool = False) -> str:
+    """What to do about a cell that is no plain number, or no plain whole number."""
     if cell.startswith(("=", "@")):
         return "save the value, not the formula"
     if cell.strip().lower().lstrip("+-") in ("nan", "inf", "infinity"):
-        return "give the value, or leave the cell empty with the reason of refusal in status"
+        return "write a finite number; the pixels of a spot that was not seen are empty, its status says why"
     if "," in cell:
         return "write a decimal point, not a comma"
     if "_" in cell or any(c.isspace() for c in cell):
         return "write the digits without underscores or spaces"
     if not cell.isascii():
         return "write it in the digits 0 to 9"
-    return "write a decimal number such as 9.47"
+    return "write a whole number such as 200" if whole else "write a decimal number such as 9.47"
 
 
 def _plain(cells: Sequence[str], kind: type[float] | type[int], low: float, high: float) -> list | None:
@@ -409,7 +422,7 @@ class Table:
             value = int(cell) if INTEGER.fullmatch(cell) else None
             if value is None or not low <= value <= high:
                 allowed = f"a whole number from {low} to {high}{', or an empty cell' * empty}"
-                remedy = "write a whole number, no point" if NUMBER.fullmatch(cell) else number_remedy(cell)
+                remedy = "write a whole number, no point" if NUMBER.fullmatch(cell) else number_remedy(cell, whole=True)
                 raise self.refuse(row, column, "integer", allowed, remedy)
             values.append(value)
         return values
@@ -505,6 +518,8 @@ def parse_table(data: bytes, file: str, columns: Sequence[str], optional: Sequen
         if blank is not None or len(row) != len(header):
             found, cells_allowed = "an empty line" if blank else f"{len(row)} cells", f"{len(header)} cells"
             remedy = "one cell per column; a decimal comma splits a number in two: write a point"
+            if blank:
+                remedy = "remove it; only the end of the file may be empty"
             raise bad("row-length", line=blank or line, found=found, allowed=cells_allowed, remedy=remedy)
         if len(lines) >= CSV_ROWS_MAX:
             found, rows_allowed = "a row more", f"at most {CSV_ROWS_MAX} rows"
@@ -643,14 +658,16 @@ class Keys:
         allowed = " or ".join(shown(w) for w in words)
         value = self._get(key, allowed)
         if value not in words:
-            raise self.refuse(key, "word", allowed, closest(str(value)[:100], words))
+            remedy = other_format(str(value), words) if key == "format" else None
+            raise self.refuse(key, "word", allowed, remedy or closest(str(value)[:100], words))
         return str(value)
 
     def table(self, key: str) -> Keys:
         """The table under `key`; an absent one is empty."""
         value = self.values.get(key, {})
         if not isinstance(value, dict):
-            raise self.refuse(key, "table", "a table", f"write it as [{escaped(key)}] with keys below")
+            place = escaped(".".join((*self.path, key)))
+            raise self.refuse(key, "table", "a table", f"write it as [{place}] with keys below")
         return Keys(value, self.file, self.text, (*self.path, key))
 
     def quantity(self, key: str, low: float, high: float, u_max: float) -> tuple[float, float]:

@@ -395,29 +395,30 @@ def error_maps(found: ErrorMap, range_index: int) -> Figure:
     names = [name for name in OF_ESTIMATOR if name in found.rms_mm]
     with _figure(0.5 + 1.75 * len(names)) as figure:
         panels = np.atleast_1d(figure.subplots(len(names), 1, sharex=True))
+        # One scale for all: equal colours are equal errors.
+        every = np.concatenate([found.rms_mm[name][:, :, range_index].ravel() for name in names])
+        seen = every[np.isfinite(every)]
+        low, high = (float(seen.min()), float(seen.max())) if len(seen) else (0.0, 1.0)
         for axes, name in zip(panels, names, strict=True):
             values = found.rms_mm[name][:, :, range_index].T
-            mesh = axes.pcolormesh(
-                found.pan_steps, found.tilt_steps, values, cmap=_colours(SEQUENTIAL), rasterized=True
-            )
+            scale = {"cmap": _colours(SEQUENTIAL), "vmin": low, "vmax": high}
+            mesh = axes.pcolormesh(found.pan_steps, found.tilt_steps, values, **scale, rasterized=True)
             figure.colorbar(mesh, ax=axes, label="mm")
-            _cells(axes, found.pan_steps, found.tilt_steps, values)
+            _cells(axes, found.pan_steps, found.tilt_steps, values, low + 0.55 * (high - low))
             axes.set(ylabel="tilt, steps", title=f"{name}, range {found.range_mm[range_index]:.4g} mm")
             axes.grid(False)
         panels[-1].set_xlabel("pan, steps")
     return figure
 
 
-def _cells(axes: Axes, x: np.ndarray, y: np.ndarray, values: np.ndarray) -> None:
-    """Values written into a map of few cells."""
-    top = np.nanmax(values) if np.isfinite(values).any() else 1.0
-    bottom = np.nanmin(values) if np.isfinite(values).any() else 0.0
+def _cells(axes: Axes, x: np.ndarray, y: np.ndarray, values: np.ndarray, dark_above: float) -> None:
+    """Values written into a map of few cells, white on dark ones."""
     for row, yy in enumerate(y):
         for column, xx in enumerate(x):
             value = values[row, column]
             if np.isfinite(value):
-                dark = value > bottom + 0.55 * (top - bottom)
-                style = {"ha": "center", "va": "center", "fontsize": 7, "color": "white" if dark else "black"}
+                colour = "white" if value > dark_above else "black"
+                style = {"ha": "center", "va": "center", "fontsize": 7, "color": colour}
                 axes.text(xx, yy, f"{value:.3g}", **style)
 
 

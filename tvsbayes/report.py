@@ -22,6 +22,7 @@ import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib.metadata import version
+from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -69,6 +70,11 @@ KEY_PARAMETERS = (
     ("stop_sd_deg.down", "stop sd down", "deg"),
     ("pixel_scale", "pixel noise / stated", ""),
 )
+
+
+def two_digits(value: float) -> str:
+    """An uncertainty to two significant digits, without an exponent (GUM 7.2.6)."""
+    return np.format_float_positional(value, precision=2, fractional=False, trim="-")
 
 
 def concise(value: float, sd: float) -> str:
@@ -311,11 +317,14 @@ def sampling_line(sampling: dict[str, object]) -> str:
 
 def lost_motion_lines(lost: dict[str, list[dict[str, float]]]) -> list[str]:
     """Lost motion after a reversal, for the step counts that were used."""
-    return [
-        f"lost motion {direction}, deg: "
-        + ", ".join(f"{e['steps']} steps {concise(e['value_deg'], e['sd_deg'])}" for e in entries)
-        for direction, entries in lost.items()
-    ]
+    lines = []
+    for direction, entries in lost.items():
+        told = []
+        for text, group in groupby(entries, lambda e: concise(e["value_deg"], e["sd_deg"])):
+            steps = [e["steps"] for e in group]
+            told.append(f"{steps[0]} {f'to {steps[-1]} ' * (len(steps) > 1)}steps {text}")
+        lines.append(f"lost motion {direction}, deg: {', '.join(told)}")
+    return lines
 
 
 def demo_text(classic_result: ClassicResult, summary: FitSummary, truth: dict[str, float]) -> str:
@@ -425,7 +434,7 @@ def locations_text(found: Locations) -> str:
             continue
         sd = np.sqrt(np.diag(found.covariance_mm2[index]))
         cells = [concise(float(x), float(u)) for x, u in zip(found.xyz_mm[index], sd, strict=True)]
-        half = " ".join(f"{u:.2g}" for u in found.u95_mm[index])
+        half = " ".join(map(two_digits, found.u95_mm[index]))
         held = int(found.digits_held[index].min())
         verdict = f"validated at {held} digit{'s' * (held > 1)}" if held else "not validated"
         rows.append([str(index), *cells, half, verdict])
@@ -459,11 +468,11 @@ def steps_text(steps: Steps) -> str:
         f"then to    pan {steps.pan_steps}, tilt {steps.tilt_steps} steps, moving {pan} and {tilt}",
     ]
     if steps.xyz_mm is not None:
-        half = ", ".join(f"{u:.2g}" for u in steps.u95_mm)
+        half = ", ".join(map(two_digits, steps.u95_mm))
         lines.append(f"whole steps leave {steps.rounding_mm:.3g} mm; beam there +- ({half}) mm (95 %)")
         lines.append(f"the aperture should read {steps.aperture_deg:.3f} deg")
     else:
-        half = ", ".join(f"{u:.2g}" for u in steps.u95_deg)
+        half = ", ".join(map(two_digits, steps.u95_deg))
         lines.append(f"whole steps leave {steps.rounding_deg:.3g} deg; azimuth and elevation +- ({half}) deg (95 %)")
     return "\n".join(lines)
 
@@ -743,13 +752,13 @@ def _numbers(e: Evidence) -> list[Number]:
     ratios = {d: x for d, x in e.fit["effective_deg_per_step"].items() if x is not None}
     numbers = []
     if ratios:
-        worst = max(ratios, key=lambda d: ratios[d]["sd"] / abs(ratios[d]["value"]))
-        x = ratios[worst]
-        u = 0.5 * (x["interval95"][1] - x["interval95"][0])
-        note = f"effective deg/step; U = {u:.2g}, p = 95 %, k = {u / x['sd']:.2f}" if x["sd"] > 0 else "fixed"
+        half = {d: 0.5 * (x["interval95"][1] - x["interval95"][0]) for d, x in ratios.items()}
+        worst = max(half, key=half.get)
+        x, u = ratios[worst], half[worst]
+        note = f"effective deg/step; 95 % interval +- {two_digits(u)}" if x["sd"] > 0 else "fixed"
         factor = (e.fit.get("validation") or {}).get("inflation", 1.0)
         if factor > 1:
-            note += f"; validation failed: use {factor:.2f} U = {factor * u:.2g}"
+            note += f"; validation failed: use {factor:.2f} times that, {two_digits(factor * u)}"
         numbers.append(Number(f"least certain ratio: {worst}", concise(x["value"], x["sd"]), note))
     if e.classic is not None and ratios:
         off = {
@@ -770,7 +779,7 @@ def _numbers(e: Evidence) -> list[Number]:
 
 
 def _mm(value: float) -> str:
-    return f"{value:.2g} mm" if value < 100 else f"{value:.0f} mm"
+    return f"{two_digits(value)} mm" if value < 100 else f"{value:.0f} mm"
 
 
 def _warnings(e: Evidence) -> list[str]:
@@ -857,7 +866,7 @@ def _results(e: Evidence) -> Section:
             row += [
                 concise(joint["value"], joint["sd"]),
                 interval_text(low, high, joint["sd"]),
-                f"{0.5 * (high - low):.2g}",
+                two_digits(0.5 * (high - low)),
             ]
         if e.classic is None:
             row += ["not applicable", ""]
@@ -867,7 +876,7 @@ def _results(e: Evidence) -> Section:
             row += [concise(classic.mean_deg_per_step, classic.u_gum_deg_per_step or 0.0), str(classic.n)]
         rows.append(row)
     pose = e.fit["reference_pose_deg"]
-    columns = ["direction", "joint value(u)", "95 % interval", "U (k near 2)", "classic value(u)", "n"]
+    columns = ["direction", "joint value(u)", "95 % interval", "half of it", "classic value(u)", "n"]
     caption = (
         f"Effective degrees of the beam per motor step at pan {pose['pan']:.2f} deg, tilt {pose['tilt']:.2f} "
         "deg, deg/step"
@@ -1023,7 +1032,7 @@ def _residuals(e: Evidence) -> Section:
             f"{c['axis']}: {c['name']}",
             str(len(c["groups"])),
             "not tested" if c["p"] is None else f"{c['p']:.3f}",
-            "SUSPICIOUS" if c["suspicious"] else "no sign",
+            "SUSPICIOUS" if c["suspicious"] else "" if c["p"] is None else "no sign",
         ]
         for c in causes
     ]
@@ -1190,11 +1199,28 @@ def _maps(e: Evidence) -> Section:
             "moved by half of it; noise of one look is included for all."
         )
     ]
+    at_middle = {name: values[middle] for name, values in e.maps.rms_mm.items()}
+    if "nominal" in at_middle:
+        worse = np.flatnonzero(at_middle["joint"] >= at_middle["nominal"])
+        if len(worse):
+            text.append(_no_better(e, [f"{e.maps.range_mm[k]:g}" for k in worse]))
     return Section("Errors in 3D", text, tables=[table], figures=figures)
 
 
+def _no_better(e: Evidence, ranges_mm: Sequence[str]) -> str:
+    """Why a calibration may place points no better than the nominal rig: what the campaign could not tell."""
+    text = f"At {', '.join(ranges_mm)} mm the joint calibration places points no better than the nominal one"
+    if e.budget is not None:
+        largest = int(np.argmax(e.budget.share))
+        text += f": {e.budget.causes[largest]} makes up {100 * e.budget.share[largest]:.0f} % of its variance"
+        text += f" at {e.range_mm:g} mm"
+    if not any(spot.aperture_deg is not None for spot in e.campaign.spots):
+        text += "; the campaign has no aperture readings, which tell the range of a point"
+    return f"{text}."
+
+
 def _cell(value: float) -> str:
-    return "no point" if not np.isfinite(value) else f"{value:.2g}" if value < 10 else f"{value:.0f}"
+    return "no point" if not np.isfinite(value) else two_digits(value) if value < 10 else f"{value:.0f}"
 
 
 def _budgets(e: Evidence) -> Section:
@@ -1204,7 +1230,7 @@ def _budgets(e: Evidence) -> Section:
         u = np.sqrt(e.budget.variance_mm2)
         order = np.argsort(-e.budget.share)
         rows = [
-            [e.budget.causes[k], f"{100 * e.budget.share[k]:.1f}", *(f"{v:.2g}" for v in u[k])]
+            [e.budget.causes[k], f"{100 * e.budget.share[k]:.1f}", *map(two_digits, u[k])]
             for k in order
             if e.budget.share[k] >= SHARE_SHOWN
         ]
@@ -1235,10 +1261,10 @@ def _gum_table(table: Mapping[str, object], prefix: str = "") -> TableView:
             row["quantity"],
             row["kind"],
             row["distribution"],
-            _blank(row["u"], ".2g"),
+            "" if row["u"] is None else two_digits(row["u"]),
             _freedom(row["dof"]) if row["u"] is not None else "",
             _blank(row["sensitivity"], ".3g"),
-            _blank(row["contribution"], ".2e"),
+            "" if row["contribution"] is None else two_digits(row["contribution"]),
             f"{100 * row['share']:.1f}",
         ]
         for row in shown
@@ -1249,8 +1275,11 @@ def _gum_table(table: Mapping[str, object], prefix: str = "") -> TableView:
     caption = (
         f"{prefix}{table['quantity']}: {concise(table['estimate'], table['u'])} {table['unit']}; effective degrees of "
         f"freedom {_freedom(table['dof'])}, k = {table['coverage_factor']:.2f}, "
-        f"p = {100 * table['probability']:.0f} %, U = {table['expanded']:.2g} {table['unit']}"
+        f"p = {100 * table['probability']:.0f} %, U = {two_digits(table['expanded'])} {table['unit']}"
     )
+    if any(row["share"] > 1 for row in shown):
+        # GUM 5.2.2: with correlated inputs the cross terms are as real as the squares.
+        caption += "; the inputs are correlated: single shares exceed 100 %, the row of correlations takes them back"
     columns = ["source", "type", "distribution", "u", "dof", "sensitivity", "contribution", "share %"]
     return TableView(caption, columns, rows)
 

@@ -467,7 +467,9 @@ def _parse_priors(table: Keys, allowed: tuple[str, ...]) -> dict[str, Prior]:
     priors: dict[str, Prior] = {}
     for keys, key, name in _entries(table):
         if name not in allowed:
-            names = "only " + ", ".join(allowed)
+            # Keys of [rig] itself that are no priors are read before.
+            more = () if "rig" not in table.path or "prior" in table.path else ("aperture_convention", "prior")
+            names = "only " + ", ".join((*allowed, *more))
             found = f"the name {escaped(name)}"
             raise keys.refuse(key, "unknown-key", names, _explanation(name, allowed), found)
         if name in priors:
