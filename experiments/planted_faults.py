@@ -621,17 +621,17 @@ FAULTS = (
     # Coordinates.
     Fault(
         "one-sided coverage factor",
-        "coordinates.py",
-        "high = 0.5 * (1 + probability)",
-        "high = probability",
+        "classic.py",
+        "upper = 0.5 * (1 + probability)",
+        "upper = probability",
         "k = 1.64 for 95 %",
         ("propagation.py::test_coverage_factor_of_infinitely_many_dof_is_normal",),
     ),
     Fault(
         "effective degrees of freedom without the fourth power",
-        "coordinates.py",
-        "denominator = np.sum(u**4 / dof)",
-        "denominator = np.sum(u**2 / dof)",
+        "classic.py",
+        "total = sum(c**4 / nu for c, nu in zip(contributions, dof, strict=True))",
+        "total = sum(c**2 / nu for c, nu in zip(contributions, dof, strict=True))",
         "coverage factors of another quantity",
         ("propagation.py::test_effective_dof",),
     ),

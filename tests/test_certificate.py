@@ -27,7 +27,6 @@ from tvsbayes.certificate import (
     beam_deg_per_step,
     budget_table,
     coordinate_budget,
-    coverage_factor,
     headline_budget,
     iso230,
     positioning,
@@ -36,6 +35,7 @@ from tvsbayes.certificate import (
     target_steps,
     unit_of,
 )
+from tvsbayes.classic import coverage_factor
 from tvsbayes.joint import Linearised
 from tvsbayes.rigs import RigTable
 from tvsbayes.simulation import effective_deg_per_step, harmonics_deg, mirror_chain, transmission, with_derived

@@ -12,6 +12,7 @@ import shutil
 import subprocess
 import sys
 from dataclasses import replace
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -290,8 +291,11 @@ def test_fit_document_has_the_contracts_keys_and_its_files(ask, folder):
 
 def test_fit_for_people_names_value_interval_and_origin(say, folder, tmp_path):
     out = tmp_path / "elsewhere"
-    code, text, _ = say("fit", folder, "--no-sample", "--out", out)
+    out.mkdir()
+    (out / "posterior.nc").write_bytes(b"of an earlier fit")
+    code, text, told = say("fit", folder, "--no-sample", "--out", out)
     assert code == 0
+    assert not (out / "posterior.nc").exists() and "posterior.nc of an earlier fit is removed" in told
     row = next(line for line in text.splitlines() if line.startswith("effective left"))
     assert row.split()[-1] == "data"
     assert str(out / "fit.json") in text
@@ -703,6 +707,10 @@ def test_a_bug_is_no_bad_input(monkeypatch):
     monkeypatch.setattr("tvsbayes.campaign.read_campaign", broken)
     with pytest.raises(RuntimeError, match="a bug"):
         run(["classic", str(PAPER_TWIN)])
+
+
+def test_the_version_is_the_packages(say):
+    assert say("--version")[:2] == (0, f"tvsbayes {version('tvsbayes')}\n")
 
 
 def test_help_loads_nothing_heavy_and_lists_the_commands():

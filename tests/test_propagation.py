@@ -13,10 +13,9 @@ import numpy as np
 import pytest
 from scipy import optimize, stats
 
+from tvsbayes.classic import coverage_factor, effective_dof
 from tvsbayes.coordinates import (
     NORMAL_95,
-    coverage_factor,
-    effective_dof,
     linear,
     numerical_tolerance,
     shortest_interval,
@@ -66,6 +65,11 @@ READINGS = np.array(
 )
 """GUM table H.2: V, mA, rad. The printed u and r of these are too coarse: from them r(R, X) is -.591."""
 IMPEDANCE = {"value": (127.732, 219.847, 254.260), "u": (0.071, 0.295, 0.236), "r": (-0.588, -0.485, 0.993)}
+
+
+def combined_dof(contributions: np.ndarray, dof: np.ndarray) -> float:
+    """Of independent contributions."""
+    return effective_dof(math.sqrt(np.sum(np.square(contributions))), contributions, dof)
 
 
 @dataclass(frozen=True)
@@ -318,12 +322,12 @@ def test_gauge_block_by_the_law():
     assert float(law.value[0]) == pytest.approx(GAUGE["mean"], abs=1e-6)
     assert u == pytest.approx(GAUGE["u"], abs=1)
     np.testing.assert_allclose(contributions, [25, 5.8, 3.9, 6.7, 0, 0, 0, 2.9, 16.6], atol=0.1)
-    assert math.floor(effective_dof(contributions, GAUGE_DOF)) == GAUGE["dof"]
+    assert math.floor(combined_dof(contributions, GAUGE_DOF)) == GAUGE["dof"]
     assert np.linalg.norm(contributions[1:4]) == pytest.approx(9.7, abs=0.1)
-    assert effective_dof(contributions[1:4], GAUGE_DOF[1:4]) == pytest.approx(
+    assert combined_dof(contributions[1:4], GAUGE_DOF[1:4]) == pytest.approx(
         25.6, abs=0.2
     )  # the GUM divides the rounded 9.7^4
-    factor = coverage_factor(0.99, GAUGE["dof"])
+    factor = coverage_factor(GAUGE["dof"], 0.99)
     assert factor == pytest.approx(2.92, abs=0.01)
     assert factor * u == pytest.approx(GAUGE["expanded"], abs=1)
     np.testing.assert_allclose(float(law.value[0]) + factor * u * np.array([-1, 1]), GAUGE["law"], atol=1)
@@ -337,11 +341,11 @@ def test_gauge_block_by_monte_carlo():
     agrees(sd, draws, GAUGE["u_mcm"], 1.0)
     agrees(lambda d: symmetric_interval(d, 0.99), draws, GAUGE["mcm"], 1.0)
     agrees(lambda d: shortest_interval(d, 0.99), draws, GAUGE["mcm"], 1.0, SHORTEST_RATE)
-    verdict = result.validate(digits=1, probability=0.99, factor=coverage_factor(0.99, GAUGE["dof"]))
+    verdict = result.validate(digits=1, probability=0.99, factor=coverage_factor(GAUGE["dof"], 0.99))
     assert verdict.tolerance[0] == pytest.approx(5.0)
     assert verdict.deviation[0] <= 2 + 4 * verdict.error[0]
     assert verdict.validated[0]
-    assert not result.validate(digits=1, probability=0.99, factor=coverage_factor(0.99)).validated[0]
+    assert not result.validate(digits=1, probability=0.99, factor=coverage_factor(math.inf, 0.99)).validated[0]
 
 
 def impedance(x):
@@ -468,19 +472,19 @@ def test_symmetric_interval_leaves_equal_tails_of_a_skew_distribution():
 
 
 def test_effective_dof():
-    assert effective_dof(np.array([0.57, 0.25]), np.array([9.0, np.inf])) == pytest.approx(12.8, abs=0.1)
-    assert effective_dof(np.array([3.0]), np.array([7.0])) == pytest.approx(7.0)
-    assert effective_dof(np.full(4, 0.2), np.full(4, 5.0)) == pytest.approx(20.0)
-    assert effective_dof(np.array([1.0, 2.0]), np.array([np.inf, np.inf])) == math.inf
-    assert effective_dof(np.array([0.0, 2.0]), np.array([3.0, np.inf])) == math.inf
+    assert combined_dof(np.array([0.57, 0.25]), np.array([9.0, np.inf])) == pytest.approx(12.8, abs=0.1)
+    assert combined_dof(np.array([3.0]), np.array([7.0])) == pytest.approx(7.0)
+    assert combined_dof(np.full(4, 0.2), np.full(4, 5.0)) == pytest.approx(20.0)
+    assert combined_dof(np.array([1.0, 2.0]), np.array([np.inf, np.inf])) == math.inf
+    assert combined_dof(np.array([0.0, 2.0]), np.array([3.0, np.inf])) == math.inf
 
 
 def test_coverage_factor_of_infinitely_many_dof_is_normal():
-    assert coverage_factor(0.95) == pytest.approx(NORMAL_95, rel=1e-12)
-    assert coverage_factor(0.95, math.inf) == pytest.approx(coverage_factor(0.95, 1e9), rel=1e-6)
+    assert coverage_factor(math.inf) == pytest.approx(NORMAL_95, rel=1e-12)
+    assert coverage_factor(math.inf) == pytest.approx(coverage_factor(1e8), rel=1e-6)
     # GUM table G.2.
-    assert [round(coverage_factor(0.95, n), 2) for n in (1.0, 5.0, 10.0, 50.0)] == [12.71, 2.57, 2.23, 2.01]
-    assert [round(coverage_factor(0.99, n), 2) for n in (1.0, 5.0, 10.0, 50.0)] == [63.66, 4.03, 3.17, 2.68]
+    assert [round(coverage_factor(n), 2) for n in (1.0, 5.0, 10.0, 50.0)] == [12.71, 2.57, 2.23, 2.01]
+    assert [round(coverage_factor(n, 0.99), 2) for n in (1.0, 5.0, 10.0, 50.0)] == [63.66, 4.03, 3.17, 2.68]
 
 
 def test_linear_is_exact_for_a_linear_model():

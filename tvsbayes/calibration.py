@@ -40,6 +40,8 @@ SIDES = {"pan": ("right", "left"), "tilt": ("down", "up")}
 """Approach sides of an axis, negative first."""
 NORMAL_95 = 1.959963984540054
 """Two-sided 95 % quantile of the normal distribution."""
+CONTRACTION_LIMIT = 0.1
+"""1 - (posterior sd / prior sd)^2 below which a value is called set by the prior (DESIGN 8)."""
 CLEARED_PROBABILITY = 0.99
 """With this probability an overshoot takes up all the play."""
 AIM_STEPS, AIM_RAD = 40, 1e-11

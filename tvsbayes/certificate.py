@@ -40,6 +40,7 @@ from tvsbayes.calibration import (
     output_deg,
 )
 from tvsbayes.campaign import APPROACH_SIGN, Campaign, Move, input_hashes
+from tvsbayes.classic import coverage_factor, effective_dof
 from tvsbayes.files import (
     JSON_BYTES_MAX,
     InputError,
@@ -656,20 +657,6 @@ INDEPENDENCE = (
     "effective degrees of freedom by Welch-Satterthwaite (GUM G.4.1), which takes the inputs as independent: with a "
     "large correlation row they are approximate"
 )
-
-
-def coverage_factor(dof: float, probability: float = PROBABILITY) -> float:
-    """Student's t_p for two-sided coverage (GUM G.4.1); fractional degrees of freedom are kept."""
-    from scipy.special import ndtri, stdtrit
-
-    upper = 0.5 * (1 + probability)
-    return float(stdtrit(dof, upper) if dof < 1e9 else ndtri(upper))
-
-
-def effective_dof(u: float, contributions: Sequence[float], dof: Sequence[float]) -> float:
-    """Welch-Satterthwaite (GUM eq. G.2b): u^4 / sum (c_i u_i)^4 / nu_i."""
-    total = sum(c**4 / nu for c, nu in zip(contributions, dof, strict=True))
-    return u**4 / total if total > 0 else math.inf
 
 
 def budget_table(

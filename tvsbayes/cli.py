@@ -64,6 +64,24 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        from importlib.metadata import version
+
+        _print(f"tvsbayes {version('tvsbayes')}")
+        raise typer.Exit
+
+
+@app.callback()
+def _options(
+    _version: Annotated[
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and exit.")
+    ] = False,
+) -> None:
+    pass
+
+
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON document on stdout.")]
 Seed = Annotated[int, typer.Option("--seed", min=0, help="Seed of everything random.")]
 CampaignFolder = Annotated[Path, typer.Argument(metavar="CAMPAIGN", help="Campaign folder.")]
@@ -168,14 +186,14 @@ def demo(
     as_json: Json = False,
 ) -> None:
     """Both estimators on the shipped paper twin, beside its truth."""
-    import shutil
     import tempfile
 
     source = shipped_data() / "twins" / "paper_twin"
     with tempfile.TemporaryDirectory(prefix="tvsbayes-demo-") as scratch:
         folder = Path(scratch) / "paper_twin" if out is None else out
         make_folder(folder, empty=True)
-        shutil.copytree(source, folder, dirs_exist_ok=True)
+        for part in sorted(source.iterdir()):
+            write_atomically(folder / part.name, part.read_bytes())
         report_line("paper twin: 96 four-point experiments of a simulated rig with known truth; fitting ...")
         from tvsbayes.campaign import read_campaign
         from tvsbayes.classic import classic as estimate_classic
@@ -590,6 +608,10 @@ def fit(
             write_posterior(posterior, folder / "posterior.nc")
             more = {"posterior": str(folder / "posterior.nc")}
         more["chain"] = str(folder / "chain.npz")
+    stale = folder / "posterior.nc"
+    if "posterior" not in more and stale.exists():
+        stale.unlink()
+        report_line("posterior.nc of an earlier fit is removed: it would not be that of fit.json")
     calibration = calibration_of(result, posterior, seed=seed) if result.converged else None
     draws = posterior.thinned(DRAWS_KEPT) if summary.estimator == "posterior" else None
     usable = posterior if summary.estimator == "posterior" else None

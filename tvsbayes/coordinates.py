@@ -86,27 +86,6 @@ def linear(
     return Linear(values, columns, columns @ covariance @ jnp.swapaxes(columns, -1, -2))
 
 
-def effective_dof(contributions: np.ndarray, dof: np.ndarray) -> float:
-    """Effective degrees of freedom of independent contributions u_i (GUM G.4.1, Welch and Satterthwaite).
-
-    Args:
-        contributions: standard uncertainties u_i(y), shape (n,).
-        dof: their degrees of freedom, infinite where exactly known, shape (n,).
-    """
-    u, dof = np.asarray(contributions, dtype=float), np.asarray(dof, dtype=float)
-    denominator = np.sum(u**4 / dof)
-    return math.inf if denominator == 0 else float(np.sum(u**2) ** 2 / denominator)
-
-
-def coverage_factor(probability: float, dof: float = math.inf) -> float:
-    """Two-sided coverage factor of Student's t (GUM G.3), truncating the degrees of freedom is the caller's (G.4.1)."""
-    # Loading it takes a twentieth of the time of a `locate`, which does not need it.
-    from scipy import special
-
-    high = 0.5 * (1 + probability)
-    return float(special.stdtrit(dof, high) if math.isfinite(dof) else special.ndtri(high))
-
-
 def symmetric_interval(draws: np.ndarray, probability: float = 0.95) -> np.ndarray:
     """Probabilistically symmetric coverage interval over the first axis (JCGM 101 7.7): first axis (low, high)."""
     tail = 0.5 * (1 - probability)

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy import special, stats
 
-from tvsbayes.calibration import INPUT_NAMES, NORMAL_95, Calibration, calibration_of_draws
+from tvsbayes.calibration import CONTRACTION_LIMIT, INPUT_NAMES, NORMAL_95, Calibration, calibration_of_draws
 from tvsbayes.campaign import Move
 from tvsbayes.classic import DIRECTIONS, four_point_ratios, observed_stops, select_experiments, separation
 from tvsbayes.joint import Derived, JointFit, linear_spots
@@ -24,8 +24,6 @@ from tvsbayes.model import INDEX, KINDS, NAMES, NOISE_NAMES, RECEIVER_NAMES, RIG
 from tvsbayes.posterior import Posterior, ideal_pixels
 from tvsbayes.rigs import HARMONIC_PRIORS, STEREO_PARAMETER_NAMES
 
-CONTRACTION_LIMIT = 0.1
-"""Below it a value is called set by the prior (DESIGN 8)."""
 LEVERAGE_LIMIT = 2.0
 """A stop is named if a headline's sd would grow by more than this factor without it (DESIGN 4.2)."""
 EXCHANGE_LIMIT = 0.5

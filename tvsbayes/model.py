@@ -32,7 +32,6 @@ from tvsbayes.rigs import FULL_TURN_DEG, RIG_PRIORS, STEREO_PARAMETER_NAMES, Rig
 
 Scalar = Float[Array, ""]
 Vector = Float[Array, "3"]
-Vectors = Float[Array, "3 *batch"]
 
 CROSS = np.zeros((3, 3, 3))
 """CROSS[i, j] . r = the matrix of the cross product r x."""
@@ -251,11 +250,6 @@ class MirrorAngles(eqx.Module):
 
     angle_rad: Float[Array, "moves 2"]
     play_sd_rad: Float[Array, "moves 2"]
-
-
-def play(angle_rad: Array, input_rad: Array, backlash_rad: Array) -> Array:
-    """Play operator: the output stays until the input drags it along (DESIGN 3.1)."""
-    return jnp.clip(angle_rad, input_rad - backlash_rad / 2, input_rad + backlash_rad / 2)
 
 
 def mirror_angles(transmission: Transmission, tilt_zero_rad: Scalar, moves: MoveArrays) -> MirrorAngles:

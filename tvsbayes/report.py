@@ -34,7 +34,7 @@ from rich.table import Table
 from rich.text import Text
 
 from tvsbayes import plots
-from tvsbayes.calibration import Calibration, Steps, calibration_bytes, mode_arrays
+from tvsbayes.calibration import CONTRACTION_LIMIT, Calibration, Steps, calibration_bytes, mode_arrays
 from tvsbayes.campaign import input_hashes
 from tvsbayes.certificate import FIGURES, traceability
 from tvsbayes.classic import DIRECTIONS, ClassicResult
@@ -959,7 +959,7 @@ def _parameters(e: Evidence) -> TableView:
     for name, x in e.fit["parameters"].items():
         if name.startswith("stereo.") or x["sd"] == 0:
             continue
-        set_by = "" if x["contraction"] is None else ("data" if x["contraction"] >= 0.1 else "prior")
+        set_by = "" if x["contraction"] is None else ("data" if x["contraction"] >= CONTRACTION_LIMIT else "prior")
         contraction = "" if x["contraction"] is None else f"{x['contraction']:.2f}"
         diagnosis = "" if x["rhat"] is None else f"{x['rhat']:.3f}"
         rows.append(
