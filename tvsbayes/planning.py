@@ -641,12 +641,19 @@ def split_of(knowledge: Knowledge, data: np.ndarray, noise: np.ndarray | None, f
     return dict(sorted(kept.items(), key=lambda item: -item[1]))
 
 
+def _at_most(value: float) -> str:
+    """A positive number to two digits, rounded down: an uncertainty that is enough, stated so that it stays enough."""
+    last = 10.0 ** (math.floor(math.log10(value)) - 1)
+    # A number that has two digits already may stand an ulp below them.
+    return f"{last * math.floor(value / last + 1e-9):.2g}"
+
+
 def _state(table: RigTable, columns: Sequence[int], share: float) -> str:
     """The stated u of a prior, and what it would have to be."""
     if len(columns) == len(NAMES) - len(RIG_NAMES):
-        return f"the stereo calibration to {100 * share:.2g} % of its present uncertainty"
-    names = [NAMES[c] for c in columns if table.priors[NAMES[c]].u > 0]
-    return " and ".join(f"u({n}) = {share * table.priors[n].u:.2g} instead of {table.priors[n].u:.2g}" for n in names)
+        return f"the stereo calibration to {_at_most(100 * share)} % of its present uncertainty"
+    stated = {NAMES[c]: table.priors[NAMES[c]].u for c in columns if table.priors[NAMES[c]].u > 0}
+    return " and ".join(f"u({name}) = {_at_most(share * u)} instead of {u:.2g}" for name, u in stated.items())
 
 
 def limit_of(knowledge: Knowledge, data: np.ndarray, found: Sensitivity, target: Target) -> Limit:
@@ -829,7 +836,7 @@ def stop_now(now: float, target: Target, limit: Limit, batches: Sequence[Batch],
 
 
 def _classic_answer(
-    knowledge: Knowledge, target: Target, forecast: ClassicForecast | None, campaign: Campaign | None
+    target: Target, forecast: ClassicForecast | None, campaign: Campaign | None
 ) -> ClassicAnswer | None:
     """N = (t s / E)^2 with the uncertainty of s: over instruments, or by chi-square where s was measured."""
     if forecast is None or not set(target.indices) <= {0, 1, 2, 3} or target.point_mm is not None:
@@ -1083,7 +1090,7 @@ def plan_from(
         baselines=(chosen, *_baselines(knowledge, target, aperture, pose_rad)),
         next=batches,
         stop=stop,
-        classic=_classic_answer(knowledge, target, forecast, campaign),
+        classic=_classic_answer(target, forecast, campaign),
         met=done or share >= ASSURED[0],
         notes=(*found.notes, *([] if done else few_stops(final.looks(experiments)))),
         draws=draws,
