@@ -192,9 +192,8 @@ def test_the_classics_value_adds_stereo_to_the_mean_of_its_experiments():
 def forecast() -> ClassicForecast:
     """41 instruments: quantiles at 2.5, 50 and 97.5 % are rows 1, 20 and 39."""
     rows = np.arange(41.0)[::-1, None]
-    return ClassicForecast(
-        1e-4 * (1 + rows * [0.1, 0.05, 0, 0]), 1e-5 * (rows + [0, 100, 0, 0]), np.array([3e-5, 4e-5, 0, 0])
-    )
+    sd, error = 1e-4 * (1 + rows * np.array([0.1, 0.05, 0, 0])), 1e-5 * (rows + np.array([0, 100, 0, 0]))
+    return ClassicForecast(sd, error, np.array([3e-5, 4e-5, 0, 0]))
 
 
 def test_the_classics_answer_before_data(forecast):

@@ -833,14 +833,14 @@ class Candidates:
         looks: candidates.
         overshoot: run-up (pan, tilt), steps.
         limits: lowest and highest counter of (pan, tilt), shape (2, 2).
-        full_turns: number of candidates that lie a full turn away.
+        turned: whether each of them lies a full turn of pan away, shape (m,).
         notes: sentences on what was left out and why.
     """
 
     looks: Looks
     overshoot: np.ndarray
     limits: np.ndarray
-    full_turns: int
+    turned: np.ndarray
     notes: tuple[str, ...]
 
 
@@ -970,5 +970,5 @@ def candidates(knowledge: Knowledge) -> Candidates:
             column="positioner",
             remedy="widen the limits in [positioner], or state backlash and ratio more closely in [rig.prior]",
         )
-    turns = int(np.sum(np.abs(looks.steps[:, 0] - box[0].mean()) >= 0.5 * turn))
-    return Candidates(looks, overshoot, limits, turns, tuple(notes))
+    away = np.abs(looks.steps[:, 0] - box[0].mean()) >= 0.5 * turn
+    return Candidates(looks, overshoot, limits, away, tuple(notes))

@@ -70,7 +70,6 @@ from tvsbayes.likelihood import (
     stop_information,
 )
 from tvsbayes.model import (
-    FULL_TURN_DEG,
     INDEX,
     NAMES,
     RIG_NAMES,
@@ -786,14 +785,11 @@ def _next(
 ) -> tuple[Batch, ...]:
     """Four looks at every sheet, chosen from all candidates and from those a full turn away, by gain per minute."""
     search = _search(knowledge, seen, at_centre.gradient, at_centre.own_variance, "c")
-    middle = np.median(found.looks.steps[:, 0])
-    turn = 0.5 * FULL_TURN_DEG / abs(physical_at(knowledge.z, knowledge.space).value[INDEX["degrees_per_step.pan"]])
-    away = np.abs(found.looks.steps[:, 0] - middle) >= turn
     batches = []
     for number in range(len(knowledge.sheets)):
         for turned in (False, True):
-            here = (found.looks.sheet == number) & (away if turned else np.ones_like(away))
-            if not here.any() or (turned and not away.any()):
+            here = (found.looks.sheet == number) & (found.turned | (not turned))
+            if not here.any():
                 continue
             part = replace(search, rows=np.where(here[:, None, None], search.rows, 0.0))
             picks = np.array(part.greedy(LOOKS_PER_EXPERIMENT))
