@@ -859,8 +859,8 @@ FAULTS = (
     Fault(
         "time model: seconds per hour",
         "design.py",
-        "for step in steps) / 60",
-        "for step in steps) / 3600",
+        "plan_seconds(rig, steps) / 60",
+        "plan_seconds(rig, steps) / 3600",
         "minutes are hours",
         ("plan_parts",),
     ),
@@ -918,8 +918,8 @@ FAULTS = (
     Fault(
         "exchanged design kept where it is worse",
         "planning.py",
-        "merit(values) > merit(plain) else",
-        "merit(values) < merit(plain) else",
+        "merit(other) > merit(plain) else",
+        "merit(other) < merit(plain) else",
         "the plan is the worse of two",
         ("planning.py::test_exchanges_are_kept_where_they_raise_assurance_or_lower_the_median",),
         survived="planted by a reviewer: no test compared the design with the one before its exchanges.",

@@ -474,7 +474,7 @@ def test_next_looks_are_worth_what_they_say_here_and_a_full_turn_away(wide):
     assert turned and len(turned) < len(batches)
     for batch in batches:
         log = run_plan(batch.actions, wide, simulation.HOME_APPROACH)
-        pan = [log.moves[move].pan_steps for _, move, _ in log.looks]
+        pan = [log.moves[look.move].pan_steps for look in log.looks]
         assert len(pan) == LOOKS_PER_EXPERIMENT
         assert min(pan) > 3000 or batch not in turned
         # The text names the looks' own counters.
@@ -535,7 +535,7 @@ def test_a_search_after_data_knows_no_home_offset(knowledge, found, seen):
 
 @pytest.fixture(scope="module")
 def refine(knowledge, found, seen):
-    """(first choice, limit, minutes) -> reported values of that choice, and the refined family with its own."""
+    """(first choice, limit, minutes) -> reported values of that choice, and what became of it."""
 
     def run(picks, limit, minutes=None):
         target = replace(parse_target("u(left) <= 1 deg/step"), limit=limit)
@@ -556,21 +556,22 @@ def poor(found):
 
 
 def test_exchanges_are_kept_where_they_raise_assurance_or_lower_the_median(refine, poor):
-    plain, (family, values) = refine(poor, 1e-9)
-    assert np.median(values) < 0.9 * np.median(plain) and not np.array_equal(family.picks, poor)
+    plain, refined = refine(poor, 1e-9)
+    values = refined.reported
+    assert np.median(values) < 0.9 * np.median(plain) and not np.array_equal(refined.family.picks, poor)
     between = 0.5 * (np.median(values) + plain.min())
     assert np.mean(plain <= between) < np.mean(values <= between)
-    assert np.array_equal(refine(poor, between)[1][1], values)
+    assert np.array_equal(refine(poor, between)[1].reported, values)
 
 
 def test_exchanges_that_cost_assurance_or_time_are_not_kept(refine, poor, monkeypatch):
-    _, (better, values) = refine(poor, 1e-9)
-    plain, (family, kept) = refine(poor, 1e-9, minutes=0.0)
-    assert np.array_equal(family.picks, poor) and np.array_equal(kept, plain)
+    better = refine(poor, 1e-9)[1]
+    plain, late = refine(poor, 1e-9, minutes=0.0)
+    assert np.array_equal(late.family.picks, poor) and np.array_equal(late.reported, plain)
     monkeypatch.setattr(Search, "exchange", lambda self, picks: list(poor))
-    plain, (family, kept) = refine(better.picks, 1e-9)
-    assert np.array_equal(family.picks, better.picks)
-    assert np.array_equal(kept, plain) and np.array_equal(kept, values)
+    plain, kept = refine(better.family.picks, 1e-9)
+    assert np.array_equal(kept.family.picks, better.family.picks)
+    assert np.array_equal(kept.reported, plain) and np.array_equal(plain, better.reported)
 
 
 # The plan.
@@ -868,7 +869,7 @@ def test_moves_of_a_plan_are_those_the_twin_makes_of_it(mounted_rig, knowledge):
     log = run_plan(paper_protocol(1), mounted_rig, ("left", "up"))
     information = information_of(paper_protocol(1), knowledge)
     assert information.moves == tuple(log.moves)
-    assert information.look_moves == tuple(look[1] for look in log.looks)
+    assert information.look_moves == tuple(look.move for look in log.looks)
 
 
 # Commands.
