@@ -512,8 +512,8 @@ FAULTS = (
     Fault(
         "focal part of the uncertainty doubled",
         "classic.py",
-        "variance += float((ahead - behind) / 0.2) ** 2",
-        "variance += float((ahead - behind) / 0.1) ** 2",
+        "0.1 * focal_scale_u) * focal_scale_u) ** 2",
+        "0.1 * focal_scale_u) * 2 * focal_scale_u) ** 2",
         "type B uncertainty of the focal scale twice as large",
         ("classic",),
     ),
@@ -703,8 +703,8 @@ FAULTS = (
     Fault(
         "closed form of `locate`: the other root",
         "calibration.py",
-        "reach = reach / (cos_b * root - (",
-        "reach = reach / (-cos_b * root - (",
+        "closing = cos_b * root - (",
+        "closing = -cos_b * root - (",
         "the robot sees points behind itself",
         ("calibration",),
     ),
