@@ -7,16 +7,20 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
 import pytest
 from conftest import dozen_plan
+from scipy import optimize
 
 from tvsbayes import design, planning, simulation
 from tvsbayes.campaign import PlanStep, four_point_protocol, grid_protocol, paper_protocol, read_plan, write_plan
+from tvsbayes.classic import DIRECTIONS
 from tvsbayes.design import (
+    LOOKS_PER_EXPERIMENT,
     NOISE_COLUMNS,
     PARAMETERS,
     QUANTITIES,
@@ -333,6 +337,54 @@ def test_a_point_has_its_own_uncertainty(knowledge):
     assert at.value(knowledge.covariance) > 10 * expected_mm
 
 
+@pytest.mark.parametrize("convention", ["in-plane", "azimuth"])
+def test_stops_and_reading_at_a_point_are_those_of_the_twins_optics(mounted_rig, convention):
+    """Beam and aperture of the twin, each angle moved by its sd: x, y and z by finite differences, axis by axis."""
+    point_mm = (900.0, 50.0, 250.0)
+    stops = {f"stop_sd_deg.{d}": Prior(sd, 1.0, "log-normal") for d, sd in zip(DIRECTIONS, (3, 5, 4, 7), strict=True)}
+    rig = with_priors(mounted_rig, **{name: replace(p, value=0.01 * p.value) for name, p in stops.items()})
+    table = replace(rig.table, aperture_convention=convention)
+    known = prior_knowledge(replace(rig, table=table))
+    values = {name: prior.value for name, prior in table.priors.items()}
+    base_mm, reading_deg = values["baseline_mm"], float(simulation.aperture_angle_deg(point_mm, 200.0, convention))
+
+    def ray(angles_rad: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        origin, direction = simulation.mirror_chain(*angles_rad, values)
+        ends = simulation.to_tvs(np.stack([origin, origin + direction]), base_mm, values["pan_zero_emission_deg"])
+        return ends[0], ends[1] - ends[0]
+
+    def passes(angles_rad: np.ndarray) -> np.ndarray:
+        origin, direction = ray(angles_rad)
+        return np.cross(direction, np.array(point_mm) - origin)[1:]
+
+    aimed = optimize.fsolve(passes, np.radians([0.0, 10.0]), xtol=1e-13)
+
+    def seen_at(pan_deg: float, tilt_deg: float, aperture_deg: float) -> np.ndarray:
+        """Where beam and reading meet, frame T, mm."""
+        origin, direction = ray(aimed + np.radians([pan_deg, tilt_deg]))
+
+        def excess_deg(reach_mm: float) -> float:
+            found = simulation.aperture_angle_deg(origin + reach_mm * direction, base_mm, convention)
+            return float(found) - reading_deg - aperture_deg
+
+        return origin + optimize.brentq(excess_deg, 500.0, 2000.0, xtol=1e-10) * direction
+
+    assert seen_at(0, 0, 0) == pytest.approx(point_mm, abs=1e-6)
+    # Central differences: the step moves the point by 3e-4 of its distance, the third derivative by its square.
+    step_deg = 0.01
+    moved = np.array([(seen_at(*step) - seen_at(*-step)) / (2 * step_deg) for step in step_deg * np.eye(3)])
+    # By default a point is reached left and up.
+    stop_mm2 = (moved[0] * 0.03) ** 2 + (moved[1] * 0.04) ** 2
+    reading_mm2 = (moved[2] * values["aperture_sd_deg"]) ** 2
+    target = parse_target("u(xyz) at 900,50,250 mm <= 1 mm")
+    at = sensitivity(target, known.z, known.space, table, np.zeros(2))
+    # The machine stands at whole counters, up to half a step beside the point.
+    half_step_rad = math.radians(values["degrees_per_step.tilt"]) / 2
+    for cause, variance_mm2 in zip(design.AT_POINT, (stop_mm2, reading_mm2), strict=True):
+        assert at.own[cause] == pytest.approx(variance_mm2, abs=half_step_rad * variance_mm2.max()), cause
+    assert (moved[1] * 0.04)[2] ** 2 > 0.1 * stop_mm2[2], "tilt counts, or it could be left out"
+
+
 # Search.
 
 
@@ -401,16 +453,48 @@ def test_every_look_is_reached_from_its_side(found, knowledge):
     assert row == len(found.looks)
 
 
+@pytest.fixture(scope="module")
+def wide(mounted_rig):
+    """A rig that can look at everything again a full turn away, and knows its ratio well enough to find it."""
+    limits = {"pan_min_steps": -200, "pan_max_steps": 6400, "tilt_min_steps": -130, "tilt_max_steps": 130}
+    return with_priors(replace(mounted_rig, positioner=limits), degrees_per_step__pan=Prior(0.06, 1e-5))
+
+
+def test_next_looks_are_worth_what_they_say_here_and_a_full_turn_away(wide):
+    """As many looks a turn away as here: 6000 steps of 0.06 deg. Gains are those of the plan judged move by move."""
+    known = prior_knowledge(wide)
+    found = candidates(known)
+    seen = LookArrays(found.looks, known, False).at(known.z, known.space)
+    target = parse_target("u(left) <= 1e-5 deg/step")
+    pose = seen.mirror_angles_rad.mean(axis=0)
+    at = sensitivity(target, known.z, known.space, wide.table, pose)
+    now = at.value(known.covariance)
+    batches = planning._next(known, found, seen, target, at, now)
+    turned = [batch for batch in batches if batch.text.startswith("a full turn of pan away, ")]
+    assert turned and len(turned) < len(batches)
+    for batch in batches:
+        log = run_plan(batch.actions, wide, simulation.HOME_APPROACH)
+        pan = [log.moves[look.move].pan_steps for look in log.looks]
+        assert len(pan) == LOOKS_PER_EXPERIMENT
+        assert min(pan) > 3000 or batch not in turned
+        # The text names the looks' own counters.
+        assert all(f"({steps}, " in batch.text for steps in pan)
+        judged = planning.judged("", batch.actions, known, target, False, pose)
+        assert batch.gain == pytest.approx(now - judged.joint, rel=1e-6)
+        assert batch.minutes == judged.minutes and batch.gain_per_minute == batch.gain / batch.minutes
+
+
 def test_a_full_turn_waits_until_the_ratio_is_known(mounted_rig):
     """Two stops over 360 deg hold k to a stop error over 6000 steps, whatever the cameras; once the spot is found."""
     limits = {"pan_min_steps": -100, "pan_max_steps": 6100, "tilt_min_steps": -130, "tilt_max_steps": 130}
     wide = replace(mounted_rig, positioner=limits)
     unknown = candidates(prior_knowledge(wide))
-    assert unknown.full_turns == 0
+    assert not unknown.turned.any()
     assert "not yet known well enough" in " ".join(unknown.notes)
     sharp = prior_knowledge(with_priors(wide, degrees_per_step__pan=Prior(0.06, 1e-5)))
     turned = candidates(sharp)
-    assert turned.full_turns > 0 and turned.looks.steps.max() <= 6100
+    assert np.array_equal(turned.turned, turned.looks.steps[:, 0] > 3000)
+    assert turned.turned.any() and turned.looks.steps.max() <= 6100
     vague = prior_knowledge(with_priors(wide, degrees_per_step__pan=Prior(0.06, 1e-3)))
     away = np.flatnonzero(turned.looks.steps[:, 0] > 3000)[:2]
     twins = turned.looks.steps[away] - np.array([6000, 0])
@@ -431,6 +515,63 @@ def test_a_full_turn_waits_until_the_ratio_is_known(mounted_rig):
     assert k < 2 * stop_deg / 6000
     at = sensitivity(ratio, vague.z, vague.space, vague.rig.table, information.pose_rad)
     assert at.value(covariance) > 10 * k, "the slope of the beam still hangs on the mirrors"
+
+
+def test_a_search_after_data_knows_no_home_offset(knowledge, found, seen):
+    """Offsets of the new session are two columns with the variance of homing: eliminated, they leave the exact sum."""
+    known = replace(knowledge, after_data=True)
+    rows = seen.rows.copy()
+    rows[..., design.CONTRAST_COLUMNS] = 0
+    shown, picks = replace(seen, rows=rows), np.arange(6)
+    wide, precision = planning._rows_for_search(shown, known)
+    whole = covariance_of(precision + np.einsum("mij,mik->jk", wide[picks], wide[picks]))[:PARAMETERS, :PARAMETERS]
+    exact = information_of_looks(shown, picks, np.zeros((6, 2)), knowledge.space, True)
+    contrasts = np.isin(np.arange(PARAMETERS), design.CONTRAST_COLUMNS)
+    expected = covariance_of(known.precision + exact + planning.KNOWN * np.diag(contrasts))
+    assert whole == pytest.approx(expected, rel=ROUNDING, abs=ROUNDING * expected.max())
+    without = information_of_looks(shown, picks, np.zeros((6, 2)), knowledge.space, False)
+    assert np.abs(without - exact).max() > 1e-3 * np.abs(exact).max(), "offsets count, or they could be left out"
+
+
+@pytest.fixture(scope="module")
+def refine(knowledge, found, seen):
+    """(first choice, limit, minutes) -> reported values of that choice, and what became of it."""
+
+    def run(picks, limit, minutes=None):
+        target = replace(parse_target("u(left) <= 1 deg/step"), limit=limit)
+        family = planning.Family(knowledge, found, np.asarray(picks), False)
+        pose = seen.mirror_angles_rad.mean(axis=0)
+        at = sensitivity(target, knowledge.z, knowledge.space, knowledge.rig.table, pose)
+        assurance = planning.Assurance(family, target, 10, 3)
+        plain = assurance.values([2])[2]
+        return plain, planning._refined(family, seen, target, at, 2, "c", minutes, assurance)
+
+    return run
+
+
+@pytest.fixture(scope="module")
+def poor(found):
+    """Eight looks at one sheet, all at one place: they tell nothing of the ratio."""
+    return np.full(2 * LOOKS_PER_EXPERIMENT, np.flatnonzero(found.looks.sheet == 1)[0])
+
+
+def test_exchanges_are_kept_where_they_raise_assurance_or_lower_the_median(refine, poor):
+    plain, refined = refine(poor, 1e-9)
+    values = refined.reported
+    assert np.median(values) < 0.9 * np.median(plain) and not np.array_equal(refined.family.picks, poor)
+    between = 0.5 * (np.median(values) + plain.min())
+    assert np.mean(plain <= between) < np.mean(values <= between)
+    assert np.array_equal(refine(poor, between)[1].reported, values)
+
+
+def test_exchanges_that_cost_assurance_or_time_are_not_kept(refine, poor, monkeypatch):
+    better = refine(poor, 1e-9)[1]
+    plain, late = refine(poor, 1e-9, minutes=0.0)
+    assert np.array_equal(late.family.picks, poor) and np.array_equal(late.reported, plain)
+    monkeypatch.setattr(Search, "exchange", lambda self, picks: list(poor))
+    plain, kept = refine(better.family.picks, 1e-9)
+    assert np.array_equal(kept.family.picks, better.family.picks)
+    assert np.array_equal(kept.reported, plain) and np.array_equal(plain, better.reported)
 
 
 # The plan.
@@ -510,20 +651,46 @@ def test_gain_per_minute_falls_in_order(result):
     assert all(b.gain_per_minute == pytest.approx(b.gain / b.minutes) for b in result.next)
 
 
-def test_a_target_below_the_floor_names_the_term_and_what_would_do(knowledge, found, seen):
-    """With exact cameras of unknown focal scale and one depth the scale limits everything, and its cure is enough."""
-    target = parse_target("u(left) <= 4e-5 deg/step")
-    picks = np.arange(len(found.looks))
-    path = arrange(found.looks, knowledge.sheets, found.overshoot).path
-    information = information_of_looks(seen, picks, path, knowledge.space, False)
-    at = sensitivity(target, knowledge.z, knowledge.space, knowledge.rig.table, np.zeros(2))
-    reachable = limit_of(knowledge, information, at, replace(target, limit=1.0))
+def test_a_target_below_the_floor_names_the_term_and_what_would_do(mounted_rig):
+    """Exact cameras of unknown focal scale, known mechanics, one depth: the scale limits, and its cure is enough.
+
+    4 degrees of pan, seen to a pixel, are too few to tell the scale from the ratio.
+    """
+    free = ("degrees_per_step", "backlash", "stop_sd", "pixel_scale", "focal_scale")
+    priors = mounted_rig.table.priors
+    held = {name: replace(prior, u=0.0) for name, prior in priors.items() if not name.startswith(free)}
+    exact = replace(mounted_rig.stereo, parameter_covariance=np.zeros_like(mounted_rig.stereo.parameter_covariance))
+    small = {f"backlash_deg.{axis}": Prior(0.0, 0.05, "half-normal") for axis in ("pan", "tilt")}
+    rig = replace(
+        with_priors(mounted_rig, **held, **small),
+        stereo=exact,
+        sheets_mm={"d2": 275.0},
+        positioner={"pan_min_steps": 270, "pan_max_steps": 330, "tilt_min_steps": -50, "tilt_max_steps": 50},
+        cameras={**mounted_rig.cameras, "spot_sd_px": 1.0},
+    )
+    looks = candidates(prior_knowledge(rig)).looks
+    once = np.linspace(0, len(looks) - 1, 2 * LOOKS_PER_EXPERIMENT).astype(int)
+
+    def limit(focal_scale_u: float, limit: float) -> Limit:
+        known = prior_knowledge(with_priors(rig, focal_scale=Prior(1.0, focal_scale_u)))
+        shown = LookArrays(looks, known, False).at(known.z, known.space)
+        path = np.zeros((len(once), 2))
+        information = information_of_looks(shown, once, path, known.space, False)
+        target = replace(parse_target("u(left) <= 1 deg/step"), limit=limit)
+        at = sensitivity(target, known.z, known.space, known.rig.table, shown.mirror_angles_rad.mean(axis=0))
+        return limit_of(known, information, at, target)
+
+    reachable = limit(0.002, 1.0)
     assert reachable.reachable and reachable.needed is None
     assert sum(reachable.shares.values()) == pytest.approx(1.0, abs=1e-6)
-    limit = limit_of(knowledge, information, at, replace(target, limit=0.5 * reachable.floor))
-    assert not limit.reachable
-    assert limit.cause == next(iter(limit.shares))
-    assert "it would do to know" in limit.needed
+    wanted = 0.8 * reachable.floor
+    short = limit(0.002, wanted)
+    assert not short.reachable and short.cause == "focal scale" and short.floor == reachable.floor
+    needed = re.fullmatch(r"it would do to know u\(focal_scale\) = (\S+) instead of 0\.002", short.needed)
+    assert limit(float(needed[1]), wanted).floor <= wanted
+    # Two digits rounded down: the next number is too large.
+    last = 10.0 ** (math.floor(math.log10(float(needed[1]))) - 1)
+    assert not limit(float(needed[1]) + last, wanted).reachable
 
 
 def test_no_calibration_removes_the_stop_at_the_point(knowledge, seen, found):
@@ -702,7 +869,7 @@ def test_moves_of_a_plan_are_those_the_twin_makes_of_it(mounted_rig, knowledge):
     log = run_plan(paper_protocol(1), mounted_rig, ("left", "up"))
     information = information_of(paper_protocol(1), knowledge)
     assert information.moves == tuple(log.moves)
-    assert information.look_moves == tuple(look[1] for look in log.looks)
+    assert information.look_moves == tuple(look.move for look in log.looks)
 
 
 # Commands.

@@ -23,10 +23,16 @@ DENSE = 1e-8
 PARAMETERS = 5
 
 
+def stop_of_looks(stops: int = 7) -> np.ndarray:
+    """Stop of each look of `campaign`: one, two, three looks at a stop in turn, shape (n,)."""
+    return np.repeat(np.arange(stops), 1 + np.arange(stops) % 3)
+
+
 def campaign(seed: int = 1, stops: int = 7) -> LinearSpots:
     """Random loads and Jacobians in two segments; looks share stops, stop errors outlive moves of the other axis."""
     rng = np.random.default_rng(seed)
-    renewed, variance, move = [], [], []
+    renewed, variance = [], []
+    stop_of_look = stop_of_looks(stops)
     for stop in range(stops):
         segment = stop in (0, 4)
         row = np.zeros(6, bool)
@@ -35,20 +41,18 @@ def campaign(seed: int = 1, stops: int = 7) -> LinearSpots:
         row[2:] = segment
         # Home offsets only after the first segment; unknown play as unit states.
         values = np.array([*rng.uniform(0.5, 3.0, 2), *([0.4, 0.4] if stop >= 4 else [0.0, 0.0]), 1.0, 1.0])
-        for look in range(1 + stop % 3):
+        for look in range(np.sum(stop_of_look == stop)):
             renewed.append(row if look == 0 else np.zeros(6, bool))
             variance.append(values)
-            move.append(stop)
-    n = len(move)
+    n = len(stop_of_look)
     slope = 3.0 * rng.standard_normal((n, 4, 2))
-    play_sd = np.where(np.array(move) >= 4, rng.uniform(0.1, 0.5, n), 0.0)
+    play_sd = np.where(stop_of_look >= 4, rng.uniform(0.1, 0.5, n), 0.0)
     return LinearSpots(
         residual=2.0 * rng.standard_normal((n, 4)),
         load=np.concatenate([slope, slope, slope * play_sd[:, None, None]], axis=2),
         renewed=np.array(renewed),
         variance=np.array(variance),
         jacobian=rng.standard_normal((n, 4, PARAMETERS)),
-        move=np.array(move),
     )
 
 
@@ -77,8 +81,9 @@ def test_groups_hold_the_dense_quantities(seed):
     jacobian = spots.jacobian.reshape(-1, PARAMETERS)
     information = stop_information(spots)
     np.testing.assert_allclose(information.fisher, jacobian.T @ precision @ jacobian, rtol=DENSE, atol=DENSE)
+    stops = stop_of_looks()
     assert [g.rows for g in information.groups] == [
-        slice(*(np.flatnonzero(spots.move == m)[[0, -1]] + [0, 1])) for m in np.unique(spots.move)
+        slice(*(np.flatnonzero(stops == stop)[[0, -1]] + [0, 1])) for stop in np.unique(stops)
     ]
     for group in information.groups:
         rows = rows_of(group.rows)
@@ -138,7 +143,7 @@ def test_sd_is_infinite_where_nothing_else_informs():
     """One stop alone informs a parameter that has no prior."""
     spots = campaign(stops=2)
     jacobian = np.zeros_like(spots.jacobian[..., :1])
-    jacobian[spots.move == 1] = 1.0
+    jacobian[stop_of_looks(2) == 1] = 1.0
     spots = replace(spots, jacobian=jacobian)
     information = stop_information(spots)
     found = standard_deviations_without(information.groups[1], np.linalg.inv(information.fisher), np.ones((1, 1)))
@@ -154,11 +159,11 @@ def test_outlier_of_a_stop_is_blamed_on_its_spot(seed, blamed):
     """
     spots = campaign(seed)
     rng = np.random.default_rng(100 + seed)
-    states = rng.standard_normal((len(spots.move), 6)) * np.sqrt(spots.variance)
-    last = np.maximum.accumulate(np.where(spots.renewed, np.arange(len(spots.move))[:, None], 0), axis=0)
+    states = rng.standard_normal(spots.variance.shape) * np.sqrt(spots.variance)
+    last = np.maximum.accumulate(np.where(spots.renewed, np.arange(len(states))[:, None], 0), axis=0)
     held = np.take_along_axis(states, last, axis=0)
-    clean = np.einsum("nks,ns->nk", spots.load, held) + rng.standard_normal((len(spots.move), 4))
-    pair = np.flatnonzero(spots.move == 1)
+    clean = np.einsum("nks,ns->nk", spots.load, held) + rng.standard_normal(spots.residual.shape)
+    pair = np.flatnonzero(stop_of_looks() == 1)
     assert len(pair) == 2
     direction = rng.standard_normal(4)
     direction /= np.linalg.norm(direction)

@@ -28,6 +28,7 @@ from jaxtyping import Array, Bool, Float
 from tvsbayes.calibration import INPUT_NAMES, NORMAL_95, Calibration
 from tvsbayes.calibration import NOISE_NAMES as CALIBRATION_NOISE
 from tvsbayes.campaign import (
+    APPROACH_SIGN,
     GRID_PAN_STEPS,
     GRID_TILT_STEPS,
     OVERSHOOT_STEPS,
@@ -63,9 +64,9 @@ from tvsbayes.model import (
 )
 from tvsbayes.rigs import HOME_SD_DEG, Rig, RigTable
 from tvsbayes.simulation import (
-    COST_KEYS,
     HOME_APPROACH,
     PlanLog,
+    plan_seconds,
     run_plan,
 )
 
@@ -247,7 +248,7 @@ def _design_arrays(
     new = redraws(tuple(replace(m, segment=0) for m in moves), spots)
     homed = new.new_segment & (np.array([moves[m].segment for m in look_moves]) >= homed_from)
     steps = [(m.pan_steps, m.tilt_steps) for m in moves]
-    sides = [(_SIDE.get(m.pan_approach, 0), _SIDE.get(m.tilt_approach, 0)) for m in moves]
+    sides = [(APPROACH_SIGN.get(m.pan_approach, 0), APPROACH_SIGN.get(m.tilt_approach, 0)) for m in moves]
     long = 2 * size
     return CampaignArrays(
         MoveArrays(
@@ -271,9 +272,6 @@ def _design_arrays(
         ),
         jnp.asarray(rig.table.aperture_convention == "azimuth"),
     )
-
-
-_SIDE = {"left": 1, "up": 1, "right": -1, "down": -1}
 
 
 def _unseen(number: int, move: int) -> Spot:
@@ -315,7 +313,7 @@ class PlanInformation:
 
 def plan_minutes(steps: Sequence[PlanStep], rig: Rig) -> float:
     """Duration of a plan by `[costs]`, minutes."""
-    return sum(float(rig.costs_s.get(COST_KEYS[step.action], 0.0)) for step in steps) / 60
+    return plan_seconds(rig, steps) / 60
 
 
 def _logged(steps: Sequence[PlanStep], rig: Rig) -> PlanLog:
@@ -348,8 +346,8 @@ def information_of(
     """
     rig = knowledge.rig
     log = _logged(steps, rig)
-    look_moves = tuple(move for _, move, _ in log.looks)
-    depth = np.array([rig.sheets_mm[log.targets[placement]] for *_, placement in log.looks])
+    look_moves = tuple(look.move for look in log.looks)
+    depth = np.array([rig.sheets_mm[log.targets[look.placement]] for look in log.looks])
     with jax.enable_x64(True):
         arrays = _design_arrays(
             log.moves, look_moves, rig, homed_from=0 if knowledge.after_data else 1, aperture=aperture
@@ -773,16 +771,16 @@ class Search:
         gain = np.swapaxes(moved, 1, 2) @ np.linalg.solve(inner, moved)
         return scores(self._quantities(covariance) - gain, self.reference, self.criterion)
 
-    def _with(self, covariance: np.ndarray, look: int, sign: int = 1) -> np.ndarray:
-        """Covariance with one look more (+1) or less (-1)."""
+    def _with(self, covariance: np.ndarray, look: int) -> np.ndarray:
+        """Covariance with one look more."""
         row = self.rows[look]
         spread = row @ covariance
-        updated = covariance - sign * spread.T @ np.linalg.solve(np.eye(4) + sign * spread @ row.T, spread)
+        updated = covariance - spread.T @ np.linalg.solve(np.eye(4) + spread @ row.T, spread)
         return 0.5 * (updated + updated.T)
 
-    def greedy(self, count: int, covariance: np.ndarray | None = None) -> list[int]:
+    def greedy(self, count: int) -> list[int]:
         """The best look, then the best beside it, and so on."""
-        covariance, picks = self.covariance if covariance is None else covariance, []
+        covariance, picks = self.covariance, []
         for _ in range(count):
             picks.append(int(np.argmin(self.after_one_more(covariance))))
             covariance = self._with(covariance, picks[-1])
@@ -833,33 +831,41 @@ class Candidates:
         looks: candidates.
         overshoot: run-up (pan, tilt), steps.
         limits: lowest and highest counter of (pan, tilt), shape (2, 2).
-        full_turns: number of candidates that lie a full turn away.
+        turned: whether each of them lies a full turn of pan away, shape (m,).
         notes: sentences on what was left out and why.
     """
 
     looks: Looks
     overshoot: np.ndarray
     limits: np.ndarray
-    full_turns: int
+    turned: np.ndarray
     notes: tuple[str, ...]
 
 
-def counter_limits(rig: Rig) -> tuple[np.ndarray, list[str]]:
+@dataclass(frozen=True)
+class CounterLimits:
     """Lowest and highest counter of (pan, tilt), shape (2, 2), and a note where the rig states none."""
+
+    steps: np.ndarray
+    notes: tuple[str, ...]
+
+
+def counter_limits(rig: Rig) -> CounterLimits:
+    """Limits of the rig file, or else those of the grid protocol."""
     limits, missing = [], []
     for axis in ("pan", "tilt"):
         keys = f"{axis}_min_steps", f"{axis}_max_steps"
         stated = [rig.positioner.get(key) for key in keys]
         missing += [key for key, value in zip(keys, stated, strict=True) if value is None]
         limits.append([d if s is None else s for s, d in zip(stated, UNSTATED_STEPS[axis], strict=True)])
-    notes = []
-    if missing:
-        notes.append(
-            f"[positioner] does not state {', '.join(missing)}: counters stay within pan "
-            f"{limits[0][0]} to {limits[0][1]}, tilt {limits[1][0]} to {limits[1][1]}; wider limits would allow longer "
-            "travel, and full turns"
-        )
-    return np.array(limits), notes
+    if not missing:
+        return CounterLimits(np.array(limits), ())
+    note = (
+        f"[positioner] does not state {', '.join(missing)}: counters stay within pan "
+        f"{limits[0][0]} to {limits[0][1]}, tilt {limits[1][0]} to {limits[1][1]}; wider limits would allow longer "
+        "travel, and full turns"
+    )
+    return CounterLimits(np.array(limits), (note,))
 
 
 def draws_of(knowledge: Knowledge, count: int, generator: np.random.Generator) -> np.ndarray:
@@ -907,7 +913,8 @@ def candidates(knowledge: Knowledge) -> Candidates:
         raise InputError(
             "no-sheet", "the rig has no sheets to look at", file="rig.toml", column="sheets", remedy=remedy
         )
-    limits, notes = counter_limits(rig)
+    stated = counter_limits(rig)
+    limits, notes = stated.steps, list(stated.notes)
     physical = physical_at(knowledge.z, knowledge.space).value
     overshoot = overshoot_steps(knowledge)
     ratio = physical[[INDEX["degrees_per_step.pan"], INDEX["degrees_per_step.tilt"]]]
@@ -970,5 +977,5 @@ def candidates(knowledge: Knowledge) -> Candidates:
             column="positioner",
             remedy="widen the limits in [positioner], or state backlash and ratio more closely in [rig.prior]",
         )
-    turns = int(np.sum(np.abs(looks.steps[:, 0] - box[0].mean()) >= 0.5 * turn))
-    return Candidates(looks, overshoot, limits, turns, tuple(notes))
+    away = np.abs(looks.steps[:, 0] - box[0].mean()) >= 0.5 * turn
+    return Candidates(looks, overshoot, limits, away, tuple(notes))

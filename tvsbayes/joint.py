@@ -543,7 +543,6 @@ def linear_spots(lin: Linearised, arrays: CampaignArrays, jacobian: np.ndarray) 
         renewed=np.concatenate([spots.redraw, segment, segment], axis=1),
         variance=np.concatenate([lin.stop_variance, home_variance, np.ones((count, 2))], axis=1),
         jacobian=jacobian,
-        move=spots.move_index,
     )
 
 

@@ -563,7 +563,6 @@ class LinearSpots:
         renewed: states drawn anew since the previous spot, shape (n, 6).
         variance: their variances, shape (n, 6).
         jacobian: -d(residual)/d(coordinates), shape (n, 4, p).
-        move: move of each spot, shape (n,).
     """
 
     residual: np.ndarray
@@ -571,7 +570,6 @@ class LinearSpots:
     renewed: np.ndarray
     variance: np.ndarray
     jacobian: np.ndarray
-    move: np.ndarray
 
 
 @dataclass(frozen=True)

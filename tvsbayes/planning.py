@@ -70,7 +70,6 @@ from tvsbayes.likelihood import (
     stop_information,
 )
 from tvsbayes.model import (
-    FULL_TURN_DEG,
     INDEX,
     NAMES,
     RIG_NAMES,
@@ -237,7 +236,9 @@ class Assurance:
         self._values |= found
         return {n: self._values[n] for n in sizes}
 
-    def _reported(self, truth, noise, seen: Seen, at_truth: Sensitivity, n: int, design: Arranged) -> float:
+    def _reported(
+        self, truth: DrawnTruth, noise: np.ndarray, seen: Seen, at_truth: Sensitivity, n: int, design: Arranged
+    ) -> float:
         knowledge, chosen = self.family.knowledge, self.index[: LOOKS_PER_EXPERIMENT * n]
 
         def covariance(scene: Seen) -> np.ndarray:
@@ -487,7 +488,7 @@ class PlanResult:
     def as_json(self) -> dict[str, object]:
         """The document of `plan --json` (DESIGN 8)."""
 
-        def plain(value):
+        def plain(value: object) -> object:
             if isinstance(value, float):
                 return value if math.isfinite(value) else None
             if isinstance(value, PlanStep):
@@ -641,12 +642,19 @@ def split_of(knowledge: Knowledge, data: np.ndarray, noise: np.ndarray | None, f
     return dict(sorted(kept.items(), key=lambda item: -item[1]))
 
 
+def _at_most(value: float) -> str:
+    """A positive number to two digits, rounded down: an uncertainty that is enough, stated so that it stays enough."""
+    last = 10.0 ** (math.floor(math.log10(value)) - 1)
+    # A number that has two digits already may stand an ulp below them.
+    return f"{last * math.floor(value / last + 1e-9):.2g}"
+
+
 def _state(table: RigTable, columns: Sequence[int], share: float) -> str:
     """The stated u of a prior, and what it would have to be."""
     if len(columns) == len(NAMES) - len(RIG_NAMES):
-        return f"the stereo calibration to {100 * share:.2g} % of its present uncertainty"
-    names = [NAMES[c] for c in columns if table.priors[NAMES[c]].u > 0]
-    return " and ".join(f"u({n}) = {share * table.priors[n].u:.2g} instead of {table.priors[n].u:.2g}" for n in names)
+        return f"the stereo calibration to {_at_most(100 * share)} % of its present uncertainty"
+    stated = {NAMES[c]: table.priors[NAMES[c]].u for c in columns if table.priors[NAMES[c]].u > 0}
+    return " and ".join(f"u({name}) = {_at_most(share * u)} instead of {u:.2g}" for name, u in stated.items())
 
 
 def limit_of(knowledge: Knowledge, data: np.ndarray, found: Sensitivity, target: Target) -> Limit:
@@ -779,14 +787,11 @@ def _next(
 ) -> tuple[Batch, ...]:
     """Four looks at every sheet, chosen from all candidates and from those a full turn away, by gain per minute."""
     search = _search(knowledge, seen, at_centre.gradient, at_centre.own_variance, "c")
-    middle = np.median(found.looks.steps[:, 0])
-    turn = 0.5 * FULL_TURN_DEG / abs(physical_at(knowledge.z, knowledge.space).value[INDEX["degrees_per_step.pan"]])
-    away = np.abs(found.looks.steps[:, 0] - middle) >= turn
     batches = []
     for number in range(len(knowledge.sheets)):
         for turned in (False, True):
-            here = (found.looks.sheet == number) & (away if turned else np.ones_like(away))
-            if not here.any() or (turned and not away.any()):
+            here = (found.looks.sheet == number) & (found.turned | (not turned))
+            if not here.any():
                 continue
             part = replace(search, rows=np.where(here[:, None, None], search.rows, 0.0))
             picks = np.array(part.greedy(LOOKS_PER_EXPERIMENT))
@@ -829,7 +834,7 @@ def stop_now(now: float, target: Target, limit: Limit, batches: Sequence[Batch],
 
 
 def _classic_answer(
-    knowledge: Knowledge, target: Target, forecast: ClassicForecast | None, campaign: Campaign | None
+    target: Target, forecast: ClassicForecast | None, campaign: Campaign | None
 ) -> ClassicAnswer | None:
     """N = (t s / E)^2 with the uncertainty of s: over instruments, or by chi-square where s was measured."""
     if forecast is None or not set(target.indices) <= {0, 1, 2, 3} or target.point_mm is not None:
@@ -881,6 +886,14 @@ def _classic_value(forecast: ClassicForecast | None, target: Target, experiments
     return float(target.factor * np.median(u.max(axis=1)))
 
 
+@dataclass(frozen=True)
+class _Refined:
+    """A design, and the uncertainty of the target that its fits report over the truths, shape (draws,)."""
+
+    family: Family
+    reported: np.ndarray
+
+
 def _refined(
     family: Family,
     seen: Seen,
@@ -890,28 +903,28 @@ def _refined(
     criterion: str,
     minutes: float | None,
     assurance: Assurance,
-) -> tuple[Family, np.ndarray]:
-    """The design of n experiments after exchanges, with its reported values over the truths.
+) -> _Refined:
+    """The design of n experiments after exchanges.
 
     Exchanges suit the most probable instrument; they are kept only where they do not cost assurance or time.
     """
     knowledge, found = family.knowledge, family.found
-    greedy = replace(family, picks=family.picks[: LOOKS_PER_EXPERIMENT * experiments])
-    plain = assurance.values([experiments])[experiments]
+    picks = family.picks[: LOOKS_PER_EXPERIMENT * experiments]
+    plain = _Refined(replace(family, picks=picks), assurance.values([experiments])[experiments])
     if criterion != "c":
-        return greedy, plain
+        return plain
     search = _search(knowledge, seen, at_centre.gradient, at_centre.own_variance, criterion)
-    here = np.isin(found.looks.sheet, found.looks.sheet[greedy.picks])
+    here = np.isin(found.looks.sheet, found.looks.sheet[picks])
     part = replace(search, rows=np.where(here[:, None, None], search.rows, 0.0))
-    exchanged = replace(greedy, picks=np.array(part.exchange(greedy.picks)))
+    exchanged = replace(family, picks=np.array(part.exchange(picks)))
     if minutes is not None and plan_minutes(exchanged.arranged(experiments).steps, knowledge.rig) > minutes:
-        return greedy, plain
-    values = assurance.of(exchanged).values([experiments])[experiments]
+        return plain
+    other = _Refined(exchanged, assurance.of(exchanged).values([experiments])[experiments])
 
-    def merit(reported: np.ndarray) -> tuple[float, float]:
-        return float(np.mean(reported <= target.limit)), -float(np.median(reported))
+    def merit(of: _Refined) -> tuple[float, float]:
+        return float(np.mean(of.reported <= target.limit)), -float(np.median(of.reported))
 
-    return (exchanged, values) if merit(values) > merit(plain) else (greedy, plain)
+    return other if merit(other) > merit(plain) else plain
 
 
 def plan(
@@ -1051,11 +1064,12 @@ def plan_from(
     experiments = n95 or n80 or allowed[-1]
     forecast = classic_forecast(knowledge, assurance.truths)
     curve = _curve(assurance, forecast, durations, [*sizes, *(n for n in (n80, n95) if n)])
-    final, checked = _refined(family, seen, target, at_centre, experiments, criterion, minutes, assurance)
+    refined = _refined(family, seen, target, at_centre, experiments, criterion, minutes, assurance)
+    final = refined.family
     design = final.arranged(experiments)
     exact = information_of(design.steps, knowledge, aperture=aperture)
     chosen = judged("planned", design.steps, knowledge, target, aperture, pose_rad)
-    share = float(np.mean(checked <= target.limit))
+    share = float(np.mean(refined.reported <= target.limit))
     largest_design = family.arranged(family.largest)
     largest_information = information_of_looks(
         seen, family.picks, largest_design.path, knowledge.space, knowledge.after_data
@@ -1083,7 +1097,7 @@ def plan_from(
         baselines=(chosen, *_baselines(knowledge, target, aperture, pose_rad)),
         next=batches,
         stop=stop,
-        classic=_classic_answer(knowledge, target, forecast, campaign),
+        classic=_classic_answer(target, forecast, campaign),
         met=done or share >= ASSURED[0],
         notes=(*found.notes, *([] if done else few_stops(final.looks(experiments)))),
         draws=draws,
@@ -1092,7 +1106,7 @@ def plan_from(
     )
 
 
-def _linear_spots(found: Expectation, moves: Sequence[int]) -> LinearSpots:
+def _linear_spots(found: Expectation) -> LinearSpots:
     """Expected looks as the smoother takes them."""
     return LinearSpots(
         residual=np.zeros(found.jacobian.shape[:2]),
@@ -1100,13 +1114,12 @@ def _linear_spots(found: Expectation, moves: Sequence[int]) -> LinearSpots:
         renewed=found.keep == 0,
         variance=found.variance,
         jacobian=found.jacobian,
-        move=np.asarray(moves),
     )
 
 
 def _pixel_part(found: Expectation) -> np.ndarray:
     """What pixel noise alone contributes to the information, (C^-1 J)^T (C^-1 J), shape (p, p)."""
-    groups = stop_information(_linear_spots(found, range(len(found.seen)))).groups
+    groups = stop_information(_linear_spots(found)).groups
     gain = np.concatenate([group.jacobian for group in groups])
     return gain.T @ gain
 
@@ -1269,8 +1282,10 @@ def _judge(steps: Sequence[PlanStep], knowledge: Knowledge) -> _Judged:
     return _Judged(found, covariance, gradient, prior)
 
 
-def _extended(steps: Sequence[PlanStep], looks: Looks, sheets: Sequence[str], overshoot: np.ndarray):
-    """A plan with looks appended; no homing in between, and a placement only where another sheet is needed."""
+def _extended(
+    steps: Sequence[PlanStep], looks: Looks, sheets: Sequence[str], overshoot: np.ndarray
+) -> tuple[PlanStep, ...]:
+    """Steps that append looks to a plan: no homing in between, a placement only where another sheet is needed."""
     end = _standing(steps)
     more = [s for s in arrange(looks, sheets, overshoot, end.at).steps if s.action != "home"]
     if more and more[0].action == "place" and more[0].target == end.sheet:
@@ -1289,7 +1304,17 @@ def _fault_text(plan: _Judged, axis: str) -> str:
     return f"{axis} ratio and {axis} backlash cannot be told apart well ({share:.0f} % of the variance is common)"
 
 
-def _cure(steps: Sequence[PlanStep], knowledge: Knowledge, found: Candidates, axis: str, before: _Judged):
+@dataclass(frozen=True)
+class _Cure:
+    """Steps to append to a plan, and what it is then."""
+
+    addition: tuple[PlanStep, ...]
+    after: _Judged
+
+
+def _cure(
+    steps: Sequence[PlanStep], knowledge: Knowledge, found: Candidates, axis: str, before: _Judged
+) -> _Cure | None:
     """Fewest looks after which the axis is no longer faulty, on the sheet that stands; None if there are none."""
     seen = LookArrays(found.looks, knowledge, False).at(knowledge.z, knowledge.space)
     rows = before.rows(axis)
@@ -1304,7 +1329,7 @@ def _cure(steps: Sequence[PlanStep], knowledge: Knowledge, found: Candidates, ax
         addition = _extended(steps, found.looks[picks[:count]], knowledge.sheets, found.overshoot)
         after = _judge((*steps, *addition), knowledge)
         if not after.faulty(axis):
-            return addition, after
+            return _Cure(addition, after)
     return None
 
 
@@ -1358,13 +1383,12 @@ def check_plan(rig: Rig, steps: Sequence[PlanStep]) -> PlanCheck:
         cure = None if found is None else _cure(steps, knowledge, found, axis, judged_plan)
         before = judged_plan.u(axis)
         if cure is not None:
-            addition, after = cure
-            looks = sum(s.action == "look" for s in addition)
+            looks, after = sum(s.action == "look" for s in cure.addition), cure.after.u(axis)
             text += (
-                f"; smallest cure: {looks} more look{'s' * (looks != 1)}, {described(addition, steps)}: u of the "
-                f"{axis} ratio {before:.2g} -> {after.u(axis):.2g} deg/step"
+                f"; smallest cure: {looks} more look{'s' * (looks != 1)}, {described(cure.addition, steps)}: u of the "
+                f"{axis} ratio {before:.2g} -> {after:.2g} deg/step"
             )
-            faults.append(PlanFault(axis, text, addition, before, after.u(axis)))
+            faults.append(PlanFault(axis, text, cure.addition, before, after))
         else:
             text += f"; no {CURE_LOOKS} looks cure it on this rig" if found is not None else ""
             faults.append(PlanFault(axis, text, (), before, None))

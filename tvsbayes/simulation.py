@@ -43,6 +43,13 @@ SPOT_SD_PX = 0.08
 """Standard uncertainty stated for a spot centre where neither caller nor rig names one."""
 COST_KEYS = {"home": "move_s", "place": "placement_s", "move": "move_s", "look": "look_s"}
 """Entry of `[costs]` that each action of a plan takes; a homing counts as a move."""
+
+
+def plan_seconds(rig: Rig, plan: Iterable[PlanStep]) -> float:
+    """Duration of a plan by `[costs]`, s; what a rig that no file describes leaves unstated costs nothing."""
+    return sum(float(rig.costs_s.get(COST_KEYS[step.action], 0.0)) for step in plan)
+
+
 TRUTH_FORMAT = "tvsbayes-truth/1"
 HOME_APPROACH = ("left", "up")
 """Side from which homing ends, per axis, where the caller names none."""
@@ -423,17 +430,26 @@ def with_derived(parameters: Mapping[str, float]) -> dict[str, float]:
     return result
 
 
+@dataclass(frozen=True)
+class PlannedLook:
+    """A look of a plan: its step, the number of the move it follows, and the number of the placement it looks at."""
+
+    step: PlanStep
+    move: int
+    placement: int
+
+
 @dataclass
 class PlanLog:
     """What the plan did, in time order, while it is being read."""
 
     moves: list[Move] = field(default_factory=list)
-    looks: list[tuple[PlanStep, int, int]] = field(default_factory=list)
+    looks: list[PlannedLook] = field(default_factory=list)
     targets: list[str] = field(default_factory=list)
 
 
 def run_plan(plan: Iterable[PlanStep], rig: Rig, home_approach: tuple[str, str]) -> PlanLog:
-    """Turn plan steps into moves and looks (step, move, placement index).
+    """Turn plan steps into moves, placements and looks.
 
     A plan that does not begin with `home` is taken as homed at counters 0, 0. Empty counters of a move
     keep the axis where it is.
@@ -468,8 +484,8 @@ def run_plan(plan: Iterable[PlanStep], rig: Rig, home_approach: tuple[str, str])
                     column="action",
                     remedy="put a `place` step before the first `look`",
                 )
-            log.looks.append((step, len(log.moves) - 1, len(log.targets) - 1))
-        time_s += float(rig.costs_s.get(COST_KEYS[step.action], 0.0))
+            log.looks.append(PlannedLook(step, len(log.moves) - 1, len(log.targets) - 1))
+        time_s += plan_seconds(rig, (step,))
     return log
 
 
@@ -527,10 +543,10 @@ def simulate(
         noise = p["aperture_sd_deg"] * streams["aperture"].standard_normal(len(pixels))
         readings = [float(b) for b in angle + p["aperture_zero_deg"] + noise]
     spots = tuple(
-        _spot(number, look, log.targets[placement], pixels[number], sd_px, readings[number])
-        for number, (look, placement) in enumerate((entry, entry[2]) for entry in log.looks)
+        _spot(number, look, log.targets[look.placement], pixels[number], sd_px, readings[number])
+        for number, look in enumerate(log.looks)
     )
-    seen = [look[1] for look, spot in zip(log.looks, spots, strict=True) if spot.status == "ok"]
+    seen = [look.move for look, spot in zip(log.looks, spots, strict=True) if spot.status == "ok"]
     if seen:
         truth = replace(truth, reference_pose_deg=tuple(map(float, resting_deg[seen].mean(axis=0))))
     full_header = {"name": "simulated campaign", "synthetic": True, "seed": int(seed), **(header or {})}
@@ -594,7 +610,7 @@ def _light(log: PlanLog, rig: Rig, truth: Truth, rng: np.random.Generator) -> tu
     depth = np.array([rig.sheets_mm[name] for name in log.targets]) + SHEET_DEPTH_SD_MM * placements[:, 0]
     slope = np.tan(np.radians(SHEET_TILT_SD_DEG * placements[:, 1:]))
     normals = np.column_stack((np.ones(len(depth)), slope))
-    move, placement = np.array([look[1:] for look in log.looks], int).reshape(-1, 2).T
+    move, placement = np.array([(look.move, look.placement) for look in log.looks], int).reshape(-1, 2).T
     angles = np.radians(np.array(truth.mirror_angles_deg).reshape(-1, 2)[move])
     origin_P, direction_P = mirror_chain(angles[:, 0], angles[:, 1], p)
     origin, direction = origin_P @ rotation.T + translation, direction_P @ rotation.T
@@ -607,16 +623,16 @@ def _light(log: PlanLog, rig: Rig, truth: Truth, rng: np.random.Generator) -> tu
 
 def _spot(
     number: int,
-    look: tuple[PlanStep, int, int],
+    look: PlannedLook,
     target: str,
     pixels: np.ndarray,
     sd_px: float,
     b: float | None,
 ) -> Spot:
     """A row of spots.csv; the aperture sees what a camera sees, so an unseen spot has no reading."""
-    step, move, _ = look
+    step = look.step
     if not np.isfinite(pixels).all():
         empty = (None,) * 8
-        return Spot(number, move, target, step.experiment, step.point, *empty, status="undetected")
+        return Spot(number, look.move, target, step.experiment, step.point, *empty, status="undetected")
     values = (*map(float, pixels), *(sd_px,) * 4)
-    return Spot(number, move, target, step.experiment, step.point, *values, aperture_deg=b)
+    return Spot(number, look.move, target, step.experiment, step.point, *values, aperture_deg=b)

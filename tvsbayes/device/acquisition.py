@@ -39,6 +39,7 @@ from tvsbayes.device.record import (
 )
 from tvsbayes.files import DeviceFault, TvsError, escaped, refusal
 from tvsbayes.rigs import Rig
+from tvsbayes.simulation import plan_seconds as seconds_of
 
 ATTEMPTS_PER_LOOK = 3
 PLACEMENTS_MAX = 3
@@ -226,12 +227,6 @@ def check_plan(rig: Rig, plan: Sequence[PlanStep]) -> None:
                 found, allowed = f"{counter} in step {step.step}", f"{low} to {high}, the soft limits"
                 column = f"{axis}_steps"
                 raise refusal("limit", file="plan", found=found, allowed=allowed, remedy=remedy, column=column)
-
-
-def seconds_of(rig: Rig, plan: Sequence[PlanStep]) -> float:
-    """What the steps will take by the costs of the rig file, s."""
-    keys = {"home": "move_s", "move": "move_s", "look": "look_s", "place": "placement_s"}
-    return sum(float(rig.costs_s[keys[step.action]]) for step in plan)
 
 
 def begin(folder: Path, rig: Rig, plan: Sequence[PlanStep], resume: bool, header: Mapping[str, object]) -> Journal:
