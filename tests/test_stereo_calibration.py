@@ -23,9 +23,10 @@ from tvsbayes.device.stereo import (
     calibrate_stereo,
     correlation_factor,
 )
-from tvsbayes.files import NothingToEstimate, read_bytes
+from tvsbayes.files import NothingToEstimate, read_bytes, shipped_data
 from tvsbayes.rigs import STEREO_PARAMETER_NAMES, parse_stereo, read_stereo, stereo_bytes
 
+MOUNTED = shipped_data() / "rigs" / "mounted"
 OPENCV_PAIRS = Path("/usr/share/doc/opencv-doc/examples/data")
 BOARD = Board(9, 6, 25.0)
 SIZE = (1280, 720)
@@ -393,4 +394,40 @@ def test_command_refuses_with_the_right_code(ask, tmp_path, arguments, code, wor
     places = {"FOLDER": folder, "NOWHERE": tmp_path / "nowhere"}
     found, document = ask(*(places.get(argument, argument) for argument in arguments))
     assert (found, document["error"]["code"]) == (code, word)
-    assert document["error"]["remedy"] or word == "number"
+    assert document["error"]["remedy"]
+
+
+@pytest.mark.parametrize(
+    "options, missing",
+    (
+        (("--board", "7x6"), "--pitch-mm"),
+        (("--pitch-mm", "25"), "--board"),
+        ((), "--board and --pitch-mm"),
+    ),
+)
+def test_command_names_the_missing_option(ask, tmp_path, options, missing):
+    code, document = ask(tmp_path, *options)
+    assert code == 2 and document["error"]["message"] == f"stereo FOLDER needs {missing}"
+    assert f"give {missing}:" in document["error"]["remedy"]
+
+
+@pytest.mark.parametrize("there", ("stereo.json", "intrinsics.yml"))
+def test_command_replaces_no_file(ask, tmp_path, there):
+    """Not even before the work: the folder holds no pictures, which would be refused otherwise."""
+    (tmp_path / there).write_text("kept")
+    pictures_or_file = (tmp_path, "--board", "7x6", "--pitch-mm", "25"), ("--import", MOUNTED / "stereo.json")
+    for source in pictures_or_file:
+        code, document = ask(*source, "-o", tmp_path / "stereo.json", "--export", "opencv")
+        error = document["error"]
+        assert (code, error["code"]) == (2, "occupied") and there in error["file"] and error["remedy"]
+    assert [path.name for path in tmp_path.iterdir()] == [there] and (tmp_path / there).read_text() == "kept"
+
+
+def test_command_warns_of_an_implausible_import(ask, capsys, tmp_path):
+    mounted = read_stereo(MOUNTED / "stereo.json")
+    swapped = replace(mounted, R=mounted.R.T, T=-mounted.R.T @ mounted.T)
+    (tmp_path / "swapped.json").write_bytes(stereo_bytes(swapped))
+    code, document = ask("--import", tmp_path / "swapped.json")
+    assert code == 0 and [w for w in document["warnings"] if "swapped" in w] == document["warnings"] != []
+    assert run(["stereo", "--import", str(tmp_path / "swapped.json")]) == 0
+    assert "warning: the second camera stands" in capsys.readouterr().out

@@ -29,7 +29,7 @@ from tvsbayes.device.boards import SIDES, Board, Finder, View, Views, find_views
 from tvsbayes.files import NotConverged, NothingToEstimate, escaped
 from tvsbayes.joint import least_squares_covariance, levenberg_marquardt, residuals_and_jacobian
 from tvsbayes.model import CV_FROM_S, StereoCameras, project, rotation_matrix
-from tvsbayes.rigs import STEREO_PARAMETER_NAMES, Stereo, rotation_vector
+from tvsbayes.rigs import STEREO_PARAMETER_NAMES, Stereo, pair_doubts, rotation_vector
 from tvsbayes.rigs import rotation_matrix as rotation_of
 
 VIEWS_MIN = 3
@@ -742,16 +742,7 @@ def _plausibility(result: StereoCalibration, poses: Sequence[np.ndarray]) -> lis
             f"corners miss by {result.noise_sd_px:.2f} px (one coordinate); 0.1 to 0.2 is usual: look for blur, "
             "pictures not of one moment, a bent board, or a lens that five coefficients do not describe"
         )
-    size, vector = (result.stereo.image_width, result.stereo.image_height), result.stereo.vector
-    for side, (fx, fy, cx, cy) in zip(SIDES, (vector[0:4], vector[9:13]), strict=True):
-        if not (0.2 * size[0] < cx < 0.8 * size[0] and 0.2 * size[1] < cy < 0.8 * size[1]):
-            warnings.append(f"the {side} principal point ({cx:.0f}, {cy:.0f}) px is far from the image's middle")
-        if abs(fx / fy - 1) > 0.05:
-            warnings.append(
-                f"the {side} fx and fy differ by {100 * abs(fx / fy - 1):.0f} %: pixels are seldom so oblong"
-            )
-    if result.stereo.T[0] > 0:
-        warnings.append("the right camera stands to the left of the left one: are the pictures swapped?")
+    warnings += pair_doubts(result.stereo)
     mean, sd = result.triangulated_pitch_mm
     if abs(mean / result.board.pitch_mm - 1) > 0.01:
         warnings.append(f"triangulated squares measure {mean:.3f} mm (sd {sd:.3f}), not {result.board.pitch_mm:g}")
