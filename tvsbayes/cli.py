@@ -492,6 +492,9 @@ def acquire(
         outcome = run_plan(instrument, steps, out, **options, say=report_line, show=line.show, ask=line.ask)
     document = {"campaign": str(out), **outcome.as_json()}
     text = f"{escaped(str(out), 200)}: {outcome.reason}, {outcome.ok} of {outcome.looks} looks count"
+    if outcome.references:
+        planned = outcome.looks - outcome.references
+        text += f" ({planned} of the plan, {outcome.references} reference looks of resumed runs)"
     _finish(document, "\n".join([text, *(f"warning: {warning}" for warning in outcome.warnings)]), as_json)
     if outcome.reason in ("interrupted", "declined"):
         report_line(f"{outcome.reason}; go on with --resume")
