@@ -1047,32 +1047,32 @@ def test_command_tells_reference_looks_from_those_of_the_plan(rig, tmp_path, cap
 KILLED = """
 import os, signal, sys
 
-left = int(sys.argv[1])
+calls, left = sys.argv[1].split(","), int(sys.argv[2])
 
-def mortal(call):
+def mortal(name, call):
     def called(*arguments):
         global left
         left -= 1
         if left == 0:
-            if call is write:
-                write(arguments[0], arguments[1][: len(arguments[1]) // 2])
+            if name == "write":
+                call(arguments[0], arguments[1][: len(arguments[1]) // 2])
             os.kill(os.getpid(), signal.SIGKILL)
         return call(*arguments)
     return called
 
-write = os.write
-os.write, os.fsync, os.replace = mortal(os.write), mortal(os.fsync), mortal(os.replace)
+for name in calls:
+    setattr(os, name, mortal(name, getattr(os, name)))
 
 from tvsbayes.cli import run
 
-sys.exit(run(sys.argv[2:]))
+sys.exit(run(sys.argv[3:]))
 """
-"""A command that is killed at its n-th call that changes what stands on the disk, in the middle of a write; 0: never.
+"""A command that is killed at the n-th of some calls of `os`, in the middle of a write; 0: never.
 
 By itself, since a clock would kill another call in every run, or none.
 """
-CALLS_PER_LOOK = 10
-"""At least: the lines of intent, motion and look are written and flushed, two tables flushed and renamed."""
+CALLS_PER_LOOK = 2
+"""At least: the lines of a placement or a motion and of the look are written one by one, and flushed."""
 
 
 def killed_runs(tmp_path: Path, kills: int, seed: int, experiments: int) -> int:
@@ -1085,18 +1085,21 @@ def killed_runs(tmp_path: Path, kills: int, seed: int, experiments: int) -> int:
     command = ["acquire", str(RIG_FILE), str(tmp_path / "plan.csv"), str(folder)]
     before = 0
     for number in range(kills + 1):
-        resume = ["--resume"] if number and (folder / LOG).exists() else []
-        call = rng.randint(1, calls_max) if number < kills else 0
+        resume = ["--resume"] if number else []
+        # Without a whole first line there is nothing to go on with.
+        call = rng.randint(2, calls_max) if number < kills else 0
+        calls = "fsync,replace" if number % 2 else "write"
         process = subprocess.run(
-            [sys.executable, "-c", KILLED, str(call), *command, "--simulate", "--centroids", *resume],
+            [sys.executable, "-c", KILLED, calls, str(call), *command, "--simulate", "--centroids", *resume],
             capture_output=True,
             cwd=Path(__file__).parents[1],
             check=False,
         )
         assert process.returncode == (-signal.SIGKILL if call else 0), (call, process.stderr.decode())
-        if not (folder / LOG).exists():
-            continue
-        record = recorded(read_journal(folder).records)
+        reading = read_journal(folder)
+        # Centroids: all that a run writes through a descriptor are lines of its log.
+        assert bool(reading.torn) == (call > 0 and calls == "write")
+        record = recorded(reading.records)
         assert len(record.spots) >= before, "a look is gone"
         before = len(record.spots)
         verify(folder)
