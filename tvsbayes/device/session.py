@@ -222,7 +222,7 @@ def acquire(
             return acquisition.run()
         finally:
             if instrument is not None:
-                write_truth(folder, rig, instrument)
+                write_truth(folder, instrument)
 
 
 def _utc_now() -> datetime.datetime:
@@ -354,7 +354,7 @@ def _settings_of(folder: Path) -> Campaign:
     return Campaign((), (), stereo, parse_rig_table(keys.table("rig")), parse_header(keys))
 
 
-def write_truth(folder: Path, rig: Rig, instrument: Instrument) -> None:
+def write_truth(folder: Path, instrument: Instrument) -> None:
     """Writes `truth.json`: the true rig, and the true angles of the moves that the journal holds."""
     if not (folder / LOG).is_file():
         return

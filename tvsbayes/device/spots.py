@@ -831,10 +831,15 @@ def _learned(patches: Sequence[_Patch], speckle_contrast: float | None) -> SpotN
     return noise
 
 
-def _overlay(picture: np.ndarray, centre: Centre, half: int = 32, zoom: int = 8) -> np.ndarray:
+OVERLAY_HALF_PX, OVERLAY_ZOOM = 32, 8
+"""Half the side of the square that an overlay shows, and how many of its pixels show one."""
+
+
+def _overlay(picture: np.ndarray, centre: Centre) -> np.ndarray:
     """The surroundings of a spot enlarged: outline green, centre red, the reason of a refusal in words (Figure 9)."""
     import cv2
 
+    half, zoom = OVERLAY_HALF_PX, OVERLAY_ZOOM
     height, width = picture.shape[:2]
     middle = centre.centre_px
     if middle is None:

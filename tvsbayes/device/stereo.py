@@ -423,18 +423,6 @@ class StereoCalibration:
 
 
 @dataclass(frozen=True)
-class CameraCalibration:
-    """One camera alone: fx fy cx cy k1 k2 p1 p2 k3 and their covariance for independent corners (9, 9)."""
-
-    vector: np.ndarray
-    covariance: np.ndarray
-    rms_px: float
-    noise_sd_px: float
-    dof: int
-    correlation_factor: float
-
-
-@dataclass(frozen=True)
 class _CameraStart:
     """Zhang's solution for one camera: matrix, distortion, and a pose (6,) for every view that it saw."""
 
@@ -487,32 +475,6 @@ def _relative(start: Sequence[_CameraStart]) -> tuple[np.ndarray, np.ndarray]:
             remedy="name the pictures of one moment alike: left01.png and right01.png",
         )
     return rotation_vector(np.median(rotations, axis=0)), np.median(translations, axis=0)
-
-
-def calibrate_camera(
-    corners: Sequence[np.ndarray], board: Board, size: tuple[int, int], *, fix_k3: bool = False
-) -> CameraCalibration:
-    """One camera by itself, through the same adjustment as a pair.
-
-    Args:
-        corners: per view (corners, 2), px.
-        board: whose corners they are.
-        size: image width and height, px.
-        fix_k3: keep k3 at 0.
-
-    Raises:
-        NothingToEstimate: too few views, or they do not determine the camera.
-        NotConverged: no minimum was found.
-    """
-    start = _camera_start(dict(enumerate(corners)), board, size, "only", fix_k3)
-    free = np.arange(24) < 9
-    free[8] = not fix_k3
-    vector = np.concatenate([start.vector, start.vector, np.zeros(6)])
-    views = [View(str(k), c, None) for k, c in enumerate(corners)]
-    done = bundle_adjustment(views, board, vector, np.array([start.poses[k] for k in range(len(corners))]), free)
-    rms = math.sqrt(float(np.nansum(done.residuals_px**2)) / (len(corners) * board.corners))
-    noise = done.noise_sd_px, done.dof, done.correlation_factor
-    return CameraCalibration(done.vector[:9], done.covariance[:9, :9], rms, *noise)
 
 
 def calibrate_stereo(
@@ -581,7 +543,7 @@ def calibrate_stereo(
         correlation_factor=done.correlation_factor,
         covariance_independent=done.covariance,
         covariance_pitch=pitch,
-        coverage={side: _coverage([getattr(v, side) for v in views], board, size) for side in SIDES},
+        coverage={side: _coverage([getattr(v, side) for v in views], size) for side in SIDES},
         triangulated_pitch_mm=_triangulated_pitch(views, board, stereo),
         found=found,
         excluded=tuple(excluded),
@@ -688,7 +650,7 @@ def _view_reports(
         yield ViewReport(view.name, *rms, float(np.linalg.norm(pose[3:])), tilt, bool(outlier))
 
 
-def _coverage(corners: Sequence[np.ndarray | None], board: Board, size: tuple[int, int]) -> float:
+def _coverage(corners: Sequence[np.ndarray | None], size: tuple[int, int]) -> float:
     """Share of the image inside the outline of a board in at least one view."""
     scale = 256 / max(size)
     mask = np.zeros([max(1, round(s * scale)) for s in size[::-1]], np.uint8)
