@@ -247,7 +247,7 @@ def test_stop_errors_scatter_runs_by_side():
 def test_the_predicted_interval_holds_a_test_on_the_true_rig():
     """Coverage: the figure of one more test on a rig from the same distribution lies inside in 95 of 100 cases."""
     rng = np.random.default_rng(5)
-    rigs, held = 300, 0
+    rigs = 300
     base = known_calibration(rigs, **{"stop_sd_deg.left": 0.1, "stop_sd_deg.right": 0.05})
     inputs = base.inputs.copy()
     inputs[:, INPUT_NAMES.index("backlash_deg.pan")] = np.abs(rng.normal(0.3, 0.05, rigs))
@@ -378,7 +378,7 @@ def test_stops_are_read_as_they_were():
 
 
 def test_reading_uncertainty_is_what_noise_does():
-    errors, stated = [], []
+    errors = []
     for seed in range(40):
         fit = stops_of(np.zeros(STOPS), noise=1.0)
         rng = np.random.default_rng(seed)
@@ -386,7 +386,6 @@ def test_reading_uncertainty_is_what_noise_does():
         fit.linearised = linearised(residual, fit.linearised.slope, fit.linearised.mirror_angles_rad)
         found = stop_readings(fit, "pan")
         errors.append((found.mirror_deg - found.steps * 0.06 + 0.15 * found.side) / found.u_deg)
-        stated.append(found.u_deg)
     z = np.concatenate(errors)
     # 1000 standard normal numbers: 1e-4 bounds of their rms.
     assert np.sqrt(np.mean(z**2)) == pytest.approx(1.0, abs=4 / np.sqrt(2 * z.size))

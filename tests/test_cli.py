@@ -272,7 +272,6 @@ def test_fit_document_has_the_contracts_keys_and_its_files(ask, folder):
     assert {"chi2", "dof", "pixel_scale"} <= set(document["noise"])
     assert document["noise"]["pixel_scale"] == document["parameters"]["pixel_scale"]["value"]
     assert all({"text", "loadings"} <= set(weak) for weak in document["weak_directions"])
-    assert all({"move", "spots", "quantity", "factor", "text"} == set(e) for e in document["leverage"])
     assert document["excluded_spots"] == []
     assert document["files"] == {
         "draws": str(folder / "results" / "draws.npz"),

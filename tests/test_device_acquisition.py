@@ -392,7 +392,8 @@ def test_resumed_after_any_look_every_look_is_there_once(rig, tmp_path, stop_at)
     with pytest.raises(InputError, match="--resume"):
         begin(folder, rig, plan, False, HEADER)
     second = Run(rig, folder, plan, resume=True, start=1)
-    assert second.engine.run().reason == "done" and second.dark()
+    outcome = second.engine.run()
+    assert outcome.reason == "done" and second.dark()
     campaign = read_campaign(folder)
     assert campaign.spots[: len(before.spots)] == before.spots, "what was taken stays as it was"
     assert campaign.moves[: len(before.moves)] == before.moves
@@ -401,6 +402,7 @@ def test_resumed_after_any_look_every_look_is_there_once(rig, tmp_path, stop_at)
     assert recorded(read_journal(folder).records).unverified == (0,), "another device start: nothing to compare with"
     assert "segment 0 is not known" in check_journal(folder)["warnings"][0]
     references = [s for s in campaign.spots if s.experiment is None]
+    assert outcome.references == len(references) == outcome.looks - 8
     on_target = {before.moves[s.move].pan_steps for s in before.spots if s.target == before.spots[-1].target}
     assert len(references) == len(on_target) and {m.segment for m in campaign.moves} == {0, 1}
     assert_looks_as_planned(campaign, plan)
@@ -549,6 +551,7 @@ def test_segment_that_an_alarm_ended_is_not_taken_for_verified(rig, tmp_path):
 def test_frames_of_an_interrupted_look_are_never_overwritten(rig, tmp_path):
     folder = tmp_path / "c"
     Run(rig, folder, observer=lambda i: Failing(i, 2, lambda i: signal.raise_signal(signal.SIGINT))).engine.run()
+    (folder / "frames").mkdir()
     (folder / "frames" / "000002_left.png").write_bytes(b"of a look that a crash cut off")
     (folder / "frames" / "screenshot.png").write_bytes(b"of the operator")
     Run(rig, folder, resume=True, start=1).engine.run()
@@ -1005,6 +1008,8 @@ def test_commands(rig, tmp_path, capsys):
     assert len(json.loads(capsys.readouterr().out)["steps"]) == 11 and not (tmp_path / "c").exists()
     assert run(["acquire", *arguments, "--simulate", "--centroids", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["ok"] == 4
+    files = {"campaign.toml", "moves.csv", "spots.csv", "stereo.json"} | {LOG, "truth.json"}
+    assert {path.name for path in (tmp_path / "c").iterdir()} == files, "no empty folders for pictures"
     assert run(["acquire", *arguments, "--simulate", "--centroids", "--json"]) == 2
     assert json.loads(capsys.readouterr().out)["error"]["code"] == "occupied"
     assert run(["acquire", *arguments[:2], str(tmp_path / "d"), "--json"]) == 2
@@ -1027,46 +1032,79 @@ def test_commands(rig, tmp_path, capsys):
     assert "acquire" in json.loads(capsys.readouterr().out)["error"]["message"]
 
 
-KILLED = "import sys; from tvsbayes.cli import run; sys.exit(run(sys.argv[1:]))"
+def test_command_tells_reference_looks_from_those_of_the_plan(rig, tmp_path, capsys):
+    plan, folder = small_plan(), tmp_path / "c"
+    write_plan(plan, tmp_path / "plan.csv")
+    Run(rig, folder, plan, observer=lambda i: Failing(i, 5, lambda i: signal.raise_signal(signal.SIGINT))).engine.run()
+    arguments = ["acquire", str(RIG_FILE), str(tmp_path / "plan.csv"), str(folder), "--simulate", "--centroids"]
+    assert run([*arguments, "--resume", "--seed", "5"]) == 0
+    first = capsys.readouterr().out.splitlines()[0]
+    assert first.endswith("done, 10 of 10 looks count (8 of the plan, 2 reference looks of resumed runs)"), first
+    assert run([*arguments[:3], str(tmp_path / "whole"), *arguments[4:]]) == 0
+    assert capsys.readouterr().out.splitlines()[0].endswith("done, 8 of 8 looks count")
+
+
+KILLED = """
+import os, signal, sys
+
+calls, left = sys.argv[1].split(","), int(sys.argv[2])
+
+def mortal(name, call):
+    def called(*arguments):
+        global left
+        left -= 1
+        if left == 0:
+            if name == "write":
+                call(arguments[0], arguments[1][: len(arguments[1]) // 2])
+            os.kill(os.getpid(), signal.SIGKILL)
+        return call(*arguments)
+    return called
+
+for name in calls:
+    setattr(os, name, mortal(name, getattr(os, name)))
+
+from tvsbayes.cli import run
+
+sys.exit(run(sys.argv[3:]))
+"""
+"""A command that is killed at the n-th of some calls of `os`, in the middle of a write; 0: never.
+
+By itself, since a clock would kill another call in every run, or none.
+"""
+CALLS_PER_LOOK = 2
+"""At least: the lines of a placement or a motion and of the look are written one by one, and flushed."""
 
 
 def killed_runs(tmp_path: Path, kills: int, seed: int, experiments: int) -> int:
     """Kill `acquire --simulate` again and again, resuming each time, then let it finish: looks of the plan."""
     rng = random.Random(seed)
+    calls_max = 4 * experiments * CALLS_PER_LOOK // max(kills, 1)
     plan = small_plan(experiments)
     write_plan(plan, tmp_path / "plan.csv")
     folder = tmp_path / "c"
-    command = [sys.executable, "-c", KILLED, "acquire", str(RIG_FILE), str(tmp_path / "plan.csv"), str(folder)]
-    before, done = 0, False
+    command = ["acquire", str(RIG_FILE), str(tmp_path / "plan.csv"), str(folder)]
+    before = 0
     for number in range(kills + 1):
-        resume = ["--resume"] if number and (folder / LOG).exists() else []
-        process = subprocess.Popen(
-            [*command, "--simulate", "--centroids", *resume],
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
+        resume = ["--resume"] if number else []
+        # Without a whole first line there is nothing to go on with.
+        call = rng.randint(2, calls_max) if number < kills else 0
+        calls = "fsync,replace" if number % 2 else "write"
+        process = subprocess.run(
+            [sys.executable, "-c", KILLED, calls, str(call), *command, "--simulate", "--centroids", *resume],
+            capture_output=True,
             cwd=Path(__file__).parents[1],
+            check=False,
         )
-        if number < kills:
-            # The first line on stderr comes with a tenth of the plan; by then the run is under way.
-            process.stderr.readline()
-            try:
-                process.wait(rng.uniform(0.0, 0.25))
-            except subprocess.TimeoutExpired:
-                process.kill()
-        _, errors = process.communicate()
-        done = process.returncode == 0
-        assert done or process.returncode == -signal.SIGKILL, errors.decode()
-        if not (folder / LOG).exists():
-            continue
-        record = recorded(read_journal(folder).records)
+        assert process.returncode == (-signal.SIGKILL if call else 0), (call, process.stderr.decode())
+        reading = read_journal(folder)
+        # Centroids: all that a run writes through a descriptor are lines of its log.
+        assert bool(reading.torn) == (call > 0 and calls == "write")
+        record = recorded(reading.records)
         assert len(record.spots) >= before, "a look is gone"
         before = len(record.spots)
         verify(folder)
         if record.moves and (folder / "campaign.toml").exists():
             assert len(read_campaign(folder).spots) >= 0.99 * len(record.spots) - 1
-        if done:
-            break
-    assert done
     campaign = read_campaign(folder)
     points = [(s.experiment, s.point) for s in campaign.spots if s.experiment is not None]
     assert points == [(s.experiment, s.point) for s in plan if s.action == "look"]
@@ -1074,11 +1112,11 @@ def killed_runs(tmp_path: Path, kills: int, seed: int, experiments: int) -> int:
 
 
 def test_killed_acquisition_is_resumed_without_a_loss(tmp_path):
-    assert killed_runs(tmp_path, 1, seed=1, experiments=15) == 60
+    assert killed_runs(tmp_path, 3, seed=1, experiments=15) == 60
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(4))
 def test_twenty_killed_acquisitions(tmp_path, seed):
-    """Four campaigns, each killed five times or until it is done."""
+    """Four campaigns, each killed five times."""
     assert killed_runs(tmp_path, 5, seed=100 + seed, experiments=60) == 240

@@ -192,6 +192,40 @@ def test_cameras_of_a_rig_file():
             open_capture(source)
 
 
+@pytest.mark.parametrize("wanted", (None, "7"))
+def test_opencv_is_silent_only_while_cameras_are_opened(monkeypatch, wanted):
+    """And not at all for whoever asked for its messages; FFmpeg's variable is nobody else's afterwards."""
+    logging, levels = cv2.utils.logging, []
+    names = ("OPENCV_LOG_LEVEL", "OPENCV_FFMPEG_LOGLEVEL")
+    for name in names:
+        monkeypatch.delenv(name, raising=False)
+        if wanted is not None:
+            monkeypatch.setenv(name, wanted)
+    before = logging.getLogLevel()
+    assert before != logging.LOG_LEVEL_SILENT
+
+    def absent(source):
+        levels.append((logging.getLogLevel(), os.environ.get(names[1])))
+        raise DeviceFault("camera", "gone", remedy="plug it in")
+
+    with pytest.raises(DeviceFault):
+        open_cameras({"source": 0}, WIDTH, HEIGHT, absent)
+    assert levels == [(logging.LOG_LEVEL_SILENT, "-8") if wanted is None else (before, wanted)]
+    assert logging.getLogLevel() == before and [os.environ.get(name) for name in names] == [wanted] * 2
+
+
+def test_virtual_camera_without_a_port_leaves_the_environment_alone(monkeypatch):
+    monkeypatch.setenv("no_proxy", "example.org")
+
+    def no_port(*_):
+        raise OSError("no port is free")
+
+    monkeypatch.setattr("tvsbayes.device.camera.ThreadingHTTPServer", no_port)
+    with pytest.raises(OSError, match="no port"), VirtualCamera(lambda: None):
+        pass
+    assert os.environ["no_proxy"] == "example.org"
+
+
 def test_stream_over_http_from_rendering_to_pictures(monkeypatch):
     """Every frame carries its number as grey level on both sides; a grab never returns one rendered before it.
 

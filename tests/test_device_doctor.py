@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import signal
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -142,3 +145,25 @@ def test_rig_without_hardware_says_what_is_missing(tmp_path):
     checks = {check.name: check for check in examine(RIG, tmp_path)}
     assert "[positioner]" in checks["port"].remedy and checks["cameras"].status == "fault"
     assert checks["disk flush"].status in ("ok", "warning") and list(tmp_path.iterdir()) == []
+
+
+def test_missing_hardware_is_told_once_and_by_us_alone(tmp_path):
+    """In a process of its own: OpenCV and FFmpeg write past Python, FFmpeg as loud as its first caller says."""
+    folder = shipped_data() / "rigs" / "mounted"
+    tables = '[positioner]\nport = "/nowhere/port"\n[cameras]\n'
+    environment = {name: value for name, value in os.environ.items() if not name.startswith("OPENCV_")}
+    for cameras in ('left = "/nowhere/left"\nright = "/nowhere/right"\n', 'source = "http://127.0.0.1:9/x.mjpg"\n'):
+        text = (folder / "rig.toml").read_text(encoding="utf-8")
+        (tmp_path / "rig.toml").write_text(f"{text}\n{tables}{cameras}", encoding="utf-8")
+        (tmp_path / "stereo.json").write_bytes((folder / "stereo.json").read_bytes())
+        command = [sys.executable, "-c", "import sys; from tvsbayes.cli import run; sys.exit(run(sys.argv[1:]))"]
+        done = subprocess.run(
+            [*command, "doctor", "rig.toml"], cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
+        )
+        assert done.returncode == 5
+        assert [line.split(":")[0] for line in done.stderr.splitlines()] == ["error", "what to do"], done.stderr
+        faults = {line.split()[1]: line for line in done.stdout.splitlines() if line.startswith("fault")}
+        assert set(faults) == {"port:", "firmware:", "cameras:"}
+        for name, remedy in (("cameras:", "check [cameras]"), ("firmware:", "check [positioner] port")):
+            assert faults[name].count(remedy) == 1, faults[name]
+        assert "tvsbayes doctor" not in done.stdout + done.stderr

@@ -345,6 +345,40 @@ def test_short_writes_are_completed(tmp_path):
     assert verify(tmp_path).records == 4
 
 
+@pytest.mark.skipif(os.name != "posix", reason="only POSIX flushes folders")
+def test_the_folder_of_the_first_frame_is_durable_before_an_event_names_it(tmp_path):
+    """It is made with that frame: its own name has to be flushed too, behind the frame's and before the line."""
+
+    class Following(Disk):
+        def __init__(self):
+            self.names, self.calls = {}, []
+
+        def open(self, path, flags):
+            descriptor = super().open(path, flags)
+            self.names[descriptor] = path.relative_to(tmp_path).as_posix()
+            return descriptor
+
+        def write(self, descriptor, data):
+            self.calls.append(f"write {self.names[descriptor]}")
+            return super().write(descriptor, data)
+
+        def fsync(self, descriptor):
+            self.calls.append(f"flush {self.names[descriptor]}")
+            super().fsync(descriptor)
+
+    disk = Following()
+    journal = Journal.create(tmp_path / "c", disk)
+    assert not (tmp_path / "c" / "frames").exists()
+    for number in range(2):
+        disk.calls.clear()
+        frame = journal.store(f"frames/{number:06d}_left.png", b"picture")
+        journal.append("looked", frames=[frame.as_json()])
+        made = ["flush c"] * (number == 0)
+        picture_calls = [f"{call} c/frames/.{number:06d}_left.png.tmp" for call in ("write", "flush")]
+        assert disk.calls == [*picture_calls, *made, "flush c/frames", f"write c/{LOG}", f"flush c/{LOG}"]
+    journal.close()
+
+
 @dataclass
 class Inode:
     """Content that the disk surely has, and what was written since."""

@@ -97,6 +97,9 @@ def test_the_recorded_approach_of_move_0_is_named_as_leverage(pan_only):
     entry = next(e for e in summary.leverage if e.quantity == "effective left")
     assert entry.move == 0
     assert "its recorded approach (left, up)" in entry.text
+    documents = summary.as_json()["leverage"]
+    assert documents and all(set(d) == {"move", "spots", "quantity", "factor", "text"} for d in documents)
+    assert documents == json.loads(json.dumps(documents, allow_nan=False))
     assert entry.factor > 2
     assert summary.effective["up"] is None
     # A refit without its spots loses as much to within a factor of two: the linear prediction does not see that

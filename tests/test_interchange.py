@@ -11,7 +11,7 @@ import pytest
 
 from tvsbayes.device.interchange import assumed_covariance, exported, parse_yaml, read_calibration
 from tvsbayes.files import InputError, shipped_data
-from tvsbayes.rigs import Stereo, read_stereo, rotation_matrix, stereo_bytes
+from tvsbayes.rigs import Stereo, pair_doubts, read_stereo, rotation_matrix, stereo_bytes
 
 OPENCV_DATA = Path("/usr/share/doc/opencv-doc/examples/data")
 KALIBR = """cam0:
@@ -91,13 +91,17 @@ def test_ros_export_is_in_metres(mounted):
 
 
 def test_opencv_reads_what_is_exported(mounted, tmp_path):
+    values = {"M1": mounted.M1, "D2": mounted.D2[None], "R": mounted.R, "T": mounted.T[:, None]}
+    read = []
     for path in written(tmp_path, exported(mounted, "opencv")):
         storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
-        for name, value in (("M1", mounted.M1), ("D2", mounted.D2[None]), ("R", mounted.R), ("T", mounted.T[:, None])):
+        for name, value in values.items():
             node = storage.getNode(name)
             if not node.empty():
                 np.testing.assert_array_equal(node.mat(), value)
+                read.append(name)
         storage.release()
+    assert sorted(read) == sorted(values), "each once, in one of the two files"
 
 
 @pytest.mark.parametrize("header", (b"%YAML:1.0\n---\n", b"%YAML 1.2\n---\n", b""))
@@ -134,6 +138,43 @@ def test_kalibr_camchain(tmp_path):
     np.testing.assert_array_equal(found.stereo.D1, [-0.3, 0.1, 0.0003, -0.0005, 0.0])
     np.testing.assert_array_equal(found.stereo.M2, [[798.5, 0, 636], [0, 798, 363], [0, 0, 1]])
     assert found.stereo.parameter_covariance[8, 8] > 0
+
+
+def test_cameras_on_the_wrong_sides_are_named(mounted, tmp_path):
+    """Whatever the format: the pair is legal, but every depth would come out negative."""
+    swapped = replace(mounted, R=mounted.R.T, T=-mounted.R.T @ mounted.T)
+    camchain = KALIBR.replace("-0.085]", "0.085]")
+    assert camchain != KALIBR
+    folders = {
+        "opencv": exported(swapped, "opencv"),
+        "kalibr": {"camchain.yaml": camchain.encode()},
+        "tvsbayes": {"stereo.json": stereo_bytes(swapped)},
+    }
+    for source, files in folders.items():
+        found = read_calibration(written(tmp_path, files))
+        assert found.source == source and found.stereo.T[0] > 0
+        assert ["swapped" in warning for warning in found.warnings] == [True], source
+
+
+def test_an_image_size_of_other_pictures_is_named(mounted, tmp_path):
+    """OpenCV's files state no size; the shipped pair has 1280 x 720 px and its principal points near the middle."""
+    files = {name: data.replace(b"image_", b"other_") for name, data in exported(mounted, "opencv").items()}
+    paths = written(tmp_path, files)
+    assert read_calibration(paths, (1280, 720)).warnings == ()
+    for size, word in (((720, 1280), "far from the middle"), ((640, 360), "outside the image")):
+        warnings = read_calibration(paths, size).warnings
+        assert len(warnings) == 2 and all(word in w and "is that its size?" in w for w in warnings), warnings
+        assert ["left" in w for w in warnings] == [True, False]
+
+
+def test_the_bounds_of_a_plausible_principal_point(mounted):
+    """A quarter of the width from the middle, (1280 - 1) / 2 px, and not a pixel more; 5 % for fx / fy."""
+    for shift_px, doubts in ((319.0, 0), (321.0, 1), (-319.0, 0), (-321.0, 1)):
+        matrix = np.array([[800.0, 0, 639.5 + shift_px], [0, 800.0, 359.5], [0, 0, 1]])
+        assert len(pair_doubts(replace(mounted, M2=matrix))) == doubts, shift_px
+    for ratio, doubts in ((1.04, 0), (1.06, 1)):
+        matrix = np.array([[800.0 * ratio, 0, 639.5], [0, 800.0, 359.5], [0, 0, 1]])
+        assert len(pair_doubts(replace(mounted, M1=matrix))) == doubts, ratio
 
 
 def test_native_calibration_keeps_its_covariance(mounted, tmp_path):

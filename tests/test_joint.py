@@ -24,9 +24,6 @@ SD = 1.0
 """One posterior standard deviation."""
 FAR = 5 * SD
 """A true value lies farther than this from a right estimate in 6 of 10 million cases."""
-SAME = 0.02 * SD
-"""Two fits of the same data: the Newton steps end within 1e-4 sd of the mode, whatever path led there; the mode's
-own uncertainty from the Hessian's finite differences is of the same order."""
 
 
 @pytest.fixture(scope="module")

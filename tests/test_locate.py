@@ -128,7 +128,7 @@ def test_bad_points_are_refused_with_line_and_column(ask, folder, tmp_path, row,
     assert exit_code == 2
     error = document["error"]
     assert (error["line"], error["column"]) == (3, column)
-    assert error["remedy"] or error["allowed"]
+    assert error["remedy"] and error["allowed"]
 
 
 def test_diverging_and_half_given_points_are_bad_input(ask, folder):

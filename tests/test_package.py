@@ -16,6 +16,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+VERSION = PROJECT["project"]["version"]
 SIZES_MAX = {".whl": 1_000_000, ".gz": 2_000_000}
 """Bytes: twice what 0.1.0 takes, so that pictures or results that slip in are seen."""
 SHIPPED = (
@@ -61,14 +62,13 @@ def built(tmp_path_factory) -> dict[str, Path]:
 
 
 def test_distributions_hold_what_belongs_in_them(built):
-    version = PROJECT["project"]["version"]
-    assert built[".whl"].name == f"tvsbayes-{version}-py3-none-any.whl"
-    assert built[".gz"].name == f"tvsbayes-{version}.tar.gz"
+    assert built[".whl"].name == f"tvsbayes-{VERSION}-py3-none-any.whl"
+    assert built[".gz"].name == f"tvsbayes-{VERSION}.tar.gz"
     for kind, limit in SIZES_MAX.items():
         assert built[kind].stat().st_size < limit
     wheel, again = (sorted(zipfile.ZipFile(built[kind]).namelist()) for kind in (".whl", "again"))
     assert wheel == again
-    assert {name.split("/")[0] for name in wheel} == {"tvsbayes", f"tvsbayes-{version}.dist-info"}
+    assert {name.split("/")[0] for name in wheel} == {"tvsbayes", f"tvsbayes-{VERSION}.dist-info"}
     assert {name.split("/")[1] for name in wheel if name.count("/") > 1 and "dist-info" not in name} == {
         "data",
         "device",
@@ -97,7 +97,7 @@ def test_installed_package_works_away_from_the_tree(kind, built, tmp_path):
     options = {"cwd": tmp_path, "env": {**clean, "TVSBAYES_CACHE": str(tmp_path / "cache")}}
     where = Path(run(python, "-c", "import tvsbayes; print(tvsbayes.__file__)", **options).strip())
     assert where.is_relative_to(tmp_path)
-    assert run(python, "-c", "import tvsbayes; print(tvsbayes.__version__)", **options).strip() == "0.1.0"
+    assert run(python, "-c", "import tvsbayes; print(tvsbayes.__version__)", **options).strip() == VERSION
     assert "Commands" in run(command, "--help", **options)
     run(command, "new", "x", **options)
     assert {path.name for path in (tmp_path / "x").iterdir()} == {"campaign.toml", "moves.csv", "rig.toml", "spots.csv"}

@@ -205,7 +205,7 @@ def test_mirroring_a_counter_swaps_names(mounted_rig, knowledge):
 
 
 def test_looks_that_miss_an_image_tell_nothing(knowledge):
-    """600 steps turn the beam by 36 degrees, out of the images."""
+    """1000 steps turn the beam by 60 degrees, out of the images."""
     steps = list(paper_protocol(1))
     more = (*steps, PlanStep(len(steps), "move", 1000, 0), PlanStep(len(steps) + 1, "look"))
     information = information_of(more, knowledge)
@@ -430,8 +430,10 @@ def test_limits_are_kept(mounted_rig, found):
     inside = candidates(known)
     arranged = arrange(inside.looks, known.sheets, inside.overshoot)
     moves = np.array([(s.pan_steps, s.tilt_steps) for s in arranged.steps if s.action == "move"])
-    assert moves.min(axis=0) == pytest.approx([0, -70], abs=40) and (moves.min(axis=0) >= [0, -70]).all()
-    assert (moves.max(axis=0) <= [150, 90]).all()
+    low, high = np.array([0, -70]), np.array([150, 90])
+    # The images reach beyond these limits: the outermost looks stand on them, and no run-up goes past.
+    for counters in (moves, inside.looks.steps):
+        assert (counters.min(axis=0) == low).all() and (counters.max(axis=0) == high).all()
     assert not inside.notes
     assert "pan_min_steps" in found.notes[0] and "pan -100 to 280" in found.notes[0]
     assert np.abs(found.looks.steps).max() <= 280

@@ -114,8 +114,6 @@ def test_ctrl_c_in_the_middle_of_a_step_is_quiet_and_loses_no_step(fitted, tmp_p
     np.testing.assert_array_equal(resumed.z, unbroken.z)
 
 
-# numpy.load leaves the handle of a truncated archive to the garbage collector.
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning", "ignore::ResourceWarning")
 def test_resume_refuses_what_is_no_chain(fitted, long, tmp_path):
     file = tmp_path / "chain.npz"
     with pytest.raises(InputError) as caught:

@@ -322,12 +322,6 @@ def test_the_papers_figures_for_any_campaign(evidence):
         plots.points_3d(campaign, number),
         plots.points_3d(campaign),
         plots.direction_scatter(result, "left", (0.062, 1e-4)),
-        plots.spot_overlay(
-            np.zeros((60, 80, 3), np.uint8),
-            (40.2, 30.1),
-            (0.05, 0.06),
-            contour_px=np.eye(3, 2),
-        ),
     ):
         assert figure.get_axes() and figure.get_size_inches()[0] == plots.WIDTH_IN
     angles = plots.trajectories(campaign, number).axes[0].get_legend_handles_labels()[1]

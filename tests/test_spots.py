@@ -189,7 +189,6 @@ def test_noise_is_learned_from_skews_drawn_from_it():
     assert learn_noise(np.column_stack((variance, parts)), 0.3).speckle_contrast == pytest.approx(0.3)
 
 
-BLANK = np.full((HEIGHT, WIDTH), 10.0)
 SMALL = 2.5**2 * np.eye(2)
 
 

@@ -31,6 +31,7 @@ from tvsbayes.files import (
     output_place,
     parse_table,
     read_bytes,
+    refusal,
     shipped_data,
     write_atomically,
 )
@@ -333,24 +334,38 @@ def stereo(
     if export not in (None, "opencv", "ros") or finder not in ("classic", "sector") or import_unit not in ("mm", "m"):
         remedy = "--export opencv or ros, --finder classic or sector, --import-unit mm or m"
         raise InputError("usage", "an option has a value that it does not know", remedy=remedy)
-    if (folder is None) == (not imports) or (folder is not None and (board is None or pitch_mm is None)):
-        remedy = "give FOLDER with --board and --pitch-mm, or --import FILE"
-        raise InputError("usage", "stereo needs pictures of a board, or a calibration to import", remedy=remedy)
+    if (folder is None) == (not imports):
+        found = "stereo needs pictures of a board, or a calibration to import"
+        found = found if folder is None else "stereo takes pictures or a calibration to import, not both"
+        raise InputError("usage", found, remedy="give FOLDER with --board and --pitch-mm, or --import FILE")
+    lacking = {"--board": board is None, "--pitch-mm": pitch_mm is None}
+    missing = " and ".join(name for name, absent in lacking.items() if absent)
+    if folder is not None and missing:
+        remedy = f"give {missing}: inner corners, columns x rows, and the side of a square: --board 9x6 --pitch-mm 25"
+        raise InputError("usage", f"stereo FOLDER needs {missing}", remedy=remedy)
     _finite(pitch_mm=pitch_mm, pitch_u_mm=pitch_u_mm)
-    from tvsbayes.device.interchange import exported, read_calibration
+    from tvsbayes.device.interchange import EXPORT_NAMES, exported, read_calibration
     from tvsbayes.report import stereo_calibration_text, stereo_text
     from tvsbayes.rigs import STEREO_PARAMETER_NAMES, stereo_bytes
 
+    beside = Path() if out is None else out.parent
+    for path in [*([] if out is None else [out]), *(beside / name for name in EXPORT_NAMES.get(export or "", ()))]:
+        if os.path.lexists(path):
+            # Asked before the pictures are read, which takes minutes. Fits stand on a calibration by its hash.
+            remedy = "name another file, or move this one away; nothing is overwritten"
+            place = escaped(str(path), 200)
+            raise refusal("occupied", file=place, found="a file that is there", allowed="a new file", remedy=remedy)
     if imports:
         unit_mm = {"mm": 1.0, "m": 1000.0}[import_unit]
         found = read_calibration(imports, _image_size(image_size), unit_mm=unit_mm)
-        pair, text = found.stereo, "\n".join([stereo_text(found.stereo), *(f"note: {note}" for note in found.notes)])
+        remarks = [*(f"note: {note}" for note in found.notes), *(f"warning: {warning}" for warning in found.warnings)]
+        pair, text = found.stereo, "\n".join([stereo_text(found.stereo), *remarks])
         sds = [float(variance) ** 0.5 for variance in pair.parameter_covariance.diagonal()]
         values = zip(STEREO_PARAMETER_NAMES, pair.vector.tolist(), sds, strict=True)
         document: dict[str, Any] = {
             **{"source": found.source, "image_width": pair.image_width, "image_height": pair.image_height},
             "parameters": {name: {"value": value, "sd": sd} for name, value, sd in values},
-            **{"rms_px": pair.rms_px, "assumed": pair.assumed, "warnings": list(found.notes)},
+            **{"rms_px": pair.rms_px, "assumed": pair.assumed, "warnings": [*found.notes, *found.warnings]},
         }
     else:
         from tvsbayes.device.boards import Board
@@ -363,7 +378,6 @@ def stereo(
         document = {"source": "pictures", **result.as_json()}
     files = {} if out is None else {"stereo": (out, stereo_bytes(pair))}
     if export:
-        beside = Path() if out is None else out.parent
         files |= {name: (beside / name, data) for name, data in exported(pair, export).items()}
     for path, data in files.values():
         write_atomically(path, data)
@@ -499,6 +513,9 @@ def acquire(
         outcome = run_plan(instrument, steps, out, **options, say=report_line, show=line.show, ask=line.ask)
     document = {"campaign": str(out), **outcome.as_json()}
     text = f"{escaped(str(out), 200)}: {outcome.reason}, {outcome.ok} of {outcome.looks} looks count"
+    if outcome.references:
+        planned = outcome.looks - outcome.references
+        text += f" ({planned} of the plan, {outcome.references} reference looks of resumed runs)"
     _finish(document, "\n".join([text, *(f"warning: {warning}" for warning in outcome.warnings)]), as_json)
     if outcome.reason in ("interrupted", "declined"):
         report_line(f"{outcome.reason}; go on with --resume")

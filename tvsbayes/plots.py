@@ -36,6 +36,8 @@ BLACK, ORANGE, SKY, GREEN, BLUE, RED, PURPLE, GREY = (
 )
 OF_ESTIMATOR = {"nominal": (GREY, "s"), "classic": (RED, "^"), "joint": (BLUE, "o")}
 """Colour and marker of each estimator in every figure."""
+SMALLEST_SHARE = 0.005
+"""Of a variance, that has a bar of its own."""
 DIVERGING, SEQUENTIAL = (BLUE, "#FFFFFF", RED), ("#FFFFFF", SKY, BLUE, "#00263E")
 """Colours of maps, from the lowest to the highest value."""
 RASTER_DPI = 150
@@ -90,39 +92,6 @@ def _measured(campaign: Campaign) -> tuple[list[Spot], np.ndarray]:
     spots = [spot for spot in campaign.spots if spot.status == "ok"]
     pixels = np.array([(s.u_left_px, s.v_left_px, s.u_right_px, s.v_right_px) for s in spots], dtype=float)
     return spots, triangulate(campaign.stereo, pixels.reshape(-1, 4))
-
-
-def spot_overlay(
-    image: np.ndarray,
-    centre_px: tuple[float, float],
-    u_px: tuple[float, float],
-    *,
-    contour_px: np.ndarray | None = None,
-    half_width_px: int = 24,
-) -> Figure:
-    """A detected spot on its frame, enlarged (paper, Figure 9).
-
-    Args:
-        image: frame (height, width, 3), uint8, blue, green, red.
-        centre_px: centroid (u, v), raw pixels.
-        u_px: its standard uncertainties; drawn ten times enlarged.
-        contour_px: (n, 2) outline of the segmented region, where the method has one.
-        half_width_px: of the part that is shown.
-    """
-    u, v = centre_px
-    with _figure(4.2) as figure:
-        axes = figure.add_subplot()
-        axes.imshow(image[..., ::-1], interpolation="nearest")
-        if contour_px is not None:
-            closed = np.vstack([contour_px, contour_px[:1]])
-            axes.plot(*closed.T, color=GREEN, linewidth=1.5, label="segmented region")
-        bars = {"xerr": 10 * u_px[0], "yerr": 10 * u_px[1]}
-        axes.errorbar(u, v, **bars, fmt="+", color=RED, markersize=10, label="centroid, 10 u")
-        axes.set(xlim=(u - half_width_px, u + half_width_px), ylim=(v + half_width_px, v - half_width_px))
-        axes.set(xlabel="u, px", ylabel="v, px", title=f"centroid ({u:.2f}, {v:.2f}) px")
-        axes.grid(False)
-        figure.legend(loc="outside lower center", ncols=2)
-    return figure
 
 
 def _experiment(campaign: Campaign, experiment: int) -> tuple[np.ndarray, str, int]:
@@ -422,10 +391,10 @@ def _cells(axes: Axes, x: np.ndarray, y: np.ndarray, values: np.ndarray, dark_ab
                 axes.text(xx, yy, f"{value:.3g}", **style)
 
 
-def shares(budget: Budget, smallest: float = 0.005) -> Figure:
-    """Shares of a point's variance by cause, largest first; what is below `smallest` is one bar."""
+def shares(budget: Budget) -> Figure:
+    """Shares of a point's variance by cause, largest first; what is below `SMALLEST_SHARE` is one bar."""
     order = np.argsort(-budget.share)
-    kept = [k for k in order if budget.share[k] >= smallest]
+    kept = [k for k in order if budget.share[k] >= SMALLEST_SHARE]
     names = [budget.causes[k] for k in kept]
     values = [100 * budget.share[k] for k in kept]
     rest = 100 - sum(values)

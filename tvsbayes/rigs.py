@@ -127,6 +127,10 @@ _STEREO_KEYS = (
 _ENTRY_MAX = 1e12
 _ROTATION_TOLERANCE = 1e-6
 _EIGENVALUE_TOLERANCE = 1e-8
+PRINCIPAL_SHARE_MAX = 0.25
+"""Share of the image's width or height by which a principal point may miss its middle before it is worth a word."""
+ASPECT_SHARE_MAX = 0.05
+"""The same of fx / fy from 1: pixels of today's sensors are square."""
 
 
 def _array(keys: Keys, key: str, *shapes: tuple[int, ...]) -> np.ndarray:
@@ -249,6 +253,37 @@ def stereo_bytes(stereo: Stereo) -> bytes:
     data = ("{\n" + ",\n".join(lines) + "\n}\n").encode()
     parse_stereo(data, "stereo.json")
     return data
+
+
+def pair_doubts(stereo: Stereo) -> tuple[str, ...]:
+    """What contradicts two cameras beside each other that look at one scene, in words; empty where nothing does.
+
+    No refusal: mirrors, cropped images and lenses off their axes exist. Seen are cameras exchanged, an image size that
+    belongs to other pictures, pixels far from square.
+    """
+    doubts = []
+    # Where the second camera stands, in axes of the first: x to the right, as columns of a picture grow.
+    right_mm = -float(stereo.R[:, 0] @ stereo.T)
+    if right_mm < 0:
+        doubts.append(
+            f"the second camera stands {-right_mm:.4g} mm to the left of the first (x_right = R x_left + T with T_x = "
+            f"{stereo.T[0]:+.4g} mm): are left and right swapped?"
+        )
+    size_px = stereo.image_width, stereo.image_height
+    for side, matrix in (("left", stereo.M1), ("right", stereo.M2)):
+        centre_px = float(matrix[0, 2]), float(matrix[1, 2])
+        point = f"the {side} principal point ({centre_px[0]:.0f}, {centre_px[1]:.0f}) px"
+        # Integer = centre of a pixel: the image reaches from -0.5 to its size - 0.5.
+        if not all(-0.5 <= c <= n - 0.5 for c, n in zip(centre_px, size_px, strict=True)):
+            doubts.append(f"{point} lies outside the image of {size_px[0]} x {size_px[1]} px: is that its size?")
+        elif any(abs(c - (n - 1) / 2) > PRINCIPAL_SHARE_MAX * n for c, n in zip(centre_px, size_px, strict=True)):
+            doubts.append(
+                f"{point} is far from the middle of the image of {size_px[0]} x {size_px[1]} px: is that its size?"
+            )
+        fx, fy = float(matrix[0, 0]), float(matrix[1, 1])
+        if abs(fx / fy - 1) > ASPECT_SHARE_MAX:
+            doubts.append(f"the {side} fx and fy differ by {100 * abs(fx / fy - 1):.0f} %: pixels are seldom so oblong")
+    return tuple(doubts)
 
 
 def write_stereo(stereo: Stereo, path: Path) -> None:

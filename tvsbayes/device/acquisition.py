@@ -107,6 +107,8 @@ class Outcome:
         looks: looks of this campaign, of all its runs.
         ok: how many of them count.
         refused: how many found no usable spot.
+        references: how many of `looks` are none of the plan's: resumed runs look again at spots seen before. They
+            count as any other.
         retries: looks repeated in this run.
         lost_segments: segments in which steps were lost.
         warnings: what the user should know.
@@ -116,6 +118,7 @@ class Outcome:
     looks: int
     ok: int
     refused: int
+    references: int
     retries: int
     lost_segments: tuple[int, ...]
     warnings: tuple[str, ...]
@@ -127,6 +130,7 @@ class Outcome:
             "looks": self.looks,
             "ok": self.ok,
             "refused": self.refused,
+            "references": self.references,
             "retries": self.retries,
             "lost_segments": list(self.lost_segments),
             "warnings": list(self.warnings),
@@ -350,7 +354,9 @@ class Acquisition:
         ok = sum(spot.status == "ok" for spot in spots)
         waiting = sum(spot.status == "undetected" for spot in spots)
         lost = tuple(segment for segment, _ in done.lost)
-        return Outcome(reason, len(spots), ok, len(spots) - ok - waiting, self._retries, lost, tuple(self._warnings))
+        refused = len(spots) - ok - waiting
+        beside = done.references, self._retries
+        return Outcome(reason, len(spots), ok, refused, *beside, lost, tuple(self._warnings))
 
     def _run(self) -> str:
         if not self.operator.accept(HAZARD):

@@ -16,7 +16,8 @@ from __future__ import annotations
 import os
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any, Protocol
@@ -41,6 +42,8 @@ STREAM_TIMEOUT_MS = 5_000
 VIEWER_TIMEOUT_S = 10.0
 """A viewer of the virtual camera that takes nothing for so long has gone."""
 JPEG_QUALITY = 97
+FFMPEG_QUIET = "-8"
+"""FFmpeg's AV_LOG_QUIET."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,6 +134,29 @@ def open_capture(source: str | int) -> Capture:
         remedy = "check [cameras] in the rig file, the cable, and that no other program has the camera"
         raise DeviceFault("camera", f"camera {escaped(str(source))} cannot be opened; {remedy}", remedy=remedy)
     return capture
+
+
+@contextmanager
+def _quiet_opencv() -> Iterator[None]:
+    """OpenCV and its FFmpeg write no warnings to stderr meanwhile: what fails is raised, with a remedy.
+
+    Whoever has set their variables OPENCV_LOG_LEVEL or OPENCV_FFMPEG_LOGLEVEL wants to read them. FFmpeg's is read
+    once, at the first stream that a process opens, and stays.
+    """
+    import cv2
+
+    logging = cv2.utils.logging
+    before = None if "OPENCV_LOG_LEVEL" in os.environ else logging.setLogLevel(logging.LOG_LEVEL_SILENT)
+    ffmpeg = "OPENCV_FFMPEG_LOGLEVEL" not in os.environ
+    if ffmpeg:
+        os.environ["OPENCV_FFMPEG_LOGLEVEL"] = FFMPEG_QUIET
+    try:
+        yield
+    finally:
+        if ffmpeg:
+            os.environ.pop("OPENCV_FFMPEG_LOGLEVEL", None)
+        if before is not None:
+            logging.setLogLevel(before)
 
 
 class OpenCVCamera:
@@ -305,15 +331,16 @@ def open_cameras(
         remedy = "give source = ... (side by side), or left = ... and right = ..."
         raise InputError("cameras", "[cameras] of the rig file names no cameras", column="cameras", remedy=remedy)
     captures: list[Capture] = []
-    try:
-        for key in ("left", "right") if pair else ("source",):
-            captures.append(opener(table[key]))
-    except BaseException:
-        for capture in captures:
-            capture.release()
-        raise
     exposure = float(table["exposure"]) if "exposure" in table else None
-    return OpenCVCamera(captures, width, height, exposure, clock)
+    with _quiet_opencv():
+        try:
+            for key in ("left", "right") if pair else ("source",):
+                captures.append(opener(table[key]))
+        except BaseException:
+            for capture in captures:
+                capture.release()
+            raise
+        return OpenCVCamera(captures, width, height, exposure, clock)
 
 
 @dataclass
@@ -367,11 +394,12 @@ class VirtualCamera:
                 """Requests are no news."""
 
         self._stop.clear()
+        self._server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
+        self._server.daemon_threads = False
+        # Behind the bind, which may fail: then nobody would put it back.
         # FFmpeg, which OpenCV opens the address with, asks the proxy of the environment even for this computer.
         self._no_proxy = os.environ.get("no_proxy")
         os.environ["no_proxy"] = ",".join(filter(None, (self._no_proxy, "127.0.0.1")))
-        self._server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
-        self._server.daemon_threads = False
         self._thread = threading.Thread(target=self._server.serve_forever, args=(0.05,), daemon=True)
         self._thread.start()
         return self

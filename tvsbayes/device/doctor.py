@@ -18,7 +18,7 @@ import numpy as np
 
 from tvsbayes.device.acquisition import StopKey
 from tvsbayes.device.camera import StereoCamera, StereoImage, open_cameras
-from tvsbayes.device.driver import Clock, SerialPositioner, device_settings, serial_opener, serial_ports
+from tvsbayes.device.driver import SEE_DOCTOR, Clock, SerialPositioner, device_settings, serial_opener, serial_ports
 from tvsbayes.device.journal import Disk
 from tvsbayes.device.protocol import FIRMWARE_VERSION
 from tvsbayes.device.session import BAUD
@@ -159,7 +159,8 @@ def _opener(rig: Rig) -> Callable[[], SerialPositioner] | None:
 
 
 def _failed(name: str, error: TvsError) -> Check:
-    return Check(name, "fault", error.found or error.message, error.remedy or "see the message")
+    found = error.found or error.message.removesuffix(f"; {error.remedy}")
+    return Check(name, "fault", found, error.remedy.removesuffix(SEE_DOCTOR) or "see the message")
 
 
 def _positioner(

@@ -415,7 +415,9 @@ class SerialPositioner:
             )
 
 
-_PORT_REMEDY = "check [positioner] port in the rig file, the cable and your rights on the port; see `tvsbayes doctor`"
+SEE_DOCTOR = "; see `tvsbayes doctor`"
+"""Ends a remedy; `doctor` leaves it out of its own."""
+_PORT_REMEDY = "check [positioner] port in the rig file, the cable and your rights on the port" + SEE_DOCTOR
 _REFUSALS = {
     "limit": "the target lies outside the soft limits: correct the plan or [positioner] in the rig file",
     "unhomed": "home first",

@@ -20,7 +20,7 @@ from typing import Literal
 import numpy as np
 
 from tvsbayes.files import NUMBER, InputError, Keys, decode, escaped, read_bytes, refusal, shown
-from tvsbayes.rigs import Stereo, parse_stereo, rotation_matrix, rotation_vector, stereo_bytes
+from tvsbayes.rigs import Stereo, pair_doubts, parse_stereo, rotation_matrix, rotation_vector, stereo_bytes
 
 YAML_BYTES_MAX = 4 * 1024 * 1024
 YAML_ENTRIES_MAX = 200_000
@@ -48,15 +48,28 @@ ASSUMED_TRANSLATION = 0.02
 ASSUMED_RMS_PX = 0.5
 
 Format = Literal["opencv", "ros"]
+EXPORT_NAMES: dict[Format, tuple[str, str]] = {
+    "opencv": ("intrinsics.yml", "extrinsics.yml"),
+    "ros": ("left.yaml", "right.yaml"),
+}
+"""The files of an export."""
 
 
 @dataclass(frozen=True)
 class Imported:
-    """A calibration of another tool: `source` is opencv, ros, kalibr or tvsbayes; `notes` say what was assumed."""
+    """A calibration of another tool.
+
+    Attributes:
+        stereo: the pair, mm and px.
+        source: opencv, ros, kalibr or tvsbayes.
+        notes: what was assumed.
+        warnings: what makes it implausible (`pair_doubts`).
+    """
 
     stereo: Stereo
     source: str
     notes: tuple[str, ...]
+    warnings: tuple[str, ...]
 
 
 def assumed_covariance(stereo: Stereo) -> np.ndarray:
@@ -373,7 +386,7 @@ def read_calibration(paths: Sequence[Path], size: tuple[int, int] | None = None,
     names = [escaped(Path(path).name) for path in paths]
     if len(paths) == 1 and Path(paths[0]).suffix.lower() == ".json":
         stereo = parse_stereo(read_bytes(paths[0], YAML_BYTES_MAX), names[0])
-        return Imported(stereo, "tvsbayes", ())
+        return Imported(stereo, "tvsbayes", (), pair_doubts(stereo))
     files = [parse_yaml(read_bytes(path, YAML_BYTES_MAX), name) for path, name in zip(paths, names, strict=True)]
     if any("cam0" in keys for keys in files):
         if len(files) != 1:
@@ -391,7 +404,7 @@ def read_calibration(paths: Sequence[Path], size: tuple[int, int] | None = None,
         remedy = "a pair needs R and T between its cameras: calibrate both together"
         raise refusal("format", file=names[0], found=found, allowed=allowed, remedy=remedy)
     notes.append("its uncertainty is assumed, and pessimistic: calibrate from pictures for a true one")
-    return Imported(stereo, source, tuple(notes))
+    return Imported(stereo, source, tuple(notes), pair_doubts(stereo))
 
 
 def _opencv_text(matrices: Mapping[str, np.ndarray], numbers: Mapping[str, int]) -> bytes:
@@ -432,10 +445,10 @@ def exported(stereo: Stereo, form: Format) -> dict[str, bytes]:
         inner = {"M1": stereo.M1, "D1": stereo.D1[None], "M2": stereo.M2, "D2": stereo.D2[None]}
         outer = {"R": stereo.R, "T": stereo.T[:, None], "R1": R1, "R2": R2, "P1": P1, "P2": P2, "Q": Q}
         sizes = {"image_width": size[0], "image_height": size[1]}
-        return {"intrinsics.yml": _opencv_text(inner, sizes), "extrinsics.yml": _opencv_text(outer, {})}
+        return dict(zip(EXPORT_NAMES[form], (_opencv_text(inner, sizes), _opencv_text(outer, {})), strict=True))
     files = {}
     cameras = (("left", stereo.M1, stereo.D1, R1, P1), ("right", stereo.M2, stereo.D2, R2, P2))
-    for name, matrix, distortion, turn, projection in cameras:
+    for file, (name, matrix, distortion, turn, projection) in zip(EXPORT_NAMES[form], cameras, strict=True):
         in_metres = projection.copy()
         in_metres[:, 3] /= M_TO_MM
         matrices = {
@@ -444,5 +457,5 @@ def exported(stereo: Stereo, form: Format) -> dict[str, bytes]:
             "rectification_matrix": turn,
             "projection_matrix": in_metres,
         }
-        files[f"{name}.yaml"] = _ros_text(name, size, matrices)
+        files[file] = _ros_text(name, size, matrices)
     return files

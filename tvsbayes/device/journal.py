@@ -324,8 +324,7 @@ class Journal:
         """
         disk = disk or Disk()
         folder = Path(folder)
-        for part in FRAME_FOLDERS:
-            make_folder(folder / part)
+        make_folder(folder)
         try:
             descriptor = disk.open(folder / LOG, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND)
         except FileExistsError as error:
@@ -334,7 +333,7 @@ class Journal:
         except OSError as error:
             raise _disk_fault(error) from error
         journal = cls(folder, descriptor, Reading((), b"", 0, 0), disk)
-        # The names of the log and the frame folders, and that of the folder itself.
+        # The name of the log, and that of the folder itself.
         journal._dirty |= {folder, folder.absolute().parent}
         try:
             _lock(descriptor)
@@ -392,6 +391,10 @@ class Journal:
         target = self.folder / name
         temporary = target.with_name(f".{target.name}.tmp")
         with self._guarded():
+            # Only for a frame: a run that states centroids leaves no empty folders behind.
+            if not target.parent.is_dir():
+                target.parent.mkdir()
+                self._dirty.add(self.folder)
             descriptor = self._disk.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
             try:
                 self._write(descriptor, data)

@@ -186,14 +186,6 @@ class DeviceModel:
             else:
                 self._step_axis(index)
 
-    @property
-    def next_event_us(self) -> int | None:
-        """When something will happen by itself, None for never; for clocks that jump."""
-        dues = [self._home_due_us] if self._homing else [axis.due_us for axis in self._axes if axis.direction]
-        if self.mechanics.laser_on:
-            dues.append(self._heard_us + self._settings["wd"] * 1000)
-        return min(dues, default=None)
-
     def _take_line(self, line: bytes, now_us: int) -> None:
         if not self._overlong and line.endswith(b"\r"):
             line = line[:-1]

@@ -46,6 +46,7 @@ class Recorded:
         spots: rows of spots.csv.
         next_step: first step of the plan behind the last one that is done.
         looked_steps: steps of the plan whose looks are there; after a repair some before `next_step` may be missing.
+        references: looks beside the plan, with which resumed runs compared what they see with what was seen before.
         target: where the sheet stands, "" before the first placement.
         placements: how often the operator was asked to place it by the plan.
         starts: how often the acquisition was started.
@@ -61,6 +62,7 @@ class Recorded:
     spots: tuple[Spot, ...] = ()
     next_step: int = 0
     looked_steps: frozenset[int] = frozenset()
+    references: int = 0
     target: str = ""
     placements: int = 0
     starts: int = 0
@@ -150,6 +152,8 @@ class Recorder:
             self.spots.append(_spot(data, len(self.moves) - 1))
             if data.get("step") is not None:
                 self._looked.add(int(data["step"]))
+            else:
+                self._change(references=self.state.references + 1)
         if data.get("step") is not None and event in ("homed", "moved", "placed", "looked"):
             self._change(next_step=max(self.state.next_step, int(data["step"]) + 1))
 

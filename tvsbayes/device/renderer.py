@@ -438,9 +438,11 @@ def _board_window(camera: Camera, pose: BoardPose, board: Board) -> tuple[slice,
     return slice(low[1], high[1]), slice(low[0], high[0])
 
 
-def render_board(
-    camera: Camera, pose: BoardPose, board: Board, sensor: Sensor, seed: Sequence[int], shading: float = 0.15
-) -> np.ndarray:
+SHADING = 0.15
+"""Relative fall of the light on a board from the upper left to the lower right corner of the picture."""
+
+
+def render_board(camera: Camera, pose: BoardPose, board: Board, sensor: Sensor, seed: Sequence[int]) -> np.ndarray:
     """One picture of a checkerboard; its corners lie at `camera.project` of the board's corners.
 
     Args:
@@ -449,12 +451,11 @@ def render_board(
         board: the board.
         sensor: the sensor; in visible light its three colours respond alike here.
         seed: whole numbers that name view and camera.
-        shading: relative fall of the light from the upper left to the lower right corner.
     """
     import cv2
 
     light = board_irradiance(camera, pose, board)
-    light *= _ambient(camera.width, camera.height, 1.0, shading)
+    light *= _ambient(camera.width, camera.height, 1.0, SHADING)
     light = cv2.GaussianBlur(light, (0, 0), sensor.blur_px) if sensor.blur_px > 0 else light
     return expose(light, replace(sensor, response=(1.0, 1.0, 1.0)), _stream("board", *seed))
 
@@ -502,23 +503,18 @@ def write_frames(
     simulated: SimulatedCampaign,
     seed: int,
     *,
-    scene: Scene | None = None,
-    sensor: Sensor | None = None,
-    board: Board | None = None,
     views: int | None = None,
     done: Callable[[int, int], None] | None = None,
 ) -> int:
     """Write `frames/{spot:06d}_left.png`, `_right.png` of every look and `boards/left01.png`, `right01.png` ...
 
-    Spots are seen by the true cameras at the laser's wavelength, boards in visible light (focal scale 1).
+    Spots are seen by the true cameras at the laser's wavelength, boards in visible light (focal scale 1). Light and
+    sensors are those of `Scene()` and `Sensor()`, the board is the paper's.
 
     Args:
         folder: the campaign's folder, which exists.
         simulated: what the twin did.
         seed: of speckle, noise and board poses.
-        scene: light; default `Scene()`.
-        sensor: both sensors; default `Sensor()`.
-        board: the checkerboard; default the paper's.
         views: how many board views, by default `BOARD_VIEWS`; 0 writes no `boards/`.
         done: called with the number of pairs written and their total.
 
@@ -528,7 +524,7 @@ def write_frames(
     Raises:
         InputError: the folder cannot be written.
     """
-    scene, sensor, board = scene or Scene(), sensor or Sensor(), board or Board()
+    scene, sensor, board = Scene(), Sensor(), Board()
     views = BOARD_VIEWS if views is None else views
     truth, light = simulated.truth, simulated.light
     infrared = cameras_of(truth.stereo, truth.parameters["focal_scale"])

@@ -165,14 +165,7 @@ def acquire(
     """
     folder = Path(folder)
     check_plan(rig, plan)
-    if laser_class is not None and laser_class.upper() not in LASER_CLASSES:
-        remedy = "read it off the laser's label"
-        raise InputError(
-            "usage", f"laser class {escaped(laser_class)}", allowed=", ".join(LASER_CLASSES), remedy=remedy
-        )
-    if not simulate and laser_class is None and not sys.stdin.isatty():
-        remedy = "run it in a terminal, or state --laser-class"
-        raise InputError("usage", "nobody can be asked about the laser hazard", remedy=remedy)
+    _check_hazard(laser_class, simulate)
     if resume and not (folder / LOG).is_file():
         remedy = "leave --resume out to begin, or name the folder of the interrupted run"
         place = escaped(str(folder / LOG), 200)
@@ -222,7 +215,19 @@ def acquire(
             return acquisition.run()
         finally:
             if instrument is not None:
-                write_truth(folder, rig, instrument)
+                write_truth(folder, instrument)
+
+
+def _check_hazard(laser_class: str | None, simulate: bool) -> None:
+    """Refuses a laser class that there is none of, and a real laser of which nobody can be told."""
+    if laser_class is not None and laser_class.upper() not in LASER_CLASSES:
+        remedy = "read it off the laser's label"
+        raise InputError(
+            "usage", f"laser class {escaped(laser_class)}", allowed=", ".join(LASER_CLASSES), remedy=remedy
+        )
+    if not simulate and laser_class is None and not sys.stdin.isatty():
+        remedy = "run it in a terminal, or state --laser-class"
+        raise InputError("usage", "nobody can be asked about the laser hazard", remedy=remedy)
 
 
 def _utc_now() -> datetime.datetime:
@@ -354,7 +359,7 @@ def _settings_of(folder: Path) -> Campaign:
     return Campaign((), (), stereo, parse_rig_table(keys.table("rig")), parse_header(keys))
 
 
-def write_truth(folder: Path, rig: Rig, instrument: Instrument) -> None:
+def write_truth(folder: Path, instrument: Instrument) -> None:
     """Writes `truth.json`: the true rig, and the true angles of the moves that the journal holds."""
     if not (folder / LOG).is_file():
         return

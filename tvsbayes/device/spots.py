@@ -742,13 +742,7 @@ def detect(
     noise = {side: SpotNoise(speckle_contrast=_contrast(speckle_contrast)) for side in SIDES}
     kept: dict[int, tuple[_Patch | str, _Patch | str]] = {}
     if method == "fit":
-        pilots = [present[k] for k in np.unique(np.linspace(0, len(present) - 1, PILOTS_MAX).astype(int))]
-
-        def patches(row: int) -> tuple[_Patch | str, _Patch | str]:
-            spot = campaign.spots[row]
-            return _patch(frames.read(spot, "left")), _patch(frames.read(spot, "right"))
-
-        kept = dict(zip(pilots, _parallel(patches, pilots, workers), strict=True))
+        kept = _pilots(campaign.spots, present, frames, workers)
         for number, side in enumerate(SIDES):
             found = [pair[number] for pair in kept.values() if not isinstance(pair[number], str)]
             noise[side] = _learned([one for one in found if one.clipped_share <= CLIPPED_SHARE_MAX], speckle_contrast)
@@ -784,19 +778,8 @@ def detect(
             if skews:
                 table = np.vstack(skews)
                 noise[side] = learn_noise(table[:: -(-len(table) // SKEWS_MAX)], speckle_contrast)
-    spots, good = list(campaign.spots), []
-    for row, found in zip(present, pairs, strict=True):
-        left, right = (one.under(noise[side]) for side, one in zip(SIDES, found, strict=True))
-        spots[row] = _row(spots[row], left, right)
-        if spots[row].status == "ok":
-            good.append((row, np.concatenate((left.centre_px, right.centre_px)), left, right))
-    covariances = np.zeros((len(good), 4, 4))
-    for place, (_, _, left, right) in enumerate(good):
-        covariances[place, :2, :2], covariances[place, 2:, 2:] = left.covariance_px2, right.covariance_px2
-    pixels = np.array([entry[1] for entry in good]).reshape(-1, 4)
-    for place in np.flatnonzero(epipolar_refused(pixels, covariances, stereo)):
-        row = good[place][0]
-        spots[row] = replace(spots[row], status="epipolar")
+    seen = [(left.under(noise["left"]), right.under(noise["right"])) for left, right in pairs]
+    spots = _rows(campaign.spots, present, seen, stereo)
     after = [spots[row] for row in present]
     stated = [s.su_left_px for s in after if s.status == "ok"] + [s.su_right_px for s in after if s.status == "ok"]
     return Detection(
@@ -809,6 +792,37 @@ def detect(
         noise=noise,
         median_sd_px=float(np.median(stated)) if stated else None,
     )
+
+
+def _pilots(
+    spots: Sequence[Spot], present: Sequence[int], frames: _Frames, workers: int
+) -> dict[int, tuple[_Patch | str, _Patch | str]]:
+    """Left and right patch, or why there is none, of looks spread evenly over the campaign, by row of spots.csv."""
+    rows = [present[k] for k in np.unique(np.linspace(0, len(present) - 1, PILOTS_MAX).astype(int))]
+
+    def patches(row: int) -> tuple[_Patch | str, _Patch | str]:
+        return _patch(frames.read(spots[row], "left")), _patch(frames.read(spots[row], "right"))
+
+    return dict(zip(rows, _parallel(patches, rows, workers), strict=True))
+
+
+def _rows(
+    spots: Sequence[Spot], present: Sequence[int], seen: Sequence[tuple[Centre, Centre]], stereo: Stereo
+) -> list[Spot]:
+    """All rows of spots.csv, those in `present` with what was seen (left, right); off their epipolar line: refused."""
+    spots, good = list(spots), []
+    for row, (left, right) in zip(present, seen, strict=True):
+        spots[row] = _row(spots[row], left, right)
+        if spots[row].status == "ok":
+            good.append((row, left, right))
+    pixels, covariances = np.zeros((len(good), 4)), np.zeros((len(good), 4, 4))
+    for place, (_, left, right) in enumerate(good):
+        pixels[place] = *left.centre_px, *right.centre_px
+        covariances[place, :2, :2], covariances[place, 2:, 2:] = left.covariance_px2, right.covariance_px2
+    for place in np.flatnonzero(epipolar_refused(pixels, covariances, stereo)):
+        row = good[place][0]
+        spots[row] = replace(spots[row], status="epipolar")
+    return spots
 
 
 def _ours(status: str) -> bool:
@@ -831,10 +845,15 @@ def _learned(patches: Sequence[_Patch], speckle_contrast: float | None) -> SpotN
     return noise
 
 
-def _overlay(picture: np.ndarray, centre: Centre, half: int = 32, zoom: int = 8) -> np.ndarray:
+OVERLAY_HALF_PX, OVERLAY_ZOOM = 32, 8
+"""Half the side of the square that an overlay shows, and how many of its pixels show one."""
+
+
+def _overlay(picture: np.ndarray, centre: Centre) -> np.ndarray:
     """The surroundings of a spot enlarged: outline green, centre red, the reason of a refusal in words (Figure 9)."""
     import cv2
 
+    half, zoom = OVERLAY_HALF_PX, OVERLAY_ZOOM
     height, width = picture.shape[:2]
     middle = centre.centre_px
     if middle is None:

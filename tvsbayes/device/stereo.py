@@ -29,7 +29,7 @@ from tvsbayes.device.boards import SIDES, Board, Finder, View, Views, find_views
 from tvsbayes.files import NotConverged, NothingToEstimate, escaped
 from tvsbayes.joint import least_squares_covariance, levenberg_marquardt, residuals_and_jacobian
 from tvsbayes.model import CV_FROM_S, StereoCameras, project, rotation_matrix
-from tvsbayes.rigs import STEREO_PARAMETER_NAMES, Stereo, rotation_vector
+from tvsbayes.rigs import STEREO_PARAMETER_NAMES, Stereo, pair_doubts, rotation_vector
 from tvsbayes.rigs import rotation_matrix as rotation_of
 
 VIEWS_MIN = 3
@@ -423,18 +423,6 @@ class StereoCalibration:
 
 
 @dataclass(frozen=True)
-class CameraCalibration:
-    """One camera alone: fx fy cx cy k1 k2 p1 p2 k3 and their covariance for independent corners (9, 9)."""
-
-    vector: np.ndarray
-    covariance: np.ndarray
-    rms_px: float
-    noise_sd_px: float
-    dof: int
-    correlation_factor: float
-
-
-@dataclass(frozen=True)
 class _CameraStart:
     """Zhang's solution for one camera: matrix, distortion, and a pose (6,) for every view that it saw."""
 
@@ -487,32 +475,6 @@ def _relative(start: Sequence[_CameraStart]) -> tuple[np.ndarray, np.ndarray]:
             remedy="name the pictures of one moment alike: left01.png and right01.png",
         )
     return rotation_vector(np.median(rotations, axis=0)), np.median(translations, axis=0)
-
-
-def calibrate_camera(
-    corners: Sequence[np.ndarray], board: Board, size: tuple[int, int], *, fix_k3: bool = False
-) -> CameraCalibration:
-    """One camera by itself, through the same adjustment as a pair.
-
-    Args:
-        corners: per view (corners, 2), px.
-        board: whose corners they are.
-        size: image width and height, px.
-        fix_k3: keep k3 at 0.
-
-    Raises:
-        NothingToEstimate: too few views, or they do not determine the camera.
-        NotConverged: no minimum was found.
-    """
-    start = _camera_start(dict(enumerate(corners)), board, size, "only", fix_k3)
-    free = np.arange(24) < 9
-    free[8] = not fix_k3
-    vector = np.concatenate([start.vector, start.vector, np.zeros(6)])
-    views = [View(str(k), c, None) for k, c in enumerate(corners)]
-    done = bundle_adjustment(views, board, vector, np.array([start.poses[k] for k in range(len(corners))]), free)
-    rms = math.sqrt(float(np.nansum(done.residuals_px**2)) / (len(corners) * board.corners))
-    noise = done.noise_sd_px, done.dof, done.correlation_factor
-    return CameraCalibration(done.vector[:9], done.covariance[:9, :9], rms, *noise)
 
 
 def calibrate_stereo(
@@ -581,7 +543,7 @@ def calibrate_stereo(
         correlation_factor=done.correlation_factor,
         covariance_independent=done.covariance,
         covariance_pitch=pitch,
-        coverage={side: _coverage([getattr(v, side) for v in views], board, size) for side in SIDES},
+        coverage={side: _coverage([getattr(v, side) for v in views], size) for side in SIDES},
         triangulated_pitch_mm=_triangulated_pitch(views, board, stereo),
         found=found,
         excluded=tuple(excluded),
@@ -688,7 +650,7 @@ def _view_reports(
         yield ViewReport(view.name, *rms, float(np.linalg.norm(pose[3:])), tilt, bool(outlier))
 
 
-def _coverage(corners: Sequence[np.ndarray | None], board: Board, size: tuple[int, int]) -> float:
+def _coverage(corners: Sequence[np.ndarray | None], size: tuple[int, int]) -> float:
     """Share of the image inside the outline of a board in at least one view."""
     scale = 256 / max(size)
     mask = np.zeros([max(1, round(s * scale)) for s in size[::-1]], np.uint8)
@@ -742,16 +704,7 @@ def _plausibility(result: StereoCalibration, poses: Sequence[np.ndarray]) -> lis
             f"corners miss by {result.noise_sd_px:.2f} px (one coordinate); 0.1 to 0.2 is usual: look for blur, "
             "pictures not of one moment, a bent board, or a lens that five coefficients do not describe"
         )
-    size, vector = (result.stereo.image_width, result.stereo.image_height), result.stereo.vector
-    for side, (fx, fy, cx, cy) in zip(SIDES, (vector[0:4], vector[9:13]), strict=True):
-        if not (0.2 * size[0] < cx < 0.8 * size[0] and 0.2 * size[1] < cy < 0.8 * size[1]):
-            warnings.append(f"the {side} principal point ({cx:.0f}, {cy:.0f}) px is far from the image's middle")
-        if abs(fx / fy - 1) > 0.05:
-            warnings.append(
-                f"the {side} fx and fy differ by {100 * abs(fx / fy - 1):.0f} %: pixels are seldom so oblong"
-            )
-    if result.stereo.T[0] > 0:
-        warnings.append("the right camera stands to the left of the left one: are the pictures swapped?")
+    warnings += pair_doubts(result.stereo)
     mean, sd = result.triangulated_pitch_mm
     if abs(mean / result.board.pitch_mm - 1) > 0.01:
         warnings.append(f"triangulated squares measure {mean:.3f} mm (sd {sd:.3f}), not {result.board.pitch_mm:g}")
