@@ -227,6 +227,8 @@ def test_swapped_cameras_are_suspected(paper_twin):
 def test_lengths_in_metres_and_angles_in_radians_are_suspected(paper_twin):
     metres = replace(paper_twin.stereo, T=paper_twin.stereo.T / 1000)
     assert "is it in metres?" in warnings_of(replace(paper_twin, stereo=metres))
+    reversed_pair = replace(paper_twin.stereo, T=-paper_twin.stereo.T)
+    assert "second camera" in warnings_of(replace(paper_twin, stereo=reversed_pair))
     grid = read_campaign(shipped_data() / "twins" / "grid_twin")
     for change, words in (
         (np.radians, "are they in radians?"),

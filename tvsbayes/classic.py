@@ -24,7 +24,7 @@ import numpy as np
 
 from tvsbayes.campaign import APPROACH_SIGN, Campaign, Move, Spot
 from tvsbayes.files import NothingToEstimate
-from tvsbayes.rigs import Stereo
+from tvsbayes.rigs import Stereo, pair_doubts
 
 DIRECTIONS = ("left", "right", "up", "down")
 PIXELS = attrgetter("u_left_px", "v_left_px", "u_right_px", "v_right_px")
@@ -549,6 +549,7 @@ def implausible(campaign: Campaign) -> tuple[str, ...]:
         found.append(f"spots {_listed(stray)} are undetected and have pixels, which nothing uses: ok, or refused?")
     if not ok:
         return tuple(found)
+    found += pair_doubts(campaign.stereo)
     baseline_mm = float(np.linalg.norm(campaign.stereo.T))
     if baseline_mm < SHORTEST_BASELINE_MM:
         found.append(f"T of stereo.json is {baseline_mm:.3g} mm long: is it in metres? Lengths are mm")
