@@ -815,6 +815,14 @@ FAULTS = (
         ("gap.py::test_the_larger_of_two_gross_defects_is_the_cause",),
     ),
     Fault(
+        "ratios that follow a backlash the wrong way",
+        "posterior.py",
+        "step[:, place + 1 :] += self._beyond_linear",
+        "step[:, place + 1 :] -= self._beyond_linear",
+        "the sampler leaves the ridge of ratio and backlash, and calls itself unconverged",
+        ("posterior_laws.py::test_a_ratio_follows_the_degrees_of_a_backlash",),
+    ),
+    Fault(
         "robust distance by the weight alone",
         "likelihood.py",
         "covariance + (weight[len(values)] - 1) * np.eye(4)",

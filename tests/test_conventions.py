@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from tvsbayes import calibration, certificate, coordinates
+from tvsbayes import calibration, classic
 from tvsbayes.likelihood import aperture_angle, observe
 from tvsbayes.model import (
     INDEX,
@@ -214,5 +214,4 @@ def test_95_percent_are_two_sided_and_normal():
     """GUM 6.2 and table G.1: k = 1.96. Quantiles of the standard library, whatever the package takes them from."""
     exact = NormalDist().inv_cdf(0.975)
     assert calibration.NORMAL_95 == pytest.approx(exact, rel=1e-9)
-    for factor in (coordinates.coverage_factor(0.95), certificate.coverage_factor(np.inf, 0.95)):
-        assert factor == pytest.approx(exact, rel=1e-9)
+    assert classic.coverage_factor(np.inf) == pytest.approx(exact, rel=1e-9)

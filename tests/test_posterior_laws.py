@@ -11,6 +11,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from scipy import stats
 
 from tvsbayes import posterior
 from tvsbayes.model import INDEX, NAMES
@@ -42,6 +43,26 @@ def route() -> Transport:
         stretch=STRETCH * np.array([[[0.0, node] for node in STRETCH_NODES]]),
         **{name: np.zeros(shape) for name, shape in empty.items()},
     )
+
+
+def test_a_ratio_follows_the_degrees_of_a_backlash():
+    """Along the ridge of both the ratio is linear in b, and b = halfnorm.ppf(Phi(z)) by SciPy's own law."""
+    at = 0.4
+    mode = np.zeros(len(NAMES))
+    mode[BACKLASH] = at
+    ridge = replace(route(), mode=mode, root=np.array([[1.2, 0.0], [-0.6, 0.05]]))
+    y = np.column_stack([np.linspace(-3.0, 3.0, 13), np.zeros(13)])
+    z = ridge.from_whitened(y)
+
+    def play(z):
+        return stats.halfnorm.ppf(stats.norm.cdf(z))
+
+    np.testing.assert_allclose(z[:, BACKLASH], at + 1.2 * y[:, 0], rtol=1e-12)
+    slope = (play(at + 1e-5) - play(at - 1e-5)) / 2e-5
+    # A central difference of 1e-5 is good to 1e-10 of the slope, SciPy's two laws to 1e-12.
+    np.testing.assert_allclose(z[:, RATIO], -0.5 * (play(z[:, BACKLASH]) - play(at)) / slope, atol=1e-8)
+    apart = ridge.from_whitened(y + [0.0, 1.0]) - z
+    np.testing.assert_allclose(apart[:, RATIO], 0.05, rtol=1e-9)
 
 
 def fit() -> SimpleNamespace:

@@ -36,7 +36,7 @@ from tvsbayes.calibration import SIDES
 from tvsbayes.campaign import input_hashes
 from tvsbayes.classic import DIRECTIONS
 from tvsbayes.files import InputError, NotConverged, escaped, read_arrays, write_atomically
-from tvsbayes.joint import Derived, JointFit, derived_quantities, linear_spots
+from tvsbayes.joint import BACKLASHES, Derived, JointFit, derived_quantities, linear_spots
 from tvsbayes.likelihood import (
     LinearSpots,
     evaluate,
@@ -75,7 +75,7 @@ HEAVY_DOF = 5.0
 HEAVY_SHARE = 0.1
 """Share of the proposals from a multivariate t: it bounds the ratio target / proposal in the tails. In fifty
 dimensions a t alone puts most draws off the shell where the target lives: effective draws fell threefold."""
-HEAVY_NAMES = (*NOISE_NAMES, "backlash_deg.pan", "backlash_deg.tilt")
+HEAVY_NAMES = (*NOISE_NAMES, *BACKLASHES)
 """Coordinates that few stops tell: their tails are heavier than normal (a walker stood still for 155 steps at 3.7 sd
 of a stop sd), so each of them is always proposed from a t of its own."""
 INFLATION = 1.03
@@ -109,6 +109,11 @@ class Mapped:
 
     z: np.ndarray
     log_jacobian: np.ndarray
+
+
+def half_normal(z: np.ndarray) -> np.ndarray:
+    """A half-normal quantity by its coordinate z, in units of its scale (DESIGN 4.1; NumPy beside `ParameterSpace`)."""
+    return -special.ndtri(0.5 * special.ndtr(-np.asarray(z)))
 
 
 @dataclass(frozen=True)
@@ -181,10 +186,34 @@ class Transport:
             state_score=self.state_score[:0],
         )
 
+    @property
+    def curved(self) -> np.ndarray:
+        """Places in `free` of coordinates whose physical value is no linear function of z over a posterior's width."""
+        return np.flatnonzero(np.isin(np.array(NAMES)[self.free], BACKLASHES))
+
+    def _beyond_linear(self, place: int, step: np.ndarray) -> np.ndarray:
+        """What steps of the z at a place (n,) move its physical value beyond the line at the mode, in units of z."""
+        at = self.mode[self.free[place]]
+        ahead, here = half_normal(at + step), half_normal(at)
+        # d(half_normal)/dz by the densities of both normals.
+        slope = np.exp(0.5 * (here**2 - at**2)) / 2
+        return (ahead - here) / slope - step
+
+    def _follow(self, place: int) -> np.ndarray:
+        """How far the places behind one follow a unit step of its z, shape (d - place - 1,)."""
+        return self.root[place + 1 :, place] / self.root[place, place]
+
     def from_whitened(self, y: np.ndarray) -> np.ndarray:
-        """From y (n, d) to z (n, p)."""
+        """From y (n, d) to z (n, p).
+
+        What follows a backlash follows its degrees, not its z: along a ridge as wide as the prior the line in z is
+        wrong by more than a ratio's width. Each place moves later ones only: no volume changes.
+        """
+        step = y @ self.root.T
+        for place in self.curved:
+            step[:, place + 1 :] += self._beyond_linear(place, step[:, place])[:, None] * self._follow(place)
         z = np.repeat(self.mode[None], len(y), axis=0)
-        z[:, self.free] += y @ self.root.T
+        z[:, self.free] += step
         return z
 
     def _quadratic(self, noise: np.ndarray) -> Quadratic:
@@ -247,7 +276,11 @@ class Transport:
 
     def to_w(self, z: np.ndarray) -> np.ndarray:
         """From z (n, p) to w (n, d); the inverse of `mapped` on the sampled columns."""
-        y = np.linalg.solve(self.root, (z - self.mode)[:, self.free].T).T
+        step = (z - self.mode)[:, self.free]
+        linear = step.copy()
+        for place in self.curved:
+            linear[:, place + 1 :] -= self._beyond_linear(place, step[:, place])[:, None] * self._follow(place)
+        y = np.linalg.solve(self.root, linear.T).T
         straight = y.copy()
         for place, form in zip(self.narrow, self.bend, strict=True):
             before = y[:, :place]
@@ -566,7 +599,7 @@ def pilot(target: Target, seed: int) -> Pilot:
     return Pilot(proposal, start, log_weights)
 
 
-CHAIN_FORMAT = "tvsbayes-chain/3"
+CHAIN_FORMAT = "tvsbayes-chain/4"
 CHAIN_BYTES_MAX = 2**32
 """A chain is the user's own file: what was in memory when it was written fits there again."""
 POSTERIOR_FORMAT = "tvsbayes-posterior/1"
