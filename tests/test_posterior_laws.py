@@ -61,7 +61,7 @@ def test_a_ratio_follows_the_degrees_of_a_backlash():
     slope = (play(at + 1e-5) - play(at - 1e-5)) / 2e-5
     # A central difference of 1e-5 is good to 1e-10 of the slope, SciPy's two laws to 1e-12.
     np.testing.assert_allclose(z[:, RATIO], -0.5 * (play(z[:, BACKLASH]) - play(at)) / slope, atol=1e-8)
-    apart = ridge.from_whitened(y + [0.0, 1.0]) - z
+    apart = ridge.from_whitened(y + np.array([0.0, 1.0])) - z
     np.testing.assert_allclose(apart[:, RATIO], 0.05, rtol=1e-9)
 
 
