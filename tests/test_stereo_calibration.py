@@ -116,7 +116,7 @@ def test_pitch_is_a_separable_type_b_term(study):
 
 
 def test_opencv_pairs(pairs, pairs_calibration):
-    """Issue 5: 13 of 13 pairs, stereo RMS at most 0.22 px; research/vision.md: |T| and the square."""
+    """13 of 13 pairs, stereo RMS at most 0.22 px; research/vision.md: |T| and the square."""
     c = pairs_calibration
     assert [view.name for view in c.views] == [f"{k:02d}" for k in (*range(1, 10), *range(11, 15))]
     assert c.pairs == 13
@@ -131,7 +131,7 @@ def test_opencv_pairs(pairs, pairs_calibration):
 
 @pytest.mark.parametrize("side", ("left", "right"))
 def test_single_camera_agrees_with_opencv(pairs, side):
-    """Issue 5: sds within 5 % of cv2.calibrateCameraExtended, from the same corners with the same model.
+    """Standard deviations within 5 % of cv2.calibrateCameraExtended, from the same corners with the same model.
 
     The adjustment of a pair of which the left camera alone has views and free parameters.
     """

@@ -71,7 +71,7 @@ def test_reference_values_are_the_papers():
 
 
 def test_paper_twin_reproduces_table_1():
-    """Each mean within one standard error of the Table's, each sd within 20 % (issue 2)."""
+    """Each mean within one standard error of the Table's, each sd within 20 %."""
     result = classic(twin("paper_twin"))
     assert len(result.experiments) == 96 and result.skipped == ()
     for direction, (mean, sd, n) in table_1().items():

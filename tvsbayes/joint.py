@@ -4,11 +4,12 @@ Annealed Levenberg-Marquardt for geometry and stereo, alternating with the noise
 full log density and the inverse Hessian there. Everything happens in the coordinates of `tvsbayes.model`
 (prior N(0, 1) each); results are handed out in the units of DESIGN 8: deg, mm, px, rad where a name says so.
 
-First the solvers: least squares through optimistix with the checks that a success flag does not make, Newton steps,
-Laplace draws. `LevenbergMarquardt` reports success on wrong answers at loose tolerances (research/statistics.md
-section 1): a result counts as converged only if its scaled gradient is small and a restart from a perturbed point
-returns. Residuals are dimensionless (already divided by their standard deviations) or in the data's unit, as the
-caller chose; the covariance follows that choice. float64 throughout.
+First the solvers: least squares through optimistix, Newton steps, Laplace draws. `LevenbergMarquardt` reports success
+on wrong answers at loose tolerances (research/statistics.md section 1), so nobody believes its flag: `fit` goes on
+with Newton steps on the density and judges the step that is left; `device/stereo` judges its own; whoever has
+residuals of another kind calls `solve_least_squares`, which asks for a small scaled gradient and for the same end from
+a perturbed start (NIST's certified problems in the tests). Residuals are dimensionless (already divided by their
+standard deviations) or in the data's unit, as the caller chose; the covariance follows that choice. float64 throughout.
 """
 
 from __future__ import annotations
