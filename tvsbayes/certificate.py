@@ -533,8 +533,8 @@ def positioning(
             reading_u = float(np.sqrt(np.mean(readings.u_deg**2)))
         if plug_in is not None:
             notes.append(
-                "plug-in: s and B hold what moved over the campaign beside stop errors: pixel noise, home offsets, drift, "
-                "and what unequal ratios of the two directions add up to; maxima of few runs are too large"
+                "plug-in: s and B hold what moved over the campaign beside stop errors: pixel noise, home offsets, "
+                "drift, and what unequal ratios of the two directions add up to; maxima of few runs are too large"
             )
             fewest = min(min(pair) for pair in counts)
             if len(steps) < wanted or fewest < RUNS:
