@@ -225,7 +225,7 @@ def demo(
 
 @app.command()
 def new(out: Annotated[Path, typer.Argument(metavar="OUT", help="Folder to create.")], as_json: Json = False) -> None:
-    """An empty campaign, explained in its campaign.toml, and a rig file. Fill them, or plan and simulate with the rig."""
+    """An empty campaign, explained in campaign.toml, and a rig file. Fill them, or plan and simulate with the rig."""
     make_folder(out, empty=True)
     templates = sorted((shipped_data() / "templates").iterdir())
     for template in templates:
