@@ -305,7 +305,7 @@ def correlations(names: Sequence[str], matrix: np.ndarray) -> Figure:
         for row in range(count):
             for column in range(count):
                 shade = "white" if abs(matrix[row, column]) > 0.8 else "black"
-                text = f"{100 * matrix[row, column]:.0f}"
+                text = f"{round(100 * matrix[row, column])}"
                 axes.text(column, row, text, ha="center", va="center", fontsize=8, color=shade)
         axes.set(xticks=range(count), yticks=range(count), yticklabels=names, title="correlation, %")
         axes.set_xticklabels(names, rotation=60, ha="right", rotation_mode="anchor")
