@@ -492,13 +492,14 @@ def acquire(
     from tvsbayes.rigs import read_rig
 
     instrument, steps = read_rig(rig), read_plan(plan)
-    from tvsbayes.device.acquisition import check_plan, outline, seconds_of
+    from tvsbayes.device.acquisition import check_plan, outline
     from tvsbayes.device.session import LiveLine
     from tvsbayes.device.session import acquire as run_plan
+    from tvsbayes.simulation import plan_seconds
 
     if dry_run:
         check_plan(instrument, steps)
-        lines, minutes = outline(instrument, steps), seconds_of(instrument, steps) / 60
+        lines, minutes = outline(instrument, steps), plan_seconds(instrument, steps) / 60
         document: dict[str, Any] = {"steps": lines, "minutes": minutes}
         _finish(document, "\n".join([*lines, f"{len(lines)} steps, about {minutes:.0f} min"]), as_json)
         return
@@ -546,7 +547,7 @@ def doctor(
     faults = [c for c in checks if c.status == "fault"]
     error = None
     if faults:
-        message = f"{len(faults)} faults: {', '.join(c.name for c in faults)}"
+        message = f"{len(faults)} fault{'s' * (len(faults) > 1)}: {', '.join(c.name for c in faults)}"
         error = DeviceFault("doctor", message, remedy=faults[0].remedy)
     _finish({"checks": [c.as_json() for c in checks]}, "\n".join(lines), as_json, error)
 

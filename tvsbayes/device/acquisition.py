@@ -39,7 +39,7 @@ from tvsbayes.device.record import (
 )
 from tvsbayes.files import DeviceFault, TvsError, escaped, refusal
 from tvsbayes.rigs import Rig
-from tvsbayes.simulation import plan_seconds as seconds_of
+from tvsbayes.simulation import plan_seconds
 
 ATTEMPTS_PER_LOOK = 3
 PLACEMENTS_MAX = 3
@@ -651,7 +651,7 @@ class Acquisition:
                 sum(s.action == "look" for s in self.plan),
                 sum(spot.status not in ("ok", "undetected") for spot in spots),
                 self._retries,
-                seconds_of(self.rig, left),
+                plan_seconds(self.rig, left),
                 doing,
                 "" if self._estimate is None or self._estimate.latest is None else self._estimate.latest.text,
             )
