@@ -163,6 +163,11 @@ def known_calibration(draws: int = 50, **changed: float) -> Calibration:
     )
 
 
+def up_and_down(*arguments, **options) -> tuple[np.ndarray, np.ndarray]:
+    found = simulated_runs(*arguments, **options)
+    return found.up_deg, found.down_deg
+
+
 def test_an_ideal_axis_has_no_error_and_play_is_its_reversal():
     ideal = positioning(known_calibration(), "pan", tests=20)
     assert ideal.deg_per_step == pytest.approx(0.06, rel=1e-9)
@@ -185,7 +190,7 @@ def test_a_wrong_ratio_is_a_systematic_deviation_over_the_targets():
 def test_unequal_ratios_carry_every_run_on():
     """K up = k + c/2, k down = k - c/2 (DESIGN 3.1): a cycle over travel L gains c L; by hand, step for step."""
     c, targets, runs = 1e-4, (0, 100, 200), 3
-    up, down = simulated_runs(
+    up, down = up_and_down(
         known_calibration(), "pan", targets, 0.06, runs=runs, tests=1, contrast_deg_per_step=np.full(50, c)
     )
     q = 0.06 * targets[0]
@@ -210,7 +215,7 @@ def test_a_run_on_a_bent_rig_is_the_twins(period_deg):
     )
     targets, beyond = (-60, 20, 90, 160, 250), 40
     for axis, name in enumerate(("pan", "tilt")):
-        up, down = simulated_runs(one, name, targets, 0.06, runs=2, tests=1)
+        up, down = up_and_down(one, name, targets, 0.06, runs=2, tests=1)
         path = [-60 - beyond, *(2 * [*targets, 250 + beyond, *targets[::-1], -60 - beyond])]
         first = np.arange(len(path)) == 0
         # The other axis: its counters' middle, in mid-play.
@@ -236,7 +241,7 @@ def test_a_run_on_a_bent_rig_is_the_twins(period_deg):
 
 def test_stop_errors_scatter_runs_by_side():
     sds = {"stop_sd_deg.left": 0.2, "stop_sd_deg.right": 0.05}
-    up, down = simulated_runs(known_calibration(**sds), "pan", (0, 50, 100, 200), 0.06, runs=5, tests=500)
+    up, down = up_and_down(known_calibration(**sds), "pan", (0, 50, 100, 200), 0.06, runs=5, tests=500)
     count = up.size
     # 1e-4 bounds of the standard deviation of `count` normal numbers; the chain is 1:1.
     for values, sd in ((up, 0.2), (down, 0.05)):
@@ -255,7 +260,7 @@ def test_the_predicted_interval_holds_a_test_on_the_true_rig():
     interval = table.predicted["reversal_deg"].interval95
     fresh = inputs.copy()
     fresh[:, INPUT_NAMES.index("backlash_deg.pan")] = np.abs(rng.normal(0.3, 0.05, rigs))
-    up, down = simulated_runs(replace(base, inputs=fresh), "pan", (0, 50, 100, 150), 0.06, tests=rigs, seed=9)
+    up, down = up_and_down(replace(base, inputs=fresh), "pan", (0, 50, 100, 150), 0.06, tests=rigs, seed=9)
     values = iso230(up, down).reversal_deg
     held = np.count_nonzero((values >= interval[0]) & (values <= interval[1]))
     # Binomial(300, 0.95) at 1e-4 either side, widened by the interval's own error of 0.4 % in probability.

@@ -380,6 +380,18 @@ def target_steps(low: float, high: float, deg_per_step: float, seed: int = 0) ->
     return tuple(found) if len(found) >= TARGETS_MIN else ()
 
 
+@dataclass(frozen=True)
+class Runs:
+    """Deviations of the runs of a test from their target angles, deg, by the side from which targets are approached.
+
+    Attributes:
+        up_deg, down_deg: arrays (m, n) or (tests, m, n) of m targets and n runs; not a number where a run is missing.
+    """
+
+    up_deg: np.ndarray
+    down_deg: np.ndarray
+
+
 def simulated_runs(
     calibration: Calibration,
     axis: str,
@@ -390,7 +402,7 @@ def simulated_runs(
     tests: int = SIMULATED_TESTS,
     contrast_deg_per_step: np.ndarray | None = None,
     seed: int = 0,
-) -> tuple[np.ndarray, np.ndarray]:
+) -> Runs:
     """Deviations of ISO 230-2 test cycles on the rigs that the data allow.
 
     A test is homed once at a turn-round point below the targets; each run goes up through them, turns round above
@@ -410,7 +422,7 @@ def simulated_runs(
         seed: of the stop errors.
 
     Returns:
-        (up, down), each of shape (tests, m, runs), deg.
+        Arrays of shape (tests, m, runs).
     """
     rows = np.linspace(0, len(calibration.inputs) - 1, tests).astype(int)
     values = {name: calibration.inputs[rows, k, None, None] for k, name in enumerate(INPUT_NAMES)}
@@ -432,13 +444,20 @@ def simulated_runs(
         mirror = output_deg(values, axis, counted, side, calibration.period_deg.get(axis))
         error = generator.standard_normal((tests, len(steps), runs)) * noise[f"stop_sd_deg.{name}"]
         result.append(_beam_deg(values, axis, mirror + error, other_deg) - deg_per_step * steps)
-    return result[0], result[1]
+    return Runs(*result)
 
 
-def _plug_in(
-    readings: StopReadings, deg_per_step: float, wanted: int
-) -> tuple[Positioning | None, tuple[int, ...], tuple[tuple[int, int], ...], str | None]:
-    """Figures of the campaign's stops: (figures, targets, runs, reason why there are none)."""
+@dataclass(frozen=True)
+class _PlugIn:
+    """Figures of the campaign's own stops, their targets and runs from either side, or why there are none."""
+
+    figures: Positioning | None
+    steps: tuple[int, ...] = ()
+    runs: tuple[tuple[int, int], ...] = ()
+    missing: str | None = None
+
+
+def _plug_in(readings: StopReadings, deg_per_step: float, wanted: int) -> _PlugIn:
     runs = {
         int(n): [np.flatnonzero((readings.steps == n) & (readings.side == s)) for s in (1, -1)]
         for n in np.unique(readings.steps)
@@ -450,7 +469,7 @@ def _plug_in(
             f"{both} of the {readings.axis} axis with at least {RUNS_MIN} stops from either side; {TARGETS_MIN} "
             f"are needed, ISO 230-2 asks for {wanted} with {RUNS} runs"
         )
-        return None, (), (), reason
+        return _PlugIn(None, missing=reason)
     other = readings.reference_pose_deg[1 - AXES.index(readings.axis)]
     deviation = _beam_deg(readings.values, readings.axis, readings.mirror_deg, other) - deg_per_step * readings.steps
     longest = max(len(rows) for pair in usable.values() for rows in pair)
@@ -459,7 +478,7 @@ def _plug_in(
         for side, rows in enumerate(pair):
             table[side, k, : len(rows)] = deviation[rows]
     counts = tuple((len(a), len(b)) for a, b in usable.values())
-    return iso230(table[0], table[1]), tuple(usable), counts, None
+    return _PlugIn(iso230(table[0], table[1]), tuple(usable), counts)
 
 
 def positioning(
@@ -508,7 +527,7 @@ def positioning(
     chosen = target_steps(low, high, ratio, seed) if targets is None else tuple(map(int, targets))
     predicted = None
     if chosen:
-        up, down = simulated_runs(
+        drawn = simulated_runs(
             calibration,
             axis,
             chosen,
@@ -518,28 +537,28 @@ def positioning(
             contrast_deg_per_step=contrast_deg_per_step,
             seed=seed,
         )
-        found = iso230(up, down)
+        found = iso230(drawn.up_deg, drawn.down_deg)
         predicted = {}
         for name in FIGURES:
             lower, middle_value, upper = np.quantile(getattr(found, name), [0.025, 0.5, 0.975])
             predicted[name] = Predicted(float(middle_value), (float(lower), float(upper)))
-    plug_in, steps, counts, missing = None, (), (), "no stops were given"
+    own = _PlugIn(None, missing="no stops were given")
     notes = [INDIRECT]
     reading_u = None
     if readings is not None:
         wanted = targets_wanted((high - low) * ratio)
-        plug_in, steps, counts, missing = _plug_in(readings, ratio, wanted)
+        own = _plug_in(readings, ratio, wanted)
         if len(readings.u_deg):
             reading_u = float(np.sqrt(np.mean(readings.u_deg**2)))
-        if plug_in is not None:
+        if own.figures is not None:
             notes.append(
                 "plug-in: s and B hold what moved over the campaign beside stop errors: pixel noise, home offsets, "
                 "drift, and what unequal ratios of the two directions add up to; maxima of few runs are too large"
             )
-            fewest = min(min(pair) for pair in counts)
-            if len(steps) < wanted or fewest < RUNS:
+            fewest = min(min(pair) for pair in own.runs)
+            if len(own.steps) < wanted or fewest < RUNS:
                 notes.append(
-                    f"plug-in: {len(steps)} targets, at least {fewest} runs per side; ISO 230-2 asks for "
+                    f"plug-in: {len(own.steps)} targets, at least {fewest} runs per side; ISO 230-2 asks for "
                     f"{wanted} targets and {RUNS} runs"
                 )
         if readings.play_left_out:
@@ -559,11 +578,11 @@ def positioning(
         target_steps=chosen,
         runs=runs,
         estimator=calibration.estimator,
-        plug_in=plug_in,
-        plug_in_steps=steps,
-        plug_in_runs=counts,
+        plug_in=own.figures,
+        plug_in_steps=own.steps,
+        plug_in_runs=own.runs,
         reading_u_deg=reading_u,
-        missing=missing,
+        missing=own.missing,
         notes=(*notes, *(f"not covered: {text}" for text in NOT_COVERED)),
     )
 
