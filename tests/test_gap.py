@@ -431,6 +431,25 @@ def test_false_alarms_of_causes_stay_rare():
             assert stats.kstest(p, "uniform").pvalue > 1e-4, name
 
 
+def test_depths_are_not_sorted_by_the_noise_that_they_share():
+    """Triangulated depth and deviation come from the same pixels: inside a placement they are correlated."""
+    generator = np.random.default_rng(12)
+    noise = generator.standard_normal(120)
+    sheets_mm = np.repeat([175.0, 275.0, 375.0], 40)
+    rows = [
+        StopResidual("pan", (k,), k, "left", 100, (depth + 0.5 * e,), (), 10.0 * k, 0.03 * e, 0.03)
+        for k, (depth, e) in enumerate(zip(sheets_mm, noise, strict=True))
+    ]
+    (depth,) = (c for c in residual_causes(rows) if (c.name, c.axis) == ("depth", "pan"))
+    assert [g.count for g in depth.groups] == [40, 40, 40] and not depth.suspicious
+    # One placement is not tested; an oblique sheet that reaches far is, in bins far wider than the noise.
+    (near,) = (c for c in residual_causes(rows[:40]) if (c.name, c.axis) == ("depth", "pan"))
+    assert len(near.groups) == 1 and near.p is None
+    oblique = [replace(r, depth_mm=(200.0 + r.steps,)) for r in rows]
+    (far,) = (c for c in residual_causes(oblique) if (c.name, c.axis) == ("depth", "pan"))
+    assert len(far.groups) == 6 and far.p is not None
+
+
 @pytest.mark.parametrize("backwards", [False, True])
 def test_recursive_residuals_are_independent_and_standard(backwards):
     """Any common value, unlike variances: the n - 1 numbers have the unit matrix for covariance, by linear algebra."""

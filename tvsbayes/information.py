@@ -17,7 +17,14 @@ from scipy import special, stats
 
 from tvsbayes.calibration import CONTRACTION_LIMIT, INPUT_NAMES, NORMAL_95, Calibration, calibration_of_draws
 from tvsbayes.campaign import Move
-from tvsbayes.classic import DIRECTIONS, four_point_ratios, observed_stops, select_experiments, separation
+from tvsbayes.classic import (
+    DIRECTIONS,
+    SHALLOW,
+    four_point_ratios,
+    observed_stops,
+    select_experiments,
+    separation,
+)
 from tvsbayes.joint import Derived, JointFit, linear_spots
 from tvsbayes.likelihood import StopGroup, ordered_spots, standard_deviations_without, stop_information
 from tvsbayes.model import INDEX, KINDS, NAMES, NOISE_NAMES, RECEIVER_NAMES, RIG_NAMES
@@ -717,6 +724,8 @@ def calibration_of(fit: JointFit, posterior: Posterior | None = None, *, seed: i
 
 
 CAUSE_BINS = 6
+PLACEMENT_GAP = 1.03
+"""Ratio of two neighbouring depths that belong to different placements: ten times the noise of a depth of 0.3 %."""
 CAUSE_LIMIT = 0.01
 """Probability, all tests of a campaign together, with which clean residuals are called dependent on a cause."""
 STEP_PHASES = 4
@@ -872,7 +881,7 @@ def residual_causes(residuals: Sequence[StopResidual]) -> tuple[Cause, ...]:
         "step phase": lambda r: f"n mod {STEP_PHASES} = {r.steps % STEP_PHASES}",
         "time": lambda r: r.time_s,
     }
-    units = {"depth": " mm", "N": " steps", "time": " s"}
+    units = {"N": " steps", "time": " s"}
     found = []
     for axis in ("pan", "tilt"):
         mine = [r for r in residuals if r.axis == axis]
@@ -887,7 +896,7 @@ def residual_causes(residuals: Sequence[StopResidual]) -> tuple[Cause, ...]:
         tested |= {name: ([key(r) for r in mine], scaled) for name, key in keys.items()}
         for name, (values, measured) in tested.items():
             groups, members = [], []
-            for label, rows in _binned(values, units.get(name, "")):
+            for label, rows in _placed(values) if name == "depth" else _binned(values, units.get(name, "")):
                 part = measured[rows]
                 spread = float(part.std(ddof=1)) if len(part) > 1 else 1.0
                 groups.append(CauseGroup(label, len(part), float(part.mean()), spread / np.sqrt(len(part))))
@@ -897,6 +906,21 @@ def residual_causes(residuals: Sequence[StopResidual]) -> tuple[Cause, ...]:
             found.append(Cause(name, axis, tuple(groups), p, False))
     tests = sum(cause.p is not None for cause in found)
     return tuple(replace(c, suspicious=c.p is not None and c.p * tests < CAUSE_LIMIT) for c in found)
+
+
+def _placed(depths_mm: Sequence[float]) -> list[tuple[str, np.ndarray]]:
+    """Groups of depths that pixel noise cannot mix: placements of the sheet, or bins of depths that reach far.
+
+    A depth is triangulated from the pixels that also give the deviation: groups inside one placement would sort the
+    stops by their own noise.
+    """
+    array = np.array(depths_mm)
+    order = np.argsort(array, kind="stable")
+    gaps = np.flatnonzero(array[order][1:] > PLACEMENT_GAP * array[order][:-1]) + 1
+    if len(gaps) >= CAUSE_BINS or (not len(gaps) and array.max(initial=0.0) > SHALLOW * array.min(initial=np.inf)):
+        return _binned(depths_mm, " mm")
+    groups = [rows for rows in np.split(order, gaps) if len(rows)]
+    return [(f"{array[rows].min():.4g} to {array[rows].max():.4g} mm", np.sort(rows)) for rows in groups]
 
 
 def _binned(values: Sequence[float | str], unit: str) -> list[tuple[str, np.ndarray]]:
