@@ -242,7 +242,7 @@ LINES = (
         joint_coverage,
     ),
     Line(
-        "The sampled 95 % interval holds it also there",
+        "The sampled 95 % interval holds it in the paper's protocol",
         "python experiments/posterior_coverage.py run --n 24 --protocols paper --cores 0 1",
         "posterior_coverage.jsonl",
         sampled_coverage,

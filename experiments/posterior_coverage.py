@@ -1,6 +1,6 @@
 """Do the sampled intervals hold the truth, and what do both estimators do with data that break the model?
 
-    python experiments/posterior_coverage.py run --n 24 --cores 0 1        # about 10 min per rig and core, resumable
+    python experiments/posterior_coverage.py run --n 24 --cores 0 1        # 1 to 6 min per rig and core, resumable
     python experiments/posterior_coverage.py broken --n 60 --cores 0 1     # 7 s per rig and core, resumable
     python experiments/posterior_coverage.py table > experiments/posterior_coverage.md
 
