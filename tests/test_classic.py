@@ -266,9 +266,12 @@ def test_a_step_out_of_the_lens_model_is_shortened():
 
     covariance = np.zeros((24, 24))
     covariance[0, 0] = 1.0
-    # Halved to less than the distance 0.01, a difference quotient of the root is up to a sixth off; here at most 6 %.
-    assert stereo_variance(function, make_stereo(covariance), 0.0) == pytest.approx(25.0, rel=0.25)
-    assert stereo_variance(function, make_stereo(0 * covariance), 0.01) == pytest.approx(25.0, rel=0.25)
+    # 0.1 halved four times is the first step below the distance 0.01: its difference quotient by hand, 6 % off.
+    step = 0.1 / 16
+    slope = (np.sqrt(0.01 - step) - np.sqrt(0.01 + step)) / (2 * step)
+    assert slope == pytest.approx(-5.0, rel=0.06)
+    assert stereo_variance(function, make_stereo(covariance), 0.0) == pytest.approx(slope**2, rel=1e-9)
+    assert stereo_variance(function, make_stereo(0 * covariance), 0.01) == pytest.approx(slope**2, rel=1e-9)
 
 
 def _changed(campaign: Campaign, row: int, **changes) -> Campaign:

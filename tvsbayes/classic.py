@@ -23,7 +23,7 @@ from operator import attrgetter
 import numpy as np
 
 from tvsbayes.campaign import APPROACH_SIGN, Campaign, Move, Spot
-from tvsbayes.files import NothingToEstimate
+from tvsbayes.files import NothingToEstimate, listed
 from tvsbayes.rigs import Stereo, pair_doubts
 
 DIRECTIONS = ("left", "right", "up", "down")
@@ -528,42 +528,48 @@ class CampaignCheck:
         return {"kind": "campaign", **asdict(self), "warnings": list(self.warnings)}
 
 
-def _depths_mm(campaign: Campaign, spots: Sequence[Spot]) -> np.ndarray:
-    return triangulate(campaign.stereo, np.array([PIXELS(spot) for spot in spots]))[:, 0]
+def _depths_mm(campaign: Campaign) -> np.ndarray:
+    """X of the usable spots, frame S; not a number where no undistorted point is seen."""
+    pixels = np.array([PIXELS(spot) for spot in campaign.spots if spot.status == "ok"], dtype=float)
+    return triangulate(campaign.stereo, pixels.reshape(-1, 4))[:, 0]
 
 
-def _listed(spots: Sequence[int]) -> str:
-    more = f" and {len(spots) - SPOTS_LISTED} more" if len(spots) > SPOTS_LISTED else ""
-    return ", ".join(map(str, spots[:SPOTS_LISTED])) + more
+def _can_stand(depths_mm: np.ndarray) -> np.ndarray:
+    return (depths_mm > NEAREST_SHEET_MM) & (depths_mm < FARTHEST_SHEET_MM)
 
 
-def implausible(campaign: Campaign) -> tuple[str, ...]:
-    """What no rig can have measured: wrong units, swapped cameras, words that miss their spelling."""
+def implausible(campaign: Campaign, depths_mm: np.ndarray | None = None) -> tuple[str, ...]:
+    """What no rig can have measured: wrong units, swapped cameras, words that miss their spelling.
+
+    Args:
+        campaign: a campaign that its reader accepted.
+        depths_mm: of its usable spots, where they are known already.
+    """
+    depths_mm = _depths_mm(campaign) if depths_mm is None else depths_mm
+    few = partial(listed, most=SPOTS_LISTED)
     ok = [spot for spot in campaign.spots if spot.status == "ok"]
     found = []
     misspelt = [s.spot for s in campaign.spots if s.status != "ok" and s.status.strip().lower() == "ok"]
     if misspelt:
-        found.append(f"spots {_listed(misspelt)} are left out: their status is not spelt ok, in small letters")
+        found.append(f"spots {few(misspelt)} are left out: their status is not spelt ok, in small letters")
     stray = [s.spot for s in campaign.spots if s.status == "undetected" and s.u_left_px is not None]
     if stray:
-        found.append(f"spots {_listed(stray)} are undetected and have pixels, which nothing uses: ok, or refused?")
+        found.append(f"spots {few(stray)} are undetected and have pixels, which nothing uses: ok, or refused?")
     if not ok:
         return tuple(found)
     found += pair_doubts(campaign.stereo)
     baseline_mm = float(np.linalg.norm(campaign.stereo.T))
     if baseline_mm < SHORTEST_BASELINE_MM:
         found.append(f"T of stereo.json is {baseline_mm:.3g} mm long: is it in metres? Lengths are mm")
-    # Not-a-number (no undistorted point) is implausible as well.
-    depths_mm = _depths_mm(campaign, ok)
-    odd = [s.spot for s, x in zip(ok, depths_mm, strict=True) if not NEAREST_SHEET_MM < x < FARTHEST_SHEET_MM]
+    odd = [spot.spot for spot, can in zip(ok, _can_stand(depths_mm), strict=True) if not can]
     if odd:
         limits = f"{NEAREST_SHEET_MM:g} to {FARTHEST_SHEET_MM:g} mm"
         question = "are left and right swapped, or mismatched?"
-        found.append(f"spots {_listed(odd)} triangulate outside {limits}: {question}")
+        found.append(f"spots {few(odd)} triangulate outside {limits}: {question}")
     readings = {s.spot: s.aperture_deg for s in ok if s.aperture_deg is not None}
     beyond = [spot for spot, reading in readings.items() if not 0 < reading < 180]
     if beyond:
-        found.append(f"aperture readings of spots {_listed(beyond)} lie outside 0 to 180 deg from the baseline")
+        found.append(f"aperture readings of spots {few(beyond)} lie outside 0 to 180 deg from the baseline")
     elif readings and max(readings.values()) < np.pi:
         found.append(f"all aperture readings lie below {np.pi:.2f}: are they in radians? aperture_deg is in degrees")
     return tuple(found)
@@ -592,12 +598,10 @@ def check_campaign(campaign: Campaign) -> CampaignCheck:
     for move in campaign.moves:
         if "unknown" in (move.pan_approach, move.tilt_approach):
             warnings.append(f"segment {move.segment} begins with an unknown approach: its first reversal tells less")
-    odd = implausible(campaign)
-    warnings += odd
-    if ok and not odd:
-        depth_mm = _depths_mm(campaign, ok)
-        if depth_mm.max() < SHALLOW * depth_mm.min():
-            warnings.append("all spots lie at one depth: a second sheet position sharpens ratios threefold")
+    depths_mm = _depths_mm(campaign)
+    warnings += implausible(campaign, depths_mm)
+    if ok and np.all(_can_stand(depths_mm)) and depths_mm.max() < SHALLOW * depths_mm.min():
+        warnings.append("all spots lie at one depth: a second sheet position sharpens ratios threefold")
     if campaign.stereo.assumed:
         warnings.append("the stereo covariance is assumed, not estimated: uncertainties are only as good as it is")
     if not np.any(campaign.stereo.parameter_covariance):

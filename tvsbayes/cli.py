@@ -37,6 +37,8 @@ from tvsbayes.files import (
 )
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from tvsbayes.calibration import Calibration
     from tvsbayes.campaign import Campaign
     from tvsbayes.information import FitSummary
@@ -633,9 +635,10 @@ def fit(
     calibration = calibration_of(result, posterior, seed=seed) if result.converged else None
     draws = posterior.thinned(DRAWS_KEPT) if summary.estimator == "posterior" else None
     usable = posterior if summary.estimator == "posterior" else None
+    physical = (result.draws if draws is None else draws).physical
     files = {
         **write_results(
-            result, summary, folder, seed, calibration, draws, _evidence(result, summary, usable, calibration)
+            result, summary, folder, seed, calibration, draws, _evidence(result, summary, usable, calibration, physical)
         ),
         **more,
     }
@@ -644,14 +647,19 @@ def fit(
 
 
 def _evidence(
-    fit: JointFit, summary: FitSummary, posterior: Posterior | None, calibration: Calibration | None
+    fit: JointFit,
+    summary: FitSummary,
+    posterior: Posterior | None,
+    calibration: Calibration | None,
+    physical: np.ndarray,
 ) -> dict[str, object]:
-    """What `fit.json` holds for reports besides the estimates; without a calibration residuals alone."""
-    import numpy as np
+    """What `fit.json` holds for reports besides the estimates; without a calibration residuals alone.
 
+    `physical` are the draws, in the units of the names, that the calibration's inputs were taken from, row by row.
+    """
     from tvsbayes.certificate import headline_budget, positioning, stop_readings
     from tvsbayes.comparison import explain_gap
-    from tvsbayes.information import DRAWS_KEPT, headline_causes, residual_causes, stop_residuals
+    from tvsbayes.information import headline_causes, residual_causes, stop_residuals
 
     stops = stop_residuals(fit)
     listed = stops[:: -(-len(stops) // RESIDUALS_LISTED) or 1]
@@ -663,8 +671,6 @@ def _evidence(
         # What a model holds fixed has no uncertainty to split.
         budgets = [headline_budget(causes, q, told[q]).as_json() for q in causes.quantities if told[q].sd > 0]
         readings = {axis: stop_readings(fit, axis) for axis in ("pan", "tilt")}
-        # Rows in the order of the calibration's inputs, which are taken from the same draws.
-        physical = np.asarray((fit.draws if posterior is None else posterior.thinned(DRAWS_KEPT)).physical)
         for axis, own in readings.items():
             contrast = physical[:, fit.names.index(f"ratio_contrast_deg_per_step.{axis}")]
             axes.append(positioning(calibration, axis, readings=own, contrast_deg_per_step=contrast).as_json())
@@ -806,7 +812,7 @@ def _fit_document(data: Campaign, folder: Path) -> dict[str, Any]:
     from tvsbayes.report import write_results
 
     summary, calibration = summarise(result), calibration_of(result)
-    evidence = _evidence(result, summary, None, calibration)
+    evidence = _evidence(result, summary, None, calibration, result.draws.physical)
     write_results(result, summary, output_place(folder, "results"), 0, calibration, None, evidence)
     return read_fit(path)
 

@@ -152,6 +152,12 @@ def closest(name: str, names: Iterable[str]) -> str:
     return f"did you mean {near[0]}?" if near else "remove it, or correct the spelling"
 
 
+def listed(numbers: Sequence[int], most: int) -> str:
+    """The first of them, and how many more there are."""
+    more = f" and {len(numbers) - most} more" if len(numbers) > most else ""
+    return ", ".join(map(str, numbers[:most])) + more
+
+
 def other_format(found: str, allowed: Iterable[str]) -> str | None:
     """The remedy for a file of another kind or version of ours; None where it is neither."""
     kind, _, number = found[:100].rpartition("/")

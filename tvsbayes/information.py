@@ -631,7 +631,7 @@ def summarise(fit: JointFit, posterior: Posterior | None = None) -> FitSummary:
         sampling=None if posterior is None else posterior.convergence.as_json(),
         curves=None if usable is None else _curves(usable, moved),
         validation=validate(fit),
-        few_stops=few_stops(fit, moved),
+        few_stops=_few_stops(fit, moved),
     )
 
 
@@ -639,7 +639,7 @@ FEW_STOPS = 12
 """Fewer tell their own scatter so poorly that 1.96 standard deviations of it hold less than 93 % (Student's t)."""
 
 
-def few_stops(fit: JointFit, moved: set[str]) -> dict[str, int]:
+def _few_stops(fit: JointFit, moved: set[str]) -> dict[str, int]:
     """Directions that the campaign moved in and saw fewer than `FEW_STOPS` stops after, with their number."""
     used = {s.move for s in fit.campaign.spots if s.status == "ok" and s.spot not in fit.excluded_spots}
     found = {}

@@ -27,6 +27,7 @@ import numpy as np
 from jax.scipy.special import ndtr, ndtri
 from jaxtyping import Array, Bool, Float, Int
 from platformdirs import user_cache_path
+from scipy import special
 
 from tvsbayes.rigs import FULL_TURN_DEG, RIG_PRIORS, STEREO_PARAMETER_NAMES, RigTable, Stereo
 
@@ -443,6 +444,16 @@ class Model(eqx.Module):
     cameras: StereoCameras
     receiver: Receiver
     noise: Noise
+
+
+def half_normal(z: np.ndarray | float) -> np.ndarray | float:
+    """A half-normal quantity by its coordinate, in units of its scale: `ParameterSpace.physical` in NumPy."""
+    return -special.ndtri(0.5 * special.ndtr(-np.asarray(z)))
+
+
+def half_normal_slope(z: np.ndarray | float) -> np.ndarray | float:
+    """Its derivative by the coordinate, phi(z) / (2 phi(b))."""
+    return 0.5 * np.exp(0.5 * (half_normal(z) ** 2 - np.asarray(z) ** 2))
 
 
 class ParameterSpace(eqx.Module):

@@ -45,7 +45,7 @@ from tvsbayes.likelihood import (
     ordered_spots,
     spot_constants,
 )
-from tvsbayes.model import INDEX, NAMES, NOISE_NAMES
+from tvsbayes.model import INDEX, NAMES, NOISE_NAMES, half_normal, half_normal_slope
 from tvsbayes.rigs import HARMONIC_PRIORS, HOME_SD_DEG, STEREO_PARAMETER_NAMES
 
 BATCH = 32
@@ -110,11 +110,6 @@ class Mapped:
 
     z: np.ndarray
     log_jacobian: np.ndarray
-
-
-def half_normal(z: np.ndarray) -> np.ndarray:
-    """A half-normal quantity by its coordinate z, in units of its scale (DESIGN 4.1; NumPy beside `ParameterSpace`)."""
-    return -special.ndtri(0.5 * special.ndtr(-np.asarray(z)))
 
 
 @dataclass(frozen=True)
@@ -187,7 +182,7 @@ class Transport:
             state_score=self.state_score[:0],
         )
 
-    @property
+    @cached_property
     def curved(self) -> np.ndarray:
         """Places in `free` of coordinates whose physical value is no linear function of z over a posterior's width."""
         return np.flatnonzero(np.isin(np.array(NAMES)[self.free], BACKLASHES))
@@ -195,10 +190,7 @@ class Transport:
     def _beyond_linear(self, place: int, step: np.ndarray) -> np.ndarray:
         """What steps of the z at a place (n,) move its physical value beyond the line at the mode, in units of z."""
         at = self.mode[self.free[place]]
-        ahead, here = half_normal(at + step), half_normal(at)
-        # d(half_normal)/dz by the densities of both normals.
-        slope = np.exp(0.5 * (here**2 - at**2)) / 2
-        return (ahead - here) / slope - step
+        return (half_normal(at + step) - half_normal(at)) / half_normal_slope(at) - step
 
     def _follow(self, place: int) -> np.ndarray:
         """How far the places behind one follow a unit step of its z, shape (d - place - 1,)."""

@@ -38,7 +38,7 @@ from tvsbayes.calibration import CONTRACTION_LIMIT, Calibration, Steps, calibrat
 from tvsbayes.campaign import input_hashes
 from tvsbayes.certificate import FIGURES, traceability
 from tvsbayes.classic import DIRECTIONS, ClassicResult
-from tvsbayes.files import InputError, escaped, make_folder, shipped_data, write_atomically
+from tvsbayes.files import InputError, escaped, listed, make_folder, shipped_data, write_atomically
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -263,9 +263,7 @@ def astray_text(summary: FitSummary) -> str:
 
 def suspect_line(spots: Sequence[int]) -> str:
     """Spots that others foretell badly, at most `SPOTS_LISTED` by their ids."""
-    listed = ", ".join(map(str, spots[:SPOTS_LISTED]))
-    more = f" and {len(spots) - SPOTS_LISTED} more" if len(spots) > SPOTS_LISTED else ""
-    return f"spots that disagree with all others: {listed}{more}"
+    return f"spots that disagree with all others: {listed(spots, SPOTS_LISTED)}"
 
 
 def few_stops_line(few: Mapping[str, int], estimator: str) -> str:

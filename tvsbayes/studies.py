@@ -26,7 +26,7 @@ from typing import BinaryIO, Protocol
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy import special, stats
+from scipy import stats
 
 from tvsbayes.calibration import NORMAL_95
 from tvsbayes.campaign import (
@@ -47,6 +47,8 @@ from tvsbayes.files import InputError, NotConverged, TvsError, escaped, read_byt
 from tvsbayes.joint import JointFit, fit
 from tvsbayes.model import (
     INDEX,
+    half_normal,
+    half_normal_slope,
     use_compilation_cache,
 )
 from tvsbayes.planning import truth_in
@@ -177,7 +179,7 @@ def half_normal_sd(mean: float, sd: float) -> float:
     that no fit has.
     """
     nodes, weights = np.polynomial.hermite_e.hermegauss(48)
-    values = -special.ndtri(0.5 * special.ndtr(-(mean + sd * nodes)))
+    values = half_normal(mean + sd * nodes)
     weights = weights / weights.sum()
     centre = weights @ values
     return float(np.sqrt(weights @ (values - centre) ** 2))
@@ -199,9 +201,7 @@ def predicted_sds(knowledge: Knowledge, fisher: np.ndarray, gradient: np.ndarray
         Shape (q,).
     """
     columns = [INDEX[f"backlash_deg.{axis}"] for axis in ("pan", "tilt")]
-    # db/dz = phi(z) / (2 phi(b)) with b the half-normal's value in its scale.
-    value = -special.ndtri(0.5 * special.ndtr(-z[columns]))
-    slope = 0.5 * np.exp(0.5 * (value**2 - z[columns] ** 2))
+    slope = half_normal_slope(z[columns])
     scale, covariance = np.ones(len(z)), np.eye(len(z))
     for _ in range(ITERATIONS):
         for column, at in zip(columns, slope, strict=True):
