@@ -261,6 +261,9 @@ def test_one_depth_is_named_and_two_are_not(paper_twin):
     near = tuple(replace(s, experiment=None, point=None) for s in paper_twin.spots if s.target == "d1")
     assert "all spots lie at one depth" in warnings_of(replace(paper_twin, spots=near))
     assert "depth" not in warnings_of(paper_twin)
+    # Another warning does not hide it.
+    misspelt = (replace(near[0], status="OK"), *near[1:])
+    assert "all spots lie at one depth" in warnings_of(replace(paper_twin, spots=misspelt))
 
 
 def test_zero_and_assumed_stereo_covariance_are_named(paper_twin):
