@@ -22,11 +22,14 @@ import jax
 import numpy as np
 from arviz_stats.base import array_stats
 
-from tvsbayes.campaign import input_hashes, read_campaign
-from tvsbayes.files import shipped_data
-from tvsbayes.joint import fit
-from tvsbayes.model import NAMES, use_compilation_cache
-from tvsbayes.posterior import Target, pilot, sample, transport
+from tvsbayes.estimators.campaign_arrays import use_compilation_cache
+from tvsbayes.estimators.joint_fit import fit
+from tvsbayes.files.disk import shipped_data
+from tvsbayes.instrument.campaign import input_hashes, read_campaign
+from tvsbayes.instrument.parameters import NAMES
+from tvsbayes.posterior.proposal import Target, pilot
+from tvsbayes.posterior.sampling import sample
+from tvsbayes.posterior.transport import transport
 
 AXES = {"chain_axis": 0, "draw_axis": 1}
 QUANTILES = {"q05": 0.05, "q50": 0.5, "q95": 0.95}

@@ -41,8 +41,8 @@ STATED_PX = 0.08
 
 def drawn_campaign(factor: str, level: float, seed: int):
     """A campaign of a drawn rig with one factor set, and its truth."""
-    from tvsbayes.campaign import four_point_protocol
-    from tvsbayes.simulation import draw_truth, simulate
+    from tvsbayes.instrument.plan import four_point_protocol
+    from tvsbayes.twin.simulated_campaign import draw_truth, simulate
 
     rig = mounted_rig()
     # The rig that `simulate` would draw itself from this seed.
@@ -65,8 +65,8 @@ def drawn_campaign(factor: str, level: float, seed: int):
 def one_campaign(task: tuple[str, float, int, bool]) -> dict[str, object]:
     """Both estimators, or the classic one alone."""
     factor, level, seed, joint = task
-    from tvsbayes.classic import classic
-    from tvsbayes.simulation import effective_deg_per_step
+    from tvsbayes.estimators.four_point import classic
+    from tvsbayes.twin.physics import effective_deg_per_step
 
     campaign, truth = drawn_campaign(factor, level, seed)
     row: dict[str, object] = {"factor": factor, "level": level, "seed": seed, "joint": joint}
@@ -83,10 +83,10 @@ def one_campaign(task: tuple[str, float, int, bool]) -> dict[str, object]:
                 if r is not None
             }
         }
-    from tvsbayes import likelihood
+    from tvsbayes.estimators import campaign_arrays
 
-    likelihood.SMALLEST_BUCKET = 64
-    from tvsbayes.model import use_compilation_cache
+    campaign_arrays.SMALLEST_BUCKET = 64
+    from tvsbayes.estimators.campaign_arrays import use_compilation_cache
 
     use_compilation_cache()
     try:

@@ -45,7 +45,7 @@ CAUSES = ("looks", "cameras", "priors")
 
 def full_turn_plan(looks: int, turn_steps: int = TURN_STEPS):
     """`looks` poses near and a turn later on each of two sheets, from either side of both axes."""
-    from tvsbayes.campaign import OVERSHOOT_STEPS, PlanStep
+    from tvsbayes.instrument.plan import OVERSHOOT_STEPS, PlanStep
 
     # Neighbours differ in tilt, and in eight looks each axis is reached from either side at either end.
     poses = ((0, -90), (200, 90), (70, 90), (140, -90), (200, -90), (0, 90), (140, 90), (70, -90))
@@ -80,8 +80,9 @@ class Worth:
 
 def worth_of(knowledge, fisher: np.ndarray, pose_rad: np.ndarray, spots: int, quantity: str = "worst") -> Worth:
     """Uncertainty and its causes from the information of the looks (p, p)."""
-    from tvsbayes.design import covariance_of, parse_target, sensitivity
-    from tvsbayes.planning import MANY, split_of
+    from tvsbayes.planning.candidates import covariance_of
+    from tvsbayes.planning.limits import MANY, split_of
+    from tvsbayes.planning.target import parse_target, sensitivity
 
     target = parse_target(f"u({quantity}) <= 2e-4 deg/step")
     at = sensitivity(target, knowledge.z, knowledge.space, knowledge.rig.table, pose_rad)
@@ -96,7 +97,7 @@ def worth_of(knowledge, fisher: np.ndarray, pose_rad: np.ndarray, spots: int, qu
 
 def worth_of_plan(knowledge, steps, times: float = 1.0, quantity: str = "worst") -> Worth:
     """The same of a plan, taken `times` times over."""
-    from tvsbayes.design import information_of
+    from tvsbayes.planning.expectation import information_of
 
     found = information_of(steps, knowledge)
     seen = found.expectation.seen
@@ -108,8 +109,10 @@ def worth_of_plan(knowledge, steps, times: float = 1.0, quantity: str = "worst")
 
 def planned_family(knowledge):
     """The planner's order of looks for the worst effective ratio; searched once, then kept."""
-    from tvsbayes.design import DEFAULT_TARGET, LookArrays, candidates, parse_target, sensitivity
-    from tvsbayes.planning import Family, design_family
+    from tvsbayes.planning.candidates import LookArrays, candidates
+    from tvsbayes.planning.forecast import Family
+    from tvsbayes.planning.search import design_family
+    from tvsbayes.planning.target import DEFAULT_TARGET, parse_target, sensitivity
 
     found = candidates(knowledge)
     if not PLANNED.exists():
@@ -125,9 +128,9 @@ def planned_family(knowledge):
 
 def plan_and_rig(name: str):
     """Plan and rig of a point that is checked by refits."""
-    from tvsbayes.campaign import mixed_protocol
-    from tvsbayes.design import prior_knowledge
-    from tvsbayes.rigs import Prior
+    from tvsbayes.instrument.parameters import Prior
+    from tvsbayes.instrument.plan import mixed_protocol
+    from tvsbayes.planning.expectation import prior_knowledge
 
     rig = mounted_rig()
     if name.startswith("mixed"):
@@ -140,13 +143,13 @@ def plan_and_rig(name: str):
 
 def one_row(task: tuple[str, int]) -> dict[str, object]:
     """A row of `tvsbayes study` with the point's name."""
-    from tvsbayes import likelihood
+    from tvsbayes.estimators import campaign_arrays
 
     # As in coverage.py: ordinary fits pad to 512 spots.
-    likelihood.SMALLEST_BUCKET = 96
-    from tvsbayes.design import DEFAULT_TARGET, parse_target
-    from tvsbayes.model import use_compilation_cache
-    from tvsbayes.studies import StudyJob, study_row
+    campaign_arrays.SMALLEST_BUCKET = 96
+    from tvsbayes.estimators.campaign_arrays import use_compilation_cache
+    from tvsbayes.planning.target import DEFAULT_TARGET, parse_target
+    from tvsbayes.studies.study_job import StudyJob, study_row
 
     use_compilation_cache()
     name, index = task
@@ -156,10 +159,10 @@ def one_row(task: tuple[str, int]) -> dict[str, object]:
 
 def table() -> None:
     """Curves, split and refits."""
-    from tvsbayes.campaign import grid_protocol, mixed_protocol, paper_protocol
-    from tvsbayes.design import prior_knowledge
-    from tvsbayes.model import use_compilation_cache
-    from tvsbayes.planning import LADDER
+    from tvsbayes.estimators.campaign_arrays import use_compilation_cache
+    from tvsbayes.instrument.plan import grid_protocol, mixed_protocol, paper_protocol
+    from tvsbayes.planning.expectation import prior_knowledge
+    from tvsbayes.planning.search import LADDER
 
     use_compilation_cache()
     knowledge = prior_knowledge(mounted_rig())
@@ -187,7 +190,7 @@ def table() -> None:
 
 def refits() -> None:
     """RMS error over predicted sd of the points that were refitted."""
-    from tvsbayes.studies import rms_bounds
+    from tvsbayes.statistics.intervals import rms_bounds
 
     print("\n## Refits\n")
     if not read_rows(ROWS):
@@ -215,7 +218,7 @@ def draw(curves: Mapping[str, list[Worth]]) -> None:
     from matplotlib import rc_context
     from matplotlib.figure import Figure
 
-    from tvsbayes.plots import BLUE, GREEN, ORANGE, PURPLE, RED, STYLE, WIDTH_IN
+    from tvsbayes.report.figures import BLUE, GREEN, ORANGE, PURPLE, RED, STYLE, WIDTH_IN
 
     with rc_context(STYLE):
         figure = Figure(figsize=(WIDTH_IN, 5.6), layout="constrained")
@@ -239,8 +242,8 @@ def main() -> None:
     arguments = parser.parse_args()
     if arguments.action == "table":
         return table()
-    from tvsbayes.design import prior_knowledge
-    from tvsbayes.model import use_compilation_cache
+    from tvsbayes.estimators.campaign_arrays import use_compilation_cache
+    from tvsbayes.planning.expectation import prior_knowledge
 
     use_compilation_cache()
     planned_family(prior_knowledge(mounted_rig()))

@@ -24,14 +24,18 @@ from scipy import stats
 from studies import mounted_rig, shipped_plan
 from table1 import paper_values
 
-from tvsbayes.campaign import four_point_protocol, mixed_protocol, paper_protocol, read_campaign
-from tvsbayes.classic import DIRECTIONS, four_point_ratios, select_experiments
-from tvsbayes.design import Knowledge, information_of, prior_knowledge
-from tvsbayes.files import shipped_data
-from tvsbayes.information import headline_causes
-from tvsbayes.joint import fit
-from tvsbayes.model import INDEX, use_compilation_cache
-from tvsbayes.simulation import project, read_truth, simulate
+from tvsbayes.assessment.causes import headline_causes
+from tvsbayes.estimators.campaign_arrays import use_compilation_cache
+from tvsbayes.estimators.four_point import four_point_ratios, select_experiments
+from tvsbayes.estimators.joint_fit import fit
+from tvsbayes.files.disk import shipped_data
+from tvsbayes.instrument.axes import DIRECTIONS
+from tvsbayes.instrument.campaign import read_campaign
+from tvsbayes.instrument.parameters import INDEX
+from tvsbayes.instrument.plan import four_point_protocol, mixed_protocol, paper_protocol
+from tvsbayes.planning.expectation import Knowledge, information_of, prior_knowledge
+from tvsbayes.twin.physics import project
+from tvsbayes.twin.simulated_campaign import read_truth, simulate
 
 TWIN = shipped_data() / "twins" / "paper_twin"
 RUNS = 60

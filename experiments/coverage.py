@@ -54,17 +54,18 @@ def one_rig(task: tuple[str, int]) -> dict[str, object]:
     cores = sorted(os.sched_getaffinity(0))
     if len(cores) > 1:
         os.sched_setaffinity(0, {cores[os.getpid() % len(cores)]})
-    from tvsbayes import likelihood
+    from tvsbayes.estimators import campaign_arrays
 
     # Ordinary fits pad to 512 spots so that campaigns share a compilation; here every campaign is alike.
-    likelihood.SMALLEST_BUCKET = 96
-    from tvsbayes.campaign import read_plan
-    from tvsbayes.classic import classic
-    from tvsbayes.files import shipped_data
-    from tvsbayes.joint import fit
-    from tvsbayes.model import use_compilation_cache
-    from tvsbayes.rigs import read_rig
-    from tvsbayes.simulation import effective_deg_per_step, effective_mirror_offset_mm, simulate
+    campaign_arrays.SMALLEST_BUCKET = 96
+    from tvsbayes.estimators.campaign_arrays import use_compilation_cache
+    from tvsbayes.estimators.four_point import classic
+    from tvsbayes.estimators.joint_fit import fit
+    from tvsbayes.files.disk import shipped_data
+    from tvsbayes.instrument.plan import read_plan
+    from tvsbayes.instrument.rig import read_rig
+    from tvsbayes.twin.physics import effective_deg_per_step, effective_mirror_offset_mm
+    from tvsbayes.twin.simulated_campaign import simulate
 
     use_compilation_cache()
     folder = shipped_data() / "rigs" / "mounted"
@@ -94,7 +95,7 @@ def one_rig(task: tuple[str, int]) -> dict[str, object]:
             "contraction": float(1 - draws.var() / prior.var()),
         }
 
-    from tvsbayes.model import INDEX
+    from tvsbayes.instrument.parameters import INDEX
 
     for k, direction in enumerate(("left", "right", "up", "down")):
         judge(f"effective {direction}", true_ratio[direction], lambda d, k=k: d.effective_deg_per_step[..., k])

@@ -22,8 +22,8 @@ def main(folder: Path, turns: int) -> None:
     """Measure and print the table."""
     import cv2
 
-    from tvsbayes.campaign import read_campaign
-    from tvsbayes.device.spots import detect
+    from tvsbayes.cameras.detection import detect
+    from tvsbayes.instrument.campaign import read_campaign
 
     campaign = read_campaign(folder)
     paths = sorted(str(path) for path in (folder / "frames").glob("*.png"))

@@ -40,10 +40,10 @@ def bound_px(mark, scene, sensor) -> float:
     values, whose slopes alone inform (for gamma speckle without other noise that is the exact information); photosites
     whose mean is clipped are left out.
     """
-    from tvsbayes.device.renderer import _ambient, _mosaic_response, spot_irradiance
+    from tvsbayes.twin.spot_pictures import _mosaic_response, ambient_level, spot_irradiance
 
     response = _mosaic_response(WIDTH, HEIGHT, sensor.response).astype(float)
-    ambient = _ambient(WIDTH, HEIGHT, scene.ambient_dn, scene.ambient_gradient_dn).astype(float)
+    ambient = ambient_level(WIDTH, HEIGHT, scene.ambient_dn, scene.ambient_gradient_dn).astype(float)
     window, light = spot_irradiance(mark, WIDTH, HEIGHT)
     rows, columns = window
     response, ambient = response[window], ambient[window]
@@ -73,7 +73,7 @@ def bound_px(mark, scene, sensor) -> float:
 
 def flat_stereo():
     """A camera without distortion: rectified pictures are raw ones, so that `contour` needs one picture only."""
-    from tvsbayes.rigs import Stereo
+    from tvsbayes.instrument.stereo_pair import Stereo
 
     matrix = np.array([[200.0, 0, 100.0], [0, 200.0, 80.0], [0, 0, 1.0]])
     none = np.zeros(5)
@@ -83,8 +83,8 @@ def flat_stereo():
 
 def run_cell(size, peak, ambient, contrast, seed: int) -> dict:
     """One cell: errors, stated sds and the bound."""
-    from tvsbayes.device import spots
-    from tvsbayes.device.renderer import Footprint, Scene, Sensor, render_spot
+    from tvsbayes.cameras import contour, detection, spot_fit
+    from tvsbayes.twin.spot_pictures import Footprint, Scene, Sensor, render_spot
 
     rng = np.random.default_rng(seed)
     scene, sensor = Scene(ambient_dn=ambient, ambient_gradient_dn=ambient / 2, speckle_contrast=contrast), Sensor()
@@ -99,19 +99,20 @@ def run_cell(size, peak, ambient, contrast, seed: int) -> dict:
         if k < 20:
             bounds.append(bound_px(mark, scene, sensor))
     row = {"size": size, "peak": peak, "ambient": ambient, "contrast": contrast, "bound": float(np.mean(bounds))}
-    patches = [spots._patch(picture) for picture in pictures]
-    camera = spots._rectified(flat_stereo())[0]
-    pilots = [one for one in patches[: spots.PILOTS_MAX] if not isinstance(one, str)]
-    learned = spots._learned([one for one in pilots if one.clipped_share <= spots.CLIPPED_SHARE_MAX], None)
+    patches = [spot_fit.patch_around(picture) for picture in pictures]
+    camera = contour.rectified_pair(flat_stereo())[0]
+    pilots = [one for one in patches[: detection.PILOTS_MAX] if not isinstance(one, str)]
+    learned = detection._learned([one for one in pilots if one.clipped_share <= spot_fit.CLIPPED_SHARE_MAX], None)
     for method in METHODS:
         if method == "fit":
-            found = [spots._centre(patch, learned) for patch in patches]
-            learned = spots.learn_noise(np.vstack([one.skews for one in found if one.status == "ok"]))
+            found = [spot_fit.centre_of(patch, learned) for patch in patches]
+            learned = spot_fit.learn_noise(np.vstack([one.skews for one in found if one.status == "ok"]))
             found = [one.under(learned) for one in found]
             row["learned"] = [learned.gain_dn, learned.speckle_contrast]
         else:
             found = [
-                spots._contour(picture, camera, spots.SpotNoise(speckle_contrast=contrast)) for picture in pictures
+                contour.contour_of(picture, camera, spot_fit.SpotNoise(speckle_contrast=contrast))
+                for picture in pictures
             ]
         ok = [k for k, one in enumerate(found) if one.status == "ok"]
         errors = np.array([found[k].centre_px - truth[k] for k in ok]).reshape(-1, 2)
@@ -138,8 +139,8 @@ def beyond_linear() -> list[tuple[float, float]]:
 
     from studies import mounted_rig, shipped_plan
 
-    from tvsbayes.device.renderer import Scene, cameras_of, footprint
-    from tvsbayes.simulation import simulate
+    from tvsbayes.twin.simulated_campaign import simulate
+    from tvsbayes.twin.spot_pictures import Scene, cameras_of, footprint
 
     twin = simulate(mounted_rig(), shipped_plan("paper"), 1)
     camera = cameras_of(twin.truth.stereo).left

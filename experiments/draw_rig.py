@@ -13,8 +13,9 @@ from pathlib import Path
 import matplotlib
 import numpy as np
 
-from tvsbayes.rigs import DEFAULT_PRIORS, rotation_matrix
-from tvsbayes.simulation import mirror_chain, to_tvs
+from tvsbayes.instrument.parameters import DEFAULT_PRIORS
+from tvsbayes.instrument.stereo_pair import rotation_matrix
+from tvsbayes.twin.physics import mirror_chain, to_tvs
 
 matplotlib.use("svg")
 from matplotlib import patches

@@ -22,13 +22,14 @@ matplotlib.use("Agg")
 import numpy as np
 from matplotlib import pyplot
 
-from tvsbayes.campaign import read_campaign
-from tvsbayes.classic import classic
-from tvsbayes.comparison import budget, error_map, simple_calibration
-from tvsbayes.files import shipped_data
-from tvsbayes.information import calibration_of
-from tvsbayes.joint import fit
-from tvsbayes.model import use_compilation_cache
+from tvsbayes.assessment.fitted_calibration import calibration_of
+from tvsbayes.coordinates.error_map import error_map, simple_calibration
+from tvsbayes.estimators.campaign_arrays import use_compilation_cache
+from tvsbayes.estimators.four_point import classic
+from tvsbayes.estimators.joint_fit import fit
+from tvsbayes.files.disk import shipped_data
+from tvsbayes.instrument.campaign import read_campaign
+from tvsbayes.metrology.budget import budget
 
 RANGES_MM = (200.0, 300.0, 400.0, 500.0, 700.0, 1000.0, 1400.0)
 PICTURE = Path(__file__).with_suffix(".png")

@@ -25,14 +25,16 @@ from arviz_stats.base import array_stats
 from numpyro.infer import MCMC, NUTS
 from studies import mounted_rig
 
-from tvsbayes import likelihood
-from tvsbayes.campaign import PlanStep
-from tvsbayes.joint import fit
-from tvsbayes.likelihood import campaign_arrays, nearest_range, observe, stop_variances
-from tvsbayes.model import NAMES, mirror_angles, parameter_space, use_compilation_cache
-from tvsbayes.posterior import sample
-from tvsbayes.rigs import Prior
-from tvsbayes.simulation import simulate
+from tvsbayes.estimators import campaign_arrays as buckets
+from tvsbayes.estimators.campaign_arrays import campaign_arrays, use_compilation_cache
+from tvsbayes.estimators.joint_fit import fit
+from tvsbayes.estimators.likelihood import nearest_range, observe, stop_variances
+from tvsbayes.instrument.parameters import NAMES, Prior
+from tvsbayes.instrument.plan import PlanStep
+from tvsbayes.model.laser_path import mirror_angles
+from tvsbayes.model.parameter_space import parameter_space
+from tvsbayes.posterior.sampling import sample
+from tvsbayes.twin.simulated_campaign import simulate
 
 KEPT = ("degrees_per_step", "ratio_contrast", "backlash", "tilt_zero", "stop_sd", "pixel_scale")
 STOPS = ((60, 40), (160, -60), (60, 20), (200, 80), (100, -30), (0, 0))
@@ -132,7 +134,7 @@ def whitening(density, z: np.ndarray, covariance: np.ndarray, latent: int):
 def main() -> None:
     """Sample both, print the comparison."""
     use_compilation_cache()
-    likelihood.SMALLEST_BUCKET = 16
+    buckets.SMALLEST_BUCKET = 16
     campaign = dozen()
     joint = fit(campaign)
     posterior = sample(joint, seed=0)

@@ -37,10 +37,12 @@ def observed(source: str, seed: int):
     """A simulated campaign, what a stranger would fit, and found minus true centres (n, 4) with their sds."""
     from studies import mounted_rig
 
-    from tvsbayes.campaign import four_point_protocol, read_campaign
-    from tvsbayes.device.renderer import write_frames
-    from tvsbayes.device.spots import detect
-    from tvsbayes.simulation import project, simulate
+    from tvsbayes.cameras.detection import detect
+    from tvsbayes.instrument.campaign import read_campaign
+    from tvsbayes.instrument.plan import four_point_protocol
+    from tvsbayes.twin.board_pictures import write_frames
+    from tvsbayes.twin.physics import project
+    from tvsbayes.twin.simulated_campaign import simulate
 
     simulated = simulate(mounted_rig(), four_point_protocol(repeats=4, steps=(100, 200)), seed)
     campaign = simulated.campaign
@@ -62,13 +64,13 @@ def observed(source: str, seed: int):
 
 def one_campaign(task: tuple[str, int]) -> dict[str, object]:
     """Observe and fit; whatever fails is recorded, never dropped."""
-    from tvsbayes import likelihood
+    from tvsbayes.estimators import campaign_arrays
 
     # Here every campaign has 64 looks: less padding than ordinary fits.
-    likelihood.SMALLEST_BUCKET = 96
-    from tvsbayes.information import summarise
-    from tvsbayes.joint import fit
-    from tvsbayes.model import use_compilation_cache
+    campaign_arrays.SMALLEST_BUCKET = 96
+    from tvsbayes.assessment.summary import summarise
+    from tvsbayes.estimators.campaign_arrays import use_compilation_cache
+    from tvsbayes.estimators.joint_fit import fit
 
     use_compilation_cache()
     source, seed = task
@@ -105,7 +107,7 @@ def known_truth(truth) -> dict[str, float]:
 
 def at_pose(truth, pose: tuple[float, float]) -> dict[str, float]:
     """True effective ratios and mirror offset at the pose of the fit."""
-    from tvsbayes.simulation import effective_deg_per_step, effective_mirror_offset_mm
+    from tvsbayes.twin.physics import effective_deg_per_step, effective_mirror_offset_mm
 
     ratio = effective_deg_per_step(truth.parameters, pose)
     offset = effective_mirror_offset_mm(truth.parameters, pose)
@@ -181,10 +183,10 @@ def rendered(folder: Path, twin: str) -> Path:
     """The campaign folder of a twin, rendered where it is not there yet."""
     from studies import mounted_rig, shipped_plan
 
-    from tvsbayes.campaign import read_campaign
-    from tvsbayes.device.renderer import write_frames
-    from tvsbayes.files import shipped_data
-    from tvsbayes.simulation import read_truth, simulate
+    from tvsbayes.files.disk import shipped_data
+    from tvsbayes.instrument.campaign import read_campaign
+    from tvsbayes.twin.board_pictures import write_frames
+    from tvsbayes.twin.simulated_campaign import read_truth, simulate
 
     place = folder / twin
     if not (place / "truth.json").exists():
@@ -205,12 +207,12 @@ def rendered(folder: Path, twin: str) -> Path:
 
 def report(place: Path, twin: str) -> None:
     """Detect, estimate and print."""
-    from tvsbayes.campaign import read_campaign
-    from tvsbayes.classic import classic
-    from tvsbayes.device.spots import detect
-    from tvsbayes.information import summarise
-    from tvsbayes.joint import fit
-    from tvsbayes.simulation import read_truth
+    from tvsbayes.assessment.summary import summarise
+    from tvsbayes.cameras.detection import detect
+    from tvsbayes.estimators.four_point import classic
+    from tvsbayes.estimators.joint_fit import fit
+    from tvsbayes.instrument.campaign import read_campaign
+    from tvsbayes.twin.simulated_campaign import read_truth
 
     campaign = read_campaign(place)
     truth = read_truth(place / "truth.json", campaign.stereo)

@@ -93,7 +93,7 @@ def watched(arguments: list[str], place: Path) -> dict[str, object]:
     before = listing(place)
     began = time.monotonic()
     log = OUTPUT / "hostile-log.txt"
-    command = [sys.executable, "-c", "from tvsbayes.cli import main; main()", *arguments]
+    command = [sys.executable, "-c", "from tvsbayes.cli.main import main; main()", *arguments]
     with log.open("wb") as stream:
         child = subprocess.Popen(
             command, stdin=subprocess.DEVNULL, stdout=stream, stderr=subprocess.STDOUT, env=environment, cwd=home
@@ -186,7 +186,7 @@ def run_folders(only: str | None) -> None:
 
 def forked(arguments: list[str]) -> tuple[int, str, float, int]:
     """Exit code, output, processor seconds and peak memory of a command in a child of this process."""
-    from tvsbayes.cli import run
+    from tvsbayes.cli.main import run
 
     with tempfile.TemporaryFile() as stream:
         child = os.fork()

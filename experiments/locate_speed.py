@@ -21,14 +21,15 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
 
-from tvsbayes.calibration import INPUT_NAMES, NOISE_NAMES, calibration_bytes, load_calibration
-from tvsbayes.campaign import read_campaign
-from tvsbayes.coordinates import locate, locate_linear, settings_of
-from tvsbayes.files import shipped_data
-from tvsbayes.information import calibration_of
-from tvsbayes.joint import fit
-from tvsbayes.model import use_compilation_cache
-from tvsbayes.simulation import mirror_chain, to_tvs
+from tvsbayes.assessment.fitted_calibration import calibration_of
+from tvsbayes.calibration.calibration_file import calibration_bytes, load_calibration
+from tvsbayes.calibration.pointing import INPUT_NAMES, NOISE_NAMES
+from tvsbayes.coordinates.location import locate, locate_linear, settings_of
+from tvsbayes.estimators.campaign_arrays import use_compilation_cache
+from tvsbayes.estimators.joint_fit import fit
+from tvsbayes.files.disk import shipped_data
+from tvsbayes.instrument.campaign import read_campaign
+from tvsbayes.twin.physics import mirror_chain, to_tvs
 
 DRAWS = 500
 REPEATS = 10

@@ -15,10 +15,14 @@ from pathlib import Path
 
 import numpy as np
 
-from tvsbayes.campaign import PROTOCOLS, PlanStep, read_campaign, write_plan
-from tvsbayes.classic import DIRECTIONS, classic, four_point_ratios, select_experiments
-from tvsbayes.rigs import Rig, Stereo, read_rig, rotation_matrix, write_stereo
-from tvsbayes.simulation import SimulatedCampaign, Truth, draw_truth, project, simulate, with_derived
+from tvsbayes.estimators.four_point import classic, four_point_ratios, select_experiments
+from tvsbayes.instrument.axes import DIRECTIONS
+from tvsbayes.instrument.campaign import read_campaign
+from tvsbayes.instrument.plan import PROTOCOLS, PlanStep, write_plan
+from tvsbayes.instrument.rig import Rig, read_rig
+from tvsbayes.instrument.stereo_pair import Stereo, rotation_matrix, write_stereo
+from tvsbayes.twin.physics import project
+from tvsbayes.twin.simulated_campaign import SimulatedCampaign, Truth, draw_truth, simulate, with_derived
 
 DATA = Path(__file__).resolve().parents[1] / "data"
 SHEETS_MM = {"d1": 175.0, "d2": 275.0, "d3": 375.0}

@@ -35,17 +35,17 @@ ESTIMATORS = ("nominal", "classic", "joint")
 
 def one_row(task: tuple[str, int]) -> dict[str, object]:
     """Fit a shipped twin (seed -1) or a drawn rig's campaign; errors at all counters and ranges."""
-    from tvsbayes import likelihood
+    from tvsbayes.estimators import campaign_arrays
 
     # As in coverage.py: ordinary fits pad to 512 spots.
-    likelihood.SMALLEST_BUCKET = 96
-    from tvsbayes.campaign import read_campaign
-    from tvsbayes.coordinates import locate_linear, settings_of
-    from tvsbayes.files import shipped_data
-    from tvsbayes.information import calibration_of
-    from tvsbayes.joint import fit
-    from tvsbayes.model import use_compilation_cache
-    from tvsbayes.simulation import SimulatedCampaign, read_truth, simulate
+    campaign_arrays.SMALLEST_BUCKET = 96
+    from tvsbayes.assessment.fitted_calibration import calibration_of
+    from tvsbayes.coordinates.location import locate_linear, settings_of
+    from tvsbayes.estimators.campaign_arrays import use_compilation_cache
+    from tvsbayes.estimators.joint_fit import fit
+    from tvsbayes.files.disk import shipped_data
+    from tvsbayes.instrument.campaign import read_campaign
+    from tvsbayes.twin.simulated_campaign import SimulatedCampaign, read_truth, simulate
 
     use_compilation_cache()
     name, seed = task
@@ -163,7 +163,7 @@ def draw(rows) -> None:
     from matplotlib import rc_context
     from matplotlib.figure import Figure
 
-    from tvsbayes.plots import BLACK, OF_ESTIMATOR, STYLE, WIDTH_IN
+    from tvsbayes.report.figures import BLACK, OF_ESTIMATOR, STYLE, WIDTH_IN
 
     with rc_context(STYLE):
         figure = Figure(figsize=(WIDTH_IN, 5.6), layout="constrained")

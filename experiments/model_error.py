@@ -52,8 +52,9 @@ CONFIDENCE = 0.95
 
 def broken_campaign(defect: str, size: float, seed: int):
     """A simulated campaign with one defect, and its truth; the twin's own formulas with other angles or points."""
-    from tvsbayes.rigs import rotation_matrix
-    from tvsbayes.simulation import inside_images, mirror_chain, project, simulate
+    from tvsbayes.instrument.stereo_pair import rotation_matrix
+    from tvsbayes.twin.physics import inside_images, mirror_chain, project
+    from tvsbayes.twin.simulated_campaign import simulate
 
     rig = mounted_rig()
     simulated = simulate(rig, shipped_plan("grid"), seed)
@@ -110,11 +111,12 @@ def broken_campaign(defect: str, size: float, seed: int):
 def one_campaign(task: tuple[str, float, int]) -> dict[str, object]:
     """Break, fit, validate."""
     defect, size, seed = task
-    from tvsbayes import likelihood
+    from tvsbayes.estimators import campaign_arrays
 
-    likelihood.SMALLEST_BUCKET = 144
-    from tvsbayes.information import residual_causes, stop_residuals, validate
-    from tvsbayes.model import use_compilation_cache
+    campaign_arrays.SMALLEST_BUCKET = 144
+    from tvsbayes.assessment.residuals import residual_causes, stop_residuals
+    from tvsbayes.assessment.score_tests import validate
+    from tvsbayes.estimators.campaign_arrays import use_compilation_cache
 
     use_compilation_cache()
     row: dict[str, object] = {"defect": defect, "size": size, "seed": seed}

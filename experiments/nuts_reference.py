@@ -23,6 +23,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+from tvsbayes.estimators.likelihood import evaluate, log_density
+from tvsbayes.instrument.campaign import ordered_spots
+
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import jax
@@ -32,10 +35,12 @@ import numpyro
 from arviz_stats.base import array_stats
 from numpyro.infer import NUTS
 
-from tvsbayes import likelihood
-from tvsbayes.campaign import input_hashes, read_campaign
-from tvsbayes.joint import JointFit, derived_quantities, fit
-from tvsbayes.model import NAMES, NOISE_NAMES, use_compilation_cache
+from tvsbayes.estimators import campaign_arrays
+from tvsbayes.estimators.campaign_arrays import use_compilation_cache
+from tvsbayes.estimators.joint_fit import JointFit, fit
+from tvsbayes.instrument.campaign import input_hashes, read_campaign
+from tvsbayes.instrument.parameters import NAMES, NOISE_NAMES
+from tvsbayes.model.headlines import derived_quantities
 
 ROOT = Path(__file__).parent.parent
 HEADLINES = (
@@ -97,7 +102,7 @@ def build_transport(joint: JointFit) -> Transport:
             part = y[first : first + BATCH]
             z = np.repeat(joint.z[None], BATCH, axis=0)
             z[: len(part), index] += part @ root.T
-            seen = likelihood.evaluate(jnp.asarray(z), joint.space, joint.arrays).standardised
+            seen = evaluate(jnp.asarray(z), joint.space, joint.arrays).standardised
             out.append(np.asarray(seen)[: len(part)].reshape(len(part), -1))
         return np.concatenate(out)
 
@@ -230,8 +235,8 @@ def main() -> None:
     jax.config.update("jax_enable_x64", True)
     use_compilation_cache()
     campaign = read_campaign(ROOT / "data" / "twins" / f"{options.twin}_twin")
-    longest = max(len(likelihood.ordered_spots(campaign)), len(campaign.moves))
-    likelihood.SMALLEST_BUCKET = 8 * -(-longest // 8)
+    longest = max(len(ordered_spots(campaign)), len(campaign.moves))
+    campaign_arrays.SMALLEST_BUCKET = 8 * -(-longest // 8)
     joint = fit(campaign)
     started = time.perf_counter()
     transport = build_transport(joint)
@@ -247,7 +252,7 @@ def main() -> None:
         return transport.z_of_y(w if options.speed else transport.y_of_w(w))
 
     def potential(w: jax.Array) -> jax.Array:
-        return joint.log_density - likelihood.log_density(z_of(w), joint.space, joint.arrays)
+        return joint.log_density - log_density(z_of(w), joint.space, joint.arrays)
 
     run = nuts(potential, size, options, dense=options.speed)
     rows = {name: summary(values) for name, values in quantities(joint, z_of, run.draws).items()}

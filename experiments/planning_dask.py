@@ -23,9 +23,11 @@ def main() -> None:
     """Run both, compare."""
     from distributed import Client, LocalCluster
 
-    from tvsbayes.design import DEFAULT_TARGET, parse_target
-    from tvsbayes.model import use_compilation_cache
-    from tvsbayes.studies import SINGLE_THREADED, StudyJob, StudyRows, study
+    from tvsbayes.estimators.campaign_arrays import use_compilation_cache
+    from tvsbayes.planning.target import DEFAULT_TARGET, parse_target
+    from tvsbayes.studies.executors import SINGLE_THREADED
+    from tvsbayes.studies.study import StudyRows, study
+    from tvsbayes.studies.study_job import StudyJob
 
     os.environ.update(SINGLE_THREADED)
     use_compilation_cache()

@@ -17,19 +17,13 @@ from pathlib import Path
 import numpy as np
 from studies import mounted_rig
 
-from tvsbayes.campaign import grid_protocol, mixed_protocol, paper_protocol
-from tvsbayes.design import (
-    DEFAULT_TARGET,
-    LookArrays,
-    candidates,
-    covariance_of,
-    information_of,
-    parse_target,
-    prior_knowledge,
-    sensitivity,
-)
-from tvsbayes.model import use_compilation_cache
-from tvsbayes.planning import LADDER, MANY, design_family, limit_of, split_of
+from tvsbayes.estimators.campaign_arrays import use_compilation_cache
+from tvsbayes.instrument.plan import grid_protocol, mixed_protocol, paper_protocol
+from tvsbayes.planning.candidates import LookArrays, candidates, covariance_of
+from tvsbayes.planning.expectation import information_of, prior_knowledge
+from tvsbayes.planning.limits import MANY, limit_of, split_of
+from tvsbayes.planning.search import LADDER, design_family
+from tvsbayes.planning.target import DEFAULT_TARGET, parse_target, sensitivity
 
 FIGURE = Path(__file__).with_name("planning_design.png")
 REPEATS = (2, 4, 8, 16, 24)

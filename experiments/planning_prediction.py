@@ -34,10 +34,10 @@ DRAWS = 400
 
 def designs(arguments: argparse.Namespace) -> None:
     """Search both planned designs and keep them with their stated assurance."""
-    from tvsbayes.campaign import write_plan
-    from tvsbayes.design import DEFAULT_TARGET, parse_target
-    from tvsbayes.model import use_compilation_cache
-    from tvsbayes.planning import plan
+    from tvsbayes.estimators.campaign_arrays import use_compilation_cache
+    from tvsbayes.instrument.plan import write_plan
+    from tvsbayes.planning.planner import plan
+    from tvsbayes.planning.target import DEFAULT_TARGET, parse_target
 
     use_compilation_cache()
     OUTPUT.mkdir(parents=True, exist_ok=True)
@@ -53,9 +53,9 @@ def designs(arguments: argparse.Namespace) -> None:
 
 def job_of(name: str):
     """The study behind the rows of a design."""
-    from tvsbayes.campaign import read_plan
-    from tvsbayes.design import DEFAULT_TARGET, parse_target
-    from tvsbayes.studies import StudyJob
+    from tvsbayes.instrument.plan import read_plan
+    from tvsbayes.planning.target import DEFAULT_TARGET, parse_target
+    from tvsbayes.studies.study_job import StudyJob
 
     steps = shipped_plan(name) if name in ("paper", "grid") else read_plan(OUTPUT / f"planning_{name}.csv")
     return StudyJob(mounted_rig(), steps, parse_target(DEFAULT_TARGET), SEED)
@@ -63,12 +63,12 @@ def job_of(name: str):
 
 def one_row(task: tuple[str, int]) -> dict[str, object]:
     """A row of `tvsbayes study` with the design's name."""
-    from tvsbayes import likelihood
+    from tvsbayes.estimators import campaign_arrays
 
     # As in coverage.py: ordinary fits pad to 512 spots, here every campaign of a design is alike.
-    likelihood.SMALLEST_BUCKET = 96
-    from tvsbayes.model import use_compilation_cache
-    from tvsbayes.studies import study_row
+    campaign_arrays.SMALLEST_BUCKET = 96
+    from tvsbayes.estimators.campaign_arrays import use_compilation_cache
+    from tvsbayes.studies.study_job import study_row
 
     use_compilation_cache()
     name, index = task
@@ -83,8 +83,9 @@ def run(arguments: argparse.Namespace) -> None:
 
 def table(arguments: argparse.Namespace) -> None:
     """Markdown of everything that came out."""
-    from tvsbayes.design import QUANTITIES
-    from tvsbayes.studies import binomial_bounds, rms_bounds, share_interval95, study_result
+    from tvsbayes.model.headlines import QUANTITIES
+    from tvsbayes.statistics.intervals import binomial_bounds, rms_bounds, share_interval95
+    from tvsbayes.studies.study import study_result
 
     rows, kept = read_rows(ROWS), json.loads(DESIGNS.read_text())
     print("# Predicted and actual uncertainty of plans\n")

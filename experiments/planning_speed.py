@@ -16,10 +16,11 @@ import jax.numpy as jnp
 import numpy as np
 from studies import mounted_rig
 
-from tvsbayes import design
-from tvsbayes.campaign import grid_protocol, paper_protocol
-from tvsbayes.design import LookArrays, Looks, Search, information_of, prior_knowledge
-from tvsbayes.model import use_compilation_cache
+from tvsbayes.estimators.campaign_arrays import use_compilation_cache
+from tvsbayes.instrument.plan import grid_protocol, paper_protocol
+from tvsbayes.planning.candidates import LookArrays, Looks
+from tvsbayes.planning.expectation import PARAMETERS, expect, information_of, padded_size, prior_knowledge
+from tvsbayes.planning.search import Search
 
 SIZES = (100, 1000, 10_000)
 REPEATS = 5
@@ -49,7 +50,7 @@ def main() -> None:
     for name, steps in (("grid, one sheet", grid_protocol(("d1",))), ("paper", paper_protocol())):
         one = seconds(lambda steps=steps: information_of(steps, knowledge))
         looks = sum(step.action == "look" for step in steps)
-        padded = design.padded_size(looks)
+        padded = padded_size(looks)
         print(f"| {name} | {looks} | {padded} | {1e3 * one:.1f} | {1 / one:.0f} |")
 
     generator = np.random.default_rng(1)
@@ -60,12 +61,12 @@ def main() -> None:
 
     arrays = LookArrays(drawn(100), knowledge, False)
     (block, depth) = arrays.blocks[0]
-    points = 0.1 * generator.standard_normal((BATCH, design.PARAMETERS))
+    points = 0.1 * generator.standard_normal((BATCH, PARAMETERS))
     with jax.enable_x64(True):
         size = block.spots.valid.size
         sheets = jnp.asarray(np.resize(depth, size))
         image = jnp.asarray([1279.0, 719.0, 1279.0, 719.0])
-        mapped = jax.jit(jax.vmap(lambda z: design.expect(z, knowledge.space, block, sheets, image).rows))
+        mapped = jax.jit(jax.vmap(lambda z: expect(z, knowledge.space, block, sheets, image).rows))
         batched = seconds(lambda: mapped(jnp.asarray(points)).block_until_ready(), 3) / BATCH
         single = seconds(lambda: arrays.at(points[0], knowledge.space), 3)
     print(
@@ -79,8 +80,8 @@ def main() -> None:
         arrays = LookArrays(looks, knowledge, False)
         linearised = seconds(lambda arrays=arrays: arrays.at(knowledge.z, knowledge.space), 1)
         seen = arrays.at(knowledge.z, knowledge.space)
-        rows = seen.rows[..., : design.PARAMETERS]
-        gradient = generator.standard_normal((4, design.PARAMETERS))
+        rows = seen.rows[..., :PARAMETERS]
+        gradient = generator.standard_normal((4, PARAMETERS))
         search = Search(rows, knowledge.precision, gradient, np.zeros(4))
         step = seconds(lambda search=search: search.after_one_more(search.covariance), 3)
         start = time.perf_counter()

@@ -90,7 +90,7 @@ FAULTS = (
     # Gears, mirrors, cameras.
     Fault(
         "contrast of the ratios with the wrong sign",
-        "model.py",
+        "model/laser_path.py",
         "jnp.where(positive, 0.5, -0.5)",
         "jnp.where(positive, -0.5, 0.5)",
         "left and right ratios change places",
@@ -98,7 +98,7 @@ FAULTS = (
     ),
     Fault(
         "backlash with the wrong sign",
-        "model.py",
+        "model/laser_path.py",
         "jnp.where(approach < 0, q + half, q - half)",
         "jnp.where(approach > 0, q + half, q - half)",
         "the first reversal of every segment is read the wrong way round",
@@ -106,7 +106,7 @@ FAULTS = (
     ),
     Fault(
         "width of an unknown play three times too large",
-        "model.py",
+        "model/laser_path.py",
         "UNIFORM_SD = 1 / 12**0.5",
         "UNIFORM_SD = 1 / 12 * 12**0.5 * 3**0.5",
         "a campaign that begins with an unknown approach tells too little",
@@ -114,7 +114,7 @@ FAULTS = (
     ),
     Fault(
         "degrees taken for radians",
-        "model.py",
+        "model/parameter_space.py",
         "SCALE = np.array([np.pi / 180 if name in RAD_NAMES",
         "SCALE = np.array([1.0 if name in RAD_NAMES",
         "every angle is 57 times too large",
@@ -122,7 +122,7 @@ FAULTS = (
     ),
     Fault(
         "ratios left in degrees",
-        "model.py",
+        "model/parameter_space.py",
         'RAD_NAMES = tuple(name for name in RIG_NAMES if "deg" in name)',
         'RAD_NAMES = tuple(name for name in RIG_NAMES if "_deg" in name)',
         "one unit forgotten: ratios in deg/step where rad/step is meant",
@@ -130,7 +130,7 @@ FAULTS = (
     ),
     Fault(
         "prior sd doubled",
-        "model.py",
+        "model/parameter_space.py",
         "jnp.where(log, log_normal, self.value + self.u * rig_z)",
         "jnp.where(log, log_normal, self.value + 2 * self.u * rig_z)",
         "priors count a quarter of what the rig file states",
@@ -138,7 +138,7 @@ FAULTS = (
     ),
     Fault(
         "half-normal prior from the wrong tail",
-        "model.py",
+        "model/parameter_space.py",
         "half_normal = -self.u * ndtri(0.5 * ndtr(-w))",
         "half_normal = -self.u * ndtri(0.5 * ndtr(w))",
         "a large coordinate is a small backlash",
@@ -146,7 +146,7 @@ FAULTS = (
     ),
     Fault(
         "stop sds of left and right exchanged",
-        "model.py",
+        "model/parameter_space.py",
         'stop_sd_rad=jnp.reshape(block("stop_sd_deg.left", 4), (2, 2))[:, ::-1]',
         'stop_sd_rad=jnp.reshape(block("stop_sd_deg.left", 4), (2, 2))',
         "the scatter of a direction is reported for the other",
@@ -154,7 +154,7 @@ FAULTS = (
     ),
     Fault(
         "k3 read where p1 stands",
-        "model.py",
+        "model/parameter_space.py",
         "intrinsics[:, np.array([4, 5, 8])]",
         "intrinsics[:, np.array([4, 5, 6])]",
         "distortion with the wrong coefficient",
@@ -162,7 +162,7 @@ FAULTS = (
     ),
     Fault(
         "receiver estimated only without readings",
-        "model.py",
+        "model/parameter_space.py",
         "if not has_aperture:",
         "if has_aperture:",
         "aperture readings teach nothing about baseline and C0",
@@ -170,7 +170,7 @@ FAULTS = (
     ),
     Fault(
         "mirror offset with the wrong sign",
-        "model.py",
+        "model/laser_path.py",
         "offset = (d[1] * o[0] - d[0] * o[1])",
         "offset = (d[0] * o[1] - d[1] * o[0])",
         "the effective mirror offset is negative",
@@ -178,7 +178,7 @@ FAULTS = (
     ),
     Fault(
         "skew of the tilt axis with the wrong sign",
-        "model.py",
+        "model/laser_path.py",
         "jnp.stack([zero, cos_skew, sin_skew])",
         "jnp.stack([zero, cos_skew, -sin_skew])",
         "axis and mirror 2 no longer stand at right angles",
@@ -186,7 +186,7 @@ FAULTS = (
     ),
     Fault(
         "p1 and p2 exchanged",
-        "model.py",
+        "model/geometry.py",
         "q = per_camera(cameras.tangential[:, ::-1])",
         "q = per_camera(cameras.tangential)",
         "tangential distortion the wrong way round: tenths of a pixel at the border",
@@ -194,7 +194,7 @@ FAULTS = (
     ),
     Fault(
         "T of the stereo pair with the wrong sign",
-        "model.py",
+        "model/geometry.py",
         "transform(rotation_matrix(cameras.rotation_rad), left) + translation",
         "transform(rotation_matrix(cameras.rotation_rad), left) - translation",
         "the right camera stands on the left",
@@ -202,7 +202,7 @@ FAULTS = (
     ),
     Fault(
         "cameras exchanged",
-        "model.py",
+        "model/geometry.py",
         "points = materialise(jnp.stack([left, right]))",
         "points = materialise(jnp.stack([right, left]))",
         "each camera sees what the other should see",
@@ -210,7 +210,7 @@ FAULTS = (
     ),
     Fault(
         "focal scale divides",
-        "model.py",
+        "model/geometry.py",
         "per_camera(cameras.focal_px * cameras.focal_scale)",
         "per_camera(cameras.focal_px / cameras.focal_scale)",
         "0.5 % of focal scale are 1 % of error",
@@ -219,7 +219,7 @@ FAULTS = (
     # Likelihood.
     Fault(
         "stop error per pose instead of per stop",
-        "likelihood.py",
+        "instrument/stops.py",
         "                if delta:\n",
         "                if any(deltas):\n",
         "spots taken while the other axis moves count as independent stops: ratios too sure",
@@ -227,7 +227,7 @@ FAULTS = (
     ),
     Fault(
         "four residuals per spot instead of three",
-        "likelihood.py",
+        "estimators/likelihood.py",
         "log_scale = 3 * jnp.log(pixel_noise)",
         "log_scale = 4 * jnp.log(pixel_noise)",
         "n for n - p: the pixel scale comes out too small",
@@ -235,7 +235,7 @@ FAULTS = (
     ),
     Fault(
         "Jacobian of the aperture's range dropped",
-        "likelihood.py",
+        "estimators/likelihood.py",
         "log_scale = 3 * jnp.log(pixel_noise) - 0.5 * jnp.log1p(aperture_part / pixel_part)",
         "log_scale = 3 * jnp.log(pixel_noise)",
         "the density is not flat in image displacement where the aperture reads",
@@ -243,7 +243,7 @@ FAULTS = (
     ),
     Fault(
         "log-determinant dropped",
-        "likelihood.py",
+        "estimators/likelihood.py",
         "jnp.sum(given.log_scale) - 0.5 * jnp.sum(log_variance) -",
         "jnp.sum(given.log_scale) -",
         "stop sds grow without limit",
@@ -251,7 +251,7 @@ FAULTS = (
     ),
     Fault(
         "correlation of the left camera used for the right",
-        "likelihood.py",
+        "estimators/campaign_arrays.py",
         "spot.ruv_right * su_r * sv_r",
         "spot.ruv_left * su_r * sv_r",
         "spots of the right camera are weighted wrongly",
@@ -259,7 +259,7 @@ FAULTS = (
     ),
     Fault(
         "extrinsic rotation transposed for the range",
-        "likelihood.py",
+        "estimators/likelihood.py",
         "transform(rotation_matrix(extrinsics.rotation_rad).T, from_origin)",
         "transform(rotation_matrix(extrinsics.rotation_rad), from_origin)",
         "spots are linearised at the wrong range",
@@ -267,7 +267,7 @@ FAULTS = (
     ),
     Fault(
         "log density of a left-out move with the wrong sign (ELPD)",
-        "likelihood.py",
+        "posterior/predictive.py",
         "log_density = log_scale - 0.5 * seen.log_variance - 0.5",
         "log_density = log_scale + 0.5 * seen.log_variance - 0.5",
         "`az.compare` prefers the worse model",
@@ -275,7 +275,7 @@ FAULTS = (
     ),
     Fault(
         "constants of the log likelihood with the wrong sign",
-        "likelihood.py",
+        "estimators/campaign_arrays.py",
         "np.log(2 * np.pi) + np.linalg.slogdet",
         "np.log(2 * np.pi) - np.linalg.slogdet",
         "log likelihoods of campaigns with other stated sds cannot be compared",
@@ -284,7 +284,7 @@ FAULTS = (
     # Fit and its summary.
     Fault(
         "effective ratio without the slope of the beam",
-        "joint.py",
+        "model/headlines.py",
         "jnp.stack([(ratio + half) * slope, (ratio - half) * slope], axis=1)",
         "jnp.stack([(ratio + half) + 0 * slope, (ratio - half) + 0 * slope], axis=1)",
         "the gear ratio is sold as the effective ratio: up to 1.7 % off for 1 deg of laser tilt",
@@ -292,7 +292,7 @@ FAULTS = (
     ),
     Fault(
         "prior sensitivity the wrong way round",
-        "information.py",
+        "assessment/weaknesses.py",
         "changed[members, members] += factor**-2 - 1",
         "changed[members, members] += factor**2 - 1",
         "what a wider prior would do is said of a narrower one",
@@ -300,7 +300,7 @@ FAULTS = (
     ),
     Fault(
         "degrees of freedom: n for n - p",
-        "information.py",
+        "assessment/summary.py",
         "dof=observations - determined,",
         "dof=observations,",
         "chi2 over dof looks too good",
@@ -308,7 +308,7 @@ FAULTS = (
     ),
     Fault(
         "contraction of sds instead of variances",
-        "information.py",
+        "assessment/summary.py",
         "contraction = float(1 - (sd / prior_sd) ** 2)",
         "contraction = float(1 - sd / prior_sd)",
         "informed parameters are called prior-limited",
@@ -317,7 +317,7 @@ FAULTS = (
     # Posterior.
     Fault(
         "log-Jacobian of the transport with the wrong sign",
-        "posterior.py",
+        "posterior/proposal.py",
         "value - self.fit.log_density + found.log_jacobian",
         "value - self.fit.log_density - found.log_jacobian",
         "the sampled posterior is not the model's: noise scales are biased",
@@ -325,7 +325,7 @@ FAULTS = (
     ),
     Fault(
         "stop errors as if pixels were always as at the mode",
-        "posterior.py",
+        "posterior/transport.py",
         "inner = weight * self.states",
         "inner = 1.0 * self.states",
         "campaigns with few stops are sampled many times slower",
@@ -333,7 +333,7 @@ FAULTS = (
     ),
     Fault(
         "log-Jacobian of the transport dropped",
-        "posterior.py",
+        "posterior/proposal.py",
         "value - self.fit.log_density + found.log_jacobian",
         "value - self.fit.log_density",
         "the same, half as much",
@@ -341,7 +341,7 @@ FAULTS = (
     ),
     Fault(
         "log-Jacobian added twice to the stored density",
-        "posterior.py",
+        "posterior/sampling.py",
         "+ fit.log_density - found.log_jacobian",
         "+ fit.log_density + found.log_jacobian",
         "`lp` of posterior.nc is not the density of its draws",
@@ -350,7 +350,7 @@ FAULTS = (
     ),
     Fault(
         "factor of the independence proposal reversed",
-        "posterior.py",
+        "posterior/proposal.py",
         "return proposed, self.log_density(w) - self.log_density(proposed)",
         "return proposed, self.log_density(proposed) - self.log_density(w)",
         "sds come out at half their size without any sign of it",
@@ -358,7 +358,7 @@ FAULTS = (
     ),
     Fault(
         "resume forgets the random state",
-        "posterior.py",
+        "posterior/sampling.py",
         "log_prob=self.before.log_density[-1], random_state=self.before.random_state",
         "log_prob=self.before.log_density[-1]",
         "a resumed chain is not the unbroken one",
@@ -366,7 +366,7 @@ FAULTS = (
     ),
     Fault(
         "no walker is stuck by its acceptance",
-        "posterior.py",
+        "posterior/sampling.py",
         "stuck = acceptance < STUCK_ACCEPTANCE * np.median(acceptance)",
         "stuck = acceptance < 0",
         "a frozen walker passes",
@@ -374,7 +374,7 @@ FAULTS = (
     ),
     Fault(
         "no walker is stuck by its density",
-        "posterior.py",
+        "posterior/sampling.py",
         "stuck |= deviation > max(",
         "stuck |= deviation > 1e9 * max(",
         "a walker in another mode passes",
@@ -383,7 +383,7 @@ FAULTS = (
     ),
     Fault(
         "R-hat up to 1.1 passes",
-        "posterior.py",
+        "posterior/sampling.py",
         "RHAT_LIMIT = 1.01",
         "RHAT_LIMIT = 1.1",
         "intervals of chains that have not converged",
@@ -392,7 +392,7 @@ FAULTS = (
     ),
     Fault(
         "a hundred effective draws pass",
-        "posterior.py",
+        "posterior/sampling.py",
         "ESS_LIMIT = 1000",
         "ESS_LIMIT = 100",
         "interval ends known to a third of an sd only",
@@ -401,7 +401,7 @@ FAULTS = (
     ),
     Fault(
         "chains shorter than 50 autocorrelation times pass",
-        "posterior.py",
+        "posterior/sampling.py",
         "if not len(kept) >= TAU_LIMIT * tau:",
         "if not TAU_LIMIT * len(kept) >= tau:",
         "R-hat and ESS of chains too short to estimate them",
@@ -410,7 +410,7 @@ FAULTS = (
     ),
     Fault(
         "lost motion of a right move from the tilt axis",
-        "posterior.py",
+        "posterior/draws.py",
         'axis = "pan" if direction in ("left", "right") else "tilt"',
         'axis = "pan" if direction in ("left",) else "tilt"',
         "lost motion of the wrong axis",
@@ -419,7 +419,7 @@ FAULTS = (
     ),
     Fault(
         "lost motion grows without end",
-        "posterior.py",
+        "posterior/draws.py",
         "lambda p: np.minimum(",
         "lambda p: np.maximum(",
         "lost motion of k N instead of at most the backlash",
@@ -427,7 +427,7 @@ FAULTS = (
     ),
     Fault(
         "tails of intervals exchanged",
-        "posterior.py",
+        "posterior/draws.py",
         "tails = (0.025, 0.975)",
         "tails = (0.975, 0.025)",
         "lower ends above upper ones",
@@ -435,7 +435,7 @@ FAULTS = (
     ),
     Fault(
         "90 % intervals called 95 %",
-        "posterior.py",
+        "posterior/draws.py",
         "tails = (0.025, 0.975)",
         "tails = (0.05, 0.95)",
         "one interval in ten misses",
@@ -443,7 +443,7 @@ FAULTS = (
     ),
     Fault(
         "Monte Carlo errors of both interval ends exchanged",
-        "posterior.py",
+        "posterior/draws.py",
         'method="quantile", prob=prob) for prob in tails]',
         'method="quantile", prob=prob) for prob in tails[::-1]]',
         "the longer tail is called the better known",
@@ -452,7 +452,7 @@ FAULTS = (
     ),
     Fault(
         "Monte Carlo error of the mean without autocorrelation",
-        "posterior.py",
+        "posterior/draws.py",
         'mcse_mean=each(array_stats.mcse, 0.0, method="mean")',
         "mcse_mean=values.std(axis=(0, 1)) / np.sqrt(values.shape[0] * values.shape[1])",
         "more digits than the chain has",
@@ -460,7 +460,7 @@ FAULTS = (
     ),
     Fault(
         "predicted looks scatter by the other direction's stop sd",
-        "posterior.py",
+        "posterior/predictive.py",
         "sd_rad = np.radians(sd_deg.reshape(len(z), 2, 2)[..., ::-1])",
         "sd_rad = np.radians(sd_deg.reshape(len(z), 2, 2))",
         "predictive checks blame the wrong direction",
@@ -469,7 +469,7 @@ FAULTS = (
     ),
     Fault(
         "predicted looks without home offset",
-        "posterior.py",
+        "posterior/predictive.py",
         "error = error + home[:, segment]",
         "error = error + 0 * home[:, segment]",
         "predictive checks call re-homed segments outliers",
@@ -479,7 +479,7 @@ FAULTS = (
     # The classic estimator.
     Fault(
         "sd with n instead of n - 1",
-        "classic.py",
+        "estimators/four_point.py",
         "sd = float(np.std(ratios, ddof=1))",
         "sd = float(np.std(ratios, ddof=0))",
         "type A uncertainty too small",
@@ -487,7 +487,7 @@ FAULTS = (
     ),
     Fault(
         "t with n degrees of freedom",
-        "classic.py",
+        "estimators/four_point.py",
         "interval95_type_a=_interval(average, type_a, n - 1)",
         "interval95_type_a=_interval(average, type_a, n)",
         "intervals too short for few repeats",
@@ -495,7 +495,7 @@ FAULTS = (
     ),
     Fault(
         "homing taken for a leg",
-        "classic.py",
+        "instrument/stops.py",
         "if a.segment == b.segment and a.steps != b.steps",
         "if a.steps != b.steps",
         "one |N| is called several",
@@ -503,7 +503,7 @@ FAULTS = (
     ),
     Fault(
         "sd of one experiment for that of the mean",
-        "classic.py",
+        "estimators/four_point.py",
         "gum = float(np.hypot(type_a, type_b))",
         "gum = float(np.hypot(sd, type_b))",
         "repeats do not help the GUM uncertainty",
@@ -511,7 +511,7 @@ FAULTS = (
     ),
     Fault(
         "focal part of the uncertainty doubled",
-        "classic.py",
+        "estimators/four_point.py",
         "0.1 * focal_scale_u) * focal_scale_u) ** 2",
         "0.1 * focal_scale_u) * 2 * focal_scale_u) ** 2",
         "type B uncertainty of the focal scale twice as large",
@@ -519,7 +519,7 @@ FAULTS = (
     ),
     Fault(
         "effective degrees of freedom by the square",
-        "classic.py",
+        "statistics/intervals.py",
         "return float(u**4 / total)",
         "return float(u**2 / total)",
         "GUM intervals too wide",
@@ -527,7 +527,7 @@ FAULTS = (
     ),
     Fault(
         "Y of frame S to the right",
-        "classic.py",
+        "instrument/stereo_pair.py",
         "np.column_stack((z, -x, -y))",
         "np.column_stack((z, x, -y))",
         "left and right change places",
@@ -535,7 +535,7 @@ FAULTS = (
     ),
     Fault(
         "slope of points 3 and 4 with the wrong sign",
-        "classic.py",
+        "estimators/four_point.py",
         "(across[..., 2] - across[..., 3])",
         "(across[..., 3] - across[..., 2])",
         "theta_f mirrored",
@@ -544,7 +544,7 @@ FAULTS = (
     # The digital twin.
     Fault(
         "twin: rotation of the stereo pair transposed",
-        "simulation.py",
+        "twin/physics.py",
         "right = left @ np.asarray(stereo.R, float).T +",
         "right = left @ np.asarray(stereo.R, float) +",
         "simulated campaigns of another stereo pair",
@@ -552,7 +552,7 @@ FAULTS = (
     ),
     Fault(
         "twin: stop error per pose",
-        "simulation.py",
+        "twin/physics.py",
         "elif counters[i] != counters[i - 1]:",
         "else:",
         "simulated stops are redrawn while the axis stands",
@@ -560,7 +560,7 @@ FAULTS = (
     ),
     Fault(
         "twin: homed from the wrong side",
-        "simulation.py",
+        "twin/simulated_campaign.py",
         "side = {positive: -0.5, negative: 0.5}",
         "side = {positive: 0.5, negative: -0.5}",
         "play of the first move in the wrong direction",
@@ -570,7 +570,7 @@ FAULTS = (
     # Comparison.
     Fault(
         "log predictive density with the wrong sign",
-        "comparison.py",
+        "comparison/hold_out.py",
         "log_density=float(np.mean(stats.t.logpdf(error, dof[name], scale=u)))",
         "log_density=-float(np.mean(stats.t.logpdf(error, dof[name], scale=u)))",
         "the worse predictor has the better score",
@@ -579,7 +579,7 @@ FAULTS = (
     ),
     Fault(
         "ratio of errors upside down",
-        "comparison.py",
+        "comparison/hold_out.py",
         'ratio = scores["classic"].rms_block_deg / scores["joint"].rms_block_deg',
         'ratio = scores["joint"].rms_block_deg / scores["classic"].rms_block_deg',
         "the report says that the classic predicts better by the factor by which it is worse",
@@ -587,7 +587,7 @@ FAULTS = (
     ),
     Fault(
         "shared cameras counted twice instead of once",
-        "comparison.py",
+        "comparison/changes.py",
         "variance = variance - 2 * np.sum(influence[0] * influence[1], axis=1)",
         "variance = variance + 2 * np.sum(influence[0] * influence[1], axis=1)",
         "a changed gear is not noticed",
@@ -595,7 +595,7 @@ FAULTS = (
     ),
     Fault(
         "distance of the error map by its largest coordinate",
-        "comparison.py",
+        "coordinates/error_map.py",
         "np.linalg.norm(error, axis=0), np.inf)",
         "np.abs(error).max(axis=0), np.inf)",
         "a tolerance in mm is said to be met up to 1.7 times too far out",
@@ -604,7 +604,7 @@ FAULTS = (
     ),
     Fault(
         "one-sided tolerance",
-        "comparison.py",
+        "report/evidence.py",
         "float(np.mean(np.abs(errors) <= limit))",
         "float(np.mean(errors <= limit))",
         "large negative errors meet every tolerance",
@@ -612,7 +612,7 @@ FAULTS = (
     ),
     Fault(
         "RMS of the error map over coordinates",
-        "comparison.py",
+        "coordinates/error_map.py",
         "square = np.sum(kept**2, axis=(0, 1)) / count",
         "square = np.sum(kept**2, axis=(0, 1)) / count / 3",
         "errors in mm too small by a factor of 1.7",
@@ -621,7 +621,7 @@ FAULTS = (
     # Coordinates.
     Fault(
         "one-sided coverage factor",
-        "classic.py",
+        "statistics/intervals.py",
         "upper = 0.5 * (1 + probability)",
         "upper = probability",
         "k = 1.64 for 95 %",
@@ -629,7 +629,7 @@ FAULTS = (
     ),
     Fault(
         "effective degrees of freedom without the fourth power",
-        "classic.py",
+        "statistics/intervals.py",
         "total = sum(c**4 / nu for c, nu in zip(contributions, dof, strict=True))",
         "total = sum(c**2 / nu for c, nu in zip(contributions, dof, strict=True))",
         "coverage factors of another quantity",
@@ -637,7 +637,7 @@ FAULTS = (
     ),
     Fault(
         "coverage interval with twice its tails",
-        "coordinates.py",
+        "statistics/intervals.py",
         "tail = 0.5 * (1 - probability)",
         "tail = 1 - probability",
         "U95 of coordinates holds 90 %",
@@ -645,7 +645,7 @@ FAULTS = (
     ),
     Fault(
         "published y with the wrong sign",
-        "coordinates.py",
+        "coordinates/location.py",
         "y = baseline_mm * (0.5 - share)",
         "y = baseline_mm * (0.5 + share)",
         "points on the wrong side of the baseline's middle",
@@ -653,7 +653,7 @@ FAULTS = (
     ),
     Fault(
         "other root of the cone",
-        "coordinates.py",
+        "coordinates/beam_meeting.py",
         "ahead = cos_b * root - w[1] * direction[1]",
         "ahead = -cos_b * root - w[1] * direction[1]",
         "points behind the scanner",
@@ -661,7 +661,7 @@ FAULTS = (
     ),
     Fault(
         "stop sd of the other side in coordinates",
-        "coordinates.py",
+        "coordinates/beam_meeting.py",
         "jnp.where(side > 0, high, jnp.where(side < 0, low,",
         "jnp.where(side > 0, low, jnp.where(side < 0, high,",
         "U95 of the wrong approach",
@@ -669,7 +669,7 @@ FAULTS = (
     ),
     Fault(
         "unknown play as if it were normal of unit sd",
-        "calibration.py",
+        "calibration/pointing.py",
         "1, 1, 1 / 12, 1 / 12, 1]",
         "1, 1, 1, 1, 1]",
         "coordinates of unknown approach 3.5 times too uncertain",
@@ -677,7 +677,7 @@ FAULTS = (
     ),
     Fault(
         "zero of the aperture with the wrong sign",
-        "coordinates.py",
+        "coordinates/beam_meeting.py",
         "settings.aperture_rad - receiver.aperture_zero_rad",
         "settings.aperture_rad + receiver.aperture_zero_rad",
         "every reading is off by twice the zero",
@@ -686,7 +686,7 @@ FAULTS = (
     # What a robot loads.
     Fault(
         "steps for the other approach",
-        "calibration.py",
+        "calibration/pointing.py",
         "at = output_deg(self.estimates, axis, steps, sign,",
         "at = output_deg(self.estimates, axis, steps, -sign,",
         "every target is missed by the backlash",
@@ -694,7 +694,7 @@ FAULTS = (
     ),
     Fault(
         "run-up from the wrong side",
-        "calibration.py",
+        "calibration/pointing.py",
         "first = steps - sign * ratio_sign * overshoot",
         "first = steps + sign * ratio_sign * overshoot",
         "the play is not taken up on the way",
@@ -702,7 +702,7 @@ FAULTS = (
     ),
     Fault(
         "closed form of `locate`: the other root",
-        "calibration.py",
+        "calibration/optics.py",
         "closing = cos_b * root - (",
         "closing = -cos_b * root - (",
         "the robot sees points behind itself",
@@ -710,7 +710,7 @@ FAULTS = (
     ),
     Fault(
         "U95 with k = 1.64",
-        "calibration.py",
+        "statistics/intervals.py",
         "NORMAL_95 = 1.959963984540054",
         "NORMAL_95 = 1.6448536269514722",
         "95 % regions hold 90 %",
@@ -719,7 +719,7 @@ FAULTS = (
     ),
     Fault(
         "variance of an unknown play four times too large",
-        "calibration.py",
+        "calibration/pointing.py",
         "place = side if side else -2 * noise[2 + k]",
         "place = side if side else -4 * noise[2 + k]",
         "points of unknown approach twice as uncertain",
@@ -727,7 +727,7 @@ FAULTS = (
     ),
     Fault(
         "C header with four digits",
-        "calibration.py",
+        "calibration/calibration_file.py",
         'f"#define {macro[name]} {value!r}"',
         'f"#define {macro[name]} {value:.4g}"',
         "the microcontroller misses by millimetres at 1 m",
@@ -735,7 +735,7 @@ FAULTS = (
     ),
     Fault(
         "aperture reading without its zero",
-        "calibration.py",
+        "calibration/pointing.py",
         'return angle + self.estimates["aperture_zero_deg"]',
         "return angle",
         "the reading foretold for a target is off by the zero",
@@ -744,7 +744,7 @@ FAULTS = (
     # Certificate.
     Fault(
         "ISO 230-2 A with one sd",
-        "certificate.py",
+        "metrology/iso230.py",
         "low_up, high_up = mean_up - 2 * sd_up, mean_up + 2 * sd_up",
         "low_up, high_up = mean_up - sd_up, mean_up + sd_up",
         "accuracy better than the standard's",
@@ -752,7 +752,7 @@ FAULTS = (
     ),
     Fault(
         "ISO 230-2 R with two sds",
-        "certificate.py",
+        "metrology/iso230.py",
         "r_up, r_down = 4 * sd_up, 4 * sd_down",
         "r_up, r_down = 2 * sd_up, 2 * sd_down",
         "unidirectional repeatability half as large",
@@ -760,7 +760,7 @@ FAULTS = (
     ),
     Fault(
         "ISO 230-2 E of the up side only",
-        "certificate.py",
+        "metrology/iso230.py",
         "systematic_deg=span(np.maximum(mean_up, mean_down), np.minimum(mean_up, mean_down))",
         "systematic_deg=span(mean_up, mean_up)",
         "systematic deviation without reversal",
@@ -768,7 +768,7 @@ FAULTS = (
     ),
     Fault(
         "ISO 230-2 M of sums",
-        "certificate.py",
+        "metrology/iso230.py",
         "mean, reversal = 0.5 * (mean_up + mean_down), mean_up - mean_down",
         "mean, reversal = mean_up + mean_down, mean_up - mean_down",
         "M twice as large",
@@ -776,7 +776,7 @@ FAULTS = (
     ),
     Fault(
         "ISO 230-2 B with the wrong sign",
-        "certificate.py",
+        "metrology/iso230.py",
         "mean, reversal = 0.5 * (mean_up + mean_down), mean_up - mean_down",
         "mean, reversal = 0.5 * (mean_up + mean_down), mean_down - mean_up",
         "a compensation table of this sign doubles the reversal error",
@@ -784,7 +784,7 @@ FAULTS = (
     ),
     Fault(
         "ISO 230-2 sd with n",
-        "certificate.py",
+        "metrology/iso230.py",
         "np.nanstd(up, axis=-1, ddof=1)",
         "np.nanstd(up, axis=-1, ddof=0)",
         "repeatability too good by a tenth",
@@ -792,7 +792,7 @@ FAULTS = (
     ),
     Fault(
         "simulated data called traceable",
-        "certificate.py",
+        "metrology/dcc.py",
         'if campaign.header.get("synthetic"):\n        return Traceability',
         'if campaign.header.get("simulated"):\n        return Traceability',
         "a twin's report claims a length standard",
@@ -800,7 +800,7 @@ FAULTS = (
     ),
     Fault(
         "a rest's looks against each other as if independent",
-        "information.py",
+        "statistics/intervals.py",
         "np.sqrt(variances[i] + 1 / weight)",
         "np.sqrt(variances[i])",
         "clean campaigns are suspected of depth",
@@ -808,7 +808,7 @@ FAULTS = (
     ),
     Fault(
         "chance of a gross defect with the wrong sign",
-        "information.py",
+        "statistics/intervals.py",
         "far = -x + np.log(",
         "far = x + np.log(",
         "the smaller of two gross defects is the cause",
@@ -816,7 +816,7 @@ FAULTS = (
     ),
     Fault(
         "ratios that follow a backlash the wrong way",
-        "posterior.py",
+        "posterior/transport.py",
         "step[:, place + 1 :] += self._beyond_linear",
         "step[:, place + 1 :] -= self._beyond_linear",
         "the sampler leaves the ridge of ratio and backlash, and calls itself unconverged",
@@ -824,7 +824,7 @@ FAULTS = (
     ),
     Fault(
         "robust distance by the weight alone",
-        "likelihood.py",
+        "estimators/linear_spots.py",
         "covariance + (weight[len(values)] - 1) * np.eye(4)",
         "covariance * weight[len(values)]",
         "stop errors shrink with the weight of a spot",
@@ -832,7 +832,7 @@ FAULTS = (
     ),
     Fault(
         "points that a third of the draws lose",
-        "calibration.py",
+        "calibration/pointing.py",
         "least = DIVERGING_SDS *",
         "least = 0.4 *",
         "the robot is sent where no range can be told",
@@ -840,7 +840,7 @@ FAULTS = (
     ),
     Fault(
         "contrast left out of the positioning figures",
-        "cli.py",
+        "pipeline.py",
         ", contrast_deg_per_step=contrast)",
         ")",
         "ISO 230-2 figures of gears that the fit does not see",
@@ -848,7 +848,7 @@ FAULTS = (
     ),
     Fault(
         "DCC: degrees called radians",
-        "certificate.py",
+        "metrology/dcc.py",
         '"deg": r"\\degree"',
         '"deg": r"\\radian"',
         "a machine reads the backlash 57 times too large",
@@ -856,7 +856,7 @@ FAULTS = (
     ),
     Fault(
         "DCC: ratios in degrees",
-        "certificate.py",
+        "metrology/dcc.py",
         '"deg/step": r"\\degree\\per\\one"',
         '"deg/step": r"\\degree"',
         "a ratio without its step",
@@ -864,7 +864,7 @@ FAULTS = (
     ),
     Fault(
         "DCC: whole width as expanded uncertainty",
-        "certificate.py",
+        "metrology/dcc.py",
         "expanded, middle = 0.5 * (high - low), 0.5 * (high + low)",
         "expanded, middle = high - low, 0.5 * (high + low)",
         "k = 3.92 in the certificate",
@@ -873,7 +873,7 @@ FAULTS = (
     # Planning.
     Fault(
         "information of the last look dropped",
-        "design.py",
+        "planning/expectation.py",
         "rows = found.rows[..., :PARAMETERS].reshape(-1, PARAMETERS)",
         "rows = found.rows[:-1, :, :PARAMETERS].reshape(-1, PARAMETERS)",
         "plans look slightly worse than they are",
@@ -881,7 +881,7 @@ FAULTS = (
     ),
     Fault(
         "run-up checked on the wrong side",
-        "design.py",
+        "planning/candidates.py",
         "start = positions - np.array(side) * overshoot",
         "start = positions + np.array(side) * overshoot",
         "plans run into the motor limits",
@@ -890,7 +890,7 @@ FAULTS = (
     ),
     Fault(
         "path of the contrast counted twice",
-        "design.py",
+        "planning/candidates.py",
         "scale = np.asarray(space.u)[CONTRAST_COLUMNS] * np.pi / 360",
         "scale = np.asarray(space.u)[CONTRAST_COLUMNS] * np.pi / 180",
         "the contrast seems known twice as well",
@@ -898,7 +898,7 @@ FAULTS = (
     ),
     Fault(
         "time model: placing a sheet as fast as a move",
-        "simulation.py",
+        "instrument/plan.py",
         '"place": "placement_s"',
         '"place": "move_s"',
         "plans take longer than they say",
@@ -906,7 +906,7 @@ FAULTS = (
     ),
     Fault(
         "time model: seconds per hour",
-        "design.py",
+        "planning/expectation.py",
         "plan_seconds(rig, steps) / 60",
         "plan_seconds(rig, steps) / 3600",
         "minutes are hours",
@@ -914,7 +914,7 @@ FAULTS = (
     ),
     Fault(
         "assurance off by one experiment",
-        "planning.py",
+        "planning/search.py",
         "while above - below > 1:",
         "while above - below > 2:",
         "n80 and n95 one too large",
@@ -923,7 +923,7 @@ FAULTS = (
     ),
     Fault(
         "U95 of a target with k = 1",
-        "design.py",
+        "planning/target.py",
         '1.0 if match["kind"] == "u" else NORMAL_95',
         '1.0 if match["kind"] == "u" else 1.0',
         "targets of U95 are met by half as many experiments",
@@ -931,7 +931,7 @@ FAULTS = (
     ),
     Fault(
         "classic count with n degrees of freedom",
-        "planning.py",
+        "planning/forecast.py",
         "wanted = max(2, math.ceil((float(special.stdtrit(n - 1, 0.975))",
         "wanted = max(2, math.ceil((float(special.stdtrit(n, 0.975))",
         "a repeat too few",
@@ -939,7 +939,7 @@ FAULTS = (
     ),
     Fault(
         "scatter known as if no parameter were fitted",
-        "planning.py",
+        "planning/forecast.py",
         "left_over = max(0.0, 1 - determined / (2 * looks))",
         "left_over = 1.0",
         "n for n - p: assurance too high",
@@ -947,7 +947,7 @@ FAULTS = (
     ),
     Fault(
         "next looks: a full turn away taken for here",
-        "planning.py",
+        "planning/limits.py",
         "(found.turned | (not turned))",
         "(~found.turned | (not turned))",
         "a full turn away is promised, looks nearby are ordered",
@@ -956,7 +956,7 @@ FAULTS = (
     ),
     Fault(
         "search after data: home variance for its inverse",
-        "planning.py",
+        "planning/search.py",
         "range(PARAMETERS, PARAMETERS + 2)] = 1 / HOME_VARIANCE_RAD2",
         "range(PARAMETERS, PARAMETERS + 2)] = HOME_VARIANCE_RAD2",
         "looks after a campaign are chosen as if homing told nothing",
@@ -965,7 +965,7 @@ FAULTS = (
     ),
     Fault(
         "exchanged design kept where it is worse",
-        "planning.py",
+        "planning/search.py",
         "merit(other) > merit(plain) else",
         "merit(other) < merit(plain) else",
         "the plan is the worse of two",
@@ -974,7 +974,7 @@ FAULTS = (
     ),
     Fault(
         "shares of pixel noise and stop errors exchanged",
-        "planning.py",
+        "planning/limits.py",
         'parts["pixel noise"] = float(pull @ noise @ pull)',
         'parts["pixel noise"] = float(pull @ (data - noise) @ pull)',
         "better cameras are bought where stops are the trouble",
@@ -983,7 +983,7 @@ FAULTS = (
     ),
     Fault(
         "needed uncertainty by the share for its square",
-        "planning.py",
+        "planning/limits.py",
         "+= share**-2 - 1",
         "+= share**-1 - 1",
         "an input is asked for far better than needed",
@@ -992,7 +992,7 @@ FAULTS = (
     ),
     Fault(
         "stated uncertainty shown as the needed one",
-        "planning.py",
+        "planning/limits.py",
         "= {_at_most(share * u)} instead of",
         "= {_at_most(u)} instead of",
         "the cure of a floor is what is there already",
@@ -1001,7 +1001,7 @@ FAULTS = (
     ),
     Fault(
         "needed uncertainty rounded up",
-        "planning.py",
+        "planning/limits.py",
         "last * math.floor(value / last + 1e-9)",
         "last * math.ceil(value / last - 1e-9)",
         "what would do does not do",
@@ -1009,7 +1009,7 @@ FAULTS = (
     ),
     Fault(
         "measuring stops at a hundredth of the value a minute",
-        "planning.py",
+        "planning/limits.py",
         "worth = STOP_SHARE_PER_MINUTE * now",
         "worth = 10 * STOP_SHARE_PER_MINUTE * now",
         "a campaign ends ten times too early",
@@ -1018,7 +1018,7 @@ FAULTS = (
     ),
     Fault(
         "classic answer: standard uncertainty for the half width",
-        "planning.py",
+        "planning/forecast.py",
         "half_width = target.limit * NORMAL_95 / target.factor",
         "half_width = target.limit / target.factor",
         "four times as many experiments are asked for",
@@ -1027,7 +1027,7 @@ FAULTS = (
     ),
     Fault(
         "classic answer: ends of the chi-square interval exchanged",
-        "planning.py",
+        "planning/forecast.py",
         "for p in (0.975, 0.025))",
         "for p in (0.025, 0.975))",
         "the interval of s and of n is upside down",
@@ -1036,7 +1036,7 @@ FAULTS = (
     ),
     Fault(
         "classic forecast: one stop of two",
-        "planning.py",
+        "planning/forecast.py",
         "pair = stops + stops[[1, 0, 3, 2]]",
         "pair = stops",
         "the classic method looks better than it is",
@@ -1045,7 +1045,7 @@ FAULTS = (
     ),
     Fault(
         "classic forecast: systematic error with the wrong sign",
-        "planning.py",
+        "planning/forecast.py",
         "errors.append(ratios[0] - true)",
         "errors.append(true - ratios[0])",
         "a correction goes the wrong way",
@@ -1054,7 +1054,7 @@ FAULTS = (
     ),
     Fault(
         "classic curve without the stereo calibration",
-        "planning.py",
+        "planning/forecast.py",
         "forecast.sd[:, rows] ** 2 / each + forecast.stereo_u[rows] ** 2",
         "forecast.sd[:, rows] ** 2 / each",
         "repeats seem to lower what is common to all of them",
@@ -1063,7 +1063,7 @@ FAULTS = (
     ),
     Fault(
         "tilt stop dropped at a target's point",
-        "design.py",
+        "planning/target.py",
         "own[:, :2].sum(axis=1)",
         "own[:, :1].sum(axis=1)",
         "z of a point seems as sure as its calibration",
@@ -1072,7 +1072,7 @@ FAULTS = (
     ),
     Fault(
         "study: assurance of the fits that converged",
-        "studies.py",
+        "studies/study.py",
         "assurance=hits / len(rows),",
         "assurance=hits / n,",
         "fits that fail make a plan look better",
@@ -1080,7 +1080,7 @@ FAULTS = (
     ),
     Fault(
         "study: coverage of one tail",
-        "studies.py",
+        "studies/study.py",
         "np.mean(np.abs(pit - 0.5) < level / 2)",
         "np.mean(np.abs(pit - 0.5) < level)",
         "every interval seems to hold the truth",
@@ -1089,7 +1089,7 @@ FAULTS = (
     # Files.
     Fault(
         "not-a-number accepted",
-        "files.py",
+        "files/csv_table.py",
         "if not (isfinite(value) and low <= value <= high):",
         "if value < low or value > high:",
         "one empty or wrong cell makes every result not-a-number",
@@ -1097,7 +1097,7 @@ FAULTS = (
     ),
     Fault(
         "duplicate key accepted",
-        "files.py",
+        "files/documents.py",
         "            if key not in values:\n",
         "            if True:\n",
         "the second of two values counts, silently",
@@ -1105,7 +1105,7 @@ FAULTS = (
     ),
     Fault(
         "written without a rename",
-        "files.py",
+        "files/disk.py",
         "            os.replace(temporary, path)\n",
         "            path.write_bytes(data)\n",
         "a crash leaves half a file where a whole one was",
@@ -1113,7 +1113,7 @@ FAULTS = (
     ),
     Fault(
         "renamed before it is on the disk",
-        "files.py",
+        "files/disk.py",
         "                os.fsync(stream.fileno())\n",
         "                pass\n",
         "after a power cut an empty file stands where a whole one was",
@@ -1121,7 +1121,7 @@ FAULTS = (
     ),
     Fault(
         "spot numbers twice",
-        "campaign.py",
+        "instrument/campaign.py",
         'table.check_unique("spot", spots, "unique ids")',
         'table.check_unique("spot", [], "unique ids")',
         "two rows answer to one number",
@@ -1129,7 +1129,7 @@ FAULTS = (
     ),
     Fault(
         "moves out of order accepted",
-        "campaign.py",
+        "instrument/campaign.py",
         "if row and times_s[row] < times_s[row - 1]:",
         "if row and times_s[row] < times_s[0]:",
         "shuffled moves make another campaign",
@@ -1137,7 +1137,7 @@ FAULTS = (
     ),
     Fault(
         "mirrored stereo rotation accepted",
-        "rigs.py",
+        "instrument/stereo_pair.py",
         "deviation = max(np.abs(rotation @ rotation.T - np.eye(3)).max(), abs(np.linalg.det(rotation) - 1.0))",
         "deviation = np.abs(rotation @ rotation.T - np.eye(3)).max()",
         "a left-handed camera frame passes",
@@ -1146,7 +1146,7 @@ FAULTS = (
     # Device.
     Fault(
         "journal: CRC not compared",
-        "device/journal.py",
+        "acquisition/journal.py",
         "if zlib.crc32(line[9:]) != crc:",
         "if zlib.crc32(line[9:]) < 0:",
         "damaged lines count as events",
@@ -1154,7 +1154,7 @@ FAULTS = (
     ),
     Fault(
         "journal: chain not compared",
-        "device/journal.py",
+        "acquisition/journal.py",
         "if int(match[3], 16) != previous:",
         "if int(match[3], 16) < 0:",
         "lines of another run count as events",
@@ -1162,7 +1162,7 @@ FAULTS = (
     ),
     Fault(
         "frame: CRC not compared",
-        "device/protocol.py",
+        "positioner/protocol.py",
         "if crc16(match[1]) != int(match[2], 16):",
         "if crc16(match[1]) < 0:",
         "a disturbed line moves the mirrors",
@@ -1170,7 +1170,7 @@ FAULTS = (
     ),
     Fault(
         "driver: an older answer taken for this one",
-        "device/driver.py",
+        "positioner/driver.py",
         "if answer.sequence == sequence:",
         "if answer.sequence <= sequence:",
         "a move counts as done before it has begun",
@@ -1178,7 +1178,7 @@ FAULTS = (
     ),
     Fault(
         "driver: arrival not compared with the order",
-        "device/driver.py",
+        "positioner/driver.py",
         "if reached != wanted or (state.pan_target_steps, state.tilt_target_steps) != wanted:",
         "if False:",
         "a stop elsewhere counts as arrival",
@@ -1187,7 +1187,7 @@ FAULTS = (
     ),
     Fault(
         "driver: reset not noticed",
-        "device/driver.py",
+        "positioner/driver.py",
         "if state.boot != self._boot:",
         "if state.boot < 0:",
         "moves go on from lost counters",
@@ -1195,7 +1195,7 @@ FAULTS = (
     ),
     Fault(
         "device: a repeated request executed again",
-        "device/model.py",
+        "positioner/firmware_model.py",
         "if sequence == self._last_sequence and line == self._last_request:",
         "if False:",
         "a retry is refused or moves twice",
@@ -1203,7 +1203,7 @@ FAULTS = (
     ),
     Fault(
         "device: soft limit of tilt open upwards",
-        "device/model.py",
+        "positioner/firmware_model.py",
         'limits["tmin"] <= tilt <= limits["tmax"]',
         'limits["tmin"] <= tilt',
         "tilt runs into the stop",
@@ -1212,7 +1212,7 @@ FAULTS = (
     ),
     Fault(
         "device: laser stays on in alarm",
-        "device/model.py",
+        "positioner/firmware_model.py",
         'if argument == "1" and self._status == "alarm":',
         'if argument == "1" and self._status == "never":',
         "the laser can be switched on in alarm",
@@ -1220,7 +1220,7 @@ FAULTS = (
     ),
     Fault(
         "laser stays on when a camera fails",
-        "device/observation.py",
+        "acquisition/observation.py",
         "            lit, on = self._lit(positioner, dark)\n        finally:\n            positioner.laser(False)",
         "            lit, on = self._lit(positioner, dark)\n        finally:\n            pass",
         "an exception leaves the laser on",
@@ -1228,7 +1228,7 @@ FAULTS = (
     ),
     Fault(
         "homing called an arrival from below",
-        "device/acquisition.py",
+        "acquisition/engine.py",
         "name = names[0] if steps > 0 else names[1]",
         "name = names[0]",
         "the recorded approach of move 0 is wrong: every ratio hangs on it",
@@ -1237,7 +1237,7 @@ FAULTS = (
     # Pictures.
     Fault(
         "neighbours of clipped pixels kept",
-        "device/spots.py",
+        "cameras/spot_fit.py",
         "usable = cv2.dilate(clipped, np.ones((3, 3), np.uint8)) == 0",
         "usable = clipped >= 0",
         "clipped cores pull the centre and widen the spot",
@@ -1245,7 +1245,7 @@ FAULTS = (
     ),
     Fault(
         "centres half a pixel off",
-        "device/spots.py",
+        "cameras/spot_fit.py",
         "centre = p[1:3] + step[1:3] + np.array(patch.corner)",
         "centre = p[1:3] + step[1:3] + np.array(patch.corner) + 0.5",
         "integer = corner instead of centre of a pixel: half a pixel everywhere",
@@ -1253,7 +1253,7 @@ FAULTS = (
     ),
     Fault(
         "covariance of a spot with the contrast, not its square",
-        "device/spots.py",
+        "cameras/spot_fit.py",
         "units = np.array([1.0, noise.gain_dn, noise.speckle_contrast**2])",
         "units = np.array([1.0, noise.gain_dn, noise.speckle_contrast])",
         "stated sds too large by the root of the contrast",
@@ -1261,7 +1261,7 @@ FAULTS = (
     ),
     Fault(
         "correlation of a spot doubled",
-        "device/spots.py",
+        "cameras/spot_fit.py",
         "mixed = (both - u - v) / 2",
         "mixed = both - u - v",
         "covariances that are none for turned spots",
@@ -1269,7 +1269,7 @@ FAULTS = (
     ),
     Fault(
         "epipolar gate open",
-        "device/spots.py",
+        "cameras/contour.py",
         "return ~(distance <= np.maximum(allowed, EPIPOLAR_FLOOR_PX))",
         "return ~(distance <= np.maximum(allowed, 1e3 * EPIPOLAR_FLOOR_PX))",
         "two different reflections count as one spot",
@@ -1277,7 +1277,7 @@ FAULTS = (
     ),
     Fault(
         "cameras exchanged in spots.csv",
-        "device/spots.py",
+        "cameras/detection.py",
         "for side, one in zip(SIDES, (left, right), strict=True):\n        good",
         "for side, one in zip(SIDES, (right, left), strict=True):\n        good",
         "the table holds left pixels under right",
@@ -1285,7 +1285,7 @@ FAULTS = (
     ),
     Fault(
         "rendered pixels half a pixel off",
-        "device/renderer.py",
+        "twin/board_pictures.py",
         "offsets = (np.arange(SUBPIXELS) + 0.5) / SUBPIXELS - 0.5",
         "offsets = (np.arange(SUBPIXELS) + 0.5) / SUBPIXELS",
         "boards stand half a pixel off in rendered pictures",
@@ -1293,7 +1293,7 @@ FAULTS = (
     ),
     Fault(
         "stereo calibration: n for n - p",
-        "device/stereo.py",
+        "cameras/bundle_adjustment.py",
         "dof = int(kept.sum()) - int(free.sum()) - 6 * len(views)",
         "dof = int(kept.sum())",
         "the covariance of the cameras is too small",

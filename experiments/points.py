@@ -35,7 +35,7 @@ KINDS = "inside", "outside"
 
 def true_look(truth, table, steps, sides, range_mm, generator):
     """True point (3,) of frame T and aperture reading of one look after homing, by the twin's optics."""
-    from tvsbayes.simulation import aperture_angle_deg, mirror_chain, to_tvs
+    from tvsbayes.twin.physics import aperture_angle_deg, mirror_chain, to_tvs
 
     p = truth.parameters
     angles = []
@@ -51,15 +51,15 @@ def true_look(truth, table, steps, sides, range_mm, generator):
 def one_rig(task: tuple[int]) -> dict[str, object]:
     """Simulate, fit, look at points, locate them."""
     (seed,) = task
-    from tvsbayes import likelihood
+    from tvsbayes.estimators import campaign_arrays
 
     # As in coverage.py: ordinary fits pad to 512 spots, here every campaign is alike.
-    likelihood.SMALLEST_BUCKET = 96
-    from tvsbayes.coordinates import locate
-    from tvsbayes.information import calibration_of
-    from tvsbayes.joint import fit
-    from tvsbayes.model import use_compilation_cache
-    from tvsbayes.simulation import simulate
+    campaign_arrays.SMALLEST_BUCKET = 96
+    from tvsbayes.assessment.fitted_calibration import calibration_of
+    from tvsbayes.coordinates.location import locate
+    from tvsbayes.estimators.campaign_arrays import use_compilation_cache
+    from tvsbayes.estimators.joint_fit import fit
+    from tvsbayes.twin.simulated_campaign import simulate
 
     use_compilation_cache()
     start = time.perf_counter()
@@ -123,10 +123,10 @@ def others_error(campaign, counters, readings, points) -> dict[str, np.ndarray]:
     import jax
     import jax.numpy as jnp
 
-    from tvsbayes.classic import classic
-    from tvsbayes.comparison import simple_calibration, simple_rays
-    from tvsbayes.coordinates import meeting
-    from tvsbayes.files import NothingToEstimate
+    from tvsbayes.coordinates.beam_meeting import meeting
+    from tvsbayes.coordinates.error_map import simple_calibration, simple_rays
+    from tvsbayes.errors import NothingToEstimate
+    from tvsbayes.estimators.four_point import classic
 
     estimates, result = {"nominal": None}, {"classic": np.full_like(points, np.nan)}
     with suppress(NothingToEstimate):

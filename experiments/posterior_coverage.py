@@ -54,14 +54,14 @@ SMALL_HEADLINES = (
 def clean_rig(task: tuple[str, int]) -> dict[str, object]:
     """One rig of a shipped protocol, by Laplace and by sampling."""
     protocol, seed = task
-    from tvsbayes import likelihood
+    from tvsbayes.estimators import campaign_arrays
 
     # As in coverage.py: ordinary fits pad to 512 spots, here every campaign is alike.
-    likelihood.SMALLEST_BUCKET = 96
-    from tvsbayes.joint import fit
-    from tvsbayes.model import use_compilation_cache
-    from tvsbayes.posterior import sample
-    from tvsbayes.simulation import simulate
+    campaign_arrays.SMALLEST_BUCKET = 96
+    from tvsbayes.estimators.campaign_arrays import use_compilation_cache
+    from tvsbayes.estimators.joint_fit import fit
+    from tvsbayes.posterior.sampling import sample
+    from tvsbayes.twin.simulated_campaign import simulate
 
     use_compilation_cache()
     simulated = simulate(mounted_rig(), shipped_plan(protocol), seed, aperture=protocol == "grid")
@@ -84,7 +84,7 @@ def clean_rig(task: tuple[str, int]) -> dict[str, object]:
 
 def broken_campaign(condition: str, seed: int):
     """A simulated campaign of 96 spots that breaks the model in one way; clean and broken share rig and stop errors."""
-    from tvsbayes.simulation import draw_truth, simulate
+    from tvsbayes.twin.simulated_campaign import draw_truth, simulate
 
     rig = mounted_rig()
     generator = np.random.default_rng([seed, 0x6272])
@@ -124,11 +124,11 @@ def broken_campaign(condition: str, seed: int):
 def broken_rig(task: tuple[str, int]) -> dict[str, object]:
     """One broken campaign, fitted plain and robust."""
     condition, seed = task
-    from tvsbayes import likelihood
+    from tvsbayes.estimators import campaign_arrays
 
-    likelihood.SMALLEST_BUCKET = 128
-    from tvsbayes.joint import fit
-    from tvsbayes.model import use_compilation_cache
+    campaign_arrays.SMALLEST_BUCKET = 128
+    from tvsbayes.estimators.campaign_arrays import use_compilation_cache
+    from tvsbayes.estimators.joint_fit import fit
 
     use_compilation_cache()
     campaign, truth = broken_campaign(condition, seed)

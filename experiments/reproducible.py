@@ -64,12 +64,12 @@ def run(name: str, cold: bool, short: bool) -> None:
     began = time.process_time()
     with tempfile.TemporaryDirectory() as scratch:
         os.environ["TVSBAYES_CACHE"] = str(Path(scratch) / "cache" if cold else OUTPUT / "reproducible-cache")
-        from tvsbayes.campaign import campaign_toml, moves_bytes, spots_bytes
-        from tvsbayes.classic import check_campaign
-        from tvsbayes.joint import fit
-        from tvsbayes.model import use_compilation_cache
-        from tvsbayes.posterior import sample
-        from tvsbayes.simulation import simulate
+        from tvsbayes.estimators.campaign_arrays import use_compilation_cache
+        from tvsbayes.estimators.joint_fit import fit
+        from tvsbayes.estimators.plausibility import check_campaign
+        from tvsbayes.instrument.campaign import campaign_toml, moves_bytes, spots_bytes
+        from tvsbayes.posterior.sampling import sample
+        from tvsbayes.twin.simulated_campaign import simulate
 
         use_compilation_cache()
         rig, plan = mounted_rig(), dense_plan(("d1", "d3"))
@@ -102,8 +102,9 @@ def run(name: str, cold: bool, short: bool) -> None:
 
 def studied(rig, plan, scratch: Path) -> dict[str, object]:
     """Rows of a study by engine, without their seconds."""
-    from tvsbayes.design import DEFAULT_TARGET, parse_target
-    from tvsbayes.studies import StudyJob, StudyRows, study
+    from tvsbayes.planning.target import DEFAULT_TARGET, parse_target
+    from tvsbayes.studies.study import StudyRows, study
+    from tvsbayes.studies.study_job import StudyJob
 
     job = StudyJob(rig, plan, parse_target(DEFAULT_TARGET), SEED)
     found: dict[str, object] = {}

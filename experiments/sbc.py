@@ -68,14 +68,14 @@ def faulty(campaign, variant: str):
 def one_simulation(task: tuple[str, int]) -> dict[str, object]:
     """Simulate, fit, sample, rank; whatever fails is recorded as a failure."""
     variant, seed = task
-    from tvsbayes import likelihood
+    from tvsbayes.estimators import campaign_arrays as buckets
 
     # A small campaign in a small bucket: ordinary ones pad to 512 spots to share a compilation.
-    likelihood.SMALLEST_BUCKET = 64
-    from tvsbayes.joint import fit
-    from tvsbayes.model import use_compilation_cache
-    from tvsbayes.posterior import sample
-    from tvsbayes.simulation import simulate
+    buckets.SMALLEST_BUCKET = 64
+    from tvsbayes.estimators.campaign_arrays import use_compilation_cache
+    from tvsbayes.estimators.joint_fit import fit
+    from tvsbayes.posterior.sampling import sample
+    from tvsbayes.twin.simulated_campaign import simulate
 
     use_compilation_cache()
     simulated = simulate(mounted_rig(), small_plan(SHEETS) if variant == FEW else dense_plan(SHEETS), seed)
@@ -106,10 +106,13 @@ def ranks(simulated, result, z: np.ndarray) -> dict[str, int]:
     """Number of draws z (n, 65), coordinates of the fit, below the truth, for every quantity of the true model."""
     import jax
 
-    from tvsbayes.likelihood import campaign_arrays, evaluate
-    from tvsbayes.model import NAMES, parameter_space
-    from tvsbayes.posterior import derived_at, in_batches
-    from tvsbayes.simulation import effective_deg_per_step, effective_mirror_offset_mm
+    from tvsbayes.estimators.campaign_arrays import campaign_arrays
+    from tvsbayes.estimators.likelihood import evaluate
+    from tvsbayes.instrument.parameters import NAMES
+    from tvsbayes.model.parameter_space import parameter_space
+    from tvsbayes.posterior.draws import derived_at
+    from tvsbayes.posterior.transport import in_batches
+    from tvsbayes.twin.physics import effective_deg_per_step, effective_mirror_offset_mm
 
     truth = simulated.truth
     pose = result.reference_pose_rad

@@ -31,13 +31,14 @@ import jax.numpy as jnp
 import numpy as np
 from scipy import optimize
 
-from tvsbayes.campaign import mixed_protocol, read_campaign, write_campaign
-from tvsbayes.files import shipped_data
-from tvsbayes.joint import Fixed, Problem, fit, levenberg_marquardt, residuals_and_jacobian, stage_residuals
-from tvsbayes.likelihood import ordered_spots
-from tvsbayes.model import NAMES
-from tvsbayes.rigs import read_rig
-from tvsbayes.simulation import simulate
+from tvsbayes.estimators.joint_fit import Fixed, Problem, fit, stage_residuals
+from tvsbayes.files.disk import shipped_data
+from tvsbayes.instrument.campaign import ordered_spots, read_campaign, write_campaign
+from tvsbayes.instrument.parameters import NAMES
+from tvsbayes.instrument.plan import mixed_protocol
+from tvsbayes.instrument.rig import read_rig
+from tvsbayes.statistics.least_squares import levenberg_marquardt, residuals_and_jacobian
+from tvsbayes.twin.simulated_campaign import simulate
 
 TWIN = shipped_data() / "twins" / "paper_twin"
 REPEATS = 5
@@ -61,7 +62,7 @@ def process_start() -> None:
     for _ in range(2):
         with tempfile.TemporaryDirectory() as cache, tempfile.TemporaryDirectory() as out:
             environment = {**os.environ, "TVSBAYES_CACHE": cache}
-            command = [sys.executable, "-c", "from tvsbayes.cli import main; main()", "fit", str(TWIN)]
+            command = [sys.executable, "-c", "from tvsbayes.cli.main import main; main()", "fit", str(TWIN)]
             command += ["--no-sample", "--json", "--out", out]
 
             def run(command=command, environment=environment):

@@ -23,10 +23,12 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from tvsbayes.device.boards import Board, View, find_views
-from tvsbayes.files import TvsError, shipped_data
-from tvsbayes.rigs import STEREO_PARAMETER_NAMES, Stereo, read_stereo, rotation_matrix, rotation_vector
-from tvsbayes.simulation import project
+from tvsbayes.cameras.boards import Board, View, find_views
+from tvsbayes.errors import TvsError
+from tvsbayes.files.disk import shipped_data
+from tvsbayes.instrument.parameters import STEREO_PARAMETER_NAMES
+from tvsbayes.instrument.stereo_pair import Stereo, read_stereo, rotation_matrix, rotation_vector
+from tvsbayes.twin.physics import project
 
 CONDITIONS = ("white", "pitch", "shared", "rendered")
 BOARD = Board(9, 6, 25.0)
@@ -80,10 +82,11 @@ def scenes(seed: int, condition: str) -> list[Scene]:
     stereo = nominal.with_vector(nominal.vector + TRUTH_SD * rng.standard_normal(24))
     if condition == "rendered":
         # Finders need the outer squares too: the renderer's own poses leave room for them.
-        from tvsbayes.device import renderer
+        from tvsbayes.twin.board_pictures import Board, board_poses
+        from tvsbayes.twin.spot_pictures import cameras_of
 
         first = BOARD.points_mm[0]
-        poses = renderer.board_poses(renderer.cameras_of(stereo), renderer.Board(), RENDERED_VIEWS, seed)
+        poses = board_poses(cameras_of(stereo), Board(), RENDERED_VIEWS, seed)
         return [
             Scene(
                 stereo,
@@ -109,17 +112,16 @@ def rendered_views(drawn: Sequence[Scene], seed: int) -> list[View]:
     """Pictures of every scene in a folder, and the corners that `find_views` finds there."""
     import cv2
 
-    from tvsbayes.device import renderer
+    from tvsbayes.twin.board_pictures import Board, BoardPose, render_board
+    from tvsbayes.twin.spot_pictures import Sensor, cameras_of
 
-    cameras = renderer.cameras_of(drawn[0].stereo)
+    cameras = cameras_of(drawn[0].stereo)
     with TemporaryDirectory() as folder:
         for k, scene in enumerate(drawn):
             rotation = rotation_matrix(scene.pose[:3])
-            pose = renderer.BoardPose(rotation, scene.pose[3:] + rotation @ scene.board.points_mm[0])
+            pose = BoardPose(rotation, scene.pose[3:] + rotation @ scene.board.points_mm[0])
             for side, camera in (("left", cameras.left), ("right", cameras.right)):
-                picture = renderer.render_board(
-                    camera, pose, renderer.Board(), renderer.Sensor(), (seed, k, side == "right")
-                )
+                picture = render_board(camera, pose, Board(), Sensor(), (seed, k, side == "right"))
                 place = str(Path(folder) / f"{side}{k:02d}.png")
                 # Level 1: the files live for seconds.
                 assert cv2.imwrite(place, picture, [cv2.IMWRITE_PNG_COMPRESSION, 1])
@@ -151,7 +153,7 @@ def chi2(difference: np.ndarray, covariance: np.ndarray) -> float:
 
 def calibrate(task: tuple[str, int]) -> dict[str, object]:
     """One rig: chi-square of the true 24 parameters under the stored covariance, z of each, and the rest."""
-    from tvsbayes.device.stereo import calibrate_stereo
+    from tvsbayes.cameras.stereo_calibration import calibrate_stereo
 
     condition, seed = task
     drawn = scenes(seed, condition)
@@ -184,7 +186,7 @@ def calibrate(task: tuple[str, int]) -> dict[str, object]:
 
 def halves() -> None:
     """Calibrate random halves of OpenCV's pairs and compare them."""
-    from tvsbayes.device.stereo import calibrate_stereo
+    from tvsbayes.cameras.stereo_calibration import calibrate_stereo
 
     found = find_views(OPENCV_PAIRS, BOARD)
     size = (found.image_width, found.image_height)

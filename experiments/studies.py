@@ -11,6 +11,9 @@ from pathlib import Path
 import numpy as np
 from coverage import SINGLE_THREADED, read_rows
 
+from tvsbayes.estimators.joint_fit import Problem, fit, fit_at
+from tvsbayes.statistics.least_squares import newton_mode
+
 PAN_SWEEP = (0, 70, 140, 200, 140, 70)
 TILT_SWEEP = (-60, -20, 20, 60, 20, -20)
 TILT_STEPS = (-60, -36, -12, 12, 36, 60, 36, 12, -12, -36)
@@ -23,7 +26,7 @@ def small_plan(sheets: Sequence[str]):
 
     Two sheets give twelve stops in every direction.
     """
-    from tvsbayes.campaign import PlanStep
+    from tvsbayes.instrument.plan import PlanStep
 
     orders = [("home", 0, 0)]
     for sheet in sheets:
@@ -35,7 +38,7 @@ def small_plan(sheets: Sequence[str]):
 
 def dense_plan(sheets: Sequence[str]):
     """30 spots per sheet, both axes driven between any two: every spot tells a stop of each axis; 60 spots for two."""
-    from tvsbayes.campaign import PlanStep
+    from tvsbayes.instrument.plan import PlanStep
 
     orders = [("home", 0, 0)]
     for sheet in sheets:
@@ -47,16 +50,16 @@ def dense_plan(sheets: Sequence[str]):
 
 def mounted_rig():
     """The shipped rig whose extrinsics are known to 0.03 rad and 5 mm."""
-    from tvsbayes.files import shipped_data
-    from tvsbayes.rigs import read_rig
+    from tvsbayes.files.disk import shipped_data
+    from tvsbayes.instrument.rig import read_rig
 
     return read_rig(shipped_data() / "rigs" / "mounted" / "rig.toml")
 
 
 def shipped_plan(protocol: str):
     """A plan of the mounted rig."""
-    from tvsbayes.campaign import read_plan
-    from tvsbayes.files import shipped_data
+    from tvsbayes.files.disk import shipped_data
+    from tvsbayes.instrument.plan import read_plan
 
     return read_plan(shipped_data() / "rigs" / "mounted" / f"{protocol}.csv")
 
@@ -70,7 +73,7 @@ HEADLINES = (
 
 def headlines(draws) -> dict[str, np.ndarray]:
     """Headline quantities of `tvsbayes.joint.Derived`, whose leading axes are kept."""
-    from tvsbayes.model import INDEX
+    from tvsbayes.instrument.parameters import INDEX
 
     ratio, physical = np.asarray(draws.effective_deg_per_step), np.asarray(draws.physical)
     each = (
@@ -86,7 +89,7 @@ def headlines(draws) -> dict[str, np.ndarray]:
 
 def true_headlines(parameters: Mapping[str, float], pose_rad: np.ndarray) -> dict[str, float]:
     """The same of a true rig, by the twin's formulas, at the pose of the fit."""
-    from tvsbayes.studies import true_headlines as values
+    from tvsbayes.studies.study_job import true_headlines as values
 
     return dict(zip(HEADLINES, values(parameters, pose_rad).tolist(), strict=True))
 
@@ -109,7 +112,7 @@ def judged(draws, centre, prior_draws, parameters: Mapping[str, float], pose_rad
 
 def physical_of(truth) -> np.ndarray:
     """A true rig and its cameras in the order of `tvsbayes.model.NAMES`, shape (65,)."""
-    from tvsbayes.model import RIG_NAMES
+    from tvsbayes.instrument.parameters import RIG_NAMES
 
     return np.array([*(truth.parameters[name] for name in RIG_NAMES), *truth.stereo.vector])
 
@@ -121,7 +124,7 @@ def coordinates(space, physical: np.ndarray) -> np.ndarray:
     """
     from scipy import stats
 
-    from tvsbayes.model import KINDS, RIG_NAMES
+    from tvsbayes.instrument.parameters import KINDS, RIG_NAMES
 
     z = np.zeros_like(physical)
     for i, (value, u, kind) in enumerate(zip(space.value, space.u, space.kind, strict=True)):
@@ -147,15 +150,13 @@ def fit_from_truth(campaign, truth):
     """
     import jax
 
-    from tvsbayes import joint
-
     with jax.enable_x64(True):
-        problem = joint.Problem(campaign, campaign.rig)
+        problem = Problem(campaign, campaign.rig)
         z = np.where(problem.free, np.clip(coordinates(problem.space, physical_of(truth)[None])[0], -4.0, 4.0), 0.0)
-        mode = joint.newton_mode(problem.objective, z, problem.free, problem.curvature(z))
+        mode = newton_mode(problem.objective, z, problem.free, problem.curvature(z))
         if not mode.problems:
-            return joint.fit_at(campaign, problem, mode, 0)
-    return joint.fit(campaign)
+            return fit_at(campaign, problem, mode, 0)
+    return fit(campaign)
 
 
 def _pin(cores) -> None:

@@ -20,10 +20,13 @@ import numpy as np
 from scipy import stats
 from studies import mounted_rig, shipped_plan
 
-from tvsbayes.campaign import read_campaign
-from tvsbayes.classic import DIRECTIONS, classic, four_point_angle_deg, ratio_deg_per_step, triangulate
-from tvsbayes.files import shipped_data
-from tvsbayes.simulation import project, read_truth, simulate
+from tvsbayes.estimators.four_point import classic, four_point_angle_deg, ratio_deg_per_step
+from tvsbayes.files.disk import shipped_data
+from tvsbayes.instrument.axes import DIRECTIONS
+from tvsbayes.instrument.campaign import read_campaign
+from tvsbayes.instrument.stereo_pair import triangulate
+from tvsbayes.twin.physics import project
+from tvsbayes.twin.simulated_campaign import read_truth, simulate
 
 AGAIN = 100
 """Campaigns of the same true rig: their sd is known to 7 %."""

@@ -75,7 +75,7 @@ DIRECTIONS = tuple(SIGN)
 
 def four_point_plan(repeats: int = 24, steps=(200,), other_side=(False,)):
     """The paper's experiments, each from a homing at its start; `other_side` starts have a run-up against it."""
-    from tvsbayes.campaign import OVERSHOOT_STEPS, PlanStep
+    from tvsbayes.instrument.plan import OVERSHOOT_STEPS, PlanStep
 
     orders: list[tuple] = []
     for direction, sign in SIGN.items():
@@ -105,8 +105,10 @@ def four_point_plan(repeats: int = 24, steps=(200,), other_side=(False,)):
 
 def planned_steps(rig):
     """What the planner takes for 16 experiments' worth of looks, as in planning_design.py."""
-    from tvsbayes.design import DEFAULT_TARGET, LookArrays, candidates, parse_target, prior_knowledge, sensitivity
-    from tvsbayes.planning import design_family
+    from tvsbayes.planning.candidates import LookArrays, candidates
+    from tvsbayes.planning.expectation import prior_knowledge
+    from tvsbayes.planning.search import design_family
+    from tvsbayes.planning.target import DEFAULT_TARGET, parse_target, sensitivity
 
     knowledge, target = prior_knowledge(rig), parse_target(DEFAULT_TARGET)
     found = candidates(knowledge)
@@ -117,7 +119,7 @@ def planned_steps(rig):
 
 def plan_of(name: str):
     """Plan of a campaign."""
-    from tvsbayes.campaign import PlanStep, grid_protocol
+    from tvsbayes.instrument.plan import PlanStep, grid_protocol
 
     if name.startswith("paper"):
         return four_point_plan()
@@ -135,9 +137,9 @@ def plan_of(name: str):
 
 def classic_without_noise(parameters, stated, true_stereo) -> dict[str, float]:
     """What the classic chain reads of the four moves, deg/step, by the twin's optics on nominal sheets."""
-    from tvsbayes.classic import four_point_ratios
-    from tvsbayes.rigs import rotation_matrix
-    from tvsbayes.simulation import mirror_chain, project
+    from tvsbayes.estimators.four_point import four_point_ratios
+    from tvsbayes.instrument.stereo_pair import rotation_matrix
+    from tvsbayes.twin.physics import mirror_chain, project
 
     rotation = rotation_matrix(np.array([parameters[f"extrinsics.rotation_rad.{a}"] for a in "xyz"]))
     shift = np.array([parameters[f"extrinsics.translation_mm.{a}"] for a in "xyz"])
@@ -167,7 +169,7 @@ def classic_without_noise(parameters, stated, true_stereo) -> dict[str, float]:
 
 def solved(kind: str, rig, seed: int):
     """True rig of a kind from drawing `seed`, that reads Table 1's means; and those readings."""
-    from tvsbayes.simulation import draw_truth, with_derived
+    from tvsbayes.twin.simulated_campaign import draw_truth, with_derived
 
     drawn = draw_truth(rig, np.random.default_rng([seed, 2]))
     table = {name: values[1] for name, values in paper_values().items()}
@@ -207,7 +209,7 @@ def solved(kind: str, rig, seed: int):
 
 def wide(rig):
     """The rig with a contrast prior that literal ratios pass."""
-    from tvsbayes.rigs import Prior
+    from tvsbayes.instrument.parameters import Prior
 
     loose = {f"ratio_contrast_deg_per_step.{axis}": Prior(0.0, CONTRAST_U) for axis in ("pan", "tilt")}
     return replace(rig, table=replace(rig.table, priors={**rig.table.priors, **loose}))
@@ -230,16 +232,17 @@ def log_evidence(result) -> float:
 
 def one_row(task: tuple[str, str, int]) -> dict[str, object]:
     """Simulate one campaign of one machine and fit the three models."""
-    from tvsbayes import likelihood
+    from tvsbayes.estimators import campaign_arrays
 
     # As in coverage.py: ordinary fits pad to 512 spots.
-    likelihood.SMALLEST_BUCKET = 96
-    from tvsbayes.campaign import read_plan
-    from tvsbayes.files import shipped_data
-    from tvsbayes.joint import fit
-    from tvsbayes.model import INDEX, use_compilation_cache
-    from tvsbayes.rigs import read_rig
-    from tvsbayes.simulation import simulate
+    campaign_arrays.SMALLEST_BUCKET = 96
+    from tvsbayes.estimators.campaign_arrays import use_compilation_cache
+    from tvsbayes.estimators.joint_fit import fit
+    from tvsbayes.files.disk import shipped_data
+    from tvsbayes.instrument.parameters import INDEX
+    from tvsbayes.instrument.plan import read_plan
+    from tvsbayes.instrument.rig import read_rig
+    from tvsbayes.twin.simulated_campaign import simulate
 
     use_compilation_cache()
     kind, name, seed = task
@@ -282,8 +285,8 @@ def one_row(task: tuple[str, str, int]) -> dict[str, object]:
 
 def run(arguments: argparse.Namespace) -> None:
     """Append rows until every machine has every campaign under every seed."""
-    from tvsbayes.campaign import write_plan
-    from tvsbayes.model import use_compilation_cache
+    from tvsbayes.estimators.campaign_arrays import use_compilation_cache
+    from tvsbayes.instrument.plan import write_plan
 
     use_compilation_cache()
     PLANNED.parent.mkdir(parents=True, exist_ok=True)
@@ -303,8 +306,7 @@ def weight_log10(row) -> float | None:
 
 def drift_deg() -> tuple[float, float]:
     """How far pan and tilt of literal gears are off at the end of the paper's campaign without homings, degrees."""
-    from tvsbayes.campaign import twin_protocol
-    from tvsbayes.simulation import run_plan
+    from tvsbayes.instrument.plan import run_plan, twin_protocol
 
     moves, result = run_plan(twin_protocol(), mounted_rig(), ("right", "up")).moves, []
     table = {name: values[1] for name, values in paper_values().items()}
@@ -320,7 +322,7 @@ def classic_part() -> None:
     """Both machines' Table 1, and whether the readings differ."""
     from scipy import stats
 
-    from tvsbayes.simulation import simulate
+    from tvsbayes.twin.simulated_campaign import simulate
 
     paper, rig = paper_values(), mounted_rig()
     readings: dict[tuple[str, str], list[np.ndarray]] = {}
@@ -366,7 +368,7 @@ def classic_part() -> None:
 
 def classic_readings(campaign) -> dict[str, np.ndarray]:
     """Ratios by direction, without uncertainties."""
-    from tvsbayes.classic import four_point_ratios, select_experiments
+    from tvsbayes.estimators.four_point import four_point_ratios, select_experiments
 
     chosen = select_experiments(campaign)
     ratios = four_point_ratios(chosen.pixels, chosen.steps, chosen.axis, campaign.stereo)
@@ -418,7 +420,7 @@ def draw(rows) -> None:
     from matplotlib import rc_context
     from matplotlib.figure import Figure
 
-    from tvsbayes.plots import BLACK, BLUE, RED, STYLE, WIDTH_IN
+    from tvsbayes.report.figures import BLACK, BLUE, RED, STYLE, WIDTH_IN
 
     looks = {"lost motion": (BLUE, "o"), "literal": (RED, "^")}
     with rc_context(STYLE):

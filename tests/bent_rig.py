@@ -9,9 +9,9 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from tvsbayes import simulation
-from tvsbayes.calibration import INPUT_NAMES, NOISE_NAMES, Calibration
-from tvsbayes.rigs import HARMONIC_PRIORS
+from tvsbayes.calibration.pointing import INPUT_NAMES, NOISE_NAMES, Calibration
+from tvsbayes.instrument.parameters import HARMONIC_PRIORS
+from tvsbayes.twin.physics import aperture_angle_deg, harmonics_deg, mirror_chain, to_tvs, transmission
 
 BENT: dict[str, float] = {
     "degrees_per_step.pan": 0.0621,
@@ -132,17 +132,15 @@ def twin_angle_deg(values: Mapping[str, float], axis: str, steps: float, start: 
     """Mirror angle of one axis after homing at a counter, by the twin."""
     args = np.array([float(steps)]), np.array([True]), np.array([start]), np.zeros(1)
     ratios = values[f"degrees_per_step.{axis}"], 0.0
-    wobble = () if period_deg is None else (simulation.harmonics_deg(values, axis), period_deg)
-    angle = float(simulation.transmission(*args, ratios, values[f"backlash_deg.{axis}"], *wobble)[0])
+    wobble = () if period_deg is None else (harmonics_deg(values, axis), period_deg)
+    angle = float(transmission(*args, ratios, values[f"backlash_deg.{axis}"], *wobble)[0])
     return angle + (values["tilt_zero_deg"] if axis == "tilt" else 0.0)
 
 
 def twin_ray_at(values: Mapping[str, float], pan_deg: float, tilt_deg: float) -> tuple[np.ndarray, np.ndarray]:
     """Origin (3,) and direction (3,) of the beam in frame T for mirror angles, by the twin."""
-    origin, direction = simulation.mirror_chain(np.radians(pan_deg), np.radians(tilt_deg), values)
-    both = simulation.to_tvs(
-        np.stack([origin, origin + direction]), values["baseline_mm"], values["pan_zero_emission_deg"]
-    )
+    origin, direction = mirror_chain(np.radians(pan_deg), np.radians(tilt_deg), values)
+    both = to_tvs(np.stack([origin, origin + direction]), values["baseline_mm"], values["pan_zero_emission_deg"])
     return both[0], both[1] - both[0]
 
 
@@ -164,8 +162,6 @@ def twin_points(origin: np.ndarray, direction: np.ndarray, baseline_mm, reading_
     seen = origin + np.multiply.outer(0.5 * np.broadcast_to(baseline_mm, len(origin)), [0.0, 1.0, 0.0])
     for _ in range(80):
         middle = 0.5 * (low + high)
-        angle = simulation.aperture_angle_deg(
-            seen + middle[:, None] * direction, 0.0, "azimuth" if azimuth else "in-plane"
-        )
+        angle = aperture_angle_deg(seen + middle[:, None] * direction, 0.0, "azimuth" if azimuth else "in-plane")
         low, high = np.where(angle < reading_deg, middle, low), np.where(angle < reading_deg, high, middle)
     return origin + (0.5 * (low + high))[:, None] * direction

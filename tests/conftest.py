@@ -22,9 +22,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tvsbayes.campaign import Campaign, PlanStep
-from tvsbayes.rigs import Rig, read_rig
-from tvsbayes.simulation import SimulatedCampaign, Truth, simulate
+from tvsbayes.instrument.campaign import Campaign
+from tvsbayes.instrument.plan import PlanStep
+from tvsbayes.instrument.rig import Rig, read_rig
+from tvsbayes.twin.simulated_campaign import SimulatedCampaign, Truth, simulate
 
 ROOT = Path(__file__).resolve().parents[1]
 COMPILES = "test_cli.py"
@@ -128,7 +129,7 @@ def coordinates(space: Any, truth: Truth) -> np.ndarray:
     """Coordinates z of a true rig: the inverse of `ParameterSpace.physical`, by scipy's distributions."""
     from scipy.stats import halfnorm, norm
 
-    from tvsbayes.model import KINDS, RIG_NAMES
+    from tvsbayes.instrument.parameters import KINDS, RIG_NAMES
 
     z = []
     for name, value, u, kind in zip(RIG_NAMES, space.value, space.u, space.kind, strict=True):
@@ -152,8 +153,8 @@ def dozen(mounted_rig: Rig) -> Dozen:
     import jax
     import jax.numpy as jnp
 
-    from tvsbayes.likelihood import campaign_arrays
-    from tvsbayes.model import parameter_space
+    from tvsbayes.estimators.campaign_arrays import campaign_arrays
+    from tvsbayes.model.parameter_space import parameter_space
 
     simulated = dozen_campaign(mounted_rig)
     campaign = simulated.campaign
@@ -185,8 +186,8 @@ def evaluate():
     import jax
     import jax.numpy as jnp
 
-    from tvsbayes.likelihood import innovations, spot_residuals
-    from tvsbayes.model import mirror_angles
+    from tvsbayes.estimators.likelihood import innovations, spot_residuals
+    from tvsbayes.model.laser_path import mirror_angles
 
     @jax.jit
     def compiled(z, space, arrays):

@@ -7,9 +7,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from tvsbayes.device.boards import Board
-from tvsbayes.rigs import Stereo, rotation_matrix
-from tvsbayes.simulation import project
+from tvsbayes.cameras.boards import Board
+from tvsbayes.instrument.stereo_pair import Stereo, rotation_matrix
+from tvsbayes.twin.physics import project
 
 BOARD = Board(7, 6, 25.0)
 SIZE = (640, 480)

@@ -21,29 +21,30 @@ from pathlib import Path
 import numpy as np
 from small_campaign import small_campaign
 
-from tvsbayes.calibration import (
-    INPUT_NAMES,
-    NOISE_NAMES,
-    Calibration,
-    calibration_bytes,
-    calibration_of_draws,
-    read_draws,
-)
-from tvsbayes.campaign import (
+from tvsbayes.acquisition.journal import Journal, encode, read_journal
+from tvsbayes.acquisition.journal_check import verify
+from tvsbayes.acquisition.recorder import recorded
+from tvsbayes.assessment.fitted_calibration import calibration_of_draws
+from tvsbayes.calibration.calibration_file import calibration_bytes, read_draws
+from tvsbayes.calibration.pointing import INPUT_NAMES, NOISE_NAMES, Calibration
+from tvsbayes.cameras.calibration_formats import read_calibration
+from tvsbayes.errors import TvsError
+from tvsbayes.files.disk import shipped_data
+from tvsbayes.files.documents import parse_toml
+from tvsbayes.files.images import image_size
+from tvsbayes.instrument.campaign import (
     input_hashes,
     parse_header,
     parse_moves,
-    parse_plan,
     parse_spots,
     read_campaign,
     write_campaign,
 )
-from tvsbayes.certificate import read_fit
-from tvsbayes.device.interchange import read_calibration
-from tvsbayes.device.journal import Journal, encode, read_journal, verify
-from tvsbayes.device.record import recorded
-from tvsbayes.files import TvsError, image_size, parse_toml, shipped_data
-from tvsbayes.rigs import RIG_PRIORS, parse_rig_table, parse_stereo, read_rig
+from tvsbayes.instrument.parameters import RIG_PRIORS
+from tvsbayes.instrument.plan import parse_plan
+from tvsbayes.instrument.rig import parse_rig_table, read_rig
+from tvsbayes.instrument.stereo_pair import parse_stereo
+from tvsbayes.results.fit_record import read_fit
 
 MEGABYTE = 1_000_000
 SIZE = 1280, 720

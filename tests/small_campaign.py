@@ -6,8 +6,10 @@ import datetime
 
 import numpy as np
 
-from tvsbayes.campaign import Campaign, Move, Spot
-from tvsbayes.rigs import DECLARED_PRIORS, DEFAULT_PRIORS, Prior, RigTable, Stereo, rotation_matrix
+from tvsbayes.instrument.campaign import Campaign, Move, Spot
+from tvsbayes.instrument.parameters import DECLARED_PRIORS, DEFAULT_PRIORS, Prior
+from tvsbayes.instrument.rig import RigTable
+from tvsbayes.instrument.stereo_pair import Stereo, rotation_matrix
 
 
 def small_stereo() -> Stereo:

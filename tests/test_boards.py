@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from drawn_boards import BOARD, FOUND_PX, POSES, SIZE, pictures, true_corners, write_pair
 
-from tvsbayes.device import boards
-from tvsbayes.device.boards import Board, find_corners, find_views
-from tvsbayes.files import InputError, NothingToEstimate
+from tvsbayes.cameras import boards
+from tvsbayes.cameras.boards import Board, find_corners, find_views
+from tvsbayes.errors import InputError, NothingToEstimate
 
 
 @pytest.fixture(scope="module")

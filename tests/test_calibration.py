@@ -30,32 +30,27 @@ from bent_rig import (
 from small_campaign import small_campaign
 from test_conventions import LAST_6, LAST_9, LAST_12, VECTOR
 
-from tvsbayes import simulation
-from tvsbayes.calibration import (
+from tvsbayes.assessment.fitted_calibration import CLEARED_PROBABILITY, _overshoot_steps, calibration_of_draws
+from tvsbayes.calibration.calibration_file import (
     CALIBRATION_FORMAT,
-    CLEARED_PROBABILITY,
-    DIVERGING_SHARE,
-    INPUT_NAMES,
     NO_CALIBRATION,
-    NOISE_NAMES,
-    NORMAL_95,
-    Calibration,
-    _overshoot_steps,
     calibration_bytes,
     calibration_header,
     calibration_json,
-    calibration_of_draws,
-    direction_of,
     expected_error,
     load_calibration,
-    output_deg,
-    range_components,
     stored_calibration,
 )
-from tvsbayes.campaign import input_hashes
-from tvsbayes.coordinates import carry, locate, locate_linear, meeting, settings_of, sources
-from tvsbayes.files import InputError
-from tvsbayes.rigs import HARMONIC_PRIORS, Prior
+from tvsbayes.calibration.optics import output_deg, range_components
+from tvsbayes.calibration.pointing import DIVERGING_SHARE, INPUT_NAMES, NOISE_NAMES, Calibration, direction_of
+from tvsbayes.coordinates.beam_meeting import carry, meeting, sources
+from tvsbayes.coordinates.location import locate, locate_linear, settings_of
+from tvsbayes.errors import InputError
+from tvsbayes.instrument.campaign import input_hashes
+from tvsbayes.instrument.parameters import HARMONIC_PRIORS, Prior
+from tvsbayes.statistics.intervals import NORMAL_95
+from tvsbayes.twin import physics
+from tvsbayes.twin.physics import to_tvs
 
 ROUNDING_MM = 1e-9
 """Of a hundred operations on lengths up to 1000 mm, magnified tenfold by a grazing line of sight."""
@@ -106,7 +101,7 @@ def test_ray_of_the_test_vector():
     printed = np.array([250.365237, 119.492704, 18.238043])
     assert np.abs(ray.origin_mm + 250.0 * ray.direction - printed).max() <= LAST_6 * 1.01
     # Turned back into frame P.
-    turned = simulation.to_tvs(np.stack([ray.origin_mm - [0, 100, 0], ray.direction]), 0.0, 89.0)
+    turned = to_tvs(np.stack([ray.origin_mm - [0, 100, 0], ray.direction]), 0.0, 89.0)
     assert np.abs(turned[0] - [5.371658918, -29.176887333, -0.940368833]).max() <= LAST_9 * 1.01
     assert np.abs(turned[1] - [0.981182562588, 0.177188586189, 0.076713648059]).max() <= LAST_12 * 1.01
     for azimuth, reading in ((False, 48.834423), (True, 48.759278)):
@@ -401,7 +396,7 @@ def play_gone(one: Calibration, axis: str, start: int, end: int, sign: int) -> f
     for row in one.inputs:
         values = dict(zip(INPUT_NAMES, row, strict=True))
         ratio, play = values[f"degrees_per_step.{axis}"], values[f"backlash_deg.{axis}"]
-        output = simulation.play([ratio * start, ratio * end], ratio * start + sign * play / 2, play)[-1]
+        output = physics.play([ratio * start, ratio * end], ratio * start + sign * play / 2, play)[-1]
         gone.append(abs(output - (ratio * end - sign * play / 2)) < 1e-9)
     return float(np.mean(gone))
 
@@ -752,7 +747,7 @@ def test_driving_loads_no_jax(tmp_path):
     path = tmp_path / "draws.npz"
     path.write_bytes(calibration_bytes(complete()))
     code = (
-        "import sys; from tvsbayes.calibration import load_calibration\n"
+        "import sys; from tvsbayes.calibration.calibration_file import load_calibration\n"
         "c = load_calibration(sys.argv[1]); s = c.steps_for((600, 0, 0))\n"
         "c.locate(s.pan_steps, s.tilt_steps, s.aperture_deg)\n"
         "print(sorted({m.split('.')[0] for m in sys.modules} & {'jax', 'jaxlib', 'equinox', 'scipy', 'cv2'}))\n"

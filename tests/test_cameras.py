@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from tvsbayes.model import CV_FROM_S, NEAREST_MM, StereoCameras, project
+from tvsbayes.model.geometry import CV_FROM_S, NEAREST_MM, StereoCameras, project
 
 pytestmark = pytest.mark.usefixtures("x64")
 

@@ -11,21 +11,20 @@ import numpy as np
 import pytest
 from small_campaign import small_campaign
 
-from tvsbayes.campaign import (
+from tvsbayes.errors import InputError
+from tvsbayes.instrument.campaign import (
     Campaign,
     Move,
-    PlanStep,
     Spot,
     input_hashes,
     parse_spots,
     read_campaign,
-    read_plan,
     spots_bytes,
     write_campaign,
-    write_plan,
 )
-from tvsbayes.files import InputError
-from tvsbayes.rigs import Prior, RigTable
+from tvsbayes.instrument.parameters import Prior
+from tvsbayes.instrument.plan import PlanStep, read_plan, write_plan
+from tvsbayes.instrument.rig import RigTable
 
 UNKNOWN_RIGS = Path(__file__).resolve().parents[2] / "shared" / "campaigns"
 
@@ -198,7 +197,7 @@ def test_forty_thousand_spots_and_more_are_read():
 
 
 def test_reading_imports_no_jax():
-    code = "import sys, tvsbayes.campaign; sys.exit(any(m in sys.modules for m in ('jax', 'scipy', 'cv2')))"
+    code = "import sys, tvsbayes.instrument.campaign; sys.exit(any(m in sys.modules for m in ('jax', 'scipy', 'cv2')))"
     root = Path(__file__).resolve().parents[1]
     assert subprocess.run([sys.executable, "-c", code], cwd=root, check=False).returncode == 0
 

@@ -17,28 +17,26 @@ from bent_rig import BENT, WOBBLE
 from bent_rig import calibration as bent_calibration
 from small_campaign import small_campaign
 
-from tvsbayes.calibration import INPUT_NAMES, NOISE_NAMES, Calibration
-from tvsbayes.campaign import Move, Spot
-from tvsbayes.certificate import (
-    CORRELATIONS,
+from tvsbayes.assessment.causes import headline_budget
+from tvsbayes.assessment.residuals import stop_readings
+from tvsbayes.calibration.pointing import INPUT_NAMES, NOISE_NAMES, Calibration
+from tvsbayes.estimators.linear_spots import Linearised
+from tvsbayes.instrument.campaign import Move, Spot
+from tvsbayes.instrument.parameters import unit_of
+from tvsbayes.instrument.rig import RigTable
+from tvsbayes.metrology.budget import CORRELATIONS, Source, budget_table, coordinate_budget
+from tvsbayes.metrology.iso230 import (
     FIGURES,
     INDIRECT,
-    Source,
     beam_deg_per_step,
-    budget_table,
-    coordinate_budget,
-    headline_budget,
     iso230,
     positioning,
     simulated_runs,
-    stop_readings,
     target_steps,
-    unit_of,
 )
-from tvsbayes.classic import coverage_factor
-from tvsbayes.joint import Linearised
-from tvsbayes.rigs import RigTable
-from tvsbayes.simulation import effective_deg_per_step, harmonics_deg, mirror_chain, transmission, with_derived
+from tvsbayes.statistics.intervals import coverage_factor
+from tvsbayes.twin.physics import effective_deg_per_step, harmonics_deg, mirror_chain, transmission
+from tvsbayes.twin.simulated_campaign import with_derived
 
 KEPT = Path(__file__).parent / "data"
 ROUNDING = 1e-9
@@ -509,8 +507,8 @@ def linear_fit(mounted_rig):
     """The linear campaign of test_comparison with headlines that are linear in its coordinates: (fit, gradient)."""
     from test_comparison import fit_of, linear_problem
 
-    from tvsbayes.joint import laplace_draws
-    from tvsbayes.model import INDEX, NAMES, RIG_NAMES
+    from tvsbayes.instrument.parameters import INDEX, NAMES, RIG_NAMES
+    from tvsbayes.statistics.least_squares import laplace_draws
 
     jacobian, load = linear_problem()
     # What the rig fixes moves no spot.
@@ -538,8 +536,8 @@ def linear_fit(mounted_rig):
 def test_headline_causes_are_what_refitting_shows(linear_fit):
     from test_comparison import refitted
 
-    from tvsbayes.information import headline_causes
-    from tvsbayes.model import INDEX, RIG_NAMES
+    from tvsbayes.assessment.causes import headline_causes
+    from tvsbayes.instrument.parameters import INDEX, RIG_NAMES
 
     fit, gradient, jacobian, load = linear_fit
     causes = headline_causes(fit)
@@ -565,7 +563,7 @@ def test_headline_causes_are_what_refitting_shows(linear_fit):
 
 
 def test_degrees_of_freedom_follow_from_how_well_the_noise_is_known(linear_fit):
-    from tvsbayes.information import headline_causes
+    from tvsbayes.assessment.causes import headline_causes
 
     causes = headline_causes(linear_fit[0])
     dof = dict(zip(causes.names, causes.dof.T, strict=True))
@@ -580,7 +578,8 @@ def test_degrees_of_freedom_follow_from_how_well_the_noise_is_known(linear_fit):
 
 
 def test_headline_budget_is_a_gum_table(linear_fit):
-    from tvsbayes.information import Estimate, headline_causes
+    from tvsbayes.assessment.causes import headline_causes
+    from tvsbayes.results.estimates import Estimate
 
     fit, gradient, _, _ = linear_fit
     causes = headline_causes(fit)
@@ -598,7 +597,7 @@ def test_headline_budget_is_a_gum_table(linear_fit):
 
 
 def test_half_normal_and_log_normal_priors_state_their_own_moments(linear_fit):
-    from tvsbayes.information import headline_causes
+    from tvsbayes.assessment.causes import headline_causes
 
     fit, *_ = linear_fit
     causes = headline_causes(fit)
@@ -616,7 +615,7 @@ def test_half_normal_and_log_normal_priors_state_their_own_moments(linear_fit):
 
 
 def test_coordinate_budgets_by_parameter_and_by_cause():
-    from tvsbayes.comparison import APERTURE_HERE, PLAY_HERE, STOP_HERE, Budget
+    from tvsbayes.metrology.budget import APERTURE_HERE, PLAY_HERE, STOP_HERE, Budget
 
     one = bent_calibration()
     rng = np.random.default_rng(7)

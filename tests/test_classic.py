@@ -12,21 +12,20 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tvsbayes.campaign import Campaign, Move, Spot
-from tvsbayes.classic import (
+from tvsbayes.errors import NothingToEstimate
+from tvsbayes.estimators.four_point import (
     classic,
-    distort,
     four_point_angle_deg,
     four_point_ratios,
     ratio_deg_per_step,
     select_experiments,
     stereo_variance,
-    triangulate,
-    undistort,
 )
-from tvsbayes.files import NothingToEstimate
-from tvsbayes.rigs import DECLARED_PRIORS, DEFAULT_PRIORS, Prior, RigTable, Stereo, rotation_matrix
-from tvsbayes.simulation import project
+from tvsbayes.instrument.campaign import Campaign, Move, Spot
+from tvsbayes.instrument.parameters import DECLARED_PRIORS, DEFAULT_PRIORS, Prior
+from tvsbayes.instrument.rig import RigTable
+from tvsbayes.instrument.stereo_pair import Stereo, distort, rotation_matrix, triangulate, undistort
+from tvsbayes.twin.physics import project
 
 ROUNDING_MM = 1e-7
 """Rounding of 1e-13 px through the depth gain Z^2/(f B) of 1 to 2 mm/px and the DLT's SVD, times 10^5."""

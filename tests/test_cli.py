@@ -20,21 +20,15 @@ import numpy as np
 import pytest
 from test_schema import problems
 
-from tvsbayes import cli
-from tvsbayes.campaign import (
-    Campaign,
-    PlanStep,
-    grid_protocol,
-    mixed_protocol,
-    read_campaign,
-    write_campaign,
-    write_plan,
-)
-from tvsbayes.classic import select_experiments
-from tvsbayes.cli import run
-from tvsbayes.files import shipped_data
-from tvsbayes.rigs import Prior
-from tvsbayes.simulation import simulate
+from tvsbayes.cli.app import keep, report_line
+from tvsbayes.cli.main import main, run
+from tvsbayes.estimators.four_point import select_experiments
+from tvsbayes.files.disk import shipped_data
+from tvsbayes.instrument.campaign import Campaign, read_campaign, write_campaign
+from tvsbayes.instrument.parameters import Prior
+from tvsbayes.instrument.plan import PlanStep, grid_protocol, mixed_protocol, write_plan
+from tvsbayes.pipeline import compile_for, fit_for
+from tvsbayes.twin.simulated_campaign import simulate
 
 DATA = shipped_data()
 MOUNTED = DATA / "rigs" / "mounted"
@@ -307,10 +301,10 @@ def test_fit_samples_writes_for_arviz_and_refuses_what_has_not_converged(ask, fo
     """The limits are loosened: what is tested is the way from options to files, not convergence."""
     import arviz
 
-    from tvsbayes import posterior
+    from tvsbayes.posterior import sampling
 
     for name, value in {"FIRST_CHECK": 40, "BLOCK": 20, "ESS_LIMIT": 50, "RHAT_LIMIT": 3.0, "TAU_LIMIT": 1}.items():
-        monkeypatch.setattr(posterior, name, value)
+        monkeypatch.setattr(sampling, name, value)
     code, document = ask("fit", folder, "--seed", 2)
     assert (code, document["estimator"], document["converged"]) == (0, "posterior", True)
     left = document["effective_deg_per_step"]["left"]
@@ -327,7 +321,7 @@ def test_fit_samples_writes_for_arviz_and_refuses_what_has_not_converged(ask, fo
     assert mean == pytest.approx(left["value"], rel=1e-12)
     assert arviz.summary(tree, var_names=["backlash_deg"]).shape[0] == 2
 
-    monkeypatch.setattr(posterior, "ESS_LIMIT", 10**9)
+    monkeypatch.setattr("tvsbayes.posterior.sampling.ESS_LIMIT", 10**9)
     code, document = ask("fit", folder, "--seed", 2, "--resume", "--max-minutes", "0.01")
     assert (code, document["estimator"], document["converged"]) == (4, "laplace", False)
     assert document["error"]["code"] == "unconverged"
@@ -347,10 +341,10 @@ def test_per_axis_fit_has_one_gear_ratio_per_axis(ask, folder):
 
 def test_what_a_fit_left_is_taken_up_again(folder, monkeypatch):
     """`compare` and `plan --given` start from results/ (DESIGN 8): the same model, mode and draws, no second fit."""
-    from tvsbayes.calibration import stored_mode
-    from tvsbayes.information import calibration_of, summarise
-    from tvsbayes.joint import fit, restored
-    from tvsbayes.report import write_results
+    from tvsbayes.assessment.fitted_calibration import calibration_of
+    from tvsbayes.assessment.summary import summarise
+    from tvsbayes.estimators.joint_fit import fit, restored
+    from tvsbayes.results.fit_record import stored_mode, write_results
 
     campaign = read_campaign(folder)
     assert stored_mode(campaign) is None
@@ -361,8 +355,9 @@ def test_what_a_fit_left_is_taken_up_again(folder, monkeypatch):
         np.testing.assert_array_equal(getattr(back, name), getattr(fresh, name))
     np.testing.assert_array_equal(back.draws.effective_deg_per_step, fresh.draws.effective_deg_per_step)
     assert (back.converged, back.log_density, back.chi2) == (True, fresh.log_density, fresh.chi2)
-    monkeypatch.setattr("tvsbayes.joint.fit", None)
-    assert cli._fit_of(campaign).converged
+    monkeypatch.setattr("tvsbayes.estimators.joint_fit.fit", None)
+    monkeypatch.setattr("tvsbayes.studies.study_job.fit", None)
+    assert fit_for(campaign, report_line).converged
     (folder / "moves.csv").write_bytes((folder / "moves.csv").read_bytes() + b"\n")
     assert stored_mode(read_campaign(folder)) is not None, "a blank line changes nothing that was measured"
     spots = (folder / "spots.csv").read_text().replace("d2", "d3")
@@ -508,14 +503,14 @@ def test_noise_above_the_stated_is_no_misfit(ask, small, tmp_path, u, swap, ends
 
 
 def test_a_fit_that_did_not_converge_is_exit_4(ask, say, folder, monkeypatch):
-    import tvsbayes.joint
+    import tvsbayes
 
-    fitted = tvsbayes.joint.fit(read_campaign(folder))
+    fitted = tvsbayes.fit(read_campaign(folder))
 
     def astray(*arguments, **options):
         return replace(fitted, converged=False, problems=("it went astray",))
 
-    monkeypatch.setattr(tvsbayes.joint, "fit", astray)
+    monkeypatch.setattr("tvsbayes.estimators.joint_fit.fit", astray)
     code, document = ask("fit", folder, "--no-sample")
     assert code == 4
     assert document["converged"] is False
@@ -641,17 +636,18 @@ def test_check_tells_a_folder_from_a_file(ask, folder, tmp_path):
 
 
 def test_a_report_for_a_browser_that_is_not_there_ends_at_once(ask, folder, monkeypatch):
-    monkeypatch.setattr("tvsbayes.report.BROWSERS", ())
-    monkeypatch.setattr("tvsbayes.cli._fit_document", None)
+    monkeypatch.setattr("tvsbayes.report.page.BROWSERS", ())
+    monkeypatch.setattr("tvsbayes.pipeline.document_for", None)
+    monkeypatch.setattr("tvsbayes.cli.estimate_commands.document_for", None)
     code, document = ask("report", folder, "--pdf")
     assert (code, document["error"]["code"]) == (2, "no-browser")
 
 
 def test_what_cannot_be_kept_costs_nobody_the_result(tmp_path, capsys):
     (tmp_path / "results").write_text("a file where the folder should be")
-    assert not cli._keep({}, tmp_path / "results" / "compare.json")
+    assert not keep({}, tmp_path / "results" / "compare.json")
     assert "warning: not kept" in capsys.readouterr().err
-    assert cli._keep({"a": 1}, tmp_path / "new" / "compare.json")
+    assert keep({"a": 1}, tmp_path / "new" / "compare.json")
     assert json.loads((tmp_path / "new" / "compare.json").read_text()) == {"a": 1}
 
 
@@ -659,7 +655,7 @@ def test_what_cannot_be_kept_costs_nobody_the_result(tmp_path, capsys):
 @pytest.mark.parametrize("arguments", [("check", "FOLDER", "--json"), ("check", "nothing here", "--json")])
 def test_a_full_disk_behind_stdout_is_said_without_a_traceback(folder, arguments):
     words = [str(folder) if word == "FOLDER" else word for word in arguments]
-    command = [sys.executable, "-c", "from tvsbayes.cli import main; main()", *words]
+    command = [sys.executable, "-c", "from tvsbayes.cli.main import main; main()", *words]
     with open("/dev/full", "w") as full:
         done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, check=False)
     assert done.returncode == 2 and "No space left" in done.stderr
@@ -669,7 +665,7 @@ def test_a_full_disk_behind_stdout_is_said_without_a_traceback(folder, arguments
 @pytest.mark.skipif(os.name != "posix", reason="pipes that break")
 def test_a_reader_that_has_gone_changes_no_exit_code(folder):
     """As where Ctrl-C ends the `tee` behind a run, for both streams."""
-    command = [sys.executable, "-c", "from tvsbayes.cli import main; main()", "check", "nothing here"]
+    command = [sys.executable, "-c", "from tvsbayes.cli.main import main; main()", "check", "nothing here"]
     reader, writer = os.pipe()
     os.close(reader)
     done = subprocess.run(command, stdout=writer, stderr=writer, check=False)
@@ -682,7 +678,8 @@ def test_interrupt_under_json_is_a_document_too(ask, monkeypatch):
     def interrupted(path):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("tvsbayes.campaign.read_campaign", interrupted)
+    monkeypatch.setattr("tvsbayes.instrument.campaign.read_campaign", interrupted)
+    monkeypatch.setattr("tvsbayes.acquisition.session.read_campaign", interrupted)
     code, document = ask("check", "x")
     assert (code, document["error"]["code"]) == (130, "interrupted")
 
@@ -691,7 +688,8 @@ def test_interrupt_is_130(say, monkeypatch):
     def interrupted(path):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("tvsbayes.campaign.read_campaign", interrupted)
+    monkeypatch.setattr("tvsbayes.instrument.campaign.read_campaign", interrupted)
+    monkeypatch.setattr("tvsbayes.acquisition.session.read_campaign", interrupted)
     code, out, log = say("classic", PAPER_TWIN)
     assert (code, out) == (130, "")
     assert "interrupted" in log
@@ -703,7 +701,8 @@ def test_a_bug_is_no_bad_input(monkeypatch):
     def broken(path):
         raise RuntimeError("a bug")
 
-    monkeypatch.setattr("tvsbayes.campaign.read_campaign", broken)
+    monkeypatch.setattr("tvsbayes.instrument.campaign.read_campaign", broken)
+    monkeypatch.setattr("tvsbayes.acquisition.session.read_campaign", broken)
     with pytest.raises(RuntimeError, match="a bug"):
         run(["classic", str(PAPER_TWIN)])
 
@@ -715,7 +714,7 @@ def test_the_version_is_the_packages(say):
 def test_help_loads_nothing_heavy_and_lists_the_commands():
     heavy = ("jax", "cv2", "scipy", "rich.table", "arviz", "emcee", "matplotlib", "equinox")
     code = (
-        "import sys; from tvsbayes.cli import run; code = run(['--help']); "
+        "import sys; from tvsbayes.cli.main import run; code = run(['--help']); "
         f"print([name for name in {heavy!r} if name in sys.modules], code, file=sys.stderr)"
     )
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
@@ -729,13 +728,13 @@ def test_whoever_waits_for_the_first_compilation_is_told(tmp_path, capsys, monke
 
     monkeypatch.setenv("TVSBAYES_CACHE", str(tmp_path))
     monkeypatch.setattr(jax.config, "update", lambda *_: None)
-    cli._use_compilation_cache()
+    compile_for(report_line)
     assert capsys.readouterr().err == "", "progress is for terminals"
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
-    cli._use_compilation_cache()
+    compile_for(report_line)
     assert "first run" in capsys.readouterr().err
     (tmp_path / "jit_fit-cache").touch()
-    cli._use_compilation_cache()
+    compile_for(report_line)
     assert capsys.readouterr().err == ""
 
 
@@ -744,5 +743,5 @@ def test_a_slow_computers_user_is_not_sent_to_the_authors_of_xla(monkeypatch):
     monkeypatch.delenv("TF_CPP_MIN_LOG_LEVEL")
     monkeypatch.setattr(sys, "argv", ["tvsbayes", "--help"])
     with pytest.raises(SystemExit):
-        cli.main()
+        main()
     assert os.environ["TF_CPP_MIN_LOG_LEVEL"] == "3"

@@ -12,26 +12,19 @@ import pytest
 from bent_rig import BENT, NO_NOISE_DEG, NOMINAL, calibration, twin_points, twin_ray
 from small_campaign import small_campaign
 
-from tvsbayes import simulation
-from tvsbayes.calibration import INPUT_NAMES, NOISE_NAMES, Calibration
-from tvsbayes.classic import ClassicResult, DirectionResult
-from tvsbayes.comparison import (
-    APERTURE_HERE,
-    PLAY_HERE,
-    STOP_HERE,
-    SimpleCalibration,
-    budget,
-    error_map,
-    simple_calibration,
-    simple_rays,
-)
-from tvsbayes.coordinates import INPUT_COLUMNS, locate_linear, meeting, published_point, settings_of
-from tvsbayes.files import InputError
-from tvsbayes.information import calibration_of, causes_of
-from tvsbayes.joint import JointFit
-from tvsbayes.likelihood import StopGroup, StopInformation
-from tvsbayes.model import INDEX, NAMES, RIG_NAMES, parameter_space
-from tvsbayes.rigs import HARMONIC_PRIORS, RIG_PRIORS, Prior
+from tvsbayes.assessment.fitted_calibration import calibration_of, causes_of
+from tvsbayes.calibration.pointing import INPUT_NAMES, NOISE_NAMES, Calibration
+from tvsbayes.coordinates.beam_meeting import INPUT_COLUMNS, meeting
+from tvsbayes.coordinates.error_map import SimpleCalibration, error_map, simple_calibration, simple_rays
+from tvsbayes.coordinates.location import locate_linear, published_point, settings_of
+from tvsbayes.errors import InputError
+from tvsbayes.estimators.four_point import ClassicResult, DirectionResult
+from tvsbayes.estimators.joint_fit import JointFit
+from tvsbayes.estimators.linear_spots import StopGroup, StopInformation
+from tvsbayes.instrument.parameters import HARMONIC_PRIORS, INDEX, NAMES, RIG_NAMES, RIG_PRIORS, Prior
+from tvsbayes.metrology.budget import APERTURE_HERE, PLAY_HERE, STOP_HERE, budget
+from tvsbayes.model.parameter_space import parameter_space
+from tvsbayes.twin.physics import aperture_angle_deg
 
 ROUNDING_MM = 1e-9
 """Of a hundred operations on lengths up to 1000 mm, magnified tenfold by a grazing line of sight."""
@@ -310,11 +303,11 @@ def test_bias_of_the_nominal_estimator_is_the_twins(azimuth, approach):
     for i, j, k in np.ndindex(2, 3, 4):
         origin, direction = twin_ray(BENT, (PAN[i], TILT[j]), side)
         point = origin + RANGE_MM[k] * direction
-        reading = simulation.aperture_angle_deg(point, BENT["baseline_mm"], convention) + BENT["aperture_zero_deg"]
+        reading = aperture_angle_deg(point, BENT["baseline_mm"], convention) + BENT["aperture_zero_deg"]
         az, el = np.radians([0.06 * PAN[i], 0.07 * TILT[j]])
         d = np.array([[np.cos(el) * np.cos(az), np.cos(el) * np.sin(az), np.sin(el)]])
         if not found.valid[i, j, k]:
-            angle = simulation.aperture_angle_deg(1e7 * d[0], 200.0, convention)
+            angle = aperture_angle_deg(1e7 * d[0], 200.0, convention)
             assert angle < reading + 1e-3, "lines of sight and nominal beam diverge"
             continue
         thought = twin_points(np.array([[0.0, 70.0, 0.0]]), d, 200.0, float(reading), azimuth)[0]
@@ -345,7 +338,7 @@ def test_joint_beats_nominal_on_a_biased_rig():
     # The joint error is what `locate` says of a look: the trace of its covariance.
     ray = one.ray(PAN[0], TILT[1])
     point = ray.origin_mm + 300.0 * ray.direction
-    reading = simulation.aperture_angle_deg(point, one.estimates["baseline_mm"], "in-plane")
+    reading = aperture_angle_deg(point, one.estimates["baseline_mm"], "in-plane")
     law = one.locate(PAN[0], TILT[1], float(reading) + one.estimates["aperture_zero_deg"])
     # The errors' second moment from 500 draws, five standard errors of one dominating direction, 5 % of curvature.
     ratio = found.rms_mm["joint"][0, 1, 2] / np.sqrt(np.trace(law.covariance_mm2))

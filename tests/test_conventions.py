@@ -9,24 +9,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from tvsbayes import calibration, classic
-from tvsbayes.likelihood import aperture_angle, observe
-from tvsbayes.model import (
-    INDEX,
-    NAMES,
-    MoveArrays,
-    Receiver,
-    Transmission,
-    beam,
-    beam_angles,
-    mirror_angles,
-    model_of,
-    parameter_space,
-    project,
-    rotate_about_z,
-    rotation_matrix,
-)
-from tvsbayes.rigs import RigTable
+from tvsbayes.estimators.likelihood import aperture_angle, observe
+from tvsbayes.instrument.parameters import INDEX, NAMES
+from tvsbayes.instrument.rig import RigTable
+from tvsbayes.model.geometry import project, rotate_about_z, rotation_matrix
+from tvsbayes.model.laser_path import MoveArrays, Transmission, beam, beam_angles, mirror_angles
+from tvsbayes.model.parameter_space import Receiver, model_of, parameter_space
+from tvsbayes.statistics.intervals import NORMAL_95, coverage_factor
 
 pytestmark = pytest.mark.usefixtures("x64")
 
@@ -213,5 +202,5 @@ def test_every_name_has_its_unit():
 def test_95_percent_are_two_sided_and_normal():
     """GUM 6.2 and table G.1: k = 1.96. Quantiles of the standard library, whatever the package takes them from."""
     exact = NormalDist().inv_cdf(0.975)
-    assert calibration.NORMAL_95 == pytest.approx(exact, rel=1e-9)
-    assert classic.coverage_factor(np.inf) == pytest.approx(exact, rel=1e-9)
+    assert NORMAL_95 == pytest.approx(exact, rel=1e-9)
+    assert coverage_factor(np.inf) == pytest.approx(exact, rel=1e-9)

@@ -24,19 +24,11 @@ from bent_rig import (
     twin_ray_at,
 )
 
-from tvsbayes import simulation
-from tvsbayes.calibration import INPUT_NAMES, NOISE_NAMES, Calibration
-from tvsbayes.coordinates import (
-    DIVERGING_SHARE,
-    carry,
-    locate,
-    locate_linear,
-    meeting,
-    published_point,
-    settings_of,
-    sources,
-)
-from tvsbayes.files import InputError
+from tvsbayes.calibration.pointing import DIVERGING_SHARE, INPUT_NAMES, NOISE_NAMES, Calibration
+from tvsbayes.coordinates.beam_meeting import carry, meeting, sources
+from tvsbayes.coordinates.location import locate, locate_linear, published_point, settings_of
+from tvsbayes.errors import InputError
+from tvsbayes.twin.physics import aperture_angle_deg
 
 ROUNDING_MM = 1e-9
 """Of a hundred operations on lengths up to 1000 mm, magnified tenfold by a grazing line of sight."""
@@ -135,7 +127,7 @@ def met(origin, direction, reading_deg, azimuth: bool):
 @pytest.mark.parametrize("azimuth", [False, True])
 def test_the_reading_of_a_point_leads_back_to_it(azimuth):
     origin, direction, points = bent_beams(200, 3)
-    reading = simulation.aperture_angle_deg(points, A_MM, "azimuth" if azimuth else "in-plane")
+    reading = aperture_angle_deg(points, A_MM, "azimuth" if azimuth else "in-plane")
     assert (reading > 90).sum() > 20 and (reading < 90).sum() > 20
     found, range_mm, meets = met(origin, direction, reading, azimuth)
     assert meets.all()
@@ -233,7 +225,7 @@ def test_a_beam_that_passes_beside_the_cone_does_not_meet():
     for reading, expected in ((nearest - 0.1, False), (nearest + 0.1, True)):
         assert met(origin, up, [reading], False)[2][0] == expected
     found = met(origin, up, [nearest + 0.1], False)[0]
-    assert simulation.aperture_angle_deg(found[0], A_MM, "in-plane") == pytest.approx(nearest + 0.1, abs=1e-9)
+    assert aperture_angle_deg(found[0], A_MM, "in-plane") == pytest.approx(nearest + 0.1, abs=1e-9)
 
 
 def test_a_point_behind_the_scanner_is_no_azimuth():
@@ -493,6 +485,6 @@ def test_readings_and_points_of_the_library_are_the_twins():
             BENT, twin_angle_deg(BENT, "pan", 70, -0.5), twin_angle_deg(BENT, "tilt", 40, -0.5)
         )
         point = origin + 420.0 * direction
-        reading = simulation.aperture_angle_deg(point, BENT["baseline_mm"], "azimuth" if azimuth else "in-plane")
+        reading = aperture_angle_deg(point, BENT["baseline_mm"], "azimuth" if azimuth else "in-plane")
         law = locate_linear(one, settings_of(70.0, 40.0, float(reading) + BENT["aperture_zero_deg"]))
         np.testing.assert_allclose(law.value[0], point, atol=10 * ROUNDING_MM)

@@ -18,16 +18,11 @@ import pytest
 from small_campaign import small_campaign
 from test_certificate import known_calibration
 
-from tvsbayes.campaign import Campaign, input_hashes
-from tvsbayes.certificate import (
-    COUNTRY_NOT_STATED,
-    NOT_ACCREDITED,
-    check_dcc,
-    dcc_bytes,
-    positioning,
-    read_fit,
-)
-from tvsbayes.files import InputError, NotConverged
+from tvsbayes.errors import InputError, NotConverged
+from tvsbayes.instrument.campaign import Campaign, input_hashes
+from tvsbayes.metrology.dcc import COUNTRY_NOT_STATED, NOT_ACCREDITED, check_dcc, dcc_bytes
+from tvsbayes.metrology.iso230 import positioning
+from tvsbayes.results.fit_record import read_fit
 
 KEPT = Path(__file__).parent / "data"
 

@@ -17,31 +17,25 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tvsbayes import simulation
-from tvsbayes.campaign import PlanStep, read_campaign, write_plan
-from tvsbayes.cli import run
-from tvsbayes.device import acquisition as engine
-from tvsbayes.device.acquisition import Acquisition, StopKey, _approach, begin, check_plan, outline
-from tvsbayes.device.camera import StereoImage, VirtualCamera
-from tvsbayes.device.estimate import RunningEstimate, directions_of
-from tvsbayes.device.journal import LOG, read_journal, verify
-from tvsbayes.device.observation import CameraObserver, Detection, TwinObserver
-from tvsbayes.device.protocol import request
-from tvsbayes.device.record import LOST_STEPS, recorded
-from tvsbayes.device.session import (
-    SIMULATED_START,
-    LiveLine,
-    SimulatedOperator,
-    TerminalOperator,
-    acquire,
-    check_journal,
-    repair_campaign,
-)
-from tvsbayes.device.twin import Instrument
-from tvsbayes.device.vision import live_detector, twin_renderer
-from tvsbayes.files import DeviceFault, InputError, shipped_data
-from tvsbayes.rigs import read_rig
-from tvsbayes.simulation import draw_truth, read_truth, simulate
+from tvsbayes.acquisition.engine import ATTEMPTS_PER_LOOK, Acquisition, _approach
+from tvsbayes.acquisition.journal import LOG, read_journal
+from tvsbayes.acquisition.journal_check import verify
+from tvsbayes.acquisition.observation import CameraObserver, Detection, TwinObserver, live_detector, twin_renderer
+from tvsbayes.acquisition.operator import LiveLine, SimulatedOperator, StopKey, TerminalOperator
+from tvsbayes.acquisition.recorder import LOST_STEPS, recorded
+from tvsbayes.acquisition.running_estimate import RunningEstimate
+from tvsbayes.acquisition.session import SIMULATED_START, acquire, begin, check_journal, check_plan, repair_campaign
+from tvsbayes.acquisition.simulated_instrument import Instrument
+from tvsbayes.cameras.capture import StereoImage, VirtualCamera
+from tvsbayes.cli.main import run
+from tvsbayes.errors import DeviceFault, InputError
+from tvsbayes.files.disk import shipped_data
+from tvsbayes.instrument.campaign import read_campaign
+from tvsbayes.instrument.plan import PlanStep, directions_of, outline, write_plan
+from tvsbayes.instrument.rig import read_rig
+from tvsbayes.positioner.protocol import request
+from tvsbayes.twin.physics import project
+from tvsbayes.twin.simulated_campaign import draw_truth, read_truth, simulate
 
 RIG_FILE = shipped_data() / "rigs" / "mounted" / "rig.toml"
 HEADER = {"name": "test", "created": SIMULATED_START.isoformat(), "synthetic": True, "seed": 5}
@@ -155,13 +149,9 @@ def test_same_seed_same_bytes(rig, tmp_path):
 
 def test_light_behind_the_device_is_that_of_the_twin(rig, tmp_path, monkeypatch):
     """Without chance the engine on the device model sees what `simulate` computes from the plan."""
-    from tvsbayes.device import twin
-
-    for module in (simulation, twin):
-        monkeypatch.setattr(module, "SHEET_DEPTH_SD_MM", 0.0)
-        monkeypatch.setattr(module, "SHEET_TILT_SD_DEG", 0.0)
-    monkeypatch.setattr(simulation, "HOME_SD_DEG", 0.0)
-    monkeypatch.setattr(twin, "HOME_SD_DEG", 0.0)
+    for module in ("twin.simulated_campaign", "acquisition.simulated_instrument"):
+        for name in ("SHEET_DEPTH_SD_MM", "SHEET_TILT_SD_DEG", "HOME_SD_DEG"):
+            monkeypatch.setattr(f"tvsbayes.{module}.{name}", 0.0)
     truth = draw_truth(rig, np.random.default_rng(3))
     still = {name: 0.0 for name in truth.parameters if name.startswith("stop_sd_deg")}
     truth = replace(truth, parameters={**truth.parameters, **still, "pixel_scale": 0.0})
@@ -629,7 +619,7 @@ def test_looks_without_a_spot_are_repeated_and_then_refused(rig, tmp_path):
 
     run_ = Run(rig, tmp_path / "c", observer=Blind)
     outcome = run_.engine.run()
-    assert (outcome.ok, outcome.refused) == (7, 1) and outcome.retries >= engine.ATTEMPTS_PER_LOOK - 1
+    assert (outcome.ok, outcome.refused) == (7, 1) and outcome.retries >= ATTEMPTS_PER_LOOK - 1
     spot = read_campaign(tmp_path / "c").spots[2]
     assert spot.status == "no-spot" and spot.u_left_px is None
 
@@ -674,7 +664,7 @@ def test_run_ends_when_the_running_estimate_meets_its_target(rig, tmp_path):
 @pytest.mark.parametrize(("asked", "shown"), [(None, False), (True, True), (False, False)])
 def test_estimate_is_shown_without_a_target(rig, tmp_path, monkeypatch, asked, shown):
     """What is known so far belongs into the live line whether or not it ends the run; simulations must ask for it."""
-    monkeypatch.setattr("tvsbayes.device.estimate._COMMAND", FIT.replace("argv[1]", "argv[2]"))
+    monkeypatch.setattr("tvsbayes.acquisition.running_estimate._COMMAND", FIT.replace("argv[1]", "argv[2]"))
     texts = []
 
     def show(progress):
@@ -790,9 +780,7 @@ def test_pictures_through_the_virtual_camera(small_rig, tmp_path):
     size = (small_rig.stereo.image_height, small_rig.stereo.image_width)
 
     def renderer(light, look, frame):
-        pixels = simulation.project(
-            light.point_S_mm[None], instrument.truth.stereo, instrument.truth.parameters["focal_scale"]
-        )[0]
+        pixels = project(light.point_S_mm[None], instrument.truth.stereo, instrument.truth.parameters["focal_scale"])[0]
         pair = [blob(size, pixels[k], pixels[k + 1], 180.0) + rng.normal(0, 1, (*size, 1)) for k in (0, 2)]
         return StereoImage(*(np.clip(p, 0, 255).astype(np.uint8) for p in pair))
 
@@ -985,7 +973,7 @@ def test_old_frames_never_become_a_spot_whatever_the_buffer(rig, depth):
         positioner.move_to(3 * step, 0)
         # The spot is where the positioner is.
         moved_to[0] = 3 * step
-        for _ in range(engine.ATTEMPTS_PER_LOOK):
+        for _ in range(ATTEMPTS_PER_LOOK):
             seen = observer.observe(positioner, step).detection
             if seen.status == "ok":
                 found.append(seen.pixels_px[0])
@@ -1063,7 +1051,7 @@ def mortal(name, call):
 for name in calls:
     setattr(os, name, mortal(name, getattr(os, name)))
 
-from tvsbayes.cli import run
+from tvsbayes.cli.main import run
 
 sys.exit(run(sys.argv[3:]))
 """

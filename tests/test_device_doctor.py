@@ -10,13 +10,14 @@ import sys
 import numpy as np
 import pytest
 
-from tvsbayes.device.camera import CameraSettings, StereoImage
-from tvsbayes.device.doctor import examine
-from tvsbayes.device.driver import SerialPositioner
-from tvsbayes.device.model import Mechanics
-from tvsbayes.device.virtual import ModelLink, SimulatedDevice, VirtualClock
-from tvsbayes.files import DeviceFault, shipped_data
-from tvsbayes.rigs import read_rig
+from tvsbayes.acquisition.doctor import examine
+from tvsbayes.acquisition.simulated_instrument import ModelLink, SimulatedDevice, VirtualClock
+from tvsbayes.cameras.capture import CameraSettings, StereoImage
+from tvsbayes.errors import DeviceFault
+from tvsbayes.files.disk import shipped_data
+from tvsbayes.instrument.rig import read_rig
+from tvsbayes.positioner.driver import SerialPositioner
+from tvsbayes.positioner.firmware_model import Mechanics
 
 RIG = read_rig(shipped_data() / "rigs" / "mounted" / "rig.toml")
 
@@ -156,7 +157,7 @@ def test_missing_hardware_is_told_once_and_by_us_alone(tmp_path):
         text = (folder / "rig.toml").read_text(encoding="utf-8")
         (tmp_path / "rig.toml").write_text(f"{text}\n{tables}{cameras}", encoding="utf-8")
         (tmp_path / "stereo.json").write_bytes((folder / "stereo.json").read_bytes())
-        command = [sys.executable, "-c", "import sys; from tvsbayes.cli import run; sys.exit(run(sys.argv[1:]))"]
+        command = [sys.executable, "-c", "import sys; from tvsbayes.cli.main import run; sys.exit(run(sys.argv[1:]))"]
         done = subprocess.run(
             [*command, "doctor", "rig.toml"], cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
         )

@@ -8,11 +8,12 @@ import threading
 
 import pytest
 
-from tvsbayes.device.driver import PositionLost, SerialPositioner, device_settings, serial_opener
-from tvsbayes.device.model import DeviceModel, Mechanics
-from tvsbayes.device.protocol import frame, parse_answer, request
-from tvsbayes.device.virtual import ModelLink, SimulatedDevice, VirtualClock
-from tvsbayes.files import DeviceFault
+from tvsbayes.acquisition.simulated_instrument import ModelLink, SimulatedDevice, VirtualClock
+from tvsbayes.errors import DeviceFault
+from tvsbayes.positioner.driver import PositionLost, SerialPositioner, device_settings
+from tvsbayes.positioner.firmware_model import DeviceModel, Mechanics
+from tvsbayes.positioner.protocol import frame, parse_answer, request
+from tvsbayes.positioner.serial_port import serial_opener
 
 SETTINGS = {"hp": -60, "ht": -40, "pmin": -300, "pmax": 300, "wd": 2000}
 

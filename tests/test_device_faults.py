@@ -13,12 +13,11 @@ from dataclasses import dataclass, field, replace
 
 import pytest
 
-from tvsbayes.device import model
-from tvsbayes.device.driver import SerialPositioner
-from tvsbayes.device.model import Mechanics
-from tvsbayes.device.protocol import frame, unframe
-from tvsbayes.device.virtual import LATENCY_US, ModelLink, SimulatedDevice, VirtualClock
-from tvsbayes.files import DeviceFault
+from tvsbayes.acquisition.simulated_instrument import LATENCY_US, ModelLink, SimulatedDevice, VirtualClock
+from tvsbayes.errors import DeviceFault
+from tvsbayes.positioner.driver import SerialPositioner
+from tvsbayes.positioner.firmware_model import Mechanics
+from tvsbayes.positioner.protocol import frame, unframe
 
 TARGETS = ((20, 6), (-9, 6), (14, -5))
 SETTINGS = {"hp": -12, "ht": -8, "pmin": -30, "pmax": 30, "tmin": -30, "tmax": 30, "wd": 2000}
@@ -202,7 +201,7 @@ class FaultyLink(ModelLink):
 @pytest.fixture(autouse=True)
 def short_travel(monkeypatch):
     """A motor that never finds its switch gives up after 500 steps instead of 20 000: the same path, less time."""
-    monkeypatch.setattr(model, "HOME_TRAVEL_MAX_STEPS", 500)
+    monkeypatch.setattr("tvsbayes.positioner.firmware_model.HOME_TRAVEL_MAX_STEPS", 500)
 
 
 @dataclass

@@ -14,8 +14,9 @@ from pathlib import Path
 
 import pytest
 
-from tvsbayes.device.journal import LOG, Disk, Journal, encode, read_journal, repair, verify
-from tvsbayes.files import DeviceFault, InputError
+from tvsbayes.acquisition.journal import LOG, Disk, Journal, encode, read_journal
+from tvsbayes.acquisition.journal_check import repair, verify
+from tvsbayes.errors import DeviceFault, InputError
 
 
 def picture(spot: int, side: str) -> bytes:
@@ -526,7 +527,7 @@ WRITER = """
 import sys
 sys.path.insert(0, sys.argv[2])
 from pathlib import Path
-from tvsbayes.device.journal import Journal
+from tvsbayes.acquisition.journal import Journal
 folder = Path(sys.argv[1])
 journal = Journal.open(folder) if (folder / "log.jsonl").exists() else Journal.create(folder, id="k")
 spot = sum(record.event == "looked" for record in journal.records)

@@ -7,8 +7,8 @@ from dataclasses import replace
 import pytest
 from test_device_driver import connected, simulated
 
-from tvsbayes.device.model import DeviceModel
-from tvsbayes.files import DeviceFault
+from tvsbayes.errors import DeviceFault
+from tvsbayes.positioner.firmware_model import DeviceModel
 
 LIMITS = {"hp": -60, "ht": -40, "pmin": -300, "pmax": 200, "tmin": -150, "tmax": 100}
 

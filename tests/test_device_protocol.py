@@ -13,9 +13,9 @@ from pathlib import Path
 
 import pytest
 
-from tvsbayes.device import firmware_folder
-from tvsbayes.device.model import DeviceModel, Mechanics
-from tvsbayes.device.protocol import (
+from tvsbayes.positioner import firmware_folder
+from tvsbayes.positioner.firmware_model import DeviceModel, Mechanics
+from tvsbayes.positioner.protocol import (
     REPLY_CHARS_MAX,
     SETTINGS,
     FrameError,

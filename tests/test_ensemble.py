@@ -17,14 +17,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from tvsbayes import posterior
-from tvsbayes.campaign import four_point_protocol
-from tvsbayes.joint import JointFit, fit, linear_spots
-from tvsbayes.likelihood import stop_information
-from tvsbayes.model import INDEX
-from tvsbayes.posterior import BATCH, Independence, Target, Transport, by_width, in_batches, walkers_for
-from tvsbayes.rigs import read_rig
-from tvsbayes.simulation import simulate
+from tvsbayes.estimators.joint_fit import JointFit, fit
+from tvsbayes.estimators.linear_spots import linear_spots, stop_information
+from tvsbayes.instrument.parameters import INDEX
+from tvsbayes.instrument.plan import four_point_protocol
+from tvsbayes.instrument.rig import read_rig
+from tvsbayes.posterior import proposal
+from tvsbayes.posterior.proposal import WALKERS, Independence, Target, walkers_for
+from tvsbayes.posterior.transport import BATCH, STRETCH_NODES, Transport, by_width, in_batches, stop_states, transport
+from tvsbayes.twin.simulated_campaign import simulate
 
 SIGMAS = 5.0
 """Standard errors: a right value lies farther out in 6 of 10 million runs, and the runs are seeded."""
@@ -50,15 +51,15 @@ def small_fit() -> tuple[JointFit, Transport]:
     rig = replace(rig, stereo=replace(rig.stereo, parameter_covariance=np.zeros((24, 24))))
     fitted = fit(simulate(rig, four_point_protocol(repeats=4, steps=(100, 200)), seed=21).campaign)
     assert fitted.converged, fitted.problems
-    return fitted, posterior.transport(fitted)
+    return fitted, transport(fitted)
 
 
 @cache
 def small_table() -> Transport:
     """The map of the same fit as with too many stops to follow each."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(posterior, "STATES_MAX", 0)
-        return posterior.transport(small_fit()[0])
+        patch.setattr("tvsbayes.posterior.transport.STATES_MAX", 0)
+        return transport(small_fit()[0])
 
 
 def small_path(whole: bool) -> Transport:
@@ -104,7 +105,7 @@ def off_target(dimension: int) -> Independence:
 @pytest.mark.parametrize("dimension", INDEPENDENT_STEPS)
 @pytest.mark.parametrize("which", ["independence", "mixture"])
 def test_independence_and_the_mixture_keep_the_target(which, dimension):
-    mixture = posterior.moves(off_target(dimension))
+    mixture = proposal.moves(off_target(dimension))
     moves = mixture[0][0] if which == "independence" else mixture
     assert bias(run(moves, dimension, INDEPENDENT_STEPS[dimension], walkers_for(dimension))) == ""
 
@@ -114,13 +115,13 @@ def test_independence_and_the_mixture_keep_the_target(which, dimension):
     ("which", "dimension"), [*[(1, d) for d in EVOLUTION_STEPS], *[(2, d) for d in EVOLUTION_STEPS if d < 20]]
 )
 def test_differential_evolution_keeps_the_target(which, dimension):
-    move, _ = posterior.moves(off_target(dimension))[which]
+    move, _ = proposal.moves(off_target(dimension))[which]
     assert isinstance(move, emcee.moves.DEMove)
     assert bias(run(move, dimension, EVOLUTION_STEPS[dimension], max(64, 2 * dimension))) == ""
 
 
 def test_the_moves_are_the_three_that_are_tried_here():
-    mixture = posterior.moves(off_target(3))
+    mixture = proposal.moves(off_target(3))
     assert [type(move) for move, _ in mixture] == [emcee.moves.MHMove, emcee.moves.DEMove, emcee.moves.DEMove]
     assert [move.gamma0 for move, _ in mixture[1:]] == [None, 1.0]
     assert sum(share for _, share in mixture) == pytest.approx(1.0, abs=len(mixture) * ROUNDING)
@@ -148,7 +149,7 @@ def test_walkers_that_move_together_are_seen():
 def test_walkers_outnumber_the_dimensions_in_whole_batches():
     for dimension in range(1, 200):
         walkers = walkers_for(dimension)
-        assert walkers > dimension and walkers >= posterior.WALKERS
+        assert walkers > dimension and walkers >= WALKERS
         assert walkers % (2 * BATCH) == 0
 
 
@@ -286,9 +287,9 @@ def test_too_many_stop_errors_get_no_columns(monkeypatch):
     fitted, path = small_fit()
     linear = linear_spots(fitted.linearised, fitted.arrays, -fitted.linearised.residual_jacobian)
     count = len(path.constant)
-    assert posterior.stop_states(fitted, linear).load.shape == (4 * len(linear.residual), count)
-    monkeypatch.setattr(posterior, "STATES_MAX", count - 1)
-    found = posterior.stop_states(fitted, linear)
+    assert stop_states(fitted, linear).load.shape == (4 * len(linear.residual), count)
+    monkeypatch.setattr("tvsbayes.posterior.transport.STATES_MAX", count - 1)
+    found = stop_states(fitted, linear)
     assert found.load.shape == (4 * len(linear.residual), 0)
     assert found.variance.shape == (0, 4) and found.constant.shape == (0,)
 
@@ -318,11 +319,11 @@ def test_w_keeps_the_curvature_far_from_the_mode():
 def test_the_table_keeps_the_curvature_far_from_the_mode():
     """The same, coordinate by coordinate."""
     fitted, path = small_fit()[0], small_path(False)
-    node = len(posterior.STRETCH_NODES) - 2
+    node = len(STRETCH_NODES) - 2
     which, place = np.unravel_index(np.argmax(path.stretch[:, node]), path.stretch[:, node].shape)
     step = 0.5 * np.eye(path.dimension)[place]
     w = np.stack([-step, np.zeros(path.dimension), step])
-    w[:, path.noise[which]] = posterior.STRETCH_NODES[node]
+    w[:, path.noise[which]] = STRETCH_NODES[node]
     with jax.enable_x64(True):
         curvature = [-(np.array([1, -2, 1]) @ Target(fitted, p)(w)) / 0.5**2 for p in (path, path.straight())]
     # The information at the node comes from one-sided steps as long: halves of their error are left.
@@ -332,7 +333,7 @@ def test_the_table_keeps_the_curvature_far_from_the_mode():
 def test_a_density_without_value_is_refused_and_counted(x64, monkeypatch):
     dimension, count = 3, BATCH + 5
     path = replace(small_fit()[1].straight(), mode=np.zeros(4), free=np.array([0, 1, 3]), root=np.eye(3))
-    path = replace(path, noise=np.zeros(0, int), stretch=np.zeros((0, len(posterior.STRETCH_NODES), 3)))
+    path = replace(path, noise=np.zeros(0, int), stretch=np.zeros((0, len(STRETCH_NODES), 3)))
     w = np.random.default_rng(11).normal(size=(count, dimension))
     without = np.array([0, 7, count - 1])
     w[without, 2] = 100.0
@@ -340,7 +341,8 @@ def test_a_density_without_value_is_refused_and_counted(x64, monkeypatch):
     def evaluate(z, space, arrays):
         return SimpleNamespace(log_density=jnp.where(z[:, 3] > 50, jnp.nan, 5.0 - z[:, 0]))
 
-    monkeypatch.setattr(posterior, "evaluate", evaluate)
+    monkeypatch.setattr("tvsbayes.posterior.proposal.evaluate", evaluate)
+    monkeypatch.setattr("tvsbayes.posterior.transport.evaluate", evaluate)
     target = Target(SimpleNamespace(space=None, arrays=None, log_density=2.0), path)
     value = target(w)
     expected = (5.0 - w[:, 0]) - 2.0

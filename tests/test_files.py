@@ -14,30 +14,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tvsbayes.files import (
-    CSV_LINE_CHARS_MAX,
-    IMAGE_PIXELS_MAX,
-    JSON_BYTES_MAX,
-    TOML_BYTES_MAX,
-    DeviceFault,
-    InputError,
-    NotConverged,
-    NothingToEstimate,
-    TvsError,
-    csv_bytes,
-    decode,
-    decode_image,
-    image_size,
-    parse_json,
-    parse_table,
-    parse_toml,
-    png_bytes,
-    read_bytes,
-    read_image,
-    shipped_data,
-    toml_line,
-    write_atomically,
-)
+from tvsbayes.errors import DeviceFault, InputError, NotConverged, NothingToEstimate, TvsError
+from tvsbayes.files.csv_table import CSV_LINE_CHARS_MAX, csv_bytes, parse_table
+from tvsbayes.files.disk import decode, read_bytes, shipped_data, write_atomically
+from tvsbayes.files.documents import JSON_BYTES_MAX, TOML_BYTES_MAX, parse_json, parse_toml, toml_line
+from tvsbayes.files.images import IMAGE_PIXELS_MAX, decode_image, image_size, png_bytes, read_image
 
 
 def test_message_tells_place_found_allowed_and_remedy():

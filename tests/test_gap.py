@@ -15,42 +15,23 @@ import pytest
 from conftest import ROOT, coordinates
 from scipy import stats
 
-from tvsbayes.campaign import four_point_protocol, read_campaign
-from tvsbayes.classic import DIRECTIONS, Selection, classic, select_experiments
-from tvsbayes.comparison import (
-    BACKLASH,
-    BETTER_CLASSIC,
-    BETTER_JOINT,
-    CANNOT_TELL,
-    CHANCE,
-    PROJECTION,
-    STEREO_SCALE,
-    Gap,
-    Prediction,
-    _foretell_classic,
-    _judge,
-    _ratio_interval,
-    compare,
-    criterion,
-    explain_gap,
-    folds_of,
-    hold_out,
-)
-from tvsbayes.files import NotConverged
-from tvsbayes.information import (
-    CAUSE_LIMIT,
-    StopResidual,
-    _Answer,
-    _holm,
-    log_chance,
-    recursive_residuals,
-    residual_causes,
-    stop_residuals,
-    summarise,
-)
-from tvsbayes.joint import JointFit, fit
-from tvsbayes.likelihood import ordered_spots
-from tvsbayes.simulation import Truth, read_truth, simulate
+from tvsbayes.assessment.residuals import CAUSE_LIMIT, residual_causes, stop_residuals
+from tvsbayes.assessment.score_tests import _Answer, _holm
+from tvsbayes.assessment.summary import summarise
+from tvsbayes.comparison.changes import compare
+from tvsbayes.comparison.gap import BACKLASH, CHANCE, PROJECTION, STEREO_SCALE, explain_gap
+from tvsbayes.comparison.hold_out import _foretell_classic, _judge, _ratio_interval, folds_of, hold_out
+from tvsbayes.errors import NotConverged
+from tvsbayes.estimators.four_point import Selection, classic, select_experiments
+from tvsbayes.estimators.joint_fit import JointFit, fit
+from tvsbayes.instrument.axes import DIRECTIONS
+from tvsbayes.instrument.campaign import ordered_spots, read_campaign
+from tvsbayes.instrument.plan import four_point_protocol
+from tvsbayes.report.evidence import criterion
+from tvsbayes.results.comparison_record import BETTER_CLASSIC, BETTER_JOINT, CANNOT_TELL, Gap, Prediction
+from tvsbayes.results.estimates import StopResidual
+from tvsbayes.statistics.intervals import log_chance, recursive_residuals
+from tvsbayes.twin.simulated_campaign import Truth, read_truth, simulate
 
 TWIN = ROOT / "data" / "twins" / "paper_twin"
 
@@ -100,7 +81,7 @@ def test_a_rest_whose_first_spot_is_left_out_keeps_its_stop_error(paper_fit):
 
 def test_a_refit_that_failed_judges_nobody(mixed_fit, monkeypatch):
     lost = replace(mixed_fit, converged=False, problems=("it went astray",))
-    monkeypatch.setattr("tvsbayes.comparison._refit", lambda *_: lost)
+    monkeypatch.setattr("tvsbayes.comparison.hold_out._refit", lambda *_: lost)
     held = hold_out(mixed_fit)
     assert held.verdict == CANNOT_TELL and "went astray" in held.reason
 
@@ -273,7 +254,7 @@ def test_a_fold_without_a_fit_decides_nothing(mixed_fit, monkeypatch):
     def lost(*_arguments):
         raise NotConverged("diverged", "NOT CONVERGED: the fit ran away")
 
-    monkeypatch.setattr("tvsbayes.comparison._refit", lost)
+    monkeypatch.setattr("tvsbayes.comparison.hold_out._refit", lost)
     held = hold_out(mixed_fit)
     assert held.verdict == CANNOT_TELL and "the fit ran away" in held.reason and not held.predictions
 

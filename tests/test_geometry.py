@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from tvsbayes import model
+from tvsbayes.model.geometry import dot, intersect_plane, reflect, rotate_about_z, rotation_matrix, transform
 
 pytestmark = pytest.mark.usefixtures("x64")
 
@@ -23,8 +23,8 @@ SERIES_ANGLE_RAD = 0.01
 @pytest.fixture(scope="module")
 def compiled():
     """(rotation matrices, their first and second derivatives) of many vectors."""
-    first = jax.jacfwd(model.rotation_matrix)
-    functions = [jax.jit(jax.vmap(f)) for f in (model.rotation_matrix, first, jax.jacfwd(first))]
+    first = jax.jacfwd(rotation_matrix)
+    functions = [jax.jit(jax.vmap(f)) for f in (rotation_matrix, first, jax.jacfwd(first))]
 
     def run(vectors):
         padded = np.zeros((BATCH, 3))
@@ -78,7 +78,7 @@ def test_second_derivative_at_zero_is_the_known_one(compiled):
 def test_rotate_about_z_is_the_rotation_about_z():
     vectors = np.random.default_rng(2).standard_normal((3, 20))
     angles = np.linspace(-np.pi, np.pi, 20)
-    turned = np.asarray(model.rotate_about_z(jnp.asarray(angles), jnp.asarray(vectors)))
+    turned = np.asarray(rotate_about_z(jnp.asarray(angles), jnp.asarray(vectors)))
     expected = Rotation.from_rotvec(angles[:, None] * [0.0, 0.0, 1.0]).apply(vectors.T).T
     np.testing.assert_allclose(turned, expected, atol=4 * ROUNDING)
 
@@ -86,9 +86,9 @@ def test_rotate_about_z_is_the_rotation_about_z():
 def test_transform_and_dot_are_the_products():
     rng = np.random.default_rng(3)
     matrix, vectors, others = rng.standard_normal((3, 3)), *rng.standard_normal((2, 3, 5, 7))
-    product = model.transform(jnp.asarray(matrix), jnp.asarray(vectors))
+    product = transform(jnp.asarray(matrix), jnp.asarray(vectors))
     np.testing.assert_allclose(product, np.einsum("ij,jab->iab", matrix, vectors), atol=10 * ROUNDING)
-    scalar = model.dot(jnp.asarray(vectors), jnp.asarray(others))
+    scalar = dot(jnp.asarray(vectors), jnp.asarray(others))
     np.testing.assert_allclose(scalar, np.sum(vectors * others, axis=0), atol=10 * ROUNDING)
 
 
@@ -105,18 +105,18 @@ def rays_and_planes():
 
 def test_reflection_keeps_what_lies_in_the_mirror_and_turns_the_rest():
     _, direction, _, normal = rays_and_planes()
-    out = model.reflect(direction, normal)
-    incoming, outgoing = (np.asarray(model.dot(v, normal)) for v in (direction, out))
+    out = reflect(direction, normal)
+    incoming, outgoing = (np.asarray(dot(v, normal)) for v in (direction, out))
     np.testing.assert_allclose(outgoing, -incoming, atol=4 * ROUNDING)
     tangential = np.asarray(direction) - incoming * np.asarray(normal)
     np.testing.assert_allclose(np.asarray(out) - outgoing * np.asarray(normal), tangential, atol=4 * ROUNDING)
-    np.testing.assert_allclose(model.reflect(out, normal), direction, atol=4 * ROUNDING)
+    np.testing.assert_allclose(reflect(out, normal), direction, atol=4 * ROUNDING)
 
 
 def test_intersection_lies_on_line_and_plane():
     origin, direction, point, normal = rays_and_planes()
-    hit = model.intersect_plane(origin, direction, point, normal)
+    hit = intersect_plane(origin, direction, point, normal)
     size = np.maximum(1.0, np.linalg.norm(hit, axis=0))
-    assert np.max(np.abs(model.dot(hit - point, normal)) / size) < 10 * ROUNDING
+    assert np.max(np.abs(dot(hit - point, normal)) / size) < 10 * ROUNDING
     across = np.cross(np.asarray(hit - origin), np.asarray(direction), axis=0)
     assert np.max(np.linalg.norm(across, axis=0) / size) < 10 * ROUNDING

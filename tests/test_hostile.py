@@ -19,14 +19,16 @@ import pytest
 from hostile_folders import CRAFTED, MEGABYTE, TARGETS, good_folder, mutations, png, sealed
 from small_campaign import small_campaign
 
-import tvsbayes.device.journal as journal_module
-from tvsbayes import cli
-from tvsbayes.calibration import read_draws
-from tvsbayes.campaign import input_hashes, read_campaign, write_campaign
-from tvsbayes.cli import run
-from tvsbayes.device.journal import LOG_ENTRIES_MAX, LOG_EVENTS_MAX, Journal, read_journal, repair, verify
-from tvsbayes.device.spots import detect
-from tvsbayes.files import DeviceFault, InputError, NotConverged, output_place, read_arrays
+from tvsbayes.acquisition.journal import LOG_ENTRIES_MAX, LOG_EVENTS_MAX, Journal, read_journal
+from tvsbayes.acquisition.journal_check import repair, verify
+from tvsbayes.calibration.calibration_file import read_draws
+from tvsbayes.cameras.detection import detect
+from tvsbayes.cli.app import report_line
+from tvsbayes.cli.main import run
+from tvsbayes.errors import DeviceFault, InputError, NotConverged
+from tvsbayes.files.disk import output_place, read_arrays
+from tvsbayes.instrument.campaign import input_hashes, read_campaign, write_campaign
+from tvsbayes.pipeline import document_for
 
 FILES = ("campaign.toml", "stereo.json", "moves.csv", "spots.csv")
 Edit = Callable[[bytes], bytes]
@@ -392,7 +394,7 @@ def test_a_log_is_capped_in_events_and_entries(good, tmp_path):
 
 
 def test_a_full_journal_says_so_and_stays_readable(tmp_path, monkeypatch):
-    monkeypatch.setattr(journal_module, "LOG_EVENTS_MAX", 3)
+    monkeypatch.setattr("tvsbayes.acquisition.journal.LOG_EVENTS_MAX", 3)
     journal = Journal.create(tmp_path / "run")
     for step in range(2):
         journal.append("intent", step=step)
@@ -418,15 +420,15 @@ def test_a_report_is_not_made_from_the_fit_of_other_data(good, tmp_path, monkeyp
     """`fit.json` of other data beside `draws.npz` of these: fit again, never combine."""
     folder = place_of(good, tmp_path)
     data = read_campaign(folder)
-    assert cli._fit_document(data, folder)["inputs"] == input_hashes(data)
+    assert document_for(data, folder, report_line)["inputs"] == input_hashes(data)
     CRAFTED["fit.json of other data"].edit(folder)
 
-    def fitted(campaign):
+    def fitted(campaign, tell):
         raise NotConverged("not-converged", "fitted anew", remedy="-")
 
-    monkeypatch.setattr(cli, "_converged_fit", fitted)
+    monkeypatch.setattr("tvsbayes.pipeline._converged_fit", fitted)
     with pytest.raises(NotConverged, match="fitted anew"):
-        cli._fit_document(data, folder)
+        document_for(data, folder, report_line)
 
 
 @pytest.mark.parametrize(
@@ -440,17 +442,17 @@ def test_a_report_is_not_made_from_the_fit_of_other_data(good, tmp_path, monkeyp
     ],
 )
 def test_a_damaged_comparison_is_refused_by_key(good, tmp_path, key, value, column):
-    from tvsbayes.comparison import _stored_hold_out
+    from tvsbayes.results.comparison_record import stored_hold_out
 
     folder = place_of(good, tmp_path)
     path, data = folder / "results" / "compare.json", read_campaign(folder)
     document = json.loads(path.read_text())
-    assert _stored_hold_out(data, document) == document
-    assert _stored_hold_out(data, {"inputs": {}}) is None
+    assert stored_hold_out(data, document) == document
+    assert stored_hold_out(data, {"inputs": {}}) is None
     document["held_out"][key] = value
     path.write_text(json.dumps(document))
     with pytest.raises(InputError) as caught:
-        _stored_hold_out(data, document)
+        stored_hold_out(data, document)
     assert caught.value.column == column
 
 
@@ -461,14 +463,14 @@ def test_frames_of_another_size_are_refused_before_they_are_decoded(good, tmp_pa
     def decoded(data, file):
         raise AssertionError("decoded")
 
-    monkeypatch.setattr("tvsbayes.device.spots.decode_image", decoded)
+    monkeypatch.setattr("tvsbayes.cameras.detection.decode_image", decoded)
     with pytest.raises(InputError) as caught:
         detect(read_campaign(folder))
     assert caught.value.code == "image-size"
 
 
 def test_boards_of_too_many_pixels_are_refused_before_they_are_decoded(tmp_path, monkeypatch):
-    from tvsbayes.device import boards
+    from tvsbayes.cameras import boards
 
     def decoded(path, folder):
         raise AssertionError("decoded")

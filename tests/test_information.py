@@ -8,14 +8,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tvsbayes.campaign import Campaign, four_point_protocol, paper_protocol
-from tvsbayes.classic import classic
-from tvsbayes.information import CONTRACTION_LIMIT, FitSummary, summarise
-from tvsbayes.joint import fit
-from tvsbayes.model import INDEX, NAMES, RECEIVER_NAMES
-from tvsbayes.report import fit_text
-from tvsbayes.rigs import HARMONIC_PRIORS, Prior
-from tvsbayes.simulation import simulate
+from tvsbayes.assessment.summary import summarise
+from tvsbayes.estimators.four_point import classic
+from tvsbayes.estimators.joint_fit import fit
+from tvsbayes.instrument.campaign import Campaign
+from tvsbayes.instrument.parameters import HARMONIC_PRIORS, INDEX, NAMES, RECEIVER_NAMES, Prior
+from tvsbayes.instrument.plan import four_point_protocol, paper_protocol
+from tvsbayes.report.fit_text import fit_text
+from tvsbayes.results.estimates import CONTRACTION_LIMIT, FitSummary
+from tvsbayes.twin.simulated_campaign import simulate
 
 
 @pytest.fixture(scope="module")

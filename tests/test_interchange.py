@@ -9,9 +9,10 @@ import cv2
 import numpy as np
 import pytest
 
-from tvsbayes.device.interchange import assumed_covariance, exported, parse_yaml, read_calibration
-from tvsbayes.files import InputError, shipped_data
-from tvsbayes.rigs import Stereo, pair_doubts, read_stereo, rotation_matrix, stereo_bytes
+from tvsbayes.cameras.calibration_formats import assumed_covariance, exported, parse_yaml, read_calibration
+from tvsbayes.errors import InputError
+from tvsbayes.files.disk import shipped_data
+from tvsbayes.instrument.stereo_pair import Stereo, pair_doubts, read_stereo, rotation_matrix, stereo_bytes
 
 OPENCV_DATA = Path("/usr/share/doc/opencv-doc/examples/data")
 KALIBR = """cam0:

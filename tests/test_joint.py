@@ -12,13 +12,16 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from tvsbayes.campaign import Campaign, four_point_protocol, grid_protocol
-from tvsbayes.files import InputError, NothingToEstimate, shipped_data
-from tvsbayes.joint import HARMONIC_SD_DEG, fit, laplace_draws, model_choice
-from tvsbayes.likelihood import ordered_spots
-from tvsbayes.model import INDEX, NAMES
-from tvsbayes.rigs import HARMONIC_PRIORS, Prior, RigTable, read_rig
-from tvsbayes.simulation import SimulatedCampaign, effective_deg_per_step, effective_mirror_offset_mm, simulate
+from tvsbayes.errors import InputError, NothingToEstimate
+from tvsbayes.estimators.joint_fit import HARMONIC_SD_DEG, fit, model_choice
+from tvsbayes.files.disk import shipped_data
+from tvsbayes.instrument.campaign import Campaign, ordered_spots
+from tvsbayes.instrument.parameters import HARMONIC_PRIORS, INDEX, NAMES, Prior
+from tvsbayes.instrument.plan import four_point_protocol, grid_protocol
+from tvsbayes.instrument.rig import RigTable, read_rig
+from tvsbayes.statistics.least_squares import laplace_draws
+from tvsbayes.twin.physics import effective_deg_per_step, effective_mirror_offset_mm
+from tvsbayes.twin.simulated_campaign import SimulatedCampaign, simulate
 
 SD = 1.0
 """One posterior standard deviation."""
@@ -240,7 +243,7 @@ def test_a_fixed_parameter_stays_and_the_rest_follows(simulated, fitted):
 
 
 def test_the_mode_is_a_stationary_maximum(fitted):
-    from tvsbayes.likelihood import density_and_gradient
+    from tvsbayes.estimators.likelihood import density_and_gradient
 
     with jax.enable_x64(True):
         value, gradient = density_and_gradient(jnp.asarray(fitted.z), fitted.space, fitted.arrays)
@@ -289,7 +292,7 @@ def test_coverage_of_forty_rigs(protocol, mounted_rig):
     """A short form of `experiments/coverage.py`; bounds of the full study stand there."""
     from scipy import stats
 
-    from tvsbayes.campaign import read_plan
+    from tvsbayes.instrument.plan import read_plan
 
     plan = read_plan(shipped_data() / "rigs" / "mounted" / f"{protocol}.csv")
     rig = read_rig(shipped_data() / "rigs" / "mounted" / "rig.toml")

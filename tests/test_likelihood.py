@@ -11,11 +11,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from tvsbayes import likelihood
-from tvsbayes.likelihood import campaign_arrays, density_and_gradient, log_constant, ordered_spots
-from tvsbayes.model import INDEX, NAMES, RIG_NAMES
-from tvsbayes.rigs import HOME_SD_DEG, rotation_matrix
-from tvsbayes.simulation import aperture_angle_deg, mirror_chain, play, project, to_tvs
+from tvsbayes.estimators.campaign_arrays import bucket, campaign_arrays, log_constant
+from tvsbayes.estimators.likelihood import density_and_gradient
+from tvsbayes.instrument.axes import HOME_SD_DEG
+from tvsbayes.instrument.campaign import ordered_spots
+from tvsbayes.instrument.parameters import INDEX, NAMES, RIG_NAMES
+from tvsbayes.instrument.stereo_pair import rotation_matrix
+from tvsbayes.twin.physics import aperture_angle_deg, mirror_chain, play, project, to_tvs
 
 pytestmark = pytest.mark.usefixtures("x64")
 
@@ -163,7 +165,7 @@ def test_a_stop_error_per_pose_is_another_density(dozen, evaluate):
 
 
 def test_padding_changes_nothing(dozen, evaluate, monkeypatch):
-    monkeypatch.setattr(likelihood, "SMALLEST_BUCKET", 1024)
+    monkeypatch.setattr("tvsbayes.estimators.campaign_arrays.SMALLEST_BUCKET", 1024)
     large = jax.tree.map(jnp.asarray, campaign_arrays(dozen.campaign))
     assert large.spots.pixels.shape == (1024, 4) and dozen.arrays.spots.pixels.shape == (512, 4)
     one, two = (evaluate(dozen.z, dozen.space, arrays) for arrays in (dozen.arrays, large))
@@ -177,7 +179,7 @@ def test_padding_changes_nothing(dozen, evaluate, monkeypatch):
 
 
 def test_bucket_sizes():
-    assert [likelihood.bucket(n) for n in (1, 512, 513, 4000)] == [512, 512, 1024, 4096]
+    assert [bucket(n) for n in (1, 512, 513, 4000)] == [512, 512, 1024, 4096]
 
 
 def test_order_of_rows_is_irrelevant(dozen):

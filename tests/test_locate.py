@@ -11,18 +11,13 @@ import numpy as np
 import pytest
 from small_campaign import small_campaign
 
-from tvsbayes.calibration import (
-    CALIBRATION_FORMAT,
-    Calibration,
-    calibration_bytes,
-    calibration_of_draws,
-    load_calibration,
-)
-from tvsbayes.campaign import read_campaign, write_campaign
-from tvsbayes.cli import run
-from tvsbayes.files import shipped_data
-from tvsbayes.model import NAMES
-from tvsbayes.rigs import RIG_PRIORS
+from tvsbayes.assessment.fitted_calibration import calibration_of_draws
+from tvsbayes.calibration.calibration_file import CALIBRATION_FORMAT, calibration_bytes, load_calibration
+from tvsbayes.calibration.pointing import Calibration
+from tvsbayes.cli.main import run
+from tvsbayes.files.disk import shipped_data
+from tvsbayes.instrument.campaign import read_campaign, write_campaign
+from tvsbayes.instrument.parameters import NAMES, RIG_PRIORS
 
 POINT = ("--pan-steps", 100, "--tilt-steps", 20, "--aperture-deg", 70)
 RELATIVE_SD = 0.01

@@ -69,14 +69,15 @@ def test_distributions_hold_what_belongs_in_them(built):
     wheel, again = (sorted(zipfile.ZipFile(built[kind]).namelist()) for kind in (".whl", "again"))
     assert wheel == again
     assert {name.split("/")[0] for name in wheel} == {"tvsbayes", f"tvsbayes-{VERSION}.dist-info"}
+    packages = {path.parent.name for path in (ROOT / "tvsbayes").glob("*/__init__.py")}
     assert {name.split("/")[1] for name in wheel if name.count("/") > 1 and "dist-info" not in name} == {
         "data",
-        "device",
+        *packages,
     }
     kept = {f"tvsbayes/data/{name}" for name in SHIPPED}
     flashed = ("tvs_positioner.ino", "tvs_core.h", "tvs_core.cpp")
-    kept |= {f"tvsbayes/device/firmware/tvs_positioner/{name}" for name in flashed}
-    kept |= {f"tvsbayes/device/firmware/{name}" for name in ("README.md", "native/replay.cpp")}
+    kept |= {f"tvsbayes/positioner/firmware/tvs_positioner/{name}" for name in flashed}
+    kept |= {f"tvsbayes/positioner/firmware/{name}" for name in ("README.md", "native/replay.cpp")}
     assert kept <= set(wheel)
     with tarfile.open(built[".gz"]) as archive:
         source = [name.partition("/")[2] for name in archive.getnames()]
@@ -101,10 +102,12 @@ def test_installed_package_works_away_from_the_tree(kind, built, tmp_path):
     assert "Commands" in run(command, "--help", **options)
     run(command, "new", "x", **options)
     assert {path.name for path in (tmp_path / "x").iterdir()} == {"campaign.toml", "moves.csv", "rig.toml", "spots.csv"}
-    data = Path(run(python, "-c", "from tvsbayes.files import shipped_data; print(shipped_data())", **options).strip())
+    data = Path(
+        run(python, "-c", "from tvsbayes.files.disk import shipped_data; print(shipped_data())", **options).strip()
+    )
     assert data.is_relative_to(tmp_path)
     assert [name for name in SHIPPED if not (data / name).is_file()] == []
-    shown = "from tvsbayes.device import firmware_folder; print(firmware_folder())"
+    shown = "from tvsbayes.positioner import firmware_folder; print(firmware_folder())"
     assert (Path(run(python, "-c", shown, **options).strip()) / "README.md").is_file()
     if kind == ".whl":  # the same files as from source: one fit is enough
         document = json.loads(run(command, "demo", "--json", **options))

@@ -12,25 +12,21 @@ import pytest
 from scipy import stats
 from small_campaign import small_stereo
 
-from tvsbayes.model import (
+from tvsbayes.instrument.parameters import (
+    DECLARED_PRIORS,
+    DEFAULT_PRIORS,
+    HARMONIC_PRIORS,
     INDEX,
     KINDS,
     NAMES,
     NOISE_NAMES,
     RECEIVER_NAMES,
     RIG_NAMES,
-    free_mask,
-    model_of,
-    parameter_space,
-)
-from tvsbayes.rigs import (
-    DECLARED_PRIORS,
-    DEFAULT_PRIORS,
-    HARMONIC_PRIORS,
     STEREO_PARAMETER_NAMES,
     Prior,
-    RigTable,
 )
+from tvsbayes.instrument.rig import RigTable
+from tvsbayes.model.parameter_space import free_mask, model_of, parameter_space
 
 pytestmark = pytest.mark.usefixtures("x64")
 

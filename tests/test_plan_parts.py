@@ -9,35 +9,25 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from tvsbayes.campaign import PlanStep, four_point_protocol
-from tvsbayes.classic import DIRECTIONS, classic
-from tvsbayes.design import (
-    AT_POINT,
-    PARAMETERS,
-    Knowledge,
-    Sensitivity,
-    Target,
-    _sided,
-    parse_target,
-    plan_minutes,
-    prior_knowledge,
-)
-from tvsbayes.model import INDEX
-from tvsbayes.planning import (
-    Batch,
+from tvsbayes.estimators.four_point import classic
+from tvsbayes.instrument.axes import DIRECTIONS
+from tvsbayes.instrument.parameters import INDEX
+from tvsbayes.instrument.plan import PlanStep, four_point_protocol
+from tvsbayes.planning.candidates import _sided
+from tvsbayes.planning.expectation import PARAMETERS, Knowledge, plan_minutes, prior_knowledge
+from tvsbayes.planning.forecast import (
     ClassicForecast,
-    Limit,
-    _classic_answer,
-    _classic_value,
-    _smallest,
+    classic_answer,
     classic_count,
     classic_forecast,
-    limit_of,
-    split_of,
-    stop_now,
     truth_in,
+    value_of_classic,
 )
-from tvsbayes.simulation import Truth, draw_truth, effective_deg_per_step, simulate, with_derived
+from tvsbayes.planning.limits import Batch, Limit, limit_of, split_of, stop_now
+from tvsbayes.planning.search import smallest_design
+from tvsbayes.planning.target import AT_POINT, Sensitivity, Target, parse_target
+from tvsbayes.twin.physics import effective_deg_per_step
+from tvsbayes.twin.simulated_campaign import Truth, draw_truth, simulate, with_derived
 
 LIMITS = np.array([[0, 100], [-50, 50]])
 OVERSHOOT = np.array([10, 20])
@@ -66,8 +56,8 @@ def test_a_side_is_offered_where_its_run_up_stays_inside(position, sides):
 def test_the_smallest_number_that_meets_is_found():
     ladder = (1, 2, 3, 5, 8, 12, 20, 40)
     for answer in range(1, 41):
-        assert _smallest(lambda n, answer=answer: n >= answer, ladder) == answer
-    assert _smallest(lambda n: n >= 41, ladder) is None
+        assert smallest_design(lambda n, answer=answer: n >= answer, ladder) == answer
+    assert smallest_design(lambda n: n >= 41, ladder) is None
 
 
 def test_minutes_of_a_plan_by_hand(mounted_rig):
@@ -181,11 +171,11 @@ def test_the_classics_value_adds_stereo_to_the_mean_of_its_experiments():
     sd = np.array([[6e-4, 1e-4, 0, 0], [6e-4, 1e-4, 0, 0], [60e-4, 1e-4, 0, 0]])
     forecast = ClassicForecast(sd, np.zeros((3, 4)), np.array([4e-4, 1e-4, 0, 0]))
     worst, left = (parse_target(f"u({name}) <= 1e-4 deg/step") for name in ("worst", "left"))
-    assert _classic_value(forecast, worst, 16) == pytest.approx(5e-4, rel=1e-12)
-    assert _classic_value(forecast, replace(left, factor=1.96), 16) == pytest.approx(1.96 * 5e-4, rel=1e-12)
+    assert value_of_classic(forecast, worst, 16) == pytest.approx(5e-4, rel=1e-12)
+    assert value_of_classic(forecast, replace(left, factor=1.96), 16) == pytest.approx(1.96 * 5e-4, rel=1e-12)
     for other in (parse_target("u(backlash.pan) <= 1 deg"), parse_target("u(x) at 1000,0,0 mm <= 1 mm")):
-        assert _classic_value(forecast, other, 16) is None
-    assert _classic_value(forecast, worst, 7) is None, "one experiment has no scatter"
+        assert value_of_classic(forecast, other, 16) is None
+    assert value_of_classic(forecast, worst, 7) is None, "one experiment has no scatter"
 
 
 @pytest.fixture(scope="module")
@@ -198,14 +188,14 @@ def forecast() -> ClassicForecast:
 
 def test_the_classics_answer_before_data(forecast):
     """S of the instruments, E = 1.96 u or U95; of `worst` the direction that needs most."""
-    answer = _classic_answer(parse_target("u(worst) <= 1e-4 deg/step"), forecast, None)
+    answer = classic_answer(parse_target("u(worst) <= 1e-4 deg/step"), forecast, None)
     assert answer.direction == "left" and not answer.from_data
     assert answer.half_width == pytest.approx(1.96e-4, rel=1e-4)
     assert (*answer.sd_interval95, answer.sd) == pytest.approx((1.1e-4, 4.9e-4, 3e-4), rel=1e-12)
     counts = tuple(classic_count(sd, answer.half_width) for sd in (1.1e-4, 4.9e-4, 3e-4))
     assert (*answer.experiments_interval95, answer.experiments) == counts
     assert (*answer.systematic_interval95, answer.systematic) == pytest.approx((1e-5, 39e-5, 20e-5), rel=1e-12)
-    expanded = _classic_answer(parse_target("U95(right) <= 1e-4 deg/step"), forecast, None)
+    expanded = classic_answer(parse_target("U95(right) <= 1e-4 deg/step"), forecast, None)
     assert expanded.half_width == pytest.approx(1e-4, rel=1e-12) and expanded.stereo_u == 4e-5
     assert expanded.systematic == pytest.approx(120e-5, rel=1e-12)
 
@@ -214,7 +204,7 @@ def test_the_classics_answer_after_data_has_the_interval_of_chi_square(mounted_r
     """(n - 1) s^2 / sigma^2 exceeds its 2.5 % quantile at the upper end and its 97.5 % quantile at the lower."""
     campaign = simulate(mounted_rig, four_point_protocol(5), 1).campaign
     measured = classic(campaign).directions["left"]
-    answer = _classic_answer(parse_target("u(left) <= 1e-4 deg/step"), forecast, campaign)
+    answer = classic_answer(parse_target("u(left) <= 1e-4 deg/step"), forecast, campaign)
     assert answer.from_data and answer.sd == measured.sd_deg_per_step and measured.n == 5
     low, high = answer.sd_interval95
     tails = [stats.chi2.cdf(4 * (answer.sd / sigma) ** 2, 4) for sigma in (high, low)]

@@ -16,62 +16,77 @@ import pytest
 from conftest import dozen_plan
 from scipy import optimize
 
-from tvsbayes import design, planning, simulation
-from tvsbayes.campaign import PlanStep, four_point_protocol, grid_protocol, paper_protocol, read_plan, write_plan
-from tvsbayes.classic import DIRECTIONS
-from tvsbayes.design import (
-    LOOKS_PER_EXPERIMENT,
-    NOISE_COLUMNS,
-    PARAMETERS,
-    QUANTITIES,
+from tvsbayes.errors import InputError
+from tvsbayes.files.disk import shipped_data
+from tvsbayes.instrument.axes import DIRECTIONS
+from tvsbayes.instrument.parameters import INDEX, RIG_NAMES, Prior
+from tvsbayes.instrument.plan import (
+    HOME_APPROACH,
+    PlanStep,
+    described,
+    four_point_protocol,
+    grid_protocol,
+    paper_protocol,
+    read_plan,
+    run_plan,
+    write_plan,
+)
+from tvsbayes.instrument.rig import Rig
+from tvsbayes.model.headlines import QUANTITIES, physical_at
+from tvsbayes.planning import forecast, planner, search
+from tvsbayes.planning.candidates import (
+    CONTRAST_COLUMNS,
     LookArrays,
     Looks,
-    Search,
-    Target,
+    Seen,
     arrange,
     candidates,
     covariance_of,
-    information_of,
     information_of_looks,
-    parse_target,
+)
+from tvsbayes.planning.expectation import (
+    LOOKS_PER_EXPERIMENT,
+    NOISE_COLUMNS,
+    PARAMETERS,
+    design_arrays,
+    information_of,
     plan_minutes,
     prior_knowledge,
-    scores,
-    sensitivity,
 )
-from tvsbayes.files import InputError, shipped_data
-from tvsbayes.model import INDEX, RIG_NAMES
-from tvsbayes.planning import (
-    STOPS_ADVISED,
-    Batch,
-    Limit,
-    check_plan,
+from tvsbayes.planning.forecast import (
+    PIXEL_COLUMN,
+    STOP_COLUMNS,
+    Assurance,
+    DrawnTruth,
+    Family,
     classic_count,
-    few_stops,
-    limit_of,
-    plan_from,
-    share_error,
-    stop_now,
     truth_in,
 )
-from tvsbayes.rigs import Prior, Rig
-from tvsbayes.simulation import Truth, draw_truth, run_plan, simulate
+from tvsbayes.planning.limits import Batch, Limit, limit_of, next_experiments, stop_now
+from tvsbayes.planning.plan_check import _beyond_limits, _extended, check_plan
+from tvsbayes.planning.planner import STOPS_ADVISED, few_stops, plan_from
+from tvsbayes.planning.search import CRITERIA, KNOWN, MEAN_WEIGHT, Search, _rows_for_search, scores
+from tvsbayes.planning.target import AT_POINT, DEFAULT_TARGET, Target, parse_target, sensitivity
+from tvsbayes.report.command_text import plan_text
+from tvsbayes.statistics.intervals import share_error
+from tvsbayes.twin.physics import aperture_angle_deg, mirror_chain, to_tvs
+from tvsbayes.twin.simulated_campaign import Truth, draw_truth, simulate
 
 ROUNDING = 1e-9
 """Relative; sums of a thousand products in float64, condition numbers up to 1e5."""
-WORST = parse_target(design.DEFAULT_TARGET)
+WORST = parse_target(DEFAULT_TARGET)
 
 
 @pytest.fixture(scope="module", autouse=True)
 def small_searches():
     """One bucket, few levels: the searches are the same, the grids coarser."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(design, "SMALLEST_DESIGN", 512)
+        patch.setattr("tvsbayes.planning.expectation.SMALLEST_DESIGN", 512)
         for name, value in (("PAN_LEVELS", 4), ("TILT_LEVELS", 3), ("COARSE_PAN", 7), ("COARSE_TILT", 5)):
-            patch.setattr(design, name, value)
-        patch.setattr(design, "VISIBILITY_DRAWS", 8)
-        patch.setattr(planning, "CLASSIC_DRAWS", 5)
-        patch.setitem(planning.plan.__kwdefaults__, "largest", 8)
+            patch.setattr(f"tvsbayes.planning.candidates.{name}", value)
+        patch.setattr("tvsbayes.planning.candidates.VISIBILITY_DRAWS", 8)
+        patch.setattr("tvsbayes.planning.forecast.CLASSIC_DRAWS", 5)
+        patch.setitem(planner.plan.__kwdefaults__, "largest", 8)
         yield
 
 
@@ -118,12 +133,14 @@ def test_a_plans_information_is_the_fits_own(mounted_rig, knowledge, monkeypatch
     """Same point, same looks: segments with home offsets, shared stops, half-open play (the dozen)."""
     import jax
 
-    from tvsbayes.joint import Problem
-    from tvsbayes.likelihood import stop_information
+    from tvsbayes.estimators.joint_fit import Problem
+    from tvsbayes.estimators.linear_spots import stop_information
 
-    monkeypatch.setattr(simulation, "SHEET_DEPTH_SD_MM", 0.0)
-    monkeypatch.setattr(simulation, "SHEET_TILT_SD_DEG", 0.0)
-    monkeypatch.setattr(simulation, "HOME_SD_DEG", 0.0)
+    monkeypatch.setattr("tvsbayes.twin.simulated_campaign.SHEET_DEPTH_SD_MM", 0.0)
+    monkeypatch.setattr("tvsbayes.acquisition.simulated_instrument.SHEET_DEPTH_SD_MM", 0.0)
+    monkeypatch.setattr("tvsbayes.twin.simulated_campaign.SHEET_TILT_SD_DEG", 0.0)
+    monkeypatch.setattr("tvsbayes.acquisition.simulated_instrument.SHEET_TILT_SD_DEG", 0.0)
+    monkeypatch.setattr("tvsbayes.twin.simulated_campaign.HOME_SD_DEG", 0.0)
     # Cameras as stated: a campaign is triangulated with the stated ones, a plan's sheets stand where they stand.
     drawn = draw_truth(mounted_rig, np.random.default_rng(3)).parameters | {"focal_scale": 1.0}
     truth = truth_in(knowledge, drawn, mounted_rig.stereo.vector)
@@ -147,7 +164,7 @@ def test_arrays_hold_every_move_of_a_plan(mounted_rig, moves):
     steps = [PlanStep(0, "home", 0, 0), PlanStep(1, "place", target="d1")]
     steps += [PlanStep(n, "move", n, 0) for n in range(2, moves + 1)]
     log = run_plan([*steps, PlanStep(moves + 1, "look")], mounted_rig, ("left", "up"))
-    arrays = design._design_arrays(log.moves, [moves - 1], mounted_rig, homed_from=1, aperture=False)
+    arrays = design_arrays(log.moves, [moves - 1], mounted_rig, homed_from=1, aperture=False)
     assert len(log.moves) == moves and np.array_equal(arrays.moves.steps[:moves, 0], [m.pan_steps for m in log.moves])
 
 
@@ -217,7 +234,7 @@ def test_looks_that_miss_an_image_tell_nothing(knowledge):
 def test_truths_have_coordinates(mounted_rig, knowledge):
     drawn = draw_truth(mounted_rig, np.random.default_rng(8))
     truth = truth_in(knowledge, drawn.parameters, drawn.stereo.vector)
-    physical = design.physical_at(truth.z, truth.space).value
+    physical = physical_at(truth.z, truth.space).value
     for name, index in INDEX.items():
         true = drawn.parameters.get(name)
         if true is not None:
@@ -227,11 +244,11 @@ def test_truths_have_coordinates(mounted_rig, knowledge):
 
 def test_other_noise_scales_need_no_new_look(knowledge, found, seen):
     """Looks whitened anew for other stop errors and pixels carry the information that looking again would give."""
-    family = planning.Family(knowledge, found, np.arange(len(found.looks)), False)
-    assurance = planning.Assurance(family, WORST, 1, 0)
-    truth = planning.DrawnTruth(knowledge.z, knowledge.space)
+    family = Family(knowledge, found, np.arange(len(found.looks)), False)
+    assurance = Assurance(family, WORST, 1, 0)
+    truth = DrawnTruth(knowledge.z, knowledge.space)
     z = knowledge.z.copy()
-    z[[*planning.STOP_COLUMNS.ravel(), planning.PIXEL_COLUMN]] = (0.7, -1.1, 0.4, 1.3, -0.6)
+    z[[*STOP_COLUMNS.ravel(), PIXEL_COLUMN]] = (0.7, -1.1, 0.4, 1.3, -0.6)
     again = assurance.arrays.at(z, knowledge.space).rows
     quick = assurance._rescaled(assurance.arrays.at(truth.z, truth.space), truth, z).rows
     one, other = (np.einsum("mij,mik->jk", rows, rows) for rows in (again, quick))
@@ -243,15 +260,15 @@ def test_other_noise_scales_need_no_new_look(knowledge, found, seen):
 def test_a_noise_scale_is_believed_by_the_weight_of_the_stops(knowledge, found, seen):
     """Thousands of stops tell the true sd; none leave the prior's median; the scatter is 1 / sqrt(2 n)."""
     true = knowledge.z.copy()
-    columns = planning.STOP_COLUMNS.ravel()
+    columns = STOP_COLUMNS.ravel()
     true[columns] = 1.5
-    truth, exact = planning.DrawnTruth(true, knowledge.space), np.zeros((PARAMETERS, PARAMETERS))
+    truth, exact = DrawnTruth(true, knowledge.space), np.zeros((PARAMETERS, PARAMETERS))
     many = np.tile(np.arange(len(found.looks)), 40)
 
     def believed(chosen, noise):
-        taken = design.Seen(*(getattr(seen, n)[chosen] for n in ("rows", "slope", "seen", "mirror_angles_rad")))
+        taken = Seen(*(getattr(seen, n)[chosen] for n in ("rows", "slope", "seen", "mirror_angles_rad")))
         side = found.looks.side[chosen]
-        return planning.believed(truth, taken, side, exact, knowledge, np.full(5, noise))[columns]
+        return forecast.believed(truth, taken, side, exact, knowledge, np.full(5, noise))[columns]
 
     assert believed(many, 0.0) == pytest.approx(1.5, abs=0.01)
     assert (np.abs(believed(many[:1], 0.0)) < 1.5).all()
@@ -262,22 +279,22 @@ def test_a_noise_scale_is_believed_by_the_weight_of_the_stops(knowledge, found, 
 
 def test_what_the_geometry_takes_from_the_stops_is_not_left_for_their_scatter(knowledge, found, seen):
     """Less p for n: with every geometric coordinate determined by L looks, 1 - p / (2 L) of the information is left."""
-    columns = planning.STOP_COLUMNS.ravel()
+    columns = STOP_COLUMNS.ravel()
     true = knowledge.z.copy()
     true[columns] = 1.5
-    truth = planning.DrawnTruth(true, knowledge.space)
+    truth = DrawnTruth(true, knowledge.space)
     chosen = np.resize(np.arange(len(found.looks)), 60)
-    taken = design.Seen(*(getattr(seen, n)[chosen] for n in ("rows", "slope", "seen", "mirror_angles_rad")))
+    taken = Seen(*(getattr(seen, n)[chosen] for n in ("rows", "slope", "seen", "mirror_angles_rad")))
     side = found.looks.side[chosen]
 
     def scatter(covariance):
         low, high = (
-            planning.believed(truth, taken, side, covariance, knowledge, np.full(5, x))[columns] for x in (0.0, 1.0)
+            forecast.believed(truth, taken, side, covariance, knowledge, np.full(5, x))[columns] for x in (0.0, 1.0)
         )
         return high - low
 
     exact = np.zeros((PARAMETERS, PARAMETERS))
-    geometry = ~design.NOISE_COLUMNS & (np.arange(PARAMETERS) < len(RIG_NAMES))
+    geometry = ~NOISE_COLUMNS & (np.arange(PARAMETERS) < len(RIG_NAMES))
     # Nothing is learned where the covariance is the prior's; a precision of 0 is a coordinate held fixed.
     precision = np.diag(knowledge.precision)
     unknown = np.diag(np.divide(1.0, precision, out=np.zeros(PARAMETERS), where=precision > 0))
@@ -346,11 +363,11 @@ def test_stops_and_reading_at_a_point_are_those_of_the_twins_optics(mounted_rig,
     table = replace(rig.table, aperture_convention=convention)
     known = prior_knowledge(replace(rig, table=table))
     values = {name: prior.value for name, prior in table.priors.items()}
-    base_mm, reading_deg = values["baseline_mm"], float(simulation.aperture_angle_deg(point_mm, 200.0, convention))
+    base_mm, reading_deg = values["baseline_mm"], float(aperture_angle_deg(point_mm, 200.0, convention))
 
     def ray(angles_rad: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        origin, direction = simulation.mirror_chain(*angles_rad, values)
-        ends = simulation.to_tvs(np.stack([origin, origin + direction]), base_mm, values["pan_zero_emission_deg"])
+        origin, direction = mirror_chain(*angles_rad, values)
+        ends = to_tvs(np.stack([origin, origin + direction]), base_mm, values["pan_zero_emission_deg"])
         return ends[0], ends[1] - ends[0]
 
     def passes(angles_rad: np.ndarray) -> np.ndarray:
@@ -364,7 +381,7 @@ def test_stops_and_reading_at_a_point_are_those_of_the_twins_optics(mounted_rig,
         origin, direction = ray(aimed + np.radians([pan_deg, tilt_deg]))
 
         def excess_deg(reach_mm: float) -> float:
-            found = simulation.aperture_angle_deg(origin + reach_mm * direction, base_mm, convention)
+            found = aperture_angle_deg(origin + reach_mm * direction, base_mm, convention)
             return float(found) - reading_deg - aperture_deg
 
         return origin + optimize.brentq(excess_deg, 500.0, 2000.0, xtol=1e-10) * direction
@@ -380,7 +397,7 @@ def test_stops_and_reading_at_a_point_are_those_of_the_twins_optics(mounted_rig,
     at = sensitivity(target, known.z, known.space, table, np.zeros(2))
     # The machine stands at whole counters, up to half a step beside the point.
     half_step_rad = math.radians(values["degrees_per_step.tilt"]) / 2
-    for cause, variance_mm2 in zip(design.AT_POINT, (stop_mm2, reading_mm2), strict=True):
+    for cause, variance_mm2 in zip(AT_POINT, (stop_mm2, reading_mm2), strict=True):
         assert at.own[cause] == pytest.approx(variance_mm2, abs=half_step_rad * variance_mm2.max()), cause
     assert (moved[1] * 0.04)[2] ** 2 > 0.1 * stop_mm2[2], "tilt counts, or it could be left out"
 
@@ -404,7 +421,7 @@ def test_greedy_takes_the_best_look_and_exchange_never_worsens():
     assert search.value(search.exchange(worst)) < 1.05 * every < 0.9 * search.value(worst)
 
 
-@pytest.mark.parametrize("criterion", design.CRITERIA)
+@pytest.mark.parametrize("criterion", CRITERIA)
 def test_a_quantity_without_variance_does_not_steer_a_search(criterion):
     generator = np.random.default_rng(10)
     rows, gradient = generator.normal(size=(12, 4, 6)), generator.normal(size=(3, 6))
@@ -418,7 +435,7 @@ def test_a_quantity_without_variance_does_not_steer_a_search(criterion):
 
 def test_criteria_are_what_they_say():
     covariance, reference = np.array([[4.0, 1.0], [1.0, 2.0]]), np.array([8.0, 2.0])
-    assert scores(covariance, reference, "c") == pytest.approx(4.0 + design.MEAN_WEIGHT * 3.0)
+    assert scores(covariance, reference, "c") == pytest.approx(4.0 + MEAN_WEIGHT * 3.0)
     assert scores(covariance, reference, "A") == pytest.approx((4 / 8 + 2 / 2) / 2)
     assert scores(covariance, reference, "D") == pytest.approx(math.log(7.0 / 16.0))
 
@@ -471,17 +488,17 @@ def test_next_looks_are_worth_what_they_say_here_and_a_full_turn_away(wide):
     pose = seen.mirror_angles_rad.mean(axis=0)
     at = sensitivity(target, known.z, known.space, wide.table, pose)
     now = at.value(known.covariance)
-    batches = planning._next(known, found, seen, target, at, now)
+    batches = next_experiments(known, found, seen, target, at, now)
     turned = [batch for batch in batches if batch.text.startswith("a full turn of pan away, ")]
     assert turned and len(turned) < len(batches)
     for batch in batches:
-        log = run_plan(batch.actions, wide, simulation.HOME_APPROACH)
+        log = run_plan(batch.actions, wide, HOME_APPROACH)
         pan = [log.moves[look.move].pan_steps for look in log.looks]
         assert len(pan) == LOOKS_PER_EXPERIMENT
         assert min(pan) > 3000 or batch not in turned
         # The text names the looks' own counters.
         assert all(f"({steps}, " in batch.text for steps in pan)
-        judged = planning.judged("", batch.actions, known, target, False, pose)
+        judged = planner.judged("", batch.actions, known, target, False, pose)
         assert batch.gain == pytest.approx(now - judged.joint, rel=1e-6)
         assert batch.minutes == judged.minutes and batch.gain_per_minute == batch.gain / batch.minutes
 
@@ -523,13 +540,13 @@ def test_a_search_after_data_knows_no_home_offset(knowledge, found, seen):
     """Offsets of the new session are two columns with the variance of homing: eliminated, they leave the exact sum."""
     known = replace(knowledge, after_data=True)
     rows = seen.rows.copy()
-    rows[..., design.CONTRAST_COLUMNS] = 0
+    rows[..., CONTRAST_COLUMNS] = 0
     shown, picks = replace(seen, rows=rows), np.arange(6)
-    wide, precision = planning._rows_for_search(shown, known)
+    wide, precision = _rows_for_search(shown, known)
     whole = covariance_of(precision + np.einsum("mij,mik->jk", wide[picks], wide[picks]))[:PARAMETERS, :PARAMETERS]
     exact = information_of_looks(shown, picks, np.zeros((6, 2)), knowledge.space, True)
-    contrasts = np.isin(np.arange(PARAMETERS), design.CONTRAST_COLUMNS)
-    expected = covariance_of(known.precision + exact + planning.KNOWN * np.diag(contrasts))
+    contrasts = np.isin(np.arange(PARAMETERS), CONTRAST_COLUMNS)
+    expected = covariance_of(known.precision + exact + KNOWN * np.diag(contrasts))
     assert whole == pytest.approx(expected, rel=ROUNDING, abs=ROUNDING * expected.max())
     without = information_of_looks(shown, picks, np.zeros((6, 2)), knowledge.space, False)
     assert np.abs(without - exact).max() > 1e-3 * np.abs(exact).max(), "offsets count, or they could be left out"
@@ -541,12 +558,12 @@ def refine(knowledge, found, seen):
 
     def run(picks, limit, minutes=None):
         target = replace(parse_target("u(left) <= 1 deg/step"), limit=limit)
-        family = planning.Family(knowledge, found, np.asarray(picks), False)
+        family = Family(knowledge, found, np.asarray(picks), False)
         pose = seen.mirror_angles_rad.mean(axis=0)
         at = sensitivity(target, knowledge.z, knowledge.space, knowledge.rig.table, pose)
-        assurance = planning.Assurance(family, target, 10, 3)
+        assurance = Assurance(family, target, 10, 3)
         plain = assurance.values([2])[2]
-        return plain, planning._refined(family, seen, target, at, 2, "c", minutes, assurance)
+        return plain, search.refine(family, seen, target, at, 2, "c", minutes, assurance)
 
     return run
 
@@ -627,14 +644,14 @@ def test_the_document_has_the_contracts_keys(result):
     assert {"actions", "gain_per_minute"} <= set(document["next"][0])
     assert {a["action"] for a in document["next"][0]["actions"]} == {"home", "place", "move", "look"}
     assert sum(document["variance_shares"].values()) == pytest.approx(1.0, abs=1e-6)
-    assert "floor" in planning.plan_text(result)
+    assert "floor" in plan_text(result)
 
 
 def test_the_text_names_the_plan_and_what_was_not_reached(result):
-    text = planning.plan_text(result)
+    text = plan_text(result)
     assert f"the plan: n = {result.experiments}, {result.looks} looks" in text
     last = result.curve[-1].experiments
-    assert f"assurance 95 %: not reached with up to {last} experiments" in planning.plan_text(replace(result, n95=None))
+    assert f"assurance 95 %: not reached with up to {last} experiments" in plan_text(replace(result, n95=None))
 
 
 def test_no_number_of_draws_makes_an_assurance_certain():
@@ -736,7 +753,7 @@ def test_after_data_the_next_session_starts_from_what_is_known(knowledge):
     assert result.steps[0].action == "home"
     enough = plan_from(known, replace(target, limit=1.0), None, taught.pose_rad, draws=20, seed=2, **options)
     assert enough.stop.now and enough.met and enough.steps == ()
-    assert enough.assurance is None and "nothing is left to do" in planning.plan_text(enough)
+    assert enough.assurance is None and "nothing is left to do" in plan_text(enough)
 
 
 def test_too_few_minutes_are_refused(knowledge):
@@ -787,12 +804,12 @@ def test_where_a_plan_stands_follows_the_twin(mounted_rig):
         *(PlanStep(0, "home", 0, 0), PlanStep(1, "place", target="d1"), PlanStep(2, "look")),
         *(PlanStep(3, "move", 100, 40), PlanStep(4, "move", 50, None), PlanStep(5, "look")),
     )
-    assert planning.described(steps) == "d1: (0, 0) by left, up; (50, 40) by right, up"
+    assert described(steps) == "d1: (0, 0) by left, up; (50, 40) by right, up"
     looks = Looks(np.array([[50, 60]]), np.array([[1, 1]]), np.array([0]))
-    addition = planning._extended(steps, looks, ("d1",), np.array([30, 10]))
+    addition = _extended(steps, looks, ("d1",), np.array([30, 10]))
     # Tilt stands at 40: 20 steps up take up its play without a run-up; pan stands at its goal and needs one.
     assert [(s.action, s.pan_steps, s.tilt_steps) for s in addition[:-1]] == [("move", 20, 40), ("move", 50, 60)]
-    assert planning.described(addition, steps) == "d1: (50, 60) by left, up"
+    assert described(addition, steps) == "d1: (50, 60) by left, up"
     moves = run_plan((*steps, *addition), mounted_rig, ("left", "up")).moves
     assert [(m.pan_steps, m.tilt_steps) for m in moves] == [(0, 0), (100, 40), (50, 40), (20, 40), (50, 60)]
 
@@ -847,7 +864,7 @@ def test_limits_of_each_axis_and_end_count_where_they_are_stated(mounted_rig):
     moves = run_plan(plan, mounted_rig, ("left", "up")).moves
 
     def warned(**positioner) -> list[str]:
-        return planning._beyond_limits(replace(mounted_rig, positioner=positioner), moves)
+        return _beyond_limits(replace(mounted_rig, positioner=positioner), moves)
 
     assert warned() == []
     assert warned(pan_min_steps=-1000, pan_max_steps=1000) == [], "tilt is not limited"
@@ -880,10 +897,10 @@ def test_moves_of_a_plan_are_those_the_twin_makes_of_it(mounted_rig, knowledge):
 @pytest.fixture
 def ask(capsys, monkeypatch):
     """Run a command with --json without touching JAX's settings: exit code and document."""
-    from tvsbayes import model
-    from tvsbayes.cli import run
+    from tvsbayes.cli.main import run
 
-    monkeypatch.setattr(model, "use_compilation_cache", lambda: False)
+    monkeypatch.setattr("tvsbayes.estimators.campaign_arrays.use_compilation_cache", lambda: False)
+    monkeypatch.setattr("tvsbayes.studies.executors.use_compilation_cache", lambda: False)
 
     def command(*arguments) -> tuple[int, dict]:
         code = run([*map(str, arguments), "--json"])
@@ -909,12 +926,14 @@ def test_plan_writes_a_plan_and_says_by_its_exit_code_whether_the_users_target_i
 
 
 def test_a_plan_with_nothing_left_to_measure_says_that_it_wrote_none(capsys, tmp_path, monkeypatch):
-    from tvsbayes import model
-    from tvsbayes.cli import run
+    from tvsbayes.cli.main import run
 
-    whole = planning.plan
-    monkeypatch.setattr(model, "use_compilation_cache", lambda: False)
-    monkeypatch.setattr(planning, "plan", lambda *given, **options: replace(whole(*given, **options), steps=()))
+    whole = planner.plan
+    monkeypatch.setattr("tvsbayes.estimators.campaign_arrays.use_compilation_cache", lambda: False)
+    monkeypatch.setattr("tvsbayes.studies.executors.use_compilation_cache", lambda: False)
+    monkeypatch.setattr(
+        "tvsbayes.planning.planner.plan", lambda *given, **options: replace(whole(*given, **options), steps=())
+    )
     place = tmp_path / "plan.csv"
     code = run([*map(str, ("plan", MOUNTED / "rig.toml", "--draws", 20, "--minutes", 3, "-o", place))])
     assert code == 0 and not place.exists()
@@ -940,9 +959,8 @@ def test_check_takes_a_rig_with_a_plan(ask):
 def test_study_counts_and_answers_for_the_users_target(ask, tmp_path, monkeypatch):
     from test_studies import invented
 
-    from tvsbayes import studies
-
-    monkeypatch.setattr(studies, "study_row", invented)
+    monkeypatch.setattr("tvsbayes.studies.study_job.study_row", invented)
+    monkeypatch.setattr("tvsbayes.studies.executors.study_row", invented)
     rows = ("--n", 8, "--rows", tmp_path / "rows.jsonl")
     target = ("--target", "u(worst) <= 1e-3 deg/step")
     code, document = ask("study", MOUNTED / "rig.toml", MOUNTED / "grid.csv", *rows, *target)

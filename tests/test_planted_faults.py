@@ -31,7 +31,7 @@ def test_every_fault_still_fits_its_file(faults):
 def test_a_fault_is_planted_in_a_copy_and_taken_out_again(faults, tmp_path):
     fault = next(f for f in faults.FAULTS if f.name == "contrast of the ratios with the wrong sign")
     copy = tmp_path / fault.path
-    copy.parent.mkdir()
+    copy.parent.mkdir(parents=True)
     whole = (ROOT / fault.path).read_text(encoding="utf-8")
     copy.write_text(whole, encoding="utf-8")
     with pytest.raises(KeyError), faults.planted(tmp_path, fault):

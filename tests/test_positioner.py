@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from tvsbayes.model import (
+from tvsbayes.model.laser_path import (
     UNIFORM_SD,
     Harmonics,
     MoveArrays,

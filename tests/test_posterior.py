@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from test_ensemble import ROUNDING, SIGMAS, small_fit
 
-from tvsbayes import posterior
-from tvsbayes.files import InputError, NotConverged
-from tvsbayes.posterior import Target, sample
+from tvsbayes.errors import InputError, NotConverged
+from tvsbayes.posterior.proposal import Target
+from tvsbayes.posterior.sampling import _stored, diagnose, sample
 
 LONG, SHORT, BLOCK = 96, 12, 6
 SEED = 3
@@ -28,22 +28,23 @@ def limits(patch: pytest.MonkeyPatch, steps: int) -> None:
     """Stop after so many steps, whatever they are worth."""
     values = {"RHAT_LIMIT": np.inf, "ESS_LIMIT": 0, "TAU_LIMIT": 0, "STUCK_ACCEPTANCE": 0.0, "STUCK_DEVIATION": np.inf}
     for name, value in {**values, "BLOCK": BLOCK, "FIRST_CHECK": steps}.items():
-        patch.setattr(posterior, name, value)
+        patch.setattr(f"tvsbayes.posterior.sampling.{name}", value)
     # The map takes seconds and no random number; the pilot needs few draws for a start.
-    patch.setattr(posterior, "transport", lambda fit: small_fit()[1])
-    patch.setattr(posterior, "PILOT_DRAWS", 512)
+    patch.setattr("tvsbayes.posterior.transport.transport", lambda fit: small_fit()[1])
+    patch.setattr("tvsbayes.posterior.sampling.transport", lambda fit: small_fit()[1])
+    patch.setattr("tvsbayes.posterior.proposal.PILOT_DRAWS", 512)
 
 
 def only_when_long(patch: pytest.MonkeyPatch) -> None:
     """`sample` looks at a resumed chain at once, and under `limits` any chain has converged."""
-    judge = posterior.diagnose
+    judge = diagnose
 
     def strict(fit, route, start, chain, seed):
         result = judge(fit, route, start, chain, seed)
         missing = () if len(chain.w) >= SHORT else ("too short",)
         return replace(result, convergence=replace(result.convergence, missing=missing))
 
-    patch.setattr(posterior, "diagnose", strict)
+    patch.setattr("tvsbayes.posterior.sampling.diagnose", strict)
 
 
 @pytest.fixture(scope="module")
@@ -145,9 +146,10 @@ def test_only_a_converged_fit_is_sampled(fitted):
 
 
 def test_what_is_missing_when_the_time_is_over_is_said(fitted, monkeypatch):
-    monkeypatch.setattr(posterior, "BLOCK", BLOCK)
-    monkeypatch.setattr(posterior, "transport", lambda fit: small_fit()[1])
-    monkeypatch.setattr(posterior, "PILOT_DRAWS", 512)
+    monkeypatch.setattr("tvsbayes.posterior.sampling.BLOCK", BLOCK)
+    monkeypatch.setattr("tvsbayes.posterior.transport.transport", lambda fit: small_fit()[1])
+    monkeypatch.setattr("tvsbayes.posterior.sampling.transport", lambda fit: small_fit()[1])
+    monkeypatch.setattr("tvsbayes.posterior.proposal.PILOT_DRAWS", 512)
     result = sample(fitted, max_minutes=1e-9, seed=SEED)
     assert not result.converged and result.convergence.steps == BLOCK
     said = "; ".join(result.convergence.missing)
@@ -156,15 +158,15 @@ def test_what_is_missing_when_the_time_is_over_is_said(fitted, monkeypatch):
 
 
 def test_a_stuck_walker_is_found(fitted, long):
-    route, start, chain = posterior._stored(long[1], fitted, SEED)
+    route, start, chain = _stored(long[1], fitted, SEED)
     with jax.enable_x64(True):
-        before = posterior.diagnose(fitted, route, start, chain, SEED).convergence
+        before = diagnose(fitted, route, start, chain, SEED).convergence
         walker = int(np.argmax(before.acceptance))
         assert walker not in before.stuck_walkers
         w, density, accepted = chain.w.copy(), chain.log_density.copy(), chain.accepted.copy()
         w[:, walker], density[:, walker], accepted[walker] = w[0, walker], density[0, walker], 0
         frozen = replace(chain, w=w, log_density=density, accepted=accepted)
-        after = posterior.diagnose(fitted, route, start, frozen, SEED).convergence
+        after = diagnose(fitted, route, start, frozen, SEED).convergence
     assert walker in after.stuck_walkers and not after.converged
     sentence = next(m for m in after.missing if m.startswith("stuck walkers: "))
     assert str(walker) in sentence.removeprefix("stuck walkers: ").split(", ")

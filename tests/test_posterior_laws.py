@@ -13,9 +13,11 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from tvsbayes import posterior
-from tvsbayes.model import INDEX, NAMES
-from tvsbayes.posterior import STRETCH_NODES, Chain, Posterior, Target, Transport, by_width, diagnose, propagated
+from tvsbayes.instrument.parameters import INDEX, NAMES
+from tvsbayes.posterior.draws import Posterior, propagated
+from tvsbayes.posterior.proposal import Target
+from tvsbayes.posterior.sampling import Chain, diagnose
+from tvsbayes.posterior.transport import STRETCH_NODES, Transport, by_width
 
 WALKERS, STEPS = 64, 400
 RATIO, BACKLASH = INDEX["degrees_per_step.pan"], INDEX["backlash_deg.pan"]
@@ -108,7 +110,8 @@ def judged(monkeypatch):
             physical=z, effective_deg_per_step=np.zeros((*z.shape[:2], 4)), effective_mirror_offset_mm=zero
         )
 
-    monkeypatch.setattr(posterior, "derived_at", derived_at)
+    monkeypatch.setattr("tvsbayes.posterior.draws.derived_at", derived_at)
+    monkeypatch.setattr("tvsbayes.posterior.sampling.derived_at", derived_at)
     weights = np.random.default_rng(3).standard_normal(500)
 
     def judge(chain: Chain) -> Posterior:
@@ -121,7 +124,8 @@ def test_the_density_of_walkers_is_the_models_times_the_jacobian(x64, monkeypatc
     def evaluate(z, space, arrays):
         return SimpleNamespace(log_density=AT_MODE - 0.5 * (z[:, RATIO] ** 2 + z[:, BACKLASH] ** 2))
 
-    monkeypatch.setattr(posterior, "evaluate", evaluate)
+    monkeypatch.setattr("tvsbayes.posterior.proposal.evaluate", evaluate)
+    monkeypatch.setattr("tvsbayes.posterior.transport.evaluate", evaluate)
     w = np.random.default_rng(4).standard_normal((50, 2))
     value = Target(fit(), route())(w)
     log_factor = STRETCH * np.maximum(w[:, 0], STRETCH_NODES[0])

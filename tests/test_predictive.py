@@ -7,10 +7,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from tvsbayes import posterior
-from tvsbayes.likelihood import ordered_spots
-from tvsbayes.model import INDEX, NAMES
-from tvsbayes.rigs import HOME_SD_DEG
+from tvsbayes.instrument.axes import HOME_SD_DEG
+from tvsbayes.instrument.campaign import ordered_spots
+from tvsbayes.instrument.parameters import INDEX, NAMES
+from tvsbayes.posterior.predictive import looks_again
 
 DRAWS = 2000
 SDS_DEG = {"left": 0.16, "right": 0.02, "up": 0.08, "down": 0.04}
@@ -60,9 +60,9 @@ def errors_deg(dozen):
         return np.zeros((len(z), len(spots), 4))
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(posterior, "looks", looks)
+        patch.setattr("tvsbayes.posterior.predictive.looks", looks)
         z = np.zeros((DRAWS, 1))
-        assert not posterior.looks_again(fit, z, physical, np.random.default_rng(4)).any()
+        assert not looks_again(fit, z, physical, np.random.default_rng(4)).any()
     return caught[0], play_deg
 
 

@@ -13,10 +13,11 @@ import numpy as np
 import pytest
 from scipy import optimize, stats
 
-from tvsbayes.classic import coverage_factor, effective_dof
-from tvsbayes.coordinates import (
+from tvsbayes.coordinates.beam_meeting import linear
+from tvsbayes.statistics.intervals import (
     NORMAL_95,
-    linear,
+    coverage_factor,
+    effective_dof,
     numerical_tolerance,
     shortest_interval,
     symmetric_interval,

@@ -8,23 +8,21 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tvsbayes.campaign import (
-    DIRECTION_SIGNS,
+from tvsbayes.cli.main import run
+from tvsbayes.estimators.plausibility import check_campaign
+from tvsbayes.files.disk import shipped_data
+from tvsbayes.instrument.axes import DIRECTION_SIGNS
+from tvsbayes.instrument.campaign import Campaign, Move, read_campaign, write_campaign
+from tvsbayes.instrument.plan import (
     OVERSHOOT_STEPS,
     PROTOCOLS,
-    Campaign,
-    Move,
     four_point_protocol,
     grid_protocol,
-    read_campaign,
     read_plan,
-    write_campaign,
     write_plan,
 )
-from tvsbayes.classic import Stop, check_campaign, observed_stops, separation
-from tvsbayes.cli import run
-from tvsbayes.files import shipped_data
-from tvsbayes.simulation import simulate
+from tvsbayes.instrument.stops import Stop, observed_stops, separation
+from tvsbayes.twin.simulated_campaign import simulate
 
 
 def pan_moves(*counters: int, approach: str = "left") -> tuple[Move, ...]:

@@ -9,9 +9,8 @@ from pathlib import Path
 
 import pytest
 import typer
-from test_layers import LEVELS, module_paths
 
-from tvsbayes.cli import app
+from tvsbayes.cli.app import app
 
 ROOT = Path(__file__).resolve().parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -48,13 +47,6 @@ def test_first_screen_has_two_set_up_commands_and_the_printed_answer():
 def test_commands_are_those_that_exist():
     names = [command.name or command.callback.__name__ for command in app.registered_commands]
     assert first_column(section("Commands")) == names
-
-
-def test_module_map_is_complete_and_in_import_order():
-    names = first_column(section("Modules"))
-    assert sorted(names) == sorted(module_paths())
-    level = {name: number for number, level in enumerate(LEVELS) for name in level}
-    assert [level[name] for name in names] == sorted(level[name] for name in names)
 
 
 def test_options_named_in_the_table_of_commands_exist():

@@ -9,30 +9,28 @@ import cv2
 import numpy as np
 import pytest
 
-from tvsbayes.campaign import read_campaign, read_plan
-from tvsbayes.cli import run
-from tvsbayes.device import renderer
-from tvsbayes.device.renderer import (
-    Board,
-    BoardPose,
+from tvsbayes.cli.main import run
+from tvsbayes.files.disk import shipped_data
+from tvsbayes.files.images import read_image
+from tvsbayes.instrument.campaign import read_campaign
+from tvsbayes.instrument.plan import read_plan
+from tvsbayes.instrument.stereo_pair import rotation_matrix
+from tvsbayes.twin.board_pictures import Board, BoardPose, board_irradiance, board_poses, render_board
+from tvsbayes.twin.physics import project
+from tvsbayes.twin.simulated_campaign import read_truth, simulate
+from tvsbayes.twin.spot_pictures import (
     Camera,
     Footprint,
     Scene,
     Sensor,
-    board_irradiance,
-    board_poses,
     cameras_of,
     expose,
     footprint,
-    render_board,
     render_spot,
     render_spots,
     speckle,
     spot_irradiance,
 )
-from tvsbayes.files import read_image, shipped_data
-from tvsbayes.rigs import rotation_matrix
-from tvsbayes.simulation import project, read_truth, simulate
 
 WIDTH, HEIGHT = 1280, 720
 MOUNTED = shipped_data() / "rigs" / "mounted"
@@ -186,7 +184,7 @@ def test_the_two_cameras_see_independent_speckle(mounted_rig):
 
 def test_simulate_writes_frames_that_detect_reads(mounted_rig, tmp_path, capsys, monkeypatch):
     """Through the command line, at full size: names, sizes, statuses, and the true centres found again."""
-    monkeypatch.setattr(renderer, "BOARD_VIEWS", 1)
+    monkeypatch.setattr("tvsbayes.twin.board_pictures.BOARD_VIEWS", 1)
     lines = (MOUNTED / "paper.csv").read_text().splitlines()[:6]
     (tmp_path / "plan.csv").write_text("\n".join(lines) + "\n")
     orders = ["simulate", str(MOUNTED / "rig.toml"), str(tmp_path / "plan.csv"), str(tmp_path / "c")]

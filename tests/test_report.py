@@ -12,22 +12,15 @@ import numpy as np
 import pytest
 from small_campaign import small_campaign
 
-from tvsbayes.calibration import INPUT_NAMES, NOISE_NAMES, Calibration, StoredMode, load_calibration
-from tvsbayes.campaign import input_hashes
-from tvsbayes.classic import ClassicResult, DirectionResult
-from tvsbayes.files import InputError
-from tvsbayes.information import Estimate, FitSummary, Leverage, WeakDirection
-from tvsbayes.report import (
-    KEY_PARAMETERS,
-    classic_text,
-    concise,
-    demo_text,
-    estimate_row,
-    fit_text,
-    interval_text,
-    text_table,
-    write_results,
-)
+from tvsbayes.calibration.calibration_file import load_calibration
+from tvsbayes.calibration.pointing import INPUT_NAMES, NOISE_NAMES, Calibration
+from tvsbayes.errors import InputError
+from tvsbayes.estimators.four_point import ClassicResult, DirectionResult
+from tvsbayes.instrument.campaign import input_hashes
+from tvsbayes.report.fit_text import KEY_PARAMETERS, classic_text, demo_text, estimate_row, fit_text
+from tvsbayes.report.tables import concise, interval_text, text_table
+from tvsbayes.results.estimates import Estimate, FitSummary, Leverage, WeakDirection
+from tvsbayes.results.fit_record import StoredMode, write_results
 
 
 @pytest.mark.parametrize(

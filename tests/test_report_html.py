@@ -17,15 +17,19 @@ import numpy as np
 import pytest
 from conftest import ROOT
 
-from tvsbayes import plots
-from tvsbayes.calibration import load_calibration
-from tvsbayes.campaign import read_campaign, write_campaign
-from tvsbayes.certificate import positioning, traceability
-from tvsbayes.classic import DIRECTIONS, classic
-from tvsbayes.cli import run
-from tvsbayes.comparison import Evidence, gather
-from tvsbayes.files import InputError, parse_json
-from tvsbayes.report import BROWSERS, FigureView, report_html
+from tvsbayes.calibration.calibration_file import load_calibration
+from tvsbayes.cli.main import run
+from tvsbayes.errors import InputError
+from tvsbayes.estimators.four_point import classic
+from tvsbayes.files.documents import parse_json
+from tvsbayes.instrument.axes import DIRECTIONS
+from tvsbayes.instrument.campaign import read_campaign, write_campaign
+from tvsbayes.metrology.dcc import traceability
+from tvsbayes.metrology.iso230 import positioning
+from tvsbayes.report.evidence import Evidence, gather
+from tvsbayes.report.figures import WIDTH_IN, direction_scatter, points_3d, trajectories
+from tvsbayes.report.page import BROWSERS, report_html
+from tvsbayes.report.tables import FigureView
 
 TWIN = ROOT / "data" / "twins" / "paper_twin"
 BYTES_MAX = 3_000_000
@@ -92,7 +96,9 @@ def page(evidence) -> bytes:
 def no_pictures(monkeypatch):
     """Pictures are not what is looked at, and take seconds."""
     view = FigureView("data:image/svg+xml;base64,", "a picture that was left out", "left out", 1, 1)
-    monkeypatch.setattr("tvsbayes.report.figure_view", lambda figure, alt, caption: view)
+    monkeypatch.setattr("tvsbayes.report.tables.figure_view", lambda figure, alt, caption: view)
+    monkeypatch.setattr("tvsbayes.report.fit_sections.figure_view", lambda figure, alt, caption: view)
+    monkeypatch.setattr("tvsbayes.report.uncertainty_sections.figure_view", lambda figure, alt, caption: view)
 
 
 def test_the_command_writes_this_page(folder, page):
@@ -318,17 +324,17 @@ def test_the_papers_figures_for_any_campaign(evidence):
     campaign, result = evidence.campaign, classic(evidence.campaign)
     number = result.experiments[0].experiment
     for figure in (
-        plots.trajectories(campaign, number),
-        plots.points_3d(campaign, number),
-        plots.points_3d(campaign),
-        plots.direction_scatter(result, "left", (0.062, 1e-4)),
+        trajectories(campaign, number),
+        points_3d(campaign, number),
+        points_3d(campaign),
+        direction_scatter(result, "left", (0.062, 1e-4)),
     ):
-        assert figure.get_axes() and figure.get_size_inches()[0] == plots.WIDTH_IN
-    angles = plots.trajectories(campaign, number).axes[0].get_legend_handles_labels()[1]
+        assert figure.get_axes() and figure.get_size_inches()[0] == WIDTH_IN
+    angles = trajectories(campaign, number).axes[0].get_legend_handles_labels()[1]
     first = result.experiments[0]
     assert angles == [f"before: {first.theta_i_deg:.2f} deg", f"after: {first.theta_f_deg:.2f} deg"]
     with pytest.raises(ValueError, match="not complete"):
-        plots.trajectories(campaign, 10_000)
+        trajectories(campaign, 10_000)
 
 
 def luminance(colour: str) -> float:

@@ -11,23 +11,18 @@ import numpy as np
 import pytest
 from small_campaign import small_stereo
 
-from tvsbayes.files import InputError, parse_toml
-from tvsbayes.rigs import (
+from tvsbayes.errors import InputError
+from tvsbayes.files.documents import parse_toml
+from tvsbayes.instrument.parameters import (
     DECLARED_PRIORS,
     DEFAULT_PRIORS,
     HARMONIC_PRIORS,
     RIG_PRIORS,
     STEREO_PARAMETER_NAMES,
     Prior,
-    RigTable,
-    parse_rig_table,
-    read_rig,
-    read_stereo,
-    rig_table_toml,
-    rotation_matrix,
-    rotation_vector,
-    write_stereo,
 )
+from tvsbayes.instrument.rig import RigTable, parse_rig_table, read_rig, rig_table_toml
+from tvsbayes.instrument.stereo_pair import read_stereo, rotation_matrix, rotation_vector, write_stereo
 
 ROUNDING = 16 * np.finfo(float).eps  # a dozen roundings in a product of three matrices of order 1
 

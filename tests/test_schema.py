@@ -12,9 +12,9 @@ import pytest
 from jsonschema import Draft202012Validator
 from test_report import estimate, small_fit, small_summary
 
-from tvsbayes.certificate import FIT_FORMATS, read_fit
-from tvsbayes.files import InputError, shipped_data
-from tvsbayes.report import FIT_FORMAT, write_results
+from tvsbayes.errors import InputError
+from tvsbayes.files.disk import shipped_data
+from tvsbayes.results.fit_record import FIT_FORMAT, FIT_FORMATS, read_fit, write_results
 
 KEPT = Path(__file__).parent / "data"
 """Documents as older versions wrote them, on the shipped paper twin; white space and digits beyond seven cut away."""
@@ -67,8 +67,8 @@ def test_a_new_document_obeys_the_schema(tmp_path):
 
 def test_what_reports_show_besides_obeys_the_schema():
     """Keys that came within version 1, as the records behind them are written; older documents lack them."""
-    from tvsbayes.comparison import Gap, GapTerm
-    from tvsbayes.information import Cause, CauseGroup, StopResidual
+    from tvsbayes.results.comparison_record import Gap, GapTerm
+    from tvsbayes.results.estimates import Cause, CauseGroup, StopResidual
 
     term = GapTerm("backlash over N", -0.002, 1e-4, (-0.0022, -0.0018))
     stop = StopResidual("pan", (3, 4), -100, "", 0, (175.0, 276.5), (None, 0.3), 61.5, -0.01, 0.04)

@@ -13,35 +13,31 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tvsbayes.campaign import DIRECTION_SIGNS, PROTOCOLS, PlanStep, four_point_protocol, grid_protocol
-from tvsbayes.files import InputError
-from tvsbayes.rigs import (
+from tvsbayes.errors import InputError
+from tvsbayes.instrument.axes import DIRECTION_SIGNS, HOME_SD_DEG
+from tvsbayes.instrument.parameters import (
     DECLARED_PRIORS,
     DEFAULT_PRIORS,
     HARMONIC_PRIORS,
-    HOME_SD_DEG,
     STEREO_PARAMETER_NAMES,
     Prior,
-    Rig,
-    RigTable,
-    Stereo,
-    rotation_matrix,
 )
-from tvsbayes.simulation import (
-    Truth,
+from tvsbayes.instrument.plan import PROTOCOLS, PlanStep, four_point_protocol, grid_protocol
+from tvsbayes.instrument.rig import Rig, RigTable
+from tvsbayes.instrument.stereo_pair import Stereo, rotation_matrix
+from tvsbayes.twin.physics import (
     aperture_angle_deg,
     beam_jacobian,
-    draw_truth,
     effective_deg_per_step,
     effective_mirror_offset_mm,
     mirror_chain,
     play,
     project,
-    simulate,
     stop_errors,
     to_tvs,
     transmission,
 )
+from tvsbayes.twin.simulated_campaign import Truth, draw_truth, simulate
 
 NOMINAL = {name: prior.value for name, prior in (DEFAULT_PRIORS | DECLARED_PRIORS).items()}
 VECTOR = NOMINAL | {
@@ -374,7 +370,7 @@ def test_streams_are_independent():
 
 def test_spots_lie_on_beam_and_sheet():
     """Without noise, triangulated spots lie on the beam and within five sds of the nominal sheet."""
-    from tvsbayes.classic import triangulate
+    from tvsbayes.instrument.stereo_pair import triangulate
 
     rig = make_rig(truth_u=0.0)
     quiet = draw_truth(rig, np.random.default_rng(0))
@@ -398,7 +394,7 @@ def test_spots_lie_on_beam_and_sheet():
 @pytest.mark.parametrize("convention", ["in-plane", "azimuth"])
 def test_aperture_reads_the_spot_with_its_zero(convention: str):
     """Read B = angle of the spot in T, seen from (0, -a/2, 0), plus zero, plus noise of the stated sd."""
-    from tvsbayes.classic import triangulate
+    from tvsbayes.instrument.stereo_pair import triangulate
 
     rig = make_rig(truth_u=0.0)
     rig = replace(rig, table=replace(rig.table, aperture_convention=convention))
@@ -583,6 +579,6 @@ def test_grid_sees_every_pose_from_both_sides():
 
 def test_the_twin_needs_no_jax():
     """Simulating and the classic estimator never import JAX (DESIGN 9)."""
-    modules = "tvsbayes.simulation, tvsbayes.classic"
+    modules = "tvsbayes.twin.simulated_campaign, tvsbayes.estimators.four_point"
     code = f"import sys, {modules}; sys.exit('jax' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

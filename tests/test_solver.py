@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from tvsbayes.joint import least_squares_covariance, scaled_gradient, solve_least_squares
+from tvsbayes.statistics.least_squares import least_squares_covariance, scaled_gradient, solve_least_squares
 
 FOLDER = Path(__file__).resolve().parents[2] / "shared" / "strd"
 PARAMETER_DIGITS, ERROR_DIGITS = 6.0, 5.0

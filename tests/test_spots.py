@@ -12,14 +12,16 @@ import cv2
 import numpy as np
 import pytest
 
-from tvsbayes.campaign import Campaign, Move, Spot, read_campaign, write_campaign
-from tvsbayes.cli import run
-from tvsbayes.device import spots as module
-from tvsbayes.device.renderer import Footprint, Scene, Sensor, cameras_of, render_spot
-from tvsbayes.device.spots import REASONS, SpotNoise, detect, epipolar_refused, find_spot, learn_noise
-from tvsbayes.files import InputError, NothingToEstimate, png_bytes
-from tvsbayes.report import detection_text
-from tvsbayes.rigs import Stereo, rotation_matrix
+from tvsbayes.cameras.contour import epipolar_refused, rectified_pair
+from tvsbayes.cameras.detection import REASONS, detect
+from tvsbayes.cameras.spot_fit import _CORRELATION, CLIPPED_DN, SpotNoise, _grey, find_spot, learn_noise, patch_around
+from tvsbayes.cli.main import run
+from tvsbayes.errors import InputError, NothingToEstimate
+from tvsbayes.files.images import png_bytes
+from tvsbayes.instrument.campaign import Campaign, Move, Spot, read_campaign, write_campaign
+from tvsbayes.instrument.stereo_pair import Stereo, rotation_matrix
+from tvsbayes.report.command_text import detection_text
+from tvsbayes.twin.spot_pictures import Footprint, Scene, Sensor, cameras_of, render_spot
 
 WIDTH, HEIGHT = 320, 240
 LOOKS = 40
@@ -158,7 +160,7 @@ def test_contour_comes_back_to_raw_pixels():
     """Against OpenCV's own way forward."""
     stereo = small_pair()
     raw = np.random.default_rng(1).uniform([20, 20], [300, 220], (50, 2))
-    for camera in module._rectified(stereo):
+    for camera in rectified_pair(stereo):
         forward = cv2.undistortPoints(
             raw[:, None], camera.matrix, camera.distortion, R=camera.rotation, P=camera.projection
         ).reshape(-1, 2)
@@ -168,12 +170,12 @@ def test_contour_comes_back_to_raw_pixels():
 
 def test_noise_through_demosaicing_has_the_correlation_that_is_assumed():
     raw = np.clip(np.random.default_rng(1).normal(128, 12, (1000, 1000)), 0, 255).astype(np.uint8)
-    grey = module._grey(cv2.cvtColor(raw, cv2.COLOR_BayerRGGB2BGR))[4:-4, 4:-4] - raw.mean()
+    grey = _grey(cv2.cvtColor(raw, cv2.COLOR_BayerRGGB2BGR))[4:-4, 4:-4] - raw.mean()
     for i in range(3):
         for j in range(3):
             lag = np.mean(grey[i:, j:] * grey[: len(grey) - i, : len(grey) - j]) / raw.var()
             # A million pixels; the truth is 0.28 at lag 0 and sums to 1.
-            assert lag == pytest.approx(module._CORRELATION[2 + i, 2 + j], abs=0.003)
+            assert lag == pytest.approx(_CORRELATION[2 + i, 2 + j], abs=0.003)
 
 
 def test_noise_is_learned_from_skews_drawn_from_it():
@@ -256,8 +258,8 @@ def test_a_clipped_core_is_normal_and_a_larger_one_widens_the_sd():
 def test_neighbours_of_clipped_pixels_are_not_used():
     """Demosaicing has mixed a clipped photosite into each of its eight neighbours."""
     frame = picture(Footprint(HERE, SMALL, 400.0))
-    patch = module._patch(frame)
-    rows, columns = np.nonzero((frame >= module.CLIPPED_DN).any(axis=2))
+    patch = patch_around(frame)
+    rows, columns = np.nonzero((frame >= CLIPPED_DN).any(axis=2))
     assert len(rows) > 3
     away = np.ones((HEIGHT, WIDTH), bool)
     for row, column in zip(rows, columns, strict=True):
@@ -336,7 +338,7 @@ def test_in_place_same_rows_other_columns_untouched(tmp_path, capsys):
 
 
 def module_bytes(campaign, first) -> bytes:
-    from tvsbayes.campaign import spots_bytes
+    from tvsbayes.instrument.campaign import spots_bytes
 
     return spots_bytes((first, *campaign.spots[1:]))
 

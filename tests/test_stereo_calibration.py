@@ -15,17 +15,14 @@ import pytest
 from drawn_boards import PAIR, POSES, pictures, write_pair
 from scipy import stats
 
-from tvsbayes.cli import run
-from tvsbayes.device.boards import Board, View, Views, find_views
-from tvsbayes.device.stereo import (
-    StereoCalibration,
-    _camera_start,
-    bundle_adjustment,
-    calibrate_stereo,
-    correlation_factor,
-)
-from tvsbayes.files import NothingToEstimate, read_bytes, shipped_data
-from tvsbayes.rigs import STEREO_PARAMETER_NAMES, parse_stereo, read_stereo, stereo_bytes
+from tvsbayes.cameras.boards import Board, View, Views, find_views
+from tvsbayes.cameras.bundle_adjustment import bundle_adjustment, correlation_factor
+from tvsbayes.cameras.stereo_calibration import StereoCalibration, _camera_start, calibrate_stereo
+from tvsbayes.cli.main import run
+from tvsbayes.errors import NothingToEstimate
+from tvsbayes.files.disk import read_bytes, shipped_data
+from tvsbayes.instrument.parameters import STEREO_PARAMETER_NAMES
+from tvsbayes.instrument.stereo_pair import parse_stereo, read_stereo, stereo_bytes
 
 MOUNTED = shipped_data() / "rigs" / "mounted"
 OPENCV_PAIRS = Path("/usr/share/doc/opencv-doc/examples/data")

@@ -9,14 +9,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from tvsbayes.likelihood import (
+from tvsbayes.estimators.likelihood import evaluate
+from tvsbayes.estimators.linear_spots import (
     LinearSpots,
-    evaluate,
     leave_one_out_chi2,
-    move_log_density,
     standard_deviations_without,
     stop_information,
 )
+from tvsbayes.posterior.predictive import move_log_density
 
 DENSE = 1e-8
 """Relative agreement with dense algebra: condition numbers of 1e4 leave 1e-12."""

@@ -12,11 +12,14 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from tvsbayes import studies
-from tvsbayes.campaign import PlanStep
-from tvsbayes.design import QUANTITIES, parse_target
-from tvsbayes.files import InputError, NotConverged, TvsError
-from tvsbayes.studies import StudyJob, StudyRows, executor, study, study_result, study_text
+from tvsbayes.errors import InputError, NotConverged, TvsError
+from tvsbayes.instrument.plan import PlanStep
+from tvsbayes.model.headlines import QUANTITIES
+from tvsbayes.planning.target import parse_target
+from tvsbayes.report.command_text import study_text
+from tvsbayes.studies.executors import DaskExecutor, ProcessExecutor, executor
+from tvsbayes.studies.study import StudyRows, study, study_result
+from tvsbayes.studies.study_job import StudyJob, half_normal_sd
 
 TARGET = parse_target("u(worst) <= 1e-3 deg/step")
 
@@ -59,7 +62,8 @@ def quick(monkeypatch):
         made.append(index)
         return invented(job, index)
 
-    monkeypatch.setattr(studies, "study_row", row)
+    monkeypatch.setattr("tvsbayes.studies.study_job.study_row", row)
+    monkeypatch.setattr("tvsbayes.studies.executors.study_row", row)
     return made
 
 
@@ -99,7 +103,7 @@ def test_one_file_keeps_designs_apart(job, quick, tmp_path, mounted_rig, monkeyp
     for other in others:
         assert StudyRows(path).of(other) == {}
     # Rows of another release answer another question.
-    monkeypatch.setattr("tvsbayes.studies.version", lambda _package: "0.0.1")
+    monkeypatch.setattr("tvsbayes.studies.study_job.version", lambda _package: "0.0.1")
     assert StudyRows(path).of(replace(job)) == {}
     assert sorted(StudyRows(path).of(job)) == [0, 1, 2]
 
@@ -168,8 +172,8 @@ def test_the_spread_of_a_half_normal_is_that_of_its_draws():
     draws = np.random.default_rng(5).standard_normal(40_000)
     for mean, sd in ((-2.0, 1.0), (0.0, 0.5), (1.0, 0.1)):
         values = -special.ndtri(0.5 * special.ndtr(-(mean + sd * draws)))
-        assert studies.half_normal_sd(mean, sd) == pytest.approx(values.std(), rel=0.012)
-    assert studies.half_normal_sd(6.0, 0.01) == pytest.approx(0.01, rel=0.02)
+        assert half_normal_sd(mean, sd) == pytest.approx(values.std(), rel=0.012)
+    assert half_normal_sd(6.0, 0.01) == pytest.approx(0.01, rel=0.02)
 
 
 def test_unknown_engines_are_refused(job):
@@ -201,7 +205,7 @@ def test_what_dask_lost_is_said_without_a_traceback(job, monkeypatch, raised, wh
 
     stand_in = SimpleNamespace(KilledWorker=KilledWorker, as_completed=as_completed)
     monkeypatch.setitem(sys.modules, "distributed", stand_in)
-    made = studies.DaskExecutor(Client())
+    made = DaskExecutor(Client())
     made.submit(job, 5)
     rows = made.as_completed()
     assert next(rows) == {"index": 5}
@@ -231,7 +235,7 @@ def test_a_dead_worker_is_told_with_what_to_do(job):
         def shutdown(self, **_):
             pass
 
-    made = studies.ProcessExecutor(1)
+    made = ProcessExecutor(1)
     made.pool.shutdown()
     made.pool = Broken()
     made.submit(job, 0)

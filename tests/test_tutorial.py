@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tvsbayes.cli import run
+from tvsbayes.cli.main import run
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGE = ROOT / "data" / "tutorial" / "README.md"

@@ -12,22 +12,24 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from tvsbayes import simulation
-from tvsbayes.joint import derived_quantities
-from tvsbayes.likelihood import aperture_angle
-from tvsbayes.model import (
-    NAMES,
-    RIG_NAMES,
-    MoveArrays,
-    beam,
-    beam_angles,
-    mirror_angles,
-    model_of,
-    parameter_space,
-    project,
+from tvsbayes.estimators.likelihood import aperture_angle
+from tvsbayes.instrument.parameters import HARMONIC_PRIORS, NAMES, RIG_NAMES, Prior
+from tvsbayes.model.geometry import project
+from tvsbayes.model.headlines import derived_quantities
+from tvsbayes.model.laser_path import MoveArrays, beam, beam_angles, mirror_angles
+from tvsbayes.model.parameter_space import model_of, parameter_space
+from tvsbayes.twin import physics
+from tvsbayes.twin.physics import (
+    aperture_angle_deg,
+    beam_jacobian,
+    effective_deg_per_step,
+    effective_mirror_offset_mm,
+    harmonics_deg,
+    mirror_chain,
+    to_tvs,
+    transmission,
 )
-from tvsbayes.rigs import HARMONIC_PRIORS, Prior
-from tvsbayes.simulation import draw_truth
+from tvsbayes.twin.simulated_campaign import draw_truth, with_derived
 
 pytestmark = pytest.mark.usefixtures("x64")
 
@@ -67,7 +69,7 @@ def batched(function, *arrays):
 def test_mirror_chain(truths, values, poses_rad):
     rays = batched(lambda v, p: beam(model_of(v).optics, p[:, 0], p[:, 1]), values, poses_rad)
     for rig, truth in enumerate(truths):
-        origin, direction = simulation.mirror_chain(*poses_rad[rig].T, truth.parameters)
+        origin, direction = mirror_chain(*poses_rad[rig].T, truth.parameters)
         assert np.abs(rays.origin_mm[rig].T - origin).max() < LENGTH_MM
         assert np.abs(rays.direction[rig].T - direction).max() < ANGLE_RAD
 
@@ -78,7 +80,7 @@ def test_cameras(truths, values):
     pixels = batched(lambda v, p: project(model_of(v).cameras, p.T).T, values, points)
     seen = 0
     for rig, truth in enumerate(truths):
-        expected = simulation.project(points[rig], truth.stereo, truth.parameters["focal_scale"])
+        expected = physics.project(points[rig], truth.stereo, truth.parameters["focal_scale"])
         in_view = np.isfinite(expected).all(axis=1)
         assert np.abs(pixels[rig] - expected)[in_view].max() < PIXEL_PX
         seen += in_view.sum()
@@ -110,8 +112,8 @@ def test_gears_and_play(truths, values, period_deg):
             ratios = p[f"degrees_per_step.{name}"], p[f"ratio_contrast_deg_per_step.{name}"]
             start = -0.5 * approach[rig, :, axis]
             args = counters[rig, :, axis], first[rig], start, np.zeros(MOVES), ratios, p[f"backlash_deg.{name}"]
-            wobble = simulation.harmonics_deg(p, name), period_deg[axis]
-            expected = np.radians(simulation.transmission(*args, *wobble) + (p["tilt_zero_deg"] if axis else 0.0))
+            wobble = harmonics_deg(p, name), period_deg[axis]
+            expected = np.radians(transmission(*args, *wobble) + (p["tilt_zero_deg"] if axis else 0.0))
             assert np.abs(found.angle_rad[rig, :, axis] - expected).max() < ANGLE_RAD
 
 
@@ -125,8 +127,8 @@ def test_aperture_angle(truths, values, convention):
     found = batched(angle, values, points)
     for rig, truth in enumerate(truths):
         baseline_mm = truth.parameters["baseline_mm"]
-        in_t = simulation.to_tvs(points[rig], baseline_mm, truth.parameters["pan_zero_emission_deg"])
-        expected = np.radians(simulation.aperture_angle_deg(in_t, baseline_mm, convention))
+        in_t = to_tvs(points[rig], baseline_mm, truth.parameters["pan_zero_emission_deg"])
+        expected = np.radians(aperture_angle_deg(in_t, baseline_mm, convention))
         assert np.abs(found[rig] - expected).max() < ANGLE_RAD
 
 
@@ -140,10 +142,10 @@ def test_headlines_of_a_fit(mounted_rig, poses_rad):
     for physical, ratios, offset_mm in zip(
         found.physical, found.effective_deg_per_step, found.effective_mirror_offset_mm, strict=True
     ):
-        rig = simulation.with_derived(dict(zip(RIG_NAMES, physical.tolist(), strict=False)))
-        expected = simulation.effective_deg_per_step(rig, pose_deg)
+        rig = with_derived(dict(zip(RIG_NAMES, physical.tolist(), strict=False)))
+        expected = effective_deg_per_step(rig, pose_deg)
         assert np.abs(ratios - list(expected.values())).max() < 1e-9 * 0.1
-        assert abs(offset_mm - simulation.effective_mirror_offset_mm(rig, pose_deg)) < LENGTH_MM
+        assert abs(offset_mm - effective_mirror_offset_mm(rig, pose_deg)) < LENGTH_MM
 
 
 def test_headlines(truths, values, poses_rad):
@@ -159,9 +161,9 @@ def test_headlines(truths, values, poses_rad):
     ratios, offset_mm, jacobian = batched(headlines, values, poses_rad[:, 0])
     for rig, truth in enumerate(truths):
         pose_deg = tuple(np.degrees(poses_rad[rig, 0]))
-        expected = simulation.effective_deg_per_step(truth.parameters, pose_deg)
+        expected = effective_deg_per_step(truth.parameters, pose_deg)
         # The twin differences its own chain: 1e-9 of a slope, hence of 0.07 deg per step.
         assert np.abs(ratios[rig] - list(expected.values())).max() < 1e-9 * 0.1
-        assert np.abs(jacobian[rig] - simulation.beam_jacobian(truth.parameters, pose_deg)).max() < 1e-9
+        assert np.abs(jacobian[rig] - beam_jacobian(truth.parameters, pose_deg)).max() < 1e-9
         assert list(expected) == ["left", "right", "up", "down"]
-        assert abs(offset_mm[rig] - simulation.effective_mirror_offset_mm(truth.parameters, pose_deg)) < LENGTH_MM
+        assert abs(offset_mm[rig] - effective_mirror_offset_mm(truth.parameters, pose_deg)) < LENGTH_MM

@@ -11,11 +11,14 @@ from types import ModuleType
 import numpy as np
 import pytest
 
-from tvsbayes.campaign import PROTOCOLS, Campaign, read_campaign, read_plan
-from tvsbayes.classic import classic, ratio_deg_per_step
-from tvsbayes.files import InputError, shipped_data
-from tvsbayes.rigs import DEFAULT_PRIORS, Rig, RigTable, read_rig
-from tvsbayes.simulation import draw_truth, read_truth, simulate
+from tvsbayes.errors import InputError
+from tvsbayes.estimators.four_point import classic, ratio_deg_per_step
+from tvsbayes.files.disk import shipped_data
+from tvsbayes.instrument.campaign import Campaign, read_campaign
+from tvsbayes.instrument.parameters import DEFAULT_PRIORS
+from tvsbayes.instrument.plan import PROTOCOLS, read_plan
+from tvsbayes.instrument.rig import Rig, RigTable, read_rig
+from tvsbayes.twin.simulated_campaign import draw_truth, read_truth, simulate
 
 DATA = shipped_data()
 TWINS = ("paper_twin", "grid_twin")
@@ -180,7 +183,7 @@ def test_stereo_covariance_is_that_of_a_real_calibration():
 
 def test_distortion_stays_invertible_over_the_image():
     """For 200 drawn cameras the distortion grows out to the image corner."""
-    from tvsbayes.classic import undistort
+    from tvsbayes.instrument.stereo_pair import undistort
 
     rig, rng = mounted(), np.random.default_rng(2)
     corners = np.array([[0.0, 0.0], [1279.0, 0.0], [0.0, 719.0], [1279.0, 719.0]])
@@ -198,10 +201,11 @@ def test_make_twins_writes_what_is_shipped():
     """Calibration, paper twin (at its seed) and grid twin come out of the experiment again."""
     module, rig = make_twins(), mounted()
     stereo = module.stated_stereo()
-    # Another BLAS rounds a 24 x 24 inverse of condition 1e5 differently: 1e-16 x 1e5, times 1000.
+    # Another processor rounds differently. Half a unit in the last place on every pixel, which the difference quotients
+    # and the inverse amplify, changes the scaled covariance by 5e-8 to 7e-8; ten times that.
     scale = np.sqrt(np.diag(rig.stereo.parameter_covariance))
     difference = (stereo.parameter_covariance - rig.stereo.parameter_covariance) / np.outer(scale, scale)
-    assert np.abs(difference).max() < 1e-8
+    assert np.abs(difference).max() < 7e-7
     seed = twin("paper_twin").header["seed"]
     for name, made in (("paper_twin", module.matched(rig, seed)), ("grid_twin", module.grid_twin(rig))):
         shipped = twin(name)

@@ -32,7 +32,7 @@ def study():
 @pytest.mark.parametrize("kind", ["lost motion", "literal"])
 def test_both_machines_read_table_1(study, kind):
     """Solved by a shortcut on nominal sheets; here the whole twin runs, gears with play included, without noise."""
-    from tvsbayes.simulation import simulate
+    from tvsbayes.twin.simulated_campaign import simulate
 
     rig = study.mounted_rig()
     truth, _ = study.solved(kind, rig, 0)

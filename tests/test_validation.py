@@ -18,28 +18,25 @@ from conftest import coordinates
 from scipy import stats
 from test_report import small_summary
 
-from tvsbayes import joint
-from tvsbayes.campaign import PlanStep
-from tvsbayes.comparison import Criterion
-from tvsbayes.information import (
-    VALIDATION_LEVEL,
-    Validation,
-    ValidationTest,
-    _Answer,
-    _holm,
-    validate,
-)
-from tvsbayes.likelihood import ordered_spots, stop_information
-from tvsbayes.model import INDEX, NAMES, NOISE_NAMES
-from tvsbayes.report import _verdict, fit_text, validation_lines
-from tvsbayes.simulation import simulate
+from tvsbayes.assessment.score_tests import VALIDATION_LEVEL, _Answer, _holm, validate
+from tvsbayes.estimators.joint_fit import JointFit, Problem, fit_at
+from tvsbayes.estimators.linear_spots import linear_spots, stop_information
+from tvsbayes.instrument.campaign import ordered_spots
+from tvsbayes.instrument.parameters import INDEX, NAMES, NOISE_NAMES
+from tvsbayes.instrument.plan import PlanStep
+from tvsbayes.report.evidence import Criterion
+from tvsbayes.report.fit_text import fit_text, validation_lines
+from tvsbayes.report.page import _verdict
+from tvsbayes.results.estimates import Validation, ValidationTest
+from tvsbayes.statistics.least_squares import Mode
+from tvsbayes.twin.simulated_campaign import simulate
 
 PAN = (0, 70, 141, 200, 142, 71)
 TILT = (-60, -36, -12, 13, 36, 61, 37, 12, -12, -36)
 
 
 @pytest.fixture(scope="module")
-def clean(mounted_rig) -> joint.JointFit:
+def clean(mounted_rig) -> JointFit:
     """60 stops of both axes on two sheets in turn, linearised at the true rig."""
     orders: list[tuple] = [("home", 0, 0)]
     for look in range(60):
@@ -48,27 +45,27 @@ def clean(mounted_rig) -> joint.JointFit:
         orders += [("move", PAN[look % 6], TILT[look % 10]), ("look",)]
     simulated = simulate(mounted_rig, tuple(PlanStep(n, *o) for n, o in enumerate(orders)), seed=4)
     with jax.enable_x64(True):
-        problem = joint.Problem(simulated.campaign, simulated.campaign.rig)
+        problem = Problem(simulated.campaign, simulated.campaign.rig)
         z = np.where(problem.free, coordinates(problem.space, simulated.truth), 0.0)
         fisher = stop_information(problem.linear_spots(z)[1]).fisher
-        mode = joint.Mode(z, np.linalg.inv(fisher + np.eye(len(z))), 0.0, ())
-        return joint.fit_at(simulated.campaign, problem, mode, 0)
+        mode = Mode(z, np.linalg.inv(fisher + np.eye(len(z))), 0.0, ())
+        return fit_at(simulated.campaign, problem, mode, 0)
 
 
-def with_residual(fit: joint.JointFit, residual: np.ndarray) -> joint.JointFit:
+def with_residual(fit: JointFit, residual: np.ndarray) -> JointFit:
     """The same fit with other residuals, shape (n, 4)."""
     return replace(fit, linearised=eqx.tree_at(lambda lin: lin.residual, fit.linearised, residual))
 
 
-def own_columns(fit: joint.JointFit) -> np.ndarray:
+def own_columns(fit: JointFit) -> np.ndarray:
     held = np.isin(NAMES, NOISE_NAMES) | ~fit.free
     return np.where(held, 0.0, -fit.linearised.residual_jacobian)
 
 
-def drawn(fit: joint.JointFit, seed: int) -> np.ndarray:
+def drawn(fit: JointFit, seed: int) -> np.ndarray:
     """Residuals by the model: unit noise of three components, stop errors drawn anew where an axis moved."""
     generator = np.random.default_rng([seed, 0x76])
-    spots = joint.linear_spots(fit.linearised, fit.arrays, own_columns(fit))
+    spots = linear_spots(fit.linearised, fit.arrays, own_columns(fit))
     state, residual = np.zeros(6), np.zeros((len(spots.residual), 4))
     for row in range(len(residual)):
         fresh = generator.standard_normal(6) * np.sqrt(spots.variance[row])
@@ -108,7 +105,7 @@ def test_p_values_are_uniform_and_false_alarms_rare(clean):
         assert share <= stats.binom.isf(1e-4, len(tests), 0.1), name
 
 
-def planted(fit: joint.JointFit, name: str) -> np.ndarray:
+def planted(fit: JointFit, name: str) -> np.ndarray:
     """What a defect adds to the residuals, written without the package's own columns."""
     spots = ordered_spots(fit.campaign)
     count = len(spots)

@@ -20,20 +20,20 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from tvsbayes.calibration import load_calibration as load_calibration
-    from tvsbayes.campaign import read_campaign as read_campaign
-    from tvsbayes.coordinates import locate as locate
-    from tvsbayes.information import calibration_of as calibration_of
-    from tvsbayes.joint import fit as fit
-    from tvsbayes.posterior import sample as sample
+    from tvsbayes.assessment.fitted_calibration import calibration_of as calibration_of
+    from tvsbayes.calibration.calibration_file import load_calibration as load_calibration
+    from tvsbayes.coordinates.location import locate as locate
+    from tvsbayes.estimators.joint_fit import fit as fit
+    from tvsbayes.instrument.campaign import read_campaign as read_campaign
+    from tvsbayes.posterior.sampling import sample as sample
 
 _HOME = {
-    "calibration_of": "information",
-    "fit": "joint",
-    "load_calibration": "calibration",
-    "locate": "coordinates",
-    "read_campaign": "campaign",
-    "sample": "posterior",
+    "calibration_of": "assessment.fitted_calibration",
+    "fit": "estimators.joint_fit",
+    "load_calibration": "calibration.calibration_file",
+    "locate": "coordinates.location",
+    "read_campaign": "instrument.campaign",
+    "sample": "posterior.sampling",
 }
 __all__ = list(_HOME)
 
@@ -47,3 +47,8 @@ def __getattr__(name: str) -> object:
 
         return version("tvsbayes")
     raise AttributeError(f"module 'tvsbayes' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    """The public names, loaded or not."""
+    return sorted({*globals(), *__all__, "__version__"})

@@ -40,19 +40,12 @@ def measure(bench: Bench, kinds: Sequence[str] = (STAGE, EXACT)) -> None:
     import jax.numpy as jnp
     from scipy import optimize
 
-    from tvsbayes.campaign import read_campaign
-    from tvsbayes.files import shipped_data
-    from tvsbayes.joint import (
-        STAGE_STEPS,
-        STAGE_TOLERANCE,
-        Fixed,
-        Problem,
-        levenberg_marquardt,
-        residuals_and_jacobian,
-        stage_residuals,
-    )
-    from tvsbayes.likelihood import innovations, ordered_spots
-    from tvsbayes.model import NAMES
+    from tvsbayes.estimators.joint_fit import STAGE_STEPS, STAGE_TOLERANCE, Fixed, Problem, stage_residuals
+    from tvsbayes.estimators.likelihood import innovations
+    from tvsbayes.files.disk import shipped_data
+    from tvsbayes.instrument.campaign import ordered_spots, read_campaign
+    from tvsbayes.instrument.parameters import NAMES
+    from tvsbayes.statistics.least_squares import levenberg_marquardt, residuals_and_jacobian
 
     def exact_residuals(z, args):
         """`stage_residuals` whose derivative holds nothing fixed."""

@@ -20,8 +20,8 @@ def measure(bench: Bench) -> None:
     """In the order in which a user would call them: later commands read what earlier ones wrote."""
     from studies import mounted_rig, small_plan
 
-    from tvsbayes.campaign import write_plan
-    from tvsbayes.files import shipped_data
+    from tvsbayes.files.disk import shipped_data
+    from tvsbayes.instrument.plan import write_plan
 
     data = shipped_data()
     rig, twin = str(data / "rigs" / "mounted" / "rig.toml"), str(data / "twins" / "grid_twin")

@@ -7,6 +7,8 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from tvsbayes.estimators.likelihood import log_density
+
 from .measure import Bench, Case, Column, timed
 
 TITLE = "Sampling the posterior"
@@ -25,18 +27,20 @@ def measure(bench: Bench) -> None:
     import jax
     import jax.numpy as jnp
 
-    from tvsbayes import likelihood
+    from tvsbayes.estimators import campaign_arrays
 
-    likelihood.SMALLEST_BUCKET = BUCKET
+    campaign_arrays.SMALLEST_BUCKET = BUCKET
     jax.config.update("jax_enable_x64", True)
     from agreement import AXES, array_stats, stretch
     from nuts_reference import build_transport, nuts
     from studies import dense_plan, mounted_rig
 
-    from tvsbayes.joint import fit
-    from tvsbayes.model import use_compilation_cache
-    from tvsbayes.posterior import Target, pilot, sample, transport
-    from tvsbayes.simulation import simulate
+    from tvsbayes.estimators.campaign_arrays import use_compilation_cache
+    from tvsbayes.estimators.joint_fit import fit
+    from tvsbayes.posterior.proposal import Target, pilot
+    from tvsbayes.posterior.sampling import sample
+    from tvsbayes.posterior.transport import transport
+    from tvsbayes.twin.simulated_campaign import simulate
 
     use_compilation_cache()
     joint = fit(simulate(mounted_rig(), dense_plan(("d1", "d3")), seed=1).campaign)
@@ -67,7 +71,7 @@ def measure(bench: Bench) -> None:
             return route.z_of_y(route.y_of_w(w))
 
         def potential(w):
-            return joint.log_density - likelihood.log_density(z_of(w), joint.space, joint.arrays)
+            return joint.log_density - log_density(z_of(w), joint.space, joint.arrays)
 
         setting = argparse.Namespace(chains=CHAINS, warmup=WARMUP, draws=DRAWS, limit=np.inf, seed=seed)
         run = nuts(potential, route.index.size, setting)

@@ -31,10 +31,11 @@ def measure(bench: Bench) -> None:
     from photutils import centroids
     from studies import mounted_rig, small_plan
 
-    from tvsbayes.campaign import read_campaign
-    from tvsbayes.device import spots
-    from tvsbayes.device.renderer import write_frames
-    from tvsbayes.simulation import project, simulate
+    from tvsbayes.cameras import detection, spot_fit
+    from tvsbayes.instrument.campaign import read_campaign
+    from tvsbayes.twin.board_pictures import write_frames
+    from tvsbayes.twin.physics import project
+    from tvsbayes.twin.simulated_campaign import simulate
 
     with tempfile.TemporaryDirectory() as place:
         folder = Path(place) / "campaign"
@@ -66,7 +67,7 @@ def measure(bench: Bench) -> None:
 
         def ours(method: str):
             def row(_: int) -> dict[str, object]:
-                found, cost = timed(lambda: spots.detect(campaign, method, workers=1))
+                found, cost = timed(lambda: detection.detect(campaign, method, workers=1))
                 centres = [
                     [getattr(spot, f"{c}_{side}_px") if spot.status == "ok" else np.nan for c in "uv"]
                     for spot in found.campaign.spots
@@ -88,7 +89,7 @@ def measure(bench: Bench) -> None:
 
         def peer(kind: str):
             def centre(path: str) -> np.ndarray:
-                patch = spots._patch(cv2.imread(path))
+                patch = spot_fit.patch_around(cv2.imread(path))
                 if isinstance(patch, str):
                     return np.full(2, np.nan)
                 grey = patch.grey.astype(float)

@@ -23,12 +23,12 @@ IMPORTS = (
     "import numpyro",
     "import arviz",
 )
-PROGRAM = [sys.executable, "-c", "from tvsbayes.cli import main; main()"]
+PROGRAM = [sys.executable, "-c", "from tvsbayes.cli.main import main; main()"]
 
 
 def measure(bench: Bench) -> None:
     """Fresh processes only; the files they read are in the file cache."""
-    from tvsbayes.files import shipped_data
+    from tvsbayes.files.disk import shipped_data
 
     twin = str(shipped_data() / "twins" / "paper_twin")
 

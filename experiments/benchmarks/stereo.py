@@ -22,9 +22,9 @@ def measure(bench: Bench) -> None:
     import cv2
     import stereo_coverage as rendered
 
-    from tvsbayes.device.stereo import calibrate_stereo
-    from tvsbayes.model import use_compilation_cache
-    from tvsbayes.rigs import rotation_vector
+    from tvsbayes.cameras.stereo_calibration import calibrate_stereo
+    from tvsbayes.estimators.campaign_arrays import use_compilation_cache
+    from tvsbayes.instrument.stereo_pair import rotation_vector
 
     use_compilation_cache()
     kept: dict[int, tuple] = {}

@@ -26,7 +26,7 @@ def measure(bench: Bench) -> None:
     import test_solver as strd
     from scipy import optimize
 
-    from tvsbayes.joint import (
+    from tvsbayes.statistics.least_squares import (
         least_squares_covariance,
         levenberg_marquardt,
         residuals_and_jacobian,

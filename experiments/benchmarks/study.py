@@ -23,9 +23,10 @@ def measure(bench: Bench) -> None:
     os.sched_setaffinity(0, range(os.cpu_count() or 1))
     from studies import mounted_rig, small_plan
 
-    from tvsbayes.design import DEFAULT_TARGET, parse_target
-    from tvsbayes.model import use_compilation_cache
-    from tvsbayes.studies import StudyJob, StudyRows, study
+    from tvsbayes.estimators.campaign_arrays import use_compilation_cache
+    from tvsbayes.planning.target import DEFAULT_TARGET, parse_target
+    from tvsbayes.studies.study import StudyRows, study
+    from tvsbayes.studies.study_job import StudyJob
 
     use_compilation_cache()
 

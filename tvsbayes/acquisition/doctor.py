@@ -1,0 +1,277 @@
+"""Is the instrument fit for a campaign? One check after the other, each with what to do.
+
+Nothing moves. The laser stays off unless the caller asks for the laser check, and then is on for one picture; a
+positioner that is not homed refuses it. Seconds where a name says `_s`; grey levels 0 to 255.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import statistics
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from tvsbayes.acquisition.journal import Disk
+from tvsbayes.acquisition.operator import StopKey
+from tvsbayes.acquisition.session import BAUD
+from tvsbayes.cameras.capture import StereoCamera, StereoImage, open_cameras
+from tvsbayes.errors import TvsError, escaped
+from tvsbayes.instrument.rig import Rig
+from tvsbayes.positioner.driver import SEE_DOCTOR, Clock, SerialPositioner, device_settings
+from tvsbayes.positioner.protocol import FIRMWARE_VERSION
+from tvsbayes.positioner.serial_port import serial_opener, serial_ports
+
+DISK_FREE_BYTES = 5 * 10**9
+"""Room for about 700 looks of four PNG of 1280 x 720 px, 1.8 MB each."""
+FLUSH_SLOW_S = 0.1
+"""A flush takes about 4 ms on a solid-state disk; five of them per look at this rate cost half a second."""
+ROUND_TRIP_SLOW_S = 0.05
+ROUND_TRIPS = 20
+CLIPPED_SHARE_MAX = 0.001
+DARK_MEAN_MIN = 2.0
+BRIGHT_MEAN_MAX = 150.0
+"""Mean grey level without laser: below, the cap may be on; above, the spot drowns in the room's light."""
+SHARPNESS_MIN = 3.0
+"""Variance of the Laplacian, grey levels squared; a picture out of focus has only the sensor's noise."""
+LASER_RISE_MIN = 40
+"""Rise of the brightest pixel between laser off and on."""
+
+
+@dataclass(frozen=True)
+class Check:
+    """One finding: `status` is "ok", "warning", "fault" or "skipped"; `remedy` says what to do, "" for ok."""
+
+    name: str
+    status: str
+    found: str
+    remedy: str = ""
+
+    def as_json(self) -> dict[str, str]:
+        """An entry of the document of `tvsbayes doctor`."""
+        return {"name": self.name, "status": self.status, "found": self.found, "remedy": self.remedy}
+
+
+def examine(
+    rig: Rig,
+    folder: Path,
+    *,
+    laser: bool = False,
+    open_positioner: Callable[[], SerialPositioner] | None = None,
+    open_camera: Callable[[], StereoCamera] | None = None,
+    clock: Clock = time,
+) -> list[Check]:
+    """All checks of an instrument, in the order in which their faults should be cured.
+
+    Args:
+        rig: the rig file.
+        folder: where campaigns will be written.
+        laser: whether the laser may be switched on for one picture; the caller has stated the hazard.
+        open_positioner: in place of the rig file's port.
+        open_camera: in place of the rig file's cameras.
+        clock: for the timings.
+    """
+    checks = [_rig(rig), *_disk(folder, clock)]
+    positioner, found = None, []
+    try:
+        if open_positioner is None:
+            checks.append(_ports(rig))
+            open_positioner = _opener(rig)
+        if open_positioner is not None:
+            positioner, found = _positioner(open_positioner, clock)
+        checks += found
+        camera, found = _camera(rig, open_camera, clock)
+        checks += found
+        try:
+            checks.append(_laser(positioner, camera, laser))
+        finally:
+            if camera is not None:
+                camera.close()
+    finally:
+        if positioner is not None:
+            positioner.close()
+    return checks
+
+
+def _rig(rig: Rig) -> Check:
+    missing = [f"{axis}_{end}_steps" for axis in ("pan", "tilt") for end in ("min", "max")]
+    missing = [name for name in missing if name not in rig.positioner]
+    if missing:
+        remedy = "state them in [positioner]: without them the firmware's own limits hold"
+        return Check("limits", "warning", f"{', '.join(missing)} not stated", remedy)
+    if len(rig.sheets_mm) < 2:
+        return Check("limits", "warning", "fewer than two sheets", "name two depths in [sheets]")
+    return Check("limits", "ok", f"soft limits stated, {len(rig.sheets_mm)} sheets")
+
+
+def _disk(folder: Path, clock: Clock) -> list[Check]:
+    """Room, and the time that a flush takes."""
+    place = folder
+    while not place.is_dir() and place != place.parent:
+        place = place.parent
+    try:
+        free = shutil.disk_usage(place).free
+        room = Check("disk", "ok", f"{free / 1e9:.1f} GB free")
+        if free < DISK_FREE_BYTES:
+            remedy = f"free at least {DISK_FREE_BYTES / 1e9:.0f} GB for 700 looks"
+            room = Check("disk", "warning", f"{free / 1e9:.1f} GB free", remedy)
+        disk, name = Disk(), place / f".tvsbayes-doctor-{os.getpid()}"
+        start = clock.monotonic()
+        descriptor = disk.open(name, os.O_WRONLY | os.O_CREAT | os.O_EXCL)
+        try:
+            disk.write(descriptor, b"x" * 4096)
+            disk.fsync(descriptor)
+        finally:
+            disk.close(descriptor)
+            name.unlink()
+        seconds = clock.monotonic() - start
+    except OSError as error:
+        found = escaped(error.strerror or str(error))
+        return [Check("disk", "fault", found, f"make {escaped(str(place), 200)} writable, or name another folder")]
+    slow = seconds > FLUSH_SLOW_S
+    remedy = "write to a local disk, not to a network or a memory card" if slow else ""
+    flush = Check("disk flush", "warning" if slow else "ok", f"{1000 * seconds:.1f} ms", remedy)
+    return [room, flush]
+
+
+def _ports(rig: Rig) -> Check:
+    ports = serial_ports()
+    listed = ", ".join(f"{p.name} ({p.description}{', Teensy' if p.teensy else ''})" for p in ports) or "none"
+    listed = escaped(listed, 400)
+    wanted = rig.positioner.get("port")
+    if not wanted:
+        return Check("port", "fault", f"ports: {listed}", 'write port = "..." into [positioner] of the rig file')
+    if all(port.name != wanted for port in ports) and not Path(str(wanted)).exists():
+        remedy = "plug the device in, or correct [positioner] port; on Linux join the group dialout"
+        return Check("port", "fault", f"{escaped(str(wanted))} is not there; ports: {listed}", remedy)
+    return Check("port", "ok", escaped(str(wanted)))
+
+
+def _opener(rig: Rig) -> Callable[[], SerialPositioner] | None:
+    port = rig.positioner.get("port")
+    if not port:
+        return None
+    opener = serial_opener(str(port), int(rig.positioner.get("baud", BAUD)))
+    return lambda: SerialPositioner(opener, device_settings(rig.positioner))
+
+
+def _failed(name: str, error: TvsError) -> Check:
+    found = error.found or error.message.removesuffix(f"; {error.remedy}")
+    return Check(name, "fault", found, error.remedy.removesuffix(SEE_DOCTOR) or "see the message")
+
+
+def _positioner(
+    open_positioner: Callable[[], SerialPositioner], clock: Clock
+) -> tuple[SerialPositioner | None, list[Check]]:
+    """Firmware, state and round trip."""
+    try:
+        positioner = open_positioner()
+    except TvsError as error:
+        return None, [_failed("firmware", error)]
+    version = escaped(positioner.identity.get("fw", "unknown"))
+    checks = [Check("firmware", "ok", f"version {version}")]
+    if version != FIRMWARE_VERSION:
+        remedy = "flash the firmware shipped with tvsbayes; this one speaks the same protocol"
+        checks = [Check("firmware", "warning", f"version {version}, shipped is {FIRMWARE_VERSION}", remedy)]
+    times = []
+    try:
+        for _ in range(ROUND_TRIPS):
+            start = clock.monotonic()
+            state = positioner.state()
+            times.append(clock.monotonic() - start)
+        if state.laser_on:
+            state = positioner.laser(False)
+            checks.append(Check("laser line", "warning", "it was on", "look for a program that left it on"))
+        homed = state.status == "idle"
+        remedy = "" if homed else "acquire homes by itself; for the laser check let a short plan run first"
+        checks.append(Check("homing", "ok" if homed else "warning", state.status, remedy))
+    except TvsError as error:
+        positioner.close()
+        return None, [*checks, _failed("positioner", error)]
+    trip, repeats = statistics.median(times), positioner.repeats
+    bad = trip > ROUND_TRIP_SLOW_S or repeats > 0
+    remedy = "use a short USB cable, away from motor wires; no hub" if bad else ""
+    found = f"{1000 * trip:.1f} ms, {repeats} of {ROUND_TRIPS} repeated"
+    return positioner, [*checks, Check("timing", "warning" if bad else "ok", found, remedy)]
+
+
+def _camera(
+    rig: Rig, open_camera: Callable[[], StereoCamera] | None, clock: Clock
+) -> tuple[StereoCamera | None, list[Check]]:
+    """Opening, settings, time of a fresh pair, exposure and focus."""
+    size = rig.stereo.image_width, rig.stereo.image_height
+    try:
+        camera = open_camera() if open_camera is not None else open_cameras(rig.cameras, *size)
+    except TvsError as error:
+        return None, [_failed("cameras", error)]
+    try:
+        settings = camera.settings()
+        start = clock.monotonic()
+        image = camera.grab()
+        seconds = clock.monotonic() - start
+    except TvsError as error:
+        camera.close()
+        return None, [_failed("cameras", error)]
+    checks = [Check("cameras", "ok", f"two pictures of {size[0]} x {size[1]} px, a fresh pair in {seconds:.2f} s")]
+    for warning in settings.warnings:
+        checks.append(Check("camera settings", "warning", warning, "fix it with the camera's own program"))
+    for side in ("left", "right"):
+        checks += _picture(side, getattr(image, side))
+    return camera, checks
+
+
+def _picture(side: str, picture: np.ndarray) -> list[Check]:
+    """Exposure and focus of a picture without laser."""
+    import cv2
+
+    grey = cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY)
+    mean, clipped = float(grey.mean()), float((grey >= 250).mean())
+    found = f"mean {mean:.0f} of 255, {100 * clipped:.2f} % clipped"
+    remedy = ""
+    if clipped > CLIPPED_SHARE_MAX or mean > BRIGHT_MEAN_MAX:
+        remedy = "darken the room or shorten the exposure: the spot must stand out"
+    elif mean < DARK_MEAN_MIN:
+        remedy = "take the cap off, or lengthen the exposure"
+    exposure = Check(f"exposure {side}", "warning" if remedy else "ok", found, remedy)
+    sharpness = float(cv2.Laplacian(grey, cv2.CV_64F).var())
+    blurred = sharpness < SHARPNESS_MIN
+    remedy = "focus on the sheet with the checkerboard at its place, then calibrate again" if blurred else ""
+    focus = Check(f"focus {side}", "warning" if blurred else "ok", f"Laplacian variance {sharpness:.1f}", remedy)
+    return [exposure, focus]
+
+
+def _laser(positioner: SerialPositioner | None, camera: StereoCamera | None, wanted: bool) -> Check:
+    """Whether both cameras see the spot; the laser is off afterwards, whatever happens."""
+    if positioner is None or camera is None:
+        return Check("laser", "skipped", "needs positioner and cameras", "cure the faults above first")
+    if not wanted:
+        return Check("laser", "skipped", "not asked for", "run doctor with --laser, goggles on")
+    stop = StopKey()
+    # There is no look worth finishing: the first Ctrl-C interrupts.
+    stop.requested = True
+    try:
+        with stop:
+            try:
+                dark = camera.grab()
+                positioner.laser(True)
+                lit = camera.grab()
+            finally:
+                stop.closing = True
+                positioner.laser(False)
+    except TvsError as error:
+        return _failed("laser", error)
+    rises = [_rise(dark, lit, side) for side in ("left", "right")]
+    found = f"brightest pixel rises by {rises[0]} (left) and {rises[1]} (right) of 255"
+    if min(rises) < LASER_RISE_MIN:
+        remedy = "put the sheet into both views; check the laser's supply, and that the lenses have no infrared filter"
+        return Check("laser", "warning", found, remedy)
+    return Check("laser", "ok", found)
+
+
+def _rise(dark: StereoImage, lit: StereoImage, side: str) -> int:
+    change = getattr(lit, side).astype(int) - getattr(dark, side).astype(int)
+    return int(change.max())

@@ -1,0 +1,375 @@
+"""The log of a run, and its frames."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import hashlib
+import json
+import os
+import re
+import zlib
+from dataclasses import dataclass
+from pathlib import Path
+
+from tvsbayes.errors import DeviceFault, InputError, escaped, refusal
+from tvsbayes.files.disk import flush_folder, make_folder, read_bytes, write_atomically
+from tvsbayes.files.documents import parse_json
+
+LOG = "log.jsonl"
+FORMAT = "tvsbayes-log/1"
+LINE_BYTES_MAX = 16_384
+LOG_BYTES_MAX = 64 * 1024 * 1024
+LOG_EVENTS_MAX = 100_000
+LOG_ENTRIES_MAX = 5_000_000
+"""Commas and opening brackets: short entries take up to 40 times their text in memory (experiments/hostile.md)."""
+FRAME_BYTES_MAX = 128 * 1024 * 1024
+FRAME_FOLDERS = ("frames", "dark")
+"""Pictures with the laser on and, for the background, off."""
+FRAME_NAME = re.compile(r"(?:frames|dark)/[0-9]{6}_(?:left|right)\.png")
+LOG_LINE = re.compile(rb"([0-9a-f]{8}) (0|[1-9][0-9]{0,8}) ([0-9a-f]{8}) (\{[ -~]*\})")
+REPAIR_REMEDY = "copy what is whole to a new folder: tvsbayes check FOLDER --repair-to NEW"
+
+
+class Disk:
+    """The calls through which a journal reaches the disk, so that tests can fail and replay each of them."""
+
+    def open(self, path: Path, flags: int) -> int:
+        """`os.open` for a file, or a folder to be flushed."""
+        return os.open(path, flags | getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_BINARY", 0), 0o666)
+
+    def write(self, descriptor: int, data: bytes) -> int:
+        """`os.write`; may write less than asked for."""
+        return os.write(descriptor, data)
+
+    def fsync(self, descriptor: int) -> None:
+        """`os.fsync`."""
+        os.fsync(descriptor)
+
+    def close(self, descriptor: int) -> None:
+        """`os.close`."""
+        os.close(descriptor)
+
+    def replace(self, source: Path, target: Path) -> None:
+        """`os.replace`."""
+        os.replace(source, target)
+
+
+@dataclass(frozen=True, slots=True)
+class Record:
+    """A line of the journal: its number from 0, the kind of event, its data, its line in the file from 1."""
+
+    number: int
+    event: str
+    data: dict[str, object]
+    line: int
+
+
+@dataclass(frozen=True, slots=True)
+class FrameFile:
+    """A stored picture: name relative to the folder, SHA-256 of the file, its size in bytes."""
+
+    name: str
+    sha256: str
+    size: int
+
+    def as_json(self) -> dict[str, object]:
+        """As a look's event holds it."""
+        return {"name": self.name, "sha256": self.sha256, "bytes": self.size}
+
+
+@dataclass(frozen=True)
+class Reading:
+    """A journal as it stands on the disk.
+
+    Attributes:
+        records: the whole lines, in order.
+        torn: bytes of an unfinished last line, empty for none.
+        size: bytes of the whole lines.
+        crc: CRC of the last one, 0 for none.
+    """
+
+    records: tuple[Record, ...]
+    torn: bytes
+    size: int
+    crc: int
+
+
+def encode(number: int, previous: int, event: str, data: dict[str, object]) -> bytes:
+    """A line of the journal with its line feed.
+
+    Raises:
+        ValueError: too long, or data that JSON cannot hold (NaN and infinity included).
+    """
+    content = json.dumps({"event": event, **data}, allow_nan=False, ensure_ascii=True, separators=(",", ":"))
+    body = b"%d %08x %s" % (number, previous, content.encode("ascii"))
+    line = b"%08x %s\n" % (zlib.crc32(body), body)
+    if len(line) > LINE_BYTES_MAX:
+        raise ValueError(f"an event of {len(line)} bytes")
+    return line
+
+
+def _decode(line: bytes, number: int, previous: int) -> tuple[dict[str, object], int] | str:
+    """Content and CRC of a line without its line feed, or what is wrong with it."""
+    match = LOG_LINE.fullmatch(line) if len(line) < LINE_BYTES_MAX else None
+    if match is None:
+        return "no event"
+    crc = int(match[1], 16)
+    if zlib.crc32(line[9:]) != crc:
+        return "a line whose CRC does not fit"
+    if int(match[2]) != number:
+        return f"event {int(match[2])} where {number} belongs"
+    if int(match[3], 16) != previous:
+        return "a line that does not follow on the one before"
+    try:
+        values = parse_json(match[4], LOG).values
+    except InputError:
+        return "no JSON"
+    return (values, crc) if isinstance(values.get("event"), str) else "no event"
+
+
+def _is_torn(tail: bytes, number: int, previous: int) -> bool:
+    """Whether a bad end of the file can be an append that a crash cut short, and nothing else.
+
+    An append begins at a line's start and ends with its line feed; power loss may leave any part of it, and blocks of
+    zero bytes for what was not written. A whole line with one wrong byte is none of that.
+    """
+    if tail.endswith(b"\n"):
+        return b"\x00\x00" in tail
+    if len(tail) > LINE_BYTES_MAX or b"\n" in tail:
+        return False
+    # A whole event whose line feed became another byte was acknowledged once.
+    return isinstance(_decode(tail[:-1], number, previous), str)
+
+
+def read_log(folder: Path) -> bytes:
+    """The bytes of `log.jsonl`, capped in size, events and entries before anything is parsed."""
+    data = read_bytes(folder / LOG, LOG_BYTES_MAX, folder)
+    counts = {
+        "events": (data.count(b"\n"), LOG_EVENTS_MAX),
+        "entries": (sum(map(data.count, (b",", b"[", b"{"))), LOG_ENTRIES_MAX),
+    }
+    for what, (count, most) in counts.items():
+        if count > most:
+            found, allowed, remedy = f"{count} {what}", f"at most {most}", "split the run into several campaigns"
+            raise refusal("size", file=LOG, found=found, allowed=allowed, remedy=remedy)
+    return data
+
+
+def read_journal(folder: Path) -> Reading:
+    """Reads `log.jsonl`; a torn last line is set apart, other damage is refused with its line.
+
+    Raises:
+        InputError: missing, damaged, or not a journal of this format.
+    """
+    folder = Path(folder)
+    data = read_log(folder)
+    records: list[Record] = []
+    position, previous = 0, 0
+    while position < len(data):
+        end = data.find(b"\n", position)
+        line = data[position:] if end < 0 else data[position:end]
+        content = _decode(line, len(records), previous) if end >= 0 else "a line without its end"
+        if isinstance(content, str):
+            tail = data[position:]
+            if (end < 0 or end + 1 == len(data)) and _is_torn(tail, len(records), previous):
+                return Reading(tuple(records), tail, position, previous)
+            number, allowed = len(records) + 1, "events in their order, each with its CRC"
+            raise refusal("journal", file=LOG, line=number, found=content, allowed=allowed, remedy=REPAIR_REMEDY)
+        values, previous = content
+        event = str(values.pop("event"))
+        if not records and (event != "created" or values.get("format") != FORMAT):
+            allowed = f"the event created of the format {FORMAT}"
+            raise refusal("journal", file=LOG, line=1, found=escaped(event), allowed=allowed, remedy=REPAIR_REMEDY)
+        records.append(Record(len(records), event, values, len(records) + 1))
+        position = end + 1
+    return Reading(tuple(records), b"", position, previous)
+
+
+class Journal:
+    """A journal open for appending; one writer at a time.
+
+    After a failure nothing more is written: a failed flush may have dropped what it was to save, so that trying again
+    would acknowledge what is not there.
+    """
+
+    def __init__(self, folder: Path, descriptor: int, reading: Reading, disk: Disk):
+        self.folder = Path(folder)
+        self.records = list(reading.records)
+        self.torn = reading.torn
+        """Bytes that were cut off when this journal was opened; they are kept in a file of their own."""
+        self._descriptor: int | None = descriptor
+        self._crc, self._size, self._disk = reading.crc, reading.size, disk
+        self._dirty: set[Path] = set()
+
+    @classmethod
+    def create(cls, folder: Path, disk: Disk | None = None, **data: object) -> Journal:
+        """A new journal in a folder that has none; `data` goes into its first event, `created`.
+
+        Raises:
+            InputError: there is one already, or the folder cannot be written.
+        """
+        disk = disk or Disk()
+        folder = Path(folder)
+        make_folder(folder)
+        try:
+            descriptor = disk.open(folder / LOG, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND)
+        except FileExistsError as error:
+            allowed, remedy = "a folder without a journal", "go on with --resume, or name another folder"
+            raise refusal("occupied", file=LOG, found="a journal", allowed=allowed, remedy=remedy) from error
+        except OSError as error:
+            raise _disk_fault(error) from error
+        journal = cls(folder, descriptor, Reading((), b"", 0, 0), disk)
+        # The name of the log, and that of the folder itself.
+        journal._dirty |= {folder, folder.absolute().parent}
+        try:
+            _lock(descriptor)
+            journal.append("created", format=FORMAT, **data)
+        except BaseException:
+            # Nothing was acknowledged: without its file the folder can be tried again.
+            journal.close()
+            with contextlib.suppress(OSError):
+                (folder / LOG).unlink()
+            raise
+        return journal
+
+    @classmethod
+    def open(cls, folder: Path, disk: Disk | None = None) -> Journal:
+        """An existing journal, to go on with; a torn last line is kept aside and cut off.
+
+        Raises:
+            InputError: damaged, or another program writes it.
+            DeviceFault: the disk refuses.
+        """
+        disk = disk or Disk()
+        folder = Path(folder)
+        read_bytes(folder / LOG, LOG_BYTES_MAX, folder)
+        try:
+            descriptor = disk.open(folder / LOG, os.O_WRONLY | os.O_APPEND)
+        except OSError as error:
+            raise _disk_fault(error) from error
+        try:
+            _lock(descriptor)
+            reading = read_journal(folder)
+            if reading.torn:
+                write_atomically(folder / f"log.torn-{reading.size}", reading.torn)
+                os.ftruncate(descriptor, reading.size)
+                disk.fsync(descriptor)
+            if not reading.records:
+                allowed, remedy = "at least the event created", "begin anew in another folder"
+                raise refusal("journal", file=LOG, found="no event", allowed=allowed, remedy=remedy)
+        except OSError as error:
+            os.close(descriptor)
+            raise _disk_fault(error) from error
+        except BaseException:
+            os.close(descriptor)
+            raise
+        return cls(folder, descriptor, reading, disk)
+
+    def store(self, name: str, data: bytes) -> FrameFile:
+        """Writes a frame; it counts once an event that names it is appended.
+
+        Raises:
+            ValueError: a name that is no frame's.
+            DeviceFault: the disk refuses; the journal is closed.
+        """
+        if not FRAME_NAME.fullmatch(name):
+            raise ValueError(name)
+        target = self.folder / name
+        temporary = target.with_name(f".{target.name}.tmp")
+        with self._guarded():
+            # Only for a frame: a run that states centroids leaves no empty folders behind.
+            if not target.parent.is_dir():
+                target.parent.mkdir()
+                self._dirty.add(self.folder)
+            descriptor = self._disk.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
+            try:
+                self._write(descriptor, data)
+                self._disk.fsync(descriptor)
+            finally:
+                self._disk.close(descriptor)
+            self._disk.replace(temporary, target)
+        self._dirty.add(target.parent)
+        return FrameFile(name, hashlib.sha256(data).hexdigest(), len(data))
+
+    def append(self, event: str, **data: object) -> Record:
+        """Appends an event and returns once it is on the disk, behind the frames stored before it.
+
+        Raises:
+            DeviceFault: the disk refuses; the journal is closed.
+        """
+        line = encode(len(self.records), self._crc, event, data)
+        with self._guarded() as descriptor:
+            if len(self.records) >= LOG_EVENTS_MAX or self._size + len(line) > LOG_BYTES_MAX:
+                message, remedy = "the journal is full", "begin a new campaign for the rest of the plan"
+                raise DeviceFault("journal-full", f"{message}; {remedy}", remedy=remedy)
+            for folder in sorted(self._dirty):
+                flush_folder(folder, self._disk)
+            self._dirty.clear()
+            self._write(descriptor, line)
+            self._disk.fsync(descriptor)
+        self._size += len(line)
+        self._crc = int(line[:8], 16)
+        record = Record(len(self.records), event, json.loads(json.dumps(data)), len(self.records) + 1)
+        self.records.append(record)
+        return record
+
+    def close(self) -> None:
+        """Gives the journal back; everything appended is on the disk already."""
+        if self._descriptor is not None:
+            descriptor, self._descriptor = self._descriptor, None
+            os.close(descriptor)
+
+    def _guarded(self) -> _Guard:
+        return _Guard(self)
+
+    def _write(self, descriptor: int, data: bytes) -> None:
+        view = memoryview(data)
+        while view:
+            view = view[self._disk.write(descriptor, bytes(view)) :]
+
+
+class _Guard:
+    """Turns the first disk error into a `DeviceFault` and closes the journal for good."""
+
+    def __init__(self, journal: Journal):
+        self.journal = journal
+
+    def __enter__(self) -> int:
+        if self.journal._descriptor is None:
+            raise DeviceFault("disk", "the journal is closed after a disk error", remedy="go on with --resume")
+        return self.journal._descriptor
+
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
+        if error is not None:
+            self.journal.close()
+        if isinstance(error, OSError):
+            raise _disk_fault(error) from error
+
+
+def _disk_fault(error: OSError) -> DeviceFault:
+    found = escaped(error.strerror or str(error))
+    remedy = "free space or change the disk, then go on with --resume: nothing acknowledged is lost"
+    return DeviceFault("disk", f"the journal cannot be written: {found}; {remedy}", found=found, remedy=remedy)
+
+
+def _lock(descriptor: int) -> None:
+    """Refuses a second writer; the lock ends with the process, however it ends."""
+    try:
+        if os.name == "posix":
+            import fcntl
+
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        else:
+            import msvcrt
+
+            # Far behind the end, so that readers are not kept out.
+            os.lseek(descriptor, LOG_BYTES_MAX + 1, os.SEEK_SET)
+            msvcrt.locking(descriptor, msvcrt.LK_NBLCK, 1)
+    except OSError as error:
+        # What flock(2) and _locking say of a lock that somebody holds; anything else is a disk without locks.
+        if error.errno not in (errno.EWOULDBLOCK, errno.EACCES, errno.EDEADLK):
+            found, allowed = escaped(error.strerror or str(error)), "a disk that can lock files"
+            raise refusal("lock", file=LOG, found=found, allowed=allowed, remedy="use a local disk") from error
+        allowed, remedy = "one program at a time", "wait for the other, or end it"
+        raise refusal("locked", file=LOG, found="another writer", allowed=allowed, remedy=remedy) from error

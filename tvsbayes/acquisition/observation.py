@@ -1,0 +1,231 @@
+"""One look: a picture without laser light, one with it, and what a detector finds in them.
+
+The laser is on only between the two pictures, and off again whatever happens. Light also proves that no picture is
+older than the look, however deep the buffers are: pictures come in the order of their exposure, so after laser-on we
+wait for the spot to appear and after laser-off for it to vanish. A look then begins with no lit picture under way, and
+what shows a spot was exposed in it. That the spot vanishes shows, too, that the laser is off.
+
+Raw px with the integer at the centre of a pixel.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+
+from tvsbayes.acquisition.simulated_instrument import Instrument, Light, Renderer
+from tvsbayes.cameras.capture import StereoCamera, StereoImage
+from tvsbayes.cameras.contour import epipolar_refused
+from tvsbayes.cameras.detection import pair_status
+from tvsbayes.cameras.spot_fit import find_spot
+from tvsbayes.errors import DeviceFault
+from tvsbayes.files.images import png_bytes
+from tvsbayes.instrument.rig import Rig
+from tvsbayes.instrument.stereo_pair import Stereo
+from tvsbayes.positioner.driver import Positioner
+from tvsbayes.twin.spot_pictures import Scene, Sensor, cameras_of, render_spots
+
+CHANGE_DN = 40
+"""Grey levels by which a pixel must change to count as lit, or as another scene: noise and JPEG stay below 10."""
+WAIT_GRABS = 20
+"""Grabs after which a spot that has not appeared never will: each takes at least three frames, and no driver or stream
+holds back sixty."""
+UNSTEADY = "unsteady"
+"""Status of a look whose background changed: somebody in the picture, or the light in the room."""
+UNDETECTED = "undetected"
+"""Status of a look whose frames wait for a detection (DESIGN 7)."""
+
+
+@dataclass(frozen=True)
+class Detection:
+    """What was found in a pair of pictures.
+
+    Attributes:
+        status: "ok", "undetected", or the reason of refusal.
+        pixels_px: u_left, v_left, u_right, v_right; None where there is no spot.
+        sds_px: their standard uncertainties.
+        correlations: of u and v, left and right.
+    """
+
+    status: str
+    pixels_px: tuple[float, float, float, float] | None = None
+    sds_px: tuple[float, float, float, float] | None = None
+    correlations: tuple[float, float] = (0.0, 0.0)
+
+
+@dataclass(frozen=True)
+class Observation:
+    """A detection and the pictures behind it, PNG by name relative to the campaign's folder."""
+
+    detection: Detection
+    pictures: dict[str, bytes] = field(default_factory=dict)
+
+
+class Detector(Protocol):
+    """Finds the spot in a pair of pictures."""
+
+    def __call__(self, lit: StereoImage, dark: StereoImage) -> Detection:
+        """`lit` with the laser on, `dark` just before without it."""
+
+
+class Observer(Protocol):
+    """Takes a look with a positioner at rest."""
+
+    def observe(self, positioner: Positioner, spot: int) -> Observation:
+        """Look number `spot`; the laser is off before and after."""
+
+
+def wait_for_detection(lit: StereoImage, dark: StereoImage) -> Detection:
+    """The detector of those who detect later: every look is `undetected`."""
+    return Detection(UNDETECTED)
+
+
+@dataclass
+class CameraObserver:
+    """Looks with cameras.
+
+    Attributes:
+        camera: the pair.
+        detector: finds the spots.
+        keep_pictures: whether they go into the campaign's folder.
+    """
+
+    camera: StereoCamera
+    detector: Detector = wait_for_detection
+    keep_pictures: bool = True
+
+    def observe(self, positioner: Positioner, spot: int) -> Observation:
+        """See `Observer.observe`.
+
+        Raises:
+            DeviceFault: a camera repeats one picture, the laser went off while it was exposed, or does not go off.
+        """
+        positioner.laser(False)
+        dark = self.camera.grab()
+        try:
+            positioner.laser(True)
+            lit, on = self._lit(positioner, dark)
+        finally:
+            positioner.laser(False)
+        if not on:
+            remedy = "raise the frame rate of the cameras, or the watchdog time of the firmware"
+            raise DeviceFault("watchdog", f"the laser went off during the exposure; {remedy}", remedy=remedy)
+        self._wait_for_darkness(dark)
+        pictures = {}
+        if self.keep_pictures:
+            pairs = {"frames": lit, "dark": dark}
+            pictures = {
+                f"{folder}/{spot:06d}_{side}.png": png_bytes(getattr(pair, side))
+                for folder, pair in pairs.items()
+                for side in ("left", "right")
+            }
+        unsteady = max(_rises(lit, dark)) > CHANGE_DN
+        return Observation(Detection(UNSTEADY) if unsteady else self.detector(lit, dark), pictures)
+
+    def _lit(self, positioner: Positioner, dark: StereoImage) -> tuple[StereoImage, bool]:
+        """A picture exposed with the laser on, and whether the laser was on to its end."""
+        for number in range(WAIT_GRABS):
+            lit = self.camera.grab()
+            # Sensor noise makes two exposures differ, whatever they show.
+            if np.array_equal(lit.left, dark.left) or np.array_equal(lit.right, dark.right):
+                remedy = "unplug the camera and plug it in again, then go on with --resume"
+                message = f"a camera delivers the same picture again and again; {remedy}"
+                raise DeviceFault("frozen", message, remedy=remedy)
+            if min(_rises(dark, lit)) > CHANGE_DN:
+                if number:
+                    # Light came on during the first lit exposure, or in one still older: take a whole one.
+                    lit = self.camera.grab()
+                break
+            if not positioner.state().laser_on:
+                return lit, False
+        return lit, positioner.state().laser_on
+
+    def _wait_for_darkness(self, dark: StereoImage) -> None:
+        for _ in range(WAIT_GRABS):
+            if max(_rises(dark, self.camera.grab())) <= CHANGE_DN:
+                return
+        remedy = "cut the laser's supply at once; if it is off, something else in the room has become bright"
+        raise DeviceFault("light", f"the spot does not vanish with the laser off; {remedy}", remedy=remedy)
+
+
+def _rises(before: StereoImage, after: StereoImage) -> tuple[int, int]:
+    """The most by which a pixel grew brighter, left and right, grey levels."""
+    import cv2
+
+    pairs = (before.left, after.left), (before.right, after.right)
+    return tuple(int(cv2.subtract(new, old).max()) for old, new in pairs)
+
+
+@dataclass
+class TwinObserver:
+    """Looks at the digital twin without pictures: the centroids that a detector would state, noise included.
+
+    Attributes:
+        instrument: the simulated one.
+        sd_px: standard uncertainty stated for every coordinate.
+    """
+
+    instrument: Instrument
+    sd_px: float
+
+    def observe(self, positioner: Positioner, spot: int) -> Observation:
+        """See `Observer.observe`."""
+        try:
+            positioner.laser(True)
+            pixels = self.instrument.noisy_centroid_px(self.sd_px)
+        finally:
+            positioner.laser(False)
+        if not np.isfinite(pixels).all():
+            return Observation(Detection("no-spot"))
+        u_left, v_left, u_right, v_right = map(float, pixels)
+        return Observation(Detection("ok", (u_left, v_left, u_right, v_right), (self.sd_px,) * 4))
+
+
+def live_detector(stereo: Stereo) -> Detector:
+    """Finds spots by the method `fit`, with the noise that a campaign's `detect` would begin with.
+
+    `tvsbayes detect` learns the cameras' noise from all looks afterwards and is the better judge of their sds.
+
+    Args:
+        stereo: the calibration, for the epipolar check.
+    """
+
+    def found(lit: StereoImage, dark: StereoImage) -> Detection:
+        left, right = find_spot(lit.left), find_spot(lit.right)
+        status = pair_status(left, right)
+        if status != "ok":
+            return Detection(status)
+        pixels = np.concatenate([left.centre_px, right.centre_px])
+        covariance = np.zeros((4, 4))
+        covariance[:2, :2], covariance[2:, 2:] = left.covariance_px2, right.covariance_px2
+        if epipolar_refused(pixels[None], covariance[None], stereo)[0]:
+            return Detection("epipolar")
+        sds = np.sqrt(np.diag(covariance))
+        correlations = covariance[0, 1] / (sds[0] * sds[1]), covariance[2, 3] / (sds[2] * sds[3])
+        return Detection(
+            "ok", tuple(map(float, pixels)), tuple(map(float, sds)), (float(correlations[0]), float(correlations[1]))
+        )
+
+    return found
+
+
+def twin_renderer(rig: Rig, seed: int) -> Renderer:
+    """Pictures of the true rig that a simulation with this seed draws.
+
+    Args:
+        rig: the declared rig.
+        seed: of the simulation.
+    """
+    truth = Instrument(rig, seed).truth
+    cameras = cameras_of(truth.stereo, truth.parameters["focal_scale"])
+    scene, sensor = Scene(), Sensor()
+
+    def pictures(light: Light, look: int, frame: int) -> StereoImage:
+        made = render_spots(
+            cameras, light.point_S_mm, light.direction_S, light.normal_S, scene, sensor, seed, look, frame
+        )
+        return StereoImage(made.left, made.right)
+
+    return pictures

@@ -1,0 +1,226 @@
+"""The engine that runs a plan on an instrument: home, place, move, look, each on the disk before the next.
+
+A plan describes, the engine does. Whatever ends a run (the plan's end, Ctrl-C, a fault of device, camera or disk),
+the laser is switched off, the end is written down, and the folder is a readable campaign as soon as the first homing
+is logged. `recorded` tells from the journal what is done; a resumed run homes into a new segment, asks for the sheet,
+repeats reference looks and goes on with the first step that is not done.
+
+Counters in motor steps, seconds where a name says `_s`, px as in DESIGN 7.
+"""
+
+from __future__ import annotations
+
+import signal
+import sys
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+from types import FrameType
+from typing import Protocol
+
+from tvsbayes.acquisition.simulated_instrument import Instrument
+from tvsbayes.errors import InputError, escaped
+
+HAZARD = """LASER HAZARD. 808 nm is invisible and likely class 3B: beam and reflections can blind before you blink.
+Before you go on: goggles rated for 808 nm on everybody in the room; beam path shut in; no mirrors, watches, rings;
+door sign and key switch in place. The laser is on only while a picture is taken. Ctrl-C stops: once after the
+present look, twice at once. The firmware's watchdog is a last resort, no interlock."""
+
+
+class Operator(Protocol):
+    """The person at the instrument."""
+
+    def accept(self, hazard: str) -> bool:
+        """Whether the hazard has been read and the run may begin."""
+
+    def place(self, target: str, x_mm: float, placement: int, remark: str) -> bool:
+        """Put the sheet at a target (nominal X in frame S); False stops the run.
+
+        `placement` counts the placements of the plan; the same number again asks for the same place. `remark` says
+        why it is asked, "" for the plan's own.
+        """
+
+
+@dataclass(frozen=True)
+class Progress:
+    """Where a run stands.
+
+    Steps of the plan and looks done and in all, refused looks, repeated ones, seconds left, what is being done, and
+    the running estimate, "" for none.
+    """
+
+    step: int
+    steps: int
+    looks: int
+    looks_total: int
+    refused: int
+    retries: int
+    seconds_left: float
+    doing: str
+    estimate: str = ""
+
+
+class StopKey:
+    """Ctrl-C: the first asks for an end after the present look, the second interrupts at once.
+
+    What ends a process from outside (SIGTERM, SIGHUP of a closed terminal, Ctrl-Break on Windows) interrupts at once
+    too: without a handler the process would die with the laser on.
+    """
+
+    def __init__(self, tell: Callable[[str], None] = lambda text: None):
+        self.requested = False
+        self.at_prompt = False
+        """While the operator is asked there is no look to finish: the first Ctrl-C interrupts the question."""
+        self.closing = False
+        """While laser and journal are being put away nothing interrupts: a third Ctrl-C would leave the laser on."""
+        self._tell = tell
+        self._before: dict[int, object] = {}
+
+    def __enter__(self) -> StopKey:
+        if threading.current_thread() is threading.main_thread():
+            for number in (signal.SIGINT, *_TERMINATIONS):
+                before = signal.getsignal(number)
+                # nohup ignores SIGHUP so that the run outlives its terminal.
+                if number == signal.SIGINT or before is not signal.SIG_IGN:
+                    self._before[number] = signal.SIG_DFL if before is None else before
+                    signal.signal(number, self._interrupt)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        while self._before:
+            number, before = self._before.popitem()
+            signal.signal(number, before)
+
+    def _interrupt(self, number: int, frame: FrameType | None) -> None:
+        if self.closing:
+            return
+        if number != signal.SIGINT or self.requested or self.at_prompt:
+            self.requested = True
+            raise KeyboardInterrupt
+        self.requested = True
+        try:
+            self._tell("finishing the present look; Ctrl-C again stops at once")
+        except (RuntimeError, OSError):
+            # The interrupted code was writing to the same stream, which then refuses, or the same key has ended the
+            # `tee` behind it: the key counts all the same.
+            pass
+
+
+_TERMINATIONS = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP", "SIGBREAK") if hasattr(signal, name))
+"""SIGHUP exists on POSIX only, SIGBREAK on Windows only."""
+LASER_CLASSES = ("1", "1M", "2", "2M", "3R", "3B", "4")
+"""IEC 60825-1, the classes that a user may state instead of being asked."""
+
+
+@dataclass
+class TerminalOperator:
+    """Asks on the terminal.
+
+    Attributes:
+        stop: the stop key, which may interrupt a question.
+        say: shows a line.
+        ask: shows a question and returns the answer.
+        laser_class: stated on the command line: the hazard is shown, nobody is asked.
+    """
+
+    stop: StopKey
+    say: Callable[[str], None]
+    ask: Callable[[str], str] = input
+    laser_class: str | None = None
+
+    def accept(self, hazard: str) -> bool:
+        """See `Operator.accept`."""
+        for line in hazard.splitlines():
+            self.say(line)
+        if self.laser_class is not None:
+            self.say(f"laser class {self.laser_class} stated on the command line: not asked")
+            return True
+        return self._answer("Type yes to go on: ") == "yes"
+
+    def place(self, target: str, x_mm: float, placement: int, remark: str) -> bool:
+        """See `Operator.place`."""
+        if remark:
+            self.say(f"note: {remark}")
+        answer = self._answer(f"Put the sheet at {target} (X = {x_mm:g} mm), then press Enter; q stops: ")
+        return answer != "q"
+
+    def _answer(self, question: str) -> str:
+        self.stop.at_prompt = True
+        try:
+            return self.ask(question).strip().lower()
+        except (EOFError, KeyboardInterrupt):
+            self.stop.requested = True
+            return "q"
+        finally:
+            self.stop.at_prompt = False
+
+
+@dataclass
+class SimulatedOperator:
+    """Puts the twin's sheet where it is asked for."""
+
+    instrument: Instrument
+
+    def accept(self, hazard: str) -> bool:
+        """A simulated laser hurts nobody."""
+        return True
+
+    def place(self, target: str, x_mm: float, placement: int, remark: str) -> bool:
+        """See `Operator.place`."""
+        self.instrument.place(target, placement)
+        return True
+
+
+def check_hazard(laser_class: str | None, simulate: bool) -> None:
+    """Refuses a laser class that there is none of, and a real laser of which nobody can be told."""
+    if laser_class is not None and laser_class.upper() not in LASER_CLASSES:
+        remedy = "read it off the laser's label"
+        raise InputError(
+            "usage", f"laser class {escaped(laser_class)}", allowed=", ".join(LASER_CLASSES), remedy=remedy
+        )
+    if not simulate and laser_class is None and not sys.stdin.isatty():
+        remedy = "run it in a terminal, or state --laser-class"
+        raise InputError("usage", "nobody can be asked about the laser hazard", remedy=remedy)
+
+
+class LiveLine:
+    """A line that shows progress on a terminal, plain lines every tenth of the way elsewhere; a context manager."""
+
+    def __init__(self) -> None:
+        from rich.console import Console
+        from rich.progress import BarColumn, TextColumn
+        from rich.progress import Progress as Bar
+
+        self._console = Console(stderr=True)
+        columns = TextColumn("{task.fields[doing]}"), BarColumn(), TextColumn("{task.fields[note]}")
+        self._bar = Bar(*columns, console=self._console, transient=True, disable=not self._console.is_terminal)
+        self._task = self._bar.add_task("acquire", total=None, doing="", note="")
+        self._tenths = 0
+
+    def __enter__(self) -> LiveLine:
+        self._bar.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._bar.stop()
+
+    def show(self, state: Progress) -> None:
+        """Takes the news."""
+        note = f"look {state.looks} of {state.looks_total}, {state.refused} refused, {state.retries} repeated, "
+        note += f"{state.seconds_left / 60:.0f} min left"
+        if state.estimate:
+            note += f"; deg/step {state.estimate}"
+        self._bar.update(self._task, total=state.steps, completed=state.step, doing=state.doing, note=note)
+        tenths = 10 * state.step // max(state.steps, 1)
+        if not self._console.is_terminal and tenths > self._tenths:
+            self._tenths = tenths
+            self._console.print(f"{10 * tenths} %: {note}", highlight=False)
+
+    def ask(self, question: str) -> str:
+        """`input` without the line running over the question, which goes to stderr: stdout is for the result."""
+        self._bar.stop()
+        try:
+            self._console.print(question, end="", markup=False, highlight=False)
+            return input()
+        finally:
+            self._bar.start()

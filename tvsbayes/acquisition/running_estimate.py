@@ -1,0 +1,134 @@
+"""The running estimate of an acquisition: a fit in a process of its own, beside the instrument.
+
+The campaign folder is readable at any time, so `tvsbayes fit --no-sample` runs on it as it stands, one fit at a time.
+The acquisition neither waits for it nor shares memory with it: a compiler at work must not delay a laser switch. The
+figures are the effective degrees per step of the beam with their standard uncertainty from the Laplace approximation
+(DESIGN 3.2, 4.2), of the looks that were there when the fit began.
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+FIRST_LOOKS = 12
+"""Fewer looks than three experiments of four points say next to nothing."""
+GROWTH = 1.2
+"""The next fit begins when there are so many times more looks than at the last: their sum costs a few fits."""
+FIT_MAX_S = 3600.0
+"""Longest wait for a fit; one takes a minute or less."""
+_COMMAND = "from tvsbayes.cli import main; main()"
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """Effective degrees per step and their standard uncertainties by direction, from so many looks."""
+
+    looks: int
+    deg_per_step: dict[str, float]
+    u_deg_per_step: dict[str, float]
+
+    @property
+    def text(self) -> str:
+        """For the live line."""
+        parts = (
+            f"{name} {self.deg_per_step[name]:.6f} u {self.u_deg_per_step[name]:.1e}" for name in self.deg_per_step
+        )
+        return ", ".join(parts)
+
+
+class RunningEstimate:
+    """Fits the folder of a running acquisition again and again.
+
+    Args:
+        folder: the campaign folder.
+        target_u_deg_per_step: the uncertainty wanted of every direction; None wants nothing and is never met.
+        directions: those that must meet it.
+        wait: whether to wait for every fit: in a simulation time stands still meanwhile.
+        command: in place of `tvsbayes fit`; the campaign folder and a scratch folder are appended.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        target_u_deg_per_step: float | None,
+        directions: Iterable[str],
+        *,
+        wait: bool = False,
+        command: Sequence[str] | None = None,
+    ):
+        self.folder, self.target, self.directions = Path(folder), target_u_deg_per_step, set(directions)
+        self.latest: Estimate | None = None
+        self._wait = wait
+        self._command = list(command) if command is not None else [sys.executable, "-c", _COMMAND, "fit"]
+        self._scratch = tempfile.TemporaryDirectory(prefix="tvsbayes-estimate-")
+        self._process: subprocess.Popen[bytes] | None = None
+        self._looks = 0
+
+    def __enter__(self) -> RunningEstimate:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._process is not None:
+            self._process.kill()
+            self._process.wait()
+        self._scratch.cleanup()
+
+    @property
+    def met(self) -> bool:
+        """Whether every direction of the plan is known as well as wanted."""
+        if self.latest is None or self.target is None:
+            return False
+        u = self.latest.u_deg_per_step
+        return bool(self.directions) and all(u.get(name, float("inf")) <= self.target for name in self.directions)
+
+    def update(self, looks: int) -> bool:
+        """Takes in a finished fit, begins the next one where it pays; whether the target is met."""
+        if self._process is not None and self._process.poll() is not None:
+            self._take()
+        if self._process is None and looks >= max(FIRST_LOOKS, GROWTH * self._looks):
+            self._begin(looks)
+            if self._wait:
+                self._wait_for_fit()
+        return self.met
+
+    def _begin(self, looks: int) -> None:
+        """Starts a fit; where no process can be started the run goes on without an estimate."""
+        self._looks = looks
+        results = Path(self._scratch.name) / "results"
+        arguments = [*self._command, str(self.folder), "--no-sample", "--json", "--out", str(results)]
+        quiet = {"stderr": subprocess.DEVNULL, "stdin": subprocess.DEVNULL}
+        try:
+            with open(Path(self._scratch.name) / "fit.json", "wb") as stream:
+                self._process = subprocess.Popen(arguments, stdout=stream, **quiet, start_new_session=True)
+        except OSError:
+            self._process = None
+
+    def _wait_for_fit(self) -> None:
+        if self._process is None:
+            return
+        try:
+            self._process.wait(FIT_MAX_S)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+        self._take()
+
+    def _take(self) -> None:
+        """A fit that did not work says nothing: the next one has more looks."""
+        self._process = None
+        try:
+            document = json.loads((Path(self._scratch.name) / "fit.json").read_bytes())
+            found = {name: entry for name, entry in document["effective_deg_per_step"].items() if entry is not None}
+            if not document["converged"] or "error" in document:
+                return
+            values = {name: float(entry["value"]) for name, entry in found.items()}
+            sds = {name: float(entry["sd"]) for name, entry in found.items()}
+        except (OSError, ValueError, KeyError, TypeError, AttributeError):
+            return
+        self.latest = Estimate(self._looks, values, sds)

@@ -1,0 +1,308 @@
+"""Tests of defects that the model leaves out."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+
+from tvsbayes.assessment.residuals import CAUSE_BINS, STEP_PHASES
+from tvsbayes.assessment.weaknesses import headline_gradients, moved_directions
+from tvsbayes.estimators.joint_fit import JointFit
+from tvsbayes.estimators.linear_spots import StopGroup, linear_spots, stop_information
+from tvsbayes.instrument.campaign import ordered_spots
+from tvsbayes.instrument.parameters import INDEX, NAMES, NOISE_NAMES, RIG_NAMES, STEREO_PARAMETER_NAMES
+from tvsbayes.results.estimates import Validation, ValidationTest
+from tvsbayes.statistics.intervals import log_chance
+
+VALIDATION_LEVEL = 0.01
+"""Probability, all tests together, with which a clean campaign fails its validation; experiments/model_error.md."""
+CHANGE_POINTS = 16
+"""Places, evenly over the spots, at which cameras may have moved; twice as many for lost steps."""
+WAVES = 16
+"""Transmission errors looked for per axis: 1/2, 1, 3/2 ... periods over the range that was seen."""
+ABSORBED = 1e-3
+"""Share of a defect's effect below which the fit has swallowed it: what is left is no more than its curvature."""
+KNOWN_DIRECTION = 1e-4
+"""Information (in prior sds) from which the fit can move along a direction; below it the spots cannot follow."""
+_POSE = tuple(f"extrinsics.{kind}.{axis}" for kind in ("rotation_rad", "translation_mm") for axis in "xyz")
+
+
+@dataclass(frozen=True)
+class _Defect:
+    """Columns d(prediction)/d(size of the defect), shape (spots, 4, q), for each of its `places`."""
+
+    name: str
+    places: tuple[str, ...]
+    columns: tuple[np.ndarray, ...]
+
+
+def _times(columns: np.ndarray, pattern: np.ndarray) -> np.ndarray:
+    """Columns (spots, 4, q) at spots where a pattern (spots,) says how much of the defect there is."""
+    return columns * pattern[:, None, None]
+
+
+@dataclass(frozen=True)
+class _Axis:
+    """One axis as the spots saw it: effect of its angle (spots, 4, 1), angle, counter, last move."""
+
+    name: str
+    push: np.ndarray
+    angle_deg: np.ndarray
+    counter: np.ndarray
+    leg_steps: np.ndarray
+
+
+def _axes(fit: JointFit) -> tuple[_Axis, _Axis]:
+    moves, lin = fit.campaign.moves, fit.linearised
+    legs = np.zeros((len(moves), 2), dtype=int)
+    for row, (previous, move) in enumerate(pairwise(moves), start=1):
+        delta = np.array([move.pan_steps - previous.pan_steps, move.tilt_steps - previous.tilt_steps])
+        legs[row] = 0 if move.pan_approach else np.where(delta != 0, delta, legs[row - 1])
+    at = [spot.move for spot in ordered_spots(fit.campaign)]
+    angle = np.degrees(lin.mirror_angles_rad)
+    counters = np.array([(moves[m].pan_steps, moves[m].tilt_steps) for m in at])
+    return tuple(
+        _Axis(name, lin.slope[:, :, i : i + 1], angle[:, i], counters[:, i], legs[at, i])
+        for i, name in enumerate(("pan", "tilt"))
+    )
+
+
+def _epipolar(fit: JointFit) -> np.ndarray:
+    """Rows of one camera against those of the other: a shift, and its gradients over the picture, shape (n, 4, 3).
+
+    The part of a residual that neither a mirror angle nor a range explains: no model of the beam is in it.
+    """
+    lin = fit.linearised
+    readings = -lin.residual_jacobian[:, :, INDEX["aperture_zero_deg"]]
+    # Without a reading the last of the four components is empty.
+    readings = np.where(np.any(readings, axis=1, keepdims=True), readings, np.eye(4)[3])
+    taken = np.concatenate([lin.slope.transpose(0, 2, 1), readings[:, None]], axis=1)
+    normal = np.linalg.svd(taken)[2][:, -1]
+    row = np.linalg.pinv(np.asarray(fit.space.stereo_root))[:, STEREO_PARAMETER_NAMES.index("stereo.right.cy")]
+    shift = -lin.residual_jacobian[:, :, len(RIG_NAMES) :] @ row
+    shift = normal * np.sum(normal * shift, axis=1, keepdims=True)
+    place = lin.predicted[:, :2]
+    spread = place.std(axis=0)
+    place = (place - place.mean(axis=0)) / np.where(spread > 0, spread, 1.0)
+    return shift[:, :, None] * np.concatenate([np.ones((len(place), 1)), place], axis=1)[:, None, :]
+
+
+def _defects_in_time(fit: JointFit, axes: Sequence[_Axis]) -> list[_Defect]:
+    """What moves, drifts or slips while the campaign runs."""
+    spots, moves = ordered_spots(fit.campaign), fit.campaign.moves
+    order = np.arange(len(spots))
+    time = np.array([moves[spot.move].time_s for spot in spots])
+    # Without a clock the order stands for the time.
+    time = order if np.ptp(time) == 0 else time
+    drift = (time - time.mean()) / max(np.ptp(time), 1)
+    segment = np.array([moves[spot.move].segment for spot in spots])
+    cameras = -fit.linearised.residual_jacobian[:, :, [INDEX[name] for name in _POSE]]
+    warmed = -fit.linearised.residual_jacobian[:, :, [*(INDEX[name] for name in _POSE), INDEX["focal_scale"]]]
+    apart = _epipolar(fit)
+
+    def rows(count: int) -> np.ndarray:
+        found = np.unique(np.linspace(0, len(spots), count + 2)[1:-1].astype(int))
+        return found[found > 0]
+
+    def since(row: int) -> np.ndarray:
+        return (order >= row).astype(float)
+
+    def place(row: int) -> str:
+        return f"from spot {spots[row].spot} on (move {spots[row].move})"
+
+    few, many = rows(CHANGE_POINTS), rows(2 * CHANGE_POINTS)
+    places = tuple(map(place, few))
+    slips = tuple((axis, row) for axis in axes for row in many)
+    return [
+        _Defect("the cameras moved", places, tuple(_times(cameras, since(row)) for row in few)),
+        _Defect("the cameras drifted (pose or focal length)", ("with time",), (_times(warmed, drift),)),
+        _Defect(
+            "one camera moved against the other (epipolar)",
+            ("with time", *places),
+            (_times(apart, drift), *(_times(apart, since(row)) for row in few)),
+        ),
+        _Defect(
+            "a ratio drifted",
+            tuple(f"{axis.name}, with time" for axis in axes),
+            tuple(_times(axis.push, drift * (axis.angle_deg - axis.angle_deg.mean())) for axis in axes),
+        ),
+        _Defect(
+            "steps were lost, or a joint slipped",
+            tuple(f"{axis.name} {place(row)}" for axis, row in slips),
+            # A homing finds the zero again.
+            tuple(_times(axis.push, since(row) * (segment == segment[row])) for axis, row in slips),
+        ),
+    ]
+
+
+def _defects_in_place(fit: JointFit, axes: Sequence[_Axis]) -> list[_Defect]:
+    """What depends on where the axes stand, how they got there, and on the sheet."""
+    targets = np.array([spot.target for spot in ordered_spots(fit.campaign)])
+    places, waves = [], []
+    for axis in axes:
+        stops = len(np.unique(axis.counter))
+        # Fewer stops than this fit any wave.
+        periods = 2 * np.ptp(axis.angle_deg) / np.arange(1, min(WAVES, 2 * stops) + 1) if stops > 3 else ()
+        for period in [*periods, *filter(None, [fit.campaign.rig.harmonic_period_deg.get(axis.name)])]:
+            phase = 2 * np.pi * axis.angle_deg / period
+            waves.append(np.concatenate([_times(axis.push, np.cos(phase)), _times(axis.push, np.sin(phase))], axis=2))
+            places.append(f"{axis.name}, period near {period:.3g} deg")
+
+    def by_group(name: str, groups: Sequence[np.ndarray]) -> _Defect:
+        columns = [
+            np.concatenate([_times(axis.push, (group == value).astype(float)) for value in np.unique(group)], axis=2)
+            for axis, group in zip(axes, groups, strict=True)
+        ]
+        return _Defect(name, tuple(axis.name for axis in axes), tuple(columns))
+
+    edges = [np.unique(np.quantile(axis.leg_steps, np.linspace(0, 1, CAUSE_BINS + 1)[1:-1])) for axis in axes]
+    return [
+        _Defect("the gears have a transmission error", tuple(places), tuple(waves)),
+        by_group(f"stops depend on the step phase (n mod {STEP_PHASES})", [a.counter % STEP_PHASES for a in axes]),
+        by_group(
+            "stops depend on the length of the move",
+            [np.digitize(axis.leg_steps, edge) for axis, edge in zip(axes, edges, strict=True)],
+        ),
+        by_group("the sheets disagree", [targets, targets]),
+    ]
+
+
+def validate(fit: JointFit) -> Validation:
+    """Look for defects that the model does not have, by score tests at the mode.
+
+    For columns D = d(prediction)/d(size of a defect) the score is g = D'^T C^-1 r, C the covariance of pixel noise,
+    stop errors and home offsets, D' = D less what the fit can follow. If the model holds, g ~ N(0, D'^T C^-1 D') and
+    g^T (D'^T C^-1 D')^-1 g is chi-square wherever the true rig lies (Rao, Proc. Cambridge Phil. Soc. 44 (1948) 50).
+    Nothing is refitted. The places of one defect share its level (Bonferroni), all tests share `VALIDATION_LEVEL`
+    (Holm, Scand. J. Statist. 6 (1979) 65). Noise scales are the fitted ones, which a defect has already widened.
+
+    A defect of size s = (D'^T C^-1 D')^-1 g, left out of the model, moves the mode by S J^T C^-1 D s. That is a
+    systematic effect without correction: its square joins the squared u (GUM F.2.4.5, as an uncorrected effect).
+    `inflation` is sqrt(1 + (largest move of a headline in its sds)^2), over the tests that failed.
+
+    Args:
+        fit: a joint fit.
+
+    Returns:
+        What was asked and found; a question that the fit can follow entirely is not asked.
+    """
+    axes = _axes(fit)
+    defects = [*_defects_in_time(fit, axes), *_defects_in_place(fit, axes)]
+    held = np.isin(NAMES, NOISE_NAMES) | ~fit.free
+    own = np.where(held, 0.0, -fit.linearised.residual_jacobian)
+    asked = np.concatenate([own, *(columns for defect in defects for columns in defect.columns)], axis=2)
+    information = stop_information(linear_spots(fit.linearised, fit.arrays, asked))
+    errors = np.concatenate([group.residual for group in information.groups])
+    score = asked.reshape(-1, asked.shape[2]).T @ errors
+    p = own.shape[2]
+    fisher, cross = information.fisher[:p, :p], information.fisher[:p, p:]
+    values, vectors = np.linalg.eigh(fisher)
+    kept = values > KNOWN_DIRECTION
+    inverse = (vectors[:, kept] / values[kept]) @ vectors[:, kept].T
+    followed = inverse @ cross
+    whole = np.diag(information.fisher)[p:]
+    scale = 1 / np.sqrt(np.where(whole > 0, whole, 1.0))
+    found = [_single_spots(fit, information.groups, inverse, inverse @ score[:p])]
+    score = (score[p:] - followed.T @ score[:p]) * scale
+    variance = (information.fisher[p:, p:] - cross.T @ followed) * np.outer(scale, scale)
+    _, gradient = headline_gradients(fit, moved_directions(fit))
+    sd = np.sqrt(np.einsum("qi,ij,qj->q", gradient, fit.covariance, gradient))
+    moved_by = gradient @ fit.covariance @ cross * scale / sd[:, None]
+
+    start = 0
+    for defect in defects:
+        answers = []
+        for place, columns in zip(defect.places, defect.columns, strict=True):
+            rows = slice(start, start + columns.shape[2])
+            start = rows.stop
+            values, vectors = np.linalg.eigh(variance[rows, rows])
+            kept = values > ABSORBED
+            if kept.any():
+                along = vectors[:, kept].T @ score[rows]
+                chi2, dof = float(np.sum(along**2 / values[kept])), int(kept.sum())
+                size = (vectors[:, kept] / values[kept]) @ along
+                shift = float(np.max(np.abs(moved_by[:, rows] @ size)))
+                answers.append(_Answer(float(log_chance(chi2, dof)), defect.name, place, chi2, dof, shift))
+        if answers:
+            worst = min(answers, key=lambda a: a.log_p)
+            found.append(replace(worst, log_p=worst.log_p + np.log(len(answers)), places=len(answers)))
+    return _holm(found)
+
+
+@dataclass(frozen=True)
+class _Answer:
+    """A test before it is judged; `log_p` because chi-squares of hundreds have no p in double precision."""
+
+    log_p: float
+    name: str
+    where: str
+    chi2: float
+    dof: int
+    shift_sd: float
+    places: int = 1
+
+
+def _single_spots(fit: JointFit, groups: Sequence[StopGroup], followed: np.ndarray, shift: np.ndarray) -> _Answer:
+    """The spot that all others foretell worst; how far it moves a headline is not asked (`--robust` drops it).
+
+    As `likelihood.leave_one_out_chi2`, less what the fit can follow.
+
+    Args:
+        fit: the fit.
+        groups: its stops; the first columns of their Jacobians belong to the coordinates.
+        followed: inverse information of the directions that the fit can follow, shape (p, p).
+        shift: step along them that the residuals still ask for, shape (p,).
+    """
+    spots = ordered_spots(fit.campaign)
+    p = len(shift)
+    errors = np.concatenate([(g.residual - g.jacobian[:, :p] @ shift).reshape(-1, 4) for g in groups])
+    blocks = []
+    for group in groups:
+        own = group.jacobian[:, :p]
+        left = group.precision - own @ followed @ own.T
+        blocks += [left[k : k + 4, k : k + 4] for k in range(0, len(left), 4)]
+    values, vectors = np.linalg.eigh(np.stack(blocks))
+    kept = values > ABSORBED
+    along = np.einsum("nij,ni->nj", vectors, errors)
+    distances = np.sum(np.where(kept, along**2 / np.where(kept, values, 1.0), 0.0), axis=1)
+    readings = np.asarray(fit.arrays.spots.has_aperture * fit.arrays.spots.valid)[: len(spots)]
+    # Without a reading the fourth component is empty.
+    dof = np.maximum(kept.sum(axis=1) - (readings == 0), 1)
+    chances = log_chance(distances, dof)
+    worst = int(np.argmin(chances))
+    return _Answer(
+        log_p=float(chances[worst] + np.log(len(spots))),
+        name="single spots disagree with all others",
+        where=f"most of all spot {spots[worst].spot}",
+        chi2=float(distances[worst]),
+        dof=int(dof[worst]),
+        shift_sd=0.0,
+        places=len(spots),
+    )
+
+
+def _holm(found: Sequence[_Answer]) -> Validation:
+    """All tests together at `VALIDATION_LEVEL`; the defect with the least p is named as the cause."""
+    found = sorted(found, key=lambda a: a.log_p)
+    bad = 0
+    while bad < len(found) and found[bad].log_p <= np.log(VALIDATION_LEVEL / (len(found) - bad)):
+        bad += 1
+    tests = tuple(
+        ValidationTest(
+            name=a.name,
+            where=a.where,
+            chi2=a.chi2,
+            dof=a.dof,
+            places=a.places,
+            p=float(min(1.0, np.exp(a.log_p))),
+            failed=rank < bad,
+            shift_sd=a.shift_sd,
+        )
+        for rank, a in enumerate(found)
+    )
+    cause = f"{tests[0].name}: {tests[0].where}" if bad else ""
+    inflation = float(np.hypot(1.0, max((t.shift_sd for t in tests[:bad]), default=0.0)))
+    return Validation(bad == 0, VALIDATION_LEVEL, cause, inflation, tests)

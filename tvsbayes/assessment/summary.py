@@ -1,0 +1,256 @@
+"""What a fit knows: headlines, contraction, weak directions, leverage of stops, causes of its covariance, calibration.
+
+Works on a finished `JointFit`, and on a `Posterior` where there is one; computes no new fit. Units are those of
+DESIGN 8.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from itertools import pairwise
+
+import jax
+import numpy as np
+
+from tvsbayes.assessment.score_tests import validate
+from tvsbayes.assessment.weaknesses import (
+    few_stops,
+    leverage,
+    moved_directions,
+    prior_conflicts,
+    prior_sensitivity,
+    weak_directions,
+)
+from tvsbayes.estimators.four_point import four_point_ratios, select_experiments
+from tvsbayes.estimators.joint_fit import JointFit
+from tvsbayes.instrument.axes import DIRECTIONS
+from tvsbayes.instrument.campaign import ordered_spots
+from tvsbayes.instrument.parameters import HARMONIC_PRIORS, INDEX, NAMES, RECEIVER_NAMES, RIG_NAMES
+from tvsbayes.model.headlines import Derived
+from tvsbayes.posterior.draws import Posterior
+from tvsbayes.posterior.predictive import ideal_pixels
+from tvsbayes.results.estimates import Estimate, FitSummary
+from tvsbayes.statistics.intervals import NORMAL_95
+
+CLASSIC_DRAWS = 256
+CURVE_POINTS = 7
+
+
+def _estimate(mode: float, draws: np.ndarray, prior_draws: np.ndarray) -> Estimate:
+    """From draws: equal-tailed interval, sample standard deviations."""
+    # The mean of equal numbers may be off by a rounding: what is fixed would scatter by 1e-17 of itself.
+    sd, prior_sd = (float(np.std(x)) if np.ptp(x) > 0 else 0.0 for x in (draws, prior_draws))
+    low, high = np.quantile(draws, [0.025, 0.975])
+    contraction = float(1 - (sd / prior_sd) ** 2) if prior_sd > 0 else None
+    return Estimate(float(mode), sd, (float(low), float(high)), prior_sd, contraction)
+
+
+class _Source:
+    """Where the numbers come from: the Laplace approximation, or a posterior and its diagnosis."""
+
+    def __init__(self, fit: JointFit, posterior: Posterior | None):
+        self.fit, self.posterior = fit, posterior
+        self.prior = fit.prior_draws
+        if posterior is None:
+            self.centre, self.draws = fit.mode, fit.draws
+        else:
+            self.draws = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), posterior.draws)
+            self.centre = jax.tree.map(lambda x: x.mean(axis=0), self.draws)
+
+    def estimate(self, name: str, of: Callable[[Derived], np.ndarray]) -> Estimate:
+        """A quantity that is linear in the fields of `Derived`, with the sampler's diagnosis of `name`."""
+        plain = _estimate(*(of(draws) for draws in (self.centre, self.draws, self.prior)))
+        if self.posterior is None:
+            return plain
+        found = self.posterior.convergence
+        return replace(
+            plain,
+            rhat=found.rhat.get(name),
+            ess_bulk=found.ess_bulk.get(name),
+            ess_tail=found.ess_tail.get(name),
+        )
+
+
+def _parameters(source: _Source) -> dict[str, Estimate]:
+    """Parameters with a coordinate; Laplace interval ends are exact images of z -+ 1.96 sd under monotone maps."""
+    fit = source.fit
+    low, high = fit.ends95
+    has_readings = bool(np.any(np.asarray(fit.arrays.spots.has_aperture) > 0))
+    estimates = {}
+    for index, name in enumerate(NAMES):
+        if name in RECEIVER_NAMES and not has_readings:
+            continue
+        if name in HARMONIC_PRIORS and not fit.free[index] and fit.mode.physical[index] == 0:
+            continue
+        estimate = source.estimate(name, lambda d, i=index: d.physical[..., i])
+        if source.posterior is not None:
+            estimates[name] = estimate
+            continue
+        if index >= len(RIG_NAMES):
+            # Stereo parameters mix coordinates linearly.
+            ends = (estimate.value - NORMAL_95 * estimate.sd, estimate.value + NORMAL_95 * estimate.sd)
+        else:
+            ends = (float(low[index]), float(high[index]))
+        estimates[name] = replace(estimate, interval95=ends)
+    return estimates
+
+
+def _derived(source: _Source) -> dict[str, Estimate]:
+    """Per-direction gear ratios and the effective mirror offset."""
+    estimates = {}
+    for axis, positive, negative in (("pan", "left", "right"), ("tilt", "up", "down")):
+        ratio, contrast = INDEX[f"degrees_per_step.{axis}"], INDEX[f"ratio_contrast_deg_per_step.{axis}"]
+        for direction, sign in ((positive, 0.5), (negative, -0.5)):
+            name = f"degrees_per_step.{direction}"
+            estimates[name] = source.estimate(
+                name, lambda d, r=ratio, c=contrast, s=sign: d.physical[..., r] + s * d.physical[..., c]
+            )
+    name = "effective_mirror_offset_mm"
+    estimates[name] = source.estimate(name, lambda d: d.effective_mirror_offset_mm)
+    return estimates
+
+
+def _classic_predicted(source: _Source) -> dict[str, Estimate | None]:
+    """Mean of each direction as the classic estimator would compute it from ideal spots of the fitted model.
+
+    Under the Laplace approximation pixels follow the parameters linearly from the mode, under a posterior they are
+    those of each draw; the classic's stereo calibration stays the stated one.
+    """
+    fit = source.fit
+    selection = select_experiments(fit.campaign)
+    result: dict[str, Estimate | None] = dict.fromkeys(DIRECTIONS)
+    if not len(selection.experiments):
+        return result
+    ordered = ordered_spots(fit.campaign)
+    row_of = {spot.spot: row for row, spot in enumerate(ordered)}
+    ids = np.array([s.spot for s in fit.campaign.spots])
+    rows = np.vectorize(row_of.get)(ids[selection.spot_rows])
+
+    def ratios(pixels):
+        return four_point_ratios(pixels, selection.steps, selection.axis, fit.campaign.stereo)
+
+    if source.posterior is None:
+        pixels = fit.linearised.predicted[rows][..., :4]
+        push = fit.linearised.predicted_jacobian[rows][..., :4, :]
+        centre = ratios(pixels)
+        draws = np.stack([ratios(pixels + push @ dz) for dz in fit.draws_z[:CLASSIC_DRAWS] - fit.z])
+    else:
+        draws = np.stack([ratios(pixels[rows]) for pixels in ideal_pixels(source.posterior, CLASSIC_DRAWS)])
+        centre = draws.mean(axis=0)
+    for direction in DIRECTIONS:
+        # Pixels far from the image, of a fit that went astray, cannot be undistorted: there is no ratio then.
+        chosen = (selection.direction == direction) & np.isfinite(centre)
+        values = draws[:, chosen].mean(axis=1) if chosen.any() else np.zeros(0)
+        values = values[np.isfinite(values)]
+        if len(values):
+            sd = float(values.std())
+            low, high = np.quantile(values, [0.025, 0.975])
+            result[direction] = Estimate(float(centre[chosen].mean()), sd, (float(low), float(high)), None, None)
+    return result
+
+
+def _curves(posterior: Posterior, moved: set[str]) -> dict[str, object]:
+    """Effective ratios along both axes over the range that was seen, and lost motion at the step counts used."""
+    fit = posterior.fit
+    angles = np.degrees(fit.linearised.mirror_angles_rad)
+    middle = np.degrees(fit.reference_pose_rad)
+    along = {}
+    for axis, name in enumerate(("pan", "tilt")):
+        rows = []
+        for angle in np.linspace(angles[:, axis].min(), angles[:, axis].max(), CURVE_POINTS):
+            pose = middle.copy()
+            pose[axis] = angle
+            found = posterior.effective_deg_per_step(*map(float, pose))
+            entry = {"pan_deg": float(pose[0]), "tilt_deg": float(pose[1])}
+            for k, direction in enumerate(DIRECTIONS):
+                if direction in moved:
+                    entry[direction] = {
+                        "value": float(found.mean[k]),
+                        "sd": float(found.sd[k]),
+                        "interval95": found.interval95[:, k].tolist(),
+                    }
+            rows.append(entry)
+        along[name] = rows
+    used: dict[str, set[int]] = {d: set() for d in DIRECTIONS}
+    for previous, move in pairwise(fit.campaign.moves):
+        if not move.pan_approach:
+            deltas = (move.pan_steps - previous.pan_steps, move.tilt_steps - previous.tilt_steps)
+            for delta, (positive, negative) in zip(deltas, (("left", "right"), ("up", "down")), strict=True):
+                if delta:
+                    used[positive if delta > 0 else negative].add(abs(delta))
+    lost = {}
+    for direction in sorted(moved, key=DIRECTIONS.index):
+        steps = sorted(used[direction])
+        steps = [steps[i] for i in np.unique(np.linspace(0, len(steps) - 1, min(CURVE_POINTS, len(steps))).astype(int))]
+        found = posterior.lost_motion_deg(direction, np.array(steps))
+        lost[direction] = [
+            {
+                "steps": int(n),
+                "value_deg": float(found.mean[k]),
+                "sd_deg": float(found.sd[k]),
+                "interval95_deg": found.interval95[:, k].tolist(),
+            }
+            for k, n in enumerate(steps)
+        ]
+    return {"effective_deg_per_step": along, "lost_motion": lost}
+
+
+def summarise(fit: JointFit, posterior: Posterior | None = None) -> FitSummary:
+    """Put a fit into the contract's terms.
+
+    Args:
+        fit: a joint fit, converged or not.
+        posterior: its sample. One that has not converged lends no number: what is returned is then the Laplace
+            approximation, labelled so, and not converged.
+
+    Returns:
+        Headlines, parameters and diagnostics.
+    """
+    moved = moved_directions(fit)
+    usable = posterior if posterior is not None and posterior.converged else None
+    source = _Source(fit, usable)
+    effective = {
+        d: source.estimate(f"effective_deg_per_step.{d}", lambda x, k=k: x.effective_deg_per_step[..., k])
+        if d in moved
+        else None
+        for k, d in enumerate(DIRECTIONS)
+    }
+    contrasts = {}
+    for axis, first in (("pan", 0), ("tilt", 2)):
+        both = {DIRECTIONS[first], DIRECTIONS[first + 1]} <= moved
+        difference = source.estimate(
+            f"effective_contrast_deg_per_step.{axis}",
+            lambda x, k=first: x.effective_deg_per_step[..., k] - x.effective_deg_per_step[..., k + 1],
+        )
+        contrasts[axis] = difference if both else None
+    readings = np.asarray(fit.arrays.spots.has_aperture * fit.arrays.spots.valid).sum()
+    observations = 3 * float(np.asarray(fit.arrays.spots.valid).sum()) + float(readings)
+    determined = float(np.trace(fit.information.fisher @ fit.covariance))
+    pan, tilt = np.degrees(fit.reference_pose_rad)
+    problems = fit.problems
+    if posterior is not None:
+        problems += tuple(f"UNCONVERGED: {sentence}" for sentence in posterior.convergence.missing)
+    return FitSummary(
+        converged=fit.converged and (posterior is None or posterior.converged),
+        problems=problems,
+        effective=effective,
+        contrasts=contrasts,
+        reference_pose_deg={"pan": float(pan), "tilt": float(tilt)},
+        jacobian=tuple(tuple(float(x) for x in row) for row in source.centre.jacobian),
+        parameters={**_parameters(source), **_derived(source)},
+        chi2=fit.chi2,
+        dof=observations - determined,
+        weak_directions=weak_directions(fit, moved),
+        leverage=leverage(fit, moved),
+        classic_predicted=_classic_predicted(source),
+        excluded_spots=fit.excluded_spots,
+        suspect_spots=fit.suspect_spots,
+        prior_conflicts=prior_conflicts(fit),
+        prior_sensitivity=prior_sensitivity(fit, moved),
+        estimator="laplace" if usable is None else "posterior",
+        sampling=None if posterior is None else posterior.convergence.as_json(),
+        curves=None if usable is None else _curves(usable, moved),
+        validation=validate(fit),
+        few_stops=few_stops(fit, moved),
+    )

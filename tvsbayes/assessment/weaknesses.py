@@ -1,0 +1,206 @@
+"""What the data leave open: weak directions, leverage, priors."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+
+from tvsbayes.estimators.joint_fit import JointFit
+from tvsbayes.estimators.linear_spots import standard_deviations_without
+from tvsbayes.instrument.axes import DIRECTIONS
+from tvsbayes.instrument.campaign import ordered_spots
+from tvsbayes.instrument.parameters import INDEX, NAMES
+from tvsbayes.instrument.stops import observed_stops, separation
+from tvsbayes.results.estimates import Leverage, PriorSensitivity, WeakDirection
+
+LEVERAGE_LIMIT = 2.0
+"""A stop is named if a headline's sd would grow by more than this factor without it (DESIGN 4.2)."""
+EXCHANGE_LIMIT = 0.5
+"""Correlation of ratio and backlash above which a quarter of the ratio's variance is exchange with the backlash."""
+LOADING_LIMIT = 0.3
+WEAK_VARIANCE = 0.5
+"""A direction of parameter space is weak if more than this share of its prior variance is left."""
+CONFLICT_LIMIT = 4.0
+"""Prior standard deviations; of fifty parameters one lies beyond it in 3 of 1000 honest campaigns."""
+SENSITIVE_SHIFT = 0.2
+"""Change of a headline, in its sds, when a prior is doubled or halved, from which it is listed."""
+SENSITIVE_SD = 0.1
+"""Relative change of a headline's sd from which it is listed."""
+SENSITIVITIES_LISTED = 16
+LISTED = 8
+
+
+def moved_directions(fit: JointFit) -> set[str]:
+    """Directions in which the campaign ever moved."""
+    moved = set()
+    moves = fit.campaign.moves
+    for previous, move in pairwise(moves):
+        if move.pan_approach:
+            continue
+        pan, tilt = move.pan_steps - previous.pan_steps, move.tilt_steps - previous.tilt_steps
+        moved |= {d for d, yes in zip(DIRECTIONS, (pan > 0, pan < 0, tilt > 0, tilt < 0), strict=True) if yes}
+    return moved
+
+
+def _backlash_direction(fit: JointFit, axis: str, direction: str) -> WeakDirection | None:
+    """Ratio and backlash of an axis, if they move together or the stops cannot separate them."""
+    index = INDEX[f"backlash_deg.{axis}"]
+    if not fit.free[index]:
+        return None
+    ratio = fit.draws.effective_deg_per_step[:, DIRECTIONS.index(direction)]
+    if np.ptp(ratio) == 0:
+        # Held by the priors: nothing moves with the backlash.
+        return None
+    correlation = float(np.corrcoef(ratio, fit.draws.physical[:, index])[0, 1])
+    used = {s.move for s in fit.campaign.spots if s.status == "ok" and s.spot not in fit.excluded_spots}
+    reason = separation(observed_stops(fit.campaign.moves, used, axis), axis)
+    if reason is None and abs(correlation) < EXCHANGE_LIMIT:
+        return None
+    reason = reason or "the legs differ too little; add a cleared approach or longer legs"
+    text = f"{axis} ratio and {axis} backlash move together (correlation {correlation:+.2f}): {reason}"
+    return WeakDirection(text, {f"effective.{direction}": 1.0, f"backlash_deg.{axis}": correlation})
+
+
+def weak_directions(fit: JointFit, moved: set[str]) -> tuple[WeakDirection, ...]:
+    found = []
+    for axis, pair in (("pan", ("left", "right")), ("tilt", ("up", "down"))):
+        if not moved & set(pair):
+            text = f"the {axis} axis was never moved: its ratio and backlash are the prior's; add moves on that axis"
+            found.append(WeakDirection(text, {f"degrees_per_step.{axis}": 1.0}))
+            continue
+        weak = _backlash_direction(fit, axis, pair[0] if pair[0] in moved else pair[1])
+        if weak is not None:
+            found.append(weak)
+    noise = {"pixel_scale", *(n for n in NAMES if n.startswith(("stop_sd", "stereo")))}
+    rows = np.array([i for i, name in enumerate(NAMES) if fit.free[i] and name not in noise])
+    if rows.size == 0:
+        return tuple(found)
+    eigenvalues, vectors = np.linalg.eigh(fit.covariance[np.ix_(rows, rows)])
+    for value, vector in list(zip(eigenvalues, vectors.T, strict=True))[::-1]:
+        if value < WEAK_VARIANCE or len(found) >= LISTED:
+            break
+        order = np.argsort(-np.abs(vector))
+        loadings = {NAMES[rows[i]]: float(vector[i]) for i in order if abs(vector[i]) > LOADING_LIMIT}
+        if not loadings:
+            loadings = {NAMES[rows[order[0]]]: float(vector[order[0]])}
+        names = list(loadings)
+        # Rounding may leave a hair more than the prior's variance: more than 100 % is not a finding.
+        left = f"{min(100.0, 100 * value):.0f} % of"
+        if len(names) == 1:
+            text = f"{names[0]} is set by the prior: {left} its variance is left; state it better or accept it"
+        else:
+            listed = ", ".join(names[:-1]) + " and " + names[-1]
+            text = f"{listed} move together, set by the prior: {left} that direction's variance is left; "
+            text += "state one of them better or accept it"
+        found.append(WeakDirection(text, loadings))
+    return tuple(found)
+
+
+def headline_gradients(fit: JointFit, moved: set[str]) -> tuple[list[str], np.ndarray]:
+    """Effective ratios and backlashes with d(quantity)/d(coordinates), shape (q, p)."""
+    quantities = {
+        f"effective {d}": fit.draws.effective_deg_per_step[:, k] for k, d in enumerate(DIRECTIONS) if d in moved
+    }
+    for axis in ("pan", "tilt"):
+        # In coordinates, where the backlash is Gaussian.
+        quantities[f"backlash {axis}"] = fit.draws_z[:, INDEX[f"backlash_deg.{axis}"]]
+    # What the priors hold fixed scatters by roundings, which nothing may be measured by.
+    quantities = {name: v for name, v in quantities.items() if np.ptp(v) > 1e-12 * np.max(np.abs(v))}
+    return list(quantities), gradients(fit, np.stack(list(quantities.values()), axis=1))
+
+
+def gradients(fit: JointFit, values: np.ndarray) -> np.ndarray:
+    """d(quantity)/d(coordinates), shape (q, p), of quantities with values (draws, q) on the Laplace draws.
+
+    Regression on the moment-matched draws gives the gradient of the linear part, averaged over the posterior.
+    """
+    centred = fit.draws_z - fit.draws_z.mean(axis=0)
+    cross = (values - values.mean(axis=0)).T @ centred / len(centred)
+    return np.linalg.solve(fit.covariance, cross.T).T
+
+
+def prior_sensitivity(fit: JointFit, moved: set[str]) -> tuple[PriorSensitivity, ...]:
+    """Each prior in turn doubled and halved in u, to first order about the mode (a refit of the linear model).
+
+    Twice the u divides the prior's precision 1 of a coordinate by four. The stereo calibration is one prior: all its
+    coordinates are scaled together. A half-normal is treated as normal in its coordinate.
+    """
+    quantities, gradients = headline_gradients(fit, moved)
+    rows = np.flatnonzero(fit.free)
+    hessian = np.linalg.inv(fit.covariance[np.ix_(rows, rows)])
+    gradients = gradients[:, rows]
+    sd = np.sqrt(np.einsum("qi,ij,qj->q", gradients, fit.covariance[np.ix_(rows, rows)], gradients))
+    pull = hessian @ fit.z[rows]
+    names = np.array(NAMES)[rows]
+    groups = {name: np.flatnonzero(names == name) for name in names if not name.startswith("stereo.")}
+    groups["stereo calibration"] = np.flatnonzero(np.char.startswith(names, "stereo."))
+    found = []
+    for parameter, members in groups.items():
+        for factor in (2.0, 0.5):
+            changed = hessian.copy()
+            changed[members, members] += factor**-2 - 1
+            values, vectors = np.linalg.eigh(changed)
+            inverse = (vectors / np.maximum(values, 1e-6)) @ vectors.T
+            shift = gradients @ (inverse @ pull - fit.z[rows]) / sd
+            ratio = np.sqrt(np.einsum("qi,ij,qj->q", gradients, inverse, gradients)) / sd
+            for k, quantity in enumerate(quantities):
+                if abs(shift[k]) > SENSITIVE_SHIFT or abs(np.log(ratio[k])) > np.log1p(SENSITIVE_SD):
+                    found.append(PriorSensitivity(str(parameter), quantity, factor, float(shift[k]), float(ratio[k])))
+    found.sort(key=lambda e: -max(abs(e.shift_sd), abs(np.log(e.sd_ratio))))
+    return tuple(found[:SENSITIVITIES_LISTED])
+
+
+def leverage(fit: JointFit, moved: set[str]) -> tuple[Leverage, ...]:
+    """Stops without which a headline's sd would more than double."""
+    quantities, gradients = headline_gradients(fit, moved)
+    sd = np.sqrt(np.einsum("qi,ij,qj->q", gradients, fit.covariance, gradients))
+    ordered = ordered_spots(fit.campaign)
+    entries = []
+    for group in fit.information.groups:
+        members = [s for s in ordered[group.rows] if s.spot not in fit.excluded_spots]
+        if not members:
+            continue
+        factors = standard_deviations_without(group, fit.covariance, gradients) / sd
+        for name, factor in zip(quantities, factors, strict=True):
+            if factor > LEVERAGE_LIMIT or not np.isfinite(factor):
+                move = fit.campaign.moves[members[0].move]
+                approach = ""
+                if move.pan_approach:
+                    approach = f" and its recorded approach ({move.pan_approach}, {move.tilt_approach})"
+                size = f"{factor:.1f} times" if np.isfinite(factor) else "beyond all bounds"
+                text = f"without move {move.move}{approach} the sd of {name} would grow {size}"
+                spots = tuple(s.spot for s in members)
+                entries.append(Leverage(move.move, spots, name, float(factor) if np.isfinite(factor) else None, text))
+    entries.sort(key=lambda e: -(e.factor if e.factor is not None else np.inf))
+    return tuple(entries[:LISTED])
+
+
+def prior_conflicts(fit: JointFit) -> tuple[str, ...]:
+    """Parameters whose mode lies where their prior hardly allows: a wrong sign or unit, or a prior stated too tight."""
+    found = []
+    for index in np.flatnonzero(fit.free & (np.abs(fit.z) > CONFLICT_LIMIT)):
+        value, distance = fit.mode.physical[index], abs(fit.z[index])
+        found.append(
+            f"{NAMES[index]} = {value:.4g} lies {distance:.1f} prior sds from its prior's centre: check the sign of "
+            "the counters and the unit, or state the prior wider"
+        )
+    return tuple(found)
+
+
+FEW_STOPS = 12
+"""Fewer tell their own scatter so poorly that 1.96 standard deviations of it hold less than 93 % (Student's t)."""
+
+
+def few_stops(fit: JointFit, moved: set[str]) -> dict[str, int]:
+    """Directions that the campaign moved in and saw fewer than `FEW_STOPS` stops after, with their number."""
+    used = {s.move for s in fit.campaign.spots if s.status == "ok" and s.spot not in fit.excluded_spots}
+    found = {}
+    for axis, directions in (("pan", ("left", "right")), ("tilt", ("up", "down"))):
+        stops = observed_stops(fit.campaign.moves, used, axis)
+        for direction, sign in zip(directions, (1, -1), strict=True):
+            count = sum(stop.sign == sign for stop in stops)
+            free = fit.free[INDEX[f"stop_sd_deg.{direction}"]]
+            if direction in moved and free and count < FEW_STOPS:
+                found[direction] = count
+    return found

@@ -1,0 +1,259 @@
+"""A calibration to drive with: rays, coordinates and counters from stored draws, in NumPy alone (DESIGN 5 and 8).
+
+What a robot loads: no JAX, no fit, less than a millisecond a call. The optics are written out in components, so that
+the same lines serve one pose in Python floats and many parameter sets in arrays; `tests/test_calibration.py` holds
+them to the JAX model. Frame T: origin mid-baseline, x depth, y along the baseline towards the positioner at +a/2,
+z up. mm; degrees where a name says `_deg`; counters in steps, absolute, after homing.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+
+from tvsbayes.calibration.pointing import INPUT_NAMES, NOISE_NAMES, Calibration
+from tvsbayes.errors import InputError, escaped
+from tvsbayes.files.disk import read_arrays, read_bytes, shipped_data
+from tvsbayes.files.documents import parse_json
+from tvsbayes.instrument.axes import AXES
+from tvsbayes.instrument.campaign import Campaign, input_hashes
+
+CALIBRATION_FORMAT = "tvsbayes-calibration/1"
+NO_CALIBRATION = "no-calibration"
+"""Code of the refusal of results that are whole but hold no calibration."""
+RESULTS_BYTES_MAX = 64 * 1024 * 1024
+UNPACKED_BYTES_MAX = 2 * RESULTS_BYTES_MAX
+NAME_CHARS_MAX = 200
+_ARRAYS = ("mean", "covariance", "range_steps", "inputs", "noise", "cause_covariance")
+
+
+def calibration_bytes(calibration: Calibration, **more: np.ndarray) -> bytes:
+    """The content of `draws.npz`: a calibration and further arrays."""
+    texts = {name: getattr(calibration, name) for name in ("noise_variance", "overshoot_steps", "period_deg")}
+    texts |= {"inputs_sha256": calibration.inputs_sha256, "causes": list(calibration.causes)}
+    buffer = io.BytesIO()
+    np.savez_compressed(
+        buffer,
+        format=CALIBRATION_FORMAT,
+        input_names=np.array(INPUT_NAMES),
+        noise_names=np.array(NOISE_NAMES),
+        estimator=calibration.estimator,
+        azimuth=calibration.azimuth,
+        tables=json.dumps(texts),
+        **{name: getattr(calibration, name) for name in _ARRAYS},
+        **more,
+    )
+    return buffer.getvalue()
+
+
+def calibration_json(calibration: Calibration) -> dict[str, object]:
+    """A calibration without its draws, for a ROS node or another language; `load_calibration` reads it."""
+    return {
+        "format": CALIBRATION_FORMAT,
+        "estimator": calibration.estimator,
+        "aperture_convention": "azimuth" if calibration.azimuth else "in-plane",
+        "harmonic_period_deg": dict(calibration.period_deg),
+        "estimates": calibration.estimates,
+        "covariance": {"names": list(INPUT_NAMES), "matrix": calibration.covariance.tolist()},
+        "noise_variance_deg2": dict(calibration.noise_variance),
+        "overshoot_steps": dict(calibration.overshoot_steps),
+        "range_steps": dict(zip(AXES, calibration.range_steps.tolist(), strict=True)),
+        "inputs": dict(calibration.inputs_sha256),
+        "expected_error": expected_error(calibration),
+    }
+
+
+def expected_error(calibration: Calibration) -> dict[str, object]:
+    """95 % half widths that remain with this calibration, at the middle of the counters it was made with.
+
+    Of the beam's direction, and of its position at 1 m; every approach from left and up.
+    """
+    middle = [round(float(value)) for value in calibration.range_steps.mean(axis=1)]
+    angles = calibration._ray_u95(middle, (1.0, 1.0), None)
+    at_1_m = calibration._ray_u95(middle, (1.0, 1.0), 1000.0)
+    return {
+        "pan_steps": middle[0],
+        "tilt_steps": middle[1],
+        "u95_azimuth_deg": float(angles[0]),
+        "u95_elevation_deg": float(angles[1]),
+        "u95_at_1_m_mm": at_1_m.tolist(),
+    }
+
+
+def calibration_header(calibration: Calibration) -> str:
+    """A C header with the estimates and the beam as a function of the counters, for a Teensy and its like."""
+    template = (shipped_data() / "export" / "tvs_calibration.h").read_text()
+    error = expected_error(calibration)
+    macro = {name: "TVS_" + name.replace(".", "_").upper() for name in INPUT_NAMES}
+    lines = [f"#define {macro[name]} {value!r}" for name, value in calibration.estimates.items()]
+    for axis in AXES:
+        lines.append(f"#define TVS_PERIOD_{axis.upper()}_DEG {float(calibration.period_deg.get(axis, 0.0))!r}")
+        lines.append(f"#define TVS_OVERSHOOT_{axis.upper()}_STEPS {calibration.overshoot_steps[axis]}")
+    lines.append(f"#define TVS_AZIMUTH_CONVENTION {int(calibration.azimuth)}")
+    stated = (
+        f"Expected error ({calibration.estimator}, 95 %) at pan {error['pan_steps']}, tilt {error['tilt_steps']} "
+        f"steps: azimuth {error['u95_azimuth_deg']:.3f} deg, elevation {error['u95_elevation_deg']:.3f} deg; "
+        f"at 1 m {max(error['u95_at_1_m_mm']):.2f} mm."
+    )
+    return template.replace("@EXPECTED_ERROR@", stated).replace("@VALUES@", "\n".join(lines))
+
+
+def load_calibration(path: Path | str) -> Calibration:
+    """Load what a robot needs, with NumPy alone.
+
+    Args:
+        path: a campaign folder with `results/`, its `results` folder, a `draws.npz`, or the JSON that
+            `tvsbayes steps-for CAMPAIGN --export json` prints.
+
+    Returns:
+        A calibration: `.ray(pan_steps, tilt_steps)` is the beam, `.locate(..., aperture_deg)` the point in mm with
+        its covariance, `.steps_for(xyz_mm)` the counters to go to; from JSON without the draws that
+        `tvsbayes.locate` needs.
+
+    Raises:
+        InputError: there is no such file, or it is not what tvsbayes wrote.
+    """
+    path = Path(path)
+    if path.is_dir():
+        inner = path / "results" / "draws.npz"
+        path = inner if inner.exists() or not (path / "draws.npz").exists() else path / "draws.npz"
+    if path.suffix == ".json":
+        return _from_json(path)
+    return read_draws(path)
+
+
+def damaged_calibration(path: Path, reason: object) -> InputError:
+    return InputError(
+        "damaged-results",
+        f"{escaped(path.name)} is not a calibration that tvsbayes wrote: {escaped(str(reason), 200)}",
+        file=escaped(path.name),
+        allowed=f"format {CALIBRATION_FORMAT}",
+        remedy="run `tvsbayes fit` on the campaign again",
+    )
+
+
+def _shaped(calibration: Calibration) -> Calibration:
+    """Refuse arrays of other shapes or with values that are not finite."""
+    n, count = len(calibration.inputs), len(INPUT_NAMES)
+    shapes = {"mean": (count,), "covariance": (count, count), "range_steps": (2, 2), "inputs": (n, count)}
+    shapes |= {"noise": (n, len(NOISE_NAMES)), "cause_covariance": (len(calibration.causes), count, count)}
+    for name, shape in shapes.items():
+        array = getattr(calibration, name)
+        if array.shape != shape or array.dtype != np.float64 or not np.all(np.isfinite(array)):
+            raise ValueError(f"{name} has shape {array.shape}, wanted {shape} of finite numbers")
+    for text in (calibration.estimator, *calibration.causes):
+        # They are printed: on terminals, in reports.
+        if not (isinstance(text, str) and len(text) <= NAME_CHARS_MAX and text.isprintable()):
+            raise ValueError("a name of an estimator or cause is no plain text")
+    if not set(NOISE_NAMES) <= set(calibration.noise_variance) or not set(AXES) <= set(calibration.overshoot_steps):
+        raise ValueError("a noise variance or an overshoot is missing")
+    if not all(math.isfinite(variance) and variance >= 0 for variance in calibration.noise_variance.values()):
+        raise ValueError("a noise variance is no variance")
+    if not all(isinstance(steps, int) and steps >= 0 for steps in calibration.overshoot_steps.values()):
+        raise ValueError("an overshoot is no number of steps")
+    if not all(math.isfinite(period) and period > 0 for period in calibration.period_deg.values()):
+        raise ValueError("a period of a transmission error is not positive")
+    return calibration
+
+
+def read_draws(path: Path) -> Calibration:
+    """Read `draws.npz`; errors as in `load_calibration`."""
+    try:
+        file = read_arrays(path, RESULTS_BYTES_MAX, UNPACKED_BYTES_MAX)
+        if "format" not in file and "physical" in file:
+            raise InputError(
+                NO_CALIBRATION,
+                f"{escaped(path.name)} holds draws and no calibration: the fit behind it did not converge, or an "
+                "older tvsbayes made it",
+                file=escaped(path.name),
+                remedy="run `tvsbayes fit` on the campaign again",
+            )
+        columns = (file["input_names"].tolist(), file["noise_names"].tolist())
+        if str(file["format"]) != CALIBRATION_FORMAT or columns != (list(INPUT_NAMES), list(NOISE_NAMES)):
+            raise ValueError(f"format {str(file['format'])[:60]!r} or other columns")
+        tables = _tables(str(file["tables"]), path)
+        return _shaped(
+            Calibration(
+                **{name: file[name] for name in _ARRAYS},
+                **{name: tables[name] for name in ("noise_variance", "overshoot_steps", "period_deg")},
+                azimuth=bool(file["azimuth"]),
+                estimator=str(file["estimator"]),
+                inputs_sha256=tables["inputs_sha256"],
+                causes=tuple(tables["causes"]),
+            )
+        )
+    except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
+        raise damaged_calibration(path, error) from error
+
+
+def _tables(text: str, path: Path) -> dict[str, object]:
+    try:
+        return parse_json(text.encode(), escaped(path.name)).values
+    except InputError as error:
+        raise damaged_calibration(path, f"its tables are no JSON of tvsbayes: {error.found}") from error
+
+
+def _from_json(path: Path) -> Calibration:
+    keys = parse_json(read_bytes(path, RESULTS_BYTES_MAX), escaped(path.name))
+    keys.word("format", (CALIBRATION_FORMAT,))
+    convention = keys.word("aperture_convention", ("in-plane", "azimuth"))
+    try:
+        d = keys.values
+        if tuple(d["covariance"]["names"]) != INPUT_NAMES:
+            raise ValueError("the covariance names other inputs")
+        return _shaped(
+            Calibration(
+                mean=np.array([d["estimates"][name] for name in INPUT_NAMES], dtype=float),
+                covariance=np.array(d["covariance"]["matrix"], dtype=float),
+                noise_variance={name: float(value) for name, value in d["noise_variance_deg2"].items()},
+                overshoot_steps={axis: int(value) for axis, value in d["overshoot_steps"].items()},
+                azimuth=convention == "azimuth",
+                period_deg={axis: float(value) for axis, value in d["harmonic_period_deg"].items()},
+                estimator=str(d["estimator"]),
+                range_steps=np.array([d["range_steps"][axis] for axis in AXES], dtype=float),
+                inputs_sha256=dict(d["inputs"]),
+            )
+        )
+    except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
+        raise damaged_calibration(path, error) from error
+
+
+def stored_calibration(campaign: Campaign) -> Calibration | None:
+    """The calibration in `results/` of a campaign folder, if it was made from exactly these data and priors.
+
+    None also where the results hold no calibration (`NO_CALIBRATION`).
+
+    Raises:
+        InputError: there are results, but damaged.
+    """
+    path = None if campaign.path is None else campaign.path / "results" / "draws.npz"
+    if path is None or not path.exists():
+        return None
+    try:
+        calibration = read_draws(path)
+    except InputError as error:
+        if error.code == NO_CALIBRATION:
+            return None
+        raise
+    return calibration if calibration.inputs_sha256 == input_hashes(campaign) else None
+
+
+def stored_ratios(campaign: Campaign) -> np.ndarray:
+    """Draws (n, 4) of the effective ratios left, right, up, down in `results/`, deg/step.
+
+    Raises:
+        InputError: missing or damaged.
+    """
+    path = campaign.path / "results" / "draws.npz"
+    try:
+        file = read_arrays(path, RESULTS_BYTES_MAX, UNPACKED_BYTES_MAX)
+        draws = np.array(file["effective_deg_per_step"], dtype=float)
+    except (KeyError, TypeError, ValueError) as error:
+        raise damaged_calibration(path, error) from error
+    if draws.ndim != 2 or draws.shape[1] != 4 or not np.all(np.isfinite(draws)):
+        raise damaged_calibration(path, ValueError("effective_deg_per_step"))
+    return draws

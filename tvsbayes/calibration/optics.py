@@ -1,0 +1,129 @@
+"""Beam and range in components, NumPy."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import numpy as np
+
+from tvsbayes.instrument.axes import FULL_TURN_DEG
+
+ROUNDING = 1e-12
+"""Of coordinates, relative to the range."""
+TO_RAD = math.pi / 180
+
+
+def _harmonic(values: Mapping[str, object], axis: str, angle_deg, period_deg: float, m):
+    """Transmission error at an angle, degrees (DESIGN 3.1)."""
+    total = 0.0
+    for order in (1, 2):
+        phase = 2 * math.pi * order * angle_deg / period_deg
+        total = total + values[f"harmonic_deg.{axis}.{order}.cos"] * m.cos(phase)
+        total = total + values[f"harmonic_deg.{axis}.{order}.sin"] * m.sin(phase)
+    return total
+
+
+def output_deg(values: Mapping[str, object], axis: str, steps, side: float, period_deg: float | None, m=np):
+    """Mirror angle of an axis after homing: q = k n, play taken up on the approach side (DESIGN 3.1).
+
+    Args:
+        values: parameters by name; floats, or arrays of one shape.
+        axis: pan or tilt.
+        steps: absolute counter.
+        side: +1 reached left or up, -1 right or down, 0 somewhere in the play.
+        period_deg: period of the transmission error, None without one.
+        m: `math` for floats, `numpy` for arrays.
+    """
+    q = values[f"degrees_per_step.{axis}"] * steps
+    if period_deg is not None and period_deg != FULL_TURN_DEG:
+        q = q + _harmonic(values, axis, q, period_deg, m)
+    output = q - 0.5 * side * values[f"backlash_deg.{axis}"]
+    if period_deg == FULL_TURN_DEG:
+        output = output + _harmonic(values, axis, output, period_deg, m)
+    return output if axis == "pan" else output + values["tilt_zero_deg"]
+
+
+def beam_components(values: Mapping[str, object], pan_deg, tilt_deg, m=np) -> tuple[tuple, tuple]:
+    """Origin (x, y, z) and direction (x, y, z) of the beam in frame T for mirror angles (DESIGN 3.2 and 2).
+
+    The laser is reflected in the turned pan stage and everything turned back at the end. Arguments as in
+    `output_deg`.
+    """
+    sin, cos, tan, sqrt = m.sin, m.cos, m.tan, m.sqrt
+    psi, beta = pan_deg * TO_RAD, tilt_deg * TO_RAD
+    sin_psi, cos_psi = sin(psi), cos(psi)
+    tx, ty = tan(values["laser_tilt_deg.x"] * TO_RAD), tan(values["laser_tilt_deg.y"] * TO_RAD)
+    length = sqrt(1.0 + tx * tx + ty * ty)
+    ox, oy = values["laser_offset_mm.x"], values["laser_offset_mm.y"]
+    x, y, z = cos_psi * ox + sin_psi * oy, cos_psi * oy - sin_psi * ox, 0.0
+    u, v, w = (cos_psi * tx + sin_psi * ty) / length, (cos_psi * ty - sin_psi * tx) / length, -1.0 / length
+
+    first = (45.0 + values["mirror1_error_deg"]) * TO_RAD
+    ny, nz = -sin(first), cos(first)
+    along = v * ny + w * nz
+    reach = -(y * ny) / along
+    x, y, z = x + reach * u, y + reach * v, reach * w
+    v, w = v - 2 * along * ny, w - 2 * along * nz
+
+    second, skew = (45.0 + values["mirror2_error_deg"]) * TO_RAD, values["tilt_axis_skew_deg"] * TO_RAD
+    sin_m, cos_m, sin_s, cos_s = sin(second), cos(second), sin(skew), cos(skew)
+    nx, up = sin_m * cos(beta), sin_m * sin(beta)
+    ny, nz = cos_m * cos_s - up * sin_s, cos_m * sin_s + up * cos_s
+    along = u * nx + v * ny + w * nz
+    cx, cy, cz = values["tilt_axis_offset_mm.x"], -values["mirror_offset_mm"], values["tilt_axis_offset_mm.z"]
+    reach = ((cx - x) * nx + (cy - y) * ny + (cz - z) * nz) / along
+    x, y, z = x + reach * u, y + reach * v, z + reach * w
+    u, v, w = u - 2 * along * nx, v - 2 * along * ny, w - 2 * along * nz
+
+    turn = psi + (values["pan_zero_emission_deg"] - 90.0) * TO_RAD
+    sin_t, cos_t = sin(turn), cos(turn)
+    origin = cos_t * x - sin_t * y, sin_t * x + cos_t * y + 0.5 * values["baseline_mm"], z
+    return origin, (cos_t * u - sin_t * v, sin_t * u + cos_t * v, w)
+
+
+def range_components(origin: tuple, direction: tuple, baseline_mm, aperture_deg, azimuth: bool, m=np):
+    """Range along the beam at which the aperture sees it under angle B, mm (derivation: `coordinates.meeting`).
+
+    Not a number where the beam misses the cone or half-plane of B; zero, negative or minus infinite where only its
+    backward extension or the other nappe is met.
+    """
+    x, y, z = origin
+    u, v, w = direction
+    y = y + 0.5 * baseline_mm
+    sin_b, cos_b = m.sin(aperture_deg * TO_RAD), m.cos(aperture_deg * TO_RAD)
+    if azimuth:
+        closing = u * cos_b - v * sin_b
+        if m is math and closing == 0:
+            return math.inf
+        reach = (y * sin_b - x * cos_b) / closing
+        ahead = (x + reach * u) * sin_b + (y + reach * v) * cos_b
+        # The other half of B's plane is behind the aperture.
+        return (reach if ahead >= 0 else math.nan) if m is math else np.where(ahead >= 0, reach, np.nan)
+    mx, my, mz = y * w - z * v, z * u - x * w, x * v - y * u
+    inside = (mx * mx + mz * mz) * sin_b * sin_b - my * my * cos_b * cos_b
+    if m is math:
+        if inside < 0:
+            return math.nan
+        root = math.sqrt(inside)
+    else:
+        # A complex step would find a root of a negative number.
+        root = np.sqrt(np.where(np.real(inside) < 0, np.nan, inside))
+    across = x * u + y * v + z * w
+    reach = y * y - cos_b * cos_b * (x * x + y * y + z * z)
+    closing = cos_b * root - (y * v - cos_b * cos_b * across)
+    if m is math and closing == 0:
+        return math.inf
+    with np.errstate(divide="ignore", invalid="ignore"):
+        reach = reach / closing
+        # At B = 90 deg both nappes are one plane, and y is nought but for rounding.
+        faces = (y + reach * v) * cos_b >= -ROUNDING * abs(reach * cos_b)
+    return (reach if faces else -math.inf) if m is math else np.where(faces | np.isnan(reach), reach, -np.inf)
+
+
+def aperture_angle_deg(point: tuple, baseline_mm, azimuth: bool, m=np):
+    """The angle B of a point (x, y, z) of frame T at the aperture, degrees, without the aperture's zero."""
+    x, y, z = point
+    lateral = x if azimuth else m.hypot(x, z)
+    arc_tangent = math.atan2 if m is math else np.arctan2
+    return arc_tangent(lateral, y + 0.5 * baseline_mm) / TO_RAD

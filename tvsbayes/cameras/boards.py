@@ -1,0 +1,376 @@
+"""Checkerboards in pictures: which files are a pair, where the inner corners are, in an order both cameras share.
+
+Corners are px with the integer at a pixel's centre, shape (corners, 2), row by row. The board's frame: origin in the
+middle, x along the columns, y along the rows, z away from the viewer, mm. Pictures pass the checks of `files` before
+they are decoded. OpenCV's corner arrays have another rank in 5.x than in 4.x: each is reshaped as it arrives. No JAX.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import re
+from collections import Counter
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import cv2
+import numpy as np
+
+from tvsbayes.errors import InputError, NothingToEstimate, escaped, refusal
+from tvsbayes.files.disk import read_bytes
+from tvsbayes.files.images import IMAGE_BYTES_MAX, image_size, read_image
+
+SIDES: tuple[Literal["left"], Literal["right"]] = ("left", "right")
+Finder = Literal["classic", "sector"]
+SUFFIXES = (".png", ".jpg", ".jpeg")
+SIDE_BY_SIDE_RATIO = 2.0
+"""Width over height from which a picture that is named neither left nor right holds both cameras' images."""
+REFINING_SHARE = 0.25
+"""Half the window of cornerSubPix over the smallest distance of two corners: the window must hold one corner only,
+and a wide one averages more noise. On OpenCV's pairs (22 to 37 px) fixed halves of 3, 5, 7, 9, 11 px leave 0.23,
+0.20, 0.18, 0.20, 0.41 px: the best is a quarter of the distance, and from half on neighbours pull."""
+WIDEST_SHARE = 0.5
+"""The same share, where the narrower window loses a corner: beyond it neighbours are inside."""
+REFINING_HALF_MIN, REFINING_HALF_MAX = 2, 11
+WORKERS_MAX = 8
+PICTURES_MAX = 2000
+PIXELS_MAX = 20_000_000
+"""Of one picture, and of those that are searched at the same time: one of 20 million takes 0.8 GB to search."""
+SECTOR_PIXELS_MAX = 3_000_000
+"""Larger pictures are searched by sectors in a smaller copy, then refined: 20 million pixels would take 3.8 GB and half
+a minute."""
+
+
+@dataclass(frozen=True)
+class Board:
+    """A checkerboard by its inner corners.
+
+    Attributes:
+        columns: inner corners along the board's x.
+        rows: inner corners along y.
+        pitch_mm: side of a square.
+        pitch_u_mm: standard uncertainty of the mean pitch (GUM type B: certificate, ruler, printer).
+    """
+
+    columns: int
+    rows: int
+    pitch_mm: float
+    pitch_u_mm: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not (3 <= self.columns <= 100 and 3 <= self.rows <= 100):
+            found = f"{self.columns} x {self.rows} inner corners"
+            raise _bad_option("--board", found, "3 to 100 inner corners each way", "count where four squares meet")
+        if not 0.01 <= self.pitch_mm <= 1e4:
+            raise _bad_option("--pitch-mm", f"{self.pitch_mm:g} mm", "0.01 to 10000 mm", "give the side of a square")
+        if not 0 <= self.pitch_u_mm < 0.1 * self.pitch_mm:
+            found = f"{self.pitch_u_mm:g} mm"
+            raise _bad_option("--pitch-u-mm", found, "0 to a tenth of the pitch", "give it for one square, not all")
+
+    @classmethod
+    def named(cls, size: str, pitch_mm: float, pitch_u_mm: float = 0.0) -> Board:
+        """From text such as "9x6".
+
+        Raises:
+            InputError: no such text, or impossible values.
+        """
+        match = re.fullmatch(r"([0-9]{1,3})\s*[xX*]\s*([0-9]{1,3})", size.strip())
+        if match is None:
+            raise _bad_option("--board", escaped(size), "COLUMNSxROWS of inner corners", "write for example 9x6")
+        return cls(int(match[1]), int(match[2]), pitch_mm, pitch_u_mm)
+
+    @property
+    def corners(self) -> int:
+        """Number of inner corners."""
+        return self.columns * self.rows
+
+    @property
+    def points_mm(self) -> np.ndarray:
+        """Inner corners in the board's frame, shape (corners, 3), row by row, z = 0, origin in the middle."""
+        grid = np.mgrid[: self.columns, : self.rows].T.reshape(-1, 2) - [(self.columns - 1) / 2, (self.rows - 1) / 2]
+        return np.column_stack([self.pitch_mm * grid, np.zeros(self.corners)])
+
+
+def _bad_option(option: str, found: str, allowed: str, remedy: str) -> InputError:
+    return InputError(
+        "usage",
+        f"{option}: found {found}; allowed: {allowed}",
+        column=option,
+        found=found,
+        allowed=allowed,
+        remedy=remedy,
+    )
+
+
+@dataclass(frozen=True)
+class View:
+    """Corners of the board at one pose: `left` and `right` of shape (corners, 2), px, row by row; None where unseen."""
+
+    name: str
+    left: np.ndarray | None
+    right: np.ndarray | None
+
+
+@dataclass(frozen=True)
+class Views:
+    """What a folder of pictures holds.
+
+    Attributes:
+        views: with the board in at least one picture, in the order of their names.
+        image_width: of one camera, px.
+        image_height: px.
+        unpaired: pictures of one camera without their counterpart; where they show the board, they are in `views`.
+        without_board: pictures in which no board was found.
+        other_size: pictures of another size than most; not used.
+        by_fallback: pictures whose board only the other finder found.
+        reordered: views whose right corners were turned to agree with the left ones.
+    """
+
+    views: tuple[View, ...]
+    image_width: int
+    image_height: int
+    unpaired: tuple[str, ...] = ()
+    without_board: tuple[str, ...] = ()
+    other_size: tuple[str, ...] = ()
+    by_fallback: tuple[str, ...] = ()
+    reordered: tuple[str, ...] = ()
+
+
+def find_corners(grey: np.ndarray, board: Board, finder: Finder = "classic") -> tuple[np.ndarray, bool] | None:
+    """Inner corners of a board in one picture.
+
+    `classic` is findChessboardCorners refined by cornerSubPix, `sector` findChessboardCornersSB (Duda and Frese
+    2018, sector based; slower). Where one fails, the other is tried.
+
+    Args:
+        grey: (height, width) uint8.
+        board: what to look for.
+        finder: which to try first.
+
+    Returns:
+        Corners (corners, 2), px, right-handed (x, then y, turn towards the image's own x, y), and whether the
+        fallback found them; None where neither did.
+    """
+    for attempt in (finder, "sector" if finder == "classic" else "classic"):
+        corners = _find_classic(grey, board) if attempt == "classic" else _find_sector(grey, board)
+        if corners is None or not np.isfinite(corners).all():
+            continue
+        grid = corners.reshape(board.rows, board.columns, 2)
+        along, across = (grid[:, -1] - grid[:, 0]).mean(0), (grid[-1] - grid[0]).mean(0)
+        # A board is not transparent: seen from the front, rows turn the same way in every picture.
+        if along[0] * across[1] - along[1] * across[0] < 0:
+            grid = grid[:, ::-1]
+        return grid.reshape(-1, 2), attempt != finder
+    return None
+
+
+def _find_classic(grey: np.ndarray, board: Board) -> np.ndarray | None:
+    found, corners = cv2.findChessboardCorners(grey, (board.columns, board.rows))
+    if not found or corners is None or np.size(corners) != 2 * board.corners:
+        return None
+    return _refined(grey, np.asarray(corners, np.float32).reshape(-1, 2), board)
+
+
+def _refined(grey: np.ndarray, corners: np.ndarray, board: Board) -> np.ndarray:
+    """Corners (n, 2) by cornerSubPix, in a window that fits their distances."""
+    grid = corners.reshape(board.rows, board.columns, 2)
+    nearest = min(np.linalg.norm(np.diff(grid, axis=axis), axis=2).min() for axis in (0, 1))
+    half = int(np.clip(round(REFINING_SHARE * nearest), REFINING_HALF_MIN, REFINING_HALF_MAX))
+    criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 100, 1e-4)
+    # A corner whose search leaves the window is given back as it came, off by pixels (steeply seen boards): widen
+    # the window then, up to the neighbours, whose distance is itself known to pixels only.
+    for size in range(half, max(half + 1, int(WIDEST_SHARE * nearest)) + 1):
+        refined = cv2.cornerSubPix(grey, corners.reshape(-1, 1, 2).copy(), (size, size), (-1, -1), criteria)
+        refined = np.asarray(refined).reshape(-1, 2)
+        if (refined != corners).any(axis=1).all():
+            break
+    return refined.astype(float)
+
+
+def _find_sector(grey: np.ndarray, board: Board) -> np.ndarray | None:
+    flags = cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY
+    shrink = math.ceil(math.sqrt(grey.size / SECTOR_PIXELS_MAX))
+    small = grey if shrink == 1 else cv2.resize(grey, None, fx=1 / shrink, fy=1 / shrink, interpolation=cv2.INTER_AREA)
+    found, corners = cv2.findChessboardCornersSB(small, (board.columns, board.rows), flags=flags)
+    if not found or corners is None or np.size(corners) != 2 * board.corners:
+        return None
+    corners = np.asarray(corners, float).reshape(-1, 2)
+    if shrink == 1:
+        return corners
+    scale = np.array(grey.shape[::-1]) / small.shape[::-1]
+    return _refined(grey, ((corners + 0.5) * scale - 0.5).astype(np.float32), board)
+
+
+def _turns(board: Board) -> list[np.ndarray]:
+    """Corner orders that a finder may give to one picture of the board: half turns, for square ones quarter turns."""
+    index = np.arange(board.corners).reshape(board.rows, board.columns)
+    quarters = (0, 1, 2, 3) if board.rows == board.columns else (0, 2)
+    return [np.rot90(index, quarter).ravel() for quarter in quarters]
+
+
+def _first_colour(grey: np.ndarray, corners: np.ndarray, board: Board) -> bool:
+    """Whether the square behind the first corner is brighter than its neighbours, by all squares."""
+    grid = corners.reshape(board.rows, board.columns, 2)
+    middles = (grid[:-1, :-1] + grid[1:, :-1] + grid[:-1, 1:] + grid[1:, 1:]) / 4
+    u, v = np.clip(np.rint(middles).astype(int), 0, np.array(grey.shape[::-1]) - 1).transpose(2, 0, 1)
+    signs = 1 - 2 * (np.add.outer(np.arange(board.rows - 1), np.arange(board.columns - 1)) % 2)
+    values = grey[v, u].astype(float)
+    return bool(np.sum(signs * (values - values.mean())) > 0)
+
+
+@dataclass(frozen=True)
+class _Detection:
+    """Corners of one picture; `colours[k]` is the first square's under the k-th order of `_turns`."""
+
+    corners: np.ndarray
+    colours: tuple[bool, ...]
+    by_fallback: bool
+
+
+def _agreeing(left: _Detection, right: _Detection, board: Board) -> tuple[np.ndarray, bool]:
+    """Right corners in the order of the left ones, and whether they were turned.
+
+    The colours decide where the board's turned image differs from it (one of columns and rows odd, one even).
+    Otherwise the two cameras are taken to be turned by less than half of the board's symmetry against each other.
+    """
+    grids = [right.corners[turn].reshape(board.rows, board.columns, 2) for turn in _turns(board)]
+    kept = [k for k, colour in enumerate(right.colours) if colour == left.colours[0]] or list(range(len(grids)))
+    grid = left.corners.reshape(board.rows, board.columns, 2)
+    along = (grid[:, -1] - grid[:, 0]).mean(0)
+    best = max(kept, key=lambda k: float(along @ _unit((grids[k][:, -1] - grids[k][:, 0]).mean(0))))
+    return grids[best].reshape(-1, 2), best != 0
+
+
+def _unit(vector: np.ndarray) -> np.ndarray:
+    return vector / max(float(np.linalg.norm(vector)), 1e-12)
+
+
+def _natural(name: str) -> list[tuple[int, str]]:
+    """Sorts 2 before 10."""
+    return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"([0-9]{1,18})", name.lower())]
+
+
+@dataclass(frozen=True)
+class _Picture:
+    """A file and whose images its equal parts, from left to right, are."""
+
+    view: str
+    path: Path
+    sides: tuple[str, ...]
+
+
+def _pictures(folder: Path, swap: bool) -> list[_Picture]:
+    """The pictures of a folder: `left*` and `right*`, or where there are none, wide frames of both cameras."""
+    try:
+        names = sorted((entry.name for entry in os.scandir(folder)), key=_natural)
+    except OSError as error:
+        place, remedy = escaped(str(folder), 200), "name the folder of the checkerboard pictures"
+        found, allowed = escaped(error.strerror or str(error)), "a readable folder"
+        raise refusal("unreadable", file=place, found=found, allowed=allowed, remedy=remedy) from error
+    images = [Path(folder) / name for name in names if name.lower().endswith(SUFFIXES) and not name.startswith(".")]
+    if len(images) > PICTURES_MAX:
+        place, remedy = escaped(str(folder), 200), "20 to 100 views are plenty; move the others away"
+        found, allowed = f"{len(images)} pictures", f"at most {PICTURES_MAX}"
+        raise refusal("size", file=place, found=found, allowed=allowed, remedy=remedy)
+    sided = [
+        _Picture(path.stem[len(side) :], path, (side,))
+        for path in images
+        for side in SIDES
+        if path.stem.lower().startswith(side)
+    ]
+    twice = [key for key, count in Counter((p.view, p.sides) for p in sided).items() if count > 1]
+    if twice:
+        (view, (side,)), remedy = twice[0], "keep one file per camera and view"
+        found = f"two pictures {escaped(side + view)}"
+        raise refusal("duplicate", file=escaped(str(folder), 200), found=found, allowed="one", remedy=remedy)
+    if sided:
+        return sided
+    return [_Picture(path.stem, path, SIDES[::-1] if swap else SIDES) for path in images]
+
+
+def find_views(folder: Path, board: Board, *, finder: Finder = "classic", swap: bool = False) -> Views:
+    """Finds the board in all pictures of a folder.
+
+    `left*` and `right*` (PNG, JPEG) are paired by the rest of the name without its suffix. Where no file has such a
+    name, pictures at least twice as wide as high are split in the middle. Other files are ignored.
+
+    Args:
+        folder: of the pictures.
+        board: what to look for.
+        finder: see `find_corners`.
+        swap: the left camera's image is the right half of a wide frame.
+
+    Raises:
+        InputError: no folder, an unreadable picture, or two for one camera and view.
+        NothingToEstimate: no picture of a camera.
+    """
+    folder = Path(folder)
+    # Sizes first: the pictures of the majority are one calibration, and only those are decoded.
+    sizes = {
+        picture: image_size(read_bytes(picture.path, IMAGE_BYTES_MAX, folder), escaped(picture.path.name))
+        for picture in _pictures(folder, swap)
+    }
+    for picture, (width, height) in sizes.items():
+        if width * height > PIXELS_MAX:
+            place, found = escaped(picture.path.name), f"{width} x {height} pixels"
+            allowed = f"at most {PIXELS_MAX // 1_000_000} million pixels"
+            raise refusal("image-size", file=place, found=found, allowed=allowed, remedy="record smaller pictures")
+    sizes = {p: s for p, s in sizes.items() if len(p.sides) == 1 or (s[0] >= SIDE_BY_SIDE_RATIO * s[1])}
+    if not sizes:
+        raise NothingToEstimate(
+            "no-pictures",
+            f"{escaped(str(folder), 200)}: no checkerboard picture",
+            allowed="left*.png with right*.png (or .jpg), or frames of both cameras side by side",
+            remedy="name the pictures left01.png, right01.png, left02.png ...",
+        )
+    counted = Counter((width // len(p.sides), height) for p, (width, height) in sizes.items())
+    size = max(counted, key=lambda s: (counted[s], s))
+    used = [p for p, (width, height) in sizes.items() if (width // len(p.sides), height) == size]
+
+    def detect(picture: _Picture) -> dict[str, _Detection | None]:
+        grey = cv2.cvtColor(read_image(picture.path, folder), cv2.COLOR_BGR2GRAY)
+        parts = (grey[:, k * size[0] : (k + 1) * size[0]] for k in range(len(picture.sides)))
+        return {
+            side: _detection(np.ascontiguousarray(part), board, finder)
+            for side, part in zip(picture.sides, parts, strict=True)
+        }
+
+    found: dict[str, dict[str, _Detection]] = {}
+    names: dict[tuple[str, str], str] = {}
+    without, fallback = [], []
+    at_once = PIXELS_MAX // (size[0] * size[1] * max(len(p.sides) for p in used))
+    with ThreadPoolExecutor(max(1, min(WORKERS_MAX, os.cpu_count() or 1, at_once))) as pool:
+        for picture, detections in zip(used, pool.map(detect, used), strict=True):
+            for side, detection in detections.items():
+                name = picture.path.name + (f" ({side})" if len(picture.sides) > 1 else "")
+                names[picture.view, side] = name
+                if detection is None:
+                    without.append(name)
+                    continue
+                found.setdefault(picture.view, {})[side] = detection
+                if detection.by_fallback:
+                    fallback.append(name)
+    views, reordered = [], []
+    for name in sorted(found, key=_natural):
+        left, right = (found[name].get(side) for side in SIDES)
+        corners = None if right is None else right.corners
+        if left is not None and right is not None:
+            corners, turned = _agreeing(left, right, board)
+            reordered += [name] * turned
+        views.append(View(name, None if left is None else left.corners, corners))
+    lonely = [n for (view, side), n in names.items() if (view, SIDES[side == "left"]) not in names]
+    unpaired = sorted(lonely, key=_natural)
+    other_size = [p.path.name for p in sizes if p not in used]
+    return Views(tuple(views), *size, *(tuple(x) for x in (unpaired, without, other_size, fallback, reordered)))
+
+
+def _detection(grey: np.ndarray, board: Board, finder: Finder) -> _Detection | None:
+    result = find_corners(grey, board, finder)
+    if result is None:
+        return None
+    corners, by_fallback = result
+    colours = tuple(_first_colour(grey, corners[turn], board) for turn in _turns(board))
+    return _Detection(corners, colours, by_fallback)

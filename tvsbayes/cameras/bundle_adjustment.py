@@ -1,0 +1,292 @@
+"""Stereo calibration from checkerboard corners: Zhang's start, bundle adjustment with its 24 x 24 covariance.
+
+Frames: the board's x runs along its columns, y along its rows, z away from the viewer; poses are board to left camera
+(OpenCV's axes: x right, y down, z along the view), x_right = R x_left + T. mm, rad, px with the integer at a pixel's
+centre.
+
+Board poses are nuisances. At every trial of the camera parameters each board is moved to its own optimum, and the
+derivative of what remains is (1 - P) J, P the projector on the columns of that board's pose (variable projection:
+Golub and Pereyra 1973, in Kaufman's form of 1975). Its normal matrix is the Schur complement of the whole bundle
+adjustment: the least squares see 24 parameters whatever the number of views, and their covariance is marginal.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from tvsbayes.cameras.boards import Board, View
+from tvsbayes.errors import NotConverged, NothingToEstimate
+from tvsbayes.instrument.parameters import STEREO_PARAMETER_NAMES
+from tvsbayes.model.geometry import CV_FROM_S, StereoCameras, project, rotation_matrix
+from tvsbayes.statistics.least_squares import least_squares_covariance, levenberg_marquardt, residuals_and_jacobian
+
+VIEWS_PER_BUCKET, CORNERS_PER_BUCKET = 16, 32
+"""Padding: calibrations of like size share one compilation."""
+POSE_STEPS, POSE_TOLERANCE = 40, 1e-20
+"""Gauss-Newton steps of a pose, and the squared step, in units of rad and board sizes, at which it is settled."""
+TOLERANCE, STEPS_MAX = 1e-7, 200
+"""In whitened coordinates this ended within 1e-7 standard errors of the minimum; the end is checked all the same."""
+RESTART_SD = 3.0
+"""The repeated adjustment starts this many standard errors away in every parameter."""
+RESTART_AGREEMENT_SD = 1e-2
+STATIONARY_SD = 1e-3
+EXACT_PX = 1e-7
+"""Exact corners leave rounding errors, whose direction means nothing."""
+
+
+class BoardArrays(eqx.Module):
+    """Corners of all views, padded, and the coordinates of the adjustment: parameters = origin + root z.
+
+    Attributes:
+        points_mm: corners in the board's frame, first axis x, y, z.
+        corners_px: (u_left, v_left, u_right, v_right) of every view and corner.
+        weight: 1 where a corner was seen, else 0.
+        poses: start of every board's rotation vector and translation (board to left camera).
+        origin: the 24 parameters at z = 0.
+        root: d(parameters)/dz; a fixed parameter has a zero row and column, so that every choice of fixed ones
+            shares one compilation.
+    """
+
+    points_mm: Float[Array, "3 corners"]
+    corners_px: Float[Array, "views 4 corners"]
+    weight: Float[Array, "views 4 corners"]
+    poses: Float[Array, "views 6"]
+    origin: Float[Array, "24"]
+    root: Float[Array, "24 24"]
+
+
+def _cameras(parameters: Float[Array, "24"]) -> StereoCameras:
+    intrinsics = parameters[:18].reshape(2, 9)
+    return StereoCameras(
+        focal_px=intrinsics[:, 0:2],
+        centre_px=intrinsics[:, 2:4],
+        radial=intrinsics[:, jnp.array([4, 5, 8])],
+        tangential=intrinsics[:, 6:8],
+        rotation_rad=parameters[18:21],
+        translation_mm=parameters[21:24],
+        focal_scale=jnp.ones(()),
+    )
+
+
+def _view_residuals(
+    pose: Float[Array, "6"],
+    parameters: Float[Array, "24"],
+    corners_px: Float[Array, "4 corners"],
+    weight: Float[Array, "4 corners"],
+    points_mm: Float[Array, "3 corners"],
+) -> Float[Array, " residuals"]:
+    """Projected minus found corners of one view, px; 0 where none was seen."""
+    left = rotation_matrix(pose[:3]) @ points_mm + pose[3:, None]
+    return (weight * (project(_cameras(parameters), CV_FROM_S.T @ left) - corners_px)).ravel()
+
+
+def _pose_gain(pose, parameters, corners_px, weight, points_mm):
+    """Jacobian by the pose and its pseudo-inverse; zero for padding."""
+    by_pose = jax.jacfwd(_view_residuals)(pose, parameters, corners_px, weight, points_mm)
+    # Rotation in rad and translation in board sizes change corners alike; the ridge only serves padding.
+    size = jnp.max(jnp.abs(points_mm))
+    scale = jnp.concatenate([jnp.ones(3), size * jnp.ones(3)])
+    scaled = by_pose * scale
+    normal = scaled.T @ scaled
+    ridge = jnp.where(jnp.max(weight) > 0, 0.0, 1.0)
+    return by_pose, scale[:, None] * jnp.linalg.solve(normal + ridge * jnp.eye(6), scaled.T), scale
+
+
+def _settled_pose(pose, parameters, corners_px, weight, points_mm):
+    """The pose of least squares for given cameras, by Gauss-Newton steps from a pose nearby."""
+
+    def unsettled(state):
+        _, step2, steps = state
+        return (step2 > POSE_TOLERANCE) & (steps < POSE_STEPS)
+
+    def step(state):
+        pose, _, steps = state
+        _, gain, scale = _pose_gain(pose, parameters, corners_px, weight, points_mm)
+        change = gain @ _view_residuals(pose, parameters, corners_px, weight, points_mm)
+        return pose - change, jnp.sum((change / scale) ** 2), steps + 1
+
+    return jax.lax.while_loop(unsettled, step, (pose, jnp.asarray(jnp.inf), 0))[0]
+
+
+def _over_views(function):
+    return jax.vmap(function, in_axes=(0, None, 0, 0, None))
+
+
+def reduced_residuals(z: Float[Array, "24"], arrays: BoardArrays) -> Float[Array, " residuals"]:
+    """All residuals with every board at its optimum, px, as a function of the cameras alone.
+
+    Its derivative is (1 - P) J of the full problem: what a change of the cameras leaves after the boards have
+    followed.
+    """
+    parameters = arrays.origin + arrays.root @ z
+    seen = (arrays.corners_px, arrays.weight, arrays.points_mm)
+    fixed = jax.lax.stop_gradient(parameters)
+    poses = jax.lax.stop_gradient(_over_views(_settled_pose)(arrays.poses, fixed, *seen))
+    by_pose, gain, _ = jax.lax.stop_gradient(_over_views(_pose_gain)(poses, fixed, *seen))
+    residuals = _over_views(_view_residuals)(poses, parameters, *seen)
+    return (residuals - jnp.einsum("vrp,vps,vs->vr", by_pose, gain, residuals)).ravel()
+
+
+@dataclass(frozen=True)
+class Adjustment:
+    """Least squares over all views, poses eliminated.
+
+    Attributes:
+        vector: the 24 parameters in the order of `STEREO_PARAMETER_NAMES`.
+        covariance: (24, 24), type A, under `noise_sd_px` alone: independent corners.
+        residuals_px: projected minus found, shape (views, 4, corners), NaN where no corner was seen.
+        noise_sd_px: standard deviation of one corner coordinate, from the residuals.
+        dof: degrees of freedom behind it: coordinates - camera parameters - 6 per view.
+        correlation_factor: see `correlation_factor`.
+    """
+
+    vector: np.ndarray
+    covariance: np.ndarray
+    residuals_px: np.ndarray
+    noise_sd_px: float
+    dof: int
+    correlation_factor: float
+
+
+def correlation_factor(jacobian: np.ndarray, residuals: np.ndarray, views: np.ndarray, noise_sd: float) -> float:
+    """How much larger the scores of whole views are than independent corners would make them; at least 1.
+
+    Corner errors of one picture have common causes (light, defocus, a lens that is not quite the model, a bent
+    board): they are not independent, and (J^T J)^-1 s^2 is then too small. The score of view i, J_i^T r_i, shows
+    it: independent errors give the sum of |J_i^T r_i|^2 in coordinates where J^T J = 1 the expectation
+    s^2 (p - sum_i tr (J_i^T J_i)^2), the second term for the residuals having been fitted. The ratio scales the
+    covariance: the cluster-robust variance of Liang and Zeger (1986) reduced to one number, since a dozen views
+    cannot support a 24 x 24 matrix of them. Errors common to ALL views stay unseen.
+
+    Args:
+        jacobian: (residuals, p), of full rank.
+        residuals: (residuals,).
+        views: (residuals,), which view each belongs to, numbered from 0.
+        noise_sd: s.
+    """
+    q, _ = np.linalg.qr(jacobian / np.linalg.norm(jacobian, axis=0))
+    count = int(views.max()) + 1
+    score, lost = 0.0, 0.0
+    for view in range(count):
+        rows = q[views == view]
+        score += float(np.sum((rows.T @ residuals[views == view]) ** 2))
+        lost += float(np.sum((rows.T @ rows) ** 2))
+    expected = noise_sd**2 * (q.shape[1] - lost)
+    return max(1.0, score / expected) if expected > 1e-3 * noise_sd**2 else 1.0
+
+
+def bundle_adjustment(
+    views: Sequence[View], board: Board, start: np.ndarray, poses: np.ndarray, free: np.ndarray
+) -> Adjustment:
+    """Least squares of all corners over cameras and board poses, checked at its end and repeated from another start.
+
+    Args:
+        views: at least one.
+        board: whose corners they hold.
+        start: the 24 parameters.
+        poses: (views, 6), board to left camera.
+        free: (24,) of bool; the others keep their start.
+
+    Raises:
+        NothingToEstimate: the views leave a combination of parameters open.
+        NotConverged: no minimum was found.
+    """
+    count = -(-len(views) // VIEWS_PER_BUCKET) * VIEWS_PER_BUCKET
+    corners = -(-board.corners // CORNERS_PER_BUCKET) * CORNERS_PER_BUCKET
+    seen, weight = np.zeros((count, 4, corners)), np.zeros((count, 4, corners))
+    start_poses, points = np.zeros((count, 6)), np.zeros((3, corners))
+    start_poses[:, 5] = 1.0
+    start_poses[: len(views)] = poses
+    points[:, : board.corners] = board.points_mm.T
+    for k, view in enumerate(views):
+        for side, found in enumerate((view.left, view.right)):
+            if found is not None:
+                seen[k, 2 * side : 2 * side + 2, : board.corners] = found.T
+                weight[k, 2 * side : 2 * side + 2, : board.corners] = 1.0
+    kept = (weight > 0).ravel()
+    view_of = np.repeat(np.arange(count), 4 * corners)[kept]
+    dof = int(kept.sum()) - int(free.sum()) - 6 * len(views)
+    if dof < 1:
+        raise undetermined("fewer corner coordinates than unknowns")
+    with jax.enable_x64(True):
+        unit = np.diag(free.astype(float))
+        arrays = BoardArrays(*map(jnp.asarray, (points, seen, weight, start_poses, np.asarray(start, float), unit)))
+        zero = np.zeros(24)
+        jacobian = np.asarray(residuals_and_jacobian(reduced_residuals, jnp.asarray(zero), arrays)[1])
+        # Whitened at the start: a unit of z is one standard error for corners of 1 px. In their own units a focal
+        # length and a k3 would share one damping.
+        root = np.zeros((24, 24))
+        root[np.ix_(free, free)] = _whitening(jacobian[:, free], np.flatnonzero(free))
+        arrays = replace(arrays, root=jnp.asarray(root))
+        value, residuals, jacobian = _descended(zero, arrays)
+        noise_sd = math.sqrt(float(residuals @ residuals) / dof)
+        # Alternating signs, so that no parameter's shift can be taken up by another's.
+        shift = RESTART_SD * noise_sd * np.where(np.arange(24) % 2, -1.0, 1.0) * free
+        again = _descended(value + shift, arrays)[0]
+        jacobian, residuals = jacobian[kept][:, free], residuals[kept]
+        # What the linear model would still move, and where the repetition ended, both as distances in standard errors
+        # whatever the conditioning: |J dz| / s.
+        left = float(np.linalg.norm(np.linalg.qr(jacobian)[0].T @ residuals))
+        apart = float(np.linalg.norm(jacobian @ (again - value)[free]))
+        problems = []
+        if not left <= STATIONARY_SD * noise_sd + EXACT_PX:
+            problems.append(f"the next step would be {left / noise_sd:.2g} standard errors")
+        if not apart <= RESTART_AGREEMENT_SD * noise_sd + EXACT_PX:
+            problems.append("a second adjustment from a start nearby ended elsewhere")
+        if problems:
+            raise NotConverged(
+                "not-converged",
+                "the bundle adjustment did not converge: " + "; ".join(problems),
+                remedy="look at the pictures for wrong boards, a wrong --board, or add tilted views",
+            )
+        try:
+            z_covariance = least_squares_covariance(jacobian)
+        except np.linalg.LinAlgError as error:
+            raise undetermined(str(error)) from error
+    placed = np.full(weight.shape, np.nan)
+    placed[weight > 0] = residuals
+    factor = correlation_factor(jacobian, residuals, view_of, noise_sd)
+    return Adjustment(
+        vector=start + root @ value,
+        covariance=noise_sd**2 * root[:, free] @ z_covariance @ root[:, free].T,
+        residuals_px=placed[: len(views), :, : board.corners],
+        noise_sd_px=noise_sd,
+        dof=dof,
+        correlation_factor=factor,
+    )
+
+
+def _descended(z: np.ndarray, arrays: BoardArrays) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Where Levenberg-Marquardt ends, with residuals and Jacobian there."""
+    tolerance = jnp.asarray(TOLERANCE)
+    end = levenberg_marquardt(reduced_residuals, jnp.asarray(z), arrays, tolerance, STEPS_MAX)
+    residuals, jacobian = residuals_and_jacobian(reduced_residuals, end, arrays)
+    return np.asarray(end), np.asarray(residuals), np.asarray(jacobian)
+
+
+def undetermined(reason: str) -> NothingToEstimate:
+    return NothingToEstimate(
+        "undetermined",
+        f"the views do not determine the cameras: {reason}",
+        remedy="add views: the board tilted by 30 to 45 deg about both axes, near and far, all over the image",
+    )
+
+
+def _whitening(jacobian: np.ndarray, free: np.ndarray) -> np.ndarray:
+    """W with (J W)^T (J W) = 1."""
+    scale = np.linalg.norm(jacobian, axis=0)
+    if not np.isfinite(jacobian).all() or not (scale > 0).all():
+        raise undetermined(f"nothing depends on {STEREO_PARAMETER_NAMES[free[int(np.argmin(scale))]]}")
+    _, singular, vt = np.linalg.svd(jacobian / scale, full_matrices=False)
+    if singular[-1] < 1e-9 * singular[0]:
+        names = [STEREO_PARAMETER_NAMES[free[k]] for k in np.argsort(-np.abs(vt[-1]))[:3]]
+        raise undetermined(f"{', '.join(names)} can change together without moving a corner")
+    return (vt.T / singular) / scale[:, None]

@@ -1,0 +1,468 @@
+"""Stereo calibrations of other tools: OpenCV's YAML, ROS camera_info, Kalibr camchains; and our own `stereo.json`.
+
+Read by an own strict reader of the small part of YAML that these tools write: block maps, lists of numbers, OpenCV's
+matrices. OpenCV's FileStorage has had memory errors on hostile files (CVE-2019-5063, -5064; opencv #28619), and YAML
+loaders refuse OpenCV's header and tags. No anchors, no aliases, no other tags, sizes capped before parsing.
+
+None of these formats carries an uncertainty. An import therefore gets `assumed_covariance` and `assumed = true`.
+Lengths in `Stereo` are mm; ROS and Kalibr write metres, OpenCV whatever unit the squares had.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from tvsbayes.errors import InputError, escaped, refusal, shown
+from tvsbayes.files.csv_table import NUMBER
+from tvsbayes.files.disk import decode, read_bytes
+from tvsbayes.files.documents import Keys
+from tvsbayes.instrument.stereo_pair import (
+    Stereo,
+    pair_doubts,
+    parse_stereo,
+    rotation_matrix,
+    rotation_vector,
+    stereo_bytes,
+)
+
+YAML_BYTES_MAX = 4 * 1024 * 1024
+YAML_ENTRIES_MAX = 200_000
+YAML_DEPTH_MAX = 3
+_MATRIX_TAG = "!!opencv-matrix"
+_KEY = re.compile(r"""([ ]*)(?:"([^"]{1,80})"|([A-Za-z_][\w.-]{0,79}))[ ]*:(?:[ ]+(.*))?""", re.ASCII)
+_TOKEN = re.compile(r"""\s*(\[|\]|,|"[^"]*"|'[^']*'|[^\s\[\],"']+)""")
+_WORD = re.compile(r"[\w./+-]{1,200}", re.ASCII)
+_ALLOWED = "key: value, nested keys, lists of numbers in [ ], OpenCV matrices"
+ROTATION_TOLERANCE = 1e-3
+"""R from a file of few digits may miss a rotation by this much; the nearest rotation is taken."""
+SHORTEST_MM = 1.0
+M_TO_MM = 1000.0
+ASSUMED_FOCAL = 0.01
+"""Standard uncertainty of fx, fy, cx, cy over the focal length."""
+ASSUMED_RADIAL = (0.04, 0.15, 0.15)
+"""Standard uncertainty of the share of k1, k2, k3 in a corner's distance from the image centre."""
+ASSUMED_TANGENTIAL = 0.003
+"""Standard uncertainty of p1 and p2, as a share of that distance."""
+ASSUMED_ROTATION_RAD = 0.01
+ASSUMED_TRANSLATION = 0.02
+"""Standard uncertainty of each component of T over |T|."""
+ASSUMED_RMS_PX = 0.5
+Format = Literal["opencv", "ros"]
+EXPORT_NAMES: dict[Format, tuple[str, str]] = {
+    "opencv": ("intrinsics.yml", "extrinsics.yml"),
+    "ros": ("left.yaml", "right.yaml"),
+}
+"""The files of an export."""
+
+
+@dataclass(frozen=True)
+class Imported:
+    """A calibration of another tool.
+
+    Attributes:
+        stereo: the pair, mm and px.
+        source: opencv, ros, kalibr or tvsbayes.
+        notes: what was assumed.
+        warnings: what makes it implausible (`pair_doubts`).
+    """
+
+    stereo: Stereo
+    source: str
+    notes: tuple[str, ...]
+    warnings: tuple[str, ...]
+
+
+def assumed_covariance(stereo: Stereo) -> np.ndarray:
+    """A pessimistic covariance (24, 24) for a calibration that came without one: independent parameters.
+
+    Standard uncertainties: 1 % of the focal length for fx, fy, cx, cy; for k1, k2, k3 what moves an image corner by
+    4, 15 and 15 % of its distance from the centre, for p1 and p2 by 0.3 %; 10 mrad for each component of R, 2 % of
+    |T| for each component of T. In every direction of parameter space this is more than the covariance of 13 views
+    at 640 x 480 (OpenCV's own pairs), errors shared by the corners of a picture included.
+    """
+    sds = []
+    for matrix in (stereo.M1, stereo.M2):
+        focal = matrix[[0, 1], [0, 1]]
+        corner = math.hypot(stereo.image_width / 2 / focal[0], stereo.image_height / 2 / focal[1])
+        k1, k2, k3 = (share / corner**power for share, power in zip(ASSUMED_RADIAL, (2, 4, 6), strict=True))
+        p = ASSUMED_TANGENTIAL / corner
+        sds += [*(ASSUMED_FOCAL * focal), *(ASSUMED_FOCAL * focal), k1, k2, p, p, k3]
+    sds += [ASSUMED_ROTATION_RAD] * 3 + [ASSUMED_TRANSLATION * float(np.linalg.norm(stereo.T))] * 3
+    return np.diag(np.square(sds))
+
+
+class _Lines:
+    """The lines of a YAML file that say something, with indentation and line numbers."""
+
+    def __init__(self, data: bytes, file: str):
+        if len(data) > YAML_BYTES_MAX:
+            found, allowed = f"{len(data)} bytes", f"at most {YAML_BYTES_MAX} bytes"
+            raise refusal("size", file=file, found=found, allowed=allowed, remedy="remove what is not needed")
+        self.file, self.text = file, decode(data, file)
+        self.lines: list[tuple[int, str]] = []
+        for number, line in enumerate(self.text.splitlines(), start=1):
+            first = not self.lines and re.fullmatch(r"%YAML[: ]1\.[012]\s*", line)
+            if not first and line.strip() not in ("", "---", "...") and not line.lstrip().startswith("#"):
+                self.lines.append((number, line.rstrip()))
+        self.at = 0
+        self.entries = 0
+
+    def bad(self, number: int, found: str, remedy: str = "write it as its own tool does") -> InputError:
+        return refusal("yaml", file=self.file, line=number, found=found, allowed=_ALLOWED, remedy=remedy)
+
+    def count(self, number: int, entries: int) -> None:
+        self.entries += entries
+        if self.entries > YAML_ENTRIES_MAX:
+            raise self.bad(number, f"more than {YAML_ENTRIES_MAX} entries")
+
+
+def _indent(line: str) -> int:
+    return len(line) - len(line.lstrip(" "))
+
+
+def _block(lines: _Lines, indent: int, depth: int) -> dict[str, object]:
+    """The map whose keys stand at `indent`."""
+    values: dict[str, object] = {}
+    while lines.at < len(lines.lines):
+        number, line = lines.lines[lines.at]
+        if _indent(line) < indent:
+            break
+        match = _KEY.fullmatch(line)
+        if match is None or _indent(line) != indent:
+            raise lines.bad(number, shown(line.strip()))
+        key, rest = match[2] or match[3], (match[4] or "").strip()
+        if key in values:
+            raise lines.bad(number, f"{shown(key)} twice", "remove one of them")
+        lines.count(number, 1)
+        lines.at += 1
+        values[key] = _value(lines, number, rest, indent, depth)
+    return values
+
+
+def _value(lines: _Lines, number: int, rest: str, indent: int, depth: int) -> object:
+    if rest.startswith("["):
+        # Counted piece by piece: a list of a million lines costs its own length only once.
+        pieces, open_brackets = [rest], rest.count("[") - rest.count("]")
+        while open_brackets > 0 and lines.at < len(lines.lines):
+            pieces.append(lines.lines[lines.at][1])
+            open_brackets += pieces[-1].count("[") - pieces[-1].count("]")
+            lines.at += 1
+        return _flow(lines, number, " ".join(pieces))
+    if rest and rest != _MATRIX_TAG:
+        return _scalar(lines, number, rest)
+    if lines.at == len(lines.lines):
+        return None
+    below, line = lines.lines[lines.at]
+    if not rest and re.match(r" *- ", line) and _indent(line) >= indent:
+        items, place = [], _indent(line)
+        while lines.at < len(lines.lines) and re.match(rf" {{{place}}}- ", lines.lines[lines.at][1]):
+            below, line = lines.lines[lines.at]
+            lines.at += 1
+            lines.count(below, 1)
+            item = line.lstrip(" ")[2:].strip()
+            if not item:
+                raise lines.bad(below, "an empty entry of a list")
+            items.append(_value(lines, below, item, place + 1, depth))
+        return items
+    if _indent(line) <= indent:
+        return None
+    if depth >= YAML_DEPTH_MAX:
+        raise lines.bad(below, f"keys nested deeper than {YAML_DEPTH_MAX}")
+    return _block(lines, _indent(line), depth + 1)
+
+
+def _flow(lines: _Lines, number: int, text: str) -> list[object]:
+    """A list in brackets, at most two deep."""
+    stack: list[list[object]] = []
+    done: list[object] | None = None
+    position, wanted = 0, True
+    while position < len(text):
+        match = _TOKEN.match(text, position)
+        if match is None or done is not None:
+            rest = text[position:].strip()
+            if not rest or rest.startswith("#"):
+                break
+            raise lines.bad(number, shown(rest))
+        token, position = match[1], match.end()
+        if token == "[":
+            if len(stack) == 2 or not wanted:
+                raise lines.bad(number, "brackets nested deeper than 2, or without a comma before")
+            stack.append([])
+        elif token == "]":
+            last = stack.pop()
+            wanted = False
+            if stack:
+                stack[-1].append(last)
+            else:
+                done = last
+        elif token == ",":
+            if wanted:
+                raise lines.bad(number, "a comma without an entry before it")
+            wanted = True
+        else:
+            if not wanted:
+                raise lines.bad(number, f"{shown(token)} without a comma before it")
+            lines.count(number, 1)
+            stack[-1].append(_scalar(lines, number, token))
+            wanted = False
+    if done is None:
+        raise lines.bad(number, "a list without its closing bracket")
+    return done
+
+
+def _scalar(lines: _Lines, number: int, text: str) -> object:
+    if text[0] in "\"'":
+        if len(text) < 2 or text[-1] != text[0] or text[0] in text[1:-1] or "\\" in text:
+            raise lines.bad(number, shown(text))
+        return text[1:-1]
+    text = re.split(r"\s+#", text, maxsplit=1)[0].strip()
+    if NUMBER.fullmatch(text):
+        value = float(text)
+        if not math.isfinite(value):
+            raise lines.bad(number, shown(text), "give a finite number")
+        return int(text) if re.fullmatch(r"[+-]?[0-9]{1,15}", text) else value
+    if text[0] in "&*!|>{%@`?" or not _WORD.fullmatch(text.replace(" ", "_").replace(":", "_")):
+        raise lines.bad(number, shown(text))
+    return text
+
+
+def parse_yaml(data: bytes, file: str) -> Keys:
+    """The top map of a YAML file as OpenCV, ROS and Kalibr write it.
+
+    Raises:
+        InputError: too large, not UTF-8, or anything outside that part of YAML; names file and line.
+    """
+    lines = _Lines(data, file)
+    if not lines.lines:
+        raise refusal("yaml", file=file, found="nothing", allowed=_ALLOWED, remedy="name a calibration file")
+    values = _block(lines, 0, 1)
+    return Keys(values, file, lines.text)
+
+
+def _matrix(keys: Keys, key: str, *shapes: tuple[int, int]) -> np.ndarray:
+    """A matrix of rows, cols, data (OpenCV, ROS) or of nested lists (Kalibr), in one of `shapes`."""
+    allowed = "finite numbers, " + " or ".join("x".join(map(str, shape)) for shape in shapes)
+    remedy = "take the file as its tool wrote it"
+    value = keys.values.get(key)
+    if isinstance(value, dict):
+        table = keys.table(key)
+        shape = table.integer("rows", 1, 1000), table.integer("cols", 1, 1000)
+        entries = value.get("data")
+    else:
+        rows = value if isinstance(value, list) else []
+        nested = bool(rows) and all(isinstance(row, list) for row in rows)
+        widths = {len(row) for row in rows} if nested else {len(rows)}
+        shape = (len(rows) if nested else 1, min(widths))
+        entries = [x for row in rows for x in row] if nested else rows
+        if len(widths) > 1:
+            entries = None
+    numbers = isinstance(entries, list) and all(isinstance(x, int | float) and abs(x) <= 1e12 for x in entries)
+    if not numbers or shape not in shapes or len(entries) != shape[0] * shape[1]:
+        found = "x".join(map(str, shape)) if value is not None and shape not in shapes else None
+        raise keys.refuse(key, "matrix", allowed, remedy, found)
+    return np.array(entries, float).reshape(shape)
+
+
+def _distortion(keys: Keys, key: str) -> np.ndarray:
+    """k1 k2 p1 p2 k3; further coefficients must be zero."""
+    shapes = [shape for n in (4, 5, 8, 12, 14) for shape in ((1, n), (n, 1))]
+    values = _matrix(keys, key, *shapes).ravel()
+    if values[5:].any():
+        allowed, remedy = "k1 k2 p1 p2 k3 (plumb bob)", "calibrate again without the rational or thin prism model"
+        raise keys.refuse(key, "distortion", allowed, remedy, f"{values.size} coefficients, not all beyond k3 zero")
+    return np.append(values, 0.0)[:5] if values.size == 4 else values[:5]
+
+
+def _rotation(keys: Keys, key: str, matrix: np.ndarray) -> np.ndarray:
+    """The nearest rotation, where the file's digits allow."""
+    deviation = max(np.abs(matrix @ matrix.T - np.eye(3)).max(), abs(np.linalg.det(matrix) - 1.0))
+    if not deviation <= ROTATION_TOLERANCE:
+        allowed = f"R R^T = 1 and det R = +1 to {ROTATION_TOLERANCE:g}"
+        remedy = "take the file as its tool wrote it"
+        raise keys.refuse(key, "rotation", allowed, remedy, f"a matrix that misses it by {deviation:.3g}")
+    return rotation_matrix(rotation_vector(matrix))
+
+
+def _size(keys: Sequence[Keys], size: tuple[int, int] | None) -> tuple[int, int]:
+    """Image size from the files, else as given."""
+    for table in keys:
+        if "image_width" in table:
+            return table.integer("image_width", 1, 65_535), table.integer("image_height", 1, 65_535)
+    if size is None:
+        remedy = "give it with --image-size, for example 1280x720"
+        raise refusal("missing-key", file=keys[0].file, found="no image size", allowed="image_width", remedy=remedy)
+    return size
+
+
+def _opencv(files: Sequence[Keys], size: tuple[int, int] | None, unit_mm: float) -> tuple[Stereo, list[str]]:
+    """M1 D1 M2 D2 and R T of the stereo sample, in one file or two."""
+    home = {}
+    for key in ("M1", "D1", "M2", "D2", "R", "T"):
+        holders = [keys for keys in files if key in keys]
+        if len(holders) != 1:
+            found = f"{key} in {len(holders)} of the files"
+            remedy = "name both files: --import intrinsics.yml --import extrinsics.yml"
+            raise refusal("missing-key", file=files[0].file, found=found, allowed="M1 D1 M2 D2 R T once", remedy=remedy)
+        home[key] = holders[0]
+    translation = _matrix(home["T"], "T", (3, 1), (1, 3)).ravel() * unit_mm
+    if np.linalg.norm(translation) < SHORTEST_MM:
+        found = f"cameras {np.linalg.norm(translation):.3g} mm apart"
+        remedy = "OpenCV keeps the unit of the squares: give --import-unit m if they were in metres"
+        raise home["T"].refuse("T", "unit", f"at least {SHORTEST_MM:g} mm", remedy, found)
+    stereo = _stereo(
+        _size(files, size),
+        *(_matrix(home["M1"], "M1", (3, 3)), _distortion(home["D1"], "D1")),
+        *(_matrix(home["M2"], "M2", (3, 3)), _distortion(home["D2"], "D2")),
+        _rotation(home["R"], "R", _matrix(home["R"], "R", (3, 3))),
+        translation,
+    )
+    return stereo, [f"T is taken in {'mm' if unit_mm == 1 else 'm'}: OpenCV's files do not state a unit"]
+
+
+def _ros(files: Sequence[Keys]) -> tuple[Stereo, list[str]]:
+    """Two camera_info files. Rectified, the right camera sees x' = x + (P03 / P00, 0, 0): R = R2^T R1, T = R2^T t."""
+    if len(files) != 2:
+        remedy = "name both cameras' files: --import left.yaml --import right.yaml"
+        found = f"{len(files)} file{'s' * (len(files) != 1)}"
+        raise refusal("missing-file", file=files[0].file, found=found, allowed="two camera_info files", remedy=remedy)
+    projections = [_matrix(keys, "projection_matrix", (3, 4)) for keys in files]
+    if projections[1][0, 3] == 0 and projections[0][0, 3] != 0:
+        files, projections = files[::-1], projections[::-1]
+    parts, turns = [], []
+    for keys in files:
+        keys.word("distortion_model", ("plumb_bob",))
+        parts += [_matrix(keys, "camera_matrix", (3, 3)), _distortion(keys, "distortion_coefficients")]
+        turn = _matrix(keys, "rectification_matrix", (3, 3))
+        turns.append(_rotation(keys, "rectification_matrix", turn))
+    sizes = [_size([keys], None) for keys in files]
+    left, right = projections
+    if sizes[0] != sizes[1] or left[0, 3] != 0 or right[0, 3] == 0 or not right[0, 0] > 0:
+        allowed = "P[0][3] = 0 in the left file, -fx baseline (m) in the right one; images of one size"
+        remedy = "take both files from one stereo calibration"
+        raise files[1].refuse("projection_matrix", "projection", allowed, remedy, "files that are no stereo pair")
+    shift = np.array([right[0, 3] / right[0, 0], right[1, 3] / right[1, 1] if right[1, 1] else 0.0, 0.0])
+    stereo = _stereo(sizes[0], *parts, turns[1].T @ turns[0], M_TO_MM * turns[1].T @ shift)
+    return stereo, []
+
+
+def _kalibr(files: Sequence[Keys]) -> tuple[Stereo, list[str]]:
+    """cam0 and cam1 of a camchain; T_cn_cnm1 maps points of cam0 into cam1."""
+    keys = files[0]
+    parts, sizes = [], []
+    for name in ("cam0", "cam1"):
+        camera = keys.table(name)
+        camera.word("camera_model", ("pinhole",))
+        camera.word("distortion_model", ("radtan",))
+        fu, fv, pu, pv = _matrix(camera, "intrinsics", (1, 4)).ravel()
+        parts += [np.array([[fu, 0.0, pu], [0.0, fv, pv], [0.0, 0.0, 1.0]]), _distortion(camera, "distortion_coeffs")]
+        width, height = _matrix(camera, "resolution", (1, 2)).ravel()
+        sizes.append((int(width), int(height)))
+    camera = keys.table("cam1")
+    if sizes[0] != sizes[1]:
+        raise camera.refuse("resolution", "image-size", "two images of one size", "calibrate them at one size")
+    pose = _matrix(camera, "T_cn_cnm1", (4, 4))
+    turn = _rotation(camera, "T_cn_cnm1", pose[:3, :3])
+    return _stereo(sizes[0], *parts, turn, M_TO_MM * pose[:3, 3]), ["radtan has no k3: it is 0 and as uncertain"]
+
+
+def _stereo(size, M1, D1, M2, D2, R, T) -> Stereo:
+    """Checked as `stereo.json` is, with the assumed covariance."""
+    bare = Stereo(*size, M1, D1, M2, D2, R, np.asarray(T, float).ravel(), np.zeros((24, 24)), ASSUMED_RMS_PX, True)
+    checked = parse_stereo(stereo_bytes(bare), "the imported calibration")
+    return replace(checked, parameter_covariance=assumed_covariance(checked))
+
+
+def read_calibration(paths: Sequence[Path], size: tuple[int, int] | None = None, *, unit_mm: float = 1.0) -> Imported:
+    """A stereo calibration from the files of another tool, or from `stereo.json`.
+
+    Args:
+        paths: OpenCV: one file or two; ROS: both cameras' camera_info; Kalibr: one camchain; `stereo.json`.
+        size: image width and height, px, where the files do not tell (OpenCV).
+        unit_mm: unit of OpenCV's T, mm.
+
+    Raises:
+        InputError: unreadable, unknown or contradictory.
+    """
+    names = [escaped(Path(path).name) for path in paths]
+    if len(paths) == 1 and Path(paths[0]).suffix.lower() == ".json":
+        stereo = parse_stereo(read_bytes(paths[0], YAML_BYTES_MAX), names[0])
+        return Imported(stereo, "tvsbayes", (), pair_doubts(stereo))
+    files = [parse_yaml(read_bytes(path, YAML_BYTES_MAX), name) for path, name in zip(paths, names, strict=True)]
+    if any("cam0" in keys for keys in files):
+        if len(files) != 1:
+            remedy = "name one camchain"
+            raise refusal("usage", file=names[0], found=f"{len(files)} files", allowed="one file", remedy=remedy)
+        source, (stereo, notes) = "kalibr", _kalibr(files)
+    elif any("projection_matrix" in keys for keys in files):
+        source, (stereo, notes) = "ros", _ros(files)
+    elif any(key in keys for keys in files for key in ("M1", "M2", "R", "T")):
+        source, (stereo, notes) = "opencv", _opencv(files, size, unit_mm)
+    else:
+        one = any("camera_matrix" in keys or "Camera_Matrix" in keys for keys in files)
+        found = "the calibration of one camera" if one else "no calibration that is known here"
+        allowed = "OpenCV's M1 D1 M2 D2 R T, ROS camera_info of both cameras, a Kalibr camchain, stereo.json"
+        remedy = "a pair needs R and T between its cameras: calibrate both together"
+        raise refusal("format", file=names[0], found=found, allowed=allowed, remedy=remedy)
+    notes.append("its uncertainty is assumed, and pessimistic: calibrate from pictures for a true one")
+    return Imported(stereo, source, tuple(notes), pair_doubts(stereo))
+
+
+def _opencv_text(matrices: Mapping[str, np.ndarray], numbers: Mapping[str, int]) -> bytes:
+    """OpenCV's YAML 1.0 of 2-D matrices: 4.x and 5.x read it alike."""
+    lines = ["%YAML:1.0", "---", *(f"{key}: {value}" for key, value in numbers.items())]
+    for key, matrix in matrices.items():
+        rows, cols = matrix.shape
+        data = ", ".join(map(repr, map(float, matrix.ravel())))
+        lines += [f"{key}: {_MATRIX_TAG}", f"   rows: {rows}", f"   cols: {cols}", "   dt: d", f"   data: [ {data} ]"]
+    return ("\n".join(lines) + "\n").encode()
+
+
+def _ros_text(name: str, size: tuple[int, int], matrices: Mapping[str, np.ndarray]) -> bytes:
+    lines = [f"image_width: {size[0]}", f"image_height: {size[1]}", f"camera_name: {name}"]
+    for key, matrix in matrices.items():
+        if key == "distortion_coefficients":
+            lines.append("distortion_model: plumb_bob")
+        rows, cols = matrix.shape
+        data = ", ".join(map(repr, map(float, matrix.ravel())))
+        lines += [f"{key}:", f"  rows: {rows}", f"  cols: {cols}", f"  data: [{data}]"]
+    return ("\n".join(lines) + "\n").encode()
+
+
+def exported(stereo: Stereo, form: Format) -> dict[str, bytes]:
+    """Files by name for another tool; none of them keeps the covariance.
+
+    `opencv`: `intrinsics.yml` (M1 D1 M2 D2, image size) and `extrinsics.yml` (R T R1 R2 P1 P2 Q) of the stereo
+    sample, mm. `ros`: `left.yaml` and `right.yaml`, camera_info, metres.
+    """
+    import cv2
+
+    size = (stereo.image_width, stereo.image_height)
+    # alpha = 0: only pixels that both cameras have, as ROS' calibrator and OpenCV's sample do by default.
+    R1, R2, P1, P2, Q, *_ = cv2.stereoRectify(
+        stereo.M1, stereo.D1, stereo.M2, stereo.D2, size, stereo.R, stereo.T.reshape(3, 1), alpha=0
+    )
+    if form == "opencv":
+        inner = {"M1": stereo.M1, "D1": stereo.D1[None], "M2": stereo.M2, "D2": stereo.D2[None]}
+        outer = {"R": stereo.R, "T": stereo.T[:, None], "R1": R1, "R2": R2, "P1": P1, "P2": P2, "Q": Q}
+        sizes = {"image_width": size[0], "image_height": size[1]}
+        return dict(zip(EXPORT_NAMES[form], (_opencv_text(inner, sizes), _opencv_text(outer, {})), strict=True))
+    files = {}
+    cameras = (("left", stereo.M1, stereo.D1, R1, P1), ("right", stereo.M2, stereo.D2, R2, P2))
+    for file, (name, matrix, distortion, turn, projection) in zip(EXPORT_NAMES[form], cameras, strict=True):
+        in_metres = projection.copy()
+        in_metres[:, 3] /= M_TO_MM
+        matrices = {
+            "camera_matrix": matrix,
+            "distortion_coefficients": distortion[None],
+            "rectification_matrix": turn,
+            "projection_matrix": in_metres,
+        }
+        files[file] = _ros_text(name, size, matrices)
+    return files

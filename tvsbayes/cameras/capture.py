@@ -1,0 +1,444 @@
+"""The stereo cameras on OpenCV, and a virtual one that serves whatever is rendered, over HTTP.
+
+A picture counts only if its exposure began after it was asked for. Drivers keep old frames in their buffers, and no
+frame says when it was exposed. So every `grab` first empties the buffers: a buffered frame comes as fast as it can be
+decoded, a live one at the camera's own rate, which is measured at opening; only behind the first live frames, which
+may still have been in the pipe, one is taken. A camera that never makes us wait is refused: its frames could be of any
+age. Where decoding takes as long as the camera's period the two cannot be told apart; then the observer's proof by
+light holds (tvsbayes.acquisition.observation).
+
+Pictures are (height, width, 3) uint8, blue, green, red, as OpenCV delivers them; raw pixels, nothing rectified.
+Seconds where a name says `_s`.
+"""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from typing import Any, Protocol
+
+import numpy as np
+
+from tvsbayes.errors import DeviceFault, InputError, escaped
+from tvsbayes.positioner.driver import Clock
+
+LIVE_S = 0.004
+"""A frame that took less than this was in a buffer, whatever the rate: cameras up to 200 frames/s are slower."""
+LIVE_SHARE = 0.7
+"""Share of the camera's period that a frame must take to count as live."""
+RATE_FRAMES, RATE_S = 12, 0.4
+"""The rate is measured over at least so many frames and seconds at opening, and read off the last eight."""
+PIPELINE_FRAMES = 2
+"""Live frames to leave out: one was being exposed when it was asked for, one may be on its way."""
+FLUSH_FRAMES_MAX = 250
+FLUSH_MAX_S = 10.0
+"""The longest emptying of buffers, in frames and in seconds."""
+STREAM_TIMEOUT_MS = 5_000
+VIEWER_TIMEOUT_S = 10.0
+"""A viewer of the virtual camera that takes nothing for so long has gone."""
+JPEG_QUALITY = 97
+FFMPEG_QUIET = "-8"
+"""FFmpeg's AV_LOG_QUIET."""
+
+
+@dataclass(frozen=True, eq=False)
+class StereoImage:
+    """Two pictures of one moment, each (height, width, 3) uint8, blue, green, red."""
+
+    left: np.ndarray
+    right: np.ndarray
+
+
+@dataclass(frozen=True)
+class CameraSettings:
+    """What the cameras say of themselves after they were set.
+
+    Attributes:
+        values: readings by name and camera, e.g. "left.exposure"; what a camera does not report is left out.
+        warnings: what could not be fixed, in words.
+    """
+
+    values: dict[str, float]
+    warnings: tuple[str, ...] = ()
+
+    def as_json(self) -> dict[str, object]:
+        """As the journal holds it."""
+        return {"values": self.values, "warnings": list(self.warnings)}
+
+
+class StereoCamera(Protocol):
+    """A pair of cameras, whatever they hang on."""
+
+    def grab(self) -> StereoImage:
+        """A pair whose exposure began after this call."""
+
+    def settings(self) -> CameraSettings:
+        """Exposure, gain, white balance and focus as they stand."""
+
+    def close(self) -> None:
+        """Give the cameras back; never raises."""
+
+
+class Capture(Protocol):
+    """The part of `cv2.VideoCapture` that is used."""
+
+    def grab(self) -> bool:
+        """Take the next frame from the driver."""
+
+    def retrieve(self) -> tuple[bool, Any]:
+        """Decode the frame taken last."""
+
+    def get(self, prop: int) -> float:
+        """A property; 0 or -1 where there is none."""
+
+    def set(self, prop: int, value: float) -> bool:
+        """Set a property; whether the driver took it."""
+
+    def getBackendName(self) -> str:
+        """Through which of OpenCV's backends it is open."""
+
+    def release(self) -> None:
+        """Give the device back."""
+
+
+def open_capture(source: str | int) -> Capture:
+    """A device by number or path, or a stream by address.
+
+    Raises:
+        DeviceFault: it cannot be opened.
+    """
+    import cv2
+
+    if isinstance(source, str) and source.isascii() and source.isdigit() and len(source) <= 4:
+        source = int(source)
+    if isinstance(source, str) and "://" in source:
+        if not source.startswith(("http://", "https://", "rtsp://")):
+            remedy = "give a device number, a device path, or an http, https or rtsp address"
+            raise InputError("camera", f"[cameras] source {escaped(source)} is no camera", remedy=remedy)
+        waits = [
+            cv2.CAP_PROP_OPEN_TIMEOUT_MSEC,
+            STREAM_TIMEOUT_MS,
+            cv2.CAP_PROP_READ_TIMEOUT_MSEC,
+            STREAM_TIMEOUT_MS,
+        ]
+        capture = cv2.VideoCapture(source, cv2.CAP_FFMPEG, waits)
+    else:
+        capture = cv2.VideoCapture(source)
+    if not capture.isOpened():
+        capture.release()
+        remedy = "check [cameras] in the rig file, the cable, and that no other program has the camera"
+        raise DeviceFault("camera", f"camera {escaped(str(source))} cannot be opened; {remedy}", remedy=remedy)
+    return capture
+
+
+@contextmanager
+def _quiet_opencv() -> Iterator[None]:
+    """OpenCV and its FFmpeg write no warnings to stderr meanwhile: what fails is raised, with a remedy.
+
+    Whoever has set their variables OPENCV_LOG_LEVEL or OPENCV_FFMPEG_LOGLEVEL wants to read them. FFmpeg's is read
+    once, at the first stream that a process opens, and stays.
+    """
+    import cv2
+
+    logging = cv2.utils.logging
+    before = None if "OPENCV_LOG_LEVEL" in os.environ else logging.setLogLevel(logging.LOG_LEVEL_SILENT)
+    ffmpeg = "OPENCV_FFMPEG_LOGLEVEL" not in os.environ
+    if ffmpeg:
+        os.environ["OPENCV_FFMPEG_LOGLEVEL"] = FFMPEG_QUIET
+    try:
+        yield
+    finally:
+        if ffmpeg:
+            os.environ.pop("OPENCV_FFMPEG_LOGLEVEL", None)
+        if before is not None:
+            logging.setLogLevel(before)
+
+
+class OpenCVCamera:
+    """Two devices, or one that delivers both pictures side by side.
+
+    Args:
+        captures: one (side by side) or two (left, right) open captures; they belong to this object from now on.
+        width: of one picture, px.
+        height: px.
+        exposure: in the driver's unit; None leaves the automatic off and the exposure where it is.
+        clock: where time comes from.
+
+    Raises:
+        DeviceFault: an exposure that does not read back as set.
+    """
+
+    def __init__(
+        self, captures: Sequence[Capture], width: int, height: int, exposure: float | None = None, clock: Clock = time
+    ):
+        self._captures, self._clock = list(captures), clock
+        self._width, self._height = width, height
+        self._warnings: list[str] = []
+        try:
+            for name, capture in zip(self._names, self._captures, strict=True):
+                self._fix(name, capture, exposure)
+            self._period_s = [self._measured_period_s(capture) for capture in self._captures]
+        except BaseException:
+            self.close()
+            raise
+
+    @property
+    def _names(self) -> tuple[str, ...]:
+        return ("left", "right") if len(self._captures) == 2 else ("stereo",)
+
+    def _fix(self, name: str, capture: Capture, exposure: float | None) -> None:
+        """Everything automatic off, size and exposure set; what does not obey is a fault or a warning."""
+        import cv2
+
+        # One frame in the buffer, where the driver lets us: less to empty.
+        capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)
+        capture.set(cv2.CAP_PROP_FRAME_WIDTH, self._width * (1 if len(self._captures) == 2 else 2))
+        capture.set(cv2.CAP_PROP_FRAME_HEIGHT, self._height)
+        fixed = {
+            "automatic exposure": capture.set(cv2.CAP_PROP_AUTO_EXPOSURE, _manual_exposure(capture)),
+            "white balance": capture.set(cv2.CAP_PROP_AUTO_WB, 0),
+            "focus": capture.set(cv2.CAP_PROP_AUTOFOCUS, 0),
+        }
+        refused = [what for what, done in fixed.items() if not done]
+        if refused:
+            self._warnings.append(f"{name}: {', '.join(refused)} cannot be fixed from here; fix it at the camera")
+        if exposure is None:
+            return
+        done, read = capture.set(cv2.CAP_PROP_EXPOSURE, exposure), capture.get(cv2.CAP_PROP_EXPOSURE)
+        # Drivers round to their own steps: 5 % of the value, or one unit.
+        if not done or abs(read - exposure) > max(0.05 * abs(exposure), 1.0):
+            found = f"{name}: exposure {exposure:g} was set and {read:g} read back"
+            remedy = "leave [cameras] exposure out and fix it at the camera, or give a value the driver takes"
+            raise DeviceFault("exposure", f"{found}; {remedy}", found=found, remedy=remedy)
+
+    def settings(self) -> CameraSettings:
+        """See `StereoCamera.settings`."""
+        import cv2
+
+        properties = {
+            "exposure": cv2.CAP_PROP_EXPOSURE,
+            "auto_exposure": cv2.CAP_PROP_AUTO_EXPOSURE,
+            "gain": cv2.CAP_PROP_GAIN,
+            "white_balance_K": cv2.CAP_PROP_WB_TEMPERATURE,
+            "auto_white_balance": cv2.CAP_PROP_AUTO_WB,
+            "focus": cv2.CAP_PROP_FOCUS,
+            "frames_per_s": cv2.CAP_PROP_FPS,
+        }
+        values = {}
+        for name, capture in zip(self._names, self._captures, strict=True):
+            for key, prop in properties.items():
+                value = float(capture.get(prop))
+                if np.isfinite(value) and value not in (0.0, -1.0):
+                    values[f"{name}.{key}"] = value
+        return CameraSettings(values, tuple(self._warnings))
+
+    def grab(self) -> StereoImage:
+        """See `StereoCamera.grab`.
+
+        Raises:
+            DeviceFault: no frame, one of another size, or a camera that never makes us wait.
+        """
+        for capture, period_s in zip(self._captures, self._period_s, strict=True):
+            self._flush(capture, max(LIVE_S, LIVE_SHARE * period_s))
+        for name, capture in zip(self._names, self._captures, strict=True):
+            if not capture.grab():
+                raise _no_frame(name)
+        return self._split([self._retrieve(n, c) for n, c in zip(self._names, self._captures, strict=True)])
+
+    def _measured_period_s(self, capture: Capture) -> float:
+        """Time between two live frames, s."""
+        times = [self._clock.monotonic()]
+        while len(times) <= RATE_FRAMES or times[-1] - times[0] < RATE_S:
+            if len(times) > FLUSH_FRAMES_MAX or not capture.grab():
+                break
+            times.append(self._clock.monotonic())
+        return float(np.median(np.diff(times)[-8:])) if len(times) > 1 else 0.0
+
+    def _flush(self, capture: Capture, live_s: float) -> None:
+        """Take frames until the next one was exposed after this call."""
+        start = before = self._clock.monotonic()
+        live = 0
+        for _ in range(FLUSH_FRAMES_MAX):
+            if not capture.grab():
+                raise _no_frame(self._names[self._captures.index(capture)])
+            now = self._clock.monotonic()
+            live += now - before > live_s
+            if live >= PIPELINE_FRAMES:
+                return
+            if now - start > FLUSH_MAX_S:
+                break
+            before = now
+        remedy = "lower the frame rate of the camera, or serve its stream at the rate of the exposures"
+        raise DeviceFault("stale", f"the camera's frames never have to be waited for; {remedy}", remedy=remedy)
+
+    def _retrieve(self, name: str, capture: Capture) -> np.ndarray:
+        good, picture = capture.retrieve()
+        if not good or picture is None:
+            raise _no_frame(name)
+        expected = self._height, self._width * (1 if len(self._captures) == 2 else 2)
+        if picture.shape[:2] != expected or picture.dtype != np.uint8:
+            found = f"{name}: pictures of {picture.shape[1]} x {picture.shape[0]} px"
+            remedy = f"{expected[1]} x {expected[0]} px were calibrated: set the camera to that size"
+            raise DeviceFault("image-size", f"{found}; {remedy}", found=found, remedy=remedy)
+        return picture
+
+    def _split(self, pictures: list[np.ndarray]) -> StereoImage:
+        if len(pictures) == 2:
+            return StereoImage(*pictures)
+        both = pictures[0]
+        return StereoImage(both[:, : self._width].copy(), both[:, self._width :].copy())
+
+    def close(self) -> None:
+        """See `StereoCamera.close`."""
+        for capture in self._captures:
+            capture.release()
+        self._captures = []
+
+
+def _manual_exposure(capture: Capture) -> int:
+    """What CAP_PROP_AUTO_EXPOSURE calls manual: Video4Linux' own V4L2_EXPOSURE_MANUAL = 1 there, elsewhere no.
+
+    On Windows 1 would switch the automatic on (opencv pull request 22635).
+    """
+    return 1 if capture.getBackendName() == "V4L2" else 0
+
+
+def _no_frame(name: str) -> DeviceFault:
+    remedy = "check its cable and USB port, and that no other program has it; then go on with --resume"
+    return DeviceFault("no-frame", f"camera {name} delivers no frame; {remedy}", remedy=remedy)
+
+
+def open_cameras(
+    table: Mapping[str, object],
+    width: int,
+    height: int,
+    opener: Callable[[str | int], Capture] = open_capture,
+    clock: Clock = time,
+) -> OpenCVCamera:
+    """The cameras of `[cameras]` in a rig file: `source` side by side, or `left` and `right`.
+
+    Raises:
+        InputError: neither, or both.
+        DeviceFault: they cannot be opened or set.
+    """
+    pair = "left" in table and "right" in table
+    if pair == ("source" in table):
+        remedy = "give source = ... (side by side), or left = ... and right = ..."
+        raise InputError("cameras", "[cameras] of the rig file names no cameras", column="cameras", remedy=remedy)
+    captures: list[Capture] = []
+    exposure = float(table["exposure"]) if "exposure" in table else None
+    with _quiet_opencv():
+        try:
+            for key in ("left", "right") if pair else ("source",):
+                captures.append(opener(table[key]))
+        except BaseException:
+            for capture in captures:
+                capture.release()
+            raise
+        return OpenCVCamera(captures, width, height, exposure, clock)
+
+
+@dataclass
+class VirtualCamera:
+    """A camera in software: serves what `render` returns as an MJPEG stream over HTTP on this computer.
+
+    Each frame is rendered when it is due, as a sensor would expose it. Use it as a context manager.
+
+    Attributes:
+        render: returns a StereoImage; called from the serving thread, one call at a time.
+        frames_per_s: rate of exposures.
+    """
+
+    render: Callable[[], StereoImage]
+    frames_per_s: float = 30.0
+    failure: Exception | None = field(default=None, init=False)
+    """What `render` raised; it ends the stream, and is raised again when the camera is left."""
+    _server: ThreadingHTTPServer | None = field(default=None, init=False, repr=False)
+    _thread: threading.Thread | None = field(default=None, init=False, repr=False)
+    _stop: threading.Event = field(default_factory=threading.Event, init=False, repr=False)
+    _lock: threading.Lock = field(default_factory=threading.Lock, init=False, repr=False)
+    _no_proxy: str | None = field(default=None, init=False, repr=False)
+
+    @property
+    def address(self) -> str:
+        """Where the stream is served, for `[cameras] source`."""
+        if self._server is None:
+            raise RuntimeError("the virtual camera is not running")
+        return f"http://127.0.0.1:{self._server.server_address[1]}/stereo.mjpg"
+
+    def jpeg(self) -> bytes:
+        """The next frame: both pictures side by side."""
+        import cv2
+
+        with self._lock:
+            pair = self.render()
+        both = np.hstack((pair.left, pair.right))
+        return cv2.imencode(".jpg", both, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1].tobytes()
+
+    def __enter__(self) -> VirtualCamera:
+        camera = self
+
+        class Handler(BaseHTTPRequestHandler):
+            # Of the connection: without it a viewer that neither reads nor closes would hold `__exit__` for ever.
+            timeout = VIEWER_TIMEOUT_S
+
+            def do_GET(self) -> None:
+                camera._serve(self)
+
+            def log_message(self, format: str, *arguments: object) -> None:
+                """Requests are no news."""
+
+        self._stop.clear()
+        self._server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
+        self._server.daemon_threads = False
+        # Behind the bind, which may fail: then nobody would put it back.
+        # FFmpeg, which OpenCV opens the address with, asks the proxy of the environment even for this computer.
+        self._no_proxy = os.environ.get("no_proxy")
+        os.environ["no_proxy"] = ",".join(filter(None, (self._no_proxy, "127.0.0.1")))
+        self._thread = threading.Thread(target=self._server.serve_forever, args=(0.05,), daemon=True)
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stop.set()
+        assert self._server is not None and self._thread is not None
+        self._server.shutdown()
+        self._thread.join()
+        # Waits for the streams, which end at the next frame.
+        self._server.server_close()
+        self._server = None
+        if self._no_proxy is None:
+            os.environ.pop("no_proxy", None)
+        else:
+            os.environ["no_proxy"] = self._no_proxy
+        if self.failure is not None:
+            raise self.failure
+
+    def _serve(self, request: BaseHTTPRequestHandler) -> None:
+        if not request.path.endswith(".mjpg"):
+            request.send_error(404)
+            return
+        request.send_response(200)
+        request.send_header("Content-Type", "multipart/x-mixed-replace; boundary=frame")
+        request.end_headers()
+        period_s = 1 / self.frames_per_s
+        due_s = time.monotonic()
+        try:
+            while not self._stop.wait(max(due_s - time.monotonic(), 0.0)):
+                try:
+                    data = self.jpeg()
+                except Exception as error:
+                    self.failure = error
+                    return
+                head = b"--frame\r\nContent-Type: image/jpeg\r\nContent-Length: %d\r\n\r\n" % len(data)
+                request.wfile.write(head + data + b"\r\n")
+                # A late frame shifts the following ones: a sensor does not expose twice at once.
+                due_s = max(due_s + period_s, time.monotonic() + period_s / 2)
+        except OSError:
+            # The viewer has gone.
+            return

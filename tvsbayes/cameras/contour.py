@@ -1,0 +1,150 @@
+"""Centre by the spot's outline; epipolar check."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import log, pi, sqrt
+
+import numpy as np
+
+from tvsbayes.cameras.spot_fit import (
+    AREA_MAX_SHARE,
+    AREA_MIN_PX,
+    BRIGHT_SHARE,
+    CLIPPED_DN,
+    CLIPPED_SHARE_MAX,
+    SECOND_SHARE,
+    Centre,
+    SpotNoise,
+    background_variance,
+)
+from tvsbayes.instrument.stereo_pair import Stereo, distort, undistort
+
+EPIPOLAR_SIGMAS, EPIPOLAR_FLOOR_PX = 6.0, 0.5
+"""A pair is refused beyond six combined sds (spot and calibration), and never below half a pixel."""
+
+
+@dataclass(frozen=True)
+class _Rectified:
+    """One camera of the paper's pipeline: maps of the rectified picture and the way back."""
+
+    maps: tuple[np.ndarray, np.ndarray]
+    rotation: np.ndarray
+    projection: np.ndarray
+    matrix: np.ndarray
+    distortion: np.ndarray
+
+    def raw(self, points_px: np.ndarray) -> np.ndarray:
+        """Raw pixels (n, 2) of rectified ones."""
+        focal, middle = self.projection[[0, 1], [0, 1]], self.projection[:2, 2]
+        rays = np.column_stack(((points_px - middle) / focal, np.ones(len(points_px)))) @ self.rotation
+        return distort(rays[:, :2] / rays[:, 2:], self.distortion) @ self.matrix[:2, :2].T + self.matrix[:2, 2]
+
+
+def rectified_pair(stereo: Stereo) -> tuple[_Rectified, _Rectified]:
+    import cv2
+
+    size = stereo.image_width, stereo.image_height
+    first, second = (stereo.M1, stereo.D1.reshape(1, 5)), (stereo.M2, stereo.D2.reshape(1, 5))
+    turns = cv2.stereoRectify(
+        *first, *second, size, np.asarray(stereo.R, float), np.asarray(stereo.T, float).reshape(3, 1)
+    )
+    cameras = []
+    for (matrix, distortion), rotation, projection in ((first, turns[0], turns[2]), (second, turns[1], turns[3])):
+        maps = cv2.initUndistortRectifyMap(matrix, distortion, rotation, projection, size, cv2.CV_32FC1)
+        cameras.append(_Rectified(maps, rotation, projection, matrix, distortion.ravel()))
+    return cameras[0], cameras[1]
+
+
+REGION_HALF_PX = 60
+"""Half side of the paper's region of interest, around the brightest place of the rectified picture."""
+
+
+def contour_of(picture: np.ndarray, camera: _Rectified, noise: SpotNoise) -> Centre:
+    """The paper's way: centroid of the region above a threshold on V of HSV, in the rectified picture.
+
+    The threshold is on V alone: at 808 nm hue is undefined and saturation low. The stated variance is that of the
+    region's outline, moved by noise over slope and rounded to whole pixels, for a round Gaussian spot: each of its
+    2 pi r pixels on its own.
+    """
+    import cv2
+
+    flat = cv2.remap(picture, *camera.maps, cv2.INTER_LINEAR)
+    value = cv2.cvtColor(flat, cv2.COLOR_BGR2HSV)[..., 2]
+    height, width = value.shape
+    smooth = cv2.blur(value, (5, 5))
+    top = np.array(np.unravel_index(int(smooth.argmax()), smooth.shape))[::-1]
+    low, high = np.maximum(top - REGION_HALF_PX, 0), np.minimum(top + REGION_HALF_PX + 1, (width, height))
+    region = value[low[1] : high[1], low[0] : high[0]]
+    floor, peak = float(np.median(region)), float(region.max())
+    spread = 1.4826 * float(np.median(np.abs(region - floor))) + 1.0
+    if smooth[top[1], top[0]] - floor < 3 * spread:
+        return Centre("no-spot")
+    mask = (region > floor + BRIGHT_SHARE * (peak - floor)).astype(np.uint8)
+    outlines, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    outlines = sorted(outlines, key=cv2.contourArea, reverse=True)
+    moments = cv2.moments(outlines[0])
+    area = moments["m00"]
+    if area < AREA_MIN_PX:
+        return Centre("too-small")
+    outline = camera.raw(outlines[0].reshape(-1, 2) + low)
+    clipped = (flat[low[1] : high[1], low[0] : high[0]] >= CLIPPED_DN).any(axis=2) & (mask > 0)
+    radius = sqrt(area / pi)
+    sd = radius / sqrt(-2 * log(BRIGHT_SHARE))
+    known = {"axes_px": (sd, sd), "clipped_share": float(clipped.sum() / mask.sum()), "outline_px": outline}
+    if len(outlines) > 1 and cv2.contourArea(outlines[1]) > SECOND_SHARE * area:
+        return Centre("two-spots", **known)
+    if known["clipped_share"] > CLIPPED_SHARE_MAX:
+        return Centre("clipped", **known)
+    if area > AREA_MAX_SHARE * width * height:
+        return Centre("too-large", **known)
+    centre = camera.raw(np.array([[moments["m10"], moments["m01"]]]) / area + low)[0]
+    if (outline < 1).any() or (outline > np.array([width, height]) - 2).any():
+        return Centre("border", **known)
+    signal = BRIGHT_SHARE * (peak - floor)
+    background = background_variance(picture, centre, int(3 * sd + 3))
+    moved = background + noise.gain_dn * signal + (noise.speckle_contrast * signal) ** 2
+    variance = (moved / (signal * radius / sd**2) ** 2 + 1 / 12) / (pi * radius)
+    return Centre("ok", centre, variance * np.eye(2), **known)
+
+
+def epipolar_residual(pixels: np.ndarray, stereo: Stereo) -> np.ndarray:
+    """x_right^T [T]x R x_left (n,) of raw pixels (n, 4): 0 for two images of one point; mm."""
+    ones = np.ones((len(pixels), 1))
+    left = np.hstack((undistort(pixels[:, :2], stereo.M1, stereo.D1), ones))
+    right = np.hstack((undistort(pixels[:, 2:], stereo.M2, stereo.D2), ones))
+    return np.sum(right * np.cross(np.asarray(stereo.T, float).ravel(), left @ np.asarray(stereo.R, float).T), axis=1)
+
+
+def epipolar_refused(pixels: np.ndarray, covariances: np.ndarray, stereo: Stereo) -> np.ndarray:
+    """Which pairs (n,) cannot be images of one point, for all that spots and calibration leave open.
+
+    Args:
+        pixels: (n, 4) u_left, v_left, u_right, v_right.
+        covariances: (n, 4, 4) of them, px^2.
+        stereo: the calibration; its covariance enters by central differences.
+    """
+    if not len(pixels):
+        return np.zeros(0, bool)
+    residual = epipolar_residual(pixels, stereo)
+    step_px = 1e-2  # truncation 1e-9 of the slope, rounding and undistortion 1e-7
+    steps = step_px * np.eye(4)
+    slope = [epipolar_residual(pixels + h, stereo) - epipolar_residual(pixels - h, stereo) for h in steps]
+    slope = np.stack(slope, axis=1) / (2 * step_px)
+    variance = np.einsum("ni,nij,nj->n", slope, covariances, slope)
+    vector, covariance = stereo.vector, np.asarray(stereo.parameter_covariance, float)
+    sds = np.sqrt(np.diag(covariance))
+    free = np.flatnonzero(sds > 0)
+    if len(free):
+        moved = []
+        for row in free:
+            step = np.zeros(24)
+            step[row] = 0.1 * sds[row]
+            ends = (epipolar_residual(pixels, stereo.with_vector(vector + sign * step)) for sign in (1, -1))
+            moved.append((next(ends) - next(ends)) / (2 * step[row]))
+        moved = np.array(moved)
+        variance = variance + np.einsum("in,ij,jn->n", moved, covariance[np.ix_(free, free)], moved)
+    distance = np.abs(residual) / np.linalg.norm(slope, axis=1)
+    allowed = EPIPOLAR_SIGMAS * np.sqrt(variance) / np.linalg.norm(slope, axis=1)
+    # Beyond where the lens model turns back nothing can be undistorted: NaN is refused too.
+    return ~(distance <= np.maximum(allowed, EPIPOLAR_FLOOR_PX))

@@ -1,0 +1,174 @@
+"""The command and what all commands share."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from tvsbayes.errors import InputError, NotConverged, NothingToEstimate, TvsError
+from tvsbayes.files.disk import make_folder, write_atomically
+
+if TYPE_CHECKING:
+    from tvsbayes.results.estimates import FitSummary
+
+
+INTERRUPTED = 130
+TARGET_MISSED = 1
+"""Done, but a limit or target that the user gave is not met."""
+app = typer.Typer(
+    name="tvsbayes",
+    help="What one motor step of a geared laser positioner does to the beam, and how sure that is.",
+    no_args_is_help=True,
+    add_completion=False,
+    rich_markup_mode=None,
+    pretty_exceptions_enable=False,
+)
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        from importlib.metadata import version
+
+        _print(f"tvsbayes {version('tvsbayes')}")
+        raise typer.Exit
+
+
+@app.callback()
+def _options(
+    _version: Annotated[
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and exit.")
+    ] = False,
+) -> None:
+    pass
+
+
+Json = Annotated[bool, typer.Option("--json", help="Print one JSON document on stdout.")]
+Seed = Annotated[int, typer.Option("--seed", min=0, help="Seed of everything random.")]
+CampaignFolder = Annotated[Path, typer.Argument(metavar="CAMPAIGN", help="Campaign folder.")]
+
+
+class Ended(Exception):
+    """Ends a command whose document is out with an exit code other than 0."""
+
+    def __init__(self, exit_code: int):
+        super().__init__(exit_code)
+        self.exit_code = exit_code
+
+
+def report_line(text: str) -> None:
+    """A line for people, on stderr; text from files may hold control characters."""
+    try:
+        typer.echo("".join(c if c.isprintable() else "?" for c in text), err=True)
+    except OSError:
+        # Ctrl-C ends the `tee` behind us too: nobody is left to be told, and the work goes on.
+        pass
+
+
+class OutputFailed(Exception):
+    """Standard output took no more, as on a full disk."""
+
+
+def _print(text: str) -> None:
+    try:
+        typer.echo(text)
+    except OSError as error:
+        # What is still in its buffer must not fail again while Python ends.
+        sys.stdout = open(os.devnull, "w", encoding="utf-8")
+        if isinstance(error, BrokenPipeError):
+            # Whoever read has gone, like `head`; the work is done, and its exit code stands.
+            return
+        raise OutputFailed(error.strerror or str(error)) from error
+
+
+def print_json(document: dict[str, Any]) -> None:
+    """The one document on stdout; NaN is a bug, not a value."""
+    _print(json.dumps(document, indent=1, allow_nan=False, ensure_ascii=True))
+
+
+def error_document(error: TvsError) -> dict[str, Any]:
+    fields = {"code": error.code, "file": error.file, "line": error.line, "column": error.column}
+    fields |= {"message": error.message, "found": error.found, "allowed": error.allowed, "remedy": error.remedy}
+    return {"error": fields}
+
+
+def report_error(error: TvsError) -> None:
+    report_line(f"error: {error.message}")
+    if error.remedy and error.remedy not in error.message:
+        report_line(f"what to do: {error.remedy}")
+
+
+def finish(document: dict[str, Any], text: str, as_json: bool, error: TvsError | None = None) -> None:
+    """Print a result in the wanted form; one that must not be used carries its error and its exit code."""
+    if as_json:
+        print_json(document if error is None else {**document, **error_document(error)})
+    else:
+        _print(text)
+    if error is not None:
+        if not as_json:
+            report_error(error)
+        raise Ended(error.exit_code)
+
+
+def unusable(summary: FitSummary) -> TvsError | None:
+    """Why a fit that ran to its end must not be used: not converged (4) or nothing learned (3)."""
+    if not summary.converged and summary.sampling is not None and not summary.sampling["converged"]:
+        return NotConverged(
+            "unconverged",
+            "UNCONVERGED: " + "; ".join(summary.sampling["missing"]) + ". The table is the Laplace approximation",
+            remedy="run again with --resume and more --max-minutes",
+        )
+    if not summary.converged:
+        return NotConverged(
+            "not-converged",
+            "NOT CONVERGED: " + "; ".join(summary.problems),
+            remedy="check for swapped cameras or wrong counters, or state the extrinsics better in [rig.prior]",
+        )
+    if not summary.headline_informed:
+        return NothingToEstimate(
+            "uninformed",
+            "the spots tell no more about any effective ratio than the priors do (contraction below 0.1 everywhere)",
+            remedy="observe stops before and after moves of both axes",
+        )
+    return None
+
+
+def keep(document: dict[str, Any], path: Path) -> bool:
+    """Write what a later report will show; a folder that cannot be written costs nobody the result."""
+    try:
+        make_folder(path.parent)
+        write_atomically(path, json.dumps(document, indent=1, allow_nan=False).encode())
+    except InputError as error:
+        report_line(f"warning: not kept for the report: {error.message}")
+        return False
+    return True
+
+
+def finite(**values: float | None) -> None:
+    """Refuse NaN and infinity, which option parsing lets through."""
+    for name, value in values.items():
+        if value is not None and not math.isfinite(value):
+            option = "--" + name.replace("_", "-")
+            allowed, remedy = "a finite number", "write a decimal number"
+            raise InputError("number", f"{option} is {value}", column=option, allowed=allowed, remedy=remedy)
+
+
+@contextmanager
+def counting(what: str) -> Iterator[Callable[[int, int], None]]:
+    """A bar for work of known length on a terminal, nothing elsewhere."""
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
+    from rich.progress import Progress as Bar
+
+    console = Console(stderr=True)
+    columns = TextColumn(what), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
+    with Bar(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+        task = bar.add_task(what, total=None)
+        yield lambda count, total: bar.update(task, completed=count, total=total)

@@ -1,0 +1,204 @@
+"""Demo, new, simulate, detect, check."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from tvsbayes.cli.app import (
+    CampaignFolder,
+    Json,
+    Seed,
+    counting,
+    finish,
+    finite,
+    report_line,
+    unusable,
+)
+from tvsbayes.errors import InputError, escaped
+from tvsbayes.files.disk import make_folder, output_place, shipped_data, write_atomically
+from tvsbayes.pipeline import compile_for
+
+DEMO_NOTE = "The twin's move history is our assumption, made so that the classic answer is the paper's Table 1."
+
+
+def demo(
+    out: Annotated[Path | None, typer.Argument(metavar="OUT", help="Folder to keep the campaign in.")] = None,
+    as_json: Json = False,
+) -> None:
+    """Both estimators on the shipped paper twin, beside its truth."""
+    import tempfile
+
+    source = shipped_data() / "twins" / "paper_twin"
+    with tempfile.TemporaryDirectory(prefix="tvsbayes-demo-") as scratch:
+        folder = Path(scratch) / "paper_twin" if out is None else out
+        make_folder(folder, empty=True)
+        for part in sorted(source.iterdir()):
+            write_atomically(folder / part.name, part.read_bytes())
+        report_line("paper twin: 96 four-point experiments of a simulated rig with known truth; fitting ...")
+        from tvsbayes.assessment.fitted_calibration import calibration_of
+        from tvsbayes.assessment.summary import summarise
+        from tvsbayes.estimators.four_point import classic as estimate_classic
+        from tvsbayes.estimators.joint_fit import fit as fit_joint
+        from tvsbayes.instrument.campaign import read_campaign
+        from tvsbayes.report.fit_text import demo_text
+        from tvsbayes.results.fit_record import write_results
+        from tvsbayes.twin.physics import effective_deg_per_step, effective_mirror_offset_mm
+        from tvsbayes.twin.simulated_campaign import read_truth
+
+        compile_for(report_line)
+        campaign = read_campaign(folder)
+        true = read_truth(folder / "truth.json", campaign.stereo).parameters
+        classic_result = estimate_classic(campaign)
+        result = fit_joint(campaign)
+        summary = summarise(result)
+        if out is not None:
+            calibration = calibration_of(result) if result.converged else None
+            write_results(result, summary, folder / "results", 0, calibration)
+    pose = (summary.reference_pose_deg["pan"], summary.reference_pose_deg["tilt"])
+    truth = {
+        **effective_deg_per_step(true, pose),
+        "backlash_deg.pan": true["backlash_deg.pan"],
+        "backlash_deg.tilt": true["backlash_deg.tilt"],
+        "effective_mirror_offset_mm": effective_mirror_offset_mm(true, pose),
+    }
+    document = {"classic": classic_result.as_json(), "fit": summary.as_json(), "truth": truth}
+    finish(document, f"{demo_text(classic_result, summary, truth)}\n\n{DEMO_NOTE}", as_json, unusable(summary))
+
+
+def new(out: Annotated[Path, typer.Argument(metavar="OUT", help="Folder to create.")], as_json: Json = False) -> None:
+    """An empty campaign, explained in campaign.toml, and a rig file. Fill them, or plan and simulate with the rig."""
+    make_folder(out, empty=True)
+    templates = sorted((shipped_data() / "templates").iterdir())
+    for template in templates:
+        write_atomically(out / template.name, template.read_bytes())
+    names = [template.name for template in templates]
+    text = f"{escaped(str(out), 200)}: {', '.join(names)}\n"
+    text += "next: put stereo.json beside them, log moves and spots, then `tvsbayes check` this folder"
+    finish({"campaign": str(out), "files": names}, text, as_json)
+
+
+def simulate(
+    rig: Annotated[Path, typer.Argument(metavar="RIG", help="Rig file.")],
+    plan: Annotated[Path, typer.Argument(metavar="PLAN", help="plan.csv.")],
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="Campaign folder to write.")],
+    aperture: Annotated[bool, typer.Option("--aperture/--no-aperture", help="Looks also read the aperture.")] = False,
+    frames: Annotated[
+        bool,
+        typer.Option("--frames", help="Pictures for `detect` and `stereo`, no centroids."),
+    ] = False,
+    seed: Seed = 0,
+    as_json: Json = False,
+) -> None:
+    """The digital twin runs a plan on a true rig that it draws. Writes the campaign and truth.json."""
+    from tvsbayes.instrument.plan import read_plan
+    from tvsbayes.instrument.rig import read_rig
+    from tvsbayes.twin.simulated_campaign import simulate as run_plan
+
+    result = run_plan(read_rig(rig), read_plan(plan), seed, aperture=aperture)
+    moves, spots = len(result.campaign.moves), result.campaign.spots
+    seen = sum(spot.status == "ok" for spot in spots)
+    document = {"campaign": str(out), "moves": moves, "spots": len(spots), "ok": seen, "seed": seed}
+    text = f"{escaped(str(out), 200)}: {moves} moves, {seen} of {len(spots)} spots seen; the truth is in truth.json"
+    if frames:
+        from tvsbayes.twin.board_pictures import write_frames
+
+        result = result.undetected()
+        result.write(out)
+        with counting("rendering") as show:
+            pictures = write_frames(out, result, seed, done=show)
+        document |= {"ok": 0, "in_view": seen, "pictures": pictures}
+        text += f"\n{pictures} pictures in frames/ and boards/; spots.csv waits for `tvsbayes detect`"
+    else:
+        result.write(out)
+    finish(document, text, as_json)
+
+
+def detect(
+    campaign: CampaignFolder,
+    method: Annotated[str, typer.Option("--method", help="fit, or contour (the paper's).")] = "fit",
+    speckle_contrast: Annotated[
+        float | None,
+        typer.Option("--speckle-contrast", min=0.0, max=2.0, help="Per pixel (default: learned; contour: 0.4)."),
+    ] = None,
+    overlay: Annotated[bool, typer.Option("--overlay", help="Pictures of every spot in results/overlay.")] = False,
+    as_json: Json = False,
+) -> None:
+    """Find the laser spots in a campaign's frames. Writes centres and uncertainties into spots.csv, in place."""
+    finite(speckle_contrast=speckle_contrast)
+    from tvsbayes.cameras.detection import detect as find
+    from tvsbayes.instrument.campaign import read_campaign, spots_bytes
+    from tvsbayes.report.command_text import detection_text
+
+    pictures = output_place(campaign, "results", "overlay") if overlay else None
+    data = read_campaign(campaign)
+    with counting("detecting") as show:
+        found = find(data, method, speckle_contrast=speckle_contrast, overlay=pictures, done=show)
+    write_atomically(campaign / "spots.csv", spots_bytes(found.campaign.spots))
+    document = {"campaign": str(campaign), **found.as_json()}
+    text = detection_text(found) + f"\nwritten: {escaped(str(campaign / 'spots.csv'), 200)}"
+    if overlay:
+        document["overlay"] = str(pictures)
+        text += f", {escaped(str(pictures), 200)}"
+    finish(document, text, as_json)
+
+
+def check(
+    path: Annotated[Path, typer.Argument(metavar="PATH", help="Campaign folder, rig file or plan.")],
+    plan_file: Annotated[
+        Path | None, typer.Argument(metavar="PLAN", help="With a rig file: what can this plan not separate?")
+    ] = None,
+    repair_to: Annotated[
+        Path | None, typer.Option("--repair-to", help="New folder for what is whole of a damaged journal.")
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """What a campaign, rig, plan or journal holds and cannot tell. Reads strictly, changes nothing."""
+    from tvsbayes.estimators.plausibility import check_campaign
+    from tvsbayes.instrument.campaign import read_campaign
+    from tvsbayes.instrument.plan import read_plan
+    from tvsbayes.instrument.rig import read_rig
+
+    if repair_to is not None:
+        from tvsbayes.acquisition.session import repair_campaign
+
+        document = repair_campaign(path, repair_to)
+        lines = [f"{key}: {value}" for key, value in document.items()]
+        finish(document, "\n".join([*lines, f"{escaped(str(repair_to), 200)}: written"]), as_json)
+        return
+    if plan_file is not None and path.suffix != ".toml":
+        remedy = "give the rig file first, then the plan"
+        raise InputError("usage", "a plan is checked together with a rig file", allowed="RIG PLAN", remedy=remedy)
+    if plan_file is not None:
+        rig, steps = read_rig(path), read_plan(plan_file)
+        from tvsbayes.planning.plan_check import check_plan
+
+        compile_for(report_line)
+        document: dict[str, Any] = check_plan(rig, steps).as_json()
+    elif path.suffix == ".csv" and not path.is_dir():
+        steps = read_plan(path)
+        actions = {action: sum(s.action == action for s in steps) for action in ("home", "place", "move", "look")}
+        document = {"kind": "plan", "steps": len(steps), **actions, "warnings": []}
+    elif path.suffix == ".toml" and not path.is_dir():
+        rig = read_rig(path)
+        document = {"kind": "rig", "sheets_mm": rig.sheets_mm, "costs_s": rig.costs_s, "warnings": []}
+    else:
+        journal = None
+        if (path / "log.jsonl").is_file():
+            from tvsbayes.acquisition.session import check_journal
+
+            journal = check_journal(path)
+        if journal is not None and not journal["moves"]:
+            document = {"kind": "journal", **journal}
+        else:
+            document = check_campaign(read_campaign(path)).as_json()
+            if journal is not None:
+                document["warnings"] = [*journal.pop("warnings"), *document["warnings"]]
+                document["journal"] = journal
+    warnings = document["warnings"]
+    lines = [f"{key}: {value}" for key, value in document.items() if key not in ("warnings", "faults")]
+    lines += [f"warning: {warning}" for warning in warnings]
+    lines.append(f"{escaped(str(path), 200)}: readable, {len(warnings)} warning{'s' * (len(warnings) != 1)}")
+    finish(document, "\n".join(lines), as_json)

@@ -1,0 +1,89 @@
+"""The command line: reads options, calls the library, prints tables or one JSON document (DESIGN 8).
+
+Heavy modules are imported inside the commands that need them; `tvsbayes --help` loads none of them. Exit codes:
+0 done, 1 done but a limit or target is not met, 2 bad input, 3 nothing to estimate, 4 not converged, 5 device fault,
+130 interrupted.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+
+import typer
+
+from tvsbayes.cli.app import (
+    INTERRUPTED,
+    Ended,
+    OutputFailed,
+    app,
+    error_document,
+    print_json,
+    report_error,
+    report_line,
+)
+from tvsbayes.cli.bench_commands import acquire, doctor, stereo
+from tvsbayes.cli.campaign_commands import check, demo, detect, new, simulate
+from tvsbayes.cli.estimate_commands import classic, compare, fit, report
+from tvsbayes.cli.use_commands import locate, plan, steps_for, study
+from tvsbayes.errors import InputError, TvsError
+
+COMMANDS = (
+    *(demo, new, simulate, detect, stereo, check, acquire, doctor),
+    *(classic, fit, report, compare, locate, steps_for, plan, study),
+)
+"""In the order of `--help`."""
+for command in COMMANDS:
+    app.command()(command)
+
+
+def run(arguments: list[str]) -> int:
+    """Run one command and return its exit code; no traceback reaches a user."""
+    try:
+        return _run(arguments)
+    except OutputFailed as error:
+        report_line(f"error: the result cannot be written to standard output: {error}")
+        return InputError.exit_code
+
+
+def _run(arguments: list[str]) -> int:
+    wants_json = "--json" in arguments
+    try:
+        # Typer returns the code of its own Exit, into which it also turns Ctrl-C; commands return None.
+        code = app(arguments, prog_name="tvsbayes", standalone_mode=False) or 0
+    except TvsError as error:
+        if wants_json:
+            print_json(error_document(error))
+        else:
+            report_error(error)
+        return error.exit_code
+    except Ended as ending:
+        return ending.exit_code
+    except typer.Exit as ending:
+        return ending.exit_code
+    except (KeyboardInterrupt, typer.Abort):
+        code = INTERRUPTED
+    except Exception as error:
+        # Wrong options are bad input like any other; typer's own classes carry the text to show.
+        if not hasattr(error, "format_message"):
+            raise
+        if wants_json:
+            print_json(error_document(InputError("usage", error.format_message(), remedy="see tvsbayes --help")))
+        else:
+            error.show()
+        return InputError.exit_code
+    if code == INTERRUPTED:
+        if wants_json:
+            print_json(error_document(TvsError("interrupted", "interrupted", remedy="run it again")))
+        report_line("interrupted")
+    return code
+
+
+def main() -> None:
+    """Entry point of the `tvsbayes` script."""
+    # Read when NumPy is first imported. The matrices here are small: OpenBLAS' second thread only waits, and its
+    # busy waiting takes the time of XLA's threads, tenfold where two fits share two cores.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    # XLA calls a compilation of more than two minutes, as on a small computer, an error to be filed with its authors.
+    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
+    sys.exit(run(sys.argv[1:]))

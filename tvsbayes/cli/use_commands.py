@@ -1,0 +1,256 @@
+"""Locate, steps-for, plan, study."""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from tvsbayes.cli.app import (
+    CampaignFolder,
+    Ended,
+    Json,
+    Seed,
+    finish,
+    finite,
+    keep,
+    report_line,
+)
+from tvsbayes.errors import InputError, TvsError, escaped
+from tvsbayes.files.csv_table import CSV_BYTES_MAX, parse_table
+from tvsbayes.files.disk import output_place, read_bytes
+from tvsbayes.pipeline import calibration_for, compile_for, fit_for
+
+POINT_COLUMNS = ("pan_steps", "tilt_steps", "pan_approach", "tilt_approach", "aperture_deg")
+STEPS_MAX, ANGLE_MAX_DEG = 1e8, 360.0
+
+
+def _read_points(path: Path) -> tuple[list[float], list[float], list[float], list[tuple[str, str]]]:
+    """Counters, readings and approaches of a CSV of points."""
+    from tvsbayes.instrument.axes import SIDES
+
+    table = parse_table(read_bytes(path, CSV_BYTES_MAX), escaped(path.name), POINT_COLUMNS)
+    if not len(table):
+        raise InputError("empty", f"{escaped(path.name)}: no points", file=escaped(path.name), remedy="add rows")
+    for axis in ("pan", "tilt"):
+        allowed = (*SIDES[axis][::-1], "unknown")
+        for row, word in enumerate(table.columns[f"{axis}_approach"]):
+            if word not in allowed:
+                remedy = "name the direction of the last move of the axis"
+                raise table.refuse(row, f"{axis}_approach", "approach", ", ".join(allowed), remedy)
+    counters = [table.numbers(name, -STEPS_MAX, STEPS_MAX) for name in ("pan_steps", "tilt_steps")]
+    readings = table.numbers("aperture_deg", -ANGLE_MAX_DEG, ANGLE_MAX_DEG)
+    pairs = list(zip(table.columns["pan_approach"], table.columns["tilt_approach"], strict=True))
+    return *counters, readings, pairs
+
+
+def locate(
+    campaign: CampaignFolder,
+    pan_steps: Annotated[float | None, typer.Option("--pan-steps", help="Absolute counter.")] = None,
+    tilt_steps: Annotated[float | None, typer.Option("--tilt-steps", help="Absolute counter.")] = None,
+    pan_approach: Annotated[str, typer.Option("--pan-approach", help="left, right or unknown.")] = "left",
+    tilt_approach: Annotated[str, typer.Option("--tilt-approach", help="up, down or unknown.")] = "up",
+    aperture_deg: Annotated[float | None, typer.Option("--aperture-deg", help="Reading B of the aperture.")] = None,
+    points: Annotated[
+        Path | None,
+        typer.Option(
+            "--points", help="CSV with columns pan_steps, tilt_steps, pan_approach, tilt_approach, aperture_deg."
+        ),
+    ] = None,
+    draws: Annotated[int, typer.Option("--draws", min=500, max=100_000, help="Draws per point.")] = 1000,
+    budget: Annotated[
+        bool, typer.Option("--budget", help="Also what the uncertainty of the point consists of.")
+    ] = False,
+    seed: Seed = 0,
+    as_json: Json = False,
+) -> None:
+    """Where the scanner points, in millimetres. Frame T, with covariance and 95 % half widths."""
+    single = (pan_steps, tilt_steps, aperture_deg)
+    if (points is None) == any(value is None for value in single):
+        remedy = "give --pan-steps, --tilt-steps and --aperture-deg, or --points FILE.csv"
+        raise InputError("usage", "locate needs one point or a file of points", remedy=remedy)
+    if budget and points is not None:
+        raise InputError("usage", "--budget is for one point", remedy="leave out --points")
+    finite(pan_steps=pan_steps, tilt_steps=tilt_steps, aperture_deg=aperture_deg)
+    where = (*single, (pan_approach, tilt_approach)) if points is None else _read_points(points)
+    from tvsbayes.instrument.axes import sides_of
+
+    if points is None:
+        sides_of((pan_approach, tilt_approach))
+    calibration = calibration_for(campaign, report_line)
+    from tvsbayes.coordinates.location import locate as locate_points
+    from tvsbayes.report.command_text import locations_text
+
+    compile_for(report_line)
+    found = locate_points(calibration, *where, draws=draws, seed=seed)
+    if points is not None:
+        entries = [found.as_json(k) for k in range(len(found.refused))]
+        document = {"estimator": found.estimator, "draws": found.draws, "points": entries}
+        finish(document, locations_text(found), as_json)
+        return
+    if found.refused[0] is not None:
+        raise found.refused[0]
+    document = {"estimator": found.estimator, "draws": found.draws, **found.as_json(0)}
+    text = locations_text(found)
+    if budget:
+        from tvsbayes.metrology.budget import budget as point_budget
+        from tvsbayes.report.command_text import budget_text
+
+        parts = point_budget(calibration, *where)
+        document["budget"] = parts.as_json()
+        text += f"\n\n{budget_text(parts)}"
+    finish(document, text, as_json)
+
+
+def steps_for(
+    campaign: CampaignFolder,
+    x_mm: Annotated[float | None, typer.Option("--x-mm", help="Wanted point, frame T: depth.")] = None,
+    y_mm: Annotated[float | None, typer.Option("--y-mm", help="Along the baseline, towards the positioner.")] = None,
+    z_mm: Annotated[float | None, typer.Option("--z-mm", help="Up.")] = None,
+    azimuth_deg: Annotated[float | None, typer.Option("--azimuth-deg", help="Wanted direction: C - 90 deg.")] = None,
+    elevation_deg: Annotated[float | None, typer.Option("--elevation-deg", help="Above the horizontal.")] = None,
+    pan_approach: Annotated[str | None, typer.Option("--pan-approach", help="left or right (default: left).")] = None,
+    tilt_approach: Annotated[str | None, typer.Option("--tilt-approach", help="up or down (default: up).")] = None,
+    rig: Annotated[Path | None, typer.Option("--rig", help="Rig file whose [positioner] limits are kept.")] = None,
+    export: Annotated[str | None, typer.Option("--export", help="header or json: the calibration itself.")] = None,
+    as_json: Json = False,
+) -> None:
+    """Counters that send the beam to a point or along a direction. With the approach that removes backlash."""
+    finite(x_mm=x_mm, y_mm=y_mm, z_mm=z_mm, azimuth_deg=azimuth_deg, elevation_deg=elevation_deg)
+    point = None if None in (x_mm, y_mm, z_mm) else (x_mm, y_mm, z_mm)
+    direction = None if None in (azimuth_deg, elevation_deg) else (azimuth_deg, elevation_deg)
+    given = sum(value is not None for value in (x_mm, y_mm, z_mm, azimuth_deg, elevation_deg))
+    if export not in (None, "header", "json"):
+        raise InputError("usage", f"--export {escaped(export)}", allowed="header, json", remedy="name one of them")
+    if given != (0 if export else 3 if point else 2 if direction else -1):
+        remedy = "give --x-mm --y-mm --z-mm, or --azimuth-deg --elevation-deg, or --export alone"
+        raise InputError("usage", "steps-for needs one target", remedy=remedy)
+    limits = None if rig is None else _limits(rig)
+    calibration = calibration_for(campaign, report_line)
+    from tvsbayes.calibration.calibration_file import calibration_header, calibration_json
+
+    if export:
+        document = calibration_json(calibration)
+        text = calibration_header(calibration) if export == "header" else json.dumps(document, indent=1)
+        finish({"header": text} if as_json and export == "header" else document, text.rstrip("\n"), as_json)
+        return
+    from tvsbayes.report.command_text import steps_text
+
+    azimuth, elevation = direction or (None, None)
+    sides = None if pan_approach is tilt_approach is None else (pan_approach or "left", tilt_approach or "up")
+    found = calibration.steps_for(point, azimuth_deg=azimuth, elevation_deg=elevation, approach=sides, limits=limits)
+    if not calibration.covers(found.pan_steps, found.tilt_steps):
+        report_line("warning: these counters lie outside those of the campaign: the calibration extrapolates")
+    document = {"estimator": calibration.estimator, **found.as_json()}
+    finish(document, steps_text(found), as_json)
+
+
+TargetText = Annotated[
+    str | None,
+    typer.Option("--target", help="As 'u(worst) <= 2e-4 deg/step' or 'U95(x) at 1000,0,0 mm <= 60 mm'."),
+]
+
+
+def plan(
+    rig: Annotated[Path, typer.Argument(metavar="RIG", help="Rig file.")],
+    given: Annotated[Path | None, typer.Option("--given", help="Campaign measured already: what next?")] = None,
+    target: TargetText = None,
+    minutes: Annotated[float | None, typer.Option("--minutes", min=0.1, help="Longest plan.")] = None,
+    output: Annotated[Path | None, typer.Option("-o", "--output", help="Write the plan here (plan.csv).")] = None,
+    criterion: Annotated[str, typer.Option("--criterion", help="c (the target), D or A (all headlines).")] = "c",
+    aperture: Annotated[bool, typer.Option("--aperture/--no-aperture", help="Looks also read the aperture.")] = False,
+    draws: Annotated[int, typer.Option("--draws", min=20, max=10_000, help="Instruments for the assurance.")] = 200,
+    seed: Seed = 0,
+    as_json: Json = False,
+) -> None:
+    """How many experiments, which ones, and when to stop. With --given: what next."""
+    from tvsbayes.instrument.campaign import input_hashes, read_campaign
+    from tvsbayes.instrument.plan import write_plan
+    from tvsbayes.instrument.rig import read_rig
+
+    instrument, data = read_rig(rig), None if given is None else read_campaign(given)
+    from tvsbayes.planning.planner import plan as find_plan
+    from tvsbayes.planning.search import CRITERIA
+    from tvsbayes.planning.target import DEFAULT_TARGET, parse_target
+    from tvsbayes.report.command_text import plan_text
+
+    wanted = parse_target(target or DEFAULT_TARGET)
+    if criterion not in CRITERIA:
+        message, allowed = f"--criterion {escaped(criterion)}", ", ".join(CRITERIA)
+        raise InputError("criterion", message, column="--criterion", allowed=allowed, remedy="name one of them")
+    compile_for(report_line)
+    fitted = None if data is None else fit_for(data, report_line)
+    options = {"criterion": criterion, "aperture": aperture, "draws": draws, "seed": seed}
+    result = find_plan(instrument, wanted, given=fitted, minutes=minutes, **options)
+    text, document = plan_text(result), result.as_json()
+    if output is not None and result.steps:
+        write_plan(result.steps, output)
+        document["plan"] = str(output)
+        text += f"\nwritten: {escaped(str(output), 200)}"
+    elif output is not None:
+        text += f"\nnothing written to {escaped(str(output), 200)}: there is nothing more to measure"
+    if data is not None:
+        # Where the report looks for what to measure next.
+        stored = {"format": "tvsbayes-plan/1", "inputs": input_hashes(data), **document}
+        keep(stored, output_place(data.path, "results") / "plan.json")
+    finish(document, text, as_json)
+    if target is not None and not result.met:
+        raise Ended(TvsError.exit_code)
+
+
+def study(
+    rig: Annotated[Path, typer.Argument(metavar="RIG", help="Rig file.")],
+    plan_file: Annotated[Path, typer.Argument(metavar="PLAN", help="plan.csv.")],
+    n: Annotated[int, typer.Option("--n", min=1, max=1_000_000, help="Simulated campaigns.")] = 100,
+    engine: Annotated[str, typer.Option("--engine", help="serial, processes or dask.")] = "serial",
+    workers: Annotated[int, typer.Option("--workers", min=1, max=1024, help="Worker processes.")] = 2,
+    scheduler: Annotated[str | None, typer.Option("--scheduler", help="Address of a Dask scheduler.")] = None,
+    rows: Annotated[Path | None, typer.Option("--rows", help="File of rows (default: PLAN with .study.jsonl).")] = None,
+    target: TargetText = None,
+    aperture: Annotated[bool, typer.Option("--aperture/--no-aperture", help="Looks also read the aperture.")] = False,
+    seed: Seed = 0,
+    as_json: Json = False,
+) -> None:
+    """Simulate a plan many times and fit every campaign. Coverage, power, assurance; run again to go on."""
+    from tvsbayes.instrument.plan import read_plan
+    from tvsbayes.instrument.rig import read_rig
+
+    instrument, steps = read_rig(rig), read_plan(plan_file)
+    from tvsbayes.planning.target import DEFAULT_TARGET, parse_target
+    from tvsbayes.report.command_text import study_text
+    from tvsbayes.statistics.intervals import ASSURED
+    from tvsbayes.studies.study import StudyRows
+    from tvsbayes.studies.study import study as run_study
+    from tvsbayes.studies.study_job import StudyJob
+
+    compile_for(report_line)
+    job = StudyJob(instrument, steps, parse_target(target or DEFAULT_TARGET), seed, aperture)
+    kept = StudyRows(rows or plan_file.with_suffix(".study.jsonl"))
+    missing = n - sum(index < n for index in kept.of(job))
+    report_line(f"{n} campaigns, {missing} to go on engine {escaped(engine)}; rows in {escaped(str(kept.path), 200)}")
+
+    def progress(done: int, wanted: int) -> None:
+        if sys.stderr.isatty():
+            report_line(f"{done} of {wanted}")
+
+    options = {"engine": engine, "workers": workers, "address": scheduler}
+    result = run_study(job, n, kept, progress=progress, **options)
+    document = {**result.as_json(), "rows": str(kept.path), "engine": engine, "seed": seed}
+    finish(document, study_text(result), as_json)
+    if target is not None and result.assurance < ASSURED[0]:
+        raise Ended(TvsError.exit_code)
+
+
+def _limits(path: Path) -> dict[str, tuple[float, float]]:
+    """Counter limits by axis from [positioner] of a rig file."""
+    from tvsbayes.instrument.rig import read_rig
+
+    stated = read_rig(path).positioner
+    return {
+        axis: (stated.get(f"{axis}_min_steps", -math.inf), stated.get(f"{axis}_max_steps", math.inf))
+        for axis in ("pan", "tilt")
+    }

@@ -1,0 +1,259 @@
+"""TVS coordinates: where beam and aperture reading meet, in mm, and how sure that is (paper eq. 1-3; DESIGN 5).
+
+Frame T: origin mid-baseline, x depth, y along the baseline towards the positioner at +a/2, z up; the aperture stands
+at (0, -a/2, 0). mm and rad inside; degrees where a name says `_deg`. The emission angle C and the aperture angle B are
+interior angles of the triangle whose third corner is the spot.
+
+Uncertainty is propagated by the law (GUM 5), by distributions (JCGM 101, 102), and the one is validated by the other;
+these functions know no frame and take any unit. The law is written for JAX so that thousands of points share one
+compiled function; distributions are arrays of draws, from any generator or from a posterior.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from tvsbayes.calibration.pointing import DIVERGING_SHARE, INPUT_NAMES, Calibration
+from tvsbayes.coordinates.beam_meeting import Carried, Linear, Settings, Sources, carry, propagate, sources
+from tvsbayes.errors import InputError
+from tvsbayes.instrument.axes import sides_of
+from tvsbayes.statistics.intervals import NORMAL_95, Validation, symmetric_interval, validate
+
+DRAWS = 1000
+"""Draws carried to a point unless the caller wants others; DESIGN 5 asks for 500 at least."""
+POINTS = 256
+"""Points per call of the compiled functions."""
+
+
+def published_point(
+    B_deg: float | np.ndarray,
+    C_deg: float | np.ndarray,
+    beta_deg: float | np.ndarray,
+    baseline_mm: float,
+    *,
+    as_printed: bool = False,
+) -> np.ndarray:
+    """The paper's equations (1)-(3), B and C in the plane that is tilted by beta about the baseline.
+
+    y = a (1/2 - sin B cos C / sin(B + C)) holds for every B and C. The paper prints a second branch for B > 90 deg,
+    y = -a (1/2 + sin B cos C / sin[180 - (B + C)]), which jumps by -a at B = 90 deg: it is returned with
+    `as_printed` only.
+
+    Args:
+        B_deg: angle at the aperture.
+        C_deg: angle at the positioner.
+        beta_deg: elevation.
+        baseline_mm: a.
+        as_printed: the paper's two branches.
+
+    Returns:
+        x, y, z in mm, first axis; infinite or behind the baseline where B + C >= 180 deg.
+    """
+    B, C, beta = (np.radians(np.asarray(angle, dtype=float)) for angle in (B_deg, C_deg, beta_deg))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        height = baseline_mm * np.sin(B) * np.sin(C) / np.sin(B + C)
+        share = np.sin(B) * np.cos(C) / np.sin(B + C)
+    y = baseline_mm * (0.5 - share)
+    if as_printed:
+        y = np.where(np.degrees(B) > 90.0, -baseline_mm * (0.5 + share), y)
+    return np.stack(np.broadcast_arrays(height * np.cos(beta), y, height * np.sin(beta)))
+
+
+@dataclass(frozen=True)
+class Locations:
+    """Points of frame T with their uncertainty; arrays over points, not a number where a point is refused.
+
+    Attributes:
+        xyz_mm: means of the draws, shape (n, 3).
+        covariance_mm2: shape (n, 3, 3).
+        interval95_mm: equal-tailed intervals, shape (n, 2, 3).
+        u95_mm: their half widths, shape (n, 3).
+        diverging_share: share of draws without a point, shape (n,).
+        linear_xyz_mm, linear_covariance_mm2: by the law of propagation, shapes (n, 3) and (n, 3, 3).
+        validation: of the law of propagation by the draws (JCGM 101 clause 8), fields of shape (n, 3).
+        refused: the refusal of each point, or None.
+        estimator: "posterior" or "laplace".
+        draws: number of draws.
+    """
+
+    xyz_mm: np.ndarray
+    covariance_mm2: np.ndarray
+    interval95_mm: np.ndarray
+    u95_mm: np.ndarray
+    diverging_share: np.ndarray
+    linear_xyz_mm: np.ndarray
+    linear_covariance_mm2: np.ndarray
+    validation: Validation
+    refused: tuple[InputError | None, ...]
+    estimator: str
+    draws: int
+
+    @cached_property
+    def digits_held(self) -> np.ndarray:
+        """Significant digits of u, two at most, to which the law of propagation holds, shape (n, 3)."""
+        return self.validation.digits_held(np.sqrt(np.diagonal(self.linear_covariance_mm2, 0, 1, 2)))
+
+    def as_json(self, index: int) -> dict[str, object]:
+        """One point; null where it is refused."""
+        error = self.refused[index]
+        if error is not None:
+            empty = dict.fromkeys(("xyz_mm", "covariance_mm2", "u95_mm"))
+            return {**empty, "refused": {"code": error.code, "message": error.message}}
+        u = np.sqrt(np.diag(self.linear_covariance_mm2[index]))
+        v = self.validation
+        return {
+            "xyz_mm": self.xyz_mm[index].tolist(),
+            "covariance_mm2": self.covariance_mm2[index].tolist(),
+            "u95_mm": self.u95_mm[index].tolist(),
+            "interval95_mm": self.interval95_mm[index].T.tolist(),
+            "diverging_share": float(self.diverging_share[index]),
+            "linear": {
+                "xyz_mm": self.linear_xyz_mm[index].tolist(),
+                "covariance_mm2": self.linear_covariance_mm2[index].tolist(),
+                "u95_mm": (NORMAL_95 * u).tolist(),
+                "digits": v.digits,
+                "validated": bool(v.validated[index].all()),
+                "digits_held": int(self.digits_held[index].min()),
+                "decided": bool(v.decided[index].all()),
+                "deviation_mm": v.deviation[index].tolist(),
+                "tolerance_mm": v.tolerance[index].tolist(),
+            },
+        }
+
+
+def settings_of(
+    pan_steps: float | Sequence[float] | np.ndarray,
+    tilt_steps: float | Sequence[float] | np.ndarray,
+    aperture_deg: float | Sequence[float] | np.ndarray,
+    approach: tuple[str, str] | Sequence[tuple[str, str]] = ("left", "up"),
+) -> Settings:
+    """Settings of many points; arguments and errors as in `locate`."""
+    numbers = [np.atleast_1d(np.asarray(x, dtype=float)) for x in (pan_steps, tilt_steps, aperture_deg)]
+    pan, tilt, reading = np.broadcast_arrays(*numbers)
+    pairs = [approach] if len(approach) == 2 and isinstance(approach[0], str) else list(approach)
+    known = {pair: sides_of(pair) for pair in set(map(tuple, pairs))}
+    side = np.broadcast_to(np.array([known[tuple(pair)] for pair in pairs]), (len(pan), 2))
+    with jax.enable_x64(True):
+        return Settings(
+            steps=jnp.asarray(np.stack([pan, tilt], axis=1)),
+            side=jnp.asarray(side),
+            aperture_rad=jnp.asarray(np.radians(reading)),
+        )
+
+
+def _blocks(settings: Settings) -> Iterator[tuple[Settings, int]]:
+    """Equal blocks of settings, the last one filled up with its last point, and how many points of each count."""
+    count = len(settings.aperture_rad)
+    size = min(POINTS, 1 << max(count - 1, 0).bit_length())
+    for begin in range(0, count, size):
+        chosen = np.minimum(np.arange(begin, begin + size), count - 1)
+        yield jax.tree.map(lambda x, chosen=chosen: x[chosen], settings), min(size, count - begin)
+
+
+def locate_linear(calibration: Calibration, settings: Settings) -> Linear:
+    """The law of propagation alone: fields with a leading axis of points, not a number where there is no point.
+
+    No draws: a million points a minute. Validate some of them with `locate`.
+    """
+    given = sources(calibration, 1, 0)
+    with jax.enable_x64(True):
+        found = [
+            jax.tree.map(lambda x, n=n: np.asarray(x)[:n], propagate(block, given)) for block, n in _blocks(settings)
+        ]
+    return jax.tree.map(lambda *parts: np.concatenate(parts), *found)
+
+
+def locate(
+    calibration: Calibration,
+    pan_steps: float | Sequence[float] | np.ndarray,
+    tilt_steps: float | Sequence[float] | np.ndarray,
+    aperture_deg: float | Sequence[float] | np.ndarray,
+    approach: tuple[str, str] | Sequence[tuple[str, str]] = ("left", "up"),
+    *,
+    draws: int = DRAWS,
+    seed: int = 0,
+) -> Locations:
+    """Where the scanner points: a calibration carried into frame T, draw by draw and by the law of propagation.
+
+    Frame T: origin half way between positioner and aperture, x depth, y towards the positioner, z up. Aperture noise
+    and the scatter of the stop are in the uncertainty, besides that of every parameter.
+
+    Args:
+        calibration: from `load_calibration` or `calibration_of`.
+        pan_steps: absolute counters, one or n.
+        tilt_steps: absolute counters, one or n.
+        aperture_deg: readings B of the aperture, deg, one or n.
+        approach: last move of (pan, tilt): left, right or unknown; up, down or unknown; one pair or n pairs.
+        draws: number of draws, at least 500; 1000 give a 95 % half width to about 3 %.
+        seed: of stop errors and aperture noise; they are the same for every point, so that a point does not depend
+            on its neighbours in the list.
+
+    Returns:
+        Points with covariance and intervals; look at `refused`.
+
+    Raises:
+        InputError: a calibration without draws, or an approach that does not exist.
+        ValueError: fewer than 500 draws (DESIGN 5), or lists of different lengths.
+    """
+    if draws < 500:
+        raise ValueError(f"{draws} draws; a coordinate's interval needs at least 500 (DESIGN 5)")
+    settings = settings_of(pan_steps, tilt_steps, aperture_deg, approach)
+    if not len(settings.steps):
+        raise ValueError("no points: the lists are empty")
+    given = sources(calibration, draws, seed)
+    parts = []
+    with jax.enable_x64(True):
+        for block, n in _blocks(settings):
+            carried, law = carry(block, given), propagate(block, given)
+            trimmed = jax.tree.map(lambda x, n=n: np.asarray(x)[..., :n], carried)
+            parts.append(_statistics(trimmed, jax.tree.map(lambda x, n=n: np.asarray(x)[:n], law), given))
+    joined = {name: np.concatenate([part[name] for part in parts]) for name in parts[0] if name != "validation"}
+    checks = [part["validation"] for part in parts]
+    fields = ("tolerance", "deviation", "error", "validated", "decided")
+    together = {name: np.concatenate([getattr(check, name) for check in checks]) for name in fields}
+    validation = Validation(checks[0].digits, **together)
+    steps, side = np.asarray(settings.steps), np.asarray(settings.side)
+    reading = np.degrees(settings.aperture_rad)
+    lost = ~(joined["diverging_share"] <= DIVERGING_SHARE)
+    refused = tuple(
+        calibration.refusal(*steps[i], float(reading[i]), tuple(side[i])) if bad else None for i, bad in enumerate(lost)
+    )
+    return Locations(**joined, validation=validation, refused=refused, estimator=calibration.estimator, draws=draws)
+
+
+def _statistics(carried: Carried, law: Linear, given: Sources) -> dict[str, object]:
+    """Moments, intervals and validation of one block of points."""
+    meets = carried.meets
+    lost = (~meets).mean(axis=0)
+    count = len(meets)
+    # The few draws without a point take the point's median place: at most one in a thousand, or the point is refused.
+    xyz = carried.xyz_mm
+    for point in np.flatnonzero(~meets.all(axis=0) & meets.any(axis=0)):
+        seen = meets[:, point]
+        xyz = xyz.copy() if xyz is carried.xyz_mm else xyz
+        xyz[~seen, :, point] = np.median(xyz[seen, :, point], axis=0)
+    mean = xyz.mean(axis=0)
+    centred = xyz - mean
+    covariance = np.einsum("dip,djp->pij", centred, centred) / (count - 1)
+    inputs = np.concatenate([np.asarray(given.inputs)[:, : len(INPUT_NAMES)], np.asarray(given.noise)], axis=1)
+    u = np.sqrt(np.einsum("pii->pi", law.covariance))
+    linearised = law.value + np.einsum("pik,dk->dpi", law.jacobian, inputs - np.asarray(given.mean))
+    draws = np.ascontiguousarray(xyz.transpose(0, 2, 1))
+    interval = symmetric_interval(draws)
+    empty = np.where(lost <= DIVERGING_SHARE, 0.0, np.nan)
+    return {
+        "xyz_mm": mean.T + empty[:, None],
+        "covariance_mm2": covariance + empty[:, None, None],
+        "interval95_mm": interval.transpose(1, 0, 2) + empty[:, None, None],
+        "u95_mm": 0.5 * (interval[1] - interval[0]) + empty[:, None],
+        "diverging_share": lost,
+        "linear_xyz_mm": law.value + empty[:, None],
+        "linear_covariance_mm2": law.covariance + empty[:, None, None],
+        "validation": validate(draws, linearised, law.value, u),
+    }

@@ -1,0 +1,141 @@
+"""What a user did wrong or must know: error classes, safe quoting."""
+
+from __future__ import annotations
+
+import difflib
+import re
+from collections.abc import Iterable, Sequence
+from functools import partial
+
+
+class TvsError(Exception):
+    """An error that a user can act on; the command line turns it into an exit code.
+
+    Attributes:
+        code: short stable identifier, e.g. "number", "unknown-key".
+        exit_code: what the process returns (DESIGN section 8).
+        file: name of the file as the user knows it, or None.
+        line: line number, 1-based, or None.
+        column: name of the column or dotted key, or None.
+        found: what stood there, shortened, control characters escaped.
+        allowed: what may stand there.
+        remedy: what the user can do now.
+    """
+
+    exit_code = 1
+
+    def __init__(
+        self,
+        code: str,
+        message: str,
+        *,
+        file: str | None = None,
+        line: int | None = None,
+        column: str | None = None,
+        found: str | None = None,
+        allowed: str | None = None,
+        remedy: str | None = None,
+    ):
+        super().__init__(message)
+        self.code = code
+        self.message = message
+        self.file = file
+        self.line = line
+        self.column = column
+        self.found = found
+        self.allowed = allowed
+        self.remedy = remedy
+
+    def __reduce__(self):
+        # Exceptions are pickled by their positional arguments alone; a worker process of a pool has to tell ours whole.
+        named = ("file", "line", "column", "found", "allowed", "remedy")
+        return partial(type(self), **{name: getattr(self, name) for name in named}), (self.code, self.message)
+
+
+class InputError(TvsError):
+    """A file, option or value that cannot be used as it is (exit 2)."""
+
+    exit_code = 2
+
+
+class NothingToEstimate(TvsError):
+    """The data are readable but hold nothing to estimate from (exit 3)."""
+
+    exit_code = 3
+
+
+class NotConverged(TvsError):
+    """An estimator did not reach its convergence criterion (exit 4)."""
+
+    exit_code = 4
+
+
+class DeviceFault(TvsError):
+    """The positioner, a camera or the disk failed while an instrument was in use (exit 5)."""
+
+    exit_code = 5
+
+
+INTEGER = re.compile(r"[+-]?[0-9]{1,18}")
+CONTROL = re.compile(r"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f]")
+
+
+def escaped(text: str, limit: int = 60) -> str:
+    """Text from a file made fit to print: what is not printable is escaped, what is long is cut."""
+    cut = text if len(text) <= limit else text[:limit] + "..."
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in cut)
+
+
+def shown(value: object) -> str:
+    """A value as an error message quotes it."""
+    if isinstance(value, str):
+        return f'"{escaped(value)}"'
+    if isinstance(value, dict):
+        return "a table with " + (escaped(", ".join(map(str, value))) or "no keys")
+    if isinstance(value, list):
+        return f"a list of {len(value)}"
+    if isinstance(value, bool):
+        return str(value).lower()
+    # An integer beyond Python's limit of digits cannot be printed at all.
+    huge = isinstance(value, int) and abs(value) >= 10**60
+    return "an integer of more than 60 digits" if huge else escaped(str(value))
+
+
+def refusal(
+    code: str,
+    *,
+    file: str,
+    found: str,
+    allowed: str,
+    remedy: str,
+    line: int | None = None,
+    column: str | None = None,
+) -> InputError:
+    """Builds the `InputError` whose message says where, what was found, what is allowed and what to do."""
+    where = file + (f" line {line}" if line else "") + (f", {escaped(column)}" if column else "")
+    message = f"{where}: found {found}; allowed: {allowed}; {remedy}"
+    where_parts = {"file": file, "line": line, "column": column}
+    return InputError(code, message, **where_parts, found=found, allowed=allowed, remedy=remedy)
+
+
+def closest(name: str, names: Iterable[str]) -> str:
+    """The remedy for an unknown name: the nearest allowed one, where any is near."""
+    near = difflib.get_close_matches(name[:100], list(names), n=1, cutoff=0.5)
+    return f"did you mean {near[0]}?" if near else "remove it, or correct the spelling"
+
+
+def listed(numbers: Sequence[int], most: int) -> str:
+    """The first of them, and how many more there are."""
+    more = f" and {len(numbers) - most} more" if len(numbers) > most else ""
+    return ", ".join(map(str, numbers[:most])) + more
+
+
+def other_format(found: str, allowed: Iterable[str]) -> str | None:
+    """The remedy for a file of another kind or version of ours; None where it is neither."""
+    kind, _, number = found[:100].rpartition("/")
+    known = {name.rpartition("/")[0] for name in allowed}
+    if not (kind.startswith("tvsbayes-") and number.isdecimal()):
+        return None
+    if kind in known:
+        return "another version of tvsbayes wrote it: use that one, or make the file again"
+    return f"this is a {escaped(kind)} file: name a {' or '.join(sorted(known))} file"

@@ -1,0 +1,171 @@
+"""A campaign as padded arrays."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+from platformdirs import user_cache_path
+
+from tvsbayes.instrument.axes import APPROACH_SIGN
+from tvsbayes.instrument.campaign import Campaign, Move, Spot, ordered_spots
+from tvsbayes.instrument.stereo_pair import triangulate
+from tvsbayes.instrument.stops import redraws
+from tvsbayes.model.laser_path import MoveArrays
+
+SMALLEST_BUCKET = 512
+"""Spots and moves are padded to this size or the next power of two above it: campaigns of ordinary size
+share one compiled function."""
+
+
+class SpotArrays(eqx.Module):
+    """Spots with status ok in time order, padded.
+
+    `whitening` maps a pixel residual to stated standard deviations. `weight` scales a spot's information
+    (1, or below for the robust option), `valid` is 0 for padding and excluded spots. `redraw[axis]` says that the
+    stop error of the axis was drawn anew since the previous spot, with variance
+    `redraw_mix[axis] @ (sd_right^2, sd_left^2)` (or down, up).
+    """
+
+    move_index: Int[Array, " spots"]
+    pixels: Float[Array, "spots 4"]
+    whitening: Float[Array, "spots 4 4"]
+    aperture_rad: Float[Array, " spots"]
+    has_aperture: Float[Array, " spots"]
+    triangulated_mm: Float[Array, "spots 3"]
+    valid: Float[Array, " spots"]
+    weight: Float[Array, " spots"]
+    redraw: Bool[Array, "spots 2"]
+    redraw_mix: Float[Array, "spots 2 2"]
+    new_segment: Bool[Array, " spots"]
+    homed: Bool[Array, " spots"]
+
+
+class CampaignArrays(eqx.Module):
+    """A campaign as arguments of jitted functions."""
+
+    moves: MoveArrays
+    spots: SpotArrays
+    azimuth_convention: Bool[Array, ""]
+
+
+def bucket(count: int) -> int:
+    """Padded length for `count` rows."""
+    size = SMALLEST_BUCKET
+    while size < count:
+        size *= 2
+    return size
+
+
+def move_arrays(moves: tuple[Move, ...]) -> MoveArrays:
+    """Pad the moves; padding repeats the last counters and therefore changes nothing."""
+    size = bucket(len(moves))
+    steps = np.zeros((size, 2))
+    steps[: len(moves)] = [(m.pan_steps, m.tilt_steps) for m in moves]
+    steps[len(moves) :] = steps[len(moves) - 1]
+    first = np.zeros(size, dtype=bool)
+    first[: len(moves)] = [bool(m.pan_approach) for m in moves]
+    approach = np.zeros((size, 2))
+    approach[: len(moves)] = [
+        (APPROACH_SIGN.get(m.pan_approach, 0), APPROACH_SIGN.get(m.tilt_approach, 0)) for m in moves
+    ]
+    return MoveArrays(jnp.asarray(steps), jnp.asarray(first), jnp.asarray(approach))
+
+
+def pixel_covariance(spot: Spot) -> np.ndarray:
+    """Stated covariance of (u_left, v_left, u_right, v_right), px^2."""
+    su_l, sv_l, su_r, sv_r = spot.su_left_px, spot.sv_left_px, spot.su_right_px, spot.sv_right_px
+    covariance = np.diag(np.square([su_l, sv_l, su_r, sv_r]))
+    covariance[0, 1] = covariance[1, 0] = spot.ruv_left * su_l * sv_l
+    covariance[2, 3] = covariance[3, 2] = spot.ruv_right * su_r * sv_r
+    return covariance
+
+
+def campaign_arrays(campaign: Campaign) -> CampaignArrays:
+    """Pack a campaign for the jitted functions.
+
+    Args:
+        campaign: a checked campaign with at least one spot of status ok.
+
+    Returns:
+        Arrays padded to `bucket` sizes.
+    """
+    spots = ordered_spots(campaign)
+    count, size = len(spots), bucket(len(spots))
+
+    def padded(rows, shape, fill=0.0, dtype=np.float64):
+        array = np.full((size, *shape), fill, dtype=dtype)
+        array[:count] = rows
+        return jnp.asarray(array)
+
+    pixels = np.array([(s.u_left_px, s.v_left_px, s.u_right_px, s.v_right_px) for s in spots])
+    covariance = np.stack([pixel_covariance(s) for s in spots])
+    whitening = np.linalg.inv(np.linalg.cholesky(covariance))
+    new = redraws(campaign.moves, spots)
+    aperture = [np.nan if s.aperture_deg is None else s.aperture_deg for s in spots]
+    points_mm = triangulate(campaign.stereo, pixels)
+    seen = np.isfinite(points_mm).all(axis=1)
+    points_mm[~seen] = NOWHERE_MM
+    with jax.enable_x64(True):
+        spot_arrays = SpotArrays(
+            move_index=padded([s.move for s in spots], (), spots[-1].move, np.int32),
+            pixels=padded(pixels, (4,), 0.0),
+            whitening=padded(whitening, (4, 4), np.eye(4)),
+            aperture_rad=padded(np.nan_to_num(np.radians(aperture)), ()),
+            has_aperture=padded(np.isfinite(aperture), ()),
+            triangulated_mm=padded(points_mm, (3,), NOWHERE_MM),
+            valid=padded(seen, ()),
+            weight=padded(1.0, (), 1.0),
+            redraw=padded(new.redraw, (2,), False, bool),
+            redraw_mix=padded(new.redraw_mix, (2, 2)),
+            new_segment=padded(new.new_segment, (), False, bool),
+            homed=padded(new.homed, (), False, bool),
+        )
+        return CampaignArrays(
+            move_arrays(campaign.moves), spot_arrays, jnp.asarray(campaign.rig.aperture_convention == "azimuth")
+        )
+
+
+NOWHERE_MM = (500.0, 0.0, 0.0)
+"""Stands for the point of a look that counts for nothing: finite, and in front of the cameras."""
+
+
+def in_sight(campaign: Campaign) -> np.ndarray:
+    """Whether each ordered spot has a triangulated point: one beyond the reach of the lens model has none."""
+    pixels = np.array([(s.u_left_px, s.v_left_px, s.u_right_px, s.v_right_px) for s in ordered_spots(campaign)])
+    return np.isfinite(triangulate(campaign.stereo, pixels.reshape(-1, 4))).all(axis=1)
+
+
+def spot_constants(campaign: Campaign) -> np.ndarray:
+    """Terms of each ordered spot's log likelihood that no parameter changes: 2 pi and its stated covariance."""
+    return np.array(
+        [
+            -0.5 * ((3 + (s.aperture_deg is not None)) * np.log(2 * np.pi) + np.linalg.slogdet(pixel_covariance(s))[1])
+            for s in ordered_spots(campaign)
+        ]
+    )
+
+
+def log_constant(campaign: Campaign) -> float:
+    """Terms of the log likelihood that no parameter changes: 2 pi and the stated pixel covariances."""
+    return float(np.sum(spot_constants(campaign)))
+
+
+def use_compilation_cache() -> bool:
+    """Keep compiled functions in the user's cache folder (or `TVSBAYES_CACHE`).
+
+    For programs such as the command line, which own their process: it changes a global setting of JAX, so nothing
+    in the library calls it.
+
+    Returns:
+        Whether nothing is in the folder yet: the model has to be compiled first, half a minute to two minutes.
+    """
+    folder = Path(os.environ.get("TVSBAYES_CACHE") or user_cache_path("tvsbayes") / "jax")
+    jax.config.update("jax_compilation_cache_dir", str(folder))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
+    return next(folder.glob("*-cache"), None) is None

@@ -1,0 +1,345 @@
+"""The paper's four-point estimator, exactly as printed, with type A and GUM uncertainties (DESIGN 4.4).
+
+Two spots before and two after a move of N steps, each triangulated alone; the beam's slope in the plane
+of the moved axis; the difference of two arctangents over N. Frame S (X depth, Y left, Z up, mm); degrees;
+pixels with the integer at the centre of a pixel. What the estimator cannot know (backlash, the tangent
+of a tilt read off its own azimuth) stays in its answer: that is what it is here for. No JAX.
+
+Also what can be said of a campaign before any fit: which stops its spots tell of, what they cannot separate.
+
+Source: Lopez-Medina et al., Metrology 2025, 5(4), 58, equations (4) to (8).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from functools import partial
+
+import numpy as np
+
+from tvsbayes.errors import NothingToEstimate
+from tvsbayes.instrument.axes import DIRECTIONS, PIXELS
+from tvsbayes.instrument.campaign import Campaign, Move, Spot
+from tvsbayes.instrument.stereo_pair import Stereo, triangulate
+from tvsbayes.statistics.intervals import coverage_factor, effective_dof
+
+STEP_HALVINGS = 40
+"""Of a difference quotient's step, until both ends lie in the lens model: a 10^-13th of a standard deviation."""
+
+
+@dataclass(frozen=True)
+class FourPointAngles:
+    """Beam slopes before and after the move, equations (4), (6), (8): arrays (...,) in degrees."""
+
+    theta_i_deg: np.ndarray
+    theta_f_deg: np.ndarray
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """One complete four-point experiment; `steps` is signed (positive = left or up)."""
+
+    experiment: int
+    direction: str
+    steps: int
+    theta_i_deg: float
+    theta_f_deg: float
+    deg_per_step: float
+
+
+@dataclass(frozen=True)
+class SkippedExperiment:
+    """An experiment that could not be used, and why in words."""
+
+    experiment: int
+    reason: str
+
+
+@dataclass(frozen=True)
+class Selection:
+    """The complete experiments of a campaign, as arrays over e experiments.
+
+    Attributes:
+        experiments: (e,) experiment numbers.
+        spot_rows: (e, 4) rows of `campaign.spots` of points 1 to 4.
+        pixels: (e, 4, 4) u_left, v_left, u_right, v_right of points 1 to 4, px.
+        steps: (e,) signed N.
+        axis: (e,) "pan" or "tilt".
+        skipped: what was left out, with reasons.
+    """
+
+    experiments: np.ndarray
+    spot_rows: np.ndarray
+    pixels: np.ndarray
+    steps: np.ndarray
+    axis: np.ndarray
+    skipped: tuple[SkippedExperiment, ...]
+
+    @property
+    def direction(self) -> np.ndarray:
+        """(e,) "left", "right", "up" or "down" by axis and sign of N (DESIGN 2)."""
+        tilt, positive = self.axis == "tilt", self.steps > 0
+        return np.where(tilt, np.where(positive, "up", "down"), np.where(positive, "left", "right"))
+
+
+@dataclass(frozen=True)
+class DirectionResult:
+    """Mean of one direction's experiments, deg/step, with type A and GUM uncertainty.
+
+    What needs two experiments (`sd`, `u`, intervals, degrees of freedom) is None for n = 1.
+    `u_stereo_deg_per_step` is sqrt(J C J^T) of stereo parameters and focal scale alone;
+    `effective_dof` is Welch-Satterthwaite's, with infinitely many for that type B part.
+    """
+
+    n: int
+    mean_deg_per_step: float
+    sd_deg_per_step: float | None
+    u_type_a_deg_per_step: float | None
+    interval95_type_a: tuple[float, float] | None
+    u_gum_deg_per_step: float | None
+    interval95_gum: tuple[float, float] | None
+    u_stereo_deg_per_step: float
+    effective_dof: float | None
+
+    def as_json(self) -> dict[str, object]:
+        """The direction's object of `classic --json` (DESIGN 8); infinite dof becomes null."""
+        document = asdict(self)
+        for name in ("interval95_type_a", "interval95_gum"):
+            document[name] = None if document[name] is None else list(document[name])
+        if self.effective_dof is not None and not np.isfinite(self.effective_dof):
+            document["effective_dof"] = None
+        return document
+
+
+@dataclass(frozen=True)
+class ClassicResult:
+    """What the paper's method says of a campaign; a direction without experiments is None."""
+
+    directions: dict[str, DirectionResult | None]
+    experiments: tuple[Experiment, ...]
+    skipped: tuple[SkippedExperiment, ...]
+
+    def as_json(self) -> dict[str, object]:
+        """The document of `tvsbayes classic --json` (DESIGN 8)."""
+        results = self.directions.items()
+        return {
+            "directions": {name: None if result is None else result.as_json() for name, result in results},
+            "experiments": [asdict(experiment) for experiment in self.experiments],
+            "skipped": [asdict(skipped) for skipped in self.skipped],
+        }
+
+
+def ratio_deg_per_step(
+    theta_i_deg: float | np.ndarray, theta_f_deg: float | np.ndarray, steps: int | np.ndarray
+) -> float | np.ndarray:
+    """Equation (5): (theta_f - theta_i) / N with signed N, so that a sane rig gives a positive ratio."""
+    return (theta_f_deg - theta_i_deg) / steps
+
+
+def four_point_angle_deg(points_S_mm: np.ndarray, axis: str | np.ndarray) -> FourPointAngles:
+    """Slopes of points 1-2 and 4-3 in the plane of the moved axis, equations (4), (6) and (8).
+
+    Args:
+        points_S_mm: (..., 4, 3) points 1 to 4 in frame S.
+        axis: "pan" (X-Y plane) or "tilt" (X-Z plane), one or an array (...,).
+    """
+    points = np.asarray(points_S_mm, float)
+    tilt = np.asarray(axis) == "tilt"
+    depth = points[..., 0]
+    across = np.where(tilt[..., None], points[..., 2], points[..., 1])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        before = (across[..., 1] - across[..., 0]) / (depth[..., 1] - depth[..., 0])
+        after = (across[..., 2] - across[..., 3]) / (depth[..., 2] - depth[..., 3])
+    return FourPointAngles(np.degrees(np.arctan(before)), np.degrees(np.arctan(after)))
+
+
+def four_point_ratios(
+    pixels: np.ndarray, steps: np.ndarray, axis: str | np.ndarray, stereo: Stereo, focal_scale: float = 1.0
+) -> np.ndarray:
+    """Degrees per step (e,) of many experiments at once, through the paper's whole chain.
+
+    Args:
+        pixels: (e, 4, 4) raw pixels (u_left, v_left, u_right, v_right) of points 1 to 4.
+        steps: (e,) signed N.
+        axis: "pan" or "tilt", one or (e,).
+        stereo: the calibration to triangulate with.
+        focal_scale: common factor on fx, fy of both cameras.
+    """
+    pixels = np.asarray(pixels, float).reshape(-1, 4, 4)
+    points = triangulate(stereo, pixels.reshape(-1, 4), focal_scale).reshape(-1, 4, 3)
+    angles = four_point_angle_deg(points, axis)
+    return np.asarray(ratio_deg_per_step(angles.theta_i_deg, angles.theta_f_deg, np.asarray(steps)))
+
+
+def select_experiments(campaign: Campaign) -> Selection:
+    """Collect the complete four-point experiments; the others are listed with a reason.
+
+    Complete: one ok spot for each point 1 to 4, points 1 and 2 at the same counters, 3 and 4 at the same,
+    exactly one axis moved between, no homing in between.
+    """
+    moves = {move.move: move for move in campaign.moves}
+    rows: dict[int, list[int]] = {}
+    for row, spot in enumerate(campaign.spots):
+        if spot.experiment is not None:
+            rows.setdefault(spot.experiment, []).append(row)
+    kept: list[tuple[int, list[int], str, int]] = []
+    skipped: list[SkippedExperiment] = []
+    for number in sorted(rows):
+        by_point, reason = _by_point(campaign.spots, rows[number])
+        if reason is None:
+            at = [moves[campaign.spots[row].move] for row in by_point]
+            axis, steps, reason = _commanded(at)
+        if reason is None:
+            kept.append((number, by_point, axis, steps))
+        else:
+            skipped.append(SkippedExperiment(number, reason))
+    spot_rows = np.array([k[1] for k in kept], dtype=int).reshape(-1, 4)
+    pixels = np.array([[PIXELS(campaign.spots[r]) for r in four] for four in spot_rows], float)
+    return Selection(
+        experiments=np.array([k[0] for k in kept], dtype=int),
+        spot_rows=spot_rows,
+        pixels=pixels.reshape(-1, 4, 4),
+        steps=np.array([k[3] for k in kept], dtype=int),
+        axis=np.array([k[2] for k in kept], dtype="U4"),
+        skipped=tuple(skipped),
+    )
+
+
+def _by_point(spots: Sequence[Spot], rows: list[int]) -> tuple[list[int], str | None]:
+    """Rows of points 1 to 4 in order, or the reason why there are not exactly four."""
+    found: dict[int | None, list[int]] = {}
+    for row in rows:
+        found.setdefault(spots[row].point, []).append(row)
+    ordered = []
+    for point in (1, 2, 3, 4):
+        here = found.get(point, [])
+        if not here:
+            return [], f"point {point} is missing"
+        ok = [row for row in here if spots[row].status == "ok"]
+        if not ok:
+            return [], f"point {point} is not usable: status {spots[here[0]].status}"
+        if len(ok) > 1:
+            return [], f"point {point} is present {len(ok)} times"
+        ordered.append(ok[0])
+    return ordered, None
+
+
+def _commanded(at: list[Move]) -> tuple[str, int, str | None]:
+    """Moved axis and signed N of the moves under points 1 to 4, or the reason why there is none."""
+    one, two, three, four = ((m.segment, m.pan_steps, m.tilt_steps) for m in at)
+    if len({m.segment for m in at}) > 1:
+        return "", 0, "the positioner was homed within the experiment"
+    if one != two:
+        return "", 0, "points 1 and 2 were seen at different counters"
+    if three != four:
+        return "", 0, "points 3 and 4 were seen at different counters"
+    pan, tilt = three[1] - two[1], three[2] - two[2]
+    if pan and tilt:
+        return "", 0, f"both axes moved between points 2 and 3 (pan {pan:+d}, tilt {tilt:+d} steps)"
+    if not pan and not tilt:
+        return "", 0, "no axis moved between points 2 and 3"
+    return ("pan", pan, None) if pan else ("tilt", tilt, None)
+
+
+def classic(campaign: Campaign) -> ClassicResult:
+    """The paper's result for a campaign: every experiment, and each direction's mean and uncertainty.
+
+    Raises:
+        NothingToEstimate: no experiment is complete.
+    """
+    selection = select_experiments(campaign)
+    points = triangulate(campaign.stereo, selection.pixels.reshape(-1, 4)).reshape(-1, 4, 3)
+    angles = four_point_angle_deg(points, selection.axis)
+    ratios = np.asarray(ratio_deg_per_step(angles.theta_i_deg, angles.theta_f_deg, selection.steps))
+    finite = np.isfinite(ratios)
+    skipped = list(selection.skipped)
+    for number in selection.experiments[~finite]:
+        skipped.append(SkippedExperiment(int(number), "a pixel cannot be undistorted or triangulated"))
+    skipped.sort(key=lambda one: one.experiment)
+    if not finite.any():
+        first = f"; the first: experiment {skipped[0].experiment}, {skipped[0].reason}" if skipped else ""
+        raise NothingToEstimate(
+            "no-experiment",
+            f"no complete four-point experiment among the {len(skipped)} named in spots.csv{first}",
+            file="spots.csv",
+            column="experiment",
+            allowed="points 1 to 4 of one experiment, one axis moved between points 2 and 3",
+            remedy="name experiment and point in spots.csv, or use `fit`, which needs neither",
+        )
+    directions: dict[str, DirectionResult | None] = {}
+    for name in DIRECTIONS:
+        rows = np.flatnonzero(finite & (selection.direction == name))
+        directions[name] = _direction(campaign, selection, rows, ratios[rows]) if len(rows) else None
+    columns = selection.experiments, selection.direction, selection.steps
+    columns = (*columns, angles.theta_i_deg, angles.theta_f_deg, ratios)
+    experiments = tuple(Experiment(*row) for row in zip(*(c[finite].tolist() for c in columns), strict=True))
+    return ClassicResult(directions, experiments, tuple(skipped))
+
+
+def _direction(campaign: Campaign, selection: Selection, rows: np.ndarray, ratios: np.ndarray) -> DirectionResult:
+    """Statistics of one direction; `rows` index the selection, `ratios` (n,) are its results."""
+
+    def mean(stereo: Stereo, focal_scale: float) -> float:
+        chosen = selection.pixels[rows], selection.steps[rows], selection.axis[rows]
+        return float(np.mean(four_point_ratios(*chosen, stereo, focal_scale)))
+
+    n = len(ratios)
+    average = float(np.mean(ratios))
+    focal_u = campaign.rig.priors["focal_scale"].u
+    type_b = float(np.sqrt(stereo_variance(mean, campaign.stereo, focal_u)))
+    if n == 1:
+        return DirectionResult(1, average, None, None, None, None, None, type_b, None)
+    sd = float(np.std(ratios, ddof=1))
+    type_a = sd / np.sqrt(n)
+    gum = float(np.hypot(type_a, type_b))
+    dof = effective_dof(gum, (type_a, type_b), (n - 1, math.inf))
+    return DirectionResult(
+        n=n,
+        mean_deg_per_step=average,
+        sd_deg_per_step=sd,
+        u_type_a_deg_per_step=float(type_a),
+        interval95_type_a=_interval(average, type_a, n - 1),
+        u_gum_deg_per_step=gum,
+        interval95_gum=_interval(average, gum, dof),
+        u_stereo_deg_per_step=type_b,
+        effective_dof=dof,
+    )
+
+
+def _interval(mean: float, u: float, dof: float) -> tuple[float, float]:
+    """Two-sided 95 % interval with Student's t."""
+    factor = coverage_factor(dof)
+    return (float(mean - factor * u), float(mean + factor * u))
+
+
+def stereo_variance(function: Callable[[Stereo, float], float], stereo: Stereo, focal_scale_u: float) -> float:
+    """J C J^T of a scalar `function(stereo, focal_scale)` for the stereo covariance and the focal scale.
+
+    Central differences with steps of one tenth of each parameter's standard deviation: small enough that
+    the third derivative does not show, large enough against rounding. Fixed parameters (zero variance)
+    are skipped. A step that takes a pixel out of the lens model is halved until it does not.
+    """
+
+    def slope(of: Callable[[float], float], step: float) -> float:
+        for _ in range(STEP_HALVINGS):
+            found = (of(step) - of(-step)) / (2 * step)
+            if np.isfinite(found):
+                break
+            step /= 2
+        return found
+
+    def moved(index: int, step: float) -> float:
+        vector = stereo.vector.copy()
+        vector[index] += step
+        return function(stereo.with_vector(vector), 1.0)
+
+    covariance = np.asarray(stereo.parameter_covariance, float)
+    gradient = np.zeros(len(covariance))
+    for index in np.flatnonzero(np.diag(covariance) > 0):
+        gradient[index] = slope(partial(moved, index), 0.1 * np.sqrt(covariance[index, index]))
+    variance = float(gradient @ covariance @ gradient)
+    if focal_scale_u > 0:
+        variance += (slope(lambda step: function(stereo, 1 + step), 0.1 * focal_scale_u) * focal_scale_u) ** 2
+    return max(variance, 0.0)

@@ -1,0 +1,242 @@
+"""Spots linearised at a point, and what each says beside all the others."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from scipy import linalg
+
+from tvsbayes.estimators.campaign_arrays import CampaignArrays
+from tvsbayes.estimators.likelihood import spot_residuals, stop_variances
+from tvsbayes.instrument.axes import HOME_SD_DEG
+from tvsbayes.model.laser_path import mirror_angles
+from tvsbayes.model.parameter_space import ParameterSpace
+
+
+class Linearised(eqx.Module):
+    """The campaign linearised at a point; first axis of the Jacobians is the spot."""
+
+    residual: Float[Array, "spots 4"]
+    slope: Float[Array, "spots 4 2"]
+    play_sd_rad: Float[Array, "spots 2"]
+    mirror_angles_rad: Float[Array, "spots 2"]
+    predicted: Float[Array, "spots 5"]
+    stop_variance: Float[Array, "spots 2"]
+    residual_jacobian: Float[Array, "spots 4 parameters"]
+    predicted_jacobian: Float[Array, "spots 5 parameters"]
+
+    def spot_deviations(self) -> SpotDeviations:
+        """Least squares of the whitened residuals, spot by spot; covariance 0 where a spot tells neither angle."""
+        slope = np.asarray(self.slope)
+        with np.errstate(all="ignore"):
+            covariance = np.linalg.pinv(np.einsum("nia,nib->nab", slope, slope))
+        return SpotDeviations(np.einsum("nab,nib,ni->na", covariance, slope, np.asarray(self.residual)), covariance)
+
+
+@dataclass(frozen=True)
+class SpotDeviations:
+    """Mirror angles (pan, tilt), seen minus predicted, every spot by itself, its range projected out.
+
+    Attributes:
+        deviation_rad: shape (spots, 2).
+        covariance_rad2: of the pixel noise, shape (spots, 2, 2).
+    """
+
+    deviation_rad: np.ndarray
+    covariance_rad2: np.ndarray
+
+
+@eqx.filter_jit
+def linearise(z: Float[Array, " parameters"], space: ParameterSpace, arrays: CampaignArrays) -> Linearised:
+    """Residuals, ideal observations at the observed ranges, and d/d(coordinates) of both."""
+
+    def forward(z):
+        model = space.model(z)
+        angles = mirror_angles(model.transmission, model.tilt_zero_rad, arrays.moves)
+        terms = spot_residuals(model, angles, arrays, jnp.ones(()), frozen=True)
+        return (terms.residual, terms.predicted), (terms, angles)
+
+    (residual, predicted), push, (terms, angles) = jax.linearize(forward, z, has_aux=True)
+    residual_jacobian, predicted_jacobian = jax.vmap(push, out_axes=-1)(jnp.eye(z.size))
+    index = arrays.spots.move_index
+    stop_sd_rad = space.model(z).noise.stop_sd_rad
+    return Linearised(
+        residual=residual,
+        slope=terms.slope,
+        play_sd_rad=angles.play_sd_rad[index],
+        mirror_angles_rad=angles.angle_rad[index],
+        predicted=predicted,
+        stop_variance=stop_variances(stop_sd_rad, arrays.spots),
+        residual_jacobian=residual_jacobian,
+        predicted_jacobian=predicted_jacobian,
+    )
+
+
+def linear_spots(lin: Linearised, arrays: CampaignArrays, jacobian: np.ndarray) -> LinearSpots:
+    """A linearised campaign as the smoother reads it.
+
+    Args:
+        lin: without padding.
+        arrays: the campaign it comes from.
+        jacobian: d(prediction)/d(whatever is asked about), shape (spots, 4, columns).
+    """
+    count = len(lin.residual)
+    spots = jax.tree.map(lambda x: np.asarray(x)[:count], arrays.spots)
+    home_variance = np.where(spots.homed, np.radians(HOME_SD_DEG) ** 2, 0.0)[:, None] * np.ones(2)
+    segment = spots.new_segment[:, None] & np.ones(2, dtype=bool)
+    return LinearSpots(
+        residual=lin.residual,
+        load=np.concatenate([lin.slope, lin.slope, lin.slope * lin.play_sd_rad[:, None, :]], axis=2),
+        renewed=np.concatenate([spots.redraw, segment, segment], axis=1),
+        variance=np.concatenate([lin.stop_variance, home_variance, np.ones((count, 2))], axis=1),
+        jacobian=jacobian,
+    )
+
+
+@dataclass(frozen=True)
+class LinearSpots:
+    """The linearised campaign, spots in time order, without padding.
+
+    Attributes:
+        residual: observed - predicted, shape (n, 4).
+        load: d(predicted)/d(filter state), shape (n, 4, 6).
+        renewed: states drawn anew since the previous spot, shape (n, 6).
+        variance: their variances, shape (n, 6).
+        jacobian: -d(residual)/d(coordinates), shape (n, 4, p).
+    """
+
+    residual: np.ndarray
+    load: np.ndarray
+    renewed: np.ndarray
+    variance: np.ndarray
+    jacobian: np.ndarray
+
+
+@dataclass(frozen=True)
+class StopGroup:
+    """Consecutive spots that share all their states.
+
+    Attributes:
+        rows: slice of the spots.
+        residual: [C^-1 r] of the group, shape (4 s,).
+        jacobian: [C^-1 J] of the group, shape (4 s, p).
+        precision: [C^-1] of the group, shape (4 s, 4 s).
+    """
+
+    rows: slice
+    residual: np.ndarray
+    jacobian: np.ndarray
+    precision: np.ndarray
+
+
+@dataclass(frozen=True)
+class StopInformation:
+    """All groups, and the likelihood's Fisher information J^T C^-1 J, shape (p, p)."""
+
+    groups: tuple[StopGroup, ...]
+    fisher: np.ndarray
+
+
+def _group_rows(renewed: np.ndarray) -> list[slice]:
+    starts = [i for i in range(len(renewed)) if i == 0 or renewed[i].any()]
+    return [slice(a, b) for a, b in zip(starts, [*starts[1:], len(renewed)], strict=True)]
+
+
+def stop_information(spots: LinearSpots) -> StopInformation:
+    """Filter forward, smooth backward.
+
+    Args:
+        spots: the linearised campaign.
+
+    Returns:
+        Groups in time order and the Fisher information of the coordinates.
+    """
+    parameters = spots.jacobian.shape[-1]
+    states = spots.load.shape[-1]
+    targets = np.concatenate([spots.residual[..., None], spots.jacobian], axis=2)
+    slices = _group_rows(spots.renewed)
+    mean, covariance = np.zeros((states, 1 + parameters)), np.zeros((states, states))
+    forward, aheads = [], []
+    for rows in slices:
+        keep = ~spots.renewed[rows.start]
+        mean = mean * keep[:, None]
+        covariance = covariance * np.outer(keep, keep) + np.diag(spots.variance[rows.start] * ~keep)
+        load = spots.load[rows].reshape(-1, states)
+        ahead = targets[rows].reshape(-1, 1 + parameters) - load @ mean
+        covariance_ahead = load @ covariance @ load.T + np.eye(len(load))
+        inverse = linalg.cho_solve(linalg.cho_factor(covariance_ahead), np.eye(len(load)))
+        gain = covariance @ load.T @ inverse
+        whitened = inverse @ ahead
+        aheads.append(ahead[:, 1:])
+        forward.append((keep, load, inverse, gain, whitened))
+        mean = mean + gain @ ahead
+        covariance = covariance - gain @ load @ covariance
+        covariance = 0.5 * (covariance + covariance.T)
+
+    groups = []
+    score, information = np.zeros((states, 1 + parameters)), np.zeros((states, states))
+    for rows, (keep, load, inverse, gain, whitened) in zip(slices[::-1], forward[::-1], strict=True):
+        # `score` and `information` stand after this group's update: u = F^-1 v - K^T r, M = F^-1 + K^T N K.
+        disturbance = whitened - gain.T @ score
+        precision = inverse + gain.T @ information @ gain
+        groups.append(StopGroup(rows, disturbance[:, 0], disturbance[:, 1:], precision))
+        through = np.eye(states) - gain @ load
+        score = (load.T @ disturbance + score) * keep[:, None]
+        information = (load.T @ inverse @ load + through.T @ information @ through) * np.outer(keep, keep)
+    # One product of all rows: with many columns the sum over the groups would cost more than everything else.
+    whitened = np.concatenate([np.zeros((0, parameters)), *(entry[-1][:, 1:] for entry in forward)])
+    fisher = np.concatenate([np.zeros((0, parameters)), *aheads]).T @ whitened
+    return StopInformation(tuple(groups[::-1]), fisher)
+
+
+def leave_one_out_chi2(information: StopInformation, weight: np.ndarray | None = None) -> np.ndarray:
+    """Squared distance of each spot from what all OTHER spots predict for it, shape (n,).
+
+    It equals twice the gain in log density from leaving the spot out, up to the determinant: of two spots of a
+    stop that disagree, the one without which the rest fits better has the larger value. That is the spot to blame.
+
+    Args:
+        information: of the linearised campaign.
+        weight: robust weights w that are in its residuals, shape (n,). Distances are those of spots of full weight:
+            of the covariance I + w P of a weighted innovation, P predicted, the noise alone is scaled back.
+    """
+    weight = np.ones(sum(len(g.residual) // 4 for g in information.groups)) if weight is None else weight
+    values = []
+    for group in information.groups:
+        for k in range(len(group.residual) // 4):
+            part = slice(4 * k, 4 * k + 4)
+            u, m = group.residual[part], group.precision[part, part]
+            covariance = np.linalg.inv(m)
+            # e = sqrt(w) (spot - prediction); (I + P) w = covariance + (w - 1) I.
+            e = covariance @ u
+            values.append(e @ np.linalg.solve(covariance + (weight[len(values)] - 1) * np.eye(4), e))
+    return np.array(values)
+
+
+def standard_deviations_without(group: StopGroup, covariance: np.ndarray, gradients: np.ndarray) -> np.ndarray:
+    """Standard deviations of quantities if a group's spots had not been taken.
+
+    Removing a block from a Gaussian changes the information by -[C^-1 J]^T M^-1 [C^-1 J]; the covariance follows
+    by Woodbury's identity.
+
+    Args:
+        group: the stop.
+        covariance: posterior covariance of the coordinates, shape (p, p).
+        gradients: d(quantity)/d(coordinates), shape (q, p).
+
+    Returns:
+        Shape (q,); inf where the rest of the campaign and the priors hold no information.
+    """
+    spread = group.jacobian @ covariance
+    inner = group.precision - spread @ group.jacobian.T
+    lost = spread @ gradients.T
+    values, vectors = np.linalg.eigh(0.5 * (inner + inner.T))
+    projected = vectors.T @ lost
+    with np.errstate(divide="ignore", invalid="ignore"):
+        extra = np.where(np.abs(projected) > 0, projected**2 / np.maximum(values, 0.0)[:, None], 0.0)
+    return np.sqrt(np.einsum("qi,ij,qj->q", gradients, covariance, gradients) + extra.sum(axis=0))

@@ -1,0 +1,217 @@
+"""Strict CSV."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+import re
+from collections.abc import Iterable, Iterator, Sequence
+from functools import partial
+
+from tvsbayes.errors import INTEGER, InputError, closest, escaped, refusal, shown
+from tvsbayes.files.disk import decode
+
+CSV_BYTES_MAX = 64 * 1024 * 1024
+CSV_ROWS_MAX = 200_000
+"""At these caps a table of spots takes 0.6 GB and 6 s of processor time to read (experiments/hostile.md)."""
+CSV_LINE_CHARS_MAX = 16_384
+NUMBER = re.compile(r"[+-]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][+-]?[0-9]+)?")
+
+
+def number_remedy(cell: str, *, whole: bool = False) -> str:
+    """What to do about a cell that is no plain number, or no plain whole number."""
+    if cell.startswith(("=", "@")):
+        return "save the value, not the formula"
+    if cell.strip().lower().lstrip("+-") in ("nan", "inf", "infinity"):
+        return "write a finite number; the pixels of a spot that was not seen are empty, its status says why"
+    if "," in cell:
+        return "write a decimal point, not a comma"
+    if "_" in cell or any(c.isspace() for c in cell):
+        return "write the digits without underscores or spaces"
+    if not cell.isascii():
+        return "write it in the digits 0 to 9"
+    return "write a whole number such as 200" if whole else "write a decimal number such as 9.47"
+
+
+def _plain(cells: Sequence[str], kind: type[float] | type[int], low: float, high: float) -> list | None:
+    """The numbers of a column without a single odd cell, fast; else None, and each cell is looked at."""
+    # Of what these characters can spell, float() and int() take exactly NUMBER and INTEGER.
+    if not cells or not set().union(*cells) <= set("0123456789+-" if kind is int else "0123456789+-.eE"):
+        return None
+    try:
+        values = list(map(kind, cells))
+    except ValueError:
+        return None
+    return values if low <= min(values) and max(values) <= high else None
+
+
+class Table:
+    """A checked CSV table: cells by column name, each with its line for the errors.
+
+    Attributes:
+        file: name of the file.
+        lines: line number of every row.
+        columns: cells of every column present, as text.
+    """
+
+    def __init__(self, file: str, lines: list[int], columns: dict[str, Sequence[str]]):
+        self.file, self.lines, self.columns = file, lines, columns
+
+    def __len__(self) -> int:
+        return len(self.lines)
+
+    def refuse(
+        self, row: int, column: str, code: str, allowed: str, remedy: str, found: str | None = None
+    ) -> InputError:
+        """The error of one cell; `found` defaults to what stands in it."""
+        if found is None:
+            found = shown(self.columns[column][row]) if self.columns[column][row] else "an empty cell"
+        place = {"file": self.file, "line": self.lines[row], "column": column}
+        return refusal(code, **place, found=found, allowed=allowed, remedy=remedy)
+
+    def numbers(self, column: str, low: float, high: float, empty: bool = False) -> list[float | None]:
+        """Finite numbers in [low, high]; None for an empty cell where `empty` allows it."""
+        if (plain := _plain(self.columns[column], float, low, high)) is not None:
+            return plain
+        values: list[float | None] = []
+        match, isfinite = NUMBER.fullmatch, math.isfinite
+        for row, cell in enumerate(self.columns[column]):
+            if not cell and empty:
+                values.append(None)
+                continue
+            value = float(cell) if match(cell) else math.nan
+            if not (isfinite(value) and low <= value <= high):
+                allowed = f"a finite decimal number from {low:g} to {high:g}{', or an empty cell' * empty}"
+                remedy = "mind the unit of the column" if isfinite(value) else number_remedy(cell)
+                raise self.refuse(row, column, "number", allowed, remedy)
+            values.append(value)
+        return values
+
+    def integers(self, column: str, low: int, high: int, empty: bool = False) -> list[int | None]:
+        """Whole numbers in [low, high]; None for an empty cell where `empty` allows it."""
+        if (plain := _plain(self.columns[column], int, low, high)) is not None:
+            return plain
+        values: list[int | None] = []
+        for row, cell in enumerate(self.columns[column]):
+            if not cell and empty:
+                values.append(None)
+                continue
+            value = int(cell) if INTEGER.fullmatch(cell) else None
+            if value is None or not low <= value <= high:
+                allowed = f"a whole number from {low} to {high}{', or an empty cell' * empty}"
+                remedy = "write a whole number, no point" if NUMBER.fullmatch(cell) else number_remedy(cell, whole=True)
+                raise self.refuse(row, column, "integer", allowed, remedy)
+            values.append(value)
+        return values
+
+    def texts(self, column: str, chars_max: int = 100, empty: bool = True) -> list[str]:
+        """Printable text that a spreadsheet does not take for a formula."""
+        allowed = f"printable text of at most {chars_max} characters that does not begin with = + - @"
+        for row, cell in enumerate(self.columns[column]):
+            if len(cell) > chars_max or not cell.isprintable() or cell.startswith(("=", "+", "-", "@")):
+                raise self.refuse(row, column, "text", allowed, "shorten or reword it")
+            if not cell and not empty:
+                raise self.refuse(row, column, "missing", allowed, "fill the cell in")
+        return list(self.columns[column])
+
+    def check_counting(self, column: str, values: Sequence[int | None]) -> None:
+        """Refuses a column that does not count 0, 1, 2 ..."""
+        for row, value in enumerate(values):
+            if value != row:
+                raise self.refuse(row, column, "order", f"{row}", "number the rows 0, 1, 2 ... in time order")
+
+    def check_unique(self, column: str, values: Sequence[object], what: str) -> None:
+        """Refuses a value that stands twice; None does not count."""
+        seen: dict[object, int] = {}
+        for row, value in enumerate(values):
+            if value is not None and seen.setdefault(value, row) != row:
+                found = f"{shown(self.columns[column][row])} again (first on line {self.lines[seen[value]]})"
+                raise self.refuse(row, column, "duplicate", what, "renumber one of them", found)
+
+
+_CSV_LINE = re.compile(r"[^\r\n]*(?:\r\n?|\n)|[^\r\n]+")
+
+
+def _csv_rows(text: str, file: str) -> Iterator[tuple[int, list[str]]]:
+    """Rows of a CSV text with the line on which each begins."""
+    bad = partial(refusal, file=file)
+
+    def capped_lines() -> Iterator[str]:
+        # A StringIO would hold the text once more, with four bytes a character.
+        for number, found_line in enumerate(_CSV_LINE.finditer(text), start=1):
+            line = found_line.group()
+            if len(line) > CSV_LINE_CHARS_MAX:
+                found, allowed = f"{len(line)} characters in one line", f"at most {CSV_LINE_CHARS_MAX}"
+                raise bad("size", line=number, found=found, allowed=allowed, remedy="one row per line")
+            yield line
+
+    reader = csv.reader(capped_lines(), strict=True)
+    start = 1
+    try:
+        for row in reader:
+            if reader.line_num > start:
+                raise csv.Error("a line break inside a cell")
+            yield start, row
+            start = reader.line_num + 1
+    except csv.Error as error:
+        allowed, remedy = "comma-separated cells, one row per line", 'close every quote " in its own line'
+        found = escaped(str(error), 120)
+        raise bad("csv", line=start, found=found, allowed=allowed, remedy=remedy) from error
+
+
+def parse_table(data: bytes, file: str, columns: Sequence[str], optional: Sequence[str] = ()) -> Table:
+    """A CSV table with exactly `columns` and any of `optional`, found by name in any order.
+
+    Raises:
+        InputError: not UTF-8, control characters, no or a wrong header, rows of another length than it.
+    """
+    bad = partial(refusal, file=file)
+    rows = _csv_rows(decode(data, file), file)
+    _, header = next(rows, (1, []))
+    allowed = "the columns " + ",".join(columns) + (f" and optionally {','.join(optional)}" * bool(optional))
+    bad_header = partial(bad, line=1, allowed=allowed)
+    if not header:
+        raise bad_header("empty", found="no header", remedy="write the column names into the first line")
+    if len(header) == 1 and re.search(r"[;\t]", header[0]):
+        raise bad_header("csv", found=shown(header[0]), remedy="use commas between cells, decimal points")
+    known = (*columns, *optional)
+    for name in header:
+        if name not in known:
+            found, remedy = f"an unknown column {shown(name)}", closest(name, known)
+            raise bad_header("unknown-column", column=name, found=found, remedy=remedy)
+        if header.count(name) > 1:
+            raise bad_header("duplicate-column", column=name, found="the column twice", remedy="remove one")
+    for name in columns:
+        if name not in header:
+            raise bad_header("missing-column", column=name, found="no such column", remedy=f"add {name}")
+
+    lines: list[int] = []
+    cells: list[list[str]] = []
+    blank = None
+    for line, row in rows:
+        if not row:
+            blank = blank or line
+            continue
+        if blank is not None or len(row) != len(header):
+            found, cells_allowed = "an empty line" if blank else f"{len(row)} cells", f"{len(header)} cells"
+            remedy = "one cell per column; a decimal comma splits a number in two: write a point"
+            if blank:
+                remedy = "remove it; only the end of the file may be empty"
+            raise bad("row-length", line=blank or line, found=found, allowed=cells_allowed, remedy=remedy)
+        if len(lines) >= CSV_ROWS_MAX:
+            found, rows_allowed = "a row more", f"at most {CSV_ROWS_MAX} rows"
+            raise bad("size", line=line, found=found, allowed=rows_allowed, remedy="split the campaign")
+        lines.append(line)
+        cells.append(row)
+    by_column = list(zip(*cells, strict=True)) or [()] * len(header)
+    return Table(file, lines, dict(zip(header, by_column, strict=True)))
+
+
+def csv_bytes(columns: Sequence[str], rows: Iterable[Sequence[object]]) -> bytes:
+    """A CSV file: None is an empty cell, floats keep every digit."""
+    stream = io.StringIO(newline="")
+    writer = csv.writer(stream, lineterminator="\n")
+    writer.writerow(columns)
+    writer.writerows(rows)
+    return stream.getvalue().encode()

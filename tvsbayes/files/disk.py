@@ -1,0 +1,252 @@
+"""Bytes and arrays read under a cap, written whole or not at all."""
+
+from __future__ import annotations
+
+import errno
+import io
+import math
+import os
+import re
+import secrets
+import stat
+import zipfile
+import zlib
+from functools import partial
+from importlib import resources
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from tvsbayes.errors import CONTROL, InputError, escaped, refusal, shown
+
+if TYPE_CHECKING:
+    import numpy as np
+
+
+def read_bytes(path: Path, cap: int, folder: Path | None = None) -> bytes:
+    """Reads a regular file of at most `cap` bytes.
+
+    Args:
+        path: the file.
+        cap: largest size, bytes; checked before reading.
+        folder: where given, the file must lie inside it after following links.
+
+    Raises:
+        InputError: missing, unreadable, not a regular file, outside `folder` or too large.
+    """
+    path = Path(path)
+    file = escaped(path.name) or escaped(str(path))
+
+    def bad(code: str, found: str, remedy: str) -> InputError:
+        allowed = f"a readable file of at most {cap} bytes"
+        return refusal(code, file=file, found=found, allowed=allowed, remedy=remedy)
+
+    try:
+        real = path.resolve(strict=True)
+        if folder is not None and not real.is_relative_to(Path(folder).resolve()):
+            raise bad("path", "a link that leaves the folder", "put the file itself into the folder")
+        # Without O_NONBLOCK the opening of a pipe would wait for a writer for ever.
+        flags = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_NOFOLLOW", 0)
+        descriptor = os.open(real, flags | getattr(os, "O_BINARY", 0))
+        try:
+            status = os.fstat(descriptor)
+            if not stat.S_ISREG(status.st_mode):
+                raise bad("not-a-file", "a folder, pipe or device", "name a regular file")
+            if status.st_size > cap:
+                raise bad("size", f"{status.st_size} bytes", "split the data or remove what is not needed")
+            with open(descriptor, "rb", closefd=False) as stream:
+                # As much as there is: a read of the cap would allocate the cap for every file.
+                data = stream.read(status.st_size + 1)
+                if len(data) > status.st_size:
+                    data += stream.read(cap + 1 - len(data))
+        finally:
+            os.close(descriptor)
+    except FileNotFoundError as error:
+        remedy = f"create it, or correct {escaped(str(path), 200)}"
+        if Path(path).name == "stereo.json":
+            remedy = f"`tvsbayes stereo` makes one of pictures or of OpenCV's, ROS' or Kalibr's calibration; {remedy}"
+        raise bad("missing-file", "no such file", remedy) from error
+    except (OSError, ValueError) as error:
+        reason = escaped(getattr(error, "strerror", None) or str(error))
+        raise bad("unreadable", reason, "check the path and its permissions") from error
+    if len(data) > cap:
+        raise bad("size", f"more than {cap} bytes", "split the data or remove what is not needed")
+    return data
+
+
+def decode(data: bytes, file: str) -> str:
+    """UTF-8 text with or without BOM; refuses other encodings, NUL and other control characters."""
+    bad = partial(refusal, file=file)
+    utf16 = data.startswith((b"\xff\xfe", b"\xfe\xff"))
+    try:
+        text = data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        line = None if utf16 else data.count(b"\n", 0, error.start) + 1
+        found = "UTF-16" if utf16 else f"the byte 0x{data[error.start]:02x}"
+        allowed, remedy = "UTF-8 text", "save it as UTF-8"
+        raise bad("encoding", line=line, found=found, allowed=allowed, remedy=remedy) from error
+    if control := CONTROL.search(text):
+        line, found = text.count("\n", 0, control.start()) + 1, shown(control.group())
+        raise bad("control-character", line=line, found=found, allowed="printable text", remedy="remove it")
+    return text
+
+
+FLUSHES_NO_FOLDER = frozenset({errno.EINVAL, errno.ENOTSUP})
+"""How a file system (some network shares) says that it can flush files only, fsync(2): its own order has to do."""
+
+
+def flush_folder(folder: Path, disk=os) -> None:
+    """Make the names in a folder durable, where the system can: only POSIX flushes folders.
+
+    Args:
+        folder: which.
+        disk: has `open`, `fsync` and `close` as the module `os` has.
+
+    Raises:
+        OSError: the disk failed.
+    """
+    if os.name != "posix":
+        return
+    descriptor = disk.open(folder, os.O_RDONLY)
+    try:
+        disk.fsync(descriptor)
+    except OSError as error:
+        if error.errno not in FLUSHES_NO_FOLDER:
+            raise
+    finally:
+        disk.close(descriptor)
+
+
+def write_atomically(path: Path, data: bytes) -> None:
+    """Replaces `path` by `data` so that a reader, or a crash, sees the old file or the new, never a part.
+
+    Raises:
+        InputError: the folder is missing, full or not writable; there stands the old file, or where only the flush
+            of the folder failed, the new one.
+    """
+    path = Path(path)
+    temporary = path.with_name(f".{path.name}.{secrets.token_hex(6)}.tmp")
+    try:
+        try:
+            with open(temporary, "xb") as stream:
+                stream.write(data)
+                stream.flush()
+                os.fsync(stream.fileno())
+            os.replace(temporary, path)
+        except BaseException:
+            temporary.unlink(missing_ok=True)
+            raise
+        # The new name itself is durable only once its folder is.
+        flush_folder(path.parent)
+    except OSError as error:
+        found, allowed = escaped(error.strerror or str(error)), "a writable folder with free space"
+        remedy, file = "name another place or free this one", escaped(str(path), 200)
+        raise refusal("write", file=file, found=found, allowed=allowed, remedy=remedy) from error
+
+
+def make_folder(folder: Path, *, empty: bool = False) -> None:
+    """Create a folder and those above it.
+
+    Args:
+        folder: where to.
+        empty: refuse a folder that holds anything: nothing is overwritten.
+
+    Raises:
+        InputError: it cannot be created, or holds something.
+    """
+    place = escaped(str(folder), 200)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        occupied = empty and any(folder.iterdir())
+    except OSError as error:
+        found, allowed = escaped(error.strerror or str(error)), "a new or empty folder"
+        raise refusal("write", file=place, found=found, allowed=allowed, remedy="name another") from error
+    if occupied:
+        allowed, remedy = "a new or empty folder", "name another folder; nothing is overwritten"
+        raise refusal("occupied", file=place, found="a folder with files", allowed=allowed, remedy=remedy)
+
+
+def output_place(folder: Path, *names: str) -> Path:
+    """`folder / names`, a place for output that no link leads out of the folder.
+
+    Raises:
+        InputError: a link inside the folder leads elsewhere: a stranger's folder chooses no place to write to.
+    """
+    place = Path(folder).joinpath(*names)
+    try:
+        inside = place.resolve().is_relative_to(Path(folder).resolve())
+    except (OSError, RuntimeError):
+        inside = False
+    if not inside:
+        shown_place, allowed = escaped(str(place), 200), "a folder inside the campaign"
+        remedy = "remove the link, or name the place for results with --out where the command has it"
+        raise refusal("path", file=shown_place, found="a link that leaves it", allowed=allowed, remedy=remedy)
+    return place
+
+
+def shipped_data() -> Path:
+    """The folder of twins, rigs, templates and reference values that travels with the package.
+
+    In a wheel it lies inside the package; in a checkout (also an editable install) beside it.
+    """
+    inside = Path(str(resources.files("tvsbayes") / "data"))
+    return inside if inside.is_dir() else Path(str(resources.files("tvsbayes"))).resolve().parent / "data"
+
+
+ARRAYS_MAX = 256
+_NPY_HEADER = re.compile(
+    rb"\x93NUMPY\x01\x00(?P<length>..)\{'descr': '(?P<kind>[<>|][biufU][0-9]{1,8})', 'fortran_order': "
+    rb"(?P<fortran>True|False), 'shape': \((?P<shape>[0-9, ]{0,100})\),? ?\} *\n",
+    re.DOTALL,
+)
+"""Version 1.0 of the header (NEP 1) as NumPy writes it; no code is evaluated to read it, as NumPy itself does."""
+
+
+def _array_of(content: bytes, name: str) -> np.ndarray:
+    """The array of an .npy; ValueError for anything but numbers and text of exactly the size that its header states."""
+    import numpy as np
+
+    match = _NPY_HEADER.match(content)
+    if match is None or match.end() != 10 + int.from_bytes(match["length"], "little"):
+        raise ValueError(f"{name} is no array of numbers or text")
+    shape = tuple(int(length) for length in match["shape"].replace(b" ", b"").split(b",") if length)
+    try:
+        dtype = np.dtype(match["kind"].decode())
+    except TypeError as error:
+        raise ValueError(f"{name} is of the kind {match['kind'].decode()}") from error
+    if len(shape) > 8 or not dtype.itemsize or math.prod(shape) * dtype.itemsize != len(content) - match.end():
+        raise ValueError(f"{name} is not as long as its header says")
+    order = "F" if match["fortran"] == b"True" else "C"
+    return np.ndarray(shape, dtype, buffer=content, offset=match.end(), order=order).copy()
+
+
+def read_arrays(path: Path, bytes_max: int, unpacked_max: int) -> dict[str, np.ndarray]:
+    """The arrays of an .npz, by name; every size is checked against the header before anything is allocated.
+
+    `numpy.load` alone turns 0.5 kB into gigabytes: by entries of no width, and by bzip2 members, which zipfile
+    unpacks without a limit whatever size they state (experiments/hostile.md).
+
+    Raises:
+        InputError: what `read_bytes` refuses.
+        ValueError: no .npz of plain numbers and text as NumPy writes it, or more than `unpacked_max` bytes.
+    """
+    data = read_bytes(path, bytes_max)
+    arrays = {}
+    try:
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            members = archive.infolist()
+            if len(members) > ARRAYS_MAX or sum(member.file_size for member in members) > unpacked_max:
+                raise ValueError(f"more than {ARRAYS_MAX} arrays or {unpacked_max} bytes when unpacked")
+            for member in members:
+                if member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+                    raise ValueError("an array that is packed in another way than numpy packs it")
+                with archive.open(member) as stream:
+                    content = stream.read(member.file_size)
+                name = member.filename.removesuffix(".npy")
+                if name in arrays:
+                    raise ValueError(f"{escaped(name)} twice")
+                arrays[name] = _array_of(content, escaped(name))
+    except ValueError:
+        raise
+    except (OSError, EOFError, zipfile.BadZipFile, zlib.error, NotImplementedError, RuntimeError) as error:
+        raise ValueError(escaped(str(error), 120)) from error
+    return arrays

@@ -1,0 +1,274 @@
+"""Strict files at the border: teaching errors, capped bytes, CSV, TOML, JSON, arrays, images, atomic writes.
+
+Everything a stranger's folder can contain enters the package here. A reader either returns checked values or raises
+`InputError` with file, line, column, what was found, what is allowed and what to do; sizes are capped before anything
+is parsed. Numbers obey an own ASCII pattern: `float` alone would take "9_4.7", "infinity" and Arabic digits. A TOML
+file of 40 kB with one key of 20 000 dotted parts holds `tomllib` for seconds and deep brackets exhaust the stack
+(research: CPython gh-149231), so TOML and JSON are scanned in linear time first.
+
+No JAX, no knowledge of what a campaign is. Lines count from 1.
+"""
+
+from __future__ import annotations
+
+import datetime
+import json
+import math
+import numbers
+import re
+import tomllib
+from collections.abc import Iterable
+
+from tvsbayes.errors import INTEGER, InputError, closest, escaped, other_format, refusal, shown
+from tvsbayes.files.disk import decode
+
+TOML_BYTES_MAX = 65_536
+JSON_BYTES_MAX = 4 * 1024 * 1024
+DOTTED_PARTS_MAX = 8
+NESTING_MAX = 16
+# Both patterns always match from an opening quote to its end or the end of the line (or file), never
+# backtracking: a scan is linear whatever a stranger writes.
+_JSON_STRING = re.compile(r'"(?:\\.|[^"\\])*+"?', re.DOTALL)
+_TOML_STRING_OR_COMMENT = re.compile(
+    r'"""(?:\\.|[^\\])*?(?:"""|\Z)|\'\'\'.*?(?:\'\'\'|\Z)|"(?:\\[^\n]|[^"\\\n])*+"?|\'[^\'\n]*+\'?|#[^\n]*+',
+    re.DOTALL,
+)
+
+
+def _check_nesting(bare: str, file: str) -> None:
+    """Refuses brackets nested too deeply for a recursive parser; `bare` is text without its strings."""
+    depth = 0
+    for bracket in re.finditer(r"[\[\]{}]", bare):
+        depth = depth + 1 if bracket.group() in "[{" else max(depth - 1, 0)
+        if depth > NESTING_MAX:
+            raise refusal(
+                "nesting",
+                file=file,
+                line=bare.count("\n", 0, bracket.start()) + 1,
+                found=f"brackets nested more than {NESTING_MAX} deep",
+                allowed=f"at most {NESTING_MAX} levels",
+                remedy="flatten the file",
+            )
+
+
+class Keys:
+    """One table of a TOML or JSON file, read key by key; its errors know file, line and dotted key."""
+
+    def __init__(self, values: dict[str, object], file: str, text: str, path: tuple[str, ...] = ()):
+        """`values` as parsed from `text`; `path` leads from the top of the file to this table."""
+        self.values, self.file, self.text, self.path = values, file, text, path
+
+    def __contains__(self, key: str) -> bool:
+        return key in self.values
+
+    def refuse(self, key: str, code: str, allowed: str, remedy: str, found: str | None = None) -> InputError:
+        """The error of one key; `found` defaults to the value that stands there."""
+        if found is None:
+            found = shown(self.values[key]) if key in self.values else "nothing"
+        keys = (*self.path, key)
+        return refusal(
+            code,
+            file=self.file,
+            line=self._line(keys),
+            column=".".join(escaped(k) for k in keys),
+            found=found,
+            allowed=allowed,
+            remedy=remedy,
+        )
+
+    def _line(self, keys: tuple[str, ...]) -> int | None:
+        """The line of the innermost of `keys` that can be found in the text, outside TOML comments."""
+        text = _TOML_STRING_OR_COMMENT.sub(
+            lambda m: " " * len(m.group()) if m.group().startswith("#") else m.group(), self.text
+        )
+        position = None
+        for key in keys:
+            pattern = rf"(?m)(?:^|[\[{{,.])[ \t]*[\"']?{re.escape(key)}[\"']?[ \t]*(?=[=.\]:])"
+            if match := re.compile(pattern).search(text, position or 0):
+                position = match.end() - 1
+        return None if position is None else text.count("\n", 0, position) + 1
+
+    def only(self, names: Iterable[str]) -> None:
+        """Refuses keys outside `names`."""
+        names = tuple(names)
+        for key in self.values:
+            if key not in names:
+                allowed = "only " + ", ".join(names)
+                raise self.refuse(key, "unknown-key", allowed, closest(key, names), found="an unknown key")
+
+    def _get(self, key: str, allowed: str) -> object:
+        if key not in self.values:
+            raise self.refuse(key, "missing-key", allowed, f"add {key}")
+        return self.values[key]
+
+    def number(self, key: str, low: float, high: float) -> float:
+        """A finite number in [low, high]; booleans are none."""
+        allowed = f"a finite number from {low:g} to {high:g}" if low < high else f"exactly {low:g}"
+        value = self._get(key, allowed)
+        if isinstance(value, bool) or not isinstance(value, int | float) or not low <= value <= high:
+            raise self.refuse(key, "number", allowed, "correct the value and mind its unit")
+        return float(value)
+
+    def integer(self, key: str, low: int, high: int) -> int:
+        """A whole number in [low, high]."""
+        allowed = f"a whole number from {low} to {high}"
+        value = self._get(key, allowed)
+        if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
+            raise self.refuse(key, "integer", allowed, "correct the value")
+        return value
+
+    def text_value(self, key: str, chars_max: int = 200) -> str:
+        """Printable text without line breaks; `notes`-like fields raise `chars_max` and may hold breaks."""
+        allowed = f"printable text of at most {chars_max} characters"
+        value = self._get(key, allowed)
+        breaks = "\n\t" if chars_max > 200 else ""
+        if not isinstance(value, str) or len(value) > chars_max:
+            raise self.refuse(key, "text", allowed, "shorten it, or put it in quotes")
+        if not all(c.isprintable() or c in breaks for c in value):
+            raise self.refuse(key, "text", allowed, "remove the control characters")
+        return value
+
+    def flag(self, key: str) -> bool:
+        """Whether the switch is on."""
+        value = self._get(key, "true or false")
+        if not isinstance(value, bool):
+            raise self.refuse(key, "boolean", "true or false", "write true or false without quotes")
+        return value
+
+    def word(self, key: str, words: tuple[str, ...]) -> str:
+        """One of a few words."""
+        allowed = " or ".join(shown(w) for w in words)
+        value = self._get(key, allowed)
+        if value not in words:
+            remedy = other_format(str(value), words) if key == "format" else None
+            raise self.refuse(key, "word", allowed, remedy or closest(str(value)[:100], words))
+        return str(value)
+
+    def table(self, key: str) -> Keys:
+        """The table under `key`; an absent one is empty."""
+        value = self.values.get(key, {})
+        if not isinstance(value, dict):
+            place = escaped(".".join((*self.path, key)))
+            raise self.refuse(key, "table", "a table", f"write it as [{place}] with keys below")
+        return Keys(value, self.file, self.text, (*self.path, key))
+
+    def quantity(self, key: str, low: float, high: float, u_max: float) -> tuple[float, float]:
+        """`{ value, u }` with value in [low, high] and standard uncertainty u in [0, u_max]."""
+        allowed = "{ value = number, u = standard uncertainty }, both and nothing else"
+        value = self._get(key, allowed)
+        if not isinstance(value, dict) or set(value) != {"value", "u"}:
+            raise self.refuse(key, "quantity", allowed, "u = 0 states that the value is exact")
+        entry = self.table(key)
+        return entry.number("value", low, high), entry.number("u", 0.0, u_max)
+
+
+def parse_toml(data: bytes, file: str) -> Keys:
+    """The top table of a TOML file; size, nesting and dotted keys are capped before parsing."""
+    if len(data) > TOML_BYTES_MAX:
+        raise refusal(
+            "size",
+            file=file,
+            found=f"{len(data)} bytes",
+            allowed=f"at most {TOML_BYTES_MAX} bytes",
+            remedy="shorten it",
+        )
+    text = decode(data, file)
+    bare = _TOML_STRING_OR_COMMENT.sub(lambda m: "Q" + "\n" * m.group().count("\n"), text)
+    _check_nesting(bare, file)
+    for number, line in enumerate(bare.split("\n"), start=1):
+        if any(part.count(".") >= DOTTED_PARTS_MAX for part in re.split(r"[^\w.\- \t]", line)):
+            raise refusal(
+                "nesting",
+                file=file,
+                line=number,
+                found=f"a key of more than {DOTTED_PARTS_MAX} dotted parts",
+                allowed=f"at most {DOTTED_PARTS_MAX}",
+                remedy="use the keys of the format only",
+            )
+    try:
+        values = tomllib.loads(text)
+    except (ValueError, RecursionError) as error:
+        place = re.search(r"\(at line (\d+), column \d+\)", str(error))
+        raise refusal(
+            "toml",
+            file=file,
+            line=int(place.group(1)) if place else None,
+            found=escaped(re.sub(r" \(at .*\)", "", str(error)), 120),
+            allowed="TOML 1.0",
+            remedy="correct the syntax; text needs quotes, numbers a decimal point",
+        ) from error
+    return Keys(values, file, text)
+
+
+def parse_json(data: bytes, file: str) -> Keys:
+    """The top object of a JSON file: capped, no duplicate keys, finite numbers only."""
+
+    def bad(code: str, found: str, allowed: str, remedy: str, line: int | None = None) -> InputError:
+        return refusal(code, file=file, line=line, found=found, allowed=allowed, remedy=remedy)
+
+    if len(data) > JSON_BYTES_MAX:
+        raise bad("size", f"{len(data)} bytes", f"at most {JSON_BYTES_MAX} bytes", "shorten it")
+    text = decode(data, file)
+    _check_nesting(_JSON_STRING.sub(lambda m: '""' + "\n" * m.group().count("\n"), text), file)
+
+    def number(literal: str) -> int | float:
+        if INTEGER.fullmatch(literal):
+            return int(literal)
+        value = float(literal)
+        if not math.isfinite(value) or literal.lstrip("-").isdigit():
+            line = text.count("\n", 0, text.find(literal)) + 1
+            raise bad("number", shown(literal), "finite numbers, integers of 18 digits", "correct it", line)
+        return value
+
+    def constant(literal: str) -> float:
+        line = text.count("\n", 0, text.find(literal)) + 1
+        raise bad("number", shown(literal), "finite numbers", "give the value", line)
+
+    def unique(pairs: list[tuple[str, object]]) -> dict[str, object]:
+        values: dict[str, object] = {}
+        for key, value in pairs:
+            if key not in values:
+                values[key] = value
+                continue
+            literal = json.dumps(key, ensure_ascii=False)
+            line = text.count("\n", 0, text.find(literal, text.find(literal) + 1)) + 1
+            raise bad("duplicate-key", f"{shown(key)} twice", "every key once", "remove one of them", line)
+        return values
+
+    try:
+        values = json.loads(
+            text, parse_float=number, parse_int=number, parse_constant=constant, object_pairs_hook=unique
+        )
+    except (ValueError, RecursionError) as error:
+        found = escaped(getattr(error, "msg", str(error)), 120)
+        raise bad("json", found, "JSON", "correct the syntax", getattr(error, "lineno", None)) from error
+    if not isinstance(values, dict):
+        raise bad("json", shown(values), "an object { ... } at the top", "write the keys of the format", 1)
+    return Keys(values, file, text)
+
+
+def toml_value(value: object) -> str:
+    """One value in TOML; a dictionary becomes an inline table.
+
+    Raises:
+        TypeError: for what no campaign or rig file holds.
+    """
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, str):
+        return json.dumps(value, ensure_ascii=False)
+    if isinstance(value, numbers.Integral):
+        return str(int(value))
+    if isinstance(value, numbers.Real):
+        return repr(float(value))
+    if isinstance(value, datetime.datetime | datetime.date):
+        return value.isoformat()
+    if isinstance(value, dict):
+        return "{ " + ", ".join(toml_line(k, v) for k, v in value.items()) + " }"
+    raise TypeError(f"no TOML for {type(value).__name__}")
+
+
+def toml_line(key: str, value: object) -> str:
+    """`key = value`, the key quoted where TOML asks for it."""
+    bare = re.fullmatch(r"[A-Za-z0-9_-]+", key)
+    return f"{key if bare else json.dumps(key, ensure_ascii=False)} = {toml_value(value)}"

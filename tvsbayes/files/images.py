@@ -1,0 +1,125 @@
+"""PNG and JPEG under a cap."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from tvsbayes.errors import InputError, escaped, refusal
+from tvsbayes.files.disk import read_bytes
+
+if TYPE_CHECKING:
+    import numpy as np
+
+
+IMAGE_BYTES_MAX = 64 * 1024 * 1024
+IMAGE_PIXELS_MAX = 50_000_000
+"""A PNG of 0.9 MB can ask for 30000 x 30000 pixels: 4 s and 1.8 GB in the decoder (research/vision.md 6)."""
+_PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
+_PNG_END = b"\0\0\0\0IEND\xaeB`\x82"
+"""The last chunk with its checksum: decoders forgive its loss, a copy cut short has lost more."""
+_PNG_DEPTHS = {0: (1, 2, 4, 8), 2: (8,), 3: (1, 2, 4, 8), 6: (8,)}
+"""Colour type of a PNG -> bit depths taken: grey, RGB, palette, RGBA (PNG specification 3, 11.2.1)."""
+_JPEG_MAGIC = b"\xff\xd8\xff"
+_JPEG_FRAMES = (0xC0, 0xC1, 0xC2)
+"""Baseline, extended and progressive Huffman frames (ITU-T T.81, table B.1)."""
+_JPEG_BARE = (0x01, 0xD8, *range(0xD0, 0xD8))
+"""Markers without a length (ITU-T T.81 B.1.1.3)."""
+IMAGES_ALLOWED = f"PNG or JPEG of 8 bits per channel, at most {IMAGE_PIXELS_MAX // 1_000_000} million pixels"
+
+
+def image_size(data: bytes, file: str) -> tuple[int, int]:
+    """Width and height in pixels that a PNG or JPEG announces, before anything is decoded.
+
+    Raises:
+        InputError: neither PNG nor JPEG, an unusual kind, or too many pixels.
+    """
+
+    def bad(code: str, found: str, remedy: str) -> InputError:
+        return refusal(code, file=file, found=found, allowed=IMAGES_ALLOWED, remedy=remedy)
+
+    if data.startswith(_PNG_MAGIC):
+        if len(data) < 33 or data[8:16] != b"\x00\x00\x00\rIHDR":
+            raise bad("image", "a PNG without its header", "copy the file again")
+        if not data.endswith(_PNG_END):
+            raise bad("image", "a PNG cut short", "copy the file again")
+        width, height = int.from_bytes(data[16:20]), int.from_bytes(data[20:24])
+        if data[24] not in _PNG_DEPTHS.get(data[25], ()):
+            raise bad("image", f"{data[24]} bits, colour type {data[25]}", "save it with 8 bits per channel")
+    elif data.startswith(_JPEG_MAGIC):
+        width, height = _jpeg_size(data, bad)
+    else:
+        raise bad("image", f"a file that begins with {data[:8].hex(' ') or 'nothing'}", "save it as PNG")
+    if not 0 < width * height <= IMAGE_PIXELS_MAX:
+        raise bad("image-size", f"{width} x {height} pixels", "crop or scale it")
+    return width, height
+
+
+def _jpeg_size(data: bytes, bad: Callable[[str, str, str], InputError]) -> tuple[int, int]:
+    """Size in the first frame header of a JPEG."""
+    position = 2
+    while position + 9 <= len(data):
+        if data[position] != 0xFF:
+            raise bad("image", "a JPEG with bytes between its segments", "copy the file again")
+        marker = data[position + 1]
+        if marker == 0xFF:
+            position += 1
+        elif marker in _JPEG_BARE:
+            position += 2
+        elif marker in _JPEG_FRAMES:
+            if data[position + 4] != 8:
+                raise bad("image", f"{data[position + 4]} bits", "save it with 8 bits per channel")
+            return int.from_bytes(data[position + 7 : position + 9]), int.from_bytes(data[position + 5 : position + 7])
+        elif 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):
+            raise bad("image", f"JPEG of kind SOF{marker - 0xC0}", "save it as PNG")
+        else:
+            position += 2 + int.from_bytes(data[position + 2 : position + 4])
+    raise bad("image", "a JPEG without a frame", "copy the file again")
+
+
+def decode_image(data: bytes, file: str) -> np.ndarray:
+    """The picture in `data` as (height, width, 3) uint8, channels blue, green, red (OpenCV's order).
+
+    The orientation tag of a JPEG is left out of account: pixel coordinates are those of the sensor.
+
+    Raises:
+        InputError: what `image_size` refuses, and data that the decoder cannot read.
+    """
+    width, height = image_size(data, file)
+    import cv2
+    import numpy as np
+
+    try:
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    except cv2.error:
+        image = None
+    if image is None or image.shape != (height, width, 3):
+        found = "damaged image data" if image is None else f"{image.shape[1]} x {image.shape[0]} pixels in the data"
+        raise refusal("image", file=file, found=found, allowed=IMAGES_ALLOWED, remedy="copy or record it again")
+    return image
+
+
+def read_image(path: Path, folder: Path | None = None) -> np.ndarray:
+    """A PNG or JPEG as (height, width, 3) uint8, blue, green, red; inside `folder` where given.
+
+    PNG is what the package writes: its checksum finds every damaged byte, a JPEG's damage shows only as wrong
+    pixels.
+
+    Raises:
+        InputError: what `read_bytes` and `decode_image` refuse.
+    """
+    return decode_image(read_bytes(path, IMAGE_BYTES_MAX, folder), escaped(Path(path).name))
+
+
+def png_bytes(image: np.ndarray) -> bytes:
+    """PNG of (height, width) or (height, width, 3) uint8 pixels, blue, green, red."""
+    import cv2
+    import numpy as np
+
+    if image.dtype != np.uint8:
+        raise TypeError(f"pixels must be uint8, not {image.dtype}")
+    done, data = cv2.imencode(".png", image)
+    if not done:
+        raise ValueError(f"no PNG of shape {image.shape}")
+    return data.tobytes()

@@ -1,0 +1,346 @@
+"""What was ordered and what was seen: plans, moves, spots and the campaign folder (DESIGN 7).
+
+Counters are absolute integers; px with the integer at the centre of a pixel; degrees where a name says
+`_deg`. Columns are found by name. No JAX.
+
+Measuring protocols are plans as well: the paper's experiments, and grids of poses. A start is `reversed` when it is
+reached by a move against the experiment's direction (play opens within the experiment), `cleared` when it is reached
+by a move along it (play already taken up), and `direct` when it is reached from wherever the axis stands.
+"""
+
+from __future__ import annotations
+
+import datetime
+import hashlib
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+from tvsbayes.errors import escaped, refusal
+from tvsbayes.files.csv_table import CSV_BYTES_MAX, Table, csv_bytes, parse_table
+from tvsbayes.files.disk import make_folder, read_bytes, write_atomically
+from tvsbayes.files.documents import JSON_BYTES_MAX, TOML_BYTES_MAX, Keys, parse_toml, toml_line
+from tvsbayes.instrument.rig import RigTable, parse_rig_table, rig_table_toml
+from tvsbayes.instrument.stereo_pair import Stereo, parse_stereo, stereo_bytes
+
+
+@dataclass(frozen=True, slots=True)
+class Move:
+    """A row of `moves.csv`: absolute counters AFTER the move.
+
+    Approaches are "left"/"right"/"unknown" and "up"/"down"/"unknown" in the first row of a segment,
+    empty elsewhere.
+    """
+
+    move: int
+    segment: int
+    time_s: float
+    pan_steps: int
+    tilt_steps: int
+    pan_approach: Literal["left", "right", "unknown", ""] = ""
+    tilt_approach: Literal["up", "down", "unknown", ""] = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Spot:
+    """A row of `spots.csv`: raw centroids and their standard uncertainties, px.
+
+    All eight are numbers where `status` is "ok"; any of them may be None elsewhere, and no estimator
+    reads the pixels of a spot that is not "ok".
+    """
+
+    spot: int
+    move: int
+    target: str
+    experiment: int | None
+    point: int | None
+    u_left_px: float | None
+    v_left_px: float | None
+    u_right_px: float | None
+    v_right_px: float | None
+    su_left_px: float | None
+    sv_left_px: float | None
+    su_right_px: float | None
+    sv_right_px: float | None
+    aperture_deg: float | None = None
+    status: str = "ok"
+    ruv_left: float = 0.0
+    ruv_right: float = 0.0
+
+
+@dataclass(frozen=True)
+class Campaign:
+    """A campaign folder, checked. `header` holds the keys of `campaign.toml` outside `[rig]`."""
+
+    moves: tuple[Move, ...]
+    spots: tuple[Spot, ...]
+    stereo: Stereo
+    rig: RigTable = field(default_factory=RigTable)
+    header: dict[str, object] = field(default_factory=dict)
+    path: Path | None = None
+
+
+_MOVE_COLUMNS = ("move", "segment", "time_s", "pan_steps", "tilt_steps", "pan_approach", "tilt_approach")
+_PIXELS = ("u_left_px", "v_left_px", "u_right_px", "v_right_px")
+_PIXEL_SDS = ("su_left_px", "sv_left_px", "su_right_px", "sv_right_px")
+_SPOT_COLUMNS = (
+    *("spot", "move", "target", "experiment", "point"),
+    *(*_PIXELS, *_PIXEL_SDS, "aperture_deg", "status"),
+)
+_CORRELATIONS = ("ruv_left", "ruv_right")
+COUNTER_MAX = 10**8
+ID_MAX = 10**9
+# How far outside the image a centroid may lie, in image sizes: half a spot at the edge, not a wrong file.
+_IMAGE_MARGIN = 0.1
+
+
+def parse_moves(data: bytes, file: str = "moves.csv") -> tuple[Move, ...]:
+    """The checked rows of `moves.csv` (DESIGN 7); at least one."""
+    table = parse_table(data, file, _MOVE_COLUMNS)
+    if not len(table):
+        allowed, remedy = "at least one row", "write row 0: the counters and approaches after homing"
+        raise refusal("empty", file=file, line=1, found="no rows", allowed=allowed, remedy=remedy)
+    moves = table.integers("move", 0, ID_MAX)
+    segments = table.integers("segment", 0, ID_MAX)
+    times_s = table.numbers("time_s", -1e12, 1e12)
+    table.check_counting("move", moves)
+    for row in range(len(table)):
+        before = segments[row - 1] if row else -1
+        if segments[row] not in ((before, before + 1) if row else (0,)):
+            allowed = f"{before} or {before + 1}" if row else "0"
+            raise table.refuse(row, "segment", "order", allowed, "count segments 0, 1, 2 ... without gaps")
+        if row and times_s[row] < times_s[row - 1]:
+            allowed = f"at least {times_s[row - 1]!r}, the time of the row before"
+            raise table.refuse(row, "time_s", "order", allowed, "list the moves in order of time")
+    approaches = {}
+    for column, words in (("pan_approach", ("left", "right")), ("tilt_approach", ("up", "down"))):
+        approaches[column] = table.columns[column]
+        for row, word in enumerate(approaches[column]):
+            first = row == 0 or segments[row] != segments[row - 1]
+            allowed_words = (*words, "unknown") if first else ("",)
+            if word not in allowed_words:
+                allowed = ", ".join(allowed_words) if first else "an empty cell inside a segment"
+                remedy = "state how the axis arrived there" if first else "leave it empty, or begin a segment"
+                raise table.refuse(row, column, "approach", allowed, remedy)
+    pan = table.integers("pan_steps", -COUNTER_MAX, COUNTER_MAX)
+    tilt = table.integers("tilt_steps", -COUNTER_MAX, COUNTER_MAX)
+    return tuple(map(Move, moves, segments, times_s, pan, tilt, *approaches.values()))
+
+
+def check_experiments(
+    table: Table, experiments: Sequence[int | None], points: Sequence[int | None], counts: Sequence[bool]
+) -> None:
+    """Refuses an experiment without point or the reverse, and twice the same point of an experiment that counts."""
+    pairs = list(zip(experiments, points, strict=True))
+    for row, (experiment, point) in enumerate(pairs):
+        if (experiment is None) != (point is None):
+            column = "experiment" if experiment is None else "point"
+            allowed = "experiment and point both given or both empty"
+            raise table.refuse(row, column, "missing", allowed, "complete the pair or empty it")
+    keys = [pair if counted and pair != (None, None) else None for pair, counted in zip(pairs, counts, strict=True)]
+    table.check_unique("point", keys, "every point of an experiment once")
+
+
+def parse_spots(data: bytes, file: str, moves: int, stereo: Stereo) -> tuple[Spot, ...]:
+    """The checked rows of `spots.csv` (DESIGN 7), in the order of the file.
+
+    Args:
+        data: the file's bytes.
+        file: its name, for errors.
+        moves: number of moves, which `move` must name.
+        stereo: gives the image size.
+    """
+    table = parse_table(data, file, _SPOT_COLUMNS, _CORRELATIONS)
+    spots = table.integers("spot", 0, ID_MAX)
+    table.check_unique("spot", spots, "unique ids")
+    move_ids = table.integers("move", 0, ID_MAX)
+    for row, move in enumerate(move_ids):
+        if move is None or move >= moves:
+            allowed = f"a row of moves.csv: 0 to {moves - 1}"
+            raise table.refuse(row, "move", "missing-move", allowed, "name the last move before the look")
+    experiments, points = table.integers("experiment", 0, ID_MAX, True), table.integers("point", 1, 4, True)
+    statuses = table.texts("status", 200, empty=False)
+    # A look that found no spot may be taken again.
+    check_experiments(table, experiments, points, [status == "ok" for status in statuses])
+    size = {"u": float(stereo.image_width), "v": float(stereo.image_height)}
+    pixels = [table.numbers(column, -1e6, 1e6, empty=True) for column in _PIXELS]
+    sds = [table.numbers(column, 1e-4, 100.0, empty=True) for column in _PIXEL_SDS]
+    for column, values in zip((*_PIXELS, *_PIXEL_SDS), (*pixels, *sds), strict=True):
+        extent = size.get(column[0], 0.0)
+        for row, value in enumerate(values):
+            if statuses[row] != "ok":
+                continue
+            if value is None:
+                allowed = "a finite decimal number, or an empty cell with a status other than ok"
+                raise table.refuse(row, column, "missing", allowed, "give the value or a refusal reason")
+            if column in _PIXELS and not -_IMAGE_MARGIN <= value / extent <= 1 + _IMAGE_MARGIN:
+                allowed = f"a position in the image, 0 to {extent:g} px, or close to it"
+                remedy = "check the image size in stereo.json, or give the spot a refusal reason"
+                raise table.refuse(row, column, "outside-image", allowed, remedy)
+    apertures = table.numbers("aperture_deg", -360.0, 360.0, empty=True)
+    correlations = [_parse_correlations(table, column, statuses) for column in _CORRELATIONS]
+    head = (spots, move_ids, table.texts("target"), experiments, points)
+    return tuple(map(Spot, *head, *pixels, *sds, apertures, statuses, *correlations))
+
+
+def _parse_correlations(table: Table, column: str, statuses: Sequence[str]) -> list[float]:
+    """Correlations of u and v; 0 without the column, and where a row without a spot leaves the cell empty."""
+    if column not in table.columns:
+        return [0.0] * len(table)
+    # At a correlation of 1 the two coordinates of a centroid would be one.
+    values = table.numbers(column, -0.999999, 0.999999, empty=True)
+    for row, value in enumerate(values):
+        if value is None and statuses[row] == "ok":
+            allowed = "a finite decimal number from -0.999999 to 0.999999"
+            raise table.refuse(row, column, "number", allowed, "write 0 where it is not known")
+    return [value or 0.0 for value in values]
+
+
+_TEXT_CHARS = {
+    **dict.fromkeys(("name", "operator", "instrument", "serial", "method", "board_certificate"), 200),
+    "notes": 4000,
+}
+_QUANTITIES = {
+    "temperature_degC": (-100.0, 200.0, 100.0),
+    "humidity_percent": (0.0, 100.0, 100.0),
+    "pitch_mm": (1e-3, 1e4, 1e3),
+}
+_HEADER_TABLES = {
+    "environment": ("temperature_degC", "humidity_percent"),
+    "traceability": ("board_certificate", "pitch_mm", "stereo_calibrated"),
+}
+_HEADER_KEYS = (
+    *("format", "name", "created", "synthetic", "seed"),
+    *("operator", "instrument", "serial", "method", "notes", *_HEADER_TABLES, "rig"),
+)
+
+
+def _header_value(keys: Keys, key: str) -> object:
+    """One checked value outside `[rig]`, by the kind its key asks for."""
+    if key in _TEXT_CHARS:
+        return keys.text_value(key, _TEXT_CHARS[key])
+    if key in _QUANTITIES:
+        value, u = keys.quantity(key, *_QUANTITIES[key])
+        return {"value": value, "u": u}
+    if key == "synthetic":
+        return keys.flag(key)
+    if key == "seed":
+        return keys.integer(key, 0, 2**63 - 1)
+    if not isinstance(keys.values[key], datetime.date):
+        allowed = "a date or time such as 2026-01-15T10:00:00Z"
+        raise keys.refuse(key, "date", allowed, "write it without quotes")
+    return keys.values[key]
+
+
+def parse_header(keys: Keys) -> dict[str, object]:
+    """The keys of `campaign.toml` outside `[rig]`, checked; their list is closed (DESIGN 7)."""
+    keys.word("format", ("tvsbayes-campaign/1",))
+    keys.only(_HEADER_KEYS)
+    plain = [key for key in keys.values if key not in ("format", "rig", *_HEADER_TABLES)]
+    header = {key: _header_value(keys, key) for key in plain}
+    for name, allowed in _HEADER_TABLES.items():
+        table = keys.table(name)
+        table.only(allowed)
+        if table.values:
+            header[name] = {key: _header_value(table, key) for key in table.values}
+    return header
+
+
+# campaign.toml is written last: a folder without it is recognisably unfinished.
+_FILES = {
+    "stereo.json": JSON_BYTES_MAX,
+    "moves.csv": CSV_BYTES_MAX,
+    "spots.csv": CSV_BYTES_MAX,
+    "campaign.toml": TOML_BYTES_MAX,
+}
+
+
+def _parse_files(files: dict[str, bytes], path: Path | None) -> Campaign:
+    keys = parse_toml(files["campaign.toml"], "campaign.toml")
+    header, rig = parse_header(keys), parse_rig_table(keys.table("rig"))
+    stereo = parse_stereo(files["stereo.json"], "stereo.json")
+    moves = parse_moves(files["moves.csv"])
+    spots = parse_spots(files["spots.csv"], "spots.csv", len(moves), stereo)
+    return Campaign(moves, spots, stereo, rig, header, path)
+
+
+def read_campaign(folder: Path | str) -> Campaign:
+    """Reads and checks a campaign folder (DESIGN 7; the README lists its files). Never `truth.json`, frames or results.
+
+    Args:
+        folder: holds `campaign.toml`, `stereo.json`, `moves.csv` and `spots.csv`.
+
+    Returns:
+        Moves in time order, spots in the order of the file, the stereo pair and the `[rig]` table; input of `fit`,
+        `classic` and the plots.
+
+    Raises:
+        InputError: anything that is missing, malformed or contradicts itself, with file, line and column.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        place, found = escaped(str(folder), 200), "no such folder" if not folder.exists() else "a file"
+        allowed, remedy = "a campaign folder", "give the folder that holds campaign.toml"
+        raise refusal("missing-file", file=place, found=found, allowed=allowed, remedy=remedy)
+    files = {name: read_bytes(folder / name, cap, folder) for name, cap in _FILES.items()}
+    return _parse_files(files, folder)
+
+
+def moves_bytes(moves: Iterable[Move]) -> bytes:
+    """The content of `moves.csv`."""
+    return csv_bytes(_MOVE_COLUMNS, ([getattr(m, c) for c in _MOVE_COLUMNS] for m in moves))
+
+
+def spots_bytes(spots: Sequence[Spot]) -> bytes:
+    """The content of `spots.csv`; the correlations appear only where one is not zero."""
+    correlated = any(s.ruv_left or s.ruv_right for s in spots)
+    columns = (*_SPOT_COLUMNS, *(_CORRELATIONS if correlated else ()))
+    return csv_bytes(columns, ([getattr(s, c) for c in columns] for s in spots))
+
+
+def campaign_toml(campaign: Campaign) -> bytes:
+    """The content of `campaign.toml`: header and the complete `[rig]` table."""
+    lines = [toml_line("format", "tvsbayes-campaign/1")]
+    tables = {name: value for name, value in campaign.header.items() if isinstance(value, dict)}
+    lines += [toml_line(key, value) for key, value in campaign.header.items() if key not in tables]
+    for name, table in tables.items():
+        lines += [f"[{name}]", *(toml_line(key, value) for key, value in table.items())]
+    return ("\n".join(lines) + "\n" + rig_table_toml(campaign.rig)).encode()
+
+
+def write_campaign(campaign: Campaign, folder: Path) -> None:
+    """Writes the four files of a campaign into a new or empty folder; what is read back is the same.
+
+    Raises:
+        InputError: the folder holds something, cannot be written, or `campaign` holds what
+            `read_campaign` would refuse (then nothing is written).
+    """
+    folder = Path(folder)
+    tables = moves_bytes(campaign.moves), spots_bytes(campaign.spots)
+    files = dict(zip(_FILES, (stereo_bytes(campaign.stereo), *tables, campaign_toml(campaign)), strict=True))
+    _parse_files(files, None)
+    make_folder(folder, empty=True)
+    for name, data in files.items():
+        write_atomically(folder / name, data)
+
+
+def input_hashes(campaign: Campaign) -> dict[str, str]:
+    """SHA-256 of what an estimate depends on, by "moves", "spots", "stereo" and "rig".
+
+    Taken over the values in canonical text, spots in order of id: line endings, digits beyond double
+    precision, the order of columns, the campaign's name and its notes do not count.
+    """
+    spots = sorted(campaign.spots, key=lambda spot: spot.spot)
+    contents = {
+        "moves": moves_bytes(campaign.moves),
+        "spots": spots_bytes(spots),
+        "stereo": stereo_bytes(campaign.stereo),
+        "rig": rig_table_toml(campaign.rig).encode(),
+    }
+    return {name: hashlib.sha256(data).hexdigest() for name, data in contents.items()}
+
+
+def ordered_spots(campaign: Campaign) -> list[Spot]:
+    """Spots with status ok in the order in which the filter meets them."""
+    return sorted((s for s in campaign.spots if s.status == "ok"), key=lambda s: (s.move, s.spot))

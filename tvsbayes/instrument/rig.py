@@ -1,0 +1,312 @@
+"""The instrument as declared: parameter names and priors, rig files, and the stereo pair with its calibration.
+
+Frames and units: DESIGN section 2. mm, degrees where a name says `_deg`, radians where it says `_rad`, image px with
+the integer at the centre of a pixel. Stereo in OpenCV's conventions: camera axes x right, y down, z along the view;
+x_right = R x_left + T; Rodrigues vectors (DESIGN 3.3 and 7). No JAX.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path, PureWindowsPath
+from typing import Literal
+
+from tvsbayes.errors import InputError, closest, escaped
+from tvsbayes.files.disk import read_bytes
+from tvsbayes.files.documents import TOML_BYTES_MAX, Keys, parse_toml, toml_line
+from tvsbayes.instrument.axes import FULL_TURN_DEG
+from tvsbayes.instrument.parameters import (
+    DECLARED_PRIORS,
+    DEFAULT_PRIORS,
+    HARMONIC_PRIORS,
+    RANGES,
+    RIG_PRIORS,
+    STEREO_PARAMETER_NAMES,
+    Prior,
+)
+from tvsbayes.instrument.stereo_pair import Stereo, read_stereo
+
+
+@dataclass(frozen=True)
+class RigTable:
+    """The `[rig]` table of a campaign or rig file: every prior the estimators use.
+
+    `priors` maps every name of `RIG_PRIORS` to its `Prior`; names left out take the default.
+    `harmonic_period_deg` maps "pan" and "tilt", where declared, to the period of the transmission error in
+    degrees of the output: `FULL_TURN_DEG` for the wheel, less for the pinion.
+
+    Raises:
+        InputError: harmonics of an axis without a period.
+    """
+
+    priors: dict[str, Prior] = field(default_factory=dict)
+    aperture_convention: Literal["in-plane", "azimuth"] = "in-plane"
+    harmonic_period_deg: dict[str, float] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "priors", {**RIG_PRIORS, **self.priors})
+        require_periods(self.priors, self.harmonic_period_deg)
+
+
+@dataclass(frozen=True)
+class Rig:
+    """A rig file: the declared rig, its stereo calibration and how it is driven (DESIGN 7).
+
+    `truth` is the distribution from which `simulate` and `study` draw true rigs (complete: names absent
+    from `[truth]` take the prior). `sheets_mm` gives the nominal X of each named target in frame S.
+    `positioner`, `cameras`, `costs_s` are the remaining tables, checked but otherwise as written (defaults
+    filled in for `cameras["spot_sd_px"]`, the standard uncertainty stated for simulated spots, and for the
+    costs). `header` holds name and notes.
+    """
+
+    table: RigTable
+    stereo: Stereo
+    truth: dict[str, Prior]
+    sheets_mm: dict[str, float]
+    positioner: dict[str, object]
+    cameras: dict[str, object]
+    costs_s: dict[str, float]
+    path: Path | None = None
+    header: dict[str, str] = field(default_factory=dict)
+
+
+_PRIOR_NAMES = (*DEFAULT_PRIORS, *HARMONIC_PRIORS)
+_PERIOD_NAMES = {f"harmonic_period_deg.{axis}": axis for axis in ("pan", "tilt")}
+_PERIOD_MIN_DEG = 1e-6
+_GROUPS = {name.rsplit(".", n)[0] for name in (*RIG_PRIORS, *_PERIOD_NAMES, *STEREO_PARAMETER_NAMES) for n in (1, 2, 3)}
+
+
+def _harmonic_without_period(priors: Mapping[str, Prior], period_deg: Mapping[str, float]) -> str | None:
+    """The first harmonic that is not fixed at 0 on an axis whose period nobody stated."""
+    for name in HARMONIC_PRIORS:
+        prior = priors.get(name)
+        if prior is not None and (prior.value != 0 or prior.u != 0) and name.split(".")[1] not in period_deg:
+            return name
+    return None
+
+
+def _period_remedy(name: str) -> str:
+    axis = name.split(".")[1]
+    return (
+        f'add "harmonic_period_deg.{axis}" = {{ value = P, u = 0.0 }} to [rig]: degrees of the output per turn of the '
+        f"faulty member, {FULL_TURN_DEG:g} for the wheel, {FULL_TURN_DEG:g} x teeth of the pinion / teeth of the wheel "
+        "for the pinion"
+    )
+
+
+def require_periods(priors: Mapping[str, Prior], period_deg: Mapping[str, float]) -> None:
+    """Refuse harmonics whose period is unknown: they would be an error at no known angle.
+
+    Raises:
+        InputError: a harmonic with a value or u other than 0 on an axis without a period.
+    """
+    name = _harmonic_without_period(priors, period_deg)
+    if name is not None:
+        message = f"{name} has no period"
+        raise InputError("missing-period", message, column=name, remedy=_period_remedy(name))
+
+
+def _explanation(name: str, allowed: tuple[str, ...]) -> str:
+    """What to do about a name that may not stand where it does."""
+    stem, _, last = name.partition(".")
+    if name in _PERIOD_NAMES:
+        return "it belongs into [rig] itself: tooth counts fix it, so it has no prior and no other truth"
+    if name in _PRIOR_NAMES:
+        return "it belongs into [rig.prior]"
+    if stem == "degrees_per_step" and last in ("left", "right", "up", "down"):
+        axis = "pan" if last in ("left", "right") else "tilt"
+        return f"it is derived: state degrees_per_step.{axis} and ratio_contrast_deg_per_step.{axis}"
+    if stem == "effective_mirror_offset_mm":
+        return "it is derived: state mirror_offset_mm"
+    if stem == "stereo":
+        return "stereo parameters and their covariance come from stereo.json"
+    return closest(name, allowed)
+
+
+def _entries(table: Keys, prefix: str = "") -> Iterator[tuple[Keys, str, str]]:
+    """Every entry as (its table, its key there, its full name), quoted or dotted keys alike."""
+    for key, value in table.values.items():
+        name = prefix + key
+        if isinstance(value, dict) and value and name in _GROUPS and not {"value", "u"} & set(value):
+            yield from _entries(table.table(key), name + ".")
+        else:
+            yield table, key, name
+
+
+def _parse_priors(table: Keys, allowed: tuple[str, ...]) -> dict[str, Prior]:
+    """The priors of one table, checked; `allowed` lists the names that may stand in it."""
+    priors: dict[str, Prior] = {}
+    for keys, key, name in _entries(table):
+        if name not in allowed:
+            # Keys of [rig] itself that are no priors are read before.
+            more = () if "rig" not in table.path or "prior" in table.path else ("aperture_convention", "prior")
+            names = "only " + ", ".join((*allowed, *more))
+            found = f"the name {escaped(name)}"
+            raise keys.refuse(key, "unknown-key", names, _explanation(name, allowed), found)
+        if name in priors:
+            raise keys.refuse(key, "duplicate-key", "every name once", "remove one", f"{name} twice")
+        if name in _PERIOD_NAMES:
+            priors[name] = Prior(_parse_period(keys, key), 0.0)
+            continue
+        distribution = RIG_PRIORS[name].distribution
+        low, high, u_max = RANGES[name.partition(".")[0]]
+        if name.startswith("extrinsics.rotation_rad"):
+            low, high, u_max = -3.15, 3.15, 3.15
+        value, u = keys.quantity(key, low, high, u_max)
+        priors[name] = Prior(value, u, distribution)
+    return priors
+
+
+def _parse_period(keys: Keys, key: str) -> float:
+    """A period in degrees of the output; exact, since it follows from tooth counts."""
+    period_deg, u = keys.quantity(key, _PERIOD_MIN_DEG, FULL_TURN_DEG, FULL_TURN_DEG)
+    if u != 0:
+        remedy = "write u = 0.0: tooth counts give the period exactly (the wheel's is 360)"
+        raise keys.refuse(key, "period-uncertain", "a period with u = 0", remedy)
+    return period_deg
+
+
+def _check_periods(table: Keys, priors: Mapping[str, Prior], period_deg: Mapping[str, float]) -> None:
+    """`require_periods` with the place in the file."""
+    name = _harmonic_without_period(priors, period_deg)
+    if name is not None:
+        allowed = "harmonics of an axis whose period is stated"
+        raise table.refuse(name, "missing-period", allowed, _period_remedy(name), "a harmonic without a period")
+
+
+def parse_rig_table(table: Keys) -> RigTable:
+    """The `[rig]` table with its `[rig.prior]`; absent entries take their defaults.
+
+    Raises:
+        InputError: unknown or misplaced names, entries that are not { value, u }, values out of range,
+            a half-normal with a value other than 0, harmonics without a period, a period with u > 0.
+    """
+    own = {k: v for k, v in table.values.items() if k not in ("aperture_convention", "prior")}
+    own_keys = Keys(own, table.file, table.text, table.path)
+    declared = _parse_priors(own_keys, (*DECLARED_PRIORS, *_PERIOD_NAMES))
+    period_deg = {axis: declared.pop(name).value for name, axis in _PERIOD_NAMES.items() if name in declared}
+    # Any parameter may stand in [rig.prior] (DESIGN 7), also one that has its place in [rig].
+    prior = _parse_priors(table.table("prior"), (*_PRIOR_NAMES, *DECLARED_PRIORS))
+    for name in declared:
+        if name in prior:
+            found = f"{name} in [rig] and in [rig.prior]"
+            raise table.table("prior").refuse(name, "duplicate-key", "every name once", "remove one", found)
+    _check_periods(table.table("prior"), prior, period_deg)
+    key = "aperture_convention"
+    azimuth = key in table and table.word(key, ("in-plane", "azimuth")) == "azimuth"
+    return RigTable({**prior, **declared}, "azimuth" if azimuth else "in-plane", period_deg)
+
+
+def rig_table_toml(table: RigTable) -> str:
+    """`[rig]` and `[rig.prior]` with every entry, also those at their defaults, so that a file says all.
+
+    Harmonics stand only where they mean something: on an axis with a period.
+    """
+
+    def entry(name: str) -> str:
+        prior = table.priors[name]
+        return toml_line(name, {"value": float(prior.value), "u": float(prior.u)})
+
+    convention = toml_line("aperture_convention", table.aperture_convention)
+    periods = [
+        toml_line(name, {"value": float(table.harmonic_period_deg[axis]), "u": 0.0})
+        for name, axis in _PERIOD_NAMES.items()
+        if axis in table.harmonic_period_deg
+    ]
+    harmonics = [entry(name) for name in HARMONIC_PRIORS if name.split(".")[1] in table.harmonic_period_deg]
+    declared, priors = map(entry, DECLARED_PRIORS), map(entry, DEFAULT_PRIORS)
+    return "\n".join(["[rig]", *declared, *periods, convention, "[rig.prior]", *priors, *harmonics]) + "\n"
+
+
+_COSTS_S = {"move_s": 1.5, "look_s": 1.0, "placement_s": 60.0}
+_COUNTER_MAX = 10**8
+
+
+def _parse_positioner(table: Keys) -> dict[str, object]:
+    """`[positioner]`: driver, port, limits and speeds."""
+    limits = ("pan_min_steps", "pan_max_steps", "tilt_min_steps", "tilt_max_steps")
+    table.only(("driver", "port", "baud", *limits, "speed_steps_per_s", "settle_s"))
+    values: dict[str, object] = {key: table.text_value(key) for key in ("driver", "port") if key in table}
+    # Serial libraries read an address as instructions: one of them writes a file of the address' choice.
+    if "://" in str(values.get("port", "")):
+        remedy = "give a port's name, such as /dev/ttyACM0 or COM3; `tvsbayes doctor` lists those there are"
+        raise table.refuse("port", "port", "the name of a serial port, no address", remedy)
+    if "baud" in table:
+        values["baud"] = table.integer("baud", 300, 10_000_000)
+    steps = {key: table.integer(key, -_COUNTER_MAX, _COUNTER_MAX) for key in limits if key in table}
+    for axis in ("pan", "tilt"):
+        low, high = steps.get(f"{axis}_min_steps"), steps.get(f"{axis}_max_steps")
+        if low is not None and high is not None and low > high:
+            key = f"{axis}_max_steps"
+            raise table.refuse(key, "limits", f"at least {axis}_min_steps = {low}", "swap the two limits")
+    for key, low_s, high_s in (("speed_steps_per_s", 1e-3, 1e7), ("settle_s", 0.0, 3600.0)):
+        if key in table:
+            values[key] = table.number(key, low_s, high_s)
+    return {**values, **steps}
+
+
+def _parse_cameras(table: Keys, stereo: Stereo) -> dict[str, object]:
+    """`[cameras]`: source, devices, size (that of the calibration), exposure, spot uncertainty."""
+    table.only(("source", "left", "right", "width", "height", "exposure", "spot_sd_px"))
+    values: dict[str, object] = {"spot_sd_px": 0.08}
+    for key in ("source", "left", "right"):
+        if key in table:
+            device = isinstance(table.values[key], str)
+            values[key] = table.text_value(key) if device else table.integer(key, 0, 1000)
+    for key, calibrated in (("width", stereo.image_width), ("height", stereo.image_height)):
+        if key in table:
+            values[key] = table.integer(key, 1, 65_535)
+            if values[key] != calibrated:
+                remedy = "calibrate and observe at one image size"
+                raise table.refuse(key, "image-size", f"{calibrated} px, as in the stereo file", remedy)
+    for key, low, high in (("exposure", -100.0, 1e9), ("spot_sd_px", 1e-4, 100.0)):
+        if key in table:
+            values[key] = table.number(key, low, high)
+    return values
+
+
+def _beside(keys: Keys, key: str, folder: Path) -> Path:
+    """The file that `key` names, which must lie in the folder of the rig file or below."""
+    name = keys.text_value(key)
+    windows = PureWindowsPath(name)
+    if not name or Path(name).is_absolute() or windows.drive or windows.root or ".." in windows.parts:
+        allowed = "a file name relative to the rig file, inside its folder"
+        raise keys.refuse(key, "path", allowed, "put the file beside the rig file and give its name")
+    return folder / name
+
+
+def read_rig(path: Path) -> Rig:
+    """Reads a rig file (format tvsbayes-rig/1, DESIGN 7) and the stereo file it names.
+
+    Raises:
+        InputError: either file unreadable, unknown keys, values out of range, a stereo path that leaves
+            the folder.
+    """
+    path = Path(path)
+    keys = parse_toml(read_bytes(path, TOML_BYTES_MAX), escaped(path.name))
+    keys.word("format", ("tvsbayes-rig/1",))
+    tables = ("rig", "truth", "sheets", "positioner", "cameras", "costs")
+    keys.only(("format", "name", "notes", "stereo", *tables))
+    header = {key: keys.text_value(key, cap) for key, cap in (("name", 200), ("notes", 2000)) if key in keys}
+    stereo = read_stereo(_beside(keys, "stereo", path.parent), folder=path.parent)
+    table = parse_rig_table(keys.table("rig"))
+    sheets = keys.table("sheets")
+    for name in sheets.values:
+        if not (name.isprintable() and 0 < len(name) <= 100):
+            raise sheets.refuse(name, "text", "a printable name of 1 to 100 characters", "rename the sheet")
+    costs = keys.table("costs")
+    costs.only(_COSTS_S)
+    truth = {**table.priors, **_parse_priors(keys.table("truth"), tuple(RIG_PRIORS))}
+    _check_periods(keys.table("truth"), truth, table.harmonic_period_deg)
+    return Rig(
+        table=table,
+        stereo=stereo,
+        truth=truth,
+        sheets_mm={name: sheets.number(name, 50.0, 100_000.0) for name in sheets.values},
+        positioner=_parse_positioner(keys.table("positioner")),
+        cameras=_parse_cameras(keys.table("cameras"), stereo),
+        costs_s={k: costs.number(k, 0.0, 1e6) if k in costs else v for k, v in _COSTS_S.items()},
+        path=path,
+        header=header,
+    )

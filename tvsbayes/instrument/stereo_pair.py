@@ -1,0 +1,329 @@
+"""The calibrated camera pair: file, covariance, triangulation."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from tvsbayes.errors import InputError, escaped, shown
+from tvsbayes.files.disk import read_bytes, write_atomically
+from tvsbayes.files.documents import JSON_BYTES_MAX, Keys, parse_json
+from tvsbayes.instrument.parameters import STEREO_PARAMETER_NAMES
+
+UNDISTORT_ITERATIONS = 200
+UNDISTORT_TOLERANCE_PX = 1e-9
+"""Largest error of re-distorting an undistorted pixel: 10^4 times the rounding of 1000 px in float64."""
+
+
+def distort(normalised: np.ndarray, distortion: np.ndarray) -> np.ndarray:
+    """Apply Brown-Conrady k1 k2 p1 p2 k3 to normalised coordinates (n, 2)."""
+    k1, k2, p1, p2, k3 = np.asarray(distortion, float).ravel()
+    x, y = normalised.T
+    r2 = x * x + y * y
+    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    across = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
+    down = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
+    return np.column_stack((across, down))
+
+
+def undistort(pixels: np.ndarray, camera: np.ndarray, distortion: np.ndarray) -> np.ndarray:
+    """Normalised coordinates (n, 2) of raw pixels (n, 2), iterated to convergence.
+
+    The result is checked by distorting it again; NaN where it does not return to its pixel within
+    `UNDISTORT_TOLERANCE_PX`. OpenCV's default of five iterations would leave tenths of a pixel.
+    """
+    import cv2
+
+    pixels = np.ascontiguousarray(pixels, float).reshape(-1, 2)
+    # OpenCV compares the re-distorted point in px: 1e-12 is rounding of the coordinate itself.
+    criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, UNDISTORT_ITERATIONS, 1e-12)
+    coefficients = np.asarray(distortion, float).reshape(1, 5)
+    if hasattr(cv2, "undistortPointsIter"):  # OpenCV 4: undistortPoints takes no criteria in Python
+        points = cv2.undistortPointsIter(pixels[:, None], camera, coefficients, None, None, criteria)
+    else:
+        points = cv2.undistortPoints(pixels[:, None], camera, coefficients, criteria=criteria)
+    points = points.reshape(-1, 2)
+    returned = distort(points, coefficients) @ camera[:2, :2].T + camera[:2, 2]
+    good = np.max(np.abs(returned - pixels), axis=1) <= UNDISTORT_TOLERANCE_PX
+    return np.where(good[:, None], points, np.nan)
+
+
+def triangulate(stereo: Stereo, pixels: np.ndarray, focal_scale: float = 1.0) -> np.ndarray:
+    """Triangulate raw pixels (n, 4: u_left, v_left, u_right, v_right) to points (n, 3) in frame S, mm.
+
+    Linear (DLT) triangulation of undistorted normalised coordinates with [I|0] and [R|T], as the paper;
+    `focal_scale` multiplies fx and fy of both cameras. NaN rows where undistortion does not converge.
+    """
+    import cv2
+
+    pixels = np.asarray(pixels, float).reshape(-1, 4)
+    if len(pixels) == 0:
+        return np.empty((0, 3))
+    scale = np.array([[focal_scale, 1.0, 1.0], [1.0, focal_scale, 1.0], [1.0, 1.0, 1.0]])
+    left = undistort(pixels[:, :2], stereo.M1 * scale, stereo.D1)
+    right = undistort(pixels[:, 2:], stereo.M2 * scale, stereo.D2)
+    good = np.isfinite(left).all(axis=1) & np.isfinite(right).all(axis=1)
+    points_S = np.full((len(pixels), 3), np.nan)
+    if good.any():
+        first = np.hstack((np.eye(3), np.zeros((3, 1))))
+        second = np.hstack((np.asarray(stereo.R, float), np.asarray(stereo.T, float).reshape(3, 1)))
+        rays = left[good].T.copy(), right[good].T.copy()
+        homogeneous = cv2.triangulatePoints(first, second, *rays).reshape(4, -1)
+        x, y, z = homogeneous[:3] / homogeneous[3]
+        points_S[good] = np.column_stack((z, -x, -y))
+    return points_S
+
+
+@dataclass(frozen=True)
+class Stereo:
+    """A stereo calibration in OpenCV's convention: x_right = R x_left + T (DESIGN 3.3 and 7).
+
+    `D1`, `D2` are k1 k2 p1 p2 k3. `parameter_covariance` orders the 24 parameters as
+    `STEREO_PARAMETER_NAMES` (rotation as Rodrigues vector, rad; translation in mm).
+    """
+
+    image_width: int
+    image_height: int
+    M1: np.ndarray
+    D1: np.ndarray
+    M2: np.ndarray
+    D2: np.ndarray
+    R: np.ndarray
+    T: np.ndarray
+    parameter_covariance: np.ndarray
+    rms_px: float
+    assumed: bool = False
+
+    @property
+    def vector(self) -> np.ndarray:
+        """The 24 parameters, shape (24,), in the order of `STEREO_PARAMETER_NAMES`."""
+        cameras = [(*M[[0, 1, 0, 1], [0, 1, 2, 2]], *D) for M, D in ((self.M1, self.D1), (self.M2, self.D2))]
+        return np.array([*cameras[0], *cameras[1], *rotation_vector(self.R), *self.T])
+
+    def with_vector(self, vector: np.ndarray) -> Stereo:
+        """The same rig with other parameters; image size and covariance stay.
+
+        Args:
+            vector: shape (24,), in the order of `STEREO_PARAMETER_NAMES`.
+        """
+        vector = np.asarray(vector, dtype=float)
+
+        def matrix(fx: float, fy: float, cx: float, cy: float) -> np.ndarray:
+            return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+
+        return replace(
+            self,
+            M1=matrix(*vector[0:4]),
+            D1=vector[4:9].copy(),
+            M2=matrix(*vector[9:13]),
+            D2=vector[13:18].copy(),
+            R=rotation_matrix(vector[18:21]),
+            T=vector[21:24].copy(),
+        )
+
+
+def rotation_matrix(rotation_vector_rad: np.ndarray) -> np.ndarray:
+    """Rodrigues' formula, smooth through zero. `rotation_vector_rad` (3,) -> (3, 3)."""
+    x, y, z = rotation_vector_rad
+    angle = math.sqrt(x * x + y * y + z * z)
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    # np.sinc(t / pi) = sin(t) / t, finite at 0; (1 - cos t) / t^2 = sinc(t / 2)^2 / 2.
+    first, second = np.sinc(angle / np.pi), 0.5 * np.sinc(angle / (2 * np.pi)) ** 2
+    return np.eye(3) + first * cross + second * cross @ cross
+
+
+def rotation_vector(matrix: np.ndarray) -> np.ndarray:
+    """The Rodrigues vector, rad, shape (3,), norm at most pi, of the rotation nearest to `matrix` (3, 3).
+
+    Through the unit quaternion's largest component, so it is accurate at 0 and at pi alike.
+    """
+    u, _, vt = np.linalg.svd(np.asarray(matrix, dtype=float))
+    r = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+    # Rows of 4 q q^T (w, x, y, z): the one with the largest diagonal is far from cancellation.
+    products = np.array(
+        [
+            [1 + r[0, 0] + r[1, 1] + r[2, 2], r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]],
+            [r[2, 1] - r[1, 2], 1 + r[0, 0] - r[1, 1] - r[2, 2], r[0, 1] + r[1, 0], r[0, 2] + r[2, 0]],
+            [r[0, 2] - r[2, 0], r[0, 1] + r[1, 0], 1 - r[0, 0] + r[1, 1] - r[2, 2], r[1, 2] + r[2, 1]],
+            [r[1, 0] - r[0, 1], r[0, 2] + r[2, 0], r[1, 2] + r[2, 1], 1 - r[0, 0] - r[1, 1] + r[2, 2]],
+        ]
+    )
+    q = products[np.argmax(np.diag(products))]
+    q = q / np.linalg.norm(q) * (1.0 if q[0] >= 0 else -1.0)
+    length = float(np.linalg.norm(q[1:]))
+    return 2.0 * q[1:] if length < 1e-12 else q[1:] * (2.0 * math.atan2(length, q[0]) / length)
+
+
+_STEREO_KEYS = (
+    *("format", "image_width", "image_height", "M1", "D1", "M2", "D2", "R", "T"),
+    *("parameter_covariance", "rms_px", "assumed"),
+)
+_ENTRY_MAX = 1e12
+_ROTATION_TOLERANCE = 1e-6
+_EIGENVALUE_TOLERANCE = 1e-8
+PRINCIPAL_SHARE_MAX = 0.25
+"""Share of the image's width or height by which a principal point may miss its middle before it is worth a word."""
+ASPECT_SHARE_MAX = 0.05
+"""The same of fx / fy from 1: pixels of today's sensors are square."""
+
+
+def _array(keys: Keys, key: str, *shapes: tuple[int, ...]) -> np.ndarray:
+    """The finite numbers under `key`, in one of `shapes`, returned in the first of them."""
+    wanted = " or ".join("x".join(map(str, shape)) for shape in shapes)
+    allowed = f"finite numbers in a list of {wanted}"
+    value = keys.values.get(key)
+    rows = value if isinstance(value, list) else [None]
+    nested = bool(rows) and all(isinstance(row, list) for row in rows)
+    entries = [entry for row in rows for entry in row] if nested else rows
+    for entry in entries:
+        if isinstance(entry, bool) or not isinstance(entry, int | float) or not abs(entry) <= _ENTRY_MAX:
+            found = shown(entry) if isinstance(value, list) else None
+            raise keys.refuse(key, "matrix", allowed, "one list per row, every entry a number", found)
+    lengths = {len(row) for row in rows} if nested else {0}
+    shape = (len(rows), *lengths) if nested else (len(rows),)
+    if len(lengths) != 1 or shape not in shapes:
+        found = "rows of different lengths" if len(lengths) != 1 else "x".join(map(str, shape))
+        raise keys.refuse(key, "shape", allowed, "write OpenCV's matrix, one list per row", found)
+    return np.array(entries, dtype=float).reshape(shapes[0])
+
+
+def _camera_matrix(keys: Keys, key: str) -> np.ndarray:
+    matrix = _array(keys, key, (3, 3))
+    pattern_holds = np.array_equal(matrix[[0, 1, 2, 2, 2], [1, 0, 0, 1, 2]], [0, 0, 0, 0, 1])
+    if not (pattern_holds and matrix[0, 0] > 0 and matrix[1, 1] > 0):
+        allowed = "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]] with fx, fy > 0, px"
+        found = escaped(json.dumps(matrix.tolist()), 120)
+        raise keys.refuse(key, "camera-matrix", allowed, "give OpenCV's camera matrix without skew", found)
+    return matrix
+
+
+def _check_covariance(keys: Keys, key: str, covariance: np.ndarray) -> None:
+    """Symmetric and positive semi-definite after scaling each row by its standard deviation."""
+    allowed = "a symmetric positive semi-definite 24x24 matrix; a zero row fixes a parameter"
+
+    def bad(found: str) -> InputError:
+        return keys.refuse(key, "covariance", allowed, "take it from the calibration of M, D, R, T", found)
+
+    variances = np.diag(covariance)
+    if (variances < 0).any():
+        name = STEREO_PARAMETER_NAMES[int(np.argmin(variances))]
+        raise bad(f"the negative variance {variances.min():.6g} of {name}")
+    free = variances > 0
+    if covariance[~free].any() or covariance[:, ~free].any():
+        raise bad("a covariance with a parameter of variance 0")
+    sds = np.sqrt(variances[free])
+    with np.errstate(over="ignore"):
+        correlation = covariance[np.ix_(free, free)] / sds[:, None] / sds[None, :]
+    if not (np.abs(correlation) <= 1 + 1e-6).all():
+        raise bad(f"a correlation of {np.abs(correlation).max():.6g}")
+    if not (np.abs(correlation - correlation.T) <= 1e-9).all():
+        raise bad("a matrix that is not symmetric")
+    smallest = float(np.linalg.eigvalsh(correlation).min()) if free.any() else 0.0
+    if smallest < -_EIGENVALUE_TOLERANCE:
+        raise bad(f"a smallest eigenvalue of {smallest:.3g} of the correlation matrix")
+
+
+def parse_stereo(data: bytes, file: str) -> Stereo:
+    """A checked stereo calibration from the bytes of `stereo.json`; see `read_stereo`."""
+    keys = parse_json(data, file)
+    keys.word("format", ("tvsbayes-stereo/1",))
+    keys.only(_STEREO_KEYS)
+    width, height = keys.integer("image_width", 1, 65_535), keys.integer("image_height", 1, 65_535)
+    rotation = _array(keys, "R", (3, 3))
+    deviation = max(np.abs(rotation @ rotation.T - np.eye(3)).max(), abs(np.linalg.det(rotation) - 1.0))
+    if deviation > _ROTATION_TOLERANCE:
+        allowed = f"R R^T = 1 and det R = +1 to {_ROTATION_TOLERANCE:g}"
+        found = f"a matrix that misses it by {deviation:.3g}"
+        raise keys.refuse("R", "rotation", allowed, "give R of x_right = R x_left + T, all digits", found)
+    translation = _array(keys, "T", (3,), (3, 1))
+    if not 0 < np.linalg.norm(translation) <= 1e5:
+        allowed = "a translation longer than 0 and at most 100000 mm"
+        raise keys.refuse("T", "translation", allowed, "give T in mm", escaped(str(translation.tolist())))
+    covariance = _array(keys, "parameter_covariance", (24, 24))
+    _check_covariance(keys, "parameter_covariance", covariance)
+    return Stereo(
+        image_width=width,
+        image_height=height,
+        M1=_camera_matrix(keys, "M1"),
+        D1=_array(keys, "D1", (5,), (1, 5), (5, 1)),
+        M2=_camera_matrix(keys, "M2"),
+        D2=_array(keys, "D2", (5,), (1, 5), (5, 1)),
+        R=rotation,
+        T=translation,
+        parameter_covariance=covariance,
+        rms_px=keys.number("rms_px", 0.0, 1e4),
+        assumed="assumed" in keys and keys.flag("assumed"),
+    )
+
+
+def read_stereo(path: Path, folder: Path | None = None) -> Stereo:
+    """Reads `stereo.json` (format tvsbayes-stereo/1, DESIGN 7).
+
+    Args:
+        path: the file.
+        folder: where given, the file must lie inside it after following links.
+
+    Raises:
+        InputError: unreadable, wrong shapes, no rotation, a covariance that is none, unknown keys.
+    """
+    return parse_stereo(read_bytes(path, JSON_BYTES_MAX, folder), escaped(Path(path).name))
+
+
+def stereo_bytes(stereo: Stereo) -> bytes:
+    """The content of `stereo.json`, one matrix row per line, every digit kept.
+
+    Raises:
+        InputError: `stereo` holds what `read_stereo` would refuse.
+    """
+    lines = []
+    for key in _STEREO_KEYS:
+        value = "tvsbayes-stereo/1" if key == "format" else getattr(stereo, key)
+        if isinstance(value, np.ndarray) and value.ndim == 2:
+            rows = ",\n  ".join(json.dumps(row) for row in value.tolist())
+            lines.append(f' "{key}": [\n  {rows}]')
+        else:
+            plain = value.tolist() if isinstance(value, np.ndarray | np.generic) else value
+            lines.append(f' "{key}": {json.dumps(plain)}')
+    data = ("{\n" + ",\n".join(lines) + "\n}\n").encode()
+    parse_stereo(data, "stereo.json")
+    return data
+
+
+def pair_doubts(stereo: Stereo) -> tuple[str, ...]:
+    """What contradicts two cameras beside each other that look at one scene, in words; empty where nothing does.
+
+    No refusal: mirrors, cropped images and lenses off their axes exist. Seen are cameras exchanged, an image size that
+    belongs to other pictures, pixels far from square.
+    """
+    doubts = []
+    # Where the second camera stands, in axes of the first: x to the right, as columns of a picture grow.
+    right_mm = -float(stereo.R[:, 0] @ stereo.T)
+    if right_mm < 0:
+        doubts.append(
+            f"the second camera stands {-right_mm:.4g} mm to the left of the first (x_right = R x_left + T with T_x = "
+            f"{stereo.T[0]:+.4g} mm): are left and right swapped?"
+        )
+    size_px = stereo.image_width, stereo.image_height
+    for side, matrix in (("left", stereo.M1), ("right", stereo.M2)):
+        centre_px = float(matrix[0, 2]), float(matrix[1, 2])
+        point = f"the {side} principal point ({centre_px[0]:.0f}, {centre_px[1]:.0f}) px"
+        # Integer = centre of a pixel: the image reaches from -0.5 to its size - 0.5.
+        if not all(-0.5 <= c <= n - 0.5 for c, n in zip(centre_px, size_px, strict=True)):
+            doubts.append(f"{point} lies outside the image of {size_px[0]} x {size_px[1]} px: is that its size?")
+        elif any(abs(c - (n - 1) / 2) > PRINCIPAL_SHARE_MAX * n for c, n in zip(centre_px, size_px, strict=True)):
+            doubts.append(
+                f"{point} is far from the middle of the image of {size_px[0]} x {size_px[1]} px: is that its size?"
+            )
+        fx, fy = float(matrix[0, 0]), float(matrix[1, 1])
+        if abs(fx / fy - 1) > ASPECT_SHARE_MAX:
+            doubts.append(f"the {side} fx and fy differ by {100 * abs(fx / fy - 1):.0f} %: pixels are seldom so oblong")
+    return tuple(doubts)
+
+
+def write_stereo(stereo: Stereo, path: Path) -> None:
+    """Writes `stereo.json` atomically; `read_stereo` gives back the same numbers."""
+    write_atomically(path, stereo_bytes(stereo))

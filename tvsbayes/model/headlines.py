@@ -1,0 +1,101 @@
+"""Effective ratios, contrasts, backlash and mirror offset at a pose."""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from tvsbayes.instrument.axes import DIRECTIONS
+from tvsbayes.model.geometry import Scalar
+from tvsbayes.model.laser_path import BeamAngles, Transmission, beam_angles
+from tvsbayes.model.parameter_space import ParameterSpace
+
+RATIOS = DIRECTIONS
+QUANTITIES: tuple[str, ...] = (
+    *RATIOS,
+    *("contrast.pan", "contrast.tilt", "backlash.pan", "backlash.tilt", "mirror_offset"),
+)
+"""Headlines in the order of `headlines`: effective deg/step, their differences, lost motion (deg), offset (mm)."""
+
+
+class Headlines(eqx.Module):
+    """Values of `QUANTITIES` and d/d(coordinates)."""
+
+    value: Float[Array, " quantities"]
+    gradient: Float[Array, "quantities parameters"]
+
+
+DEGREES = 180 / np.pi
+
+
+def effective_deg_per_step(gears: Transmission, angles: BeamAngles) -> Float[Array, "4"]:
+    """Gear ratio of each direction times the slope of the mirrors at the pose of `angles`, ordered as `DIRECTIONS`."""
+    ratio, half = gears.ratio_rad_per_step, 0.5 * gears.contrast_rad_per_step
+    slope = jnp.diagonal(angles.jacobian)
+    return jnp.stack([(ratio + half) * slope, (ratio - half) * slope], axis=1).ravel() * DEGREES
+
+
+@eqx.filter_jit
+def headlines(z: Float[Array, " parameters"], space: ParameterSpace, pose_rad: Float[Array, "2"]) -> Headlines:
+    """Headlines at one pose (DESIGN 3.2) with their derivatives."""
+
+    def values(z):
+        model = space.model(z)
+        angles = beam_angles(model.optics, pose_rad[0], pose_rad[1])
+        gears = model.transmission
+        effective = effective_deg_per_step(gears, angles)
+        contrast = gears.contrast_rad_per_step * jnp.diagonal(angles.jacobian) * DEGREES
+        lost = gears.backlash_rad * DEGREES
+        return jnp.concatenate([effective, contrast, lost, angles.effective_mirror_offset_mm[None]])
+
+    return Headlines(values(z), jax.jacfwd(values)(z))
+
+
+class Physical(eqx.Module):
+    """Values in the units of `NAMES` and d/d(coordinates)."""
+
+    value: Float[Array, " parameters"]
+    slope: Float[Array, "parameters parameters"]
+
+
+@eqx.filter_jit
+def _physical(z: Float[Array, " parameters"], space: ParameterSpace) -> Physical:
+    return Physical(space.physical(z), jax.jacfwd(space.physical)(z))
+
+
+def physical_at(z: np.ndarray, space: ParameterSpace) -> Physical:
+    """Values and slopes at a point, NumPy arrays."""
+    with jax.enable_x64(True):
+        return jax.tree.map(np.asarray, _physical(jnp.asarray(z), space))
+
+
+class Derived(eqx.Module):
+    """Headlines at one pose for one point of parameter space, in the units of DESIGN 8.
+
+    `effective_deg_per_step` is ordered left, right, up, down: gear ratio times the slope of the mirrors, the mean over
+    a period of the transmission error, without its local slope. `jacobian` is d(azimuth, elevation)/d(pan, tilt).
+    """
+
+    physical: Float[Array, " parameters"]
+    effective_deg_per_step: Float[Array, "4"]
+    jacobian: Float[Array, "2 2"]
+    effective_mirror_offset_mm: Scalar
+
+
+@eqx.filter_jit
+def derived_quantities(
+    z: Float[Array, "draws parameters"], space: ParameterSpace, reference_pose_rad: Float[Array, "2"]
+) -> Derived:
+    """Headlines of many points at once (DESIGN 3.2); every field has the leading axis `draws`."""
+
+    def one(z):
+        physical = space.physical(z)
+        model = space.model(z)
+        angles = beam_angles(model.optics, reference_pose_rad[0], reference_pose_rad[1])
+        effective = effective_deg_per_step(model.transmission, angles)
+        return Derived(physical, effective, angles.jacobian, angles.effective_mirror_offset_mm)
+
+    return jax.vmap(one)(z)

@@ -1,0 +1,225 @@
+"""The forward model: parameters -> transmission -> laser beam -> pixels of both cameras (DESIGN 3). Differentiable.
+
+A vector is an array whose first axis is x, y, z; any batch axes follow. Lengths in mm, angles in rad. All functions
+are written for JAX with few, wide operations: compile time grows with their number.
+
+Frame P: z along the pan axis, up; x along the nominal beam at pan angle 0; y left; origin where the nominal laser
+meets mirror 1. Frame Q is P turned by the pan angle. Pan positive = left, tilt positive = up; arrays over axes are
+ordered (pan, tilt). Frame S: origin in the left camera's centre, X depth, Y left, Z up; OpenCV's camera axes are
+x = -Y, y = -Z, z = X. Pinhole with Brown-Conrady distortion; the right camera sees x_right = R x_left + T. Image px
+with the integer at the centre of a pixel, ordered (u_left, v_left, u_right, v_right).
+
+Every parameter of DESIGN 8 has a coordinate z with prior N(0, 1): normal priors are value + u z, half-normals
+u Phi^-1((1 + Phi(z)) / 2) (DESIGN 4.1: no boundary, no mirrored mode), log-normals value exp(u z); the 24 stereo
+parameters are mean + root z with root root^T their full covariance. u = 0 fixes a parameter whatever its z, so that
+one compiled function serves every choice of fixed parameters. Units of physical values are those of the names.
+"""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from tvsbayes.model.geometry import Scalar, along_batch, intersect_plane, materialise, reflect, rotate_about_z
+
+UNIFORM_SD = 1 / 12**0.5
+"""Standard deviation of a uniform distribution of unit width."""
+ORDERS = np.array([1.0, 2.0])
+"""Turns of a harmonic of the transmission error per period."""
+
+
+class Harmonics(eqx.Module):
+    """Transmission error of both axes: h(a) = sum_o c_o cos(2 pi o a / P) + s_o sin(2 pi o a / P) (DESIGN 3.1).
+
+    Attributes:
+        amplitude_rad: indices axis, order, (c, s).
+        period_rad: P of each axis, angle of the output.
+        on_wheel: the wheel's error, a function of the output behind the play, instead of the pinion's, a function
+            of the input before it.
+    """
+
+    amplitude_rad: Float[Array, "2 2 2"]
+    period_rad: Float[Array, "2"]
+    on_wheel: Bool[Array, "2"]
+
+    def error_rad(self, angle_rad: Float[Array, "*moves 2"]) -> Float[Array, "*moves 2"]:
+        """The error at one angle per axis."""
+        phase = (2 * jnp.pi) * (angle_rad / self.period_rad)[..., None] * ORDERS
+        cosine, sine = self.amplitude_rad[..., 0], self.amplitude_rad[..., 1]
+        return jnp.sum(cosine * jnp.cos(phase) + sine * jnp.sin(phase), axis=-1)
+
+
+def no_harmonics() -> Harmonics:
+    """Perfect gears; a full turn stands for the period that nobody stated."""
+    return Harmonics(jnp.zeros((2, 2, 2)), jnp.full(2, 2 * jnp.pi), jnp.ones(2, dtype=bool))
+
+
+class Transmission(eqx.Module):
+    """Gears of both axes: mean ratio, left-minus-right (up-minus-down) contrast, play and transmission error."""
+
+    ratio_rad_per_step: Float[Array, "2"]
+    contrast_rad_per_step: Float[Array, "2"]
+    backlash_rad: Float[Array, "2"]
+    harmonics: Harmonics = eqx.field(default_factory=no_harmonics)
+
+    def directional_ratio(self, positive: Bool[Array, "2"]) -> Float[Array, "2"]:
+        """Ratio of left and up moves (`positive`) or right and down moves, rad per step."""
+        return self.ratio_rad_per_step + jnp.where(positive, 0.5, -0.5) * self.contrast_rad_per_step
+
+
+class MoveArrays(eqx.Module):
+    """Moves of a campaign, padded; `approach` is +1 left/up, -1 right/down, 0 unknown, read at `first` rows."""
+
+    steps: Float[Array, "moves 2"]
+    first: Bool[Array, " moves"]
+    approach: Float[Array, "moves 2"]
+
+
+class MirrorAngles(eqx.Module):
+    """Mirror angles after each move, without stop error and home offset.
+
+    Where the approach of a segment's first row is unknown the play may lie anywhere in its band: `angle_rad`
+    is then the middle of the possible angles and `play_sd_rad` the standard deviation of a uniform
+    distribution over them (zero as soon as a move has taken the play up).
+    """
+
+    angle_rad: Float[Array, "moves 2"]
+    play_sd_rad: Float[Array, "moves 2"]
+
+
+def mirror_angles(transmission: Transmission, tilt_zero_rad: Scalar, moves: MoveArrays) -> MirrorAngles:
+    """Follow the counters through gears, play and transmission error.
+
+    Over a band of unknown play the wheel's error is taken at the band's middle, as a shift of the whole band. At an
+    amplitude of 0.1 deg and a play of 0.5 deg its curvature, left out, is worth 1e-6 deg and its slope 0.4 % of the
+    deviation. The filter likewise adds home offsets behind the gears, as if the error had no slope.
+
+    Args:
+        transmission: gears of both axes.
+        tilt_zero_rad: tilt mirror angle at mid-play and counter zero.
+        moves: absolute counters in time order.
+
+    Returns:
+        Mirror angles (pan, tilt) after each move.
+    """
+    half = transmission.backlash_rad / 2
+    harmonics = transmission.harmonics
+
+    def turn(state, move):
+        previous_steps, q = state
+        steps, first = move
+        delta = steps - previous_steps
+        q_moved = q + transmission.directional_ratio(delta > 0) * delta
+        q_homed = transmission.ratio_rad_per_step * steps
+        q = jnp.where(first, q_homed, q_moved)
+        return (steps, q), q
+
+    def take_up(band, move):
+        low, high = band
+        q, first, approach = move
+        # Play is monotone in its state: the two ends of the band bound every history in between.
+        low = jnp.where(first, jnp.where(approach < 0, q + half, q - half), jnp.clip(low, q - half, q + half))
+        high = jnp.where(first, jnp.where(approach > 0, q - half, q + half), jnp.clip(high, q - half, q + half))
+        return (low, high), (0.5 * (low + high), UNIFORM_SD * (high - low))
+
+    zero = jnp.zeros(2)
+    _, q = jax.lax.scan(turn, (zero, zero), (moves.steps, moves.first))
+    # The errors know no history: outside the scans they cost one vector operation.
+    driven = q + jnp.where(harmonics.on_wheel, 0.0, harmonics.error_rad(q))
+    _, (output, play_sd_rad) = jax.lax.scan(take_up, (zero, zero), (driven, moves.first, moves.approach))
+    output += jnp.where(harmonics.on_wheel, harmonics.error_rad(output), 0.0)
+    return MirrorAngles(output + jnp.stack([jnp.zeros(()), tilt_zero_rad]), play_sd_rad)
+
+
+class Optics(eqx.Module):
+    """Laser and the two mirrors, with every deviation from the nominal 45-degree chain (DESIGN 3.2)."""
+
+    mirror_offset_mm: Scalar
+    mirror1_error_rad: Scalar
+    mirror2_error_rad: Scalar
+    laser_tilt_rad: Float[Array, "2"]
+    laser_offset_mm: Float[Array, "2"]
+    tilt_axis_skew_rad: Scalar
+    tilt_axis_offset_mm: Float[Array, "2"]
+
+
+class Beam(eqx.Module):
+    """Rays, in frame P unless said otherwise: they leave mirror 2 at `origin_mm` along the unit vectors `direction`."""
+
+    origin_mm: Float[Array, "3 *batch"]
+    direction: Float[Array, "3 *batch"]
+
+
+def beam(optics: Optics, pan_rad: Float[Array, "*batch"], tilt_rad: Float[Array, "*batch"]) -> Beam:
+    """Trace the laser over both mirrors (DESIGN 3.2; the signs are part of the contract).
+
+    Args:
+        optics: laser and mirrors.
+        pan_rad: angles psi of the pan stage.
+        tilt_rad: angles beta of the tilt stage.
+
+    Returns:
+        The rays in frame P.
+    """
+    zero, one = jnp.zeros(()), jnp.ones(())
+    tangents = jnp.tan(optics.laser_tilt_rad)
+    laser = jnp.concatenate([tangents, -one[None]]) / jnp.sqrt(1 + jnp.dot(tangents, tangents))
+    laser_origin = jnp.concatenate([optics.laser_offset_mm, zero[None]])
+    # The laser stands still in P; in the pan stage's frame Q it turns backwards.
+    laser, laser_origin = materialise(
+        (
+            rotate_about_z(-pan_rad, along_batch(laser, pan_rad)),
+            rotate_about_z(-pan_rad, along_batch(laser_origin, pan_rad)),
+        )
+    )
+
+    mirror1 = jnp.pi / 4 + optics.mirror1_error_rad
+    normal1 = along_batch(jnp.stack([zero, -jnp.sin(mirror1), jnp.cos(mirror1)]), pan_rad)
+    hit1 = intersect_plane(laser_origin, laser, jnp.zeros_like(normal1), normal1)
+    between = reflect(laser, normal1)
+    hit1, between = materialise((hit1, between))
+
+    ax, az = optics.tilt_axis_offset_mm
+    centre = along_batch(jnp.stack([ax, -optics.mirror_offset_mm, az]), pan_rad)
+    sin_skew, cos_skew = jnp.sin(optics.tilt_axis_skew_rad), jnp.cos(optics.tilt_axis_skew_rad)
+    mirror2 = jnp.pi / 4 + optics.mirror2_error_rad
+    ahead = jnp.sin(mirror2) * jnp.array([1.0, 0.0, 0.0])
+    above = jnp.sin(mirror2) * jnp.stack([zero, -sin_skew, cos_skew])
+    axial = jnp.cos(mirror2) * jnp.stack([zero, cos_skew, sin_skew])
+    ahead, above, axial = (along_batch(v, pan_rad) for v in (ahead, above, axial))
+    normal2 = materialise(jnp.cos(tilt_rad) * ahead + jnp.sin(tilt_rad) * above + axial)
+    hit2 = materialise(intersect_plane(hit1, between, centre, normal2))
+    outgoing = materialise(reflect(between, normal2))
+    return Beam(*materialise((rotate_about_z(pan_rad, hit2), rotate_about_z(pan_rad, outgoing))))
+
+
+class BeamAngles(eqx.Module):
+    """Azimuth atan2(d_y, d_x) and elevation asin(d_z) of the beam in frame P with their Jacobian.
+
+    `jacobian[i, j]` is d(azimuth, elevation)_i / d(pan, tilt)_j. `effective_mirror_offset_mm` is the signed
+    distance of the beam line from the pan axis: the horizontal moment d_y o_x - d_x o_y over |d_xy|, +L for
+    the nominal chain.
+    """
+
+    azimuth_rad: Scalar
+    elevation_rad: Scalar
+    jacobian: Float[Array, "2 2"]
+    effective_mirror_offset_mm: Scalar
+
+
+def beam_angles(optics: Optics, pan_rad: Scalar, tilt_rad: Scalar) -> BeamAngles:
+    """Direction of the beam and its local slope against the mirror angles at one pose (DESIGN 3.2)."""
+
+    def azimuth_elevation(angles):
+        d = beam(optics, angles[0], angles[1]).direction
+        return jnp.stack([jnp.arctan2(d[1], d[0]), jnp.arctan2(d[2], jnp.hypot(d[0], d[1]))])
+
+    pose = jnp.stack([pan_rad, tilt_rad])
+    azimuth, elevation = azimuth_elevation(pose)
+    ray = beam(optics, pan_rad, tilt_rad)
+    o, d = ray.origin_mm, ray.direction
+    offset = (d[1] * o[0] - d[0] * o[1]) / jnp.hypot(d[0], d[1])
+    return BeamAngles(azimuth, elevation, jax.jacfwd(azimuth_elevation)(pose), offset)

@@ -1,0 +1,301 @@
+"""What a plan will tell before it is run."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from tvsbayes.errors import InputError
+from tvsbayes.estimators.campaign_arrays import CampaignArrays, SpotArrays
+from tvsbayes.estimators.joint_fit import JointFit
+from tvsbayes.estimators.linear_spots import linearise
+from tvsbayes.instrument.axes import APPROACH_SIGN, HOME_SD_DEG
+from tvsbayes.instrument.campaign import Move, Spot
+from tvsbayes.instrument.parameters import NAMES, NOISE_NAMES
+from tvsbayes.instrument.plan import HOME_APPROACH, PlanLog, PlanStep, plan_seconds, run_plan
+from tvsbayes.instrument.rig import Rig
+from tvsbayes.instrument.stops import redraws
+from tvsbayes.model.geometry import along_batch, materialise, project, rotation_matrix, transform
+from tvsbayes.model.laser_path import MoveArrays, beam, mirror_angles
+from tvsbayes.model.parameter_space import ParameterSpace, parameter_space
+
+LOOKS_PER_EXPERIMENT = 4
+"""The paper counts four spots as one experiment; so do all curves here, whatever the looks are."""
+PARAMETERS = len(NAMES)
+HOME_VARIANCE_RAD2 = math.radians(HOME_SD_DEG) ** 2
+SMALLEST_DESIGN = 128
+"""Looks are padded to this size or a power of four above it; moves to twice that."""
+
+
+def padded_size(count: int) -> int:
+    """Padded number of looks."""
+    size = SMALLEST_DESIGN
+    while size < count:
+        size *= 4
+    return size
+
+
+@dataclass(frozen=True)
+class Knowledge:
+    """What is known of an instrument when a plan is judged.
+
+    Attributes:
+        rig: limits, sheets, costs; its table and stereo calibration are those of the data where there are any.
+        space: priors as arrays.
+        z: most probable coordinates, shape (p,).
+        precision: their inverse covariance, shape (p, p).
+        after_data: there is a campaign already: a new session begins with an unknown home offset.
+    """
+
+    rig: Rig
+    space: ParameterSpace
+    z: np.ndarray
+    precision: np.ndarray
+    after_data: bool = False
+
+    @cached_property
+    def covariance(self) -> np.ndarray:
+        """Shape (p, p)."""
+        return np.linalg.inv(self.precision)
+
+    @property
+    def sheets(self) -> tuple[str, ...]:
+        """Names of the sheets, nearest first."""
+        return tuple(sorted(self.rig.sheets_mm, key=self.rig.sheets_mm.get))
+
+
+def prior_knowledge(rig: Rig) -> Knowledge:
+    """Before any data: the priors of the rig file."""
+    return Knowledge(rig, parameter_space(rig.table, rig.stereo), np.zeros(PARAMETERS), np.eye(PARAMETERS))
+
+
+def knowledge_of(result: JointFit, rig: Rig) -> Knowledge:
+    """After a fit: its mode and Laplace covariance; sheets, limits and costs of the rig file."""
+    of_data = replace(rig, table=result.campaign.rig, stereo=result.campaign.stereo)
+    return Knowledge(of_data, result.space, result.z, np.linalg.inv(result.covariance), True)
+
+
+class Expectation(eqx.Module):
+    """The looks of a plan as the model expects them at one point of parameter space; first axis: looks.
+
+    `rows` = d(standardised innovations)/d(coordinates, common offset of pan, of tilt in rad): over all looks
+    rows^T rows is the Fisher information. The other arrays are those of `likelihood.LinearSpots`. A look that misses
+    its sheet or an image is not `seen` and its rows are zero.
+    """
+
+    rows: Float[Array, "looks 4 columns"]
+    jacobian: Float[Array, "looks 4 parameters"]
+    slope: Float[Array, "looks 4 2"]
+    load: Float[Array, "looks 4 6"]
+    keep: Float[Array, "looks 6"]
+    variance: Float[Array, "looks 6"]
+    seen: Bool[Array, " looks"]
+    mirror_angles_rad: Float[Array, "looks 2"]
+
+
+NOISE_COLUMNS = np.isin(NAMES, NOISE_NAMES)
+
+
+@eqx.filter_jit
+def expect(
+    z: Float[Array, " parameters"],
+    space: ParameterSpace,
+    arrays: CampaignArrays,
+    depth_mm: Float[Array, " looks"],
+    image_px: Float[Array, "4"],
+) -> Expectation:
+    """Expected looks on sheets at given depths X, linearised and whitened by the filter in time order.
+
+    Args:
+        z: coordinates.
+        space: priors.
+        arrays: moves and looks; pixels and points are not read.
+        depth_mm: X of each look's sheet in frame S.
+        image_px: largest (u, v, u, v) inside the images.
+
+    Returns:
+        Expectation of every look, padding included.
+    """
+    model = space.model(z)
+    spots = arrays.spots
+    pan, tilt = mirror_angles(model.transmission, model.tilt_zero_rad, arrays.moves).angle_rad[spots.move_index].T
+    ray = beam(model.optics, pan, tilt)
+    turn = rotation_matrix(model.extrinsics.rotation_rad)
+    origin = materialise(transform(turn, ray.origin_mm) + along_batch(model.extrinsics.translation_mm, pan))
+    direction = materialise(transform(turn, ray.direction))
+    reach = (depth_mm - origin[0]) / direction[0]
+    points = materialise(origin + jnp.where(jnp.isfinite(reach), reach, 0.0) * direction)
+    pixels = project(model.cameras, points)
+    inside = jnp.all((pixels >= 0) & (pixels <= image_px[:, None]), axis=0)
+    seen = (reach > 0) & inside & (spots.valid > 0)
+    harmless = jnp.array([500.0, 0.0, 0.0])[:, None]
+    arrays = eqx.tree_at(
+        lambda a: (a.spots.valid, a.spots.triangulated_mm),
+        arrays,
+        (jnp.where(seen, 1.0, 0.0), jnp.where(seen, points, harmless).T),
+    )
+    spots = arrays.spots
+    lin = linearise(z, space, arrays)
+    jacobian = jnp.where(NOISE_COLUMNS, 0.0, -lin.residual_jacobian)
+    count = pan.size
+    home = jnp.where(spots.homed, HOME_VARIANCE_RAD2, 0.0)[:, None] * jnp.ones(2)
+    segment = jnp.broadcast_to(spots.new_segment[:, None], (count, 2))
+    load = jnp.concatenate([lin.slope, lin.slope, lin.slope * lin.play_sd_rad[:, None, :]], axis=2)
+    keep = jnp.where(jnp.concatenate([spots.redraw, segment, segment], axis=1), 0.0, 1.0)
+    variance = jnp.concatenate([lin.stop_variance, home, jnp.ones((count, 2))], axis=1)
+
+    def step(carry, row):
+        mean, covariance = carry
+        look, load, keep, variance = row
+        mean = mean * keep[:, None]
+        covariance = covariance * (keep[:, None] * keep) + jnp.diag(variance * (1 - keep))
+        whitened = []
+        for component in range(4):
+            gain = jnp.sum(covariance * load[component], axis=1)
+            ahead = 1 + jnp.sum(load[component] * gain)
+            error = look[component] - jnp.sum(load[component][:, None] * mean, axis=0)
+            mean = mean + gain[:, None] * (error / ahead)
+            covariance = covariance - gain[:, None] * (gain / ahead)
+            whitened.append(error / jnp.sqrt(ahead))
+        return (mean, covariance), jnp.stack(whitened)
+
+    columns = jnp.concatenate([jacobian, lin.slope], axis=2)
+    nothing = (jnp.zeros((6, columns.shape[2])), jnp.zeros((6, 6)))
+    _, rows = jax.lax.scan(step, nothing, (columns, load, keep, variance))
+    rows = jnp.where(seen[:, None, None], rows, 0.0)
+    return Expectation(rows, jacobian, lin.slope, load, keep, variance, seen, lin.mirror_angles_rad)
+
+
+def design_arrays(
+    moves: Sequence[Move], look_moves: Sequence[int], rig: Rig, *, homed_from: int, aperture: bool
+) -> CampaignArrays:
+    """Moves and looks without pixels; segments from `homed_from` on have an unknown home offset."""
+    # Half the moves rounded up: there are twice as many places for them as for looks.
+    size, count = padded_size(max(len(look_moves), (len(moves) + 1) // 2)), len(look_moves)
+
+    def padded(rows, shape, fill, dtype=float, length=size):
+        array = np.full((length, *shape), fill, dtype=dtype)
+        array[: len(rows)] = rows
+        return jnp.asarray(array)
+
+    spots = [_unseen(number, move) for number, move in enumerate(look_moves)]
+    new = redraws(tuple(replace(m, segment=0) for m in moves), spots)
+    homed = new.new_segment & (np.array([moves[m].segment for m in look_moves]) >= homed_from)
+    steps = [(m.pan_steps, m.tilt_steps) for m in moves]
+    sides = [(APPROACH_SIGN.get(m.pan_approach, 0), APPROACH_SIGN.get(m.tilt_approach, 0)) for m in moves]
+    long = 2 * size
+    return CampaignArrays(
+        MoveArrays(
+            padded(steps, (2,), steps[-1], length=long),
+            padded([bool(m.pan_approach) for m in moves], (), False, bool, long),
+            padded(sides, (2,), 0.0, length=long),
+        ),
+        SpotArrays(
+            move_index=padded(look_moves, (), look_moves[-1], np.int32),
+            pixels=jnp.zeros((size, 4)),
+            whitening=jnp.asarray(np.tile(np.eye(4) / float(rig.cameras["spot_sd_px"]), (size, 1, 1))),
+            aperture_rad=jnp.zeros(size),
+            has_aperture=padded([float(aperture)] * count, (), 0.0),
+            triangulated_mm=jnp.zeros((size, 3)),
+            valid=padded([1.0] * count, (), 0.0),
+            weight=jnp.ones(size),
+            redraw=padded(new.redraw, (2,), False, bool),
+            redraw_mix=padded(new.redraw_mix, (2, 2), 0.0),
+            new_segment=padded(new.new_segment, (), False, bool),
+            homed=padded(homed, (), False, bool),
+        ),
+        jnp.asarray(rig.table.aperture_convention == "azimuth"),
+    )
+
+
+def _unseen(number: int, move: int) -> Spot:
+    return Spot(number, move, "", None, None, *(None,) * 8)
+
+
+def expected_information(
+    arrays: CampaignArrays, depth_mm: np.ndarray, rig: Rig, z: np.ndarray, space: ParameterSpace
+) -> Expectation:
+    """`expect` without padding, as NumPy arrays."""
+    count = len(depth_mm)
+    last = np.tile([rig.stereo.image_width - 1.0, rig.stereo.image_height - 1.0], 2)
+    padded = np.full(arrays.spots.valid.shape, depth_mm[-1])
+    padded[:count] = depth_mm
+    found = expect(jnp.asarray(z), space, arrays, jnp.asarray(padded), jnp.asarray(last))
+    return jax.tree.map(lambda x: np.asarray(x)[:count], found)
+
+
+@dataclass(frozen=True)
+class PlanInformation:
+    """What a plan will tell.
+
+    Attributes:
+        fisher: J^T C^-1 J of all its looks, shape (p, p), without that of priors or earlier data.
+        expectation: of its looks, shape (looks, ...).
+        moves: its moves.
+        look_moves: move of each look.
+        minutes: duration by the rig's costs.
+        pose_rad: mean mirror angles (pan, tilt) over the looks seen, at which the headlines hold, shape (2,).
+    """
+
+    fisher: np.ndarray
+    expectation: Expectation
+    moves: tuple[Move, ...]
+    look_moves: tuple[int, ...]
+    minutes: float
+    pose_rad: np.ndarray
+
+
+def plan_minutes(steps: Sequence[PlanStep], rig: Rig) -> float:
+    """Duration of a plan by `[costs]`, minutes."""
+    return plan_seconds(rig, steps) / 60
+
+
+def _logged(steps: Sequence[PlanStep], rig: Rig) -> PlanLog:
+    log = run_plan(steps, rig, HOME_APPROACH)
+    if not log.looks:
+        remedy = "add `look` steps to the plan"
+        raise InputError("no-look", "the plan looks at nothing", file="plan.csv", column="action", remedy=remedy)
+    return log
+
+
+def information_of(
+    steps: Sequence[PlanStep],
+    knowledge: Knowledge,
+    *,
+    aperture: bool = False,
+    z: np.ndarray | None = None,
+    space: ParameterSpace | None = None,
+) -> PlanInformation:
+    """Expected Fisher information of a plan, move by move as in a fit.
+
+    Args:
+        steps: the plan; every target is a sheet of the rig.
+        knowledge: where the instrument is believed to be.
+        aperture: looks also read the aperture.
+        z: another point to look from (a drawn truth), shape (p,).
+        space: its priors, where they differ.
+
+    Raises:
+        InputError: a plan that looks at nothing or places an unknown sheet.
+    """
+    rig = knowledge.rig
+    log = _logged(steps, rig)
+    look_moves = tuple(look.move for look in log.looks)
+    depth = np.array([rig.sheets_mm[log.targets[look.placement]] for look in log.looks])
+    with jax.enable_x64(True):
+        arrays = design_arrays(
+            log.moves, look_moves, rig, homed_from=0 if knowledge.after_data else 1, aperture=aperture
+        )
+        found = expected_information(arrays, depth, rig, knowledge.z if z is None else z, space or knowledge.space)
+    rows = found.rows[..., :PARAMETERS].reshape(-1, PARAMETERS)
+    seen = found.seen if found.seen.any() else np.ones(len(depth), dtype=bool)
+    pose = found.mirror_angles_rad[seen].mean(axis=0)
+    return PlanInformation(rows.T @ rows, found, tuple(log.moves), look_moves, plan_minutes(steps, rig), pose)

@@ -1,0 +1,358 @@
+"""How many looks, which ones, and when to stop; what a plan cannot separate (DESIGN 6 and 8).
+
+`plan` searches the cheapest plan that meets a target (`tvsbayes.design`) and says with which probability it will, over
+draws of the instrument; `check_plan` says in words what a plan leaves together. Units are those of DESIGN 8, minutes
+by the rig's `[costs]`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from tvsbayes.errors import InputError, NotConverged
+from tvsbayes.estimators.joint_fit import JointFit
+from tvsbayes.estimators.linear_spots import LinearSpots, stop_information
+from tvsbayes.instrument.campaign import Campaign
+from tvsbayes.instrument.plan import PlanStep, grid_protocol, mixed_protocol, paper_protocol, step_json
+from tvsbayes.instrument.rig import Rig
+from tvsbayes.planning.candidates import LookArrays, Looks, candidates, covariance_of, information_of_looks
+from tvsbayes.planning.expectation import (
+    Expectation,
+    Knowledge,
+    information_of,
+    knowledge_of,
+    plan_minutes,
+    prior_knowledge,
+)
+from tvsbayes.planning.forecast import (
+    Assurance,
+    ClassicAnswer,
+    ClassicForecast,
+    classic_answer,
+    classic_forecast,
+    value_of_classic,
+)
+from tvsbayes.planning.limits import Advice, Batch, Limit, limit_of, next_experiments, split_of, stop_now
+from tvsbayes.planning.search import LADDER, design_family, refine, smallest_design
+from tvsbayes.planning.target import Target, sensitivity
+from tvsbayes.statistics.intervals import ASSURED, share_error
+
+
+@dataclass(frozen=True)
+class CurvePoint:
+    """What up to n experiments give: medians over draws of the instrument, in the target's unit.
+
+    `classic` is None where the four-point method does not estimate the quantity or n is too small for it.
+    """
+
+    experiments: int
+    minutes: float
+    classic: float | None
+    joint: float
+    assurance: float
+    assurance_se: float
+
+
+@dataclass(frozen=True)
+class Baseline:
+    """A known protocol, or the planned one, judged by the same yardstick at the most probable instrument."""
+
+    name: str
+    spots: int
+    seen: int
+    minutes: float
+    joint: float
+
+
+@dataclass(frozen=True)
+class PlanResult:
+    """How many, which ones, and when to stop.
+
+    Attributes:
+        target: what is wanted.
+        steps: the recommended plan; empty where there is nothing left to do.
+        experiments, looks, minutes: its size.
+        expected: the target's value after it at the most probable instrument; `now`: before it.
+        assurance, assurance_se: probability that its fit reports the target as met, and Monte Carlo error; None where
+            there is nothing left to do.
+        curve: by number of experiments.
+        n80, n95: experiments for which the assurance is 80 % and 95 %, None if none.
+        limit: what no number of looks removes.
+        shares: what the variance of the target consists of after the plan.
+        baselines: other protocols beside it.
+        next: possible next experiments, best first.
+        stop: the stopping rule applied now.
+        classic: the four-point method's own answer, None for quantities that it does not estimate.
+        met: the target is met already, or the plan meets it with an assurance of 80 %.
+        notes: what was left out and why.
+        draws, seed, criterion: of the computation.
+    """
+
+    target: Target
+    steps: tuple[PlanStep, ...]
+    experiments: int
+    looks: int
+    minutes: float
+    now: float
+    expected: float
+    assurance: float | None
+    assurance_se: float | None
+    curve: tuple[CurvePoint, ...]
+    n80: int | None
+    n95: int | None
+    limit: Limit
+    shares: dict[str, float]
+    baselines: tuple[Baseline, ...]
+    next: tuple[Batch, ...]
+    stop: Advice
+    classic: ClassicAnswer | None
+    met: bool
+    notes: tuple[str, ...]
+    draws: int
+    seed: int
+    criterion: str
+
+    def as_json(self) -> dict[str, object]:
+        """The document of `plan --json` (DESIGN 8)."""
+
+        def plain(value: object) -> object:
+            if isinstance(value, float):
+                return value if math.isfinite(value) else None
+            if isinstance(value, PlanStep):
+                return step_json(value)
+            if isinstance(value, Target):
+                return value.as_json()
+            if isinstance(value, tuple | list):
+                return [plain(v) for v in value]
+            if isinstance(value, dict):
+                return {k: plain(v) for k, v in value.items()}
+            return plain(vars(value)) if hasattr(value, "__dataclass_fields__") else value
+
+        document = {key: plain(value) for key, value in vars(self).items() if key not in ("steps", "limit", "shares")}
+        document["limited_by"] = plain(self.limit)
+        document["variance_shares"] = plain(self.shares)
+        return document
+
+
+PLAN_DRAWS = 200
+STOPS_ADVISED = 6
+"""Stops of a direction below which its stop sd is known no better than to 30 % (1 / sqrt(2 n)): Laplace intervals of
+that axis are then too short, and the sampler may not converge."""
+
+
+def _baselines(knowledge: Knowledge, target: Target, aperture: bool, pose_rad: np.ndarray | None) -> list[Baseline]:
+    """The paper's protocol, its mixture of step counts and starts, and the grid, on this rig's sheets."""
+    sheets = knowledge.sheets
+    plans: dict[str, tuple[PlanStep, ...]] = {}
+    if len(sheets) > 1:
+        plans["paper"] = paper_protocol(targets=sheets[:2])
+        plans["mixed"] = mixed_protocol(targets=sheets[:2])
+    plans["grid"] = grid_protocol(targets=sheets[:3])
+    return [judged(name, steps, knowledge, target, aperture, pose_rad) for name, steps in plans.items()]
+
+
+def judged(
+    name: str,
+    steps: Sequence[PlanStep],
+    knowledge: Knowledge,
+    target: Target,
+    aperture: bool,
+    pose_rad: np.ndarray | None = None,
+) -> Baseline:
+    """One plan at the most probable instrument; ratios hold at `pose_rad`, by default the plan's own, as in a fit."""
+    found = information_of(steps, knowledge, aperture=aperture)
+    pose = found.pose_rad if pose_rad is None else pose_rad
+    at = sensitivity(target, knowledge.z, knowledge.space, knowledge.rig.table, pose)
+    value = at.value(covariance_of(knowledge.precision + found.fisher), target.factor)
+    seen = int(found.expectation.seen.sum())
+    return Baseline(name, len(found.look_moves), seen, found.minutes, value)
+
+
+def plan(
+    rig: Rig,
+    target: Target,
+    *,
+    given: JointFit | None = None,
+    minutes: float | None = None,
+    criterion: str = "c",
+    aperture: bool = False,
+    draws: int = PLAN_DRAWS,
+    largest: int = LADDER[-1],
+    seed: int = 0,
+) -> PlanResult:
+    """Find the cheapest plan that meets a target, and say what it will give, or why none can (DESIGN 6).
+
+    Args:
+        rig: sheets, limits, costs; its priors where there is no campaign.
+        target: what is wanted.
+        given: a fit of what was measured already.
+        minutes: the plan must not take longer.
+        criterion: what the search lowers: "c" the target, "D" or "A" ratios and backlashes together.
+        aperture: looks also read the aperture.
+        draws: instruments over which the assurance is taken.
+        largest: experiments (of four looks) beyond which no plan is sought.
+        seed: of the draws.
+
+    Returns:
+        The plan, its curve and the advice.
+
+    Raises:
+        InputError: no sheet to look at, nothing in view, a point out of reach, too few minutes for one experiment.
+        NotConverged: `given` did not converge.
+    """
+    if given is not None and not given.converged:
+        raise NotConverged("not-converged", "NOT CONVERGED: " + "; ".join(given.problems), remedy="see `tvsbayes fit`")
+    knowledge = prior_knowledge(rig) if given is None else knowledge_of(given, rig)
+    options = {"criterion": criterion, "aperture": aperture, "largest": largest, "minutes": minutes}
+    campaign, pose = (None, None) if given is None else (given.campaign, given.reference_pose_rad)
+    return plan_from(knowledge, target, campaign, pose, draws=draws, seed=seed, **options)
+
+
+def _curve(
+    assurance: Assurance, forecast: ClassicForecast | None, durations: Mapping[int, float], sizes: Sequence[int]
+) -> tuple[CurvePoint, ...]:
+    """What up to n experiments give, for each size.
+
+    Noise scales estimated from few stops make single draws jump; a row states the best of all sizes up to its own,
+    so that more experiments never look worse. A best of estimates leans towards the hopeful side.
+    """
+    target, draws = assurance.target, len(assurance.truths)
+    rows, best, surest = [], math.inf, 0.0
+    for n in sorted(set(sizes)):
+        reported = assurance.values([n])[n]
+        best = min(best, float(np.median(reported)))
+        surest = max(surest, float(np.mean(reported <= target.limit)))
+        classic_value = value_of_classic(forecast, target, n)
+        rows.append(CurvePoint(n, durations[n], classic_value, best, surest, share_error(surest, draws)))
+    return tuple(rows)
+
+
+def few_stops(looks: Looks) -> list[str]:
+    """Directions that a design reaches so rarely that a fit can say little about them, as notes."""
+    notes = []
+    for axis, sides in ((0, ("left", "right")), (1, ("up", "down"))):
+        for side, direction in zip((1, -1), sides, strict=True):
+            stops = int(np.sum(looks.side[:, axis] == side))
+            if stops < STOPS_ADVISED:
+                reached = f"{stops} stop{'s' * (stops != 1)} {direction}"
+                notes.append(
+                    f"only {reached}: this plan is for its target alone; for reliable intervals of {direction} plan "
+                    "u(worst), which asks for every direction"
+                )
+    return notes
+
+
+def plan_from(
+    knowledge: Knowledge,
+    target: Target,
+    campaign: Campaign | None = None,
+    pose_rad: np.ndarray | None = None,
+    *,
+    criterion: str,
+    aperture: bool,
+    largest: int,
+    minutes: float | None,
+    draws: int,
+    seed: int,
+) -> PlanResult:
+    """`plan` from what is known; effective ratios hold at `pose_rad`, by default in the middle of the candidates."""
+    rig, after_data = knowledge.rig, knowledge.after_data
+    found = candidates(knowledge)
+    seen = LookArrays(found.looks, knowledge, aperture).at(knowledge.z, knowledge.space)
+    pose = seen.mirror_angles_rad.mean(axis=0) if pose_rad is None else pose_rad
+    at_centre = sensitivity(target, knowledge.z, knowledge.space, knowledge.rig.table, pose)
+    now = at_centre.value(knowledge.covariance, target.factor)
+    if now == 0:
+        raise InputError(
+            "target",
+            f"{target.quantity} is held fixed by the rig (u = 0): its uncertainty is 0 whatever is measured",
+            column="--target",
+            found=target.text,
+            allowed="a quantity that is to be estimated",
+            remedy="state u > 0 for it in [rig.prior], or another target",
+        )
+    options = {"criterion": criterion, "aperture": aperture, "largest": largest, "minutes": minutes}
+    family = design_family(knowledge, found, seen, target, at_centre, **options)
+    durations = {n: plan_minutes(family.arranged(n).steps, rig) for n in range(1, largest + 1)}
+    allowed = [n for n in durations if minutes is None or durations[n] <= minutes]
+    if not allowed:
+        raise InputError(
+            "minutes",
+            f"one experiment of four looks takes {durations[1]:.1f} minutes",
+            column="--minutes",
+            allowed=f"at least {durations[1]:.1f}",
+            remedy="allow more minutes, or lower [costs] if the machine is faster",
+        )
+    sizes = sorted({n for n in LADDER if n <= allowed[-1]} | {allowed[-1]})
+    assurance = Assurance(family, target, draws, seed)
+
+    def met_share(n: int) -> float:
+        return float(np.mean(assurance.values([n])[n] <= target.limit))
+
+    assurance.values(sizes)
+    n80, n95 = (smallest_design(lambda n, level=level: met_share(n) >= level, sizes) for level in ASSURED)
+    experiments = n95 or n80 or allowed[-1]
+    forecast = classic_forecast(knowledge, assurance.truths)
+    curve = _curve(assurance, forecast, durations, [*sizes, *(n for n in (n80, n95) if n)])
+    refined = refine(family, seen, target, at_centre, experiments, criterion, minutes, assurance)
+    final = refined.family
+    design = final.arranged(experiments)
+    exact = information_of(design.steps, knowledge, aperture=aperture)
+    chosen = judged("planned", design.steps, knowledge, target, aperture, pose_rad)
+    share = float(np.mean(refined.reported <= target.limit))
+    largest_design = family.arranged(family.largest)
+    largest_information = information_of_looks(
+        seen, family.picks, largest_design.path, knowledge.space, knowledge.after_data
+    )
+    limit = limit_of(knowledge, largest_information, at_centre, target)
+    noise = _pixel_part(exact.expectation)
+    batches = next_experiments(knowledge, found, seen, target, at_centre, now)
+    stop = stop_now(now, target, limit, batches, after_data)
+    done = after_data and now <= target.limit
+    return PlanResult(
+        target=target,
+        steps=() if done else design.steps,
+        experiments=0 if done else experiments,
+        looks=0 if done else len(final.picks),
+        minutes=0.0 if done else exact.minutes,
+        now=now,
+        expected=now if done else chosen.joint,
+        assurance=None if done else share,
+        assurance_se=None if done else share_error(share, draws),
+        curve=curve,
+        n80=n80,
+        n95=n95,
+        limit=limit,
+        shares=split_of(knowledge, exact.fisher, noise, at_centre),
+        baselines=(chosen, *_baselines(knowledge, target, aperture, pose_rad)),
+        next=batches,
+        stop=stop,
+        classic=classic_answer(target, forecast, campaign),
+        met=done or share >= ASSURED[0],
+        notes=(*found.notes, *([] if done else few_stops(final.looks(experiments)))),
+        draws=draws,
+        seed=seed,
+        criterion=criterion,
+    )
+
+
+def _linear_spots(found: Expectation) -> LinearSpots:
+    """Expected looks as the smoother takes them."""
+    return LinearSpots(
+        residual=np.zeros(found.jacobian.shape[:2]),
+        load=found.load,
+        renewed=found.keep == 0,
+        variance=found.variance,
+        jacobian=found.jacobian,
+    )
+
+
+def _pixel_part(found: Expectation) -> np.ndarray:
+    """What pixel noise alone contributes to the information, (C^-1 J)^T (C^-1 J), shape (p, p)."""
+    groups = stop_information(_linear_spots(found)).groups
+    gain = np.concatenate([group.jacobian for group in groups])
+    return gain.T @ gain

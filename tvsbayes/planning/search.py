@@ -1,0 +1,248 @@
+"""The smallest plan that is enough: greedy search over families of sheets."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from tvsbayes.model.headlines import QUANTITIES, headlines
+from tvsbayes.planning.candidates import CONTRAST_COLUMNS, Candidates, Seen, covariance_of, information_of_looks
+from tvsbayes.planning.expectation import HOME_VARIANCE_RAD2, LOOKS_PER_EXPERIMENT, PARAMETERS, Knowledge, plan_minutes
+from tvsbayes.planning.forecast import Assurance, Family
+from tvsbayes.planning.target import Sensitivity, Target
+
+CRITERIA = ("c", "D", "A")
+MEAN_WEIGHT = 0.05
+"""Of the mean variance beside the worst: looks that help only the others still count a little."""
+
+
+def scores(variances: np.ndarray, reference: np.ndarray, criterion: str) -> np.ndarray:
+    """What a search lowers, from covariances (..., q, q) of the quantities; shape (...).
+
+    "c": the worst variance and `MEAN_WEIGHT` of the mean; "D": log-determinant; "A": mean variance in units of
+    `reference` (q,).
+    """
+    if criterion == "D":
+        return np.linalg.slogdet(variances / np.sqrt(np.outer(reference, reference)))[1]
+    diagonal = np.diagonal(variances, axis1=-2, axis2=-1)
+    if criterion == "A":
+        return np.mean(diagonal / reference, axis=-1)
+    return diagonal.max(axis=-1) + MEAN_WEIGHT * diagonal.mean(axis=-1)
+
+
+@dataclass
+class Search:
+    """Greedy choice and exchange of looks by low-rank updates of one covariance.
+
+    Attributes:
+        rows: of all candidates, shape (m, 4, P); a candidate that is not to be chosen has zero rows.
+        precision: before any look, shape (P, P).
+        gradient: d(quantity)/d(column), shape (q, P).
+        own: variance beside it, shape (q,).
+        criterion: see `scores`.
+
+    A quantity that the priors hold fixed has no variance to lower and is left out.
+    """
+
+    rows: np.ndarray
+    precision: np.ndarray
+    gradient: np.ndarray
+    own: np.ndarray
+    criterion: str = "c"
+
+    def __post_init__(self) -> None:
+        self.covariance = covariance_of(self.precision)
+        uncertain = np.diag(self._quantities(self.covariance)) > 0
+        self.gradient, self.own = self.gradient[uncertain], self.own[uncertain]
+        self.reference = np.diag(self._quantities(self.covariance)).copy()
+
+    def _quantities(self, covariance: np.ndarray) -> np.ndarray:
+        return self.gradient @ covariance @ self.gradient.T + np.diag(self.own)
+
+    def after_one_more(self, covariance: np.ndarray) -> np.ndarray:
+        """Score of every candidate if it were added, shape (m,): C - B^T K^-1 B, one 4 x 4 solve each."""
+        count, _, columns = self.rows.shape
+        spread = (self.rows.reshape(-1, columns) @ covariance).reshape(count, 4, columns)
+        inner = spread @ self.rows.transpose(0, 2, 1) + np.eye(4)
+        moved = spread @ self.gradient.T
+        gain = np.swapaxes(moved, 1, 2) @ np.linalg.solve(inner, moved)
+        return scores(self._quantities(covariance) - gain, self.reference, self.criterion)
+
+    def _with(self, covariance: np.ndarray, look: int) -> np.ndarray:
+        """Covariance with one look more."""
+        row = self.rows[look]
+        spread = row @ covariance
+        updated = covariance - spread.T @ np.linalg.solve(np.eye(4) + spread @ row.T, spread)
+        return 0.5 * (updated + updated.T)
+
+    def greedy(self, count: int) -> list[int]:
+        """The best look, then the best beside it, and so on."""
+        covariance, picks = self.covariance, []
+        for _ in range(count):
+            picks.append(int(np.argmin(self.after_one_more(covariance))))
+            covariance = self._with(covariance, picks[-1])
+        return picks
+
+    def value(self, picks: Sequence[int]) -> float:
+        """Score of a design."""
+        rows = self.rows[list(picks)].reshape(-1, self.rows.shape[2])
+        covariance = covariance_of(self.precision + rows.T @ rows)
+        return float(scores(self._quantities(covariance), self.reference, self.criterion))
+
+    def exchange(self, picks: Sequence[int], passes: int = 2, worth: float = 1e-3) -> list[int]:
+        """Replace looks one by one while that lowers the score by more than `worth` of it (Fedorov's exchange)."""
+        picks = list(picks)
+        for _ in range(passes):
+            changed = False
+            for place, look in enumerate(picks):
+                rows = self.rows[picks[:place] + picks[place + 1 :]].reshape(-1, self.rows.shape[2])
+                without = covariance_of(self.precision + rows.T @ rows)
+                found = self.after_one_more(without)
+                best = int(np.argmin(found))
+                if found[look] - found[best] > worth * abs(found[look]):
+                    picks[place], changed = best, True
+            if not changed:
+                break
+        return picks
+
+
+LADDER = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96)
+"""Experiments at which the curve is drawn; 96 is the paper's."""
+KNOWN = 1e8
+"""Precision of the contrasts during a search: their part in a design is a matter of its path, which comes later."""
+
+
+def _rows_for_search(seen: Seen, knowledge: Knowledge) -> tuple[np.ndarray, np.ndarray]:
+    """Rows and precision with the contrasts taken as known; home offsets are two more columns after data."""
+    precision = knowledge.precision.copy()
+    precision[CONTRAST_COLUMNS, CONTRAST_COLUMNS] += KNOWN
+    if not knowledge.after_data:
+        return seen.rows[..., :PARAMETERS], precision
+    full = np.zeros((PARAMETERS + 2, PARAMETERS + 2))
+    full[:PARAMETERS, :PARAMETERS] = precision
+    full[range(PARAMETERS, PARAMETERS + 2), range(PARAMETERS, PARAMETERS + 2)] = 1 / HOME_VARIANCE_RAD2
+    return seen.rows, full
+
+
+SUBSETS_MAX = 40
+
+
+def _sheet_subsets(count: int) -> list[tuple[int, ...]]:
+    """Which sheets to place: all choices of one to three, the farthest apart first."""
+    found = [s for size in (1, 2, 3) for s in combinations(range(count), size)]
+    return sorted(found, key=lambda s: (s[0] - s[-1], len(s)))[:SUBSETS_MAX]
+
+
+def search_designs(knowledge: Knowledge, seen: Seen, gradient: np.ndarray, own: np.ndarray, criterion: str) -> Search:
+    rows, precision = _rows_for_search(seen, knowledge)
+    wide = np.zeros((len(gradient), rows.shape[2]))
+    wide[:, :PARAMETERS] = gradient
+    return Search(rows, precision, wide, own, criterion)
+
+
+def design_family(
+    knowledge: Knowledge,
+    found: Candidates,
+    seen: Seen,
+    target: Target,
+    at_centre: Sensitivity,
+    *,
+    criterion: str = "c",
+    aperture: bool = False,
+    largest: int = LADDER[-1],
+    minutes: float | None = None,
+) -> Family:
+    """The choice of sheets and the order of looks that reach the target soonest.
+
+    For every choice of sheets looks are added greedily; the choice that first meets the target, counted in minutes,
+    is kept, or the best after `largest` experiments (or `minutes`) if none does.
+    """
+    if criterion == "c":
+        gradient, own = at_centre.gradient, at_centre.own_variance
+    else:
+        with jax.enable_x64(True):
+            pose = jnp.asarray(seen.mirror_angles_rad.mean(axis=0))
+            everything = np.asarray(headlines(jnp.asarray(knowledge.z), knowledge.space, pose).gradient)
+        gradient = everything[[QUANTITIES.index(q) for q in ("left", "up", "backlash.pan", "backlash.tilt")]]
+        own = np.zeros(len(gradient))
+    search = search_designs(knowledge, seen, gradient, own, criterion)
+    best: tuple[float, float, list[int]] | None = None
+    for subset in _sheet_subsets(len(knowledge.sheets)):
+        here = np.isin(found.looks.sheet, subset)
+        if not here.any():
+            continue
+        part = replace(search, rows=np.where(here[:, None, None], search.rows, 0.0))
+        picks = part.greedy(LOOKS_PER_EXPERIMENT * largest)
+        family = Family(knowledge, found, np.array(picks), aperture)
+        reached = (math.inf, math.inf)
+        for n in (n for n in LADDER if n <= largest):
+            design = family.arranged(n)
+            duration = plan_minutes(design.steps, knowledge.rig)
+            if minutes is not None and duration > minutes:
+                break
+            chosen = family.picks[: LOOKS_PER_EXPERIMENT * n]
+            information = information_of_looks(seen, chosen, design.path, knowledge.space, knowledge.after_data)
+            value = at_centre.value(covariance_of(knowledge.precision + information), target.factor)
+            reached = min(reached, (duration, value) if value <= target.limit else (math.inf, value))
+        if best is None or reached < best[:2]:
+            best = (*reached, picks)
+    return Family(knowledge, found, np.array(best[2]), aperture)
+
+
+def smallest_design(meets: Callable[[int], bool], sizes: Sequence[int]) -> int | None:
+    """Smallest whole number that meets a monotone condition, bracketed by a ladder first."""
+    above = next((n for n in sizes if meets(n)), None)
+    if above is None:
+        return None
+    below = max((n for n in sizes if n < above), default=0)
+    while above - below > 1:
+        middle = (above + below) // 2
+        above, below = (middle, below) if meets(middle) else (above, middle)
+    return above
+
+
+@dataclass(frozen=True)
+class _Refined:
+    """A design, and the uncertainty of the target that its fits report over the truths, shape (draws,)."""
+
+    family: Family
+    reported: np.ndarray
+
+
+def refine(
+    family: Family,
+    seen: Seen,
+    target: Target,
+    at_centre: Sensitivity,
+    experiments: int,
+    criterion: str,
+    minutes: float | None,
+    assurance: Assurance,
+) -> _Refined:
+    """The design of n experiments after exchanges.
+
+    Exchanges suit the most probable instrument; they are kept only where they do not cost assurance or time.
+    """
+    knowledge, found = family.knowledge, family.found
+    picks = family.picks[: LOOKS_PER_EXPERIMENT * experiments]
+    plain = _Refined(replace(family, picks=picks), assurance.values([experiments])[experiments])
+    if criterion != "c":
+        return plain
+    search = search_designs(knowledge, seen, at_centre.gradient, at_centre.own_variance, criterion)
+    here = np.isin(found.looks.sheet, found.looks.sheet[picks])
+    part = replace(search, rows=np.where(here[:, None, None], search.rows, 0.0))
+    exchanged = replace(family, picks=np.array(part.exchange(picks)))
+    if minutes is not None and plan_minutes(exchanged.arranged(experiments).steps, knowledge.rig) > minutes:
+        return plain
+    other = _Refined(exchanged, assurance.of(exchanged).values([experiments])[experiments])
+
+    def merit(of: _Refined) -> tuple[float, float]:
+        return float(np.mean(of.reported <= target.limit)), -float(np.median(of.reported))
+
+    return other if merit(other) > merit(plain) else plain

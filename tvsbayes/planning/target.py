@@ -1,0 +1,211 @@
+"""What a plan will tell before it is run: expected information, targets, and the search for looks (DESIGN 6).
+
+The model says what the looks of a plan would show; their Bayesian Fisher information, that of the priors (or of a fit)
+plus J^T C^-1 J of all looks, gives the covariance that a fit will report, for any quantity of interest. Frames and
+units are those of DESIGN 2 and 8: counters in steps, mm, degrees where a name says so, rad inside. Coordinates z have
+prior N(0, 1) each (`tvsbayes.model`).
+
+`information_of` judges any plan, move by move, through the filter of `tvsbayes.likelihood`: shared stops, home offsets
+and unknown play as in a fit. `Looks` are plans whose every look is reached anew on both axes from a known side: their
+stop errors are independent and information adds up look by look; of the history only the length of the path remains
+(it carries the contrast of the two directions). Thousands of candidates are scored by low-rank updates.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from tvsbayes.calibration.pointing import INPUT_NAMES, NOISES, Calibration
+from tvsbayes.calibration.pointing import NOISE_NAMES as CALIBRATION_NOISE
+from tvsbayes.coordinates.beam_meeting import Sources, propagate
+from tvsbayes.coordinates.location import settings_of
+from tvsbayes.errors import InputError, escaped
+from tvsbayes.instrument.parameters import INDEX
+from tvsbayes.instrument.plan import OVERSHOOT_STEPS
+from tvsbayes.instrument.rig import RigTable
+from tvsbayes.model.headlines import QUANTITIES, RATIOS, headlines, physical_at
+from tvsbayes.model.parameter_space import ParameterSpace
+from tvsbayes.statistics.intervals import NORMAL_95
+
+UNITS = {
+    **dict.fromkeys((*RATIOS, "worst", "contrast.pan", "contrast.tilt"), "deg/step"),
+    **dict.fromkeys(("backlash.pan", "backlash.tilt"), "deg"),
+    **dict.fromkeys(("mirror_offset", "x", "y", "z", "xyz"), "mm"),
+}
+COORDINATES = {"x": (0,), "y": (1,), "z": (2,), "xyz": (0, 1, 2)}
+DEFAULT_TARGET = "u(worst) <= 2e-4 deg/step"
+"""0.3 % of the paper's ratios: above the floor that stereo and a focal scale known to 0.2 % leave."""
+
+
+@dataclass(frozen=True)
+class Target:
+    """What the measurement is for: an uncertainty that shall not exceed a limit.
+
+    Attributes:
+        text: as written.
+        quantity: one of `UNITS`.
+        factor: 1 for u, 1.96 for U95.
+        limit: in the unit.
+        unit: deg/step, deg or mm.
+        point_mm: where a coordinate is wanted, frame T.
+    """
+
+    text: str
+    quantity: str
+    factor: float
+    limit: float
+    unit: str
+    point_mm: tuple[float, float, float] | None = None
+
+    @property
+    def indices(self) -> tuple[int, ...]:
+        """Rows of the headlines, or of x, y, z, whose worst is meant."""
+        if self.quantity in COORDINATES:
+            return COORDINATES[self.quantity]
+        return (0, 1, 2, 3) if self.quantity == "worst" else (QUANTITIES.index(self.quantity),)
+
+    def as_json(self) -> dict[str, object]:
+        """Part of the documents of `plan` and `study`."""
+        point = None if self.point_mm is None else list(self.point_mm)
+        return {
+            "text": self.text,
+            "quantity": self.quantity,
+            "limit": self.limit,
+            "unit": self.unit,
+            "at_mm": point,
+            "expanded95": self.factor != 1.0,
+        }
+
+
+_NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
+_TARGET = re.compile(
+    rf"\s*(?P<kind>u|U95)\s*\(\s*(?P<name>[\w.]+)\s*\)"
+    rf"(?:\s+at\s+(?P<at>{_NUMBER}\s*,\s*{_NUMBER}\s*,\s*{_NUMBER})\s*mm)?"
+    rf"\s*<=\s*(?P<limit>{_NUMBER})\s*(?P<unit>deg/step|deg|mm)\s*",
+    re.ASCII,
+)
+SMALLEST_LIMIT, LARGEST_NUMBER = 1e-12, 1e9
+"""Limits and coordinates of a target: beyond these a number is a slip of the pen, and squares of it overflow."""
+TARGET_FORMS = (
+    "u(NAME) <= NUMBER UNIT or U95(NAME) <= NUMBER UNIT with NAME left, right, up, down, worst, contrast.pan, "
+    "contrast.tilt (deg/step), backlash.pan, backlash.tilt (deg), mirror_offset (mm); or u or U95 of x, y, z or xyz "
+    "at X,Y,Z mm <= NUMBER mm"
+)
+
+
+def parse_target(text: str) -> Target:
+    """Read a target such as `u(left) <= 2e-4 deg/step` or `U95(x) at 1000,0,0 mm <= 60 mm`.
+
+    Raises:
+        InputError: anything else, with what is allowed.
+    """
+
+    def refuse(found: str, remedy: str) -> InputError:
+        shown = escaped(text, 120)
+        message = f"--target {shown!r}: {found}; allowed: {TARGET_FORMS}; {remedy}"
+        return InputError("target", message, column="--target", found=shown, allowed=TARGET_FORMS, remedy=remedy)
+
+    match = _TARGET.fullmatch(text) if len(text) <= 200 else None
+    if match is None:
+        raise refuse("not of that form", f"write for example '{DEFAULT_TARGET}'")
+    name, unit, limit = match["name"], match["unit"], float(match["limit"])
+    if name not in UNITS:
+        raise refuse(f"no quantity {name}", "name one of the quantities")
+    if unit != UNITS[name]:
+        raise refuse(f"{name} is in {UNITS[name]}, not {unit}", f"state the limit in {UNITS[name]}")
+    if not SMALLEST_LIMIT <= limit < LARGEST_NUMBER:
+        raise refuse(f"the limit {limit:g}", f"state a limit from {SMALLEST_LIMIT:g} to {LARGEST_NUMBER:g}")
+    if (match["at"] is None) == (name in COORDINATES):
+        remedy = "name the point: at 1000,0,0 mm" if name in COORDINATES else "leave the point out"
+        raise refuse("a coordinate needs a point, and nothing else has one", remedy)
+    point = None if match["at"] is None else tuple(float(x) for x in match["at"].split(","))
+    if point is not None and max(map(abs, point)) > LARGEST_NUMBER:
+        raise refuse("the point is too far away", f"state its coordinates within {LARGEST_NUMBER:g} mm")
+    return Target(" ".join(text.split()), name, 1.0 if match["kind"] == "u" else NORMAL_95, limit, unit, point)
+
+
+@dataclass(frozen=True)
+class Sensitivity:
+    """How a target hangs on the coordinates.
+
+    Attributes:
+        gradient: d(quantity)/d(coordinates) of each quantity whose worst is meant, shape (q, p).
+        own: variance that no calibration lowers, by cause, shapes (q,): the stop and the reading at the point itself.
+    """
+
+    gradient: np.ndarray
+    own: Mapping[str, np.ndarray] = field(default_factory=dict)
+
+    @property
+    def own_variance(self) -> np.ndarray:
+        """Shape (q,)."""
+        return sum(self.own.values(), np.zeros(len(self.gradient)))
+
+    def value(self, covariance: np.ndarray, factor: float = 1.0) -> float:
+        """The target's value under a covariance (p, p) of the coordinates."""
+        variance = np.einsum("qi,ij,qj->q", self.gradient, covariance, self.gradient) + self.own_variance
+        return float(factor * np.sqrt(variance.max()))
+
+
+AT_POINT = ("stop error at the point", "aperture noise at the point")
+
+
+def sensitivity(
+    target: Target, z: np.ndarray, space: ParameterSpace, table: RigTable, pose_rad: np.ndarray
+) -> Sensitivity:
+    """Linearise a target at a point of parameter space.
+
+    Args:
+        target: what is wanted.
+        z: coordinates, shape (p,).
+        space: priors.
+        table: gives the aperture's convention and the periods.
+        pose_rad: where effective ratios hold, shape (2,).
+
+    Raises:
+        InputError: no beam reaches the target's point.
+    """
+    rows = list(target.indices)
+    with jax.enable_x64(True):
+        if target.point_mm is None:
+            found = headlines(jnp.asarray(z), space, jnp.asarray(pose_rad))
+            return Sensitivity(np.asarray(found.gradient)[rows])
+    at = physical_at(z, space)
+    physical, slope = at.value, at.slope
+    inputs = [INDEX[name] for name in INPUT_NAMES]
+    stop_sd = physical[[INDEX[name] for name in CALIBRATION_NOISE]]
+    azimuth = table.aperture_convention == "azimuth"
+    machine = Calibration(
+        mean=physical[inputs],
+        covariance=slope[inputs] @ slope[inputs].T,
+        noise_variance=dict(zip(CALIBRATION_NOISE, stop_sd**2, strict=True)),
+        overshoot_steps={"pan": OVERSHOOT_STEPS, "tilt": OVERSHOOT_STEPS},
+        azimuth=azimuth,
+        period_deg=table.harmonic_period_deg,
+    )
+    goal = machine.steps_for(target.point_mm)
+    settings = settings_of(float(goal.pan_steps), float(goal.tilt_steps), goal.aperture_deg, goal.approach)
+    count = len(inputs)
+    with jax.enable_x64(True):
+        law = propagate(
+            settings,
+            Sources(
+                mean=jnp.asarray(np.concatenate([physical[inputs], np.zeros(NOISES)])),
+                covariance=jnp.zeros((count + NOISES, count + NOISES)),
+                stop_sd_deg=jnp.asarray(stop_sd),
+                inputs=jnp.zeros((1, count + len(stop_sd))),
+                noise=jnp.zeros((1, NOISES)),
+                period_deg=space.harmonic_period_deg,
+                azimuth_convention=jnp.asarray(azimuth),
+            ),
+        )
+    jacobian = np.asarray(law.jacobian)[0][rows]
+    own = jacobian[:, count:] ** 2
+    here = {AT_POINT[0]: own[:, :2].sum(axis=1), AT_POINT[1]: own[:, 4]}
+    return Sensitivity(jacobian[:, :count] @ slope[inputs], here)

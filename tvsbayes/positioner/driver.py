@@ -1,0 +1,439 @@
+"""The positioner behind a link."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Protocol
+
+from tvsbayes.errors import DeviceFault, escaped
+from tvsbayes.positioner.protocol import (
+    REPLY_CHARS_MAX,
+    SETTINGS,
+    VERSION,
+    DeviceState,
+    FrameError,
+    Reply,
+    parse_answer,
+    request,
+    unsigned,
+)
+
+ATTEMPTS = 6
+"""How often a request is sent before the device counts as dead."""
+CLOSING_ATTEMPTS = 3
+"""The same when the line is given back anyway."""
+REPLY_S = 0.5
+"""Silence after which a request is sent again. A clean round trip takes about 1 ms on USB, 0.2 s at 9600 baud."""
+NAK_S = 0.05
+"""Silence after a negative acknowledgement that is enough."""
+REPLY_MAX_S = 3.0
+"""Longest wait for one answer while bytes keep arriving: a slow line, or noise."""
+DRAIN_S, DRAIN_MAX_S = 0.05, 1.0
+"""Silence that ends the draining of a line just opened, and the longest draining."""
+POLL_S = 0.05
+"""Time between two looks at a motion; far below the laser watchdog of the device."""
+HOME_S = 300.0
+"""Longest homing: 20 000 steps per axis at 200 steps/s are 200 s."""
+RECONNECT_S = 10.0
+"""How long an unplugged device may stay away."""
+
+
+class PositionLost(DeviceFault):
+    """The device was reset or moved by others: counters mean nothing until it is homed again."""
+
+
+class Clock(Protocol):
+    """Time as the driver sees it."""
+
+    def monotonic(self) -> float:
+        """Seconds, never going back."""
+
+    def sleep(self, seconds: float) -> None:
+        """Let time pass."""
+
+
+class Link(Protocol):
+    """A byte pipe to the device; any call raises OSError once it is gone."""
+
+    def write(self, data: bytes) -> None:
+        """Send all of `data`, or raise."""
+
+    def read(self, timeout_s: float) -> bytes:
+        """Whatever has arrived; waits up to `timeout_s` for the first byte; may be empty."""
+
+    def close(self) -> None:
+        """Give the port back; never raises."""
+
+
+@dataclass(frozen=True, slots=True)
+class HomeReport:
+    """A finished homing.
+
+    Attributes:
+        state: the device afterwards: idle, counters at the home switches.
+        deviation_steps: (pan, tilt) counter where each switch was found minus where it should have been, since the
+            homing before; not zero after lost steps. (0, 0) for the first homing of a device.
+        known: whether this connection homed before, to which the deviation refers.
+        compared: whether the device was homed at all when this homing began; if not (unhomed, in alarm) it reports
+            (0, 0) whatever happened.
+    """
+
+    state: DeviceState
+    deviation_steps: tuple[int, int]
+    known: bool
+    compared: bool
+
+
+class Positioner(Protocol):
+    """A two-axis positioner with a laser, whatever drives it."""
+
+    def home(self) -> HomeReport:
+        """Find the home switches; the laser is off afterwards."""
+
+    def move_to(self, pan_steps: int, tilt_steps: int) -> DeviceState:
+        """Go to absolute counters; returns when the device has said that it is there."""
+
+    def laser(self, on: bool) -> DeviceState:
+        """Switch the laser; returns when the device has said so."""
+
+    def state(self) -> DeviceState:
+        """Ask the device; also a sign of life for its laser watchdog."""
+
+    def close(self) -> None:
+        """Laser off and motors at rest as well as possible, then the line closed; never raises."""
+
+
+class SerialPositioner:
+    """The driver of the firmware shipped with this package.
+
+    Args:
+        open_link: opens the line, also after an unplugging; raises OSError while there is none.
+        settings: device settings by protocol name (`protocol.SETTINGS`) to set and read back.
+        clock: where time comes from.
+
+    Raises:
+        DeviceFault: nothing answers, or what answers is another firmware.
+    """
+
+    def __init__(
+        self,
+        open_link: Callable[[], Link],
+        settings: Mapping[str, int] | None = None,
+        clock: Clock = time,
+    ):
+        self._open_link, self._clock = open_link, clock
+        self._settings = dict(settings or {})
+        self._link: Link | None = None
+        self._buffer, self._dropping = bytearray(), False
+        self._sequence, self._boot = 0, -1
+        self._homed_here, self._compares = False, False
+        self.repeats = 0
+        """Requests sent again so far: the quality of the line."""
+        try:
+            self._link = open_link()
+        except OSError as error:
+            raise _fault("port", f"the port cannot be opened: {_reason(error)}", _PORT_REMEDY) from error
+        try:
+            self._drain()
+            identity = self._identify()
+            self._boot, self._compares = identity.state.boot, identity.state.status == "idle"
+            self.identity = dict(identity.extra)
+            for key, value in self._settings.items():
+                self._set(key, value)
+            self._limits = {key: self._get(key) for key in ("vmax", "amax")}
+        except BaseException:
+            self.close()
+            raise
+
+    def home(self) -> HomeReport:
+        """See `Positioner.home`."""
+        known, compared = self._homed_here, self._compares
+        # A homing that is broken off leaves no counters to compare with.
+        self._homed_here = self._compares = False
+        state = self._wait(self._command("HOME"), HOME_S)
+        self._homed_here = self._compares = True
+        if state.laser_on:
+            raise _fault("laser", "the laser is on after homing", "cut the laser's supply and check the firmware")
+        return HomeReport(state, (state.pan_home_deviation_steps, state.tilt_home_deviation_steps), known, compared)
+
+    def move_to(self, pan_steps: int, tilt_steps: int) -> DeviceState:
+        """See `Positioner.move_to`.
+
+        Raises:
+            DeviceFault: refused, stopped, in alarm, too late, or not where it should be.
+        """
+        wanted = (int(pan_steps), int(tilt_steps))
+        reply = self._command("MA", *wanted)
+        before = reply.state
+        distance = max(
+            abs(wanted[0] - before.pan_steps),
+            abs(wanted[1] - before.tilt_steps),
+        )
+        # Twice the whole way at the speed before any ramp, and two full ramps; 5 s for the line.
+        top, ramp = self._limits["vmax"], self._limits["amax"]
+        state = self._wait(reply, 5.0 + 2.0 * (distance / min(top, 200) + 2.0 * top / ramp))
+        reached = (state.pan_steps, state.tilt_steps)
+        if reached != wanted or (state.pan_target_steps, state.tilt_target_steps) != wanted:
+            found = f"the device says done at {reached}, ordered was {wanted}"
+            raise _fault("position", found, "home again; if it happens twice, flash the firmware anew")
+        return state
+
+    def laser(self, on: bool) -> DeviceState:
+        """See `Positioner.laser`."""
+        state = self._command("L", int(on)).state
+        if state.laser_on != on:
+            state = self.state()
+        if state.laser_on != on:
+            found = f"the laser line stayed {'off' if on else 'on'} ({state.last_error})"
+            raise _fault("laser", found, "cut the laser's supply and check its wiring")
+        return state
+
+    def state(self) -> DeviceState:
+        """See `Positioner.state`."""
+        return self._command("?").state
+
+    def close(self) -> None:
+        """See `Positioner.close`."""
+        if self._link is None:
+            return
+        try:
+            if self._boot >= 0:
+                self._switch_off()
+        except (DeviceFault, OSError):
+            # The device's own watchdog switches the laser off when it no longer hears from us.
+            pass
+        finally:
+            self._link.close()
+            self._link = None
+
+    def _switch_off(self) -> None:
+        """Laser off and motors at rest, with few attempts."""
+        few = {"attempts": CLOSING_ATTEMPTS, "reconnect": False}
+        reply = self._exchange("L", 0, **few)
+        if reply.error == "seq":
+            # Another program has counted on. Whatever it does, our laser goes off: take up its number.
+            last = self._exchange("ID", sequence=0, **few).extra.get("q", "")
+            if last.isdigit() and last.isascii():
+                self._sequence = int(last)
+                self._exchange("L", 0, **few)
+        elif reply.state.status == "moving":
+            # Interrupted in a motion: a blocked axis must not be driven on when nobody watches it any more.
+            self._exchange("STOP", **few)
+
+    def _drain(self) -> None:
+        """Throw away what an earlier conversation left on the line."""
+        deadline = self._clock.monotonic() + DRAIN_MAX_S
+        try:
+            while self._link is not None and self._link.read(DRAIN_S) and self._clock.monotonic() < deadline:
+                pass
+        except OSError:
+            # The first request meets the same error and reconnects.
+            pass
+
+    def _set(self, key: str, value: int) -> None:
+        low, high, _ = SETTINGS[key]
+        reply = self._exchange("SET", key, value)
+        if reply.error is not None or reply.extra.get("v") != str(value):
+            found = f"setting {key} = {value} was answered {reply.error or reply.extra.get('v')}"
+            raise _fault("setting", found, f"allowed: {low} to {high}, at rest; flash the shipped firmware")
+
+    def _get(self, key: str) -> int:
+        text = self._exchange("GET", key).extra.get("v", "")
+        if not text.isdigit() or not text.isascii() or int(text) == 0:
+            raise _fault("setting", f"{key} was answered {escaped(text)!r}", "flash the shipped firmware")
+        return int(text)
+
+    def _identify(self) -> Reply:
+        """The device's identity; its last sequence is where ours goes on."""
+        reply = self._exchange("ID", sequence=0)
+        version, firmware = reply.extra.get("proto"), escaped(reply.extra.get("fw", "unknown"))
+        if version != str(VERSION):
+            found = f"firmware {firmware} speaks protocol {escaped(str(version))}, this program speaks {VERSION}"
+            remedy = "flash the firmware shipped with tvsbayes: see README.md in its positioner/firmware folder"
+            raise _fault("firmware", found, remedy)
+        last = unsigned(reply.extra.get("q", ""))
+        if last is None:
+            raise _fault("firmware", f"firmware {firmware} names no last sequence", "flash the shipped firmware")
+        self._sequence = max(self._sequence, last)
+        return reply
+
+    def _command(self, *words: object) -> Reply:
+        """A request that a healthy, homed device does not refuse."""
+        reply = self._exchange(*words)
+        self._check(reply.state)
+        if reply.error is not None:
+            found = f"{' '.join(map(str, words))} was refused: {reply.error}"
+            raise _fault(f"refused-{reply.error}", found, _REFUSALS.get(reply.error, "home and try again"))
+        return reply
+
+    def _check(self, state: DeviceState) -> None:
+        if state.boot != self._boot:
+            self._homed_here = self._compares = False
+            raise PositionLost(
+                "reset",
+                "positioner: the device was reset, its counters are lost",
+                remedy="check its supply and cable, then go on with --resume: it homes again",
+            )
+        if state.status == "alarm":
+            self._homed_here = self._compares = False
+            remedy = _ALARMS.get(state.last_error, "home again")
+            raise _fault(f"alarm-{state.last_error}", f"the device is in alarm: {state.last_error}", remedy)
+
+    def _wait(self, reply: Reply, longest_s: float) -> DeviceState:
+        """Until the motion that `reply` accepted is done."""
+        deadline = self._clock.monotonic() + longest_s
+        state = reply.state
+        while not (state.status == "idle" and state.done_sequence == reply.sequence):
+            if state.status != "moving":
+                # The cached answer to a repeated request may be older than the motion.
+                state = self._command("?").state
+                if state.status == "idle" and state.done_sequence == reply.sequence:
+                    break
+                if state.status != "moving":
+                    found = f"the motion ended without reaching its target ({state.status}, {state.last_error})"
+                    raise _fault("stopped", found, "home again")
+            if self._clock.monotonic() > deadline:
+                self._exchange("STOP")
+                found = f"the motion is not done after {longest_s:.0f} s"
+                raise _fault("stall", found, "look for a blocked axis or a missing home switch; then home again")
+            self._clock.sleep(POLL_S)
+            state = self._command("?").state
+        return state
+
+    def _exchange(
+        self, *words: object, sequence: int | None = None, attempts: int = ATTEMPTS, reconnect: bool = True
+    ) -> Reply:
+        """One request and its answer, repeated while it is unanswered and reconnected when the line is gone."""
+        if sequence is None:
+            self._sequence += 1
+            sequence = self._sequence
+        line = request(sequence, *map(str, words))
+        for attempt in range(attempts):
+            try:
+                if self._link is None:
+                    raise OSError("the line is closed")
+                if attempt:
+                    self.repeats += 1
+                    # Ends whatever half line the device holds.
+                    self._link.write(b"\n")
+                self._link.write(line)
+                reply = self._await(sequence)
+            except OSError as error:
+                if not reconnect:
+                    raise
+                self._reconnect(error)
+                continue
+            if reply is not None:
+                return reply
+        found = f"no answer to {' '.join(map(str, words))} after {attempts} attempts"
+        raise _fault("no-answer", found, "check cable, supply and firmware; unplug and plug in again")
+
+    def _await(self, sequence: int) -> Reply | None:
+        """The answer to `sequence`; None for silence, at once after a negative acknowledgement."""
+        start = self._clock.monotonic()
+        deadline = start + REPLY_S
+        while True:
+            while (line := self._next_line()) is not None:
+                try:
+                    answer = parse_answer(line)
+                except FrameError:
+                    continue
+                if isinstance(answer, Reply):
+                    if answer.sequence == sequence:
+                        return answer
+                elif answer.kind == "nak":
+                    # Noise may draw many of them, and the answer may still follow.
+                    deadline = min(deadline, self._clock.monotonic() + NAK_S)
+            left_s = deadline - self._clock.monotonic()
+            if left_s <= 0 or self._link is None:
+                return None
+            data = self._link.read(left_s)
+            if data:
+                deadline = min(self._clock.monotonic() + REPLY_S, start + REPLY_MAX_S)
+                self._buffer += data
+
+    def _next_line(self) -> bytes | None:
+        """A complete line from the buffer; one that is too long to be an answer is thrown away."""
+        while (end := self._buffer.find(b"\n")) >= 0:
+            line = bytes(self._buffer[:end])
+            del self._buffer[: end + 1]
+            dropped, self._dropping = self._dropping, False
+            if not dropped and len(line) <= REPLY_CHARS_MAX:
+                return line
+        if len(self._buffer) > REPLY_CHARS_MAX:
+            self._buffer.clear()
+            self._dropping = True
+        return None
+
+    def _reconnect(self, cause: OSError) -> None:
+        """Wait for the device to come back, and make sure that it is the same one in the same life."""
+        if self._link is not None:
+            self._link.close()
+            self._link = None
+        deadline = self._clock.monotonic() + RECONNECT_S
+        while self._link is None:
+            try:
+                self._link = self._open_link()
+            except OSError:
+                if self._clock.monotonic() > deadline:
+                    found = f"the device is gone: {_reason(cause)}"
+                    raise _fault("unplugged", found, "plug it in, then go on with --resume") from cause
+                self._clock.sleep(POLL_S)
+        self._buffer.clear()
+        self._dropping = False
+        if self._boot < 0:
+            return
+        before = self._sequence
+        try:
+            self._link.write(b"\n")
+            self._link.write(request(0, "ID"))
+            reply = self._await(0)
+        except OSError:
+            # Gone again: the next attempt of the caller comes back here.
+            return
+        if reply is None:
+            return
+        self._check(reply.state)
+        last = reply.extra.get("q", "")
+        if not (last.isdigit() and last.isascii() and int(last) <= before):
+            raise PositionLost(
+                "foreign",
+                "positioner: another program has driven the device meanwhile",
+                remedy="close it, then go on with --resume: the device homes again",
+            )
+
+
+SEE_DOCTOR = "; see `tvsbayes doctor`"
+"""Ends a remedy; `doctor` leaves it out of its own."""
+_PORT_REMEDY = "check [positioner] port in the rig file, the cable and your rights on the port" + SEE_DOCTOR
+_REFUSALS = {
+    "limit": "the target lies outside the soft limits: correct the plan or [positioner] in the rig file",
+    "unhomed": "home first",
+    "busy": "another program drives the device: close it",
+    "seq": "another program drives the device: close it",
+}
+_ALARMS = {
+    "limit": "a limit switch opened: clear the way, check the limits in the rig file, then home",
+    "home": "a home switch was not found: check its wiring, then home",
+    "abort": "somebody aborted: make sure that all is well, then home",
+}
+
+
+def _reason(error: OSError) -> str:
+    return escaped(error.strerror or str(error), 200)
+
+
+def _fault(code: str, found: str, remedy: str) -> DeviceFault:
+    return DeviceFault(code, f"positioner: {found}; {remedy}", found=found, remedy=remedy)
+
+
+def device_settings(positioner: Mapping[str, object]) -> dict[str, int]:
+    """Device settings that `[positioner]` of a rig file states: limits and top speed."""
+    names = {"pan_min_steps": "pmin", "pan_max_steps": "pmax", "tilt_min_steps": "tmin", "tilt_max_steps": "tmax"}
+    settings = {short: int(positioner[name]) for name, short in names.items() if name in positioner}
+    if "speed_steps_per_s" in positioner:
+        low, high, _ = SETTINGS["vmax"]
+        settings["vmax"] = min(max(round(float(positioner["speed_steps_per_s"])), low), high)
+    return settings

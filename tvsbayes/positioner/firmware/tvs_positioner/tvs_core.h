@@ -1,0 +1,87 @@
+// Core of the positioner's firmware: frames, sequence numbers, ramps, homing, soft limits, laser watchdog.
+// Portable C++11: no Arduino include, no heap, no floating point. The board is reached through Hooks only, so the
+// same core runs natively in the tests, where it must agree byte by byte with tvsbayes/positioner/firmware_model.py.
+// The protocol is described in tvsbayes/positioner/protocol.py. Times are microseconds since start, positions motor steps.
+#pragma once
+
+#include <stddef.h>
+#include <stdint.h>
+
+namespace tvs {
+
+enum { kPan = 0, kTilt = 1, kAxes = 2 };
+
+// What the core needs from a board. Called from receive() and advance() only, never from an interrupt.
+class Hooks {
+ public:
+  virtual void step(int axis, bool positive) = 0;
+  virtual bool home_switch(int axis) = 0;
+  virtual bool limit_switch(int axis) = 0;
+  virtual void laser(bool on) = 0;
+  virtual void write(const char* data, size_t size) = 0;
+
+ protected:
+  ~Hooks() {}
+};
+
+class Core {
+ public:
+  // boot_id: a number that differs between starts; a host tells by it that counters were lost.
+  Core(Hooks& hooks, uint32_t boot_id);
+  // Laser off, banner out. Call once, before anything else.
+  void start(uint64_t now_us);
+  // Takes one byte from the host.
+  void receive(uint8_t byte, uint64_t now_us);
+  // Does every step, and switches off the laser, that is due by now, in order of time.
+  void advance(uint64_t now_us);
+
+ private:
+  enum Status { kUnhomed, kIdle, kMoving, kAlarm };
+  enum Phase { kAway, kFast, kBack, kSlow };
+  enum { kSettings = 9, kRequestMax = 96, kReplyMax = 192 };
+  struct Axis {
+    int32_t position, target, home_deviation;
+    int32_t level;      // step number on the ramp: speed^2 = start^2 + 2 * acceleration * level
+    int32_t direction;  // +1, -1; 0 at rest
+    uint64_t due_us;
+  };
+
+  void line(uint64_t now_us);
+  void nak(const char* kind);
+  void send(const char* body, size_t size);
+  void execute(uint32_t sequence, const char* words[], int count, uint64_t now_us);
+  const char* command(uint32_t sequence, const char* words[], int count, uint64_t now_us, char* extra);
+  const char* move(uint32_t sequence, int32_t pan, int32_t tilt, uint64_t now_us);
+  void reply(uint32_t sequence, const char* error, const char* extra);
+  uint32_t delay_us(int32_t level) const;
+  int32_t top_level() const;
+  void step_axis(int axis);
+  void finish_if_at_rest();
+  void halt(Status status, const char* error);
+  void set_laser(bool on);
+  void home_axis(int axis, uint64_t now_us);
+  void home_phase(Phase phase, uint64_t now_us);
+  void home_step();
+  void home_found(uint64_t now_us);
+
+  Hooks& hooks_;
+  const uint32_t boot_id_;
+  Status status_;
+  const char* error_;
+  Axis axes_[kAxes];
+  int32_t settings_[kSettings];
+  uint32_t last_sequence_, motion_sequence_, done_sequence_;
+  bool laser_, stopping_, homing_, homed_before_;
+  int home_axis_;
+  Phase home_phase_;
+  int32_t home_clear_, home_travel_;
+  bool home_limit_;
+  uint64_t home_due_us_, heard_us_;
+  char request_[kRequestMax + 2], last_request_[kRequestMax + 2], last_reply_[kReplyMax + 8];
+  size_t request_size_, last_request_size_, last_reply_size_;
+  bool overlong_;
+};
+
+uint16_t crc16(const char* data, size_t size);
+
+}  // namespace tvs

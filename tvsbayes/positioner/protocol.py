@@ -1,0 +1,225 @@
+"""The positioner's serial protocol: frames, CRC-16, requests and replies.
+
+One text line per message, so that it can be typed, logged and searched:
+
+    request     >SEQ COMMAND ARGUMENTS*CRC          >12 MA 200 -40*BAE5
+    reply       <SEQ ok|err CODE STATE EXTRA*CRC
+    unasked     !boot ...*CRC, !nak frame|crc|parse|long*CRC
+
+CRC is CRC-16/CCITT-FALSE over everything before `*`, four upper-case hexadecimal digits. SEQ is an unsigned 32 bit
+number. A request with the sequence of the last one and the same bytes is answered from the cached reply and not
+executed again; a lower sequence, or the same one with other content, is refused. All moves are absolute. So a host
+may repeat a request whose answer it did not get, as often as it wants. `>0 ID` is the only request without a place
+in the sequence: it reads the device's last number, from which a host goes on counting.
+
+Every reply carries the state: b boot id, st status, p counters, t targets, d sequence of the last motion that
+reached its target, l laser, h home deviation, e last error. A motion is done when d is its sequence, never by time.
+
+Counters are absolute motor steps (pan, tilt). No state, no input or output here.
+"""
+
+from __future__ import annotations
+
+import binascii
+import re
+from dataclasses import dataclass, field
+from typing import Literal, cast
+
+VERSION = 1
+"""Version of this protocol; a device with another one is refused."""
+FIRMWARE_VERSION = "1.0.0"
+"""Version of the firmware shipped with this package, which the device model reports too."""
+REQUEST_CHARS_MAX = 96
+"""Longest request line without its line feed; a longer one is dropped up to the next line feed."""
+REPLY_CHARS_MAX = 192
+"""Longest reply line without its line feed."""
+SEQUENCE_MAX = 2**32 - 1
+STEPS_MIN, STEPS_MAX = -(2**31), 2**31 - 1
+Status = Literal["unhomed", "idle", "moving", "alarm"]
+STATUSES = ("unhomed", "idle", "moving", "alarm")
+SETTINGS: dict[str, tuple[int, int, int]] = {
+    "vmax": (10, 20_000, 800),
+    "amax": (10, 100_000, 4_000),
+    "pmin": (-100_000_000, 100_000_000, -1_000),
+    "pmax": (-100_000_000, 100_000_000, 1_000),
+    "tmin": (-100_000_000, 100_000_000, -500),
+    "tmax": (-100_000_000, 100_000_000, 500),
+    "hp": (-100_000_000, 100_000_000, -1_200),
+    "ht": (-100_000_000, 100_000_000, -700),
+    "wd": (100, 10_000, 2_000),
+}
+"""Lowest, highest and boot value by name: top speed (steps/s), acceleration (steps/s^2), soft limits of pan and tilt
+(steps), counters at the home switches (steps), laser watchdog (ms)."""
+_INTEGER = re.compile(r"0|-?[1-9][0-9]{0,9}")
+_UNSIGNED = re.compile(r"0|[1-9][0-9]{0,9}")
+_FRAME = re.compile(rb"([><!][ -)+-~]*)\*([0-9A-F]{4})")
+_WORD = re.compile(r"[a-z]+(-[a-z]+)*")
+_FIELD = re.compile(r"([a-z]+)=([ -~]+)")
+
+
+class FrameError(ValueError):
+    """A line that is no message; `kind` is "frame", "crc" or "parse"."""
+
+    def __init__(self, kind: Literal["frame", "crc", "parse"]):
+        super().__init__(kind)
+        self.kind = kind
+
+
+@dataclass(frozen=True, slots=True)
+class DeviceState:
+    """What a device says of itself in every reply.
+
+    Attributes:
+        boot: number drawn at every start; another one means that counters are lost.
+        status: "unhomed", "idle", "moving" (also while homing) or "alarm".
+        pan_steps, tilt_steps: counters now.
+        pan_target_steps, tilt_target_steps: where the last motion leads.
+        done_sequence: sequence of the last motion that reached its target, 0 for none.
+        laser_on: whether the laser line is on.
+        pan_home_deviation_steps, tilt_home_deviation_steps: at the last homing, counter where the switch was found
+            minus where it should have been: not zero after lost steps.
+        last_error: "none" or a word.
+    """
+
+    boot: int
+    status: Status
+    pan_steps: int
+    tilt_steps: int
+    pan_target_steps: int
+    tilt_target_steps: int
+    done_sequence: int
+    laser_on: bool
+    pan_home_deviation_steps: int
+    tilt_home_deviation_steps: int
+    last_error: str
+
+
+@dataclass(frozen=True, slots=True)
+class Reply:
+    """An answer: `error` is None for ok, else the reason of refusal; `extra` holds fields beside the state."""
+
+    sequence: int
+    error: str | None
+    state: DeviceState
+    extra: dict[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class Unasked:
+    """A line that answers nothing: "boot" after a start, "nak" for a frame that could not be read."""
+
+    kind: str
+    text: str
+
+
+def crc16(data: bytes) -> int:
+    """CRC-16/CCITT-FALSE: polynomial 0x1021, initial value 0xFFFF; "123456789" gives 0x29B1."""
+    return binascii.crc_hqx(data, 0xFFFF)
+
+
+def frame(body: str) -> bytes:
+    """A complete line: body, `*`, CRC, line feed."""
+    data = body.encode("ascii")
+    return data + b"*%04X\n" % crc16(data)
+
+
+def unframe(line: bytes) -> str:
+    """The body of a line (without its line feed), CRC checked.
+
+    Raises:
+        FrameError: "frame" for what is no message at all, "crc" for a damaged one.
+    """
+    match = _FRAME.fullmatch(line)
+    if match is None:
+        raise FrameError("frame")
+    if crc16(match[1]) != int(match[2], 16):
+        raise FrameError("crc")
+    return match[1].decode("ascii")
+
+
+def request(sequence: int, command: str, *arguments: object) -> bytes:
+    """A request line.
+
+    Raises:
+        ValueError: longer than a device accepts.
+    """
+    line = frame(" ".join(map(str, (f">{sequence}", command, *arguments))))
+    if len(line) - 1 > REQUEST_CHARS_MAX:
+        raise ValueError(f"request of {len(line)} bytes")
+    return line
+
+
+def unsigned(text: str) -> int | None:
+    """A number from 0 to 2^32 - 1 without sign or leading zeros, else None."""
+    return value if _UNSIGNED.fullmatch(text) and (value := int(text)) <= SEQUENCE_MAX else None
+
+
+def signed(text: str) -> int | None:
+    """A number from -2^31 to 2^31 - 1 without leading zeros, else None; "-0" is none."""
+    return value if _INTEGER.fullmatch(text) and STEPS_MIN <= (value := int(text)) <= STEPS_MAX else None
+
+
+def state_text(state: DeviceState) -> str:
+    """The fields of a state as every reply carries them."""
+    return (
+        f"b={state.boot} st={state.status} p={state.pan_steps},{state.tilt_steps} "
+        f"t={state.pan_target_steps},{state.tilt_target_steps} d={state.done_sequence} l={int(state.laser_on)} "
+        f"h={state.pan_home_deviation_steps},{state.tilt_home_deviation_steps} e={state.last_error}"
+    )
+
+
+_STATE_KEYS = ("b", "st", "p", "t", "d", "l", "h", "e")
+
+
+def parse_answer(line: bytes) -> Reply | Unasked:
+    """Reads a line (without its line feed) that a device sent.
+
+    Raises:
+        FrameError: no message, a damaged one, or one whose fields are not those of this protocol.
+    """
+    body = unframe(line)
+    if body.startswith("!"):
+        kind, _, text = body[1:].partition(" ")
+        return Unasked(kind, text)
+    head, *rest = body.split(" ")
+    sequence = unsigned(head[1:])
+    if not head.startswith("<") or sequence is None or not rest:
+        raise FrameError("parse")
+    error = None
+    if rest[0] == "err" and len(rest) > 1 and _WORD.fullmatch(rest[1]):
+        error, rest = rest[1], rest[1:]
+    elif rest[0] != "ok":
+        raise FrameError("parse")
+    fields: dict[str, str] = {}
+    for item in rest[1:]:
+        match = _FIELD.fullmatch(item)
+        if match is None or match[1] in fields:
+            raise FrameError("parse")
+        fields[match[1]] = match[2]
+    return Reply(sequence, error, _state(fields), {k: v for k, v in fields.items() if k not in _STATE_KEYS})
+
+
+def _pair(text: str) -> tuple[int, int]:
+    numbers = [signed(part) for part in text.split(",")]
+    if len(numbers) != 2 or None in numbers:
+        raise FrameError("parse")
+    return cast("tuple[int, int]", tuple(numbers))
+
+
+def _state(fields: dict[str, str]) -> DeviceState:
+    if any(key not in fields for key in _STATE_KEYS):
+        raise FrameError("parse")
+    boot, done = unsigned(fields["b"]), unsigned(fields["d"])
+    good = fields["st"] in STATUSES and fields["l"] in ("0", "1") and _WORD.fullmatch(fields["e"])
+    if boot is None or done is None or not good:
+        raise FrameError("parse")
+    return DeviceState(
+        boot,
+        cast("Status", fields["st"]),
+        *_pair(fields["p"]),
+        *_pair(fields["t"]),
+        done,
+        fields["l"] == "1",
+        *_pair(fields["h"]),
+        fields["e"],
+    )

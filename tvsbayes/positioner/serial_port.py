@@ -1,0 +1,98 @@
+"""Host side of the positioner: one request at a time, safe repeats, resynchronisation, replugging.
+
+What a caller may rely on: `move_to` and `home` return only after the device said, in a frame with a good CRC, that
+this very motion reached its target, at the counters asked for, in the same life of the device (boot id). Everything
+else ends in a `DeviceFault` within a bounded time. After a time-out the same line is sent again; that is safe,
+because the device executes a sequence number once. A device that was reset has lost its counters: that is a
+`PositionLost`, never a silent continuation.
+
+Counters are absolute motor steps (pan, tilt); seconds where a name says `_s`. Time comes from a `Clock`, bytes from
+a `Link`: tests drive both without hardware and without waiting.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from tvsbayes.positioner.driver import Link
+
+
+class _SerialLink:
+    """pyserial as a `Link`."""
+
+    def __init__(self, port: str, baud: int):
+        import serial
+
+        # Exclusive: a second program on the line would eat our answers. A write time-out, else a stalled peer
+        # would hold us for ever.
+        # Not `serial_for_url`, whose addresses run other code and one of which writes files.
+        self._serial = serial.Serial(None, baud, timeout=0.1, write_timeout=1.0)
+        if hasattr(self._serial, "exclusive"):
+            self._serial.exclusive = True
+        self._serial.port = port
+        try:
+            self._serial.open()
+        except ValueError as error:
+            # A name or speed that the system cannot even try, such as one with a NUL.
+            raise OSError(str(error)) from error
+
+    def write(self, data: bytes) -> None:
+        self._serial.write(data)
+
+    def read(self, timeout_s: float) -> bytes:
+        self._serial.timeout = timeout_s
+        first = self._serial.read(1)
+        # A pulled plug makes in_waiting raise a bare OSError, a read SerialException, which is one.
+        return first + self._serial.read(self._serial.in_waiting) if first else b""
+
+    def close(self) -> None:
+        try:
+            self._serial.close()
+        except OSError:
+            pass
+
+
+@dataclass(frozen=True, slots=True)
+class Port:
+    """A serial port of this computer, with what its USB device says of itself (empty where it says nothing)."""
+
+    name: str
+    description: str
+    vid: int | None
+    pid: int | None
+    serial_number: str
+
+    @property
+    def teensy(self) -> bool:
+        """Whether the vendor is PJRC, who make the Teensy."""
+        return self.vid == 0x16C0
+
+
+def serial_ports() -> list[Port]:
+    """The serial ports of this computer, by name."""
+    from serial.tools import list_ports
+
+    found = (Port(p.device, p.description or "", p.vid, p.pid, p.serial_number or "") for p in list_ports.comports())
+    return sorted(found, key=lambda port: port.name)
+
+
+def serial_opener(port: str, baud: int) -> Callable[[], Link]:
+    """Opens a port by name; after an unplugging, the same USB device under whatever name it came back."""
+    identity: list[Port] = [p for p in serial_ports() if p.name == port and p.serial_number]
+
+    def open_link() -> Link:
+        name = port
+        if identity:
+            known = identity[0]
+            matches = [
+                p.name
+                for p in serial_ports()
+                if (p.vid, p.pid, p.serial_number) == (known.vid, known.pid, known.serial_number)
+            ]
+            if not matches:
+                raise OSError(f"no port with the USB serial number {known.serial_number}")
+            name = matches[0]
+        return _SerialLink(name, baud)
+
+    return open_link

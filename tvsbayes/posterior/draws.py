@@ -1,0 +1,210 @@
+"""Draws of the posterior, carried into any quantity."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from arviz_stats.base import array_stats
+
+from tvsbayes.estimators.joint_fit import JointFit
+from tvsbayes.instrument.axes import DIRECTIONS
+from tvsbayes.instrument.parameters import NAMES
+from tvsbayes.model.headlines import Derived, derived_quantities
+from tvsbayes.posterior.transport import in_batches
+from tvsbayes.results.estimates import Convergence
+
+DERIVED_BATCH = 2049
+"""The batch in which the fit computes its headlines: the compilation is shared."""
+
+
+class Draws(Mapping[str, np.ndarray]):
+    """Posterior draws by name: every parameter of DESIGN 8, and derived quantities, each of shape (n,).
+
+    Derived: `degrees_per_step.left|right|up|down`, `effective_deg_per_step.left|right|up|down`,
+    `effective_contrast_deg_per_step.pan|tilt` (left - right, up - down), `effective_mirror_offset_mm`.
+    """
+
+    def __init__(self, draws: Derived):
+        physical = draws.physical.reshape(-1, draws.physical.shape[-1])
+        self._columns = dict(zip(NAMES, physical.T, strict=True))
+        for axis, positive, negative in (("pan", "left", "right"), ("tilt", "up", "down")):
+            ratio, half = (
+                self._columns[f"degrees_per_step.{axis}"],
+                self._columns[f"ratio_contrast_deg_per_step.{axis}"] / 2,
+            )
+            self._columns[f"degrees_per_step.{positive}"] = ratio + half
+            self._columns[f"degrees_per_step.{negative}"] = ratio - half
+        effective = draws.effective_deg_per_step.reshape(-1, len(DIRECTIONS))
+        self._columns |= {f"effective_deg_per_step.{d}": effective[:, k] for k, d in enumerate(DIRECTIONS)}
+        for axis, first in (("pan", 0), ("tilt", 2)):
+            self._columns[f"effective_contrast_deg_per_step.{axis}"] = effective[:, first] - effective[:, first + 1]
+        self._columns["effective_mirror_offset_mm"] = draws.effective_mirror_offset_mm.ravel()
+
+    def __getitem__(self, name: str) -> np.ndarray:
+        """Draws of one quantity."""
+        if name not in self._columns:
+            raise KeyError(f"no quantity {name!r}; there are: {', '.join(self._columns)}")
+        return self._columns[name]
+
+    def __iter__(self) -> Iterator[str]:
+        """Names."""
+        return iter(self._columns)
+
+    def __len__(self) -> int:
+        """Number of quantities."""
+        return len(self._columns)
+
+
+@dataclass(frozen=True)
+class Propagated:
+    """A quantity under the posterior; every field has the quantity's own shape.
+
+    Attributes:
+        mean, sd: of the posterior.
+        interval95: equal-tailed, first axis (low, high).
+        mcse_mean, mcse_sd, mcse_interval95: Monte Carlo standard errors of the above.
+        ess: bulk effective draws behind them.
+        draws: the values, shape (chain, draw, ...).
+    """
+
+    mean: np.ndarray
+    sd: np.ndarray
+    interval95: np.ndarray
+    mcse_mean: np.ndarray
+    mcse_sd: np.ndarray
+    mcse_interval95: np.ndarray
+    ess: np.ndarray
+    draws: np.ndarray
+
+
+@dataclass(frozen=True)
+class Posterior:
+    """A sampled posterior; look at `converged` before using it.
+
+    Attributes:
+        fit: the fit whose posterior it is.
+        z: stored draws of the prior-normal coordinates, shape (chain, draw, p).
+        log_density: their log posterior density, without `likelihood.log_constant`, shape (chain, draw).
+        draws: parameters and headlines in the units of DESIGN 8, fields with leading axes (chain, draw).
+        convergence: the diagnosis.
+        seed: of the chain.
+        seconds: spent sampling, earlier runs of a resumed chain included.
+    """
+
+    fit: JointFit
+    z: np.ndarray
+    log_density: np.ndarray
+    draws: Derived
+    convergence: Convergence
+    seed: int
+    seconds: float
+
+    @property
+    def converged(self) -> bool:
+        """All limits of DESIGN 4.3 are met."""
+        return self.convergence.converged
+
+    @property
+    def by_name(self) -> Draws:
+        """All draws by contract name, chains joined."""
+        return Draws(self.draws)
+
+    def thinned(self, count: int) -> Derived:
+        """At most `count` evenly chosen draws, chains joined: every field with one leading axis."""
+        total = self.z.shape[0] * self.z.shape[1]
+        chosen = np.linspace(0, total - 1, min(count, total)).astype(int)
+        return jax.tree.map(lambda x: x.reshape(total, *x.shape[2:])[chosen], self.draws)
+
+    def propagate(self, function: Callable[[Draws], np.ndarray]) -> Propagated:
+        """Carry the posterior into a quantity of your own.
+
+        Args:
+            function: is called once with all draws, a mapping from name to an array (n,) in the unit that the name
+                says, and returns one value per draw: an array (n,) or (n, ...). For instance what 200 steps to the
+                left turn after a reversal, deg: `lambda p: 200 * p["degrees_per_step.left"] - p["backlash_deg.pan"]`.
+                The names are those of `fit.json` and of `list(posterior.by_name)`.
+
+        Returns:
+            Mean, sd, interval and their Monte Carlo errors (JCGM 101 clause 7, with correlated draws), each of the
+            shape (...) of one value.
+
+        Raises:
+            ValueError: the function returned another number of rows, or values that are not finite.
+        """
+        values = np.asarray(function(self.by_name), dtype=float)
+        chains, draws = self.z.shape[:2]
+        if values.ndim == 0 or len(values) != chains * draws:
+            raise ValueError(
+                f"the function returned shape {values.shape}; its first axis must be the {chains * draws} draws it was "
+                "given: compute with whole arrays, not with their means"
+            )
+        if not np.all(np.isfinite(values)):
+            share = np.mean(~np.isfinite(values.reshape(len(values), -1)).all(axis=1))
+            raise ValueError(f"the function has no finite value for {100 * share:.2g} % of the draws")
+        return propagated(values.reshape(chains, draws, *values.shape[1:]))
+
+    def effective_deg_per_step(self, pan_deg: float, tilt_deg: float) -> Propagated:
+        """Effective degrees per step (left, right, up, down) at any pose of the mirrors (DESIGN 3.2)."""
+        with jax.enable_x64(True):
+            return propagated(derived_at(self.fit, self.z, np.radians([pan_deg, tilt_deg])).effective_deg_per_step)
+
+    def lost_motion_deg(self, direction: str, steps: np.ndarray) -> Propagated:
+        """Mirror angle that a move of `steps` loses after a reversal: min(k N, b) (play operator, DESIGN 3.1).
+
+        Args:
+            direction: left, right, up or down.
+            steps: numbers of steps N >= 0, shape (n,).
+
+        Returns:
+            Fields of shape (n,), deg; divided by N it is what a four-point estimate is short by.
+        """
+        if direction not in DIRECTIONS:
+            raise ValueError(f"direction {direction!r}; allowed: {', '.join(DIRECTIONS)}")
+        axis = "pan" if direction in ("left", "right") else "tilt"
+        count = np.atleast_1d(np.asarray(steps, dtype=float))
+        return self.propagate(
+            lambda p: np.minimum(
+                np.multiply.outer(p[f"degrees_per_step.{direction}"], count), p[f"backlash_deg.{axis}"][:, None]
+            )
+        )
+
+
+def propagated(values: np.ndarray) -> Propagated:
+    """Summary of draws (chain, draw, ...)."""
+    tails = (0.025, 0.975)
+    quantiles = np.quantile(values, tails, axis=(0, 1))
+    flat = values.reshape(*values.shape[:2], -1)
+    # A quantity that no draw changes has no effective number of draws and no Monte Carlo error.
+    moving = np.ptp(flat, axis=(0, 1)) > 0
+
+    def each(statistic: Callable[..., np.ndarray], otherwise: float, **options) -> np.ndarray:
+        result = np.full(flat.shape[2], otherwise)
+        if moving.any():
+            result[moving] = statistic(flat[..., moving], chain_axis=0, draw_axis=1, **options)
+        return result.reshape(values.shape[2:])
+
+    errors = [each(array_stats.mcse, 0.0, method="quantile", prob=prob) for prob in tails]
+    return Propagated(
+        mean=values.mean(axis=(0, 1)),
+        sd=values.std(axis=(0, 1)),
+        interval95=quantiles,
+        mcse_mean=each(array_stats.mcse, 0.0, method="mean"),
+        mcse_sd=each(array_stats.mcse, 0.0, method="sd"),
+        mcse_interval95=np.stack(errors),
+        ess=each(array_stats.ess, float(values.shape[0] * values.shape[1]), method="bulk"),
+        draws=values,
+    )
+
+
+def derived_at(fit: JointFit, z: np.ndarray, pose_rad: np.ndarray) -> Derived:
+    """Parameters and headlines of draws (chain, draw, p) at a pose (pan, tilt)."""
+    shape = z.shape[:2]
+    pose = jnp.asarray(pose_rad)
+    flat = in_batches(
+        lambda block: derived_quantities(block, fit.space, pose), z.reshape(-1, z.shape[-1]), DERIVED_BATCH
+    )
+    return jax.tree.map(lambda x: x.reshape(*shape, *x.shape[1:]), flat)

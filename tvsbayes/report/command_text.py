@@ -1,0 +1,272 @@
+"""What commands print besides a fit: cameras, coordinates, comparisons, plans, studies."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from tvsbayes.calibration.pointing import Steps
+from tvsbayes.errors import escaped
+from tvsbayes.planning.planner import PlanResult
+from tvsbayes.report.tables import concise, text_table, two_digits
+from tvsbayes.statistics.intervals import ASSURED, BOUND, LEVELS, binomial_bounds, rms_bounds
+from tvsbayes.studies.study import StudyResult
+
+if TYPE_CHECKING:
+    from tvsbayes.cameras.detection import Detection
+    from tvsbayes.cameras.stereo_calibration import StereoCalibration
+    from tvsbayes.coordinates.location import Locations
+    from tvsbayes.instrument.stereo_pair import Stereo
+    from tvsbayes.metrology.budget import Budget
+    from tvsbayes.results.comparison_record import Comparison, Gap, GapTerm, HoldOut
+
+
+def plan_text(result: PlanResult) -> str:
+    """A result for people."""
+    unit = result.target.unit
+    lines = [f"target: {result.target.text}; now {result.now:.3g} {unit}", ""]
+    lines.append("experiments  minutes     classic       joint  assurance")
+    for p in result.curve:
+        classic_value = "-" if p.classic is None else f"{p.classic:.3g}"
+        lines.append(
+            f"{p.experiments:11d}  {p.minutes:7.1f}  {classic_value:>10}  {p.joint:>10.3g}  "
+            f"{100 * p.assurance:5.0f} +- {100 * p.assurance_se:.1f} %"
+        )
+    lines.append(f"(four looks each; medians over {result.draws} drawn instruments, {unit})")
+    none = f"not reached with up to {result.curve[-1].experiments} experiments"
+    for level, n in zip(ASSURED, (result.n80, result.n95), strict=True):
+        lines.append(f"assurance {100 * level:.0f} %: {none if n is None else f'n = {n}'}")
+    if result.assurance is None:
+        lines.append("the target is met already: nothing is left to do")
+    else:
+        lines.append(
+            f"the plan: n = {result.experiments}, {result.looks} looks in {result.minutes:.1f} minutes; assurance "
+            f"{100 * result.assurance:.0f} +- {100 * result.assurance_se:.1f} %"
+        )
+    lines += ["", f"{'plan':10}  spots  in view  minutes  expected {unit}"]
+    lines += [f"{b.name:10}  {b.spots:5d}  {b.seen:7d}  {b.minutes:7.1f}  {b.joint:.3g}" for b in result.baselines]
+    shares = ", ".join(f"{name} {100 * s:.0f} %" for name, s in list(result.shares.items())[:5])
+    lines += ["", f"after the plan the variance consists of: {shares}"]
+    verdict = "lies below the target" if result.limit.reachable else "NO NUMBER OF LOOKS MEETS THE TARGET"
+    lines.append(f"floor {result.limit.floor:.3g} {unit}, set by {result.limit.cause}: {verdict}")
+    if result.limit.needed:
+        lines.append(result.limit.needed)
+    if result.classic is not None:
+        c = result.classic
+        low, high = c.experiments_interval95
+        source = "measured" if c.from_data else "predicted"
+        lines.append(
+            f"classic, {c.direction}: n = (t s / E)^2 = {c.experiments} per direction ({low} to {high}) for s = "
+            f"{c.sd:.2g} deg/step ({source}), E = {c.half_width:.2g}; its systematic error {c.systematic:+.2g} "
+            f"({c.systematic_interval95[0]:+.2g} to {c.systematic_interval95[1]:+.2g}) stays whatever n"
+        )
+    if result.next:
+        lines.append("next:")
+        lines += [f"  {b.gain_per_minute:.2g} {unit} a minute ({b.minutes:.1f} min): {b.text}" for b in result.next[:3]]
+    lines.append(f"{'STOP' if result.stop.now else 'go on'}: {result.stop.reason}; {result.stop.rule}")
+    lines += [f"note: {note}" for note in result.notes]
+    return "\n".join(lines)
+
+
+def stereo_text(stereo: Stereo) -> str:
+    """The 24 parameters of a pair with their standard uncertainties, both cameras beside each other."""
+    sds = np.sqrt(np.diag(stereo.parameter_covariance))
+    cells = [concise(float(value), float(sd)) for value, sd in zip(stereo.vector, sds, strict=True)]
+    names = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
+    units = ("px",) * 4 + ("",) * 5
+    rows = [[name, cells[k], cells[9 + k], unit] for k, (name, unit) in enumerate(zip(names, units, strict=True))]
+    title = f"stereo pair, {stereo.image_width} x {stereo.image_height} px"
+    cameras = text_table(title, ["", "left(u)", "right(u)", "unit"], rows)
+    rows = [[axis, cells[18 + k], cells[21 + k]] for k, axis in enumerate("xyz")]
+    return f"{cameras}\n{text_table('x_right = R x_left + T', ['', 'rotation, rad', 'T, mm'], rows)}"
+
+
+def stereo_calibration_text(result: StereoCalibration) -> str:
+    """A calibration from checkerboards: parameters, views, and everything the reader must know about it."""
+
+    def px(value: float | None) -> str:
+        return "-" if value is None else f"{value:.3f}"
+
+    rows = []
+    for view in result.views:
+        cells = [px(view.left_rms_px), px(view.right_rms_px), f"{view.distance_mm:.0f}", f"{view.tilt_deg:.0f}"]
+        rows.append([escaped(view.name) or "-", *cells, "OUTLIER" if view.outlier else ""])
+    columns = ["view", "left rms px", "right rms px", "distance mm", "tilt deg", ""]
+    board, mean_sd = result.board, result.triangulated_pitch_mm
+    lines = [
+        stereo_text(result.stereo),
+        text_table(f"{result.pairs} pairs, {len(result.views) - result.pairs} single views", columns, rows),
+        f"rms over corners: both {result.stereo.rms_px:.3f}, left {px(result.left_rms_px)}, right "
+        f"{px(result.right_rms_px)} px; one coordinate: sd {result.noise_sd_px:.3f} px, dof {result.dof}",
+        "uncertainties hold for corner errors that the corners of a picture share: variances "
+        f"{result.correlation_factor:.1f} times those of independent corners",
+        f"baseline {concise(float(np.linalg.norm(result.stereo.T)), result.baseline_sd_mm)} mm; squares, triangulated: "
+        f"{mean_sd[0]:.3f} mm on average, sd {mean_sd[1]:.3f}, stated {board.pitch_mm:g}",
+        "boards cover "
+        + ", ".join(f"{100 * share:.0f} % of the {side} image" for side, share in result.coverage.items()),
+    ]
+    if (found := result.found) is not None:
+        lists = {
+            "without their counterpart": found.unpaired,
+            "no board found": found.without_board,
+            "another size, not used": found.other_size,
+            "found by the other finder": found.by_fallback,
+            "right corners turned to agree": found.reordered,
+        }
+        lines += [f"{what}: {escaped(', '.join(names), 400)}" for what, names in lists.items() if names]
+    if result.excluded:
+        lines.append(f"left out: {escaped(', '.join(result.excluded), 400)}")
+    lines += [f"warning: {warning}" for warning in result.warnings]
+    return "\n".join(lines)
+
+
+def detection_text(found: Detection) -> str:
+    """What `detect` found, as a table of statuses."""
+    from tvsbayes.cameras.detection import REASONS
+
+    rows = [[status, str(count), REASONS.get(status.split(" ")[0], "")] for status, count in found.statuses.items()]
+    rows += [["undetected", str(found.missing), "no frames"]] if found.missing else []
+    rows += [["as it was", str(found.kept), "refused by somebody else"]] if found.kept else []
+    noise = ", ".join(
+        f"{side} contrast {one.speckle_contrast:.2f}, gain {one.gain_dn:.3f} DN" for side, one in found.noise.items()
+    )
+    sd = (
+        ""
+        if found.median_sd_px is None
+        else f"median standard uncertainty of a coordinate {found.median_sd_px:.3f} px; "
+    )
+    title = f"{found.processed} looks"
+    return f"{text_table(title, ['status', 'looks', 'meaning'], rows)}\nmethod {found.method}; {sd}noise: {noise}"
+
+
+def locations_text(found: Locations) -> str:
+    """Points with their uncertainty."""
+    rows = []
+    for index, error in enumerate(found.refused):
+        if error is not None:
+            rows.append([str(index), f"refused: {error.code}", "", "", "", ""])
+            continue
+        sd = np.sqrt(np.diag(found.covariance_mm2[index]))
+        cells = [concise(float(x), float(u)) for x, u in zip(found.xyz_mm[index], sd, strict=True)]
+        half = " ".join(map(two_digits, found.u95_mm[index]))
+        held = int(found.digits_held[index].min())
+        verdict = f"validated at {held} digit{'s' * (held > 1)}" if held else "not validated"
+        rows.append([str(index), *cells, half, verdict])
+    columns = ["point", "x(u) mm", "y(u) mm", "z(u) mm", "U95 mm", "linear propagation"]
+    return text_table(f"frame T, {found.draws} draws ({found.estimator})", columns, rows)
+
+
+def budget_text(budget: Budget) -> str:
+    """Uncertainty budget of a point: causes by share, then the parameters that contribute most."""
+    order = np.argsort(-budget.share)
+    rows = []
+    for k in order[budget.share[order] >= 0.0005]:
+        parts = [f"{np.sqrt(v):.3g}" for v in budget.variance_mm2[k]]
+        rows.append([budget.causes[k], f"{100 * budget.share[k]:.1f}", *parts])
+    causes = text_table("uncertainty by cause", ["cause", "share %", "u(x) mm", "u(y) mm", "u(z) mm"], rows)
+    size = np.linalg.norm(budget.contribution_mm, axis=1)
+    rows = [
+        [budget.parameters[k], *(f"{v:+.3g}" for v in budget.contribution_mm[k])]
+        for k in np.argsort(-size)[:10]
+        if size[k] > 0
+    ]
+    title = "by parameter, one standard uncertainty each (correlated: they do not add up)"
+    return f"{causes}\n\n{text_table(title, ['parameter', 'x mm', 'y mm', 'z mm'], rows)}"
+
+
+def steps_text(steps: Steps) -> str:
+    """Counters, the way there, and what remains."""
+    pan, tilt = steps.approach
+    lines = [
+        f"go to      pan {steps.via_pan_steps}, tilt {steps.via_tilt_steps} steps (takes up the backlash)",
+        f"then to    pan {steps.pan_steps}, tilt {steps.tilt_steps} steps, moving {pan} and {tilt}",
+    ]
+    if steps.xyz_mm is not None:
+        half = ", ".join(map(two_digits, steps.u95_mm))
+        lines.append(f"whole steps leave {steps.rounding_mm:.3g} mm; beam there +- ({half}) mm (95 %)")
+        lines.append(f"the aperture should read {steps.aperture_deg:.3f} deg")
+    else:
+        half = ", ".join(map(two_digits, steps.u95_deg))
+        lines.append(f"whole steps leave {steps.rounding_deg:.3g} deg; azimuth and elevation +- ({half}) deg (95 %)")
+    return "\n".join(lines)
+
+
+def gap_text(gaps: dict[str, Gap | None]) -> str:
+    """The gap between both estimators by its terms."""
+    found = {direction: gap for direction, gap in gaps.items() if gap is not None}
+    rows = [
+        ["classic mean", *(f"{gap.classic:.6f}" for gap in found.values())],
+        ["effective ratio (joint)", *(concise(gap.joint.value, gap.joint.sd) for gap in found.values())],
+        ["classic - joint", *(signed(gap.total) for gap in found.values())],
+    ]
+    for number, term in enumerate(next(iter(found.values())).terms):
+        rows.append([f"  {term.name}", *(signed(gap.terms[number]) for gap in found.values())])
+    return text_table("why the classic differs from the joint, deg/step, value(u)", ["", *found], rows)
+
+
+def signed(term: GapTerm) -> str:
+    """A difference with its sign, value(u)."""
+    text = concise(term.value, term.sd)
+    return text if text.startswith("-") else f"+{text}"
+
+
+def hold_out_text(held: HoldOut) -> str:
+    """Who foretells left-out angles better, and what no hold-out can see."""
+    lines = []
+    if held.classic is not None:
+        rows = [
+            [
+                name,
+                f"{score.rms_deg:.3f}",
+                f"{score.rms_block_deg:.3f}",
+                f"{100 * score.coverage:.0f} %",
+                f"{score.log_density:+.2f}",
+            ]
+            for name, score in (("classic", held.classic), ("joint", held.joint))
+        ]
+        title = f"angles of {len(held.predictions)} experiments left out by {held.by}, deg"
+        columns = ["", "rms error", "rms of block means", "inside 95 %", "log density"]
+        lines.append(text_table(title, columns, rows))
+    lines.append(f"held-out angles: {held.verdict}: {held.reason}")
+    common = ", ".join(f"{d} {u:.1e}" for d, u in held.unseen.items())
+    lines.append(f"not seen by any hold-out, common to all spots: u by stereo and focal scale, deg/step: {common}")
+    return "\n".join(lines)
+
+
+def changes_text(comparison: Comparison) -> str:
+    """Two calibrations of one instrument."""
+    rows = []
+    for c in comparison.changes:
+        cells = [c.quantity, f"{c.first:.6f}", f"{c.second:.6f}", concise(c.difference, c.u), c.unit]
+        normalised = "fixed" if c.normalised is None else f"{c.normalised:+.2f}"
+        rows.append([*cells, normalised, "yes" if c.significant else "no"])
+    pan, tilt = comparison.reference_pose_deg
+    title = f"A and B at pan {pan:.2f} deg, tilt {tilt:.2f} deg"
+    table = text_table(title, ["quantity", "A", "B", "B - A (u)", "unit", "normalised", "significant"], rows)
+    days = "" if comparison.days is None else f" in {comparison.days:.1f} days"
+    cameras = "the same stereo calibration: its error is left out of u" if comparison.shared_cameras else "two cameras"
+    return f"{table}\n{comparison.verdict}{days} (limit {comparison.limit:.2f} u for all together; {cameras})"
+
+
+def study_text(result: StudyResult) -> str:
+    """A study for people."""
+    n, t = result.converged, result.target
+    low, high = rms_bounds(n)
+    lines = [
+        f"{result.campaigns} simulated campaigns, {n} fits converged; {result.seconds:.1f} s each",
+        "headline        median sd  RMS z  predicted  " + "  ".join(f"{100 * x:3.0f} %" for x in LEVELS) + "  power",
+        f"bounds at {BOUND:g}        {low:.2f}-{high:.2f}".ljust(48)
+        + "  ".join("{:.0f}-{:.0f}".format(*(100 * b for b in binomial_bounds(n, x))) for x in LEVELS),
+    ]
+    for name, h in result.headlines.items():
+        shares = "  ".join(f"{100 * h.coverage[f'{100 * x:g}']:5.1f}" for x in LEVELS)
+        numbers = f"{h.sd:9.3g}  {h.rms_z:5.2f}  {h.rms_predicted:9.2f}  {shares}  {h.power:5.2f}"
+        lines.append(f"{name:14}  {numbers}  {'within' if h.within else 'OUTSIDE'}")
+    a, b = result.assurance_interval95
+    share = f"{100 * result.assurance:.1f} % of fits ({100 * a:.1f} to {100 * b:.1f} %)"
+    lines.append(f"{t.text}: reported as met by {share}")
+    if result.reported is not None:
+        lines.append("reported: {:.3g}, {:.3g}, {:.3g}".format(*result.reported) + f" {t.unit} (5, 50, 95 % of fits)")
+    lines += [f"failed: {p}" for p in result.problems[:5]]
+    return "\n".join(lines)

@@ -1,0 +1,437 @@
+"""The paper's figures for any campaign, and the pictures of a calibration report, as matplotlib figures.
+
+Every function takes results and returns a `matplotlib.figure.Figure` that no window owns: nothing is shown, and no
+global setting of matplotlib is touched; importing the module loads none of it. Frame S (X depth, Y left, Z up) in mm;
+ratios in deg/step; angles in deg. Figures are one phone's width (4.6 inch) with text of 9 points. Colours are Okabe
+and Ito's (safe for colour-blind readers, jfly.uni-koeln.de/color); wherever a colour means something, a marker or a
+label says the same.
+"""
+
+from __future__ import annotations
+
+import io
+import re
+from collections.abc import Mapping, Sequence
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from tvsbayes.estimators.four_point import ClassicResult, select_experiments
+from tvsbayes.instrument.axes import DIRECTIONS
+from tvsbayes.instrument.stereo_pair import triangulate
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from matplotlib.axes import Axes
+    from matplotlib.colors import Colormap
+    from matplotlib.figure import Figure
+
+    from tvsbayes.coordinates.error_map import ErrorMap
+    from tvsbayes.instrument.campaign import Campaign, Spot
+    from tvsbayes.metrology.budget import Budget
+
+
+WIDTH_IN = 4.6
+BLACK, ORANGE, SKY, GREEN, BLUE, RED, PURPLE, GREY = (
+    *("#000000", "#E69F00", "#56B4E9", "#009E73", "#0072B2", "#D55E00", "#CC79A7"),
+    "#767676",
+)
+OF_ESTIMATOR = {"nominal": (GREY, "s"), "classic": (RED, "^"), "joint": (BLUE, "o")}
+"""Colour and marker of each estimator in every figure."""
+SMALLEST_SHARE = 0.005
+"""Of a variance, that has a bar of its own."""
+DIVERGING, SEQUENTIAL = (BLUE, "#FFFFFF", RED), ("#FFFFFF", SKY, BLUE, "#00263E")
+"""Colours of maps, from the lowest to the highest value."""
+RASTER_DPI = 150
+"""Of the parts of a figure with hundreds of points."""
+STYLE = {
+    "font.size": 9.0,
+    "axes.titlesize": 9.5,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "grid.color": "#DDDDDD",
+    "grid.linewidth": 0.6,
+    "legend.frameon": False,
+    "legend.fontsize": 8.0,
+    "svg.hashsalt": "tvsbayes",
+}
+
+
+@contextmanager
+def _figure(height_in: float) -> Iterator[Figure]:
+    """A figure in the house style; the caller fills it."""
+    from matplotlib import rc_context
+    from matplotlib.figure import Figure
+
+    with rc_context(STYLE):
+        yield Figure(figsize=(WIDTH_IN, height_in), layout="constrained")
+
+
+def _colours(stops: Sequence[str]) -> Colormap:
+    from matplotlib.colors import LinearSegmentedColormap
+
+    return LinearSegmentedColormap.from_list("-".join(stops), stops)
+
+
+def svg(figure: Figure) -> bytes:
+    """A figure as an SVG document; the same figure gives the same bytes."""
+    from matplotlib import rc_context
+    from matplotlib.backends.backend_svg import FigureCanvasSVG
+
+    buffer, dpi = io.BytesIO(), figure.dpi
+    # The identifiers in the file are drawn when it is written. The canvas draws once, where `savefig` draws a first
+    # time for the layout alone.
+    with rc_context(STYLE):
+        figure.dpi = RASTER_DPI
+        FigureCanvasSVG(figure).print_svg(buffer, metadata={"Date": None, "Creator": None})
+        figure.dpi = dpi
+    return re.sub(rb">\s+<", b"><", buffer.getvalue())
+
+
+def _measured(campaign: Campaign) -> tuple[list[Spot], np.ndarray]:
+    """The usable spots and where the stated cameras see them, shape (n, 3), mm in frame S."""
+    spots = [spot for spot in campaign.spots if spot.status == "ok"]
+    pixels = np.array([(s.u_left_px, s.v_left_px, s.u_right_px, s.v_right_px) for s in spots], dtype=float)
+    return spots, triangulate(campaign.stereo, pixels.reshape(-1, 4))
+
+
+def _experiment(campaign: Campaign, experiment: int) -> tuple[np.ndarray, str, int]:
+    """Points 1 to 4 (4, 3) of a complete experiment, its axis and N."""
+    selection = select_experiments(campaign)
+    rows = np.flatnonzero(selection.experiments == experiment)
+    if not len(rows):
+        known = ", ".join(map(str, selection.experiments[:10]))
+        raise ValueError(f"experiment {experiment} is not complete; complete are {known or 'none'}")
+    row = rows[0]
+    points = triangulate(campaign.stereo, selection.pixels[row])
+    return points, str(selection.axis[row]), int(selection.steps[row])
+
+
+def trajectories(campaign: Campaign, experiment: int) -> Figure:
+    """The beam before and after the steps of one experiment, in the plane of its angle (paper, Figures 10 and 12).
+
+    Raises:
+        ValueError: the experiment is not complete.
+    """
+    points, axis, steps = _experiment(campaign, experiment)
+    across = 1 if axis == "pan" else 2
+    before, after = points[[0, 1]], points[[3, 2]]
+    with _figure(3.6) as figure:
+        axes = figure.add_subplot()
+        for pair, name, colour, marker in ((before, "before", BLUE, "o"), (after, "after", RED, "^")):
+            run = pair[1] - pair[0]
+            start, end = pair[0] - 0.6 * run, pair[1] + 0.2 * run
+            axes.plot([start[0], end[0]], [start[across], end[across]], color=colour, linewidth=1)
+            angle = np.degrees(np.arctan2(run[across], run[0]))
+            label = f"{name}: {angle:.2f} deg"
+            axes.plot(pair[:, 0], pair[:, across], marker, color=colour, label=label, linestyle="none")
+        for number, point in enumerate(points, start=1):
+            axes.annotate(f"P{number}", (point[0], point[across]), (4, 5), textcoords="offset points")
+        title = f"experiment {experiment}: {axis} by {steps:+d} steps"
+        axes.set(xlabel="X (depth), mm", ylabel=f"{'Y (left)' if across == 1 else 'Z (up)'}, mm", title=title)
+        axes.legend()
+    return figure
+
+
+def points_3d(campaign: Campaign, experiment: int | None = None) -> Figure:
+    """Spots in frame S: the four of one experiment, or all of a campaign (paper, Figure 11).
+
+    Raises:
+        ValueError: the experiment is not complete.
+    """
+    if experiment is None:
+        _, points = _measured(campaign)
+    else:
+        points = _experiment(campaign, experiment)[0]
+    with _figure(4.0) as figure:
+        axes = figure.add_subplot(projection="3d")
+        axes.scatter(*points.T, s=12 if experiment is None else 40, color=BLUE, depthshade=False, rasterized=True)
+        if experiment is not None:
+            axes.plot(*points.T, color=GREY, linewidth=0.8)
+            for number, point in enumerate(points, start=1):
+                axes.text(*point, f"  P{number}")
+        axes.set(xlabel="X (depth), mm", ylabel="Y (left), mm", zlabel="Z (up), mm")
+        axes.set_box_aspect(None, zoom=0.82)
+    return figure
+
+
+def direction_scatter(result: ClassicResult, direction: str, joint: tuple[float, float] | None = None) -> Figure:
+    """One direction's experiments with mean and bands of 1, 2, 3 sigma (paper, Figures 13 to 16).
+
+    Args:
+        result: of the classic estimator.
+        direction: left, right, up or down.
+        joint: value and standard uncertainty of the joint estimator, drawn beside.
+
+    Raises:
+        ValueError: the direction has no experiment.
+    """
+    summary = result.directions[direction]
+    if summary is None:
+        raise ValueError(f"no complete experiment moves {direction}")
+    mine = [e for e in result.experiments if e.direction == direction]
+    mean, sd = summary.mean_deg_per_step, summary.sd_deg_per_step
+    with _figure(3.2) as figure:
+        axes = figure.add_subplot()
+        if sd is not None:
+            for k, shade in ((3, "#F0F0F0"), (2, "#E0E0E0"), (1, "#CCCCCC")):
+                axes.axhspan(mean - k * sd, mean + k * sd, color=shade, label=f"{k} sigma", zorder=0)
+        axes.axhline(mean, color=RED, label=f"mean {mean:.6f}")
+        if joint is not None:
+            label = f"joint {joint[0]:.6f}, 2 u"
+            axes.errorbar(len(mine) + 1.5, joint[0], 2 * joint[1], fmt="o", color=BLUE, capsize=3, label=label)
+        axes.plot(range(1, len(mine) + 1), [e.deg_per_step for e in mine], "^", color=BLACK, markersize=4)
+        axes.set(xlabel="experiment of this direction", ylabel="deg/step", title=f"{direction}, n = {summary.n}")
+        figure.legend(loc="outside lower center", ncols=3)
+    return figure
+
+
+def setup(
+    campaign: Campaign, translation_mm: Sequence[float] | None = None, baseline_mm: float | None = None
+) -> Figure:
+    """The rig from above and from the side in frame S: cameras, positioner, spots.
+
+    Args:
+        campaign: for spots and cameras.
+        translation_mm: origin of the positioner's frame P in S, (3,), as estimated; None leaves it out.
+        baseline_mm: of the TVS, for the caption of the positioner.
+    """
+    _, points = _measured(campaign)
+    right = -campaign.stereo.R.T @ campaign.stereo.T
+    right_s = np.array([right[2], -right[0], -right[1]])
+    with _figure(5.4) as figure:
+        panels = figure.subplots(2, 1, sharex=True, height_ratios=(3, 2))
+        for axes, across, name in ((panels[0], 1, "Y (left), mm"), (panels[1], 2, "Z (up), mm")):
+            axes.plot(points[:, 0], points[:, across], ".", color=RED, markersize=3, label="spots", rasterized=True)
+            for centre, label in ((np.zeros(3), "left camera"), (right_s, "right camera")):
+                marker = "s" if label.startswith("left") else "D"
+                axes.plot(centre[0], centre[across], marker, color=GREEN, label=label, linestyle="none")
+            if translation_mm is not None:
+                origin = np.asarray(translation_mm, dtype=float)
+                axes.plot(
+                    origin[0], origin[across], "^", color=BLUE, markersize=8, label="positioner", linestyle="none"
+                )
+                for point in points[np.unique(np.round(points, -1), axis=0, return_index=True)[1][:24]]:
+                    axes.plot([origin[0], point[0]], [origin[across], point[across]], color=ORANGE, linewidth=0.5)
+            axes.set_ylabel(name)
+            axes.set_aspect("equal", adjustable="datalim")
+        panels[0].set_title("from above" + ("" if baseline_mm is None else f"; TVS baseline {baseline_mm:.4g} mm"))
+        panels[1].set(xlabel="X (depth), mm", title="from the side")
+        figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=4)
+    return figure
+
+
+def coverage(campaign: Campaign) -> Figure:
+    """Where the data lie: counters seen, and spots in both images."""
+    from matplotlib.patches import Rectangle
+
+    spots, _ = _measured(campaign)
+    moves = {move.move: move for move in campaign.moves}
+    counters = np.array([(moves[s.move].pan_steps, moves[s.move].tilt_steps) for s in spots]).reshape(-1, 2)
+    with _figure(5.6) as figure:
+        panels = figure.subplots(2, 1)
+        poses, counts = np.unique(counters, axis=0, return_counts=True)
+        panels[0].scatter(*poses.T, s=8 + 4 * np.sqrt(counts), color=BLUE, marker="o")
+        panels[0].set(xlabel="pan counter, steps", ylabel="tilt counter, steps", title="poses; area grows with spots")
+        for side, colour, marker in (("left", GREEN, "s"), ("right", RED, "^")):
+            u, v = ([getattr(s, f"{c}_{side}_px") for s in spots] for c in "uv")
+            panels[1].plot(u, v, marker, color=colour, markersize=2.5, label=f"{side} image", rasterized=True)
+        width, height = campaign.stereo.image_width, campaign.stereo.image_height
+        panels[1].add_patch(Rectangle((0, 0), width, height, fill=False, color=GREY))
+        panels[1].set(xlabel="u, px", ylabel="v, px", title="spots in the images; frame: the sensor")
+        panels[1].set(xlim=(-0.02 * width, 1.02 * width), ylim=(1.02 * height, -0.02 * height))
+        panels[1].set_aspect("equal")
+        figure.legend(loc="outside lower center", ncols=2)
+    return figure
+
+
+def intervals(
+    joint: Mapping[str, tuple[float, tuple[float, float]] | None],
+    classic: Mapping[str, tuple[float, tuple[float, float] | None] | None],
+) -> Figure:
+    """Ratios of both estimators with their 95 % intervals; value and interval by direction, deg/step."""
+    with _figure(3.2) as figure:
+        axes = figure.add_subplot()
+        for offset, name, results in ((-0.12, "classic", classic), (0.12, "joint", joint)):
+            colour, marker = OF_ESTIMATOR[name]
+            labelled = False
+            for row, direction in enumerate(DIRECTIONS):
+                found = results.get(direction)
+                if found is None:
+                    continue
+                value, interval = found
+                low, high = interval or (value, value)
+                bars = [[max(value - low, 0.0)], [max(high - value, 0.0)]]
+                label = None if labelled else name
+                style = {"fmt": marker, "color": colour, "capsize": 3, "label": label}
+                axes.errorbar(value, row + offset, xerr=bars, **style)
+                labelled = True
+        axes.set(yticks=range(len(DIRECTIONS)), yticklabels=DIRECTIONS, xlabel="deg/step, 95 % intervals")
+        axes.invert_yaxis()
+        axes.tick_params(axis="x", labelrotation=30)
+        figure.legend(loc="outside lower center", ncols=2)
+    return figure
+
+
+def gap_terms(gaps: Mapping[str, Mapping[str, Any] | None]) -> Figure:
+    """Terms of (classic - joint), deg/step, by direction; `gaps` as `fit.json` and `compare.json` hold them."""
+    found = {direction: each for direction, each in gaps.items() if each is not None}
+    markers = dict(zip(DIRECTIONS, "<>^v", strict=True))
+    colours = dict(zip(DIRECTIONS, (BLUE, RED, GREEN, ORANGE), strict=True))
+    names = [term["name"] for term in next(iter(found.values()))["terms"]]
+    with _figure(3.6) as figure:
+        axes = figure.add_subplot()
+        for shift, (direction, each) in zip(np.linspace(-0.24, 0.24, len(found)), found.items(), strict=True):
+            values = np.array([t["value"] for t in each["terms"]])
+            ends = np.array([t["interval95"] for t in each["terms"]])
+            bars = np.abs(ends.T - values)
+            place = np.arange(len(names)) + shift
+            style = {"fmt": markers[direction], "color": colours[direction], "capsize": 2, "label": direction}
+            axes.errorbar(values, place, xerr=bars, markersize=4, **style)
+        axes.axvline(0.0, color=BLACK, linewidth=0.8)
+        wrapped = [name.replace(" and ", "\nand ", 1).replace(" over", "\nover") for name in names]
+        axes.set(yticks=range(len(names)), yticklabels=wrapped, xlabel="classic - joint, deg/step, 95 % intervals")
+        axes.invert_yaxis()
+        axes.tick_params(axis="x", labelrotation=30)
+        figure.legend(loc="outside lower center", ncols=4)
+    return figure
+
+
+def correlations(names: Sequence[str], matrix: np.ndarray) -> Figure:
+    """Correlations with their values in the cells."""
+    count = len(names)
+    with _figure(0.9 + 0.42 * count) as figure:
+        axes = figure.add_subplot()
+        axes.imshow(matrix, cmap=_colours(DIVERGING), vmin=-1, vmax=1)
+        for row in range(count):
+            for column in range(count):
+                shade = "white" if abs(matrix[row, column]) > 0.8 else "black"
+                text = f"{round(100 * matrix[row, column])}"
+                axes.text(column, row, text, ha="center", va="center", fontsize=8, color=shade)
+        axes.set(xticks=range(count), yticks=range(count), yticklabels=names, title="correlation, %")
+        axes.set_xticklabels(names, rotation=60, ha="right", rotation_mode="anchor")
+        axes.grid(False)
+    return figure
+
+
+def residuals(stops: Sequence[Mapping[str, Any]], axis: str) -> Figure:
+    """Deviations of one axis' stops over time and against their counters; `stops` as `fit.json` holds them."""
+    mine = [stop for stop in stops if stop["axis"] == axis]
+    directions = ("left", "right") if axis == "pan" else ("up", "down")
+    with _figure(4.6) as figure:
+        panels = figure.subplots(2, 1, sharey=True)
+        for direction, colour, marker in (*zip(directions, (BLUE, RED), "^v", strict=True), ("", GREY, "x")):
+            part = [stop for stop in mine if stop["direction"] == direction]
+            if not part:
+                continue
+            scaled = [stop["deviation_deg"] / stop["u_deg"] for stop in part]
+            style = {"color": colour, "markersize": 3.5, "linestyle": "none", "rasterized": True}
+            label = f"moving {direction}" if direction else "unknown approach"
+            panels[0].plot([stop["time_s"] for stop in part], scaled, marker, label=label, **style)
+            panels[1].plot([stop["steps"] for stop in part], scaled, marker, **style)
+        for axes, name in zip(panels, ("time, s", f"{axis} counter, steps"), strict=True):
+            axes.axhspan(-2, 2, color="#EEEEEE", zorder=0)
+            axes.axhline(0.0, color=BLACK, linewidth=0.8)
+            axes.set(xlabel=name, ylabel="deviation / u")
+        panels[0].set_title(f"stops of the {axis} axis, {len(mine)}; band: 2 standard deviations")
+        figure.legend(loc="outside lower center", ncols=3)
+    return figure
+
+
+def causes(found: Sequence[Mapping[str, Any]], axis: str) -> Figure:
+    """Mean deviation by group of each cause, with two standard errors; `found` as `fit.json` holds it."""
+    mine = [cause for cause in found if cause["axis"] == axis and len(cause["groups"]) > 1]
+    rows = sum(len(cause["groups"]) for cause in mine)
+    with _figure(1.2 + 0.22 * max(rows, 2)) as figure:
+        axes = figure.add_subplot()
+        labels, place = [], 0
+        for cause in mine:
+            colour, marker = (RED, "D") if cause["suspicious"] else (BLUE, "o")
+            for group in cause["groups"]:
+                style = {"fmt": marker, "color": colour, "markersize": 4}
+                axes.errorbar(group["mean"], place, xerr=2 * group["standard_error"], **style)
+                labels.append(f"{cause['name']}: {group['label']}")
+                place += 1
+            axes.axhline(place - 0.5, color="#CCCCCC", linewidth=0.6)
+        axes.axvline(0.0, color=BLACK, linewidth=0.8)
+        axes.set(yticks=range(len(labels)), yticklabels=labels, xlabel="mean deviation / u, two standard errors")
+        axes.invert_yaxis()
+        axes.tick_params(axis="y", labelsize=8)
+    return figure
+
+
+def error_maps(found: ErrorMap, range_index: int) -> Figure:
+    """Root mean square 3D error of each estimator over pan and tilt at one range, mm."""
+    names = [name for name in OF_ESTIMATOR if name in found.rms_mm]
+    with _figure(0.5 + 1.75 * len(names)) as figure:
+        panels = np.atleast_1d(figure.subplots(len(names), 1, sharex=True))
+        # One scale for all: equal colours are equal errors.
+        every = np.concatenate([found.rms_mm[name][:, :, range_index].ravel() for name in names])
+        seen = every[np.isfinite(every)]
+        low, high = (float(seen.min()), float(seen.max())) if len(seen) else (0.0, 1.0)
+        for axes, name in zip(panels, names, strict=True):
+            values = found.rms_mm[name][:, :, range_index].T
+            scale = {"cmap": _colours(SEQUENTIAL), "vmin": low, "vmax": high}
+            mesh = axes.pcolormesh(found.pan_steps, found.tilt_steps, values, **scale, rasterized=True)
+            figure.colorbar(mesh, ax=axes, label="mm")
+            _cells(axes, found.pan_steps, found.tilt_steps, values, low + 0.55 * (high - low))
+            axes.set(ylabel="tilt, steps", title=f"{name}, range {found.range_mm[range_index]:.4g} mm")
+            axes.grid(False)
+        panels[-1].set_xlabel("pan, steps")
+    return figure
+
+
+def _cells(axes: Axes, x: np.ndarray, y: np.ndarray, values: np.ndarray, dark_above: float) -> None:
+    """Values written into a map of few cells, white on dark ones."""
+    for row, yy in enumerate(y):
+        for column, xx in enumerate(x):
+            value = values[row, column]
+            if np.isfinite(value):
+                colour = "white" if value > dark_above else "black"
+                style = {"ha": "center", "va": "center", "fontsize": 7, "color": colour}
+                axes.text(xx, yy, f"{value:.3g}", **style)
+
+
+def shares(budget: Budget) -> Figure:
+    """Shares of a point's variance by cause, largest first; what is below `SMALLEST_SHARE` is one bar."""
+    order = np.argsort(-budget.share)
+    kept = [k for k in order if budget.share[k] >= SMALLEST_SHARE]
+    names = [budget.causes[k] for k in kept]
+    values = [100 * budget.share[k] for k in kept]
+    rest = 100 - sum(values)
+    if rest > 0.05:
+        names.append("all others")
+        values.append(rest)
+    with _figure(0.9 + 0.26 * len(names)) as figure:
+        axes = figure.add_subplot()
+        bars = axes.barh(range(len(names)), values, color=SKY, edgecolor=BLACK, linewidth=0.5)
+        axes.bar_label(bars, labels=[f"{value:.1f} %" for value in values], padding=3, fontsize=8)
+        axes.set(yticks=range(len(names)), yticklabels=names, xlabel="share of the variance, %")
+        axes.set_xlim(0, 1.2 * max(values))
+        axes.invert_yaxis()
+    return figure
+
+
+def ratio_curves(curves: Mapping[str, Sequence[Mapping[str, object]]]) -> Figure:
+    """Effective ratios along both axes with 95 % intervals; `curves` as `fit.json` holds them."""
+    with _figure(5.4) as figure:
+        panels = figure.subplots(2, 1)
+        markers = dict(zip(DIRECTIONS, "<>^v", strict=True))
+        colours = dict(zip(DIRECTIONS, (BLUE, RED, GREEN, ORANGE), strict=True))
+        for axes, axis, shown in zip(panels, ("pan", "tilt"), (DIRECTIONS[:2], DIRECTIONS[2:]), strict=True):
+            angle = np.array([entry[f"{axis}_deg"] for entry in curves[axis]])
+            for shift, direction in zip((-0.01, 0.01), shown, strict=True):
+                entries = [entry.get(direction) for entry in curves[axis]]
+                if any(entry is None for entry in entries):
+                    continue
+                value = np.array([entry["value"] for entry in entries])
+                ends = np.array([entry["interval95"] for entry in entries])
+                style = {"fmt": markers[direction] + "-", "color": colours[direction], "capsize": 2, "markersize": 4}
+                place = angle + shift * np.ptp(angle)
+                axes.errorbar(place, value, yerr=np.abs(ends.T - value), label=direction, **style)
+            axes.set(xlabel=f"{axis} angle, deg", ylabel="deg/step")
+            axes.legend()
+    return figure

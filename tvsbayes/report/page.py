@@ -1,0 +1,236 @@
+"""The page: verdict, numbers, warnings; HTML and PDF."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import os
+import shutil
+import subprocess
+import tempfile
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from markupsafe import Markup
+
+from tvsbayes.errors import InputError
+from tvsbayes.files.disk import shipped_data, write_atomically
+from tvsbayes.metrology.dcc import traceability
+from tvsbayes.report.fit_sections import (
+    identifiability_section,
+    residuals_section,
+    results_section,
+    setup_section,
+    validation_section,
+)
+from tvsbayes.report.fit_text import few_stops_line, suspect_line, validation_lines
+from tvsbayes.report.tables import Number, Page, TableView, concise, two_digits
+from tvsbayes.report.uncertainty_sections import (
+    axes_section,
+    budgets_section,
+    limits_section,
+    maps_section,
+    method_section,
+    plan_section,
+)
+
+if TYPE_CHECKING:
+    from tvsbayes.report.evidence import Evidence
+
+
+BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome", "msedge")
+PDF_SECONDS = 120
+
+
+def find_browser() -> str:
+    """The program that prints pages.
+
+    Raises:
+        InputError: none is installed.
+    """
+    browser = next(filter(None, map(shutil.which, BROWSERS)), None)
+    if browser is None:
+        message = f"--pdf needs one of {', '.join(BROWSERS)} on the path"
+        raise InputError("no-browser", message, remedy="print the page from any browser (A4)")
+    return browser
+
+
+def print_to_pdf(page: Path) -> Path:
+    """Print a report with an installed Chromium or Chrome; the PDF lies beside it.
+
+    Raises:
+        InputError: none is installed, or it failed.
+    """
+    browser = find_browser()
+    target = page.with_suffix(".pdf")
+    remedy = f"open {page} in any browser and print it to PDF (A4)"
+    with tempfile.TemporaryDirectory(prefix="tvsbayes-") as scratch:
+        printed = Path(scratch) / "report.pdf"
+        flags = ["--headless", "--disable-gpu", "--no-first-run", "--disable-background-networking", "--disable-sync"]
+        if hasattr(os, "geteuid") and os.geteuid() == 0:
+            # Chromium's own walls cannot be built by root; the page is ours and holds no script.
+            flags.append("--no-sandbox")
+        flags += ["--no-pdf-header-footer", "--generate-pdf-document-outline", f"--user-data-dir={scratch}/profile"]
+        command = [browser, *flags, f"--print-to-pdf={printed}", page.resolve().as_uri()]
+        try:
+            done = subprocess.run(command, capture_output=True, timeout=PDF_SECONDS, check=False)
+        except (OSError, subprocess.TimeoutExpired) as error:
+            raise InputError("pdf", f"{Path(browser).name} did not print the report", remedy=remedy) from error
+        if done.returncode or not printed.exists():
+            raise InputError("pdf", f"{Path(browser).name} ended with code {done.returncode}", remedy=remedy)
+        write_atomically(target, printed.read_bytes())
+    return target
+
+
+def report_html(evidence: Evidence) -> bytes:
+    """The report, UTF-8.
+
+    Args:
+        evidence: computed beforehand; nothing is computed here.
+    """
+    folder = shipped_data() / "report"
+    environment = Environment(
+        loader=FileSystemLoader(str(folder)), autoescape=True, undefined=StrictUndefined, trim_blocks=True
+    )
+    page = _page(evidence)
+    css = (folder / "report.css").read_text(encoding="utf-8").replace("@ID@", page.report_id)
+    digest = base64.b64encode(hashlib.sha256(css.encode()).digest()).decode()
+    policy = f"default-src 'none'; img-src data:; style-src 'sha256-{digest}'; base-uri 'none'; form-action 'none'"
+    # The style sheet is ours; escaped quotes would change its hash.
+    html = environment.get_template("report.html").render(r=page, css=Markup(css), policy=policy)
+    return html.encode()
+
+
+def _page(e: Evidence) -> Page:
+    fit = e.fit
+    inputs = fit["inputs"]
+    report_id = (
+        hashlib.sha256(
+            repr((sorted(inputs.items()), fit["seed"], fit["versions"], fit["effective_deg_per_step"])).encode()
+        )
+        .hexdigest()[:12]
+        .upper()
+    )
+    header = e.campaign.header
+    verdict, kind = _verdict(e)
+    sections = [
+        setup_section(e),
+        results_section(e),
+        identifiability_section(e),
+        residuals_section(e),
+        validation_section(e),
+        maps_section(e),
+        budgets_section(e),
+        axes_section(e),
+        plan_section(e),
+        method_section(e),
+        limits_section(e),
+    ]
+    rows = [[c.quantity, f"{c.limit:.3g} {c.unit}", f"{c.probability:.3f}", c.verdict] for c in e.criteria]
+    criteria = None
+    if rows:
+        caption = "Decision rule: met if P(|error| <= limit) >= 0.95, not met if <= 0.05, else cannot tell"
+        criteria = TableView(caption, ["error of", "limit", "probability", "verdict"], rows)
+    return Page(
+        report_id=report_id,
+        name=str(header.get("name") or "campaign without a name"),
+        verdict=verdict,
+        verdict_class=kind,
+        numbers=_numbers(e),
+        criteria=criteria,
+        traceable=traceability(e.campaign).statement,
+        warnings=_warnings(e),
+        versions=fit["versions"],
+        sections=sections,
+    )
+
+
+def _verdict(e: Evidence) -> tuple[str, str]:
+    """One line, and the class that colours it."""
+    if not e.fit["converged"]:
+        return "NOT CONVERGED: the numbers below must not be used", "not-met"
+    validation = e.fit.get("validation")
+    failed = "" if validation is None or validation["passed"] else validation_lines(validation)[0] + ". "
+    if failed and not e.criteria:
+        return f"{failed}No limit was stated", "cannot-tell"
+    if not e.criteria:
+        return (
+            (
+                "No limit was stated: the results below are without a verdict (state one with "
+                "--limit-deg-per-step or --limit-mm)"
+            ),
+            "cannot-tell",
+        )
+    told = []
+    for verdict in ("not met", "cannot tell", "met"):
+        mine = [c for c in e.criteria if c.verdict == verdict]
+        limits = dict.fromkeys((c.limit, c.unit) for c in mine)
+        for limit, unit in limits:
+            part = [c for c in mine if (c.limit, c.unit) == (limit, unit)]
+            least = min(c.probability for c in part)
+            names = ", ".join(c.quantity for c in part)
+            told.append((verdict, f"{verdict}: {names} within {limit:.3g} {unit} (P at least {least:.3f})"))
+    text = "; ".join(sentence for _, sentence in told)
+    judged = "With that factor: " if failed else ""
+    return failed + judged + text[0].upper() + text[1:], told[0][0].replace(" ", "-")
+
+
+def _numbers(e: Evidence) -> list[Number]:
+    """Worst ratio, how far off the classic is, millimetres at the stated range."""
+    ratios = {d: x for d, x in e.fit["effective_deg_per_step"].items() if x is not None}
+    numbers = []
+    if ratios:
+        half = {d: 0.5 * (x["interval95"][1] - x["interval95"][0]) for d, x in ratios.items()}
+        worst = max(half, key=half.get)
+        x, u = ratios[worst], half[worst]
+        note = f"effective deg/step; 95 % interval +- {two_digits(u)}" if x["sd"] > 0 else "fixed"
+        factor = (e.fit.get("validation") or {}).get("inflation", 1.0)
+        if factor > 1:
+            note += f"; validation failed: use {factor:.2f} times that, {two_digits(factor * u)}"
+        numbers.append(Number(f"least certain ratio: {worst}", concise(x["value"], x["sd"]), note))
+    if e.classic is not None and ratios:
+        off = {
+            d: 100 * (r.mean_deg_per_step / ratios[d]["value"] - 1)
+            for d, r in e.classic.directions.items()
+            if r is not None and d in ratios
+        }
+        if off:
+            worst = max(off, key=lambda d: abs(off[d]))
+            numbers.append(Number(f"classic mean, {worst}", f"{off[worst]:+.1f} %", "away from the joint estimate"))
+    if len(numbers) < 2:
+        numbers.append(Number("classic mean", "not applicable", "no complete four-point experiment"))
+    joint = e.distances_mm["joint"]
+    others = ", ".join(f"{name} {_mm(np.quantile(v, 0.95))}" for name, v in e.distances_mm.items() if name != "joint")
+    note = f"95 % of 3D errors stay below this; {others}"
+    numbers.append(Number(f"joint, {e.range_mm:g} mm away", _mm(np.quantile(joint, 0.95)), note))
+    return numbers
+
+
+def _mm(value: float) -> str:
+    return f"{two_digits(value)} mm" if value < 100 else f"{value:.0f} mm"
+
+
+def _warnings(e: Evidence) -> list[str]:
+    found = [str(text) for text in e.fit["problems"]]
+    validation = e.fit.get("validation")
+    if validation is not None and not validation["passed"]:
+        found += validation_lines(validation)
+    if e.fit["estimator"] == "laplace":
+        found.append(
+            "Intervals are those of the Laplace approximation at the mode; with few stops of a direction that of the "
+            "backlash is too short. The command fit without --no-sample samples the posterior."
+        )
+    if e.campaign.header.get("synthetic"):
+        found.append("The campaign is synthetic: made by the digital twin, not measured.")
+    if e.campaign.stereo.assumed:
+        found.append("The stereo calibration's covariance is assumed, not estimated.")
+    found += [f"Prior conflict: {text}" for text in e.fit["prior_conflicts"]]
+    if e.fit.get("few_stops"):
+        line = few_stops_line(e.fit["few_stops"], str(e.fit["estimator"]))
+        found.append(f"{line[0].upper()}{line[1:]}.")
+    if e.fit["suspect_spots"]:
+        line = suspect_line(e.fit["suspect_spots"])
+        found.append(f"{line[0].upper()}{line[1:]}.")
+    return found

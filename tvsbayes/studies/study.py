@@ -1,0 +1,257 @@
+"""Studies: the twin runs a plan many times, every campaign is fitted, coverage, power and assurance are counted.
+
+Rows are made by an executor (this process, spawned processes, a Dask cluster) and kept in a file of JSON lines, keyed
+by the hash of everything that decides them and the campaign's number: a study goes on where it was interrupted, and
+its numbers do not depend on the engine. Units are those of DESIGN 8.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+
+from tvsbayes.errors import InputError, NotConverged, escaped, refusal
+from tvsbayes.files.disk import read_bytes
+from tvsbayes.instrument.axes import DIRECTIONS
+from tvsbayes.model.headlines import QUANTITIES
+from tvsbayes.planning.target import Target
+from tvsbayes.statistics.intervals import LEVELS, NORMAL_95, binomial_bounds, rms_bounds, share_interval95
+from tvsbayes.studies.executors import executor
+from tvsbayes.studies.study_job import STUDY_FORMAT, StudyJob
+
+ROWS_BYTES_MAX = 128 * 1024 * 1024
+
+
+class StudyRows:
+    """Rows of studies in a file of JSON lines: appended one by one, each on disk before the next.
+
+    A process that is killed while it writes leaves a torn last line; it is cut off when the file is opened again.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = Path(path)
+        data = read_bytes(self.path, ROWS_BYTES_MAX) if self.path.exists() else b""
+        whole = data[: data.rfind(b"\n") + 1]
+        self.rows: dict[tuple[str, int], dict[str, object]] = {}
+        for number, line in enumerate(whole.splitlines(), 1):
+            row = self._row(line, number)
+            self.rows[row["design"], row["index"]] = row
+        self.torn = len(data) - len(whole)
+        # Before the first campaign is fitted, not after.
+        if not os.access(self.path if self.path.exists() else self.path.parent, os.W_OK):
+            raise self._unwritable("no right to write, or no such folder")
+
+    def _unwritable(self, found: str) -> InputError:
+        allowed, remedy = "a file that can be written", "name another with --rows"
+        return refusal("write", file=escaped(str(self.path), 200), found=found, allowed=allowed, remedy=remedy)
+
+    @contextmanager
+    def _open(self) -> Iterator[BinaryIO]:
+        """The file, for reading and writing; made where there is none."""
+        try:
+            with self.path.open("r+b" if self.path.exists() else "w+b") as file:
+                yield file
+        except OSError as error:
+            raise self._unwritable(escaped(error.strerror or str(error))) from error
+
+    def _row(self, line: bytes, number: int) -> dict[str, object]:
+        try:
+            row = json.loads(line)
+            if row["format"] == STUDY_FORMAT and isinstance(row["design"], str) and isinstance(row["index"], int):
+                return row
+        except (ValueError, KeyError, TypeError, RecursionError):
+            pass
+        raise InputError(
+            "study-row",
+            f"{escaped(self.path.name)} line {number} is no row of a study",
+            file=escaped(self.path.name),
+            line=number,
+            allowed=f"lines written by `tvsbayes study` ({STUDY_FORMAT})",
+            remedy="name another file with --rows",
+        )
+
+    def of(self, job: StudyJob) -> dict[int, dict[str, object]]:
+        """Rows of one design by index."""
+        return {index: row for (design, index), row in self.rows.items() if design == job.key}
+
+    def append(self, row: dict[str, object]) -> None:
+        """Add a row and wait until the disk has it."""
+        row = {"format": STUDY_FORMAT, **row}
+        line = json.dumps(row, allow_nan=False).encode() + b"\n"
+        with self._open() as file:
+            if self.torn:
+                file.truncate(self.path.stat().st_size - self.torn)
+                self.torn = 0
+            file.seek(0, os.SEEK_END)
+            file.write(line)
+            file.flush()
+            os.fsync(file.fileno())
+        self.rows[row["design"], row["index"]] = row
+
+
+@dataclass(frozen=True)
+class HeadlineStudy:
+    """How one headline fared over the campaigns of a study.
+
+    Attributes:
+        coverage: share of intervals that hold the truth, by level; `bounds`: what an honest share stays within.
+        rms_z: RMS of (estimate - truth) / reported sd; `rms_bounds` likewise.
+        rms_predicted: the same over the sd that the planner predicted at each truth.
+        predicted_over_rms: root mean square of the predicted sd over RMS of (estimate - truth).
+        power: share of campaigns whose estimate differs from its null (0, or the stated ratio) by 1.96 sd.
+        sd: median reported sd.
+    """
+
+    coverage: dict[str, float]
+    bounds: dict[str, tuple[float, float]]
+    rms_z: float
+    rms_predicted: float
+    rms_bounds: tuple[float, float]
+    predicted_over_rms: float
+    power: float
+    sd: float
+
+    @property
+    def within(self) -> bool:
+        """All of coverage and z inside their bounds."""
+        low, high = self.rms_bounds
+        covered = all(a <= self.coverage[level] <= b for level, (a, b) in self.bounds.items())
+        return covered and low <= self.rms_z <= high
+
+
+@dataclass(frozen=True)
+class StudyResult:
+    """Coverage, power and assurance of a plan, measured.
+
+    Attributes:
+        design: its hash.
+        campaigns, converged: how many were simulated, and how many fits ended well.
+        headlines: by name; one that the priors hold fixed is not estimated and left out.
+        target: what was wanted.
+        assurance, assurance_interval95: share of ALL campaigns whose fit reports the target as met (Clopper-Pearson).
+        reported: 5, 50 and 95 % quantiles of the reported value.
+        seconds: median time of a row.
+        problems: failures, in words.
+    """
+
+    design: str
+    campaigns: int
+    converged: int
+    headlines: dict[str, HeadlineStudy]
+    target: Target
+    assurance: float
+    assurance_interval95: tuple[float, float]
+    reported: tuple[float, float, float] | None
+    seconds: float
+    problems: tuple[str, ...]
+
+    def as_json(self) -> dict[str, object]:
+        """The document of `study --json`."""
+        document = {key: value for key, value in vars(self).items() if key not in ("headlines", "target", "problems")}
+        document["headlines"] = {
+            name: {**vars(h), "bounds": {k: list(v) for k, v in h.bounds.items()}, "within": h.within}
+            for name, h in self.headlines.items()
+        }
+        return {**document, "target": self.target.as_json(), "problems": list(self.problems)}
+
+
+def study_result(job: StudyJob, rows: Sequence[Mapping[str, object]]) -> StudyResult:
+    """Count rows of a study.
+
+    Raises:
+        NotConverged: not one fit ended well.
+    """
+    good = [row for row in rows if row["converged"]]
+    problems = tuple(f"campaign {r['index']}: {'; '.join(r['problems'])}" for r in rows if not r["converged"])
+    if not good:
+        message = "no fit of the study converged" + (f"; {problems[0]}" if problems else "")
+        raise NotConverged("not-converged", message, remedy="check the plan with `tvsbayes check RIG PLAN`")
+    n = len(good)
+    stated = {d: job.rig.table.priors[f"degrees_per_step.{a}"].value for a, d in _axes_of_directions()}
+    found = {}
+    for name in QUANTITIES:
+        entries = [row["headlines"][name] for row in good]
+        if all(e["interval95"][0] == e["interval95"][1] for e in entries):
+            continue
+        truth, value, sd, pit, predicted = (
+            np.array([e[key] for e in entries]) for key in ("truth", "value", "sd", "pit", "predicted_sd")
+        )
+        error = value - truth
+        null = stated.get(name, job.rig.table.priors["mirror_offset_mm"].value if name == "mirror_offset" else 0.0)
+        found[name] = HeadlineStudy(
+            coverage={f"{100 * level:g}": float(np.mean(np.abs(pit - 0.5) < level / 2)) for level in LEVELS},
+            bounds={f"{100 * level:g}": binomial_bounds(n, level) for level in LEVELS},
+            rms_z=float(np.sqrt(np.mean((error / sd) ** 2))),
+            rms_predicted=float(np.sqrt(np.mean((error / predicted) ** 2))),
+            rms_bounds=rms_bounds(n),
+            predicted_over_rms=float(np.sqrt(np.mean(predicted**2) / np.mean(error**2))),
+            power=float(np.mean(np.abs(value - null) > NORMAL_95 * sd)),
+            sd=float(np.median(sd)),
+        )
+    reported = np.array([row["target"] for row in good if row["target"] is not None])
+    hits = int(np.sum(reported <= job.target.limit))
+    low, middle, high = np.quantile(reported, [0.05, 0.5, 0.95]) if len(reported) else (math.nan,) * 3
+    return StudyResult(
+        design=job.key,
+        campaigns=len(rows),
+        converged=n,
+        headlines=found,
+        target=job.target,
+        # A fit that failed met nothing.
+        assurance=hits / len(rows),
+        assurance_interval95=share_interval95(hits, len(rows)),
+        reported=(float(low), float(middle), float(high)) if len(reported) else None,
+        seconds=float(np.median([row["seconds"] for row in rows])),
+        problems=problems,
+    )
+
+
+def _axes_of_directions() -> Iterator[tuple[str, str]]:
+    return ((("pan", "tilt")[k // 2], d) for k, d in enumerate(DIRECTIONS))
+
+
+def study(
+    job: StudyJob,
+    count: int,
+    rows: StudyRows,
+    *,
+    engine: str = "serial",
+    workers: int = 2,
+    address: str | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> StudyResult:
+    """Make the rows 0 ... count - 1 of a study that are not there yet, and count them all.
+
+    Args:
+        job: what is studied.
+        count: number of campaigns.
+        rows: where rows are kept; what is there is not made again.
+        engine: where they are made; the numbers are the same on each.
+        workers: processes.
+        address: of a Dask scheduler.
+        progress: called with rows done and rows wanted.
+
+    Raises:
+        InputError: no such engine.
+        NotConverged: not one fit ended well.
+    """
+    done = rows.of(job)
+    missing = [index for index in range(count) if index not in done]
+    if missing:
+        with executor(engine, min(workers, len(missing)), address) as running:
+            for index in missing:
+                running.submit(job, index)
+            for finished, row in enumerate(running.as_completed(), count - len(missing) + 1):
+                rows.append(row)
+                if progress is not None:
+                    progress(finished, count)
+    made = rows.of(job)
+    return study_result(job, [made[index] for index in range(count)])

@@ -1,0 +1,185 @@
+"""A plan simulated and fitted once."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from importlib.metadata import version
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from tvsbayes.errors import InputError, TvsError
+from tvsbayes.estimators.joint_fit import JointFit, fit
+from tvsbayes.instrument.axes import DIRECTIONS
+from tvsbayes.instrument.parameters import INDEX
+from tvsbayes.instrument.plan import PlanStep
+from tvsbayes.instrument.rig import Rig, rig_table_toml
+from tvsbayes.instrument.stereo_pair import stereo_bytes
+from tvsbayes.model.headlines import QUANTITIES, headlines
+from tvsbayes.model.parameter_space import half_normal, half_normal_slope
+from tvsbayes.planning.candidates import covariance_of
+from tvsbayes.planning.expectation import Knowledge, information_of, prior_knowledge
+from tvsbayes.planning.forecast import truth_in
+from tvsbayes.planning.target import Target, sensitivity
+from tvsbayes.twin.physics import effective_deg_per_step, effective_mirror_offset_mm
+from tvsbayes.twin.simulated_campaign import simulate
+
+STUDY_FORMAT = "tvsbayes-study/1"
+ITERATIONS = 6
+"""Of slope and width of a backlash: the width's error falls at least threefold each."""
+
+
+@dataclass(frozen=True)
+class StudyJob:
+    """What a worker needs to make any row of a study."""
+
+    rig: Rig
+    steps: tuple[PlanStep, ...]
+    target: Target
+    seed: int = 0
+    aperture: bool = False
+
+    @cached_property
+    def key(self) -> str:
+        """SHA-256 of everything that decides the rows: program, rig, truth, cameras, plan, target, seed, reading."""
+        rig = self.rig
+        parts = [
+            STUDY_FORMAT,
+            version("tvsbayes"),
+            rig_table_toml(rig.table),
+            json.dumps({name: [p.value, p.u, p.distribution] for name, p in sorted(rig.truth.items())}),
+            stereo_bytes(rig.stereo).decode(),
+            json.dumps([sorted(rig.sheets_mm.items()), rig.cameras["spot_sd_px"], sorted(rig.costs_s.items())]),
+            json.dumps([[s.action, s.pan_steps, s.tilt_steps, s.target, s.experiment, s.point] for s in self.steps]),
+            json.dumps([self.target.text, self.seed, self.aperture]),
+        ]
+        return hashlib.sha256("\0".join(parts).encode()).hexdigest()
+
+    def campaign_seed(self, index: int) -> int:
+        """Seed of campaign `index`: independent of order, engine and number of campaigns."""
+        high, low = np.random.SeedSequence([self.seed, index]).generate_state(2)
+        return (int(high) >> 10) << 32 | int(low)
+
+
+def true_headlines(parameters: Mapping[str, float], pose_rad: np.ndarray) -> np.ndarray:
+    """`QUANTITIES` of a true rig by the twin's formulas, at a pose."""
+    pose = tuple(np.degrees(pose_rad))
+    ratio = effective_deg_per_step(parameters, pose)
+    return np.array(
+        [
+            *(ratio[d] for d in DIRECTIONS),
+            ratio["left"] - ratio["right"],
+            ratio["up"] - ratio["down"],
+            parameters["backlash_deg.pan"],
+            parameters["backlash_deg.tilt"],
+            effective_mirror_offset_mm(parameters, pose),
+        ]
+    )
+
+
+def study_row(job: StudyJob, index: int) -> dict[str, object]:
+    """Simulate one campaign, fit it (Laplace), compare with the truth and with what the planner predicted there.
+
+    Whatever fails is a row as well: failures are counted, never dropped.
+    """
+    start = time.perf_counter()
+    seed = job.campaign_seed(index)
+    run = simulate(job.rig, job.steps, seed, aperture=job.aperture)
+    row: dict[str, object] = {"design": job.key, "index": index, "seed": seed, "converged": False}
+    row["unseen"] = sum(spot.status != "ok" for spot in run.campaign.spots)
+    try:
+        result = fit(run.campaign)
+    except TvsError as error:
+        return {**row, "problems": [error.message], "seconds": time.perf_counter() - start}
+    row |= {"converged": result.converged, "problems": list(result.problems)}
+    knowledge = prior_knowledge(job.rig)
+    truth = truth_in(knowledge, run.truth.parameters, run.truth.stereo.vector)
+    pose = result.reference_pose_rad
+    information = information_of(job.steps, knowledge, aperture=job.aperture, z=truth.z, space=truth.space)
+    with jax.enable_x64(True):
+        at_truth = headlines(jnp.asarray(truth.z), truth.space, jnp.asarray(pose))
+        at_mode = headlines(jnp.asarray(result.z), result.space, jnp.asarray(pose))
+    gradient = np.asarray(at_truth.gradient)
+    predicted_sd = predicted_sds(knowledge, information.fisher, gradient, truth.z)
+    true = true_headlines(run.truth.parameters, pose)
+    draws = _headline_draws(result)
+    value, sd = np.asarray(at_mode.value), draws.std(axis=0)
+    low, high = np.quantile(draws, [0.025, 0.975], axis=0)
+    row["headlines"] = {
+        name: {
+            "truth": float(true[k]),
+            "value": float(value[k]),
+            "sd": float(sd[k]),
+            "interval95": [float(low[k]), float(high[k])],
+            "pit": float(np.mean(draws[:, k] < true[k])),
+            "predicted_sd": float(predicted_sd[k]),
+        }
+        for k, name in enumerate(QUANTITIES)
+    }
+    try:
+        at = sensitivity(job.target, result.z, result.space, job.rig.table, pose)
+        row["target"] = at.value(result.covariance, job.target.factor)
+    except InputError:
+        row["target"] = None
+    return {**row, "seconds": time.perf_counter() - start}
+
+
+def half_normal_sd(mean: float, sd: float) -> float:
+    """Sd of a half-normal of scale 1 whose coordinate is N(mean, sd^2), by Gauss-Hermite quadrature.
+
+    Near no backlash the map from coordinate to backlash is flat on one side: a slope there would promise a certainty
+    that no fit has.
+    """
+    nodes, weights = np.polynomial.hermite_e.hermegauss(48)
+    values = half_normal(mean + sd * nodes)
+    weights = weights / weights.sum()
+    centre = weights @ values
+    return float(np.sqrt(weights @ (values - centre) ** 2))
+
+
+def predicted_sds(knowledge: Knowledge, fisher: np.ndarray, gradient: np.ndarray, z: np.ndarray) -> np.ndarray:
+    """Sd of quantities at a truth, the backlashes linearised over the width of their posteriors, not at a point.
+
+    Near no backlash its slope against its coordinate vanishes: linearised there, a ratio would seem free of the
+    exchange with it. The slope is taken as sd(backlash) / sd(coordinate), the posterior's width found by iteration.
+
+    Args:
+        knowledge: before the plan.
+        fisher: information of the plan at the truth, shape (p, p).
+        gradient: d(quantity)/d(coordinates) there, shape (q, p).
+        z: coordinates of the truth, shape (p,).
+
+    Returns:
+        Shape (q,).
+    """
+    columns = [INDEX[f"backlash_deg.{axis}"] for axis in ("pan", "tilt")]
+    slope = half_normal_slope(z[columns])
+    scale, covariance = np.ones(len(z)), np.eye(len(z))
+    for _ in range(ITERATIONS):
+        for column, at in zip(columns, slope, strict=True):
+            width = math.sqrt(covariance[column, column])
+            scale[column] = half_normal_sd(z[column], width) / width / at
+        covariance = covariance_of(knowledge.precision + fisher * np.outer(scale, scale))
+    return np.sqrt(np.einsum("qi,ij,qj->q", gradient * scale, covariance, gradient * scale))
+
+
+def _headline_draws(result: JointFit) -> np.ndarray:
+    """`QUANTITIES` of the Laplace draws, shape (draws, 9)."""
+    ratio, physical = np.asarray(result.draws.effective_deg_per_step), np.asarray(result.draws.physical)
+    return np.column_stack(
+        [
+            ratio,
+            ratio[:, 0] - ratio[:, 1],
+            ratio[:, 2] - ratio[:, 3],
+            physical[:, INDEX["backlash_deg.pan"]],
+            physical[:, INDEX["backlash_deg.tilt"]],
+            result.draws.effective_mirror_offset_mm,
+        ]
+    )

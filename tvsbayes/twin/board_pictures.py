@@ -1,0 +1,286 @@
+"""Calibration boards as cameras see them; all frames on disk."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from os import cpu_count
+from pathlib import Path
+
+import numpy as np
+
+from tvsbayes.files.disk import make_folder, write_atomically
+from tvsbayes.files.images import png_bytes
+from tvsbayes.instrument.stereo_pair import rotation_matrix
+from tvsbayes.twin.simulated_campaign import SimulatedCampaign
+from tvsbayes.twin.spot_pictures import (
+    Camera,
+    CameraPair,
+    Scene,
+    Sensor,
+    ambient_level,
+    cameras_of,
+    expose,
+    random_stream,
+    render_spots,
+)
+
+SIDES = ("left", "right")
+
+
+@dataclass(frozen=True)
+class Board:
+    """A checkerboard by its INNER corners, as OpenCV counts them; corner (0, 0) is the board's origin.
+
+    Inner corner (i, j) lies at (i, j, 0) * pitch; squares reach one pitch further on every side, a white margin
+    `margin` pitches further still.
+    """
+
+    columns: int = 9
+    rows: int = 6
+    pitch_mm: float = 25.0
+    margin: float = 0.6
+    white_dn: float = 190.0
+    black_dn: float = 25.0
+    surround_dn: float = 70.0
+
+    def corners_mm(self) -> np.ndarray:
+        """Inner corners (rows * columns, 3) in the board's axes, row by row, as OpenCV's finder orders them."""
+        x, y = np.meshgrid(np.arange(self.columns), np.arange(self.rows))
+        return np.column_stack((x.ravel(), y.ravel(), np.zeros(x.size))) * self.pitch_mm
+
+
+@dataclass(frozen=True)
+class BoardPose:
+    """Where a board stands: `rotation` (3, 3), `translation_mm` (3,) take its axes to the left camera's."""
+
+    rotation: np.ndarray
+    translation_mm: np.ndarray
+
+
+def _fine_levels(x: np.ndarray, y: np.ndarray, board: Board) -> np.ndarray:
+    """Reflectance in DN at board coordinates in units of the pitch."""
+    squares = (x >= -1) & (x < board.columns) & (y >= -1) & (y < board.rows)
+    dark = (np.floor(x).astype(np.int64) + np.floor(y).astype(np.int64)) % 2 == 0
+    m = board.margin
+    paper = (x >= -1 - m) & (x < board.columns + m) & (y >= -1 - m) & (y < board.rows + m)
+    outside = np.where(paper, board.white_dn, board.surround_dn)
+    return np.where(squares, np.where(dark, board.black_dn, board.white_dn), outside)
+
+
+def _rays(camera: Camera) -> np.ndarray:
+    """Undistorted normalised coordinates (height, width, 2) of every pixel; NaN where the lens gives none."""
+    return _rays_of(
+        camera.width,
+        camera.height,
+        tuple(camera.matrix[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()),
+        tuple(camera.distortion.tolist()),
+    )
+
+
+@lru_cache(maxsize=4)
+def _rays_of(width: int, height: int, pinhole: tuple[float, ...], distortion: tuple[float, ...]) -> np.ndarray:
+    fx, fy, cx, cy = pinhole
+    k1, k2, p1, p2, k3 = distortion
+    u, v = np.meshgrid((np.arange(width) - cx) / fx, (np.arange(height) - cy) / fy)
+    x, y = u.copy(), v.copy()
+    for _ in range(30):  # Newton with the radial slope alone: linear convergence by the tangential part, 1e-4 a step
+        r2 = x * x + y * y
+        radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+        slope = radial + 2 * r2 * (k1 + r2 * (2 * k2 + r2 * 3 * k3))
+        miss_u = u - (x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x))
+        miss_v = v - (y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y)
+        # Along the radius the map stretches by `slope`, across it by `radial`.
+        with np.errstate(divide="ignore", invalid="ignore"):
+            along = (x * miss_u + y * miss_v) / np.where(r2 > 0, r2, 1.0) * (1 / slope - 1 / radial)
+            step_x, step_y = miss_u / radial + x * along, miss_v / radial + y * along
+        x, y = x + step_x, y + step_y
+        if np.nanmax(np.abs(miss_u) + np.abs(miss_v)) < 1e-12:
+            break
+    good = (np.abs(miss_u) + np.abs(miss_v) < 1e-9)[..., None]
+    return np.where(good, np.stack((x, y), axis=-1), np.nan)
+
+
+SUBPIXELS = 8
+"""Samples per axis in a pixel that an edge of the board may cross: levels to 1/64."""
+
+
+def board_irradiance(camera: Camera, pose: BoardPose, board: Board) -> np.ndarray:
+    """Irradiance (height, width) of a checkerboard in DN: area-sampled at its edges, without blur."""
+    rotation = camera.rotation @ pose.rotation
+    translation = camera.rotation @ pose.translation_mm + camera.translation_mm
+    homography = np.column_stack((rotation[:, 0], rotation[:, 1], translation))
+    back = np.linalg.inv(homography) / board.pitch_mm
+    window = _board_window(camera, pose, board)
+    picture = np.full((camera.height, camera.width), board.surround_dn)
+    rays = _rays(camera)[window]
+    if min(rays.shape[:2]) < 2:
+        return picture
+    projective = np.dstack((rays, np.ones(rays.shape[:2]))) @ back.T
+    with np.errstate(divide="ignore", invalid="ignore"):
+        plane = projective[..., :2] / (projective[..., 2:] * board.pitch_mm)
+    # Rays that meet the board's plane behind the camera see the surround.
+    plane = np.where(np.isfinite(plane) & (projective[..., 2:] > 0), plane, 1e6)
+    slope_u, slope_v = np.gradient(plane, axis=1), np.gradient(plane, axis=0)
+    reach = np.abs(slope_u) + np.abs(slope_v)
+    levels = _fine_levels(plane[..., 0], plane[..., 1], board)
+    m = board.margin
+    inside = (plane > -1 - m - reach) & (plane < np.array([board.columns, board.rows]) + m + reach)
+    edges = np.abs(plane - np.round(plane)) < reach
+    rims = (np.abs(plane + 1 + m) < reach) | (np.abs(plane - np.array([board.columns, board.rows]) - m) < reach)
+    rows, columns = np.nonzero(inside.all(axis=-1) & (edges | rims).any(axis=-1))
+    offsets = (np.arange(SUBPIXELS) + 0.5) / SUBPIXELS - 0.5
+    total = np.zeros(len(rows))
+    for du in offsets:
+        for dv in offsets:
+            x, y = (plane[rows, columns] + du * slope_u[rows, columns] + dv * slope_v[rows, columns]).T
+            total += _fine_levels(x, y, board)
+    levels[rows, columns] = total / SUBPIXELS**2
+    picture[window] = levels
+    return picture
+
+
+def _board_window(camera: Camera, pose: BoardPose, board: Board) -> tuple[slice, slice]:
+    """Rows and columns that the board's paper covers; the whole image where part of it forms none."""
+    m, along = board.margin, np.linspace(0.0, 1.0, 60)
+    x, y = (-1 - m + (count + 1 + 2 * m) * along for count in (board.columns, board.rows))
+    ends = [np.column_stack((x, np.full(60, edge))) for edge in y[[0, -1]]]
+    ends += [np.column_stack((np.full(60, edge), y)) for edge in x[[0, -1]]]
+    rim = np.column_stack((np.vstack(ends) * board.pitch_mm, np.zeros(240)))
+    seen = camera.project(rim @ pose.rotation.T + pose.translation_mm)
+    size = np.array([camera.width, camera.height])
+    if not np.isfinite(seen).all():
+        return slice(0, camera.height), slice(0, camera.width)
+    # Between two of the 60 points an edge bulges by less than a pixel; gradients need two more.
+    low = np.clip(np.floor(seen.min(axis=0)) - 4, 0, size).astype(int)
+    high = np.clip(np.ceil(seen.max(axis=0)) + 5, 0, size).astype(int)
+    return slice(low[1], high[1]), slice(low[0], high[0])
+
+
+SHADING = 0.15
+"""Relative fall of the light on a board from the upper left to the lower right corner of the picture."""
+
+
+def render_board(camera: Camera, pose: BoardPose, board: Board, sensor: Sensor, seed: Sequence[int]) -> np.ndarray:
+    """One picture of a checkerboard; its corners lie at `camera.project` of the board's corners.
+
+    Args:
+        camera: the camera, in visible light: focal scale 1.
+        pose: of the board to the left camera.
+        board: the board.
+        sensor: the sensor; in visible light its three colours respond alike here.
+        seed: whole numbers that name view and camera.
+    """
+    import cv2
+
+    light = board_irradiance(camera, pose, board)
+    light *= ambient_level(camera.width, camera.height, 1.0, SHADING)
+    light = cv2.GaussianBlur(light, (0, 0), sensor.blur_px) if sensor.blur_px > 0 else light
+    return expose(light, replace(sensor, response=(1.0, 1.0, 1.0)), random_stream("board", *seed))
+
+
+BORDER_PX = 8.0
+"""Least distance of a board's outer squares from the image's border."""
+DEPTHS_MM = (280.0, 520.0)
+TILT_MAX_DEG = 40.0
+
+
+def board_poses(cameras: CameraPair, board: Board, views: int, seed: int) -> list[BoardPose]:
+    """Poses that a careful user would take: tilted up to 40 degrees, all over the part that both cameras see.
+
+    Raises:
+        ValueError: the board fits hardly anywhere into both images.
+    """
+    rng = random_stream("board", seed)
+    corners = board.corners_mm()
+    middle = corners.mean(axis=0)
+    reach = np.array([board.columns, board.rows]) * board.pitch_mm
+    rim = np.array([[x, y, 0.0] for x in (-board.pitch_mm, reach[0]) for y in (-board.pitch_mm, reach[1])])
+    left, right, found = cameras.left, cameras.right, []
+    for _ in range(200 * views):
+        depth = rng.uniform(*DEPTHS_MM)
+        aim = np.array([rng.uniform(0, left.width), rng.uniform(0, left.height), 1.0])
+        tilt, heading, roll = rng.uniform(0, np.radians(TILT_MAX_DEG)), rng.uniform(0, 2 * np.pi), rng.normal(0, 0.15)
+        turned = rotation_matrix(tilt * np.array([np.cos(heading), np.sin(heading), 0.0]))
+        turned = turned @ rotation_matrix(np.array([0.0, 0.0, roll]))
+        pose = BoardPose(turned, depth * np.linalg.solve(left.matrix, aim) - turned @ middle)
+        seen = np.hstack([c.project(rim @ pose.rotation.T + pose.translation_mm) for c in (left, right)])
+        last = np.tile([left.width - 1, left.height - 1], 2)
+        if np.isfinite(seen).all() and ((seen > BORDER_PX) & (seen < last - BORDER_PX)).all():
+            found.append(pose)
+            if len(found) == views:
+                return found
+    raise ValueError(f"a board of {reach[0]:g} x {reach[1]:g} mm fits into both images {len(found)} of {views} times")
+
+
+BOARD_VIEWS = 20
+"""Views of the checkerboard, as the paper took (section 2.3)."""
+
+
+def write_frames(
+    folder: Path,
+    simulated: SimulatedCampaign,
+    seed: int,
+    *,
+    views: int | None = None,
+    done: Callable[[int, int], None] | None = None,
+) -> int:
+    """Write `frames/{spot:06d}_left.png`, `_right.png` of every look and `boards/left01.png`, `right01.png` ...
+
+    Spots are seen by the true cameras at the laser's wavelength, boards in visible light (focal scale 1). Light and
+    sensors are those of `Scene()` and `Sensor()`, the board is the paper's.
+
+    Args:
+        folder: the campaign's folder, which exists.
+        simulated: what the twin did.
+        seed: of speckle, noise and board poses.
+        views: how many board views, by default `BOARD_VIEWS`; 0 writes no `boards/`.
+        done: called with the number of pairs written and their total.
+
+    Returns:
+        How many pictures were written.
+
+    Raises:
+        InputError: the folder cannot be written.
+    """
+    scene, sensor, board = Scene(), Sensor(), Board()
+    views = BOARD_VIEWS if views is None else views
+    truth, light = simulated.truth, simulated.light
+    infrared = cameras_of(truth.stereo, truth.parameters["focal_scale"])
+    visible = cameras_of(truth.stereo)
+    poses = board_poses(visible, board, views, seed) if views else []
+    make_folder(folder / "frames")
+    if poses:
+        make_folder(folder / "boards")
+
+    def write(place: str, names: Sequence[str], pictures: Sequence[np.ndarray]) -> None:
+        for name, picture in zip(names, pictures, strict=True):
+            write_atomically(folder / place / name, png_bytes(picture))
+
+    def spot(row: int) -> None:
+        number = simulated.campaign.spots[row].spot
+        at = light.points_mm[row], light.directions[row], light.normals[row]
+        made = render_spots(infrared, *at, scene, sensor, seed, number)
+        write("frames", [f"{number:06d}_{side}.png" for side in SIDES], (made.left, made.right))
+
+    def view(number: int) -> None:
+        pair = enumerate((visible.left, visible.right))
+        made = [render_board(camera, poses[number], board, sensor, (seed, number, side)) for side, camera in pair]
+        write("boards", [f"{side}{number + 1:02d}.png" for side in SIDES], made)
+
+    def jobs() -> Iterator[tuple[Callable[[int], None], int]]:
+        yield from ((view, number) for number in range(len(poses)))
+        yield from ((spot, row) for row in range(len(simulated.campaign.spots)))
+
+    total = len(poses) + len(simulated.campaign.spots)
+    # NumPy's generators, OpenCV and the writing of files leave Python's lock: threads are enough.
+    pool = ThreadPoolExecutor(min(8, cpu_count() or 1))
+    try:
+        for count, _ in enumerate(pool.map(lambda job: job[0](job[1]), jobs()), start=1):
+            if done is not None:
+                done(count, total)
+    finally:
+        pool.shutdown(cancel_futures=True)
+    return 2 * total
