@@ -2,7 +2,7 @@
 
 Writes data/tutorial/rig.svg. Every ray, mirror and frame is computed by the digital twin's own optics
 (`tvsbayes.simulation`) and by the transformations of the README's conventions, so the picture cannot turn an axis the
-other way than the code does; `tests/test_readme.py` holds it to that. Lengths are those of a tidy drawing, mm. Colours
+other way than the code does; `tests/promises/test_readme.py` holds it to that. Lengths are those of a tidy drawing, mm. Colours
 are of the Okabe-Ito palette; no colour says what a label does not say too.
 """
 

@@ -31,10 +31,10 @@ DEVICE = OUTPUT / "evidence_device.json"
 PAGE = Path(__file__).parent / "EVIDENCE.md"
 HEADINGS = ("claim", "figure", "holds", "rows of", "commit", "command")
 DEVICE_TESTS = (
-    "tests/test_device_faults.py",
-    "tests/test_device_journal.py",
-    "tests/test_device_acquisition.py",
-    "tests/test_device_protocol.py",
+    "tests/positioner/test_faults.py",
+    "tests/acquisition/test_journal.py",
+    "tests/acquisition/test_engine.py",
+    "tests/positioner/test_protocol.py",
 )
 LEVEL, BOUND = 0.95, 1e-4
 

@@ -4,7 +4,7 @@
     python experiments/hostile.py mutations --n 100000       seeded mutations of a good folder, in process
     python experiments/hostile.py table > experiments/hostile.md
 
-Folders and mutations are those of `tests/hostile_folders.py`. A command is a process of its own with a HOME and a
+Folders and mutations are those of `tests/support/hostile_folders.py`. A command is a process of its own with a HOME and a
 TMPDIR of its own, watched: exit code, traceback, peak resident memory, processor time, and a listing with hashes of
 the campaign's folder, its parent, HOME and TMPDIR before and after. Rows go to `experiments/output/`.
 """

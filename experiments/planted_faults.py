@@ -62,7 +62,7 @@ class Fault:
         old: text that stands in the file exactly once.
         new: what it becomes.
         harm: what a user would suffer.
-        tests: the test files (or single tests) most likely to see it.
+        tests: the test files (or single tests) most likely to see it, as "package/module" or "package/module::test".
         survived: why no default test saw it before one was written for it, seen in a run or read off the tests; empty
             for the others.
     """
@@ -83,7 +83,12 @@ class Fault:
     @property
     def selection(self) -> tuple[str, ...]:
         """Arguments of pytest."""
-        return tuple(f"tests/test_{one}" if ".py" in one else f"tests/test_{one}.py" for one in self.tests)
+        found = []
+        for one in self.tests:
+            file, _, single = one.partition("::")
+            package, _, module = file.partition("/")
+            found.append(f"tests/{package}/test_{module}.py" + (f"::{single}" if single else ""))
+        return tuple(found)
 
 
 FAULTS = (
@@ -94,7 +99,7 @@ FAULTS = (
         "jnp.where(positive, 0.5, -0.5)",
         "jnp.where(positive, -0.5, 0.5)",
         "left and right ratios change places",
-        ("positioner",),
+        ("model/laser_path",),
     ),
     Fault(
         "backlash with the wrong sign",
@@ -102,7 +107,7 @@ FAULTS = (
         "jnp.where(approach < 0, q + half, q - half)",
         "jnp.where(approach > 0, q + half, q - half)",
         "the first reversal of every segment is read the wrong way round",
-        ("positioner",),
+        ("model/laser_path",),
     ),
     Fault(
         "width of an unknown play three times too large",
@@ -110,7 +115,7 @@ FAULTS = (
         "UNIFORM_SD = 1 / 12**0.5",
         "UNIFORM_SD = 1 / 12 * 12**0.5 * 3**0.5",
         "a campaign that begins with an unknown approach tells too little",
-        ("positioner",),
+        ("model/laser_path",),
     ),
     Fault(
         "degrees taken for radians",
@@ -118,7 +123,7 @@ FAULTS = (
         "SCALE = np.array([np.pi / 180 if name in RAD_NAMES",
         "SCALE = np.array([1.0 if name in RAD_NAMES",
         "every angle is 57 times too large",
-        ("parameters",),
+        ("model/parameter_space",),
     ),
     Fault(
         "ratios left in degrees",
@@ -126,7 +131,7 @@ FAULTS = (
         'RAD_NAMES = tuple(name for name in RIG_NAMES if "deg" in name)',
         'RAD_NAMES = tuple(name for name in RIG_NAMES if "_deg" in name)',
         "one unit forgotten: ratios in deg/step where rad/step is meant",
-        ("parameters",),
+        ("model/parameter_space",),
     ),
     Fault(
         "prior sd doubled",
@@ -134,7 +139,7 @@ FAULTS = (
         "jnp.where(log, log_normal, self.value + self.u * rig_z)",
         "jnp.where(log, log_normal, self.value + 2 * self.u * rig_z)",
         "priors count a quarter of what the rig file states",
-        ("parameters",),
+        ("model/parameter_space",),
     ),
     Fault(
         "half-normal prior from the wrong tail",
@@ -142,7 +147,7 @@ FAULTS = (
         "half_normal = -self.u * ndtri(0.5 * ndtr(-w))",
         "half_normal = -self.u * ndtri(0.5 * ndtr(w))",
         "a large coordinate is a small backlash",
-        ("parameters",),
+        ("model/parameter_space",),
     ),
     Fault(
         "stop sds of left and right exchanged",
@@ -150,7 +155,7 @@ FAULTS = (
         'stop_sd_rad=jnp.reshape(block("stop_sd_deg.left", 4), (2, 2))[:, ::-1]',
         'stop_sd_rad=jnp.reshape(block("stop_sd_deg.left", 4), (2, 2))',
         "the scatter of a direction is reported for the other",
-        ("parameters",),
+        ("model/parameter_space",),
     ),
     Fault(
         "k3 read where p1 stands",
@@ -158,7 +163,7 @@ FAULTS = (
         "intrinsics[:, np.array([4, 5, 8])]",
         "intrinsics[:, np.array([4, 5, 6])]",
         "distortion with the wrong coefficient",
-        ("parameters",),
+        ("model/parameter_space",),
     ),
     Fault(
         "receiver estimated only without readings",
@@ -166,7 +171,7 @@ FAULTS = (
         "if not has_aperture:",
         "if has_aperture:",
         "aperture readings teach nothing about baseline and C0",
-        ("parameters",),
+        ("model/parameter_space",),
     ),
     Fault(
         "mirror offset with the wrong sign",
@@ -174,7 +179,7 @@ FAULTS = (
         "offset = (d[1] * o[0] - d[0] * o[1])",
         "offset = (d[0] * o[1] - d[1] * o[0])",
         "the effective mirror offset is negative",
-        ("positioner",),
+        ("model/laser_path",),
     ),
     Fault(
         "skew of the tilt axis with the wrong sign",
@@ -182,7 +187,7 @@ FAULTS = (
         "jnp.stack([zero, cos_skew, sin_skew])",
         "jnp.stack([zero, cos_skew, -sin_skew])",
         "axis and mirror 2 no longer stand at right angles",
-        ("conventions",),
+        ("promises/conventions",),
     ),
     Fault(
         "p1 and p2 exchanged",
@@ -190,7 +195,7 @@ FAULTS = (
         "q = per_camera(cameras.tangential[:, ::-1])",
         "q = per_camera(cameras.tangential)",
         "tangential distortion the wrong way round: tenths of a pixel at the border",
-        ("cameras",),
+        ("model/cameras",),
     ),
     Fault(
         "T of the stereo pair with the wrong sign",
@@ -198,7 +203,7 @@ FAULTS = (
         "transform(rotation_matrix(cameras.rotation_rad), left) + translation",
         "transform(rotation_matrix(cameras.rotation_rad), left) - translation",
         "the right camera stands on the left",
-        ("cameras",),
+        ("model/cameras",),
     ),
     Fault(
         "cameras exchanged",
@@ -206,7 +211,7 @@ FAULTS = (
         "points = materialise(jnp.stack([left, right]))",
         "points = materialise(jnp.stack([right, left]))",
         "each camera sees what the other should see",
-        ("cameras",),
+        ("model/cameras",),
     ),
     Fault(
         "focal scale divides",
@@ -214,7 +219,7 @@ FAULTS = (
         "per_camera(cameras.focal_px * cameras.focal_scale)",
         "per_camera(cameras.focal_px / cameras.focal_scale)",
         "0.5 % of focal scale are 1 % of error",
-        ("cameras",),
+        ("model/cameras",),
     ),
     # Likelihood.
     Fault(
@@ -223,7 +228,7 @@ FAULTS = (
         "                if delta:\n",
         "                if any(deltas):\n",
         "spots taken while the other axis moves count as independent stops: ratios too sure",
-        ("likelihood",),
+        ("estimators/likelihood",),
     ),
     Fault(
         "four residuals per spot instead of three",
@@ -231,7 +236,7 @@ FAULTS = (
         "log_scale = 3 * jnp.log(pixel_noise)",
         "log_scale = 4 * jnp.log(pixel_noise)",
         "n for n - p: the pixel scale comes out too small",
-        ("likelihood",),
+        ("estimators/likelihood",),
     ),
     Fault(
         "Jacobian of the aperture's range dropped",
@@ -239,7 +244,7 @@ FAULTS = (
         "log_scale = 3 * jnp.log(pixel_noise) - 0.5 * jnp.log1p(aperture_part / pixel_part)",
         "log_scale = 3 * jnp.log(pixel_noise)",
         "the density is not flat in image displacement where the aperture reads",
-        ("likelihood",),
+        ("estimators/likelihood",),
     ),
     Fault(
         "log-determinant dropped",
@@ -247,7 +252,7 @@ FAULTS = (
         "jnp.sum(given.log_scale) - 0.5 * jnp.sum(log_variance) -",
         "jnp.sum(given.log_scale) -",
         "stop sds grow without limit",
-        ("likelihood",),
+        ("estimators/likelihood",),
     ),
     Fault(
         "correlation of the left camera used for the right",
@@ -255,7 +260,7 @@ FAULTS = (
         "spot.ruv_right * su_r * sv_r",
         "spot.ruv_left * su_r * sv_r",
         "spots of the right camera are weighted wrongly",
-        ("likelihood",),
+        ("estimators/likelihood",),
     ),
     Fault(
         "extrinsic rotation transposed for the range",
@@ -263,7 +268,7 @@ FAULTS = (
         "transform(rotation_matrix(extrinsics.rotation_rad).T, from_origin)",
         "transform(rotation_matrix(extrinsics.rotation_rad), from_origin)",
         "spots are linearised at the wrong range",
-        ("likelihood",),
+        ("estimators/likelihood",),
     ),
     Fault(
         "log density of a left-out move with the wrong sign (ELPD)",
@@ -271,7 +276,7 @@ FAULTS = (
         "log_density = log_scale - 0.5 * seen.log_variance - 0.5",
         "log_density = log_scale + 0.5 * seen.log_variance - 0.5",
         "`az.compare` prefers the worse model",
-        ("stops",),
+        ("estimators/linear_spots",),
     ),
     Fault(
         "constants of the log likelihood with the wrong sign",
@@ -279,7 +284,7 @@ FAULTS = (
         "np.log(2 * np.pi) + np.linalg.slogdet",
         "np.log(2 * np.pi) - np.linalg.slogdet",
         "log likelihoods of campaigns with other stated sds cannot be compared",
-        ("likelihood", "stops"),
+        ("estimators/likelihood", "estimators/linear_spots"),
     ),
     # Fit and its summary.
     Fault(
@@ -288,7 +293,7 @@ FAULTS = (
         "jnp.stack([(ratio + half) * slope, (ratio - half) * slope], axis=1)",
         "jnp.stack([(ratio + half) + 0 * slope, (ratio - half) + 0 * slope], axis=1)",
         "the gear ratio is sold as the effective ratio: up to 1.7 % off for 1 deg of laser tilt",
-        ("twin_equals_model",),
+        ("promises/twin_equals_model",),
     ),
     Fault(
         "prior sensitivity the wrong way round",
@@ -296,7 +301,7 @@ FAULTS = (
         "changed[members, members] += factor**-2 - 1",
         "changed[members, members] += factor**2 - 1",
         "what a wider prior would do is said of a narrower one",
-        ("information.py::test_prior_sensitivity_is_what_a_refit_finds",),
+        ("assessment/summary::test_prior_sensitivity_is_what_a_refit_finds",),
     ),
     Fault(
         "degrees of freedom: n for n - p",
@@ -304,7 +309,7 @@ FAULTS = (
         "dof=observations - determined,",
         "dof=observations,",
         "chi2 over dof looks too good",
-        ("information.py::test_dof_counts_spots_less_what_they_determine",),
+        ("assessment/summary::test_dof_counts_spots_less_what_they_determine",),
     ),
     Fault(
         "contraction of sds instead of variances",
@@ -312,7 +317,7 @@ FAULTS = (
         "contraction = float(1 - (sd / prior_sd) ** 2)",
         "contraction = float(1 - sd / prior_sd)",
         "informed parameters are called prior-limited",
-        ("information.py::test_contraction_tells_data_from_prior",),
+        ("assessment/summary::test_contraction_tells_data_from_prior",),
     ),
     # Posterior.
     Fault(
@@ -321,7 +326,7 @@ FAULTS = (
         "value - self.fit.log_density + found.log_jacobian",
         "value - self.fit.log_density - found.log_jacobian",
         "the sampled posterior is not the model's: noise scales are biased",
-        ("posterior_laws",),
+        ("posterior/draws",),
     ),
     Fault(
         "stop errors as if pixels were always as at the mode",
@@ -329,7 +334,7 @@ FAULTS = (
         "inner = weight * self.states",
         "inner = 1.0 * self.states",
         "campaigns with few stops are sampled many times slower",
-        ("ensemble.py::test_the_precision_at_other_noise_scales_is_the_smoothers",),
+        ("posterior/transport::test_the_precision_at_other_noise_scales_is_the_smoothers",),
     ),
     Fault(
         "log-Jacobian of the transport dropped",
@@ -337,7 +342,7 @@ FAULTS = (
         "value - self.fit.log_density + found.log_jacobian",
         "value - self.fit.log_density",
         "the same, half as much",
-        ("posterior_laws",),
+        ("posterior/draws",),
     ),
     Fault(
         "log-Jacobian added twice to the stored density",
@@ -345,7 +350,7 @@ FAULTS = (
         "+ fit.log_density - found.log_jacobian",
         "+ fit.log_density + found.log_jacobian",
         "`lp` of posterior.nc is not the density of its draws",
-        ("posterior_laws",),
+        ("posterior/draws",),
         survived="read: nothing compared the stored density with that of the stored draws.",
     ),
     Fault(
@@ -354,7 +359,7 @@ FAULTS = (
         "return proposed, self.log_density(w) - self.log_density(proposed)",
         "return proposed, self.log_density(proposed) - self.log_density(w)",
         "sds come out at half their size without any sign of it",
-        ("ensemble.py::test_the_proposal_density_and_draws_agree_in_many_dimensions",),
+        ("posterior/transport::test_the_proposal_density_and_draws_agree_in_many_dimensions",),
     ),
     Fault(
         "resume forgets the random state",
@@ -362,7 +367,7 @@ FAULTS = (
         "log_prob=self.before.log_density[-1], random_state=self.before.random_state",
         "log_prob=self.before.log_density[-1]",
         "a resumed chain is not the unbroken one",
-        ("posterior.py::test_a_seed_gives_one_chain_also_when_interrupted",),
+        ("posterior/sampling::test_a_seed_gives_one_chain_also_when_interrupted",),
     ),
     Fault(
         "no walker is stuck by its acceptance",
@@ -370,7 +375,7 @@ FAULTS = (
         "stuck = acceptance < STUCK_ACCEPTANCE * np.median(acceptance)",
         "stuck = acceptance < 0",
         "a frozen walker passes",
-        ("posterior_laws",),
+        ("posterior/draws",),
     ),
     Fault(
         "no walker is stuck by its density",
@@ -378,7 +383,7 @@ FAULTS = (
         "stuck |= deviation > max(",
         "stuck |= deviation > 1e9 * max(",
         "a walker in another mode passes",
-        ("posterior_laws",),
+        ("posterior/draws",),
         survived="read: the frozen walker of the test was found by its acceptance alone.",
     ),
     Fault(
@@ -387,7 +392,7 @@ FAULTS = (
         "RHAT_LIMIT = 1.01",
         "RHAT_LIMIT = 1.1",
         "intervals of chains that have not converged",
-        ("posterior_laws",),
+        ("posterior/draws",),
         survived="read: the tests set the limits themselves, or had chains of six steps.",
     ),
     Fault(
@@ -396,7 +401,7 @@ FAULTS = (
         "ESS_LIMIT = 1000",
         "ESS_LIMIT = 100",
         "interval ends known to a third of an sd only",
-        ("posterior_laws",),
+        ("posterior/draws",),
         survived="read: as for R-hat.",
     ),
     Fault(
@@ -405,7 +410,7 @@ FAULTS = (
         "if not len(kept) >= TAU_LIMIT * tau:",
         "if not TAU_LIMIT * len(kept) >= tau:",
         "R-hat and ESS of chains too short to estimate them",
-        ("posterior_laws",),
+        ("posterior/draws",),
         survived="read: as for R-hat.",
     ),
     Fault(
@@ -414,7 +419,7 @@ FAULTS = (
         'axis = "pan" if direction in ("left", "right") else "tilt"',
         'axis = "pan" if direction in ("left",) else "tilt"',
         "lost motion of the wrong axis",
-        ("posterior_laws",),
+        ("posterior/draws",),
         survived="read: left and up only were tried.",
     ),
     Fault(
@@ -423,7 +428,7 @@ FAULTS = (
         "lambda p: np.minimum(",
         "lambda p: np.maximum(",
         "lost motion of k N instead of at most the backlash",
-        ("posterior_laws",),
+        ("posterior/draws",),
     ),
     Fault(
         "tails of intervals exchanged",
@@ -431,7 +436,7 @@ FAULTS = (
         "tails = (0.025, 0.975)",
         "tails = (0.975, 0.025)",
         "lower ends above upper ones",
-        ("posterior_laws",),
+        ("posterior/draws",),
     ),
     Fault(
         "90 % intervals called 95 %",
@@ -439,7 +444,7 @@ FAULTS = (
         "tails = (0.025, 0.975)",
         "tails = (0.05, 0.95)",
         "one interval in ten misses",
-        ("posterior_laws",),
+        ("posterior/draws",),
     ),
     Fault(
         "Monte Carlo errors of both interval ends exchanged",
@@ -447,7 +452,7 @@ FAULTS = (
         'method="quantile", prob=prob) for prob in tails]',
         'method="quantile", prob=prob) for prob in tails[::-1]]',
         "the longer tail is called the better known",
-        ("posterior_laws",),
+        ("posterior/draws",),
         survived="read: these errors were asked for of a constant only.",
     ),
     Fault(
@@ -456,7 +461,7 @@ FAULTS = (
         'mcse_mean=each(array_stats.mcse, 0.0, method="mean")',
         "mcse_mean=values.std(axis=(0, 1)) / np.sqrt(values.shape[0] * values.shape[1])",
         "more digits than the chain has",
-        ("posterior_laws",),
+        ("posterior/draws",),
     ),
     Fault(
         "predicted looks scatter by the other direction's stop sd",
@@ -464,7 +469,7 @@ FAULTS = (
         "sd_rad = np.radians(sd_deg.reshape(len(z), 2, 2)[..., ::-1])",
         "sd_rad = np.radians(sd_deg.reshape(len(z), 2, 2))",
         "predictive checks blame the wrong direction",
-        ("predictive",),
+        ("posterior/predictive",),
         survived="read: nothing looked at the scatter of predicted looks but a coverage with a bound of 71 %.",
     ),
     Fault(
@@ -473,7 +478,7 @@ FAULTS = (
         "error = error + home[:, segment]",
         "error = error + 0 * home[:, segment]",
         "predictive checks call re-homed segments outliers",
-        ("predictive",),
+        ("posterior/predictive",),
         survived="read: as for the other direction's stop sd.",
     ),
     # The classic estimator.
@@ -483,7 +488,7 @@ FAULTS = (
         "sd = float(np.std(ratios, ddof=1))",
         "sd = float(np.std(ratios, ddof=0))",
         "type A uncertainty too small",
-        ("classic",),
+        ("estimators/four_point",),
     ),
     Fault(
         "t with n degrees of freedom",
@@ -491,7 +496,7 @@ FAULTS = (
         "interval95_type_a=_interval(average, type_a, n - 1)",
         "interval95_type_a=_interval(average, type_a, n)",
         "intervals too short for few repeats",
-        ("classic",),
+        ("estimators/four_point",),
     ),
     Fault(
         "homing taken for a leg",
@@ -499,7 +504,7 @@ FAULTS = (
         "if a.segment == b.segment and a.steps != b.steps",
         "if a.steps != b.steps",
         "one |N| is called several",
-        ("protocols.py::test_homing_is_no_leg",),
+        ("instrument/stops::test_homing_is_no_leg",),
     ),
     Fault(
         "sd of one experiment for that of the mean",
@@ -507,7 +512,7 @@ FAULTS = (
         "gum = float(np.hypot(type_a, type_b))",
         "gum = float(np.hypot(sd, type_b))",
         "repeats do not help the GUM uncertainty",
-        ("classic",),
+        ("estimators/four_point",),
     ),
     Fault(
         "focal part of the uncertainty doubled",
@@ -515,7 +520,7 @@ FAULTS = (
         "0.1 * focal_scale_u) * focal_scale_u) ** 2",
         "0.1 * focal_scale_u) * 2 * focal_scale_u) ** 2",
         "type B uncertainty of the focal scale twice as large",
-        ("classic",),
+        ("estimators/four_point",),
     ),
     Fault(
         "effective degrees of freedom by the square",
@@ -523,7 +528,7 @@ FAULTS = (
         "return float(u**4 / total)",
         "return float(u**2 / total)",
         "GUM intervals too wide",
-        ("classic",),
+        ("estimators/four_point",),
     ),
     Fault(
         "Y of frame S to the right",
@@ -531,7 +536,7 @@ FAULTS = (
         "np.column_stack((z, -x, -y))",
         "np.column_stack((z, x, -y))",
         "left and right change places",
-        ("classic",),
+        ("estimators/four_point",),
     ),
     Fault(
         "slope of points 3 and 4 with the wrong sign",
@@ -539,7 +544,7 @@ FAULTS = (
         "(across[..., 2] - across[..., 3])",
         "(across[..., 3] - across[..., 2])",
         "theta_f mirrored",
-        ("classic",),
+        ("estimators/four_point",),
     ),
     # The digital twin.
     Fault(
@@ -548,7 +553,7 @@ FAULTS = (
         "right = left @ np.asarray(stereo.R, float).T +",
         "right = left @ np.asarray(stereo.R, float) +",
         "simulated campaigns of another stereo pair",
-        ("simulation", "classic"),
+        ("twin/simulated_campaign", "estimators/four_point"),
     ),
     Fault(
         "twin: stop error per pose",
@@ -556,7 +561,7 @@ FAULTS = (
         "elif counters[i] != counters[i - 1]:",
         "else:",
         "simulated stops are redrawn while the axis stands",
-        ("simulation",),
+        ("twin/simulated_campaign",),
     ),
     Fault(
         "twin: homed from the wrong side",
@@ -564,7 +569,7 @@ FAULTS = (
         "side = {positive: -0.5, negative: 0.5}",
         "side = {positive: 0.5, negative: -0.5}",
         "play of the first move in the wrong direction",
-        ("simulation",),
+        ("twin/simulated_campaign",),
         survived="run: `simulate`'s own choice of the side was read by no test, only the functions that it calls.",
     ),
     # Comparison.
@@ -574,7 +579,7 @@ FAULTS = (
         "log_density=float(np.mean(stats.t.logpdf(error, dof[name], scale=u)))",
         "log_density=-float(np.mean(stats.t.logpdf(error, dof[name], scale=u)))",
         "the worse predictor has the better score",
-        ("gap.py::test_scores_of_predictions_by_hand",),
+        ("comparison/gap::test_scores_of_predictions_by_hand",),
         survived="read: no test read this score.",
     ),
     Fault(
@@ -583,7 +588,7 @@ FAULTS = (
         'ratio = scores["classic"].rms_block_deg / scores["joint"].rms_block_deg',
         'ratio = scores["joint"].rms_block_deg / scores["classic"].rms_block_deg',
         "the report says that the classic predicts better by the factor by which it is worse",
-        ("gap.py::test_scores_of_predictions_by_hand",),
+        ("comparison/gap::test_scores_of_predictions_by_hand",),
     ),
     Fault(
         "shared cameras counted twice instead of once",
@@ -591,7 +596,7 @@ FAULTS = (
         "variance = variance - 2 * np.sum(influence[0] * influence[1], axis=1)",
         "variance = variance + 2 * np.sum(influence[0] * influence[1], axis=1)",
         "a changed gear is not noticed",
-        ("gap.py::test_a_calibration_has_not_changed_from_itself",),
+        ("comparison/gap::test_a_calibration_has_not_changed_from_itself",),
     ),
     Fault(
         "distance of the error map by its largest coordinate",
@@ -599,7 +604,7 @@ FAULTS = (
         "np.linalg.norm(error, axis=0), np.inf)",
         "np.abs(error).max(axis=0), np.inf)",
         "a tolerance in mm is said to be met up to 1.7 times too far out",
-        ("comparison.py::test_bias_of_the_nominal_estimator_is_the_twins",),
+        ("coordinates/error_map::test_bias_of_the_nominal_estimator_is_the_twins",),
         survived="read: only RMS and bias of the map were compared with the twin.",
     ),
     Fault(
@@ -608,7 +613,7 @@ FAULTS = (
         "float(np.mean(np.abs(errors) <= limit))",
         "float(np.mean(errors <= limit))",
         "large negative errors meet every tolerance",
-        ("gap.py::test_criterion_follows_its_rule",),
+        ("comparison/gap::test_criterion_follows_its_rule",),
     ),
     Fault(
         "RMS of the error map over coordinates",
@@ -616,7 +621,7 @@ FAULTS = (
         "square = np.sum(kept**2, axis=(0, 1)) / count",
         "square = np.sum(kept**2, axis=(0, 1)) / count / 3",
         "errors in mm too small by a factor of 1.7",
-        ("comparison.py::test_bias_of_the_nominal_estimator_is_the_twins",),
+        ("coordinates/error_map::test_bias_of_the_nominal_estimator_is_the_twins",),
     ),
     # Coordinates.
     Fault(
@@ -625,7 +630,7 @@ FAULTS = (
         "upper = 0.5 * (1 + probability)",
         "upper = probability",
         "k = 1.64 for 95 %",
-        ("propagation.py::test_coverage_factor_of_infinitely_many_dof_is_normal",),
+        ("statistics/intervals::test_coverage_factor_of_infinitely_many_dof_is_normal",),
     ),
     Fault(
         "effective degrees of freedom without the fourth power",
@@ -633,7 +638,7 @@ FAULTS = (
         "total = sum(c**4 / nu for c, nu in zip(contributions, dof, strict=True))",
         "total = sum(c**2 / nu for c, nu in zip(contributions, dof, strict=True))",
         "coverage factors of another quantity",
-        ("propagation.py::test_effective_dof",),
+        ("statistics/intervals::test_effective_dof",),
     ),
     Fault(
         "coverage interval with twice its tails",
@@ -641,7 +646,7 @@ FAULTS = (
         "tail = 0.5 * (1 - probability)",
         "tail = 1 - probability",
         "U95 of coordinates holds 90 %",
-        ("propagation.py::test_symmetric_interval_of_normals",),
+        ("statistics/intervals::test_symmetric_interval_of_normals",),
     ),
     Fault(
         "published y with the wrong sign",
@@ -649,7 +654,7 @@ FAULTS = (
         "y = baseline_mm * (0.5 - share)",
         "y = baseline_mm * (0.5 + share)",
         "points on the wrong side of the baseline's middle",
-        ("coordinates",),
+        ("coordinates/location",),
     ),
     Fault(
         "other root of the cone",
@@ -657,7 +662,7 @@ FAULTS = (
         "ahead = cos_b * root - w[1] * direction[1]",
         "ahead = -cos_b * root - w[1] * direction[1]",
         "points behind the scanner",
-        ("coordinates",),
+        ("coordinates/location",),
     ),
     Fault(
         "stop sd of the other side in coordinates",
@@ -665,7 +670,7 @@ FAULTS = (
         "jnp.where(side > 0, high, jnp.where(side < 0, low,",
         "jnp.where(side > 0, low, jnp.where(side < 0, high,",
         "U95 of the wrong approach",
-        ("coordinates",),
+        ("coordinates/location",),
     ),
     Fault(
         "unknown play as if it were normal of unit sd",
@@ -673,7 +678,7 @@ FAULTS = (
         "1, 1, 1 / 12, 1 / 12, 1]",
         "1, 1, 1, 1, 1]",
         "coordinates of unknown approach 3.5 times too uncertain",
-        ("coordinates", "calibration"),
+        ("coordinates/location", "calibration/pointing"),
     ),
     Fault(
         "zero of the aperture with the wrong sign",
@@ -681,7 +686,7 @@ FAULTS = (
         "settings.aperture_rad - receiver.aperture_zero_rad",
         "settings.aperture_rad + receiver.aperture_zero_rad",
         "every reading is off by twice the zero",
-        ("coordinates",),
+        ("coordinates/location",),
     ),
     # What a robot loads.
     Fault(
@@ -690,7 +695,7 @@ FAULTS = (
         "at = output_deg(self.estimates, axis, steps, sign,",
         "at = output_deg(self.estimates, axis, steps, -sign,",
         "every target is missed by the backlash",
-        ("calibration",),
+        ("calibration/pointing",),
     ),
     Fault(
         "run-up from the wrong side",
@@ -698,7 +703,7 @@ FAULTS = (
         "first = steps - sign * ratio_sign * overshoot",
         "first = steps + sign * ratio_sign * overshoot",
         "the play is not taken up on the way",
-        ("calibration",),
+        ("calibration/pointing",),
     ),
     Fault(
         "closed form of `locate`: the other root",
@@ -706,7 +711,7 @@ FAULTS = (
         "closing = cos_b * root - (",
         "closing = -cos_b * root - (",
         "the robot sees points behind itself",
-        ("calibration",),
+        ("calibration/pointing",),
     ),
     Fault(
         "U95 with k = 1.64",
@@ -714,7 +719,7 @@ FAULTS = (
         "NORMAL_95 = 1.959963984540054",
         "NORMAL_95 = 1.6448536269514722",
         "95 % regions hold 90 %",
-        ("conventions.py::test_95_percent_are_two_sided_and_normal",),
+        ("promises/conventions::test_95_percent_are_two_sided_and_normal",),
         survived="run: the tests of half widths took the factor from the package.",
     ),
     Fault(
@@ -723,7 +728,7 @@ FAULTS = (
         "place = side if side else -2 * noise[2 + k]",
         "place = side if side else -4 * noise[2 + k]",
         "points of unknown approach twice as uncertain",
-        ("calibration",),
+        ("calibration/pointing",),
     ),
     Fault(
         "C header with four digits",
@@ -731,7 +736,7 @@ FAULTS = (
         'f"#define {macro[name]} {value!r}"',
         'f"#define {macro[name]} {value:.4g}"',
         "the microcontroller misses by millimetres at 1 m",
-        ("calibration",),
+        ("calibration/pointing",),
     ),
     Fault(
         "aperture reading without its zero",
@@ -739,7 +744,7 @@ FAULTS = (
         'return angle + self.estimates["aperture_zero_deg"]',
         "return angle",
         "the reading foretold for a target is off by the zero",
-        ("calibration",),
+        ("calibration/pointing",),
     ),
     # Certificate.
     Fault(
@@ -748,7 +753,7 @@ FAULTS = (
         "low_up, high_up = mean_up - 2 * sd_up, mean_up + 2 * sd_up",
         "low_up, high_up = mean_up - sd_up, mean_up + sd_up",
         "accuracy better than the standard's",
-        ("certificate.py::test_figures_of_the_published_readings",),
+        ("metrology/iso230::test_figures_of_the_published_readings",),
     ),
     Fault(
         "ISO 230-2 R with two sds",
@@ -756,7 +761,7 @@ FAULTS = (
         "r_up, r_down = 4 * sd_up, 4 * sd_down",
         "r_up, r_down = 2 * sd_up, 2 * sd_down",
         "unidirectional repeatability half as large",
-        ("certificate.py::test_figures_of_the_published_readings",),
+        ("metrology/iso230::test_figures_of_the_published_readings",),
     ),
     Fault(
         "ISO 230-2 E of the up side only",
@@ -764,7 +769,7 @@ FAULTS = (
         "systematic_deg=span(np.maximum(mean_up, mean_down), np.minimum(mean_up, mean_down))",
         "systematic_deg=span(mean_up, mean_up)",
         "systematic deviation without reversal",
-        ("certificate.py::test_figures_of_the_published_readings",),
+        ("metrology/iso230::test_figures_of_the_published_readings",),
     ),
     Fault(
         "ISO 230-2 M of sums",
@@ -772,7 +777,7 @@ FAULTS = (
         "mean, reversal = 0.5 * (mean_up + mean_down), mean_up - mean_down",
         "mean, reversal = mean_up + mean_down, mean_up - mean_down",
         "M twice as large",
-        ("certificate.py::test_figures_of_the_published_readings",),
+        ("metrology/iso230::test_figures_of_the_published_readings",),
     ),
     Fault(
         "ISO 230-2 B with the wrong sign",
@@ -780,7 +785,7 @@ FAULTS = (
         "mean, reversal = 0.5 * (mean_up + mean_down), mean_up - mean_down",
         "mean, reversal = 0.5 * (mean_up + mean_down), mean_down - mean_up",
         "a compensation table of this sign doubles the reversal error",
-        ("certificate.py::test_figures_of_the_published_readings",),
+        ("metrology/iso230::test_figures_of_the_published_readings",),
     ),
     Fault(
         "ISO 230-2 sd with n",
@@ -788,7 +793,7 @@ FAULTS = (
         "np.nanstd(up, axis=-1, ddof=1)",
         "np.nanstd(up, axis=-1, ddof=0)",
         "repeatability too good by a tenth",
-        ("certificate.py::test_figures_of_the_published_readings",),
+        ("metrology/iso230::test_figures_of_the_published_readings",),
     ),
     Fault(
         "simulated data called traceable",
@@ -796,7 +801,7 @@ FAULTS = (
         'if campaign.header.get("synthetic"):\n        return Traceability',
         'if campaign.header.get("simulated"):\n        return Traceability',
         "a twin's report claims a length standard",
-        ("report_html.py::test_traceability_is_what_the_certificate_says",),
+        ("report/page::test_traceability_is_what_the_certificate_says",),
     ),
     Fault(
         "a rest's looks against each other as if independent",
@@ -804,7 +809,7 @@ FAULTS = (
         "np.sqrt(variances[i] + 1 / weight)",
         "np.sqrt(variances[i])",
         "clean campaigns are suspected of depth",
-        ("gap.py::test_recursive_residuals_are_independent_and_standard",),
+        ("comparison/gap::test_recursive_residuals_are_independent_and_standard",),
     ),
     Fault(
         "chance of a gross defect with the wrong sign",
@@ -812,7 +817,7 @@ FAULTS = (
         "far = -x + np.log(",
         "far = x + np.log(",
         "the smaller of two gross defects is the cause",
-        ("gap.py::test_the_larger_of_two_gross_defects_is_the_cause",),
+        ("comparison/gap::test_the_larger_of_two_gross_defects_is_the_cause",),
     ),
     Fault(
         "ratios that follow a backlash the wrong way",
@@ -820,7 +825,7 @@ FAULTS = (
         "step[:, place + 1 :] += self._beyond_linear",
         "step[:, place + 1 :] -= self._beyond_linear",
         "the sampler leaves the ridge of ratio and backlash, and calls itself unconverged",
-        ("posterior_laws.py::test_a_ratio_follows_the_degrees_of_a_backlash",),
+        ("posterior/draws::test_a_ratio_follows_the_degrees_of_a_backlash",),
     ),
     Fault(
         "robust distance by the weight alone",
@@ -828,7 +833,7 @@ FAULTS = (
         "covariance + (weight[len(values)] - 1) * np.eye(4)",
         "covariance * weight[len(values)]",
         "stop errors shrink with the weight of a spot",
-        ("stops.py::test_leave_one_out_of_weighted_spots_is_that_of_full_weight",),
+        ("estimators/linear_spots::test_leave_one_out_of_weighted_spots_is_that_of_full_weight",),
     ),
     Fault(
         "points that a third of the draws lose",
@@ -836,7 +841,7 @@ FAULTS = (
         "least = DIVERGING_SDS *",
         "least = 0.4 *",
         "the robot is sent where no range can be told",
-        ("calibration.py::test_points_that_too_many_draws_lose_are_refused_as_by_the_draws",),
+        ("calibration/pointing::test_points_that_too_many_draws_lose_are_refused_as_by_the_draws",),
     ),
     Fault(
         "contrast left out of the positioning figures",
@@ -844,7 +849,7 @@ FAULTS = (
         ", contrast_deg_per_step=contrast)",
         ")",
         "ISO 230-2 figures of gears that the fit does not see",
-        ("report_html.py::test_axes_are_judged_with_the_fitted_contrast",),
+        ("report/page::test_axes_are_judged_with_the_fitted_contrast",),
     ),
     Fault(
         "DCC: degrees called radians",
@@ -852,7 +857,7 @@ FAULTS = (
         '"deg": r"\\degree"',
         '"deg": r"\\radian"',
         "a machine reads the backlash 57 times too large",
-        ("dcc",),
+        ("metrology/dcc",),
     ),
     Fault(
         "DCC: ratios in degrees",
@@ -860,7 +865,7 @@ FAULTS = (
         '"deg/step": r"\\degree\\per\\one"',
         '"deg/step": r"\\degree"',
         "a ratio without its step",
-        ("dcc",),
+        ("metrology/dcc",),
     ),
     Fault(
         "DCC: whole width as expanded uncertainty",
@@ -868,7 +873,7 @@ FAULTS = (
         "expanded, middle = 0.5 * (high - low), 0.5 * (high + low)",
         "expanded, middle = high - low, 0.5 * (high + low)",
         "k = 3.92 in the certificate",
-        ("dcc",),
+        ("metrology/dcc",),
     ),
     # Planning.
     Fault(
@@ -877,7 +882,7 @@ FAULTS = (
         "rows = found.rows[..., :PARAMETERS].reshape(-1, PARAMETERS)",
         "rows = found.rows[:-1, :, :PARAMETERS].reshape(-1, PARAMETERS)",
         "plans look slightly worse than they are",
-        ("planning.py::test_a_plans_information_is_the_fits_own",),
+        ("planning/planner::test_a_plans_information_is_the_fits_own",),
     ),
     Fault(
         "run-up checked on the wrong side",
@@ -885,7 +890,7 @@ FAULTS = (
         "start = positions - np.array(side) * overshoot",
         "start = positions + np.array(side) * overshoot",
         "plans run into the motor limits",
-        ("plan_parts",),
+        ("planning/forecast",),
         survived="known: limits were tried with a grid that has no position near them on the side that matters.",
     ),
     Fault(
@@ -894,7 +899,7 @@ FAULTS = (
         "scale = np.asarray(space.u)[CONTRAST_COLUMNS] * np.pi / 360",
         "scale = np.asarray(space.u)[CONTRAST_COLUMNS] * np.pi / 180",
         "the contrast seems known twice as well",
-        ("planning.py::test_looks_add_up_to_the_plan_they_make",),
+        ("planning/planner::test_looks_add_up_to_the_plan_they_make",),
     ),
     Fault(
         "time model: placing a sheet as fast as a move",
@@ -902,7 +907,7 @@ FAULTS = (
         '"place": "placement_s"',
         '"place": "move_s"',
         "plans take longer than they say",
-        ("simulation",),
+        ("twin/simulated_campaign",),
     ),
     Fault(
         "time model: seconds per hour",
@@ -910,7 +915,7 @@ FAULTS = (
         "plan_seconds(rig, steps) / 60",
         "plan_seconds(rig, steps) / 3600",
         "minutes are hours",
-        ("plan_parts",),
+        ("planning/forecast",),
     ),
     Fault(
         "assurance off by one experiment",
@@ -918,7 +923,7 @@ FAULTS = (
         "while above - below > 1:",
         "while above - below > 2:",
         "n80 and n95 one too large",
-        ("plan_parts",),
+        ("planning/forecast",),
         survived="read: the assurance at n80 and n95 was asked for, not that one less fails.",
     ),
     Fault(
@@ -927,7 +932,7 @@ FAULTS = (
         '1.0 if match["kind"] == "u" else NORMAL_95',
         '1.0 if match["kind"] == "u" else 1.0',
         "targets of U95 are met by half as many experiments",
-        ("planning.py::test_targets_are_read",),
+        ("planning/planner::test_targets_are_read",),
     ),
     Fault(
         "classic count with n degrees of freedom",
@@ -935,7 +940,7 @@ FAULTS = (
         "wanted = max(2, math.ceil((float(special.stdtrit(n - 1, 0.975))",
         "wanted = max(2, math.ceil((float(special.stdtrit(n, 0.975))",
         "a repeat too few",
-        ("planning.py::test_the_classics_count_is_the_first_that_suffices",),
+        ("planning/planner::test_the_classics_count_is_the_first_that_suffices",),
     ),
     Fault(
         "scatter known as if no parameter were fitted",
@@ -943,7 +948,7 @@ FAULTS = (
         "left_over = max(0.0, 1 - determined / (2 * looks))",
         "left_over = 1.0",
         "n for n - p: assurance too high",
-        ("planning.py::test_what_the_geometry_takes_from_the_stops_is_not_left_for_their_scatter",),
+        ("planning/planner::test_what_the_geometry_takes_from_the_stops_is_not_left_for_their_scatter",),
     ),
     Fault(
         "next looks: a full turn away taken for here",
@@ -951,7 +956,7 @@ FAULTS = (
         "(found.turned | (not turned))",
         "(~found.turned | (not turned))",
         "a full turn away is promised, looks nearby are ordered",
-        ("planning.py::test_next_looks_are_worth_what_they_say_here_and_a_full_turn_away",),
+        ("planning/planner::test_next_looks_are_worth_what_they_say_here_and_a_full_turn_away",),
         survived="planted by a reviewer: only the order of the next looks was asked for.",
     ),
     Fault(
@@ -960,7 +965,7 @@ FAULTS = (
         "range(PARAMETERS, PARAMETERS + 2)] = 1 / HOME_VARIANCE_RAD2",
         "range(PARAMETERS, PARAMETERS + 2)] = HOME_VARIANCE_RAD2",
         "looks after a campaign are chosen as if homing told nothing",
-        ("planning.py::test_a_search_after_data_knows_no_home_offset",),
+        ("planning/planner::test_a_search_after_data_knows_no_home_offset",),
         survived="planted by a reviewer: any design of the search was good enough for its test.",
     ),
     Fault(
@@ -969,7 +974,7 @@ FAULTS = (
         "merit(other) > merit(plain) else",
         "merit(other) < merit(plain) else",
         "the plan is the worse of two",
-        ("planning.py::test_exchanges_are_kept_where_they_raise_assurance_or_lower_the_median",),
+        ("planning/planner::test_exchanges_are_kept_where_they_raise_assurance_or_lower_the_median",),
         survived="planted by a reviewer: no test compared the design with the one before its exchanges.",
     ),
     Fault(
@@ -978,7 +983,7 @@ FAULTS = (
         'parts["pixel noise"] = float(pull @ noise @ pull)',
         'parts["pixel noise"] = float(pull @ (data - noise) @ pull)',
         "better cameras are bought where stops are the trouble",
-        ("plan_parts.py::test_shares_of_two_parameters_by_hand",),
+        ("planning/forecast::test_shares_of_two_parameters_by_hand",),
         survived="planted by a reviewer: shares were asked to add up, not to be right.",
     ),
     Fault(
@@ -987,7 +992,7 @@ FAULTS = (
         "+= share**-2 - 1",
         "+= share**-1 - 1",
         "an input is asked for far better than needed",
-        ("plan_parts.py::test_an_input_has_to_be_known_as_much_better_as_the_floor_is_too_high",),
+        ("planning/forecast::test_an_input_has_to_be_known_as_much_better_as_the_floor_is_too_high",),
         survived="planted by a reviewer: the words of the advice were asked for, not its number.",
     ),
     Fault(
@@ -996,7 +1001,7 @@ FAULTS = (
         "= {_at_most(share * u)} instead of",
         "= {_at_most(u)} instead of",
         "the cure of a floor is what is there already",
-        ("planning.py::test_a_target_below_the_floor_names_the_term_and_what_would_do",),
+        ("planning/planner::test_a_target_below_the_floor_names_the_term_and_what_would_do",),
         survived="planted by a reviewer: the words of the advice were asked for, not its number.",
     ),
     Fault(
@@ -1005,7 +1010,7 @@ FAULTS = (
         "last * math.floor(value / last + 1e-9)",
         "last * math.ceil(value / last - 1e-9)",
         "what would do does not do",
-        ("plan_parts.py::test_what_is_needed_is_never_rounded_up",),
+        ("planning/forecast::test_what_is_needed_is_never_rounded_up",),
     ),
     Fault(
         "measuring stops at a hundredth of the value a minute",
@@ -1013,7 +1018,7 @@ FAULTS = (
         "worth = STOP_SHARE_PER_MINUTE * now",
         "worth = 10 * STOP_SHARE_PER_MINUTE * now",
         "a campaign ends ten times too early",
-        ("plan_parts.py::test_measuring_stops_below_a_thousandth_of_the_value_a_minute",),
+        ("planning/forecast::test_measuring_stops_below_a_thousandth_of_the_value_a_minute",),
         survived="planted by a reviewer: the rule was tried far from its threshold only.",
     ),
     Fault(
@@ -1022,7 +1027,7 @@ FAULTS = (
         "half_width = target.limit * NORMAL_95 / target.factor",
         "half_width = target.limit / target.factor",
         "four times as many experiments are asked for",
-        ("plan_parts.py::test_the_classics_answer_before_data",),
+        ("planning/forecast::test_the_classics_answer_before_data",),
         survived="planted by a reviewer: no test read the classic's answer.",
     ),
     Fault(
@@ -1031,7 +1036,7 @@ FAULTS = (
         "for p in (0.975, 0.025))",
         "for p in (0.025, 0.975))",
         "the interval of s and of n is upside down",
-        ("plan_parts.py::test_the_classics_answer_after_data_has_the_interval_of_chi_square",),
+        ("planning/forecast::test_the_classics_answer_after_data_has_the_interval_of_chi_square",),
         survived="planted by a reviewer: no test read the classic's answer.",
     ),
     Fault(
@@ -1040,7 +1045,7 @@ FAULTS = (
         "pair = stops + stops[[1, 0, 3, 2]]",
         "pair = stops",
         "the classic method looks better than it is",
-        ("plan_parts.py::test_the_classics_forecast_is_what_its_experiments_do",),
+        ("planning/forecast::test_the_classics_forecast_is_what_its_experiments_do",),
         survived="planted by a reviewer: the classic's curve was asked to fall, not to be right.",
     ),
     Fault(
@@ -1049,7 +1054,7 @@ FAULTS = (
         "errors.append(ratios[0] - true)",
         "errors.append(true - ratios[0])",
         "a correction goes the wrong way",
-        ("plan_parts.py::test_the_classics_forecast_is_what_its_experiments_do",),
+        ("planning/forecast::test_the_classics_forecast_is_what_its_experiments_do",),
         survived="planted by a reviewer: no test read the classic's answer.",
     ),
     Fault(
@@ -1058,7 +1063,7 @@ FAULTS = (
         "forecast.sd[:, rows] ** 2 / each + forecast.stereo_u[rows] ** 2",
         "forecast.sd[:, rows] ** 2 / each",
         "repeats seem to lower what is common to all of them",
-        ("plan_parts.py::test_the_classics_value_adds_stereo_to_the_mean_of_its_experiments",),
+        ("planning/forecast::test_the_classics_value_adds_stereo_to_the_mean_of_its_experiments",),
         survived="planted by a reviewer: the classic's curve was asked to fall, not to be right.",
     ),
     Fault(
@@ -1067,7 +1072,7 @@ FAULTS = (
         "own[:, :2].sum(axis=1)",
         "own[:, :1].sum(axis=1)",
         "z of a point seems as sure as its calibration",
-        ("planning.py::test_stops_and_reading_at_a_point_are_those_of_the_twins_optics",),
+        ("planning/planner::test_stops_and_reading_at_a_point_are_those_of_the_twins_optics",),
         survived="planted by a reviewer: only x was tried, in which the tilt's stop is of second order.",
     ),
     Fault(
@@ -1076,7 +1081,7 @@ FAULTS = (
         "assurance=hits / len(rows),",
         "assurance=hits / n,",
         "fits that fail make a plan look better",
-        ("studies.py::test_failures_count_against_the_assurance",),
+        ("studies/study::test_failures_count_against_the_assurance",),
     ),
     Fault(
         "study: coverage of one tail",
@@ -1084,7 +1089,7 @@ FAULTS = (
         "np.mean(np.abs(pit - 0.5) < level / 2)",
         "np.mean(np.abs(pit - 0.5) < level)",
         "every interval seems to hold the truth",
-        ("studies.py::test_counts_of_a_perfect_estimator_are_within_bounds_and_of_a_boastful_one_outside",),
+        ("studies/study::test_counts_of_a_perfect_estimator_are_within_bounds_and_of_a_boastful_one_outside",),
     ),
     # Files.
     Fault(
@@ -1093,7 +1098,7 @@ FAULTS = (
         "if not (isfinite(value) and low <= value <= high):",
         "if value < low or value > high:",
         "one empty or wrong cell makes every result not-a-number",
-        ("files",),
+        ("files/documents",),
     ),
     Fault(
         "duplicate key accepted",
@@ -1101,7 +1106,7 @@ FAULTS = (
         "            if key not in values:\n",
         "            if True:\n",
         "the second of two values counts, silently",
-        ("files",),
+        ("files/documents",),
     ),
     Fault(
         "written without a rename",
@@ -1109,7 +1114,7 @@ FAULTS = (
         "            os.replace(temporary, path)\n",
         "            path.write_bytes(data)\n",
         "a crash leaves half a file where a whole one was",
-        ("files",),
+        ("files/documents",),
     ),
     Fault(
         "renamed before it is on the disk",
@@ -1117,7 +1122,7 @@ FAULTS = (
         "                os.fsync(stream.fileno())\n",
         "                pass\n",
         "after a power cut an empty file stands where a whole one was",
-        ("files",),
+        ("files/documents",),
     ),
     Fault(
         "spot numbers twice",
@@ -1125,7 +1130,7 @@ FAULTS = (
         'table.check_unique("spot", spots, "unique ids")',
         'table.check_unique("spot", [], "unique ids")',
         "two rows answer to one number",
-        ("hostile",),
+        ("promises/hostile",),
     ),
     Fault(
         "moves out of order accepted",
@@ -1133,7 +1138,7 @@ FAULTS = (
         "if row and times_s[row] < times_s[row - 1]:",
         "if row and times_s[row] < times_s[0]:",
         "shuffled moves make another campaign",
-        ("hostile",),
+        ("promises/hostile",),
     ),
     Fault(
         "mirrored stereo rotation accepted",
@@ -1141,7 +1146,7 @@ FAULTS = (
         "deviation = max(np.abs(rotation @ rotation.T - np.eye(3)).max(), abs(np.linalg.det(rotation) - 1.0))",
         "deviation = np.abs(rotation @ rotation.T - np.eye(3)).max()",
         "a left-handed camera frame passes",
-        ("rigs",),
+        ("instrument/rig",),
     ),
     # Device.
     Fault(
@@ -1150,7 +1155,7 @@ FAULTS = (
         "if zlib.crc32(line[9:]) != crc:",
         "if zlib.crc32(line[9:]) < 0:",
         "damaged lines count as events",
-        ("device_journal",),
+        ("acquisition/journal",),
     ),
     Fault(
         "journal: chain not compared",
@@ -1158,7 +1163,7 @@ FAULTS = (
         "if int(match[3], 16) != previous:",
         "if int(match[3], 16) < 0:",
         "lines of another run count as events",
-        ("device_journal",),
+        ("acquisition/journal",),
     ),
     Fault(
         "frame: CRC not compared",
@@ -1166,7 +1171,7 @@ FAULTS = (
         "if crc16(match[1]) != int(match[2], 16):",
         "if crc16(match[1]) < 0:",
         "a disturbed line moves the mirrors",
-        ("device_protocol",),
+        ("positioner/protocol",),
     ),
     Fault(
         "driver: an older answer taken for this one",
@@ -1174,7 +1179,7 @@ FAULTS = (
         "if answer.sequence == sequence:",
         "if answer.sequence <= sequence:",
         "a move counts as done before it has begun",
-        ("device_driver", "device_faults"),
+        ("positioner/driver", "positioner/faults"),
     ),
     Fault(
         "driver: arrival not compared with the order",
@@ -1182,7 +1187,7 @@ FAULTS = (
         "if reached != wanted or (state.pan_target_steps, state.tilt_target_steps) != wanted:",
         "if False:",
         "a stop elsewhere counts as arrival",
-        ("device_limits",),
+        ("positioner/limits",),
         survived="run: no simulated device had said done at another place.",
     ),
     Fault(
@@ -1191,7 +1196,7 @@ FAULTS = (
         "if state.boot != self._boot:",
         "if state.boot < 0:",
         "moves go on from lost counters",
-        ("device_driver",),
+        ("positioner/driver",),
     ),
     Fault(
         "device: a repeated request executed again",
@@ -1199,7 +1204,7 @@ FAULTS = (
         "if sequence == self._last_sequence and line == self._last_request:",
         "if False:",
         "a retry is refused or moves twice",
-        ("device_protocol",),
+        ("positioner/protocol",),
     ),
     Fault(
         "device: soft limit of tilt open upwards",
@@ -1207,7 +1212,7 @@ FAULTS = (
         'limits["tmin"] <= tilt <= limits["tmax"]',
         'limits["tmin"] <= tilt',
         "tilt runs into the stop",
-        ("device_limits",),
+        ("positioner/limits",),
         survived="run: the lower limit of tilt and the upper one of pan were tried, no other.",
     ),
     Fault(
@@ -1216,7 +1221,7 @@ FAULTS = (
         'if argument == "1" and self._status == "alarm":',
         'if argument == "1" and self._status == "never":',
         "the laser can be switched on in alarm",
-        ("device_protocol",),
+        ("positioner/protocol",),
     ),
     Fault(
         "laser stays on when a camera fails",
@@ -1224,7 +1229,7 @@ FAULTS = (
         "            lit, on = self._lit(positioner, dark)\n        finally:\n            positioner.laser(False)",
         "            lit, on = self._lit(positioner, dark)\n        finally:\n            pass",
         "an exception leaves the laser on",
-        ("device_acquisition",),
+        ("acquisition/engine",),
     ),
     Fault(
         "homing called an arrival from below",
@@ -1232,7 +1237,7 @@ FAULTS = (
         "name = names[0] if steps > 0 else names[1]",
         "name = names[0]",
         "the recorded approach of move 0 is wrong: every ratio hangs on it",
-        ("device_acquisition.py::test_approach_after_homing",),
+        ("acquisition/engine::test_approach_after_homing",),
     ),
     # Pictures.
     Fault(
@@ -1241,7 +1246,7 @@ FAULTS = (
         "usable = cv2.dilate(clipped, np.ones((3, 3), np.uint8)) == 0",
         "usable = clipped >= 0",
         "clipped cores pull the centre and widen the spot",
-        ("spots",),
+        ("cameras/detection",),
     ),
     Fault(
         "centres half a pixel off",
@@ -1249,7 +1254,7 @@ FAULTS = (
         "centre = p[1:3] + step[1:3] + np.array(patch.corner)",
         "centre = p[1:3] + step[1:3] + np.array(patch.corner) + 0.5",
         "integer = corner instead of centre of a pixel: half a pixel everywhere",
-        ("spots",),
+        ("cameras/detection",),
     ),
     Fault(
         "covariance of a spot with the contrast, not its square",
@@ -1257,7 +1262,7 @@ FAULTS = (
         "units = np.array([1.0, noise.gain_dn, noise.speckle_contrast**2])",
         "units = np.array([1.0, noise.gain_dn, noise.speckle_contrast])",
         "stated sds too large by the root of the contrast",
-        ("spots",),
+        ("cameras/detection",),
     ),
     Fault(
         "correlation of a spot doubled",
@@ -1265,7 +1270,7 @@ FAULTS = (
         "mixed = (both - u - v) / 2",
         "mixed = both - u - v",
         "covariances that are none for turned spots",
-        ("spots",),
+        ("cameras/detection",),
     ),
     Fault(
         "epipolar gate open",
@@ -1273,7 +1278,7 @@ FAULTS = (
         "return ~(distance <= np.maximum(allowed, EPIPOLAR_FLOOR_PX))",
         "return ~(distance <= np.maximum(allowed, 1e3 * EPIPOLAR_FLOOR_PX))",
         "two different reflections count as one spot",
-        ("spots",),
+        ("cameras/detection",),
     ),
     Fault(
         "cameras exchanged in spots.csv",
@@ -1281,7 +1286,7 @@ FAULTS = (
         "for side, one in zip(SIDES, (left, right), strict=True):\n        good",
         "for side, one in zip(SIDES, (right, left), strict=True):\n        good",
         "the table holds left pixels under right",
-        ("spots",),
+        ("cameras/detection",),
     ),
     Fault(
         "rendered pixels half a pixel off",
@@ -1289,7 +1294,7 @@ FAULTS = (
         "offsets = (np.arange(SUBPIXELS) + 0.5) / SUBPIXELS - 0.5",
         "offsets = (np.arange(SUBPIXELS) + 0.5) / SUBPIXELS",
         "boards stand half a pixel off in rendered pictures",
-        ("renderer",),
+        ("twin/spot_pictures",),
     ),
     Fault(
         "stereo calibration: n for n - p",
@@ -1297,7 +1302,7 @@ FAULTS = (
         "dof = int(kept.sum()) - int(free.sum()) - 6 * len(views)",
         "dof = int(kept.sum())",
         "the covariance of the cameras is too small",
-        ("stereo_calibration.py::test_degrees_of_freedom_are_coordinates_less_unknowns",),
+        ("cameras/stereo_calibration::test_degrees_of_freedom_are_coordinates_less_unknowns",),
     ),
 )
 

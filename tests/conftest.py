@@ -28,12 +28,36 @@ from tvsbayes.instrument.rig import Rig, read_rig
 from tvsbayes.twin.simulated_campaign import SimulatedCampaign, Truth, simulate
 
 ROOT = Path(__file__).resolve().parents[1]
-COMPILES = "test_cli.py"
+COMPILES = "cli/test_main.py"
 LONG = (
-    *("test_planning.py", "test_report_html.py", "test_posterior.py", "test_gap.py", "test_information.py"),
-    *("test_ensemble.py", "test_solver.py", "test_likelihood.py", "test_comparison.py", "test_stops.py"),
-    *("test_stereo_calibration.py", "test_coordinates.py", "test_joint.py", "test_studies.py", "test_locate.py"),
-    *("test_calibration.py", "test_propagation.py", "test_readme.py", "test_positioner.py", "test_twins.py"),
+    *(
+        "planning/test_planner.py",
+        "report/test_page.py",
+        "posterior/test_sampling.py",
+        "comparison/test_gap.py",
+        "assessment/test_summary.py",
+    ),
+    *(
+        "posterior/test_transport.py",
+        "statistics/test_least_squares.py",
+        "estimators/test_likelihood.py",
+        "coordinates/test_error_map.py",
+        "estimators/test_linear_spots.py",
+    ),
+    *(
+        "cameras/test_stereo_calibration.py",
+        "coordinates/test_location.py",
+        "estimators/test_joint_fit.py",
+        "studies/test_study.py",
+        "cli/test_use_commands.py",
+    ),
+    *(
+        "calibration/test_pointing.py",
+        "statistics/test_intervals.py",
+        "promises/test_readme.py",
+        "model/test_laser_path.py",
+        "promises/test_shipped_data.py",
+    ),
 )
 """Files that compile the model or much of it, about ten seconds or more, roughly the longest first."""
 
@@ -46,7 +70,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """
 
     def turn(item: pytest.Item) -> int:
-        name = item.path.name
+        name = f"{item.path.parent.name}/{item.path.name}"
         return 0 if name == COMPILES else 2 + LONG.index(name) if name in LONG else 1
 
     items.sort(key=turn)

@@ -34,7 +34,7 @@ COMMANDS = (
 )
 """In the order of `--help`."""
 for command in COMMANDS:
-    app.command()(command)
+    app.command(command.__name__.replace("_", "-"))(command)
 
 
 def run(arguments: list[str]) -> int:

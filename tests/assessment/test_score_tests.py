@@ -1,0 +1,218 @@
+"""Validation of a fit: exact under the model, blind to what the fit can follow, and right about planted defects.
+
+Residuals are drawn at a true rig from the linear model (pixel noise, stop errors that persist) instead of refitted: the
+tests do not see what a fit would take away, which is itself tested.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from types import SimpleNamespace
+
+import equinox as eqx
+import jax
+import numpy as np
+import pytest
+from conftest import coordinates
+from report.test_fit_text import small_summary
+from scipy import stats
+
+from tvsbayes.assessment.score_tests import VALIDATION_LEVEL, _Answer, _holm, validate
+from tvsbayes.estimators.joint_fit import JointFit, Problem, fit_at
+from tvsbayes.estimators.linear_spots import linear_spots, stop_information
+from tvsbayes.instrument.campaign import ordered_spots
+from tvsbayes.instrument.parameters import INDEX, NAMES, NOISE_NAMES
+from tvsbayes.instrument.plan import PlanStep
+from tvsbayes.report.evidence import Criterion
+from tvsbayes.report.fit_text import fit_text, validation_lines
+from tvsbayes.report.page import _verdict
+from tvsbayes.results.estimates import Validation, ValidationTest
+from tvsbayes.statistics.least_squares import Mode
+from tvsbayes.twin.simulated_campaign import simulate
+
+PAN = (0, 70, 141, 200, 142, 71)
+TILT = (-60, -36, -12, 13, 36, 61, 37, 12, -12, -36)
+
+
+@pytest.fixture(scope="module")
+def clean(mounted_rig) -> JointFit:
+    """60 stops of both axes on two sheets in turn, linearised at the true rig."""
+    orders: list[tuple] = [("home", 0, 0)]
+    for look in range(60):
+        if look % 15 == 0:
+            orders.append(("place", None, None, ("d1", "d2")[look // 15 % 2]))
+        orders += [("move", PAN[look % 6], TILT[look % 10]), ("look",)]
+    simulated = simulate(mounted_rig, tuple(PlanStep(n, *o) for n, o in enumerate(orders)), seed=4)
+    with jax.enable_x64(True):
+        problem = Problem(simulated.campaign, simulated.campaign.rig)
+        z = np.where(problem.free, coordinates(problem.space, simulated.truth), 0.0)
+        fisher = stop_information(problem.linear_spots(z)[1]).fisher
+        mode = Mode(z, np.linalg.inv(fisher + np.eye(len(z))), 0.0, ())
+        return fit_at(simulated.campaign, problem, mode, 0)
+
+
+def with_residual(fit: JointFit, residual: np.ndarray) -> JointFit:
+    """The same fit with other residuals, shape (n, 4)."""
+    return replace(fit, linearised=eqx.tree_at(lambda lin: lin.residual, fit.linearised, residual))
+
+
+def own_columns(fit: JointFit) -> np.ndarray:
+    held = np.isin(NAMES, NOISE_NAMES) | ~fit.free
+    return np.where(held, 0.0, -fit.linearised.residual_jacobian)
+
+
+def drawn(fit: JointFit, seed: int) -> np.ndarray:
+    """Residuals by the model: unit noise of three components, stop errors drawn anew where an axis moved."""
+    generator = np.random.default_rng([seed, 0x76])
+    spots = linear_spots(fit.linearised, fit.arrays, own_columns(fit))
+    state, residual = np.zeros(6), np.zeros((len(spots.residual), 4))
+    for row in range(len(residual)):
+        fresh = generator.standard_normal(6) * np.sqrt(spots.variance[row])
+        state = np.where(spots.renewed[row], fresh, state)
+        residual[row] = spots.load[row] @ state
+        residual[row, :3] += generator.standard_normal(3)
+    return residual
+
+
+def test_what_the_fit_can_follow_is_not_seen(clean):
+    """Adding J a changes no test: the true rig may lie anywhere, and no refit is needed to see a defect."""
+    residual = drawn(clean, 1)
+    offset = own_columns(clean) @ (0.3 * np.random.default_rng(2).standard_normal(len(NAMES)))
+    before, after = (validate(with_residual(clean, r)).tests for r in (residual, residual + offset))
+    first, second = ({t.name: t for t in tests} for tests in (before, after))
+    assert len(first) >= 8
+    for name, test in first.items():
+        # Directions that the spots tell less than 1e-4 prior sds are not followed: 0.3 sd of 50 of them.
+        assert second[name].chi2 == pytest.approx(test.chi2, abs=0.3), name
+
+
+def test_p_values_are_uniform_and_false_alarms_rare(clean):
+    """Twenty-five clean campaigns: one-place tests by Kolmogorov-Smirnov, all by the number of alarms, both at 1e-4."""
+    found = [validate(with_residual(clean, drawn(clean, seed))) for seed in range(25)]
+    alarms = sum(not v.passed for v in found)
+    assert alarms <= stats.binom.isf(1e-4, len(found), VALIDATION_LEVEL)
+    by_name: dict[str, list[ValidationTest]] = {}
+    for validation in found:
+        for test in validation.tests:
+            by_name.setdefault(test.name, []).append(test)
+    drift = [t.p for t in by_name["the cameras drifted (pose or focal length)"]]
+    assert stats.kstest(drift, "uniform").pvalue > 1e-4
+    for name, tests in by_name.items():
+        assert len(tests) == len(found), name
+        # Shared levels are conservative: small p at most as often as they say.
+        share = sum(t.p < 0.1 for t in tests)
+        assert share <= stats.binom.isf(1e-4, len(tests), 0.1), name
+
+
+def planted(fit: JointFit, name: str) -> np.ndarray:
+    """What a defect adds to the residuals, written without the package's own columns."""
+    spots = ordered_spots(fit.campaign)
+    count = len(spots)
+    along = np.arange(count) / (count - 1)
+    lin = fit.linearised
+    pan, tilt = (np.radians(1) * lin.slope[:, :, k] for k in (0, 1))
+    angle = np.degrees(lin.mirror_angles_rad)
+    pose = [INDEX[f"extrinsics.rotation_rad.{a}"] for a in "xyz"]
+    units = np.asarray(fit.space.u)[pose]
+    turned = -lin.residual_jacobian[:, :, pose] @ (np.radians([1.5, -1.0, 0.5]) / units)
+    counters = np.array([fit.campaign.moves[s.move].pan_steps for s in spots])
+    patterns = {
+        "the cameras moved": turned * (along > 0.6)[:, None],
+        "the cameras drifted": 2 * turned * along[:, None],
+        "a ratio drifted": pan * (0.1 * (along - 0.5) * (angle[:, 0] - angle[:, 0].mean()))[:, None],
+        "steps were lost": -pan * (0.24 * (along > 0.4))[:, None],
+        "the gears": 0.2 * tilt * np.cos(2 * np.pi * angle[:, 1] / 1.7)[:, None],
+        "stops depend on the step phase": 0.2 * pan * np.where(counters % 4 == 2, 1.0, -1.0)[:, None],
+    }
+    return patterns[name]
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "the cameras moved",
+        "the cameras drifted",
+        "a ratio drifted",
+        "steps were lost",
+        "the gears",
+        "stops depend on the step phase",
+    ],
+)
+def test_a_planted_defect_is_named(clean, name):
+    found = validate(with_residual(clean, drawn(clean, 5) + planted(clean, name)))
+    assert not found.passed
+    assert found.cause.startswith(name)
+    assert found.inflation > 1
+
+
+def test_a_lost_step_is_placed(clean):
+    found = validate(with_residual(clean, drawn(clean, 5) + planted(clean, "steps were lost")))
+    row = int(found.cause.split("from spot ")[1].split(" ")[0])
+    # 32 places over 60 spots: the nearest lies within two.
+    assert found.cause.split(": ")[1].startswith("pan") and abs(row - 24) <= 2
+
+
+def test_one_bad_spot_is_named_and_moves_no_uncertainty(clean):
+    residual = drawn(clean, 6)
+    residual[33, :3] += 12.0
+    found = validate(with_residual(clean, residual))
+    worst = next(t for t in found.tests if t.name.startswith("single"))
+    assert worst.failed and worst.where.endswith(f"spot {ordered_spots(clean.campaign)[33].spot}")
+
+
+def test_holm_shares_the_level_and_the_factor_takes_failed_tests_alone():
+    logs = np.log([0.004, 1e-5, 0.5, 0.004999])
+    answers = [_Answer(float(p), f"t{k}", "here", 9.0, 1, 2.0 + k) for k, p in enumerate(logs)]
+    found = _holm(answers)
+    # Four tests: 1e-5 <= 0.01/4, then 0.004 > 0.01/3.
+    assert [t.name for t in found.tests if t.failed] == ["t1"]
+    assert found.cause == "t1: here" and found.inflation == pytest.approx(np.hypot(1, 3.0))
+    # 0.004 <= 0.01/2 once only two are left.
+    found = _holm([answers[0], answers[2]])
+    assert [t.failed for t in found.tests] == [True, False] and found.inflation == pytest.approx(np.hypot(1, 2.0))
+    nothing = _holm([answers[2]])
+    assert nothing.passed and nothing.inflation == 1.0 and nothing.cause == ""
+
+
+FAILED = Validation(
+    False,
+    0.01,
+    "the cameras moved: from spot 60 on (move 70)",
+    3.25,
+    (ValidationTest("the cameras moved", "from spot 60 on (move 70)", 80.0, 6, 16, 1e-9, True, 3.09),),
+)
+
+
+def test_no_reader_of_the_text_can_miss_a_failure():
+    plain = fit_text(small_summary())
+    assert "alidation" not in plain and "VALIDATION" not in plain
+    lines = fit_text(replace(small_summary(), validation=FAILED)).splitlines()
+    warning = validation_lines(FAILED.as_json())[0]
+    assert "3.25" in warning and "the cameras moved: from spot 60" in warning
+    assert lines[0] == warning and lines.count(warning) == 2
+    passed = replace(FAILED, passed=True, cause="", inflation=1.0, tests=(replace(FAILED.tests[0], failed=False),))
+    text = fit_text(replace(small_summary(), validation=passed))
+    assert "VALIDATION" not in text and "validation: no sign of a model error in 1 tests" in text
+
+
+def test_no_reader_of_the_report_can_miss_a_failure():
+    fit = {"converged": True, "validation": FAILED.as_json()}
+    warning = validation_lines(FAILED.as_json())[0]
+    met = Criterion("ratio left", 1e-3, "deg/step", 0.99, "met")
+    for criteria, kind in (((), "cannot-tell"), ((met,), "met")):
+        text, shown = _verdict(SimpleNamespace(fit=fit, criteria=criteria))
+        assert text.startswith(warning) and shown == kind
+    text, _ = _verdict(SimpleNamespace(fit={"converged": True}, criteria=(met,)))
+    assert text.startswith("Met")
+
+
+def test_the_entry_obeys_the_schema():
+    from results.test_fit_record import changed, kept, problems, schema_of
+
+    document = kept("fit-1-laplace.json")
+    schema = schema_of(document)
+    written = json.loads(json.dumps({**document, "validation": FAILED.as_json()}))
+    assert problems(written, schema) == [] and problems({**written, "validation": None}, schema) == []
+    for path, value in (("inflation", 0.5), ("passed", 1), ("tests/0/p", 2.0), ("tests/0/dof", 0), ("level", ...)):
+        assert problems(changed(written, f"validation/{path}", value), schema), path

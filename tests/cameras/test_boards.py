@@ -1,0 +1,213 @@
+"""Which pictures are a pair, where the corners are, in an order that both cameras share."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from support.drawn_boards import BOARD, FOUND_PX, POSES, SIZE, pictures, true_corners, write_pair
+
+from tvsbayes.cameras import boards
+from tvsbayes.cameras.boards import Board, find_corners, find_views
+from tvsbayes.errors import InputError, NothingToEstimate
+
+
+@pytest.fixture(scope="module")
+def six(tmp_path_factory) -> Path:
+    """Six pairs, half of them JPEG."""
+    folder = tmp_path_factory.mktemp("six")
+    for k, pose in enumerate(POSES):
+        write_pair(folder, f"_{k + 8}", pictures(pose), ".jpg" if k % 2 else ".png")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def six_views(six):
+    return find_views(six, BOARD)
+
+
+def test_pairs_of_png_and_jpeg_are_found_where_they_are(six_views):
+    """Natural order: 8, 9, 10."""
+    assert [view.name for view in six_views.views] == [f"_{k}" for k in range(8, 14)]
+    assert (six_views.image_width, six_views.image_height) == SIZE
+    assert six_views.unpaired == six_views.without_board == six_views.other_size == six_views.reordered == ()
+    for view, pose in zip(six_views.views, POSES, strict=True):
+        seen = np.hstack([view.left, view.right])
+        turned = seen[::-1]
+        misses = [np.abs(order - true_corners(pose)).max() for order in (seen, turned)]
+        assert min(misses) < FOUND_PX
+
+
+def test_other_files_are_ignored_and_lonely_pictures_named(tmp_path):
+    write_pair(tmp_path, "1", pictures(POSES[0]))
+    cv2.imwrite(str(tmp_path / "left2.png"), pictures(POSES[1])[0])
+    cv2.imwrite(str(tmp_path / "RIGHT3.PNG"), np.full(SIZE[::-1], 90, np.uint8))
+    cv2.imwrite(str(tmp_path / "left_small.png"), np.zeros((30, 40), np.uint8))
+    cv2.imwrite(str(tmp_path / "leaf.png"), np.zeros((100, 400), np.uint8))
+    (tmp_path / "left_notes.txt").write_text("no picture")
+    (tmp_path / "right.yml").write_text("%YAML:1.0")
+    (tmp_path / ".left9.png").write_bytes(b"hidden")
+    found = find_views(tmp_path, BOARD)
+    assert [(v.name, v.left is None, v.right is None) for v in found.views] == [("1", False, False), ("2", False, True)]
+    assert found.unpaired == ("left2.png", "RIGHT3.PNG")
+    assert found.without_board == ("RIGHT3.PNG",)
+    assert found.other_size == ("left_small.png",)
+
+
+@pytest.mark.parametrize("swap", (False, True))
+def test_wide_frames_are_split(tmp_path, six, six_views, swap):
+    for view in six_views.views[:2]:
+        halves = [cv2.imread(str(next(six.glob(f"{side}{view.name}.*"))), 0) for side in ("left", "right")]
+        cv2.imwrite(str(tmp_path / f"frame{view.name}.png"), np.hstack(halves[::-1] if swap else halves))
+    cv2.imwrite(str(tmp_path / "portrait.png"), np.zeros((400, 300), np.uint8))
+    found = find_views(tmp_path, BOARD, swap=swap)
+    assert (found.image_width, found.image_height) == SIZE
+    for split, view in zip(found.views, six_views.views[:2], strict=True):
+        assert split.name == f"frame{view.name}"
+        np.testing.assert_array_equal(split.left, view.left)
+        np.testing.assert_array_equal(split.right, view.right)
+
+
+@pytest.mark.parametrize("columns, rows, quarters", ((7, 6, 2), (7, 5, 2), (6, 6, 1), (6, 6, 2), (6, 6, 3)))
+def test_turned_corner_orders_are_mended(tmp_path, monkeypatch, columns, rows, quarters):
+    """By colour (7 x 6), by direction (7 x 5), by both (6 x 6): a finder that starts at another corner."""
+    board = Board(columns, rows, 25.0)
+    write_pair(tmp_path, "1", pictures(POSES[0], board))
+    straight = find_views(tmp_path, board)
+    calls = iter((False, True))
+    original = boards.find_corners
+
+    def turned(grey, board, finder="classic"):
+        corners, fallback = original(grey, board, finder)
+        if next(calls):
+            grid = np.rot90(corners.reshape(board.rows, board.columns, 2), quarters)
+            corners = grid.reshape(-1, 2)
+        return corners, fallback
+
+    monkeypatch.setattr(boards, "find_corners", turned)
+    monkeypatch.setattr(boards.os, "cpu_count", lambda: 1)
+    mended = find_views(tmp_path, board)
+    assert mended.reordered == ("1",)
+    for side in ("left", "right"):
+        np.testing.assert_array_equal(getattr(mended.views[0], side), getattr(straight.views[0], side))
+
+
+def test_mirrored_corner_orders_are_mended(monkeypatch):
+    """A finder that counts rows from right to left: x would turn into y the wrong way round."""
+    grey = pictures(POSES[0])[0]
+    straight, _ = boards.find_corners(grey, BOARD)
+    original = boards._find_classic
+
+    def mirrored(grey, board):
+        return original(grey, board).reshape(board.rows, board.columns, 2)[:, ::-1].reshape(-1, 2)
+
+    monkeypatch.setattr(boards, "_find_classic", mirrored)
+    np.testing.assert_array_equal(boards.find_corners(grey, BOARD)[0], straight)
+
+
+def test_colours_decide_for_a_camera_on_its_head(tmp_path):
+    """The right picture turned by 180 degrees: direction alone would pair the wrong corners."""
+    left, right = pictures(POSES[0])
+    write_pair(tmp_path, "1", [left, right[::-1, ::-1]])
+    view = find_views(tmp_path, BOARD).views[0]
+    upright = np.array(SIZE) - 1 - view.right
+    seen = np.hstack([view.left, upright])
+    assert min(np.abs(order - true_corners(POSES[0])).max() for order in (seen, seen[::-1])) < FOUND_PX
+
+
+def test_other_finder_steps_in_by_name(six, monkeypatch, tmp_path):
+    write_pair(tmp_path, "1", pictures(POSES[0]))
+    monkeypatch.setattr(boards, "_find_classic", lambda grey, board: None)
+    found = find_views(tmp_path, BOARD)
+    assert found.by_fallback == ("left1.png", "right1.png")
+    seen = np.hstack([found.views[0].left, found.views[0].right])
+    assert min(np.abs(order - true_corners(POSES[0])).max() for order in (seen, seen[::-1])) < FOUND_PX
+    direct = find_views(tmp_path, BOARD, finder="sector")
+    assert direct.by_fallback == ()
+    np.testing.assert_array_equal(direct.views[0].left, found.views[0].left)
+
+
+@pytest.mark.parametrize("share", [0.5, 0.2])
+def test_large_pictures_are_searched_in_a_smaller_copy(monkeypatch, share):
+    """The size of the copy is no whole part of the picture's; corners are refined in the picture itself."""
+    monkeypatch.setattr(boards, "SECTOR_PIXELS_MAX", int(share * SIZE[0] * SIZE[1]))
+    picture = pictures(POSES[0])[0][:-3, :-1]
+    corners, fallback = find_corners(np.ascontiguousarray(picture), BOARD, "sector")
+    assert not fallback
+    # A finder of one picture cannot know a half turn.
+    true = true_corners(POSES[0])[:, :2]
+    assert min(np.abs(order - true).max() for order in (corners, corners[::-1])) < FOUND_PX
+
+
+def bomb() -> bytes:
+    """A PNG header that announces 30000 x 30000 pixels."""
+    ok, data = cv2.imencode(".png", np.zeros((4, 4), np.uint8))
+    assert ok
+    data = bytearray(data.tobytes())
+    data[16:24] = (30000).to_bytes(4) * 2
+    return bytes(data)
+
+
+@pytest.mark.parametrize("kind", ("bomb", "garbage", "damaged", "link", "pipe", "twice"))
+def test_hostile_pictures_are_refused_by_name(tmp_path, kind):
+    folder = tmp_path / "pictures"
+    folder.mkdir()
+    write_pair(folder, "1", pictures(POSES[0]))
+    place = folder / "left2.png"
+    if kind == "bomb":
+        place.write_bytes(bomb())
+    elif kind == "garbage":
+        place.write_bytes(b"GIF89a" + bytes(100))
+    elif kind == "damaged":
+        data = bytearray((folder / "left1.png").read_bytes())
+        data[len(data) // 2] ^= 255
+        place.write_bytes(data)
+    elif kind == "link":
+        (tmp_path / "outside.png").write_bytes((folder / "left1.png").read_bytes())
+        place.symlink_to(tmp_path / "outside.png")
+    elif kind == "pipe":
+        os.mkfifo(place)
+    else:
+        place = folder / "left1.jpg"
+        place.write_bytes((folder / "left1.png").read_bytes())
+    with pytest.raises(InputError, match="left1" if kind == "twice" else "left2.png"):
+        find_views(folder, BOARD)
+
+
+def test_no_pictures_is_said(tmp_path):
+    (tmp_path / "notes.txt").write_text("nothing")
+    with pytest.raises(NothingToEstimate, match="no checkerboard picture"):
+        find_views(tmp_path, BOARD)
+    with pytest.raises(InputError, match="nowhere"):
+        find_views(tmp_path / "nowhere", BOARD)
+
+
+@pytest.mark.parametrize("text", ("9", "9x", "x6", "9x6x2", "2x9", "9x101", "-9x6", "nine x six", "٩x٦"))
+def test_impossible_boards_are_refused(text):
+    with pytest.raises(InputError, match="--board"):
+        Board.named(text, 25.0)
+
+
+def test_board_reads_and_measures_itself():
+    board = Board.named("9 X 6", 25.0, 0.01)
+    assert (board.columns, board.rows, board.corners) == (9, 6, 54)
+    np.testing.assert_allclose(board.points_mm.mean(0), 0, atol=1e-12)
+    np.testing.assert_allclose(board.points_mm[1] - board.points_mm[0], [25, 0, 0])
+    np.testing.assert_allclose(board.points_mm[9] - board.points_mm[0], [0, 25, 0])
+    for bad in ({"pitch_mm": 0.0}, {"pitch_mm": np.nan}, {"pitch_u_mm": 3.0}, {"pitch_u_mm": -1.0}):
+        with pytest.raises(InputError, match="--pitch"):
+            replace(board, **bad)
+
+
+def test_corners_that_the_refining_gives_back_get_a_wider_window():
+    """A board at 65 degrees: with the narrow window cornerSubPix returns a corner as it came, 2.5 px off."""
+    pose = np.array([-0.387, 1.073, 0.189, -11.453, 19.857, 477.414])
+    right = true_corners(pose)[:, 2:]
+    found, by_fallback = find_corners(pictures(pose)[1], BOARD)
+    # The drawn board's warp leaves 0.4 px on squares of 10 px.
+    assert not by_fallback
+    assert min(np.abs(found - right).max(), np.abs(found[::-1] - right).max()) < 1.0

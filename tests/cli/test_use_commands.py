@@ -1,0 +1,215 @@
+"""`locate` and `steps-for` as commands, on a campaign whose results are drawn, not fitted."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from support.small_campaign import small_campaign
+
+from tvsbayes.assessment.fitted_calibration import calibration_of_draws
+from tvsbayes.calibration.calibration_file import CALIBRATION_FORMAT, calibration_bytes, load_calibration
+from tvsbayes.calibration.pointing import Calibration
+from tvsbayes.cli.main import run
+from tvsbayes.files.disk import shipped_data
+from tvsbayes.instrument.campaign import read_campaign, write_campaign
+from tvsbayes.instrument.parameters import NAMES, RIG_PRIORS
+
+POINT = ("--pan-steps", 100, "--tilt-steps", 20, "--aperture-deg", 70)
+RELATIVE_SD = 0.01
+"""Of every parameter: small enough for all draws to meet their line of sight."""
+
+
+def drawn_calibration(campaign) -> Calibration:
+    """Normal draws about the default rig; mirror errors and tilts of 0.1 deg."""
+    generator = np.random.default_rng(8)
+    columns = []
+    for name in NAMES:
+        value = RIG_PRIORS[name].value if name in RIG_PRIORS else 0.0
+        value = 0.1 if name.startswith(("mirror1", "mirror2", "laser_tilt", "tilt_axis", "backlash")) else value
+        sd = RELATIVE_SD * abs(value) if name.startswith(("degrees", "mirror", "laser", "backlash")) else 0.0
+        columns.append(value + sd * generator.standard_normal(600))
+    causes = ("pixel noise", "stereo calibration")
+    found = calibration_of_draws(NAMES, np.stack(columns, axis=1), campaign, "posterior", 0)
+    parts = np.stack([0.25 * found.covariance, 0.75 * found.covariance])
+    return replace(found, causes=causes, cause_covariance=parts)
+
+
+@pytest.fixture
+def folder(tmp_path) -> Path:
+    """A campaign folder with results that fit it."""
+    folder = tmp_path / "campaign"
+    write_campaign(small_campaign(), folder)
+    (folder / "results").mkdir()
+    calibration = drawn_calibration(read_campaign(folder))
+    (folder / "results" / "draws.npz").write_bytes(calibration_bytes(calibration))
+    return folder
+
+
+@pytest.fixture
+def ask(capsys):
+    """Run a command with --json: exit code, and the one document on stdout."""
+
+    def refuse(constant: str) -> None:
+        raise AssertionError(f"{constant} is no JSON")
+
+    def run_json(*arguments: object) -> tuple[int, dict[str, Any]]:
+        code = run([*map(str, arguments), "--json"])
+        return code, json.loads(capsys.readouterr().out, parse_constant=refuse)
+
+    return run_json
+
+
+def test_locate_one_point(ask, folder):
+    code, document = ask("locate", folder, *POINT, "--pan-approach", "left", "--tilt-approach", "up")
+    assert code == 0
+    assert document["estimator"] == "posterior"
+    assert np.shape(document["xyz_mm"]) == (3,)
+    assert np.shape(document["covariance_mm2"]) == (3, 3)
+    assert np.shape(document["u95_mm"]) == (3,)
+    assert set(document["linear"]) >= {"xyz_mm", "covariance_mm2", "u95_mm", "digits", "validated"}
+    by_hand = load_calibration(folder).locate(100, 20, 70.0)
+    np.testing.assert_allclose(document["linear"]["xyz_mm"], by_hand.xyz_mm, rtol=1e-9)
+    # Draws and law differ by curvature, a few hundredths of u here, and by 600 draws' noise.
+    sd = np.sqrt(np.diag(document["covariance_mm2"]))
+    np.testing.assert_allclose(document["xyz_mm"], by_hand.xyz_mm, atol=0.25 * sd.max())
+    assert ask("locate", folder, *POINT)[1] == document
+
+
+def test_sides_differ_by_the_backlash(ask, folder):
+    left = ask("locate", folder, *POINT)[1]["linear"]["xyz_mm"]
+    right = ask("locate", folder, *POINT, "--pan-approach", "right")[1]["linear"]["xyz_mm"]
+    calibration = load_calibration(folder)
+    rays = [calibration.ray(100, 20, (side, "up")).direction for side in ("left", "right")]
+    angle = np.degrees(np.arccos(np.clip(rays[0] @ rays[1], -1, 1)))
+    assert angle == pytest.approx(calibration.estimates["backlash_deg.pan"], rel=0.02)
+    assert left[0] != right[0]
+
+
+def test_points_from_a_file_keep_their_order_and_refuse_one_by_one(ask, folder, tmp_path):
+    rows = ["tilt_steps,pan_steps,aperture_deg,pan_approach,tilt_approach"]
+    rows += ["20,100,70,left,up", "20,100,150,left,up", "-20,0,75,right,down", "20,100,70,unknown,unknown"]
+    points = tmp_path / "points.csv"
+    points.write_text("\n".join(rows) + "\n")
+    code, document = ask("locate", folder, "--points", points)
+    assert code == 0
+    entries = document["points"]
+    assert len(entries) == 4
+    single = ask("locate", folder, *POINT)[1]
+    np.testing.assert_allclose(entries[0]["xyz_mm"], single["xyz_mm"], rtol=1e-12)
+    np.testing.assert_allclose(entries[0]["u95_mm"], single["u95_mm"], rtol=1e-12)
+    assert entries[1]["xyz_mm"] is None
+    assert entries[1]["refused"]["code"] == "diverging"
+    assert entries[2]["xyz_mm"][1] != entries[0]["xyz_mm"][1]
+    assert entries[3]["u95_mm"][0] > entries[0]["u95_mm"][0]
+
+
+@pytest.mark.parametrize(
+    ("row", "code", "column"),
+    [
+        ("20,100,70,up,up", "approach", "pan_approach"),
+        ("20,100,nan,left,up", "number", "aperture_deg"),
+        ("20,1e12,70,left,up", "range", "pan_steps"),
+    ],
+)
+def test_bad_points_are_refused_with_line_and_column(ask, folder, tmp_path, row, code, column):
+    points = tmp_path / "points.csv"
+    points.write_text(f"tilt_steps,pan_steps,aperture_deg,pan_approach,tilt_approach\n20,100,70,left,up\n{row}\n")
+    exit_code, document = ask("locate", folder, "--points", points)
+    assert exit_code == 2
+    error = document["error"]
+    assert (error["line"], error["column"]) == (3, column)
+    assert error["remedy"] and error["allowed"]
+
+
+def test_diverging_and_half_given_points_are_bad_input(ask, folder):
+    code, document = ask("locate", folder, "--pan-steps", 100, "--tilt-steps", 20, "--aperture-deg", 150)
+    assert (code, document["error"]["code"]) == (2, "diverging")
+    for arguments in ((), ("--pan-steps", 100), (*POINT, "--points", "x.csv"), (*POINT, "--pan-approach", "up")):
+        assert ask("locate", folder, *arguments)[0] == 2
+    code, document = ask("locate", folder, "--pan-steps", "nan", "--tilt-steps", 20, "--aperture-deg", 70)
+    assert (code, document["error"]["code"]) == (2, "number")
+
+
+def test_budget_adds_up(ask, folder):
+    code, document = ask("locate", folder, *POINT, "--budget")
+    assert code == 0
+    shares = {entry["cause"]: entry["share"] for entry in document["budget"]["causes"]}
+    assert sum(shares.values()) == pytest.approx(1.0, abs=1e-12)
+    assert shares["stereo calibration"] == pytest.approx(3 * shares["pixel noise"], rel=1e-9)
+    variance = sum(np.square(entry["u_mm"]) for entry in document["budget"]["causes"])
+    np.testing.assert_allclose(variance, np.diag(document["linear"]["covariance_mm2"]), rtol=1e-9)
+
+
+def test_steps_for_a_point_leads_back_to_it(ask, folder):
+    wanted = (700.0, 20.0, 40.0)
+    code, found = ask("steps-for", folder, *(x for k, v in zip("xyz", wanted, strict=True) for x in (f"--{k}-mm", v)))
+    assert code == 0
+    again = ask(
+        "locate",
+        folder,
+        *("--pan-steps", found["pan_steps"], "--tilt-steps", found["tilt_steps"]),
+        *("--aperture-deg", found["aperture_deg"]),
+    )[1]["linear"]["xyz_mm"]
+    np.testing.assert_allclose(again, found["xyz_mm"], atol=1e-6)
+    # Half a step on each axis, as seen from the positioner.
+    reach = np.linalg.norm(np.subtract(wanted, found["ray"]["origin_mm"]))
+    half_step_mm = reach * np.radians(0.5 * np.hypot(0.06, 0.07)) * 1.05
+    assert np.linalg.norm(np.subtract(again, wanted)) < half_step_mm
+    assert found["via_pan_steps"] < found["pan_steps"]
+    assert found["via_tilt_steps"] < found["tilt_steps"]
+
+
+def test_limits_of_a_rig_are_kept(ask, folder, tmp_path):
+    source = shipped_data() / "rigs" / "mounted"
+    text = (source / "rig.toml").read_text()
+    # An uncertain backlash: clearing it takes more steps than its best estimate.
+    calibration = replace(load_calibration(folder), overshoot_steps={"pan": 6, "tilt": 6})
+    (folder / "results" / "draws.npz").write_bytes(calibration_bytes(calibration))
+    limits = "[positioner]\npan_min_steps = 97\npan_max_steps = 200\ntilt_min_steps = -100\ntilt_max_steps = 100\n"
+    assert "[positioner]" not in text
+    (tmp_path / "rig.toml").write_text(f"{text}\n{limits}")
+    (tmp_path / "stereo.json").write_bytes((source / "stereo.json").read_bytes())
+    aim = calibration.ray(100, 20).direction
+    azimuth, elevation = np.degrees([np.arctan2(aim[1], aim[0]), np.arcsin(aim[2])])
+    direction = ("--azimuth-deg", azimuth, "--elevation-deg", elevation)
+    free = ask("steps-for", folder, *direction)[1]
+    assert (free["pan_steps"], free["approach"]["pan"]) == (100, "left")
+    code, kept = ask("steps-for", folder, *direction, "--rig", tmp_path / "rig.toml")
+    assert code == 0
+    assert kept["approach"]["pan"] == "right"
+    assert kept["via_pan_steps"] > kept["pan_steps"] >= 97
+    code, document = ask("steps-for", folder, *direction, "--rig", tmp_path / "rig.toml", "--pan-approach", "left")
+    assert (code, document["error"]["code"]) == (2, "outside-limits")
+
+
+def test_exports_are_read_back(folder, capsys, tmp_path):
+    assert run(["steps-for", str(folder), "--export", "json"]) == 0
+    path = tmp_path / "calibration.json"
+    path.write_text(capsys.readouterr().out)
+    assert json.loads(path.read_text())["format"] == CALIBRATION_FORMAT
+    stored, exported = load_calibration(folder), load_calibration(path)
+    point = (600.0, 10.0, 30.0)
+    assert stored.steps_for(point).as_json() == exported.steps_for(point).as_json()
+    assert run(["steps-for", str(folder), "--export", "header"]) == 0
+    header = capsys.readouterr().out
+    assert "Expected error (posterior, 95 %)" in header
+    assert "@" not in header.split("#ifndef")[0]
+
+
+@pytest.mark.parametrize("arguments", [(), ("--x-mm", 1, "--y-mm", 2), ("--azimuth-deg", 1), ("--export", "xml")])
+def test_steps_for_needs_one_target(ask, folder, arguments):
+    code, document = ask("steps-for", folder, *arguments)
+    assert (code, document["error"]["code"]) == (2, "usage")
+
+
+def test_damaged_results_are_refused_and_not_replaced(ask, folder):
+    draws = folder / "results" / "draws.npz"
+    draws.write_bytes(draws.read_bytes()[:1000])
+    code, document = ask("locate", folder, *POINT)
+    assert (code, document["error"]["code"]) == (2, "damaged-results")
+    assert draws.stat().st_size == 1000

@@ -1,0 +1,490 @@
+"""Where beam and aperture meet, and how sure: against ray intersections, the twin's optics and hand derivatives."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from support.bent_rig import (
+    BENT,
+    DRAWS,
+    NO_NOISE_DEG,
+    NOISE_DEG,
+    NOMINAL,
+    SD,
+    WOBBLE,
+    calibration,
+    twin_angle_deg,
+    twin_points,
+    twin_ray_at,
+)
+
+from tvsbayes.calibration.pointing import DIVERGING_SHARE, INPUT_NAMES, NOISE_NAMES, Calibration
+from tvsbayes.coordinates.beam_meeting import carry, meeting, sources
+from tvsbayes.coordinates.location import locate, locate_linear, published_point, settings_of
+from tvsbayes.errors import InputError
+from tvsbayes.twin.physics import aperture_angle_deg
+
+ROUNDING_MM = 1e-9
+"""Of a hundred operations on lengths up to 1000 mm, magnified tenfold by a grazing line of sight."""
+A_MM = 200.0
+NORMAL_95 = 1.959963984540054
+
+
+def rays_meet(B_deg: float, C_deg: float, beta_deg: float) -> np.ndarray:
+    """Intersection of both rays in the plane tilted by beta, as a linear system."""
+    B, C, beta = np.radians([B_deg, C_deg, beta_deg])
+    beam, sight = np.array([math.sin(C), -math.cos(C)]), np.array([math.sin(B), math.cos(B)])
+    reach, _ = np.linalg.solve(np.stack([beam, -sight], axis=1), [0.0, -A_MM])
+    distance, y = reach * beam + [0.0, A_MM / 2]
+    return np.array([distance * math.cos(beta), y, distance * math.sin(beta)])
+
+
+@pytest.mark.parametrize("beta_deg", [0.0, 17.0, -30.0])
+def test_published_point_is_where_the_rays_meet(beta_deg):
+    pairs = [(B, C) for B in (5.0, 45.0, 80.0, 90.0, 95.0, 140.0) for C in (10.0, 60.0, 90.0, 100.0) if B + C < 175]
+    assert any(B > 90 for B, _ in pairs) and any(C > 90 for _, C in pairs)
+    B, C = np.array(pairs).T
+    found = published_point(B, C, beta_deg, A_MM)
+    assert found.shape == (3, len(pairs))
+    for i, pair in enumerate(pairs):
+        # Points up to 2 m away where both rays meet under 5 deg.
+        np.testing.assert_allclose(found[:, i], rays_meet(*pair, beta_deg), atol=10 * ROUNDING_MM)
+        np.testing.assert_array_equal(published_point(*pair, beta_deg, A_MM), found[:, i])
+    distance = np.hypot(found[0], found[2])
+    np.testing.assert_allclose(found[1], A_MM / 2 - distance / np.tan(np.radians(C)), atol=10 * ROUNDING_MM)
+    np.testing.assert_allclose(found[1], -A_MM / 2 + distance / np.tan(np.radians(B)), atol=10 * ROUNDING_MM)
+
+
+@pytest.mark.parametrize(("B", "C", "y_mm"), [(90, 70, -100.0), (95, 70, -163.3), (110, 50, -253.2)])
+def test_published_y_is_the_table(B, C, y_mm):
+    """The table of research/domain.md section 1, printed to 0.1 mm."""
+    assert published_point(float(B), float(C), 0.0, A_MM)[1] == pytest.approx(y_mm, abs=0.05)
+
+
+def test_published_point_diverges_without_a_warning():
+    found = published_point(np.array([100.0, 90.0]), np.array([80.0, 120.0]), 0.0, A_MM)
+    assert abs(found[0, 0]) > 1e15 and found[0, 1] < 0
+
+
+def test_the_printed_branch_jumps_at_90_degrees():
+    """By -a at B = 90 deg for every C: -a/2 before, -a (1/2 + 1) behind, whatever tan C."""
+    C = np.array([20.0, 50.0, 70.0, 89.0])
+    below, above = (published_point(90.0 + d, C, 8.0, A_MM, as_printed=True) for d in (-1e-7, 1e-7))
+    # sin B cos C / sin(B + C) = 1 at B = 90 deg: 1/2 - 1 against -(1/2 + 1).
+    np.testing.assert_allclose(above[1] - below[1], -A_MM, atol=1e-3)
+    np.testing.assert_allclose(above[[0, 2]], below[[0, 2]], atol=1e-2)
+    smooth = published_point(90.0 + 1e-7, C, 8.0, A_MM) - published_point(90.0 - 1e-7, C, 8.0, A_MM)
+    # 2e-7 deg times at most 1 m per degree at C = 89.
+    assert np.abs(smooth).max() < 1e-2
+    B = np.array([30.0, 60.0, 90.0])
+    np.testing.assert_array_equal(
+        published_point(B, 70.0, 8.0, A_MM, as_printed=True), published_point(B, 70.0, 8.0, A_MM)
+    )
+    # The table's last column, research/domain.md section 1, at B and C whose share is 253.2 / 200 + 1/2.
+    share = 0.5 + 253.2 / 200
+    assert published_point(110.0, 50.0, 0.0, A_MM, as_printed=True)[1] == pytest.approx(-A_MM * (0.5 + share), abs=0.05)
+
+
+def bent_beams(count: int, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Origins (n, 3), directions (n, 3) by the twin, and points (n, 3) on them 100 to 1500 mm away."""
+    rng = np.random.default_rng(seed)
+    origins, directions = [], []
+    for pan, tilt in rng.uniform([-55.0, -35.0], [55.0, 35.0], (count, 2)):
+        values = {name: BENT[name] + rng.normal() * SD.get(name, SD.get(name.split(".")[0], 0)) for name in BENT}
+        values |= {"baseline_mm": A_MM, "mirror1_error_deg": rng.normal(), "laser_tilt_deg.x": rng.normal()}
+        origin, direction = twin_ray_at(values, pan, tilt)
+        origins.append(origin)
+        directions.append(direction)
+    o, d = np.array(origins), np.array(directions)
+    return o, d, o + rng.uniform(100.0, 1500.0, (count, 1)) * d
+
+
+@jax.jit
+def compiled_meeting(origin, direction, reading, azimuth):
+    return meeting(origin, direction, jnp.asarray(A_MM), reading, azimuth)
+
+
+def met(origin, direction, reading_deg, azimuth: bool):
+    """Points (n, 3), ranges (n,), and whether they meet, by one compiled function of 200 beams."""
+    count = len(origin)
+    rows = np.arange(200) % count
+    with jax.enable_x64(True):
+        found = compiled_meeting(
+            jnp.asarray(np.asarray(origin, float)[rows].T),
+            jnp.asarray(np.asarray(direction, float)[rows].T),
+            jnp.asarray(np.radians(np.asarray(reading_deg, float))[rows]),
+            jnp.asarray(azimuth),
+        )
+        return np.asarray(found.xyz_mm).T[:count], np.asarray(found.range_mm)[:count], np.asarray(found.meets)[:count]
+
+
+@pytest.mark.parametrize("azimuth", [False, True])
+def test_the_reading_of_a_point_leads_back_to_it(azimuth):
+    origin, direction, points = bent_beams(200, 3)
+    reading = aperture_angle_deg(points, A_MM, "azimuth" if azimuth else "in-plane")
+    assert (reading > 90).sum() > 20 and (reading < 90).sum() > 20
+    found, range_mm, meets = met(origin, direction, reading, azimuth)
+    assert meets.all()
+    # The reading's rounding of 2e-14 deg at up to r^2 / (a sin) = 200 mm per degree, and of the discriminant's root.
+    np.testing.assert_allclose(found, points, atol=1e-7)
+    np.testing.assert_allclose(range_mm, np.linalg.norm(points - origin, axis=1), atol=1e-7)
+
+
+@pytest.mark.parametrize("azimuth", [False, True])
+def test_a_right_angle_is_no_exception(azimuth):
+    """B = 90 deg exactly: the plane y = -a/2."""
+    origin, direction, _ = bent_beams(200, 4)
+    reach = (-A_MM / 2 - origin[:, 1]) / direction[:, 1]
+    ahead = (reach > 0) & (origin[:, 0] + reach * direction[:, 0] > 0)
+    points = origin + reach[:, None] * direction
+    found, _, meets = met(origin, direction, np.full(200, 90.0), azimuth)
+    assert ahead.sum() > 50
+    # cos(90 deg) is 6e-17, not 0: it decides about beams that run behind the positioner only.
+    np.testing.assert_array_equal(meets, ahead)
+    np.testing.assert_allclose(found[ahead], points[ahead], atol=ROUNDING_MM, rtol=1e-10)
+
+
+@pytest.mark.parametrize("azimuth", [False, True])
+@pytest.mark.parametrize("reading_deg", [40.0, 70.0, 90.0, 100.0])
+def test_meeting_has_the_derivative_of_central_differences(azimuth, reading_deg):
+    """With respect to origin, direction, baseline and reading, also where the square's leading term vanishes."""
+    # A beam with C = 60 deg: it meets all of these readings.
+    values = BENT | {"pan_zero_emission_deg": 60.0}
+    origin, direction = twin_ray_at(values, 1.0, 12.0)
+    inputs = np.concatenate([origin, direction, [A_MM, math.radians(reading_deg)]])
+
+    @jax.jit
+    def point(x):
+        return meeting(x[:3], x[3:6], x[6], x[7], jnp.asarray(azimuth)).xyz_mm
+
+    with jax.enable_x64(True):
+        jacobian = np.asarray(jax.jit(jax.jacfwd(point))(jnp.asarray(inputs)))
+        step = 1e-5 * np.array([100.0] * 3 + [1.0] * 3 + [100.0, 1.0])
+        for i in range(8):
+            moved = [np.asarray(point(jnp.asarray(inputs + s * step[i] * np.eye(8)[i]))) for s in (1, -1)]
+            slope = (moved[0] - moved[1]) / (2 * step[i])
+            # Truncation 1e-10 and rounding 1e-11 of points of 1000 mm over a step of 1e-5.
+            np.testing.assert_allclose(jacobian[:, i], slope, rtol=1e-6, atol=1e-6)
+
+
+def test_beams_from_the_baseline_give_the_published_point():
+    rng = np.random.default_rng(6)
+    B, C, beta = rng.uniform(20, 130, 200), rng.uniform(15, 120, 200), rng.uniform(-60, 60, 200)
+    C = np.minimum(C, 172.0 - B)
+    cr, br = np.radians(C), np.radians(beta)
+    direction = np.stack([np.sin(cr) * np.cos(br), -np.cos(cr), np.sin(cr) * np.sin(br)], axis=1)
+    origin = np.tile([0.0, A_MM / 2, 0.0], (200, 1))
+    found, _, meets = met(origin, direction, B, False)
+    assert meets.all()
+    np.testing.assert_allclose(found, published_point(B, C, beta, A_MM).T, atol=1e-7)
+
+
+def test_conventions_differ_by_the_documented_share():
+    """B = C = 80 deg, a = 200 mm (research/domain.md section 2): printed to 0.1 mm; 3.4 % in x at 15 deg."""
+    origin = np.array([[0.0, A_MM / 2, 0.0]])
+    for elevation, in_plane, azimuth in ((5.0, (565.0, 49.4), (567.1, 50.4)), (15.0, (547.8, 146.8), (567.1, 154.3))):
+        C, el = np.radians([80.0, elevation])
+        plane = np.array([[math.sin(C) * math.cos(el), -math.cos(C), math.sin(C) * math.sin(el)]])
+        level = np.array([[math.cos(el) * math.sin(C), -math.cos(el) * math.cos(C), math.sin(el)]])
+        one, two = met(origin, plane, [80.0], False)[0][0], met(origin, level, [80.0], True)[0][0]
+        assert one[[0, 2]] == pytest.approx(in_plane, abs=0.05)
+        assert two[[0, 2]] == pytest.approx(azimuth, abs=0.05)
+    assert one[0] / two[0] - 1 == pytest.approx(-0.034, abs=0.0005)
+
+
+def level_beam(C_deg: float) -> np.ndarray:
+    return np.array([math.sin(math.radians(C_deg)), -math.cos(math.radians(C_deg)), 0.0])
+
+
+@pytest.mark.parametrize("azimuth", [False, True])
+def test_beams_without_a_point_do_not_meet(azimuth):
+    origin = np.array([0.0, A_MM / 2, 0.0])
+    cases = {
+        "diverging": (origin, level_beam(85.0), 96.0),
+        "parallel to a micro-degree": (origin, level_beam(80.0), 100.000001),
+        "away from the aperture": (origin, level_beam(150.0), 60.0),
+        "far behind the aperture's side": (origin, level_beam(120.0), 120.0),
+    }
+    for name, case in cases.items():
+        assert not met(*(np.array([part]) for part in case), azimuth)[2][0], name
+    near = met(origin[None], level_beam(85.0)[None], [94.9], azimuth)
+    assert near[2][0] and near[0][0, 0] > 1e4, "the point before it diverges is far and exists"
+
+
+def test_a_beam_that_passes_beside_the_cone_does_not_meet():
+    """Straight up in front of the aperture at 100 mm, 300 mm to the side: never nearer to +y than 18 deg."""
+    nearest = math.degrees(math.atan2(100.0, 300.0))
+    origin = np.array([[100.0, -A_MM / 2 + 300.0, -900.0]])
+    up = np.array([[0.0, 0.0, 1.0]])
+    for reading, expected in ((nearest - 0.1, False), (nearest + 0.1, True)):
+        assert met(origin, up, [reading], False)[2][0] == expected
+    found = met(origin, up, [nearest + 0.1], False)[0]
+    assert aperture_angle_deg(found[0], A_MM, "in-plane") == pytest.approx(nearest + 0.1, abs=1e-9)
+
+
+def test_a_point_behind_the_scanner_is_no_azimuth():
+    """A beam that runs back meets the azimuth's line only on the far side of the aperture."""
+    origin = np.array([[0.0, A_MM / 2, 0.0]])
+    back = level_beam(60.0) * [-1.0, 1.0, 1.0]
+    assert not met(origin, back[None], [120.0], True)[2][0]
+    assert not met(origin, back[None], [60.0], True)[2][0]
+
+
+BENT_SETTINGS = ((130.0, 90.0, 60.0, ("left", "up")), (-60.0, -70.0, 70.0, ("right", "unknown")))
+
+
+def cloud(one: Calibration, inputs, angle_noise_deg, reading_noise_deg, setting, place=None) -> np.ndarray:
+    """Points (draws, 3) by the twin alone: gears, mirrors, frames, and bisection for the reading."""
+    pan, tilt, reading, approach = setting
+    start = {"left": -0.5, "up": -0.5, "right": 0.5, "down": 0.5}
+    rays = []
+    for i, row in enumerate(inputs):
+        values = dict(zip(INPUT_NAMES, row, strict=True))
+        angles = []
+        for axis, name in enumerate(("pan", "tilt")):
+            where = place[i, axis] if approach[axis] == "unknown" else start[approach[axis]]
+            steps = (pan, tilt)[axis]
+            angles.append(
+                twin_angle_deg(values, name, steps, where, one.period_deg.get(name)) + angle_noise_deg[i, axis]
+            )
+        rays.append(twin_ray_at(values, *angles))
+    origin, direction = (np.array(part) for part in zip(*rays, strict=True))
+    column = dict(zip(INPUT_NAMES, inputs.T, strict=True))
+    true = reading - column["aperture_zero_deg"] - reading_noise_deg
+    return twin_points(origin, direction, column["baseline_mm"], true, one.azimuth)
+
+
+def stop_sd_deg(noise: np.ndarray, approach: tuple[str, str]) -> np.ndarray:
+    """Standard deviations (draws, 2) of both stop errors; an unknown side takes the root mean square."""
+    left, right, up, down = noise[:, :4].T
+    pan = {"left": left, "right": right, "unknown": np.sqrt((left**2 + right**2) / 2)}[approach[0]]
+    tilt = {"up": up, "down": down, "unknown": np.sqrt((up**2 + down**2) / 2)}[approach[1]]
+    return np.stack([pan, tilt], axis=1)
+
+
+@pytest.fixture(scope="module", params=["in-plane", "azimuth"])
+def bent(request) -> Calibration:
+    """The azimuth's rig has transmission errors, of the wheel and of the pinion."""
+    if request.param == "in-plane":
+        return calibration()
+    return calibration(BENT | WOBBLE, azimuth=True, period_deg={"pan": 360.0, "tilt": 40.0})
+
+
+def test_every_draw_goes_through_the_twins_optics(bent):
+    """The unit noises of a draw, put through the twin with its parameters, give that draw of the point."""
+    given = sources(bent, DRAWS, 4)
+    unit = np.asarray(given.noise)
+    assert np.abs(unit[:, 2:4]).max() <= 0.5
+    for setting in BENT_SETTINGS:
+        with jax.enable_x64(True):
+            found = carry(settings_of(*setting[:3], setting[3]), given)
+        assert np.asarray(found.meets).all()
+        stop = unit[:, :2] * stop_sd_deg(bent.noise, setting[3])
+        expected = cloud(bent, bent.inputs, stop, unit[:, 4] * bent.noise[:, 4], setting, unit[:, 2:4])
+        # Bisection of 1e5 mm: rounding of the angle, 1e-13 deg, times at most 100 mm per degree.
+        np.testing.assert_allclose(np.asarray(found.xyz_mm)[:, :, 0], expected, atol=100 * ROUNDING_MM)
+
+
+def test_mean_and_covariance_are_a_monte_carlo_by_the_twin(bent):
+    """Same distribution, other draws of the noises: means and standard deviations within Monte Carlo errors."""
+    rng = np.random.default_rng(12)
+    for setting in BENT_SETTINGS:
+        place = rng.uniform(-0.5, 0.5, (DRAWS, 2))
+        stop = rng.standard_normal((DRAWS, 2)) * stop_sd_deg(bent.noise, setting[3])
+        points = cloud(bent, bent.inputs, stop, rng.standard_normal(DRAWS) * bent.noise[:, 4], setting, place)
+        found = locate(bent, *setting, draws=DRAWS)
+        assert found.refused == (None,) and found.draws == DRAWS
+        sd = points.std(axis=0)
+        # Five standard errors of the difference of two means, two variances and correlations, of DRAWS each.
+        assert np.abs((found.xyz_mm[0] - points.mean(axis=0)) / sd).max() < 5 * math.sqrt(2 / DRAWS)
+        distance = (found.covariance_mm2[0] - np.cov(points.T)) / np.outer(sd, sd)
+        assert np.abs(distance).max() < 5 * math.sqrt(2 * 2 / DRAWS)
+        interval = np.quantile(points, (0.025, 0.975), axis=0)
+        # The error of an end is sqrt(0.025 0.975 / n) over the density 0.058 / sd there.
+        assert np.abs((found.interval95_mm[0] - interval) / sd).max() < 5 * math.sqrt(2) * 2.67 / math.sqrt(DRAWS)
+        np.testing.assert_allclose(found.u95_mm[0], np.diff(found.interval95_mm[0], axis=0)[0] / 2, rtol=1e-12)
+
+
+def test_a_point_does_not_depend_on_its_neighbours():
+    """260 points make two blocks; one alone makes a block of one."""
+    one = calibration()
+    rng = np.random.default_rng(9)
+    pan, tilt = rng.integers(-150, 150, (2, 260)).astype(float)
+    reading = rng.uniform(40.0, 65.0, 260)
+    approach = [("left", "up"), ("right", "down"), ("unknown", "up"), ("left", "unknown")] * 65
+    reading[7] = 150.0
+    many = locate(one, pan, tilt, reading, approach, draws=DRAWS)
+    assert [i for i, error in enumerate(many.refused) if error is not None] == [7]
+    for i in (0, 7, 8, 255, 256, 259):
+        single = locate(one, pan[i], tilt[i], reading[i], approach[i], draws=DRAWS)
+        for name in ("xyz_mm", "covariance_mm2", "interval95_mm", "u95_mm", "linear_xyz_mm", "linear_covariance_mm2"):
+            # Other vector lengths add in another order.
+            np.testing.assert_allclose(
+                getattr(single, name)[0], getattr(many, name)[i], rtol=1e-9, atol=ROUNDING_MM, err_msg=name
+            )
+        assert single.diverging_share[0] == many.diverging_share[i]
+        np.testing.assert_array_equal(single.validation.validated[0], many.validation.validated[i])
+    bad = many.refused[7]
+    assert isinstance(bad, InputError) and bad.code == "diverging" and "aperture 150 deg" in bad.message
+    for name in ("xyz_mm", "covariance_mm2", "interval95_mm", "u95_mm", "linear_xyz_mm", "linear_covariance_mm2"):
+        assert np.isnan(getattr(many, name)[7]).all()
+        assert np.isfinite(np.delete(getattr(many, name), 7, axis=0)).all()
+    assert many.diverging_share[7] == 1.0
+    again = locate(one, pan[:1], tilt[:1], reading[:1], approach[:1], draws=DRAWS, seed=1)
+    assert not np.array_equal(again.xyz_mm[0], many.xyz_mm[0]), "the seed moves the noises"
+    json.dumps([many.as_json(i) for i in (0, 7)], allow_nan=False)
+    assert set(many.as_json(0)) >= {"xyz_mm", "covariance_mm2", "u95_mm"}
+    refused = many.as_json(7)
+    assert refused["xyz_mm"] is refused["covariance_mm2"] is refused["u95_mm"] is None
+    assert refused["refused"]["code"] == "diverging"
+
+
+def with_diverging(count: int) -> Calibration:
+    """A nominal rig of DRAWS draws in which `count` have their C0 at 170 deg."""
+    one = calibration(NOMINAL, {"pan_zero_emission_deg": 0.05}, NO_NOISE_DEG)
+    inputs = one.inputs.copy()
+    inputs[:count, INPUT_NAMES.index("pan_zero_emission_deg")] = 170.0
+    return replace(one, inputs=inputs)
+
+
+def test_the_law_alone_has_no_number_where_there_is_no_point():
+    found = locate_linear(calibration(BENT, SD, NOISE_DEG), settings_of([100.0, 100.0], [20.0, 20.0], [70.0, 150.0]))
+    for field in (found.value, found.jacobian, found.covariance):
+        assert np.isfinite(field[0]).all() and np.isnan(field[1]).all()
+
+
+@pytest.mark.parametrize(("count", "refused"), [(0, False), (1, False), (2, True), (DRAWS, True)])
+def test_more_than_a_thousandth_of_diverging_draws_refuses(count, refused):
+    """One of 1000 is exactly the allowed share."""
+    assert DIVERGING_SHARE == 1 / DRAWS
+    found = locate(with_diverging(count), 0.0, 0.0, 60.0, draws=DRAWS)
+    assert (found.refused[0] is not None) == refused
+    assert found.diverging_share[0] == pytest.approx(count / DRAWS, abs=1e-12)
+    if not refused:
+        # The point of the others: B = 60, C = 90, x = (a - L) tan 60; an outlier would carry it away.
+        assert found.xyz_mm[0, 0] == pytest.approx(170.0 * math.tan(math.radians(60.0)), abs=0.05)
+
+
+def test_what_cannot_be_asked_is_refused():
+    one = calibration()
+    with pytest.raises(ValueError, match="at least 500"):
+        locate(one, 0.0, 0.0, 60.0, draws=499)
+    with pytest.raises(ValueError):
+        locate(one, [0.0, 1.0], [0.0, 1.0, 2.0], 60.0, draws=DRAWS)
+    with pytest.raises(InputError) as caught:
+        locate(replace(one, inputs=one.inputs[:0], noise=one.noise[:0]), 0.0, 0.0, 60.0, draws=DRAWS)
+    assert caught.value.code == "no-draws"
+    with pytest.raises(InputError) as caught:
+        locate(one, [0.0, 1.0], 0.0, 60.0, [("left", "up"), ("up", "left")], draws=DRAWS)
+    assert (caught.value.code, caught.value.column) == ("approach", "pan_approach")
+
+
+def test_draws_are_chosen_evenly_or_used_again():
+    one = calibration(noise_spread=0.0)
+    few, all_, more = (np.asarray(sources(one, n, 0).inputs)[:, : len(INPUT_NAMES)] for n in (500, DRAWS, DRAWS + 7))
+    np.testing.assert_array_equal(few[[0, -1]], one.inputs[[0, -1]])
+    assert len({tuple(row) for row in few}) == 500
+    np.testing.assert_array_equal(all_, one.inputs)
+    np.testing.assert_array_equal(more, np.concatenate([one.inputs, one.inputs[:7]]))
+    noise = np.asarray(sources(one, DRAWS + 7, 0).noise)
+    assert not np.any(noise[:7] == noise[DRAWS:]), "rows that come again get other noises"
+
+
+def test_the_law_is_validated_near_and_refuted_far():
+    # The law holds the sds of the noises still; here they are.
+    small = {name: 0.02 * sd for name, sd in NOISE_DEG.items()}
+    near = calibration(spread=0.02, noise_deg=small, noise_spread=0.0)
+    found = locate(near, 130.0, 90.0, 60.0, draws=DRAWS)
+    assert found.validation.validated.all()
+    linear = found.as_json(0)["linear"]
+    assert linear["validated"] is True and linear["digits"] == 2
+    # C is 99 deg here: the point moves out to several metres, where u is a fair part of the range.
+    far = locate(calibration(), 130.0, 0.0, 77.5, draws=DRAWS)
+    assert far.refused == (None,) and far.linear_xyz_mm[0, 0] > 1500
+    assert not far.validation.validated[0, 0] and far.validation.decided[0, 0]
+    assert far.as_json(0)["linear"]["validated"] is False
+
+
+C_DEG, B_DEG = 80.0, 75.0
+"""Angles at which the sensitivities are checked; the beam leaves from the baseline, level."""
+PLAIN = NOMINAL | {"mirror_offset_mm": 0.0, "pan_zero_emission_deg": C_DEG, "backlash_deg.pan": 0.4}
+PLAY_DEG = 0.4
+
+
+def sensitivities() -> dict[str, np.ndarray]:
+    """research/domain.md section 3, per degree of angle and per mm of a."""
+    B, C = np.radians([B_DEG, C_DEG])
+    s2, turn = math.sin(B + C) ** 2, math.pi / 180 * A_MM
+    x = A_MM * math.sin(B) * math.sin(C) / math.sin(B + C)
+    y = A_MM * (0.5 - math.sin(B) * math.cos(C) / math.sin(B + C))
+    d_c = turn * np.array([math.sin(B) ** 2 / s2, math.sin(B) * math.cos(B) / s2, 0.0])
+    d_b = turn * np.array([math.sin(C) ** 2 / s2, -math.sin(C) * math.cos(C) / s2, 0.0])
+    return {
+        "C": d_c,
+        "B": d_b,
+        "a": np.array([x, y, 0.0]) / A_MM,
+        "tilt": np.array([0.0, 0.0, math.pi / 180 * x / math.sin(C)]),
+    }
+
+
+ALONE = {
+    "stop_sd_deg.left": ("C", ("left", "up")),
+    "stop_sd_deg.right": ("C", ("right", "up")),
+    "stop_sd_deg.up": ("tilt", ("left", "up")),
+    "stop_sd_deg.down": ("tilt", ("left", "down")),
+    "aperture_sd_deg": ("B", ("left", "up")),
+    "baseline_mm": ("a", ("left", "up")),
+    "pan_zero_emission_deg": ("C", ("left", "up")),
+    "aperture_zero_deg": ("B", ("left", "up")),
+    "play": ("C", ("unknown", "up")),
+}
+
+
+@pytest.mark.parametrize("cause", ALONE)
+def test_each_cause_alone_has_its_sensitivity(cause):
+    """The counter brings the beam to C whatever the play: the side's half play is taken back."""
+    quantity, approach = ALONE[cause]
+    u = 0.01
+    # No exact zeros: the root mean square of two sds has no derivative there.
+    noise = dict.fromkeys(NOISE_NAMES, 1e-9) | ({cause: u} if cause in NOISE_NAMES else {})
+    one = calibration(PLAIN, {cause: u} if cause in INPUT_NAMES else {}, noise, noise_spread=0.0)
+    side = {"left": 1.0, "right": -1.0, "unknown": 0.0}[approach[0]]
+    steps = 0.5 * side * PLAY_DEG / PLAIN["degrees_per_step.pan"]
+    if cause in INPUT_NAMES:
+        u = math.sqrt(one.covariance[INPUT_NAMES.index(cause), INPUT_NAMES.index(cause)])
+    if cause == "play":
+        u = PLAY_DEG / math.sqrt(12)
+    one = replace(one, mean=np.array([PLAIN[name] for name in INPUT_NAMES]))
+    slope = sensitivities()[quantity]
+    expected = u**2 * np.outer(slope, slope)
+    law = locate_linear(one, settings_of(steps, 0.0, B_DEG, approach))
+    # The mirror offset is nought and the elevation level: what is left is rounding.
+    scale = np.abs(expected).max()
+    np.testing.assert_allclose(law.covariance[0] / scale, expected / scale, atol=1e-9)
+    np.testing.assert_allclose(law.value[0], published_point(B_DEG, C_DEG, 0.0, A_MM), atol=ROUNDING_MM)
+    numpy = one.locate(steps, 0.0, B_DEG, approach).covariance_mm2
+    np.testing.assert_allclose(numpy / scale, expected / scale, atol=1e-9)
+    found = locate(one, steps, 0.0, B_DEG, approach, draws=DRAWS)
+    # 1.96 of a normal, 0.95 sqrt(3) of a uniform distribution; a half width of n draws errs by 2.67 / sqrt(2 n) sd.
+    wide = 0.95 * math.sqrt(3) if cause == "play" else NORMAL_95
+    bound = 5 * 2.67 / math.sqrt(2 * DRAWS) * u * np.abs(slope).max()
+    assert np.abs(found.u95_mm[0] - wide * u * np.abs(slope)).max() < bound
+
+
+def test_readings_and_points_of_the_library_are_the_twins():
+    """A point sent through the twin's reading comes back, whichever convention, through the whole library."""
+    for azimuth in (False, True):
+        one = calibration(BENT, {}, NO_NOISE_DEG, azimuth=azimuth)
+        origin, direction = twin_ray_at(
+            BENT, twin_angle_deg(BENT, "pan", 70, -0.5), twin_angle_deg(BENT, "tilt", 40, -0.5)
+        )
+        point = origin + 420.0 * direction
+        reading = aperture_angle_deg(point, BENT["baseline_mm"], "azimuth" if azimuth else "in-plane")
+        law = locate_linear(one, settings_of(70.0, 40.0, float(reading) + BENT["aperture_zero_deg"]))
+        np.testing.assert_allclose(law.value[0], point, atol=10 * ROUNDING_MM)

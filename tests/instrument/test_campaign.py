@@ -1,0 +1,273 @@
+"""Campaign folders and plans: round trips, hashes, the campaigns of unknown rigs, cost of reading."""
+
+from __future__ import annotations
+
+import dataclasses
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.small_campaign import small_campaign
+
+from tvsbayes.errors import InputError
+from tvsbayes.instrument.campaign import (
+    Campaign,
+    Move,
+    Spot,
+    input_hashes,
+    parse_spots,
+    read_campaign,
+    spots_bytes,
+    write_campaign,
+)
+from tvsbayes.instrument.parameters import Prior
+from tvsbayes.instrument.plan import PlanStep, read_plan, write_plan
+from tvsbayes.instrument.rig import RigTable
+
+UNKNOWN_RIGS = Path(__file__).resolve().parents[3] / "shared" / "campaigns"
+
+
+def assert_same(a: Campaign, b: Campaign) -> None:
+    assert (a.moves, a.spots, a.rig, a.header) == (b.moves, b.spots, b.rig, b.header)
+    for field in dataclasses.fields(a.stereo):
+        assert np.array_equal(getattr(a.stereo, field.name), getattr(b.stereo, field.name)), field.name
+
+
+def test_round_trip_is_identical(tmp_path):
+    campaign = small_campaign()
+    write_campaign(campaign, tmp_path / "deep" / "new")
+    again = read_campaign(tmp_path / "deep" / "new")
+    assert_same(campaign, again)
+    assert again.path == tmp_path / "deep" / "new"
+    write_campaign(again, tmp_path / "second")
+    for name in ("campaign.toml", "stereo.json", "moves.csv", "spots.csv"):
+        assert (tmp_path / "second" / name).read_bytes() == (again.path / name).read_bytes()
+    assert sorted(p.name for p in again.path.iterdir()) == [
+        "campaign.toml",
+        "moves.csv",
+        "spots.csv",
+        "stereo.json",
+    ]
+
+
+def test_numpy_scalars_are_written_as_numbers(tmp_path):
+    campaign = small_campaign()
+    spots = [dataclasses.replace(s, aperture_deg=np.float64(50.0) / 3, spot=np.int64(s.spot)) for s in campaign.spots]
+    priors = {**campaign.rig.priors, "focal_scale": Prior(np.float64(1.001), np.float64(0.0))}
+    header = {"seed": np.int64(3)}
+    numpy_like = Campaign(campaign.moves, tuple(spots), campaign.stereo, RigTable(priors), header)
+    write_campaign(numpy_like, tmp_path / "c")
+    assert_same(numpy_like, read_campaign(tmp_path / "c"))
+
+
+def test_a_look_that_found_nothing_may_be_taken_again(tmp_path):
+    """The same point of the experiment, and its correlations empty like its pixels; `classic` takes the one seen."""
+    campaign = small_campaign()
+    lost = dataclasses.replace(campaign.spots[6], experiment=3, point=1)
+    write_campaign(dataclasses.replace(campaign, spots=(*campaign.spots[:6], lost)), tmp_path / "c")
+    table = tmp_path / "c" / "spots.csv"
+    header, *rows = table.read_text().splitlines()
+    column = header.split(",").index("ruv_right")
+    cells = rows[-1].split(",")
+    assert cells[column] == "-0.5" and "undetected" in cells
+    cells[column] = ""
+    table.write_text("\n".join([header, *rows[:-1], ",".join(cells)]) + "\n")
+    again = read_campaign(tmp_path / "c").spots[-1]
+    assert (again.experiment, again.point, again.ruv_right) == (3, 1, 0.0)
+
+
+def test_write_refuses_a_folder_with_files(tmp_path):
+    (tmp_path / "notes.txt").write_text("mine")
+    with pytest.raises(InputError, match="nothing is overwritten"):
+        write_campaign(small_campaign(), tmp_path)
+    assert [p.name for p in tmp_path.iterdir()] == ["notes.txt"]
+    with pytest.raises(InputError, match="a new or empty folder"):
+        write_campaign(small_campaign(), tmp_path / "notes.txt")
+
+
+def test_write_refuses_what_read_would(tmp_path):
+    campaign = small_campaign()
+    wrong = {
+        "nan": {"spots": (dataclasses.replace(campaign.spots[0], u_left_px=float("nan")),)},
+        "move": {"moves": (Move(1, 0, 0.0, 0, 0, "left", "up"),)},
+        "header": {"header": {"color": "red"}},
+        "stereo": {"stereo": dataclasses.replace(campaign.stereo, R=2 * np.eye(3))},
+        "rig": {"rig": RigTable({**campaign.rig.priors, "backlash_deg.pan": Prior(0.2, 0.1, "half-normal")})},
+    }
+    for name, change in wrong.items():
+        with pytest.raises(InputError):
+            write_campaign(dataclasses.replace(campaign, **change), tmp_path / name)
+        assert not (tmp_path / name).exists()
+
+
+def test_truth_frames_results_and_strangers_are_not_read(tmp_path):
+    write_campaign(small_campaign(), tmp_path / "c")
+    (tmp_path / "c" / "truth.json").write_bytes(b"\xff no JSON at all")
+    (tmp_path / "c" / "frames").mkdir()
+    (tmp_path / "c" / "results").mkdir()
+    (tmp_path / "c" / "holiday.jpg").write_bytes(b"\0")
+    assert_same(small_campaign(), read_campaign(tmp_path / "c"))
+
+
+def test_bom_crlf_order_of_rows_and_columns(tmp_path):
+    write_campaign(small_campaign(), tmp_path / "c")
+    for path in (tmp_path / "c").iterdir():
+        path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes().replace(b"\n", b"\r\n"))
+    again = read_campaign(tmp_path / "c")
+    assert_same(small_campaign(), again)
+    moves = (tmp_path / "c" / "moves.csv").read_text(encoding="utf-8-sig").splitlines()
+    turned = "\n".join(",".join(line.split(",")[::-1]) for line in moves)
+    (tmp_path / "c" / "moves.csv").write_text(turned)
+    assert read_campaign(tmp_path / "c").moves == again.moves
+    lines = (tmp_path / "c" / "spots.csv").read_text(encoding="utf-8-sig").splitlines()
+    (tmp_path / "c" / "spots.csv").write_text("\n".join([lines[0], *lines[:0:-1]]))
+    assert read_campaign(tmp_path / "c").spots == again.spots[::-1]
+
+
+def test_a_campaign_may_have_no_spots_yet(tmp_path):
+    campaign = dataclasses.replace(small_campaign(), spots=())
+    write_campaign(campaign, tmp_path / "c")
+    assert read_campaign(tmp_path / "c").spots == ()
+
+
+def test_hashes_cover_the_data_and_not_the_names(tmp_path):
+    campaign = small_campaign()
+    reference = input_hashes(campaign)
+    assert set(reference) == {"moves", "spots", "stereo", "rig"}
+    assert all(len(digest) == 64 for digest in reference.values())
+    write_campaign(campaign, tmp_path / "c")
+    assert input_hashes(read_campaign(tmp_path / "c")) == reference
+    same = dataclasses.replace(campaign, header={"name": "other", "notes": "x"}, spots=campaign.spots[::-1])
+    assert input_hashes(same) == reference
+
+    priors = {**campaign.rig.priors, "pixel_scale": Prior(1.0, 0.51, "log-normal")}
+    covariance = campaign.stereo.parameter_covariance * 1.0000001
+    last_digit = np.nextafter(campaign.spots[0].u_left_px, np.inf)
+    changes = {
+        "moves": {"moves": (*campaign.moves[:-1], dataclasses.replace(campaign.moves[-1], pan_steps=-101))},
+        "spots": {"spots": (dataclasses.replace(campaign.spots[0], u_left_px=last_digit), *campaign.spots[1:])},
+        "stereo": {"stereo": dataclasses.replace(campaign.stereo, parameter_covariance=covariance)},
+        "rig": {"rig": RigTable(priors, campaign.rig.aperture_convention)},
+    }
+    for name, change in changes.items():
+        changed = input_hashes(dataclasses.replace(campaign, **change))
+        assert {key for key in reference if changed[key] != reference[key]} == {name}
+
+
+def test_transmission_error_is_written_read_and_hashed(tmp_path):
+    campaign = small_campaign()
+    seen = {input_hashes(campaign)["rig"]}
+    for number, (priors, periods) in enumerate(
+        [
+            ({}, {"pan": 30.0}),
+            ({}, {"pan": 40.0}),
+            ({"harmonic_deg.pan.2.cos": Prior(0.01, 0.1)}, {"pan": 30.0}),
+            ({"harmonic_deg.tilt.1.sin": Prior(0.0, 0.1)}, {"pan": 30.0, "tilt": 360.0}),
+        ]
+    ):
+        table = dataclasses.replace(campaign.rig, priors={**campaign.rig.priors, **priors}, harmonic_period_deg=periods)
+        wobbling = dataclasses.replace(campaign, rig=table)
+        write_campaign(wobbling, tmp_path / str(number))
+        again = read_campaign(tmp_path / str(number))
+        assert_same(wobbling, again)
+        assert again.rig == table
+        seen.add(input_hashes(again)["rig"])
+    assert len(seen) == 5
+
+
+@pytest.mark.parametrize(("name", "moves", "spots"), [("rig_a", 195, 384), ("rig_b", 145, 144), ("rig_c", 195, 384)])
+def test_campaigns_of_unknown_rigs(tmp_path, name, moves, spots):
+    if not (UNKNOWN_RIGS / name).is_dir():
+        pytest.skip(f"{UNKNOWN_RIGS / name} is not part of the repository")
+    campaign = read_campaign(UNKNOWN_RIGS / name)
+    assert (len(campaign.moves), len(campaign.spots)) == (moves, spots)
+    assert campaign.rig.priors["mirror_offset_mm"] == Prior(30.0, 2.0)
+    write_campaign(campaign, tmp_path / name)
+    assert_same(campaign, read_campaign(tmp_path / name))
+
+
+def test_forty_thousand_spots_and_more_are_read():
+    campaign = small_campaign()
+    base = campaign.spots[4]
+    spots = [dataclasses.replace(base, spot=i, u_left_px=100.0 + i / 1000) for i in range(40_000)]
+    again = parse_spots(spots_bytes(spots), "spots.csv", len(campaign.moves), campaign.stereo)
+    assert list(again) == spots
+
+
+def test_reading_imports_no_jax():
+    code = "import sys, tvsbayes.instrument.campaign; sys.exit(any(m in sys.modules for m in ('jax', 'scipy', 'cv2')))"
+    root = Path(__file__).resolve().parents[2]
+    assert subprocess.run([sys.executable, "-c", code], cwd=root, check=False).returncode == 0
+
+
+def test_a_refused_spot_keeps_its_pixels(tmp_path):
+    write_campaign(small_campaign(), tmp_path / "c")
+    undetected, refused = read_campaign(tmp_path / "c").spots[6:]
+    assert (undetected.status, undetected.u_left_px, undetected.su_left_px) == ("undetected", None, None)
+    assert (refused.status, refused.v_left_px) == ("saturated, 41 px", 1e4)
+
+
+PLAN = (
+    PlanStep(0, "home", 0, 0),
+    PlanStep(1, "place", target="d1"),
+    PlanStep(2, "look", target="d1", experiment=0, point=1),
+    PlanStep(3, "move", 200, -5),
+    PlanStep(4, "look"),
+    PlanStep(5, "home", -100, 20),
+    PlanStep(6, "look", experiment=0, point=2),
+)
+
+
+def test_plan_round_trip(tmp_path):
+    write_plan(PLAN, tmp_path / "plan.csv")
+    assert read_plan(tmp_path / "plan.csv") == PLAN
+    text = (tmp_path / "plan.csv").read_text().replace("0,home,0,0,", "0,home,,,")
+    (tmp_path / "plan.csv").write_text(text)
+    assert read_plan(tmp_path / "plan.csv") == PLAN  # home counters default to 0
+
+
+PLAN_REFUSED = {
+    "no home": (1, {"action": "move"}, 2, "action"),
+    "unknown action": (4, {"action": "wait"}, 5, "action"),
+    "gap": (4, {"step": 9}, 5, "step"),
+    "place without target": (2, {"target": ""}, 3, "target"),
+    "place with counters": (2, {"pan_steps": 1}, 3, "pan_steps"),
+    "move without tilt": (4, {"tilt_steps": None}, 5, "tilt_steps"),
+    "move with target": (4, {"target": "d1"}, 5, "target"),
+    "look with counters": (3, {"tilt_steps": 1}, 4, "tilt_steps"),
+    "look at another": (3, {"target": "d2"}, 4, "target"),
+    "point alone": (5, {"point": 2}, 6, "experiment"),
+    "point 5": (3, {"point": 5}, 4, "point"),
+    "point twice": (7, {"point": 1}, 8, "point"),
+    "home with target": (1, {"target": "d1"}, 2, "target"),
+    "far": (4, {"pan_steps": 10**9}, 5, "pan_steps"),
+}
+
+
+@pytest.mark.parametrize("name", PLAN_REFUSED)
+def test_plan_refusals(tmp_path, name):
+    row, change, line, column = PLAN_REFUSED[name]
+    steps = list(PLAN)
+    steps[row - 1] = dataclasses.replace(steps[row - 1], **change)
+    with pytest.raises(InputError) as caught:
+        write_plan(steps, tmp_path / "plan.csv")
+    assert (caught.value.file, caught.value.line, caught.value.column) == ("plan.csv", line, column)
+    assert not (tmp_path / "plan.csv").exists()
+
+
+def test_plan_without_steps_and_look_before_place(tmp_path):
+    with pytest.raises(InputError, match="no rows"):
+        write_plan([], tmp_path / "plan.csv")
+    with pytest.raises(InputError, match="place the target first"):
+        write_plan([PlanStep(0, "home"), PlanStep(1, "look")], tmp_path / "plan.csv")
+
+
+def test_records_are_hashable_and_small():
+    # Frozen, slotted records: 40 000 spots stay cheap and cannot be changed behind an estimator's back.
+    assert not hasattr(small_campaign().spots[0], "__dict__")
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        small_campaign().spots[0].u_left_px = 1.0  # type: ignore[misc]
+    assert len({*small_campaign().spots, *small_campaign().spots}) == len(small_campaign().spots)
+    assert Spot.__slots__

@@ -1,0 +1,254 @@
+"""Priors as coordinates, and which name drives which quantity of the model (DESIGN 4.1, 8)."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy import stats
+from support.small_campaign import small_stereo
+
+from tvsbayes.instrument.parameters import (
+    DECLARED_PRIORS,
+    DEFAULT_PRIORS,
+    HARMONIC_PRIORS,
+    INDEX,
+    KINDS,
+    NAMES,
+    NOISE_NAMES,
+    RECEIVER_NAMES,
+    RIG_NAMES,
+    STEREO_PARAMETER_NAMES,
+    Prior,
+)
+from tvsbayes.instrument.rig import RigTable
+from tvsbayes.model.parameter_space import free_mask, model_of, parameter_space
+
+pytestmark = pytest.mark.usefixtures("x64")
+
+DEG = np.pi / 180
+QUANTILE_ROUNDING = 1e-10
+"""Relative: JAX's ndtri against scipy's."""
+
+
+ROWS = 4000
+"""One batch size for all tests: one compilation."""
+
+
+def table(**changes: Prior) -> RigTable:
+    return RigTable({**DEFAULT_PRIORS, **DECLARED_PRIORS, "aperture_sd_deg": Prior(0.02, 0.3, "log-normal"), **changes})
+
+
+@pytest.fixture(scope="module")
+def physical():
+    """(z (n, p), space) -> values (n, p) and the derivative of each rig value by its own coordinate (n, p)."""
+
+    def one(z, space):
+        return space.physical(z), jax.jvp(space.physical, (z,), (jnp.ones_like(z),))[1]
+
+    compiled = jax.jit(jax.vmap(one, in_axes=(0, None)))
+
+    def run(z, space):
+        padded = np.zeros((ROWS, len(NAMES)))
+        padded[: len(z)] = z
+        with jax.enable_x64(True):
+            space = jax.tree.map(jnp.asarray, space)
+            return [np.asarray(x)[: len(z)] for x in compiled(jnp.asarray(padded), space)]
+
+    return run
+
+
+def test_names_are_the_contracts():
+    assert NAMES == (*DEFAULT_PRIORS, *DECLARED_PRIORS, *HARMONIC_PRIORS, *STEREO_PARAMETER_NAMES)
+    assert len(set(NAMES)) == len(NAMES) == 65
+    assert all(NAMES[index] == name for name, index in INDEX.items())
+
+
+def test_physical_values_are_scipys_quantiles(physical):
+    """Coordinate z is the prior's quantile at Phi(z), for every kind, out to twelve standard deviations."""
+    z = np.linspace(-12.0, 12.0, 97)
+    space = parameter_space(table(), small_stereo())
+    values, slopes = physical(np.tile(z[:, None], (1, len(NAMES))), space)
+    assert np.isfinite(values).all() and np.isfinite(slopes).all()
+    kinds = set()
+    for index, name in enumerate(RIG_NAMES):
+        prior = table().priors[name]
+        kinds.add(prior.distribution)
+        if prior.distribution == "half-normal":
+            expected = stats.halfnorm.isf(stats.norm.sf(z), scale=prior.u)
+            # Below -8 the quantile drowns in the rounding of Phi: 1e-15 of the scale.
+            np.testing.assert_allclose(values[:, index], expected, rtol=QUANTILE_ROUNDING, atol=1e-14 * prior.u)
+            assert np.all(values[:, index] >= 0) and np.all(slopes[:, index] >= 0)
+        elif prior.distribution == "log-normal":
+            expected = prior.value * np.exp(prior.u * z)
+            np.testing.assert_allclose(values[:, index], expected, rtol=QUANTILE_ROUNDING)
+        else:
+            expected = prior.value + prior.u * z
+            np.testing.assert_allclose(values[:, index], expected, rtol=QUANTILE_ROUNDING, atol=1e-15 * prior.u)
+    assert kinds == set(KINDS)
+
+
+def test_slopes_against_differences(physical):
+    z = np.tile(np.linspace(-4.0, 4.0, 33)[:, None], (1, len(NAMES)))
+    space = parameter_space(table(), small_stereo())
+    step = 1e-3
+    near, far = (physical(z + m * step, space)[0] - physical(z - m * step, space)[0] for m in (1, 2))
+    slopes = physical(z, space)[1]
+    scale = np.abs(slopes).max(axis=0)
+    error = np.abs((8 * near - far) / (12 * step) - slopes).max(axis=0)
+    # Rounding: 1e-16 x value / 1e-3; the largest ratio of value to u is 200 mm to 0.1 mm.
+    assert np.all(error[scale > 0] / scale[scale > 0] < 1e-9)
+
+
+def test_a_stray_coordinate_of_a_half_normal_is_still_a_number(physical):
+    """A fit that goes astray may try what no prior holds; Phi(-40) underflows, and infinities reach the gradient."""
+    z = np.zeros((3, len(NAMES)))
+    z[:, INDEX["backlash_deg.pan"]] = [35.0, 40.0, 1e3]
+    values = physical(z, parameter_space(table(), small_stereo()))[0][:, INDEX["backlash_deg.pan"]]
+    assert np.all(np.isfinite(values)) and values[1] == values[2] > values[0] > 17.0
+
+
+def test_prior_draws_have_the_priors_distribution(physical):
+    """Seeded Kolmogorov-Smirnov tests of 4000 draws: p above 1e-4."""
+    z = np.random.default_rng(12).standard_normal((4000, len(NAMES)))
+    values, _ = physical(z, parameter_space(table(), small_stereo()))
+    for name, distribution in (
+        ("backlash_deg.pan", stats.halfnorm(scale=0.5)),
+        ("backlash_deg.tilt", stats.halfnorm(scale=0.5)),
+        ("stop_sd_deg.left", stats.lognorm(s=1.0, scale=0.04)),
+        ("pixel_scale", stats.lognorm(s=0.5, scale=1.0)),
+        ("mirror_offset_mm", stats.norm(30.0, 5.0)),
+    ):
+        assert stats.kstest(values[:, INDEX[name]], distribution.cdf).pvalue > 1e-4, name
+
+
+def test_u_zero_fixes_every_kind(physical):
+    fixed = {name: replace(prior, u=0.0) for name, prior in table().priors.items()}
+    stereo = replace(small_stereo(), parameter_covariance=np.zeros((24, 24)))
+    space = parameter_space(RigTable(fixed), stereo)
+    values, slopes = physical(np.linspace(-12, 12, 9)[:, None] * np.ones(len(NAMES)), space)
+    expected = np.array([*(fixed[name].value for name in RIG_NAMES), *stereo.vector])
+    np.testing.assert_allclose(values, np.broadcast_to(expected, values.shape), rtol=0, atol=1e-12)
+    assert np.all(slopes == 0)
+    assert not free_mask(space, has_aperture=True).any()
+
+
+def test_free_parameters():
+    """Those with u > 0; the receiver's only with readings; zero rows of the stereo covariance never."""
+    space = parameter_space(table(), small_stereo())
+    fixed = {"stereo.left.k3", "stereo.right.k3", *HARMONIC_PRIORS}
+    for has_aperture in (True, False):
+        free = {name for name, yes in zip(NAMES, free_mask(space, has_aperture), strict=True) if yes}
+        assert set(NAMES) - free == fixed | (set() if has_aperture else set(RECEIVER_NAMES))
+    assert set(NOISE_NAMES) <= set(RIG_NAMES)
+
+
+def test_stereo_root_squares_to_the_covariance():
+    """In units of the standard deviations, which span five orders of magnitude; zero rows stay zero."""
+    covariance = small_stereo().parameter_covariance
+    space = parameter_space(table(), small_stereo())
+    sd = np.sqrt(np.diag(covariance))
+    scale = np.where(sd > 0, sd, 1.0)
+    error = (space.stereo_root @ space.stereo_root.T - covariance) / np.outer(scale, scale)
+    assert np.abs(error).max() < 1e-13  # 24 products of order one
+    fixed = sd == 0
+    assert fixed.sum() == 2
+    assert np.all(space.stereo_root[fixed] == 0)
+    np.testing.assert_allclose(space.stereo_mean, small_stereo().vector, rtol=0, atol=1e-12)
+
+
+# Where each name must arrive: path in Model, index there, contract unit -> model unit. Written out by hand.
+FIELDS: dict[str, tuple[str, tuple[int, ...], float]] = {
+    "degrees_per_step.pan": ("transmission.ratio_rad_per_step", (0,), DEG),
+    "degrees_per_step.tilt": ("transmission.ratio_rad_per_step", (1,), DEG),
+    "ratio_contrast_deg_per_step.pan": ("transmission.contrast_rad_per_step", (0,), DEG),
+    "ratio_contrast_deg_per_step.tilt": ("transmission.contrast_rad_per_step", (1,), DEG),
+    "backlash_deg.pan": ("transmission.backlash_rad", (0,), DEG),
+    "backlash_deg.tilt": ("transmission.backlash_rad", (1,), DEG),
+    "tilt_zero_deg": ("tilt_zero_rad", (), DEG),
+    "mirror_offset_mm": ("optics.mirror_offset_mm", (), 1.0),
+    "mirror1_error_deg": ("optics.mirror1_error_rad", (), DEG),
+    "mirror2_error_deg": ("optics.mirror2_error_rad", (), DEG),
+    "laser_tilt_deg.x": ("optics.laser_tilt_rad", (0,), DEG),
+    "laser_tilt_deg.y": ("optics.laser_tilt_rad", (1,), DEG),
+    "laser_offset_mm.x": ("optics.laser_offset_mm", (0,), 1.0),
+    "laser_offset_mm.y": ("optics.laser_offset_mm", (1,), 1.0),
+    "tilt_axis_skew_deg": ("optics.tilt_axis_skew_rad", (), DEG),
+    "tilt_axis_offset_mm.x": ("optics.tilt_axis_offset_mm", (0,), 1.0),
+    "tilt_axis_offset_mm.z": ("optics.tilt_axis_offset_mm", (1,), 1.0),
+    **{f"extrinsics.rotation_rad.{a}": ("extrinsics.rotation_rad", (i,), 1.0) for i, a in enumerate("xyz")},
+    **{f"extrinsics.translation_mm.{a}": ("extrinsics.translation_mm", (i,), 1.0) for i, a in enumerate("xyz")},
+    "stop_sd_deg.left": ("noise.stop_sd_rad", (0, 1), DEG),
+    "stop_sd_deg.right": ("noise.stop_sd_rad", (0, 0), DEG),
+    "stop_sd_deg.up": ("noise.stop_sd_rad", (1, 1), DEG),
+    "stop_sd_deg.down": ("noise.stop_sd_rad", (1, 0), DEG),
+    "pixel_scale": ("noise.pixel_scale", (), 1.0),
+    "focal_scale": ("cameras.focal_scale", (), 1.0),
+    "baseline_mm": ("receiver.baseline_mm", (), 1.0),
+    "pan_zero_emission_deg": ("receiver.pan_zero_emission_rad", (), DEG),
+    "aperture_zero_deg": ("receiver.aperture_zero_rad", (), DEG),
+    "aperture_sd_deg": ("receiver.aperture_sd_rad", (), DEG),
+    **{
+        f"stereo.{side}.{name}": (f"cameras.{field}", (camera, column), 1.0)
+        for camera, side in enumerate(("left", "right"))
+        for field, names in (
+            ("focal_px", ("fx", "fy")),
+            ("centre_px", ("cx", "cy")),
+            ("radial", ("k1", "k2", "k3")),
+            ("tangential", ("p1", "p2")),
+        )
+        for column, name in enumerate(names)
+    },
+    **{
+        f"harmonic_deg.{axis}.{order}.{part}": ("transmission.harmonics.amplitude_rad", (i, order - 1, j), DEG)
+        for i, axis in enumerate(("pan", "tilt"))
+        for order in (1, 2)
+        for j, part in enumerate(("cos", "sin"))
+    },
+    **{f"stereo.rotation_rad.{a}": ("cameras.rotation_rad", (i,), 1.0) for i, a in enumerate("xyz")},
+    **{f"stereo.translation_mm.{a}": ("cameras.translation_mm", (i,), 1.0) for i, a in enumerate("xyz")},
+}
+
+
+def leaves(model) -> dict[str, np.ndarray]:
+    """Every array of a Model by its dotted path."""
+    flat = jax.tree_util.tree_flatten_with_path(model)[0]
+    return {"".join(map(str, path)).lstrip("."): np.asarray(leaf) for path, leaf in flat}
+
+
+def test_every_name_drives_its_field_and_nothing_else():
+    assert set(FIELDS) == set(NAMES)
+    base = 10.0 + np.arange(len(NAMES))
+    rows = np.vstack([base, base + np.eye(len(NAMES))])
+    models = leaves(eqx.filter_jit(jax.vmap(model_of))(jnp.asarray(rows)))
+    for known in ("period_rad", "on_wheel"):
+        models.pop(f"transmission.harmonics.{known}")
+    assert sum(leaf[0].size for leaf in models.values()) == len(NAMES)
+    for row, name in enumerate(NAMES, start=1):
+        path, index, unit = FIELDS[name]
+        for field, values in models.items():
+            change = values[row] - values[0]
+            expected = np.zeros_like(change)
+            if field == path:
+                expected[index] = unit
+                assert values[0][index] == pytest.approx(base[row - 1] * unit, rel=1e-15)
+            np.testing.assert_allclose(change, expected, atol=1e-13, err_msg=f"{name} -> {field}")
+
+
+@pytest.mark.parametrize(
+    ("stated", "period_deg", "on_wheel"),
+    [
+        ({}, [360.0, 360.0], [True, True]),
+        ({"tilt": 22.5}, [360.0, 22.5], [True, False]),
+        ({"pan": 12.0, "tilt": 360.0}, [12.0, 360.0], [False, True]),
+    ],
+)
+def test_a_full_turn_is_the_wheels_period_and_less_the_pinions(stated, period_deg, on_wheel):
+    space = parameter_space(RigTable(harmonic_period_deg=stated), small_stereo())
+    harmonics = space.model(jnp.zeros(len(NAMES))).transmission.harmonics
+    np.testing.assert_allclose(harmonics.period_rad, np.radians(period_deg), rtol=1e-15)
+    assert harmonics.on_wheel.tolist() == on_wheel

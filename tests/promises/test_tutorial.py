@@ -1,0 +1,208 @@
+"""The tutorial prints what the commands print, and the README's picture turns every axis the way the code does."""
+
+from __future__ import annotations
+
+import doctest
+import re
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tvsbayes.cli.main import run
+
+ROOT = Path(__file__).resolve().parents[2]
+PAGE = ROOT / "data" / "tutorial" / "README.md"
+TEXT = PAGE.read_text(encoding="utf-8")
+NUMBER = re.compile(r"-?\d+(?:\.\d+)?(?:e-?\d+)?")
+QUICK = ("simulate", "check", "classic", "new")
+"""Commands without a fit: they run by default."""
+ANYTHING = "..."
+"""A printed line of dots stands for lines that the page leaves out."""
+
+
+@dataclass(frozen=True)
+class Shown:
+    """A command of the page and what the page says it prints."""
+
+    arguments: tuple[str, ...]
+    printed: str
+
+
+def shown() -> list[Shown]:
+    """Every `$ tvsbayes ...` of the page in order, long lines joined at their backslashes."""
+    found = []
+    for block in re.findall(r"```console\n(.*?)```", TEXT, flags=re.DOTALL):
+        for part in re.split(r"^\$ ", block, flags=re.MULTILINE)[1:]:
+            command, printed = part.replace("\\\n", "").split("\n", 1)
+            words = [word.strip("'") for word in re.findall(r"'[^']*'|\S+", command)]
+            assert words[0] == "tvsbayes", command
+            found.append(Shown(tuple(words[1:]), printed))
+    return found
+
+
+def same(line: str, expected: str) -> bool:
+    """Words equal, each number within one unit of its last printed digit: another processor rounds otherwise."""
+    if NUMBER.sub("#", " ".join(line.split())) != NUMBER.sub("#", " ".join(expected.split())):
+        return False
+    pairs = zip(NUMBER.findall(line), NUMBER.findall(expected), strict=True)
+    for found, wanted in pairs:
+        digits, _, exponent = wanted.partition("e")
+        unit = 10.0 ** (int(exponent or 0) - len(digits.partition(".")[2]))
+        # Half a unit for the binary fractions of the digits themselves.
+        if abs(float(found) - float(wanted)) > 1.5 * unit:
+            return False
+    return True
+
+
+def first_difference(printed: str, expected: str) -> str | None:
+    """The first line of the page that the command did not print in its place, or None."""
+    lines, at, free = printed.rstrip("\n").splitlines(), 0, False
+    for wanted in expected.rstrip("\n").splitlines():
+        if wanted == ANYTHING:
+            free = True
+            continue
+        places = range(at, len(lines)) if free else range(at, min(at + 1, len(lines)))
+        here = next((k for k in places if same(lines[k], wanted)), None)
+        if here is None:
+            return f"page: {wanted!r}, printed: {lines[at] if at < len(lines) else None!r}"
+        at, free = here + 1, False
+    return None if free or at == len(lines) else f"printed, not on the page: {lines[at]!r}"
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory) -> Path:
+    """Where the page's commands run: a folder with `data/`, as the root of a clone."""
+    made = tmp_path_factory.mktemp("clone")
+    (made / "data").symlink_to(ROOT / "data")
+    return made
+
+
+def follow(steps: list[Shown], folder: Path, monkeypatch, capsys) -> None:
+    monkeypatch.chdir(folder)
+    for step in steps:
+        code = run(list(step.arguments))
+        captured = capsys.readouterr()
+        assert code == 0, (step.arguments, captured.err)
+        assert (difference := first_difference(captured.out, step.printed)) is None, (step.arguments, difference)
+
+
+def test_commands_without_a_fit_print_what_the_page_says(folder, monkeypatch, capsys):
+    steps = [step for step in shown() if step.arguments[0] in QUICK]
+    assert {step.arguments[0] for step in steps} == set(QUICK)
+    follow(steps, folder, monkeypatch, capsys)
+
+
+def test_python_examples_print_what_the_page_says(folder, monkeypatch):
+    monkeypatch.chdir(folder)
+    code = "\n".join(re.findall(r"```pycon\n(.*?)```", TEXT, flags=re.DOTALL))
+    example = doctest.DocTestParser().get_doctest(code, {}, "tutorial", "README.md", 0)
+    report: list[str] = []
+    results = doctest.DocTestRunner(verbose=False).run(example, out=report.append)
+    assert results.attempted >= 3
+    assert not results.failed, "".join(report)
+
+
+@pytest.mark.slow
+def test_the_whole_page_prints_what_it_says(tmp_path, monkeypatch, capsys):
+    (tmp_path / "data").symlink_to(ROOT / "data")
+    steps = shown()
+    wanted = {"fit", "compare", "steps-for", "locate", "plan", "report"}
+    assert wanted <= {step.arguments[0] for step in steps}
+    import jax
+    from jax.experimental.compilation_cache import compilation_cache
+
+    names = ("jax_compilation_cache_dir", "jax_persistent_cache_min_compile_time_secs")
+    before = {name: jax.config.values[name] for name in names}
+    monkeypatch.setenv("TVSBAYES_CACHE", str(tmp_path / "cache"))
+    try:
+        follow(steps, tmp_path, monkeypatch, capsys)
+    finally:
+        for name, value in before.items():
+            jax.config.update(name, value)
+        compilation_cache.reset_cache()
+    assert (tmp_path / "trial" / "results" / "report.html").stat().st_size > 100_000
+
+
+@pytest.mark.parametrize(
+    ("found", "wanted", "agree"),
+    [
+        ("left 24 0.050935", "left  24  0.050936", True),
+        ("left 24 0.050935", "left 24 0.050938", False),
+        ("left 24 0.0509", "right 24 0.0509", False),
+        ("u 0.46(10)", "u 0.46(12)", False),
+        ("5.2e-06 a minute", "5.3e-06 a minute", True),
+        ("5.2e-06 a minute", "5.2e-05 a minute", False),
+    ],
+)
+def test_lines_are_compared_by_words_and_numbers(found, wanted, agree):
+    assert same(found, wanted) == agree
+
+
+def test_left_out_lines_are_marked():
+    assert first_difference("a\nb\nc\n", "a\n...\nc\n") is None
+    assert first_difference("a\nb\nc\n", "a\n...\n") is None
+    assert first_difference("a\nb\nc\n", "a\nc\n") is not None
+    assert first_difference("a\nb\n", "a\n") is not None
+
+
+@pytest.fixture(scope="module")
+def drawing():
+    """The script that draws the README's picture."""
+    pytest.importorskip("matplotlib")
+    sys.path.insert(0, str(ROOT / "experiments"))
+    try:
+        import draw_rig
+    finally:
+        sys.path.remove(str(ROOT / "experiments"))
+    return draw_rig
+
+
+def test_picture_from_above_obeys_the_conventions(drawing):
+    """README: S has X depth (up the page), Y left, Z up (to the reader); pan positive = left."""
+    origin, x, y, z = drawing.seen_from_above(np.vstack([np.zeros(3), np.eye(3)]))
+    assert (x - origin).tolist() == [0, 1]
+    assert (y - origin).tolist() == [-1, 0]
+    assert (z - origin).tolist() == [0, 0]
+    ahead, left = (drawing.seen_from_above(drawing.beam_to_sheet(pan, 0.0, 275.0))[2] for pan in (0.0, 11.0))
+    assert left[0] < ahead[0] - 10  # mm on the page
+    # Positioner right of both cameras, aperture right of the positioner by the baseline.
+    aperture = drawing.in_stereo(drawing.scanner_in_positioner([0.0, -drawing.BASELINE_MM / 2, 0.0]))
+    assert drawing.T_SP_MM[1] < -drawing.CAMERA_PITCH_MM
+    assert drawing.seen_from_above(aperture)[0] > drawing.seen_from_above(drawing.T_SP_MM)[0]
+    assert np.linalg.norm(aperture - drawing.T_SP_MM) == pytest.approx(drawing.BASELINE_MM, abs=1e-9)
+
+
+def test_oblique_picture_is_a_view_and_not_its_mirror_image(drawing):
+    """Two page axes and the direction to the viewer are right-handed; z points up, mirror 2 lies right of mirror 1."""
+    page = drawing.seen_obliquely(np.eye(3))
+    viewer = drawing.VIEWER / np.linalg.norm(drawing.VIEWER)
+    assert np.linalg.det(np.column_stack((page, viewer))) == pytest.approx(1.0, abs=1e-12)
+    assert page[2].tolist()[0] == pytest.approx(0.0, abs=1e-12)
+    assert page[2, 1] > 0.5
+    second, direction = drawing.mirror_chain(0.0, 0.0, drawing.GEOMETRY)
+    assert drawing.seen_obliquely(second)[0] > 5  # mm, of L = 30
+    _, raised = drawing.mirror_chain(0.0, np.radians(10.0), drawing.GEOMETRY)
+    assert drawing.seen_obliquely(raised - direction)[1] > 0.05
+
+
+HALF_POINT = 0.5
+"""Of the picture's lines, pt: less than the thinnest is long; another matplotlib may set text a little otherwise."""
+
+
+def test_shipped_picture_is_what_the_script_draws(drawing, tmp_path, monkeypatch):
+    made = tmp_path / "rig.svg"
+    monkeypatch.setattr(drawing, "OUT", made)
+    drawing.main()
+    texts = [path.read_text(encoding="utf-8") for path in (made, ROOT / "data" / "tutorial" / "rig.svg")]
+    words, shipped_words = (re.findall(r"<!-- (.*?) -->", text, flags=re.DOTALL) for text in texts)
+    assert words == shipped_words
+    assert {"S: stereo frame, Z up", "P: positioner frame, z up", "laser spot", "B", "C", "L"} <= set(words)
+    lines = [" ".join(re.findall(r'clip-path="[^"]*"|<path d="([^"]*)"', text)) for text in texts]
+    numbers, shipped = (np.array(re.findall(r"-?\d+(?:\.\d+)?", line), float) for line in lines)
+    assert len(numbers) == len(shipped) > 500
+    assert np.abs(numbers - shipped).max() < HALF_POINT
+    # The label at the arc of the pan angle says "> 0: left".
+    assert drawing.PAN_DEG > 0

@@ -1,0 +1,211 @@
+"""The schema of `results/fit.json`: every old version stays valid and readable, and a fresh fit obeys it."""
+
+from __future__ import annotations
+
+import copy
+import json
+import math
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import pytest
+from jsonschema import Draft202012Validator
+from report.test_fit_text import estimate, small_fit, small_summary
+
+from tvsbayes.errors import InputError
+from tvsbayes.files.disk import shipped_data
+from tvsbayes.results.fit_record import FIT_FORMAT, FIT_FORMATS, read_fit, write_results
+
+KEPT = Path(__file__).parents[1] / "data"
+"""Documents as older versions wrote them, on the shipped paper twin; white space and digits beyond seven cut away."""
+OLD = sorted(KEPT.glob("fit-*.json"))
+
+
+def schema_of(document: dict) -> dict:
+    """The schema that the document names."""
+    version = document["format"].removeprefix("tvsbayes-fit/")
+    return json.loads((shipped_data() / "schemas" / f"fit-{version}.schema.json").read_text())
+
+
+def problems(document: object, schema: dict) -> list[str]:
+    """The places that break the schema."""
+    return [error.json_path for error in Draft202012Validator(schema).iter_errors(document)]
+
+
+def kept(name: str) -> dict:
+    return json.loads((KEPT / name).read_text())
+
+
+def test_every_readable_version_has_a_schema_and_kept_documents():
+    for version in FIT_FORMATS:
+        documents = [json.loads(path.read_text()) for path in OLD]
+        mine = [d for d in documents if d["format"] == version]
+        assert {d["estimator"] for d in mine} == {"laplace", "posterior"}
+        schema = schema_of(mine[0])
+        assert schema["$schema"] == "https://json-schema.org/draft/2020-12/schema"
+        assert schema["properties"]["format"] == {"const": version}
+    assert FIT_FORMAT in FIT_FORMATS
+
+
+@pytest.mark.parametrize("path", OLD, ids=lambda p: p.stem)
+def test_old_documents_stay_valid_and_readable(path):
+    document = json.loads(path.read_text())
+    assert problems(document, schema_of(document)) == []
+    assert read_fit(path) == document
+
+
+def test_a_new_document_obeys_the_schema(tmp_path):
+    """The writer's own path, with everything that may be null; a real fit is checked in test_cli."""
+    summary = small_summary()
+    names = ("degrees_per_step.pan", "degrees_per_step.tilt")
+    summary = replace(summary, parameters={**summary.parameters, **{name: estimate(0.06, 1e-4) for name in names}})
+    write_results(small_fit(), summary, tmp_path, seed=3)
+    document = json.loads((tmp_path / "fit.json").read_text())
+    assert problems(document, schema_of(document)) == []
+    assert read_fit(tmp_path / "fit.json") == document
+
+
+def test_what_reports_show_besides_obeys_the_schema():
+    """Keys that came within version 1, as the records behind them are written; older documents lack them."""
+    from tvsbayes.results.comparison_record import Gap, GapTerm
+    from tvsbayes.results.estimates import Cause, CauseGroup, StopResidual
+
+    term = GapTerm("backlash over N", -0.002, 1e-4, (-0.0022, -0.0018))
+    stop = StopResidual("pan", (3, 4), -100, "", 0, (175.0, 276.5), (None, 0.3), 61.5, -0.01, 0.04)
+    cause = Cause("depth", "tilt", (CauseGroup("175 to 276 mm", 12, 0.1, 0.3),), None, False)
+    gap = {"left": asdict(Gap(0.059, term, term, (term,))), "right": None}
+    document = kept("fit-1-laplace.json")
+    schema = schema_of(document)
+    added = {"residuals": [asdict(stop)], "residual_causes": [asdict(cause)], "gap": gap, "few_stops": {"up": 3}}
+    written = json.loads(json.dumps({**document, **added}))
+    assert problems(written, schema) == []
+    assert problems({**written, "gap": None}, schema) == []
+    for path, value in (
+        ("gap/left/terms/0/sd", -1.0),
+        ("gap/forward", None),
+        ("few_stops/forward", 3),
+        ("few_stops/up", -1),
+        ("residuals/0/axis", "z"),
+        ("residual_causes/0/p", 2.0),
+    ):
+        assert problems(changed(written, path, value), schema), path
+
+
+def changed(document: dict, path: str, value: object) -> dict:
+    """A copy with one value set, or taken out where `value` is ...; parts of the path are split at "/"."""
+    result = copy.deepcopy(document)
+    *way, last = (int(part) if part.isdigit() else part for part in path.split("/"))
+    inner = result
+    for part in way:
+        inner = inner[part]
+    if value is ...:
+        del inner[last]
+    else:
+        inner[last] = value
+    return result
+
+
+BROKEN = [
+    ("format", "tvsbayes-fit/2"),
+    ("format", ...),
+    ("estimator", "guess"),
+    ("converged", 1),
+    ("problems", "none"),
+    ("surprise", 1.0),
+    ("effective_deg_per_step/left", ...),
+    ("effective_deg_per_step/left/value", "0.06"),
+    ("effective_deg_per_step/left/value", None),
+    ("effective_deg_per_step/left/sd", -1e-4),
+    ("effective_deg_per_step/left/interval95", [0.06]),
+    ("effective_deg_per_step/left/interval95", [0.06, 0.06, 0.06]),
+    ("effective_deg_per_step/left/contraction", 1.5),
+    ("effective_deg_per_step/forward", None),
+    ("effective_contrast_deg_per_step/pan", 0.1),
+    ("effective_jacobian", [[1.0, 0.0]]),
+    ("effective_jacobian", [[1.0], [0.0, 1.0]]),
+    ("reference_pose_deg/pan", True),
+    ("parameters/backlash_deg.pan", ...),
+    ("parameters/backlash_deg.pan", None),
+    ("parameters/Backlash!", {}),
+    ("noise/chi2", -1.0),
+    ("noise/stop_sd_deg/up", ...),
+    ("weak_directions/0/loadings", [0.5]),
+    ("leverage", [{"move": 0}]),
+    ("prior_sensitivity/0/factor", 0.0),
+    ("excluded_spots", [1.5]),
+    ("suspect_spots", [-1]),
+    ("sampling/worst_rhat", 1.01),
+    ("sampling/walkers", 0),
+    ("curves/lost_motion/left/0/interval95_deg", [0.1]),
+    ("curves/effective_deg_per_step/pan/0/left/sd", None),
+    ("covariance/matrix", []),
+    ("covariance/names", []),
+    ("inputs/moves", "abc"),
+    ("inputs/rig", ...),
+    ("versions/tvsbayes", ...),
+    ("versions/jax", 12),
+    ("seed", -1),
+    ("seed", 1.5),
+    ("command", None),
+]
+
+
+@pytest.mark.parametrize(("path", "value"), BROKEN, ids=lambda x: x if isinstance(x, str) else None)
+def test_the_schema_refuses(tmp_path, path, value):
+    document = changed(kept("fit-1-posterior.json"), path, value)
+    assert problems(document, schema_of(kept("fit-1-posterior.json")))
+    file = tmp_path / "fit.json"
+    file.write_text(json.dumps(document))
+    with pytest.raises(InputError) as error:
+        read_fit(file)
+    # The message names the place: the value itself, or a key inside it; entries of a list by the list's key.
+    assert error.value.column.startswith(".".join(part for part in path.split("/") if not part.isdigit()))
+
+
+@pytest.mark.parametrize("version", FIT_FORMATS)
+def test_a_schema_has_only_rules_that_are_checked(version):
+    """A keyword that JSON Schema does not know would be passed over in silence."""
+    schema = schema_of({"format": version})
+    Draft202012Validator.check_schema(schema)
+    known = {*Draft202012Validator.VALIDATORS, "$schema", "$id", "$defs", "title", "description"}
+
+    def unknown(rules: object) -> set[str]:
+        if not isinstance(rules, dict):
+            return set()
+        inner = [*rules.get("properties", {}).values(), *rules.get("$defs", {}).values(), *rules.get("anyOf", ())]
+        inner += [rules.get(name) for name in ("items", "additionalProperties", "propertyNames")]
+        return (set(rules) - known).union(*map(unknown, inner))
+
+    assert unknown(schema) == set()
+    assert unknown({"properties": {"a": {"items": {"minimun": 0}}}}) == {"minimun"}
+
+
+@pytest.mark.parametrize(
+    ("path", "value", "names"),
+    [
+        ("format", "tvsbayes-fit/9", "format"),
+        ("estimator", ["laplace"], "estimator"),
+        ("effective_deg_per_step/left/value", "0.06", "effective_deg_per_step.left.value"),
+        ("effective_deg_per_step/left/interval95", [1, "2"], "effective_deg_per_step.left.interval95"),
+        ("effective_deg_per_step/up", ..., "effective_deg_per_step.up"),
+        ("parameters/backlash_deg.tilt/sd", -1.0, "parameters.backlash_deg.tilt.sd"),
+        ("reference_pose_deg", [], "reference_pose_deg"),
+        ("inputs/rig", 5, "inputs.rig"),
+        ("versions/tvsbayes", ..., "versions.tvsbayes"),
+        ("seed", 1.5, "seed"),
+        ("command", "a\x00b", "command"),
+    ],
+)
+def test_damaged_documents_are_refused_by_key(tmp_path, path, value, names):
+    file = tmp_path / "fit.json"
+    file.write_text(json.dumps(changed(kept("fit-1-laplace.json"), path, value)))
+    with pytest.raises(InputError) as error:
+        read_fit(file)
+    assert error.value.column == names
+
+
+def test_numbers_that_are_none_are_refused(tmp_path):
+    file = tmp_path / "fit.json"
+    file.write_text(json.dumps(changed(kept("fit-1-laplace.json"), "noise/chi2", math.nan)))
+    with pytest.raises(InputError):
+        read_fit(file)
