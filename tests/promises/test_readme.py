@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 import typer
 
-from tvsbayes.cli.app import app
+from tvsbayes.cli.main import app
 
 ROOT = Path(__file__).resolve().parents[2]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
