@@ -31,7 +31,7 @@ from tvsbayes.instrument.campaign import Campaign, parse_header, read_campaign
 from tvsbayes.instrument.plan import PlanStep, directions_of
 from tvsbayes.instrument.rig import Rig, parse_rig_table
 from tvsbayes.instrument.stereo_pair import read_stereo
-from tvsbayes.positioner.driver import Positioner, SerialPositioner, device_settings
+from tvsbayes.positioner.driver import LIMITS, Positioner, SerialPositioner, device_settings
 from tvsbayes.positioner.protocol import SETTINGS
 from tvsbayes.positioner.serial_port import serial_opener
 from tvsbayes.twin.simulated_campaign import SPOT_SD_PX
@@ -43,7 +43,7 @@ def check_plan(rig: Rig, plan: Sequence[PlanStep]) -> None:
     Raises:
         InputError: targets without a sheet position, counters outside the limits.
     """
-    names = {"pan": ("pmin", "pmax"), "tilt": ("tmin", "tmax")}
+    limits = {name: int(rig.positioner.get(name, SETTINGS[short][2])) for name, short in LIMITS.items()}
     for step in plan:
         if step.action == "place" and step.target not in rig.sheets_mm:
             allowed = ", ".join(rig.sheets_mm) or "a target named in [sheets]"
@@ -53,10 +53,7 @@ def check_plan(rig: Rig, plan: Sequence[PlanStep]) -> None:
         for axis, counter in (("pan", step.pan_steps), ("tilt", step.tilt_steps)):
             if counter is None:
                 continue
-            low, high = (
-                int(rig.positioner.get(f"{axis}_{end}_steps", SETTINGS[name][2]))
-                for end, name in zip(("min", "max"), names[axis], strict=True)
-            )
+            low, high = limits[f"{axis}_min_steps"], limits[f"{axis}_max_steps"]
             if not low <= counter <= high:
                 remedy = f"correct the plan, or {axis}_min_steps and {axis}_max_steps in [positioner]"
                 found, allowed = f"{counter} in step {step.step}", f"{low} to {high}, the soft limits"

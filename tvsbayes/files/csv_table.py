@@ -1,4 +1,8 @@
-"""Strict CSV."""
+"""Strict CSV: cells by column name, each error with its line and column.
+
+Numbers obey an own ASCII pattern: `float` alone would take "9_4.7", "infinity" and Arabic digits. Size, rows and the
+length of a line are capped; lines count from 1.
+"""
 
 from __future__ import annotations
 
@@ -17,6 +21,7 @@ CSV_ROWS_MAX = 200_000
 """At these caps a table of spots takes 0.6 GB and 6 s of processor time to read (experiments/hostile.md)."""
 CSV_LINE_CHARS_MAX = 16_384
 NUMBER = re.compile(r"[+-]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][+-]?[0-9]+)?")
+_CSV_LINE = re.compile(r"[^\r\n]*(?:\r\n?|\n)|[^\r\n]+")
 
 
 def number_remedy(cell: str, *, whole: bool = False) -> str:
@@ -67,8 +72,8 @@ class Table:
         """The error of one cell; `found` defaults to what stands in it."""
         if found is None:
             found = shown(self.columns[column][row]) if self.columns[column][row] else "an empty cell"
-        place = {"file": self.file, "line": self.lines[row], "column": column}
-        return refusal(code, **place, found=found, allowed=allowed, remedy=remedy)
+        line = self.lines[row]
+        return refusal(code, file=self.file, line=line, column=column, found=found, allowed=allowed, remedy=remedy)
 
     def numbers(self, column: str, low: float, high: float, empty: bool = False) -> list[float | None]:
         """Finite numbers in [low, high]; None for an empty cell where `empty` allows it."""
@@ -128,9 +133,6 @@ class Table:
             if value is not None and seen.setdefault(value, row) != row:
                 found = f"{shown(self.columns[column][row])} again (first on line {self.lines[seen[value]]})"
                 raise self.refuse(row, column, "duplicate", what, "renumber one of them", found)
-
-
-_CSV_LINE = re.compile(r"[^\r\n]*(?:\r\n?|\n)|[^\r\n]+")
 
 
 def _csv_rows(text: str, file: str) -> Iterator[tuple[int, list[str]]]:

@@ -1,4 +1,9 @@
-"""Bytes and arrays read under a cap, written whole or not at all."""
+"""Bytes and arrays read under a cap, and files written whole or not at all.
+
+A reader returns what a regular file inside its folder holds, or raises `InputError` with file, line, what was found,
+what is allowed and what to do. Sizes are capped before anything is read or unpacked. No knowledge of what a campaign
+is; lines count from 1.
+"""
 
 from __future__ import annotations
 
@@ -14,12 +19,22 @@ import zlib
 from functools import partial
 from importlib import resources
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 from tvsbayes.errors import CONTROL, InputError, escaped, refusal, shown
 
 if TYPE_CHECKING:
     import numpy as np
+
+FLUSHES_NO_FOLDER = frozenset({errno.EINVAL, errno.ENOTSUP})
+"""How a file system (some network shares) says that it can flush files only, fsync(2): its own order has to do."""
+ARRAYS_MAX = 256
+_NPY_HEADER = re.compile(
+    rb"\x93NUMPY\x01\x00(?P<length>..)\{'descr': '(?P<kind>[<>|][biufU][0-9]{1,8})', 'fortran_order': "
+    rb"(?P<fortran>True|False), 'shape': \((?P<shape>[0-9, ]{0,100})\),? ?\} *\n",
+    re.DOTALL,
+)
+"""Version 1.0 of the header (NEP 1) as NumPy writes it; no code is evaluated to read it, as NumPy itself does."""
 
 
 def read_bytes(path: Path, cap: int, folder: Path | None = None) -> bytes:
@@ -90,16 +105,25 @@ def decode(data: bytes, file: str) -> str:
     return text
 
 
-FLUSHES_NO_FOLDER = frozenset({errno.EINVAL, errno.ENOTSUP})
-"""How a file system (some network shares) says that it can flush files only, fsync(2): its own order has to do."""
+class Flushing(Protocol):
+    """What the flushing of a folder asks of a disk: the module `os` has it."""
+
+    def open(self, path: Path, flags: int, /) -> int:
+        """A descriptor of the folder."""
+
+    def fsync(self, descriptor: int, /) -> None:
+        """Make durable what is behind it."""
+
+    def close(self, descriptor: int, /) -> None:
+        """Give it back."""
 
 
-def flush_folder(folder: Path, disk=os) -> None:
+def flush_folder(folder: Path, disk: Flushing = os) -> None:
     """Make the names in a folder durable, where the system can: only POSIX flushes folders.
 
     Args:
         folder: which.
-        disk: has `open`, `fsync` and `close` as the module `os` has.
+        disk: through which calls.
 
     Raises:
         OSError: the disk failed.
@@ -192,15 +216,6 @@ def shipped_data() -> Path:
     return inside if inside.is_dir() else Path(str(resources.files("tvsbayes"))).resolve().parent / "data"
 
 
-ARRAYS_MAX = 256
-_NPY_HEADER = re.compile(
-    rb"\x93NUMPY\x01\x00(?P<length>..)\{'descr': '(?P<kind>[<>|][biufU][0-9]{1,8})', 'fortran_order': "
-    rb"(?P<fortran>True|False), 'shape': \((?P<shape>[0-9, ]{0,100})\),? ?\} *\n",
-    re.DOTALL,
-)
-"""Version 1.0 of the header (NEP 1) as NumPy writes it; no code is evaluated to read it, as NumPy itself does."""
-
-
 def _array_of(content: bytes, name: str) -> np.ndarray:
     """The array of an .npy; ValueError for anything but numbers and text of exactly the size that its header states."""
     import numpy as np
@@ -215,8 +230,8 @@ def _array_of(content: bytes, name: str) -> np.ndarray:
         raise ValueError(f"{name} is of the kind {match['kind'].decode()}") from error
     if len(shape) > 8 or not dtype.itemsize or math.prod(shape) * dtype.itemsize != len(content) - match.end():
         raise ValueError(f"{name} is not as long as its header says")
-    order = "F" if match["fortran"] == b"True" else "C"
-    return np.ndarray(shape, dtype, buffer=content, offset=match.end(), order=order).copy()
+    array = np.frombuffer(content, dtype, offset=match.end())
+    return array.reshape(shape, order="F" if match["fortran"] == b"True" else "C").copy()
 
 
 def read_arrays(path: Path, bytes_max: int, unpacked_max: int) -> dict[str, np.ndarray]:

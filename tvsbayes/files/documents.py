@@ -1,12 +1,8 @@
-"""Strict files at the border: teaching errors, capped bytes, CSV, TOML, JSON, arrays, images, atomic writes.
+"""Strict TOML and JSON: values read key by key, each error with its line and dotted key; and TOML written.
 
-Everything a stranger's folder can contain enters the package here. A reader either returns checked values or raises
-`InputError` with file, line, column, what was found, what is allowed and what to do; sizes are capped before anything
-is parsed. Numbers obey an own ASCII pattern: `float` alone would take "9_4.7", "infinity" and Arabic digits. A TOML
-file of 40 kB with one key of 20 000 dotted parts holds `tomllib` for seconds and deep brackets exhaust the stack
-(research: CPython gh-149231), so TOML and JSON are scanned in linear time first.
-
-No JAX, no knowledge of what a campaign is. Lines count from 1.
+A TOML file of 40 kB with one key of 20 000 dotted parts holds `tomllib` for seconds and deep brackets exhaust the
+stack (CPython gh-149231), so both formats are scanned in linear time before they are parsed. No knowledge of what a
+campaign is; lines count from 1.
 """
 
 from __future__ import annotations

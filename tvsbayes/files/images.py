@@ -1,4 +1,8 @@
-"""PNG and JPEG under a cap."""
+"""PNG and JPEG: their size before anything is decoded, their pixels, and PNG written.
+
+Pictures are (height, width, 3) uint8, blue, green, red (OpenCV's order), pixel coordinates those of the sensor. What a
+header announces is checked against a cap first: a small file can ask for gigabytes.
+"""
 
 from __future__ import annotations
 

@@ -27,6 +27,9 @@ from tvsbayes.instrument.parameters import (
 )
 from tvsbayes.instrument.stereo_pair import Stereo, read_stereo
 
+Setting = str | int | float
+"""A value of `[positioner]` or `[cameras]`, by the kind that its key asks for."""
+
 
 @dataclass(frozen=True)
 class RigTable:
@@ -64,8 +67,8 @@ class Rig:
     stereo: Stereo
     truth: dict[str, Prior]
     sheets_mm: dict[str, float]
-    positioner: dict[str, object]
-    cameras: dict[str, object]
+    positioner: dict[str, Setting]
+    cameras: dict[str, Setting]
     costs_s: dict[str, float]
     path: Path | None = None
     header: dict[str, str] = field(default_factory=dict)
@@ -223,11 +226,11 @@ _COSTS_S = {"move_s": 1.5, "look_s": 1.0, "placement_s": 60.0}
 _COUNTER_MAX = 10**8
 
 
-def _parse_positioner(table: Keys) -> dict[str, object]:
+def _parse_positioner(table: Keys) -> dict[str, Setting]:
     """`[positioner]`: driver, port, limits and speeds."""
     limits = ("pan_min_steps", "pan_max_steps", "tilt_min_steps", "tilt_max_steps")
     table.only(("driver", "port", "baud", *limits, "speed_steps_per_s", "settle_s"))
-    values: dict[str, object] = {key: table.text_value(key) for key in ("driver", "port") if key in table}
+    values: dict[str, Setting] = {key: table.text_value(key) for key in ("driver", "port") if key in table}
     # Serial libraries read an address as instructions: one of them writes a file of the address' choice.
     if "://" in str(values.get("port", "")):
         remedy = "give a port's name, such as /dev/ttyACM0 or COM3; `tvsbayes doctor` lists those there are"
@@ -246,10 +249,10 @@ def _parse_positioner(table: Keys) -> dict[str, object]:
     return {**values, **steps}
 
 
-def _parse_cameras(table: Keys, stereo: Stereo) -> dict[str, object]:
+def _parse_cameras(table: Keys, stereo: Stereo) -> dict[str, Setting]:
     """`[cameras]`: source, devices, size (that of the calibration), exposure, spot uncertainty."""
     table.only(("source", "left", "right", "width", "height", "exposure", "spot_sd_px"))
-    values: dict[str, object] = {"spot_sd_px": 0.08}
+    values: dict[str, Setting] = {"spot_sd_px": 0.08}
     for key in ("source", "left", "right"):
         if key in table:
             device = isinstance(table.values[key], str)

@@ -1,10 +1,21 @@
-"""The positioner behind a link."""
+"""Host side of the positioner: one request at a time, safe repeats, resynchronisation, replugging.
+
+What a caller may rely on: `move_to` and `home` return only after the device said, in a frame with a good CRC, that
+this very motion reached its target, at the counters asked for, in the same life of the device (boot id). Everything
+else ends in a `DeviceFault` within a bounded time. After a time-out the same line is sent again; that is safe,
+because the device executes a sequence number once. A device that was reset has lost its counters: that is a
+`PositionLost`, never a silent continuation.
+
+Counters are absolute motor steps (pan, tilt); seconds where a name says `_s`. Time comes from a `Clock`, bytes from
+a `Link`: tests drive both without hardware and without waiting.
+"""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Protocol
 
 from tvsbayes.errors import DeviceFault, escaped
@@ -36,8 +47,24 @@ POLL_S = 0.05
 """Time between two looks at a motion; far below the laser watchdog of the device."""
 HOME_S = 300.0
 """Longest homing: 20 000 steps per axis at 200 steps/s are 200 s."""
+LIMITS = {"pan_min_steps": "pmin", "pan_max_steps": "pmax", "tilt_min_steps": "tmin", "tilt_max_steps": "tmax"}
+"""Soft limits: names in `[positioner]` of a rig file, and those of the protocol."""
 RECONNECT_S = 10.0
 """How long an unplugged device may stay away."""
+SEE_DOCTOR = "; see `tvsbayes doctor`"
+"""Ends a remedy; `doctor` leaves it out of its own."""
+_PORT_REMEDY = "check [positioner] port in the rig file, the cable and your rights on the port" + SEE_DOCTOR
+_REFUSALS = {
+    "limit": "the target lies outside the soft limits: correct the plan or [positioner] in the rig file",
+    "unhomed": "home first",
+    "busy": "another program drives the device: close it",
+    "seq": "another program drives the device: close it",
+}
+_ALARMS = {
+    "limit": "a limit switch opened: clear the way, check the limits in the rig file, then home",
+    "home": "a home switch was not found: check its wiring, then home",
+    "abort": "somebody aborted: make sure that all is well, then home",
+}
 
 
 class PositionLost(DeviceFault):
@@ -167,10 +194,7 @@ class SerialPositioner:
         wanted = (int(pan_steps), int(tilt_steps))
         reply = self._command("MA", *wanted)
         before = reply.state
-        distance = max(
-            abs(wanted[0] - before.pan_steps),
-            abs(wanted[1] - before.tilt_steps),
-        )
+        distance = max(abs(wanted[0] - before.pan_steps), abs(wanted[1] - before.tilt_steps))
         # Twice the whole way at the speed before any ramp, and two full ramps; 5 s for the line.
         top, ramp = self._limits["vmax"], self._limits["amax"]
         state = self._wait(reply, 5.0 + 2.0 * (distance / min(top, 200) + 2.0 * top / ramp))
@@ -210,17 +234,17 @@ class SerialPositioner:
 
     def _switch_off(self) -> None:
         """Laser off and motors at rest, with few attempts."""
-        few = {"attempts": CLOSING_ATTEMPTS, "reconnect": False}
-        reply = self._exchange("L", 0, **few)
+        few = partial(self._exchange, attempts=CLOSING_ATTEMPTS, reconnect=False)
+        reply = few("L", 0)
         if reply.error == "seq":
             # Another program has counted on. Whatever it does, our laser goes off: take up its number.
-            last = self._exchange("ID", sequence=0, **few).extra.get("q", "")
+            last = few("ID", sequence=0).extra.get("q", "")
             if last.isdigit() and last.isascii():
                 self._sequence = int(last)
-                self._exchange("L", 0, **few)
+                few("L", 0)
         elif reply.state.status == "moving":
             # Interrupted in a motion: a blocked axis must not be driven on when nobody watches it any more.
-            self._exchange("STOP", **few)
+            few("STOP")
 
     def _drain(self) -> None:
         """Throw away what an earlier conversation left on the line."""
@@ -405,22 +429,6 @@ class SerialPositioner:
             )
 
 
-SEE_DOCTOR = "; see `tvsbayes doctor`"
-"""Ends a remedy; `doctor` leaves it out of its own."""
-_PORT_REMEDY = "check [positioner] port in the rig file, the cable and your rights on the port" + SEE_DOCTOR
-_REFUSALS = {
-    "limit": "the target lies outside the soft limits: correct the plan or [positioner] in the rig file",
-    "unhomed": "home first",
-    "busy": "another program drives the device: close it",
-    "seq": "another program drives the device: close it",
-}
-_ALARMS = {
-    "limit": "a limit switch opened: clear the way, check the limits in the rig file, then home",
-    "home": "a home switch was not found: check its wiring, then home",
-    "abort": "somebody aborted: make sure that all is well, then home",
-}
-
-
 def _reason(error: OSError) -> str:
     return escaped(error.strerror or str(error), 200)
 
@@ -429,10 +437,9 @@ def _fault(code: str, found: str, remedy: str) -> DeviceFault:
     return DeviceFault(code, f"positioner: {found}; {remedy}", found=found, remedy=remedy)
 
 
-def device_settings(positioner: Mapping[str, object]) -> dict[str, int]:
+def device_settings(positioner: Mapping[str, str | int | float]) -> dict[str, int]:
     """Device settings that `[positioner]` of a rig file states: limits and top speed."""
-    names = {"pan_min_steps": "pmin", "pan_max_steps": "pmax", "tilt_min_steps": "tmin", "tilt_max_steps": "tmax"}
-    settings = {short: int(positioner[name]) for name, short in names.items() if name in positioner}
+    settings = {short: int(positioner[name]) for name, short in LIMITS.items() if name in positioner}
     if "speed_steps_per_s" in positioner:
         low, high, _ = SETTINGS["vmax"]
         settings["vmax"] = min(max(round(float(positioner["speed_steps_per_s"])), low), high)

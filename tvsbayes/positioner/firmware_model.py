@@ -204,15 +204,15 @@ class DeviceModel:
         if sequence is None or len(words) < 2:
             return self._nak("parse")
         if sequence == 0:
-            error, extra = self._command(0, words[1:], now_us) if words[1:] == ["ID"] else ("seq", "")
-            return self._write(self._reply(0, error, extra))
+            refused, extra = self._command(0, words[1:], now_us) if words[1:] == ["ID"] else ("seq", "")
+            return self._write(self._reply(0, refused, extra))
         if sequence == self._last_sequence and line == self._last_request:
             return self._write(self._last_reply)
         if sequence <= self._last_sequence:
             return self._write(self._reply(sequence, "seq", ""))
         self._last_sequence, self._last_request = sequence, line
-        error, extra = self._command(sequence, words[1:], now_us)
-        self._last_reply = self._reply(sequence, error, extra)
+        refused, extra = self._command(sequence, words[1:], now_us)
+        self._last_reply = self._reply(sequence, refused, extra)
         return self._write(self._last_reply)
 
     def _nak(self, kind: str) -> None:

@@ -55,6 +55,7 @@ _UNSIGNED = re.compile(r"0|[1-9][0-9]{0,9}")
 _FRAME = re.compile(rb"([><!][ -)+-~]*)\*([0-9A-F]{4})")
 _WORD = re.compile(r"[a-z]+(-[a-z]+)*")
 _FIELD = re.compile(r"([a-z]+)=([ -~]+)")
+_STATE_KEYS = ("b", "st", "p", "t", "d", "l", "h", "e")
 
 
 class FrameError(ValueError):
@@ -166,9 +167,6 @@ def state_text(state: DeviceState) -> str:
         f"t={state.pan_target_steps},{state.tilt_target_steps} d={state.done_sequence} l={int(state.laser_on)} "
         f"h={state.pan_home_deviation_steps},{state.tilt_home_deviation_steps} e={state.last_error}"
     )
-
-
-_STATE_KEYS = ("b", "st", "p", "t", "d", "l", "h", "e")
 
 
 def parse_answer(line: bytes) -> Reply | Unasked:

@@ -1,13 +1,7 @@
-"""Host side of the positioner: one request at a time, safe repeats, resynchronisation, replugging.
+"""Serial ports: those of this computer, and one of them as the driver's `Link`.
 
-What a caller may rely on: `move_to` and `home` return only after the device said, in a frame with a good CRC, that
-this very motion reached its target, at the counters asked for, in the same life of the device (boot id). Everything
-else ends in a `DeviceFault` within a bounded time. After a time-out the same line is sent again; that is safe,
-because the device executes a sequence number once. A device that was reset has lost its counters: that is a
-`PositionLost`, never a silent continuation.
-
-Counters are absolute motor steps (pan, tilt); seconds where a name says `_s`. Time comes from a `Clock`, bytes from
-a `Link`: tests drive both without hardware and without waiting.
+A port is opened by name and for this program alone; after an unplugging the same USB device is found again under
+whatever name it came back. Seconds where a name says `_s`.
 """
 
 from __future__ import annotations
