@@ -129,6 +129,7 @@ def broken_rig(task: tuple[str, int]) -> dict[str, object]:
     campaign_arrays.SMALLEST_BUCKET = 128
     from tvsbayes.estimators.campaign_arrays import use_compilation_cache
     from tvsbayes.estimators.joint_fit import fit
+    from tvsbayes.instrument.model_choice import ModelChoice
 
     use_compilation_cache()
     campaign, truth = broken_campaign(condition, seed)
@@ -137,7 +138,7 @@ def broken_rig(task: tuple[str, int]) -> dict[str, object]:
     for name, robust in (("plain", False), ("robust", True)):
         start = time.perf_counter()
         try:
-            result = fit(campaign, robust=robust)
+            result = fit(campaign, model=ModelChoice(robust=robust))
             entry: dict[str, object] = {"converged": result.converged, "problems": list(result.problems)}
             entry["excluded"] = len(result.excluded_spots)
             entry["suspect"] = len(result.suspect_spots)

@@ -239,6 +239,7 @@ def one_row(task: tuple[str, str, int]) -> dict[str, object]:
     from tvsbayes.estimators.campaign_arrays import use_compilation_cache
     from tvsbayes.estimators.joint_fit import fit
     from tvsbayes.files.disk import shipped_data
+    from tvsbayes.instrument.model_choice import ModelChoice
     from tvsbayes.instrument.parameters import INDEX
     from tvsbayes.instrument.plan import read_plan
     from tvsbayes.instrument.rig import read_rig
@@ -257,11 +258,11 @@ def one_row(task: tuple[str, str, int]) -> dict[str, object]:
     row["unseen"] = sum(spot.status != "ok" for spot in campaign.spots)
     if name == "paper, as published":
         campaign = forget_sides(campaign)
-    options = {"play": {"per_axis": True}, "ratios": {"no_backlash": True}, "both": {}}
+    choices = {"play": ModelChoice(per_axis=True), "ratios": ModelChoice(no_backlash=True), "both": ModelChoice()}
     row["models"] = {}
     for model in MODELS:
         try:
-            result = fit(campaign, **options[model])
+            result = fit(campaign, model=choices[model])
         except Exception as error:
             row["models"][model] = {"converged": False, "problems": [repr(error)]}
             continue

@@ -25,9 +25,11 @@ if TYPE_CHECKING:
     from tvsbayes.coordinates.location import locate as locate
     from tvsbayes.estimators.joint_fit import fit as fit
     from tvsbayes.instrument.campaign import read_campaign as read_campaign
+    from tvsbayes.instrument.model_choice import ModelChoice as ModelChoice
     from tvsbayes.posterior.sampling import sample as sample
 
 _HOME = {
+    "ModelChoice": "instrument.model_choice",
     "calibration_of": "assessment.fitted_calibration",
     "fit": "estimators.joint_fit",
     "load_calibration": "calibration.calibration_file",

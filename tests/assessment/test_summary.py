@@ -12,6 +12,7 @@ from tvsbayes.assessment.summary import summarise
 from tvsbayes.estimators.four_point import classic
 from tvsbayes.estimators.joint_fit import fit
 from tvsbayes.instrument.campaign import Campaign
+from tvsbayes.instrument.model_choice import ModelChoice
 from tvsbayes.instrument.parameters import HARMONIC_PRIORS, INDEX, NAMES, RECEIVER_NAMES, Prior
 from tvsbayes.instrument.plan import four_point_protocol, paper_protocol
 from tvsbayes.report.fit_text import fit_text
@@ -164,7 +165,7 @@ def test_aperture_readings_bring_their_parameters(mounted_rig):
 
 def test_gears_without_play_are_not_called_weak_for_it(paper):
     """Of one |N| the ratio cannot be told from play; of gears said to have none it can."""
-    summary = summarise(fit(paper, no_backlash=True))
+    summary = summarise(fit(paper, model=ModelChoice(no_backlash=True)))
     assert not any("backlash" in weak.text for weak in summary.weak_directions)
     assert not any("backlash" in entry.quantity for entry in summary.leverage)
     for axis in ("pan", "tilt"):

@@ -25,6 +25,7 @@ from tvsbayes.cli.main import main, run
 from tvsbayes.estimators.four_point import select_experiments
 from tvsbayes.files.disk import shipped_data
 from tvsbayes.instrument.campaign import Campaign, read_campaign, write_campaign
+from tvsbayes.instrument.model_choice import ModelChoice
 from tvsbayes.instrument.parameters import Prior
 from tvsbayes.instrument.plan import PlanStep, grid_protocol, mixed_protocol, write_plan
 from tvsbayes.pipeline import compile_for, fit_for
@@ -348,7 +349,7 @@ def test_what_a_fit_left_is_taken_up_again(folder, monkeypatch):
 
     campaign = read_campaign(folder)
     assert stored_mode(campaign) is None
-    fresh = fit(campaign, per_axis=True)
+    fresh = fit(campaign, model=ModelChoice(per_axis=True))
     write_results(fresh, summarise(fresh), folder / "results", 0, calibration_of(fresh))
     back = restored(campaign, stored_mode(campaign))
     for name in ("z", "covariance", "draws_z", "free", "reference_pose_rad"):

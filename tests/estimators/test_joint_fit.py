@@ -13,9 +13,10 @@ import numpy as np
 import pytest
 
 from tvsbayes.errors import InputError, NothingToEstimate
-from tvsbayes.estimators.joint_fit import HARMONIC_SD_DEG, fit, model_choice
+from tvsbayes.estimators.joint_fit import fit
 from tvsbayes.files.disk import shipped_data
 from tvsbayes.instrument.campaign import Campaign, ordered_spots
+from tvsbayes.instrument.model_choice import ModelChoice
 from tvsbayes.instrument.parameters import HARMONIC_PRIORS, INDEX, NAMES, Prior
 from tvsbayes.instrument.plan import four_point_protocol, grid_protocol
 from tvsbayes.instrument.rig import RigTable, read_rig
@@ -121,7 +122,7 @@ def test_an_outlier_is_blamed_on_the_right_spot_of_its_stop(simulated):
     moved = replace(first, u_left_px=first.u_left_px + 4.0, u_right_px=first.u_right_px + 4.0)
     campaign = simulated.campaign
     spoiled = tuple(moved if s.spot == first.spot else s for s in campaign.spots)
-    robust = fit(replace(campaign, spots=spoiled), robust=True)
+    robust = fit(replace(campaign, spots=spoiled), model=ModelChoice(robust=True))
     assert robust.converged, robust.problems
     assert robust.excluded_spots == (first.spot,)
     without = fit(replace(campaign, spots=tuple(s for s in campaign.spots if s.spot != first.spot)))
@@ -142,7 +143,7 @@ def test_the_plain_fit_names_the_outlier_as_suspect(simulated):
 
 
 def test_robust_on_clean_data_excludes_nothing(simulated, fitted):
-    robust = fit(simulated.campaign, robust=True)
+    robust = fit(simulated.campaign, model=ModelChoice(robust=True))
     assert robust.excluded_spots == ()
     sd = fitted.draws.effective_deg_per_step.std(axis=0)
     difference = robust.mode.effective_deg_per_step - fitted.mode.effective_deg_per_step
@@ -150,7 +151,7 @@ def test_robust_on_clean_data_excludes_nothing(simulated, fitted):
 
 
 def test_the_per_axis_model_has_one_ratio(simulated):
-    result = fit(simulated.campaign, per_axis=True)
+    result = fit(simulated.campaign, model=ModelChoice(per_axis=True))
     left, right, up, down = result.draws.effective_deg_per_step.T
     np.testing.assert_array_equal(left, right)
     np.testing.assert_array_equal(up, down)
@@ -178,7 +179,7 @@ def wobbling(mounted_rig) -> SimulatedCampaign:
 
 def test_a_pinions_error_is_found_and_without_it_the_stops_scatter(simulated, fitted, wobbling, caplog):
     with compiling_nothing(caplog):
-        plain, freed = fit(wobbling.campaign), fit(wobbling.campaign, harmonics=True)
+        plain, freed = fit(wobbling.campaign), fit(wobbling.campaign, model=ModelChoice(harmonics=True))
     assert plain.converged and freed.converged, (plain.problems, freed.problems)
     for name in HARMONIC_PRIORS:
         index = INDEX[name]
@@ -199,29 +200,12 @@ def test_a_pinions_error_is_found_and_without_it_the_stops_scatter(simulated, fi
 
 def test_harmonics_need_a_period_to_be_freed(simulated):
     with pytest.raises(InputError, match="no axis states the period") as caught:
-        fit(simulated.campaign, harmonics=True)
+        fit(simulated.campaign, model=ModelChoice(harmonics=True))
     assert '"harmonic_period_deg.pan" = { value = 360.0, u = 0.0 }' in caught.value.remedy
 
 
-def test_the_choice_of_a_model_keeps_what_the_rig_states():
-    stated = {"harmonic_deg.pan.2.cos": Prior(0.02, 0.005), "harmonic_deg.pan.2.sin": Prior(0.03, 0.0)}
-    table = RigTable(stated, harmonic_period_deg={"pan": 30.0})
-    plain = {"per_axis": False, "harmonics": False, "no_backlash": False}
-    assert model_choice(table, **plain) == table
-    chosen = model_choice(table, **{**plain, "harmonics": True})
-    asked = {"harmonic_deg.pan.1.cos", "harmonic_deg.pan.1.sin"}
-    assert {n for n in HARMONIC_PRIORS if chosen.priors[n] == Prior(0.0, HARMONIC_SD_DEG)} == asked
-    assert all(chosen.priors[name] == prior for name, prior in stated.items())
-    assert all(p == Prior(0.0, 0.0) for n, p in chosen.priors.items() if n.startswith("harmonic_deg.tilt"))
-    bare = model_choice(table, **{**plain, "no_backlash": True, "per_axis": True}).priors
-    changed = {name for name, prior in bare.items() if prior != table.priors[name]}
-    stems = ("backlash_deg", "ratio_contrast_deg_per_step")
-    assert changed == {f"{stem}.{axis}" for stem in stems for axis in ("pan", "tilt")}
-    assert all(bare[name].u == 0 for name in changed)
-
-
 def test_gears_without_play_put_it_into_the_stops(simulated, fitted):
-    result = fit(simulated.campaign, no_backlash=True)
+    result = fit(simulated.campaign, model=ModelChoice(no_backlash=True))
     assert result.converged, result.problems
     for axis in ("pan", "tilt"):
         index = INDEX[f"backlash_deg.{axis}"]

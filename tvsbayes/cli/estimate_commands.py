@@ -81,13 +81,14 @@ def fit(
     from tvsbayes.assessment.fitted_calibration import DRAWS_KEPT, calibration_of
     from tvsbayes.assessment.summary import summarise
     from tvsbayes.estimators.joint_fit import fit as fit_joint
+    from tvsbayes.instrument.model_choice import ModelChoice
     from tvsbayes.report.fit_text import fit_text
     from tvsbayes.results.fit_record import write_results
 
     compile_for(report_line)
     folder = out or output_place(campaign, "results")
-    model = {"per_axis": per_axis, "harmonics": harmonics, "no_backlash": no_backlash}
-    result = fit_joint(data, robust=robust, **model, seed=seed)
+    model = ModelChoice(robust=robust, per_axis=per_axis, harmonics=harmonics, no_backlash=no_backlash)
+    result = fit_joint(data, model=model, seed=seed)
     summary, posterior, more = summarise(result), None, {}
     # A sample of what must not be used anyway would only take the user's time.
     if not no_sample and unusable(summary) is None:

@@ -25,7 +25,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 from scipy import optimize
 
-from tvsbayes.errors import InputError, NotConverged, NothingToEstimate
+from tvsbayes.errors import NotConverged, NothingToEstimate
 from tvsbayes.estimators.campaign_arrays import CampaignArrays, campaign_arrays, in_sight
 from tvsbayes.estimators.likelihood import density_and_gradient, innovations
 from tvsbayes.estimators.linear_spots import (
@@ -38,7 +38,8 @@ from tvsbayes.estimators.linear_spots import (
     stop_information,
 )
 from tvsbayes.instrument.campaign import Campaign, ordered_spots
-from tvsbayes.instrument.parameters import HARMONIC_PRIORS, INDEX, NAMES, NOISE_NAMES, RIG_NAMES, Prior
+from tvsbayes.instrument.model_choice import AS_STATED, ModelChoice
+from tvsbayes.instrument.parameters import INDEX, NAMES, NOISE_NAMES, RIG_NAMES, Prior
 from tvsbayes.instrument.rig import RigTable
 from tvsbayes.model.geometry import Scalar
 from tvsbayes.model.headlines import Derived, derived_quantities
@@ -58,10 +59,6 @@ SMALLEST_CAMPAIGN = 8
 """Spots below which no fit is tried: two beams at two depths, seen before and after one move on each axis."""
 NOISE_SETTLED = 0.05
 """Change of every noise coordinate (prior sds) below which the alternation stops: half a posterior sd."""
-CONTRASTS = ("ratio_contrast_deg_per_step.pan", "ratio_contrast_deg_per_step.tilt")
-BACKLASHES = ("backlash_deg.pan", "backlash_deg.tilt")
-HARMONIC_SD_DEG = 0.1
-"""Prior standard deviation of every part of a freed transmission error (DESIGN 3.1)."""
 MISFIT_LIMIT = 20.0
 """Factor on the stated pixel noise beyond which the mode explains no spot: a wrong basin, swapped cameras or wrong
 counters, not noise."""
@@ -278,42 +275,8 @@ def _robust_weights(problem: Problem, z: np.ndarray) -> tuple[CampaignArrays, fl
     return arrays, change
 
 
-def model_choice(table: RigTable, *, per_axis: bool, harmonics: bool, no_backlash: bool) -> RigTable:
-    """The priors of a simpler or richer model of the gears; options as in `fit`.
-
-    Raises:
-        InputError: harmonics are wanted and no axis states the period of its error.
-    """
-    changed: dict[str, Prior] = {}
-    if per_axis:
-        changed |= dict.fromkeys(CONTRASTS, Prior(0.0, 0.0))
-    if no_backlash:
-        changed |= dict.fromkeys(BACKLASHES, Prior(0.0, 0.0, "half-normal"))
-    if harmonics:
-        if not table.harmonic_period_deg:
-            raise InputError(
-                "missing-period",
-                "no axis states the period of its transmission error",
-                file="campaign.toml",
-                column="rig.harmonic_period_deg",
-                allowed="a period in degrees of the output, 360 for the wheel, less for the pinion",
-                remedy='add "harmonic_period_deg.pan" = { value = 360.0, u = 0.0 } (or tilt) to [rig]',
-            )
-        for name, unasked in HARMONIC_PRIORS.items():
-            if name.split(".")[1] in table.harmonic_period_deg and table.priors[name] == unasked:
-                changed[name] = Prior(0.0, HARMONIC_SD_DEG)
-    return replace(table, priors={**table.priors, **changed})
-
-
 def fit(
-    campaign: Campaign,
-    *,
-    robust: bool = False,
-    per_axis: bool = False,
-    harmonics: bool = False,
-    no_backlash: bool = False,
-    without: Collection[int] = (),
-    seed: int = 0,
+    campaign: Campaign, *, model: ModelChoice = AS_STATED, without: Collection[int] = (), seed: int = 0
 ) -> JointFit:
     """Fit the joint model to every usable spot (DESIGN 4).
 
@@ -322,12 +285,7 @@ def fit(
 
     Args:
         campaign: from `read_campaign`.
-        robust: downweight and exclude spots that disagree with all others (Huber weights and a gate on
-            leave-one-out residuals).
-        per_axis: one ratio per axis, the contrasts fixed at 0 (DESIGN 3.1).
-        harmonics: free the transmission error of every axis with a stated period, N(0, 0.1 deg) each, where
-            `[rig.prior]` says nothing else; a harmonic stated as exactly 0 counts as nothing said.
-        no_backlash: gears without play, both backlashes fixed at 0.
+        model: simpler or richer gears than the rig states, robust against outliers or not.
         without: ids of spots that teach the fit nothing but can be predicted by it.
         seed: seed of the Laplace draws.
 
@@ -339,7 +297,7 @@ def fit(
         NothingToEstimate: if the campaign has fewer than `SMALLEST_CAMPAIGN` usable spots, or all is fixed.
         NotConverged: if the fit diverged; a fit that ended badly is returned with `converged` False.
     """
-    table = model_choice(campaign.rig, per_axis=per_axis, harmonics=harmonics, no_backlash=no_backlash)
+    table = model.table(campaign.rig)
     spots = ordered_spots(campaign)
     # A spot beyond what the lens model can undistort is in nobody's sight line.
     used = np.array([spot.spot not in without for spot in spots], dtype=bool) & in_sight(campaign)
@@ -370,7 +328,7 @@ def fit(
             for inflation in ANNEALING:
                 z = problem.least_squares(z, inflation)
             z = problem.alternate(z)
-            if robust:
+            if model.robust:
                 for _ in range(20):
                     problem.arrays, change = _robust_weights(problem, z)
                     if change < 0.02:

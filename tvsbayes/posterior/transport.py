@@ -11,10 +11,11 @@ import jax.numpy as jnp
 import numpy as np
 from scipy import linalg
 
-from tvsbayes.estimators.joint_fit import BACKLASHES, JointFit
+from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.estimators.likelihood import evaluate
 from tvsbayes.estimators.linear_spots import LinearSpots, linear_spots
 from tvsbayes.instrument.axes import SIDES
+from tvsbayes.instrument.model_choice import BACKLASHES
 from tvsbayes.instrument.parameters import INDEX, NAMES, NOISE_NAMES
 from tvsbayes.model.parameter_space import half_normal, half_normal_slope
 

@@ -1,0 +1,63 @@
+"""Which model a fit holds against the data: gears simpler or richer than a rig file states, spots to be left out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+from tvsbayes.errors import InputError
+from tvsbayes.instrument.parameters import HARMONIC_PRIORS, Prior
+from tvsbayes.instrument.rig import RigTable
+
+CONTRASTS = ("ratio_contrast_deg_per_step.pan", "ratio_contrast_deg_per_step.tilt")
+BACKLASHES = ("backlash_deg.pan", "backlash_deg.tilt")
+HARMONIC_SD_DEG = 0.1
+"""Prior standard deviation of every part of a freed transmission error."""
+
+
+@dataclass(frozen=True)
+class ModelChoice:
+    """What `fit` is asked for beyond the priors of the rig; the defaults take those as they are stated.
+
+    Attributes:
+        robust: downweight and exclude spots that disagree with all others (Huber weights and a gate on leave-one-out
+            residuals).
+        per_axis: one ratio per axis, the contrasts of left and right, up and down fixed at 0.
+        harmonics: free the transmission error of every axis with a stated period, N(0, 0.1 deg) each, where
+            `[rig.prior]` says nothing else; a harmonic stated as exactly 0 counts as nothing said.
+        no_backlash: gears without play, both backlashes fixed at 0.
+    """
+
+    robust: bool = False
+    per_axis: bool = False
+    harmonics: bool = False
+    no_backlash: bool = False
+
+    def table(self, stated: RigTable) -> RigTable:
+        """The rig with the priors of the gears that are chosen.
+
+        Raises:
+            InputError: harmonics are wanted and no axis states the period of its error.
+        """
+        changed: dict[str, Prior] = {}
+        if self.per_axis:
+            changed |= dict.fromkeys(CONTRASTS, Prior(0.0, 0.0))
+        if self.no_backlash:
+            changed |= dict.fromkeys(BACKLASHES, Prior(0.0, 0.0, "half-normal"))
+        if self.harmonics:
+            if not stated.harmonic_period_deg:
+                raise InputError(
+                    "missing-period",
+                    "no axis states the period of its transmission error",
+                    file="campaign.toml",
+                    column="rig.harmonic_period_deg",
+                    allowed="a period in degrees of the output, 360 for the wheel, less for the pinion",
+                    remedy='add "harmonic_period_deg.pan" = { value = 360.0, u = 0.0 } (or tilt) to [rig]',
+                )
+            for name, unasked in HARMONIC_PRIORS.items():
+                if name.split(".")[1] in stated.harmonic_period_deg and stated.priors[name] == unasked:
+                    changed[name] = Prior(0.0, HARMONIC_SD_DEG)
+        return replace(stated, priors={**stated.priors, **changed})
+
+
+AS_STATED = ModelChoice()
+"""The model of the rig file itself."""
