@@ -41,8 +41,8 @@ from tvsbayes.calibration.calibration_file import (
     load_calibration,
     stored_calibration,
 )
-from tvsbayes.calibration.optics import output_deg, range_components
-from tvsbayes.calibration.pointing import DIVERGING_SHARE, INPUT_NAMES, NOISE_NAMES, Calibration, direction_of
+from tvsbayes.calibration.optics import direction_of, output_deg, range_components
+from tvsbayes.calibration.pointing import DIVERGING_SHARE, INPUT_NAMES, NOISE_NAMES, Calibration
 from tvsbayes.coordinates.beam_meeting import carry, meeting, sources
 from tvsbayes.coordinates.location import locate, locate_linear, settings_of
 from tvsbayes.errors import InputError
@@ -529,12 +529,12 @@ def test_json_export_brings_back_all_but_the_draws(tmp_path):
 def test_expected_error_is_that_of_the_middle():
     one = replace(complete(), range_steps=np.array([[-100.0, 300.0], [40.0, 60.0]]))
     error = expected_error(one)
-    assert (error["pan_steps"], error["tilt_steps"]) == (100, 50)
+    assert (error.pan_steps, error.tilt_steps) == (100, 50)
     d = one.ray(100, 50).direction
     there = one.steps_for(azimuth_deg=math.degrees(math.atan2(d[1], d[0])), elevation_deg=math.degrees(math.asin(d[2])))
-    assert [error["u95_azimuth_deg"], error["u95_elevation_deg"]] == pytest.approx(there.u95_deg, rel=ROUNDING)
+    assert [error.u95_azimuth_deg, error.u95_elevation_deg] == pytest.approx(there.u95_deg, rel=ROUNDING)
     at_1_m = one.steps_for(one.ray(100, 50).origin_mm + 1000.0 * d)
-    assert error["u95_at_1_m_mm"] == pytest.approx(at_1_m.u95_mm, rel=1e-9)
+    assert error.u95_at_1_m_mm == pytest.approx(at_1_m.u95_mm, rel=1e-9)
 
 
 def arrays_of(one: Calibration) -> dict[str, np.ndarray]:
@@ -734,8 +734,8 @@ def test_the_c_header_computes_the_same(tmp_path, periods, azimuth):
 def test_the_c_header_states_its_error_and_overshoot(bent):
     text = calibration_header(bent)
     error = expected_error(bent)
-    assert f"azimuth {error['u95_azimuth_deg']:.3f} deg, elevation {error['u95_elevation_deg']:.3f} deg" in text
-    assert f"at 1 m {max(error['u95_at_1_m_mm']):.2f} mm" in text
+    assert f"azimuth {error.u95_azimuth_deg:.3f} deg, elevation {error.u95_elevation_deg:.3f} deg" in text
+    assert f"at 1 m {max(error.u95_at_1_m_mm):.2f} mm" in text
     assert f"#define TVS_OVERSHOOT_PAN_STEPS {bent.overshoot_steps['pan']}\n" in text
     assert "@" not in text
     for name in (*INPUT_NAMES, *HARMONIC_PRIORS):

@@ -1,9 +1,7 @@
-"""A calibration to drive with: rays, coordinates and counters from stored draws, in NumPy alone (DESIGN 5 and 8).
+"""Calibrations on disk: `draws.npz` of `results/`, JSON for another language, a C header for a microcontroller.
 
-What a robot loads: no JAX, no fit, less than a millisecond a call. The optics are written out in components, so that
-the same lines serve one pose in Python floats and many parameter sets in arrays; `tests/test_calibration.py` holds
-them to the JAX model. Frame T: origin mid-baseline, x depth, y along the baseline towards the positioner at +a/2,
-z up. mm; degrees where a name says `_deg`; counters in steps, absolute, after homing.
+NumPy alone. What is read comes from a stranger: caps, shapes and finite numbers are checked before a calibration is
+made of it. Units as in the names; matrices in the order of `INPUT_NAMES`.
 """
 
 from __future__ import annotations
@@ -11,7 +9,10 @@ from __future__ import annotations
 import io
 import json
 import math
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import TypedDict, cast
 
 import numpy as np
 
@@ -31,10 +32,49 @@ NAME_CHARS_MAX = 200
 _ARRAYS = ("mean", "covariance", "range_steps", "inputs", "noise", "cause_covariance")
 
 
+class _Tables(TypedDict):
+    """What `draws.npz` keeps as JSON beside the arrays; fields as in `Calibration`."""
+
+    noise_variance: Mapping[str, float]
+    overshoot_steps: Mapping[str, int]
+    period_deg: Mapping[str, float]
+    inputs_sha256: Mapping[str, str]
+    causes: list[str]
+
+
+class _Moments(TypedDict):
+    """Names of the inputs and their covariance matrix."""
+
+    names: list[str]
+    matrix: list[list[float]]
+
+
+class CalibrationDocument(TypedDict):
+    """A calibration without its draws, as JSON."""
+
+    format: str
+    estimator: str
+    aperture_convention: str
+    harmonic_period_deg: Mapping[str, float]
+    estimates: Mapping[str, float]
+    covariance: _Moments
+    noise_variance_deg2: Mapping[str, float]
+    overshoot_steps: Mapping[str, int]
+    range_steps: Mapping[str, list[float]]
+    inputs: Mapping[str, str]
+    expected_error: dict[str, object]
+
+
 def calibration_bytes(calibration: Calibration, **more: np.ndarray) -> bytes:
     """The content of `draws.npz`: a calibration and further arrays."""
-    texts = {name: getattr(calibration, name) for name in ("noise_variance", "overshoot_steps", "period_deg")}
-    texts |= {"inputs_sha256": calibration.inputs_sha256, "causes": list(calibration.causes)}
+    tables = _Tables(
+        noise_variance=calibration.noise_variance,
+        overshoot_steps=calibration.overshoot_steps,
+        period_deg=calibration.period_deg,
+        inputs_sha256=calibration.inputs_sha256,
+        causes=list(calibration.causes),
+    )
+    arrays = {name: getattr(calibration, name) for name in _ARRAYS} | more
     buffer = io.BytesIO()
     np.savez_compressed(
         buffer,
@@ -43,14 +83,13 @@ def calibration_bytes(calibration: Calibration, **more: np.ndarray) -> bytes:
         noise_names=np.array(NOISE_NAMES),
         estimator=calibration.estimator,
         azimuth=calibration.azimuth,
-        tables=json.dumps(texts),
-        **{name: getattr(calibration, name) for name in _ARRAYS},
-        **more,
+        tables=json.dumps(tables),
+        **arrays,
     )
     return buffer.getvalue()
 
 
-def calibration_json(calibration: Calibration) -> dict[str, object]:
+def calibration_json(calibration: Calibration) -> CalibrationDocument:
     """A calibration without its draws, for a ROS node or another language; `load_calibration` reads it."""
     return {
         "format": CALIBRATION_FORMAT,
@@ -63,25 +102,28 @@ def calibration_json(calibration: Calibration) -> dict[str, object]:
         "overshoot_steps": dict(calibration.overshoot_steps),
         "range_steps": dict(zip(AXES, calibration.range_steps.tolist(), strict=True)),
         "inputs": dict(calibration.inputs_sha256),
-        "expected_error": expected_error(calibration),
+        "expected_error": asdict(expected_error(calibration)),
     }
 
 
-def expected_error(calibration: Calibration) -> dict[str, object]:
-    """95 % half widths that remain with this calibration, at the middle of the counters it was made with.
+@dataclass(frozen=True)
+class ExpectedError:
+    """95 % half widths of the beam at counters: of its azimuth and elevation, and of its position at 1 m (x, y, z)."""
 
-    Of the beam's direction, and of its position at 1 m; every approach from left and up.
-    """
-    middle = [round(float(value)) for value in calibration.range_steps.mean(axis=1)]
-    angles = calibration._ray_u95(middle, (1.0, 1.0), None)
-    at_1_m = calibration._ray_u95(middle, (1.0, 1.0), 1000.0)
-    return {
-        "pan_steps": middle[0],
-        "tilt_steps": middle[1],
-        "u95_azimuth_deg": float(angles[0]),
-        "u95_elevation_deg": float(angles[1]),
-        "u95_at_1_m_mm": at_1_m.tolist(),
-    }
+    pan_steps: int
+    tilt_steps: int
+    u95_azimuth_deg: float
+    u95_elevation_deg: float
+    u95_at_1_m_mm: list[float]
+
+
+def expected_error(calibration: Calibration) -> ExpectedError:
+    """What remains with this calibration at the middle of its campaign's counters, reached from left and up."""
+    pan, tilt = (round(float(value)) for value in calibration.range_steps.mean(axis=1))
+    counters, sides = (float(pan), float(tilt)), (1.0, 1.0)
+    azimuth, elevation = calibration.beam_u95_deg(counters, sides).tolist()
+    at_1_m = calibration.beam_u95_mm(counters, sides, 1000.0).tolist()
+    return ExpectedError(pan, tilt, azimuth, elevation, at_1_m)
 
 
 def calibration_header(calibration: Calibration) -> str:
@@ -95,9 +137,9 @@ def calibration_header(calibration: Calibration) -> str:
         lines.append(f"#define TVS_OVERSHOOT_{axis.upper()}_STEPS {calibration.overshoot_steps[axis]}")
     lines.append(f"#define TVS_AZIMUTH_CONVENTION {int(calibration.azimuth)}")
     stated = (
-        f"Expected error ({calibration.estimator}, 95 %) at pan {error['pan_steps']}, tilt {error['tilt_steps']} "
-        f"steps: azimuth {error['u95_azimuth_deg']:.3f} deg, elevation {error['u95_elevation_deg']:.3f} deg; "
-        f"at 1 m {max(error['u95_at_1_m_mm']):.2f} mm."
+        f"Expected error ({calibration.estimator}, 95 %) at pan {error.pan_steps}, tilt {error.tilt_steps} "
+        f"steps: azimuth {error.u95_azimuth_deg:.3f} deg, elevation {error.u95_elevation_deg:.3f} deg; "
+        f"at 1 m {max(error.u95_at_1_m_mm):.2f} mm."
     )
     return template.replace("@EXPECTED_ERROR@", stated).replace("@VALUES@", "\n".join(lines))
 
@@ -127,6 +169,7 @@ def load_calibration(path: Path | str) -> Calibration:
 
 
 def damaged_calibration(path: Path, reason: object) -> InputError:
+    """The refusal of a file that is not what tvsbayes wrote."""
     return InputError(
         "damaged-results",
         f"{escaped(path.name)} is not a calibration that tvsbayes wrote: {escaped(str(reason), 200)}",
@@ -178,21 +221,29 @@ def read_draws(path: Path) -> Calibration:
         tables = _tables(str(file["tables"]), path)
         return _shaped(
             Calibration(
-                **{name: file[name] for name in _ARRAYS},
-                **{name: tables[name] for name in ("noise_variance", "overshoot_steps", "period_deg")},
+                mean=file["mean"],
+                covariance=file["covariance"],
+                noise_variance=tables["noise_variance"],
+                overshoot_steps=tables["overshoot_steps"],
                 azimuth=bool(file["azimuth"]),
+                period_deg=tables["period_deg"],
                 estimator=str(file["estimator"]),
+                range_steps=file["range_steps"],
                 inputs_sha256=tables["inputs_sha256"],
+                inputs=file["inputs"],
+                noise=file["noise"],
                 causes=tuple(tables["causes"]),
+                cause_covariance=file["cause_covariance"],
             )
         )
     except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
         raise damaged_calibration(path, error) from error
 
 
-def _tables(text: str, path: Path) -> dict[str, object]:
+def _tables(text: str, path: Path) -> _Tables:
+    """Unchecked but for being JSON: `_shaped` refuses what does not fit."""
     try:
-        return parse_json(text.encode(), escaped(path.name)).values
+        return cast(_Tables, parse_json(text.encode(), escaped(path.name)).values)
     except InputError as error:
         raise damaged_calibration(path, f"its tables are no JSON of tvsbayes: {error.found}") from error
 
@@ -202,7 +253,8 @@ def _from_json(path: Path) -> Calibration:
     keys.word("format", (CALIBRATION_FORMAT,))
     convention = keys.word("aperture_convention", ("in-plane", "azimuth"))
     try:
-        d = keys.values
+        # What does not fit its type fails below or in `_shaped`.
+        d = cast(CalibrationDocument, keys.values)
         if tuple(d["covariance"]["names"]) != INPUT_NAMES:
             raise ValueError("the covariance names other inputs")
         return _shaped(
@@ -248,6 +300,8 @@ def stored_ratios(campaign: Campaign) -> np.ndarray:
     Raises:
         InputError: missing or damaged.
     """
+    if campaign.path is None:
+        raise damaged_calibration(Path("draws.npz"), "the campaign has no folder")
     path = campaign.path / "results" / "draws.npz"
     try:
         file = read_arrays(path, RESULTS_BYTES_MAX, UNPACKED_BYTES_MAX)

@@ -1,37 +1,62 @@
-"""Beam and range in components, NumPy."""
+"""The optics written out in components: counters to mirror angles, beams, ranges and aperture readings, in NumPy.
+
+The same lines serve one pose in Python floats (`m` = `math`) and many parameter sets in arrays (`m` = `numpy`, also
+complex, for derivatives). Frame T: origin mid-baseline, x depth, y along the baseline towards the positioner at +a/2,
+z up; mm, degrees, steps. Parameters come by name with the units of their names.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import dataclass
+from types import ModuleType
+from typing import NamedTuple
 
 import numpy as np
 
 from tvsbayes.instrument.axes import FULL_TURN_DEG
+from tvsbayes.instrument.parameters import HARMONIC_ORDERS
 
 ROUNDING = 1e-12
 """Of coordinates, relative to the range."""
 TO_RAD = math.pi / 180
+type Number = float | np.ndarray
+"""One pose in Python floats, or arrays of one shape."""
+type Vector = tuple[Number, Number, Number]
+"""x, y, z of frame T."""
+type Values = Mapping[str, Number]
+"""Parameters by name."""
 
 
-def _harmonic(values: Mapping[str, object], axis: str, angle_deg, period_deg: float, m):
+@dataclass(frozen=True)
+class Ray:
+    """A beam in frame T: it leaves the positioner at `origin_mm` along the unit vector `direction`; shape (3, ...)."""
+
+    origin_mm: np.ndarray
+    direction: np.ndarray
+
+
+def _harmonic(values: Values, axis: str, angle_deg: Number, period_deg: float, m: ModuleType) -> Number:
     """Transmission error at an angle, degrees (DESIGN 3.1)."""
-    total = 0.0
-    for order in (1, 2):
+    total: Number = 0.0
+    for order in HARMONIC_ORDERS:
         phase = 2 * math.pi * order * angle_deg / period_deg
         total = total + values[f"harmonic_deg.{axis}.{order}.cos"] * m.cos(phase)
         total = total + values[f"harmonic_deg.{axis}.{order}.sin"] * m.sin(phase)
     return total
 
 
-def output_deg(values: Mapping[str, object], axis: str, steps, side: float, period_deg: float | None, m=np):
+def output_deg(
+    values: Values, axis: str, steps: Number, side: Number, period_deg: float | None, m: ModuleType = np
+) -> Number:
     """Mirror angle of an axis after homing: q = k n, play taken up on the approach side (DESIGN 3.1).
 
     Args:
         values: parameters by name; floats, or arrays of one shape.
         axis: pan or tilt.
         steps: absolute counter.
-        side: +1 reached left or up, -1 right or down, 0 somewhere in the play.
+        side: +1 reached left or up, -1 right or down, any number between for a place in the play.
         period_deg: period of the transmission error, None without one.
         m: `math` for floats, `numpy` for arrays.
     """
@@ -44,8 +69,19 @@ def output_deg(values: Mapping[str, object], axis: str, steps, side: float, peri
     return output if axis == "pan" else output + values["tilt_zero_deg"]
 
 
-def beam_components(values: Mapping[str, object], pan_deg, tilt_deg, m=np) -> tuple[tuple, tuple]:
-    """Origin (x, y, z) and direction (x, y, z) of the beam in frame T for mirror angles (DESIGN 3.2 and 2).
+class Components(NamedTuple):
+    """A beam in components."""
+
+    origin: Vector
+    direction: Vector
+
+    def at(self, range_mm: Number) -> np.ndarray:
+        """Points at ranges along it, first axis x, y, z."""
+        return np.array([o + range_mm * d for o, d in zip(self.origin, self.direction, strict=True)])
+
+
+def beam_components(values: Values, pan_deg: Number, tilt_deg: Number, m: ModuleType = np) -> Components:
+    """Origin and unit direction of the beam in frame T for mirror angles (DESIGN 3.2 and 2).
 
     The laser is reflected in the turned pan stage and everything turned back at the end. Arguments as in
     `output_deg`.
@@ -79,10 +115,12 @@ def beam_components(values: Mapping[str, object], pan_deg, tilt_deg, m=np) -> tu
     turn = psi + (values["pan_zero_emission_deg"] - 90.0) * TO_RAD
     sin_t, cos_t = sin(turn), cos(turn)
     origin = cos_t * x - sin_t * y, sin_t * x + cos_t * y + 0.5 * values["baseline_mm"], z
-    return origin, (cos_t * u - sin_t * v, sin_t * u + cos_t * v, w)
+    return Components(origin, (cos_t * u - sin_t * v, sin_t * u + cos_t * v, w))
 
 
-def range_components(origin: tuple, direction: tuple, baseline_mm, aperture_deg, azimuth: bool, m=np):
+def range_components(
+    origin: Vector, direction: Vector, baseline_mm: Number, aperture_deg: Number, azimuth: bool, m: ModuleType = np
+) -> Number:
     """Range along the beam at which the aperture sees it under angle B, mm (derivation: `coordinates.meeting`).
 
     Not a number where the beam misses the cone or half-plane of B; zero, negative or minus infinite where only its
@@ -102,6 +140,7 @@ def range_components(origin: tuple, direction: tuple, baseline_mm, aperture_deg,
         return (reach if ahead >= 0 else math.nan) if m is math else np.where(ahead >= 0, reach, np.nan)
     mx, my, mz = y * w - z * v, z * u - x * w, x * v - y * u
     inside = (mx * mx + mz * mz) * sin_b * sin_b - my * my * cos_b * cos_b
+    root: Number
     if m is math:
         if inside < 0:
             return math.nan
@@ -121,9 +160,16 @@ def range_components(origin: tuple, direction: tuple, baseline_mm, aperture_deg,
     return (reach if faces else -math.inf) if m is math else np.where(faces | np.isnan(reach), reach, -np.inf)
 
 
-def aperture_angle_deg(point: tuple, baseline_mm, azimuth: bool, m=np):
+def aperture_angle_deg(point: Vector, baseline_mm: Number, azimuth: bool, m: ModuleType = np) -> Number:
     """The angle B of a point (x, y, z) of frame T at the aperture, degrees, without the aperture's zero."""
     x, y, z = point
     lateral = x if azimuth else m.hypot(x, z)
     arc_tangent = math.atan2 if m is math else np.arctan2
     return arc_tangent(lateral, y + 0.5 * baseline_mm) / TO_RAD
+
+
+def direction_of(azimuth_deg: Number, elevation_deg: Number) -> np.ndarray:
+    """Unit vectors of directions in frame T, first axis x, y, z; azimuth atan2(y, x), elevation asin(z)."""
+    azimuth, elevation = np.radians(azimuth_deg), np.radians(elevation_deg)
+    level = np.cos(elevation)
+    return np.stack([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)])

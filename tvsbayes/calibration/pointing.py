@@ -1,17 +1,35 @@
-"""What a robot loads: counters to rays and points, points to counters."""
+"""What a robot loads: estimates and covariance that carry counters to rays and points, and points to counters.
+
+No JAX, no fit, less than a millisecond a call. Frame T: origin mid-baseline, x depth, y along the baseline towards the
+positioner at +a/2, z up. mm; degrees where a name says `_deg`; counters in steps, absolute, after homing.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from functools import cached_property
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property, partial
+from types import ModuleType
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from tvsbayes.calibration.optics import TO_RAD, aperture_angle_deg, beam_components, output_deg, range_components
+from tvsbayes.calibration.aiming import Direction, Drive, Point, Steps, mirror_angles
+from tvsbayes.calibration.optics import (
+    TO_RAD,
+    Components,
+    Number,
+    Ray,
+    Values,
+    aperture_angle_deg,
+    beam_components,
+    direction_of,
+    output_deg,
+    range_components,
+)
 from tvsbayes.errors import InputError
-from tvsbayes.instrument.axes import APPROACH_SIGN, AXES, SIDES, bad_approach, sides_of
+from tvsbayes.instrument.axes import AXES, DIRECTIONS, SIDES, sides_of
 from tvsbayes.instrument.parameters import HARMONIC_PRIORS
 from tvsbayes.statistics.intervals import NORMAL_95
 
@@ -24,25 +42,25 @@ INPUT_NAMES: tuple[str, ...] = (
     *("baseline_mm", "pan_zero_emission_deg", "aperture_zero_deg"),
 )
 """What a coordinate depends on. Contrasts do not enter: after homing a counter stands for its mean ratio."""
-NOISE_NAMES = (*(f"stop_sd_deg.{d}" for d in ("left", "right", "up", "down")), "aperture_sd_deg")
-AIM_STEPS, AIM_RAD = 40, 1e-11
+NOISE_NAMES = (*(f"stop_sd_deg.{d}" for d in DIRECTIONS), "aperture_sd_deg")
 DIVERGING_SHARE = 1e-3
 """Share of draws without a point above which a point is refused (DESIGN 5)."""
 DIVERGING_SDS = 3.0902323061678132
 """Range over its standard deviation below which more than `DIVERGING_SHARE` of a normal 1/range is beyond infinity."""
-NOISES = 5
-"""Unit noises of a look: stop error and place in the play (pan, tilt), aperture."""
+UNIT_NOISES: dict[str, float] = {
+    **{f"stop error {axis}": 1.0 for axis in AXES},
+    **{f"place in the play, {axis}": 1 / 12 for axis in AXES},
+    "aperture noise": 1.0,
+}
+"""Noises of a look in units of their own scale, with their variances: a place in the play is uniform."""
+NOISES = len(UNIT_NOISES)
 COMPLEX_STEP = 1e-30
 """Imaginary step of derivatives: nothing is subtracted, so it may be as small as it likes (Squire and Trapp, SIAM
 Review 40 (1998) 110)."""
-
-
-@dataclass(frozen=True)
-class Ray:
-    """A beam in frame T: it leaves the positioner at `origin_mm` (3,) along the unit vector `direction` (3,)."""
-
-    origin_mm: np.ndarray
-    direction: np.ndarray
+type Counters = tuple[Number, Number]
+"""Absolute counters (pan, tilt), steps."""
+type Sides = tuple[float, float]
+"""Approach sides (pan, tilt): +1 left or up, -1 right or down, 0 unknown."""
 
 
 @dataclass(frozen=True)
@@ -55,44 +73,11 @@ class Located:
 
 
 @dataclass(frozen=True)
-class Steps:
-    """Counters that send the beam where it is wanted.
+class _Moved:
+    """Parameters by name and unit noises of a look, each moved by an imaginary step in one of (inputs + NOISES)."""
 
-    Attributes:
-        pan_steps, tilt_steps: absolute counters.
-        approach: last move of each axis, (left or right, up or down).
-        via_pan_steps, via_tilt_steps: go there first: the move on from there takes up all play with a probability of
-            `CLEARED_PROBABILITY`.
-        ray: the beam at these counters.
-        xyz_mm: the point on it that is nearest to the wanted one, or None for a wanted direction.
-        aperture_deg: what the aperture should read there, or None.
-        rounding_mm, rounding_deg: distance from the wanted point or direction that whole steps leave.
-        u95_mm, u95_deg: 95 % half widths of the beam's position at the point (3,), or of its azimuth and elevation.
-    """
-
-    pan_steps: int
-    tilt_steps: int
-    approach: tuple[str, str]
-    via_pan_steps: int
-    via_tilt_steps: int
-    ray: Ray
-    xyz_mm: np.ndarray | None
-    aperture_deg: float | None
-    rounding_mm: float | None
-    rounding_deg: float | None
-    u95_mm: np.ndarray | None
-    u95_deg: np.ndarray | None
-
-    def as_json(self) -> dict[str, object]:
-        """The document of `steps-for`."""
-
-        def plain(value):
-            return value.tolist() if isinstance(value, np.ndarray) else value
-
-        document = {key: plain(value) for key, value in vars(self).items() if key not in ("ray", "approach")}
-        document["approach"] = dict(zip(AXES, self.approach, strict=True))
-        document["ray"] = {key: plain(value) for key, value in vars(self.ray).items()}
-        return document
+    values: Values
+    noise: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -135,18 +120,18 @@ class Calibration:
         return dict(zip(INPUT_NAMES, self.mean.tolist(), strict=True))
 
     @cached_property
-    def _moved(self) -> tuple[dict[str, np.ndarray | float], np.ndarray]:
-        """Parameters by name and unit noises of a look, each moved by an imaginary step in one of (inputs + NOISES)."""
+    def _moved(self) -> _Moved:
         count = len(INPUT_NAMES)
         sets = np.concatenate([self.mean, np.zeros(NOISES)]) + 1j * COMPLEX_STEP * np.eye(count + NOISES)
-        values = dict(zip(INPUT_NAMES, sets[:, :count].T, strict=True))
-        return values | {name: math.sqrt(self.noise_variance[name]) for name in NOISE_NAMES}, sets[:, count:].T
+        values: dict[str, Number] = dict(zip(INPUT_NAMES, sets[:, :count].T, strict=True))
+        values |= {name: math.sqrt(self.noise_variance[name]) for name in NOISE_NAMES}
+        return _Moved(values, sets[:, count:].T)
 
     @cached_property
     def covariance_with_noise(self) -> np.ndarray:
         """Covariance of `INPUT_NAMES` and the unit noises of a look, shape (inputs + NOISES, inputs + NOISES)."""
         count = len(INPUT_NAMES)
-        covariance = np.diag([*np.zeros(count), 1, 1, 1 / 12, 1 / 12, 1])
+        covariance = np.diag([*np.zeros(count), *UNIT_NOISES.values()])
         covariance[:count, :count] = self.covariance
         return covariance
 
@@ -154,12 +139,13 @@ class Calibration:
         """Whether the campaign reached these counters."""
         return all(low <= n <= high for n, (low, high) in zip((pan_steps, tilt_steps), self.range_steps, strict=True))
 
-    def angles(self, values: Mapping[str, object], steps: tuple, sides: tuple, m=np) -> tuple:
-        """Mirror angles (pan, tilt) of parameters by name at counters and approach sides; `m` as in `output_deg`."""
-        return tuple(
-            output_deg(values, axis, n, side, self.period_deg.get(axis), m)
+    def beam_at(self, steps: Counters, sides: Sides, m: ModuleType = np) -> Components:
+        """The beam of the best estimates at counters and approach sides; `m` as in `output_deg`."""
+        pan_deg, tilt_deg = (
+            output_deg(self.estimates, axis, n, side, self.period_deg.get(axis), m)
             for axis, n, side in zip(AXES, steps, sides, strict=True)
         )
+        return beam_components(self.estimates, pan_deg, tilt_deg, m)
 
     def ray(self, pan_steps: float, tilt_steps: float, approach: tuple[str, str] = ("left", "up")) -> Ray:
         """The beam at counters that were reached from a side.
@@ -172,9 +158,8 @@ class Calibration:
         Raises:
             InputError: an approach that does not exist.
         """
-        angles = self.angles(self.estimates, (pan_steps, tilt_steps), sides_of(approach), math)
-        origin, direction = beam_components(self.estimates, *angles, math)
-        return Ray(np.array(origin), np.array(direction))
+        beam = self.beam_at((pan_steps, tilt_steps), sides_of(approach), math)
+        return Ray(np.array(beam.origin), np.array(beam.direction))
 
     def locate(
         self,
@@ -202,70 +187,61 @@ class Calibration:
         steps = (float(pan_steps), float(tilt_steps))
         if not all(map(math.isfinite, (*steps, aperture_deg))):
             raise self.refusal(pan_steps, tilt_steps, aperture_deg, sides)
-        ray, baseline_mm = self.ray(*steps, approach), self.estimates["baseline_mm"]
-        beam = tuple(ray.origin_mm.tolist()), tuple(ray.direction.tolist())
+        beam = self.beam_at(steps, sides, math)
         true_deg = aperture_deg - self.estimates["aperture_zero_deg"]
-        reach = range_components(*beam, baseline_mm, true_deg, self.azimuth, math)
+        reach = range_components(*beam, self.estimates["baseline_mm"], true_deg, self.azimuth, math)
         if not 0 < reach < math.inf:
             raise self.refusal(pan_steps, tilt_steps, aperture_deg, sides)
-        estimate = ray.origin_mm + reach * ray.direction
-
+        direction = np.array(beam.direction)
         jacobian = self.derivatives(*steps, aperture_deg, approach)
         covariance = jacobian @ self.covariance_with_noise @ jacobian.T
         # The inverse of the range is nearly normal: its tail beyond zero is the share of draws that diverge.
-        least = DIVERGING_SDS * math.sqrt(max(ray.direction @ covariance @ ray.direction, 0.0))
+        least = DIVERGING_SDS * math.sqrt(max(direction @ covariance @ direction, 0.0))
         if not (np.all(np.isfinite(covariance)) and reach > least):
             raise self.refusal(pan_steps, tilt_steps, aperture_deg, sides)
-        return Located(estimate, covariance, NORMAL_95 * np.sqrt(np.diag(covariance)))
+        return Located(np.array(beam.origin) + reach * direction, covariance, NORMAL_95 * np.sqrt(np.diag(covariance)))
 
-    def refusal(
-        self, pan_steps: float, tilt_steps: float, aperture_deg: float, sides: tuple[float, float]
-    ) -> InputError:
+    def refusal(self, pan_steps: float, tilt_steps: float, aperture_deg: float, sides: Sides) -> InputError:
         """Why beam and line of sight of a look have no point in common, or none that can be told: by name.
 
         "grazing" where the estimated beam passes the aperture's cone without touching it, else "diverging".
         """
         where = f"pan {pan_steps:g}, tilt {tilt_steps:g} steps, aperture {aperture_deg:g} deg"
-        given = {"column": "aperture_deg", "found": f"{aperture_deg:g}"}
+        refused = partial(InputError, column="aperture_deg", found=f"{aperture_deg:g}")
         if all(map(math.isfinite, (pan_steps, tilt_steps, aperture_deg))) and not self.azimuth:
-            values = self.estimates
-            origin, direction = beam_components(
-                values, *self.angles(values, (pan_steps, tilt_steps), sides, math), math
-            )
-            true_deg = aperture_deg - values["aperture_zero_deg"]
-            if math.isnan(range_components(origin, direction, values["baseline_mm"], true_deg, False, math)):
-                return InputError(
+            beam = self.beam_at((pan_steps, tilt_steps), sides, math)
+            true_deg = aperture_deg - self.estimates["aperture_zero_deg"]
+            if math.isnan(range_components(*beam, self.estimates["baseline_mm"], true_deg, False, math)):
+                return refused(
                     "grazing",
                     f"{where}: the beam passes the cone of all points seen under this angle without touching it",
-                    **given,
                     allowed="readings away from 0 and 180 deg, of a beam in the plane of baseline and spot",
                     remedy="check reading and counters; the beam runs past the baseline, not towards a spot",
                 )
-        return InputError(
+        return refused(
             "diverging",
             f"{where}: beam and line of sight diverge",
-            **given,
             allowed="readings B with B + C clearly below 180 deg, C the beam's own angle to the baseline",
             remedy="check reading and counters; such a target is too far, or behind the scanner",
         )
 
-    def noisy_angles(self, values: Mapping[str, object], noise: Sequence, steps: tuple, sides: tuple) -> tuple:
-        """Mirror angles (pan, tilt) with stop errors, and somewhere in the play where the side is unknown.
+    def noisy_beam(self, values: Values, noise: np.ndarray, steps: Counters, sides: Sides) -> Components:
+        """The beam with stop errors, and from somewhere in the play where the side is unknown.
 
         Args:
             values: by name, of `INPUT_NAMES` and `NOISE_NAMES`; arrays of one shape.
-            noise: `NOISES` unit noises, arrays of that shape (`Drawn`).
-            steps: counters (pan, tilt).
-            sides: approach sides (pan, tilt): +1 left or up, -1 right or down, 0 unknown.
+            noise: `NOISES` unit noises, first axis, arrays of that shape (`Drawn`).
+            steps: counters.
+            sides: approach sides.
         """
-        found = []
+        angles = []
         for k, (axis, side) in enumerate(zip(AXES, sides, strict=True)):
             low, high = (values[f"stop_sd_deg.{name}"] for name in SIDES[axis])
             stop_sd = high if side > 0 else low if side < 0 else np.sqrt(0.5 * (low**2 + high**2))
             # Where the side is unknown, the play is taken up by any part of it.
             place = side if side else -2 * noise[2 + k]
-            found.append(output_deg(values, axis, steps[k], place, self.period_deg.get(axis)) + stop_sd * noise[k])
-        return tuple(found)
+            angles.append(output_deg(values, axis, steps[k], place, self.period_deg.get(axis)) + stop_sd * noise[k])
+        return beam_components(values, angles[0], angles[1])
 
     def derivatives(
         self, pan_steps: float, tilt_steps: float, aperture_deg: float, approach: tuple[str, str] = ("left", "up")
@@ -287,18 +263,17 @@ class Calibration:
             InputError: an approach that does not exist, or beam and line of sight do not meet.
         """
         sides = sides_of(approach)
-        values, noise = self._moved
-        angles = self.noisy_angles(values, noise, (pan_steps, tilt_steps), sides)
-        origin, direction = beam_components(values, *angles)
+        values, noise = self._moved.values, self._moved.noise
+        beam = self._moved_beam((pan_steps, tilt_steps), sides)
         true_deg = aperture_deg - values["aperture_zero_deg"] - values["aperture_sd_deg"] * noise[4]
-        reach = range_components(origin, direction, values["baseline_mm"], true_deg, self.azimuth)
-        if not np.all(reach.real > 0):
+        reach = range_components(*beam, values["baseline_mm"], true_deg, self.azimuth)
+        if not np.all(np.asarray(reach).real > 0):
             raise self.refusal(pan_steps, tilt_steps, aperture_deg, sides)
-        return np.array([o + reach * d for o, d in zip(origin, direction, strict=True)]).imag / COMPLEX_STEP
+        return beam.at(reach).imag / COMPLEX_STEP
 
     def steps_for(
         self,
-        xyz_mm: tuple[float, float, float] | np.ndarray | None = None,
+        xyz_mm: ArrayLike | None = None,
         *,
         azimuth_deg: float | None = None,
         elevation_deg: float | None = None,
@@ -317,114 +292,64 @@ class Calibration:
         Raises:
             InputError: neither or both targets, no mirror angle reaches it, or it lies outside the limits.
         """
-        angles_given = (azimuth_deg is not None, elevation_deg is not None)
-        if angles_given != ((False, False) if xyz_mm is not None else (True, True)):
-            remedy = "give a point, or azimuth and elevation"
-            raise InputError("no-target", "steps_for needs one target, a point or a direction", remedy=remedy)
-        target = None if xyz_mm is None else np.asarray(xyz_mm, dtype=float)
-        angles = self._aim(target, azimuth_deg, elevation_deg)
-        chosen, counters, via = [], [], []
-        for axis, angle_deg in zip(AXES, angles, strict=True):
-            wanted = None if approach is None else approach[AXES.index(axis)]
-            side, steps, first = self._counter(axis, angle_deg, wanted, (limits or {}).get(axis))
-            chosen.append(side)
-            counters.append(steps)
-            via.append(first)
-        ray = self.ray(*counters, approach=(chosen[0], chosen[1]))
-        shared = (*counters, (chosen[0], chosen[1]), *via, ray)
-        sides = sides_of((chosen[0], chosen[1]))
+        target = self._target(xyz_mm, azimuth_deg, elevation_deg)
+        arrivals = []
+        for index, (axis, angle_deg) in enumerate(zip(AXES, mirror_angles(self.estimates, target), strict=True)):
+            drive = Drive(axis, self.estimates, self.period_deg.get(axis), self.overshoot_steps[axis])
+            wanted = None if approach is None else approach[index]
+            arrivals.append(drive.arrival(angle_deg, wanted, (limits or {}).get(axis)))
+        pan, tilt = arrivals
+        reached = pan.side, tilt.side
+        ray = self.ray(pan.steps, tilt.steps, reached)
+        found = Steps(pan.steps, tilt.steps, reached, pan.via_steps, tilt.via_steps, ray)
+        counters, sides = (float(pan.steps), float(tilt.steps)), sides_of(reached)
         o, d = ray.origin_mm, ray.direction
-        if target is None:
-            wanted_direction = direction_of(azimuth_deg, elevation_deg)
-            rounding = math.degrees(math.atan2(np.linalg.norm(np.cross(d, wanted_direction)), d @ wanted_direction))
-            return Steps(*shared, None, None, None, rounding, None, self._ray_u95(counters, sides, None))
-        reach = float((target - o) @ d)
+        if isinstance(target, Direction):
+            goal = direction_of(target.azimuth_deg, target.elevation_deg)
+            rounding = math.degrees(math.atan2(np.linalg.norm(np.cross(d, goal)), d @ goal))
+            return replace(found, rounding_deg=rounding, u95_deg=self.beam_u95_deg(counters, sides))
+        reach = float((target.xyz_mm - o) @ d)
         point = o + reach * d
-        aperture = self.reading(point)
-        u95 = self._ray_u95(counters, sides, reach)
-        return Steps(*shared, point, aperture, float(np.linalg.norm(target - point)), None, u95, None)
+        return replace(
+            found,
+            xyz_mm=point,
+            aperture_deg=self.reading(point),
+            rounding_mm=float(np.linalg.norm(target.xyz_mm - point)),
+            u95_mm=self.beam_u95_mm(counters, sides, reach),
+        )
+
+    @staticmethod
+    def _target(xyz_mm: ArrayLike | None, azimuth_deg: float | None, elevation_deg: float | None) -> Point | Direction:
+        """The one target of `steps_for`."""
+        if xyz_mm is not None and azimuth_deg is None and elevation_deg is None:
+            return Point(np.asarray(xyz_mm, dtype=float))
+        if xyz_mm is None and azimuth_deg is not None and elevation_deg is not None:
+            return Direction(azimuth_deg, elevation_deg)
+        remedy = "give a point, or azimuth and elevation"
+        raise InputError("no-target", "steps_for needs one target, a point or a direction", remedy=remedy)
 
     def reading(self, point: np.ndarray) -> float:
         """What the aperture reads for a point of frame T, degrees."""
-        angle = aperture_angle_deg(tuple(point), self.estimates["baseline_mm"], self.azimuth, math)
-        return angle + self.estimates["aperture_zero_deg"]
+        x, y, z = point.tolist()
+        angle = aperture_angle_deg((x, y, z), self.estimates["baseline_mm"], self.azimuth, math)
+        return float(angle) + self.estimates["aperture_zero_deg"]
 
-    def _aim(self, target: np.ndarray | None, azimuth_deg, elevation_deg) -> tuple[float, float]:
-        """Mirror angles whose beam passes through a point or along a direction, degrees.
+    def beam_u95_deg(self, steps: Counters, sides: Sides) -> np.ndarray:
+        """95 % half widths of the beam's azimuth and elevation (2,), degrees."""
+        _, (u, v, w) = self._moved_beam(steps, sides)
+        # Of the azimuth atan2(y, x), whose derivatives those of atan(y / x) are.
+        return self._u95(np.array([np.arctan(v / u), np.arcsin(w)]) / TO_RAD)
 
-        A mirror angle moves the beam by nearly as much, so that plain correction converges.
-        """
-        pan_deg = tilt_deg = 0.0
-        finite = np.all(np.isfinite((azimuth_deg, elevation_deg) if target is None else target))
-        # Behind the baseline there is no triangle for the aperture to close.
-        ahead = finite and (abs(azimuth_deg) < 90 if target is None else target[0] > 0)
-        for _ in range(AIM_STEPS if ahead else 0):
-            o, d = beam_components(self.estimates, pan_deg, tilt_deg, math)
-            if target is None:
-                goal = (azimuth_deg, elevation_deg)
-            else:
-                x, y, z = (float(t) - c for t, c in zip(target, o, strict=True))
-                goal = (math.degrees(math.atan2(y, x)), math.degrees(math.atan2(z, math.hypot(x, y))))
-            azimuth = math.remainder(goal[0] - math.degrees(math.atan2(d[1], d[0])), 360.0)
-            elevation = goal[1] - math.degrees(math.atan2(d[2], math.hypot(d[0], d[1])))
-            if max(abs(azimuth), abs(elevation)) < math.degrees(AIM_RAD):
-                return pan_deg, tilt_deg
-            pan_deg, tilt_deg = pan_deg + azimuth, tilt_deg + elevation
-            if abs(tilt_deg) > 90:
-                break
-        raise InputError(
-            "out-of-reach",
-            "no mirror angles send the beam there",
-            allowed="points in front of the scanner and farther from it than the mirrors, elevations below 80 deg",
-            remedy="check the target's frame: x depth, y along the baseline towards the positioner, z up, mm",
-        )
+    def beam_u95_mm(self, steps: Counters, sides: Sides, range_mm: float) -> np.ndarray:
+        """95 % half widths of the beam's position at a range (3,), mm."""
+        return self._u95(self._moved_beam(steps, sides).at(range_mm))
 
-    def _counter(self, axis: str, angle_deg: float, side: str | None, limits) -> tuple[str, int, int]:
-        """Side, counter and the counter to go to first; the other side where limits forbid the preferred one."""
-        negative, positive = SIDES[axis]
-        low, high = (-math.inf, math.inf) if limits is None else limits
-        overshoot = self.overshoot_steps[axis]
-        tried = (positive, negative) if side is None else (side,)
-        for name in tried:
-            if name not in SIDES[axis]:
-                raise bad_approach(axis, name, SIDES[axis][::-1])
-            sign = APPROACH_SIGN[name]
-            steps = self._steps_at(axis, angle_deg, sign)
-            ratio_sign = 1 if self.estimates[f"degrees_per_step.{axis}"] > 0 else -1
-            first = steps - sign * ratio_sign * overshoot
-            if low <= steps <= high and low <= first <= high:
-                return name, steps, first
-        raise InputError(
-            "outside-limits",
-            f"{axis}: the target needs counter {steps}, approached from {first}",
-            column=axis,
-            found=f"{steps} and {first}",
-            allowed=f"{low:g} to {high:g}",
-            remedy="choose a target inside the limits, or widen them in [positioner] if the machine allows",
-        )
+    def _moved_beam(self, steps: Counters, sides: Sides) -> Components:
+        return self.noisy_beam(self._moved.values, self._moved.noise, steps, sides)
 
-    def _steps_at(self, axis: str, angle_deg: float, sign: int) -> int:
-        """The counter whose mirror angle is nearest to the wanted one."""
-        ratio = self.estimates[f"degrees_per_step.{axis}"]
-        steps = 0.0
-        for _ in range(AIM_STEPS):
-            at = output_deg(self.estimates, axis, steps, sign, self.period_deg.get(axis), math)
-            change = (angle_deg - at) / ratio
-            steps += change
-            if abs(change) < 1e-9:
-                break
-        return round(steps)
-
-    def _ray_u95(self, steps, sides, reach: float | None) -> np.ndarray:
-        """95 % half widths of the beam at a range (3,), mm, or of its azimuth and elevation (2,), degrees."""
-        values, noise = self._moved
-        origin, direction = beam_components(values, *self.noisy_angles(values, noise, tuple(map(float, steps)), sides))
-        if reach is not None:
-            found = np.array([o + reach * d for o, d in zip(origin, direction, strict=True)])
-        else:
-            # Of the azimuth atan2(y, x), whose derivatives those of atan(y / x) are.
-            found = np.array([np.arctan(direction[1] / direction[0]), np.arcsin(direction[2])]) / TO_RAD
-        jacobian = found.imag / COMPLEX_STEP
+    def _u95(self, moved: np.ndarray) -> np.ndarray:
+        """Half widths (q,) of quantities (q, inputs + NOISES) of the moved parameters."""
+        jacobian = moved.imag / COMPLEX_STEP
         return NORMAL_95 * np.sqrt(np.diag(jacobian @ self.covariance_with_noise @ jacobian.T))
 
 
@@ -462,10 +387,3 @@ def drawn(calibration: Calibration, draws: int, seed: int) -> Drawn:
     normal = generator.standard_normal((draws, NOISES))
     noise = np.column_stack([normal[:, :2], generator.uniform(-0.5, 0.5, (draws, 2)), normal[:, 4]])
     return Drawn(columns, noise)
-
-
-def direction_of(azimuth_deg: float | np.ndarray, elevation_deg: float | np.ndarray) -> np.ndarray:
-    """Unit vectors of directions in frame T, first axis x, y, z."""
-    azimuth, elevation = np.radians(azimuth_deg), np.radians(elevation_deg)
-    level = np.cos(elevation)
-    return np.stack([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)])

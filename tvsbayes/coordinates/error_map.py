@@ -1,4 +1,9 @@
-"""Error over the work space, nominal, classic and joint."""
+"""Errors over the work space of the nominal, the classic and the joint calibration, on the rigs that the data allow.
+
+Frame T, mm; counters in steps. The beam of each drawn rig is followed to a range, the aperture reads it, and every
+estimator is asked where the spot is. Nominal and classic users are given what is fair: a baseline shortened by the
+mirror offset, its middle moved by half of that, and readings in the convention that their equations expect. NumPy.
+"""
 
 from __future__ import annotations
 
@@ -7,16 +12,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tvsbayes.calibration.optics import aperture_angle_deg, beam_components, range_components
-from tvsbayes.calibration.pointing import (
-    DIVERGING_SHARE,
-    INPUT_NAMES,
-    NOISE_NAMES,
-    Calibration,
+from tvsbayes.calibration.optics import (
+    Components,
     Ray,
+    aperture_angle_deg,
     direction_of,
-    drawn,
+    range_components,
 )
+from tvsbayes.calibration.pointing import DIVERGING_SHARE, INPUT_NAMES, NOISE_NAMES, Calibration, Drawn, Sides, drawn
 from tvsbayes.estimators.four_point import ClassicResult
 from tvsbayes.instrument.parameters import RIG_PRIORS, Prior
 
@@ -96,6 +99,67 @@ class ErrorMap:
     distance_mm: Mapping[str, np.ndarray]
 
 
+@dataclass(frozen=True)
+class _Truth:
+    """What happened on every rig: points reached (3, draws, points), mm, and what the aperture read there, deg."""
+
+    xyz_mm: np.ndarray
+    aperture_deg: np.ndarray
+
+
+def _truth(
+    calibration: Calibration, pan: np.ndarray, tilt: np.ndarray, range_mm: np.ndarray, approach: Sides, rigs: Drawn
+) -> _Truth:
+    values = dict(zip((*INPUT_NAMES, *NOISE_NAMES), rigs.inputs.T[..., None], strict=True))
+    noise = rigs.noise.T[..., None]
+    points = calibration.noisy_beam(values, noise, (pan, tilt), approach).at(range_mm)
+    reading = aperture_angle_deg((points[0], points[1], points[2]), values["baseline_mm"], calibration.azimuth)
+    return _Truth(points, reading + values["aperture_zero_deg"] + values["aperture_sd_deg"] * noise[4])
+
+
+@dataclass(frozen=True)
+class _Belief:
+    """What an estimator takes for true: its beams (points,), twice the aperture's distance from y = 0, its zero."""
+
+    beam: Components
+    baseline_mm: float
+    aperture_zero_deg: float
+
+
+def _simple_belief(simple: SimpleCalibration, pan: np.ndarray, tilt: np.ndarray) -> _Belief:
+    ray = simple_rays(simple, np.stack([pan, tilt], axis=1))
+    (x, y, z), (u, v, w) = ray.origin_mm, ray.direction
+    # `range_components` puts the aperture at half the distance given; a simple user's stands at origin - baseline.
+    aperture_mm = 2 * (simple.baseline_mm - simple.origin_y_mm)
+    return _Belief(Components((x, y, z), (u, v, w)), aperture_mm, simple.aperture_zero_deg)
+
+
+@dataclass(frozen=True)
+class _Errors:
+    """Errors of one estimator over the points; fields as in `ErrorMap`, `usable` as its `valid`."""
+
+    rms_mm: np.ndarray
+    bias_mm: np.ndarray
+    distance_mm: np.ndarray
+    usable: np.ndarray
+
+
+def _errors(belief: _Belief, truth: _Truth, azimuth: bool) -> _Errors:
+    reading = truth.aperture_deg - belief.aperture_zero_deg
+    reach = range_components(*belief.beam, belief.baseline_mm, reading, azimuth)
+    meets = np.isfinite(reach) & (reach > 0)
+    error = belief.beam.at(np.where(meets, reach, 0.0)) - truth.xyz_mm
+    kept, count = np.where(meets, error, 0.0), np.maximum(meets.sum(axis=0), 1)
+    usable = (~meets).mean(axis=0) <= DIVERGING_SHARE
+    square = np.sum(kept**2, axis=(0, 1)) / count
+    return _Errors(
+        rms_mm=np.where(usable, np.sqrt(square), np.nan),
+        bias_mm=np.where(usable, kept.sum(axis=1) / count, np.nan).T,
+        distance_mm=np.where(meets, np.linalg.norm(error, axis=0), np.inf),
+        usable=usable,
+    )
+
+
 def error_map(
     calibration: Calibration,
     pan_steps: Sequence[float] | np.ndarray,
@@ -103,7 +167,7 @@ def error_map(
     range_mm: Sequence[float] | np.ndarray,
     *,
     simple: Mapping[str, SimpleCalibration],
-    approach: tuple[float, float] = (1.0, 1.0),
+    approach: Sides = (1.0, 1.0),
     draws: int = 500,
     seed: int = 0,
 ) -> ErrorMap:
@@ -124,42 +188,22 @@ def error_map(
     """
     axes = [np.asarray(x, dtype=float) for x in (pan_steps, tilt_steps, range_mm)]
     pan, tilt, ranges = (x.ravel() for x in np.meshgrid(*axes, indexing="ij"))
-    steps = np.stack([pan, tilt], axis=1)
-    rigs = drawn(calibration, draws, seed)
-    # Axes: draws, points.
-    values = dict(zip((*INPUT_NAMES, *NOISE_NAMES), rigs.inputs.T[..., None], strict=True))
-    noise = rigs.noise.T[..., None]
-    origin, direction = beam_components(values, *calibration.noisy_angles(values, noise, (pan, tilt), approach))
-    points = np.array([o + ranges * d for o, d in zip(origin, direction, strict=True)])
-    reading = aperture_angle_deg(tuple(points), values["baseline_mm"], calibration.azimuth)
-    reading = reading + values["aperture_zero_deg"] + values["aperture_sd_deg"] * noise[4]
+    truth = _truth(calibration, pan, tilt, ranges, approach, drawn(calibration, draws, seed))
     best = calibration.estimates
-    beam = beam_components(best, *calibration.angles(best, (pan, tilt), approach))
-    looks = {"joint": (*beam, best["baseline_mm"], best["aperture_zero_deg"])}
-    for name, one in simple.items():
-        ray = simple_rays(one, steps)
-        # `range_components` puts the aperture at half the distance it is given; a simple user's stands at origin -
-        # baseline.
-        aperture = 2 * (one.baseline_mm - one.origin_y_mm), one.aperture_zero_deg
-        looks[name] = tuple(ray.origin_mm), tuple(ray.direction), *aperture
-    shape = tuple(len(x) for x in axes)
-    rms, bias, distance, valid = {}, {}, {}, np.ones(shape, dtype=bool)
-    for name, (origin, direction, baseline_mm, zero_deg) in looks.items():
-        reach = range_components(origin, direction, baseline_mm, reading - zero_deg, calibration.azimuth)
-        meets = np.isfinite(reach) & (reach > 0)
-        reach = np.where(meets, reach, 0.0)
-        error = np.array([o + reach * d for o, d in zip(origin, direction, strict=True)]) - points
-        share = (~meets).mean(axis=0)
-        kept = np.where(meets, error, 0.0)
-        count = np.maximum(meets.sum(axis=0), 1)
-        usable = share <= DIVERGING_SHARE
-        square = np.sum(kept**2, axis=(0, 1)) / count
-        rms[name] = np.where(usable, np.sqrt(square), np.nan).reshape(shape)
-        bias[name] = np.where(usable, kept.sum(axis=1) / count, np.nan).T.reshape(*shape, 3)
-        valid &= usable.reshape(shape)
-        length = np.where(meets, np.linalg.norm(error, axis=0), np.inf)
-        distance[name] = length.reshape(-1, *shape)
+    beam = calibration.beam_at((pan, tilt), approach)
+    beliefs = {"joint": _Belief(beam, best["baseline_mm"], best["aperture_zero_deg"])}
+    beliefs |= {name: _simple_belief(one, pan, tilt) for name, one in simple.items()}
+    errors = {name: _errors(belief, truth, calibration.azimuth) for name, belief in beliefs.items()}
     (pan_low, pan_high), (tilt_low, tilt_high) = calibration.range_steps
-    within = (pan >= pan_low) & (pan <= pan_high) & (tilt >= tilt_low) & (tilt <= tilt_high)
-    inside = within.reshape(shape)
-    return ErrorMap(*axes, rms_mm=rms, bias_mm=bias, inside=inside, valid=valid, distance_mm=distance)
+    inside = (pan >= pan_low) & (pan <= pan_high) & (tilt >= tilt_low) & (tilt <= tilt_high)
+    shape = tuple(len(x) for x in axes)
+    return ErrorMap(
+        pan_steps=axes[0],
+        tilt_steps=axes[1],
+        range_mm=axes[2],
+        rms_mm={name: found.rms_mm.reshape(shape) for name, found in errors.items()},
+        bias_mm={name: found.bias_mm.reshape(*shape, 3) for name, found in errors.items()},
+        inside=inside.reshape(shape),
+        valid=np.all([found.usable for found in errors.values()], axis=0).reshape(shape),
+        distance_mm={name: found.distance_mm.reshape(-1, *shape) for name, found in errors.items()},
+    )

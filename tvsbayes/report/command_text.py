@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tvsbayes.calibration.pointing import Steps
+from tvsbayes.calibration.aiming import Steps
 from tvsbayes.errors import escaped
 from tvsbayes.planning.planner import PlanResult
 from tvsbayes.report.tables import concise, text_table, two_digits

@@ -1,0 +1,192 @@
+"""The optics backwards: mirror angles and counters that send the beam to a point or along a direction.
+
+Frame T (see `optics`), mm, degrees, counters in steps; best estimates in Python floats, one target at a time.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from tvsbayes.calibration.optics import Ray, Vector, beam_components, output_deg
+from tvsbayes.errors import InputError
+from tvsbayes.instrument.axes import APPROACH_SIGN, AXES, SIDES, bad_approach
+
+AIM_STEPS, AIM_RAD = 40, 1e-11
+
+
+@dataclass(frozen=True)
+class Steps:
+    """Counters that send the beam where it is wanted.
+
+    Attributes:
+        pan_steps, tilt_steps: absolute counters.
+        approach: last move of each axis, (left or right, up or down).
+        via_pan_steps, via_tilt_steps: go there first: the move on from there takes up all play with a probability of
+            `CLEARED_PROBABILITY`.
+        ray: the beam at these counters.
+        xyz_mm: the point on it that is nearest to the wanted one, or None for a wanted direction.
+        aperture_deg: what the aperture should read there, or None.
+        rounding_mm, rounding_deg: distance from the wanted point or direction that whole steps leave.
+        u95_mm, u95_deg: 95 % half widths of the beam's position at the point (3,), or of its azimuth and elevation.
+    """
+
+    pan_steps: int
+    tilt_steps: int
+    approach: tuple[str, str]
+    via_pan_steps: int
+    via_tilt_steps: int
+    ray: Ray
+    xyz_mm: np.ndarray | None = None
+    aperture_deg: float | None = None
+    rounding_mm: float | None = None
+    rounding_deg: float | None = None
+    u95_mm: np.ndarray | None = None
+    u95_deg: np.ndarray | None = None
+
+    def as_json(self) -> dict[str, object]:
+        """The document of `steps-for`."""
+
+        def plain(value: object) -> object:
+            return value.tolist() if isinstance(value, np.ndarray) else value
+
+        document = {key: plain(value) for key, value in vars(self).items() if key not in ("ray", "approach")}
+        document["approach"] = dict(zip(AXES, self.approach, strict=True))
+        document["ray"] = {key: plain(value) for key, value in vars(self.ray).items()}
+        return document
+
+
+@dataclass(frozen=True)
+class Direction:
+    """A wanted direction: azimuth atan2(d_y, d_x), the emission angle C less 90 deg, and elevation asin(d_z)."""
+
+    azimuth_deg: float
+    elevation_deg: float
+
+    @property
+    def ahead(self) -> bool:
+        """Whether it leaves the baseline forwards; no number is no direction."""
+        return math.isfinite(self.azimuth_deg) and math.isfinite(self.elevation_deg) and abs(self.azimuth_deg) < 90
+
+    def seen_from(self, origin: Vector) -> Direction:
+        """The same from everywhere."""
+        return self
+
+
+@dataclass(frozen=True)
+class Point:
+    """A wanted point (3,), mm."""
+
+    xyz_mm: np.ndarray
+
+    @property
+    def ahead(self) -> bool:
+        """Whether it lies before the baseline: behind it there is no triangle for the aperture to close."""
+        return bool(np.all(np.isfinite(self.xyz_mm)) and self.xyz_mm[0] > 0)
+
+    def seen_from(self, origin: Vector) -> Direction:
+        """The direction that leads to it from the origin of a beam."""
+        x, y, z = (float(t) - c for t, c in zip(self.xyz_mm, origin, strict=True))
+        return Direction(math.degrees(math.atan2(y, x)), math.degrees(math.atan2(z, math.hypot(x, y))))
+
+
+def mirror_angles(values: Mapping[str, float], target: Point | Direction) -> tuple[float, float]:
+    """Mirror angles (pan, tilt) whose beam passes through a point or along a direction, degrees.
+
+    A mirror angle moves the beam by nearly as much, so that plain correction converges.
+
+    Args:
+        values: best estimates by name.
+        target: where to.
+
+    Raises:
+        InputError: no mirror angles send the beam there.
+    """
+    pan_deg = tilt_deg = 0.0
+    for _ in range(AIM_STEPS if target.ahead else 0):
+        beam = beam_components(values, pan_deg, tilt_deg, math)
+        goal, (x, y, z) = target.seen_from(beam.origin), beam.direction
+        azimuth = math.remainder(goal.azimuth_deg - math.degrees(math.atan2(y, x)), 360.0)
+        elevation = goal.elevation_deg - math.degrees(math.atan2(z, math.hypot(x, y)))
+        if max(abs(azimuth), abs(elevation)) < math.degrees(AIM_RAD):
+            return pan_deg, tilt_deg
+        pan_deg, tilt_deg = pan_deg + azimuth, tilt_deg + elevation
+        if abs(tilt_deg) > 90:
+            break
+    raise InputError(
+        "out-of-reach",
+        "no mirror angles send the beam there",
+        allowed="points in front of the scanner and farther from it than the mirrors, elevations below 80 deg",
+        remedy="check the target's frame: x depth, y along the baseline towards the positioner, z up, mm",
+    )
+
+
+@dataclass(frozen=True)
+class Arrival:
+    """How an axis comes to a counter: `via_steps` first, then on to `steps`, reached on `side`."""
+
+    side: str
+    steps: int
+    via_steps: int
+
+
+@dataclass(frozen=True)
+class Drive:
+    """One axis between counters and mirror angles.
+
+    Attributes:
+        axis: pan or tilt.
+        values: best estimates by name.
+        period_deg: period of its transmission error, None without one.
+        overshoot_steps: steps that take up all its play.
+    """
+
+    axis: str
+    values: Mapping[str, float]
+    period_deg: float | None
+    overshoot_steps: int
+
+    def counter(self, angle_deg: float, side: int) -> int:
+        """The counter whose mirror angle is nearest to the wanted one, reached on a side (+1 left or up, -1)."""
+        ratio, steps = self.values[f"degrees_per_step.{self.axis}"], 0.0
+        for _ in range(AIM_STEPS):
+            at = output_deg(self.values, self.axis, steps, side, self.period_deg, math)
+            change = float((angle_deg - at) / ratio)
+            steps += change
+            if abs(change) < 1e-9:
+                break
+        return round(steps)
+
+    def arrival(self, angle_deg: float, side: str | None, limits: tuple[float, float] | None) -> Arrival:
+        """How to reach a mirror angle; without a wanted side left or up, the other one where limits forbid it.
+
+        Args:
+            angle_deg: wanted mirror angle.
+            side: wanted side, or None.
+            limits: lowest and highest counter, or None.
+
+        Raises:
+            InputError: no such side, or counters outside the limits.
+        """
+        negative, positive = SIDES[self.axis]
+        low, high = (-math.inf, math.inf) if limits is None else limits
+        for name in (positive, negative) if side is None else (side,):
+            if name not in SIDES[self.axis]:
+                raise bad_approach(self.axis, name, SIDES[self.axis][::-1])
+            sign = APPROACH_SIGN[name]
+            steps = self.counter(angle_deg, sign)
+            ratio_sign = 1 if self.values[f"degrees_per_step.{self.axis}"] > 0 else -1
+            first = steps - sign * ratio_sign * self.overshoot_steps
+            if low <= steps <= high and low <= first <= high:
+                return Arrival(name, steps, first)
+        raise InputError(
+            "outside-limits",
+            f"{self.axis}: the target needs counter {steps}, approached from {first}",
+            column=self.axis,
+            found=f"{steps} and {first}",
+            allowed=f"{low:g} to {high:g}",
+            remedy="choose a target inside the limits, or widen them in [positioner] if the machine allows",
+        )
