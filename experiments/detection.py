@@ -139,8 +139,9 @@ def beyond_linear() -> list[tuple[float, float]]:
 
     from studies import mounted_rig, shipped_plan
 
+    from tvsbayes.twin.physics import cameras_of
     from tvsbayes.twin.simulated_campaign import simulate
-    from tvsbayes.twin.spot_pictures import Scene, cameras_of, footprint
+    from tvsbayes.twin.spot_pictures import Scene, footprint
 
     twin = simulate(mounted_rig(), shipped_plan("paper"), 1)
     camera = cameras_of(twin.truth.stereo).left

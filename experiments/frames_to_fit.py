@@ -40,7 +40,7 @@ def observed(source: str, seed: int):
     from tvsbayes.cameras.detection import detect
     from tvsbayes.instrument.campaign import read_campaign
     from tvsbayes.instrument.plan import four_point_protocol
-    from tvsbayes.twin.board_pictures import write_frames
+    from tvsbayes.twin.frames import write_frames
     from tvsbayes.twin.physics import project
     from tvsbayes.twin.simulated_campaign import simulate
 
@@ -185,7 +185,7 @@ def rendered(folder: Path, twin: str) -> Path:
 
     from tvsbayes.files.disk import shipped_data
     from tvsbayes.instrument.campaign import read_campaign
-    from tvsbayes.twin.board_pictures import write_frames
+    from tvsbayes.twin.frames import write_frames
     from tvsbayes.twin.simulated_campaign import read_truth, simulate
 
     place = folder / twin

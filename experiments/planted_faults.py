@@ -550,8 +550,8 @@ FAULTS = (
     Fault(
         "twin: rotation of the stereo pair transposed",
         "twin/physics.py",
-        "right = left @ np.asarray(stereo.R, float).T +",
-        "right = left @ np.asarray(stereo.R, float) +",
+        "own = points_mm @ self.rotation.T +",
+        "own = points_mm @ self.rotation +",
         "simulated campaigns of another stereo pair",
         ("twin/simulated_campaign", "estimators/four_point"),
     ),

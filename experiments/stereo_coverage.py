@@ -83,7 +83,7 @@ def scenes(seed: int, condition: str) -> list[Scene]:
     if condition == "rendered":
         # Finders need the outer squares too: the renderer's own poses leave room for them.
         from tvsbayes.twin.board_pictures import Board, board_poses
-        from tvsbayes.twin.spot_pictures import cameras_of
+        from tvsbayes.twin.physics import cameras_of
 
         first = BOARD.points_mm[0]
         poses = board_poses(cameras_of(stereo), Board(), RENDERED_VIEWS, seed)
@@ -113,7 +113,8 @@ def rendered_views(drawn: Sequence[Scene], seed: int) -> list[View]:
     import cv2
 
     from tvsbayes.twin.board_pictures import Board, BoardPose, render_board
-    from tvsbayes.twin.spot_pictures import Sensor, cameras_of
+    from tvsbayes.twin.physics import cameras_of
+    from tvsbayes.twin.spot_pictures import Sensor
 
     cameras = cameras_of(drawn[0].stereo)
     with TemporaryDirectory() as folder:

@@ -33,7 +33,7 @@ def measure(bench: Bench) -> None:
 
     from tvsbayes.cameras import detection, spot_fit
     from tvsbayes.instrument.campaign import read_campaign
-    from tvsbayes.twin.board_pictures import write_frames
+    from tvsbayes.twin.frames import write_frames
     from tvsbayes.twin.physics import project
     from tvsbayes.twin.simulated_campaign import simulate
 

@@ -149,9 +149,9 @@ def test_same_seed_same_bytes(rig, tmp_path):
 
 def test_light_behind_the_device_is_that_of_the_twin(rig, tmp_path, monkeypatch):
     """Without chance the engine on the device model sees what `simulate` computes from the plan."""
-    for module in ("twin.simulated_campaign", "acquisition.simulated_instrument"):
-        for name in ("SHEET_DEPTH_SD_MM", "SHEET_TILT_SD_DEG", "HOME_SD_DEG"):
-            monkeypatch.setattr(f"tvsbayes.{module}.{name}", 0.0)
+    for name in ("SHEET_DEPTH_SD_MM", "SHEET_TILT_SD_DEG", "HOME_SD_DEG"):
+        monkeypatch.setattr(f"tvsbayes.twin.simulated_campaign.{name}", 0.0)
+    monkeypatch.setattr("tvsbayes.acquisition.simulated_instrument.HOME_SD_DEG", 0.0)
     truth = draw_truth(rig, np.random.default_rng(3))
     still = {name: 0.0 for name in truth.parameters if name.startswith("stop_sd_deg")}
     truth = replace(truth, parameters={**truth.parameters, **still, "pixel_scale": 0.0})
@@ -780,7 +780,7 @@ def test_pictures_through_the_virtual_camera(small_rig, tmp_path):
     size = (small_rig.stereo.image_height, small_rig.stereo.image_width)
 
     def renderer(light, look, frame):
-        pixels = project(light.point_S_mm[None], instrument.truth.stereo, instrument.truth.parameters["focal_scale"])[0]
+        pixels = project(light.points_mm[None], instrument.truth.stereo, instrument.truth.parameters["focal_scale"])[0]
         pair = [blob(size, pixels[k], pixels[k + 1], 180.0) + rng.normal(0, 1, (*size, 1)) for k in (0, 2)]
         return StereoImage(*(np.clip(p, 0, 255).astype(np.uint8) for p in pair))
 

@@ -21,7 +21,8 @@ from tvsbayes.files.images import png_bytes
 from tvsbayes.instrument.campaign import Campaign, Move, Spot, read_campaign, write_campaign
 from tvsbayes.instrument.stereo_pair import Stereo, rotation_matrix
 from tvsbayes.report.command_text import detection_text
-from tvsbayes.twin.spot_pictures import Footprint, Scene, Sensor, cameras_of, render_spot
+from tvsbayes.twin.physics import cameras_of
+from tvsbayes.twin.spot_pictures import Footprint, Scene, Sensor, render_spot
 
 WIDTH, HEIGHT = 320, 240
 LOOKS = 40

@@ -16,14 +16,12 @@ from tvsbayes.instrument.campaign import read_campaign
 from tvsbayes.instrument.plan import read_plan
 from tvsbayes.instrument.stereo_pair import rotation_matrix
 from tvsbayes.twin.board_pictures import Board, BoardPose, board_irradiance, board_poses, render_board
-from tvsbayes.twin.physics import project
+from tvsbayes.twin.physics import Camera, cameras_of, project
 from tvsbayes.twin.simulated_campaign import read_truth, simulate
 from tvsbayes.twin.spot_pictures import (
-    Camera,
     Footprint,
     Scene,
     Sensor,
-    cameras_of,
     expose,
     footprint,
     render_spot,
@@ -151,12 +149,12 @@ def test_opencv_finds_the_corners_where_the_optics_put_them(mounted_rig):
 
 def test_the_same_seed_gives_the_same_picture_and_another_another(twin):
     cameras = cameras_of(twin.truth.stereo)
-    at = twin.light.points_mm[5], twin.light.directions[5], twin.light.normals[5]
-    one, two = (render_spots(cameras, *at, Scene(), Sensor(), 1, 5) for _ in range(2))
+    light = twin.light.of(5)
+    one, two = (render_spots(cameras, light, Scene(), Sensor(), 1, 5) for _ in range(2))
     assert np.array_equal(one.left, two.left)
     assert np.array_equal(one.right, two.right)
     for seed, spot in ((2, 5), (1, 6)):
-        other = render_spots(cameras, *at, Scene(), Sensor(), seed, spot)
+        other = render_spots(cameras, light, Scene(), Sensor(), seed, spot)
         assert not np.array_equal(one.left, other.left)
 
 
@@ -184,7 +182,7 @@ def test_the_two_cameras_see_independent_speckle(mounted_rig):
 
 def test_simulate_writes_frames_that_detect_reads(mounted_rig, tmp_path, capsys, monkeypatch):
     """Through the command line, at full size: names, sizes, statuses, and the true centres found again."""
-    monkeypatch.setattr("tvsbayes.twin.board_pictures.BOARD_VIEWS", 1)
+    monkeypatch.setattr("tvsbayes.twin.frames.BOARD_VIEWS", 1)
     lines = (MOUNTED / "paper.csv").read_text().splitlines()[:6]
     (tmp_path / "plan.csv").write_text("\n".join(lines) + "\n")
     orders = ["simulate", str(MOUNTED / "rig.toml"), str(tmp_path / "plan.csv"), str(tmp_path / "c")]

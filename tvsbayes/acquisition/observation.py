@@ -15,7 +15,7 @@ from typing import Protocol
 
 import numpy as np
 
-from tvsbayes.acquisition.simulated_instrument import Instrument, Light, Renderer
+from tvsbayes.acquisition.simulated_instrument import Instrument, Renderer
 from tvsbayes.cameras.capture import StereoCamera, StereoImage
 from tvsbayes.cameras.contour import epipolar_refused
 from tvsbayes.cameras.detection import pair_status
@@ -25,7 +25,8 @@ from tvsbayes.files.images import png_bytes
 from tvsbayes.instrument.rig import Rig
 from tvsbayes.instrument.stereo_pair import Stereo
 from tvsbayes.positioner.driver import Positioner
-from tvsbayes.twin.spot_pictures import Scene, Sensor, cameras_of, render_spots
+from tvsbayes.twin.physics import Light, cameras_of
+from tvsbayes.twin.spot_pictures import Scene, Sensor, render_spots
 
 CHANGE_DN = 40
 """Grey levels by which a pixel must change to count as lit, or as another scene: noise and JPEG stay below 10."""
@@ -223,9 +224,7 @@ def twin_renderer(rig: Rig, seed: int) -> Renderer:
     scene, sensor = Scene(), Sensor()
 
     def pictures(light: Light, look: int, frame: int) -> StereoImage:
-        made = render_spots(
-            cameras, light.point_S_mm, light.direction_S, light.normal_S, scene, sensor, seed, look, frame
-        )
+        made = render_spots(cameras, light, scene, sensor, seed, look, frame)
         return StereoImage(made.left, made.right)
 
     return pictures

@@ -2,8 +2,8 @@
 
 The firmware model drives `Mechanics`; every stretch of its motion goes here through ratio, play and stop error of a
 true rig, homing included. So the light follows from what the motors did, not from what the plan said: lost steps,
-resets and repeated moves show in the pictures as they would on the bench. Physics from tvsbayes.simulation, no
-estimator's formula (DESIGN 3, 5). Frame S, mm; degrees where a name says `_deg`.
+resets and repeated moves show in the pictures as they would on the bench. Physics of `tvsbayes.twin`, no estimator's
+formula. Frame S, mm; degrees where a name says `_deg`; the time of a virtual clock.
 
 Everything random follows from the seed: sheets by the number of their placement, stops by the number of the start,
 so that a run that is resumed finds its rig and its sheet again, and new stop errors.
@@ -12,184 +12,31 @@ so that a run that is resumed finds its rig and its sheet again, and new stop er
 from __future__ import annotations
 
 import heapq
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from typing import Protocol
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Protocol, TypedDict
 
 import numpy as np
 
 from tvsbayes.cameras.capture import StereoImage
-from tvsbayes.instrument.axes import FULL_TURN_DEG, HOME_SD_DEG
+from tvsbayes.instrument.axes import AXES, FULL_TURN_DEG, HOME_SD_DEG, SIDES
 from tvsbayes.instrument.rig import Rig
-from tvsbayes.instrument.stereo_pair import rotation_matrix
 from tvsbayes.positioner.driver import SerialPositioner, device_settings
 from tvsbayes.positioner.firmware_model import DeviceModel, Mechanics
 from tvsbayes.positioner.protocol import SETTINGS
-from tvsbayes.twin.physics import harmonics_deg, mirror_chain, project
-from tvsbayes.twin.simulated_campaign import SHEET_DEPTH_SD_MM, SHEET_TILT_SD_DEG, Truth, draw_truth
+from tvsbayes.twin.physics import Light, Sheet, harmonics_deg, light_on_sheet, project, take_up, wobble_deg
+from tvsbayes.twin.simulated_campaign import Truth, draw_truth, placed_sheet
 
-AXES = ("pan", "tilt")
-SENSES = (("left", "right"), ("up", "down"))
-"""Name of positive and of negative motion per axis (DESIGN 2)."""
 _STREAMS = {"truth": 0, "stops": 1, "homes": 2, "sheets": 3, "pixels": 4}
-
-
-@dataclass(frozen=True, eq=False)
-class Light:
-    """Where the beam meets the sheet; the point is NaN where there is no light, no sheet, or they never meet.
-
-    Attributes:
-        point_S_mm: (3,) frame S.
-        direction_S: (3,) along the beam.
-        normal_S: (3,) of the sheet.
-    """
-
-    point_S_mm: np.ndarray
-    direction_S: np.ndarray
-    normal_S: np.ndarray
-
-
-class Renderer(Protocol):
-    """Pictures of a spot: what the true cameras see of a `Light`."""
-
-    def __call__(self, light: Light, look: int, frame: int) -> StereoImage:
-        """Both pictures; `look` numbers the look (same speckle), `frame` the exposure (new noise)."""
-
-
-class Instrument:
-    """A true rig behind a simulated device.
-
-    Args:
-        rig: the declared rig; its `truth` is what the true one is drawn from.
-        seed: of everything random.
-        start: how often this campaign was started before: stop errors go on, they do not repeat.
-        truth: the true rig; None draws one, the same for every start of a seed.
-        clock: virtual time.
-    """
-
-    def __init__(
-        self,
-        rig: Rig,
-        seed: int,
-        start: int = 0,
-        truth: Truth | None = None,
-        clock: VirtualClock | None = None,
-    ):
-        self.rig, self.seed = rig, int(seed)
-        self.truth = draw_truth(rig, self._stream("truth")) if truth is None else truth
-        self.clock = clock or VirtualClock()
-        self._stops, self._homes = self._stream("stops", start), self._stream("homes", start)
-        self._pixels = self._stream("pixels", start)
-        self._first_home, self._from_switch = [start == 0, start == 0], [False, False]
-        p = self.truth.parameters
-        self._backlash = [p[f"backlash_deg.{axis}"] for axis in AXES]
-        self._q = [0.0, 0.0]
-        self._y = [b * self._stops.uniform(-0.5, 0.5) for b in self._backlash]
-        self._eta = [0.0, 0.0]
-        home = SETTINGS["hp"][2], SETTINGS["ht"][2]
-        self.mechanics = Mechanics(home_steps=home, moved=self._moved, found_home=self._found_home)
-        # A boot id of its own for every start: a simulated device does not outlive its process.
-        self.device = SimulatedDevice(self.clock, self.mechanics, first_boot=1 + 1000 * start)
-        self.motions = 0
-        """Stretches of motion so far; between two of them the scene stands still."""
-        self._sheet: tuple[np.ndarray, np.ndarray] | None = None
-        self._rotation = rotation_matrix(np.array([p[f"extrinsics.rotation_rad.{a}"] for a in "xyz"]))
-        self._translation = np.array([p[f"extrinsics.translation_mm.{a}"] for a in "xyz"])
-
-    def _stream(self, name: str, *numbers: int) -> np.random.Generator:
-        return np.random.default_rng(np.random.SeedSequence([self.seed, _STREAMS[name], *numbers]))
-
-    def positioner(self) -> SerialPositioner:
-        """The driver on this device, with the limits and the speed of the rig file."""
-        return SerialPositioner(lambda: ModelLink(self.device), device_settings(self.rig.positioner), self.clock)
-
-    def place(self, target: str, placement: int) -> None:
-        """Put the sheet at a target; the same placement number puts it at the same place again."""
-        draws = self._stream("sheets", placement).standard_normal(3)
-        depth = self.rig.sheets_mm[target] + SHEET_DEPTH_SD_MM * draws[0]
-        slope = np.tan(np.radians(SHEET_TILT_SD_DEG * draws[1:]))
-        self._sheet = np.array([depth, 0.0, 0.0]), np.array([1.0, *slope])
-
-    def _moved(self, axis: int, steps: int) -> None:
-        """A stretch of motion: ratio of its sense, play, a new stop error (DESIGN 3.1)."""
-        self.motions += 1
-        p, sense = self.truth.parameters, SENSES[axis][0 if steps > 0 else 1]
-        # The first row of a segment stands at mean ratio x counters, whatever the way there from the switch.
-        ratio = AXES[axis] if self._from_switch[axis] else sense
-        self._from_switch[axis] = False
-        self._q[axis] += steps * p[f"degrees_per_step.{ratio}"]
-        self._take_up(axis)
-        self._eta[axis] = p[f"stop_sd_deg.{sense}"] * self._stops.standard_normal()
-
-    def _found_home(self, axis: int) -> None:
-        """Counters are set: from here on the angle is ratio x counters + home offset, 0 in the first segment."""
-        offset = 0.0 if self._first_home[axis] else HOME_SD_DEG * self._homes.standard_normal()
-        self._first_home[axis], self._from_switch[axis] = False, True
-        ratio = self.truth.parameters[f"degrees_per_step.{AXES[axis]}"]
-        angle = ratio * self.mechanics.home_steps[axis] + offset
-        self._y[axis] += angle - self._q[axis]
-        self._q[axis] = angle
-        self._take_up(axis)
-
-    def _take_up(self, axis: int) -> None:
-        driving, half = self._q[axis] + self._wobble(axis, self._q[axis], wheel=False), self._backlash[axis] / 2
-        self._y[axis] = min(max(self._y[axis], driving - half), driving + half)
-
-    def _wobble(self, axis: int, angle_deg: float, wheel: bool) -> float:
-        """Transmission error of the wheel (behind the play) or of the pinion (before it), degrees."""
-        period = self.rig.table.harmonic_period_deg.get(AXES[axis], FULL_TURN_DEG)
-        if (period == FULL_TURN_DEG) != wheel:
-            return 0.0
-        turn = np.exp(2j * np.pi * angle_deg / period)
-        parts = harmonics_deg(self.truth.parameters, AXES[axis])
-        return float(sum(part * turn**order for order, part in enumerate(parts, start=1)).real) if parts else 0.0
-
-    def state_deg(self) -> dict[str, tuple[float, float]]:
-        """Mirror angles (psi, beta) at a row of moves.csv, and the stop errors (pan, tilt) in them.
-
-        Ends the way from the home switch: to be called once per motion, by who drives it.
-        """
-        self._from_switch = [False, False]
-        return {"mirror_angles_deg": self._mirror_angles_deg(), "stop_errors_deg": (self._eta[0], self._eta[1])}
-
-    def _mirror_angles_deg(self) -> tuple[float, float]:
-        psi, beta = (self._y[i] + self._wobble(i, self._y[i], wheel=True) + self._eta[i] for i in (0, 1))
-        return psi, beta + self.truth.parameters["tilt_zero_deg"]
-
-    def light(self) -> Light:
-        """What the laser does at this moment; changes nothing, so that a camera's thread may ask at any time."""
-        psi, beta = np.radians(self._mirror_angles_deg())
-        origin_P, direction_P = mirror_chain(psi, beta, self.truth.parameters)
-        origin, direction = self._rotation @ origin_P + self._translation, self._rotation @ direction_P
-        point, normal = np.full(3, np.nan), np.array([1.0, 0.0, 0.0])
-        if self._sheet is not None:
-            on_sheet, normal = self._sheet
-            distance = float((on_sheet - origin) @ normal / (direction @ normal))
-            if self.mechanics.laser_on and distance > 0:
-                point = origin + distance * direction
-        return Light(point, direction, normal)
-
-    def centroid_px(self) -> np.ndarray:
-        """(4,) u_left, v_left, u_right, v_right of the spot without noise; NaN where it is not seen."""
-        return project(self.light().point_S_mm[None], self.truth.stereo, self.truth.parameters["focal_scale"])[0]
-
-    def noisy_centroid_px(self, sd_px: float) -> np.ndarray:
-        """A centroid as a detector that states `sd_px` would give it: pixel scale x sd_px of noise."""
-        noise = self.truth.parameters["pixel_scale"] * sd_px * self._pixels.standard_normal(4)
-        return self.centroid_px() + noise
-
-
-def reference_pose_deg(looks: list[Mapping[str, tuple[float, float]]]) -> tuple[float, float] | None:
-    """Mean mirror angles without stop errors over `state_deg` of the looks used (DESIGN 3.2); None for none."""
-    if not looks:
-        return None
-    resting = np.array([np.subtract(look["mirror_angles_deg"], look["stop_errors_deg"]) for look in looks])
-    pan, tilt = resting.mean(axis=0)
-    return float(pan), float(tilt)
-
-
 LATENCY_US = 300
 """One way of a request or an answer over USB; a round trip measured on a pseudo-terminal took 0.64 ms."""
+
+
+class TrueAngles(TypedDict):
+    """Mirror angles (psi, beta) at rest after a motion, and the stop errors (pan, tilt) in them, degrees."""
+
+    mirror_angles_deg: tuple[float, float]
+    stop_errors_deg: tuple[float, float]
 
 
 class VirtualClock:
@@ -297,3 +144,129 @@ class ModelLink:
             else:
                 self._arrived += data
         self.device.model.advance(now_us)
+
+
+class Renderer(Protocol):
+    """Pictures of a spot: what the true cameras see of a `Light`."""
+
+    def __call__(self, light: Light, look: int, frame: int) -> StereoImage:
+        """Both pictures; `look` numbers the look (same speckle), `frame` the exposure (new noise)."""
+
+
+class Instrument:
+    """A true rig behind a simulated device.
+
+    Args:
+        rig: the declared rig; its `truth` is what the true one is drawn from.
+        seed: of everything random.
+        start: how often this campaign was started before: stop errors go on, they do not repeat.
+        truth: the true rig; None draws one, the same for every start of a seed.
+        clock: virtual time.
+    """
+
+    def __init__(
+        self,
+        rig: Rig,
+        seed: int,
+        start: int = 0,
+        truth: Truth | None = None,
+        clock: VirtualClock | None = None,
+    ):
+        self.rig, self.seed = rig, int(seed)
+        self.truth = draw_truth(rig, self._stream("truth")) if truth is None else truth
+        self.clock = clock or VirtualClock()
+        self._stops, self._homes = self._stream("stops", start), self._stream("homes", start)
+        self._pixels = self._stream("pixels", start)
+        self._first_home, self._from_switch = [start == 0, start == 0], [False, False]
+        p = self.truth.parameters
+        self._backlash = [p[f"backlash_deg.{axis}"] for axis in AXES]
+        self._q = [0.0, 0.0]
+        self._y = [b * self._stops.uniform(-0.5, 0.5) for b in self._backlash]
+        self._eta = [0.0, 0.0]
+        home = SETTINGS["hp"][2], SETTINGS["ht"][2]
+        self.mechanics = Mechanics(home_steps=home, moved=self._moved, found_home=self._found_home)
+        # A boot id of its own for every start: a simulated device does not outlive its process.
+        self.device = SimulatedDevice(self.clock, self.mechanics, first_boot=1 + 1000 * start)
+        self.motions = 0
+        """Stretches of motion so far; between two of them the scene stands still."""
+        self._sheet = Sheet(np.array(np.nan), np.array([1.0, 0.0, 0.0]))
+
+    def _stream(self, name: str, *numbers: int) -> np.random.Generator:
+        return np.random.default_rng(np.random.SeedSequence([self.seed, _STREAMS[name], *numbers]))
+
+    def positioner(self) -> SerialPositioner:
+        """The driver on this device, with the limits and the speed of the rig file."""
+        return SerialPositioner(lambda: ModelLink(self.device), device_settings(self.rig.positioner), self.clock)
+
+    def place(self, target: str, placement: int) -> None:
+        """Put the sheet at a target; the same placement number puts it at the same place again."""
+        draws = self._stream("sheets", placement).standard_normal(3)
+        self._sheet = placed_sheet(self.rig.sheets_mm[target], draws)
+
+    def _moved(self, axis: int, steps: int) -> None:
+        """A stretch of motion: ratio of its sense, play, a new stop error (DESIGN 3.1)."""
+        self.motions += 1
+        p, sense = self.truth.parameters, SIDES[AXES[axis]][steps > 0]
+        # The first row of a segment stands at mean ratio x counters, whatever the way there from the switch.
+        ratio = AXES[axis] if self._from_switch[axis] else sense
+        self._from_switch[axis] = False
+        self._q[axis] += steps * p[f"degrees_per_step.{ratio}"]
+        self._take_up(axis)
+        self._eta[axis] = p[f"stop_sd_deg.{sense}"] * self._stops.standard_normal()
+
+    def _found_home(self, axis: int) -> None:
+        """Counters are set: from here on the angle is ratio x counters + home offset, 0 in the first segment."""
+        offset = 0.0 if self._first_home[axis] else HOME_SD_DEG * self._homes.standard_normal()
+        self._first_home[axis], self._from_switch[axis] = False, True
+        ratio = self.truth.parameters[f"degrees_per_step.{AXES[axis]}"]
+        angle = ratio * self.mechanics.home_steps[axis] + offset
+        self._y[axis] += angle - self._q[axis]
+        self._q[axis] = angle
+        self._take_up(axis)
+
+    def _take_up(self, axis: int) -> None:
+        driving = self._q[axis] + self._wobble_deg(axis, self._q[axis], wheel=False)
+        self._y[axis] = take_up(self._y[axis], driving, self._backlash[axis])
+
+    def _wobble_deg(self, axis: int, angle_deg: float, wheel: bool) -> float:
+        """Transmission error of the wheel (behind the play) or of the pinion (before it), degrees."""
+        period = self.rig.table.harmonic_period_deg.get(AXES[axis], FULL_TURN_DEG)
+        if (period == FULL_TURN_DEG) != wheel:
+            return 0.0
+        return float(wobble_deg(angle_deg, harmonics_deg(self.truth.parameters, AXES[axis]), period))
+
+    def state_deg(self) -> TrueAngles:
+        """What a row of moves.csv finds.
+
+        Ends the way from the home switch: to be called once per motion, by who drives it.
+        """
+        self._from_switch = [False, False]
+        return {"mirror_angles_deg": self._mirror_angles_deg(), "stop_errors_deg": (self._eta[0], self._eta[1])}
+
+    def _mirror_angles_deg(self) -> tuple[float, float]:
+        psi, beta = (self._y[i] + self._wobble_deg(i, self._y[i], wheel=True) + self._eta[i] for i in (0, 1))
+        return psi, beta + self.truth.parameters["tilt_zero_deg"]
+
+    def light(self) -> Light:
+        """What the laser does at this moment; changes nothing, so that a camera's thread may ask at any time."""
+        psi, beta = np.radians(self._mirror_angles_deg())
+        light = light_on_sheet(psi, beta, self.truth.parameters, self._sheet)
+        return light if self.mechanics.laser_on else replace(light, points_mm=np.full(3, np.nan))
+
+    def centroid_px(self) -> np.ndarray:
+        """(4,) u_left, v_left, u_right, v_right of the spot without noise; NaN where it is not seen."""
+        return project(self.light().points_mm[None], self.truth.stereo, self.truth.parameters["focal_scale"])[0]
+
+    def noisy_centroid_px(self, sd_px: float) -> np.ndarray:
+        """A centroid as a detector that states `sd_px` would give it: pixel scale x sd_px of noise."""
+        noise = self.truth.parameters["pixel_scale"] * sd_px * self._pixels.standard_normal(4)
+        return self.centroid_px() + noise
+
+
+def reference_pose_deg(looks: Sequence[TrueAngles]) -> tuple[float, float] | None:
+    """Mean mirror angles without stop errors over `state_deg` of the looks used (DESIGN 3.2); None for none."""
+    if not looks:
+        return None
+    resting = np.array([np.subtract(look["mirror_angles_deg"], look["stop_errors_deg"]) for look in looks])
+    pan, tilt = resting.mean(axis=0)
+    return float(pan), float(tilt)

@@ -103,7 +103,7 @@ def simulate(
     document = {"campaign": str(out), "moves": moves, "spots": len(spots), "ok": seen, "seed": seed}
     text = f"{escaped(str(out), 200)}: {moves} moves, {seen} of {len(spots)} spots seen; the truth is in truth.json"
     if frames:
-        from tvsbayes.twin.board_pictures import write_frames
+        from tvsbayes.twin.frames import write_frames
 
         result = result.undetected()
         result.write(out)

@@ -12,6 +12,7 @@ import math
 import re
 from collections.abc import Iterable, Iterator, Sequence
 from functools import partial
+from typing import overload
 
 from tvsbayes.errors import INTEGER, InputError, closest, escaped, refusal, shown
 from tvsbayes.files.disk import decode
@@ -75,7 +76,13 @@ class Table:
         line = self.lines[row]
         return refusal(code, file=self.file, line=line, column=column, found=found, allowed=allowed, remedy=remedy)
 
-    def numbers(self, column: str, low: float, high: float, empty: bool = False) -> list[float | None]:
+    @overload
+    def numbers(self, column: str, low: float, high: float) -> list[float]: ...
+
+    @overload
+    def numbers(self, column: str, low: float, high: float, empty: bool) -> list[float | None]: ...
+
+    def numbers(self, column: str, low: float, high: float, empty: bool = False) -> list[float] | list[float | None]:
         """Finite numbers in [low, high]; None for an empty cell where `empty` allows it."""
         if (plain := _plain(self.columns[column], float, low, high)) is not None:
             return plain
@@ -93,7 +100,13 @@ class Table:
             values.append(value)
         return values
 
-    def integers(self, column: str, low: int, high: int, empty: bool = False) -> list[int | None]:
+    @overload
+    def integers(self, column: str, low: int, high: int) -> list[int]: ...
+
+    @overload
+    def integers(self, column: str, low: int, high: int, empty: bool) -> list[int | None]: ...
+
+    def integers(self, column: str, low: int, high: int, empty: bool = False) -> list[int] | list[int | None]:
         """Whole numbers in [low, high]; None for an empty cell where `empty` allows it."""
         if (plain := _plain(self.columns[column], int, low, high)) is not None:
             return plain

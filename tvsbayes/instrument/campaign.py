@@ -13,7 +13,7 @@ from __future__ import annotations
 import datetime
 import hashlib
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
@@ -81,6 +81,10 @@ class Campaign:
     path: Path | None = None
 
 
+CAMERAS: tuple[Literal["left"], Literal["right"]] = ("left", "right")
+"""The two cameras, in the order of the columns of spots.csv."""
+NO_PIXELS = (None, None, None, None)
+"""Pixels, or their standard uncertainties, of a look without a spot."""
 _MOVE_COLUMNS = ("move", "segment", "time_s", "pan_steps", "tilt_steps", "pan_approach", "tilt_approach")
 _PIXELS = ("u_left_px", "v_left_px", "u_right_px", "v_right_px")
 _PIXEL_SDS = ("su_left_px", "sv_left_px", "su_right_px", "sv_right_px")
@@ -93,6 +97,44 @@ COUNTER_MAX = 10**8
 ID_MAX = 10**9
 # How far outside the image a centroid may lie, in image sizes: half a spot at the edge, not a wrong file.
 _IMAGE_MARGIN = 0.1
+
+
+def frame_name(spot: int, camera: str, folder: str = "frames") -> str:
+    """Where a picture of a look lies in a campaign folder: `frames/000012_left.png`, `dark/` without laser light."""
+    return f"{folder}/{spot:06d}_{camera}.png"
+
+
+def with_pixels(
+    spot: Spot,
+    status: str,
+    pixels_px: Sequence[float | None] = NO_PIXELS,
+    sds_px: Sequence[float | None] = NO_PIXELS,
+    correlations: Sequence[float] = (0.0, 0.0),
+) -> Spot:
+    """The row with another answer of a detector.
+
+    Args:
+        spot: the row.
+        status: "ok", or why there is no spot.
+        pixels_px: u_left, v_left, u_right, v_right.
+        sds_px: their standard uncertainties.
+        correlations: of u and v, left and right.
+    """
+    (u_left, v_left, u_right, v_right), (su_left, sv_left, su_right, sv_right) = pixels_px, sds_px
+    return replace(
+        spot,
+        status=status,
+        u_left_px=u_left,
+        v_left_px=v_left,
+        u_right_px=u_right,
+        v_right_px=v_right,
+        su_left_px=su_left,
+        sv_left_px=sv_left,
+        su_right_px=su_right,
+        sv_right_px=sv_right,
+        ruv_left=correlations[0],
+        ruv_right=correlations[1],
+    )
 
 
 def parse_moves(data: bytes, file: str = "moves.csv") -> tuple[Move, ...]:

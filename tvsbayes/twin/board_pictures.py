@@ -1,33 +1,30 @@
-"""Calibration boards as cameras see them; all frames on disk."""
+"""Pictures of a checkerboard as the twin's cameras take them, in visible light.
+
+A board's edges are area-sampled, its corners lie at `Camera.project` of their places. Poses take the board's axes to
+the left camera's (x right, y down, z along the view); mm; px with the integer at the centre of a pixel; DN = grey
+levels of 8 bits. Everything random follows from the seeds given.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from os import cpu_count
-from pathlib import Path
 
 import numpy as np
 
-from tvsbayes.files.disk import make_folder, write_atomically
-from tvsbayes.files.images import png_bytes
 from tvsbayes.instrument.stereo_pair import rotation_matrix
-from tvsbayes.twin.simulated_campaign import SimulatedCampaign
-from tvsbayes.twin.spot_pictures import (
-    Camera,
-    CameraPair,
-    Scene,
-    Sensor,
-    ambient_level,
-    cameras_of,
-    expose,
-    random_stream,
-    render_spots,
-)
+from tvsbayes.twin.physics import Camera, CameraPair
+from tvsbayes.twin.spot_pictures import Sensor, ambient_level, expose, random_stream
 
-SIDES = ("left", "right")
+SUBPIXELS = 8
+"""Samples per axis in a pixel that an edge of the board may cross: levels to 1/64."""
+SHADING = 0.15
+"""Relative fall of the light on a board from the upper left to the lower right corner of the picture."""
+BORDER_PX = 8.0
+"""Least distance of a board's outer squares from the image's border."""
+DEPTHS_MM = (280.0, 520.0)
+TILT_MAX_DEG = 40.0
 
 
 @dataclass(frozen=True)
@@ -103,10 +100,6 @@ def _rays_of(width: int, height: int, pinhole: tuple[float, ...], distortion: tu
     return np.where(good, np.stack((x, y), axis=-1), np.nan)
 
 
-SUBPIXELS = 8
-"""Samples per axis in a pixel that an edge of the board may cross: levels to 1/64."""
-
-
 def board_irradiance(camera: Camera, pose: BoardPose, board: Board) -> np.ndarray:
     """Irradiance (height, width) of a checkerboard in DN: area-sampled at its edges, without blur."""
     rotation = camera.rotation @ pose.rotation
@@ -159,10 +152,6 @@ def _board_window(camera: Camera, pose: BoardPose, board: Board) -> tuple[slice,
     return slice(low[1], high[1]), slice(low[0], high[0])
 
 
-SHADING = 0.15
-"""Relative fall of the light on a board from the upper left to the lower right corner of the picture."""
-
-
 def render_board(camera: Camera, pose: BoardPose, board: Board, sensor: Sensor, seed: Sequence[int]) -> np.ndarray:
     """One picture of a checkerboard; its corners lie at `camera.project` of the board's corners.
 
@@ -179,12 +168,6 @@ def render_board(camera: Camera, pose: BoardPose, board: Board, sensor: Sensor, 
     light *= ambient_level(camera.width, camera.height, 1.0, SHADING)
     light = cv2.GaussianBlur(light, (0, 0), sensor.blur_px) if sensor.blur_px > 0 else light
     return expose(light, replace(sensor, response=(1.0, 1.0, 1.0)), random_stream("board", *seed))
-
-
-BORDER_PX = 8.0
-"""Least distance of a board's outer squares from the image's border."""
-DEPTHS_MM = (280.0, 520.0)
-TILT_MAX_DEG = 40.0
 
 
 def board_poses(cameras: CameraPair, board: Board, views: int, seed: int) -> list[BoardPose]:
@@ -213,74 +196,3 @@ def board_poses(cameras: CameraPair, board: Board, views: int, seed: int) -> lis
             if len(found) == views:
                 return found
     raise ValueError(f"a board of {reach[0]:g} x {reach[1]:g} mm fits into both images {len(found)} of {views} times")
-
-
-BOARD_VIEWS = 20
-"""Views of the checkerboard, as the paper took (section 2.3)."""
-
-
-def write_frames(
-    folder: Path,
-    simulated: SimulatedCampaign,
-    seed: int,
-    *,
-    views: int | None = None,
-    done: Callable[[int, int], None] | None = None,
-) -> int:
-    """Write `frames/{spot:06d}_left.png`, `_right.png` of every look and `boards/left01.png`, `right01.png` ...
-
-    Spots are seen by the true cameras at the laser's wavelength, boards in visible light (focal scale 1). Light and
-    sensors are those of `Scene()` and `Sensor()`, the board is the paper's.
-
-    Args:
-        folder: the campaign's folder, which exists.
-        simulated: what the twin did.
-        seed: of speckle, noise and board poses.
-        views: how many board views, by default `BOARD_VIEWS`; 0 writes no `boards/`.
-        done: called with the number of pairs written and their total.
-
-    Returns:
-        How many pictures were written.
-
-    Raises:
-        InputError: the folder cannot be written.
-    """
-    scene, sensor, board = Scene(), Sensor(), Board()
-    views = BOARD_VIEWS if views is None else views
-    truth, light = simulated.truth, simulated.light
-    infrared = cameras_of(truth.stereo, truth.parameters["focal_scale"])
-    visible = cameras_of(truth.stereo)
-    poses = board_poses(visible, board, views, seed) if views else []
-    make_folder(folder / "frames")
-    if poses:
-        make_folder(folder / "boards")
-
-    def write(place: str, names: Sequence[str], pictures: Sequence[np.ndarray]) -> None:
-        for name, picture in zip(names, pictures, strict=True):
-            write_atomically(folder / place / name, png_bytes(picture))
-
-    def spot(row: int) -> None:
-        number = simulated.campaign.spots[row].spot
-        at = light.points_mm[row], light.directions[row], light.normals[row]
-        made = render_spots(infrared, *at, scene, sensor, seed, number)
-        write("frames", [f"{number:06d}_{side}.png" for side in SIDES], (made.left, made.right))
-
-    def view(number: int) -> None:
-        pair = enumerate((visible.left, visible.right))
-        made = [render_board(camera, poses[number], board, sensor, (seed, number, side)) for side, camera in pair]
-        write("boards", [f"{side}{number + 1:02d}.png" for side in SIDES], made)
-
-    def jobs() -> Iterator[tuple[Callable[[int], None], int]]:
-        yield from ((view, number) for number in range(len(poses)))
-        yield from ((spot, row) for row in range(len(simulated.campaign.spots)))
-
-    total = len(poses) + len(simulated.campaign.spots)
-    # NumPy's generators, OpenCV and the writing of files leave Python's lock: threads are enough.
-    pool = ThreadPoolExecutor(min(8, cpu_count() or 1))
-    try:
-        for count, _ in enumerate(pool.map(lambda job: job[0](job[1]), jobs()), start=1):
-            if done is not None:
-                done(count, total)
-    finally:
-        pool.shutdown(cancel_futures=True)
-    return 2 * total

@@ -1,31 +1,34 @@
-"""The digital twin: draws a true rig, runs a plan on it and writes down what the cameras would see.
+"""The twin's own physics: gears with play, stop errors, mirrors, the beam on a sheet, cameras, the aperture's angle.
 
-It shares formats and parameter names with the estimators, but no formula: its physics (gears with play, mirrors,
-cameras, aperture; DESIGN 3 and 5) is written here a second time, from the design alone, so that an error in the
-estimators' model cannot hide in the twin. Frames S (stereo), P (positioner), Q (pan stage) and T (TVS) as in
-DESIGN 2; mm; degrees and radians by suffix; pixels with the integer at the centre of a pixel. The parts of chance
-(rig, stop errors, sheets, pixels, aperture) have their own random streams: changing one leaves the others as they
-were.
+It shares formats and parameter names with the estimators, but no formula: all of it is written here a second time,
+from the design alone, so that an error in the estimators' model cannot hide in the twin. Frames S (stereo),
+P (positioner), Q (pan stage) and T (TVS) as in `data/docs/conventions.md`; mm; degrees and radians by suffix; pixels
+with the integer at the centre of a pixel.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
 
-from tvsbayes.instrument.axes import FULL_TURN_DEG
+from tvsbayes.instrument.axes import APPROACH_SIGN, FULL_TURN_DEG
 from tvsbayes.instrument.parameters import HARMONIC_ORDERS
-from tvsbayes.instrument.stereo_pair import Stereo
+from tvsbayes.instrument.stereo_pair import Stereo, rotation_matrix
+
+
+def take_up(output_deg: float, driving_deg: float, backlash_deg: float) -> float:
+    """Where a gear with play stands once its driver has come to `driving_deg`: it moves when the play is used up."""
+    return min(max(output_deg, driving_deg - backlash_deg / 2), driving_deg + backlash_deg / 2)
 
 
 def play(q_deg: Sequence[float], start_deg: float, backlash_deg: float) -> np.ndarray:
     """Output of a gear with play for driving angles q (n,), from output `start_deg` on."""
     output, y = np.empty(len(q_deg)), start_deg
     for i, q in enumerate(q_deg):
-        y = min(max(y, q - backlash_deg / 2), q + backlash_deg / 2)
-        output[i] = y
+        output[i] = y = take_up(y, q, backlash_deg)
     return output
 
 
@@ -61,15 +64,22 @@ def transmission(
         turned = steps * np.where(steps > 0, mean + contrast / 2, mean - contrast / 2)
         q = mean * counters[begin] + home_deg[begin] + np.concatenate(([0.0], np.cumsum(turned)))
         if not wheel:
-            q = q + _wobble(q, harmonics_deg, period_deg)
+            q = q + wobble_deg(q, harmonics_deg, period_deg)
         output[begin:end] = play(q, q[0] + start_fraction[begin] * backlash_deg, backlash_deg)
-    return output + _wobble(output, harmonics_deg, period_deg) if wheel else output
+    return output + wobble_deg(output, harmonics_deg, period_deg) if wheel else output
 
 
-def _wobble(angle_deg: np.ndarray, harmonics_deg: Sequence[complex], period_deg: float) -> np.ndarray:
-    """Transmission error at angles: the real part of sum_o (c_o - i s_o) e^(i o phase)."""
+def harmonics_deg(parameters: Mapping[str, float], axis: str) -> list[complex]:
+    """Transmission error of an axis as `transmission` takes it; a rig that names none has none."""
+    names = [f"harmonic_deg.{axis}.{order}" for order in HARMONIC_ORDERS]
+    return [complex(parameters.get(f"{name}.cos", 0.0), -parameters.get(f"{name}.sin", 0.0)) for name in names]
+
+
+def wobble_deg(angle_deg: np.ndarray | float, harmonics_deg: Sequence[complex], period_deg: float) -> np.ndarray:
+    """Transmission error at angles, their shape: the real part of sum_o (c_o - i s_o) e^(i o phase)."""
     turn = np.exp(2j * np.pi * np.asarray(angle_deg) / period_deg)
-    return sum((part * turn**order for order, part in enumerate(harmonics_deg, start=1)), np.zeros(len(turn))).real
+    parts = (part * turn**order for order, part in enumerate(harmonics_deg, start=1))
+    return np.real(sum(parts, np.zeros(turn.shape)))
 
 
 def stop_errors(
@@ -89,8 +99,7 @@ def stop_errors(
     both = float(np.sqrt((sds["+"] ** 2 + sds["-"] ** 2) / 2))
     for i in range(len(counters)):
         if first[i]:
-            side = {"left": "+", "up": "+", "right": "-", "down": "-"}.get(approach[i])
-            error = draws[i] * (sds[side] if side else both)
+            error = draws[i] * {1: sds["+"], -1: sds["-"], 0: both}[APPROACH_SIGN[approach[i]]]
         elif counters[i] != counters[i - 1]:
             error = draws[i] * sds["+" if counters[i] > counters[i - 1] else "-"]
         held[i] = error
@@ -141,38 +150,113 @@ def _reflect(
     return point + distance * direction, direction - 2 * along * normal
 
 
+@dataclass(frozen=True, eq=False)
+class Sheet:
+    """White sheets, one (...) or many: `depth_mm` (...), X of the plane on the X axis, and `normal` (..., 3) in S.
+
+    The first component of the normal is 1: n . p = depth.
+    """
+
+    depth_mm: np.ndarray
+    normal: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Light:
+    """Where beams meet their sheets, one (3,) or many (n, 3): what pictures of them are made from.
+
+    Attributes:
+        points_mm: (..., 3) on the sheet, frame S; NaN where there is no light or the beam never meets the sheet.
+        directions: (..., 3) unit vectors along the beam, frame S.
+        normals: (..., 3) of the sheet, frame S, of any length.
+        points_P_mm: (..., 3) the same points in frame P.
+    """
+
+    points_mm: np.ndarray
+    directions: np.ndarray
+    normals: np.ndarray
+    points_P_mm: np.ndarray
+
+    def of(self, row: int) -> Light:
+        """That of one of many."""
+        return Light(self.points_mm[row], self.directions[row], self.normals[row], self.points_P_mm[row])
+
+
+def light_on_sheet(
+    psi_rad: np.ndarray | float, beta_rad: np.ndarray | float, parameters: Mapping[str, float], sheet: Sheet
+) -> Light:
+    """The light that mirrors at (...) angles throw on (...) sheets."""
+    rotation = rotation_matrix(np.array([parameters[f"extrinsics.rotation_rad.{a}"] for a in "xyz"]))
+    translation = np.array([parameters[f"extrinsics.translation_mm.{a}"] for a in "xyz"])
+    origin_P, direction_P = mirror_chain(psi_rad, beta_rad, parameters)
+    origin, direction = origin_P @ rotation.T + translation, direction_P @ rotation.T
+    with np.errstate(divide="ignore"):
+        gap = sheet.depth_mm - np.sum(origin * sheet.normal, axis=-1)
+        distance = gap / np.sum(direction * sheet.normal, axis=-1)
+    distance = np.where(distance > 0, distance, np.nan)[..., None]
+    return Light(origin + distance * direction, direction, sheet.normal, origin_P + distance * direction_P)
+
+
+@dataclass(frozen=True)
+class Camera:
+    """One camera: `rotation`, `translation_mm` take points of the left camera's axes to its own."""
+
+    matrix: np.ndarray
+    distortion: np.ndarray
+    rotation: np.ndarray
+    translation_mm: np.ndarray
+    width: int
+    height: int
+
+    def project(self, points_mm: np.ndarray) -> np.ndarray:
+        """Pixels (n, 2) of points (n, 3) in the left camera's axes, by pinhole and Brown-Conrady distortion.
+
+        Beyond the image's borders too; NaN behind the camera and beyond the radius where distortion turns back.
+        """
+        own = points_mm @ self.rotation.T + self.translation_mm
+        k1, k2, p1, p2, k3 = self.distortion
+        with np.errstate(divide="ignore", invalid="ignore"):
+            a, b = own[:, 0] / own[:, 2], own[:, 1] / own[:, 2]
+        r2 = a * a + b * b
+        radial = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3
+        u = a * radial + 2 * p1 * a * b + p2 * (r2 + 2 * a * a)
+        v = b * radial + p1 * (r2 + 2 * b * b) + 2 * p2 * a * b
+        pixels = np.column_stack((self.matrix[0, 0] * u + self.matrix[0, 2], self.matrix[1, 1] * v + self.matrix[1, 2]))
+        good = (own[:, 2] > 0) & (r2 < _turning_radius_squared(k1, k2, k3))
+        return np.where(good[:, None], pixels, np.nan)
+
+
+@dataclass(frozen=True)
+class CameraPair:
+    """The two cameras of a rig."""
+
+    left: Camera
+    right: Camera
+
+
+def cameras_of(stereo: Stereo, focal_scale: float = 1.0) -> CameraPair:
+    """Both cameras of a calibration; `focal_scale` multiplies fx and fy (1 in visible light, DESIGN 3.3)."""
+    scale = np.array([[focal_scale, 1.0, 1.0], [1.0, focal_scale, 1.0], [1.0, 1.0, 1.0]])
+    size = stereo.image_width, stereo.image_height
+    left = Camera(stereo.M1 * scale, np.asarray(stereo.D1, float).ravel(), np.eye(3), np.zeros(3), *size)
+    pose = np.asarray(stereo.R, float), np.asarray(stereo.T, float).ravel()
+    return CameraPair(left, Camera(stereo.M2 * scale, np.asarray(stereo.D2, float).ravel(), *pose, *size))
+
+
+def camera_axes(vectors_S: np.ndarray) -> np.ndarray:
+    """Vectors (..., 3) of frame S in the left camera's axes: x right, y down, z along the view."""
+    x, y, z = np.moveaxis(np.asarray(vectors_S, float), -1, 0)
+    return np.stack((-y, -z, x), axis=-1)
+
+
 def project(points_S_mm: np.ndarray, stereo: Stereo, focal_scale: float = 1.0) -> np.ndarray:
     """Pixels (n, 4: u_left, v_left, u_right, v_right) of points (n, 3) in frame S; NaN where not seen.
 
-    Pinhole with Brown-Conrady; `focal_scale` multiplies fx and fy of both cameras. Not seen: behind a
-    camera, beyond the radius where the distortion polynomial turns back, or outside the image, whose
-    outermost pixel centres are 0 and width - 1.
+    `focal_scale` multiplies fx and fy of both cameras. Not seen: where `Camera.project` gives none, or outside the
+    image, whose outermost pixel centres are 0 and width - 1.
     """
-    x, y, z = np.asarray(points_S_mm, float).reshape(-1, 3).T
-    left = np.column_stack((-y, -z, x))
-    right = left @ np.asarray(stereo.R, float).T + np.asarray(stereo.T, float).ravel()
-    views = ((left, stereo.M1, stereo.D1), (right, stereo.M2, stereo.D2))
-    return inside_images(np.hstack([project_camera(*view, focal_scale) for view in views]), stereo)
-
-
-def project_camera(
-    points_mm: np.ndarray, matrix: np.ndarray, coefficients: np.ndarray, focal_scale: float = 1.0
-) -> np.ndarray:
-    """Pixels (n, 2) of points (n, 3) in a camera's own axes (x right, y down, z along the view).
-
-    Beyond the image's borders too; NaN behind the camera and beyond the radius where distortion turns back.
-    """
-    k1, k2, p1, p2, k3 = np.asarray(coefficients, float).ravel()
-    with np.errstate(divide="ignore", invalid="ignore"):
-        a, b = (points_mm[:, :2] / points_mm[:, 2:]).T
-    r2 = a * a + b * b
-    radial = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3
-    u = a * radial + 2 * p1 * a * b + p2 * (r2 + 2 * a * a)
-    v = b * radial + p1 * (r2 + 2 * b * b) + 2 * p2 * a * b
-    u = focal_scale * matrix[0, 0] * u + matrix[0, 2]
-    v = focal_scale * matrix[1, 1] * v + matrix[1, 2]
-    good = (points_mm[:, 2] > 0) & (r2 < _turning_radius_squared(k1, k2, k3))
-    return np.where(good[:, None], np.column_stack((u, v)), np.nan)
+    cameras, points = cameras_of(stereo, focal_scale), camera_axes(np.reshape(points_S_mm, (-1, 3)))
+    return inside_images(np.hstack([camera.project(points) for camera in (cameras.left, cameras.right)]), stereo)
 
 
 def inside_images(pixels: np.ndarray, stereo: Stereo) -> np.ndarray:
@@ -228,11 +312,6 @@ def effective_mirror_offset_mm(parameters: Mapping[str, float], pose_deg: tuple[
     (d_y o_x - d_x o_y) / sqrt(d_x^2 + d_y^2) with origin o and direction d in P: the beam's moment about
     the pan axis over its horizontal length.
     """
-    o, d = mirror_chain(*np.radians(pose_deg), parameters)
+    psi, beta = np.radians(pose_deg)
+    o, d = mirror_chain(psi, beta, parameters)
     return float((d[1] * o[0] - d[0] * o[1]) / np.hypot(d[0], d[1]))
-
-
-def harmonics_deg(parameters: Mapping[str, float], axis: str) -> list[complex]:
-    """Transmission error of an axis as `transmission` takes it; a rig that names none has none."""
-    names = [f"harmonic_deg.{axis}.{order}" for order in HARMONIC_ORDERS]
-    return [complex(parameters.get(f"{name}.cos", 0.0), -parameters.get(f"{name}.sin", 0.0)) for name in names]

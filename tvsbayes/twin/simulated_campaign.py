@@ -1,19 +1,25 @@
-"""A true rig drawn, and a plan run on it."""
+"""A true rig drawn, a plan run on it, and what a stranger would get: the campaign, with the truth beside it.
+
+Frames S (stereo) and P (positioner), mm; degrees where a name says `_deg`; pixels with the integer at the centre of a
+pixel. The parts of chance (rig, stop errors, home offsets, sheets, pixels, aperture) have their own random streams:
+changing one leaves the others as they were.
+"""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import NotRequired, TypedDict, cast
 
 import numpy as np
 
 from tvsbayes.errors import InputError
 from tvsbayes.files.disk import read_bytes, write_atomically
 from tvsbayes.files.documents import JSON_BYTES_MAX, parse_json
-from tvsbayes.instrument.axes import FULL_TURN_DEG, HOME_SD_DEG
-from tvsbayes.instrument.campaign import Campaign, Move, Spot, write_campaign
+from tvsbayes.instrument.axes import FULL_TURN_DEG, HOME_SD_DEG, SIDES
+from tvsbayes.instrument.campaign import NO_PIXELS, Campaign, Move, Spot, with_pixels, write_campaign
 from tvsbayes.instrument.parameters import (
     DECLARED_PRIORS,
     DEFAULT_PRIORS,
@@ -23,14 +29,16 @@ from tvsbayes.instrument.parameters import (
 )
 from tvsbayes.instrument.plan import HOME_APPROACH, PlanLog, PlannedLook, PlanStep, run_plan
 from tvsbayes.instrument.rig import Rig, require_periods
-from tvsbayes.instrument.stereo_pair import Stereo, rotation_matrix
+from tvsbayes.instrument.stereo_pair import Stereo
 from tvsbayes.twin.physics import (
+    Light,
+    Sheet,
     aperture_angle_deg,
     effective_deg_per_step,
     effective_mirror_offset_mm,
     harmonics_deg,
     inside_images,
-    mirror_chain,
+    light_on_sheet,
     project,
     stop_errors,
     to_tvs,
@@ -44,6 +52,23 @@ SHEET_TILT_SD_DEG = 0.5
 SPOT_SD_PX = 0.08
 """Standard uncertainty stated for a spot centre where neither caller nor rig names one."""
 TRUTH_FORMAT = "tvsbayes-truth/1"
+Pair = tuple[float, float]
+"""Of pan and tilt."""
+
+
+class TruthDocument(TypedDict):
+    """truth.json; see `Truth`."""
+
+    format: str
+    note: str
+    parameters: dict[str, float]
+    stereo: dict[str, float]
+    mirror_angles_deg: Sequence[Pair]
+    stop_errors_deg: Sequence[Pair]
+    home_offsets_deg: Sequence[Pair]
+    reference_pose_deg: Pair | None
+    effective_deg_per_step: NotRequired[dict[str, float]]
+    effective_mirror_offset_mm: NotRequired[float]
 
 
 @dataclass(frozen=True)
@@ -68,20 +93,19 @@ class Truth:
     reference_pose_deg: tuple[float, float] | None = None
     note: str = "The true rig of a simulated campaign; no estimator reads this file."
 
-    def as_json(self) -> dict[str, object]:
+    def as_json(self) -> TruthDocument:
         """The document of truth.json, with the effective ratios at the reference pose where one is known."""
-        document: dict[str, object] = {
+        document: TruthDocument = {
             "format": TRUTH_FORMAT,
             "note": self.note,
             "parameters": {name: float(value) for name, value in self.parameters.items()},
             "stereo": dict(zip(STEREO_PARAMETER_NAMES, map(float, self.stereo.vector), strict=True)),
-            "mirror_angles_deg": [list(pair) for pair in self.mirror_angles_deg],
-            "stop_errors_deg": [list(pair) for pair in self.stop_errors_deg],
-            "home_offsets_deg": [list(pair) for pair in self.home_offsets_deg],
-            "reference_pose_deg": None,
+            "mirror_angles_deg": self.mirror_angles_deg,
+            "stop_errors_deg": self.stop_errors_deg,
+            "home_offsets_deg": self.home_offsets_deg,
+            "reference_pose_deg": self.reference_pose_deg,
         }
         if self.reference_pose_deg is not None:
-            document["reference_pose_deg"] = list(self.reference_pose_deg)
             document["effective_deg_per_step"] = effective_deg_per_step(self.parameters, self.reference_pose_deg)
             document["effective_mirror_offset_mm"] = effective_mirror_offset_mm(
                 self.parameters, self.reference_pose_deg
@@ -89,36 +113,18 @@ class Truth:
         return document
 
     @classmethod
-    def from_json(cls, document: Mapping[str, object], stated: Stereo) -> Truth:
+    def from_json(cls, document: TruthDocument, stated: Stereo) -> Truth:
         """Rebuild from truth.json; image size and covariance come from the campaign's `stated` stereo."""
-        pairs = {
-            name: tuple(tuple(map(float, pair)) for pair in document[name])
-            for name in ("mirror_angles_deg", "stop_errors_deg", "home_offsets_deg")
-        }
-        pose = document["reference_pose_deg"]
-        vector = np.array([document["stereo"][name] for name in STEREO_PARAMETER_NAMES], float)
+        pose, known = document["reference_pose_deg"], document["stereo"]
         return cls(
             parameters={name: float(value) for name, value in document["parameters"].items()},
-            stereo=stated.with_vector(vector),
+            stereo=stated.with_vector(np.array([float(known[name]) for name in STEREO_PARAMETER_NAMES])),
+            mirror_angles_deg=_pairs(document["mirror_angles_deg"]),
+            stop_errors_deg=_pairs(document["stop_errors_deg"]),
+            home_offsets_deg=_pairs(document["home_offsets_deg"]),
             reference_pose_deg=None if pose is None else (float(pose[0]), float(pose[1])),
             note=str(document["note"]),
-            **pairs,
         )
-
-
-@dataclass(frozen=True)
-class Light:
-    """Where the beam of each look met its sheet, in frame S: what a picture of it is made from.
-
-    Attributes:
-        points_mm: (n, 3) points on the sheet; NaN where the beam never meets it.
-        directions: (n, 3) unit vectors along the beam.
-        normals: (n, 3) normals of the sheet, of any length.
-    """
-
-    points_mm: np.ndarray
-    directions: np.ndarray
-    normals: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -131,8 +137,7 @@ class SimulatedCampaign:
 
     def undetected(self) -> SimulatedCampaign:
         """The same run before anybody has looked at its pictures: no pixels, status "undetected"."""
-        empty = dict.fromkeys(f"{s}{c}_{side}_px" for s in ("", "s") for c in "uv" for side in ("left", "right"))
-        spots = tuple(replace(spot, **empty, status="undetected") for spot in self.campaign.spots)
+        spots = tuple(with_pixels(spot, "undetected") for spot in self.campaign.spots)
         return replace(self, campaign=replace(self.campaign, spots=spots))
 
     def write(self, folder: str | Path) -> None:
@@ -155,7 +160,8 @@ def read_truth(path: str | Path, stated: Stereo) -> Truth:
     keys = parse_json(read_bytes(path, JSON_BYTES_MAX), path.name)
     keys.word("format", (TRUTH_FORMAT,))
     try:
-        return Truth.from_json(keys.values, stated)
+        # What stands in the entries is converted, or refused below.
+        return Truth.from_json(cast("TruthDocument", keys.values), stated)
     except (KeyError, TypeError, ValueError, IndexError) as error:
         raise InputError(
             "truth",
@@ -196,11 +202,27 @@ def _draw(prior: Prior, rng: np.random.Generator) -> float:
 def with_derived(parameters: Mapping[str, float]) -> dict[str, float]:
     """Add the four directional ratios that mean ratios and contrasts imply (DESIGN 3.1)."""
     result = dict(parameters)
-    for axis, positive, negative in (("pan", "left", "right"), ("tilt", "up", "down")):
+    for axis, (negative, positive) in SIDES.items():
         ratio, contrast = result[f"degrees_per_step.{axis}"], result[f"ratio_contrast_deg_per_step.{axis}"]
         result[f"degrees_per_step.{positive}"] = ratio + contrast / 2
         result[f"degrees_per_step.{negative}"] = ratio - contrast / 2
     return result
+
+
+@dataclass(frozen=True)
+class _Streams:
+    """The parts of chance in a simulated campaign."""
+
+    truth: np.random.Generator
+    stops: np.random.Generator
+    homes: np.random.Generator
+    sheets: np.random.Generator
+    pixels: np.random.Generator
+    aperture: np.random.Generator
+
+
+def _pairs(rows: Iterable[Sequence[float]]) -> tuple[Pair, ...]:
+    return tuple((float(pan), float(tilt)) for pan, tilt in rows)
 
 
 def simulate(
@@ -231,63 +253,53 @@ def simulate(
         InputError: the plan looks before a sheet is placed, or names a sheet the rig does not have; the true
             rig has a transmission error whose period the declared one does not state.
     """
-    streams = dict(
-        zip(
-            ("truth", "stops", "homes", "sheets", "pixels", "aperture"),
-            map(np.random.default_rng, np.random.SeedSequence(seed).spawn(6)),
-            strict=True,
-        )
-    )
+    streams = _Streams(*map(np.random.default_rng, np.random.SeedSequence(seed).spawn(6)))
     if truth is None:
-        truth = draw_truth(rig, streams["truth"])
+        truth = draw_truth(rig, streams.truth)
     sd_px = float(rig.cameras.get("spot_sd_px", SPOT_SD_PX) if spot_sd_px is None else spot_sd_px)
     log = run_plan(plan, rig, home_approach)
     fixed = {name: Prior(value, 0.0) for name, value in truth.parameters.items() if name in HARMONIC_PRIORS}
     require_periods(fixed, rig.table.harmonic_period_deg)
-    truth, resting_deg = _drive(log.moves, truth, rig.table.harmonic_period_deg, streams["stops"], streams["homes"])
-    light, points_P = _light(log, rig, truth, streams["sheets"])
-    p = truth.parameters
-    pixels = project(light.points_mm, truth.stereo, p["focal_scale"])
-    noise_px = p["pixel_scale"] * sd_px * streams["pixels"].standard_normal(pixels.shape)
+    driven = _drive(log.moves, truth, rig.table.harmonic_period_deg, streams)
+    truth = driven.truth
+    light = _light(log, rig, truth, streams.sheets)
+    pixels = project(light.points_mm, truth.stereo, truth.parameters["focal_scale"])
+    noise_px = truth.parameters["pixel_scale"] * sd_px * streams.pixels.standard_normal(pixels.shape)
     pixels = inside_images(pixels + noise_px, truth.stereo)
-    readings: list[float | None] = [None] * len(pixels)
-    if aperture:
-        points_T = to_tvs(points_P, p["baseline_mm"], p["pan_zero_emission_deg"])
-        angle = aperture_angle_deg(points_T, p["baseline_mm"], rig.table.aperture_convention)
-        noise = p["aperture_sd_deg"] * streams["aperture"].standard_normal(len(pixels))
-        readings = [float(b) for b in angle + p["aperture_zero_deg"] + noise]
+    angles = _aperture_deg(light, truth.parameters, rig, streams.aperture) if aperture else [None] * len(pixels)
     spots = tuple(
-        _spot(number, look, log.targets[look.placement], pixels[number], sd_px, readings[number])
+        _spot(number, look, log.targets[look.placement], pixels[number], sd_px, angles[number])
         for number, look in enumerate(log.looks)
     )
     seen = [look.move for look, spot in zip(log.looks, spots, strict=True) if spot.status == "ok"]
     if seen:
-        truth = replace(truth, reference_pose_deg=tuple(map(float, resting_deg[seen].mean(axis=0))))
+        pan, tilt = driven.resting_deg[seen].mean(axis=0)
+        truth = replace(truth, reference_pose_deg=(float(pan), float(tilt)))
     full_header = {"name": "simulated campaign", "synthetic": True, "seed": int(seed), **(header or {})}
     campaign = Campaign(tuple(log.moves), spots, rig.stereo, rig.table, full_header)
     return SimulatedCampaign(campaign, truth, light)
 
 
-def _drive(
-    moves: list[Move],
-    truth: Truth,
-    harmonic_period_deg: Mapping[str, float],
-    stops: np.random.Generator,
-    homes: np.random.Generator,
-) -> tuple[Truth, np.ndarray]:
-    """Realise the mirror angles of all moves; also return (n, 2) angles without stop errors, degrees."""
+@dataclass(frozen=True)
+class _Driven:
+    """A true rig with its angles, stop errors and home offsets as realised; the angles (n, 2) without stop errors."""
+
+    truth: Truth
+    resting_deg: np.ndarray
+
+
+def _drive(moves: Sequence[Move], truth: Truth, harmonic_period_deg: Mapping[str, float], streams: _Streams) -> _Driven:
+    """Realise the mirror angles of all moves."""
     p = truth.parameters
     counters = np.array([(m.pan_steps, m.tilt_steps) for m in moves], float).reshape(-1, 2)
     segments = np.array([m.segment for m in moves], int)
     first = np.diff(segments, prepend=-1) != 0
-    home_draws = HOME_SD_DEG * homes.standard_normal((int(segments.max(initial=0)) + 1, 2))
+    home_draws = HOME_SD_DEG * streams.homes.standard_normal((int(segments.max(initial=0)) + 1, 2))
     home_draws[0] = 0.0
-    stop_draws, start_draws = (
-        stops.standard_normal((len(moves), 2)),
-        stops.uniform(-0.5, 0.5, (len(moves), 2)),
-    )
+    stop_draws = streams.stops.standard_normal((len(moves), 2))
+    start_draws = streams.stops.uniform(-0.5, 0.5, (len(moves), 2))
     resting, errors = np.empty_like(counters), np.empty_like(counters)
-    for i, (axis, positive, negative) in enumerate((("pan", "left", "right"), ("tilt", "up", "down"))):
+    for i, (axis, (negative, positive)) in enumerate(SIDES.items()):
         approach = [m.pan_approach if axis == "pan" else m.tilt_approach for m in moves]
         side = {positive: -0.5, negative: 0.5}
         start = np.array([side.get(name, draw) for name, draw in zip(approach, start_draws[:, i], strict=True)])
@@ -308,45 +320,43 @@ def _drive(
     resting[:, 1] += p["tilt_zero_deg"]
     realised = replace(
         truth,
-        mirror_angles_deg=tuple(map(tuple, (resting + errors).tolist())),
-        stop_errors_deg=tuple(map(tuple, errors.tolist())),
-        home_offsets_deg=tuple(map(tuple, home_draws.tolist())),
+        mirror_angles_deg=_pairs((resting + errors).tolist()),
+        stop_errors_deg=_pairs(errors.tolist()),
+        home_offsets_deg=_pairs(home_draws.tolist()),
     )
-    return realised, resting
+    return _Driven(realised, resting)
 
 
-def _light(log: PlanLog, rig: Rig, truth: Truth, rng: np.random.Generator) -> tuple[Light, np.ndarray]:
-    """Where each look's beam meets its sheet, and the same points (n, 3) in P, mm; NaN where it never does."""
-    p = truth.parameters
-    rotation = rotation_matrix(np.array([p[f"extrinsics.rotation_rad.{a}"] for a in "xyz"]))
-    translation = np.array([p[f"extrinsics.translation_mm.{a}"] for a in "xyz"])
-    placements = rng.standard_normal((len(log.targets), 3))
-    depth = np.array([rig.sheets_mm[name] for name in log.targets]) + SHEET_DEPTH_SD_MM * placements[:, 0]
-    slope = np.tan(np.radians(SHEET_TILT_SD_DEG * placements[:, 1:]))
-    normals = np.column_stack((np.ones(len(depth)), slope))
+def placed_sheet(nominal_mm: np.ndarray | float, draws: np.ndarray) -> Sheet:
+    """Sheets (...) as a hand puts them at their nominal X; `draws` (..., 3) are standard normal."""
+    slope = np.tan(np.radians(SHEET_TILT_SD_DEG * draws[..., 1:]))
+    normal = np.concatenate((np.ones((*draws.shape[:-1], 1)), slope), axis=-1)
+    return Sheet(nominal_mm + SHEET_DEPTH_SD_MM * draws[..., 0], normal)
+
+
+def _light(log: PlanLog, rig: Rig, truth: Truth, rng: np.random.Generator) -> Light:
+    """Where each look's beam meets its sheet; NaN where it never does."""
+    nominal_mm = np.array([rig.sheets_mm[name] for name in log.targets])
+    sheets = placed_sheet(nominal_mm, rng.standard_normal((len(log.targets), 3)))
     move, placement = np.array([(look.move, look.placement) for look in log.looks], int).reshape(-1, 2).T
-    angles = np.radians(np.array(truth.mirror_angles_deg).reshape(-1, 2)[move])
-    origin_P, direction_P = mirror_chain(angles[:, 0], angles[:, 1], p)
-    origin, direction = origin_P @ rotation.T + translation, direction_P @ rotation.T
-    normal = normals[placement]
-    with np.errstate(divide="ignore"):
-        distance = (depth[placement] - np.sum(origin * normal, axis=1)) / np.sum(direction * normal, axis=1)
-    distance = np.where(distance > 0, distance, np.nan)[:, None]
-    return Light(origin + distance * direction, direction, normal), origin_P + distance * direction_P
+    psi, beta = np.radians(np.array(truth.mirror_angles_deg).reshape(-1, 2)[move]).T
+    return light_on_sheet(psi, beta, truth.parameters, Sheet(sheets.depth_mm[placement], sheets.normal[placement]))
+
+
+def _aperture_deg(light: Light, p: Mapping[str, float], rig: Rig, rng: np.random.Generator) -> list[float]:
+    """What the aperture reads of each look, its zero and noise included."""
+    points_T = to_tvs(light.points_P_mm, p["baseline_mm"], p["pan_zero_emission_deg"])
+    angle = aperture_angle_deg(points_T, p["baseline_mm"], rig.table.aperture_convention)
+    noise = p["aperture_sd_deg"] * rng.standard_normal(len(angle))
+    return [float(b) for b in angle + p["aperture_zero_deg"] + noise]
 
 
 def _spot(
-    number: int,
-    look: PlannedLook,
-    target: str,
-    pixels: np.ndarray,
-    sd_px: float,
-    b: float | None,
+    number: int, look: PlannedLook, target: str, pixels: np.ndarray, sd_px: float, aperture_deg: float | None
 ) -> Spot:
     """A row of spots.csv; the aperture sees what a camera sees, so an unseen spot has no reading."""
     step = look.step
+    row = Spot(number, look.move, target, step.experiment, step.point, *NO_PIXELS, *NO_PIXELS, status="undetected")
     if not np.isfinite(pixels).all():
-        empty = (None,) * 8
-        return Spot(number, look.move, target, step.experiment, step.point, *empty, status="undetected")
-    values = (*map(float, pixels), *(sd_px,) * 4)
-    return Spot(number, look.move, target, step.experiment, step.point, *values, aperture_deg=b)
+        return row
+    return with_pixels(replace(row, aperture_deg=aperture_deg), "ok", pixels.tolist(), (sd_px,) * 4)

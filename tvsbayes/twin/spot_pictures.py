@@ -1,10 +1,10 @@
-"""The virtual cameras of the twin: pictures of a laser spot on a sheet, and of a checkerboard.
+"""Pictures of a laser spot on a sheet, as the twin's cameras take them.
 
 The order is that of a real camera: irradiance at the sensor (spot, speckle, ambient light, optical blur, integrated
-over the pixel), Bayer mosaic, shot and read noise, clipping, 8 bits, demosaicing by OpenCV. Frames S (stereo) and the
-cameras' own axes as in DESIGN 2; mm; px with the integer at the centre of a pixel; DN = grey levels of 8 bits.
-Pictures are (height, width, 3) uint8, blue, green, red. Everything random follows from the seeds given, whatever the
-order or the number of threads.
+over the pixel), Bayer mosaic, shot and read noise, clipping, 8 bits, demosaicing by OpenCV. Frame S (stereo) and the
+cameras' own axes; mm; px with the integer at the centre of a pixel; DN = grey levels of 8 bits. Pictures are
+(height, width, 3) uint8, blue, green, red. Everything random follows from the seeds given, whatever the order or the
+number of threads.
 
 The spot is the image of a round Gaussian beam on an oblique sheet through the camera's linearised map at the point
 where the beam's axis meets the sheet: an elliptic Gaussian whose centroid IS the projection of that point. What the
@@ -21,12 +21,12 @@ from functools import lru_cache
 
 import numpy as np
 
-from tvsbayes.instrument.stereo_pair import Stereo
-from tvsbayes.twin.physics import project_camera
+from tvsbayes.twin.physics import Camera, CameraPair, Light, camera_axes
 
 WINDOW_SDS = 6.0
 """Half side of the rendered window in spot sds: a spot ten times overexposed ends at 4e-5 DN."""
 _STREAMS = {"speckle": 0, "noise": 1, "board": 2}
+_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(3)
 
 
 @dataclass(frozen=True)
@@ -72,39 +72,6 @@ class Scene:
 
 
 @dataclass(frozen=True)
-class Camera:
-    """One camera: `rotation`, `translation_mm` take points of the left camera's axes to its own."""
-
-    matrix: np.ndarray
-    distortion: np.ndarray
-    rotation: np.ndarray
-    translation_mm: np.ndarray
-    width: int
-    height: int
-
-    def project(self, points_mm: np.ndarray) -> np.ndarray:
-        """Pixels (n, 2) of points (n, 3) in the left camera's axes; NaN where no image forms."""
-        return project_camera(points_mm @ self.rotation.T + self.translation_mm, self.matrix, self.distortion)
-
-
-@dataclass(frozen=True)
-class CameraPair:
-    """The two cameras of a rig."""
-
-    left: Camera
-    right: Camera
-
-
-def cameras_of(stereo: Stereo, focal_scale: float = 1.0) -> CameraPair:
-    """Both cameras of a calibration; `focal_scale` multiplies fx and fy (1 in visible light, DESIGN 3.3)."""
-    scale = np.array([[focal_scale, 1.0, 1.0], [1.0, focal_scale, 1.0], [1.0, 1.0, 1.0]])
-    size = stereo.image_width, stereo.image_height
-    left = Camera(stereo.M1 * scale, np.asarray(stereo.D1, float).ravel(), np.eye(3), np.zeros(3), *size)
-    pose = np.asarray(stereo.R, float), np.asarray(stereo.T, float).ravel()
-    return CameraPair(left, Camera(stereo.M2 * scale, np.asarray(stereo.D2, float).ravel(), *pose, *size))
-
-
-@dataclass(frozen=True)
 class Footprint:
     """The image of a spot before the sensor: an elliptic Gaussian.
 
@@ -147,8 +114,7 @@ def footprint(
         scene: beam and exposure.
         blur_px: sd of the lens' point spread.
     """
-    axes = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])  # frame S -> left camera, DESIGN 2
-    point, beam, normal = (axes @ np.asarray(v, float) for v in (point_S_mm, direction_S, normal_S))
+    point, beam, normal = (camera_axes(vector) for vector in (point_S_mm, direction_S, normal_S))
     beam, normal = beam / np.linalg.norm(beam), normal / np.linalg.norm(normal)
     if not np.isfinite(point).all():
         return None
@@ -162,9 +128,6 @@ def footprint(
     slope = (seen[1:3] - seen[3:5]).T / (2 * step_mm)
     covariance = slope @ sheet_covariance @ slope.T + blur_px**2 * np.eye(2)
     return Footprint(seen[0], covariance, scene.peak_dn * abs(float(beam @ normal)))
-
-
-_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(3)
 
 
 def spot_irradiance(spot: Footprint, width: int, height: int) -> tuple[tuple[slice, slice], np.ndarray]:
@@ -216,6 +179,7 @@ def _mosaic_response(width: int, height: int, response: tuple[float, float, floa
 
 @lru_cache(maxsize=8)
 def ambient_level(width: int, height: int, level_dn: float, gradient_dn: float) -> np.ndarray:
+    """Light of the room (height, width) in DN: `level_dn` in the middle, a plane over the picture, never negative."""
     u = np.linspace(-0.5, 0.5, width, dtype=np.float32)
     v = np.linspace(-0.5, 0.5, height, dtype=np.float32)[:, None]
     return np.maximum(level_dn - gradient_dn * (u + v) / 2, 0)
@@ -240,6 +204,7 @@ def expose(irradiance_dn: np.ndarray, sensor: Sensor, rng: np.random.Generator |
 
 
 def random_stream(name: str, *numbers: int) -> np.random.Generator:
+    """The generator of one part of chance, a key of `_STREAMS`, of what the whole numbers name."""
     return np.random.default_rng(np.random.SeedSequence([_STREAMS[name], *map(int, numbers)]))
 
 
@@ -275,32 +240,25 @@ def render_spot(
 
 
 def render_spots(
-    cameras: CameraPair,
-    point_S_mm: np.ndarray,
-    direction_S: np.ndarray,
-    normal_S: np.ndarray,
-    scene: Scene,
-    sensor: Sensor,
-    seed: int,
-    spot: int,
-    frame: int = 0,
+    cameras: CameraPair, light: Light, scene: Scene, sensor: Sensor, seed: int, spot: int, frame: int = 0
 ) -> SpotFrames:
     """Both pictures of one look; speckle and noise of the two cameras are independent.
 
     Args:
         cameras: the true cameras at the laser's wavelength (`cameras_of` with the focal scale).
-        point_S_mm: (3,) where the beam's axis meets the sheet, frame S; NaN: ambient light only.
-        direction_S: (3,) along the beam.
-        normal_S: (3,) of the sheet.
+        light: of one beam; where it meets no sheet there is ambient light only.
         scene: beam, exposure, ambient light, speckle.
         sensor: both sensors.
         seed: of the campaign.
         spot: number of the look.
         frame: number of the exposure of this look.
     """
-    marks, pictures = [], []
-    for number, camera in enumerate((cameras.left, cameras.right)):
-        mark = footprint(camera, point_S_mm, direction_S, normal_S, scene, sensor.blur_px)
-        marks.append(mark)
-        pictures.append(render_spot(mark, camera.width, camera.height, scene, sensor, (seed, spot, number), frame))
-    return SpotFrames(*pictures, *marks)
+
+    def taken(number: int, camera: Camera) -> tuple[np.ndarray, Footprint | None]:
+        at = light.points_mm, light.directions, light.normals
+        mark = footprint(camera, *at, scene, sensor.blur_px)
+        return render_spot(mark, camera.width, camera.height, scene, sensor, (seed, spot, number), frame), mark
+
+    left, left_mark = taken(0, cameras.left)
+    right, right_mark = taken(1, cameras.right)
+    return SpotFrames(left, right, left_mark, right_mark)

@@ -1,0 +1,110 @@
+"""The pictures of a simulated campaign on disk: a pair per look, and board views to calibrate the cameras from.
+
+Spots are seen by the true cameras at the laser's wavelength, boards in visible light (focal scale 1). Light and sensors
+are those of `Scene()` and `Sensor()`, the board is the paper's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import partial
+from os import cpu_count
+from pathlib import Path
+
+import numpy as np
+
+from tvsbayes.files.disk import make_folder, write_atomically
+from tvsbayes.files.images import png_bytes
+from tvsbayes.instrument.campaign import CAMERAS, frame_name
+from tvsbayes.twin.board_pictures import Board, BoardPose, board_poses, render_board
+from tvsbayes.twin.physics import CameraPair, cameras_of
+from tvsbayes.twin.simulated_campaign import SimulatedCampaign
+from tvsbayes.twin.spot_pictures import Scene, Sensor, render_spots
+
+BOARD_VIEWS = 20
+"""Views of the checkerboard, as the paper took (section 2.3)."""
+WORKERS_MAX = 8
+
+
+def write_frames(
+    folder: Path,
+    simulated: SimulatedCampaign,
+    seed: int,
+    *,
+    views: int | None = None,
+    done: Callable[[int, int], None] | None = None,
+) -> int:
+    """Write `frames/000000_left.png`, `_right.png` of every look and `boards/left01.png`, `right01.png` ...
+
+    Args:
+        folder: the campaign's folder, which exists.
+        simulated: what the twin did.
+        seed: of speckle, noise and board poses.
+        views: how many board views, by default `BOARD_VIEWS`; 0 writes no `boards/`.
+        done: called with the number of pairs written and their total.
+
+    Returns:
+        How many pictures were written.
+
+    Raises:
+        InputError: the folder cannot be written.
+    """
+    visible, board = cameras_of(simulated.truth.stereo), Board()
+    views = BOARD_VIEWS if views is None else views
+    poses = board_poses(visible, board, views, seed) if views else []
+    make_folder(folder / "frames")
+    if poses:
+        make_folder(folder / "boards")
+    infrared = cameras_of(simulated.truth.stereo, simulated.truth.parameters["focal_scale"])
+    looks, boards = _Looks(folder, simulated, infrared, seed), _Boards(folder, board, poses, visible, seed)
+    jobs = [partial(boards.write, number) for number in range(len(poses))]
+    jobs += [partial(looks.write, row) for row in range(len(simulated.campaign.spots))]
+    # NumPy's generators, OpenCV and the writing of files leave Python's lock: threads are enough.
+    pool = ThreadPoolExecutor(min(WORKERS_MAX, cpu_count() or 1))
+    try:
+        for count, _ in enumerate(pool.map(lambda job: job(), jobs), start=1):
+            if done is not None:
+                done(count, len(jobs))
+    finally:
+        pool.shutdown(cancel_futures=True)
+    return 2 * len(jobs)
+
+
+@dataclass(frozen=True)
+class _Looks:
+    """Pictures of the looks of a campaign."""
+
+    folder: Path
+    simulated: SimulatedCampaign
+    cameras: CameraPair
+    seed: int
+
+    def write(self, row: int) -> None:
+        """Both pictures of a row of spots.csv."""
+        number = self.simulated.campaign.spots[row].spot
+        made = render_spots(self.cameras, self.simulated.light.of(row), Scene(), Sensor(), self.seed, number)
+        for camera, picture in zip(CAMERAS, (made.left, made.right), strict=True):
+            _write(self.folder / frame_name(number, camera), picture)
+
+
+@dataclass(frozen=True)
+class _Boards:
+    """Pictures of a board in its poses."""
+
+    folder: Path
+    board: Board
+    poses: list[BoardPose]
+    cameras: CameraPair
+    seed: int
+
+    def write(self, number: int) -> None:
+        """Both pictures of a pose."""
+        for side, (name, camera) in enumerate(zip(CAMERAS, (self.cameras.left, self.cameras.right), strict=True)):
+            picture = render_board(camera, self.poses[number], self.board, Sensor(), (self.seed, number, side))
+            _write(self.folder / "boards" / f"{name}{number + 1:02d}.png", picture)
+
+
+def _write(path: Path, picture: np.ndarray) -> None:
+    write_atomically(path, png_bytes(picture))
