@@ -29,7 +29,7 @@ from tvsbayes.estimators.four_point import classic
 from tvsbayes.estimators.joint_fit import fit
 from tvsbayes.files.disk import shipped_data
 from tvsbayes.instrument.campaign import read_campaign
-from tvsbayes.metrology.budget import budget
+from tvsbayes.metrology.look_budget import budget
 
 RANGES_MM = (200.0, 300.0, 400.0, 500.0, 700.0, 1000.0, 1400.0)
 PICTURE = Path(__file__).with_suffix(".png")

@@ -53,7 +53,7 @@ def evidence_of(
     from tvsbayes.assessment.causes import headline_budget, headline_causes
     from tvsbayes.assessment.residuals import residual_causes, stop_readings, stop_residuals
     from tvsbayes.comparison.gap import explain_gap
-    from tvsbayes.metrology.iso230 import positioning
+    from tvsbayes.metrology.positioning_table import positioning
 
     stops = stop_residuals(fit)
     listed = stops[:: -(-len(stops) // RESIDUALS_LISTED) or 1]

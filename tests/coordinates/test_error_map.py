@@ -22,7 +22,7 @@ from tvsbayes.estimators.four_point import ClassicResult, DirectionResult
 from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.estimators.linear_spots import StopGroup, StopInformation
 from tvsbayes.instrument.parameters import HARMONIC_PRIORS, INDEX, NAMES, RIG_NAMES, RIG_PRIORS, Prior
-from tvsbayes.metrology.budget import APERTURE_HERE, PLAY_HERE, STOP_HERE, budget
+from tvsbayes.metrology.look_budget import APERTURE_HERE, PLAY_HERE, STOP_HERE, budget
 from tvsbayes.model.parameter_space import parameter_space
 from tvsbayes.twin.physics import aperture_angle_deg
 

@@ -21,7 +21,7 @@ from support.small_campaign import small_campaign
 from tvsbayes.errors import InputError, NotConverged
 from tvsbayes.instrument.campaign import Campaign, input_hashes
 from tvsbayes.metrology.dcc import COUNTRY_NOT_STATED, NOT_ACCREDITED, check_dcc, dcc_bytes
-from tvsbayes.metrology.iso230 import positioning
+from tvsbayes.metrology.positioning_table import positioning
 from tvsbayes.results.fit_record import read_fit
 
 KEPT = Path(__file__).parents[1] / "data"

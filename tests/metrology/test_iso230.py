@@ -19,21 +19,17 @@ from support.small_campaign import small_campaign
 
 from tvsbayes.assessment.causes import headline_budget
 from tvsbayes.assessment.residuals import stop_readings
+from tvsbayes.calibration.optics import beam_deg_per_step
 from tvsbayes.calibration.pointing import INPUT_NAMES, NOISE_NAMES, Calibration
 from tvsbayes.estimators.linear_spots import Linearised
 from tvsbayes.instrument.campaign import Move, Spot
 from tvsbayes.instrument.parameters import unit_of
 from tvsbayes.instrument.rig import RigTable
-from tvsbayes.metrology.budget import CORRELATIONS, Source, budget_table, coordinate_budget
-from tvsbayes.metrology.iso230 import (
-    FIGURES,
-    INDIRECT,
-    beam_deg_per_step,
-    iso230,
-    positioning,
-    simulated_runs,
-    target_steps,
-)
+from tvsbayes.metrology.budget_tables import CORRELATIONS, Source, budget_table
+from tvsbayes.metrology.iso230 import FIGURES, figures_of
+from tvsbayes.metrology.look_budget import APERTURE_HERE, PLAY_HERE, STOP_HERE, Budget, coordinate_budget
+from tvsbayes.metrology.positioning_table import INDIRECT, positioning
+from tvsbayes.metrology.simulated_cycles import simulated_runs, target_steps
 from tvsbayes.statistics.intervals import coverage_factor
 from tvsbayes.twin.physics import effective_deg_per_step, harmonics_deg, mirror_chain, transmission
 from tvsbayes.twin.simulated_campaign import with_derived
@@ -78,7 +74,7 @@ def vector_runs() -> tuple[np.ndarray, np.ndarray]:
 
 
 def test_figures_of_the_published_readings():
-    found = iso230(*vector_runs())
+    found = figures_of(*vector_runs())
     assert set(PUBLISHED) == set(FIGURES)
     for name, value in PUBLISHED.items():
         assert float(getattr(found, name)) == pytest.approx(value, rel=PRINTED), name
@@ -94,9 +90,9 @@ def test_figures_of_the_published_readings():
 def test_figures_of_many_tests_are_those_of_each():
     rng = np.random.default_rng(1)
     up, down = rng.normal(size=(3, 4, 5)), rng.normal(size=(3, 4, 6))
-    together = iso230(up, down)
+    together = figures_of(up, down)
     for k in range(3):
-        one = iso230(up[k], down[k])
+        one = figures_of(up[k], down[k])
         for name in vars(one):
             np.testing.assert_allclose(getattr(together, name)[k], getattr(one, name), rtol=ROUNDING)
 
@@ -104,9 +100,9 @@ def test_figures_of_many_tests_are_those_of_each():
 def test_laws_of_the_figures():
     rng = np.random.default_rng(2)
     up, down = rng.normal(size=(6, 5)), rng.normal(0.5, 2.0, size=(6, 5))
-    found = iso230(up, down)
+    found = figures_of(up, down)
     # A common offset changes nothing; exchanging the sides exchanges their figures and turns B_i round.
-    shifted, turned = iso230(up + 7.0, down + 7.0), iso230(down, up)
+    shifted, turned = figures_of(up + 7.0, down + 7.0), figures_of(down, up)
     for name in FIGURES:
         partner = name.replace("_up_", "_X_").replace("_down_", "_up_").replace("_X_", "_down_")
         sign = -1 if name == "mean_reversal_deg" else 1
@@ -123,8 +119,8 @@ def test_runs_that_were_not_made_are_left_out():
     up, down = rng.normal(size=(2, 3)), rng.normal(size=(2, 4))
     padded = np.full((2, 6), np.nan)
     padded[:, 1:4] = up
-    for name, value in vars(iso230(padded, down)).items():
-        np.testing.assert_allclose(value, getattr(iso230(up, down), name), rtol=ROUNDING)
+    for name, value in vars(figures_of(padded, down)).items():
+        np.testing.assert_allclose(value, getattr(figures_of(up, down), name), rtol=ROUNDING)
 
 
 @pytest.mark.parametrize(
@@ -140,7 +136,7 @@ def test_runs_that_were_not_made_are_left_out():
 )
 def test_too_little_for_figures_is_refused(up, down):
     with pytest.raises(ValueError, match="target"):
-        iso230(up, down)
+        figures_of(up, down)
 
 
 def known_calibration(draws: int = 50, **changed: float) -> Calibration:
@@ -259,7 +255,7 @@ def test_the_predicted_interval_holds_a_test_on_the_true_rig():
     fresh = inputs.copy()
     fresh[:, INPUT_NAMES.index("backlash_deg.pan")] = np.abs(rng.normal(0.3, 0.05, rigs))
     up, down = up_and_down(replace(base, inputs=fresh), "pan", (0, 50, 100, 150), 0.06, tests=rigs, seed=9)
-    values = iso230(up, down).reversal_deg
+    values = figures_of(up, down).reversal_deg
     held = np.count_nonzero((values >= interval[0]) & (values <= interval[1]))
     # Binomial(300, 0.95) at 1e-4 either side, widened by the interval's own error of 0.4 % in probability.
     assert 265 <= held <= 298
@@ -404,7 +400,7 @@ def test_plug_in_figures_are_those_of_the_stops():
     order = [n for _ in range(4) for n in (0, 100, 200, 300, 200, 100)]
     up = np.array([[offsets[k] for k in range(24) if order[k] == n and k % 6 < 3] for n in (100, 200)])
     down = np.array([[offsets[k] for k in range(24) if order[k] == n and k % 6 > 3] for n in (100, 200)])
-    expected = iso230(up - 0.15, down + 0.15)
+    expected = figures_of(up - 0.15, down + 0.15)
     for name in FIGURES:
         assert float(getattr(table.plug_in, name)) == pytest.approx(float(getattr(expected, name)), abs=1e-9), name
     assert any("2 targets, at least 4 runs" in note for note in table.notes)
@@ -614,9 +610,7 @@ def test_half_normal_and_log_normal_priors_state_their_own_moments(linear_fit):
     assert causes.centre[k] == pytest.approx(math.log(stated.value), abs=1e-12)
 
 
-def test_coordinate_budgets_by_parameter_and_by_cause():
-    from tvsbayes.metrology.budget import APERTURE_HERE, PLAY_HERE, STOP_HERE, Budget
-
+def test_coordinate_budgets_by_parameter():
     one = bent_calibration()
     rng = np.random.default_rng(7)
     noises = (
@@ -637,17 +631,13 @@ def test_coordinate_budgets_by_parameter_and_by_cause():
     causes = ("pixel noise", "prior of extrinsics", STOP_HERE, PLAY_HERE, APERTURE_HERE)
     found = Budget(causes, parts.sum(axis=1) / parts.sum(), parts, names, contribution, correlation, covariance)
     for index, component in enumerate("xyz"):
-        tables = {by: coordinate_budget(found, one, (1.0, 2.0, 3.0), component, by=by) for by in ("parameter", "cause")}
-        for table in tables.values():
-            assert (table.estimate, table.unit) == (float(index + 1), "mm")
-            assert table.u == pytest.approx(math.sqrt(covariance[index, index]))
-            assert sum(row.share for row in table.rows) == pytest.approx(1.0, abs=1e-9)
-        # Causes are independent; of the parameters two are not.
-        assert tables["cause"].rows[-1].share == pytest.approx(0.0, abs=1e-9)
+        table = coordinate_budget(found, one, (1.0, 2.0, 3.0), component)
+        assert (table.estimate, table.unit) == (float(index + 1), "mm")
+        assert table.u == pytest.approx(math.sqrt(covariance[index, index]))
+        assert sum(row.share for row in table.rows) == pytest.approx(1.0, abs=1e-9)
+        # Two of the parameters are not independent.
         pair = 2 * 0.7 * contribution[0, index] * contribution[2, index] / covariance[index, index]
-        assert tables["parameter"].rows[-1].share == pytest.approx(pair, abs=1e-9)
-    kinds = {row.quantity: row.kind for row in tables["cause"].rows}
-    assert (kinds["pixel noise"], kinds["prior of extrinsics"], kinds[STOP_HERE]) == ("A", "B", "A")
+        assert table.rows[-1].share == pytest.approx(pair, abs=1e-9)
     rows = {row.quantity: row for row in coordinate_budget(found, one, (1.0, 2.0, 3.0), "x").rows}
     for name, row in rows.items():
         if name in names:

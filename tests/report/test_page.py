@@ -25,7 +25,7 @@ from tvsbayes.files.documents import parse_json
 from tvsbayes.instrument.axes import DIRECTIONS
 from tvsbayes.instrument.campaign import read_campaign, write_campaign
 from tvsbayes.metrology.dcc import traceability
-from tvsbayes.metrology.iso230 import positioning
+from tvsbayes.metrology.positioning_table import positioning
 from tvsbayes.report.evidence import Evidence, gather
 from tvsbayes.report.figures import WIDTH_IN, direction_scatter, points_3d, trajectories
 from tvsbayes.report.page import BROWSERS, report_html

@@ -11,7 +11,7 @@ from tvsbayes.assessment.weaknesses import gradients, moved_directions
 from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.instrument.axes import DIRECTIONS
 from tvsbayes.instrument.parameters import INDEX, KINDS, NAMES, RIG_NAMES, unit_of
-from tvsbayes.metrology.budget import BudgetTable, Source, budget_table
+from tvsbayes.metrology.budget_tables import BudgetTable, Source, budget_table
 from tvsbayes.results.estimates import HeadlineCauses
 
 if TYPE_CHECKING:

@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from tvsbayes.instrument.axes import FULL_TURN_DEG
+from tvsbayes.instrument.axes import AXES, FULL_TURN_DEG
 from tvsbayes.instrument.parameters import HARMONIC_ORDERS
 
 ROUNDING = 1e-12
@@ -173,3 +173,29 @@ def direction_of(azimuth_deg: Number, elevation_deg: Number) -> np.ndarray:
     azimuth, elevation = np.radians(azimuth_deg), np.radians(elevation_deg)
     level = np.cos(elevation)
     return np.stack([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)])
+
+
+def beam_angle_deg(values: Values, axis: str, mirror_deg: np.ndarray, other_deg: Number) -> np.ndarray:
+    """Beam angle about one axis: azimuth less its value C0 - 90 deg, or elevation; whole turns are kept.
+
+    Args:
+        values: parameters by name.
+        axis: pan or tilt.
+        mirror_deg: its mirror angles.
+        other_deg: mirror angle of the other axis.
+    """
+    pan, tilt = (mirror_deg, other_deg) if axis == "pan" else (other_deg, mirror_deg)
+    _, (u, v, w) = beam_components(values, pan, tilt)
+    if axis == "tilt":
+        return np.degrees(np.arcsin(w))
+    nominal = pan + values["pan_zero_emission_deg"] - 90.0
+    off = np.degrees(np.arctan2(v, u)) - nominal
+    return pan + (off + 180.0) % 360.0 - 180.0
+
+
+def beam_deg_per_step(values: Mapping[str, float], axis: str, pose_deg: tuple[float, float]) -> float:
+    """Mean of both directions' effective degrees per step at mirror angles (pan, tilt), as DESIGN 3.2 defines it."""
+    index, half = AXES.index(axis), 1e-3
+    here, other = pose_deg[index], pose_deg[1 - index]
+    ends = [beam_angle_deg(values, axis, np.float64(here + s * half), np.float64(other)) for s in (1, -1)]
+    return float(values[f"degrees_per_step.{axis}"] * (ends[0] - ends[1]) / (2 * half))

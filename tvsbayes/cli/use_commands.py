@@ -97,7 +97,7 @@ def locate(
     document = {"estimator": found.estimator, "draws": found.draws, **found.as_json(0)}
     text = locations_text(found)
     if budget:
-        from tvsbayes.metrology.budget import budget as point_budget
+        from tvsbayes.metrology.look_budget import budget as point_budget
         from tvsbayes.report.command_text import budget_text
 
         parts = point_budget(calibration, *where)

@@ -19,7 +19,7 @@ from pathlib import Path
 from tvsbayes.errors import InputError, NotConverged, escaped
 from tvsbayes.instrument.axes import AXES, SIDES
 from tvsbayes.instrument.campaign import Campaign, input_hashes
-from tvsbayes.metrology.budget import PROBABILITY
+from tvsbayes.metrology.budget_tables import PROBABILITY
 from tvsbayes.metrology.iso230 import FIGURES
 from tvsbayes.statistics.intervals import NORMAL_95
 

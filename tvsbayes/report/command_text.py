@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from tvsbayes.cameras.stereo_calibration import StereoCalibration
     from tvsbayes.coordinates.location import Locations
     from tvsbayes.instrument.stereo_pair import Stereo
-    from tvsbayes.metrology.budget import Budget
+    from tvsbayes.metrology.look_budget import Budget
     from tvsbayes.results.comparison_record import Comparison, Gap, GapTerm, HoldOut
 
 

@@ -14,7 +14,8 @@ from tvsbayes.errors import NothingToEstimate
 from tvsbayes.estimators.four_point import ClassicResult, classic
 from tvsbayes.instrument.axes import DIRECTIONS
 from tvsbayes.instrument.campaign import Campaign
-from tvsbayes.metrology.budget import Budget, BudgetTable, budget, coordinate_budget
+from tvsbayes.metrology.budget_tables import BudgetTable
+from tvsbayes.metrology.look_budget import Budget, budget, coordinate_budget
 from tvsbayes.results.comparison_record import CANNOT_TELL, stored_hold_out, stored_plan
 
 MET, NOT_MET = "met", "not met"

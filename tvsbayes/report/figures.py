@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
     from tvsbayes.coordinates.error_map import ErrorMap
     from tvsbayes.instrument.campaign import Campaign, Spot
-    from tvsbayes.metrology.budget import Budget
+    from tvsbayes.metrology.look_budget import Budget
 
 
 WIDTH_IN = 4.6

@@ -1,0 +1,151 @@
+"""Uncertainty budgets as the GUM asks for: input quantities, their contributions, effective degrees of freedom, U.
+
+Any unit; each row says its own. GUM = JCGM 100:2008.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+
+from tvsbayes.statistics.intervals import coverage_factor, effective_dof
+
+PROBABILITY = 0.95
+
+
+@dataclass(frozen=True)
+class Source:
+    """An input quantity of a budget.
+
+    Attributes:
+        quantity, unit: its name and the unit of estimate and u; unit "1" for a standardised effect.
+        estimate: its value, None where it is no single quantity.
+        u: standard uncertainty.
+        kind: "A" by statistics of the campaign, "B" otherwise (GUM 4.2, 4.3), "A, B" for a parameter fitted from both.
+        distribution: from which u comes.
+        dof: degrees of freedom of u (GUM G.4), infinite where it is taken as known.
+        sensitivity: change of the result per unit of the quantity.
+    """
+
+    quantity: str
+    unit: str
+    estimate: float | None
+    u: float
+    kind: str
+    distribution: str
+    dof: float
+    sensitivity: float
+
+
+@dataclass(frozen=True)
+class BudgetRow:
+    """A line of a budget; fields as in `Source`, None where a line sums up several or is the correlation row.
+
+    `contribution` is sensitivity times u, signed, in the unit of the result; `share` is of the combined variance and
+    negative where correlations take variance away.
+    """
+
+    quantity: str
+    unit: str
+    estimate: float | None
+    u: float | None
+    kind: str
+    distribution: str
+    dof: float | None
+    sensitivity: float | None
+    contribution: float | None
+    share: float
+
+
+@dataclass(frozen=True)
+class BudgetTable:
+    """A GUM uncertainty budget.
+
+    Attributes:
+        quantity, unit: of the result.
+        estimate: the result.
+        rows: largest contribution first; the last one is `CORRELATIONS`, so that the shares sum to 1.
+        u: combined standard uncertainty (GUM 5.1.2, 5.2.2).
+        dof: effective degrees of freedom (GUM eq. G.2b), infinite where no input's are finite.
+        coverage_factor: k = t_p(dof) (GUM G.4.1).
+        probability: coverage probability p.
+        expanded: U = k u.
+        notes: what the reader must know.
+    """
+
+    quantity: str
+    unit: str
+    estimate: float
+    rows: tuple[BudgetRow, ...]
+    u: float
+    dof: float
+    coverage_factor: float
+    probability: float
+    expanded: float
+    notes: tuple[str, ...]
+
+    def as_json(self) -> dict[str, object]:
+        """Plain values; infinite degrees of freedom become null."""
+        document = asdict(self) | {"rows": [asdict(row) for row in self.rows], "notes": list(self.notes)}
+        for entry in (document, *document["rows"]):
+            if entry["dof"] == math.inf:
+                entry["dof"] = None
+        return document
+
+
+CORRELATIONS = "correlations, and what linear propagation leaves"
+SMALL_SHARE = 1e-3
+"""Inputs below this share of the variance are summed up in one line."""
+INDEPENDENCE = (
+    "effective degrees of freedom by Welch-Satterthwaite (GUM G.4.1), which takes the inputs as independent: with a "
+    "large correlation row they are approximate"
+)
+
+
+def budget_table(
+    quantity: str,
+    unit: str,
+    estimate: float,
+    u: float,
+    sources: Sequence[Source],
+    *,
+    probability: float = PROBABILITY,
+    notes: Sequence[str] = (),
+) -> BudgetTable:
+    """Assemble a budget.
+
+    Args:
+        quantity: name of the result.
+        unit: its unit.
+        estimate: its value.
+        u: its combined standard uncertainty, correlations and all: what the rows do not reach is the correlation row.
+        sources: input quantities.
+        probability: of U.
+        notes: put before the standing one.
+
+    Returns:
+        The table.
+
+    Raises:
+        ValueError: u is not positive, or a number is not finite.
+    """
+    contributions = [s.sensitivity * s.u for s in sources]
+    if not (u > 0 and math.isfinite(u) and all(map(math.isfinite, (estimate, *contributions)))):
+        raise ValueError(f"{quantity}: a budget needs finite contributions and a positive uncertainty, not {u}")
+    shares = [(c / u) ** 2 for c in contributions]
+    rows, small = [], []
+    for source, contribution, share in sorted(zip(sources, contributions, shares, strict=True), key=lambda x: -x[2]):
+        if share < SMALL_SHARE:
+            small.append((source, contribution, share))
+        else:
+            rows.append(BudgetRow(**vars(source), contribution=contribution, share=share))
+    if small:
+        kinds = sorted({kind for source, _, _ in small for kind in source.kind.split(", ")})
+        several = (f"{len(small)} further inputs, each below {100 * SMALL_SHARE:g} %", "", None, None, ", ".join(kinds))
+        together = math.sqrt(sum(c**2 for _, c, _ in small))
+        rows.append(BudgetRow(*several, "", None, None, together, sum(share for _, _, share in small)))
+    rows.append(BudgetRow(CORRELATIONS, "", None, None, "", "", None, None, None, 1 - sum(shares)))
+    dof = effective_dof(u, contributions, [s.dof for s in sources])
+    k = coverage_factor(dof, probability)
+    return BudgetTable(quantity, unit, estimate, tuple(rows), u, dof, k, probability, k * u, (*notes, INDEPENDENCE))

@@ -1,0 +1,137 @@
+"""What the uncertainty of one located point comes from: by cause, and by parameter with correlations.
+
+Frame T, mm; law of propagation of uncertainty (GUM 5.1, 5.2).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from tvsbayes.calibration.pointing import INPUT_NAMES, UNIT_NOISES, Calibration
+from tvsbayes.instrument.parameters import unit_of
+from tvsbayes.metrology.budget_tables import BudgetTable, Source, budget_table
+
+STOP_HERE, APERTURE_HERE, PLAY_HERE = "stop error here", "aperture noise here", "unknown approach here"
+"""Causes that belong to the one look and not to the calibration."""
+
+
+@dataclass(frozen=True)
+class Budget:
+    """What the variance of one point consists of, by the law of propagation.
+
+    Attributes:
+        causes: pixel noise, stop errors of the campaign, stereo calibration, focal scale, every prior, and what this
+            one look adds.
+        share: of the total variance (sum over x, y, z), shape (causes,); sums to 1.
+        variance_mm2: by cause and coordinate, shape (causes, 3).
+        parameters: names of the inputs and of this look's noises.
+        contribution_mm: sensitivity times standard uncertainty, shape (parameters, 3).
+        correlation: of the parameters, shape (parameters, parameters); their contributions do not add up without it.
+        covariance_mm2: of the point, shape (3, 3).
+    """
+
+    causes: tuple[str, ...]
+    share: np.ndarray
+    variance_mm2: np.ndarray
+    parameters: tuple[str, ...]
+    contribution_mm: np.ndarray
+    correlation: np.ndarray
+    covariance_mm2: np.ndarray
+
+    def as_json(self) -> dict[str, object]:
+        """Causes with share and standard uncertainty, parameters with signed contributions and correlations."""
+        u = np.sqrt(self.variance_mm2)
+        return {
+            "causes": [
+                {"cause": name, "share": float(share), "u_mm": row.tolist()}
+                for name, share, row in zip(self.causes, self.share, u, strict=True)
+            ],
+            "parameters": [
+                {"name": name, "contribution_mm": row.tolist()}
+                for name, row in zip(self.parameters, self.contribution_mm, strict=True)
+            ],
+            "correlation": self.correlation.tolist(),
+        }
+
+
+def budget(
+    calibration: Calibration,
+    pan_steps: float,
+    tilt_steps: float,
+    aperture_deg: float,
+    approach: tuple[str, str] = ("left", "up"),
+) -> Budget:
+    """The uncertainty budget of one point (GUM 7.2.7 asks for it): by cause, and by parameter with correlations.
+
+    Args:
+        calibration: with causes, as a fit keeps them.
+        pan_steps: absolute counter.
+        tilt_steps: absolute counter.
+        aperture_deg: reading B.
+        approach: last move of (pan, tilt): left or right, up or down, or unknown.
+
+    Raises:
+        ValueError: a calibration that does not know its causes.
+        InputError: an approach that does not exist, or beam and line of sight do not meet.
+    """
+    if not calibration.causes:
+        raise ValueError("this calibration does not know its causes: fit the campaign again")
+    jacobian = calibration.derivatives(pan_steps, tilt_steps, aperture_deg, approach)
+    covariance = calibration.covariance_with_noise
+    count = len(INPUT_NAMES)
+    calibrated, here = jacobian[:, :count], jacobian[:, count:]
+    by_cause = [np.einsum("ij,jk,ik->i", calibrated, c, calibrated) for c in calibration.cause_covariance]
+    own = here**2 * np.diag(covariance)[count:]
+    by_cause += [own[:, :2].sum(axis=1), own[:, 2:4].sum(axis=1), own[:, 4]]
+    variance = np.array(by_cause)
+    u = np.sqrt(np.diag(covariance))
+    # What does not vary correlates with nothing.
+    safe = np.where(u > 0, u, 1.0)
+    return Budget(
+        causes=(*calibration.causes, STOP_HERE, PLAY_HERE, APERTURE_HERE),
+        share=variance.sum(axis=1) / variance.sum(),
+        variance_mm2=variance,
+        parameters=(*INPUT_NAMES, *UNIT_NOISES),
+        contribution_mm=(jacobian * u).T,
+        correlation=covariance / np.outer(safe, safe),
+        covariance_mm2=jacobian @ covariance @ jacobian.T,
+    )
+
+
+_KINDS = {"stop": ("A", "normal"), "place": ("B", "uniform"), "aperture": ("B", "normal")}
+"""Kind of evaluation (GUM 4.2, 4.3) and distribution of the unit noises, by the first word of their names."""
+
+
+def coordinate_budget(budget: Budget, calibration: Calibration, xyz_mm: Sequence[float], component: str) -> BudgetTable:
+    """The budget of x, y or z of one located point, by parameter of the calibration and noise of the look.
+
+    Args:
+        budget: of the look.
+        calibration: behind it.
+        xyz_mm: the point, frame T, mm.
+        component: "x", "y" or "z".
+
+    Raises:
+        ValueError: another component.
+    """
+    if component not in ("x", "y", "z"):
+        raise ValueError(f"component {component!r}; allowed: x, y, z")
+    index = "xyz".index(component)
+    u = math.sqrt(float(budget.covariance_mm2[index, index]))
+    sd = np.sqrt(np.diag(calibration.covariance_with_noise)).tolist()
+    sources = []
+    for name, width, moved in zip(budget.parameters, sd, budget.contribution_mm[:, index].tolist(), strict=True):
+        if width == 0:
+            continue
+        if name in UNIT_NOISES:
+            kind, shape = _KINDS[name.split()[0]]
+            sources.append(Source(name, "1", 0.0, width, kind, shape, math.inf, moved / width))
+        else:
+            estimate = calibration.estimates[name]
+            sources.append(Source(name, unit_of(name), estimate, width, "A, B", "normal", math.inf, moved / width))
+    notes = ("by parameter; parameters fitted together are correlated (GUM 5.2.2)",)
+    return budget_table(f"{component} of the point", "mm", float(xyz_mm[index]), u, sources, notes=notes)

@@ -1,0 +1,236 @@
+"""The ISO 230-2-style table of an axis: what tests on the rigs that the data allow would find, beside its own stops.
+
+Angles in degrees of the beam about the axis that turns (azimuth for pan, elevation for tilt); counters in steps.
+Nothing is fitted here and no angle standard is involved: the notes of a table say what it rests on. No JAX.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+
+import numpy as np
+
+from tvsbayes.calibration.optics import beam_angle_deg, beam_deg_per_step, output_deg
+from tvsbayes.calibration.pointing import Calibration
+from tvsbayes.instrument.axes import AXES
+from tvsbayes.instrument.stops import StopReadings
+from tvsbayes.metrology.iso230 import FIGURES, RUNS_MIN, Positioning, figures_of
+from tvsbayes.metrology.simulated_cycles import (
+    RUNS,
+    SIMULATED_TESTS,
+    TARGETS_MIN,
+    Runs,
+    simulated_runs,
+    target_steps,
+    targets_wanted,
+)
+
+INDIRECT = (
+    "ISO 230-2-style and indirect: angles of the beam are inferred from spots in two cameras through the fitted model; "
+    "no angle standard measured them"
+)
+OWN_STOPS = (
+    "plug-in: s and B hold what moved over the campaign beside stop errors: pixel noise, home offsets, drift, and what "
+    "unequal ratios of the two directions add up to; maxima of few runs are too large"
+)
+DEFINITIONS = "definitions of ISO 230-2 as secondary sources give them"
+NOT_COVERED = (
+    "drift, temperature and load: every run is taken to be made under the conditions of the campaign",
+    "errors of the gears that neither play, ratio nor the stated harmonics describe",
+    "an error that all looks of the cameras share: it is in the predicted E, M and A through the ratio, and in no "
+    "plug-in figure",
+)
+
+
+@dataclass(frozen=True)
+class Predicted:
+    """Median and equal-tailed 95 % interval of a figure over simulated tests."""
+
+    median: float
+    interval95: tuple[float, float]
+
+
+@dataclass(frozen=True)
+class AxisPositioning:
+    """ISO 230-2-style table of one axis.
+
+    Attributes:
+        axis: pan or tilt.
+        deg_per_step: targets are this times the counter.
+        predicted: field of `FIGURES` -> median and interval over tests simulated from the draws; None if the axis
+            never moved.
+        target_steps: targets of the simulated tests.
+        runs: simulated runs per target and side.
+        estimator: "posterior" or "laplace": where the draws come from.
+        plug_in: figures of the campaign's own stops, no leading axis; None where `missing` says why.
+        plug_in_steps: counters of its targets.
+        plug_in_runs: runs (up, down) at each of them.
+        reading_u_deg: root mean square standard uncertainty of one reading from pixel noise, which is in every s.
+        missing: why there is no plug-in table.
+        notes: that it is indirect, what it rests on and what it does not cover.
+    """
+
+    axis: str
+    deg_per_step: float
+    predicted: dict[str, Predicted] | None
+    target_steps: tuple[int, ...]
+    runs: int
+    estimator: str
+    plug_in: Positioning | None
+    plug_in_steps: tuple[int, ...]
+    plug_in_runs: tuple[tuple[int, int], ...]
+    reading_u_deg: float | None
+    missing: str | None
+    notes: tuple[str, ...]
+
+    def as_json(self) -> dict[str, object]:
+        """Plain values; tuples become lists."""
+        document = {name: value for name, value in vars(self).items() if name not in ("predicted", "plug_in")}
+        predicted = None if self.predicted is None else {name: asdict(p) for name, p in self.predicted.items()}
+        document |= {"predicted": predicted, "plug_in": self.plug_in and self.plug_in.as_json()}
+        return json.loads(json.dumps(document, allow_nan=False))
+
+
+@dataclass(frozen=True)
+class _PlugIn:
+    """Figures of the campaign's own stops, their targets and runs from either side, or why there are none."""
+
+    figures: Positioning | None = None
+    steps: tuple[int, ...] = ()
+    runs: tuple[tuple[int, int], ...] = ()
+    missing: str | None = None
+    reading_u_deg: float | None = None
+    notes: tuple[str, ...] = ()
+
+
+def _plug_in(readings: StopReadings, deg_per_step: float, wanted: int) -> _PlugIn:
+    """What the campaign's own stops say, where targets are `deg_per_step` times the counter and ISO wants so many."""
+    u = float(np.sqrt(np.mean(readings.u_deg**2))) if len(readings.u_deg) else None
+    left_out, few = readings.play_left_out, []
+    unplayed = [f"plug-in: {left_out} stops left out whose play was not taken up for certain"] if left_out else []
+    runs = {
+        int(n): [np.flatnonzero((readings.steps == n) & (readings.side == s)) for s in (1, -1)]
+        for n in np.unique(readings.steps)
+    }
+    usable = {n: pair for n, pair in runs.items() if min(map(len, pair)) >= RUNS_MIN}
+    if len(usable) < TARGETS_MIN:
+        both = f"{len(usable)} counter{'s' * (len(usable) != 1)}"
+        reason = (
+            f"{both} of the {readings.axis} axis with at least {RUNS_MIN} stops from either side; {TARGETS_MIN} "
+            f"are needed, ISO 230-2 asks for {wanted} with {RUNS} runs"
+        )
+        return _PlugIn(missing=reason, reading_u_deg=u, notes=tuple(unplayed))
+    other = readings.reference_pose_deg[1 - AXES.index(readings.axis)]
+    angle = beam_angle_deg(readings.values, readings.axis, readings.mirror_deg, other)
+    deviation = angle - deg_per_step * readings.steps
+    longest = max(len(rows) for pair in usable.values() for rows in pair)
+    table = np.full((2, len(usable), longest), np.nan)
+    for k, pair in enumerate(usable.values()):
+        for side, rows in enumerate(pair):
+            table[side, k, : len(rows)] = deviation[rows]
+    counts = tuple((len(a), len(b)) for a, b in usable.values())
+    fewest = min(map(min, counts))
+    if len(usable) < wanted or fewest < RUNS:
+        few.append(
+            f"plug-in: {len(usable)} targets, at least {fewest} runs per side; ISO 230-2 asks for {wanted} targets and "
+            f"{RUNS} runs"
+        )
+    return _PlugIn(
+        figures=figures_of(table[0], table[1]),
+        steps=tuple(usable),
+        runs=counts,
+        reading_u_deg=u,
+        notes=(OWN_STOPS, *few, *unplayed),
+    )
+
+
+def _predicted(runs: Runs) -> dict[str, Predicted]:
+    """Median and interval of every figure over simulated tests."""
+    found = figures_of(runs.up_deg, runs.down_deg)
+    predicted = {}
+    for name in FIGURES:
+        low, middle, high = np.quantile(getattr(found, name), [0.025, 0.5, 0.975])
+        predicted[name] = Predicted(float(middle), (float(low), float(high)))
+    return predicted
+
+
+def _middle_deg_per_step(calibration: Calibration, axis: str) -> float:
+    """The beam's mean ratio of both directions at the middle of the counters, in mid-play."""
+    estimates = calibration.estimates
+    pan, tilt = (
+        float(output_deg(estimates, a, n, 0.0, calibration.period_deg.get(a)))
+        for a, n in zip(AXES, calibration.range_steps.mean(axis=1).tolist(), strict=True)
+    )
+    return beam_deg_per_step(estimates, axis, (pan, tilt))
+
+
+def positioning(
+    calibration: Calibration,
+    axis: str,
+    *,
+    readings: StopReadings | None = None,
+    deg_per_step: float | None = None,
+    targets: Sequence[int] | None = None,
+    runs: int = RUNS,
+    tests: int = SIMULATED_TESTS,
+    contrast_deg_per_step: np.ndarray | None = None,
+    seed: int = 0,
+) -> AxisPositioning:
+    """The ISO 230-2-style table of an axis: posterior predictive, beside the campaign's own stops.
+
+    Args:
+        calibration: with draws.
+        axis: pan or tilt.
+        readings: of `stop_readings`; None leaves the plug-in table out.
+        deg_per_step: what turns counters into target angles: None takes the calibrated mean of both directions at the
+            middle of the counters, as a user of the calibration would; give the design ratio to see the uncalibrated
+            axis.
+        targets: counters of the simulated tests; None spreads them over the campaign's range.
+        runs: as in `simulated_runs`, like the next three.
+        tests: number of simulated tests.
+        contrast_deg_per_step: draws of the ratio contrast.
+        seed: of targets and stop errors.
+
+    Returns:
+        The table, with what it does not cover.
+
+    Raises:
+        ValueError: the calibration holds no draws.
+    """
+    if not len(calibration.inputs):
+        raise ValueError("this calibration has no draws: read it from results/draws.npz")
+    low, high = calibration.range_steps[AXES.index(axis)]
+    ratio = _middle_deg_per_step(calibration, axis) if deg_per_step is None else float(deg_per_step)
+    chosen = target_steps(low, high, ratio, seed) if targets is None else tuple(map(int, targets))
+    predicted = None
+    made = f"no prediction: the {axis} axis was never moved over a range"
+    if chosen:
+        contrast = contrast_deg_per_step
+        predicted = _predicted(
+            simulated_runs(
+                calibration, axis, chosen, ratio, runs=runs, tests=tests, contrast_deg_per_step=contrast, seed=seed
+            )
+        )
+        made = (
+            f"predicted: {tests} simulated tests of {runs} runs per side, homed once before each test, drawn from the "
+            f"{calibration.estimator}; a difference between the ratios of the two directions carries run after run on"
+        )
+    own = _PlugIn(missing="no stops were given")
+    if readings is not None:
+        own = _plug_in(readings, ratio, targets_wanted((high - low) * ratio))
+    return AxisPositioning(
+        axis=axis,
+        deg_per_step=ratio,
+        predicted=predicted,
+        target_steps=chosen,
+        runs=runs,
+        estimator=calibration.estimator,
+        plug_in=own.figures,
+        plug_in_steps=own.steps,
+        plug_in_runs=own.runs,
+        reading_u_deg=own.reading_u_deg,
+        missing=own.missing,
+        notes=(INDIRECT, *own.notes, made, DEFINITIONS, *(f"not covered: {text}" for text in NOT_COVERED)),
+    )
