@@ -41,7 +41,7 @@ STATED_PX = 0.08
 
 def drawn_campaign(factor: str, level: float, seed: int):
     """A campaign of a drawn rig with one factor set, and its truth."""
-    from tvsbayes.instrument.plan import four_point_protocol
+    from tvsbayes.instrument.protocols import four_point_protocol
     from tvsbayes.twin.simulated_campaign import draw_truth, simulate
 
     rig = mounted_rig()

@@ -45,7 +45,8 @@ CAUSES = ("looks", "cameras", "priors")
 
 def full_turn_plan(looks: int, turn_steps: int = TURN_STEPS):
     """`looks` poses near and a turn later on each of two sheets, from either side of both axes."""
-    from tvsbayes.instrument.plan import OVERSHOOT_STEPS, PlanStep
+    from tvsbayes.instrument.plan import PlanStep
+    from tvsbayes.instrument.protocols import OVERSHOOT_STEPS
 
     # Neighbours differ in tilt, and in eight looks each axis is reached from either side at either end.
     poses = ((0, -90), (200, 90), (70, 90), (140, -90), (200, -90), (0, 90), (140, 90), (70, -90))
@@ -129,7 +130,7 @@ def planned_family(knowledge):
 def plan_and_rig(name: str):
     """Plan and rig of a point that is checked by refits."""
     from tvsbayes.instrument.parameters import Prior
-    from tvsbayes.instrument.plan import mixed_protocol
+    from tvsbayes.instrument.protocols import mixed_protocol
     from tvsbayes.planning.expectation import prior_knowledge
 
     rig = mounted_rig()
@@ -160,7 +161,7 @@ def one_row(task: tuple[str, int]) -> dict[str, object]:
 def table() -> None:
     """Curves, split and refits."""
     from tvsbayes.estimators.campaign_arrays import use_compilation_cache
-    from tvsbayes.instrument.plan import grid_protocol, mixed_protocol, paper_protocol
+    from tvsbayes.instrument.protocols import grid_protocol, mixed_protocol, paper_protocol
     from tvsbayes.planning.expectation import prior_knowledge
     from tvsbayes.planning.search import LADDER
 

@@ -32,7 +32,7 @@ from tvsbayes.files.disk import shipped_data
 from tvsbayes.instrument.axes import DIRECTIONS
 from tvsbayes.instrument.campaign import read_campaign
 from tvsbayes.instrument.parameters import INDEX
-from tvsbayes.instrument.plan import four_point_protocol, mixed_protocol, paper_protocol
+from tvsbayes.instrument.protocols import four_point_protocol, mixed_protocol, paper_protocol
 from tvsbayes.planning.expectation import Knowledge, information_of, prior_knowledge
 from tvsbayes.twin.physics import project
 from tvsbayes.twin.simulated_campaign import read_truth, simulate

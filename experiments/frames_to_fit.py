@@ -39,7 +39,7 @@ def observed(source: str, seed: int):
 
     from tvsbayes.cameras.detection import detect
     from tvsbayes.instrument.campaign import read_campaign
-    from tvsbayes.instrument.plan import four_point_protocol
+    from tvsbayes.instrument.protocols import four_point_protocol
     from tvsbayes.twin.frames import write_frames
     from tvsbayes.twin.physics import project
     from tvsbayes.twin.simulated_campaign import simulate

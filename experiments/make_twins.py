@@ -18,7 +18,8 @@ import numpy as np
 from tvsbayes.estimators.four_point import classic, four_point_ratios, select_experiments
 from tvsbayes.instrument.axes import DIRECTIONS
 from tvsbayes.instrument.campaign import read_campaign
-from tvsbayes.instrument.plan import PROTOCOLS, PlanStep, write_plan
+from tvsbayes.instrument.plan import PlanStep, write_plan
+from tvsbayes.instrument.protocols import PROTOCOLS
 from tvsbayes.instrument.rig import Rig, read_rig
 from tvsbayes.instrument.stereo_pair import Stereo, rotation_matrix, write_stereo
 from tvsbayes.twin.physics import project

@@ -18,7 +18,7 @@ import numpy as np
 from studies import mounted_rig
 
 from tvsbayes.estimators.campaign_arrays import use_compilation_cache
-from tvsbayes.instrument.plan import grid_protocol, mixed_protocol, paper_protocol
+from tvsbayes.instrument.protocols import grid_protocol, mixed_protocol, paper_protocol
 from tvsbayes.planning.candidates import LookArrays, candidates, covariance_of
 from tvsbayes.planning.expectation import information_of, prior_knowledge
 from tvsbayes.planning.limits import MANY, limit_of, split_of

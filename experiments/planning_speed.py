@@ -17,7 +17,7 @@ import numpy as np
 from studies import mounted_rig
 
 from tvsbayes.estimators.campaign_arrays import use_compilation_cache
-from tvsbayes.instrument.plan import grid_protocol, paper_protocol
+from tvsbayes.instrument.protocols import grid_protocol, paper_protocol
 from tvsbayes.planning.candidates import LookArrays, Looks
 from tvsbayes.planning.expectation import PARAMETERS, expect, information_of, padded_size, prior_knowledge
 from tvsbayes.planning.search import Search

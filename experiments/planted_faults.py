@@ -225,8 +225,8 @@ FAULTS = (
     Fault(
         "stop error per pose instead of per stop",
         "instrument/stops.py",
-        "                if delta:\n",
-        "                if any(deltas):\n",
+        "redraw = np.diff(came_by, axis=0, prepend=-1) != 0",
+        "redraw = np.any(np.diff(came_by, axis=0, prepend=-1) != 0, axis=1, keepdims=True) | [False, False]",
         "spots taken while the other axis moves count as independent stops: ratios too sure",
         ("estimators/likelihood",),
     ),
@@ -416,7 +416,7 @@ FAULTS = (
     Fault(
         "lost motion of a right move from the tilt axis",
         "posterior/draws.py",
-        'axis = "pan" if direction in ("left", "right") else "tilt"',
+        "axis, _ = DIRECTION_SIGNS[direction]",
         'axis = "pan" if direction in ("left",) else "tilt"',
         "lost motion of the wrong axis",
         ("posterior/draws",),

@@ -35,7 +35,7 @@ from tvsbayes.estimators.joint_fit import Fixed, Problem, fit, stage_residuals
 from tvsbayes.files.disk import shipped_data
 from tvsbayes.instrument.campaign import ordered_spots, read_campaign, write_campaign
 from tvsbayes.instrument.parameters import NAMES
-from tvsbayes.instrument.plan import mixed_protocol
+from tvsbayes.instrument.protocols import mixed_protocol
 from tvsbayes.instrument.rig import read_rig
 from tvsbayes.statistics.least_squares import levenberg_marquardt, residuals_and_jacobian
 from tvsbayes.twin.simulated_campaign import simulate

@@ -75,7 +75,8 @@ DIRECTIONS = tuple(SIGN)
 
 def four_point_plan(repeats: int = 24, steps=(200,), other_side=(False,)):
     """The paper's experiments, each from a homing at its start; `other_side` starts have a run-up against it."""
-    from tvsbayes.instrument.plan import OVERSHOOT_STEPS, PlanStep
+    from tvsbayes.instrument.plan import PlanStep
+    from tvsbayes.instrument.protocols import OVERSHOOT_STEPS
 
     orders: list[tuple] = []
     for direction, sign in SIGN.items():
@@ -119,7 +120,8 @@ def planned_steps(rig):
 
 def plan_of(name: str):
     """Plan of a campaign."""
-    from tvsbayes.instrument.plan import PlanStep, grid_protocol
+    from tvsbayes.instrument.plan import PlanStep
+    from tvsbayes.instrument.protocols import grid_protocol
 
     if name.startswith("paper"):
         return four_point_plan()
@@ -307,7 +309,8 @@ def weight_log10(row) -> float | None:
 
 def drift_deg() -> tuple[float, float]:
     """How far pan and tilt of literal gears are off at the end of the paper's campaign without homings, degrees."""
-    from tvsbayes.instrument.plan import run_plan, twin_protocol
+    from tvsbayes.instrument.plan import run_plan
+    from tvsbayes.instrument.protocols import twin_protocol
 
     moves, result = run_plan(twin_protocol(), mounted_rig(), ("right", "up")).moves, []
     table = {name: values[1] for name, values in paper_values().items()}

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from tvsbayes.errors import NotConverged
 from tvsbayes.files.disk import output_place
+from tvsbayes.instrument.axes import AXES
 
 if TYPE_CHECKING:
     import numpy as np
@@ -64,7 +65,7 @@ def evidence_of(
         told = {**{f"effective_deg_per_step.{d}": e for d, e in summary.effective.items()}, **summary.parameters}
         # What a model holds fixed has no uncertainty to split.
         budgets = [headline_budget(causes, q, told[q]).as_json() for q in causes.quantities if told[q].sd > 0]
-        readings = {axis: stop_readings(fit, axis) for axis in ("pan", "tilt")}
+        readings = {axis: stop_readings(fit, axis) for axis in AXES}
         for axis, own in readings.items():
             contrast = physical[:, fit.names.index(f"ratio_contrast_deg_per_step.{axis}")]
             axes.append(positioning(calibration, axis, readings=own, contrast_deg_per_step=contrast).as_json())

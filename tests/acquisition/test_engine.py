@@ -31,8 +31,9 @@ from tvsbayes.cli.main import run
 from tvsbayes.errors import DeviceFault, InputError
 from tvsbayes.files.disk import shipped_data
 from tvsbayes.instrument.campaign import read_campaign
-from tvsbayes.instrument.plan import PlanStep, directions_of, outline, write_plan
+from tvsbayes.instrument.plan import PlanStep, outline, run_plan, write_plan
 from tvsbayes.instrument.rig import read_rig
+from tvsbayes.instrument.stops import legs_of
 from tvsbayes.positioner.protocol import request
 from tvsbayes.twin.physics import project
 from tvsbayes.twin.simulated_campaign import draw_truth, read_truth, simulate
@@ -648,9 +649,10 @@ print(json.dumps({"converged": looks != 15, "effective_deg_per_step": {"left": e
 def test_run_ends_when_the_running_estimate_meets_its_target(rig, tmp_path):
     """A stand-in whose u falls as 0.012 / looks: 5e-4 is met at 24 looks; fits at 12, 15 (fails), 18, 22, 27."""
     plan, texts = small_plan(20), []
-    assert directions_of(plan) == {"left", "right"}
+    directions = set(legs_of(run_plan(plan, rig).moves))
+    assert directions == {"left", "right"}
     command = [sys.executable, "-c", FIT]
-    with RunningEstimate(tmp_path / "c", 5e-4, directions_of(plan), wait=True, command=command) as estimate:
+    with RunningEstimate(tmp_path / "c", 5e-4, directions, wait=True, command=command) as estimate:
         run_ = Run(rig, tmp_path / "c", plan, estimate=estimate, show=lambda p: texts.append(p.estimate))
         outcome = run_.engine.run()
     assert (outcome.reason, outcome.looks, estimate.latest.looks) == ("target met", 27, 27) and run_.dark()

@@ -14,7 +14,7 @@ from tvsbayes.estimators.joint_fit import fit
 from tvsbayes.instrument.campaign import Campaign
 from tvsbayes.instrument.model_choice import ModelChoice
 from tvsbayes.instrument.parameters import HARMONIC_PRIORS, INDEX, NAMES, RECEIVER_NAMES, Prior
-from tvsbayes.instrument.plan import four_point_protocol, paper_protocol
+from tvsbayes.instrument.protocols import four_point_protocol, paper_protocol
 from tvsbayes.report.fit_text import fit_text
 from tvsbayes.results.estimates import CONTRACTION_LIMIT, FitSummary
 from tvsbayes.twin.simulated_campaign import simulate

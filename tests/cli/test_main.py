@@ -27,7 +27,8 @@ from tvsbayes.files.disk import shipped_data
 from tvsbayes.instrument.campaign import Campaign, read_campaign, write_campaign
 from tvsbayes.instrument.model_choice import ModelChoice
 from tvsbayes.instrument.parameters import Prior
-from tvsbayes.instrument.plan import PlanStep, grid_protocol, mixed_protocol, write_plan
+from tvsbayes.instrument.plan import PlanStep, write_plan
+from tvsbayes.instrument.protocols import grid_protocol, mixed_protocol
 from tvsbayes.pipeline import compile_for, fit_for
 from tvsbayes.twin.simulated_campaign import simulate
 

@@ -26,7 +26,7 @@ from tvsbayes.estimators.four_point import Selection, classic, select_experiment
 from tvsbayes.estimators.joint_fit import JointFit, fit
 from tvsbayes.instrument.axes import DIRECTIONS
 from tvsbayes.instrument.campaign import ordered_spots, read_campaign
-from tvsbayes.instrument.plan import four_point_protocol
+from tvsbayes.instrument.protocols import four_point_protocol
 from tvsbayes.report.evidence import criterion
 from tvsbayes.results.comparison_record import BETTER_CLASSIC, BETTER_JOINT, CANNOT_TELL, Gap, Prediction
 from tvsbayes.results.estimates import StopResidual

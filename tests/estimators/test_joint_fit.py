@@ -18,8 +18,8 @@ from tvsbayes.files.disk import shipped_data
 from tvsbayes.instrument.campaign import Campaign, ordered_spots
 from tvsbayes.instrument.model_choice import ModelChoice
 from tvsbayes.instrument.parameters import HARMONIC_PRIORS, INDEX, NAMES, Prior
-from tvsbayes.instrument.plan import four_point_protocol, grid_protocol
-from tvsbayes.instrument.rig import RigTable, read_rig
+from tvsbayes.instrument.protocols import four_point_protocol, grid_protocol
+from tvsbayes.instrument.rig import read_rig
 from tvsbayes.statistics.least_squares import laplace_draws
 from tvsbayes.twin.physics import effective_deg_per_step, effective_mirror_offset_mm
 from tvsbayes.twin.simulated_campaign import SimulatedCampaign, simulate

@@ -13,14 +13,8 @@ from tvsbayes.estimators.plausibility import check_campaign
 from tvsbayes.files.disk import shipped_data
 from tvsbayes.instrument.axes import DIRECTION_SIGNS
 from tvsbayes.instrument.campaign import Campaign, Move, read_campaign, write_campaign
-from tvsbayes.instrument.plan import (
-    OVERSHOOT_STEPS,
-    PROTOCOLS,
-    four_point_protocol,
-    grid_protocol,
-    read_plan,
-    write_plan,
-)
+from tvsbayes.instrument.plan import read_plan, write_plan
+from tvsbayes.instrument.protocols import OVERSHOOT_STEPS, PROTOCOLS, four_point_protocol, grid_protocol
 from tvsbayes.instrument.stops import Stop, observed_stops, separation
 from tvsbayes.twin.simulated_campaign import simulate
 

@@ -12,7 +12,8 @@ from scipy import stats
 from tvsbayes.estimators.four_point import classic
 from tvsbayes.instrument.axes import DIRECTIONS
 from tvsbayes.instrument.parameters import INDEX
-from tvsbayes.instrument.plan import PlanStep, four_point_protocol
+from tvsbayes.instrument.plan import PlanStep
+from tvsbayes.instrument.protocols import four_point_protocol
 from tvsbayes.planning.candidates import _sided
 from tvsbayes.planning.expectation import PARAMETERS, Knowledge, plan_minutes, prior_knowledge
 from tvsbayes.planning.forecast import (

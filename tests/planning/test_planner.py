@@ -19,18 +19,10 @@ from scipy import optimize
 from tvsbayes.errors import InputError
 from tvsbayes.files.disk import shipped_data
 from tvsbayes.instrument.axes import DIRECTIONS
+from tvsbayes.instrument.counter_limits import CounterLimits
 from tvsbayes.instrument.parameters import INDEX, RIG_NAMES, Prior
-from tvsbayes.instrument.plan import (
-    HOME_APPROACH,
-    PlanStep,
-    described,
-    four_point_protocol,
-    grid_protocol,
-    paper_protocol,
-    read_plan,
-    run_plan,
-    write_plan,
-)
+from tvsbayes.instrument.plan import HOME_APPROACH, PlanStep, described, read_plan, run_plan, write_plan
+from tvsbayes.instrument.protocols import four_point_protocol, grid_protocol, paper_protocol
 from tvsbayes.instrument.rig import Rig
 from tvsbayes.model.headlines import QUANTITIES, physical_at
 from tvsbayes.planning import forecast, planner, search
@@ -63,7 +55,7 @@ from tvsbayes.planning.forecast import (
     truth_in,
 )
 from tvsbayes.planning.limits import Batch, Limit, limit_of, next_experiments, stop_now
-from tvsbayes.planning.plan_check import _beyond_limits, _extended, check_plan
+from tvsbayes.planning.plan_check import beyond_limits, check_plan, extended
 from tvsbayes.planning.planner import STOPS_ADVISED, few_stops, plan_from
 from tvsbayes.planning.search import CRITERIA, KNOWN, MEAN_WEIGHT, Search, _rows_for_search, scores
 from tvsbayes.planning.target import AT_POINT, DEFAULT_TARGET, Target, parse_target, sensitivity
@@ -804,12 +796,12 @@ def test_where_a_plan_stands_follows_the_twin(mounted_rig):
         *(PlanStep(0, "home", 0, 0), PlanStep(1, "place", target="d1"), PlanStep(2, "look")),
         *(PlanStep(3, "move", 100, 40), PlanStep(4, "move", 50, None), PlanStep(5, "look")),
     )
-    assert described(steps) == "d1: (0, 0) by left, up; (50, 40) by right, up"
+    assert described(mounted_rig, steps) == "d1: (0, 0) by left, up; (50, 40) by right, up"
     looks = Looks(np.array([[50, 60]]), np.array([[1, 1]]), np.array([0]))
-    addition = _extended(steps, looks, ("d1",), np.array([30, 10]))
+    addition = extended(steps, looks, prior_knowledge(mounted_rig), np.array([30, 10]))
     # Tilt stands at 40: 20 steps up take up its play without a run-up; pan stands at its goal and needs one.
     assert [(s.action, s.pan_steps, s.tilt_steps) for s in addition[:-1]] == [("move", 20, 40), ("move", 50, 60)]
-    assert described(addition, steps) == "d1: (50, 60) by left, up"
+    assert described(mounted_rig, addition, steps) == "d1: (50, 60) by left, up"
     moves = run_plan((*steps, *addition), mounted_rig, ("left", "up")).moves
     assert [(m.pan_steps, m.tilt_steps) for m in moves] == [(0, 0), (100, 40), (50, 40), (20, 40), (50, 60)]
 
@@ -864,7 +856,7 @@ def test_limits_of_each_axis_and_end_count_where_they_are_stated(mounted_rig):
     moves = run_plan(plan, mounted_rig, ("left", "up")).moves
 
     def warned(**positioner) -> list[str]:
-        return _beyond_limits(replace(mounted_rig, positioner=positioner), moves)
+        return beyond_limits(CounterLimits.of(positioner), moves)
 
     assert warned() == []
     assert warned(pan_min_steps=-1000, pan_max_steps=1000) == [], "tilt is not limited"

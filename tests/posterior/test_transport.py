@@ -20,7 +20,7 @@ import pytest
 from tvsbayes.estimators.joint_fit import JointFit, fit
 from tvsbayes.estimators.linear_spots import linear_spots, stop_information
 from tvsbayes.instrument.parameters import INDEX
-from tvsbayes.instrument.plan import four_point_protocol
+from tvsbayes.instrument.protocols import four_point_protocol
 from tvsbayes.instrument.rig import read_rig
 from tvsbayes.posterior import proposal
 from tvsbayes.posterior.proposal import WALKERS, Independence, Target, walkers_for

@@ -16,7 +16,8 @@ from tvsbayes.estimators.four_point import classic, ratio_deg_per_step
 from tvsbayes.files.disk import shipped_data
 from tvsbayes.instrument.campaign import Campaign, read_campaign
 from tvsbayes.instrument.parameters import DEFAULT_PRIORS
-from tvsbayes.instrument.plan import PROTOCOLS, read_plan
+from tvsbayes.instrument.plan import read_plan
+from tvsbayes.instrument.protocols import PROTOCOLS
 from tvsbayes.instrument.rig import Rig, RigTable, read_rig
 from tvsbayes.twin.simulated_campaign import draw_truth, read_truth, simulate
 

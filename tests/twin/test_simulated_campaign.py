@@ -22,7 +22,8 @@ from tvsbayes.instrument.parameters import (
     STEREO_PARAMETER_NAMES,
     Prior,
 )
-from tvsbayes.instrument.plan import PROTOCOLS, PlanStep, four_point_protocol, grid_protocol
+from tvsbayes.instrument.plan import PlanStep
+from tvsbayes.instrument.protocols import PROTOCOLS, four_point_protocol, grid_protocol
 from tvsbayes.instrument.rig import Rig, RigTable
 from tvsbayes.instrument.stereo_pair import Stereo, rotation_matrix
 from tvsbayes.twin.physics import (

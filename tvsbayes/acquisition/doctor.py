@@ -98,8 +98,7 @@ def examine(
 
 
 def _rig(rig: Rig) -> Check:
-    missing = [f"{axis}_{end}_steps" for axis in ("pan", "tilt") for end in ("min", "max")]
-    missing = [name for name in missing if name not in rig.positioner]
+    missing = rig.limits.unstated
     if missing:
         remedy = "state them in [positioner]: without them the firmware's own limits hold"
         return Check("limits", "warning", f"{', '.join(missing)} not stated", remedy)

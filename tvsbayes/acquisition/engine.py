@@ -22,9 +22,9 @@ from tvsbayes.acquisition.recorder import (
 )
 from tvsbayes.acquisition.running_estimate import RunningEstimate
 from tvsbayes.errors import DeviceFault, TvsError
-from tvsbayes.instrument.axes import APPROACH_SIGN
+from tvsbayes.instrument.axes import APPROACH_SIGN, SENSES
 from tvsbayes.instrument.campaign import Campaign, Spot
-from tvsbayes.instrument.plan import PlanStep, plan_seconds
+from tvsbayes.instrument.plan import PlanStep, plan_seconds, run_plan
 from tvsbayes.instrument.rig import Rig
 from tvsbayes.positioner.driver import Clock, HomeReport, Positioner
 
@@ -236,11 +236,11 @@ class Acquisition:
 
     def _do(self, step: PlanStep) -> None:
         if step.action == "home":
-            self._home(step.step, (int(step.pan_steps or 0), int(step.tilt_steps or 0)))
+            self._home(step.step, step.counters((0, 0)))
         elif step.action == "place":
             self._place(step.target, self._scene(step.step).placement + 1, "", step.step)
         elif step.action == "move":
-            self._move(int(step.pan_steps or 0), int(step.tilt_steps or 0), step.step)
+            self._move(*step.counters(self._scene(step.step).counters[-1]), step.step)
         else:
             self._look(step.step, step.experiment, step.point)
 
@@ -267,8 +267,7 @@ class Acquisition:
         state = self.positioner.move_to(*counters)
         self._clock.sleep(self._settle_s)
         approach = [
-            _approach(to - start, names)
-            for to, start, names in zip(counters, switches, (("left", "right"), ("up", "down")), strict=True)
+            _approach(to - start, names) for to, start, names in zip(counters, switches, SENSES.values(), strict=True)
         ]
         reached = {"pan_steps": state.pan_steps, "tilt_steps": state.tilt_steps, "boot": state.boot}
         self._log("homed", step=step, time_s=self._now_s(), **reached, approach=approach, **self._annotate())
@@ -364,10 +363,9 @@ class Acquisition:
 
     def _scene(self, row: int) -> _Scene:
         """What the plan has made of sheet and counters when the step in this row begins."""
-        placed = [step.target for step in self.plan[:row] if step.action == "place"]
-        motions = [step for step in self.plan[:row] if step.action in ("home", "move")]
-        counters = [(int(step.pan_steps or 0), int(step.tilt_steps or 0)) for step in motions[-2:]]
-        return _Scene(placed[-1] if placed else "", len(placed) - 1, tuple(counters))
+        done = run_plan(self.plan[:row], self.rig)
+        counters = tuple((move.pan_steps, move.tilt_steps) for move in done.moves[-2:])
+        return _Scene(done.sheet, len(done.targets) - 1, counters)
 
     def _recover(self, before: Recorded, next_row: int) -> None:
         """Goes back to where the plan stood: the sheet, a new segment with reference looks, and what a repair lost.

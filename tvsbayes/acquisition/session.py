@@ -27,10 +27,13 @@ from tvsbayes.cameras.capture import StereoImage, VirtualCamera, open_cameras
 from tvsbayes.errors import InputError, escaped, refusal
 from tvsbayes.files.disk import read_bytes, write_atomically
 from tvsbayes.files.documents import TOML_BYTES_MAX, parse_toml
+from tvsbayes.instrument.axes import AXES
 from tvsbayes.instrument.campaign import Campaign, parse_header, read_campaign
-from tvsbayes.instrument.plan import PlanStep, directions_of
+from tvsbayes.instrument.counter_limits import LIMIT_KEYS
+from tvsbayes.instrument.plan import PlanStep, run_plan
 from tvsbayes.instrument.rig import Rig, parse_rig_table
 from tvsbayes.instrument.stereo_pair import read_stereo
+from tvsbayes.instrument.stops import legs_of
 from tvsbayes.positioner.driver import LIMITS, Positioner, SerialPositioner, device_settings
 from tvsbayes.positioner.protocol import SETTINGS
 from tvsbayes.positioner.serial_port import serial_opener
@@ -43,19 +46,20 @@ def check_plan(rig: Rig, plan: Sequence[PlanStep]) -> None:
     Raises:
         InputError: targets without a sheet position, counters outside the limits.
     """
-    limits = {name: int(rig.positioner.get(name, SETTINGS[short][2])) for name, short in LIMITS.items()}
+    firmware = {axis: (SETTINGS[LIMITS[low]][2], SETTINGS[LIMITS[high]][2]) for axis, (low, high) in LIMIT_KEYS.items()}
+    limits = rig.limits.within(firmware)
     for step in plan:
         if step.action == "place" and step.target not in rig.sheets_mm:
             allowed = ", ".join(rig.sheets_mm) or "a target named in [sheets]"
             remedy = "add its nominal X to [sheets] of the rig file"
             found = f"target {step.target} in step {step.step}"
             raise refusal("unknown-target", file="plan", found=found, allowed=allowed, remedy=remedy, column="target")
-        for axis, counter in (("pan", step.pan_steps), ("tilt", step.tilt_steps)):
+        for axis, counter in zip(AXES, (step.pan_steps, step.tilt_steps), strict=True):
             if counter is None:
                 continue
-            low, high = limits[f"{axis}_min_steps"], limits[f"{axis}_max_steps"]
+            low, high = limits[axis]
             if not low <= counter <= high:
-                remedy = f"correct the plan, or {axis}_min_steps and {axis}_max_steps in [positioner]"
+                remedy = f"correct the plan, or {' and '.join(LIMIT_KEYS[axis])} in [positioner]"
                 found, allowed = f"{counter} in step {step.step}", f"{low} to {high}, the soft limits"
                 column = f"{axis}_steps"
                 raise refusal("limit", file="plan", found=found, allowed=allowed, remedy=remedy, column=column)
@@ -186,7 +190,9 @@ def acquire(
             say(f"{len(journal.torn)} bytes of an unfinished line were cut off and kept in log.torn-*")
         running = None
         if target_u_deg_per_step is not None or (not simulate if estimate is None else estimate):
-            running = RunningEstimate(folder, target_u_deg_per_step, directions_of(plan), wait=simulate)
+            running = RunningEstimate(
+                folder, target_u_deg_per_step, set(legs_of(run_plan(plan, rig).moves)), wait=simulate
+            )
             stack.enter_context(running)
         acquisition = Acquisition(
             rig,

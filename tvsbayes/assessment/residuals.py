@@ -11,8 +11,8 @@ from scipy import stats
 
 from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.estimators.plausibility import SHALLOW
-from tvsbayes.instrument.axes import AXES
-from tvsbayes.instrument.campaign import Move, ordered_spots
+from tvsbayes.instrument.axes import AXES, direction_of
+from tvsbayes.instrument.campaign import ordered_spots
 from tvsbayes.instrument.stops import StopReadings, rests_of
 from tvsbayes.results.estimates import Cause, CauseGroup, StopResidual
 from tvsbayes.statistics.intervals import recursive_residuals
@@ -44,17 +44,17 @@ def stop_readings(fit: JointFit, axis: str) -> StopReadings:
         variance = float(seen.covariance_rad2[row, index, index])
         if spot.spot in fit.excluded_spots or variance <= 0:
             continue
-        if rest.side == 0 or rest.leg < needed:
-            left_out.add(rest.number)
+        if rest.sign == 0 or rest.leg < needed:
+            left_out.add(rest.move)
             continue
-        entry = sums.setdefault(rest.number, [0.0, 0.0, float(fit.linearised.mirror_angles_rad[row, index])])
+        entry = sums.setdefault(rest.move, [0.0, 0.0, float(fit.linearised.mirror_angles_rad[row, index])])
         entry[0] += 1 / variance
         entry[1] += float(seen.deviation_rad[row, index]) / variance
     kept = [(rests[move], entry) for move, entry in sums.items()]
     return StopReadings(
         axis=axis,
         steps=np.array([rest.steps for rest, _ in kept], dtype=int),
-        side=np.array([rest.side for rest, _ in kept], dtype=int),
+        side=np.array([rest.sign for rest, _ in kept], dtype=int),
         mirror_deg=np.degrees([angle + pull / weight for _, (weight, pull, angle) in kept]),
         u_deg=np.degrees([weight**-0.5 for _, (weight, _, _) in kept]),
         play_left_out=len(left_out),
@@ -84,46 +84,36 @@ def stop_residuals(fit: JointFit) -> tuple[StopResidual, ...]:
     rows = jax.tree.map(lambda x: np.asarray(x)[: len(spots)], fit.arrays.spots)
     seen = fit.linearised.spot_deviations()
     found = []
-    for index, (axis, directions) in enumerate((("pan", ("left", "right")), ("tilt", ("up", "down")))):
-        rest = np.cumsum(rows.redraw[:, index] | rows.new_segment)
-        for number in np.unique(rest):
-            chosen = np.flatnonzero((rest == number) & (rows.valid > 0))
+    for index, axis in enumerate(AXES):
+        rests = rests_of(moves, axis)
+        begun = np.array([rests[spot.move].move for spot in spots])
+        for number in np.unique(begun):
+            chosen = np.flatnonzero((begun == number) & (rows.valid > 0))
             if not len(chosen):
                 continue
-            first = spots[chosen[0]].move
-            # Walk back to the move of this axis, or to the homing, that began the rest.
-            begun = first
-            while not moves[begun].pan_approach and _steps(moves[begun], axis) == _steps(moves[begun - 1], axis):
-                begun -= 1
-            approach = getattr(moves[begun], f"{axis}_approach")
-            leg = 0 if approach else _steps(moves[begun], axis) - _steps(moves[begun - 1], axis)
-            direction = approach.replace("unknown", "") if approach else directions[leg < 0]
+            rest = rests[number]
             mine, noise = seen.deviation_rad[chosen, index], seen.covariance_rad2[chosen, index, index]
             weight = 1 / noise
             mean = mine @ weight / weight.sum()
             # The row that drew the stop error has its variance, whether that spot is used or not.
-            drawn = np.flatnonzero(rest == number)[0]
+            drawn = np.flatnonzero(begun == number)[0]
             variance = 1 / weight.sum() + fit.linearised.stop_variance[drawn, index]
             within = recursive_residuals(mine, noise, backwards=len(found) % 2 == 1)
             found.append(
                 StopResidual(
                     axis=axis,
                     spots=tuple(spots[i].spot for i in chosen),
-                    steps=_steps(moves[begun], axis),
-                    direction=direction,
-                    leg_steps=abs(leg),
+                    steps=rest.steps,
+                    direction=direction_of(axis, rest.sign),
+                    leg_steps=abs(rest.distance),
                     depth_mm=tuple(map(float, rows.triangulated_mm[chosen, 0])),
                     within=within,
-                    time_s=moves[first].time_s,
+                    time_s=moves[spots[chosen[0]].move].time_s,
                     deviation_deg=float(np.degrees(mean)),
                     u_deg=float(np.degrees(np.sqrt(variance))),
                 )
             )
     return tuple(found)
-
-
-def _steps(move: Move, axis: str) -> int:
-    return move.pan_steps if axis == "pan" else move.tilt_steps
 
 
 def residual_causes(residuals: Sequence[StopResidual]) -> tuple[Cause, ...]:
@@ -140,7 +130,7 @@ def residual_causes(residuals: Sequence[StopResidual]) -> tuple[Cause, ...]:
     }
     units = {"N": " steps", "time": " s"}
     found = []
-    for axis in ("pan", "tilt"):
+    for axis in AXES:
         mine = [r for r in residuals if r.axis == axis]
         scaled = np.array([r.deviation_deg / r.u_deg for r in mine])
         looks = [

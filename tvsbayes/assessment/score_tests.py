@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
 
 import numpy as np
 
@@ -12,8 +11,10 @@ from tvsbayes.assessment.residuals import CAUSE_BINS, STEP_PHASES
 from tvsbayes.assessment.weaknesses import headline_gradients, moved_directions
 from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.estimators.linear_spots import StopGroup, linear_spots, stop_information
+from tvsbayes.instrument.axes import AXES
 from tvsbayes.instrument.campaign import ordered_spots
 from tvsbayes.instrument.parameters import INDEX, NAMES, NOISE_NAMES, RIG_NAMES, STEREO_PARAMETER_NAMES
+from tvsbayes.instrument.stops import rests_of
 from tvsbayes.results.estimates import Validation, ValidationTest
 from tvsbayes.statistics.intervals import log_chance
 
@@ -56,18 +57,17 @@ class _Axis:
 
 
 def _axes(fit: JointFit) -> tuple[_Axis, _Axis]:
-    moves, lin = fit.campaign.moves, fit.linearised
-    legs = np.zeros((len(moves), 2), dtype=int)
-    for row, (previous, move) in enumerate(pairwise(moves), start=1):
-        delta = np.array([move.pan_steps - previous.pan_steps, move.tilt_steps - previous.tilt_steps])
-        legs[row] = 0 if move.pan_approach else np.where(delta != 0, delta, legs[row - 1])
-    at = [spot.move for spot in ordered_spots(fit.campaign)]
+    lin = fit.linearised
     angle = np.degrees(lin.mirror_angles_rad)
-    counters = np.array([(moves[m].pan_steps, moves[m].tilt_steps) for m in at])
-    return tuple(
-        _Axis(name, lin.slope[:, :, i : i + 1], angle[:, i], counters[:, i], legs[at, i])
-        for i, name in enumerate(("pan", "tilt"))
-    )
+
+    def seen(index: int) -> _Axis:
+        name = AXES[index]
+        rests = rests_of(fit.campaign.moves, name)
+        at = [rests[spot.move] for spot in ordered_spots(fit.campaign)]
+        counter, leg = (np.array([getattr(rest, field) for rest in at]) for field in ("steps", "distance"))
+        return _Axis(name, lin.slope[:, :, index : index + 1], angle[:, index], counter, leg)
+
+    return seen(0), seen(1)
 
 
 def _epipolar(fit: JointFit) -> np.ndarray:

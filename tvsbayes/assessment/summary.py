@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from itertools import pairwise
 
 import jax
 import numpy as np
@@ -24,9 +23,10 @@ from tvsbayes.assessment.weaknesses import (
 )
 from tvsbayes.estimators.four_point import four_point_ratios, select_experiments
 from tvsbayes.estimators.joint_fit import JointFit
-from tvsbayes.instrument.axes import DIRECTIONS
+from tvsbayes.instrument.axes import AXES, DIRECTIONS, SENSES
 from tvsbayes.instrument.campaign import ordered_spots
 from tvsbayes.instrument.parameters import HARMONIC_PRIORS, INDEX, NAMES, RECEIVER_NAMES, RIG_NAMES
+from tvsbayes.instrument.stops import legs_of
 from tvsbayes.model.headlines import Derived
 from tvsbayes.posterior.draws import Posterior
 from tvsbayes.posterior.predictive import ideal_pixels
@@ -99,7 +99,7 @@ def _parameters(source: _Source) -> dict[str, Estimate]:
 def _derived(source: _Source) -> dict[str, Estimate]:
     """Per-direction gear ratios and the effective mirror offset."""
     estimates = {}
-    for axis, positive, negative in (("pan", "left", "right"), ("tilt", "up", "down")):
+    for axis, (positive, negative) in SENSES.items():
         ratio, contrast = INDEX[f"degrees_per_step.{axis}"], INDEX[f"ratio_contrast_deg_per_step.{axis}"]
         for direction, sign in ((positive, 0.5), (negative, -0.5)):
             name = f"degrees_per_step.{direction}"
@@ -156,7 +156,7 @@ def _curves(posterior: Posterior, moved: set[str]) -> dict[str, object]:
     angles = np.degrees(fit.linearised.mirror_angles_rad)
     middle = np.degrees(fit.reference_pose_rad)
     along = {}
-    for axis, name in enumerate(("pan", "tilt")):
+    for axis, name in enumerate(AXES):
         rows = []
         for angle in np.linspace(angles[:, axis].min(), angles[:, axis].max(), CURVE_POINTS):
             pose = middle.copy()
@@ -172,16 +172,10 @@ def _curves(posterior: Posterior, moved: set[str]) -> dict[str, object]:
                     }
             rows.append(entry)
         along[name] = rows
-    used: dict[str, set[int]] = {d: set() for d in DIRECTIONS}
-    for previous, move in pairwise(fit.campaign.moves):
-        if not move.pan_approach:
-            deltas = (move.pan_steps - previous.pan_steps, move.tilt_steps - previous.tilt_steps)
-            for delta, (positive, negative) in zip(deltas, (("left", "right"), ("up", "down")), strict=True):
-                if delta:
-                    used[positive if delta > 0 else negative].add(abs(delta))
+    used = legs_of(fit.campaign.moves)
     lost = {}
     for direction in sorted(moved, key=DIRECTIONS.index):
-        steps = sorted(used[direction])
+        steps = sorted(set(used[direction]))
         steps = [steps[i] for i in np.unique(np.linspace(0, len(steps) - 1, min(CURVE_POINTS, len(steps))).astype(int))]
         found = posterior.lost_motion_deg(direction, np.array(steps))
         lost[direction] = [

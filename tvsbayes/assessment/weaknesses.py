@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
-
 import numpy as np
 
 from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.estimators.linear_spots import standard_deviations_without
-from tvsbayes.instrument.axes import DIRECTIONS
+from tvsbayes.instrument.axes import AXES, DIRECTIONS, SENSES
 from tvsbayes.instrument.campaign import ordered_spots
 from tvsbayes.instrument.parameters import INDEX, NAMES
-from tvsbayes.instrument.stops import observed_stops, separation
+from tvsbayes.instrument.stops import legs_of, observed_stops, separation
 from tvsbayes.results.estimates import Leverage, PriorSensitivity, WeakDirection
 
 LEVERAGE_LIMIT = 2.0
@@ -33,14 +31,7 @@ LISTED = 8
 
 def moved_directions(fit: JointFit) -> set[str]:
     """Directions in which the campaign ever moved."""
-    moved = set()
-    moves = fit.campaign.moves
-    for previous, move in pairwise(moves):
-        if move.pan_approach:
-            continue
-        pan, tilt = move.pan_steps - previous.pan_steps, move.tilt_steps - previous.tilt_steps
-        moved |= {d for d, yes in zip(DIRECTIONS, (pan > 0, pan < 0, tilt > 0, tilt < 0), strict=True) if yes}
-    return moved
+    return set(legs_of(fit.campaign.moves))
 
 
 def _backlash_direction(fit: JointFit, axis: str, direction: str) -> WeakDirection | None:
@@ -64,7 +55,7 @@ def _backlash_direction(fit: JointFit, axis: str, direction: str) -> WeakDirecti
 
 def weak_directions(fit: JointFit, moved: set[str]) -> tuple[WeakDirection, ...]:
     found = []
-    for axis, pair in (("pan", ("left", "right")), ("tilt", ("up", "down"))):
+    for axis, pair in SENSES.items():
         if not moved & set(pair):
             text = f"the {axis} axis was never moved: its ratio and backlash are the prior's; add moves on that axis"
             found.append(WeakDirection(text, {f"degrees_per_step.{axis}": 1.0}))
@@ -102,7 +93,7 @@ def headline_gradients(fit: JointFit, moved: set[str]) -> tuple[list[str], np.nd
     quantities = {
         f"effective {d}": fit.draws.effective_deg_per_step[:, k] for k, d in enumerate(DIRECTIONS) if d in moved
     }
-    for axis in ("pan", "tilt"):
+    for axis in AXES:
         # In coordinates, where the backlash is Gaussian.
         quantities[f"backlash {axis}"] = fit.draws_z[:, INDEX[f"backlash_deg.{axis}"]]
     # What the priors hold fixed scatters by roundings, which nothing may be measured by.
@@ -196,7 +187,7 @@ def few_stops(fit: JointFit, moved: set[str]) -> dict[str, int]:
     """Directions that the campaign moved in and saw fewer than `FEW_STOPS` stops after, with their number."""
     used = {s.move for s in fit.campaign.spots if s.status == "ok" and s.spot not in fit.excluded_spots}
     found = {}
-    for axis, directions in (("pan", ("left", "right")), ("tilt", ("up", "down"))):
+    for axis, directions in SENSES.items():
         stops = observed_stops(fit.campaign.moves, used, axis)
         for direction, sign in zip(directions, (1, -1), strict=True):
             count = sum(stop.sign == sign for stop in stops)

@@ -31,13 +31,13 @@ STEPS_MAX, ANGLE_MAX_DEG = 1e8, 360.0
 
 def _read_points(path: Path) -> tuple[list[float], list[float], list[float], list[tuple[str, str]]]:
     """Counters, readings and approaches of a CSV of points."""
-    from tvsbayes.instrument.axes import SIDES
+    from tvsbayes.instrument.axes import SENSES
 
     table = parse_table(read_bytes(path, CSV_BYTES_MAX), escaped(path.name), POINT_COLUMNS)
     if not len(table):
         raise InputError("empty", f"{escaped(path.name)}: no points", file=escaped(path.name), remedy="add rows")
-    for axis in ("pan", "tilt"):
-        allowed = (*SIDES[axis][::-1], "unknown")
+    for axis, directions in SENSES.items():
+        allowed = (*directions, "unknown")
         for row, word in enumerate(table.columns[f"{axis}_approach"]):
             if word not in allowed:
                 remedy = "name the direction of the last move of the axis"
@@ -247,10 +247,7 @@ def study(
 
 def _limits(path: Path) -> dict[str, tuple[float, float]]:
     """Counter limits by axis from [positioner] of a rig file."""
+    from tvsbayes.instrument.axes import AXES
     from tvsbayes.instrument.rig import read_rig
 
-    stated = read_rig(path).positioner
-    return {
-        axis: (stated.get(f"{axis}_min_steps", -math.inf), stated.get(f"{axis}_max_steps", math.inf))
-        for axis in ("pan", "tilt")
-    }
+    return read_rig(path).limits.within(dict.fromkeys(AXES, (-math.inf, math.inf)))

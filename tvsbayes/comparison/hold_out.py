@@ -16,7 +16,7 @@ import numpy as np
 from tvsbayes.comparison.gap import camera_u, experiment_pixels
 from tvsbayes.errors import TvsError
 from tvsbayes.estimators.four_point import Selection, four_point_ratios, select_experiments
-from tvsbayes.instrument.axes import DIRECTIONS
+from tvsbayes.instrument.axes import AXES, DIRECTIONS
 from tvsbayes.instrument.campaign import Campaign
 from tvsbayes.results.comparison_record import BETTER_CLASSIC, BETTER_JOINT, CANNOT_TELL, HoldOut, Prediction, Score
 
@@ -45,7 +45,7 @@ def folds_of(campaign: Campaign, selection: Selection, by: str) -> dict[str, np.
     starts = [moves[campaign.spots[four[0]].move] for four in selection.spot_rows]
     moved = np.array([m.pan_steps if a == "pan" else m.tilt_steps for m, a in zip(starts, selection.axis, strict=True)])
     folds = {}
-    for axis in ("pan", "tilt"):
+    for axis in AXES:
         mine = selection.axis == axis
         counters = np.unique(moved[mine])
         if not len(counters):

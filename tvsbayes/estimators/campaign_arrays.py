@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from pathlib import Path
 
 import equinox as eqx
@@ -62,9 +63,9 @@ def bucket(count: int) -> int:
     return size
 
 
-def move_arrays(moves: tuple[Move, ...]) -> MoveArrays:
-    """Pad the moves; padding repeats the last counters and therefore changes nothing."""
-    size = bucket(len(moves))
+def move_arrays(moves: Sequence[Move], size: int | None = None) -> MoveArrays:
+    """Pad the moves, by default to their `bucket`; padding repeats the last counters and therefore changes nothing."""
+    size = bucket(len(moves)) if size is None else size
     steps = np.zeros((size, 2))
     steps[: len(moves)] = [(m.pan_steps, m.tilt_steps) for m in moves]
     steps[len(moves) :] = steps[len(moves) - 1]
@@ -106,7 +107,7 @@ def campaign_arrays(campaign: Campaign) -> CampaignArrays:
     pixels = np.array([(s.u_left_px, s.v_left_px, s.u_right_px, s.v_right_px) for s in spots])
     covariance = np.stack([pixel_covariance(s) for s in spots])
     whitening = np.linalg.inv(np.linalg.cholesky(covariance))
-    new = redraws(campaign.moves, spots)
+    new = redraws(campaign.moves, [s.move for s in spots])
     aperture = [np.nan if s.aperture_deg is None else s.aperture_deg for s in spots]
     points_mm = triangulate(campaign.stereo, pixels)
     seen = np.isfinite(points_mm).all(axis=1)

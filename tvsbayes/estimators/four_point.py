@@ -20,7 +20,7 @@ from functools import partial
 import numpy as np
 
 from tvsbayes.errors import NothingToEstimate
-from tvsbayes.instrument.axes import DIRECTIONS, PIXELS
+from tvsbayes.instrument.axes import AXES, DIRECTIONS, PIXELS, SENSES
 from tvsbayes.instrument.campaign import Campaign, Move, Spot
 from tvsbayes.instrument.stereo_pair import Stereo, triangulate
 from tvsbayes.statistics.intervals import coverage_factor, effective_dof
@@ -80,8 +80,8 @@ class Selection:
     @property
     def direction(self) -> np.ndarray:
         """(e,) "left", "right", "up" or "down" by axis and sign of N (DESIGN 2)."""
-        tilt, positive = self.axis == "tilt", self.steps > 0
-        return np.where(tilt, np.where(positive, "up", "down"), np.where(positive, "left", "right"))
+        pan, tilt = (np.where(self.steps > 0, *SENSES[axis]) for axis in AXES)
+        return np.where(self.axis == "tilt", tilt, pan)
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ import numpy as np
 
 from tvsbayes.errors import listed
 from tvsbayes.estimators.four_point import select_experiments
-from tvsbayes.instrument.axes import PIXELS
+from tvsbayes.instrument.axes import AXES, PIXELS
 from tvsbayes.instrument.campaign import Campaign
 from tvsbayes.instrument.stereo_pair import pair_doubts, triangulate
 from tvsbayes.instrument.stops import observed_stops, separation
@@ -105,7 +105,7 @@ def check_campaign(campaign: Campaign) -> CampaignCheck:
     if not ok:
         warnings.append("no spot has status ok: there is nothing to estimate from")
     observed = {spot.move for spot in ok}
-    for axis in ("pan", "tilt") if ok else ():
+    for axis in AXES if ok else ():
         reason = separation(observed_stops(campaign.moves, observed, axis), axis)
         if reason is not None:
             warnings.append(f"{axis} ratio and {axis} backlash are hard to tell apart: {reason}")

@@ -1,14 +1,41 @@
-"""Pan and tilt, their sides, signs and turns."""
+"""Pan and tilt: names, directions of motion and their signs, sides of approach, constants of an axis.
+
+A counter counts up when pan turns left and tilt goes up. A side of approach is the direction of the last move.
+"""
 
 from __future__ import annotations
 
 from operator import attrgetter
+from typing import Literal
 
 from tvsbayes.errors import InputError, escaped
 
-AXES = ("pan", "tilt")
-SIDES = {"pan": ("right", "left"), "tilt": ("down", "up")}
+Axis = Literal["pan", "tilt"]
+PanApproach = Literal["left", "right", "unknown"]
+TiltApproach = Literal["up", "down", "unknown"]
+
+SENSES: dict[Axis, tuple[str, str]] = {"pan": ("left", "right"), "tilt": ("up", "down")}
+"""Direction of positive and of negative motion of an axis; every other table of axes follows from this one."""
+AXES: tuple[Axis, Axis] = ("pan", "tilt")
+DIRECTIONS = (*SENSES["pan"], *SENSES["tilt"])
+SIDES: dict[str, tuple[str, str]] = {axis: (negative, positive) for axis, (positive, negative) in SENSES.items()}
 """Approach sides of an axis, negative first."""
+DIRECTION_SIGNS: dict[str, tuple[Axis, int]] = {
+    direction: (axis, sign) for axis, pair in SENSES.items() for direction, sign in zip(pair, (1, -1), strict=True)
+}
+"""Axis and sense of motion of a direction."""
+APPROACH_SIGN = {**{direction: sign for direction, (_, sign) in DIRECTION_SIGNS.items()}, "unknown": 0}
+"""Sense of motion of an approach (DESIGN 2)."""
+PIXELS = attrgetter("u_left_px", "v_left_px", "u_right_px", "v_right_px")
+FULL_TURN_DEG = 360.0
+"""Period of the wheel (the output member); a shorter one is the pinion's."""
+HOME_SD_DEG = 0.05
+"""Standard deviation of the home offset of every segment after the first (DESIGN 3.2, fixed)."""
+
+
+def direction_of(axis: str, change: float) -> str:
+    """Direction of a motion of an axis by the sign of its change; "" where nothing moves, or nobody knows."""
+    return SIDES[axis][int(change > 0)] if change else ""
 
 
 def bad_approach(axis: str, name: object, allowed: tuple[str, ...]) -> InputError:
@@ -24,20 +51,13 @@ def bad_approach(axis: str, name: object, allowed: tuple[str, ...]) -> InputErro
 
 
 def sides_of(approach: tuple[str, str]) -> tuple[float, float]:
-    """+1, -1 or 0 for the approach of (pan, tilt)."""
+    """+1, -1 or 0 for the approach of (pan, tilt).
+
+    Raises:
+        InputError: a side that the axis does not have.
+    """
     for axis, name in zip(AXES, approach, strict=True):
-        allowed = (*SIDES[axis][::-1], "unknown")
+        allowed = (*SENSES[axis], "unknown")
         if name not in allowed:
             raise bad_approach(axis, name, allowed)
     return float(APPROACH_SIGN[approach[0]]), float(APPROACH_SIGN[approach[1]])
-
-
-APPROACH_SIGN = {"left": 1, "up": 1, "right": -1, "down": -1, "unknown": 0}
-"""Sense of motion of an approach (DESIGN 2)."""
-DIRECTION_SIGNS = {"left": ("pan", 1), "right": ("pan", -1), "up": ("tilt", 1), "down": ("tilt", -1)}
-DIRECTIONS = ("left", "right", "up", "down")
-PIXELS = attrgetter("u_left_px", "v_left_px", "u_right_px", "v_right_px")
-FULL_TURN_DEG = 360.0
-"""Period of the wheel (the output member); a shorter one is the pinion's."""
-HOME_SD_DEG = 0.05
-"""Standard deviation of the home offset of every segment after the first (DESIGN 3.2, fixed)."""

@@ -1,11 +1,7 @@
-"""What was ordered and what was seen: plans, moves, spots and the campaign folder (DESIGN 7).
+"""What was moved and what was seen: moves, spots and the campaign folder (DESIGN 7).
 
-Counters are absolute integers; px with the integer at the centre of a pixel; degrees where a name says
-`_deg`. Columns are found by name. No JAX.
-
-Measuring protocols are plans as well: the paper's experiments, and grids of poses. A start is `reversed` when it is
-reached by a move against the experiment's direction (play opens within the experiment), `cleared` when it is reached
-by a move along it (play already taken up), and `direct` when it is reached from wherever the axis stands.
+Counters are absolute integers; px with the integer at the centre of a pixel; degrees where a name says `_deg`. Columns
+are found by name. No JAX.
 """
 
 from __future__ import annotations
@@ -21,6 +17,8 @@ from tvsbayes.errors import escaped, refusal
 from tvsbayes.files.csv_table import CSV_BYTES_MAX, Table, csv_bytes, parse_table
 from tvsbayes.files.disk import make_folder, read_bytes, write_atomically
 from tvsbayes.files.documents import JSON_BYTES_MAX, TOML_BYTES_MAX, Keys, parse_toml, toml_line
+from tvsbayes.instrument.axes import SENSES, PanApproach, TiltApproach
+from tvsbayes.instrument.counter_limits import COUNTER_MAX
 from tvsbayes.instrument.rig import RigTable, parse_rig_table, rig_table_toml
 from tvsbayes.instrument.stereo_pair import Stereo, parse_stereo, stereo_bytes
 
@@ -38,8 +36,8 @@ class Move:
     time_s: float
     pan_steps: int
     tilt_steps: int
-    pan_approach: Literal["left", "right", "unknown", ""] = ""
-    tilt_approach: Literal["up", "down", "unknown", ""] = ""
+    pan_approach: PanApproach | Literal[""] = ""
+    tilt_approach: TiltApproach | Literal[""] = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,7 +91,6 @@ _SPOT_COLUMNS = (
     *(*_PIXELS, *_PIXEL_SDS, "aperture_deg", "status"),
 )
 _CORRELATIONS = ("ruv_left", "ruv_right")
-COUNTER_MAX = 10**8
 ID_MAX = 10**9
 # How far outside the image a centroid may lie, in image sizes: half a spot at the edge, not a wrong file.
 _IMAGE_MARGIN = 0.1
@@ -156,7 +153,8 @@ def parse_moves(data: bytes, file: str = "moves.csv") -> tuple[Move, ...]:
             allowed = f"at least {times_s[row - 1]!r}, the time of the row before"
             raise table.refuse(row, "time_s", "order", allowed, "list the moves in order of time")
     approaches = {}
-    for column, words in (("pan_approach", ("left", "right")), ("tilt_approach", ("up", "down"))):
+    for axis, words in SENSES.items():
+        column = f"{axis}_approach"
         approaches[column] = table.columns[column]
         for row, word in enumerate(approaches[column]):
             first = row == 0 or segments[row] != segments[row - 1]

@@ -1,21 +1,25 @@
-"""A plan: steps, file, cost, what following it visits; the standard plans."""
+"""A plan: its steps and their file, what following it does, how long it takes, and the same in words.
+
+What an action means stands here alone: `home` sets the counters, 0 where its cells are empty, and both axes then stand
+on the side from which homing ends; `place` asks for a target; `move` goes to absolute counters, an empty cell keeps the
+axis where it is; `look` observes. A plan that does not begin with `home` begins as homed at 0, 0. Counters in steps.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from functools import reduce
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
-
-import numpy as np
 
 from tvsbayes.errors import InputError, escaped, refusal
 from tvsbayes.files.csv_table import CSV_BYTES_MAX, csv_bytes, parse_table
 from tvsbayes.files.disk import read_bytes, write_atomically
-from tvsbayes.instrument.axes import AXES, DIRECTION_SIGNS, SIDES
-from tvsbayes.instrument.campaign import COUNTER_MAX, ID_MAX, Move, check_experiments
+from tvsbayes.instrument.axes import AXES, SENSES, Axis, PanApproach, TiltApproach, direction_of
+from tvsbayes.instrument.campaign import ID_MAX, Move, check_experiments
+from tvsbayes.instrument.counter_limits import COUNTER_MAX
 from tvsbayes.instrument.rig import Rig
+from tvsbayes.instrument.stops import rests_of
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,6 +33,13 @@ class PlanStep:
     target: str = ""
     experiment: int | None = None
     point: int | None = None
+
+    def counters(self, at: tuple[int, int]) -> tuple[int, int]:
+        """Counters (pan, tilt) after this step, where the axes stood at `at` before it."""
+        if self.action not in ("home", "move"):
+            return at
+        pan, tilt = (0, 0) if self.action == "home" else at
+        return pan if self.pan_steps is None else self.pan_steps, tilt if self.tilt_steps is None else self.tilt_steps
 
 
 _PLAN_COLUMNS = ("step", "action", "pan_steps", "tilt_steps", "target", "experiment", "point")
@@ -92,269 +103,40 @@ def write_plan(steps: Sequence[PlanStep], path: Path) -> None:
     write_atomically(path, data)
 
 
-PAN_RANGE_STEPS = (0, 200)
-TILT_RANGE_STEPS = (-100, 100)
-OVERSHOOT_STEPS = 40
-"""How far beyond a start an approach begins: 2.4 deg at 0.06 deg/step, beyond any play worth measuring."""
-GRID_PAN_STEPS = (-60, 0, 60, 120, 180, 240)
-GRID_TILT_STEPS = (-90, -30, 30, 90)
-
-
 @dataclass
-class _Plan:
-    """Plan steps under construction and the counters they lead to."""
+class PlanBuilder:
+    """Plan steps under construction, the counters (pan, tilt) they lead to, and the steps travelled since homing."""
 
     steps: list[PlanStep] = field(default_factory=list)
-    counters: dict[str, int] = field(default_factory=lambda: {"pan": 0, "tilt": 0})
+    at: tuple[int, int] = (0, 0)
+    travelled: tuple[int, int] = (0, 0)
 
-    def home(self) -> None:
-        self.counters = {"pan": 0, "tilt": 0}
-        self.steps.append(PlanStep(len(self.steps), "home", 0, 0))
+    def home(self, pan: int = 0, tilt: int = 0) -> None:
+        """Begin a segment at these counters."""
+        self.at, self.travelled = (pan, tilt), (0, 0)
+        self.steps.append(PlanStep(len(self.steps), "home", pan, tilt))
 
     def place(self, target: str) -> None:
+        """Ask for a target."""
         self.steps.append(PlanStep(len(self.steps), "place", target=target))
 
-    def move(self, **counters: int) -> None:
+    def move(self, pan: int | None = None, tilt: int | None = None) -> None:
         """Move to absolute counters; nothing is ordered where they are reached already."""
-        if any(self.counters[axis] != value for axis, value in counters.items()):
-            self.counters.update(counters)
-            self.steps.append(PlanStep(len(self.steps), "move", self.counters["pan"], self.counters["tilt"]))
+        before, self.at = self.at, PlanStep(0, "move", pan, tilt).counters(self.at)
+        if self.at != before:
+            far = [abs(after - start) for after, start in zip(self.at, before, strict=True)]
+            self.travelled = self.travelled[0] + far[0], self.travelled[1] + far[1]
+            self.steps.append(PlanStep(len(self.steps), "move", *self.at))
 
     def look(self, experiment: int | None = None, point: int | None = None) -> None:
+        """Observe, as a point of an experiment or without."""
         self.steps.append(PlanStep(len(self.steps), "look", experiment=experiment, point=point))
 
-    def reach(self, axis: str, counter: int, sign: int, overshoot: int) -> None:
+    def reach(self, axis: Axis, counter: int, sign: int, overshoot: int) -> None:
         """Arrive at a counter by a move of the given sign, by way of an overshoot where needed."""
-        if (counter - self.counters[axis]) * sign <= 0:
+        if (counter - self.at[AXES.index(axis)]) * sign <= 0:
             self.move(**{axis: counter - sign * overshoot})
         self.move(**{axis: counter})
-
-
-def four_point_protocol(
-    repeats: int = 24,
-    steps: Sequence[int] = (200,),
-    approaches: Mapping[str, Sequence[str]] | None = None,
-    targets: tuple[str, str] = ("d1", "d2"),
-    pan_range_steps: tuple[int, int] = PAN_RANGE_STEPS,
-    tilt_range_steps: tuple[int, int] = TILT_RANGE_STEPS,
-    overshoot_steps: int = OVERSHOOT_STEPS,
-) -> tuple[PlanStep, ...]:
-    """The paper's four-point experiments, in its order: point 1 at d1, 2 at d2, move N, 3 at d2, 4 at d1.
-
-    Left and right at mid tilt, then up and down at mid pan. Positive moves start from the low end of the
-    range, negative ones from the high end.
-
-    Args:
-        repeats: experiments per direction.
-        steps: |N| of the experiments, taken in turn.
-        approaches: direction -> "reversed", "cleared" or "direct" of its experiments, taken in turn;
-            default: all direct, which is plain go and return.
-        targets: names of the near and the far sheet.
-        pan_range_steps: lowest and highest pan counter.
-        tilt_range_steps: lowest and highest tilt counter.
-        overshoot_steps: run-up where a start must be reached from the other side.
-    """
-    ranges = {"pan": pan_range_steps, "tilt": tilt_range_steps}
-    plan, experiment = _Plan(), 0
-    plan.home()
-    plan.place(targets[0])
-    for direction, (axis, sign) in DIRECTION_SIGNS.items():
-        other = "tilt" if axis == "pan" else "pan"
-        plan.move(**{other: sum(ranges[other]) // 2})
-        start = ranges[axis][0 if sign > 0 else 1]
-        turns = (approaches or {}).get(direction, ("direct",))
-        for repeat in range(repeats):
-            approach = turns[repeat % len(turns)]
-            if approach == "direct":
-                plan.move(**{axis: start})
-            else:
-                plan.reach(axis, start, sign if approach == "cleared" else -sign, overshoot_steps)
-            plan.look(experiment, 1)
-            plan.place(targets[1])
-            plan.look(experiment, 2)
-            plan.move(**{axis: start + sign * steps[repeat % len(steps)]})
-            plan.look(experiment, 3)
-            plan.place(targets[0])
-            plan.look(experiment, 4)
-            experiment += 1
-    return tuple(plan.steps)
-
-
-def paper_protocol(repeats: int = 24, targets: tuple[str, str] = ("d1", "d2")) -> tuple[PlanStep, ...]:
-    """The paper's protocol as it reads: one |N| = 200, plain go and return.
-
-    Every start but the first, where the homing stands, is then reversed.
-    """
-    return four_point_protocol(repeats, targets=targets)
-
-
-def twin_protocol(repeats: int = 24) -> tuple[PlanStep, ...]:
-    """The history under which one backlash per axis gives Table 1: left, down reversed; right, up cleared.
-
-    The paper does not record how its starts were reached: this is our assumption.
-    """
-    history = {"left": "reversed", "right": "cleared", "up": "cleared", "down": "reversed"}
-    return four_point_protocol(repeats, approaches={name: (how,) for name, how in history.items()})
-
-
-def mixed_protocol(repeats: int = 24, targets: tuple[str, str] = ("d1", "d2")) -> tuple[PlanStep, ...]:
-    """The paper's experiments with |N| = 100 and 200 in turn, and two in six from cleared starts."""
-    turns = ("reversed", "reversed", "reversed", "cleared", "cleared", "reversed")
-    approaches = dict.fromkeys(DIRECTION_SIGNS, turns)
-    return four_point_protocol(repeats, steps=(100, 200), approaches=approaches, targets=targets)
-
-
-def grid_protocol(
-    targets: Sequence[str] = ("d1", "d2", "d3"),
-    pan_steps: Sequence[int] = GRID_PAN_STEPS,
-    tilt_steps: Sequence[int] = GRID_TILT_STEPS,
-    overshoot_steps: int = OVERSHOOT_STEPS,
-) -> tuple[PlanStep, ...]:
-    """A grid of poses at every sheet, each pose seen once from either side of both axes.
-
-    Rows of tilt upwards, then downwards, each axis taken up before the row's first look; rows alternate
-    between left and right, and the way down takes each row the other way. One placement per sheet.
-    """
-    plan = _Plan()
-    plan.home()
-    for target in targets:
-        plan.place(target)
-        for tilt_sign in (1, -1):
-            for row, tilt in enumerate(sorted(tilt_steps, reverse=tilt_sign < 0)):
-                rank = row if tilt_sign > 0 else len(tilt_steps) - 1 - row
-                pan_sign = tilt_sign * (1 if rank % 2 == 0 else -1)
-                ordered = sorted(pan_steps, reverse=pan_sign < 0)
-                run_up = ordered[0] - pan_sign * overshoot_steps
-                if (tilt - plan.counters["tilt"]) * tilt_sign <= 0:
-                    plan.move(pan=run_up, tilt=tilt - tilt_sign * overshoot_steps)
-                plan.move(pan=run_up, tilt=tilt)
-                for pan in ordered:
-                    plan.move(pan=pan)
-                    plan.look()
-    return tuple(plan.steps)
-
-
-PROTOCOLS = {
-    "paper": paper_protocol,
-    "mixed": mixed_protocol,
-    "grid": grid_protocol,
-    "paper_twin": twin_protocol,
-}
-"""Plans that `experiments/make_twins.py` ships, by file name."""
-UNSTATED_STEPS = {
-    "pan": (min(GRID_PAN_STEPS) - OVERSHOOT_STEPS, max(GRID_PAN_STEPS) + OVERSHOOT_STEPS),
-    "tilt": (min(GRID_TILT_STEPS) - OVERSHOOT_STEPS, max(GRID_TILT_STEPS) + OVERSHOOT_STEPS),
-}
-"""Counters used where `[positioner]` states no limits: those of the grid protocol, not one step more."""
-
-
-@dataclass(frozen=True)
-class CounterLimits:
-    """Lowest and highest counter of (pan, tilt), shape (2, 2), and a note where the rig states none."""
-
-    steps: np.ndarray
-    notes: tuple[str, ...]
-
-
-def counter_limits(rig: Rig) -> CounterLimits:
-    """Limits of the rig file, or else those of the grid protocol."""
-    limits, missing = [], []
-    for axis in ("pan", "tilt"):
-        keys = f"{axis}_min_steps", f"{axis}_max_steps"
-        stated = [rig.positioner.get(key) for key in keys]
-        missing += [key for key, value in zip(keys, stated, strict=True) if value is None]
-        limits.append([d if s is None else s for s, d in zip(stated, UNSTATED_STEPS[axis], strict=True)])
-    if not missing:
-        return CounterLimits(np.array(limits), ())
-    note = (
-        f"[positioner] does not state {', '.join(missing)}: counters stay within pan "
-        f"{limits[0][0]} to {limits[0][1]}, tilt {limits[1][0]} to {limits[1][1]}; wider limits would allow longer "
-        "travel, and full turns"
-    )
-    return CounterLimits(np.array(limits), (note,))
-
-
-def outline(rig: Rig, plan: Sequence[PlanStep]) -> list[str]:
-    """What a run would do, in words: the listing of `--dry-run`."""
-    lines, counters = [], (0, 0)
-    for step in plan:
-        if step.action in ("home", "move"):
-            after = (int(step.pan_steps or 0), int(step.tilt_steps or 0))
-            verb = "home, then go to" if step.action == "home" else "go to"
-            by = "" if step.action == "home" else f" (by {after[0] - counters[0]:+d}, {after[1] - counters[1]:+d})"
-            lines.append(f"{step.step}: {verb} pan {after[0]}, tilt {after[1]}{by}")
-            counters = after
-        elif step.action == "place":
-            lines.append(f"{step.step}: ask for the sheet at {step.target}, X = {rig.sheets_mm[step.target]:g} mm")
-        else:
-            name = "" if step.experiment is None else f", experiment {step.experiment} point {step.point}"
-            lines.append(f"{step.step}: look{name}")
-    return lines
-
-
-def directions_of(plan: Iterable[PlanStep]) -> set[str]:
-    """The directions in which a plan moves."""
-    found, before = set(), (0, 0)
-    for step in plan:
-        if step.action in ("home", "move"):
-            after = (int(step.pan_steps or 0), int(step.tilt_steps or 0))
-            if step.action == "move":
-                for change, names in zip(
-                    (after[0] - before[0], after[1] - before[1]), (("left", "right"), ("up", "down")), strict=True
-                ):
-                    found |= {names[0]} if change > 0 else {names[1]} if change < 0 else set()
-            before = after
-    return found
-
-
-HOME_APPROACH = ("left", "up")
-"""Side from which homing ends, per axis, where the caller names none."""
-
-
-@dataclass(frozen=True)
-class _Standing:
-    """Where a plan has come to: the sheet that stands, counters (pan, tilt), and the direction each axis came in."""
-
-    sheet: str = ""
-    at: tuple[int, int] = (0, 0)
-    came: tuple[str, str] = HOME_APPROACH
-
-    def after(self, step: PlanStep) -> _Standing:
-        """As `simulation.run_plan` takes a step: a move's empty counters keep the axis where it is."""
-        if step.action == "place":
-            return replace(self, sheet=step.target)
-        if step.action == "home":
-            return replace(self, at=(step.pan_steps or 0, step.tilt_steps or 0), came=HOME_APPROACH)
-        if step.action != "move":
-            return self
-        ordered = (step.pan_steps, step.tilt_steps)
-        at = tuple(old if new is None else new for old, new in zip(self.at, ordered, strict=True))
-        came = tuple(
-            way if new == old else SIDES[axis][int(new > old)]
-            for axis, old, new, way in zip(AXES, self.at, at, self.came, strict=True)
-        )
-        return replace(self, at=at, came=came)
-
-
-def standing(steps: Sequence[PlanStep]) -> _Standing:
-    """Where a plan ends."""
-    return reduce(_Standing.after, steps, _Standing())
-
-
-def described(steps: Sequence[PlanStep], before: Sequence[PlanStep] = ()) -> str:
-    """Looks of a short plan on one sheet in words, after another plan."""
-    now, words = standing(before), []
-    for step in steps:
-        now = now.after(step)
-        if step.action == "look":
-            words.append(f"({now.at[0]}, {now.at[1]}) by {now.came[0]}, {now.came[1]}")
-    return f"{now.sheet}: " + "; ".join(words)
-
-
-def step_json(step: PlanStep) -> dict[str, object]:
-    """An action of a plan in a document."""
-    filled = {"pan_steps": step.pan_steps, "tilt_steps": step.tilt_steps, "target": step.target or None}
-    return {"action": step.action, **{k: v for k, v in filled.items() if v is not None}}
 
 
 COST_KEYS = {"home": "move_s", "place": "placement_s", "move": "move_s", "look": "look_s"}
@@ -364,6 +146,10 @@ COST_KEYS = {"home": "move_s", "place": "placement_s", "move": "move_s", "look":
 def plan_seconds(rig: Rig, plan: Iterable[PlanStep]) -> float:
     """Duration of a plan by `[costs]`, s; what a rig that no file describes leaves unstated costs nothing."""
     return sum(float(rig.costs_s.get(COST_KEYS[step.action], 0.0)) for step in plan)
+
+
+HOME_APPROACH: tuple[PanApproach, TiltApproach] = (SENSES["pan"][0], SENSES["tilt"][0])
+"""Side from which homing ends, per axis, where the caller names none."""
 
 
 @dataclass(frozen=True)
@@ -377,30 +163,39 @@ class PlannedLook:
 
 @dataclass
 class PlanLog:
-    """What the plan did, in time order, while it is being read."""
+    """What a plan does: its moves with their times by `[costs]`, its looks, and the targets placed, in order."""
 
     moves: list[Move] = field(default_factory=list)
     looks: list[PlannedLook] = field(default_factory=list)
     targets: list[str] = field(default_factory=list)
 
+    @property
+    def at(self) -> tuple[int, int]:
+        """Counters (pan, tilt) at its end."""
+        return (self.moves[-1].pan_steps, self.moves[-1].tilt_steps) if self.moves else (0, 0)
 
-def run_plan(plan: Iterable[PlanStep], rig: Rig, home_approach: tuple[str, str]) -> PlanLog:
+    @property
+    def sheet(self) -> str:
+        """The target that stands at its end, "" if none was placed."""
+        return self.targets[-1] if self.targets else ""
+
+
+def run_plan(
+    plan: Iterable[PlanStep], rig: Rig, home_approach: tuple[PanApproach, TiltApproach] = HOME_APPROACH
+) -> PlanLog:
     """Turn plan steps into moves, placements and looks.
 
-    A plan that does not begin with `home` is taken as homed at counters 0, 0. Empty counters of a move
-    keep the axis where it is.
+    Raises:
+        InputError: a look before a target is placed, or a target that the rig does not have.
     """
     log, time_s, segment = PlanLog(), 0.0, -1
     for step in plan:
         if step.action == "home" or (not log.moves and step.action in ("move", "look")):
             segment += 1
-            counters = (step.pan_steps or 0, step.tilt_steps or 0) if step.action == "home" else (0, 0)
+            counters = step.counters((0, 0)) if step.action == "home" else (0, 0)
             log.moves.append(Move(len(log.moves), segment, time_s, *counters, *home_approach))
         if step.action == "move":
-            last = log.moves[-1]
-            pan = last.pan_steps if step.pan_steps is None else step.pan_steps
-            tilt = last.tilt_steps if step.tilt_steps is None else step.tilt_steps
-            log.moves.append(Move(len(log.moves), segment, time_s, pan, tilt))
+            log.moves.append(Move(len(log.moves), segment, time_s, *step.counters(log.at)))
         elif step.action == "place":
             if step.target not in rig.sheets_mm:
                 raise InputError(
@@ -423,3 +218,39 @@ def run_plan(plan: Iterable[PlanStep], rig: Rig, home_approach: tuple[str, str])
             log.looks.append(PlannedLook(step, len(log.moves) - 1, len(log.targets) - 1))
         time_s += plan_seconds(rig, (step,))
     return log
+
+
+def outline(rig: Rig, plan: Sequence[PlanStep]) -> list[str]:
+    """What a run would do, in words: the listing of `--dry-run`."""
+    lines, at = [], (0, 0)
+    for step in plan:
+        before, at = at, step.counters(at)
+        if step.action == "home":
+            lines.append(f"{step.step}: home, then go to pan {at[0]}, tilt {at[1]}")
+        elif step.action == "move":
+            by = f"(by {at[0] - before[0]:+d}, {at[1] - before[1]:+d})"
+            lines.append(f"{step.step}: go to pan {at[0]}, tilt {at[1]} {by}")
+        elif step.action == "place":
+            lines.append(f"{step.step}: ask for the sheet at {step.target}, X = {rig.sheets_mm[step.target]:g} mm")
+        else:
+            name = "" if step.experiment is None else f", experiment {step.experiment} point {step.point}"
+            lines.append(f"{step.step}: look{name}")
+    return lines
+
+
+def described(rig: Rig, steps: Sequence[PlanStep], before: Sequence[PlanStep] = ()) -> str:
+    """Looks of a short plan on one sheet in words, after another plan."""
+    log = run_plan((*before, *steps), rig)
+    pan, tilt = (rests_of(log.moves, axis) for axis in AXES)
+    words = []
+    for look in log.looks[sum(step.action == "look" for step in before) :]:
+        stops = pan[look.move], tilt[look.move]
+        came = ", ".join(direction_of(axis, stop.sign) for axis, stop in zip(AXES, stops, strict=True))
+        words.append(f"({stops[0].steps}, {stops[1].steps}) by {came}")
+    return f"{log.sheet}: " + "; ".join(words)
+
+
+def step_json(step: PlanStep) -> dict[str, object]:
+    """An action of a plan in a document."""
+    filled = {"pan_steps": step.pan_steps, "tilt_steps": step.tilt_steps, "target": step.target or None}
+    return {"action": step.action, **{k: v for k, v in filled.items() if v is not None}}

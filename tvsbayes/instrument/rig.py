@@ -15,7 +15,8 @@ from typing import Literal
 from tvsbayes.errors import InputError, closest, escaped
 from tvsbayes.files.disk import read_bytes
 from tvsbayes.files.documents import TOML_BYTES_MAX, Keys, parse_toml, toml_line
-from tvsbayes.instrument.axes import FULL_TURN_DEG
+from tvsbayes.instrument.axes import AXES, DIRECTION_SIGNS, FULL_TURN_DEG
+from tvsbayes.instrument.counter_limits import COUNTER_MAX, LIMIT_KEYS, CounterLimits
 from tvsbayes.instrument.parameters import (
     DECLARED_PRIORS,
     DEFAULT_PRIORS,
@@ -73,9 +74,14 @@ class Rig:
     path: Path | None = None
     header: dict[str, str] = field(default_factory=dict)
 
+    @property
+    def limits(self) -> CounterLimits:
+        """Lowest and highest counters, where `[positioner]` states them."""
+        return CounterLimits.of(self.positioner)
+
 
 _PRIOR_NAMES = (*DEFAULT_PRIORS, *HARMONIC_PRIORS)
-_PERIOD_NAMES = {f"harmonic_period_deg.{axis}": axis for axis in ("pan", "tilt")}
+_PERIOD_NAMES = {f"harmonic_period_deg.{axis}": axis for axis in AXES}
 _PERIOD_MIN_DEG = 1e-6
 _GROUPS = {name.rsplit(".", n)[0] for name in (*RIG_PRIORS, *_PERIOD_NAMES, *STEREO_PARAMETER_NAMES) for n in (1, 2, 3)}
 
@@ -117,8 +123,8 @@ def _explanation(name: str, allowed: tuple[str, ...]) -> str:
         return "it belongs into [rig] itself: tooth counts fix it, so it has no prior and no other truth"
     if name in _PRIOR_NAMES:
         return "it belongs into [rig.prior]"
-    if stem == "degrees_per_step" and last in ("left", "right", "up", "down"):
-        axis = "pan" if last in ("left", "right") else "tilt"
+    if stem == "degrees_per_step" and last in DIRECTION_SIGNS:
+        axis, _ = DIRECTION_SIGNS[last]
         return f"it is derived: state degrees_per_step.{axis} and ratio_contrast_deg_per_step.{axis}"
     if stem == "effective_mirror_offset_mm":
         return "it is derived: state mirror_offset_mm"
@@ -223,13 +229,12 @@ def rig_table_toml(table: RigTable) -> str:
 
 
 _COSTS_S = {"move_s": 1.5, "look_s": 1.0, "placement_s": 60.0}
-_COUNTER_MAX = 10**8
 
 
 def _parse_positioner(table: Keys) -> dict[str, Setting]:
     """`[positioner]`: driver, port, limits and speeds."""
-    limits = ("pan_min_steps", "pan_max_steps", "tilt_min_steps", "tilt_max_steps")
-    table.only(("driver", "port", "baud", *limits, "speed_steps_per_s", "settle_s"))
+    keys = [key for pair in LIMIT_KEYS.values() for key in pair]
+    table.only(("driver", "port", "baud", *keys, "speed_steps_per_s", "settle_s"))
     values: dict[str, Setting] = {key: table.text_value(key) for key in ("driver", "port") if key in table}
     # Serial libraries read an address as instructions: one of them writes a file of the address' choice.
     if "://" in str(values.get("port", "")):
@@ -237,12 +242,10 @@ def _parse_positioner(table: Keys) -> dict[str, Setting]:
         raise table.refuse("port", "port", "the name of a serial port, no address", remedy)
     if "baud" in table:
         values["baud"] = table.integer("baud", 300, 10_000_000)
-    steps = {key: table.integer(key, -_COUNTER_MAX, _COUNTER_MAX) for key in limits if key in table}
-    for axis in ("pan", "tilt"):
-        low, high = steps.get(f"{axis}_min_steps"), steps.get(f"{axis}_max_steps")
-        if low is not None and high is not None and low > high:
-            key = f"{axis}_max_steps"
-            raise table.refuse(key, "limits", f"at least {axis}_min_steps = {low}", "swap the two limits")
+    steps = {key: table.integer(key, -COUNTER_MAX, COUNTER_MAX) for key in keys if key in table}
+    for lowest, highest in LIMIT_KEYS.values():
+        if lowest in steps and highest in steps and steps[lowest] > steps[highest]:
+            raise table.refuse(highest, "limits", f"at least {lowest} = {steps[lowest]}", "swap the two limits")
     for key, low_s, high_s in (("speed_steps_per_s", 1e-3, 1e7), ("settle_s", 0.0, 3600.0)):
         if key in table:
             values[key] = table.number(key, low_s, high_s)

@@ -1,4 +1,8 @@
-"""Where the moves came to rest."""
+"""Where the moves came to rest: the one follower of the moves of an axis, and what its stops can tell before any fit.
+
+Counters in steps; signs +1 left or up, -1 right or down. An axis rests until its own counter changes or a homing sets
+it anew; looks taken in between share its stop error, also when the other axis moves.
+"""
 
 from __future__ import annotations
 
@@ -10,8 +14,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from tvsbayes.instrument.axes import APPROACH_SIGN
-from tvsbayes.instrument.campaign import Move, Spot
+from tvsbayes.instrument.axes import APPROACH_SIGN, AXES, direction_of
+from tvsbayes.instrument.campaign import Move
 
 
 @dataclass(frozen=True)
@@ -39,47 +43,65 @@ class StopReadings:
     values: Mapping[str, float]
 
 
-@dataclass(frozen=True)
-class _Rest:
-    """Where an axis stands after a move; `leg` is the distance of the last move, infinite after homing."""
-
-    number: int
-    steps: int
-    side: int
-    leg: float
-
-
-def rests_of(moves: Sequence[Move], axis: str) -> list[_Rest]:
-    """The stop at which an axis stands after every move: a new one whenever its counter changed (DESIGN 3.1)."""
-    rests: list[_Rest] = []
-    for move in moves:
-        steps, approach = getattr(move, f"{axis}_steps"), getattr(move, f"{axis}_approach")
-        if approach:
-            last = _Rest(move.move, steps, APPROACH_SIGN[approach], math.inf)
-        elif steps != rests[-1].steps:
-            distance = steps - rests[-1].steps
-            # Moves on in the same sense keep the play taken up.
-            same = rests[-1].side * distance > 0
-            leg = abs(distance) + (rests[-1].leg if same else 0.0)
-            last = _Rest(move.move, steps, 1 if distance > 0 else -1, leg)
-        else:
-            last = rests[-1]
-        rests.append(last)
-    return rests
-
-
-INSEPARABLE, INSEPARABLE_ONE_LENGTH = 0.9, 0.7
-"""Correlation of ratio and backlash above which four fifths (half, where every leg has one length) of the ratio's
-variance is exchange with the backlash. Equal numbers of cleared and reversed legs of one length give 0.55."""
-
-
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class Stop:
     """A rest of one axis at which a usable spot was seen; `sign` is the sense of the move that led there."""
 
     segment: int
     steps: int
     sign: int
+
+
+@dataclass(frozen=True, slots=True)
+class Rest(Stop):
+    """Where an axis stands after a move, and how it came there.
+
+    Attributes:
+        move: number of the move that led there.
+        homing: number of the homing from which its counter counts.
+        distance: steps of that move with their sign, 0 after homing.
+        leg: steps since the sense of motion last changed, infinite after homing: what the play was taken up with.
+    """
+
+    move: int
+    homing: int
+    distance: int
+    leg: float
+
+
+def rests_of(moves: Sequence[Move], axis: str) -> list[Rest]:
+    """The rest at which an axis stands after every move: a new one whenever its counter changed (DESIGN 3.1).
+
+    Args:
+        moves: all moves in order, the first after a homing.
+        axis: "pan" or "tilt".
+    """
+    rests: list[Rest] = []
+    for move in moves:
+        steps, approach = getattr(move, f"{axis}_steps"), getattr(move, f"{axis}_approach")
+        if approach:
+            rest = Rest(move.segment, steps, APPROACH_SIGN[approach], move.move, move.move, 0, math.inf)
+        elif steps != rests[-1].steps:
+            before = rests[-1]
+            distance = steps - before.steps
+            sign = 1 if distance > 0 else -1
+            # Moves on in the same sense keep the play taken up.
+            leg = abs(distance) + (before.leg if before.sign == sign else 0.0)
+            rest = Rest(move.segment, steps, sign, move.move, before.homing, distance, leg)
+        else:
+            rest = rests[-1]
+        rests.append(rest)
+    return rests
+
+
+def legs_of(moves: Sequence[Move]) -> dict[str, list[int]]:
+    """Lengths of the moves in each direction, steps, in order; directions never moved in are absent."""
+    found: dict[str, list[int]] = {}
+    for axis in AXES:
+        for rest in dict.fromkeys(rests_of(moves, axis)):
+            if rest.distance:
+                found.setdefault(direction_of(axis, rest.distance), []).append(abs(rest.distance))
+    return found
 
 
 def observed_stops(moves: Sequence[Move], observed: Collection[int], axis: str) -> tuple[Stop, ...]:
@@ -90,20 +112,14 @@ def observed_stops(moves: Sequence[Move], observed: Collection[int], axis: str) 
         observed: numbers of the moves after which a usable spot was seen.
         axis: "pan" or "tilt".
     """
-    stops: list[Stop] = []
-    current, seen, previous = Stop(0, 0, 0), False, 0
-    for move in moves:
-        steps = move.pan_steps if axis == "pan" else move.tilt_steps
-        approach = move.pan_approach if axis == "pan" else move.tilt_approach
-        if approach:
-            current, seen = Stop(move.segment, steps, APPROACH_SIGN[approach]), False
-        elif steps != previous:
-            current, seen = Stop(move.segment, steps, 1 if steps > previous else -1), False
-        if move.move in observed and not seen:
-            stops.append(current)
-            seen = True
-        previous = steps
-    return tuple(stops)
+    rests = rests_of(moves, axis) if moves else []
+    seen = dict.fromkeys(rest for move, rest in zip(moves, rests, strict=True) if move.move in observed)
+    return tuple(Stop(rest.segment, rest.steps, rest.sign) for rest in seen)
+
+
+INSEPARABLE, INSEPARABLE_ONE_LENGTH = 0.9, 0.7
+"""Correlation of ratio and backlash above which four fifths (half, where every leg has one length) of the ratio's
+variance is exchange with the backlash. Equal numbers of cleared and reversed legs of one length give 0.55."""
 
 
 def separation(stops: Sequence[Stop], axis: str) -> str | None:
@@ -142,14 +158,17 @@ def separation(stops: Sequence[Stop], axis: str) -> str | None:
     return f"{only}; add N = {max(common // 2, 1)} or a cleared approach"
 
 
-def _stop_mix(sign: int) -> tuple[float, float]:
-    """Share of each direction's variance in a stop error: one of them, or half of both where unknown."""
-    return (0.5, 0.5) if sign == 0 else (float(sign < 0), float(sign > 0))
-
-
 @dataclass(frozen=True)
 class Redraws:
-    """Which states are new at each spot, arrays over spots; fields as in `SpotArrays`."""
+    """Which errors are new at each look since the look before, arrays over looks; fields as in `SpotArrays`.
+
+    Attributes:
+        redraw: the stop error of (pan, tilt), shape (n, 2).
+        redraw_mix: share of the variance of (negative, positive) direction in it, shape (n, 2, 2); half of both where
+            the direction is unknown.
+        new_segment: there was a homing, shape (n,).
+        homed: one whose home offset is unknown, shape (n,).
+    """
 
     redraw: np.ndarray
     redraw_mix: np.ndarray
@@ -157,28 +176,19 @@ class Redraws:
     homed: np.ndarray
 
 
-def redraws(moves: tuple[Move, ...], spots: list[Spot]) -> Redraws:
-    """Follow the moves between spots: an axis' stop error is new once its own counter has changed (DESIGN 3.1)."""
-    count = len(spots)
-    new = Redraws(
-        redraw=np.zeros((count, 2), dtype=bool),
-        redraw_mix=np.zeros((count, 2, 2)),
-        new_segment=np.zeros(count, dtype=bool),
-        homed=np.zeros(count, dtype=bool),
-    )
-    seen = -1
-    for row, spot in enumerate(spots):
-        for index in range(seen + 1, spot.move + 1):
-            move = moves[index]
-            if move.pan_approach:
-                signs = (APPROACH_SIGN[move.pan_approach], APPROACH_SIGN[move.tilt_approach])
-                new.redraw[row], new.redraw_mix[row] = True, [_stop_mix(s) for s in signs]
-                new.new_segment[row], new.homed[row] = True, move.segment > 0
-                continue
-            previous = moves[index - 1]
-            deltas = (move.pan_steps - previous.pan_steps, move.tilt_steps - previous.tilt_steps)
-            for axis, delta in enumerate(deltas):
-                if delta:
-                    new.redraw[row, axis], new.redraw_mix[row, axis] = True, _stop_mix(delta)
-        seen = spot.move
-    return new
+def redraws(moves: Sequence[Move], looks: Sequence[int], homed_from: int = 1) -> Redraws:
+    """An axis' stop error is new once its own counter has changed or was set by homing (DESIGN 3.1).
+
+    Args:
+        moves: all moves in order.
+        looks: number of the move before each look, in order.
+        homed_from: first segment with an unknown home offset.
+    """
+    at = [[rests[move] for move in looks] for rests in (rests_of(moves, axis) for axis in AXES)]
+    came_by = np.array([[rest.move for rest in rests] for rests in at]).T.reshape(-1, 2)
+    redraw = np.diff(came_by, axis=0, prepend=-1) != 0
+    sign = np.array([[rest.sign for rest in rests] for rests in at]).T.reshape(-1, 2)
+    mix = (1 + sign[..., None] * np.array([-1, 1])) / 2
+    new_segment = np.diff([rest.homing for rest in at[0]], prepend=-1) != 0
+    segment = np.array([rest.segment for rest in at[0]], dtype=int)
+    return Redraws(redraw, np.where(redraw[..., None], mix, 0.0), new_segment, new_segment & (segment >= homed_from))

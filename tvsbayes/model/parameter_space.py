@@ -10,7 +10,7 @@ from jax.scipy.special import ndtr, ndtri
 from jaxtyping import Array, Bool, Float, Int
 from scipy import special
 
-from tvsbayes.instrument.axes import FULL_TURN_DEG
+from tvsbayes.instrument.axes import AXES, FULL_TURN_DEG
 from tvsbayes.instrument.parameters import INDEX, KINDS, NAMES, RECEIVER_NAMES, RIG_NAMES
 from tvsbayes.instrument.rig import RigTable
 from tvsbayes.instrument.stereo_pair import Stereo
@@ -192,7 +192,7 @@ def parameter_space(table: RigTable, stereo: Stereo) -> ParameterSpace:
             kind=jnp.array([KINDS.index(p.distribution) for p in priors]),
             stereo_mean=jnp.asarray(stereo.vector),
             stereo_root=jnp.asarray(root),
-            harmonic_period_deg=jnp.array([table.harmonic_period_deg.get(a, FULL_TURN_DEG) for a in ("pan", "tilt")]),
+            harmonic_period_deg=jnp.array([table.harmonic_period_deg.get(a, FULL_TURN_DEG) for a in AXES]),
         )
 
 

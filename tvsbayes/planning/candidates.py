@@ -10,10 +10,12 @@ import jax
 import numpy as np
 
 from tvsbayes.errors import InputError
-from tvsbayes.instrument.axes import FULL_TURN_DEG
+from tvsbayes.instrument.axes import AXES, FULL_TURN_DEG, SENSES, direction_of
 from tvsbayes.instrument.campaign import Move
+from tvsbayes.instrument.counter_limits import CounterLimits
 from tvsbayes.instrument.parameters import INDEX
-from tvsbayes.instrument.plan import PlanStep, counter_limits
+from tvsbayes.instrument.plan import PlanBuilder, PlanStep
+from tvsbayes.instrument.protocols import UNSTATED_STEPS
 from tvsbayes.model.headlines import physical_at
 from tvsbayes.model.parameter_space import ParameterSpace
 from tvsbayes.planning.expectation import (
@@ -71,30 +73,22 @@ def arrange(looks: Looks, sheets: Sequence[str], overshoot: np.ndarray, home: tu
         overshoot: run-up (pan, tilt) in steps that takes up all play, shape (2,).
         home: counters of the homing.
     """
-    steps = [PlanStep(0, "home", *home)]
-    at, travelled = np.array(home), np.zeros(2, dtype=int)
+    plan = PlanBuilder()
+    plan.home(*home)
     order = np.lexsort((looks.steps[:, 0] * looks.side[:, 0], looks.side[:, 0], looks.side[:, 1], looks.sheet))
     path = np.zeros((len(looks), 2), dtype=int)
     placed = -1
-
-    def go(counters: np.ndarray) -> None:
-        nonlocal at
-        travelled[:] += np.abs(counters - at)
-        at = counters
-        steps.append(PlanStep(len(steps), "move", int(counters[0]), int(counters[1])))
-
     for look in order:
         if looks.sheet[look] != placed:
             placed = int(looks.sheet[look])
-            steps.append(PlanStep(len(steps), "place", target=sheets[placed]))
+            plan.place(sheets[placed])
         goal, side = looks.steps[look], looks.side[look]
-        run_up = (goal - at) * side < overshoot
-        if run_up.any():
-            go(np.where(run_up, goal - side * overshoot, at))
-        go(goal)
-        path[look] = travelled
-        steps.append(PlanStep(len(steps), "look"))
-    return Arranged(tuple(steps), order, path)
+        run_up = (goal - plan.at) * side < overshoot
+        plan.move(*np.where(run_up, goal - side * overshoot, plan.at).tolist())
+        plan.move(*goal.tolist())
+        path[look] = plan.travelled
+        plan.look()
+    return Arranged(tuple(plan.steps), order, path)
 
 
 @dataclass(frozen=True)
@@ -115,12 +109,11 @@ class LookArrays:
     def __init__(self, looks: Looks, knowledge: Knowledge, aperture: bool):
         self.rig, self.knowledge, self.blocks = knowledge.rig, knowledge, []
         depth = np.array([knowledge.rig.sheets_mm[name] for name in knowledge.sheets])[looks.sheet]
-        words = np.array([("right", "left"), ("down", "up")])
         for begin in range(0, len(looks), self.BLOCK):
             part = slice(begin, begin + self.BLOCK)
             moves = [
-                Move(i, i, 0.0, int(pan), int(tilt), words[0, int(left > 0)], words[1, int(up > 0)])
-                for i, ((pan, tilt), (left, up)) in enumerate(zip(looks.steps[part], looks.side[part], strict=True))
+                Move(i, i, 0.0, *steps, *map(direction_of, AXES, side))
+                for i, (steps, side) in enumerate(zip(looks.steps[part].tolist(), looks.side[part], strict=True))
             ]
             with jax.enable_x64(True):
                 # Each look stands for itself: no home offsets.
@@ -208,7 +201,7 @@ def overshoot_steps(knowledge: Knowledge) -> np.ndarray:
     draws = draws_of(knowledge, 200, np.random.default_rng(17))
     physical = np.stack([physical_at(z, knowledge.space).value for z in draws])
     result = []
-    for axis, sides in (("pan", ("left", "right")), ("tilt", ("up", "down"))):
+    for axis, sides in SENSES.items():
         lost = np.quantile(physical[:, INDEX[f"backlash_deg.{axis}"]], 0.99)
         scatter = max(np.median(physical[:, INDEX[f"stop_sd_deg.{side}"]]) for side in sides)
         ratio = abs(np.median(physical[:, INDEX[f"degrees_per_step.{axis}"]]))
@@ -227,6 +220,18 @@ def _sided(positions: np.ndarray, sheets: np.ndarray, limits: np.ndarray, oversh
     return Looks(*(np.concatenate(parts) for parts in zip(*found, strict=True)))
 
 
+def _allowed(stated: CounterLimits) -> tuple[np.ndarray, list[str]]:
+    limits = stated.within(UNSTATED_STEPS)
+    notes = []
+    if stated.unstated:
+        ranges = ", ".join(f"{axis} {low} to {high}" for axis, (low, high) in limits.items())
+        notes.append(
+            f"[positioner] does not state {', '.join(stated.unstated)}: counters stay within {ranges}; wider limits "
+            "would allow longer travel, and full turns"
+        )
+    return np.array([limits[axis] for axis in AXES]), notes
+
+
 def candidates(knowledge: Knowledge) -> Candidates:
     """Looks on a grid over what images and motor limits allow, on every sheet, from both sides of both axes.
 
@@ -242,8 +247,7 @@ def candidates(knowledge: Knowledge) -> Candidates:
         raise InputError(
             "no-sheet", "the rig has no sheets to look at", file="rig.toml", column="sheets", remedy=remedy
         )
-    stated = counter_limits(rig)
-    limits, notes = stated.steps, list(stated.notes)
+    limits, notes = _allowed(rig.limits)
     physical = physical_at(knowledge.z, knowledge.space).value
     overshoot = overshoot_steps(knowledge)
     ratio = physical[[INDEX["degrees_per_step.pan"], INDEX["degrees_per_step.tilt"]]]

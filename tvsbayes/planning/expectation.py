@@ -14,17 +14,17 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from tvsbayes.errors import InputError
-from tvsbayes.estimators.campaign_arrays import CampaignArrays, SpotArrays
+from tvsbayes.estimators.campaign_arrays import CampaignArrays, SpotArrays, move_arrays
 from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.estimators.linear_spots import linearise
-from tvsbayes.instrument.axes import APPROACH_SIGN, HOME_SD_DEG
-from tvsbayes.instrument.campaign import Move, Spot
+from tvsbayes.instrument.axes import HOME_SD_DEG
+from tvsbayes.instrument.campaign import Move
 from tvsbayes.instrument.parameters import NAMES, NOISE_NAMES
-from tvsbayes.instrument.plan import HOME_APPROACH, PlanLog, PlanStep, plan_seconds, run_plan
+from tvsbayes.instrument.plan import PlanLog, PlanStep, plan_seconds, run_plan
 from tvsbayes.instrument.rig import Rig
 from tvsbayes.instrument.stops import redraws
 from tvsbayes.model.geometry import along_batch, materialise, project, rotation_matrix, transform
-from tvsbayes.model.laser_path import MoveArrays, beam, mirror_angles
+from tvsbayes.model.laser_path import beam, mirror_angles
 from tvsbayes.model.parameter_space import ParameterSpace, parameter_space
 
 LOOKS_PER_EXPERIMENT = 4
@@ -181,23 +181,14 @@ def design_arrays(
     # Half the moves rounded up: there are twice as many places for them as for looks.
     size, count = padded_size(max(len(look_moves), (len(moves) + 1) // 2)), len(look_moves)
 
-    def padded(rows, shape, fill, dtype=float, length=size):
-        array = np.full((length, *shape), fill, dtype=dtype)
+    def padded(rows, shape, fill, dtype=float):
+        array = np.full((size, *shape), fill, dtype=dtype)
         array[: len(rows)] = rows
         return jnp.asarray(array)
 
-    spots = [_unseen(number, move) for number, move in enumerate(look_moves)]
-    new = redraws(tuple(replace(m, segment=0) for m in moves), spots)
-    homed = new.new_segment & (np.array([moves[m].segment for m in look_moves]) >= homed_from)
-    steps = [(m.pan_steps, m.tilt_steps) for m in moves]
-    sides = [(APPROACH_SIGN.get(m.pan_approach, 0), APPROACH_SIGN.get(m.tilt_approach, 0)) for m in moves]
-    long = 2 * size
+    new = redraws(moves, look_moves, homed_from)
     return CampaignArrays(
-        MoveArrays(
-            padded(steps, (2,), steps[-1], length=long),
-            padded([bool(m.pan_approach) for m in moves], (), False, bool, long),
-            padded(sides, (2,), 0.0, length=long),
-        ),
+        move_arrays(moves, 2 * size),
         SpotArrays(
             move_index=padded(look_moves, (), look_moves[-1], np.int32),
             pixels=jnp.zeros((size, 4)),
@@ -210,14 +201,10 @@ def design_arrays(
             redraw=padded(new.redraw, (2,), False, bool),
             redraw_mix=padded(new.redraw_mix, (2, 2), 0.0),
             new_segment=padded(new.new_segment, (), False, bool),
-            homed=padded(homed, (), False, bool),
+            homed=padded(new.homed, (), False, bool),
         ),
         jnp.asarray(rig.table.aperture_convention == "azimuth"),
     )
-
-
-def _unseen(number: int, move: int) -> Spot:
-    return Spot(number, move, "", None, None, *(None,) * 8)
 
 
 def expected_information(
@@ -259,7 +246,7 @@ def plan_minutes(steps: Sequence[PlanStep], rig: Rig) -> float:
 
 
 def _logged(steps: Sequence[PlanStep], rig: Rig) -> PlanLog:
-    log = run_plan(steps, rig, HOME_APPROACH)
+    log = run_plan(steps, rig)
     if not log.looks:
         remedy = "add `look` steps to the plan"
         raise InputError("no-look", "the plan looks at nothing", file="plan.csv", column="action", remedy=remedy)

@@ -14,10 +14,10 @@ from scipy import special, stats
 
 from tvsbayes.errors import InputError, TvsError
 from tvsbayes.estimators.four_point import classic, four_point_ratios, select_experiments
-from tvsbayes.instrument.axes import DIRECTIONS
+from tvsbayes.instrument.axes import AXES, DIRECTIONS, SIDES
 from tvsbayes.instrument.campaign import Campaign
 from tvsbayes.instrument.parameters import INDEX, NAMES, RIG_NAMES
-from tvsbayes.instrument.plan import four_point_protocol
+from tvsbayes.instrument.protocols import four_point_protocol
 from tvsbayes.model.headlines import physical_at
 from tvsbayes.model.parameter_space import ParameterSpace
 from tvsbayes.planning.candidates import (
@@ -80,7 +80,7 @@ def draw_truths(knowledge: Knowledge, count: int, seed: int) -> list[DrawnTruth]
     return [truth_in(knowledge, t.parameters, t.stereo.vector) for t in drawn]
 
 
-STOP_COLUMNS = np.array([[INDEX[f"stop_sd_deg.{d}"] for d in pair] for pair in (("right", "left"), ("down", "up"))])
+STOP_COLUMNS = np.array([[INDEX[f"stop_sd_deg.{d}"] for d in SIDES[axis]] for axis in AXES])
 PIXEL_COLUMN = INDEX["pixel_scale"]
 
 

@@ -184,7 +184,7 @@ def next_experiments(
             information = information_of_looks(seen, picks, design.path, knowledge.space, knowledge.after_data)
             after = at_centre.value(covariance_of(knowledge.precision + information), target.factor)
             minutes = plan_minutes(design.steps, knowledge.rig)
-            text = f"{'a full turn of pan away, ' if turned else ''}{described(design.steps)}"
+            text = f"{'a full turn of pan away, ' if turned else ''}{described(knowledge.rig, design.steps)}"
             gain = max(now - after, 0.0)
             batches.append(Batch(design.steps, minutes, gain, gain / max(minutes, 1e-9), text))
     unique = {batch.actions: batch for batch in batches}.values()

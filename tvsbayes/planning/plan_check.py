@@ -13,7 +13,8 @@ import numpy as np
 from tvsbayes.errors import InputError
 from tvsbayes.instrument.axes import AXES
 from tvsbayes.instrument.campaign import Move
-from tvsbayes.instrument.plan import PlanStep, described, standing, step_json
+from tvsbayes.instrument.counter_limits import CounterLimits
+from tvsbayes.instrument.plan import PlanStep, described, run_plan, step_json
 from tvsbayes.instrument.rig import Rig
 from tvsbayes.instrument.stops import observed_stops, separation
 from tvsbayes.model.headlines import QUANTITIES, headlines
@@ -127,12 +128,12 @@ def _judge(steps: Sequence[PlanStep], knowledge: Knowledge) -> _Judged:
     return _Judged(found, covariance, gradient, prior)
 
 
-def _extended(
-    steps: Sequence[PlanStep], looks: Looks, sheets: Sequence[str], overshoot: np.ndarray
+def extended(
+    steps: Sequence[PlanStep], looks: Looks, knowledge: Knowledge, overshoot: np.ndarray
 ) -> tuple[PlanStep, ...]:
     """Steps that append looks to a plan: no homing in between, a placement only where another sheet is needed."""
-    end = standing(steps)
-    more = [s for s in arrange(looks, sheets, overshoot, end.at).steps if s.action != "home"]
+    end = run_plan(steps, knowledge.rig)
+    more = [s for s in arrange(looks, knowledge.sheets, overshoot, end.at).steps if s.action != "home"]
     if more and more[0].action == "place" and more[0].target == end.sheet:
         more = more[1:]
     return tuple(replace(s, step=len(steps) + k) for k, s in enumerate(more))
@@ -166,30 +167,26 @@ def _cure(
     own = np.zeros(len(rows))
     precision = knowledge.precision + before.information.fisher
     search = Search(seen.rows[..., :PARAMETERS], precision, before.gradient[rows], own, "A")
-    placed = standing(steps).sheet
+    placed = run_plan(steps, knowledge.rig).sheet
     here = found.looks.sheet == (knowledge.sheets.index(placed) if placed in knowledge.sheets else 0)
     part = replace(search, rows=np.where(here[:, None, None], search.rows, 0.0))
     picks = np.array(part.greedy(CURE_LOOKS))
     for count in range(1, CURE_LOOKS + 1):
-        addition = _extended(steps, found.looks[picks[:count]], knowledge.sheets, found.overshoot)
+        addition = extended(steps, found.looks[picks[:count]], knowledge, found.overshoot)
         after = _judge((*steps, *addition), knowledge)
         if not after.faulty(axis):
             return _Cure(addition, after)
     return None
 
 
-def _beyond_limits(rig: Rig, moves: Sequence[Move]) -> list[str]:
+def beyond_limits(limits: CounterLimits, moves: Sequence[Move]) -> list[str]:
     """Axes that leave the limits which `[positioner]` states, as sentences."""
     found = []
     for axis in AXES:
         counters = [getattr(move, f"{axis}_steps") for move in moves]
-        least, most = (rig.positioner.get(f"{axis}_{end}_steps") for end in ("min", "max"))
-        if (least is None or min(counters) >= least) and (most is None or max(counters) <= most):
-            continue
-        allowed = f"{least} to {most}"
-        if least is None or most is None:
-            allowed = f"up to {most}" if least is None else f"{least} and more"
-        found.append(f"{axis} moves from {min(counters)} to {max(counters)} steps; [positioner] allows {allowed}")
+        least, most = min(counters), max(counters)
+        if not (limits.allow(axis, least) and limits.allow(axis, most)):
+            found.append(f"{axis} moves from {least} to {most} steps; [positioner] allows {limits.words(axis)}")
     return found
 
 
@@ -214,7 +211,7 @@ def check_plan(rig: Rig, steps: Sequence[PlanStep]) -> PlanCheck:
         warnings.append(
             f"{missed} of {len(information.look_moves)} looks miss an image at the most probable instrument"
         )
-    warnings += _beyond_limits(rig, information.moves)
+    warnings += beyond_limits(rig.limits, information.moves)
     faulty = [axis for axis in AXES if judged_plan.faulty(axis)]
     found = None
     if faulty:
@@ -230,7 +227,7 @@ def check_plan(rig: Rig, steps: Sequence[PlanStep]) -> PlanCheck:
         if cure is not None:
             looks, after = sum(s.action == "look" for s in cure.addition), cure.after.u(axis)
             text += (
-                f"; smallest cure: {looks} more look{'s' * (looks != 1)}, {described(cure.addition, steps)}: u of the "
+                f"; smallest cure: {looks} more look{'s' * (looks != 1)}, {described(rig, cure.addition, steps)}: u of the "
                 f"{axis} ratio {before:.2g} -> {after:.2g} deg/step"
             )
             faults.append(PlanFault(axis, text, cure.addition, before, after))

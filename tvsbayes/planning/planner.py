@@ -16,8 +16,10 @@ import numpy as np
 from tvsbayes.errors import InputError, NotConverged
 from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.estimators.linear_spots import LinearSpots, stop_information
+from tvsbayes.instrument.axes import AXES, DIRECTION_SIGNS
 from tvsbayes.instrument.campaign import Campaign
-from tvsbayes.instrument.plan import PlanStep, grid_protocol, mixed_protocol, paper_protocol, step_json
+from tvsbayes.instrument.plan import PlanStep, step_json
+from tvsbayes.instrument.protocols import grid_protocol, mixed_protocol, paper_protocol
 from tvsbayes.instrument.rig import Rig
 from tvsbayes.planning.candidates import LookArrays, Looks, candidates, covariance_of, information_of_looks
 from tvsbayes.planning.expectation import (
@@ -234,15 +236,14 @@ def _curve(
 def few_stops(looks: Looks) -> list[str]:
     """Directions that a design reaches so rarely that a fit can say little about them, as notes."""
     notes = []
-    for axis, sides in ((0, ("left", "right")), (1, ("up", "down"))):
-        for side, direction in zip((1, -1), sides, strict=True):
-            stops = int(np.sum(looks.side[:, axis] == side))
-            if stops < STOPS_ADVISED:
-                reached = f"{stops} stop{'s' * (stops != 1)} {direction}"
-                notes.append(
-                    f"only {reached}: this plan is for its target alone; for reliable intervals of {direction} plan "
-                    "u(worst), which asks for every direction"
-                )
+    for direction, (axis, sign) in DIRECTION_SIGNS.items():
+        stops = int(np.sum(looks.side[:, AXES.index(axis)] == sign))
+        if stops < STOPS_ADVISED:
+            reached = f"{stops} stop{'s' * (stops != 1)} {direction}"
+            notes.append(
+                f"only {reached}: this plan is for its target alone; for reliable intervals of {direction} plan "
+                "u(worst), which asks for every direction"
+            )
     return notes
 
 

@@ -27,7 +27,7 @@ from tvsbayes.coordinates.beam_meeting import Sources, propagate
 from tvsbayes.coordinates.location import settings_of
 from tvsbayes.errors import InputError, escaped
 from tvsbayes.instrument.parameters import INDEX
-from tvsbayes.instrument.plan import OVERSHOOT_STEPS
+from tvsbayes.instrument.protocols import OVERSHOOT_STEPS
 from tvsbayes.instrument.rig import RigTable
 from tvsbayes.model.headlines import QUANTITIES, RATIOS, headlines, physical_at
 from tvsbayes.model.parameter_space import ParameterSpace

@@ -11,7 +11,7 @@ import numpy as np
 from arviz_stats.base import array_stats
 
 from tvsbayes.estimators.joint_fit import JointFit
-from tvsbayes.instrument.axes import DIRECTIONS
+from tvsbayes.instrument.axes import DIRECTION_SIGNS, DIRECTIONS, SENSES
 from tvsbayes.instrument.parameters import NAMES
 from tvsbayes.model.headlines import Derived, derived_quantities
 from tvsbayes.posterior.transport import in_batches
@@ -31,7 +31,7 @@ class Draws(Mapping[str, np.ndarray]):
     def __init__(self, draws: Derived):
         physical = draws.physical.reshape(-1, draws.physical.shape[-1])
         self._columns = dict(zip(NAMES, physical.T, strict=True))
-        for axis, positive, negative in (("pan", "left", "right"), ("tilt", "up", "down")):
+        for axis, (positive, negative) in SENSES.items():
             ratio, half = (
                 self._columns[f"degrees_per_step.{axis}"],
                 self._columns[f"ratio_contrast_deg_per_step.{axis}"] / 2,
@@ -164,7 +164,7 @@ class Posterior:
         """
         if direction not in DIRECTIONS:
             raise ValueError(f"direction {direction!r}; allowed: {', '.join(DIRECTIONS)}")
-        axis = "pan" if direction in ("left", "right") else "tilt"
+        axis, _ = DIRECTION_SIGNS[direction]
         count = np.atleast_1d(np.asarray(steps, dtype=float))
         return self.propagate(
             lambda p: np.minimum(

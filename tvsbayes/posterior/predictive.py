@@ -28,7 +28,7 @@ from tvsbayes.estimators.likelihood import (
     observe_with_stop_errors,
 )
 from tvsbayes.files.disk import write_atomically
-from tvsbayes.instrument.axes import DIRECTIONS, HOME_SD_DEG
+from tvsbayes.instrument.axes import DIRECTIONS, HOME_SD_DEG, SENSES
 from tvsbayes.instrument.campaign import input_hashes, ordered_spots
 from tvsbayes.instrument.parameters import HARMONIC_PRIORS, INDEX, NAMES, STEREO_PARAMETER_NAMES
 from tvsbayes.model.headlines import Derived
@@ -317,7 +317,7 @@ def data_tree(posterior: Posterior) -> xr.DataTree:
     fit = posterior.fit
     shape = posterior.z.shape[:2]
     varying = {NAMES[i] for i in np.flatnonzero(fit.free)} | {"effective_mirror_offset_mm"}
-    for axis, pair in (("pan", ("left", "right")), ("tilt", ("up", "down"))):
+    for axis, pair in SENSES.items():
         if varying & {f"degrees_per_step.{axis}", f"ratio_contrast_deg_per_step.{axis}"}:
             varying |= {f"degrees_per_step.{d}" for d in pair} | {f"effective_deg_per_step.{d}" for d in pair}
     prior_draws = jax.tree.map(lambda x: np.asarray(x)[None], fit.prior_draws)

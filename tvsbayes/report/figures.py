@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from tvsbayes.estimators.four_point import ClassicResult, select_experiments
-from tvsbayes.instrument.axes import DIRECTIONS
+from tvsbayes.instrument.axes import DIRECTIONS, SENSES
 from tvsbayes.instrument.stereo_pair import triangulate
 
 if TYPE_CHECKING:
@@ -320,7 +320,7 @@ def correlations(names: Sequence[str], matrix: np.ndarray) -> Figure:
 def residuals(stops: Sequence[Mapping[str, Any]], axis: str) -> Figure:
     """Deviations of one axis' stops over time and against their counters; `stops` as `fit.json` holds them."""
     mine = [stop for stop in stops if stop["axis"] == axis]
-    directions = ("left", "right") if axis == "pan" else ("up", "down")
+    directions = SENSES[axis]
     with _figure(4.6) as figure:
         panels = figure.subplots(2, 1, sharey=True)
         for direction, colour, marker in (*zip(directions, (BLUE, RED), "^v", strict=True), ("", GREY, "x")):
@@ -421,7 +421,7 @@ def ratio_curves(curves: Mapping[str, Sequence[Mapping[str, object]]]) -> Figure
         panels = figure.subplots(2, 1)
         markers = dict(zip(DIRECTIONS, "<>^v", strict=True))
         colours = dict(zip(DIRECTIONS, (BLUE, RED, GREEN, ORANGE), strict=True))
-        for axes, axis, shown in zip(panels, ("pan", "tilt"), (DIRECTIONS[:2], DIRECTIONS[2:]), strict=True):
+        for axes, axis, shown in zip(panels, SENSES, SENSES.values(), strict=True):
             angle = np.array([entry[f"{axis}_deg"] for entry in curves[axis]])
             for shift, direction in zip((-0.01, 0.01), shown, strict=True):
                 entries = [entry.get(direction) for entry in curves[axis]]

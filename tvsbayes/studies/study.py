@@ -20,7 +20,7 @@ import numpy as np
 
 from tvsbayes.errors import InputError, NotConverged, escaped, refusal
 from tvsbayes.files.disk import read_bytes
-from tvsbayes.instrument.axes import DIRECTIONS
+from tvsbayes.instrument.axes import DIRECTION_SIGNS
 from tvsbayes.model.headlines import QUANTITIES
 from tvsbayes.planning.target import Target
 from tvsbayes.statistics.intervals import LEVELS, NORMAL_95, binomial_bounds, rms_bounds, share_interval95
@@ -175,7 +175,7 @@ def study_result(job: StudyJob, rows: Sequence[Mapping[str, object]]) -> StudyRe
         message = "no fit of the study converged" + (f"; {problems[0]}" if problems else "")
         raise NotConverged("not-converged", message, remedy="check the plan with `tvsbayes check RIG PLAN`")
     n = len(good)
-    stated = {d: job.rig.table.priors[f"degrees_per_step.{a}"].value for a, d in _axes_of_directions()}
+    stated = {d: job.rig.table.priors[f"degrees_per_step.{axis}"].value for d, (axis, _) in DIRECTION_SIGNS.items()}
     found = {}
     for name in QUANTITIES:
         entries = [row["headlines"][name] for row in good]
@@ -212,10 +212,6 @@ def study_result(job: StudyJob, rows: Sequence[Mapping[str, object]]) -> StudyRe
         seconds=float(np.median([row["seconds"] for row in rows])),
         problems=problems,
     )
-
-
-def _axes_of_directions() -> Iterator[tuple[str, str]]:
-    return ((("pan", "tilt")[k // 2], d) for k, d in enumerate(DIRECTIONS))
 
 
 def study(

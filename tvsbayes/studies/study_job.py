@@ -17,7 +17,7 @@ import numpy as np
 
 from tvsbayes.errors import InputError, TvsError
 from tvsbayes.estimators.joint_fit import JointFit, fit
-from tvsbayes.instrument.axes import DIRECTIONS
+from tvsbayes.instrument.axes import AXES, DIRECTIONS
 from tvsbayes.instrument.parameters import INDEX
 from tvsbayes.instrument.plan import PlanStep
 from tvsbayes.instrument.rig import Rig, rig_table_toml
@@ -159,7 +159,7 @@ def predicted_sds(knowledge: Knowledge, fisher: np.ndarray, gradient: np.ndarray
     Returns:
         Shape (q,).
     """
-    columns = [INDEX[f"backlash_deg.{axis}"] for axis in ("pan", "tilt")]
+    columns = [INDEX[f"backlash_deg.{axis}"] for axis in AXES]
     slope = half_normal_slope(z[columns])
     scale, covariance = np.ones(len(z)), np.eye(len(z))
     for _ in range(ITERATIONS):

@@ -18,7 +18,7 @@ import numpy as np
 from tvsbayes.errors import InputError
 from tvsbayes.files.disk import read_bytes, write_atomically
 from tvsbayes.files.documents import JSON_BYTES_MAX, parse_json
-from tvsbayes.instrument.axes import FULL_TURN_DEG, HOME_SD_DEG, SIDES
+from tvsbayes.instrument.axes import FULL_TURN_DEG, HOME_SD_DEG, SIDES, PanApproach, TiltApproach
 from tvsbayes.instrument.campaign import NO_PIXELS, Campaign, Move, Spot, with_pixels, write_campaign
 from tvsbayes.instrument.parameters import (
     DECLARED_PRIORS,
@@ -233,7 +233,7 @@ def simulate(
     *,
     aperture: bool = False,
     spot_sd_px: float | None = None,
-    home_approach: tuple[str, str] = HOME_APPROACH,
+    home_approach: tuple[PanApproach, TiltApproach] = HOME_APPROACH,
     header: Mapping[str, object] | None = None,
 ) -> SimulatedCampaign:
     """Run a plan on a true rig and return the campaign a stranger would see, with its truth.
