@@ -54,7 +54,7 @@ LONG = (
     *(
         "calibration/test_pointing.py",
         "statistics/test_intervals.py",
-        "promises/test_readme.py",
+        "promises/test_docs.py",
         "model/test_laser_path.py",
         "promises/test_shipped_data.py",
     ),

@@ -22,7 +22,8 @@ SIZES_MAX = {".whl": 1_000_000, ".gz": 2_000_000}
 SHIPPED = (
     *("rigs/mounted/rig.toml", "rigs/nominal/rig.toml", "twins/paper_twin/spots.csv", "twins/grid_twin/truth.json"),
     *("schemas/fit-1.schema.json", "report/report.html", "report/report.css", "templates/campaign.toml"),
-    *("export/tvs_calibration.h", "reference/table1.csv", "tutorial/rig.svg"),
+    *("export/tvs_calibration.h", "reference/table1.csv", "tutorial/rig.svg", "tutorial/README.md"),
+    *(path.relative_to(ROOT / "data").as_posix() for path in sorted((ROOT / "data" / "docs").glob("*.md"))),
 )
 
 pytestmark = pytest.mark.slow
@@ -83,9 +84,10 @@ def test_distributions_hold_what_belongs_in_them(built):
         source = [name.partition("/")[2] for name in archive.getnames()]
     stray = ("experiments/output", "results/", ".venv", "__pycache__", ".git/")
     assert not [name for name in [*wheel, *source] if any(part in name for part in stray)]
-    assert {"README.md", "CHANGELOG.md", "LICENSE", "tests/promises/test_package.py", "experiments/README.md"} <= set(
-        source
-    )
+    assert {
+        *("README.md", "CHANGELOG.md", "CONTRIBUTING.md", "LICENSE", "experiments/README.md"),
+        *("tests/promises/test_package.py", "data/docs/formulation.md", "data/docs/site/mkdocs.yml"),
+    } <= set(source)
 
 
 @pytest.mark.parametrize("kind", [".whl", "again"])
