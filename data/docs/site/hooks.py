@@ -1,8 +1,8 @@
 """Builds the site of the documents (mkdocs): pages from outside data/, links between them, formulas, API reference.
 
-In the site `data/` is the root. README is its index; CONTRIBUTING, CHANGELOG and `experiments/` keep their places. Links
-between files of the repository are turned into links of the site. Formulas become MathML while the site is built, so
-that a browser needs no script and no network for them.
+In the site `data/` is the root; README is its index; CONTRIBUTING, CHANGELOG and `experiments/` keep their places.
+Links between files of the repository become links of the site. Formulas become MathML while the site is built, so that
+a browser needs no script and no network for them.
 """
 
 from __future__ import annotations
