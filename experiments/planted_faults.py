@@ -575,7 +575,7 @@ FAULTS = (
     # Comparison.
     Fault(
         "log predictive density with the wrong sign",
-        "comparison/hold_out.py",
+        "comparison/scores.py",
         "log_density=float(np.mean(stats.t.logpdf(error, dof[name], scale=u)))",
         "log_density=-float(np.mean(stats.t.logpdf(error, dof[name], scale=u)))",
         "the worse predictor has the better score",
@@ -584,7 +584,7 @@ FAULTS = (
     ),
     Fault(
         "ratio of errors upside down",
-        "comparison/hold_out.py",
+        "comparison/scores.py",
         'ratio = scores["classic"].rms_block_deg / scores["joint"].rms_block_deg',
         'ratio = scores["joint"].rms_block_deg / scores["classic"].rms_block_deg',
         "the report says that the classic predicts better by the factor by which it is worse",

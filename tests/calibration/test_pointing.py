@@ -41,7 +41,7 @@ from tvsbayes.calibration.calibration_file import (
     load_calibration,
     stored_calibration,
 )
-from tvsbayes.calibration.optics import direction_of, output_deg, range_components
+from tvsbayes.calibration.optics import unit_vector, output_deg, range_components
 from tvsbayes.calibration.pointing import DIVERGING_SHARE, INPUT_NAMES, NOISE_NAMES, Calibration
 from tvsbayes.coordinates.beam_meeting import carry, meeting, sources
 from tvsbayes.coordinates.location import locate, locate_linear, settings_of
@@ -316,7 +316,7 @@ def test_steps_for_a_direction(bent):
         # Half a step of 0.0621 and 0.0704 deg, and 5 % for the crosstalk of a bent rig at 30 deg of elevation.
         assert abs(gone[0]) < 0.05 * 0.0704 + 0.5 * 0.0621 * 1.05
         assert abs(gone[1]) < 0.05 * 0.0621 + 0.5 * 0.0704 * 1.05
-        wanted = direction_of(azimuth, elevation)
+        wanted = unit_vector(azimuth, elevation)
         # The cosine loses half of the digits.
         assert steps.rounding_deg == pytest.approx(math.degrees(math.acos(min(1.0, wanted @ d))), abs=1e-5)
         assert steps.xyz_mm is None and steps.aperture_deg is None and steps.u95_mm is None

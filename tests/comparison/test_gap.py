@@ -20,7 +20,8 @@ from tvsbayes.assessment.score_tests import _Answer, _holm
 from tvsbayes.assessment.summary import summarise
 from tvsbayes.comparison.changes import compare
 from tvsbayes.comparison.gap import BACKLASH, CHANCE, PROJECTION, STEREO_SCALE, explain_gap
-from tvsbayes.comparison.hold_out import _foretell_classic, _judge, _ratio_interval, folds_of, hold_out
+from tvsbayes.comparison.held_out import folds_of, foretell_classic, hold_out
+from tvsbayes.comparison.scores import judge, ratio_interval
 from tvsbayes.errors import NotConverged
 from tvsbayes.estimators.four_point import Selection, classic, select_experiments
 from tvsbayes.estimators.joint_fit import JointFit, fit
@@ -81,7 +82,7 @@ def test_a_rest_whose_first_spot_is_left_out_keeps_its_stop_error(paper_fit):
 
 def test_a_refit_that_failed_judges_nobody(mixed_fit, monkeypatch):
     lost = replace(mixed_fit, converged=False, problems=("it went astray",))
-    monkeypatch.setattr("tvsbayes.comparison.hold_out._refit", lambda *_: lost)
+    monkeypatch.setattr("tvsbayes.comparison.held_out.refit", lambda *_: lost)
     held = hold_out(mixed_fit)
     assert held.verdict == CANNOT_TELL and "went astray" in held.reason
 
@@ -175,7 +176,7 @@ def test_scores_of_predictions_by_hand():
         (("a", "left", 3), ("a", "left", 1), ("b", "up", -2), ("b", "up", -4))
     ):
         told.append(Prediction(e, fold, direction, 100, 6.0 + error, 6.0, 1.0, 3, 6.0 + 0.9 * error, 1.0))
-    held = _judge("steps", told, np.array([100, 200]), {})
+    held = judge("steps", told, np.array([100, 200]), {})
     assert held.classic.rms_deg == pytest.approx(np.sqrt(30 / 4)) and held.joint.rms_deg == pytest.approx(
         np.sqrt(0.075)
     )
@@ -202,7 +203,7 @@ def test_the_better_predictor_is_named(verdict):
         Prediction(e, f"fold {e}", "left", 100, 6.0 + error, float(far[e]), 1.0, 3, float(near[e]), 1.0)
         for e, error in enumerate(errors)
     ]
-    held = _judge("steps", told, np.array([100, 200]), {})
+    held = judge("steps", told, np.array([100, 200]), {})
     assert held.verdict == verdict
     assert held.ratio == pytest.approx(10.0 if verdict == BETTER_JOINT else 0.1)
     # Proportional errors leave no doubt about their ratio; the correlation is 1 but for rounding.
@@ -245,16 +246,16 @@ def test_experiments_beyond_the_lens_model_neither_teach_nor_are_asked():
     rows, nothing = np.zeros((4, 4), dtype=int), np.zeros((4, 4, 4))
     selection = Selection(np.arange(4), rows, nothing, np.full(4, 200), np.full(4, "pan"), ())
     angle = np.array([12.0, 12.1, 11.9, np.nan])
-    told = _foretell_classic(angle, selection, np.array([True, False, False, False]))
+    told = foretell_classic(angle, selection, np.array([True, False, False, False]))
     assert told[0][0] == pytest.approx(12.0) and np.isfinite(told[0][1]) and told[0][2] == 1
-    assert _foretell_classic(angle, selection, np.array([False, False, False, True])) == {}
+    assert foretell_classic(angle, selection, np.array([False, False, False, True])) == {}
 
 
 def test_a_fold_without_a_fit_decides_nothing(mixed_fit, monkeypatch):
     def lost(*_arguments):
         raise NotConverged("diverged", "NOT CONVERGED: the fit ran away")
 
-    monkeypatch.setattr("tvsbayes.comparison.hold_out._refit", lost)
+    monkeypatch.setattr("tvsbayes.comparison.held_out.refit", lost)
     held = hold_out(mixed_fit)
     assert held.verdict == CANNOT_TELL and "the fit ran away" in held.reason and not held.predictions
 
@@ -268,10 +269,10 @@ def test_few_experiments_foretell_with_the_width_of_their_own_scatter():
     predictions = []
     for index in range(sets):
         angle = 12.0 + 0.05 * generator.standard_normal(3)
-        ((_, told),) = _foretell_classic(angle, selection, np.array([True, False, False])).items()
+        ((_, told),) = foretell_classic(angle, selection, np.array([True, False, False])).items()
         assert told[2] == 1
         predictions.append(Prediction(index, "one", "left", 200, float(angle[0]), *told, 12.0, 0.05))
-    held = _judge("steps", predictions, np.array([100, 200]), {})
+    held = judge("steps", predictions, np.array([100, 200]), {})
     low, high = stats.binom.ppf([1e-4, 1 - 1e-4], sets, 0.95) / sets
     assert low <= held.classic.coverage <= high
     assert low <= held.joint.coverage <= high
@@ -286,7 +287,7 @@ def test_interval_of_the_ratio_of_errors_covers(correlation, true):
     second = correlation * first + np.sqrt(1 - correlation**2) * generator.standard_normal((sets, 8))
     inside = 0
     for a, b in zip(true * first, second, strict=True):
-        low, high = _ratio_interval(a, b)
+        low, high = ratio_interval(a, b)
         inside += low <= true <= high
     low, high = stats.binom.ppf([1e-4, 1 - 1e-4], sets, 0.95)
     assert low <= inside <= high

@@ -38,7 +38,7 @@ JAX_FREE_PACKAGES = (
 )
 JAX_FREE_MODULES = (
     *("statistics.intervals", "estimators.four_point", "estimators.plausibility", "coordinates.error_map"),
-    *("comparison.gap", "comparison.changes", "comparison.hold_out"),
+    *("comparison.gap", "comparison.changes", "comparison.held_out"),
 )
 """Free of JAX until a function that fits is called, in packages that are not."""
 JAX_FAMILY = {"jax", "jaxlib", "equinox", "optimistix", "lineax", "jaxtyping"}

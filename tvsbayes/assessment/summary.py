@@ -31,7 +31,7 @@ from tvsbayes.model.headlines import Derived
 from tvsbayes.posterior.draws import Posterior
 from tvsbayes.posterior.predictive import ideal_pixels
 from tvsbayes.results.estimates import Estimate, FitSummary
-from tvsbayes.statistics.intervals import NORMAL_95
+from tvsbayes.statistics.intervals import NORMAL_95, interval95
 
 CLASSIC_DRAWS = 256
 CURVE_POINTS = 7
@@ -41,9 +41,8 @@ def _estimate(mode: float, draws: np.ndarray, prior_draws: np.ndarray) -> Estima
     """From draws: equal-tailed interval, sample standard deviations."""
     # The mean of equal numbers may be off by a rounding: what is fixed would scatter by 1e-17 of itself.
     sd, prior_sd = (float(np.std(x)) if np.ptp(x) > 0 else 0.0 for x in (draws, prior_draws))
-    low, high = np.quantile(draws, [0.025, 0.975])
     contraction = float(1 - (sd / prior_sd) ** 2) if prior_sd > 0 else None
-    return Estimate(float(mode), sd, (float(low), float(high)), prior_sd, contraction)
+    return Estimate(float(mode), sd, interval95(draws), prior_sd, contraction)
 
 
 class _Source:
@@ -145,8 +144,7 @@ def _classic_predicted(source: _Source) -> dict[str, Estimate | None]:
         values = values[np.isfinite(values)]
         if len(values):
             sd = float(values.std())
-            low, high = np.quantile(values, [0.025, 0.975])
-            result[direction] = Estimate(float(centre[chosen].mean()), sd, (float(low), float(high)), None, None)
+            result[direction] = Estimate(float(centre[chosen].mean()), sd, interval95(values), None, None)
     return result
 
 

@@ -168,7 +168,7 @@ def aperture_angle_deg(point: Vector, baseline_mm: Number, azimuth: bool, m: Mod
     return arc_tangent(lateral, y + 0.5 * baseline_mm) / TO_RAD
 
 
-def direction_of(azimuth_deg: Number, elevation_deg: Number) -> np.ndarray:
+def unit_vector(azimuth_deg: Number, elevation_deg: Number) -> np.ndarray:
     """Unit vectors of directions in frame T, first axis x, y, z; azimuth atan2(y, x), elevation asin(z)."""
     azimuth, elevation = np.radians(azimuth_deg), np.radians(elevation_deg)
     level = np.cos(elevation)

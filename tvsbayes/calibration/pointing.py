@@ -24,7 +24,7 @@ from tvsbayes.calibration.optics import (
     Values,
     aperture_angle_deg,
     beam_components,
-    direction_of,
+    unit_vector,
     output_deg,
     range_components,
 )
@@ -305,7 +305,7 @@ class Calibration:
         counters, sides = (float(pan.steps), float(tilt.steps)), sides_of(reached)
         o, d = ray.origin_mm, ray.direction
         if isinstance(target, Direction):
-            goal = direction_of(target.azimuth_deg, target.elevation_deg)
+            goal = unit_vector(target.azimuth_deg, target.elevation_deg)
             rounding = math.degrees(math.atan2(np.linalg.norm(np.cross(d, goal)), d @ goal))
             return replace(found, rounding_deg=rounding, u95_deg=self.beam_u95_deg(counters, sides))
         reach = float((target.xyz_mm - o) @ d)

@@ -223,7 +223,7 @@ def compare(
     fits = [fit_for(each, report_line) for each in data]
     from tvsbayes.comparison.changes import compare as compare_fits
     from tvsbayes.comparison.gap import explain_gap
-    from tvsbayes.comparison.hold_out import hold_out
+    from tvsbayes.comparison.held_out import hold_out
 
     if other is not None:
         changes = compare_fits(*fits)

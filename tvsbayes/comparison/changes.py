@@ -1,4 +1,7 @@
-"""Two campaigns of one rig."""
+"""Two campaigns of one rig: which of its ratios and backlashes have changed, beyond what both fits leave open.
+
+Ratios in deg/step, backlashes in deg, at the reference pose of the first. Loads JAX when asked, not when imported.
+"""
 
 from __future__ import annotations
 
@@ -8,12 +11,32 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tvsbayes.comparison.gap import camera_influence
-from tvsbayes.instrument.axes import DIRECTIONS
+from tvsbayes.instrument.axes import AXES, DIRECTIONS
 from tvsbayes.instrument.campaign import Campaign
+from tvsbayes.instrument.parameters import unit_of
 from tvsbayes.results.comparison_record import Change, Comparison
 
 if TYPE_CHECKING:
     from tvsbayes.estimators.joint_fit import JointFit
+
+
+QUANTITIES = (*(f"effective_deg_per_step.{d}" for d in DIRECTIONS), *(f"backlash_deg.{axis}" for axis in AXES))
+"""What is compared."""
+
+
+def _draws_at(found: JointFit, pose_rad: np.ndarray) -> np.ndarray:
+    """`QUANTITIES` at a pose, shape (1 + draws, quantities): the estimate, then the Laplace draws."""
+    import jax
+    import jax.numpy as jnp
+
+    from tvsbayes.instrument.parameters import INDEX
+    from tvsbayes.model.headlines import derived_quantities
+
+    with jax.enable_x64(True):
+        z = jnp.asarray(np.vstack([found.z, found.draws_z]))
+        at_pose = derived_quantities(z, found.space, jnp.asarray(pose_rad))
+    backlash = np.asarray(at_pose.physical)[:, [INDEX[f"backlash_deg.{axis}"] for axis in AXES]]
+    return np.concatenate([np.asarray(at_pose.effective_deg_per_step), backlash], axis=1)
 
 
 def compare(first: JointFit, second: JointFit) -> Comparison:
@@ -27,12 +50,7 @@ def compare(first: JointFit, second: JointFit) -> Comparison:
         first: converged fit of A.
         second: converged fit of B.
     """
-    import jax
-    import jax.numpy as jnp
     from scipy import stats
-
-    from tvsbayes.instrument.parameters import INDEX
-    from tvsbayes.model.headlines import derived_quantities
 
     pose = first.reference_pose_rad
     cameras = first.campaign.stereo, second.campaign.stereo
@@ -40,31 +58,21 @@ def compare(first: JointFit, second: JointFit) -> Comparison:
         np.array_equal(cameras[0].vector, cameras[1].vector)
         and np.array_equal(cameras[0].parameter_covariance, cameras[1].parameter_covariance)
     )
-    values, influence = [], []
-    for found in (first, second):
-        with jax.enable_x64(True):
-            at_pose = derived_quantities(
-                jnp.asarray(np.vstack([found.z, found.draws_z])), found.space, jnp.asarray(pose)
-            )
-        backlash = np.asarray(at_pose.physical)[:, [INDEX["backlash_deg.pan"], INDEX["backlash_deg.tilt"]]]
-        rows = np.concatenate([np.asarray(at_pose.effective_deg_per_step), backlash], axis=1)
-        values.append(rows)
-        influence.append(camera_influence(found, rows[1:]))
-    names = [*(f"effective_deg_per_step.{d}" for d in DIRECTIONS), "backlash_deg.pan", "backlash_deg.tilt"]
-    units = ["deg/step"] * 4 + ["deg"] * 2
-    limit = float(stats.norm.isf(0.5 * (1 - 0.95 ** (1 / len(names)))))
-    variance = sum(v[1:].var(axis=0, ddof=1) for v in values)
+    before, after = _draws_at(first, pose), _draws_at(second, pose)
+    limit = float(stats.norm.isf(0.5 * (1 - 0.95 ** (1 / len(QUANTITIES)))))
+    variance = before[1:].var(axis=0, ddof=1) + after[1:].var(axis=0, ddof=1)
     if shared:
+        influence = camera_influence(first, before[1:]), camera_influence(second, after[1:])
         variance = variance - 2 * np.sum(influence[0] * influence[1], axis=1)
     changes = []
-    for k, name in enumerate(names):
-        a, b = (float(v[0, k]) for v in values)
+    for k, name in enumerate(QUANTITIES):
+        a, b = float(before[0, k]), float(after[0, k])
         # What both hold fixed has changed if the statements differ; its variance is zero but for rounding.
-        fixed = all(np.ptp(v[1:, k]) == 0 for v in values)
+        fixed = np.ptp(before[1:, k]) == np.ptp(after[1:, k]) == 0
         u = 0.0 if fixed else float(np.sqrt(max(variance[k], 0.0)))
         ratio = (b - a) / u if u > 0 else None
         significant = a != b if ratio is None else abs(ratio) > limit
-        changes.append(Change(name, units[k], a, b, b - a, u, ratio, significant))
+        changes.append(Change(name, unit_of(name), a, b, b - a, u, ratio, significant))
     moved = [c for c in changes if c.significant]
     listed = ", ".join(
         f"{c.quantity} by {c.difference:+.3g} {c.unit} "

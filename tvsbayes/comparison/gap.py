@@ -1,18 +1,29 @@
-"""Why classic and joint differ."""
+"""Why classic and joint differ: their gap term by term, and what the cameras alone do to both.
+
+Ratios in deg/step. The classic estimator is asked on the model's own spots while the rig is made ideal step by step.
+Loads JAX when a gap is asked for, not when imported.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from tvsbayes.errors import NothingToEstimate
-from tvsbayes.estimators.four_point import Selection, classic, four_point_ratios, select_experiments
+from tvsbayes.estimators.four_point import (
+    Selection,
+    classic,
+    experiment_rows,
+    four_point_ratios,
+    select_experiments,
+)
 from tvsbayes.instrument.axes import DIRECTIONS
 from tvsbayes.instrument.parameters import RIG_PRIORS
 from tvsbayes.results.comparison_record import Gap, GapTerm
+from tvsbayes.statistics.intervals import interval95
 
 if TYPE_CHECKING:
     from tvsbayes.estimators.joint_fit import JointFit
@@ -64,24 +75,72 @@ def explain_gap(found: JointFit, posterior: Posterior | None = None, draws: int 
     Returns:
         By direction; None without complete experiments.
     """
+    selection = select_experiments(found.campaign)
+    result: dict[str, Gap | None] = dict.fromkeys(DIRECTIONS)
+    if not len(selection.experiments):
+        return result
+    try:
+        measured = classic(found.campaign)
+    except NothingToEstimate:
+        return result
+    chosen = _chosen_draws(found, posterior, draws)
+    idealised = _idealised(found, selection, chosen.z)
+    # An experiment whose spots lie on one another, or beyond the lens model, has no ratio.
+    sound = np.all([np.isfinite(r).all(axis=0) for r in idealised.classic], axis=0)
+    for k, direction in enumerate(DIRECTIONS):
+        rows, own = (selection.direction == direction) & sound, measured.directions[direction]
+        if rows.any() and own is not None:
+            result[direction] = _gap(own.mean_deg_per_step, chosen, idealised, k, rows)
+    return result
+
+
+@dataclass(frozen=True)
+class _Chosen:
+    """Draws that the terms rest on.
+
+    Attributes:
+        z: coordinates (n, p); of the Laplace approximation the mode, then draws.
+        mode_first: so it is; else the estimate is the mean of the draws.
+        ratios: effective ratios of all draws, shape (N, 4), deg/step.
+    """
+
+    z: np.ndarray
+    mode_first: bool
+    ratios: np.ndarray
+
+
+def _chosen_draws(found: JointFit, posterior: Posterior | None, draws: int) -> _Chosen:
+    if posterior is None:
+        z = np.vstack([found.z, found.draws_z[:draws]])
+        return _Chosen(z, True, np.asarray(found.draws.effective_deg_per_step))
+    every = posterior.z.reshape(-1, posterior.z.shape[-1])
+    z = every[np.linspace(0, len(every) - 1, draws).astype(int)]
+    return _Chosen(z, False, np.asarray(posterior.draws.effective_deg_per_step).reshape(-1, len(DIRECTIONS)))
+
+
+@dataclass(frozen=True)
+class _Idealised:
+    """The classic estimator on the model's own spots, from the rig as it is to the ideal one.
+
+    Attributes:
+        classic: ratios (n, experiments), deg/step: as it is, without backlash, with the stated cameras, with ideal
+            optics.
+        full: effective ratios (n, 4) of the rig as it is, deg/step.
+        ideal: those of the ideal optics.
+    """
+
+    classic: tuple[np.ndarray, ...]
+    full: np.ndarray
+    ideal: np.ndarray
+
+
+def _idealised(found: JointFit, selection: Selection, z: np.ndarray) -> _Idealised:
     import jax
     import jax.numpy as jnp
 
     from tvsbayes.model.headlines import derived_quantities
     from tvsbayes.posterior.predictive import looks
 
-    selection = select_experiments(found.campaign)
-    result: dict[str, Gap | None] = dict.fromkeys(DIRECTIONS)
-    if not len(selection.experiments):
-        return result
-    if posterior is None:
-        z = np.vstack([found.z, found.draws_z[:draws]])
-        ratios_of_all = found.draws.effective_deg_per_step
-    else:
-        every = posterior.z.reshape(-1, posterior.z.shape[-1])
-        z = every[np.linspace(0, len(every) - 1, draws).astype(int)]
-        ratios_of_all = posterior.draws.effective_deg_per_step.reshape(-1, len(DIRECTIONS))
-    pixels_of = experiment_pixels(found, selection)
     with jax.enable_x64(True):
         spaces = [found.space]
         for names in (("backlash_deg.pan", "backlash_deg.tilt"), ("focal_scale",), OPTICS):
@@ -91,84 +150,60 @@ def explain_gap(found: JointFit, posterior: Posterior | None = None, draws: int 
             np.asarray(derived_quantities(jnp.asarray(z), space, pose).effective_deg_per_step)
             for space in (spaces[0], spaces[-1])
         )
-    try:
-        measured = classic(found.campaign)
-    except NothingToEstimate:
-        return result
+    rows = experiment_rows(found.campaign, selection)
     quiet = np.zeros((len(z), len(found.arrays.spots.valid), 2))
     ratios = []
     for space in spaces:
-        pixels = pixels_of(looks(replace(found, space=space), z, quiet))
+        pixels = looks(replace(found, space=space), z, quiet)[:, rows]
         every = [four_point_ratios(p, selection.steps, selection.axis, found.campaign.stereo) for p in pixels]
         ratios.append(np.stack(every))
-    # An experiment whose spots lie on one another, or beyond the lens model, has no ratio.
-    sound = np.all([np.isfinite(r).all(axis=0) for r in ratios], axis=0)
-    for k, direction in enumerate(DIRECTIONS):
-        chosen = (selection.direction == direction) & sound
-        found_classic = measured.directions[direction]
-        if not chosen.any() or found_classic is None:
-            continue
-        seen = found_classic.mean_deg_per_step
-        whole, unplayed, scaled, straight = (r[:, chosen].mean(axis=1) for r in ratios)
-        parts = {
-            BACKLASH: whole - unplayed,
-            STEREO_SCALE: unplayed - scaled,
-            SKEW: scaled - straight - (full[:, k] - ideal[:, k]),
-            PROJECTION: straight - ideal[:, k],
-            CHANCE: seen - whole,
-        }
-
-        # The ratio itself as every table states it, from all draws; its mean is a control variate for those of the
-        # terms, which then add up to the gap.
-        ratio, own = ratios_of_all[:, k], full[:, k]
-        centre = own[0] if posterior is None else ratio.mean()
-
-        def term(name: str, values: np.ndarray, own: np.ndarray = own, centre: float = centre) -> GapTerm:
-            if posterior is None:
-                value, sampled = values[0], values[1:]
-            else:
-                slope = np.cov(values, own)[0, 1] / own.var(ddof=1) if np.ptp(own) > 0 else 0.0
-                value, sampled = values.mean() + slope * (centre - own.mean()), values
-            return GapTerm(name, float(value), float(sampled.std()), _middle95(sampled))
-
-        sd = float(ratio.std())
-        joint = GapTerm("effective ratio", float(centre), sd, _middle95(ratio))
-        total = GapTerm("classic - joint", float(seen - centre), sd, _middle95(seen - ratio))
-        result[direction] = Gap(seen, joint, total, tuple(term(name, values) for name, values in parts.items()))
-    return result
+    return _Idealised(tuple(ratios), full, ideal)
 
 
-def _middle95(draws: np.ndarray) -> tuple[float, float]:
-    low, high = np.quantile(draws, [0.025, 0.975])
-    return float(low), float(high)
+def _gap(seen: float, chosen: _Chosen, idealised: _Idealised, k: int, rows: np.ndarray) -> Gap:
+    """The gap of direction k, whose experiments are `rows`, to the classic mean that was seen."""
+    whole, unplayed, scaled, straight = (r[:, rows].mean(axis=1) for r in idealised.classic)
+    own, ideal = idealised.full[:, k], idealised.ideal[:, k]
+    parts = {
+        BACKLASH: whole - unplayed,
+        STEREO_SCALE: unplayed - scaled,
+        SKEW: scaled - straight - (own - ideal),
+        PROJECTION: straight - ideal,
+        CHANCE: seen - whole,
+    }
+    # The ratio itself as every table states it, from all draws; its mean is a control variate for those of the
+    # terms, which then add up to the gap.
+    ratio = chosen.ratios[:, k]
+    centre = float(own[0] if chosen.mode_first else ratio.mean())
 
+    def term(name: str, values: np.ndarray) -> GapTerm:
+        if chosen.mode_first:
+            value, sampled = values[0], values[1:]
+        else:
+            slope = np.cov(values, own)[0, 1] / own.var(ddof=1) if np.ptp(own) > 0 else 0.0
+            value, sampled = values.mean() + slope * (centre - own.mean()), values
+        return GapTerm(name, float(value), float(sampled.std()), interval95(sampled))
 
-def experiment_pixels(found: JointFit, selection: Selection) -> Callable[[np.ndarray], np.ndarray]:
-    """Picks the four looks of each experiment, (draws, e, 4, 4), from those of all spots in the filter's order."""
-    from tvsbayes.instrument.campaign import ordered_spots
-
-    row_of = {spot.spot: row for row, spot in enumerate(ordered_spots(found.campaign))}
-    ids = [[row_of[found.campaign.spots[r].spot] for r in four] for four in selection.spot_rows]
-    rows = np.array(ids, dtype=int).reshape(-1, 4)
-    return lambda pixels: pixels[:, rows]
-
-
-def _influence(found: JointFit, slopes: np.ndarray) -> np.ndarray:
-    """Shift (q, p) of quantities with gradients (q, p) if the prior of coordinate j is off by its sd: (S e_j)."""
-    fisher = found.information.fisher
-    return slopes @ np.linalg.inv(fisher + np.eye(len(fisher)))
+    sd = float(ratio.std())
+    joint = GapTerm("effective ratio", centre, sd, interval95(ratio))
+    total = GapTerm("classic - joint", float(seen - centre), sd, interval95(seen - ratio))
+    return Gap(seen, joint, total, tuple(term(name, values) for name, values in parts.items()))
 
 
 def camera_influence(found: JointFit, values: np.ndarray) -> np.ndarray:
-    """That of the stereo calibration's priors and the focal scale's on quantities whose draws are (n, q)."""
+    """Shift of quantities with draws (n, q) if a camera parameter is off by the sd of its prior, shape (q, cameras).
+
+    Of the focal scale and the stereo calibration's coordinates: the prior of coordinate j moves the mode by S e_j.
+    """
     from tvsbayes.assessment.weaknesses import gradients
     from tvsbayes.instrument.parameters import INDEX, NAMES, RIG_NAMES
 
+    fisher = found.information.fisher
     cameras = [INDEX["focal_scale"], *range(len(RIG_NAMES), len(NAMES))]
-    return _influence(found, gradients(found, values))[:, cameras]
+    return (gradients(found, values) @ np.linalg.inv(fisher + np.eye(len(fisher))))[:, cameras]
 
 
 def camera_u(found: JointFit) -> np.ndarray:
     """Standard uncertainty (4,) of the effective ratios that stereo calibration and focal scale alone cause."""
-    shift = camera_influence(found, found.draws.effective_deg_per_step)
+    shift = camera_influence(found, np.asarray(found.draws.effective_deg_per_step))
     return np.sqrt(np.sum(shift**2, axis=1))

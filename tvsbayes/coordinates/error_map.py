@@ -16,7 +16,7 @@ from tvsbayes.calibration.optics import (
     Components,
     Ray,
     aperture_angle_deg,
-    direction_of,
+    unit_vector,
     range_components,
 )
 from tvsbayes.calibration.pointing import DIVERGING_SHARE, INPUT_NAMES, NOISE_NAMES, Calibration, Drawn, Sides, drawn
@@ -70,7 +70,7 @@ def simple_rays(simple: SimpleCalibration, steps: np.ndarray) -> Ray:
     k = simple.deg_per_step
     pan = np.where(steps[:, 0] >= 0, k["left"], k["right"]) * steps[:, 0] + simple.pan_zero_emission_deg - 90.0
     tilt = np.where(steps[:, 1] >= 0, k["up"], k["down"]) * steps[:, 1]
-    direction = direction_of(pan, tilt)
+    direction = unit_vector(pan, tilt)
     origin = np.zeros_like(direction)
     origin[1] = simple.origin_y_mm
     return Ray(origin, direction)

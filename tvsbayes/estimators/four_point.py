@@ -21,7 +21,7 @@ import numpy as np
 
 from tvsbayes.errors import NothingToEstimate
 from tvsbayes.instrument.axes import AXES, DIRECTIONS, PIXELS, SENSES
-from tvsbayes.instrument.campaign import Campaign, Move, Spot
+from tvsbayes.instrument.campaign import Campaign, Move, Spot, ordered_spots
 from tvsbayes.instrument.stereo_pair import Stereo, triangulate
 from tvsbayes.statistics.intervals import coverage_factor, effective_dof
 
@@ -205,6 +205,13 @@ def select_experiments(campaign: Campaign) -> Selection:
         axis=np.array([k[2] for k in kept], dtype="U4"),
         skipped=tuple(skipped),
     )
+
+
+def experiment_rows(campaign: Campaign, selection: Selection) -> np.ndarray:
+    """Rows (e, 4) of the selected looks among `ordered_spots`, the order of whatever a fit says of every spot."""
+    row_of = {spot.spot: row for row, spot in enumerate(ordered_spots(campaign))}
+    rows = [[row_of[campaign.spots[row].spot] for row in four] for four in selection.spot_rows]
+    return np.array(rows, dtype=int).reshape(-1, 4)
 
 
 def _by_point(spots: Sequence[Spot], rows: list[int]) -> tuple[list[int], str | None]:

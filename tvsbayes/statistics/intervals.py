@@ -46,6 +46,12 @@ def symmetric_interval(draws: np.ndarray, probability: float = 0.95) -> np.ndarr
     return np.quantile(draws, (tail, 1 - tail), axis=0)
 
 
+def interval95(draws: np.ndarray) -> tuple[float, float]:
+    """Equal-tailed 95 % interval of scalar draws (n,), as plain numbers."""
+    low, high = symmetric_interval(draws)
+    return float(low), float(high)
+
+
 def shortest_interval(draws: np.ndarray, probability: float = 0.95) -> np.ndarray:
     """Shortest coverage interval of scalar draws (n,), shape (2,) (JCGM 101 5.3.4 and 7.7.4)."""
     ordered = np.sort(np.asarray(draws, dtype=float))

@@ -1,0 +1,171 @@
+"""Classic against joint on experiments that neither had seen: folds left out, refitted and foretold.
+
+Four-point angles in degrees, counters in steps. Loads JAX when a fold is refitted, not when imported.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from tvsbayes.comparison.gap import camera_u
+from tvsbayes.comparison.scores import judge
+from tvsbayes.errors import TvsError
+from tvsbayes.estimators.four_point import Selection, experiment_rows, four_point_ratios, select_experiments
+from tvsbayes.instrument.axes import AXES, DIRECTIONS
+from tvsbayes.instrument.campaign import Campaign
+from tvsbayes.results.comparison_record import CANNOT_TELL, HoldOut, Prediction
+
+if TYPE_CHECKING:
+    from tvsbayes.estimators.joint_fit import JointFit
+
+
+HOLD_OUT_DRAWS = 256
+REGIONS = 4
+
+
+def folds_of(campaign: Campaign, selection: Selection, by: str) -> dict[str, np.ndarray]:
+    """Masks (e,) of the experiments that are left out together.
+
+    Raises:
+        ValueError: another scheme.
+    """
+    if by == "steps":
+        lengths = np.abs(selection.steps)
+        return {f"|N| = {n}": lengths == n for n in np.unique(lengths)}
+    if by != "regions":
+        raise ValueError(f'folds by "steps" or "regions", not {by!r}')
+    moves = {move.move: move for move in campaign.moves}
+    starts = [moves[campaign.spots[four[0]].move] for four in selection.spot_rows]
+    moved = np.array([m.pan_steps if a == "pan" else m.tilt_steps for m, a in zip(starts, selection.axis, strict=True)])
+    folds = {}
+    for axis in AXES:
+        mine = selection.axis == axis
+        counters = np.unique(moved[mine])
+        if not len(counters):
+            continue
+        for part in np.array_split(counters, min(REGIONS, len(counters))):
+            name = f"{axis} from {part[0]}" + (f" to {part[-1]}" if len(part) > 1 else "")
+            folds[name] = mine & np.isin(moved, part)
+    return folds
+
+
+def hold_out(fit_of_all: JointFit, by: str = "steps", seed: int = 0) -> HoldOut:
+    """Leave experiments out, fold by fold, refit, and ask both estimators for their four-point angles.
+
+    The classic foretells N times its mean of the direction; its uncertainty is the scatter of angles about N times
+    the mean, and that of the mean. The joint foretells what the classic chain would measure on its beams, with
+    stop errors and pixel noise drawn anew: the same quantity for both. Noise common to all experiments (the cameras)
+    moves both predictions and the measured angle alike and is reported beside.
+
+    Args:
+        fit_of_all: a converged fit; its campaign and model are used.
+        by: "steps" or "regions", see `folds_of`.
+        seed: of the predictive draws.
+    """
+    campaign = fit_of_all.campaign
+    selection = select_experiments(campaign)
+    unseen = dict(zip(DIRECTIONS, camera_u(fit_of_all).tolist(), strict=True))
+    lengths = np.unique(np.abs(selection.steps))
+
+    def undecided(reason: str) -> HoldOut:
+        return HoldOut(by, (), None, None, None, None, CANNOT_TELL, reason, unseen)
+
+    if not len(selection.experiments):
+        return undecided("there is no complete experiment")
+    folds = folds_of(campaign, selection, by)
+    if len(folds) < 2:
+        what = f"all experiments have |N| = {lengths[0]}" if by == "steps" else "all experiments start at one counter"
+        return undecided(f"{what}: a constant lost motion looks like a ratio there; measure a second |N|")
+    angle = four_point_ratios(selection.pixels, selection.steps, selection.axis, campaign.stereo) * selection.steps
+    predictions: list[Prediction] = []
+    for index, (name, out) in enumerate(folds.items()):
+        foretold = foretell_classic(angle, selection, out)
+        if not foretold:
+            continue
+        without = f"without the experiments {name}"
+        try:
+            taught = refit(fit_of_all, frozenset(campaign.spots[r].spot for r in selection.spot_rows[out].ravel()))
+        except TvsError as error:
+            return undecided(f"{without} there is no fit: {error.message}")
+        if not taught.converged:
+            return undecided(f"{without} the fit does not converge: {'; '.join(taught.problems)}")
+        by_model = foretell_joint(taught, selection, out, np.random.default_rng([seed, index]))
+        for e, joint in by_model.items():
+            if e in foretold:
+                about = (int(selection.experiments[e]), name, str(selection.direction[e]), int(selection.steps[e]))
+                predictions.append(Prediction(*about, float(angle[e]), *foretold[e], *joint))
+    if not predictions:
+        return undecided("no direction has two experiments outside of every fold")
+    return judge(by, predictions, lengths, unseen)
+
+
+def refit(fit_of_all: JointFit, without: frozenset[int]) -> JointFit:
+    """The same model without some spots; its harmonics, contrasts and backlash are free where they were."""
+    from tvsbayes.estimators.joint_fit import fit, priors_used
+
+    rig, space = fit_of_all.campaign.rig, fit_of_all.space
+    priors = priors_used(rig.priors, np.asarray(space.value), np.asarray(space.u))
+    held = replace(fit_of_all.campaign, rig=replace(rig, priors=priors))
+    return fit(held, without=without | set(fit_of_all.excluded_spots))
+
+
+class ClassicForecast(NamedTuple):
+    """An angle as the classic foretells it, deg: its standard uncertainty has few degrees of freedom."""
+
+    angle_deg: float
+    u_deg: float
+    dof: int
+
+
+def foretell_classic(angle: np.ndarray, selection: Selection, out: np.ndarray) -> dict[int, ClassicForecast]:
+    """What N times the mean of a direction says of each left-out experiment with two others there, by row.
+
+    Its uncertainty is the scatter of angles (e,) about N times the mean, and that of the mean.
+    Experiments without a finite angle (pixels beyond the lens model) neither teach nor are asked.
+    """
+    found: dict[int, ClassicForecast] = {}
+    seen = np.isfinite(angle)
+    for direction in DIRECTIONS:
+        mine = seen & (selection.direction == direction)
+        taught, asked = np.flatnonzero(mine & ~out), np.flatnonzero(mine & out)
+        if len(taught) < 2:
+            continue
+        ratios = angle[taught] / selection.steps[taught]
+        mean, sd = ratios.mean(), ratios.std(ddof=1)
+        noise = np.sum((angle[taught] - mean * selection.steps[taught]) ** 2) / (len(taught) - 1)
+        for e in asked:
+            steps = float(selection.steps[e])
+            u = float(np.sqrt(noise + (steps * sd) ** 2 / len(taught)))
+            found[int(e)] = ClassicForecast(float(mean * steps), u, len(taught) - 1)
+    return found
+
+
+class JointForecast(NamedTuple):
+    """An angle as the joint foretells it, deg."""
+
+    angle_deg: float
+    u_deg: float
+
+
+def foretell_joint(
+    taught: JointFit, selection: Selection, out: np.ndarray, generator: np.random.Generator
+) -> dict[int, JointForecast]:
+    """What the classic chain would measure on the joint's beams for each left-out experiment, by row.
+
+    Stop errors and pixel noise are drawn anew. Draws beyond the cameras' lens model tell no angle.
+    """
+    from tvsbayes.posterior.predictive import looks_again
+
+    z, physical = taught.draws_z[:HOLD_OUT_DRAWS], np.asarray(taught.draws.physical[:HOLD_OUT_DRAWS])
+    pixels = looks_again(taught, z, physical, generator)[:, experiment_rows(taught.campaign, selection)[out]]
+    steps, axis = selection.steps[out], selection.axis[out]
+    draws = np.stack([four_point_ratios(p, steps, axis, taught.campaign.stereo) for p in pixels]) * steps
+    found = {}
+    for k, e in enumerate(np.flatnonzero(out).tolist()):
+        told = draws[np.isfinite(draws[:, k]), k]
+        if len(told) > 1:
+            found[e] = JointForecast(float(told.mean()), float(told.std(ddof=1)))
+    return found
