@@ -41,7 +41,7 @@ from tvsbayes.calibration.calibration_file import (
     load_calibration,
     stored_calibration,
 )
-from tvsbayes.calibration.optics import unit_vector, output_deg, range_components
+from tvsbayes.calibration.optics import output_deg, range_components, unit_vector
 from tvsbayes.calibration.pointing import DIVERGING_SHARE, INPUT_NAMES, NOISE_NAMES, Calibration
 from tvsbayes.coordinates.beam_meeting import carry, meeting, sources
 from tvsbayes.coordinates.location import locate, locate_linear, settings_of

@@ -175,7 +175,7 @@ def unit_vector(azimuth_deg: Number, elevation_deg: Number) -> np.ndarray:
     return np.stack([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)])
 
 
-def beam_angle_deg(values: Values, axis: str, mirror_deg: np.ndarray, other_deg: Number) -> np.ndarray:
+def beam_angle_deg(values: Values, axis: str, mirror_deg: Number, other_deg: Number) -> np.ndarray:
     """Beam angle about one axis: azimuth less its value C0 - 90 deg, or elevation; whole turns are kept.
 
     Args:
@@ -197,5 +197,5 @@ def beam_deg_per_step(values: Mapping[str, float], axis: str, pose_deg: tuple[fl
     """Mean of both directions' effective degrees per step at mirror angles (pan, tilt), as DESIGN 3.2 defines it."""
     index, half = AXES.index(axis), 1e-3
     here, other = pose_deg[index], pose_deg[1 - index]
-    ends = [beam_angle_deg(values, axis, np.float64(here + s * half), np.float64(other)) for s in (1, -1)]
+    ends = [beam_angle_deg(values, axis, here + s * half, other) for s in (1, -1)]
     return float(values[f"degrees_per_step.{axis}"] * (ends[0] - ends[1]) / (2 * half))

@@ -24,9 +24,9 @@ from tvsbayes.calibration.optics import (
     Values,
     aperture_angle_deg,
     beam_components,
-    unit_vector,
     output_deg,
     range_components,
+    unit_vector,
 )
 from tvsbayes.errors import InputError
 from tvsbayes.instrument.axes import AXES, DIRECTIONS, SIDES, sides_of

@@ -16,8 +16,8 @@ from tvsbayes.calibration.optics import (
     Components,
     Ray,
     aperture_angle_deg,
-    unit_vector,
     range_components,
+    unit_vector,
 )
 from tvsbayes.calibration.pointing import DIVERGING_SHARE, INPUT_NAMES, NOISE_NAMES, Calibration, Drawn, Sides, drawn
 from tvsbayes.estimators.four_point import ClassicResult
