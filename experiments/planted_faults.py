@@ -1160,8 +1160,8 @@ FAULTS = (
     Fault(
         "journal: chain not compared",
         "acquisition/journal.py",
-        "if int(match[3], 16) != previous:",
-        "if int(match[3], 16) < 0:",
+        "if found.previous != previous:",
+        "if found.previous < 0:",
         "lines of another run count as events",
         ("acquisition/journal",),
     ),

@@ -17,14 +17,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tvsbayes.acquisition.bench import SIMULATED_START, Bench, Vision
+from tvsbayes.acquisition.campaign_files import check_journal, repair_campaign
 from tvsbayes.acquisition.engine import ATTEMPTS_PER_LOOK, Acquisition, _approach
 from tvsbayes.acquisition.journal import LOG, read_journal
 from tvsbayes.acquisition.journal_check import verify
 from tvsbayes.acquisition.observation import CameraObserver, Detection, TwinObserver, live_detector, twin_renderer
-from tvsbayes.acquisition.operator import LiveLine, SimulatedOperator, StopKey, TerminalOperator
+from tvsbayes.acquisition.operator import LiveLine, SimulatedOperator, StopKey, Terminal, TerminalOperator
 from tvsbayes.acquisition.recorder import LOST_STEPS, recorded
-from tvsbayes.acquisition.running_estimate import RunningEstimate
-from tvsbayes.acquisition.session import SIMULATED_START, acquire, begin, check_journal, check_plan, repair_campaign
+from tvsbayes.acquisition.running_estimate import EstimateWish, RunningEstimate
+from tvsbayes.acquisition.session import acquire, begin, check_plan
 from tvsbayes.acquisition.simulated_instrument import Instrument
 from tvsbayes.cameras.capture import StereoImage, VirtualCamera
 from tvsbayes.cli.main import run
@@ -110,11 +112,13 @@ class Run:
             rig,
             self.plan,
             begin(self.folder, rig, self.plan, resume, HEADER),
-            self.positioner,
-            observer(self.instrument) if observer else TwinObserver(self.instrument, 0.08),
-            operator(self) if operator else SimulatedOperator(self.instrument),
-            clock=clock,
-            utc=lambda: SIMULATED_START + datetime.timedelta(seconds=offset + clock.monotonic()),
+            Bench(
+                self.positioner,
+                observer(self.instrument) if observer else TwinObserver(self.instrument, 0.08),
+                operator(self) if operator else SimulatedOperator(self.instrument),
+                clock,
+                lambda: SIMULATED_START + datetime.timedelta(seconds=offset + clock.monotonic()),
+            ),
             stop=self.stop,
             **options,
         )
@@ -164,11 +168,13 @@ def test_light_behind_the_device_is_that_of_the_twin(rig, tmp_path, monkeypatch)
         rig,
         plan,
         begin(folder, rig, plan, False, HEADER),
-        instrument.positioner(),
-        TwinObserver(instrument, 0.08),
-        SimulatedOperator(instrument),
-        clock=instrument.clock,
-        utc=lambda: SIMULATED_START + datetime.timedelta(seconds=instrument.clock.monotonic()),
+        Bench(
+            instrument.positioner(),
+            TwinObserver(instrument, 0.08),
+            SimulatedOperator(instrument),
+            instrument.clock,
+            lambda: SIMULATED_START + datetime.timedelta(seconds=instrument.clock.monotonic()),
+        ),
     ).run()
     found = read_campaign(folder)
     assert [(m.segment, m.pan_steps, m.pan_approach) for m in found.moves] == [
@@ -429,7 +435,7 @@ def test_looks_that_a_repair_lost_are_taken_again(rig, tmp_path, event, number, 
         if progress.step == last_step:
             signal.raise_signal(signal.SIGINT)
 
-    acquire(rig, plan, tmp_path / "old", simulate=True, seed=4, show=show)
+    acquire(rig, plan, tmp_path / "old", simulate=True, seed=4, terminal=Terminal(show=show))
     damaged = [r for r in read_journal(tmp_path / "old").records if r.event == event][number]
     log = tmp_path / "old" / LOG
     lines = log.read_bytes().splitlines(keepends=True)
@@ -521,7 +527,7 @@ def test_lost_steps_of_an_interrupted_run_are_found_by_the_next(rig, tmp_path):
     first.engine.run()
     second = Run(rig, folder, plan, resume=True, start=1)
     first.instrument.mechanics.true_steps[0] -= 6
-    second.engine.positioner = first.instrument.positioner()
+    second.engine.bench = replace(second.engine.bench, positioner=first.instrument.positioner())
     assert second.engine.run().lost_segments == (0,)
     assert {s.status for s in read_campaign(folder).spots[:4]} == {LOST_STEPS}
 
@@ -534,7 +540,7 @@ def test_segment_that_an_alarm_ended_is_not_taken_for_verified(rig, tmp_path):
         first.engine.run()
     first.instrument.mechanics.true_steps[0] -= 6
     second = Run(rig, folder, plan, resume=True, start=1)
-    second.engine.positioner = first.instrument.positioner()
+    second.engine.bench = replace(second.engine.bench, positioner=first.instrument.positioner())
     assert second.engine.run().lost_segments == ()
     assert recorded(read_journal(folder).records).unverified == (0,)
 
@@ -553,7 +559,7 @@ def test_frames_of_an_interrupted_look_are_never_overwritten(rig, tmp_path):
 def test_clock_that_goes_back_leaves_the_times_in_order(rig, tmp_path):
     run_ = Run(rig, tmp_path / "c")
     times = iter([50.0, 40.0, 60.0, 10.0] + [70.0 + k for k in range(200)])
-    run_.engine._utc = lambda: SIMULATED_START + datetime.timedelta(seconds=next(times))
+    run_.engine._log._utc = lambda: SIMULATED_START + datetime.timedelta(seconds=next(times))
     run_.engine.run()
     moves = read_campaign(tmp_path / "c").moves
     assert all(a.time_s <= b.time_s for a, b in pairwise(moves))
@@ -652,34 +658,36 @@ def test_run_ends_when_the_running_estimate_meets_its_target(rig, tmp_path):
     directions = set(legs_of(run_plan(plan, rig).moves))
     assert directions == {"left", "right"}
     command = [sys.executable, "-c", FIT]
-    with RunningEstimate(tmp_path / "c", 5e-4, directions, wait=True, command=command) as estimate:
+    with RunningEstimate(tmp_path / "c", command, 5e-4, directions, wait=True) as estimate:
         run_ = Run(rig, tmp_path / "c", plan, estimate=estimate, show=lambda p: texts.append(p.estimate))
         outcome = run_.engine.run()
     assert (outcome.reason, outcome.looks, estimate.latest.looks) == ("target met", 27, 27) and run_.dark()
     assert texts[0] == "" and texts[-1].startswith("left 0.060000 u 5.")
     assert recorded(read_journal(tmp_path / "c").records).unverified == (), "the closing homing took place"
     for needed in ({"left", "up"}, set()):
-        with RunningEstimate(tmp_path / "c", 1.0, needed, wait=True, command=command) as estimate:
+        with RunningEstimate(tmp_path / "c", command, 1.0, needed, wait=True) as estimate:
             assert not estimate.update(27) and estimate.latest is not None, "a direction without a figure is not met"
 
 
 @pytest.mark.parametrize(("asked", "shown"), [(None, False), (True, True), (False, False)])
-def test_estimate_is_shown_without_a_target(rig, tmp_path, monkeypatch, asked, shown):
+def test_estimate_is_shown_without_a_target(rig, tmp_path, asked, shown):
     """What is known so far belongs into the live line whether or not it ends the run; simulations must ask for it."""
-    monkeypatch.setattr("tvsbayes.acquisition.running_estimate._COMMAND", FIT.replace("argv[1]", "argv[2]"))
+    wish = EstimateWish((sys.executable, "-c", FIT), asked=asked)
     texts = []
 
     def show(progress):
         texts.append(progress.estimate)
 
-    outcome = acquire(rig, small_plan(4), tmp_path / "c", simulate=True, seed=4, estimate=asked, show=show)
+    outcome = acquire(
+        rig, small_plan(4), tmp_path / "c", simulate=True, seed=4, estimate=wish, terminal=Terminal(show=show)
+    )
     assert (outcome.reason, outcome.looks) == ("done", 16)
     assert texts[-1] == ("left 0.060000 u 1.0e-03, right 0.060000 u 1.0e-03" if shown else "")
 
 
 def test_running_estimate_does_not_hold_up_the_run_and_dies_with_it(rig, tmp_path):
     command = [sys.executable, "-c", "import threading; threading.Event().wait()"]
-    with RunningEstimate(tmp_path / "c", 1.0, {"left"}, command=command) as estimate:
+    with RunningEstimate(tmp_path / "c", command, 1.0, {"left"}) as estimate:
         assert Run(rig, tmp_path / "c", small_plan(5), estimate=estimate).engine.run().reason == "done"
         child = estimate._process
         assert child.poll() is None and estimate.latest is None
@@ -688,7 +696,7 @@ def test_running_estimate_does_not_hold_up_the_run_and_dies_with_it(rig, tmp_pat
 
 def test_estimate_that_cannot_start_does_not_end_the_run(tmp_path):
     for wait in (True, False):
-        with RunningEstimate(tmp_path, 1.0, {"left"}, wait=wait, command=[str(tmp_path / "nothing")]) as estimate:
+        with RunningEstimate(tmp_path, [str(tmp_path / "nothing")], 1.0, {"left"}, wait=wait) as estimate:
             assert not estimate.update(12) and estimate.latest is None
 
 
@@ -731,14 +739,14 @@ def test_stop_key_interrupts_a_question_at_once():
         return "never"
 
     with StopKey(said.append) as stop:
-        operator = TerminalOperator(stop, said.append, ask)
+        operator = TerminalOperator(stop, Terminal(said.append, ask=ask))
         assert operator.accept("line one\nline two") is False and stop.requested
         assert said == ["line one", "line two"]
         assert operator.place("d1", 175.0, 0, "") is False
     stop = StopKey()
-    assert TerminalOperator(stop, said.append, lambda q: " YES ").accept("x") is True
-    assert TerminalOperator(stop, said.append, lambda q: "y").accept("x") is False
-    assert TerminalOperator(stop, said.append, laser_class="3B").accept("x") is True
+    assert TerminalOperator(stop, Terminal(said.append, ask=lambda q: " YES ")).accept("x") is True
+    assert TerminalOperator(stop, Terminal(said.append, ask=lambda q: "y")).accept("x") is False
+    assert TerminalOperator(stop, Terminal(said.append), laser_class="3B").accept("x") is True
 
 
 def blob(shape, u, v, peak):
@@ -787,7 +795,7 @@ def test_pictures_through_the_virtual_camera(small_rig, tmp_path):
         return StereoImage(*(np.clip(p, 0, 255).astype(np.uint8) for p in pair))
 
     folder = tmp_path / "c"
-    outcome = acquire(small_rig, TWO_LOOKS, folder, simulate=True, seed=7, renderer=renderer, detector=centroids)
+    outcome = acquire(small_rig, TWO_LOOKS, folder, simulate=True, seed=7, vision=Vision(centroids, renderer))
     assert (outcome.ok, outcome.refused) == (2, 0)
     assert verify(folder).frames == 8
     names = sorted(p.name for p in (folder / "frames").iterdir())
@@ -802,8 +810,8 @@ def test_pictures_through_the_virtual_camera(small_rig, tmp_path):
 def test_rendered_pictures_are_detected_while_the_plan_runs(small_rig, tmp_path):
     """What `acquire --simulate` does: the twin's cameras rendered, spots fitted with their uncertainty."""
     folder = tmp_path / "c"
-    vision = {"renderer": twin_renderer(small_rig, 7), "detector": live_detector(small_rig.stereo)}
-    outcome = acquire(small_rig, TWO_LOOKS, folder, simulate=True, seed=7, **vision)
+    vision = Vision(live_detector(small_rig.stereo), twin_renderer(small_rig, 7))
+    outcome = acquire(small_rig, TWO_LOOKS, folder, simulate=True, seed=7, vision=vision)
     assert (outcome.ok, outcome.refused) == (2, 0)
     truth = json.loads((folder / "truth.json").read_text())
     for spot in read_campaign(folder).spots:
@@ -882,7 +890,14 @@ def test_hardware_path_from_rig_file_to_campaign(small_rig, tmp_path):
         table = {"driver": "serial", "port": os.ttyname(slave), "settle_s": 0.0}
         real = replace(small_rig, positioner=table, cameras={"source": virtual.address, "spot_sd_px": 0.08})
         said = []
-        outcome = acquire(real, plan, tmp_path / "c", laser_class="3B", detector=centroids, say=said.append, ask=ask)
+        outcome = acquire(
+            real,
+            plan,
+            tmp_path / "c",
+            laser_class="3B",
+            vision=Vision(centroids),
+            terminal=Terminal(said.append, ask=ask),
+        )
     os.close(slave)
     os.close(master)
     assert (outcome.reason, outcome.ok, len(asked)) == ("done", 3, 2), said

@@ -54,7 +54,7 @@ def test_what_is_written_is_read_back(folder):
     assert reading.records[2].data["frames"][1]["name"] == "frames/000000_right.png" and not reading.torn
     found = verify(folder)
     assert (found.records, found.frames, found.orphans, found.torn_bytes, found.stopped) == (8, 6, (), 0, "done")
-    assert found.as_json()["warnings"] == []
+    assert found.warnings == []
 
 
 def test_line_format_is_the_documented_one():
@@ -173,7 +173,7 @@ def test_frames_of_an_interrupted_look_are_listed_and_kept(folder):
     (folder / "frames" / "000003_left.png").write_bytes(b"taken, not logged")
     found = verify(folder)
     assert found.orphans == ("frames/000003_left.png",)
-    assert "interrupted" in found.as_json()["warnings"][0]
+    assert "interrupted" in found.warnings[0]
 
 
 def test_frame_names_cannot_leave_the_folder(folder):
@@ -253,6 +253,12 @@ def test_repair_keeps_what_is_whole_and_marks_the_gap(folder, tmp_path):
     assert {p: p.read_bytes() for p in folder.rglob("*") if p.is_file()} == before, "the old one is untouched"
     with pytest.raises(InputError):
         repair(folder, tmp_path / "new")
+
+
+def test_what_was_repaired_can_be_repaired_again(folder, tmp_path):
+    repair(folder, tmp_path / "once")
+    again = repair(tmp_path / "once", tmp_path / "twice")
+    assert again.lost_lines == [] and verify(tmp_path / "twice").records == verify(tmp_path / "once").records
 
 
 def test_repair_of_a_journal_without_its_first_line(folder, tmp_path):

@@ -681,7 +681,7 @@ def test_interrupt_under_json_is_a_document_too(ask, monkeypatch):
         raise KeyboardInterrupt
 
     monkeypatch.setattr("tvsbayes.instrument.campaign.read_campaign", interrupted)
-    monkeypatch.setattr("tvsbayes.acquisition.session.read_campaign", interrupted)
+    monkeypatch.setattr("tvsbayes.acquisition.campaign_files.read_campaign", interrupted)
     code, document = ask("check", "x")
     assert (code, document["error"]["code"]) == (130, "interrupted")
 
@@ -691,7 +691,7 @@ def test_interrupt_is_130(say, monkeypatch):
         raise KeyboardInterrupt
 
     monkeypatch.setattr("tvsbayes.instrument.campaign.read_campaign", interrupted)
-    monkeypatch.setattr("tvsbayes.acquisition.session.read_campaign", interrupted)
+    monkeypatch.setattr("tvsbayes.acquisition.campaign_files.read_campaign", interrupted)
     code, out, log = say("classic", PAPER_TWIN)
     assert (code, out) == (130, "")
     assert "interrupted" in log
@@ -704,7 +704,7 @@ def test_a_bug_is_no_bad_input(monkeypatch):
         raise RuntimeError("a bug")
 
     monkeypatch.setattr("tvsbayes.instrument.campaign.read_campaign", broken)
-    monkeypatch.setattr("tvsbayes.acquisition.session.read_campaign", broken)
+    monkeypatch.setattr("tvsbayes.acquisition.campaign_files.read_campaign", broken)
     with pytest.raises(RuntimeError, match="a bug"):
         run(["classic", str(PAPER_TWIN)])
 

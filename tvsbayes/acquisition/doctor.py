@@ -12,19 +12,20 @@ import statistics
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from tvsbayes.acquisition.journal import Disk
+from tvsbayes.acquisition.observation import CHANGE_DN, rises_dn
 from tvsbayes.acquisition.operator import StopKey
-from tvsbayes.acquisition.session import BAUD
-from tvsbayes.cameras.capture import StereoCamera, StereoImage, open_cameras
+from tvsbayes.cameras.capture import StereoCamera, open_cameras
 from tvsbayes.errors import TvsError, escaped
 from tvsbayes.instrument.rig import Rig
-from tvsbayes.positioner.driver import SEE_DOCTOR, Clock, SerialPositioner, device_settings
+from tvsbayes.positioner.driver import SEE_DOCTOR, Clock, SerialPositioner
 from tvsbayes.positioner.protocol import FIRMWARE_VERSION
-from tvsbayes.positioner.serial_port import serial_opener, serial_ports
+from tvsbayes.positioner.serial_port import positioner_of, serial_ports
 
 DISK_FREE_BYTES = 5 * 10**9
 """Room for about 700 looks of four PNG of 1280 x 720 px, 1.8 MB each."""
@@ -38,8 +39,6 @@ BRIGHT_MEAN_MAX = 150.0
 """Mean grey level without laser: below, the cap may be on; above, the spot drowns in the room's light."""
 SHARPNESS_MIN = 3.0
 """Variance of the Laplacian, grey levels squared; a picture out of focus has only the sensor's noise."""
-LASER_RISE_MIN = 40
-"""Rise of the brightest pixel between laser off and on."""
 
 
 @dataclass(frozen=True)
@@ -76,11 +75,13 @@ def examine(
         clock: for the timings.
     """
     checks = [_rig(rig), *_disk(folder, clock)]
-    positioner, found = None, []
+    positioner: SerialPositioner | None = None
+    found: list[Check] = []
     try:
         if open_positioner is None:
             checks.append(_ports(rig))
-            open_positioner = _opener(rig)
+            if rig.positioner.get("port"):
+                open_positioner = partial(positioner_of, rig.positioner)
         if open_positioner is not None:
             positioner, found = _positioner(open_positioner, clock)
         checks += found
@@ -150,17 +151,10 @@ def _ports(rig: Rig) -> Check:
     return Check("port", "ok", escaped(str(wanted)))
 
 
-def _opener(rig: Rig) -> Callable[[], SerialPositioner] | None:
-    port = rig.positioner.get("port")
-    if not port:
-        return None
-    opener = serial_opener(str(port), int(rig.positioner.get("baud", BAUD)))
-    return lambda: SerialPositioner(opener, device_settings(rig.positioner))
-
-
 def _failed(name: str, error: TvsError) -> Check:
-    found = error.found or error.message.removesuffix(f"; {error.remedy}")
-    return Check(name, "fault", found, error.remedy.removesuffix(SEE_DOCTOR) or "see the message")
+    remedy = error.remedy or ""
+    found = error.found or error.message.removesuffix(f"; {remedy}")
+    return Check(name, "fault", found, remedy.removesuffix(SEE_DOCTOR) or "see the message")
 
 
 def _positioner(
@@ -218,8 +212,7 @@ def _camera(
     checks = [Check("cameras", "ok", f"two pictures of {size[0]} x {size[1]} px, a fresh pair in {seconds:.2f} s")]
     for warning in settings.warnings:
         checks.append(Check("camera settings", "warning", warning, "fix it with the camera's own program"))
-    for side in ("left", "right"):
-        checks += _picture(side, getattr(image, side))
+    checks += [*_picture("left", image.left), *_picture("right", image.right)]
     return camera, checks
 
 
@@ -263,14 +256,9 @@ def _laser(positioner: SerialPositioner | None, camera: StereoCamera | None, wan
                 positioner.laser(False)
     except TvsError as error:
         return _failed("laser", error)
-    rises = [_rise(dark, lit, side) for side in ("left", "right")]
+    rises = rises_dn(dark, lit)
     found = f"brightest pixel rises by {rises[0]} (left) and {rises[1]} (right) of 255"
-    if min(rises) < LASER_RISE_MIN:
+    if min(rises) < CHANGE_DN:
         remedy = "put the sheet into both views; check the laser's supply, and that the lenses have no infrared filter"
         return Check("laser", "warning", found, remedy)
     return Check("laser", "ok", found)
-
-
-def _rise(dark: StereoImage, lit: StereoImage, side: str) -> int:
-    change = getattr(lit, side).astype(int) - getattr(dark, side).astype(int)
-    return int(change.max())

@@ -1,32 +1,34 @@
-"""A plan run look by look."""
+"""The engine that runs a plan on an instrument: home, place, move, look, each on the disk before the next.
+
+A plan describes, the engine does. Whatever ends a run (the plan's end, Ctrl-C, a fault of device, camera or disk),
+the laser is switched off, the end is written down, and the folder is a readable campaign as soon as the first homing
+is logged. `recorded` tells from the journal what is done; a resumed run homes into a new segment, asks for the sheet,
+repeats reference looks and goes on with the first step that is not done.
+
+Counters in motor steps, seconds where a name says `_s`, raw px.
+"""
 
 from __future__ import annotations
 
-import datetime
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from tvsbayes.acquisition.journal import FRAME_NAME, Journal
-from tvsbayes.acquisition.journal_check import orphans
-from tvsbayes.acquisition.observation import Observation, Observer
-from tvsbayes.acquisition.operator import HAZARD, Operator, Progress, StopKey
-from tvsbayes.acquisition.recorder import (
-    HOME_TOLERANCE_STEPS,
-    Recorded,
-    Recorder,
-    campaign_of,
-    keep_edited,
-    write_derived,
-)
+from tvsbayes.acquisition.bench import Bench
+from tvsbayes.acquisition.journal import Journal
+from tvsbayes.acquisition.journal_events import Four
+from tvsbayes.acquisition.observation import Observation
+from tvsbayes.acquisition.operator import HAZARD, Progress, StopKey
+from tvsbayes.acquisition.recorder import Recorded
+from tvsbayes.acquisition.run_log import Outcome, RunLog
 from tvsbayes.acquisition.running_estimate import RunningEstimate
 from tvsbayes.errors import DeviceFault, TvsError
-from tvsbayes.instrument.axes import APPROACH_SIGN, SENSES
-from tvsbayes.instrument.campaign import Campaign, Spot
+from tvsbayes.instrument.axes import APPROACH_SIGN, PIXELS, SENSES
+from tvsbayes.instrument.campaign import Spot
 from tvsbayes.instrument.plan import PlanStep, plan_seconds, run_plan
 from tvsbayes.instrument.rig import Rig
-from tvsbayes.positioner.driver import Clock, HomeReport, Positioner
+from tvsbayes.instrument.stereo_pair import triangulate
 
 ATTEMPTS_PER_LOOK = 3
 PLACEMENTS_MAX = 3
@@ -40,50 +42,8 @@ SETTLE_S = 0.3
 CLEARED_STEPS = 20
 """Fewer steps than these after homing may leave play: then the approach is unknown. 20 steps are 1.2 degrees at 0.06
 degrees per step, against 0.5 degrees of lost motion in the paper."""
-DERIVED_EVERY = 100
-"""Up to this many spots the campaign files are written after every look, then ever more rarely: at least 99 % of the
-looks are in them at any time, all of them in the journal."""
 DEPTH_SHARE = 0.25
 """Share of the distance to the next target by which a sheet may be off before it counts as misplaced."""
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """How a run ended.
-
-    Attributes:
-        reason: "done", "target met", "interrupted" or "declined".
-        looks: looks of this campaign, of all its runs.
-        ok: how many of them count.
-        refused: how many found no usable spot.
-        references: how many of `looks` are none of the plan's: resumed runs look again at spots seen before. They
-            count as any other.
-        retries: looks repeated in this run.
-        lost_segments: segments in which steps were lost.
-        warnings: what the user should know.
-    """
-
-    reason: str
-    looks: int
-    ok: int
-    refused: int
-    references: int
-    retries: int
-    lost_segments: tuple[int, ...]
-    warnings: tuple[str, ...]
-
-    def as_json(self) -> dict[str, object]:
-        """The document of `tvsbayes acquire`."""
-        return {
-            "reason": self.reason,
-            "looks": self.looks,
-            "ok": self.ok,
-            "refused": self.refused,
-            "references": self.references,
-            "retries": self.retries,
-            "lost_segments": list(self.lost_segments),
-            "warnings": list(self.warnings),
-        }
 
 
 class _Stopped(Exception):
@@ -112,15 +72,9 @@ class Acquisition:
         rig: the rig.
         plan: checked by `check_plan`.
         journal: from `begin`; closed in the end.
-        positioner: connected; closed in the end.
-        observer: takes the looks.
-        operator: is asked before the laser and for every sheet.
-        clock: for settling.
-        utc: the time of day, for `time_s`.
+        bench: what it runs on; its positioner is closed in the end.
         stop: the stop key, in force while `run` runs.
         show: told about progress.
-        annotate: further entries of every motion's event (the twin's true angles).
-        details: what to write down of device and cameras at the start.
         estimate: the running estimate; a run that meets its target ends.
     """
 
@@ -129,32 +83,18 @@ class Acquisition:
         rig: Rig,
         plan: Sequence[PlanStep],
         journal: Journal,
-        positioner: Positioner,
-        observer: Observer,
-        operator: Operator,
+        bench: Bench,
         *,
-        clock: Clock,
-        utc: Callable[[], datetime.datetime],
         stop: StopKey | None = None,
         show: Callable[[Progress], None] = lambda progress: None,
-        annotate: Callable[[], Mapping[str, object]] = dict,
-        details: Mapping[str, object] | None = None,
         estimate: RunningEstimate | None = None,
     ):
-        self._estimate = estimate
-        self.rig, self.plan, self.journal = rig, tuple(plan), journal
-        self.positioner, self.observer, self.operator = positioner, observer, operator
-        self._clock, self._utc, self._stop, self._show = clock, utc, stop or StopKey(), show
-        self._annotate, self._details = annotate, dict(details or {})
+        self.rig, self.plan, self.journal, self.bench = rig, tuple(plan), journal, bench
+        self._stop, self._show, self._estimate = stop or StopKey(), show, estimate
         self._settle_s = float(rig.positioner.get("settle_s", SETTLE_S))
-        self._retries, self._warnings, self._check_depth = 0, [], False
-        self._behind = ""
-        self._placement = -1
-        self._recorder = Recorder()
-        for record in journal.records:
-            self._recorder.add(record)
-        self._time_s = max((move.time_s for move in self._recorder.moves), default=0.0)
-        self._spot = self._next_spot()
+        self._retries, self._check_depth, self._placement = 0, False, -1
+        self._log = RunLog(journal, rig, bench.utc)
+        self._spot = self._log.next_spot()
 
     def run(self) -> Outcome:
         """Runs the plan to its end, or to the stop key.
@@ -182,57 +122,34 @@ class Acquisition:
                 self._stop.closing = True
                 # The positioner is closed first: light matters more than the log.
                 try:
-                    self.positioner.close()
+                    self.bench.positioner.close()
                 finally:
-                    self._end(reason, exit_code)
-        done = self._recorder.result()
-        spots = done.spots
-        ok = sum(spot.status == "ok" for spot in spots)
-        waiting = sum(spot.status == "undetected" for spot in spots)
-        lost = tuple(segment for segment, _ in done.lost)
-        refused = len(spots) - ok - waiting
-        beside = done.references, self._retries
-        return Outcome(reason, len(spots), ok, refused, *beside, lost, tuple(self._warnings))
+                    self._log.end(reason, exit_code)
+        return self._log.outcome(reason, self._retries)
 
     def _run(self) -> str:
-        if not self.operator.accept(HAZARD):
+        if not self.bench.operator.accept(HAZARD):
             return "declined"
-        self._log("start", utc=self._utc_text(), **self._details)
-        resumed = self._recorder.result()
+        self._log.write("start", utc=self._log.utc_text(), **self.bench.details)
+        resumed = self._log.recorder.result()
         # Before the first homing nothing counts, whatever was placed.
         next_row = resumed.next_step if resumed.moves else 0
         if resumed.moves:
-            self._keep_edited()
+            self._log.warnings += self._log.files.keep_edited()
         self._recover(resumed, next_row)
         for step in self.plan[next_row:]:
             if self._stop.requested:
                 return "interrupted"
             self._tell(step)
             self._do(step)
-            if step.action == "look" and self._estimate is not None and self._estimate.update(self._ok_looks()):
+            if step.action == "look" and self._estimate is not None and self._estimate.update(self._log.ok_looks):
                 reason = "target met"
                 break
         else:
             reason = "done"
-        if self._recorder.moves:
-            self._close_segment(self.positioner.home())
+        if self._log.recorder.moves:
+            self._log.close_segment(self.bench.positioner.home())
         return reason
-
-    def _ok_looks(self) -> int:
-        return sum(spot.status == "ok" for spot in self._recorder.spots)
-
-    def _end(self, reason: str, exit_code: int) -> None:
-        """Writes down how it ended, as well as the disk allows."""
-        try:
-            self._log("stop", reason=reason, exit_code=exit_code, utc=self._utc_text())
-        except DeviceFault:
-            # A broken disk was the reason, and is on its way to the user already.
-            pass
-        finally:
-            self.journal.close()
-        self._derive(always=True)
-        if self._behind:
-            self._warnings.append(f"the campaign files are behind the journal: {self._behind}")
 
     def _do(self, step: PlanStep) -> None:
         if step.action == "home":
@@ -244,60 +161,33 @@ class Acquisition:
         else:
             self._look(step.step, step.experiment, step.point)
 
-    @property
-    def _done(self) -> Recorded:
-        """Where the run stands, without its moves and spots."""
-        return self._recorder.state
-
-    def _now_s(self) -> float:
-        """Seconds since the campaign was created, never going back, whatever the clock of the computer does."""
-        created = self.journal.records[0].data.get("created")
-        start = datetime.datetime.fromisoformat(str(created))
-        self._time_s = max(self._time_s, round((self._utc() - start).total_seconds(), 3))
-        return self._time_s
-
-    def _utc_text(self) -> str:
-        return self._utc().isoformat(timespec="milliseconds")
-
     def _home(self, step: int | None, counters: tuple[int, int]) -> None:
         self.journal.append("intent", step=step, action="home")
-        report = self.positioner.home()
-        self._close_segment(report)
+        report = self.bench.positioner.home()
+        self._log.close_segment(report)
         switches = report.state.pan_steps, report.state.tilt_steps
-        state = self.positioner.move_to(*counters)
-        self._clock.sleep(self._settle_s)
-        approach = [
-            _approach(to - start, names) for to, start, names in zip(counters, switches, SENSES.values(), strict=True)
-        ]
+        state = self.bench.positioner.move_to(*counters)
+        self.bench.clock.sleep(self._settle_s)
+        turns = zip(counters, switches, SENSES.values(), strict=True)
+        approach = [_approach(to - start, names) for to, start, names in turns]
         reached = {"pan_steps": state.pan_steps, "tilt_steps": state.tilt_steps, "boot": state.boot}
-        self._log("homed", step=step, time_s=self._now_s(), **reached, approach=approach, **self._annotate())
-
-    def _close_segment(self, report: HomeReport) -> None:
-        """What homing says about the segment that it ends."""
-        if not self._recorder.moves:
-            return
-        known = report.known or (report.compared and report.state.boot == self._done.boot)
-        segment, deviation = self._recorder.moves[-1].segment, list(report.deviation_steps) if known else None
-        self._log("verified", segment=segment, deviation_steps=deviation)
-        if deviation is not None and max(map(abs, deviation)) > HOME_TOLERANCE_STEPS:
-            self._warnings.append(
-                f"segment {segment}: the home switches were found {deviation[0]} and {deviation[1]} steps off: steps "
-                "were lost, its spots do not count; lower the speed or free the mechanism"
-            )
+        self._log.write(
+            "homed", step=step, time_s=self._log.now_s(), **reached, approach=approach, **self.bench.annotate()
+        )
 
     def _place(self, target: str, placement: int, remark: str, step: int | None) -> None:
         again = step is None
-        if not self.operator.place(target, self.rig.sheets_mm[target], placement, remark):
+        if not self.bench.operator.place(target, self.rig.sheets_mm[target], placement, remark):
             raise _Stopped
-        self._log("placed", step=step, target=target, again=again, utc=self._utc_text())
+        self._log.write("placed", step=step, target=target, again=again, utc=self._log.utc_text())
         self._placement, self._check_depth = placement, True
 
     def _move(self, pan: int, tilt: int, step: int | None, **more: object) -> None:
         self.journal.append("intent", step=step, action="move", pan_steps=pan, tilt_steps=tilt)
-        state = self.positioner.move_to(pan, tilt)
-        self._clock.sleep(self._settle_s)
+        state = self.bench.positioner.move_to(pan, tilt)
+        self.bench.clock.sleep(self._settle_s)
         reached = {"pan_steps": state.pan_steps, "tilt_steps": state.tilt_steps}
-        self._log("moved", step=step, time_s=self._now_s(), **reached, **more, **self._annotate())
+        self._log.write("moved", step=step, time_s=self._log.now_s(), **reached, **more, **self.bench.annotate())
 
     def _look(self, step: int | None, experiment: int | None, point: int | None, reference: Spot | None = None) -> None:
         for _ in range(PLACEMENTS_MAX):
@@ -305,24 +195,18 @@ class Acquisition:
             wrong = self._misplaced(observation)
             if wrong is None:
                 break
-            self._place(self._done.target, self._placement, wrong, None)
+            self._place(self._log.recorder.state.target, self._placement, wrong, None)
         else:
             remedy = "check the sheet and [sheets] of the rig file, then go on with --resume"
             raise DeviceFault("placement", f"the sheet is not where it should be: {wrong}; {remedy}", remedy=remedy)
         frames = [self.journal.store(name, data).as_json() for name, data in observation.pictures.items()]
         found = observation.detection
-        more: dict[str, object] = {}
-        if reference is not None:
-            shift_px = _shift_px(reference, found.pixels_px)
-            more = {"reference_of": reference.spot, "shift_px": shift_px}
-            if shift_px is None or shift_px > REFERENCE_SHIFT_MAX_PX:
-                seen = "is not seen" if shift_px is None else f"has moved by {shift_px:.0f} px"
-                self._warnings.append(f"the reference spot {reference.spot} {seen}: have camera or sheet been moved?")
-        self._log(
+        more = {} if reference is None else self._compared(reference, found.pixels_px)
+        self._log.write(
             "looked",
             step=step,
             spot=self._spot,
-            target=self._done.target,
+            target=self._log.recorder.state.target,
             experiment=experiment,
             point=point,
             status=found.status,
@@ -330,17 +214,25 @@ class Acquisition:
             sds_px=found.sds_px,
             correlations=found.correlations,
             frames=frames,
-            time_s=self._now_s(),
+            time_s=self._log.now_s(),
             **more,
         )
         self._spot += 1
-        self._derive()
+        self._log.files.derive()
+
+    def _compared(self, reference: Spot, pixels_px: Four | None) -> dict[str, object]:
+        """What a look at a spot seen before says of it; a large change is worth a word."""
+        shift_px = None if pixels_px is None else _shift_px(reference, pixels_px)
+        if shift_px is None or shift_px > REFERENCE_SHIFT_MAX_PX:
+            seen = "is not seen" if shift_px is None else f"has moved by {shift_px:.0f} px"
+            self._log.warnings.append(f"the reference spot {reference.spot} {seen}: have camera or sheet been moved?")
+        return {"reference_of": reference.spot, "shift_px": shift_px}
 
     def _observe(self) -> Observation:
         """A look; one that finds no spot is repeated, the last one counts."""
         for attempt in range(ATTEMPTS_PER_LOOK):
             self._retries += attempt > 0
-            observation = self.observer.observe(self.positioner, self._spot)
+            observation = self.bench.observer.observe(self.bench.positioner, self._spot)
             if observation.detection.status in ("ok", "undetected") or self._stop.requested:
                 break
         return observation
@@ -350,14 +242,12 @@ class Acquisition:
         pixels = observation.detection.pixels_px
         if not self._check_depth or observation.detection.status != "ok" or pixels is None:
             return None
-        from tvsbayes.instrument.stereo_pair import triangulate
-
         depth = float(triangulate(self.rig.stereo, np.array([pixels]))[0, 0])
-        nominal = self.rig.sheets_mm[self._done.target]
+        nominal = self.rig.sheets_mm[self._log.recorder.state.target]
         others = [abs(x - nominal) for x in self.rig.sheets_mm.values() if x != nominal]
         tolerance = DEPTH_SHARE * min([*others, nominal])
         if abs(depth - nominal) > tolerance:
-            return f"its spot lies at X = {depth:.0f} mm, {self._done.target} is at {nominal:.0f} mm"
+            return f"its spot lies at X = {depth:.0f} mm, {self._log.recorder.state.target} is at {nominal:.0f} mm"
         self._check_depth = False
         return None
 
@@ -395,7 +285,7 @@ class Acquisition:
         """Looks again where the last spots on the present sheet were seen."""
         candidates: dict[tuple[int, int], Spot] = {}
         for spot in reversed(before.spots):
-            if spot.status == "ok" and spot.target == self._done.target:
+            if spot.status == "ok" and spot.target == self._log.recorder.state.target:
                 move = before.moves[spot.move]
                 candidates.setdefault((move.pan_steps, move.tilt_steps), spot)
         for (pan, tilt), spot in list(candidates.items())[:REFERENCE_LOOKS]:
@@ -415,62 +305,16 @@ class Acquisition:
         self._look(step.step, step.experiment, step.point)
 
     def _put_sheet(self, scene: _Scene, remark: str) -> None:
-        if scene.target and scene.target != self._done.target:
+        if scene.target and scene.target != self._log.recorder.state.target:
             self._place(scene.target, scene.placement, remark, None)
 
     def _heed_stop(self) -> None:
         if self._stop.requested:
             raise _Stopped
 
-    def _log(self, event: str, **data: object) -> None:
-        self._recorder.add(self.journal.append(event, **data))
-        if event in ("homed", "verified"):
-            self._derive(always=True)
-
-    def _next_spot(self) -> int:
-        """The first number that neither an event nor a frame of an interrupted look has."""
-        used = [spot.spot for spot in self._recorder.spots]
-        names = orphans(self.journal.folder, tuple(self.journal.records))
-        # Other pictures, which somebody has put there, have no number.
-        used += [int(name.split("/")[1][:6]) for name in names if FRAME_NAME.fullmatch(name)]
-        return max(used, default=-1) + 1
-
-    def _keep_edited(self) -> None:
-        """Files that somebody has changed since the run was interrupted are about to be written again."""
-        campaign = self._campaign()
-        if campaign is None:
-            return
-        for name, copy in keep_edited(campaign, self.journal.folder).items():
-            self._warnings.append(f"{name} was edited since: what stood in it is kept in {copy.name}")
-
-    def _derive(self, always: bool = False) -> None:
-        count = len(self._recorder.spots)
-        if not always and count > DERIVED_EVERY and count % (count // DERIVED_EVERY):
-            return
-        campaign = self._campaign()
-        if campaign is None:
-            return
-        try:
-            write_derived(campaign, self.journal.folder, tables_only=not always)
-            self._behind = ""
-        except TvsError as error:
-            # Somebody has the table open, say. The journal has everything, and the next look tries again; after the
-            # last one --resume does.
-            self._behind = error.message
-
-    def _campaign(self) -> Campaign | None:
-        """What the journal holds so far, None before the first homing."""
-        header = {"name": str(self.journal.records[0].data.get("name", "acquired campaign"))}
-        created = datetime.datetime.fromisoformat(str(self.journal.records[0].data.get("created")))
-        header["created"] = created.astimezone(datetime.UTC)
-        for name in ("synthetic", "seed"):
-            if name in self.journal.records[0].data:
-                header[name] = self.journal.records[0].data[name]
-        return campaign_of(self._recorder.result(), self.rig, header)
-
     def _tell(self, step: PlanStep) -> None:
         left = self.plan[step.step :]
-        spots = self._recorder.spots
+        spots = self._log.recorder.spots
         doing = {
             "home": "homing",
             "place": f"placing {step.target}",
@@ -504,12 +348,6 @@ def _approach(steps: int, names: tuple[str, str]) -> str:
     return name if abs(steps) >= CLEARED_STEPS or steps < 0 else "unknown"
 
 
-def _shift_px(before: Spot, now: Sequence[float] | None) -> float | None:
+def _shift_px(before: Spot, now: Four) -> float:
     """Largest change of a coordinate since the reference, px."""
-    if now is None:
-        return None
-    return round(max(abs(a - b) for a, b in zip(_pixels(before), now, strict=True)), 3)
-
-
-def _pixels(spot: Spot) -> tuple[float, ...]:
-    return tuple(float(v or 0.0) for v in (spot.u_left_px, spot.v_left_px, spot.u_right_px, spot.v_right_px))
+    return round(max(abs(float(a) - b) for a, b in zip(PIXELS(before), now, strict=True)), 3)

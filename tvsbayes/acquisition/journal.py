@@ -1,4 +1,13 @@
-"""The log of a run, and its frames."""
+"""The journal of an acquisition, `log.jsonl`: append-only, a CRC on every line, chained, on the disk before it counts.
+
+One event per line: `CRC32 NUMBER PREVIOUS-CRC32 JSON`. The first CRC, in eight lower-case hexadecimal digits, covers
+the rest of the line; the second is the first one of the line before, so that a missing, swapped or repeated line
+shows. Frames are files of their own, written under a temporary name, flushed to the disk, renamed, their folder
+flushed; only then is the line with their SHA-256 appended and flushed; only then has the event happened. So a crash
+or a power cut at any moment leaves every acknowledged event whole, and at most one torn line at the end.
+
+Times in the events: UTC for people, `time_s` for the campaign (seconds since the first start, never decreasing).
+"""
 
 from __future__ import annotations
 
@@ -8,10 +17,13 @@ import hashlib
 import json
 import os
 import re
+import sys
 import zlib
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+from tvsbayes.acquisition.journal_events import Frame
 from tvsbayes.errors import DeviceFault, InputError, escaped, refusal
 from tvsbayes.files.disk import flush_folder, make_folder, read_bytes, write_atomically
 from tvsbayes.files.documents import parse_json
@@ -27,6 +39,7 @@ FRAME_BYTES_MAX = 128 * 1024 * 1024
 FRAME_FOLDERS = ("frames", "dark")
 """Pictures with the laser on and, for the background, off."""
 FRAME_NAME = re.compile(r"(?:frames|dark)/[0-9]{6}_(?:left|right)\.png")
+"""As `instrument.campaign.frame_name` makes them."""
 LOG_LINE = re.compile(rb"([0-9a-f]{8}) (0|[1-9][0-9]{0,8}) ([0-9a-f]{8}) (\{[ -~]*\})")
 REPAIR_REMEDY = "copy what is whole to a new folder: tvsbayes check FOLDER --repair-to NEW"
 
@@ -73,7 +86,7 @@ class FrameFile:
     sha256: str
     size: int
 
-    def as_json(self) -> dict[str, object]:
+    def as_json(self) -> Frame:
         """As a look's event holds it."""
         return {"name": self.name, "sha256": self.sha256, "bytes": self.size}
 
@@ -109,23 +122,43 @@ def encode(number: int, previous: int, event: str, data: dict[str, object]) -> b
     return line
 
 
-def _decode(line: bytes, number: int, previous: int) -> tuple[dict[str, object], int] | str:
-    """Content and CRC of a line without its line feed, or what is wrong with it."""
+@dataclass(frozen=True, slots=True)
+class Line:
+    """A whole line of a journal: number of the event, CRC of the line before and its own, event and data."""
+
+    number: int
+    previous: int
+    crc: int
+    event: str
+    data: dict[str, object]
+
+
+def parse_line(line: bytes) -> Line | str:
+    """A line without its line feed, or what is wrong with it, whatever stands before it."""
     match = LOG_LINE.fullmatch(line) if len(line) < LINE_BYTES_MAX else None
     if match is None:
         return "no event"
     crc = int(match[1], 16)
     if zlib.crc32(line[9:]) != crc:
         return "a line whose CRC does not fit"
-    if int(match[2]) != number:
-        return f"event {int(match[2])} where {number} belongs"
-    if int(match[3], 16) != previous:
-        return "a line that does not follow on the one before"
     try:
-        values = parse_json(match[4], LOG).values
+        data = parse_json(match[4], LOG).values
     except InputError:
         return "no JSON"
-    return (values, crc) if isinstance(values.get("event"), str) else "no event"
+    event = data.pop("event", None)
+    return Line(int(match[2]), int(match[3], 16), crc, event, data) if isinstance(event, str) else "no event"
+
+
+def _following(line: bytes, number: int, previous: int) -> Line | str:
+    """The line that belongs behind `number` others, the last of which has the CRC `previous`; or what is wrong."""
+    found = parse_line(line)
+    if isinstance(found, str):
+        return found
+    if found.number != number:
+        return f"event {found.number} where {number} belongs"
+    if found.previous != previous:
+        return "a line that does not follow on the one before"
+    return found
 
 
 def _is_torn(tail: bytes, number: int, previous: int) -> bool:
@@ -139,7 +172,14 @@ def _is_torn(tail: bytes, number: int, previous: int) -> bool:
     if len(tail) > LINE_BYTES_MAX or b"\n" in tail:
         return False
     # A whole event whose line feed became another byte was acknowledged once.
-    return isinstance(_decode(tail[:-1], number, previous), str)
+    return isinstance(_following(tail[:-1], number, previous), str)
+
+
+def require_journal(folder: Path, remedy: str) -> None:
+    """Refuses a folder without `log.jsonl`."""
+    if not (folder / LOG).is_file():
+        place = escaped(str(folder / LOG), 200)
+        raise refusal("missing-file", file=place, found="no journal", allowed="a journal", remedy=remedy)
 
 
 def read_log(folder: Path) -> bytes:
@@ -169,19 +209,18 @@ def read_journal(folder: Path) -> Reading:
     while position < len(data):
         end = data.find(b"\n", position)
         line = data[position:] if end < 0 else data[position:end]
-        content = _decode(line, len(records), previous) if end >= 0 else "a line without its end"
-        if isinstance(content, str):
+        found = _following(line, len(records), previous) if end >= 0 else "a line without its end"
+        if isinstance(found, str):
             tail = data[position:]
             if (end < 0 or end + 1 == len(data)) and _is_torn(tail, len(records), previous):
                 return Reading(tuple(records), tail, position, previous)
             number, allowed = len(records) + 1, "events in their order, each with its CRC"
-            raise refusal("journal", file=LOG, line=number, found=content, allowed=allowed, remedy=REPAIR_REMEDY)
-        values, previous = content
-        event = str(values.pop("event"))
-        if not records and (event != "created" or values.get("format") != FORMAT):
-            allowed = f"the event created of the format {FORMAT}"
-            raise refusal("journal", file=LOG, line=1, found=escaped(event), allowed=allowed, remedy=REPAIR_REMEDY)
-        records.append(Record(len(records), event, values, len(records) + 1))
+            raise refusal("journal", file=LOG, line=number, found=found, allowed=allowed, remedy=REPAIR_REMEDY)
+        if not records and (found.event != "created" or found.data.get("format") != FORMAT):
+            allowed, event = f"the event created of the format {FORMAT}", escaped(found.event)
+            raise refusal("journal", file=LOG, line=1, found=event, allowed=allowed, remedy=REPAIR_REMEDY)
+        previous = found.crc
+        records.append(Record(len(records), found.event, found.data, len(records) + 1))
         position = end + 1
     return Reading(tuple(records), b"", position, previous)
 
@@ -203,7 +242,7 @@ class Journal:
         self._dirty: set[Path] = set()
 
     @classmethod
-    def create(cls, folder: Path, disk: Disk | None = None, **data: object) -> Journal:
+    def create(cls, folder: Path, disk: Disk | None = None, /, **data: object) -> Journal:
         """A new journal in a folder that has none; `data` goes into its first event, `created`.
 
         Raises:
@@ -292,7 +331,7 @@ class Journal:
         self._dirty.add(target.parent)
         return FrameFile(name, hashlib.sha256(data).hexdigest(), len(data))
 
-    def append(self, event: str, **data: object) -> Record:
+    def append(self, event: str, /, **data: object) -> Record:
         """Appends an event and returns once it is on the disk, behind the frames stored before it.
 
         Raises:
@@ -320,31 +359,23 @@ class Journal:
             descriptor, self._descriptor = self._descriptor, None
             os.close(descriptor)
 
-    def _guarded(self) -> _Guard:
-        return _Guard(self)
+    @contextlib.contextmanager
+    def _guarded(self) -> Iterator[int]:
+        """The descriptor; the first error closes the journal for good, one of the disk becomes a `DeviceFault`."""
+        if self._descriptor is None:
+            raise DeviceFault("disk", "the journal is closed after a disk error", remedy="go on with --resume")
+        try:
+            yield self._descriptor
+        except BaseException as error:
+            self.close()
+            if isinstance(error, OSError):
+                raise _disk_fault(error) from error
+            raise
 
     def _write(self, descriptor: int, data: bytes) -> None:
         view = memoryview(data)
         while view:
             view = view[self._disk.write(descriptor, bytes(view)) :]
-
-
-class _Guard:
-    """Turns the first disk error into a `DeviceFault` and closes the journal for good."""
-
-    def __init__(self, journal: Journal):
-        self.journal = journal
-
-    def __enter__(self) -> int:
-        if self.journal._descriptor is None:
-            raise DeviceFault("disk", "the journal is closed after a disk error", remedy="go on with --resume")
-        return self.journal._descriptor
-
-    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
-        if error is not None:
-            self.journal.close()
-        if isinstance(error, OSError):
-            raise _disk_fault(error) from error
 
 
 def _disk_fault(error: OSError) -> DeviceFault:
@@ -356,16 +387,16 @@ def _disk_fault(error: OSError) -> DeviceFault:
 def _lock(descriptor: int) -> None:
     """Refuses a second writer; the lock ends with the process, however it ends."""
     try:
-        if os.name == "posix":
-            import fcntl
-
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        else:
+        if sys.platform == "win32":
             import msvcrt
 
             # Far behind the end, so that readers are not kept out.
             os.lseek(descriptor, LOG_BYTES_MAX + 1, os.SEEK_SET)
             msvcrt.locking(descriptor, msvcrt.LK_NBLCK, 1)
+        else:
+            import fcntl
+
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError as error:
         # What flock(2) and _locking say of a lock that somebody holds; anything else is a disk without locks.
         if error.errno not in (errno.EWOULDBLOCK, errno.EACCES, errno.EDEADLK):

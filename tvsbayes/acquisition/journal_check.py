@@ -1,22 +1,12 @@
-"""The journal of an acquisition, `log.jsonl`: append-only, a CRC on every line, chained, on the disk before it counts.
-
-One event per line: `CRC32 NUMBER PREVIOUS-CRC32 JSON`. The first CRC, in eight lower-case hexadecimal digits, covers
-the rest of the line; the second is the first one of the line before, so that a missing, swapped or repeated line
-shows. Frames are files of their own, written under a temporary name, flushed to the disk, renamed, their folder
-flushed; only then is the line with their SHA-256 appended and flushed; only then has the event happened. So a crash
-or a power cut at any moment leaves every acknowledged event whole, and at most one torn line at the end.
+"""A journal and its frames checked, and what is whole of a damaged one copied.
 
 CRC and chain find accidents; they are no seal against forgery. A missing end is not visible from inside: a run that
 ended by itself has a `stop` event, and frames without a line are listed.
-
-Times in the events: UTC for people, `time_s` for the campaign (seconds since the first start, never decreasing).
 """
 
 from __future__ import annotations
 
 import hashlib
-import zlib
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -24,19 +14,18 @@ from tvsbayes.acquisition.journal import (
     FRAME_BYTES_MAX,
     FRAME_FOLDERS,
     FRAME_NAME,
-    LINE_BYTES_MAX,
     LOG,
-    LOG_LINE,
     REPAIR_REMEDY,
     FrameFile,
     Journal,
+    Line,
     Record,
+    parse_line,
     read_journal,
     read_log,
 )
 from tvsbayes.errors import InputError, refusal
 from tvsbayes.files.disk import make_folder, read_bytes
-from tvsbayes.files.documents import parse_json
 
 
 @dataclass(frozen=True)
@@ -57,8 +46,9 @@ class Verification:
     torn_bytes: int
     stopped: str | None
 
-    def as_json(self) -> dict[str, object]:
-        """The document of `tvsbayes check`."""
+    @property
+    def warnings(self) -> list[str]:
+        """What the user should know."""
         warnings = []
         if self.torn_bytes:
             warnings.append(f"{LOG} ends in {self.torn_bytes} bytes of an unfinished line, which --resume cuts off")
@@ -67,7 +57,7 @@ class Verification:
             warnings.append(f"{len(self.orphans)} frames without an event, of interrupted looks: {names}")
         if self.stopped is None:
             warnings.append("the run did not end by itself: go on with tvsbayes acquire --resume")
-        return {"records": self.records, "frames": self.frames, "stopped": self.stopped, "warnings": warnings}
+        return warnings
 
 
 def frames_of(record: Record) -> list[FrameFile]:
@@ -79,12 +69,20 @@ def frames_of(record: Record) -> list[FrameFile]:
     entries = record.data.get("frames", [])
     found = []
     for entry in entries if isinstance(entries, list) else [None]:
-        good = isinstance(entry, dict) and set(entry) == {"name", "sha256", "bytes"}
-        if not (good and isinstance(entry["name"], str) and FRAME_NAME.fullmatch(entry["name"])):
+        frame = _frame(entry)
+        if frame is None:
             allowed = "frames as { name, sha256, bytes }"
             raise refusal("journal", file=LOG, line=record.line, found="another", allowed=allowed, remedy=REPAIR_REMEDY)
-        found.append(FrameFile(entry["name"], str(entry["sha256"]), entry["bytes"]))
+        found.append(frame)
     return found
+
+
+def _frame(entry: object) -> FrameFile | None:
+    if not isinstance(entry, dict) or set(entry) != {"name", "sha256", "bytes"}:
+        return None
+    name = entry["name"]
+    good = isinstance(name, str) and FRAME_NAME.fullmatch(name)
+    return FrameFile(name, str(entry["sha256"]), entry["bytes"]) if good else None
 
 
 def _frame_problem(folder: Path, frame: FrameFile) -> str | None:
@@ -121,9 +119,15 @@ def verify(folder: Path) -> Verification:
             problem = "a frame that an event before it names" if frame.name in named else _frame_problem(folder, frame)
             named.add(frame.name)
             if problem is not None:
-                place = {"file": LOG, "line": record.line, "column": frame.name}
-                allowed = "the frame that the event names, unchanged"
-                raise refusal("frame", **place, found=problem, allowed=allowed, remedy=REPAIR_REMEDY)
+                raise refusal(
+                    "frame",
+                    file=LOG,
+                    line=record.line,
+                    column=frame.name,
+                    found=problem,
+                    allowed="the frame that the event names, unchanged",
+                    remedy=REPAIR_REMEDY,
+                )
             count += 1
     stops = [str(r.data.get("reason", "")) for r in reading.records[-1:] if r.event == "stop"]
     missing = tuple(orphans(folder, reading.records))
@@ -156,21 +160,6 @@ class Repair:
         }
 
 
-def _whole_lines(data: bytes) -> Iterator[tuple[int, dict[str, object] | None, int]]:
-    """(line, content or None where it is damaged, number it states) of every line that ends."""
-    for number, line in enumerate(data.split(b"\n")[:-1], start=1):
-        match = LOG_LINE.fullmatch(line) if len(line) < LINE_BYTES_MAX else None
-        if match is None or zlib.crc32(line[9:]) != int(match[1], 16):
-            yield number, None, -1
-            continue
-        try:
-            values = parse_json(match[4], LOG).values
-        except InputError:
-            yield number, None, -1
-            continue
-        yield number, values if isinstance(values.get("event"), str) else None, int(match[2])
-
-
 def repair(folder: Path, to: Path) -> Repair:
     """Copies what is whole into a new folder; the old one stays as it is.
 
@@ -182,39 +171,38 @@ def repair(folder: Path, to: Path) -> Repair:
     """
     folder, to = Path(folder), Path(to)
     data = read_log(folder)
-    lines = list(_whole_lines(data))
+    lines = [parse_line(line) for line in data.split(b"\n")[:-1]]
     done = Repair(torn_bytes=len(data) - data.rfind(b"\n") - 1)
-    events = [(line, values, number) for line, values, number in lines if values is not None]
-    done.lost_lines = [line for line, values, _ in lines if values is None]
+    events = [(place, line) for place, line in enumerate(lines, start=1) if isinstance(line, Line)]
+    done.lost_lines = [place for place, line in enumerate(lines, start=1) if isinstance(line, str)]
     if not events:
         allowed, remedy = "at least one whole line", "take the campaign again"
         raise refusal("journal", file=LOG, found="nothing whole", allowed=allowed, remedy=remedy)
     make_folder(to, empty=True)
-    first = events[0][1] if events[0][1]["event"] == "created" else {}
-    created = {k: v for k, v in first.items() if k not in ("event", "format")}
-    journal = Journal.create(to, **created, repaired=True)
+    first = events[0][1].data if events[0][1].event == "created" else {}
+    created = {key: value for key, value in first.items() if key != "format"}
+    journal = Journal.create(to, **{**created, "repaired": True})
     expected, ended = 1 if first else 0, False
     named: set[str] = set()
     try:
-        for line, values, number in events[1:] if first else events:
-            if number != expected:
-                journal.append("gap", before_line=line)
-            expected = number + 1
-            content = {k: v for k, v in values.items() if k not in ("event", "frames")}
-            record = Record(number, str(values["event"]), values, line)
+        for place, line in events[1:] if first else events:
+            if line.number != expected:
+                journal.append("gap", before_line=place)
+            expected = line.number + 1
             kept = []
-            for frame in frames_of(record):
+            for frame in frames_of(Record(line.number, line.event, line.data, place)):
                 twice = frame.name in named
                 named.add(frame.name)
                 if not twice and _frame_problem(folder, frame) is None:
                     kept.append(journal.store(frame.name, read_bytes(folder / frame.name, FRAME_BYTES_MAX, folder)))
                 else:
                     done.lost_frames.append(frame.name)
-            if "frames" in values:
+            content = {key: value for key, value in line.data.items() if key != "frames"}
+            if "frames" in line.data:
                 content["frames"] = [frame.as_json() for frame in kept]
-            journal.append(record.event, **content)
+            journal.append(line.event, **content)
             done.kept += 1
-            ended = record.event == "stop"
+            ended = line.event == "stop"
         if not ended:
             journal.append("gap", before_line=len(lines) + 1)
     finally:

@@ -5,7 +5,7 @@ older than the look, however deep the buffers are: pictures come in the order of
 wait for the spot to appear and after laser-off for it to vanish. A look then begins with no lit picture under way, and
 what shows a spot was exposed in it. That the spot vanishes shows, too, that the laser is off.
 
-Raw px with the integer at the centre of a pixel.
+Raw px with the integer at the centre of a pixel; grey levels 0 to 255.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from typing import Protocol
 
 import numpy as np
 
+from tvsbayes.acquisition.journal_events import Four
 from tvsbayes.acquisition.simulated_instrument import Instrument, Renderer
 from tvsbayes.cameras.capture import StereoCamera, StereoImage
 from tvsbayes.cameras.contour import epipolar_refused
@@ -22,6 +23,7 @@ from tvsbayes.cameras.detection import pair_status
 from tvsbayes.cameras.spot_fit import find_spot
 from tvsbayes.errors import DeviceFault
 from tvsbayes.files.images import png_bytes
+from tvsbayes.instrument.campaign import CAMERAS, frame_name
 from tvsbayes.instrument.rig import Rig
 from tvsbayes.instrument.stereo_pair import Stereo
 from tvsbayes.positioner.driver import Positioner
@@ -51,8 +53,8 @@ class Detection:
     """
 
     status: str
-    pixels_px: tuple[float, float, float, float] | None = None
-    sds_px: tuple[float, float, float, float] | None = None
+    pixels_px: Four | None = None
+    sds_px: Four | None = None
     correlations: tuple[float, float] = (0.0, 0.0)
 
 
@@ -116,13 +118,12 @@ class CameraObserver:
         self._wait_for_darkness(dark)
         pictures = {}
         if self.keep_pictures:
-            pairs = {"frames": lit, "dark": dark}
             pictures = {
-                f"{folder}/{spot:06d}_{side}.png": png_bytes(getattr(pair, side))
-                for folder, pair in pairs.items()
-                for side in ("left", "right")
+                frame_name(spot, camera, folder): png_bytes(getattr(pair, camera))
+                for folder, pair in (("frames", lit), ("dark", dark))
+                for camera in CAMERAS
             }
-        unsteady = max(_rises(lit, dark)) > CHANGE_DN
+        unsteady = max(rises_dn(lit, dark)) > CHANGE_DN
         return Observation(Detection(UNSTEADY) if unsteady else self.detector(lit, dark), pictures)
 
     def _lit(self, positioner: Positioner, dark: StereoImage) -> tuple[StereoImage, bool]:
@@ -134,7 +135,7 @@ class CameraObserver:
                 remedy = "unplug the camera and plug it in again, then go on with --resume"
                 message = f"a camera delivers the same picture again and again; {remedy}"
                 raise DeviceFault("frozen", message, remedy=remedy)
-            if min(_rises(dark, lit)) > CHANGE_DN:
+            if min(rises_dn(dark, lit)) > CHANGE_DN:
                 if number:
                     # Light came on during the first lit exposure, or in one still older: take a whole one.
                     lit = self.camera.grab()
@@ -145,18 +146,18 @@ class CameraObserver:
 
     def _wait_for_darkness(self, dark: StereoImage) -> None:
         for _ in range(WAIT_GRABS):
-            if max(_rises(dark, self.camera.grab())) <= CHANGE_DN:
+            if max(rises_dn(dark, self.camera.grab())) <= CHANGE_DN:
                 return
         remedy = "cut the laser's supply at once; if it is off, something else in the room has become bright"
         raise DeviceFault("light", f"the spot does not vanish with the laser off; {remedy}", remedy=remedy)
 
 
-def _rises(before: StereoImage, after: StereoImage) -> tuple[int, int]:
+def rises_dn(before: StereoImage, after: StereoImage) -> tuple[int, int]:
     """The most by which a pixel grew brighter, left and right, grey levels."""
     import cv2
 
-    pairs = (before.left, after.left), (before.right, after.right)
-    return tuple(int(cv2.subtract(new, old).max()) for old, new in pairs)
+    left, right = cv2.subtract(after.left, before.left), cv2.subtract(after.right, before.right)
+    return int(left.max()), int(right.max())
 
 
 @dataclass
@@ -205,9 +206,9 @@ def live_detector(stereo: Stereo) -> Detector:
             return Detection("epipolar")
         sds = np.sqrt(np.diag(covariance))
         correlations = covariance[0, 1] / (sds[0] * sds[1]), covariance[2, 3] / (sds[2] * sds[3])
-        return Detection(
-            "ok", tuple(map(float, pixels)), tuple(map(float, sds)), (float(correlations[0]), float(correlations[1]))
-        )
+        u, v, x, y = pixels.tolist()
+        su, sv, sx, sy = sds.tolist()
+        return Detection("ok", (u, v, x, y), (su, sv, sx, sy), (float(correlations[0]), float(correlations[1])))
 
     return found
 

@@ -1,11 +1,7 @@
-"""The engine that runs a plan on an instrument: home, place, move, look, each on the disk before the next.
+"""The people of a run: the operator who is asked, the key that stops, and what is shown meanwhile.
 
-A plan describes, the engine does. Whatever ends a run (the plan's end, Ctrl-C, a fault of device, camera or disk),
-the laser is switched off, the end is written down, and the folder is a readable campaign as soon as the first homing
-is logged. `recorded` tells from the journal what is done; a resumed run homes into a new segment, asks for the sheet,
-repeats reference looks and goes on with the first step that is not done.
-
-Counters in motor steps, seconds where a name says `_s`, px as in DESIGN 7.
+The hazard is told before the laser can come on, and whoever cannot be asked has to state its class. Ctrl-C ends a run
+in good order; what ends the process from outside is turned into an interrupt, so that the laser goes off.
 """
 
 from __future__ import annotations
@@ -25,6 +21,11 @@ HAZARD = """LASER HAZARD. 808 nm is invisible and likely class 3B: beam and refl
 Before you go on: goggles rated for 808 nm on everybody in the room; beam path shut in; no mirrors, watches, rings;
 door sign and key switch in place. The laser is on only while a picture is taken. Ctrl-C stops: once after the
 present look, twice at once. The firmware's watchdog is a last resort, no interlock."""
+LASER_CLASSES = ("1", "1M", "2", "2M", "3R", "3B", "4")
+"""IEC 60825-1, the classes that a user may state instead of being asked."""
+_Handler = Callable[[int, FrameType | None], object] | int | signal.Handlers
+_TERMINATIONS = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP", "SIGBREAK") if hasattr(signal, name))
+"""SIGHUP exists on POSIX only, SIGBREAK on Windows only."""
 
 
 class Operator(Protocol):
@@ -74,7 +75,7 @@ class StopKey:
         self.closing = False
         """While laser and journal are being put away nothing interrupts: a third Ctrl-C would leave the laser on."""
         self._tell = tell
-        self._before: dict[int, object] = {}
+        self._before: dict[int, _Handler] = {}
 
     def __enter__(self) -> StopKey:
         if threading.current_thread() is threading.main_thread():
@@ -106,10 +107,13 @@ class StopKey:
             pass
 
 
-_TERMINATIONS = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP", "SIGBREAK") if hasattr(signal, name))
-"""SIGHUP exists on POSIX only, SIGBREAK on Windows only."""
-LASER_CLASSES = ("1", "1M", "2", "2M", "3R", "3B", "4")
-"""IEC 60825-1, the classes that a user may state instead of being asked."""
+@dataclass(frozen=True)
+class Terminal:
+    """How a run talks to its user: lines to `say`, progress to `show`, and questions to `ask`, which are answered."""
+
+    say: Callable[[str], None] = lambda text: None
+    show: Callable[[Progress], None] = lambda progress: None
+    ask: Callable[[str], str] = input
 
 
 @dataclass
@@ -118,36 +122,34 @@ class TerminalOperator:
 
     Attributes:
         stop: the stop key, which may interrupt a question.
-        say: shows a line.
-        ask: shows a question and returns the answer.
+        terminal: where.
         laser_class: stated on the command line: the hazard is shown, nobody is asked.
     """
 
     stop: StopKey
-    say: Callable[[str], None]
-    ask: Callable[[str], str] = input
+    terminal: Terminal
     laser_class: str | None = None
 
     def accept(self, hazard: str) -> bool:
         """See `Operator.accept`."""
         for line in hazard.splitlines():
-            self.say(line)
+            self.terminal.say(line)
         if self.laser_class is not None:
-            self.say(f"laser class {self.laser_class} stated on the command line: not asked")
+            self.terminal.say(f"laser class {self.laser_class} stated on the command line: not asked")
             return True
         return self._answer("Type yes to go on: ") == "yes"
 
     def place(self, target: str, x_mm: float, placement: int, remark: str) -> bool:
         """See `Operator.place`."""
         if remark:
-            self.say(f"note: {remark}")
+            self.terminal.say(f"note: {remark}")
         answer = self._answer(f"Put the sheet at {target} (X = {x_mm:g} mm), then press Enter; q stops: ")
         return answer != "q"
 
     def _answer(self, question: str) -> str:
         self.stop.at_prompt = True
         try:
-            return self.ask(question).strip().lower()
+            return self.terminal.ask(question).strip().lower()
         except (EOFError, KeyboardInterrupt):
             self.stop.requested = True
             return "q"

@@ -1,43 +1,26 @@
 """What a journal says happened: the campaign that its events hold, at any time.
 
-`moves.csv` and `spots.csv` are derived from `log.jsonl` and can be derived again. A segment begins with a homing and
-ends with the next one, which tells whether steps were lost in between: then no spot of the segment counts. After a
-gap that a repair left, nothing counts until the next homing, because nobody knows which motion is missing.
-
-Counters in motor steps, px and seconds as in DESIGN 7.
+A segment begins with a homing and ends with the next one, which tells whether steps were lost in between: then no spot
+of the segment counts. After a gap that a repair left, nothing counts until the next homing, because nobody knows which
+motion is missing. Counters in motor steps, px and seconds as in moves.csv and spots.csv.
 """
 
 from __future__ import annotations
 
-import hashlib
-import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from pathlib import Path
+from typing import cast
 
 from tvsbayes.acquisition.journal import LOG, Record
-from tvsbayes.errors import InputError, refusal
-from tvsbayes.files.csv_table import CSV_BYTES_MAX
-from tvsbayes.files.disk import read_bytes, write_atomically
-from tvsbayes.instrument.campaign import (
-    Campaign,
-    Move,
-    Spot,
-    campaign_toml,
-    moves_bytes,
-    parse_moves,
-    parse_spots,
-    spots_bytes,
-)
-from tvsbayes.instrument.plan import PlanStep
-from tvsbayes.instrument.rig import Rig, rig_table_toml
-from tvsbayes.instrument.stereo_pair import stereo_bytes
+from tvsbayes.acquisition.journal_events import Homed, Looked, Moved, Placed, Stop, Verified
+from tvsbayes.errors import refusal
+from tvsbayes.instrument.axes import PanApproach, TiltApproach
+from tvsbayes.instrument.campaign import NO_PIXELS, Move, Spot, with_pixels
 
 HOME_TOLERANCE_STEPS = 2
 """Scatter of a home switch, as homing finds it again; more than that are lost steps."""
 LOST_STEPS = "lost-steps"
 """Status of a spot in whose segment steps were lost."""
-PIXELS = ("u_left_px", "v_left_px", "u_right_px", "v_right_px")
 
 
 @dataclass(frozen=True)
@@ -77,18 +60,6 @@ class Recorded:
     ended: str | None = None
 
 
-def plan_sha256(plan: Sequence[PlanStep]) -> str:
-    """What makes a plan the same plan: its steps, not its file."""
-    rows = [(s.step, s.action, s.pan_steps, s.tilt_steps, s.target, s.experiment, s.point) for s in plan]
-    return hashlib.sha256(json.dumps(rows).encode()).hexdigest()
-
-
-def rig_sha256(rig: Rig) -> str:
-    """What makes a rig the same rig: priors, stereo calibration, sheets, positioner and cameras."""
-    tables = json.dumps([rig.sheets_mm, rig.positioner, rig.cameras], sort_keys=True)
-    return hashlib.sha256(rig_table_toml(rig.table).encode() + stereo_bytes(rig.stereo) + tables.encode()).hexdigest()
-
-
 class Recorder:
     """Follows a journal event by event.
 
@@ -117,51 +88,64 @@ class Recorder:
         try:
             self._add(record)
         except (KeyError, TypeError, ValueError, IndexError) as error:
-            allowed, remedy = f"the entries of the event {record.event}", "tvsbayes check FOLDER --repair-to NEW"
-            place = {"file": LOG, "line": record.line}
-            raise refusal("event", **place, found=f"{error!r}"[:80], allowed=allowed, remedy=remedy) from error
+            found, allowed = f"{error!r}"[:80], f"the entries of the event {record.event}"
+            remedy = "tvsbayes check FOLDER --repair-to NEW"
+            raise refusal("event", file=LOG, line=record.line, found=found, allowed=allowed, remedy=remedy) from error
 
     def _add(self, record: Record) -> None:
-        data, event = record.data, record.event
+        """Takes an event; the casts say which it is, the conversions behind them whether it holds what it should."""
+        data, event, state = record.data, record.event, self.state
         if event in ("moved", "looked") and not self._trusted:
             self._ignored.append(record.line)
             return
         if event == "gap":
             self._trusted = False
         elif event == "start":
-            self._change(starts=self.state.starts + 1, ended=None)
+            self.state = replace(state, starts=state.starts + 1, ended=None)
         elif event == "stop":
-            self._change(ended=str(data["reason"]))
+            self.state = replace(state, ended=str(cast("Stop", data)["reason"]))
         elif event == "placed":
-            again = bool(data.get("again", False))
-            self._change(target=str(data["target"]), placements=self.state.placements + (not again))
+            placed = cast("Placed", data)
+            again = bool(placed.get("again", False))
+            self.state = replace(state, target=str(placed["target"]), placements=state.placements + (not again))
         elif event == "verified":
-            segment, deviation = int(data["segment"]), data["deviation_steps"]
-            if deviation is None:
-                # A device that was restarted meanwhile has no counters to compare with.
-                return
-            self._closed.add(segment)
-            if max(map(abs, deviation)) > HOME_TOLERANCE_STEPS:
-                self._lost[segment] = (int(deviation[0]), int(deviation[1]))
+            self._verified(cast("Verified", data))
         elif event == "homed":
-            self._trusted = True
-            segment = self.moves[-1].segment + 1 if self.moves else 0
-            self.moves.append(Move(len(self.moves), segment, *_head(data), *data["approach"]))
-            # Only a homing of the plan states counters; one of a resumed run repeats them.
-            self._change(boot=int(data["boot"]), home_steps=(int(data["pan_steps"]), int(data["tilt_steps"])))
+            self._homed(cast("Homed", data))
         elif event == "moved":
-            self.moves.append(Move(len(self.moves), self.moves[-1].segment, *_head(data)))
+            self.moves.append(Move(len(self.moves), self.moves[-1].segment, *_head(cast("Moved", data))))
         elif event == "looked":
-            self.spots.append(_spot(data, len(self.moves) - 1))
-            if data.get("step") is not None:
-                self._looked.add(int(data["step"]))
-            else:
-                self._change(references=self.state.references + 1)
+            self._looks(cast("Looked", data))
         if data.get("step") is not None and event in ("homed", "moved", "placed", "looked"):
-            self._change(next_step=max(self.state.next_step, int(data["step"]) + 1))
+            step = int(cast("Moved | Placed | Looked", data)["step"] or 0)
+            self.state = replace(self.state, next_step=max(self.state.next_step, step + 1))
 
-    def _change(self, **changes: object) -> None:
-        self.state = replace(self.state, **changes)
+    def _verified(self, data: Verified) -> None:
+        segment, deviation = int(data["segment"]), data["deviation_steps"]
+        if deviation is None:
+            # A device that was restarted meanwhile has no counters to compare with.
+            return
+        self._closed.add(segment)
+        if max(map(abs, deviation)) > HOME_TOLERANCE_STEPS:
+            self._lost[segment] = (int(deviation[0]), int(deviation[1]))
+
+    def _homed(self, data: Homed) -> None:
+        self._trusted = True
+        segment = self.moves[-1].segment + 1 if self.moves else 0
+        pan, tilt = data["approach"]
+        # What sides they are is checked where the tables are written.
+        approach = cast("PanApproach", pan), cast("TiltApproach", tilt)
+        self.moves.append(Move(len(self.moves), segment, *_head(data), *approach))
+        # Only a homing of the plan states counters; one of a resumed run repeats them.
+        counters = int(data["pan_steps"]), int(data["tilt_steps"])
+        self.state = replace(self.state, boot=int(data["boot"]), home_steps=counters)
+
+    def _looks(self, data: Looked) -> None:
+        self.spots.append(_spot(data, len(self.moves) - 1))
+        if data.get("step") is not None:
+            self._looked.add(int(data["step"] or 0))
+        else:
+            self.state = replace(self.state, references=self.state.references + 1)
 
     def result(self) -> Recorded:
         """The campaign so far."""
@@ -193,113 +177,23 @@ def recorded(records: Iterable[Record]) -> Recorded:
     return recorder.result()
 
 
-def _head(data: dict[str, object]) -> tuple[float, int, int]:
+def _head(data: Moved) -> tuple[float, int, int]:
     return float(data["time_s"]), int(data["pan_steps"]), int(data["tilt_steps"])
 
 
-def _spot(data: dict[str, object], move: int) -> Spot:
+def _spot(data: Looked, move: int) -> Spot:
     if move < 0:
         raise ValueError("a look before the first homing")
-    pixels, sds = data["pixels_px"], data["sds_px"]
-    correlations = data.get("correlations", [0.0, 0.0])
-    return Spot(
+    row = Spot(
         int(data["spot"]),
         move,
         str(data["target"]),
         data["experiment"],
         data["point"],
-        *(pixels or [None] * 4),
-        *(sds or [None] * 4),
+        *NO_PIXELS,
+        *NO_PIXELS,
         data.get("aperture_deg"),
-        str(data["status"]),
-        *map(float, correlations),
     )
-
-
-def campaign_of(record: Recorded, rig: Rig, header: dict[str, object]) -> Campaign | None:
-    """The campaign to write, None before the first homing."""
-    if not record.moves:
-        return None
-    return Campaign(record.moves, record.spots, rig.stereo, rig.table, header)
-
-
-def write_derived(campaign: Campaign, folder: Path, tables_only: bool = False) -> None:
-    """Writes the four campaign files, or the tables that grow, so that the folder is readable at any moment.
-
-    Moves go before spots: a spot never names a move that is not there yet. Spots that `detect` has found since in
-    frames that waited keep what it found. A file that is as it should be is not written again.
-
-    Raises:
-        InputError: the folder cannot be written.
-    """
-    folder = Path(folder)
-    for name, data in _files(campaign, folder, tables_only).items():
-        if not _holds(folder / name, data):
-            write_atomically(folder / name, data)
-
-
-def _holds(path: Path, data: bytes) -> bool:
-    try:
-        return path.read_bytes() == data
-    except OSError:
-        return False
-
-
-def _files(campaign: Campaign, folder: Path, tables_only: bool = False) -> dict[str, bytes]:
-    detected = _detected(campaign, folder)
-    spots = [
-        detected[spot.spot] if spot.status == "undetected" and spot.spot in detected else spot
-        for spot in campaign.spots
-    ]
-    moves, table = moves_bytes(campaign.moves), spots_bytes(spots)
-    parse_spots(table, "spots.csv", len(parse_moves(moves)), campaign.stereo)
-    files = {"moves.csv": moves, "spots.csv": table}
-    if tables_only:
-        return files
-    return {"stereo.json": stereo_bytes(campaign.stereo), **files, "campaign.toml": campaign_toml(campaign)}
-
-
-def keep_edited(campaign: Campaign, folder: Path) -> dict[str, Path]:
-    """Copies of campaign files that hold what is not in the journal, before they are written again.
-
-    Somebody may have refused spots, written readings, or stated priors since. Tables that only lack the latest rows
-    were left so by the run itself.
-
-    Args:
-        campaign: what the journal says.
-        folder: campaign folder.
-
-    Returns:
-        The copies made, `spots.edited-1.csv` and so on, by the name of the file.
-    """
-    folder, kept = Path(folder), {}
-    for name, data in _files(campaign, folder).items():
-        path = folder / name
-        if not path.is_file():
-            continue
-        present = read_bytes(path, CSV_BYTES_MAX, folder)
-        if not set(present.splitlines()) - set(data.splitlines()):
-            continue
-        number = 1
-        while (copy := path.with_name(f"{path.stem}.edited-{number}{path.suffix}")).exists():
-            number += 1
-        write_atomically(copy, present)
-        kept[name] = copy
-    return kept
-
-
-def _detected(campaign: Campaign, folder: Path) -> dict[int, Spot]:
-    """Spots of the present spots.csv that wait in the journal and were found since."""
-    if not (folder / "spots.csv").is_file() or all(spot.status != "undetected" for spot in campaign.spots):
-        return {}
-    waiting = {spot.spot: spot for spot in campaign.spots if spot.status == "undetected"}
-    try:
-        data = read_bytes(folder / "spots.csv", CSV_BYTES_MAX, folder)
-        present = parse_spots(data, "spots.csv", len(campaign.moves), campaign.stereo)
-    except InputError:
-        return {}
-    return {
-        spot.spot: spot
-        for spot in present
-        if spot.spot in waiting and spot.move == waiting[spot.spot].move and spot.status != "undetected"
-    }
+    pixels, sds = data["pixels_px"] or NO_PIXELS, data["sds_px"] or NO_PIXELS
+    left, right = map(float, data.get("correlations", (0.0, 0.0)))
+    return with_pixels(row, str(data["status"]), pixels, sds, (left, right))

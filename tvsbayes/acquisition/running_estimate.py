@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import json
 import subprocess
-import sys
 import tempfile
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -22,7 +21,25 @@ GROWTH = 1.2
 """The next fit begins when there are so many times more looks than at the last: their sum costs a few fits."""
 FIT_MAX_S = 3600.0
 """Longest wait for a fit; one takes a minute or less."""
-_COMMAND = "from tvsbayes.cli import main; main()"
+
+
+@dataclass(frozen=True)
+class EstimateWish:
+    """Whether a run is fitted beside itself, and to what end.
+
+    Attributes:
+        command: `tvsbayes fit`, as a process is started.
+        target_u_deg_per_step: ends the run once the effective ratio of every direction of its plan is known so well.
+        asked: whether to fit; None: on hardware, and for a target.
+    """
+
+    command: tuple[str, ...]
+    target_u_deg_per_step: float | None = None
+    asked: bool | None = None
+
+    def holds(self, simulate: bool) -> bool:
+        """Whether a run, simulated or not, is to be fitted."""
+        return self.target_u_deg_per_step is not None or (not simulate if self.asked is None else self.asked)
 
 
 @dataclass(frozen=True)
@@ -47,25 +64,25 @@ class RunningEstimate:
 
     Args:
         folder: the campaign folder.
+        command: `tvsbayes fit`; the folder, `--no-sample --json` and a place for results are appended.
         target_u_deg_per_step: the uncertainty wanted of every direction; None wants nothing and is never met.
         directions: those that must meet it.
         wait: whether to wait for every fit: in a simulation time stands still meanwhile.
-        command: in place of `tvsbayes fit`; the campaign folder and a scratch folder are appended.
     """
 
     def __init__(
         self,
         folder: Path,
+        command: Sequence[str],
         target_u_deg_per_step: float | None,
         directions: Iterable[str],
         *,
         wait: bool = False,
-        command: Sequence[str] | None = None,
     ):
         self.folder, self.target, self.directions = Path(folder), target_u_deg_per_step, set(directions)
         self.latest: Estimate | None = None
         self._wait = wait
-        self._command = list(command) if command is not None else [sys.executable, "-c", _COMMAND, "fit"]
+        self._command = tuple(command)
         self._scratch = tempfile.TemporaryDirectory(prefix="tvsbayes-estimate-")
         self._process: subprocess.Popen[bytes] | None = None
         self._looks = 0
@@ -102,10 +119,12 @@ class RunningEstimate:
         self._looks = looks
         results = Path(self._scratch.name) / "results"
         arguments = [*self._command, str(self.folder), "--no-sample", "--json", "--out", str(results)]
-        quiet = {"stderr": subprocess.DEVNULL, "stdin": subprocess.DEVNULL}
+        nothing = subprocess.DEVNULL
         try:
             with open(Path(self._scratch.name) / "fit.json", "wb") as stream:
-                self._process = subprocess.Popen(arguments, stdout=stream, **quiet, start_new_session=True)
+                self._process = subprocess.Popen(
+                    arguments, stdout=stream, stderr=nothing, stdin=nothing, start_new_session=True
+                )
         except OSError:
             self._process = None
 

@@ -14,10 +14,11 @@ from __future__ import annotations
 import heapq
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Protocol, TypedDict
+from typing import Protocol
 
 import numpy as np
 
+from tvsbayes.acquisition.journal_events import TrueAngles
 from tvsbayes.cameras.capture import StereoImage
 from tvsbayes.instrument.axes import AXES, FULL_TURN_DEG, HOME_SD_DEG, SIDES
 from tvsbayes.instrument.rig import Rig
@@ -30,13 +31,6 @@ from tvsbayes.twin.simulated_campaign import Truth, draw_truth, placed_sheet
 _STREAMS = {"truth": 0, "stops": 1, "homes": 2, "sheets": 3, "pixels": 4}
 LATENCY_US = 300
 """One way of a request or an answer over USB; a round trip measured on a pseudo-terminal took 0.64 ms."""
-
-
-class TrueAngles(TypedDict):
-    """Mirror angles (psi, beta) at rest after a motion, and the stop errors (pan, tilt) in them, degrees."""
-
-    mirror_angles_deg: tuple[float, float]
-    stop_errors_deg: tuple[float, float]
 
 
 class VirtualClock:

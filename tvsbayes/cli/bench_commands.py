@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -14,6 +15,8 @@ from tvsbayes.files.disk import write_atomically
 from tvsbayes.pipeline import compile_for
 
 IMAGE_SIDE_MAX = 65_535
+FIT_COMMAND = (sys.executable, "-m", "tvsbayes", "fit")
+"""`tvsbayes fit` in a process of its own."""
 
 
 def stereo(
@@ -142,7 +145,9 @@ def acquire(
     from tvsbayes.instrument.rig import read_rig
 
     instrument, steps = read_rig(rig), read_plan(plan)
-    from tvsbayes.acquisition.operator import LiveLine
+    from tvsbayes.acquisition.bench import Vision
+    from tvsbayes.acquisition.operator import LiveLine, Terminal
+    from tvsbayes.acquisition.running_estimate import EstimateWish
     from tvsbayes.acquisition.session import acquire as run_plan
     from tvsbayes.acquisition.session import check_plan
     from tvsbayes.instrument.plan import outline, plan_seconds
@@ -153,15 +158,24 @@ def acquire(
         document: dict[str, Any] = {"steps": lines, "minutes": minutes}
         finish(document, "\n".join([*lines, f"{len(lines)} steps, about {minutes:.0f} min"]), as_json)
         return
-    with LiveLine() as line:
-        options: dict[str, Any] = {"simulate": simulate, "resume": resume, "laser_class": laser_class, "seed": seed}
-        options |= {"target_u_deg_per_step": target_u, "estimate": estimate}
-        if not centroids:
-            from tvsbayes.acquisition.observation import live_detector, twin_renderer
+    vision = Vision()
+    if not centroids:
+        from tvsbayes.acquisition.observation import live_detector, twin_renderer
 
-            options["detector"] = live_detector(instrument.stereo)
-            options["renderer"] = twin_renderer(instrument, seed) if simulate else None
-        outcome = run_plan(instrument, steps, out, **options, say=report_line, show=line.show, ask=line.ask)
+        vision = Vision(live_detector(instrument.stereo), twin_renderer(instrument, seed) if simulate else None)
+    with LiveLine() as line:
+        outcome = run_plan(
+            instrument,
+            steps,
+            out,
+            simulate=simulate,
+            resume=resume,
+            laser_class=laser_class,
+            seed=seed,
+            estimate=EstimateWish(FIT_COMMAND, target_u, estimate),
+            vision=vision,
+            terminal=Terminal(report_line, line.show, line.ask),
+        )
     document = {"campaign": str(out), **outcome.as_json()}
     text = f"{escaped(str(out), 200)}: {outcome.reason}, {outcome.ok} of {outcome.looks} looks count"
     if outcome.references:

@@ -162,7 +162,7 @@ def check(
     from tvsbayes.instrument.rig import read_rig
 
     if repair_to is not None:
-        from tvsbayes.acquisition.session import repair_campaign
+        from tvsbayes.acquisition.campaign_files import repair_campaign
 
         document = repair_campaign(path, repair_to)
         lines = [f"{key}: {value}" for key, value in document.items()]
@@ -187,7 +187,7 @@ def check(
     else:
         journal = None
         if (path / "log.jsonl").is_file():
-            from tvsbayes.acquisition.session import check_journal
+            from tvsbayes.acquisition.campaign_files import check_journal
 
             journal = check_journal(path)
         if journal is not None and not journal["moves"]:

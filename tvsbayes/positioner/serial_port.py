@@ -6,45 +6,14 @@ whatever name it came back. Seconds where a name says `_s`.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
-from tvsbayes.positioner.driver import Link
+from tvsbayes.errors import InputError
+from tvsbayes.positioner.driver import Link, SerialPositioner, device_settings
 
-
-class _SerialLink:
-    """pyserial as a `Link`."""
-
-    def __init__(self, port: str, baud: int):
-        import serial
-
-        # Exclusive: a second program on the line would eat our answers. A write time-out, else a stalled peer
-        # would hold us for ever.
-        # Not `serial_for_url`, whose addresses run other code and one of which writes files.
-        self._serial = serial.Serial(None, baud, timeout=0.1, write_timeout=1.0)
-        if hasattr(self._serial, "exclusive"):
-            self._serial.exclusive = True
-        self._serial.port = port
-        try:
-            self._serial.open()
-        except ValueError as error:
-            # A name or speed that the system cannot even try, such as one with a NUL.
-            raise OSError(str(error)) from error
-
-    def write(self, data: bytes) -> None:
-        self._serial.write(data)
-
-    def read(self, timeout_s: float) -> bytes:
-        self._serial.timeout = timeout_s
-        first = self._serial.read(1)
-        # A pulled plug makes in_waiting raise a bare OSError, a read SerialException, which is one.
-        return first + self._serial.read(self._serial.in_waiting) if first else b""
-
-    def close(self) -> None:
-        try:
-            self._serial.close()
-        except OSError:
-            pass
+BAUD = 115_200
+"""Of a rig file that states none; a USB device ignores it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,3 +59,52 @@ def serial_opener(port: str, baud: int) -> Callable[[], Link]:
         return _SerialLink(name, baud)
 
     return open_link
+
+
+def positioner_of(table: Mapping[str, str | int | float]) -> SerialPositioner:
+    """The positioner that `[positioner]` of a rig file names, connected.
+
+    Raises:
+        InputError: the table names no serial port.
+        DeviceFault: the port cannot be opened, or nothing of ours answers.
+    """
+    port = table.get("port")
+    if table.get("driver", "serial") != "serial" or not port:
+        remedy = 'write driver = "serial" and port = "/dev/ttyACM0" (or "COM3") into [positioner]; see tvsbayes doctor'
+        raise InputError("positioner", "[positioner] of the rig file names no serial port", remedy=remedy)
+    return SerialPositioner(serial_opener(str(port), int(table.get("baud", BAUD))), device_settings(table))
+
+
+class _SerialLink:
+    """pyserial as a `Link`."""
+
+    def __init__(self, port: str, baud: int):
+        import serial
+
+        # Exclusive: a second program on the line would eat our answers. A write time-out, else a stalled peer
+        # would hold us for ever.
+        # Not `serial_for_url`, whose addresses run other code and one of which writes files.
+        self._serial = serial.Serial(None, baud, timeout=0.1, write_timeout=1.0)
+        if hasattr(self._serial, "exclusive"):
+            self._serial.exclusive = True
+        self._serial.port = port
+        try:
+            self._serial.open()
+        except ValueError as error:
+            # A name or speed that the system cannot even try, such as one with a NUL.
+            raise OSError(str(error)) from error
+
+    def write(self, data: bytes) -> None:
+        self._serial.write(data)
+
+    def read(self, timeout_s: float) -> bytes:
+        self._serial.timeout = timeout_s
+        first = self._serial.read(1)
+        # A pulled plug makes in_waiting raise a bare OSError, a read SerialException, which is one.
+        return first + self._serial.read(self._serial.in_waiting) if first else b""
+
+    def close(self) -> None:
+        try:
+            self._serial.close()
+        except OSError:
+            pass

@@ -119,9 +119,9 @@ class Truth:
         return cls(
             parameters={name: float(value) for name, value in document["parameters"].items()},
             stereo=stated.with_vector(np.array([float(known[name]) for name in STEREO_PARAMETER_NAMES])),
-            mirror_angles_deg=_pairs(document["mirror_angles_deg"]),
-            stop_errors_deg=_pairs(document["stop_errors_deg"]),
-            home_offsets_deg=_pairs(document["home_offsets_deg"]),
+            mirror_angles_deg=pan_and_tilt(document["mirror_angles_deg"]),
+            stop_errors_deg=pan_and_tilt(document["stop_errors_deg"]),
+            home_offsets_deg=pan_and_tilt(document["home_offsets_deg"]),
             reference_pose_deg=None if pose is None else (float(pose[0]), float(pose[1])),
             note=str(document["note"]),
         )
@@ -148,6 +148,11 @@ class SimulatedCampaign:
             for key, value in self.truth.as_json().items()
         )
         write_atomically(Path(folder) / "truth.json", ("{\n" + ",\n".join(entries) + "\n}\n").encode())
+
+
+def pan_and_tilt(rows: Iterable[Sequence[float]]) -> tuple[Pair, ...]:
+    """Rows of two numbers as a `Truth` holds them."""
+    return tuple((float(pan), float(tilt)) for pan, tilt in rows)
 
 
 def read_truth(path: str | Path, stated: Stereo) -> Truth:
@@ -219,10 +224,6 @@ class _Streams:
     sheets: np.random.Generator
     pixels: np.random.Generator
     aperture: np.random.Generator
-
-
-def _pairs(rows: Iterable[Sequence[float]]) -> tuple[Pair, ...]:
-    return tuple((float(pan), float(tilt)) for pan, tilt in rows)
 
 
 def simulate(
@@ -320,9 +321,9 @@ def _drive(moves: Sequence[Move], truth: Truth, harmonic_period_deg: Mapping[str
     resting[:, 1] += p["tilt_zero_deg"]
     realised = replace(
         truth,
-        mirror_angles_deg=_pairs((resting + errors).tolist()),
-        stop_errors_deg=_pairs(errors.tolist()),
-        home_offsets_deg=_pairs(home_draws.tolist()),
+        mirror_angles_deg=pan_and_tilt((resting + errors).tolist()),
+        stop_errors_deg=pan_and_tilt(errors.tolist()),
+        home_offsets_deg=pan_and_tilt(home_draws.tolist()),
     )
     return _Driven(realised, resting)
 

@@ -1,0 +1,175 @@
+"""Everything a run needs beside its plan and its journal: the bench of a rig file, or its twin on a virtual clock.
+
+A simulated bench draws its true rig from the seed; what its cameras see comes from the twin as centroids, or, with a
+`renderer`, as pictures through a virtual MJPEG camera and the same camera code as on the bench. Its time goes on where
+the last run of its journal stood.
+"""
+
+from __future__ import annotations
+
+import datetime
+import json
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import cast
+
+from tvsbayes.acquisition.journal import LOG, read_journal
+from tvsbayes.acquisition.journal_events import Moved
+from tvsbayes.acquisition.observation import CameraObserver, Detector, Observer, TwinObserver, wait_for_detection
+from tvsbayes.acquisition.operator import Operator, SimulatedOperator
+from tvsbayes.acquisition.recorder import Recorded, recorded
+from tvsbayes.acquisition.simulated_instrument import Instrument, Renderer, reference_pose_deg
+from tvsbayes.cameras.capture import StereoImage, VirtualCamera, open_cameras
+from tvsbayes.files.disk import write_atomically
+from tvsbayes.instrument.rig import Rig
+from tvsbayes.positioner.driver import Clock, Positioner
+from tvsbayes.positioner.serial_port import positioner_of
+from tvsbayes.twin.simulated_campaign import SPOT_SD_PX, pan_and_tilt
+
+SIMULATED_START = datetime.datetime(2026, 1, 1, tzinfo=datetime.UTC)
+"""Time of day at which every simulated campaign begins: same seed, same bytes."""
+
+
+@dataclass(frozen=True)
+class Vision:
+    """How pictures come to be seen.
+
+    Attributes:
+        detector: finds spots in pictures; by default they wait as `undetected`.
+        renderer: makes the twin's pictures; without one a simulation states centroids.
+    """
+
+    detector: Detector = wait_for_detection
+    renderer: Renderer | None = None
+
+
+@dataclass(frozen=True)
+class Bench:
+    """An instrument at work.
+
+    Attributes:
+        positioner: connected.
+        observer: takes the looks.
+        operator: is asked before the laser and for every sheet.
+        clock: for settling.
+        utc: the time of day, for `time_s`.
+        details: what to write down of device and cameras at the start.
+        annotate: further entries of every motion's event (the twin's true angles).
+        conclude: called with the campaign folder once the run has ended.
+        warnings: what the user should know before it begins.
+    """
+
+    positioner: Positioner
+    observer: Observer
+    operator: Operator
+    clock: Clock
+    utc: Callable[[], datetime.datetime]
+    details: Mapping[str, object] = field(default_factory=dict)
+    annotate: Callable[[], Mapping[str, object]] = dict
+    conclude: Callable[[Path], None] = lambda folder: None
+    warnings: tuple[str, ...] = ()
+
+
+def _utc_now() -> datetime.datetime:
+    return datetime.datetime.now(datetime.UTC)
+
+
+@contextmanager
+def hardware(rig: Rig, detector: Detector, operator: Operator) -> Iterator[Bench]:
+    """Positioner and cameras of a rig file; closed in the end.
+
+    Raises:
+        InputError: the rig file names none.
+        DeviceFault: they cannot be opened or set.
+    """
+    positioner = positioner_of(rig.positioner)
+    try:
+        camera = open_cameras(rig.cameras, rig.stereo.image_width, rig.stereo.image_height)
+    except BaseException:
+        positioner.close()
+        raise
+    try:
+        settings = camera.settings()
+        details = {"device": positioner.identity, "cameras": settings.as_json()}
+        observer = CameraObserver(camera, detector)
+        yield Bench(positioner, observer, operator, time, _utc_now, details, warnings=settings.warnings)
+    finally:
+        positioner.close()
+        camera.close()
+
+
+@contextmanager
+def simulated(rig: Rig, seed: int, before: Recorded, vision: Vision) -> Iterator[Bench]:
+    """The twin on the device model; with a renderer, seen through a virtual camera.
+
+    Args:
+        rig: the declared rig.
+        seed: of everything random.
+        before: what the journal holds of earlier runs.
+        vision: how its pictures are made and seen.
+    """
+    instrument = Instrument(rig, seed, before.starts)
+    positioner, clock = instrument.positioner(), instrument.clock
+    # Virtual time goes on where the last run stood.
+    start = SIMULATED_START + datetime.timedelta(seconds=max((move.time_s for move in before.moves), default=0.0))
+
+    def bench(observer: Observer) -> Bench:
+        return Bench(
+            positioner,
+            observer,
+            SimulatedOperator(instrument),
+            clock,
+            utc=lambda: start + datetime.timedelta(seconds=clock.monotonic()),
+            details={"device": positioner.identity, "simulated": True},
+            annotate=lambda: {"twin": instrument.state_deg()},
+            conclude=lambda folder: write_truth(folder, instrument),
+        )
+
+    try:
+        if vision.renderer is None:
+            yield bench(TwinObserver(instrument, float(rig.cameras.get("spot_sd_px", SPOT_SD_PX))))
+            return
+        with VirtualCamera(_exposures(instrument, vision.renderer)) as virtual:
+            camera = open_cameras({"source": virtual.address}, rig.stereo.image_width, rig.stereo.image_height)
+            try:
+                yield bench(CameraObserver(camera, vision.detector))
+            finally:
+                camera.close()
+    finally:
+        positioner.close()
+
+
+def _exposures(instrument: Instrument, renderer: Renderer) -> Callable[[], StereoImage]:
+    """One picture after the other of what the laser does at that moment."""
+    frame = 0
+
+    def render() -> StereoImage:
+        nonlocal frame
+        frame += 1
+        return renderer(instrument.light(), instrument.motions, frame)
+
+    return render
+
+
+def write_truth(folder: Path, instrument: Instrument) -> None:
+    """Writes `truth.json`: the true rig, and the true angles of the moves that the journal holds."""
+    if not (folder / LOG).is_file():
+        return
+    reading = read_journal(folder)
+    record = recorded(reading.records)
+    # As in `recorded`: motions after a gap are no rows of moves.csv.
+    counted = [r for r in reading.records if r.line not in set(record.ignored_lines)]
+    events = [cast("Moved", r.data) for r in counted if r.event in ("homed", "moved")]
+    motions = [event["twin"] for event in events if "twin" in event]
+    seen = [motions[spot.move] for spot in record.spots if spot.status == "ok" and spot.move < len(motions)]
+    truth = replace(
+        instrument.truth,
+        mirror_angles_deg=pan_and_tilt(m["mirror_angles_deg"] for m in motions),
+        stop_errors_deg=pan_and_tilt(m["stop_errors_deg"] for m in motions),
+        reference_pose_deg=reference_pose_deg(seen),
+    )
+    text = json.dumps(truth.as_json(), indent=1, allow_nan=False) + "\n"
+    write_atomically(folder / "truth.json", text.encode())

@@ -1,0 +1,238 @@
+"""The campaign files beside a journal: derived from it at any time, kept where somebody edited them, repaired with it.
+
+`moves.csv` and `spots.csv` follow `log.jsonl` and can be derived again; `campaign.toml` and `stereo.json` are written
+once a homing is logged. A reader finds a whole campaign at any moment.
+"""
+
+from __future__ import annotations
+
+import datetime
+from pathlib import Path
+from typing import cast
+
+from tvsbayes.acquisition.journal import Journal, read_journal, require_journal
+from tvsbayes.acquisition.journal_check import repair, verify
+from tvsbayes.acquisition.journal_events import Created
+from tvsbayes.acquisition.recorder import Recorded, Recorder, recorded
+from tvsbayes.errors import InputError, TvsError
+from tvsbayes.files.csv_table import CSV_BYTES_MAX
+from tvsbayes.files.disk import read_bytes, write_atomically
+from tvsbayes.files.documents import TOML_BYTES_MAX, parse_toml
+from tvsbayes.instrument.campaign import (
+    Campaign,
+    Spot,
+    campaign_toml,
+    moves_bytes,
+    parse_header,
+    parse_moves,
+    parse_spots,
+    read_campaign,
+    spots_bytes,
+)
+from tvsbayes.instrument.rig import Rig, parse_rig_table
+from tvsbayes.instrument.stereo_pair import read_stereo, stereo_bytes
+
+DERIVED_EVERY = 100
+"""Up to this many spots the campaign files are written after every look, then ever more rarely: at least 99 % of the
+looks are in them at any time, all of them in the journal."""
+NAME_DEFAULT = "acquired campaign"
+
+
+class CampaignFiles:
+    """The files of a running acquisition.
+
+    Args:
+        journal: of the run.
+        recorder: follows it.
+        rig: the rig.
+
+    Attributes:
+        behind: why the files lack what the journal has, "" where they do not.
+    """
+
+    def __init__(self, journal: Journal, recorder: Recorder, rig: Rig):
+        self._journal, self._recorder, self._rig = journal, recorder, rig
+        self.behind = ""
+
+    def derive(self, always: bool = False) -> None:
+        """Writes them anew, unless it is no time for that yet (see `DERIVED_EVERY`)."""
+        count = len(self._recorder.spots)
+        if not always and count > DERIVED_EVERY and count % (count // DERIVED_EVERY):
+            return
+        if not self._recorder.moves:
+            return
+        try:
+            write_derived(self._campaign(), self._journal.folder, tables_only=not always)
+            self.behind = ""
+        except TvsError as error:
+            # Somebody has the table open, say. The journal has everything, and the next look tries again; after the
+            # last one --resume does.
+            self.behind = error.message
+
+    def keep_edited(self) -> list[str]:
+        """Copies files that somebody has changed since a run was interrupted; what to say about each."""
+        kept = keep_edited(self._campaign(), self._journal.folder)
+        return [f"{name} was edited since: what stood in it is kept in {copy.name}" for name, copy in kept.items()]
+
+    def _campaign(self) -> Campaign:
+        """What the journal holds so far; there has been a homing."""
+        created = cast("Created", self._journal.records[0].data)
+        start = datetime.datetime.fromisoformat(str(created["created"])).astimezone(datetime.UTC)
+        header: dict[str, object] = {"name": str(created.get("name", NAME_DEFAULT)), "created": start}
+        header |= {name: value for name, value in created.items() if name in ("synthetic", "seed")}
+        return _campaign_of(self._recorder.result(), Campaign((), (), self._rig.stereo, self._rig.table, header))
+
+
+def _campaign_of(record: Recorded, settings: Campaign) -> Campaign:
+    """The campaign of a journal with the stereo calibration, rig and header of `settings`."""
+    return Campaign(record.moves, record.spots, settings.stereo, settings.rig, settings.header)
+
+
+def write_derived(campaign: Campaign, folder: Path, tables_only: bool = False) -> None:
+    """Writes the four campaign files, or the tables that grow, so that the folder is readable at any moment.
+
+    Moves go before spots: a spot never names a move that is not there yet. Spots that `detect` has found since in
+    frames that waited keep what it found. A file that is as it should be is not written again.
+
+    Raises:
+        InputError: the folder cannot be written.
+    """
+    folder = Path(folder)
+    for name, data in _files(campaign, folder, tables_only).items():
+        if not _holds(folder / name, data):
+            write_atomically(folder / name, data)
+
+
+def _holds(path: Path, data: bytes) -> bool:
+    try:
+        return path.read_bytes() == data
+    except OSError:
+        return False
+
+
+def _files(campaign: Campaign, folder: Path, tables_only: bool = False) -> dict[str, bytes]:
+    detected = _detected(campaign, folder)
+    spots = [
+        detected[spot.spot] if spot.status == "undetected" and spot.spot in detected else spot
+        for spot in campaign.spots
+    ]
+    moves, table = moves_bytes(campaign.moves), spots_bytes(spots)
+    parse_spots(table, "spots.csv", len(parse_moves(moves)), campaign.stereo)
+    files = {"moves.csv": moves, "spots.csv": table}
+    if tables_only:
+        return files
+    return {"stereo.json": stereo_bytes(campaign.stereo), **files, "campaign.toml": campaign_toml(campaign)}
+
+
+def keep_edited(campaign: Campaign, folder: Path) -> dict[str, Path]:
+    """Copies of campaign files that hold what is not in the journal, before they are written again.
+
+    Somebody may have refused spots, written readings, or stated priors since. Tables that only lack the latest rows
+    were left so by the run itself.
+
+    Args:
+        campaign: what the journal says.
+        folder: campaign folder.
+
+    Returns:
+        The copies made, `spots.edited-1.csv` and so on, by the name of the file.
+    """
+    folder, kept = Path(folder), {}
+    for name, data in _files(campaign, folder).items():
+        path = folder / name
+        if not path.is_file():
+            continue
+        present = read_bytes(path, CSV_BYTES_MAX, folder)
+        if not set(present.splitlines()) - set(data.splitlines()):
+            continue
+        number = 1
+        while (copy := path.with_name(f"{path.stem}.edited-{number}{path.suffix}")).exists():
+            number += 1
+        write_atomically(copy, present)
+        kept[name] = copy
+    return kept
+
+
+def _detected(campaign: Campaign, folder: Path) -> dict[int, Spot]:
+    """Spots of the present spots.csv that wait in the journal and were found since."""
+    if not (folder / "spots.csv").is_file() or all(spot.status != "undetected" for spot in campaign.spots):
+        return {}
+    waiting = {spot.spot: spot for spot in campaign.spots if spot.status == "undetected"}
+    try:
+        data = read_bytes(folder / "spots.csv", CSV_BYTES_MAX, folder)
+        present = parse_spots(data, "spots.csv", len(campaign.moves), campaign.stereo)
+    except InputError:
+        return {}
+    return {
+        spot.spot: spot
+        for spot in present
+        if spot.spot in waiting and spot.move == waiting[spot.spot].move and spot.status != "undetected"
+    }
+
+
+def check_journal(folder: Path) -> dict[str, object]:
+    """Verifies the journal of a campaign folder and compares the campaign files with it.
+
+    `moves` and `looks` of the document count what the journal holds; without a move there is no campaign yet.
+
+    Raises:
+        InputError: damage, with line number.
+    """
+    checked = verify(folder)
+    reading = read_journal(folder)
+    record = recorded(reading.records)
+    warnings = checked.warnings
+    gaps = [r.line for r in reading.records if r.event == "gap"]
+    if gaps:
+        warnings.append(
+            f"a repair left gaps in lines {', '.join(map(str, gaps[:5]))}{', ...' * (len(gaps) > 5)}, and "
+            f"{len(record.ignored_lines)} events after them do not count: acquire --resume takes lost looks again"
+        )
+    for segment, deviation in record.lost:
+        warnings.append(f"segment {segment}: {deviation[0]} and {deviation[1]} steps were lost; its spots do not count")
+    if record.unverified:
+        names = ", ".join(map(str, record.unverified))
+        warnings.append(
+            f"whether steps were lost in segment {names} is not known: the run or the device was interrupted"
+        )
+    if record.moves:
+        present = read_campaign(folder)
+        behind = len(record.moves) - len(present.moves), len(record.spots) - len(present.spots)
+        if behind != (0, 0):
+            warnings.append(
+                f"moves.csv and spots.csv are {behind[0]} moves and {behind[1]} looks behind the journal: "
+                "acquire --resume writes them again"
+            )
+    else:
+        warnings.append("no homing has been logged: there is no campaign yet")
+    return {
+        "records": checked.records,
+        "frames": checked.frames,
+        "stopped": checked.stopped,
+        "warnings": warnings,
+        "moves": len(record.moves),
+        "looks": len(record.spots),
+    }
+
+
+def repair_campaign(folder: Path, to: Path) -> dict[str, object]:
+    """Copies what is whole of a journal, and writes the campaign that it holds, into a new folder.
+
+    Raises:
+        InputError: no journal, nothing whole, a folder that holds something, or campaign files that are damaged too.
+    """
+    require_journal(folder, "only folders written by `tvsbayes acquire` have a journal to repair")
+    # Rig, stereo and header stand in files of their own, written once and not touched since.
+    before = _settings_of(folder)
+    done = repair(folder, to)
+    record = recorded(read_journal(to).records)
+    if record.moves:
+        write_derived(_campaign_of(record, before), to)
+    return {**done.as_json(), "moves": len(record.moves), "looks": len(record.spots)}
+
+
+def _settings_of(folder: Path) -> Campaign:
+    """Stereo calibration, rig and header of a campaign whose tables may be damaged."""
+    keys = parse_toml(read_bytes(folder / "campaign.toml", TOML_BYTES_MAX, folder), "campaign.toml")
+    stereo = read_stereo(folder / "stereo.json", folder=folder)
+    return Campaign((), (), stereo, parse_rig_table(keys.table("rig")), parse_header(keys))

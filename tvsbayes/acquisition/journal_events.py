@@ -1,0 +1,112 @@
+"""The events of a run's journal, as their JSON objects stand in `log.jsonl`.
+
+`created` opens a journal. Every motion of the plan is an `intent` before, and an order has an event of its own once it
+is done: `homed`, `placed`, `moved`, `looked`. `verified` closes a segment, `start` and `stop` enclose a run, `gap`
+stands where a repair lost lines. Counters in motor steps, raw px, degrees and seconds by suffix; `utc` and `created`
+are ISO 8601.
+
+A checksum finds accidents, not forgery: who reads an event converts what its entries hold, and refuses what does not
+convert.
+"""
+
+from __future__ import annotations
+
+from typing import NotRequired, TypedDict
+
+Four = tuple[float, float, float, float]
+"""u_left, v_left, u_right, v_right."""
+
+
+class Created(TypedDict):
+    """The first event: whose journal it is; a plan and a rig are known by their SHA-256."""
+
+    format: str
+    created: str
+    name: NotRequired[str]
+    synthetic: NotRequired[bool]
+    seed: NotRequired[int]
+    plan_sha256: NotRequired[str]
+    rig_sha256: NotRequired[str]
+    repaired: NotRequired[bool]
+
+
+class Placed(TypedDict):
+    """The sheet stands at a target; `again` where the plan did not ask for it."""
+
+    step: int | None
+    target: str
+    again: NotRequired[bool]
+    utc: str
+
+
+class Moved(TypedDict):
+    """A motion has ended at these counters, since the campaign was created `time_s` ago.
+
+    `step` is that of the plan, None for motions of a resumed run; `twin` is what a simulation knows of the mirrors.
+    """
+
+    step: int | None
+    time_s: float
+    pan_steps: int
+    tilt_steps: int
+    reference: NotRequired[bool]
+    twin: NotRequired[TrueAngles]
+
+
+class Homed(Moved):
+    """A homing and the way to its counters: boot id of the device, the side of arrival of pan and tilt."""
+
+    boot: int
+    approach: list[str]
+
+
+class TrueAngles(TypedDict):
+    """Mirror angles (psi, beta) of a simulated rig at rest, and the stop errors (pan, tilt) in them, degrees."""
+
+    mirror_angles_deg: tuple[float, float]
+    stop_errors_deg: tuple[float, float]
+
+
+class Verified(TypedDict):
+    """What a homing found of the segment before: (pan, tilt) switches minus counters; None where it cannot tell."""
+
+    segment: int
+    deviation_steps: list[int] | None
+
+
+class Frame(TypedDict):
+    """A stored picture: name relative to the folder, SHA-256 and size of the file."""
+
+    name: str
+    sha256: str
+    bytes: int
+
+
+class Looked(TypedDict):
+    """A look and what a detector found in it.
+
+    `reference_of` names the spot that a look of a resumed run compares itself with, `shift_px` the largest change.
+    """
+
+    step: int | None
+    spot: int
+    target: str
+    experiment: int | None
+    point: int | None
+    status: str
+    pixels_px: Four | None
+    sds_px: Four | None
+    correlations: NotRequired[tuple[float, float]]
+    frames: list[Frame]
+    time_s: float
+    aperture_deg: NotRequired[float | None]
+    reference_of: NotRequired[int]
+    shift_px: NotRequired[float | None]
+
+
+class Stop(TypedDict):
+    """The end of a run."""
+
+    reason: str
+    exit_code: int
+    utc: str

@@ -1,0 +1,156 @@
+"""What a run writes down: the journal, the campaign that follows from it, its files, and how the run ended.
+
+Seconds where a name says `_s`, since the campaign was created; UTC for people.
+"""
+
+from __future__ import annotations
+
+import datetime
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from tvsbayes.acquisition.campaign_files import CampaignFiles
+from tvsbayes.acquisition.journal import FRAME_NAME, Journal
+from tvsbayes.acquisition.journal_check import orphans
+from tvsbayes.acquisition.recorder import HOME_TOLERANCE_STEPS, Recorder
+from tvsbayes.errors import DeviceFault
+from tvsbayes.instrument.rig import Rig
+from tvsbayes.positioner.driver import HomeReport
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How a run ended.
+
+    Attributes:
+        reason: "done", "target met", "interrupted" or "declined".
+        looks: looks of this campaign, of all its runs.
+        ok: how many of them count.
+        refused: how many found no usable spot.
+        references: how many of `looks` are none of the plan's: resumed runs look again at spots seen before. They
+            count as any other.
+        retries: looks repeated in this run.
+        lost_segments: segments in which steps were lost.
+        warnings: what the user should know.
+    """
+
+    reason: str
+    looks: int
+    ok: int
+    refused: int
+    references: int
+    retries: int
+    lost_segments: tuple[int, ...]
+    warnings: tuple[str, ...]
+
+    def as_json(self) -> dict[str, object]:
+        """The document of `tvsbayes acquire`."""
+        return {
+            "reason": self.reason,
+            "looks": self.looks,
+            "ok": self.ok,
+            "refused": self.refused,
+            "references": self.references,
+            "retries": self.retries,
+            "lost_segments": list(self.lost_segments),
+            "warnings": list(self.warnings),
+        }
+
+
+class RunLog:
+    """Journal, recorder and campaign files in step.
+
+    Args:
+        journal: from `begin`; closed by `end`.
+        rig: the rig.
+        utc: the time of day.
+
+    Attributes:
+        recorder: the campaign so far, of all runs.
+        files: the campaign files.
+        warnings: what the user should know.
+    """
+
+    def __init__(self, journal: Journal, rig: Rig, utc: Callable[[], datetime.datetime]):
+        self._journal, self._utc = journal, utc
+        self.recorder = Recorder()
+        for record in journal.records:
+            self.recorder.add(record)
+        self.files = CampaignFiles(journal, self.recorder, rig)
+        self.warnings: list[str] = []
+        self._time_s = max((move.time_s for move in self.recorder.moves), default=0.0)
+
+    @property
+    def ok_looks(self) -> int:
+        """How many looks count, as far as is known."""
+        return sum(spot.status == "ok" for spot in self.recorder.spots)
+
+    def write(self, event: str, **data: object) -> None:
+        """Appends an event; after a homing the campaign files are written anew.
+
+        Raises:
+            DeviceFault: the disk refuses.
+        """
+        self.recorder.add(self._journal.append(event, **data))
+        if event in ("homed", "verified"):
+            self.files.derive(always=True)
+
+    def now_s(self) -> float:
+        """Seconds since the campaign was created, never going back, whatever the clock of the computer does."""
+        start = datetime.datetime.fromisoformat(str(self._journal.records[0].data.get("created")))
+        self._time_s = max(self._time_s, round((self._utc() - start).total_seconds(), 3))
+        return self._time_s
+
+    def utc_text(self) -> str:
+        """The time of day."""
+        return self._utc().isoformat(timespec="milliseconds")
+
+    def next_spot(self) -> int:
+        """The first number that neither an event nor a frame of an interrupted look has."""
+        used = [spot.spot for spot in self.recorder.spots]
+        names = orphans(self._journal.folder, tuple(self._journal.records))
+        # Other pictures, which somebody has put there, have no number.
+        used += [int(name.split("/")[1][:6]) for name in names if FRAME_NAME.fullmatch(name)]
+        return max(used, default=-1) + 1
+
+    def close_segment(self, report: HomeReport) -> None:
+        """Writes down what a homing says about the segment that it ends."""
+        if not self.recorder.moves:
+            return
+        known = report.known or (report.compared and report.state.boot == self.recorder.state.boot)
+        segment, deviation = self.recorder.moves[-1].segment, list(report.deviation_steps) if known else None
+        self.write("verified", segment=segment, deviation_steps=deviation)
+        if deviation is not None and max(map(abs, deviation)) > HOME_TOLERANCE_STEPS:
+            self.warnings.append(
+                f"segment {segment}: the home switches were found {deviation[0]} and {deviation[1]} steps off: steps "
+                "were lost, its spots do not count; lower the speed or free the mechanism"
+            )
+
+    def end(self, reason: str, exit_code: int) -> None:
+        """Writes down how it ended, as well as the disk allows, and closes the journal."""
+        try:
+            self.write("stop", reason=reason, exit_code=exit_code, utc=self.utc_text())
+        except DeviceFault:
+            # A broken disk was the reason, and is on its way to the user already.
+            pass
+        finally:
+            self._journal.close()
+        self.files.derive(always=True)
+        if self.files.behind:
+            self.warnings.append(f"the campaign files are behind the journal: {self.files.behind}")
+
+    def outcome(self, reason: str, retries: int) -> Outcome:
+        """How the run ended, for this reason and after so many repeated looks."""
+        done = self.recorder.result()
+        ok = sum(spot.status == "ok" for spot in done.spots)
+        waiting = sum(spot.status == "undetected" for spot in done.spots)
+        return Outcome(
+            reason=reason,
+            looks=len(done.spots),
+            ok=ok,
+            refused=len(done.spots) - ok - waiting,
+            references=done.references,
+            retries=retries,
+            lost_segments=tuple(segment for segment, _ in done.lost),
+            warnings=tuple(self.warnings),
+        )
