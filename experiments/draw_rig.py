@@ -13,7 +13,7 @@ from pathlib import Path
 import matplotlib
 import numpy as np
 
-from tvsbayes.instrument.parameters import DEFAULT_PRIORS
+from tvsbayes.instrument.parameters import RIG_PRIORS
 from tvsbayes.instrument.stereo_pair import rotation_matrix
 from tvsbayes.twin.physics import mirror_chain, to_tvs
 
@@ -32,7 +32,7 @@ T_SP_ROTATION_RAD = np.array([0.0, 0.0, 0.25])
 T_SP_MM = np.array([0.0, -200.0, 0.0])
 """Pose of the drawing: farther to the right of the cameras than in the shipped rigs, whose glyphs would overlap."""
 PAN_DEG = 11.0
-GEOMETRY = {name: prior.value for name, prior in DEFAULT_PRIORS.items()}
+GEOMETRY = {name: prior.value for name, prior in RIG_PRIORS.items()}
 """Nominal mirrors: L 30 mm, no misalignment."""
 
 

@@ -30,7 +30,7 @@ from pathlib import Path
 import numpy as np
 from coverage import read_rows
 from scipy import stats
-from studies import coordinates, dense_plan, mounted_rig, physical_of, run_rows, small_plan
+from studies import dense_plan, mounted_rig, physical_of, run_rows, small_plan
 
 OUTPUT = Path(__file__).parent / "output"
 ROWS = OUTPUT / "sbc.jsonl"
@@ -109,7 +109,7 @@ def ranks(simulated, result, z: np.ndarray) -> dict[str, int]:
     from tvsbayes.estimators.campaign_arrays import campaign_arrays
     from tvsbayes.estimators.likelihood import evaluate
     from tvsbayes.instrument.parameters import NAMES
-    from tvsbayes.model.parameter_space import parameter_space
+    from tvsbayes.model.parameter_space import coordinates_of, parameter_space
     from tvsbayes.posterior.draws import derived_at
     from tvsbayes.posterior.transport import in_batches
     from tvsbayes.twin.physics import effective_deg_per_step, effective_mirror_offset_mm
@@ -122,7 +122,7 @@ def ranks(simulated, result, z: np.ndarray) -> dict[str, int]:
         true = physical_of(truth)
         space = parameter_space(simulated.campaign.rig, simulated.campaign.stereo)
         arrays = campaign_arrays(simulated.campaign)
-        both = coordinates(space, np.vstack([true, physical]))
+        both = coordinates_of(space, np.vstack([true, physical]))
         log_posterior = in_batches(lambda block: evaluate(block, space, arrays).log_density, both)
     log_likelihood = log_posterior + 0.5 * np.sum(both**2, axis=1)
     values = {"log-likelihood": log_likelihood, "log-posterior": log_posterior}

@@ -12,6 +12,7 @@ import numpy as np
 from coverage import SINGLE_THREADED, read_rows
 
 from tvsbayes.estimators.joint_fit import Problem, fit, fit_at
+from tvsbayes.model.parameter_space import coordinates_of
 from tvsbayes.statistics.least_squares import newton_mode
 
 PAN_SWEEP = (0, 70, 140, 200, 140, 70)
@@ -117,31 +118,6 @@ def physical_of(truth) -> np.ndarray:
     return np.array([*(truth.parameters[name] for name in RIG_NAMES), *truth.stereo.vector])
 
 
-def coordinates(space, physical: np.ndarray) -> np.ndarray:
-    """Prior coordinates z (n, 65) of physical values (n, 65): the inverse of the priors, by scipy's distributions.
-
-    Fixed parameters get 0, directions in which the cameras' covariance is singular too.
-    """
-    from scipy import stats
-
-    from tvsbayes.instrument.parameters import KINDS, RIG_NAMES
-
-    z = np.zeros_like(physical)
-    for i, (value, u, kind) in enumerate(zip(space.value, space.u, space.kind, strict=True)):
-        if u == 0:
-            continue
-        x = physical[:, i]
-        if KINDS[int(kind)] == "half-normal":
-            z[:, i] = stats.norm.isf(stats.halfnorm.sf(x, scale=u))
-        elif KINDS[int(kind)] == "log-normal":
-            z[:, i] = np.log(x / value) / u
-        else:
-            z[:, i] = (x - value) / u
-    cameras = slice(len(RIG_NAMES), None)
-    z[:, cameras] = (physical[:, cameras] - np.asarray(space.stereo_mean)) @ np.linalg.pinv(space.stereo_root).T
-    return z
-
-
 def fit_from_truth(campaign, truth):
     """`joint.fit` without its search: Newton steps from the true rig to the mode, a third of the time.
 
@@ -152,7 +128,7 @@ def fit_from_truth(campaign, truth):
 
     with jax.enable_x64(True):
         problem = Problem(campaign, campaign.rig)
-        z = np.where(problem.free, np.clip(coordinates(problem.space, physical_of(truth)[None])[0], -4.0, 4.0), 0.0)
+        z = np.where(problem.free, np.clip(coordinates_of(problem.space, physical_of(truth)), -4.0, 4.0), 0.0)
         mode = newton_mode(problem.objective, z, problem.free, problem.curvature(z))
         if not mode.problems:
             return fit_at(campaign, problem, mode, 0)

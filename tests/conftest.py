@@ -150,25 +150,11 @@ def dozen_campaign(rig: Rig) -> SimulatedCampaign:
 
 
 def coordinates(space: Any, truth: Truth) -> np.ndarray:
-    """Coordinates z of a true rig: the inverse of `ParameterSpace.physical`, by scipy's distributions."""
-    from scipy.stats import halfnorm, norm
+    """Coordinates z of a true rig."""
+    from tvsbayes.instrument.parameters import RIG_NAMES
+    from tvsbayes.model.parameter_space import coordinates_of
 
-    from tvsbayes.instrument.parameters import KINDS, RIG_NAMES
-
-    z = []
-    for name, value, u, kind in zip(RIG_NAMES, space.value, space.u, space.kind, strict=True):
-        if u == 0:
-            z.append(0.0)
-            continue
-        true = truth.parameters[name]
-        if KINDS[int(kind)] == "half-normal":
-            z.append(norm.isf(halfnorm.sf(true, scale=u)))
-        elif KINDS[int(kind)] == "log-normal":
-            z.append(np.log(true / value) / u)
-        else:
-            z.append((true - value) / u)
-    stereo = np.linalg.pinv(np.asarray(space.stereo_root)) @ (truth.stereo.vector - np.asarray(space.stereo_mean))
-    return np.concatenate([z, stereo])
+    return coordinates_of(space, np.array([*(truth.parameters[name] for name in RIG_NAMES), *truth.stereo.vector]))
 
 
 @pytest.fixture(scope="session")

@@ -13,7 +13,7 @@ from tvsbayes.estimators.four_point import classic
 from tvsbayes.estimators.joint_fit import fit
 from tvsbayes.instrument.campaign import Campaign
 from tvsbayes.instrument.model_choice import ModelChoice
-from tvsbayes.instrument.parameters import HARMONIC_PRIORS, INDEX, NAMES, RECEIVER_NAMES, Prior
+from tvsbayes.instrument.parameters import HARMONIC_NAMES, INDEX, NAMES, RECEIVER_NAMES, Prior
 from tvsbayes.instrument.protocols import four_point_protocol, paper_protocol
 from tvsbayes.report.fit_text import fit_text
 from tvsbayes.results.estimates import CONTRACTION_LIMIT, FitSummary
@@ -37,7 +37,7 @@ def summary(fitted) -> FitSummary:
 
 
 def test_every_parameter_of_the_contract_is_there_and_only_those(summary):
-    expected = set(NAMES) - set(RECEIVER_NAMES) - set(HARMONIC_PRIORS)
+    expected = set(NAMES) - set(RECEIVER_NAMES) - set(HARMONIC_NAMES)
     expected |= {f"degrees_per_step.{d}" for d in ("left", "right", "up", "down")} | {"effective_mirror_offset_mm"}
     assert set(summary.parameters) == expected
 
@@ -183,7 +183,7 @@ def test_harmonics_are_listed_where_they_are_free_or_known(paper):
     )
     stated = replace(paper, rig=replace(table, priors={**table.priors, "harmonic_deg.pan.1.sin": Prior(0.0, 0.05)}))
     parameters = summarise(fit(stated)).parameters
-    listed = {name: parameters[name] for name in HARMONIC_PRIORS if name in parameters}
+    listed = {name: parameters[name] for name in HARMONIC_NAMES if name in parameters}
     assert set(listed) == {"harmonic_deg.pan.1.sin", "harmonic_deg.tilt.1.cos"}
     assert listed["harmonic_deg.tilt.1.cos"].value == pytest.approx(0.05)
     assert listed["harmonic_deg.tilt.1.cos"].contraction is None

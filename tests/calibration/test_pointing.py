@@ -47,7 +47,7 @@ from tvsbayes.coordinates.beam_meeting import carry, meeting, sources
 from tvsbayes.coordinates.location import locate, locate_linear, settings_of
 from tvsbayes.errors import InputError
 from tvsbayes.instrument.campaign import input_hashes
-from tvsbayes.instrument.parameters import HARMONIC_PRIORS, Prior
+from tvsbayes.instrument.parameters import HARMONIC_NAMES, Prior
 from tvsbayes.statistics.intervals import NORMAL_95
 from tvsbayes.twin import physics
 from tvsbayes.twin.physics import to_tvs
@@ -738,7 +738,7 @@ def test_the_c_header_states_its_error_and_overshoot(bent):
     assert f"at 1 m {max(error.u95_at_1_m_mm):.2f} mm" in text
     assert f"#define TVS_OVERSHOOT_PAN_STEPS {bent.overshoot_steps['pan']}\n" in text
     assert "@" not in text
-    for name in (*INPUT_NAMES, *HARMONIC_PRIORS):
+    for name in (*INPUT_NAMES, *HARMONIC_NAMES):
         assert f"#define TVS_{name.replace('.', '_').upper()} " in text
 
 

@@ -21,7 +21,7 @@ from tvsbayes.errors import InputError
 from tvsbayes.estimators.four_point import ClassicResult, DirectionResult
 from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.estimators.linear_spots import StopGroup, StopInformation
-from tvsbayes.instrument.parameters import HARMONIC_PRIORS, INDEX, NAMES, RIG_NAMES, RIG_PRIORS, Prior
+from tvsbayes.instrument.parameters import HARMONIC_NAMES, INDEX, NAMES, RIG_NAMES, RIG_PRIORS, Prior
 from tvsbayes.metrology.look_budget import APERTURE_HERE, PLAY_HERE, STOP_HERE, budget
 from tvsbayes.model.parameter_space import parameter_space
 from tvsbayes.twin.physics import aperture_angle_deg
@@ -46,7 +46,7 @@ def linear_problem(stereo: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
     mix = rng.normal(size=(len(RIG_NAMES), len(NAMES) - len(RIG_NAMES)))
     jacobian[:, len(RIG_NAMES) :] = 0.02 * stereo * jacobian[:, : len(RIG_NAMES)] @ mix
     # Fixed in the rig, which has no transmission error.
-    jacobian[:, [INDEX[name] for name in HARMONIC_PRIORS]] = 0.0
+    jacobian[:, [INDEX[name] for name in HARMONIC_NAMES]] = 0.0
     load = np.zeros((ROWS, STATES))
     for state in range(STATES):
         load[13 * state : 13 * state + 20, state] = 2.0 * rng.normal(size=len(load[13 * state : 13 * state + 20]))

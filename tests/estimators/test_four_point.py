@@ -22,7 +22,7 @@ from tvsbayes.estimators.four_point import (
     stereo_variance,
 )
 from tvsbayes.instrument.campaign import Campaign, Move, Spot
-from tvsbayes.instrument.parameters import DECLARED_PRIORS, DEFAULT_PRIORS, Prior
+from tvsbayes.instrument.parameters import RIG_PRIORS, Prior
 from tvsbayes.instrument.rig import RigTable
 from tvsbayes.instrument.stereo_pair import Stereo, distort, rotation_matrix, triangulate, undistort
 from tvsbayes.twin.physics import project
@@ -91,7 +91,7 @@ def make_campaign(
         for point, row in enumerate(pixels, 1):
             move, target = start + (point > 2), "d1" if point in (1, 4) else "d2"
             spots.append(Spot(len(spots), move, target, number, point, *map(float, row), *(0.08,) * 4))
-    priors = {**DEFAULT_PRIORS, **DECLARED_PRIORS, "focal_scale": Prior(1.0, focal_u)}
+    priors = {**RIG_PRIORS, "focal_scale": Prior(1.0, focal_u)}
     return Campaign(tuple(moves), tuple(spots), stereo, RigTable(priors))
 
 

@@ -17,7 +17,7 @@ from tvsbayes.estimators.joint_fit import fit
 from tvsbayes.files.disk import shipped_data
 from tvsbayes.instrument.campaign import Campaign, ordered_spots
 from tvsbayes.instrument.model_choice import ModelChoice
-from tvsbayes.instrument.parameters import HARMONIC_PRIORS, INDEX, NAMES, Prior
+from tvsbayes.instrument.parameters import HARMONIC_NAMES, INDEX, NAMES, Prior
 from tvsbayes.instrument.protocols import four_point_protocol, grid_protocol
 from tvsbayes.instrument.rig import read_rig
 from tvsbayes.statistics.least_squares import laplace_draws
@@ -181,7 +181,7 @@ def test_a_pinions_error_is_found_and_without_it_the_stops_scatter(simulated, fi
     with compiling_nothing(caplog):
         plain, freed = fit(wobbling.campaign), fit(wobbling.campaign, model=ModelChoice(harmonics=True))
     assert plain.converged and freed.converged, (plain.problems, freed.problems)
-    for name in HARMONIC_PRIORS:
+    for name in HARMONIC_NAMES:
         index = INDEX[name]
         assert freed.free[index] == (".pan." in name) and not plain.free[index], name
         error = freed.mode.physical[index] - PAN_ERROR_DEG.get(name, 0.0)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from tvsbayes.instrument.model_choice import HARMONIC_SD_DEG, ModelChoice
-from tvsbayes.instrument.parameters import HARMONIC_PRIORS, Prior
+from tvsbayes.instrument.parameters import HARMONIC_NAMES, Prior
 from tvsbayes.instrument.rig import RigTable
 
 
@@ -13,7 +13,7 @@ def test_the_choice_of_a_model_keeps_what_the_rig_states():
     assert ModelChoice().table(table) == table
     chosen = ModelChoice(harmonics=True).table(table)
     asked = {"harmonic_deg.pan.1.cos", "harmonic_deg.pan.1.sin"}
-    assert {n for n in HARMONIC_PRIORS if chosen.priors[n] == Prior(0.0, HARMONIC_SD_DEG)} == asked
+    assert {n for n in HARMONIC_NAMES if chosen.priors[n] == Prior(0.0, HARMONIC_SD_DEG)} == asked
     assert all(chosen.priors[name] == prior for name, prior in stated.items())
     assert all(p == Prior(0.0, 0.0) for n, p in chosen.priors.items() if n.startswith("harmonic_deg.tilt"))
     bare = ModelChoice(no_backlash=True, per_axis=True).table(table).priors

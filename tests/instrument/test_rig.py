@@ -14,9 +14,7 @@ from support.small_campaign import small_stereo
 from tvsbayes.errors import InputError
 from tvsbayes.files.documents import parse_toml
 from tvsbayes.instrument.parameters import (
-    DECLARED_PRIORS,
-    DEFAULT_PRIORS,
-    HARMONIC_PRIORS,
+    HARMONIC_NAMES,
     RIG_PRIORS,
     STEREO_PARAMETER_NAMES,
     Prior,
@@ -207,12 +205,13 @@ def test_one_camera_of_both_pictures_may_be_a_number(tmp_path):
 def test_rig_table_round_trip():
     priors = {
         name: Prior(p.value if p.distribution == "half-normal" else p.value * 1.1 + 0.001, p.u / 3, p.distribution)
-        for name, p in {**DEFAULT_PRIORS, **DECLARED_PRIORS}.items()
+        for name, p in RIG_PRIORS.items()
+        if name not in HARMONIC_NAMES
     }
     table = RigTable(priors, "azimuth")
     assert rig_table(rig_table_toml(table)) == table
     assert "harmonic" not in rig_table_toml(table), "a table without a period has nothing to say of them"
-    stated = {name: Prior(0.01 * i, 0.02) for i, name in enumerate(HARMONIC_PRIORS)}
+    stated = {name: Prior(0.01 * i, 0.02) for i, name in enumerate(HARMONIC_NAMES)}
     for periods in ({"pan": 22.5}, {"tilt": 360.0}, {"pan": 360.0, "tilt": 1.25}):
         own = {name: prior for name, prior in stated.items() if name.split(".")[1] in periods}
         table = RigTable({**priors, **own}, "azimuth", periods)
@@ -399,7 +398,7 @@ def test_rig_file(tmp_path):
     assert rig.table.priors["baseline_mm"] == Prior(199.0, 0.2)
     assert rig.truth["mirror_offset_mm"] == Prior(31.0, 1.0)  # absent from [truth]: the prior
     assert rig.truth["backlash_deg.pan"] == Prior(0.0, 0.3, "half-normal")
-    assert rig.table.priors["backlash_deg.pan"] == DEFAULT_PRIORS["backlash_deg.pan"]
+    assert rig.table.priors["backlash_deg.pan"] == RIG_PRIORS["backlash_deg.pan"]
     assert rig.truth["focal_scale"] == Prior(1.002, 0.0)
     assert set(rig.truth) == set(RIG_PRIORS)
     assert rig.sheets_mm == {"d1": 175.0, "far wall": 1000.5}

@@ -23,7 +23,6 @@ from tvsbayes.calibration.optics import beam_deg_per_step
 from tvsbayes.calibration.pointing import INPUT_NAMES, NOISE_NAMES, Calibration
 from tvsbayes.estimators.linear_spots import Linearised
 from tvsbayes.instrument.campaign import Move, Spot
-from tvsbayes.instrument.parameters import unit_of
 from tvsbayes.instrument.rig import RigTable
 from tvsbayes.metrology.budget_tables import CORRELATIONS, Source, budget_table
 from tvsbayes.metrology.iso230 import FIGURES, figures_of
@@ -482,20 +481,6 @@ def test_known_inputs_give_the_normal_factor():
     assert table.coverage_factor == pytest.approx(1.959964, abs=1e-6)
     with pytest.raises(ValueError, match="positive"):
         budget_table("y", "mm", 0.0, 0.0, [])
-
-
-def test_units_of_contract_names():
-    units = {
-        "effective_deg_per_step.left": "deg/step",
-        "degrees_per_step.pan": "deg/step",
-        "ratio_contrast_deg_per_step.tilt": "deg/step",
-        "backlash_deg.pan": "deg",
-        "mirror_offset_mm": "mm",
-        "extrinsics.rotation_rad.x": "rad",
-        "extrinsics.translation_mm.z": "mm",
-        "focal_scale": "1",
-    }
-    assert {name: unit_of(name) for name in units} == units
 
 
 @pytest.fixture(scope="module")

@@ -25,6 +25,7 @@ from tvsbayes.instrument.plan import HOME_APPROACH, PlanStep, described, read_pl
 from tvsbayes.instrument.protocols import four_point_protocol, grid_protocol, paper_protocol
 from tvsbayes.instrument.rig import Rig
 from tvsbayes.model.headlines import QUANTITIES, physical_at
+from tvsbayes.model.parameter_space import STOP_COLUMNS
 from tvsbayes.planning import forecast, planner, search
 from tvsbayes.planning.candidates import (
     CONTRAST_COLUMNS,
@@ -47,7 +48,6 @@ from tvsbayes.planning.expectation import (
 )
 from tvsbayes.planning.forecast import (
     PIXEL_COLUMN,
-    STOP_COLUMNS,
     Assurance,
     DrawnTruth,
     Family,

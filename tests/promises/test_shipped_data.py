@@ -15,7 +15,7 @@ from tvsbayes.errors import InputError
 from tvsbayes.estimators.four_point import classic, ratio_deg_per_step
 from tvsbayes.files.disk import shipped_data
 from tvsbayes.instrument.campaign import Campaign, read_campaign
-from tvsbayes.instrument.parameters import DEFAULT_PRIORS
+from tvsbayes.instrument.parameters import REGISTRY, RIG_PRIORS
 from tvsbayes.instrument.plan import read_plan
 from tvsbayes.instrument.protocols import PROTOCOLS
 from tvsbayes.instrument.rig import Rig, RigTable, read_rig
@@ -160,7 +160,9 @@ def test_mounted_and_nominal_rig():
     rig, nominal = mounted(), read_rig(DATA / "rigs" / "nominal" / "rig.toml")
     assert nominal.table == RigTable()
     assert np.array_equal(nominal.stereo.parameter_covariance, rig.stereo.parameter_covariance)
-    for name, default in DEFAULT_PRIORS.items():
+    for name, default in RIG_PRIORS.items():
+        if REGISTRY[name].place != "rig.prior":
+            continue
         prior = rig.table.priors[name]
         if name.startswith("extrinsics."):
             assert prior.u == (0.03 if "rotation" in name else 5.0)

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from tvsbayes.estimators.likelihood import aperture_angle
-from tvsbayes.instrument.parameters import HARMONIC_PRIORS, NAMES, RIG_NAMES, Prior
+from tvsbayes.instrument.parameters import HARMONIC_NAMES, NAMES, RIG_NAMES, Prior
 from tvsbayes.model.geometry import project
 from tvsbayes.model.headlines import derived_quantities
 from tvsbayes.model.laser_path import MoveArrays, beam, beam_angles, mirror_angles
@@ -44,7 +44,7 @@ ANGLE_RAD = LENGTH_MM / 1000.0
 @pytest.fixture(scope="module")
 def truths(mounted_rig):
     rng = np.random.default_rng(77)
-    wobbling = replace(mounted_rig, truth={**mounted_rig.truth, **dict.fromkeys(HARMONIC_PRIORS, Prior(0.0, 0.1))})
+    wobbling = replace(mounted_rig, truth={**mounted_rig.truth, **dict.fromkeys(HARMONIC_NAMES, Prior(0.0, 0.1))})
     return [draw_truth(wobbling, rng) for _ in range(RIGS)]
 
 

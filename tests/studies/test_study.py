@@ -19,7 +19,7 @@ from tvsbayes.planning.target import parse_target
 from tvsbayes.report.command_text import study_text
 from tvsbayes.studies.executors import DaskExecutor, ProcessExecutor, executor
 from tvsbayes.studies.study import StudyRows, study, study_result
-from tvsbayes.studies.study_job import StudyJob, half_normal_sd
+from tvsbayes.studies.study_job import StudyJob
 
 TARGET = parse_target("u(worst) <= 1e-3 deg/step")
 
@@ -163,17 +163,6 @@ def test_failures_count_against_the_assurance(job):
     assert result.problems == ("campaign 4: did not settle",)
     with pytest.raises(NotConverged, match="did not settle"):
         study_result(job, [failed])
-
-
-def test_the_spread_of_a_half_normal_is_that_of_its_draws():
-    """Against draws: 40000 know an sd to 0.4 %, three times that is asked; far from zero the slope is enough."""
-    from scipy import special
-
-    draws = np.random.default_rng(5).standard_normal(40_000)
-    for mean, sd in ((-2.0, 1.0), (0.0, 0.5), (1.0, 0.1)):
-        values = -special.ndtri(0.5 * special.ndtr(-(mean + sd * draws)))
-        assert half_normal_sd(mean, sd) == pytest.approx(values.std(), rel=0.012)
-    assert half_normal_sd(6.0, 0.01) == pytest.approx(0.01, rel=0.02)
 
 
 def test_unknown_engines_are_refused(job):

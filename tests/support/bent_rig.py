@@ -10,7 +10,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from tvsbayes.calibration.pointing import INPUT_NAMES, NOISE_NAMES, Calibration
-from tvsbayes.instrument.parameters import HARMONIC_PRIORS
+from tvsbayes.instrument.parameters import HARMONIC_NAMES
 from tvsbayes.twin.physics import aperture_angle_deg, harmonics_deg, mirror_chain, to_tvs, transmission
 
 BENT: dict[str, float] = {
@@ -18,7 +18,7 @@ BENT: dict[str, float] = {
     "degrees_per_step.tilt": 0.0704,
     "backlash_deg.pan": 0.51,
     "backlash_deg.tilt": 0.23,
-    **dict.fromkeys(HARMONIC_PRIORS, 0.0),
+    **dict.fromkeys(HARMONIC_NAMES, 0.0),
     "tilt_zero_deg": -0.8,
     "mirror_offset_mm": 28.5,
     "mirror1_error_deg": 0.4,

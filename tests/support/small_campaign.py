@@ -7,7 +7,7 @@ import datetime
 import numpy as np
 
 from tvsbayes.instrument.campaign import Campaign, Move, Spot
-from tvsbayes.instrument.parameters import DECLARED_PRIORS, DEFAULT_PRIORS, Prior
+from tvsbayes.instrument.parameters import RIG_PRIORS, Prior
 from tvsbayes.instrument.rig import RigTable
 from tvsbayes.instrument.stereo_pair import Stereo, rotation_matrix
 
@@ -61,7 +61,7 @@ def small_campaign() -> Campaign:
     spots[6] = Spot(22, 4, "d1", None, None, *[None] * 8, status="undetected", ruv_right=-0.5)
     refused = {f: getattr(last, f) for f in Spot.__slots__} | {"status": "saturated, 41 px", "v_left_px": 1e4}
     spots[7] = Spot(**refused)
-    priors = {**DEFAULT_PRIORS, **DECLARED_PRIORS}
+    priors = dict(RIG_PRIORS)
     priors["mirror_offset_mm"] = Prior(31.0, 2.0)
     priors["stop_sd_deg.up"] = Prior(0.05, 0.0, "log-normal")
     priors["focal_scale"] = Prior(1.001, 0.001)

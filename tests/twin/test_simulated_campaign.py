@@ -16,9 +16,8 @@ import pytest
 from tvsbayes.errors import InputError
 from tvsbayes.instrument.axes import DIRECTION_SIGNS, HOME_SD_DEG
 from tvsbayes.instrument.parameters import (
-    DECLARED_PRIORS,
-    DEFAULT_PRIORS,
-    HARMONIC_PRIORS,
+    HARMONIC_NAMES,
+    RIG_PRIORS,
     STEREO_PARAMETER_NAMES,
     Prior,
 )
@@ -40,7 +39,7 @@ from tvsbayes.twin.physics import (
 )
 from tvsbayes.twin.simulated_campaign import Truth, draw_truth, simulate
 
-NOMINAL = {name: prior.value for name, prior in (DEFAULT_PRIORS | DECLARED_PRIORS).items()}
+NOMINAL = {name: prior.value for name, prior in RIG_PRIORS.items()}
 VECTOR = NOMINAL | {
     "mirror_offset_mm": 30.0,
     "mirror1_error_deg": 0.3,
@@ -70,7 +69,7 @@ def make_rig(truth_u: float | None = None) -> Rig:
         parameter_covariance=np.diag([1.0, 1.0, *[0.25] * 2, *[1e-6] * 5] * 2 + [1e-8] * 3 + [0.0] * 3),
         rms_px=0.2,
     )
-    priors = {**DEFAULT_PRIORS, **DECLARED_PRIORS}
+    priors = dict(RIG_PRIORS)
     for axis in "xyz":
         priors[f"extrinsics.rotation_rad.{axis}"] = Prior(0.0, 0.02)
         priors[f"extrinsics.translation_mm.{axis}"] = Prior(-20.0 if axis == "y" else 0.0, 5.0)
@@ -328,7 +327,7 @@ def test_same_seed_same_campaign_other_seed_another():
 def test_transmission_error_leaves_every_other_draw_as_it_was():
     """The same rig, stop errors, sheets and noise, whose mirrors stand off by the error of the wheel."""
     rig, plan = make_rig(), small_plan()
-    names = [name for name in HARMONIC_PRIORS if ".tilt." in name]
+    names = [name for name in HARMONIC_NAMES if ".tilt." in name]
     wobbling = replace(
         rig,
         table=replace(rig.table, harmonic_period_deg={"tilt": 360.0}),

@@ -12,6 +12,7 @@ from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.instrument.axes import DIRECTIONS
 from tvsbayes.instrument.parameters import INDEX, KINDS, NAMES, RIG_NAMES, unit_of
 from tvsbayes.metrology.budget_tables import BudgetTable, Source, budget_table
+from tvsbayes.model.parameter_space import HALF_NORMAL_MEAN, HALF_NORMAL_SD
 from tvsbayes.results.estimates import HeadlineCauses
 
 if TYPE_CHECKING:
@@ -107,8 +108,7 @@ def headline_causes(fit: JointFit) -> HeadlineCauses:
         if shape == "log-normal":
             centre = float(np.log(centre))
         elif shape == "half-normal":
-            # Mean and standard deviation of |x|, x ~ N(0, u^2).
-            centre, width = width * float(np.sqrt(2 / np.pi)), width * float(np.sqrt(1 - 2 / np.pi))
+            centre, width = width * HALF_NORMAL_MEAN, width * HALF_NORMAL_SD
         rows.append((name, spread[:, INDEX[name]], width, centre, shape, np.inf * every))
     kept = [row for row in rows if np.any(row[1] != 0)]
     names, contribution, widths, centres, shapes, dof = zip(*kept, strict=True)

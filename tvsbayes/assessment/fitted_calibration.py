@@ -14,8 +14,7 @@ from tvsbayes.calibration.pointing import INPUT_NAMES, NOISE_NAMES, Calibration
 from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.instrument.axes import AXES
 from tvsbayes.instrument.campaign import Campaign, input_hashes
-from tvsbayes.instrument.parameters import INDEX, NAMES
-from tvsbayes.model.parameter_space import prior_groups
+from tvsbayes.instrument.parameters import INDEX, NAMES, PRIOR_GROUPS
 from tvsbayes.posterior.draws import Posterior
 
 CLEARED_PROBABILITY = 0.99
@@ -122,7 +121,7 @@ def causes_of(fit: JointFit) -> Causes:
         "pixel and aperture noise" if readings else "pixel noise": noise,
         "stop errors of the campaign": fisher - noise,
     }
-    for stem, columns in prior_groups().items():
+    for stem, columns in PRIOR_GROUPS.items():
         share = np.zeros_like(fisher)
         share[columns, columns] = 1.0
         parts[stem] = share

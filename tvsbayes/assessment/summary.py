@@ -25,7 +25,7 @@ from tvsbayes.estimators.four_point import four_point_ratios, select_experiments
 from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.instrument.axes import AXES, DIRECTIONS, SENSES
 from tvsbayes.instrument.campaign import ordered_spots
-from tvsbayes.instrument.parameters import HARMONIC_PRIORS, INDEX, NAMES, RECEIVER_NAMES, RIG_NAMES
+from tvsbayes.instrument.parameters import HARMONIC_NAMES, INDEX, NAMES, RECEIVER_NAMES, RIG_NAMES
 from tvsbayes.instrument.stops import legs_of
 from tvsbayes.model.headlines import Derived
 from tvsbayes.posterior.draws import Posterior
@@ -80,7 +80,7 @@ def _parameters(source: _Source) -> dict[str, Estimate]:
     for index, name in enumerate(NAMES):
         if name in RECEIVER_NAMES and not has_readings:
             continue
-        if name in HARMONIC_PRIORS and not fit.free[index] and fit.mode.physical[index] == 0:
+        if name in HARMONIC_NAMES and not fit.free[index] and fit.mode.physical[index] == 0:
             continue
         estimate = source.estimate(name, lambda d, i=index: d.physical[..., i])
         if source.posterior is not None:

@@ -29,20 +29,18 @@ from tvsbayes.calibration.optics import (
     unit_vector,
 )
 from tvsbayes.errors import InputError
-from tvsbayes.instrument.axes import AXES, DIRECTIONS, SIDES, sides_of
-from tvsbayes.instrument.parameters import HARMONIC_PRIORS
+from tvsbayes.instrument.axes import AXES, SIDES, sides_of
+from tvsbayes.instrument.parameters import names_of
 from tvsbayes.statistics.intervals import NORMAL_95
 
-INPUT_NAMES: tuple[str, ...] = (
-    *("degrees_per_step.pan", "degrees_per_step.tilt", "backlash_deg.pan", "backlash_deg.tilt"),
-    *HARMONIC_PRIORS,
+INPUT_NAMES: tuple[str, ...] = names_of(
+    *("degrees_per_step", "backlash_deg", "harmonic_deg"),
     *("tilt_zero_deg", "mirror_offset_mm", "mirror1_error_deg", "mirror2_error_deg"),
-    *("laser_tilt_deg.x", "laser_tilt_deg.y", "laser_offset_mm.x", "laser_offset_mm.y"),
-    *("tilt_axis_skew_deg", "tilt_axis_offset_mm.x", "tilt_axis_offset_mm.z"),
+    *("laser_tilt_deg", "laser_offset_mm", "tilt_axis_skew_deg", "tilt_axis_offset_mm"),
     *("baseline_mm", "pan_zero_emission_deg", "aperture_zero_deg"),
 )
 """What a coordinate depends on. Contrasts do not enter: after homing a counter stands for its mean ratio."""
-NOISE_NAMES = (*(f"stop_sd_deg.{d}" for d in DIRECTIONS), "aperture_sd_deg")
+NOISE_NAMES = names_of("stop_sd_deg", "aperture_sd_deg")
 DIVERGING_SHARE = 1e-3
 """Share of draws without a point above which a point is refused (DESIGN 5)."""
 DIVERGING_SDS = 3.0902323061678132

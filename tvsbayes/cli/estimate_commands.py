@@ -92,7 +92,7 @@ def fit(
     summary, posterior, more = summarise(result), None, {}
     # A sample of what must not be used anyway would only take the user's time.
     if not no_sample and unusable(summary) is None:
-        from tvsbayes.posterior.predictive import write_posterior
+        from tvsbayes.posterior.arviz_tree import write_posterior
         from tvsbayes.posterior.sampling import sample
 
         make_folder(folder)

@@ -21,7 +21,7 @@ from tvsbayes.estimators.four_point import (
     select_experiments,
 )
 from tvsbayes.instrument.axes import DIRECTIONS
-from tvsbayes.instrument.parameters import RIG_PRIORS
+from tvsbayes.instrument.parameters import names_of
 from tvsbayes.results.comparison_record import Gap, GapTerm
 from tvsbayes.statistics.intervals import interval95
 
@@ -32,7 +32,10 @@ if TYPE_CHECKING:
 
 
 GAP_DRAWS = 256
-OPTICS = tuple(name for name in RIG_PRIORS if name.startswith(("mirror1", "mirror2", "laser_", "tilt_axis_")))
+OPTICS = names_of(
+    *("mirror1_error_deg", "mirror2_error_deg", "laser_tilt_deg", "laser_offset_mm"),
+    *("tilt_axis_skew_deg", "tilt_axis_offset_mm"),
+)
 """What bends the beam's way through the positioner; all zero in the nominal rig."""
 BACKLASH, STEREO_SCALE, SKEW, PROJECTION, CHANCE = (
     "backlash over N",

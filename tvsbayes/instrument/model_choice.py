@@ -5,11 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 from tvsbayes.errors import InputError
-from tvsbayes.instrument.parameters import HARMONIC_PRIORS, Prior
+from tvsbayes.instrument.parameters import HARMONIC_NAMES, REGISTRY, Prior, names_of
 from tvsbayes.instrument.rig import RigTable
 
-CONTRASTS = ("ratio_contrast_deg_per_step.pan", "ratio_contrast_deg_per_step.tilt")
-BACKLASHES = ("backlash_deg.pan", "backlash_deg.tilt")
 HARMONIC_SD_DEG = 0.1
 """Prior standard deviation of every part of a freed transmission error."""
 
@@ -40,9 +38,9 @@ class ModelChoice:
         """
         changed: dict[str, Prior] = {}
         if self.per_axis:
-            changed |= dict.fromkeys(CONTRASTS, Prior(0.0, 0.0))
+            changed |= dict.fromkeys(names_of("ratio_contrast_deg_per_step"), Prior(0.0, 0.0))
         if self.no_backlash:
-            changed |= dict.fromkeys(BACKLASHES, Prior(0.0, 0.0, "half-normal"))
+            changed |= dict.fromkeys(names_of("backlash_deg"), Prior(0.0, 0.0, "half-normal"))
         if self.harmonics:
             if not stated.harmonic_period_deg:
                 raise InputError(
@@ -53,8 +51,9 @@ class ModelChoice:
                     allowed="a period in degrees of the output, 360 for the wheel, less for the pinion",
                     remedy='add "harmonic_period_deg.pan" = { value = 360.0, u = 0.0 } (or tilt) to [rig]',
                 )
-            for name, unasked in HARMONIC_PRIORS.items():
-                if name.split(".")[1] in stated.harmonic_period_deg and stated.priors[name] == unasked:
+            for name in HARMONIC_NAMES:
+                unasked = stated.priors[name] == REGISTRY[name].prior
+                if unasked and name.split(".")[1] in stated.harmonic_period_deg:
                     changed[name] = Prior(0.0, HARMONIC_SD_DEG)
         return replace(stated, priors={**stated.priors, **changed})
 

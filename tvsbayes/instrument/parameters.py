@@ -1,40 +1,28 @@
-"""Every parameter once: name, unit, prior, kind, range, block."""
+"""The one registry of parameters: name, unit, prior, range and block of each, in the order of all vectors and files.
+
+Units are those of the names: degrees where one says `deg`, radians where it says `rad`, mm, px; "1" has none.
+"""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
-from typing import Literal
+from itertools import groupby
+from typing import Literal, get_args
 
-UNIT_ENDINGS = (
-    ("_deg_per_step", "deg/step"),
-    ("degrees_per_step", "deg/step"),
-    ("_deg", "deg"),
-    ("_mm", "mm"),
-    ("_rad", "rad"),
-)
+from tvsbayes.instrument.axes import AXES, DIRECTIONS
 
-
-def unit_of(name: str) -> str:
-    """Unit of a contract name (DESIGN 8): `backlash_deg.pan` -> deg; "1" where it has none."""
-    stem = name.split(".")[0]
-    if name.startswith("extrinsics."):
-        stem = name.split(".")[1]
-    return next((unit for ending, unit in UNIT_ENDINGS if stem.endswith(ending)), "1")
-
-
-STEREO_PARAMETER_NAMES: tuple[str, ...] = (
-    *(f"stereo.left.{p}" for p in ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")),
-    *(f"stereo.right.{p}" for p in ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")),
-    *(f"stereo.rotation_rad.{a}" for a in "xyz"),
-    *(f"stereo.translation_mm.{a}" for a in "xyz"),
-)
-"""The 24 stereo parameters in the order of `parameter_covariance` (DESIGN 7)."""
 Distribution = Literal["normal", "half-normal", "log-normal"]
+KINDS: tuple[Distribution, ...] = get_args(Distribution)
+Unit = Literal["deg/step", "deg", "rad", "mm", "px", "1"]
+Place = Literal["rig", "rig.prior", "stereo"]
+HARMONIC_ORDERS = (1, 2)
+"""Of the transmission error: turns per period."""
 
 
 @dataclass(frozen=True, slots=True)
 class Prior:
-    """One parameter's state of knowledge before the spots (DESIGN 3.2 and 7).
+    """One parameter's state of knowledge before the spots.
 
     `value` and `u` mean: normal: mean and standard uncertainty; half-normal: 0 and scale;
     log-normal: median and standard deviation of the logarithm. `u = 0` fixes the parameter.
@@ -45,95 +33,137 @@ class Prior:
     distribution: Distribution = "normal"
 
 
-DEFAULT_PRIORS: dict[str, Prior] = {
-    "degrees_per_step.pan": Prior(0.06, 0.01),
-    "degrees_per_step.tilt": Prior(0.07, 0.01),
-    "ratio_contrast_deg_per_step.pan": Prior(0.0, 2e-4),
-    "ratio_contrast_deg_per_step.tilt": Prior(0.0, 2e-4),
-    "backlash_deg.pan": Prior(0.0, 0.5, "half-normal"),
-    "backlash_deg.tilt": Prior(0.0, 0.5, "half-normal"),
-    "tilt_zero_deg": Prior(0.0, 2.0),
-    "mirror_offset_mm": Prior(30.0, 5.0),
-    "mirror1_error_deg": Prior(0.0, 0.5),
-    "mirror2_error_deg": Prior(0.0, 0.5),
-    "laser_tilt_deg.x": Prior(0.0, 0.5),
-    "laser_tilt_deg.y": Prior(0.0, 0.5),
-    "laser_offset_mm.x": Prior(0.0, 0.5),
-    "laser_offset_mm.y": Prior(0.0, 0.5),
-    "tilt_axis_skew_deg": Prior(0.0, 0.5),
-    "tilt_axis_offset_mm.x": Prior(0.0, 0.5),
-    "tilt_axis_offset_mm.z": Prior(0.0, 0.5),
-    "extrinsics.rotation_rad.x": Prior(0.0, 0.5),
-    "extrinsics.rotation_rad.y": Prior(0.0, 0.5),
-    "extrinsics.rotation_rad.z": Prior(0.0, 0.5),
-    "extrinsics.translation_mm.x": Prior(0.0, 100.0),
-    "extrinsics.translation_mm.y": Prior(0.0, 100.0),
-    "extrinsics.translation_mm.z": Prior(0.0, 100.0),
-    "stop_sd_deg.left": Prior(0.04, 1.0, "log-normal"),
-    "stop_sd_deg.right": Prior(0.04, 1.0, "log-normal"),
-    "stop_sd_deg.up": Prior(0.04, 1.0, "log-normal"),
-    "stop_sd_deg.down": Prior(0.04, 1.0, "log-normal"),
-    "pixel_scale": Prior(1.0, 0.5, "log-normal"),
-}
-"""Priors that `[rig.prior]` may replace, in the order of the parameter vector (DESIGN 3.2)."""
-DECLARED_PRIORS: dict[str, Prior] = {
-    "focal_scale": Prior(1.0, 0.002),
-    "baseline_mm": Prior(200.0, 0.1),
-    "pan_zero_emission_deg": Prior(90.0, 0.2),
-    "aperture_zero_deg": Prior(0.0, 0.1),
-    "aperture_sd_deg": Prior(0.02, 0.0, "log-normal"),
-}
-"""Entries of `[rig]` itself, with the defaults of DESIGN 7."""
-HARMONIC_ORDERS = (1, 2)
-HARMONIC_PRIORS: dict[str, Prior] = {
-    f"harmonic_deg.{axis}.{order}.{part}": Prior(0.0, 0.0)
-    for axis in ("pan", "tilt")
-    for order in HARMONIC_ORDERS
-    for part in ("cos", "sin")
-}
-"""Transmission error by axis, order and phase, part of `[rig.prior]` (DESIGN 3.1); none unless asked for."""
-RIG_PRIORS: dict[str, Prior] = {**DEFAULT_PRIORS, **DECLARED_PRIORS, **HARMONIC_PRIORS}
-"""Every prior of a rig with its default, in the order of the parameter vector."""
-# Lowest and highest value and highest standard uncertainty by the first part of a name. Wide: they catch
-# a wrong unit or a slipped key, not an unusual instrument.
-RANGES: dict[str, tuple[float, float, float]] = {
-    "degrees_per_step": (1e-6, 10.0, 10.0),
-    "ratio_contrast_deg_per_step": (-1.0, 1.0, 1.0),
-    "backlash_deg": (0.0, 0.0, 45.0),
-    "tilt_zero_deg": (-90.0, 90.0, 180.0),
-    "mirror_offset_mm": (-1000.0, 1000.0, 1000.0),
-    "mirror1_error_deg": (-30.0, 30.0, 30.0),
-    "mirror2_error_deg": (-30.0, 30.0, 30.0),
-    "laser_tilt_deg": (-30.0, 30.0, 30.0),
-    "laser_offset_mm": (-100.0, 100.0, 100.0),
-    "tilt_axis_skew_deg": (-30.0, 30.0, 30.0),
-    "tilt_axis_offset_mm": (-100.0, 100.0, 100.0),
-    "extrinsics": (-1e5, 1e5, 1e5),
-    "stop_sd_deg": (1e-6, 10.0, 5.0),
-    "pixel_scale": (1e-3, 1e3, 5.0),
-    "focal_scale": (0.5, 2.0, 0.5),
-    "baseline_mm": (1.0, 1e5, 1e4),
-    "pan_zero_emission_deg": (0.0, 180.0, 180.0),
-    "aperture_zero_deg": (-180.0, 180.0, 180.0),
-    "aperture_sd_deg": (1e-6, 10.0, 5.0),
-    "harmonic_deg": (-10.0, 10.0, 10.0),
-}
+UNSTATED = Prior(0.0, 0.0)
 
-RIG_NAMES: tuple[str, ...] = tuple(RIG_PRIORS)
-NAMES: tuple[str, ...] = (*RIG_NAMES, *STEREO_PARAMETER_NAMES)
-"""Contract names (DESIGN 8) in the order of the coordinates."""
-NOISE_NAMES: tuple[str, ...] = (
-    *(f"stop_sd_deg.{direction}" for direction in ("left", "right", "up", "down")),
-    "pixel_scale",
-    "aperture_sd_deg",
+
+@dataclass(frozen=True, slots=True)
+class Parameter:
+    """One parameter of the instrument.
+
+    Attributes:
+        name: in files, results and draws.
+        block: the array of the model that it is an entry of: its name without the last part, or all of it.
+        unit: of value and u.
+        place: the table `[rig]` or `[rig.prior]` of a file, or the stereo calibration.
+        prior: default; that of the cameras is the covariance of their calibration.
+        low, high, u_max: lowest and highest value and highest standard uncertainty that a file may state. Wide: they
+            catch a wrong unit or a slipped key, not an unusual instrument.
+        noise: a scale of noise: the point estimate alternates it with geometry and stereo.
+        receiver: observable only through aperture readings.
+    """
+
+    name: str
+    block: str
+    unit: Unit
+    place: Place
+    prior: Prior = UNSTATED
+    low: float = -math.inf
+    high: float = math.inf
+    u_max: float = math.inf
+    noise: bool = False
+    receiver: bool = False
+
+    @property
+    def cause(self) -> str:
+        """What budgets call it as a cause of uncertainty; the stereo calibration counts as one, and so do blocks."""
+        if self.place == "stereo":
+            return "stereo calibration"
+        return "focal scale" if self.name == "focal_scale" else f"prior of {self.name.split('.')[0]}"
+
+
+def _block(
+    block: str,
+    parts: tuple[str, ...],
+    unit: Unit,
+    prior: Prior,
+    limits: tuple[float, float, float],
+    place: Place = "rig.prior",
+    *,
+    noise: bool = False,
+    receiver: bool = False,
+) -> tuple[Parameter, ...]:
+    """Parameters that differ in nothing but the last part of their names; a scalar has no parts."""
+    names = [f"{block}.{part}" for part in parts] or [block]
+    return tuple(Parameter(name, block, unit, place, prior, *limits, noise, receiver) for name in names)
+
+
+def _cameras() -> tuple[Parameter, ...]:
+    """The stereo calibration, named and ordered as OpenCV does; its file has a reader and limits of its own."""
+    units: dict[str, Unit] = {name: "px" for name in ("fx", "fy", "cx", "cy")}
+    units |= {name: "1" for name in ("k1", "k2", "p1", "p2", "k3")}
+    found = {f"stereo.{side}": units for side in ("left", "right")}
+    found |= {"stereo.rotation_rad": dict.fromkeys("xyz", "rad"), "stereo.translation_mm": dict.fromkeys("xyz", "mm")}
+    return tuple(
+        Parameter(f"{block}.{part}", block, unit, "stereo")
+        for block, own in found.items()
+        for part, unit in own.items()
+    )
+
+
+_SMALL, _XYZ = Prior(0.0, 0.5), ("x", "y", "z")
+_RATIO, _ANGLE, _LENGTH, _SD = (1e-6, 10.0, 10.0), (-30.0, 30.0, 30.0), (-100.0, 100.0, 100.0), (1e-6, 10.0, 5.0)
+_HARMONICS = tuple(f"{axis}.{order}.{part}" for axis in AXES for order in HARMONIC_ORDERS for part in ("cos", "sin"))
+_PARAMETERS = (
+    Parameter("degrees_per_step.pan", "degrees_per_step", "deg/step", "rig.prior", Prior(0.06, 0.01), *_RATIO),
+    Parameter("degrees_per_step.tilt", "degrees_per_step", "deg/step", "rig.prior", Prior(0.07, 0.01), *_RATIO),
+    *_block("ratio_contrast_deg_per_step", AXES, "deg/step", Prior(0.0, 2e-4), (-1.0, 1.0, 1.0)),
+    *_block("backlash_deg", AXES, "deg", Prior(0.0, 0.5, "half-normal"), (0.0, 0.0, 45.0)),
+    *_block("tilt_zero_deg", (), "deg", Prior(0.0, 2.0), (-90.0, 90.0, 180.0)),
+    *_block("mirror_offset_mm", (), "mm", Prior(30.0, 5.0), (-1000.0, 1000.0, 1000.0)),
+    *_block("mirror1_error_deg", (), "deg", _SMALL, _ANGLE),
+    *_block("mirror2_error_deg", (), "deg", _SMALL, _ANGLE),
+    *_block("laser_tilt_deg", ("x", "y"), "deg", _SMALL, _ANGLE),
+    *_block("laser_offset_mm", ("x", "y"), "mm", _SMALL, _LENGTH),
+    *_block("tilt_axis_skew_deg", (), "deg", _SMALL, _ANGLE),
+    *_block("tilt_axis_offset_mm", ("x", "z"), "mm", _SMALL, _LENGTH),
+    *_block("extrinsics.rotation_rad", _XYZ, "rad", Prior(0.0, 0.5), (-3.15, 3.15, 3.15)),
+    *_block("extrinsics.translation_mm", _XYZ, "mm", Prior(0.0, 100.0), (-1e5, 1e5, 1e5)),
+    *_block("stop_sd_deg", DIRECTIONS, "deg", Prior(0.04, 1.0, "log-normal"), _SD, noise=True),
+    *_block("pixel_scale", (), "1", Prior(1.0, 0.5, "log-normal"), (1e-3, 1e3, 5.0), noise=True),
+    *_block("focal_scale", (), "1", Prior(1.0, 0.002), (0.5, 2.0, 0.5), "rig"),
+    *_block("baseline_mm", (), "mm", Prior(200.0, 0.1), (1.0, 1e5, 1e4), "rig", receiver=True),
+    *_block("pan_zero_emission_deg", (), "deg", Prior(90.0, 0.2), (0.0, 180.0, 180.0), "rig", receiver=True),
+    *_block("aperture_zero_deg", (), "deg", Prior(0.0, 0.1), (-180.0, 180.0, 180.0), "rig", receiver=True),
+    *_block("aperture_sd_deg", (), "deg", Prior(0.02, 0.0, "log-normal"), _SD, "rig", noise=True, receiver=True),
+    # No transmission error unless a rig states one or a fit is asked to free it.
+    *_block("harmonic_deg", _HARMONICS, "deg", UNSTATED, (-10.0, 10.0, 10.0)),
+    *_cameras(),
 )
-"""Scales that the point estimate alternates with geometry and stereo (DESIGN 4.2)."""
-RECEIVER_NAMES: tuple[str, ...] = (
-    "baseline_mm",
-    "pan_zero_emission_deg",
-    "aperture_zero_deg",
-    "aperture_sd_deg",
-)
-"""Observable only through aperture readings."""
+
+REGISTRY: dict[str, Parameter] = {parameter.name: parameter for parameter in _PARAMETERS}
+"""Every parameter by its name, in the order of the coordinates, which stored draws and results keep."""
+NAMES: tuple[str, ...] = tuple(REGISTRY)
 INDEX: dict[str, int] = {name: index for index, name in enumerate(NAMES)}
-KINDS = ("normal", "half-normal", "log-normal")
+BLOCKS: dict[str, tuple[str, ...]] = {
+    block: tuple(parameter.name for parameter in own) for block, own in groupby(_PARAMETERS, lambda p: p.block)
+}
+"""Names by block; the parameters of a block follow each other."""
+RIG_NAMES: tuple[str, ...] = tuple(p.name for p in _PARAMETERS if p.place != "stereo")
+"""What has a prior of its own; they come first."""
+RIG_PRIORS: dict[str, Prior] = {name: REGISTRY[name].prior for name in RIG_NAMES}
+STEREO_PARAMETER_NAMES: tuple[str, ...] = tuple(p.name for p in _PARAMETERS if p.place == "stereo")
+"""The 24 stereo parameters in the order of `parameter_covariance` of a stereo file."""
+HARMONIC_NAMES: tuple[str, ...] = BLOCKS["harmonic_deg"]
+"""Transmission error by axis, order and phase."""
+NOISE_NAMES: tuple[str, ...] = tuple(p.name for p in _PARAMETERS if p.noise)
+RECEIVER_NAMES: tuple[str, ...] = tuple(p.name for p in _PARAMETERS if p.receiver)
+DERIVED_UNITS: dict[str, Unit] = {
+    **dict.fromkeys(("degrees_per_step", "effective_deg_per_step", "effective_contrast_deg_per_step"), "deg/step"),
+    "effective_mirror_offset_mm": "mm",
+}
+"""Of quantities that follow from parameters, by the first part of their names: ratios by direction, for instance."""
+PRIOR_GROUPS: dict[str, list[int]] = {
+    cause: [INDEX[parameter.name] for parameter in _PARAMETERS if parameter.cause == cause]
+    for cause in dict.fromkeys(REGISTRY[name].cause for name in (*STEREO_PARAMETER_NAMES, *RIG_NAMES))
+}
+"""Coordinates of every prior that can be a cause of uncertainty, the stereo calibration first."""
+
+
+def names_of(*blocks: str) -> tuple[str, ...]:
+    """Names of the parameters of blocks, in the order asked for."""
+    return tuple(name for block in blocks for name in BLOCKS[block])
+
+
+def unit_of(name: str) -> Unit:
+    """Unit of a parameter or a derived quantity: `backlash_deg.pan` -> deg; "1" where it has none."""
+    return REGISTRY[name].unit if name in REGISTRY else DERIVED_UNITS[name.split(".")[0]]

@@ -18,12 +18,11 @@ from tvsbayes.files.documents import TOML_BYTES_MAX, Keys, parse_toml, toml_line
 from tvsbayes.instrument.axes import AXES, DIRECTION_SIGNS, FULL_TURN_DEG
 from tvsbayes.instrument.counter_limits import COUNTER_MAX, LIMIT_KEYS, CounterLimits
 from tvsbayes.instrument.parameters import (
-    DECLARED_PRIORS,
-    DEFAULT_PRIORS,
-    HARMONIC_PRIORS,
-    RANGES,
+    HARMONIC_NAMES,
+    NAMES,
+    REGISTRY,
+    RIG_NAMES,
     RIG_PRIORS,
-    STEREO_PARAMETER_NAMES,
     Prior,
 )
 from tvsbayes.instrument.stereo_pair import Stereo, read_stereo
@@ -80,15 +79,16 @@ class Rig:
         return CounterLimits.of(self.positioner)
 
 
-_PRIOR_NAMES = (*DEFAULT_PRIORS, *HARMONIC_PRIORS)
+_PRIOR_NAMES = tuple(p.name for p in REGISTRY.values() if p.place == "rig.prior")
+_DECLARED_NAMES = tuple(p.name for p in REGISTRY.values() if p.place == "rig")
 _PERIOD_NAMES = {f"harmonic_period_deg.{axis}": axis for axis in AXES}
 _PERIOD_MIN_DEG = 1e-6
-_GROUPS = {name.rsplit(".", n)[0] for name in (*RIG_PRIORS, *_PERIOD_NAMES, *STEREO_PARAMETER_NAMES) for n in (1, 2, 3)}
+_GROUPS = {name.rsplit(".", n)[0] for name in (*NAMES, *_PERIOD_NAMES) for n in (1, 2, 3)}
 
 
 def _harmonic_without_period(priors: Mapping[str, Prior], period_deg: Mapping[str, float]) -> str | None:
     """The first harmonic that is not fixed at 0 on an axis whose period nobody stated."""
-    for name in HARMONIC_PRIORS:
+    for name in HARMONIC_NAMES:
         prior = priors.get(name)
         if prior is not None and (prior.value != 0 or prior.u != 0) and name.split(".")[1] not in period_deg:
             return name
@@ -158,12 +158,9 @@ def _parse_priors(table: Keys, allowed: tuple[str, ...]) -> dict[str, Prior]:
         if name in _PERIOD_NAMES:
             priors[name] = Prior(_parse_period(keys, key), 0.0)
             continue
-        distribution = RIG_PRIORS[name].distribution
-        low, high, u_max = RANGES[name.partition(".")[0]]
-        if name.startswith("extrinsics.rotation_rad"):
-            low, high, u_max = -3.15, 3.15, 3.15
-        value, u = keys.quantity(key, low, high, u_max)
-        priors[name] = Prior(value, u, distribution)
+        parameter = REGISTRY[name]
+        value, u = keys.quantity(key, parameter.low, parameter.high, parameter.u_max)
+        priors[name] = Prior(value, u, parameter.prior.distribution)
     return priors
 
 
@@ -193,10 +190,10 @@ def parse_rig_table(table: Keys) -> RigTable:
     """
     own = {k: v for k, v in table.values.items() if k not in ("aperture_convention", "prior")}
     own_keys = Keys(own, table.file, table.text, table.path)
-    declared = _parse_priors(own_keys, (*DECLARED_PRIORS, *_PERIOD_NAMES))
+    declared = _parse_priors(own_keys, (*_DECLARED_NAMES, *_PERIOD_NAMES))
     period_deg = {axis: declared.pop(name).value for name, axis in _PERIOD_NAMES.items() if name in declared}
     # Any parameter may stand in [rig.prior] (DESIGN 7), also one that has its place in [rig].
-    prior = _parse_priors(table.table("prior"), (*_PRIOR_NAMES, *DECLARED_PRIORS))
+    prior = _parse_priors(table.table("prior"), (*_PRIOR_NAMES, *_DECLARED_NAMES))
     for name in declared:
         if name in prior:
             found = f"{name} in [rig] and in [rig.prior]"
@@ -223,8 +220,9 @@ def rig_table_toml(table: RigTable) -> str:
         for name, axis in _PERIOD_NAMES.items()
         if axis in table.harmonic_period_deg
     ]
-    harmonics = [entry(name) for name in HARMONIC_PRIORS if name.split(".")[1] in table.harmonic_period_deg]
-    declared, priors = map(entry, DECLARED_PRIORS), map(entry, DEFAULT_PRIORS)
+    harmonics = [entry(name) for name in HARMONIC_NAMES if name.split(".")[1] in table.harmonic_period_deg]
+    declared = map(entry, _DECLARED_NAMES)
+    priors = (entry(name) for name in _PRIOR_NAMES if name not in HARMONIC_NAMES)
     return "\n".join(["[rig]", *declared, *periods, convention, "[rig.prior]", *priors, *harmonics]) + "\n"
 
 
@@ -303,7 +301,7 @@ def read_rig(path: Path) -> Rig:
             raise sheets.refuse(name, "text", "a printable name of 1 to 100 characters", "rename the sheet")
     costs = keys.table("costs")
     costs.only(_COSTS_S)
-    truth = {**table.priors, **_parse_priors(keys.table("truth"), tuple(RIG_PRIORS))}
+    truth = {**table.priors, **_parse_priors(keys.table("truth"), RIG_NAMES)}
     _check_periods(keys.table("truth"), truth, table.harmonic_period_deg)
     return Rig(
         table=table,

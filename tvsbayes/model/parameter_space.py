@@ -2,30 +2,22 @@
 
 from __future__ import annotations
 
+import math
+from types import ModuleType
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.scipy.special import ndtr, ndtri
 from jaxtyping import Array, Bool, Float, Int
 from scipy import special
 
-from tvsbayes.instrument.axes import AXES, FULL_TURN_DEG
-from tvsbayes.instrument.parameters import INDEX, KINDS, NAMES, RECEIVER_NAMES, RIG_NAMES
+from tvsbayes.instrument.axes import AXES, FULL_TURN_DEG, SIDES
+from tvsbayes.instrument.parameters import BLOCKS, INDEX, KINDS, NAMES, RECEIVER_NAMES, REGISTRY, RIG_NAMES
 from tvsbayes.instrument.rig import RigTable
 from tvsbayes.instrument.stereo_pair import Stereo
 from tvsbayes.model.geometry import Scalar, StereoCameras, Vector
 from tvsbayes.model.laser_path import Harmonics, Optics, Transmission
-
-
-def prior_groups() -> dict[str, list[int]]:
-    """Coordinates of every prior that can be a cause of uncertainty; the stereo calibration is one of them."""
-    groups: dict[str, list[int]] = {"stereo calibration": list(range(len(RIG_NAMES), len(NAMES)))}
-    for name in RIG_NAMES:
-        stem = "focal scale" if name == "focal_scale" else f"prior of {name.split('.')[0]}"
-        groups.setdefault(stem, []).append(INDEX[name])
-    return groups
-
 
 NO_PERIOD_DEG = np.full(2, FULL_TURN_DEG)
 """Stands for the periods of transmission errors that nobody stated; harmless, since those errors are 0."""
@@ -66,14 +58,43 @@ class Model(eqx.Module):
     noise: Noise
 
 
-def half_normal(z: np.ndarray | float) -> np.ndarray | float:
-    """A half-normal quantity by its coordinate, in units of its scale: `ParameterSpace.physical` in NumPy."""
-    return -special.ndtri(0.5 * special.ndtr(-np.asarray(z)))
+HALF_NORMAL_MEAN, HALF_NORMAL_SD = math.sqrt(2 / math.pi), math.sqrt(1 - 2 / math.pi)
+"""Of |x|, x ~ N(0, 1)."""
 
 
-def half_normal_slope(z: np.ndarray | float) -> np.ndarray | float:
+def half_normal(z, functions: ModuleType = special):
+    """A half-normal quantity of scale 1 by its coordinate, Phi^-1((1 + Phi(z)) / 2).
+
+    1 - (1 + Phi(z)) / 2 = Phi(-z) / 2 keeps its digits where Phi(z) rounds to 1.
+
+    Args:
+        z: coordinates, any shape.
+        functions: where `ndtr` and `ndtri` come from, SciPy's or JAX's.
+    """
+    return -functions.ndtri(0.5 * functions.ndtr(-z))
+
+
+def half_normal_slope(z: np.ndarray) -> np.ndarray:
     """Its derivative by the coordinate, phi(z) / (2 phi(b))."""
-    return 0.5 * np.exp(0.5 * (half_normal(z) ** 2 - np.asarray(z) ** 2))
+    return 0.5 * np.exp(0.5 * (half_normal(z) ** 2 - z**2))
+
+
+def half_normal_coordinate(value: np.ndarray) -> np.ndarray:
+    """The coordinate of a half-normal quantity of scale 1, by the tail that keeps its digits; values of any sign."""
+    return -special.ndtri(np.minimum(2 * special.ndtr(-np.maximum(value, 0.0)), 1 - 1e-16))
+
+
+def half_normal_sd(mean: float, sd: float) -> float:
+    """Sd of a half-normal of scale 1 whose coordinate is N(mean, sd^2), by Gauss-Hermite quadrature.
+
+    Near nought the map from coordinate to quantity is flat on one side: a slope there would promise a certainty that
+    no fit has.
+    """
+    nodes, weights = np.polynomial.hermite_e.hermegauss(48)
+    values = half_normal(mean + sd * nodes)
+    weights = weights / weights.sum()
+    centre = weights @ values
+    return float(np.sqrt(weights @ (values - centre) ** 2))
 
 
 class ParameterSpace(eqx.Module):
@@ -93,14 +114,14 @@ class ParameterSpace(eqx.Module):
     def physical(self, z: Float[Array, " parameters"]) -> Float[Array, " parameters"]:
         """Coordinates -> values in the units of `NAMES`."""
         rig_z, stereo_z = z[: len(RIG_NAMES)], z[len(RIG_NAMES) :]
-        half, log = self.kind == 1, self.kind == 2
+        half, log = (self.kind == KINDS.index(kind) for kind in ("half-normal", "log-normal"))
         # Unused branches are fed harmless numbers: `where` lets their infinities into the gradient.
         # Beyond 37 sd Phi underflows and its inverse has no value: a fit may stray there, and must come back.
         w = jnp.where(half, jnp.minimum(rig_z, 36.0), 0.0)
-        # 1 - (1 + Phi(w)) / 2 = Phi(-w) / 2 keeps its digits where Phi(w) rounds to 1.
-        half_normal = -self.u * ndtri(0.5 * ndtr(-w))
         log_normal = self.value * jnp.exp(jnp.where(log, self.u, 0.0) * rig_z)
-        rig = jnp.where(half, half_normal, jnp.where(log, log_normal, self.value + self.u * rig_z))
+        rig = jnp.where(
+            half, self.u * half_normal(w, jax.scipy.special), jnp.where(log, log_normal, self.value + self.u * rig_z)
+        )
         return jnp.concatenate([rig, self.stereo_mean + self.stereo_root @ stereo_z])
 
     def model(self, z: Float[Array, " parameters"]) -> Model:
@@ -108,9 +129,10 @@ class ParameterSpace(eqx.Module):
         return model_of(self.physical(z), self.harmonic_period_deg)
 
 
-RAD_NAMES = tuple(name for name in RIG_NAMES if "deg" in name)
-SCALE = np.array([np.pi / 180 if name in RAD_NAMES else 1.0 for name in NAMES])
+SCALE = np.array([np.pi / 180 if REGISTRY[name].unit.startswith("deg") else 1.0 for name in NAMES])
 """Contract units -> rad and mm."""
+STOP_COLUMNS = np.array([[INDEX[f"stop_sd_deg.{side}"] for side in SIDES[axis]] for axis in AXES])
+"""Coordinates of the stop sds by axis and approach side, (right, left) and (down, up): shape (2, 2)."""
 
 
 def model_of(
@@ -128,49 +150,51 @@ def model_of(
     values = physical * SCALE
     period_deg = jnp.asarray(harmonic_period_deg)
 
-    def block(first: str, length: int):
-        return values[INDEX[first] : INDEX[first] + length]
+    def block(name: str):
+        first, *others = (INDEX[entry] for entry in BLOCKS[name])
+        return values[first : first + 1 + len(others)] if others else values[first]
 
-    def one(name: str):
-        return values[INDEX[name]]
+    def of_both(*names: str):
+        return values[np.array([[INDEX[f"stereo.{side}.{name}"] for name in names] for side in ("left", "right")])]
 
-    intrinsics = jnp.reshape(block("stereo.left.fx", 18), (2, 9))
     return Model(
         transmission=Transmission(
-            ratio_rad_per_step=block("degrees_per_step.pan", 2),
-            contrast_rad_per_step=block("ratio_contrast_deg_per_step.pan", 2),
-            backlash_rad=block("backlash_deg.pan", 2),
+            ratio_rad_per_step=block("degrees_per_step"),
+            contrast_rad_per_step=block("ratio_contrast_deg_per_step"),
+            backlash_rad=block("backlash_deg"),
             harmonics=Harmonics(
-                amplitude_rad=jnp.reshape(block("harmonic_deg.pan.1.cos", 8), (2, 2, 2)),
+                amplitude_rad=jnp.reshape(block("harmonic_deg"), (2, 2, 2)),
                 period_rad=period_deg * (jnp.pi / 180),
                 on_wheel=period_deg == FULL_TURN_DEG,
             ),
         ),
         optics=Optics(
-            mirror_offset_mm=one("mirror_offset_mm"),
-            mirror1_error_rad=one("mirror1_error_deg"),
-            mirror2_error_rad=one("mirror2_error_deg"),
-            laser_tilt_rad=block("laser_tilt_deg.x", 2),
-            laser_offset_mm=block("laser_offset_mm.x", 2),
-            tilt_axis_skew_rad=one("tilt_axis_skew_deg"),
-            tilt_axis_offset_mm=block("tilt_axis_offset_mm.x", 2),
+            mirror_offset_mm=block("mirror_offset_mm"),
+            mirror1_error_rad=block("mirror1_error_deg"),
+            mirror2_error_rad=block("mirror2_error_deg"),
+            laser_tilt_rad=block("laser_tilt_deg"),
+            laser_offset_mm=block("laser_offset_mm"),
+            tilt_axis_skew_rad=block("tilt_axis_skew_deg"),
+            tilt_axis_offset_mm=block("tilt_axis_offset_mm"),
         ),
-        tilt_zero_rad=one("tilt_zero_deg"),
-        extrinsics=Extrinsics(block("extrinsics.rotation_rad.x", 3), block("extrinsics.translation_mm.x", 3)),
+        tilt_zero_rad=block("tilt_zero_deg"),
+        extrinsics=Extrinsics(block("extrinsics.rotation_rad"), block("extrinsics.translation_mm")),
         cameras=StereoCameras(
-            focal_px=intrinsics[:, 0:2],
-            centre_px=intrinsics[:, 2:4],
-            radial=intrinsics[:, np.array([4, 5, 8])],
-            tangential=intrinsics[:, 6:8],
-            rotation_rad=block("stereo.rotation_rad.x", 3),
-            translation_mm=block("stereo.translation_mm.x", 3),
-            focal_scale=one("focal_scale"),
+            focal_px=of_both("fx", "fy"),
+            centre_px=of_both("cx", "cy"),
+            radial=of_both("k1", "k2", "k3"),
+            tangential=of_both("p1", "p2"),
+            rotation_rad=block("stereo.rotation_rad"),
+            translation_mm=block("stereo.translation_mm"),
+            focal_scale=block("focal_scale"),
         ),
-        receiver=Receiver(*block("baseline_mm", 4)),
-        noise=Noise(
-            stop_sd_rad=jnp.reshape(block("stop_sd_deg.left", 4), (2, 2))[:, ::-1],
-            pixel_scale=one("pixel_scale"),
+        receiver=Receiver(
+            baseline_mm=block("baseline_mm"),
+            pan_zero_emission_rad=block("pan_zero_emission_deg"),
+            aperture_zero_rad=block("aperture_zero_deg"),
+            aperture_sd_rad=block("aperture_sd_deg"),
         ),
+        noise=Noise(stop_sd_rad=values[STOP_COLUMNS], pixel_scale=block("pixel_scale")),
     )
 
 
@@ -194,6 +218,23 @@ def parameter_space(table: RigTable, stereo: Stereo) -> ParameterSpace:
             stereo_root=jnp.asarray(root),
             harmonic_period_deg=jnp.array([table.harmonic_period_deg.get(a, FULL_TURN_DEG) for a in AXES]),
         )
+
+
+def coordinates_of(space: ParameterSpace, physical: np.ndarray) -> np.ndarray:
+    """Coordinates of values in the units of `NAMES`, the inverse of `ParameterSpace.physical`; shapes (..., p).
+
+    What priors hold fixed has coordinate 0, and so have directions in which the cameras are exactly known. Values beyond
+    30 sds are taken for 30.
+    """
+    value, u, kind = (np.asarray(x, dtype=float) for x in (space.value, space.u, space.kind))
+    true, cameras = np.split(np.asarray(physical, dtype=float), [len(RIG_NAMES)], axis=-1)
+    safe = np.where(u > 0, u, 1.0)
+    log = np.log(np.where(true > 0, true, 1.0) / np.where(value > 0, value, 1.0)) / safe
+    z = np.where(kind == KINDS.index("log-normal"), log, (true - value) / safe)
+    z = np.where(kind == KINDS.index("half-normal"), half_normal_coordinate(true / safe), z)
+    z = np.where(u > 0, np.clip(z, -30.0, 30.0), 0.0)
+    stereo = (cameras - np.asarray(space.stereo_mean)) @ np.linalg.pinv(np.asarray(space.stereo_root)).T
+    return np.concatenate([z, stereo], axis=-1)
 
 
 def free_mask(space: ParameterSpace, has_aperture: bool) -> Bool[np.ndarray, " parameters"]:

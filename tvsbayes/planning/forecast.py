@@ -10,7 +10,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy import special, stats
+from scipy import stats
 
 from tvsbayes.errors import InputError, TvsError
 from tvsbayes.estimators.four_point import classic, four_point_ratios, select_experiments
@@ -19,7 +19,7 @@ from tvsbayes.instrument.campaign import Campaign
 from tvsbayes.instrument.parameters import INDEX, NAMES, RIG_NAMES
 from tvsbayes.instrument.protocols import four_point_protocol
 from tvsbayes.model.headlines import physical_at
-from tvsbayes.model.parameter_space import ParameterSpace
+from tvsbayes.model.parameter_space import STOP_COLUMNS, ParameterSpace, coordinates_of
 from tvsbayes.planning.candidates import (
     Arranged,
     Candidates,
@@ -55,20 +55,12 @@ def truth_in(knowledge: Knowledge, parameters: Mapping[str, float], stereo_vecto
         stereo_vector: true cameras, shape (24,).
     """
     space = knowledge.space
-    value, u, kind = (np.asarray(x, dtype=float) for x in (space.value, space.u, space.kind))
     true = np.array([parameters[name] for name in RIG_NAMES])
-    safe = np.where(u > 0, u, 1.0)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        # Inverse of u Phi^-1((1 + Phi(z)) / 2), by the tail that keeps its digits.
-        half = -special.ndtri(np.minimum(2 * special.ndtr(-np.maximum(true, 0.0) / safe), 1 - 1e-16))
-        log = np.log(np.where(true > 0, true, 1.0) / np.where(value > 0, value, 1.0)) / safe
-    z = np.where(kind == 1, half, np.where(kind == 2, log, (true - value) / safe))
-    z = np.where(u > 0, np.clip(z, -30.0, 30.0), 0.0)
+    z = coordinates_of(space, np.concatenate([true, stereo_vector]))
     # A half-normal with u = 0 is 0 whatever its value; nothing else can be stated for it.
-    held = np.where(u > 0, value, true)
-    stereo = np.linalg.pinv(np.asarray(space.stereo_root)) @ (stereo_vector - np.asarray(space.stereo_mean))
+    held = np.where(np.asarray(space.u) > 0, np.asarray(space.value), true)
     with jax.enable_x64(True):
-        return DrawnTruth(np.concatenate([z, stereo]), eqx.tree_at(lambda s: s.value, space, jnp.asarray(held)))
+        return DrawnTruth(z, eqx.tree_at(lambda s: s.value, space, jnp.asarray(held)))
 
 
 def draw_truths(knowledge: Knowledge, count: int, seed: int) -> list[DrawnTruth]:
@@ -80,7 +72,6 @@ def draw_truths(knowledge: Knowledge, count: int, seed: int) -> list[DrawnTruth]
     return [truth_in(knowledge, t.parameters, t.stereo.vector) for t in drawn]
 
 
-STOP_COLUMNS = np.array([[INDEX[f"stop_sd_deg.{d}"] for d in SIDES[axis]] for axis in AXES])
 PIXEL_COLUMN = INDEX["pixel_scale"]
 
 

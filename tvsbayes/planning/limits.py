@@ -8,10 +8,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from tvsbayes.instrument.parameters import NAMES, RIG_NAMES
+from tvsbayes.instrument.parameters import NAMES, PRIOR_GROUPS, RIG_NAMES
 from tvsbayes.instrument.plan import PlanStep, described
 from tvsbayes.instrument.rig import RigTable
-from tvsbayes.model.parameter_space import prior_groups
 from tvsbayes.planning.candidates import Candidates, Seen, arrange, covariance_of, information_of_looks
 from tvsbayes.planning.expectation import LOOKS_PER_EXPERIMENT, Knowledge, plan_minutes
 from tvsbayes.planning.search import search_designs
@@ -87,7 +86,7 @@ def split_of(knowledge: Knowledge, data: np.ndarray, noise: np.ndarray | None, f
         # What the campaign taught and its priors cannot be told apart here: `locate --budget` and `fit` do.
         parts["the campaign and its priors"] = float(pull @ knowledge.precision @ pull)
     else:
-        for name, columns in prior_groups().items():
+        for name, columns in PRIOR_GROUPS.items():
             parts[name] = float(np.sum(pull[columns] ** 2))
     parts |= {name: float(value[worst]) for name, value in found.own.items()}
     total = sum(parts.values())
@@ -125,7 +124,7 @@ def limit_of(knowledge: Knowledge, data: np.ndarray, found: Sensitivity, target:
     cause = next(iter(shares))
     if floor <= target.limit:
         return Limit(floor, cause, shares, True, None)
-    groups = prior_groups()
+    groups = PRIOR_GROUPS
     at_point = math.sqrt(max(found.own_variance)) * target.factor
     if at_point > target.limit:
         short = f"{at_point:.3g} {target.unit} come from the stop and the reading at the point itself"

@@ -1,13 +1,9 @@
-"""Likelihood and pixels of looks, kept and new; the ArviZ tree of all that."""
+"""What a posterior says of looks: their density given all others, and their pixels if they were taken again.
+
+The unit of the log likelihood is a move: the spots between two moves share their stop errors. Pixels px; angles rad.
+"""
 
 from __future__ import annotations
-
-import json
-import tempfile
-from collections.abc import Mapping
-from dataclasses import dataclass
-from importlib.metadata import version
-from pathlib import Path
 
 import equinox as eqx
 import jax
@@ -27,14 +23,11 @@ from tvsbayes.estimators.likelihood import (
     no_belief,
     observe_with_stop_errors,
 )
-from tvsbayes.files.disk import write_atomically
-from tvsbayes.instrument.axes import DIRECTIONS, HOME_SD_DEG, SENSES
-from tvsbayes.instrument.campaign import input_hashes, ordered_spots
-from tvsbayes.instrument.parameters import HARMONIC_PRIORS, INDEX, NAMES, STEREO_PARAMETER_NAMES
-from tvsbayes.model.headlines import Derived
-from tvsbayes.model.parameter_space import ParameterSpace
-from tvsbayes.posterior.draws import Draws, Posterior
-from tvsbayes.posterior.sampling import fingerprint
+from tvsbayes.instrument.axes import HOME_SD_DEG
+from tvsbayes.instrument.campaign import ordered_spots
+from tvsbayes.instrument.parameters import INDEX
+from tvsbayes.model.parameter_space import STOP_COLUMNS, ParameterSpace
+from tvsbayes.posterior.draws import Posterior
 from tvsbayes.posterior.transport import BATCH, in_batches
 
 RANK_TOLERANCE = 1e-12
@@ -134,89 +127,7 @@ def move_log_density(
     return jax.vmap(one)(z)
 
 
-POSTERIOR_FORMAT = "tvsbayes-posterior/1"
 PIXELS = ("u_left", "v_left", "u_right", "v_right")
-
-
-@dataclass(frozen=True)
-class Variable:
-    """A variable of posterior.nc: its dimensions beyond (chain, draw) and the contract names behind it."""
-
-    dims: tuple[str, ...]
-    names: np.ndarray
-
-
-def _variable(dims: tuple[str, ...], pattern: str) -> Variable:
-    """Fill `{}` in a pattern with the coordinates of the dimensions."""
-    shape = tuple(len(COORDS[dim]) for dim in dims)
-    names = [pattern.format(*(COORDS[d][i] for d, i in zip(dims, index, strict=True))) for index in np.ndindex(shape)]
-    return Variable(dims, np.array(names).reshape(shape))
-
-
-COORDS: dict[str, tuple[str, ...]] = {
-    "direction": DIRECTIONS,
-    "axis": ("pan", "tilt"),
-    "laser_axis": ("x", "y"),
-    "tilt_axis_component": ("x", "z"),
-    "component": ("x", "y", "z"),
-    "harmonic": tuple(name.removeprefix("harmonic_deg.") for name in HARMONIC_PRIORS),
-    "stereo_parameter": tuple(name.removeprefix("stereo.") for name in STEREO_PARAMETER_NAMES),
-}
-VARIABLES: dict[str, Variable] = {
-    "effective_deg_per_step": _variable(("direction",), "effective_deg_per_step.{}"),
-    "degrees_per_step": _variable(("direction",), "degrees_per_step.{}"),
-    "mean_degrees_per_step": _variable(("axis",), "degrees_per_step.{}"),
-    "ratio_contrast_deg_per_step": _variable(("axis",), "ratio_contrast_deg_per_step.{}"),
-    "backlash_deg": _variable(("axis",), "backlash_deg.{}"),
-    "effective_mirror_offset_mm": _variable((), "effective_mirror_offset_mm"),
-    **{
-        name: _variable((), name)
-        for name in (
-            *("mirror_offset_mm", "tilt_zero_deg", "mirror1_error_deg", "mirror2_error_deg", "tilt_axis_skew_deg"),
-            *("pixel_scale", "focal_scale", "baseline_mm", "pan_zero_emission_deg"),
-            *("aperture_zero_deg", "aperture_sd_deg"),
-        )
-    },
-    "laser_tilt_deg": _variable(("laser_axis",), "laser_tilt_deg.{}"),
-    "laser_offset_mm": _variable(("laser_axis",), "laser_offset_mm.{}"),
-    "tilt_axis_offset_mm": _variable(("tilt_axis_component",), "tilt_axis_offset_mm.{}"),
-    "extrinsics_rotation_rad": _variable(("component",), "extrinsics.rotation_rad.{}"),
-    "extrinsics_translation_mm": _variable(("component",), "extrinsics.translation_mm.{}"),
-    "stop_sd_deg": _variable(("direction",), "stop_sd_deg.{}"),
-    "harmonic_deg": _variable(("harmonic",), "harmonic_deg.{}"),
-    "stereo": _variable(("stereo_parameter",), "stereo.{}"),
-}
-"""Variables of posterior.nc. `degrees_per_step` by direction; the mean ratio of an axis is `mean_degrees_per_step`."""
-
-
-def _variables(draws: Derived, varying: set[str], shape: tuple[int, int]) -> dict[str, xr.DataArray]:
-    """All variables that vary, with named dimensions; fixed entries of a dimension are left out."""
-    columns = Draws(draws)
-    result = {}
-    for variable, spec in VARIABLES.items():
-        chosen = np.array([name in varying for name in spec.names.ravel()])
-        if not chosen.any():
-            continue
-        values = np.stack([columns[name] for name in spec.names.ravel()[chosen]], axis=-1)
-        if spec.dims:
-            labels = [label for label, yes in zip(COORDS[spec.dims[0]], chosen, strict=True) if yes]
-            coords = {"chain": np.arange(shape[0]), "draw": np.arange(shape[1]), spec.dims[0]: labels}
-            result[variable] = xr.DataArray(values.reshape(*shape, -1), coords, ("chain", "draw", *spec.dims))
-        else:
-            coords = {"chain": np.arange(shape[0]), "draw": np.arange(shape[1])}
-            result[variable] = xr.DataArray(values.reshape(shape), coords, ("chain", "draw"))
-    return result
-
-
-def _dataset(variables: Mapping[str, xr.DataArray]) -> xr.Dataset:
-    """Join variables; a coordinate of which some have fewer entries is kept apart under the variable's name."""
-    full = {}
-    for name, array in variables.items():
-        for dim in array.dims[2:]:
-            if array.sizes[dim] < len(COORDS.get(dim, ())):
-                array = array.rename({dim: f"{name}_{dim}"})
-        full[name] = array
-    return xr.Dataset(full)
 
 
 def move_log_likelihood(posterior: Posterior) -> xr.DataArray:
@@ -282,9 +193,7 @@ def looks_again(fit: JointFit, z: np.ndarray, physical: np.ndarray, generator: n
     """
     count = len(ordered_spots(fit.campaign))
     arrays = jax.tree.map(np.asarray, fit.arrays.spots)
-    sd_deg = physical[:, [INDEX[f"stop_sd_deg.{d}"] for d in DIRECTIONS]]
-    # Per axis (right, left) and (down, up), as `redraw_mix` orders them.
-    sd_rad = np.radians(sd_deg.reshape(len(z), 2, 2)[..., ::-1])
+    sd_rad = np.radians(physical[:, STOP_COLUMNS])
     variance = np.sum(arrays.redraw_mix[None] * sd_rad[:, None] ** 2, axis=3)
     fresh = np.sqrt(variance) * generator.standard_normal(variance.shape)
     size = len(arrays.valid)
@@ -301,75 +210,3 @@ def looks_again(fit: JointFit, z: np.ndarray, physical: np.ndarray, generator: n
     root = np.linalg.inv(arrays.whitening[:count])
     noise = np.einsum("sij,nsj->nsi", root, generator.standard_normal(ideal.shape))
     return ideal + pixel_scale * noise
-
-
-def data_tree(posterior: Posterior) -> xr.DataTree:
-    """Everything ArviZ works on, in its groups.
-
-    Posterior, prior, posterior_predictive, log_likelihood, observed_data and sample_stats.
-
-    Args:
-        posterior: a sampled posterior.
-
-    Returns:
-        A tree for `az.summary`, `az.loo`, `az.compare` and ArviZ's plots. The unit of the log likelihood is a move.
-    """
-    fit = posterior.fit
-    shape = posterior.z.shape[:2]
-    varying = {NAMES[i] for i in np.flatnonzero(fit.free)} | {"effective_mirror_offset_mm"}
-    for axis, pair in SENSES.items():
-        if varying & {f"degrees_per_step.{axis}", f"ratio_contrast_deg_per_step.{axis}"}:
-            varying |= {f"degrees_per_step.{d}" for d in pair} | {f"effective_deg_per_step.{d}" for d in pair}
-    prior_draws = jax.tree.map(lambda x: np.asarray(x)[None], fit.prior_draws)
-    spots = ordered_spots(fit.campaign)
-    pixels = np.array([(s.u_left_px, s.v_left_px, s.u_right_px, s.v_right_px) for s in spots])
-    coords = {"chain": np.arange(shape[0]), "draw": np.arange(shape[1])}
-    stats = {
-        "lp": xr.DataArray(posterior.log_density, coords, ("chain", "draw")),
-        "acceptance_rate": xr.DataArray(posterior.convergence.acceptance, {"chain": coords["chain"]}, ("chain",)),
-    }
-    observed = xr.DataArray(
-        pixels, {"spot": [s.spot for s in spots], "pixel": list(PIXELS)}, ("spot", "pixel"), name="pixels"
-    )
-    tree = xr.DataTree.from_dict(
-        {
-            "posterior": _dataset(_variables(posterior.draws, varying, shape)),
-            "prior": _dataset(_variables(prior_draws, varying, prior_draws.physical.shape[:2])),
-            "posterior_predictive": predictive_pixels(posterior).to_dataset(name="pixels"),
-            "log_likelihood": move_log_likelihood(posterior).to_dataset(name="pixels"),
-            "observed_data": observed.to_dataset(),
-            "sample_stats": xr.Dataset(stats),
-        }
-    )
-    convergence = posterior.convergence
-    tree.attrs = {
-        "format": POSTERIOR_FORMAT,
-        "sampling_library": "emcee",
-        "sampling_time": posterior.seconds,
-        "seed": posterior.seed,
-        "converged": int(convergence.converged),
-        "steps": convergence.steps,
-        "discarded": convergence.discarded,
-        "thin": convergence.thin,
-        "versions": json.dumps({name: version(name) for name in ("tvsbayes", "emcee", "arviz", "jax", "numpy")}),
-        "inputs": json.dumps(input_hashes(fit.campaign)),
-        "fingerprint": fingerprint(fit),
-        "reference_pose_deg": np.degrees(fit.reference_pose_rad),
-        "log_likelihood_unit": "spots of a move given all other spots",
-    }
-    return tree
-
-
-def write_posterior(posterior: Posterior, path: Path) -> None:
-    """Write `posterior.nc` (netCDF-4), whole or not at all.
-
-    Raises:
-        InputError: the folder cannot be written.
-    """
-    tree = data_tree(posterior)
-    packed = {"zlib": True, "complevel": 4, "shuffle": True}
-    encoding = {f"/{name}": dict.fromkeys(group.data_vars, packed) for name, group in tree.children.items()}
-    with tempfile.TemporaryDirectory(prefix="tvsbayes-") as scratch:
-        file = Path(scratch) / "posterior.nc"
-        tree.to_netcdf(file, engine="h5netcdf", encoding=encoding)
-        write_atomically(path, file.read_bytes())

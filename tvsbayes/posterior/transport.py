@@ -14,10 +14,8 @@ from scipy import linalg
 from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.estimators.likelihood import evaluate
 from tvsbayes.estimators.linear_spots import LinearSpots, linear_spots
-from tvsbayes.instrument.axes import SIDES
-from tvsbayes.instrument.model_choice import BACKLASHES
-from tvsbayes.instrument.parameters import INDEX, NAMES, NOISE_NAMES
-from tvsbayes.model.parameter_space import half_normal, half_normal_slope
+from tvsbayes.instrument.parameters import BLOCKS, NAMES, NOISE_NAMES
+from tvsbayes.model.parameter_space import STOP_COLUMNS, half_normal, half_normal_slope
 
 BATCH = 32
 """Points per call of the compiled density: half an ensemble of 64, the calls of a differential-evolution step."""
@@ -36,7 +34,7 @@ STRETCH_NODES = (-2.0, 0.0, 2.0, 4.0, 6.0)
 then."""
 STRETCH_LIMITS = 1e-2, 1e2
 """Of the information of a coordinate, 1 at the mode."""
-HEAVY_NAMES = (*NOISE_NAMES, *BACKLASHES, "extrinsics.rotation_rad.y", "mirror_offset_mm")
+HEAVY_NAMES = (*NOISE_NAMES, *BLOCKS["backlash_deg"], "extrinsics.rotation_rad.y", "mirror_offset_mm")
 """Coordinates whose tails are heavier than normal: those that few stops tell (a walker stood still for 155 steps at 3.7
 sd of a stop sd), and the tilt of the frames with the mirrors' offset, along whose ridge a quadratic shear falls short
 (one stood at 7.7 sd). Each of them is always proposed from a t of its own."""
@@ -142,7 +140,7 @@ class Transport:
     @cached_property
     def curved(self) -> np.ndarray:
         """Places in `free` of coordinates whose physical value is no linear function of z over a posterior's width."""
-        return np.flatnonzero(np.isin(np.array(NAMES)[self.free], BACKLASHES))
+        return np.flatnonzero(np.isin(np.array(NAMES)[self.free], BLOCKS["backlash_deg"]))
 
     def _beyond_linear(self, place: int, step: np.ndarray) -> np.ndarray:
         """What steps of the z at a place (n,) move its physical value beyond the line at the mode, in units of z."""
@@ -294,8 +292,7 @@ def stop_states(fit: JointFit, linear: LinearSpots) -> StopStates:
     """Unroll the filter's six states: a column for each time that one is drawn anew; none beyond `STATES_MAX`."""
     spots, states = linear.load.shape[0], linear.load.shape[2]
     mix = np.asarray(fit.arrays.spots.redraw_mix)[:spots]
-    sd_deg = fit.mode.physical[[INDEX[f"stop_sd_deg.{name}"] for axis in SIDES for name in SIDES[axis]]]
-    variance_of = np.radians(sd_deg).reshape(2, 2) ** 2
+    variance_of = np.radians(fit.mode.physical[STOP_COLUMNS]) ** 2
     places, variance, constant = [], [], []
     for state in range(states):
         drawn = np.flatnonzero(linear.renewed[:, state])
@@ -354,8 +351,7 @@ def transport(fit: JointFit) -> Transport:
     wide = root[np.ix_(geometry, geometry)]
     jacobian = linear.jacobian.reshape(-1, len(names))[:, free[geometry]] @ wide
     residual = linear.residual.ravel()
-    directions = [f"stop_sd_deg.{name}" for axis in SIDES for name in SIDES[axis]]
-    of_noise = np.array([[name == names[free[place]] for place in noise] for name in directions]).reshape(4, -1)
+    of_noise = STOP_COLUMNS.reshape(4, 1) == free[noise]
     count = len(free)
     route = Transport(
         mode=fit.z,

@@ -23,7 +23,7 @@ from tvsbayes.instrument.plan import PlanStep
 from tvsbayes.instrument.rig import Rig, rig_table_toml
 from tvsbayes.instrument.stereo_pair import stereo_bytes
 from tvsbayes.model.headlines import QUANTITIES, headlines
-from tvsbayes.model.parameter_space import half_normal, half_normal_slope
+from tvsbayes.model.parameter_space import half_normal_sd, half_normal_slope
 from tvsbayes.planning.candidates import covariance_of
 from tvsbayes.planning.expectation import Knowledge, information_of, prior_knowledge
 from tvsbayes.planning.forecast import truth_in
@@ -129,19 +129,6 @@ def study_row(job: StudyJob, index: int) -> dict[str, object]:
     except InputError:
         row["target"] = None
     return {**row, "seconds": time.perf_counter() - start}
-
-
-def half_normal_sd(mean: float, sd: float) -> float:
-    """Sd of a half-normal of scale 1 whose coordinate is N(mean, sd^2), by Gauss-Hermite quadrature.
-
-    Near no backlash the map from coordinate to backlash is flat on one side: a slope there would promise a certainty
-    that no fit has.
-    """
-    nodes, weights = np.polynomial.hermite_e.hermegauss(48)
-    values = half_normal(mean + sd * nodes)
-    weights = weights / weights.sum()
-    centre = weights @ values
-    return float(np.sqrt(weights @ (values - centre) ** 2))
 
 
 def predicted_sds(knowledge: Knowledge, fisher: np.ndarray, gradient: np.ndarray, z: np.ndarray) -> np.ndarray:

@@ -21,9 +21,8 @@ from tvsbayes.files.documents import JSON_BYTES_MAX, parse_json
 from tvsbayes.instrument.axes import FULL_TURN_DEG, HOME_SD_DEG, SIDES, PanApproach, TiltApproach
 from tvsbayes.instrument.campaign import NO_PIXELS, Campaign, Move, Spot, with_pixels, write_campaign
 from tvsbayes.instrument.parameters import (
-    DECLARED_PRIORS,
-    DEFAULT_PRIORS,
-    HARMONIC_PRIORS,
+    HARMONIC_NAMES,
+    RIG_NAMES,
     STEREO_PARAMETER_NAMES,
     Prior,
 )
@@ -184,13 +183,15 @@ def draw_truth(rig: Rig, rng: np.random.Generator) -> Truth:
     report a coverage that no real calibration has.
     """
     parameters = {
-        name: _draw(rig.truth.get(name, rig.table.priors[name]), rng) for name in (*DEFAULT_PRIORS, *DECLARED_PRIORS)
+        name: _draw(rig.truth.get(name, rig.table.priors[name]), rng)
+        for name in RIG_NAMES
+        if name not in HARMONIC_NAMES
     }
     # Through the eigenvectors: fixed parameters give a semi-definite covariance that Cholesky refuses.
     variances, vectors = np.linalg.eigh(np.asarray(rig.stereo.parameter_covariance, float))
     offset = vectors @ (np.sqrt(np.clip(variances, 0.0, None)) * rng.standard_normal(len(variances)))
     # Last: rigs without transmission error are the same rigs whatever is drawn here.
-    parameters |= {name: _draw(rig.truth.get(name, rig.table.priors[name]), rng) for name in HARMONIC_PRIORS}
+    parameters |= {name: _draw(rig.truth.get(name, rig.table.priors[name]), rng) for name in HARMONIC_NAMES}
     return Truth(with_derived(parameters), rig.stereo.with_vector(rig.stereo.vector + offset))
 
 
@@ -259,7 +260,7 @@ def simulate(
         truth = draw_truth(rig, streams.truth)
     sd_px = float(rig.cameras.get("spot_sd_px", SPOT_SD_PX) if spot_sd_px is None else spot_sd_px)
     log = run_plan(plan, rig, home_approach)
-    fixed = {name: Prior(value, 0.0) for name, value in truth.parameters.items() if name in HARMONIC_PRIORS}
+    fixed = {name: Prior(value, 0.0) for name, value in truth.parameters.items() if name in HARMONIC_NAMES}
     require_periods(fixed, rig.table.harmonic_period_deg)
     driven = _drive(log.moves, truth, rig.table.harmonic_period_deg, streams)
     truth = driven.truth

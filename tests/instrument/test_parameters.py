@@ -1,0 +1,84 @@
+"""The registry of parameters: one entry each, in an order that stored draws and results rely on."""
+
+from __future__ import annotations
+
+from tvsbayes.instrument.parameters import (
+    BLOCKS,
+    INDEX,
+    KINDS,
+    NAMES,
+    NOISE_NAMES,
+    PRIOR_GROUPS,
+    RECEIVER_NAMES,
+    REGISTRY,
+    RIG_NAMES,
+    RIG_PRIORS,
+    STEREO_PARAMETER_NAMES,
+    names_of,
+    unit_of,
+)
+
+
+def test_names_are_the_contracts():
+    assert NAMES == (*RIG_PRIORS, *STEREO_PARAMETER_NAMES) and RIG_NAMES == tuple(RIG_PRIORS)
+    assert len(set(NAMES)) == len(NAMES) == 65
+    assert all(NAMES[index] == name for name, index in INDEX.items())
+
+
+def test_the_order_of_stored_draws():
+    """The order of `draws.npz` and of every covariance of results: as results written earlier have it."""
+    blocks = (
+        *("degrees_per_step", "ratio_contrast_deg_per_step", "backlash_deg", "tilt_zero_deg", "mirror_offset_mm"),
+        *("mirror1_error_deg", "mirror2_error_deg", "laser_tilt_deg", "laser_offset_mm", "tilt_axis_skew_deg"),
+        *("tilt_axis_offset_mm", "extrinsics.rotation_rad", "extrinsics.translation_mm", "stop_sd_deg"),
+        *("pixel_scale", "focal_scale", "baseline_mm", "pan_zero_emission_deg", "aperture_zero_deg"),
+        *("aperture_sd_deg", "harmonic_deg", "stereo.left", "stereo.right", "stereo.rotation_rad"),
+        "stereo.translation_mm",
+    )
+    assert tuple(BLOCKS) == blocks
+    assert NAMES == names_of(*blocks), "the parameters of a block follow each other"
+    assert BLOCKS["stop_sd_deg"] == tuple(f"stop_sd_deg.{d}" for d in ("left", "right", "up", "down"))
+    assert BLOCKS["harmonic_deg"][:3] == ("harmonic_deg.pan.1.cos", "harmonic_deg.pan.1.sin", "harmonic_deg.pan.2.cos")
+    cameras = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
+    assert BLOCKS["stereo.right"] == tuple(f"stereo.right.{name}" for name in cameras)
+
+
+def test_every_default_lies_in_its_range():
+    for name, prior in RIG_PRIORS.items():
+        parameter = REGISTRY[name]
+        assert parameter.low <= prior.value <= parameter.high and 0 <= prior.u <= parameter.u_max, name
+        assert prior.distribution in KINDS
+        assert prior.distribution != "half-normal" or parameter.low == parameter.high == 0
+
+
+def test_noise_and_receiver():
+    assert NOISE_NAMES == (*BLOCKS["stop_sd_deg"], "pixel_scale", "aperture_sd_deg")
+    assert RECEIVER_NAMES == ("baseline_mm", "pan_zero_emission_deg", "aperture_zero_deg", "aperture_sd_deg")
+    assert {RIG_PRIORS[name].distribution for name in NOISE_NAMES} == {"log-normal"}
+
+
+def test_every_prior_is_in_one_group():
+    assert next(iter(PRIOR_GROUPS)) == "stereo calibration"
+    assert PRIOR_GROUPS["stereo calibration"] == list(range(len(RIG_NAMES), len(NAMES)))
+    assert [NAMES[column] for column in PRIOR_GROUPS["prior of backlash_deg"]] == list(BLOCKS["backlash_deg"])
+    assert len(PRIOR_GROUPS["prior of extrinsics"]) == 6 and len(PRIOR_GROUPS["focal scale"]) == 1
+    assert sorted(column for group in PRIOR_GROUPS.values() for column in group) == list(range(len(NAMES)))
+
+
+def test_units_of_contract_names():
+    units = {
+        "effective_deg_per_step.left": "deg/step",
+        "degrees_per_step.pan": "deg/step",
+        "ratio_contrast_deg_per_step.tilt": "deg/step",
+        "backlash_deg.pan": "deg",
+        "mirror_offset_mm": "mm",
+        "extrinsics.rotation_rad.x": "rad",
+        "extrinsics.translation_mm.z": "mm",
+        "effective_contrast_deg_per_step.pan": "deg/step",
+        "effective_mirror_offset_mm": "mm",
+        "stereo.left.cy": "px",
+        "stereo.right.k3": "1",
+        "stereo.rotation_rad.z": "rad",
+        "focal_scale": "1",
+    }
+    assert {name: unit_of(name) for name in units} == units

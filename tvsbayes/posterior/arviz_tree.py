@@ -1,0 +1,171 @@
+"""What ArviZ works on: the posterior with its prior, predictions and log likelihoods, and `posterior.nc`.
+
+Variables by contract name, with named dimensions; units are those of the names (deg, mm, rad, px).
+"""
+
+from __future__ import annotations
+
+import json
+import tempfile
+from collections.abc import Mapping
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+
+import jax
+import numpy as np
+import xarray as xr
+
+from tvsbayes.files.disk import write_atomically
+from tvsbayes.instrument.axes import AXES, DIRECTIONS, SENSES
+from tvsbayes.instrument.campaign import input_hashes, ordered_spots
+from tvsbayes.instrument.parameters import BLOCKS, HARMONIC_NAMES, NAMES, RIG_NAMES, STEREO_PARAMETER_NAMES
+from tvsbayes.model.headlines import Derived
+from tvsbayes.posterior.draws import Draws, Posterior
+from tvsbayes.posterior.predictive import PIXELS, move_log_likelihood, predictive_pixels
+from tvsbayes.posterior.sampling import fingerprint
+
+POSTERIOR_FORMAT = "tvsbayes-posterior/1"
+
+
+COORDS: dict[str, tuple[str, ...]] = {
+    "direction": DIRECTIONS,
+    "axis": AXES,
+    "laser_axis": ("x", "y"),
+    "tilt_axis_component": ("x", "z"),
+    "component": ("x", "y", "z"),
+    "harmonic": tuple(name.removeprefix("harmonic_deg.") for name in HARMONIC_NAMES),
+    "stereo_parameter": tuple(name.removeprefix("stereo.") for name in STEREO_PARAMETER_NAMES),
+}
+
+
+@dataclass(frozen=True)
+class Variable:
+    """A variable of posterior.nc: contract names behind it, and their dimension beyond (chain, draw) if it has one."""
+
+    names: tuple[str, ...]
+    dim: str | None = None
+
+
+def _of_block(block: str) -> Variable:
+    """A block of parameters, whose dimension is the one with its labels."""
+    labels = tuple(name.removeprefix(f"{block}.") for name in BLOCKS[block])
+    return Variable(BLOCKS[block], next((dim for dim, own in COORDS.items() if own == labels), None))
+
+
+_RIG_BLOCKS = sorted(
+    (block for block, names in BLOCKS.items() if names[0] in RIG_NAMES), key=lambda b: len(BLOCKS[b]) > 1
+)
+VARIABLES: dict[str, Variable] = {
+    **{
+        ratio: Variable(tuple(f"{ratio}.{direction}" for direction in DIRECTIONS), "direction")
+        for ratio in ("effective_deg_per_step", "degrees_per_step")
+    },
+    "mean_degrees_per_step": _of_block("degrees_per_step"),
+    "effective_mirror_offset_mm": Variable(("effective_mirror_offset_mm",)),
+    **{block.replace(".", "_"): _of_block(block) for block in _RIG_BLOCKS if block != "degrees_per_step"},
+    "stereo": Variable(STEREO_PARAMETER_NAMES, "stereo_parameter"),
+}
+"""Variables of posterior.nc. `degrees_per_step` by direction; the mean ratio of an axis is `mean_degrees_per_step`."""
+
+
+def _variables(draws: Derived, varying: set[str], shape: tuple[int, int]) -> dict[str, xr.DataArray]:
+    """All variables that vary, with named dimensions; fixed entries of a dimension are left out."""
+    columns = Draws(draws)
+    result = {}
+    for variable, spec in VARIABLES.items():
+        chosen = np.array([name in varying for name in spec.names])
+        if not chosen.any():
+            continue
+        values = np.stack([columns[name] for name in np.array(spec.names)[chosen]], axis=-1)
+        coords: dict[str, object] = {"chain": np.arange(shape[0]), "draw": np.arange(shape[1])}
+        if spec.dim is None:
+            values = values.reshape(shape)
+        else:
+            values = values.reshape(*shape, -1)
+            coords[spec.dim] = [label for label, yes in zip(COORDS[spec.dim], chosen, strict=True) if yes]
+        result[variable] = xr.DataArray(values, coords, tuple(coords))
+    return result
+
+
+def _dataset(variables: Mapping[str, xr.DataArray]) -> xr.Dataset:
+    """Join variables; a coordinate of which some have fewer entries is kept apart under the variable's name."""
+    full = {}
+    for name, array in variables.items():
+        for dim in array.dims[2:]:
+            if array.sizes[dim] < len(COORDS.get(dim, ())):
+                array = array.rename({dim: f"{name}_{dim}"})
+        full[name] = array
+    return xr.Dataset(full)
+
+
+def data_tree(posterior: Posterior) -> xr.DataTree:
+    """Everything ArviZ works on, in its groups.
+
+    Posterior, prior, posterior_predictive, log_likelihood, observed_data and sample_stats.
+
+    Args:
+        posterior: a sampled posterior.
+
+    Returns:
+        A tree for `az.summary`, `az.loo`, `az.compare` and ArviZ's plots. The unit of the log likelihood is a move.
+    """
+    fit = posterior.fit
+    shape = posterior.z.shape[:2]
+    varying = {NAMES[i] for i in np.flatnonzero(fit.free)} | {"effective_mirror_offset_mm"}
+    for axis, pair in SENSES.items():
+        if varying & {f"degrees_per_step.{axis}", f"ratio_contrast_deg_per_step.{axis}"}:
+            varying |= {f"degrees_per_step.{d}" for d in pair} | {f"effective_deg_per_step.{d}" for d in pair}
+    prior_draws = jax.tree.map(lambda x: np.asarray(x)[None], fit.prior_draws)
+    spots = ordered_spots(fit.campaign)
+    pixels = np.array([(s.u_left_px, s.v_left_px, s.u_right_px, s.v_right_px) for s in spots])
+    coords = {"chain": np.arange(shape[0]), "draw": np.arange(shape[1])}
+    stats = {
+        "lp": xr.DataArray(posterior.log_density, coords, ("chain", "draw")),
+        "acceptance_rate": xr.DataArray(posterior.convergence.acceptance, {"chain": coords["chain"]}, ("chain",)),
+    }
+    observed = xr.DataArray(
+        pixels, {"spot": [s.spot for s in spots], "pixel": list(PIXELS)}, ("spot", "pixel"), name="pixels"
+    )
+    tree = xr.DataTree.from_dict(
+        {
+            "posterior": _dataset(_variables(posterior.draws, varying, shape)),
+            "prior": _dataset(_variables(prior_draws, varying, prior_draws.physical.shape[:2])),
+            "posterior_predictive": predictive_pixels(posterior).to_dataset(name="pixels"),
+            "log_likelihood": move_log_likelihood(posterior).to_dataset(name="pixels"),
+            "observed_data": observed.to_dataset(),
+            "sample_stats": xr.Dataset(stats),
+        }
+    )
+    convergence = posterior.convergence
+    tree.attrs = {
+        "format": POSTERIOR_FORMAT,
+        "sampling_library": "emcee",
+        "sampling_time": posterior.seconds,
+        "seed": posterior.seed,
+        "converged": int(convergence.converged),
+        "steps": convergence.steps,
+        "discarded": convergence.discarded,
+        "thin": convergence.thin,
+        "versions": json.dumps({name: version(name) for name in ("tvsbayes", "emcee", "arviz", "jax", "numpy")}),
+        "inputs": json.dumps(input_hashes(fit.campaign)),
+        "fingerprint": fingerprint(fit),
+        "reference_pose_deg": np.degrees(fit.reference_pose_rad),
+        "log_likelihood_unit": "spots of a move given all other spots",
+    }
+    return tree
+
+
+def write_posterior(posterior: Posterior, path: Path) -> None:
+    """Write `posterior.nc` (netCDF-4), whole or not at all.
+
+    Raises:
+        InputError: the folder cannot be written.
+    """
+    tree = data_tree(posterior)
+    packed = {"zlib": True, "complevel": 4, "shuffle": True}
+    encoding = {f"/{name}": dict.fromkeys(group.data_vars, packed) for name, group in tree.children.items()}
+    with tempfile.TemporaryDirectory(prefix="tvsbayes-") as scratch:
+        file = Path(scratch) / "posterior.nc"
+        tree.to_netcdf(file, engine="h5netcdf", encoding=encoding)
+        write_atomically(path, file.read_bytes())
