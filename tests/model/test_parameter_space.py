@@ -259,7 +259,7 @@ def test_coordinates_are_the_inverse(physical):
     np.testing.assert_allclose(found[:, : len(RIG_NAMES)][:, rig], z[:, : len(RIG_NAMES)][:, rig], atol=1e-9)
     again, _ = physical(found, space)
     np.testing.assert_allclose(again, values, rtol=1e-10, atol=1e-9)
-    np.testing.assert_array_equal(coordinates_of(space, values[3]), found[3])
+    np.testing.assert_allclose(coordinates_of(space, values[3]), found[3], rtol=1e-12, atol=1e-12)
 
 
 def test_the_spread_of_a_half_normal_is_that_of_its_draws():

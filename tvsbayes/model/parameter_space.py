@@ -62,7 +62,7 @@ HALF_NORMAL_MEAN, HALF_NORMAL_SD = math.sqrt(2 / math.pi), math.sqrt(1 - 2 / mat
 """Of |x|, x ~ N(0, 1)."""
 
 
-def half_normal(z, functions: ModuleType = special):
+def half_normal[Number: (float, np.ndarray, jax.Array)](z: Number, functions: ModuleType = special) -> Number:
     """A half-normal quantity of scale 1 by its coordinate, Phi^-1((1 + Phi(z)) / 2).
 
     1 - (1 + Phi(z)) / 2 = Phi(-z) / 2 keeps its digits where Phi(z) rounds to 1.
@@ -74,7 +74,7 @@ def half_normal(z, functions: ModuleType = special):
     return -functions.ndtri(0.5 * functions.ndtr(-z))
 
 
-def half_normal_slope(z: np.ndarray) -> np.ndarray:
+def half_normal_slope[Number: (float, np.ndarray)](z: Number) -> Number:
     """Its derivative by the coordinate, phi(z) / (2 phi(b))."""
     return 0.5 * np.exp(0.5 * (half_normal(z) ** 2 - z**2))
 
@@ -135,6 +135,13 @@ STOP_COLUMNS = np.array([[INDEX[f"stop_sd_deg.{side}"] for side in SIDES[axis]] 
 """Coordinates of the stop sds by axis and approach side, (right, left) and (down, up): shape (2, 2)."""
 
 
+def _camera_columns(*parts: str) -> slice | np.ndarray:
+    """Columns of named intrinsics in a camera's block: a slice where they follow each other, which compiles to less."""
+    columns = [BLOCKS["stereo.left"].index(f"stereo.left.{part}") for part in parts]
+    first, last = columns[0], columns[-1]
+    return slice(first, last + 1) if columns == list(range(first, last + 1)) else np.array(columns)
+
+
 def model_of(
     physical: Float[Array, " parameters"], harmonic_period_deg: Float[Array | np.ndarray, "2"] = NO_PERIOD_DEG
 ) -> Model:
@@ -154,9 +161,7 @@ def model_of(
         first, *others = (INDEX[entry] for entry in BLOCKS[name])
         return values[first : first + 1 + len(others)] if others else values[first]
 
-    def of_both(*names: str):
-        return values[np.array([[INDEX[f"stereo.{side}.{name}"] for name in names] for side in ("left", "right")])]
-
+    intrinsics = jnp.stack([block("stereo.left"), block("stereo.right")])
     return Model(
         transmission=Transmission(
             ratio_rad_per_step=block("degrees_per_step"),
@@ -180,10 +185,10 @@ def model_of(
         tilt_zero_rad=block("tilt_zero_deg"),
         extrinsics=Extrinsics(block("extrinsics.rotation_rad"), block("extrinsics.translation_mm")),
         cameras=StereoCameras(
-            focal_px=of_both("fx", "fy"),
-            centre_px=of_both("cx", "cy"),
-            radial=of_both("k1", "k2", "k3"),
-            tangential=of_both("p1", "p2"),
+            focal_px=intrinsics[:, _camera_columns("fx", "fy")],
+            centre_px=intrinsics[:, _camera_columns("cx", "cy")],
+            radial=intrinsics[:, _camera_columns("k1", "k2", "k3")],
+            tangential=intrinsics[:, _camera_columns("p1", "p2")],
             rotation_rad=block("stereo.rotation_rad"),
             translation_mm=block("stereo.translation_mm"),
             focal_scale=block("focal_scale"),
@@ -194,7 +199,7 @@ def model_of(
             aperture_zero_rad=block("aperture_zero_deg"),
             aperture_sd_rad=block("aperture_sd_deg"),
         ),
-        noise=Noise(stop_sd_rad=values[STOP_COLUMNS], pixel_scale=block("pixel_scale")),
+        noise=Noise(stop_sd_rad=jnp.reshape(block("stop_sd_deg"), (2, 2))[:, ::-1], pixel_scale=block("pixel_scale")),
     )
 
 
@@ -223,8 +228,8 @@ def parameter_space(table: RigTable, stereo: Stereo) -> ParameterSpace:
 def coordinates_of(space: ParameterSpace, physical: np.ndarray) -> np.ndarray:
     """Coordinates of values in the units of `NAMES`, the inverse of `ParameterSpace.physical`; shapes (..., p).
 
-    What priors hold fixed has coordinate 0, and so have directions in which the cameras are exactly known. Values beyond
-    30 sds are taken for 30.
+    What priors hold fixed has coordinate 0, and so have directions in which the cameras are exactly known. Values
+    beyond 30 sds are taken for 30.
     """
     value, u, kind = (np.asarray(x, dtype=float) for x in (space.value, space.u, space.kind))
     true, cameras = np.split(np.asarray(physical, dtype=float), [len(RIG_NAMES)], axis=-1)

@@ -33,7 +33,7 @@ from tvsbayes.planning.candidates import (
 )
 from tvsbayes.planning.expectation import LOOKS_PER_EXPERIMENT, NOISE_COLUMNS, PARAMETERS, Knowledge
 from tvsbayes.planning.target import Sensitivity, Target, sensitivity
-from tvsbayes.statistics.intervals import NORMAL_95
+from tvsbayes.statistics.intervals import NORMAL_95, coverage_factor
 from tvsbayes.twin.physics import effective_deg_per_step
 from tvsbayes.twin.simulated_campaign import Truth, draw_truth, simulate, with_derived
 
@@ -279,7 +279,7 @@ def classic_count(sd: float, half_width: float) -> int:
     """Experiments of one direction for a 95 % half width: n = (t s / E)^2, t with n - 1 degrees of freedom."""
     n = 2
     for _ in range(200):
-        wanted = max(2, math.ceil((float(special.stdtrit(n - 1, 0.975)) * sd / half_width) ** 2))
+        wanted = max(2, math.ceil((coverage_factor(n - 1) * sd / half_width) ** 2))
         if wanted <= n:
             # t falls with n: from above the first n that suffices is the answer.
             while n > 2 and (float(special.stdtrit(n - 2, 0.975)) * sd / half_width) ** 2 <= n - 1:
