@@ -14,7 +14,7 @@ from scipy import stats
 
 from tvsbayes.errors import InputError, TvsError
 from tvsbayes.estimators.four_point import classic, four_point_ratios, select_experiments
-from tvsbayes.instrument.axes import AXES, DIRECTIONS, SIDES
+from tvsbayes.instrument.axes import DIRECTIONS
 from tvsbayes.instrument.campaign import Campaign
 from tvsbayes.instrument.parameters import INDEX, NAMES, RIG_NAMES
 from tvsbayes.instrument.protocols import four_point_protocol
@@ -282,7 +282,7 @@ def classic_count(sd: float, half_width: float) -> int:
         wanted = max(2, math.ceil((coverage_factor(n - 1) * sd / half_width) ** 2))
         if wanted <= n:
             # t falls with n: from above the first n that suffices is the answer.
-            while n > 2 and (float(special.stdtrit(n - 2, 0.975)) * sd / half_width) ** 2 <= n - 1:
+            while n > 2 and (coverage_factor(n - 2) * sd / half_width) ** 2 <= n - 1:
                 n -= 1
             return n
         n = min(wanted, 2 * n)
