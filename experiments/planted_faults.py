@@ -937,8 +937,8 @@ FAULTS = (
     Fault(
         "classic count with n degrees of freedom",
         "planning/forecast.py",
-        "wanted = max(2, math.ceil((float(special.stdtrit(n - 1, 0.975))",
-        "wanted = max(2, math.ceil((float(special.stdtrit(n, 0.975))",
+        "wanted = max(2, math.ceil((coverage_factor(n - 1)",
+        "wanted = max(2, math.ceil((coverage_factor(n)",
         "a repeat too few",
         ("planning/planner::test_the_classics_count_is_the_first_that_suffices",),
     ),
