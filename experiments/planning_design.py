@@ -94,7 +94,7 @@ def main() -> None:
     turned = []
     for label, allowed in (("more of the same range", ~away), ("with the beams a full turn away", np.ones_like(away))):
         part = replace(shown, rows=np.where(allowed[:, None, None], shown.rows, 0.0))
-        more = design_family(sharp, wide, part, replace(TARGET, limit=1e-9), at, largest=16)
+        more = design_family(sharp, wide, part, replace(TARGET, limit=1e-9), at, Scope(largest=16))
         for n in (2, 4, 8, 16):
             arranged = more.arranged(n)
             after = information_of(arranged.steps, sharp)

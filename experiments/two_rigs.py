@@ -108,14 +108,14 @@ def planned_steps(rig):
     """What the planner takes for 16 experiments' worth of looks, as in planning_design.py."""
     from tvsbayes.planning.candidates import LookArrays, candidates
     from tvsbayes.planning.expectation import prior_knowledge
-    from tvsbayes.planning.search import design_family
+    from tvsbayes.planning.search import Scope, design_family
     from tvsbayes.planning.target import DEFAULT_TARGET, parse_target, sensitivity
 
     knowledge, target = prior_knowledge(rig), parse_target(DEFAULT_TARGET)
     found = candidates(knowledge)
     seen = LookArrays(found.looks, knowledge, False).at(knowledge.z, knowledge.space)
     centre = sensitivity(target, knowledge.z, knowledge.space, rig.table, seen.mirror_angles_rad.mean(axis=0))
-    return design_family(knowledge, found, seen, replace(target, limit=1e-9), centre, largest=16).arranged(16).steps
+    return design_family(knowledge, found, seen, replace(target, limit=1e-9), centre, Scope(largest=16)).arranged(16).steps
 
 
 def plan_of(name: str):

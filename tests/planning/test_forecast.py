@@ -14,7 +14,7 @@ from tvsbayes.instrument.axes import DIRECTIONS
 from tvsbayes.instrument.parameters import INDEX
 from tvsbayes.instrument.plan import PlanStep
 from tvsbayes.instrument.protocols import four_point_protocol
-from tvsbayes.planning.candidates import _sided
+from tvsbayes.planning.candidates import Positions, sided
 from tvsbayes.planning.expectation import PARAMETERS, Knowledge, plan_minutes, prior_knowledge
 from tvsbayes.planning.forecast import (
     ClassicForecast,
@@ -49,7 +49,7 @@ OVERSHOOT = np.array([10, 20])
     ],
 )
 def test_a_side_is_offered_where_its_run_up_stays_inside(position, sides):
-    looks = _sided(np.array([position]), np.array([3]), LIMITS, OVERSHOOT)
+    looks = sided(Positions(np.array([position]), np.array([3])), LIMITS, OVERSHOOT)
     assert {tuple(side) for side in looks.side.tolist()} == sides and len(looks) == len(sides)
     assert all(tuple(steps) == position for steps in looks.steps.tolist()) and set(looks.sheet.tolist()) <= {3}
 

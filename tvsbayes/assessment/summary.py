@@ -14,9 +14,9 @@ import numpy as np
 
 from tvsbayes.assessment.score_tests import validate
 from tvsbayes.assessment.weaknesses import (
-    few_stops,
     leverage,
     moved_directions,
+    poorly_known_stops,
     prior_conflicts,
     prior_sensitivity,
     weak_directions,
@@ -244,5 +244,5 @@ def summarise(fit: JointFit, posterior: Posterior | None = None) -> FitSummary:
         sampling=None if posterior is None else posterior.convergence.as_json(),
         curves=None if usable is None else _curves(usable, moved),
         validation=validate(fit),
-        few_stops=few_stops(fit, moved),
+        few_stops=poorly_known_stops(fit),
     )

@@ -9,13 +9,11 @@ from tvsbayes.estimators.linear_spots import standard_deviations_without
 from tvsbayes.instrument.axes import AXES, DIRECTIONS, SENSES
 from tvsbayes.instrument.campaign import ordered_spots
 from tvsbayes.instrument.parameters import INDEX, NAMES
-from tvsbayes.instrument.stops import legs_of, observed_stops, separation
+from tvsbayes.instrument.stops import few_stops, inseparable, legs_of, observed_stops, one_sided, separation
 from tvsbayes.results.estimates import Leverage, PriorSensitivity, WeakDirection
 
 LEVERAGE_LIMIT = 2.0
 """A stop is named if a headline's sd would grow by more than this factor without it (DESIGN 4.2)."""
-EXCHANGE_LIMIT = 0.5
-"""Correlation of ratio and backlash above which a quarter of the ratio's variance is exchange with the backlash."""
 LOADING_LIMIT = 0.3
 WEAK_VARIANCE = 0.5
 """A direction of parameter space is weak if more than this share of its prior variance is left."""
@@ -34,6 +32,11 @@ def moved_directions(fit: JointFit) -> set[str]:
     return set(legs_of(fit.campaign.moves))
 
 
+def _used_moves(fit: JointFit) -> set[int]:
+    """Moves after which a spot counts."""
+    return {s.move for s in fit.campaign.spots if s.status == "ok" and s.spot not in fit.excluded_spots}
+
+
 def _backlash_direction(fit: JointFit, axis: str, direction: str) -> WeakDirection | None:
     """Ratio and backlash of an axis, if they move together or the stops cannot separate them."""
     index = INDEX[f"backlash_deg.{axis}"]
@@ -44,11 +47,10 @@ def _backlash_direction(fit: JointFit, axis: str, direction: str) -> WeakDirecti
         # Held by the priors: nothing moves with the backlash.
         return None
     correlation = float(np.corrcoef(ratio, fit.draws.physical[:, index])[0, 1])
-    used = {s.move for s in fit.campaign.spots if s.status == "ok" and s.spot not in fit.excluded_spots}
-    reason = separation(observed_stops(fit.campaign.moves, used, axis), axis)
-    if reason is None and abs(correlation) < EXCHANGE_LIMIT:
+    stops = observed_stops(fit.campaign.moves, _used_moves(fit), axis)
+    if one_sided(stops, axis) is None and not inseparable(correlation):
         return None
-    reason = reason or "the legs differ too little; add a cleared approach or longer legs"
+    reason = separation(stops, axis) or "the legs differ too little; add a cleared approach or longer legs"
     text = f"{axis} ratio and {axis} backlash move together (correlation {correlation:+.2f}): {reason}"
     return WeakDirection(text, {f"effective.{direction}": 1.0, f"backlash_deg.{axis}": correlation})
 
@@ -179,19 +181,7 @@ def prior_conflicts(fit: JointFit) -> tuple[str, ...]:
     return tuple(found)
 
 
-FEW_STOPS = 12
-"""Fewer tell their own scatter so poorly that 1.96 standard deviations of it hold less than 93 % (Student's t)."""
-
-
-def few_stops(fit: JointFit, moved: set[str]) -> dict[str, int]:
-    """Directions that the campaign moved in and saw fewer than `FEW_STOPS` stops after, with their number."""
-    used = {s.move for s in fit.campaign.spots if s.status == "ok" and s.spot not in fit.excluded_spots}
-    found = {}
-    for axis, directions in SENSES.items():
-        stops = observed_stops(fit.campaign.moves, used, axis)
-        for direction, sign in zip(directions, (1, -1), strict=True):
-            count = sum(stop.sign == sign for stop in stops)
-            free = fit.free[INDEX[f"stop_sd_deg.{direction}"]]
-            if direction in moved and free and count < FEW_STOPS:
-                found[direction] = count
-    return found
+def poorly_known_stops(fit: JointFit) -> dict[str, int]:
+    """Directions whose stop sd is estimated from `few_stops`, with their number."""
+    few = few_stops(fit.campaign.moves, _used_moves(fit))
+    return {direction: count for direction, count in few.items() if fit.free[INDEX[f"stop_sd_deg.{direction}"]]}

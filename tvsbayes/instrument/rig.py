@@ -191,7 +191,9 @@ def parse_rig_table(table: Keys) -> RigTable:
     own = {k: v for k, v in table.values.items() if k not in ("aperture_convention", "prior")}
     own_keys = Keys(own, table.file, table.text, table.path)
     declared = _parse_priors(own_keys, (*_DECLARED_NAMES, *_PERIOD_NAMES))
-    period_deg = {axis: declared.pop(name).value for name, axis in _PERIOD_NAMES.items() if name in declared}
+    period_deg: dict[str, float] = {
+        axis: declared.pop(name).value for name, axis in _PERIOD_NAMES.items() if name in declared
+    }
     # Any parameter may stand in [rig.prior] (DESIGN 7), also one that has its place in [rig].
     prior = _parse_priors(table.table("prior"), (*_PRIOR_NAMES, *_DECLARED_NAMES))
     for name in declared:

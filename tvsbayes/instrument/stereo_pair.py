@@ -177,13 +177,14 @@ def _array(keys: Keys, key: str, *shapes: tuple[int, ...]) -> np.ndarray:
     allowed = f"finite numbers in a list of {wanted}"
     value = keys.values.get(key)
     rows = value if isinstance(value, list) else [None]
-    nested = bool(rows) and all(isinstance(row, list) for row in rows)
-    entries = [entry for row in rows for entry in row] if nested else rows
+    lists = [row for row in rows if isinstance(row, list)]
+    nested = bool(rows) and len(lists) == len(rows)
+    entries = [entry for row in lists for entry in row] if nested else rows
     for entry in entries:
         if isinstance(entry, bool) or not isinstance(entry, int | float) or not abs(entry) <= _ENTRY_MAX:
             found = shown(entry) if isinstance(value, list) else None
             raise keys.refuse(key, "matrix", allowed, "one list per row, every entry a number", found)
-    lengths = {len(row) for row in rows} if nested else {0}
+    lengths = {len(row) for row in lists} if nested else {0}
     shape = (len(rows), *lengths) if nested else (len(rows),)
     if len(lengths) != 1 or shape not in shapes:
         found = "rows of different lengths" if len(lengths) != 1 else "x".join(map(str, shape))

@@ -14,7 +14,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from tvsbayes.instrument.axes import APPROACH_SIGN, AXES, direction_of
+from tvsbayes.instrument.axes import APPROACH_SIGN, AXES, DIRECTIONS, direction_of
 from tvsbayes.instrument.campaign import Move
 
 
@@ -117,9 +117,40 @@ def observed_stops(moves: Sequence[Move], observed: Collection[int], axis: str) 
     return tuple(Stop(rest.segment, rest.steps, rest.sign) for rest in seen)
 
 
-INSEPARABLE, INSEPARABLE_ONE_LENGTH = 0.9, 0.7
-"""Correlation of ratio and backlash above which four fifths (half, where every leg has one length) of the ratio's
-variance is exchange with the backlash. Equal numbers of cleared and reversed legs of one length give 0.55."""
+FEW_STOPS = 12
+"""Fewer tell their own scatter so poorly that 1.96 standard deviations of it hold less than 93 % (Student's t)."""
+
+
+def few_stops(moves: Sequence[Move], observed: Collection[int]) -> dict[str, int]:
+    """Directions moved in with fewer than `FEW_STOPS` observed stops, and their number; see `observed_stops`."""
+    seen = Counter(direction_of(axis, stop.sign) for axis in AXES for stop in observed_stops(moves, observed, axis))
+    moved = legs_of(moves)
+    return {
+        direction: seen[direction] for direction in DIRECTIONS if direction in moved and seen[direction] < FEW_STOPS
+    }
+
+
+INSEPARABLE = 0.5
+"""Correlation of an effective ratio and its backlash, in a fit or in what a plan is expected to tell, from which a
+quarter of the ratio's variance is exchange with the backlash."""
+ALONE, ALONE_ONE_LENGTH = 0.9, 0.7
+"""The same in the moves alone, where neither cameras nor priors add to the ratio's variance and the correlation is
+larger: what is called inseparable here is so in the fit. Equal numbers of cleared and reversed legs of one length give
+0.55."""
+
+
+def inseparable(correlation: float) -> bool:
+    """Whether a ratio and its backlash are hard to tell apart, by their correlation in a fit or expected of a plan."""
+    return abs(correlation) >= INSEPARABLE
+
+
+def one_sided(stops: Sequence[Stop], axis: str) -> str | None:
+    """What is missing of the stops without which no campaign tells a ratio from its backlash, None if nothing is."""
+    if len({stop.steps for stop in stops}) < 2:
+        return f"the {axis} axis was seen at one counter only; look before and after moves of that axis"
+    if not {1, -1} <= {stop.sign for stop in stops}:
+        return f"every stop of the {axis} axis was reached from one side; reach some from the other"
+    return None
 
 
 def separation(stops: Sequence[Stop], axis: str) -> str | None:
@@ -131,12 +162,11 @@ def separation(stops: Sequence[Stop], axis: str) -> str | None:
     Returns:
         A sentence, or None if nothing stands in the way.
     """
+    missing = one_sided(stops, axis)
+    if missing is not None:
+        return missing
     steps = np.array([stop.steps for stop in stops], dtype=float)
     signs = np.array([stop.sign for stop in stops], dtype=float)
-    if len({stop.steps for stop in stops}) < 2:
-        return f"the {axis} axis was seen at one counter only; look before and after moves of that axis"
-    if not (np.any(signs > 0) and np.any(signs < 0)):
-        return f"every stop of the {axis} axis was reached from one side; reach some from the other"
     segments = np.array([stop.segment for stop in stops])
     zeros = (segments[:, None] == np.unique(segments)).astype(float)
     design = np.column_stack([steps / np.ptp(steps), -signs / 2, zeros])
@@ -151,7 +181,7 @@ def separation(stops: Sequence[Stop], axis: str) -> str | None:
     lengths = Counter(abs(b.steps - a.steps) for a, b in legs)
     if not lengths:
         return f"no leg of the {axis} axis was seen at both ends; look before and after moves of that axis"
-    if correlation < (INSEPARABLE_ONE_LENGTH if len(lengths) == 1 else INSEPARABLE):
+    if correlation < (ALONE_ONE_LENGTH if len(lengths) == 1 else ALONE):
         return None
     common = lengths.most_common(1)[0][0]
     only = f"only one |N| = {common}" if len(lengths) == 1 else f"nearly every leg has |N| = {common} and reverses"

@@ -1,7 +1,13 @@
-"""Looks that the rig can make, and what each adds."""
+"""Looks that the rig can make, and what each adds to what is known.
+
+`Looks` are plans whose every look is reached anew on both axes from a known side: their stop errors are independent and
+information adds up look by look; of the history only the length of the path remains (it carries the contrast of the two
+directions), and thousands of candidates are scored by low-rank updates. Counters in steps, angles in rad.
+"""
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -209,27 +215,113 @@ def overshoot_steps(knowledge: Knowledge) -> np.ndarray:
     return np.array(result)
 
 
-def _sided(positions: np.ndarray, sheets: np.ndarray, limits: np.ndarray, overshoot: np.ndarray) -> Looks:
-    """Positions (m, 2) on sheets (m,) from all four sides whose run-up stays inside the limits."""
+def sided(positions: Positions, limits: np.ndarray, overshoot: np.ndarray) -> Looks:
+    """Positions from all four sides whose run-up stays inside the limits (2, 2)."""
     found = []
-    for side in ((1, 1), (1, -1), (-1, 1), (-1, -1)):
-        start = positions - np.array(side) * overshoot
-        both = np.stack([positions, start])
+    for side in itertools.product((1, -1), repeat=2):
+        start = positions.steps - np.array(side) * overshoot
+        both = np.stack([positions.steps, start])
         good = np.all((both >= limits[:, 0]) & (both <= limits[:, 1]), axis=(0, 2))
-        found.append((positions[good], np.broadcast_to(side, (good.sum(), 2)), sheets[good]))
-    return Looks(*(np.concatenate(parts) for parts in zip(*found, strict=True)))
+        sides = np.tile(np.array(side), (int(good.sum()), 1))
+        found.append(Looks(positions.steps[good], sides, positions.sheet[good]))
+    return Looks(*(np.concatenate([getattr(part, name) for part in found]) for name in ("steps", "side", "sheet")))
 
 
-def _allowed(stated: CounterLimits) -> tuple[np.ndarray, list[str]]:
+@dataclass(frozen=True)
+class Positions:
+    """Counters (pan, tilt), shape (m, 2), each on a sheet, shape (m,)."""
+
+    steps: np.ndarray
+    sheet: np.ndarray
+
+    @classmethod
+    def grid(cls, window: np.ndarray, counts: tuple[int, int], sheets: int) -> Positions:
+        """Even levels of (pan, tilt) over a window (2, 2) of lowest and highest counters, on every sheet."""
+        levels = [np.unique(np.linspace(low, high, n).round()) for (low, high), n in zip(window, counts, strict=True)]
+        pan, tilt, sheet = np.meshgrid(*levels, np.arange(sheets), indexing="ij")
+        return cls(np.stack([pan.ravel(), tilt.ravel()], 1).astype(int), sheet.ravel())
+
+    def __getitem__(self, chosen: np.ndarray) -> Positions:
+        return Positions(self.steps[chosen], self.sheet[chosen])
+
+    def also(self, pan_turns: Sequence[int]) -> Positions:
+        """These, and the same so many steps of pan away."""
+        moved = [self.steps, *(self.steps + np.array([turn, 0]) for turn in pan_turns)]
+        return Positions(np.concatenate(moved), np.tile(self.sheet, len(moved)))
+
+    def visible(self, knowledge: Knowledge, points: np.ndarray) -> np.ndarray:
+        """Share of instruments at points (n, p) whose images both show the spot, shape (m,)."""
+        arrays = LookArrays(Looks(self.steps, np.ones_like(self.steps), self.sheet), knowledge, False)
+        return np.mean([arrays.at(z, knowledge.space).seen for z in points], axis=0)
+
+
+@dataclass(frozen=True)
+class Allowed:
+    """Lowest and highest counter of (pan, tilt), shape (2, 2), and notes where the rig file states none."""
+
+    limits: np.ndarray
+    notes: tuple[str, ...]
+
+
+def allowed(stated: CounterLimits) -> Allowed:
+    """What the rig file states, else the limits of the grid protocol."""
     limits = stated.within(UNSTATED_STEPS)
-    notes = []
-    if stated.unstated:
-        ranges = ", ".join(f"{axis} {low} to {high}" for axis, (low, high) in limits.items())
-        notes.append(
-            f"[positioner] does not state {', '.join(stated.unstated)}: counters stay within {ranges}; wider limits "
-            "would allow longer travel, and full turns"
+    steps = np.array([limits[axis] for axis in AXES])
+    if not stated.unstated:
+        return Allowed(steps, ())
+    ranges = ", ".join(f"{axis} {low} to {high}" for axis, (low, high) in limits.items())
+    note = (
+        f"[positioner] does not state {', '.join(stated.unstated)}: counters stay within {ranges}; wider limits would "
+        "allow longer travel, and full turns"
+    )
+    return Allowed(steps, (note,))
+
+
+def _box_in_view(knowledge: Knowledge, limits: np.ndarray, ratio: np.ndarray) -> np.ndarray:
+    """Lowest and highest counter of (pan, tilt) that both cameras see at the most probable instrument, shape (2, 2)."""
+    reach = REACH_DEG / np.abs(ratio)
+    window = np.stack([np.maximum(limits[:, 0], -reach), np.minimum(limits[:, 1], reach)], axis=1)
+    coarse = Positions.grid(window, (COARSE_PAN, COARSE_TILT), len(knowledge.sheets))
+    seen = coarse.steps[coarse.visible(knowledge, knowledge.z[None]) > 0]
+    if not len(seen):
+        raise InputError(
+            "out-of-view",
+            "no counters within the limits put the spot into both images on any sheet",
+            file="rig.toml",
+            column="rig.prior",
+            remedy="check the extrinsics in [rig.prior], the sheets' X and the limits in [positioner]",
         )
-    return np.array([limits[axis] for axis in AXES]), notes
+    return np.stack([seen.min(axis=0), seen.max(axis=0)], axis=1)
+
+
+@dataclass(frozen=True)
+class _InView:
+    """Positions that drawn instruments see, and notes on those that were left out."""
+
+    positions: Positions
+    notes: tuple[str, ...]
+
+
+def _in_view(knowledge: Knowledge, box: np.ndarray, turns: Sequence[int], half_turn: float) -> _InView:
+    """Positions of a box (2, 2) and full turns away from it that `VISIBLE_SHARE` of drawn instruments see."""
+    positions = Positions.grid(box, (PAN_LEVELS, TILT_LEVELS), len(knowledge.sheets)).also(turns)
+    share = positions.visible(knowledge, draws_of(knowledge, VISIBILITY_DRAWS, np.random.default_rng(23)))
+    good = share >= VISIBLE_SHARE
+    near = np.abs(positions.steps[:, 0] - box[0].mean()) < half_turn
+    notes = []
+    if turns and not (good & ~near).any():
+        notes.append(
+            "a full turn is allowed, but the ratio is not yet known well enough to find the spot after it: measure "
+            "first, then plan with --given"
+        )
+    if (good & near).sum() < 2 * LOOKS_PER_EXPERIMENT:
+        good = near & (positions.visible(knowledge, knowledge.z[None]) > 0)
+        notes.append(
+            "where the positioner stands is stated so loosely that looks may miss the images (as few as "
+            f"{100 * share[good].min(initial=1.0):.0f} % of drawn instruments see one): state the extrinsics, or "
+            "measure little and plan with --given"
+        )
+    return _InView(positions[good], tuple(notes))
 
 
 def candidates(knowledge: Knowledge) -> Candidates:
@@ -247,60 +339,16 @@ def candidates(knowledge: Knowledge) -> Candidates:
         raise InputError(
             "no-sheet", "the rig has no sheets to look at", file="rig.toml", column="sheets", remedy=remedy
         )
-    limits, notes = _allowed(rig.limits)
-    physical = physical_at(knowledge.z, knowledge.space).value
+    counters = allowed(rig.limits)
+    limits = counters.limits
+    physical = np.asarray(physical_at(knowledge.z, knowledge.space).value)
+    ratio = physical[[INDEX[f"degrees_per_step.{axis}"] for axis in AXES]]
     overshoot = overshoot_steps(knowledge)
-    ratio = physical[[INDEX["degrees_per_step.pan"], INDEX["degrees_per_step.tilt"]]]
-    reach = REACH_DEG / np.abs(ratio)
-    window = np.stack([np.maximum(limits[:, 0], -reach), np.minimum(limits[:, 1], reach)], axis=1)
-    sheets = np.arange(len(rig.sheets_mm))
-
-    def grid(pan: np.ndarray, tilt: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        pan, tilt, sheet = np.meshgrid(pan, tilt, sheets, indexing="ij")
-        return np.stack([pan.ravel(), tilt.ravel()], 1).astype(int), sheet.ravel()
-
-    def levels_of(axis: int, count: int, window: np.ndarray = window) -> np.ndarray:
-        return np.unique(np.linspace(*window[axis], count).round().astype(int))
-
-    def visible(positions: np.ndarray, sheet: np.ndarray, points: np.ndarray) -> np.ndarray:
-        arrays = LookArrays(Looks(positions, np.ones_like(positions), sheet), knowledge, False)
-        return np.mean([arrays.at(z, knowledge.space).seen for z in points], axis=0)
-
-    coarse, sheet = grid(levels_of(0, COARSE_PAN), levels_of(1, COARSE_TILT))
-    at_centre = visible(coarse, sheet, knowledge.z[None]) > 0
-    if not at_centre.any():
-        raise InputError(
-            "out-of-view",
-            "no counters within the limits put the spot into both images on any sheet",
-            file="rig.toml",
-            column="rig.prior",
-            remedy="check the extrinsics in [rig.prior], the sheets' X and the limits in [positioner]",
-        )
-    box = np.stack([coarse[at_centre].min(axis=0), coarse[at_centre].max(axis=0)], axis=1)
-    positions, sheet = grid(*(levels_of(axis, count, box) for axis, count in enumerate((PAN_LEVELS, TILT_LEVELS))))
-    turn = round(FULL_TURN_DEG / abs(ratio[0]))
-    turned = [
-        (positions + np.array([sign * turn, 0]), sheet)
-        for sign in (1, -1)
-        if limits[0, 0] <= box[0, 1] + sign * turn and box[0, 0] + sign * turn <= limits[0, 1]
-    ]
-    positions, sheet = (np.concatenate(x) for x in zip((positions, sheet), *turned, strict=True))
-    share = visible(positions, sheet, draws_of(knowledge, VISIBILITY_DRAWS, np.random.default_rng(23)))
-    good = share >= VISIBLE_SHARE
-    near = np.abs(positions[:, 0] - box[0].mean()) < 0.5 * turn
-    if turned and not (good & ~near).any():
-        notes.append(
-            "a full turn is allowed, but the ratio is not yet known well enough to find the spot after it: measure "
-            "first, then plan with --given"
-        )
-    if (good & near).sum() < 2 * LOOKS_PER_EXPERIMENT:
-        good = near & (visible(positions, sheet, knowledge.z[None]) > 0)
-        notes.append(
-            "where the positioner stands is stated so loosely that looks may miss the images (as few as "
-            f"{100 * share[good].min(initial=1.0):.0f} % of drawn instruments see one): state the extrinsics, or "
-            "measure little and plan with --given"
-        )
-    looks = _sided(positions[good], sheet[good], limits, overshoot)
+    box = _box_in_view(knowledge, limits, ratio)
+    turn = round(FULL_TURN_DEG / abs(float(ratio[0])))
+    turns = [n for n in (turn, -turn) if limits[0, 0] <= box[0, 1] + n and box[0, 0] + n <= limits[0, 1]]
+    view = _in_view(knowledge, box, turns, 0.5 * turn)
+    looks = sided(view.positions, limits, overshoot)
     if not len(looks):
         raise InputError(
             "limits",
@@ -311,4 +359,4 @@ def candidates(knowledge: Knowledge) -> Candidates:
             remedy="widen the limits in [positioner], or state backlash and ratio more closely in [rig.prior]",
         )
     away = np.abs(looks.steps[:, 0] - box[0].mean()) >= 0.5 * turn
-    return Candidates(looks, overshoot, limits, away, tuple(notes))
+    return Candidates(looks, overshoot, limits, away, (*counters.notes, *view.notes))

@@ -1,4 +1,10 @@
-"""What a plan will tell before it is run."""
+"""What a plan will tell before it is run: the expected Fisher information of its looks.
+
+The model says what the looks would show; the information of the priors (or of a fit) plus J^T C^-1 J of all looks gives
+the covariance that a fit will report. `information_of` judges any plan move by move, through the filter of the
+likelihood: shared stops, home offsets and unknown play as in a fit. Counters in steps, mm, rad; coordinates z have
+prior N(0, 1) each.
+"""
 
 from __future__ import annotations
 
@@ -69,7 +75,7 @@ class Knowledge:
     @property
     def sheets(self) -> tuple[str, ...]:
         """Names of the sheets, nearest first."""
-        return tuple(sorted(self.rig.sheets_mm, key=self.rig.sheets_mm.get))
+        return tuple(sorted(self.rig.sheets_mm, key=self.rig.sheets_mm.__getitem__))
 
 
 def prior_knowledge(rig: Rig) -> Knowledge:
@@ -239,6 +245,11 @@ class PlanInformation:
     minutes: float
     pose_rad: np.ndarray
 
+    @property
+    def seen_moves(self) -> set[int]:
+        """Moves after which a look is in both images."""
+        return {move for move, seen in zip(self.look_moves, self.expectation.seen, strict=True) if seen}
+
 
 def plan_minutes(steps: Sequence[PlanStep], rig: Rig) -> float:
     """Duration of a plan by `[costs]`, minutes."""
@@ -282,7 +293,7 @@ def information_of(
             log.moves, look_moves, rig, homed_from=0 if knowledge.after_data else 1, aperture=aperture
         )
         found = expected_information(arrays, depth, rig, knowledge.z if z is None else z, space or knowledge.space)
-    rows = found.rows[..., :PARAMETERS].reshape(-1, PARAMETERS)
-    seen = found.seen if found.seen.any() else np.ones(len(depth), dtype=bool)
-    pose = found.mirror_angles_rad[seen].mean(axis=0)
+    rows = np.asarray(found.rows)[..., :PARAMETERS].reshape(-1, PARAMETERS)
+    seen = np.asarray(found.seen) if found.seen.any() else np.ones(len(depth), dtype=bool)
+    pose = np.asarray(found.mirror_angles_rad)[seen].mean(axis=0)
     return PlanInformation(rows.T @ rows, found, tuple(log.moves), look_moves, plan_minutes(steps, rig), pose)

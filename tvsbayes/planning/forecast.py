@@ -1,4 +1,8 @@
-"""Drawn rigs: the chance that the joint or the classic estimator meets the target."""
+"""Drawn rigs: the chance that the joint fit of a design meets the target, and what the classic estimator would do.
+
+An instrument is drawn from `[truth]` of the rig file, or from the posterior of a campaign. Values in the target's unit,
+the classic's in deg/step.
+"""
 
 from __future__ import annotations
 
@@ -179,6 +183,10 @@ class Assurance:
         self._values |= found
         return {n: self._values[n] for n in sizes}
 
+    def met_share(self, experiments: int) -> float:
+        """Share of the truths whose fit of n experiments reports the target as met."""
+        return float(np.mean(self.values([experiments])[experiments] <= self.target.limit))
+
     def _reported(
         self, truth: DrawnTruth, noise: np.ndarray, seen: Seen, at_truth: Sensitivity, n: int, design: Arranged
     ) -> float:
@@ -244,7 +252,7 @@ def classic_forecast(knowledge: Knowledge, truths: Sequence[DrawnTruth]) -> Clas
     sds, errors = [], []
     first = None
     for truth in truths[:CLASSIC_DRAWS]:
-        physical = physical_at(truth.z, truth.space).value
+        physical = np.asarray(physical_at(truth.z, truth.space).value)
         parameters = dict(zip(NAMES, map(float, physical), strict=True))
         quiet = dict.fromkeys([f"stop_sd_deg.{d}" for d in DIRECTIONS] + ["pixel_scale"], 0.0)
         stereo = rig.stereo.with_vector(physical[len(RIG_NAMES) :])
@@ -252,26 +260,27 @@ def classic_forecast(knowledge: Knowledge, truths: Sequence[DrawnTruth]) -> Clas
         selection = select_experiments(run.campaign)
         # The second of each direction: its start is reached as all later ones are.
         later = np.flatnonzero(selection.experiments % 2 == 1)
-        if len(later) < len(DIRECTIONS):
+        pose = run.truth.reference_pose_deg
+        if len(later) < len(DIRECTIONS) or pose is None:
             continue
         pixels, steps, axis = selection.pixels[later], selection.steps[later], selection.axis[later]
         moved = np.concatenate([pixels[None], pixels + PROBE_PX * np.eye(16).reshape(16, 1, 4, 4)])
         flat = four_point_ratios(moved.reshape(-1, 4, 4), np.tile(steps, 17), np.tile(axis, 17), rig.stereo)
         ratios = flat.reshape(17, 4)
         by_pixel = np.sum(((ratios[1:] - ratios[0]) / PROBE_PX) ** 2, axis=0)
-        effective = effective_deg_per_step(with_derived(parameters), run.truth.reference_pose_deg)
+        effective = effective_deg_per_step(with_derived(parameters), pose)
         true = np.array([effective[d] for d in DIRECTIONS])
         stops = np.array([parameters[f"stop_sd_deg.{d}"] ** 2 for d in DIRECTIONS])
         pair = stops + stops[[1, 0, 3, 2]]
-        spot_sd = rig.cameras["spot_sd_px"] * parameters["pixel_scale"]
+        spot_sd = float(rig.cameras["spot_sd_px"]) * parameters["pixel_scale"]
         variance = by_pixel * spot_sd**2 + pair * (ratios[0] / true / steps) ** 2
         sds.append(np.sqrt(variance))
         errors.append(ratios[0] - true)
         first = run.campaign if first is None else first
     if first is None:
         return None
-    found = classic(first).directions
-    stereo_u = np.array([found[d].u_stereo_deg_per_step for d in DIRECTIONS])
+    # Every direction has its experiments, else the draw was left out.
+    stereo_u = np.array([r.u_stereo_deg_per_step for r in classic(first).directions.values() if r is not None])
     return ClassicForecast(np.array(sds), np.array(errors), stereo_u)
 
 

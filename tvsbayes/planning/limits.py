@@ -1,10 +1,10 @@
-"""What no further look improves, and when to stop."""
+"""What no further look improves, what input would, the next looks, and when to stop. Values in the target's unit."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -170,15 +170,14 @@ def next_experiments(
     now: float,
 ) -> tuple[Batch, ...]:
     """Four looks at every sheet, chosen from all candidates and from those a full turn away, by gain per minute."""
-    search = search_designs(knowledge, seen, at_centre.gradient, at_centre.own_variance, "c")
+    search = search_designs(knowledge, seen, at_centre)
     batches = []
     for number in range(len(knowledge.sheets)):
         for turned in (False, True):
             here = (found.looks.sheet == number) & (found.turned | (not turned))
             if not here.any():
                 continue
-            part = replace(search, rows=np.where(here[:, None, None], search.rows, 0.0))
-            picks = np.array(part.greedy(LOOKS_PER_EXPERIMENT))
+            picks = np.array(search.among(here).greedy(LOOKS_PER_EXPERIMENT))
             design = arrange(found.looks[picks], knowledge.sheets, found.overshoot)
             information = information_of_looks(seen, picks, design.path, knowledge.space, knowledge.after_data)
             after = at_centre.value(covariance_of(knowledge.precision + information), target.factor)

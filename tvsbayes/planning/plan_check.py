@@ -1,4 +1,8 @@
-"""Faults of a plan and their cure."""
+"""What a plan cannot tell apart, in words, and the smallest addition that cures it.
+
+Judged at the most probable instrument by the same rules as a fit is (`stops.inseparable`, `stops.few_stops`). Counters
+in steps, u of the ratios in deg/step, minutes by the rig's `[costs]`.
+"""
 
 from __future__ import annotations
 
@@ -11,22 +15,20 @@ import jax.numpy as jnp
 import numpy as np
 
 from tvsbayes.errors import InputError
-from tvsbayes.instrument.axes import AXES
+from tvsbayes.instrument.axes import AXES, SENSES, Axis
 from tvsbayes.instrument.campaign import Move
 from tvsbayes.instrument.counter_limits import CounterLimits
+from tvsbayes.instrument.parameters import INDEX
 from tvsbayes.instrument.plan import PlanStep, described, run_plan, step_json
 from tvsbayes.instrument.rig import Rig
-from tvsbayes.instrument.stops import observed_stops, separation
+from tvsbayes.instrument.stops import Stop, few_stops, inseparable, observed_stops, one_sided, separation
 from tvsbayes.model.headlines import QUANTITIES, headlines
 from tvsbayes.planning.candidates import Candidates, LookArrays, Looks, arrange, candidates, covariance_of
 from tvsbayes.planning.expectation import PARAMETERS, Knowledge, PlanInformation, information_of, prior_knowledge
 from tvsbayes.planning.search import Search
 from tvsbayes.results.estimates import CONTRACTION_LIMIT
 
-EXCHANGE_SHARE = 0.5
-"""A ratio and a backlash are hard to tell apart where more than this share of the ratio's variance is exchange with
-the backlash: knowing the backlash would then lower u of the ratio by 30 % and more."""
-CURE_LOOKS = 12
+CURE_LOOKS = 24
 """Looks beyond which an addition is no small cure."""
 
 
@@ -35,13 +37,13 @@ class PlanFault:
     """Something that a plan leaves to the priors, and the smallest addition that cures it.
 
     Attributes:
-        axis: pan, tilt, or "depth".
+        axis: pan or tilt.
         text: in words.
         addition: steps to append to the plan, empty where none was found.
         before, after: u of the worst effective ratio of the axis without and with it, deg/step.
     """
 
-    axis: str
+    axis: Axis
     text: str
     addition: tuple[PlanStep, ...]
     before: float
@@ -81,29 +83,29 @@ class PlanCheck:
 
 
 @dataclass(frozen=True)
-class _Judged:
-    """Covariance of the headlines after a plan, shape (9, 9), and what separates ratio and backlash of each axis."""
+class Judged:
+    """What a plan tells of the headlines: their covariance, shape (9, 9), gradients and prior variances, shape (9,)."""
 
     information: PlanInformation
     covariance: np.ndarray
     gradient: np.ndarray
     prior: np.ndarray
 
-    def rows(self, axis: str) -> list[int]:
+    def rows(self, axis: Axis) -> list[int]:
         """Rows of the ratio and of the backlash of an axis."""
-        return [QUANTITIES.index("left" if axis == "pan" else "up"), QUANTITIES.index(f"backlash.{axis}")]
+        return [QUANTITIES.index(SENSES[axis][0]), QUANTITIES.index(f"backlash.{axis}")]
 
-    def exchange(self, axis: str) -> float:
-        """Share of the ratio's variance that knowing the backlash would remove."""
+    def exchange(self, axis: Axis) -> float:
+        """Correlation of ratio and backlash of an axis: its square is the share of variance that they exchange."""
         ratio, lost = self.rows(axis)
         c = self.covariance
         if self.prior[lost] == 0:
             return 0.0
-        return float(c[ratio, lost] ** 2 / (c[ratio, ratio] * c[lost, lost]))
+        return float(c[ratio, lost] / np.sqrt(c[ratio, ratio] * c[lost, lost]))
 
-    def u(self, axis: str) -> float:
+    def u(self, axis: Axis) -> float:
         """Of the worse effective ratio of an axis, deg/step."""
-        rows = [0, 1] if axis == "pan" else [2, 3]
+        rows = [QUANTITIES.index(direction) for direction in SENSES[axis]]
         return float(np.sqrt(np.diag(self.covariance)[rows].max()))
 
     def contraction(self) -> np.ndarray:
@@ -111,21 +113,45 @@ class _Judged:
         left = np.diag(self.covariance)
         return 1 - np.divide(left, self.prior, out=np.full(len(left), np.nan), where=self.prior > 0)
 
-    def faulty(self, axis: str) -> bool:
-        """The axis' ratio or backlash is the prior's, or they exchange."""
-        return bool(
-            (self.contraction()[self.rows(axis)] < CONTRACTION_LIMIT).any() or self.exchange(axis) > EXCHANGE_SHARE
-        )
+    def stops(self, axis: Axis) -> tuple[Stop, ...]:
+        """Those that are seen."""
+        return observed_stops(self.information.moves, self.information.seen_moves, axis)
+
+    def together(self, axis: Axis) -> str:
+        """That ratio and backlash of the axis move together."""
+        share = 100 * self.exchange(axis) ** 2
+        return f"{axis} ratio and {axis} backlash cannot be told apart well ({share:.0f} % of the variance is common)"
+
+    def fault(self, axis: Axis) -> str | None:
+        """What the plan leaves open of the axis in words: its ratio or backlash is the prior's, or they exchange."""
+        ratio, lost = self.contraction()[self.rows(axis)]
+        stops = self.stops(axis)
+        free = self.prior[self.rows(axis)[1]] > 0
+        if ratio < CONTRACTION_LIMIT:
+            text = f"the plan tells nothing of the {axis} ratio"
+        elif lost < CONTRACTION_LIMIT:
+            text = f"the plan tells nothing of the {axis} backlash"
+        elif inseparable(self.exchange(axis)) or (free and one_sided(stops, axis) is not None):
+            text = self.together(axis)
+        else:
+            return None
+        reason = separation(stops, axis)
+        return text if reason is None else f"{text}: {reason}"
 
 
-def _judge(steps: Sequence[PlanStep], knowledge: Knowledge) -> _Judged:
-    found = information_of(steps, knowledge)
+def judge(steps: Sequence[PlanStep], knowledge: Knowledge, *, aperture: bool = False) -> Judged:
+    """What a plan will tell of the headlines at the most probable instrument.
+
+    Raises:
+        InputError: a plan that looks at nothing or places an unknown sheet.
+    """
+    found = information_of(steps, knowledge, aperture=aperture)
     with jax.enable_x64(True):
         at = headlines(jnp.asarray(knowledge.z), knowledge.space, jnp.asarray(found.pose_rad))
     gradient = np.asarray(at.gradient)
     covariance = gradient @ covariance_of(knowledge.precision + found.fisher) @ gradient.T
     prior = np.einsum("qi,ij,qj->q", gradient, knowledge.covariance, gradient)
-    return _Judged(found, covariance, gradient, prior)
+    return Judged(found, covariance, gradient, prior)
 
 
 def extended(
@@ -139,29 +165,18 @@ def extended(
     return tuple(replace(s, step=len(steps) + k) for k, s in enumerate(more))
 
 
-def _fault_text(plan: _Judged, axis: str) -> str:
-    """What a faulty axis leaves open."""
-    ratio, lost = plan.contraction()[plan.rows(axis)]
-    if ratio < CONTRACTION_LIMIT:
-        return f"the plan tells nothing of the {axis} ratio"
-    if lost < CONTRACTION_LIMIT:
-        return f"the plan tells nothing of the {axis} backlash"
-    share = 100 * plan.exchange(axis)
-    return f"{axis} ratio and {axis} backlash cannot be told apart well ({share:.0f} % of the variance is common)"
-
-
 @dataclass(frozen=True)
 class _Cure:
     """Steps to append to a plan, and what it is then."""
 
     addition: tuple[PlanStep, ...]
-    after: _Judged
+    after: Judged
 
 
 def _cure(
-    steps: Sequence[PlanStep], knowledge: Knowledge, found: Candidates, axis: str, before: _Judged
+    steps: Sequence[PlanStep], knowledge: Knowledge, found: Candidates, axis: Axis, before: Judged
 ) -> _Cure | None:
-    """Fewest looks after which the axis is no longer faulty, on the sheet that stands; None if there are none."""
+    """Fewest looks after which the axis has no fault, on the sheet that stands; None if there are none."""
     seen = LookArrays(found.looks, knowledge, False).at(knowledge.z, knowledge.space)
     rows = before.rows(axis)
     own = np.zeros(len(rows))
@@ -169,12 +184,11 @@ def _cure(
     search = Search(seen.rows[..., :PARAMETERS], precision, before.gradient[rows], own, "A")
     placed = run_plan(steps, knowledge.rig).sheet
     here = found.looks.sheet == (knowledge.sheets.index(placed) if placed in knowledge.sheets else 0)
-    part = replace(search, rows=np.where(here[:, None, None], search.rows, 0.0))
-    picks = np.array(part.greedy(CURE_LOOKS))
+    picks = np.array(search.among(here).greedy(CURE_LOOKS))
     for count in range(1, CURE_LOOKS + 1):
         addition = extended(steps, found.looks[picks[:count]], knowledge, found.overshoot)
-        after = _judge((*steps, *addition), knowledge)
-        if not after.faulty(axis):
+        after = judge((*steps, *addition), knowledge)
+        if after.fault(axis) is None:
             return _Cure(addition, after)
     return None
 
@@ -190,6 +204,30 @@ def beyond_limits(limits: CounterLimits, moves: Sequence[Move]) -> list[str]:
     return found
 
 
+def _fault(
+    steps: Sequence[PlanStep], knowledge: Knowledge, found: Candidates | None, plan: Judged, axis: Axis, text: str
+) -> PlanFault:
+    """A fault with its smallest cure, if candidates were found among which to seek one."""
+    before = plan.u(axis)
+    if found is None:
+        return PlanFault(axis, text, (), before, None)
+    cure = _cure(steps, knowledge, found, axis, plan)
+    if cure is None:
+        return PlanFault(axis, f"{text}; no {CURE_LOOKS} looks cure it on this rig", (), before, None)
+    looks, after = sum(s.action == "look" for s in cure.addition), cure.after.u(axis)
+    more = f"{looks} more look{'s' * (looks != 1)}, {described(knowledge.rig, cure.addition, steps)}"
+    text += f"; smallest cure: {more}: u of the {axis} ratio {before:.2g} -> {after:.2g} deg/step"
+    return PlanFault(axis, text, cure.addition, before, after)
+
+
+def _few_stops(knowledge: Knowledge, plan: Judged) -> list[str]:
+    """Directions whose stops will hardly tell their own scatter, as a sentence."""
+    few = few_stops(plan.information.moves, plan.information.seen_moves)
+    free = np.asarray(knowledge.space.u) > 0
+    named = ", ".join(f"{name} {count}" for name, count in few.items() if free[INDEX[f"stop_sd_deg.{name}"]])
+    return [f"few stops ({named}): they will hardly tell their own scatter; add stops"] if named else []
+
+
 def check_plan(rig: Rig, steps: Sequence[PlanStep]) -> PlanCheck:
     """What a plan on a rig cannot tell apart, in words, and the smallest addition that would (DESIGN 6).
 
@@ -201,56 +239,38 @@ def check_plan(rig: Rig, steps: Sequence[PlanStep]) -> PlanCheck:
         InputError: a plan that looks at nothing or places an unknown sheet.
     """
     knowledge = prior_knowledge(rig)
-    judged_plan = _judge(steps, knowledge)
-    information = judged_plan.information
-    contraction = judged_plan.contraction()
-    observed = {move for move, seen in zip(information.look_moves, information.expectation.seen, strict=True) if seen}
-    warnings, faults = [], []
-    missed = int((~information.expectation.seen).sum())
-    if missed:
-        warnings.append(
-            f"{missed} of {len(information.look_moves)} looks miss an image at the most probable instrument"
-        )
+    plan = judge(steps, knowledge)
+    information = plan.information
+    looks, seen = len(information.look_moves), int(information.expectation.seen.sum())
+    warnings = []
+    if seen < looks:
+        warnings.append(f"{looks - seen} of {looks} looks miss an image at the most probable instrument")
     warnings += beyond_limits(rig.limits, information.moves)
-    faulty = [axis for axis in AXES if judged_plan.faulty(axis)]
     found = None
-    if faulty:
+    texts = {axis: text for axis in AXES if (text := plan.fault(axis)) is not None}
+    if texts:
         try:
             found = candidates(knowledge)
         except InputError as error:
             warnings.append(f"no cure can be sought on this rig: {error.message}")
-    for axis in faulty:
-        reason = separation(observed_stops(information.moves, observed, axis), axis)
-        text = _fault_text(judged_plan, axis) + (f": {reason}" if reason else "")
-        cure = None if found is None else _cure(steps, knowledge, found, axis, judged_plan)
-        before = judged_plan.u(axis)
-        if cure is not None:
-            looks, after = sum(s.action == "look" for s in cure.addition), cure.after.u(axis)
-            text += (
-                f"; smallest cure: {looks} more look{'s' * (looks != 1)}, {described(rig, cure.addition, steps)}: u of the "
-                f"{axis} ratio {before:.2g} -> {after:.2g} deg/step"
-            )
-            faults.append(PlanFault(axis, text, cure.addition, before, after))
-        else:
-            text += f"; no {CURE_LOOKS} looks cure it on this rig" if found is not None else ""
-            faults.append(PlanFault(axis, text, (), before, None))
-        warnings.append(text)
+    faults = tuple(_fault(steps, knowledge, found, plan, axis, text) for axis, text in texts.items())
+    warnings += [fault.text for fault in faults]
+    warnings += _few_stops(knowledge, plan)
     depths = {s.target for s in steps if s.action == "place"}
     if len({rig.sheets_mm[name] for name in depths}) == 1 and len(rig.sheets_mm) > 1:
         warnings.append(
             "all looks are at one depth: a second sheet position sharpens ratios; place "
             + ", ".join(name for name in knowledge.sheets if name not in depths)
         )
-    u = np.sqrt(np.diag(judged_plan.covariance))
+    u, shares = np.sqrt(np.diag(plan.covariance)), plan.contraction()
     return PlanCheck(
-        looks=len(information.look_moves),
-        seen=len(information.look_moves) - missed,
+        looks=looks,
+        seen=seen,
         minutes=information.minutes,
         expected=dict(zip(QUANTITIES, map(float, u), strict=True)),
         contraction={
-            name: None if math.isnan(share) else float(share)
-            for name, share in zip(QUANTITIES, contraction, strict=True)
+            name: None if math.isnan(share) else float(share) for name, share in zip(QUANTITIES, shares, strict=True)
         },
-        faults=tuple(faults),
+        faults=faults,
         warnings=tuple(warnings),
     )

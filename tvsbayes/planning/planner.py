@@ -1,8 +1,6 @@
-"""How many looks, which ones, and when to stop; what a plan cannot separate (DESIGN 6 and 8).
+"""How many looks, which ones, and when to stop: the cheapest plan that meets a target, and how sure it is to.
 
-`plan` searches the cheapest plan that meets a target (`tvsbayes.design`) and says with which probability it will, over
-draws of the instrument; `check_plan` says in words what a plan leaves together. Units are those of DESIGN 8, minutes
-by the rig's `[costs]`.
+Values in the target's unit, minutes by the rig's `[costs]`; an experiment is four looks.
 """
 
 from __future__ import annotations
@@ -21,10 +19,20 @@ from tvsbayes.instrument.campaign import Campaign
 from tvsbayes.instrument.plan import PlanStep, step_json
 from tvsbayes.instrument.protocols import grid_protocol, mixed_protocol, paper_protocol
 from tvsbayes.instrument.rig import Rig
-from tvsbayes.planning.candidates import LookArrays, Looks, candidates, covariance_of, information_of_looks
+from tvsbayes.instrument.stops import FEW_STOPS, inseparable
+from tvsbayes.planning.candidates import (
+    Candidates,
+    LookArrays,
+    Looks,
+    Seen,
+    candidates,
+    covariance_of,
+    information_of_looks,
+)
 from tvsbayes.planning.expectation import (
     Expectation,
     Knowledge,
+    PlanInformation,
     information_of,
     knowledge_of,
     plan_minutes,
@@ -34,13 +42,15 @@ from tvsbayes.planning.forecast import (
     Assurance,
     ClassicAnswer,
     ClassicForecast,
+    Family,
     classic_answer,
     classic_forecast,
     value_of_classic,
 )
 from tvsbayes.planning.limits import Advice, Batch, Limit, limit_of, next_experiments, split_of, stop_now
-from tvsbayes.planning.search import LADDER, design_family, refine, smallest_design
-from tvsbayes.planning.target import Target, sensitivity
+from tvsbayes.planning.plan_check import judge
+from tvsbayes.planning.search import LADDER, Scope, design_family, refine, smallest_design
+from tvsbayes.planning.target import Sensitivity, Target, sensitivity
 from tvsbayes.statistics.intervals import ASSURED, share_error
 
 
@@ -141,9 +151,6 @@ class PlanResult:
 
 
 PLAN_DRAWS = 200
-STOPS_ADVISED = 6
-"""Stops of a direction below which its stop sd is known no better than to 30 % (1 / sqrt(2 n)): Laplace intervals of
-that axis are then too short, and the sampler may not converge."""
 
 
 def _baselines(knowledge: Knowledge, target: Target, aperture: bool, pose_rad: np.ndarray | None) -> list[Baseline]:
@@ -151,22 +158,19 @@ def _baselines(knowledge: Knowledge, target: Target, aperture: bool, pose_rad: n
     sheets = knowledge.sheets
     plans: dict[str, tuple[PlanStep, ...]] = {}
     if len(sheets) > 1:
-        plans["paper"] = paper_protocol(targets=sheets[:2])
-        plans["mixed"] = mixed_protocol(targets=sheets[:2])
+        pair = sheets[0], sheets[1]
+        plans = {"paper": paper_protocol(targets=pair), "mixed": mixed_protocol(targets=pair)}
     plans["grid"] = grid_protocol(targets=sheets[:3])
-    return [judged(name, steps, knowledge, target, aperture, pose_rad) for name, steps in plans.items()]
+    return [
+        judged(name, information_of(steps, knowledge, aperture=aperture), knowledge, target, pose_rad)
+        for name, steps in plans.items()
+    ]
 
 
 def judged(
-    name: str,
-    steps: Sequence[PlanStep],
-    knowledge: Knowledge,
-    target: Target,
-    aperture: bool,
-    pose_rad: np.ndarray | None = None,
+    name: str, found: PlanInformation, knowledge: Knowledge, target: Target, pose_rad: np.ndarray | None = None
 ) -> Baseline:
     """One plan at the most probable instrument; ratios hold at `pose_rad`, by default the plan's own, as in a fit."""
-    found = information_of(steps, knowledge, aperture=aperture)
     pose = found.pose_rad if pose_rad is None else pose_rad
     at = sensitivity(target, knowledge.z, knowledge.space, knowledge.rig.table, pose)
     value = at.value(covariance_of(knowledge.precision + found.fisher), target.factor)
@@ -209,9 +213,9 @@ def plan(
     if given is not None and not given.converged:
         raise NotConverged("not-converged", "NOT CONVERGED: " + "; ".join(given.problems), remedy="see `tvsbayes fit`")
     knowledge = prior_knowledge(rig) if given is None else knowledge_of(given, rig)
-    options = {"criterion": criterion, "aperture": aperture, "largest": largest, "minutes": minutes}
     campaign, pose = (None, None) if given is None else (given.campaign, given.reference_pose_rad)
-    return plan_from(knowledge, target, campaign, pose, draws=draws, seed=seed, **options)
+    scope = Scope(criterion, aperture, largest, minutes)
+    return plan_from(knowledge, target, campaign, pose, scope=scope, draws=draws, seed=seed)
 
 
 def _curve(
@@ -233,35 +237,41 @@ def _curve(
     return tuple(rows)
 
 
-def few_stops(looks: Looks) -> list[str]:
-    """Directions that a design reaches so rarely that a fit can say little about them, as notes."""
+def few_looks(looks: Looks, target: Target) -> list[str]:
+    """Directions that a design reaches so rarely that a fit can say little about them, as notes.
+
+    Every look of a design is a stop of its own.
+    """
     notes = []
     for direction, (axis, sign) in DIRECTION_SIGNS.items():
         stops = int(np.sum(looks.side[:, AXES.index(axis)] == sign))
-        if stops < STOPS_ADVISED:
-            reached = f"{stops} stop{'s' * (stops != 1)} {direction}"
-            notes.append(
-                f"only {reached}: this plan is for its target alone; for reliable intervals of {direction} plan "
-                "u(worst), which asks for every direction"
-            )
+        if stops < FEW_STOPS:
+            reached = f"only {stops} stop{'s' * (stops != 1)} {direction}"
+            cure = "plan u(worst), which asks for every direction"
+            if target.quantity == "worst":
+                cure = f"look more often: {FEW_STOPS} stops tell their own scatter"
+            notes.append(f"{reached}: this plan is for its target alone; for reliable intervals of {direction} {cure}")
     return notes
 
 
-def plan_from(
-    knowledge: Knowledge,
-    target: Target,
-    campaign: Campaign | None = None,
-    pose_rad: np.ndarray | None = None,
-    *,
-    criterion: str,
-    aperture: bool,
-    largest: int,
-    minutes: float | None,
-    draws: int,
-    seed: int,
-) -> PlanResult:
-    """`plan` from what is known; effective ratios hold at `pose_rad`, by default in the middle of the candidates."""
-    rig, after_data = knowledge.rig, knowledge.after_data
+@dataclass(frozen=True)
+class _Question:
+    """What is asked of a search: the candidates, what they show at the most probable instrument, and the target there.
+
+    Attributes:
+        found: candidates.
+        seen: what they show.
+        at_centre: how the target hangs on the coordinates.
+        now: the target's value before any further look.
+    """
+
+    found: Candidates
+    seen: Seen
+    at_centre: Sensitivity
+    now: float
+
+
+def _question(knowledge: Knowledge, target: Target, pose_rad: np.ndarray | None, aperture: bool) -> _Question:
     found = candidates(knowledge)
     seen = LookArrays(found.looks, knowledge, aperture).at(knowledge.z, knowledge.space)
     pose = seen.mirror_angles_rad.mean(axis=0) if pose_rad is None else pose_rad
@@ -276,10 +286,13 @@ def plan_from(
             allowed="a quantity that is to be estimated",
             remedy="state u > 0 for it in [rig.prior], or another target",
         )
-    options = {"criterion": criterion, "aperture": aperture, "largest": largest, "minutes": minutes}
-    family = design_family(knowledge, found, seen, target, at_centre, **options)
-    durations = {n: plan_minutes(family.arranged(n).steps, rig) for n in range(1, largest + 1)}
-    allowed = [n for n in durations if minutes is None or durations[n] <= minutes]
+    return _Question(found, seen, at_centre, now)
+
+
+def _durations(family: Family, scope: Scope) -> dict[int, float]:
+    """Minutes of every number of experiments that the time allows."""
+    durations = {n: plan_minutes(family.arranged(n).steps, family.knowledge.rig) for n in range(1, scope.largest + 1)}
+    allowed = {n: minutes for n, minutes in durations.items() if scope.minutes is None or minutes <= scope.minutes}
     if not allowed:
         raise InputError(
             "minutes",
@@ -288,72 +301,97 @@ def plan_from(
             allowed=f"at least {durations[1]:.1f}",
             remedy="allow more minutes, or lower [costs] if the machine is faster",
         )
-    sizes = sorted({n for n in LADDER if n <= allowed[-1]} | {allowed[-1]})
-    assurance = Assurance(family, target, draws, seed)
+    return allowed
 
-    def met_share(n: int) -> float:
-        return float(np.mean(assurance.values([n])[n] <= target.limit))
 
+@dataclass(frozen=True)
+class _Size:
+    """How many experiments: those of the curve, and the smallest numbers with an assurance of 80 % and 95 %."""
+
+    curve: tuple[CurvePoint, ...]
+    n80: int | None
+    n95: int | None
+    experiments: int
+
+
+def _size(assurance: Assurance, forecast: ClassicForecast | None, durations: Mapping[int, float]) -> _Size:
+    largest = max(durations)
+    sizes = sorted({n for n in LADDER if n <= largest} | {largest})
     assurance.values(sizes)
-    n80, n95 = (smallest_design(lambda n, level=level: met_share(n) >= level, sizes) for level in ASSURED)
-    experiments = n95 or n80 or allowed[-1]
-    forecast = classic_forecast(knowledge, assurance.truths)
+
+    def smallest(level: float) -> int | None:
+        return smallest_design(lambda n: assurance.met_share(n) >= level, sizes)
+
+    n80, n95 = map(smallest, ASSURED)
     curve = _curve(assurance, forecast, durations, [*sizes, *(n for n in (n80, n95) if n)])
-    refined = refine(family, seen, target, at_centre, experiments, criterion, minutes, assurance)
-    final = refined.family
-    design = final.arranged(experiments)
-    exact = information_of(design.steps, knowledge, aperture=aperture)
-    chosen = judged("planned", design.steps, knowledge, target, aperture, pose_rad)
+    return _Size(curve, n80, n95, n95 or n80 or largest)
+
+
+def plan_from(
+    knowledge: Knowledge,
+    target: Target,
+    campaign: Campaign | None = None,
+    pose_rad: np.ndarray | None = None,
+    *,
+    scope: Scope,
+    draws: int,
+    seed: int,
+) -> PlanResult:
+    """`plan` from what is known; effective ratios hold at `pose_rad`, by default in the middle of the candidates."""
+    asked = _question(knowledge, target, pose_rad, scope.aperture)
+    family = design_family(knowledge, asked.found, asked.seen, target, asked.at_centre, scope)
+    durations = _durations(family, scope)
+    assurance = Assurance(family, target, draws, seed)
+    forecast = classic_forecast(knowledge, assurance.truths)
+    size = _size(assurance, forecast, durations)
+    refined = refine(family, asked.seen, target, asked.at_centre, size.experiments, scope, assurance)
+    steps = refined.family.arranged(size.experiments).steps
+    exact = judge(steps, knowledge, aperture=scope.aperture)
+    chosen = judged("planned", exact.information, knowledge, target, pose_rad)
     share = float(np.mean(refined.reported <= target.limit))
-    largest_design = family.arranged(family.largest)
-    largest_information = information_of_looks(
-        seen, family.picks, largest_design.path, knowledge.space, knowledge.after_data
-    )
-    limit = limit_of(knowledge, largest_information, at_centre, target)
-    noise = _pixel_part(exact.expectation)
-    batches = next_experiments(knowledge, found, seen, target, at_centre, now)
-    stop = stop_now(now, target, limit, batches, after_data)
-    done = after_data and now <= target.limit
+    path = family.arranged(family.largest).path
+    most = information_of_looks(asked.seen, family.picks, path, knowledge.space, knowledge.after_data)
+    limit = limit_of(knowledge, most, asked.at_centre, target)
+    pixels = _pixel_part(exact.information.expectation)
+    batches = next_experiments(knowledge, asked.found, asked.seen, target, asked.at_centre, asked.now)
+    done = knowledge.after_data and asked.now <= target.limit
+    notes = few_looks(refined.family.looks(size.experiments), target)
+    notes += [exact.together(axis) for axis in AXES if inseparable(exact.exchange(axis))]
     return PlanResult(
         target=target,
-        steps=() if done else design.steps,
-        experiments=0 if done else experiments,
-        looks=0 if done else len(final.picks),
-        minutes=0.0 if done else exact.minutes,
-        now=now,
-        expected=now if done else chosen.joint,
+        steps=() if done else steps,
+        experiments=0 if done else size.experiments,
+        looks=0 if done else len(refined.family.picks),
+        minutes=0.0 if done else exact.information.minutes,
+        now=asked.now,
+        expected=asked.now if done else chosen.joint,
         assurance=None if done else share,
         assurance_se=None if done else share_error(share, draws),
-        curve=curve,
-        n80=n80,
-        n95=n95,
+        curve=size.curve,
+        n80=size.n80,
+        n95=size.n95,
         limit=limit,
-        shares=split_of(knowledge, exact.fisher, noise, at_centre),
-        baselines=(chosen, *_baselines(knowledge, target, aperture, pose_rad)),
+        shares=split_of(knowledge, exact.information.fisher, pixels, asked.at_centre),
+        baselines=(chosen, *_baselines(knowledge, target, scope.aperture, pose_rad)),
         next=batches,
-        stop=stop,
+        stop=stop_now(asked.now, target, limit, batches, knowledge.after_data),
         classic=classic_answer(target, forecast, campaign),
         met=done or share >= ASSURED[0],
-        notes=(*found.notes, *([] if done else few_stops(final.looks(experiments)))),
+        notes=(*asked.found.notes, *([] if done else notes)),
         draws=draws,
         seed=seed,
-        criterion=criterion,
-    )
-
-
-def _linear_spots(found: Expectation) -> LinearSpots:
-    """Expected looks as the smoother takes them."""
-    return LinearSpots(
-        residual=np.zeros(found.jacobian.shape[:2]),
-        load=found.load,
-        renewed=found.keep == 0,
-        variance=found.variance,
-        jacobian=found.jacobian,
+        criterion=scope.criterion,
     )
 
 
 def _pixel_part(found: Expectation) -> np.ndarray:
     """What pixel noise alone contributes to the information, (C^-1 J)^T (C^-1 J), shape (p, p)."""
-    groups = stop_information(_linear_spots(found)).groups
-    gain = np.concatenate([group.jacobian for group in groups])
+    spots = LinearSpots(
+        residual=np.zeros(found.jacobian.shape[:2]),
+        load=np.asarray(found.load),
+        renewed=np.asarray(found.keep) == 0,
+        variance=np.asarray(found.variance),
+        jacobian=np.asarray(found.jacobian),
+    )
+    gain = np.concatenate([group.jacobian for group in stop_information(spots).groups])
     return gain.T @ gain

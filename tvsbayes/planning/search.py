@@ -1,4 +1,8 @@
-"""The smallest plan that is enough: greedy search over families of sheets."""
+"""The smallest plan that is enough: greedy choice of looks, and their exchange, over choices of sheets.
+
+Scores are variances of the quantities wanted; rows and precisions are in the coordinates, with two more columns (rad)
+for the home offset of (pan, tilt) where a campaign went before.
+"""
 
 from __future__ import annotations
 
@@ -89,6 +93,10 @@ class Search:
             covariance = self._with(covariance, picks[-1])
         return picks
 
+    def among(self, here: np.ndarray) -> Search:
+        """The same search with only some candidates to choose from, shape (m,)."""
+        return replace(self, rows=np.where(here[:, None, None], self.rows, 0.0))
+
     def value(self, picks: Sequence[int]) -> float:
         """Score of a design."""
         rows = self.rows[list(picks)].reshape(-1, self.rows.shape[2])
@@ -118,7 +126,7 @@ KNOWN = 1e8
 """Precision of the contrasts during a search: their part in a design is a matter of its path, which comes later."""
 
 
-def _rows_for_search(seen: Seen, knowledge: Knowledge) -> tuple[np.ndarray, np.ndarray]:
+def search_rows(seen: Seen, knowledge: Knowledge) -> tuple[np.ndarray, np.ndarray]:
     """Rows and precision with the contrasts taken as known; home offsets are two more columns after data."""
     precision = knowledge.precision.copy()
     precision[CONTRAST_COLUMNS, CONTRAST_COLUMNS] += KNOWN
@@ -130,6 +138,23 @@ def _rows_for_search(seen: Seen, knowledge: Knowledge) -> tuple[np.ndarray, np.n
     return seen.rows, full
 
 
+@dataclass(frozen=True)
+class Scope:
+    """How a design is sought.
+
+    Attributes:
+        criterion: what the search lowers, one of `CRITERIA`: "c" the target, "D" or "A" ratios and backlashes together.
+        aperture: looks also read the aperture.
+        largest: experiments beyond which none is sought.
+        minutes: the plan must not take longer.
+    """
+
+    criterion: str = "c"
+    aperture: bool = False
+    largest: int = LADDER[-1]
+    minutes: float | None = None
+
+
 SUBSETS_MAX = 40
 
 
@@ -139,11 +164,42 @@ def _sheet_subsets(count: int) -> list[tuple[int, ...]]:
     return sorted(found, key=lambda s: (s[0] - s[-1], len(s)))[:SUBSETS_MAX]
 
 
-def search_designs(knowledge: Knowledge, seen: Seen, gradient: np.ndarray, own: np.ndarray, criterion: str) -> Search:
-    rows, precision = _rows_for_search(seen, knowledge)
-    wide = np.zeros((len(gradient), rows.shape[2]))
-    wide[:, :PARAMETERS] = gradient
-    return Search(rows, precision, wide, own, criterion)
+def search_designs(knowledge: Knowledge, seen: Seen, at_centre: Sensitivity, criterion: str = "c") -> Search:
+    """A search for the target's sensitivities among looks; contrasts count as known, see `KNOWN`."""
+    rows, precision = search_rows(seen, knowledge)
+    wide = np.zeros((len(at_centre.gradient), rows.shape[2]))
+    wide[:, :PARAMETERS] = at_centre.gradient
+    return Search(rows, precision, wide, at_centre.own_variance, criterion)
+
+
+def _of_all_gears(knowledge: Knowledge, seen: Seen) -> Sensitivity:
+    """Ratios and backlashes of both axes, in the middle of the looks."""
+    with jax.enable_x64(True):
+        pose = jnp.asarray(seen.mirror_angles_rad.mean(axis=0))
+        everything = np.asarray(headlines(jnp.asarray(knowledge.z), knowledge.space, pose).gradient)
+    return Sensitivity(everything[[QUANTITIES.index(q) for q in ("left", "up", "backlash.pan", "backlash.tilt")]])
+
+
+@dataclass(frozen=True, order=True)
+class _Reached:
+    """How soon a family meets the target: minutes, infinite where it never does, and then the target's value."""
+
+    minutes: float = math.inf
+    value: float = math.inf
+
+
+def _reached(family: Family, seen: Seen, target: Target, at_centre: Sensitivity, scope: Scope) -> _Reached:
+    knowledge, best = family.knowledge, _Reached()
+    for n in (n for n in LADDER if n <= scope.largest):
+        design = family.arranged(n)
+        duration = plan_minutes(design.steps, knowledge.rig)
+        if scope.minutes is not None and duration > scope.minutes:
+            break
+        chosen = family.picks[: LOOKS_PER_EXPERIMENT * n]
+        information = information_of_looks(seen, chosen, design.path, knowledge.space, knowledge.after_data)
+        value = at_centre.value(covariance_of(knowledge.precision + information), target.factor)
+        best = min(best, _Reached(duration if value <= target.limit else math.inf, value))
+    return best
 
 
 def design_family(
@@ -152,47 +208,23 @@ def design_family(
     seen: Seen,
     target: Target,
     at_centre: Sensitivity,
-    *,
-    criterion: str = "c",
-    aperture: bool = False,
-    largest: int = LADDER[-1],
-    minutes: float | None = None,
+    scope: Scope | None = None,
 ) -> Family:
     """The choice of sheets and the order of looks that reach the target soonest.
 
     For every choice of sheets looks are added greedily; the choice that first meets the target, counted in minutes,
-    is kept, or the best after `largest` experiments (or `minutes`) if none does.
+    is kept, or the best after the largest number of experiments (or minutes) if none does.
     """
-    if criterion == "c":
-        gradient, own = at_centre.gradient, at_centre.own_variance
-    else:
-        with jax.enable_x64(True):
-            pose = jnp.asarray(seen.mirror_angles_rad.mean(axis=0))
-            everything = np.asarray(headlines(jnp.asarray(knowledge.z), knowledge.space, pose).gradient)
-        gradient = everything[[QUANTITIES.index(q) for q in ("left", "up", "backlash.pan", "backlash.tilt")]]
-        own = np.zeros(len(gradient))
-    search = search_designs(knowledge, seen, gradient, own, criterion)
-    best: tuple[float, float, list[int]] | None = None
+    scope = scope or Scope()
+    sought = at_centre if scope.criterion == "c" else _of_all_gears(knowledge, seen)
+    search = search_designs(knowledge, seen, sought, scope.criterion)
+    families = []
     for subset in _sheet_subsets(len(knowledge.sheets)):
         here = np.isin(found.looks.sheet, subset)
-        if not here.any():
-            continue
-        part = replace(search, rows=np.where(here[:, None, None], search.rows, 0.0))
-        picks = part.greedy(LOOKS_PER_EXPERIMENT * largest)
-        family = Family(knowledge, found, np.array(picks), aperture)
-        reached = (math.inf, math.inf)
-        for n in (n for n in LADDER if n <= largest):
-            design = family.arranged(n)
-            duration = plan_minutes(design.steps, knowledge.rig)
-            if minutes is not None and duration > minutes:
-                break
-            chosen = family.picks[: LOOKS_PER_EXPERIMENT * n]
-            information = information_of_looks(seen, chosen, design.path, knowledge.space, knowledge.after_data)
-            value = at_centre.value(covariance_of(knowledge.precision + information), target.factor)
-            reached = min(reached, (duration, value) if value <= target.limit else (math.inf, value))
-        if best is None or reached < best[:2]:
-            best = (*reached, picks)
-    return Family(knowledge, found, np.array(best[2]), aperture)
+        if here.any():
+            picks = search.among(here).greedy(LOOKS_PER_EXPERIMENT * scope.largest)
+            families.append(Family(knowledge, found, np.array(picks), scope.aperture))
+    return min(families, key=lambda family: _reached(family, seen, target, at_centre, scope))
 
 
 def smallest_design(meets: Callable[[int], bool], sizes: Sequence[int]) -> int | None:
@@ -208,7 +240,7 @@ def smallest_design(meets: Callable[[int], bool], sizes: Sequence[int]) -> int |
 
 
 @dataclass(frozen=True)
-class _Refined:
+class Refined:
     """A design, and the uncertainty of the target that its fits report over the truths, shape (draws,)."""
 
     family: Family
@@ -221,28 +253,27 @@ def refine(
     target: Target,
     at_centre: Sensitivity,
     experiments: int,
-    criterion: str,
-    minutes: float | None,
+    scope: Scope,
     assurance: Assurance,
-) -> _Refined:
+) -> Refined:
     """The design of n experiments after exchanges.
 
     Exchanges suit the most probable instrument; they are kept only where they do not cost assurance or time.
     """
     knowledge, found = family.knowledge, family.found
     picks = family.picks[: LOOKS_PER_EXPERIMENT * experiments]
-    plain = _Refined(replace(family, picks=picks), assurance.values([experiments])[experiments])
-    if criterion != "c":
+    plain = Refined(replace(family, picks=picks), assurance.values([experiments])[experiments])
+    if scope.criterion != "c":
         return plain
-    search = search_designs(knowledge, seen, at_centre.gradient, at_centre.own_variance, criterion)
+    search = search_designs(knowledge, seen, at_centre, scope.criterion)
     here = np.isin(found.looks.sheet, found.looks.sheet[picks])
-    part = replace(search, rows=np.where(here[:, None, None], search.rows, 0.0))
-    exchanged = replace(family, picks=np.array(part.exchange(picks)))
-    if minutes is not None and plan_minutes(exchanged.arranged(experiments).steps, knowledge.rig) > minutes:
+    exchanged = replace(family, picks=np.array(search.among(here).exchange(picks.tolist())))
+    duration = plan_minutes(exchanged.arranged(experiments).steps, knowledge.rig)
+    if scope.minutes is not None and duration > scope.minutes:
         return plain
-    other = _Refined(exchanged, assurance.of(exchanged).values([experiments])[experiments])
+    other = Refined(exchanged, assurance.of(exchanged).values([experiments])[experiments])
 
-    def merit(of: _Refined) -> tuple[float, float]:
+    def merit(of: Refined) -> tuple[float, float]:
         return float(np.mean(of.reported <= target.limit)), -float(np.median(of.reported))
 
     return other if merit(other) > merit(plain) else plain

@@ -1,14 +1,6 @@
-"""What a plan will tell before it is run: expected information, targets, and the search for looks (DESIGN 6).
+"""What a measurement is for: its target in words, and how that quantity hangs on the coordinates.
 
-The model says what the looks of a plan would show; their Bayesian Fisher information, that of the priors (or of a fit)
-plus J^T C^-1 J of all looks, gives the covariance that a fit will report, for any quantity of interest. Frames and
-units are those of DESIGN 2 and 8: counters in steps, mm, degrees where a name says so, rad inside. Coordinates z have
-prior N(0, 1) each (`tvsbayes.model`).
-
-`information_of` judges any plan, move by move, through the filter of `tvsbayes.likelihood`: shared stops, home offsets
-and unknown play as in a fit. `Looks` are plans whose every look is reached anew on both axes from a known side: their
-stop errors are independent and information adds up look by look; of the history only the length of the path remains
-(it carries the contrast of the two directions). Thousands of candidates are scored by low-rank updates.
+Ratios in deg/step, backlashes in deg, mirror offset and coordinates of a point (frame T) in mm.
 """
 
 from __future__ import annotations
@@ -124,7 +116,10 @@ def parse_target(text: str) -> Target:
     if (match["at"] is None) == (name in COORDINATES):
         remedy = "name the point: at 1000,0,0 mm" if name in COORDINATES else "leave the point out"
         raise refuse("a coordinate needs a point, and nothing else has one", remedy)
-    point = None if match["at"] is None else tuple(float(x) for x in match["at"].split(","))
+    point = None
+    if match["at"] is not None:
+        x, y, z = map(float, match["at"].split(","))
+        point = x, y, z
     if point is not None and max(map(abs, point)) > LARGEST_NUMBER:
         raise refuse("the point is too far away", f"state its coordinates within {LARGEST_NUMBER:g} mm")
     return Target(" ".join(text.split()), name, 1.0 if match["kind"] == "u" else NORMAL_95, limit, unit, point)
@@ -177,7 +172,7 @@ def sensitivity(
             found = headlines(jnp.asarray(z), space, jnp.asarray(pose_rad))
             return Sensitivity(np.asarray(found.gradient)[rows])
     at = physical_at(z, space)
-    physical, slope = at.value, at.slope
+    physical, slope = np.asarray(at.value), np.asarray(at.slope)
     inputs = [INDEX[name] for name in INPUT_NAMES]
     stop_sd = physical[[INDEX[name] for name in CALIBRATION_NOISE]]
     azimuth = table.aperture_convention == "azimuth"
@@ -190,6 +185,7 @@ def sensitivity(
         period_deg=table.harmonic_period_deg,
     )
     goal = machine.steps_for(target.point_mm)
+    assert goal.aperture_deg is not None, "a point has a reading"
     settings = settings_of(float(goal.pan_steps), float(goal.tilt_steps), goal.aperture_deg, goal.approach)
     count = len(inputs)
     with jax.enable_x64(True):
