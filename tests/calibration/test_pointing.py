@@ -425,26 +425,25 @@ def test_steps_as_json_are_plain(bent):
     assert set(document["ray"]) == {"origin_mm", "direction"}
 
 
-def drawn(campaign, draws=4000, **more):
+def drawn(campaign, draws=4000):
     """`calibration_of_draws` of normal draws in an order of columns of its own, with names it does not need."""
     bent = calibration(draws=draws)
     names = ("pixel_scale", *reversed((*INPUT_NAMES, *NOISE_NAMES)))
     physical = np.concatenate([bent.inputs, bent.noise], axis=1)[:, ::-1]
     physical = np.column_stack([np.full(draws, 7.0), physical])
-    return bent, calibration_of_draws(names, physical, campaign, "laplace", 3, **more)
+    return bent, calibration_of_draws(names, physical, campaign, "laplace", 3)
 
 
 def test_calibration_of_draws_takes_its_columns():
     campaign = small_campaign()
-    causes = np.zeros((1, len(INPUT_NAMES), len(INPUT_NAMES)))
-    bent, one = drawn(campaign, causes=("all",), cause_covariance=causes)
+    bent, one = drawn(campaign)
     np.testing.assert_array_equal(one.inputs, bent.inputs)
     np.testing.assert_array_equal(one.noise, bent.noise)
     np.testing.assert_allclose(one.mean, bent.inputs.mean(axis=0), rtol=ROUNDING)
     np.testing.assert_allclose(one.covariance, np.cov(bent.inputs.T), atol=ROUNDING)
     # Mean of the squares, not square of the mean: a variance adds up in variances.
     assert one.noise_variance["aperture_sd_deg"] == pytest.approx((bent.noise[:, 4] ** 2).mean(), rel=ROUNDING)
-    assert one.azimuth and one.estimator == "laplace" and one.causes == ("all",)
+    assert one.azimuth and one.estimator == "laplace" and one.causes == ()
     np.testing.assert_array_equal(one.range_steps, [[-100, 200], [-7, 120]])
     assert one.inputs_sha256 == input_hashes(campaign)
     play_steps = bent.inputs[:, 2] / bent.inputs[:, 0]

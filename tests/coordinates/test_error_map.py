@@ -12,7 +12,8 @@ import pytest
 from support.bent_rig import BENT, NO_NOISE_DEG, NOMINAL, calibration, twin_points, twin_ray
 from support.small_campaign import small_campaign
 
-from tvsbayes.assessment.fitted_calibration import calibration_of, causes_of
+from tvsbayes.assessment.causes import causes_of
+from tvsbayes.assessment.fitted_calibration import calibration_of
 from tvsbayes.calibration.pointing import INPUT_NAMES, NOISE_NAMES, Calibration
 from tvsbayes.coordinates.beam_meeting import INPUT_COLUMNS, meeting
 from tvsbayes.coordinates.error_map import SimpleCalibration, error_map, simple_calibration, simple_rays

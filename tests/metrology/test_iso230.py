@@ -358,7 +358,7 @@ def stops_of(offsets_deg: np.ndarray, looks: int = 2, noise: float = 0.0) -> Sim
         mode=SimpleNamespace(physical=calibration.mean),
         campaign=campaign,
         linearised=linearised(residual, slope, angles),
-        excluded_spots=(0,),
+        arrays=SimpleNamespace(spots=SimpleNamespace(valid=(np.arange(len(rows)) > 0).astype(float))),
         reference_pose_rad=np.zeros(2),
     )
 

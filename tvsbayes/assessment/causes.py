@@ -1,22 +1,176 @@
-"""What the uncertainty of a headline comes from."""
+"""What uncertainty comes from: that of ratios and backlashes, and that of the inputs of a coordinate.
+
+Expected information in coordinates, each in sds of its prior, so that every prior has precision 1; noise scales are
+taken as known. Quantities in the units of their names.
+"""
 
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from collections.abc import Iterable
+from dataclasses import dataclass
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 from tvsbayes.assessment.weaknesses import gradients, moved_directions
+from tvsbayes.calibration.pointing import INPUT_NAMES
 from tvsbayes.estimators.joint_fit import JointFit
-from tvsbayes.instrument.axes import DIRECTIONS
-from tvsbayes.instrument.parameters import INDEX, KINDS, NAMES, RIG_NAMES, unit_of
+from tvsbayes.instrument.axes import DIRECTIONS, SENSES
+from tvsbayes.instrument.parameters import INDEX, KINDS, NAMES, PRIOR_GROUPS, RIG_NAMES, unit_of
 from tvsbayes.metrology.budget_tables import BudgetTable, Source, budget_table
 from tvsbayes.model.parameter_space import HALF_NORMAL_MEAN, HALF_NORMAL_SD
-from tvsbayes.results.estimates import HeadlineCauses
+from tvsbayes.results.estimates import Estimate, HeadlineCauses
 
-if TYPE_CHECKING:
-    from tvsbayes.results.estimates import Estimate
+STOP_ERRORS = "stop errors of the campaign"
+
+
+@dataclass(frozen=True)
+class _Told:
+    """What the campaign tells, J^T C^-1 J, by the noise that limits it, matrices (p, p).
+
+    With C = 1 + (stop errors), whitened by the pixel noise: (C^-1 J)^T (C^-1 J), and the rest.
+    """
+
+    pixels: str
+    by_pixels: np.ndarray
+    by_stops: np.ndarray
+
+
+def _told(fit: JointFit) -> _Told:
+    readings = np.any(np.asarray(fit.arrays.spots.has_aperture) * np.asarray(fit.arrays.spots.valid))
+    gain = np.concatenate([group.jacobian for group in fit.information.groups])
+    noise = gain.T @ gain
+    return _Told("pixel and aperture noise" if readings else "pixel noise", noise, fit.information.fisher - noise)
+
+
+@dataclass(frozen=True)
+class Causes:
+    """What the covariance of the inputs of a coordinate comes from.
+
+    Attributes:
+        names: causes.
+        covariance: their parts, shape (causes, inputs, inputs), ordered as `calibration.INPUT_NAMES`; they add up.
+    """
+
+    names: tuple[str, ...]
+    covariance: np.ndarray
+
+
+def causes_of(fit: JointFit) -> Causes:
+    """Split the covariance of a fit by cause (DESIGN 5).
+
+    An estimate moves by S J^T C^-1 e when the data err by e, and by S e_j when prior j is off by its sd, S the
+    posterior covariance. With C = 1 + (stop errors) the parts S (C^-1 J)^T (C^-1 J) S, S (J^T C^-1 J - that) S and
+    S e_j e_j^T S add up to S. Expected information about geometry and cameras; noise scales are taken as known.
+    """
+    fisher = fit.information.fisher
+    posterior = np.linalg.inv(fisher + np.eye(len(NAMES)))
+    told = _told(fit)
+    parts = {told.pixels: told.by_pixels, STOP_ERRORS: told.by_stops}
+    for stem, columns in PRIOR_GROUPS.items():
+        share = np.zeros_like(fisher)
+        share[columns, columns] = 1.0
+        parts[stem] = share
+    inputs = [INDEX[name] for name in INPUT_NAMES]
+    with jax.enable_x64(True):
+        slope = np.asarray(jax.jacfwd(fit.space.physical)(jnp.asarray(fit.z)))[inputs]
+    spread = slope @ posterior
+    covariance = {name: spread @ part @ spread.T for name, part in parts.items()}
+    # A prior that was fixed, or that no coordinate hangs on, is no cause.
+    kept = {name: c for name, c in covariance.items() if np.any(np.diag(c) > 0)}
+    return Causes(tuple(kept), np.stack(list(kept.values())))
+
+
+@dataclass(frozen=True)
+class _Cause:
+    """One column of `HeadlineCauses`; contribution and dof of shape (quantities,)."""
+
+    name: str
+    contribution: np.ndarray
+    dof: np.ndarray
+    distribution: str = "normal"
+    centre: float = math.nan
+    u: float = math.nan
+
+
+def headline_causes(fit: JointFit) -> HeadlineCauses:
+    """Split the variance of ratios and backlashes by cause, as `causes_of` does for the inputs of a coordinate.
+
+    Linear part of each headline in the coordinates; expected information, noise scales taken as known. How well the
+    noise scales are known gives the degrees of freedom: nu = 1/(2 var(ln s)) (GUM G.4.2, eq. G.3).
+    """
+    columns = _headline_draws(fit)
+    if not columns:
+        none = np.zeros((0, 0))
+        return HeadlineCauses((), (), none, np.zeros(0), np.zeros(0), (), none)
+    gradient = gradients(fit, np.stack(list(columns.values()), axis=1))
+    spread = gradient @ np.linalg.inv(fit.information.fisher + np.eye(len(NAMES)))
+    causes = [*_noise_causes(fit, tuple(columns), spread), *_prior_causes(fit, spread)]
+    kept = [cause for cause in causes if np.any(cause.contribution != 0)]
+    return HeadlineCauses(
+        quantities=tuple(columns),
+        names=tuple(cause.name for cause in kept),
+        contribution=np.stack([cause.contribution for cause in kept], axis=1),
+        u=np.array([cause.u for cause in kept]),
+        centre=np.array([cause.centre for cause in kept]),
+        distribution=tuple(cause.distribution for cause in kept),
+        dof=np.stack([cause.dof for cause in kept], axis=1),
+    )
+
+
+def _headline_draws(fit: JointFit) -> dict[str, np.ndarray]:
+    """Draws of the effective ratios of directions that moved and the backlashes of their axes, by contract name."""
+    moved = moved_directions(fit)
+    ratios, physical = np.asarray(fit.draws.effective_deg_per_step), np.asarray(fit.draws.physical)
+    columns = {f"effective_deg_per_step.{d}": ratios[:, k] for k, d in enumerate(DIRECTIONS) if d in moved}
+    for axis, pair in SENSES.items():
+        if moved & set(pair):
+            columns[f"backlash_deg.{axis}"] = physical[:, INDEX[f"backlash_deg.{axis}"]]
+    return columns
+
+
+def _noise_causes(fit: JointFit, quantities: tuple[str, ...], spread: np.ndarray) -> list[_Cause]:
+    """What is no single quantity: noise of the campaign, and the cameras' calibration as one."""
+    moved, told, every = moved_directions(fit), _told(fit), np.ones(len(quantities))
+    physical = np.asarray(fit.draws.physical)
+
+    def root(part: np.ndarray) -> np.ndarray:
+        return np.sqrt(np.maximum(np.einsum("qi,ij,qj->q", spread, part, spread), 0.0))
+
+    def freedom(names: Iterable[str]) -> float:
+        logs = [np.log(physical[:, INDEX[name]]) for name in names]
+        spreads = [float(np.var(x)) for x in logs if np.ptp(x) > 1e-9]
+        return min((0.5 / s for s in spreads), default=np.inf)
+
+    def stop_freedom(quantity: str) -> float:
+        """By the stops of the axis that a quantity belongs to."""
+        of = quantity.split(".")[1]
+        pair = next(pair for axis, pair in SENSES.items() if of == axis or of in pair)
+        return freedom(f"stop_sd_deg.{d}" for d in pair if d in moved)
+
+    return [
+        _Cause(told.pixels, root(told.by_pixels), freedom(["pixel_scale"]) * every),
+        _Cause(STOP_ERRORS, root(told.by_stops), np.array([stop_freedom(q) for q in quantities])),
+        _Cause("stereo calibration", np.linalg.norm(spread[:, len(RIG_NAMES) :], axis=1), np.inf * every),
+    ]
+
+
+def _prior_causes(fit: JointFit, spread: np.ndarray) -> list[_Cause]:
+    """Every stated prior of the rig that a quantity hangs on."""
+    found = []
+    stated = (np.asarray(x).tolist() for x in (fit.space.value, fit.space.u, fit.space.kind))
+    for name, centre, u, kind in zip(RIG_NAMES, *stated, strict=True):
+        contribution, shape = spread[:, INDEX[name]], KINDS[kind]
+        if u == 0 or not np.any(contribution):
+            continue
+        if shape == "log-normal":
+            centre = math.log(centre)
+        elif shape == "half-normal":
+            centre, u = u * HALF_NORMAL_MEAN, u * HALF_NORMAL_SD
+        found.append(_Cause(name, contribution, np.full(len(spread), np.inf), shape, centre, u))
+    return found
 
 
 def headline_budget(causes: HeadlineCauses, quantity: str, estimate: Estimate) -> BudgetTable:
@@ -26,7 +180,7 @@ def headline_budget(causes: HeadlineCauses, quantity: str, estimate: Estimate) -
     An estimate moves by c when the centre of a prior moves by one unit.
 
     Args:
-        causes: of `information.headline_causes`.
+        causes: of `headline_causes`.
         quantity: one of its quantities.
         estimate: what is reported of it, Laplace or posterior; its sd is the combined uncertainty.
     """
@@ -50,74 +204,3 @@ def headline_budget(causes: HeadlineCauses, quantity: str, estimate: Estimate) -
         "add to linear propagation",
     )
     return budget_table(quantity, unit_of(quantity), estimate.value, estimate.sd, sources, notes=notes)
-
-
-def headline_causes(fit: JointFit) -> HeadlineCauses:
-    """Split the variance of ratios and backlashes by cause, as `causes_of` does for the inputs of a coordinate.
-
-    Linear part of each headline in the coordinates; expected information, noise scales taken as known. How well the
-    noise scales are known gives the degrees of freedom: nu = 1/(2 var(ln s)) (GUM G.4.2, eq. G.3).
-    """
-    moved = moved_directions(fit)
-    columns = {
-        f"effective_deg_per_step.{d}": fit.draws.effective_deg_per_step[:, k]
-        for k, d in enumerate(DIRECTIONS)
-        if d in moved
-    }
-    for axis, pair in (("pan", DIRECTIONS[:2]), ("tilt", DIRECTIONS[2:])):
-        if moved & set(pair):
-            columns[f"backlash_deg.{axis}"] = fit.draws.physical[:, INDEX[f"backlash_deg.{axis}"]]
-    if not columns:
-        none = np.zeros((0, 0))
-        return HeadlineCauses((), (), none, np.zeros(0), np.zeros(0), (), none)
-    gradient = gradients(fit, np.stack(list(columns.values()), axis=1))
-    spread = gradient @ np.linalg.inv(fit.information.fisher + np.eye(len(NAMES)))
-    gain = np.concatenate([group.jacobian for group in fit.information.groups])
-    noise = gain.T @ gain
-
-    def root(part: np.ndarray) -> np.ndarray:
-        return np.sqrt(np.maximum(np.einsum("qi,ij,qj->q", spread, part, spread), 0.0))
-
-    def freedom(names: list[str]) -> float:
-        logs = [np.log(fit.draws.physical[:, INDEX[name]]) for name in names]
-        spreads = [float(np.var(x)) for x in logs if np.ptp(x) > 1e-9]
-        return min((0.5 / s for s in spreads), default=np.inf)
-
-    # The two directions of the axis that a quantity belongs to.
-    axes = {name: DIRECTIONS[:2] for name in ("pan", *DIRECTIONS[:2])}
-    axes |= {name: DIRECTIONS[2:] for name in ("tilt", *DIRECTIONS[2:])}
-    stops = [freedom([f"stop_sd_deg.{d}" for d in axes[q.split(".")[1]] if d in moved]) for q in columns]
-    readings = bool(np.any(np.asarray(fit.arrays.spots.has_aperture) * np.asarray(fit.arrays.spots.valid)))
-    pixels = "pixel and aperture noise" if readings else "pixel noise"
-    every = np.ones(len(columns))
-    cameras = np.linalg.norm(spread[:, len(RIG_NAMES) :], axis=1)
-    shaken = root(fit.information.fisher - noise)
-    # Name, contribution, u, centre, distribution, degrees of freedom.
-    rows = [
-        (pixels, root(noise), np.nan, np.nan, "normal", freedom(["pixel_scale"]) * every),
-        ("stop errors of the campaign", shaken, np.nan, np.nan, "normal", np.array(stops)),
-        ("stereo calibration", cameras, np.nan, np.nan, "normal", np.inf * every),
-    ]
-    space = fit.space
-    for name, value, u, kind in zip(
-        RIG_NAMES, *(np.asarray(x) for x in (space.value, space.u, space.kind)), strict=True
-    ):
-        if u == 0 or not np.any(spread[:, INDEX[name]]):
-            continue
-        shape, centre, width = KINDS[int(kind)], float(value), float(u)
-        if shape == "log-normal":
-            centre = float(np.log(centre))
-        elif shape == "half-normal":
-            centre, width = width * HALF_NORMAL_MEAN, width * HALF_NORMAL_SD
-        rows.append((name, spread[:, INDEX[name]], width, centre, shape, np.inf * every))
-    kept = [row for row in rows if np.any(row[1] != 0)]
-    names, contribution, widths, centres, shapes, dof = zip(*kept, strict=True)
-    return HeadlineCauses(
-        quantities=tuple(columns),
-        names=names,
-        contribution=np.stack(contribution, axis=1),
-        u=np.array(widths, dtype=float),
-        centre=np.array(centres, dtype=float),
-        distribution=shapes,
-        dof=np.stack(dof, axis=1),
-    )

@@ -1,20 +1,21 @@
-"""A calibration from a fit, with the causes of its covariance."""
+"""From a fit, or a posterior's draws, to what a robot loads: a `Calibration` with the causes of its covariance.
+
+Columns in the units of their contract names; counters in steps.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import replace
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
+from tvsbayes.assessment.causes import causes_of
 from tvsbayes.calibration.pointing import INPUT_NAMES, NOISE_NAMES, Calibration
 from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.instrument.axes import AXES
 from tvsbayes.instrument.campaign import Campaign, input_hashes
-from tvsbayes.instrument.parameters import INDEX, NAMES, PRIOR_GROUPS
 from tvsbayes.posterior.draws import Posterior
 
 CLEARED_PROBABILITY = 0.99
@@ -35,8 +36,6 @@ def calibration_of_draws(
     campaign: Campaign,
     estimator: str,
     seed: int,
-    causes: tuple[str, ...] = (),
-    cause_covariance: np.ndarray | None = None,
 ) -> Calibration:
     """Choose the columns that coordinates depend on.
 
@@ -49,8 +48,6 @@ def calibration_of_draws(
         campaign: what was fitted.
         estimator: "posterior" or "laplace".
         seed: of the draws from priors.
-        causes: as in `Calibration`.
-        cause_covariance: as in `Calibration`.
     """
     column = {name: physical[:, i] for i, name in enumerate(names)}
     generator = np.random.default_rng([seed, 5])
@@ -79,7 +76,6 @@ def calibration_of_draws(
         inputs_sha256=input_hashes(campaign),
         inputs=inputs,
         noise=noise,
-        **({} if cause_covariance is None else {"causes": causes, "cause_covariance": cause_covariance}),
     )
 
 
@@ -90,49 +86,6 @@ def _overshoot_steps(column: Mapping[str, np.ndarray], axis: str) -> int:
 
 DRAWS_KEPT = 4096
 """Posterior draws in a calibration, evenly chosen; posterior.nc holds them all."""
-
-
-@dataclass(frozen=True)
-class Causes:
-    """What the covariance of the inputs of a coordinate comes from.
-
-    Attributes:
-        names: causes.
-        covariance: their parts, shape (causes, inputs, inputs), ordered as `calibration.INPUT_NAMES`; they add up.
-    """
-
-    names: tuple[str, ...]
-    covariance: np.ndarray
-
-
-def causes_of(fit: JointFit) -> Causes:
-    """Split the covariance of a fit by cause (DESIGN 5).
-
-    An estimate moves by S J^T C^-1 e when the data err by e, and by S e_j when prior j is off by its sd, S the
-    posterior covariance. With C = 1 + (stop errors) the parts S (C^-1 J)^T (C^-1 J) S, S (J^T C^-1 J - that) S and
-    S e_j e_j^T S add up to S. Expected information about geometry and cameras; noise scales are taken as known.
-    """
-    fisher = fit.information.fisher
-    posterior = np.linalg.inv(fisher + np.eye(len(NAMES)))
-    gain = np.concatenate([group.jacobian for group in fit.information.groups])
-    noise = gain.T @ gain
-    readings = bool(np.any(np.asarray(fit.arrays.spots.has_aperture) * np.asarray(fit.arrays.spots.valid)))
-    parts = {
-        "pixel and aperture noise" if readings else "pixel noise": noise,
-        "stop errors of the campaign": fisher - noise,
-    }
-    for stem, columns in PRIOR_GROUPS.items():
-        share = np.zeros_like(fisher)
-        share[columns, columns] = 1.0
-        parts[stem] = share
-    inputs = [INDEX[name] for name in INPUT_NAMES]
-    with jax.enable_x64(True):
-        slope = np.asarray(jax.jacfwd(fit.space.physical)(jnp.asarray(fit.z)))[inputs]
-    spread = slope @ posterior
-    covariance = {name: spread @ part @ spread.T for name, part in parts.items()}
-    # A prior that was fixed, or that no coordinate hangs on, is no cause.
-    kept = {name: c for name, c in covariance.items() if np.any(np.diag(c) > 0)}
-    return Causes(tuple(kept), np.stack(list(kept.values())))
 
 
 def calibration_of(fit: JointFit, posterior: Posterior | None = None, *, seed: int = 0) -> Calibration:
@@ -146,8 +99,9 @@ def calibration_of(fit: JointFit, posterior: Posterior | None = None, *, seed: i
     Returns:
         A calibration for `locate`, with `.ray`, `.locate` and `.steps_for` of its own.
     """
-    usable = posterior is not None and posterior.converged
-    draws = posterior.thinned(DRAWS_KEPT).physical if usable else fit.draws.physical
+    draws, estimator = fit.draws, "laplace"
+    if posterior is not None and posterior.converged:
+        draws, estimator = posterior.thinned(DRAWS_KEPT), "posterior"
+    found = calibration_of_draws(fit.names, np.asarray(draws.physical), fit.campaign, estimator, seed)
     causes = causes_of(fit)
-    name = "posterior" if usable else "laplace"
-    return calibration_of_draws(fit.names, np.asarray(draws), fit.campaign, name, seed, causes.names, causes.covariance)
+    return replace(found, causes=causes.names, cause_covariance=causes.covariance)

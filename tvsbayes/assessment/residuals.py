@@ -1,11 +1,13 @@
-"""Deviations at stops, by cause."""
+"""Deviations at the stops: seen minus modelled mirror angles, as readings of an axis and grouped by possible cause.
+
+Angles in degrees (rad inside, where a name says so), counters in steps, depths in mm, times in s.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
-import jax
 import numpy as np
 from scipy import stats
 
@@ -13,55 +15,9 @@ from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.estimators.plausibility import SHALLOW
 from tvsbayes.instrument.axes import AXES, direction_of
 from tvsbayes.instrument.campaign import ordered_spots
-from tvsbayes.instrument.stops import StopReadings, rests_of
+from tvsbayes.instrument.stops import Rest, StopReadings, rests_of
 from tvsbayes.results.estimates import Cause, CauseGroup, StopResidual
 from tvsbayes.statistics.intervals import recursive_residuals
-
-
-def stop_readings(fit: JointFit, axis: str) -> StopReadings:
-    """What the spots say of every stop of an axis, before any stop error is shrunk towards zero.
-
-    At each stop the mirror angle that fits its spots best (`joint.SpotDeviations`, weighted by their noise), added to
-    the angle that counters and play predict.
-
-    Args:
-        fit: a converged fit.
-        axis: pan or tilt.
-
-    Returns:
-        One row per stop with a known side and the play taken up for certain.
-    """
-    index = AXES.index(axis)
-    values = dict(zip(fit.names, np.asarray(fit.mode.physical, dtype=float).tolist(), strict=True))
-    spots = sorted((s for s in fit.campaign.spots if s.status == "ok"), key=lambda s: (s.move, s.spot))
-    rests = rests_of(fit.campaign.moves, axis)
-    needed = values[f"backlash_deg.{axis}"] / abs(values[f"degrees_per_step.{axis}"])
-    seen = fit.linearised.spot_deviations()
-    sums: dict[int, list[float]] = {}
-    left_out = set()
-    for row, spot in enumerate(spots):
-        rest = rests[spot.move]
-        variance = float(seen.covariance_rad2[row, index, index])
-        if spot.spot in fit.excluded_spots or variance <= 0:
-            continue
-        if rest.sign == 0 or rest.leg < needed:
-            left_out.add(rest.move)
-            continue
-        entry = sums.setdefault(rest.move, [0.0, 0.0, float(fit.linearised.mirror_angles_rad[row, index])])
-        entry[0] += 1 / variance
-        entry[1] += float(seen.deviation_rad[row, index]) / variance
-    kept = [(rests[move], entry) for move, entry in sums.items()]
-    return StopReadings(
-        axis=axis,
-        steps=np.array([rest.steps for rest, _ in kept], dtype=int),
-        side=np.array([rest.sign for rest, _ in kept], dtype=int),
-        mirror_deg=np.degrees([angle + pull / weight for _, (weight, pull, angle) in kept]),
-        u_deg=np.degrees([weight**-0.5 for _, (weight, _, _) in kept]),
-        play_left_out=len(left_out),
-        reference_pose_deg=tuple(np.degrees(fit.reference_pose_rad).tolist()),
-        values=values,
-    )
-
 
 CAUSE_BINS = 6
 PLACEMENT_GAP = 1.03
@@ -72,44 +28,106 @@ STEP_PHASES = 4
 """Full steps per electrical period of a two-phase stepper: what its currents repeat with."""
 
 
+@dataclass(frozen=True)
+class _SeenRest:
+    """A rest of an axis with its usable spots, the mean weighted by their pixel noise.
+
+    At each spot the residual, range projected out, is explained by two angles (`SpotDeviations`).
+
+    Attributes:
+        rest: where the axis stood and how it came there.
+        first: row among `ordered_spots` of its first spot, usable or not: the one that drew the stop error.
+        rows: of its usable spots, shape (n,).
+        deviation_rad: of each, shape (n,).
+        variance_rad2: of each by pixel noise, shape (n,).
+        mean_rad: weighted mean.
+        mean_variance_rad2: its variance by pixel noise.
+    """
+
+    rest: Rest
+    first: int
+    rows: np.ndarray
+    deviation_rad: np.ndarray
+    variance_rad2: np.ndarray
+    mean_rad: float
+    mean_variance_rad2: float
+
+
+def _seen_rests(fit: JointFit, axis: str) -> list[_SeenRest]:
+    """Rests of an axis that usable spots tell of, in order."""
+    index, rests = AXES.index(axis), rests_of(fit.campaign.moves, axis)
+    seen = fit.linearised.spot_deviations()
+    deviation, variance = seen.deviation_rad[:, index], seen.covariance_rad2[:, index, index]
+    valid = np.asarray(fit.arrays.spots.valid)
+    rows_of: dict[Rest, list[int]] = {}
+    for row, spot in enumerate(ordered_spots(fit.campaign)):
+        rows_of.setdefault(rests[spot.move], []).append(row)
+    found = []
+    for rest, every in rows_of.items():
+        # A variance of 0: the spot tells neither angle.
+        rows = np.array([row for row in every if valid[row] > 0 and variance[row] > 0], dtype=int)
+        if len(rows):
+            weight = 1 / variance[rows]
+            total = float(weight.sum())
+            mean = float(deviation[rows] @ weight) / total
+            found.append(_SeenRest(rest, every[0], rows, deviation[rows], variance[rows], mean, 1 / total))
+    return found
+
+
+def stop_readings(fit: JointFit, axis: str) -> StopReadings:
+    """What the spots say of every stop of an axis, before any stop error is shrunk towards zero.
+
+    At each stop the mean deviation of its spots, added to the angle that counters and play predict.
+
+    Args:
+        fit: a converged fit.
+        axis: pan or tilt.
+
+    Returns:
+        One row per stop with a known side and the play taken up for certain.
+    """
+    values = dict(zip(fit.names, np.asarray(fit.mode.physical, dtype=float).tolist(), strict=True))
+    needed = values[f"backlash_deg.{axis}"] / abs(values[f"degrees_per_step.{axis}"])
+    seen = _seen_rests(fit, axis)
+    kept = [one for one in seen if one.rest.sign != 0 and one.rest.leg >= needed]
+    predicted = np.asarray(fit.linearised.mirror_angles_rad)[[one.rows[0] for one in kept], AXES.index(axis)]
+    pan, tilt = np.degrees(fit.reference_pose_rad).tolist()
+    return StopReadings(
+        axis=axis,
+        steps=np.array([one.rest.steps for one in kept], dtype=int),
+        side=np.array([one.rest.sign for one in kept], dtype=int),
+        mirror_deg=np.degrees(predicted + [one.mean_rad for one in kept]),
+        u_deg=np.degrees(np.sqrt([one.mean_variance_rad2 for one in kept])),
+        play_left_out=len(seen) - len(kept),
+        reference_pose_deg=(pan, tilt),
+        values=values,
+    )
+
+
 def stop_residuals(fit: JointFit) -> tuple[StopResidual, ...]:
     """Deviations of all stops from the fitted model, both axes, in order.
 
-    At each spot the residual, range projected out, is explained by two angles (least squares); the spots of one rest
-    of an axis are averaged with the weights of their pixel noise. The common part of the calibration is in none of
-    them, and each deviation has lost a little to the fit: they scatter by slightly less than `u_deg`.
+    The common part of the calibration is in none of them, and each deviation has lost a little to the fit: they
+    scatter by slightly less than `u_deg`.
     """
-    spots = ordered_spots(fit.campaign)
-    moves = fit.campaign.moves
-    rows = jax.tree.map(lambda x: np.asarray(x)[: len(spots)], fit.arrays.spots)
-    seen = fit.linearised.spot_deviations()
-    found = []
+    spots, moves = ordered_spots(fit.campaign), fit.campaign.moves
+    depth_mm = np.asarray(fit.arrays.spots.triangulated_mm)[:, 0]
+    found: list[StopResidual] = []
     for index, axis in enumerate(AXES):
-        rests = rests_of(moves, axis)
-        begun = np.array([rests[spot.move].move for spot in spots])
-        for number in np.unique(begun):
-            chosen = np.flatnonzero((begun == number) & (rows.valid > 0))
-            if not len(chosen):
-                continue
-            rest = rests[number]
-            mine, noise = seen.deviation_rad[chosen, index], seen.covariance_rad2[chosen, index, index]
-            weight = 1 / noise
-            mean = mine @ weight / weight.sum()
+        for one in _seen_rests(fit, axis):
             # The row that drew the stop error has its variance, whether that spot is used or not.
-            drawn = np.flatnonzero(begun == number)[0]
-            variance = 1 / weight.sum() + fit.linearised.stop_variance[drawn, index]
-            within = recursive_residuals(mine, noise, backwards=len(found) % 2 == 1)
+            variance = one.mean_variance_rad2 + fit.linearised.stop_variance[one.first, index]
             found.append(
                 StopResidual(
                     axis=axis,
-                    spots=tuple(spots[i].spot for i in chosen),
-                    steps=rest.steps,
-                    direction=direction_of(axis, rest.sign),
-                    leg_steps=abs(rest.distance),
-                    depth_mm=tuple(map(float, rows.triangulated_mm[chosen, 0])),
-                    within=within,
-                    time_s=moves[spots[chosen[0]].move].time_s,
-                    deviation_deg=float(np.degrees(mean)),
+                    spots=tuple(spots[row].spot for row in one.rows),
+                    steps=one.rest.steps,
+                    direction=direction_of(axis, one.rest.sign),
+                    leg_steps=abs(one.rest.distance),
+                    depth_mm=tuple(depth_mm[one.rows].tolist()),
+                    within=recursive_residuals(one.deviation_rad, one.variance_rad2, backwards=len(found) % 2 == 1),
+                    time_s=moves[spots[one.rows[0]].move].time_s,
+                    deviation_deg=float(np.degrees(one.mean_rad)),
                     u_deg=float(np.degrees(np.sqrt(variance))),
                 )
             )
@@ -139,11 +157,12 @@ def residual_causes(residuals: Sequence[StopResidual]) -> tuple[Cause, ...]:
             for depth, value in zip(r.depth_mm, r.within or (r.deviation_deg / r.u_deg,), strict=True)
             if value is not None
         ]
-        tested = {"depth": ([depth for depth, _ in looks], np.array([value for _, value in looks]))}
-        tested |= {name: ([key(r) for r in mine], scaled) for name, key in keys.items()}
-        for name, (values, measured) in tested.items():
+        depths = [depth for depth, _ in looks]
+        tested = {"depth": (_placed(depths), np.array([value for _, value in looks]))}
+        tested |= {n: (_binned([key(r) for r in mine], units.get(n, "")), scaled) for n, key in keys.items()}
+        for name, (parts, measured) in tested.items():
             groups, members = [], []
-            for label, rows in _placed(values) if name == "depth" else _binned(values, units.get(name, "")):
+            for label, rows in parts:
                 part = measured[rows]
                 spread = float(part.std(ddof=1)) if len(part) > 1 else 1.0
                 groups.append(CauseGroup(label, len(part), float(part.mean()), spread / np.sqrt(len(part))))

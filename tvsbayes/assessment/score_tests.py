@@ -1,4 +1,8 @@
-"""Tests of defects that the model leaves out."""
+"""Whether the residuals look as the model says: score tests of defects that it leaves out.
+
+Residuals are whitened by the pixel noise, four components a spot (range projected out; the last is empty without a
+reading); coordinates are in sds of their priors. Counters in steps, angles in degrees.
+"""
 
 from __future__ import annotations
 
@@ -46,7 +50,7 @@ def _times(columns: np.ndarray, pattern: np.ndarray) -> np.ndarray:
 
 
 @dataclass(frozen=True)
-class _Axis:
+class _SeenAxis:
     """One axis as the spots saw it: effect of its angle (spots, 4, 1), angle, counter, last move."""
 
     name: str
@@ -56,18 +60,15 @@ class _Axis:
     leg_steps: np.ndarray
 
 
-def _axes(fit: JointFit) -> tuple[_Axis, _Axis]:
-    lin = fit.linearised
-    angle = np.degrees(lin.mirror_angles_rad)
-
-    def seen(index: int) -> _Axis:
-        name = AXES[index]
-        rests = rests_of(fit.campaign.moves, name)
+def _seen_axes(fit: JointFit) -> list[_SeenAxis]:
+    slope, angle = np.asarray(fit.linearised.slope), np.degrees(fit.linearised.mirror_angles_rad)
+    found = []
+    for index, axis in enumerate(AXES):
+        rests = rests_of(fit.campaign.moves, axis)
         at = [rests[spot.move] for spot in ordered_spots(fit.campaign)]
         counter, leg = (np.array([getattr(rest, field) for rest in at]) for field in ("steps", "distance"))
-        return _Axis(name, lin.slope[:, :, index : index + 1], angle[:, index], counter, leg)
-
-    return seen(0), seen(1)
+        found.append(_SeenAxis(axis, slope[:, :, index : index + 1], angle[:, index], counter, leg))
+    return found
 
 
 def _epipolar(fit: JointFit) -> np.ndarray:
@@ -75,22 +76,22 @@ def _epipolar(fit: JointFit) -> np.ndarray:
 
     The part of a residual that neither a mirror angle nor a range explains: no model of the beam is in it.
     """
-    lin = fit.linearised
-    readings = -lin.residual_jacobian[:, :, INDEX["aperture_zero_deg"]]
+    jacobian, slope = np.asarray(fit.linearised.residual_jacobian), np.asarray(fit.linearised.slope)
+    readings = -jacobian[:, :, INDEX["aperture_zero_deg"]]
     # Without a reading the last of the four components is empty.
     readings = np.where(np.any(readings, axis=1, keepdims=True), readings, np.eye(4)[3])
-    taken = np.concatenate([lin.slope.transpose(0, 2, 1), readings[:, None]], axis=1)
+    taken = np.concatenate([slope.transpose(0, 2, 1), readings[:, None]], axis=1)
     normal = np.linalg.svd(taken)[2][:, -1]
     row = np.linalg.pinv(np.asarray(fit.space.stereo_root))[:, STEREO_PARAMETER_NAMES.index("stereo.right.cy")]
-    shift = -lin.residual_jacobian[:, :, len(RIG_NAMES) :] @ row
+    shift = -jacobian[:, :, len(RIG_NAMES) :] @ row
     shift = normal * np.sum(normal * shift, axis=1, keepdims=True)
-    place = lin.predicted[:, :2]
+    place = np.asarray(fit.linearised.predicted)[:, :2]
     spread = place.std(axis=0)
     place = (place - place.mean(axis=0)) / np.where(spread > 0, spread, 1.0)
     return shift[:, :, None] * np.concatenate([np.ones((len(place), 1)), place], axis=1)[:, None, :]
 
 
-def _defects_in_time(fit: JointFit, axes: Sequence[_Axis]) -> list[_Defect]:
+def _defects_in_time(fit: JointFit, axes: Sequence[_SeenAxis]) -> list[_Defect]:
     """What moves, drifts or slips while the campaign runs."""
     spots, moves = ordered_spots(fit.campaign), fit.campaign.moves
     order = np.arange(len(spots))
@@ -99,8 +100,8 @@ def _defects_in_time(fit: JointFit, axes: Sequence[_Axis]) -> list[_Defect]:
     time = order if np.ptp(time) == 0 else time
     drift = (time - time.mean()) / max(np.ptp(time), 1)
     segment = np.array([moves[spot.move].segment for spot in spots])
-    cameras = -fit.linearised.residual_jacobian[:, :, [INDEX[name] for name in _POSE]]
-    warmed = -fit.linearised.residual_jacobian[:, :, [*(INDEX[name] for name in _POSE), INDEX["focal_scale"]]]
+    jacobian, pose = np.asarray(fit.linearised.residual_jacobian), [INDEX[name] for name in _POSE]
+    cameras, warmed = -jacobian[:, :, pose], -jacobian[:, :, [*pose, INDEX["focal_scale"]]]
     apart = _epipolar(fit)
 
     def rows(count: int) -> np.ndarray:
@@ -138,7 +139,7 @@ def _defects_in_time(fit: JointFit, axes: Sequence[_Axis]) -> list[_Defect]:
     ]
 
 
-def _defects_in_place(fit: JointFit, axes: Sequence[_Axis]) -> list[_Defect]:
+def _defects_in_place(fit: JointFit, axes: Sequence[_SeenAxis]) -> list[_Defect]:
     """What depends on where the axes stand, how they got there, and on the sheet."""
     targets = np.array([spot.target for spot in ordered_spots(fit.campaign)])
     places, waves = [], []
@@ -170,6 +171,88 @@ def _defects_in_place(fit: JointFit, axes: Sequence[_Axis]) -> list[_Defect]:
     ]
 
 
+@dataclass(frozen=True)
+class _Answer:
+    """A test before it is judged; `log_p` because chi-squares of hundreds have no p in double precision."""
+
+    log_p: float
+    name: str
+    where: str
+    chi2: float
+    dof: int
+    shift_sd: float
+    places: int = 1
+
+
+@dataclass(frozen=True)
+class _Scores:
+    """Scores of all columns, each scaled to unit information, less what the fit can follow.
+
+    Attributes:
+        score: shape (q,).
+        variance: shape (q, q).
+        moved_by: how far a defect of unit size moves every headline, in its sds, shape (headlines, q).
+    """
+
+    score: np.ndarray
+    variance: np.ndarray
+    moved_by: np.ndarray
+
+    def answer(self, name: str, place: str, rows: slice) -> _Answer | None:
+        """The test of some columns; None where the fit can follow them entirely."""
+        values, vectors = np.linalg.eigh(self.variance[rows, rows])
+        kept = values > ABSORBED
+        if not kept.any():
+            return None
+        along = vectors[:, kept].T @ self.score[rows]
+        chi2, dof = float(np.sum(along**2 / values[kept])), int(kept.sum())
+        size = (vectors[:, kept] / values[kept]) @ along
+        shift = float(np.max(np.abs(self.moved_by[:, rows] @ size)))
+        return _Answer(float(log_chance(chi2, dof)), name, place, chi2, dof, shift)
+
+
+@dataclass(frozen=True)
+class _Asked:
+    """What all tests share.
+
+    Attributes:
+        groups: stops of the campaign; the first p columns of their Jacobians are the fit's own, then the defects'.
+        own_score: of the fit's own columns, shape (p,): what the residuals still ask for.
+        followed: inverse information of the directions that the fit can follow, shape (p, p).
+        scores: of the defects' columns.
+    """
+
+    groups: Sequence[StopGroup]
+    own_score: np.ndarray
+    followed: np.ndarray
+    scores: _Scores
+
+
+def _ask(fit: JointFit, defects: Sequence[_Defect]) -> _Asked:
+    held = np.isin(NAMES, NOISE_NAMES) | ~fit.free
+    own = np.where(held, 0.0, -np.asarray(fit.linearised.residual_jacobian))
+    asked = np.concatenate([own, *(columns for defect in defects for columns in defect.columns)], axis=2)
+    information = stop_information(linear_spots(fit.linearised, fit.arrays, asked))
+    errors = np.concatenate([group.residual for group in information.groups])
+    score = asked.reshape(-1, asked.shape[2]).T @ errors
+    p = own.shape[2]
+    fisher, cross = information.fisher[:p, :p], information.fisher[:p, p:]
+    values, vectors = np.linalg.eigh(fisher)
+    kept = values > KNOWN_DIRECTION
+    inverse = (vectors[:, kept] / values[kept]) @ vectors[:, kept].T
+    followed = inverse @ cross
+    whole = np.diag(information.fisher)[p:]
+    scale = 1 / np.sqrt(np.where(whole > 0, whole, 1.0))
+    _, gradient = headline_gradients(fit, moved_directions(fit))
+    sd = np.sqrt(np.einsum("qi,ij,qj->q", gradient, fit.covariance, gradient))
+    scores = _Scores(
+        score=(score[p:] - followed.T @ score[:p]) * scale,
+        variance=(information.fisher[p:, p:] - cross.T @ followed) * np.outer(scale, scale),
+        moved_by=gradient @ fit.covariance @ cross * scale / sd[:, None],
+    )
+    return _Asked(information.groups, score[:p], inverse, scores)
+
+
 def validate(fit: JointFit) -> Validation:
     """Look for defects that the model does not have, by score tests at the mode.
 
@@ -189,80 +272,37 @@ def validate(fit: JointFit) -> Validation:
     Returns:
         What was asked and found; a question that the fit can follow entirely is not asked.
     """
-    axes = _axes(fit)
+    axes = _seen_axes(fit)
     defects = [*_defects_in_time(fit, axes), *_defects_in_place(fit, axes)]
-    held = np.isin(NAMES, NOISE_NAMES) | ~fit.free
-    own = np.where(held, 0.0, -fit.linearised.residual_jacobian)
-    asked = np.concatenate([own, *(columns for defect in defects for columns in defect.columns)], axis=2)
-    information = stop_information(linear_spots(fit.linearised, fit.arrays, asked))
-    errors = np.concatenate([group.residual for group in information.groups])
-    score = asked.reshape(-1, asked.shape[2]).T @ errors
-    p = own.shape[2]
-    fisher, cross = information.fisher[:p, :p], information.fisher[:p, p:]
-    values, vectors = np.linalg.eigh(fisher)
-    kept = values > KNOWN_DIRECTION
-    inverse = (vectors[:, kept] / values[kept]) @ vectors[:, kept].T
-    followed = inverse @ cross
-    whole = np.diag(information.fisher)[p:]
-    scale = 1 / np.sqrt(np.where(whole > 0, whole, 1.0))
-    found = [_single_spots(fit, information.groups, inverse, inverse @ score[:p])]
-    score = (score[p:] - followed.T @ score[:p]) * scale
-    variance = (information.fisher[p:, p:] - cross.T @ followed) * np.outer(scale, scale)
-    _, gradient = headline_gradients(fit, moved_directions(fit))
-    sd = np.sqrt(np.einsum("qi,ij,qj->q", gradient, fit.covariance, gradient))
-    moved_by = gradient @ fit.covariance @ cross * scale / sd[:, None]
-
+    asked = _ask(fit, defects)
+    found = [_single_spots(fit, asked)]
     start = 0
     for defect in defects:
         answers = []
         for place, columns in zip(defect.places, defect.columns, strict=True):
             rows = slice(start, start + columns.shape[2])
             start = rows.stop
-            values, vectors = np.linalg.eigh(variance[rows, rows])
-            kept = values > ABSORBED
-            if kept.any():
-                along = vectors[:, kept].T @ score[rows]
-                chi2, dof = float(np.sum(along**2 / values[kept])), int(kept.sum())
-                size = (vectors[:, kept] / values[kept]) @ along
-                shift = float(np.max(np.abs(moved_by[:, rows] @ size)))
-                answers.append(_Answer(float(log_chance(chi2, dof)), defect.name, place, chi2, dof, shift))
+            answer = asked.scores.answer(defect.name, place, rows)
+            if answer is not None:
+                answers.append(answer)
         if answers:
             worst = min(answers, key=lambda a: a.log_p)
             found.append(replace(worst, log_p=worst.log_p + np.log(len(answers)), places=len(answers)))
     return _holm(found)
 
 
-@dataclass(frozen=True)
-class _Answer:
-    """A test before it is judged; `log_p` because chi-squares of hundreds have no p in double precision."""
-
-    log_p: float
-    name: str
-    where: str
-    chi2: float
-    dof: int
-    shift_sd: float
-    places: int = 1
-
-
-def _single_spots(fit: JointFit, groups: Sequence[StopGroup], followed: np.ndarray, shift: np.ndarray) -> _Answer:
+def _single_spots(fit: JointFit, asked: _Asked) -> _Answer:
     """The spot that all others foretell worst; how far it moves a headline is not asked (`--robust` drops it).
 
-    As `likelihood.leave_one_out_chi2`, less what the fit can follow.
-
-    Args:
-        fit: the fit.
-        groups: its stops; the first columns of their Jacobians belong to the coordinates.
-        followed: inverse information of the directions that the fit can follow, shape (p, p).
-        shift: step along them that the residuals still ask for, shape (p,).
+    As `linear_spots.leave_one_out_chi2`, less what the fit can follow.
     """
     spots = ordered_spots(fit.campaign)
-    p = len(shift)
-    errors = np.concatenate([(g.residual - g.jacobian[:, :p] @ shift).reshape(-1, 4) for g in groups])
+    p, shift = len(asked.own_score), asked.followed @ asked.own_score
+    errors = np.concatenate([(g.residual - g.jacobian[:, :p] @ shift).reshape(-1, 4) for g in asked.groups])
     blocks = []
-    for group in groups:
+    for group in asked.groups:
         own = group.jacobian[:, :p]
-        left = group.precision - own @ followed @ own.T
+        left = group.precision - own @ asked.followed @ own.T
         blocks += [left[k : k + 4, k : k + 4] for k in range(0, len(left), 4)]
     values, vectors = np.linalg.eigh(np.stack(blocks))
     kept = values > ABSORBED

@@ -1,7 +1,6 @@
-"""What a fit knows: headlines, contraction, weak directions, leverage of stops, causes of its covariance, calibration.
+"""What a fit knows, put together: headlines, parameters, diagnostics, and what the classic estimator should report.
 
-Works on a finished `JointFit`, and on a `Posterior` where there is one; computes no new fit. Units are those of
-DESIGN 8.
+Works on a finished `JointFit`, and on a `Posterior` where there is one; computes no new fit. Units as in the names.
 """
 
 from __future__ import annotations
@@ -21,10 +20,9 @@ from tvsbayes.assessment.weaknesses import (
     prior_sensitivity,
     weak_directions,
 )
-from tvsbayes.estimators.four_point import four_point_ratios, select_experiments
+from tvsbayes.estimators.four_point import experiment_rows, four_point_ratios, select_experiments
 from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.instrument.axes import AXES, DIRECTIONS, SENSES
-from tvsbayes.instrument.campaign import ordered_spots
 from tvsbayes.instrument.parameters import HARMONIC_NAMES, INDEX, NAMES, RECEIVER_NAMES, RIG_NAMES
 from tvsbayes.instrument.stops import legs_of
 from tvsbayes.model.headlines import Derived
@@ -45,6 +43,25 @@ def _estimate(mode: float, draws: np.ndarray, prior_draws: np.ndarray) -> Estima
     return Estimate(float(mode), sd, interval95(draws), prior_sd, contraction)
 
 
+type _Quantity = Callable[[Derived], np.ndarray]
+"""What is read off headlines and parameters, with or without a leading axis of draws."""
+
+
+def _ratio(index: int) -> _Quantity:
+    """Effective ratio of one of `DIRECTIONS`, deg/step."""
+    return lambda derived: np.asarray(derived.effective_deg_per_step)[..., index]
+
+
+def _parameter(name: str) -> _Quantity:
+    """A parameter, in the unit of its name."""
+    return lambda derived: np.asarray(derived.physical)[..., INDEX[name]]
+
+
+def _sum(first: _Quantity, factor: float, second: _Quantity) -> _Quantity:
+    """One and a multiple of another."""
+    return lambda derived: first(derived) + factor * second(derived)
+
+
 class _Source:
     """Where the numbers come from: the Laplace approximation, or a posterior and its diagnosis."""
 
@@ -57,9 +74,9 @@ class _Source:
             self.draws = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), posterior.draws)
             self.centre = jax.tree.map(lambda x: x.mean(axis=0), self.draws)
 
-    def estimate(self, name: str, of: Callable[[Derived], np.ndarray]) -> Estimate:
+    def estimate(self, name: str, of: _Quantity) -> Estimate:
         """A quantity that is linear in the fields of `Derived`, with the sampler's diagnosis of `name`."""
-        plain = _estimate(*(of(draws) for draws in (self.centre, self.draws, self.prior)))
+        plain = _estimate(float(of(self.centre)), of(self.draws), of(self.prior))
         if self.posterior is None:
             return plain
         found = self.posterior.convergence
@@ -82,7 +99,7 @@ def _parameters(source: _Source) -> dict[str, Estimate]:
             continue
         if name in HARMONIC_NAMES and not fit.free[index] and fit.mode.physical[index] == 0:
             continue
-        estimate = source.estimate(name, lambda d, i=index: d.physical[..., i])
+        estimate = source.estimate(name, _parameter(name))
         if source.posterior is not None:
             estimates[name] = estimate
             continue
@@ -98,15 +115,13 @@ def _parameters(source: _Source) -> dict[str, Estimate]:
 def _derived(source: _Source) -> dict[str, Estimate]:
     """Per-direction gear ratios and the effective mirror offset."""
     estimates = {}
-    for axis, (positive, negative) in SENSES.items():
-        ratio, contrast = INDEX[f"degrees_per_step.{axis}"], INDEX[f"ratio_contrast_deg_per_step.{axis}"]
-        for direction, sign in ((positive, 0.5), (negative, -0.5)):
+    for axis, pair in SENSES.items():
+        ratio, contrast = _parameter(f"degrees_per_step.{axis}"), _parameter(f"ratio_contrast_deg_per_step.{axis}")
+        for direction, half in zip(pair, (0.5, -0.5), strict=True):
             name = f"degrees_per_step.{direction}"
-            estimates[name] = source.estimate(
-                name, lambda d, r=ratio, c=contrast, s=sign: d.physical[..., r] + s * d.physical[..., c]
-            )
+            estimates[name] = source.estimate(name, _sum(ratio, half, contrast))
     name = "effective_mirror_offset_mm"
-    estimates[name] = source.estimate(name, lambda d: d.effective_mirror_offset_mm)
+    estimates[name] = source.estimate(name, lambda derived: np.asarray(derived.effective_mirror_offset_mm))
     return estimates
 
 
@@ -121,17 +136,14 @@ def _classic_predicted(source: _Source) -> dict[str, Estimate | None]:
     result: dict[str, Estimate | None] = dict.fromkeys(DIRECTIONS)
     if not len(selection.experiments):
         return result
-    ordered = ordered_spots(fit.campaign)
-    row_of = {spot.spot: row for row, spot in enumerate(ordered)}
-    ids = np.array([s.spot for s in fit.campaign.spots])
-    rows = np.vectorize(row_of.get)(ids[selection.spot_rows])
+    rows = experiment_rows(fit.campaign, selection)
 
-    def ratios(pixels):
+    def ratios(pixels: np.ndarray) -> np.ndarray:
         return four_point_ratios(pixels, selection.steps, selection.axis, fit.campaign.stereo)
 
     if source.posterior is None:
-        pixels = fit.linearised.predicted[rows][..., :4]
-        push = fit.linearised.predicted_jacobian[rows][..., :4, :]
+        pixels = np.asarray(fit.linearised.predicted)[rows][..., :4]
+        push = np.asarray(fit.linearised.predicted_jacobian)[rows][..., :4, :]
         centre = ratios(pixels)
         draws = np.stack([ratios(pixels + push @ dz) for dz in fit.draws_z[:CLASSIC_DRAWS] - fit.z])
     else:
@@ -150,42 +162,48 @@ def _classic_predicted(source: _Source) -> dict[str, Estimate | None]:
 
 def _curves(posterior: Posterior, moved: set[str]) -> dict[str, object]:
     """Effective ratios along both axes over the range that was seen, and lost motion at the step counts used."""
-    fit = posterior.fit
-    angles = np.degrees(fit.linearised.mirror_angles_rad)
-    middle = np.degrees(fit.reference_pose_rad)
-    along = {}
-    for axis, name in enumerate(AXES):
-        rows = []
-        for angle in np.linspace(angles[:, axis].min(), angles[:, axis].max(), CURVE_POINTS):
-            pose = middle.copy()
-            pose[axis] = angle
-            found = posterior.effective_deg_per_step(*map(float, pose))
-            entry = {"pan_deg": float(pose[0]), "tilt_deg": float(pose[1])}
-            for k, direction in enumerate(DIRECTIONS):
-                if direction in moved:
-                    entry[direction] = {
-                        "value": float(found.mean[k]),
-                        "sd": float(found.sd[k]),
-                        "interval95": found.interval95[:, k].tolist(),
-                    }
-            rows.append(entry)
-        along[name] = rows
-    used = legs_of(fit.campaign.moves)
-    lost = {}
-    for direction in sorted(moved, key=DIRECTIONS.index):
-        steps = sorted(set(used[direction]))
-        steps = [steps[i] for i in np.unique(np.linspace(0, len(steps) - 1, min(CURVE_POINTS, len(steps))).astype(int))]
-        found = posterior.lost_motion_deg(direction, np.array(steps))
-        lost[direction] = [
-            {
-                "steps": int(n),
-                "value_deg": float(found.mean[k]),
-                "sd_deg": float(found.sd[k]),
-                "interval95_deg": found.interval95[:, k].tolist(),
-            }
-            for k, n in enumerate(steps)
-        ]
+    lost = {direction: _lost_motion(posterior, direction) for direction in DIRECTIONS if direction in moved}
+    along = {axis: _along(posterior, index, moved) for index, axis in enumerate(AXES)}
     return {"effective_deg_per_step": along, "lost_motion": lost}
+
+
+def _along(posterior: Posterior, axis: int, moved: set[str]) -> list[dict[str, object]]:
+    """Effective ratios at angles of one axis, the other at the reference pose."""
+    angles = np.degrees(posterior.fit.linearised.mirror_angles_rad)[:, axis]
+    rows = []
+    for angle in np.linspace(angles.min(), angles.max(), CURVE_POINTS):
+        pose = np.degrees(posterior.fit.reference_pose_rad)
+        pose[axis] = angle
+        pan, tilt = pose.tolist()
+        found = posterior.effective_deg_per_step(pan, tilt)
+        ratios = {
+            direction: {
+                "value": float(found.mean[k]),
+                "sd": float(found.sd[k]),
+                "interval95": found.interval95[:, k].tolist(),
+            }
+            for k, direction in enumerate(DIRECTIONS)
+            if direction in moved
+        }
+        rows.append({"pan_deg": pan, "tilt_deg": tilt, **ratios})
+    return rows
+
+
+def _lost_motion(posterior: Posterior, direction: str) -> list[dict[str, object]]:
+    """Mirror angle that a reversal costs, at a few of the lengths that the campaign moved."""
+    used = sorted(set(legs_of(posterior.fit.campaign.moves)[direction]))
+    chosen = np.unique(np.linspace(0, len(used) - 1, min(CURVE_POINTS, len(used))).astype(int))
+    steps = [used[i] for i in chosen]
+    found = posterior.lost_motion_deg(direction, np.array(steps))
+    return [
+        {
+            "steps": n,
+            "value_deg": float(found.mean[k]),
+            "sd_deg": float(found.sd[k]),
+            "interval95_deg": found.interval95[:, k].tolist(),
+        }
+        for k, n in enumerate(steps)
+    ]
 
 
 def summarise(fit: JointFit, posterior: Posterior | None = None) -> FitSummary:
@@ -203,23 +221,19 @@ def summarise(fit: JointFit, posterior: Posterior | None = None) -> FitSummary:
     usable = posterior if posterior is not None and posterior.converged else None
     source = _Source(fit, usable)
     effective = {
-        d: source.estimate(f"effective_deg_per_step.{d}", lambda x, k=k: x.effective_deg_per_step[..., k])
-        if d in moved
-        else None
+        d: source.estimate(f"effective_deg_per_step.{d}", _ratio(k)) if d in moved else None
         for k, d in enumerate(DIRECTIONS)
     }
-    contrasts = {}
-    for axis, first in (("pan", 0), ("tilt", 2)):
-        both = {DIRECTIONS[first], DIRECTIONS[first + 1]} <= moved
-        difference = source.estimate(
-            f"effective_contrast_deg_per_step.{axis}",
-            lambda x, k=first: x.effective_deg_per_step[..., k] - x.effective_deg_per_step[..., k + 1],
-        )
-        contrasts[axis] = difference if both else None
+    contrasts: dict[str, Estimate | None] = dict.fromkeys(AXES)
+    for k, (axis, pair) in enumerate(SENSES.items()):
+        if set(pair) <= moved:
+            difference = _sum(_ratio(2 * k), -1.0, _ratio(2 * k + 1))
+            contrasts[axis] = source.estimate(f"effective_contrast_deg_per_step.{axis}", difference)
     readings = np.asarray(fit.arrays.spots.has_aperture * fit.arrays.spots.valid).sum()
     observations = 3 * float(np.asarray(fit.arrays.spots.valid).sum()) + float(readings)
     determined = float(np.trace(fit.information.fisher @ fit.covariance))
-    pan, tilt = np.degrees(fit.reference_pose_rad)
+    pan, tilt = np.degrees(fit.reference_pose_rad).tolist()
+    (a, b), (c, d) = np.asarray(source.centre.jacobian).tolist()
     problems = fit.problems
     if posterior is not None:
         problems += tuple(f"UNCONVERGED: {sentence}" for sentence in posterior.convergence.missing)
@@ -228,8 +242,8 @@ def summarise(fit: JointFit, posterior: Posterior | None = None) -> FitSummary:
         problems=problems,
         effective=effective,
         contrasts=contrasts,
-        reference_pose_deg={"pan": float(pan), "tilt": float(tilt)},
-        jacobian=tuple(tuple(float(x) for x in row) for row in source.centre.jacobian),
+        reference_pose_deg={"pan": pan, "tilt": tilt},
+        jacobian=((a, b), (c, d)),
         parameters={**_parameters(source), **_derived(source)},
         chi2=fit.chi2,
         dof=observations - determined,

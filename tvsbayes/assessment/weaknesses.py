@@ -1,4 +1,7 @@
-"""What the data leave open: weak directions, leverage, priors."""
+"""What the data leave open: weak directions, stops on which all hangs, priors that decide, directions with few stops.
+
+Directions and gradients are those of the coordinates, each in sds of its prior; the linear model about the mode.
+"""
 
 from __future__ import annotations
 
@@ -56,6 +59,7 @@ def _backlash_direction(fit: JointFit, axis: str, direction: str) -> WeakDirecti
 
 
 def weak_directions(fit: JointFit, moved: set[str]) -> tuple[WeakDirection, ...]:
+    """Combinations of parameters that data and priors leave wide, in words: axes never moved, play, priors alone."""
     found = []
     for axis, pair in SENSES.items():
         if not moved & set(pair):
@@ -92,9 +96,8 @@ def weak_directions(fit: JointFit, moved: set[str]) -> tuple[WeakDirection, ...]
 
 def headline_gradients(fit: JointFit, moved: set[str]) -> tuple[list[str], np.ndarray]:
     """Effective ratios and backlashes with d(quantity)/d(coordinates), shape (q, p)."""
-    quantities = {
-        f"effective {d}": fit.draws.effective_deg_per_step[:, k] for k, d in enumerate(DIRECTIONS) if d in moved
-    }
+    ratios = np.asarray(fit.draws.effective_deg_per_step)
+    quantities = {f"effective {d}": ratios[:, k] for k, d in enumerate(DIRECTIONS) if d in moved}
     for axis in AXES:
         # In coordinates, where the backlash is Gaussian.
         quantities[f"backlash {axis}"] = fit.draws_z[:, INDEX[f"backlash_deg.{axis}"]]
