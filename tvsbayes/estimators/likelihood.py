@@ -179,33 +179,66 @@ def stop_variances(stop_sd_rad: Float[Array, "2 2"], spots: SpotArrays) -> Float
 class FilterRows(eqx.Module):
     """What the filter meets at each spot, in time order: its residual, how its states move it, which are new.
 
-    `load` = d(predicted)/d(state), `keep` is 0 for a state drawn anew since the previous spot and 1 otherwise,
-    `variance` the variance it is then drawn with.
+    `residual` has the shape (spots, 4), or (spots, 4, columns) where several are filtered at once; `load` is
+    d(predicted)/d(state), `keep` is 0 for a state drawn anew since the previous spot and 1 otherwise, `variance` the
+    variance it is then drawn with.
     """
 
-    residual: Float[Array, "*spots 4"]
+    residual: Float[Array, "..."]
     load: Float[Array, "*spots 4 6"]
     keep: Float[Array, "*spots 6"]
     variance: Float[Array, "*spots 6"]
 
 
-class Belief(eqx.Module):
-    """Mean and covariance of the filter's state."""
+def filter_rows(
+    residual: Float[Array, "spots 4 *columns"],
+    slope: Float[Array, "spots 4 2"],
+    play_sd_rad: Float[Array, "spots 2"],
+    stop_variance: Float[Array, "spots 2"],
+    spots: SpotArrays,
+) -> FilterRows:
+    """States of the filter at every spot: stop errors, home offsets, places in an unknown play.
 
-    mean: Float[Array, "6"]
+    Args:
+        residual: observed - predicted, or whatever else goes through the filter.
+        slope: d(predicted)/d(pan, tilt).
+        play_sd_rad: of the place in the play, zero where it is known.
+        stop_variance: from `stop_variances`.
+        spots: which of them re-home and draw stop errors anew.
+    """
+    pairs = (len(spots.valid), 2)
+    home = jnp.where(spots.homed, (HOME_SD_DEG * jnp.pi / 180) ** 2, 0.0)[:, None]
+    segment = jnp.broadcast_to(spots.new_segment[:, None], pairs)
+    return FilterRows(
+        residual=residual,
+        load=jnp.concatenate([slope, slope, slope * play_sd_rad[:, None]], axis=2),
+        keep=jnp.where(jnp.concatenate([spots.redraw, segment, segment], axis=1), 0.0, 1.0),
+        variance=jnp.concatenate([stop_variance, jnp.broadcast_to(home, pairs), jnp.ones(pairs)], axis=1),
+    )
+
+
+def _along(states: Float[Array, "6"], like: Array) -> Float[Array, "6 ..."]:
+    """Numbers of the six states for every column of `like`."""
+    return jnp.reshape(states, (STATES,) + (1,) * (like.ndim - 1))
+
+
+class Belief(eqx.Module):
+    """Mean, one for every column of residuals, and covariance of the filter's state."""
+
+    mean: Float[Array, "6 *columns"]
     covariance: Float[Array, "6 6"]
 
     def renewed(self, row: FilterRows) -> Belief:
         """The state as the spot finds it, before the spot is looked at."""
         new = jnp.diag(row.variance * (1 - row.keep))
-        return Belief(self.mean * row.keep, self.covariance * (row.keep[:, None] * row.keep) + new)
+        return Belief(self.mean * _along(row.keep, self.mean), self.covariance * (row.keep[:, None] * row.keep) + new)
 
 
 class Look(eqx.Module):
     """A spot seen by the filter: the state after it, standardised errors and the log of their variances' product."""
 
     belief: Belief
-    standardised: Float[Array, "4"]
+    standardised: Float[Array, "4 *columns"]
     log_variance: Scalar
 
 
@@ -217,17 +250,17 @@ def look(belief: Belief, row: FilterRows) -> Look:
         # Sums instead of products: a call into a matrix library costs more than six numbers.
         gain = jnp.sum(covariance * row.load[component], axis=1)
         variance_ahead = 1 + jnp.sum(row.load[component] * gain)
-        error = row.residual[component] - jnp.sum(row.load[component] * mean)
-        mean = mean + gain * (error / variance_ahead)
+        error = row.residual[component] - jnp.sum(_along(row.load[component], mean) * mean, axis=0)
+        mean = mean + _along(gain, mean) * (error / variance_ahead)
         covariance = covariance - gain[:, None] * (gain / variance_ahead)
         errors.append(error / jnp.sqrt(variance_ahead))
         variances.append(variance_ahead)
     return Look(Belief(mean, covariance), jnp.stack(errors), jnp.sum(jnp.log(jnp.stack(variances))))
 
 
-def no_belief() -> Belief:
+def no_belief(*columns: int) -> Belief:
     """Before the first spot, whose states are all new."""
-    return Belief(jnp.zeros(STATES), jnp.zeros((STATES, STATES)))
+    return Belief(jnp.zeros((STATES, *columns)), jnp.zeros((STATES, STATES)))
 
 
 class FilterInput(eqx.Module):
@@ -247,19 +280,8 @@ def filter_input(
     play_sd = angles.play_sd_rad[spots.move_index]
     if frozen:
         play_sd = jax.lax.stop_gradient(play_sd)
-    load = jnp.concatenate([terms.slope, terms.slope, terms.slope * play_sd[:, None]], axis=2)
-    home_variance = jnp.where(spots.homed, (HOME_SD_DEG * jnp.pi / 180) ** 2, 0.0)[:, None]
-    segment = jnp.broadcast_to(spots.new_segment[:, None], (spots.valid.size, 2))
-    renewed = jnp.concatenate([spots.redraw, segment, segment], axis=1)
-    variance = jnp.concatenate(
-        [
-            stop_variances(model.noise.stop_sd_rad, spots),
-            jnp.broadcast_to(home_variance, segment.shape),
-            jnp.ones(segment.shape),
-        ],
-        axis=1,
-    )
-    return FilterInput(FilterRows(terms.residual, load, jnp.where(renewed, 0.0, 1.0), variance), terms.log_scale)
+    variance = stop_variances(model.noise.stop_sd_rad, spots)
+    return FilterInput(filter_rows(terms.residual, terms.slope, play_sd, variance, spots), terms.log_scale)
 
 
 class Innovations(eqx.Module):

@@ -12,8 +12,7 @@ from jaxtyping import Array, Float
 from scipy import linalg
 
 from tvsbayes.estimators.campaign_arrays import CampaignArrays
-from tvsbayes.estimators.likelihood import spot_residuals, stop_variances
-from tvsbayes.instrument.axes import HOME_SD_DEG
+from tvsbayes.estimators.likelihood import filter_rows, spot_residuals, stop_variances
 from tvsbayes.model.laser_path import mirror_angles
 from tvsbayes.model.parameter_space import ParameterSpace
 
@@ -85,17 +84,11 @@ def linear_spots(lin: Linearised, arrays: CampaignArrays, jacobian: np.ndarray) 
         arrays: the campaign it comes from.
         jacobian: d(prediction)/d(whatever is asked about), shape (spots, 4, columns).
     """
-    count = len(lin.residual)
-    spots = jax.tree.map(lambda x: np.asarray(x)[:count], arrays.spots)
-    home_variance = np.where(spots.homed, np.radians(HOME_SD_DEG) ** 2, 0.0)[:, None] * np.ones(2)
-    segment = spots.new_segment[:, None] & np.ones(2, dtype=bool)
-    return LinearSpots(
-        residual=lin.residual,
-        load=np.concatenate([lin.slope, lin.slope, lin.slope * lin.play_sd_rad[:, None, :]], axis=2),
-        renewed=np.concatenate([spots.redraw, segment, segment], axis=1),
-        variance=np.concatenate([lin.stop_variance, home_variance, np.ones((count, 2))], axis=1),
-        jacobian=jacobian,
-    )
+    with jax.enable_x64(True):
+        spots = jax.tree.map(lambda x: jnp.asarray(x)[: len(lin.residual)], arrays.spots)
+        seen = (jnp.asarray(x) for x in (lin.residual, lin.slope, lin.play_sd_rad, lin.stop_variance))
+        rows = jax.tree.map(np.asarray, filter_rows(*seen, spots))
+    return LinearSpots(rows.residual, rows.load, rows.keep == 0, rows.variance, jacobian)
 
 
 @dataclass(frozen=True)

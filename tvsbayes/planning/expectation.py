@@ -22,6 +22,7 @@ from jaxtyping import Array, Bool, Float
 from tvsbayes.errors import InputError
 from tvsbayes.estimators.campaign_arrays import CampaignArrays, SpotArrays, move_arrays
 from tvsbayes.estimators.joint_fit import JointFit
+from tvsbayes.estimators.likelihood import filter_rows, look, no_belief
 from tvsbayes.estimators.linear_spots import linearise
 from tvsbayes.instrument.axes import HOME_SD_DEG
 from tvsbayes.instrument.campaign import Move
@@ -151,33 +152,16 @@ def expect(
     spots = arrays.spots
     lin = linearise(z, space, arrays)
     jacobian = jnp.where(NOISE_COLUMNS, 0.0, -lin.residual_jacobian)
-    count = pan.size
-    home = jnp.where(spots.homed, HOME_VARIANCE_RAD2, 0.0)[:, None] * jnp.ones(2)
-    segment = jnp.broadcast_to(spots.new_segment[:, None], (count, 2))
-    load = jnp.concatenate([lin.slope, lin.slope, lin.slope * lin.play_sd_rad[:, None, :]], axis=2)
-    keep = jnp.where(jnp.concatenate([spots.redraw, segment, segment], axis=1), 0.0, 1.0)
-    variance = jnp.concatenate([lin.stop_variance, home, jnp.ones((count, 2))], axis=1)
-
-    def step(carry, row):
-        mean, covariance = carry
-        look, load, keep, variance = row
-        mean = mean * keep[:, None]
-        covariance = covariance * (keep[:, None] * keep) + jnp.diag(variance * (1 - keep))
-        whitened = []
-        for component in range(4):
-            gain = jnp.sum(covariance * load[component], axis=1)
-            ahead = 1 + jnp.sum(load[component] * gain)
-            error = look[component] - jnp.sum(load[component][:, None] * mean, axis=0)
-            mean = mean + gain[:, None] * (error / ahead)
-            covariance = covariance - gain[:, None] * (gain / ahead)
-            whitened.append(error / jnp.sqrt(ahead))
-        return (mean, covariance), jnp.stack(whitened)
-
     columns = jnp.concatenate([jacobian, lin.slope], axis=2)
-    nothing = (jnp.zeros((6, columns.shape[2])), jnp.zeros((6, 6)))
-    _, rows = jax.lax.scan(step, nothing, (columns, load, keep, variance))
+    given = filter_rows(columns, lin.slope, lin.play_sd_rad, lin.stop_variance, spots)
+
+    def step(belief, row):
+        found = look(belief.renewed(row), row)
+        return found.belief, found.standardised
+
+    _, rows = jax.lax.scan(step, no_belief(columns.shape[2]), given)
     rows = jnp.where(seen[:, None, None], rows, 0.0)
-    return Expectation(rows, jacobian, lin.slope, load, keep, variance, seen, lin.mirror_angles_rad)
+    return Expectation(rows, jacobian, lin.slope, given.load, given.keep, given.variance, seen, lin.mirror_angles_rad)
 
 
 def design_arrays(
