@@ -9,9 +9,9 @@ From a campaign folder to a robot:
     found = tvsbayes.locate(calibration, 100, 20, 70.0)  # counters and aperture reading -> mm, with covariance
     calibration = tvsbayes.load_calibration("mine")      # the same from results/ after `tvsbayes fit mine`: NumPy alone
 
-mm, px, and degrees where a name says `deg`; frames and signs are in the README's table of conventions. Classic
-estimator, simulation, planning, comparison, figures: `tvsbayes.classic`, `.simulation`, `.planning`, `.comparison`,
-`.plots`. Refused input raises `tvsbayes.files.InputError`, which says where, what was found and what to do.
+mm, px, and degrees where a name says `deg`; frames, signs and names are in `data/docs/conventions.md`, the map of all
+modules in `data/docs/architecture.md`, more examples in `data/docs/python.md`. Refused input raises
+`tvsbayes.errors.InputError`, which says where, what was found and what to do.
 """
 
 from __future__ import annotations
