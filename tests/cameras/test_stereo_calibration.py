@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
-import sys
 from dataclasses import replace
 from pathlib import Path
-from types import ModuleType
 
 import cv2
 import numpy as np
@@ -15,6 +12,8 @@ import pytest
 from scipy import stats
 from support.drawn_boards import PAIR, POSES, pictures, write_pair
 
+from experiments.cameras.stereo_coverage import calibrate
+from experiments.common.board_views import CORNER_SD_PX, corners_of, scenes, true_corners
 from tvsbayes.cameras.boards import Board, View, Views, find_views
 from tvsbayes.cameras.bundle_adjustment import bundle_adjustment, correlation_factor
 from tvsbayes.cameras.stereo_calibration import StereoCalibration, _camera_start, calibrate_stereo
@@ -34,28 +33,15 @@ VIEWS = 14
 
 
 @pytest.fixture(scope="module")
-def study() -> ModuleType:
-    """`experiments/stereo_coverage.py`, thinned."""
-    path = Path(__file__).parents[2] / "experiments" / "stereo_coverage.py"
-    spec = importlib.util.spec_from_file_location("stereo_coverage", path)
-    module = importlib.util.module_from_spec(spec)
-    # Dataclasses look their own module up.
-    sys.modules["stereo_coverage"] = module
-    spec.loader.exec_module(module)
-    module.VIEWS = VIEWS
-    return module
-
-
-@pytest.fixture(scope="module")
-def drawn(study):
+def drawn():
     """Scenes of one rig."""
-    return study.scenes(3, "white")
+    return scenes(3, "white", VIEWS)
 
 
 @pytest.fixture(scope="module")
-def views(study, drawn) -> list[View]:
+def views(drawn) -> list[View]:
     rng = np.random.default_rng(3)
-    return [study.corners_of(scene, f"{k:02d}", rng) for k, scene in enumerate(drawn)]
+    return [corners_of(scene, f"{k:02d}", rng) for k, scene in enumerate(drawn)]
 
 
 @pytest.fixture(scope="module")
@@ -84,30 +70,30 @@ def sds(covariance: np.ndarray) -> np.ndarray:
     return np.sqrt(np.diag(covariance))
 
 
-def test_thinned_study_finds_the_covariance_true(study):
+def test_thinned_study_finds_the_covariance_true():
     """Four rigs, 96 degrees of freedom, bounds at 1e-4 from their number; sds 0.7 times as large would fail."""
-    rows = [study.calibrate(("white", seed)) for seed in range(4)]
+    rows = [calibrate(("white", seed), VIEWS) for seed in range(4)]
     total = sum(row["chi2"] for row in rows)
     low, high = stats.chi2(24 * len(rows)).ppf([5e-5, 1 - 5e-5])
     assert low < total < high
     assert total / 0.7**2 > high
     noise = np.mean([row["noise_sd_px"] for row in rows])
     dof = len(rows) * (4 * 54 * VIEWS - 24 - 6 * VIEWS)
-    assert abs(noise / study.CORNER_SD_PX - 1) < 4 / np.sqrt(2 * dof)
+    assert abs(noise / CORNER_SD_PX - 1) < 4 / np.sqrt(2 * dof)
 
 
-def test_errors_that_corners_share_are_in_the_covariance(study):
+def test_errors_that_corners_share_are_in_the_covariance():
     """Half of the variance shared over 2.5 squares: independent corners would claim a third of the true sds."""
-    rows = [study.calibrate(("shared", seed)) for seed in range(2)]
+    rows = [calibrate(("shared", seed), VIEWS) for seed in range(2)]
     low, high = stats.chi2(24 * len(rows)).ppf([5e-5, 1 - 5e-5])
     # The factor is itself an estimate from 14 views: its square root scatters by about 15 %.
     assert low / 1.3**2 < sum(row["chi2"] for row in rows) < high * 1.3**2
     assert sum(row["chi2_independent"] for row in rows) > 2 * high
 
 
-def test_pitch_is_a_separable_type_b_term(study):
+def test_pitch_is_a_separable_type_b_term():
     """T is off by the pitch's error, and the stated uncertainty holds it."""
-    row = study.calibrate(("pitch", 0))
+    row = calibrate(("pitch", 0), VIEWS)
     low, high = stats.chi2(24).ppf([5e-5, 1 - 5e-5])
     assert low < row["chi2"] < high
 
@@ -180,13 +166,13 @@ def test_halves_of_the_real_pairs_agree_as_they_say(pairs):
 
 
 @pytest.fixture(scope="module")
-def exact(study, drawn) -> StereoCalibration:
+def exact(drawn) -> StereoCalibration:
     """From corners without errors."""
-    corners = [study.true_corners(scene) for scene in drawn]
+    corners = [true_corners(scene) for scene in drawn]
     return calibrate_stereo([View(str(k), c[:, :2], c[:, 2:]) for k, c in enumerate(corners)], BOARD, SIZE)
 
 
-def test_covariance_is_the_schur_complement_of_the_whole_adjustment(study, drawn, exact):
+def test_covariance_is_the_schur_complement_of_the_whole_adjustment(drawn, exact):
     """Against differences through the twin's optics, which share no code, with board poses as explicit unknowns."""
     information = np.zeros((24, 24))
 
@@ -197,9 +183,9 @@ def test_covariance_is_the_schur_complement_of_the_whole_adjustment(study, drawn
     for scene in drawn:
         true = scene.stereo
         by_stereo = slopes(
-            lambda v, s=scene: study.true_corners(replace(s, stereo=s.stereo.with_vector(v))).ravel(), true.vector
+            lambda v, s=scene: true_corners(replace(s, stereo=s.stereo.with_vector(v))).ravel(), true.vector
         )
-        by_pose = slopes(lambda p, s=scene: study.true_corners(replace(s, pose=p)).ravel(), scene.pose)
+        by_pose = slopes(lambda p, s=scene: true_corners(replace(s, pose=p)).ravel(), scene.pose)
         coupling = by_stereo.T @ by_pose
         information += by_stereo.T @ by_stereo - coupling @ np.linalg.solve(by_pose.T @ by_pose, coupling.T)
     scale = sds(exact.covariance_independent)
@@ -278,7 +264,7 @@ def test_views_of_one_camera_inform_that_camera(views, calibration):
     assert np.abs(z).max() < 4
 
 
-def test_fixed_k3_has_no_variance(study, drawn, views):
+def test_fixed_k3_has_no_variance(drawn, views):
     found = calibrate_stereo(views, BOARD, SIZE, fix_k3=True)
     fixed = [STEREO_PARAMETER_NAMES.index(f"stereo.{side}.k3") for side in ("left", "right")]
     assert not found.stereo.vector[fixed].any()
@@ -295,13 +281,13 @@ def test_too_little_is_refused_in_words(views):
         calibrate_stereo(apart, BOARD, SIZE)
 
 
-def test_plausibility_names_what_is_missing(study, drawn):
+def test_plausibility_names_what_is_missing(drawn):
     """Four boards, all but parallel, in the middle of the image."""
     flat = []
     rng = np.random.default_rng(5)
     for k, depth in enumerate((500.0, 520.0, 540.0, 560.0)):
         pose = np.array([0.04 * k, 0.05 * (-1) ** k, 0.0, 42.5, 0.0, depth])
-        flat.append(study.corners_of(replace(drawn[0], pose=pose), str(k), rng))
+        flat.append(corners_of(replace(drawn[0], pose=pose), str(k), rng))
     words = " ".join(calibrate_stereo(flat, BOARD, SIZE).warnings)
     for expected in ("few views: 4 pairs", "nearly parallel", "poor coverage", "--pitch-u-mm"):
         assert expected in words

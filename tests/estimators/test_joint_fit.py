@@ -273,7 +273,7 @@ def test_too_few_spots_are_refused_by_number(simulated):
 @pytest.mark.slow
 @pytest.mark.parametrize("protocol", ["paper", "mixed", "grid"])
 def test_coverage_of_forty_rigs(protocol, mounted_rig):
-    """A short form of `experiments/coverage.py`; bounds of the full study stand there."""
+    """A short form of `experiments/intervals/laplace_coverage.py`; bounds of the full study stand there."""
     from scipy import stats
 
     from tvsbayes.instrument.plan import read_plan

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import csv
-import importlib.util
 import json
 import tomllib
-from types import ModuleType
 
 import numpy as np
 import pytest
 
+from experiments.inputs import make_twins
 from tvsbayes.errors import InputError
 from tvsbayes.estimators.four_point import classic, ratio_deg_per_step
 from tvsbayes.files.disk import shipped_data
@@ -33,17 +32,6 @@ def mounted() -> Rig:
 def twin(name: str) -> Campaign:
     """A shipped twin."""
     return read_campaign(DATA / "twins" / name)
-
-
-def make_twins() -> ModuleType:
-    """The experiment that wrote data/."""
-    path = DATA.parent / "experiments" / "make_twins.py"
-    if not path.is_file():
-        pytest.skip("experiments/ is not part of an installed package")
-    spec = importlib.util.spec_from_file_location("make_twins", path)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
 
 
 def table_1() -> dict[str, tuple[float, float, int]]:
@@ -202,15 +190,15 @@ def test_distortion_stays_invertible_over_the_image():
 
 def test_make_twins_writes_what_is_shipped():
     """Calibration, paper twin (at its seed) and grid twin come out of the experiment again."""
-    module, rig = make_twins(), mounted()
-    stereo = module.stated_stereo()
+    rig = mounted()
+    stereo = make_twins.stated_stereo()
     # Another processor rounds differently. Half a unit in the last place on every pixel, which the difference quotients
     # and the inverse amplify, changes the scaled covariance by 5e-8 to 7e-8; ten times that.
     scale = np.sqrt(np.diag(rig.stereo.parameter_covariance))
     difference = (stereo.parameter_covariance - rig.stereo.parameter_covariance) / np.outer(scale, scale)
     assert np.abs(difference).max() < 7e-7
     seed = twin("paper_twin").header["seed"]
-    for name, made in (("paper_twin", module.matched(rig, seed)), ("grid_twin", module.grid_twin(rig))):
+    for name, made in (("paper_twin", make_twins.matched(rig, seed)), ("grid_twin", make_twins.grid_twin(rig))):
         shipped = twin(name)
         assert made.campaign.moves == shipped.moves
         for one, other in zip(made.campaign.spots, shipped.spots, strict=True):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import doctest
 import re
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -152,11 +151,8 @@ def test_left_out_lines_are_marked():
 def drawing():
     """The script that draws the README's picture."""
     pytest.importorskip("matplotlib")
-    sys.path.insert(0, str(ROOT / "experiments"))
-    try:
-        import draw_rig
-    finally:
-        sys.path.remove(str(ROOT / "experiments"))
+    from experiments.inputs import draw_rig
+
     return draw_rig
 
 

@@ -1,7 +1,7 @@
 """Campaign folders from strangers: a good one, one crafted folder per threat, and seeded random mutations.
 
 The names say which line of the threat list (research/security.md, section 1) a folder stands for. Used by
-`promises/test_hostile.py` and, with more of everything, by `experiments/hostile.py`. No JAX, no OpenCV.
+`promises/test_hostile.py` and, with more of everything, by `experiments/robustness/hostile.py`. No JAX, no OpenCV.
 """
 
 from __future__ import annotations

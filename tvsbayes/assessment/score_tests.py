@@ -23,7 +23,7 @@ from tvsbayes.results.estimates import Validation, ValidationTest
 from tvsbayes.statistics.intervals import log_chance
 
 VALIDATION_LEVEL = 0.01
-"""Probability, all tests together, with which a clean campaign fails its validation; experiments/model_error.md."""
+"""Probability, all tests together, with which a clean campaign fails; `experiments/robustness/model_error.md`."""
 CHANGE_POINTS = 16
 """Places, evenly over the spots, at which cameras may have moved; twice as many for lost steps."""
 WAVES = 16

@@ -19,7 +19,7 @@ from tvsbayes.files.disk import decode
 
 CSV_BYTES_MAX = 64 * 1024 * 1024
 CSV_ROWS_MAX = 200_000
-"""At these caps a table of spots takes 0.6 GB and 6 s of processor time to read (experiments/hostile.md)."""
+"""At these caps a table of spots takes 0.6 GB and 6 s of processor time to read (experiments/robustness/hostile.md)."""
 CSV_LINE_CHARS_MAX = 16_384
 NUMBER = re.compile(r"[+-]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][+-]?[0-9]+)?")
 _CSV_LINE = re.compile(r"[^\r\n]*(?:\r\n?|\n)|[^\r\n]+")

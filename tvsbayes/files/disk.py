@@ -238,7 +238,7 @@ def read_arrays(path: Path, bytes_max: int, unpacked_max: int) -> dict[str, np.n
     """The arrays of an .npz, by name; every size is checked against the header before anything is allocated.
 
     `numpy.load` alone turns 0.5 kB into gigabytes: by entries of no width, and by bzip2 members, which zipfile
-    unpacks without a limit whatever size they state (experiments/hostile.md).
+    unpacks without a limit whatever size they state (experiments/robustness/hostile.md).
 
     Raises:
         InputError: what `read_bytes` refuses.

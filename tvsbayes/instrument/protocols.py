@@ -130,7 +130,7 @@ PROTOCOLS = {
     "grid": grid_protocol,
     "paper_twin": twin_protocol,
 }
-"""Plans that `experiments/make_twins.py` ships, by file name."""
+"""Plans that `experiments/inputs/make_twins.py` ships, by file name."""
 UNSTATED_STEPS = {
     "pan": (min(GRID_PAN_STEPS) - OVERSHOOT_STEPS, max(GRID_PAN_STEPS) + OVERSHOOT_STEPS),
     "tilt": (min(GRID_TILT_STEPS) - OVERSHOOT_STEPS, max(GRID_TILT_STEPS) + OVERSHOOT_STEPS),

@@ -2,14 +2,15 @@
 
 The order is that of a real camera: irradiance at the sensor (spot, speckle, ambient light, optical blur, integrated
 over the pixel), Bayer mosaic, shot and read noise, clipping, 8 bits, demosaicing by OpenCV. Frame S (stereo) and the
-cameras' own axes; mm; px with the integer at the centre of a pixel; DN = grey levels of 8 bits. Pictures are
-(height, width, 3) uint8, blue, green, red. Everything random follows from the seeds given, whatever the order or the
-number of threads.
+cameras' own axes; mm; px with the integer at the centre of a pixel; DN = grey levels of 8 bits. Pictures are (height,
+width, 3) uint8, blue, green, red. Everything random follows from the seeds given, whatever the order or the number of
+threads.
 
 The spot is the image of a round Gaussian beam on an oblique sheet through the camera's linearised map at the point
 where the beam's axis meets the sheet: an elliptic Gaussian whose centroid IS the projection of that point. What the
-linear map leaves out (curvature of distortion and perspective across the spot) would shift a centroid by 0.002 px at
-a spot sd of 2 px and 0.01 px at 4 px (`experiments/detection.md`). NumPy and OpenCV only, never the model under test.
+linear map leaves out (curvature of distortion and perspective across the spot) would shift a centroid by 0.002 px at a
+spot sd of 2 px and 0.01 px at 4 px (`experiments/cameras/detection.md`). NumPy and OpenCV only, never the model under
+test.
 """
 
 from __future__ import annotations

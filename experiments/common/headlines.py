@@ -1,0 +1,126 @@
+"""Headlines of a fit against the truth: PIT, z and contraction, and what a table says of them.
+
+PIT: share of the draws below the truth. Contraction: 1 - posterior variance / prior variance. Bounds are two-sided at
+`tvsbayes.statistics.intervals.BOUND`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from tvsbayes.instrument.axes import DIRECTIONS
+from tvsbayes.instrument.parameters import INDEX
+from tvsbayes.statistics.intervals import BOUND, LEVELS, binomial_bounds, rms_bounds
+from tvsbayes.studies import study_job
+
+HEADLINES = (
+    *(f"effective {direction}" for direction in DIRECTIONS),
+    *("contrast pan", "contrast tilt", "backlash pan", "backlash tilt", "effective mirror offset"),
+)
+"""In the order of `tvsbayes.model.headlines.QUANTITIES`."""
+SHRINK = 0.8
+"""A table whose sds are multiplied by this has to fail, or its test could not."""
+LEAST_CONTRACTION = 0.1
+"""Below it an interval is the prior's own and is not judged."""
+OUTSIDE = " **!**"
+"""Marks a figure that is outside its bounds."""
+NOTE = f"**!** marks a figure outside its bounds at {BOUND:g}"
+
+
+def headlines(draws) -> dict[str, np.ndarray]:
+    """Headline quantities of `tvsbayes.model.headlines.Derived`, whose leading axes are kept."""
+    ratio, physical = np.asarray(draws.effective_deg_per_step), np.asarray(draws.physical)
+    each = (
+        *np.moveaxis(ratio, -1, 0),
+        ratio[..., 0] - ratio[..., 1],
+        ratio[..., 2] - ratio[..., 3],
+        physical[..., INDEX["backlash_deg.pan"]],
+        physical[..., INDEX["backlash_deg.tilt"]],
+        np.asarray(draws.effective_mirror_offset_mm),
+    )
+    return dict(zip(HEADLINES, each, strict=True))
+
+
+def true_headlines(parameters: Mapping[str, float], pose_rad: np.ndarray) -> dict[str, float]:
+    """The same of a true rig, by the twin's formulas, at the pose of the fit."""
+    return dict(zip(HEADLINES, study_job.true_headlines(parameters, pose_rad).tolist(), strict=True))
+
+
+def judged(draws, centre, prior_draws, parameters: Mapping[str, float], pose_rad: np.ndarray) -> dict[str, dict]:
+    """PIT, also of draws shrunk about the centre by `SHRINK`, z and contraction of every headline.
+
+    Args:
+        draws: a `Derived` with leading axes.
+        centre: one without; None takes the draws' mean.
+        prior_draws: as the draws.
+        parameters: of the true rig.
+        pose_rad: of the fit.
+    """
+    true, prior = true_headlines(parameters, pose_rad), headlines(prior_draws)
+    middle = None if centre is None else headlines(centre)
+    result = {}
+    for name, values in headlines(draws).items():
+        values = values.ravel()
+        at = float(values.mean() if middle is None else middle[name])
+        result[name] = {
+            "pit": float(np.mean(values < true[name])),
+            "pit_shrunk": float(np.mean(at + SHRINK * (values - at) < true[name])),
+            "z": float((at - true[name]) / values.std()),
+            "contraction": float(1 - values.var() / prior[name].var()),
+        }
+    return result
+
+
+def marked(text: str, inside: bool) -> str:
+    """A figure of a table, marked where it is outside its bounds."""
+    return text + ("" if inside else OUTSIDE)
+
+
+def level_titles() -> str:
+    """Headings of the columns of `LEVELS`."""
+    return " | ".join(f"{100 * level:.0f} %" for level in LEVELS)
+
+
+def level_limits(count: int) -> str:
+    """Bounds of the columns of `LEVELS`, in percent."""
+    return " | ".join(f"{100 * low:.0f}-{100 * high:.0f}" for low, high in (binomial_bounds(count, x) for x in LEVELS))
+
+
+def rms_limits(count: int) -> str:
+    """Bounds of an RMS z."""
+    low, high = rms_bounds(count)
+    return f"{low:.2f}-{high:.2f}"
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """RMS z and coverage of one quantity over many rigs: cells of a table, and whether all are within bounds."""
+
+    cells: tuple[str, ...]
+    within: bool
+    prior: bool
+
+    @property
+    def word(self) -> str:
+        """The last cell of a row."""
+        return "prior" if self.prior else ("within" if self.within else "OUTSIDE")
+
+
+def verdict(entries: Sequence[Mapping[str, float]], shrunk: bool = False) -> Verdict:
+    """What `judged` says of one quantity, rig by rig; `shrunk` judges the draws shrunk by `SHRINK`."""
+    pit = np.array([e["pit_shrunk" if shrunk else "pit"] for e in entries])
+    z = np.array([e["z"] for e in entries]) / (SHRINK if shrunk else 1.0)
+    low, high = rms_bounds(len(pit))
+    rms = float(np.sqrt(np.mean(z**2)))
+    inside = [low <= rms <= high]
+    cells = [marked(f"{rms:.2f}", inside[0])]
+    for level in LEVELS:
+        share = float(np.mean(np.abs(pit - 0.5) < level / 2))
+        low, high = binomial_bounds(len(pit), level)
+        inside.append(low <= share <= high)
+        cells.append(marked(f"{100 * share:.1f}", inside[-1]))
+    prior = float(np.median([e["contraction"] for e in entries])) < LEAST_CONTRACTION
+    return Verdict(tuple(cells), all(inside), prior)

@@ -1,0 +1,205 @@
+"""Samplers that share no code with the one they judge: NumPyro's NUTS in sheared coordinates, emcee's stretch move.
+
+A triangular quadratic shear w -> y of volume 1 takes the curvature out of the stiff directions, and z = mode + C y with
+C the Cholesky factor of the Laplace covariance. Coordinates change the cost of a draw, not the posterior.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import emcee
+import jax
+import jax.numpy as jnp
+import numpy as np
+from arviz_stats.base import array_stats
+
+from tvsbayes.estimators.joint_fit import JointFit
+from tvsbayes.estimators.likelihood import evaluate
+from tvsbayes.instrument.parameters import NAMES, NOISE_NAMES
+from tvsbayes.posterior import transport
+from tvsbayes.posterior.proposal import Target
+
+AXES = {"chain_axis": 0, "draw_axis": 1}
+"""Of draws (chain, draw)."""
+STRETCH_STEPS = 400
+STEP = 0.5
+"""Posterior sds (of what the coordinates before leave open) over which second differences are taken."""
+STIFF_SD = 0.05
+"""Prior sds: a coordinate that the data tell better than this, given those before it, is sheared."""
+BATCH = 64
+
+
+def worst_ess(draws: np.ndarray) -> float:
+    """Least bulk effective draws of (chain, draw, quantity)."""
+    return float(np.min(array_stats.ess(draws, method="bulk", **AXES)))
+
+
+@dataclass(frozen=True)
+class Transport:
+    """w -> y -> z: y_k = w_k - y^T shear_k y / 2 over earlier coordinates, z[index] = mode[index] + root y."""
+
+    mode: np.ndarray
+    index: np.ndarray
+    root: np.ndarray
+    stiff: tuple[int, ...]
+    shear: np.ndarray
+
+    def z_of_y(self, y: jax.Array) -> jax.Array:
+        """Laplace-whitened coordinates to prior coordinates."""
+        return jnp.asarray(self.mode).at[self.index].add(jnp.asarray(self.root) @ y)
+
+    def y_of_w(self, w: jax.Array) -> jax.Array:
+        """The shear; its Jacobian is lower triangular with ones on the diagonal."""
+        y = w
+        for k in self.stiff:
+            y = y.at[k].add(-0.5 * y[:k] @ (jnp.asarray(self.shear[k, :k, :k]) @ y[:k]))
+        return y
+
+
+def pivoted(covariance: np.ndarray) -> np.ndarray:
+    """Order of the coordinates by what the earlier ones leave open, widest first."""
+    rest, order = covariance.copy(), []
+    for _ in range(len(rest)):
+        open_variance = np.diag(rest).copy()
+        open_variance[order] = -1
+        k = int(np.argmax(open_variance))
+        order.append(k)
+        rest = rest - np.outer(rest[:, k], rest[k]) / rest[k, k]
+    return np.array(order)
+
+
+def build_transport(joint: JointFit) -> Transport:
+    """Second differences of the standardised innovations give the shear that keeps them fixed to second order."""
+    rows = np.flatnonzero(joint.free)
+    index = rows[pivoted(joint.covariance[np.ix_(rows, rows)])]
+    root = np.linalg.cholesky(joint.covariance[np.ix_(index, index)])
+    size = index.size
+
+    def residuals(y: np.ndarray) -> np.ndarray:
+        out = []
+        for first in range(0, len(y), BATCH):
+            part = y[first : first + BATCH]
+            z = np.repeat(joint.z[None], BATCH, axis=0)
+            z[: len(part), index] += part @ root.T
+            seen = evaluate(jnp.asarray(z), joint.space, joint.arrays).standardised
+            out.append(np.asarray(seen)[: len(part)].reshape(len(part), -1))
+        return np.concatenate(out)
+
+    geometry = [k for k in range(size) if NAMES[index[k]] not in NOISE_NAMES]
+    stiff = [k for k in geometry if root[k, k] < STIFF_SD]
+    centre = residuals(np.zeros((1, size)))[0]
+    plus, minus = residuals(STEP * np.eye(size)), residuals(-STEP * np.eye(size))
+    slope = ((plus - minus) / (2 * STEP))[stiff]
+    second = (plus + minus - 2 * centre) / STEP**2
+    shear = np.zeros((size, size, size))
+    for i in geometry:
+        shear[stiff, i, i] = slope @ second[i]
+    pairs = [(i, j) for a, i in enumerate(geometry) for j in geometry[:a]]
+    for first in range(0, len(pairs), 2 * BATCH):
+        some = pairs[first : first + 2 * BATCH]
+        y = np.zeros((2, len(some), size))
+        for n, pair in enumerate(some):
+            y[0, n, list(pair)], y[1, n, list(pair)] = STEP, -STEP
+        both = residuals(y.reshape(-1, size)).reshape(2, len(some), -1).sum(axis=0)
+        mixed = (both - 2 * centre) / STEP**2
+        for n, (i, j) in enumerate(some):
+            value = 0.5 * slope @ (mixed[n] - second[i] - second[j])
+            shear[stiff, i, j] = shear[stiff, j, i] = value
+    k = np.arange(size)
+    earlier = (k[:, None, None] > k[None, :, None]) & (k[:, None, None] > k[None, None, :])
+    return Transport(joint.z, index, root, tuple(stiff), np.where(earlier, shear, 0.0))
+
+
+@dataclass(frozen=True)
+class Run:
+    """Draws (chain, draw, coordinate) and what they took; seconds are the process' CPU time: cores may be shared."""
+
+    draws: np.ndarray
+    divergences: int
+    leapfrogs: float
+    acceptance: float
+    compile_s: float
+    warmup_s: float
+    sampling_s: float
+
+
+@dataclass(frozen=True)
+class Setting:
+    """Of a run: chains, draws of each before and after the warm-up ends, seed, seconds after which drawing ends."""
+
+    chains: int
+    warmup: int
+    draws: int
+    seed: int
+    limit_s: float = np.inf
+
+
+def nuts(potential: Callable[[jax.Array], jax.Array], size: int, setting: Setting, dense: bool = False) -> Run:
+    """Sample exp(-potential) by NumPyro (the extra `bench`), all chains in step."""
+    from numpyro.infer import NUTS
+
+    kernel = NUTS(potential_fn=potential, dense_mass=dense, target_accept_prob=0.8)
+    key, start = jax.random.split(jax.random.PRNGKey(setting.seed))
+    started = time.process_time()
+    state = kernel.init(
+        jax.random.split(key, setting.chains),
+        setting.warmup,
+        0.1**0.5 * jax.random.normal(start, (setting.chains, size)),
+        model_args=(),
+        model_kwargs={},
+    )
+    advance = jax.jit(lambda state: kernel.sample(state, (), {})).lower(state).compile()
+    compile_s = time.process_time() - started
+
+    def several(state, count: int, limit_s: float, label: str):
+        started = said = time.perf_counter()
+        cpu = time.process_time()
+        seen = []
+        while len(seen) < count and time.perf_counter() - started < limit_s:
+            state = advance(state)
+            seen.append([np.asarray(x) for x in (state.z, state.diverging, state.num_steps, state.accept_prob)])
+            if time.perf_counter() - said > 20:
+                said = time.perf_counter()
+                print(f"{label}: {len(seen)} in {said - started:.0f} s, leapfrogs {seen[-1][2]}", flush=True)
+        return state, [np.stack(x) for x in zip(*seen, strict=True)], time.process_time() - cpu
+
+    state, _, warmup_s = several(state, setting.warmup, np.inf, "warm-up")
+    _, (z, diverging, leapfrogs, acceptance), sampling_s = several(state, setting.draws, setting.limit_s, "draws")
+    return Run(
+        draws=np.swapaxes(z, 0, 1),
+        divergences=int(diverging.sum()),
+        leapfrogs=float(leapfrogs.mean()),
+        acceptance=float(acceptance.mean()),
+        compile_s=compile_s,
+        warmup_s=warmup_s,
+        sampling_s=sampling_s,
+    )
+
+
+@dataclass(frozen=True)
+class Stretched:
+    """Worst bulk effective draws of the free parameters, and seconds."""
+
+    ess: float
+    cpu_s: float
+    wall_s: float
+
+
+def stretch(joint: JointFit, start: np.ndarray, path: transport.Transport) -> Stretched:
+    """Emcee's default move in Laplace-whitened coordinates from draws that a map `path` has made."""
+    straight = path.straight()
+    whitened = straight.to_w(path.mapped(start).z)
+    walkers = 2 * len(whitened)
+    generator = np.random.default_rng(3)
+    whitened = np.concatenate([whitened, whitened + 0.1 * generator.standard_normal(whitened.shape)])
+    sampler = emcee.EnsembleSampler(walkers, whitened.shape[1], Target(joint, straight), vectorize=True)
+    state = emcee.State(whitened, random_state=np.random.RandomState(1).get_state())
+    wall, cpu = time.perf_counter(), time.process_time()
+    sampler.run_mcmc(state, STRETCH_STEPS, skip_initial_state_check=True)
+    wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
+    kept = straight.mapped(sampler.get_chain()[STRETCH_STEPS // 4 :].reshape(-1, whitened.shape[1])).z
+    kept = kept.reshape(-1, walkers, kept.shape[1])[..., np.flatnonzero(joint.free)].transpose(1, 0, 2)
+    return Stretched(worst_ess(kept), cpu, wall)

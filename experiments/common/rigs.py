@@ -1,0 +1,93 @@
+"""The shipped rig, its plans and twins, and what studies do to simulated campaigns: small plans, other pixels."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from tvsbayes.files.disk import shipped_data
+from tvsbayes.instrument.campaign import Campaign, Spot, read_campaign
+from tvsbayes.instrument.plan import PlanStep, read_plan
+from tvsbayes.instrument.rig import Rig, read_rig
+from tvsbayes.twin.simulated_campaign import SimulatedCampaign, Truth, draw_truth, read_truth
+
+TWINS = ("paper_twin", "grid_twin")
+PIXELS = ("u_left_px", "v_left_px", "u_right_px", "v_right_px")
+PAN_SWEEP = (0, 70, 140, 200, 140, 70)
+TILT_SWEEP = (-60, -20, 20, 60, 20, -20)
+TILT_STEPS = (-60, -36, -12, 12, 36, 60, 36, 12, -12, -36)
+CROSSING = 100, -20
+"""Tilt while panning is the second number, pan while tilting the first."""
+
+
+def mounted_rig() -> Rig:
+    """The shipped rig whose extrinsics are known to 0.03 rad and 5 mm."""
+    return read_rig(shipped_data() / "rigs" / "mounted" / "rig.toml")
+
+
+def shipped_plan(protocol: str) -> tuple[PlanStep, ...]:
+    """A plan of the mounted rig."""
+    return tuple(read_plan(shipped_data() / "rigs" / "mounted" / f"{protocol}.csv"))
+
+
+def twin_campaign(name: str) -> Campaign:
+    """A shipped twin, one of `TWINS`."""
+    return read_campaign(shipped_data() / "twins" / name)
+
+
+def shipped_twin(name: str) -> SimulatedCampaign:
+    """A shipped twin with its truth, without its light."""
+    campaign = twin_campaign(name)
+    truth = read_truth(shipped_data() / "twins" / name / "truth.json", campaign.stereo)
+    return SimulatedCampaign(campaign, truth, None)
+
+
+def numbered(orders: Sequence[tuple]) -> tuple[PlanStep, ...]:
+    """A plan from the arguments of its steps."""
+    return tuple(PlanStep(number, *order) for number, order in enumerate(orders))
+
+
+def small_plan(sheets: Sequence[str]) -> tuple[PlanStep, ...]:
+    """Both axes swept there and back twice, 24 spots and moves per sheet, after one homing.
+
+    Two sheets give twelve stops in every direction.
+    """
+    orders: list[tuple] = [("home", 0, 0)]
+    for sheet in sheets:
+        orders.append(("place", None, None, sheet))
+        for pan, tilt in [(p, CROSSING[1]) for p in PAN_SWEEP * 2] + [(CROSSING[0], t) for t in TILT_SWEEP * 2]:
+            orders += [("move", pan, tilt), ("look",)]
+    return numbered(orders)
+
+
+def dense_plan(sheets: Sequence[str]) -> tuple[PlanStep, ...]:
+    """30 spots per sheet, both axes driven between any two: every spot tells a stop of each axis; 60 spots for two."""
+    orders: list[tuple] = [("home", 0, 0)]
+    for sheet in sheets:
+        orders.append(("place", None, None, sheet))
+        for look in range(30):
+            orders += [("move", PAN_SWEEP[look % len(PAN_SWEEP)], TILT_STEPS[look % len(TILT_STEPS)]), ("look",)]
+    return numbered(orders)
+
+
+def drawn_truth(rig: Rig, seed: int) -> Truth:
+    """The true rig that `simulate` draws itself from a seed."""
+    return draw_truth(rig, np.random.default_rng(np.random.SeedSequence(seed).spawn(6)[0]))
+
+
+def unseen(campaign: Campaign) -> int:
+    """Looks without a spot in both images."""
+    return sum(spot.status != "ok" for spot in campaign.spots)
+
+
+def pixels_of(campaign: Campaign, prefix: str = "") -> np.ndarray:
+    """Centres (spots, 4) in the order of `PIXELS`, px; with the prefix s their sds; NaN where there is none."""
+    found = [[getattr(spot, prefix + name) for name in PIXELS] for spot in campaign.spots]
+    return np.array([[np.nan if value is None else value for value in row] for row in found])
+
+
+def with_pixels(spot: Spot, pixels_px: np.ndarray) -> Spot:
+    """The spot with other centres, in the order of `PIXELS`."""
+    return replace(spot, **dict(zip(PIXELS, map(float, pixels_px), strict=True)))

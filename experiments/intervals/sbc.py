@@ -1,0 +1,261 @@
+"""Is the sampler's posterior the posterior? Simulation-based calibration on a small rig, by a loop of our own.
+
+    python -m experiments.intervals.sbc run --n 200 --cores 0 1        # seconds per rig and core: see sbc.md; resumable
+    python -m experiments.intervals.sbc run --variants "prior x3" "camera dropped" --n 50 --cores 0 1
+    python -m experiments.intervals.sbc table > experiments/intervals/sbc.md     # also writes sbc.png
+
+Rows are appended to `experiments/output/intervals/sbc.jsonl`; delete that file when the sampler has changed.
+
+Every simulation draws a rig from the priors of `data/rigs/mounted` (seed i), runs the 60 spots of
+`rigs.dense_plan`, fits, samples, and ranks the truth among 255 draws spread over all walkers (Talts et al.,
+arXiv:1804.06788). Ranked are all free parameters, the effective ratios and mirror offset, and the joint log-
+likelihood and log-posterior of the true model, which see what single parameters hide (Modrak et al., doi
+10.1214/23-BA1404). `table` turns ranks into PIT = (rank + U) / 256 with seeded U and tests their ECDF with the
+simultaneous band of Sailynoja et al. (doi 10.1007/s11222-022-10090-6). Quantity by quantity its p must reach 0.05 /
+number of quantities. The same test must fail on three planted faults: draws shrunk about their mean by 0.8 in prior
+coordinates (from the same chains), the prior of the stereo calibration taken three times too wide, and the right
+camera's centres taken as a thousand times worse than they are. `few stops` is clean too: 48 spots, twelve stops in
+every direction, where the Laplace interval of the backlash is too short. Test quantities are those of the true model
+throughout. Simulations whose fit or sampler did not converge are listed and counted: they have no ranks, so more than
+`FAILURES` of them fail the study.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+
+import jax
+import numpy as np
+from matplotlib.figure import Figure
+from scipy import stats
+
+from experiments.common.command_line import act, study_parser
+from experiments.common.fits import compile_for, physical_of
+from experiments.common.headlines import SHRINK
+from experiments.common.rigs import dense_plan, mounted_rig, small_plan, unseen
+from experiments.common.rows import output, read_rows, run_rows
+from experiments.common.uniformity import ALPHA, BAND_SAMPLES, DRAWS, FAULT_SIMULATIONS, Band, pit_values
+from tvsbayes.estimators.campaign_arrays import campaign_arrays
+from tvsbayes.estimators.joint_fit import fit
+from tvsbayes.estimators.likelihood import evaluate
+from tvsbayes.instrument.axes import DIRECTIONS
+from tvsbayes.instrument.parameters import NAMES
+from tvsbayes.model.parameter_space import parameter_space
+from tvsbayes.posterior.draws import derived_at
+from tvsbayes.posterior.sampling import sample
+from tvsbayes.posterior.transport import in_batches
+from tvsbayes.twin.physics import effective_deg_per_step, effective_mirror_offset_mm
+from tvsbayes.twin.simulated_campaign import simulate
+
+ROWS = output(__file__, "sbc.jsonl")
+PICTURE = Path(__file__).with_suffix(".png")
+SHEETS = ("d1", "d2")
+WIDER = 3.0
+WORSE = 1000.0
+MAX_MINUTES = 8.0
+CLEAN, FEW, SHRUNK, PRIOR, CAMERA = "clean", "few stops", f"sd x {SHRINK}", "prior x3", "camera dropped"
+VARIANTS = (CLEAN, FEW, PRIOR, CAMERA)
+"""Simulated separately; the shrunk draws come with the clean ones."""
+FAILURES = 0.02
+"""Largest share of simulations without ranks: the failures of 1 in 50 could move no ECDF out of its band."""
+
+
+def faulty(campaign, variant: str):
+    """The campaign that the fit is given."""
+    if variant == PRIOR:
+        stereo = campaign.stereo
+        wide = replace(stereo, parameter_covariance=WIDER**2 * stereo.parameter_covariance)
+        return replace(campaign, stereo=wide)
+    if variant == CAMERA:
+        spots = tuple(
+            replace(s, su_right_px=WORSE * s.su_right_px, sv_right_px=WORSE * s.sv_right_px) for s in campaign.spots
+        )
+        return replace(campaign, spots=spots)
+    return campaign
+
+
+def one_simulation(task: tuple[str, int]) -> dict[str, object]:
+    """Simulate, fit, sample, rank; whatever fails is recorded as a failure."""
+    variant, seed = task
+    compile_for(64)
+    simulated = simulate(mounted_rig(), small_plan(SHEETS) if variant == FEW else dense_plan(SHEETS), seed)
+    row: dict[str, object] = {"variant": variant, "seed": seed, "converged": False, "problems": []}
+    row["unseen"] = unseen(simulated.campaign)
+    start = time.perf_counter()
+    try:
+        result = fit(faulty(simulated.campaign, variant))
+        row["problems"] = list(result.problems)
+        posterior = sample(result, seed=seed, max_minutes=MAX_MINUTES)
+        row |= {"converged": bool(posterior.converged), "problems": list(posterior.convergence.missing)}
+        row["steps"], row["tau"] = posterior.convergence.steps, posterior.convergence.tau_steps
+        z = posterior.z
+        # The same instants of every walker, as far apart as the chain allows: 4 x 64 draws, one of them too many.
+        per_walker = -(-(DRAWS + 1) // len(z))
+        instants = np.linspace(0, z.shape[1] - 1, per_walker).round().astype(int)
+        chosen = z[:, instants].reshape(-1, z.shape[-1])[:DRAWS]
+        row["ranks"] = ranks(simulated, result, chosen)
+        if variant == CLEAN:
+            mean = z.reshape(-1, z.shape[-1]).mean(axis=0)
+            row["ranks_shrunk"] = ranks(simulated, result, mean + SHRINK * (chosen - mean))
+    except Exception as error:
+        row |= {"converged": False, "problems": [*row["problems"], repr(error)]}
+    return {**row, "seconds": time.perf_counter() - start}
+
+
+def ranks(simulated, result, z: np.ndarray) -> dict[str, int]:
+    """Number of draws z (n, 65), coordinates of the fit, below the truth, for every quantity of the true model."""
+    truth = simulated.truth
+    pose = result.reference_pose_rad
+    with jax.enable_x64(True):
+        draws = derived_at(result, z[None], pose)
+        physical = draws.physical[0]
+        true = physical_of(truth)
+        space = parameter_space(simulated.campaign.rig, simulated.campaign.stereo)
+        arrays = campaign_arrays(simulated.campaign)
+        both = coordinates_of(space, np.vstack([true, physical]))
+        log_posterior = in_batches(lambda block: evaluate(block, space, arrays).log_density, both)
+    log_likelihood = log_posterior + 0.5 * np.sum(both**2, axis=1)
+    values = {"log-likelihood": log_likelihood, "log-posterior": log_posterior}
+    values |= {NAMES[i]: np.append(true[i], physical[:, i]) for i in np.flatnonzero(result.free)}
+    ratio = effective_deg_per_step(truth.parameters, tuple(np.degrees(pose)))
+    for k, direction in enumerate(DIRECTIONS):
+        effective = draws.effective_deg_per_step[0, :, k]
+        values[f"effective_deg_per_step.{direction}"] = np.append(ratio[direction], effective)
+    offset = effective_mirror_offset_mm(truth.parameters, tuple(np.degrees(pose)))
+    values["effective_mirror_offset_mm"] = np.append(offset, draws.effective_mirror_offset_mm[0])
+    return {name: int(np.sum(v[1:] < v[0])) for name, v in values.items()}
+
+
+def sum_of_squares_p(pit: np.ndarray) -> float:
+    """Two-sided p of the sum of squared normal scores against chi-square."""
+    total = np.sum(stats.norm.ppf(pit) ** 2)
+    return float(2 * min(stats.chi2.cdf(total, len(pit)), stats.chi2.sf(total, len(pit))))
+
+
+def picture(band: Band, pit: dict[str, np.ndarray], names: list[str], limit: float) -> None:
+    """ECDF minus uniform, with the bands at 95 % and at the criterion's level."""
+    figure = Figure(figsize=(10, 5.5), layout="constrained")
+    axes = figure.subplots(2, 3, sharex=True, sharey=True)
+    for axis, name in zip(axes.flat, names, strict=True):
+        for level, colour in ((limit, "0.9"), (ALPHA, "0.78")):
+            low, high = band.limits(level)
+            axis.fill_between(band.points, low - band.points, high - band.points, color=colour, step="mid", lw=0)
+        axis.step(band.points, band.counts(pit[name]) / band.n - band.points, where="mid", color="C0", lw=1.2)
+        axis.axhline(0, color="0.4", lw=0.6)
+        axis.set_title(f"{name}, p = {band.p_value(pit[name]):.3f}", fontsize=9)
+    figure.supxlabel("PIT of the truth")
+    figure.supylabel("ECDF - uniform")
+    figure.suptitle(f"{band.n} simulations; bands: 95 % (dark), criterion (light), each simultaneous", fontsize=10)
+    figure.savefig(PICTURE, dpi=130)
+
+
+@dataclass(frozen=True)
+class Design:
+    """Simulations that are tested together: their name, all of them, those with ranks, and their PIT by quantity."""
+
+    title: str
+    chosen: list[dict]
+    good: list[dict]
+    pit: dict[str, np.ndarray]
+
+    @cached_property
+    def band(self) -> Band:
+        """Of the simulations with ranks."""
+        return Band(len(self.good))
+
+    @property
+    def clean(self) -> bool:
+        """Nothing was planted: the test has to pass."""
+        return self.title in (CLEAN, FEW)
+
+
+def designs(rows: list[dict]) -> list[Design]:
+    """Every design with at least two simulations that have ranks."""
+    of = {v: [r for r in rows if r["variant"] == v] for v in VARIANTS}
+    shrunk = [r for r in of[CLEAN] if r["seed"] < FAULT_SIMULATIONS]
+    wanted = [(CLEAN, of[CLEAN], "ranks"), (FEW, of[FEW], "ranks"), (SHRUNK, shrunk, "ranks_shrunk")]
+    wanted += [(v, of[v], "ranks") for v in (PRIOR, CAMERA)]
+    found = []
+    for title, chosen, key in wanted:
+        good = [r for r in chosen if r["converged"]]
+        if len(good) >= 2:
+            found.append(Design(title, chosen, good, pit_values(good, key)))
+    return found
+
+
+def design_row(design: Design, p: dict[str, float]) -> str:
+    """The line of a design from the p of its quantities."""
+    limit, least = ALPHA / len(p), min(p, key=p.get)
+    failing = sum(v < limit for v in p.values())
+    lost = len(design.chosen) - len(design.good)
+    # A fault has to be seen in the ranks, not in lost simulations.
+    passes = failing == 0 and not (design.clean and lost > FAILURES * len(design.chosen))
+    said = "passes" if passes else "FAILS"
+    if len(design.chosen) < FAULT_SIMULATIONS:
+        said = "too few to judge"
+    cells = (design.title, len(design.chosen), lost, len(p), f"{limit:.1e}", f"{p[least]:.1e}, {least}")
+    cells += (f"{p['log-likelihood']:.1e}", f"{p['log-posterior']:.1e}", failing)
+    return f"| {' | '.join(map(str, (*cells, said, 'passes' if design.clean else 'FAILS')))} |"
+
+
+def table(arguments: argparse.Namespace) -> None:
+    """The study's page and picture."""
+    rows = read_rows(arguments.rows)
+    print("# Simulation-based calibration of the sampler\n")
+    print("Written by `python -m experiments.intervals.sbc table` after `run`; rig i has seed i. 60 spots of the")
+    print("mounted rig (48 for `few stops`), every prior quantity anew, no aperture readings; two shared cores.\n")
+    columns = ("draws", "simulations", "without ranks", "quantities", "criterion p", "least p, of", "p log-likelihood")
+    columns += ("p log-posterior", "quantities failing", "verdict", "wanted")
+    print("| " + " | ".join(columns) + " |\n|" + "---|" * len(columns))
+    found = designs(rows)
+    p_of = {}
+    for design in found:
+        band = design.band
+        p_of[design.title] = {name: band.p_value(values) for name, values in design.pit.items()}
+        print(design_row(design, p_of[design.title]))
+    print(f"\np = {1 / (1 + BAND_SAMPLES):.0e} is the smallest that {BAND_SAMPLES} simulated bands can give.\n")
+    for design in found:
+        if design.title != SHRUNK:
+            s = [r["seconds"] for r in design.chosen]
+            print(f"- {design.title}: {sum(s) / 60:.0f} core minutes, median {np.median(s):.0f} s a simulation")
+    for r in rows:
+        if not r["converged"]:
+            print(f"- no ranks: {r['variant']}, seed {r['seed']}: {'; '.join(r['problems'])}")
+    for design in found:
+        if design.title == CLEAN:
+            clean_part(design, p_of[CLEAN])
+
+
+def clean_part(design: Design, p: dict[str, float]) -> None:
+    """Every quantity of the clean simulations, the two densities first, then by p; with the picture."""
+    first = ["log-likelihood", "log-posterior"]
+    order = first + sorted((n for n in p if n not in first), key=p.get)
+    picture(design.band, design.pit, order[:6], ALPHA / len(p))
+    print("\n![ECDF differences of the two densities and the four worst quantities](sbc.png)\n")
+    print(f"## Clean, all quantities: {len(design.good)} simulations\n")
+    print("| quantity | mean PIT | sd of PIT x sqrt 12 | p of the band | p of sum z^2 |\n|---|---|---|---|---|")
+    for name in order:
+        values = design.pit[name]
+        spread = values.std() * np.sqrt(12)
+        print(f"| {name} | {values.mean():.3f} | {spread:.3f} | {p[name]:.3f} | {sum_of_squares_p(values):.3f} |")
+
+
+def run(arguments: argparse.Namespace) -> None:
+    """Append rows until every simulation is there, variant by variant in turn."""
+    tasks = [(v, s) for s in range(arguments.n) for v in arguments.variants]
+    run_rows(one_simulation, tasks, arguments.rows, ("variant", "seed"), arguments.cores)
+
+
+def main() -> None:
+    """Command line."""
+    command = study_parser(__doc__, ROWS, n=200)
+    command.add_argument("--variants", nargs="+", default=[CLEAN], choices=VARIANTS)
+    act(command, run=run, table=table)
+
+
+if __name__ == "__main__":
+    main()

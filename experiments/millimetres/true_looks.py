@@ -1,0 +1,106 @@
+"""Looks at points whose truth is known, by the twin's optics, and what nominal and classic calibrations say of them.
+
+The machine is homed and sent to counters from given sides; the beam, with a stop error of its own, meets a target at a
+range, and the aperture reads it. Points in mm of the frame T, readings in degrees.
+"""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from dataclasses import dataclass, field
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy import stats
+
+from tvsbayes.coordinates.beam_meeting import meeting
+from tvsbayes.coordinates.error_map import simple_calibration, simple_rays
+from tvsbayes.errors import NothingToEstimate
+from tvsbayes.estimators.four_point import ClassicResult, classic
+from tvsbayes.instrument.axes import AXES, SIDES
+from tvsbayes.instrument.campaign import Campaign
+from tvsbayes.twin.physics import aperture_angle_deg, mirror_chain, to_tvs
+from tvsbayes.twin.simulated_campaign import Truth
+
+ELLIPSOID = stats.chi2.isf(0.05, 3)
+"""d^T S^-1 d of the border of a 95 % ellipsoid."""
+ESTIMATORS = ("nominal", "classic", "joint")
+
+
+@dataclass
+class TrueLooks:
+    """Looks of one true rig.
+
+    Attributes:
+        truth: of the rig.
+        convention: of its aperture.
+        generator: of sides, stop errors and aperture noise.
+        counters, sides, points, readings: of every look, in order.
+    """
+
+    truth: Truth
+    convention: str
+    generator: np.random.Generator
+    counters: list[np.ndarray] = field(default_factory=list)
+    sides: list[tuple[str, str]] = field(default_factory=list)
+    points: list[np.ndarray] = field(default_factory=list)
+    readings: list[float] = field(default_factory=list)
+
+    @property
+    def counters_steps(self) -> np.ndarray:
+        """Counters (looks, 2) of pan and tilt."""
+        return np.array(self.counters)
+
+    @property
+    def points_mm(self) -> np.ndarray:
+        """True points (looks, 3)."""
+        return np.array(self.points)
+
+    def add(self, counters: np.ndarray, range_mm: float | None = None, span_mm: tuple[float, float] = (0, 0)) -> None:
+        """One look from random sides, at a range or at a random one within `span_mm`."""
+        signs = self.generator.choice([-1, 1], 2)
+        reach = self.generator.uniform(*span_mm) if range_mm is None else range_mm
+        p, angles, names = self.truth.parameters, [], []
+        for k, axis in enumerate(AXES):
+            names.append(SIDES[axis][int(signs[k] > 0)])
+            rest = p[f"degrees_per_step.{axis}"] * counters[k] - 0.5 * signs[k] * p[f"backlash_deg.{axis}"]
+            angles.append(rest + self.generator.standard_normal() * p[f"stop_sd_deg.{names[k]}"])
+        origin, direction = mirror_chain(np.radians(angles[0]), np.radians(angles[1] + p["tilt_zero_deg"]), p)
+        point = to_tvs(origin + reach * direction, p["baseline_mm"], p["pan_zero_emission_deg"])
+        angle = aperture_angle_deg(point, p["baseline_mm"], self.convention) + p["aperture_zero_deg"]
+        self.readings.append(float(angle + p["aperture_sd_deg"] * self.generator.standard_normal()))
+        self.counters.append(np.asarray(counters))
+        self.sides.append((names[0], names[1]))
+        self.points.append(point)
+
+    def errors_of_others_mm(self, campaign: Campaign) -> dict[str, np.ndarray]:
+        """Errors (looks, 3) of the nominal and the classic calibration; NaN without complete experiments."""
+        estimates: dict[str, ClassicResult | None] = {"nominal": None}
+        result = {"classic": np.full_like(self.points_mm, np.nan)}
+        with suppress(NothingToEstimate):
+            estimates["classic"] = classic(campaign)
+        for name, estimate in estimates.items():
+            simple = simple_calibration(campaign.rig.priors, estimate)
+            with jax.enable_x64(True):
+                rays = simple_rays(simple, self.counters_steps)
+                base = jnp.asarray(2 * (simple.baseline_mm - simple.origin_y_mm))
+                azimuth = jnp.asarray(campaign.rig.aperture_convention == "azimuth")
+                readings_rad = jnp.radians(jnp.asarray(self.readings))
+                met = meeting(rays.origin_mm, rays.direction, base, readings_rad, azimuth)
+            found = np.where(np.asarray(met.meets)[:, None], np.asarray(met.xyz_mm).T, np.nan)
+            result[name] = found - self.points_mm
+        return result
+
+
+def squared_distance(error: np.ndarray, covariance: np.ndarray, usable: np.ndarray, otherwise: float) -> np.ndarray:
+    """d^T S^-1 d (points,) of errors (points, 3) under covariances (points, 3, 3); `otherwise` where unusable."""
+    found = np.full(len(error), otherwise)
+    inverse = np.linalg.inv(covariance[usable])
+    found[usable] = np.einsum("pi,pij,pj->p", error[usable], inverse, error[usable])
+    return found
+
+
+def or_none(values: np.ndarray) -> list[float | None]:
+    """Numbers for a row: None for what is not a number."""
+    return [None if np.isnan(v) else float(v) for v in values]

@@ -1,0 +1,283 @@
+"""Two rigs, one Table 1: equal gears with lost motion seen at an azimuth, and four literal ratios; who tells?
+
+    python -m experiments.paper.two_rigs run --n 6 --cores 0        # 10 minutes, resumable
+    python -m experiments.paper.two_rigs table > experiments/paper/two_rigs.md     # writes the figure too
+
+Seed s draws optics, cameras and mounting from the priors of `data/rigs/mounted`; then two machines are put into that
+drawing, each solved so that the classic estimator reads Table 1's means without noise:
+
+* "lost motion": one gear ratio for both axes, contrasts 0, a backlash per axis; the yaw makes the tilt look larger;
+* "literal": four ratios, no play; turned so that the tilt experiments happen at azimuth 0, where a tilt is read as it
+  is. Such gears drift away (no toothed gear can be so over long travel): homed before every experiment.
+
+Both run the same plans, with the stop errors of the paper twin (which give the Table's sds) and 0.05 px. The nominal
+rig is declared, which knows nothing of the mounting, with N(0, 0.005 deg/step) for the contrasts: the default 2e-4
+excludes literal ratios beforehand. Three models are fitted: gears with play and one ratio per axis; ratios per
+direction without play; both. log10 of the Bayes factor = difference of the Laplace evidences of the first two. It is
+called told apart beyond 100 to 1. Campaigns:
+
+* paper, as published: |N| = 200, 24 in each direction, every experiment from a homing at its start counters, ended on
+  the right and on the upper side, and the sides NOT recorded;
+* paper, sides recorded; mixed: 12 in each direction, |N| = 100 and 200 in turn, every second start reached from the
+  other side of its homing;
+* grid: the shipped grid, homed once per sheet; planned: 64 looks by the planner for the worst effective ratio.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from matplotlib import rc_context
+from matplotlib.figure import Figure
+from scipy import stats
+
+from experiments.common.command_line import act, study_parser
+from experiments.common.fits import compile_for
+from experiments.common.rigs import mounted_rig, unseen
+from experiments.common.rows import output, read_rows, run_rows
+from experiments.paper.table1 import paper_values
+from experiments.paper.two_machines import HOME_SIDES, RIGS, classic_readings, plan_of, solved
+from tvsbayes.estimators.campaign_arrays import use_compilation_cache
+from tvsbayes.estimators.joint_fit import JointFit, fit
+from tvsbayes.files.disk import shipped_data
+from tvsbayes.instrument.axes import AXES, DIRECTIONS
+from tvsbayes.instrument.campaign import Campaign
+from tvsbayes.instrument.model_choice import ModelChoice
+from tvsbayes.instrument.parameters import INDEX, Prior
+from tvsbayes.instrument.plan import read_plan, run_plan, write_plan
+from tvsbayes.instrument.protocols import twin_protocol
+from tvsbayes.instrument.rig import Rig, read_rig
+from tvsbayes.report.figures import BLACK, BLUE, RED, STYLE, WIDTH_IN
+from tvsbayes.twin.simulated_campaign import simulate
+
+ROWS, PLANNED = output(__file__, "two_rigs.jsonl"), output(__file__, "two_rigs_planned.csv")
+FIGURE = Path(__file__).with_suffix(".png")
+CAMPAIGNS = ("paper, as published", "paper, sides recorded", "mixed", "grid", "planned")
+MODELS = {"play": ModelChoice(per_axis=True), "ratios": ModelChoice(no_backlash=True), "both": ModelChoice()}
+CONTRAST_U = 0.005
+"""Prior sd of left - right and up - down, deg/step: twice what Table 1 shows for pan."""
+TOLD_LOG10 = 2.0
+SPOT_SD_PX = 0.05
+QUANTITIES = (
+    "ratio_contrast_deg_per_step.pan",
+    "ratio_contrast_deg_per_step.tilt",
+    "backlash_deg.pan",
+    "backlash_deg.tilt",
+)
+CLASSIC_SEEDS = 10
+NOTES = """\
+True contrasts of the literal rigs: about -2.6 (pan) and +1.1 (tilt) in 1e-3 deg/step, of the others 0. True backlashes
+of the rigs with lost motion: about 0.53 and 0.20 deg, of the others 0. Tilt over pan ratio: 1.000, and about 1.135.
+
+Where the sides are not recorded the model takes the play to stand anywhere in its band at every start, each anew:
+starts that are always reached from the same side then look like a ratio. What tells the two apart is where the beam
+stands after moves both ways, against homings that are good to 0.05 deg (the model's fixed value)."""
+
+
+def wide(rig: Rig) -> Rig:
+    """The rig with a contrast prior that literal ratios pass."""
+    loose = {f"ratio_contrast_deg_per_step.{axis}": Prior(0.0, CONTRAST_U) for axis in AXES}
+    return replace(rig, table=replace(rig.table, priors={**rig.table.priors, **loose}))
+
+
+def forget_sides(campaign: Campaign) -> Campaign:
+    """The campaign as somebody records it who does not note from where a start was reached."""
+    first = {"pan_approach": "unknown", "tilt_approach": "unknown"}
+    return replace(campaign, moves=tuple(replace(m, **first) if m.pan_approach else m for m in campaign.moves))
+
+
+def log_evidence(result: JointFit) -> float:
+    """Laplace's ln p(data), up to the constant that all models of a campaign share.
+
+    The coordinates have N(0, 1) priors, whose (2 pi)^(-p/2) the Gaussian integral cancels; a fixed one stays at 0
+    with unit variance and adds nothing.
+    """
+    return float(result.log_density + 0.5 * np.linalg.slogdet(result.covariance)[1])
+
+
+def one_row(task: tuple[str, str, int]) -> dict[str, object]:
+    """Simulate one campaign of one machine and fit the three models."""
+    compile_for(96)
+    kind, name, seed = task
+    start = time.process_time()
+    truth = solved(kind, mounted_rig(), seed)
+    declared = wide(read_rig(shipped_data() / "rigs" / "nominal" / "rig.toml"))
+    plan = read_plan(PLANNED) if name == "planned" else plan_of(name)
+    # Other noise for every machine and campaign, or the two-sample tests would compare twins.
+    noise = 10_000 + 100 * seed + 10 * RIGS.index(kind) + CAMPAIGNS.index(name)
+    campaign = simulate(declared, plan, noise, truth, spot_sd_px=SPOT_SD_PX, home_approach=HOME_SIDES).campaign
+    row: dict[str, object] = {"kind": kind, "campaign": name, "seed": seed, "unseen": unseen(campaign)}
+    if name == "paper, as published":
+        campaign = forget_sides(campaign)
+    row["models"] = {}
+    for model, choice in MODELS.items():
+        try:
+            result = fit(campaign, model=choice)
+        except Exception as error:
+            row["models"][model] = {"converged": False, "problems": [repr(error)]}
+            continue
+        draws, found = result.draws.physical, {"converged": bool(result.converged), "problems": list(result.problems)}
+        found["log_evidence"], found["chi2"] = log_evidence(result), result.chi2
+        for axis in AXES:
+            for quantity in ("ratio_contrast_deg_per_step", "backlash_deg"):
+                column = draws[:, INDEX[f"{quantity}.{axis}"]]
+                ends = np.quantile(column, (0.025, 0.975)).tolist()
+                mode = float(result.mode.physical[INDEX[f"{quantity}.{axis}"]])
+                found[f"{quantity}.{axis}"] = [mode, float(column.std()), *ends]
+        equal = draws[:, INDEX["degrees_per_step.tilt"]] / draws[:, INDEX["degrees_per_step.pan"]]
+        found["tilt over pan"] = [float(equal.mean()), float(equal.std())]
+        row["models"][model] = found
+    return {
+        **row,
+        "truth": {n: v for n, v in truth.parameters.items() if "step" in n},
+        "cpu_s": time.process_time() - start,
+    }
+
+
+def run(arguments: argparse.Namespace) -> None:
+    """Append rows until every machine has every campaign under every seed."""
+    use_compilation_cache()
+    PLANNED.parent.mkdir(parents=True, exist_ok=True)
+    if not PLANNED.exists():
+        write_plan(plan_of("planned"), PLANNED)
+    tasks = [(kind, name, seed) for seed in range(arguments.n) for name in CAMPAIGNS for kind in RIGS]
+    run_rows(one_row, tasks, arguments.rows, ("kind", "campaign", "seed"), arguments.cores)
+
+
+def weight_log10(row) -> float | None:
+    """log10 of the Bayes factor of play against literal ratios; None where a fit failed."""
+    found = row["models"]
+    if not (found["play"]["converged"] and found["ratios"]["converged"]):
+        return None
+    return (found["play"]["log_evidence"] - found["ratios"]["log_evidence"]) / np.log(10)
+
+
+def drift_deg() -> tuple[float, float]:
+    """How far pan and tilt of literal gears are off at the end of the paper's campaign without homings, degrees."""
+    moves, result = run_plan(twin_protocol(), mounted_rig(), ("right", "up")).moves, []
+    table = {name: values[1] for name, values in paper_values().items()}
+    for axis, plus, minus in (("pan_steps", "left", "right"), ("tilt_steps", "up", "down")):
+        steps = np.diff([getattr(m, axis) for m in moves])
+        turned = np.sum(np.where(steps > 0, table[plus], table[minus]) * steps)
+        # Against the mean ratio, which would bring the counter back to where it says.
+        result.append(float(turned - (table[plus] + table[minus]) / 2 * np.sum(steps)))
+    return result[0], result[1]
+
+
+def classic_part() -> None:
+    """Both machines' Table 1, and whether the readings differ."""
+    paper, rig = paper_values(), mounted_rig()
+    readings: dict[tuple[str, str], list[np.ndarray]] = {}
+    ratios = {kind: [] for kind in RIGS}
+    for seed in range(CLASSIC_SEEDS):
+        for kind in RIGS:
+            truth = solved(kind, rig, seed)
+            ratios[kind].append([truth.parameters[f"degrees_per_step.{d}"] for d in DIRECTIONS])
+            noise = 10_000 + 100 * seed + 10 * RIGS.index(kind)
+            plan = plan_of("paper, as published")
+            campaign = simulate(rig, plan, noise, truth, spot_sd_px=SPOT_SD_PX, home_approach=HOME_SIDES).campaign
+            for direction, values in classic_readings(campaign).items():
+                readings.setdefault((kind, direction), []).append(values)
+    print("## The classic estimator\n")
+    print(f"{CLASSIC_SEEDS} drawings, 24 experiments per direction each; deg/step; range of the true gear ratios.\n")
+    print(
+        "| direction | paper: mean, sd | lost motion: mean, sd | literal: mean, sd | true ratios, lost motion ", end=""
+    )
+    print("| true ratios, literal | Welch p < 0.05 |\n|" + "---|" * 7)
+    every = []
+    for k, name in enumerate(DIRECTIONS):
+        cells = [f"{paper[name][1]:.6f}, {paper[name][2]:.6f}"]
+        for kind in RIGS:
+            values = readings[kind, name]
+            spread = np.sqrt(np.mean([v.var(ddof=1) for v in values]))
+            cells.append(f"{np.mean(values):.6f}, {spread:.6f}")
+        cells += [f"{np.min(ratios[kind], axis=0)[k]:.4f} to {np.max(ratios[kind], axis=0)[k]:.4f}" for kind in RIGS]
+        p = [
+            stats.ttest_ind(a, b, equal_var=False).pvalue
+            for a, b in zip(*(readings[kind, name] for kind in RIGS), strict=True)
+        ]
+        every += p
+        print(f"| {name} | {' | '.join(cells)} | {sum(x < 0.05 for x in p)} of {len(p)} |")
+    hits = sum(p < 0.05 for p in every)
+    chance = stats.binomtest(hits, len(every), 0.05)
+    uniform = stats.kstest(every, "uniform").pvalue
+    print(f"\nOf {len(every)} two-sample tests {hits} have p < 0.05, where chance gives 5 % (binomial p of that count")
+    print(f"{chance.pvalue:.2g}; the p-values against uniform, Kolmogorov-Smirnov: {uniform:.2g}).")
+    pan, tilt = drift_deg()
+    print("\nWithout the homings literal gears would have drifted by", end=" ")
+    print(f"{pan:.0f} deg in pan and {tilt:.0f} deg in tilt at the end of the paper's 96 experiments.\n")
+
+
+def table(arguments: argparse.Namespace) -> None:
+    """The page and its figure."""
+    rows = read_rows(arguments.rows)
+    print("# Two rigs, one Table 1\n")
+    print("Written by `python -m experiments.paper.two_rigs table` after `run`; what was done stands in the script.\n")
+    classic_part()
+    print("## The joint estimator\n")
+    print(f"Told apart: the evidence is beyond {10**TOLD_LOG10:.0f} to 1 for the true one of play and literal ratios;")
+    print("misled: for the wrong one. Contrast and backlash (medians over the seeds, sd of the model with both) in")
+    print("1e-3 deg/step and deg; z of the contrast: largest of pan and tilt, |contrast| / sd, median.\n")
+    print(
+        "| campaign | truth | seeds | converged | told apart | undecided | misled | log10 factor: median (range) ",
+        end="",
+    )
+    print("| contrast pan | contrast tilt | z | backlash pan | backlash tilt | tilt over pan ratio |\n|" + "---|" * 14)
+    for name in CAMPAIGNS:
+        for kind in RIGS:
+            chosen = [r for r in rows if r["campaign"] == name and r["kind"] == kind]
+            if not chosen:
+                continue
+            weights = [w for w in map(weight_log10, chosen) if w is not None]
+            right = np.array(weights) * (1 if kind == "lost motion" else -1)
+            told, misled = int(np.sum(right > TOLD_LOG10)), int(np.sum(right < -TOLD_LOG10))
+            cells = [f"{told}", f"{len(weights) - told - misled}", f"{misled}"]
+            cells.append(f"{np.median(weights):+.0f} ({min(weights):+.0f} to {max(weights):+.0f})" if weights else "-")
+            both = [r["models"]["both"] for r in chosen if r["models"]["both"]["converged"]]
+            if both:
+                at = {n: np.median([b[n][:2] for b in both], axis=0) for n in QUANTITIES}
+                z = np.median([max(abs(b[n][0]) / b[n][1] for n in QUANTITIES[:2]) for b in both])
+                cells += [f"{1e3 * at[n][0]:+.2f} +- {1e3 * at[n][1]:.2f}" for n in QUANTITIES[:2]] + [f"{z:.1f}"]
+                cells += [f"{at[n][0]:.3f} +- {at[n][1]:.3f}" for n in QUANTITIES[2:]]
+                ratio = np.median([b["tilt over pan"] for b in both], axis=0)
+                cells.append(f"{ratio[0]:.3f} +- {ratio[1]:.3f}")
+            else:
+                cells += ["-"] * 6
+            print(f"| {name} | {kind} | {len(chosen)} | {len(weights)} | {' | '.join(cells)} |")
+    print(f"\n{NOTES}")
+    draw(rows)
+
+
+def draw(rows) -> None:
+    """Weight of the evidence by campaign, and contrast against backlash of pan."""
+    looks = {"lost motion": (BLUE, "o"), "literal": (RED, "^")}
+    with rc_context(STYLE):
+        figure = Figure(figsize=(WIDTH_IN, 3.4), layout="constrained")
+        axes = figure.subplots()
+        for kind, (colour, marker) in looks.items():
+            places, weights = [], []
+            for k, name in enumerate(CAMPAIGNS):
+                chosen = [r for r in rows if r["campaign"] == name and r["kind"] == kind]
+                for w in filter(lambda w: w is not None, map(weight_log10, chosen)):
+                    places.append(k + (0.12 if kind == "literal" else -0.12))
+                    weights.append(w)
+            label = f"true: {'gears with play' if kind == 'lost motion' else 'literal ratios'}"
+            axes.plot(weights, places, marker, color=colour, markersize=5, alpha=0.7, label=label)
+        axes.axvline(0.0, color=BLACK, linewidth=0.8)
+        axes.set(yticks=range(len(CAMPAIGNS)), yticklabels=CAMPAIGNS, ylim=(len(CAMPAIGNS) - 0.5, -0.5))
+        axes.set_xlabel("log10 Bayes factor: literal ratios < 0 < play")
+        figure.legend(loc="outside lower center", ncols=2)
+        figure.savefig(FIGURE, dpi=130)
+
+
+def main() -> None:
+    """Command line."""
+    act(study_parser(__doc__, ROWS, n=6), run=run, table=table)
+
+
+if __name__ == "__main__":
+    main()

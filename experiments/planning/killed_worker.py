@@ -1,0 +1,64 @@
+"""Does a study lose anything when a worker of a Dask cluster dies? Two worker processes, one killed in mid-run.
+
+    python -m experiments.planning.killed_worker        # five minutes; needs the extra dask
+
+The same study is made serially in this process, and on a local cluster of two worker processes of which one is killed
+(SIGKILL) after the second row. Printed: rows, whether every number is the same, and what the cluster did.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import tempfile
+from pathlib import Path
+
+from experiments.common.command_line import print_only
+from experiments.common.rigs import mounted_rig, small_plan
+from tvsbayes.estimators.campaign_arrays import use_compilation_cache
+from tvsbayes.planning.target import DEFAULT_TARGET, parse_target
+from tvsbayes.studies.executors import SINGLE_THREADED
+from tvsbayes.studies.study import StudyRows, study
+from tvsbayes.studies.study_job import StudyJob
+
+CAMPAIGNS = 10
+KILL_AFTER = 2
+
+
+def main() -> None:
+    """Run both, compare."""
+    print_only(__doc__)
+    from distributed import Client, LocalCluster
+
+    os.environ.update(SINGLE_THREADED)
+    use_compilation_cache()
+    job = StudyJob(mounted_rig(), small_plan(("d1", "d3")), parse_target(DEFAULT_TARGET), 3)
+
+    def numbers(path: Path) -> dict[int, dict]:
+        return {i: {k: v for k, v in r.items() if k != "seconds"} for i, r in StudyRows(path).of(job).items()}
+
+    with tempfile.TemporaryDirectory() as folder:
+        on_cluster, serial = Path(folder) / "dask.jsonl", Path(folder) / "serial.jsonl"
+        options = {"n_workers": 2, "threads_per_worker": 1, "processes": True, "dashboard_address": None}
+        with LocalCluster(**options) as cluster, Client(cluster) as client:
+            workers = client.run(os.getpid)
+            print("worker processes:", sorted(workers.values()), flush=True)
+
+            def progress(done: int, wanted: int) -> None:
+                if done == KILL_AFTER:
+                    victim = min(client.run(os.getpid).values())
+                    os.kill(victim, signal.SIGKILL)
+                    print(f"killed worker {victim} after {done} of {wanted} rows", flush=True)
+
+            rows = StudyRows(on_cluster)
+            study(job, CAMPAIGNS, rows, engine="dask", address=cluster.scheduler_address, progress=progress)
+            print("worker processes at the end:", sorted(client.run(os.getpid).values()), flush=True)
+        study(job, CAMPAIGNS, StudyRows(serial), engine="serial")
+        one, other = numbers(on_cluster), numbers(serial)
+        lines = on_cluster.read_bytes().count(b"\n")
+    print(f"rows on the cluster: {sorted(one)}, lines in the file: {lines}; serial: {sorted(other)}")
+    print(f"every number the same: {one == other}; converged: {sum(r['converged'] for r in one.values())}")
+
+
+if __name__ == "__main__":
+    main()

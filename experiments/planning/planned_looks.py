@@ -1,0 +1,184 @@
+"""Planned looks against the paper's 96 experiments: minutes and spots to the same u, and what a full turn does.
+
+    python -m experiments.planning.planned_looks > experiments/planning/planned_looks.md
+
+Takes two minutes and writes the figure too. On the paper's rig (`data/rigs/mounted`: sheets at 175, 275, 375 mm, costs
+1.5 s a move, 1 s a look, 60 s a placement), expected information at the most probable instrument, no simulation. Two
+numbers are followed: u of the worst effective ratio, which falls with n, and its floor, what is left where the same
+looks are taken a hundred times (stereo, focal scale, priors of the optics). Protocols are repeated; the planned looks
+are those of the greedy search without exchange. The full turn is taken after the planned looks, when the ratio is
+known: its spot must be found.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from experiments.common.command_line import print_only
+from experiments.common.rigs import mounted_rig
+from experiments.common.worth import UNREACHED, searched_family
+from tvsbayes.estimators.campaign_arrays import use_compilation_cache
+from tvsbayes.instrument.plan import PlanStep
+from tvsbayes.instrument.protocols import grid_protocol, mixed_protocol, paper_protocol
+from tvsbayes.planning.candidates import LookArrays, candidates, covariance_of
+from tvsbayes.planning.expectation import Knowledge, PlanInformation, information_of, prior_knowledge
+from tvsbayes.planning.forecast import Family
+from tvsbayes.planning.limits import MANY, limit_of, split_of
+from tvsbayes.planning.search import LADDER, Scope, design_family
+from tvsbayes.planning.target import DEFAULT_TARGET, Sensitivity, parse_target, sensitivity
+
+FIGURE = Path(__file__).with_suffix(".png")
+REPEATS = (2, 4, 8, 16, 24)
+TARGET = parse_target(DEFAULT_TARGET)
+TURN = {"pan_min_steps": -100, "pan_max_steps": 7000, "tilt_min_steps": -130, "tilt_max_steps": 130}
+"""Limits that allow a full turn of pan: 6000 steps at 0.06 deg/step."""
+
+
+@dataclass(frozen=True)
+class Session:
+    """What a plan tells: its information, the worst ratio's slopes at its pose, and u of that ratio, deg/step."""
+
+    knowledge: Knowledge
+    information: PlanInformation
+    at: Sensitivity
+    value: float
+
+    @property
+    def spots(self) -> int:
+        """Looks."""
+        return len(self.information.look_moves)
+
+    def row(self, name: str) -> str:
+        """A line of the table."""
+        limit = limit_of(self.knowledge, self.information.fisher, self.at, TARGET)
+        shares = split_of(self.knowledge, self.information.fisher, None, self.at)
+        first, floor = (
+            ", ".join(f"{cause} {100 * share:.0f} %" for cause, share in list(parts.items())[:count])
+            for parts, count in ((shares, 3), (limit.shares, 2))
+        )
+        numbers = f"{self.spots} | {self.information.minutes:.1f} | {1e4 * self.value:.2f}"
+        return f"| {name} | {numbers} | {first} | {1e4 * limit.floor:.2f} | {floor} |"
+
+
+def session(knowledge: Knowledge, steps: Sequence[PlanStep]) -> Session:
+    """What a plan tells before anything is measured."""
+    found = information_of(steps, knowledge)
+    at = sensitivity(TARGET, knowledge.z, knowledge.space, knowledge.rig.table, found.pose_rad)
+    return Session(knowledge, found, at, at.value(covariance_of(knowledge.precision + found.fisher)))
+
+
+@dataclass(frozen=True)
+class Point:
+    """A size of a campaign: minutes, u of the worst ratio (deg/step), spots."""
+
+    minutes: float
+    value: float
+    spots: int
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Curves of u by campaign, lines of the first table, and the planned sessions by experiments."""
+
+    curves: dict[str, list[Point]] = field(default_factory=dict)
+    rows: dict[str, str] = field(default_factory=dict)
+    planned: dict[int, Session] = field(default_factory=dict)
+
+    def add(self, name: str, found: Session, times: int = 1) -> None:
+        """A point of a curve: the session taken `times` times."""
+        value = found.at.value(covariance_of(found.knowledge.precision + times * found.information.fisher))
+        self.curves.setdefault(name, []).append(Point(times * found.information.minutes, value, times * found.spots))
+
+
+def compared(knowledge: Knowledge, family: Family) -> Comparison:
+    """Protocols with their repeats, and the planner's looks."""
+    result = Comparison()
+    for repeats in REPEATS:
+        for name, protocol in (("paper", paper_protocol), ("mixed", mixed_protocol)):
+            found = session(knowledge, protocol(repeats))
+            result.add(name, found)
+            result.rows[name] = found.row(name)
+    grid = session(knowledge, grid_protocol())
+    result.rows["grid"] = grid.row("grid")
+    for times in (1, 2, 4):
+        result.add("grid", grid, times)
+    for n in LADDER:
+        result.planned[n] = session(knowledge, family.arranged(n).steps)
+        result.add("planned", result.planned[n])
+    for n in (8, 16, 32, 96):
+        result.rows[f"planned {n}"] = result.planned[n].row(f"planned, {n}")
+    return result
+
+
+def second_session(first: Session) -> None:
+    """When the ratio is known: near looks against a full turn, eight to 64 looks each."""
+    rig, knowledge = first.knowledge.rig, first.knowledge
+    precision = knowledge.precision + first.information.fisher
+    sharp = replace(knowledge, rig=replace(rig, positioner=TURN), precision=precision, after_data=True)
+    wide = candidates(sharp)
+    shown = LookArrays(wide.looks, sharp, False).at(sharp.z, sharp.space)
+    away = wide.looks.steps[:, 0] > 3000
+    print("\n## A second session after 16 planned experiments\n")
+    print("| looks added | experiments | spots in all | a turn away | minutes in all | u worst | floor | u of k pan |")
+    print("|---|---|---|---|---|---|---|---|")
+    for label, allowed in (("more of the same range", ~away), ("with the beams a full turn away", np.ones_like(away))):
+        part = replace(shown, rows=np.where(allowed[:, None, None], shown.rows, 0.0))
+        more = design_family(sharp, wide, part, replace(TARGET, limit=UNREACHED), first.at, Scope(largest=16))
+        for n in (2, 4, 8, 16):
+            after = information_of(more.arranged(n).steps, sharp)
+            covariance = covariance_of(sharp.precision + after.fisher)
+            floor = first.at.value(covariance_of(sharp.precision + MANY * after.fisher))
+            picked = int(away[more.picks[: 4 * n]].sum())
+            minutes = first.information.minutes + after.minutes
+            ratio = covariance[0, 0] ** 0.5 * rig.table.priors["degrees_per_step.pan"].u
+            numbers = f"{1e4 * first.at.value(covariance):.2f} | {1e4 * floor:.2f} | {1e4 * ratio:.2f}"
+            print(f"| {label} | {n} | {first.spots + 4 * n} | {picked} | {minutes:.1f} | {numbers} |")
+
+
+def main() -> None:
+    """Print the tables, write the figure."""
+    print_only(__doc__)
+    use_compilation_cache()
+    knowledge = prior_knowledge(mounted_rig())
+    result = compared(knowledge, searched_family(knowledge))
+    print("# Planned looks against the paper's 96 experiments\n")
+    print("Written by `python -m experiments.planning.planned_looks`; u of the worst effective ratio, 1e-4 deg/step.\n")
+    print("| plan | spots | minutes | u | what it consists of | floor | what sets it |\n|---|---|---|---|---|---|---|")
+    print("\n".join(result.rows.values()))
+    print("\n## To the uncertainty of a protocol\n")
+    print("| as good as | u | spots | minutes | planned: spots | planned: minutes | times faster |")
+    print("|---|---|---|---|---|---|---|")
+    for name in ("paper", "mixed", "grid"):
+        one = result.curves[name][-1 if name != "grid" else 0]
+        enough = next((p for p in result.curves["planned"] if p.value <= one.value), None)
+        cells = "- | - | -"
+        if enough is not None:
+            cells = f"{enough.spots} | {enough.minutes:.1f} | {one.minutes / enough.minutes:.0f}"
+        print(f"| {name} | {1e4 * one.value:.2f} | {one.spots} | {one.minutes:.1f} | {cells} |")
+    second_session(result.planned[16])
+    draw(result.curves)
+
+
+def draw(curves: Mapping[str, Sequence[Point]]) -> None:
+    """U against minutes, both logarithmic."""
+    figure = Figure(figsize=(6.4, 4.0), layout="constrained")
+    axes = figure.subplots()
+    for name, points in curves.items():
+        last = points[-1]
+        axes.loglog([p.minutes for p in points], [p.value for p in points], marker="o", markersize=3, label=name)
+        place = {"fontsize": 7, "xytext": (3, 3), "textcoords": "offset points"}
+        axes.annotate(f"{last.spots} spots", (last.minutes, last.value), **place)
+    axes.axhline(TARGET.limit, color="grey", linewidth=0.8, linestyle=":")
+    axes.set_xlabel("minutes")
+    axes.set_ylabel("u of the worst effective ratio, deg/step")
+    axes.legend(frameon=False)
+    figure.savefig(FIGURE, dpi=110)
+
+
+if __name__ == "__main__":
+    main()

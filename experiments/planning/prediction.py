@@ -1,0 +1,150 @@
+"""Does a fit come out as the planner said? Predicted sd against RMS error, and predicted assurance against a count.
+
+    python -m experiments.planning.prediction designs              # searches the planned designs, two minutes
+    python -m experiments.planning.prediction run --n 1000 --cores 0 1     # 3 s per campaign and core, resumable
+    python -m experiments.planning.prediction table > experiments/planning/prediction.md
+
+Four designs on the mounted rig: the paper's 96 experiments, the grid, and what `tvsbayes plan` recommends for its
+default target with an assurance of 80 % (`n80`) and of 95 % (`n95`). Campaign i of a design is drawn with a seed of
+its own, every prior quantity anew, simulated by the twin and fitted (Laplace). Compared are: the error of the estimate
+with the sd that the planner predicts AT that truth before any data (RMS of z, chi-square bounds at 1e-4); with the sd
+that the fit reports; and the share of fits that report the target as met with the assurance that the planner stated
+from its own draws (binomial bounds around the stated value, which has a Monte Carlo error itself). The last column
+repeats the first comparison with the predicted sd times 0.8: it must fail, or the test could not.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+
+import numpy as np
+from scipy import stats
+
+from experiments.common.command_line import act, study_parser
+from experiments.common.fits import compile_for
+from experiments.common.headlines import SHRINK
+from experiments.common.rigs import mounted_rig, shipped_plan
+from experiments.common.rows import output, read_rows, run_rows
+from tvsbayes.estimators.campaign_arrays import use_compilation_cache
+from tvsbayes.instrument.plan import read_plan, write_plan
+from tvsbayes.model.headlines import QUANTITIES
+from tvsbayes.planning.planner import plan
+from tvsbayes.planning.target import DEFAULT_TARGET, parse_target
+from tvsbayes.statistics.intervals import binomial_bounds, rms_bounds, share_interval95
+from tvsbayes.studies.study import study_result
+from tvsbayes.studies.study_job import StudyJob, study_row
+
+ROWS, DESIGNS = output(__file__, "prediction.jsonl"), output(__file__, "designs.json")
+NAMES = ("paper", "grid", "n80", "n95")
+SEED = 2025
+"""Of the campaigns; the planner's own draws have seed 0."""
+DRAWS = 400
+
+
+def design_file(name: str) -> Path:
+    """The plan of a searched design."""
+    return output(__file__, f"design_{name}.csv")
+
+
+def designs(arguments: argparse.Namespace) -> None:
+    """Search both planned designs and keep them with their stated assurance."""
+    use_compilation_cache()
+    DESIGNS.parent.mkdir(parents=True, exist_ok=True)
+    target, rig, kept = parse_target(DEFAULT_TARGET), mounted_rig(), {}
+    both = plan(rig, target, draws=DRAWS)
+    for name, result in (("n95", both), ("n80", plan(rig, target, draws=DRAWS, largest=both.n80))):
+        write_plan(result.steps, design_file(name))
+        fields = ("experiments", "looks", "minutes", "assurance", "assurance_se", "expected")
+        kept[name] = {field: getattr(result, field) for field in fields}
+    DESIGNS.write_text(json.dumps(kept, indent=1) + "\n")
+    print(json.dumps(kept, indent=1))
+
+
+def job_of(name: str) -> StudyJob:
+    """The study behind the rows of a design."""
+    steps = shipped_plan(name) if name in ("paper", "grid") else read_plan(design_file(name))
+    return StudyJob(mounted_rig(), steps, parse_target(DEFAULT_TARGET), SEED)
+
+
+def one_row(task: tuple[str, int]) -> dict[str, object]:
+    """A row of `tvsbayes study` with the design's name."""
+    compile_for(96)
+
+    name, index = task
+    return {"name": name, **study_row(job_of(name), index)}
+
+
+def run(arguments: argparse.Namespace) -> None:
+    """Append rows until every (design, index) is there; designs in the inner loop, so that they stay balanced."""
+    tasks = [(name, index) for index in range(arguments.n) for name in arguments.designs]
+    run_rows(one_row, tasks, arguments.rows, ("name", "index"), arguments.cores)
+
+
+def table(arguments: argparse.Namespace) -> None:
+    """Markdown of everything that came out."""
+    rows, kept = read_rows(arguments.rows), json.loads(DESIGNS.read_text())
+    print("# Predicted and actual uncertainty of plans\n")
+    print("Written by `python -m experiments.planning.prediction table`; bounds at 1e-4.\n")
+    for name in NAMES:
+        job = job_of(name)
+        chosen = [r for r in rows if r["name"] == name and r["design"] == job.key]
+        if not chosen:
+            continue
+        result = study_result(job, chosen)
+        low, high = rms_bounds(result.converged)
+        looks = sum(step.action == "look" for step in job.steps)
+        print(f"## {name}: {looks} spots, {result.campaigns} campaigns, {result.converged} fits converged\n")
+        print(
+            f"| headline | RMS z, predicted sd ({low:.2f}-{high:.2f}) | RMS z, reported sd | predicted / RMS error ",
+            end="",
+        )
+        print(f"| 95 % interval holds truth | verdict | with sd x {SHRINK} |\n|---|---|---|---|---|---|---|")
+        for quantity in QUANTITIES:
+            h = result.headlines[quantity]
+            verdict = "within" if low <= h.rms_predicted <= high else "OUTSIDE"
+            shrunk = "fails" if not low <= h.rms_predicted / SHRINK <= high else "passes"
+            cells = (
+                f"{h.rms_predicted:.3f} | {h.rms_z:.3f} | {h.predicted_over_rms:.3f} | {100 * h.coverage['95']:.1f} %"
+            )
+            print(f"| {quantity} | {cells} | {verdict} | {shrunk} |")
+        print()
+    print("## Assurance\n")
+    print(
+        "| design | experiments | spots | minutes | stated | counted | 95 % interval | bounds of the stated | verdict |"
+    )
+    print("|---|---|---|---|---|---|---|---|---|")
+    for name in ("n80", "n95"):
+        job, stated = job_of(name), kept[name]
+        chosen = [r for r in rows if r["name"] == name and r["design"] == job.key]
+        if not chosen:
+            continue
+        result = study_result(job, chosen)
+        n, a, se = result.campaigns, stated["assurance"], stated["assurance_se"]
+        hits = round(result.assurance * n)
+        low, high = share_interval95(hits, n)
+        # The stated value is an estimate from draws: its error widens the bounds.
+        exact, wide = binomial_bounds(n, a), stats.norm.isf(0.5e-4) * se
+        bounds = max(0.0, exact[0] - wide), min(1.0, exact[1] + wide)
+        verdict = "within" if bounds[0] <= result.assurance <= bounds[1] else "OUTSIDE"
+        sizes = f"{stated['experiments']} | {stated['looks']} | {stated['minutes']:.1f}"
+        counted = f"{100 * result.assurance:.1f} % of {n} | {100 * low:.0f}-{100 * high:.0f} %"
+        said = f"{100 * a:.1f} +- {100 * se:.1f} %"
+        print(f"| {name} | {sizes} | {said} | {counted} | {100 * bounds[0]:.0f}-{100 * bounds[1]:.0f} % | {verdict} |")
+    failed = [r for r in rows if not r["converged"]]
+    seconds = np.median([r["seconds"] for r in rows])
+    print(f"\n{len(rows)} rows, median {seconds:.1f} s; {len(failed)} fits failed.")
+    for row in failed[:10]:
+        print(f"- {row['name']} {row['index']}: {'; '.join(row['problems'])}")
+
+
+def main() -> None:
+    """Command line."""
+    command = study_parser(__doc__, ROWS, n=1000, actions=("designs", "run", "table"))
+    command.add_argument("--designs", nargs="+", default=NAMES, choices=NAMES)
+    act(command, designs=designs, run=run, table=table)
+
+
+if __name__ == "__main__":
+    main()

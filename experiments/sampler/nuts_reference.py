@@ -1,0 +1,152 @@
+"""What is the exact posterior of the two twins? NUTS references, and what a draw costs.
+
+    taskset -c 1 python -m experiments.sampler.nuts_reference paper      # 11 CPU minutes
+    taskset -c 1 python -m experiments.sampler.nuts_reference grid --warmup 300 --draws 720     # 5
+    taskset -c 1 python -m experiments.sampler.nuts_reference paper --speed --chains 1 --warmup 200 --limit 90
+
+The first two write `data/reference/posterior_{paper,grid}.json`: mean, sd and quantiles of every free parameter and
+headline under `tvsbayes.estimators.likelihood.log_density`, each with its Monte Carlo standard error. NumPyro's NUTS
+(the extra `bench`; four chains in step, diagonal mass) samples the sheared coordinates of
+`common/reference_samplers.py`: a reference shares no sampling code with `tvsbayes.posterior`, which it judges.
+`--speed` measures effective draws per second without the shear, dense mass.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import time
+from collections.abc import Callable
+from importlib.metadata import version
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from arviz_stats.base import array_stats
+
+from experiments.common.command_line import parser
+from experiments.common.fits import compile_for
+from experiments.common.reference_samplers import AXES, Run, Setting, build_transport, nuts
+from experiments.common.rigs import twin_campaign
+from experiments.common.rows import ROOT
+from tvsbayes.estimators.joint_fit import JointFit, fit
+from tvsbayes.estimators.likelihood import log_density
+from tvsbayes.instrument.axes import DIRECTIONS
+from tvsbayes.instrument.campaign import Campaign, input_hashes, ordered_spots
+from tvsbayes.instrument.parameters import NAMES
+from tvsbayes.model.headlines import derived_quantities
+
+HEADLINES = (
+    *(f"effective_deg_per_step.{direction}" for direction in DIRECTIONS),
+    "effective_mirror_offset_mm",
+)
+QUANTILES = {"q05": 0.05, "q50": 0.50, "q95": 0.95}
+
+
+def quantities(joint: JointFit, z_of: Callable[[jax.Array], jax.Array], draws: np.ndarray) -> dict[str, np.ndarray]:
+    """Free parameters and headlines by contract name, each (chain, draw)."""
+    z = jax.jit(jax.vmap(z_of))(draws.reshape(-1, draws.shape[-1]))
+    derived = derived_quantities(z, joint.space, jnp.asarray(joint.reference_pose_rad))
+    shape = draws.shape[:2]
+    physical = np.asarray(derived.physical)
+    named = {NAMES[k]: physical[:, k].reshape(shape) for k in np.flatnonzero(joint.free)}
+    effective = np.asarray(derived.effective_deg_per_step)
+    named |= {name: effective[:, k].reshape(shape) for k, name in enumerate(HEADLINES[:4])}
+    return named | {HEADLINES[4]: np.asarray(derived.effective_mirror_offset_mm).reshape(shape)}
+
+
+def summary(values: np.ndarray) -> dict[str, float]:
+    """Moments and quantiles of one quantity (chain, draw), each with its Monte Carlo standard error."""
+    row = {"mean": values.mean(), "mean_mcse": array_stats.mcse(values, method="mean", **AXES)}
+    row |= {"sd": values.std(ddof=1), "sd_mcse": array_stats.mcse(values, method="sd", **AXES)}
+    for name, level in QUANTILES.items():
+        row[name] = np.quantile(values, level)
+        row[f"{name}_mcse"] = array_stats.mcse(values, method="quantile", prob=level, **AXES)
+    row["ess_bulk"] = array_stats.ess(values, method="bulk", **AXES)
+    row["rhat"] = array_stats.rhat(values, **AXES)
+    digits = {"ess_bulk": 5, "rhat": 5}
+    return {
+        name: float(f"{float(x):.{3 if name.endswith('mcse') else digits.get(name, 8)}g}") for name, x in row.items()
+    }
+
+
+def content_hash(reference: dict[str, object]) -> str:
+    """SHA-256 of a reference without its own hash, as canonical JSON."""
+    rest = {key: value for key, value in reference.items() if key != "sha256"}
+    return hashlib.sha256(json.dumps(rest, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
+
+
+def write_reference(twin: str, campaign: Campaign, setting: Setting, run: Run, rows: dict[str, dict]) -> None:
+    """`data/reference/posterior_TWIN.json`, a quantity a line."""
+    reference = {
+        "twin": f"{twin}_twin",
+        "target": "tvsbayes.estimators.likelihood.log_density, options of fit() at their defaults",
+        "sampler": "NUTS in sheared coordinates, experiments/sampler/nuts_reference.py",
+        "versions": {name: version(name) for name in ("numpyro", "jax", "numpy")},
+        "seed": setting.seed,
+        "chains": setting.chains,
+        "warmup_per_chain": setting.warmup,
+        "draws_per_chain": run.draws.shape[1],
+        "divergences": run.divergences,
+        "largest_rhat": max(row["rhat"] for row in rows.values()),
+        "smallest_ess_bulk": min(row["ess_bulk"] for row in rows.values()),
+        "input_sha256": input_hashes(campaign),
+        "quantities": rows,
+    }
+    reference["sha256"] = content_hash(reference)
+    lines = ",\n  ".join(f"{json.dumps(name)}: {json.dumps(row)}" for name, row in rows.items())
+    text = json.dumps({**reference, "quantities": None}, indent=1)
+    text = text.replace('"quantities": null', '"quantities": {\n  ' + lines + "\n }")
+    (ROOT / "data" / "reference" / f"posterior_{twin}.json").write_text(text + "\n")
+
+
+def main() -> None:
+    """Write one reference, or measure speed."""
+    command = parser(__doc__)
+    command.add_argument("twin", choices=("paper", "grid"))
+    command.add_argument("--speed", action="store_true", help="the same without the shear, dense mass; writes nothing")
+    command.add_argument("--chains", type=int, default=4)
+    command.add_argument("--warmup", type=int, default=500)
+    command.add_argument("--draws", type=int, default=1500, help="per chain")
+    command.add_argument("--limit", type=float, default=np.inf, help="seconds after which drawing ends")
+    command.add_argument("--seed", type=int, default=20261121)
+    options = command.parse_args()
+
+    jax.config.update("jax_enable_x64", True)
+    campaign = twin_campaign(f"{options.twin}_twin")
+    compile_for(8 * -(-max(len(ordered_spots(campaign)), len(campaign.moves)) // 8))
+    joint = fit(campaign)
+    started = time.perf_counter()
+    transport = build_transport(joint)
+    transport_s = time.perf_counter() - started
+    size = transport.index.size
+    print(f"{size} free coordinates, {len(transport.stiff)} sheared, transport {transport_s:.1f} s")
+    for w in np.random.default_rng(options.seed).standard_normal((3, size)):
+        sign, log_volume = np.linalg.slogdet(np.asarray(jax.jacfwd(transport.y_of_w)(jnp.asarray(w))))
+        print(f"log |dy/dw| = {log_volume:.1e}, sign {sign:.0f}")
+
+    def z_of(w: jax.Array) -> jax.Array:
+        return transport.z_of_y(w if options.speed else transport.y_of_w(w))
+
+    def potential(w: jax.Array) -> jax.Array:
+        return joint.log_density - log_density(z_of(w), joint.space, joint.arrays)
+
+    setting = Setting(options.chains, options.warmup, options.draws, options.seed, options.limit)
+    run = nuts(potential, size, setting, dense=options.speed)
+    rows = {name: summary(values) for name, values in quantities(joint, z_of, run.draws).items()}
+    worst = min(rows, key=lambda name: rows[name]["ess_bulk"])
+    ess = rows[worst]["ess_bulk"]
+    print(
+        f"| {options.twin} | {'no shear, dense mass' if options.speed else 'shear'} | "
+        f"{options.chains} x ({options.warmup} + {run.draws.shape[1]}) | {run.leapfrogs:.1f} | {run.divergences} | "
+        f"{run.compile_s:.0f} | {run.warmup_s:.0f} | {run.sampling_s:.0f} | "
+        f"{max(row['rhat'] for row in rows.values()):.4f} | {ess:.0f} ({worst}) | "
+        f"{ess / run.sampling_s:.2f} | {ess / (run.sampling_s + run.warmup_s):.2f} | acceptance {run.acceptance:.3f}",
+        flush=True,
+    )
+    if not options.speed:
+        write_reference(options.twin, campaign, setting, run, rows)
+
+
+if __name__ == "__main__":
+    main()

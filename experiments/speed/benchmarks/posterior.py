@@ -1,0 +1,132 @@
+"""Worst effective draws per CPU second of one posterior: `tvsbayes.sample`, NumPyro's NUTS, emcee's stretch move."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from arviz_stats.base import array_stats
+
+from experiments.common.clock import timed
+from experiments.common.fits import compile_for
+from experiments.common.reference_samplers import AXES, Setting, build_transport, nuts, stretch, worst_ess
+from experiments.common.rigs import dense_plan, mounted_rig
+from experiments.speed.benchmarks.measure import Bench, Case, Column
+from tvsbayes.estimators.joint_fit import JointFit, fit
+from tvsbayes.estimators.likelihood import log_density
+from tvsbayes.posterior.proposal import Target, pilot
+from tvsbayes.posterior.sampling import sample
+from tvsbayes.posterior.transport import Transport, transport
+from tvsbayes.twin.simulated_campaign import simulate
+
+TITLE = "Sampling the posterior"
+NAME = "60 spots of the mounted rig, both axes moved between any two"
+REPEATS = 3
+CHAINS, WARMUP, DRAWS = 4, 250, 500
+OURS, NUTS, STRETCH = "tvsbayes", "NumPyro NUTS, sheared", "emcee stretch move"
+BUCKET = 64
+"""Padded length of the campaign: ordinary fits pad to 512, for all contenders alike; here nothing is gained by it."""
+
+
+@dataclass(frozen=True)
+class Contenders:
+    """The samplers of one posterior; each turn has a seed and returns its row.
+
+    Attributes:
+        joint: the fit.
+        path: our map to nearly normal coordinates.
+        walkers: draws of our pilot, from which the stretch move starts.
+    """
+
+    joint: JointFit
+    path: Transport
+    walkers: np.ndarray
+
+    def worst(self, z: np.ndarray) -> dict[str, float]:
+        """Of the free parameters of draws (chain, draw, parameter)."""
+        free = z[..., np.flatnonzero(self.joint.free)]
+        return {"ess": worst_ess(free), "rhat": float(np.max(array_stats.rhat(free, **AXES)))}
+
+    def ours(self, seed: int) -> dict[str, object]:
+        """Until its own limits are met."""
+        posterior, cost = timed(lambda: sample(self.joint, seed=seed, max_minutes=30.0))
+        told = self.worst(posterior.z)
+        return {**cost, **told, "converged": posterior.converged, "rate": told["ess"] / cost["cpu_s"]}
+
+    def stretched(self, _: int) -> dict[str, object]:
+        """Emcee's default move."""
+        found = stretch(self.joint, self.walkers, self.path)
+        return {"ess": found.ess, "cpu_s": found.cpu_s, "wall_s": found.wall_s, "rate": found.ess / found.cpu_s}
+
+    def hamiltonian(self, seed: int) -> dict[str, object]:
+        """NumPyro's NUTS in sheared coordinates."""
+        route, built = timed(lambda: build_transport(self.joint))
+
+        def z_of(w):
+            return route.z_of_y(route.y_of_w(w))
+
+        def potential(w):
+            return self.joint.log_density - log_density(z_of(w), self.joint.space, self.joint.arrays)
+
+        run = nuts(potential, route.index.size, Setting(CHAINS, WARMUP, DRAWS, seed))
+        shape = run.draws.shape
+        z = np.asarray(jax.jit(jax.vmap(z_of))(jnp.asarray(run.draws.reshape(-1, shape[-1]))))
+        told = self.worst(z.reshape(*shape[:2], -1))
+        cpu = built["cpu_s"] + run.warmup_s + run.sampling_s
+        return {
+            **told,
+            "cpu_s": cpu,
+            "rate": told["ess"] / cpu,
+            "sampling_rate": told["ess"] / run.sampling_s,
+            "compile_s": run.compile_s,
+            "leapfrogs": run.leapfrogs,
+            "divergences": run.divergences,
+        }
+
+
+def measure(bench: Bench) -> None:
+    """Every sampler once per repeat, with the repeat's number as its seed."""
+    repeats = min(bench.repeats, REPEATS)
+    if not bench.missing(NAME, (OURS, NUTS, STRETCH), repeats):
+        return
+    compile_for(BUCKET)
+    jax.config.update("jax_enable_x64", True)
+    joint = fit(simulate(mounted_rig(), dense_plan(("d1", "d3")), seed=1).campaign)
+    path = transport(joint)
+    # Compiles everything that `sample` calls, and gives the stretch move walkers that are draws already.
+    samplers = Contenders(joint, path, pilot(Target(joint, path), 0).start)
+    works = {OURS: samplers.ours, NUTS: samplers.hamiltonian, STRETCH: samplers.stretched}
+    bench.interleaved(NAME, works, repeats)
+
+
+def cases(rows: Sequence[Mapping]) -> list[Case]:
+    """Tables of the part."""
+    about = (
+        "Worst bulk effective draws of all free parameters over the process' CPU seconds, compilation apart. "
+        "`tvsbayes` is `sample` from the fit until its own limits are met, transport, pilot and diagnosis included. "
+        f"NUTS ({CHAINS} chains in step, {WARMUP} + {DRAWS} draws each) samples Laplace-whitened coordinates, "
+        "sheared as in `sampler/nuts_reference.py`; its seconds hold transport and warm-up, the last rate only the "
+        "draws; without the shear it did not finish its warm-up on a larger campaign (`sampler/nuts_reference.md`). "
+        "The stretch move makes 400 steps in Laplace-whitened coordinates from draws of our pilot; a quarter of its "
+        "steps is left out, none of its seconds."
+    )
+    columns = (
+        Column("ess", "worst bulk ESS", "{:.0f}"),
+        Column("rhat", "worst R-hat", "{:.4f}"),
+        Column("cpu_s", "CPU s"),
+        Column("rate", "ESS per CPU s"),
+        Column("sampling_rate", "of the draws alone"),
+        Column("leapfrogs", "leapfrogs a draw"),
+        Column("divergences", "divergences", "{:.0f}"),
+        Column("compile_s", "compilation, CPU s"),
+    )
+    return [Case(NAME, about, columns, "rate")]
+
+
+def remarks(rows: Sequence[Mapping]) -> list[str]:
+    """Did ours converge?"""
+    seen = [r["values"]["converged"] for r in rows if r["contender"] == OURS]
+    return [f"`tvsbayes` met its own limits of convergence in {sum(seen)} of {len(seen)} runs."]

@@ -1,0 +1,85 @@
+"""Commands from process start, with an empty and with a filled compilation cache, beside bare imports."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import sys
+import tempfile
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from experiments.speed.benchmarks.measure import Bench, Case, Column, command_cost
+
+TITLE = "From process start"
+FLOOR, COMMANDS = "Floor: Python and its packages", "Commands"
+COLD_REPEATS = 3
+IMPORTS = (
+    "pass",
+    "import numpy",
+    "import scipy.optimize",
+    "import cv2",
+    "import jax",
+    "import numpyro",
+    "import arviz",
+)
+PROGRAM = [sys.executable, "-c", "from tvsbayes.cli.main import main; main()"]
+
+
+def measure(bench: Bench) -> None:
+    """Fresh processes only; the files they read are in the file cache."""
+    from tvsbayes.files.disk import shipped_data
+
+    twin = str(shipped_data() / "twins" / "paper_twin")
+
+    def floor(code: str):
+        return lambda _: command_cost([sys.executable, "-c", code])[1]
+
+    with tempfile.TemporaryDirectory() as place:
+        out = Path(place)
+
+        def command(arguments: Sequence[str], cache: Path | None):
+            def row(_: int) -> dict[str, float]:
+                with tempfile.TemporaryDirectory() as empty:
+                    environment = {**os.environ, "TVSBAYES_CACHE": str(cache or empty)}
+                    return command_cost([*PROGRAM, *arguments], environment)[1]
+
+            return row
+
+        floor_of = {code: floor(code) for code in IMPORTS}
+        short = {
+            "tvsbayes --help": command(["--help"], out),
+            "tvsbayes check": command(["check", twin, "--json"], out),
+            "tvsbayes classic": command(["classic", twin, "--json"], out),
+        }
+        for case, works in ((FLOOR, floor_of), (COMMANDS, short)):
+            if bench.missing(case, list(works)):
+                for work in works.values():
+                    work(0)
+                bench.interleaved(case, works)
+        fit = ["fit", twin, "--no-sample", "--json", "--out", str(out / "fit")]
+        cold, warm = "tvsbayes fit --no-sample, cache empty", "tvsbayes fit --no-sample, cache filled"
+        bench.interleaved(COMMANDS, {cold: command(fit, None)}, min(bench.repeats, COLD_REPEATS))
+        if bench.missing(COMMANDS, [warm]):
+            command(fit, out / "filled")(0)
+            bench.interleaved(COMMANDS, {warm: command(fit, out / "filled")})
+        report = "tvsbayes report"
+        if bench.missing(COMMANDS, [report]):
+            shutil.copytree(twin, out / "twin")
+            command(["fit", str(out / "twin"), "--no-sample", "--json"], out / "filled")(0)
+            bench.interleaved(COMMANDS, {report: command(["report", str(out / "twin"), "--json"], out / "filled")})
+
+
+def cases(rows: Sequence[Mapping]) -> list[Case]:
+    """Tables of the part."""
+    columns = (Column("wall_s", "wall s"), Column("cpu_s", "CPU s"), Column("rss_mib", "peak memory, MiB", "{:.0f}"))
+    about = "On the shipped paper twin (384 spots)."
+    return [
+        Case(FLOOR, "`python -c ...`", columns, ours=""),
+        Case(COMMANDS, about, columns, ours=""),
+    ]
+
+
+def remarks(rows: Sequence[Mapping]) -> list[str]:
+    """None."""
+    return []

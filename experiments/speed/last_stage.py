@@ -1,0 +1,88 @@
+"""The last least-squares stage of a fit, where every solver converges: its start, residuals and Jacobian.
+
+Annealing reaches the basin; solvers are compared from there.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy import optimize
+
+from tvsbayes.estimators.joint_fit import Fixed, Problem, stage_residuals
+from tvsbayes.estimators.likelihood import innovations
+from tvsbayes.instrument.campaign import Campaign, ordered_spots
+from tvsbayes.instrument.parameters import NAMES
+from tvsbayes.statistics.least_squares import levenberg_marquardt, residuals_and_jacobian
+
+PEER_TOLERANCE = 1e-6
+ANNEALING = (60.0, 10.0, 2.0)
+"""Inflations of the stages before."""
+Residuals = Callable[..., jax.Array]
+
+
+def exact_residuals(z, args):
+    """`stage_residuals` whose derivative holds nothing fixed."""
+    space, arrays, fixed = args
+    full = jnp.where(fixed.held, fixed.value, z)
+    errors = innovations(space.model(full), arrays, fixed.inflation, frozen=False).standardised
+    return jnp.concatenate([errors.ravel(), jnp.where(fixed.held, z - fixed.value, z)])
+
+
+@dataclass
+class LastStage:
+    """What a solver is given; float64 has to be on.
+
+    Attributes:
+        start: coordinates (p,).
+        args: of the residual functions.
+        compiling_s: CPU seconds of the first stage of the annealing, compilation included.
+        calls: of `residuals` and `jacobian`, counted.
+    """
+
+    start: np.ndarray
+    args: tuple
+    compiling_s: float
+    calls: dict[str, int]
+
+    def __post_init__(self) -> None:
+        """Both kinds of residuals have the same values."""
+        self._values = jax.jit(lambda z: stage_residuals(z, self.args))
+
+    def residuals(self, z: np.ndarray) -> np.ndarray:
+        """Values."""
+        self.calls["residuals"] += 1
+        return np.asarray(self._values(jnp.asarray(z)))
+
+    def jacobian(self, z: np.ndarray, kind: Residuals = stage_residuals) -> np.ndarray:
+        """Derivative, with slopes and projection held fixed or not."""
+        self.calls["Jacobians"] += 1
+        return np.asarray(residuals_and_jacobian(kind, jnp.asarray(z), self.args)[1])
+
+    def ours(self, tolerance: float, steps: int, kind: Residuals = stage_residuals) -> np.ndarray:
+        """Where our solver ends."""
+        limit = jnp.asarray(tolerance)
+        return np.asarray(levenberg_marquardt(kind, jnp.asarray(self.start), self.args, limit, steps))
+
+    def peer(self, method: str, differences: bool = False, kind: Residuals = stage_residuals) -> np.ndarray:
+        """Where `scipy.optimize.least_squares` ends, with the same Jacobian or with finite differences."""
+        options = {"method": method, "xtol": PEER_TOLERANCE, "ftol": PEER_TOLERANCE, "gtol": PEER_TOLERANCE}
+        jac = "2-point" if differences else lambda z: self.jacobian(z, kind)
+        return optimize.least_squares(self.residuals, self.start, jac=jac, **options).x
+
+
+def last_stage(campaign: Campaign) -> LastStage:
+    """Anneal as a fit does; float64 has to be on."""
+    problem = Problem(campaign, campaign.rig, np.ones(len(ordered_spots(campaign)), dtype=bool))
+    begun = time.process_time()
+    start = problem.least_squares(np.zeros(len(NAMES)), ANNEALING[0])
+    compiling_s = time.process_time() - begun
+    for inflation in ANNEALING[1:]:
+        start = problem.least_squares(start, inflation)
+    args = problem.space, problem.arrays, Fixed(jnp.asarray(problem.held), jnp.asarray(start), jnp.asarray(1.0))
+    return LastStage(start, args, compiling_s, {"residuals": 0, "Jacobians": 0})
