@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from support.bent_rig import BENT, NO_NOISE_DEG, NOMINAL, calibration, twin_points, twin_ray
+from support.published_equations import published_point
 from support.small_campaign import small_campaign
 
 from tvsbayes.assessment.causes import causes_of
@@ -17,7 +18,7 @@ from tvsbayes.assessment.fitted_calibration import calibration_of
 from tvsbayes.calibration.pointing import INPUT_NAMES, NOISE_NAMES, Calibration
 from tvsbayes.coordinates.beam_meeting import INPUT_COLUMNS, meeting
 from tvsbayes.coordinates.error_map import SimpleCalibration, error_map, simple_calibration, simple_rays
-from tvsbayes.coordinates.location import locate_linear, published_point, settings_of
+from tvsbayes.coordinates.location import locate_linear, settings_of
 from tvsbayes.errors import InputError
 from tvsbayes.estimators.four_point import ClassicResult, DirectionResult
 from tvsbayes.estimators.joint_fit import JointFit

@@ -23,10 +23,11 @@ from support.bent_rig import (
     twin_points,
     twin_ray_at,
 )
+from support.published_equations import published_point
 
 from tvsbayes.calibration.pointing import DIVERGING_SHARE, INPUT_NAMES, NOISE_NAMES, Calibration
 from tvsbayes.coordinates.beam_meeting import carry, meeting, sources
-from tvsbayes.coordinates.location import locate, locate_linear, published_point, settings_of
+from tvsbayes.coordinates.location import locate, locate_linear, settings_of
 from tvsbayes.errors import InputError
 from tvsbayes.twin.physics import aperture_angle_deg
 

@@ -1,12 +1,8 @@
-"""TVS coordinates: where beam and aperture reading meet, in mm, and how sure that is (paper eq. 1-3; DESIGN 5).
+"""TVS coordinates: points where beam and aperture reading meet, in mm, and how sure that is.
 
 Frame T: origin mid-baseline, x depth, y along the baseline towards the positioner at +a/2, z up; the aperture stands
-at (0, -a/2, 0). mm and rad inside; degrees where a name says `_deg`. The emission angle C and the aperture angle B are
-interior angles of the triangle whose third corner is the spot.
-
-Uncertainty is propagated by the law (GUM 5), by distributions (JCGM 101, 102), and the one is validated by the other;
-these functions know no frame and take any unit. The law is written for JAX so that thousands of points share one
-compiled function; distributions are arrays of draws, from any generator or from a posterior.
+at (0, -a/2, 0). Uncertainty is propagated by the law (GUM 5) and by distributions (JCGM 101, 102), and the one is
+validated by the other.
 """
 
 from __future__ import annotations
@@ -14,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import cast
 
 import jax
 import jax.numpy as jnp
@@ -29,40 +26,6 @@ DRAWS = 1000
 """Draws carried to a point unless the caller wants others; DESIGN 5 asks for 500 at least."""
 POINTS = 256
 """Points per call of the compiled functions."""
-
-
-def published_point(
-    B_deg: float | np.ndarray,
-    C_deg: float | np.ndarray,
-    beta_deg: float | np.ndarray,
-    baseline_mm: float,
-    *,
-    as_printed: bool = False,
-) -> np.ndarray:
-    """The paper's equations (1)-(3), B and C in the plane that is tilted by beta about the baseline.
-
-    y = a (1/2 - sin B cos C / sin(B + C)) holds for every B and C. The paper prints a second branch for B > 90 deg,
-    y = -a (1/2 + sin B cos C / sin[180 - (B + C)]), which jumps by -a at B = 90 deg: it is returned with
-    `as_printed` only.
-
-    Args:
-        B_deg: angle at the aperture.
-        C_deg: angle at the positioner.
-        beta_deg: elevation.
-        baseline_mm: a.
-        as_printed: the paper's two branches.
-
-    Returns:
-        x, y, z in mm, first axis; infinite or behind the baseline where B + C >= 180 deg.
-    """
-    B, C, beta = (np.radians(np.asarray(angle, dtype=float)) for angle in (B_deg, C_deg, beta_deg))
-    with np.errstate(divide="ignore", invalid="ignore"):
-        height = baseline_mm * np.sin(B) * np.sin(C) / np.sin(B + C)
-        share = np.sin(B) * np.cos(C) / np.sin(B + C)
-    y = baseline_mm * (0.5 - share)
-    if as_printed:
-        y = np.where(np.degrees(B) > 90.0, -baseline_mm * (0.5 + share), y)
-    return np.stack(np.broadcast_arrays(height * np.cos(beta), y, height * np.sin(beta)))
 
 
 @dataclass(frozen=True)
@@ -136,9 +99,10 @@ def settings_of(
     """Settings of many points; arguments and errors as in `locate`."""
     numbers = [np.atleast_1d(np.asarray(x, dtype=float)) for x in (pan_steps, tilt_steps, aperture_deg)]
     pan, tilt, reading = np.broadcast_arrays(*numbers)
-    pairs = [approach] if len(approach) == 2 and isinstance(approach[0], str) else list(approach)
-    known = {pair: sides_of(pair) for pair in set(map(tuple, pairs))}
-    side = np.broadcast_to(np.array([known[tuple(pair)] for pair in pairs]), (len(pan), 2))
+    single = len(approach) == 2 and isinstance(approach[0], str)
+    pairs = cast("Sequence[tuple[str, str]]", [approach] if single else approach)
+    known = {(pan_side, tilt_side): sides_of((pan_side, tilt_side)) for pan_side, tilt_side in pairs}
+    side = np.broadcast_to(np.array([known[pan_side, tilt_side] for pan_side, tilt_side in pairs]), (len(pan), 2))
     with jax.enable_x64(True):
         return Settings(
             steps=jnp.asarray(np.stack([pan, tilt], axis=1)),
@@ -213,47 +177,80 @@ def locate(
             carried, law = carry(block, given), propagate(block, given)
             trimmed = jax.tree.map(lambda x, n=n: np.asarray(x)[..., :n], carried)
             parts.append(_statistics(trimmed, jax.tree.map(lambda x, n=n: np.asarray(x)[:n], law), given))
-    joined = {name: np.concatenate([part[name] for part in parts]) for name in parts[0] if name != "validation"}
-    checks = [part["validation"] for part in parts]
-    fields = ("tolerance", "deviation", "error", "validated", "decided")
-    together = {name: np.concatenate([getattr(check, name) for check in checks]) for name in fields}
-    validation = Validation(checks[0].digits, **together)
-    steps, side = np.asarray(settings.steps), np.asarray(settings.side)
-    reading = np.degrees(settings.aperture_rad)
-    lost = ~(joined["diverging_share"] <= DIVERGING_SHARE)
-    refused = tuple(
-        calibration.refusal(*steps[i], float(reading[i]), tuple(side[i])) if bad else None for i, bad in enumerate(lost)
+    checks = [part.validation for part in parts]
+    lost = _joined(parts, "diverging_share")
+    asked = zip(
+        settings.steps.tolist(), np.degrees(settings.aperture_rad).tolist(), settings.side.tolist(), strict=True
     )
-    return Locations(**joined, validation=validation, refused=refused, estimator=calibration.estimator, draws=draws)
+    return Locations(
+        xyz_mm=_joined(parts, "xyz_mm"),
+        covariance_mm2=_joined(parts, "covariance_mm2"),
+        interval95_mm=_joined(parts, "interval95_mm"),
+        u95_mm=_joined(parts, "u95_mm"),
+        diverging_share=lost,
+        linear_xyz_mm=_joined(parts, "linear_xyz_mm"),
+        linear_covariance_mm2=_joined(parts, "linear_covariance_mm2"),
+        validation=Validation(
+            digits=checks[0].digits,
+            tolerance=_joined(checks, "tolerance"),
+            deviation=_joined(checks, "deviation"),
+            error=_joined(checks, "error"),
+            validated=_joined(checks, "validated"),
+            decided=_joined(checks, "decided"),
+        ),
+        refused=tuple(
+            None if share <= DIVERGING_SHARE else calibration.refusal(pan, tilt, deg, (pan_side, tilt_side))
+            for share, ((pan, tilt), deg, (pan_side, tilt_side)) in zip(lost.tolist(), asked, strict=True)
+        ),
+        estimator=calibration.estimator,
+        draws=draws,
+    )
 
 
-def _statistics(carried: Carried, law: Linear, given: Sources) -> dict[str, object]:
+def _joined(parts: Sequence[object], field: str) -> np.ndarray:
+    return np.concatenate([getattr(part, field) for part in parts])
+
+
+@dataclass(frozen=True)
+class _Block:
+    """Some of the points; fields as in `Locations`."""
+
+    xyz_mm: np.ndarray
+    covariance_mm2: np.ndarray
+    interval95_mm: np.ndarray
+    u95_mm: np.ndarray
+    diverging_share: np.ndarray
+    linear_xyz_mm: np.ndarray
+    linear_covariance_mm2: np.ndarray
+    validation: Validation
+
+
+def _statistics(carried: Carried, law: Linear, given: Sources) -> _Block:
     """Moments, intervals and validation of one block of points."""
-    meets = carried.meets
+    meets, xyz = np.asarray(carried.meets), np.array(carried.xyz_mm)
+    value, law_covariance = np.asarray(law.value), np.asarray(law.covariance)
     lost = (~meets).mean(axis=0)
     count = len(meets)
     # The few draws without a point take the point's median place: at most one in a thousand, or the point is refused.
-    xyz = carried.xyz_mm
     for point in np.flatnonzero(~meets.all(axis=0) & meets.any(axis=0)):
         seen = meets[:, point]
-        xyz = xyz.copy() if xyz is carried.xyz_mm else xyz
         xyz[~seen, :, point] = np.median(xyz[seen, :, point], axis=0)
     mean = xyz.mean(axis=0)
     centred = xyz - mean
     covariance = np.einsum("dip,djp->pij", centred, centred) / (count - 1)
     inputs = np.concatenate([np.asarray(given.inputs)[:, : len(INPUT_NAMES)], np.asarray(given.noise)], axis=1)
-    u = np.sqrt(np.einsum("pii->pi", law.covariance))
-    linearised = law.value + np.einsum("pik,dk->dpi", law.jacobian, inputs - np.asarray(given.mean))
+    u = np.sqrt(np.einsum("pii->pi", law_covariance))
+    linearised = value + np.einsum("pik,dk->dpi", law.jacobian, inputs - np.asarray(given.mean))
     draws = np.ascontiguousarray(xyz.transpose(0, 2, 1))
     interval = symmetric_interval(draws)
     empty = np.where(lost <= DIVERGING_SHARE, 0.0, np.nan)
-    return {
-        "xyz_mm": mean.T + empty[:, None],
-        "covariance_mm2": covariance + empty[:, None, None],
-        "interval95_mm": interval.transpose(1, 0, 2) + empty[:, None, None],
-        "u95_mm": 0.5 * (interval[1] - interval[0]) + empty[:, None],
-        "diverging_share": lost,
-        "linear_xyz_mm": law.value + empty[:, None],
-        "linear_covariance_mm2": law.covariance + empty[:, None, None],
-        "validation": validate(draws, linearised, law.value, u),
-    }
+    return _Block(
+        xyz_mm=mean.T + empty[:, None],
+        covariance_mm2=covariance + empty[:, None, None],
+        interval95_mm=interval.transpose(1, 0, 2) + empty[:, None, None],
+        u95_mm=0.5 * (interval[1] - interval[0]) + empty[:, None],
+        diverging_share=lost,
+        linear_xyz_mm=value + empty[:, None],
+        linear_covariance_mm2=law_covariance + empty[:, None, None],
+        validation=validate(draws, linearised, value, u),
+    )

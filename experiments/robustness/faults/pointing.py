@@ -21,12 +21,12 @@ FAULTS = (
         ("coordinates/error_map::test_bias_of_the_nominal_estimator_is_the_twins",),
     ),
     Fault(
-        "published y with the wrong sign",
-        "coordinates/location.py",
-        "y = baseline_mm * (0.5 - share)",
-        "y = baseline_mm * (0.5 + share)",
-        "points on the wrong side of the baseline's middle",
-        ("coordinates/location",),
+        "published equations with the beam on the wrong side",
+        "coordinates/error_map.py",
+        "origin[1] = simple.origin_y_mm",
+        "origin[1] = -simple.origin_y_mm",
+        "nominal and classic points on the wrong side of the baseline's middle",
+        ("coordinates/error_map::test_simple_rays_with_readings_are_the_published_equations",),
     ),
     Fault(
         "other root of the cone",
