@@ -66,6 +66,7 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
         files.append(File.generated(config, place, content=content, inclusion=InclusionLevel.INCLUDED))
 
     experiments = [path for path in sorted((ROOT / "experiments").rglob("*")) if path.suffix in (".md", ".png")]
+    experiments = [path for path in experiments if "output" not in path.parts]
     for path in (ROOT / "README.md", *(ROOT / name for name in OUTSIDE), *experiments):
         content = path.read_bytes()
         place = place_in_site(path.relative_to(ROOT).as_posix())
