@@ -28,11 +28,14 @@ from tvsbayes.instrument.rig import Rig, read_rig
 from tvsbayes.twin.simulated_campaign import SimulatedCampaign, Truth, simulate
 
 ROOT = Path(__file__).resolve().parents[1]
-COMPILES = "cli/test_main.py"
+pytest_plugins = ["support.commands", "support.reported_twin"]
+"""Fixtures of commands and of the report, by the modules that hold their helpers."""
+COMPILES = "cli/test_estimate_commands.py"
 LONG = (
     *(
         "planning/test_planner.py",
         "report/test_page.py",
+        "cli/test_campaign_commands.py",
         "posterior/test_sampling.py",
         "comparison/test_gap.py",
         "assessment/test_summary.py",

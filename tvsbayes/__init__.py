@@ -7,10 +7,13 @@ From a campaign folder to a robot:
     posterior = tvsbayes.sample(fit)                     # its posterior; .propagate carries it into any quantity
     calibration = tvsbayes.calibration_of(fit, posterior)
     found = tvsbayes.locate(calibration, 100, 20, 70.0)  # counters and aperture reading -> mm, with covariance
+    results = tvsbayes.calibrate(campaign, folder)       # all of it at once, and the files that `tvsbayes fit` writes
     calibration = tvsbayes.load_calibration("mine")      # the same from results/ after `tvsbayes fit mine`: NumPy alone
 
 mm, px, and degrees where a name says `deg`; frames, signs and names are in `data/docs/conventions.md`, the map of all
-modules in `data/docs/architecture.md`, more examples in `data/docs/python.md`. Refused input raises
+modules in `data/docs/architecture.md`, more examples in `data/docs/python.md`. Figures: `tvsbayes.plots`. Classic
+estimator: `tvsbayes.estimators.four_point`; simulation: `tvsbayes.twin.simulated_campaign`; planning:
+`tvsbayes.planning.planner`; two campaigns: `tvsbayes.comparison.changes`. Refused input raises
 `tvsbayes.errors.InputError`, which says where, what was found and what to do.
 """
 
@@ -22,28 +25,55 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from tvsbayes.assessment.fitted_calibration import calibration_of as calibration_of
     from tvsbayes.calibration.calibration_file import load_calibration as load_calibration
+    from tvsbayes.calibration.pointing import Calibration as Calibration
+    from tvsbayes.coordinates.location import Locations as Locations
     from tvsbayes.coordinates.location import locate as locate
+    from tvsbayes.errors import TvsError as TvsError
+    from tvsbayes.estimators.joint_fit import JointFit as JointFit
     from tvsbayes.estimators.joint_fit import fit as fit
+    from tvsbayes.instrument.campaign import Campaign as Campaign
     from tvsbayes.instrument.campaign import read_campaign as read_campaign
     from tvsbayes.instrument.model_choice import ModelChoice as ModelChoice
+    from tvsbayes.pipeline import CampaignResults as CampaignResults
+    from tvsbayes.pipeline import calibrate as calibrate
+    from tvsbayes.posterior.draws import Posterior as Posterior
     from tvsbayes.posterior.sampling import sample as sample
+    from tvsbayes.report import figures as plots
+    from tvsbayes.results.comparison_record import Comparison as Comparison
+    from tvsbayes.results.estimates import FitSummary as FitSummary
+    from tvsbayes.results.fit_record import FitRecord as FitRecord
+    from tvsbayes.results.fit_record import read_fit as read_fit
 
 _HOME = {
+    "Calibration": "calibration.pointing",
+    "Campaign": "instrument.campaign",
+    "CampaignResults": "pipeline",
+    "Comparison": "results.comparison_record",
+    "FitRecord": "results.fit_record",
+    "FitSummary": "results.estimates",
+    "JointFit": "estimators.joint_fit",
+    "Locations": "coordinates.location",
     "ModelChoice": "instrument.model_choice",
+    "Posterior": "posterior.draws",
+    "TvsError": "errors",
+    "calibrate": "pipeline",
     "calibration_of": "assessment.fitted_calibration",
     "fit": "estimators.joint_fit",
     "load_calibration": "calibration.calibration_file",
     "locate": "coordinates.location",
     "read_campaign": "instrument.campaign",
+    "read_fit": "results.fit_record",
     "sample": "posterior.sampling",
 }
-__all__ = list(_HOME)
+__all__ = [*_HOME, "plots"]
 
 
 def __getattr__(name: str) -> object:
     """Load what is asked for when it is first asked for: readers bring NumPy, the estimator brings JAX."""
     if name in _HOME:
         return getattr(import_module(f"tvsbayes.{_HOME[name]}"), name)
+    if name == "plots":
+        return import_module("tvsbayes.report.figures")
     if name == "__version__":
         from importlib.metadata import version
 

@@ -69,6 +69,11 @@ class NotConverged(TvsError):
 
     exit_code = 4
 
+    @classmethod
+    def of(cls, problems: Iterable[str], remedy: str) -> NotConverged:
+        """Of a fit that ended with these problems, in sentences."""
+        return cls("not-converged", "NOT CONVERGED: " + "; ".join(problems), remedy=remedy)
+
 
 class DeviceFault(TvsError):
     """The positioner, a camera or the disk failed while an instrument was in use (exit 5)."""
@@ -114,8 +119,7 @@ def refusal(
     """Builds the `InputError` whose message says where, what was found, what is allowed and what to do."""
     where = file + (f" line {line}" if line else "") + (f", {escaped(column)}" if column else "")
     message = f"{where}: found {found}; allowed: {allowed}; {remedy}"
-    where_parts = {"file": file, "line": line, "column": column}
-    return InputError(code, message, **where_parts, found=found, allowed=allowed, remedy=remedy)
+    return InputError(code, message, file=file, line=line, column=column, found=found, allowed=allowed, remedy=remedy)
 
 
 def closest(name: str, names: Iterable[str]) -> str:

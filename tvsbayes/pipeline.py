@@ -1,16 +1,22 @@
-"""Fit, calibration and evidence of a campaign, as the commands make them."""
+"""From a campaign to everything said of it: fit, posterior, calibration, evidence, made whole, kept in `results/`.
+
+What the commands call, for whoever calls from Python. Units are those of the contract names; JAX is loaded by what
+fits.
+"""
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Callable
-from dataclasses import asdict
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from tvsbayes.errors import NotConverged
-from tvsbayes.files.disk import output_place
+from tvsbayes.errors import NotConverged, NothingToEstimate, TvsError
+from tvsbayes.files.disk import make_folder, output_place
 from tvsbayes.instrument.axes import AXES
+from tvsbayes.instrument.model_choice import AS_STATED, ModelChoice
 
 if TYPE_CHECKING:
     import numpy as np
@@ -19,17 +25,30 @@ if TYPE_CHECKING:
     from tvsbayes.estimators.joint_fit import JointFit
     from tvsbayes.instrument.campaign import Campaign
     from tvsbayes.posterior.draws import Posterior
+    from tvsbayes.posterior.sampling import Progress
     from tvsbayes.results.estimates import FitSummary
+    from tvsbayes.results.fit_record import FitEvidence, FitRecord
+    from tvsbayes.results.stored_draws import ResultDraws
 
 
 Tell = Callable[[str], None]
 """Shows a line to whoever waits."""
+Watch = Callable[[], AbstractContextManager["Callable[[Progress], None]"]]
+"""Opens what shows the progress of a sampler."""
 RESIDUALS_LISTED = 4096
 """Stops in `fit.json`, evenly chosen: a long campaign's file stays readable within its cap."""
 FITTING_FIRST = (
     "results/ are missing, older than the campaign, or of a fit that did not converge: fitting first "
     "(Laplace approximation) ..."
 )
+
+
+def untold(line: str) -> None:
+    """For whoever does not want to be told."""
+
+
+def _unwatched() -> AbstractContextManager[Callable[[Progress], None]]:
+    return nullcontext(lambda state: None)
 
 
 def compile_for(tell: Tell) -> None:
@@ -40,14 +59,154 @@ def compile_for(tell: Tell) -> None:
         tell("first run: the model is compiled, half a minute to two minutes; later runs take it from the cache")
 
 
+def unusable(summary: FitSummary) -> TvsError | None:
+    """Why a fit that ran to its end must not be used: not converged (4) or nothing learned (3)."""
+    if not summary.converged and summary.sampling is not None and not summary.sampling.converged:
+        return NotConverged(
+            "unconverged",
+            "UNCONVERGED: " + "; ".join(summary.sampling.missing) + ". The table is the Laplace approximation",
+            remedy="run again with --resume and more --max-minutes",
+        )
+    if not summary.converged:
+        return NotConverged.of(
+            summary.problems,
+            "check for swapped cameras or wrong counters, or state the extrinsics better in [rig.prior]",
+        )
+    if not summary.headline_informed:
+        return NothingToEstimate(
+            "uninformed",
+            "the spots tell no more about any effective ratio than the priors do (contraction below 0.1 everywhere)",
+            remedy="observe stops before and after moves of both axes",
+        )
+    return None
+
+
+@dataclass(frozen=True)
+class CampaignResults:
+    """Everything that is said of a campaign, and what it was taken from.
+
+    Attributes:
+        record: the content of `fit.json`.
+        fit: mode and Laplace approximation.
+        posterior: its sample, None where nothing was sampled; one that has not converged lends the record no number.
+        calibration: what `locate` needs; None of a fit that did not converge.
+        draws: behind the record.
+        error: why the results must not be used, None where they may.
+        files: paths of what was written, by kind: "draws", "fit", "posterior", "chain".
+    """
+
+    record: FitRecord
+    fit: JointFit
+    posterior: Posterior | None
+    calibration: Calibration | None
+    draws: ResultDraws
+    error: TvsError | None
+    files: dict[str, str]
+
+
+def calibrate(
+    campaign: Campaign,
+    folder: Path | None = None,
+    *,
+    model: ModelChoice = AS_STATED,
+    sampled: bool = True,
+    max_minutes: float = 10.0,
+    resume: bool = False,
+    seed: int = 0,
+    tell: Tell = untold,
+    watch: Watch = _unwatched,
+) -> CampaignResults:
+    """Fit a campaign, sample its posterior, and make complete results of both, as the command `fit` does.
+
+    Args:
+        campaign: from `read_campaign`.
+        folder: for `fit.json`, `draws.npz`, `posterior.nc` and `chain.npz`; None writes nothing. For `locate` and the
+            commands this is `results` in the campaign's folder.
+        model: what is asked for beyond the rig's priors.
+        sampled: sample the posterior; else the Laplace approximation stands alone.
+        max_minutes: time for sampling.
+        resume: go on with the chain in the folder.
+        seed: of everything random.
+        tell: shows what takes long.
+        watch: opens what shows the sampler's progress.
+
+    Raises:
+        InputError: as `fit` and `sample`, or the folder cannot be written.
+        NothingToEstimate: too few spots, or nothing is free.
+        NotConverged: the fit diverged. One that ended badly is in the results, with their `error`.
+    """
+    from tvsbayes.assessment.summary import summarise
+    from tvsbayes.estimators.joint_fit import fit as fit_joint
+
+    found = fit_joint(campaign, model=model, seed=seed)
+    posterior, files = None, {}
+    # A sample of what must not be used anyway would only take time.
+    if sampled and unusable(summarise(found)) is None:
+        from tvsbayes.posterior.sampling import sample
+
+        checkpoint = None if folder is None else folder / "chain.npz"
+        if folder is not None:
+            make_folder(folder)
+        with watch() as progress:
+            posterior = sample(
+                found, max_minutes=max_minutes, seed=seed, checkpoint=checkpoint, resume=resume, progress=progress
+            )
+        files = _posterior_files(posterior, folder, tell)
+    if folder is not None and "posterior" not in files and (stale := folder / "posterior.nc").exists():
+        stale.unlink()
+        tell("posterior.nc of an earlier fit is removed: it would not be that of fit.json")
+    return _results(found, posterior, seed, folder, files)
+
+
+def _posterior_files(posterior: Posterior, folder: Path | None, tell: Tell) -> dict[str, str]:
+    """Write a posterior that has converged for ArviZ; the chain is kept already."""
+    if folder is None:
+        return {}
+    files = {}
+    if posterior.converged:
+        from tvsbayes.posterior.arviz_tree import write_posterior
+
+        tell("computing log likelihoods and predictions for posterior.nc ...")
+        write_posterior(posterior, folder / "posterior.nc")
+        files["posterior"] = str(folder / "posterior.nc")
+    return {**files, "chain": str(folder / "chain.npz")}
+
+
+def _results(
+    found: JointFit, posterior: Posterior | None, seed: int, folder: Path | None, files: dict[str, str]
+) -> CampaignResults:
+    """Summary, calibration and evidence of a fit and its sample, written where a folder is named."""
+    from tvsbayes.assessment.fitted_calibration import DRAWS_KEPT, calibration_of
+    from tvsbayes.assessment.summary import summarise
+    from tvsbayes.instrument.campaign import input_hashes
+    from tvsbayes.results.fit_record import FitRecord, covariance_of_draws, provenance
+    from tvsbayes.results.stored_draws import ResultDraws, write_results
+
+    summary = summarise(found, posterior)
+    usable = posterior if summary.estimator == "posterior" else None
+    calibration = calibration_of(found, posterior, seed=seed) if found.converged else None
+    behind = found.draws if usable is None else usable.thinned(DRAWS_KEPT)
+    draws = ResultDraws(found.names, behind.physical, behind.effective_deg_per_step, found.reference_pose_rad)
+    record = FitRecord(
+        summary,
+        covariance_of_draws(draws.names, draws.physical, summary.parameters),
+        evidence_of(found, summary, usable, calibration, draws.physical),
+        provenance(input_hashes(found.campaign), seed),
+    )
+    if folder is not None:
+        mode = None if calibration is None else found.stored
+        files = {**write_results(folder, record, draws, calibration, mode), **files}
+    return CampaignResults(record, found, posterior, calibration, draws, unusable(summary), files)
+
+
 def evidence_of(
     fit: JointFit,
     summary: FitSummary,
     posterior: Posterior | None,
     calibration: Calibration | None,
     physical: np.ndarray,
-) -> dict[str, object]:
-    """What `fit.json` holds for reports besides the estimates; without a calibration residuals alone.
+) -> FitEvidence:
+    """What reports show besides the estimates; without a calibration residuals alone.
 
     `physical` are the draws, in the units of the names, that the calibration's inputs were taken from, row by row.
     """
@@ -55,30 +214,27 @@ def evidence_of(
     from tvsbayes.assessment.residuals import residual_causes, stop_readings, stop_residuals
     from tvsbayes.comparison.gap import explain_gap
     from tvsbayes.metrology.positioning_table import positioning
+    from tvsbayes.results.fit_record import FitEvidence
 
     stops = stop_residuals(fit)
-    listed = stops[:: -(-len(stops) // RESIDUALS_LISTED) or 1]
-    gaps, budgets, axes = {}, [], []
-    if calibration is not None:
-        gaps = explain_gap(fit, posterior)
-        causes = headline_causes(fit)
-        told = {**{f"effective_deg_per_step.{d}": e for d, e in summary.effective.items()}, **summary.parameters}
-        # What a model holds fixed has no uncertainty to split.
-        budgets = [headline_budget(causes, q, told[q]).as_json() for q in causes.quantities if told[q].sd > 0]
-        readings = {axis: stop_readings(fit, axis) for axis in AXES}
-        for axis, own in readings.items():
-            contrast = physical[:, fit.names.index(f"ratio_contrast_deg_per_step.{axis}")]
-            axes.append(positioning(calibration, axis, readings=own, contrast_deg_per_step=contrast).as_json())
-    return {
-        "residuals": [asdict(stop) for stop in listed],
-        "residual_causes": [asdict(cause) for cause in residual_causes(stops)],
-        "gap": {d: None if gap is None else asdict(gap) for d, gap in gaps.items()} if any(gaps.values()) else None,
-        "budgets": budgets,
-        "positioning": axes,
-    }
+    listed, causes = stops[:: -(-len(stops) // RESIDUALS_LISTED) or 1], residual_causes(stops)
+    if calibration is None:
+        return FitEvidence(listed, causes)
+    gaps = explain_gap(fit, posterior)
+    parts = headline_causes(fit)
+    told = {**{f"effective_deg_per_step.{d}": e for d, e in summary.effective.items()}, **summary.parameters}
+    # What a model holds fixed has no uncertainty to split.
+    known = {q: e for q in parts.quantities if (e := told[q]) is not None and e.sd > 0}
+    budgets = tuple(headline_budget(parts, q, e) for q, e in known.items())
+    axes = []
+    for axis in AXES:
+        contrast = physical[:, fit.names.index(f"ratio_contrast_deg_per_step.{axis}")]
+        own = stop_readings(fit, axis)
+        axes.append(positioning(calibration, axis, readings=own, contrast_deg_per_step=contrast))
+    return FitEvidence(listed, causes, gaps if any(gaps.values()) else None, budgets, tuple(axes))
 
 
-def calibration_for(folder: Path, tell: Tell) -> Calibration:
+def calibration_for(folder: Path, tell: Tell = untold) -> Calibration:
     """The calibration in `results/` where its hashes agree with the campaign; else fit first (DESIGN 8)."""
     from tvsbayes.calibration.calibration_file import stored_calibration
     from tvsbayes.instrument.campaign import read_campaign
@@ -87,61 +243,45 @@ def calibration_for(folder: Path, tell: Tell) -> Calibration:
     found = stored_calibration(campaign)
     if found is not None:
         return found
-    tell(FITTING_FIRST)
     result = _converged_fit(campaign, tell)
     from tvsbayes.assessment.fitted_calibration import calibration_of
 
     return calibration_of(result)
 
 
-def fit_for(campaign: Campaign, tell: Tell) -> JointFit:
+def fit_for(campaign: Campaign, tell: Tell = untold) -> JointFit:
     """The fit in `results/` where its hashes agree with the campaign; else fit first (DESIGN 8)."""
     from tvsbayes.estimators.joint_fit import restored
-    from tvsbayes.results.fit_record import stored_mode
+    from tvsbayes.results.stored_draws import stored_mode
 
     compile_for(tell)
     stored = stored_mode(campaign)
     found = None if stored is None else restored(campaign, stored)
-    if found is not None:
-        return found
-    tell(FITTING_FIRST)
-    return _converged_fit(campaign, tell)
+    return _converged_fit(campaign, tell) if found is None else found
 
 
 def _converged_fit(campaign: Campaign, tell: Tell) -> JointFit:
     """A fit for a command that needs one in passing."""
+    tell(FITTING_FIRST)
     from tvsbayes.estimators.joint_fit import fit as fit_joint
 
     compile_for(tell)
     result = fit_joint(campaign)
     if not result.converged:
-        raise NotConverged(
-            "not-converged",
-            "NOT CONVERGED: " + "; ".join(result.problems),
-            remedy="see `tvsbayes fit`; this command needs a fit that has converged",
-        )
+        raise NotConverged.of(result.problems, "see `tvsbayes fit`; this command needs a fit that has converged")
     return result
 
 
-def document_for(data: Campaign, folder: Path, tell: Tell) -> dict[str, Any]:
-    """`results/fit.json` where it was made from exactly this campaign; else fit first (DESIGN 8)."""
+def record_for(campaign: Campaign, folder: Path, tell: Tell = untold) -> FitRecord:
+    """`results/fit.json` where it was made from exactly this campaign and whole; else fit first (DESIGN 8)."""
     from tvsbayes.calibration.calibration_file import stored_calibration
     from tvsbayes.instrument.campaign import input_hashes
     from tvsbayes.results.fit_record import read_fit
 
     path = folder / "results" / "fit.json"
-    if stored_calibration(data) is not None and path.exists():
-        document = read_fit(path)
+    if stored_calibration(campaign) is not None and path.exists():
+        record = read_fit(path)
         # An old fit.json beside new draws would be the report of other data.
-        if "budgets" in document and document["inputs"] == input_hashes(data):
-            return document
-    tell(FITTING_FIRST)
-    result = _converged_fit(data, tell)
-    from tvsbayes.assessment.fitted_calibration import calibration_of
-    from tvsbayes.assessment.summary import summarise
-    from tvsbayes.results.fit_record import write_results
-
-    summary, calibration = summarise(result), calibration_of(result)
-    evidence = evidence_of(result, summary, None, calibration, result.draws.physical)
-    write_results(result, summary, output_place(folder, "results"), 0, calibration, None, evidence)
-    return read_fit(path)
+        if record.evidence is not None and record.provenance.inputs == input_hashes(campaign):
+            return record
+    return _results(_converged_fit(campaign, tell), None, 0, output_place(folder, "results"), {}).record

@@ -31,6 +31,7 @@ from tvsbayes.assessment.residuals import residual_causes, stop_residuals
 from tvsbayes.assessment.score_tests import validate
 from tvsbayes.instrument.axes import DIRECTIONS
 from tvsbayes.instrument.stereo_pair import rotation_matrix
+from tvsbayes.results.records import plain
 from tvsbayes.twin.physics import inside_images, mirror_chain, project
 from tvsbayes.twin.simulated_campaign import simulate
 
@@ -123,7 +124,7 @@ def one_campaign(task: tuple[str, float, int]) -> dict[str, object]:
         start = time.process_time()
         found = validate(fit)
         row["validate_s"] = time.process_time() - start
-        row["validation"] = found.as_json()
+        row["validation"] = plain(found)
         row["grouped"] = sorted({c.name for c in residual_causes(stop_residuals(fit)) if c.suspicious})
         row["values"] = judged(fit.draws, fit.mode, fit.prior_draws, truth.parameters, fit.reference_pose_rad)
     except Exception as error:

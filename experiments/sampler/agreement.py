@@ -30,6 +30,7 @@ from tvsbayes.posterior.draws import Posterior
 from tvsbayes.posterior.proposal import Target, pilot
 from tvsbayes.posterior.sampling import sample
 from tvsbayes.posterior.transport import transport
+from tvsbayes.results.records import plain
 
 QUANTILES = {"q05": 0.05, "q50": 0.5, "q95": 0.95}
 
@@ -75,7 +76,7 @@ def main() -> None:
         wall, cpu = time.perf_counter(), time.process_time()
         posterior = sample(joint, seed=0, max_minutes=10.0)
         wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
-        found = posterior.convergence.as_json()
+        found = plain(posterior.convergence.sampling)
         names = [NAMES[i] for i in np.flatnonzero(joint.free)]
         least = min(posterior.convergence.ess_bulk[n] for n in names)
         print(f"\n## {name} twin\n")

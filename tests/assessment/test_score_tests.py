@@ -8,15 +8,14 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
-from types import SimpleNamespace
 
 import equinox as eqx
 import jax
 import numpy as np
 import pytest
 from conftest import coordinates
-from report.test_fit_text import small_summary
 from scipy import stats
+from support.small_results import small_summary
 
 from tvsbayes.assessment.score_tests import VALIDATION_LEVEL, _Answer, _holm, validate
 from tvsbayes.estimators.joint_fit import JointFit, Problem, fit_at
@@ -26,8 +25,9 @@ from tvsbayes.instrument.parameters import INDEX, NAMES, NOISE_NAMES
 from tvsbayes.instrument.plan import PlanStep
 from tvsbayes.report.evidence import Criterion
 from tvsbayes.report.fit_text import fit_text, validation_lines
-from tvsbayes.report.page import _verdict
+from tvsbayes.report.page import verdict_of
 from tvsbayes.results.estimates import Validation, ValidationTest
+from tvsbayes.results.records import plain
 from tvsbayes.statistics.least_squares import Mode
 from tvsbayes.twin.simulated_campaign import simulate
 
@@ -185,10 +185,10 @@ FAILED = Validation(
 
 
 def test_no_reader_of_the_text_can_miss_a_failure():
-    plain = fit_text(small_summary())
-    assert "alidation" not in plain and "VALIDATION" not in plain
+    unasked = fit_text(small_summary())
+    assert "alidation" not in unasked and "VALIDATION" not in unasked
     lines = fit_text(replace(small_summary(), validation=FAILED)).splitlines()
-    warning = validation_lines(FAILED.as_json())[0]
+    warning = validation_lines(FAILED)[0]
     assert "3.25" in warning and "the cameras moved: from spot 60" in warning
     assert lines[0] == warning and lines.count(warning) == 2
     passed = replace(FAILED, passed=True, cause="", inflation=1.0, tests=(replace(FAILED.tests[0], failed=False),))
@@ -197,22 +197,21 @@ def test_no_reader_of_the_text_can_miss_a_failure():
 
 
 def test_no_reader_of_the_report_can_miss_a_failure():
-    fit = {"converged": True, "validation": FAILED.as_json()}
-    warning = validation_lines(FAILED.as_json())[0]
+    summary = replace(small_summary(), validation=FAILED)
+    warning = validation_lines(FAILED)[0]
     met = Criterion("ratio left", 1e-3, "deg/step", 0.99, "met")
     for criteria, kind in (((), "cannot-tell"), ((met,), "met")):
-        text, shown = _verdict(SimpleNamespace(fit=fit, criteria=criteria))
-        assert text.startswith(warning) and shown == kind
-    text, _ = _verdict(SimpleNamespace(fit={"converged": True}, criteria=(met,)))
-    assert text.startswith("Met")
+        verdict = verdict_of(summary, criteria)
+        assert verdict.text.startswith(warning) and verdict.kind == kind
+    assert verdict_of(small_summary(), (met,)).text.startswith("Met")
 
 
 def test_the_entry_obeys_the_schema():
-    from results.test_fit_record import changed, kept, problems, schema_of
+    from support.fit_documents import changed, kept, problems, schema_of
 
     document = kept("fit-1-laplace.json")
     schema = schema_of(document)
-    written = json.loads(json.dumps({**document, "validation": FAILED.as_json()}))
+    written = json.loads(json.dumps({**document, "validation": plain(FAILED)}))
     assert problems(written, schema) == [] and problems({**written, "validation": None}, schema) == []
     for path, value in (("inflation", 0.5), ("passed", 1), ("tests/0/p", 2.0), ("tests/0/dof", 0), ("level", ...)):
         assert problems(changed(written, f"validation/{path}", value), schema), path

@@ -15,20 +15,22 @@ import numpy as np
 import pytest
 from support.bent_rig import BENT, WOBBLE
 from support.bent_rig import calibration as bent_calibration
+from support.known_calibration import known_calibration
 from support.small_campaign import small_campaign
 
 from tvsbayes.assessment.causes import headline_budget
 from tvsbayes.assessment.residuals import stop_readings
 from tvsbayes.calibration.optics import beam_deg_per_step
-from tvsbayes.calibration.pointing import INPUT_NAMES, NOISE_NAMES, Calibration
+from tvsbayes.calibration.pointing import INPUT_NAMES
 from tvsbayes.estimators.linear_spots import Linearised
 from tvsbayes.instrument.campaign import Move, Spot
 from tvsbayes.instrument.rig import RigTable
 from tvsbayes.metrology.budget_tables import CORRELATIONS, Source, budget_table
-from tvsbayes.metrology.iso230 import FIGURES, figures_of
+from tvsbayes.metrology.iso230 import figures_of
 from tvsbayes.metrology.look_budget import APERTURE_HERE, PLAY_HERE, STOP_HERE, Budget, coordinate_budget
 from tvsbayes.metrology.positioning_table import INDIRECT, positioning
 from tvsbayes.metrology.simulated_cycles import simulated_runs, target_steps
+from tvsbayes.results.metrology_tables import FIGURES
 from tvsbayes.statistics.intervals import coverage_factor
 from tvsbayes.twin.physics import effective_deg_per_step, harmonics_deg, mirror_chain, transmission
 from tvsbayes.twin.simulated_campaign import with_derived
@@ -136,24 +138,6 @@ def test_runs_that_were_not_made_are_left_out():
 def test_too_little_for_figures_is_refused(up, down):
     with pytest.raises(ValueError, match="target"):
         figures_of(up, down)
-
-
-def known_calibration(draws: int = 50, **changed: float) -> Calibration:
-    """Draws that all hold the same rig: an ideal chain but for what is changed; stop errors without any scatter."""
-    values = dict.fromkeys(INPUT_NAMES, 0.0)
-    values |= {"degrees_per_step.pan": 0.06, "degrees_per_step.tilt": 0.07, "mirror_offset_mm": 30.0}
-    values |= {"baseline_mm": 200.0, "pan_zero_emission_deg": 90.0, **{k: v for k, v in changed.items() if k in values}}
-    noise = {name: changed.get(name, 0.0) for name in NOISE_NAMES}
-    mean = np.array([values[name] for name in INPUT_NAMES])
-    return Calibration(
-        mean=mean,
-        covariance=np.zeros((len(mean), len(mean))),
-        noise_variance={name: sd**2 for name, sd in noise.items()},
-        overshoot_steps={"pan": 10, "tilt": 10},
-        range_steps=np.array([[-100.0, 300.0], [-60.0, 60.0]]),
-        inputs=np.tile(mean, (draws, 1)),
-        noise=np.tile([noise[name] for name in NOISE_NAMES], (draws, 1)),
-    )
 
 
 def up_and_down(*arguments, **options) -> tuple[np.ndarray, np.ndarray]:

@@ -28,7 +28,7 @@ from tvsbayes.cli.main import run
 from tvsbayes.errors import DeviceFault, InputError, NotConverged
 from tvsbayes.files.disk import output_place, read_arrays
 from tvsbayes.instrument.campaign import input_hashes, read_campaign, write_campaign
-from tvsbayes.pipeline import document_for
+from tvsbayes.pipeline import record_for
 
 FILES = ("campaign.toml", "stereo.json", "moves.csv", "spots.csv")
 Edit = Callable[[bytes], bytes]
@@ -420,7 +420,7 @@ def test_a_report_is_not_made_from_the_fit_of_other_data(good, tmp_path, monkeyp
     """`fit.json` of other data beside `draws.npz` of these: fit again, never combine."""
     folder = place_of(good, tmp_path)
     data = read_campaign(folder)
-    assert document_for(data, folder, report_line)["inputs"] == input_hashes(data)
+    assert record_for(data, folder, report_line).provenance.inputs == input_hashes(data)
     CRAFTED["fit.json of other data"].edit(folder)
 
     def fitted(campaign, tell):
@@ -428,7 +428,7 @@ def test_a_report_is_not_made_from_the_fit_of_other_data(good, tmp_path, monkeyp
 
     monkeypatch.setattr("tvsbayes.pipeline._converged_fit", fitted)
     with pytest.raises(NotConverged, match="fitted anew"):
-        document_for(data, folder, report_line)
+        record_for(data, folder, report_line)
 
 
 @pytest.mark.parametrize(
@@ -443,16 +443,18 @@ def test_a_report_is_not_made_from_the_fit_of_other_data(good, tmp_path, monkeyp
 )
 def test_a_damaged_comparison_is_refused_by_key(good, tmp_path, key, value, column):
     from tvsbayes.results.comparison_record import stored_hold_out
+    from tvsbayes.results.records import plain
 
     folder = place_of(good, tmp_path)
     path, data = folder / "results" / "compare.json", read_campaign(folder)
     document = json.loads(path.read_text())
-    assert stored_hold_out(data, document) == document
-    assert stored_hold_out(data, {"inputs": {}}) is None
+    inputs = document["inputs"]
+    assert plain(stored_hold_out(data, inputs)) == document["held_out"]
+    assert stored_hold_out(data, {}) is None
     document["held_out"][key] = value
     path.write_text(json.dumps(document))
     with pytest.raises(InputError) as caught:
-        stored_hold_out(data, document)
+        stored_hold_out(data, inputs)
     assert caught.value.column == column
 
 

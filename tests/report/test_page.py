@@ -10,30 +10,22 @@ import shutil
 import subprocess
 import xml.etree.ElementTree as ET
 from dataclasses import replace
-from html.parser import HTMLParser
-from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import ROOT
+from support.reported_twin import PLANNED, Nodes, evidence_of
 
 from tvsbayes.calibration.calibration_file import load_calibration
-from tvsbayes.cli.main import run
-from tvsbayes.errors import InputError
-from tvsbayes.estimators.four_point import classic
-from tvsbayes.files.documents import parse_json
+from tvsbayes.files.disk import shipped_data
 from tvsbayes.instrument.axes import DIRECTIONS
 from tvsbayes.instrument.campaign import read_campaign, write_campaign
-from tvsbayes.metrology.dcc import traceability
 from tvsbayes.metrology.positioning_table import positioning
-from tvsbayes.report.evidence import Evidence, gather
-from tvsbayes.report.figures import WIDTH_IN, direction_scatter, points_3d, trajectories
+from tvsbayes.metrology.traceability import traceability
 from tvsbayes.report.page import BROWSERS, report_html
-from tvsbayes.report.tables import FigureView
 
-TWIN = ROOT / "data" / "twins" / "paper_twin"
 BYTES_MAX = 3_000_000
-VOID = {"meta", "img", "br", "link", "input", "hr"}
+
+
 KNOWN = {
     *("html", "head", "meta", "title", "style", "body", "header", "main", "footer", "section", "figure", "figcaption"),
     *("h1", "h2", "p", "strong", "ul", "li", "dl", "dt", "dd", "div", "img"),
@@ -41,68 +33,8 @@ KNOWN = {
 }
 
 
-class Nodes(HTMLParser):
-    """Every element with its attributes, and the text outside of the style sheet."""
-
-    def __init__(self, page: bytes):
-        super().__init__()
-        self.elements: list[tuple[str, dict[str, str | None]]] = []
-        self.open: list[str] = []
-        self.text: list[str] = []
-        self.feed(page.decode())
-
-    def handle_starttag(self, tag, attrs):
-        self.elements.append((tag, dict(attrs)))
-        if tag not in VOID:
-            self.open.append(tag)
-
-    def handle_endtag(self, tag):
-        assert self.open.pop() == tag
-
-    def handle_data(self, data):
-        if "style" not in self.open:
-            self.text.append(data)
-
-    def of(self, tag: str) -> list[dict[str, str | None]]:
-        return [attributes for name, attributes in self.elements if name == tag]
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory) -> Path:
-    """The paper twin with the results that the report command makes where there are none."""
-    place = tmp_path_factory.mktemp("report") / "twin"
-    shutil.copytree(TWIN, place)
-    assert run(["report", str(place), "--limit-deg-per-step", "1e-3", "--limit-mm", "1", "--json"]) == 1
-    return place
-
-
-def evidence_of(place: Path) -> Evidence:
-    document = parse_json((place / "results" / "fit.json").read_bytes(), "fit.json").values
-    limits = {"range_mm": 1000.0, "limit_deg_per_step": 1e-3, "limit_mm": 1.0}
-    return gather(read_campaign(place), document, load_calibration(place), **limits)
-
-
-@pytest.fixture(scope="module")
-def evidence(folder) -> Evidence:
-    return evidence_of(folder)
-
-
-@pytest.fixture(scope="module")
-def page(evidence) -> bytes:
-    return report_html(evidence)
-
-
-@pytest.fixture
-def no_pictures(monkeypatch):
-    """Pictures are not what is looked at, and take seconds."""
-    view = FigureView("data:image/svg+xml;base64,", "a picture that was left out", "left out", 1, 1)
-    monkeypatch.setattr("tvsbayes.report.tables.figure_view", lambda figure, alt, caption: view)
-    monkeypatch.setattr("tvsbayes.report.fit_sections.figure_view", lambda figure, alt, caption: view)
-    monkeypatch.setattr("tvsbayes.report.uncertainty_sections.figure_view", lambda figure, alt, caption: view)
-
-
-def test_the_command_writes_this_page(folder, page):
-    assert (folder / "results" / "report.html").read_bytes() == page
+def test_the_command_writes_this_page(reported, page):
+    assert (reported / "results" / "report.html").read_bytes() == page
     assert len(page) < BYTES_MAX
 
 
@@ -149,19 +81,19 @@ def test_the_page_can_be_read_by_ear(page):
 def test_numbers_of_the_page_are_the_libraries(page, evidence):
     text = " ".join(Nodes(page).text)
     for direction in DIRECTIONS:
-        joint = evidence.fit["effective_deg_per_step"][direction]
-        assert f"{joint['value']:.6f}"[:7] in text
+        joint = evidence.fit.summary.effective[direction]
+        assert f"{joint.value:.6f}"[:7] in text
         assert f"{evidence.classic.directions[direction].mean_deg_per_step:.5f}"[:7] in text
     assert not re.search(r"\b(nan|inf|None|undefined)\b", text)
     for word in ("Not an accredited", "Simulated data: not traceable", "synthetic", "End of report", "Seed"):
         assert word in text
-    for sha in evidence.fit["inputs"].values():
+    for sha in evidence.fit.provenance.inputs.values():
         assert sha in text
     assert "Not met" in text and "P at least" in text
 
 
-def test_the_same_results_give_the_same_bytes(page, folder):
-    assert report_html(evidence_of(folder)) == page
+def test_the_same_results_give_the_same_bytes(page, reported):
+    assert report_html(evidence_of(reported)) == page
 
 
 def test_traceability_is_what_the_certificate_says(evidence, no_pictures):
@@ -181,20 +113,20 @@ def test_traceability_is_what_the_certificate_says(evidence, no_pictures):
         assert said.statement in text and ("As declared by the user" in text) == declared
 
 
-def test_axes_are_judged_with_the_fitted_contrast(folder, evidence):
+def test_axes_are_judged_with_the_fitted_contrast(reported, evidence):
     """ISO 230-2 figures come from all that the fit knows of the gears: unequal ratios carry every run on."""
-    with np.load(folder / "results" / "draws.npz") as stored:
+    with np.load(reported / "results" / "draws.npz") as stored:
         names, physical = stored["names"].tolist(), stored["physical"]
         contrasts = {a: physical[:, names.index(f"ratio_contrast_deg_per_step.{a}")] for a in ("pan", "tilt")}
-    for axis, table in zip(contrasts, evidence.fit["positioning"], strict=True):
+    for axis, table in zip(contrasts, evidence.fit.evidence.positioning, strict=True):
         told, untold = (
-            positioning(load_calibration(folder), axis, contrast_deg_per_step=c).predicted
+            positioning(load_calibration(reported), axis, contrast_deg_per_step=c).predicted
             for c in (contrasts[axis], None)
         )
-        for name, figure in table["predicted"].items():
-            assert figure["median"] == pytest.approx(told[name].median, rel=1e-9), (axis, name)
+        for name, figure in table.predicted.items():
+            assert figure.median == pytest.approx(told[name].median, rel=1e-9), (axis, name)
         # 1e-5 deg: far above rounding; this campaign leaves little room for unequal ratios.
-        assert abs(table["predicted"]["accuracy_deg"]["median"] - untold["accuracy_deg"].median) > 1e-5
+        assert abs(table.predicted["accuracy_deg"].median - untold["accuracy_deg"].median) > 1e-5
 
 
 def test_a_campaign_without_experiments_says_so(evidence, no_pictures):
@@ -206,7 +138,8 @@ def test_a_campaign_without_experiments_says_so(evidence, no_pictures):
 
 def test_no_limit_no_verdict_and_no_convergence_no_use(evidence, no_pictures):
     assert "No limit was stated" in " ".join(Nodes(report_html(replace(evidence, criteria=()))).text)
-    broken = replace(evidence, fit={**evidence.fit, "converged": False, "problems": ["the mode was not reached"]})
+    astray = replace(evidence.fit.summary, converged=False, problems=("the mode was not reached",))
+    broken = replace(evidence, fit=replace(evidence.fit, summary=astray))
     text = " ".join(Nodes(report_html(broken)).text)
     assert "NOT CONVERGED" in text and "the mode was not reached" in text
 
@@ -224,17 +157,19 @@ PAYLOADS = (
 
 
 @pytest.mark.parametrize("shift", range(3))
-def test_what_strangers_write_stays_text(folder, page, shift, tmp_path, no_pictures):
+def test_what_strangers_write_stays_text(reported, page, shift, tmp_path, no_pictures):
     """Every text field of campaign.toml; results stay valid, for texts are outside the hash."""
-    campaign = read_campaign(folder)
+    campaign = read_campaign(reported)
     payloads = PAYLOADS[shift:] + PAYLOADS[:shift]
     header = dict(zip(("name", "operator", "instrument", "serial", "method", "notes"), payloads, strict=False))
     header |= {"created": campaign.header["created"], "traceability": {"board_certificate": payloads[6]}}
     place = tmp_path / "hostile"
     write_campaign(replace(campaign, header=header), place)
-    shutil.copytree(folder / "results", place / "results")
+    shutil.copytree(reported / "results", place / "results")
     hostile = evidence_of(place)
-    hostile = replace(hostile, fit={**hostile.fit, "command": payloads[7], "prior_conflicts": [*payloads]})
+    summary = replace(hostile.fit.summary, prior_conflicts=payloads)
+    made = replace(hostile.fit.provenance, command=payloads[7])
+    hostile = replace(hostile, fit=replace(hostile.fit, summary=summary, provenance=made))
     nodes, plain = Nodes(report_html(hostile)), Nodes(page)
     assert {tag for tag, _ in nodes.elements} <= KNOWN
     for tag in ("img", "style", "meta"):
@@ -244,67 +179,11 @@ def test_what_strangers_write_stays_text(folder, page, shift, tmp_path, no_pictu
     assert all(text.count(payload) >= 2 for payload in payloads)
 
 
-STORED = {"compare.json": "held_out", "plan.json": "planned"}
-BATCH = {"text": "sheet d9, <b>four</b> looks", "minutes": 2.5, "gain": 1.2e-5, "gain_per_minute": 4.8e-6}
-PLANNED = {
-    "target": {"text": "u(left) <= 2e-4 deg/step", "unit": "deg/step"},
-    "now": 3.1e-4,
-    "stop": {"now": False, "reason": "the target is not met", "rule": "a rule"},
-    "limited_by": {"needed": "focal scale to 0.1 %"},
-    "next": [BATCH],
-}
-"""What `plan --given` writes, as far as reports show it."""
-
-
-@pytest.mark.parametrize("name", STORED)
-def test_results_that_belong_to_other_data_are_not_reported(folder, name):
-    """Those of another campaign are left out."""
-    (folder / "results" / name).write_text(json.dumps({"inputs": {"moves": "0"}}))
+def test_next_experiments_are_those_of_the_plan(reported, evidence, no_pictures):
+    path = reported / "results" / "plan.json"
+    path.write_text(json.dumps({"inputs": evidence.fit.provenance.inputs, **PLANNED}))
     try:
-        assert getattr(evidence_of(folder), STORED[name]) is None
-    finally:
-        (folder / "results" / name).unlink()
-
-
-@pytest.mark.parametrize("name", STORED)
-@pytest.mark.parametrize("content", [{}, {"held_out": None, "target": 3}, {"held_out": {"verdict": "x"}, "target": {}}])
-def test_results_that_no_command_wrote_are_refused_by_name(folder, evidence, name, content):
-    path = folder / "results" / name
-    path.write_text(json.dumps({"inputs": evidence.fit["inputs"], **content}))
-    try:
-        with pytest.raises(InputError, match=f"results/{name}"):
-            evidence_of(folder)
-    finally:
-        path.unlink()
-
-
-@pytest.mark.parametrize(
-    ("key", "value", "column"),
-    [
-        ("now", None, "now"),
-        ("target", {"text": 3, "unit": "mm"}, "target.text"),
-        ("stop", {"now": "no", "reason": "", "rule": ""}, "stop.now"),
-        ("limited_by", {"needed": ["a"]}, "limited_by.needed"),
-        ("next", {}, "next"),
-        ("next", [{**BATCH, "gain": "high"}], "next.gain"),
-    ],
-)
-def test_a_damaged_plan_is_refused_by_key(folder, evidence, key, value, column):
-    path = folder / "results" / "plan.json"
-    path.write_text(json.dumps({"inputs": evidence.fit["inputs"], **PLANNED, key: value}))
-    try:
-        with pytest.raises(InputError) as caught:
-            evidence_of(folder)
-        assert caught.value.column == column
-    finally:
-        path.unlink()
-
-
-def test_next_experiments_are_those_of_the_plan(folder, evidence, no_pictures):
-    path = folder / "results" / "plan.json"
-    path.write_text(json.dumps({"inputs": evidence.fit["inputs"], **PLANNED}))
-    try:
-        planned = evidence_of(folder).planned
+        planned = evidence_of(reported).planned
     finally:
         path.unlink()
     text = report_html(replace(evidence, planned=planned)).decode()
@@ -320,23 +199,6 @@ def test_the_points_budget_is_shown_by_parameter_too(evidence, page):
     assert f"1000 mm away: {evidence.point.quantity}" in page.decode()
 
 
-def test_the_papers_figures_for_any_campaign(evidence):
-    campaign, result = evidence.campaign, classic(evidence.campaign)
-    number = result.experiments[0].experiment
-    for figure in (
-        trajectories(campaign, number),
-        points_3d(campaign, number),
-        points_3d(campaign),
-        direction_scatter(result, "left", (0.062, 1e-4)),
-    ):
-        assert figure.get_axes() and figure.get_size_inches()[0] == WIDTH_IN
-    angles = trajectories(campaign, number).axes[0].get_legend_handles_labels()[1]
-    first = result.experiments[0]
-    assert angles == [f"before: {first.theta_i_deg:.2f} deg", f"after: {first.theta_f_deg:.2f} deg"]
-    with pytest.raises(ValueError, match="not complete"):
-        trajectories(campaign, 10_000)
-
-
 def luminance(colour: str) -> float:
     """Relative luminance of an sRGB colour (WCAG 2.2)."""
     digits = colour.lstrip("#")
@@ -348,7 +210,7 @@ def luminance(colour: str) -> float:
 
 def test_text_stands_out_in_both_schemes():
     """4.5:1 for every text colour on the page and on its cards (WCAG 2.2, 1.4.3)."""
-    css = (ROOT / "data" / "report" / "report.css").read_text()
+    css = (shipped_data() / "report" / "report.css").read_text()
     schemes = [dict(re.findall(r"--(\w+): (#[0-9a-f]+)", block)) for block in re.findall(r":root \{([^}]*)\}", css)]
     assert len(schemes) == 2
     for scheme in schemes:
@@ -372,11 +234,11 @@ document.getElementById("f").onload = function () {{
 
 
 @pytest.mark.parametrize("width", [360, 1280])
-def test_chromium_shows_the_page_without_overflow_or_complaint(folder, tmp_path, width):
+def test_chromium_shows_the_page_without_overflow_or_complaint(reported, tmp_path, width):
     browser = next(filter(None, map(shutil.which, BROWSERS)), None)
     if browser is None:
         pytest.skip("no Chromium or Chrome on the path (Debian's package: chromium)")
-    shutil.copy(folder / "results" / "report.html", tmp_path / "report.html")
+    shutil.copy(reported / "results" / "report.html", tmp_path / "report.html")
     (tmp_path / "probe.html").write_text(PROBE.format(width=width))
     flags = ["--headless", "--no-sandbox", "--disable-gpu", "--no-first-run", "--disable-background-networking"]
     flags += ["--disable-sync", "--disable-quic", "--allow-file-access-from-files", "--enable-logging=stderr"]

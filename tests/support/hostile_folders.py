@@ -44,6 +44,7 @@ from tvsbayes.instrument.parameters import RIG_PRIORS
 from tvsbayes.instrument.plan import parse_plan
 from tvsbayes.instrument.rig import parse_rig_table, read_rig
 from tvsbayes.instrument.stereo_pair import parse_stereo
+from tvsbayes.results.comparison_record import COMPARISON_FORMAT
 from tvsbayes.results.fit_record import read_fit
 
 MEGABYTE = 1_000_000
@@ -157,9 +158,10 @@ def good_folder(place: Path) -> Path:
     draws = calibration_bytes(drawn_calibration(read_campaign(place)), **arrays)
     (place / "results" / "draws.npz").write_bytes(draws)
     score = {"rms_deg": 0.1, "rms_block_deg": 0.05, "coverage": 0.95, "log_density": 1.0}
-    held = {"by": "steps", "verdict": "joint", "reason": "smaller errors", "classic": score, "joint": score}
-    held |= {"unseen": {"left": 1e-4}}
-    (place / "results" / "compare.json").write_text(json.dumps({"inputs": hashes, "held_out": held}, indent=1))
+    held = {"by": "steps", "predictions": [], "classic": score, "joint": score, "ratio": 1.0, "interval95": None}
+    held |= {"verdict": "joint", "reason": "smaller errors", "unseen": {"left": 1e-4}}
+    compared = {"format": COMPARISON_FORMAT, "inputs": hashes, "held_out": held}
+    (place / "results" / "compare.json").write_text(json.dumps(compared, indent=1))
     for spot in campaign.spots[:2]:
         for side in ("left", "right"):
             (place / "frames" / f"{spot.spot:06d}_{side}.png").write_bytes(png(*SIZE))

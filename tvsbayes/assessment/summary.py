@@ -28,7 +28,7 @@ from tvsbayes.instrument.stops import legs_of
 from tvsbayes.model.headlines import Derived
 from tvsbayes.posterior.draws import Posterior
 from tvsbayes.posterior.predictive import ideal_pixels
-from tvsbayes.results.estimates import Estimate, FitSummary
+from tvsbayes.results.estimates import CurvePoint, Curves, Estimate, FitSummary, LostMotion, RatioAt
 from tvsbayes.statistics.intervals import NORMAL_95, interval95
 
 CLASSIC_DRAWS = 256
@@ -160,50 +160,41 @@ def _classic_predicted(source: _Source) -> dict[str, Estimate | None]:
     return result
 
 
-def _curves(posterior: Posterior, moved: set[str]) -> dict[str, object]:
+def _curves(posterior: Posterior, moved: set[str]) -> Curves:
     """Effective ratios along both axes over the range that was seen, and lost motion at the step counts used."""
     lost = {direction: _lost_motion(posterior, direction) for direction in DIRECTIONS if direction in moved}
     along = {axis: _along(posterior, index, moved) for index, axis in enumerate(AXES)}
-    return {"effective_deg_per_step": along, "lost_motion": lost}
+    return Curves(along, lost)
 
 
-def _along(posterior: Posterior, axis: int, moved: set[str]) -> list[dict[str, object]]:
+def _along(posterior: Posterior, axis: int, moved: set[str]) -> tuple[CurvePoint, ...]:
     """Effective ratios at angles of one axis, the other at the reference pose."""
     angles = np.degrees(posterior.fit.linearised.mirror_angles_rad)[:, axis]
-    rows = []
+    points = []
     for angle in np.linspace(angles.min(), angles.max(), CURVE_POINTS):
         pose = np.degrees(posterior.fit.reference_pose_rad)
         pose[axis] = angle
         pan, tilt = pose.tolist()
         found = posterior.effective_deg_per_step(pan, tilt)
         ratios = {
-            direction: {
-                "value": float(found.mean[k]),
-                "sd": float(found.sd[k]),
-                "interval95": found.interval95[:, k].tolist(),
-            }
+            direction: RatioAt(float(found.mean[k]), float(found.sd[k]), tuple(found.interval95[:, k].tolist()))
             for k, direction in enumerate(DIRECTIONS)
             if direction in moved
         }
-        rows.append({"pan_deg": pan, "tilt_deg": tilt, **ratios})
-    return rows
+        points.append(CurvePoint(pan, tilt, ratios))
+    return tuple(points)
 
 
-def _lost_motion(posterior: Posterior, direction: str) -> list[dict[str, object]]:
+def _lost_motion(posterior: Posterior, direction: str) -> tuple[LostMotion, ...]:
     """Mirror angle that a reversal costs, at a few of the lengths that the campaign moved."""
     used = sorted(set(legs_of(posterior.fit.campaign.moves)[direction]))
     chosen = np.unique(np.linspace(0, len(used) - 1, min(CURVE_POINTS, len(used))).astype(int))
     steps = [used[i] for i in chosen]
     found = posterior.lost_motion_deg(direction, np.array(steps))
-    return [
-        {
-            "steps": n,
-            "value_deg": float(found.mean[k]),
-            "sd_deg": float(found.sd[k]),
-            "interval95_deg": found.interval95[:, k].tolist(),
-        }
+    return tuple(
+        LostMotion(n, float(found.mean[k]), float(found.sd[k]), tuple(found.interval95[:, k].tolist()))
         for k, n in enumerate(steps)
-    ]
+    )
 
 
 def summarise(fit: JointFit, posterior: Posterior | None = None) -> FitSummary:
@@ -255,7 +246,7 @@ def summarise(fit: JointFit, posterior: Posterior | None = None) -> FitSummary:
         prior_conflicts=prior_conflicts(fit),
         prior_sensitivity=prior_sensitivity(fit, moved),
         estimator="laplace" if usable is None else "posterior",
-        sampling=None if posterior is None else posterior.convergence.as_json(),
+        sampling=None if posterior is None else posterior.convergence.sampling,
         curves=None if usable is None else _curves(usable, moved),
         validation=validate(fit),
         few_stops=poorly_known_stops(fit),

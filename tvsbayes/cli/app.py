@@ -1,4 +1,4 @@
-"""The command and what all commands share."""
+"""The command, and what all commands share: options, output as text or one JSON document, errors, progress."""
 
 from __future__ import annotations
 
@@ -9,16 +9,12 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
-from tvsbayes.errors import InputError, NotConverged, NothingToEstimate, TvsError
+from tvsbayes.errors import InputError, TvsError
 from tvsbayes.files.disk import make_folder, write_atomically
-
-if TYPE_CHECKING:
-    from tvsbayes.results.estimates import FitSummary
-
 
 INTERRUPTED = 130
 TARGET_MISSED = 1
@@ -94,12 +90,14 @@ def print_json(document: dict[str, Any]) -> None:
 
 
 def error_document(error: TvsError) -> dict[str, Any]:
+    """What `--json` prints of an error."""
     fields = {"code": error.code, "file": error.file, "line": error.line, "column": error.column}
     fields |= {"message": error.message, "found": error.found, "allowed": error.allowed, "remedy": error.remedy}
     return {"error": fields}
 
 
 def report_error(error: TvsError) -> None:
+    """An error for people, with what to do where the message does not say it."""
     report_line(f"error: {error.message}")
     if error.remedy and error.remedy not in error.message:
         report_line(f"what to do: {error.remedy}")
@@ -117,29 +115,6 @@ def finish(document: dict[str, Any], text: str, as_json: bool, error: TvsError |
         raise Ended(error.exit_code)
 
 
-def unusable(summary: FitSummary) -> TvsError | None:
-    """Why a fit that ran to its end must not be used: not converged (4) or nothing learned (3)."""
-    if not summary.converged and summary.sampling is not None and not summary.sampling["converged"]:
-        return NotConverged(
-            "unconverged",
-            "UNCONVERGED: " + "; ".join(summary.sampling["missing"]) + ". The table is the Laplace approximation",
-            remedy="run again with --resume and more --max-minutes",
-        )
-    if not summary.converged:
-        return NotConverged(
-            "not-converged",
-            "NOT CONVERGED: " + "; ".join(summary.problems),
-            remedy="check for swapped cameras or wrong counters, or state the extrinsics better in [rig.prior]",
-        )
-    if not summary.headline_informed:
-        return NothingToEstimate(
-            "uninformed",
-            "the spots tell no more about any effective ratio than the priors do (contraction below 0.1 everywhere)",
-            remedy="observe stops before and after moves of both axes",
-        )
-    return None
-
-
 def keep(document: dict[str, Any], path: Path) -> bool:
     """Write what a later report will show; a folder that cannot be written costs nobody the result."""
     try:
@@ -149,6 +124,13 @@ def keep(document: dict[str, Any], path: Path) -> bool:
         report_line(f"warning: not kept for the report: {error.message}")
         return False
     return True
+
+
+def refuse_options(reason: str, remedy: str, **given: object) -> None:
+    """Refuse options that this use of a command would ignore; given are those that are neither None nor False."""
+    named = ["--" + name.replace("_", "-") for name, value in given.items() if value is not None and value is not False]
+    if named:
+        raise InputError("usage", f"{' and '.join(named)} {'are' if len(named) > 1 else 'is'} {reason}", remedy=remedy)
 
 
 def finite(**values: float | None) -> None:

@@ -1,18 +1,27 @@
-"""Stereo, acquire, doctor."""
+"""Commands at the bench: stereo, acquire, doctor."""
 
 from __future__ import annotations
 
 import os
 import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from tvsbayes.cli.app import INTERRUPTED, Ended, Json, Seed, finish, finite, report_line
+from tvsbayes.cli.app import INTERRUPTED, TARGET_MISSED, Ended, Json, finish, finite, refuse_options, report_line
 from tvsbayes.errors import InputError, escaped, refusal
 from tvsbayes.files.disk import write_atomically
 from tvsbayes.pipeline import compile_for
+
+if TYPE_CHECKING:
+    from tvsbayes.acquisition.run_log import Outcome
+    from tvsbayes.cameras.boards import Board
+    from tvsbayes.instrument.plan import PlanStep
+    from tvsbayes.instrument.rig import Rig
+    from tvsbayes.instrument.stereo_pair import Stereo
 
 IMAGE_SIDE_MAX = 65_535
 FIT_COMMAND = (sys.executable, "-m", "tvsbayes", "fit")
@@ -23,7 +32,9 @@ def stereo(
     folder: Annotated[Path | None, typer.Argument(metavar="FOLDER", help="Folder of checkerboard pictures.")] = None,
     board: Annotated[str | None, typer.Option("--board", help="Inner corners, columns x rows: 9x6.")] = None,
     pitch_mm: Annotated[float | None, typer.Option("--pitch-mm", help="Side of a square.")] = None,
-    pitch_u_mm: Annotated[float, typer.Option("--pitch-u-mm", help="Its standard uncertainty (mean of all).")] = 0.0,
+    pitch_u_mm: Annotated[
+        float | None, typer.Option("--pitch-u-mm", help="Its standard uncertainty (mean of all; default 0).")
+    ] = None,
     out: Annotated[Path | None, typer.Option("-o", "--out", help="stereo.json to write.")] = None,
     imports: Annotated[
         list[Path] | None,
@@ -32,71 +43,124 @@ def stereo(
         ),
     ] = None,
     export: Annotated[str | None, typer.Option("--export", help="opencv or ros: also for these, beside -o.")] = None,
-    finder: Annotated[str, typer.Option("--finder", help="classic or sector; the other is the fallback.")] = "classic",
+    finder: Annotated[
+        str | None, typer.Option("--finder", help="classic (default) or sector; the other is the fallback.")
+    ] = None,
     swap: Annotated[
         bool, typer.Option("--swap", help="Wide frames hold the left camera's image on the right.")
     ] = False,
     fix_k3: Annotated[bool, typer.Option("--fix-k3", help="Keep k3 at 0.")] = False,
     robust: Annotated[bool, typer.Option("--robust", help="Leave out outlying views, by name.")] = False,
     image_size: Annotated[str | None, typer.Option("--image-size", help="1280x720, where imports lack it.")] = None,
-    import_unit: Annotated[str, typer.Option("--import-unit", help="mm or m: unit of an imported OpenCV T.")] = "mm",
+    import_unit: Annotated[
+        str | None, typer.Option("--import-unit", help="mm (default) or m: unit of an imported OpenCV T.")
+    ] = None,
     as_json: Json = False,
 ) -> None:
     """Calibrate the camera pair from checkerboard pictures. With the covariance of all 24 parameters; or import one."""
-    if export not in (None, "opencv", "ros") or finder not in ("classic", "sector") or import_unit not in ("mm", "m"):
+    if export not in (None, "opencv", "ros") or finder not in (None, "classic", "sector"):
         remedy = "--export opencv or ros, --finder classic or sector, --import-unit mm or m"
         raise InputError("usage", "an option has a value that it does not know", remedy=remedy)
     if (folder is None) == (not imports):
         found = "stereo needs pictures of a board, or a calibration to import"
         found = found if folder is None else "stereo takes pictures or a calibration to import, not both"
         raise InputError("usage", found, remedy="give FOLDER with --board and --pitch-mm, or --import FILE")
-    lacking = {"--board": board is None, "--pitch-mm": pitch_mm is None}
-    missing = " and ".join(name for name, absent in lacking.items() if absent)
-    if folder is not None and missing:
-        remedy = f"give {missing}: inner corners, columns x rows, and the side of a square: --board 9x6 --pitch-mm 25"
-        raise InputError("usage", f"stereo FOLDER needs {missing}", remedy=remedy)
     finite(pitch_mm=pitch_mm, pitch_u_mm=pitch_u_mm)
-    from tvsbayes.cameras.calibration_formats import EXPORT_NAMES, exported, read_calibration
-    from tvsbayes.instrument.parameters import STEREO_PARAMETER_NAMES
-    from tvsbayes.instrument.stereo_pair import stereo_bytes
-    from tvsbayes.report.command_text import stereo_calibration_text, stereo_text
+    places = _new_files(out, export)
+    if folder is None:
+        options = {"board": board, "pitch_mm": pitch_mm, "pitch_u_mm": pitch_u_mm, "finder": finder, "swap": swap}
+        refuse_options("for pictures of a board", "leave out --import", **options, fix_k3=fix_k3, robust=robust)
+        made = _imported(imports or [], image_size, import_unit)
+    else:
+        options = {"image_size": image_size, "import_unit": import_unit}
+        refuse_options("for --import", "leave it out: pictures tell it", **options)
+        pattern = _board(board, pitch_mm, pitch_u_mm or 0.0)
+        from tvsbayes.cameras.stereo_calibration import calibrate_folder
+        from tvsbayes.report.command_text import stereo_calibration_text
+
+        compile_for(report_line)
+        options = {"swap": swap, "fix_k3": fix_k3, "robust": robust}
+        result = calibrate_folder(folder, pattern, finder=finder or "classic", **options)
+        document = {"source": "pictures", **result.as_json()}
+        made = MadePair(result.stereo, stereo_calibration_text(result), document)
+    _write_pair(made, places, export, as_json)
+
+
+@dataclass(frozen=True)
+class MadePair:
+    """A calibrated pair with what is printed of it."""
+
+    stereo: Stereo
+    text: str
+    document: dict[str, object]
+
+
+def _new_files(out: Path | None, export: str | None) -> dict[str, Path]:
+    """Where the pair is to be written, by kind; refused before pictures are read, which takes minutes."""
+    from tvsbayes.cameras.calibration_formats import EXPORT_NAMES
 
     beside = Path() if out is None else out.parent
-    for path in [*([] if out is None else [out]), *(beside / name for name in EXPORT_NAMES.get(export or "", ()))]:
+    places = {} if out is None else {"stereo": out}
+    places |= {name: beside / name for name in EXPORT_NAMES.get(export or "", ())}
+    for path in places.values():
         if os.path.lexists(path):
-            # Asked before the pictures are read, which takes minutes. Fits stand on a calibration by its hash.
+            # Fits stand on a calibration by its hash.
             remedy = "name another file, or move this one away; nothing is overwritten"
             place = escaped(str(path), 200)
             raise refusal("occupied", file=place, found="a file that is there", allowed="a new file", remedy=remedy)
-    if imports:
-        unit_mm = {"mm": 1.0, "m": 1000.0}[import_unit]
-        found = read_calibration(imports, _image_size(image_size), unit_mm=unit_mm)
-        remarks = [*(f"note: {note}" for note in found.notes), *(f"warning: {warning}" for warning in found.warnings)]
-        pair, text = found.stereo, "\n".join([stereo_text(found.stereo), *remarks])
-        sds = [float(variance) ** 0.5 for variance in pair.parameter_covariance.diagonal()]
-        values = zip(STEREO_PARAMETER_NAMES, pair.vector.tolist(), sds, strict=True)
-        document: dict[str, Any] = {
-            **{"source": found.source, "image_width": pair.image_width, "image_height": pair.image_height},
-            "parameters": {name: {"value": value, "sd": sd} for name, value, sd in values},
-            **{"rms_px": pair.rms_px, "assumed": pair.assumed, "warnings": [*found.notes, *found.warnings]},
-        }
-    else:
-        from tvsbayes.cameras.boards import Board
-        from tvsbayes.cameras.stereo_calibration import calibrate_folder
+    return places
 
-        compile_for(report_line)
-        pattern = Board.named(board, pitch_mm, pitch_u_mm)
-        result = calibrate_folder(folder, pattern, finder=finder, swap=swap, fix_k3=fix_k3, robust=robust)
-        pair, text = result.stereo, stereo_calibration_text(result)
-        document = {"source": "pictures", **result.as_json()}
-    files = {} if out is None else {"stereo": (out, stereo_bytes(pair))}
-    if export:
-        files |= {name: (beside / name, data) for name, data in exported(pair, export).items()}
-    for path, data in files.values():
-        write_atomically(path, data)
-    written = {name: str(path) for name, (path, _) in files.items()}
-    text += f"\nwritten: {', '.join(written.values())}" if written else "\nnothing written: give -o stereo.json"
-    finish({**document, "files": written}, text, as_json)
+
+def _board(board: str | None, pitch_mm: float | None, pitch_u_mm: float) -> Board:
+    """The board in the pictures."""
+    from tvsbayes.cameras.boards import Board
+
+    if board is None or pitch_mm is None:
+        missing = " and ".join(
+            name for name, given in {"--board": board, "--pitch-mm": pitch_mm}.items() if given is None
+        )
+        remedy = f"give {missing}: inner corners, columns x rows, and the side of a square: --board 9x6 --pitch-mm 25"
+        raise InputError("usage", f"stereo FOLDER needs {missing}", remedy=remedy)
+    return Board.named(board, pitch_mm, pitch_u_mm)
+
+
+def _imported(paths: list[Path], image_size: str | None, import_unit: str | None) -> MadePair:
+    """A calibration of another tool, or of ours."""
+    from tvsbayes.cameras.calibration_formats import read_calibration
+    from tvsbayes.instrument.parameters import STEREO_PARAMETER_NAMES
+    from tvsbayes.report.command_text import stereo_text
+
+    units_mm = {"mm": 1.0, "m": 1000.0}
+    if (import_unit or "mm") not in units_mm:
+        remedy = "--export opencv or ros, --finder classic or sector, --import-unit mm or m"
+        raise InputError("usage", "an option has a value that it does not know", remedy=remedy)
+    found = read_calibration(paths, _image_size(image_size), unit_mm=units_mm[import_unit or "mm"])
+    if found.source != "opencv":
+        reason, remedy = f"for files of OpenCV, and this is one of {found.source}", "leave it out: this file tells it"
+        refuse_options(reason, remedy, image_size=image_size, import_unit=import_unit)
+    remarks = [*(f"note: {note}" for note in found.notes), *(f"warning: {warning}" for warning in found.warnings)]
+    pair = found.stereo
+    sds = [float(variance) ** 0.5 for variance in pair.parameter_covariance.diagonal()]
+    values = zip(STEREO_PARAMETER_NAMES, pair.vector.tolist(), sds, strict=True)
+    document: dict[str, object] = {
+        **{"source": found.source, "image_width": pair.image_width, "image_height": pair.image_height},
+        "parameters": {name: {"value": value, "sd": sd} for name, value, sd in values},
+        **{"rms_px": pair.rms_px, "assumed": pair.assumed, "warnings": [*found.notes, *found.warnings]},
+    }
+    return MadePair(pair, "\n".join([stereo_text(pair), *remarks]), document)
+
+
+def _write_pair(made: MadePair, places: dict[str, Path], export: str | None, as_json: bool) -> None:
+    """Write a pair where it was asked for, and say so."""
+    from tvsbayes.cameras.calibration_formats import exported
+    from tvsbayes.instrument.stereo_pair import stereo_bytes
+
+    contents = {} if export is None else exported(made.stereo, export)
+    for name, path in places.items():
+        write_atomically(path, stereo_bytes(made.stereo) if name == "stereo" else contents[name])
+    written = {name: str(path) for name, path in places.items()}
+    said = f"written: {', '.join(written.values())}" if written else "nothing written: give -o stereo.json"
+    finish({**made.document, "files": written}, f"{made.text}\n{said}", as_json)
 
 
 def _image_size(text: str | None) -> tuple[int, int] | None:
@@ -134,7 +198,7 @@ def acquire(
             help="Fit the looks so far beside the run (default: on hardware only; a simulation waits for each fit).",
         ),
     ] = None,
-    seed: Seed = 0,
+    seed: Annotated[int | None, typer.Option("--seed", min=0, help="Of a simulation (default 0).")] = None,
     as_json: Json = False,
 ) -> None:
     """Drive positioner and cameras through a plan into a campaign. Nothing is lost, whatever ends it.
@@ -144,25 +208,27 @@ def acquire(
     from tvsbayes.instrument.plan import read_plan
     from tvsbayes.instrument.rig import read_rig
 
+    if simulate:
+        refuse_options("for a laser, and --simulate has none", "leave out one of them", laser_class=laser_class)
+    else:
+        refuse_options("for the twin", "add --simulate, or leave it out", centroids=centroids, seed=seed)
+    if target_u is not None and estimate is False:
+        raise InputError(
+            "usage", "--target-u needs the fits that --no-estimate forbids", remedy="leave out one of them"
+        )
     instrument, steps = read_rig(rig), read_plan(plan)
+    if dry_run:
+        _rehearse(instrument, steps, as_json)
+        return
     from tvsbayes.acquisition.bench import Vision
+    from tvsbayes.acquisition.observation import live_detector, twin_renderer
     from tvsbayes.acquisition.operator import LiveLine, Terminal
     from tvsbayes.acquisition.running_estimate import EstimateWish
     from tvsbayes.acquisition.session import acquire as run_plan
-    from tvsbayes.acquisition.session import check_plan
-    from tvsbayes.instrument.plan import outline, plan_seconds
 
-    if dry_run:
-        check_plan(instrument, steps)
-        lines, minutes = outline(instrument, steps), plan_seconds(instrument, steps) / 60
-        document: dict[str, Any] = {"steps": lines, "minutes": minutes}
-        finish(document, "\n".join([*lines, f"{len(lines)} steps, about {minutes:.0f} min"]), as_json)
-        return
     vision = Vision()
     if not centroids:
-        from tvsbayes.acquisition.observation import live_detector, twin_renderer
-
-        vision = Vision(live_detector(instrument.stereo), twin_renderer(instrument, seed) if simulate else None)
+        vision = Vision(live_detector(instrument.stereo), twin_renderer(instrument, seed or 0) if simulate else None)
     with LiveLine() as line:
         outcome = run_plan(
             instrument,
@@ -171,23 +237,38 @@ def acquire(
             simulate=simulate,
             resume=resume,
             laser_class=laser_class,
-            seed=seed,
+            seed=seed or 0,
             estimate=EstimateWish(FIT_COMMAND, target_u, estimate),
             vision=vision,
             terminal=Terminal(report_line, line.show, line.ask),
         )
-    document = {"campaign": str(out), **outcome.as_json()}
-    text = f"{escaped(str(out), 200)}: {outcome.reason}, {outcome.ok} of {outcome.looks} looks count"
-    if outcome.references:
-        planned = outcome.looks - outcome.references
-        text += f" ({planned} of the plan, {outcome.references} reference looks of resumed runs)"
-    finish(document, "\n".join([text, *(f"warning: {warning}" for warning in outcome.warnings)]), as_json)
+    _tell_outcome(outcome, out, as_json)
     if outcome.reason in ("interrupted", "declined"):
         report_line(f"{outcome.reason}; go on with --resume")
         raise Ended(INTERRUPTED)
     if target_u is not None and outcome.reason != "target met":
         report_line("the plan is done and the target is not met: plan more with tvsbayes plan --given")
-        raise Ended(1)
+        raise Ended(TARGET_MISSED)
+
+
+def _rehearse(rig: Rig, plan: Sequence[PlanStep], as_json: bool) -> None:
+    """What a run would do, step by step, and how long it would take."""
+    from tvsbayes.acquisition.session import check_plan
+    from tvsbayes.instrument.plan import outline, plan_seconds
+
+    check_plan(rig, plan)
+    lines, minutes = outline(rig, plan), plan_seconds(rig, plan) / 60
+    text = "\n".join([*lines, f"{len(lines)} steps, about {minutes:.0f} min"])
+    finish({"steps": lines, "minutes": minutes}, text, as_json)
+
+
+def _tell_outcome(outcome: Outcome, out: Path, as_json: bool) -> None:
+    text = f"{escaped(str(out), 200)}: {outcome.reason}, {outcome.ok} of {outcome.looks} looks count"
+    if outcome.references:
+        planned = outcome.looks - outcome.references
+        text += f" ({planned} of the plan, {outcome.references} reference looks of resumed runs)"
+    warnings = [f"warning: {warning}" for warning in outcome.warnings]
+    finish({"campaign": str(out), **outcome.as_json()}, "\n".join([text, *warnings]), as_json)
 
 
 def doctor(

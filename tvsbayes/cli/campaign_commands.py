@@ -1,4 +1,4 @@
-"""Demo, new, simulate, detect, check."""
+"""Commands on campaigns: demo, new, simulate, detect, check."""
 
 from __future__ import annotations
 
@@ -15,11 +15,10 @@ from tvsbayes.cli.app import (
     finish,
     finite,
     report_line,
-    unusable,
 )
 from tvsbayes.errors import InputError, escaped
 from tvsbayes.files.disk import make_folder, output_place, shipped_data, write_atomically
-from tvsbayes.pipeline import compile_for
+from tvsbayes.pipeline import calibrate, compile_for
 
 DEMO_NOTE = "The twin's move history is our assumption, made so that the classic answer is the paper's Table 1."
 
@@ -38,13 +37,9 @@ def demo(
         for part in sorted(source.iterdir()):
             write_atomically(folder / part.name, part.read_bytes())
         report_line("paper twin: 96 four-point experiments of a simulated rig with known truth; fitting ...")
-        from tvsbayes.assessment.fitted_calibration import calibration_of
-        from tvsbayes.assessment.summary import summarise
         from tvsbayes.estimators.four_point import classic as estimate_classic
-        from tvsbayes.estimators.joint_fit import fit as fit_joint
         from tvsbayes.instrument.campaign import read_campaign
         from tvsbayes.report.fit_text import demo_text
-        from tvsbayes.results.fit_record import write_results
         from tvsbayes.twin.physics import effective_deg_per_step, effective_mirror_offset_mm
         from tvsbayes.twin.simulated_campaign import read_truth
 
@@ -52,11 +47,8 @@ def demo(
         campaign = read_campaign(folder)
         true = read_truth(folder / "truth.json", campaign.stereo).parameters
         classic_result = estimate_classic(campaign)
-        result = fit_joint(campaign)
-        summary = summarise(result)
-        if out is not None:
-            calibration = calibration_of(result) if result.converged else None
-            write_results(result, summary, folder / "results", 0, calibration)
+        results = calibrate(campaign, None if out is None else out / "results", sampled=False)
+    summary = results.record.summary
     pose = (summary.reference_pose_deg["pan"], summary.reference_pose_deg["tilt"])
     truth = {
         **effective_deg_per_step(true, pose),
@@ -65,7 +57,7 @@ def demo(
         "effective_mirror_offset_mm": effective_mirror_offset_mm(true, pose),
     }
     document = {"classic": classic_result.as_json(), "fit": summary.as_json(), "truth": truth}
-    finish(document, f"{demo_text(classic_result, summary, truth)}\n\n{DEMO_NOTE}", as_json, unusable(summary))
+    finish(document, f"{demo_text(classic_result, summary, truth)}\n\n{DEMO_NOTE}", as_json, results.error)
 
 
 def new(out: Annotated[Path, typer.Argument(metavar="OUT", help="Folder to create.")], as_json: Json = False) -> None:
@@ -162,6 +154,8 @@ def check(
     from tvsbayes.instrument.rig import read_rig
 
     if repair_to is not None:
+        if plan_file is not None:
+            raise InputError("usage", "a repaired journal takes no plan", remedy="leave out PLAN or --repair-to")
         from tvsbayes.acquisition.campaign_files import repair_campaign
 
         document = repair_campaign(path, repair_to)

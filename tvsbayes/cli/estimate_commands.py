@@ -1,4 +1,4 @@
-"""Classic, fit, report, compare."""
+"""Commands that estimate and tell: classic, fit, report, compare."""
 
 from __future__ import annotations
 
@@ -19,20 +19,24 @@ from tvsbayes.cli.app import (
     Seed,
     finish,
     keep,
+    refuse_options,
     report_line,
-    unusable,
 )
 from tvsbayes.errors import InputError, NothingToEstimate, escaped
-from tvsbayes.files.disk import make_folder, output_place, write_atomically
-from tvsbayes.pipeline import compile_for, document_for, evidence_of, fit_for
+from tvsbayes.files.disk import output_place, write_atomically
+from tvsbayes.pipeline import calibrate, compile_for, fit_for, record_for
 
 if TYPE_CHECKING:
+    from tvsbayes.estimators.joint_fit import JointFit
     from tvsbayes.instrument.campaign import Campaign
     from tvsbayes.posterior.sampling import Progress
+    from tvsbayes.results.comparison_record import ComparisonRecord
+    from tvsbayes.results.fit_record import FitRecord
 
 
 DCC_MESSAGES = 20
 """Of a schema validator, shown at most."""
+MAX_MINUTES = 10.0
 
 
 def _warn_of(campaign: Campaign) -> None:
@@ -52,16 +56,16 @@ def classic(campaign: CampaignFolder, as_json: Json = False) -> None:
     data = read_campaign(campaign)
     _warn_of(data)
     result = estimate(data)
-    skipped = [f"experiment {s.experiment} skipped: {s.reason}" for s in result.skipped]
-    finish(result.as_json(), "\n".join([classic_text(result), *skipped]), as_json)
+    finish(result.as_json(), classic_text(result), as_json)
 
 
 def fit(
     campaign: CampaignFolder,
     no_sample: Annotated[bool, typer.Option("--no-sample", help="Laplace approximation only.")] = False,
     max_minutes: Annotated[
-        float, typer.Option("--max-minutes", min=0.01, help="Time for sampling; unconverged by then: exit 4.")
-    ] = 10.0,
+        float | None,
+        typer.Option("--max-minutes", min=0.01, help="Time for sampling (default 10); unconverged by then: exit 4."),
+    ] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Continue the chain of an earlier run.")] = False,
     robust: Annotated[bool, typer.Option("--robust", help="Downweight and exclude outlying spots, by name.")] = False,
     per_axis: Annotated[bool, typer.Option("--per-axis", help="One ratio per axis: contrasts fixed at 0.")] = False,
@@ -76,63 +80,28 @@ def fit(
 
     if resume and no_sample:
         raise InputError("usage", "--resume continues a chain and --no-sample makes none", remedy="give one of them")
+    if no_sample:
+        refuse_options("for a sampler, and --no-sample runs none", "give one of them", max_minutes=max_minutes)
     data = read_campaign(campaign)
     _warn_of(data)
-    from tvsbayes.assessment.fitted_calibration import DRAWS_KEPT, calibration_of
-    from tvsbayes.assessment.summary import summarise
-    from tvsbayes.estimators.joint_fit import fit as fit_joint
     from tvsbayes.instrument.model_choice import ModelChoice
     from tvsbayes.report.fit_text import fit_text
-    from tvsbayes.results.fit_record import write_results
 
     compile_for(report_line)
-    folder = out or output_place(campaign, "results")
-    model = ModelChoice(robust=robust, per_axis=per_axis, harmonics=harmonics, no_backlash=no_backlash)
-    result = fit_joint(data, model=model, seed=seed)
-    summary, posterior, more = summarise(result), None, {}
-    # A sample of what must not be used anyway would only take the user's time.
-    if not no_sample and unusable(summary) is None:
-        from tvsbayes.posterior.arviz_tree import write_posterior
-        from tvsbayes.posterior.sampling import sample
-
-        make_folder(folder)
-        with _sampling_progress() as progress:
-            posterior = sample(
-                result,
-                max_minutes=max_minutes,
-                seed=seed,
-                checkpoint=folder / "chain.npz",
-                resume=resume,
-                progress=progress,
-            )
-        summary = summarise(result, posterior)
-        if posterior.converged:
-            report_line("computing log likelihoods and predictions for posterior.nc ...")
-            write_posterior(posterior, folder / "posterior.nc")
-            more = {"posterior": str(folder / "posterior.nc")}
-        more["chain"] = str(folder / "chain.npz")
-    stale = folder / "posterior.nc"
-    if "posterior" not in more and stale.exists():
-        stale.unlink()
-        report_line("posterior.nc of an earlier fit is removed: it would not be that of fit.json")
-    calibration = calibration_of(result, posterior, seed=seed) if result.converged else None
-    draws = posterior.thinned(DRAWS_KEPT) if summary.estimator == "posterior" else None
-    usable = posterior if summary.estimator == "posterior" else None
-    physical = (result.draws if draws is None else draws).physical
-    files = {
-        **write_results(
-            result,
-            summary,
-            folder,
-            seed,
-            calibration,
-            draws,
-            evidence_of(result, summary, usable, calibration, physical),
-        ),
-        **more,
-    }
+    results = calibrate(
+        data,
+        out or output_place(campaign, "results"),
+        model=ModelChoice(robust=robust, per_axis=per_axis, harmonics=harmonics, no_backlash=no_backlash),
+        sampled=not no_sample,
+        max_minutes=MAX_MINUTES if max_minutes is None else max_minutes,
+        resume=resume,
+        seed=seed,
+        tell=report_line,
+        watch=_sampling_progress,
+    )
+    summary, files = results.record.summary, results.files
     document = {**summary.as_json(), "seed": seed, "files": files}
-    finish(document, f"{fit_text(summary)}\nwritten: {', '.join(files.values())}", as_json, unusable(summary))
+    finish(document, f"{fit_text(summary)}\nwritten: {', '.join(files.values())}", as_json, results.error)
 
 
 def report(
@@ -145,9 +114,9 @@ def report(
     range_mm: Annotated[float, typer.Option("--range-mm", min=1, help="Range at which millimetres are stated.")] = 1e3,
     pdf: Annotated[bool, typer.Option("--pdf", help="Also print to PDF with an installed Chromium.")] = False,
     dcc: Annotated[bool, typer.Option("--dcc", help="Also write DCC-schema XML (unsigned, not accredited).")] = False,
-    laboratory: Annotated[str, typer.Option("--laboratory", help="Who measured, for --dcc.")] = "not stated",
-    customer: Annotated[str, typer.Option("--customer", help="For whom, for --dcc.")] = "not stated",
-    country: Annotated[str, typer.Option("--country", help="ISO 3166-1 code of the place, for --dcc.")] = "ZZ",
+    laboratory: Annotated[str | None, typer.Option("--laboratory", help="Who measured, for --dcc.")] = None,
+    customer: Annotated[str | None, typer.Option("--customer", help="For whom, for --dcc.")] = None,
+    country: Annotated[str | None, typer.Option("--country", help="ISO 3166-1 code of the place, for --dcc.")] = None,
     dcc_schema: Annotated[
         Path | None, typer.Option("--dcc-schema", help="PTB's dcc.xsd on this machine: validate the XML against it.")
     ] = None,
@@ -158,6 +127,9 @@ def report(
     from tvsbayes.calibration.calibration_file import load_calibration
     from tvsbayes.instrument.campaign import read_campaign
 
+    parties = {"laboratory": laboratory, "customer": customer, "country": country}
+    if not (dcc or dcc_schema):
+        refuse_options("for a certificate", "add --dcc", **parties)
     data = read_campaign(campaign)
     results = output_place(campaign, "results")
     from tvsbayes.report.fit_text import validation_lines
@@ -165,71 +137,99 @@ def report(
 
     if pdf:
         find_browser()
-    document = document_for(data, campaign, report_line)
-    from tvsbayes.metrology.dcc import check_dcc, dcc_bytes
-    from tvsbayes.report.evidence import gather
+    record = record_for(data, campaign, report_line)
+    from tvsbayes.report.evidence import MET, gather
 
     limits = {"limit_deg_per_step": limit_deg_per_step, "limit_mm": limit_mm}
-    evidence = gather(data, document, load_calibration(campaign), range_mm=range_mm, **limits)
+    evidence = gather(data, record, load_calibration(campaign), range_mm=range_mm, **limits)
     path = out or results / "report.html"
     write_atomically(path, report_html(evidence))
     files = {"report": str(path)}
     if pdf:
         files["pdf"] = str(print_to_pdf(path))
-    if dcc or dcc_schema:
-        certificate = results / "dcc.xml"
-        places = {"laboratory": laboratory, "customer": customer, "country": country}
-        today = datetime.datetime.now(datetime.UTC).date()
-        content = dcc_bytes(data, document, issued=today, report=path.read_bytes(), **places)
-        write_atomically(certificate, content)
-        files["dcc"] = str(certificate)
-    checked = check_dcc(content, dcc_schema) if dcc_schema else None
+    result: dict[str, Any] = {"criteria": [asdict(c) for c in evidence.criteria], "files": files}
     lines = [
         f"{c.quantity} within {c.limit:g} {c.unit}: {c.verdict} (P = {c.probability:.3f})" for c in evidence.criteria
     ]
-    result: dict[str, Any] = {"criteria": [asdict(c) for c in evidence.criteria], "files": files}
-    if checked is not None:
+    missed = any(c.verdict != MET for c in evidence.criteria)
+    if dcc or dcc_schema:
+        certificate = results / "dcc.xml"
+        content = _certificate(data, record, path.read_bytes(), {k: v for k, v in parties.items() if v is not None})
+        write_atomically(certificate, content)
+        files["dcc"] = str(certificate)
+    if dcc_schema:
+        from tvsbayes.metrology.schema_check import check_dcc
+
+        checked = check_dcc(content, dcc_schema)
         verdict = {True: "valid", False: "NOT VALID", None: "could not be checked"}[checked.valid]
         lines += [f"DCC by {checked.tool} against {dcc_schema}: {verdict}", *checked.messages[:DCC_MESSAGES]]
         result["dcc_schema"] = asdict(checked)
-    validation = document.get("validation")
-    if validation is not None and not validation["passed"]:
+        missed |= not checked.valid
+    validation = record.summary.validation
+    if validation is not None and not validation.passed:
         lines.insert(0, validation_lines(validation)[0])
-    text = "\n".join([*lines, f"written: {', '.join(files.values())}"])
-    finish(result, text, as_json)
-    if any(c.verdict != "met" for c in evidence.criteria) or (checked is not None and not checked.valid):
+    finish(result, "\n".join([*lines, f"written: {', '.join(files.values())}"]), as_json)
+    if missed:
         raise Ended(TARGET_MISSED)
+
+
+def _certificate(campaign: Campaign, record: FitRecord, report: bytes, stated: dict[str, str]) -> bytes:
+    """DCC-schema XML, issued today (UTC)."""
+    from tvsbayes.metrology.dcc import Parties, dcc_bytes
+
+    today = datetime.datetime.now(datetime.UTC).date()
+    return dcc_bytes(campaign, record, issued=today, parties=Parties(**stated), report=report)
 
 
 def compare(
     campaign: CampaignFolder,
     other: Annotated[Path | None, typer.Argument(metavar="B", help="Later campaign of the same instrument.")] = None,
-    by: Annotated[str, typer.Option("--by", help="Left out together: steps or regions.")] = "steps",
-    seed: Seed = 0,
+    by: Annotated[str | None, typer.Option("--by", help="Left out together: steps (default) or regions.")] = None,
+    seed: Annotated[int | None, typer.Option("--seed", min=0, help="Seed of everything random (default 0).")] = None,
     as_json: Json = False,
 ) -> None:
     """Classic against joint on experiments that were left out.
 
     The gap between the two estimators term by term; with a later campaign B, what has changed since.
     """
-    from tvsbayes.instrument.campaign import input_hashes, read_campaign
+    from tvsbayes.instrument.campaign import read_campaign
 
-    if by not in ("steps", "regions"):
+    if other is not None:
+        refuse_options("for one campaign: with B nothing is left out", "leave it out, or leave out B", by=by, seed=seed)
+    if by not in (None, "steps", "regions"):
         raise InputError("usage", f"--by {escaped(by)}: allowed are steps and regions", remedy="choose one of them")
     data = [read_campaign(folder) for folder in (campaign, *([other] if other is not None else ()))]
     results = output_place(campaign, "results")
-    from tvsbayes.report.command_text import changes_text, gap_text, hold_out_text
-
     fits = [fit_for(each, report_line) for each in data]
-    from tvsbayes.comparison.changes import compare as compare_fits
-    from tvsbayes.comparison.gap import explain_gap
-    from tvsbayes.comparison.held_out import hold_out
-
     if other is not None:
+        from tvsbayes.comparison.changes import compare as compare_fits
+        from tvsbayes.report.command_text import changes_text
+
         changes = compare_fits(*fits)
         finish(changes.as_json(), changes_text(changes), as_json)
         return
-    gaps = explain_gap(fits[0])
+    from tvsbayes.report.command_text import gap_text, hold_out_text
+
+    record = _classic_against_joint(fits[0], by or "steps", seed or 0)
+    document = record.as_json()
+    files, text = {}, f"{gap_text(record.directions)}\n\n{hold_out_text(record.held_out)}"
+    if keep(document, path := results / "compare.json"):
+        files, text = {"compare": str(path)}, f"{text}\nwritten: {path}"
+    finish({**document, "files": files}, text, as_json)
+
+
+def _classic_against_joint(found: JointFit, by: str, seed: int) -> ComparisonRecord:
+    """Why both estimators differ, and which foretells what it has not seen.
+
+    Raises:
+        NothingToEstimate: there is no complete experiment.
+    """
+    from tvsbayes.comparison.gap import explain_gap
+    from tvsbayes.comparison.held_out import hold_out
+    from tvsbayes.instrument.campaign import input_hashes
+    from tvsbayes.results.comparison_record import ComparisonRecord
+
+    gaps = explain_gap(found)
     if not any(gaps.values()):
         raise NothingToEstimate(
             "no-experiments",
@@ -237,20 +237,7 @@ def compare(
             file="spots.csv",
             remedy="number the looks in the columns experiment and point, or use `tvsbayes fit`",
         )
-    held = hold_out(fits[0], by, seed)
-    document = {
-        "kind": "classic against joint",
-        "format": "tvsbayes-compare/1",
-        "estimator": "laplace",
-        "directions": {name: None if gap is None else asdict(gap) for name, gap in gaps.items()},
-        "held_out": held.as_json(),
-        "inputs": input_hashes(data[0]),
-        "seed": seed,
-    }
-    files, text = {}, f"{gap_text(gaps)}\n\n{hold_out_text(held)}"
-    if keep(document, path := results / "compare.json"):
-        files, text = {"compare": str(path)}, f"{text}\nwritten: {path}"
-    finish({**document, "files": files}, text, as_json)
+    return ComparisonRecord(gaps, hold_out(found, by, seed), input_hashes(found.campaign), seed)
 
 
 @contextmanager

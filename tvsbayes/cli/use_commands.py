@@ -1,4 +1,4 @@
-"""Locate, steps-for, plan, study."""
+"""Commands that use a calibration or look ahead: locate, steps-for, plan, study."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ from tvsbayes.cli.app import (
     finish,
     finite,
     keep,
+    refuse_options,
     report_line,
 )
 from tvsbayes.errors import InputError, TvsError, escaped
@@ -27,6 +28,7 @@ from tvsbayes.pipeline import calibration_for, compile_for, fit_for
 
 POINT_COLUMNS = ("pan_steps", "tilt_steps", "pan_approach", "tilt_approach", "aperture_deg")
 STEPS_MAX, ANGLE_MAX_DEG = 1e8, 360.0
+WORKERS = 2
 
 
 def _read_points(path: Path) -> tuple[list[float], list[float], list[float], list[tuple[str, str]]]:
@@ -52,8 +54,10 @@ def locate(
     campaign: CampaignFolder,
     pan_steps: Annotated[float | None, typer.Option("--pan-steps", help="Absolute counter.")] = None,
     tilt_steps: Annotated[float | None, typer.Option("--tilt-steps", help="Absolute counter.")] = None,
-    pan_approach: Annotated[str, typer.Option("--pan-approach", help="left, right or unknown.")] = "left",
-    tilt_approach: Annotated[str, typer.Option("--tilt-approach", help="up, down or unknown.")] = "up",
+    pan_approach: Annotated[
+        str | None, typer.Option("--pan-approach", help="left (default), right or unknown.")
+    ] = None,
+    tilt_approach: Annotated[str | None, typer.Option("--tilt-approach", help="up (default), down or unknown.")] = None,
     aperture_deg: Annotated[float | None, typer.Option("--aperture-deg", help="Reading B of the aperture.")] = None,
     points: Annotated[
         Path | None,
@@ -73,14 +77,17 @@ def locate(
     if (points is None) == any(value is None for value in single):
         remedy = "give --pan-steps, --tilt-steps and --aperture-deg, or --points FILE.csv"
         raise InputError("usage", "locate needs one point or a file of points", remedy=remedy)
-    if budget and points is not None:
-        raise InputError("usage", "--budget is for one point", remedy="leave out --points")
+    if points is not None:
+        options = {"budget": budget, "pan_approach": pan_approach, "tilt_approach": tilt_approach}
+        options |= {"pan_steps": pan_steps, "tilt_steps": tilt_steps, "aperture_deg": aperture_deg}
+        refuse_options("for one point", "leave out --points, or give the columns of its file", **options)
     finite(pan_steps=pan_steps, tilt_steps=tilt_steps, aperture_deg=aperture_deg)
-    where = (*single, (pan_approach, tilt_approach)) if points is None else _read_points(points)
+    approach = (pan_approach or "left", tilt_approach or "up")
+    where = (*single, approach) if points is None else _read_points(points)
     from tvsbayes.instrument.axes import sides_of
 
     if points is None:
-        sides_of((pan_approach, tilt_approach))
+        sides_of(approach)
     calibration = calibration_for(campaign, report_line)
     from tvsbayes.coordinates.location import locate as locate_points
     from tvsbayes.report.command_text import locations_text
@@ -126,6 +133,9 @@ def steps_for(
     given = sum(value is not None for value in (x_mm, y_mm, z_mm, azimuth_deg, elevation_deg))
     if export not in (None, "header", "json"):
         raise InputError("usage", f"--export {escaped(export)}", allowed="header, json", remedy="name one of them")
+    if export:
+        options = {"pan_approach": pan_approach, "tilt_approach": tilt_approach, "rig": rig}
+        refuse_options("for one target", "leave it out: --export writes the calibration itself", **options)
     if given != (0 if export else 3 if point else 2 if direction else -1):
         remedy = "give --x-mm --y-mm --z-mm, or --azimuth-deg --elevation-deg, or --export alone"
         raise InputError("usage", "steps-for needs one target", remedy=remedy)
@@ -177,6 +187,7 @@ def plan(
     from tvsbayes.planning.search import CRITERIA
     from tvsbayes.planning.target import DEFAULT_TARGET, parse_target
     from tvsbayes.report.command_text import plan_text
+    from tvsbayes.results.plan_record import plan_document
 
     wanted = parse_target(target or DEFAULT_TARGET)
     if criterion not in CRITERIA:
@@ -193,10 +204,9 @@ def plan(
         text += f"\nwritten: {escaped(str(output), 200)}"
     elif output is not None:
         text += f"\nnothing written to {escaped(str(output), 200)}: there is nothing more to measure"
-    if data is not None:
+    if data is not None and given is not None:
         # Where the report looks for what to measure next.
-        stored = {"format": "tvsbayes-plan/1", "inputs": input_hashes(data), **document}
-        keep(stored, output_place(data.path, "results") / "plan.json")
+        keep(plan_document(document, input_hashes(data)), output_place(given, "results") / "plan.json")
     finish(document, text, as_json)
     if target is not None and not result.met:
         raise Ended(TvsError.exit_code)
@@ -207,7 +217,9 @@ def study(
     plan_file: Annotated[Path, typer.Argument(metavar="PLAN", help="plan.csv.")],
     n: Annotated[int, typer.Option("--n", min=1, max=1_000_000, help="Simulated campaigns.")] = 100,
     engine: Annotated[str, typer.Option("--engine", help="serial, processes or dask.")] = "serial",
-    workers: Annotated[int, typer.Option("--workers", min=1, max=1024, help="Worker processes.")] = 2,
+    workers: Annotated[
+        int | None, typer.Option("--workers", min=1, max=1024, help="Worker processes (default 2).")
+    ] = None,
     scheduler: Annotated[str | None, typer.Option("--scheduler", help="Address of a Dask scheduler.")] = None,
     rows: Annotated[Path | None, typer.Option("--rows", help="File of rows (default: PLAN with .study.jsonl).")] = None,
     target: TargetText = None,
@@ -219,6 +231,14 @@ def study(
     from tvsbayes.instrument.plan import read_plan
     from tvsbayes.instrument.rig import read_rig
 
+    if engine == "serial":
+        refuse_options(
+            "for engines with workers", "add --engine processes or dask", workers=workers, scheduler=scheduler
+        )
+    if engine == "processes":
+        refuse_options("for the engine dask", "add --engine dask", scheduler=scheduler)
+    if scheduler is not None:
+        refuse_options("for a cluster that is started here", "leave it out, or leave out --scheduler", workers=workers)
     instrument, steps = read_rig(rig), read_plan(plan_file)
     from tvsbayes.planning.target import DEFAULT_TARGET, parse_target
     from tvsbayes.report.command_text import study_text
@@ -237,8 +257,7 @@ def study(
         if sys.stderr.isatty():
             report_line(f"{done} of {wanted}")
 
-    options = {"engine": engine, "workers": workers, "address": scheduler}
-    result = run_study(job, n, kept, progress=progress, **options)
+    result = run_study(job, n, kept, engine=engine, workers=workers or WORKERS, address=scheduler, progress=progress)
     document = {**result.as_json(), "rows": str(kept.path), "engine": engine, "seed": seed}
     finish(document, study_text(result), as_json)
     if target is not None and result.assurance < ASSURED[0]:

@@ -44,7 +44,7 @@ from tvsbayes.instrument.rig import RigTable
 from tvsbayes.model.geometry import Scalar
 from tvsbayes.model.headlines import Derived, derived_quantities
 from tvsbayes.model.parameter_space import ParameterSpace, free_mask, parameter_space
-from tvsbayes.results.fit_record import StoredMode
+from tvsbayes.results.stored_draws import StoredMode
 from tvsbayes.statistics.intervals import NORMAL_95, chi2_quantile
 from tvsbayes.statistics.least_squares import NEWTON_STEP, Mode, laplace_draws, levenberg_marquardt, newton_mode
 

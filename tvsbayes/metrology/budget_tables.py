@@ -7,8 +7,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
+from tvsbayes.results.metrology_tables import BudgetRow, BudgetTable
 from tvsbayes.statistics.intervals import coverage_factor, effective_dof
 
 PROBABILITY = 0.95
@@ -36,62 +37,6 @@ class Source:
     distribution: str
     dof: float
     sensitivity: float
-
-
-@dataclass(frozen=True)
-class BudgetRow:
-    """A line of a budget; fields as in `Source`, None where a line sums up several or is the correlation row.
-
-    `contribution` is sensitivity times u, signed, in the unit of the result; `share` is of the combined variance and
-    negative where correlations take variance away.
-    """
-
-    quantity: str
-    unit: str
-    estimate: float | None
-    u: float | None
-    kind: str
-    distribution: str
-    dof: float | None
-    sensitivity: float | None
-    contribution: float | None
-    share: float
-
-
-@dataclass(frozen=True)
-class BudgetTable:
-    """A GUM uncertainty budget.
-
-    Attributes:
-        quantity, unit: of the result.
-        estimate: the result.
-        rows: largest contribution first; the last one is `CORRELATIONS`, so that the shares sum to 1.
-        u: combined standard uncertainty (GUM 5.1.2, 5.2.2).
-        dof: effective degrees of freedom (GUM eq. G.2b), infinite where no input's are finite.
-        coverage_factor: k = t_p(dof) (GUM G.4.1).
-        probability: coverage probability p.
-        expanded: U = k u.
-        notes: what the reader must know.
-    """
-
-    quantity: str
-    unit: str
-    estimate: float
-    rows: tuple[BudgetRow, ...]
-    u: float
-    dof: float
-    coverage_factor: float
-    probability: float
-    expanded: float
-    notes: tuple[str, ...]
-
-    def as_json(self) -> dict[str, object]:
-        """Plain values; infinite degrees of freedom become null."""
-        document = asdict(self) | {"rows": [asdict(row) for row in self.rows], "notes": list(self.notes)}
-        for entry in (document, *document["rows"]):
-            if entry["dof"] == math.inf:
-                entry["dof"] = None
-        return document
 
 
 CORRELATIONS = "correlations, and what linear propagation leaves"

@@ -7,65 +7,12 @@ edition's text was at hand, and further definitions have no number here.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
+
+from tvsbayes.results.metrology_tables import Positioning
 
 RUNS_MIN = 2
 """A standard deviation needs two runs."""
-FIGURES: dict[str, tuple[str, str]] = {
-    "reversal_deg": ("B", "reversal error of the axis"),
-    "mean_reversal_deg": ("mean B", "mean reversal error"),
-    "repeatability_up_deg": ("R up", "unidirectional repeatability, up"),
-    "repeatability_down_deg": ("R down", "unidirectional repeatability, down"),
-    "repeatability_deg": ("R", "bidirectional repeatability"),
-    "systematic_up_deg": ("E up", "unidirectional systematic deviation, up"),
-    "systematic_down_deg": ("E down", "unidirectional systematic deviation, down"),
-    "systematic_deg": ("E", "bidirectional systematic deviation"),
-    "mean_systematic_deg": ("M", "mean bidirectional deviation"),
-    "accuracy_up_deg": ("A up", "unidirectional accuracy, up"),
-    "accuracy_down_deg": ("A down", "unidirectional accuracy, down"),
-    "accuracy_deg": ("A", "bidirectional accuracy"),
-}
-"""Fields of `Positioning` that are one number per test: symbol and term of ISO 230-2."""
-
-
-@dataclass(frozen=True)
-class Positioning:
-    """ISO 230-2 figures of one axis. Any leading axes (...) are tests; m targets.
-
-    Attributes:
-        mean_up_deg, mean_down_deg: mean deviation per target and side, shape (..., m).
-        sd_up_deg, sd_down_deg: their standard deviations (n - 1), shape (..., m).
-        reversal_at_deg: B_i, up minus down, signed, shape (..., m).
-        reversal_deg: B = max |B_i|; mean_reversal_deg: mean of B_i, signed; shape (...), as all that follow.
-        repeatability_deg: R; repeatability_up_deg, repeatability_down_deg: of one side.
-        systematic_deg: E; systematic_up_deg, systematic_down_deg: of one side.
-        mean_systematic_deg: M.
-        accuracy_deg: A; accuracy_up_deg, accuracy_down_deg: of one side.
-    """
-
-    mean_up_deg: np.ndarray
-    mean_down_deg: np.ndarray
-    sd_up_deg: np.ndarray
-    sd_down_deg: np.ndarray
-    reversal_at_deg: np.ndarray
-    reversal_deg: np.ndarray
-    mean_reversal_deg: np.ndarray
-    repeatability_up_deg: np.ndarray
-    repeatability_down_deg: np.ndarray
-    repeatability_deg: np.ndarray
-    systematic_up_deg: np.ndarray
-    systematic_down_deg: np.ndarray
-    systematic_deg: np.ndarray
-    mean_systematic_deg: np.ndarray
-    accuracy_up_deg: np.ndarray
-    accuracy_down_deg: np.ndarray
-    accuracy_deg: np.ndarray
-
-    def as_json(self) -> dict[str, object]:
-        """Every field as a number or nested lists."""
-        return {name: np.asarray(value).tolist() for name, value in vars(self).items()}
 
 
 def figures_of(up_deg: np.ndarray, down_deg: np.ndarray) -> Positioning:

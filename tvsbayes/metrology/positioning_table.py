@@ -6,9 +6,8 @@ Nothing is fitted here and no angle standard is involved: the notes of a table s
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -16,7 +15,7 @@ from tvsbayes.calibration.optics import beam_angle_deg, beam_deg_per_step, outpu
 from tvsbayes.calibration.pointing import Calibration
 from tvsbayes.instrument.axes import AXES
 from tvsbayes.instrument.stops import StopReadings
-from tvsbayes.metrology.iso230 import FIGURES, RUNS_MIN, Positioning, figures_of
+from tvsbayes.metrology.iso230 import RUNS_MIN, figures_of
 from tvsbayes.metrology.simulated_cycles import (
     RUNS,
     SIMULATED_TESTS,
@@ -26,6 +25,7 @@ from tvsbayes.metrology.simulated_cycles import (
     target_steps,
     targets_wanted,
 )
+from tvsbayes.results.metrology_tables import FIGURES, AxisPositioning, Positioning, Predicted
 
 INDIRECT = (
     "ISO 230-2-style and indirect: angles of the beam are inferred from spots in two cameras through the fitted model; "
@@ -42,55 +42,6 @@ NOT_COVERED = (
     "an error that all looks of the cameras share: it is in the predicted E, M and A through the ratio, and in no "
     "plug-in figure",
 )
-
-
-@dataclass(frozen=True)
-class Predicted:
-    """Median and equal-tailed 95 % interval of a figure over simulated tests."""
-
-    median: float
-    interval95: tuple[float, float]
-
-
-@dataclass(frozen=True)
-class AxisPositioning:
-    """ISO 230-2-style table of one axis.
-
-    Attributes:
-        axis: pan or tilt.
-        deg_per_step: targets are this times the counter.
-        predicted: field of `FIGURES` -> median and interval over tests simulated from the draws; None if the axis
-            never moved.
-        target_steps: targets of the simulated tests.
-        runs: simulated runs per target and side.
-        estimator: "posterior" or "laplace": where the draws come from.
-        plug_in: figures of the campaign's own stops, no leading axis; None where `missing` says why.
-        plug_in_steps: counters of its targets.
-        plug_in_runs: runs (up, down) at each of them.
-        reading_u_deg: root mean square standard uncertainty of one reading from pixel noise, which is in every s.
-        missing: why there is no plug-in table.
-        notes: that it is indirect, what it rests on and what it does not cover.
-    """
-
-    axis: str
-    deg_per_step: float
-    predicted: dict[str, Predicted] | None
-    target_steps: tuple[int, ...]
-    runs: int
-    estimator: str
-    plug_in: Positioning | None
-    plug_in_steps: tuple[int, ...]
-    plug_in_runs: tuple[tuple[int, int], ...]
-    reading_u_deg: float | None
-    missing: str | None
-    notes: tuple[str, ...]
-
-    def as_json(self) -> dict[str, object]:
-        """Plain values; tuples become lists."""
-        document = {name: value for name, value in vars(self).items() if name not in ("predicted", "plug_in")}
-        predicted = None if self.predicted is None else {name: asdict(p) for name, p in self.predicted.items()}
-        document |= {"predicted": predicted, "plug_in": self.plug_in and self.plug_in.as_json()}
-        return json.loads(json.dumps(document, allow_nan=False))
 
 
 @dataclass(frozen=True)

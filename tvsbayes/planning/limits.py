@@ -9,23 +9,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from tvsbayes.instrument.parameters import NAMES, PRIOR_GROUPS, RIG_NAMES
-from tvsbayes.instrument.plan import PlanStep, described
+from tvsbayes.instrument.plan import described
 from tvsbayes.instrument.rig import RigTable
 from tvsbayes.planning.candidates import Candidates, Seen, arrange, covariance_of, information_of_looks
 from tvsbayes.planning.expectation import LOOKS_PER_EXPERIMENT, Knowledge, plan_minutes
 from tvsbayes.planning.search import search_designs
 from tvsbayes.planning.target import Sensitivity, Target
-
-
-@dataclass(frozen=True)
-class Batch:
-    """A possible next experiment: four looks at one sheet and what they bring."""
-
-    actions: tuple[PlanStep, ...]
-    minutes: float
-    gain: float
-    gain_per_minute: float
-    text: str
+from tvsbayes.results.plan_record import Advice, Batch
 
 
 @dataclass(frozen=True)
@@ -45,15 +35,6 @@ class Limit:
     shares: dict[str, float]
     reachable: bool
     needed: str | None
-
-
-@dataclass(frozen=True)
-class Advice:
-    """Whether to go on measuring, and the rule."""
-
-    now: bool
-    reason: str
-    rule: str
 
 
 MANY = 100.0

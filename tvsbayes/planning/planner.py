@@ -47,10 +47,11 @@ from tvsbayes.planning.forecast import (
     classic_forecast,
     value_of_classic,
 )
-from tvsbayes.planning.limits import Advice, Batch, Limit, limit_of, next_experiments, split_of, stop_now
+from tvsbayes.planning.limits import Limit, limit_of, next_experiments, split_of, stop_now
 from tvsbayes.planning.plan_check import judge
 from tvsbayes.planning.search import LADDER, Scope, design_family, refine, smallest_design
 from tvsbayes.planning.target import Sensitivity, Target, sensitivity
+from tvsbayes.results.plan_record import Advice, Batch
 from tvsbayes.statistics.intervals import ASSURED, share_error
 
 
@@ -211,7 +212,7 @@ def plan(
         NotConverged: `given` did not converge.
     """
     if given is not None and not given.converged:
-        raise NotConverged("not-converged", "NOT CONVERGED: " + "; ".join(given.problems), remedy="see `tvsbayes fit`")
+        raise NotConverged.of(given.problems, "see `tvsbayes fit`")
     knowledge = prior_knowledge(rig) if given is None else knowledge_of(given, rig)
     campaign, pose = (None, None) if given is None else (given.campaign, given.reference_pose_rad)
     scope = Scope(criterion, aperture, largest, minutes)

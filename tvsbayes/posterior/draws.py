@@ -15,7 +15,7 @@ from tvsbayes.instrument.axes import DIRECTION_SIGNS, DIRECTIONS, SENSES
 from tvsbayes.instrument.parameters import NAMES
 from tvsbayes.model.headlines import Derived, derived_quantities
 from tvsbayes.posterior.transport import in_batches
-from tvsbayes.results.estimates import Convergence
+from tvsbayes.results.convergence import Convergence
 
 DERIVED_BATCH = 2049
 """The batch in which the fit computes its headlines: the compilation is shared."""

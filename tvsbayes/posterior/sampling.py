@@ -35,7 +35,7 @@ from tvsbayes.instrument.parameters import NAMES
 from tvsbayes.posterior.draws import Draws, Posterior, derived_at
 from tvsbayes.posterior.proposal import Independence, Pilot, Target, moves, pilot
 from tvsbayes.posterior.transport import Transport, transport
-from tvsbayes.results.estimates import Convergence
+from tvsbayes.results.convergence import Convergence
 
 CHAIN_FORMAT = "tvsbayes-chain/4"
 CHAIN_BYTES_MAX = 2**32
@@ -270,11 +270,7 @@ def sample(
         ValueError: max_minutes is not positive.
     """
     if not fit.converged:
-        raise NotConverged(
-            "not-converged",
-            "NOT CONVERGED: " + "; ".join(fit.problems),
-            remedy="a posterior needs a mode to start from",
-        )
+        raise NotConverged.of(fit.problems, "a posterior needs a mode to start from")
     if not max_minutes > 0:
         raise ValueError(f"max_minutes is {max_minutes}; it must be positive")
     began = time.monotonic()

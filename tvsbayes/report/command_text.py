@@ -1,17 +1,18 @@
-"""What commands print besides a fit: cameras, coordinates, comparisons, plans, studies."""
+"""What commands print besides a fit: cameras, coordinates, comparisons, plans, studies; units in heads and words."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tvsbayes.calibration.aiming import Steps
+from tvsbayes.calibration.pointing import Steps
 from tvsbayes.errors import escaped
-from tvsbayes.planning.planner import PlanResult
-from tvsbayes.report.tables import concise, text_table, two_digits
+from tvsbayes.report.result_tables import gap_table, hold_out_table, point_budget_table
+from tvsbayes.report.tables import TableView, concise, two_digits
+from tvsbayes.results.comparison_record import Comparison, Gap, HoldOut
 from tvsbayes.statistics.intervals import ASSURED, BOUND, LEVELS, binomial_bounds, rms_bounds
-from tvsbayes.studies.study import StudyResult
 
 if TYPE_CHECKING:
     from tvsbayes.cameras.detection import Detection
@@ -19,7 +20,8 @@ if TYPE_CHECKING:
     from tvsbayes.coordinates.location import Locations
     from tvsbayes.instrument.stereo_pair import Stereo
     from tvsbayes.metrology.look_budget import Budget
-    from tvsbayes.results.comparison_record import Comparison, Gap, GapTerm, HoldOut
+    from tvsbayes.planning.planner import PlanResult
+    from tvsbayes.studies.study import StudyResult
 
 
 def plan_text(result: PlanResult) -> str:
@@ -77,9 +79,9 @@ def stereo_text(stereo: Stereo) -> str:
     units = ("px",) * 4 + ("",) * 5
     rows = [[name, cells[k], cells[9 + k], unit] for k, (name, unit) in enumerate(zip(names, units, strict=True))]
     title = f"stereo pair, {stereo.image_width} x {stereo.image_height} px"
-    cameras = text_table(title, ["", "left(u)", "right(u)", "unit"], rows)
+    cameras = TableView(title, ["", "left(u)", "right(u)", "unit"], rows).text()
     rows = [[axis, cells[18 + k], cells[21 + k]] for k, axis in enumerate("xyz")]
-    return f"{cameras}\n{text_table('x_right = R x_left + T', ['', 'rotation, rad', 'T, mm'], rows)}"
+    return f"{cameras}\n{TableView('x_right = R x_left + T', ['', 'rotation, rad', 'T, mm'], rows).text()}"
 
 
 def stereo_calibration_text(result: StereoCalibration) -> str:
@@ -96,7 +98,7 @@ def stereo_calibration_text(result: StereoCalibration) -> str:
     board, mean_sd = result.board, result.triangulated_pitch_mm
     lines = [
         stereo_text(result.stereo),
-        text_table(f"{result.pairs} pairs, {len(result.views) - result.pairs} single views", columns, rows),
+        TableView(f"{result.pairs} pairs, {len(result.views) - result.pairs} single views", columns, rows).text(),
         f"rms over corners: both {result.stereo.rms_px:.3f}, left {px(result.left_rms_px)}, right "
         f"{px(result.right_rms_px)} px; one coordinate: sd {result.noise_sd_px:.3f} px, dof {result.dof}",
         "uncertainties hold for corner errors that the corners of a picture share: variances "
@@ -137,7 +139,7 @@ def detection_text(found: Detection) -> str:
         else f"median standard uncertainty of a coordinate {found.median_sd_px:.3f} px; "
     )
     title = f"{found.processed} looks"
-    return f"{text_table(title, ['status', 'looks', 'meaning'], rows)}\nmethod {found.method}; {sd}noise: {noise}"
+    return f"{TableView(title, ['status', 'looks', 'meaning'], rows).text()}\nmethod {found.method}; {sd}noise: {noise}"
 
 
 def locations_text(found: Locations) -> str:
@@ -154,17 +156,11 @@ def locations_text(found: Locations) -> str:
         verdict = f"validated at {held} digit{'s' * (held > 1)}" if held else "not validated"
         rows.append([str(index), *cells, half, verdict])
     columns = ["point", "x(u) mm", "y(u) mm", "z(u) mm", "U95 mm", "linear propagation"]
-    return text_table(f"frame T, {found.draws} draws ({found.estimator})", columns, rows)
+    return TableView(f"frame T, {found.draws} draws ({found.estimator})", columns, rows).text()
 
 
 def budget_text(budget: Budget) -> str:
     """Uncertainty budget of a point: causes by share, then the parameters that contribute most."""
-    order = np.argsort(-budget.share)
-    rows = []
-    for k in order[budget.share[order] >= 0.0005]:
-        parts = [f"{np.sqrt(v):.3g}" for v in budget.variance_mm2[k]]
-        rows.append([budget.causes[k], f"{100 * budget.share[k]:.1f}", *parts])
-    causes = text_table("uncertainty by cause", ["cause", "share %", "u(x) mm", "u(y) mm", "u(z) mm"], rows)
     size = np.linalg.norm(budget.contribution_mm, axis=1)
     rows = [
         [budget.parameters[k], *(f"{v:+.3g}" for v in budget.contribution_mm[k])]
@@ -172,7 +168,8 @@ def budget_text(budget: Budget) -> str:
         if size[k] > 0
     ]
     title = "by parameter, one standard uncertainty each (correlated: they do not add up)"
-    return f"{causes}\n\n{text_table(title, ['parameter', 'x mm', 'y mm', 'z mm'], rows)}"
+    parts = TableView(title, ["parameter", "x mm", "y mm", "z mm"], rows)
+    return f"{point_budget_table(budget).text()}\n\n{parts.text()}"
 
 
 def steps_text(steps: Steps) -> str:
@@ -192,42 +189,15 @@ def steps_text(steps: Steps) -> str:
     return "\n".join(lines)
 
 
-def gap_text(gaps: dict[str, Gap | None]) -> str:
+def gap_text(gaps: Mapping[str, Gap | None]) -> str:
     """The gap between both estimators by its terms."""
-    found = {direction: gap for direction, gap in gaps.items() if gap is not None}
-    rows = [
-        ["classic mean", *(f"{gap.classic:.6f}" for gap in found.values())],
-        ["effective ratio (joint)", *(concise(gap.joint.value, gap.joint.sd) for gap in found.values())],
-        ["classic - joint", *(signed(gap.total) for gap in found.values())],
-    ]
-    for number, term in enumerate(next(iter(found.values())).terms):
-        rows.append([f"  {term.name}", *(signed(gap.terms[number]) for gap in found.values())])
-    return text_table("why the classic differs from the joint, deg/step, value(u)", ["", *found], rows)
-
-
-def signed(term: GapTerm) -> str:
-    """A difference with its sign, value(u)."""
-    text = concise(term.value, term.sd)
-    return text if text.startswith("-") else f"+{text}"
+    return gap_table(gaps).text()
 
 
 def hold_out_text(held: HoldOut) -> str:
     """Who foretells left-out angles better, and what no hold-out can see."""
-    lines = []
-    if held.classic is not None:
-        rows = [
-            [
-                name,
-                f"{score.rms_deg:.3f}",
-                f"{score.rms_block_deg:.3f}",
-                f"{100 * score.coverage:.0f} %",
-                f"{score.log_density:+.2f}",
-            ]
-            for name, score in (("classic", held.classic), ("joint", held.joint))
-        ]
-        title = f"angles of {len(held.predictions)} experiments left out by {held.by}, deg"
-        columns = ["", "rms error", "rms of block means", "inside 95 %", "log density"]
-        lines.append(text_table(title, columns, rows))
+    scores = hold_out_table(held)
+    lines = [] if scores is None else [scores.text()]
     lines.append(f"held-out angles: {held.verdict}: {held.reason}")
     common = ", ".join(f"{d} {u:.1e}" for d, u in held.unseen.items())
     lines.append(f"not seen by any hold-out, common to all spots: u by stereo and focal scale, deg/step: {common}")
@@ -243,7 +213,7 @@ def changes_text(comparison: Comparison) -> str:
         rows.append([*cells, normalised, "yes" if c.significant else "no"])
     pan, tilt = comparison.reference_pose_deg
     title = f"A and B at pan {pan:.2f} deg, tilt {tilt:.2f} deg"
-    table = text_table(title, ["quantity", "A", "B", "B - A (u)", "unit", "normalised", "significant"], rows)
+    table = TableView(title, ["quantity", "A", "B", "B - A (u)", "unit", "normalised", "significant"], rows).text()
     days = "" if comparison.days is None else f" in {comparison.days:.1f} days"
     cameras = "the same stereo calibration: its error is left out of u" if comparison.shared_cameras else "two cameras"
     return f"{table}\n{comparison.verdict}{days} (limit {comparison.limit:.2f} u for all together; {cameras})"

@@ -1,4 +1,7 @@
-"""What a report shows, gathered."""
+"""What a report shows, gathered: results as they are stored, the classic beside them, errors in 3D, limits judged.
+
+Ratios in deg/step, points and their errors in mm, frame T.
+"""
 
 from __future__ import annotations
 
@@ -14,9 +17,11 @@ from tvsbayes.errors import NothingToEstimate
 from tvsbayes.estimators.four_point import ClassicResult, classic
 from tvsbayes.instrument.axes import DIRECTIONS
 from tvsbayes.instrument.campaign import Campaign
-from tvsbayes.metrology.budget_tables import BudgetTable
 from tvsbayes.metrology.look_budget import Budget, budget, coordinate_budget
-from tvsbayes.results.comparison_record import CANNOT_TELL, stored_hold_out, stored_plan
+from tvsbayes.results.comparison_record import CANNOT_TELL, HoldOut, stored_hold_out
+from tvsbayes.results.fit_record import FitEvidence, FitRecord
+from tvsbayes.results.metrology_tables import BudgetTable
+from tvsbayes.results.plan_record import PlanRecord, stored_plan
 
 MET, NOT_MET = "met", "not met"
 MET_PROBABILITY = 0.95
@@ -62,10 +67,10 @@ class Evidence:
 
     Attributes:
         campaign: what was measured.
-        fit: the document of `results/fit.json`.
+        fit: the content of `results/fit.json`.
         classic: the paper's estimator; None without complete experiments.
-        held_out: the document of `results/compare.json`, None where `compare` was not run on these data.
-        planned: the document of `results/plan.json`, None where `plan --given` was not run on these data.
+        held_out: of `results/compare.json`, None where `compare` was not run on these data.
+        planned: of `results/plan.json`, None where `plan --given` was not run on these data.
         criteria: what was asked of the calibration, judged.
         distances_mm: draws of the 3D error by estimator at `range_mm` and the middle of the counters.
         range_mm: stated range.
@@ -75,10 +80,10 @@ class Evidence:
     """
 
     campaign: Campaign
-    fit: Mapping[str, object]
+    fit: FitRecord
     classic: ClassicResult | None
-    held_out: Mapping[str, object] | None
-    planned: Mapping[str, object] | None
+    held_out: HoldOut | None
+    planned: PlanRecord | None
     criteria: Sequence[Criterion]
     distances_mm: Mapping[str, np.ndarray]
     range_mm: float
@@ -86,10 +91,15 @@ class Evidence:
     budget: Budget | None
     point: BudgetTable | None
 
+    @property
+    def shown(self) -> FitEvidence:
+        """What the fit lends reports besides its estimates."""
+        return self.fit.evidence or FitEvidence()
+
 
 def gather(
     campaign: Campaign,
-    fit: Mapping[str, object],
+    fit: FitRecord,
     calibration: Calibration,
     *,
     range_mm: float,
@@ -110,44 +120,57 @@ def gather(
         classic_result = classic(campaign)
     except NothingToEstimate:
         classic_result = None
-    simple = {"nominal": simple_calibration(campaign.rig.priors)}
-    if classic_result is not None:
-        simple["classic"] = simple_calibration(campaign.rig.priors, classic_result)
-    (pan_low, pan_high), (tilt_low, tilt_high) = calibration.range_steps
-    middle = 0.5 * (pan_low + pan_high), 0.5 * (tilt_low + tilt_high)
-    ranges = sorted({*MAP_RANGES_MM, range_mm})
-    pan, tilt = np.linspace(pan_low, pan_high, MAP_CELLS), np.linspace(tilt_low, tilt_high, MAP_CELLS)
-    maps = error_map(calibration, pan, tilt, ranges, simple=simple, draws=MAP_DRAWS)
+    maps = _maps(campaign, classic_result, calibration, range_mm)
     # The middle cell of an odd number is the middle of the counters.
-    cell = MAP_CELLS // 2, MAP_CELLS // 2, ranges.index(range_mm)
+    cell = MAP_CELLS // 2, MAP_CELLS // 2, maps.range_mm.tolist().index(range_mm)
     found = {name: distance[:, *cell] for name, distance in maps.distance_mm.items()}
     criteria = []
-    # Limits are judged with the uncertainty that a failed validation leaves (`information.Validation`).
-    inflation = float((fit.get("validation") or {}).get("inflation", 1.0))
     if limit_deg_per_step is not None:
-        draws = stored_ratios(campaign)
-        for k, direction in enumerate(DIRECTIONS):
-            estimate = fit["effective_deg_per_step"].get(direction)
-            if estimate is not None:
-                errors = inflation * (draws[:, k] - estimate["value"])
-                criteria.append(criterion(f"ratio {direction}", errors, limit_deg_per_step, "deg/step"))
+        criteria += _ratio_criteria(campaign, fit, limit_deg_per_step)
     if limit_mm is not None:
-        criteria.append(criterion(f"3D point at {range_mm:g} mm", inflation * found["joint"], limit_mm, "mm"))
-    ray = calibration.ray(*middle, ("left", "up"))
+        errors = _inflation(fit) * found["joint"]
+        criteria.append(criterion(f"3D point at {range_mm:g} mm", errors, limit_mm, "mm"))
+    pan, tilt = (float(value) for value in calibration.range_steps.mean(axis=1))
+    ray = calibration.ray(pan, tilt, ("left", "up"))
     point = np.asarray(ray.origin_mm) + range_mm * np.asarray(ray.direction)
-    reading = calibration.reading(point)
-    found_budget = budget(calibration, *middle, reading)
-    least = "xyz"[int(np.argmax(np.diag(found_budget.covariance_mm2)))]
+    own = budget(calibration, pan, tilt, calibration.reading(point))
+    least = "xyz"[int(np.argmax(np.diag(own.covariance_mm2)))]
     return Evidence(
         campaign=campaign,
         fit=fit,
         classic=classic_result,
-        held_out=stored_hold_out(campaign, fit),
-        planned=stored_plan(campaign, fit),
+        held_out=stored_hold_out(campaign, fit.provenance.inputs),
+        planned=stored_plan(campaign, fit.provenance.inputs),
         criteria=criteria,
         distances_mm=found,
         range_mm=range_mm,
         maps=maps,
-        budget=found_budget,
-        point=coordinate_budget(found_budget, calibration, point, least),
+        budget=own,
+        point=coordinate_budget(own, calibration, point.tolist(), least),
     )
+
+
+def _maps(campaign: Campaign, result: ClassicResult | None, calibration: Calibration, range_mm: float) -> ErrorMap:
+    """Errors over the counters seen, at the stated range and the scanner's ends."""
+    simple = {"nominal": simple_calibration(campaign.rig.priors)}
+    if result is not None:
+        simple["classic"] = simple_calibration(campaign.rig.priors, result)
+    pan, tilt = (np.linspace(low, high, MAP_CELLS) for low, high in calibration.range_steps)
+    ranges = sorted({*MAP_RANGES_MM, range_mm})
+    return error_map(calibration, pan, tilt, ranges, simple=simple, draws=MAP_DRAWS)
+
+
+def _inflation(fit: FitRecord) -> float:
+    """Limits are judged with the uncertainty that a failed validation leaves."""
+    return 1.0 if fit.summary.validation is None else fit.summary.validation.inflation
+
+
+def _ratio_criteria(campaign: Campaign, fit: FitRecord, limit: float) -> list[Criterion]:
+    """Every effective ratio against its limit, deg/step."""
+    draws, found = stored_ratios(campaign), []
+    for k, direction in enumerate(DIRECTIONS):
+        estimate = fit.summary.effective[direction]
+        if estimate is not None:
+            errors = _inflation(fit) * (draws[:, k] - estimate.value)
+            found.append(criterion(f"ratio {direction}", errors, limit, "deg/step"))
+    return found

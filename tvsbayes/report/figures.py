@@ -13,11 +13,11 @@ import io
 import re
 from collections.abc import Mapping, Sequence
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tvsbayes.estimators.four_point import ClassicResult, select_experiments
+from tvsbayes.estimators.four_point import ClassicResult, DirectionResult, select_experiments
 from tvsbayes.instrument.axes import DIRECTIONS, SENSES
 from tvsbayes.instrument.stereo_pair import triangulate
 
@@ -31,6 +31,8 @@ if TYPE_CHECKING:
     from tvsbayes.coordinates.error_map import ErrorMap
     from tvsbayes.instrument.campaign import Campaign, Spot
     from tvsbayes.metrology.look_budget import Budget
+    from tvsbayes.results.comparison_record import Gap
+    from tvsbayes.results.estimates import Cause, Curves, Estimate, StopResidual
 
 
 WIDTH_IN = 4.6
@@ -40,6 +42,8 @@ BLACK, ORANGE, SKY, GREEN, BLUE, RED, PURPLE, GREY = (
 )
 OF_ESTIMATOR = {"nominal": (GREY, "s"), "classic": (RED, "^"), "joint": (BLUE, "o")}
 """Colour and marker of each estimator in every figure."""
+OF_DIRECTION = {"left": ("<", BLUE), "right": (">", RED), "up": ("^", GREEN), "down": ("v", ORANGE)}
+"""Marker and colour of each direction in figures of ratios."""
 SMALLEST_SHARE = 0.005
 """Of a variance, that has a bar of its own."""
 DIVERGING, SEQUENTIAL = (BLUE, "#FFFFFF", RED), ("#FFFFFF", SKY, BLUE, "#00263E")
@@ -158,13 +162,13 @@ def points_3d(campaign: Campaign, experiment: int | None = None) -> Figure:
     return figure
 
 
-def direction_scatter(result: ClassicResult, direction: str, joint: tuple[float, float] | None = None) -> Figure:
+def direction_scatter(result: ClassicResult, direction: str, joint: Estimate | None = None) -> Figure:
     """One direction's experiments with mean and bands of 1, 2, 3 sigma (paper, Figures 13 to 16).
 
     Args:
         result: of the classic estimator.
         direction: left, right, up or down.
-        joint: value and standard uncertainty of the joint estimator, drawn beside.
+        joint: of the joint estimator, drawn beside.
 
     Raises:
         ValueError: the direction has no experiment.
@@ -181,8 +185,8 @@ def direction_scatter(result: ClassicResult, direction: str, joint: tuple[float,
                 axes.axhspan(mean - k * sd, mean + k * sd, color=shade, label=f"{k} sigma", zorder=0)
         axes.axhline(mean, color=RED, label=f"mean {mean:.6f}")
         if joint is not None:
-            label = f"joint {joint[0]:.6f}, 2 u"
-            axes.errorbar(len(mine) + 1.5, joint[0], 2 * joint[1], fmt="o", color=BLUE, capsize=3, label=label)
+            label = f"joint {joint.value:.6f}, 2 u"
+            axes.errorbar(len(mine) + 1.5, joint.value, 2 * joint.sd, fmt="o", color=BLUE, capsize=3, label=label)
         axes.plot(range(1, len(mine) + 1), [e.deg_per_step for e in mine], "^", color=BLACK, markersize=4)
         axes.set(xlabel="experiment of this direction", ylabel="deg/step", title=f"{direction}, n = {summary.n}")
         figure.legend(loc="outside lower center", ncols=3)
@@ -248,27 +252,23 @@ def coverage(campaign: Campaign) -> Figure:
     return figure
 
 
-def intervals(
-    joint: Mapping[str, tuple[float, tuple[float, float]] | None],
-    classic: Mapping[str, tuple[float, tuple[float, float] | None] | None],
-) -> Figure:
-    """Ratios of both estimators with their 95 % intervals; value and interval by direction, deg/step."""
+def intervals(joint: Mapping[str, Estimate | None], classic: Mapping[str, DirectionResult | None]) -> Figure:
+    """Ratios of both estimators with their 95 % intervals by direction, deg/step."""
+    told = {d: (x.value, x.interval95) for d, x in joint.items() if x is not None}
+    seen = {d: (x.mean_deg_per_step, x.interval95_gum or (x.mean_deg_per_step,) * 2) for d, x in classic.items() if x}
     with _figure(3.2) as figure:
         axes = figure.add_subplot()
-        for offset, name, results in ((-0.12, "classic", classic), (0.12, "joint", joint)):
+        for offset, name, results in ((-0.12, "classic", seen), (0.12, "joint", told)):
             colour, marker = OF_ESTIMATOR[name]
-            labelled = False
+            # Of the first only, or every point would have its line in the legend.
+            label: str | None = name
             for row, direction in enumerate(DIRECTIONS):
-                found = results.get(direction)
-                if found is None:
+                if direction not in results:
                     continue
-                value, interval = found
-                low, high = interval or (value, value)
+                value, (low, high) = results[direction]
                 bars = [[max(value - low, 0.0)], [max(high - value, 0.0)]]
-                label = None if labelled else name
-                style = {"fmt": marker, "color": colour, "capsize": 3, "label": label}
-                axes.errorbar(value, row + offset, xerr=bars, **style)
-                labelled = True
+                axes.errorbar(value, row + offset, xerr=bars, fmt=marker, color=colour, capsize=3, label=label)
+                label = None
         axes.set(yticks=range(len(DIRECTIONS)), yticklabels=DIRECTIONS, xlabel="deg/step, 95 % intervals")
         axes.invert_yaxis()
         axes.tick_params(axis="x", labelrotation=30)
@@ -276,21 +276,18 @@ def intervals(
     return figure
 
 
-def gap_terms(gaps: Mapping[str, Mapping[str, Any] | None]) -> Figure:
-    """Terms of (classic - joint), deg/step, by direction; `gaps` as `fit.json` and `compare.json` hold them."""
+def gap_terms(gaps: Mapping[str, Gap | None]) -> Figure:
+    """Terms of (classic - joint), deg/step, by direction."""
     found = {direction: each for direction, each in gaps.items() if each is not None}
-    markers = dict(zip(DIRECTIONS, "<>^v", strict=True))
-    colours = dict(zip(DIRECTIONS, (BLUE, RED, GREEN, ORANGE), strict=True))
-    names = [term["name"] for term in next(iter(found.values()))["terms"]]
+    names = [term.name for term in next(iter(found.values())).terms]
     with _figure(3.6) as figure:
         axes = figure.add_subplot()
         for shift, (direction, each) in zip(np.linspace(-0.24, 0.24, len(found)), found.items(), strict=True):
-            values = np.array([t["value"] for t in each["terms"]])
-            ends = np.array([t["interval95"] for t in each["terms"]])
-            bars = np.abs(ends.T - values)
-            place = np.arange(len(names)) + shift
-            style = {"fmt": markers[direction], "color": colours[direction], "capsize": 2, "label": direction}
-            axes.errorbar(values, place, xerr=bars, markersize=4, **style)
+            values = np.array([term.value for term in each.terms])
+            ends = np.array([term.interval95 for term in each.terms])
+            marker, colour = OF_DIRECTION[direction]
+            place, bars = np.arange(len(names)) + shift, np.abs(ends.T - values)
+            axes.errorbar(values, place, xerr=bars, fmt=marker, color=colour, capsize=2, label=direction, markersize=4)
         axes.axvline(0.0, color=BLACK, linewidth=0.8)
         wrapped = [name.replace(" and ", "\nand ", 1).replace(" over", "\nover") for name in names]
         axes.set(yticks=range(len(names)), yticklabels=wrapped, xlabel="classic - joint, deg/step, 95 % intervals")
@@ -317,45 +314,47 @@ def correlations(names: Sequence[str], matrix: np.ndarray) -> Figure:
     return figure
 
 
-def residuals(stops: Sequence[Mapping[str, Any]], axis: str) -> Figure:
-    """Deviations of one axis' stops over time and against their counters; `stops` as `fit.json` holds them."""
-    mine = [stop for stop in stops if stop["axis"] == axis]
+def residuals(stops: Sequence[StopResidual], axis: str) -> Figure:
+    """Deviations of one axis' stops over time and against their counters."""
+    mine = [stop for stop in stops if stop.axis == axis]
     directions = SENSES[axis]
     with _figure(4.6) as figure:
         panels = figure.subplots(2, 1, sharey=True)
         for direction, colour, marker in (*zip(directions, (BLUE, RED), "^v", strict=True), ("", GREY, "x")):
-            part = [stop for stop in mine if stop["direction"] == direction]
+            part = [stop for stop in mine if stop.direction == direction]
             if not part:
                 continue
-            scaled = [stop["deviation_deg"] / stop["u_deg"] for stop in part]
-            style = {"color": colour, "markersize": 3.5, "linestyle": "none", "rasterized": True}
+            scaled = [stop.deviation_deg / stop.u_deg for stop in part]
             label = f"moving {direction}" if direction else "unknown approach"
-            panels[0].plot([stop["time_s"] for stop in part], scaled, marker, label=label, **style)
-            panels[1].plot([stop["steps"] for stop in part], scaled, marker, **style)
+            for axes, place in zip(
+                panels, ([stop.time_s for stop in part], [stop.steps for stop in part]), strict=True
+            ):
+                axes.plot(
+                    place, scaled, marker, color=colour, markersize=3.5, linestyle="none", rasterized=True, label=label
+                )
         for axes, name in zip(panels, ("time, s", f"{axis} counter, steps"), strict=True):
             axes.axhspan(-2, 2, color="#EEEEEE", zorder=0)
             axes.axhline(0.0, color=BLACK, linewidth=0.8)
             axes.set(xlabel=name, ylabel="deviation / u")
         panels[0].set_title(f"stops of the {axis} axis, {len(mine)}; band: 2 standard deviations")
-        figure.legend(loc="outside lower center", ncols=3)
+        figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
     return figure
 
 
-def causes(found: Sequence[Mapping[str, Any]], axis: str) -> Figure:
-    """Mean deviation by group of each cause, with two standard errors; `found` as `fit.json` holds it."""
-    mine = [cause for cause in found if cause["axis"] == axis and len(cause["groups"]) > 1]
-    rows = sum(len(cause["groups"]) for cause in mine)
+def causes(found: Sequence[Cause], axis: str) -> Figure:
+    """Mean deviation by group of each cause, with two standard errors."""
+    mine = [cause for cause in found if cause.axis == axis and len(cause.groups) > 1]
+    rows = sum(len(cause.groups) for cause in mine)
     with _figure(1.2 + 0.22 * max(rows, 2)) as figure:
         axes = figure.add_subplot()
-        labels, place = [], 0
+        labels: list[str] = []
         for cause in mine:
-            colour, marker = (RED, "D") if cause["suspicious"] else (BLUE, "o")
-            for group in cause["groups"]:
-                style = {"fmt": marker, "color": colour, "markersize": 4}
-                axes.errorbar(group["mean"], place, xerr=2 * group["standard_error"], **style)
-                labels.append(f"{cause['name']}: {group['label']}")
-                place += 1
-            axes.axhline(place - 0.5, color="#CCCCCC", linewidth=0.6)
+            colour, marker = (RED, "D") if cause.suspicious else (BLUE, "o")
+            for group in cause.groups:
+                reach = 2 * group.standard_error
+                axes.errorbar(group.mean, len(labels), xerr=reach, fmt=marker, color=colour, markersize=4)
+                labels.append(f"{cause.name}: {group.label}")
+            axes.axhline(len(labels) - 0.5, color="#CCCCCC", linewidth=0.6)
         axes.axvline(0.0, color=BLACK, linewidth=0.8)
         axes.set(yticks=range(len(labels)), yticklabels=labels, xlabel="mean deviation / u, two standard errors")
         axes.invert_yaxis()
@@ -374,8 +373,10 @@ def error_maps(found: ErrorMap, range_index: int) -> Figure:
         low, high = (float(seen.min()), float(seen.max())) if len(seen) else (0.0, 1.0)
         for axes, name in zip(panels, names, strict=True):
             values = found.rms_mm[name][:, :, range_index].T
-            scale = {"cmap": _colours(SEQUENTIAL), "vmin": low, "vmax": high}
-            mesh = axes.pcolormesh(found.pan_steps, found.tilt_steps, values, **scale, rasterized=True)
+            colours = _colours(SEQUENTIAL)
+            mesh = axes.pcolormesh(
+                found.pan_steps, found.tilt_steps, values, cmap=colours, vmin=low, vmax=high, rasterized=True
+            )
             figure.colorbar(mesh, ax=axes, label="mm")
             _cells(axes, found.pan_steps, found.tilt_steps, values, low + 0.55 * (high - low))
             axes.set(ylabel="tilt, steps", title=f"{name}, range {found.range_mm[range_index]:.4g} mm")
@@ -391,8 +392,7 @@ def _cells(axes: Axes, x: np.ndarray, y: np.ndarray, values: np.ndarray, dark_ab
             value = values[row, column]
             if np.isfinite(value):
                 colour = "white" if value > dark_above else "black"
-                style = {"ha": "center", "va": "center", "fontsize": 7, "color": colour}
-                axes.text(xx, yy, f"{value:.3g}", **style)
+                axes.text(xx, yy, f"{value:.3g}", ha="center", va="center", fontsize=7, color=colour)
 
 
 def shares(budget: Budget) -> Figure:
@@ -415,23 +415,23 @@ def shares(budget: Budget) -> Figure:
     return figure
 
 
-def ratio_curves(curves: Mapping[str, Sequence[Mapping[str, object]]]) -> Figure:
-    """Effective ratios along both axes with 95 % intervals; `curves` as `fit.json` holds them."""
+def ratio_curves(curves: Curves) -> Figure:
+    """Effective ratios along both axes with 95 % intervals."""
     with _figure(5.4) as figure:
         panels = figure.subplots(2, 1)
-        markers = dict(zip(DIRECTIONS, "<>^v", strict=True))
-        colours = dict(zip(DIRECTIONS, (BLUE, RED, GREEN, ORANGE), strict=True))
         for axes, axis, shown in zip(panels, SENSES, SENSES.values(), strict=True):
-            angle = np.array([entry[f"{axis}_deg"] for entry in curves[axis]])
+            points = curves.ratios[axis]
+            angle = np.array([point.pan_deg if axis == "pan" else point.tilt_deg for point in points])
             for shift, direction in zip((-0.01, 0.01), shown, strict=True):
-                entries = [entry.get(direction) for entry in curves[axis]]
-                if any(entry is None for entry in entries):
+                if any(direction not in point.ratios for point in points):
                     continue
-                value = np.array([entry["value"] for entry in entries])
-                ends = np.array([entry["interval95"] for entry in entries])
-                style = {"fmt": markers[direction] + "-", "color": colours[direction], "capsize": 2, "markersize": 4}
-                place = angle + shift * np.ptp(angle)
-                axes.errorbar(place, value, yerr=np.abs(ends.T - value), label=direction, **style)
+                value = np.array([point.ratios[direction].value for point in points])
+                ends = np.array([point.ratios[direction].interval95 for point in points])
+                marker, colour = OF_DIRECTION[direction]
+                place, bars = angle + shift * np.ptp(angle), np.abs(ends.T - value)
+                axes.errorbar(
+                    place, value, yerr=bars, label=direction, fmt=f"{marker}-", color=colour, capsize=2, markersize=4
+                )
             axes.set(xlabel=f"{axis} angle, deg", ylabel="deg/step")
             axes.legend()
     return figure

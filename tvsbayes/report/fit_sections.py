@@ -1,16 +1,21 @@
-"""Sections: setting, headlines, parameters, identifiability, residuals, tests."""
+"""Sections of the page on a fit: setting, headlines, parameters, what the data tell apart, residuals, tests.
+
+Ratios in deg/step, other values in the unit of their name; frame S in mm for the picture of the rig.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from tvsbayes.instrument.axes import DIRECTIONS
+from tvsbayes.metrology.traceability import stated_value
 from tvsbayes.report import figures
-from tvsbayes.report.tables import Section, TableView, concise, figure_view, interval_text, two_digits
-from tvsbayes.results.estimates import CONTRACTION_LIMIT
+from tvsbayes.report.fit_text import sampling_line
+from tvsbayes.report.result_tables import gap_table, hold_out_table
+from tvsbayes.report.tables import FigureView, Section, TableView, concise, figure_view, interval_text, two_digits
+from tvsbayes.results.estimates import Cause, Validation
 
 if TYPE_CHECKING:
     from tvsbayes.report.evidence import Evidence
@@ -23,36 +28,30 @@ CORRELATED = (
 """Parameters of the correlation matrix, in order; those that were not estimated are left out."""
 
 
+HEADER_SHOWN = (
+    *(("instrument", "instrument"), ("serial", "serial number"), ("operator", "operator"), ("method", "method")),
+    *(("created", "measured or made"), ("notes", "notes")),
+)
+"""Keys of a campaign's header, and what they are called on the page."""
+
+
 def setup_section(e: Evidence) -> Section:
-    campaign, header = e.campaign, e.campaign.header
+    """The rig, and what was measured where."""
+    campaign, header, summary = e.campaign, e.campaign.header, e.fit.summary
     ok = sum(spot.status == "ok" for spot in campaign.spots)
     targets = sorted({spot.target for spot in campaign.spots if spot.target})
-    rows = [
-        [label, str(header[key])]
-        for key, label in (
-            *(
-                ("instrument", "instrument"),
-                ("serial", "serial number"),
-                ("operator", "operator"),
-                ("method", "method"),
-            ),
-            *(("created", "measured or made"), ("notes", "notes")),
-        )
-        if header.get(key)
-    ]
+    rows = [[label, str(header[key])] for key, label in HEADER_SHOWN if header.get(key)]
     rows += [
         ["moves, segments", f"{len(campaign.moves)}, {1 + campaign.moves[-1].segment}"],
-        ["spots used, in all", f"{ok - len(e.fit['excluded_spots'])}, {len(campaign.spots)}"],
+        ["spots used, in all", f"{ok - len(summary.excluded_spots)}, {len(campaign.spots)}"],
         ["placements of the sheet", ", ".join(targets) or "not named"],
     ]
-    environment = header.get("environment") or {}
     for key, unit in (("temperature_degC", "degC"), ("humidity_percent", "%")):
-        stated = environment.get(key)
-        if stated:
-            rows.append([key.split("_")[0], f"{stated['value']:g} {unit}, u = {stated['u']:g} {unit}"])
-    parameters = e.fit["parameters"]
+        if (stated := stated_value(campaign, "environment", key)) is not None:
+            rows.append([key.split("_")[0], f"{stated.value:g} {unit}, u = {stated.u:g} {unit}"])
     names = [f"extrinsics.translation_mm.{a}" for a in "xyz"]
-    where = [parameters[n]["value"] for n in names] if all(n in parameters for n in names) else None
+    known = all(name in summary.parameters for name in names)
+    where = [summary.parameters[name].value for name in names] if known else None
     baseline = campaign.rig.priors["baseline_mm"].value
     views = [
         figure_view(
@@ -71,86 +70,27 @@ def setup_section(e: Evidence) -> Section:
 
 
 def results_section(e: Evidence) -> Section:
-    ratios, rows = e.fit["effective_deg_per_step"], []
-    for direction in DIRECTIONS:
-        joint = ratios.get(direction)
-        classic = None if e.classic is None else e.classic.directions[direction]
-        row = [direction]
-        if joint is None:
-            row += ["never moved", "", ""]
-        else:
-            low, high = joint["interval95"]
-            row += [
-                concise(joint["value"], joint["sd"]),
-                interval_text(low, high, joint["sd"]),
-                two_digits(0.5 * (high - low)),
-            ]
-        if e.classic is None:
-            row += ["not applicable", ""]
-        elif classic is None:
-            row += ["no experiment", ""]
-        else:
-            row += [concise(classic.mean_deg_per_step, classic.u_gum_deg_per_step or 0.0), str(classic.n)]
-        rows.append(row)
-    pose = e.fit["reference_pose_deg"]
-    columns = ["direction", "joint value(u)", "95 % interval", "half of it", "classic value(u)", "n"]
-    caption = (
-        f"Effective degrees of the beam per motor step at pan {pose['pan']:.2f} deg, tilt {pose['tilt']:.2f} "
-        "deg, deg/step"
-    )
-    tables = [TableView(caption, columns, rows), _parameters(e)]
-    joint_view = {d: None if x is None else (x["value"], tuple(x["interval95"])) for d, x in ratios.items()}
-    classic_view = {}
-    if e.classic is not None:
-        classic_view = {
-            d: None if r is None else (r.mean_deg_per_step, r.interval95_gum) for d, r in e.classic.directions.items()
-        }
-    views = [
-        figure_view(
-            figures.intervals(joint_view, classic_view),
-            "Ratios of both estimators with 95 % intervals; values in the table above",
-            "Effective ratios, joint (circles) and classic (triangles).",
-        )
-    ]
+    """Both estimators beside each other, and why they differ."""
     text = [
-        (
-            "value(u): the digits in brackets are the standard uncertainty in units of the last "
-            "place, or with their decimal point the uncertainty itself."
-        )
+        "value(u): the digits in brackets are the standard uncertainty in units of the last place, or with their "
+        "decimal point the uncertainty itself."
     ]
     if e.classic is None:
         text.append("Classic: not applicable, the campaign has no complete four-point experiment.")
-    else:
-        for direction in DIRECTIONS:
-            result = e.classic.directions[direction]
-            if result is None:
-                continue
-            joint = ratios.get(direction)
-            alt = f"{result.n} experiments moving {direction}: mean {result.mean_deg_per_step:.6f} deg/step"
-            if result.sd_deg_per_step is not None:
-                alt += f", standard deviation {result.sd_deg_per_step:.6f}"
-            pair = None if joint is None else (joint["value"], joint["sd"])
-            views.append(
-                figure_view(
-                    figures.direction_scatter(e.classic, direction, pair),
-                    alt,
-                    f"Experiments moving {direction}, with the mean and bands of 1, 2 and 3 sigma.",
-                )
-            )
-    gaps = e.fit.get("gap")
-    if gaps:
-        tables.append(_gap_table(gaps))
+    tables, views = [_both(e), _parameters(e)], [_intervals(e), *_scatters(e)]
+    if e.shown.gap:
+        tables.append(gap_table(e.shown.gap))
         views.append(
             figure_view(
-                figures.gap_terms(gaps),
+                figures.gap_terms(e.shown.gap),
                 "Terms of the difference between both estimators; values in the table above",
                 "Why the classic differs from the joint.",
             )
         )
-    if e.fit.get("curves"):
+    if e.fit.summary.curves is not None:
         views.append(
             figure_view(
-                figures.ratio_curves(e.fit["curves"]["effective_deg_per_step"]),
+                figures.ratio_curves(e.fit.summary.curves),
                 "Effective ratios over the range of pan and tilt angles; values in fit.json",
                 "Effective ratios over the range that was seen.",
             )
@@ -158,36 +98,76 @@ def results_section(e: Evidence) -> Section:
     return Section("Results, classic beside joint", text, tables=tables, figures=views)
 
 
-def _gap_table(gaps: Mapping[str, Mapping[str, object] | None]) -> TableView:
-    found = {d: g for d, g in gaps.items() if g is not None}
-    names = [term["name"] for term in next(iter(found.values()))["terms"]]
+def _both(e: Evidence) -> TableView:
+    """Effective ratios of both estimators by direction."""
+    rows = []
+    for direction in DIRECTIONS:
+        joint = e.fit.summary.effective[direction]
+        classic = None if e.classic is None else e.classic.directions[direction]
+        row = [direction]
+        if joint is None:
+            row += ["never moved", "", ""]
+        else:
+            low, high = joint.interval95
+            interval = interval_text(low, high, joint.sd)
+            row += [concise(joint.value, joint.sd), interval, two_digits(0.5 * (high - low))]
+        if e.classic is None:
+            row += ["not applicable", ""]
+        elif classic is None:
+            row += ["no experiment", ""]
+        else:
+            row += [concise(classic.mean_deg_per_step, classic.u_gum_deg_per_step or 0.0), str(classic.n)]
+        rows.append(row)
+    pose = e.fit.summary.reference_pose_deg
+    caption = (
+        f"Effective degrees of the beam per motor step at pan {pose['pan']:.2f} deg, tilt {pose['tilt']:.2f} "
+        "deg, deg/step"
+    )
+    columns = ["direction", "joint value(u)", "95 % interval", "half of it", "classic value(u)", "n"]
+    return TableView(caption, columns, rows)
 
-    def cell(term: Mapping[str, float]) -> str:
-        text = concise(term["value"], term["sd"])
-        return text if text.startswith("-") else f"+{text}"
 
-    rows = [["classic - joint", *(cell(g["total"]) for g in found.values())]]
-    rows += [[name, *(cell(g["terms"][k]) for g in found.values())] for k, name in enumerate(names)]
-    return TableView("The gap between both estimators by its terms, deg/step", ["term", *found], rows)
+def _intervals(e: Evidence) -> FigureView:
+    """Ratios of both estimators with their intervals."""
+    classic = {} if e.classic is None else e.classic.directions
+    return figure_view(
+        figures.intervals(e.fit.summary.effective, classic),
+        "Ratios of both estimators with 95 % intervals; values in the table above",
+        "Effective ratios, joint (circles) and classic (triangles).",
+    )
+
+
+def _scatters(e: Evidence) -> list[FigureView]:
+    """The experiments of every direction that has some."""
+    views = []
+    for direction in DIRECTIONS if e.classic is not None else ():
+        result = e.classic.directions[direction]
+        if result is None:
+            continue
+        alt = f"{result.n} experiments moving {direction}: mean {result.mean_deg_per_step:.6f} deg/step"
+        if result.sd_deg_per_step is not None:
+            alt += f", standard deviation {result.sd_deg_per_step:.6f}"
+        figure = figures.direction_scatter(e.classic, direction, e.fit.summary.effective[direction])
+        caption = f"Experiments moving {direction}, with the mean and bands of 1, 2 and 3 sigma."
+        views.append(figure_view(figure, alt, caption))
+    return views
 
 
 def _parameters(e: Evidence) -> TableView:
+    """Everything that was estimated, but for the cameras' parameters."""
     rows = []
-    for name, x in e.fit["parameters"].items():
-        if name.startswith("stereo.") or x["sd"] == 0:
+    for name, x in e.fit.summary.parameters.items():
+        if name.startswith("stereo.") or x.sd == 0:
             continue
-        set_by = "" if x["contraction"] is None else ("data" if x["contraction"] >= CONTRACTION_LIMIT else "prior")
-        contraction = "" if x["contraction"] is None else f"{x['contraction']:.2f}"
-        diagnosis = "" if x["rhat"] is None else f"{x['rhat']:.3f}"
         rows.append(
             [
                 name,
-                concise(x["value"], x["sd"]),
-                interval_text(*x["interval95"], x["sd"]),
-                f"{x['prior_sd']:.2g}",
-                contraction,
-                set_by,
-                diagnosis,
+                concise(x.value, x.sd),
+                interval_text(*x.interval95, x.sd),
+                "" if x.prior_sd is None else f"{x.prior_sd:.2g}",
+                "" if x.contraction is None else f"{x.contraction:.2f}",
+                "" if x.contraction is None else "data" if x.informed else "prior",
+                "" if x.rhat is None else f"{x.rhat:.3f}",
             ]
         )
     columns = ["parameter", "value(u)", "95 % interval", "u of the prior", "contraction", "set by", "R-hat"]
@@ -195,8 +175,8 @@ def _parameters(e: Evidence) -> TableView:
 
 
 def identifiability_section(e: Evidence) -> Section:
-    covariance = e.fit["covariance"]
-    names, matrix = covariance["names"], np.array(covariance["matrix"])
+    """What the campaign cannot separate, which stops and priors it hangs on."""
+    names, matrix = e.fit.covariance.names, e.fit.covariance.matrix
     kept = [n for n in CORRELATED if n in names and matrix[names.index(n), names.index(n)] > 0]
     views, rows = [], []
     if len(kept) > 1:
@@ -215,15 +195,16 @@ def identifiability_section(e: Evidence) -> Section:
                 "Correlations of the posterior.",
             )
         )
-    items = [w["text"] for w in e.fit["weak_directions"]] + [entry["text"] for entry in e.fit["leverage"]]
+    summary = e.fit.summary
+    items = [weak.text for weak in summary.weak_directions] + [entry.text for entry in summary.leverage]
     sensitive = [
         [
-            f"{x['parameter']}, {'twice' if x['factor'] > 1 else 'half'} its u",
-            x["quantity"],
-            f"{x['shift_sd']:+.2f}",
-            f"{x['sd_ratio']:.2f}",
+            f"{x.parameter}, {'twice' if x.factor > 1 else 'half'} its u",
+            x.quantity,
+            f"{x.shift_sd:+.2f}",
+            f"{x.sd_ratio:.2f}",
         ]
-        for x in e.fit["prior_sensitivity"]
+        for x in summary.prior_sensitivity
     ]
     text = []
     if not items:
@@ -236,159 +217,103 @@ def identifiability_section(e: Evidence) -> Section:
 
 
 def residuals_section(e: Evidence) -> Section:
-    causes = e.fit.get("residual_causes") or []
-    noise = e.fit["noise"]
+    """Whether the deviations of the stops depend on anything."""
+    summary, causes = e.fit.summary, e.shown.residual_causes
     text = [
-        (
-            f"chi-square {noise['chi2']:.1f} for {noise['dof']:.1f} degrees of freedom; the pixel "
-            f"noise is {noise['pixel_scale']:.2f} times the stated one."
-        )
+        f"chi-square {summary.chi2:.1f} for {summary.dof:.1f} degrees of freedom; the pixel noise is "
+        f"{summary.parameters['pixel_scale'].value:.2f} times the stated one."
     ]
-    rows = [
-        [
-            f"{c['axis']}: {c['name']}",
-            str(len(c["groups"])),
-            "not tested" if c["p"] is None else f"{c['p']:.3f}",
-            "SUSPICIOUS" if c["suspicious"] else "" if c["p"] is None else "no sign",
-        ]
-        for c in causes
-    ]
-    tables = (
-        [TableView("Do the deviations of the stops depend on ...", ["cause", "groups", "p", "verdict"], rows)]
-        if rows
-        else []
-    )
-    groups = [
-        [f"{c['axis']}, {c['name']}: {g['label']}", str(g["count"]), f"{g['mean']:+.2f}", f"{g['standard_error']:.2f}"]
-        for c in causes
-        for g in c["groups"]
-        if len(c["groups"]) > 1
-    ]
-    if groups:
-        tables.append(
-            TableView(
-                "Mean deviation of stops in units of its standard deviation",
-                ["group", "count", "mean", "standard error"],
-                groups,
-            )
-        )
     views = []
     for axis in ("pan", "tilt"):
-        if any(c["axis"] == axis for c in causes):
+        if any(c.axis == axis for c in causes):
             alt = f"Mean deviation by group, {axis} axis; values in the table above"
             views.append(figure_view(figures.causes(causes, axis), alt, f"{axis} axis: mean deviation by group."))
-        stops = [x for x in e.fit.get("residuals") or [] if x["axis"] == axis]
+        stops = [stop for stop in e.shown.residuals if stop.axis == axis]
         if stops:
-            views.append(
-                figure_view(
-                    figures.residuals(stops, axis),
-                    (
-                        f"Deviations of {len(stops)} stops of the {axis} axis over time and counter; "
-                        "group means in the table above"
-                    ),
-                    f"Stops of the {axis} axis: observed minus fitted angle.",
-                )
-            )
+            alt = f"Deviations of {len(stops)} stops of the {axis} axis over time and counter; group means in the "
+            alt += "table above"
+            caption = f"Stops of the {axis} axis: observed minus fitted angle."
+            views.append(figure_view(figures.residuals(stops, axis), alt, caption))
+    tables = [_causes(causes), _groups(causes)] if causes else []
     return Section("Residuals by cause", text, tables=tables, figures=views)
 
 
+def _causes(causes: tuple[Cause, ...]) -> TableView:
+    rows = [
+        [
+            f"{c.axis}: {c.name}",
+            str(len(c.groups)),
+            "not tested" if c.p is None else f"{c.p:.3f}",
+            "SUSPICIOUS" if c.suspicious else "" if c.p is None else "no sign",
+        ]
+        for c in causes
+    ]
+    return TableView("Do the deviations of the stops depend on ...", ["cause", "groups", "p", "verdict"], rows)
+
+
+def _groups(causes: tuple[Cause, ...]) -> TableView | None:
+    rows = [
+        [f"{c.axis}, {c.name}: {g.label}", str(g.count), f"{g.mean:+.2f}", f"{g.standard_error:.2f}"]
+        for c in causes
+        for g in c.groups
+        if len(c.groups) > 1
+    ]
+    columns = ["group", "count", "mean", "standard error"]
+    return TableView("Mean deviation of stops in units of its standard deviation", columns, rows) if rows else None
+
+
 def validation_section(e: Evidence) -> Section:
-    text, items, tables = [], [], []
-    validation = e.fit.get("validation")
+    """Signs of model errors, the sampler's diagnosis, and what was foretold of the classic and of left-out angles."""
+    text, items, validation, sampling = [], [], e.fit.summary.validation, e.fit.summary.sampling
+    tables: list[TableView | None] = []
     if validation is None:
         text.append("The results hold no tests for model errors: run the command fit again.")
     else:
         text.append(
-            f"A clean campaign fails the tests below with a probability of {100 * validation['level']:g} %, all "
-            f"together. Factor on every u: {validation['inflation']:.2f}."
+            f"A clean campaign fails the tests below with a probability of {100 * validation.level:g} %, all "
+            f"together. Factor on every u: {validation.inflation:.2f}."
         )
         tables.append(_tests(validation))
-    sampling = e.fit.get("sampling")
     if sampling is None:
         text.append("The posterior was not sampled: intervals are those of the Laplace approximation.")
     else:
-        worst, bulk, tail = (sampling[k] for k in ("worst_rhat", "least_ess_bulk", "least_ess_tail"))
-        text.append(
-            f"{sampling['walkers']} walkers, {sampling['steps']} steps; worst R-hat {worst['value']:.3f} "
-            f"({worst['quantity']}); least effective draws {bulk['value']:.0f} in the bulk "
-            f"({bulk['quantity']}) and {tail['value']:.0f} in the tails ({tail['quantity']})."
-        )
-        items += [f"UNCONVERGED: {sentence}" for sentence in sampling["missing"]]
-    predicted = e.fit.get("classic_predicted_deg_per_step") or {}
-    rows = []
-    if e.classic is not None:
-        for direction in DIRECTIONS:
-            told, seen = predicted.get(direction), e.classic.directions[direction]
-            if told is not None and seen is not None:
-                spread = np.hypot(told["sd"], seen.u_type_a_deg_per_step or 0.0)
-                z = (seen.mean_deg_per_step - told["value"]) / spread if spread > 0 else 0.0
-                rows.append(
-                    [
-                        direction,
-                        concise(told["value"], told["sd"]),
-                        concise(seen.mean_deg_per_step, seen.u_type_a_deg_per_step or 0.0),
-                        f"{z:+.1f}",
-                    ]
-                )
-    if rows:
-        tables.append(
-            TableView(
-                "What the joint model says the classic estimator should report, and what it reports, deg/step",
-                ["direction", "foretold", "reported, type A", "difference / u"],
-                rows,
-            )
-        )
+        text.append(f"{sampling_line(sampling)}.")
+        items += [f"UNCONVERGED: {sentence}" for sentence in sampling.missing]
+    tables.append(_foretold(e))
     if e.held_out is None:
         text.append(
             "Held-out experiments: not computed; run the command compare on the campaign and make the report again."
         )
     else:
-        text.append(_held_out(e.held_out["held_out"], tables))
+        text.append(f"Held-out experiments: {e.held_out.verdict}: {e.held_out.reason}.")
+        rows = [[d, f"{u:.1e}"] for d, u in e.held_out.unseen.items()]
+        caption = "What no hold-out sees: u by stereo calibration and focal scale, common to all spots, deg/step"
+        tables += [hold_out_table(e.held_out), TableView(caption, ["direction", "u"], rows)]
     return Section("Validation", text, items, tables)
 
 
-def _held_out(held: Mapping[str, object], tables: list[TableView]) -> str:
-    """Its tables are appended; the verdict is returned."""
-    if held["classic"] is not None:
-        rows = [
-            [
-                name,
-                f"{held[name]['rms_deg']:.3f}",
-                f"{held[name]['rms_block_deg']:.3f}",
-                f"{100 * held[name]['coverage']:.0f} %",
-            ]
-            for name in ("classic", "joint")
-        ]
-        tables.append(
-            TableView(
-                "Angles of experiments that were left out, deg",
-                ["estimator", "rms error", "rms of block means", "inside 95 % intervals"],
-                rows,
-            )
-        )
-    rows = [[d, f"{u:.1e}"] for d, u in held["unseen"].items()]
-    tables.append(
-        TableView(
-            "What no hold-out sees: u by stereo calibration and focal scale, common to all spots, deg/step",
-            ["direction", "u"],
-            rows,
-        )
-    )
-    return f"Held-out experiments: {held['verdict']}: {held['reason']}."
+def _foretold(e: Evidence) -> TableView | None:
+    """What the model says of the classic estimator beside what that says."""
+    rows = []
+    for direction in DIRECTIONS if e.classic is not None else ():
+        told, seen = e.fit.summary.classic_predicted[direction], e.classic.directions[direction]
+        if told is None or seen is None:
+            continue
+        u = seen.u_type_a_deg_per_step or 0.0
+        spread = np.hypot(told.sd, u)
+        z = (seen.mean_deg_per_step - told.value) / spread if spread > 0 else 0.0
+        cells = [concise(told.value, told.sd), concise(seen.mean_deg_per_step, u), f"{z:+.1f}"]
+        rows.append([direction, *cells])
+    caption = "What the joint model says the classic estimator should report, and what it reports, deg/step"
+    columns = ["direction", "foretold", "reported, type A", "difference / u"]
+    return TableView(caption, columns, rows) if rows else None
 
 
-def _tests(validation: Mapping[str, object]) -> TableView:
+def _tests(validation: Validation) -> TableView:
     """Every test for a model error, the least p first."""
     rows = [
-        [
-            t["name"],
-            t["where"],
-            f"{t['chi2']:.1f}",
-            str(t["dof"]),
-            f"{t['p']:.2g}",
-            "FAILED" if t["failed"] else "no sign",
-        ]
-        for t in validation["tests"]
+        [t.name, t.where, f"{t.chi2:.1f}", str(t.dof), f"{t.p:.2g}", "FAILED" if t.failed else "no sign"]
+        for t in validation.tests
     ]
     columns = ["sign of", "most at", "chi-square", "degrees of freedom", "p, all places", "verdict"]
     return TableView("Tests for errors that the model does not have", columns, rows)

@@ -1,4 +1,9 @@
-"""The page: verdict, numbers, warnings; HTML and PDF."""
+"""The calibration report as one page: verdict, numbers and warnings at its top, the sections below; HTML and PDF.
+
+No script, nothing fetched. Text of a campaign reaches it through jinja2's autoescape only; pictures are SVG inside
+`data:` images, which browsers open without scripts and without network. Its policy (CSP) allows exactly its own style
+sheet, by hash, and such images.
+"""
 
 from __future__ import annotations
 
@@ -8,8 +13,9 @@ import os
 import shutil
 import subprocess
 import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
@@ -17,7 +23,8 @@ from markupsafe import Markup
 
 from tvsbayes.errors import InputError
 from tvsbayes.files.disk import shipped_data, write_atomically
-from tvsbayes.metrology.dcc import traceability
+from tvsbayes.metrology.traceability import traceability
+from tvsbayes.report.evidence import MET, NOT_MET, Criterion, Evidence
 from tvsbayes.report.fit_sections import (
     identifiability_section,
     residuals_section,
@@ -35,10 +42,8 @@ from tvsbayes.report.uncertainty_sections import (
     method_section,
     plan_section,
 )
-
-if TYPE_CHECKING:
-    from tvsbayes.report.evidence import Evidence
-
+from tvsbayes.results.comparison_record import CANNOT_TELL
+from tvsbayes.results.estimates import FitSummary
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome", "msedge")
 PDF_SECONDS = 120
@@ -104,17 +109,7 @@ def report_html(evidence: Evidence) -> bytes:
 
 
 def _page(e: Evidence) -> Page:
-    fit = e.fit
-    inputs = fit["inputs"]
-    report_id = (
-        hashlib.sha256(
-            repr((sorted(inputs.items()), fit["seed"], fit["versions"], fit["effective_deg_per_step"])).encode()
-        )
-        .hexdigest()[:12]
-        .upper()
-    )
-    header = e.campaign.header
-    verdict, kind = _verdict(e)
+    verdict = verdict_of(e.fit.summary, e.criteria)
     sections = [
         setup_section(e),
         results_section(e),
@@ -134,38 +129,41 @@ def _page(e: Evidence) -> Page:
         caption = "Decision rule: met if P(|error| <= limit) >= 0.95, not met if <= 0.05, else cannot tell"
         criteria = TableView(caption, ["error of", "limit", "probability", "verdict"], rows)
     return Page(
-        report_id=report_id,
-        name=str(header.get("name") or "campaign without a name"),
-        verdict=verdict,
-        verdict_class=kind,
+        report_id=e.fit.report_id,
+        name=str(e.campaign.header.get("name") or "campaign without a name"),
+        verdict=verdict.text,
+        verdict_class=verdict.kind,
         numbers=_numbers(e),
         criteria=criteria,
         traceable=traceability(e.campaign).statement,
         warnings=_warnings(e),
-        versions=fit["versions"],
+        versions=e.fit.provenance.versions,
         sections=sections,
     )
 
 
-def _verdict(e: Evidence) -> tuple[str, str]:
-    """One line, and the class that colours it."""
-    if not e.fit["converged"]:
-        return "NOT CONVERGED: the numbers below must not be used", "not-met"
-    validation = e.fit.get("validation")
-    failed = "" if validation is None or validation["passed"] else validation_lines(validation)[0] + ". "
-    if failed and not e.criteria:
-        return f"{failed}No limit was stated", "cannot-tell"
-    if not e.criteria:
-        return (
-            (
-                "No limit was stated: the results below are without a verdict (state one with "
-                "--limit-deg-per-step or --limit-mm)"
-            ),
-            "cannot-tell",
-        )
+@dataclass(frozen=True)
+class Verdict:
+    """One line, and the class that colours it: "met", "not-met" or "cannot-tell"."""
+
+    text: str
+    kind: str
+
+
+def verdict_of(summary: FitSummary, criteria: Sequence[Criterion]) -> Verdict:
+    """What the page says first: whether its numbers may be used, and whether the limits are met."""
+    if not summary.converged:
+        return Verdict("NOT CONVERGED: the numbers below must not be used", "not-met")
+    validation = summary.validation
+    failed = "" if validation is None or validation.passed else validation_lines(validation)[0] + ". "
+    if failed and not criteria:
+        return Verdict(f"{failed}No limit was stated", "cannot-tell")
+    if not criteria:
+        text = "No limit was stated: the results below are without a verdict (state one with --limit-deg-per-step or "
+        return Verdict(f"{text}--limit-mm)", "cannot-tell")
     told = []
-    for verdict in ("not met", "cannot tell", "met"):
-        mine = [c for c in e.criteria if c.verdict == verdict]
+    for verdict in (NOT_MET, CANNOT_TELL, MET):
+        mine = [c for c in criteria if c.verdict == verdict]
         limits = dict.fromkeys((c.limit, c.unit) for c in mine)
         for limit, unit in limits:
             part = [c for c in mine if (c.limit, c.unit) == (limit, unit)]
@@ -174,25 +172,26 @@ def _verdict(e: Evidence) -> tuple[str, str]:
             told.append((verdict, f"{verdict}: {names} within {limit:.3g} {unit} (P at least {least:.3f})"))
     text = "; ".join(sentence for _, sentence in told)
     judged = "With that factor: " if failed else ""
-    return failed + judged + text[0].upper() + text[1:], told[0][0].replace(" ", "-")
+    return Verdict(failed + judged + text[0].upper() + text[1:], told[0][0].replace(" ", "-"))
 
 
 def _numbers(e: Evidence) -> list[Number]:
     """Worst ratio, how far off the classic is, millimetres at the stated range."""
-    ratios = {d: x for d, x in e.fit["effective_deg_per_step"].items() if x is not None}
+    ratios = {d: x for d, x in e.fit.summary.effective.items() if x is not None}
     numbers = []
     if ratios:
-        half = {d: 0.5 * (x["interval95"][1] - x["interval95"][0]) for d, x in ratios.items()}
-        worst = max(half, key=half.get)
+        half = {d: 0.5 * (x.interval95[1] - x.interval95[0]) for d, x in ratios.items()}
+        worst = max(half, key=lambda d: half[d])
         x, u = ratios[worst], half[worst]
-        note = f"effective deg/step; 95 % interval +- {two_digits(u)}" if x["sd"] > 0 else "fixed"
-        factor = (e.fit.get("validation") or {}).get("inflation", 1.0)
-        if factor > 1:
+        note = f"effective deg/step; 95 % interval +- {two_digits(u)}" if x.sd > 0 else "fixed"
+        validation = e.fit.summary.validation
+        if validation is not None and validation.inflation > 1:
+            factor = validation.inflation
             note += f"; validation failed: use {factor:.2f} times that, {two_digits(factor * u)}"
-        numbers.append(Number(f"least certain ratio: {worst}", concise(x["value"], x["sd"]), note))
+        numbers.append(Number(f"least certain ratio: {worst}", concise(x.value, x.sd), note))
     if e.classic is not None and ratios:
         off = {
-            d: 100 * (r.mean_deg_per_step / ratios[d]["value"] - 1)
+            d: 100 * (r.mean_deg_per_step / ratios[d].value - 1)
             for d, r in e.classic.directions.items()
             if r is not None and d in ratios
         }
@@ -201,10 +200,10 @@ def _numbers(e: Evidence) -> list[Number]:
             numbers.append(Number(f"classic mean, {worst}", f"{off[worst]:+.1f} %", "away from the joint estimate"))
     if len(numbers) < 2:
         numbers.append(Number("classic mean", "not applicable", "no complete four-point experiment"))
-    joint = e.distances_mm["joint"]
-    others = ", ".join(f"{name} {_mm(np.quantile(v, 0.95))}" for name, v in e.distances_mm.items() if name != "joint")
+    below = {name: float(np.quantile(v, 0.95)) for name, v in e.distances_mm.items()}
+    others = ", ".join(f"{name} {_mm(value)}" for name, value in below.items() if name != "joint")
     note = f"95 % of 3D errors stay below this; {others}"
-    numbers.append(Number(f"joint, {e.range_mm:g} mm away", _mm(np.quantile(joint, 0.95)), note))
+    numbers.append(Number(f"joint, {e.range_mm:g} mm away", _mm(below["joint"]), note))
     return numbers
 
 
@@ -213,11 +212,11 @@ def _mm(value: float) -> str:
 
 
 def _warnings(e: Evidence) -> list[str]:
-    found = [str(text) for text in e.fit["problems"]]
-    validation = e.fit.get("validation")
-    if validation is not None and not validation["passed"]:
-        found += validation_lines(validation)
-    if e.fit["estimator"] == "laplace":
+    summary = e.fit.summary
+    found = list(summary.problems)
+    if summary.validation is not None and not summary.validation.passed:
+        found += validation_lines(summary.validation)
+    if summary.estimator == "laplace":
         found.append(
             "Intervals are those of the Laplace approximation at the mode; with few stops of a direction that of the "
             "backlash is too short. The command fit without --no-sample samples the posterior."
@@ -226,11 +225,10 @@ def _warnings(e: Evidence) -> list[str]:
         found.append("The campaign is synthetic: made by the digital twin, not measured.")
     if e.campaign.stereo.assumed:
         found.append("The stereo calibration's covariance is assumed, not estimated.")
-    found += [f"Prior conflict: {text}" for text in e.fit["prior_conflicts"]]
-    if e.fit.get("few_stops"):
-        line = few_stops_line(e.fit["few_stops"], str(e.fit["estimator"]))
-        found.append(f"{line[0].upper()}{line[1:]}.")
-    if e.fit["suspect_spots"]:
-        line = suspect_line(e.fit["suspect_spots"])
-        found.append(f"{line[0].upper()}{line[1:]}.")
-    return found
+    found += [f"Prior conflict: {text}" for text in summary.prior_conflicts]
+    lines = []
+    if summary.few_stops:
+        lines.append(few_stops_line(summary.few_stops, summary.estimator))
+    if summary.suspect_spots:
+        lines.append(suspect_line(summary.suspect_spots))
+    return found + [f"{line[0].upper()}{line[1:]}." for line in lines]

@@ -1,4 +1,7 @@
-"""Numbers, tables, figures and sections that texts and pages are made of."""
+"""What texts and pages are made of: numbers with their uncertainty, tables, figures, sections.
+
+A table is made once and printed by either: `text()` on a terminal, the template of the page in HTML.
+"""
 
 from __future__ import annotations
 
@@ -39,23 +42,16 @@ def concise(value: float, sd: float) -> str:
     return f"{value:.{decimals}f}({digits})"
 
 
+def signed(value: float, sd: float) -> str:
+    """A difference with its sign, as `concise`."""
+    text = concise(value, sd)
+    return text if text.startswith("-") else f"+{text}"
+
+
 def interval_text(low: float, high: float, sd: float) -> str:
     """Interval ends to one digit more than the standard uncertainty's second."""
     decimals = max(0, 2 - math.floor(math.log10(sd))) if sd > 0 else 6
     return f"[{low:.{decimals}f}, {high:.{decimals}f}]"
-
-
-def text_table(title: str, columns: list[str], rows: list[list[str]]) -> str:
-    """A table without lines, for terminals and files alike."""
-    table = Table(title=title, title_justify="left", title_style="", box=None, pad_edge=False)
-    for number, column in enumerate(columns):
-        table.add_column(column, justify="left" if number == 0 else "right", no_wrap=True)
-    for row in rows:
-        table.add_row(*(Text(cell) for cell in row))
-    stream = io.StringIO()
-    # Plain text whatever FORCE_COLOR and the like say: it also goes into files.
-    Console(file=stream, width=120, highlight=False, color_system=None, force_terminal=False).print(table)
-    return "\n".join(line.rstrip() for line in stream.getvalue().splitlines())
 
 
 @dataclass(frozen=True)
@@ -70,6 +66,18 @@ class TableView:
     def pairs(self) -> bool:
         """Names with their values."""
         return not self.columns
+
+    def text(self) -> str:
+        """The table without lines, for terminals and files alike."""
+        table = Table(title=self.caption, title_justify="left", title_style="", box=None, pad_edge=False)
+        for number, column in enumerate(self.columns):
+            table.add_column(column, justify="left" if number == 0 else "right", no_wrap=True)
+        for row in self.rows:
+            table.add_row(*map(Text, row))
+        stream = io.StringIO()
+        # Plain text whatever FORCE_COLOR and the like say: it also goes into files.
+        Console(file=stream, width=120, highlight=False, color_system=None, force_terminal=False).print(table)
+        return "\n".join(line.rstrip() for line in stream.getvalue().splitlines())
 
 
 @dataclass(frozen=True)

@@ -1,26 +1,30 @@
-"""Maps, budgets, axes, plan, method, limits."""
+"""Sections of the page on uncertainty: errors in 3D, budgets, ISO 230-2-style figures, plan, method, limits.
+
+mm in frame T, deg for figures of an axis; budgets name their unit.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tvsbayes.metrology.iso230 import FIGURES
+from tvsbayes.metrology.traceability import header_table
 from tvsbayes.report import figures
+from tvsbayes.report.result_tables import SHARE_SHOWN, point_budget_table
 from tvsbayes.report.tables import Section, TableView, concise, figure_view, two_digits
+from tvsbayes.results.metrology_tables import FIGURES, AxisPositioning, BudgetTable
 
 if TYPE_CHECKING:
     from tvsbayes.report.evidence import Evidence
 
 
-SHARE_SHOWN = 5e-4
-"""Of a variance: smaller ones print as 0.0 %."""
 ESTIMATORS = {"laplace": "Laplace approximation at the mode", "posterior": "posterior sampled by emcee"}
 
 
 def maps_section(e: Evidence) -> Section:
+    """Where which estimator errs by how many millimetres."""
     views = []
     middle = len(e.maps.pan_steps) // 2, len(e.maps.tilt_steps) // 2
     rows = []
@@ -67,23 +71,11 @@ def _cell(value: float) -> str:
 
 
 def budgets_section(e: Evidence) -> Section:
-    tables, views = [], []
-    tables += [_gum_table(table) for table in e.fit["budgets"]]
+    """What the uncertainty of headlines and of a point consists of."""
+    tables = [_gum_table(table) for table in e.shown.budgets]
+    views = []
     if e.budget is not None:
-        u = np.sqrt(e.budget.variance_mm2)
-        order = np.argsort(-e.budget.share)
-        rows = [
-            [e.budget.causes[k], f"{100 * e.budget.share[k]:.1f}", *map(two_digits, u[k])]
-            for k in order
-            if e.budget.share[k] >= SHARE_SHOWN
-        ]
-        tables.append(
-            TableView(
-                f"Budget of a point {e.range_mm:g} mm away, by cause",
-                ["cause", "share %", "u(x) mm", "u(y) mm", "u(z) mm"],
-                rows,
-            )
-        )
+        tables.append(point_budget_table(e.budget, f"Budget of a point {e.range_mm:g} mm away, by cause"))
         views.append(
             figure_view(
                 figures.shares(e.budget),
@@ -92,92 +84,91 @@ def budgets_section(e: Evidence) -> Section:
             )
         )
     if e.point is not None:
-        tables.append(_gum_table(e.point.as_json(), f"{e.range_mm:g} mm away: "))
+        tables.append(_gum_table(e.point, f"{e.range_mm:g} mm away: "))
     return Section("Uncertainty budgets", tables=tables, figures=views)
 
 
-def _gum_table(table: Mapping[str, object], prefix: str = "") -> TableView:
+def _gum_table(table: BudgetTable, prefix: str = "") -> TableView:
     """A budget as GUM 7.2.7 asks for it; sources that matter to no digit are counted in one line."""
-    shown = [row for row in table["rows"] if row["u"] is None or abs(row["share"]) >= SHARE_SHOWN]
+    shown = [row for row in table.rows if row.u is None or abs(row.share) >= SHARE_SHOWN]
     rows = [
         [
-            row["quantity"],
-            row["kind"],
-            row["distribution"],
-            "" if row["u"] is None else two_digits(row["u"]),
-            _freedom(row["dof"]) if row["u"] is not None else "",
-            _blank(row["sensitivity"], ".3g"),
-            "" if row["contribution"] is None else two_digits(row["contribution"]),
-            f"{100 * row['share']:.1f}",
+            row.quantity,
+            row.kind,
+            row.distribution,
+            "" if row.u is None else two_digits(row.u),
+            "" if row.u is None else _freedom(row.dof),
+            "" if row.sensitivity is None else f"{row.sensitivity:.3g}",
+            "" if row.contribution is None else two_digits(row.contribution),
+            f"{100 * row.share:.1f}",
         ]
         for row in shown
     ]
-    if len(shown) < len(table["rows"]):
-        rest = [row["share"] for row in table["rows"] if row not in shown]
+    if len(shown) < len(table.rows):
+        rest = [row.share for row in table.rows if row not in shown]
         rows.insert(-1, [f"{len(rest)} smaller ones", "", "", "", "", "", "", f"{100 * sum(rest):.1f}"])
     caption = (
-        f"{prefix}{table['quantity']}: {concise(table['estimate'], table['u'])} {table['unit']}; effective degrees of "
-        f"freedom {_freedom(table['dof'])}, k = {table['coverage_factor']:.2f}, "
-        f"p = {100 * table['probability']:.0f} %, U = {two_digits(table['expanded'])} {table['unit']}"
+        f"{prefix}{table.quantity}: {concise(table.estimate, table.u)} {table.unit}; effective degrees of "
+        f"freedom {_freedom(table.dof)}, k = {table.coverage_factor:.2f}, "
+        f"p = {100 * table.probability:.0f} %, U = {two_digits(table.expanded)} {table.unit}"
     )
-    if any(row["share"] > 1 for row in shown):
+    if any(row.share > 1 for row in shown):
         # GUM 5.2.2: with correlated inputs the cross terms are as real as the squares.
         caption += "; the inputs are correlated: single shares exceed 100 %, the row of correlations takes them back"
     columns = ["source", "type", "distribution", "u", "dof", "sensitivity", "contribution", "share %"]
     return TableView(caption, columns, rows)
 
 
-def _blank(value: float | None, form: str) -> str:
-    return "" if value is None else format(value, form)
-
-
 def _freedom(dof: float | None) -> str:
-    return "infinite" if dof is None else f"{dof:.0f}"
+    return "infinite" if dof is None or np.isinf(dof) else f"{dof:.0f}"
 
 
 def axes_section(e: Evidence) -> Section:
-    tables, items = [], []
-    for axis in e.fit["positioning"]:
-        rows = [
-            [
-                " ".join(reversed(FIGURES[name])),
-                f"{p['median']:.4f}",
-                f"[{p['interval95'][0]:.4f}, {p['interval95'][1]:.4f}]",
-                "" if axis["plug_in"] is None else _blank(axis["plug_in"].get(name), ".4f"),
-            ]
-            for name, p in (axis["predicted"] or {}).items()
-        ]
-        if rows:
-            caption = (
-                f"{axis['axis']} axis, deg: predicted for {axis['runs']} runs per side at {len(axis['target_steps'])} "
-                "targets, and as the campaign's own stops have it"
-            )
-            tables.append(TableView(caption, ["figure", "median", "95 % interval", "own stops"], rows))
-        if axis["missing"]:
-            items.append(f"{axis['axis']}, own stops: {axis['missing']}")
-        items += [note for note in axis["notes"] if note not in items]
+    """Figures of both axes as ISO 230-2 defines them."""
+    tables = [_axis_table(axis) for axis in e.shown.positioning if axis.predicted]
+    items = []
+    for axis in e.shown.positioning:
+        if axis.missing:
+            items.append(f"{axis.axis}, own stops: {axis.missing}")
+        items += [note for note in axis.notes if note not in items]
     text = [] if tables or items else ["Not computed: the fit has not converged."]
     return Section("ISO 230-2-style figures", text, items, tables)
 
 
+def _axis_table(axis: AxisPositioning) -> TableView:
+    rows = [
+        [
+            " ".join(reversed(FIGURES[name])),
+            f"{p.median:.4f}",
+            f"[{p.interval95[0]:.4f}, {p.interval95[1]:.4f}]",
+            "" if axis.plug_in is None else f"{getattr(axis.plug_in, name):.4f}",
+        ]
+        for name, p in (axis.predicted or {}).items()
+    ]
+    caption = (
+        f"{axis.axis} axis, deg: predicted for {axis.runs} runs per side at {len(axis.target_steps)} "
+        "targets, and as the campaign's own stops have it"
+    )
+    return TableView(caption, ["figure", "median", "95 % interval", "own stops"], rows)
+
+
 def plan_section(e: Evidence) -> Section:
-    items = [w["text"] for w in e.fit["weak_directions"]]
-    if e.planned is None:
+    """What further experiments would bring."""
+    items, plan = [weak.text for weak in e.fit.summary.weak_directions], e.planned
+    if plan is None:
         text = [
             "tvsbayes plan RIG --given CAMPAIGN weighs further experiments; a report made after it shows them here."
         ]
         return Section("What to measure next", text, items)
-    plan, unit = e.planned, e.planned["target"]["unit"]
-    stop = plan["stop"]
+    unit, stop = plan.target.unit, plan.stop
     text = [
-        f"Wanted: {plan['target']['text']}; known now to {plan['now']:.2g} {unit}. "
-        f"{'Stop measuring' if stop['now'] else 'Go on measuring'}: {stop['reason']}. Rule: {stop['rule']}.",
+        f"Wanted: {plan.target.text}; known now to {plan.now:.2g} {unit}. "
+        f"{'Stop measuring' if stop.now else 'Go on measuring'}: {stop.reason}. Rule: {stop.rule}.",
     ]
-    if plan["limited_by"]["needed"]:
-        text.append(plan["limited_by"]["needed"])
+    if plan.limited_by.needed:
+        text.append(plan.limited_by.needed)
     rows = [
-        [batch["text"], f"{batch['minutes']:.1f}", f"{batch['gain']:.2g}", f"{batch['gain_per_minute']:.2g}"]
-        for batch in plan["next"]
+        [batch.text, f"{batch.minutes:.1f}", f"{batch.gain:.2g}", f"{batch.gain_per_minute:.2g}"] for batch in plan.next
     ]
     columns = ["four looks", "minutes", f"gain, {unit}", f"gain a minute, {unit}"]
     tables = [TableView("Next experiments, best first", columns, rows)] if rows else []
@@ -185,29 +176,26 @@ def plan_section(e: Evidence) -> Section:
 
 
 def method_section(e: Evidence) -> Section:
-    fit, header = e.fit, e.campaign.header
+    """How it was computed, from what and by what."""
+    made = e.fit.provenance
     text = [
-        (
-            "Joint model: two-mirror positioner with per-direction ratios, backlash, mirror offset "
-            "and misalignments, seen by a calibrated stereo pair; all spots at once; stop errors "
-            "integrated out; stereo calibration and focal scale uncertain within their stated "
-            "covariance. Classic: the four-point method of doi 10.3390/metrology5040058."
-        ),
-        (
-            f"Estimator: {ESTIMATORS[fit['estimator']]}. Intervals are equal-tailed "
-            "(JCGM 101:2008, 5.3.3), coverage probability 95 %."
-        ),
-        f"Command: {fit['command']}. Seed {fit['seed']}.",
+        "Joint model: two-mirror positioner with per-direction ratios, backlash, mirror offset and misalignments, seen "
+        "by a calibrated stereo pair; all spots at once; stop errors integrated out; stereo calibration and focal "
+        "scale uncertain within their stated covariance. Classic: the four-point method of "
+        "doi 10.3390/metrology5040058.",
+        f"Estimator: {ESTIMATORS[e.fit.summary.estimator]}. Intervals are equal-tailed "
+        "(JCGM 101:2008, 5.3.3), coverage probability 95 %.",
+        f"Command: {made.command}. Seed {made.seed}.",
     ]
-    stated = header.get("traceability") or {}
-    rows = [["traceability", key, str(value)] for key, value in stated.items()]
-    rows += [["sha256", name, str(value)] for name, value in fit["inputs"].items()]
-    rows += [["version", name, str(value)] for name, value in fit["versions"].items()]
+    rows = [["traceability", k, str(v)] for k, v in header_table(e.campaign, "traceability").items()]
+    rows += [["sha256", name, value] for name, value in made.inputs.items()]
+    rows += [["version", name, value] for name, value in made.versions.items()]
     table = TableView("Traceability as declared, inputs, versions", ["", "name", "value"], rows)
     return Section("Method, traceability, provenance", text, tables=[table])
 
 
 def limits_section(e: Evidence) -> Section:
+    """What no number above can tell."""
     items = [
         (
             "The scale of all angles is that of the stereo calibration; an error of its board "

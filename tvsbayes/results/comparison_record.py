@@ -1,14 +1,19 @@
-"""Gap, held-out scores, changes; compare.json and plan.json read back."""
+"""Classic against joint and one date against another, as results; `results/compare.json` written and read.
+
+Ratios and their gaps in deg/step, angles in deg.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
-from tvsbayes.files.disk import read_bytes
-from tvsbayes.files.documents import JSON_BYTES_MAX, Keys, parse_json
 from tvsbayes.instrument.axes import DIRECTIONS
 from tvsbayes.instrument.campaign import Campaign
+from tvsbayes.results.records import plain, read_record, stored_document
+
+COMPARISON_FORMAT = "tvsbayes-compare/1"
+BETTER_CLASSIC, BETTER_JOINT, CANNOT_TELL = "classic predicts better", "joint predicts better", "cannot tell"
 
 
 @dataclass(frozen=True)
@@ -36,9 +41,6 @@ class Gap:
     joint: GapTerm
     total: GapTerm
     terms: tuple[GapTerm, ...]
-
-
-BETTER_CLASSIC, BETTER_JOINT, CANNOT_TELL = "classic predicts better", "joint predicts better", "cannot tell"
 
 
 @dataclass(frozen=True)
@@ -109,7 +111,7 @@ class HoldOut:
 
     def as_json(self) -> dict[str, object]:
         """Plain types."""
-        return asdict(self)
+        return plain(self)
 
 
 @dataclass(frozen=True)
@@ -159,62 +161,52 @@ class Comparison:
 
     def as_json(self) -> dict[str, object]:
         """Plain types."""
-        return {"kind": "two calibrations", **asdict(self)}
+        return {"kind": "two calibrations", **plain(self)}
 
 
-def _stored(campaign: Campaign, fit: Mapping[str, object], name: str) -> Keys | None:
-    """A document in `results/`, where it was made from the data and priors of this fit."""
-    path = campaign.path / "results" / name
-    if not path.exists():
-        return None
-    keys = parse_json(read_bytes(path, JSON_BYTES_MAX), f"results/{name}")
-    return keys if keys.values.get("inputs") == fit["inputs"] else None
+@dataclass(frozen=True)
+class ComparisonRecord:
+    """Classic against joint, as `results/compare.json` holds it.
+
+    Attributes:
+        directions: why both differ, by direction; None without complete experiments.
+        held_out: how both foretell what neither had seen.
+        inputs: hashes of what the campaign's estimates depend on.
+        seed: of the predictive draws.
+    """
+
+    directions: dict[str, Gap | None]
+    held_out: HoldOut
+    inputs: dict[str, str]
+    seed: int
+
+    def as_json(self) -> dict[str, object]:
+        """The document of `compare --json`, without what the caller adds (`files`)."""
+        values = plain(self)
+        head = {"kind": "classic against joint", "format": COMPARISON_FORMAT, "estimator": "laplace"}
+        return head | values
 
 
-def stored_hold_out(campaign: Campaign, fit: Mapping[str, object]) -> dict[str, object] | None:
-    """The document of `compare`; what reports show of it is checked."""
-    keys = _stored(campaign, fit, "compare.json")
+def stored_hold_out(campaign: Campaign, inputs: Mapping[str, str]) -> HoldOut | None:
+    """What `compare` found of held-out angles, if it was made from the data and priors with these hashes.
+
+    Raises:
+        InputError: it is damaged or of another version, with the key.
+    """
+    keys = stored_document(campaign, "compare.json", (COMPARISON_FORMAT,), inputs)
     if keys is None:
         return None
+    again = "run `tvsbayes compare` again"
     held = keys.table("held_out")
-    held.text_value("verdict")
-    held.text_value("reason", 2000)
-    for name in ("classic", "joint"):
-        if held.values.get(name, "") is not None:
-            score = held.table(name)
-            for figure in ("rms_deg", "rms_block_deg"):
-                score.number(figure, 0.0, 1e6)
-            score.number("coverage", 0.0, 1.0)
-        elif held.values.get("classic") is not held.values.get("joint"):
-            raise held.refuse(name, "table", "scores of both estimators or of none", "run `tvsbayes compare` again")
-    for direction in held.table("unseen").values:
+    found = read_record(HoldOut, held, again)
+    if (found.classic is None) != (found.joint is None):
+        lacking = "classic" if found.classic is None else "joint"
+        raise held.refuse(lacking, "table", "scores of both estimators or of none", again)
+    for name in ("classic", "joint") if found.joint else ():
+        for figure, most in (("rms_deg", 1e6), ("rms_block_deg", 1e6), ("coverage", 1.0)):
+            held.table(name).number(figure, 0.0, most)
+    for direction in found.unseen:
         if direction not in DIRECTIONS:
-            raise held.refuse("unseen", "word", ", ".join(DIRECTIONS), "run `tvsbayes compare` again")
+            raise held.refuse("unseen", "word", ", ".join(DIRECTIONS), again)
         held.table("unseen").number(direction, 0.0, 1e6)
-    return keys.values
-
-
-def stored_plan(campaign: Campaign, fit: Mapping[str, object]) -> dict[str, object] | None:
-    """The document of `plan --given`; what reports show of it is checked."""
-    keys = _stored(campaign, fit, "plan.json")
-    if keys is None:
-        return None
-    again = "run `tvsbayes plan --given` again"
-    for name in ("text", "unit"):
-        keys.table("target").text_value(name)
-    keys.number("now", 0.0, 1e6)
-    stop = keys.table("stop")
-    stop.flag("now")
-    stop.text_value("reason", 2000)
-    stop.text_value("rule", 2000)
-    if keys.table("limited_by").values.get("needed") is not None:
-        keys.table("limited_by").text_value("needed", 2000)
-    batches = keys.values.get("next")
-    if not isinstance(batches, list) or not all(isinstance(batch, dict) for batch in batches):
-        raise keys.refuse("next", "list", "a list of tables", again)
-    for batch in batches:
-        entry = Keys(batch, keys.file, keys.text, ("next",))
-        entry.text_value("text", 2000)
-        for name in ("minutes", "gain", "gain_per_minute"):
-            entry.number(name, -1e6, 1e6)
-    return keys.values
+    return found

@@ -1,15 +1,36 @@
-"""What a fit says and how it was examined: typed, JAX-free."""
+"""What a fit says and how it was examined: estimates, what they hang on, tests and residuals of its model.
+
+Values in the units of the contract names: deg, deg/step, mm, rad, px; time in s, counters in steps.
+"""
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from tvsbayes.instrument.axes import DIRECTIONS
+from tvsbayes.results.convergence import Sampling
+from tvsbayes.results.records import plain
 
 CONTRACTION_LIMIT = 0.1
 """1 - (posterior sd / prior sd)^2 below which a value is called set by the prior (DESIGN 8)."""
+
+
+SUMMARY_KEYS = (
+    *("estimator", "converged", "problems", "effective_deg_per_step", "effective_contrast_deg_per_step"),
+    *("reference_pose_deg", "effective_jacobian", "parameters", "noise", "weak_directions", "leverage"),
+    *("classic_predicted_deg_per_step", "excluded_spots", "suspect_spots", "prior_conflicts", "prior_sensitivity"),
+    *("sampling", "curves", "validation", "few_stops"),
+)
+"""Of a summary in `fit.json`, in order; `noise` gathers what other keys hold."""
+KEPT_AS = {
+    "effective_deg_per_step": "effective",
+    "effective_contrast_deg_per_step": "contrasts",
+    "effective_jacobian": "jacobian",
+    "classic_predicted_deg_per_step": "classic_predicted",
+}
+"""Fields of `FitSummary` whose key in `fit.json` is longer."""
 
 
 @dataclass(frozen=True)
@@ -27,10 +48,6 @@ class Estimate:
     rhat: float | None = None
     ess_bulk: float | None = None
     ess_tail: float | None = None
-
-    def as_json(self) -> dict[str, object]:
-        """The sampler's diagnostics are null where nothing was sampled (DESIGN 8)."""
-        return {**asdict(self), "interval95": list(self.interval95)}
 
     @property
     def informed(self) -> bool:
@@ -114,9 +131,55 @@ class Validation:
     inflation: float
     tests: tuple[ValidationTest, ...]
 
+
+@dataclass(frozen=True)
+class RatioAt:
+    """An effective ratio at one pose, deg/step: mean, standard deviation, equal-tailed 95 % interval."""
+
+    value: float
+    sd: float
+    interval95: tuple[float, float]
+
+
+@dataclass(frozen=True)
+class CurvePoint:
+    """Effective ratios of the directions that moved, at one pose of the mirrors."""
+
+    pan_deg: float
+    tilt_deg: float
+    ratios: dict[str, RatioAt]
+
+
+@dataclass(frozen=True)
+class LostMotion:
+    """What a reversal takes from so many steps, deg."""
+
+    steps: int
+    value_deg: float
+    sd_deg: float
+    interval95_deg: tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Curves:
+    """What a posterior says of other poses and step counts.
+
+    Attributes:
+        ratios: by axis ("pan", "tilt"): effective ratios along the angles of that axis that were seen.
+        lost_motion: by direction, for the step counts that were used.
+    """
+
+    ratios: dict[str, tuple[CurvePoint, ...]]
+    lost_motion: dict[str, tuple[LostMotion, ...]]
+
     def as_json(self) -> dict[str, object]:
-        """An optional key of `fit.json`."""
-        return {**asdict(self), "tests": [asdict(test) for test in self.tests]}
+        """As `fit.json` has them: the ratios of a pose stand beside its angles."""
+
+        def flat(point: CurvePoint) -> dict[str, object]:
+            return {"pan_deg": point.pan_deg, "tilt_deg": point.tilt_deg, **plain(point.ratios)}
+
+        along = {axis: [flat(point) for point in points] for axis, points in self.ratios.items()}
+        return {"effective_deg_per_step": along, "lost_motion": plain(self.lost_motion)}
 
 
 @dataclass(frozen=True)
@@ -163,8 +226,8 @@ class FitSummary:
     prior_conflicts: tuple[str, ...]
     prior_sensitivity: tuple[PriorSensitivity, ...]
     estimator: str = "laplace"
-    sampling: dict[str, object] | None = None
-    curves: dict[str, object] | None = None
+    sampling: Sampling | None = None
+    curves: Curves | None = None
     validation: Validation | None = None
     few_stops: dict[str, int] = field(default_factory=dict)
 
@@ -174,39 +237,16 @@ class FitSummary:
         return any(e is not None and e.informed for e in self.effective.values())
 
     def as_json(self) -> dict[str, object]:
-        """The contract's keys, without those that the caller adds (`files`)."""
-
-        def of(estimates):
-            return {name: None if e is None else e.as_json() for name, e in estimates.items()}
-
-        parameters = of(self.parameters)
-        return {
-            "estimator": self.estimator,
-            "converged": self.converged,
-            "problems": list(self.problems),
-            "effective_deg_per_step": of(self.effective),
-            "effective_contrast_deg_per_step": of(self.contrasts),
-            "reference_pose_deg": self.reference_pose_deg,
-            "effective_jacobian": [list(row) for row in self.jacobian],
-            "parameters": parameters,
-            "noise": {
-                "chi2": self.chi2,
-                "dof": self.dof,
-                "pixel_scale": self.parameters["pixel_scale"].value,
-                "stop_sd_deg": {d: self.parameters[f"stop_sd_deg.{d}"].value for d in DIRECTIONS},
-            },
-            "weak_directions": [asdict(w) for w in self.weak_directions],
-            "leverage": [{**asdict(entry), "spots": list(entry.spots)} for entry in self.leverage],
-            "classic_predicted_deg_per_step": of(self.classic_predicted),
-            "excluded_spots": list(self.excluded_spots),
-            "suspect_spots": list(self.suspect_spots),
-            "prior_conflicts": list(self.prior_conflicts),
-            "prior_sensitivity": [asdict(entry) for entry in self.prior_sensitivity],
-            "sampling": self.sampling,
-            "curves": self.curves,
-            "validation": None if self.validation is None else self.validation.as_json(),
-            "few_stops": self.few_stops,
+        """The contract's keys (DESIGN 8), without those that the caller adds (`files`)."""
+        values = plain(replace(self, curves=None))
+        noise = {
+            "chi2": values.pop("chi2"),
+            "dof": values.pop("dof"),
+            "pixel_scale": self.parameters["pixel_scale"].value,
+            "stop_sd_deg": {d: self.parameters[f"stop_sd_deg.{d}"].value for d in DIRECTIONS},
         }
+        values |= {"noise": noise, "curves": None if self.curves is None else self.curves.as_json()}
+        return {key: values[KEPT_AS.get(key, key)] for key in SUMMARY_KEYS}
 
 
 @dataclass(frozen=True)
@@ -288,60 +328,3 @@ class HeadlineCauses:
     centre: np.ndarray
     distribution: tuple[str, ...]
     dof: np.ndarray
-
-
-@dataclass(frozen=True)
-class Convergence:
-    """Whether a chain may be used, and why not.
-
-    Attributes:
-        steps: length of the chain; discarded: first steps left out; thin: one in so many is stored.
-        tau_steps: longest integrated autocorrelation time.
-        rhat, ess_bulk, ess_tail: by contract name, of every sampled or derived quantity.
-        acceptance: share of accepted moves by walker.
-        stuck_walkers: walkers that hardly moved or live at another density.
-        invalid: evaluations that gave no number.
-        pareto_k: tail index of target / proposal in the last pilot draws; above 0.7 the proposal is a poor guide.
-        missing: sentences on what is not reached; empty when converged.
-    """
-
-    steps: int
-    discarded: int
-    thin: int
-    tau_steps: float
-    rhat: dict[str, float]
-    ess_bulk: dict[str, float]
-    ess_tail: dict[str, float]
-    acceptance: np.ndarray
-    stuck_walkers: tuple[int, ...]
-    invalid: int
-    pareto_k: float
-    missing: tuple[str, ...]
-
-    @property
-    def converged(self) -> bool:
-        """All limits of DESIGN 4.3 are met."""
-        return not self.missing
-
-    def as_json(self) -> dict[str, object]:
-        """For fit.json, key `sampling`."""
-        worst = max(self.rhat, key=self.rhat.get)
-        fewest = min(self.ess_bulk, key=self.ess_bulk.get)
-        tail = min(self.ess_tail, key=self.ess_tail.get)
-        return {
-            "converged": self.converged,
-            "missing": list(self.missing),
-            "walkers": len(self.acceptance),
-            "steps": self.steps,
-            "discarded": self.discarded,
-            "thin": self.thin,
-            "tau_steps": self.tau_steps,
-            "worst_rhat": {"quantity": worst, "value": self.rhat[worst]},
-            "least_ess_bulk": {"quantity": fewest, "value": self.ess_bulk[fewest]},
-            "least_ess_tail": {"quantity": tail, "value": self.ess_tail[tail]},
-            "acceptance": float(self.acceptance.mean()),
-            "least_acceptance": float(self.acceptance.min()),
-            "stuck_walkers": list(self.stuck_walkers),
-            "invalid_evaluations": self.invalid,
-            "proposal_pareto_k": self.pareto_k,
-        }

@@ -1,13 +1,18 @@
-"""Results/ of a fit: fit.json and draws.npz, written and read."""
+"""`results/fit.json` as one record: what a fit says, why it can be believed, and what it was made from and by.
+
+Written from the record and read into it; its JSON form is a contract (`data/schemas/fit-1.schema.json`: keys may be
+added within a version, never removed or given another meaning). Units stand in the names.
+"""
 
 from __future__ import annotations
 
-import io
+import datetime
+import hashlib
 import json
 import shlex
 import sys
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, fields
 from functools import cache
 from importlib.metadata import version
 from itertools import islice
@@ -16,90 +21,132 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tvsbayes.calibration.calibration_file import (
-    RESULTS_BYTES_MAX,
-    UNPACKED_BYTES_MAX,
-    calibration_bytes,
-    damaged_calibration,
-    stored_calibration,
-)
-from tvsbayes.calibration.pointing import Calibration
 from tvsbayes.errors import escaped, shown
-from tvsbayes.files.disk import make_folder, read_arrays, read_bytes, shipped_data, write_atomically
+from tvsbayes.files.disk import read_bytes, shipped_data
 from tvsbayes.files.documents import JSON_BYTES_MAX, Keys, parse_json
-from tvsbayes.instrument.campaign import Campaign, input_hashes
+from tvsbayes.results.comparison_record import Gap
+from tvsbayes.results.estimates import KEPT_AS, Cause, FitSummary, StopResidual
+from tvsbayes.results.metrology_tables import AxisPositioning, BudgetTable
+from tvsbayes.results.records import plain, read_record
 
 if TYPE_CHECKING:
-    from tvsbayes.estimators.joint_fit import JointFit
-    from tvsbayes.model.headlines import Derived
-    from tvsbayes.results.estimates import FitSummary
+    from jsonschema import Draft202012Validator
 
-
-@dataclass(frozen=True)
-class StoredMode:
-    """Where a fit ended, as `draws.npz` keeps it: enough to go on without fitting again.
-
-    Attributes:
-        names: parameters, in the order of the coordinates.
-        z, covariance: mode and Laplace covariance in prior coordinates, shapes (p,) and (p, p).
-        log_density: at the mode.
-        prior: value and u of every parameter of the rig that the fit used, shape (2, r).
-        valid, weight: whether each spot, in the order of the fit, was used, and its weight; shape (spots,).
-    """
-
-    names: tuple[str, ...]
-    z: np.ndarray
-    covariance: np.ndarray
-    log_density: float
-    prior: np.ndarray
-    valid: np.ndarray
-    weight: np.ndarray
-
-
-_MODE_ARRAYS = ("z", "covariance", "prior", "valid", "weight")
-
-
-def mode_arrays(mode: StoredMode) -> dict[str, np.ndarray]:
-    """The arrays of `draws.npz` that `stored_mode` reads back; the names stand there already."""
-    return {f"mode_{name}": getattr(mode, name) for name in _MODE_ARRAYS} | {
-        "mode_log_density": np.array(mode.log_density)
-    }
-
-
-def stored_mode(campaign: Campaign) -> StoredMode | None:
-    """Where the fit in `results/` ended, if it was made from exactly these data and priors, and converged.
-
-    Raises:
-        InputError: there are results, but damaged.
-    """
-    if stored_calibration(campaign) is None:
-        return None
-    path = campaign.path / "results" / "draws.npz"
-    try:
-        file = read_arrays(path, RESULTS_BYTES_MAX, UNPACKED_BYTES_MAX)
-        if "mode_z" not in file:
-            return None
-        found = {name: np.array(file[f"mode_{name}"], dtype=float) for name in (*_MODE_ARRAYS, "log_density")}
-        names = tuple(file["names"].tolist())
-        count, spots = len(names), sum(spot.status == "ok" for spot in campaign.spots)
-        shapes = {"z": (count,), "covariance": (count, count), "valid": (spots,), "weight": (spots,), "log_density": ()}
-        if any(found[name].shape != shape for name, shape in shapes.items()) or found["prior"].shape[:1] != (2,):
-            raise ValueError("a mode of another shape")
-        if not all(np.isfinite(array).all() for array in found.values()):
-            raise ValueError("a mode that is not finite")
-        return StoredMode(names, **(found | {"log_density": float(found["log_density"])}))
-    except (KeyError, TypeError, ValueError) as error:
-        raise damaged_calibration(path, error) from error
-
-
-FIT_FORMATS = ("tvsbayes-fit/1",)
+FIT_FORMAT = "tvsbayes-fit/1"
+FIT_FORMATS = (FIT_FORMAT,)
 """Versions of `results/fit.json` that can be read; the schema of each is in `data/schemas`."""
 SCHEMA_PROBLEMS = 20
 """Among which the one to name is chosen: a document of another making has thousands."""
+PACKAGES = (
+    *("tvsbayes", "jax", "optimistix", "equinox", "emcee", "arviz", "numpy", "scipy"),
+    "opencv-python-headless",
+)
+"""Whose versions a result states."""
+AGAIN = "run `tvsbayes fit` again"
+
+
+@dataclass(frozen=True)
+class NamedCovariance:
+    """Of the draws behind the values; rows and columns of `matrix`, shape (n, n), are `names`, in their units."""
+
+    names: tuple[str, ...]
+    matrix: np.ndarray
+
+
+@dataclass(frozen=True)
+class FitEvidence:
+    """What reports show of a fit besides its estimates.
+
+    Attributes:
+        residuals: stops against the fitted model; some where there are very many.
+        residual_causes: whether their deviations depend on depth, direction, N, step phase or time.
+        gap: classic minus joint by its terms, deg/step; None without an experiment that tells it.
+        budgets: GUM budgets of ratios and backlashes.
+        positioning: ISO 230-2-style tables of both axes; empty where the fit must not be used.
+    """
+
+    residuals: tuple[StopResidual, ...] = ()
+    residual_causes: tuple[Cause, ...] = ()
+    gap: dict[str, Gap | None] | None = None
+    budgets: tuple[BudgetTable, ...] = ()
+    positioning: tuple[AxisPositioning, ...] = ()
+
+    def as_json(self) -> dict[str, object]:
+        """Keys of `fit.json`."""
+        return plain(self) | {"budgets": [table.as_json() for table in self.budgets]}
+
+
+@dataclass(frozen=True)
+class Provenance:
+    """What results were made from and by.
+
+    Attributes:
+        inputs: SHA-256 of what the estimate depends on: moves, spots, stereo, rig.
+        versions: of Python and `PACKAGES`.
+        seed: of everything random.
+        command: as it was typed.
+    """
+
+    inputs: dict[str, str]
+    versions: dict[str, str]
+    seed: int
+    command: str
+
+
+def provenance(inputs: Mapping[str, str], seed: int) -> Provenance:
+    """Of results that this process makes."""
+    versions = {"python": sys.version.split()[0], **{name: version(name) for name in PACKAGES}}
+    return Provenance(dict(inputs), versions, seed, shlex.join(["tvsbayes", *sys.argv[1:]]))
+
+
+def covariance_of_draws(names: Sequence[str], physical: np.ndarray, told: Mapping[str, object]) -> NamedCovariance:
+    """Of the columns that were told of; `physical` has shape (draws, names), in the units of the names."""
+    told_of = [index for index, name in enumerate(names) if name in told]
+    return NamedCovariance(tuple(names[i] for i in told_of), np.cov(physical[:, told_of], rowvar=False))
+
+
+@dataclass(frozen=True)
+class FitRecord:
+    """Everything that `results/fit.json` holds.
+
+    Attributes:
+        summary: estimates and diagnostics.
+        covariance: of the parameters' draws.
+        evidence: what reports show besides; None in documents without.
+        provenance: inputs, versions, seed, command.
+    """
+
+    summary: FitSummary
+    covariance: NamedCovariance
+    evidence: FitEvidence | None
+    provenance: Provenance
+
+    def as_json(self) -> dict[str, object]:
+        """The document."""
+        evidence = {} if self.evidence is None else self.evidence.as_json()
+        head = {"format": FIT_FORMAT, **self.summary.as_json(), "covariance": plain(self.covariance)}
+        return {**head, **evidence, **asdict(self.provenance)}
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 of what the results say, from what and by what: the identity of everything made from them."""
+        said = plain([self.summary.estimator, self.summary.effective, self.summary.parameters])
+        made = [self.provenance.inputs, self.provenance.versions, self.provenance.seed]
+        return hashlib.sha256(json.dumps([said, made], sort_keys=True).encode()).hexdigest()
+
+    @property
+    def report_id(self) -> str:
+        """Number of a report of these results: twelve hexadecimal digits."""
+        return self.digest[:12].upper()
+
+    def certificate_id(self, name: object, issued: datetime.date) -> str:
+        """Of a certificate of these results for the campaign of that name: `tvsbayes-` and 32 hexadecimal digits."""
+        text = json.dumps([self.digest, str(name), issued.isoformat()])
+        return f"tvsbayes-{hashlib.sha256(text.encode()).hexdigest()[:32]}"
 
 
 @cache
-def _fit_validator(version: str):
+def _fit_validator(version: str) -> Draft202012Validator:
     from jsonschema import Draft202012Validator
 
     path = shipped_data() / "schemas" / f"fit-{version}.schema.json"
@@ -133,111 +180,67 @@ def _schema_problem(values: object, version: str) -> tuple[list[str | int], str]
             return place, f"{other} {shown(rule)}"
 
 
+def _check_schema(keys: Keys, version: str) -> None:
+    problem = _schema_problem(keys.values, version)
+    if problem is None:
+        return
+    place, allowed = problem
+    value: object = keys.values
+    for part in place:
+        if isinstance(value, list) and isinstance(part, int):
+            value = value[part]
+        else:
+            value = value.get(str(part), "nothing") if isinstance(value, dict) else "nothing"
+    # An entry of a list is named by the key of the list.
+    *path, key = (part for part in place if isinstance(part, str))
+    raise Keys({}, keys.file, keys.text, tuple(path)).refuse(key, "schema", allowed, AGAIN, shown(value))
+
+
 def _check_agreement(keys: Keys) -> None:
     """What no schema can say: sizes that belong together, names that others stand for."""
-    again = "run `tvsbayes fit` again"
     covariance = keys.table("covariance")
-    count = len(covariance.values["names"])
-    if any(len(row) != count for row in [covariance.values["matrix"], *covariance.values["matrix"]]):
-        raise covariance.refuse("matrix", "shape", f"{count} rows of {count} numbers", again)
+    names, matrix = covariance.values["names"], covariance.values["matrix"]
+    # The schema has them as lists.
+    assert isinstance(names, list) and isinstance(matrix, list)
+    if any(len(row) != len(names) for row in [matrix, *matrix]):
+        raise covariance.refuse("matrix", "shape", f"{len(names)} rows of {len(names)} numbers", AGAIN)
     keys.integer("seed", 0, 2**63 - 1)
     keys.text_value("command", 20_000)
     for name in ("python", "tvsbayes", *keys.table("versions").values):
         keys.table("versions").text_value(name)
 
 
-def read_fit(path: Path | str) -> dict[str, object]:
+def _summary_keys(keys: Keys) -> Keys:
+    """The document's table under the names that `FitSummary` gives to what it holds."""
+    values = {KEPT_AS.get(key, key): value for key, value in keys.values.items()} | keys.table("noise").values
+    if keys.values["curves"] is not None:
+        curves = keys.table("curves")
+        along = {
+            axis: [
+                {"pan_deg": point.pop("pan_deg"), "tilt_deg": point.pop("tilt_deg"), "ratios": point}
+                for point in map(dict, points)
+            ]
+            for axis, points in curves.table("effective_deg_per_step").values.items()
+        }
+        values["curves"] = {"ratios": along, "lost_motion": curves.values["lost_motion"]}
+    return Keys(values, keys.file, keys.text)
+
+
+def read_fit(path: Path | str) -> FitRecord:
     """Read `results/fit.json` of any version: what reports and certificates are written from, held to its schema.
 
     Raises:
         InputError: missing, damaged or of an unknown version, with the key.
     """
     keys = parse_json(read_bytes(Path(path), JSON_BYTES_MAX), escaped(Path(path).name))
-    version = keys.word("format", FIT_FORMATS).removeprefix("tvsbayes-fit/")
-    if problem := _schema_problem(keys.values, version):
-        place, allowed = problem
-        value: object = keys.values
-        for part in place:
-            value = value[part] if isinstance(part, int) else value.get(part, "nothing")
-        # An entry of a list is named by the key of the list.
-        *path, key = (part for part in place if isinstance(part, str))
-        table = Keys({}, keys.file, keys.text, tuple(path))
-        raise table.refuse(key, "schema", allowed, "run `tvsbayes fit` again", shown(value))
+    _check_schema(keys, keys.word("format", FIT_FORMATS).removeprefix("tvsbayes-fit/"))
     _check_agreement(keys)
-    return keys.values
-
-
-FIT_FORMAT = "tvsbayes-fit/1"
-
-
-def fit_document(
-    fit: JointFit, summary: FitSummary, seed: int, draws: Derived, evidence: Mapping[str, object] | None = None
-) -> dict[str, object]:
-    """The content of `results/fit.json` (DESIGN 7): estimates, covariance of `draws` with names, provenance.
-
-    `evidence` adds what reports show besides: residuals by cause, the gap to the classic estimator.
-    """
-    names = list(summary.parameters)
-    packages = ("tvsbayes", "jax", "optimistix", "equinox", "emcee", "arviz", "numpy", "scipy")
-    packages += ("opencv-python-headless",)
-    estimated = [index for index, name in enumerate(fit.names) if name in names]
-    covariance = np.cov(draws.physical[:, estimated], rowvar=False)
-    return {
-        "format": FIT_FORMAT,
-        **summary.as_json(),
-        "covariance": {"names": [fit.names[i] for i in estimated], "matrix": covariance.tolist()},
-        **(evidence or {}),
-        "inputs": input_hashes(fit.campaign),
-        "versions": {"python": sys.version.split()[0], **{name: version(name) for name in packages}},
-        "seed": seed,
-        "command": shlex.join(["tvsbayes", *sys.argv[1:]]),
-    }
-
-
-def write_results(
-    fit: JointFit,
-    summary: FitSummary,
-    folder: Path,
-    seed: int,
-    calibration: Calibration | None = None,
-    draws: Derived | None = None,
-    evidence: Mapping[str, object] | None = None,
-) -> dict[str, str]:
-    """Write `fit.json` and `draws.npz`, each whole or not at all.
-
-    Args:
-        fit: the fit.
-        summary: what is said of it.
-        folder: is made where it does not exist.
-        seed: of everything random.
-        calibration: what `locate` and `steps-for` read back; None for a fit that must not be used.
-        draws: behind the summary, one leading axis; None for the Laplace approximation's.
-        evidence: further keys of `fit.json`, see `fit_document`.
-
-    Returns:
-        Paths by "fit" and "draws".
-
-    Raises:
-        InputError: the folder cannot be written.
-    """
-    draws = fit.draws if draws is None else draws
-    arrays = {
-        "names": np.array(fit.names),
-        "estimator": np.array(summary.estimator),
-        "physical": draws.physical,
-        "effective_deg_per_step": draws.effective_deg_per_step,
-        "reference_pose_rad": fit.reference_pose_rad,
-    }
-    if calibration is None:
-        buffer = io.BytesIO()
-        np.savez_compressed(buffer, **arrays)
-        content = buffer.getvalue()
-    else:
-        del arrays["estimator"]
-        content = calibration_bytes(calibration, **arrays, **mode_arrays(fit.stored))
-    document = json.dumps(fit_document(fit, summary, seed, draws, evidence), indent=1, allow_nan=False)
-    contents = {"draws": ("draws.npz", content), "fit": ("fit.json", document.encode())}
-    make_folder(folder)
-    for name, data in contents.values():
-        write_atomically(folder / name, data)
-    return {key: str(folder / name) for key, (name, _) in contents.items()}
+    # Documents of the first tvsbayes hold none; a part of it is none.
+    shown_besides = {field.name for field in fields(FitEvidence)} <= set(keys.values)
+    evidence = read_record(FitEvidence, keys, AGAIN) if shown_besides else None
+    return FitRecord(
+        read_record(FitSummary, _summary_keys(keys), AGAIN),
+        read_record(NamedCovariance, keys.table("covariance"), AGAIN),
+        evidence,
+        read_record(Provenance, keys, AGAIN),
+    )

@@ -86,7 +86,7 @@ FAULTS = (
     ),
     Fault(
         "simulated data called traceable",
-        "metrology/dcc.py",
+        "metrology/traceability.py",
         'if campaign.header.get("synthetic"):\n        return Traceability',
         'if campaign.header.get("simulated"):\n        return Traceability',
         "a twin's report claims a length standard",
@@ -102,7 +102,7 @@ FAULTS = (
     ),
     Fault(
         "DCC: degrees called radians",
-        "metrology/dcc.py",
+        "metrology/dcc_elements.py",
         '"deg": r"\\degree"',
         '"deg": r"\\radian"',
         "a machine reads the backlash 57 times too large",
@@ -110,7 +110,7 @@ FAULTS = (
     ),
     Fault(
         "DCC: ratios in degrees",
-        "metrology/dcc.py",
+        "metrology/dcc_elements.py",
         '"deg/step": r"\\degree\\per\\one"',
         '"deg/step": r"\\degree"',
         "a ratio without its step",
@@ -118,7 +118,7 @@ FAULTS = (
     ),
     Fault(
         "DCC: whole width as expanded uncertainty",
-        "metrology/dcc.py",
+        "metrology/dcc_elements.py",
         "expanded, middle = 0.5 * (high - low), 0.5 * (high + low)",
         "expanded, middle = high - low, 0.5 * (high + low)",
         "k = 3.92 in the certificate",

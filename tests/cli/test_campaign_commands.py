@@ -1,0 +1,149 @@
+"""`check`, `simulate`, `new`, `demo`: documents and exit codes."""
+
+from __future__ import annotations
+
+import re
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.commands import (
+    DATA,
+    DIRECTIONS,
+    MOUNTED,
+    PAPER_TWIN,
+    assert_error,
+    two_sheets,
+)
+
+from tvsbayes.instrument.campaign import read_campaign, write_campaign
+from tvsbayes.instrument.plan import write_plan
+
+pytestmark = pytest.mark.usefixtures("own_compilation_cache")
+
+
+def test_check_reads_campaign_rig_and_plan(ask, say):
+    code, document = ask("check", PAPER_TWIN)
+    assert code == 0
+    assert document == {
+        "kind": "campaign",
+        "moves": 244,
+        "segments": 1,
+        "spots": 384,
+        "ok_spots": 384,
+        "refused": {},
+        "aperture_readings": 0,
+        "experiments": 96,
+        "warnings": [],
+    }
+    code, document = ask("check", MOUNTED / "rig.toml")
+    assert (code, document["kind"], document["sheets_mm"]["d1"]) == (0, "rig", 175.0)
+    code, document = ask("check", MOUNTED / "paper.csv")
+    assert (code, document["kind"], document["look"], document["home"]) == (0, "plan", 384, 1)
+    code, out, _ = say("check", PAPER_TWIN)
+    assert code == 0
+    assert "spots: 384" in out
+    assert out.endswith(", 0 warnings\n")
+
+
+def test_check_warns_without_failing(ask, say, grid_campaign, tmp_path):
+    """Weak directions alone are exit 0 (DESIGN 8)."""
+    stereo = replace(grid_campaign.stereo, parameter_covariance=np.zeros((24, 24)))
+    write_campaign(replace(grid_campaign, stereo=stereo), tmp_path / "exact")
+    code, document = ask("check", tmp_path / "exact")
+    assert code == 0
+    assert len(document["warnings"]) == 1
+    assert "covariance is zero" in document["warnings"][0]
+    assert "warning: the stereo covariance is zero" in say("check", tmp_path / "exact")[1]
+
+
+def test_check_tells_a_folder_from_a_file(ask, grid_folder, tmp_path):
+    shutil.copytree(grid_folder, tmp_path / "camp.csv")
+    code, document = ask("check", tmp_path / "camp.csv")
+    assert code == 0 and document["spots"] > 0
+
+
+def test_simulate_writes_a_campaign_and_repeats_itself(ask, tmp_path):
+    plan = tmp_path / "plan.csv"
+    write_plan(two_sheets((100, 30)), plan)
+    documents = []
+    for name, seed in (("a", 7), ("b", 7), ("c", 8)):
+        code, document = ask("simulate", MOUNTED / "rig.toml", plan, tmp_path / name, "--aperture", "--seed", seed)
+        assert code == 0
+        documents.append(document)
+    assert documents[0] == {"campaign": str(tmp_path / "a"), "moves": 2, "spots": 8, "ok": 8, "seed": 7}
+    names = {"campaign.toml", "stereo.json", "moves.csv", "spots.csv", "truth.json"}
+    assert {path.name for path in (tmp_path / "a").iterdir()} == names
+    for name in names:
+        assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
+    assert (tmp_path / "a" / "spots.csv").read_bytes() != (tmp_path / "c" / "spots.csv").read_bytes()
+    assert all(spot.aperture_deg is not None for spot in read_campaign(tmp_path / "a").spots)
+    code, document = ask("simulate", MOUNTED / "rig.toml", plan, tmp_path / "a")
+    assert code == 2
+    assert_error(document, "occupied")
+
+
+def test_new_campaign_lacks_only_its_stereo_calibration(ask, say, tmp_path):
+    out = tmp_path / "mine"
+    code, document = ask("new", out)
+    assert code == 0
+    assert sorted(document["files"]) == ["campaign.toml", "moves.csv", "rig.toml", "spots.csv"]
+    code, document = ask("check", out)
+    assert code == 2
+    assert assert_error(document, "missing-file")["file"] == "stereo.json"
+    (out / "stereo.json").write_bytes((MOUNTED / "stereo.json").read_bytes())
+    code, document = ask("check", out)
+    assert code == 0
+    assert (document["moves"], document["spots"]) == (1, 0)
+    assert ask("check", out / "rig.toml")[0] == 0
+    code, text, log = say("new", out)
+    assert (code, text) == (2, "")
+    assert "nothing is overwritten" in log
+
+
+def test_demo_shows_classic_and_joint_beside_the_truth(ask, tmp_path):
+    out = tmp_path / "kept"
+    code, document = ask("demo", out)
+    assert code == 0
+    assert set(document) == {"classic", "fit", "truth"}
+    fit, truth = document["fit"], document["truth"]
+    intervals = {d: fit["effective_deg_per_step"][d]["interval95"] for d in DIRECTIONS}
+    names = ("backlash_deg.pan", "backlash_deg.tilt", "effective_mirror_offset_mm")
+    intervals |= {name: fit["parameters"][name]["interval95"] for name in names}
+    assert set(truth) == set(intervals)
+    for name, (low, high) in intervals.items():
+        assert low < truth[name] < high, name
+    # The claim that the demo exists for: type A intervals of the classic estimator miss.
+    for direction, result in document["classic"]["directions"].items():
+        low, high = result["interval95_type_a"]
+        assert not low < truth[direction] < high
+    # What the joint model expects the classic estimator to say is what it says, within five sds of both.
+    for direction, result in document["classic"]["directions"].items():
+        predicted = fit["classic_predicted_deg_per_step"][direction]
+        sd = np.hypot(predicted["sd"], result["u_type_a_deg_per_step"])
+        assert abs(predicted["value"] - result["mean_deg_per_step"]) < 5 * sd
+    assert (out / "truth.json").is_file()
+    assert (out / "results" / "fit.json").is_file()
+    assert ask("demo", out)[0] == 2
+
+
+def test_readme_shows_what_the_demo_prints(say):
+    """Same lines; each number within a tenth of its uncertainty (another processor rounds differently)."""
+    readme = DATA.parent / "README.md"
+    if not readme.is_file():
+        pytest.skip("the README is not part of an installed package")
+    shown = readme.read_text(encoding="utf-8").split("```text\n")[1].split("```")[0]
+    code, out, _ = say("demo")
+    assert code == 0
+    number = re.compile(r"(-?\d+\.\d+)(?:\((\d+\.?\d*)\))?")
+    assert [re.sub(r" +", " ", number.sub("#", line)) for line in out.splitlines()] == [
+        re.sub(r" +", " ", number.sub("#", line)) for line in shown.splitlines()
+    ]
+    pairs = list(zip(number.finditer(out), number.finditer(shown), strict=True))
+    assert len(pairs) == 4 * 3 + 3 * 2
+    for (value, digits), (value_shown, digits_shown) in ((a.groups(), b.groups()) for a, b in pairs):
+        unit = 10.0 ** -len(value.partition(".")[2])
+        u = unit if digits is None else float(digits) * (1.0 if "." in digits else unit)
+        assert abs(float(value) - float(value_shown)) <= max(0.1 * u, 1.01 * unit)
+        assert (digits is None) == (digits_shown is None)

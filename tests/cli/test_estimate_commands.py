@@ -1,0 +1,337 @@
+"""`classic`, `fit`, `report`, `compare`: documents, files and exit codes."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.commands import (
+    DATA,
+    DIRECTIONS,
+    ESTIMATE_KEYS,
+    PAPER_TWIN,
+    assert_error,
+    no_constant,
+    steps,
+    two_sheets,
+    with_spots,
+)
+from support.fit_documents import problems
+
+from tvsbayes.estimators.four_point import select_experiments
+from tvsbayes.instrument.campaign import read_campaign, write_campaign
+from tvsbayes.instrument.parameters import Prior
+from tvsbayes.instrument.protocols import mixed_protocol
+from tvsbayes.twin.simulated_campaign import simulate
+
+pytestmark = pytest.mark.usefixtures("own_compilation_cache")
+
+
+def test_classic_document_has_the_contracts_keys(ask):
+    code, document = ask("classic", PAPER_TWIN)
+    assert code == 0
+    assert set(document) == {"directions", "experiments", "skipped"}
+    contract = {
+        "n",
+        "mean_deg_per_step",
+        "sd_deg_per_step",
+        "u_type_a_deg_per_step",
+        "interval95_type_a",
+        "u_gum_deg_per_step",
+        "interval95_gum",
+    }
+    assert list(document["directions"]) == list(DIRECTIONS)
+    for result in document["directions"].values():
+        # Two more than DESIGN 8 names.
+        assert set(result) == contract | {"u_stereo_deg_per_step", "effective_dof"}
+        assert result["n"] == 24
+        low, high = result["interval95_type_a"]
+        assert low < result["mean_deg_per_step"] < high
+    assert len(document["experiments"]) == 96
+    keys = {"experiment", "direction", "steps", "theta_i_deg", "theta_f_deg", "deg_per_step"}
+    assert all(set(e) == keys for e in document["experiments"])
+
+
+def test_classic_gives_null_for_a_direction_without_experiments(ask, say, tmp_path):
+    twin = read_campaign(PAPER_TWIN)
+    left_only = tuple(s for s in twin.spots if s.experiment < 24)
+    write_campaign(replace(twin, spots=left_only), tmp_path / "left")
+    code, document = ask("classic", tmp_path / "left")
+    assert code == 0
+    assert document["directions"]["left"]["n"] == 24
+    assert [document["directions"][d] for d in DIRECTIONS[1:]] == [None] * 3
+    assert "no experiment" in say("classic", tmp_path / "left")[1]
+
+
+def test_classic_without_a_complete_experiment_has_nothing_to_estimate(ask, grid_folder):
+    code, document = ask("classic", grid_folder)
+    assert code == 3
+    assert set(document) == {"error"}
+
+
+def test_fit_document_has_the_contracts_keys_and_its_files(ask, grid_folder):
+    code, document = ask("fit", grid_folder, "--no-sample", "--seed", 4)
+    assert code == 0
+    assert (document["estimator"], document["converged"], document["seed"]) == ("laplace", True, 4)
+    assert list(document["effective_deg_per_step"]) == list(DIRECTIONS)
+    assert set(document["reference_pose_deg"]) == {"pan", "tilt"}
+    required = {
+        *("degrees_per_step.pan", "degrees_per_step.tilt"),
+        *(f"degrees_per_step.{d}" for d in DIRECTIONS),
+        *("ratio_contrast_deg_per_step.pan", "ratio_contrast_deg_per_step.tilt"),
+        *("backlash_deg.pan", "backlash_deg.tilt", "tilt_zero_deg"),
+        *("mirror_offset_mm", "effective_mirror_offset_mm", "mirror1_error_deg", "mirror2_error_deg"),
+        *("laser_tilt_deg.x", "laser_tilt_deg.y", "laser_offset_mm.x", "laser_offset_mm.y"),
+        *("tilt_axis_skew_deg", "tilt_axis_offset_mm.x", "tilt_axis_offset_mm.z"),
+        *(f"extrinsics.{kind}.{axis}" for kind in ("rotation_rad", "translation_mm") for axis in "xyz"),
+        *(f"stop_sd_deg.{d}" for d in DIRECTIONS),
+        *("pixel_scale", "focal_scale", "stereo.left.fx"),
+    }
+    # Without aperture readings a, C0 and the aperture's zero and noise are not estimated.
+    assert required <= set(document["parameters"])
+    assert not {"baseline_mm", "pan_zero_emission_deg", "aperture_zero_deg", "aperture_sd_deg"} & set(
+        document["parameters"]
+    )
+    for estimate in (*document["parameters"].values(), *document["effective_deg_per_step"].values()):
+        assert set(estimate) == ESTIMATE_KEYS
+        low, high = estimate["interval95"]
+        assert low <= estimate["value"] <= high
+        assert estimate["rhat"] is estimate["ess_bulk"] is estimate["ess_tail"] is None
+    for direction in DIRECTIONS:
+        assert document["effective_deg_per_step"][direction]["contraction"] > 0.9
+    assert {"chi2", "dof", "pixel_scale"} <= set(document["noise"])
+    assert document["noise"]["pixel_scale"] == document["parameters"]["pixel_scale"]["value"]
+    assert all({"text", "loadings"} <= set(weak) for weak in document["weak_directions"])
+    assert document["excluded_spots"] == []
+    assert document["files"] == {
+        "draws": str(grid_folder / "results" / "draws.npz"),
+        "fit": str(grid_folder / "results" / "fit.json"),
+    }
+    saved = json.loads((grid_folder / "results" / "fit.json").read_text(), parse_constant=no_constant)
+    assert saved["format"] == "tvsbayes-fit/1"
+    assert problems(saved, json.loads((DATA / "schemas" / "fit-1.schema.json").read_text())) == []
+    assert {**{key: saved[key] for key in document if key != "files"}, "files": document["files"]} == document
+    with np.load(grid_folder / "results" / "draws.npz", allow_pickle=False) as draws:
+        assert draws["effective_deg_per_step"].shape == (len(draws["physical"]), 4)
+        column = list(draws["names"]).index("backlash_deg.pan")
+        sd = document["parameters"]["backlash_deg.pan"]["sd"]
+        assert draws["physical"][:, column].std() == pytest.approx(sd, rel=1e-9)
+
+
+def test_fit_for_people_names_value_interval_and_origin(say, grid_folder, tmp_path):
+    out = tmp_path / "elsewhere"
+    out.mkdir()
+    (out / "posterior.nc").write_bytes(b"of an earlier fit")
+    code, text, told = say("fit", grid_folder, "--no-sample", "--out", out)
+    assert code == 0
+    assert not (out / "posterior.nc").exists() and "posterior.nc of an earlier fit is removed" in told
+    row = next(line for line in text.splitlines() if line.startswith("effective left"))
+    assert row.split()[-1] == "data"
+    assert str(out / "fit.json") in text
+    assert (out / "draws.npz").is_file()
+    assert not (grid_folder / "results").exists()
+
+
+@pytest.mark.slow
+def test_fit_samples_writes_for_arviz_and_refuses_what_has_not_converged(ask, grid_folder, monkeypatch):
+    """The limits are loosened: what is tested is the way from options to files, not convergence."""
+    import arviz
+
+    from tvsbayes.posterior import sampling
+
+    for name, value in {"FIRST_CHECK": 40, "BLOCK": 20, "ESS_LIMIT": 50, "RHAT_LIMIT": 3.0, "TAU_LIMIT": 1}.items():
+        monkeypatch.setattr(sampling, name, value)
+    code, document = ask("fit", grid_folder, "--seed", 2)
+    assert (code, document["estimator"], document["converged"]) == (0, "posterior", True)
+    left = document["effective_deg_per_step"]["left"]
+    assert left["interval95"][0] < left["value"] < left["interval95"][1]
+    assert left["ess_bulk"] >= 50 and left["rhat"] <= 3.0
+    assert document["parameters"]["degrees_per_step.left"]["ess_tail"] > 0
+    assert set(document["files"]) == {"fit", "draws", "posterior", "chain"}
+    assert {"effective_deg_per_step", "lost_motion"} == set(document["curves"])
+    tree = arviz.from_netcdf(document["files"]["posterior"])
+    assert list(tree["posterior"]["degrees_per_step"].dims) == ["chain", "draw", "direction"]
+    assert list(tree["posterior"]["backlash_deg"].dims) == ["chain", "draw", "axis"]
+    assert {"prior", "posterior_predictive", "log_likelihood", "observed_data", "sample_stats"} <= set(tree.children)
+    mean = tree["posterior"]["effective_deg_per_step"].sel(direction="left").mean().item()
+    assert mean == pytest.approx(left["value"], rel=1e-12)
+    assert arviz.summary(tree, var_names=["backlash_deg"]).shape[0] == 2
+
+    monkeypatch.setattr("tvsbayes.posterior.sampling.ESS_LIMIT", 10**9)
+    code, document = ask("fit", grid_folder, "--seed", 2, "--resume", "--max-minutes", "0.01")
+    assert (code, document["estimator"], document["converged"]) == (4, "laplace", False)
+    assert document["error"]["code"] == "unconverged"
+    assert document["sampling"]["steps"] > 40
+    code, document = ask("fit", grid_folder, "--seed", 3, "--resume")
+    assert (code, document["error"]["code"]) == (2, "other-chain")
+
+
+def test_per_axis_fit_has_one_gear_ratio_per_axis(ask, grid_folder):
+    code, document = ask("fit", grid_folder, "--no-sample", "--per-axis")
+    assert code == 0
+    parameters = document["parameters"]
+    assert parameters["degrees_per_step.left"]["value"] == parameters["degrees_per_step.right"]["value"]
+    contrast = parameters["ratio_contrast_deg_per_step.tilt"]
+    assert (contrast["value"], contrast["sd"], contrast["prior_sd"], contrast["contraction"]) == (0.0, 0.0, 0.0, None)
+
+
+def test_fit_without_backlash_and_with_harmonics(ask, grid_campaign, grid_folder, tmp_path):
+    code, document = ask("fit", grid_folder, "--no-sample", "--harmonics")
+    assert code == 2 and "harmonic_period_deg.pan" in document["error"]["remedy"]
+    table = replace(grid_campaign.rig, harmonic_period_deg={"tilt": 360.0})
+    write_campaign(replace(grid_campaign, rig=table), tmp_path / "wheel")
+    code, document = ask("fit", tmp_path / "wheel", "--no-sample", "--harmonics", "--no-backlash")
+    assert code == 0
+    parameters = document["parameters"]
+    assert {name for name in parameters if name.startswith("harmonic_deg")} == {
+        f"harmonic_deg.tilt.{order}.{part}" for order in (1, 2) for part in ("cos", "sin")
+    }
+    assert parameters["backlash_deg.pan"]["value"] == parameters["backlash_deg.tilt"]["sd"] == 0.0
+
+
+def test_robust_fit_names_the_spot_it_leaves_out(ask, grid_campaign, tmp_path):
+    spots = list(grid_campaign.spots)
+    # 40 stated sds.
+    spots[9] = replace(spots[9], v_left_px=spots[9].v_left_px + 40 * spots[9].sv_left_px)
+    write_campaign(replace(grid_campaign, spots=tuple(spots)), tmp_path / "odd")
+    code, document = ask("fit", tmp_path / "odd", "--no-sample", "--robust")
+    assert code == 0
+    assert document["excluded_spots"] == [spots[9].spot]
+
+
+def test_a_direction_never_moved_is_null_and_one_side_is_weak(ask, say, mounted_rig, tmp_path):
+    plan = two_sheets((40, 0), (80, 30), (120, 30), (160, 60), (200, 90))
+    write_campaign(simulate(mounted_rig, plan, seed=5).campaign, tmp_path / "one way")
+    code, document = ask("fit", tmp_path / "one way", "--no-sample")
+    assert code == 0
+    effective = document["effective_deg_per_step"]
+    assert effective["right"] is effective["down"] is None
+    assert effective["left"]["contraction"] > 0.9
+    texts = [weak["text"] for weak in document["weak_directions"]]
+    assert [text for text in texts if "pan ratio and pan backlash" in text and "from one side" in text]
+    assert "never moved" in say("fit", tmp_path / "one way", "--no-sample")[1]
+
+
+def test_too_few_spots_are_nothing_to_estimate(ask, grid_campaign, tmp_path):
+    write_campaign(replace(grid_campaign, spots=grid_campaign.spots[:7]), tmp_path / "few")
+    code, document = ask("fit", tmp_path / "few", "--no-sample")
+    assert code == 3
+    assert_error(document, "too-few-spots")
+    assert not (tmp_path / "few" / "results").exists()
+
+
+def test_spots_at_one_stop_inform_no_headline(ask, mounted_rig, tmp_path):
+    """Both axes move, but only after the last look."""
+    looks = [("place", "d1"), *[("look",)] * 5, ("place", "d2"), *[("look",)] * 5]
+    plan = steps(("home", 0, 0), *looks, ("move", 100, 50), ("move", 0, 0))
+    write_campaign(simulate(mounted_rig, plan, seed=6).campaign, tmp_path / "still")
+    code, document = ask("fit", tmp_path / "still", "--no-sample")
+    assert code == 3
+    assert_error(document, "uninformed")
+    # The document is there all the same, and says where the values come from.
+    assert all(e["contraction"] < 0.1 for e in document["effective_deg_per_step"].values())
+
+
+def test_swapped_cameras_end_in_words_and_files(ask, mounted_rig, tmp_path):
+    """Predicted pixels beyond the lens model, draws far out: no number that JSON cannot hold."""
+
+    def swapped(s):
+        left, right = (s.u_left_px, s.v_left_px), (s.u_right_px, s.v_right_px)
+        changed = zip(("u_left_px", "v_left_px", "u_right_px", "v_right_px"), (*right, *left), strict=True)
+        return replace(s, **dict(changed))
+
+    four = simulate(mounted_rig, mixed_protocol(4), seed=3).campaign
+    write_campaign(with_spots(four, swapped), tmp_path / "swapped")
+    code, document = ask("fit", tmp_path / "swapped", "--no-sample")
+    assert code == 4 and "swapped cameras" in document["error"]["remedy"]
+    saved = json.loads((tmp_path / "swapped" / "results" / "fit.json").read_text(), parse_constant=no_constant)
+    assert problems(saved, json.loads((DATA / "schemas" / "fit-1.schema.json").read_text())) == []
+
+
+def test_a_spot_beyond_the_lens_and_one_twice_cost_themselves_only(ask, mounted_rig, tmp_path):
+    """One that cannot be undistorted is left out by name; experiments without a ratio have no gap."""
+    four = simulate(mounted_rig, mixed_protocol(2), seed=3).campaign
+    selection = select_experiments(four)
+    ups = set(selection.experiments[selection.direction == "up"].tolist())
+    firsts = {s.experiment: s for s in four.spots if s.point == 1}
+    lost = next(s.spot for s in four.spots if s.experiment not in ups)
+
+    def spoilt(s):
+        if s.spot == lost:
+            return replace(s, u_left_px=1279.0, v_left_px=719.0)
+        if s.experiment in ups and s.point == 2:
+            names = ("u_left_px", "v_left_px", "u_right_px", "v_right_px")
+            return replace(s, **{name: getattr(firsts[s.experiment], name) for name in names})
+        return s
+
+    stereo = replace(four.stereo, D1=np.array([-0.4, 0.0, 0.0, 0.0, 0.0]))
+    write_campaign(replace(with_spots(four, spoilt), stereo=stereo), tmp_path / "c")
+    code, document = ask("fit", tmp_path / "c", "--no-sample")
+    assert code == 0 and document["excluded_spots"] == [lost]
+    assert document["classic_predicted_deg_per_step"]["up"] is None
+    saved = json.loads((tmp_path / "c" / "results" / "fit.json").read_text())
+    assert saved["gap"]["up"] is None and saved["gap"]["down"] is not None
+
+
+def test_looks_at_one_stop_have_nothing_to_tell(ask, grid_campaign, tmp_path):
+    seen = grid_campaign.moves[grid_campaign.spots[0].move]
+    only = replace(grid_campaign.moves[0], pan_steps=seen.pan_steps, tilt_steps=seen.tilt_steps)
+    here = replace(grid_campaign, moves=(only,), spots=tuple(s for s in grid_campaign.spots if s.move == seen.move))
+    repeated = [replace(s, spot=k, move=0, u_left_px=s.u_left_px + 0.02 * k) for k, s in enumerate(here.spots * 12)]
+    write_campaign(replace(here, spots=tuple(repeated)), tmp_path / "c")
+    code, document = ask("fit", tmp_path / "c", "--no-sample")
+    assert (code, document["error"]["code"]) == (3, "uninformed")
+
+
+def test_all_fixed_is_nothing_to_estimate(ask, grid_campaign, tmp_path):
+    priors = {name: replace(prior, u=0.0) for name, prior in grid_campaign.rig.priors.items()}
+    stereo = replace(grid_campaign.stereo, parameter_covariance=np.zeros((24, 24)))
+    write_campaign(replace(grid_campaign, stereo=stereo, rig=replace(grid_campaign.rig, priors=priors)), tmp_path / "c")
+    code, document = ask("fit", tmp_path / "c", "--no-sample")
+    assert (code, document["error"]["code"]) == (3, "nothing-free")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("u", "swap", "ends"), [(0.05, False, 0), (0.5, False, 0), (0.0, False, 0), (0.0, True, 4)])
+def test_noise_above_the_stated_is_no_misfit(ask, grid_campaign, tmp_path, u, swap, ends):
+    """A misfit is a factor on the stated noise, however sure the noise was said to be; swapped cameras are one."""
+    rng = np.random.default_rng(1)
+
+    def louder(s):
+        names = ("u_left_px", "v_left_px", "u_right_px", "v_right_px")
+        pixels = [getattr(s, name) + 0.25 * rng.normal() for name in (names[2:] + names[:2] if swap else names)]
+        return replace(s, **dict(zip(names, pixels, strict=True)))
+
+    priors = {**grid_campaign.rig.priors, "pixel_scale": Prior(1.0, u, "log-normal")}
+    write_campaign(
+        with_spots(replace(grid_campaign, rig=replace(grid_campaign.rig, priors=priors)), louder), tmp_path / "c"
+    )
+    assert ask("fit", tmp_path / "c", "--no-sample")[0] == ends
+
+
+def test_a_fit_that_did_not_converge_is_exit_4(ask, say, grid_folder, monkeypatch):
+    import tvsbayes
+
+    fitted = tvsbayes.fit(read_campaign(grid_folder))
+
+    def astray(*arguments, **options):
+        return replace(fitted, converged=False, problems=("it went astray",))
+
+    monkeypatch.setattr("tvsbayes.estimators.joint_fit.fit", astray)
+    code, document = ask("fit", grid_folder, "--no-sample")
+    assert code == 4
+    assert document["converged"] is False
+    assert "it went astray" in assert_error(document, "not-converged")["message"]
+    code, _, log = say("fit", grid_folder, "--no-sample")
+    assert code == 4
+    assert "NOT CONVERGED: it went astray" in log
+
+
+def test_a_report_for_a_browser_that_is_not_there_ends_at_once(ask, grid_folder, monkeypatch):
+    monkeypatch.setattr("tvsbayes.report.page.BROWSERS", ())
+    monkeypatch.setattr("tvsbayes.pipeline.record_for", None)
+    monkeypatch.setattr("tvsbayes.cli.estimate_commands.record_for", None)
+    code, document = ask("report", grid_folder, "--pdf")
+    assert (code, document["error"]["code"]) == (2, "no-browser")

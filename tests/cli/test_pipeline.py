@@ -1,0 +1,55 @@
+"""Results made whole, and taken up again by whoever needs them."""
+
+from __future__ import annotations
+
+import sys
+
+import numpy as np
+import pytest
+
+import tvsbayes
+from tvsbayes.cli.app import report_line
+from tvsbayes.instrument.campaign import read_campaign
+from tvsbayes.instrument.model_choice import ModelChoice
+from tvsbayes.pipeline import compile_for, fit_for
+
+pytestmark = pytest.mark.usefixtures("own_compilation_cache")
+
+
+def test_what_a_fit_left_is_taken_up_again(grid_folder, monkeypatch):
+    """`compare` and `plan --given` start from results/ (DESIGN 8): the same model, mode and draws, no second fit."""
+    from tvsbayes.estimators.joint_fit import restored
+    from tvsbayes.results.stored_draws import stored_mode
+
+    campaign = read_campaign(grid_folder)
+    assert stored_mode(campaign) is None
+    results = tvsbayes.calibrate(campaign, grid_folder / "results", model=ModelChoice(per_axis=True), sampled=False)
+    fresh = results.fit
+    back = restored(campaign, stored_mode(campaign))
+    for name in ("z", "covariance", "draws_z", "free", "reference_pose_rad"):
+        np.testing.assert_array_equal(getattr(back, name), getattr(fresh, name))
+    np.testing.assert_array_equal(back.draws.effective_deg_per_step, fresh.draws.effective_deg_per_step)
+    assert (back.converged, back.log_density, back.chi2) == (True, fresh.log_density, fresh.chi2)
+    monkeypatch.setattr("tvsbayes.estimators.joint_fit.fit", None)
+    monkeypatch.setattr("tvsbayes.studies.study_job.fit", None)
+    assert fit_for(campaign, report_line).converged
+    (grid_folder / "moves.csv").write_bytes((grid_folder / "moves.csv").read_bytes() + b"\n")
+    assert stored_mode(read_campaign(grid_folder)) is not None, "a blank line changes nothing that was measured"
+    spots = (grid_folder / "spots.csv").read_text().replace("d2", "d3")
+    (grid_folder / "spots.csv").write_text(spots)
+    assert stored_mode(read_campaign(grid_folder)) is None
+
+
+def test_whoever_waits_for_the_first_compilation_is_told(tmp_path, capsys, monkeypatch):
+    import jax
+
+    monkeypatch.setenv("TVSBAYES_CACHE", str(tmp_path))
+    monkeypatch.setattr(jax.config, "update", lambda *_: None)
+    compile_for(report_line)
+    assert capsys.readouterr().err == "", "progress is for terminals"
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
+    compile_for(report_line)
+    assert "first run" in capsys.readouterr().err
+    (tmp_path / "jit_fit-cache").touch()
+    compile_for(report_line)
+    assert capsys.readouterr().err == ""

@@ -1,0 +1,56 @@
+"""What a report gathers from `results/`: only what belongs to these data, and is whole."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+from support.reported_twin import BATCH, PLANNED, evidence_of
+
+from tvsbayes.errors import InputError
+
+STORED = {"compare.json": "held_out", "plan.json": "planned"}
+
+
+@pytest.mark.parametrize("name", STORED)
+def test_results_that_belong_to_other_data_are_not_reported(reported, name):
+    """Those of another campaign are left out."""
+    (reported / "results" / name).write_text(json.dumps({"inputs": {"moves": "0"}}))
+    try:
+        assert getattr(evidence_of(reported), STORED[name]) is None
+    finally:
+        (reported / "results" / name).unlink()
+
+
+@pytest.mark.parametrize("name", STORED)
+@pytest.mark.parametrize("content", [{}, {"held_out": None, "target": 3}, {"held_out": {"verdict": "x"}, "target": {}}])
+def test_results_that_no_command_wrote_are_refused_by_name(reported, evidence, name, content):
+    path = reported / "results" / name
+    path.write_text(json.dumps({"inputs": evidence.fit.provenance.inputs, **content}))
+    try:
+        with pytest.raises(InputError, match=f"results/{name}"):
+            evidence_of(reported)
+    finally:
+        path.unlink()
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "column"),
+    [
+        ("now", None, "now"),
+        ("target", {"text": 3, "unit": "mm"}, "target.text"),
+        ("stop", {"now": "no", "reason": "", "rule": ""}, "stop.now"),
+        ("limited_by", {"needed": ["a"]}, "limited_by.needed"),
+        ("next", {}, "next"),
+        ("next", [{**BATCH, "gain": "high"}], "next.gain"),
+    ],
+)
+def test_a_damaged_plan_is_refused_by_key(reported, evidence, key, value, column):
+    path = reported / "results" / "plan.json"
+    path.write_text(json.dumps({"inputs": evidence.fit.provenance.inputs, **PLANNED, key: value}))
+    try:
+        with pytest.raises(InputError) as caught:
+            evidence_of(reported)
+        assert caught.value.column == column
+    finally:
+        path.unlink()

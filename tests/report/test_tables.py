@@ -1,0 +1,76 @@
+"""Numbers with their uncertainty, `value(u)`, and tables as text."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from tvsbayes.report.tables import TableView, concise, interval_text
+
+
+@pytest.mark.parametrize(
+    ("value", "sd", "expected"),
+    [
+        (0.059394, 0.000081, "0.059394(81)"),
+        (0.0593944, 0.0008082, "0.05939(81)"),
+        (-12.3456, 0.0123, "-12.346(12)"),
+        # Rounding the sd to two digits carries into the next decade: 10, never 100.
+        (0.0593944, 0.0000994, "0.059394(99)"),
+        (0.0593944, 0.0000995, "0.05939(10)"),
+        (0.0593944, 0.0000996, "0.05939(10)"),
+        (0.0593944, 0.00099999, "0.0594(10)"),
+        (21.34, 0.996, "21.3(1.0)"),
+        (21.34, 1.54, "21.3(1.5)"),
+        (21.34, 9.94, "21.3(9.9)"),
+        (21.34, 9.96, "21(10)"),
+        (21.34, 12.6, "21(13)"),
+        (1234.5, 123.0, "1234(120)"),
+        (0.2, 0.0, "0.2"),
+        (200.0, 0.0, "200"),
+        (0.2, math.nan, "0.2"),
+        (0.2, math.inf, "0.2"),
+        (0.0, 1e-12, "0.0000000000000(10)"),
+    ],
+)
+def test_concise_shows_two_digits_of_the_uncertainty(value, sd, expected):
+    assert concise(value, sd) == expected
+
+
+@pytest.mark.parametrize("mantissa", [1.0, 1.049, 1.05, 4.44, 9.4999, 9.5, 9.949, 9.95, 9.96, 9.999])
+def test_concise_says_the_uncertainty_to_five_percent(mantissa):
+    """Read back: two digits leave at most half a unit of 1.0, 5 %; value and digits end at the same place."""
+    for exponent in range(-9, 3):
+        sd = mantissa * 10.0**exponent
+        number, digits = concise(math.pi, sd).rstrip(")").split("(")
+        places = len(number.partition(".")[2])
+        shown = float(digits) if "." in digits or not places else int(digits) * 10.0**-places
+        assert len(digits.replace(".", "").rstrip("0") or "0") <= 2
+        assert shown == pytest.approx(sd, rel=0.0501)
+        assert abs(float(number) - math.pi) <= 0.5 * 10.0**-places
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "sd", "expected"),
+    [
+        (0.061926, 0.0622781, 0.00009, "[0.0619260, 0.0622781]"),
+        (-0.5, 0.5, 0.25, "[-0.500, 0.500]"),
+        (18.3, 24.3, 1.54, "[18.30, 24.30]"),
+        (-100.0, 300.0, 123.0, "[-100, 300]"),
+        (0.2, 0.2, 0.0, "[0.200000, 0.200000]"),
+    ],
+)
+def test_interval_ends_carry_one_digit_more_than_the_uncertainty(low, high, sd, expected):
+    assert interval_text(low, high, sd) == expected
+
+
+def test_tables_are_plain_text_whatever_the_terminal_says(monkeypatch):
+    monkeypatch.setenv("FORCE_COLOR", "1")
+    monkeypatch.setenv("COLUMNS", "20")
+    text = TableView("title", ["name", "95 %"], [["[bold]a[/bold]", "1.25"], ["longer name", "[1, 2]"]]).text()
+    assert text.splitlines() == [
+        "title",
+        "name              95 %",
+        "[bold]a[/bold]    1.25",
+        "longer name     [1, 2]",
+    ]

@@ -1,0 +1,96 @@
+"""The files in `results/`: whole or not at all, and read back."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.small_campaign import small_campaign
+from support.small_results import small_draws, small_mode, small_record, small_summary
+
+from tvsbayes.calibration.calibration_file import load_calibration
+from tvsbayes.calibration.pointing import INPUT_NAMES, NOISE_NAMES, Calibration
+from tvsbayes.errors import InputError
+from tvsbayes.instrument.campaign import input_hashes
+from tvsbayes.results.stored_draws import write_results
+
+
+def test_results_are_two_files_with_their_provenance(tmp_path):
+    summary, folder = small_summary(), tmp_path / "new" / "results"
+    paths = write_results(folder, small_record(summary, seed=5), small_draws())
+    assert paths == {"draws": str(folder / "draws.npz"), "fit": str(folder / "fit.json")}
+    assert sorted(path.name for path in folder.iterdir()) == ["draws.npz", "fit.json"]
+
+    def refuse(constant):
+        raise AssertionError(f"{constant} is no JSON")
+
+    document = json.loads((folder / "fit.json").read_text(), parse_constant=refuse)
+    assert document["format"] == "tvsbayes-fit/1"
+    assert document["seed"] == 5
+    assert document["inputs"] == input_hashes(small_campaign())
+    assert document["effective_deg_per_step"]["right"] is None
+    assert document["covariance"]["names"] == ["backlash_deg.pan", "pixel_scale"]
+    assert {"python", "tvsbayes", "jax", "numpy"} <= set(document["versions"])
+    assert document["command"].startswith("tvsbayes")
+    with np.load(folder / "draws.npz", allow_pickle=False) as draws:
+        physical, names = draws["physical"], list(draws["names"])
+    assert names == ["backlash_deg.pan", "not estimated", "pixel_scale"]
+    expected = np.cov(physical[:, [0, 2]], rowvar=False)
+    np.testing.assert_allclose(document["covariance"]["matrix"], expected, rtol=1e-12)
+
+
+def test_results_with_a_calibration_are_read_back(tmp_path):
+    count = len(INPUT_NAMES)
+    calibration = Calibration(
+        mean=np.arange(count, dtype=float),
+        covariance=np.eye(count),
+        noise_variance=dict.fromkeys(NOISE_NAMES, 0.01),
+        overshoot_steps={"pan": 3, "tilt": 4},
+        estimator="posterior",
+        inputs=np.ones((5, count)),
+        noise=np.ones((5, len(NOISE_NAMES))),
+    )
+    write_results(tmp_path, small_record(), small_draws(), calibration, small_mode())
+    found = load_calibration(tmp_path)
+    assert (found.estimator, found.overshoot_steps["tilt"]) == ("posterior", 4)
+    np.testing.assert_array_equal(found.mean, calibration.mean)
+    np.testing.assert_array_equal(found.inputs, calibration.inputs)
+    with np.load(tmp_path / "draws.npz", allow_pickle=False) as draws:
+        assert draws["physical"].shape == (50, 3)
+        assert str(draws["estimator"]) == "posterior"
+    write_results(tmp_path, small_record(), small_draws())
+    with pytest.raises(InputError, match="did not converge"):
+        load_calibration(tmp_path)
+
+
+def test_nan_is_written_nowhere(tmp_path):
+    with pytest.raises(ValueError, match="JSON"):
+        write_results(tmp_path / "results", small_record(replace(small_summary(), chi2=math.nan)), small_draws())
+    assert not (tmp_path / "results").exists()
+
+
+def test_a_failed_write_leaves_the_old_result_whole(tmp_path, monkeypatch):
+    write_results(tmp_path, small_record(seed=1), small_draws())
+    before = (tmp_path / "fit.json").read_bytes()
+    replace_file = os.replace
+
+    def full(source, target):
+        if str(target).endswith("fit.json"):
+            raise OSError(28, "No space left on device")
+        replace_file(source, target)
+
+    monkeypatch.setattr(os, "replace", full)
+    with pytest.raises(InputError, match="No space left"):
+        write_results(tmp_path, small_record(seed=2), small_draws())
+    assert (tmp_path / "fit.json").read_bytes() == before
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["draws.npz", "fit.json"]
+
+
+def test_a_file_where_the_folder_should_be_is_bad_input(tmp_path):
+    (tmp_path / "results").write_text("")
+    with pytest.raises(InputError):
+        write_results(tmp_path / "results", small_record(), small_draws())

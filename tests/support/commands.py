@@ -1,0 +1,121 @@
+"""Commands run in this process, and campaigns, plans and folders for them.
+
+One fit compiles the model (the paper twin, the grids and small campaigns share one bucket), all others reuse it.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tvsbayes.cli.main import run
+from tvsbayes.files.disk import shipped_data
+from tvsbayes.instrument.campaign import Campaign, write_campaign
+from tvsbayes.instrument.plan import PlanStep
+from tvsbayes.instrument.protocols import grid_protocol
+from tvsbayes.twin.simulated_campaign import simulate
+
+DATA = shipped_data()
+
+
+MOUNTED = DATA / "rigs" / "mounted"
+
+
+PAPER_TWIN = DATA / "twins" / "paper_twin"
+
+
+DIRECTIONS = ("left", "right", "up", "down")
+
+
+ESTIMATE_KEYS = {"value", "sd", "interval95", "prior_sd", "contraction", "rhat", "ess_bulk", "ess_tail"}
+
+
+def no_constant(name: str) -> None:
+    raise AssertionError(f"{name} is no JSON")
+
+
+@pytest.fixture(scope="module")
+def own_compilation_cache():
+    """`fit` and `demo` point JAX at the folder of the tests; afterwards JAX is as it was."""
+    import jax
+    from jax.experimental.compilation_cache import compilation_cache
+
+    names = ("jax_compilation_cache_dir", "jax_persistent_cache_min_compile_time_secs")
+    before = {name: jax.config.values[name] for name in names}
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("TVSBAYES_CACHE", os.environ["JAX_COMPILATION_CACHE_DIR"])
+        yield
+    for name, value in before.items():
+        jax.config.update(name, value)
+    compilation_cache.reset_cache()
+
+
+@pytest.fixture
+def ask(capsys):
+    """Run a command with --json: exit code, and the one document on stdout."""
+
+    def run_json(*arguments: object) -> tuple[int, dict[str, Any]]:
+        code = run([*map(str, arguments), "--json"])
+        captured = capsys.readouterr()
+        assert "Traceback" not in captured.err
+        return code, json.loads(captured.out, parse_constant=no_constant)
+
+    return run_json
+
+
+@pytest.fixture
+def say(capsys):
+    """Run a command for people: exit code, stdout, stderr."""
+
+    def run_text(*arguments: object) -> tuple[int, str, str]:
+        code = run([*map(str, arguments)])
+        return code, *capsys.readouterr()
+
+    return run_text
+
+
+@pytest.fixture(scope="session")
+def grid_campaign(mounted_rig) -> Campaign:
+    """24 spots: three by two poses on two sheets, each from either side of both axes."""
+    plan = grid_protocol(targets=("d1", "d2"), pan_steps=(0, 100, 200), tilt_steps=(-60, 60))
+    return simulate(mounted_rig, plan, seed=3).campaign
+
+
+@pytest.fixture
+def grid_folder(grid_campaign, tmp_path) -> Path:
+    """A copy of the small campaign that a test may spoil."""
+    write_campaign(grid_campaign, tmp_path / "campaign")
+    return tmp_path / "campaign"
+
+
+def steps(*orders: tuple) -> tuple[PlanStep, ...]:
+    """Orders as a plan: ("place", target), ("look",), ("home" or "move", pan, tilt)."""
+    return tuple(
+        PlanStep(number, action, target=rest[0]) if action == "place" else PlanStep(number, action, *rest)
+        for number, (action, *rest) in enumerate(orders)
+    )
+
+
+def two_sheets(*counters: tuple[int, int]) -> tuple[PlanStep, ...]:
+    """Each stop looked at twice on both sheets; both axes homed at 0."""
+    looks = (("place", "d1"), ("look",), ("look",), ("place", "d2"), ("look",), ("look",))
+    return steps(("home", 0, 0), *looks, *(order for pair in counters for order in (("move", *pair), *looks)))
+
+
+def assert_error(document: dict[str, Any], code: str) -> dict[str, Any]:
+    error = document["error"]
+    assert {"code", "file", "line", "message", "remedy"} <= set(error)
+    assert error["code"] == code
+    assert error["message"]
+    assert error["remedy"]
+    return error
+
+
+def with_spots(campaign: Campaign, change) -> Campaign:
+    """Every spot changed."""
+    return replace(campaign, spots=tuple(map(change, campaign.spots)))

@@ -1,0 +1,96 @@
+"""The paper twin with the results that the report command makes, and what a page is made of."""
+
+from __future__ import annotations
+
+import shutil
+from html.parser import HTMLParser
+from pathlib import Path
+
+import pytest
+
+from tvsbayes.calibration.calibration_file import load_calibration
+from tvsbayes.cli.main import run
+from tvsbayes.files.disk import shipped_data
+from tvsbayes.instrument.campaign import read_campaign
+from tvsbayes.report.evidence import Evidence, gather
+from tvsbayes.report.page import report_html
+from tvsbayes.report.tables import FigureView
+from tvsbayes.results.fit_record import read_fit
+from tvsbayes.results.plan_record import PLAN_FORMAT
+
+TWIN = shipped_data() / "twins" / "paper_twin"
+
+
+VOID = {"meta", "img", "br", "link", "input", "hr"}
+BATCH = {"text": "sheet d9, <b>four</b> looks", "minutes": 2.5, "gain": 1.2e-5, "gain_per_minute": 4.8e-6}
+
+
+PLANNED = {
+    "format": PLAN_FORMAT,
+    "target": {"text": "u(left) <= 2e-4 deg/step", "unit": "deg/step"},
+    "now": 3.1e-4,
+    "stop": {"now": False, "reason": "the target is not met", "rule": "a rule"},
+    "limited_by": {"needed": "focal scale to 0.1 %"},
+    "next": [BATCH],
+}
+"""What `plan --given` writes, as far as reports show it."""
+
+
+class Nodes(HTMLParser):
+    """Every element with its attributes, and the text outside of the style sheet."""
+
+    def __init__(self, page: bytes):
+        super().__init__()
+        self.elements: list[tuple[str, dict[str, str | None]]] = []
+        self.open: list[str] = []
+        self.text: list[str] = []
+        self.feed(page.decode())
+
+    def handle_starttag(self, tag, attrs):
+        self.elements.append((tag, dict(attrs)))
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        if "style" not in self.open:
+            self.text.append(data)
+
+    def of(self, tag: str) -> list[dict[str, str | None]]:
+        return [attributes for name, attributes in self.elements if name == tag]
+
+
+def evidence_of(place: Path) -> Evidence:
+    record = read_fit(place / "results" / "fit.json")
+    limits = {"range_mm": 1000.0, "limit_deg_per_step": 1e-3, "limit_mm": 1.0}
+    return gather(read_campaign(place), record, load_calibration(place), **limits)
+
+
+@pytest.fixture(scope="session")
+def reported(tmp_path_factory) -> Path:
+    """The paper twin with the results that the report command makes where there are none."""
+    place = tmp_path_factory.mktemp("report") / "twin"
+    shutil.copytree(TWIN, place)
+    assert run(["report", str(place), "--limit-deg-per-step", "1e-3", "--limit-mm", "1", "--json"]) == 1
+    return place
+
+
+@pytest.fixture(scope="session")
+def evidence(reported) -> Evidence:
+    return evidence_of(reported)
+
+
+@pytest.fixture(scope="session")
+def page(evidence) -> bytes:
+    return report_html(evidence)
+
+
+@pytest.fixture
+def no_pictures(monkeypatch):
+    """Pictures are not what is looked at, and take seconds."""
+    view = FigureView("data:image/svg+xml;base64,", "a picture that was left out", "left out", 1, 1)
+    monkeypatch.setattr("tvsbayes.report.tables.figure_view", lambda figure, alt, caption: view)
+    monkeypatch.setattr("tvsbayes.report.fit_sections.figure_view", lambda figure, alt, caption: view)
+    monkeypatch.setattr("tvsbayes.report.uncertainty_sections.figure_view", lambda figure, alt, caption: view)

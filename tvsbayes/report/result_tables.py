@@ -1,0 +1,121 @@
+"""Tables that texts and the page print alike: both estimators, their gap, what they foretell, budgets of a point.
+
+Units stand in captions and heads; numbers carry two digits of their uncertainty (GUM 7.2.6).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from tvsbayes.estimators.four_point import ClassicResult
+from tvsbayes.instrument.axes import DIRECTIONS
+from tvsbayes.metrology.look_budget import Budget
+from tvsbayes.report.tables import TableView, concise, interval_text, signed
+from tvsbayes.results.comparison_record import Gap, GapTerm, HoldOut
+from tvsbayes.results.estimates import Estimate, FitSummary
+
+KEY_PARAMETERS = (
+    ("backlash_deg.pan", "backlash pan", "deg"),
+    ("backlash_deg.tilt", "backlash tilt", "deg"),
+    ("effective_mirror_offset_mm", "mirror offset (effective)", "mm"),
+    ("mirror_offset_mm", "mirror offset L", "mm"),
+    ("extrinsics.rotation_rad.x", "extrinsics rotation x", "rad"),
+    ("extrinsics.rotation_rad.y", "extrinsics rotation y", "rad"),
+    ("extrinsics.rotation_rad.z", "extrinsics rotation z", "rad"),
+    ("extrinsics.translation_mm.x", "extrinsics translation x", "mm"),
+    ("extrinsics.translation_mm.y", "extrinsics translation y", "mm"),
+    ("extrinsics.translation_mm.z", "extrinsics translation z", "mm"),
+    ("stop_sd_deg.left", "stop sd left", "deg"),
+    ("stop_sd_deg.right", "stop sd right", "deg"),
+    ("stop_sd_deg.up", "stop sd up", "deg"),
+    ("stop_sd_deg.down", "stop sd down", "deg"),
+    ("pixel_scale", "pixel noise / stated", ""),
+)
+SHARE_SHOWN = 5e-4
+"""Of a variance: smaller ones print as 0.0 %."""
+
+
+def classic_table(result: ClassicResult) -> TableView:
+    """The classic estimator by direction."""
+    rows = []
+    for direction in DIRECTIONS:
+        r = result.directions[direction]
+        if r is None:
+            rows.append([direction, "0", "no experiment", "", "", ""])
+            continue
+        optional = (r.sd_deg_per_step, r.u_type_a_deg_per_step)
+        sd, u = ("-" if x is None else f"{x:.6f}" for x in optional)
+        # An interval has its u beside it.
+        gum = "-" if r.interval95_gum is None else interval_text(*r.interval95_gum, r.u_gum_deg_per_step or 0.0)
+        rows.append([direction, str(r.n), f"{r.mean_deg_per_step:.6f}", sd, u, gum])
+    columns = ["direction", "n", "mean deg/step", "sd", "u type A", "95 % interval (GUM)"]
+    return TableView("classic four-point estimator", columns, rows)
+
+
+def estimate_row(label: str, estimate: Estimate | None, unit: str) -> list[str]:
+    """Cells of one quantity: value(u), unit, interval, and whether data or prior set it."""
+    if estimate is None:
+        return [label, "never moved", unit, "", ""]
+    origin = "fixed" if estimate.contraction is None else ("data" if estimate.informed else "prior")
+    interval = interval_text(*estimate.interval95, estimate.sd)
+    return [label, concise(estimate.value, estimate.sd), unit, interval, origin]
+
+
+def headline_table(summary: FitSummary) -> TableView:
+    """Ratios, contrasts and key parameters of the joint estimator."""
+    pose = summary.reference_pose_deg
+    rows = [estimate_row(f"effective {d}", summary.effective[d], "deg/step") for d in DIRECTIONS]
+    for axis, label in (("pan", "left - right"), ("tilt", "up - down")):
+        if summary.contrasts[axis] is not None:
+            rows.append(estimate_row(label, summary.contrasts[axis], "deg/step"))
+    rows += [estimate_row(label, summary.parameters[name], unit) for name, label, unit in KEY_PARAMETERS]
+    kind = {"laplace": "Laplace", "posterior": "posterior"}[summary.estimator]
+    title = f"joint estimator ({kind}) at pan {pose['pan']:.2f} deg, tilt {pose['tilt']:.2f} deg"
+    return TableView(title, ["quantity", "value(u)", "unit", "95 % interval", "set by"], rows)
+
+
+def gap_table(gaps: Mapping[str, Gap | None]) -> TableView:
+    """The gap between both estimators by its terms, of the directions that have one."""
+    found = {direction: gap for direction, gap in gaps.items() if gap is not None}
+
+    def cell(term: GapTerm) -> str:
+        return signed(term.value, term.sd)
+
+    rows = [
+        ["classic mean", *(f"{gap.classic:.6f}" for gap in found.values())],
+        ["effective ratio (joint)", *(concise(gap.joint.value, gap.joint.sd) for gap in found.values())],
+        ["classic - joint", *(cell(gap.total) for gap in found.values())],
+    ]
+    for number, term in enumerate(next(iter(found.values())).terms):
+        rows.append([f"  {term.name}", *(cell(gap.terms[number]) for gap in found.values())])
+    return TableView("why the classic differs from the joint, deg/step, value(u)", ["", *found], rows)
+
+
+def hold_out_table(held: HoldOut) -> TableView | None:
+    """How well both estimators foretell angles that were left out; None where nothing could be judged."""
+    if held.classic is None or held.joint is None:
+        return None
+    rows = [
+        [
+            name,
+            f"{score.rms_deg:.3f}",
+            f"{score.rms_block_deg:.3f}",
+            f"{100 * score.coverage:.0f} %",
+            f"{score.log_density:+.2f}",
+        ]
+        for name, score in (("classic", held.classic), ("joint", held.joint))
+    ]
+    columns = ["", "rms error", "rms of block means", "inside 95 %", "log density"]
+    return TableView(f"angles of {len(held.predictions)} experiments left out by {held.by}, deg", columns, rows)
+
+
+def point_budget_table(budget: Budget, caption: str = "uncertainty by cause") -> TableView:
+    """What the uncertainty of a located point consists of, the largest share first."""
+    order = np.argsort(-budget.share)
+    rows = [
+        [budget.causes[k], f"{100 * budget.share[k]:.1f}", *(f"{np.sqrt(v):.3g}" for v in budget.variance_mm2[k])]
+        for k in order[budget.share[order] >= SHARE_SHOWN]
+    ]
+    return TableView(caption, ["cause", "share %", "u(x) mm", "u(y) mm", "u(z) mm"], rows)

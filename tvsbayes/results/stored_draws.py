@@ -1,0 +1,139 @@
+"""`results/draws.npz`: draws behind `fit.json`, the calibration that `locate` reads, and where the fit ended.
+
+Draws in the units of the contract names, ratios in deg/step, pose in rad; mode and covariance in prior coordinates.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from tvsbayes.calibration.calibration_file import (
+    RESULTS_BYTES_MAX,
+    UNPACKED_BYTES_MAX,
+    calibration_bytes,
+    damaged_calibration,
+    stored_calibration,
+)
+from tvsbayes.calibration.pointing import Calibration
+from tvsbayes.files.disk import make_folder, read_arrays, write_atomically
+from tvsbayes.instrument.campaign import Campaign
+from tvsbayes.results.fit_record import FitRecord
+
+
+@dataclass(frozen=True)
+class StoredMode:
+    """Where a fit ended, as `draws.npz` keeps it: enough to go on without fitting again.
+
+    Attributes:
+        names: parameters, in the order of the coordinates.
+        z, covariance: mode and Laplace covariance in prior coordinates, shapes (p,) and (p, p).
+        log_density: at the mode.
+        prior: value and u of every parameter of the rig that the fit used, shape (2, r).
+        valid, weight: whether each spot, in the order of the fit, was used, and its weight; shape (spots,).
+    """
+
+    names: tuple[str, ...]
+    z: np.ndarray
+    covariance: np.ndarray
+    log_density: float
+    prior: np.ndarray
+    valid: np.ndarray
+    weight: np.ndarray
+
+
+@dataclass(frozen=True)
+class ResultDraws:
+    """Draws behind a record, of a posterior or of the Laplace approximation.
+
+    Attributes:
+        names: columns of `physical`.
+        physical: shape (draws, names), in the units of the names.
+        effective_deg_per_step: left, right, up, down at the reference pose, shape (draws, 4).
+        reference_pose_rad: mirror angles (pan, tilt), shape (2,).
+    """
+
+    names: tuple[str, ...]
+    physical: np.ndarray
+    effective_deg_per_step: np.ndarray
+    reference_pose_rad: np.ndarray
+
+
+_MODE_ARRAYS = ("z", "covariance", "prior", "valid", "weight")
+
+
+def draws_bytes(
+    draws: ResultDraws, estimator: str, calibration: Calibration | None = None, mode: StoredMode | None = None
+) -> bytes:
+    """The content of `draws.npz`; without a calibration it holds draws that nothing must be calculated from."""
+    arrays = {**vars(draws), "names": np.array(draws.names)}
+    if calibration is None:
+        buffer = io.BytesIO()
+        np.savez_compressed(buffer, estimator=np.array(estimator), **arrays)
+        return buffer.getvalue()
+    if mode is not None:
+        arrays |= {f"mode_{name}": getattr(mode, name) for name in _MODE_ARRAYS}
+        arrays["mode_log_density"] = np.array(mode.log_density)
+    return calibration_bytes(calibration, **arrays)
+
+
+def write_results(
+    folder: Path,
+    record: FitRecord,
+    draws: ResultDraws,
+    calibration: Calibration | None = None,
+    mode: StoredMode | None = None,
+) -> dict[str, str]:
+    """Write `fit.json` and `draws.npz`, each whole or not at all.
+
+    Args:
+        folder: is made where it does not exist.
+        record: what is said of the fit.
+        draws: behind it.
+        calibration: what `locate` and `steps-for` read back; None for a fit that must not be used.
+        mode: from which `compare` and `plan` go on.
+
+    Returns:
+        Paths by "draws" and "fit".
+
+    Raises:
+        InputError: the folder cannot be written.
+    """
+    content = draws_bytes(draws, record.summary.estimator, calibration, mode)
+    document = json.dumps(record.as_json(), indent=1, allow_nan=False)
+    contents = {"draws": ("draws.npz", content), "fit": ("fit.json", document.encode())}
+    make_folder(folder)
+    for name, data in contents.values():
+        write_atomically(folder / name, data)
+    return {key: str(folder / name) for key, (name, _) in contents.items()}
+
+
+def stored_mode(campaign: Campaign) -> StoredMode | None:
+    """Where the fit in `results/` ended, if it was made from exactly these data and priors, and converged.
+
+    Raises:
+        InputError: there are results, but damaged.
+    """
+    if campaign.path is None or stored_calibration(campaign) is None:
+        return None
+    path = campaign.path / "results" / "draws.npz"
+    try:
+        file = read_arrays(path, RESULTS_BYTES_MAX, UNPACKED_BYTES_MAX)
+        if "mode_z" not in file:
+            return None
+        found = {name: np.array(file[f"mode_{name}"], dtype=float) for name in _MODE_ARRAYS}
+        log_density = np.array(file["mode_log_density"], dtype=float)
+        names = tuple(file["names"].tolist())
+        count, spots = len(names), sum(spot.status == "ok" for spot in campaign.spots)
+        shapes = {"z": (count,), "covariance": (count, count), "valid": (spots,), "weight": (spots,)}
+        if any(found[name].shape != shape for name, shape in shapes.items()) or found["prior"].shape[:1] != (2,):
+            raise ValueError("a mode of another shape")
+        if log_density.shape or not all(np.isfinite(array).all() for array in (*found.values(), log_density)):
+            raise ValueError("a mode that is not finite")
+        return StoredMode(names, log_density=float(log_density), **found)
+    except (KeyError, TypeError, ValueError) as error:
+        raise damaged_calibration(path, error) from error
