@@ -28,7 +28,8 @@ from tvsbayes.acquisition.recorder import LOST_STEPS, recorded
 from tvsbayes.acquisition.running_estimate import EstimateWish, RunningEstimate
 from tvsbayes.acquisition.session import acquire, begin, check_plan
 from tvsbayes.acquisition.simulated_instrument import Instrument
-from tvsbayes.cameras.capture import StereoImage, VirtualCamera
+from tvsbayes.cameras.capture import StereoImage
+from tvsbayes.cameras.virtual_camera import VirtualCamera
 from tvsbayes.cli.main import run
 from tvsbayes.errors import DeviceFault, InputError
 from tvsbayes.files.disk import shipped_data

@@ -9,7 +9,8 @@ import cv2
 import numpy as np
 import pytest
 
-from tvsbayes.cameras.calibration_formats import assumed_covariance, exported, parse_yaml, read_calibration
+from tvsbayes.cameras.calibration_formats import assumed_covariance, exported, read_calibration
+from tvsbayes.cameras.calibration_yaml import parse_yaml
 from tvsbayes.errors import InputError
 from tvsbayes.files.disk import shipped_data
 from tvsbayes.instrument.stereo_pair import Stereo, pair_doubts, read_stereo, rotation_matrix, stereo_bytes

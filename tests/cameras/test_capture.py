@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from tvsbayes.acquisition.simulated_instrument import VirtualClock
-from tvsbayes.cameras.capture import OpenCVCamera, StereoImage, VirtualCamera, open_cameras, open_capture
+from tvsbayes.cameras.capture import OpenCVCamera, StereoImage, open_cameras, open_capture
+from tvsbayes.cameras.virtual_camera import VirtualCamera
 from tvsbayes.errors import DeviceFault, InputError
 
 WIDTH, HEIGHT = 64, 48
@@ -141,7 +142,7 @@ def test_automatic_exposure_is_off_on_every_backend(backend, manual):
 
 
 def test_viewer_that_says_nothing_does_not_hold_the_virtual_camera(monkeypatch):
-    monkeypatch.setattr("tvsbayes.cameras.capture.VIEWER_TIMEOUT_S", 0.2)
+    monkeypatch.setattr("tvsbayes.cameras.virtual_camera.VIEWER_TIMEOUT_S", 0.2)
     with VirtualCamera(lambda: None) as virtual:
         host, port = virtual.address.split("/")[2].split(":")
         silent = socket.create_connection((host, int(port)))
@@ -220,7 +221,7 @@ def test_virtual_camera_without_a_port_leaves_the_environment_alone(monkeypatch)
     def no_port(*_):
         raise OSError("no port is free")
 
-    monkeypatch.setattr("tvsbayes.cameras.capture.ThreadingHTTPServer", no_port)
+    monkeypatch.setattr("tvsbayes.cameras.virtual_camera.ThreadingHTTPServer", no_port)
     with pytest.raises(OSError, match="no port"), VirtualCamera(lambda: None):
         pass
     assert os.environ["no_proxy"] == "example.org"

@@ -14,7 +14,8 @@ import pytest
 
 from tvsbayes.cameras.contour import epipolar_refused, rectified_pair
 from tvsbayes.cameras.detection import REASONS, detect
-from tvsbayes.cameras.spot_fit import _CORRELATION, CLIPPED_DN, SpotNoise, _grey, find_spot, learn_noise, patch_around
+from tvsbayes.cameras.spot_fit import CLIPPED_DN, find_spot, patch_around
+from tvsbayes.cameras.spot_noise import _CORRELATION, SpotNoise, grey_of, learn_noise
 from tvsbayes.cli.main import run
 from tvsbayes.errors import InputError, NothingToEstimate
 from tvsbayes.files.images import png_bytes
@@ -171,7 +172,7 @@ def test_contour_comes_back_to_raw_pixels():
 
 def test_noise_through_demosaicing_has_the_correlation_that_is_assumed():
     raw = np.clip(np.random.default_rng(1).normal(128, 12, (1000, 1000)), 0, 255).astype(np.uint8)
-    grey = _grey(cv2.cvtColor(raw, cv2.COLOR_BayerRGGB2BGR))[4:-4, 4:-4] - raw.mean()
+    grey = grey_of(cv2.cvtColor(raw, cv2.COLOR_BayerRGGB2BGR))[4:-4, 4:-4] - raw.mean()
     for i in range(3):
         for j in range(3):
             lag = np.mean(grey[i:, j:] * grey[: len(grey) - i, : len(grey) - j]) / raw.var()

@@ -16,7 +16,8 @@ from experiments.cameras.stereo_coverage import calibrate
 from experiments.common.board_views import CORNER_SD_PX, corners_of, scenes, true_corners
 from tvsbayes.cameras.boards import Board, View, Views, find_views
 from tvsbayes.cameras.bundle_adjustment import bundle_adjustment, correlation_factor
-from tvsbayes.cameras.stereo_calibration import StereoCalibration, _camera_start, calibrate_stereo
+from tvsbayes.cameras.stereo_calibration import StereoCalibration, calibrate_stereo
+from tvsbayes.cameras.stereo_start import camera_start
 from tvsbayes.cli.main import run
 from tvsbayes.errors import NothingToEstimate
 from tvsbayes.files.disk import read_bytes, shipped_data
@@ -119,7 +120,7 @@ def test_single_camera_agrees_with_opencv(pairs, side):
     The adjustment of a pair of which the left camera alone has views and free parameters.
     """
     corners = [getattr(view, side) for view in pairs.views]
-    start = _camera_start(dict(enumerate(corners)), BOARD, PAIRS_SIZE, side, False)
+    start = camera_start(dict(enumerate(corners)), BOARD, PAIRS_SIZE, side, False)
     alone = [View(str(k), seen, None) for k, seen in enumerate(corners)]
     vector, poses = np.concatenate([start.vector, start.vector, np.zeros(6)]), list(start.poses.values())
     ours = bundle_adjustment(alone, BOARD, vector, np.array(poses), np.arange(24) < 9)

@@ -22,7 +22,8 @@ from tvsbayes.acquisition.observation import CameraObserver, Detector, Observer,
 from tvsbayes.acquisition.operator import Operator, SimulatedOperator
 from tvsbayes.acquisition.recorder import Recorded, recorded
 from tvsbayes.acquisition.simulated_instrument import Instrument, Renderer, reference_pose_deg
-from tvsbayes.cameras.capture import StereoImage, VirtualCamera, open_cameras
+from tvsbayes.cameras.capture import StereoImage, open_cameras
+from tvsbayes.cameras.virtual_camera import VirtualCamera
 from tvsbayes.files.disk import write_atomically
 from tvsbayes.instrument.rig import Rig
 from tvsbayes.positioner.driver import Clock, Positioner

@@ -11,6 +11,7 @@ import math
 import os
 import re
 from collections import Counter
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,8 +23,8 @@ import numpy as np
 from tvsbayes.errors import InputError, NothingToEstimate, escaped, refusal
 from tvsbayes.files.disk import read_bytes
 from tvsbayes.files.images import IMAGE_BYTES_MAX, image_size, read_image
+from tvsbayes.instrument.campaign import CAMERAS
 
-SIDES: tuple[Literal["left"], Literal["right"]] = ("left", "right")
 Finder = Literal["classic", "sector"]
 SUFFIXES = (".png", ".jpg", ".jpeg")
 SIDE_BY_SIDE_RATIO = 2.0
@@ -278,7 +279,7 @@ def _pictures(folder: Path, swap: bool) -> list[_Picture]:
     sided = [
         _Picture(path.stem[len(side) :], path, (side,))
         for path in images
-        for side in SIDES
+        for side in CAMERAS
         if path.stem.lower().startswith(side)
     ]
     twice = [key for key, count in Counter((p.view, p.sides) for p in sided).items() if count > 1]
@@ -288,7 +289,7 @@ def _pictures(folder: Path, swap: bool) -> list[_Picture]:
         raise refusal("duplicate", file=escaped(str(folder), 200), found=found, allowed="one", remedy=remedy)
     if sided:
         return sided
-    return [_Picture(path.stem, path, SIDES[::-1] if swap else SIDES) for path in images]
+    return [_Picture(path.stem, path, CAMERAS[::-1] if swap else CAMERAS) for path in images]
 
 
 def find_views(folder: Path, board: Board, *, finder: Finder = "classic", swap: bool = False) -> Views:
@@ -308,17 +309,59 @@ def find_views(folder: Path, board: Board, *, finder: Finder = "classic", swap: 
         NothingToEstimate: no picture of a camera.
     """
     folder = Path(folder)
-    # Sizes first: the pictures of the majority are one calibration, and only those are decoded.
-    sizes = {
-        picture: image_size(read_bytes(picture.path, IMAGE_BYTES_MAX, folder), escaped(picture.path.name))
-        for picture in _pictures(folder, swap)
-    }
-    for picture, (width, height) in sizes.items():
+    sizes = _sizes(folder, swap)
+    counted = Counter(sizes.values())
+    size = max(counted, key=lambda s: (counted[s], s))
+    used = [picture for picture, own in sizes.items() if own == size]
+    boards: dict[str, dict[str, _Detection]] = {}
+    names: dict[tuple[str, str], str] = {}
+    without, fallback = [], []
+    for picture, detections in zip(used, _detections(folder, used, size, board, finder), strict=True):
+        for side, detection in detections.items():
+            name = picture.path.name + (f" ({side})" if len(picture.sides) > 1 else "")
+            names[picture.view, side] = name
+            if detection is None:
+                without.append(name)
+                continue
+            boards.setdefault(picture.view, {})[side] = detection
+            if detection.by_fallback:
+                fallback.append(name)
+    views, reordered = [], []
+    for name in sorted(boards, key=_natural):
+        left, right = (boards[name].get(side) for side in CAMERAS)
+        corners = None if right is None else right.corners
+        if left is not None and right is not None:
+            corners, turned = _agreeing(left, right, board)
+            reordered += [name] * turned
+        views.append(View(name, None if left is None else left.corners, corners))
+    lonely = [n for (view, side), n in names.items() if (view, CAMERAS[side == "left"]) not in names]
+    return Views(
+        views=tuple(views),
+        image_width=size[0],
+        image_height=size[1],
+        unpaired=tuple(sorted(lonely, key=_natural)),
+        without_board=tuple(without),
+        other_size=tuple(picture.path.name for picture, own in sizes.items() if own != size),
+        by_fallback=tuple(fallback),
+        reordered=tuple(reordered),
+    )
+
+
+def _sizes(folder: Path, swap: bool) -> dict[_Picture, tuple[int, int]]:
+    """Width and height of one camera's image in every picture of a board, by their headers.
+
+    The pictures of the majority are one calibration, and only those are decoded.
+    """
+    sizes = {}
+    for picture in _pictures(folder, swap):
+        data = read_bytes(picture.path, IMAGE_BYTES_MAX, folder)
+        width, height = image_size(data, escaped(picture.path.name))
         if width * height > PIXELS_MAX:
             place, found = escaped(picture.path.name), f"{width} x {height} pixels"
             allowed = f"at most {PIXELS_MAX // 1_000_000} million pixels"
             raise refusal("image-size", file=place, found=found, allowed=allowed, remedy="record smaller pictures")
-    sizes = {p: s for p, s in sizes.items() if len(p.sides) == 1 or (s[0] >= SIDE_BY_SIDE_RATIO * s[1])}
+        if len(picture.sides) == 1 or width >= SIDE_BY_SIDE_RATIO * height:
+            sizes[picture] = width // len(picture.sides), height
     if not sizes:
         raise NothingToEstimate(
             "no-pictures",
@@ -326,9 +369,13 @@ def find_views(folder: Path, board: Board, *, finder: Finder = "classic", swap: 
             allowed="left*.png with right*.png (or .jpg), or frames of both cameras side by side",
             remedy="name the pictures left01.png, right01.png, left02.png ...",
         )
-    counted = Counter((width // len(p.sides), height) for p, (width, height) in sizes.items())
-    size = max(counted, key=lambda s: (counted[s], s))
-    used = [p for p, (width, height) in sizes.items() if (width // len(p.sides), height) == size]
+    return sizes
+
+
+def _detections(
+    folder: Path, pictures: Sequence[_Picture], size: tuple[int, int], board: Board, finder: Finder
+) -> Iterator[dict[str, _Detection | None]]:
+    """The boards in pictures, by the camera whose image holds it."""
 
     def detect(picture: _Picture) -> dict[str, _Detection | None]:
         grey = cv2.cvtColor(read_image(picture.path, folder), cv2.COLOR_BGR2GRAY)
@@ -338,33 +385,9 @@ def find_views(folder: Path, board: Board, *, finder: Finder = "classic", swap: 
             for side, part in zip(picture.sides, parts, strict=True)
         }
 
-    found: dict[str, dict[str, _Detection]] = {}
-    names: dict[tuple[str, str], str] = {}
-    without, fallback = [], []
-    at_once = PIXELS_MAX // (size[0] * size[1] * max(len(p.sides) for p in used))
+    at_once = PIXELS_MAX // (size[0] * size[1] * max(len(p.sides) for p in pictures))
     with ThreadPoolExecutor(max(1, min(WORKERS_MAX, os.cpu_count() or 1, at_once))) as pool:
-        for picture, detections in zip(used, pool.map(detect, used), strict=True):
-            for side, detection in detections.items():
-                name = picture.path.name + (f" ({side})" if len(picture.sides) > 1 else "")
-                names[picture.view, side] = name
-                if detection is None:
-                    without.append(name)
-                    continue
-                found.setdefault(picture.view, {})[side] = detection
-                if detection.by_fallback:
-                    fallback.append(name)
-    views, reordered = [], []
-    for name in sorted(found, key=_natural):
-        left, right = (found[name].get(side) for side in SIDES)
-        corners = None if right is None else right.corners
-        if left is not None and right is not None:
-            corners, turned = _agreeing(left, right, board)
-            reordered += [name] * turned
-        views.append(View(name, None if left is None else left.corners, corners))
-    lonely = [n for (view, side), n in names.items() if (view, SIDES[side == "left"]) not in names]
-    unpaired = sorted(lonely, key=_natural)
-    other_size = [p.path.name for p in sizes if p not in used]
-    return Views(tuple(views), *size, *(tuple(x) for x in (unpaired, without, other_size, fallback, reordered)))
+        yield from pool.map(detect, pictures)
 
 
 def _detection(grey: np.ndarray, board: Board, finder: Finder) -> _Detection | None:

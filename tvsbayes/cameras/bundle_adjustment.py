@@ -1,4 +1,4 @@
-"""Stereo calibration from checkerboard corners: Zhang's start, bundle adjustment with its 24 x 24 covariance.
+"""The bundle adjustment of a stereo calibration, with the 24 x 24 covariance of its cameras.
 
 Frames: the board's x runs along its columns, y along its rows, z away from the viewer; poses are board to left camera
 (OpenCV's axes: x right, y down, z along the view), x_right = R x_left + T. mm, rad, px with the integer at a pixel's
@@ -85,7 +85,7 @@ def _view_residuals(
 ) -> Float[Array, " residuals"]:
     """Projected minus found corners of one view, px; 0 where none was seen."""
     left = rotation_matrix(pose[:3]) @ points_mm + pose[3:, None]
-    return (weight * (project(_cameras(parameters), CV_FROM_S.T @ left) - corners_px)).ravel()
+    return (weight * (project(_cameras(parameters), jnp.asarray(CV_FROM_S.T) @ left) - corners_px)).ravel()
 
 
 def _pose_gain(pose, parameters, corners_px, weight, points_mm):
@@ -199,6 +199,46 @@ def bundle_adjustment(
         NothingToEstimate: the views leave a combination of parameters open.
         NotConverged: no minimum was found.
     """
+    with jax.enable_x64(True):
+        arrays = _padded(views, board, start, poses, free)
+        seen = np.asarray(arrays.weight) > 0
+        kept = seen.ravel()
+        dof = int(kept.sum()) - int(free.sum()) - 6 * len(views)
+        if dof < 1:
+            raise undetermined("fewer corner coordinates than unknowns")
+        zero = np.zeros(24)
+        jacobian = np.asarray(residuals_and_jacobian(reduced_residuals, jnp.asarray(zero), arrays)[1])
+        # Whitened at the start: a unit of z is one standard error for corners of 1 px. In their own units a focal
+        # length and a k3 would share one damping.
+        root = np.zeros((24, 24))
+        root[np.ix_(free, free)] = _whitening(jacobian[:, free], np.flatnonzero(free))
+        arrays = replace(arrays, root=jnp.asarray(root))
+        end = _descended(zero, arrays)
+        noise_sd = math.sqrt(float(end.residuals @ end.residuals) / dof)
+        # Alternating signs, so that no parameter's shift can be taken up by another's.
+        shift = RESTART_SD * noise_sd * np.where(np.arange(24) % 2, -1.0, 1.0) * free
+        again = _descended(end.z + shift, arrays)
+    jacobian, residuals = end.jacobian[kept][:, free], end.residuals[kept]
+    _check_minimum(jacobian, residuals, (again.z - end.z)[free], noise_sd)
+    try:
+        z_covariance = least_squares_covariance(jacobian)
+    except np.linalg.LinAlgError as error:
+        raise undetermined(str(error)) from error
+    placed = np.full(seen.shape, np.nan)
+    placed[seen] = residuals
+    view_of = np.repeat(np.arange(len(seen)), seen[0].size)[kept]
+    return Adjustment(
+        vector=start + root @ end.z,
+        covariance=noise_sd**2 * root[:, free] @ z_covariance @ root[:, free].T,
+        residuals_px=placed[: len(views), :, : board.corners],
+        noise_sd_px=noise_sd,
+        dof=dof,
+        correlation_factor=correlation_factor(jacobian, residuals, view_of, noise_sd),
+    )
+
+
+def _padded(views: Sequence[View], board: Board, start: np.ndarray, poses: np.ndarray, free: np.ndarray) -> BoardArrays:
+    """The arrays of an adjustment in buckets, its coordinates in the parameters' own units."""
     count = -(-len(views) // VIEWS_PER_BUCKET) * VIEWS_PER_BUCKET
     corners = -(-board.corners // CORNERS_PER_BUCKET) * CORNERS_PER_BUCKET
     seen, weight = np.zeros((count, 4, corners)), np.zeros((count, 4, corners))
@@ -211,68 +251,49 @@ def bundle_adjustment(
             if found is not None:
                 seen[k, 2 * side : 2 * side + 2, : board.corners] = found.T
                 weight[k, 2 * side : 2 * side + 2, : board.corners] = 1.0
-    kept = (weight > 0).ravel()
-    view_of = np.repeat(np.arange(count), 4 * corners)[kept]
-    dof = int(kept.sum()) - int(free.sum()) - 6 * len(views)
-    if dof < 1:
-        raise undetermined("fewer corner coordinates than unknowns")
-    with jax.enable_x64(True):
-        unit = np.diag(free.astype(float))
-        arrays = BoardArrays(*map(jnp.asarray, (points, seen, weight, start_poses, np.asarray(start, float), unit)))
-        zero = np.zeros(24)
-        jacobian = np.asarray(residuals_and_jacobian(reduced_residuals, jnp.asarray(zero), arrays)[1])
-        # Whitened at the start: a unit of z is one standard error for corners of 1 px. In their own units a focal
-        # length and a k3 would share one damping.
-        root = np.zeros((24, 24))
-        root[np.ix_(free, free)] = _whitening(jacobian[:, free], np.flatnonzero(free))
-        arrays = replace(arrays, root=jnp.asarray(root))
-        value, residuals, jacobian = _descended(zero, arrays)
-        noise_sd = math.sqrt(float(residuals @ residuals) / dof)
-        # Alternating signs, so that no parameter's shift can be taken up by another's.
-        shift = RESTART_SD * noise_sd * np.where(np.arange(24) % 2, -1.0, 1.0) * free
-        again = _descended(value + shift, arrays)[0]
-        jacobian, residuals = jacobian[kept][:, free], residuals[kept]
-        # What the linear model would still move, and where the repetition ended, both as distances in standard errors
-        # whatever the conditioning: |J dz| / s.
-        left = float(np.linalg.norm(np.linalg.qr(jacobian)[0].T @ residuals))
-        apart = float(np.linalg.norm(jacobian @ (again - value)[free]))
-        problems = []
-        if not left <= STATIONARY_SD * noise_sd + EXACT_PX:
-            problems.append(f"the next step would be {left / noise_sd:.2g} standard errors")
-        if not apart <= RESTART_AGREEMENT_SD * noise_sd + EXACT_PX:
-            problems.append("a second adjustment from a start nearby ended elsewhere")
-        if problems:
-            raise NotConverged(
-                "not-converged",
-                "the bundle adjustment did not converge: " + "; ".join(problems),
-                remedy="look at the pictures for wrong boards, a wrong --board, or add tilted views",
-            )
-        try:
-            z_covariance = least_squares_covariance(jacobian)
-        except np.linalg.LinAlgError as error:
-            raise undetermined(str(error)) from error
-    placed = np.full(weight.shape, np.nan)
-    placed[weight > 0] = residuals
-    factor = correlation_factor(jacobian, residuals, view_of, noise_sd)
-    return Adjustment(
-        vector=start + root @ value,
-        covariance=noise_sd**2 * root[:, free] @ z_covariance @ root[:, free].T,
-        residuals_px=placed[: len(views), :, : board.corners],
-        noise_sd_px=noise_sd,
-        dof=dof,
-        correlation_factor=factor,
-    )
+    unit = np.diag(free.astype(float))
+    return BoardArrays(*map(jnp.asarray, (points, seen, weight, start_poses, np.asarray(start, float), unit)))
 
 
-def _descended(z: np.ndarray, arrays: BoardArrays) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Where Levenberg-Marquardt ends, with residuals and Jacobian there."""
+def _check_minimum(jacobian: np.ndarray, residuals: np.ndarray, apart: np.ndarray, noise_sd: float) -> None:
+    """Refuses an end that is no minimum.
+
+    What the linear model would still move, and `apart`, how far off the repetition ended, both as distances in
+    standard errors whatever the conditioning: |J dz| / s.
+    """
+    left = float(np.linalg.norm(np.linalg.qr(jacobian)[0].T @ residuals))
+    problems = []
+    if not left <= STATIONARY_SD * noise_sd + EXACT_PX:
+        problems.append(f"the next step would be {left / noise_sd:.2g} standard errors")
+    if not float(np.linalg.norm(jacobian @ apart)) <= RESTART_AGREEMENT_SD * noise_sd + EXACT_PX:
+        problems.append("a second adjustment from a start nearby ended elsewhere")
+    if problems:
+        raise NotConverged(
+            "not-converged",
+            "the bundle adjustment did not converge: " + "; ".join(problems),
+            remedy="look at the pictures for wrong boards, a wrong --board, or add tilted views",
+        )
+
+
+@dataclass(frozen=True)
+class _End:
+    """Where a descent ended: coordinates z (24,), residuals and Jacobian there."""
+
+    z: np.ndarray
+    residuals: np.ndarray
+    jacobian: np.ndarray
+
+
+def _descended(z: np.ndarray, arrays: BoardArrays) -> _End:
+    """Where Levenberg-Marquardt ends."""
     tolerance = jnp.asarray(TOLERANCE)
     end = levenberg_marquardt(reduced_residuals, jnp.asarray(z), arrays, tolerance, STEPS_MAX)
     residuals, jacobian = residuals_and_jacobian(reduced_residuals, end, arrays)
-    return np.asarray(end), np.asarray(residuals), np.asarray(jacobian)
+    return _End(np.asarray(end), np.asarray(residuals), np.asarray(jacobian))
 
 
 def undetermined(reason: str) -> NothingToEstimate:
+    """The refusal of views that leave something open."""
     return NothingToEstimate(
         "undetermined",
         f"the views do not determine the cameras: {reason}",

@@ -1,9 +1,5 @@
 """Stereo calibrations of other tools: OpenCV's YAML, ROS camera_info, Kalibr camchains; and our own `stereo.json`.
 
-Read by an own strict reader of the small part of YAML that these tools write: block maps, lists of numbers, OpenCV's
-matrices. OpenCV's FileStorage has had memory errors on hostile files (CVE-2019-5063, -5064; opencv #28619), and YAML
-loaders refuse OpenCV's header and tags. No anchors, no aliases, no other tags, sizes capped before parsing.
-
 None of these formats carries an uncertainty. An import therefore gets `assumed_covariance` and `assumed = true`.
 Lengths in `Stereo` are mm; ROS and Kalibr write metres, OpenCV whatever unit the squares had.
 """
@@ -11,7 +7,6 @@ Lengths in `Stereo` are mm; ROS and Kalibr write metres, OpenCV whatever unit th
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -19,9 +14,9 @@ from typing import Literal
 
 import numpy as np
 
-from tvsbayes.errors import InputError, escaped, refusal, shown
-from tvsbayes.files.csv_table import NUMBER
-from tvsbayes.files.disk import decode, read_bytes
+from tvsbayes.cameras.calibration_yaml import MATRIX_TAG, YAML_BYTES_MAX, parse_yaml
+from tvsbayes.errors import escaped, refusal
+from tvsbayes.files.disk import read_bytes
 from tvsbayes.files.documents import Keys
 from tvsbayes.instrument.stereo_pair import (
     Stereo,
@@ -32,14 +27,6 @@ from tvsbayes.instrument.stereo_pair import (
     stereo_bytes,
 )
 
-YAML_BYTES_MAX = 4 * 1024 * 1024
-YAML_ENTRIES_MAX = 200_000
-YAML_DEPTH_MAX = 3
-_MATRIX_TAG = "!!opencv-matrix"
-_KEY = re.compile(r"""([ ]*)(?:"([^"]{1,80})"|([A-Za-z_][\w.-]{0,79}))[ ]*:(?:[ ]+(.*))?""", re.ASCII)
-_TOKEN = re.compile(r"""\s*(\[|\]|,|"[^"]*"|'[^']*'|[^\s\[\],"']+)""")
-_WORD = re.compile(r"[\w./+-]{1,200}", re.ASCII)
-_ALLOWED = "key: value, nested keys, lists of numbers in [ ], OpenCV matrices"
 ROTATION_TOLERANCE = 1e-3
 """R from a file of few digits may miss a rotation by this much; the nearest rotation is taken."""
 SHORTEST_MM = 1.0
@@ -79,6 +66,74 @@ class Imported:
     warnings: tuple[str, ...]
 
 
+def read_calibration(paths: Sequence[Path], size: tuple[int, int] | None = None, *, unit_mm: float = 1.0) -> Imported:
+    """A stereo calibration from the files of another tool, or from `stereo.json`.
+
+    Args:
+        paths: OpenCV: one file or two; ROS: both cameras' camera_info; Kalibr: one camchain; `stereo.json`.
+        size: image width and height, px, where the files do not tell (OpenCV).
+        unit_mm: unit of OpenCV's T, mm.
+
+    Raises:
+        InputError: unreadable, unknown or contradictory.
+    """
+    names = [escaped(Path(path).name) for path in paths]
+    if len(paths) == 1 and Path(paths[0]).suffix.lower() == ".json":
+        stereo = parse_stereo(read_bytes(paths[0], YAML_BYTES_MAX), names[0])
+        return Imported(stereo, "tvsbayes", (), pair_doubts(stereo))
+    files = [parse_yaml(read_bytes(path, YAML_BYTES_MAX), name) for path, name in zip(paths, names, strict=True)]
+    if any("cam0" in keys for keys in files):
+        if len(files) != 1:
+            remedy = "name one camchain"
+            raise refusal("usage", file=names[0], found=f"{len(files)} files", allowed="one file", remedy=remedy)
+        source, (stereo, notes) = "kalibr", _kalibr(files)
+    elif any("projection_matrix" in keys for keys in files):
+        source, (stereo, notes) = "ros", _ros(files)
+    elif any(key in keys for keys in files for key in ("M1", "M2", "R", "T")):
+        source, (stereo, notes) = "opencv", _opencv(files, size, unit_mm)
+    else:
+        one = any("camera_matrix" in keys or "Camera_Matrix" in keys for keys in files)
+        found = "the calibration of one camera" if one else "no calibration that is known here"
+        allowed = "OpenCV's M1 D1 M2 D2 R T, ROS camera_info of both cameras, a Kalibr camchain, stereo.json"
+        remedy = "a pair needs R and T between its cameras: calibrate both together"
+        raise refusal("format", file=names[0], found=found, allowed=allowed, remedy=remedy)
+    notes.append("its uncertainty is assumed, and pessimistic: calibrate from pictures for a true one")
+    return Imported(stereo, source, tuple(notes), pair_doubts(stereo))
+
+
+def exported(stereo: Stereo, form: Format) -> dict[str, bytes]:
+    """Files by name for another tool; none of them keeps the covariance.
+
+    `opencv`: `intrinsics.yml` (M1 D1 M2 D2, image size) and `extrinsics.yml` (R T R1 R2 P1 P2 Q) of the stereo
+    sample, mm. `ros`: `left.yaml` and `right.yaml`, camera_info, metres.
+    """
+    import cv2
+
+    size = (stereo.image_width, stereo.image_height)
+    # alpha = 0: only pixels that both cameras have, as ROS' calibrator and OpenCV's sample do by default.
+    R1, R2, P1, P2, Q, *_ = cv2.stereoRectify(
+        stereo.M1, stereo.D1, stereo.M2, stereo.D2, size, stereo.R, stereo.T.reshape(3, 1), alpha=0
+    )
+    if form == "opencv":
+        inner = {"M1": stereo.M1, "D1": stereo.D1[None], "M2": stereo.M2, "D2": stereo.D2[None]}
+        outer = {"R": stereo.R, "T": stereo.T[:, None], "R1": R1, "R2": R2, "P1": P1, "P2": P2, "Q": Q}
+        sizes = {"image_width": size[0], "image_height": size[1]}
+        return dict(zip(EXPORT_NAMES[form], (_opencv_text(inner, sizes), _opencv_text(outer, {})), strict=True))
+    files = {}
+    cameras = (("left", stereo.M1, stereo.D1, R1, P1), ("right", stereo.M2, stereo.D2, R2, P2))
+    for file, (name, matrix, distortion, turn, projection) in zip(EXPORT_NAMES[form], cameras, strict=True):
+        in_metres = np.array(projection, float)
+        in_metres[:, 3] /= M_TO_MM
+        matrices = {
+            "camera_matrix": matrix,
+            "distortion_coefficients": distortion[None],
+            "rectification_matrix": turn,
+            "projection_matrix": in_metres,
+        }
+        files[file] = _ros_text(name, size, matrices)
+    return files
+
+
 def assumed_covariance(stereo: Stereo) -> np.ndarray:
     """A pessimistic covariance (24, 24) for a calibration that came without one: independent parameters.
 
@@ -98,152 +153,12 @@ def assumed_covariance(stereo: Stereo) -> np.ndarray:
     return np.diag(np.square(sds))
 
 
-class _Lines:
-    """The lines of a YAML file that say something, with indentation and line numbers."""
+@dataclass(frozen=True)
+class _Camera:
+    """Inner parameters of one camera: matrix (3, 3) and k1 k2 p1 p2 k3."""
 
-    def __init__(self, data: bytes, file: str):
-        if len(data) > YAML_BYTES_MAX:
-            found, allowed = f"{len(data)} bytes", f"at most {YAML_BYTES_MAX} bytes"
-            raise refusal("size", file=file, found=found, allowed=allowed, remedy="remove what is not needed")
-        self.file, self.text = file, decode(data, file)
-        self.lines: list[tuple[int, str]] = []
-        for number, line in enumerate(self.text.splitlines(), start=1):
-            first = not self.lines and re.fullmatch(r"%YAML[: ]1\.[012]\s*", line)
-            if not first and line.strip() not in ("", "---", "...") and not line.lstrip().startswith("#"):
-                self.lines.append((number, line.rstrip()))
-        self.at = 0
-        self.entries = 0
-
-    def bad(self, number: int, found: str, remedy: str = "write it as its own tool does") -> InputError:
-        return refusal("yaml", file=self.file, line=number, found=found, allowed=_ALLOWED, remedy=remedy)
-
-    def count(self, number: int, entries: int) -> None:
-        self.entries += entries
-        if self.entries > YAML_ENTRIES_MAX:
-            raise self.bad(number, f"more than {YAML_ENTRIES_MAX} entries")
-
-
-def _indent(line: str) -> int:
-    return len(line) - len(line.lstrip(" "))
-
-
-def _block(lines: _Lines, indent: int, depth: int) -> dict[str, object]:
-    """The map whose keys stand at `indent`."""
-    values: dict[str, object] = {}
-    while lines.at < len(lines.lines):
-        number, line = lines.lines[lines.at]
-        if _indent(line) < indent:
-            break
-        match = _KEY.fullmatch(line)
-        if match is None or _indent(line) != indent:
-            raise lines.bad(number, shown(line.strip()))
-        key, rest = match[2] or match[3], (match[4] or "").strip()
-        if key in values:
-            raise lines.bad(number, f"{shown(key)} twice", "remove one of them")
-        lines.count(number, 1)
-        lines.at += 1
-        values[key] = _value(lines, number, rest, indent, depth)
-    return values
-
-
-def _value(lines: _Lines, number: int, rest: str, indent: int, depth: int) -> object:
-    if rest.startswith("["):
-        # Counted piece by piece: a list of a million lines costs its own length only once.
-        pieces, open_brackets = [rest], rest.count("[") - rest.count("]")
-        while open_brackets > 0 and lines.at < len(lines.lines):
-            pieces.append(lines.lines[lines.at][1])
-            open_brackets += pieces[-1].count("[") - pieces[-1].count("]")
-            lines.at += 1
-        return _flow(lines, number, " ".join(pieces))
-    if rest and rest != _MATRIX_TAG:
-        return _scalar(lines, number, rest)
-    if lines.at == len(lines.lines):
-        return None
-    below, line = lines.lines[lines.at]
-    if not rest and re.match(r" *- ", line) and _indent(line) >= indent:
-        items, place = [], _indent(line)
-        while lines.at < len(lines.lines) and re.match(rf" {{{place}}}- ", lines.lines[lines.at][1]):
-            below, line = lines.lines[lines.at]
-            lines.at += 1
-            lines.count(below, 1)
-            item = line.lstrip(" ")[2:].strip()
-            if not item:
-                raise lines.bad(below, "an empty entry of a list")
-            items.append(_value(lines, below, item, place + 1, depth))
-        return items
-    if _indent(line) <= indent:
-        return None
-    if depth >= YAML_DEPTH_MAX:
-        raise lines.bad(below, f"keys nested deeper than {YAML_DEPTH_MAX}")
-    return _block(lines, _indent(line), depth + 1)
-
-
-def _flow(lines: _Lines, number: int, text: str) -> list[object]:
-    """A list in brackets, at most two deep."""
-    stack: list[list[object]] = []
-    done: list[object] | None = None
-    position, wanted = 0, True
-    while position < len(text):
-        match = _TOKEN.match(text, position)
-        if match is None or done is not None:
-            rest = text[position:].strip()
-            if not rest or rest.startswith("#"):
-                break
-            raise lines.bad(number, shown(rest))
-        token, position = match[1], match.end()
-        if token == "[":
-            if len(stack) == 2 or not wanted:
-                raise lines.bad(number, "brackets nested deeper than 2, or without a comma before")
-            stack.append([])
-        elif token == "]":
-            last = stack.pop()
-            wanted = False
-            if stack:
-                stack[-1].append(last)
-            else:
-                done = last
-        elif token == ",":
-            if wanted:
-                raise lines.bad(number, "a comma without an entry before it")
-            wanted = True
-        else:
-            if not wanted:
-                raise lines.bad(number, f"{shown(token)} without a comma before it")
-            lines.count(number, 1)
-            stack[-1].append(_scalar(lines, number, token))
-            wanted = False
-    if done is None:
-        raise lines.bad(number, "a list without its closing bracket")
-    return done
-
-
-def _scalar(lines: _Lines, number: int, text: str) -> object:
-    if text[0] in "\"'":
-        if len(text) < 2 or text[-1] != text[0] or text[0] in text[1:-1] or "\\" in text:
-            raise lines.bad(number, shown(text))
-        return text[1:-1]
-    text = re.split(r"\s+#", text, maxsplit=1)[0].strip()
-    if NUMBER.fullmatch(text):
-        value = float(text)
-        if not math.isfinite(value):
-            raise lines.bad(number, shown(text), "give a finite number")
-        return int(text) if re.fullmatch(r"[+-]?[0-9]{1,15}", text) else value
-    if text[0] in "&*!|>{%@`?" or not _WORD.fullmatch(text.replace(" ", "_").replace(":", "_")):
-        raise lines.bad(number, shown(text))
-    return text
-
-
-def parse_yaml(data: bytes, file: str) -> Keys:
-    """The top map of a YAML file as OpenCV, ROS and Kalibr write it.
-
-    Raises:
-        InputError: too large, not UTF-8, or anything outside that part of YAML; names file and line.
-    """
-    lines = _Lines(data, file)
-    if not lines.lines:
-        raise refusal("yaml", file=file, found="nothing", allowed=_ALLOWED, remedy="name a calibration file")
-    values = _block(lines, 0, 1)
-    return Keys(values, file, lines.text)
+    matrix: np.ndarray
+    distortion: np.ndarray
 
 
 def _matrix(keys: Keys, key: str, *shapes: tuple[int, int]) -> np.ndarray:
@@ -263,11 +178,12 @@ def _matrix(keys: Keys, key: str, *shapes: tuple[int, int]) -> np.ndarray:
         entries = [x for row in rows for x in row] if nested else rows
         if len(widths) > 1:
             entries = None
-    numbers = isinstance(entries, list) and all(isinstance(x, int | float) and abs(x) <= 1e12 for x in entries)
-    if not numbers or shape not in shapes or len(entries) != shape[0] * shape[1]:
+    numbers = entries if isinstance(entries, list) else []
+    good = all(isinstance(x, int | float) and abs(x) <= 1e12 for x in numbers)
+    if not good or shape not in shapes or len(numbers) != shape[0] * shape[1]:
         found = "x".join(map(str, shape)) if value is not None and shape not in shapes else None
         raise keys.refuse(key, "matrix", allowed, remedy, found)
-    return np.array(entries, float).reshape(shape)
+    return np.array(numbers, float).reshape(shape)
 
 
 def _distortion(keys: Keys, key: str) -> np.ndarray:
@@ -316,13 +232,11 @@ def _opencv(files: Sequence[Keys], size: tuple[int, int] | None, unit_mm: float)
         found = f"cameras {np.linalg.norm(translation):.3g} mm apart"
         remedy = "OpenCV keeps the unit of the squares: give --import-unit m if they were in metres"
         raise home["T"].refuse("T", "unit", f"at least {SHORTEST_MM:g} mm", remedy, found)
-    stereo = _stereo(
-        _size(files, size),
-        *(_matrix(home["M1"], "M1", (3, 3)), _distortion(home["D1"], "D1")),
-        *(_matrix(home["M2"], "M2", (3, 3)), _distortion(home["D2"], "D2")),
-        _rotation(home["R"], "R", _matrix(home["R"], "R", (3, 3))),
-        translation,
+    left, right = (
+        _Camera(_matrix(home[f"M{n}"], f"M{n}", (3, 3)), _distortion(home[f"D{n}"], f"D{n}")) for n in (1, 2)
     )
+    rotation = _rotation(home["R"], "R", _matrix(home["R"], "R", (3, 3)))
+    stereo = _stereo(_size(files, size), left, right, rotation, translation)
     return stereo, [f"T is taken in {'mm' if unit_mm == 1 else 'm'}: OpenCV's files do not state a unit"]
 
 
@@ -335,10 +249,11 @@ def _ros(files: Sequence[Keys]) -> tuple[Stereo, list[str]]:
     projections = [_matrix(keys, "projection_matrix", (3, 4)) for keys in files]
     if projections[1][0, 3] == 0 and projections[0][0, 3] != 0:
         files, projections = files[::-1], projections[::-1]
-    parts, turns = [], []
+    cameras, turns = [], []
     for keys in files:
         keys.word("distortion_model", ("plumb_bob",))
-        parts += [_matrix(keys, "camera_matrix", (3, 3)), _distortion(keys, "distortion_coefficients")]
+        matrix = _matrix(keys, "camera_matrix", (3, 3))
+        cameras.append(_Camera(matrix, _distortion(keys, "distortion_coefficients")))
         turn = _matrix(keys, "rectification_matrix", (3, 3))
         turns.append(_rotation(keys, "rectification_matrix", turn))
     sizes = [_size([keys], None) for keys in files]
@@ -348,20 +263,21 @@ def _ros(files: Sequence[Keys]) -> tuple[Stereo, list[str]]:
         remedy = "take both files from one stereo calibration"
         raise files[1].refuse("projection_matrix", "projection", allowed, remedy, "files that are no stereo pair")
     shift = np.array([right[0, 3] / right[0, 0], right[1, 3] / right[1, 1] if right[1, 1] else 0.0, 0.0])
-    stereo = _stereo(sizes[0], *parts, turns[1].T @ turns[0], M_TO_MM * turns[1].T @ shift)
+    stereo = _stereo(sizes[0], cameras[0], cameras[1], turns[1].T @ turns[0], M_TO_MM * turns[1].T @ shift)
     return stereo, []
 
 
 def _kalibr(files: Sequence[Keys]) -> tuple[Stereo, list[str]]:
     """cam0 and cam1 of a camchain; T_cn_cnm1 maps points of cam0 into cam1."""
     keys = files[0]
-    parts, sizes = [], []
+    cameras, sizes = [], []
     for name in ("cam0", "cam1"):
         camera = keys.table(name)
         camera.word("camera_model", ("pinhole",))
         camera.word("distortion_model", ("radtan",))
         fu, fv, pu, pv = _matrix(camera, "intrinsics", (1, 4)).ravel()
-        parts += [np.array([[fu, 0.0, pu], [0.0, fv, pv], [0.0, 0.0, 1.0]]), _distortion(camera, "distortion_coeffs")]
+        matrix = np.array([[fu, 0.0, pu], [0.0, fv, pv], [0.0, 0.0, 1.0]])
+        cameras.append(_Camera(matrix, _distortion(camera, "distortion_coeffs")))
         width, height = _matrix(camera, "resolution", (1, 2)).ravel()
         sizes.append((int(width), int(height)))
     camera = keys.table("cam1")
@@ -369,49 +285,18 @@ def _kalibr(files: Sequence[Keys]) -> tuple[Stereo, list[str]]:
         raise camera.refuse("resolution", "image-size", "two images of one size", "calibrate them at one size")
     pose = _matrix(camera, "T_cn_cnm1", (4, 4))
     turn = _rotation(camera, "T_cn_cnm1", pose[:3, :3])
-    return _stereo(sizes[0], *parts, turn, M_TO_MM * pose[:3, 3]), ["radtan has no k3: it is 0 and as uncertain"]
+    stereo = _stereo(sizes[0], cameras[0], cameras[1], turn, M_TO_MM * pose[:3, 3])
+    return stereo, ["radtan has no k3: it is 0 and as uncertain"]
 
 
-def _stereo(size, M1, D1, M2, D2, R, T) -> Stereo:
+def _stereo(
+    size: tuple[int, int], left: _Camera, right: _Camera, rotation: np.ndarray, translation_mm: np.ndarray
+) -> Stereo:
     """Checked as `stereo.json` is, with the assumed covariance."""
-    bare = Stereo(*size, M1, D1, M2, D2, R, np.asarray(T, float).ravel(), np.zeros((24, 24)), ASSUMED_RMS_PX, True)
+    inner = left.matrix, left.distortion, right.matrix, right.distortion
+    bare = Stereo(*size, *inner, rotation, translation_mm, np.zeros((24, 24)), ASSUMED_RMS_PX, assumed=True)
     checked = parse_stereo(stereo_bytes(bare), "the imported calibration")
     return replace(checked, parameter_covariance=assumed_covariance(checked))
-
-
-def read_calibration(paths: Sequence[Path], size: tuple[int, int] | None = None, *, unit_mm: float = 1.0) -> Imported:
-    """A stereo calibration from the files of another tool, or from `stereo.json`.
-
-    Args:
-        paths: OpenCV: one file or two; ROS: both cameras' camera_info; Kalibr: one camchain; `stereo.json`.
-        size: image width and height, px, where the files do not tell (OpenCV).
-        unit_mm: unit of OpenCV's T, mm.
-
-    Raises:
-        InputError: unreadable, unknown or contradictory.
-    """
-    names = [escaped(Path(path).name) for path in paths]
-    if len(paths) == 1 and Path(paths[0]).suffix.lower() == ".json":
-        stereo = parse_stereo(read_bytes(paths[0], YAML_BYTES_MAX), names[0])
-        return Imported(stereo, "tvsbayes", (), pair_doubts(stereo))
-    files = [parse_yaml(read_bytes(path, YAML_BYTES_MAX), name) for path, name in zip(paths, names, strict=True)]
-    if any("cam0" in keys for keys in files):
-        if len(files) != 1:
-            remedy = "name one camchain"
-            raise refusal("usage", file=names[0], found=f"{len(files)} files", allowed="one file", remedy=remedy)
-        source, (stereo, notes) = "kalibr", _kalibr(files)
-    elif any("projection_matrix" in keys for keys in files):
-        source, (stereo, notes) = "ros", _ros(files)
-    elif any(key in keys for keys in files for key in ("M1", "M2", "R", "T")):
-        source, (stereo, notes) = "opencv", _opencv(files, size, unit_mm)
-    else:
-        one = any("camera_matrix" in keys or "Camera_Matrix" in keys for keys in files)
-        found = "the calibration of one camera" if one else "no calibration that is known here"
-        allowed = "OpenCV's M1 D1 M2 D2 R T, ROS camera_info of both cameras, a Kalibr camchain, stereo.json"
-        remedy = "a pair needs R and T between its cameras: calibrate both together"
-        raise refusal("format", file=names[0], found=found, allowed=allowed, remedy=remedy)
-    notes.append("its uncertainty is assumed, and pessimistic: calibrate from pictures for a true one")
-    return Imported(stereo, source, tuple(notes), pair_doubts(stereo))
 
 
 def _opencv_text(matrices: Mapping[str, np.ndarray], numbers: Mapping[str, int]) -> bytes:
@@ -420,7 +305,7 @@ def _opencv_text(matrices: Mapping[str, np.ndarray], numbers: Mapping[str, int])
     for key, matrix in matrices.items():
         rows, cols = matrix.shape
         data = ", ".join(map(repr, map(float, matrix.ravel())))
-        lines += [f"{key}: {_MATRIX_TAG}", f"   rows: {rows}", f"   cols: {cols}", "   dt: d", f"   data: [ {data} ]"]
+        lines += [f"{key}: {MATRIX_TAG}", f"   rows: {rows}", f"   cols: {cols}", "   dt: d", f"   data: [ {data} ]"]
     return ("\n".join(lines) + "\n").encode()
 
 
@@ -433,36 +318,3 @@ def _ros_text(name: str, size: tuple[int, int], matrices: Mapping[str, np.ndarra
         data = ", ".join(map(repr, map(float, matrix.ravel())))
         lines += [f"{key}:", f"  rows: {rows}", f"  cols: {cols}", f"  data: [{data}]"]
     return ("\n".join(lines) + "\n").encode()
-
-
-def exported(stereo: Stereo, form: Format) -> dict[str, bytes]:
-    """Files by name for another tool; none of them keeps the covariance.
-
-    `opencv`: `intrinsics.yml` (M1 D1 M2 D2, image size) and `extrinsics.yml` (R T R1 R2 P1 P2 Q) of the stereo
-    sample, mm. `ros`: `left.yaml` and `right.yaml`, camera_info, metres.
-    """
-    import cv2
-
-    size = (stereo.image_width, stereo.image_height)
-    # alpha = 0: only pixels that both cameras have, as ROS' calibrator and OpenCV's sample do by default.
-    R1, R2, P1, P2, Q, *_ = cv2.stereoRectify(
-        stereo.M1, stereo.D1, stereo.M2, stereo.D2, size, stereo.R, stereo.T.reshape(3, 1), alpha=0
-    )
-    if form == "opencv":
-        inner = {"M1": stereo.M1, "D1": stereo.D1[None], "M2": stereo.M2, "D2": stereo.D2[None]}
-        outer = {"R": stereo.R, "T": stereo.T[:, None], "R1": R1, "R2": R2, "P1": P1, "P2": P2, "Q": Q}
-        sizes = {"image_width": size[0], "image_height": size[1]}
-        return dict(zip(EXPORT_NAMES[form], (_opencv_text(inner, sizes), _opencv_text(outer, {})), strict=True))
-    files = {}
-    cameras = (("left", stereo.M1, stereo.D1, R1, P1), ("right", stereo.M2, stereo.D2, R2, P2))
-    for file, (name, matrix, distortion, turn, projection) in zip(EXPORT_NAMES[form], cameras, strict=True):
-        in_metres = projection.copy()
-        in_metres[:, 3] /= M_TO_MM
-        matrices = {
-            "camera_matrix": matrix,
-            "distortion_coefficients": distortion[None],
-            "rectification_matrix": turn,
-            "projection_matrix": in_metres,
-        }
-        files[file] = _ros_text(name, size, matrices)
-    return files

@@ -1,11 +1,11 @@
-"""The stereo cameras on OpenCV, and a virtual one that serves whatever is rendered, over HTTP.
+"""The stereo cameras on OpenCV.
 
 A picture counts only if its exposure began after it was asked for. Drivers keep old frames in their buffers, and no
 frame says when it was exposed. So every `grab` first empties the buffers: a buffered frame comes as fast as it can be
 decoded, a live one at the camera's own rate, which is measured at opening; only behind the first live frames, which
 may still have been in the pipe, one is taken. A camera that never makes us wait is refused: its frames could be of any
-age. Where decoding takes as long as the camera's period the two cannot be told apart; then the observer's proof by
-light holds (tvsbayes.acquisition.observation).
+age. Where decoding takes as long as the camera's period the two cannot be told apart; then the proof by light holds
+that whoever drives the laser adds.
 
 Pictures are (height, width, 3) uint8, blue, green, red, as OpenCV delivers them; raw pixels, nothing rectified.
 Seconds where a name says `_s`.
@@ -14,12 +14,10 @@ Seconds where a name says `_s`.
 from __future__ import annotations
 
 import os
-import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
@@ -39,9 +37,6 @@ FLUSH_FRAMES_MAX = 250
 FLUSH_MAX_S = 10.0
 """The longest emptying of buffers, in frames and in seconds."""
 STREAM_TIMEOUT_MS = 5_000
-VIEWER_TIMEOUT_S = 10.0
-"""A viewer of the virtual camera that takes nothing for so long has gone."""
-JPEG_QUALITY = 97
 FFMPEG_QUIET = "-8"
 """FFmpeg's AV_LOG_QUIET."""
 
@@ -106,6 +101,29 @@ class Capture(Protocol):
         """Give the device back."""
 
 
+@contextmanager
+def _quiet_opencv() -> Iterator[None]:
+    """OpenCV and its FFmpeg write no warnings to stderr meanwhile: what fails is raised, with a remedy.
+
+    Whoever has set their variables OPENCV_LOG_LEVEL or OPENCV_FFMPEG_LOGLEVEL wants to read them. FFmpeg's is read
+    once, at the first stream that a process opens, and stays.
+    """
+    import cv2
+
+    logging = cv2.utils.logging
+    before = None if "OPENCV_LOG_LEVEL" in os.environ else logging.setLogLevel(logging.LOG_LEVEL_SILENT)
+    ffmpeg = "OPENCV_FFMPEG_LOGLEVEL" not in os.environ
+    if ffmpeg:
+        os.environ["OPENCV_FFMPEG_LOGLEVEL"] = FFMPEG_QUIET
+    try:
+        yield
+    finally:
+        if ffmpeg:
+            os.environ.pop("OPENCV_FFMPEG_LOGLEVEL", None)
+        if before is not None:
+            logging.setLogLevel(before)
+
+
 def open_capture(source: str | int) -> Capture:
     """A device by number or path, or a stream by address.
 
@@ -136,27 +154,34 @@ def open_capture(source: str | int) -> Capture:
     return capture
 
 
-@contextmanager
-def _quiet_opencv() -> Iterator[None]:
-    """OpenCV and its FFmpeg write no warnings to stderr meanwhile: what fails is raised, with a remedy.
+def open_cameras(
+    table: Mapping[str, str | int | float],
+    width: int,
+    height: int,
+    opener: Callable[[str | int], Capture] = open_capture,
+    clock: Clock = time,
+) -> OpenCVCamera:
+    """The cameras of `[cameras]` in a rig file: `source` side by side, or `left` and `right`.
 
-    Whoever has set their variables OPENCV_LOG_LEVEL or OPENCV_FFMPEG_LOGLEVEL wants to read them. FFmpeg's is read
-    once, at the first stream that a process opens, and stays.
+    Raises:
+        InputError: neither, or both.
+        DeviceFault: they cannot be opened or set.
     """
-    import cv2
-
-    logging = cv2.utils.logging
-    before = None if "OPENCV_LOG_LEVEL" in os.environ else logging.setLogLevel(logging.LOG_LEVEL_SILENT)
-    ffmpeg = "OPENCV_FFMPEG_LOGLEVEL" not in os.environ
-    if ffmpeg:
-        os.environ["OPENCV_FFMPEG_LOGLEVEL"] = FFMPEG_QUIET
-    try:
-        yield
-    finally:
-        if ffmpeg:
-            os.environ.pop("OPENCV_FFMPEG_LOGLEVEL", None)
-        if before is not None:
-            logging.setLogLevel(before)
+    pair = "left" in table and "right" in table
+    if pair == ("source" in table):
+        remedy = "give source = ... (side by side), or left = ... and right = ..."
+        raise InputError("cameras", "[cameras] of the rig file names no cameras", column="cameras", remedy=remedy)
+    captures: list[Capture] = []
+    exposure = float(table["exposure"]) if "exposure" in table else None
+    with _quiet_opencv():
+        try:
+            for source in (table[key] for key in (("left", "right") if pair else ("source",))):
+                captures.append(opener(source if isinstance(source, str) else int(source)))
+        except BaseException:
+            for capture in captures:
+                capture.release()
+            raise
+        return OpenCVCamera(captures, width, height, exposure, clock)
 
 
 class OpenCVCamera:
@@ -311,134 +336,3 @@ def _manual_exposure(capture: Capture) -> int:
 def _no_frame(name: str) -> DeviceFault:
     remedy = "check its cable and USB port, and that no other program has it; then go on with --resume"
     return DeviceFault("no-frame", f"camera {name} delivers no frame; {remedy}", remedy=remedy)
-
-
-def open_cameras(
-    table: Mapping[str, object],
-    width: int,
-    height: int,
-    opener: Callable[[str | int], Capture] = open_capture,
-    clock: Clock = time,
-) -> OpenCVCamera:
-    """The cameras of `[cameras]` in a rig file: `source` side by side, or `left` and `right`.
-
-    Raises:
-        InputError: neither, or both.
-        DeviceFault: they cannot be opened or set.
-    """
-    pair = "left" in table and "right" in table
-    if pair == ("source" in table):
-        remedy = "give source = ... (side by side), or left = ... and right = ..."
-        raise InputError("cameras", "[cameras] of the rig file names no cameras", column="cameras", remedy=remedy)
-    captures: list[Capture] = []
-    exposure = float(table["exposure"]) if "exposure" in table else None
-    with _quiet_opencv():
-        try:
-            for key in ("left", "right") if pair else ("source",):
-                captures.append(opener(table[key]))
-        except BaseException:
-            for capture in captures:
-                capture.release()
-            raise
-        return OpenCVCamera(captures, width, height, exposure, clock)
-
-
-@dataclass
-class VirtualCamera:
-    """A camera in software: serves what `render` returns as an MJPEG stream over HTTP on this computer.
-
-    Each frame is rendered when it is due, as a sensor would expose it. Use it as a context manager.
-
-    Attributes:
-        render: returns a StereoImage; called from the serving thread, one call at a time.
-        frames_per_s: rate of exposures.
-    """
-
-    render: Callable[[], StereoImage]
-    frames_per_s: float = 30.0
-    failure: Exception | None = field(default=None, init=False)
-    """What `render` raised; it ends the stream, and is raised again when the camera is left."""
-    _server: ThreadingHTTPServer | None = field(default=None, init=False, repr=False)
-    _thread: threading.Thread | None = field(default=None, init=False, repr=False)
-    _stop: threading.Event = field(default_factory=threading.Event, init=False, repr=False)
-    _lock: threading.Lock = field(default_factory=threading.Lock, init=False, repr=False)
-    _no_proxy: str | None = field(default=None, init=False, repr=False)
-
-    @property
-    def address(self) -> str:
-        """Where the stream is served, for `[cameras] source`."""
-        if self._server is None:
-            raise RuntimeError("the virtual camera is not running")
-        return f"http://127.0.0.1:{self._server.server_address[1]}/stereo.mjpg"
-
-    def jpeg(self) -> bytes:
-        """The next frame: both pictures side by side."""
-        import cv2
-
-        with self._lock:
-            pair = self.render()
-        both = np.hstack((pair.left, pair.right))
-        return cv2.imencode(".jpg", both, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1].tobytes()
-
-    def __enter__(self) -> VirtualCamera:
-        camera = self
-
-        class Handler(BaseHTTPRequestHandler):
-            # Of the connection: without it a viewer that neither reads nor closes would hold `__exit__` for ever.
-            timeout = VIEWER_TIMEOUT_S
-
-            def do_GET(self) -> None:
-                camera._serve(self)
-
-            def log_message(self, format: str, *arguments: object) -> None:
-                """Requests are no news."""
-
-        self._stop.clear()
-        self._server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
-        self._server.daemon_threads = False
-        # Behind the bind, which may fail: then nobody would put it back.
-        # FFmpeg, which OpenCV opens the address with, asks the proxy of the environment even for this computer.
-        self._no_proxy = os.environ.get("no_proxy")
-        os.environ["no_proxy"] = ",".join(filter(None, (self._no_proxy, "127.0.0.1")))
-        self._thread = threading.Thread(target=self._server.serve_forever, args=(0.05,), daemon=True)
-        self._thread.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._stop.set()
-        assert self._server is not None and self._thread is not None
-        self._server.shutdown()
-        self._thread.join()
-        # Waits for the streams, which end at the next frame.
-        self._server.server_close()
-        self._server = None
-        if self._no_proxy is None:
-            os.environ.pop("no_proxy", None)
-        else:
-            os.environ["no_proxy"] = self._no_proxy
-        if self.failure is not None:
-            raise self.failure
-
-    def _serve(self, request: BaseHTTPRequestHandler) -> None:
-        if not request.path.endswith(".mjpg"):
-            request.send_error(404)
-            return
-        request.send_response(200)
-        request.send_header("Content-Type", "multipart/x-mixed-replace; boundary=frame")
-        request.end_headers()
-        period_s = 1 / self.frames_per_s
-        due_s = time.monotonic()
-        try:
-            while not self._stop.wait(max(due_s - time.monotonic(), 0.0)):
-                try:
-                    data = self.jpeg()
-                except Exception as error:
-                    self.failure = error
-                    return
-                head = b"--frame\r\nContent-Type: image/jpeg\r\nContent-Length: %d\r\n\r\n" % len(data)
-                request.wfile.write(head + data + b"\r\n")
-                # A late frame shifts the following ones: a sensor does not expose twice at once.
-                due_s = max(due_s + period_s, time.monotonic() + period_s / 2)
-        except OSError:
-            # The viewer has gone.
-            return

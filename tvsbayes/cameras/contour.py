@@ -1,8 +1,13 @@
-"""Centre by the spot's outline; epipolar check."""
+"""The paper's centre, by the spot's outline in the rectified picture (section 2.4), and the epipolar check of a pair.
+
+Raw image px with the integer at the centre of a pixel; grey levels of 8 bits; pictures (height, width, 3) uint8, blue,
+green, red.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from math import log, pi, sqrt
 
 import numpy as np
@@ -15,17 +20,18 @@ from tvsbayes.cameras.spot_fit import (
     CLIPPED_SHARE_MAX,
     SECOND_SHARE,
     Centre,
-    SpotNoise,
-    background_variance,
 )
+from tvsbayes.cameras.spot_noise import SpotNoise, background_variance
 from tvsbayes.instrument.stereo_pair import Stereo, distort, undistort
 
 EPIPOLAR_SIGMAS, EPIPOLAR_FLOOR_PX = 6.0, 0.5
 """A pair is refused beyond six combined sds (spot and calibration), and never below half a pixel."""
+REGION_HALF_PX = 60
+"""Half side of the paper's region of interest, around the brightest place of the rectified picture."""
 
 
 @dataclass(frozen=True)
-class _Rectified:
+class Rectified:
     """One camera of the paper's pipeline: maps of the rectified picture and the way back."""
 
     maps: tuple[np.ndarray, np.ndarray]
@@ -41,7 +47,8 @@ class _Rectified:
         return distort(rays[:, :2] / rays[:, 2:], self.distortion) @ self.matrix[:2, :2].T + self.matrix[:2, 2]
 
 
-def rectified_pair(stereo: Stereo) -> tuple[_Rectified, _Rectified]:
+def rectified_pair(stereo: Stereo) -> tuple[Rectified, Rectified]:
+    """Both cameras of a pair as OpenCV rectifies it."""
     import cv2
 
     size = stereo.image_width, stereo.image_height
@@ -52,15 +59,11 @@ def rectified_pair(stereo: Stereo) -> tuple[_Rectified, _Rectified]:
     cameras = []
     for (matrix, distortion), rotation, projection in ((first, turns[0], turns[2]), (second, turns[1], turns[3])):
         maps = cv2.initUndistortRectifyMap(matrix, distortion, rotation, projection, size, cv2.CV_32FC1)
-        cameras.append(_Rectified(maps, rotation, projection, matrix, distortion.ravel()))
+        cameras.append(Rectified(maps, rotation, projection, matrix, distortion.ravel()))
     return cameras[0], cameras[1]
 
 
-REGION_HALF_PX = 60
-"""Half side of the paper's region of interest, around the brightest place of the rectified picture."""
-
-
-def contour_of(picture: np.ndarray, camera: _Rectified, noise: SpotNoise) -> Centre:
+def contour_of(picture: np.ndarray, camera: Rectified, noise: SpotNoise) -> Centre:
     """The paper's way: centroid of the region above a threshold on V of HSV, in the rectified picture.
 
     The threshold is on V alone: at 808 nm hue is undefined and saturation low. The stated variance is that of the
@@ -91,21 +94,22 @@ def contour_of(picture: np.ndarray, camera: _Rectified, noise: SpotNoise) -> Cen
     clipped = (flat[low[1] : high[1], low[0] : high[0]] >= CLIPPED_DN).any(axis=2) & (mask > 0)
     radius = sqrt(area / pi)
     sd = radius / sqrt(-2 * log(BRIGHT_SHARE))
-    known = {"axes_px": (sd, sd), "clipped_share": float(clipped.sum() / mask.sum()), "outline_px": outline}
+    clipped_share = float(clipped.sum() / mask.sum())
+    known = partial(Centre, axes_px=(sd, sd), clipped_share=clipped_share, outline_px=outline)
     if len(outlines) > 1 and cv2.contourArea(outlines[1]) > SECOND_SHARE * area:
-        return Centre("two-spots", **known)
-    if known["clipped_share"] > CLIPPED_SHARE_MAX:
-        return Centre("clipped", **known)
+        return known("two-spots")
+    if clipped_share > CLIPPED_SHARE_MAX:
+        return known("clipped")
     if area > AREA_MAX_SHARE * width * height:
-        return Centre("too-large", **known)
+        return known("too-large")
     centre = camera.raw(np.array([[moments["m10"], moments["m01"]]]) / area + low)[0]
     if (outline < 1).any() or (outline > np.array([width, height]) - 2).any():
-        return Centre("border", **known)
+        return known("border")
     signal = BRIGHT_SHARE * (peak - floor)
     background = background_variance(picture, centre, int(3 * sd + 3))
     moved = background + noise.gain_dn * signal + (noise.speckle_contrast * signal) ** 2
     variance = (moved / (signal * radius / sd**2) ** 2 + 1 / 12) / (pi * radius)
-    return Centre("ok", centre, variance * np.eye(2), **known)
+    return known("ok", centre, variance * np.eye(2))
 
 
 def epipolar_residual(pixels: np.ndarray, stereo: Stereo) -> np.ndarray:
@@ -129,20 +133,20 @@ def epipolar_refused(pixels: np.ndarray, covariances: np.ndarray, stereo: Stereo
     residual = epipolar_residual(pixels, stereo)
     step_px = 1e-2  # truncation 1e-9 of the slope, rounding and undistortion 1e-7
     steps = step_px * np.eye(4)
-    slope = [epipolar_residual(pixels + h, stereo) - epipolar_residual(pixels - h, stereo) for h in steps]
-    slope = np.stack(slope, axis=1) / (2 * step_px)
+    changes = [epipolar_residual(pixels + h, stereo) - epipolar_residual(pixels - h, stereo) for h in steps]
+    slope = np.stack(changes, axis=1) / (2 * step_px)
     variance = np.einsum("ni,nij,nj->n", slope, covariances, slope)
     vector, covariance = stereo.vector, np.asarray(stereo.parameter_covariance, float)
     sds = np.sqrt(np.diag(covariance))
     free = np.flatnonzero(sds > 0)
     if len(free):
-        moved = []
+        by_camera = []
         for row in free:
             step = np.zeros(24)
             step[row] = 0.1 * sds[row]
             ends = (epipolar_residual(pixels, stereo.with_vector(vector + sign * step)) for sign in (1, -1))
-            moved.append((next(ends) - next(ends)) / (2 * step[row]))
-        moved = np.array(moved)
+            by_camera.append((next(ends) - next(ends)) / (2 * step[row]))
+        moved = np.array(by_camera)
         variance = variance + np.einsum("in,ij,jn->n", moved, covariance[np.ix_(free, free)], moved)
     distance = np.abs(residual) / np.linalg.norm(slope, axis=1)
     allowed = EPIPOLAR_SIGMAS * np.sqrt(variance) / np.linalg.norm(slope, axis=1)

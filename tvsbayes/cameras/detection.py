@@ -1,21 +1,14 @@
-"""Laser spots in pictures: centres with covariances from the frames of a campaign, or the reason why there is none.
+"""Laser spots in the frames of a campaign: centres with covariances, or the reason why there is none.
 
-Raw image px with the integer at the centre of a pixel; DN = grey levels of 8 bits; pictures (height, width, 3) uint8,
-blue, green, red. Two methods:
-
-- `fit` (default): an elliptic Gaussian on a sloping background, fitted to the pixels around the spot by iterated
-  weighted least squares. Pixels next to a clipped one are left out: a clipped core is normal, costs information and so
-  widens the standard uncertainty. Grey is (B + 2 G + R) / 4, in which every photosite of a Bayer sensor weighs alike;
-  808 nm passes all three dyes, so hue tells nothing. Variance of a pixel with signal S:
-  background + gain * S + (contrast * S)^2: what the frame shows without spot, shot noise, speckle.
-- `contour`: the paper's (section 2.4): rectify, region of interest, HSV, threshold, contour, centroid of the binary
-  region, here taken back to the raw pixels of the format.
+Raw image px with the integer at the centre of a pixel. Two methods: `fit` (`cameras.spot_fit`), the default, and
+`contour` (`cameras.contour`), the paper's (section 2.4): rectify, region of interest, HSV, threshold, contour, centroid
+of the binary region, here taken back to the raw pixels of the format.
 
 Gain and contrast are learned from the campaign itself, per camera, from what a symmetric fit cannot follow: third-order
 (skew) residuals have the scale of the spot, are noise alone for any symmetric spot, and average demosaicing and the
 grain of speckle as the centre does. A skewed beam counts as noise and widens the sd. Sd of an intensity centroid under
 speckle alone: contrast / sqrt(8 pi) = 0.2 contrast px, whatever the size of the spot (Gaussian spot, independent
-pixels). No JAX.
+pixels).
 
 Refusals (status in spots.csv: reason, then the camera): see `REASONS`.
 """
@@ -31,27 +24,27 @@ from pathlib import Path
 
 import numpy as np
 
-from tvsbayes.cameras.contour import contour_of, epipolar_refused, rectified_pair
+from tvsbayes.cameras.contour import Rectified, contour_of, epipolar_refused, rectified_pair
 from tvsbayes.cameras.spot_fit import (
     CLIPPED_SHARE_MAX,
-    CONTRAST_DEFAULT,
     Centre,
+    Located,
     Patch,
-    SpotNoise,
     centre_of,
     fit_spot,
-    learn_noise,
     patch_around,
     skewness,
 )
+from tvsbayes.cameras.spot_noise import CONTRAST_DEFAULT, SpotNoise, learn_noise
 from tvsbayes.errors import InputError, NothingToEstimate, escaped, refusal
 from tvsbayes.files.disk import make_folder, read_bytes, write_atomically
 from tvsbayes.files.images import IMAGE_BYTES_MAX, decode_image, image_size, png_bytes
-from tvsbayes.instrument.campaign import Campaign, Spot
+from tvsbayes.instrument.campaign import CAMERAS, Campaign, Spot, frame_name, with_pixels
 from tvsbayes.instrument.stereo_pair import Stereo
 
 METHODS = ("fit", "contour")
-SIDES = ("left", "right")
+_Patches = tuple[Patch | str, Patch | str]
+"""Left and right patch of a look, or why there is none."""
 REASONS = {
     "no-spot": "nothing stands out of the background",
     "two-spots": "a second spot holds over a quarter of the light of the first",
@@ -68,6 +61,8 @@ PILOTS_MAX = 24
 """Looks from which the weights of the fits are learned; uncertainties are stated from all."""
 LEARNING_ROUNDS = 3
 SKEWS_MAX = 4000
+OVERLAY_HALF_PX, OVERLAY_ZOOM = 32, 8
+"""Half the side of the square that an overlay shows, and how many of its pixels show one."""
 
 
 @dataclass(frozen=True)
@@ -114,7 +109,7 @@ class Detection:
 
 def pair_status(left: Centre, right: Centre) -> str:
     """The word "ok", or the reasons of both cameras with their sides, as `spots.csv` holds them."""
-    bad = [(c.status, side) for c, side in zip((left, right), SIDES, strict=True) if c.status != "ok"]
+    bad = [(c.status, side) for c, side in zip((left, right), CAMERAS, strict=True) if c.status != "ok"]
     if len(bad) == 2 and bad[0][0] == bad[1][0]:
         return f"{bad[0][0]} both"
     return ", ".join(f"{reason} {side}" for reason, side in bad) or "ok"
@@ -122,17 +117,20 @@ def pair_status(left: Centre, right: Centre) -> str:
 
 def _row(spot: Spot, left: Centre, right: Centre) -> Spot:
     """A row with what was found; pixels stay empty where a camera refused."""
-    values: dict[str, float | None] = {}
     status = pair_status(left, right)
-    for side, one in zip(SIDES, (left, right), strict=True):
-        good = status == "ok"
-        sds = np.sqrt(np.diag(one.covariance_px2)) if good else (None, None)
-        for number, coordinate in enumerate("uv"):
-            values[f"{coordinate}_{side}_px"] = round(float(one.centre_px[number]), 6) if good else None
-            # The format's smallest sd; no spot is known that well.
-            values[f"s{coordinate}_{side}_px"] = max(round(float(sds[number]), 7), 1e-4) if good else None
-        values[f"ruv_{side}"] = round(float(one.covariance_px2[0, 1] / sds[0] / sds[1]), 6) if good else 0.0
-    return replace(spot, **values, status=status)
+    if status != "ok":
+        return with_pixels(spot, status)
+    pixels: list[float] = []
+    sds: list[float] = []
+    correlations: list[float] = []
+    for one in (left, right):
+        found = one.located
+        sd = np.sqrt(np.diag(found.covariance_px2))
+        pixels += [round(float(value), 6) for value in found.centre_px]
+        # The format's smallest sd; no spot is known that well.
+        sds += [max(round(float(value), 7), 1e-4) for value in sd]
+        correlations.append(round(float(found.covariance_px2[0, 1] / sd[0] / sd[1]), 6))
+    return with_pixels(spot, status, pixels, sds, correlations)
 
 
 @dataclass(frozen=True)
@@ -143,10 +141,10 @@ class _Frames:
     size: tuple[int, int]
 
     def path(self, spot: Spot, side: str) -> Path:
-        return self.folder / "frames" / f"{spot.spot:06d}_{side}.png"
+        return self.folder / frame_name(spot.spot, side)
 
     def there(self, spot: Spot) -> bool:
-        return all(os.path.lexists(self.path(spot, side)) for side in SIDES)
+        return all(os.path.lexists(self.path(spot, side)) for side in CAMERAS)
 
     def read(self, spot: Spot, side: str) -> np.ndarray:
         path = self.path(spot, side)
@@ -164,7 +162,7 @@ class _Frames:
         return decode_image(data, escaped(path.name))
 
 
-def _parallel(job: Callable, items: Sequence, workers: int) -> Iterator:
+def _parallel[Item, Result](job: Callable[[Item], Result], items: Sequence[Item], workers: int) -> Iterator[Result]:
     """Results in order. Decoding and OpenCV leave Python's lock, so threads do; Ctrl-C drops what has not begun."""
     pool = ThreadPoolExecutor(workers)
     try:
@@ -197,13 +195,7 @@ def detect(
         InputError: a frame that cannot be read safely, has another size, or a campaign without folder.
         NothingToEstimate: no row has both frames.
     """
-    if method not in METHODS:
-        remedy = "choose one of them"
-        raise InputError("method", f"no method {method!r}", found=method, allowed=", ".join(METHODS), remedy=remedy)
-    if campaign.path is None:
-        raise InputError("path", "a campaign that was not read from a folder has no frames")
-    stereo = campaign.stereo
-    frames = _Frames(Path(campaign.path), (stereo.image_width, stereo.image_height))
+    frames = _frames_of(campaign, method)
     rows = [row for row, spot in enumerate(campaign.spots) if _ours(spot.status)]
     present = [row for row in rows if frames.there(campaign.spots[row])]
     if not present:
@@ -214,51 +206,17 @@ def detect(
             remedy="put the pictures there, or write centroids into spots.csv yourself",
         )
     workers = workers or os.cpu_count() or 1
-    noise = {side: SpotNoise(speckle_contrast=_contrast(speckle_contrast)) for side in SIDES}
-    kept: dict[int, tuple[Patch | str, Patch | str]] = {}
-    if method == "fit":
-        kept = _pilots(campaign.spots, present, frames, workers)
-        for number, side in enumerate(SIDES):
-            found = [pair[number] for pair in kept.values() if not isinstance(pair[number], str)]
-            noise[side] = _learned([one for one in found if one.clipped_share <= CLIPPED_SHARE_MAX], speckle_contrast)
-    maps = rectified_pair(stereo) if method == "contour" else (None, None)
-    if overlay is not None:
-        make_folder(overlay)
-
-    def look(row: int) -> tuple[Centre, Centre]:
-        spot = campaign.spots[row]
-        if row in kept and overlay is None:
-            first, second = (centre_of(patch, noise[side]) for side, patch in zip(SIDES, kept[row], strict=True))
-            return first, second
-        found, pictures = [], []
-        for side, camera in zip(SIDES, maps, strict=True):
-            picture = frames.read(spot, side)
-            found.append(
-                centre_of(patch_around(picture), noise[side])
-                if camera is None
-                else contour_of(picture, camera, noise[side])
-            )
-            if overlay is not None:
-                pictures.append(_overlay(picture, found[-1]))
-        if overlay is not None:
-            write_atomically(overlay / f"{spot.spot:06d}.png", png_bytes(np.hstack(pictures)))
-        return found[0], found[1]
-
+    looks = _looks(campaign, method, frames, present, speckle_contrast, workers, overlay)
     pairs = []
-    for pair in _parallel(look, present, workers):
+    for pair in _parallel(looks.centres, present, workers):
         pairs.append(pair)
         if done is not None:
             done(len(pairs), len(present))
-    if method == "fit":
-        for number, side in enumerate(SIDES):
-            skews = [pair[number].skews for pair in pairs if pair[number].status in ("ok", "misshapen")]
-            if skews:
-                table = np.vstack(skews)
-                noise[side] = learn_noise(table[:: -(-len(table) // SKEWS_MAX)], speckle_contrast)
+    noise = _relearned(looks.noise, pairs, speckle_contrast) if method == "fit" else looks.noise
     seen = [(left.under(noise["left"]), right.under(noise["right"])) for left, right in pairs]
-    spots = _rows(campaign.spots, present, seen, stereo)
+    spots = _rows(campaign.spots, present, seen, campaign.stereo)
     after = [spots[row] for row in present]
-    stated = [s.su_left_px for s in after if s.status == "ok"] + [s.su_right_px for s in after if s.status == "ok"]
+    stated = [sd for s in after if s.status == "ok" for sd in (s.su_left_px, s.su_right_px) if sd is not None]
     return Detection(
         campaign=replace(campaign, spots=tuple(spots)),
         method=method,
@@ -271,13 +229,100 @@ def detect(
     )
 
 
-def _pilots(
-    spots: Sequence[Spot], present: Sequence[int], frames: _Frames, workers: int
-) -> dict[int, tuple[Patch | str, Patch | str]]:
+def _frames_of(campaign: Campaign, method: str) -> _Frames:
+    """Where the frames lie, of a campaign that has some, for a method that there is."""
+    if method not in METHODS:
+        remedy = "choose one of them"
+        raise InputError("method", f"no method {method!r}", found=method, allowed=", ".join(METHODS), remedy=remedy)
+    if campaign.path is None:
+        raise InputError("path", "a campaign that was not read from a folder has no frames")
+    return _Frames(Path(campaign.path), (campaign.stereo.image_width, campaign.stereo.image_height))
+
+
+@dataclass(frozen=True)
+class _Looks:
+    """Finds the centres of one look after the other.
+
+    Attributes:
+        spots: all rows of spots.csv.
+        frames: their pictures.
+        noise: of the left and of the right camera.
+        patches: of rows that were read before.
+        rectified: both cameras for the method `contour`, empty for `fit`.
+        overlay: folder for a picture of every look.
+    """
+
+    spots: Sequence[Spot]
+    frames: _Frames
+    noise: dict[str, SpotNoise]
+    patches: dict[int, _Patches]
+    rectified: dict[str, Rectified]
+    overlay: Path | None
+
+    def centres(self, row: int) -> tuple[Centre, Centre]:
+        """Left and right centre of a row."""
+        if row in self.patches and self.overlay is None:
+            first, second = self.patches[row]
+            return centre_of(first, self.noise["left"]), centre_of(second, self.noise["right"])
+        spot = self.spots[row]
+        pictures = {camera: self.frames.read(spot, camera) for camera in CAMERAS}
+        left, right = (self._centre(camera, picture) for camera, picture in pictures.items())
+        if self.overlay is not None:
+            views = _overlay(pictures["left"], left), _overlay(pictures["right"], right)
+            write_atomically(self.overlay / f"{spot.spot:06d}.png", png_bytes(np.hstack(views)))
+        return left, right
+
+    def _centre(self, camera: str, picture: np.ndarray) -> Centre:
+        if camera in self.rectified:
+            return contour_of(picture, self.rectified[camera], self.noise[camera])
+        return centre_of(patch_around(picture), self.noise[camera])
+
+
+def _looks(
+    campaign: Campaign,
+    method: str,
+    frames: _Frames,
+    present: Sequence[int],
+    speckle_contrast: float | None,
+    workers: int,
+    overlay: Path | None,
+) -> _Looks:
+    """What a method knows before it begins: the noise of each camera from pilots, or the rectified pictures."""
+    noise: dict[str, SpotNoise] = {}
+    patches: dict[int, _Patches] = {}
+    rectified: dict[str, Rectified] = {}
+    if method == "fit":
+        patches = _pilots(campaign.spots, present, frames, workers)
+        for number, camera in enumerate(CAMERAS):
+            found = [patch for pair in patches.values() if not isinstance(patch := pair[number], str)]
+            noise[camera] = _learned([one for one in found if one.clipped_share <= CLIPPED_SHARE_MAX], speckle_contrast)
+    else:
+        noise["left"] = noise["right"] = SpotNoise(speckle_contrast=_contrast(speckle_contrast))
+        rectified["left"], rectified["right"] = rectified_pair(campaign.stereo)
+    if overlay is not None:
+        make_folder(overlay)
+    return _Looks(campaign.spots, frames, noise, patches, rectified, overlay)
+
+
+def _relearned(
+    noise: dict[str, SpotNoise], pairs: Sequence[tuple[Centre, Centre]], speckle_contrast: float | None
+) -> dict[str, SpotNoise]:
+    """The noise of each camera from all of its spots."""
+    result = dict(noise)
+    for number, camera in enumerate(CAMERAS):
+        good = [pair[number] for pair in pairs if pair[number].status in ("ok", "misshapen")]
+        skews = [centre.skews for centre in good if centre.skews is not None]
+        if skews:
+            table = np.vstack(skews)
+            result[camera] = learn_noise(table[:: -(-len(table) // SKEWS_MAX)], speckle_contrast)
+    return result
+
+
+def _pilots(spots: Sequence[Spot], present: Sequence[int], frames: _Frames, workers: int) -> dict[int, _Patches]:
     """Left and right patch, or why there is none, of looks spread evenly over the campaign, by row of spots.csv."""
     rows = [present[k] for k in np.unique(np.linspace(0, len(present) - 1, PILOTS_MAX).astype(int))]
 
-    def patches(row: int) -> tuple[Patch | str, Patch | str]:
+    def patches(row: int) -> _Patches:
         return patch_around(frames.read(spots[row], "left")), patch_around(frames.read(spots[row], "right"))
 
     return dict(zip(rows, _parallel(patches, rows, workers), strict=True))
@@ -287,19 +332,21 @@ def _rows(
     spots: Sequence[Spot], present: Sequence[int], seen: Sequence[tuple[Centre, Centre]], stereo: Stereo
 ) -> list[Spot]:
     """All rows of spots.csv, those in `present` with what was seen (left, right); off their epipolar line: refused."""
-    spots, good = list(spots), []
+    rows = list(spots)
+    good: list[tuple[int, Located, Located]] = []
     for row, (left, right) in zip(present, seen, strict=True):
-        spots[row] = _row(spots[row], left, right)
-        if spots[row].status == "ok":
-            good.append((row, left, right))
+        rows[row] = _row(rows[row], left, right)
+        if rows[row].status == "ok":
+            good.append((row, left.located, right.located))
     pixels, covariances = np.zeros((len(good), 4)), np.zeros((len(good), 4, 4))
-    for place, (_, left, right) in enumerate(good):
-        pixels[place] = *left.centre_px, *right.centre_px
-        covariances[place, :2, :2], covariances[place, 2:, 2:] = left.covariance_px2, right.covariance_px2
-    for place in np.flatnonzero(epipolar_refused(pixels, covariances, stereo)):
-        row = good[place][0]
-        spots[row] = replace(spots[row], status="epipolar")
-    return spots
+    for place, (_, one, other) in enumerate(good):
+        pixels[place] = *one.centre_px, *other.centre_px
+        covariances[place, :2, :2], covariances[place, 2:, 2:] = one.covariance_px2, other.covariance_px2
+    refused = epipolar_refused(pixels, covariances, stereo)
+    for (row, _, _), bad in zip(good, refused, strict=True):
+        if bad:
+            rows[row] = replace(rows[row], status="epipolar")
+    return rows
 
 
 def _ours(status: str) -> bool:
@@ -322,10 +369,6 @@ def _learned(patches: Sequence[Patch], speckle_contrast: float | None) -> SpotNo
     return noise
 
 
-OVERLAY_HALF_PX, OVERLAY_ZOOM = 32, 8
-"""Half the side of the square that an overlay shows, and how many of its pixels show one."""
-
-
 def _overlay(picture: np.ndarray, centre: Centre) -> np.ndarray:
     """The surroundings of a spot enlarged: outline green, centre red, the reason of a refusal in words (Figure 9)."""
     import cv2
@@ -334,8 +377,8 @@ def _overlay(picture: np.ndarray, centre: Centre) -> np.ndarray:
     height, width = picture.shape[:2]
     middle = centre.centre_px
     if middle is None:
-        known = centre.outline_px is not None and len(centre.outline_px)
-        middle = centre.outline_px.mean(axis=0) if known else np.array([width, height]) / 2
+        outline = centre.outline_px
+        middle = np.array([width, height]) / 2 if outline is None or not len(outline) else outline.mean(axis=0)
     low = np.clip(np.round(middle).astype(int) - half, 0, np.maximum((width, height) - np.array(2 * half), 0))
     crop = picture[low[1] : low[1] + 2 * half, low[0] : low[0] + 2 * half]
     crop = cv2.copyMakeBorder(crop, 0, 2 * half - crop.shape[0], 0, 2 * half - crop.shape[1], cv2.BORDER_CONSTANT)

@@ -1,11 +1,24 @@
-"""Centre of a spot with covariance."""
+"""The centre of one camera's spot with its covariance, or the reason why there is none; and the noise it has.
+
+An elliptic Gaussian on a sloping background, fitted to the pixels around the spot by iterated weighted least squares.
+Pixels next to a clipped one are left out: a clipped core is normal, costs information and so widens the standard
+uncertainty. Grey is (B + 2 G + R) / 4, in which every photosite of a Bayer sensor weighs alike; 808 nm passes all three
+dyes, so hue tells nothing. Variance of a pixel with signal S: background + gain * S + (contrast * S)^2: what the frame
+shows without spot, shot noise, speckle.
+
+Raw image px with the integer at the centre of a pixel; DN = grey levels of 8 bits; pictures (height, width, 3) uint8,
+blue, green, red.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 from math import log, pi, sqrt
 
 import numpy as np
+
+from tvsbayes.cameras.spot_noise import SpotNoise, background_variance, grey_of, through_demosaicing
 
 CLIPPED_DN = 250
 """A channel at or above this counts as clipped: white balance and JPEG leave full wells a little below 255."""
@@ -24,46 +37,17 @@ BORDER_SDS = 3.0
 """A spot cut off nearer than this has lost what tells its place."""
 DETECTION_SIGMAS, DETECTION_MIN_DN = 8.0, 2.0
 """Least height of a spot over the background, of means of 4 x 4 px: in sds of them and in DN."""
-GAIN_MEDIAN_DN, GAIN_SD_OF_LOG = 0.05, 1.0
-"""Prior of the shot-noise gain, log-normal, DN per DN of signal: 255 DN at 5000 electrons, within a factor of e."""
-CONTRAST_DEFAULT = 0.4
-"""Speckle contrast where no campaign tells it: the middle of what averaging leaves, 0.3 to 0.63 (research note on
-vision, section 4)."""
-CONTRAST_SCALE, CONTRAST_MAX = 0.5, 2.0
-"""Prior of the learned contrast: half-normal of this scale, up to here. Speckle may be absent; fully developed it has
-1, and its grain in px multiplies that."""
-SKEW_OUTLIER = 30.0
-"""A squared skew residual this many times its expectation teaches nothing about noise (normal: one in 10^7)."""
 SKEW_LIMIT = 80.0
 """Largest sum of a spot's four standardised squared skew residuals (normal: one in 10^15; speckle has longer tails)."""
 _SHRINK = 4
-_CELL = 8
-
-
-def _autocorrelation(kernel: np.ndarray) -> np.ndarray:
-    padded = np.pad(kernel, 2)
-    return np.array([[np.sum(kernel * padded[i : i + 3, j : j + 3]) for j in range(5)] for i in range(5)])
-
-
-# What one photosite's noise becomes in grey by bilinear demosaicing: red and blue sites, green sites; half of each.
-_CORRELATION = (
-    _autocorrelation(np.array([[1, 2, 1], [2, 4, 2], [1, 2, 1]]) / 16)
-    + _autocorrelation(np.array([[0, 1, 0], [1, 4, 1], [0, 1, 0]]) / 8)
-) / 2
-_LAGS = np.maximum(_CELL - np.abs(np.arange(-2, 3)), 0)
-_CELL_VARIANCE = float(np.sum(_CORRELATION * np.outer(_LAGS, _LAGS))) / _CELL**4
-"""Variance of the mean of a cell for unit noise per photosite."""
 
 
 @dataclass(frozen=True)
-class SpotNoise:
-    """Variance of a grey pixel with signal S beyond the background's: gain_dn * S + (speckle_contrast * S)^2, DN^2.
+class Located:
+    """Centre (2,) u, v of a spot, px, and its covariance (2, 2), px^2."""
 
-    The contrast is that per independent pixel: contrast times the root of the grain's area in px.
-    """
-
-    gain_dn: float = GAIN_MEDIAN_DN
-    speckle_contrast: float = CONTRAST_DEFAULT
+    centre_px: np.ndarray
+    covariance_px2: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -89,6 +73,12 @@ class Centre:
     outline_px: np.ndarray | None = None
     parts_px2: np.ndarray | None = None
     skews: np.ndarray | None = None
+
+    @property
+    def located(self) -> Located:
+        """Centre and covariance of a spot that counts."""
+        assert self.centre_px is not None and self.covariance_px2 is not None, self.status
+        return Located(self.centre_px, self.covariance_px2)
 
     def under(self, noise: SpotNoise) -> Centre:
         """The same centre with the covariance that this noise gives it; misshapen where its skew is no noise."""
@@ -136,10 +126,6 @@ class _Fitted:
     z2: np.ndarray
 
 
-def _grey(picture: np.ndarray) -> np.ndarray:
-    return picture.astype(np.float32) @ np.array([0.25, 0.5, 0.25], np.float32)
-
-
 def patch_around(picture: np.ndarray) -> Patch | str:
     """Find the spot of a picture; the reason for refusal where there is not exactly one."""
     import cv2
@@ -158,7 +144,7 @@ def patch_around(picture: np.ndarray) -> Patch | str:
         return "no-spot"
     bright = (above > max(SECOND_SHARE * peak, DETECTION_SIGMAS / 2 * noise)).astype(np.uint8)
     count, labels, stats, centroids = cv2.connectedComponentsWithStats(bright, connectivity=8)
-    flux = np.bincount(labels.ravel(), weights=above.ravel(), minlength=count)
+    flux = np.bincount(labels.ravel().astype(np.intp), weights=above.ravel(), minlength=count)
     flux[0] = 0.0
     main = int(flux.argmax())
     if np.sort(flux)[-2] > SECOND_SHARE * flux[main]:
@@ -174,7 +160,7 @@ def patch_around(picture: np.ndarray) -> Patch | str:
     left, top = np.maximum(np.round(start).astype(int) - half, 0)
     right, bottom = np.minimum(np.round(start).astype(int) + half + 1, (width, height))
     window = picture[top:bottom, left:right]
-    grey = _grey(window)
+    grey = grey_of(window)
     clipped = (window >= CLIPPED_DN).any(axis=2).astype(np.uint8)
     floor = float(np.median(np.concatenate((grey[0], grey[-1], grey[:, 0], grey[:, -1]))))
     level = floor + BRIGHT_SHARE * (float(grey.max()) - floor)
@@ -196,61 +182,45 @@ def patch_around(picture: np.ndarray) -> Patch | str:
     )
 
 
-def background_variance(picture: np.ndarray, centre: np.ndarray, half: int) -> float:
-    """Variance of one photosite around the spot, DN^2.
+@dataclass(frozen=True)
+class _Model:
+    """The model of a spot at trial parameters: its precision's factor (a, b; 0, c), and over the pixels the signal."""
 
-    From means of 8 x 8 px, in second differences that slopes do not enter: single demosaiced pixels are smoothed and
-    show too little.
+    a: float
+    b: float
+    c: float
+    z1: np.ndarray
+    z2: np.ndarray
+    signal: np.ndarray
+
+
+@dataclass(frozen=True)
+class _Pixels:
+    """A patch as a fit takes it: coordinates, data (n,), which of them count, and the derivatives (9, n) to be filled.
+
+    The last three derivatives, of the background's level and slopes, never change.
     """
-    import cv2
 
-    corner = np.floor(centre).astype(int) - half - 96
-    low = np.clip(corner, 0, picture.shape[1::-1])
-    high = np.clip(corner + 2 * half + 192, 0, picture.shape[1::-1])
-    cells = (high - low) // _CELL
-    region = _grey(picture[low[1] : low[1] + _CELL * cells[1], low[0] : low[0] + _CELL * cells[0]])
-    if min(cells) < 3:
-        return 1.0
-    means = cv2.resize(region, (int(cells[0]), int(cells[1])), interpolation=cv2.INTER_AREA)
-    v, u = np.indices(means.shape)
-    middle = (_CELL - 1) / 2
-    off_u, off_v = np.abs(_CELL * u + middle + low[0] - centre[0]), np.abs(_CELL * v + middle + low[1] - centre[1])
-    far = np.maximum(off_u, off_v) > half + 2 * _CELL
-    values = (means[:, 1:-1] - (means[:, :-2] + means[:, 2:]) / 2)[far[:, 1:-1]]
-    if values.size < 8:
-        return 1.0
-    # MAD: edges of other things in the picture are few. 1.5: variance of the difference of independent means.
-    variance = (1.4826 * float(np.median(np.abs(values)))) ** 2 / 1.5 / _CELL_VARIANCE
-    return max(variance, 1 / 12)  # rounding to whole grey levels
+    u: np.ndarray
+    v: np.ndarray
+    data: np.ndarray
+    usable: np.ndarray
+    jacobian: np.ndarray
 
+    @classmethod
+    def of(cls, patch: Patch) -> _Pixels:
+        v, u = (axis.ravel().astype(float) for axis in np.indices(patch.grey.shape))
+        middle_u, middle_v = (np.array(patch.grey.shape[::-1]) - 1) / 2
+        jacobian = np.empty((9, patch.grey.size))
+        jacobian[6], jacobian[7], jacobian[8] = 1.0, (u - middle_u) / (middle_u + 1), (v - middle_v) / (middle_v + 1)
+        return cls(u, v, patch.grey.ravel().astype(float), patch.usable.ravel(), jacobian)
 
-def fit_spot(patch: Patch, noise: SpotNoise) -> _Fitted | None:
-    """Elliptic Gaussian on a plane by weighted Gauss-Newton steps; None where they do not settle.
-
-    Parameters: log height, centre, lower triangle of the precision's Cholesky factor with logs on its diagonal,
-    level and slopes of the background. Own steps and no library's: a general solver takes longer than the decoding
-    of the picture.
-    """
-    v, u = (axis.ravel().astype(float) for axis in np.indices(patch.grey.shape))
-    usable = patch.usable.ravel()
-    if usable.sum() < 25:
-        return None
-    data = patch.grey.ravel().astype(float)
-    edge = float(np.median(np.concatenate((patch.grey[0], patch.grey[-1]))))
-    centre = patch.start_px - np.array(patch.corner)
-    tight = -log(patch.start_sd_px)
-    p = np.array([log(max(float(patch.grey.max()) - edge, 1.0)), *centre, tight, 0.0, tight, edge, 0.0, 0.0])
-    middle_u, middle_v = (np.array(patch.grey.shape[::-1]) - 1) / 2
-    jacobian = np.empty((9, data.size))
-    jacobian[6], jacobian[7], jacobian[8] = 1.0, (u - middle_u) / (middle_u + 1), (v - middle_v) / (middle_v + 1)
-    limits = np.array([0.7, 0, 0, 0.4, 0.4, 0.4, np.inf, np.inf, np.inf])
-    settled = 0
-    for iteration in range(60):
+    def model(self, p: np.ndarray) -> _Model:
+        """The model at parameters p (9,), whose derivatives it leaves in `jacobian`."""
         a, b, c = np.exp(p[3]), p[4], np.exp(p[5])
-        x, y = u - p[1], v - p[2]
+        x, y, jacobian = self.u - p[1], self.v - p[2], self.jacobian
         z1, z2 = a * x + b * y, c * y
         signal = np.exp(p[0] - (z1 * z1 + z2 * z2) / 2)
-        residual = data - signal - p[6:] @ jacobian[6:]
         along = signal * z1
         down = signal * z2
         np.multiply(along, a, out=jacobian[1])
@@ -260,13 +230,35 @@ def fit_spot(patch: Patch, noise: SpotNoise) -> _Fitted | None:
         np.multiply(along, -a * x, out=jacobian[3])
         np.multiply(along, -y, out=jacobian[4])
         np.multiply(down, -c * y, out=jacobian[5])
+        return _Model(a, b, c, z1, z2, signal)
+
+
+def fit_spot(patch: Patch, noise: SpotNoise) -> _Fitted | None:
+    """Elliptic Gaussian on a plane by weighted Gauss-Newton steps; None where they do not settle.
+
+    Parameters: log height, centre, lower triangle of the precision's Cholesky factor with logs on its diagonal,
+    level and slopes of the background. Own steps and no library's: a general solver takes longer than the decoding
+    of the picture.
+    """
+    if patch.usable.sum() < 25:
+        return None
+    pixels = _Pixels.of(patch)
+    jacobian, usable = pixels.jacobian, pixels.usable
+    edge = float(np.median(np.concatenate((patch.grey[0], patch.grey[-1]))))
+    centre = patch.start_px - np.array(patch.corner)
+    tight = -log(patch.start_sd_px)
+    p = np.array([log(max(float(patch.grey.max()) - edge, 1.0)), *centre, tight, 0.0, tight, edge, 0.0, 0.0])
+    limits = np.array([0.7, 0, 0, 0.4, 0.4, 0.4, np.inf, np.inf, np.inf])
+    settled = 0
+    for iteration in range(60):
+        model = pixels.model(p)
+        signal = model.signal
+        residual = pixels.data - signal - p[6:] @ jacobian[6:]
         # Far from the solution the weights of a wrong model mislead: equal ones first.
-        if settled:
-            weights = usable / (
-                patch.background_variance + signal * (noise.gain_dn + noise.speckle_contrast**2 * signal)
-            )
-        else:
-            weights = usable / patch.background_variance
+        variance = patch.background_variance + (
+            signal * (noise.gain_dn + noise.speckle_contrast**2 * signal) if settled else 0.0
+        )
+        weights = usable / variance
         weighted = jacobian * weights
         normal = weighted @ jacobian.T
         scale = np.sqrt(np.diag(normal)) + 1e-30
@@ -276,29 +268,20 @@ def fit_spot(patch: Patch, noise: SpotNoise) -> _Fitted | None:
         except np.linalg.LinAlgError:
             return None
         step /= scale
-        limits[1] = limits[2] = 1 / min(a, c)
-        limits[4] = 0.4 * c
+        limits[1] = limits[2] = 1 / min(model.a, model.c)
+        limits[4] = 0.4 * model.c
         step *= min(1.0, float(np.min(limits / np.maximum(np.abs(step), 1e-300))))
-        move, change = np.abs(step[1:3]).max() * max(a, c), np.abs(step[[0, 3, 5]]).max()
+        move, change = np.abs(step[1:3]).max() * max(model.a, model.c), np.abs(step[[0, 3, 5]]).max()
         # In sds of the spot; what is left after the last step is ten times less.
         if settled > 1 and move < 5e-4 and change < 5e-3:
-            factor = np.array([[a, 0.0], [b, c]])
+            factor = np.array([[model.a, 0.0], [model.b, model.c]])
             centre = p[1:3] + step[1:3] + np.array(patch.corner)
-            return _Fitted(centre, factor @ factor.T, signal, jacobian, weights, residual, z1, z2)
+            return _Fitted(centre, factor @ factor.T, signal, jacobian, weights, residual, model.z1, model.z2)
         settled += bool(settled or (move < 0.05 and change < 0.1) or iteration > 12)
         p = p + step
         if not np.isfinite(p).all() or max(abs(p[3]), abs(p[5])) > 6 or p[0] > 12:
             return None
     return None
-
-
-def _through_demosaicing(filters: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
-    """Variance (k,) of filters (k, n) on a patch (h, w) of unit noise per photosite, as grey shows it."""
-    import cv2
-
-    pictures = filters.reshape(len(filters), *shape)
-    smooth = [cv2.filter2D(one, cv2.CV_64F, _CORRELATION, borderType=cv2.BORDER_CONSTANT) for one in pictures]
-    return np.einsum("kij,kij->k", pictures, np.array(smooth))
 
 
 def _covariance_parts(fitted: _Fitted, patch: Patch) -> np.ndarray:
@@ -310,7 +293,7 @@ def _covariance_parts(fitted: _Fitted, patch: Patch) -> np.ndarray:
     signal = fitted.signal
     parts = []
     for filters, size in ((gains, patch.background_variance), (gains * np.sqrt(signal), 1.0), (gains * signal, 1.0)):
-        u, v, both = size * _through_demosaicing(filters, patch.grey.shape)
+        u, v, both = size * through_demosaicing(filters, patch.grey.shape)
         mixed = (both - u - v) / 2
         parts.append([[u, mixed], [mixed, v]])
     return np.array(parts)
@@ -328,57 +311,25 @@ def skewness(fitted: _Fitted, patch: Patch) -> np.ndarray:
     taken = np.linalg.solve(weighted @ fitted.jacobian.T, weighted @ shapes.T)
     filters = (shapes - taken.T @ fitted.jacobian) * fitted.weights
     parts = [
-        patch.background_variance * _through_demosaicing(filters, patch.grey.shape),
-        _through_demosaicing(filters * np.sqrt(signal), patch.grey.shape),
-        _through_demosaicing(filters * signal, patch.grey.shape),
+        patch.background_variance * through_demosaicing(filters, patch.grey.shape),
+        through_demosaicing(filters * np.sqrt(signal), patch.grey.shape),
+        through_demosaicing(filters * signal, patch.grey.shape),
     ]
     return np.column_stack(((filters @ fitted.residual) ** 2, *parts))
-
-
-def learn_noise(skews: np.ndarray, speckle_contrast: float | None = None) -> SpotNoise:
-    """Gain and contrast of one camera: posterior means of contrast and log gain on a grid.
-
-    Means of their squares would state too much where there is no speckle: the contrast's posterior begins at 0.
-
-    Args:
-        skews: (n, 4) as `skewness` makes them, of any number of spots.
-        speckle_contrast: taken as known where given.
-    """
-    away = np.linspace(-3, 3, 41)[:, None]
-    gains = GAIN_MEDIAN_DN * np.exp(away * GAIN_SD_OF_LOG)
-    # Equal steps of the root: fine near 0; each point weighs what lies around it.
-    contrasts = np.linspace(0, 1, 121) ** 2 * CONTRAST_MAX
-    widths = np.gradient(contrasts)
-    if speckle_contrast is not None:
-        contrasts, widths = np.array([speckle_contrast]), np.ones(1)
-    squares = contrasts**2
-    # A reflection in one spot must not widen all others.
-    expected = skews[:, 1] + skews[:, 2] * GAIN_MEDIAN_DN + skews[:, 3] * np.median(squares)
-    ratio = skews[:, 0] / expected
-    skews = skews[ratio <= SKEW_OUTLIER * np.median(ratio) / 0.455]  # 0.455: median of a squared normal value
-    logs = np.log(widths) - squares / CONTRAST_SCALE**2 / 2 - away**2 / 2
-    for measured, background, per_gain, per_contrast in skews:
-        variance = background + per_gain * gains + per_contrast * squares
-        logs -= (np.log(variance) + measured / variance) / 2
-    weights = np.exp(logs - logs.max())
-    weights /= weights.sum()
-    gain_dn = GAIN_MEDIAN_DN * float(np.exp(GAIN_SD_OF_LOG * (weights.sum(axis=1) @ away.ravel())))
-    return SpotNoise(gain_dn, float(weights.sum(axis=0) @ contrasts))
 
 
 def centre_of(patch: Patch | str, noise: SpotNoise) -> Centre:
     """The fit's answer for a patch, checked."""
     if isinstance(patch, str):
         return Centre(patch)
-    known = {"clipped_share": patch.clipped_share, "outline_px": patch.outline_px}
+    known = partial(Centre, clipped_share=patch.clipped_share, outline_px=patch.outline_px)
     if patch.clipped_share > CLIPPED_SHARE_MAX:
-        return Centre("clipped", **known)
+        return known("clipped")
     fitted = fit_spot(patch, noise)
     if fitted is None:
-        return Centre(_at_border(patch.start_px, 2 * patch.start_sd_px, patch.size) or "unfitted", **known)
+        return known(_at_border(patch.start_px, 2 * patch.start_sd_px, patch.size) or "unfitted")
     spread = np.linalg.inv(fitted.precision)
     short, long = np.sqrt(np.linalg.eigvalsh(spread))
-    known["axes_px"] = (float(long), float(short))
     status = "ok"
     if 2 * pi * log(2) * long * short < AREA_MIN_PX:
         status = "too-small"
@@ -389,7 +340,8 @@ def centre_of(patch: Patch | str, noise: SpotNoise) -> Centre:
     elif np.abs(fitted.centre_px - patch.start_px).max() > 3 * patch.start_sd_px + 2 * _SHRINK:
         status = "unfitted"
     parts, skews = _covariance_parts(fitted, patch), skewness(fitted, patch)
-    return Centre(status, fitted.centre_px, None, **known, parts_px2=parts, skews=skews).under(noise)
+    axes = float(long), float(short)
+    return known(status, fitted.centre_px, axes_px=axes, parts_px2=parts, skews=skews).under(noise)
 
 
 def _at_border(centre: np.ndarray, reach: np.ndarray | float, size: tuple[int, int]) -> str | None:

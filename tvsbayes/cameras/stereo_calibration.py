@@ -1,4 +1,9 @@
-"""A folder of board pictures to stereo.json."""
+"""From board pictures to a stereo calibration with its covariance, and what a careful reader would ask about it.
+
+Type A: all corners of all views in one bundle adjustment, widened for errors that the corners of a picture share. Type
+B: the pitch of the board, to which all lengths are proportional. mm, px with the integer at a pixel's centre,
+parameters in the order of `STEREO_PARAMETER_NAMES`.
+"""
 
 from __future__ import annotations
 
@@ -11,23 +16,17 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from tvsbayes.cameras.boards import SIDES, Board, Finder, View, Views, find_views
-from tvsbayes.cameras.bundle_adjustment import Adjustment, bundle_adjustment, undetermined
-from tvsbayes.errors import NothingToEstimate, escaped
+from tvsbayes.cameras.boards import Board, Finder, View, Views, find_views
+from tvsbayes.cameras.bundle_adjustment import Adjustment, bundle_adjustment
+from tvsbayes.cameras.stereo_start import pixels_of, pose_of, start_of
+from tvsbayes.errors import escaped
+from tvsbayes.instrument.campaign import CAMERAS
 from tvsbayes.instrument.parameters import STEREO_PARAMETER_NAMES
-from tvsbayes.instrument.stereo_pair import Stereo, pair_doubts, rotation_vector
-from tvsbayes.instrument.stereo_pair import rotation_matrix as rotation_of
+from tvsbayes.instrument.stereo_pair import Stereo, pair_doubts, rotation_matrix
 
-VIEWS_MIN = 3
-"""Views per camera below which Zhang's method (2000) cannot find a focal length with both principal coordinates."""
-START_VIEWS = 30
-"""The start needs no more; every further view enters the bundle adjustment alone."""
 OUTLIER_Z, OUTLIER_SPREAD_MIN = 4.0, 0.2
 """A view is an outlier if the logarithm of its residual rms lies more than 4 robust standard deviations (1.4826 MAD,
 at least 0.2) above the median: never below 2.2 times the median rms. On clean views the logarithm scatters by 0.05."""
-MISMATCH_TIMES, MISMATCH_SHARE = 5.0, 0.01
-"""A view is no pair if its right corners miss the place that the left ones and the median of all relative poses
-predict by more than five times the median view and by more than 1 % of the image width."""
 VIEWS_ADVISED = 10
 """Zhang (2000), figure 3: the errors have fallen to a floor by about ten views."""
 TILT_ADVISED_DEG = 15.0
@@ -145,61 +144,6 @@ class StereoCalibration:
         return float(np.sqrt(along @ self.stereo.parameter_covariance[21:, 21:] @ along))
 
 
-@dataclass(frozen=True)
-class _CameraStart:
-    """Zhang's solution for one camera: matrix, distortion, and a pose (6,) for every view that it saw."""
-
-    matrix: np.ndarray
-    distortion: np.ndarray
-    poses: dict[int, np.ndarray]
-
-    @property
-    def vector(self) -> np.ndarray:
-        return np.array([*self.matrix[[0, 1, 0, 1], [0, 1, 2, 2]], *self.distortion])
-
-
-def _camera_start(
-    corners: dict[int, np.ndarray], board: Board, size: tuple[int, int], side: str, fix_k3: bool
-) -> _CameraStart:
-    """Zhang's method (cv2.calibrateCamera) on some views, then a pose for each."""
-    if len(corners) < VIEWS_MIN:
-        raise NothingToEstimate(
-            "few-views",
-            f"the board was found in {len(corners)} pictures of the {side} camera; {VIEWS_MIN} are the least",
-            remedy="check --board (inner corners: where four squares meet), sharpness and light; take 15 to 25 views",
-        )
-    keys = sorted(corners)
-    chosen = [keys[k] for k in np.unique(np.linspace(0, len(keys) - 1, START_VIEWS).astype(int))]
-    points = board.points_mm.astype(np.float32)
-    flags = cv2.CALIB_FIX_K3 if fix_k3 else 0
-    found = [np.ascontiguousarray(corners[k], np.float32) for k in chosen]
-    try:
-        _, matrix, distortion, *_ = cv2.calibrateCamera([points] * len(found), found, size, None, None, flags=flags)
-    except cv2.error as error:
-        raise undetermined(f"OpenCV found no start for the {side} camera ({escaped(str(error.err), 100)})") from error
-    matrix, distortion = np.asarray(matrix, float), np.asarray(distortion, float).ravel()[:5]
-    if not (np.isfinite(matrix).all() and np.isfinite(distortion).all()):
-        raise undetermined(f"OpenCV found no finite start for the {side} camera")
-    return _CameraStart(matrix, distortion, {k: _board_pose(corners[k], board, matrix, distortion) for k in keys})
-
-
-def _relative(start: Sequence[_CameraStart]) -> tuple[np.ndarray, np.ndarray]:
-    """R and T as the median over pairs: one wrong pair does not move them."""
-    rotations, translations = [], []
-    for k in sorted(set(start[0].poses) & set(start[1].poses)):
-        left, right = (s.poses[k] for s in start)
-        turn = rotation_of(right[:3]) @ rotation_of(left[:3]).T
-        rotations.append(turn)
-        translations.append(right[3:] - turn @ left[3:])
-    if not rotations:
-        raise NothingToEstimate(
-            "no-pairs",
-            "no view shows the board to both cameras",
-            remedy="name the pictures of one moment alike: left01.png and right01.png",
-        )
-    return rotation_vector(np.median(rotations, axis=0)), np.median(translations, axis=0)
-
-
 def calibrate_stereo(
     views: Sequence[View],
     board: Board,
@@ -225,55 +169,67 @@ def calibrate_stereo(
         NotConverged: no minimum was found.
     """
     began = time.perf_counter()
+    done = _adjusted(views, board, size, fix_k3, robust)
+    adjustment = done.adjustment
+    pitch = np.zeros((24, 24))
+    # The pixels know angles only: all lengths, T among them, are proportional to the pitch.
+    shift = adjustment.vector[21:] * (board.pitch_u_mm / board.pitch_mm)
+    pitch[21:, 21:] = np.outer(shift, shift)
+    covariance = adjustment.correlation_factor * adjustment.covariance + pitch
+    covariance, nothing = 0.5 * (covariance + covariance.T), np.zeros(1)
+    rms = _rms(adjustment.residuals_px)
+    empty = Stereo(*size, nothing, nothing, nothing, nothing, nothing, nothing, covariance, rms)
+    stereo = empty.with_vector(adjustment.vector)
+    poses = [pose_of(view, board, stereo) for view in done.views]
+    result = StereoCalibration(
+        stereo=stereo,
+        board=board,
+        views=tuple(_view_reports(done, poses)),
+        left_rms_px=_rms(adjustment.residuals_px[:, :2]),
+        right_rms_px=_rms(adjustment.residuals_px[:, 2:]),
+        noise_sd_px=adjustment.noise_sd_px,
+        dof=adjustment.dof,
+        correlation_factor=adjustment.correlation_factor,
+        covariance_independent=adjustment.covariance,
+        covariance_pitch=pitch,
+        coverage={side: _coverage([getattr(v, side) for v in done.views], size) for side in CAMERAS},
+        triangulated_pitch_mm=_triangulated_pitch(done.views, board, stereo),
+        found=found,
+        excluded=done.excluded,
+        warnings=(),
+        seconds={"adjustment": time.perf_counter() - began},
+    )
+    return replace(result, warnings=tuple(_plausibility(result, poses)))
+
+
+@dataclass(frozen=True)
+class _Adjusted:
+    """A bundle adjustment: of which views, which of them lie off, and the names of those left out."""
+
+    adjustment: Adjustment
+    views: Sequence[View]
+    outliers: np.ndarray
+    excluded: tuple[str, ...]
+
+
+def _adjusted(views: Sequence[View], board: Board, size: tuple[int, int], fix_k3: bool, robust: bool) -> _Adjusted:
+    """The adjustment of all views that are pairs; with `robust` repeated once without outlying ones."""
     views = [view for view in views if view.left is not None or view.right is not None]
     free = np.ones(24, bool)
     free[[8, 17]] = not fix_k3
     excluded: list[str] = []
-    start = _start(views, board, size, fix_k3)
+    start = start_of(views, board, size, fix_k3)
     leave_out = start.mismatched
     while True:
         if leave_out.any():
             excluded += [view.name for view, out in zip(views, leave_out, strict=True) if out]
             views = [view for view, out in zip(views, leave_out, strict=True) if not out]
-            start = _start(views, board, size, fix_k3)
+            start = start_of(views, board, size, fix_k3)
         done = bundle_adjustment(views, board, start.vector, start.poses, free)
         outliers = _outliers(done)
         if not (robust and outliers.any()):
-            break
+            return _Adjusted(done, views, outliers, tuple(excluded))
         leave_out, robust = outliers, False
-    pitch = np.zeros((24, 24))
-    # The pixels know angles only: all lengths, T among them, are proportional to the pitch.
-    shift = done.vector[21:] * (board.pitch_u_mm / board.pitch_mm)
-    pitch[21:, 21:] = np.outer(shift, shift)
-    covariance = done.correlation_factor * done.covariance + pitch
-    empty = Stereo(*size, *(np.zeros(1) for _ in range(6)), 0.5 * (covariance + covariance.T), _rms(done.residuals_px))
-    stereo = empty.with_vector(done.vector)
-    poses = [
-        _board_pose(view.left, board, stereo.M1, stereo.D1)
-        if view.left is not None
-        else _left_pose(_board_pose(view.right, board, stereo.M2, stereo.D2), stereo.R, stereo.T)
-        for view in views
-    ]
-    reports = tuple(_view_reports(views, done, poses, outliers))
-    result = StereoCalibration(
-        stereo=stereo,
-        board=board,
-        views=reports,
-        left_rms_px=_rms(done.residuals_px[:, :2]),
-        right_rms_px=_rms(done.residuals_px[:, 2:]),
-        noise_sd_px=done.noise_sd_px,
-        dof=done.dof,
-        correlation_factor=done.correlation_factor,
-        covariance_independent=done.covariance,
-        covariance_pitch=pitch,
-        coverage={side: _coverage([getattr(v, side) for v in views], size) for side in SIDES},
-        triangulated_pitch_mm=_triangulated_pitch(views, board, stereo),
-        found=found,
-        excluded=tuple(excluded),
-        warnings=(),
-        seconds={"adjustment": time.perf_counter() - began},
-    )
-    return replace(result, warnings=tuple(_plausibility(result, poses)))
 
 
 def calibrate_folder(
@@ -294,56 +250,6 @@ def calibrate_folder(
     return replace(result, seconds=seconds | result.seconds)
 
 
-def _pixels(corners: np.ndarray) -> np.ndarray:
-    """Corners (corners, 2) as every OpenCV takes them: contiguous, of rank 3."""
-    return np.ascontiguousarray(corners, float).reshape(-1, 1, 2)
-
-
-def _board_pose(corners: np.ndarray, board: Board, matrix: np.ndarray, distortion: np.ndarray) -> np.ndarray:
-    """Board to camera, shape (6,), from one picture by IPPE (Collins and Bartoli 2014)."""
-    done, turn, shift = cv2.solvePnP(board.points_mm, _pixels(corners), matrix, distortion, flags=cv2.SOLVEPNP_IPPE)
-    if not done or not (np.isfinite(turn).all() and np.isfinite(shift).all()):
-        raise undetermined("a board has no pose that OpenCV can find")
-    return np.concatenate([np.ravel(turn), np.ravel(shift)])
-
-
-def _left_pose(right_pose: np.ndarray, turn: np.ndarray, shift: np.ndarray) -> np.ndarray:
-    """Board to left camera from board to right camera; `turn` is R, `shift` T."""
-    rotation = rotation_vector(turn.T @ rotation_of(right_pose[:3]))
-    return np.concatenate([rotation, turn.T @ (right_pose[3:] - shift)])
-
-
-@dataclass(frozen=True)
-class _Start:
-    """Where the adjustment starts: the 24 parameters, board poses (views, 6), and which views are no pair at all."""
-
-    vector: np.ndarray
-    poses: np.ndarray
-    mismatched: np.ndarray
-
-
-def _start(views: Sequence[View], board: Board, size: tuple[int, int], fix_k3: bool) -> _Start:
-    cameras = []
-    for side in SIDES:
-        corners = {k: getattr(v, side) for k, v in enumerate(views) if getattr(v, side) is not None}
-        cameras.append(_camera_start(corners, board, size, side, fix_k3))
-    left, right = cameras
-    turn, shift = _relative(cameras)
-    rotation = rotation_of(turn)
-    poses, misses = [], np.zeros(len(views))
-    for k, view in enumerate(views):
-        poses.append(left.poses[k] if k in left.poses else _left_pose(right.poses[k], rotation, shift))
-        if k in left.poses and k in right.poses:
-            pose = poses[k]
-            seen_from_right = rotation_vector(rotation @ rotation_of(pose[:3])), rotation @ pose[3:] + shift
-            pixels, _ = cv2.projectPoints(board.points_mm, *seen_from_right, right.matrix, right.distortion)
-            misses[k] = math.sqrt(np.mean(np.sum((np.reshape(pixels, (-1, 2)) - view.right) ** 2, axis=1)))
-    usual = float(np.median(misses[misses > 0])) if misses.any() else 0.0
-    mismatched = misses > max(MISMATCH_TIMES * usual, MISMATCH_SHARE * size[0])
-    vector = np.concatenate([left.vector, right.vector, turn, shift])
-    return _Start(vector, np.array(poses), mismatched)
-
-
 def _rms(residuals_px: np.ndarray) -> float:
     """Root of the mean squared distance of a corner, as OpenCV defines it; residuals (views, 2 or 4, corners)."""
     return math.sqrt(2 * float(np.nanmean(residuals_px**2)))
@@ -358,19 +264,21 @@ def _outliers(done: Adjustment) -> np.ndarray:
 
 
 def _normal(pose: np.ndarray) -> np.ndarray:
-    return rotation_of(pose[:3])[:, 2]
+    return rotation_matrix(pose[:3])[:, 2]
 
 
-def _view_reports(
-    views: Sequence[View], done: Adjustment, poses: Sequence[np.ndarray], outliers: np.ndarray
-) -> Iterator[ViewReport]:
-    for view, residuals, pose, outlier in zip(views, done.residuals_px, poses, outliers, strict=True):
-        rms = [
-            None if seen is None else _rms(residuals[rows])
-            for seen, rows in ((view.left, slice(0, 2)), (view.right, slice(2, 4)))
-        ]
-        tilt = math.degrees(math.acos(min(1.0, abs(float(_normal(pose)[2])))))
-        yield ViewReport(view.name, *rms, float(np.linalg.norm(pose[3:])), tilt, bool(outlier))
+def _view_reports(done: _Adjusted, poses: Sequence[np.ndarray]) -> Iterator[ViewReport]:
+    for view, residuals, pose, outlier in zip(
+        done.views, done.adjustment.residuals_px, poses, done.outliers, strict=True
+    ):
+        yield ViewReport(
+            view.name,
+            None if view.left is None else _rms(residuals[:2]),
+            None if view.right is None else _rms(residuals[2:]),
+            float(np.linalg.norm(pose[3:])),
+            math.degrees(math.acos(min(1.0, abs(float(_normal(pose)[2]))))),
+            bool(outlier),
+        )
 
 
 def _coverage(corners: Sequence[np.ndarray | None], size: tuple[int, int]) -> float:
@@ -392,7 +300,7 @@ def _triangulated_pitch(views: Sequence[View], board: Board, stereo: Stereo) -> 
         if view.left is None or view.right is None:
             continue
         rays = [
-            cv2.undistortPoints(_pixels(seen), M, D).reshape(-1, 2).T
+            cv2.undistortPoints(pixels_of(seen), M, D).reshape(-1, 2).T
             for seen, M, D in ((view.left, stereo.M1, stereo.D1), (view.right, stereo.M2, stereo.D2))
         ]
         points = np.asarray(cv2.triangulatePoints(np.eye(3, 4), right, *rays))

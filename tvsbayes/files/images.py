@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 IMAGE_BYTES_MAX = 64 * 1024 * 1024
 IMAGE_PIXELS_MAX = 50_000_000
-"""A PNG of 0.9 MB can ask for 30000 x 30000 pixels: 4 s and 1.8 GB in the decoder (research/vision.md 6)."""
+"""A PNG of 0.9 MB can ask for 30000 x 30000 pixels: 4 s and 1.8 GB in the decoder."""
 _PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
 _PNG_END = b"\0\0\0\0IEND\xaeB`\x82"
 """The last chunk with its checksum: decoders forgive its loss, a copy cut short has lost more."""

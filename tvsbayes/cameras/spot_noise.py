@@ -1,0 +1,121 @@
+"""The noise of a camera's pixels around a laser spot: what demosaicing makes of it, and what a campaign tells of it.
+
+DN = grey levels of 8 bits; pictures (height, width, 3) uint8, blue, green, red; grey is (B + 2 G + R) / 4, in which
+every photosite of a Bayer sensor weighs alike.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+GAIN_MEDIAN_DN, GAIN_SD_OF_LOG = 0.05, 1.0
+"""Prior of the shot-noise gain, log-normal, DN per DN of signal: 255 DN at 5000 electrons, within a factor of e."""
+CONTRAST_DEFAULT = 0.4
+"""Speckle contrast where no campaign tells it: the middle of what averaging leaves, 0.3 to 0.63."""
+CONTRAST_SCALE, CONTRAST_MAX = 0.5, 2.0
+"""Prior of the learned contrast: half-normal of this scale, up to here. Speckle may be absent; fully developed it has
+1, and its grain in px multiplies that."""
+SKEW_OUTLIER = 30.0
+"""A squared skew residual this many times its expectation teaches nothing about noise (normal: one in 10^7)."""
+_CELL = 8
+
+
+def _autocorrelation(kernel: np.ndarray) -> np.ndarray:
+    padded = np.pad(kernel, 2)
+    return np.array([[np.sum(kernel * padded[i : i + 3, j : j + 3]) for j in range(5)] for i in range(5)])
+
+
+# What one photosite's noise becomes in grey by bilinear demosaicing: red and blue sites, green sites; half of each.
+_CORRELATION = (
+    _autocorrelation(np.array([[1, 2, 1], [2, 4, 2], [1, 2, 1]]) / 16)
+    + _autocorrelation(np.array([[0, 1, 0], [1, 4, 1], [0, 1, 0]]) / 8)
+) / 2
+_LAGS = np.maximum(_CELL - np.abs(np.arange(-2, 3)), 0)
+_CELL_VARIANCE = float(np.sum(_CORRELATION * np.outer(_LAGS, _LAGS))) / _CELL**4
+"""Variance of the mean of a cell for unit noise per photosite."""
+
+
+@dataclass(frozen=True)
+class SpotNoise:
+    """Variance of a grey pixel with signal S beyond the background's: gain_dn * S + (speckle_contrast * S)^2, DN^2.
+
+    The contrast is that per independent pixel: contrast times the root of the grain's area in px.
+    """
+
+    gain_dn: float = GAIN_MEDIAN_DN
+    speckle_contrast: float = CONTRAST_DEFAULT
+
+
+def learn_noise(skews: np.ndarray, speckle_contrast: float | None = None) -> SpotNoise:
+    """Gain and contrast of one camera: posterior means of contrast and log gain on a grid.
+
+    Means of their squares would state too much where there is no speckle: the contrast's posterior begins at 0.
+
+    Args:
+        skews: (n, 4) as `skewness` makes them, of any number of spots.
+        speckle_contrast: taken as known where given.
+    """
+    away = np.linspace(-3, 3, 41)[:, None]
+    gains = GAIN_MEDIAN_DN * np.exp(away * GAIN_SD_OF_LOG)
+    # Equal steps of the root: fine near 0; each point weighs what lies around it.
+    contrasts = np.linspace(0, 1, 121) ** 2 * CONTRAST_MAX
+    widths = np.gradient(contrasts)
+    if speckle_contrast is not None:
+        contrasts, widths = np.array([speckle_contrast]), np.ones(1)
+    squares = contrasts**2
+    # A reflection in one spot must not widen all others.
+    expected = skews[:, 1] + skews[:, 2] * GAIN_MEDIAN_DN + skews[:, 3] * np.median(squares)
+    ratio = skews[:, 0] / expected
+    skews = skews[ratio <= SKEW_OUTLIER * np.median(ratio) / 0.455]  # 0.455: median of a squared normal value
+    logs = np.log(widths) - squares / CONTRAST_SCALE**2 / 2 - away**2 / 2
+    for measured, background, per_gain, per_contrast in skews:
+        variance = background + per_gain * gains + per_contrast * squares
+        logs -= (np.log(variance) + measured / variance) / 2
+    weights = np.exp(logs - logs.max())
+    weights /= weights.sum()
+    gain_dn = GAIN_MEDIAN_DN * float(np.exp(GAIN_SD_OF_LOG * (weights.sum(axis=1) @ away.ravel())))
+    return SpotNoise(gain_dn, float(weights.sum(axis=0) @ contrasts))
+
+
+def background_variance(picture: np.ndarray, centre: np.ndarray, half: int) -> float:
+    """Variance of one photosite around the spot, DN^2.
+
+    From means of 8 x 8 px, in second differences that slopes do not enter: single demosaiced pixels are smoothed and
+    show too little.
+    """
+    import cv2
+
+    corner = np.floor(centre).astype(int) - half - 96
+    low = np.clip(corner, 0, picture.shape[1::-1])
+    high = np.clip(corner + 2 * half + 192, 0, picture.shape[1::-1])
+    cells = (high - low) // _CELL
+    region = grey_of(picture[low[1] : low[1] + _CELL * cells[1], low[0] : low[0] + _CELL * cells[0]])
+    if min(cells) < 3:
+        return 1.0
+    means = cv2.resize(region, (int(cells[0]), int(cells[1])), interpolation=cv2.INTER_AREA)
+    v, u = np.indices(means.shape)
+    middle = (_CELL - 1) / 2
+    off_u, off_v = np.abs(_CELL * u + middle + low[0] - centre[0]), np.abs(_CELL * v + middle + low[1] - centre[1])
+    far = np.maximum(off_u, off_v) > half + 2 * _CELL
+    values = (means[:, 1:-1] - (means[:, :-2] + means[:, 2:]) / 2)[far[:, 1:-1]]
+    if values.size < 8:
+        return 1.0
+    # MAD: edges of other things in the picture are few. 1.5: variance of the difference of independent means.
+    variance = (1.4826 * float(np.median(np.abs(values)))) ** 2 / 1.5 / _CELL_VARIANCE
+    return max(variance, 1 / 12)  # rounding to whole grey levels
+
+
+def through_demosaicing(filters: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+    """Variance (k,) of filters (k, n) on a patch (h, w) of unit noise per photosite, as grey shows it."""
+    import cv2
+
+    pictures = filters.reshape(len(filters), *shape)
+    smooth = [cv2.filter2D(one, cv2.CV_64F, _CORRELATION, borderType=cv2.BORDER_CONSTANT) for one in pictures]
+    return np.einsum("kij,kij->k", pictures, np.array(smooth))
+
+
+def grey_of(picture: np.ndarray) -> np.ndarray:
+    """Grey (h, w) of a picture or a part of it, DN."""
+    return picture.astype(np.float32) @ np.array([0.25, 0.5, 0.25], np.float32)
