@@ -29,9 +29,9 @@ from tvsbayes.twin.spot_pictures import (
     Footprint,
     Scene,
     Sensor,
-    _mosaic_response,
     ambient_level,
     footprint,
+    mosaic_response,
     render_spot,
     spot_irradiance,
 )
@@ -57,7 +57,7 @@ def bound_px(mark, scene, sensor) -> float:
     values, whose slopes alone inform (for gamma speckle without other noise that is the exact information); photosites
     whose mean is clipped are left out.
     """
-    response = _mosaic_response(WIDTH, HEIGHT, sensor.response).astype(float)
+    response = mosaic_response(WIDTH, HEIGHT, sensor.response).astype(float)
     ambient = ambient_level(WIDTH, HEIGHT, scene.ambient_dn, scene.ambient_gradient_dn).astype(float)
     window, light = spot_irradiance(mark, WIDTH, HEIGHT)
     rows, columns = window
@@ -116,12 +116,12 @@ def run_cell(size, peak, ambient, contrast, seed: int) -> dict:
     for method in METHODS:
         if method == "fit":
             found = [spot_fit.centre_of(patch, learned) for patch in patches]
-            learned = spot_fit.learn_noise(np.vstack([one.skews for one in found if one.status == "ok"]))
+            learned = spot_noise.learn_noise(np.vstack([one.skews for one in found if one.status == "ok"]))
             found = [one.under(learned) for one in found]
             row["learned"] = [learned.gain_dn, learned.speckle_contrast]
         else:
             found = [
-                contour.contour_of(picture, camera, spot_fit.SpotNoise(speckle_contrast=contrast))
+                contour.contour_of(picture, camera, spot_noise.SpotNoise(speckle_contrast=contrast))
                 for picture in pictures
             ]
         ok = [k for k, one in enumerate(found) if one.status == "ok"]

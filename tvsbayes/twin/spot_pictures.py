@@ -171,7 +171,7 @@ def speckle(shape: tuple[int, int], contrast: float, grain_px: float, rng: np.ra
 
 
 @lru_cache(maxsize=8)
-def _mosaic_response(width: int, height: int, response: tuple[float, float, float]) -> np.ndarray:
+def mosaic_response(width: int, height: int, response: tuple[float, float, float]) -> np.ndarray:
     """Response (height, width) of an RGGB mosaic: red at even rows and columns."""
     blue, green, red = response
     tile = np.array([[red, green], [green, blue]], np.float32)
@@ -194,7 +194,7 @@ def expose(irradiance_dn: np.ndarray, sensor: Sensor, rng: np.random.Generator |
     import cv2
 
     height, width = irradiance_dn.shape
-    raw = irradiance_dn.astype(np.float32) * _mosaic_response(width, height, sensor.response)
+    raw = irradiance_dn.astype(np.float32) * mosaic_response(width, height, sensor.response)
     if rng is not None:
         noise = rng.standard_normal(raw.shape, np.float32)
         noise *= np.sqrt(np.float32(sensor.gain_dn_per_electron) * raw + np.float32(sensor.read_noise_dn**2))
