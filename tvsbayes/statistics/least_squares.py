@@ -1,4 +1,10 @@
-"""Levenberg-Marquardt, Newton mode, Laplace draws."""
+"""Minima of sums of squares and of negative log densities, with the covariance there; float64 throughout.
+
+optimistix' `LevenbergMarquardt` reports success on wrong answers at loose tolerances, so nobody believes its flag: the
+joint fit goes on with Newton steps on the density and judges the step that is left, the bundle adjustment judges the
+next step and a second descent. Residuals are dimensionless (divided by their standard deviations) or in the data's unit,
+as the caller chose; the covariance follows that choice.
+"""
 
 from __future__ import annotations
 
@@ -13,17 +19,6 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Float, PyTree
 
-TIGHT = 1e-12
-"""Relative and absolute tolerance that solved 44 of 44 StRD fits; 1e-8 still accepted one wrong answer."""
-SCALED_GRADIENT_LIMIT = 1e-8
-"""Largest |J_j . r| / (|J_j| |r|) of a stationary point."""
-POLISHING_STEPS = 5
-POLISHABLE_GRADIENT = 1e-6
-"""Scaled gradients that Gauss-Newton steps may still reduce; above it the run has not arrived."""
-RESTART_PERTURBATION = 1e-3
-"""Relative perturbation of the restart."""
-RESTART_AGREEMENT_SD = 1e-2
-"""A restart that ends within this many standard errors of the first solution has returned to it."""
 NEWTON_STEP = 1e-4
 """Finite-difference step of the Hessian in posterior standard deviations: third derivatives are of order one
 there, so the error is 1e-4; the gradient's rounding (1e-9) is amplified to 1e-5."""
@@ -34,27 +29,6 @@ HESSIAN_KEPT = 0.1
 LAPLACE_DRAWS = 2048
 Objective = Callable[[np.ndarray], tuple[float, np.ndarray]]
 Residual = Callable[[Float[Array, " parameters"], PyTree], Float[Array, " residuals"]]
-
-
-@dataclass(frozen=True)
-class LeastSquares:
-    """Outcome of a least-squares fit.
-
-    Attributes:
-        value: parameters at the solution, shape (p,).
-        residuals: residuals there, shape (n,).
-        jacobian: d(residuals)/d(parameters) there, shape (n, p).
-        scaled_gradient: largest cosine between a column of the Jacobian and the residuals.
-        converged: gradient small and, if asked for, the restart returned.
-        problems: sentences on what failed; empty when converged.
-    """
-
-    value: np.ndarray
-    residuals: np.ndarray
-    jacobian: np.ndarray
-    scaled_gradient: float
-    converged: bool
-    problems: tuple[str, ...]
 
 
 def damped_solver(tolerance: Float[Array, ""]) -> optx.LevenbergMarquardt:
@@ -196,13 +170,6 @@ def laplace_draws(z: np.ndarray, covariance: np.ndarray, seed: int) -> np.ndarra
     return z + normal @ np.linalg.cholesky(covariance).T
 
 
-def scaled_gradient(jacobian: np.ndarray, residuals: np.ndarray) -> float:
-    """Largest |J_j . r| / (|J_j| |r|); 0 where residuals or a column vanish."""
-    norms = np.linalg.norm(jacobian, axis=0) * np.linalg.norm(residuals)
-    products = np.abs(jacobian.T @ residuals)
-    return float(np.max(np.divide(products, norms, out=np.zeros_like(products), where=norms > 0)))
-
-
 def least_squares_covariance(jacobian: np.ndarray) -> np.ndarray:
     """(J^T J)^-1 by a singular value decomposition of the column-scaled Jacobian.
 
@@ -223,56 +190,3 @@ def least_squares_covariance(jacobian: np.ndarray) -> np.ndarray:
         raise np.linalg.LinAlgError(f"scaled condition number {singular[0] / max(singular[-1], 1e-300):.1e}")
     root = vt.T / singular / scale[:, None]
     return root @ root.T
-
-
-def solve_least_squares(
-    residual: Residual, start: np.ndarray, args: PyTree = None, *, max_steps: int = 10_000, restart: bool = True
-) -> LeastSquares:
-    """Fit and check (research/statistics.md section 1).
-
-    Args:
-        residual: function (parameters, args) -> residuals; pass the same function object to reuse its compilation.
-        start: starting parameters, shape (p,).
-        args: whatever the residual needs, as arrays.
-        max_steps: budget of Levenberg-Marquardt steps.
-        restart: repeat from a point perturbed by `RESTART_PERTURBATION` and demand that it returns.
-
-    Returns:
-        The better of both solutions with its checks.
-    """
-    with jax.enable_x64(True):
-        tolerance = jnp.asarray(TIGHT)
-        value = np.asarray(levenberg_marquardt(residual, jnp.asarray(start, float), args, tolerance, max_steps))
-        residuals, jacobian = (np.asarray(x) for x in residuals_and_jacobian(residual, jnp.asarray(value), args))
-        problems = []
-        if restart:
-            signs = np.where(np.arange(value.size) % 2 == 0, 1.0, -1.0)
-            moved = value * (1 + RESTART_PERTURBATION * signs)
-            again = np.asarray(levenberg_marquardt(residual, jnp.asarray(moved), args, tolerance, max_steps))
-            residuals2, jacobian2 = (np.asarray(x) for x in residuals_and_jacobian(residual, jnp.asarray(again), args))
-            try:
-                dof = max(residuals.size - value.size, 1)
-                sd = np.sqrt(np.diag(least_squares_covariance(jacobian)) * (residuals @ residuals) / dof)
-                if np.any(np.abs(again - value) > RESTART_AGREEMENT_SD * sd + 1e-9 * np.abs(value)):
-                    problems.append("a restart from a slightly perturbed point ended elsewhere")
-            except np.linalg.LinAlgError as error:
-                problems.append(f"the Jacobian is singular: {error}")
-            if residuals2 @ residuals2 < residuals @ residuals:
-                value, residuals, jacobian = again, residuals2, jacobian2
-        gradient = scaled_gradient(jacobian, residuals)
-        # The sum of squares is flat to rounding within 1e-8 of its minimum; Gauss-Newton steps see the gradient.
-        for _ in range(POLISHING_STEPS):
-            if not SCALED_GRADIENT_LIMIT < gradient < POLISHABLE_GRADIENT:
-                break
-            trial = value - np.linalg.lstsq(jacobian, residuals, rcond=None)[0]
-            residuals2, jacobian2 = (np.asarray(x) for x in residuals_and_jacobian(residual, jnp.asarray(trial), args))
-            if not scaled_gradient(jacobian2, residuals2) < gradient:
-                break
-            value, residuals, jacobian = trial, residuals2, jacobian2
-            gradient = scaled_gradient(jacobian, residuals)
-        if not np.all(np.isfinite(residuals)):
-            problems.append("residuals are not finite")
-        # At a perfect fit the residuals are rounding errors and their direction means nothing.
-        elif gradient > SCALED_GRADIENT_LIMIT and np.linalg.norm(residuals) > 1e-12 * np.linalg.norm(jacobian @ value):
-            problems.append(f"scaled gradient {gradient:.1e} above {SCALED_GRADIENT_LIMIT:.0e}")
-    return LeastSquares(value, residuals, jacobian, gradient, not problems, tuple(problems))

@@ -15,12 +15,7 @@ from scipy import optimize
 from experiments.common.clock import timed
 from experiments.common.of_tests import module_of_tests
 from experiments.speed.benchmarks.measure import Bench, Case, Column, Work
-from tvsbayes.statistics.least_squares import (
-    least_squares_covariance,
-    levenberg_marquardt,
-    residuals_and_jacobian,
-    solve_least_squares,
-)
+from tvsbayes.statistics.least_squares import least_squares_covariance, residuals_and_jacobian
 
 TITLE = "Certified least-squares problems (NIST StRD)"
 NAME = "44 fits: 22 problems from both starts"
@@ -35,7 +30,7 @@ Solve = Callable[[str, np.ndarray], np.ndarray]
 
 
 class Problems:
-    """The certified problems of `tests/statistics/test_least_squares.py` and their solvers; float64 has to be on."""
+    """The certified problems of `tests/support/certified_problems.py` and their solvers; float64 has to be on."""
 
     def __init__(self, strd: ModuleType):
         self.strd = strd
@@ -53,13 +48,8 @@ class Problems:
         return np.asarray(residuals_and_jacobian(residual, jnp.asarray(value), self.data[name])[1])
 
     def ours(self, name: str, start: np.ndarray) -> np.ndarray:
-        """As shipped."""
-        return solve_least_squares(self.strd.RESIDUALS[name], start, self.data[name]).value
-
-    def bare(self, name: str, start: np.ndarray) -> np.ndarray:
-        """One run without restart and checks."""
-        residual, tolerance = self.strd.RESIDUALS[name], jnp.asarray(1e-12)
-        return np.asarray(levenberg_marquardt(residual, jnp.asarray(start), self.data[name], tolerance, 10_000))
+        """The descent of `stereo` and of the fit, with residuals and Jacobian at its end."""
+        return self.strd.descended(self.strd.RESIDUALS[name], start, self.data[name]).value
 
     def peer(self, method: str) -> Solve:
         """Scipy with the same residuals and Jacobian."""
@@ -125,7 +115,7 @@ class Problems:
 
 def measure(bench: Bench) -> None:
     """Fit every problem from both starts, all solvers in turn."""
-    strd = module_of_tests("statistics/test_least_squares")
+    strd = module_of_tests("support.certified_problems")
     if not strd.FOLDER.is_dir():
         print(f"strd: skipped, NIST's files are not at {strd.FOLDER.name} beside the repository", flush=True)
         return
@@ -133,7 +123,6 @@ def measure(bench: Bench) -> None:
         problems = Problems(strd)
         solvers = {
             "tvsbayes": problems.ours,
-            "tvsbayes, one run without restart and checks": problems.bare,
             "scipy lm": problems.peer("lm"),
             "scipy trf": problems.peer("trf"),
             "scipy lm, NumPy and finite differences": problems.usual,
@@ -149,7 +138,7 @@ def cases(rows: Sequence[Mapping]) -> list[Case]:
     """Tables of the part."""
     about = (
         "Digits agree with the certified values (at most 11 are printed by NIST): of the worst parameter of a fit, and "
-        f"of the worst standard error. `tvsbayes` is `solve_least_squares` as shipped, two runs and the checks; "
+        f"of the worst standard error. `tvsbayes` is the descent of `stereo` and of the fit; "
         f"scipy has tolerances {TIGHT:g}, `x_scale='jac'` and the same compiled residuals and Jacobian, each call of "
         "which costs it 0.1 ms or more from Python; or, as most use it, NumPy and finite differences. Seconds are of "
         "all 44, without compilation."
