@@ -6,7 +6,8 @@ import jax
 import numpy as np
 
 from tvsbayes.estimators import campaign_arrays
-from tvsbayes.estimators.joint_fit import JointFit, Problem, fit, fit_at
+from tvsbayes.estimators.joint_fit import JointFit, fit, fit_at
+from tvsbayes.estimators.mode_search import Problem
 from tvsbayes.instrument.campaign import Campaign
 from tvsbayes.instrument.parameters import RIG_NAMES
 from tvsbayes.model.parameter_space import coordinates_of

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy import optimize
 
-from tvsbayes.estimators.joint_fit import Fixed, Problem, stage_residuals
+from tvsbayes.estimators.mode_search import Fixed, Problem, stage_residuals
 from tvsbayes.estimators.likelihood import innovations
 from tvsbayes.instrument.campaign import Campaign, ordered_spots
 from tvsbayes.instrument.parameters import NAMES

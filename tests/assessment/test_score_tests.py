@@ -18,8 +18,9 @@ from scipy import stats
 from support.small_results import small_summary
 
 from tvsbayes.assessment.score_tests import VALIDATION_LEVEL, _Answer, _holm, validate
-from tvsbayes.estimators.joint_fit import JointFit, Problem, fit_at
+from tvsbayes.estimators.joint_fit import JointFit, fit_at
 from tvsbayes.estimators.linear_spots import linear_spots, stop_information
+from tvsbayes.estimators.mode_search import Problem
 from tvsbayes.instrument.campaign import ordered_spots
 from tvsbayes.instrument.parameters import INDEX, NAMES, NOISE_NAMES
 from tvsbayes.instrument.plan import PlanStep

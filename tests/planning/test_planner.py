@@ -126,8 +126,8 @@ def test_a_plans_information_is_the_fits_own(mounted_rig, knowledge, monkeypatch
     """Same point, same looks: segments with home offsets, shared stops, half-open play (the dozen)."""
     import jax
 
-    from tvsbayes.estimators.joint_fit import Problem
     from tvsbayes.estimators.linear_spots import stop_information
+    from tvsbayes.estimators.mode_search import Problem
 
     monkeypatch.setattr("tvsbayes.twin.simulated_campaign.SHEET_DEPTH_SD_MM", 0.0)
     monkeypatch.setattr("tvsbayes.twin.simulated_campaign.SHEET_TILT_SD_DEG", 0.0)

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 from platformdirs import user_cache_path
 
-from tvsbayes.instrument.axes import APPROACH_SIGN
+from tvsbayes.instrument.axes import APPROACH_SIGN, PIXELS
 from tvsbayes.instrument.campaign import Campaign, Move, Spot, ordered_spots
 from tvsbayes.instrument.stereo_pair import triangulate
 from tvsbayes.instrument.stops import redraws
@@ -78,12 +78,17 @@ def move_arrays(moves: Sequence[Move], size: int | None = None) -> MoveArrays:
     return MoveArrays(jnp.asarray(steps), jnp.asarray(first), jnp.asarray(approach))
 
 
+def pixels_of(spots: Sequence[Spot]) -> np.ndarray:
+    """Their pixels (u_left, v_left, u_right, v_right), shape (spots, 4)."""
+    return np.array([PIXELS(spot) for spot in spots], dtype=float).reshape(-1, 4)
+
+
 def pixel_covariance(spot: Spot) -> np.ndarray:
     """Stated covariance of (u_left, v_left, u_right, v_right), px^2."""
-    su_l, sv_l, su_r, sv_r = spot.su_left_px, spot.sv_left_px, spot.su_right_px, spot.sv_right_px
-    covariance = np.diag(np.square([su_l, sv_l, su_r, sv_r]))
-    covariance[0, 1] = covariance[1, 0] = spot.ruv_left * su_l * sv_l
-    covariance[2, 3] = covariance[3, 2] = spot.ruv_right * su_r * sv_r
+    sd = np.array([spot.su_left_px, spot.sv_left_px, spot.su_right_px, spot.sv_right_px], dtype=float)
+    covariance = np.diag(sd**2)
+    covariance[0, 1] = covariance[1, 0] = spot.ruv_left * sd[0] * sd[1]
+    covariance[2, 3] = covariance[3, 2] = spot.ruv_right * sd[2] * sd[3]
     return covariance
 
 
@@ -104,7 +109,7 @@ def campaign_arrays(campaign: Campaign) -> CampaignArrays:
         array[:count] = rows
         return jnp.asarray(array)
 
-    pixels = np.array([(s.u_left_px, s.v_left_px, s.u_right_px, s.v_right_px) for s in spots])
+    pixels = pixels_of(spots)
     covariance = np.stack([pixel_covariance(s) for s in spots])
     whitening = np.linalg.inv(np.linalg.cholesky(covariance))
     new = redraws(campaign.moves, [s.move for s in spots])
@@ -138,8 +143,7 @@ NOWHERE_MM = (500.0, 0.0, 0.0)
 
 def in_sight(campaign: Campaign) -> np.ndarray:
     """Whether each ordered spot has a triangulated point: one beyond the reach of the lens model has none."""
-    pixels = np.array([(s.u_left_px, s.v_left_px, s.u_right_px, s.v_right_px) for s in ordered_spots(campaign)])
-    return np.isfinite(triangulate(campaign.stereo, pixels.reshape(-1, 4))).all(axis=1)
+    return np.isfinite(triangulate(campaign.stereo, pixels_of(ordered_spots(campaign)))).all(axis=1)
 
 
 def spot_constants(campaign: Campaign) -> np.ndarray:

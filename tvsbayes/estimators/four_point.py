@@ -279,8 +279,8 @@ def classic(campaign: Campaign) -> ClassicResult:
     for name in DIRECTIONS:
         rows = np.flatnonzero(finite & (selection.direction == name))
         directions[name] = _direction(campaign, selection, rows, ratios[rows]) if len(rows) else None
-    columns = selection.experiments, selection.direction, selection.steps
-    columns = (*columns, angles.theta_i_deg, angles.theta_f_deg, ratios)
+    commanded = selection.experiments, selection.direction, selection.steps
+    columns = (*commanded, angles.theta_i_deg, angles.theta_f_deg, ratios)
     experiments = tuple(Experiment(*row) for row in zip(*(c[finite].tolist() for c in columns), strict=True))
     return ClassicResult(directions, experiments, tuple(skipped))
 
@@ -344,7 +344,7 @@ def stereo_variance(function: Callable[[Stereo, float], float], stereo: Stereo, 
 
     covariance = np.asarray(stereo.parameter_covariance, float)
     gradient = np.zeros(len(covariance))
-    for index in np.flatnonzero(np.diag(covariance) > 0):
+    for index in np.flatnonzero(np.diag(covariance) > 0).tolist():
         gradient[index] = slope(partial(moved, index), 0.1 * np.sqrt(covariance[index, index]))
     variance = float(gradient @ covariance @ gradient)
     if focal_scale_u > 0:

@@ -86,8 +86,9 @@ def linear_spots(lin: Linearised, arrays: CampaignArrays, jacobian: np.ndarray) 
     """
     with jax.enable_x64(True):
         spots = jax.tree.map(lambda x: jnp.asarray(x)[: len(lin.residual)], arrays.spots)
-        seen = (jnp.asarray(x) for x in (lin.residual, lin.slope, lin.play_sd_rad, lin.stop_variance))
-        rows = jax.tree.map(np.asarray, filter_rows(*seen, spots))
+        lin = jax.tree.map(jnp.asarray, lin)
+        found = filter_rows(lin.residual, lin.slope, lin.play_sd_rad, lin.stop_variance, spots)
+        rows = jax.tree.map(np.asarray, found)
     return LinearSpots(rows.residual, rows.load, rows.keep == 0, rows.variance, jacobian)
 
 
@@ -199,7 +200,7 @@ def leave_one_out_chi2(information: StopInformation, weight: np.ndarray | None =
             of the covariance I + w P of a weighted innovation, P predicted, the noise alone is scaled back.
     """
     weight = np.ones(sum(len(g.residual) // 4 for g in information.groups)) if weight is None else weight
-    values = []
+    values: list[float] = []
     for group in information.groups:
         for k in range(len(group.residual) // 4):
             part = slice(4 * k, 4 * k + 4)

@@ -16,6 +16,7 @@ import jax
 import numpy as np
 import xarray as xr
 
+from tvsbayes.estimators.campaign_arrays import pixels_of
 from tvsbayes.files.disk import write_atomically
 from tvsbayes.instrument.axes import AXES, DIRECTIONS, SENSES
 from tvsbayes.instrument.campaign import input_hashes, ordered_spots
@@ -93,7 +94,7 @@ def _dataset(variables: Mapping[str, xr.DataArray]) -> xr.Dataset:
     full = {}
     for name, array in variables.items():
         for dim in array.dims[2:]:
-            if array.sizes[dim] < len(COORDS.get(dim, ())):
+            if array.sizes[dim] < len(COORDS[str(dim)]):
                 array = array.rename({dim: f"{name}_{dim}"})
         full[name] = array
     return xr.Dataset(full)
@@ -118,14 +119,13 @@ def data_tree(posterior: Posterior) -> xr.DataTree:
             varying |= {f"degrees_per_step.{d}" for d in pair} | {f"effective_deg_per_step.{d}" for d in pair}
     prior_draws = jax.tree.map(lambda x: np.asarray(x)[None], fit.prior_draws)
     spots = ordered_spots(fit.campaign)
-    pixels = np.array([(s.u_left_px, s.v_left_px, s.u_right_px, s.v_right_px) for s in spots])
     coords = {"chain": np.arange(shape[0]), "draw": np.arange(shape[1])}
     stats = {
         "lp": xr.DataArray(posterior.log_density, coords, ("chain", "draw")),
         "acceptance_rate": xr.DataArray(posterior.convergence.acceptance, {"chain": coords["chain"]}, ("chain",)),
     }
     observed = xr.DataArray(
-        pixels, {"spot": [s.spot for s in spots], "pixel": list(PIXELS)}, ("spot", "pixel"), name="pixels"
+        pixels_of(spots), {"spot": [s.spot for s in spots], "pixel": list(PIXELS)}, ("spot", "pixel"), name="pixels"
     )
     tree = xr.DataTree.from_dict(
         {

@@ -29,20 +29,18 @@ class Draws(Mapping[str, np.ndarray]):
     """
 
     def __init__(self, draws: Derived):
-        physical = draws.physical.reshape(-1, draws.physical.shape[-1])
-        self._columns = dict(zip(NAMES, physical.T, strict=True))
+        physical = np.asarray(draws.physical).reshape(-1, len(NAMES))
+        self._columns: dict[str, np.ndarray] = dict(zip(NAMES, physical.T, strict=True))
         for axis, (positive, negative) in SENSES.items():
-            ratio, half = (
-                self._columns[f"degrees_per_step.{axis}"],
-                self._columns[f"ratio_contrast_deg_per_step.{axis}"] / 2,
-            )
+            ratio = self._columns[f"degrees_per_step.{axis}"]
+            half = self._columns[f"ratio_contrast_deg_per_step.{axis}"] / 2
             self._columns[f"degrees_per_step.{positive}"] = ratio + half
             self._columns[f"degrees_per_step.{negative}"] = ratio - half
-        effective = draws.effective_deg_per_step.reshape(-1, len(DIRECTIONS))
+        effective = np.asarray(draws.effective_deg_per_step).reshape(-1, len(DIRECTIONS))
         self._columns |= {f"effective_deg_per_step.{d}": effective[:, k] for k, d in enumerate(DIRECTIONS)}
         for axis, first in (("pan", 0), ("tilt", 2)):
             self._columns[f"effective_contrast_deg_per_step.{axis}"] = effective[:, first] - effective[:, first + 1]
-        self._columns["effective_mirror_offset_mm"] = draws.effective_mirror_offset_mm.ravel()
+        self._columns["effective_mirror_offset_mm"] = np.asarray(draws.effective_mirror_offset_mm).ravel()
 
     def __getitem__(self, name: str) -> np.ndarray:
         """Draws of one quantity."""
@@ -150,7 +148,8 @@ class Posterior:
     def effective_deg_per_step(self, pan_deg: float, tilt_deg: float) -> Propagated:
         """Effective degrees per step (left, right, up, down) at any pose of the mirrors (DESIGN 3.2)."""
         with jax.enable_x64(True):
-            return propagated(derived_at(self.fit, self.z, np.radians([pan_deg, tilt_deg])).effective_deg_per_step)
+            found = derived_at(self.fit, self.z, np.radians([pan_deg, tilt_deg]))
+        return propagated(np.asarray(found.effective_deg_per_step))
 
     def lost_motion_deg(self, direction: str, steps: np.ndarray) -> Propagated:
         """Mirror angle that a move of `steps` loses after a reversal: min(k N, b) (play operator, DESIGN 3.1).

@@ -245,7 +245,7 @@ class Transport:
         return straight
 
 
-def in_batches(function: Callable[[np.ndarray], object], points: np.ndarray, size: int = BATCH) -> object:
+def in_batches[Result](function: Callable[[jax.Array], Result], points: np.ndarray, size: int = BATCH) -> Result:
     """Call a compiled function on blocks of one size and join the results along the first axis.
 
     The last block is filled up with its last row, so that nothing is compiled for a rest.
@@ -263,7 +263,8 @@ def in_batches(function: Callable[[np.ndarray], object], points: np.ndarray, siz
 
 def by_width(covariance: np.ndarray) -> np.ndarray:
     """Order of the coordinates in which each has the largest variance left by those before it."""
-    rest, order = covariance.copy(), []
+    rest = covariance.copy()
+    order: list[int] = []
     for _ in range(len(covariance)):
         variances = np.diag(rest).copy()
         variances[order] = -np.inf
@@ -292,7 +293,7 @@ def stop_states(fit: JointFit, linear: LinearSpots) -> StopStates:
     """Unroll the filter's six states: a column for each time that one is drawn anew; none beyond `STATES_MAX`."""
     spots, states = linear.load.shape[0], linear.load.shape[2]
     mix = np.asarray(fit.arrays.spots.redraw_mix)[:spots]
-    variance_of = np.radians(fit.mode.physical[STOP_COLUMNS]) ** 2
+    variance_of = np.radians(np.asarray(fit.mode.physical)[STOP_COLUMNS]) ** 2
     places, variance, constant = [], [], []
     for state in range(states):
         drawn = np.flatnonzero(linear.renewed[:, state])
@@ -328,7 +329,7 @@ def transport(fit: JointFit) -> Transport:
         The map; the noise scales take no part in the shear.
     """
     names = np.array(NAMES)
-    linear = linear_spots(fit.linearised, fit.arrays, -fit.linearised.residual_jacobian)
+    linear = linear_spots(fit.linearised, fit.arrays, -np.asarray(fit.linearised.residual_jacobian))
     stops = stop_states(fit, linear)
     whole = len(stops.constant) > 0
     free = np.flatnonzero(fit.free)

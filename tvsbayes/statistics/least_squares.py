@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import cast
 
 import equinox as eqx
 import jax
@@ -37,8 +38,15 @@ def damped_solver(tolerance: Float[Array, ""]) -> optx.LevenbergMarquardt:
     By default optimistix asks for 99 % agreement and divides by 3.5: in directions that only a prior holds, where
     the damping is as large as the curvature, it then creeps.
     """
-    solver = optx.LevenbergMarquardt(rtol=tolerance, atol=tolerance, linear_solver=lx.QR())
-    search = optx.ClassicalTrustRegion(high_cutoff=0.75, low_cutoff=0.1, high_constant=10.0, low_constant=0.2)
+    solver: optx.LevenbergMarquardt = optx.LevenbergMarquardt(
+        # A traced tolerance, so that every stage shares the compilation, is a float to all of optimistix.
+        rtol=cast(float, tolerance),
+        atol=cast(float, tolerance),
+        linear_solver=lx.QR(),
+    )
+    search: optx.ClassicalTrustRegion = optx.ClassicalTrustRegion(
+        high_cutoff=0.75, low_cutoff=0.1, high_constant=10.0, low_constant=0.2
+    )
     return eqx.tree_at(lambda s: s.search, solver, search)
 
 
@@ -84,7 +92,9 @@ def levenberg_marquardt(
 ) -> Float[Array, " parameters"]:
     """One Levenberg-Marquardt run; tolerances are traced so that every stage of a fit shares the compilation."""
     solver = damped_solver(tolerance)
-    solution = optx.least_squares(with_dense_jacobian(residual), solver, start, args, max_steps=max_steps, throw=False)
+    solution: optx.Solution = optx.least_squares(
+        with_dense_jacobian(residual), solver, start, args, max_steps=max_steps, throw=False
+    )
     return solution.value
 
 

@@ -1,0 +1,198 @@
+"""The search for the mode: one campaign in front of the compiled functions, before the Newton steps on its density.
+
+Annealed Levenberg-Marquardt for geometry and stereo in turn with the noise scales, and the robust option's weights.
+Everything happens in the coordinates of `model.parameter_space` (prior N(0, 1) each).
+"""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+from scipy import optimize
+
+from tvsbayes.estimators.campaign_arrays import CampaignArrays, campaign_arrays
+from tvsbayes.estimators.likelihood import density_and_gradient, innovations
+from tvsbayes.estimators.linear_spots import (
+    Linearised,
+    LinearSpots,
+    leave_one_out_chi2,
+    linear_spots,
+    linearise,
+    stop_information,
+)
+from tvsbayes.instrument.campaign import Campaign, ordered_spots
+from tvsbayes.instrument.parameters import NAMES, NOISE_NAMES
+from tvsbayes.instrument.rig import RigTable
+from tvsbayes.model.geometry import Scalar
+from tvsbayes.model.parameter_space import ParameterSpace, free_mask, parameter_space
+from tvsbayes.statistics.intervals import chi2_quantile
+from tvsbayes.statistics.least_squares import NEWTON_STEP, levenberg_marquardt
+
+ANNEALING = (60.0, 10.0, 2.0, 1.0)
+"""Factors on the pixel noise before it takes its own value: plain Levenberg-Marquardt from the nominal rig goes
+astray when the extrinsics are off by 0.3 rad and 60 mm (DESIGN 4.2)."""
+STAGE_TOLERANCE = 1e-2
+STAGE_STEPS = 12
+"""Levenberg-Marquardt only has to reach the basin: its frozen Jacobian (`spot_residuals`) is not exact at the level
+of the noise, where it would stall; the Newton steps on the full density finish the work."""
+NOISE_SETTLED = 0.05
+"""Change of every noise coordinate (prior sds) below which the alternation stops: half a posterior sd."""
+GATE_PROBABILITY = 1e-6
+"""A clean spot is excluded by the robust option with this probability."""
+HUBER_CORE = 0.8214
+"""Share of clean spots with full weight: P(|z| < 1.345), the constant of 95 % efficiency (Huber 1964)."""
+ROUNDS_MAX, WEIGHTS_SETTLED = 20, 0.02
+"""Rounds of the robust option, and the largest change of a weight at which they end."""
+
+
+class Fixed(eqx.Module):
+    """What a least-squares stage holds: coordinates kept at a value, and the factor on the noise."""
+
+    held: Bool[Array, " parameters"]
+    value: Float[Array, " parameters"]
+    inflation: Scalar
+
+
+def stage_residuals(
+    z: Float[Array, " parameters"], args: tuple[ParameterSpace, CampaignArrays, Fixed]
+) -> Float[Array, " residuals"]:
+    """[standardised innovations; prior residuals] with the noise scales held (DESIGN 4.2)."""
+    space, arrays, fixed = args
+    full = jnp.where(fixed.held, fixed.value, z)
+    errors = innovations(space.model(full), arrays, fixed.inflation, frozen=True).standardised
+    return jnp.concatenate([errors.ravel(), jnp.where(fixed.held, z - fixed.value, z)])
+
+
+class Problem:
+    """One campaign in front of the compiled functions."""
+
+    def __init__(self, campaign: Campaign, table: RigTable, used: np.ndarray | None = None):
+        self.spots = ordered_spots(campaign)
+        used = np.ones(len(self.spots), dtype=bool) if used is None else used
+        self.space = parameter_space(table, campaign.stereo)
+        arrays = campaign_arrays(campaign)
+        valid = np.array(arrays.spots.valid)
+        valid[: len(used)] *= used
+        self.arrays = eqx.tree_at(lambda a: a.spots.valid, arrays, jnp.asarray(valid))
+        readings = (spot.aperture_deg is not None for spot, use in zip(self.spots, used, strict=True) if use)
+        self.free = free_mask(self.space, any(readings))
+        is_noise = np.isin(NAMES, NOISE_NAMES)
+        self.noise = np.flatnonzero(is_noise & self.free)
+        self.held = is_noise | ~self.free
+
+    def compile_aside(self, executor: ThreadPoolExecutor) -> None:
+        """Start the compilations that later steps need while the first stage runs on the other core."""
+
+        def work():
+            with jax.enable_x64(True):
+                z = jnp.zeros(len(NAMES))
+                density_and_gradient(z, self.space, self.arrays)
+                linearise(z, self.space, self.arrays)
+
+        executor.submit(work)
+
+    def least_squares(self, z: np.ndarray, inflation: float) -> np.ndarray:
+        """Geometry and stereo for given noise scales."""
+        fixed = Fixed(jnp.asarray(self.held), jnp.asarray(z), jnp.asarray(inflation))
+        args = (self.space, self.arrays, fixed)
+        tolerance = jnp.asarray(STAGE_TOLERANCE)
+        return np.array(levenberg_marquardt(stage_residuals, jnp.asarray(z), args, tolerance, STAGE_STEPS))
+
+    def objective(self, z: np.ndarray) -> tuple[float, np.ndarray]:
+        """Negative log density and its gradient."""
+        value, slope = density_and_gradient(jnp.asarray(z), self.space, self.arrays)
+        return -float(value), -np.asarray(slope)
+
+    def noise_scales(self, z: np.ndarray) -> np.ndarray:
+        """Best noise scales for given geometry, under their priors."""
+
+        def part(values):
+            full = z.copy()
+            full[self.noise] = values
+            value, slope = self.objective(full)
+            return value, slope[self.noise]
+
+        result = z.copy()
+        if self.noise.size:
+            # Eight prior standard deviations: a factor 3000 on a stop sd, 55 on the pixel scale.
+            bounds = [(-8.0, 8.0)] * self.noise.size
+            result[self.noise] = optimize.minimize(part, z[self.noise], jac=True, method="L-BFGS-B", bounds=bounds).x
+        return result
+
+    def alternate(self, z: np.ndarray) -> np.ndarray:
+        """Geometry and noise scales in turn until the noise settles (DESIGN 4.2)."""
+        for _ in range(6):
+            previous = z
+            z = self.least_squares(self.noise_scales(z), 1.0)
+            if np.max(np.abs(z - previous)[self.noise], initial=0.0) < NOISE_SETTLED:
+                break
+        return z
+
+    def searched(self, robust: bool) -> np.ndarray:
+        """Where the Newton steps on the full density may begin: the basin of the mode, weights settled if `robust`."""
+        z = np.zeros(len(NAMES))
+        for inflation in ANNEALING:
+            z = self.least_squares(z, inflation)
+        z = self.alternate(z)
+        for _ in range(ROUNDS_MAX if robust else 0):
+            if self.reweighted(z) < WEIGHTS_SETTLED:
+                break
+            z = self.alternate(z)
+        return z
+
+    def linear_spots(self, z: np.ndarray) -> tuple[Linearised, LinearSpots]:
+        """The campaign linearised at a point, without padding."""
+        count = len(self.spots)
+        full = linearise(jnp.asarray(z), self.space, self.arrays)
+        lin = jax.tree.map(lambda x: np.asarray(x)[:count], full)
+        return lin, linear_spots(lin, self.arrays, np.where(self.held, 0.0, -lin.residual_jacobian))
+
+    def curvature(self, z: np.ndarray) -> np.ndarray:
+        """Expected information of the coordinates: Fisher's of geometry and stereo, measured for the noise."""
+        value = stop_information(self.linear_spots(z)[1]).fisher + np.eye(len(NAMES))
+        slope = self.objective(z)[1]
+        for index in self.noise:
+            nudged = z.copy()
+            nudged[index] += NEWTON_STEP
+            value[index, index] = max(1.0, (self.objective(nudged)[1] - slope)[index] / NEWTON_STEP)
+        return value
+
+    def reweighted(self, z: np.ndarray) -> float:
+        """One round of the robust option: gate and Huber weights from leave-one-out residuals.
+
+        Returns:
+            The largest change of a weight.
+        """
+        spots = self.arrays.spots
+        count = len(self.spots)
+        valid, weight = np.array(spots.valid[:count]), np.array(spots.weight[:count])
+        readings = np.asarray(spots.has_aperture[:count])
+        chi2 = leave_one_out_chi2(stop_information(self.linear_spots(z)[1]), weight)
+        used = valid > 0
+        # The noise scales were fitted with the outliers in: the median restores the scale of the clean spots.
+        scale2 = np.median(chi2[used] / chi2_quantile(readings[used], 0.5))
+        chi2 = chi2 / max(scale2, 1e-12)
+        over = used & (chi2 > chi2_quantile(readings, GATE_PROBABILITY))
+        # A bad spot makes its neighbours look bad: only the worst of each run is blamed in one round.
+        for index in np.flatnonzero(over):
+            run = slice(max(index - 2, 0), index + 3)
+            if chi2[index] >= np.max(np.where(used[run], chi2[run], 0.0)):
+                valid[index] = 0.0
+        core = chi2_quantile(readings, 1 - HUBER_CORE)
+        new_weight = np.where(valid > 0, np.sqrt(np.minimum(1.0, core / np.maximum(chi2, 1e-12))), 1.0)
+        change = float(np.max(np.abs(new_weight - weight) + (valid != used)))
+
+        def padded(array, values):
+            return jnp.asarray(np.concatenate([values, np.asarray(array)[count:]]))
+
+        self.arrays = eqx.tree_at(
+            lambda a: (a.spots.valid, a.spots.weight),
+            self.arrays,
+            (padded(spots.valid, valid), padded(spots.weight, new_weight)),
+        )
+        return change
