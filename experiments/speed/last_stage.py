@@ -14,8 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 from scipy import optimize
 
-from tvsbayes.estimators.mode_search import Fixed, Problem, stage_residuals
 from tvsbayes.estimators.likelihood import innovations
+from tvsbayes.estimators.mode_search import Fixed, Problem, stage_residuals
 from tvsbayes.instrument.campaign import Campaign, ordered_spots
 from tvsbayes.instrument.parameters import NAMES
 from tvsbayes.statistics.least_squares import levenberg_marquardt, residuals_and_jacobian

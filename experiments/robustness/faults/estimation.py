@@ -158,8 +158,8 @@ FAULTS = (
     Fault(
         "correlation of the left camera used for the right",
         "estimators/campaign_arrays.py",
-        "spot.ruv_right * su_r * sv_r",
-        "spot.ruv_left * su_r * sv_r",
+        "spot.ruv_right * sd[2] * sd[3]",
+        "spot.ruv_left * sd[2] * sd[3]",
         "spots of the right camera are weighted wrongly",
         ("estimators/likelihood",),
     ),
