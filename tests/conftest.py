@@ -8,6 +8,7 @@ pyproject.toml has every array checked against its annotation (jaxtyping's impor
 from __future__ import annotations
 
 import os
+import signal
 from pathlib import Path
 
 # Before NumPy is imported: OpenBLAS' waiting threads would take the time of XLA's (see `tvsbayes.cli.main`).
@@ -92,6 +93,26 @@ def x64():
 def mounted_rig() -> Rig:
     """The shipped rig whose extrinsics are known to 0.03 rad and 5 mm."""
     return read_rig(ROOT / "data" / "rigs" / "mounted" / "rig.toml")
+
+
+@pytest.fixture(scope="session")
+def small_rig(mounted_rig: Rig) -> Rig:
+    """The same rig with cameras of a quarter of the pixels per side: pictures that cost a sixteenth."""
+    scale = np.ones(24)
+    scale[[0, 1, 2, 3, 9, 10, 11, 12]] = 0.25
+    stereo = mounted_rig.stereo.with_vector(mounted_rig.stereo.vector * scale)
+    width, height = mounted_rig.stereo.image_width // 4, mounted_rig.stereo.image_height // 4
+    covariance = mounted_rig.stereo.parameter_covariance * np.outer(scale, scale)
+    stereo = replace(stereo, image_width=width, image_height=height, parameter_covariance=covariance)
+    return replace(mounted_rig, stereo=stereo)
+
+
+@pytest.fixture
+def ctrl_c_works():
+    """A shell's background jobs are born with SIGINT ignored; the tests that ask for this raise it."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ import numpy as np
 from experiments.common.command_line import act, parser
 from experiments.common.rigs import mounted_rig, shipped_plan
 from experiments.common.rows import append_row, output, read_rows
-from tvsbayes.cameras import contour, detection, spot_fit
+from tvsbayes.cameras import contour, detection, spot_fit, spot_noise
 from tvsbayes.instrument.stereo_pair import Stereo
 from tvsbayes.twin.physics import cameras_of
 from tvsbayes.twin.simulated_campaign import simulate

@@ -83,7 +83,7 @@ FAULTS = (
         "            lit, on = self._lit(positioner, dark)\n        finally:\n            positioner.laser(False)",
         "            lit, on = self._lit(positioner, dark)\n        finally:\n            pass",
         "an exception leaves the laser on",
-        ("acquisition/engine",),
+        ("acquisition/observation",),
     ),
     Fault(
         "homing called an arrival from below",

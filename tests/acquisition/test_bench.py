@@ -1,0 +1,183 @@
+"""The bench from end to end: the twin through the virtual camera, hardware from the rig file to the campaign."""
+
+from __future__ import annotations
+
+import json
+import os
+import threading
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.bench_runs import small_plan
+
+from tvsbayes.acquisition.bench import Vision
+from tvsbayes.acquisition.journal import read_journal
+from tvsbayes.acquisition.journal_check import verify
+from tvsbayes.acquisition.observation import Detection, live_detector, twin_renderer
+from tvsbayes.acquisition.operator import Terminal
+from tvsbayes.acquisition.session import acquire
+from tvsbayes.acquisition.simulated_instrument import Instrument
+from tvsbayes.cameras.capture import StereoImage
+from tvsbayes.cameras.virtual_camera import VirtualCamera
+from tvsbayes.instrument.campaign import read_campaign
+from tvsbayes.instrument.plan import PlanStep
+from tvsbayes.twin.physics import project
+from tvsbayes.twin.simulated_campaign import read_truth
+
+
+def blob(shape, u, v, peak):
+    """A plain Gaussian spot of 2 px: enough for the camera path, whose pictures are tested elsewhere."""
+    y, x = np.mgrid[: shape[0], : shape[1]]
+    spot = peak * np.exp(-((x - u) ** 2 + (y - v) ** 2) / (2 * 2.0**2)) if np.isfinite(u) else np.zeros(shape)
+    return np.repeat(np.clip(20 + spot, 0, 255)[..., None], 3, axis=2)
+
+
+def centroids(lit: StereoImage, dark: StereoImage) -> Detection:
+    pixels = []
+    for side in ("left", "right"):
+        light = np.clip(getattr(lit, side).astype(float) - getattr(dark, side), 12, None).mean(axis=2) - 12
+        if light.max() < 50:
+            return Detection("no-spot")
+        y, x = np.mgrid[: light.shape[0], : light.shape[1]]
+        pixels += [float((light * x).sum() / light.sum()), float((light * y).sum() / light.sum())]
+    return Detection("ok", tuple(pixels), (0.1,) * 4)
+
+
+def centroids_of_the_twin(mounted_rig, truth: dict, move: int) -> np.ndarray:
+    """Where the true cameras see the spot of sheet d1 after a move, without noise: (4,) px."""
+    k, p = np.radians(truth["mirror_angles_deg"][move]), truth["parameters"]
+    still = Instrument(mounted_rig, 7)
+    still._y, still._eta = list(np.degrees(k) - [0.0, p["tilt_zero_deg"]]), [0.0, 0.0]
+    still.place("d1", 0)
+    still.mechanics.laser_on = True
+    return still.centroid_px()
+
+
+TWO_LOOKS = (
+    *(PlanStep(0, "home", 0, 0), PlanStep(1, "place", target="d1"), PlanStep(2, "look")),
+    *(PlanStep(3, "move", 60, 10), PlanStep(4, "look")),
+)
+
+
+def test_truth_file_is_that_of_the_run(mounted_rig, tmp_path):
+    acquire(mounted_rig, small_plan(2), tmp_path / "c", simulate=True, seed=4)
+    campaign = read_campaign(tmp_path / "c")
+    truth = read_truth(tmp_path / "c" / "truth.json", campaign.stereo)
+    assert len(truth.mirror_angles_deg) == len(campaign.moves) and truth.reference_pose_deg is not None
+    assert truth.parameters == Instrument(mounted_rig, 4).truth.parameters
+    k = truth.parameters["degrees_per_step.left"]
+    turned = np.subtract(truth.mirror_angles_deg, truth.stop_errors_deg)
+    assert turned[3][0] - turned[2][0] == pytest.approx(100 * k - truth.parameters["backlash_deg.pan"], abs=1e-9)
+
+
+def test_pictures_through_the_virtual_camera(small_rig, tmp_path):
+    """Renderer, MJPEG server, OpenCV, background, detection, journal: spots where the twin has them."""
+    instrument = Instrument(small_rig, 7)
+    rng = np.random.default_rng(0)
+    size = (small_rig.stereo.image_height, small_rig.stereo.image_width)
+
+    def renderer(light, look, frame):
+        pixels = project(light.points_mm[None], instrument.truth.stereo, instrument.truth.parameters["focal_scale"])[0]
+        pair = [blob(size, pixels[k], pixels[k + 1], 180.0) + rng.normal(0, 1, (*size, 1)) for k in (0, 2)]
+        return StereoImage(*(np.clip(p, 0, 255).astype(np.uint8) for p in pair))
+
+    folder = tmp_path / "c"
+    outcome = acquire(small_rig, TWO_LOOKS, folder, simulate=True, seed=7, vision=Vision(centroids, renderer))
+    assert (outcome.ok, outcome.refused) == (2, 0)
+    assert verify(folder).frames == 8
+    names = sorted(p.name for p in (folder / "frames").iterdir())
+    assert names == ["000000_left.png", "000000_right.png", "000001_left.png", "000001_right.png"]
+    campaign, truth = read_campaign(folder), json.loads((folder / "truth.json").read_text())
+    for spot in campaign.spots:
+        pixels = (spot.u_left_px, spot.v_left_px, spot.u_right_px, spot.v_right_px)
+        # JPEG and the threshold move a centroid of a 2 px spot by less than 0.1 px.
+        assert np.abs(centroids_of_the_twin(small_rig, truth, spot.move) - pixels).max() < 0.1
+
+
+def test_rendered_pictures_are_detected_while_the_plan_runs(small_rig, tmp_path):
+    """What `acquire --simulate` does: the twin's cameras rendered, spots fitted with their uncertainty."""
+    folder = tmp_path / "c"
+    vision = Vision(live_detector(small_rig.stereo), twin_renderer(small_rig, 7))
+    outcome = acquire(small_rig, TWO_LOOKS, folder, simulate=True, seed=7, vision=vision)
+    assert (outcome.ok, outcome.refused) == (2, 0)
+    truth = json.loads((folder / "truth.json").read_text())
+    for spot in read_campaign(folder).spots:
+        pixels = np.array([spot.u_left_px, spot.v_left_px, spot.u_right_px, spot.v_right_px])
+        sds = np.array([spot.su_left_px, spot.sv_left_px, spot.su_right_px, spot.sv_right_px])
+        assert 0.01 < sds.min() and sds.max() < 0.2
+        # Eight coordinates in all, five sds each: JPEG's blocks add to the noise that is stated.
+        assert np.all(np.abs(centroids_of_the_twin(small_rig, truth, spot.move) - pixels) < 5 * sds)
+
+
+@pytest.mark.skipif(not hasattr(os, "openpty"), reason="pseudo-terminals exist on POSIX only")
+def test_hardware_path_from_rig_file_to_campaign(small_rig, tmp_path):
+    """Pyserial on a pseudo-terminal, OpenCV on a stream, questions on a terminal: all as on the bench."""
+    size = (small_rig.stereo.image_height, small_rig.stereo.image_width)
+    instrument = Instrument(small_rig, 7)
+    rng, lit_in_motion = np.random.default_rng(0), []
+    moved = instrument.mechanics.moved
+    instrument.mechanics.moved = lambda *a: (lit_in_motion.append(instrument.mechanics.laser_on), moved(*a))
+    noise = rng.integers(0, 9, (*size, 3)).astype(np.uint8)
+    frame = [0]
+
+    def render():
+        frame[0] += 1
+        pixels, pair = instrument.centroid_px(), []
+        for k in (0, 2):
+            # Never the same picture twice in a look, however many frames a busy computer needs: that would be a fault.
+            picture = 20 + np.roll(noise, frame[0], axis=k // 2)
+            if np.isfinite(pixels[k]):
+                u, v = map(round, pixels[k : k + 2])
+                picture[v - 5 : v + 6, u - 5 : u + 6] += blob((11, 11), 5, 5, 180).astype(np.uint8)
+            pair.append(picture)
+        return StereoImage(*pair)
+
+    master, slave = os.openpty()
+    lines: list[bytes] = []
+    instrument.device.listener = lines.append
+
+    def serve():
+        while True:
+            try:
+                data = os.read(master, 4096)
+            except OSError:
+                return
+            # Every request finds the device 1 s later: motions end without anybody waiting.
+            instrument.clock.now_us += 1_000_000
+            instrument.device.model.advance(instrument.clock.now_us)
+            instrument.device.model.receive(data, instrument.clock.now_us)
+            while lines:
+                os.write(master, lines.pop(0))
+
+    threading.Thread(target=serve, daemon=True).start()
+    asked = []
+
+    def ask(question):
+        asked.append(question)
+        instrument.place("d1" if "d1" in question else "d2", len(asked))
+        return ""
+
+    plan = [PlanStep(0, "home", 0, 0), PlanStep(1, "place", target="d1"), PlanStep(2, "look")]
+    plan += [PlanStep(3, "move", 60, 10), PlanStep(4, "look"), PlanStep(5, "place", target="d2"), PlanStep(6, "look")]
+    with VirtualCamera(render, frames_per_s=30) as virtual:
+        table = {"driver": "serial", "port": os.ttyname(slave), "settle_s": 0.0}
+        real = replace(small_rig, positioner=table, cameras={"source": virtual.address, "spot_sd_px": 0.08})
+        said = []
+        outcome = acquire(
+            real,
+            plan,
+            tmp_path / "c",
+            laser_class="3B",
+            vision=Vision(centroids),
+            terminal=Terminal(said.append, ask=ask),
+        )
+    os.close(slave)
+    os.close(master)
+    assert (outcome.reason, outcome.ok, len(asked)) == ("done", 3, 2), said
+    assert any("808 nm is invisible" in line for line in said)
+    assert not instrument.mechanics.laser_on and lit_in_motion and not any(lit_in_motion)
+    assert verify(tmp_path / "c").frames == 12 and len(read_campaign(tmp_path / "c").spots) == 3
+    assert "synthetic" not in read_campaign(tmp_path / "c").header
+    start = next(r for r in read_journal(tmp_path / "c").records if r.event == "start")
+    assert start.data["device"]["fw"] == "1.0.0" and "cameras" in start.data

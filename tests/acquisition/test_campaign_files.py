@@ -1,0 +1,83 @@
+"""Campaign files beside a journal: written after every look, kept where somebody edited them."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+from pathlib import Path
+
+import pytest
+from support.bench_runs import HEADER, Failing, Run, small_plan
+
+from tvsbayes.acquisition.session import begin
+from tvsbayes.cli.main import run
+from tvsbayes.instrument.campaign import read_campaign
+
+pytestmark = pytest.mark.usefixtures("ctrl_c_works")
+
+
+def test_campaign_is_readable_after_every_look(mounted_rig, tmp_path):
+    seen = []
+
+    def show(progress):
+        if (tmp_path / "c" / "campaign.toml").exists():
+            seen.append(len(read_campaign(tmp_path / "c").spots))
+            assert seen[-1] == progress.looks and progress.looks_total == 8
+            assert progress.seconds_left >= 0
+
+    Run(mounted_rig, tmp_path / "c", show=show).engine.run()
+    assert seen[-1] == 7 and len(seen) > 10
+
+
+@pytest.mark.parametrize("refusals", [3, 10_000])
+def test_a_table_that_somebody_has_open_does_not_end_the_run(mounted_rig, tmp_path, monkeypatch, refusals):
+    """On Windows `os.replace` refuses while a spreadsheet holds spots.csv; the journal has the look already."""
+    replace_, left = os.replace, [refusals]
+
+    def held(source, destination):
+        if Path(destination).name == "spots.csv" and left[0] > 0:
+            left[0] -= 1
+            raise PermissionError(13, "The process cannot access the file")
+        replace_(source, destination)
+
+    monkeypatch.setattr(os, "replace", held)
+    outcome = Run(mounted_rig, tmp_path / "c").engine.run()
+    assert (outcome.reason, outcome.looks) == ("done", 8)
+    assert [text for text in outcome.warnings if "behind the journal" in text] == list(outcome.warnings)
+    assert len(outcome.warnings) == (refusals > 8)
+    if not outcome.warnings:
+        assert len(read_campaign(tmp_path / "c").spots) == 8
+
+
+def test_what_somebody_changed_since_is_kept_beside(mounted_rig, tmp_path):
+    """A refused spot, and a prior stated in campaign.toml: resuming writes these files again."""
+    Run(
+        mounted_rig,
+        tmp_path / "c",
+        observer=lambda i: Failing(i, 3, lambda instrument: signal.raise_signal(signal.SIGINT)),
+    ).engine.run()
+    spots, header = tmp_path / "c" / "spots.csv", tmp_path / "c" / "campaign.toml"
+    edited = spots.read_text().replace(",ok", ",dust", 1)
+    assert edited != spots.read_text()
+    spots.write_text(edited)
+    stated = header.read_text() + "\n# mirror looked at on Monday\n"
+    header.write_text(stated)
+    outcome = Run(mounted_rig, tmp_path / "c", resume=True, start=1).engine.run()
+    assert (tmp_path / "c" / "spots.edited-1.csv").read_text() == edited
+    assert (tmp_path / "c" / "campaign.edited-1.toml").read_text() == stated
+    told = [w.split(" was")[0] for w in outcome.warnings if "edited" in w]
+    assert sorted(told) == ["campaign.toml", "spots.csv"]
+    assert not list((tmp_path / "c").glob("moves.edited*"))
+    again = Run(mounted_rig, tmp_path / "c", resume=True, start=2).engine.run()
+    assert (
+        not any("edited" in warning for warning in again.warnings)
+        and len(list((tmp_path / "c").glob("*.edited-*"))) == 2
+    )
+
+
+def test_folder_without_a_homing_is_told_so(mounted_rig, tmp_path, capsys):
+    begin(tmp_path / "c", mounted_rig, small_plan(), False, HEADER).close()
+    assert run(["check", str(tmp_path / "c"), "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert document["kind"] == "journal" and "no homing" in document["warnings"][-1]

@@ -1,0 +1,116 @@
+"""One look: no old picture, no strange light and no lying camera becomes a spot."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tvsbayes.acquisition.engine import ATTEMPTS_PER_LOOK
+from tvsbayes.acquisition.observation import CameraObserver, Detection, live_detector, twin_renderer
+from tvsbayes.acquisition.simulated_instrument import Instrument
+from tvsbayes.cameras.capture import StereoImage
+from tvsbayes.errors import DeviceFault
+
+
+class Scripted:
+    """A camera whose n-th pair is `level(n)` grey all over, after `seconds` of exposure."""
+
+    def __init__(self, clock, level, seconds=0.1):
+        self.clock, self.level, self.seconds, self.count = clock, level, seconds, 0
+
+    def grab(self):
+        self.clock.sleep(self.seconds)
+        self.count += 1
+        picture = np.full((4, 4, 3), self.level(self.count), np.uint8)
+        return StereoImage(picture, picture)
+
+
+def test_pictures_that_are_no_pair_are_refused(small_rig):
+    dark = np.zeros((small_rig.stereo.image_height, small_rig.stereo.image_width, 3), np.uint8)
+    light = Instrument(small_rig, 7)
+    light.place("d1", 0)
+    light.mechanics.laser_on = True
+    made = twin_renderer(small_rig, 7)(light.light(), 0, 0)
+    detector = live_detector(small_rig.stereo)
+    assert detector(made, made).status == "ok"
+    assert detector(StereoImage(dark, dark), made).status == "no-spot both"
+    assert detector(StereoImage(made.left, dark), made).status == "no-spot right"
+    lifted = np.roll(made.right, 20, axis=0)
+    assert detector(StereoImage(made.left, lifted), made).status == "epipolar"
+
+
+@pytest.mark.parametrize(
+    ("level", "seconds", "code"),
+    [
+        (lambda n: 7, 0.1, "frozen"),
+        (lambda n: n % 30, 2.5, "watchdog"),
+        (lambda n: 0 if n == 1 else 100, 0.1, "light"),
+    ],
+)
+def test_camera_that_lies_is_a_fault_and_the_laser_is_off(mounted_rig, level, seconds, code):
+    instrument = Instrument(mounted_rig, 1)
+    positioner = instrument.positioner()
+    positioner.home()
+    with pytest.raises(DeviceFault) as caught:
+        CameraObserver(Scripted(instrument.clock, level, seconds)).observe(positioner, 0)
+    assert caught.value.code == code and not instrument.mechanics.laser_on
+
+
+def test_pictures_without_a_visible_spot_wait_for_detection(mounted_rig):
+    instrument = Instrument(mounted_rig, 1)
+    positioner = instrument.positioner()
+    positioner.home()
+    camera = Scripted(instrument.clock, lambda n: n % 30)
+    found = CameraObserver(camera).observe(positioner, 3)
+    assert found.detection.status == "undetected" and camera.count == 22
+    assert sorted(found.pictures)[0] == "dark/000003_left.png" and len(found.pictures) == 4
+
+
+def test_changed_background_is_refused(mounted_rig):
+    instrument = Instrument(mounted_rig, 1)
+    positioner = instrument.positioner()
+    positioner.home()
+    camera = Scripted(instrument.clock, lambda n: 90 if n == 1 else n % 30)
+    assert CameraObserver(camera).observe(positioner, 3).detection.status == "unsteady"
+
+
+@pytest.mark.parametrize("depth", range(0, 12))
+def test_old_frames_never_become_a_spot_whatever_the_buffer(mounted_rig, depth):
+    """A camera without any flushing, with a buffer `depth` frames deep: light alone keeps the spots true."""
+    instrument = Instrument(mounted_rig, 1)
+    positioner = instrument.positioner()
+    positioner.home()
+    rng = np.random.default_rng(depth)
+    queue, moved_to = [], [0]
+
+    def expose():
+        picture = rng.integers(0, 6, (3, 40, 3)).astype(np.uint8)
+        if instrument.mechanics.laser_on:
+            picture[1, moved_to[0]] = 200
+        queue.append(picture)
+
+    class Camera:
+        def grab(self):
+            expose()
+            while len(queue) <= depth:
+                expose()
+            picture = queue.pop(0)
+            return StereoImage(picture, picture)
+
+    def detector(lit, dark):
+        light = lit.left[1].astype(int).sum(axis=1) - dark.left[1].astype(int).sum(axis=1)
+        u = float(light.argmax())
+        return Detection("ok", (u,) * 4, (0.1,) * 4) if light.max() > 300 else Detection("no-spot")
+
+    observer, found = CameraObserver(Camera(), detector, keep_pictures=False), []
+    for step in range(12):
+        positioner.move_to(3 * step, 0)
+        # The spot is where the positioner is.
+        moved_to[0] = 3 * step
+        for _ in range(ATTEMPTS_PER_LOOK):
+            seen = observer.observe(positioner, step).detection
+            if seen.status == "ok":
+                found.append(seen.pixels_px[0])
+                assert seen.pixels_px[0] == 3 * step
+                break
+    assert found == [3.0 * step for step in range(12)]

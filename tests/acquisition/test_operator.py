@@ -1,0 +1,56 @@
+"""The keys that stop a run, and the questions it asks."""
+
+from __future__ import annotations
+
+import signal
+
+import pytest
+from support.bench_runs import raise_error
+
+from tvsbayes.acquisition.operator import LiveLine, StopKey, Terminal, TerminalOperator
+
+pytestmark = pytest.mark.usefixtures("ctrl_c_works")
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGHUP"), reason="POSIX only")
+def test_nohup_is_respected(monkeypatch):
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        with StopKey():
+            signal.raise_signal(signal.SIGHUP)
+        assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGHUP, before)
+
+
+@pytest.mark.parametrize("error", [RuntimeError("reentrant call inside a writer"), BrokenPipeError(32, "Broken pipe")])
+def test_stop_key_counts_even_where_its_word_cannot_be_written(error):
+    with StopKey(lambda text: raise_error(error)) as stop:
+        signal.raise_signal(signal.SIGINT)
+    assert stop.requested
+
+
+def test_questions_go_to_stderr(monkeypatch, capsys):
+    """With --json stdout holds one document."""
+    monkeypatch.setattr("builtins.input", lambda: "yes")
+    assert LiveLine().ask("Type yes [now]: ") == "yes"
+    out, err = capsys.readouterr()
+    assert out == "" and "Type yes [now]: " in err
+
+
+def test_stop_key_interrupts_a_question_at_once():
+    said = []
+
+    def ask(question):
+        signal.raise_signal(signal.SIGINT)
+        return "never"
+
+    with StopKey(said.append) as stop:
+        operator = TerminalOperator(stop, Terminal(said.append, ask=ask))
+        assert operator.accept("line one\nline two") is False and stop.requested
+        assert said == ["line one", "line two"]
+        assert operator.place("d1", 175.0, 0, "") is False
+    stop = StopKey()
+    assert TerminalOperator(stop, Terminal(said.append, ask=lambda q: " YES ")).accept("x") is True
+    assert TerminalOperator(stop, Terminal(said.append, ask=lambda q: "y")).accept("x") is False
+    assert TerminalOperator(stop, Terminal(said.append), laser_class="3B").accept("x") is True

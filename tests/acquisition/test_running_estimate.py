@@ -1,0 +1,72 @@
+"""The fit beside a run."""
+
+from __future__ import annotations
+
+import sys
+
+import pytest
+from support.bench_runs import Run, small_plan
+
+from tvsbayes.acquisition.journal import read_journal
+from tvsbayes.acquisition.operator import Terminal
+from tvsbayes.acquisition.recorder import recorded
+from tvsbayes.acquisition.running_estimate import EstimateWish, RunningEstimate
+from tvsbayes.acquisition.session import acquire
+from tvsbayes.instrument.plan import run_plan
+from tvsbayes.instrument.stops import legs_of
+
+FIT = """
+import json, sys
+from pathlib import Path
+looks = len((Path(sys.argv[1]) / "spots.csv").read_text().splitlines()) - 1
+entry = {"value": 0.06, "sd": 0.012 / looks}
+print(json.dumps({"converged": looks != 15, "effective_deg_per_step": {"left": entry, "right": entry, "up": None}}))
+"""
+
+
+def test_run_ends_when_the_running_estimate_meets_its_target(mounted_rig, tmp_path):
+    """A stand-in whose u falls as 0.012 / looks: 5e-4 is met at 24 looks; fits at 12, 15 (fails), 18, 22, 27."""
+    plan, texts = small_plan(20), []
+    directions = set(legs_of(run_plan(plan, mounted_rig).moves))
+    assert directions == {"left", "right"}
+    command = [sys.executable, "-c", FIT]
+    with RunningEstimate(tmp_path / "c", command, 5e-4, directions, wait=True) as estimate:
+        run_ = Run(mounted_rig, tmp_path / "c", plan, estimate=estimate, show=lambda p: texts.append(p.estimate))
+        outcome = run_.engine.run()
+    assert (outcome.reason, outcome.looks, estimate.latest.looks) == ("target met", 27, 27) and run_.dark()
+    assert texts[0] == "" and texts[-1].startswith("left 0.060000 u 5.")
+    assert recorded(read_journal(tmp_path / "c").records).unverified == (), "the closing homing took place"
+    for needed in ({"left", "up"}, set()):
+        with RunningEstimate(tmp_path / "c", command, 1.0, needed, wait=True) as estimate:
+            assert not estimate.update(27) and estimate.latest is not None, "a direction without a figure is not met"
+
+
+@pytest.mark.parametrize(("asked", "shown"), [(None, False), (True, True), (False, False)])
+def test_estimate_is_shown_without_a_target(mounted_rig, tmp_path, asked, shown):
+    """What is known so far belongs into the live line whether or not it ends the run; simulations must ask for it."""
+    wish = EstimateWish((sys.executable, "-c", FIT), asked=asked)
+    texts = []
+
+    def show(progress):
+        texts.append(progress.estimate)
+
+    outcome = acquire(
+        mounted_rig, small_plan(4), tmp_path / "c", simulate=True, seed=4, estimate=wish, terminal=Terminal(show=show)
+    )
+    assert (outcome.reason, outcome.looks) == ("done", 16)
+    assert texts[-1] == ("left 0.060000 u 1.0e-03, right 0.060000 u 1.0e-03" if shown else "")
+
+
+def test_running_estimate_does_not_hold_up_the_run_and_dies_with_it(mounted_rig, tmp_path):
+    command = [sys.executable, "-c", "import threading; threading.Event().wait()"]
+    with RunningEstimate(tmp_path / "c", command, 1.0, {"left"}) as estimate:
+        assert Run(mounted_rig, tmp_path / "c", small_plan(5), estimate=estimate).engine.run().reason == "done"
+        child = estimate._process
+        assert child.poll() is None and estimate.latest is None
+    assert child.poll() is not None
+
+
+def test_estimate_that_cannot_start_does_not_end_the_run(tmp_path):
+    for wait in (True, False):
+        with RunningEstimate(tmp_path, [str(tmp_path / "nothing")], 1.0, {"left"}, wait=wait) as estimate:
+            assert not estimate.update(12) and estimate.latest is None

@@ -1,0 +1,190 @@
+"""From files and options to a finished run: the command, what it refuses, and what a kill leaves."""
+
+from __future__ import annotations
+
+import json
+import random
+import signal
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from support.bench_runs import HEADER, RIG_FILE, Failing, Run, small_plan
+
+from tvsbayes.acquisition.journal import LOG, read_journal
+from tvsbayes.acquisition.journal_check import verify
+from tvsbayes.acquisition.recorder import recorded
+from tvsbayes.acquisition.session import acquire, begin, check_plan
+from tvsbayes.cli.main import run
+from tvsbayes.errors import InputError
+from tvsbayes.instrument.campaign import read_campaign
+from tvsbayes.instrument.plan import outline, write_plan
+
+pytestmark = pytest.mark.usefixtures("ctrl_c_works")
+
+
+def test_same_seed_same_bytes(mounted_rig, tmp_path):
+    for name in "ab":
+        acquire(mounted_rig, small_plan(1), tmp_path / name, simulate=True, seed=9)
+    for file in ("moves.csv", "spots.csv", "campaign.toml", "truth.json", LOG):
+        assert (tmp_path / "a" / file).read_bytes() == (tmp_path / "b" / file).read_bytes(), file
+    acquire(mounted_rig, small_plan(1), tmp_path / "other", simulate=True, seed=10)
+    assert (tmp_path / "other" / "spots.csv").read_bytes() != (tmp_path / "a" / "spots.csv").read_bytes()
+
+
+def test_resume_with_another_plan_rig_or_seed_is_refused(mounted_rig, tmp_path):
+    folder, plan = tmp_path / "c", small_plan()
+    Run(
+        mounted_rig, folder, plan, observer=lambda i: Failing(i, 2, lambda i: signal.raise_signal(signal.SIGINT))
+    ).engine.run()
+    size = (folder / LOG).stat().st_size
+    other_plan = [*plan[:-1], replace(plan[-1], point=None, experiment=None)]
+    other_rig = replace(mounted_rig, sheets_mm={**mounted_rig.sheets_mm, "d1": 180.0})
+    for arguments, word in (
+        ((mounted_rig, other_plan, True, HEADER), "another plan"),
+        ((other_rig, plan, True, HEADER), "another rig"),
+        ((mounted_rig, plan, True, {**HEADER, "seed": 6}), "seed"),
+    ):
+        with pytest.raises(InputError, match=word):
+            begin(folder, *arguments)
+    assert (folder / LOG).stat().st_size == size
+    begin(folder, mounted_rig, plan, True, HEADER).close()
+    with pytest.raises(InputError, match="no journal"):
+        acquire(mounted_rig, plan, tmp_path / "nowhere", simulate=True, resume=True)
+
+
+def test_plans_that_the_rig_cannot_run_are_refused_before_anything_moves(mounted_rig):
+    plan = small_plan(1)
+    with pytest.raises(InputError, match="target d9 in step 3"):
+        check_plan(mounted_rig, [*plan[:3], replace(plan[3], target="d9"), *plan[4:]])
+    with pytest.raises(InputError, match="4000 in step 1"):
+        check_plan(mounted_rig, [plan[0], replace(plan[1], pan_steps=4000)])
+    narrow = replace(mounted_rig, positioner={"pan_max_steps": 90})
+    with pytest.raises(InputError, match="100 in step 7"):
+        check_plan(narrow, plan)
+    assert outline(mounted_rig, plan)[7] == "7: go to pan 100, tilt 0 (by +100, +0)"
+
+
+def test_commands(mounted_rig, tmp_path, capsys):
+    write_plan(small_plan(1), tmp_path / "plan.csv")
+    arguments = [str(RIG_FILE), str(tmp_path / "plan.csv"), str(tmp_path / "c")]
+    assert run(["acquire", *arguments, "--dry-run", "--json"]) == 0
+    assert len(json.loads(capsys.readouterr().out)["steps"]) == 11 and not (tmp_path / "c").exists()
+    assert run(["acquire", *arguments, "--simulate", "--centroids", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["ok"] == 4
+    files = {"campaign.toml", "moves.csv", "spots.csv", "stereo.json"} | {LOG, "truth.json"}
+    assert {path.name for path in (tmp_path / "c").iterdir()} == files, "no empty folders for pictures"
+    assert run(["acquire", *arguments, "--simulate", "--centroids", "--json"]) == 2
+    assert json.loads(capsys.readouterr().out)["error"]["code"] == "occupied"
+    assert run(["acquire", *arguments[:2], str(tmp_path / "d"), "--json"]) == 2
+    assert json.loads(capsys.readouterr().out)["error"]["code"] == "usage" and not (tmp_path / "d").exists()
+    assert run(["acquire", *arguments[:2], str(tmp_path / "d"), "--laser-class", "3B", "--json"]) == 2
+    assert json.loads(capsys.readouterr().out)["error"]["code"] == "positioner"
+    assert run(["check", str(tmp_path / "c"), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["journal"]["stopped"] == "done"
+    log = tmp_path / "c" / LOG
+    lines = log.read_bytes().splitlines(keepends=True)
+    log.write_bytes(b"".join([*lines[:9], lines[9].replace(b"0", b"1", 1), *lines[10:]]))
+    assert run(["check", str(tmp_path / "c"), "--json"]) == 2
+    assert json.loads(capsys.readouterr().out)["error"]["line"] == 10
+    assert run(["check", str(tmp_path / "c"), "--repair-to", str(tmp_path / "fixed"), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["lost_lines"] == [10]
+    assert run(["check", str(tmp_path / "fixed"), "--json"]) == 0
+    assert len(read_campaign(tmp_path / "fixed").moves) >= 1
+    capsys.readouterr()
+    assert run(["check", str(RIG_FILE.parent), "--repair-to", str(tmp_path / "x"), "--json"]) == 2
+    assert "acquire" in json.loads(capsys.readouterr().out)["error"]["message"]
+
+
+def test_command_tells_reference_looks_from_those_of_the_plan(mounted_rig, tmp_path, capsys):
+    plan, folder = small_plan(), tmp_path / "c"
+    write_plan(plan, tmp_path / "plan.csv")
+    Run(
+        mounted_rig, folder, plan, observer=lambda i: Failing(i, 5, lambda i: signal.raise_signal(signal.SIGINT))
+    ).engine.run()
+    arguments = ["acquire", str(RIG_FILE), str(tmp_path / "plan.csv"), str(folder), "--simulate", "--centroids"]
+    assert run([*arguments, "--resume", "--seed", "5"]) == 0
+    first = capsys.readouterr().out.splitlines()[0]
+    assert first.endswith("done, 10 of 10 looks count (8 of the plan, 2 reference looks of resumed runs)"), first
+    assert run([*arguments[:3], str(tmp_path / "whole"), *arguments[4:]]) == 0
+    assert capsys.readouterr().out.splitlines()[0].endswith("done, 8 of 8 looks count")
+
+
+KILLED = """
+import os, signal, sys
+
+calls, left = sys.argv[1].split(","), int(sys.argv[2])
+
+def mortal(name, call):
+    def called(*arguments):
+        global left
+        left -= 1
+        if left == 0:
+            if name == "write":
+                call(arguments[0], arguments[1][: len(arguments[1]) // 2])
+            os.kill(os.getpid(), signal.SIGKILL)
+        return call(*arguments)
+    return called
+
+for name in calls:
+    setattr(os, name, mortal(name, getattr(os, name)))
+
+from tvsbayes.cli.main import run
+
+sys.exit(run(sys.argv[3:]))
+"""
+"""A command that is killed at the n-th of some calls of `os`, in the middle of a write; 0: never.
+
+By itself, since a clock would kill another call in every run, or none.
+"""
+CALLS_PER_LOOK = 2
+"""At least: the lines of a placement or a motion and of the look are written one by one, and flushed."""
+
+
+def killed_runs(tmp_path: Path, kills: int, seed: int, experiments: int) -> int:
+    """Kill `acquire --simulate` again and again, resuming each time, then let it finish: looks of the plan."""
+    rng = random.Random(seed)
+    calls_max = 4 * experiments * CALLS_PER_LOOK // max(kills, 1)
+    plan = small_plan(experiments)
+    write_plan(plan, tmp_path / "plan.csv")
+    folder = tmp_path / "c"
+    command = ["acquire", str(RIG_FILE), str(tmp_path / "plan.csv"), str(folder)]
+    before = 0
+    for number in range(kills + 1):
+        resume = ["--resume"] if number else []
+        # Without a whole first line there is nothing to go on with.
+        call = rng.randint(2, calls_max) if number < kills else 0
+        calls = "fsync,replace" if number % 2 else "write"
+        process = subprocess.run(
+            [sys.executable, "-c", KILLED, calls, str(call), *command, "--simulate", "--centroids", *resume],
+            capture_output=True,
+            cwd=Path(__file__).parents[2],
+            check=False,
+        )
+        assert process.returncode == (-signal.SIGKILL if call else 0), (call, process.stderr.decode())
+        reading = read_journal(folder)
+        # Centroids: all that a run writes through a descriptor are lines of its log.
+        assert bool(reading.torn) == (call > 0 and calls == "write")
+        record = recorded(reading.records)
+        assert len(record.spots) >= before, "a look is gone"
+        before = len(record.spots)
+        verify(folder)
+        if record.moves and (folder / "campaign.toml").exists():
+            assert len(read_campaign(folder).spots) >= 0.99 * len(record.spots) - 1
+    campaign = read_campaign(folder)
+    points = [(s.experiment, s.point) for s in campaign.spots if s.experiment is not None]
+    assert points == [(s.experiment, s.point) for s in plan if s.action == "look"]
+    return len(points)
+
+
+def test_killed_acquisition_is_resumed_without_a_loss(tmp_path):
+    assert killed_runs(tmp_path, 3, seed=1, experiments=15) == 60
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(4))
+def test_twenty_killed_acquisitions(tmp_path, seed):
+    """Four campaigns, each killed five times."""
+    assert killed_runs(tmp_path, 5, seed=100 + seed, experiments=60) == 240
