@@ -13,39 +13,19 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import pytest
+from support.journals import continue_looks, write_looks
 
 from tvsbayes.acquisition.journal import LOG, Disk, Journal, encode, read_journal
-from tvsbayes.acquisition.journal_check import repair, verify
+from tvsbayes.acquisition.journal_check import verify
 from tvsbayes.errors import DeviceFault, InputError
-
-
-def picture(spot: int, side: str) -> bytes:
-    return f"picture {spot} {side} ".encode() * 20
-
-
-def write_looks(folder: Path, looks: int, disk: Disk | None = None, acknowledge=lambda number: None) -> None:
-    """A small acquisition: created, then for every look an intent and the look with two frames, then stop."""
-    journal = Journal.create(folder, disk, id="0123", plan_sha256="ab" * 32)
-    acknowledge(len(journal.records))
-    continue_looks(journal, looks, acknowledge)
-    journal.append("stop", reason="done", exit_code=0)
-    acknowledge(len(journal.records))
-    journal.close()
-
-
-def continue_looks(journal: Journal, looks: int, acknowledge=lambda number: None, first: int = 0) -> None:
-    for spot in range(first, first + looks):
-        journal.append("intent", step=spot)
-        acknowledge(len(journal.records))
-        frames = [journal.store(f"frames/{spot:06d}_{side}.png", picture(spot, side)) for side in ("left", "right")]
-        journal.append("looked", spot=spot, frames=[frame.as_json() for frame in frames])
-        acknowledge(len(journal.records))
 
 
 @pytest.fixture
 def folder(tmp_path) -> Path:
     write_looks(tmp_path / "run", 3)
     return tmp_path / "run"
+
+
 
 
 def test_what_is_written_is_read_back(folder):
@@ -149,33 +129,6 @@ def test_end_torn_at_every_byte_loses_nothing_else(folder):
     assert (folder / LOG).read_bytes() == whole
 
 
-def test_frames_swapped_stale_missing_or_grown_are_found(folder):
-    left, right, later = (folder / "frames" / f"{name}.png" for name in ("000000_left", "000000_right", "000001_left"))
-    one, two = left.read_bytes(), right.read_bytes()
-    damages = {
-        "swapped": lambda: (left.write_bytes(two), right.write_bytes(one)),
-        "stale": lambda: left.write_bytes(later.read_bytes()),
-        "one byte": lambda: left.write_bytes(one[:50] + b"?" + one[51:]),
-        "grown": lambda: left.write_bytes(one + b"x"),
-        "missing": left.unlink,
-    }
-    for what, damage in damages.items():
-        damage()
-        with pytest.raises(InputError) as caught:
-            verify(folder)
-        assert (caught.value.line, caught.value.column) == (3, "frames/000000_left.png"), what
-        left.write_bytes(one)
-        right.write_bytes(two)
-    assert verify(folder).frames == 6
-
-
-def test_frames_of_an_interrupted_look_are_listed_and_kept(folder):
-    (folder / "frames" / "000003_left.png").write_bytes(b"taken, not logged")
-    found = verify(folder)
-    assert found.orphans == ("frames/000003_left.png",)
-    assert "interrupted" in found.warnings[0]
-
-
 def test_frame_names_cannot_leave_the_folder(folder):
     journal = Journal.open(folder)
     for name in ("../000000_left.png", "/tmp/000000_left.png", "frames/0_left.png", "frames/000000_up.png"):
@@ -233,39 +186,6 @@ def test_two_writers_are_refused(folder):
     with pytest.raises(InputError) as caught:
         Journal.create(folder)
     assert caught.value.code == "occupied"
-
-
-def test_repair_keeps_what_is_whole_and_marks_the_gap(folder, tmp_path):
-    lines = (folder / LOG).read_bytes().splitlines(keepends=True)
-    lines[3] = lines[3].replace(b"step", b"stop")
-    (folder / LOG).write_bytes(b"".join(lines)[:-4])
-    (folder / "frames" / "000002_right.png").write_bytes(b"damaged")
-    before = {p: p.read_bytes() for p in folder.rglob("*") if p.is_file()}
-    done = repair(folder, tmp_path / "new")
-    assert done.lost_lines == [4] and done.lost_frames == ["frames/000002_right.png"] and done.kept == 6
-    events = [(r.event, r.data) for r in read_journal(tmp_path / "new").records]
-    assert [event for event, _ in events] == [
-        *("created", "intent", "looked", "gap"),
-        *("looked", "intent", "looked", "gap"),
-    ]
-    assert events[0][1]["repaired"] is True and events[0][1]["id"] == "0123" and events[3][1] == {"before_line": 5}
-    assert verify(tmp_path / "new").frames == 5
-    assert {p: p.read_bytes() for p in folder.rglob("*") if p.is_file()} == before, "the old one is untouched"
-    with pytest.raises(InputError):
-        repair(folder, tmp_path / "new")
-
-
-def test_what_was_repaired_can_be_repaired_again(folder, tmp_path):
-    repair(folder, tmp_path / "once")
-    again = repair(tmp_path / "once", tmp_path / "twice")
-    assert again.lost_lines == [] and verify(tmp_path / "twice").records == verify(tmp_path / "once").records
-
-
-def test_repair_of_a_journal_without_its_first_line(folder, tmp_path):
-    (folder / LOG).write_bytes(b"x" + (folder / LOG).read_bytes())
-    done = repair(folder, tmp_path / "new")
-    assert done.lost_lines == [1]
-    assert [r.event for r in read_journal(tmp_path / "new").records][:3] == ["created", "gap", "intent"]
 
 
 class FailingDisk(Disk):

@@ -22,37 +22,15 @@ from tvsbayes.instrument.parameters import (
     Prior,
 )
 from tvsbayes.instrument.plan import PlanStep
-from tvsbayes.instrument.protocols import PROTOCOLS, four_point_protocol, grid_protocol
+from tvsbayes.instrument.protocols import grid_protocol
 from tvsbayes.instrument.rig import Rig, RigTable
 from tvsbayes.instrument.stereo_pair import Stereo, rotation_matrix
 from tvsbayes.twin.physics import (
-    aperture_angle_deg,
-    beam_jacobian,
     effective_deg_per_step,
-    effective_mirror_offset_mm,
     mirror_chain,
-    play,
     project,
-    stop_errors,
-    to_tvs,
-    transmission,
 )
 from tvsbayes.twin.simulated_campaign import Truth, draw_truth, simulate
-
-NOMINAL = {name: prior.value for name, prior in RIG_PRIORS.items()}
-VECTOR = NOMINAL | {
-    "mirror_offset_mm": 30.0,
-    "mirror1_error_deg": 0.3,
-    "mirror2_error_deg": -0.2,
-    "laser_tilt_deg.x": 0.25,
-    "laser_tilt_deg.y": -0.35,
-    "laser_offset_mm.x": 0.2,
-    "laser_offset_mm.y": -0.4,
-    "tilt_axis_skew_deg": 0.4,
-    "tilt_axis_offset_mm.x": 0.5,
-    "tilt_axis_offset_mm.z": -0.3,
-}
-POSE_DEG = (10.0, 5.0)
 
 
 def make_rig(truth_u: float | None = None) -> Rig:
@@ -99,115 +77,6 @@ def small_plan() -> tuple[PlanStep, ...]:
     return tuple(steps)
 
 
-# Half a unit of the last digit that DESIGN 3.2 prints.
-LAST_9, LAST_12, LAST_7, LAST_6 = 0.5e-9, 0.5e-12, 0.5e-7, 0.5e-6
-
-
-def test_mirror_chain_vector():
-    """Origin and direction of DESIGN 3.2 to the last printed digit."""
-    origin, direction = mirror_chain(*np.radians(POSE_DEG), VECTOR)
-    assert origin == pytest.approx([5.371658918, -29.176887333, -0.940368833], abs=LAST_9 * 1.01)
-    assert direction == pytest.approx([0.981182562588, 0.177188586189, 0.076713648059], abs=LAST_12 * 1.01)
-
-
-def test_beam_jacobian_vector():
-    """d(az, el)/d(psi, beta) of DESIGN 3.2 to the last printed digit."""
-    printed = np.array([[1.0070677, 0.0038895], [-0.0025873, 0.9977070]])
-    assert np.abs(beam_jacobian(VECTOR, POSE_DEG) - printed).max() <= LAST_7
-
-
-def test_tvs_and_aperture_vector():
-    """p_T and both readings of B of DESIGN 3.2 to the last printed digit."""
-    origin, direction = mirror_chain(*np.radians(POSE_DEG), VECTOR)
-    point = to_tvs(origin + 250.0 * direction, 200.0, 91.0)
-    assert point == pytest.approx([250.365237, 119.492704, 18.238043], abs=LAST_6 * 1.01)
-    assert aperture_angle_deg(point, 200.0, "in-plane") == pytest.approx(48.834423, abs=LAST_6)
-    assert aperture_angle_deg(point, 200.0, "azimuth") == pytest.approx(48.759278, abs=LAST_6)
-
-
-def test_aperture_beyond_a_right_angle():
-    """A spot outside the aperture's side has B > 90 deg in both conventions."""
-    points = np.array([[100.0, -200.0, 30.0]])
-    assert aperture_angle_deg(points, 200.0, "in-plane")[0] > 90
-    assert aperture_angle_deg(points, 200.0, "azimuth")[0] == pytest.approx(135.0)
-
-
-def test_nominal_chain_is_a_periscope():
-    """Nominal beam: origin (0, -L, 0), along +x; pan and tilt positive to the left and up."""
-    origin, direction = mirror_chain(0.0, 0.0, NOMINAL)
-    assert origin == pytest.approx([0.0, -30.0, 0.0], abs=1e-12)
-    assert direction == pytest.approx([1.0, 0.0, 0.0], abs=1e-12)
-    left = mirror_chain(0.1, 0.0, NOMINAL)[1]
-    up = mirror_chain(0.0, 0.1, NOMINAL)[1]
-    assert left == pytest.approx([np.cos(0.1), np.sin(0.1), 0.0], abs=1e-12)
-    assert up == pytest.approx([np.cos(0.1), 0.0, np.sin(0.1)], abs=1e-12)
-
-
-def test_mirror_chain_takes_arrays():
-    """Arrays of angles give what single angles give."""
-    psi, beta = np.radians([[10.0, -3.0], [5.0, 2.0]])
-    origins, directions = mirror_chain(psi, beta, VECTOR)
-    for i in range(2):
-        origin, direction = mirror_chain(psi[i], beta[i], VECTOR)
-        assert np.array_equal(origins[i], origin) and np.array_equal(directions[i], direction)
-
-
-def test_effective_ratios_and_offset_of_the_nominal_rig():
-    """Nominal: the beam turns as the mirrors do and passes the pan axis at +L, at any pose."""
-    parameters = NOMINAL | {"degrees_per_step.left": 0.0601, "degrees_per_step.right": 0.0599}
-    parameters |= {"degrees_per_step.up": 0.0701, "degrees_per_step.down": 0.0699}
-    effective = effective_deg_per_step(parameters, (12.0, 7.0))
-    # Differences of angles of order 0.1 rad over 2e-5 rad: rounding 1e-16 / 2e-5 = 1e-11, times ten.
-    assert effective == pytest.approx({"left": 0.0601, "right": 0.0599, "up": 0.0701, "down": 0.0699}, rel=1e-10)
-    assert effective_mirror_offset_mm(parameters, (12.0, 7.0)) == pytest.approx(30.0, abs=1e-10)
-    tilted = parameters | {"laser_tilt_deg.x": 1.0}
-    slope = effective_deg_per_step(tilted, (12.0, 7.0))["left"] / 0.0601
-    assert 0.001 < abs(slope - 1) < 0.02, "a laser tilt changes the local slope by up to 1.7 % (DESIGN 3.2)"
-
-
-def test_play_vector():
-    """The play vector of DESIGN 3.2, through the transmission with its two ratios and by itself."""
-    counters = np.cumsum([0, 200, -200, 3, -2, 100])
-    first = np.arange(6) == 0
-    y = transmission(counters, first, np.full(6, -0.5), np.zeros(6), (0.061, -0.002), 0.3)
-    # Exact in decimals: rounding of sums of order 12 only.
-    assert y == pytest.approx([-0.15, 11.85, -0.25, -0.25, -0.25, 5.506], abs=1e-13)
-    q = np.array([12.0, -0.4, -0.22, -0.344, 5.656])
-    assert play(q, -0.15, 0.3) == pytest.approx(y[1:], abs=1e-13)
-
-
-def test_play_keeps_reversals_and_clears():
-    """After a reversal the output lags by b; after a run-up by nothing (classic sees k - b/N and k)."""
-    first = np.arange(4) == 0
-    y = transmission(np.array([0, -40, 0, 200]), first, np.full(4, 0.5), np.zeros(4), (0.06, 0.0), 0.5)
-    assert y[3] - y[2] == pytest.approx(200 * 0.06, abs=1e-12)
-    y = transmission(np.array([0, 200, 0, 200]), first, np.full(4, 0.5), np.zeros(4), (0.06, 0.0), 0.5)
-    assert y[3] - y[2] == pytest.approx(200 * 0.06 - 0.5, abs=1e-12)
-
-
-def test_first_rows_of_segments():
-    """The gear restarts at q = k n + h with the mean ratio; the approach decides the flank."""
-    first = np.array([True, False, True, False])
-    home = np.array([0.0, 0.0, 0.03, 0.03])
-    y = transmission(np.array([0, 100, 50, 60]), first, np.array([-0.5, 0, 0.5, 0]), home, (0.06, 0.002), 0.2)
-    # 100 steps to the left at 0.061 deg, less half the play.
-    assert y[:2] == pytest.approx([-0.1, 6.1 - 0.1], abs=1e-12)
-    assert y[2] == pytest.approx(50 * 0.06 + 0.03 + 0.1, abs=1e-12)
-    # Ten steps of 0.061 deg are 0.61 deg: play 0.2 deg is crossed first.
-    assert y[3] == pytest.approx(50 * 0.06 + 0.03 + 0.61 - 0.1, abs=1e-12)
-
-
-def test_stop_errors_persist_and_are_redrawn():
-    """Held while the other axis moves or nothing does; redrawn by this axis' counter and by homing."""
-    counters = np.array([0, 5, 5, 5, 4, 4, 4])
-    first = np.array([1, 0, 0, 0, 0, 1, 0], bool)
-    approach = ["left", "", "", "", "", "unknown", ""]
-    draws = np.arange(1.0, 8.0)
-    held = stop_errors(counters, first, approach, draws, {"+": 0.1, "-": 0.01})
-    both = np.sqrt((0.1**2 + 0.01**2) / 2)
-    assert held == pytest.approx([0.1, 0.2, 0.2, 0.2, 0.05, 6 * both, 6 * both], abs=1e-15)
-
-
 def test_stop_error_is_redrawn_though_play_absorbs_the_move():
     """Move 51 after 50 lies within the play of 2 deg, yet the spot moves by a new stop error."""
     rig = make_rig(truth_u=0.0)
@@ -221,17 +90,6 @@ def test_stop_error_is_redrawn_though_play_absorbs_the_move():
     assert tilt[0] == tilt[1] and len({tilt[1], tilt[2], tilt[3]}) == 3 and tilt[3] == tilt[4]
     psi = np.array(result.mirror_angles_deg)[:, 0] - pan
     assert psi[3] == psi[2] == psi[1] and psi[4] == pytest.approx(psi[3] + 0.06, abs=1e-12)
-
-
-def test_stop_errors_have_the_sd_of_their_direction():
-    """2000 moves to either side: sample sds within four standard errors of their own sd."""
-    counters = np.arange(4001) % 2
-    first = np.arange(4001) == 0
-    draws = np.random.default_rng(5).standard_normal(4001)
-    held = stop_errors(counters, first, ["left"] + [""] * 4000, draws, {"+": 0.15, "-": 0.02})
-    four_se = 4 / np.sqrt(2 * 2000)
-    assert np.std(held[1::2]) == pytest.approx(0.15, rel=four_se)
-    assert np.std(held[2::2]) == pytest.approx(0.02, rel=four_se)
 
 
 def test_home_offsets():
@@ -492,89 +350,6 @@ def test_time_advances_by_the_rigs_costs():
     times = [move.time_s for move in simulate(rig, small_plan(), 1).campaign.moves]
     # home place look | move look | move look look | move look place | move look | home look | move
     assert times == [0.0, 16.0, 21.0, 29.0, 45.0, 50.0, 55.0]
-
-
-@pytest.mark.parametrize("name", ["paper", "mixed", "paper_twin"])
-def test_four_point_plans(name: str):
-    """96 experiments of four looks in the paper's order: d1, d2, move, d2, d1; 24 per direction."""
-    plan = PROTOCOLS[name]()
-    looks, counters, target = {}, (0, 0), ""
-    for step in plan:
-        if step.action == "place":
-            target = step.target
-        elif step.action in ("home", "move"):
-            counters = (step.pan_steps, step.tilt_steps)
-        else:
-            looks.setdefault(step.experiment, []).append((step.point, target, counters))
-    assert len(looks) == 96 and [step.step for step in plan] == list(range(len(plan)))
-    seen = []
-    for four in looks.values():
-        assert [look[:2] for look in four] == [(1, "d1"), (2, "d2"), (3, "d2"), (4, "d1")]
-        assert four[0][2] == four[1][2] and four[2][2] == four[3][2]
-        seen.append(tuple(np.subtract(four[2][2], four[1][2])))
-    sizes = {(200,), (100, 200)}
-    for direction, (axis, sign) in DIRECTION_SIGNS.items():
-        mine = [s[axis == "tilt"] for s in seen if np.sign(s[axis == "tilt"]) == sign and s[axis == "pan"] == 0]
-        assert len(mine) == 24, direction
-        assert tuple(sorted({abs(s) for s in mine})) in sizes
-
-
-def _approach_signs(plan: tuple[PlanStep, ...]) -> dict[str, set[bool]]:
-    """Direction -> whether its starts were reached along the experiment (cleared), as the set of cases."""
-    history: list[tuple[int, int]] = []
-    arrived: dict[int, int] = {}
-    cases: dict[str, set[bool]] = {}
-    for step in plan:
-        if step.action in ("home", "move"):
-            history.append((step.pan_steps, step.tilt_steps))
-        elif step.action == "look" and step.point == 1:
-            arrived[step.experiment] = len(history) - 1
-        elif step.action == "look" and step.point == 3:
-            start = arrived[step.experiment]
-            delta = np.subtract(history[start + 1], history[start])
-            axis = int(np.flatnonzero(delta)[0])
-            before = next(h for h in reversed(history[:start]) if h[axis] != history[start][axis])
-            direction = [["right", "left"], ["down", "up"]][axis][int(delta[axis] > 0)]
-            cases.setdefault(direction, set()).add((history[start][axis] - before[axis]) * delta[axis] > 0)
-    return cases
-
-
-def test_approaches_of_the_protocols():
-    """Reversed where asked; right and up cleared in the twin's; both kinds in the mixed."""
-    asked = four_point_protocol(repeats=3, approaches={name: ("reversed",) for name in DIRECTION_SIGNS})
-    assert _approach_signs(asked) == {name: {False} for name in DIRECTION_SIGNS}
-    twin = _approach_signs(PROTOCOLS["paper_twin"]())
-    assert twin == {"left": {False}, "right": {True}, "up": {True}, "down": {False}}
-    assert _approach_signs(PROTOCOLS["mixed"]()) == {name: {True, False} for name in DIRECTION_SIGNS}
-
-
-def test_the_papers_protocol_is_plain_go_and_return():
-    """Pan 0, 200, 0, ... from the homing on, without overshoot; tilt likewise."""
-    counters = [(s.pan_steps, s.tilt_steps) for s in PROTOCOLS["paper"]() if s.action in ("home", "move")]
-    assert counters[:4] == [(0, 0), (200, 0), (0, 0), (200, 0)]
-    assert {pan for pan, _ in counters} == {0, 100, 200} and {tilt for _, tilt in counters} == {-100, 0, 100}
-    # Left: 24 out, 23 back; right the same; to mid pan and the low start; up and down likewise.
-    assert len(counters) == 1 + 47 + 47 + 2 + 47 + 47
-
-
-def test_grid_sees_every_pose_from_both_sides():
-    """At each of three sheets each pose once per side of pan and of tilt, with one placement per sheet."""
-    plan = grid_protocol()
-    assert sum(step.action == "place" for step in plan) == 3
-    approach, counters, target = [0, 0], [0, 0], ""
-    seen: dict[tuple, set] = {}
-    for step in plan:
-        if step.action == "place":
-            target = step.target
-        elif step.action in ("home", "move"):
-            for axis, value in enumerate((step.pan_steps, step.tilt_steps)):
-                if value != counters[axis]:
-                    approach[axis], counters[axis] = int(np.sign(value - counters[axis])), value
-        else:
-            seen.setdefault((target, *counters), set()).add(tuple(approach))
-    assert len(seen) == 3 * 24
-    for pose, sides in seen.items():
-        assert {pan for pan, _ in sides} == {-1, 1} and {tilt for _, tilt in sides} == {-1, 1}, pose
 
 
 def test_the_twin_needs_no_jax():

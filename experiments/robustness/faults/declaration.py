@@ -41,7 +41,7 @@ FAULTS = (
         "elif counters[i] != counters[i - 1]:",
         "else:",
         "simulated stops are redrawn while the axis stands",
-        ("twin/simulated_campaign",),
+        ("twin/physics",),
     ),
     Fault(
         "twin: homed from the wrong side",
@@ -66,7 +66,7 @@ FAULTS = (
         "if not (isfinite(value) and low <= value <= high):",
         "if value < low or value > high:",
         "one empty or wrong cell makes every result not-a-number",
-        ("files/documents",),
+        ("files/csv_table",),
     ),
     Fault(
         "duplicate key accepted",
@@ -82,7 +82,7 @@ FAULTS = (
         "            os.replace(temporary, path)\n",
         "            path.write_bytes(data)\n",
         "a crash leaves half a file where a whole one was",
-        ("files/documents",),
+        ("files/disk",),
     ),
     Fault(
         "renamed before it is on the disk",
@@ -90,7 +90,7 @@ FAULTS = (
         "                os.fsync(stream.fileno())\n",
         "                pass\n",
         "after a power cut an empty file stands where a whole one was",
-        ("files/documents",),
+        ("files/disk",),
     ),
     Fault(
         "spot numbers twice",

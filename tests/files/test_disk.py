@@ -1,0 +1,111 @@
+"""Bytes read under a cap, files written whole or not at all."""
+
+from __future__ import annotations
+
+import errno
+import os
+import stat
+from contextlib import nullcontext
+from pathlib import Path
+
+import pytest
+
+from tvsbayes.errors import InputError
+from tvsbayes.files.disk import decode, read_bytes, shipped_data, write_atomically
+
+
+def test_only_regular_files_inside_the_folder(tmp_path):
+    folder = tmp_path / "campaign"
+    folder.mkdir()
+    (tmp_path / "outside.csv").write_text("x")
+    (folder / "inside.csv").write_text("x")
+    (folder / "good.csv").symlink_to(folder / "inside.csv")
+    (folder / "bad.csv").symlink_to(tmp_path / "outside.csv")
+    (folder / "loop.csv").symlink_to(folder / "loop.csv")
+    (folder / "gone.csv").symlink_to(folder / "nothing.csv")
+    (folder / "device.csv").symlink_to("/dev/zero")
+    os.mkfifo(folder / "pipe.csv")
+    assert read_bytes(folder / "good.csv", 10, folder) == b"x"
+    codes = {}
+    for name in ("bad", "loop", "gone", "device", "pipe", "missing", "nul\0"):
+        with pytest.raises(InputError) as caught:
+            read_bytes(folder / f"{name}.csv", 10, folder)
+        codes[name] = caught.value.code
+    with pytest.raises(InputError, match="regular file"):
+        read_bytes(folder, 10)
+    assert codes == {
+        "bad": "path",
+        "loop": "unreadable",
+        "gone": "missing-file",
+        "device": "path",
+        "pipe": "not-a-file",
+        "missing": "missing-file",
+        "nul\0": "unreadable",
+    }
+
+
+def test_size_is_capped_before_reading(tmp_path):
+    path = tmp_path / "sparse.csv"
+    with open(path, "wb") as stream:
+        stream.truncate(10**12)  # a terabyte of holes: reading it would not end
+    with pytest.raises(InputError, match="1000000000000 bytes"):
+        read_bytes(path, 1000)
+
+
+def test_control_characters_never_reach_the_message(tmp_path):
+    with pytest.raises(InputError) as caught:
+        read_bytes(tmp_path / "a\x1b[31m\u202e.csv", 10)
+    assert caught.value.message.isprintable()
+    with pytest.raises(InputError) as caught:
+        decode(b"a\n\x07", "t.csv")
+    assert caught.value.message.isprintable() and caught.value.line == 2
+
+
+@pytest.mark.parametrize("broken", ["fsync", "replace"])
+@pytest.mark.parametrize("failure", [OSError(28, "No space left on device"), KeyboardInterrupt()])
+def test_interrupted_write_leaves_the_old_file_whole(tmp_path, monkeypatch, broken, failure):
+    path = tmp_path / "spots.csv"
+    path.write_bytes(b"old")
+
+    def fail(*_args):
+        raise failure
+
+    monkeypatch.setattr(os, broken, fail)
+    with pytest.raises(InputError if isinstance(failure, OSError) else KeyboardInterrupt):
+        write_atomically(path, b"new content")
+    assert path.read_bytes() == b"old"
+    assert [p.name for p in tmp_path.iterdir()] == ["spots.csv"]
+
+
+@pytest.mark.skipif(os.name != "posix", reason="only POSIX flushes folders")
+@pytest.mark.parametrize(("number", "fails"), [(errno.EINVAL, False), (errno.ENOTSUP, False), (errno.EIO, True)])
+def test_a_folder_that_cannot_be_flushed(tmp_path, monkeypatch, number, fails):
+    """Some network shares flush files only; a disk that fails is another matter."""
+    flush = os.fsync
+
+    def files_only(descriptor):
+        if stat.S_ISDIR(os.fstat(descriptor).st_mode):
+            raise OSError(number, os.strerror(number))
+        flush(descriptor)
+
+    monkeypatch.setattr(os, "fsync", files_only)
+    with pytest.raises(InputError) if fails else nullcontext():
+        write_atomically(tmp_path / "a.json", b"1")
+    assert (tmp_path / "a.json").read_bytes() == b"1"
+
+
+def test_atomic_write_replaces_and_obeys_the_umask(tmp_path):
+    path = tmp_path / "a.json"
+    write_atomically(path, b"1")
+    write_atomically(path, b"2")
+    (tmp_path / "plain").write_bytes(b"")
+    assert path.read_bytes() == b"2"
+    assert stat.S_IMODE(path.stat().st_mode) == stat.S_IMODE((tmp_path / "plain").stat().st_mode)
+    with pytest.raises(InputError, match="writable folder"):
+        write_atomically(tmp_path / "no such folder" / "a.json", b"1")
+
+
+def test_shipped_data_lies_beside_a_checkout_or_inside_a_wheel():
+    data = shipped_data()
+    package = Path(__file__).resolve().parents[2] / "tvsbayes"
+    assert data.name == "data" and data.parent.name in ("tvsbayes", package.parent.name)

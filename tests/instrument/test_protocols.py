@@ -1,0 +1,93 @@
+"""The standard plans: how starts are reached, and what is seen from which side."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tvsbayes.instrument.axes import DIRECTION_SIGNS
+from tvsbayes.instrument.plan import PlanStep
+from tvsbayes.instrument.protocols import PROTOCOLS, four_point_protocol, grid_protocol
+
+
+def _approach_signs(plan: tuple[PlanStep, ...]) -> dict[str, set[bool]]:
+    """Direction -> whether its starts were reached along the experiment (cleared), as the set of cases."""
+    history: list[tuple[int, int]] = []
+    arrived: dict[int, int] = {}
+    cases: dict[str, set[bool]] = {}
+    for step in plan:
+        if step.action in ("home", "move"):
+            history.append((step.pan_steps, step.tilt_steps))
+        elif step.action == "look" and step.point == 1:
+            arrived[step.experiment] = len(history) - 1
+        elif step.action == "look" and step.point == 3:
+            start = arrived[step.experiment]
+            delta = np.subtract(history[start + 1], history[start])
+            axis = int(np.flatnonzero(delta)[0])
+            before = next(h for h in reversed(history[:start]) if h[axis] != history[start][axis])
+            direction = [["right", "left"], ["down", "up"]][axis][int(delta[axis] > 0)]
+            cases.setdefault(direction, set()).add((history[start][axis] - before[axis]) * delta[axis] > 0)
+    return cases
+
+
+@pytest.mark.parametrize("name", ["paper", "mixed", "paper_twin"])
+def test_four_point_plans(name: str):
+    """96 experiments of four looks in the paper's order: d1, d2, move, d2, d1; 24 per direction."""
+    plan = PROTOCOLS[name]()
+    looks, counters, target = {}, (0, 0), ""
+    for step in plan:
+        if step.action == "place":
+            target = step.target
+        elif step.action in ("home", "move"):
+            counters = (step.pan_steps, step.tilt_steps)
+        else:
+            looks.setdefault(step.experiment, []).append((step.point, target, counters))
+    assert len(looks) == 96 and [step.step for step in plan] == list(range(len(plan)))
+    seen = []
+    for four in looks.values():
+        assert [look[:2] for look in four] == [(1, "d1"), (2, "d2"), (3, "d2"), (4, "d1")]
+        assert four[0][2] == four[1][2] and four[2][2] == four[3][2]
+        seen.append(tuple(np.subtract(four[2][2], four[1][2])))
+    sizes = {(200,), (100, 200)}
+    for direction, (axis, sign) in DIRECTION_SIGNS.items():
+        mine = [s[axis == "tilt"] for s in seen if np.sign(s[axis == "tilt"]) == sign and s[axis == "pan"] == 0]
+        assert len(mine) == 24, direction
+        assert tuple(sorted({abs(s) for s in mine})) in sizes
+
+
+def test_approaches_of_the_protocols():
+    """Reversed where asked; right and up cleared in the twin's; both kinds in the mixed."""
+    asked = four_point_protocol(repeats=3, approaches={name: ("reversed",) for name in DIRECTION_SIGNS})
+    assert _approach_signs(asked) == {name: {False} for name in DIRECTION_SIGNS}
+    twin = _approach_signs(PROTOCOLS["paper_twin"]())
+    assert twin == {"left": {False}, "right": {True}, "up": {True}, "down": {False}}
+    assert _approach_signs(PROTOCOLS["mixed"]()) == {name: {True, False} for name in DIRECTION_SIGNS}
+
+
+def test_the_papers_protocol_is_plain_go_and_return():
+    """Pan 0, 200, 0, ... from the homing on, without overshoot; tilt likewise."""
+    counters = [(s.pan_steps, s.tilt_steps) for s in PROTOCOLS["paper"]() if s.action in ("home", "move")]
+    assert counters[:4] == [(0, 0), (200, 0), (0, 0), (200, 0)]
+    assert {pan for pan, _ in counters} == {0, 100, 200} and {tilt for _, tilt in counters} == {-100, 0, 100}
+    # Left: 24 out, 23 back; right the same; to mid pan and the low start; up and down likewise.
+    assert len(counters) == 1 + 47 + 47 + 2 + 47 + 47
+
+
+def test_grid_sees_every_pose_from_both_sides():
+    """At each of three sheets each pose once per side of pan and of tilt, with one placement per sheet."""
+    plan = grid_protocol()
+    assert sum(step.action == "place" for step in plan) == 3
+    approach, counters, target = [0, 0], [0, 0], ""
+    seen: dict[tuple, set] = {}
+    for step in plan:
+        if step.action == "place":
+            target = step.target
+        elif step.action in ("home", "move"):
+            for axis, value in enumerate((step.pan_steps, step.tilt_steps)):
+                if value != counters[axis]:
+                    approach[axis], counters[axis] = int(np.sign(value - counters[axis])), value
+        else:
+            seen.setdefault((target, *counters), set()).add(tuple(approach))
+    assert len(seen) == 3 * 24
+    for pose, sides in seen.items():
+        assert {pan for pan, _ in sides} == {-1, 1} and {tilt for _, tilt in sides} == {-1, 1}, pose

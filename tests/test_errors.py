@@ -1,0 +1,32 @@
+"""Errors tell place, found, allowed and remedy, and pass between processes whole."""
+
+from __future__ import annotations
+
+import pickle
+
+import pytest
+
+from tvsbayes.errors import DeviceFault, InputError, NotConverged, NothingToEstimate, TvsError
+from tvsbayes.files.csv_table import parse_table
+
+
+def test_message_tells_place_found_allowed_and_remedy():
+    table = parse_table(b"a,b\n1,2\n3,nan\n", "spots.csv", ("a", "b"))
+    with pytest.raises(InputError) as caught:
+        table.numbers("b", 0.0, 10.0)
+    error = caught.value
+    assert error.message == (
+        'spots.csv line 3, b: found "nan"; allowed: a finite decimal number from 0 to 10; '
+        "write a finite number; the pixels of a spot that was not seen are empty, its status says why"
+    )
+    assert (error.code, error.file, error.line, error.column) == ("number", "spots.csv", 3, "b")
+    assert isinstance(error, TvsError) and error.exit_code == 2
+    assert error.found and error.allowed and error.remedy and str(error) == error.message
+
+
+@pytest.mark.parametrize("kind", [TvsError, InputError, NothingToEstimate, NotConverged, DeviceFault])
+def test_errors_pass_between_processes_whole(kind):
+    """A pool that cannot unpickle its worker's error waits for ever."""
+    told = kind("code", "what was found", file="a.csv", line=3, column="u_px", found="x", allowed="y", remedy="z")
+    again = pickle.loads(pickle.dumps(told))
+    assert type(again) is kind and again.args == told.args and vars(again) == vars(told)
