@@ -27,7 +27,7 @@ LEAST_CONTRACTION = 0.1
 """Below it an interval is the prior's own and is not judged."""
 OUTSIDE = " **!**"
 """Marks a figure that is outside its bounds."""
-NOTE = f"**!** marks a figure outside its bounds at {BOUND:g}"
+NOTE = f"**!** marks a figure outside its bounds at {BOUND:.0e}".replace("e-0", "e-")
 
 
 def headlines(draws) -> dict[str, np.ndarray]:
