@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 import threading
+from dataclasses import replace
 
 import pytest
 
@@ -16,6 +17,7 @@ from tvsbayes.positioner.protocol import frame, parse_answer, request
 from tvsbayes.positioner.serial_port import serial_opener
 
 SETTINGS = {"hp": -60, "ht": -40, "pmin": -300, "pmax": 300, "wd": 2000}
+LIMITS = {"hp": -60, "ht": -40, "pmin": -300, "pmax": 200, "tmin": -150, "tmax": 100}
 
 
 def simulated(**mechanics) -> SimulatedDevice:
@@ -296,3 +298,35 @@ def test_state_reads_as_the_model_says():
     device.listener = lines.append
     device.model.receive(request(0, "ID"), 0)
     assert parse_answer(lines[-1][:-1]).state == device.model.state
+
+
+@pytest.mark.parametrize(("axis", "last"), [(0, -300), (0, 200), (1, -150), (1, 100)])
+def test_the_last_step_inside_a_limit_is_reached_and_the_next_refused(axis, last):
+    positioner = connected(simulated(), LIMITS)
+    positioner.home()
+    inside, outside = [0, 0], [0, 0]
+    inside[axis], outside[axis] = last, last + (1 if last > 0 else -1)
+    state = positioner.move_to(*inside)
+    assert [state.pan_steps, state.tilt_steps] == inside
+    with pytest.raises(DeviceFault) as caught:
+        positioner.move_to(*outside)
+    assert caught.value.code == "refused-limit"
+    state = positioner.state()
+    assert [state.pan_steps, state.tilt_steps] == inside, "a refused move moves nothing"
+
+
+@pytest.mark.parametrize("field", ["pan_steps", "tilt_steps", "pan_target_steps", "tilt_target_steps"])
+def test_done_at_another_place_is_no_arrival(field, monkeypatch):
+    """A step lost between the counter and the answer; the sequence and the status are those of an arrival."""
+    positioner = connected(simulated(), LIMITS)
+    positioner.home()
+    truth = DeviceModel.state.fget
+
+    def lie(device):
+        state = truth(device)
+        return replace(state, **{field: getattr(state, field) - 1})
+
+    monkeypatch.setattr(DeviceModel, "state", property(lie))
+    with pytest.raises(DeviceFault) as caught:
+        positioner.move_to(120, 30)
+    assert caught.value.code == "position"

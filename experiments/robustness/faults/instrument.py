@@ -33,7 +33,7 @@ FAULTS = (
         "if answer.sequence == sequence:",
         "if answer.sequence <= sequence:",
         "a move counts as done before it has begun",
-        ("positioner/driver", "positioner/faults"),
+        ("positioner/driver", "positioner/driver_faults"),
     ),
     Fault(
         "driver: arrival not compared with the order",
@@ -41,7 +41,7 @@ FAULTS = (
         "if reached != wanted or (state.pan_target_steps, state.tilt_target_steps) != wanted:",
         "if False:",
         "a stop elsewhere counts as arrival",
-        ("positioner/limits",),
+        ("positioner/driver",),
         survived="run: no simulated device had said done at another place.",
     ),
     Fault(
@@ -58,7 +58,7 @@ FAULTS = (
         "if sequence == self._last_sequence and line == self._last_request:",
         "if False:",
         "a retry is refused or moves twice",
-        ("positioner/protocol",),
+        ("positioner/firmware_model",),
     ),
     Fault(
         "device: soft limit of tilt open upwards",
@@ -66,7 +66,7 @@ FAULTS = (
         'limits["tmin"] <= tilt <= limits["tmax"]',
         'limits["tmin"] <= tilt',
         "tilt runs into the stop",
-        ("positioner/limits",),
+        ("positioner/driver",),
         survived="run: the lower limit of tilt and the upper one of pan were tried, no other.",
     ),
     Fault(
@@ -75,7 +75,7 @@ FAULTS = (
         'if argument == "1" and self._status == "alarm":',
         'if argument == "1" and self._status == "never":',
         "the laser can be switched on in alarm",
-        ("positioner/protocol",),
+        ("positioner/firmware_model",),
     ),
     Fault(
         "laser stays on when a camera fails",

@@ -1,0 +1,359 @@
+"""Device model and firmware core: both on the same bytes, ramps, homing, watchdog, laser.
+
+The differential test builds the C++ core with g++ in a temporary folder, sanitizers on where they link.
+"""
+
+from __future__ import annotations
+
+import random
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from tvsbayes.positioner import firmware_folder
+from tvsbayes.positioner.firmware_model import DeviceModel, Mechanics
+from tvsbayes.positioner.protocol import (
+    SETTINGS,
+    Reply,
+    frame,
+    parse_answer,
+    request,
+)
+
+FIRMWARE = firmware_folder()
+BOOT = 4_000_000_001
+
+
+class Bench:
+    """A device model with a time of its own; keeps the transcript in the form of firmware/native/replay.cpp."""
+
+    def __init__(self, home=(-60, -40), limit=900, boot=BOOT):
+        self.now_us, self.transcript, self.sent = 0, [], []
+        bench = self
+
+        class Board(Mechanics):
+            def __setattr__(self, name, value):
+                super().__setattr__(name, value)
+                if name == "laser_on" and hasattr(bench, "device_started"):
+                    bench.transcript.append(f"l {bench.now_us} {int(value)}")
+
+        self.board = Board(home_steps=home, limit_steps=limit)
+        self.device_started = True
+        self.device = DeviceModel(self.board, boot, 0, self._write)
+
+    def _write(self, line: bytes) -> None:
+        self.transcript.append(f"w {self.now_us} {line.hex()}")
+        self.sent.append(line)
+
+    def run(self, orders: list[str]) -> list[str]:
+        for order in orders:
+            kind, _, rest = order.partition(" ")
+            if kind == "a":
+                self.now_us = int(rest)
+                self.device.advance(self.now_us)
+            elif kind == "x":
+                self.device.receive(bytes.fromhex(rest), self.now_us)
+            elif kind == "k":
+                axis, steps = map(int, rest.split())
+                self.board.missing_steps[axis] += steps
+            else:
+                pan, tilt = self.board.true_steps
+                self.transcript.append(f"q {pan} {tilt} {int(self.board.laser_on)}")
+        return self.transcript
+
+    def ask(self, sequence: int, *words: object) -> Reply:
+        """One request now, and its reply."""
+        self.device.receive(request(sequence, *words), self.now_us)
+        answer = parse_answer(self.sent[-1][:-1])
+        assert isinstance(answer, Reply)
+        return answer
+
+    def pass_time(self, seconds: float) -> None:
+        self.now_us += round(seconds * 1e6)
+        self.device.advance(self.now_us)
+
+    def homed(self) -> Bench:
+        self.ask(1, "SET", "hp", -60)
+        self.ask(2, "SET", "ht", -40)
+        self.ask(3, "HOME")
+        self.pass_time(20)
+        assert self.ask(4, "?").state.status == "idle"
+        return self
+
+
+def test_repeated_request_is_answered_from_the_cache_and_not_executed_again():
+    bench = Bench().homed()
+    first = request(5, "MA", 100, 20)
+    bench.device.receive(first, bench.now_us)
+    reply = bench.sent[-1]
+    bench.pass_time(5)
+    assert bench.board.true_steps == [100, 20]
+    bench.device.receive(first, bench.now_us)
+    assert bench.sent[-1] == reply, "the cached reply, though the state has changed since"
+    assert bench.ask(6, "?").state.done_sequence == 5
+
+
+def test_lower_sequences_and_reused_ones_are_refused():
+    bench = Bench().homed()
+    bench.ask(5, "MA", 10, 0)
+    bench.pass_time(5)
+    assert bench.ask(5, "MA", 30, 0).error == "seq"
+    assert bench.ask(4, "MA", 30, 0).error == "seq"
+    assert bench.ask(0, "MA", 30, 0).error == "seq"
+    bench.pass_time(5)
+    assert bench.board.true_steps == [10, 0]
+    assert bench.ask(0, "ID").extra == {"fw": "1.0.0", "proto": "1", "q": "5"}
+
+
+def test_moves_need_homing_stay_inside_the_limits_and_never_overlap():
+    bench = Bench()
+    assert bench.ask(1, "MA", 1, 1).error == "unhomed"
+    assert bench.ask(2, "L", 1).error == "unhomed"
+    bench = Bench().homed()
+    assert bench.ask(5, "MA", 1001, 0).error == "limit"
+    assert bench.ask(6, "MA", 0, -501).error == "limit"
+    assert bench.ask(7, "MA", 200, 0).error is None
+    assert bench.ask(8, "MA", 0, 0).error == "busy"
+    assert bench.ask(9, "SET", "pmax", 5).error == "busy"
+    assert bench.ask(10, "HOME").error == "busy"
+    assert bench.ask(11, "HOME", 1).error == "argument"
+    assert bench.ask(12, "MOVE", 1).error == "command"
+    assert bench.ask(13, "SET", "pmax", 10**9).error == "argument"
+    assert bench.ask(14, "GET", "pmax").extra == {"v": "1000"}
+
+
+def test_ramp_obeys_speed_and_acceleration_and_ends_slowly():
+    """Intervals between steps against the trapezoid: v^2 = 200^2 + 2 a n, up to vmax, down again."""
+    bench = Bench().homed()
+    bench.ask(5, "MA", 0, 0)
+    bench.pass_time(5)
+    times_us: list[int] = []
+    step, start = bench.board.step, bench.now_us
+    bench.board.step = lambda axis, sense: (times_us.append(bench.device._axes[0].due_us), step(axis, sense))
+    bench.ask(6, "MA", 400, 0)
+    bench.pass_time(5)
+    gaps = [b - a for a, b in zip([start, *times_us], times_us, strict=False)]
+    assert len(gaps) == 400
+    vmax, amax = SETTINGS["vmax"][2], SETTINGS["amax"][2]
+    # One step of ramp and the rounding to a microsecond: 1e6 / 800 = 1250 us, exactly.
+    assert min(gaps) == 1_000_000 // vmax
+    assert gaps[0] == gaps[-1] == 5000
+    for n, gap in enumerate(gaps[:50]):
+        speed = min((200**2 + 2 * amax * n) ** 0.5, vmax)
+        assert gap == pytest.approx(1e6 / speed, rel=1 / 200, abs=1)
+    assert gaps == gaps[::-1]
+
+
+def test_stop_slows_down_and_keeps_the_counters():
+    bench = Bench().homed()
+    bench.ask(5, "MA", 800, 0)
+    bench.pass_time(0.5)
+    bench.ask(6, "STOP")
+    bench.pass_time(5)
+    state = bench.ask(7, "?").state
+    assert (state.status, state.last_error) == ("idle", "stop")
+    assert state.done_sequence == 3, "a stopped motion is never done"
+    assert 0 < state.pan_steps < 800 and state.pan_steps == bench.board.true_steps[0] == state.pan_target_steps
+
+
+def test_abort_and_limit_switch_end_in_alarm_with_the_laser_off():
+    for word in ("ABORT", "limit"):
+        bench = Bench(limit=300).homed()
+        bench.ask(5, "L", 1)
+        assert bench.board.laser_on
+        bench.ask(6, "MA", 600, 0)
+        bench.pass_time(0.3)
+        if word == "ABORT":
+            bench.ask(7, "ABORT")
+        bench.pass_time(1.5)
+        state = bench.ask(8, "?").state
+        assert (state.status, state.last_error) == ("alarm", word.lower())
+        assert not bench.board.laser_on
+        assert bench.ask(9, "L", 1).error == "alarm"
+        assert bench.ask(10, "MA", 0, 0).error == "alarm"
+        bench.ask(11, "HOME")
+        bench.pass_time(20)
+        assert bench.ask(12, "MA", 0, 0).error is None
+
+
+def test_watchdog_switches_the_laser_off_and_valid_frames_keep_it_on():
+    bench = Bench().homed()
+    bench.ask(5, "L", 1)
+    for k in range(10):
+        bench.pass_time(1.9)
+        assert bench.ask(6 + k, "?").state.laser_on
+    bench.pass_time(1.9)
+    bench.device.receive(b">99 ?*0000\n", bench.now_us)
+    bench.pass_time(0.11)
+    assert not bench.board.laser_on, "a damaged frame is no sign of life"
+    assert bench.ask(40, "?").state.last_error == "watchdog"
+
+
+def test_homing_finds_lost_steps():
+    bench = Bench().homed()
+    bench.ask(5, "MA", 100, 50)
+    bench.board.missing_steps = [7, 3]
+    bench.pass_time(5)
+    assert bench.ask(6, "?").state.pan_steps == 100, "counters do not know"
+    assert bench.board.true_steps == [93, 47]
+    bench.ask(7, "HOME")
+    bench.pass_time(20)
+    state = bench.ask(8, "?").state
+    assert (state.pan_home_deviation_steps, state.tilt_home_deviation_steps) == (7, 3)
+    assert bench.board.true_steps == [-60, -40]
+
+
+def test_homing_without_a_switch_gives_up():
+    bench = Bench(home=(-60_000, -40), limit=10**6)
+    bench.ask(1, "HOME")
+    bench.pass_time(200)
+    state = bench.ask(2, "?").state
+    assert (state.status, state.last_error) == ("alarm", "home")
+
+
+def test_homing_that_opens_a_limit_ends_there_and_one_from_an_open_limit_leads_back(native):
+    """A home switch that never comes is not searched for against the stop."""
+    orders = [f"x {request(1, 'HOME').hex()}", "a 2000000", "q", f"x {request(2, '?').hex()}"]
+    bench = Bench(home=(-60_000, -40), limit=300)
+    assert replay(native, orders, home=(-60_000, -40), limit=300) == bench.run(orders)
+    state = parse_answer(bench.sent[-1][:-1]).state
+    assert (state.status, state.last_error, bench.board.true_steps) == ("alarm", "limit", [-301, 0])
+    bench.board.home_steps, bench.board.true_steps[:] = (-60, -40), [400, -400]
+    bench.ask(3, "HOME")
+    bench.pass_time(20)
+    assert (bench.ask(4, "?").state.status, bench.board.true_steps) == ("idle", [-60, -40])
+
+
+def test_mechanics_tell_every_stretch_in_one_sense():
+    bench, heard = Bench().homed(), []
+    bench.board.moved = lambda axis, steps: heard.append((axis, steps))
+    bench.ask(5, "MA", 0, 0)
+    bench.pass_time(5)
+    bench.ask(6, "HOME")
+    bench.pass_time(20)
+    assert [steps for axis, steps in heard if axis == 0] == [60, -60, 20, -20]
+    assert [steps for axis, steps in heard if axis == 1] == [40, -40, 20, -20]
+
+
+def _random_orders(seed: int) -> list[str]:
+    """A session with damage: commands of every kind, flips, losses, doubles, merges, noise, pauses, lost steps."""
+    rng = random.Random(seed)
+    now_us, sequence, orders = 0, 0, []
+    sent = b""
+    words = [f"SET hp {-60}", f"SET ht {-40}", "HOME"]
+    for turn in range(140):
+        if turn >= 3:
+            words = [
+                rng.choice(
+                    [
+                        f"MA {rng.randint(-300, 1100)} {rng.randint(-300, 520)}",
+                        f"MA {rng.randint(-40, 40)} {rng.randint(-30, 30)}",
+                        *("HOME", "?", "L 1", "L 0", "STOP", "ABORT", "ID", "L 2", "MA 1", "MA +1 01", "MA -0 0"),
+                        f"SET {rng.choice([*SETTINGS, 'xx'])} {rng.choice([-(10**9), -300, 10, 150, 900, 2**31])}",
+                        f"GET {rng.choice([*SETTINGS, 'xx'])}",
+                        *("MA 1 2 3", "", "ID 1", "MA  1 2", "?" + "x" * rng.randint(0, 120)),
+                    ]
+                )
+            ]
+        for word in words[:1]:
+            if turn < 3 or rng.random() < 0.9:
+                sequence += 1
+            number = sequence if rng.random() < 0.95 or turn < 3 else rng.choice([0, max(sequence - 1, 0), "x", "01"])
+            line = frame(f">{number} {word}")
+            if turn >= 3:
+                kind = rng.random()
+                place = rng.randrange(len(line))
+                if kind < 0.08:
+                    line = line[:place] + bytes([line[place] ^ (1 << rng.randrange(8))]) + line[place + 1 :]
+                elif kind < 0.14:
+                    line = line[:place] + line[place + 1 :]
+                elif kind < 0.2:
+                    line = line[:place] + line[place : place + 1] + line[place:]
+                elif kind < 0.25:
+                    line += line
+                elif kind < 0.3:
+                    line = sent + line
+                elif kind < 0.34:
+                    line = rng.randbytes(rng.randint(1, 300)) + b"\n" + line
+                elif kind < 0.38:
+                    line = line[:-1] + b"\r\n"
+            sent = line
+            orders.append(f"x {line.hex()}")
+        words = words[1:]
+        if rng.random() < 0.05:
+            orders.append(f"k {rng.randrange(2)} {rng.randint(1, 9)}")
+        now_us += rng.choice([0, 137, 20_000, 150_000, 900_000, 2_500_000, 14_000_000])
+        orders += [f"a {now_us}", "q"]
+    return orders
+
+
+def build(folder: Path, *options: str) -> Path | None:
+    """The native core, or None where the compiler refuses the options."""
+    program = folder / "replay"
+    sources = [FIRMWARE / "native" / "replay.cpp", FIRMWARE / "tvs_positioner" / "tvs_core.cpp"]
+    command = ["g++", "-std=c++11", "-Wall", "-Wextra", "-Werror", *options, f"-I{FIRMWARE / 'tvs_positioner'}"]
+    result = subprocess.run([*command, *map(str, sources), "-o", str(program)], capture_output=True, check=False)
+    return program if result.returncode == 0 else None
+
+
+@pytest.fixture(scope="module")
+def native(tmp_path_factory) -> Path:
+    """The C++ core on a native board."""
+    if shutil.which("g++") is None:
+        pytest.skip("no g++ to build the firmware core with")
+    folder = tmp_path_factory.mktemp("native")
+    program = build(folder, "-fsanitize=address,undefined", "-fno-sanitize-recover=all") or build(folder)
+    assert program is not None, "the firmware core does not compile without warnings"
+    return program
+
+
+def replay(program: Path, orders: list[str], *, boot=BOOT, home=(-60, -40), limit=900) -> list[str]:
+    arguments = [str(program), str(boot), *map(str, home), str(limit)]
+    script = "\n".join(orders) + "\n"
+    result = subprocess.run(arguments, input=script, capture_output=True, text=True, check=False)
+    assert result.returncode == 0, result.stderr
+    return result.stdout.splitlines()
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_firmware_core_and_model_do_the_same_with_the_same_bytes(native, seed):
+    orders = _random_orders(seed)
+    ours, theirs = Bench().run(orders), replay(native, orders)
+    assert theirs == ours
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(100, 400))
+def test_firmware_core_and_model_do_the_same_in_300_sessions(native, seed):
+    orders = _random_orders(seed)
+    assert replay(native, orders) == Bench().run(orders)
+
+
+def test_random_sessions_reach_every_branch():
+    """The differential test is worth what its sessions exercise."""
+    seen = "\n".join(line for seed in range(12) for line in Bench().run(_random_orders(seed)))
+    text = "\n".join(bytes.fromhex(line.split()[2]).decode() for line in seen.splitlines() if line.startswith("w"))
+    wanted = [f"err {word} " for word in ("command", "argument", "seq", "unhomed", "alarm", "busy", "limit")]
+    wanted += [f"!nak {kind}" for kind in ("frame", "crc", "parse", "long")]
+    wanted += ["e=watchdog", "e=stop", "e=abort", "e=limit", "st=moving", "st=alarm", "st=unhomed", "l=1"]
+    assert [word for word in wanted if word not in text] == []
+
+
+def test_firmware_travels_with_the_package():
+    """Everything that a user needs to flash the board lies in the installed package."""
+    names = ["README.md", "tvs_positioner/tvs_positioner.ino", "tvs_positioner/tvs_core.h"]
+    names += ["tvs_positioner/tvs_core.cpp", "native/replay.cpp"]
+    assert [name for name in names if not (FIRMWARE / name).is_file()] == []
+    core = "".join((FIRMWARE / "tvs_positioner" / f"tvs_core.{end}").read_text() for end in ("h", "cpp"))
+    code = re.sub(r"//.*", "", core)
+    line = request(0, "ID").decode().strip()
+    assert f"`{line}`" in (FIRMWARE / "README.md").read_text(), "what the user types to see the board answer"
+    assert re.findall(r"Arduino\.h|\bmalloc\b|\bnew\b|\bstd::", code) == []
+
+
+def test_boot_banner():
+    banner = parse_answer(Bench().sent[0][:-1])
+    assert banner == Unasked("boot", f"b={BOOT} fw=1.0.0")
