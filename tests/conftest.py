@@ -38,8 +38,15 @@ LONG = (
         "report/test_page.py",
         "cli/test_campaign_commands.py",
         "posterior/test_sampling.py",
-        "comparison/test_gap.py",
+        "comparison/test_held_out.py",
         "assessment/test_summary.py",
+    ),
+    *(
+        "comparison/test_changes.py",
+        "comparison/test_gap.py",
+        "assessment/test_score_tests.py",
+        "assessment/test_residuals.py",
+        "assessment/test_causes.py",
     ),
     *(
         "posterior/test_transport.py",
@@ -235,3 +242,38 @@ def evaluate():
             return Evaluated(*jax.tree.map(np.asarray, compiled(jnp.asarray(z), space, arrays)))
 
     return run
+
+
+@pytest.fixture(scope="session")
+def bent():
+    """A calibration of a bent rig, with draws."""
+    from support.bent_rig import calibration
+
+    return calibration()
+
+
+@pytest.fixture(scope="session")
+def wobbling():
+    """The same with transmission errors on both axes and aperture readings as azimuths."""
+    from support.bent_rig import BENT, WOBBLE, calibration
+    from support.two_poses import PERIODS_DEG
+
+    return calibration(BENT | WOBBLE, azimuth=True, period_deg=PERIODS_DEG)
+
+
+@pytest.fixture(scope="session")
+def paper_fit():
+    """The fit of the shipped twin of the paper: equal gears, |N| = 200."""
+    from tvsbayes.estimators.joint_fit import fit
+    from tvsbayes.instrument.campaign import read_campaign
+
+    return fit(read_campaign(ROOT / "data" / "twins" / "paper_twin"))
+
+
+@pytest.fixture(scope="session")
+def mixed_fit(mounted_rig: Rig):
+    """A fit of two step counts, reversed and cleared starts: the play is seen."""
+    from tvsbayes.estimators.joint_fit import fit
+    from tvsbayes.instrument.protocols import four_point_protocol
+
+    return fit(simulate(mounted_rig, four_point_protocol(repeats=6, steps=(100, 200)), seed=3).campaign)

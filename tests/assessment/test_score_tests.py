@@ -29,6 +29,7 @@ from tvsbayes.report.fit_text import fit_text, validation_lines
 from tvsbayes.report.page import verdict_of
 from tvsbayes.results.estimates import Validation, ValidationTest
 from tvsbayes.results.records import plain
+from tvsbayes.statistics.intervals import log_chance
 from tvsbayes.statistics.least_squares import Mode
 from tvsbayes.twin.simulated_campaign import simulate
 
@@ -216,3 +217,18 @@ def test_the_entry_obeys_the_schema():
     assert problems(written, schema) == [] and problems({**written, "validation": None}, schema) == []
     for path, value in (("inflation", 0.5), ("passed", 1), ("tests/0/p", 2.0), ("tests/0/dof", 0), ("level", ...)):
         assert problems(changed(written, f"validation/{path}", value), schema), path
+
+
+def test_the_larger_of_two_gross_defects_is_the_cause():
+    """The chance of a chi-square with two degrees of freedom is exp(-x / 2), however small; others stay ordered."""
+    far = np.array([10.0, 1e3, 1e5, 1e7])
+    np.testing.assert_allclose(log_chance(far, 2), -far / 2, rtol=1e-12)
+    for dof in (1, 3, 6):
+        near = np.array([1.0, 30.0, 600.0])
+        np.testing.assert_allclose(log_chance(near, dof), stats.chi2.logsf(near, dof), rtol=1e-12)
+        # Continued from where the plain law still has digits: the asymptotic slope is -1/2.
+        ends = log_chance(np.array([1000.0, 2000.0, 1e5]), dof)
+        assert np.all(np.isfinite(ends)) and np.all(np.diff(ends) < 0)
+        assert (ends[1] - ends[0]) / 1000 == pytest.approx(-0.5, abs=3 / 1000)
+    spot, cameras = (_Answer(float(log_chance(x, 3)), str(x), "", x, 3, 0.0) for x in (1600.0, 1e5))
+    assert _holm([spot, cameras]).cause.startswith("100000.0")

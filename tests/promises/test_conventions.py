@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from support.printed_vector import LAST_6, LAST_7, LAST_9, LAST_12, VECTOR
 
 from tvsbayes.estimators.likelihood import aperture_angle, observe
 from tvsbayes.instrument.parameters import INDEX, NAMES
@@ -19,22 +20,8 @@ from tvsbayes.statistics.intervals import NORMAL_95, coverage_factor
 
 pytestmark = pytest.mark.usefixtures("x64")
 
-LAST_12, LAST_9, LAST_7, LAST_6 = 0.5e-12, 0.5e-9, 0.5e-7, 0.5e-6
-"""Half a unit of the last digit that the design prints, each in the unit of what it bounds."""
 ROUNDING = 1e-12
 """Of a dozen operations on numbers up to 1000 (mm, px)."""
-VECTOR = {
-    "mirror_offset_mm": 30.0,
-    "mirror1_error_deg": 0.3,
-    "mirror2_error_deg": -0.2,
-    "laser_tilt_deg.x": 0.25,
-    "laser_tilt_deg.y": -0.35,
-    "laser_offset_mm.x": 0.2,
-    "laser_offset_mm.y": -0.4,
-    "tilt_axis_skew_deg": 0.4,
-    "tilt_axis_offset_mm.x": 0.5,
-    "tilt_axis_offset_mm.z": -0.3,
-}
 PAN_RAD, TILT_RAD = np.radians([10.0, 5.0])
 RANGE_MM, BASELINE_MM, C0_RAD = 250.0, 200.0, np.radians(91.0)
 

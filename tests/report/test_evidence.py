@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import json
 
+import numpy as np
 import pytest
 from support.reported_twin import BATCH, PLANNED, evidence_of
 
 from tvsbayes.errors import InputError
+from tvsbayes.report.evidence import criterion
 
 STORED = {"compare.json": "held_out", "plan.json": "planned"}
 
@@ -54,3 +56,12 @@ def test_a_damaged_plan_is_refused_by_key(reported, evidence, key, value, column
         assert caught.value.column == column
     finally:
         path.unlink()
+
+
+@pytest.mark.parametrize(
+    ("share", "verdict"), [(1.0, "met"), (0.95, "met"), (0.94, "cannot tell"), (0.06, "cannot tell"), (0.05, "not met")]
+)
+def test_criterion_follows_its_rule(share, verdict):
+    errors = np.where(np.arange(1000) < 1000 * share, 0.5, -2.0)
+    judged = criterion("x", errors, 1.0, "mm")
+    assert (judged.probability, judged.verdict) == (pytest.approx(share), verdict)

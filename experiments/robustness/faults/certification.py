@@ -9,7 +9,7 @@ FAULTS = (
         "log_density=float(np.mean(stats.t.logpdf(error, dof[name], scale=u)))",
         "log_density=-float(np.mean(stats.t.logpdf(error, dof[name], scale=u)))",
         "the worse predictor has the better score",
-        ("comparison/gap::test_scores_of_predictions_by_hand",),
+        ("comparison/scores::test_scores_of_predictions_by_hand",),
         survived="read: no test read this score.",
     ),
     Fault(
@@ -18,7 +18,7 @@ FAULTS = (
         'ratio = scores["classic"].rms_block_deg / scores["joint"].rms_block_deg',
         'ratio = scores["joint"].rms_block_deg / scores["classic"].rms_block_deg',
         "the report says that the classic predicts better by the factor by which it is worse",
-        ("comparison/gap::test_scores_of_predictions_by_hand",),
+        ("comparison/scores::test_scores_of_predictions_by_hand",),
     ),
     Fault(
         "shared cameras counted twice instead of once",
@@ -26,7 +26,7 @@ FAULTS = (
         "variance = variance - 2 * np.sum(influence[0] * influence[1], axis=1)",
         "variance = variance + 2 * np.sum(influence[0] * influence[1], axis=1)",
         "a changed gear is not noticed",
-        ("comparison/gap::test_a_calibration_has_not_changed_from_itself",),
+        ("comparison/changes::test_a_calibration_has_not_changed_from_itself",),
     ),
     Fault(
         "one-sided tolerance",
@@ -34,7 +34,7 @@ FAULTS = (
         "float(np.mean(np.abs(errors) <= limit))",
         "float(np.mean(errors <= limit))",
         "large negative errors meet every tolerance",
-        ("comparison/gap::test_criterion_follows_its_rule",),
+        ("report/evidence::test_criterion_follows_its_rule",),
     ),
     Fault(
         "ISO 230-2 A with one sd",

@@ -274,7 +274,7 @@ FAULTS = (
         "np.sqrt(variances[i] + 1 / weight)",
         "np.sqrt(variances[i])",
         "clean campaigns are suspected of depth",
-        ("comparison/gap::test_recursive_residuals_are_independent_and_standard",),
+        ("statistics/intervals::test_recursive_residuals_are_independent_and_standard",),
     ),
     Fault(
         "chance of a gross defect with the wrong sign",
@@ -282,7 +282,7 @@ FAULTS = (
         "far = -x + np.log(",
         "far = x + np.log(",
         "the smaller of two gross defects is the cause",
-        ("comparison/gap::test_the_larger_of_two_gross_defects_is_the_cause",),
+        ("assessment/score_tests::test_the_larger_of_two_gross_defects_is_the_cause",),
     ),
     Fault(
         "robust distance by the weight alone",

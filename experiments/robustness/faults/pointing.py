@@ -34,7 +34,7 @@ FAULTS = (
         "ahead = cos_b * root - w[1] * direction[1]",
         "ahead = -cos_b * root - w[1] * direction[1]",
         "points behind the scanner",
-        ("coordinates/location",),
+        ("coordinates/beam_meeting",),
     ),
     Fault(
         "stop sd of the other side in coordinates",
@@ -66,7 +66,7 @@ FAULTS = (
         "at = output_deg(self.values, self.axis, steps, side,",
         "at = output_deg(self.values, self.axis, steps, -side,",
         "every target is missed by the backlash",
-        ("calibration/pointing",),
+        ("calibration/aiming",),
     ),
     Fault(
         "run-up from the wrong side",
@@ -74,7 +74,7 @@ FAULTS = (
         "first = steps - sign * ratio_sign * self.overshoot_steps",
         "first = steps + sign * ratio_sign * self.overshoot_steps",
         "the play is not taken up on the way",
-        ("calibration/pointing",),
+        ("calibration/aiming",),
     ),
     Fault(
         "closed form of `locate`: the other root",
@@ -82,7 +82,7 @@ FAULTS = (
         "closing = cos_b * root - (",
         "closing = -cos_b * root - (",
         "the robot sees points behind itself",
-        ("calibration/pointing",),
+        ("calibration/optics", "calibration/pointing"),
     ),
     Fault(
         "variance of an unknown play four times too large",
@@ -98,7 +98,7 @@ FAULTS = (
         'f"#define {macro[name]} {value!r}"',
         'f"#define {macro[name]} {value:.4g}"',
         "the microcontroller misses by millimetres at 1 m",
-        ("calibration/pointing",),
+        ("calibration/calibration_file",),
     ),
     Fault(
         "aperture reading without its zero",
@@ -106,7 +106,7 @@ FAULTS = (
         'return float(angle) + self.estimates["aperture_zero_deg"]',
         "return float(angle)",
         "the reading foretold for a target is off by the zero",
-        ("calibration/pointing",),
+        ("calibration/aiming",),
     ),
     Fault(
         "points that a third of the draws lose",

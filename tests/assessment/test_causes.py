@@ -1,0 +1,188 @@
+"""Causes of uncertainty are what refitting a linear campaign shows, and add up."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from support.linear_fit import ROWS, fit_of, linear_problem, refitted, slope_of
+
+from tvsbayes.assessment.causes import causes_of, headline_budget
+from tvsbayes.instrument.campaign import Move
+from tvsbayes.instrument.parameters import INDEX, NAMES, RIG_NAMES
+from tvsbayes.instrument.rig import RigTable
+from tvsbayes.metrology.budget_tables import CORRELATIONS
+
+
+@pytest.fixture(scope="module")
+def linear_fit(mounted_rig):
+    """The linear campaign of test_comparison with headlines that are linear in its coordinates: (fit, gradient)."""
+    from tvsbayes.instrument.parameters import INDEX, NAMES, RIG_NAMES
+    from tvsbayes.statistics.least_squares import laplace_draws
+
+    jacobian, load = linear_problem()
+    # What the rig fixes moves no spot.
+    jacobian[:, [INDEX[name] for name in RIG_NAMES if mounted_rig.table.priors[name].u == 0]] = 0.0
+    fit = fit_of(jacobian, load, mounted_rig)
+    covariance = np.linalg.inv(fit.information.fisher + np.eye(len(NAMES)))
+    rng = np.random.default_rng(12)
+    draws_z = laplace_draws(fit.z, covariance, 1)
+    gradient = rng.normal(size=(6, len(NAMES))) * 1e-3
+    # Nothing hangs on a coordinate that is fixed, and noise scales carry no headline.
+    gradient[:, : len(RIG_NAMES)][:, np.asarray(fit.space.u) == 0] = 0.0
+    physical = np.full((len(draws_z), len(NAMES)), 0.5)
+    values = draws_z @ gradient.T
+    physical[:, INDEX["backlash_deg.pan"]], physical[:, INDEX["backlash_deg.tilt"]] = values[:, 4], values[:, 5]
+    for k, name in enumerate(("stop_sd_deg.left", "stop_sd_deg.right", "pixel_scale")):
+        physical[:, INDEX[name]] = np.exp((0.1, 0.2, 0.05)[k] * rng.standard_normal(len(draws_z)))
+    moves = (Move(0, 0, 0.0, 0, 0, "left", "up"), Move(1, 0, 1.0, 9, 0), Move(2, 0, 2.0, 0, 0), Move(3, 0, 3.0, 0, 9))
+    draws = SimpleNamespace(physical=physical, effective_deg_per_step=values[:, :4])
+    for name, value in (("draws_z", draws_z), ("covariance", covariance), ("draws", draws)):
+        object.__setattr__(fit, name, value)
+    object.__setattr__(fit, "campaign", replace(fit.campaign, moves=moves))
+    return fit, gradient, jacobian, load
+
+
+def test_headline_causes_are_what_refitting_shows(linear_fit):
+    from tvsbayes.assessment.causes import headline_causes
+    from tvsbayes.instrument.parameters import INDEX, RIG_NAMES
+
+    fit, gradient, jacobian, load = linear_fit
+    causes = headline_causes(fit)
+    # Down was never moved.
+    assert causes.quantities == (
+        *(f"effective_deg_per_step.{d}" for d in ("left", "right", "up")),
+        *("backlash_deg.pan", "backlash_deg.tilt"),
+    )
+    gradient = gradient[[0, 1, 2, 4, 5]]
+    by_datum, by_prior = refitted(jacobian, load)
+    pixels, stops = gradient @ by_datum, gradient @ by_datum @ load
+    scale = np.abs(causes.contribution).max()
+    found = {name: causes.contribution[:, k] for k, name in enumerate(causes.names)}
+    np.testing.assert_allclose(found["pixel noise"], np.linalg.norm(pixels, axis=1), rtol=1e-6)
+    np.testing.assert_allclose(found["stop errors of the campaign"], np.linalg.norm(stops, axis=1), rtol=1e-6)
+    cameras = gradient @ by_prior[:, len(RIG_NAMES) :]
+    np.testing.assert_allclose(found["stereo calibration"], np.linalg.norm(cameras, axis=1), rtol=1e-6)
+    for name in ("mirror_offset_mm", "laser_tilt_deg.y", "focal_scale", "backlash_deg.pan"):
+        np.testing.assert_allclose(found[name], gradient @ by_prior[:, INDEX[name]], atol=1e-6 * scale, rtol=1e-6)
+    # They add up to the variance: nothing is forgotten, nothing counted twice.
+    total = np.einsum("qi,ij,qj->q", gradient, fit.covariance, gradient)
+    np.testing.assert_allclose((causes.contribution**2).sum(axis=1), total, rtol=1e-6)
+
+
+def test_degrees_of_freedom_follow_from_how_well_the_noise_is_known(linear_fit):
+    from tvsbayes.assessment.causes import headline_causes
+
+    causes = headline_causes(linear_fit[0])
+    dof = dict(zip(causes.names, causes.dof.T, strict=True))
+    # nu = 1/(2 var(ln s)): ln s has sd 0.05 for pixels, 0.2 for the worse of left and right (GUM eq. G.3); 2048 draws.
+    count = 2048
+    tolerance = 4 * np.sqrt(2 / count)
+    np.testing.assert_allclose(dof["pixel noise"], 0.5 / 0.05**2, rtol=tolerance)
+    np.testing.assert_allclose(dof["stop errors of the campaign"][[0, 1, 3]], 0.5 / 0.2**2, rtol=tolerance)
+    # The stop scatter of the tilt axis was held fixed here.
+    assert np.all(np.isinf(dof["stop errors of the campaign"][[2, 4]]))
+    assert np.all(np.isinf(dof["stereo calibration"]))
+
+
+def test_headline_budget_is_a_gum_table(linear_fit):
+    from tvsbayes.assessment.causes import headline_causes
+    from tvsbayes.results.estimates import Estimate
+
+    fit, gradient, _, _ = linear_fit
+    causes = headline_causes(fit)
+    sd = float(np.sqrt(gradient[1] @ fit.covariance @ gradient[1]))
+    table = headline_budget(causes, "effective_deg_per_step.right", Estimate(0.06, sd, (0.05, 0.07), 1.0, 0.9))
+    rows = {row.quantity: row for row in table.rows}
+    assert (table.unit, table.estimate, table.u) == ("deg/step", 0.06, sd)
+    assert rows["pixel noise"].kind == "A" and rows["pixel noise"].unit == "deg/step"
+    assert rows["stereo calibration"].kind == "B"
+    assert abs(rows[CORRELATIONS].share) < 1e-6
+    prior = next(row for row in table.rows if row.quantity.startswith("prior of ") and row.distribution == "normal")
+    assert prior.kind == "B" and prior.contribution == pytest.approx(prior.sensitivity * prior.u)
+    assert sum(row.share for row in table.rows) == pytest.approx(1.0, abs=1e-12)
+    json.dumps(table.as_json(), allow_nan=False)
+
+
+def test_half_normal_and_log_normal_priors_state_their_own_moments(linear_fit):
+    from tvsbayes.assessment.causes import headline_causes
+
+    fit, *_ = linear_fit
+    causes = headline_causes(fit)
+    k = causes.names.index("backlash_deg.pan")
+    scale = float(np.asarray(fit.space.u)[list(RigTable().priors).index("backlash_deg.pan")])
+    draws = np.abs(np.random.default_rng(0).normal(0.0, scale, 200_000))
+    assert causes.distribution[k] == "half-normal"
+    # 4 standard errors of mean and standard deviation.
+    assert causes.centre[k] == pytest.approx(draws.mean(), abs=4 * draws.std() / np.sqrt(draws.size))
+    assert causes.u[k] == pytest.approx(draws.std(), rel=4 / np.sqrt(draws.size))
+    k = causes.names.index("pixel_scale")
+    stated = RigTable().priors["pixel_scale"]
+    assert (causes.distribution[k], causes.u[k]) == ("log-normal", stated.u)
+    assert causes.centre[k] == pytest.approx(math.log(stated.value), abs=1e-12)
+
+
+ALGEBRA = 1e-9
+"""Relative, of solving 65 equations whose information spans six decades."""
+
+
+DIFFERENCES = 1e-6
+"""Relative, of central differences with a step of 1e-4 sd."""
+
+
+@pytest.mark.parametrize("readings", [False, True])
+def test_causes_are_what_refitting_shows(mounted_rig, readings):
+    jacobian, load = linear_problem()
+    fit = fit_of(jacobian, load, mounted_rig, readings)
+    causes = causes_of(fit)
+    by_datum, by_prior = refitted(jacobian, load)
+    slope = slope_of(fit)
+    pixels, stops = slope @ by_datum, slope @ by_datum @ load
+    expected = {
+        "pixel and aperture noise" if readings else "pixel noise": pixels @ pixels.T,
+        "stop errors of the campaign": stops @ stops.T,
+    }
+    stereo = slope @ by_prior[:, len(RIG_NAMES) :]
+    expected["stereo calibration"] = stereo @ stereo.T
+    for stem in ("mirror_offset_mm", "laser_tilt_deg", "extrinsics", "focal_scale"):
+        columns = [INDEX[name] for name in RIG_NAMES if name.split(".")[0] == stem]
+        moved = slope @ by_prior[:, columns]
+        expected["focal scale" if stem == "focal_scale" else f"prior of {stem}"] = moved @ moved.T
+    for name, part in expected.items():
+        found = causes.covariance[causes.names.index(name)]
+        scale = np.sqrt(np.outer(np.diag(part), np.diag(part))) + 1e-300
+        assert np.abs((found - part) / scale).max() < 10 * DIFFERENCES, name
+    assert len(set(causes.names)) == len(causes.names)
+
+
+def test_causes_add_up_to_the_posterior(mounted_rig):
+    jacobian, load = linear_problem()
+    fit = fit_of(jacobian, load, mounted_rig)
+    causes = causes_of(fit)
+    inverse = np.linalg.inv(np.eye(ROWS) + load @ load.T)
+    posterior = np.linalg.inv(jacobian.T @ inverse @ jacobian + np.eye(len(NAMES)))
+    slope = slope_of(fit)
+    total = slope @ posterior @ slope.T
+    scale = np.sqrt(np.outer(np.diag(total), np.diag(total)))
+    scale[scale == 0] = 1.0
+    assert np.abs((causes.covariance.sum(axis=0) - total) / scale).max() < 10 * DIFFERENCES
+    for name, part in zip(causes.names, causes.covariance, strict=True):
+        unit = part / scale
+        assert np.abs(unit - unit.T).max() < ALGEBRA, name
+        assert np.linalg.eigvalsh(0.5 * (unit + unit.T)).min() > -ALGEBRA, name
+        assert np.any(part != 0)
+    # Fixed in the rig: no cause.
+    assert not any("harmonic" in name for name in causes.names)
+
+
+def test_worse_cameras_have_a_larger_share(mounted_rig):
+    shares = []
+    for stereo in (0.5, 1.0, 2.0):
+        causes = causes_of(fit_of(*linear_problem(stereo), mounted_rig))
+        ratio = causes.covariance[:, 0, 0]
+        shares.append(ratio[causes.names.index("stereo calibration")] / ratio.sum())
+    assert shares[0] < shares[1] < shares[2]

@@ -1,0 +1,84 @@
+"""From draws and fits to calibrations."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.bent_rig import (
+    calibration,
+)
+from support.linear_fit import fit_of, linear_problem
+from support.small_campaign import small_campaign
+
+from tvsbayes.assessment.causes import causes_of
+from tvsbayes.assessment.fitted_calibration import (
+    calibration_of,
+    calibration_of_draws,
+)
+from tvsbayes.calibration.pointing import INPUT_NAMES, NOISE_NAMES
+from tvsbayes.coordinates.beam_meeting import INPUT_COLUMNS
+from tvsbayes.instrument.campaign import input_hashes
+from tvsbayes.instrument.parameters import Prior
+
+ROUNDING = 1e-12
+"""Of a hundred operations on numbers of order 1."""
+
+
+def drawn(campaign, draws=4000):
+    """`calibration_of_draws` of normal draws in an order of columns of its own, with names it does not need."""
+    bent = calibration(draws=draws)
+    names = ("pixel_scale", *reversed((*INPUT_NAMES, *NOISE_NAMES)))
+    physical = np.concatenate([bent.inputs, bent.noise], axis=1)[:, ::-1]
+    physical = np.column_stack([np.full(draws, 7.0), physical])
+    return bent, calibration_of_draws(names, physical, campaign, "laplace", 3)
+
+
+def test_calibration_of_draws_takes_its_columns():
+    campaign = small_campaign()
+    bent, one = drawn(campaign)
+    np.testing.assert_array_equal(one.inputs, bent.inputs)
+    np.testing.assert_array_equal(one.noise, bent.noise)
+    np.testing.assert_allclose(one.mean, bent.inputs.mean(axis=0), rtol=ROUNDING)
+    np.testing.assert_allclose(one.covariance, np.cov(bent.inputs.T), atol=ROUNDING)
+    # Mean of the squares, not square of the mean: a variance adds up in variances.
+    assert one.noise_variance["aperture_sd_deg"] == pytest.approx((bent.noise[:, 4] ** 2).mean(), rel=ROUNDING)
+    assert one.azimuth and one.estimator == "laplace" and one.causes == ()
+    np.testing.assert_array_equal(one.range_steps, [[-100, 200], [-7, 120]])
+    assert one.inputs_sha256 == input_hashes(campaign)
+    play_steps = bent.inputs[:, 2] / bent.inputs[:, 0]
+    least = one.overshoot_steps["pan"]
+    assert (play_steps <= least).mean() >= 0.99 > (play_steps <= least - 1).mean()
+
+
+def test_the_apertures_noise_takes_its_prior_without_readings():
+    """A sampler holds it still; its log-normal prior has E s^2 = m^2 exp(2 u^2)."""
+    campaign = small_campaign()
+    priors = campaign.rig.priors | {"aperture_sd_deg": Prior(0.02, 0.8, "log-normal")}
+    unread = tuple(replace(spot, aperture_deg=None) for spot in campaign.spots)
+    one = drawn(replace(campaign, spots=unread, rig=replace(campaign.rig, priors=priors)))[1]
+    # 4000 draws of exp(1.6 w): sd of the mean is sqrt(exp(2.56) - 1) / sqrt(4000) = 5.5 % of it.
+    assert one.noise_variance["aperture_sd_deg"] == pytest.approx(0.02**2 * np.exp(2 * 0.8**2), rel=4 * 0.055)
+
+
+def test_what_only_readings_tell_takes_its_prior_without_them():
+    campaign = small_campaign()
+    silent = replace(campaign, spots=tuple(replace(s, aperture_deg=None) for s in campaign.spots))
+    _, one = drawn(silent)
+    for name in ("baseline_mm", "pan_zero_emission_deg", "aperture_zero_deg"):
+        prior, column = silent.rig.priors[name], one.inputs[:, INPUT_NAMES.index(name)]
+        assert prior.u > 0
+        assert column.mean() == pytest.approx(prior.value, abs=1e-9)
+        assert column.std() == pytest.approx(prior.u, rel=1e-9)
+    _, again = drawn(silent)
+    np.testing.assert_array_equal(one.inputs, again.inputs)
+
+
+def test_calibration_of_a_fit_brings_its_causes(mounted_rig):
+    fit = fit_of(*linear_problem(), mounted_rig)
+    one = calibration_of(fit)
+    causes = causes_of(fit)
+    assert (one.estimator, one.causes) == ("laplace", causes.names)
+    np.testing.assert_array_equal(one.cause_covariance, causes.covariance)
+    np.testing.assert_array_equal(one.inputs, fit.draws.physical[:, INPUT_COLUMNS[: len(INPUT_NAMES)]])

@@ -1,0 +1,322 @@
+"""Calibrations on disk: draws, JSON and C header brought back, damage refused."""
+
+from __future__ import annotations
+
+import io
+import json
+import math
+import shutil
+import subprocess
+import sys
+import zipfile
+from dataclasses import fields, replace
+from itertools import product
+
+import numpy as np
+import pytest
+from support.bent_rig import (
+    BENT,
+    WOBBLE,
+    calibration,
+)
+from support.refusals import refusal
+from support.small_campaign import small_campaign
+from support.two_poses import PERIODS_DEG, POSES
+
+from tvsbayes.calibration.calibration_file import (
+    CALIBRATION_FORMAT,
+    NO_CALIBRATION,
+    calibration_bytes,
+    calibration_header,
+    calibration_json,
+    expected_error,
+    load_calibration,
+    stored_calibration,
+)
+from tvsbayes.calibration.pointing import INPUT_NAMES, NOISE_NAMES, Calibration
+from tvsbayes.instrument.campaign import input_hashes
+from tvsbayes.instrument.parameters import HARMONIC_NAMES
+
+ROUNDING_MM = 1e-9
+"""Of a hundred operations on lengths up to 1000 mm, magnified tenfold by a grazing line of sight."""
+
+
+ROUNDING = 1e-12
+"""Of a hundred operations on numbers of order 1."""
+
+
+def differing(one: Calibration, other: Calibration, without: tuple[str, ...] = ()) -> list[str]:
+    """Names of the fields that are not the same to the last bit, arrays in float64."""
+
+    def equal(a: object, b: object) -> bool:
+        if isinstance(a, np.ndarray):
+            return b.dtype == np.float64 and np.array_equal(a, b)
+        return a == b
+
+    names = (f.name for f in fields(Calibration) if f.name not in without)
+    return [name for name in names if not equal(getattr(one, name), getattr(other, name))]
+
+
+def complete() -> Calibration:
+    """Every field holds something that could get lost."""
+    one = calibration(BENT | WOBBLE, azimuth=True, period_deg=PERIODS_DEG, draws=60)
+    parts = np.stack([0.25 * one.covariance, 0.75 * one.covariance])
+    return replace(one, causes=("pixel noise", "stereo"), cause_covariance=parts, estimator="laplace")
+
+
+def test_draws_file_brings_everything_back(tmp_path):
+    one = complete()
+    (tmp_path / "results").mkdir()
+    path = tmp_path / "results" / "draws.npz"
+    path.write_bytes(calibration_bytes(one, physical=np.zeros((3, 65))))
+    for asked in (tmp_path, str(tmp_path), tmp_path / "results", path):
+        assert differing(one, load_calibration(asked)) == []
+
+
+def test_results_without_a_calibration_are_no_damage(tmp_path):
+    """A fit that did not converge, or an older version, leaves draws alone: such results are as good as none."""
+    campaign = replace(small_campaign(), path=tmp_path)
+    (tmp_path / "results").mkdir()
+    np.savez_compressed(tmp_path / "results" / "draws.npz", names=np.array(INPUT_NAMES), physical=np.zeros((3, 65)))
+    assert stored_calibration(campaign) is None
+    error = refusal(lambda: load_calibration(tmp_path))
+    assert error.code == NO_CALIBRATION and error.remedy and "did not converge" in error.message
+    np.savez_compressed(tmp_path / "results" / "draws.npz", names=np.array(INPUT_NAMES))
+    assert refusal(lambda: stored_calibration(campaign)).code == "damaged-results"
+
+
+def test_json_export_brings_back_all_but_the_draws(tmp_path):
+    one = complete()
+    path = tmp_path / "robot.json"
+    path.write_text(json.dumps(calibration_json(one), allow_nan=False))
+    other = load_calibration(path)
+    assert differing(one, other, without=("inputs", "noise", "causes", "cause_covariance")) == []
+    assert len(other.inputs) == len(other.noise) == len(other.causes) == 0
+    assert other.locate(100, 50, 75.0).u95_mm == pytest.approx(one.locate(100, 50, 75.0).u95_mm, rel=ROUNDING)
+    assert other.steps_for((600, 0, 0)).as_json() == one.steps_for((600, 0, 0)).as_json()
+
+
+def test_expected_error_is_that_of_the_middle():
+    one = replace(complete(), range_steps=np.array([[-100.0, 300.0], [40.0, 60.0]]))
+    error = expected_error(one)
+    assert (error.pan_steps, error.tilt_steps) == (100, 50)
+    d = one.ray(100, 50).direction
+    there = one.steps_for(azimuth_deg=math.degrees(math.atan2(d[1], d[0])), elevation_deg=math.degrees(math.asin(d[2])))
+    assert [error.u95_azimuth_deg, error.u95_elevation_deg] == pytest.approx(there.u95_deg, rel=ROUNDING)
+    at_1_m = one.steps_for(one.ray(100, 50).origin_mm + 1000.0 * d)
+    assert error.u95_at_1_m_mm == pytest.approx(at_1_m.u95_mm, rel=1e-9)
+
+
+def arrays_of(one: Calibration) -> dict[str, np.ndarray]:
+    with np.load(io.BytesIO(calibration_bytes(one))) as file:
+        return {name: file[name] for name in file.files}
+
+
+def table(arrays: dict[str, np.ndarray], name: str, value: object) -> dict[str, np.ndarray]:
+    return arrays | {"tables": np.array(json.dumps(json.loads(str(arrays["tables"])) | {name: value}))}
+
+
+def poisoned(array: np.ndarray, value: float) -> np.ndarray:
+    array = array.copy()
+    array.flat[3] = value
+    return array
+
+
+DAMAGES = {
+    "another format": lambda a: a | {"format": np.array("tvsbayes-calibration/9")},
+    "no format": lambda a: {name: value for name, value in a.items() if name != "format"},
+    "other columns": lambda a: a | {"input_names": a["input_names"][::-1]},
+    "other noises": lambda a: a | {"noise_names": a["noise_names"][::-1]},
+    "no mean": lambda a: {name: value for name, value in a.items() if name != "mean"},
+    "no tables": lambda a: {name: value for name, value in a.items() if name != "tables"},
+    "nan in the mean": lambda a: a | {"mean": poisoned(a["mean"], np.nan)},
+    "inf in the covariance": lambda a: a | {"covariance": poisoned(a["covariance"], np.inf)},
+    "nan in the draws": lambda a: a | {"inputs": poisoned(a["inputs"], np.nan)},
+    "a short mean": lambda a: a | {"mean": a["mean"][:-1]},
+    "fewer noises": lambda a: a | {"noise": a["noise"][:-1]},
+    "narrow draws": lambda a: a | {"inputs": a["inputs"][:, 1:]},
+    "causes without parts": lambda a: a | {"cause_covariance": a["cause_covariance"][:1]},
+    "integers": lambda a: a | {"mean": a["mean"].astype(int)},
+    "objects": lambda a: a | {"mean": a["mean"].astype(object)},
+    "text": lambda a: a | {"covariance": np.array("covariance")},
+    "tables no json": lambda a: a | {"tables": np.array("{")},
+    "tables a list": lambda a: a | {"tables": np.array("[]")},
+    "noise variance missing": lambda a: table(a, "noise_variance", {"aperture_sd_deg": 1.0}),
+    "noise variance nan": lambda a: table(a, "noise_variance", dict.fromkeys(NOISE_NAMES, math.nan)),
+    "noise variance negative": lambda a: table(a, "noise_variance", dict.fromkeys(NOISE_NAMES, -1.0)),
+    "noise variance text": lambda a: table(a, "noise_variance", dict.fromkeys(NOISE_NAMES, "1")),
+    "overshoot missing": lambda a: table(a, "overshoot_steps", {"pan": 3}),
+    "overshoot text": lambda a: table(a, "overshoot_steps", {"pan": "3", "tilt": 3}),
+    "period zero": lambda a: table(a, "period_deg", {"pan": 0.0}),
+    "period text": lambda a: table(a, "period_deg", {"pan": "360"}),
+    "periods a list": lambda a: table(a, "period_deg", [360.0]),
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_damaged_draws_are_refused(damage, tmp_path):
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, **DAMAGES[damage](arrays_of(complete())))
+    path = tmp_path / "draws.npz"
+    path.write_bytes(buffer.getvalue())
+    error = refusal(lambda: load_calibration(path))
+    assert (error.code, error.file) == ("damaged-results", "draws.npz")
+    assert error.remedy and CALIBRATION_FORMAT in error.allowed
+
+
+def test_files_that_are_no_archive_are_refused(tmp_path):
+    good = calibration_bytes(complete())
+    path = tmp_path / "draws.npz"
+    flipped = bytearray(good)
+    flipped[len(good) // 3] ^= 0xFF
+    for content in (b"", b"PK", b"hello", good[: len(good) // 2], good[:-30], good[100:], bytes(flipped)):
+        path.write_bytes(content)
+        assert refusal(lambda: load_calibration(path)).code == "damaged-results"
+    assert refusal(lambda: load_calibration(tmp_path / "none")).exit_code == 2
+    assert refusal(lambda: load_calibration(tmp_path / "none.json")).exit_code == 2
+
+
+def test_an_archive_that_swells_is_refused(tmp_path):
+    """A megabyte of zeros that claims a gigabyte of draws: refused before it is unpacked."""
+    header = io.BytesIO()
+    np.lib.format.write_array_header_1_0(
+        header, {"descr": "<f8", "fortran_order": False, "shape": (2**20, len(INPUT_NAMES) * 5)}
+    )
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
+        with archive.open("inputs.npy", "w", force_zip64=True) as member:
+            member.write(header.getvalue())
+            for _ in range(300):
+                member.write(bytes(2**20))
+        for name, array in arrays_of(complete()).items():
+            if name != "inputs":
+                one = io.BytesIO()
+                np.save(one, array)
+                archive.writestr(f"{name}.npy", one.getvalue())
+    path = tmp_path / "draws.npz"
+    path.write_bytes(buffer.getvalue())
+    assert path.stat().st_size < 4 * 2**20
+    error = refusal(lambda: load_calibration(path))
+    assert error.code == "damaged-results" and "unpacked" in error.message
+
+
+JSON_DAMAGES = {
+    "format": lambda d: d | {"format": "tvsbayes-calibration/9"},
+    "no estimates": lambda d: {k: v for k, v in d.items() if k != "estimates"},
+    "estimate missing": lambda d: d | {"estimates": {k: v for k, v in d["estimates"].items() if k != "baseline_mm"}},
+    "estimate text": lambda d: d | {"estimates": d["estimates"] | {"baseline_mm": "wide"}},
+    "estimate null": lambda d: d | {"estimates": d["estimates"] | {"baseline_mm": None}},
+    "estimates a list": lambda d: d | {"estimates": [1.0]},
+    "other names": lambda d: d | {"covariance": d["covariance"] | {"names": ["x"]}},
+    "ragged": lambda d: d | {"covariance": d["covariance"] | {"matrix": [[1.0], [1.0, 2.0]]}},
+    "small": lambda d: d | {"covariance": d["covariance"] | {"matrix": [[1.0]]}},
+    "noise missing": lambda d: d | {"noise_variance_deg2": {}},
+    "noise negative": lambda d: d | {"noise_variance_deg2": dict.fromkeys(NOISE_NAMES, -1.0)},
+    "noise null": lambda d: d | {"noise_variance_deg2": None},
+    "overshoot missing": lambda d: d | {"overshoot_steps": {}},
+    "overshoot text": lambda d: d | {"overshoot_steps": {"pan": "x", "tilt": 1}},
+    "overshoot negative": lambda d: d | {"overshoot_steps": {"pan": -1, "tilt": 1}},
+    "range": lambda d: d | {"range_steps": {"pan": [0, 1]}},
+    "period": lambda d: d | {"harmonic_period_deg": {"pan": 0}},
+    "convention": lambda d: d | {"aperture_convention": "sideways"},
+    "a list": lambda d: [d],
+}
+
+
+@pytest.mark.parametrize("damage", JSON_DAMAGES)
+def test_damaged_json_is_refused(damage, tmp_path):
+    path = tmp_path / "robot.json"
+    path.write_text(json.dumps(JSON_DAMAGES[damage](calibration_json(complete()))))
+    assert refusal(lambda: load_calibration(path)).file == "robot.json"
+    path.write_text(path.read_text()[:-40])
+    assert refusal(lambda: load_calibration(path)).file == "robot.json"
+
+
+def test_stored_calibration_is_that_of_these_data(tmp_path):
+    campaign = replace(small_campaign(), path=tmp_path)
+    assert stored_calibration(replace(campaign, path=None)) is None
+    assert stored_calibration(campaign) is None
+    (tmp_path / "results").mkdir()
+    path = tmp_path / "results" / "draws.npz"
+    one = replace(complete(), inputs_sha256=input_hashes(campaign))
+    path.write_bytes(calibration_bytes(one))
+    assert differing(one, stored_calibration(campaign)) == []
+    for name in one.inputs_sha256:
+        path.write_bytes(calibration_bytes(replace(one, inputs_sha256=one.inputs_sha256 | {name: "f" * 64})))
+        assert stored_calibration(campaign) is None, name
+    path.write_bytes(b"no archive")
+    assert refusal(lambda: stored_calibration(campaign)).code == "damaged-results"
+
+
+MAIN = """
+#include <stdio.h>
+#include "tvs_calibration.h"
+int main(void)
+{
+    double pan, tilt, reading, o[3], d[3], p[3];
+    int left, up;
+    while (scanf("%lf %lf %d %d %lf", &pan, &tilt, &left, &up, &reading) == 5) {
+        tvs_beam(pan, tilt, left, up, o, d);
+        int found = tvs_locate(pan, tilt, left, up, reading, p);
+        printf("%d", found);
+        for (int i = 0; i < 3; i++)
+            printf(" %.17g %.17g %.17g", o[i], d[i], found ? p[i] : 0.0);
+        puts("");
+    }
+    return 0;
+}
+"""
+
+
+@pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler here")
+@pytest.mark.parametrize("periods", [{}, PERIODS_DEG, {"pan": 25.0, "tilt": 360.0}])
+@pytest.mark.parametrize("azimuth", [False, True])
+def test_the_c_header_computes_the_same(tmp_path, periods, azimuth):
+    one = calibration(BENT | (WOBBLE if periods else {}), period_deg=periods, azimuth=azimuth)
+    (tmp_path / "tvs_calibration.h").write_text(calibration_header(one))
+    (tmp_path / "main.c").write_text(MAIN)
+    strict = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic")
+    subprocess.run(["cc", *strict, "main.c", "-o", "main", "-lm"], cwd=tmp_path, check=True)
+    poses = (*POSES, (2600, 90, 110.0), (350, 10, 120.0))
+    asked = [(pan, tilt, left, up, reading) for (pan, tilt, reading), left, up in product(poses, (1, -1), (1, -1))]
+    text = "".join(" ".join(map(repr, row)) + "\n" for row in asked)
+    done = subprocess.run([tmp_path / "main"], input=text, capture_output=True, text=True, check=True)
+    rows = [list(map(float, line.split())) for line in done.stdout.splitlines()]
+    refused = 0
+    for (pan, tilt, left, up, reading), (found, *numbers) in zip(asked, rows, strict=True):
+        approach = ("left" if left > 0 else "right", "up" if up > 0 else "down")
+        origin, direction, point = np.array(numbers).reshape(3, 3).T
+        ray = one.ray(pan, tilt, approach)
+        np.testing.assert_allclose(origin, ray.origin_mm, atol=ROUNDING_MM)
+        np.testing.assert_allclose(direction, ray.direction, atol=ROUNDING_MM / 1000)
+        if found:
+            np.testing.assert_allclose(point, one.locate(pan, tilt, reading, approach).xyz_mm, atol=ROUNDING_MM)
+        else:
+            assert refusal(lambda a=(pan, tilt, reading, approach): one.locate(*a)).code in ("diverging", "grazing")
+            refused += 1
+    assert refused >= 4
+
+
+def test_the_c_header_states_its_error_and_overshoot(bent):
+    text = calibration_header(bent)
+    error = expected_error(bent)
+    assert f"azimuth {error.u95_azimuth_deg:.3f} deg, elevation {error.u95_elevation_deg:.3f} deg" in text
+    assert f"at 1 m {max(error.u95_at_1_m_mm):.2f} mm" in text
+    assert f"#define TVS_OVERSHOOT_PAN_STEPS {bent.overshoot_steps['pan']}\n" in text
+    assert "@" not in text
+    for name in (*INPUT_NAMES, *HARMONIC_NAMES):
+        assert f"#define TVS_{name.replace('.', '_').upper()} " in text
+
+
+def test_driving_loads_no_jax(tmp_path):
+    """From a file to counters and a point, without JAX, scipy or OpenCV."""
+    path = tmp_path / "draws.npz"
+    path.write_bytes(calibration_bytes(complete()))
+    code = (
+        "import sys; from tvsbayes.calibration.calibration_file import load_calibration\n"
+        "c = load_calibration(sys.argv[1]); s = c.steps_for((600, 0, 0))\n"
+        "c.locate(s.pan_steps, s.tilt_steps, s.aperture_deg)\n"
+        "print(sorted({m.split('.')[0] for m in sys.modules} & {'jax', 'jaxlib', 'equinox', 'scipy', 'cv2'}))\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code, path], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]", done.stdout

@@ -1,0 +1,68 @@
+"""Two campaigns compared: nothing changes from itself, a changed gear is named."""
+
+from __future__ import annotations
+
+import datetime
+import json
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from tvsbayes.comparison.changes import compare
+from tvsbayes.estimators.joint_fit import fit
+from tvsbayes.instrument.protocols import four_point_protocol
+from tvsbayes.twin.simulated_campaign import simulate
+
+
+def test_a_calibration_has_not_changed_from_itself(mixed_fit):
+    same = compare(mixed_fit, mixed_fit)
+    assert same.shared_cameras and same.verdict == "no significant change" and same.days is None
+    for change in same.changes:
+        assert change.difference == 0.0 and change.normalised == 0.0 and change.u > 0
+    # A second pair of cameras: nothing is shared, every u grows.
+    stereo = replace(
+        mixed_fit.campaign.stereo, parameter_covariance=mixed_fit.campaign.stereo.parameter_covariance * 1.01
+    )
+    apart = compare(mixed_fit, replace(mixed_fit, campaign=replace(mixed_fit.campaign, stereo=stereo)))
+    assert not apart.shared_cameras
+    for one, other in zip(same.changes[:4], apart.changes[:4], strict=True):
+        assert other.u > 1.05 * one.u
+
+
+def test_what_both_hold_fixed_is_compared_as_stated(mixed_fit):
+    """A backlash fixed in both fits has no u: equal statements are no change, others are one; JSON takes both."""
+    row = list(mixed_fit.names).index("backlash_deg.tilt")
+    fits = []
+    for value in (0.1, 0.1, 0.2):
+        stated, u, kind = (np.array(x) for x in (mixed_fit.space.value, mixed_fit.space.u, mixed_fit.space.kind))
+        stated[row], u[row], kind[row] = value, 0.0, 0
+        with jax.enable_x64(True):
+            space = replace(mixed_fit.space, value=jnp.asarray(stated), u=jnp.asarray(u), kind=jnp.asarray(kind))
+        fits.append(replace(mixed_fit, space=space))
+    same, other = (compare(fits[0], second).changes[-1] for second in fits[1:])
+    assert (same.normalised, same.significant) == (None, False)
+    assert (other.normalised, other.significant) == (None, True)
+    json.dumps(compare(fits[0], fits[2]).as_json(), allow_nan=False)
+
+
+def test_a_changed_gear_is_named(mounted_rig, mixed_fit):
+    """The same rig with 2 % more degrees per pan step, measured again 30 days later."""
+    protocol = four_point_protocol(repeats=6, steps=(100, 200))
+    first = simulate(mounted_rig, protocol, seed=3)
+    parameters = dict(first.truth.parameters)
+    parameters["degrees_per_step.pan"] *= 1.02
+    second = simulate(mounted_rig, protocol, seed=4, truth=replace(first.truth, parameters=parameters)).campaign
+    made = datetime.datetime(2026, 1, 1, tzinfo=datetime.UTC)
+    dated = [
+        replace(campaign, header={**campaign.header, "created": made + datetime.timedelta(days=30 * k)})
+        for k, campaign in enumerate((mixed_fit.campaign, second))
+    ]
+    found = compare(replace(mixed_fit, campaign=dated[0]), replace(fit(second), campaign=dated[1]))
+    moved = {c.quantity for c in found.changes if c.significant}
+    assert moved == {"effective_deg_per_step.left", "effective_deg_per_step.right"}
+    assert found.days == 30.0 and found.verdict.startswith("changed: effective_deg_per_step.left by +")
+    for change in found.changes[:2]:
+        assert change.difference == pytest.approx(0.02 * change.first, abs=4 * change.u)
