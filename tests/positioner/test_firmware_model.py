@@ -18,6 +18,7 @@ from tvsbayes.positioner.firmware_model import DeviceModel, Mechanics
 from tvsbayes.positioner.protocol import (
     SETTINGS,
     Reply,
+    Unasked,
     frame,
     parse_answer,
     request,
