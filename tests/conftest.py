@@ -28,13 +28,14 @@ from tvsbayes.instrument.plan import PlanStep
 from tvsbayes.instrument.rig import Rig, read_rig
 from tvsbayes.twin.simulated_campaign import SimulatedCampaign, Truth, simulate
 
+pytest_plugins = ("support.coarse_planning", "support.invented_studies")
+
 ROOT = Path(__file__).resolve().parents[1]
 pytest_plugins = ["support.commands", "support.reported_twin"]
 """Fixtures of commands and of the report, by the modules that hold their helpers."""
 COMPILES = "cli/test_estimate_commands.py"
 LONG = (
     *(
-        "planning/test_planner.py",
         "report/test_page.py",
         "cli/test_campaign_commands.py",
         "posterior/test_sampling.py",
@@ -49,6 +50,14 @@ LONG = (
         "assessment/test_causes.py",
     ),
     *(
+        "planning/test_candidates.py",
+        "planning/test_expectation.py",
+        "cli/test_planning_commands.py",
+        "planning/test_plan_check.py",
+        "planning/test_planner.py",
+        "planning/test_limits.py",
+    ),
+    *(
         "posterior/test_transport.py",
         "statistics/test_least_squares.py",
         "estimators/test_likelihood.py",
@@ -59,7 +68,7 @@ LONG = (
         "cameras/test_stereo_calibration.py",
         "coordinates/test_location.py",
         "estimators/test_joint_fit.py",
-        "studies/test_study.py",
+        "studies/test_executors.py",
         "cli/test_use_commands.py",
     ),
     *(

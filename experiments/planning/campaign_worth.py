@@ -84,7 +84,7 @@ def one_row(task: tuple[str, int]) -> dict[str, object]:
 
     name, index = task
     steps, rig = plan_and_rig(name)
-    return {"name": name, **study_row(StudyJob(rig, tuple(steps), parse_target(DEFAULT_TARGET), SEED), index)}
+    return {"name": name, **study_row(StudyJob(rig, tuple(steps), parse_target(DEFAULT_TARGET), SEED), index).as_json()}
 
 
 def table(arguments: argparse.Namespace) -> None:

@@ -11,6 +11,7 @@ from __future__ import annotations
 import os
 import signal
 import tempfile
+from dataclasses import replace
 from pathlib import Path
 
 from experiments.common.command_line import print_only
@@ -18,7 +19,8 @@ from experiments.common.rigs import mounted_rig, small_plan
 from tvsbayes.estimators.campaign_arrays import use_compilation_cache
 from tvsbayes.planning.target import DEFAULT_TARGET, parse_target
 from tvsbayes.studies.executors import SINGLE_THREADED
-from tvsbayes.studies.study import StudyRows, study
+from tvsbayes.studies.rows import StudyRow, StudyRows
+from tvsbayes.studies.study import study
 from tvsbayes.studies.study_job import StudyJob
 
 CAMPAIGNS = 10
@@ -34,8 +36,8 @@ def main() -> None:
     use_compilation_cache()
     job = StudyJob(mounted_rig(), small_plan(("d1", "d3")), parse_target(DEFAULT_TARGET), 3)
 
-    def numbers(path: Path) -> dict[int, dict]:
-        return {i: {k: v for k, v in r.items() if k != "seconds"} for i, r in StudyRows(path).of(job).items()}
+    def numbers(path: Path) -> dict[int, StudyRow]:
+        return {i: replace(row, seconds=0.0) for i, row in StudyRows(path).of(job.key).items()}
 
     with tempfile.TemporaryDirectory() as folder:
         on_cluster, serial = Path(folder) / "dask.jsonl", Path(folder) / "serial.jsonl"
@@ -57,7 +59,7 @@ def main() -> None:
         one, other = numbers(on_cluster), numbers(serial)
         lines = on_cluster.read_bytes().count(b"\n")
     print(f"rows on the cluster: {sorted(one)}, lines in the file: {lines}; serial: {sorted(other)}")
-    print(f"every number the same: {one == other}; converged: {sum(r['converged'] for r in one.values())}")
+    print(f"every number the same: {one == other}; converged: {sum(r.converged for r in one.values())}")
 
 
 if __name__ == "__main__":

@@ -33,6 +33,7 @@ from tvsbayes.model.headlines import QUANTITIES
 from tvsbayes.planning.planner import plan
 from tvsbayes.planning.target import DEFAULT_TARGET, parse_target
 from tvsbayes.statistics.intervals import binomial_bounds, rms_bounds, share_interval95
+from tvsbayes.studies.rows import StudyRow
 from tvsbayes.studies.study import study_result
 from tvsbayes.studies.study_job import StudyJob, study_row
 
@@ -73,7 +74,7 @@ def one_row(task: tuple[str, int]) -> dict[str, object]:
     compile_for(96)
 
     name, index = task
-    return {"name": name, **study_row(job_of(name), index)}
+    return {"name": name, **study_row(job_of(name), index).as_json()}
 
 
 def run(arguments: argparse.Namespace) -> None:
@@ -89,7 +90,7 @@ def table(arguments: argparse.Namespace) -> None:
     print("Written by `python -m experiments.planning.prediction table`; bounds at 1e-4.\n")
     for name in NAMES:
         job = job_of(name)
-        chosen = [r for r in rows if r["name"] == name and r["design"] == job.key]
+        chosen = [StudyRow.from_json(r) for r in rows if r["name"] == name and r["design"] == job.key]
         if not chosen:
             continue
         result = study_result(job, chosen)
@@ -117,7 +118,7 @@ def table(arguments: argparse.Namespace) -> None:
     print("|---|---|---|---|---|---|---|---|---|")
     for name in ("n80", "n95"):
         job, stated = job_of(name), kept[name]
-        chosen = [r for r in rows if r["name"] == name and r["design"] == job.key]
+        chosen = [StudyRow.from_json(r) for r in rows if r["name"] == name and r["design"] == job.key]
         if not chosen:
             continue
         result = study_result(job, chosen)

@@ -37,7 +37,8 @@ from tvsbayes.instrument.plan import PlanStep
 from tvsbayes.instrument.rig import Rig
 from tvsbayes.planning.target import DEFAULT_TARGET, parse_target
 from tvsbayes.posterior.sampling import sample
-from tvsbayes.studies.study import StudyRows, study
+from tvsbayes.studies.rows import StudyRows
+from tvsbayes.studies.study import study
 from tvsbayes.studies.study_job import StudyJob
 from tvsbayes.twin.simulated_campaign import simulate
 
@@ -120,7 +121,9 @@ def studied(rig: Rig, plan: Sequence[PlanStep], scratch: Path) -> dict[str, obje
         except Exception as error:
             found[engine] = f"not run: {str(error)[:100]}"
             continue
-        found[engine] = {i: {k: v for k, v in r.items() if k != "seconds"} for i, r in sorted(rows.of(job).items())}
+        found[engine] = {
+            i: {k: v for k, v in row.as_json().items() if k != "seconds"} for i, row in sorted(rows.of(job.key).items())
+        }
     return found
 
 

@@ -23,7 +23,6 @@ from tvsbayes.instrument.campaign import (
     write_campaign,
 )
 from tvsbayes.instrument.parameters import Prior
-from tvsbayes.instrument.plan import PlanStep, read_plan, write_plan
 from tvsbayes.instrument.rig import RigTable
 
 UNKNOWN_RIGS = Path(__file__).resolve().parents[3] / "shared" / "campaigns"
@@ -207,61 +206,6 @@ def test_a_refused_spot_keeps_its_pixels(tmp_path):
     undetected, refused = read_campaign(tmp_path / "c").spots[6:]
     assert (undetected.status, undetected.u_left_px, undetected.su_left_px) == ("undetected", None, None)
     assert (refused.status, refused.v_left_px) == ("saturated, 41 px", 1e4)
-
-
-PLAN = (
-    PlanStep(0, "home", 0, 0),
-    PlanStep(1, "place", target="d1"),
-    PlanStep(2, "look", target="d1", experiment=0, point=1),
-    PlanStep(3, "move", 200, -5),
-    PlanStep(4, "look"),
-    PlanStep(5, "home", -100, 20),
-    PlanStep(6, "look", experiment=0, point=2),
-)
-
-
-def test_plan_round_trip(tmp_path):
-    write_plan(PLAN, tmp_path / "plan.csv")
-    assert read_plan(tmp_path / "plan.csv") == PLAN
-    text = (tmp_path / "plan.csv").read_text().replace("0,home,0,0,", "0,home,,,")
-    (tmp_path / "plan.csv").write_text(text)
-    assert read_plan(tmp_path / "plan.csv") == PLAN  # home counters default to 0
-
-
-PLAN_REFUSED = {
-    "no home": (1, {"action": "move"}, 2, "action"),
-    "unknown action": (4, {"action": "wait"}, 5, "action"),
-    "gap": (4, {"step": 9}, 5, "step"),
-    "place without target": (2, {"target": ""}, 3, "target"),
-    "place with counters": (2, {"pan_steps": 1}, 3, "pan_steps"),
-    "move without tilt": (4, {"tilt_steps": None}, 5, "tilt_steps"),
-    "move with target": (4, {"target": "d1"}, 5, "target"),
-    "look with counters": (3, {"tilt_steps": 1}, 4, "tilt_steps"),
-    "look at another": (3, {"target": "d2"}, 4, "target"),
-    "point alone": (5, {"point": 2}, 6, "experiment"),
-    "point 5": (3, {"point": 5}, 4, "point"),
-    "point twice": (7, {"point": 1}, 8, "point"),
-    "home with target": (1, {"target": "d1"}, 2, "target"),
-    "far": (4, {"pan_steps": 10**9}, 5, "pan_steps"),
-}
-
-
-@pytest.mark.parametrize("name", PLAN_REFUSED)
-def test_plan_refusals(tmp_path, name):
-    row, change, line, column = PLAN_REFUSED[name]
-    steps = list(PLAN)
-    steps[row - 1] = dataclasses.replace(steps[row - 1], **change)
-    with pytest.raises(InputError) as caught:
-        write_plan(steps, tmp_path / "plan.csv")
-    assert (caught.value.file, caught.value.line, caught.value.column) == ("plan.csv", line, column)
-    assert not (tmp_path / "plan.csv").exists()
-
-
-def test_plan_without_steps_and_look_before_place(tmp_path):
-    with pytest.raises(InputError, match="no rows"):
-        write_plan([], tmp_path / "plan.csv")
-    with pytest.raises(InputError, match="place the target first"):
-        write_plan([PlanStep(0, "home"), PlanStep(1, "look")], tmp_path / "plan.csv")
 
 
 def test_records_are_hashable_and_small():

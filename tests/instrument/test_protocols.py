@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from tvsbayes.instrument.axes import DIRECTION_SIGNS
-from tvsbayes.instrument.plan import PlanStep
-from tvsbayes.instrument.protocols import PROTOCOLS, four_point_protocol, grid_protocol
+from tvsbayes.instrument.plan import PlanStep, read_plan, write_plan
+from tvsbayes.instrument.protocols import OVERSHOOT_STEPS, PROTOCOLS, four_point_protocol, grid_protocol
+from tvsbayes.twin.simulated_campaign import simulate
 
 
 def _approach_signs(plan: tuple[PlanStep, ...]) -> dict[str, set[bool]]:
@@ -91,3 +92,64 @@ def test_grid_sees_every_pose_from_both_sides():
     assert len(seen) == 3 * 24
     for pose, sides in seen.items():
         assert {pan for pan, _ in sides} == {-1, 1} and {tilt for _, tilt in sides} == {-1, 1}, pose
+
+
+@pytest.mark.parametrize("name", PROTOCOLS)
+def test_protocols_are_valid_plans_within_their_range(name, tmp_path):
+    steps = PROTOCOLS[name]()
+    write_plan(steps, tmp_path / "plan.csv")
+    assert read_plan(tmp_path / "plan.csv") == steps
+    # Grid: poses -60 ... 240 and their run-up; the others: 0 ... 200 and theirs.
+    furthest = 240 + OVERSHOOT_STEPS
+    assert all(abs(s.pan_steps) <= furthest and abs(s.tilt_steps) <= furthest for s in steps if s.action == "move")
+    assert any(s.action == "look" for s in steps)
+
+
+@pytest.mark.parametrize("how", ["reversed", "cleared"])
+def test_starts_are_reached_as_ordered(how):
+    """The last move of the axis before point 1 runs against (reversed) or along (cleared) the experiment."""
+    plan = four_point_protocol(3, approaches=dict.fromkeys(DIRECTION_SIGNS, (how,)))
+    directions = [name for name in DIRECTION_SIGNS for _ in range(3)]
+    counters, last_sign, seen = {"pan": 0, "tilt": 0}, {"pan": 0, "tilt": 0}, 0
+    for step in plan:
+        if step.action == "move":
+            for moved, value in (("pan", step.pan_steps), ("tilt", step.tilt_steps)):
+                if value != counters[moved]:
+                    last_sign[moved], counters[moved] = np.sign(value - counters[moved]), value
+        if step.action == "look" and step.point == 1:
+            axis, sign = DIRECTION_SIGNS[directions[step.experiment]]
+            assert last_sign[axis] == (sign if how == "cleared" else -sign)
+            seen += 1
+        if step.action == "look" and step.point == 4:
+            assert last_sign[axis] == sign
+    assert seen == 12
+
+
+def test_step_counts_are_taken_in_turn(mounted_rig):
+    campaign = simulate(mounted_rig, four_point_protocol(2, steps=(100, 200)), seed=1).campaign
+    ends = {s.experiment: campaign.moves[s.move] for s in campaign.spots if s.point == 3}
+    starts = {s.experiment: campaign.moves[s.move] for s in campaign.spots if s.point == 2}
+    lengths = [
+        abs(ends[e].pan_steps - starts[e].pan_steps) + abs(ends[e].tilt_steps - starts[e].tilt_steps) for e in range(8)
+    ]
+    assert lengths == [100, 200] * 4
+
+
+def test_grid_sees_each_pose_from_either_side_of_both_axes(mounted_rig):
+    campaign = simulate(mounted_rig, grid_protocol(targets=("d1",)), seed=1).campaign
+    observed = {s.move for s in campaign.spots}
+    sides: dict[tuple[int, int], list[tuple[int, int]]] = {}
+    sign, previous = {"pan": 1, "tilt": 1}, campaign.moves[0]
+    for move in campaign.moves[1:]:
+        for axis, now, before in (
+            ("pan", move.pan_steps, previous.pan_steps),
+            ("tilt", move.tilt_steps, previous.tilt_steps),
+        ):
+            sign[axis] = sign[axis] if now == before else int(np.sign(now - before))
+        if move.move in observed:
+            sides.setdefault((move.pan_steps, move.tilt_steps), []).append((sign["pan"], sign["tilt"]))
+        previous = move
+    assert len(sides) == 24
+    for pan_signs, tilt_signs in (zip(*seen, strict=True) for seen in sides.values()):
+        assert sorted(pan_signs) == [-1, 1]
+        assert sorted(tilt_signs) == [-1, 1]

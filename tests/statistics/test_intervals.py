@@ -20,6 +20,7 @@ from tvsbayes.statistics.intervals import (
     effective_dof,
     numerical_tolerance,
     recursive_residuals,
+    share_error,
     shortest_interval,
     symmetric_interval,
     validate,
@@ -629,3 +630,13 @@ def test_recursive_residuals_are_independent_and_standard(backwards):
     np.testing.assert_allclose(kept @ np.diag(variances) @ kept.T, np.eye(3), atol=1e-12)
     np.testing.assert_allclose(kept.sum(axis=1), 0.0, atol=1e-12)
     assert recursive_residuals(np.ones(1), np.ones(1), backwards=backwards) == ()
+
+
+def test_no_number_of_draws_makes_an_assurance_certain():
+    """At 0 and 1 the standard deviation of Beta(1/2, n + 1/2); between them the binomial's."""
+    from scipy import stats
+
+    for draws in (20, 200):
+        assert share_error(1.0, draws) == share_error(0.0, draws)
+        assert share_error(0.0, draws) == pytest.approx(stats.beta(0.5, draws + 0.5).std(), rel=1e-12)
+        assert share_error(0.8, draws) == pytest.approx(stats.binom(draws, 0.8).std() / draws, rel=1e-12)

@@ -243,14 +243,14 @@ def study(
     from tvsbayes.planning.target import DEFAULT_TARGET, parse_target
     from tvsbayes.report.command_text import study_text
     from tvsbayes.statistics.intervals import ASSURED
-    from tvsbayes.studies.study import StudyRows
+    from tvsbayes.studies.rows import StudyRows
     from tvsbayes.studies.study import study as run_study
     from tvsbayes.studies.study_job import StudyJob
 
     compile_for(report_line)
     job = StudyJob(instrument, steps, parse_target(target or DEFAULT_TARGET), seed, aperture)
     kept = StudyRows(rows or plan_file.with_suffix(".study.jsonl"))
-    missing = n - sum(index < n for index in kept.of(job))
+    missing = n - sum(index < n for index in kept.of(job.key))
     report_line(f"{n} campaigns, {missing} to go on engine {escaped(engine)}; rows in {escaped(str(kept.path), 200)}")
 
     def progress(done: int, wanted: int) -> None:

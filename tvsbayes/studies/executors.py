@@ -1,4 +1,7 @@
-"""In this process, in many, or on a cluster."""
+"""Where the rows of a study are made: in this process, in spawned processes, or on a Dask cluster.
+
+Every worker has one thread, so that the sums of a row are the same on every engine.
+"""
 
 from __future__ import annotations
 
@@ -12,6 +15,7 @@ from typing import Protocol
 
 from tvsbayes.errors import InputError, escaped
 from tvsbayes.estimators.campaign_arrays import use_compilation_cache
+from tvsbayes.studies.rows import StudyRow
 from tvsbayes.studies.study_job import StudyJob, study_row
 
 ENGINES = ("serial", "processes", "dask")
@@ -25,7 +29,7 @@ SINGLE_THREADED = {
 """Read by XLA and OpenBLAS when a process starts: one thread per worker, and the same sums on every engine."""
 
 
-def _in_worker(job: StudyJob, index: int) -> dict[str, object]:
+def _in_worker(job: StudyJob, index: int) -> StudyRow:
     """`study_row` in a process of its own, which may keep compiled functions."""
     use_compilation_cache()
     return study_row(job, index)
@@ -37,7 +41,7 @@ class Executor(Protocol):
     def submit(self, job: StudyJob, index: int) -> None:
         """Order one row."""
 
-    def as_completed(self) -> Iterator[dict[str, object]]:
+    def as_completed(self) -> Iterator[StudyRow]:
         """Rows in the order in which they are finished."""
 
 
@@ -51,7 +55,7 @@ class SerialExecutor:
         """Order one row."""
         self._ordered.append((job, index))
 
-    def as_completed(self) -> Iterator[dict[str, object]]:
+    def as_completed(self) -> Iterator[StudyRow]:
         """Rows in order."""
         for job, index in self._ordered:
             yield study_row(job, index)
@@ -74,7 +78,7 @@ class ProcessExecutor:
         """Order one row."""
         self._ordered.append(self.pool.submit(_in_worker, job, index))
 
-    def as_completed(self) -> Iterator[dict[str, object]]:
+    def as_completed(self) -> Iterator[StudyRow]:
         """Rows as they come.
 
         Raises:
@@ -98,7 +102,7 @@ class DaskExecutor:
         """Order one row."""
         self._ordered.append(self.client.submit(_in_worker, job, index, pure=False, retries=3))
 
-    def as_completed(self) -> Iterator[dict[str, object]]:
+    def as_completed(self) -> Iterator[StudyRow]:
         """Rows as they come.
 
         Raises:

@@ -1,100 +1,25 @@
 """Studies: the twin runs a plan many times, every campaign is fitted, coverage, power and assurance are counted.
 
-Rows are made by an executor (this process, spawned processes, a Dask cluster) and kept in a file of JSON lines, keyed
-by the hash of everything that decides them and the campaign's number: a study goes on where it was interrupted, and
-its numbers do not depend on the engine. Units are those of DESIGN 8.
+Rows that are kept already are not made again: a study goes on where it was interrupted, and its numbers do not depend
+on the engine. Headlines in deg/step, deg and mm.
 """
 
 from __future__ import annotations
 
-import json
 import math
-import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import BinaryIO
 
 import numpy as np
 
-from tvsbayes.errors import InputError, NotConverged, escaped, refusal
-from tvsbayes.files.disk import read_bytes
+from tvsbayes.errors import NotConverged
 from tvsbayes.instrument.axes import DIRECTION_SIGNS
 from tvsbayes.model.headlines import QUANTITIES
 from tvsbayes.planning.target import Target
 from tvsbayes.statistics.intervals import LEVELS, NORMAL_95, binomial_bounds, rms_bounds, share_interval95
 from tvsbayes.studies.executors import executor
-from tvsbayes.studies.study_job import STUDY_FORMAT, StudyJob
-
-ROWS_BYTES_MAX = 128 * 1024 * 1024
-
-
-class StudyRows:
-    """Rows of studies in a file of JSON lines: appended one by one, each on disk before the next.
-
-    A process that is killed while it writes leaves a torn last line; it is cut off when the file is opened again.
-    """
-
-    def __init__(self, path: Path) -> None:
-        self.path = Path(path)
-        data = read_bytes(self.path, ROWS_BYTES_MAX) if self.path.exists() else b""
-        whole = data[: data.rfind(b"\n") + 1]
-        self.rows: dict[tuple[str, int], dict[str, object]] = {}
-        for number, line in enumerate(whole.splitlines(), 1):
-            row = self._row(line, number)
-            self.rows[row["design"], row["index"]] = row
-        self.torn = len(data) - len(whole)
-        # Before the first campaign is fitted, not after.
-        if not os.access(self.path if self.path.exists() else self.path.parent, os.W_OK):
-            raise self._unwritable("no right to write, or no such folder")
-
-    def _unwritable(self, found: str) -> InputError:
-        allowed, remedy = "a file that can be written", "name another with --rows"
-        return refusal("write", file=escaped(str(self.path), 200), found=found, allowed=allowed, remedy=remedy)
-
-    @contextmanager
-    def _open(self) -> Iterator[BinaryIO]:
-        """The file, for reading and writing; made where there is none."""
-        try:
-            with self.path.open("r+b" if self.path.exists() else "w+b") as file:
-                yield file
-        except OSError as error:
-            raise self._unwritable(escaped(error.strerror or str(error))) from error
-
-    def _row(self, line: bytes, number: int) -> dict[str, object]:
-        try:
-            row = json.loads(line)
-            if row["format"] == STUDY_FORMAT and isinstance(row["design"], str) and isinstance(row["index"], int):
-                return row
-        except (ValueError, KeyError, TypeError, RecursionError):
-            pass
-        raise InputError(
-            "study-row",
-            f"{escaped(self.path.name)} line {number} is no row of a study",
-            file=escaped(self.path.name),
-            line=number,
-            allowed=f"lines written by `tvsbayes study` ({STUDY_FORMAT})",
-            remedy="name another file with --rows",
-        )
-
-    def of(self, job: StudyJob) -> dict[int, dict[str, object]]:
-        """Rows of one design by index."""
-        return {index: row for (design, index), row in self.rows.items() if design == job.key}
-
-    def append(self, row: dict[str, object]) -> None:
-        """Add a row and wait until the disk has it."""
-        row = {"format": STUDY_FORMAT, **row}
-        line = json.dumps(row, allow_nan=False).encode() + b"\n"
-        with self._open() as file:
-            if self.torn:
-                file.truncate(self.path.stat().st_size - self.torn)
-                self.torn = 0
-            file.seek(0, os.SEEK_END)
-            file.write(line)
-            file.flush()
-            os.fsync(file.fileno())
-        self.rows[row["design"], row["index"]] = row
+from tvsbayes.studies.rows import StudyRow, StudyRows
+from tvsbayes.studies.study_job import StudyJob
 
 
 @dataclass(frozen=True)
@@ -163,14 +88,14 @@ class StudyResult:
         return {**document, "target": self.target.as_json(), "problems": list(self.problems)}
 
 
-def study_result(job: StudyJob, rows: Sequence[Mapping[str, object]]) -> StudyResult:
+def study_result(job: StudyJob, rows: Sequence[StudyRow]) -> StudyResult:
     """Count rows of a study.
 
     Raises:
         NotConverged: not one fit ended well.
     """
-    good = [row for row in rows if row["converged"]]
-    problems = tuple(f"campaign {r['index']}: {'; '.join(r['problems'])}" for r in rows if not r["converged"])
+    good = [row for row in rows if row.converged]
+    problems = tuple(f"campaign {row.index}: {'; '.join(row.problems)}" for row in rows if not row.converged)
     if not good:
         message = "no fit of the study converged" + (f"; {problems[0]}" if problems else "")
         raise NotConverged("not-converged", message, remedy="check the plan with `tvsbayes check RIG PLAN`")
@@ -178,12 +103,12 @@ def study_result(job: StudyJob, rows: Sequence[Mapping[str, object]]) -> StudyRe
     stated = {d: job.rig.table.priors[f"degrees_per_step.{axis}"].value for d, (axis, _) in DIRECTION_SIGNS.items()}
     found = {}
     for name in QUANTITIES:
-        entries = [row["headlines"][name] for row in good]
-        if all(e["interval95"][0] == e["interval95"][1] for e in entries):
+        entries = [row.headlines[name] for row in good]
+        if all(e.interval95[0] == e.interval95[1] for e in entries):
             continue
-        truth, value, sd, pit, predicted = (
-            np.array([e[key] for e in entries]) for key in ("truth", "value", "sd", "pit", "predicted_sd")
-        )
+        truth, value, sd, pit, predicted = np.array(
+            [(e.truth, e.value, e.sd, e.pit, e.predicted_sd) for e in entries]
+        ).T
         error = value - truth
         null = stated.get(name, job.rig.table.priors["mirror_offset_mm"].value if name == "mirror_offset" else 0.0)
         found[name] = HeadlineStudy(
@@ -196,7 +121,7 @@ def study_result(job: StudyJob, rows: Sequence[Mapping[str, object]]) -> StudyRe
             power=float(np.mean(np.abs(value - null) > NORMAL_95 * sd)),
             sd=float(np.median(sd)),
         )
-    reported = np.array([row["target"] for row in good if row["target"] is not None])
+    reported = np.array([row.target for row in good if row.target is not None])
     hits = int(np.sum(reported <= job.target.limit))
     low, middle, high = np.quantile(reported, [0.05, 0.5, 0.95]) if len(reported) else (math.nan,) * 3
     return StudyResult(
@@ -209,7 +134,7 @@ def study_result(job: StudyJob, rows: Sequence[Mapping[str, object]]) -> StudyRe
         assurance=hits / len(rows),
         assurance_interval95=share_interval95(hits, len(rows)),
         reported=(float(low), float(middle), float(high)) if len(reported) else None,
-        seconds=float(np.median([row["seconds"] for row in rows])),
+        seconds=float(np.median([row.seconds for row in rows])),
         problems=problems,
     )
 
@@ -239,7 +164,7 @@ def study(
         InputError: no such engine.
         NotConverged: not one fit ended well.
     """
-    done = rows.of(job)
+    done = rows.of(job.key)
     missing = [index for index in range(count) if index not in done]
     if missing:
         with executor(engine, min(workers, len(missing)), address) as running:
@@ -249,5 +174,5 @@ def study(
                 rows.append(row)
                 if progress is not None:
                     progress(finished, count)
-    made = rows.of(job)
+    made = rows.of(job.key)
     return study_result(job, [made[index] for index in range(count)])

@@ -1,4 +1,7 @@
-"""A plan simulated and fitted once."""
+"""What a study asks, and one row of it: a plan simulated and fitted once, beside the truth and the planner's forecast.
+
+Headlines in deg/step, deg and mm; coordinates z have prior N(0, 1) each.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +10,7 @@ import json
 import math
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from importlib.metadata import version
 
@@ -28,10 +31,10 @@ from tvsbayes.planning.candidates import covariance_of
 from tvsbayes.planning.expectation import Knowledge, information_of, prior_knowledge
 from tvsbayes.planning.forecast import truth_in
 from tvsbayes.planning.target import Target, sensitivity
+from tvsbayes.studies.rows import STUDY_FORMAT, HeadlineRow, StudyRow
 from tvsbayes.twin.physics import effective_deg_per_step, effective_mirror_offset_mm
-from tvsbayes.twin.simulated_campaign import simulate
+from tvsbayes.twin.simulated_campaign import Truth, simulate
 
-STUDY_FORMAT = "tvsbayes-study/1"
 ITERATIONS = 6
 """Of slope and width of a backlash: the width's error falls at least threefold each."""
 
@@ -70,7 +73,7 @@ class StudyJob:
 
 def true_headlines(parameters: Mapping[str, float], pose_rad: np.ndarray) -> np.ndarray:
     """`QUANTITIES` of a true rig by the twin's formulas, at a pose."""
-    pose = tuple(np.degrees(pose_rad))
+    pose = float(np.degrees(pose_rad[0])), float(np.degrees(pose_rad[1]))
     ratio = effective_deg_per_step(parameters, pose)
     return np.array(
         [
@@ -84,51 +87,56 @@ def true_headlines(parameters: Mapping[str, float], pose_rad: np.ndarray) -> np.
     )
 
 
-def study_row(job: StudyJob, index: int) -> dict[str, object]:
+def study_row(job: StudyJob, index: int) -> StudyRow:
     """Simulate one campaign, fit it (Laplace), compare with the truth and with what the planner predicted there.
 
     Whatever fails is a row as well: failures are counted, never dropped.
     """
-    start = time.perf_counter()
-    seed = job.campaign_seed(index)
+    start, seed = time.perf_counter(), job.campaign_seed(index)
     run = simulate(job.rig, job.steps, seed, aperture=job.aperture)
-    row: dict[str, object] = {"design": job.key, "index": index, "seed": seed, "converged": False}
-    row["unseen"] = sum(spot.status != "ok" for spot in run.campaign.spots)
+    row = StudyRow(job.key, index, seed, False, sum(spot.status != "ok" for spot in run.campaign.spots), (), 0.0)
     try:
         result = fit(run.campaign)
     except TvsError as error:
-        return {**row, "problems": [error.message], "seconds": time.perf_counter() - start}
-    row |= {"converged": result.converged, "problems": list(result.problems)}
-    knowledge = prior_knowledge(job.rig)
-    truth = truth_in(knowledge, run.truth.parameters, run.truth.stereo.vector)
-    pose = result.reference_pose_rad
+        return replace(row, problems=(error.message,), seconds=time.perf_counter() - start)
+    try:
+        at = sensitivity(job.target, result.z, result.space, job.rig.table, result.reference_pose_rad)
+        value = at.value(result.covariance, job.target.factor)
+    except InputError:
+        value = None
+    return replace(
+        row,
+        converged=result.converged,
+        problems=tuple(result.problems),
+        headlines=_compared(job, result, run.truth),
+        target=value,
+        seconds=time.perf_counter() - start,
+    )
+
+
+def _compared(job: StudyJob, result: JointFit, true: Truth) -> dict[str, HeadlineRow]:
+    """Every headline of a fit beside the truth, and beside what the planner predicts at that truth."""
+    knowledge, pose = prior_knowledge(job.rig), result.reference_pose_rad
+    truth = truth_in(knowledge, true.parameters, true.stereo.vector)
     information = information_of(job.steps, knowledge, aperture=job.aperture, z=truth.z, space=truth.space)
     with jax.enable_x64(True):
         at_truth = headlines(jnp.asarray(truth.z), truth.space, jnp.asarray(pose))
         at_mode = headlines(jnp.asarray(result.z), result.space, jnp.asarray(pose))
-    gradient = np.asarray(at_truth.gradient)
-    predicted_sd = predicted_sds(knowledge, information.fisher, gradient, truth.z)
-    true = true_headlines(run.truth.parameters, pose)
-    draws = _headline_draws(result)
-    value, sd = np.asarray(at_mode.value), draws.std(axis=0)
+    predicted = predicted_sds(knowledge, information.fisher, np.asarray(at_truth.gradient), truth.z)
+    values, draws = true_headlines(true.parameters, pose), _headline_draws(result)
     low, high = np.quantile(draws, [0.025, 0.975], axis=0)
-    row["headlines"] = {
-        name: {
-            "truth": float(true[k]),
-            "value": float(value[k]),
-            "sd": float(sd[k]),
-            "interval95": [float(low[k]), float(high[k])],
-            "pit": float(np.mean(draws[:, k] < true[k])),
-            "predicted_sd": float(predicted_sd[k]),
-        }
+    sd = draws.std(axis=0)
+    return {
+        name: HeadlineRow(
+            truth=float(values[k]),
+            value=float(at_mode.value[k]),
+            sd=float(sd[k]),
+            interval95=(float(low[k]), float(high[k])),
+            pit=float(np.mean(draws[:, k] < values[k])),
+            predicted_sd=float(predicted[k]),
+        )
         for k, name in enumerate(QUANTITIES)
     }
-    try:
-        at = sensitivity(job.target, result.z, result.space, job.rig.table, pose)
-        row["target"] = at.value(result.covariance, job.target.factor)
-    except InputError:
-        row["target"] = None
-    return {**row, "seconds": time.perf_counter() - start}
 
 
 def predicted_sds(knowledge: Knowledge, fisher: np.ndarray, gradient: np.ndarray, z: np.ndarray) -> np.ndarray:

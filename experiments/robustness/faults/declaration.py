@@ -114,7 +114,7 @@ FAULTS = (
         "deviation = max(np.abs(rotation @ rotation.T - np.eye(3)).max(), abs(np.linalg.det(rotation) - 1.0))",
         "deviation = np.abs(rotation @ rotation.T - np.eye(3)).max()",
         "a left-handed camera frame passes",
-        ("instrument/rig",),
+        ("instrument/stereo_pair",),
     ),
     Fault(
         "rendered pixels half a pixel off",

@@ -9,7 +9,7 @@ FAULTS = (
         "rows = np.asarray(found.rows)[..., :PARAMETERS].reshape(-1, PARAMETERS)",
         "rows = np.asarray(found.rows)[:-1, :, :PARAMETERS].reshape(-1, PARAMETERS)",
         "plans look slightly worse than they are",
-        ("planning/planner::test_a_plans_information_is_the_fits_own",),
+        ("planning/expectation::test_a_plans_information_is_the_fits_own",),
     ),
     Fault(
         "run-up checked on the wrong side",
@@ -17,7 +17,7 @@ FAULTS = (
         "start = positions.steps - np.array(side) * overshoot",
         "start = positions.steps + np.array(side) * overshoot",
         "plans run into the motor limits",
-        ("planning/forecast",),
+        ("planning/candidates",),
         survived="known: limits were tried with a grid that has no position near them on the side that matters.",
     ),
     Fault(
@@ -26,7 +26,7 @@ FAULTS = (
         "scale = np.asarray(space.u)[CONTRAST_COLUMNS] * np.pi / 360",
         "scale = np.asarray(space.u)[CONTRAST_COLUMNS] * np.pi / 180",
         "the contrast seems known twice as well",
-        ("planning/planner::test_looks_add_up_to_the_plan_they_make",),
+        ("planning/candidates::test_looks_add_up_to_the_plan_they_make",),
     ),
     Fault(
         "time model: seconds per hour",
@@ -34,7 +34,7 @@ FAULTS = (
         "plan_seconds(rig, steps) / 60",
         "plan_seconds(rig, steps) / 3600",
         "minutes are hours",
-        ("planning/forecast",),
+        ("planning/expectation",),
     ),
     Fault(
         "assurance off by one experiment",
@@ -42,7 +42,7 @@ FAULTS = (
         "while above - below > 1:",
         "while above - below > 2:",
         "n80 and n95 one too large",
-        ("planning/forecast",),
+        ("planning/search",),
         survived="read: the assurance at n80 and n95 was asked for, not that one less fails.",
     ),
     Fault(
@@ -51,7 +51,7 @@ FAULTS = (
         '1.0 if match["kind"] == "u" else NORMAL_95',
         '1.0 if match["kind"] == "u" else 1.0',
         "targets of U95 are met by half as many experiments",
-        ("planning/planner::test_targets_are_read",),
+        ("planning/target::test_targets_are_read",),
     ),
     Fault(
         "classic count with n degrees of freedom",
@@ -59,7 +59,7 @@ FAULTS = (
         "wanted = max(2, math.ceil((coverage_factor(n - 1)",
         "wanted = max(2, math.ceil((coverage_factor(n)",
         "a repeat too few",
-        ("planning/planner::test_the_classics_count_is_the_first_that_suffices",),
+        ("planning/forecast::test_the_classics_count_is_the_first_that_suffices",),
     ),
     Fault(
         "scatter known as if no parameter were fitted",
@@ -67,7 +67,7 @@ FAULTS = (
         "left_over = max(0.0, 1 - determined / (2 * looks))",
         "left_over = 1.0",
         "n for n - p: assurance too high",
-        ("planning/planner::test_what_the_geometry_takes_from_the_stops_is_not_left_for_their_scatter",),
+        ("planning/forecast::test_what_the_geometry_takes_from_the_stops_is_not_left_for_their_scatter",),
     ),
     Fault(
         "next looks: a full turn away taken for here",
@@ -75,7 +75,7 @@ FAULTS = (
         "(found.turned | (not turned))",
         "(~found.turned | (not turned))",
         "a full turn away is promised, looks nearby are ordered",
-        ("planning/planner::test_next_looks_are_worth_what_they_say_here_and_a_full_turn_away",),
+        ("planning/limits::test_next_looks_are_worth_what_they_say_here_and_a_full_turn_away",),
         survived="planted by a reviewer: only the order of the next looks was asked for.",
     ),
     Fault(
@@ -84,7 +84,7 @@ FAULTS = (
         "range(PARAMETERS, PARAMETERS + 2)] = 1 / HOME_VARIANCE_RAD2",
         "range(PARAMETERS, PARAMETERS + 2)] = HOME_VARIANCE_RAD2",
         "looks after a campaign are chosen as if homing told nothing",
-        ("planning/planner::test_a_search_after_data_knows_no_home_offset",),
+        ("planning/search::test_a_search_after_data_knows_no_home_offset",),
         survived="planted by a reviewer: any design of the search was good enough for its test.",
     ),
     Fault(
@@ -93,7 +93,7 @@ FAULTS = (
         "merit(other) > merit(plain) else",
         "merit(other) < merit(plain) else",
         "the plan is the worse of two",
-        ("planning/planner::test_exchanges_are_kept_where_they_raise_assurance_or_lower_the_median",),
+        ("planning/search::test_exchanges_are_kept_where_they_raise_assurance_or_lower_the_median",),
         survived="planted by a reviewer: no test compared the design with the one before its exchanges.",
     ),
     Fault(
@@ -102,7 +102,7 @@ FAULTS = (
         'parts["pixel noise"] = float(pull @ noise @ pull)',
         'parts["pixel noise"] = float(pull @ (data - noise) @ pull)',
         "better cameras are bought where stops are the trouble",
-        ("planning/forecast::test_shares_of_two_parameters_by_hand",),
+        ("planning/limits::test_shares_of_two_parameters_by_hand",),
         survived="planted by a reviewer: shares were asked to add up, not to be right.",
     ),
     Fault(
@@ -111,7 +111,7 @@ FAULTS = (
         "+= share**-2 - 1",
         "+= share**-1 - 1",
         "an input is asked for far better than needed",
-        ("planning/forecast::test_an_input_has_to_be_known_as_much_better_as_the_floor_is_too_high",),
+        ("planning/limits::test_an_input_has_to_be_known_as_much_better_as_the_floor_is_too_high",),
         survived="planted by a reviewer: the words of the advice were asked for, not its number.",
     ),
     Fault(
@@ -120,7 +120,7 @@ FAULTS = (
         "= {_at_most(share * u)} instead of",
         "= {_at_most(u)} instead of",
         "the cure of a floor is what is there already",
-        ("planning/planner::test_a_target_below_the_floor_names_the_term_and_what_would_do",),
+        ("planning/limits::test_a_target_below_the_floor_names_the_term_and_what_would_do",),
         survived="planted by a reviewer: the words of the advice were asked for, not its number.",
     ),
     Fault(
@@ -129,7 +129,7 @@ FAULTS = (
         "last * math.floor(value / last + 1e-9)",
         "last * math.ceil(value / last - 1e-9)",
         "what would do does not do",
-        ("planning/forecast::test_what_is_needed_is_never_rounded_up",),
+        ("planning/limits::test_what_is_needed_is_never_rounded_up",),
     ),
     Fault(
         "measuring stops at a hundredth of the value a minute",
@@ -137,7 +137,7 @@ FAULTS = (
         "worth = STOP_SHARE_PER_MINUTE * now",
         "worth = 10 * STOP_SHARE_PER_MINUTE * now",
         "a campaign ends ten times too early",
-        ("planning/forecast::test_measuring_stops_below_a_thousandth_of_the_value_a_minute",),
+        ("planning/limits::test_measuring_stops_below_a_thousandth_of_the_value_a_minute",),
         survived="planted by a reviewer: the rule was tried far from its threshold only.",
     ),
     Fault(
@@ -191,7 +191,7 @@ FAULTS = (
         "own[:, :2].sum(axis=1)",
         "own[:, :1].sum(axis=1)",
         "z of a point seems as sure as its calibration",
-        ("planning/planner::test_stops_and_reading_at_a_point_are_those_of_the_twins_optics",),
+        ("planning/target::test_stops_and_reading_at_a_point_are_those_of_the_twins_optics",),
         survived="planted by a reviewer: only x was tried, in which the tilt's stop is of second order.",
     ),
     Fault(

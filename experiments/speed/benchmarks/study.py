@@ -24,7 +24,8 @@ def measure(bench: Bench) -> None:
     from experiments.common.rigs import mounted_rig, small_plan
     from tvsbayes.estimators.campaign_arrays import use_compilation_cache
     from tvsbayes.planning.target import DEFAULT_TARGET, parse_target
-    from tvsbayes.studies.study import StudyRows, study
+    from tvsbayes.studies.rows import StudyRows
+    from tvsbayes.studies.study import study
     from tvsbayes.studies.study_job import StudyJob
 
     use_compilation_cache()

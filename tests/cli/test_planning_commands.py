@@ -1,0 +1,93 @@
+"""`plan`, `check RIG PLAN` and `study` as commands."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import pytest
+
+from tvsbayes.files.disk import shipped_data
+from tvsbayes.instrument.plan import read_plan
+from tvsbayes.model.headlines import QUANTITIES
+from tvsbayes.planning import planner
+
+pytestmark = pytest.mark.usefixtures("small_searches")
+
+
+@pytest.fixture
+def ask(capsys, monkeypatch):
+    """Run a command with --json without touching JAX's settings: exit code and document."""
+    from tvsbayes.cli.main import run
+
+    monkeypatch.setattr("tvsbayes.estimators.campaign_arrays.use_compilation_cache", lambda: False)
+    monkeypatch.setattr("tvsbayes.studies.executors.use_compilation_cache", lambda: False)
+
+    def command(*arguments) -> tuple[int, dict]:
+        code = run([*map(str, arguments), "--json"])
+        return code, json.loads(capsys.readouterr().out)
+
+    return command
+
+
+MOUNTED = shipped_data() / "rigs" / "mounted"
+
+
+def test_plan_writes_a_plan_and_says_by_its_exit_code_whether_the_users_target_is_met(ask, tmp_path):
+    small = ("--draws", 20, "--minutes", 3, "-o", tmp_path / "plan.csv")
+    code, document = ask("plan", MOUNTED / "rig.toml", "--target", "u(left) <= 1e-7 deg/step", *small)
+    assert code == 1 and not document["met"] and document["n80"] is None
+    assert document["limited_by"]["reachable"] is False and document["limited_by"]["needed"]
+    assert sum(s.action == "look" for s in read_plan(tmp_path / "plan.csv")) == document["looks"]
+    assert document["minutes"] <= 3
+    code, document = ask("plan", MOUNTED / "rig.toml", *small)
+    assert code == 0 and not document["met"], "the default target is nobody's demand"
+    code, document = ask("plan", MOUNTED / "rig.toml", "--target", "u(left) <= 5e-3 deg/step", *small)
+    assert code == 0 and document["met"]
+
+
+def test_a_plan_with_nothing_left_to_measure_says_that_it_wrote_none(capsys, tmp_path, monkeypatch):
+    from tvsbayes.cli.main import run
+
+    whole = planner.plan
+    monkeypatch.setattr("tvsbayes.estimators.campaign_arrays.use_compilation_cache", lambda: False)
+    monkeypatch.setattr("tvsbayes.studies.executors.use_compilation_cache", lambda: False)
+    monkeypatch.setattr(
+        "tvsbayes.planning.planner.plan", lambda *given, **options: replace(whole(*given, **options), steps=())
+    )
+    place = tmp_path / "plan.csv"
+    code = run([*map(str, ("plan", MOUNTED / "rig.toml", "--draws", 20, "--minutes", 3, "-o", place))])
+    assert code == 0 and not place.exists()
+    assert f"nothing written to {place}" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("options", [("--target", "u(left) <= 1 mm"), ("--criterion", "E"), ("--minutes", "0.2")])
+def test_bad_options_of_plan_are_refused(ask, options):
+    code, document = ask("plan", MOUNTED / "rig.toml", "--draws", 20, *options)
+    assert code == 2
+    assert document["error"]["column"] == options[0]
+    assert document["error"]["allowed"] and document["error"]["remedy"]
+
+
+def test_check_takes_a_rig_with_a_plan(ask):
+    code, document = ask("check", MOUNTED / "rig.toml", MOUNTED / "grid.csv")
+    assert code == 0 and document["kind"] == "rig with plan" and document["warnings"] == []
+    assert set(document["expected"]) == set(QUANTITIES)
+    code, document = ask("check", MOUNTED / "grid.csv", MOUNTED / "grid.csv")
+    assert code == 2 and document["error"]["code"] == "usage"
+
+
+def test_study_counts_and_answers_for_the_users_target(ask, tmp_path, monkeypatch):
+    from support.invented_studies import invented
+
+    monkeypatch.setattr("tvsbayes.studies.study_job.study_row", invented)
+    monkeypatch.setattr("tvsbayes.studies.executors.study_row", invented)
+    rows = ("--n", 8, "--rows", tmp_path / "rows.jsonl")
+    target = ("--target", "u(worst) <= 1e-3 deg/step")
+    code, document = ask("study", MOUNTED / "rig.toml", MOUNTED / "grid.csv", *rows, *target)
+    assert code == 1 and document["assurance"] == 0.75, "three of four invented fits meet it, 80 % are asked"
+    assert document["campaigns"] == 8 and (tmp_path / "rows.jsonl").read_bytes().count(b"\n") == 8
+    code, _ = ask("study", MOUNTED / "rig.toml", MOUNTED / "grid.csv", *rows)
+    assert code == 0
+    code, document = ask("study", MOUNTED / "rig.toml", MOUNTED / "grid.csv", "--engine", "cloud")
+    assert code == 2 and document["error"]["column"] == "--engine"

@@ -1,0 +1,128 @@
+"""What a campaign tells before any fit: readable numbers that no rig can have measured are named."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tvsbayes.cli.main import run
+from tvsbayes.estimators.plausibility import check_campaign
+from tvsbayes.files.disk import shipped_data
+from tvsbayes.instrument.campaign import Campaign, read_campaign, write_campaign
+from tvsbayes.instrument.protocols import PROTOCOLS
+from tvsbayes.twin.simulated_campaign import simulate
+
+
+@pytest.fixture(scope="module")
+def paper_twin() -> Campaign:
+    return read_campaign(shipped_data() / "twins" / "paper_twin")
+
+
+def warnings_of(campaign: Campaign) -> str:
+    return "\n".join(check_campaign(campaign).warnings)
+
+
+@pytest.mark.parametrize(("name", "experiments", "readings"), [("paper_twin", 96, 0), ("grid_twin", 0, 144)])
+def test_shipped_twins_have_no_warning(name, experiments, readings):
+    found = check_campaign(read_campaign(shipped_data() / "twins" / name))
+    assert found.warnings == ()
+    assert (found.experiments, found.aperture_readings, found.refused) == (experiments, readings, {})
+    assert found.ok_spots == found.spots
+
+
+def test_the_papers_protocol_is_warned_of_on_both_axes(mounted_rig):
+    text = warnings_of(simulate(mounted_rig, PROTOCOLS["paper"](), seed=2).campaign)
+    # Not "only one": between pan and tilt experiments each axis goes to its middle once.
+    for axis in ("pan", "tilt"):
+        reason = "nearly every leg has |N| = 200 and reverses"
+        assert f"{axis} ratio and {axis} backlash are hard to tell apart: {reason}" in text
+
+
+def test_swapped_cameras_are_suspected(paper_twin):
+    spots = tuple(
+        replace(
+            s,
+            u_left_px=s.u_right_px,
+            v_left_px=s.v_right_px,
+            u_right_px=s.u_left_px,
+            v_right_px=s.v_left_px,
+        )
+        for s in paper_twin.spots
+    )
+    text = warnings_of(replace(paper_twin, spots=spots))
+    assert "are left and right swapped" in text
+    assert "spots 0, 1, 2, 3, 4, 5, 6, 7, 8, 9 and 374 more triangulate outside" in text
+
+
+def test_lengths_in_metres_and_angles_in_radians_are_suspected(paper_twin):
+    metres = replace(paper_twin.stereo, T=paper_twin.stereo.T / 1000)
+    assert "is it in metres?" in warnings_of(replace(paper_twin, stereo=metres))
+    reversed_pair = replace(paper_twin.stereo, T=-paper_twin.stereo.T)
+    assert "second camera" in warnings_of(replace(paper_twin, stereo=reversed_pair))
+    grid = read_campaign(shipped_data() / "twins" / "grid_twin")
+    for change, words in (
+        (np.radians, "are they in radians?"),
+        (lambda reading: -reading, "outside 0 to 180 deg"),
+        (lambda reading: 180.0 + reading, "outside 0 to 180 deg"),
+    ):
+        spots = tuple(replace(s, aperture_deg=float(change(s.aperture_deg))) for s in grid.spots)
+        assert words in warnings_of(replace(grid, spots=spots))
+
+
+def test_a_status_that_misses_its_word_is_named(paper_twin):
+    first, second, *rest = paper_twin.spots
+    spots = (replace(first, status="OK"), replace(second, status="undetected"), *rest)
+    text = warnings_of(replace(paper_twin, spots=spots))
+    assert "spots 0 are left out: their status is not spelt ok" in text
+    assert "spots 1 are undetected and have pixels" in text
+
+
+def test_commands_that_estimate_repeat_what_no_rig_can_have_measured(paper_twin, tmp_path, capfd):
+    """Nothing makes a user run `check` first; stdout stays the document."""
+    spots = tuple(replace(s, u_left_px=s.u_right_px, u_right_px=s.u_left_px) for s in paper_twin.spots)
+    write_campaign(replace(paper_twin, spots=spots), tmp_path / "swapped")
+    run(["classic", str(tmp_path / "swapped"), "--json"])
+    printed = capfd.readouterr()
+    assert "warning: spots 0, 1" in printed.err and "swapped" in printed.err
+    json.loads(printed.out)
+
+
+def test_one_depth_is_named_and_two_are_not(paper_twin):
+    near = tuple(replace(s, experiment=None, point=None) for s in paper_twin.spots if s.target == "d1")
+    assert "all spots lie at one depth" in warnings_of(replace(paper_twin, spots=near))
+    assert "depth" not in warnings_of(paper_twin)
+    # Another warning does not hide it.
+    misspelt = (replace(near[0], status="OK"), *near[1:])
+    assert "all spots lie at one depth" in warnings_of(replace(paper_twin, spots=misspelt))
+
+
+def test_zero_and_assumed_stereo_covariance_are_named(paper_twin):
+    zero = replace(paper_twin.stereo, parameter_covariance=np.zeros((24, 24)))
+    assert "stereo covariance is zero" in warnings_of(replace(paper_twin, stereo=zero))
+    assumed = replace(paper_twin.stereo, assumed=True)
+    assert "stereo covariance is assumed" in warnings_of(replace(paper_twin, stereo=assumed))
+
+
+def test_unknown_approach_is_named_with_its_segment(paper_twin):
+    first = replace(paper_twin.moves[0], tilt_approach="unknown")
+    moves = (first, *paper_twin.moves[1:])
+    assert "segment 0 begins with an unknown approach" in warnings_of(replace(paper_twin, moves=moves))
+
+
+def test_incomplete_experiments_and_refused_spots_are_counted(paper_twin):
+    spots = list(paper_twin.spots)
+    spots[5] = replace(spots[5], status="saturated")
+    found = check_campaign(replace(paper_twin, spots=tuple(spots)))
+    assert found.refused == {"saturated": 1}
+    assert (found.ok_spots, found.experiments) == (383, 95)
+    assert [w for w in found.warnings if w.startswith("experiment 1 is not complete")]
+
+
+def test_a_campaign_without_usable_spots_is_told_once(paper_twin):
+    spots = tuple(replace(s, status="too dim", experiment=None, point=None) for s in paper_twin.spots)
+    found = check_campaign(replace(paper_twin, spots=spots))
+    assert found.ok_spots == 0
+    assert found.warnings == ("no spot has status ok: there is nothing to estimate from",)

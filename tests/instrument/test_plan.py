@@ -1,0 +1,92 @@
+"""Plans: written, read and refused with their place; what following one does."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+
+from tvsbayes.errors import InputError
+from tvsbayes.instrument.plan import PlanBuilder, PlanStep, read_plan, run_plan, write_plan
+
+PLAN = (
+    PlanStep(0, "home", 0, 0),
+    PlanStep(1, "place", target="d1"),
+    PlanStep(2, "look", target="d1", experiment=0, point=1),
+    PlanStep(3, "move", 200, -5),
+    PlanStep(4, "look"),
+    PlanStep(5, "home", -100, 20),
+    PlanStep(6, "look", experiment=0, point=2),
+)
+
+
+def test_plan_round_trip(tmp_path):
+    write_plan(PLAN, tmp_path / "plan.csv")
+    assert read_plan(tmp_path / "plan.csv") == PLAN
+    text = (tmp_path / "plan.csv").read_text().replace("0,home,0,0,", "0,home,,,")
+    (tmp_path / "plan.csv").write_text(text)
+    assert read_plan(tmp_path / "plan.csv") == PLAN  # home counters default to 0
+
+
+PLAN_REFUSED = {
+    "no home": (1, {"action": "move"}, 2, "action"),
+    "unknown action": (4, {"action": "wait"}, 5, "action"),
+    "gap": (4, {"step": 9}, 5, "step"),
+    "place without target": (2, {"target": ""}, 3, "target"),
+    "place with counters": (2, {"pan_steps": 1}, 3, "pan_steps"),
+    "move without tilt": (4, {"tilt_steps": None}, 5, "tilt_steps"),
+    "move with target": (4, {"target": "d1"}, 5, "target"),
+    "look with counters": (3, {"tilt_steps": 1}, 4, "tilt_steps"),
+    "look at another": (3, {"target": "d2"}, 4, "target"),
+    "point alone": (5, {"point": 2}, 6, "experiment"),
+    "point 5": (3, {"point": 5}, 4, "point"),
+    "point twice": (7, {"point": 1}, 8, "point"),
+    "home with target": (1, {"target": "d1"}, 2, "target"),
+    "far": (4, {"pan_steps": 10**9}, 5, "pan_steps"),
+}
+
+
+@pytest.mark.parametrize("name", PLAN_REFUSED)
+def test_plan_refusals(tmp_path, name):
+    row, change, line, column = PLAN_REFUSED[name]
+    steps = list(PLAN)
+    steps[row - 1] = dataclasses.replace(steps[row - 1], **change)
+    with pytest.raises(InputError) as caught:
+        write_plan(steps, tmp_path / "plan.csv")
+    assert (caught.value.file, caught.value.line, caught.value.column) == ("plan.csv", line, column)
+    assert not (tmp_path / "plan.csv").exists()
+
+
+def test_plan_without_steps_and_look_before_place(tmp_path):
+    with pytest.raises(InputError, match="no rows"):
+        write_plan([], tmp_path / "plan.csv")
+    with pytest.raises(InputError, match="place the target first"):
+        write_plan([PlanStep(0, "home"), PlanStep(1, "look")], tmp_path / "plan.csv")
+
+
+def test_a_plan_does_what_its_actions_mean(mounted_rig):
+    """Empty counters are 0 after homing and keep the axis elsewhere; without `home` a plan begins as homed at 0, 0."""
+    steps = (PlanStep(0, "place", target="d1"), PlanStep(1, "look"), PlanStep(2, "move", 50, None))
+    steps = (*steps, PlanStep(3, "look"), PlanStep(4, "home", None, 7), PlanStep(5, "place", target="d2"))
+    log = run_plan(steps, mounted_rig)
+    assert [(m.segment, m.pan_steps, m.tilt_steps, m.pan_approach) for m in log.moves] == [
+        *((0, 0, 0, "left"), (0, 50, 0, ""), (1, 0, 7, "left"))
+    ]
+    assert [(look.move, look.placement) for look in log.looks] == [(0, 0), (1, 0)]
+    assert (log.at, log.sheet, log.targets) == ((0, 7), "d2", ["d1", "d2"])
+    with pytest.raises(InputError, match="which the rig does not have"):
+        run_plan((PlanStep(0, "place", target="d9"),), mounted_rig)
+    with pytest.raises(InputError, match="before a target is placed"):
+        run_plan((PlanStep(0, "look"),), mounted_rig)
+
+
+def test_a_plan_that_is_built_orders_no_move_twice():
+    plan = PlanBuilder()
+    plan.home()
+    plan.move(pan=10)
+    plan.move(pan=10)
+    plan.reach("tilt", -5, 1, 40)
+    assert [(s.action, s.pan_steps, s.tilt_steps) for s in plan.steps] == [
+        *(("home", 0, 0), ("move", 10, 0), ("move", 10, -45), ("move", 10, -5))
+    ]
+    assert (plan.at, plan.travelled) == ((10, -5), (10, 85))

@@ -1,0 +1,127 @@
+"""Information of a plan is what a fit of it knows, move by move."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from conftest import dozen_plan
+from support.coarse_planning import ROUNDING, with_priors
+
+from tvsbayes.instrument.parameters import INDEX, Prior
+from tvsbayes.instrument.plan import PlanStep, run_plan
+from tvsbayes.instrument.protocols import four_point_protocol, paper_protocol
+from tvsbayes.model.headlines import QUANTITIES
+from tvsbayes.planning.candidates import covariance_of
+from tvsbayes.planning.expectation import NOISE_COLUMNS, design_arrays, information_of, plan_minutes, prior_knowledge
+from tvsbayes.planning.forecast import truth_in
+from tvsbayes.planning.target import Target, sensitivity
+from tvsbayes.twin.simulated_campaign import Truth, draw_truth, simulate
+
+pytestmark = pytest.mark.usefixtures("small_searches")
+
+
+def u_of(steps, knowledge, z=None) -> np.ndarray:
+    """U of every headline after a plan, at the pose of its own looks."""
+    information = information_of(steps, knowledge)
+    at = [
+        sensitivity(
+            Target("", q, 1.0, 1.0, ""), knowledge.z, knowledge.space, knowledge.rig.table, information.pose_rad
+        )
+        for q in QUANTITIES
+    ]
+    covariance = covariance_of(knowledge.precision + information.fisher)
+    return np.array([s.value(covariance) for s in at])
+
+
+def test_a_plans_information_is_the_fits_own(mounted_rig, knowledge, monkeypatch):
+    """Same point, same looks: segments with home offsets, shared stops, half-open play (the dozen)."""
+    import jax
+
+    from tvsbayes.estimators.linear_spots import stop_information
+    from tvsbayes.estimators.mode_search import Problem
+
+    monkeypatch.setattr("tvsbayes.twin.simulated_campaign.SHEET_DEPTH_SD_MM", 0.0)
+    monkeypatch.setattr("tvsbayes.twin.simulated_campaign.SHEET_TILT_SD_DEG", 0.0)
+    monkeypatch.setattr("tvsbayes.twin.simulated_campaign.HOME_SD_DEG", 0.0)
+    # Cameras as stated: a campaign is triangulated with the stated ones, a plan's sheets stand where they stand.
+    drawn = draw_truth(mounted_rig, np.random.default_rng(3)).parameters | {"focal_scale": 1.0}
+    truth = truth_in(knowledge, drawn, mounted_rig.stereo.vector)
+    quiet = {name: 0.0 for name in drawn if name.startswith("stop_sd_deg")} | {"pixel_scale": 0.0}
+    run = simulate(mounted_rig, dozen_plan(), 4, Truth({**drawn, **quiet}, mounted_rig.stereo), aperture=True)
+    assert all(spot.status == "ok" for spot in run.campaign.spots)
+    problem = Problem(run.campaign, mounted_rig.table)
+    with jax.enable_x64(True):
+        own = stop_information(problem.linear_spots(truth.z)[1]).fisher
+    planned = information_of(dozen_plan(), knowledge, aperture=True, z=truth.z).fisher
+    scale = np.sqrt(np.diag(own))
+    safe = np.where(scale > 0, scale, 1.0)
+    # The spots are triangulated from pixels without noise: linear triangulation is exact to 1e-9 of its point.
+    assert np.abs(planned / np.outer(safe, safe) - own / np.outer(safe, safe)).max() < 1e-6
+    assert (scale[~NOISE_COLUMNS] > 0).sum() > 40
+
+
+@pytest.mark.parametrize("moves", [256, 257])
+def test_arrays_hold_every_move_of_a_plan(mounted_rig, moves):
+    """One move more than twice the smallest number of looks: a homing and two moves per look, 128 times."""
+    steps = [PlanStep(0, "home", 0, 0), PlanStep(1, "place", target="d1")]
+    steps += [PlanStep(n, "move", n, 0) for n in range(2, moves + 1)]
+    log = run_plan([*steps, PlanStep(moves + 1, "look")], mounted_rig, ("left", "up"))
+    arrays = design_arrays(log.moves, [moves - 1], mounted_rig, homed_from=1, aperture=False)
+    assert len(log.moves) == moves and np.array_equal(arrays.moves.steps[:moves, 0], [m.pan_steps for m in log.moves])
+
+
+def test_more_looks_never_raise_a_variance(knowledge):
+    """At a fixed point every added step of a plan adds a positive semi-definite matrix."""
+    steps = paper_protocol(2)
+    looks = [k for k, step in enumerate(steps) if step.action == "look"]
+    previous = np.diag(knowledge.covariance)
+    for count in (2, 5, 9, 16, 32):
+        information = information_of(steps[: looks[count - 1] + 1], knowledge).fisher
+        variance = np.diag(covariance_of(knowledge.precision + information))
+        assert np.all(variance <= previous * (1 + ROUNDING)), count
+        previous = variance
+    assert previous[INDEX["degrees_per_step.pan"]] < 0.01
+
+
+def test_mirroring_a_counter_swaps_names(mounted_rig, knowledge):
+    """A motor that counts the other way: the same beams, left and right exchanged."""
+    steps = tuple(s for s in four_point_protocol(3, approaches={"left": ("reversed",)}))
+    assert steps[2].action != "look"
+    mirrored = tuple(
+        replace(s, pan_steps=-s.pan_steps) if s.action in ("move", "home") and s.pan_steps is not None else s
+        for s in steps
+    )
+    turned = prior_knowledge(with_priors(mounted_rig, degrees_per_step__pan=Prior(-0.06, 0.01)))
+    u, v = u_of(steps, knowledge), u_of(mirrored, turned)
+    names = list(QUANTITIES)
+    swapped = {"left": "right", "right": "left"}
+    expected = [u[names.index(swapped.get(name, name))] for name in names]
+    assert v == pytest.approx(expected, rel=1e-6)
+    assert abs(u[0] / u[1] - 1) > 1e-4, "left and right differ, or the law would be empty"
+
+
+def test_looks_that_miss_an_image_tell_nothing(knowledge):
+    """1000 steps turn the beam by 60 degrees, out of the images."""
+    steps = list(paper_protocol(1))
+    more = (*steps, PlanStep(len(steps), "move", 1000, 0), PlanStep(len(steps) + 1, "look"))
+    information = information_of(more, knowledge)
+    assert not information.expectation.seen[-1]
+    assert information.expectation.seen[:-1].all()
+    assert information.fisher == pytest.approx(information_of(steps, knowledge).fisher, rel=ROUNDING)
+
+
+def test_moves_of_a_plan_are_those_the_twin_makes_of_it(mounted_rig, knowledge):
+    log = run_plan(paper_protocol(1), mounted_rig, ("left", "up"))
+    information = information_of(paper_protocol(1), knowledge)
+    assert information.moves == tuple(log.moves)
+    assert information.look_moves == tuple(look.move for look in log.looks)
+
+
+def test_minutes_of_a_plan_by_hand(mounted_rig):
+    """A homing counts as a move: 2 + 60 + 2 + 3 + 3 = 70 s."""
+    rig = replace(mounted_rig, costs_s={"move_s": 2.0, "look_s": 3.0, "placement_s": 60.0})
+    steps = [PlanStep(0, "home", 0, 0), PlanStep(1, "place", target="d1"), PlanStep(2, "move", 50, 0)]
+    steps += [PlanStep(3, "look"), PlanStep(4, "look")]
+    assert plan_minutes(steps, rig) == pytest.approx(70 / 60, rel=1e-12)

@@ -1,0 +1,198 @@
+"""Shares and floors, what would do, the next looks, and when to stop."""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.coarse_planning import with_priors
+
+from tvsbayes.instrument.parameters import INDEX, Prior
+from tvsbayes.instrument.plan import HOME_APPROACH, run_plan
+from tvsbayes.planning import planner
+from tvsbayes.planning.candidates import LookArrays, arrange, candidates, information_of_looks
+from tvsbayes.planning.expectation import LOOKS_PER_EXPERIMENT, PARAMETERS, information_of, prior_knowledge
+from tvsbayes.planning.limits import Batch, Limit, limit_of, next_experiments, split_of, stop_now
+from tvsbayes.planning.target import AT_POINT, Sensitivity, Target, parse_target, sensitivity
+
+pytestmark = pytest.mark.usefixtures("small_searches")
+
+
+@pytest.fixture(scope="module")
+def wide(mounted_rig):
+    """A rig that can look at everything again a full turn away, and knows its ratio well enough to find it."""
+    limits = {"pan_min_steps": -200, "pan_max_steps": 6400, "tilt_min_steps": -130, "tilt_max_steps": 130}
+    return with_priors(replace(mounted_rig, positioner=limits), degrees_per_step__pan=Prior(0.06, 1e-5))
+
+
+def test_next_looks_are_worth_what_they_say_here_and_a_full_turn_away(wide):
+    """As many looks a turn away as here: 6000 steps of 0.06 deg. Gains are those of the plan judged move by move."""
+    known = prior_knowledge(wide)
+    found = candidates(known)
+    seen = LookArrays(found.looks, known, False).at(known.z, known.space)
+    target = parse_target("u(left) <= 1e-5 deg/step")
+    pose = seen.mirror_angles_rad.mean(axis=0)
+    at = sensitivity(target, known.z, known.space, wide.table, pose)
+    now = at.value(known.covariance)
+    batches = next_experiments(known, found, seen, target, at, now)
+    turned = [batch for batch in batches if batch.text.startswith("a full turn of pan away, ")]
+    assert turned and len(turned) < len(batches)
+    for batch in batches:
+        log = run_plan(batch.actions, wide, HOME_APPROACH)
+        pan = [log.moves[look.move].pan_steps for look in log.looks]
+        assert len(pan) == LOOKS_PER_EXPERIMENT
+        assert min(pan) > 3000 or batch not in turned
+        # The text names the looks' own counters.
+        assert all(f"({steps}, " in batch.text for steps in pan)
+        judged = planner.judged("", information_of(batch.actions, known), known, target, pose)
+        assert batch.gain == pytest.approx(now - judged.joint, rel=1e-6)
+        assert batch.minutes == judged.minutes and batch.gain_per_minute == batch.gain / batch.minutes
+
+
+def test_a_target_below_the_floor_names_the_term_and_what_would_do(mounted_rig):
+    """Exact cameras of unknown focal scale, known mechanics, one depth: the scale limits, and its cure is enough.
+
+    4 degrees of pan, seen to a pixel, are too few to tell the scale from the ratio.
+    """
+    free = ("degrees_per_step", "backlash", "stop_sd", "pixel_scale", "focal_scale")
+    priors = mounted_rig.table.priors
+    held = {name: replace(prior, u=0.0) for name, prior in priors.items() if not name.startswith(free)}
+    exact = replace(mounted_rig.stereo, parameter_covariance=np.zeros_like(mounted_rig.stereo.parameter_covariance))
+    small = {f"backlash_deg.{axis}": Prior(0.0, 0.05, "half-normal") for axis in ("pan", "tilt")}
+    rig = replace(
+        with_priors(mounted_rig, **held, **small),
+        stereo=exact,
+        sheets_mm={"d2": 275.0},
+        positioner={"pan_min_steps": 270, "pan_max_steps": 330, "tilt_min_steps": -50, "tilt_max_steps": 50},
+        cameras={**mounted_rig.cameras, "spot_sd_px": 1.0},
+    )
+    looks = candidates(prior_knowledge(rig)).looks
+    once = np.linspace(0, len(looks) - 1, 2 * LOOKS_PER_EXPERIMENT).astype(int)
+
+    def limit(focal_scale_u: float, limit: float) -> Limit:
+        known = prior_knowledge(with_priors(rig, focal_scale=Prior(1.0, focal_scale_u)))
+        shown = LookArrays(looks, known, False).at(known.z, known.space)
+        path = np.zeros((len(once), 2))
+        information = information_of_looks(shown, once, path, known.space, False)
+        target = replace(parse_target("u(left) <= 1 deg/step"), limit=limit)
+        at = sensitivity(target, known.z, known.space, known.rig.table, shown.mirror_angles_rad.mean(axis=0))
+        return limit_of(known, information, at, target)
+
+    reachable = limit(0.002, 1.0)
+    assert reachable.reachable and reachable.needed is None
+    assert sum(reachable.shares.values()) == pytest.approx(1.0, abs=1e-6)
+    wanted = 0.8 * reachable.floor
+    short = limit(0.002, wanted)
+    assert not short.reachable and short.cause == "focal scale" and short.floor == reachable.floor
+    needed = re.fullmatch(r"it would do to know u\(focal_scale\) = (\S+) instead of 0\.002", short.needed)
+    assert limit(float(needed[1]), wanted).floor <= wanted
+    # Two digits rounded down: the next number is too large.
+    last = 10.0 ** (math.floor(math.log10(float(needed[1]))) - 1)
+    assert not limit(float(needed[1]) + last, wanted).reachable
+
+
+def test_no_calibration_removes_the_stop_at_the_point(knowledge, seen, found):
+    target = parse_target("U95(x) at 1000,0,0 mm <= 0.5 mm")
+    at = sensitivity(target, knowledge.z, knowledge.space, knowledge.rig.table, np.zeros(2))
+    path = arrange(found.looks, knowledge.sheets, found.overshoot).path
+    information = information_of_looks(seen, np.arange(len(found.looks)), path, knowledge.space, False)
+    limit = limit_of(knowledge, information, at, target)
+    assert not limit.reachable and "at the point itself" in limit.needed
+
+
+def test_when_to_stop():
+    target, open_end = parse_target("u(left) <= 2e-4 deg/step"), Limit(1e-5, "focal scale", {}, True, None)
+    good, poor = (Batch((), 1.0, g, g, "") for g in (1e-5, 1e-8))
+    assert stop_now(1e-4, target, open_end, (good,), True).now
+    assert not stop_now(1e-4, target, open_end, (good,), False).now, "nothing was measured yet"
+    assert not stop_now(3e-4, target, open_end, (good,), True).now
+    assert stop_now(3e-4, target, open_end, (poor,), True).now
+    floor = replace(open_end, floor=2.5e-4, reachable=False)
+    assert stop_now(3e-4, target, floor, (good,), True).now
+    assert "floor" in stop_now(3e-4, target, floor, (good,), False).reason
+
+
+SCALE, STEREO = INDEX["focal_scale"], PARAMETERS - 1
+
+
+def at(columns: dict[int, float]) -> np.ndarray:
+    """A vector over the coordinates with a few entries, shape (p,)."""
+    vector = np.zeros(PARAMETERS)
+    vector[list(columns)] = list(columns.values())
+    return vector
+
+
+def test_shares_of_two_parameters_by_hand(knowledge):
+    """Data diag(3, 1) on priors of 1: S = diag(1/4, 1/2); g = (2, 3) is pulled by S g = (1/2, 3/2)."""
+    data, noise = (np.diag(at({SCALE: scale, STEREO: camera})) for scale, camera in ((3.0, 1.0), (2.0, 0.2)))
+    gradient = np.stack([at({SCALE: 0.1}), at({SCALE: 2.0, STEREO: 3.0})])
+    own = {AT_POINT[0]: np.array([0.0, 0.5]), AT_POINT[1]: np.array([0.4, 0.0])}
+    target = Sensitivity(gradient, own)
+    # Prior 1/4 and 9/4; pixels 2/4 + 0.2 * 9/4; the rest of the data 1/4 + 0.8 * 9/4; the point 0.5.
+    parts = {"focal scale": 0.25, "stereo calibration": 2.25, AT_POINT[0]: 0.5}
+    looks = {"pixel noise": 0.95, "stop errors of the looks": 2.05}
+    assert split_of(knowledge, data, noise, target) == pytest.approx({k: v / 6 for k, v in (parts | looks).items()})
+    shares = split_of(knowledge, data, None, target)
+    assert shares == pytest.approx({k: v / 6 for k, v in (parts | {"looks": 3.0}).items()})
+    assert list(shares) == ["looks", "stereo calibration", AT_POINT[0], "focal scale"], "largest first"
+
+
+def test_after_data_priors_and_campaign_are_one_share(knowledge):
+    """Precision 2 of all and data diag(2, 0): S = diag(1/4, 1/2), S g = (1/2, 3/2); 2 (1/4 + 9/4) and 2 / 4."""
+    known = replace(knowledge, precision=2 * np.eye(PARAMETERS), after_data=True)
+    gradient = at({SCALE: 2.0, STEREO: 3.0})[None]
+    shares = split_of(known, np.diag(at({SCALE: 2.0})), None, Sensitivity(gradient))
+    assert shares == pytest.approx({"the campaign and its priors": 5.0 / 5.5, "looks": 0.5 / 5.5})
+
+
+def target_of(limit: float) -> Target:
+    return Target("", "left", 1.0, limit, "deg/step")
+
+
+def test_an_input_has_to_be_known_as_much_better_as_the_floor_is_too_high(knowledge):
+    """A value that is one prior's alone goes with its u: a floor 4 / 1.02 times the target asks for u / 4 * 1.02."""
+    nothing, only = np.zeros((PARAMETERS, PARAMETERS)), Sensitivity(at({SCALE: 2.0})[None])
+    limit = limit_of(knowledge, nothing, only, target_of(0.51))
+    assert (limit.floor, limit.cause, limit.reachable) == (2.0, "focal scale", False)
+    # 0.255 of 0.002, stated to two digits.
+    assert limit.needed == "it would do to know u(focal_scale) = 0.00051 instead of 0.002"
+    assert limit_of(knowledge, nothing, only, target_of(2.0)).reachable
+
+
+def test_what_is_needed_is_never_rounded_up(knowledge):
+    """0.2578 of 0.002 is 0.000516 and 0.2598 of it 0.0005196: two digits that are enough are 0.00051 for both."""
+    nothing, only = np.zeros((PARAMETERS, PARAMETERS)), Sensitivity(at({SCALE: 1.0})[None])
+    for share in (0.2578, 0.2598):
+        needed = limit_of(knowledge, nothing, only, target_of(share)).needed
+        assert needed == "it would do to know u(focal_scale) = 0.00051 instead of 0.002"
+
+
+def test_two_inputs_are_asked_for_where_one_is_not_enough(knowledge):
+    """4^2 + 3^2 with a target of 2: the larger to a tenth of its u, the smaller to sqrt(4 - 0.4^2) / 3 = 0.653."""
+    nothing, both = np.zeros((PARAMETERS, PARAMETERS)), Sensitivity(at({STEREO: 4.0, SCALE: 3.0})[None])
+    limit = limit_of(knowledge, nothing, both, target_of(2.0))
+    assert limit.shares == pytest.approx({"stereo calibration": 16 / 25, "focal scale": 9 / 25})
+    stereo = "the stereo calibration to 10 % of its present uncertainty"
+    assert limit.needed == f"it would do to know {stereo}; u(focal_scale) = 0.0013 instead of 0.002"
+
+
+@pytest.mark.parametrize(("gain_per_minute", "stop"), [(0.98e-3, True), (1.02e-3, False)])
+def test_measuring_stops_below_a_thousandth_of_the_value_a_minute(gain_per_minute, stop):
+    """The rule that is printed: less than 0.1 % of what is known now, with and without data."""
+    now, target = 3e-4, parse_target("u(left) <= 2e-4 deg/step")
+    best = Batch((), 2.0, 2 * gain_per_minute * now, gain_per_minute * now, "")
+    idle = replace(best, gain_per_minute=0.0)
+    for after_data in (False, True):
+        advice = stop_now(now, target, Limit(1e-5, "focal scale", {}, True, None), (best, idle), after_data)
+        assert advice.now is stop
+        assert "less than 0.1 % a minute" in advice.rule
+
+
+@pytest.mark.parametrize(("now", "stop"), [(2e-4, True), (2.01e-4, False)])
+def test_measuring_stops_where_the_target_is_met(now, stop):
+    good = Batch((), 1.0, 0.1 * now, 0.1 * now, "")
+    target = parse_target("u(left) <= 2e-4 deg/step")
+    assert stop_now(now, target, Limit(1e-5, "focal scale", {}, True, None), (good,), True).now is stop

@@ -1,0 +1,118 @@
+"""The search for looks: greedy, exchanges, criteria, and the smallest number that meets."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.coarse_planning import ROUNDING
+
+from tvsbayes.planning import search
+from tvsbayes.planning.candidates import CONTRAST_COLUMNS, covariance_of, information_of_looks
+from tvsbayes.planning.expectation import LOOKS_PER_EXPERIMENT, PARAMETERS
+from tvsbayes.planning.forecast import Assurance, Family
+from tvsbayes.planning.search import CRITERIA, KNOWN, MEAN_WEIGHT, Scope, Search, scores, search_rows, smallest_design
+from tvsbayes.planning.target import parse_target, sensitivity
+
+pytestmark = pytest.mark.usefixtures("small_searches")
+
+
+def test_greedy_takes_the_best_look_and_exchange_never_worsens():
+    generator = np.random.default_rng(9)
+    rows, gradient = generator.normal(size=(12, 4, 6)), generator.normal(size=(2, 6))
+    search = Search(rows, np.diag([1.0, 2, 3, 4, 5, 6]), gradient, np.zeros(2))
+    one = [search.value([k]) for k in range(12)]
+    picks = search.greedy(4)
+    assert picks[0] == int(np.argmin(one))
+    assert search.after_one_more(search.covariance) == pytest.approx(one, rel=ROUNDING)
+    every = min(search.value([a, b, c]) for a in range(12) for b in range(a, 12) for c in range(b, 12))
+    exchanged = search.exchange(picks[:3])
+    assert every * (1 - ROUNDING) <= search.value(exchanged) <= search.value(picks[:3])
+    assert search.value(exchanged) < 1.05 * every
+    worst = 3 * [int(np.argmax(one))]
+    assert search.value(search.exchange(worst)) < 1.05 * every < 0.9 * search.value(worst)
+
+
+@pytest.mark.parametrize("criterion", CRITERIA)
+def test_a_quantity_without_variance_does_not_steer_a_search(criterion):
+    generator = np.random.default_rng(10)
+    rows, gradient = generator.normal(size=(12, 4, 6)), generator.normal(size=(3, 6))
+    gradient[1] = 0
+    with_fixed, without = (
+        Search(rows, np.eye(6), g, np.zeros(len(g)), criterion) for g in (gradient, gradient[[0, 2]])
+    )
+    assert with_fixed.greedy(4) == without.greedy(4)
+    assert math.isfinite(with_fixed.value([0, 1]))
+
+
+def test_criteria_are_what_they_say():
+    covariance, reference = np.array([[4.0, 1.0], [1.0, 2.0]]), np.array([8.0, 2.0])
+    assert scores(covariance, reference, "c") == pytest.approx(4.0 + MEAN_WEIGHT * 3.0)
+    assert scores(covariance, reference, "A") == pytest.approx((4 / 8 + 2 / 2) / 2)
+    assert scores(covariance, reference, "D") == pytest.approx(math.log(7.0 / 16.0))
+
+
+def test_a_search_after_data_knows_no_home_offset(knowledge, found, seen):
+    """Offsets of the new session are two columns with the variance of homing: eliminated, they leave the exact sum."""
+    known = replace(knowledge, after_data=True)
+    rows = seen.rows.copy()
+    rows[..., CONTRAST_COLUMNS] = 0
+    shown, picks = replace(seen, rows=rows), np.arange(6)
+    wide, precision = search_rows(shown, known)
+    whole = covariance_of(precision + np.einsum("mij,mik->jk", wide[picks], wide[picks]))[:PARAMETERS, :PARAMETERS]
+    exact = information_of_looks(shown, picks, np.zeros((6, 2)), knowledge.space, True)
+    contrasts = np.isin(np.arange(PARAMETERS), CONTRAST_COLUMNS)
+    expected = covariance_of(known.precision + exact + KNOWN * np.diag(contrasts))
+    assert whole == pytest.approx(expected, rel=ROUNDING, abs=ROUNDING * expected.max())
+    without = information_of_looks(shown, picks, np.zeros((6, 2)), knowledge.space, False)
+    assert np.abs(without - exact).max() > 1e-3 * np.abs(exact).max(), "offsets count, or they could be left out"
+
+
+@pytest.fixture(scope="module")
+def refine(knowledge, found, seen):
+    """(first choice, limit, minutes) -> reported values of that choice, and what became of it."""
+
+    def run(picks, limit, minutes=None):
+        target = replace(parse_target("u(left) <= 1 deg/step"), limit=limit)
+        family = Family(knowledge, found, np.asarray(picks), False)
+        pose = seen.mirror_angles_rad.mean(axis=0)
+        at = sensitivity(target, knowledge.z, knowledge.space, knowledge.rig.table, pose)
+        assurance = Assurance(family, target, 10, 3)
+        plain = assurance.values([2])[2]
+        return plain, search.refine(family, seen, target, at, 2, Scope(minutes=minutes), assurance)
+
+    return run
+
+
+@pytest.fixture(scope="module")
+def poor(found):
+    """Eight looks at one sheet, all at one place: they tell nothing of the ratio."""
+    return np.full(2 * LOOKS_PER_EXPERIMENT, np.flatnonzero(found.looks.sheet == 1)[0])
+
+
+def test_exchanges_are_kept_where_they_raise_assurance_or_lower_the_median(refine, poor):
+    plain, refined = refine(poor, 1e-9)
+    values = refined.reported
+    assert np.median(values) < 0.9 * np.median(plain) and not np.array_equal(refined.family.picks, poor)
+    between = 0.5 * (np.median(values) + plain.min())
+    assert np.mean(plain <= between) < np.mean(values <= between)
+    assert np.array_equal(refine(poor, between)[1].reported, values)
+
+
+def test_exchanges_that_cost_assurance_or_time_are_not_kept(refine, poor, monkeypatch):
+    better = refine(poor, 1e-9)[1]
+    plain, late = refine(poor, 1e-9, minutes=0.0)
+    assert np.array_equal(late.family.picks, poor) and np.array_equal(late.reported, plain)
+    monkeypatch.setattr(Search, "exchange", lambda self, picks: list(poor))
+    plain, kept = refine(better.family.picks, 1e-9)
+    assert np.array_equal(kept.family.picks, better.family.picks)
+    assert np.array_equal(kept.reported, plain) and np.array_equal(plain, better.reported)
+
+
+def test_the_smallest_number_that_meets_is_found():
+    ladder = (1, 2, 3, 5, 8, 12, 20, 40)
+    for answer in range(1, 41):
+        assert smallest_design(lambda n, answer=answer: n >= answer, ladder) == answer
+    assert smallest_design(lambda n: n >= 41, ladder) is None

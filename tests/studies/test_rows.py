@@ -1,0 +1,63 @@
+"""The file of rows: designs apart, foreign files and places that cannot be written refused."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import pytest
+from support.invented_studies import invented, sweep
+
+from tvsbayes.errors import InputError
+from tvsbayes.planning.target import parse_target
+from tvsbayes.studies.rows import StudyRow, StudyRows
+from tvsbayes.studies.study import study
+
+
+def test_one_file_keeps_designs_apart(job, quick, tmp_path, mounted_rig, monkeypatch):
+    path = tmp_path / "rows.jsonl"
+    study(job, 3, StudyRows(path))
+    others = (
+        replace(job, seed=8),
+        replace(job, aperture=True),
+        replace(job, steps=sweep(("d1",))),
+        replace(job, target=parse_target("u(left) <= 1e-3 deg/step")),
+        replace(job, rig=replace(mounted_rig, sheets_mm={**mounted_rig.sheets_mm, "d1": 176.0})),
+        replace(job, rig=replace(mounted_rig, cameras={**mounted_rig.cameras, "spot_sd_px": 0.1})),
+        replace(
+            job, rig=replace(mounted_rig, truth={**mounted_rig.truth, "pixel_scale": mounted_rig.truth["focal_scale"]})
+        ),
+    )
+    assert len({job.key, *(other.key for other in others)}) == 1 + len(others)
+    for other in others:
+        assert StudyRows(path).of(other.key) == {}
+    # Rows of another release answer another question.
+    monkeypatch.setattr("tvsbayes.studies.study_job.version", lambda _package: "0.0.1")
+    assert StudyRows(path).of(replace(job).key) == {}
+    assert sorted(StudyRows(path).of(job.key)) == [0, 1, 2]
+
+
+@pytest.mark.parametrize("line", ["{", "[]", "1", '{"format": "tvsbayes-study/1"}', '{"a": 1}'])
+def test_a_foreign_file_is_refused_with_its_line(job, quick, tmp_path, line):
+    path = tmp_path / "rows.jsonl"
+    study(job, 2, StudyRows(path))
+    path.write_text(path.read_text() + line + "\n")
+    with pytest.raises(InputError, match="line 3 is no row"):
+        StudyRows(path)
+
+
+def test_rows_that_cannot_be_written_are_refused_before_the_first_fit(tmp_path):
+    with pytest.raises(InputError) as error:
+        StudyRows(tmp_path / "no such folder" / "rows.jsonl")
+    StudyRows(tmp_path / "rows.jsonl")
+    assert list(tmp_path.iterdir()) == [], "nothing is written before there is a row"
+    assert error.value.code == "write" and "--rows" in error.value.remedy
+
+
+def test_a_row_is_read_as_it_was_written(job):
+    """Also one whose fit failed, which has neither headlines nor a target."""
+    failed = StudyRow(job.key, 4, 1, False, 2, ("did not settle",), 1.0)
+    for row in (invented(job, 1), failed):
+        document = json.loads(json.dumps(row.as_json(), allow_nan=False))
+        assert StudyRow.from_json(document) == row
+    assert set(failed.as_json()) == {"design", "index", "seed", "converged", "unseen", "problems", "seconds"}

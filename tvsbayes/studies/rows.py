@@ -1,0 +1,167 @@
+"""Rows of studies: one simulated and fitted campaign each, kept in a file of JSON lines.
+
+Headlines in deg/step, deg and mm, the target in its own unit, seconds of computing. A row belongs to a design, the hash
+of everything that decides it, and to the number of its campaign.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any, BinaryIO
+
+from tvsbayes.errors import InputError, escaped, refusal
+from tvsbayes.files.disk import read_bytes
+
+STUDY_FORMAT = "tvsbayes-study/1"
+ROWS_BYTES_MAX = 128 * 1024 * 1024
+
+
+@dataclass(frozen=True)
+class HeadlineRow:
+    """How one headline fared in one campaign.
+
+    Attributes:
+        truth: true value.
+        value: estimate.
+        sd: its reported standard deviation.
+        interval95: as reported.
+        pit: share of the fit's draws below the truth.
+        predicted_sd: what the planner predicted at that truth.
+    """
+
+    truth: float
+    value: float
+    sd: float
+    interval95: tuple[float, float]
+    pit: float
+    predicted_sd: float
+
+    @classmethod
+    def from_json(cls, document: Mapping[str, Any]) -> HeadlineRow:
+        """The entry of a line."""
+        low, high = map(float, document["interval95"])
+        single = {key: float(document[key]) for key in ("truth", "value", "sd", "pit", "predicted_sd")}
+        return cls(interval95=(low, high), **single)
+
+
+@dataclass(frozen=True)
+class StudyRow:
+    """One campaign of a study; a fit that failed has no headlines.
+
+    Attributes:
+        design: hash of what it belongs to.
+        index: number of the campaign.
+        seed: of the campaign.
+        converged: the fit ended well.
+        unseen: looks without a spot.
+        problems: of the fit, in words.
+        seconds: simulation and fit.
+        headlines: by name.
+        target: reported value of the target, None where the fit has none.
+    """
+
+    design: str
+    index: int
+    seed: int
+    converged: bool
+    unseen: int
+    problems: tuple[str, ...]
+    seconds: float
+    headlines: dict[str, HeadlineRow] = field(default_factory=dict)
+    target: float | None = None
+
+    def as_json(self) -> dict[str, object]:
+        """Its line in a file of rows, less the format."""
+        document = {**asdict(self), "problems": list(self.problems)}
+        told = ("headlines", "target") if self.headlines else ()
+        order = ("design", "index", "seed", "converged", "unseen", "problems", *told, "seconds")
+        return {name: document[name] for name in order}
+
+    @classmethod
+    def from_json(cls, document: Mapping[str, Any]) -> StudyRow:
+        """The row of a line.
+
+        Raises:
+            KeyError, TypeError, ValueError, AttributeError: a document of another shape.
+        """
+        target = document.get("target")
+        return cls(
+            design=str(document["design"]),
+            index=int(document["index"]),
+            seed=int(document["seed"]),
+            converged=bool(document["converged"]),
+            unseen=int(document["unseen"]),
+            problems=tuple(map(str, document["problems"])),
+            seconds=float(document["seconds"]),
+            headlines={str(k): HeadlineRow.from_json(h) for k, h in document.get("headlines", {}).items()},
+            target=None if target is None else float(target),
+        )
+
+
+class StudyRows:
+    """Rows of studies in a file of JSON lines: appended one by one, each on disk before the next.
+
+    A process that is killed while it writes leaves a torn last line; it is cut off when the file is opened again.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = Path(path)
+        data = read_bytes(self.path, ROWS_BYTES_MAX) if self.path.exists() else b""
+        whole = data[: data.rfind(b"\n") + 1]
+        rows = (self._row(line, number) for number, line in enumerate(whole.splitlines(), 1))
+        self.rows = {(row.design, row.index): row for row in rows}
+        self.torn = len(data) - len(whole)
+        # Before the first campaign is fitted, not after.
+        if not os.access(self.path if self.path.exists() else self.path.parent, os.W_OK):
+            raise self._unwritable("no right to write, or no such folder")
+
+    def _unwritable(self, found: str) -> InputError:
+        allowed, remedy = "a file that can be written", "name another with --rows"
+        return refusal("write", file=escaped(str(self.path), 200), found=found, allowed=allowed, remedy=remedy)
+
+    @contextmanager
+    def _open(self) -> Iterator[BinaryIO]:
+        """The file, for reading and writing; made where there is none."""
+        try:
+            with self.path.open("r+b" if self.path.exists() else "w+b") as file:
+                yield file
+        except OSError as error:
+            raise self._unwritable(escaped(error.strerror or str(error))) from error
+
+    def _row(self, line: bytes, number: int) -> StudyRow:
+        try:
+            document = json.loads(line)
+            if document["format"] == STUDY_FORMAT:
+                return StudyRow.from_json(document)
+        except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
+            pass
+        raise InputError(
+            "study-row",
+            f"{escaped(self.path.name)} line {number} is no row of a study",
+            file=escaped(self.path.name),
+            line=number,
+            allowed=f"lines written by `tvsbayes study` ({STUDY_FORMAT})",
+            remedy="name another file with --rows",
+        )
+
+    def of(self, design: str) -> dict[int, StudyRow]:
+        """Rows of one design by index."""
+        return {index: row for (key, index), row in self.rows.items() if key == design}
+
+    def append(self, row: StudyRow) -> None:
+        """Add a row and wait until the disk has it."""
+        line = json.dumps({"format": STUDY_FORMAT, **row.as_json()}, allow_nan=False).encode() + b"\n"
+        with self._open() as file:
+            if self.torn:
+                file.truncate(self.path.stat().st_size - self.torn)
+                self.torn = 0
+            file.seek(0, os.SEEK_END)
+            file.write(line)
+            file.flush()
+            os.fsync(file.fileno())
+        self.rows[row.design, row.index] = row
