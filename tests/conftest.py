@@ -28,11 +28,9 @@ from tvsbayes.instrument.plan import PlanStep
 from tvsbayes.instrument.rig import Rig, read_rig
 from tvsbayes.twin.simulated_campaign import SimulatedCampaign, Truth, simulate
 
-pytest_plugins = ("support.coarse_planning", "support.invented_studies")
-
 ROOT = Path(__file__).resolve().parents[1]
-pytest_plugins = ["support.commands", "support.reported_twin"]
-"""Fixtures of commands and of the report, by the modules that hold their helpers."""
+pytest_plugins = ["support.commands", "support.reported_twin", "support.coarse_planning", "support.invented_studies"]
+"""Fixtures of commands, of the report, of planning and of studies, by the modules that hold their helpers."""
 COMPILES = "cli/test_estimate_commands.py"
 LONG = (
     *(
