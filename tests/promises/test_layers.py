@@ -191,7 +191,6 @@ def test_twin_shares_no_formula_with_the_estimators(inner):
             assert not {room(other) for other in reachable(inner, name)} & BESIDE_THE_TWIN, name
 
 
-@pytest.mark.xfail(reason="typed results and the division of long modules follow")
 def test_modules_stay_readable():
     long = {name: count for name, path in MODULES.items() if (count := len(path.read_text().splitlines())) > LINES_MAX}
     assert not long
