@@ -163,7 +163,9 @@ def _classic_predicted(source: _Source) -> dict[str, Estimate | None]:
 def _curves(posterior: Posterior, moved: set[str]) -> Curves:
     """Effective ratios along both axes over the range that was seen, and lost motion at the step counts used."""
     lost = {direction: _lost_motion(posterior, direction) for direction in DIRECTIONS if direction in moved}
-    along = {axis: _along(posterior, index, moved) for index, axis in enumerate(AXES)}
+    along: dict[str, tuple[CurvePoint, ...]] = {
+        axis: _along(posterior, index, moved) for index, axis in enumerate(AXES)
+    }
     return Curves(along, lost)
 
 

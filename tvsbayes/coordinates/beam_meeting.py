@@ -1,4 +1,9 @@
-"""Where beam and aperture reading meet, in JAX."""
+"""Where beam and aperture reading meet, written for JAX so that thousands of points share one compiled function.
+
+Frame T: origin mid-baseline, x depth, y along the baseline towards the positioner at +a/2, z up; the aperture stands
+at (0, -a/2, 0). mm and rad; degrees where a name says `_deg`. The emission angle C and the aperture angle B are
+interior angles of the triangle whose third corner is the spot. The law of propagation knows no frame, takes any unit.
+"""
 
 from __future__ import annotations
 

@@ -177,6 +177,11 @@ def locate(
             carried, law = carry(block, given), propagate(block, given)
             trimmed = jax.tree.map(lambda x, n=n: np.asarray(x)[..., :n], carried)
             parts.append(_statistics(trimmed, jax.tree.map(lambda x, n=n: np.asarray(x)[:n], law), given))
+    return _assembled(parts, calibration, settings, draws)
+
+
+def _assembled(parts: list[_Block], calibration: Calibration, settings: Settings, draws: int) -> Locations:
+    """All blocks together, with the refusal of every point that too many draws lose."""
     checks = [part.validation for part in parts]
     lost = _joined(parts, "diverging_share")
     asked = zip(

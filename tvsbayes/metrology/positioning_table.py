@@ -35,6 +35,10 @@ OWN_STOPS = (
     "plug-in: s and B hold what moved over the campaign beside stop errors: pixel noise, home offsets, drift, and what "
     "unequal ratios of the two directions add up to; maxima of few runs are too large"
 )
+SIMULATED = (
+    "predicted: {} simulated tests of {} runs per side, homed once before each test, drawn from the {}; a difference "
+    "between the ratios of the two directions carries run after run on"
+)
 DEFINITIONS = "definitions of ISO 230-2 as secondary sources give them"
 NOT_COVERED = (
     "drift, temperature and load: every run is taken to be made under the conditions of the campaign",
@@ -155,22 +159,14 @@ def positioning(
     low, high = calibration.range_steps[AXES.index(axis)]
     ratio = _middle_deg_per_step(calibration, axis) if deg_per_step is None else float(deg_per_step)
     chosen = target_steps(low, high, ratio, seed) if targets is None else tuple(map(int, targets))
-    predicted = None
-    made = f"no prediction: the {axis} axis was never moved over a range"
+    predicted, made = None, f"no prediction: the {axis} axis was never moved over a range"
     if chosen:
+        options = {"runs": runs, "tests": tests, "seed": seed}
         contrast = contrast_deg_per_step
-        predicted = _predicted(
-            simulated_runs(
-                calibration, axis, chosen, ratio, runs=runs, tests=tests, contrast_deg_per_step=contrast, seed=seed
-            )
-        )
-        made = (
-            f"predicted: {tests} simulated tests of {runs} runs per side, homed once before each test, drawn from the "
-            f"{calibration.estimator}; a difference between the ratios of the two directions carries run after run on"
-        )
-    own = _PlugIn(missing="no stops were given")
-    if readings is not None:
-        own = _plug_in(readings, ratio, targets_wanted((high - low) * ratio))
+        found = simulated_runs(calibration, axis, chosen, ratio, contrast_deg_per_step=contrast, **options)
+        predicted, made = _predicted(found), SIMULATED.format(tests, runs, calibration.estimator)
+    wanted = targets_wanted((high - low) * ratio)
+    own = _PlugIn(missing="no stops were given") if readings is None else _plug_in(readings, ratio, wanted)
     return AxisPositioning(
         axis=axis,
         deg_per_step=ratio,
