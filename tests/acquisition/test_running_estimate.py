@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import subprocess
 import sys
 
 import pytest
@@ -12,6 +13,7 @@ from tvsbayes.acquisition.operator import Terminal
 from tvsbayes.acquisition.recorder import recorded
 from tvsbayes.acquisition.running_estimate import EstimateWish, RunningEstimate
 from tvsbayes.acquisition.session import acquire
+from tvsbayes.cli.bench_commands import FIT_COMMAND
 from tvsbayes.instrument.plan import run_plan
 from tvsbayes.instrument.stops import legs_of
 
@@ -70,3 +72,8 @@ def test_estimate_that_cannot_start_does_not_end_the_run(tmp_path):
     for wait in (True, False):
         with RunningEstimate(tmp_path, [str(tmp_path / "nothing")], 1.0, {"left"}, wait=wait) as estimate:
             assert not estimate.update(12) and estimate.latest is None
+
+
+def test_the_command_of_acquire_is_a_fit():
+    done = subprocess.run([*FIT_COMMAND, "--help"], capture_output=True, text=True, check=False)
+    assert done.returncode == 0 and "--no-sample" in done.stdout, done.stderr
