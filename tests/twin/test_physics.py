@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from support.printed_vector import LAST_6, LAST_7, LAST_9, LAST_12
+from support.printed_vector import VECTOR as PRINTED
 
 from tvsbayes.instrument.parameters import (
     RIG_PRIORS,
@@ -21,21 +23,8 @@ from tvsbayes.twin.physics import (
 )
 
 NOMINAL = {name: prior.value for name, prior in RIG_PRIORS.items()}
-VECTOR = NOMINAL | {
-    "mirror_offset_mm": 30.0,
-    "mirror1_error_deg": 0.3,
-    "mirror2_error_deg": -0.2,
-    "laser_tilt_deg.x": 0.25,
-    "laser_tilt_deg.y": -0.35,
-    "laser_offset_mm.x": 0.2,
-    "laser_offset_mm.y": -0.4,
-    "tilt_axis_skew_deg": 0.4,
-    "tilt_axis_offset_mm.x": 0.5,
-    "tilt_axis_offset_mm.z": -0.3,
-}
+VECTOR = NOMINAL | PRINTED
 POSE_DEG = (10.0, 5.0)
-# Half a unit of the last digit that DESIGN 3.2 prints.
-LAST_9, LAST_12, LAST_7, LAST_6 = 0.5e-9, 0.5e-12, 0.5e-7, 0.5e-6
 
 
 def test_mirror_chain_vector():
