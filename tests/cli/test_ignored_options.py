@@ -1,0 +1,53 @@
+"""Options that this use of a command would ignore are refused before anything is read, with what to do."""
+
+from __future__ import annotations
+
+import pytest
+
+IGNORED = [
+    ("fit c --no-sample --max-minutes 3", "--max-minutes is for a sampler"),
+    ("fit c --no-sample --resume", "--resume continues a chain"),
+    ("report c --laboratory A --country MX", "--laboratory and --country are for a certificate"),
+    ("report c --customer B", "--customer is for a certificate"),
+    ("compare a b --by regions", "--by is for one campaign"),
+    ("compare a b --seed 3", "--seed is for one campaign"),
+    ("compare a b --by steps --seed 0", "--by and --seed are for one campaign"),
+    ("locate c --points p.csv --pan-approach right", "--pan-approach is for one point"),
+    ("locate c --points p.csv --tilt-approach up", "--tilt-approach is for one point"),
+    ("locate c --points p.csv --budget", "--budget is for one point"),
+    ("steps-for c --export header --pan-approach left", "--pan-approach is for one target"),
+    ("steps-for c --export json --rig r.toml", "--rig is for one target"),
+    ("study r.toml p.csv --workers 4", "--workers is for engines with workers"),
+    ("study r.toml p.csv --scheduler tcp://a:1", "--scheduler is for engines with workers"),
+    ("study r.toml p.csv --engine processes --scheduler tcp://a:1", "--scheduler is for the engine dask"),
+    ("study r.toml p.csv --engine dask --scheduler tcp://a:1 --workers 4", "--workers is for a cluster"),
+    ("check c p.csv --repair-to d", "a repaired journal takes no plan"),
+    ("stereo f --board 9x6 --pitch-mm 25 --image-size 1280x720", "--image-size is for --import"),
+    ("stereo f --board 9x6 --pitch-mm 25 --import-unit m", "--import-unit is for --import"),
+    ("stereo --import a.yml --board 9x6 --pitch-mm 25", "--board and --pitch-mm are for pictures"),
+    ("stereo --import a.yml --pitch-u-mm 0.1", "--pitch-u-mm is for pictures"),
+    ("stereo --import a.yml --finder sector --swap", "--finder and --swap are for pictures"),
+    ("stereo --import a.yml --fix-k3 --robust", "--fix-k3 and --robust are for pictures"),
+    ("acquire r.toml p.csv o --centroids", "--centroids is for the twin"),
+    ("acquire r.toml p.csv o --seed 0", "--seed is for the twin"),
+    ("acquire r.toml p.csv o --simulate --laser-class 3B", "--laser-class is for a laser"),
+    ("acquire r.toml p.csv o --target-u 1e-4 --no-estimate", "--target-u needs the fits"),
+]
+
+
+@pytest.mark.parametrize(("line", "said"), IGNORED, ids=[line for line, _ in IGNORED])
+def test_what_would_be_ignored_is_refused(ask, line, said):
+    code, document = ask(*line.split())
+    assert (code, document["error"]["code"]) == (2, "usage")
+    assert document["error"]["message"].startswith(said) and document["error"]["remedy"]
+
+
+def test_a_unit_is_for_files_that_state_none(ask, tmp_path):
+    """Only OpenCV's files leave the unit of T open; that of ours is stated."""
+    from tvsbayes.files.disk import shipped_data
+
+    pair = shipped_data() / "rigs" / "mounted" / "stereo.json"
+    for option in (("--import-unit", "m"), ("--image-size", "1280x720")):
+        code, document = ask("stereo", "--import", pair, *option)
+        assert (code, document["error"]["code"]) == (2, "usage") and "OpenCV" in document["error"]["message"]
+    assert ask("stereo", "--import", pair)[0] == 0
