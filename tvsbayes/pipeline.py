@@ -176,6 +176,8 @@ def _results(
     found: JointFit, posterior: Posterior | None, seed: int, folder: Path | None, files: dict[str, str]
 ) -> CampaignResults:
     """Summary, calibration and evidence of a fit and its sample, written where a folder is named."""
+    import numpy as np
+
     from tvsbayes.assessment.fitted_calibration import DRAWS_KEPT, calibration_of
     from tvsbayes.assessment.summary import summarise
     from tvsbayes.instrument.campaign import input_hashes
@@ -186,7 +188,8 @@ def _results(
     usable = posterior if summary.estimator == "posterior" else None
     calibration = calibration_of(found, posterior, seed=seed) if found.converged else None
     behind = found.draws if usable is None else usable.thinned(DRAWS_KEPT)
-    draws = ResultDraws(found.names, behind.physical, behind.effective_deg_per_step, found.reference_pose_rad)
+    physical, effective = np.asarray(behind.physical), np.asarray(behind.effective_deg_per_step)
+    draws = ResultDraws(found.names, physical, effective, found.reference_pose_rad)
     record = FitRecord(
         summary,
         covariance_of_draws(draws.names, draws.physical, summary.parameters),

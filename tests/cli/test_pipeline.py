@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import sys
 
 import numpy as np
@@ -53,3 +54,20 @@ def test_whoever_waits_for_the_first_compilation_is_told(tmp_path, capsys, monke
     (tmp_path / "jit_fit-cache").touch()
     compile_for(report_line)
     assert capsys.readouterr().err == ""
+
+
+def test_results_from_python_are_those_of_the_command(ask, grid_folder, tmp_path):
+    """The same document and draws, but for the command that made them; without a folder nothing is written."""
+    assert ask("fit", grid_folder, "--no-sample", "--seed", 3)[0] == 0
+    campaign = read_campaign(grid_folder)
+    results = tvsbayes.calibrate(campaign, tmp_path / "mine", sampled=False, seed=3)
+    assert set(results.files) == {"draws", "fit"} and results.error is None
+    by_command, mine = (tvsbayes.read_fit(f / "fit.json") for f in (grid_folder / "results", tmp_path / "mine"))
+    assert {**by_command.as_json(), "command": ""} == {**mine.as_json(), "command": ""}
+    assert mine.as_json() == json.loads(json.dumps(results.record.as_json()))
+    assert mine.evidence.budgets and mine.evidence.positioning and mine.digest == by_command.digest
+    with np.load(grid_folder / "results" / "draws.npz") as one, np.load(tmp_path / "mine" / "draws.npz") as other:
+        assert sorted(one) == sorted(other)
+        for name in one:
+            np.testing.assert_array_equal(one[name], other[name])
+    assert tvsbayes.calibrate(campaign, sampled=False).files == {}

@@ -6,7 +6,7 @@ import json
 import math
 import os
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any
@@ -84,7 +84,7 @@ def _print(text: str) -> None:
         raise OutputFailed(error.strerror or str(error)) from error
 
 
-def print_json(document: dict[str, Any]) -> None:
+def print_json(document: Mapping[str, Any]) -> None:
     """The one document on stdout; NaN is a bug, not a value."""
     _print(json.dumps(document, indent=1, allow_nan=False, ensure_ascii=True))
 
@@ -103,7 +103,7 @@ def report_error(error: TvsError) -> None:
         report_line(f"what to do: {error.remedy}")
 
 
-def finish(document: dict[str, Any], text: str, as_json: bool, error: TvsError | None = None) -> None:
+def finish(document: Mapping[str, Any], text: str, as_json: bool, error: TvsError | None = None) -> None:
     """Print a result in the wanted form; one that must not be used carries its error and its exit code."""
     if as_json:
         print_json(document if error is None else {**document, **error_document(error)})
@@ -115,7 +115,7 @@ def finish(document: dict[str, Any], text: str, as_json: bool, error: TvsError |
         raise Ended(error.exit_code)
 
 
-def keep(document: dict[str, Any], path: Path) -> bool:
+def keep(document: Mapping[str, Any], path: Path) -> bool:
     """Write what a later report will show; a folder that cannot be written costs nobody the result."""
     try:
         make_folder(path.parent)

@@ -18,7 +18,8 @@ from tvsbayes.pipeline import compile_for
 
 if TYPE_CHECKING:
     from tvsbayes.acquisition.run_log import Outcome
-    from tvsbayes.cameras.boards import Board
+    from tvsbayes.cameras.boards import Board, Finder
+    from tvsbayes.cameras.calibration_formats import Format
     from tvsbayes.instrument.plan import PlanStep
     from tvsbayes.instrument.rig import Rig
     from tvsbayes.instrument.stereo_pair import Stereo
@@ -66,7 +67,8 @@ def stereo(
         found = found if folder is None else "stereo takes pictures or a calibration to import, not both"
         raise InputError("usage", found, remedy="give FOLDER with --board and --pitch-mm, or --import FILE")
     finite(pitch_mm=pitch_mm, pitch_u_mm=pitch_u_mm)
-    places = _new_files(out, export)
+    form: Format | None = None if export is None else "ros" if export == "ros" else "opencv"
+    places = _new_files(out, form)
     if folder is None:
         options = {"board": board, "pitch_mm": pitch_mm, "pitch_u_mm": pitch_u_mm, "finder": finder, "swap": swap}
         refuse_options("for pictures of a board", "leave out --import", **options, fix_k3=fix_k3, robust=robust)
@@ -79,11 +81,11 @@ def stereo(
         from tvsbayes.report.command_text import stereo_calibration_text
 
         compile_for(report_line)
-        options = {"swap": swap, "fix_k3": fix_k3, "robust": robust}
-        result = calibrate_folder(folder, pattern, finder=finder or "classic", **options)
+        kind: Finder = "sector" if finder == "sector" else "classic"
+        result = calibrate_folder(folder, pattern, finder=kind, swap=swap, fix_k3=fix_k3, robust=robust)
         document = {"source": "pictures", **result.as_json()}
         made = MadePair(result.stereo, stereo_calibration_text(result), document)
-    _write_pair(made, places, export, as_json)
+    _write_pair(made, places, form, as_json)
 
 
 @dataclass(frozen=True)
@@ -95,13 +97,13 @@ class MadePair:
     document: dict[str, object]
 
 
-def _new_files(out: Path | None, export: str | None) -> dict[str, Path]:
+def _new_files(out: Path | None, export: Format | None) -> dict[str, Path]:
     """Where the pair is to be written, by kind; refused before pictures are read, which takes minutes."""
     from tvsbayes.cameras.calibration_formats import EXPORT_NAMES
 
     beside = Path() if out is None else out.parent
     places = {} if out is None else {"stereo": out}
-    places |= {name: beside / name for name in EXPORT_NAMES.get(export or "", ())}
+    places |= {name: beside / name for name in (() if export is None else EXPORT_NAMES[export])}
     for path in places.values():
         if os.path.lexists(path):
             # Fits stand on a calibration by its hash.
@@ -150,7 +152,7 @@ def _imported(paths: list[Path], image_size: str | None, import_unit: str | None
     return MadePair(pair, "\n".join([stereo_text(pair), *remarks]), document)
 
 
-def _write_pair(made: MadePair, places: dict[str, Path], export: str | None, as_json: bool) -> None:
+def _write_pair(made: MadePair, places: dict[str, Path], export: Format | None, as_json: bool) -> None:
     """Write a pair where it was asked for, and say so."""
     from tvsbayes.cameras.calibration_formats import exported
     from tvsbayes.instrument.stereo_pair import stereo_bytes
@@ -174,6 +176,22 @@ def _image_size(text: str | None) -> tuple[int, int] | None:
     return sizes[0], sizes[1]
 
 
+LaserClass = Annotated[
+    str | None, typer.Option("--laser-class", help="Class on the laser's label: states the hazard is known.")
+]
+TargetU = Annotated[
+    float | None,
+    typer.Option("--target-u", min=0.0, help="Stop when every effective ratio is known to this u, deg/step."),
+]
+Estimated = Annotated[
+    bool | None,
+    typer.Option(
+        "--estimate/--no-estimate",
+        help="Fit the looks so far beside the run (default: on hardware only; a simulation waits for each fit).",
+    ),
+]
+
+
 def acquire(
     rig: Annotated[Path, typer.Argument(metavar="RIG", help="Rig file.")],
     plan: Annotated[Path, typer.Argument(metavar="PLAN", help="plan.csv.")],
@@ -184,20 +202,9 @@ def acquire(
     ] = False,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with an interrupted run.")] = False,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="List what would happen; nothing moves.")] = False,
-    laser_class: Annotated[
-        str | None, typer.Option("--laser-class", help="Class on the laser's label: states the hazard is known.")
-    ] = None,
-    target_u: Annotated[
-        float | None,
-        typer.Option("--target-u", min=0.0, help="Stop when every effective ratio is known to this u, deg/step."),
-    ] = None,
-    estimate: Annotated[
-        bool | None,
-        typer.Option(
-            "--estimate/--no-estimate",
-            help="Fit the looks so far beside the run (default: on hardware only; a simulation waits for each fit).",
-        ),
-    ] = None,
+    laser_class: LaserClass = None,
+    target_u: TargetU = None,
+    estimate: Estimated = None,
     seed: Annotated[int | None, typer.Option("--seed", min=0, help="Of a simulation (default 0).")] = None,
     as_json: Json = False,
 ) -> None:

@@ -148,20 +148,28 @@ def check(
     as_json: Json = False,
 ) -> None:
     """What a campaign, rig, plan or journal holds and cannot tell. Reads strictly, changes nothing."""
-    from tvsbayes.estimators.plausibility import check_campaign
-    from tvsbayes.instrument.campaign import read_campaign
-    from tvsbayes.instrument.plan import read_plan
-    from tvsbayes.instrument.rig import read_rig
-
     if repair_to is not None:
         if plan_file is not None:
             raise InputError("usage", "a repaired journal takes no plan", remedy="leave out PLAN or --repair-to")
         from tvsbayes.acquisition.campaign_files import repair_campaign
 
-        document = repair_campaign(path, repair_to)
-        lines = [f"{key}: {value}" for key, value in document.items()]
-        finish(document, "\n".join([*lines, f"{escaped(str(repair_to), 200)}: written"]), as_json)
+        repaired = repair_campaign(path, repair_to)
+        lines = [f"{key}: {value}" for key, value in repaired.items()]
+        finish(repaired, "\n".join([*lines, f"{escaped(str(repair_to), 200)}: written"]), as_json)
         return
+    document = _held(path, plan_file)
+    warnings = document["warnings"]
+    lines = [f"{key}: {value}" for key, value in document.items() if key not in ("warnings", "faults")]
+    lines += [f"warning: {warning}" for warning in warnings]
+    lines.append(f"{escaped(str(path), 200)}: readable, {len(warnings)} warning{'s' * (len(warnings) != 1)}")
+    finish(document, "\n".join(lines), as_json)
+
+
+def _held(path: Path, plan_file: Path | None) -> dict[str, Any]:
+    """What a plan with its rig, a plan, a rig, a journal or a campaign holds; warnings under their own key."""
+    from tvsbayes.instrument.plan import read_plan
+    from tvsbayes.instrument.rig import read_rig
+
     if plan_file is not None and path.suffix != ".toml":
         remedy = "give the rig file first, then the plan"
         raise InputError("usage", "a plan is checked together with a rig file", allowed="RIG PLAN", remedy=remedy)
@@ -170,29 +178,31 @@ def check(
         from tvsbayes.planning.plan_check import check_plan
 
         compile_for(report_line)
-        document: dict[str, Any] = check_plan(rig, steps).as_json()
-    elif path.suffix == ".csv" and not path.is_dir():
+        return check_plan(rig, steps).as_json()
+    if path.suffix == ".csv" and not path.is_dir():
         steps = read_plan(path)
         actions = {action: sum(s.action == action for s in steps) for action in ("home", "place", "move", "look")}
-        document = {"kind": "plan", "steps": len(steps), **actions, "warnings": []}
-    elif path.suffix == ".toml" and not path.is_dir():
+        return {"kind": "plan", "steps": len(steps), **actions, "warnings": []}
+    if path.suffix == ".toml" and not path.is_dir():
         rig = read_rig(path)
-        document = {"kind": "rig", "sheets_mm": rig.sheets_mm, "costs_s": rig.costs_s, "warnings": []}
-    else:
-        journal = None
-        if (path / "log.jsonl").is_file():
-            from tvsbayes.acquisition.campaign_files import check_journal
+        return {"kind": "rig", "sheets_mm": rig.sheets_mm, "costs_s": rig.costs_s, "warnings": []}
+    return _campaign_held(path)
 
-            journal = check_journal(path)
-        if journal is not None and not journal["moves"]:
-            document = {"kind": "journal", **journal}
-        else:
-            document = check_campaign(read_campaign(path)).as_json()
-            if journal is not None:
-                document["warnings"] = [*journal.pop("warnings"), *document["warnings"]]
-                document["journal"] = journal
-    warnings = document["warnings"]
-    lines = [f"{key}: {value}" for key, value in document.items() if key not in ("warnings", "faults")]
-    lines += [f"warning: {warning}" for warning in warnings]
-    lines.append(f"{escaped(str(path), 200)}: readable, {len(warnings)} warning{'s' * (len(warnings) != 1)}")
-    finish(document, "\n".join(lines), as_json)
+
+def _campaign_held(path: Path) -> dict[str, Any]:
+    """A campaign and its journal; the journal alone where nothing has moved yet."""
+    from tvsbayes.estimators.plausibility import check_campaign
+    from tvsbayes.instrument.campaign import read_campaign
+
+    journal: dict[str, Any] | None = None
+    if (path / "log.jsonl").is_file():
+        from tvsbayes.acquisition.campaign_files import check_journal
+
+        journal = check_journal(path)
+    if journal is not None and not journal["moves"]:
+        return {"kind": "journal", **journal}
+    document: dict[str, Any] = check_campaign(read_campaign(path)).as_json()
+    if journal is not None:
+        document["warnings"] = [*journal.pop("warnings"), *document["warnings"]]
+        document["journal"] = journal
+    return document

@@ -104,12 +104,18 @@ def fit(
     finish(document, f"{fit_text(summary)}\nwritten: {', '.join(files.values())}", as_json, results.error)
 
 
+LimitRatio = Annotated[
+    float | None,
+    typer.Option("--limit-deg-per-step", min=0, help="Largest error allowed of any ratio: for a verdict."),
+]
+Schema = Annotated[
+    Path | None, typer.Option("--dcc-schema", help="PTB's dcc.xsd on this machine: validate the XML against it.")
+]
+
+
 def report(
     campaign: CampaignFolder,
-    limit_deg_per_step: Annotated[
-        float | None,
-        typer.Option("--limit-deg-per-step", min=0, help="Largest error allowed of any ratio: for a verdict."),
-    ] = None,
+    limit_deg_per_step: LimitRatio = None,
     limit_mm: Annotated[float | None, typer.Option("--limit-mm", min=0, help="Largest 3D error allowed.")] = None,
     range_mm: Annotated[float, typer.Option("--range-mm", min=1, help="Range at which millimetres are stated.")] = 1e3,
     pdf: Annotated[bool, typer.Option("--pdf", help="Also print to PDF with an installed Chromium.")] = False,
@@ -117,9 +123,7 @@ def report(
     laboratory: Annotated[str | None, typer.Option("--laboratory", help="Who measured, for --dcc.")] = None,
     customer: Annotated[str | None, typer.Option("--customer", help="For whom, for --dcc.")] = None,
     country: Annotated[str | None, typer.Option("--country", help="ISO 3166-1 code of the place, for --dcc.")] = None,
-    dcc_schema: Annotated[
-        Path | None, typer.Option("--dcc-schema", help="PTB's dcc.xsd on this machine: validate the XML against it.")
-    ] = None,
+    dcc_schema: Schema = None,
     out: Annotated[Path | None, typer.Option("--out", help="File (default CAMPAIGN/results/report.html).")] = None,
     as_json: Json = False,
 ) -> None:
@@ -138,6 +142,7 @@ def report(
     if pdf:
         find_browser()
     record = record_for(data, campaign, report_line)
+    from tvsbayes.metrology.schema_check import check_dcc
     from tvsbayes.report.evidence import MET, gather
 
     limits = {"limit_deg_per_step": limit_deg_per_step, "limit_mm": limit_mm}
@@ -153,18 +158,15 @@ def report(
     ]
     missed = any(c.verdict != MET for c in evidence.criteria)
     if dcc or dcc_schema:
-        certificate = results / "dcc.xml"
-        content = _certificate(data, record, path.read_bytes(), {k: v for k, v in parties.items() if v is not None})
-        write_atomically(certificate, content)
-        files["dcc"] = str(certificate)
-    if dcc_schema:
-        from tvsbayes.metrology.schema_check import check_dcc
-
-        checked = check_dcc(content, dcc_schema)
-        verdict = {True: "valid", False: "NOT VALID", None: "could not be checked"}[checked.valid]
-        lines += [f"DCC by {checked.tool} against {dcc_schema}: {verdict}", *checked.messages[:DCC_MESSAGES]]
-        result["dcc_schema"] = asdict(checked)
-        missed |= not checked.valid
+        content = _certificate(data, record, path.read_bytes(), parties)
+        write_atomically(results / "dcc.xml", content)
+        files["dcc"] = str(results / "dcc.xml")
+        if dcc_schema:
+            checked = check_dcc(content, dcc_schema)
+            verdict = {True: "valid", False: "NOT VALID", None: "could not be checked"}[checked.valid]
+            lines += [f"DCC by {checked.tool} against {dcc_schema}: {verdict}", *checked.messages[:DCC_MESSAGES]]
+            result["dcc_schema"] = asdict(checked)
+            missed |= not checked.valid
     validation = record.summary.validation
     if validation is not None and not validation.passed:
         lines.insert(0, validation_lines(validation)[0])
@@ -173,11 +175,12 @@ def report(
         raise Ended(TARGET_MISSED)
 
 
-def _certificate(campaign: Campaign, record: FitRecord, report: bytes, stated: dict[str, str]) -> bytes:
+def _certificate(campaign: Campaign, record: FitRecord, report: bytes, parties: dict[str, str | None]) -> bytes:
     """DCC-schema XML, issued today (UTC)."""
     from tvsbayes.metrology.dcc import Parties, dcc_bytes
 
     today = datetime.datetime.now(datetime.UTC).date()
+    stated = {name: text for name, text in parties.items() if text is not None}
     return dcc_bytes(campaign, record, issued=today, parties=Parties(**stated), report=report)
 
 

@@ -65,7 +65,7 @@ def _run(arguments: list[str]) -> int:
         code = INTERRUPTED
     except Exception as error:
         # Wrong options are bad input like any other; typer's own classes carry the text to show.
-        if not hasattr(error, "format_message"):
+        if not (hasattr(error, "format_message") and hasattr(error, "show")):
             raise
         if wants_json:
             print_json(error_document(InputError("usage", error.format_message(), remedy="see tvsbayes --help")))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import sys
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -31,7 +32,17 @@ STEPS_MAX, ANGLE_MAX_DEG = 1e8, 360.0
 WORKERS = 2
 
 
-def _read_points(path: Path) -> tuple[list[float], list[float], list[float], list[tuple[str, str]]]:
+@dataclass(frozen=True)
+class Points:
+    """Looks whose points are wanted, row by row."""
+
+    pan_steps: list[float]
+    tilt_steps: list[float]
+    aperture_deg: list[float]
+    approach: list[tuple[str, str]]
+
+
+def _read_points(path: Path) -> Points:
     """Counters, readings and approaches of a CSV of points."""
     from tvsbayes.instrument.axes import SENSES
 
@@ -44,10 +55,10 @@ def _read_points(path: Path) -> tuple[list[float], list[float], list[float], lis
             if word not in allowed:
                 remedy = "name the direction of the last move of the axis"
                 raise table.refuse(row, f"{axis}_approach", "approach", ", ".join(allowed), remedy)
-    counters = [table.numbers(name, -STEPS_MAX, STEPS_MAX) for name in ("pan_steps", "tilt_steps")]
+    pan, tilt = (table.numbers(name, -STEPS_MAX, STEPS_MAX) for name in ("pan_steps", "tilt_steps"))
     readings = table.numbers("aperture_deg", -ANGLE_MAX_DEG, ANGLE_MAX_DEG)
     pairs = list(zip(table.columns["pan_approach"], table.columns["tilt_approach"], strict=True))
-    return *counters, readings, pairs
+    return Points(pan, tilt, readings, pairs)
 
 
 def locate(
@@ -73,44 +84,51 @@ def locate(
     as_json: Json = False,
 ) -> None:
     """Where the scanner points, in millimetres. Frame T, with covariance and 95 % half widths."""
-    single = (pan_steps, tilt_steps, aperture_deg)
-    if (points is None) == any(value is None for value in single):
+    if points is not None:
+        options = {"pan_approach": pan_approach, "tilt_approach": tilt_approach, "budget": budget or None}
+        counters = {"pan_steps": pan_steps, "tilt_steps": tilt_steps, "aperture_deg": aperture_deg}
+        refuse_options("for one point", "leave out --points, or give the columns of its file", **options, **counters)
+        _locate_all(campaign, _read_points(points), draws, seed, as_json)
+        return
+    if pan_steps is None or tilt_steps is None or aperture_deg is None:
         remedy = "give --pan-steps, --tilt-steps and --aperture-deg, or --points FILE.csv"
         raise InputError("usage", "locate needs one point or a file of points", remedy=remedy)
-    if points is not None:
-        options = {"budget": budget, "pan_approach": pan_approach, "tilt_approach": tilt_approach}
-        options |= {"pan_steps": pan_steps, "tilt_steps": tilt_steps, "aperture_deg": aperture_deg}
-        refuse_options("for one point", "leave out --points, or give the columns of its file", **options)
     finite(pan_steps=pan_steps, tilt_steps=tilt_steps, aperture_deg=aperture_deg)
-    approach = (pan_approach or "left", tilt_approach or "up")
-    where = (*single, approach) if points is None else _read_points(points)
     from tvsbayes.instrument.axes import sides_of
 
-    if points is None:
-        sides_of(approach)
+    where = (pan_steps, tilt_steps, aperture_deg, (pan_approach or "left", tilt_approach or "up"))
+    sides_of(where[-1])
     calibration = calibration_for(campaign, report_line)
     from tvsbayes.coordinates.location import locate as locate_points
-    from tvsbayes.report.command_text import locations_text
+    from tvsbayes.report.command_text import budget_text, locations_text
 
     compile_for(report_line)
     found = locate_points(calibration, *where, draws=draws, seed=seed)
-    if points is not None:
-        entries = [found.as_json(k) for k in range(len(found.refused))]
-        document = {"estimator": found.estimator, "draws": found.draws, "points": entries}
-        finish(document, locations_text(found), as_json)
-        return
     if found.refused[0] is not None:
         raise found.refused[0]
     document = {"estimator": found.estimator, "draws": found.draws, **found.as_json(0)}
     text = locations_text(found)
     if budget:
         from tvsbayes.metrology.look_budget import budget as point_budget
-        from tvsbayes.report.command_text import budget_text
 
         parts = point_budget(calibration, *where)
         document["budget"] = parts.as_json()
         text += f"\n\n{budget_text(parts)}"
     finish(document, text, as_json)
+
+
+def _locate_all(campaign: Path, points: Points, draws: int, seed: int, as_json: bool) -> None:
+    """Every point of a file, refused one by one."""
+    calibration = calibration_for(campaign, report_line)
+    from tvsbayes.coordinates.location import locate as locate_points
+    from tvsbayes.report.command_text import locations_text
+
+    compile_for(report_line)
+    where = (points.pan_steps, points.tilt_steps, points.aperture_deg, points.approach)
+    found = locate_points(calibration, *where, draws=draws, seed=seed)
+    entries = [found.as_json(k) for k in range(len(found.refused))]
+    document = {"estimator": found.estimator, "draws": found.draws, "points": entries}
+    finish(document, locations_text(found), as_json)
 
 
 def steps_for(
@@ -128,7 +146,7 @@ def steps_for(
 ) -> None:
     """Counters that send the beam to a point or along a direction. With the approach that removes backlash."""
     finite(x_mm=x_mm, y_mm=y_mm, z_mm=z_mm, azimuth_deg=azimuth_deg, elevation_deg=elevation_deg)
-    point = None if None in (x_mm, y_mm, z_mm) else (x_mm, y_mm, z_mm)
+    point = None if x_mm is None or y_mm is None or z_mm is None else (x_mm, y_mm, z_mm)
     direction = None if None in (azimuth_deg, elevation_deg) else (azimuth_deg, elevation_deg)
     given = sum(value is not None for value in (x_mm, y_mm, z_mm, azimuth_deg, elevation_deg))
     if export not in (None, "header", "json"):
@@ -144,9 +162,9 @@ def steps_for(
     from tvsbayes.calibration.calibration_file import calibration_header, calibration_json
 
     if export:
-        document = calibration_json(calibration)
-        text = calibration_header(calibration) if export == "header" else json.dumps(document, indent=1)
-        finish({"header": text} if as_json and export == "header" else document, text.rstrip("\n"), as_json)
+        stored = calibration_json(calibration)
+        text = calibration_header(calibration) if export == "header" else json.dumps(stored, indent=1)
+        finish({"header": text} if as_json and export == "header" else stored, text.rstrip("\n"), as_json)
         return
     from tvsbayes.report.command_text import steps_text
 
@@ -195,8 +213,16 @@ def plan(
         raise InputError("criterion", message, column="--criterion", allowed=allowed, remedy="name one of them")
     compile_for(report_line)
     fitted = None if data is None else fit_for(data, report_line)
-    options = {"criterion": criterion, "aperture": aperture, "draws": draws, "seed": seed}
-    result = find_plan(instrument, wanted, given=fitted, minutes=minutes, **options)
+    result = find_plan(
+        instrument,
+        wanted,
+        given=fitted,
+        minutes=minutes,
+        criterion=criterion,
+        aperture=aperture,
+        draws=draws,
+        seed=seed,
+    )
     text, document = plan_text(result), result.as_json()
     if output is not None and result.steps:
         write_plan(result.steps, output)

@@ -39,7 +39,7 @@ def plan_text(result: PlanResult) -> str:
     none = f"not reached with up to {result.curve[-1].experiments} experiments"
     for level, n in zip(ASSURED, (result.n80, result.n95), strict=True):
         lines.append(f"assurance {100 * level:.0f} %: {none if n is None else f'n = {n}'}")
-    if result.assurance is None:
+    if result.assurance is None or result.assurance_se is None:
         lines.append("the target is met already: nothing is left to do")
     else:
         lines.append(
@@ -179,11 +179,11 @@ def steps_text(steps: Steps) -> str:
         f"go to      pan {steps.via_pan_steps}, tilt {steps.via_tilt_steps} steps (takes up the backlash)",
         f"then to    pan {steps.pan_steps}, tilt {steps.tilt_steps} steps, moving {pan} and {tilt}",
     ]
-    if steps.xyz_mm is not None:
+    if steps.u95_mm is not None:
         half = ", ".join(map(two_digits, steps.u95_mm))
         lines.append(f"whole steps leave {steps.rounding_mm:.3g} mm; beam there +- ({half}) mm (95 %)")
         lines.append(f"the aperture should read {steps.aperture_deg:.3f} deg")
-    else:
+    if steps.u95_deg is not None:
         half = ", ".join(map(two_digits, steps.u95_deg))
         lines.append(f"whole steps leave {steps.rounding_deg:.3g} deg; azimuth and elevation +- ({half}) deg (95 %)")
     return "\n".join(lines)

@@ -13,12 +13,12 @@ import io
 import re
 from collections.abc import Mapping, Sequence
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from tvsbayes.estimators.four_point import ClassicResult, DirectionResult, select_experiments
-from tvsbayes.instrument.axes import DIRECTIONS, SENSES
+from tvsbayes.instrument.axes import DIRECTIONS, SENSES, Axis
 from tvsbayes.instrument.stereo_pair import triangulate
 
 if TYPE_CHECKING:
@@ -50,7 +50,7 @@ DIVERGING, SEQUENTIAL = (BLUE, "#FFFFFF", RED), ("#FFFFFF", SKY, BLUE, "#00263E"
 """Colours of maps, from the lowest to the highest value."""
 RASTER_DPI = 150
 """Of the parts of a figure with hundreds of points."""
-STYLE = {
+STYLE: dict[Any, object] = {
     "font.size": 9.0,
     "axes.titlesize": 9.5,
     "axes.spines.top": False,
@@ -314,7 +314,7 @@ def correlations(names: Sequence[str], matrix: np.ndarray) -> Figure:
     return figure
 
 
-def residuals(stops: Sequence[StopResidual], axis: str) -> Figure:
+def residuals(stops: Sequence[StopResidual], axis: Axis) -> Figure:
     """Deviations of one axis' stops over time and against their counters."""
     mine = [stop for stop in stops if stop.axis == axis]
     directions = SENSES[axis]

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tvsbayes.instrument.axes import DIRECTIONS
+from tvsbayes.instrument.axes import AXES, DIRECTIONS
 from tvsbayes.metrology.traceability import stated_value
 from tvsbayes.report import figures
 from tvsbayes.report.fit_text import sampling_line
@@ -77,7 +77,7 @@ def results_section(e: Evidence) -> Section:
     ]
     if e.classic is None:
         text.append("Classic: not applicable, the campaign has no complete four-point experiment.")
-    tables, views = [_both(e), _parameters(e)], [_intervals(e), *_scatters(e)]
+    tables, views = [_both(e), _parameters(e)], [_intervals(e), *_one_experiment(e), *_scatters(e)]
     if e.shown.gap:
         tables.append(gap_table(e.shown.gap))
         views.append(
@@ -127,6 +127,24 @@ def _both(e: Evidence) -> TableView:
     return TableView(caption, columns, rows)
 
 
+def _one_experiment(e: Evidence) -> list[FigureView]:
+    """The first complete experiment as the paper draws one: its beams and its points."""
+    if e.classic is None or not e.classic.experiments:
+        return []
+    number = e.classic.experiments[0].experiment
+    beams = figure_view(
+        figures.trajectories(e.campaign, number),
+        f"Beams of experiment {number} before and after its steps, with the angle of each",
+        f"Experiment {number}: the beam before and after, in the plane of its angle.",
+    )
+    points = figure_view(
+        figures.points_3d(e.campaign, number),
+        f"The four points of experiment {number} in space, in the order of measurement",
+        f"Experiment {number}: its four points, frame S.",
+    )
+    return [beams, points]
+
+
 def _intervals(e: Evidence) -> FigureView:
     """Ratios of both estimators with their intervals."""
     classic = {} if e.classic is None else e.classic.directions
@@ -140,8 +158,9 @@ def _intervals(e: Evidence) -> FigureView:
 def _scatters(e: Evidence) -> list[FigureView]:
     """The experiments of every direction that has some."""
     views = []
-    for direction in DIRECTIONS if e.classic is not None else ():
-        result = e.classic.directions[direction]
+    if e.classic is None:
+        return []
+    for direction, result in e.classic.directions.items():
         if result is None:
             continue
         alt = f"{result.n} experiments moving {direction}: mean {result.mean_deg_per_step:.6f} deg/step"
@@ -224,7 +243,7 @@ def residuals_section(e: Evidence) -> Section:
         f"{summary.parameters['pixel_scale'].value:.2f} times the stated one."
     ]
     views = []
-    for axis in ("pan", "tilt"):
+    for axis in AXES:
         if any(c.axis == axis for c in causes):
             alt = f"Mean deviation by group, {axis} axis; values in the table above"
             views.append(figure_view(figures.causes(causes, axis), alt, f"{axis} axis: mean deviation by group."))
@@ -295,8 +314,8 @@ def validation_section(e: Evidence) -> Section:
 def _foretold(e: Evidence) -> TableView | None:
     """What the model says of the classic estimator beside what that says."""
     rows = []
-    for direction in DIRECTIONS if e.classic is not None else ():
-        told, seen = e.fit.summary.classic_predicted[direction], e.classic.directions[direction]
+    for direction, told in e.fit.summary.classic_predicted.items():
+        seen = None if e.classic is None else e.classic.directions[direction]
         if told is None or seen is None:
             continue
         u = seen.u_type_a_deg_per_step or 0.0

@@ -24,6 +24,7 @@ import numpy as np
 from tvsbayes.errors import escaped, shown
 from tvsbayes.files.disk import read_bytes, shipped_data
 from tvsbayes.files.documents import JSON_BYTES_MAX, Keys, parse_json
+from tvsbayes.instrument.axes import DIRECTIONS
 from tvsbayes.results.comparison_record import Gap
 from tvsbayes.results.estimates import KEPT_AS, Cause, FitSummary, StopResidual
 from tvsbayes.results.metrology_tables import AxisPositioning, BudgetTable
@@ -215,13 +216,11 @@ def _summary_keys(keys: Keys) -> Keys:
     values = {KEPT_AS.get(key, key): value for key, value in keys.values.items()} | keys.table("noise").values
     if keys.values["curves"] is not None:
         curves = keys.table("curves")
-        along = {
-            axis: [
-                {"pan_deg": point.pop("pan_deg"), "tilt_deg": point.pop("tilt_deg"), "ratios": point}
-                for point in map(dict, points)
-            ]
-            for axis, points in curves.table("effective_deg_per_step").values.items()
-        }
+        along = {}
+        for axis, points in curves.table("effective_deg_per_step").values.items():
+            assert isinstance(points, list)
+            ratios = [{key: of for key, of in point.items() if key in DIRECTIONS} for point in points]
+            along[axis] = [{**point, "ratios": of} for point, of in zip(points, ratios, strict=True)]
         values["curves"] = {"ratios": along, "lost_motion": curves.values["lost_motion"]}
     return Keys(values, keys.file, keys.text)
 

@@ -112,7 +112,9 @@ def _is_a(kind: type, value: object) -> bool:
         return kind is bool
     if isinstance(value, str):
         return kind is str and len(value) <= TEXT_CHARS_MAX and all(c.isprintable() or c in "\n\t" for c in value)
-    return isinstance(value, int | float if kind is float else kind) and math.isfinite(value)
+    if kind is int:
+        return isinstance(value, int)
+    return kind is float and isinstance(value, int | float) and math.isfinite(value)
 
 
 def stored_document(campaign: Campaign, name: str, formats: tuple[str, ...], inputs: Mapping[str, str]) -> Keys | None:

@@ -1,0 +1,35 @@
+"""What `tvsbayes` itself offers: names that load on demand and collide with nothing."""
+
+from __future__ import annotations
+
+import importlib
+import pkgutil
+import subprocess
+import sys
+
+import tvsbayes
+
+FIRST = {"calibration_of", "fit", "load_calibration", "locate", "read_campaign", "sample"}
+
+
+def test_every_public_name_is_there_and_shown():
+    assert FIRST | {"plots", "calibrate", "FitRecord", "JointFit", "Posterior", "Campaign"} <= set(tvsbayes.__all__)
+    assert set(tvsbayes.__all__) <= set(dir(tvsbayes))
+    for name in tvsbayes.__all__:
+        assert getattr(tvsbayes, name).__doc__, name
+
+
+def test_no_public_name_is_that_of_a_package():
+    """An attribute of the package that is also a module would be one or the other, by what was imported last."""
+    assert not set(tvsbayes.__all__) & {module.name for module in pkgutil.iter_modules(tvsbayes.__path__)}
+
+
+def test_names_are_where_type_checkers_look_for_them():
+    for name, home in tvsbayes._HOME.items():
+        assert getattr(importlib.import_module(f"tvsbayes.{home}"), name) is getattr(tvsbayes, name)
+
+
+def test_importing_it_loads_neither_numpy_nor_jax():
+    code = "import sys, tvsbayes; dir(tvsbayes); print([n for n in ('numpy', 'jax', 'matplotlib') if n in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
