@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from tvsbayes.errors import InputError
-from tvsbayes.estimators.campaign_arrays import CampaignArrays, SpotArrays, move_arrays
+from tvsbayes.estimators.campaign_arrays import NOWHERE_MM, CampaignArrays, SpotArrays, move_arrays
 from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.estimators.likelihood import filter_rows, look, no_belief
 from tvsbayes.estimators.linear_spots import linearise
@@ -143,7 +143,7 @@ def expect(
     pixels = project(model.cameras, points)
     inside = jnp.all((pixels >= 0) & (pixels <= image_px[:, None]), axis=0)
     seen = (reach > 0) & inside & (spots.valid > 0)
-    harmless = jnp.array([500.0, 0.0, 0.0])[:, None]
+    harmless = jnp.array(NOWHERE_MM)[:, None]
     arrays = eqx.tree_at(
         lambda a: (a.spots.valid, a.spots.triangulated_mm),
         arrays,
