@@ -85,6 +85,7 @@ def test_numbers_of_the_page_are_the_libraries(page, evidence):
         assert f"{joint.value:.6f}"[:7] in text
         assert f"{evidence.classic.directions[direction].mean_deg_per_step:.5f}"[:7] in text
     assert not re.search(r"\b(nan|inf|None|undefined)\b", text)
+    assert text.count(f"Report {evidence.fit.report_id}") == 1
     for word in ("Not an accredited", "Simulated data: not traceable", "synthetic", "End of report", "Seed"):
         assert word in text
     for sha in evidence.fit.provenance.inputs.values():

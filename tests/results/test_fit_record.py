@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import datetime
 import json
 import math
 from dataclasses import asdict, replace
@@ -175,3 +176,30 @@ def test_numbers_that_are_none_are_refused(tmp_path):
     file.write_text(json.dumps(changed(kept("fit-1-laplace.json"), "noise/chi2", math.nan)))
     with pytest.raises(InputError):
         read_fit(file)
+
+
+def test_a_failure_without_its_test_and_foreign_figures_are_refused(tmp_path):
+    """What pages and certificates look up must be there; the schema does not know it."""
+    failed = {"passed": False, "level": 0.01, "cause": "drift", "inflation": 2.0, "tests": []}
+    axis = {"axis": "pan", "deg_per_step": 0.06, "target_steps": [0, 100], "runs": 5, "estimator": "laplace"}
+    axis |= {"plug_in_steps": [], "plug_in_runs": [], "reading_u_deg": None, "missing": None, "notes": []}
+    axis |= {"predicted": {"colour": {"median": 0.1, "interval95": [0.0, 0.2]}}, "plug_in": None}
+    besides = {"residuals": [], "residual_causes": [], "gap": None, "budgets": [], "positioning": [axis]}
+    for column, added in (("validation", {"validation": failed}), ("positioning", besides)):
+        document = {**kept("fit-1-laplace.json"), **added}
+        assert problems(document, schema_of(document)) == []
+        (tmp_path / "fit.json").write_text(json.dumps(document))
+        with pytest.raises(InputError) as error:
+            read_fit(tmp_path / "fit.json")
+        assert error.value.column == column
+
+
+def test_one_identity_of_results_names_report_and_certificate():
+    """Twelve digits of one digest; another seed or another version is another document."""
+    record = small_record()
+    day = datetime.date(2026, 11, 22)
+    assert record.report_id == record.digest[:12].upper()
+    assert record.certificate_id("a", day) == small_record().certificate_id("a", day)
+    other = small_record(seed=1)
+    ids = {record.certificate_id("a", day), record.certificate_id("b", day), other.certificate_id("a", day)}
+    assert len(ids) == 3 and other.report_id != record.report_id

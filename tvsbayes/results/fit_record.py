@@ -27,7 +27,7 @@ from tvsbayes.files.documents import JSON_BYTES_MAX, Keys, parse_json
 from tvsbayes.instrument.axes import DIRECTIONS
 from tvsbayes.results.comparison_record import Gap
 from tvsbayes.results.estimates import KEPT_AS, Cause, FitSummary, StopResidual
-from tvsbayes.results.metrology_tables import AxisPositioning, BudgetTable
+from tvsbayes.results.metrology_tables import FIGURES, AxisPositioning, BudgetTable
 from tvsbayes.results.records import plain, read_record
 
 if TYPE_CHECKING:
@@ -236,10 +236,16 @@ def read_fit(path: Path | str) -> FitRecord:
     _check_agreement(keys)
     # Documents of the first tvsbayes hold none; a part of it is none.
     shown_besides = {field.name for field in fields(FitEvidence)} <= set(keys.values)
-    evidence = read_record(FitEvidence, keys, AGAIN) if shown_besides else None
-    return FitRecord(
+    record = FitRecord(
         read_record(FitSummary, _summary_keys(keys), AGAIN),
         read_record(NamedCovariance, keys.table("covariance"), AGAIN),
-        evidence,
+        read_record(FitEvidence, keys, AGAIN) if shown_besides else None,
         read_record(Provenance, keys, AGAIN),
     )
+    validation = record.summary.validation
+    if validation is not None and not (validation.passed or validation.tests):
+        raise keys.refuse("validation", "schema", "the test that failed", AGAIN, "a failure of no test")
+    for table in () if record.evidence is None else record.evidence.positioning:
+        if table.predicted is not None and set(table.predicted) != set(FIGURES):
+            raise keys.refuse("positioning", "schema", ", ".join(FIGURES), AGAIN, "other figures")
+    return record
