@@ -28,8 +28,8 @@ from tvsbayes.instrument.campaign import input_hashes
 from tvsbayes.instrument.parameters import NAMES
 from tvsbayes.posterior.draws import Posterior
 from tvsbayes.posterior.proposal import Target, pilot
+from tvsbayes.posterior.ridges import transport
 from tvsbayes.posterior.sampling import sample
-from tvsbayes.posterior.transport import transport
 from tvsbayes.results.records import plain
 
 QUANTILES = {"q05": 0.05, "q50": 0.5, "q95": 0.95}

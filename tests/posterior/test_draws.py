@@ -16,8 +16,9 @@ from scipy import stats
 from tvsbayes.instrument.parameters import INDEX, NAMES
 from tvsbayes.posterior.draws import Posterior, propagated
 from tvsbayes.posterior.proposal import Target
+from tvsbayes.posterior.ridges import by_width
 from tvsbayes.posterior.sampling import Chain, diagnose
-from tvsbayes.posterior.transport import STRETCH_NODES, Transport, by_width
+from tvsbayes.posterior.transport import STRETCH_NODES, Transport
 
 WALKERS, STEPS = 64, 400
 RATIO, BACKLASH = INDEX["degrees_per_step.pan"], INDEX["backlash_deg.pan"]
@@ -125,7 +126,7 @@ def test_the_density_of_walkers_is_the_models_times_the_jacobian(x64, monkeypatc
         return SimpleNamespace(log_density=AT_MODE - 0.5 * (z[:, RATIO] ** 2 + z[:, BACKLASH] ** 2))
 
     monkeypatch.setattr("tvsbayes.posterior.proposal.evaluate", evaluate)
-    monkeypatch.setattr("tvsbayes.posterior.transport.evaluate", evaluate)
+    monkeypatch.setattr("tvsbayes.posterior.ridges.evaluate", evaluate)
     w = np.random.default_rng(4).standard_normal((50, 2))
     value = Target(fit(), route())(w)
     log_factor = STRETCH * np.maximum(w[:, 0], STRETCH_NODES[0])

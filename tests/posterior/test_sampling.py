@@ -30,7 +30,7 @@ def limits(patch: pytest.MonkeyPatch, steps: int) -> None:
     for name, value in {**values, "BLOCK": BLOCK, "FIRST_CHECK": steps}.items():
         patch.setattr(f"tvsbayes.posterior.sampling.{name}", value)
     # The map takes seconds and no random number; the pilot needs few draws for a start.
-    patch.setattr("tvsbayes.posterior.transport.transport", lambda fit: small_fit()[1])
+    patch.setattr("tvsbayes.posterior.ridges.transport", lambda fit: small_fit()[1])
     patch.setattr("tvsbayes.posterior.sampling.transport", lambda fit: small_fit()[1])
     patch.setattr("tvsbayes.posterior.proposal.PILOT_DRAWS", 512)
 
@@ -147,7 +147,7 @@ def test_only_a_converged_fit_is_sampled(fitted):
 
 def test_what_is_missing_when_the_time_is_over_is_said(fitted, monkeypatch):
     monkeypatch.setattr("tvsbayes.posterior.sampling.BLOCK", BLOCK)
-    monkeypatch.setattr("tvsbayes.posterior.transport.transport", lambda fit: small_fit()[1])
+    monkeypatch.setattr("tvsbayes.posterior.ridges.transport", lambda fit: small_fit()[1])
     monkeypatch.setattr("tvsbayes.posterior.sampling.transport", lambda fit: small_fit()[1])
     monkeypatch.setattr("tvsbayes.posterior.proposal.PILOT_DRAWS", 512)
     result = sample(fitted, max_minutes=1e-9, seed=SEED)

@@ -24,7 +24,8 @@ from tvsbayes.instrument.protocols import four_point_protocol
 from tvsbayes.instrument.rig import read_rig
 from tvsbayes.posterior import proposal
 from tvsbayes.posterior.proposal import WALKERS, Independence, Target, walkers_for
-from tvsbayes.posterior.transport import BATCH, STRETCH_NODES, Transport, by_width, in_batches, stop_states, transport
+from tvsbayes.posterior.ridges import by_width, stop_states, transport
+from tvsbayes.posterior.transport import BATCH, STRETCH_NODES, Transport, in_batches
 from tvsbayes.twin.simulated_campaign import simulate
 
 SIGMAS = 5.0
@@ -58,7 +59,7 @@ def small_fit() -> tuple[JointFit, Transport]:
 def small_table() -> Transport:
     """The map of the same fit as with too many stops to follow each."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("tvsbayes.posterior.transport.STATES_MAX", 0)
+        patch.setattr("tvsbayes.posterior.ridges.STATES_MAX", 0)
         return transport(small_fit()[0])
 
 
@@ -288,7 +289,7 @@ def test_too_many_stop_errors_get_no_columns(monkeypatch):
     linear = linear_spots(fitted.linearised, fitted.arrays, -fitted.linearised.residual_jacobian)
     count = len(path.constant)
     assert stop_states(fitted, linear).load.shape == (4 * len(linear.residual), count)
-    monkeypatch.setattr("tvsbayes.posterior.transport.STATES_MAX", count - 1)
+    monkeypatch.setattr("tvsbayes.posterior.ridges.STATES_MAX", count - 1)
     found = stop_states(fitted, linear)
     assert found.load.shape == (4 * len(linear.residual), 0)
     assert found.variance.shape == (0, 4) and found.constant.shape == (0,)
@@ -342,7 +343,7 @@ def test_a_density_without_value_is_refused_and_counted(x64, monkeypatch):
         return SimpleNamespace(log_density=jnp.where(z[:, 3] > 50, jnp.nan, 5.0 - z[:, 0]))
 
     monkeypatch.setattr("tvsbayes.posterior.proposal.evaluate", evaluate)
-    monkeypatch.setattr("tvsbayes.posterior.transport.evaluate", evaluate)
+    monkeypatch.setattr("tvsbayes.posterior.ridges.evaluate", evaluate)
     target = Target(SimpleNamespace(space=None, arrays=None, log_density=2.0), path)
     value = target(w)
     expected = (5.0 - w[:, 0]) - 2.0

@@ -1,4 +1,4 @@
-"""The least squares of `stereo` and of the fit, and their covariance, on NIST's certified problems and on small ones."""
+"""The least squares of `stereo` and of the fit, and their covariance: NIST's certified problems, and small ones."""
 
 from __future__ import annotations
 

@@ -34,7 +34,8 @@ from tvsbayes.instrument.campaign import input_hashes
 from tvsbayes.instrument.parameters import NAMES
 from tvsbayes.posterior.draws import Draws, Posterior, derived_at
 from tvsbayes.posterior.proposal import Independence, Pilot, Target, moves, pilot
-from tvsbayes.posterior.transport import Transport, transport
+from tvsbayes.posterior.ridges import transport
+from tvsbayes.posterior.transport import Transport
 from tvsbayes.results.convergence import Convergence
 
 CHAIN_FORMAT = "tvsbayes-chain/4"

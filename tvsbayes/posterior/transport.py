@@ -1,4 +1,9 @@
-"""The map that makes the posterior nearly normal."""
+"""The map that makes the posterior nearly normal, so that proposals need no knowledge of its ridges.
+
+Three layers: z, the prior-normal coordinates of the model; y, whitened by the Laplace covariance; w, in which walkers
+live. Wide directions (laser tilt, mirror errors) bend the ridges on which the narrow ones (extrinsics, ratios) lie: a
+shear moves each narrow coordinate by a quadratic form of the wider ones. Noise scales widen and turn what they limit.
+"""
 
 from __future__ import annotations
 
@@ -9,31 +14,17 @@ from functools import cached_property
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy import linalg
 
-from tvsbayes.estimators.joint_fit import JointFit
-from tvsbayes.estimators.likelihood import evaluate
-from tvsbayes.estimators.linear_spots import LinearSpots, linear_spots
 from tvsbayes.instrument.parameters import BLOCKS, NAMES, NOISE_NAMES
-from tvsbayes.model.parameter_space import STOP_COLUMNS, half_normal, half_normal_slope
+from tvsbayes.model.parameter_space import half_normal, half_normal_slope
 
 BATCH = 32
 """Points per call of the compiled density: half an ensemble of 64, the calls of a differential-evolution step."""
 BLOCK_ROWS = 256
 """Points that are mapped at a time: their matrices take 64 MB at most."""
-NARROW = 0.05
-"""Conditional posterior sd, in prior sds, below which a coordinate is moved by the shear. Wider ones would be moved
-far enough for cubic terms to matter."""
-SHEAR_STEP = 0.5
-"""Step of the second differences in posterior sds: the shear should hold over +-2 sd, not only at the mode."""
-STATES_MAX = 64
-"""Most stop errors for which the whole covariance follows the noise scales of every walker. With more stops its
-matrices cost several times the density, the scales are known better, and widths from a table do."""
 STRETCH_NODES = (-2.0, 0.0, 2.0, 4.0, 6.0)
-"""Of that table, evenly spaced, in w of a noise coordinate. Below the first nothing gets narrower: other stops limit it
-then."""
-STRETCH_LIMITS = 1e-2, 1e2
-"""Of the information of a coordinate, 1 at the mode."""
+"""Of the table of widths, evenly spaced, in w of a noise coordinate. Below the first nothing gets narrower: other stops
+limit it then."""
 HEAVY_NAMES = (*NOISE_NAMES, *BLOCKS["backlash_deg"], "extrinsics.rotation_rad.y", "mirror_offset_mm")
 """Coordinates whose tails are heavier than normal: those that few stops tell (a walker stood still for 155 steps at 3.7
 sd of a stop sd), and the tilt of the frames with the mirrors' offset, along whose ridge a quadratic shear falls short
@@ -73,7 +64,7 @@ class Transport:
 
     With stop errors e of variance S and pixels in units of their noise, the linearised residuals are r - J y - G e:
     the precision of y is then prior + J'J - J'G (S^-1 + G'G)^-1 G'J (Woodbury), at any noise scales from the same
-    products. Beyond `STATES_MAX` stop errors (m = 0 here) only the widths follow, from a table for every scale.
+    products. Beyond `ridges.STATES_MAX` stop errors (m = 0 here) only the widths follow, from a table for every scale.
 
     Attributes:
         mode: z at w = 0, shape (p,).
@@ -259,155 +250,3 @@ def in_batches[Result](function: Callable[[jax.Array], Result], points: np.ndarr
         result = function(jnp.asarray(block))
         blocks.append(jax.tree.map(lambda x, n=count: np.asarray(x)[:n], result))
     return jax.tree.map(lambda *parts: np.concatenate(parts), *blocks)
-
-
-def by_width(covariance: np.ndarray) -> np.ndarray:
-    """Order of the coordinates in which each has the largest variance left by those before it."""
-    rest = covariance.copy()
-    order: list[int] = []
-    for _ in range(len(covariance)):
-        variances = np.diag(rest).copy()
-        variances[order] = -np.inf
-        widest = int(np.argmax(variances))
-        order.append(widest)
-        rest = rest - np.outer(rest[:, widest], rest[widest]) / rest[widest, widest]
-    return np.array(order, dtype=int)
-
-
-@dataclass(frozen=True)
-class StopStates:
-    """Every stop error, home offset and place in the play that a campaign drew, one column each.
-
-    Attributes:
-        load: d(predicted)/d(state) of the spots' components, shape (4 n, m).
-        variance: at the fit's noise scales, by direction (right, left, down, up), shape (m, 4).
-        constant: of states of another kind, shape (m,).
-    """
-
-    load: np.ndarray
-    variance: np.ndarray
-    constant: np.ndarray
-
-
-def stop_states(fit: JointFit, linear: LinearSpots) -> StopStates:
-    """Unroll the filter's six states: a column for each time that one is drawn anew; none beyond `STATES_MAX`."""
-    spots, states = linear.load.shape[0], linear.load.shape[2]
-    mix = np.asarray(fit.arrays.spots.redraw_mix)[:spots]
-    variance_of = np.radians(np.asarray(fit.mode.physical)[STOP_COLUMNS]) ** 2
-    places, variance, constant = [], [], []
-    for state in range(states):
-        drawn = np.flatnonzero(linear.renewed[:, state])
-        for begin, end in zip(drawn, [*drawn[1:], spots], strict=True):
-            by_direction = np.zeros((2, 2))
-            if state < 2:
-                by_direction[state] = mix[begin, state] * variance_of[state]
-            rest = 0.0 if state < 2 else linear.variance[begin, state]
-            if linear.load[begin:end, :, state].any() and by_direction.sum() + rest > 0:
-                places.append((slice(begin, end), state))
-                variance.append(by_direction.ravel())
-                constant.append(rest)
-    # Columns of every state of a long campaign would fill the memory.
-    count = len(places) if len(places) <= STATES_MAX else 0
-    load = np.zeros((spots, 4, count))
-    for column, (rows, state) in enumerate(places[:count]):
-        load[rows, :, column] = linear.load[rows, :, state]
-    variances = np.array(variance[:count]).reshape(count, 4)
-    return StopStates(load.reshape(4 * spots, count), variances, np.array(constant[:count]))
-
-
-def transport(fit: JointFit) -> Transport:
-    """Measure the bend of the ridges at a fit's mode, and how the noise scales set the covariance.
-
-    With r the standardised innovations and J their Jacobian in y, the narrow coordinate k has its optimum shifted by
-    -y (J_k . d2r/dy2) y / 2: in y the Gauss-Newton Hessian is the identity. Second differences of r, all pairs in
-    batches of the one compiled density.
-
-    Args:
-        fit: a converged fit.
-
-    Returns:
-        The map; the noise scales take no part in the shear.
-    """
-    names = np.array(NAMES)
-    linear = linear_spots(fit.linearised, fit.arrays, -np.asarray(fit.linearised.residual_jacobian))
-    stops = stop_states(fit, linear)
-    whole = len(stops.constant) > 0
-    free = np.flatnonzero(fit.free)
-    scales = np.isin(names[free], NOISE_NAMES)
-    if whole:
-        others = free[~scales]
-        covariance = np.linalg.inv(np.eye(len(others)) + fit.information.fisher[np.ix_(others, others)])
-        order = by_width(covariance)
-        free = np.concatenate([free[scales], others[order]])
-        root = linalg.block_diag(
-            np.linalg.cholesky(fit.covariance[np.ix_(free[: scales.sum()], free[: scales.sum()])]),
-            np.linalg.cholesky(covariance[np.ix_(order, order)]),
-        )
-    else:
-        free = free[by_width(fit.covariance[np.ix_(free, free)])]
-        root = np.linalg.cholesky(fit.covariance[np.ix_(free, free)])
-    scales = np.isin(names[free], NOISE_NAMES)
-    noise, geometry = np.flatnonzero(scales), np.flatnonzero(~scales)
-    narrow = np.flatnonzero((np.diag(root) < NARROW) & ~scales)
-    wide = root[np.ix_(geometry, geometry)]
-    jacobian = linear.jacobian.reshape(-1, len(names))[:, free[geometry]] @ wide
-    residual = linear.residual.ravel()
-    of_noise = STOP_COLUMNS.reshape(4, 1) == free[noise]
-    count = len(free)
-    route = Transport(
-        mode=fit.z,
-        free=free,
-        root=root,
-        noise=noise,
-        narrow=narrow,
-        bend=np.zeros((len(narrow), count, count)),
-        stretch=np.zeros((len(noise), len(STRETCH_NODES), count)),
-        slope=np.asarray(fit.space.u)[free[noise]][:, None] * root[np.ix_(noise, noise)],
-        pixels=(names[free[noise]] == "pixel_scale").astype(float),
-        variance=stops.variance @ of_noise,
-        # Stop errors whose sd is not estimated keep their variance.
-        constant=stops.constant + stops.variance @ ~of_noise.any(axis=1),
-        prior=wide.T @ wide,
-        known=jacobian.T @ jacobian,
-        load=jacobian.T @ stops.load,
-        states=stops.load.T @ stops.load,
-        score=jacobian.T @ residual,
-        state_score=stops.load.T @ residual,
-    )
-    plain = route.straight()
-
-    def residuals(y: np.ndarray) -> np.ndarray:
-        seen = in_batches(lambda z: evaluate(z, fit.space, fit.arrays).standardised, plain.from_whitened(y))
-        return np.nan_to_num(seen.reshape(len(y), -1))
-
-    bend, stretch = route.bend, route.stretch
-    with jax.enable_x64(True):
-        steps = SHEAR_STEP * np.eye(count)
-        centre = residuals(np.zeros((1, count)))[0]
-        ahead, behind = residuals(steps), residuals(-steps)
-        slopes = (ahead - behind)[narrow] / (2 * SHEAR_STEP)
-        own = (ahead + behind - 2 * centre) @ slopes.T / SHEAR_STEP**2
-        bend[:, geometry, geometry] = own[geometry].T
-        pairs = np.array([(i, j) for i in geometry for j in geometry if j < i]).reshape(-1, 2)
-        for some in np.array_split(pairs, max(1, len(pairs) // 256)) if len(pairs) else ():
-            y = np.zeros((len(some), count))
-            np.put_along_axis(y, some, SHEAR_STEP, axis=1)
-            both = residuals(np.concatenate([y, -y]))
-            curvature = (both[: len(some)] + both[len(some) :] - 2 * centre) @ slopes.T / SHEAR_STEP**2
-            mixed = 0.5 * (curvature - own[some[:, 0]] - own[some[:, 1]])
-            bend[:, some[:, 0], some[:, 1]] = bend[:, some[:, 1], some[:, 0]] = mixed.T
-        # The data's share of the information 1 of each coordinate, as a noise coordinate goes up or down.
-        for which, place in enumerate(noise if not whole else ()):
-            later = geometry[geometry > place]
-            shares = []
-            for node in STRETCH_NODES:
-                at = np.zeros((1 + len(later), count))
-                at[:, place] = node
-                at[1:, later] += SHEAR_STEP * np.eye(len(later))
-                seen = residuals(at)
-                shares.append(np.sum(((seen[1:] - seen[0]) / SHEAR_STEP) ** 2, axis=1))
-            change = np.array(shares) - shares[STRETCH_NODES.index(0.0)]
-            stretch[which][:, later] = -0.5 * np.log(np.clip(1 + change, *STRETCH_LIMITS))
-    for place, form in zip(narrow, bend, strict=True):
-        form[place:], form[:, place:] = 0.0, 0.0
-    return route

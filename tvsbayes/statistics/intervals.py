@@ -52,15 +52,6 @@ def interval95(draws: np.ndarray) -> tuple[float, float]:
     return float(low), float(high)
 
 
-def shortest_interval(draws: np.ndarray, probability: float = 0.95) -> np.ndarray:
-    """Shortest coverage interval of scalar draws (n,), shape (2,) (JCGM 101 5.3.4 and 7.7.4)."""
-    ordered = np.sort(np.asarray(draws, dtype=float))
-    inside = min(len(ordered) - 1, max(1, round(probability * len(ordered))))
-    width = ordered[inside:] - ordered[: len(ordered) - inside]
-    first = int(np.argmin(width))
-    return ordered[[first, first + inside]]
-
-
 def numerical_tolerance(u: np.ndarray, digits: int) -> np.ndarray:
     """Half a unit of the last of `digits` significant digits of a standard uncertainty (JCGM 101 7.9.2)."""
     u = np.asarray(u, dtype=float)

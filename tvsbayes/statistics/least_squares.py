@@ -2,8 +2,8 @@
 
 optimistix' `LevenbergMarquardt` reports success on wrong answers at loose tolerances, so nobody believes its flag: the
 joint fit goes on with Newton steps on the density and judges the step that is left, the bundle adjustment judges the
-next step and a second descent. Residuals are dimensionless (divided by their standard deviations) or in the data's unit,
-as the caller chose; the covariance follows that choice.
+next step and a second descent. Residuals are dimensionless (divided by their standard deviations) or in the data's
+unit, as the caller chose; the covariance follows that choice.
 """
 
 from __future__ import annotations

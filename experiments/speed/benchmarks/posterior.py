@@ -18,8 +18,9 @@ from experiments.speed.benchmarks.measure import Bench, Case, Column
 from tvsbayes.estimators.joint_fit import JointFit, fit
 from tvsbayes.estimators.likelihood import log_density
 from tvsbayes.posterior.proposal import Target, pilot
+from tvsbayes.posterior.ridges import transport
 from tvsbayes.posterior.sampling import sample
-from tvsbayes.posterior.transport import Transport, transport
+from tvsbayes.posterior.transport import Transport
 from tvsbayes.twin.simulated_campaign import simulate
 
 TITLE = "Sampling the posterior"
