@@ -56,6 +56,7 @@ LONG = (
         "planning/test_limits.py",
     ),
     *(
+        "posterior/test_proposal.py",
         "posterior/test_transport.py",
         "statistics/test_least_squares.py",
         "estimators/test_likelihood.py",

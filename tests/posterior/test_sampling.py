@@ -7,7 +7,7 @@ from dataclasses import replace
 import jax
 import numpy as np
 import pytest
-from posterior.test_transport import ROUNDING, SIGMAS, small_fit
+from support.small_posterior import ROUNDING, SIGMAS, small_fit
 
 from tvsbayes.errors import InputError, NotConverged
 from tvsbayes.posterior.proposal import Target

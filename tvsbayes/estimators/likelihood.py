@@ -106,6 +106,18 @@ class SpotResiduals(eqx.Module):
     predicted: Float[Array, "spots 5"]
 
 
+def whitened(
+    vectors: Float[Array, "n 5 spots"],
+    spots: SpotArrays,
+    pixel_noise: Scalar,
+    aperture_noise: Scalar,
+    root_weight: Float[Array, " spots"],
+) -> Float[Array, "n 5 spots"]:
+    """Differences of observations in units of their noise; the noise is the inverse factor on the stated sds."""
+    pixels = jnp.sum(spots.whitening.transpose(1, 2, 0) * vectors[:, None, :4], axis=2) * (pixel_noise * root_weight)
+    return jnp.concatenate([pixels, vectors[:, 4:] * (aperture_noise * root_weight * spots.has_aperture)], 1)
+
+
 def spot_residuals(
     model: Model, angles: MirrorAngles, arrays: CampaignArrays, inflation: Scalar, frozen: bool
 ) -> SpotResiduals:
@@ -145,13 +157,8 @@ def spot_residuals(
     aperture_noise = 1 / (model.receiver.aperture_sd_rad * inflation)
     root_weight = jnp.sqrt(spots.weight) * spots.valid
 
-    def whitened(vectors: Float[Array, "n 5 spots"]) -> Float[Array, "n 5 spots"]:
-        pixels = jnp.sum(spots.whitening.transpose(1, 2, 0) * vectors[:, None, :4], axis=2) * (
-            pixel_noise * root_weight
-        )
-        return jnp.concatenate([pixels, vectors[:, 4:] * (aperture_noise * root_weight * spots.has_aperture)], 1)
-
-    misfit, slopes = materialise((whitened(misfit[None]), hold(whitened(slopes))))
+    noise = pixel_noise, aperture_noise, root_weight
+    misfit, slopes = materialise((whitened(misfit[None], spots, *noise), hold(whitened(slopes, spots, *noise))))
     # Padding has no slope; any fixed direction keeps the projection finite there.
     along = slopes[2] + (1 - spots.valid) * np.eye(5)[0][:, None]
     pixel_part = jnp.sum(along[:4] ** 2, axis=0)

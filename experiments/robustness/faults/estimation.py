@@ -105,7 +105,7 @@ FAULTS = (
         "q = per_camera(cameras.tangential[:, ::-1])",
         "q = per_camera(cameras.tangential)",
         "tangential distortion the wrong way round: tenths of a pixel at the border",
-        ("model/cameras",),
+        ("model/geometry",),
     ),
     Fault(
         "T of the stereo pair with the wrong sign",
@@ -113,7 +113,7 @@ FAULTS = (
         "transform(rotation_matrix(cameras.rotation_rad), left) + translation",
         "transform(rotation_matrix(cameras.rotation_rad), left) - translation",
         "the right camera stands on the left",
-        ("model/cameras",),
+        ("model/geometry",),
     ),
     Fault(
         "cameras exchanged",
@@ -121,7 +121,7 @@ FAULTS = (
         "points = materialise(jnp.stack([left, right]))",
         "points = materialise(jnp.stack([right, left]))",
         "each camera sees what the other should see",
-        ("model/cameras",),
+        ("model/geometry",),
     ),
     Fault(
         "focal scale divides",
@@ -129,7 +129,7 @@ FAULTS = (
         "per_camera(cameras.focal_px * cameras.focal_scale)",
         "per_camera(cameras.focal_px / cameras.focal_scale)",
         "0.5 % of focal scale are 1 % of error",
-        ("model/cameras",),
+        ("model/geometry",),
     ),
     Fault(
         "four residuals per spot instead of three",

@@ -74,7 +74,7 @@ FAULTS = (
         "return proposed, self.log_density(w) - self.log_density(proposed)",
         "return proposed, self.log_density(proposed) - self.log_density(w)",
         "sds come out at half their size without any sign of it",
-        ("posterior/transport::test_the_proposal_density_and_draws_agree_in_many_dimensions",),
+        ("posterior/proposal::test_the_proposal_density_and_draws_agree_in_many_dimensions",),
     ),
     Fault(
         "resume forgets the random state",
