@@ -26,8 +26,6 @@ def folder(tmp_path) -> Path:
     return tmp_path / "run"
 
 
-
-
 def test_what_is_written_is_read_back(folder):
     reading = read_journal(folder)
     assert [r.event for r in reading.records] == ["created", *["intent", "looked"] * 3, "stop"]
