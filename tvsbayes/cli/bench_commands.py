@@ -220,9 +220,8 @@ def acquire(
     else:
         refuse_options("for the twin", "add --simulate, or leave it out", centroids=centroids, seed=seed)
     if target_u is not None and estimate is False:
-        raise InputError(
-            "usage", "--target-u needs the fits that --no-estimate forbids", remedy="leave out one of them"
-        )
+        remedy = "leave out one of them"
+        raise InputError("usage", "--target-u needs the fits that --no-estimate forbids", remedy=remedy)
     instrument, steps = read_rig(rig), read_plan(plan)
     if dry_run:
         _rehearse(instrument, steps, as_json)
@@ -249,13 +248,7 @@ def acquire(
             vision=vision,
             terminal=Terminal(report_line, line.show, line.ask),
         )
-    _tell_outcome(outcome, out, as_json)
-    if outcome.reason in ("interrupted", "declined"):
-        report_line(f"{outcome.reason}; go on with --resume")
-        raise Ended(INTERRUPTED)
-    if target_u is not None and outcome.reason != "target met":
-        report_line("the plan is done and the target is not met: plan more with tvsbayes plan --given")
-        raise Ended(TARGET_MISSED)
+    _end(outcome, out, target_u, as_json)
 
 
 def _rehearse(rig: Rig, plan: Sequence[PlanStep], as_json: bool) -> None:
@@ -269,13 +262,20 @@ def _rehearse(rig: Rig, plan: Sequence[PlanStep], as_json: bool) -> None:
     finish({"steps": lines, "minutes": minutes}, text, as_json)
 
 
-def _tell_outcome(outcome: Outcome, out: Path, as_json: bool) -> None:
+def _end(outcome: Outcome, out: Path, target_u: float | None, as_json: bool) -> None:
+    """What has become of a run, and the exit code that says so."""
     text = f"{escaped(str(out), 200)}: {outcome.reason}, {outcome.ok} of {outcome.looks} looks count"
     if outcome.references:
         planned = outcome.looks - outcome.references
         text += f" ({planned} of the plan, {outcome.references} reference looks of resumed runs)"
     warnings = [f"warning: {warning}" for warning in outcome.warnings]
     finish({"campaign": str(out), **outcome.as_json()}, "\n".join([text, *warnings]), as_json)
+    if outcome.reason in ("interrupted", "declined"):
+        report_line(f"{outcome.reason}; go on with --resume")
+        raise Ended(INTERRUPTED)
+    if target_u is not None and outcome.reason != "target met":
+        report_line("the plan is done and the target is not met: plan more with tvsbayes plan --given")
+        raise Ended(TARGET_MISSED)
 
 
 def doctor(
