@@ -1,4 +1,7 @@
-"""What a user did wrong or must know: error classes, safe quoting."""
+"""What a user did wrong or must know: error classes with their exit codes, and text that is safe to quote.
+
+An error says where, what was found, what is allowed and what to do; text from files is escaped before it is shown.
+"""
 
 from __future__ import annotations
 

@@ -40,7 +40,7 @@ from tvsbayes.instrument.axes import DIRECTIONS
 from tvsbayes.instrument.campaign import Campaign, read_campaign
 from tvsbayes.instrument.protocols import four_point_protocol
 from tvsbayes.results.estimates import Estimate, FitSummary
-from tvsbayes.statistics.intervals import BOUND, rms_bounds
+from tvsbayes.statistics.chances import BOUND, rms_bounds
 from tvsbayes.twin.frames import write_frames
 from tvsbayes.twin.physics import effective_deg_per_step, effective_mirror_offset_mm, project
 from tvsbayes.twin.simulated_campaign import Truth, read_truth, simulate

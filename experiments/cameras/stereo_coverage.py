@@ -40,7 +40,7 @@ from tvsbayes.cameras.boards import View, find_views
 from tvsbayes.cameras.stereo_calibration import calibrate_stereo
 from tvsbayes.errors import TvsError
 from tvsbayes.instrument.parameters import STEREO_PARAMETER_NAMES
-from tvsbayes.statistics.intervals import BOUND
+from tvsbayes.statistics.chances import BOUND
 
 ROWS, HALVES = output(__file__, "stereo_coverage.jsonl"), output(__file__, "stereo_halves.json")
 OPENCV_PAIRS = Path("/usr/share/doc/opencv-doc/examples/data")

@@ -13,7 +13,7 @@ import numpy as np
 
 from tvsbayes.instrument.axes import DIRECTIONS
 from tvsbayes.instrument.parameters import INDEX
-from tvsbayes.statistics.intervals import BOUND, LEVELS, binomial_bounds, rms_bounds
+from tvsbayes.statistics.chances import BOUND, LEVELS, binomial_bounds, rms_bounds
 from tvsbayes.studies import study_job
 
 HEADLINES = (

@@ -34,7 +34,7 @@ from experiments.common.rows import output, read_rows, run_rows
 from tvsbayes.estimators.four_point import classic
 from tvsbayes.estimators.joint_fit import fit
 from tvsbayes.instrument.axes import DIRECTIONS
-from tvsbayes.statistics.intervals import LEVELS
+from tvsbayes.statistics.chances import LEVELS
 from tvsbayes.twin.physics import effective_deg_per_step
 from tvsbayes.twin.simulated_campaign import simulate
 

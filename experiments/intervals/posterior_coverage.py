@@ -43,7 +43,7 @@ from tvsbayes.estimators.joint_fit import fit
 from tvsbayes.instrument.axes import DIRECTIONS
 from tvsbayes.instrument.model_choice import ModelChoice
 from tvsbayes.posterior.sampling import sample
-from tvsbayes.statistics.intervals import LEVELS, binomial_bounds
+from tvsbayes.statistics.chances import LEVELS, binomial_bounds
 from tvsbayes.twin.simulated_campaign import simulate
 
 CLEAN_ROWS = output(__file__, "posterior_coverage.jsonl")

@@ -30,7 +30,7 @@ from tvsbayes.assessment.fitted_calibration import calibration_of
 from tvsbayes.calibration.pointing import Calibration
 from tvsbayes.coordinates.location import locate
 from tvsbayes.estimators.joint_fit import fit
-from tvsbayes.statistics.intervals import BOUND, binomial_bounds
+from tvsbayes.statistics.chances import BOUND, binomial_bounds
 from tvsbayes.twin.simulated_campaign import SimulatedCampaign, simulate
 
 ROWS = output(__file__, "located_points.jsonl")

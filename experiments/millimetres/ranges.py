@@ -33,7 +33,7 @@ from tvsbayes.assessment.fitted_calibration import calibration_of
 from tvsbayes.coordinates.location import locate_linear, settings_of
 from tvsbayes.estimators.joint_fit import fit
 from tvsbayes.report.figures import BLACK, OF_ESTIMATOR, STYLE, WIDTH_IN
-from tvsbayes.statistics.intervals import binomial_bounds
+from tvsbayes.statistics.chances import binomial_bounds
 from tvsbayes.twin.simulated_campaign import simulate
 
 ROWS = output(__file__, "ranges.jsonl")

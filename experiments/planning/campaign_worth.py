@@ -44,7 +44,7 @@ from tvsbayes.planning.forecast import Family
 from tvsbayes.planning.search import LADDER
 from tvsbayes.planning.target import DEFAULT_TARGET, parse_target
 from tvsbayes.report.figures import BLUE, GREEN, ORANGE, PURPLE, RED, STYLE, WIDTH_IN
-from tvsbayes.statistics.intervals import rms_bounds
+from tvsbayes.statistics.chances import rms_bounds
 from tvsbayes.studies.study_job import StudyJob, study_row
 
 ROWS, PLANNED = output(__file__, "campaign_worth.jsonl"), output(__file__, "campaign_worth_planned.npz")

@@ -32,7 +32,7 @@ from tvsbayes.instrument.plan import read_plan, write_plan
 from tvsbayes.model.headlines import QUANTITIES
 from tvsbayes.planning.planner import plan
 from tvsbayes.planning.target import DEFAULT_TARGET, parse_target
-from tvsbayes.statistics.intervals import binomial_bounds, rms_bounds, share_interval95
+from tvsbayes.statistics.chances import binomial_bounds, rms_bounds, share_interval95
 from tvsbayes.studies.rows import StudyRow
 from tvsbayes.studies.study import study_result
 from tvsbayes.studies.study_job import StudyJob, study_row

@@ -28,7 +28,7 @@ from experiments.common.headlines import HEADLINES, LEAST_CONTRACTION
 from experiments.common.rows import OUTPUT, ROOT, git, output, read_rows
 from experiments.common.uniformity import ALPHA, FAULT_SIMULATIONS, Band, pit_values
 from experiments.common.watched import fine
-from tvsbayes.statistics.intervals import BOUND, binomial_bounds, rms_bounds
+from tvsbayes.statistics.chances import BOUND, binomial_bounds, rms_bounds
 
 DEVICE = output(__file__, "evidence_device.json")
 PAGE = Path(__file__).with_suffix(".md")

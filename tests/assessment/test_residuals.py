@@ -14,7 +14,7 @@ from tvsbayes.assessment.residuals import CAUSE_LIMIT, residual_causes, stop_rea
 from tvsbayes.instrument.axes import DIRECTIONS
 from tvsbayes.instrument.campaign import ordered_spots
 from tvsbayes.results.estimates import StopResidual
-from tvsbayes.statistics.intervals import recursive_residuals
+from tvsbayes.statistics.chances import recursive_residuals
 
 
 def test_stops_are_read_as_they_were():

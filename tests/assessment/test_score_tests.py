@@ -29,7 +29,7 @@ from tvsbayes.report.fit_text import fit_text, validation_lines
 from tvsbayes.report.page import verdict_of
 from tvsbayes.results.estimates import Validation, ValidationTest
 from tvsbayes.results.records import plain
-from tvsbayes.statistics.intervals import log_chance
+from tvsbayes.statistics.chances import log_chance
 from tvsbayes.statistics.least_squares import Mode
 from tvsbayes.twin.simulated_campaign import simulate
 

@@ -21,7 +21,7 @@ from tvsbayes.planning.planner import few_looks, plan_from
 from tvsbayes.planning.search import Scope
 from tvsbayes.planning.target import DEFAULT_TARGET, parse_target
 from tvsbayes.report.command_text import plan_text
-from tvsbayes.statistics.intervals import share_error
+from tvsbayes.statistics.chances import share_error
 from tvsbayes.twin.simulated_campaign import simulate
 
 pytestmark = pytest.mark.usefixtures("small_searches")

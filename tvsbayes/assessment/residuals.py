@@ -17,7 +17,7 @@ from tvsbayes.instrument.axes import AXES, direction_of
 from tvsbayes.instrument.campaign import ordered_spots
 from tvsbayes.instrument.stops import Rest, StopReadings, rests_of
 from tvsbayes.results.estimates import Cause, CauseGroup, StopResidual
-from tvsbayes.statistics.intervals import recursive_residuals
+from tvsbayes.statistics.chances import recursive_residuals
 
 CAUSE_BINS = 6
 PLACEMENT_GAP = 1.03

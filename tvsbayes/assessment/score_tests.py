@@ -20,7 +20,7 @@ from tvsbayes.instrument.campaign import ordered_spots
 from tvsbayes.instrument.parameters import INDEX, NAMES, NOISE_NAMES, RIG_NAMES, STEREO_PARAMETER_NAMES
 from tvsbayes.instrument.stops import rests_of
 from tvsbayes.results.estimates import Validation, ValidationTest
-from tvsbayes.statistics.intervals import log_chance
+from tvsbayes.statistics.chances import log_chance
 
 VALIDATION_LEVEL = 0.01
 """Probability, all tests together, with which a clean campaign fails; `experiments/robustness/model_error.md`."""

@@ -1,4 +1,7 @@
-"""Commands at the bench: stereo, acquire, doctor."""
+"""Commands at the bench: stereo, acquire, doctor.
+
+Options in, library called, table or JSON out; heavy imports stand inside the commands.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Commands on campaigns: demo, new, simulate, detect, check."""
+"""Commands on campaigns: demo, new, simulate, detect, check.
+
+Options in, library called, table or JSON out; heavy imports stand inside the commands.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Commands that estimate and tell: classic, fit, report, compare."""
+"""Commands that estimate and tell: classic, fit, report, compare.
+
+Options in, library called, table or JSON out; heavy imports stand inside the commands.
+"""
 
 from __future__ import annotations
 

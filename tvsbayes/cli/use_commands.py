@@ -1,4 +1,7 @@
-"""Commands that use a calibration or look ahead: locate, steps-for, plan, study."""
+"""Commands that use a calibration or look ahead: locate, steps-for, plan, study.
+
+Options in, library called, table or JSON out; heavy imports stand inside the commands.
+"""
 
 from __future__ import annotations
 
@@ -268,7 +271,7 @@ def study(
     instrument, steps = read_rig(rig), read_plan(plan_file)
     from tvsbayes.planning.target import DEFAULT_TARGET, parse_target
     from tvsbayes.report.command_text import study_text
-    from tvsbayes.statistics.intervals import ASSURED
+    from tvsbayes.statistics.chances import ASSURED
     from tvsbayes.studies.rows import StudyRows
     from tvsbayes.studies.study import study as run_study
     from tvsbayes.studies.study_job import StudyJob

@@ -27,7 +27,8 @@ from tvsbayes.instrument.parameters import INDEX, NAMES, RIG_NAMES, Prior
 from tvsbayes.model.headlines import Derived, derived_quantities
 from tvsbayes.model.parameter_space import ParameterSpace
 from tvsbayes.results.stored_draws import StoredMode
-from tvsbayes.statistics.intervals import NORMAL_95, chi2_quantile
+from tvsbayes.statistics.chances import chi2_quantile
+from tvsbayes.statistics.intervals import NORMAL_95
 from tvsbayes.statistics.least_squares import Mode, laplace_draws, newton_mode
 
 SMALLEST_CAMPAIGN = 8

@@ -1,4 +1,8 @@
-"""Spots linearised at a point, and what each says beside all the others."""
+"""Spots linearised at a point of parameter space, and what each spot and each stop says beside all the others.
+
+NumPy after one compiled linearisation: the smoother over stop errors gives leave-one-out residuals, the information
+of every stop, and standard deviations without it. Residuals are whitened; coordinates z of the parameter space.
+"""
 
 from __future__ import annotations
 

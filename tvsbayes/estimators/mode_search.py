@@ -30,7 +30,7 @@ from tvsbayes.instrument.parameters import NAMES, NOISE_NAMES
 from tvsbayes.instrument.rig import RigTable
 from tvsbayes.model.geometry import Scalar
 from tvsbayes.model.parameter_space import ParameterSpace, free_mask, parameter_space
-from tvsbayes.statistics.intervals import chi2_quantile
+from tvsbayes.statistics.chances import chi2_quantile
 from tvsbayes.statistics.least_squares import NEWTON_STEP, levenberg_marquardt
 
 ANNEALING = (60.0, 10.0, 2.0, 1.0)

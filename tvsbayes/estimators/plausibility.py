@@ -1,4 +1,7 @@
-"""Hints about a campaign before it is fitted."""
+"""Hints about a campaign before it is fitted: spots that no rig can have seen, and what its moves cannot tell apart.
+
+Depths are triangulated, mm along X of frame S; counters in steps. Sentences for people, no verdict that stops a fit.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,8 @@
-"""The calibrated camera pair: file, covariance, triangulation."""
+"""The calibrated camera pair: `stereo.json`, its 24 parameters with their covariance, distortion, triangulation.
+
+OpenCV's names and frames: M, D of each camera, x_right = R x_left + T; mm, rad, px with the integer at the centre of a
+pixel. Points come out in frame S (X depth, Y left, Z up, origin in the left camera's centre). NumPy.
+"""
 
 from __future__ import annotations
 

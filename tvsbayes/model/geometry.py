@@ -1,4 +1,10 @@
-"""Vectors, rotations, reflections and cameras in JAX."""
+"""Vectors, rotations, reflections and cameras in JAX: what the laser's path and the pixels are made of.
+
+A vector is an array whose first axis is x, y, z; any batch axes follow. mm, rad. Frame S: origin in the left camera's
+centre, X depth, Y left, Z up; OpenCV's camera axes are x = -Y, y = -Z, z = X. Pinhole with Brown-Conrady distortion;
+the right camera sees x_right = R x_left + T. Image px with the integer at the centre of a pixel, ordered (u_left,
+v_left, u_right, v_right).
+"""
 
 from __future__ import annotations
 

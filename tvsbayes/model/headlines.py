@@ -1,4 +1,8 @@
-"""Effective ratios, contrasts, backlash and mirror offset at a pose."""
+"""Headlines of a point of parameter space at a pose: effective ratios, contrasts, backlash, mirror offset.
+
+deg/step of the beam's azimuth and elevation in frame P; deg; mm. The pose is the pair of mirror angles (pan, tilt),
+rad. With derivatives by the coordinates for planning, or for many points at once for draws.
+"""
 
 from __future__ import annotations
 

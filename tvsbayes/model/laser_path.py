@@ -1,18 +1,11 @@
-"""The forward model: parameters -> transmission -> laser beam -> pixels of both cameras (DESIGN 3). Differentiable.
+"""The way of the laser: counters -> gears, play -> mirror angles -> beam. Differentiable (DESIGN 3.1, 3.2).
 
 A vector is an array whose first axis is x, y, z; any batch axes follow. Lengths in mm, angles in rad. All functions
 are written for JAX with few, wide operations: compile time grows with their number.
 
 Frame P: z along the pan axis, up; x along the nominal beam at pan angle 0; y left; origin where the nominal laser
 meets mirror 1. Frame Q is P turned by the pan angle. Pan positive = left, tilt positive = up; arrays over axes are
-ordered (pan, tilt). Frame S: origin in the left camera's centre, X depth, Y left, Z up; OpenCV's camera axes are
-x = -Y, y = -Z, z = X. Pinhole with Brown-Conrady distortion; the right camera sees x_right = R x_left + T. Image px
-with the integer at the centre of a pixel, ordered (u_left, v_left, u_right, v_right).
-
-Every parameter of DESIGN 8 has a coordinate z with prior N(0, 1): normal priors are value + u z, half-normals
-u Phi^-1((1 + Phi(z)) / 2) (DESIGN 4.1: no boundary, no mirrored mode), log-normals value exp(u z); the 24 stereo
-parameters are mean + root z with root root^T their full covariance. u = 0 fixes a parameter whatever its z, so that
-one compiled function serves every choice of fixed parameters. Units of physical values are those of the names.
+ordered (pan, tilt).
 """
 
 from __future__ import annotations

@@ -52,7 +52,7 @@ from tvsbayes.planning.plan_check import judge
 from tvsbayes.planning.search import LADDER, Scope, design_family, refine, smallest_design
 from tvsbayes.planning.target import Sensitivity, Target, sensitivity
 from tvsbayes.results.plan_record import Advice, Batch
-from tvsbayes.statistics.intervals import ASSURED, share_error
+from tvsbayes.statistics.chances import ASSURED, share_error
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,7 @@
-"""Draws of the posterior, carried into any quantity."""
+"""Draws of the posterior, carried into any quantity with their Monte Carlo error.
+
+One row a draw, parameters and headlines in the units of their names; chains are walkers of the ensemble.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Target and pilot proposals of the sampler."""
+"""What is sampled and how a step is proposed: the target in the map's coordinates, its pilot, the moves of emcee.
+
+Coordinates w of `posterior.transport`, nearly standard normal; log densities are exact, the map's Jacobian in them.
+"""
 
 from __future__ import annotations
 

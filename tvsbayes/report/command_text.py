@@ -12,7 +12,7 @@ from tvsbayes.errors import escaped
 from tvsbayes.report.result_tables import gap_table, hold_out_table, point_budget_table
 from tvsbayes.report.tables import TableView, concise, two_digits
 from tvsbayes.results.comparison_record import Comparison, Gap, HoldOut
-from tvsbayes.statistics.intervals import ASSURED, BOUND, LEVELS, binomial_bounds, rms_bounds
+from tvsbayes.statistics.chances import ASSURED, BOUND, LEVELS, binomial_bounds, rms_bounds
 
 if TYPE_CHECKING:
     from tvsbayes.cameras.detection import Detection

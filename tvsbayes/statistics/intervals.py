@@ -1,4 +1,7 @@
-"""Intervals, coverage factors and tests of many trials."""
+"""Intervals and coverage factors of the GUM and its supplements, and the validation of the law of propagation.
+
+Numbers in the unit of their quantity. JCGM 100 (GUM), 101 (Monte Carlo) and 102 (several outputs). NumPy.
+"""
 
 from __future__ import annotations
 
@@ -146,96 +149,3 @@ def _with_error(statistic: Callable[..., np.ndarray], *draws: np.ndarray) -> tup
     """A statistic of draws and its Monte Carlo standard error from interleaved blocks."""
     blocks = [statistic(*(d[k::BLOCKS] for d in draws)) for k in range(BLOCKS)]
     return statistic(*draws), np.std(blocks, axis=0, ddof=1) / math.sqrt(BLOCKS)
-
-
-ASSURED = (0.8, 0.95)
-
-
-def recursive_residuals(values: np.ndarray, variances: np.ndarray, *, backwards: bool) -> tuple[float | None, ...]:
-    """Each value against the weighted mean of those before it, standardised.
-
-    Of independent values with one mean these are independent and N(0, 1) (Brown, Durbin and Evans, J. R. Stat. Soc. B
-    37, 1975, 149); distances from the mean of all are not: those of a pair are opposite.
-
-    Args:
-        values: shape (n,).
-        variances: of their noise, shape (n,).
-        backwards: begin with the last.
-
-    Returns:
-        n of them in the order of the values, None where there is nothing before; empty for fewer than two.
-    """
-    if len(values) < 2:
-        return ()
-    order = np.arange(len(values))[::-1] if backwards else np.arange(len(values))
-    found: list[float | None] = [None] * len(values)
-    total = weight = 0.0
-    for i in order:
-        if weight:
-            found[i] = float((values[i] - total / weight) / np.sqrt(variances[i] + 1 / weight))
-        total += values[i] / variances[i]
-        weight += 1 / variances[i]
-    return tuple(found)
-
-
-def log_chance(chi2: np.ndarray | float, dof: np.ndarray | float) -> np.ndarray:
-    """Log probability of a chi-square of at least this size, also where the probability itself underflows.
-
-    Far out Q(a, x) = Gamma(a, x) / Gamma(a) with Gamma(a, x) = e^-x U(1 - a, 1 - a, x) (DLMF 8.5.3): two gross
-    defects must not tie at minus infinity, the worse one is the cause.
-    """
-    from scipy import special, stats
-
-    with np.errstate(divide="ignore"):
-        plain = stats.chi2.logsf(chi2, dof)
-    a, x = 0.5 * np.asarray(dof, dtype=float), 0.5 * np.asarray(chi2, dtype=float)
-    far = -x + np.log(special.hyperu(1 - a, 1 - a, x)) - special.gammaln(a)
-    return np.where(np.isfinite(plain), plain, far)
-
-
-def chi2_quantile(readings: np.ndarray, probability: float) -> np.ndarray:
-    """Chi-square that a spot of three residuals and so many aperture readings exceeds with this probability."""
-    from scipy import stats
-
-    return stats.chi2.isf(probability, 3 + readings)
-
-
-def share_error(share: float, draws: int) -> float:
-    """Monte Carlo standard error of a share: binomial, and where all draws agree that of Beta(1/2, draws + 1/2).
-
-    No number of draws makes 0 or 1 certain, as sqrt(p (1 - p) / n) would have it there; the Beta distribution is the
-    posterior under Jeffreys' prior.
-    """
-    if 0 < share < 1:
-        return math.sqrt(share * (1 - share) / draws)
-    return math.sqrt(0.5 * (draws + 0.5) / (draws + 2)) / (draws + 1)
-
-
-LEVELS = (0.50, 0.68, 0.90, 0.95)
-BOUND = 1e-4
-"""Two-sided probability with which an honest study leaves its bounds."""
-
-
-def binomial_bounds(count: int, probability: float) -> tuple[float, float]:
-    """Share that an event of this probability keeps within in `count` trials, but for `BOUND`."""
-    from scipy import stats
-
-    low, high = stats.binom.ppf(BOUND / 2, count, probability), stats.binom.isf(BOUND / 2, count, probability)
-    return float(low) / count, float(high) / count
-
-
-def rms_bounds(count: int) -> tuple[float, float]:
-    """RMS that `count` standard normal numbers keep within, but for `BOUND`."""
-    from scipy import stats
-
-    low, high = np.sqrt(stats.chi2.ppf([BOUND / 2, 1 - BOUND / 2], count) / count)
-    return float(low), float(high)
-
-
-def share_interval95(hits: int, count: int) -> tuple[float, float]:
-    """Clopper and Pearson's interval of a probability."""
-    from scipy import stats
-
-    low = 0.0 if hits == 0 else float(stats.beta.ppf(0.025, hits, count - hits + 1))
-    high = 1.0 if hits == count else float(stats.beta.ppf(0.975, hits + 1, count - hits))
-    return low, high

@@ -16,7 +16,8 @@ from tvsbayes.errors import NotConverged
 from tvsbayes.instrument.axes import DIRECTION_SIGNS
 from tvsbayes.model.headlines import QUANTITIES
 from tvsbayes.planning.target import Target
-from tvsbayes.statistics.intervals import LEVELS, NORMAL_95, binomial_bounds, rms_bounds, share_interval95
+from tvsbayes.statistics.chances import LEVELS, binomial_bounds, rms_bounds, share_interval95
+from tvsbayes.statistics.intervals import NORMAL_95
 from tvsbayes.studies.executors import executor
 from tvsbayes.studies.rows import StudyRow, StudyRows
 from tvsbayes.studies.study_job import StudyJob

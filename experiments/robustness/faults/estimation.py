@@ -270,15 +270,15 @@ FAULTS = (
     ),
     Fault(
         "a rest's looks against each other as if independent",
-        "statistics/intervals.py",
+        "statistics/chances.py",
         "np.sqrt(variances[i] + 1 / weight)",
         "np.sqrt(variances[i])",
         "clean campaigns are suspected of depth",
-        ("statistics/intervals::test_recursive_residuals_are_independent_and_standard",),
+        ("statistics/chances::test_recursive_residuals_are_independent_and_standard",),
     ),
     Fault(
         "chance of a gross defect with the wrong sign",
-        "statistics/intervals.py",
+        "statistics/chances.py",
         "far = -x + np.log(",
         "far = x + np.log(",
         "the smaller of two gross defects is the cause",
