@@ -125,7 +125,7 @@ def calibration(
 
 
 TWIN_SIDE = {"left": -0.5, "up": -0.5, "right": 0.5, "down": 0.5, "unknown": 0.0}
-"""Where the play stands, as a share of it (`simulation.transmission`)."""
+"""Where the play stands, as a share of it (`twin.physics`)."""
 
 
 def twin_angle_deg(values: Mapping[str, float], axis: str, steps: float, start: float, period_deg=None) -> float:

@@ -121,7 +121,7 @@ def beam_components(values: Values, pan_deg: Number, tilt_deg: Number, m: Module
 def range_components(
     origin: Vector, direction: Vector, baseline_mm: Number, aperture_deg: Number, azimuth: bool, m: ModuleType = np
 ) -> Number:
-    """Range along the beam at which the aperture sees it under angle B, mm (derivation: `coordinates.meeting`).
+    """Range along the beam at which the aperture sees it under angle B, mm (derivation: `beam_meeting.meeting`).
 
     Not a number where the beam misses the cone or half-plane of B; zero, negative or minus infinite where only its
     backward extension or the other nappe is met.

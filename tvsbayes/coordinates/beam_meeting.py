@@ -181,7 +181,7 @@ def model_from(inputs: Float[Array, " columns"], period_deg: Float[Array, "2"]) 
 
 
 def sources(calibration: Calibration, draws: int, seed: int) -> Sources:
-    """A calibration for the compiled functions, with its draws; arguments and errors as in `calibration.drawn`."""
+    """A calibration for the compiled functions, with its draws; arguments and errors as in `pointing.drawn`."""
     found = drawn(calibration, draws, seed)
     with jax.enable_x64(True):
         return Sources(

@@ -42,8 +42,8 @@ counters, not noise."""
 class JointFit:
     """Mode and Laplace approximation of the posterior: what `fit` returns.
 
-    Read it through `information.summarise` (values, intervals, diagnostics in words), `posterior.sample` (draws of the
-    posterior itself) or `information.calibration_of` (coordinates); the fields are what those are made of.
+    Read it through `summary.summarise` (values, intervals, diagnostics in words), `sampling.sample` (draws of the
+    posterior itself) or `fitted_calibration.calibration_of` (coordinates); the fields are what those are made of.
 
     Attributes:
         campaign: what was fitted.
@@ -51,7 +51,7 @@ class JointFit:
         arrays: the campaign as arrays, with the weights of the robust option.
         z: mode in prior coordinates, shape (p,).
         covariance: inverse negative Hessian there, shape (p, p); the identity where nothing is estimated.
-        log_density: log posterior density at the mode, without `likelihood.log_constant`.
+        log_density: log posterior density at the mode, without `campaign_arrays.log_constant`.
         linearised: the campaign linearised at the mode, without padding.
         information: leave-one-out quantities per stop.
         chi2: squared standardised innovations of the spots used.
@@ -182,7 +182,7 @@ def restored(campaign: Campaign, stored: StoredMode, seed: int = 0) -> JointFit 
 
     Args:
         campaign: the one it was made from.
-        stored: from `calibration.stored_mode`.
+        stored: from `stored_draws.stored_mode`.
         seed: of the Laplace draws; those of `fit` with the same seed.
 
     Returns:

@@ -89,7 +89,7 @@ class Posterior:
     Attributes:
         fit: the fit whose posterior it is.
         z: stored draws of the prior-normal coordinates, shape (chain, draw, p).
-        log_density: their log posterior density, without `likelihood.log_constant`, shape (chain, draw).
+        log_density: their log posterior density, without `campaign_arrays.log_constant`, shape (chain, draw).
         draws: parameters and headlines in the units of DESIGN 8, fields with leading axes (chain, draw).
         convergence: the diagnosis.
         seed: of the chain.

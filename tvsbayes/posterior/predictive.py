@@ -96,7 +96,7 @@ def move_log_density(
 
     Returns:
         Contribution of each spot given the earlier spots of its own move and all spots of the other moves: the sum
-        over a move's spots is the move's log density, without `likelihood.spot_constants`.
+        over a move's spots is the move's log density, without `campaign_arrays.spot_constants`.
     """
     index = arrays.spots.move_index
     other = index[1:] != index[:-1]
