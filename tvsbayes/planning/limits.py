@@ -46,7 +46,7 @@ STOP_SHARE_PER_MINUTE = 1e-3
 
 
 def split_of(knowledge: Knowledge, data: np.ndarray, noise: np.ndarray | None, found: Sensitivity) -> dict[str, float]:
-    """Share of each cause in the worst quantity's variance; see `fitted_calibration.causes_of`.
+    """Share of each cause in the worst quantity's variance; see `causes.causes_of`.
 
     Args:
         knowledge: before the looks.
