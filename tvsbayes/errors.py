@@ -16,7 +16,7 @@ class TvsError(Exception):
 
     Attributes:
         code: short stable identifier, e.g. "number", "unknown-key".
-        exit_code: what the process returns (DESIGN section 8).
+        exit_code: what the process returns.
         file: name of the file as the user knows it, or None.
         line: line number, 1-based, or None.
         column: name of the column or dotted key, or None.

@@ -238,7 +238,7 @@ def evidence_of(
 
 
 def calibration_for(folder: Path, tell: Tell = untold) -> Calibration:
-    """The calibration in `results/` where its hashes agree with the campaign; else fit first (DESIGN 8)."""
+    """The calibration in `results/` where its hashes agree with the campaign; else fit first."""
     from tvsbayes.calibration.calibration_file import stored_calibration
     from tvsbayes.instrument.campaign import read_campaign
 
@@ -253,7 +253,7 @@ def calibration_for(folder: Path, tell: Tell = untold) -> Calibration:
 
 
 def fit_for(campaign: Campaign, tell: Tell = untold) -> JointFit:
-    """The fit in `results/` where its hashes agree with the campaign; else fit first (DESIGN 8)."""
+    """The fit in `results/` where its hashes agree with the campaign; else fit first."""
     from tvsbayes.estimators.joint_fit import restored
     from tvsbayes.results.stored_draws import stored_mode
 
@@ -276,7 +276,7 @@ def _converged_fit(campaign: Campaign, tell: Tell) -> JointFit:
 
 
 def record_for(campaign: Campaign, folder: Path, tell: Tell = untold) -> FitRecord:
-    """`results/fit.json` where it was made from exactly this campaign and whole; else fit first (DESIGN 8)."""
+    """`results/fit.json` where it was made from exactly this campaign and whole; else fit first."""
     from tvsbayes.calibration.calibration_file import stored_calibration
     from tvsbayes.instrument.campaign import input_hashes
     from tvsbayes.results.fit_record import read_fit

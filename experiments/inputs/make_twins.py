@@ -172,7 +172,7 @@ def pose_entries() -> str:
 def write_rigs() -> None:
     """data/rigs: the nominal and the mounted rig with calibration; plans for both beside the latter."""
     nominal = (
-        "Nothing measured about its mounting; the analysis priors are the defaults of DESIGN 3.2.",
+        "Nothing measured about its mounting; the analysis priors are the defaults.",
         "[truth]                 # stand as the mounted rig does: else few spots would be in view\n" + pose_entries(),
     )
     mounted = (

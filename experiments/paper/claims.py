@@ -1,4 +1,4 @@
-"""The five claims of DESIGN section 1, each with the figure that comes out.
+"""The five claims of formulation 1, each with the figure that comes out.
 
     python -m experiments.paper.claims > experiments/paper/claims.md       # two minutes
 
@@ -326,9 +326,9 @@ def main() -> None:
     use_compilation_cache()
     campaign = twin_campaign("paper_twin")
     chosen = select_experiments(campaign)
-    print("# The claims of DESIGN section 1\n")
+    print("# The claims of formulation 1\n")
     print("Written by `python -m experiments.paper.claims`; what was done stands in the script.\n")
-    print("| claim | DESIGN | found | command | verdict |\n|---|---|---|---|---|")
+    print("| claim | stated | found | command | verdict |\n|---|---|---|---|---|")
     first()
     second()
     third(chosen, campaign.stereo)

@@ -5,7 +5,7 @@
 A dozen spots of the mounted rig, six stops at two sheets, both axes with cleared and reversed moves. Optics, cameras
 and extrinsics are held, so that a dozen spots tell what is left: mean ratios, contrasts, backlashes, tilt zero, stop
 sds, pixel scale. NumPyro's NUTS samples these, every stop error and every range; a range is flat in image
-displacement, so the density carries |d(pixels)/d(range)| (DESIGN 4.1). NUTS moves in coordinates whitened at the mode
+displacement, so the density carries |d(pixels)/d(range)|. NUTS moves in coordinates whitened at the mode
 of the marginal density; with a mass matrix of its own finding it spent 1000 gradients on every draw. It shares
 `observe` and the gears with the likelihood, not the filter, the projection, nor the linearisation about the
 triangulated point. `tvsbayes.sample` samples the marginal density.

@@ -53,7 +53,7 @@ def test_light_behind_the_device_is_that_of_the_twin(mounted_rig, tmp_path, monk
 
 
 def test_camera_that_looks_on_does_not_change_the_motion(mounted_rig):
-    """The way from the home switch follows the mean ratio (DESIGN 3.1), whatever a camera's thread asks meanwhile."""
+    """The way from the home switch follows the mean ratio, whatever a camera's thread asks meanwhile."""
     ends = []
     for watched in (False, True):
         instrument = Instrument(mounted_rig, 5)

@@ -58,7 +58,7 @@ def test_backlash_intervals_stay_positive(summary):
 
 def test_contraction_tells_data_from_prior(summary):
     assert all(e.contraction > 0.99 for e in summary.effective.values())
-    # Nearly a gauge against the laser's offset and the extrinsics (research/domain.md section 7).
+    # Nearly a gauge against the laser's offset and the extrinsics.
     assert summary.parameters["tilt_axis_offset_mm.x"].contraction < 0.2
     for name, estimate in summary.parameters.items():
         assert estimate.informed == (estimate.contraction is not None and estimate.contraction >= CONTRACTION_LIMIT), (

@@ -54,7 +54,7 @@ def test_ray_is_the_twins(approach, periods):
 
 
 def test_ray_of_the_test_vector():
-    """DESIGN 3.2: psi 10 deg, beta 5 deg; 250 mm along the beam with C0 91 deg and a 200 mm."""
+    """Of formulation 3.2: psi 10 deg, beta 5 deg; 250 mm along the beam with C0 91 deg and a 200 mm."""
     values = NOMINAL | VECTOR | {"pan_zero_emission_deg": 91.0, "degrees_per_step.pan": 0.05}
     values |= {"degrees_per_step.tilt": 0.05}
     one = calibration(values, {})
@@ -166,7 +166,7 @@ def test_a_beam_along_the_line_of_sight_is_refused():
 
 
 def test_points_that_too_many_draws_lose_are_refused_as_by_the_draws(bent):
-    """DESIGN 5: more than 0.1 % of draws diverge. The law of propagation asks range and u, the other counts draws."""
+    """More than 0.1 % of draws diverge. The law of propagation asks range and u, the other counts draws."""
     rng = np.random.default_rng(4)
     count = 4000
     inputs = np.array([NOMINAL[name] for name in INPUT_NAMES]) + np.zeros((count, 1))

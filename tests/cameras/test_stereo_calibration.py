@@ -100,7 +100,7 @@ def test_pitch_is_a_separable_type_b_term():
 
 
 def test_opencv_pairs(pairs, pairs_calibration):
-    """13 of 13 pairs, stereo RMS at most 0.22 px; research/vision.md: |T| and the square."""
+    """13 of 13 pairs, stereo RMS at most 0.22 px; |T| and the square."""
     c = pairs_calibration
     assert [view.name for view in c.views] == [f"{k:02d}" for k in (*range(1, 10), *range(11, 15))]
     assert c.pairs == 13
@@ -135,7 +135,7 @@ def test_single_camera_agrees_with_opencv(pairs, side):
     # OpenCV before 5.0 may divide by the number of corners less the parameters instead of twice that number.
     n, p = 54 * len(corners), 9 + 6 * len(corners)
     ratio = ours_sds / np.ravel(deviations)[:9]
-    # Tighter than the issue asks: without the degrees of freedom the sds would be 3 % too small.
+    # Without the degrees of freedom the sds would be 3 % too small.
     assert (np.abs(ratio - 1) < 0.01).all() or (np.abs(ratio / np.sqrt((n - p) / (2 * n - p)) - 1) < 0.01).all()
     assert (np.abs(found - theirs) < 0.01 * ours_sds).all()
     assert abs(rms_px - rms) < 1e-4

@@ -48,7 +48,7 @@ def test_check_reads_campaign_rig_and_plan(ask, say):
 
 
 def test_check_warns_without_failing(ask, say, grid_campaign, tmp_path):
-    """Weak directions alone are exit 0 (DESIGN 8)."""
+    """Weak directions alone are exit 0."""
     stereo = replace(grid_campaign.stereo, parameter_covariance=np.zeros((24, 24)))
     write_campaign(replace(grid_campaign, stereo=stereo), tmp_path / "exact")
     code, document = ask("check", tmp_path / "exact")

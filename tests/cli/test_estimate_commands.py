@@ -44,7 +44,7 @@ def test_classic_document_has_the_contracts_keys(ask):
     }
     assert list(document["directions"]) == list(DIRECTIONS)
     for result in document["directions"].values():
-        # Two more than DESIGN 8 names.
+        # Two more than the shortest contract.
         assert set(result) == contract | {"u_stereo_deg_per_step", "effective_dof"}
         assert result["n"] == 24
         low, high = result["interval95_type_a"]

@@ -18,7 +18,7 @@ pytestmark = pytest.mark.usefixtures("own_compilation_cache")
 
 
 def test_what_a_fit_left_is_taken_up_again(grid_folder, monkeypatch):
-    """`compare` and `plan --given` start from results/ (DESIGN 8): the same model, mode and draws, no second fit."""
+    """`compare` and `plan --given` start from results/: the same model, mode and draws, no second fit."""
     from tvsbayes.estimators.joint_fit import restored
     from tvsbayes.results.stored_draws import stored_mode
 

@@ -80,7 +80,7 @@ def test_terms_name_the_true_causes_with_sign_and_size(paper_fit, paper_gaps, pa
     assert true["left"][BACKLASH] == pytest.approx(-lost["pan"], rel=0.05)
     assert abs(true["right"][BACKLASH]) < 0.02 * lost["pan"]
     assert by["left"][BACKLASH] < -0.9 * lost["pan"] < 0
-    # Equal gears read as 1.12 in tilt: an azimuth near 27 deg (DESIGN 1.2).
+    # Equal gears read as 1.12 in tilt: an azimuth near 27 deg (formulation 1.2).
     for direction in ("up", "down"):
         assert by[direction][PROJECTION] == pytest.approx(0.0064, abs=0.0008)
     assert abs(by["left"][PROJECTION]) < 1e-4

@@ -120,7 +120,7 @@ def test_beams_from_the_baseline_give_the_published_point():
 
 
 def test_conventions_differ_by_the_documented_share():
-    """B = C = 80 deg, a = 200 mm (research/domain.md section 2): printed to 0.1 mm; 3.4 % in x at 15 deg."""
+    """B = C = 80 deg, a = 200 mm: printed to 0.1 mm; 3.4 % in x at 15 deg."""
     origin = np.array([[0.0, A_MM / 2, 0.0]])
     for elevation, in_plane, azimuth in ((5.0, (565.0, 49.4), (567.1, 50.4)), (15.0, (547.8, 146.8), (567.1, 154.3))):
         C, el = np.radians([80.0, elevation])

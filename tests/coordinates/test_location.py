@@ -226,7 +226,7 @@ PLAY_DEG = 0.4
 
 
 def sensitivities() -> dict[str, np.ndarray]:
-    """research/domain.md section 3, per degree of angle and per mm of a."""
+    """Per degree of angle and per mm of a."""
     B, C = np.radians([B_DEG, C_DEG])
     s2, turn = math.sin(B + C) ** 2, math.pi / 180 * A_MM
     x = A_MM * math.sin(B) * math.sin(C) / math.sin(B + C)

@@ -238,7 +238,7 @@ def test_focal_error_shifts_the_ratio_as_no_repeat_can_show():
     seen = np.degrees(np.arctan(np.tan(np.radians([18.5, 30.4])) / 1.005))
     # The near and far points share the intercept, which scales with depth and leaves the slope alone.
     assert ratio == pytest.approx((seen[1] - seen[0]) / 200, abs=ROUNDING_DEG)
-    assert ratio / 0.0595 - 1 == pytest.approx(-0.0033, abs=0.00005)  # research/domain.md 4, two digits
+    assert ratio / 0.0595 - 1 == pytest.approx(-0.0033, abs=0.00005)  # two digits
 
 
 def test_fixed_parameters_are_skipped():
@@ -321,7 +321,7 @@ def test_nothing_to_estimate():
 
 
 def test_json_is_the_contract():
-    """Keys of DESIGN 8, and a document that any JSON reader takes."""
+    """Keys of data/docs/commands.md, and a document that any JSON reader takes."""
     document = json.loads(
         json.dumps(
             classic(make_campaign([("pan", 200, 10.0, 22.0), ("pan", 200, 10.0, 22.1)])).as_json(),

@@ -1,4 +1,4 @@
-"""The joint estimator: finds the truth, says how sure it is, blames the right spot, compiles once (DESIGN 4.2)."""
+"""The joint estimator: finds the truth, says how sure it is, blames the right spot, compiles once (formulation 4.2)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The likelihood against dense Gaussians, numerical integration and finite differences (DESIGN 4.1)."""
+"""The likelihood against dense Gaussians, numerical integration and finite differences (formulation 4.1)."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from tvsbayes.twin.physics import aperture_angle_deg, mirror_chain, play, projec
 pytestmark = pytest.mark.usefixtures("x64")
 
 LOG_UNIT = 1.0
-"""One unit of log density; exact algebra on a dozen spots leaves 1e-8 of it (the issue's bound)."""
+"""One unit of log density; exact algebra on a dozen spots leaves 1e-8 of it."""
 FINE_UNIT = 1e-8 * LOG_UNIT
 
 
@@ -141,7 +141,7 @@ def test_log_density_adds_the_prior(dozen, evaluate):
 
 
 def test_a_stop_error_per_pose_is_another_density(dozen, evaluate):
-    """The mistake DESIGN 3.1 names: both axes drawn anew at every move."""
+    """The mistake formulation 3.1 names: both axes drawn anew at every move."""
     spots = ordered_spots(dozen.campaign)
     same_move = np.array([i > 0 and s.move == spots[i - 1].move for i, s in enumerate(spots)])
     redraw, mix = np.array(dozen.arrays.spots.redraw), np.array(dozen.arrays.spots.redraw_mix)

@@ -36,7 +36,7 @@ def test_rig_table_defaults_and_both_spellings():
 
 
 def test_any_parameter_may_stand_in_the_priors():
-    """DESIGN 7: also one whose own place is [rig]."""
+    """Also one whose own place is [rig]."""
     one = rig_table("[rig]\nbaseline_mm = { value = 199, u = 0.2 }\nfocal_scale = { value = 1, u = 0.01 }")
     other = rig_table("[rig.prior]\nbaseline_mm = { value = 199, u = 0.2 }\nfocal_scale = { value = 1, u = 0.01 }")
     assert one == other and other.priors["baseline_mm"] == Prior(199.0, 0.2)

@@ -26,7 +26,7 @@ VECTOR = np.array(
     ]
 )
 """Of 25 + 25 readings of paulscherrerinstitute/ecmccfg, examples/test/fat_sat/report.md, nm: means up and down, s up
-and down, B_i, R_i (research/report.md section 3)."""
+and down, B_i, R_i."""
 
 
 PUBLISHED = {

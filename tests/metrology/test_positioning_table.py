@@ -23,7 +23,7 @@ def test_an_ideal_axis_has_no_error_and_play_is_its_reversal():
     ideal = positioning(known_calibration(), "pan", tests=20)
     assert ideal.deg_per_step == pytest.approx(0.06, rel=1e-9)
     assert all(abs(p.median) < 1e-9 for p in ideal.predicted.values())
-    # Reached left (up) the mirror lags by b/2, reached right (down) it leads by b/2 (DESIGN 3.1): B_i = -b.
+    # Reached left (up) the mirror lags by b/2, reached right (down) it leads by b/2 (formulation 3.1): B_i = -b.
     played = positioning(known_calibration(**{"backlash_deg.pan": 0.3}), "pan", tests=20).predicted
     for name in ("reversal_deg", "repeatability_deg", "systematic_deg", "accuracy_deg"):
         assert played[name].median == pytest.approx(0.3, abs=1e-9), name
@@ -63,7 +63,7 @@ def test_bent_optics_bend_the_beam_not_the_counters():
     bent = positioning(known_calibration(**{"backlash_deg.pan": 0.2, "laser_tilt_deg.x": 1.0}), "pan", tests=5)
     assert straight["mean_systematic_deg"].median == pytest.approx(0.0, abs=1e-9)
     assert bent.predicted["mean_systematic_deg"].median > 0.01
-    # 1 deg of laser tilt changes the slope by 1.7 % at most (DESIGN 3.2).
+    # 1 deg of laser tilt changes the slope by 1.7 % at most (formulation 3.2).
     assert bent.predicted["mean_reversal_deg"].median == pytest.approx(-0.2, rel=0.017)
     # Unasked, targets follow the slope at the middle of the counters: pan 100, tilt 0.
     values = known_calibration(**{"laser_tilt_deg.x": 1.0}).estimates
@@ -117,7 +117,7 @@ def test_too_few_stops_give_a_reason_and_no_table():
 
 
 def test_an_axis_that_turns_far_is_asked_for_more_targets():
-    """More than 180 deg of travel want eight targets (research/report.md section 3), in the words as in the tests."""
+    """More than 180 deg of travel want eight targets, in the words as in the tests."""
     fit = stops_of(np.zeros(STOPS))
     calibration = known_calibration()
     far = replace(calibration, range_steps=np.array([[0, 4000], calibration.range_steps[1]]))

@@ -16,7 +16,7 @@ from tvsbayes.twin.physics import harmonics_deg, mirror_chain, transmission
 
 
 def test_unequal_ratios_carry_every_run_on():
-    """K up = k + c/2, k down = k - c/2 (DESIGN 3.1): a cycle over travel L gains c L; by hand, step for step."""
+    """K up = k + c/2, k down = k - c/2 (formulation 3.1): a cycle over travel L gains c L; by hand, step for step."""
     c, targets, runs = 1e-4, (0, 100, 200), 3
     up, down = up_and_down(
         known_calibration(), "pan", targets, 0.06, runs=runs, tests=1, contrast_deg_per_step=np.full(50, c)

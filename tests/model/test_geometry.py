@@ -31,7 +31,7 @@ BATCH = 64
 SERIES_ANGLE_RAD = 0.01
 """Where `rotation_matrix` changes from series to closed form."""
 PIXEL_ROUNDING = 1e-9
-"""px: the issue's bound; twenty operations on 1e3 px leave 1e-12."""
+"""px; twenty operations on 1e3 px leave 1e-12."""
 CAMERA_MATRICES = (
     np.array([[802.0, 0.0, 645.0], [0.0, 795.0, 355.0], [0.0, 0.0, 1.0]]),
     np.array([[790.0, 0.0, 630.0], [0.0, 805.0, 362.0], [0.0, 0.0, 1.0]]),

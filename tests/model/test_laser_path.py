@@ -1,4 +1,4 @@
-"""Gears, play, mirrors: their laws, their derivatives, their behaviour far from any real rig (DESIGN 3.1, 3.2)."""
+"""Gears, play, mirrors: their laws, their derivatives, their behaviour far from any real rig."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ pytestmark = pytest.mark.usefixtures("x64")
 ANGLE_ROUNDING_RAD = 1e-14
 """A hundred additions of angles of order one."""
 RELATIVE_DERIVATIVE = 1e-7
-"""The issue's bound on derivatives; differences of fourth order with 1e-3 steps stay below 1e-10."""
+"""Bound on derivatives; differences of fourth order with 1e-3 steps stay below 1e-10."""
 MOVES = 24
 LENGTH = 32
 

@@ -1,4 +1,4 @@
-"""Priors as coordinates, and which name drives which quantity of the model (DESIGN 4.1, 8)."""
+"""Priors as coordinates, and which name drives which quantity of the model (formulation 4.1)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Verdicts on chains whose quality is known, and summaries of draws whose distribution is (DESIGN 4.3).
+"""Verdicts on chains whose quality is known, and summaries of draws whose distribution is (formulation 4.3).
 
 No fit: chains are drawn, so that every limit is crossed alone, and nothing is compiled but a batch or two.
 """

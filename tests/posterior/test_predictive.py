@@ -1,4 +1,4 @@
-"""Predictive looks scatter as the rig does: stop errors by direction, home offsets by segment, play (DESIGN 3.1)."""
+"""Predictive looks scatter as the rig does: stop errors by direction, home offsets by segment, play."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Chains are repeatable, resumable and judged; quantities are carried with their Monte Carlo error (DESIGN 4.3)."""
+"""Chains are repeatable, resumable and judged; quantities are carried with their Monte Carlo error."""
 
 from __future__ import annotations
 

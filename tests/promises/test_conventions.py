@@ -1,4 +1,4 @@
-"""The signs and frames of DESIGN 2 and its printed test vectors (DESIGN 3.2), on the JAX model."""
+"""The signs and frames of formulation 2 and its printed test vectors (formulation 3.2), on the JAX model."""
 
 from __future__ import annotations
 

@@ -228,7 +228,6 @@ OUTSIDE = re.compile(r"\bDESIGN\b|\bresearch/|\bpaper\.txt|newcomer|\.\./shared|
 """Words that point to a text which no reader of the repository has."""
 
 
-@pytest.mark.xfail(reason="references to texts outside the repository follow")
 def test_nothing_points_outside_the_repository():
     folders = ("tvsbayes", "tests", "experiments", "data")
     paths = [

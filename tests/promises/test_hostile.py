@@ -1,6 +1,6 @@
 """Campaign folders from strangers: every one is read or refused with its place, never a traceback.
 
-The rows follow research/security.md section 1 (TOML, JSON, CSV, paths) and DESIGN section 7.
+The rows are threats to readers of TOML, JSON, CSV and paths; what is allowed stands in data/docs/campaign-files.md.
 """
 
 from __future__ import annotations

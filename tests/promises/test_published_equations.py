@@ -42,7 +42,7 @@ def test_published_point_is_where_the_rays_meet(beta_deg):
 
 @pytest.mark.parametrize(("B", "C", "y_mm"), [(90, 70, -100.0), (95, 70, -163.3), (110, 50, -253.2)])
 def test_published_y_is_the_table(B, C, y_mm):
-    """The table of research/domain.md section 1, printed to 0.1 mm."""
+    """A table of published points by paper eq. (1) to (3), printed to 0.1 mm."""
     assert published_point(float(B), float(C), 0.0, A_MM)[1] == pytest.approx(y_mm, abs=0.05)
 
 
@@ -65,6 +65,6 @@ def test_the_printed_branch_jumps_at_90_degrees():
     np.testing.assert_array_equal(
         published_point(B, 70.0, 8.0, A_MM, as_printed=True), published_point(B, 70.0, 8.0, A_MM)
     )
-    # The table's last column, research/domain.md section 1, at B and C whose share is 253.2 / 200 + 1/2.
+    # The table's last column, at B and C whose share is 253.2 / 200 + 1/2.
     share = 0.5 + 253.2 / 200
     assert published_point(110.0, 50.0, 0.0, A_MM, as_printed=True)[1] == pytest.approx(-A_MM * (0.5 + share), abs=0.05)

@@ -48,7 +48,7 @@ def table_1() -> dict[str, tuple[float, float, int]]:
 
 
 def test_reference_values_are_the_papers():
-    """Table 1 and the worked example as DESIGN 1 quotes them, with their origin."""
+    """Table 1 and the worked example as formulation 1 quotes them, with their origin."""
     assert table_1() == {
         "left": (0.059394, 0.000808, 24),
         "right": (0.062023, 0.000176, 24),

@@ -35,7 +35,7 @@ pytestmark = pytest.mark.usefixtures("x64")
 
 RIGS, POSES, MOVES = 100, 8, 40
 LENGTH_MM = 1e-9
-"""The issue's bound: 1e-12 of a metre, a thousand times rounding."""
+"""1e-12 of a metre, a thousand times rounding."""
 PIXEL_PX = 1e-9
 ANGLE_RAD = LENGTH_MM / 1000.0
 """What moves a spot at 1 m by that length."""

@@ -63,7 +63,7 @@ ORDER = {
     "expandedMU": "valueExpandedMU coverageFactor coverageProbability distribution?",
     "coverageIntervalMU": "valueStandardMU intervalMin intervalMax coverageProbability distribution?",
 }
-"""Children in order, of DCC 3.3.0 and D-SI 2.2.1 as far as we write them (research/report.md section 4; order of the
+"""Children in order, of DCC 3.3.0 and D-SI 2.2.1 as far as we write them (order of the
 parts inside from the published 3.2.1 schema, whose names 3.3.0 keeps)."""
 
 

@@ -1,6 +1,6 @@
 """Campaign folders from strangers: a good one, one crafted folder per threat, and seeded random mutations.
 
-The names say which line of the threat list (research/security.md, section 1) a folder stands for. Used by
+The names say which threat a folder stands for. Used by
 `promises/test_hostile.py` and, with more of everything, by `experiments/robustness/hostile.py`. No JAX, no OpenCV.
 """
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 LAST_12, LAST_9, LAST_7, LAST_6 = 0.5e-12, 0.5e-9, 0.5e-7, 0.5e-6
-"""Half a unit of the last digit that the design prints, each in the unit of what it bounds."""
+"""Half a unit of the last digit that formulation prints, each in the unit of what it bounds."""
 VECTOR = {
     "mirror_offset_mm": 30.0,
     "mirror1_error_deg": 0.3,

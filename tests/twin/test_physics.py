@@ -28,20 +28,20 @@ POSE_DEG = (10.0, 5.0)
 
 
 def test_mirror_chain_vector():
-    """Origin and direction of DESIGN 3.2 to the last printed digit."""
+    """Origin and direction of formulation 3.2 to the last printed digit."""
     origin, direction = mirror_chain(*np.radians(POSE_DEG), VECTOR)
     assert origin == pytest.approx([5.371658918, -29.176887333, -0.940368833], abs=LAST_9 * 1.01)
     assert direction == pytest.approx([0.981182562588, 0.177188586189, 0.076713648059], abs=LAST_12 * 1.01)
 
 
 def test_beam_jacobian_vector():
-    """d(az, el)/d(psi, beta) of DESIGN 3.2 to the last printed digit."""
+    """d(az, el)/d(psi, beta) of formulation 3.2 to the last printed digit."""
     printed = np.array([[1.0070677, 0.0038895], [-0.0025873, 0.9977070]])
     assert np.abs(beam_jacobian(VECTOR, POSE_DEG) - printed).max() <= LAST_7
 
 
 def test_tvs_and_aperture_vector():
-    """p_T and both readings of B of DESIGN 3.2 to the last printed digit."""
+    """p_T and both readings of B of formulation 3.2 to the last printed digit."""
     origin, direction = mirror_chain(*np.radians(POSE_DEG), VECTOR)
     point = to_tvs(origin + 250.0 * direction, 200.0, 91.0)
     assert point == pytest.approx([250.365237, 119.492704, 18.238043], abs=LAST_6 * 1.01)
@@ -86,11 +86,11 @@ def test_effective_ratios_and_offset_of_the_nominal_rig():
     assert effective_mirror_offset_mm(parameters, (12.0, 7.0)) == pytest.approx(30.0, abs=1e-10)
     tilted = parameters | {"laser_tilt_deg.x": 1.0}
     slope = effective_deg_per_step(tilted, (12.0, 7.0))["left"] / 0.0601
-    assert 0.001 < abs(slope - 1) < 0.02, "a laser tilt changes the local slope by up to 1.7 % (DESIGN 3.2)"
+    assert 0.001 < abs(slope - 1) < 0.02, "a laser tilt changes the local slope by up to 1.7 % (formulation 3.2)"
 
 
 def test_play_vector():
-    """The play vector of DESIGN 3.2, through the transmission with its two ratios and by itself."""
+    """The play vector of formulation 3.2, through the transmission with its two ratios and by itself."""
     counters = np.cumsum([0, 200, -200, 3, -2, 100])
     first = np.arange(6) == 0
     y = transmission(counters, first, np.full(6, -0.5), np.zeros(6), (0.061, -0.002), 0.3)

@@ -1,4 +1,4 @@
-"""The digital twin's laws: test vectors of DESIGN 3.2, transmission, stop errors, seeds, protocols.
+"""The digital twin's laws: test vectors of formulation 3.2, transmission, stop errors, seeds, protocols.
 
 Degrees, mm and pixels by suffix. Nothing here imports an estimator's model.
 """
@@ -101,7 +101,7 @@ def test_home_offsets():
 
 
 def test_homing_ends_on_the_side_that_it_states():
-    """Reached left or up a mirror lags by half the play, reached right or down it leads by as much (DESIGN 3.1)."""
+    """Reached left or up a mirror lags by half the play, reached right or down it leads by as much."""
     rig = make_rig(truth_u=0.0)
     truth = draw_truth(rig, np.random.default_rng(0))
     known = {f"stop_sd_deg.{d}": 0.0 for d in DIRECTION_SIGNS}
@@ -353,7 +353,7 @@ def test_time_advances_by_the_rigs_costs():
 
 
 def test_the_twin_needs_no_jax():
-    """Simulating and the classic estimator never import JAX (DESIGN 9)."""
+    """Simulating and the classic estimator never import JAX."""
     modules = "tvsbayes.twin.simulated_campaign, tvsbayes.estimators.four_point"
     code = f"import sys, {modules}; sys.exit('jax' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

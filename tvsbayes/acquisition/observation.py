@@ -38,7 +38,7 @@ holds back sixty."""
 UNSTEADY = "unsteady"
 """Status of a look whose background changed: somebody in the picture, or the light in the room."""
 UNDETECTED = "undetected"
-"""Status of a look whose frames wait for a detection (DESIGN 7)."""
+"""Status of a look whose frames wait for a detection."""
 
 
 @dataclass(frozen=True)

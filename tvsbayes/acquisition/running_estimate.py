@@ -3,7 +3,7 @@
 The campaign folder is readable at any time, so `tvsbayes fit --no-sample` runs on it as it stands, one fit at a time.
 The acquisition neither waits for it nor shares memory with it: a compiler at work must not delay a laser switch. The
 figures are the effective degrees per step of the beam with their standard uncertainty from the Laplace approximation
-(DESIGN 3.2, 4.2), of the looks that were there when the fit began.
+(formulation 3.2 and 4.2), of the looks that were there when the fit began.
 """
 
 from __future__ import annotations

@@ -198,7 +198,7 @@ class Instrument:
         self._sheet = placed_sheet(self.rig.sheets_mm[target], draws)
 
     def _moved(self, axis: int, steps: int) -> None:
-        """A stretch of motion: ratio of its sense, play, a new stop error (DESIGN 3.1)."""
+        """A stretch of motion: ratio of its sense, play, a new stop error (formulation 3.1)."""
         self.motions += 1
         p, sense = self.truth.parameters, SIDES[AXES[axis]][steps > 0]
         # The first row of a segment stands at mean ratio x counters, whatever the way there from the switch.
@@ -258,7 +258,7 @@ class Instrument:
 
 
 def reference_pose_deg(looks: Sequence[TrueAngles]) -> tuple[float, float] | None:
-    """Mean mirror angles without stop errors over `state_deg` of the looks used (DESIGN 3.2); None for none."""
+    """Mean mirror angles without stop errors over `state_deg` of the looks used (formulation 3.2); None for none."""
     if not looks:
         return None
     resting = np.array([np.subtract(look["mirror_angles_deg"], look["stop_errors_deg"]) for look in looks])

@@ -59,7 +59,7 @@ class Causes:
 
 
 def causes_of(fit: JointFit) -> Causes:
-    """Split the covariance of a fit by cause (DESIGN 5).
+    """Split the covariance of a fit by cause (formulation 5).
 
     An estimate moves by S J^T C^-1 e when the data err by e, and by S e_j when prior j is off by its sd, S the
     posterior covariance. With C = 1 + (stop errors) the parts S (C^-1 J)^T (C^-1 J) S, S (J^T C^-1 J - that) S and

@@ -16,7 +16,7 @@ from tvsbayes.instrument.stops import few_stops, inseparable, legs_of, observed_
 from tvsbayes.results.estimates import Leverage, PriorSensitivity, WeakDirection
 
 LEVERAGE_LIMIT = 2.0
-"""A stop is named if a headline's sd would grow by more than this factor without it (DESIGN 4.2)."""
+"""A stop is named if a headline's sd would grow by more than this factor without it (formulation 4.2)."""
 LOADING_LIMIT = 0.3
 WEAK_VARIANCE = 0.5
 """A direction of parameter space is weak if more than this share of its prior variance is left."""

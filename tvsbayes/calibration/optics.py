@@ -38,7 +38,7 @@ class Ray:
 
 
 def _harmonic(values: Values, axis: str, angle_deg: Number, period_deg: float, m: ModuleType) -> Number:
-    """Transmission error at an angle, degrees (DESIGN 3.1)."""
+    """Transmission error at an angle, degrees (formulation 3.1)."""
     total: Number = 0.0
     for order in HARMONIC_ORDERS:
         phase = 2 * math.pi * order * angle_deg / period_deg
@@ -50,7 +50,7 @@ def _harmonic(values: Values, axis: str, angle_deg: Number, period_deg: float, m
 def output_deg(
     values: Values, axis: str, steps: Number, side: Number, period_deg: float | None, m: ModuleType = np
 ) -> Number:
-    """Mirror angle of an axis after homing: q = k n, play taken up on the approach side (DESIGN 3.1).
+    """Mirror angle of an axis after homing: q = k n, play taken up on the approach side (formulation 3.1).
 
     Args:
         values: parameters by name; floats, or arrays of one shape.
@@ -81,7 +81,7 @@ class Components(NamedTuple):
 
 
 def beam_components(values: Values, pan_deg: Number, tilt_deg: Number, m: ModuleType = np) -> Components:
-    """Origin and unit direction of the beam in frame T for mirror angles (DESIGN 3.2 and 2).
+    """Origin and unit direction of the beam in frame T for mirror angles (formulation 3.2 and 2).
 
     The laser is reflected in the turned pan stage and everything turned back at the end. Arguments as in
     `output_deg`.
@@ -194,7 +194,7 @@ def beam_angle_deg(values: Values, axis: str, mirror_deg: Number, other_deg: Num
 
 
 def beam_deg_per_step(values: Mapping[str, float], axis: str, pose_deg: tuple[float, float]) -> float:
-    """Mean of both directions' effective degrees per step at mirror angles (pan, tilt), as DESIGN 3.2 defines it."""
+    """Mean of both directions' effective degrees per step at mirror angles (pan, tilt) (formulation 3.2)."""
     index, half = AXES.index(axis), 1e-3
     here, other = pose_deg[index], pose_deg[1 - index]
     ends = [beam_angle_deg(values, axis, here + s * half, other) for s in (1, -1)]

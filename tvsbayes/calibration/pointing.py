@@ -42,7 +42,7 @@ INPUT_NAMES: tuple[str, ...] = names_of(
 """What a coordinate depends on. Contrasts do not enter: after homing a counter stands for its mean ratio."""
 NOISE_NAMES = names_of("stop_sd_deg", "aperture_sd_deg")
 DIVERGING_SHARE = 1e-3
-"""Share of draws without a point above which a point is refused (DESIGN 5)."""
+"""Share of draws without a point above which a point is refused (formulation 5)."""
 DIVERGING_SDS = 3.0902323061678132
 """Range over its standard deviation below which more than `DIVERGING_SHARE` of a normal 1/range is beyond infinity."""
 UNIT_NOISES: dict[str, float] = {
@@ -179,7 +179,7 @@ class Calibration:
 
         Raises:
             InputError: an approach that does not exist, or beam and line of sight do not meet, or more than 0.1 % of
-                what the data allow would not (DESIGN 5).
+                what the data allow would not (formulation 5).
         """
         sides = sides_of(approach)
         steps = (float(pan_steps), float(tilt_steps))

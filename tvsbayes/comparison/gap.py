@@ -62,7 +62,7 @@ def _ideal(space: ParameterSpace, names: Sequence[str]) -> ParameterSpace:
 
 
 def explain_gap(found: JointFit, posterior: Posterior | None = None, draws: int = GAP_DRAWS) -> dict[str, Gap | None]:
-    """The gap between both estimators, term by term (DESIGN 1).
+    """The gap between both estimators, term by term (formulation 1).
 
     On every draw the model takes the classic estimator's spots without noise, and again without backlash, then with
     the stated cameras in place of the true ones, then with ideal optics. Each change of the classic mean is one

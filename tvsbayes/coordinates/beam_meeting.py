@@ -72,7 +72,7 @@ def meeting(
     aperture_rad: Float[Array, "*batch"],
     azimuth_convention: Bool[Array, ""],
 ) -> Meeting:
-    """Meet beams with the cone, or vertical plane, of an aperture angle (DESIGN 5); closed form, differentiable.
+    """Meet beams with the cone, or vertical plane, of an aperture angle (formulation 5); closed form, differentiable.
 
     With w the beam's origin seen from the aperture and c = cos B, the in-plane reading asks for (w + r d)_y =
     c |w + r d|. Squared this is a quadratic in r whose discriminant is c^2 S^2, S^2 = |m|^2 sin^2 B - m_y^2 with the
@@ -128,7 +128,7 @@ class Settings(eqx.Module):
 def beams_at(model: Model, steps: Array, side: Array, noise: Float[Array, "noises"]) -> Beam:
     """Beams of one rig at many settings, frame T: q = k n after homing, play taken up on the approach side.
 
-    Source: DESIGN 3.1.
+    Source: formulation 3.1.
 
     Args:
         model: parameters.

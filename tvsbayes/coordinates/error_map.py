@@ -26,7 +26,7 @@ from tvsbayes.instrument.parameters import RIG_PRIORS, Prior
 
 @dataclass(frozen=True)
 class SimpleCalibration:
-    """What a user of published equations knows: C = C0 + k n, beta = k n, no backlash (DESIGN 5).
+    """What a user of published equations knows: C = C0 + k n, beta = k n, no backlash (formulation 5).
 
     Attributes:
         deg_per_step: by direction (left, right, up, down): counters above zero were reached left or up.

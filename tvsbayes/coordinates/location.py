@@ -23,7 +23,7 @@ from tvsbayes.instrument.axes import sides_of
 from tvsbayes.statistics.intervals import NORMAL_95, Validation, symmetric_interval, validate
 
 DRAWS = 1000
-"""Draws carried to a point unless the caller wants others; DESIGN 5 asks for 500 at least."""
+"""Draws carried to a point unless the caller wants others; formulation 5 asks for 500 at least."""
 POINTS = 256
 """Points per call of the compiled functions."""
 
@@ -163,10 +163,10 @@ def locate(
 
     Raises:
         InputError: a calibration without draws, or an approach that does not exist.
-        ValueError: fewer than 500 draws (DESIGN 5), or lists of different lengths.
+        ValueError: fewer than 500 draws (formulation 5), or lists of different lengths.
     """
     if draws < 500:
-        raise ValueError(f"{draws} draws; a coordinate's interval needs at least 500 (DESIGN 5)")
+        raise ValueError(f"{draws} draws; a coordinate's interval needs at least 500")
     settings = settings_of(pan_steps, tilt_steps, aperture_deg, approach)
     if not len(settings.steps):
         raise ValueError("no points: the lists are empty")

@@ -1,4 +1,4 @@
-"""The paper's four-point estimator, exactly as printed, with type A and GUM uncertainties (DESIGN 4.4).
+"""The paper's four-point estimator, exactly as printed, with type A and GUM uncertainties (formulation 4.4).
 
 Two spots before and two after a move of N steps, each triangulated alone; the beam's slope in the plane
 of the moved axis; the difference of two arctangents over N. Frame S (X depth, Y left, Z up, mm); degrees;
@@ -79,7 +79,7 @@ class Selection:
 
     @property
     def direction(self) -> np.ndarray:
-        """(e,) "left", "right", "up" or "down" by axis and sign of N (DESIGN 2)."""
+        """(e,) "left", "right", "up" or "down" by axis and sign of N (formulation 2)."""
         pan, tilt = (np.where(self.steps > 0, *SENSES[axis]) for axis in AXES)
         return np.where(self.axis == "tilt", tilt, pan)
 
@@ -104,7 +104,7 @@ class DirectionResult:
     effective_dof: float | None
 
     def as_json(self) -> dict[str, object]:
-        """The direction's object of `classic --json` (DESIGN 8); infinite dof becomes null."""
+        """The direction's object of `classic --json`; infinite dof becomes null."""
         document = asdict(self)
         for name in ("interval95_type_a", "interval95_gum"):
             document[name] = None if document[name] is None else list(document[name])
@@ -122,7 +122,7 @@ class ClassicResult:
     skipped: tuple[SkippedExperiment, ...]
 
     def as_json(self) -> dict[str, object]:
-        """The document of `tvsbayes classic --json` (DESIGN 8)."""
+        """The document of `tvsbayes classic --json`."""
         results = self.directions.items()
         return {
             "directions": {name: None if result is None else result.as_json() for name, result in results},

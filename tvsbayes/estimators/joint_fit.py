@@ -111,7 +111,7 @@ class JointFit:
 def fit(
     campaign: Campaign, *, model: ModelChoice = AS_STATED, without: Collection[int] = (), seed: int = 0
 ) -> JointFit:
-    """Fit the joint model to every usable spot (DESIGN 4).
+    """Fit the joint model to every usable spot (formulation 4).
 
     The first call in a process compiles the model, half a minute; `tvsbayes.information.summarise(fit(campaign))` is
     the table that the command prints.

@@ -1,4 +1,4 @@
-"""Likelihood of all spots of a campaign: flat ranges, marginal stop errors and home offsets (DESIGN 4.1).
+"""Likelihood of all spots of a campaign: flat ranges, marginal stop errors and home offsets (formulation 4.1).
 
 Each spot gives four pixels and perhaps an aperture angle. Its range along the beam is unknown and flat in image
 displacement: the part of the residual along d(pixels)/d(range) is projected out. Stop errors (persistent while
@@ -48,7 +48,7 @@ STATES = 6
 def aperture_angle(
     receiver: Receiver, points_p_mm: Float[Array, "3 *batch"], azimuth_convention: Bool[Array, ""]
 ) -> Float[Array, "*batch"]:
-    """Angle B at the aperture between +y of frame T and the spot, or its projection on x-y (DESIGN 5)."""
+    """Angle B at the aperture between +y of frame T and the spot, or its projection on x-y (formulation 5)."""
     turned = rotate_about_z(receiver.pan_zero_emission_rad - jnp.pi / 2, points_p_mm)
     lateral2 = turned[0] ** 2 + jnp.where(azimuth_convention, 0.0, 1.0) * turned[2] ** 2
     # A spot on the baseline itself has no direction; the floor keeps the derivative finite there.
@@ -121,7 +121,7 @@ def whitened(
 def spot_residuals(
     model: Model, angles: MirrorAngles, arrays: CampaignArrays, inflation: Scalar, frozen: bool
 ) -> SpotResiduals:
-    """Linearise every spot about the triangulated point's range (DESIGN 4.1).
+    """Linearise every spot about the triangulated point's range (formulation 4.1).
 
     Args:
         model: parameters.

@@ -35,7 +35,7 @@ from tvsbayes.statistics.least_squares import NEWTON_STEP, levenberg_marquardt
 
 ANNEALING = (60.0, 10.0, 2.0, 1.0)
 """Factors on the pixel noise before it takes its own value: plain Levenberg-Marquardt from the nominal rig goes
-astray when the extrinsics are off by 0.3 rad and 60 mm (DESIGN 4.2)."""
+astray when the extrinsics are off by 0.3 rad and 60 mm (formulation 4.2)."""
 STAGE_TOLERANCE = 1e-2
 STAGE_STEPS = 12
 """Levenberg-Marquardt only has to reach the basin: its frozen Jacobian (`spot_residuals`) is not exact at the level
@@ -61,7 +61,7 @@ class Fixed(eqx.Module):
 def stage_residuals(
     z: Float[Array, " parameters"], args: tuple[ParameterSpace, CampaignArrays, Fixed]
 ) -> Float[Array, " residuals"]:
-    """[standardised innovations; prior residuals] with the noise scales held (DESIGN 4.2)."""
+    """[standardised innovations; prior residuals] with the noise scales held (formulation 4.2)."""
     space, arrays, fixed = args
     full = jnp.where(fixed.held, fixed.value, z)
     errors = innovations(space.model(full), arrays, fixed.inflation, frozen=True).standardised
@@ -125,7 +125,7 @@ class Problem:
         return result
 
     def alternate(self, z: np.ndarray) -> np.ndarray:
-        """Geometry and noise scales in turn until the noise settles (DESIGN 4.2)."""
+        """Geometry and noise scales in turn until the noise settles (formulation 4.2)."""
         for _ in range(6):
             previous = z
             z = self.least_squares(self.noise_scales(z), 1.0)

@@ -25,12 +25,12 @@ DIRECTION_SIGNS: dict[str, tuple[Axis, int]] = {
 }
 """Axis and sense of motion of a direction."""
 APPROACH_SIGN = {**{direction: sign for direction, (_, sign) in DIRECTION_SIGNS.items()}, "unknown": 0}
-"""Sense of motion of an approach (DESIGN 2)."""
+"""Sense of motion of an approach (formulation 2)."""
 PIXELS = attrgetter("u_left_px", "v_left_px", "u_right_px", "v_right_px")
 FULL_TURN_DEG = 360.0
 """Period of the wheel (the output member); a shorter one is the pinion's."""
 HOME_SD_DEG = 0.05
-"""Standard deviation of the home offset of every segment after the first (DESIGN 3.2, fixed)."""
+"""Standard deviation of the home offset of every segment after the first (formulation 3.2, fixed)."""
 
 
 def direction_of(axis: str, change: float) -> str:

@@ -1,4 +1,4 @@
-"""What was moved and what was seen: moves, spots and the campaign folder (DESIGN 7).
+"""What was moved and what was seen: moves, spots and the campaign folder.
 
 Counters are absolute integers; px with the integer at the centre of a pixel; degrees where a name says `_deg`. Columns
 are found by name. No JAX.
@@ -135,7 +135,7 @@ def with_pixels(
 
 
 def parse_moves(data: bytes, file: str = "moves.csv") -> tuple[Move, ...]:
-    """The checked rows of `moves.csv` (DESIGN 7); at least one."""
+    """The checked rows of `moves.csv`; at least one."""
     table = parse_table(data, file, _MOVE_COLUMNS)
     if not len(table):
         allowed, remedy = "at least one row", "write row 0: the counters and approaches after homing"
@@ -183,7 +183,7 @@ def check_experiments(
 
 
 def parse_spots(data: bytes, file: str, moves: int, stereo: Stereo) -> tuple[Spot, ...]:
-    """The checked rows of `spots.csv` (DESIGN 7), in the order of the file.
+    """The checked rows of `spots.csv`, in the order of the file.
 
     Args:
         data: the file's bytes.
@@ -274,7 +274,7 @@ def _header_value(keys: Keys, key: str) -> object:
 
 
 def parse_header(keys: Keys) -> dict[str, object]:
-    """The keys of `campaign.toml` outside `[rig]`, checked; their list is closed (DESIGN 7)."""
+    """The keys of `campaign.toml` outside `[rig]`, checked; their list is closed."""
     keys.word("format", ("tvsbayes-campaign/1",))
     keys.only(_HEADER_KEYS)
     plain = [key for key in keys.values if key not in ("format", "rig", *_HEADER_TABLES)]
@@ -306,7 +306,7 @@ def _parse_files(files: dict[str, bytes], path: Path | None) -> Campaign:
 
 
 def read_campaign(folder: Path | str) -> Campaign:
-    """Reads and checks a campaign folder (DESIGN 7; the README lists its files). Never `truth.json`, frames or results.
+    """Reads and checks a campaign folder (data/docs/campaign-files.md). Never `truth.json`, frames or results.
 
     Args:
         folder: holds `campaign.toml`, `stereo.json`, `moves.csv` and `spots.csv`.

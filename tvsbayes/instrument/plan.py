@@ -53,7 +53,7 @@ _PLAN_ACTIONS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
 
 
 def parse_plan(data: bytes, file: str = "plan.csv") -> tuple[PlanStep, ...]:
-    """The checked rows of `plan.csv` (DESIGN 7); see `read_plan`."""
+    """The checked rows of `plan.csv`; see `read_plan`."""
     table = parse_table(data, file, _PLAN_COLUMNS)
     if not len(table):
         allowed, remedy = "at least one step", "begin with step 0, action home"

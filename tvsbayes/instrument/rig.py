@@ -1,8 +1,8 @@
 """The instrument as declared: parameter names and priors, rig files, and the stereo pair with its calibration.
 
-Frames and units: DESIGN section 2. mm, degrees where a name says `_deg`, radians where it says `_rad`, image px with
+Frames and units: formulation 2. mm, degrees where a name says `_deg`, radians where it says `_rad`, image px with
 the integer at the centre of a pixel. Stereo in OpenCV's conventions: camera axes x right, y down, z along the view;
-x_right = R x_left + T; Rodrigues vectors (DESIGN 3.3 and 7). No JAX.
+x_right = R x_left + T; Rodrigues vectors (formulation 3.3). No JAX.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ class RigTable:
 
 @dataclass(frozen=True)
 class Rig:
-    """A rig file: the declared rig, its stereo calibration and how it is driven (DESIGN 7).
+    """A rig file: the declared rig, its stereo calibration and how it is driven.
 
     `truth` is the distribution from which `simulate` and `study` draw true rigs (complete: names absent
     from `[truth]` take the prior). `sheets_mm` gives the nominal X of each named target in frame S.
@@ -194,7 +194,7 @@ def parse_rig_table(table: Keys) -> RigTable:
     period_deg: dict[str, float] = {
         axis: declared.pop(name).value for name, axis in _PERIOD_NAMES.items() if name in declared
     }
-    # Any parameter may stand in [rig.prior] (DESIGN 7), also one that has its place in [rig].
+    # Any parameter may stand in [rig.prior], also one that has its place in [rig].
     prior = _parse_priors(table.table("prior"), (*_PRIOR_NAMES, *_DECLARED_NAMES))
     for name in declared:
         if name in prior:
@@ -283,7 +283,7 @@ def _beside(keys: Keys, key: str, folder: Path) -> Path:
 
 
 def read_rig(path: Path) -> Rig:
-    """Reads a rig file (format tvsbayes-rig/1, DESIGN 7) and the stereo file it names.
+    """Reads a rig file (format tvsbayes-rig/1) and the stereo file it names.
 
     Raises:
         InputError: either file unreadable, unknown keys, values out of range, a stereo path that leaves

@@ -84,7 +84,7 @@ def triangulate(stereo: Stereo, pixels: np.ndarray, focal_scale: float = 1.0) ->
 
 @dataclass(frozen=True)
 class Stereo:
-    """A stereo calibration in OpenCV's convention: x_right = R x_left + T (DESIGN 3.3 and 7).
+    """A stereo calibration in OpenCV's convention: x_right = R x_left + T (formulation 3.3).
 
     `D1`, `D2` are k1 k2 p1 p2 k3. `parameter_covariance` orders the 24 parameters as
     `STEREO_PARAMETER_NAMES` (rotation as Rodrigues vector, rad; translation in mm).
@@ -266,7 +266,7 @@ def parse_stereo(data: bytes, file: str) -> Stereo:
 
 
 def read_stereo(path: Path, folder: Path | None = None) -> Stereo:
-    """Reads `stereo.json` (format tvsbayes-stereo/1, DESIGN 7).
+    """Reads `stereo.json` (format tvsbayes-stereo/1).
 
     Args:
         path: the file.

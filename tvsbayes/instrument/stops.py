@@ -70,7 +70,7 @@ class Rest(Stop):
 
 
 def rests_of(moves: Sequence[Move], axis: str) -> list[Rest]:
-    """The rest at which an axis stands after every move: a new one whenever its counter changed (DESIGN 3.1).
+    """The rest at which an axis stands after every move: a new one whenever its counter changed (formulation 3.1).
 
     Args:
         moves: all moves in order, the first after a homing.
@@ -207,7 +207,7 @@ class Redraws:
 
 
 def redraws(moves: Sequence[Move], looks: Sequence[int], homed_from: int = 1) -> Redraws:
-    """An axis' stop error is new once its own counter has changed or was set by homing (DESIGN 3.1).
+    """An axis' stop error is new once its own counter has changed or was set by homing (formulation 3.1).
 
     Args:
         moves: all moves in order.

@@ -103,7 +103,7 @@ def simulated_runs(
     middle = float(calibration.range_steps[AXES.index(other)].mean())
     other_deg = output_deg(values, other, middle, 0.0, calibration.period_deg.get(other))
     ratio = values[f"degrees_per_step.{axis}"]
-    # Upwards a step is k + c/2, downwards k - c/2 (DESIGN 3.1): a whole cycle of 2 L steps gains c L.
+    # Upwards a step is k + c/2, downwards k - c/2 (formulation 3.1): a whole cycle of 2 L steps gains c L.
     before = contrast * (high - low) * np.arange(runs)
     gained = {1.0: before + 0.5 * contrast * (steps - low), -1.0: before + 0.5 * contrast * (2 * high - low - steps)}
     generator = np.random.default_rng([seed, 2302])

@@ -85,7 +85,7 @@ def rotate_about_z(angle_rad: Float[Array, "..."], vector: Float[Array, "3 ..."]
 
 
 def reflect(direction: Float[Array, "3 ..."], normal: Float[Array, "3 ..."]) -> Float[Array, "3 ..."]:
-    """Mirror directions at a plane with unit normal: d - 2 (d.n) n (DESIGN 3.2)."""
+    """Mirror directions at a plane with unit normal: d - 2 (d.n) n (formulation 3.2)."""
     return direction - 2 * dot(direction, normal) * normal
 
 
@@ -109,7 +109,7 @@ class StereoCameras(eqx.Module):
         tangential: (p1, p2) of each camera.
         rotation_rad: Rodrigues vector of R, x_right = R x_left + T.
         translation_mm: T.
-        focal_scale: factor on every focal length (the laser's wavelength, DESIGN 3.3).
+        focal_scale: factor on every focal length (the laser's wavelength, formulation 3.3).
     """
 
     focal_px: Float[Array, "2 2"]

@@ -44,7 +44,7 @@ def effective_deg_per_step(gears: Transmission, angles: BeamAngles) -> Float[Arr
 
 @eqx.filter_jit
 def headlines(z: Float[Array, " parameters"], space: ParameterSpace, pose_rad: Float[Array, "2"]) -> Headlines:
-    """Headlines at one pose (DESIGN 3.2) with their derivatives."""
+    """Headlines at one pose (formulation 3.2) with their derivatives."""
 
     def values(z):
         model = space.model(z)
@@ -77,7 +77,7 @@ def physical_at(z: np.ndarray, space: ParameterSpace) -> Physical:
 
 
 class Derived(eqx.Module):
-    """Headlines at one pose for one point of parameter space, in the units of DESIGN 8.
+    """Headlines at one pose for one point of parameter space, in the units of data/docs/conventions.md.
 
     `effective_deg_per_step` is ordered left, right, up, down: gear ratio times the slope of the mirrors, the mean over
     a period of the transmission error, without its local slope. `jacobian` is d(azimuth, elevation)/d(pan, tilt).
@@ -93,7 +93,7 @@ class Derived(eqx.Module):
 def derived_quantities(
     z: Float[Array, "draws parameters"], space: ParameterSpace, reference_pose_rad: Float[Array, "2"]
 ) -> Derived:
-    """Headlines of many points at once (DESIGN 3.2); every field has the leading axis `draws`."""
+    """Headlines of many points at once (formulation 3.2); every field has the leading axis `draws`."""
 
     def one(z):
         physical = space.physical(z)

@@ -1,4 +1,4 @@
-"""The way of the laser: counters -> gears, play -> mirror angles -> beam. Differentiable (DESIGN 3.1, 3.2).
+"""The way of the laser: counters -> gears, play -> mirror angles -> beam. Differentiable (formulation 3.1 and 3.2).
 
 A vector is an array whose first axis is x, y, z; any batch axes follow. Lengths in mm, angles in rad. All functions
 are written for JAX with few, wide operations: compile time grows with their number.
@@ -25,7 +25,7 @@ ORDERS = np.array([1.0, 2.0])
 
 
 class Harmonics(eqx.Module):
-    """Transmission error of both axes: h(a) = sum_o c_o cos(2 pi o a / P) + s_o sin(2 pi o a / P) (DESIGN 3.1).
+    """Transmission error of both axes: h(a) = sum_o c_o cos(2 pi o a / P) + s_o sin(2 pi o a / P) (formulation 3.1).
 
     Attributes:
         amplitude_rad: indices axis, order, (c, s).
@@ -128,7 +128,7 @@ def mirror_angles(transmission: Transmission, tilt_zero_rad: Scalar, moves: Move
 
 
 class Optics(eqx.Module):
-    """Laser and the two mirrors, with every deviation from the nominal 45-degree chain (DESIGN 3.2)."""
+    """Laser and the two mirrors, with every deviation from the nominal 45-degree chain (formulation 3.2)."""
 
     mirror_offset_mm: Scalar
     mirror1_error_rad: Scalar
@@ -147,7 +147,7 @@ class Beam(eqx.Module):
 
 
 def beam(optics: Optics, pan_rad: Float[Array, "*batch"], tilt_rad: Float[Array, "*batch"]) -> Beam:
-    """Trace the laser over both mirrors (DESIGN 3.2; the signs are part of the contract).
+    """Trace the laser over both mirrors (formulation 3.2; the signs are part of the contract).
 
     Args:
         optics: laser and mirrors.
@@ -204,7 +204,7 @@ class BeamAngles(eqx.Module):
 
 
 def beam_angles(optics: Optics, pan_rad: Scalar, tilt_rad: Scalar) -> BeamAngles:
-    """Direction of the beam and its local slope against the mirror angles at one pose (DESIGN 3.2)."""
+    """Direction of the beam and its local slope against the mirror angles at one pose (formulation 3.2)."""
 
     def azimuth_elevation(angles):
         d = beam(optics, angles[0], angles[1]).direction

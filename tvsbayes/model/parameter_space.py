@@ -1,7 +1,7 @@
 """Coordinates with standard-normal priors, and the model that a point of them stands for.
 
 Every parameter has a coordinate z with prior N(0, 1): normal priors are value + u z, half-normals
-u Phi^-1((1 + Phi(z)) / 2) (DESIGN 4.1: no boundary, no mirrored mode), log-normals value exp(u z); the 24 stereo
+u Phi^-1((1 + Phi(z)) / 2) (formulation 4.1: no boundary, no mirrored mode), log-normals value exp(u z); the 24 stereo
 parameters are mean + root z with root root^T their full covariance. u = 0 fixes a parameter whatever its z, so that
 one compiled function serves every choice of fixed parameters. Physical values have the units of their names.
 """

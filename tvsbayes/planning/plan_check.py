@@ -229,7 +229,7 @@ def _few_stops(knowledge: Knowledge, plan: Judged) -> list[str]:
 
 
 def check_plan(rig: Rig, steps: Sequence[PlanStep]) -> PlanCheck:
-    """What a plan on a rig cannot tell apart, in words, and the smallest addition that would (DESIGN 6).
+    """What a plan on a rig cannot tell apart, in words, and the smallest addition that would (formulation 6).
 
     Args:
         rig: priors, sheets, limits.

@@ -130,7 +130,7 @@ class PlanResult:
     criterion: str
 
     def as_json(self) -> dict[str, object]:
-        """The document of `plan --json` (DESIGN 8)."""
+        """The document of `plan --json`."""
 
         def plain(value: object) -> object:
             if isinstance(value, float):
@@ -191,7 +191,7 @@ def plan(
     largest: int = LADDER[-1],
     seed: int = 0,
 ) -> PlanResult:
-    """Find the cheapest plan that meets a target, and say what it will give, or why none can (DESIGN 6).
+    """Find the cheapest plan that meets a target, and say what it will give, or why none can (formulation 6).
 
     Args:
         rig: sheets, limits, costs; its priors where there is no campaign.

@@ -25,7 +25,7 @@ DERIVED_BATCH = 2049
 
 
 class Draws(Mapping[str, np.ndarray]):
-    """Posterior draws by name: every parameter of DESIGN 8, and derived quantities, each of shape (n,).
+    """Posterior draws by name: every parameter, and derived quantities, each of shape (n,).
 
     Derived: `degrees_per_step.left|right|up|down`, `effective_deg_per_step.left|right|up|down`,
     `effective_contrast_deg_per_step.pan|tilt` (left - right, up - down), `effective_mirror_offset_mm`.
@@ -90,7 +90,8 @@ class Posterior:
         fit: the fit whose posterior it is.
         z: stored draws of the prior-normal coordinates, shape (chain, draw, p).
         log_density: their log posterior density, without `campaign_arrays.log_constant`, shape (chain, draw).
-        draws: parameters and headlines in the units of DESIGN 8, fields with leading axes (chain, draw).
+        draws: parameters and headlines in the units of data/docs/conventions.md, fields with leading axes (chain,
+            draw).
         convergence: the diagnosis.
         seed: of the chain.
         seconds: spent sampling, earlier runs of a resumed chain included.
@@ -106,7 +107,7 @@ class Posterior:
 
     @property
     def converged(self) -> bool:
-        """All limits of DESIGN 4.3 are met."""
+        """All limits of formulation 4.3 are met."""
         return self.convergence.converged
 
     @property
@@ -149,13 +150,13 @@ class Posterior:
         return propagated(values.reshape(chains, draws, *values.shape[1:]))
 
     def effective_deg_per_step(self, pan_deg: float, tilt_deg: float) -> Propagated:
-        """Effective degrees per step (left, right, up, down) at any pose of the mirrors (DESIGN 3.2)."""
+        """Effective degrees per step (left, right, up, down) at any pose of the mirrors (formulation 3.2)."""
         with jax.enable_x64(True):
             found = derived_at(self.fit, self.z, np.radians([pan_deg, tilt_deg]))
         return propagated(np.asarray(found.effective_deg_per_step))
 
     def lost_motion_deg(self, direction: str, steps: np.ndarray) -> Propagated:
-        """Mirror angle that a move of `steps` loses after a reversal: min(k N, b) (play operator, DESIGN 3.1).
+        """Mirror angle that a move of `steps` loses after a reversal: min(k N, b) (play operator, formulation 3.1).
 
         Args:
             direction: left, right, up or down.

@@ -83,7 +83,7 @@ class LaterSpots(eqx.Module):
 def move_log_density(
     z: Float[Array, "batch parameters"], space: ParameterSpace, arrays: CampaignArrays
 ) -> Float[Array, "batch spots"]:
-    """Log density of the spots of each move given ALL other spots and the parameters (DESIGN 4.3).
+    """Log density of the spots of each move given ALL other spots and the parameters (formulation 4.3).
 
     Stop errors persist while their axis stands, so spots are not independent given the parameters; whole moves
     are the unit that can be left out. Backward and forward passes meet at each move (two-filter smoother: Fraser

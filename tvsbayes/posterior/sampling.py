@@ -1,4 +1,4 @@
-"""The posterior: sampled until it has converged, diagnosed, carried into any quantity, kept for ArviZ (DESIGN 4.3).
+"""The posterior: sampled until it has converged, diagnosed, carried into any quantity, kept for ArviZ.
 
 emcee samples in coordinates in which the posterior is nearly standard normal. Three layers: z, the prior-normal
 coordinates of `tvsbayes.model`; y, whitened by the Laplace covariance; w, in which walkers live. Wide directions (laser
@@ -7,8 +7,8 @@ coordinate by a quadratic form of the wider ones. Noise scales widen and turn wh
 backlash and their sums): in w everything else is measured from the mean and by the covariance that the linearised
 campaign has at the noise scales of the walker. NumPy outside the compiled density.
 
-Arrays of draws are ordered (chain, draw, ...); a chain is a walker. Units are those of DESIGN 8 (deg, mm, px).
-Convergence is judged on the stored draws, so that what ArviZ computes from `posterior.nc` is what was judged.
+Arrays of draws are ordered (chain, draw, ...); a chain is a walker. Units are those of data/docs/conventions.md (deg,
+mm, px). Convergence is judged on the stored draws, so that what ArviZ computes from `posterior.nc` is what was judged.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ CHAIN_BYTES_MAX = 2**32
 RHAT_LIMIT = 1.01
 ESS_LIMIT = 1000
 TAU_LIMIT = 50
-"""Limits of DESIGN 4.3: rank R-hat by walker, bulk and tail effective draws, steps in autocorrelation times."""
+"""Limits of formulation 4.3: rank R-hat by walker, bulk and tail effective draws, steps in autocorrelation times."""
 STUCK_ACCEPTANCE = 0.25
 """A walker is stuck that accepts less than this share of what the median walker accepts ..."""
 STUCK_DEVIATION = 8.0
@@ -251,7 +251,7 @@ def sample(
     resume: bool = False,
     progress: Callable[[Progress], None] | None = None,
 ) -> Posterior:
-    """Sample the posterior of a fit until it has converged or the time is over (DESIGN 4.3).
+    """Sample the posterior of a fit until it has converged or the time is over (formulation 4.3).
 
     Args:
         fit: a converged fit.

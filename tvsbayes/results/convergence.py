@@ -73,7 +73,7 @@ class Convergence:
 
     @property
     def converged(self) -> bool:
-        """All limits of DESIGN 4.3 are met."""
+        """All limits of formulation 4.3 are met."""
         return not self.missing
 
     @property

@@ -14,7 +14,7 @@ from tvsbayes.results.convergence import Sampling
 from tvsbayes.results.records import plain
 
 CONTRACTION_LIMIT = 0.1
-"""1 - (posterior sd / prior sd)^2 below which a value is called set by the prior (DESIGN 8)."""
+"""1 - (posterior sd / prior sd)^2 below which a value is called set by the prior."""
 
 
 SUMMARY_KEYS = (
@@ -184,7 +184,7 @@ class Curves:
 
 @dataclass(frozen=True)
 class FitSummary:
-    """A joint fit in the contract's terms (DESIGN 8).
+    """A joint fit in the contract's terms.
 
     Attributes:
         converged: whether the mode was reached.
@@ -237,7 +237,7 @@ class FitSummary:
         return any(e is not None and e.informed for e in self.effective.values())
 
     def as_json(self) -> dict[str, object]:
-        """The contract's keys (DESIGN 8), without those that the caller adds (`files`)."""
+        """The contract's keys, without those that the caller adds (`files`)."""
         values = plain(replace(self, curves=None))
         noise = {
             "chi2": values.pop("chi2"),

@@ -1,9 +1,9 @@
 """The twin's own physics: gears with play, stop errors, mirrors, the beam on a sheet, cameras, the aperture's angle.
 
 It shares formats and parameter names with the estimators, but no formula: all of it is written here a second time,
-from the design alone, so that an error in the estimators' model cannot hide in the twin. Frames S (stereo),
-P (positioner), Q (pan stage) and T (TVS) as in `data/docs/conventions.md`; mm; degrees and radians by suffix; pixels
-with the integer at the centre of a pixel.
+from data/docs/formulation.md alone, so that an error in the estimators' model cannot hide in the twin. Frames S
+(stereo), P (positioner), Q (pan stage) and T (TVS) as in `data/docs/conventions.md`; mm; degrees and radians by suffix;
+pixels with the integer at the centre of a pixel.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ def transmission(
     harmonics_deg: Sequence[complex] = (),
     period_deg: float = FULL_TURN_DEG,
 ) -> np.ndarray:
-    """Output angle (n,) in degrees of one axis after each move, stop errors excluded (DESIGN 3.1).
+    """Output angle (n,) in degrees of one axis after each move, stop errors excluded (formulation 3.1).
 
     Args:
         counters: (n,) absolute counters.
@@ -111,7 +111,7 @@ def mirror_chain(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Beam leaving mirror 2 for mirror angles psi, beta: origin (..., 3) mm and direction (..., 3) in P.
 
-    True reflections at true intersections (DESIGN 3.2). The laser is turned into the pan stage Q instead
+    True reflections at true intersections (formulation 3.2). The laser is turned into the pan stage Q instead
     of the mirrors out of it. `geometry` maps contract names to values.
     """
     psi, beta = np.broadcast_arrays(np.asarray(psi_rad, float), np.asarray(beta_rad, float))
@@ -235,7 +235,7 @@ class CameraPair:
 
 
 def cameras_of(stereo: Stereo, focal_scale: float = 1.0) -> CameraPair:
-    """Both cameras of a calibration; `focal_scale` multiplies fx and fy (1 in visible light, DESIGN 3.3)."""
+    """Both cameras of a calibration; `focal_scale` multiplies fx and fy (1 in visible light, formulation 3.3)."""
     scale = np.array([[focal_scale, 1.0, 1.0], [1.0, focal_scale, 1.0], [1.0, 1.0, 1.0]])
     size = stereo.image_width, stereo.image_height
     left = Camera(stereo.M1 * scale, np.asarray(stereo.D1, float).ravel(), np.eye(3), np.zeros(3), *size)
@@ -280,7 +280,7 @@ def to_tvs(points_P_mm: np.ndarray, baseline_mm: float, pan_zero_emission_deg: f
 
 
 def aperture_angle_deg(points_T_mm: np.ndarray, baseline_mm: float, convention: str) -> np.ndarray:
-    """Angle B (...,) at the aperture between +y and the spot, "in-plane" or its "azimuth" (DESIGN 5)."""
+    """Angle B (...,) at the aperture between +y and the spot, "in-plane" or its "azimuth" (formulation 5)."""
     x, y, z = np.moveaxis(np.asarray(points_T_mm, float) + np.array([0.0, baseline_mm / 2, 0.0]), -1, 0)
     return np.degrees(np.arctan2(np.hypot(x, z) if convention == "in-plane" else x, y))
 
@@ -297,7 +297,7 @@ def beam_jacobian(geometry: Mapping[str, float], pose_deg: tuple[float, float]) 
 def effective_deg_per_step(
     parameters: Mapping[str, float], reference_pose_deg: tuple[float, float]
 ) -> dict[str, float]:
-    """Degrees of the beam per step at a pose: k_dir d(az)/d(psi) and k_dir d(el)/d(beta) (DESIGN 3.2).
+    """Degrees of the beam per step at a pose: k_dir d(az)/d(psi) and k_dir d(el)/d(beta) (formulation 3.2).
 
     The mean over a period of the transmission error, without its local slope.
     """

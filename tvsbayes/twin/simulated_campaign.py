@@ -75,7 +75,7 @@ class Truth:
     """A true rig: what no estimator may read.
 
     Attributes:
-        parameters: every physical parameter by its contract name (DESIGN 8), derived ones included.
+        parameters: every physical parameter by its contract name, derived ones included.
         stereo: the true cameras (the campaign carries the stated ones).
         mirror_angles_deg: (psi, beta) of each move as realised, stop errors included; empty before a run.
         stop_errors_deg: (pan, tilt) stop error of each move, as held.
@@ -206,7 +206,7 @@ def _draw(prior: Prior, rng: np.random.Generator) -> float:
 
 
 def with_derived(parameters: Mapping[str, float]) -> dict[str, float]:
-    """Add the four directional ratios that mean ratios and contrasts imply (DESIGN 3.1)."""
+    """Add the four directional ratios that mean ratios and contrasts imply (formulation 3.1)."""
     result = dict(parameters)
     for axis, (negative, positive) in SIDES.items():
         ratio, contrast = result[f"degrees_per_step.{axis}"], result[f"ratio_contrast_deg_per_step.{axis}"]
