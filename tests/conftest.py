@@ -193,7 +193,9 @@ def coordinates(space: Any, truth: Truth) -> np.ndarray:
     from tvsbayes.instrument.parameters import RIG_NAMES
     from tvsbayes.model.parameter_space import coordinates_of
 
-    return coordinates_of(space, np.array([*(truth.parameters[name] for name in RIG_NAMES), *truth.stereo.vector]))
+    # Older truths do not name the harmonics, which are zero then.
+    physical = [*(truth.parameters.get(name, 0.0) for name in RIG_NAMES), *truth.stereo.vector]
+    return coordinates_of(space, np.array(physical))
 
 
 @pytest.fixture(scope="session")

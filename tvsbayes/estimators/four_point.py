@@ -5,8 +5,6 @@ of the moved axis; the difference of two arctangents over N. Frame S (X depth, Y
 pixels with the integer at the centre of a pixel. What the estimator cannot know (backlash, the tangent
 of a tilt read off its own azimuth) stays in its answer: that is what it is here for. No JAX.
 
-Also what can be said of a campaign before any fit: which stops its spots tell of, what they cannot separate.
-
 Source: Lopez-Medina et al., Metrology 2025, 5(4), 58, equations (4) to (8).
 """
 

@@ -241,7 +241,7 @@ class Belief(eqx.Module):
         return Belief(self.mean * _along(row.keep, self.mean), self.covariance * (row.keep[:, None] * row.keep) + new)
 
 
-class Look(eqx.Module):
+class KalmanUpdate(eqx.Module):
     """A spot seen by the filter: the state after it, standardised errors and the log of their variances' product."""
 
     belief: Belief
@@ -249,7 +249,7 @@ class Look(eqx.Module):
     log_variance: Scalar
 
 
-def look(belief: Belief, row: FilterRows) -> Look:
+def kalman_update(belief: Belief, row: FilterRows) -> KalmanUpdate:
     """Update with one spot: its components have independent unit noise, so four scalar updates and no inverse."""
     mean, covariance = belief.mean, belief.covariance
     errors, variances = [], []
@@ -262,7 +262,7 @@ def look(belief: Belief, row: FilterRows) -> Look:
         covariance = covariance - gain[:, None] * (gain / variance_ahead)
         errors.append(error / jnp.sqrt(variance_ahead))
         variances.append(variance_ahead)
-    return Look(Belief(mean, covariance), jnp.stack(errors), jnp.sum(jnp.log(jnp.stack(variances))))
+    return KalmanUpdate(Belief(mean, covariance), jnp.stack(errors), jnp.sum(jnp.log(jnp.stack(variances))))
 
 
 def no_belief(*columns: int) -> Belief:
@@ -318,7 +318,7 @@ def innovations(
     given = filter_input(model, arrays, inflation, frozen)
 
     def step(belief, row):
-        seen = look(belief.renewed(row), row)
+        seen = kalman_update(belief.renewed(row), row)
         return seen.belief, (seen.standardised, seen.log_variance)
 
     _, (standardised, log_variance) = jax.lax.scan(step, no_belief(), given.rows)

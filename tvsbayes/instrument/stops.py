@@ -121,13 +121,16 @@ FEW_STOPS = 12
 """Fewer tell their own scatter so poorly that 1.96 standard deviations of it hold less than 93 % (Student's t)."""
 
 
+def too_few(stops: Mapping[str, int]) -> dict[str, int]:
+    """Of the numbers of stops by direction those below `FEW_STOPS`."""
+    return {direction: count for direction, count in stops.items() if count < FEW_STOPS}
+
+
 def few_stops(moves: Sequence[Move], observed: Collection[int]) -> dict[str, int]:
-    """Directions moved in with fewer than `FEW_STOPS` observed stops, and their number; see `observed_stops`."""
+    """Directions moved in with too few observed stops, and their number; see `observed_stops`."""
     seen = Counter(direction_of(axis, stop.sign) for axis in AXES for stop in observed_stops(moves, observed, axis))
     moved = legs_of(moves)
-    return {
-        direction: seen[direction] for direction in DIRECTIONS if direction in moved and seen[direction] < FEW_STOPS
-    }
+    return too_few({direction: seen[direction] for direction in DIRECTIONS if direction in moved})
 
 
 INSEPARABLE = 0.5

@@ -22,7 +22,7 @@ from jaxtyping import Array, Bool, Float
 from tvsbayes.errors import InputError
 from tvsbayes.estimators.campaign_arrays import NOWHERE_MM, CampaignArrays, SpotArrays, move_arrays
 from tvsbayes.estimators.joint_fit import JointFit
-from tvsbayes.estimators.likelihood import filter_rows, look, no_belief
+from tvsbayes.estimators.likelihood import filter_rows, kalman_update, no_belief
 from tvsbayes.estimators.linear_spots import linearise
 from tvsbayes.instrument.axes import HOME_SD_DEG
 from tvsbayes.instrument.campaign import Move
@@ -156,7 +156,7 @@ def expect(
     given = filter_rows(columns, lin.slope, lin.play_sd_rad, lin.stop_variance, spots)
 
     def step(belief, row):
-        found = look(belief.renewed(row), row)
+        found = kalman_update(belief.renewed(row), row)
         return found.belief, found.standardised
 
     _, rows = jax.lax.scan(step, no_belief(columns.shape[2]), given)

@@ -19,7 +19,7 @@ from tvsbayes.instrument.campaign import Campaign
 from tvsbayes.instrument.plan import PlanStep, step_json
 from tvsbayes.instrument.protocols import grid_protocol, mixed_protocol, paper_protocol
 from tvsbayes.instrument.rig import Rig
-from tvsbayes.instrument.stops import FEW_STOPS, inseparable
+from tvsbayes.instrument.stops import FEW_STOPS, inseparable, too_few
 from tvsbayes.planning.candidates import (
     Candidates,
     LookArrays,
@@ -244,14 +244,13 @@ def few_looks(looks: Looks, target: Target) -> list[str]:
     Every look of a design is a stop of its own.
     """
     notes = []
-    for direction, (axis, sign) in DIRECTION_SIGNS.items():
-        stops = int(np.sum(looks.side[:, AXES.index(axis)] == sign))
-        if stops < FEW_STOPS:
-            reached = f"only {stops} stop{'s' * (stops != 1)} {direction}"
-            cure = "plan u(worst), which asks for every direction"
-            if target.quantity == "worst":
-                cure = f"look more often: {FEW_STOPS} stops tell their own scatter"
-            notes.append(f"{reached}: this plan is for its target alone; for reliable intervals of {direction} {cure}")
+    sides = {d: looks.side[:, AXES.index(axis)] == sign for d, (axis, sign) in DIRECTION_SIGNS.items()}
+    for direction, stops in too_few({d: int(np.sum(reached)) for d, reached in sides.items()}).items():
+        reached = f"only {stops} stop{'s' * (stops != 1)} {direction}"
+        cure = "plan u(worst), which asks for every direction"
+        if target.quantity == "worst":
+            cure = f"look more often: {FEW_STOPS} stops tell their own scatter"
+        notes.append(f"{reached}: this plan is for its target alone; for reliable intervals of {direction} {cure}")
     return notes
 
 

@@ -19,7 +19,7 @@ from tvsbayes.estimators.likelihood import (
     Belief,
     FilterRows,
     filter_input,
-    look,
+    kalman_update,
     no_belief,
     observe_with_stop_errors,
 )
@@ -113,7 +113,7 @@ def move_log_density(
         row, first, beyond, log_scale = row_and_first
         belief = belief.renewed(row)
         cavity = jax.tree.map(lambda a, b: jnp.where(first, a, b), beyond.joined(belief), cavity)
-        seen = look(cavity, row)
+        seen = kalman_update(cavity, row)
         log_density = log_scale - 0.5 * seen.log_variance - 0.5 * jnp.sum(seen.standardised**2)
         return (look(belief, row).belief, seen.belief), log_density
 
