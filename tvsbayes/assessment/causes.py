@@ -51,7 +51,7 @@ class Causes:
 
     Attributes:
         names: causes.
-        covariance: their parts, shape (causes, inputs, inputs), ordered as `calibration.INPUT_NAMES`; they add up.
+        covariance: their parts, shape (causes, inputs, inputs), ordered as `INPUT_NAMES`; they add up.
     """
 
     names: tuple[str, ...]

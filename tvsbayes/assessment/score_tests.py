@@ -17,7 +17,7 @@ from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.estimators.linear_spots import StopGroup, linear_spots, stop_information
 from tvsbayes.instrument.axes import AXES
 from tvsbayes.instrument.campaign import ordered_spots
-from tvsbayes.instrument.parameters import INDEX, NAMES, NOISE_NAMES, RIG_NAMES, STEREO_PARAMETER_NAMES
+from tvsbayes.instrument.parameters import INDEX, NAMES, NOISE_NAMES, RIG_NAMES, STEREO_PARAMETER_NAMES, names_of
 from tvsbayes.instrument.stops import rests_of
 from tvsbayes.results.estimates import Validation, ValidationTest
 from tvsbayes.statistics.chances import log_chance
@@ -32,7 +32,7 @@ ABSORBED = 1e-3
 """Share of a defect's effect below which the fit has swallowed it: what is left is no more than its curvature."""
 KNOWN_DIRECTION = 1e-4
 """Information (in prior sds) from which the fit can move along a direction; below it the spots cannot follow."""
-_POSE = tuple(f"extrinsics.{kind}.{axis}" for kind in ("rotation_rad", "translation_mm") for axis in "xyz")
+_POSE = names_of("extrinsics.rotation_rad", "extrinsics.translation_mm")
 
 
 @dataclass(frozen=True)

@@ -62,7 +62,8 @@ def stereo(
     as_json: Json = False,
 ) -> None:
     """Calibrate the camera pair from checkerboard pictures. With the covariance of all 24 parameters; or import one."""
-    if export not in (None, "opencv", "ros") or finder not in (None, "classic", "sector"):
+    known = (export, ("opencv", "ros")), (finder, ("classic", "sector")), (import_unit, ("mm", "m"))
+    if any(value not in (None, *allowed) for value, allowed in known):
         remedy = "--export opencv or ros, --finder classic or sector, --import-unit mm or m"
         raise InputError("usage", "an option has a value that it does not know", remedy=remedy)
     if (folder is None) == (not imports):
@@ -135,11 +136,7 @@ def _imported(paths: list[Path], image_size: str | None, import_unit: str | None
     from tvsbayes.instrument.parameters import STEREO_PARAMETER_NAMES
     from tvsbayes.report.command_text import stereo_text
 
-    units_mm = {"mm": 1.0, "m": 1000.0}
-    if (import_unit or "mm") not in units_mm:
-        remedy = "--export opencv or ros, --finder classic or sector, --import-unit mm or m"
-        raise InputError("usage", "an option has a value that it does not know", remedy=remedy)
-    found = read_calibration(paths, _image_size(image_size), unit_mm=units_mm[import_unit or "mm"])
+    found = read_calibration(paths, _image_size(image_size), unit_mm={"mm": 1.0, "m": 1000.0}[import_unit or "mm"])
     if found.source != "opencv":
         reason, remedy = f"for files of OpenCV, and this is one of {found.source}", "leave it out: this file tells it"
         refuse_options(reason, remedy, image_size=image_size, import_unit=import_unit)

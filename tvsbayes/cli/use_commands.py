@@ -15,6 +15,7 @@ from typing import Annotated
 import typer
 
 from tvsbayes.cli.app import (
+    TARGET_MISSED,
     CampaignFolder,
     Ended,
     Json,
@@ -25,7 +26,7 @@ from tvsbayes.cli.app import (
     refuse_options,
     report_line,
 )
-from tvsbayes.errors import InputError, TvsError, escaped
+from tvsbayes.errors import InputError, escaped
 from tvsbayes.files.csv_table import CSV_BYTES_MAX, parse_table
 from tvsbayes.files.disk import output_place, read_bytes
 from tvsbayes.pipeline import calibration_for, compile_for, fit_for
@@ -238,7 +239,7 @@ def plan(
         keep(plan_document(document, input_hashes(data)), output_place(given, "results") / "plan.json")
     finish(document, text, as_json)
     if target is not None and not result.met:
-        raise Ended(TvsError.exit_code)
+        raise Ended(TARGET_MISSED)
 
 
 def study(
@@ -290,7 +291,7 @@ def study(
     document = {**result.as_json(), "rows": str(kept.path), "engine": engine, "seed": seed}
     finish(document, study_text(result), as_json)
     if target is not None and result.assurance < ASSURED[0]:
-        raise Ended(TvsError.exit_code)
+        raise Ended(TARGET_MISSED)
 
 
 def _limits(path: Path) -> dict[str, tuple[float, float]]:

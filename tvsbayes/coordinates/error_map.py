@@ -21,6 +21,7 @@ from tvsbayes.calibration.optics import (
 )
 from tvsbayes.calibration.pointing import DIVERGING_SHARE, INPUT_NAMES, NOISE_NAMES, Calibration, Drawn, Sides, drawn
 from tvsbayes.estimators.four_point import ClassicResult
+from tvsbayes.instrument.axes import SENSES
 from tvsbayes.instrument.parameters import RIG_PRIORS, Prior
 
 
@@ -50,11 +51,9 @@ def simple_calibration(
 
     Directions that the classic estimator did not measure keep their nominal ratio.
     """
-    nominal = {"left": "pan", "right": "pan", "up": "tilt", "down": "tilt"}
-    ratios = {direction: priors[f"degrees_per_step.{axis}"].value for direction, axis in nominal.items()}
+    ratios = {d: priors[f"degrees_per_step.{axis}"].value for axis, pair in SENSES.items() for d in pair}
     if classic is not None:
-        measured = {d: r.mean_deg_per_step for d, r in classic.directions.items() if r is not None}
-        ratios |= measured
+        ratios |= {d: r.mean_deg_per_step for d, r in classic.directions.items() if r is not None}
     a, offset = priors["baseline_mm"].value, priors["mirror_offset_mm"].value
     zeros = (priors["pan_zero_emission_deg"].value, priors["aperture_zero_deg"].value)
     return SimpleCalibration(ratios, a - offset, 0.5 * a - offset, *zeros)
@@ -85,7 +84,7 @@ class ErrorMap:
         rms_mm: root mean square distance from the true point, by estimator.
         bias_mm: mean error vector, by estimator, shape (pan, tilt, range, 3).
         inside: counters within those of the campaign.
-        valid: every estimator asked finds a point in all but `coordinates.DIVERGING_SHARE` of the draws.
+        valid: every estimator asked finds a point in all but `DIVERGING_SHARE` of the draws.
         distance_mm: 3D errors by estimator, arrays (draws, pan, tilt, range), infinite where there is no point.
     """
 

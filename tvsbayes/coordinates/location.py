@@ -8,9 +8,9 @@ validated by the other.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
-from typing import cast
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -176,62 +176,33 @@ def locate(
         for block, n in _blocks(settings):
             carried, law = carry(block, given), propagate(block, given)
             trimmed = jax.tree.map(lambda x, n=n: np.asarray(x)[..., :n], carried)
-            parts.append(_statistics(trimmed, jax.tree.map(lambda x, n=n: np.asarray(x)[:n], law), given))
-    return _assembled(parts, calibration, settings, draws)
-
-
-def _assembled(parts: list[_Block], calibration: Calibration, settings: Settings, draws: int) -> Locations:
-    """All blocks together, with the refusal of every point that too many draws lose."""
-    checks = [part.validation for part in parts]
-    lost = _joined(parts, "diverging_share")
+            law = jax.tree.map(lambda x, n=n: np.asarray(x)[:n], law)
+            parts.append(_statistics(trimmed, law, given, calibration.estimator))
+    found = _together(parts)
     asked = zip(
         settings.steps.tolist(), np.degrees(settings.aperture_rad).tolist(), settings.side.tolist(), strict=True
     )
-    return Locations(
-        xyz_mm=_joined(parts, "xyz_mm"),
-        covariance_mm2=_joined(parts, "covariance_mm2"),
-        interval95_mm=_joined(parts, "interval95_mm"),
-        u95_mm=_joined(parts, "u95_mm"),
-        diverging_share=lost,
-        linear_xyz_mm=_joined(parts, "linear_xyz_mm"),
-        linear_covariance_mm2=_joined(parts, "linear_covariance_mm2"),
-        validation=Validation(
-            digits=checks[0].digits,
-            tolerance=_joined(checks, "tolerance"),
-            deviation=_joined(checks, "deviation"),
-            error=_joined(checks, "error"),
-            validated=_joined(checks, "validated"),
-            decided=_joined(checks, "decided"),
-        ),
-        refused=tuple(
-            None if share <= DIVERGING_SHARE else calibration.refusal(pan, tilt, deg, (pan_side, tilt_side))
-            for share, ((pan, tilt), deg, (pan_side, tilt_side)) in zip(lost.tolist(), asked, strict=True)
-        ),
-        estimator=calibration.estimator,
-        draws=draws,
+    refused = tuple(
+        None if share <= DIVERGING_SHARE else calibration.refusal(pan, tilt, deg, (pan_side, tilt_side))
+        for share, ((pan, tilt), deg, (pan_side, tilt_side)) in zip(found.diverging_share.tolist(), asked, strict=True)
     )
+    return replace(found, refused=refused)
 
 
-def _joined(parts: Sequence[object], field: str) -> np.ndarray:
-    return np.concatenate([getattr(part, field) for part in parts])
+def _together[T: (Locations, Validation)](parts: Sequence[T]) -> T:
+    """Blocks of points as one: arrays follow each other, all else is the same in every block."""
+
+    def joined(values: list[Any]) -> Any:
+        if isinstance(values[0], Validation):
+            return _together(values)
+        return np.concatenate(values) if isinstance(values[0], np.ndarray) else values[0]
+
+    names = [field.name for field in fields(parts[0])]
+    return replace(parts[0], **{name: joined([getattr(part, name) for part in parts]) for name in names})
 
 
-@dataclass(frozen=True)
-class _Block:
-    """Some of the points; fields as in `Locations`."""
-
-    xyz_mm: np.ndarray
-    covariance_mm2: np.ndarray
-    interval95_mm: np.ndarray
-    u95_mm: np.ndarray
-    diverging_share: np.ndarray
-    linear_xyz_mm: np.ndarray
-    linear_covariance_mm2: np.ndarray
-    validation: Validation
-
-
-def _statistics(carried: Carried, law: Linear, given: Sources) -> _Block:
-    """Moments, intervals and validation of one block of points."""
+def _statistics(carried: Carried, law: Linear, given: Sources, estimator: str) -> Locations:
+    """Moments, intervals and validation of one block of points; none of them is refused by name yet."""
     meets, xyz = np.asarray(carried.meets), np.array(carried.xyz_mm)
     value, law_covariance = np.asarray(law.value), np.asarray(law.covariance)
     lost = (~meets).mean(axis=0)
@@ -249,7 +220,7 @@ def _statistics(carried: Carried, law: Linear, given: Sources) -> _Block:
     draws = np.ascontiguousarray(xyz.transpose(0, 2, 1))
     interval = symmetric_interval(draws)
     empty = np.where(lost <= DIVERGING_SHARE, 0.0, np.nan)
-    return _Block(
+    return Locations(
         xyz_mm=mean.T + empty[:, None],
         covariance_mm2=covariance + empty[:, None, None],
         interval95_mm=interval.transpose(1, 0, 2) + empty[:, None, None],
@@ -258,4 +229,7 @@ def _statistics(carried: Carried, law: Linear, given: Sources) -> _Block:
         linear_xyz_mm=value + empty[:, None],
         linear_covariance_mm2=law_covariance + empty[:, None, None],
         validation=validate(draws, linearised, value, u),
+        refused=(),
+        estimator=estimator,
+        draws=count,
     )

@@ -113,8 +113,8 @@ def fit(
 ) -> JointFit:
     """Fit the joint model to every usable spot (formulation 4).
 
-    The first call in a process compiles the model, half a minute; `tvsbayes.information.summarise(fit(campaign))` is
-    the table that the command prints.
+    The first call in a process compiles the model, half a minute; what the command prints is
+    `assessment.summary.summarise(fit(campaign))`.
 
     Args:
         campaign: from `read_campaign`.

@@ -10,7 +10,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from tvsbayes.estimators.four_point import ClassicResult
-from tvsbayes.instrument.axes import DIRECTIONS
+from tvsbayes.instrument.axes import DIRECTIONS, SENSES
 from tvsbayes.metrology.look_budget import Budget
 from tvsbayes.report.tables import TableView, concise, interval_text, signed
 from tvsbayes.results.comparison_record import Gap, GapTerm, HoldOut
@@ -21,16 +21,9 @@ KEY_PARAMETERS = (
     ("backlash_deg.tilt", "backlash tilt", "deg"),
     ("effective_mirror_offset_mm", "mirror offset (effective)", "mm"),
     ("mirror_offset_mm", "mirror offset L", "mm"),
-    ("extrinsics.rotation_rad.x", "extrinsics rotation x", "rad"),
-    ("extrinsics.rotation_rad.y", "extrinsics rotation y", "rad"),
-    ("extrinsics.rotation_rad.z", "extrinsics rotation z", "rad"),
-    ("extrinsics.translation_mm.x", "extrinsics translation x", "mm"),
-    ("extrinsics.translation_mm.y", "extrinsics translation y", "mm"),
-    ("extrinsics.translation_mm.z", "extrinsics translation z", "mm"),
-    ("stop_sd_deg.left", "stop sd left", "deg"),
-    ("stop_sd_deg.right", "stop sd right", "deg"),
-    ("stop_sd_deg.up", "stop sd up", "deg"),
-    ("stop_sd_deg.down", "stop sd down", "deg"),
+    *((f"extrinsics.rotation_rad.{axis}", f"extrinsics rotation {axis}", "rad") for axis in "xyz"),
+    *((f"extrinsics.translation_mm.{axis}", f"extrinsics translation {axis}", "mm") for axis in "xyz"),
+    *((f"stop_sd_deg.{direction}", f"stop sd {direction}", "deg") for direction in DIRECTIONS),
     ("pixel_scale", "pixel noise / stated", ""),
 )
 SHARE_SHOWN = 5e-4
@@ -67,9 +60,9 @@ def headline_table(summary: FitSummary) -> TableView:
     """Ratios, contrasts and key parameters of the joint estimator."""
     pose = summary.reference_pose_deg
     rows = [estimate_row(f"effective {d}", summary.effective[d], "deg/step") for d in DIRECTIONS]
-    for axis, label in (("pan", "left - right"), ("tilt", "up - down")):
+    for axis, pair in SENSES.items():
         if summary.contrasts[axis] is not None:
-            rows.append(estimate_row(label, summary.contrasts[axis], "deg/step"))
+            rows.append(estimate_row(" - ".join(pair), summary.contrasts[axis], "deg/step"))
     rows += [estimate_row(label, summary.parameters[name], unit) for name, label, unit in KEY_PARAMETERS]
     kind = {"laplace": "Laplace", "posterior": "posterior"}[summary.estimator]
     title = f"joint estimator ({kind}) at pan {pose['pan']:.2f} deg, tilt {pose['tilt']:.2f} deg"
