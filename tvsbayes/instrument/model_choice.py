@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 from tvsbayes.errors import InputError
 from tvsbayes.instrument.parameters import HARMONIC_NAMES, REGISTRY, Prior, names_of
-from tvsbayes.instrument.rig import RigTable
+
+if TYPE_CHECKING:
+    from tvsbayes.instrument.rig import RigTable
 
 HARMONIC_SD_DEG = 0.1
 """Prior standard deviation of every part of a freed transmission error."""
