@@ -1,7 +1,7 @@
 """Headlines of a fit against the truth: PIT, z and contraction, and what a table says of them.
 
 PIT: share of the draws below the truth. Contraction: 1 - posterior variance / prior variance. Bounds are two-sided at
-`tvsbayes.statistics.intervals.BOUND`.
+`tvsbayes.statistics.chances.BOUND`.
 """
 
 from __future__ import annotations

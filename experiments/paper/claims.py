@@ -3,7 +3,7 @@
     python -m experiments.paper.claims > experiments/paper/claims.md       # two minutes
 
 Claim 1 is read from laplace_coverage.md (300 rigs per protocol); the rest is computed here:
-2 by the classic chain on exact points, 3 by `tvsbayes.classic` with another focal scale on the shipped paper twin, 4
+2 by the classic chain on exact points, 3 by `tvsbayes classic` with another focal scale on the shipped paper twin, 4
 from Table 1 and the twin without stop errors, 5 from the expected information of 96 experiments on the mounted rig
 (`tvsbayes plan`) and from a fit of the twin. "Separation from backlash" is the part of the variance that would go if
 both backlashes were known.

@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 import json
-import os
-import threading
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from support.bench_runs import small_plan
+from support.pseudo_terminal import needs_pseudo_terminals, served
 
 from tvsbayes.acquisition.bench import Vision
 from tvsbayes.acquisition.journal import read_journal
 from tvsbayes.acquisition.journal_check import verify
-from tvsbayes.acquisition.observation import Detection, live_detector, twin_renderer
+from tvsbayes.acquisition.observation import Sighting, live_detector, twin_renderer
 from tvsbayes.acquisition.operator import Terminal
 from tvsbayes.acquisition.session import acquire
 from tvsbayes.acquisition.simulated_instrument import Instrument
@@ -33,15 +32,15 @@ def blob(shape, u, v, peak):
     return np.repeat(np.clip(20 + spot, 0, 255)[..., None], 3, axis=2)
 
 
-def centroids(lit: StereoImage, dark: StereoImage) -> Detection:
+def centroids(lit: StereoImage, dark: StereoImage) -> Sighting:
     pixels = []
     for side in ("left", "right"):
         light = np.clip(getattr(lit, side).astype(float) - getattr(dark, side), 12, None).mean(axis=2) - 12
         if light.max() < 50:
-            return Detection("no-spot")
+            return Sighting("no-spot")
         y, x = np.mgrid[: light.shape[0], : light.shape[1]]
         pixels += [float((light * x).sum() / light.sum()), float((light * y).sum() / light.sum())]
-    return Detection("ok", tuple(pixels), (0.1,) * 4)
+    return Sighting("ok", tuple(pixels), (0.1,) * 4)
 
 
 def centroids_of_the_twin(mounted_rig, truth: dict, move: int) -> np.ndarray:
@@ -110,7 +109,7 @@ def test_rendered_pictures_are_detected_while_the_plan_runs(small_rig, tmp_path)
         assert np.all(np.abs(centroids_of_the_twin(small_rig, truth, spot.move) - pixels) < 5 * sds)
 
 
-@pytest.mark.skipif(not hasattr(os, "openpty"), reason="pseudo-terminals exist on POSIX only")
+@needs_pseudo_terminals
 def test_hardware_path_from_rig_file_to_campaign(small_rig, tmp_path):
     """Pyserial on a pseudo-terminal, OpenCV on a stream, questions on a terminal: all as on the bench."""
     size = (small_rig.stereo.image_height, small_rig.stereo.image_width)
@@ -133,24 +132,6 @@ def test_hardware_path_from_rig_file_to_campaign(small_rig, tmp_path):
             pair.append(picture)
         return StereoImage(*pair)
 
-    master, slave = os.openpty()
-    lines: list[bytes] = []
-    instrument.device.listener = lines.append
-
-    def serve():
-        while True:
-            try:
-                data = os.read(master, 4096)
-            except OSError:
-                return
-            # Every request finds the device 1 s later: motions end without anybody waiting.
-            instrument.clock.now_us += 1_000_000
-            instrument.device.model.advance(instrument.clock.now_us)
-            instrument.device.model.receive(data, instrument.clock.now_us)
-            while lines:
-                os.write(master, lines.pop(0))
-
-    threading.Thread(target=serve, daemon=True).start()
     asked = []
 
     def ask(question):
@@ -160,8 +141,8 @@ def test_hardware_path_from_rig_file_to_campaign(small_rig, tmp_path):
 
     plan = [PlanStep(0, "home", 0, 0), PlanStep(1, "place", target="d1"), PlanStep(2, "look")]
     plan += [PlanStep(3, "move", 60, 10), PlanStep(4, "look"), PlanStep(5, "place", target="d2"), PlanStep(6, "look")]
-    with VirtualCamera(render, frames_per_s=30) as virtual:
-        table = {"driver": "serial", "port": os.ttyname(slave), "settle_s": 0.0}
+    with VirtualCamera(render, frames_per_s=30) as virtual, served(instrument.device, 1_000_000) as port:
+        table = {"driver": "serial", "port": port, "settle_s": 0.0}
         real = replace(small_rig, positioner=table, cameras={"source": virtual.address, "spot_sd_px": 0.08})
         said = []
         outcome = acquire(
@@ -172,8 +153,6 @@ def test_hardware_path_from_rig_file_to_campaign(small_rig, tmp_path):
             vision=Vision(centroids),
             terminal=Terminal(said.append, ask=ask),
         )
-    os.close(slave)
-    os.close(master)
     assert (outcome.reason, outcome.ok, len(asked)) == ("done", 3, 2), said
     assert any("808 nm is invisible" in line for line in said)
     assert not instrument.mechanics.laser_on and lit_in_motion and not any(lit_in_motion)

@@ -20,12 +20,6 @@ from tvsbayes.acquisition.journal_check import verify
 from tvsbayes.errors import DeviceFault, InputError
 
 
-@pytest.fixture
-def folder(tmp_path) -> Path:
-    write_looks(tmp_path / "run", 3)
-    return tmp_path / "run"
-
-
 def test_what_is_written_is_read_back(folder):
     reading = read_journal(folder)
     assert [r.event for r in reading.records] == ["created", *["intent", "looked"] * 3, "stop"]

@@ -2,20 +2,11 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import pytest
-from support.journals import write_looks
 
 from tvsbayes.acquisition.journal import LOG, read_journal
 from tvsbayes.acquisition.journal_check import repair, verify
 from tvsbayes.errors import InputError
-
-
-@pytest.fixture
-def folder(tmp_path) -> Path:
-    write_looks(tmp_path / "run", 3)
-    return tmp_path / "run"
 
 
 def test_frames_swapped_stale_missing_or_grown_are_found(folder):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tvsbayes.acquisition.engine import ATTEMPTS_PER_LOOK
-from tvsbayes.acquisition.observation import CameraObserver, Detection, live_detector, twin_renderer
+from tvsbayes.acquisition.observation import CameraObserver, Sighting, live_detector, twin_renderer
 from tvsbayes.acquisition.simulated_instrument import Instrument
 from tvsbayes.cameras.capture import StereoImage
 from tvsbayes.errors import DeviceFault
@@ -62,7 +62,7 @@ def test_pictures_without_a_visible_spot_wait_for_detection(mounted_rig):
     positioner.home()
     camera = Scripted(instrument.clock, lambda n: n % 30)
     found = CameraObserver(camera).observe(positioner, 3)
-    assert found.detection.status == "undetected" and camera.count == 22
+    assert found.sighting.status == "undetected" and camera.count == 22
     assert sorted(found.pictures)[0] == "dark/000003_left.png" and len(found.pictures) == 4
 
 
@@ -71,7 +71,7 @@ def test_changed_background_is_refused(mounted_rig):
     positioner = instrument.positioner()
     positioner.home()
     camera = Scripted(instrument.clock, lambda n: 90 if n == 1 else n % 30)
-    assert CameraObserver(camera).observe(positioner, 3).detection.status == "unsteady"
+    assert CameraObserver(camera).observe(positioner, 3).sighting.status == "unsteady"
 
 
 @pytest.mark.parametrize("depth", range(0, 12))
@@ -100,7 +100,7 @@ def test_old_frames_never_become_a_spot_whatever_the_buffer(mounted_rig, depth):
     def detector(lit, dark):
         light = lit.left[1].astype(int).sum(axis=1) - dark.left[1].astype(int).sum(axis=1)
         u = float(light.argmax())
-        return Detection("ok", (u,) * 4, (0.1,) * 4) if light.max() > 300 else Detection("no-spot")
+        return Sighting("ok", (u,) * 4, (0.1,) * 4) if light.max() > 300 else Sighting("no-spot")
 
     observer, found = CameraObserver(Camera(), detector, keep_pictures=False), []
     for step in range(12):
@@ -108,7 +108,7 @@ def test_old_frames_never_become_a_spot_whatever_the_buffer(mounted_rig, depth):
         # The spot is where the positioner is.
         moved_to[0] = 3 * step
         for _ in range(ATTEMPTS_PER_LOOK):
-            seen = observer.observe(positioner, step).detection
+            seen = observer.observe(positioner, step).sighting
             if seen.status == "ok":
                 found.append(seen.pixels_px[0])
                 assert seen.pixels_px[0] == 3 * step

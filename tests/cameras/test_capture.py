@@ -1,18 +1,15 @@
-"""Cameras: no frame older than the request, settings read back, the MJPEG path over the loopback."""
+"""Cameras: no frame older than the request, settings read back."""
 
 from __future__ import annotations
 
-import itertools
 import os
-import socket
 
 import cv2
 import numpy as np
 import pytest
 
 from tvsbayes.acquisition.simulated_instrument import VirtualClock
-from tvsbayes.cameras.capture import OpenCVCamera, StereoImage, open_cameras, open_capture
-from tvsbayes.cameras.virtual_camera import VirtualCamera
+from tvsbayes.cameras.capture import OpenCVCamera, open_cameras, open_capture
 from tvsbayes.errors import DeviceFault, InputError
 
 WIDTH, HEIGHT = 64, 48
@@ -141,18 +138,6 @@ def test_automatic_exposure_is_off_on_every_backend(backend, manual):
     assert capture.properties[cv2.CAP_PROP_AUTO_EXPOSURE] == manual
 
 
-def test_viewer_that_says_nothing_does_not_hold_the_virtual_camera(monkeypatch):
-    monkeypatch.setattr("tvsbayes.cameras.virtual_camera.VIEWER_TIMEOUT_S", 0.2)
-    with VirtualCamera(lambda: None) as virtual:
-        host, port = virtual.address.split("/")[2].split(":")
-        silent = socket.create_connection((host, int(port)))
-        # Connections are accepted in order: an answer to the second means that the first is being served.
-        with socket.create_connection((host, int(port))) as other:
-            other.sendall(b"GET /nothing HTTP/1.0\r\n\r\n")
-            assert b"404" in other.recv(100)
-    silent.close()
-
-
 def test_what_cannot_be_fixed_is_said():
     clock = VirtualClock()
     camera = OpenCVCamera([FakeCapture(clock, obeys=False)], WIDTH, HEIGHT, clock=clock)
@@ -213,47 +198,3 @@ def test_opencv_is_silent_only_while_cameras_are_opened(monkeypatch, wanted):
         open_cameras({"source": 0}, WIDTH, HEIGHT, absent)
     assert levels == [(logging.LOG_LEVEL_SILENT, "-8") if wanted is None else (before, wanted)]
     assert logging.getLogLevel() == before and [os.environ.get(name) for name in names] == [wanted] * 2
-
-
-def test_virtual_camera_without_a_port_leaves_the_environment_alone(monkeypatch):
-    monkeypatch.setenv("no_proxy", "example.org")
-
-    def no_port(*_):
-        raise OSError("no port is free")
-
-    monkeypatch.setattr("tvsbayes.cameras.virtual_camera.ThreadingHTTPServer", no_port)
-    with pytest.raises(OSError, match="no port"), VirtualCamera(lambda: None):
-        pass
-    assert os.environ["no_proxy"] == "example.org"
-
-
-def test_stream_over_http_from_rendering_to_pictures(monkeypatch):
-    """Every frame carries its number as grey level on both sides; a grab never returns one rendered before it.
-
-    Whatever proxy the environment names: FFmpeg would ask it for this computer's own address.
-    """
-    monkeypatch.setenv("http_proxy", "http://proxy.invalid:3128")
-    monkeypatch.delenv("no_proxy", raising=False)
-    numbers, rendered = itertools.count(1), []
-
-    def render():
-        number = next(numbers)
-        rendered.append(number)
-        pair = [np.full((HEIGHT, WIDTH, 3), 3 * (number % 80) + offset, np.uint8) for offset in (0, 10)]
-        return StereoImage(*pair)
-
-    with VirtualCamera(render, frames_per_s=40) as virtual:
-        camera = open_cameras({"source": virtual.address}, WIDTH, HEIGHT)
-        for _ in range(3):
-            before = rendered[-1]
-            image = camera.grab()
-            left, right = image.left.mean(), image.right.mean()
-            # Grey levels survive a JPEG of quality 97 within one.
-            assert right - left == pytest.approx(10, abs=1)
-            number = round(left / 3)
-            assert (number - before) % 80 >= 1 and (number - before) % 80 < 40
-            assert image.left.std() < 1
-        camera.close()
-    assert "no_proxy" not in os.environ
-    with pytest.raises(DeviceFault):
-        open_capture("http://127.0.0.1:9/stereo.mjpg")

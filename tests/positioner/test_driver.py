@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-import os
 import re
-import threading
 from dataclasses import replace
 
 import pytest
 
 from tvsbayes.acquisition.simulated_instrument import ModelLink, SimulatedDevice, VirtualClock
 from tvsbayes.errors import DeviceFault
-from tvsbayes.positioner.driver import PositionLost, SerialPositioner, device_settings
+from tvsbayes.positioner.driver import PositionLost, SerialPositioner
 from tvsbayes.positioner.firmware_model import DeviceModel, Mechanics
 from tvsbayes.positioner.protocol import frame, parse_answer, request
-from tvsbayes.positioner.serial_port import serial_opener
 
 SETTINGS = {"hp": -60, "ht": -40, "pmin": -300, "pmax": 300, "wd": 2000}
 LIMITS = {"hp": -60, "ht": -40, "pmin": -300, "pmax": 200, "tmin": -150, "tmax": 100}
@@ -164,17 +161,6 @@ def test_an_identity_without_a_sequence_is_refused(last):
     assert caught.value.code == "firmware"
 
 
-def test_a_ports_name_is_never_taken_as_an_address(tmp_path):
-    """With pyserial spy:// would write a file, alt:// call another class; other names end in its ValueError."""
-    pytest.importorskip("serial")
-    victim = tmp_path / "victim.txt"
-    for port in (f"spy:///dev/ptmx?file={victim}", "loop://?x=1", "alt://x?class=nope", "a\0b"):
-        with pytest.raises(DeviceFault) as caught:
-            SerialPositioner(serial_opener(port, 115_200), {}, VirtualClock())
-        assert caught.value.code == "port"
-    assert not victim.exists()
-
-
 def test_port_that_cannot_be_opened():
     def gone():
         raise OSError(2, "No such file or directory")
@@ -251,45 +237,6 @@ def test_another_program_meanwhile_is_noticed():
     with pytest.raises(PositionLost) as caught:
         positioner.state()
     assert caught.value.code == "foreign"
-
-
-def test_settings_of_a_rig_file():
-    table = {"driver": "serial", "pan_min_steps": -400, "tilt_max_steps": 10, "speed_steps_per_s": 1e6}
-    assert device_settings(table) == {"pmin": -400, "tmax": 10, "vmax": 20_000}
-
-
-@pytest.mark.skipif(not hasattr(os, "openpty"), reason="pseudo-terminals exist on POSIX only")
-def test_pyserial_on_a_pseudo_terminal():
-    """The same session over a real file descriptor and pyserial; the device's time runs with its bytes."""
-    master, slave = os.openpty()
-    lines: list[bytes] = []
-    device = simulated()
-    device.listener = lines.append
-
-    def serve():
-        # Every request finds the device 2 s later: motions end without anybody waiting.
-        while True:
-            try:
-                data = os.read(master, 4096)
-            except OSError:
-                return
-            device.clock.now_us += 2_000_000
-            device.model.advance(device.clock.now_us)
-            device.model.receive(data, device.clock.now_us)
-            while lines:
-                os.write(master, lines.pop(0))
-
-    thread = threading.Thread(target=serve, daemon=True)
-    thread.start()
-    settings = {**SETTINGS, "wd": 10_000}
-    positioner = SerialPositioner(serial_opener(os.ttyname(slave), 115200), settings)
-    positioner.home()
-    assert positioner.laser(True).laser_on
-    assert positioner.move_to(30, 12).pan_steps == 30
-    positioner.close()
-    assert device.mechanics.true_steps == [30, 12] and not device.mechanics.laser_on
-    os.close(slave)
-    os.close(master)
 
 
 def test_state_reads_as_the_model_says():

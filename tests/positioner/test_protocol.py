@@ -1,4 +1,4 @@
-"""Frames, CRC, requests and replies: published values, what is no message."""
+"""Frames, CRC, requests and replies: published values, what is no message; settings of a rig file."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from tvsbayes.positioner.protocol import (
     FrameError,
     Reply,
     crc16,
+    device_settings,
     frame,
     parse_answer,
     request,
@@ -74,3 +75,8 @@ def test_replies_that_are_not_of_the_protocol_are_refused(body):
 def test_unknown_fields_are_kept_apart():
     reply = parse_answer(frame("<1 ok b=1 st=idle p=0,0 t=0,0 d=0 l=0 h=0,0 e=none fw=1.0.0 zz=9")[:-1])
     assert isinstance(reply, Reply) and reply.extra == {"fw": "1.0.0", "zz": "9"}
+
+
+def test_settings_of_a_rig_file():
+    table = {"driver": "serial", "pan_min_steps": -400, "tilt_max_steps": 10, "speed_steps_per_s": 1e6}
+    assert device_settings(table) == {"pmin": -400, "tmax": 10, "vmax": 20_000}

@@ -1,6 +1,6 @@
 """A bent rig known to a normal distribution, and where its beam meets a reading by the twin's optics alone.
 
-mm, degrees as named. No fit, no JAX: `tvsbayes.simulation` is the outside reference of three test modules.
+mm, degrees as named. No fit, no JAX: the twin is the outside reference of three test modules.
 """
 
 from __future__ import annotations

@@ -200,7 +200,7 @@ class Acquisition:
             remedy = "check the sheet and [sheets] of the rig file, then go on with --resume"
             raise DeviceFault("placement", f"the sheet is not where it should be: {wrong}; {remedy}", remedy=remedy)
         frames = [self.journal.store(name, data).as_json() for name, data in observation.pictures.items()]
-        found = observation.detection
+        found = observation.sighting
         more = {} if reference is None else self._compared(reference, found.pixels_px)
         self._log.write(
             "looked",
@@ -233,14 +233,14 @@ class Acquisition:
         for attempt in range(ATTEMPTS_PER_LOOK):
             self._retries += attempt > 0
             observation = self.bench.observer.observe(self.bench.positioner, self._spot)
-            if observation.detection.status in ("ok", "undetected") or self._stop.requested:
+            if observation.sighting.status in ("ok", "undetected") or self._stop.requested:
                 break
         return observation
 
     def _misplaced(self, observation: Observation) -> str | None:
         """Why the sheet seems to stand elsewhere, judged by the first spot after it was placed."""
-        pixels = observation.detection.pixels_px
-        if not self._check_depth or observation.detection.status != "ok" or pixels is None:
+        pixels = observation.sighting.pixels_px
+        if not self._check_depth or observation.sighting.status != "ok" or pixels is None:
             return None
         depth = float(triangulate(self.rig.stereo, np.array([pixels]))[0, 0])
         nominal = self.rig.sheets_mm[self._log.recorder.state.target]

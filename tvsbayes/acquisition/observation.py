@@ -42,7 +42,7 @@ UNDETECTED = "undetected"
 
 
 @dataclass(frozen=True)
-class Detection:
+class Sighting:
     """What was found in a pair of pictures.
 
     Attributes:
@@ -60,16 +60,16 @@ class Detection:
 
 @dataclass(frozen=True)
 class Observation:
-    """A detection and the pictures behind it, PNG by name relative to the campaign's folder."""
+    """A sighting and the pictures behind it, PNG by name relative to the campaign's folder."""
 
-    detection: Detection
+    sighting: Sighting
     pictures: dict[str, bytes] = field(default_factory=dict)
 
 
 class Detector(Protocol):
     """Finds the spot in a pair of pictures."""
 
-    def __call__(self, lit: StereoImage, dark: StereoImage) -> Detection:
+    def __call__(self, lit: StereoImage, dark: StereoImage) -> Sighting:
         """`lit` with the laser on, `dark` just before without it."""
 
 
@@ -80,9 +80,9 @@ class Observer(Protocol):
         """Look number `spot`; the laser is off before and after."""
 
 
-def wait_for_detection(lit: StereoImage, dark: StereoImage) -> Detection:
+def wait_for_detection(lit: StereoImage, dark: StereoImage) -> Sighting:
     """The detector of those who detect later: every look is `undetected`."""
-    return Detection(UNDETECTED)
+    return Sighting(UNDETECTED)
 
 
 @dataclass
@@ -124,7 +124,7 @@ class CameraObserver:
                 for camera in CAMERAS
             }
         unsteady = max(rises_dn(lit, dark)) > CHANGE_DN
-        return Observation(Detection(UNSTEADY) if unsteady else self.detector(lit, dark), pictures)
+        return Observation(Sighting(UNSTEADY) if unsteady else self.detector(lit, dark), pictures)
 
     def _lit(self, positioner: Positioner, dark: StereoImage) -> tuple[StereoImage, bool]:
         """A picture exposed with the laser on, and whether the laser was on to its end."""
@@ -180,9 +180,9 @@ class TwinObserver:
         finally:
             positioner.laser(False)
         if not np.isfinite(pixels).all():
-            return Observation(Detection("no-spot"))
+            return Observation(Sighting("no-spot"))
         u_left, v_left, u_right, v_right = map(float, pixels)
-        return Observation(Detection("ok", (u_left, v_left, u_right, v_right), (self.sd_px,) * 4))
+        return Observation(Sighting("ok", (u_left, v_left, u_right, v_right), (self.sd_px,) * 4))
 
 
 def live_detector(stereo: Stereo) -> Detector:
@@ -194,21 +194,21 @@ def live_detector(stereo: Stereo) -> Detector:
         stereo: the calibration, for the epipolar check.
     """
 
-    def found(lit: StereoImage, dark: StereoImage) -> Detection:
+    def found(lit: StereoImage, dark: StereoImage) -> Sighting:
         left, right = find_spot(lit.left), find_spot(lit.right)
         status = pair_status(left, right)
         if status != "ok":
-            return Detection(status)
+            return Sighting(status)
         pixels = np.concatenate([left.centre_px, right.centre_px])
         covariance = np.zeros((4, 4))
         covariance[:2, :2], covariance[2:, 2:] = left.covariance_px2, right.covariance_px2
         if epipolar_refused(pixels[None], covariance[None], stereo)[0]:
-            return Detection("epipolar")
+            return Sighting("epipolar")
         sds = np.sqrt(np.diag(covariance))
         correlations = covariance[0, 1] / (sds[0] * sds[1]), covariance[2, 3] / (sds[2] * sds[3])
         u, v, x, y = pixels.tolist()
         su, sv, sx, sy = sds.tolist()
-        return Detection("ok", (u, v, x, y), (su, sv, sx, sy), (float(correlations[0]), float(correlations[1])))
+        return Sighting("ok", (u, v, x, y), (su, sv, sx, sy), (float(correlations[0]), float(correlations[1])))
 
     return found
 

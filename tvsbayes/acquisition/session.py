@@ -26,8 +26,7 @@ from tvsbayes.instrument.plan import PlanStep, run_plan
 from tvsbayes.instrument.rig import Rig, rig_table_toml
 from tvsbayes.instrument.stereo_pair import stereo_bytes
 from tvsbayes.instrument.stops import legs_of
-from tvsbayes.positioner.driver import LIMITS
-from tvsbayes.positioner.protocol import SETTINGS
+from tvsbayes.positioner.protocol import LIMIT_SETTINGS, SETTINGS
 
 
 def acquire(
@@ -108,9 +107,7 @@ def check_plan(rig: Rig, plan: Sequence[PlanStep]) -> None:
     Raises:
         InputError: targets without a sheet position, counters outside the limits.
     """
-    firmware: dict[str, tuple[int, int]] = {
-        axis: (SETTINGS[LIMITS[low]][2], SETTINGS[LIMITS[high]][2]) for axis, (low, high) in LIMIT_KEYS.items()
-    }
+    firmware = {axis: (SETTINGS[low][2], SETTINGS[high][2]) for axis, (low, high) in LIMIT_SETTINGS.items()}
     limits = rig.limits.within(firmware)
     for step in plan:
         if step.action == "place" and step.target not in rig.sheets_mm:

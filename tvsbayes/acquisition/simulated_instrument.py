@@ -22,9 +22,9 @@ from tvsbayes.acquisition.journal_events import TrueAngles
 from tvsbayes.cameras.capture import StereoImage
 from tvsbayes.instrument.axes import AXES, FULL_TURN_DEG, HOME_SD_DEG, SIDES
 from tvsbayes.instrument.rig import Rig
-from tvsbayes.positioner.driver import SerialPositioner, device_settings
+from tvsbayes.positioner.driver import SerialPositioner
 from tvsbayes.positioner.firmware_model import DeviceModel, Mechanics
-from tvsbayes.positioner.protocol import SETTINGS
+from tvsbayes.positioner.protocol import SETTINGS, device_settings
 from tvsbayes.twin.physics import Light, Sheet, harmonics_deg, light_on_sheet, project, take_up, wobble_deg
 from tvsbayes.twin.simulated_campaign import Truth, draw_truth, placed_sheet
 

@@ -47,8 +47,6 @@ POLL_S = 0.05
 """Time between two looks at a motion; far below the laser watchdog of the device."""
 HOME_S = 300.0
 """Longest homing: 20 000 steps per axis at 200 steps/s are 200 s."""
-LIMITS = {"pan_min_steps": "pmin", "pan_max_steps": "pmax", "tilt_min_steps": "tmin", "tilt_max_steps": "tmax"}
-"""Soft limits: names in `[positioner]` of a rig file, and those of the protocol."""
 RECONNECT_S = 10.0
 """How long an unplugged device may stay away."""
 SEE_DOCTOR = "; see `tvsbayes doctor`"
@@ -435,12 +433,3 @@ def _reason(error: OSError) -> str:
 
 def _fault(code: str, found: str, remedy: str) -> DeviceFault:
     return DeviceFault(code, f"positioner: {found}; {remedy}", found=found, remedy=remedy)
-
-
-def device_settings(positioner: Mapping[str, str | int | float]) -> dict[str, int]:
-    """Device settings that `[positioner]` of a rig file states: limits and top speed."""
-    settings = {short: int(positioner[name]) for name, short in LIMITS.items() if name in positioner}
-    if "speed_steps_per_s" in positioner:
-        low, high, _ = SETTINGS["vmax"]
-        settings["vmax"] = min(max(round(float(positioner["speed_steps_per_s"])), low), high)
-    return settings

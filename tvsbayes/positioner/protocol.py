@@ -22,8 +22,11 @@ from __future__ import annotations
 
 import binascii
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Literal, cast
+
+from tvsbayes.instrument.counter_limits import CounterLimits
 
 VERSION = 1
 """Version of this protocol; a device with another one is refused."""
@@ -50,6 +53,8 @@ SETTINGS: dict[str, tuple[int, int, int]] = {
 }
 """Lowest, highest and boot value by name: top speed (steps/s), acceleration (steps/s^2), soft limits of pan and tilt
 (steps), counters at the home switches (steps), laser watchdog (ms)."""
+LIMIT_SETTINGS = {"pan": ("pmin", "pmax"), "tilt": ("tmin", "tmax")}
+"""Soft limits of an axis, lowest first, by their names in the protocol."""
 _INTEGER = re.compile(r"0|-?[1-9][0-9]{0,9}")
 _UNSIGNED = re.compile(r"0|[1-9][0-9]{0,9}")
 _FRAME = re.compile(rb"([><!][ -)+-~]*)\*([0-9A-F]{4})")
@@ -221,3 +226,18 @@ def _state(fields: dict[str, str]) -> DeviceState:
         *_pair(fields["h"]),
         fields["e"],
     )
+
+
+def device_settings(positioner: Mapping[str, str | int | float]) -> dict[str, int]:
+    """Device settings that `[positioner]` of a rig file states: limits and top speed."""
+    stated = CounterLimits.of(positioner).steps
+    settings = {
+        key: limit
+        for axis, keys in LIMIT_SETTINGS.items()
+        for key, limit in zip(keys, stated[axis], strict=True)
+        if limit is not None
+    }
+    if "speed_steps_per_s" in positioner:
+        low, high, _ = SETTINGS["vmax"]
+        settings["vmax"] = min(max(round(float(positioner["speed_steps_per_s"])), low), high)
+    return settings

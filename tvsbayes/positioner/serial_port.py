@@ -10,7 +10,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 from tvsbayes.errors import InputError
-from tvsbayes.positioner.driver import Link, SerialPositioner, device_settings
+from tvsbayes.positioner.driver import Link, SerialPositioner
+from tvsbayes.positioner.protocol import device_settings
 
 BAUD = 115_200
 """Of a rig file that states none; a USB device ignores it."""

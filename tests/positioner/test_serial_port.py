@@ -1,0 +1,38 @@
+"""Serial ports: opened by name alone, and the driver over a real file descriptor."""
+
+from __future__ import annotations
+
+import pytest
+from support.pseudo_terminal import needs_pseudo_terminals, served
+
+from tvsbayes.acquisition.simulated_instrument import SimulatedDevice, VirtualClock
+from tvsbayes.errors import DeviceFault
+from tvsbayes.positioner.driver import SerialPositioner
+from tvsbayes.positioner.firmware_model import Mechanics
+from tvsbayes.positioner.serial_port import serial_opener
+
+SETTINGS = {"hp": -60, "ht": -40, "pmin": -300, "pmax": 300, "wd": 10_000}
+
+
+def test_a_ports_name_is_never_taken_as_an_address(tmp_path):
+    """With pyserial spy:// would write a file, alt:// call another class; other names end in its ValueError."""
+    pytest.importorskip("serial")
+    victim = tmp_path / "victim.txt"
+    for port in (f"spy:///dev/ptmx?file={victim}", "loop://?x=1", "alt://x?class=nope", "a\0b"):
+        with pytest.raises(DeviceFault) as caught:
+            SerialPositioner(serial_opener(port, 115_200), {}, VirtualClock())
+        assert caught.value.code == "port"
+    assert not victim.exists()
+
+
+@needs_pseudo_terminals
+def test_pyserial_on_a_pseudo_terminal():
+    """A session from connection to close; the device's time runs with its bytes."""
+    device = SimulatedDevice(VirtualClock(), Mechanics(home_steps=(-60, -40), limit_steps=900))
+    with served(device, 2_000_000) as port:
+        positioner = SerialPositioner(serial_opener(port, 115_200), SETTINGS)
+        positioner.home()
+        assert positioner.laser(True).laser_on
+        assert positioner.move_to(30, 12).pan_steps == 30
+        positioner.close()
+        assert device.mechanics.true_steps == [30, 12] and not device.mechanics.laser_on
