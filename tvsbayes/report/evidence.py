@@ -88,8 +88,8 @@ class Evidence:
     distances_mm: Mapping[str, np.ndarray]
     range_mm: float
     maps: ErrorMap
-    budget: Budget | None
-    point: BudgetTable | None
+    budget: Budget
+    point: BudgetTable
 
     @property
     def shown(self) -> FitEvidence:

@@ -157,9 +157,9 @@ def _intervals(e: Evidence) -> FigureView:
 
 def _scatters(e: Evidence) -> list[FigureView]:
     """The experiments of every direction that has some."""
-    views = []
     if e.classic is None:
         return []
+    views = []
     for direction, result in e.classic.directions.items():
         if result is None:
             continue

@@ -147,7 +147,7 @@ def demo_text(classic_result: ClassicResult, summary: FitSummary, truth: dict[st
     columns = ["deg/step", "classic, type A", "holds truth", "joint", "holds truth", "truth"]
     ratios = TableView("degrees of beam per motor step, value(u)", columns, rows).text()
     rows = []
-    for name, label, unit in KEY_PARAMETERS[:3]:
+    for name, label, unit in (row for row in KEY_PARAMETERS if row[0] in truth):
         e, true = summary.parameters[name], truth[name]
         rows.append([f"{label}, {unit}", concise(e.value, e.sd), holds(e.interval95, true), f"{true:.4f}"])
     others = TableView("what the classic estimator cannot see", ["", "joint", "holds truth", "truth"], rows).text()

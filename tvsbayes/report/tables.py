@@ -99,7 +99,7 @@ class Section:
     text: Sequence[str] = ()
     items: Sequence[str] = ()
     tables: Sequence[TableView | None] = ()
-    figures: Sequence[FigureView | None] = ()
+    figures: Sequence[FigureView] = ()
 
 
 @dataclass(frozen=True)

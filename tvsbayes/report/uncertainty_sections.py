@@ -25,12 +25,11 @@ ESTIMATORS = {"laplace": "Laplace approximation at the mode", "posterior": "post
 
 def maps_section(e: Evidence) -> Section:
     """Where which estimator errs by how many millimetres."""
-    views = []
-    middle = len(e.maps.pan_steps) // 2, len(e.maps.tilt_steps) // 2
-    rows = []
+    pan, tilt = len(e.maps.pan_steps) // 2, len(e.maps.tilt_steps) // 2
+    at_middle = {name: values[pan, tilt] for name, values in e.maps.rms_mm.items()}
+    rows, views = [], []
     for k, reach in enumerate(e.maps.range_mm):
-        rows.append([f"{reach:g}", *(_cell(e.maps.rms_mm[name][middle][k]) for name in e.maps.rms_mm)])
-    for k, reach in enumerate(e.maps.range_mm):
+        rows.append([f"{reach:g}", *(_cell(values[k]) for values in at_middle.values())])
         views.append(
             figure_view(
                 figures.error_maps(e.maps, k),
@@ -38,29 +37,24 @@ def maps_section(e: Evidence) -> Section:
                 f"3D error at {reach:g} mm, root mean square over the rigs that the data allow.",
             )
         )
-    at = f"pan {e.maps.pan_steps[middle[0]]:.0f}, tilt {e.maps.tilt_steps[middle[1]]:.0f} steps"
+    at = f"pan {e.maps.pan_steps[pan]:.0f}, tilt {e.maps.tilt_steps[tilt]:.0f} steps"
     table = TableView(f"Root mean square 3D error in mm at {at}, by range in mm", ["range", *e.maps.rms_mm], rows)
     text = [
-        (
-            "Nominal and classic users are given a baseline shortened by the mirror offset and "
-            "moved by half of it; noise of one look is included for all."
-        )
+        "Nominal and classic users are given a baseline shortened by the mirror offset and moved by half of it; noise "
+        "of one look is included for all."
     ]
-    at_middle = {name: values[middle] for name, values in e.maps.rms_mm.items()}
-    if "nominal" in at_middle:
-        worse = np.flatnonzero(at_middle["joint"] >= at_middle["nominal"])
-        if len(worse):
-            text.append(_no_better(e, [f"{e.maps.range_mm[k]:g}" for k in worse]))
+    worse = np.flatnonzero(at_middle["joint"] >= at_middle["nominal"])
+    if len(worse):
+        text.append(_no_better(e, [f"{e.maps.range_mm[k]:g}" for k in worse]))
     return Section("Errors in 3D", text, tables=[table], figures=views)
 
 
 def _no_better(e: Evidence, ranges_mm: Sequence[str]) -> str:
     """Why a calibration may place points no better than the nominal rig: what the campaign could not tell."""
     text = f"At {', '.join(ranges_mm)} mm the joint calibration places points no better than the nominal one"
-    if e.budget is not None:
-        largest = int(np.argmax(e.budget.share))
-        text += f": {e.budget.causes[largest]} makes up {100 * e.budget.share[largest]:.0f} % of its variance"
-        text += f" at {e.range_mm:g} mm"
+    largest = int(np.argmax(e.budget.share))
+    text += f": {e.budget.causes[largest]} makes up {100 * e.budget.share[largest]:.0f} % of its variance"
+    text += f" at {e.range_mm:g} mm"
     if not any(spot.aperture_deg is not None for spot in e.campaign.spots):
         text += "; the campaign has no aperture readings, which tell the range of a point"
     return f"{text}."
@@ -72,20 +66,17 @@ def _cell(value: float) -> str:
 
 def budgets_section(e: Evidence) -> Section:
     """What the uncertainty of headlines and of a point consists of."""
-    tables = [_gum_table(table) for table in e.shown.budgets]
-    views = []
-    if e.budget is not None:
-        tables.append(point_budget_table(e.budget, f"Budget of a point {e.range_mm:g} mm away, by cause"))
-        views.append(
-            figure_view(
-                figures.shares(e.budget),
-                "Shares of the variance by cause; values at the bars and in the table above",
-                f"What the uncertainty of a point {e.range_mm:g} mm away consists of.",
-            )
-        )
-    if e.point is not None:
-        tables.append(_gum_table(e.point, f"{e.range_mm:g} mm away: "))
-    return Section("Uncertainty budgets", tables=tables, figures=views)
+    tables = [
+        *(_gum_table(table) for table in e.shown.budgets),
+        point_budget_table(e.budget, f"Budget of a point {e.range_mm:g} mm away, by cause"),
+        _gum_table(e.point, f"{e.range_mm:g} mm away: "),
+    ]
+    view = figure_view(
+        figures.shares(e.budget),
+        "Shares of the variance by cause; values at the bars and in the table above",
+        f"What the uncertainty of a point {e.range_mm:g} mm away consists of.",
+    )
+    return Section("Uncertainty budgets", tables=tables, figures=[view])
 
 
 def _gum_table(table: BudgetTable, prefix: str = "") -> TableView:
@@ -197,19 +188,12 @@ def method_section(e: Evidence) -> Section:
 def limits_section(e: Evidence) -> Section:
     """What no number above can tell."""
     items = [
-        (
-            "The scale of all angles is that of the stereo calibration; an error of its board "
-            "or of the focal length at the laser's wavelength beyond the stated uncertainty is "
-            "in no residual."
-        ),
-        (
-            "Baseline, C0 and aperture zero cannot be seen in spots: without aperture readings "
-            "they are the user's statement."
-        ),
-        (
-            "Results hold for the range of counters and depths that was seen, at the temperature "
-            "of the campaign, moving slowly enough to lose no step."
-        ),
+        "The scale of all angles is that of the stereo calibration; an error of its board or of the focal length at "
+        "the laser's wavelength beyond the stated uncertainty is in no residual.",
+        "Baseline, C0 and aperture zero cannot be seen in spots: without aperture readings they are the user's "
+        "statement.",
+        "Results hold for the range of counters and depths that was seen, at the temperature of the campaign, moving "
+        "slowly enough to lose no step.",
         "Angles are inferred through cameras and model; no angle standard was compared.",
     ]
     return Section("Limitations", items=items)
