@@ -110,14 +110,7 @@ def shown(value: object) -> str:
 
 
 def refusal(
-    code: str,
-    *,
-    file: str,
-    found: str,
-    allowed: str,
-    remedy: str,
-    line: int | None = None,
-    column: str | None = None,
+    code: str, *, file: str, found: str, allowed: str, remedy: str, line: int | None = None, column: str | None = None
 ) -> InputError:
     """Builds the `InputError` whose message says where, what was found, what is allowed and what to do."""
     where = file + (f" line {line}" if line else "") + (f", {escaped(column)}" if column else "")

@@ -31,11 +31,7 @@ def receiver_priors(campaign: Campaign) -> dict[str, tuple[float, float]]:
 
 
 def calibration_of_draws(
-    names: tuple[str, ...],
-    physical: np.ndarray,
-    campaign: Campaign,
-    estimator: str,
-    seed: int,
+    names: tuple[str, ...], physical: np.ndarray, campaign: Campaign, estimator: str, seed: int
 ) -> Calibration:
     """Choose the columns that coordinates depend on.
 

@@ -81,10 +81,7 @@ class _Source:
             return plain
         found = self.posterior.convergence
         return replace(
-            plain,
-            rhat=found.rhat.get(name),
-            ess_bulk=found.ess_bulk.get(name),
-            ess_tail=found.ess_tail.get(name),
+            plain, rhat=found.rhat.get(name), ess_bulk=found.ess_bulk.get(name), ess_tail=found.ess_tail.get(name)
         )
 
 

@@ -160,11 +160,7 @@ class Calibration:
         return Ray(np.array(beam.origin), np.array(beam.direction))
 
     def locate(
-        self,
-        pan_steps: float,
-        tilt_steps: float,
-        aperture_deg: float,
-        approach: tuple[str, str] = ("left", "up"),
+        self, pan_steps: float, tilt_steps: float, aperture_deg: float, approach: tuple[str, str] = ("left", "up")
     ) -> Located:
         """The point that beam and aperture reading agree on, with its covariance by the law of propagation (GUM 5.2).
 

@@ -10,15 +10,7 @@ from typing import Annotated, Any
 
 import typer
 
-from tvsbayes.cli.app import (
-    CampaignFolder,
-    Json,
-    Seed,
-    counting,
-    finish,
-    finite,
-    report_line,
-)
+from tvsbayes.cli.app import CampaignFolder, Json, Seed, counting, finish, finite, report_line
 from tvsbayes.errors import InputError, escaped
 from tvsbayes.files.disk import make_folder, output_place, shipped_data, write_atomically
 from tvsbayes.pipeline import calibrate, compile_for, unusable
@@ -83,10 +75,7 @@ def simulate(
     plan: Annotated[Path, typer.Argument(metavar="PLAN", help="plan.csv.")],
     out: Annotated[Path, typer.Argument(metavar="OUT", help="Campaign folder to write.")],
     aperture: Annotated[bool, typer.Option("--aperture/--no-aperture", help="Looks also read the aperture.")] = False,
-    frames: Annotated[
-        bool,
-        typer.Option("--frames", help="Pictures for `detect` and `stereo`, no centroids."),
-    ] = False,
+    frames: Annotated[bool, typer.Option("--frames", help="Pictures for `detect` and `stereo`, no centroids.")] = False,
     seed: Seed = 0,
     as_json: Json = False,
 ) -> None:

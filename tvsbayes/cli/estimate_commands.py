@@ -14,17 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from tvsbayes.cli.app import (
-    TARGET_MISSED,
-    CampaignFolder,
-    Ended,
-    Json,
-    Seed,
-    finish,
-    keep,
-    refuse_options,
-    report_line,
-)
+from tvsbayes.cli.app import TARGET_MISSED, CampaignFolder, Ended, Json, Seed, finish, keep, refuse_options, report_line
 from tvsbayes.errors import InputError, NothingToEstimate, escaped
 from tvsbayes.files.disk import output_place, write_atomically
 from tvsbayes.pipeline import calibrate, compile_for, fit_for, record_for
@@ -108,8 +98,7 @@ def fit(
 
 
 LimitRatio = Annotated[
-    float | None,
-    typer.Option("--limit-deg-per-step", min=0, help="Largest error allowed of any ratio: for a verdict."),
+    float | None, typer.Option("--limit-deg-per-step", min=0, help="Largest error allowed of any ratio: for a verdict.")
 ]
 Schema = Annotated[
     Path | None, typer.Option("--dcc-schema", help="PTB's dcc.xsd on this machine: validate the XML against it.")

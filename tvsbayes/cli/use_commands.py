@@ -182,8 +182,7 @@ def steps_for(
 
 
 TargetText = Annotated[
-    str | None,
-    typer.Option("--target", help="As 'u(worst) <= 2e-4 deg/step' or 'U95(x) at 1000,0,0 mm <= 60 mm'."),
+    str | None, typer.Option("--target", help="As 'u(worst) <= 2e-4 deg/step' or 'U95(x) at 1000,0,0 mm <= 60 mm'.")
 ]
 
 

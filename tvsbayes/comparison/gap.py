@@ -13,13 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tvsbayes.errors import NothingToEstimate
-from tvsbayes.estimators.four_point import (
-    Selection,
-    classic,
-    experiment_rows,
-    four_point_ratios,
-    select_experiments,
-)
+from tvsbayes.estimators.four_point import Selection, classic, experiment_rows, four_point_ratios, select_experiments
 from tvsbayes.instrument.axes import DIRECTIONS
 from tvsbayes.instrument.parameters import names_of
 from tvsbayes.results.comparison_record import Gap, GapTerm

@@ -55,15 +55,7 @@ def judge(by: str, predictions: list[Prediction], lengths: np.ndarray, unseen: d
         reason = f"over {blocks_seen} blocks (fold and direction) the classic errs {ratio:.2g} times as much as the "
         reason += f"joint, 95 % interval {interval[0]:.2g} to {interval[1]:.2g}"
     return HoldOut(
-        by,
-        tuple(predictions),
-        scores["classic"],
-        scores["joint"],
-        float(ratio),
-        interval,
-        verdict,
-        reason,
-        unseen,
+        by, tuple(predictions), scores["classic"], scores["joint"], float(ratio), interval, verdict, reason, unseen
     )
 
 

@@ -12,13 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tvsbayes.calibration.optics import (
-    Components,
-    Ray,
-    aperture_angle_deg,
-    range_components,
-    unit_vector,
-)
+from tvsbayes.calibration.optics import Components, Ray, aperture_angle_deg, range_components, unit_vector
 from tvsbayes.calibration.pointing import DIVERGING_SHARE, INPUT_NAMES, NOISE_NAMES, Calibration, Drawn, Sides, drawn
 from tvsbayes.estimators.four_point import ClassicResult
 from tvsbayes.instrument.axes import SENSES

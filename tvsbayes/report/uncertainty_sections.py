@@ -154,7 +154,7 @@ def plan_section(e: Evidence) -> Section:
     unit, stop = plan.target.unit, plan.stop
     text = [
         f"Wanted: {plan.target.text}; known now to {plan.now:.2g} {unit}. "
-        f"{'Stop measuring' if stop.now else 'Go on measuring'}: {stop.reason}. Rule: {stop.rule}.",
+        f"{'Stop measuring' if stop.now else 'Go on measuring'}: {stop.reason}. Rule: {stop.rule}."
     ]
     if plan.limited_by.needed:
         text.append(plan.limited_by.needed)

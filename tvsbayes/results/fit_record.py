@@ -38,10 +38,7 @@ FIT_FORMATS = (FIT_FORMAT,)
 """Versions of `results/fit.json` that can be read; the schema of each is in `data/schemas`."""
 SCHEMA_PROBLEMS = 20
 """Among which the one to name is chosen: a document of another making has thousands."""
-PACKAGES = (
-    *("tvsbayes", "jax", "optimistix", "equinox", "emcee", "arviz", "numpy", "scipy"),
-    "opencv-python-headless",
-)
+PACKAGES = (*("tvsbayes", "jax", "optimistix", "equinox", "emcee", "arviz", "numpy", "scipy"), "opencv-python-headless")
 """Whose versions a result states."""
 AGAIN = "run `tvsbayes fit` again"
 
