@@ -115,7 +115,7 @@ def move_log_density(
         cavity = jax.tree.map(lambda a, b: jnp.where(first, a, b), beyond.joined(belief), cavity)
         seen = kalman_update(cavity, row)
         log_density = log_scale - 0.5 * seen.log_variance - 0.5 * jnp.sum(seen.standardised**2)
-        return (look(belief, row).belief, seen.belief), log_density
+        return (kalman_update(belief, row).belief, seen.belief), log_density
 
     def one(z):
         given = filter_input(space.model(z), arrays)
