@@ -379,4 +379,4 @@ def test_looks_without_a_spot_are_repeated_and_then_refused(mounted_rig, tmp_pat
     ("steps", "name"), [(1200, "left"), (20, "left"), (19, "unknown"), (0, "right"), (-3, "right"), (-500, "right")]
 )
 def test_approach_after_homing(steps, name):
-    assert _approach(steps, ("left", "right")) == name
+    assert _approach("pan", steps) == name

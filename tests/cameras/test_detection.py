@@ -1,7 +1,4 @@
-"""Spots in pictures: true centres within stated uncertainties, refusals by name, files in place, hostile frames.
-
-Pictures are rendered by the twin's cameras at 320 x 240 px, so that a test can afford dozens of looks.
-"""
+"""Spots of a campaign: true centres within stated uncertainties, files in place, hostile frames."""
 
 from __future__ import annotations
 
@@ -11,47 +8,19 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from support.drawn_spots import HEIGHT, WIDTH, oval, picture, small_pair
 
-from tvsbayes.cameras.contour import epipolar_refused, rectified_pair
-from tvsbayes.cameras.detection import REASONS, detect
-from tvsbayes.cameras.spot_fit import CLIPPED_DN, find_spot, patch_around
-from tvsbayes.cameras.spot_noise import _CORRELATION, SpotNoise, grey_of, learn_noise
+from tvsbayes.cameras.contour import epipolar_refused
+from tvsbayes.cameras.detection import detect
 from tvsbayes.cli.main import run
 from tvsbayes.errors import InputError, NothingToEstimate
 from tvsbayes.files.images import png_bytes
 from tvsbayes.instrument.campaign import Campaign, Move, Spot, read_campaign, write_campaign
-from tvsbayes.instrument.stereo_pair import Stereo, rotation_matrix
 from tvsbayes.report.command_text import detection_text
 from tvsbayes.twin.physics import cameras_of
 from tvsbayes.twin.spot_pictures import Footprint, Scene, Sensor, render_spot
 
-WIDTH, HEIGHT = 320, 240
 LOOKS = 40
-
-
-def small_pair() -> Stereo:
-    """Two cameras of 320 x 240 px, 85 mm apart, whose calibration is known to 0.1 px and 0.05 mm."""
-    matrix = np.array([[200.0, 0, 161.0], [0, 201.0, 118.0], [0, 0, 1.0]])
-    sds = np.array([*([0.1] * 4 + [1e-4] * 2 + [1e-5] * 2 + [1e-4]) * 2, *[1e-4] * 3, *[0.05] * 3])
-    return Stereo(
-        image_width=WIDTH,
-        image_height=HEIGHT,
-        M1=matrix,
-        D1=np.array([-0.3, 0.1, 3e-4, -5e-4, -0.01]),
-        M2=matrix + np.array([[-1.0, 0, 2], [0, -1, 3], [0, 0, 0]]),
-        D2=np.array([-0.29, 0.095, -2e-4, 4e-4, -0.009]),
-        R=rotation_matrix(np.array([0.004, -0.006, 0.003])),
-        T=np.array([-85.0, 0.2, -0.3]),
-        parameter_covariance=np.diag(sds**2),
-        rms_px=0.2,
-    )
-
-
-def oval(rng: np.random.Generator, sd: float) -> np.ndarray:
-    """Covariance of a spot 1.2 times as long as wide, turned at random."""
-    c, s = np.cos(angle := rng.uniform(0, np.pi)), np.sin(angle)
-    turn = np.array([[c, -s], [s, c]])
-    return turn @ np.diag([1.2 * sd**2, sd**2 / 1.2]) @ turn.T
 
 
 class Folder:
@@ -130,19 +99,6 @@ def test_stated_sd_is_the_actual_error_with_speckle_and_clipped_cores(speckled, 
     assert np.sqrt(np.mean(errors**2)) < 0.08
 
 
-@pytest.mark.parametrize("contrast", [0.0, 0.4])
-def test_propagation_of_known_noise(contrast):
-    """200 pictures whose noise is known: what remains is how the fit passes it on."""
-    rng, scene, chi2 = np.random.default_rng(8), Scene(speckle_contrast=contrast), []
-    for number in range(200):
-        centre = np.array([40.0, 32.0]) + rng.uniform(-1, 1, 2)
-        made = render_spot(Footprint(centre, oval(rng, 2.0), 200.0), 80, 64, scene, Sensor(), (9, number, 0))
-        seen = find_spot(made, SpotNoise(Sensor().gain_dn_per_electron, contrast))
-        chi2.append((seen.centre_px - centre) @ np.linalg.solve(seen.covariance_px2, seen.centre_px - centre))
-    # 400 degrees of freedom: 1 / sqrt(800) of the sd; four of them, and 8 % for the small picture's background.
-    assert abs(np.sqrt(np.sum(chi2) / 400) - 1) < 4 / np.sqrt(800) + 0.08
-
-
 def test_what_is_learned_of_the_noise(found_plain, found_speckled):
     for side in ("left", "right"):
         assert found_plain.noise[side].speckle_contrast < 0.08
@@ -156,131 +112,6 @@ def test_the_paper_s_contour_is_several_times_worse_and_says_so(speckled, found_
     rms = np.sqrt(np.mean(errors**2))
     assert rms > 2 * np.sqrt(np.mean(speckled.errors(found_speckled)[0] ** 2))
     assert 0.6 < rms / np.sqrt(np.mean(stated**2)) < 1.6
-
-
-def test_contour_comes_back_to_raw_pixels():
-    """Against OpenCV's own way forward."""
-    stereo = small_pair()
-    raw = np.random.default_rng(1).uniform([20, 20], [300, 220], (50, 2))
-    for camera in rectified_pair(stereo):
-        forward = cv2.undistortPoints(
-            raw[:, None], camera.matrix, camera.distortion, R=camera.rotation, P=camera.projection
-        ).reshape(-1, 2)
-        # undistortPoints stops after five iterations: hundredths of a pixel.
-        np.testing.assert_allclose(camera.raw(forward), raw, atol=0.05)
-
-
-def test_noise_through_demosaicing_has_the_correlation_that_is_assumed():
-    raw = np.clip(np.random.default_rng(1).normal(128, 12, (1000, 1000)), 0, 255).astype(np.uint8)
-    grey = grey_of(cv2.cvtColor(raw, cv2.COLOR_BayerRGGB2BGR))[4:-4, 4:-4] - raw.mean()
-    for i in range(3):
-        for j in range(3):
-            lag = np.mean(grey[i:, j:] * grey[: len(grey) - i, : len(grey) - j]) / raw.var()
-            # A million pixels; the truth is 0.28 at lag 0 and sums to 1.
-            assert lag == pytest.approx(_CORRELATION[2 + i, 2 + j], abs=0.003)
-
-
-def test_noise_is_learned_from_skews_drawn_from_it():
-    rng = np.random.default_rng(3)
-    parts = np.column_stack((rng.uniform(1, 2, 400), rng.uniform(50, 200, 400), rng.uniform(5e3, 2e4, 400)))
-    for gain, contrast in ((0.04, 0.0), (0.05, 0.4)):
-        variance = parts @ [1.0, gain, contrast**2]
-        learned = learn_noise(np.column_stack((variance * rng.chisquare(1, 400), parts)))
-        # 400 squares tell a variance to sqrt(2 / 400) = 7 %; what of it is gain and what contrast^2 they tell less.
-        said = parts @ [1.0, learned.gain_dn, learned.speckle_contrast**2]
-        assert said.mean() == pytest.approx(variance.mean(), rel=4 * np.sqrt(2 / 400))
-    assert learned.speckle_contrast == pytest.approx(0.4, rel=0.2)
-    assert learn_noise(np.column_stack((variance, parts)), 0.3).speckle_contrast == pytest.approx(0.3)
-
-
-SMALL = 2.5**2 * np.eye(2)
-
-
-def picture(*marks: Footprint, scene: Scene | None = None) -> np.ndarray:
-    """Several spots in one picture, without speckle."""
-    scene = scene or Scene(speckle_contrast=0.0)
-    made = [render_spot(mark, WIDTH, HEIGHT, scene, Sensor(), (1, k, 0)) for k, mark in enumerate(marks)]
-    return np.maximum.reduce(made)
-
-
-def lamp() -> np.ndarray:
-    dark = picture(None)
-    cv2.rectangle(dark, (100, 60), (180, 140), (230, 230, 230), -1)
-    return dark
-
-
-def hot_pixel() -> np.ndarray:
-    raw = np.full((HEIGHT, WIDTH), 12, np.uint8)
-    raw[100, 151] = 240
-    return cv2.cvtColor(raw, cv2.COLOR_BayerRGGB2BGR)
-
-
-HERE = np.array([150.3, 110.8])
-THERE = np.array([210.3, 120.8])
-REFUSED = {
-    "no-spot": lambda: picture(None),
-    "two-spots": lambda: picture(Footprint(HERE, SMALL, 180.0), Footprint(THERE, SMALL, 150.0)),
-    "too-small": hot_pixel,
-    "too-large": lamp,
-    "border": lambda: picture(Footprint(np.array([2.0, 100.0]), 4 * SMALL, 180.0)),
-    "clipped": lambda: picture(Footprint(HERE, 2 * SMALL, 3000.0)),
-    "misshapen": lambda: picture(Footprint(HERE, SMALL, 150.0), Footprint(HERE + np.array([7.0, 2.0]), SMALL, 60.0)),
-    "elongated": lambda: picture(Footprint(HERE, np.diag([15.0**2, 2.0**2]), 180.0)),
-}
-
-
-@pytest.mark.parametrize("reason", REFUSED)
-def test_every_refusal_has_its_name(reason):
-    assert find_spot(REFUSED[reason]()).status == reason
-
-
-def test_all_reasons_are_tested():
-    """`epipolar` below; `unfitted` has no picture of its own."""
-    assert set(REASONS) - set(REFUSED) == {"epipolar", "unfitted"}
-
-
-def test_a_weak_second_reflection_and_a_gradient_do_no_harm():
-    steep = Scene(speckle_contrast=0.0, ambient_dn=60.0, ambient_gradient_dn=100.0)
-    seen = find_spot(
-        picture(Footprint(HERE, SMALL, 180.0), Footprint(THERE, SMALL, 25.0), scene=steep), SpotNoise(0.04, 0)
-    )
-    assert seen.status == "ok"
-    assert np.abs(seen.centre_px - HERE).max() < 5 * np.sqrt(seen.covariance_px2.max())
-
-
-def test_a_clipped_core_is_normal_and_a_larger_one_widens_the_sd():
-    sds = []
-    for peak in (240.0, 400.0, 700.0):
-        seen = find_spot(picture(Footprint(HERE, SMALL, peak)), SpotNoise(0.04, 0.4))
-        assert seen.status == "ok"
-        sds.append(np.sqrt(np.trace(seen.covariance_px2)) * np.sqrt(peak))
-    assert sds[0] < sds[1] < sds[2]
-
-
-def test_neighbours_of_clipped_pixels_are_not_used():
-    """Demosaicing has mixed a clipped photosite into each of its eight neighbours."""
-    frame = picture(Footprint(HERE, SMALL, 400.0))
-    patch = patch_around(frame)
-    rows, columns = np.nonzero((frame >= CLIPPED_DN).any(axis=2))
-    assert len(rows) > 3
-    away = np.ones((HEIGHT, WIDTH), bool)
-    for row, column in zip(rows, columns, strict=True):
-        away[row - 1 : row + 2, column - 1 : column + 2] = False
-    left, top = patch.corner
-    height, width = patch.usable.shape
-    np.testing.assert_array_equal(patch.usable, away[top : top + height, left : left + width])
-
-
-def test_correlation_follows_a_turned_spot():
-    """A long spot at 45 degrees is known worse along itself: u and v errors go together."""
-    turned = np.array([[20.0, 14.0], [14.0, 20.0]])
-    for sign in (1, -1):
-        cov = find_spot(
-            picture(Footprint(HERE, turned * [[1, sign], [sign, 1]], 180.0)), SpotNoise(0.04, 0)
-        ).covariance_px2
-        # Against even noise a Gaussian's centre has the correlation of the Gaussian, 14 / 20; demosaicing, which mixes
-        # neighbours, changes it by less than a tenth.
-        assert sign * cov[0, 1] / cov[0, 0] == pytest.approx(0.7, abs=0.1)
 
 
 def test_a_pair_off_its_epipolar_lines_is_refused(plain, tmp_path):

@@ -7,6 +7,7 @@ once a homing is logged. A reader finds a whole campaign at any moment.
 from __future__ import annotations
 
 import datetime
+from dataclasses import asdict
 from pathlib import Path
 from typing import cast
 
@@ -228,7 +229,7 @@ def repair_campaign(folder: Path, to: Path) -> dict[str, object]:
     record = recorded(read_journal(to).records)
     if record.moves:
         write_derived(_campaign_of(record, before), to)
-    return {**done.as_json(), "moves": len(record.moves), "looks": len(record.spots)}
+    return {**asdict(done), "moves": len(record.moves), "looks": len(record.spots)}
 
 
 def _settings_of(folder: Path) -> Campaign:

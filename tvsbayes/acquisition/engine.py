@@ -24,7 +24,7 @@ from tvsbayes.acquisition.recorder import Recorded
 from tvsbayes.acquisition.run_log import Outcome, RunLog
 from tvsbayes.acquisition.running_estimate import RunningEstimate
 from tvsbayes.errors import DeviceFault, TvsError
-from tvsbayes.instrument.axes import APPROACH_SIGN, PIXELS, SENSES
+from tvsbayes.instrument.axes import AXES, PIXELS, direction_of
 from tvsbayes.instrument.campaign import Spot
 from tvsbayes.instrument.plan import PlanStep, plan_seconds, run_plan
 from tvsbayes.instrument.rig import Rig
@@ -157,7 +157,7 @@ class Acquisition:
         elif step.action == "place":
             self._place(step.target, self._scene(step.step).placement + 1, "", step.step)
         elif step.action == "move":
-            self._move(*step.counters(self._scene(step.step).counters[-1]), step.step)
+            self._move(*step.counters(run_plan(self.plan[: step.step], self.rig).at), step.step)
         else:
             self._look(step.step, step.experiment, step.point)
 
@@ -168,8 +168,8 @@ class Acquisition:
         switches = report.state.pan_steps, report.state.tilt_steps
         state = self.bench.positioner.move_to(*counters)
         self.bench.clock.sleep(self._settle_s)
-        turns = zip(counters, switches, SENSES.values(), strict=True)
-        approach = [_approach(to - start, names) for to, start, names in turns]
+        ways = zip(AXES, counters, switches, strict=True)
+        approach = [_approach(axis, to - start) for axis, to, start in ways]
         reached = {"pan_steps": state.pan_steps, "tilt_steps": state.tilt_steps, "boot": state.boot}
         self._log.write(
             "homed", step=step, time_s=self._log.now_s(), **reached, approach=approach, **self.bench.annotate()
@@ -336,16 +336,12 @@ class Acquisition:
         )
 
 
-def _approach(steps: int, names: tuple[str, str]) -> str:
+def _approach(axis: str, steps: int) -> str:
     """The side from which an axis stands after homing and a move of so many steps.
 
     Homing itself ends in the negative sense, over more steps than any play.
     """
-    if steps == 0:
-        return names[1]
-    name = names[0] if steps > 0 else names[1]
-    assert APPROACH_SIGN[name] * steps > 0
-    return name if abs(steps) >= CLEARED_STEPS or steps < 0 else "unknown"
+    return "unknown" if 0 < steps < CLEARED_STEPS else direction_of(axis, 1 if steps > 0 else -1)
 
 
 def _shift_px(before: Spot, now: Four) -> float:

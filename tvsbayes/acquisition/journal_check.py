@@ -150,15 +150,6 @@ class Repair:
     lost_frames: list[str] = field(default_factory=list)
     torn_bytes: int = 0
 
-    def as_json(self) -> dict[str, object]:
-        """The document of `tvsbayes check --repair-to`."""
-        return {
-            "kept": self.kept,
-            "lost_lines": self.lost_lines,
-            "lost_frames": self.lost_frames,
-            "torn_bytes": self.torn_bytes,
-        }
-
 
 def repair(folder: Path, to: Path) -> Repair:
     """Copies what is whole into a new folder; the old one stays as it is.

@@ -88,8 +88,8 @@ FAULTS = (
     Fault(
         "homing called an arrival from below",
         "acquisition/engine.py",
-        "name = names[0] if steps > 0 else names[1]",
-        "name = names[0]",
+        "direction_of(axis, 1 if steps > 0 else -1)",
+        "direction_of(axis, 1)",
         "the recorded approach of move 0 is wrong: every ratio hangs on it",
         ("acquisition/engine::test_approach_after_homing",),
     ),
@@ -99,7 +99,7 @@ FAULTS = (
         "usable = cv2.dilate(clipped, np.ones((3, 3), np.uint8)) == 0",
         "usable = clipped >= 0",
         "clipped cores pull the centre and widen the spot",
-        ("cameras/detection",),
+        ("cameras/spot_fit", "cameras/detection"),
     ),
     Fault(
         "centres half a pixel off",
@@ -107,7 +107,7 @@ FAULTS = (
         "centre = p[1:3] + step[1:3] + np.array(patch.corner)",
         "centre = p[1:3] + step[1:3] + np.array(patch.corner) + 0.5",
         "integer = corner instead of centre of a pixel: half a pixel everywhere",
-        ("cameras/detection",),
+        ("cameras/spot_fit", "cameras/detection"),
     ),
     Fault(
         "covariance of a spot with the contrast, not its square",
@@ -115,7 +115,7 @@ FAULTS = (
         "units = np.array([1.0, noise.gain_dn, noise.speckle_contrast**2])",
         "units = np.array([1.0, noise.gain_dn, noise.speckle_contrast])",
         "stated sds too large by the root of the contrast",
-        ("cameras/detection",),
+        ("cameras/spot_fit", "cameras/detection"),
     ),
     Fault(
         "correlation of a spot doubled",
@@ -123,7 +123,7 @@ FAULTS = (
         "mixed = (both - u - v) / 2",
         "mixed = both - u - v",
         "covariances that are none for turned spots",
-        ("cameras/detection",),
+        ("cameras/spot_fit", "cameras/detection"),
     ),
     Fault(
         "epipolar gate open",

@@ -1,0 +1,108 @@
+"""The centre of one spot: its covariance, refusals by name, what clipping and neighbours do to it."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+from support.drawn_spots import HEIGHT, WIDTH, oval, picture
+
+from tvsbayes.cameras.detection import REASONS
+from tvsbayes.cameras.spot_fit import CLIPPED_DN, find_spot, patch_around
+from tvsbayes.cameras.spot_noise import SpotNoise
+from tvsbayes.twin.spot_pictures import Footprint, Scene, Sensor, render_spot
+
+SMALL = 2.5**2 * np.eye(2)
+HERE = np.array([150.3, 110.8])
+THERE = np.array([210.3, 120.8])
+
+
+@pytest.mark.parametrize("contrast", [0.0, 0.4])
+def test_propagation_of_known_noise(contrast):
+    """200 pictures whose noise is known: what remains is how the fit passes it on."""
+    rng, scene, chi2 = np.random.default_rng(8), Scene(speckle_contrast=contrast), []
+    for number in range(200):
+        centre = np.array([40.0, 32.0]) + rng.uniform(-1, 1, 2)
+        made = render_spot(Footprint(centre, oval(rng, 2.0), 200.0), 80, 64, scene, Sensor(), (9, number, 0))
+        seen = find_spot(made, SpotNoise(Sensor().gain_dn_per_electron, contrast))
+        chi2.append((seen.centre_px - centre) @ np.linalg.solve(seen.covariance_px2, seen.centre_px - centre))
+    # 400 degrees of freedom: 1 / sqrt(800) of the sd; four of them, and 8 % for the small picture's background.
+    assert abs(np.sqrt(np.sum(chi2) / 400) - 1) < 4 / np.sqrt(800) + 0.08
+
+
+def lamp() -> np.ndarray:
+    dark = picture(None)
+    cv2.rectangle(dark, (100, 60), (180, 140), (230, 230, 230), -1)
+    return dark
+
+
+def hot_pixel() -> np.ndarray:
+    raw = np.full((HEIGHT, WIDTH), 12, np.uint8)
+    raw[100, 151] = 240
+    return cv2.cvtColor(raw, cv2.COLOR_BayerRGGB2BGR)
+
+
+REFUSED = {
+    "no-spot": lambda: picture(None),
+    "two-spots": lambda: picture(Footprint(HERE, SMALL, 180.0), Footprint(THERE, SMALL, 150.0)),
+    "too-small": hot_pixel,
+    "too-large": lamp,
+    "border": lambda: picture(Footprint(np.array([2.0, 100.0]), 4 * SMALL, 180.0)),
+    "clipped": lambda: picture(Footprint(HERE, 2 * SMALL, 3000.0)),
+    "misshapen": lambda: picture(Footprint(HERE, SMALL, 150.0), Footprint(HERE + np.array([7.0, 2.0]), SMALL, 60.0)),
+    "elongated": lambda: picture(Footprint(HERE, np.diag([15.0**2, 2.0**2]), 180.0)),
+}
+
+
+@pytest.mark.parametrize("reason", REFUSED)
+def test_every_refusal_has_its_name(reason):
+    assert find_spot(REFUSED[reason]()).status == reason
+
+
+def test_all_reasons_are_tested():
+    """`epipolar` below; `unfitted` has no picture of its own."""
+    assert set(REASONS) - set(REFUSED) == {"epipolar", "unfitted"}
+
+
+def test_a_weak_second_reflection_and_a_gradient_do_no_harm():
+    steep = Scene(speckle_contrast=0.0, ambient_dn=60.0, ambient_gradient_dn=100.0)
+    seen = find_spot(
+        picture(Footprint(HERE, SMALL, 180.0), Footprint(THERE, SMALL, 25.0), scene=steep), SpotNoise(0.04, 0)
+    )
+    assert seen.status == "ok"
+    assert np.abs(seen.centre_px - HERE).max() < 5 * np.sqrt(seen.covariance_px2.max())
+
+
+def test_a_clipped_core_is_normal_and_a_larger_one_widens_the_sd():
+    sds = []
+    for peak in (240.0, 400.0, 700.0):
+        seen = find_spot(picture(Footprint(HERE, SMALL, peak)), SpotNoise(0.04, 0.4))
+        assert seen.status == "ok"
+        sds.append(np.sqrt(np.trace(seen.covariance_px2)) * np.sqrt(peak))
+    assert sds[0] < sds[1] < sds[2]
+
+
+def test_neighbours_of_clipped_pixels_are_not_used():
+    """Demosaicing has mixed a clipped photosite into each of its eight neighbours."""
+    frame = picture(Footprint(HERE, SMALL, 400.0))
+    patch = patch_around(frame)
+    rows, columns = np.nonzero((frame >= CLIPPED_DN).any(axis=2))
+    assert len(rows) > 3
+    away = np.ones((HEIGHT, WIDTH), bool)
+    for row, column in zip(rows, columns, strict=True):
+        away[row - 1 : row + 2, column - 1 : column + 2] = False
+    left, top = patch.corner
+    height, width = patch.usable.shape
+    np.testing.assert_array_equal(patch.usable, away[top : top + height, left : left + width])
+
+
+def test_correlation_follows_a_turned_spot():
+    """A long spot at 45 degrees is known worse along itself: u and v errors go together."""
+    turned = np.array([[20.0, 14.0], [14.0, 20.0]])
+    for sign in (1, -1):
+        cov = find_spot(
+            picture(Footprint(HERE, turned * [[1, sign], [sign, 1]], 180.0)), SpotNoise(0.04, 0)
+        ).covariance_px2
+        # Against even noise a Gaussian's centre has the correlation of the Gaussian, 14 / 20; demosaicing, which mixes
+        # neighbours, changes it by less than a tenth.
+        assert sign * cov[0, 1] / cov[0, 0] == pytest.approx(0.7, abs=0.1)
