@@ -69,7 +69,6 @@ def scenes(seed: int, condition: str, count: int = VIEWS) -> list[Scene]:
     stereo = nominal.with_vector(nominal.vector + TRUTH_SD * rng.standard_normal(24))
     if condition == "rendered":
         # Finders need the outer squares too: the renderer's own poses leave room for them.
-
         first = BOARD.points_mm[0]
         poses = board_poses(cameras_of(stereo), board_pictures.Board(), RENDERED_VIEWS, seed)
         return [

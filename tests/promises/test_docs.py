@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pytest
 import typer
-from promises.test_layers import MODULES, ORDER, imported, room
+from support.package_imports import MODULES, ORDER, imported, room
 
 from tvsbayes.cli.main import app, run
 from tvsbayes.instrument.parameters import RIG_PRIORS, unit_of

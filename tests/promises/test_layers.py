@@ -3,24 +3,24 @@
 from __future__ import annotations
 
 import ast
-import re
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from support.package_imports import (
+    MODULES,
+    ORDER,
+    PACKAGE,
+    imported,
+    inside,
+    parsed,
+    reachable,
+    room,
+    running,
+)
 
 ROOT = Path(__file__).resolve().parents[2]
-PACKAGE = ROOT / "tvsbayes"
-ORDER = (
-    *("errors", "files", "statistics", "instrument"),
-    *("calibration", "results", "metrology", "twin", "model"),
-    *("estimators", "posterior", "assessment", "coordinates", "comparison", "planning", "studies"),
-    *("positioner", "cameras", "acquisition"),
-    *("pipeline", "report", "cli"),
-)
-"""From bottom to top: packages and single modules; each imports only what stands before it."""
 HARDWARE = ("positioner", "cameras", "acquisition")
 HARDWARE_USERS = {
     "cameras": {"positioner"},
@@ -44,89 +44,12 @@ JAX_FREE_MODULES = (
 JAX_FAMILY = {"jax", "jaxlib", "equinox", "optimistix", "lineax", "jaxtyping"}
 HEAVY = ("jax", "arviz", "emcee", "cv2", "matplotlib", "scipy", "equinox", "optimistix")
 LINES_MAX = 450
-MODULE = re.compile(r"\btvsbayes(?:\.\w+)+")
-
-
-def modules_of(folder: Path) -> dict[str, Path]:
-    """Every module of the package by its name below it, the packages' empty faces left out."""
-    return {
-        ".".join(path.relative_to(folder).with_suffix("").parts): path
-        for path in sorted(folder.rglob("*.py"))
-        if path.name not in ("__init__.py", "__main__.py")
-    }
-
-
-MODULES = modules_of(PACKAGE)
-
-
-def strings(tree: ast.AST) -> Iterator[str]:
-    """String constants that are no docstrings: code handed to a new process, dotted names to be imported."""
-    prose = {
-        id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant)
-    }
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in prose:
-            yield node.value
-
-
-def running(tree: ast.AST) -> ast.AST:
-    """The code without what only type checkers read."""
-
-    class Runs(ast.NodeTransformer):
-        def visit_If(self, node: ast.If) -> ast.AST | list[ast.stmt]:
-            self.generic_visit(node)
-            name = node.test.attr if isinstance(node.test, ast.Attribute) else getattr(node.test, "id", "")
-            return node.orelse if name == "TYPE_CHECKING" else node
-
-    return Runs().visit(tree)
-
-
-def imported(tree: ast.AST, modules: frozenset[str] | None = None) -> set[str]:
-    """Modules that code imports: at the top, inside functions, for type checkers, or named in a string of code."""
-    known = frozenset(MODULES) if modules is None else modules
-    found: set[str] = set()
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Import):
-            found.update(alias.name for alias in node.names)
-        elif isinstance(node, ast.ImportFrom):
-            assert not node.level, "relative imports hide what a module needs"
-            base = node.module or ""
-            inside = {f"{base}.{alias.name}" for alias in node.names}
-            own = {name for name in inside if name.removeprefix("tvsbayes.") in known}
-            found.update(own or {base})
-    for text in strings(tree):
-        found.update(name for name in MODULE.findall(text) if name.removeprefix("tvsbayes.") in known)
-    return found
-
-
-def parsed(name: str) -> ast.AST:
-    return ast.parse(MODULES[name].read_text(encoding="utf-8"))
-
-
-def inside(imports: dict[str, set[str]]) -> dict[str, set[str]]:
-    """Modules of the package that each module imports."""
-    return {
-        name: {other.removeprefix("tvsbayes.") for other in names} & set(imports) for name, names in imports.items()
-    }
 
 
 @pytest.fixture(scope="module")
 def inner() -> dict[str, set[str]]:
     """Modules of the package that each module imports, types included."""
     return inside({name: imported(parsed(name)) for name in MODULES})
-
-
-def room(name: str) -> str:
-    return name.split(".")[0]
-
-
-def reachable(graph: dict[str, set[str]], start: str) -> set[str]:
-    seen, todo = set(), [start]
-    while todo:
-        for name in graph[todo.pop()] - seen:
-            seen.add(name)
-            todo.append(name)
-    return seen
 
 
 def in_new_process(code: str) -> str:
@@ -194,6 +117,12 @@ def test_twin_shares_no_formula_with_the_estimators(inner):
 def test_modules_stay_readable():
     long = {name: count for name, path in MODULES.items() if (count := len(path.read_text().splitlines())) > LINES_MAX}
     assert not long
+
+
+def test_no_test_module_imports_another():
+    for path in (ROOT / "tests").rglob("*.py"):
+        names = imported(ast.parse(path.read_text(encoding="utf-8")))
+        assert not {name for name in names if name.split(".")[-1].startswith("test_")}, path
 
 
 def test_importing_the_estimator_changes_no_jax_setting():

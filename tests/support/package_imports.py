@@ -1,0 +1,95 @@
+"""Who imports whom in the package: its modules by name, and what the code of each asks for."""
+
+from __future__ import annotations
+
+import ast
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+PACKAGE = Path(__file__).resolve().parents[2] / "tvsbayes"
+ORDER = (
+    *("errors", "files", "statistics", "instrument"),
+    *("calibration", "results", "metrology", "twin", "model"),
+    *("estimators", "posterior", "assessment", "coordinates", "comparison", "planning", "studies"),
+    *("positioner", "cameras", "acquisition"),
+    *("pipeline", "report", "cli"),
+)
+"""From bottom to top: packages and single modules; each imports only what stands before it."""
+MODULE = re.compile(r"\btvsbayes(?:\.\w+)+")
+
+
+def modules_of(folder: Path) -> dict[str, Path]:
+    """Every module of the package by its name below it, the packages' empty faces left out."""
+    return {
+        ".".join(path.relative_to(folder).with_suffix("").parts): path
+        for path in sorted(folder.rglob("*.py"))
+        if path.name not in ("__init__.py", "__main__.py")
+    }
+
+
+MODULES = modules_of(PACKAGE)
+
+
+def strings(tree: ast.AST) -> Iterator[str]:
+    """String constants that are no docstrings: code handed to a new process, dotted names to be imported."""
+    prose = {
+        id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant)
+    }
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in prose:
+            yield node.value
+
+
+def running(tree: ast.AST) -> ast.AST:
+    """The code without what only type checkers read."""
+
+    class Runs(ast.NodeTransformer):
+        def visit_If(self, node: ast.If) -> ast.AST | list[ast.stmt]:
+            self.generic_visit(node)
+            name = node.test.attr if isinstance(node.test, ast.Attribute) else getattr(node.test, "id", "")
+            return node.orelse if name == "TYPE_CHECKING" else node
+
+    return Runs().visit(tree)
+
+
+def imported(tree: ast.AST, modules: frozenset[str] | None = None) -> set[str]:
+    """Modules that code imports: at the top, inside functions, for type checkers, or named in a string of code."""
+    known = frozenset(MODULES) if modules is None else modules
+    found: set[str] = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            found.update(alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            assert not node.level, "relative imports hide what a module needs"
+            base = node.module or ""
+            inside = {f"{base}.{alias.name}" for alias in node.names}
+            own = {name for name in inside if name.removeprefix("tvsbayes.") in known}
+            found.update(own or {base})
+    for text in strings(tree):
+        found.update(name for name in MODULE.findall(text) if name.removeprefix("tvsbayes.") in known)
+    return found
+
+
+def parsed(name: str) -> ast.AST:
+    return ast.parse(MODULES[name].read_text(encoding="utf-8"))
+
+
+def inside(imports: dict[str, set[str]]) -> dict[str, set[str]]:
+    """Modules of the package that each module imports."""
+    return {
+        name: {other.removeprefix("tvsbayes.") for other in names} & set(imports) for name, names in imports.items()
+    }
+
+
+def room(name: str) -> str:
+    return name.split(".")[0]
+
+
+def reachable(graph: dict[str, set[str]], start: str) -> set[str]:
+    seen, todo = set(), [start]
+    while todo:
+        for name in graph[todo.pop()] - seen:
+            seen.add(name)
+            todo.append(name)
+    return seen
