@@ -119,7 +119,7 @@ def main() -> int:
             path.rename(path.with_suffix(f".{int(time.time())}.jsonl"))
         for part in arguments.parts:
             begun = time.perf_counter()
-            command = [sys.executable, "-m", "experiments.benchmarks", "--worker", part]
+            command = [sys.executable, "-m", "experiments.speed.benchmarks", "--worker", part]
             command += ["--repeats", str(arguments.repeats), "--limit", str(arguments.limit)]
             command += ["--sizes", *map(str, arguments.sizes)]
             done = subprocess.run(command, env=environment(part), cwd=HERE.parents[2])
