@@ -106,7 +106,7 @@ class CampaignResults:
 
 def calibrate(
     campaign: Campaign,
-    folder: Path | None = None,
+    folder: Path | str | None = None,
     *,
     model: ModelChoice = AS_STATED,
     sampled: bool = True,
@@ -138,24 +138,25 @@ def calibrate(
     from tvsbayes.assessment.summary import summarise
     from tvsbayes.estimators.joint_fit import fit as fit_joint
 
+    place = None if folder is None else Path(folder)
     found = fit_joint(campaign, model=model, seed=seed)
     posterior, files = None, {}
     # A sample of what must not be used anyway would only take time.
     if sampled and unusable(summarise(found)) is None:
         from tvsbayes.posterior.sampling import sample
 
-        checkpoint = None if folder is None else folder / "chain.npz"
-        if folder is not None:
-            make_folder(folder)
+        checkpoint = None if place is None else place / "chain.npz"
+        if place is not None:
+            make_folder(place)
         with watch() as progress:
             posterior = sample(
                 found, max_minutes=max_minutes, seed=seed, checkpoint=checkpoint, resume=resume, progress=progress
             )
-        files = _posterior_files(posterior, folder, tell)
-    if folder is not None and "posterior" not in files and (stale := folder / "posterior.nc").exists():
+        files = _posterior_files(posterior, place, tell)
+    if place is not None and "posterior" not in files and (stale := place / "posterior.nc").exists():
         stale.unlink()
         tell("posterior.nc of an earlier fit is removed: it would not be that of fit.json")
-    return _results(found, posterior, seed, folder, files)
+    return _results(found, posterior, seed, place, files)
 
 
 def _posterior_files(posterior: Posterior, folder: Path | None, tell: Tell) -> dict[str, str]:

@@ -16,18 +16,13 @@ from tvsbayes.calibration.pointing import INPUT_NAMES, NOISE_NAMES, Calibration
 from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.instrument.axes import AXES
 from tvsbayes.instrument.campaign import Campaign, input_hashes
+from tvsbayes.instrument.parameters import RECEIVER_NAMES
 from tvsbayes.posterior.draws import Posterior
 
 CLEARED_PROBABILITY = 0.99
 """With this probability an overshoot takes up all the play."""
-
-
-def receiver_priors(campaign: Campaign) -> dict[str, tuple[float, float]]:
-    """Value and u of what only aperture readings could tell, where the campaign has none."""
-    if any(s.aperture_deg is not None for s in campaign.spots if s.status == "ok"):
-        return {}
-    names = ("baseline_mm", "pan_zero_emission_deg", "aperture_zero_deg")
-    return {name: (campaign.rig.priors[name].value, campaign.rig.priors[name].u) for name in names}
+DRAWS_KEPT = 4096
+"""Posterior draws in a calibration, evenly chosen; posterior.nc holds them all."""
 
 
 def calibration_of_draws(
@@ -53,10 +48,11 @@ def calibration_of_draws(
         found = generator.standard_normal(len(physical))
         return (found - found.mean()) / found.std()
 
-    if untold := receiver_priors(campaign):
-        column |= {name: value + u * standard() for name, (value, u) in untold.items()}
-        prior = campaign.rig.priors["aperture_sd_deg"]
-        column["aperture_sd_deg"] = prior.value * np.exp(prior.u * standard())
+    if not any(spot.aperture_deg is not None for spot in campaign.spots if spot.status == "ok"):
+        for name in RECEIVER_NAMES:
+            prior, off = campaign.rig.priors[name], standard()
+            log = prior.distribution == "log-normal"
+            column[name] = prior.value * np.exp(prior.u * off) if log else prior.value + prior.u * off
     inputs = np.stack([column[name] for name in INPUT_NAMES], axis=1)
     noise = np.stack([column[name] for name in NOISE_NAMES], axis=1)
     counters = np.array([(m.pan_steps, m.tilt_steps) for m in campaign.moves], dtype=float)
@@ -78,10 +74,6 @@ def calibration_of_draws(
 def _overshoot_steps(column: Mapping[str, np.ndarray], axis: str) -> int:
     play_steps = column[f"backlash_deg.{axis}"] / np.abs(column[f"degrees_per_step.{axis}"])
     return math.ceil(np.quantile(play_steps, CLEARED_PROBABILITY))
-
-
-DRAWS_KEPT = 4096
-"""Posterior draws in a calibration, evenly chosen; posterior.nc holds them all."""
 
 
 def calibration_of(fit: JointFit, posterior: Posterior | None = None, *, seed: int = 0) -> Calibration:

@@ -66,7 +66,7 @@ class ResultDraws:
 _MODE_ARRAYS = ("z", "covariance", "prior", "valid", "weight")
 
 
-def draws_bytes(
+def _draws_bytes(
     draws: ResultDraws, estimator: str, calibration: Calibration | None = None, mode: StoredMode | None = None
 ) -> bytes:
     """The content of `draws.npz`; without a calibration it holds draws that nothing must be calculated from."""
@@ -103,7 +103,7 @@ def write_results(
     Raises:
         InputError: the folder cannot be written.
     """
-    content = draws_bytes(draws, record.summary.estimator, calibration, mode)
+    content = _draws_bytes(draws, record.summary.estimator, calibration, mode)
     document = json.dumps(record.as_json(), indent=1, allow_nan=False)
     contents = {"draws": ("draws.npz", content), "fit": ("fit.json", document.encode())}
     make_folder(folder)
