@@ -109,10 +109,6 @@ class HoldOut:
     reason: str
     unseen: dict[str, float]
 
-    def as_json(self) -> dict[str, object]:
-        """Plain types."""
-        return plain(self)
-
 
 @dataclass(frozen=True)
 class Change:

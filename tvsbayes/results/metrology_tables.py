@@ -160,7 +160,3 @@ class AxisPositioning:
     notes: tuple[str, ...]
     predicted: dict[str, Predicted] | None
     plug_in: Positioning | None
-
-    def as_json(self) -> dict[str, object]:
-        """Plain values."""
-        return plain(self)
