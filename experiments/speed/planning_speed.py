@@ -19,10 +19,17 @@ import numpy as np
 from experiments.common.clock import shortest
 from experiments.common.command_line import print_only
 from experiments.common.rigs import mounted_rig
-from tvsbayes.estimators.campaign_arrays import use_compilation_cache
+from tvsbayes.estimators.campaign_arrays import bucket, use_compilation_cache
 from tvsbayes.instrument.protocols import grid_protocol, paper_protocol
 from tvsbayes.planning.candidates import LookArrays, Looks
-from tvsbayes.planning.expectation import PARAMETERS, expect, information_of, padded_size, prior_knowledge
+from tvsbayes.planning.expectation import (
+    DESIGN_GROWTH,
+    PARAMETERS,
+    SMALLEST_DESIGN,
+    expect,
+    information_of,
+    prior_knowledge,
+)
 from tvsbayes.planning.search import Search
 
 SIZES = (100, 1000, 10_000)
@@ -47,7 +54,7 @@ def main() -> None:
     for name, steps in (("grid, one sheet", grid_protocol(("d1",))), ("paper", paper_protocol())):
         one = warm(lambda steps=steps: information_of(steps, knowledge))
         looks = sum(step.action == "look" for step in steps)
-        padded = padded_size(looks)
+        padded = bucket(looks, SMALLEST_DESIGN, DESIGN_GROWTH)
         print(f"| {name} | {looks} | {padded} | {1e3 * one:.1f} | {1 / one:.0f} |")
 
     generator = np.random.default_rng(1)

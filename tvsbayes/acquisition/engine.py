@@ -24,8 +24,8 @@ from tvsbayes.acquisition.recorder import Recorded
 from tvsbayes.acquisition.run_log import Outcome, RunLog
 from tvsbayes.acquisition.running_estimate import RunningEstimate
 from tvsbayes.errors import DeviceFault, TvsError
-from tvsbayes.instrument.axes import AXES, PIXELS, direction_of
-from tvsbayes.instrument.campaign import Spot
+from tvsbayes.instrument.axes import AXES, direction_of
+from tvsbayes.instrument.campaign import Spot, pixels_of
 from tvsbayes.instrument.plan import PlanStep, plan_seconds, run_plan
 from tvsbayes.instrument.rig import Rig
 from tvsbayes.instrument.stereo_pair import triangulate
@@ -346,4 +346,4 @@ def _approach(axis: str, steps: int) -> str:
 
 def _shift_px(before: Spot, now: Four) -> float:
     """Largest change of a coordinate since the reference, px."""
-    return round(max(abs(float(a) - b) for a, b in zip(PIXELS(before), now, strict=True)), 3)
+    return round(max(abs(float(a) - b) for a, b in zip(pixels_of([before])[0], now, strict=True)), 3)

@@ -15,7 +15,8 @@ from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.estimators.plausibility import SHALLOW
 from tvsbayes.instrument.axes import AXES, direction_of
 from tvsbayes.instrument.campaign import ordered_spots
-from tvsbayes.instrument.stops import Rest, StopReadings, rests_of
+from tvsbayes.instrument.stops import Rest, rests_of
+from tvsbayes.metrology.positioning_table import StopReadings
 from tvsbayes.results.estimates import Cause, CauseGroup, StopResidual
 from tvsbayes.statistics.chances import recursive_residuals
 

@@ -15,10 +15,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
+from numpy.typing import ArrayLike
 from platformdirs import user_cache_path
 
-from tvsbayes.instrument.axes import APPROACH_SIGN, PIXELS
-from tvsbayes.instrument.campaign import Campaign, Move, Spot, ordered_spots
+from tvsbayes.instrument.axes import APPROACH_SIGN
+from tvsbayes.instrument.campaign import Campaign, Move, Spot, ordered_spots, pixels_of
 from tvsbayes.instrument.stereo_pair import triangulate
 from tvsbayes.instrument.stops import redraws
 from tvsbayes.model.laser_path import MoveArrays
@@ -26,6 +27,8 @@ from tvsbayes.model.laser_path import MoveArrays
 SMALLEST_BUCKET = 512
 """Spots and moves are padded to this size or the next power of two above it: campaigns of ordinary size
 share one compiled function."""
+NOWHERE_MM = (500.0, 0.0, 0.0)
+"""Stands for the point of a look that counts for nothing: finite, and in front of the cameras."""
 
 
 class SpotArrays(eqx.Module):
@@ -59,32 +62,28 @@ class CampaignArrays(eqx.Module):
     azimuth_convention: Bool[Array, ""]
 
 
-def bucket(count: int) -> int:
-    """Padded length for `count` rows."""
-    size = SMALLEST_BUCKET
+def bucket(count: int, smallest: int | None = None, growth: int = 2) -> int:
+    """Padded length for `count` rows: `smallest`, by default `SMALLEST_BUCKET`, times a power of `growth`."""
+    size = SMALLEST_BUCKET if smallest is None else smallest
     while size < count:
-        size *= 2
+        size *= growth
     return size
+
+
+def padded(rows: ArrayLike, size: int, fill: ArrayLike = 0.0, dtype: type = np.float64) -> jax.Array:
+    """Rows (n, ...) with as many like `fill` behind them as make `size`."""
+    given: np.ndarray = np.asarray(rows, dtype)
+    rest: np.ndarray = np.broadcast_to(np.asarray(fill, dtype), (size - len(given), *given.shape[1:]))
+    return jnp.asarray(np.concatenate([given, rest]))
 
 
 def move_arrays(moves: Sequence[Move], size: int | None = None) -> MoveArrays:
     """Pad the moves, by default to their `bucket`; padding repeats the last counters and therefore changes nothing."""
     size = bucket(len(moves)) if size is None else size
-    steps = np.zeros((size, 2))
-    steps[: len(moves)] = [(m.pan_steps, m.tilt_steps) for m in moves]
-    steps[len(moves) :] = steps[len(moves) - 1]
-    first = np.zeros(size, dtype=bool)
-    first[: len(moves)] = [bool(m.pan_approach) for m in moves]
-    approach = np.zeros((size, 2))
-    approach[: len(moves)] = [
-        (APPROACH_SIGN.get(m.pan_approach, 0), APPROACH_SIGN.get(m.tilt_approach, 0)) for m in moves
-    ]
-    return MoveArrays(jnp.asarray(steps), jnp.asarray(first), jnp.asarray(approach))
-
-
-def pixels_of(spots: Sequence[Spot]) -> np.ndarray:
-    """Their pixels (u_left, v_left, u_right, v_right), shape (spots, 4)."""
-    return np.array([PIXELS(spot) for spot in spots], dtype=float).reshape(-1, 4)
+    steps = [(m.pan_steps, m.tilt_steps) for m in moves]
+    approach = [(APPROACH_SIGN.get(m.pan_approach, 0), APPROACH_SIGN.get(m.tilt_approach, 0)) for m in moves]
+    first = [bool(m.pan_approach) for m in moves]
+    return MoveArrays(padded(steps, size, steps[-1]), padded(first, size, False, bool), padded(approach, size))
 
 
 def pixel_covariance(spot: Spot) -> np.ndarray:
@@ -106,13 +105,7 @@ def campaign_arrays(campaign: Campaign) -> CampaignArrays:
         Arrays padded to `bucket` sizes.
     """
     spots = ordered_spots(campaign)
-    count, size = len(spots), bucket(len(spots))
-
-    def padded(rows, shape, fill=0.0, dtype=np.float64):
-        array = np.full((size, *shape), fill, dtype=dtype)
-        array[:count] = rows
-        return jnp.asarray(array)
-
+    size = bucket(len(spots))
     pixels = pixels_of(spots)
     covariance = np.stack([pixel_covariance(s) for s in spots])
     whitening = np.linalg.inv(np.linalg.cholesky(covariance))
@@ -123,26 +116,22 @@ def campaign_arrays(campaign: Campaign) -> CampaignArrays:
     points_mm[~seen] = NOWHERE_MM
     with jax.enable_x64(True):
         spot_arrays = SpotArrays(
-            move_index=padded([s.move for s in spots], (), spots[-1].move, np.int32),
-            pixels=padded(pixels, (4,), 0.0),
-            whitening=padded(whitening, (4, 4), np.eye(4)),
-            aperture_rad=padded(np.nan_to_num(np.radians(aperture)), ()),
-            has_aperture=padded(np.isfinite(aperture), ()),
-            triangulated_mm=padded(points_mm, (3,), NOWHERE_MM),
-            valid=padded(seen, ()),
-            weight=padded(1.0, (), 1.0),
-            redraw=padded(new.redraw, (2,), False, bool),
-            redraw_mix=padded(new.redraw_mix, (2, 2)),
-            new_segment=padded(new.new_segment, (), False, bool),
-            homed=padded(new.homed, (), False, bool),
+            move_index=padded([s.move for s in spots], size, spots[-1].move, np.int32),
+            pixels=padded(pixels, size),
+            whitening=padded(whitening, size, np.eye(4)),
+            aperture_rad=padded(np.nan_to_num(np.radians(aperture)), size),
+            has_aperture=padded(np.isfinite(aperture), size),
+            triangulated_mm=padded(points_mm, size, NOWHERE_MM),
+            valid=padded(seen, size),
+            weight=jnp.ones(size),
+            redraw=padded(new.redraw, size, False, bool),
+            redraw_mix=padded(new.redraw_mix, size),
+            new_segment=padded(new.new_segment, size, False, bool),
+            homed=padded(new.homed, size, False, bool),
         )
         return CampaignArrays(
             move_arrays(campaign.moves), spot_arrays, jnp.asarray(campaign.rig.aperture_convention == "azimuth")
         )
-
-
-NOWHERE_MM = (500.0, 0.0, 0.0)
-"""Stands for the point of a look that counts for nothing: finite, and in front of the cameras."""
 
 
 def in_sight(campaign: Campaign) -> np.ndarray:
@@ -161,7 +150,7 @@ def spot_constants(campaign: Campaign) -> np.ndarray:
 
 
 def log_constant(campaign: Campaign) -> float:
-    """Terms of the log likelihood that no parameter changes: 2 pi and the stated pixel covariances."""
+    """Their sum: terms of the log likelihood that no parameter changes."""
     return float(np.sum(spot_constants(campaign)))
 
 

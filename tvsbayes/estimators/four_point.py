@@ -18,8 +18,8 @@ from functools import partial
 import numpy as np
 
 from tvsbayes.errors import NothingToEstimate
-from tvsbayes.instrument.axes import AXES, DIRECTIONS, PIXELS, SENSES
-from tvsbayes.instrument.campaign import Campaign, Move, Spot, ordered_spots
+from tvsbayes.instrument.axes import AXES, DIRECTIONS, SENSES
+from tvsbayes.instrument.campaign import Campaign, Move, Spot, ordered_spots, pixels_of
 from tvsbayes.instrument.stereo_pair import Stereo, triangulate
 from tvsbayes.statistics.intervals import coverage_factor, effective_dof
 
@@ -194,11 +194,10 @@ def select_experiments(campaign: Campaign) -> Selection:
         else:
             skipped.append(SkippedExperiment(number, reason))
     spot_rows = np.array([k[1] for k in kept], dtype=int).reshape(-1, 4)
-    pixels = np.array([[PIXELS(campaign.spots[r]) for r in four] for four in spot_rows], float)
     return Selection(
         experiments=np.array([k[0] for k in kept], dtype=int),
         spot_rows=spot_rows,
-        pixels=pixels.reshape(-1, 4, 4),
+        pixels=pixels_of(campaign.spots[row] for row in spot_rows.ravel()).reshape(-1, 4, 4),
         steps=np.array([k[3] for k in kept], dtype=int),
         axis=np.array([k[2] for k in kept], dtype="U4"),
         skipped=tuple(skipped),

@@ -7,13 +7,6 @@ filter in time order. Angles rad, lengths mm; residuals are in units of their st
 
 State of the filter: stop error (pan, tilt), home offset (pan, tilt), position in the unknown play band (pan, tilt)
 in units of its standard deviation.
-
-All spots taken between two moves share their stop errors and form a group. With C the covariance of all residuals
-(unit noise + stop errors, home offsets, unknown play), one forward and one backward pass give, for every group g,
-u_g = [C^-1 r]_g, [C^-1 J]_g and the diagonal block M_g = [C^-1]_gg in time linear in the number of groups
-(disturbance smoother: de Jong, Biometrika 75 (1988) 594; Durbin and Koopman, Time Series Analysis by State Space
-Methods, 4.5): leave-one-out residuals, and what a fit would lose without a stop. The densities of whole moves given
-all other spots come from the same two passes in JAX, for many points of parameter space at once.
 """
 
 from __future__ import annotations

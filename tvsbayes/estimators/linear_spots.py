@@ -1,7 +1,10 @@
 """Spots linearised at a point of parameter space, and what each spot and each stop says beside all the others.
 
-NumPy after one compiled linearisation: the smoother over stop errors gives leave-one-out residuals, the information
-of every stop, and standard deviations without it. Residuals are whitened; coordinates z of the parameter space.
+NumPy after one compiled linearisation. All spots taken between two moves share their stop errors and form a group. With
+C the covariance of all residuals (unit noise + stop errors, home offsets, unknown play), one forward and one backward
+pass give, for every group g, u_g = [C^-1 r]_g, [C^-1 J]_g and the diagonal block M_g = [C^-1]_gg in time linear in the
+number of groups (disturbance smoother: de Jong, Biometrika 75 (1988) 594; Durbin and Koopman, Time Series Analysis by
+State Space Methods, 4.5): leave-one-out residuals, and what a fit would lose without a stop. Residuals are whitened.
 """
 
 from __future__ import annotations

@@ -13,8 +13,8 @@ import numpy as np
 
 from tvsbayes.errors import listed
 from tvsbayes.estimators.four_point import select_experiments
-from tvsbayes.instrument.axes import AXES, PIXELS
-from tvsbayes.instrument.campaign import Campaign
+from tvsbayes.instrument.axes import AXES
+from tvsbayes.instrument.campaign import Campaign, pixels_of
 from tvsbayes.instrument.stereo_pair import pair_doubts, triangulate
 from tvsbayes.instrument.stops import observed_stops, separation
 
@@ -47,8 +47,7 @@ class CampaignCheck:
 
 def _depths_mm(campaign: Campaign) -> np.ndarray:
     """X of the usable spots, frame S; not a number where no undistorted point is seen."""
-    pixels = np.array([PIXELS(spot) for spot in campaign.spots if spot.status == "ok"], dtype=float)
-    return triangulate(campaign.stereo, pixels.reshape(-1, 4))[:, 0]
+    return triangulate(campaign.stereo, pixels_of(s for s in campaign.spots if s.status == "ok"))[:, 0]
 
 
 def _can_stand(depths_mm: np.ndarray) -> np.ndarray:

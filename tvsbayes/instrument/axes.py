@@ -5,7 +5,6 @@ A counter counts up when pan turns left and tilt goes up. A side of approach is 
 
 from __future__ import annotations
 
-from operator import attrgetter
 from typing import Literal
 
 from tvsbayes.errors import InputError, escaped
@@ -26,7 +25,6 @@ DIRECTION_SIGNS: dict[str, tuple[Axis, int]] = {
 """Axis and sense of motion of a direction."""
 APPROACH_SIGN = {**{direction: sign for direction, (_, sign) in DIRECTION_SIGNS.items()}, "unknown": 0}
 """Sense of motion of an approach (formulation 2)."""
-PIXELS = attrgetter("u_left_px", "v_left_px", "u_right_px", "v_right_px")
 FULL_TURN_DEG = 360.0
 """Period of the wheel (the output member); a shorter one is the pinion's."""
 HOME_SD_DEG = 0.05

@@ -13,6 +13,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
+import numpy as np
+
 from tvsbayes.errors import escaped, refusal
 from tvsbayes.files.csv_table import CSV_BYTES_MAX, Table, csv_bytes, parse_table
 from tvsbayes.files.disk import make_folder, read_bytes, write_atomically
@@ -81,14 +83,15 @@ class Campaign:
 
 CAMERAS: tuple[Literal["left"], Literal["right"]] = ("left", "right")
 """The two cameras, in the order of the columns of spots.csv."""
+PIXELS = ("u_left_px", "v_left_px", "u_right_px", "v_right_px")
+"""Columns of a spot's centres."""
 NO_PIXELS = (None, None, None, None)
 """Pixels, or their standard uncertainties, of a look without a spot."""
 _MOVE_COLUMNS = ("move", "segment", "time_s", "pan_steps", "tilt_steps", "pan_approach", "tilt_approach")
-_PIXELS = ("u_left_px", "v_left_px", "u_right_px", "v_right_px")
 _PIXEL_SDS = ("su_left_px", "sv_left_px", "su_right_px", "sv_right_px")
 _SPOT_COLUMNS = (
     *("spot", "move", "target", "experiment", "point"),
-    *(*_PIXELS, *_PIXEL_SDS, "aperture_deg", "status"),
+    *(*PIXELS, *_PIXEL_SDS, "aperture_deg", "status"),
 )
 _CORRELATIONS = ("ruv_left", "ruv_right")
 ID_MAX = 10**9
@@ -204,9 +207,9 @@ def parse_spots(data: bytes, file: str, moves: int, stereo: Stereo) -> tuple[Spo
     # A look that found no spot may be taken again.
     check_experiments(table, experiments, points, [status == "ok" for status in statuses])
     size = {"u": float(stereo.image_width), "v": float(stereo.image_height)}
-    pixels = [table.numbers(column, -1e6, 1e6, empty=True) for column in _PIXELS]
+    pixels = [table.numbers(column, -1e6, 1e6, empty=True) for column in PIXELS]
     sds = [table.numbers(column, 1e-4, 100.0, empty=True) for column in _PIXEL_SDS]
-    for column, values in zip((*_PIXELS, *_PIXEL_SDS), (*pixels, *sds), strict=True):
+    for column, values in zip((*PIXELS, *_PIXEL_SDS), (*pixels, *sds), strict=True):
         extent = size.get(column[0], 0.0)
         for row, value in enumerate(values):
             if statuses[row] != "ok":
@@ -214,7 +217,7 @@ def parse_spots(data: bytes, file: str, moves: int, stereo: Stereo) -> tuple[Spo
             if value is None:
                 allowed = "a finite decimal number, or an empty cell with a status other than ok"
                 raise table.refuse(row, column, "missing", allowed, "give the value or a refusal reason")
-            if column in _PIXELS and not -_IMAGE_MARGIN <= value / extent <= 1 + _IMAGE_MARGIN:
+            if column in PIXELS and not -_IMAGE_MARGIN <= value / extent <= 1 + _IMAGE_MARGIN:
                 allowed = f"a position in the image, 0 to {extent:g} px, or close to it"
                 remedy = "check the image size in stereo.json, or give the spot a refusal reason"
                 raise table.refuse(row, column, "outside-image", allowed, remedy)
@@ -384,3 +387,8 @@ def input_hashes(campaign: Campaign) -> dict[str, str]:
 def ordered_spots(campaign: Campaign) -> list[Spot]:
     """Spots with status ok in the order in which the filter meets them."""
     return sorted((s for s in campaign.spots if s.status == "ok"), key=lambda s: (s.move, s.spot))
+
+
+def pixels_of(spots: Iterable[Spot]) -> np.ndarray:
+    """Their `PIXELS`, shape (spots, 4); not a number where there are none."""
+    return np.array([[getattr(spot, name) for name in PIXELS] for spot in spots], dtype=float).reshape(-1, 4)

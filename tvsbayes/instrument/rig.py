@@ -1,8 +1,6 @@
-"""The instrument as declared: parameter names and priors, rig files, and the stereo pair with its calibration.
+"""The instrument as declared: the `[rig]` table with its priors, and rig files (data/docs/campaign-files.md).
 
-Frames and units: formulation 2. mm, degrees where a name says `_deg`, radians where it says `_rad`, image px with
-the integer at the centre of a pixel. Stereo in OpenCV's conventions: camera axes x right, y down, z along the view;
-x_right = R x_left + T; Rodrigues vectors (formulation 3.3). No JAX.
+Units are those of the names: mm, degrees, radians, px, s; counters in steps. No JAX.
 """
 
 from __future__ import annotations
@@ -17,14 +15,7 @@ from tvsbayes.files.disk import read_bytes
 from tvsbayes.files.documents import TOML_BYTES_MAX, Keys, parse_toml, toml_line
 from tvsbayes.instrument.axes import AXES, DIRECTION_SIGNS, FULL_TURN_DEG
 from tvsbayes.instrument.counter_limits import COUNTER_MAX, LIMIT_KEYS, CounterLimits
-from tvsbayes.instrument.parameters import (
-    HARMONIC_NAMES,
-    NAMES,
-    REGISTRY,
-    RIG_NAMES,
-    RIG_PRIORS,
-    Prior,
-)
+from tvsbayes.instrument.parameters import HARMONIC_NAMES, NAMES, REGISTRY, RIG_NAMES, RIG_PRIORS, Prior
 from tvsbayes.instrument.stereo_pair import Stereo, read_stereo
 
 Setting = str | int | float

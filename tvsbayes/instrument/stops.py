@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -16,31 +16,6 @@ import numpy as np
 
 from tvsbayes.instrument.axes import APPROACH_SIGN, AXES, DIRECTIONS, direction_of
 from tvsbayes.instrument.campaign import Move
-
-
-@dataclass(frozen=True)
-class StopReadings:
-    """Mirror angles at the stops of one axis, as the spots told them and the fitted geometry reads them.
-
-    Attributes:
-        axis: pan or tilt.
-        steps: counter of each stop, shape (n,).
-        side: +1 reached left or up, -1 right or down, shape (n,).
-        mirror_deg: mirror angle, shape (n,); stop errors and home offsets are in it.
-        u_deg: its standard uncertainty from pixel noise alone, shape (n,).
-        play_left_out: stops whose last move may not have taken up the play.
-        reference_pose_deg: pan and tilt of the fit's reference pose.
-        values: parameters at the mode, by name.
-    """
-
-    axis: str
-    steps: np.ndarray
-    side: np.ndarray
-    mirror_deg: np.ndarray
-    u_deg: np.ndarray
-    play_left_out: int
-    reference_pose_deg: tuple[float, float]
-    values: Mapping[str, float]
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,8 +87,8 @@ def observed_stops(moves: Sequence[Move], observed: Collection[int], axis: str) 
         observed: numbers of the moves after which a usable spot was seen.
         axis: "pan" or "tilt".
     """
-    rests = rests_of(moves, axis) if moves else []
-    seen = dict.fromkeys(rest for move, rest in zip(moves, rests, strict=True) if move.move in observed)
+    found = zip(moves, rests_of(moves, axis), strict=True)
+    seen = dict.fromkeys(rest for move, rest in found if move.move in observed)
     return tuple(Stop(rest.segment, rest.steps, rest.sign) for rest in seen)
 
 

@@ -6,7 +6,7 @@ Nothing is fitted here and no angle standard is involved: the notes of a table s
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,7 +14,6 @@ import numpy as np
 from tvsbayes.calibration.optics import beam_angle_deg, beam_deg_per_step, output_deg
 from tvsbayes.calibration.pointing import Calibration
 from tvsbayes.instrument.axes import AXES
-from tvsbayes.instrument.stops import StopReadings
 from tvsbayes.metrology.iso230 import RUNS_MIN, figures_of
 from tvsbayes.metrology.simulated_cycles import (
     RUNS,
@@ -46,6 +45,31 @@ NOT_COVERED = (
     "an error that all looks of the cameras share: it is in the predicted E, M and A through the ratio, and in no "
     "plug-in figure",
 )
+
+
+@dataclass(frozen=True)
+class StopReadings:
+    """Mirror angles at the stops of one axis, as the spots told them and the fitted geometry reads them.
+
+    Attributes:
+        axis: pan or tilt.
+        steps: counter of each stop, shape (n,).
+        side: +1 reached left or up, -1 right or down, shape (n,).
+        mirror_deg: mirror angle, shape (n,); stop errors and home offsets are in it.
+        u_deg: its standard uncertainty from pixel noise alone, shape (n,).
+        play_left_out: stops whose last move may not have taken up the play.
+        reference_pose_deg: pan and tilt of the fit's reference pose.
+        values: parameters at the mode, by name.
+    """
+
+    axis: str
+    steps: np.ndarray
+    side: np.ndarray
+    mirror_deg: np.ndarray
+    u_deg: np.ndarray
+    play_left_out: int
+    reference_pose_deg: tuple[float, float]
+    values: Mapping[str, float]
 
 
 @dataclass(frozen=True)

@@ -12,16 +12,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from tvsbayes.instrument.axes import DIRECTIONS
+from tvsbayes.instrument.axes import AXES, DIRECTIONS
 from tvsbayes.model.geometry import Scalar
 from tvsbayes.model.laser_path import BeamAngles, Transmission, beam_angles
 from tvsbayes.model.parameter_space import ParameterSpace
 
-RATIOS = DIRECTIONS
-QUANTITIES: tuple[str, ...] = (
-    *RATIOS,
-    *("contrast.pan", "contrast.tilt", "backlash.pan", "backlash.tilt", "mirror_offset"),
-)
+QUANTITIES = (*DIRECTIONS, *(f"{kind}.{axis}" for kind in ("contrast", "backlash") for axis in AXES), "mirror_offset")
 """Headlines in the order of `headlines`: effective deg/step, their differences, lost motion (deg), offset (mm)."""
 
 

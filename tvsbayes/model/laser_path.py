@@ -16,12 +16,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from tvsbayes.instrument.parameters import HARMONIC_ORDERS
 from tvsbayes.model.geometry import Scalar, along_batch, intersect_plane, materialise, reflect, rotate_about_z
 
 UNIFORM_SD = 1 / 12**0.5
 """Standard deviation of a uniform distribution of unit width."""
-ORDERS = np.array([1.0, 2.0])
-"""Turns of a harmonic of the transmission error per period."""
+ORDERS = np.array(HARMONIC_ORDERS, dtype=float)
 
 
 class Harmonics(eqx.Module):

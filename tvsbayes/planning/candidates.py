@@ -10,7 +10,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import jax
 import numpy as np
@@ -106,6 +106,9 @@ class Seen:
     seen: np.ndarray
     mirror_angles_rad: np.ndarray
 
+    def __getitem__(self, chosen: np.ndarray) -> Seen:
+        return Seen(*(getattr(self, part.name)[chosen] for part in fields(Seen)))
+
 
 class LookArrays:
     """Looks in front of the compiled function, in blocks of one size."""
@@ -130,8 +133,7 @@ class LookArrays:
         """Evaluate at a point."""
         with jax.enable_x64(True):
             found = [expected_information(arrays, depth, self.rig, z, space) for arrays, depth in self.blocks]
-        names = ("rows", "slope", "seen", "mirror_angles_rad")
-        return Seen(*(np.concatenate([getattr(part, name) for part in found]) for name in names))
+        return Seen(*(np.concatenate([getattr(block, part.name) for block in found]) for part in fields(Seen)))
 
 
 CONTRAST_COLUMNS = [INDEX["ratio_contrast_deg_per_step.pan"], INDEX["ratio_contrast_deg_per_step.tilt"]]
@@ -224,7 +226,7 @@ def sided(positions: Positions, limits: np.ndarray, overshoot: np.ndarray) -> Lo
         good = np.all((both >= limits[:, 0]) & (both <= limits[:, 1]), axis=(0, 2))
         sides = np.tile(np.array(side), (int(good.sum()), 1))
         found.append(Looks(positions.steps[good], sides, positions.sheet[good]))
-    return Looks(*(np.concatenate([getattr(part, name) for part in found]) for name in ("steps", "side", "sheet")))
+    return Looks(*(np.concatenate([getattr(some, part.name) for some in found]) for part in fields(Looks)))
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from tvsbayes.errors import InputError
-from tvsbayes.estimators.campaign_arrays import NOWHERE_MM, CampaignArrays, SpotArrays, move_arrays
+from tvsbayes.estimators.campaign_arrays import NOWHERE_MM, CampaignArrays, SpotArrays, bucket, move_arrays, padded
 from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.estimators.likelihood import filter_rows, kalman_update, no_belief
 from tvsbayes.estimators.linear_spots import linearise
@@ -38,16 +38,8 @@ LOOKS_PER_EXPERIMENT = 4
 """The paper counts four spots as one experiment; so do all curves here, whatever the looks are."""
 PARAMETERS = len(NAMES)
 HOME_VARIANCE_RAD2 = math.radians(HOME_SD_DEG) ** 2
-SMALLEST_DESIGN = 128
+SMALLEST_DESIGN, DESIGN_GROWTH = 128, 4
 """Looks are padded to this size or a power of four above it; moves to twice that."""
-
-
-def padded_size(count: int) -> int:
-    """Padded number of looks."""
-    size = SMALLEST_DESIGN
-    while size < count:
-        size *= 4
-    return size
 
 
 @dataclass(frozen=True)
@@ -94,7 +86,7 @@ class Expectation(eqx.Module):
     """The looks of a plan as the model expects them at one point of parameter space; first axis: looks.
 
     `rows` = d(standardised innovations)/d(coordinates, common offset of pan, of tilt in rad): over all looks
-    rows^T rows is the Fisher information. The other arrays are those of `likelihood.LinearSpots`. A look that misses
+    rows^T rows is the Fisher information. The other arrays are those of `linear_spots.LinearSpots`. A look that misses
     its sheet or an image is not `seen` and its rows are zero.
     """
 
@@ -169,29 +161,24 @@ def design_arrays(
 ) -> CampaignArrays:
     """Moves and looks without pixels; segments from `homed_from` on have an unknown home offset."""
     # Half the moves rounded up: there are twice as many places for them as for looks.
-    size, count = padded_size(max(len(look_moves), (len(moves) + 1) // 2)), len(look_moves)
-
-    def padded(rows, shape, fill, dtype=float):
-        array = np.full((size, *shape), fill, dtype=dtype)
-        array[: len(rows)] = rows
-        return jnp.asarray(array)
-
+    count = len(look_moves)
+    size = bucket(max(count, (len(moves) + 1) // 2), SMALLEST_DESIGN, DESIGN_GROWTH)
     new = redraws(moves, look_moves, homed_from)
     return CampaignArrays(
         move_arrays(moves, 2 * size),
         SpotArrays(
-            move_index=padded(look_moves, (), look_moves[-1], np.int32),
+            move_index=padded(look_moves, size, look_moves[-1], np.int32),
             pixels=jnp.zeros((size, 4)),
             whitening=jnp.asarray(np.tile(np.eye(4) / float(rig.cameras["spot_sd_px"]), (size, 1, 1))),
             aperture_rad=jnp.zeros(size),
-            has_aperture=padded([float(aperture)] * count, (), 0.0),
+            has_aperture=padded([float(aperture)] * count, size),
             triangulated_mm=jnp.zeros((size, 3)),
-            valid=padded([1.0] * count, (), 0.0),
+            valid=padded([1.0] * count, size),
             weight=jnp.ones(size),
-            redraw=padded(new.redraw, (2,), False, bool),
-            redraw_mix=padded(new.redraw_mix, (2, 2), 0.0),
-            new_segment=padded(new.new_segment, (), False, bool),
-            homed=padded(new.homed, (), False, bool),
+            redraw=padded(new.redraw, size, False, bool),
+            redraw_mix=padded(new.redraw_mix, size),
+            new_segment=padded(new.new_segment, size, False, bool),
+            homed=padded(new.homed, size, False, bool),
         ),
         jnp.asarray(rig.table.aperture_convention == "azimuth"),
     )
@@ -203,9 +190,8 @@ def expected_information(
     """`expect` without padding, as NumPy arrays."""
     count = len(depth_mm)
     last = np.tile([rig.stereo.image_width - 1.0, rig.stereo.image_height - 1.0], 2)
-    padded = np.full(arrays.spots.valid.shape, depth_mm[-1])
-    padded[:count] = depth_mm
-    found = expect(jnp.asarray(z), space, arrays, jnp.asarray(padded), jnp.asarray(last))
+    depths = padded(depth_mm, len(arrays.spots.valid), depth_mm[-1])
+    found = expect(jnp.asarray(z), space, arrays, depths, jnp.asarray(last))
     return jax.tree.map(lambda x: np.asarray(x)[:count], found)
 
 

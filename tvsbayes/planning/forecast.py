@@ -196,8 +196,7 @@ class Assurance:
             information = information_of_looks(scene, chosen, design.path, truth.space, knowledge.after_data)
             return covariance_of(knowledge.precision + information)
 
-        taken = Seen(*(getattr(seen, name)[chosen] for name in ("rows", "slope", "seen", "mirror_angles_rad")))
-        z = believed(truth, taken, self.looks.side[chosen], covariance(seen), knowledge, noise)
+        z = believed(truth, seen[chosen], self.looks.side[chosen], covariance(seen), knowledge, noise)
         return at_truth.value(covariance(self._rescaled(seen, truth, z)), self.target.factor)
 
     def _rescaled(self, seen: Seen, truth: DrawnTruth, z: np.ndarray) -> Seen:
@@ -326,7 +325,7 @@ class ClassicAnswer:
 
 def classic_answer(target: Target, forecast: ClassicForecast | None, campaign: Campaign | None) -> ClassicAnswer | None:
     """N = (t s / E)^2 with the uncertainty of s: over instruments, or by chi-square where s was measured."""
-    if forecast is None or not set(target.indices) <= {0, 1, 2, 3} or target.point_mm is not None:
+    if forecast is None or not target.of_ratios:
         return None
     half_width = target.limit * NORMAL_95 / target.factor
     measured = None if campaign is None else _measured(campaign)
@@ -368,7 +367,7 @@ def _measured(campaign: Campaign) -> dict[str, tuple[float, int]] | None:
 def value_of_classic(forecast: ClassicForecast | None, target: Target, experiments: int) -> float | None:
     """Median over instruments of what the classic estimator should report: type A and stereo, as GUM adds them."""
     each = experiments / len(DIRECTIONS)
-    if forecast is None or each < 2 or target.point_mm is not None or not set(target.indices) <= {0, 1, 2, 3}:
+    if forecast is None or each < 2 or not target.of_ratios:
         return None
     rows = list(target.indices)
     u = np.sqrt(forecast.sd[:, rows] ** 2 / each + forecast.stereo_u[rows] ** 2)

@@ -18,15 +18,16 @@ from tvsbayes.calibration.pointing import NOISE_NAMES as CALIBRATION_NOISE
 from tvsbayes.coordinates.beam_meeting import Sources, propagate
 from tvsbayes.coordinates.location import settings_of
 from tvsbayes.errors import InputError, escaped
+from tvsbayes.instrument.axes import DIRECTIONS
 from tvsbayes.instrument.parameters import INDEX
 from tvsbayes.instrument.protocols import OVERSHOOT_STEPS
 from tvsbayes.instrument.rig import RigTable
-from tvsbayes.model.headlines import QUANTITIES, RATIOS, headlines, physical_at
+from tvsbayes.model.headlines import QUANTITIES, headlines, physical_at
 from tvsbayes.model.parameter_space import ParameterSpace
 from tvsbayes.statistics.intervals import NORMAL_95
 
 UNITS = {
-    **dict.fromkeys((*RATIOS, "worst", "contrast.pan", "contrast.tilt"), "deg/step"),
+    **dict.fromkeys((*DIRECTIONS, "worst", "contrast.pan", "contrast.tilt"), "deg/step"),
     **dict.fromkeys(("backlash.pan", "backlash.tilt"), "deg"),
     **dict.fromkeys(("mirror_offset", "x", "y", "z", "xyz"), "mm"),
 }
@@ -60,7 +61,12 @@ class Target:
         """Rows of the headlines, or of x, y, z, whose worst is meant."""
         if self.quantity in COORDINATES:
             return COORDINATES[self.quantity]
-        return (0, 1, 2, 3) if self.quantity == "worst" else (QUANTITIES.index(self.quantity),)
+        return tuple(range(len(DIRECTIONS))) if self.quantity == "worst" else (QUANTITIES.index(self.quantity),)
+
+    @property
+    def of_ratios(self) -> bool:
+        """Effective ratios are wanted, which the four-point estimator estimates too."""
+        return self.quantity == "worst" or self.quantity in DIRECTIONS
 
     def as_json(self) -> dict[str, object]:
         """Part of the documents of `plan` and `study`."""

@@ -16,19 +16,16 @@ import jax
 import numpy as np
 import xarray as xr
 
-from tvsbayes.estimators.campaign_arrays import pixels_of
 from tvsbayes.files.disk import write_atomically
 from tvsbayes.instrument.axes import AXES, DIRECTIONS, SENSES
-from tvsbayes.instrument.campaign import input_hashes, ordered_spots
+from tvsbayes.instrument.campaign import input_hashes, ordered_spots, pixels_of
 from tvsbayes.instrument.parameters import BLOCKS, HARMONIC_NAMES, NAMES, RIG_NAMES, STEREO_PARAMETER_NAMES
 from tvsbayes.model.headlines import Derived
 from tvsbayes.posterior.draws import Draws, Posterior
-from tvsbayes.posterior.predictive import PIXELS, move_log_likelihood, predictive_pixels
+from tvsbayes.posterior.predictive import PIXEL_LABELS, move_log_likelihood, predictive_pixels
 from tvsbayes.posterior.sampling import fingerprint
 
 POSTERIOR_FORMAT = "tvsbayes-posterior/1"
-
-
 COORDS: dict[str, tuple[str, ...]] = {
     "direction": DIRECTIONS,
     "axis": AXES,
@@ -125,7 +122,10 @@ def data_tree(posterior: Posterior) -> xr.DataTree:
         "acceptance_rate": xr.DataArray(posterior.convergence.acceptance, {"chain": coords["chain"]}, ("chain",)),
     }
     observed = xr.DataArray(
-        pixels_of(spots), {"spot": [s.spot for s in spots], "pixel": list(PIXELS)}, ("spot", "pixel"), name="pixels"
+        pixels_of(spots),
+        {"spot": [s.spot for s in spots], "pixel": list(PIXEL_LABELS)},
+        ("spot", "pixel"),
+        name="pixels",
     )
     tree = xr.DataTree.from_dict(
         {

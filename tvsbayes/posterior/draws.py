@@ -14,7 +14,7 @@ import numpy as np
 from arviz_stats.base import array_stats
 
 from tvsbayes.estimators.joint_fit import JointFit
-from tvsbayes.instrument.axes import DIRECTION_SIGNS, DIRECTIONS, SENSES
+from tvsbayes.instrument.axes import AXES, DIRECTION_SIGNS, DIRECTIONS, SENSES
 from tvsbayes.instrument.parameters import NAMES
 from tvsbayes.model.headlines import Derived, derived_quantities
 from tvsbayes.posterior.transport import in_batches
@@ -41,8 +41,8 @@ class Draws(Mapping[str, np.ndarray]):
             self._columns[f"degrees_per_step.{negative}"] = ratio - half
         effective = np.asarray(draws.effective_deg_per_step).reshape(-1, len(DIRECTIONS))
         self._columns |= {f"effective_deg_per_step.{d}": effective[:, k] for k, d in enumerate(DIRECTIONS)}
-        for axis, first in (("pan", 0), ("tilt", 2)):
-            self._columns[f"effective_contrast_deg_per_step.{axis}"] = effective[:, first] - effective[:, first + 1]
+        contrast = effective[:, ::2] - effective[:, 1::2]
+        self._columns |= {f"effective_contrast_deg_per_step.{a}": contrast[:, k] for k, a in enumerate(AXES)}
         self._columns["effective_mirror_offset_mm"] = np.asarray(draws.effective_mirror_offset_mm).ravel()
 
     def __getitem__(self, name: str) -> np.ndarray:
@@ -207,7 +207,6 @@ def derived_at(fit: JointFit, z: np.ndarray, pose_rad: np.ndarray) -> Derived:
     """Parameters and headlines of draws (chain, draw, p) at a pose (pan, tilt)."""
     shape = z.shape[:2]
     pose = jnp.asarray(pose_rad)
-    flat = in_batches(
-        lambda block: derived_quantities(block, fit.space, pose), z.reshape(-1, z.shape[-1]), DERIVED_BATCH
-    )
+    points = z.reshape(-1, z.shape[-1])
+    flat = in_batches(lambda block: derived_quantities(block, fit.space, pose), points, size=DERIVED_BATCH)
     return jax.tree.map(lambda x: x.reshape(*shape, *x.shape[1:]), flat)

@@ -24,11 +24,11 @@ from tvsbayes.estimators.likelihood import (
     observe_with_stop_errors,
 )
 from tvsbayes.instrument.axes import HOME_SD_DEG
-from tvsbayes.instrument.campaign import ordered_spots
+from tvsbayes.instrument.campaign import PIXELS, ordered_spots
 from tvsbayes.instrument.parameters import INDEX
 from tvsbayes.model.parameter_space import STOP_COLUMNS, ParameterSpace
 from tvsbayes.posterior.draws import Posterior
-from tvsbayes.posterior.transport import BATCH, in_batches
+from tvsbayes.posterior.transport import in_batches
 
 RANK_TOLERANCE = 1e-12
 """Share of a state's precision below which what other states leave of it is rounding, not information."""
@@ -127,7 +127,7 @@ def move_log_density(
     return jax.vmap(one)(z)
 
 
-PIXELS = ("u_left", "v_left", "u_right", "v_right")
+PIXEL_LABELS = tuple(name.removesuffix("_px") for name in PIXELS)
 
 
 def move_log_likelihood(posterior: Posterior) -> xr.DataArray:
@@ -149,16 +149,9 @@ def move_log_likelihood(posterior: Posterior) -> xr.DataArray:
 
 def looks(fit: JointFit, z: np.ndarray, stop_error_rad: np.ndarray) -> np.ndarray:
     """Noiseless pixels of all ordered spots, shape (draws, spots, 4), for coordinates (draws, p)."""
-    count, blocks = len(ordered_spots(fit.campaign)), []
     with jax.enable_x64(True):
-        for start in range(0, len(z), BATCH):
-            rows = np.arange(len(z))[start : start + BATCH]
-            filled = np.resize(rows, BATCH)
-            seen = observe_with_stop_errors(
-                jnp.asarray(z[filled]), jnp.asarray(stop_error_rad[filled]), fit.space, fit.arrays
-            )
-            blocks.append(np.asarray(seen)[: len(rows), :count, :4])
-    return np.concatenate(blocks)
+        seen = in_batches(lambda z, e: observe_with_stop_errors(z, e, fit.space, fit.arrays), z, stop_error_rad)
+    return np.asarray(seen)[:, : len(ordered_spots(fit.campaign)), :4]
 
 
 def ideal_pixels(posterior: Posterior, draws: int) -> np.ndarray:
@@ -182,7 +175,7 @@ def predictive_pixels(posterior: Posterior, draws_per_chain: int = 8) -> xr.Data
     physical = np.asarray(posterior.draws.physical)[:, chosen].reshape(len(z), -1)
     values = looks_again(fit, z, physical, generator).reshape(chains, len(chosen), -1, 4)
     spots = [spot.spot for spot in ordered_spots(fit.campaign)]
-    coords = {"chain": np.arange(chains), "draw": chosen, "spot": spots, "pixel": list(PIXELS)}
+    coords = {"chain": np.arange(chains), "draw": chosen, "spot": spots, "pixel": list(PIXEL_LABELS)}
     return xr.DataArray(values.astype(np.float32), coords, ("chain", "draw", "spot", "pixel"))
 
 

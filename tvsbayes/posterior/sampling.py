@@ -1,14 +1,8 @@
-"""The posterior: sampled until it has converged, diagnosed, carried into any quantity, kept for ArviZ.
+"""The posterior sampled until it has converged: the loop, its checkpoint and its diagnosis.
 
-emcee samples in coordinates in which the posterior is nearly standard normal. Three layers: z, the prior-normal
-coordinates of `tvsbayes.model`; y, whitened by the Laplace covariance; w, in which walkers live. Wide directions (laser
-tilt, mirror errors) bend the ridges on which the narrow ones (extrinsics, ratios) lie: a shear moves each narrow
-coordinate by a quadratic form of the wider ones. Noise scales widen and turn what they limit (a stop sd its ratio, the
-backlash and their sums): in w everything else is measured from the mean and by the covariance that the linearised
-campaign has at the noise scales of the walker. NumPy outside the compiled density.
-
-Arrays of draws are ordered (chain, draw, ...); a chain is a walker. Units are those of data/docs/conventions.md (deg,
-mm, px). Convergence is judged on the stored draws, so that what ArviZ computes from `posterior.nc` is what was judged.
+emcee samples in coordinates w in which the posterior is nearly standard normal (`posterior.transport`). Arrays of draws
+are ordered (chain, draw, ...); a chain is a walker. Convergence is judged on the stored draws, so that what ArviZ
+computes from `posterior.nc` is what was judged.
 """
 
 from __future__ import annotations

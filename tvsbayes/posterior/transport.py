@@ -2,7 +2,9 @@
 
 Three layers: z, the prior-normal coordinates of the model; y, whitened by the Laplace covariance; w, in which walkers
 live. Wide directions (laser tilt, mirror errors) bend the ridges on which the narrow ones (extrinsics, ratios) lie: a
-shear moves each narrow coordinate by a quadratic form of the wider ones. Noise scales widen and turn what they limit.
+shear moves each narrow coordinate by a quadratic form of the wider ones. Noise scales widen and turn what they limit (a
+stop sd its ratio, the backlash and their sums): in w everything else is measured from the mean and by the covariance
+that the linearised campaign has at the noise scales of the walker. NumPy outside the compiled density.
 """
 
 from __future__ import annotations
@@ -236,17 +238,14 @@ class Transport:
         return straight
 
 
-def in_batches[Result](function: Callable[[jax.Array], Result], points: np.ndarray, size: int = BATCH) -> Result:
-    """Call a compiled function on blocks of one size and join the results along the first axis.
+def in_batches[Result](function: Callable[..., Result], *points: np.ndarray, size: int = BATCH) -> Result:
+    """Call a compiled function on blocks of one size of each of `points` and join the results along the first axis.
 
     The last block is filled up with its last row, so that nothing is compiled for a rest.
     """
-    blocks = []
-    for start in range(0, len(points), size):
-        block = points[start : start + size]
-        count = len(block)
-        if count < size:
-            block = np.concatenate([block, np.repeat(block[-1:], size - count, axis=0)])
-        result = function(jnp.asarray(block))
-        blocks.append(jax.tree.map(lambda x, n=count: np.asarray(x)[:n], result))
+    blocks, total = [], len(points[0])
+    for start in range(0, total, size):
+        rows = np.minimum(np.arange(start, start + size), total - 1)
+        result = function(*(jnp.asarray(x[rows]) for x in points))
+        blocks.append(jax.tree.map(lambda x, n=total - start: np.asarray(x)[:n], result))
     return jax.tree.map(lambda *parts: np.concatenate(parts), *blocks)

@@ -9,7 +9,12 @@ import math
 
 import numpy as np
 
+LEVELS = (0.50, 0.68, 0.90, 0.95)
+"""Probabilities of the intervals whose coverage is counted."""
 ASSURED = (0.8, 0.95)
+"""Assurances of which a plan states the number of experiments; it meets its target from the first on."""
+BOUND = 1e-4
+"""Two-sided probability with which an honest study leaves its bounds."""
 
 
 def recursive_residuals(values: np.ndarray, variances: np.ndarray, *, backwards: bool) -> tuple[float | None, ...]:
@@ -70,13 +75,6 @@ def share_error(share: float, draws: int) -> float:
     if 0 < share < 1:
         return math.sqrt(share * (1 - share) / draws)
     return math.sqrt(0.5 * (draws + 0.5) / (draws + 2)) / (draws + 1)
-
-
-LEVELS = (0.50, 0.68, 0.90, 0.95)
-
-
-BOUND = 1e-4
-"""Two-sided probability with which an honest study leaves its bounds."""
 
 
 def binomial_bounds(count: int, probability: float) -> tuple[float, float]:

@@ -20,8 +20,8 @@ import numpy as np
 
 from tvsbayes.errors import InputError, TvsError
 from tvsbayes.estimators.joint_fit import JointFit, fit
-from tvsbayes.instrument.axes import AXES, DIRECTIONS
-from tvsbayes.instrument.parameters import INDEX
+from tvsbayes.instrument.axes import DIRECTIONS, SENSES
+from tvsbayes.instrument.parameters import BLOCKS, INDEX
 from tvsbayes.instrument.plan import PlanStep
 from tvsbayes.instrument.rig import Rig, rig_table_toml
 from tvsbayes.instrument.stereo_pair import stereo_bytes
@@ -35,6 +35,7 @@ from tvsbayes.studies.rows import STUDY_FORMAT, HeadlineRow, StudyRow
 from tvsbayes.twin.physics import effective_deg_per_step, effective_mirror_offset_mm
 from tvsbayes.twin.simulated_campaign import Truth, simulate
 
+BACKLASH_COLUMNS = [INDEX[name] for name in BLOCKS["backlash_deg"]]
 ITERATIONS = 6
 """Of slope and width of a backlash: the width's error falls at least threefold each."""
 
@@ -78,10 +79,8 @@ def true_headlines(parameters: Mapping[str, float], pose_rad: np.ndarray) -> np.
     return np.array(
         [
             *(ratio[d] for d in DIRECTIONS),
-            ratio["left"] - ratio["right"],
-            ratio["up"] - ratio["down"],
-            parameters["backlash_deg.pan"],
-            parameters["backlash_deg.tilt"],
+            *(ratio[positive] - ratio[negative] for positive, negative in SENSES.values()),
+            *(parameters[name] for name in BLOCKS["backlash_deg"]),
             effective_mirror_offset_mm(parameters, pose),
         ]
     )
@@ -154,11 +153,10 @@ def predicted_sds(knowledge: Knowledge, fisher: np.ndarray, gradient: np.ndarray
     Returns:
         Shape (q,).
     """
-    columns = [INDEX[f"backlash_deg.{axis}"] for axis in AXES]
-    slope = half_normal_slope(z[columns])
+    slope = half_normal_slope(z[BACKLASH_COLUMNS])
     scale, covariance = np.ones(len(z)), np.eye(len(z))
     for _ in range(ITERATIONS):
-        for column, at in zip(columns, slope, strict=True):
+        for column, at in zip(BACKLASH_COLUMNS, slope, strict=True):
             width = math.sqrt(covariance[column, column])
             scale[column] = half_normal_sd(z[column], width) / width / at
         covariance = covariance_of(knowledge.precision + fisher * np.outer(scale, scale))
@@ -167,14 +165,6 @@ def predicted_sds(knowledge: Knowledge, fisher: np.ndarray, gradient: np.ndarray
 
 def _headline_draws(result: JointFit) -> np.ndarray:
     """`QUANTITIES` of the Laplace draws, shape (draws, 9)."""
-    ratio, physical = np.asarray(result.draws.effective_deg_per_step), np.asarray(result.draws.physical)
-    return np.column_stack(
-        [
-            ratio,
-            ratio[:, 0] - ratio[:, 1],
-            ratio[:, 2] - ratio[:, 3],
-            physical[:, INDEX["backlash_deg.pan"]],
-            physical[:, INDEX["backlash_deg.tilt"]],
-            result.draws.effective_mirror_offset_mm,
-        ]
-    )
+    ratio, offset_mm = np.asarray(result.draws.effective_deg_per_step), result.draws.effective_mirror_offset_mm
+    backlash = np.asarray(result.draws.physical)[:, BACKLASH_COLUMNS]
+    return np.column_stack([ratio, ratio[:, ::2] - ratio[:, 1::2], backlash, offset_mm])

@@ -14,7 +14,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from tvsbayes.instrument.axes import APPROACH_SIGN, FULL_TURN_DEG
+from tvsbayes.instrument.axes import APPROACH_SIGN, AXES, DIRECTION_SIGNS, FULL_TURN_DEG
 from tvsbayes.instrument.parameters import HARMONIC_ORDERS
 from tvsbayes.instrument.stereo_pair import Stereo, rotation_matrix
 
@@ -301,9 +301,10 @@ def effective_deg_per_step(
 
     The mean over a period of the transmission error, without its local slope.
     """
-    jacobian = beam_jacobian(parameters, reference_pose_deg)
-    slopes = {"left": jacobian[0, 0], "right": jacobian[0, 0], "up": jacobian[1, 1], "down": jacobian[1, 1]}
-    return {name: float(parameters[f"degrees_per_step.{name}"] * slope) for name, slope in slopes.items()}
+    slope = dict(zip(AXES, np.diagonal(beam_jacobian(parameters, reference_pose_deg)), strict=True))
+    return {
+        name: float(parameters[f"degrees_per_step.{name}"] * slope[axis]) for name, (axis, _) in DIRECTION_SIGNS.items()
+    }
 
 
 def effective_mirror_offset_mm(parameters: Mapping[str, float], pose_deg: tuple[float, float]) -> float:

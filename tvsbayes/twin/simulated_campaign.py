@@ -20,12 +20,7 @@ from tvsbayes.files.disk import read_bytes, write_atomically
 from tvsbayes.files.documents import JSON_BYTES_MAX, parse_json
 from tvsbayes.instrument.axes import FULL_TURN_DEG, HOME_SD_DEG, SIDES, PanApproach, TiltApproach
 from tvsbayes.instrument.campaign import NO_PIXELS, Campaign, Move, Spot, with_pixels, write_campaign
-from tvsbayes.instrument.parameters import (
-    HARMONIC_NAMES,
-    RIG_NAMES,
-    STEREO_PARAMETER_NAMES,
-    Prior,
-)
+from tvsbayes.instrument.parameters import HARMONIC_NAMES, RIG_NAMES, STEREO_PARAMETER_NAMES, Prior
 from tvsbayes.instrument.plan import HOME_APPROACH, PlanLog, PlannedLook, PlanStep, run_plan
 from tvsbayes.instrument.rig import Rig, require_periods
 from tvsbayes.instrument.stereo_pair import Stereo
@@ -86,10 +81,10 @@ class Truth:
 
     parameters: dict[str, float]
     stereo: Stereo
-    mirror_angles_deg: tuple[tuple[float, float], ...] = ()
-    stop_errors_deg: tuple[tuple[float, float], ...] = ()
-    home_offsets_deg: tuple[tuple[float, float], ...] = ()
-    reference_pose_deg: tuple[float, float] | None = None
+    mirror_angles_deg: tuple[Pair, ...] = ()
+    stop_errors_deg: tuple[Pair, ...] = ()
+    home_offsets_deg: tuple[Pair, ...] = ()
+    reference_pose_deg: Pair | None = None
     note: str = "The true rig of a simulated campaign; no estimator reads this file."
 
     def as_json(self) -> TruthDocument:

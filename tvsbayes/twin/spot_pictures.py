@@ -89,12 +89,10 @@ class Footprint:
 
 @dataclass(frozen=True)
 class SpotFrames:
-    """Pictures of one look; a footprint is None where the camera cannot see the point at all."""
+    """Pictures of one look."""
 
     left: np.ndarray
     right: np.ndarray
-    left_footprint: Footprint | None
-    right_footprint: Footprint | None
 
 
 def footprint(
@@ -255,11 +253,8 @@ def render_spots(
         frame: number of the exposure of this look.
     """
 
-    def taken(number: int, camera: Camera) -> tuple[np.ndarray, Footprint | None]:
-        at = light.points_mm, light.directions, light.normals
-        mark = footprint(camera, *at, scene, sensor.blur_px)
-        return render_spot(mark, camera.width, camera.height, scene, sensor, (seed, spot, number), frame), mark
+    def taken(number: int, camera: Camera) -> np.ndarray:
+        mark = footprint(camera, light.points_mm, light.directions, light.normals, scene, sensor.blur_px)
+        return render_spot(mark, camera.width, camera.height, scene, sensor, (seed, spot, number), frame)
 
-    left, left_mark = taken(0, cameras.left)
-    right, right_mark = taken(1, cameras.right)
-    return SpotFrames(left, right, left_mark, right_mark)
+    return SpotFrames(taken(0, cameras.left), taken(1, cameras.right))
