@@ -57,7 +57,7 @@ def test_other_noise_scales_need_no_new_look(knowledge, found, seen):
     z = knowledge.z.copy()
     z[[*STOP_COLUMNS.ravel(), PIXEL_COLUMN]] = (0.7, -1.1, 0.4, 1.3, -0.6)
     again = assurance.arrays.at(z, knowledge.space).rows
-    quick = assurance._rescaled(assurance.arrays.at(truth.z, truth.space), truth, z).rows
+    quick = assurance.rescaled(assurance.arrays.at(truth.z, truth.space), truth, z).rows
     one, other = (np.einsum("mij,mik->jk", rows, rows) for rows in (again, quick))
     assert np.abs(one - other).max() < ROUNDING * np.abs(one).max()
     before = np.einsum("mij,mik->jk", seen.rows, seen.rows)

@@ -11,7 +11,7 @@ from support.small_posterior import ROUNDING, SIGMAS, small_fit
 
 from tvsbayes.errors import InputError, NotConverged
 from tvsbayes.posterior.proposal import Target
-from tvsbayes.posterior.sampling import _stored, diagnose, sample
+from tvsbayes.posterior.sampling import diagnose, sample, stored_chain
 
 LONG, SHORT, BLOCK = 96, 12, 6
 SEED = 3
@@ -158,7 +158,7 @@ def test_what_is_missing_when_the_time_is_over_is_said(fitted, monkeypatch):
 
 
 def test_a_stuck_walker_is_found(fitted, long):
-    route, start, chain = _stored(long[1], fitted, SEED)
+    route, start, chain = stored_chain(long[1], fitted, SEED)
     with jax.enable_x64(True):
         before = diagnose(fitted, route, start, chain, SEED).convergence
         walker = int(np.argmax(before.acceptance))

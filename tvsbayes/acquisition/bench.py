@@ -28,7 +28,7 @@ from tvsbayes.files.disk import write_atomically
 from tvsbayes.instrument.rig import Rig
 from tvsbayes.positioner.driver import Clock, Positioner
 from tvsbayes.positioner.serial_port import positioner_of
-from tvsbayes.twin.simulated_campaign import SPOT_SD_PX, pan_and_tilt
+from tvsbayes.twin.simulated_campaign import pan_and_tilt
 
 SIMULATED_START = datetime.datetime(2026, 1, 1, tzinfo=datetime.UTC)
 """Time of day at which every simulated campaign begins: same seed, same bytes."""
@@ -131,7 +131,7 @@ def simulated(rig: Rig, seed: int, before: Recorded, vision: Vision) -> Iterator
 
     try:
         if vision.renderer is None:
-            yield bench(TwinObserver(instrument, float(rig.cameras.get("spot_sd_px", SPOT_SD_PX))))
+            yield bench(TwinObserver(instrument, rig.spot_sd_px))
             return
         with VirtualCamera(_exposures(instrument, vision.renderer)) as virtual:
             camera = open_cameras({"source": virtual.address}, rig.stereo.image_width, rig.stereo.image_height)

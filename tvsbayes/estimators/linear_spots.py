@@ -83,22 +83,6 @@ def linearise(z: Float[Array, " parameters"], space: ParameterSpace, arrays: Cam
     )
 
 
-def linear_spots(lin: Linearised, arrays: CampaignArrays, jacobian: np.ndarray) -> LinearSpots:
-    """A linearised campaign as the smoother reads it.
-
-    Args:
-        lin: without padding.
-        arrays: the campaign it comes from.
-        jacobian: d(prediction)/d(whatever is asked about), shape (spots, 4, columns).
-    """
-    with jax.enable_x64(True):
-        spots = jax.tree.map(lambda x: jnp.asarray(x)[: len(lin.residual)], arrays.spots)
-        lin = jax.tree.map(jnp.asarray, lin)
-        found = filter_rows(lin.residual, lin.slope, lin.play_sd_rad, lin.stop_variance, spots)
-        rows = jax.tree.map(np.asarray, found)
-    return LinearSpots(rows.residual, rows.load, rows.keep == 0, rows.variance, jacobian)
-
-
 @dataclass(frozen=True)
 class LinearSpots:
     """The linearised campaign, spots in time order, without padding.
@@ -116,6 +100,22 @@ class LinearSpots:
     renewed: np.ndarray
     variance: np.ndarray
     jacobian: np.ndarray
+
+
+def linear_spots(lin: Linearised, arrays: CampaignArrays, jacobian: np.ndarray) -> LinearSpots:
+    """A linearised campaign as the smoother reads it.
+
+    Args:
+        lin: without padding.
+        arrays: the campaign it comes from.
+        jacobian: d(prediction)/d(whatever is asked about), shape (spots, 4, columns).
+    """
+    with jax.enable_x64(True):
+        spots = jax.tree.map(lambda x: jnp.asarray(x)[: len(lin.residual)], arrays.spots)
+        lin = jax.tree.map(jnp.asarray, lin)
+        found = filter_rows(lin.residual, lin.slope, lin.play_sd_rad, lin.stop_variance, spots)
+        rows = jax.tree.map(np.asarray, found)
+    return LinearSpots(rows.residual, rows.load, rows.keep == 0, rows.variance, jacobian)
 
 
 @dataclass(frozen=True)

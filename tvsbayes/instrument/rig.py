@@ -18,6 +18,8 @@ from tvsbayes.instrument.counter_limits import COUNTER_MAX, LIMIT_KEYS, CounterL
 from tvsbayes.instrument.parameters import HARMONIC_NAMES, NAMES, REGISTRY, RIG_NAMES, RIG_PRIORS, Prior
 from tvsbayes.instrument.stereo_pair import Stereo, read_stereo
 
+SPOT_SD_PX = 0.08
+"""Standard uncertainty stated for a spot centre where nobody names one."""
 Setting = str | int | float
 """A value of `[positioner]` or `[cameras]`, by the kind that its key asks for."""
 
@@ -63,6 +65,11 @@ class Rig:
     costs_s: dict[str, float]
     path: Path | None = None
     header: dict[str, str] = field(default_factory=dict)
+
+    @property
+    def spot_sd_px(self) -> float:
+        """Standard uncertainty stated for the centres of simulated spots."""
+        return float(self.cameras.get("spot_sd_px", SPOT_SD_PX))
 
     @property
     def limits(self) -> CounterLimits:
@@ -246,7 +253,7 @@ def _parse_positioner(table: Keys) -> dict[str, Setting]:
 def _parse_cameras(table: Keys, stereo: Stereo) -> dict[str, Setting]:
     """`[cameras]`: source, devices, size (that of the calibration), exposure, spot uncertainty."""
     table.only(("source", "left", "right", "width", "height", "exposure", "spot_sd_px"))
-    values: dict[str, Setting] = {"spot_sd_px": 0.08}
+    values: dict[str, Setting] = {"spot_sd_px": SPOT_SD_PX}
     for key in ("source", "left", "right"):
         if key in table:
             device = isinstance(table.values[key], str)

@@ -298,6 +298,11 @@ def stereo_bytes(stereo: Stereo) -> bytes:
     return data
 
 
+def write_stereo(stereo: Stereo, path: Path) -> None:
+    """Writes `stereo.json` atomically; `read_stereo` gives back the same numbers."""
+    write_atomically(path, stereo_bytes(stereo))
+
+
 def pair_doubts(stereo: Stereo) -> tuple[str, ...]:
     """What contradicts two cameras beside each other that look at one scene, in words; empty where nothing does.
 
@@ -327,8 +332,3 @@ def pair_doubts(stereo: Stereo) -> tuple[str, ...]:
         if abs(fx / fy - 1) > ASPECT_SHARE_MAX:
             doubts.append(f"the {side} fx and fy differ by {100 * abs(fx / fy - 1):.0f} %: pixels are seldom so oblong")
     return tuple(doubts)
-
-
-def write_stereo(stereo: Stereo, path: Path) -> None:
-    """Writes `stereo.json` atomically; `read_stereo` gives back the same numbers."""
-    write_atomically(path, stereo_bytes(stereo))

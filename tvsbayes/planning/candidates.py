@@ -217,18 +217,6 @@ def overshoot_steps(knowledge: Knowledge) -> np.ndarray:
     return np.array(result)
 
 
-def sided(positions: Positions, limits: np.ndarray, overshoot: np.ndarray) -> Looks:
-    """Positions from all four sides whose run-up stays inside the limits (2, 2)."""
-    found = []
-    for side in itertools.product((1, -1), repeat=2):
-        start = positions.steps - np.array(side) * overshoot
-        both = np.stack([positions.steps, start])
-        good = np.all((both >= limits[:, 0]) & (both <= limits[:, 1]), axis=(0, 2))
-        sides = np.tile(np.array(side), (int(good.sum()), 1))
-        found.append(Looks(positions.steps[good], sides, positions.sheet[good]))
-    return Looks(*(np.concatenate([getattr(some, part.name) for some in found]) for part in fields(Looks)))
-
-
 @dataclass(frozen=True)
 class Positions:
     """Counters (pan, tilt), shape (m, 2), each on a sheet, shape (m,)."""
@@ -255,6 +243,18 @@ class Positions:
         """Share of instruments at points (n, p) whose images both show the spot, shape (m,)."""
         arrays = LookArrays(Looks(self.steps, np.ones_like(self.steps), self.sheet), knowledge, False)
         return np.mean([arrays.at(z, knowledge.space).seen for z in points], axis=0)
+
+
+def sided(positions: Positions, limits: np.ndarray, overshoot: np.ndarray) -> Looks:
+    """Positions from all four sides whose run-up stays inside the limits (2, 2)."""
+    found = []
+    for side in itertools.product((1, -1), repeat=2):
+        start = positions.steps - np.array(side) * overshoot
+        both = np.stack([positions.steps, start])
+        good = np.all((both >= limits[:, 0]) & (both <= limits[:, 1]), axis=(0, 2))
+        sides = np.tile(np.array(side), (int(good.sum()), 1))
+        found.append(Looks(positions.steps[good], sides, positions.sheet[good]))
+    return Looks(*(np.concatenate([getattr(some, part.name) for some in found]) for part in fields(Looks)))
 
 
 @dataclass(frozen=True)

@@ -169,7 +169,7 @@ def design_arrays(
         SpotArrays(
             move_index=padded(look_moves, size, look_moves[-1], np.int32),
             pixels=jnp.zeros((size, 4)),
-            whitening=jnp.asarray(np.tile(np.eye(4) / float(rig.cameras["spot_sd_px"]), (size, 1, 1))),
+            whitening=jnp.asarray(np.tile(np.eye(4) / rig.spot_sd_px, (size, 1, 1))),
             aperture_rad=jnp.zeros(size),
             has_aperture=padded([float(aperture)] * count, size),
             triangulated_mm=jnp.zeros((size, 3)),

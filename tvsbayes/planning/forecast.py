@@ -197,9 +197,9 @@ class Assurance:
             return covariance_of(knowledge.precision + information)
 
         z = believed(truth, seen[chosen], self.looks.side[chosen], covariance(seen), knowledge, noise)
-        return at_truth.value(covariance(self._rescaled(seen, truth, z)), self.target.factor)
+        return at_truth.value(covariance(self.rescaled(seen, truth, z)), self.target.factor)
 
-    def _rescaled(self, seen: Seen, truth: DrawnTruth, z: np.ndarray) -> Seen:
+    def rescaled(self, seen: Seen, truth: DrawnTruth, z: np.ndarray) -> Seen:
         """The same looks whitened with other noise scales: I s^2 + slope S slope^T per look."""
         names = [*STOP_COLUMNS.ravel(), PIXEL_COLUMN]
         u, true = np.asarray(truth.space.u)[names], np.asarray(truth.space.value)[names]
@@ -271,7 +271,7 @@ def classic_forecast(knowledge: Knowledge, truths: Sequence[DrawnTruth]) -> Clas
         true = np.array([effective[d] for d in DIRECTIONS])
         stops = np.array([parameters[f"stop_sd_deg.{d}"] ** 2 for d in DIRECTIONS])
         pair = stops + stops[[1, 0, 3, 2]]
-        spot_sd = float(rig.cameras["spot_sd_px"]) * parameters["pixel_scale"]
+        spot_sd = rig.spot_sd_px * parameters["pixel_scale"]
         variance = by_pixel * spot_sd**2 + pair * (ratios[0] / true / steps) ** 2
         sds.append(np.sqrt(variance))
         errors.append(ratios[0] - true)

@@ -121,12 +121,8 @@ def data_tree(posterior: Posterior) -> xr.DataTree:
         "lp": xr.DataArray(posterior.log_density, coords, ("chain", "draw")),
         "acceptance_rate": xr.DataArray(posterior.convergence.acceptance, {"chain": coords["chain"]}, ("chain",)),
     }
-    observed = xr.DataArray(
-        pixels_of(spots),
-        {"spot": [s.spot for s in spots], "pixel": list(PIXEL_LABELS)},
-        ("spot", "pixel"),
-        name="pixels",
-    )
+    places = {"spot": [s.spot for s in spots], "pixel": list(PIXEL_LABELS)}
+    observed = xr.DataArray(pixels_of(spots), places, tuple(places), name="pixels")
     tree = xr.DataTree.from_dict(
         {
             "posterior": _dataset(_variables(posterior.draws, varying, shape)),

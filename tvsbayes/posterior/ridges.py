@@ -158,8 +158,7 @@ Residuals = Callable[[np.ndarray], np.ndarray]
 
 def bends(route: Transport, residuals: Residuals) -> np.ndarray:
     """Quadratic forms of the shear, shape (k, d, d): second differences of the residuals along the narrow places."""
-    count, narrow = route.dimension, route.narrow
-    geometry = np.setdiff1d(np.arange(count), route.noise)
+    count, narrow, geometry = route.dimension, route.narrow, route.geometry
     bend, steps = np.zeros_like(route.bend), SHEAR_STEP * np.eye(count)
     centre = residuals(np.zeros((1, count)))[0]
     ahead, behind = residuals(steps), residuals(-steps)
@@ -182,9 +181,8 @@ def bends(route: Transport, residuals: Residuals) -> np.ndarray:
 def stretches(route: Transport, residuals: Residuals) -> np.ndarray:
     """Table of widths, shape (q, nodes, d): the data's share of each place's information as a noise scale goes."""
     stretch = np.zeros_like(route.stretch)
-    geometry = np.setdiff1d(np.arange(route.dimension), route.noise)
     for which, place in enumerate(route.noise):
-        later = geometry[geometry > place]
+        later = route.geometry[route.geometry > place]
         shares = []
         for node in STRETCH_NODES:
             at = np.zeros((1 + len(later), route.dimension))

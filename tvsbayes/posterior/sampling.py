@@ -123,7 +123,7 @@ def _checkpoint(path: Path, fit: JointFit, route: Transport, start: Pilot, chain
     write_atomically(path, buffer.getvalue())
 
 
-def _stored(path: Path, fit: JointFit, seed: int) -> tuple[Transport, Pilot, Chain]:
+def stored_chain(path: Path, fit: JointFit, seed: int) -> tuple[Transport, Pilot, Chain]:
     """Read a checkpoint; refuse one of other data, model, priors, versions or seed."""
     name = escaped(path.name)
     if not path.exists():
@@ -273,7 +273,7 @@ def sample(
         if resume:
             if checkpoint is None:
                 raise ValueError("resume needs the checkpoint to continue")
-            route, start, chain = _stored(checkpoint, fit, seed)
+            route, start, chain = stored_chain(checkpoint, fit, seed)
         else:
             route = transport(fit)
             try:

@@ -112,6 +112,11 @@ class Transport:
         return len(self.free)
 
     @property
+    def geometry(self) -> np.ndarray:
+        """Places in `free` of all coordinates but those of noise, ascending."""
+        return np.setdiff1d(np.arange(self.dimension), self.noise)
+
+    @property
     def heavy(self) -> np.ndarray:
         """Coordinates of `HEAVY_NAMES`, shape (d,)."""
         return np.isin(np.array(NAMES)[self.free], HEAVY_NAMES)

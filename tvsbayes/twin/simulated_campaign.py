@@ -43,8 +43,6 @@ SHEET_DEPTH_SD_MM = 1.0
 """Standard deviation of a placed sheet's depth about its nominal X: a hand against a stop."""
 SHEET_TILT_SD_DEG = 0.5
 """Standard deviation of a placed sheet's rotation about Y and about Z, each."""
-SPOT_SD_PX = 0.08
-"""Standard uncertainty stated for a spot centre where neither caller nor rig names one."""
 TRUTH_FORMAT = "tvsbayes-truth/1"
 Pair = tuple[float, float]
 """Of pan and tilt."""
@@ -253,7 +251,7 @@ def simulate(
     streams = _Streams(*map(np.random.default_rng, np.random.SeedSequence(seed).spawn(6)))
     if truth is None:
         truth = draw_truth(rig, streams.truth)
-    sd_px = float(rig.cameras.get("spot_sd_px", SPOT_SD_PX) if spot_sd_px is None else spot_sd_px)
+    sd_px = rig.spot_sd_px if spot_sd_px is None else float(spot_sd_px)
     log = run_plan(plan, rig, home_approach)
     fixed = {name: Prior(value, 0.0) for name, value in truth.parameters.items() if name in HARMONIC_NAMES}
     require_periods(fixed, rig.table.harmonic_period_deg)
