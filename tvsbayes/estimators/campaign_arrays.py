@@ -14,8 +14,8 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
-from numpy.typing import ArrayLike
 from platformdirs import user_cache_path
 
 from tvsbayes.instrument.axes import APPROACH_SIGN
@@ -27,7 +27,7 @@ from tvsbayes.model.laser_path import MoveArrays
 SMALLEST_BUCKET = 512
 """Spots and moves are padded to this size or the next power of two above it: campaigns of ordinary size
 share one compiled function."""
-NOWHERE_MM = (500.0, 0.0, 0.0)
+NOWHERE_MM = np.array([500.0, 0.0, 0.0])
 """Stands for the point of a look that counts for nothing: finite, and in front of the cameras."""
 
 
@@ -70,7 +70,9 @@ def bucket(count: int, smallest: int | None = None, growth: int = 2) -> int:
     return size
 
 
-def padded(rows: ArrayLike, size: int, fill: ArrayLike = 0.0, dtype: type = np.float64) -> jax.Array:
+def padded(
+    rows: Sequence[object] | np.ndarray, size: int, fill: ArrayLike = 0.0, dtype: type = np.float64
+) -> jax.Array:
     """Rows (n, ...) with as many like `fill` behind them as make `size`."""
     given: np.ndarray = np.asarray(rows, dtype)
     rest: np.ndarray = np.broadcast_to(np.asarray(fill, dtype), (size - len(given), *given.shape[1:]))
@@ -80,7 +82,7 @@ def padded(rows: ArrayLike, size: int, fill: ArrayLike = 0.0, dtype: type = np.f
 def move_arrays(moves: Sequence[Move], size: int | None = None) -> MoveArrays:
     """Pad the moves, by default to their `bucket`; padding repeats the last counters and therefore changes nothing."""
     size = bucket(len(moves)) if size is None else size
-    steps = [(m.pan_steps, m.tilt_steps) for m in moves]
+    steps = np.array([(m.pan_steps, m.tilt_steps) for m in moves])
     approach = [(APPROACH_SIGN.get(m.pan_approach, 0), APPROACH_SIGN.get(m.tilt_approach, 0)) for m in moves]
     first = [bool(m.pan_approach) for m in moves]
     return MoveArrays(padded(steps, size, steps[-1]), padded(first, size, False, bool), padded(approach, size))
