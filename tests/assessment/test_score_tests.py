@@ -19,7 +19,7 @@ from support.small_results import small_summary
 
 from tvsbayes.assessment.score_tests import VALIDATION_LEVEL, _Answer, _holm, validate
 from tvsbayes.estimators.joint_fit import JointFit, fit_at
-from tvsbayes.estimators.linear_spots import linear_spots, stop_information
+from tvsbayes.estimators.linear_spots import linear_spots
 from tvsbayes.estimators.mode_search import Problem
 from tvsbayes.instrument.campaign import ordered_spots
 from tvsbayes.instrument.parameters import INDEX, NAMES, NOISE_NAMES
@@ -49,7 +49,7 @@ def clean(mounted_rig) -> JointFit:
     with jax.enable_x64(True):
         problem = Problem(simulated.campaign, simulated.campaign.rig)
         z = np.where(problem.free, coordinates(problem.space, simulated.truth), 0.0)
-        fisher = stop_information(problem.linear_spots(z)[1]).fisher
+        fisher = problem.information(problem.linearised(z)).fisher
         mode = Mode(z, np.linalg.inv(fisher + np.eye(len(z))), 0.0, ())
         return fit_at(simulated.campaign, problem, mode, 0)
 

@@ -39,7 +39,6 @@ def test_a_plans_information_is_the_fits_own(mounted_rig, knowledge, monkeypatch
     """Same point, same looks: segments with home offsets, shared stops, half-open play (the dozen)."""
     import jax
 
-    from tvsbayes.estimators.linear_spots import stop_information
     from tvsbayes.estimators.mode_search import Problem
 
     monkeypatch.setattr("tvsbayes.twin.simulated_campaign.SHEET_DEPTH_SD_MM", 0.0)
@@ -53,7 +52,7 @@ def test_a_plans_information_is_the_fits_own(mounted_rig, knowledge, monkeypatch
     assert all(spot.status == "ok" for spot in run.campaign.spots)
     problem = Problem(run.campaign, mounted_rig.table)
     with jax.enable_x64(True):
-        own = stop_information(problem.linear_spots(truth.z)[1]).fisher
+        own = problem.information(problem.linearised(truth.z)).fisher
     planned = information_of(dozen_plan(), knowledge, aperture=True, z=truth.z).fisher
     scale = np.sqrt(np.diag(own))
     safe = np.where(scale > 0, scale, 1.0)

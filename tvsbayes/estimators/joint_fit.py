@@ -19,7 +19,7 @@ from jaxtyping import Bool
 
 from tvsbayes.errors import NotConverged, NothingToEstimate
 from tvsbayes.estimators.campaign_arrays import CampaignArrays, in_sight
-from tvsbayes.estimators.linear_spots import Linearised, StopInformation, leave_one_out_chi2, stop_information
+from tvsbayes.estimators.linear_spots import Linearised, StopInformation, leave_one_out_chi2
 from tvsbayes.estimators.mode_search import GATE_PROBABILITY, Problem
 from tvsbayes.instrument.campaign import Campaign, ordered_spots
 from tvsbayes.instrument.model_choice import AS_STATED, ModelChoice
@@ -211,8 +211,8 @@ def fit_at(campaign: Campaign, problem: Problem, mode: Mode, seed: int) -> Joint
         seed: of the Laplace draws.
     """
     used = np.asarray(problem.arrays.spots.valid[: len(problem.spots)]) > 0
-    lin, linear = problem.linear_spots(mode.z)
-    information = stop_information(linear)
+    lin = problem.linearised(mode.z)
+    information = problem.information(lin)
     chi2_spots = leave_one_out_chi2(information, np.asarray(problem.arrays.spots.weight[: len(problem.spots)]))
     readings = np.asarray(problem.arrays.spots.has_aperture[: len(problem.spots)])
     suspect = used & (chi2_spots > chi2_quantile(readings, GATE_PROBABILITY))
@@ -230,7 +230,7 @@ def fit_at(campaign: Campaign, problem: Problem, mode: Mode, seed: int) -> Joint
     )
     ids = np.array([s.spot for s in problem.spots])
     problems = mode.problems
-    chi2 = sum(float(linear.residual[g.rows].ravel() @ g.residual) for g in information.groups)
+    chi2 = sum(float(np.asarray(lin.residual)[g.rows].ravel() @ g.residual) for g in information.groups)
     # Where the scale is fixed the misfit stays in chi-square.
     looks = max(float(np.sum(used * (3 + readings))), 1.0)
     misfit = float(at_mode_and_draws.physical[0, INDEX["pixel_scale"]]) * max(1.0, np.sqrt(chi2 / looks))

@@ -19,7 +19,7 @@ from tvsbayes.estimators.campaign_arrays import CampaignArrays, campaign_arrays
 from tvsbayes.estimators.likelihood import density_and_gradient, innovations
 from tvsbayes.estimators.linear_spots import (
     Linearised,
-    LinearSpots,
+    StopInformation,
     leave_one_out_chi2,
     linear_spots,
     linearise,
@@ -145,16 +145,19 @@ class Problem:
             z = self.alternate(z)
         return z
 
-    def linear_spots(self, z: np.ndarray) -> tuple[Linearised, LinearSpots]:
+    def linearised(self, z: np.ndarray) -> Linearised:
         """The campaign linearised at a point, without padding."""
-        count = len(self.spots)
         full = linearise(jnp.asarray(z), self.space, self.arrays)
-        lin = jax.tree.map(lambda x: np.asarray(x)[:count], full)
-        return lin, linear_spots(lin, self.arrays, np.where(self.held, 0.0, -lin.residual_jacobian))
+        return jax.tree.map(lambda x: np.asarray(x)[: len(self.spots)], full)
+
+    def information(self, lin: Linearised) -> StopInformation:
+        """What its stops tell of geometry and stereo, noise scales held."""
+        jacobian = np.where(self.held, 0.0, -np.asarray(lin.residual_jacobian))
+        return stop_information(linear_spots(lin, self.arrays, jacobian))
 
     def curvature(self, z: np.ndarray) -> np.ndarray:
         """Expected information of the coordinates: Fisher's of geometry and stereo, measured for the noise."""
-        value = stop_information(self.linear_spots(z)[1]).fisher + np.eye(len(NAMES))
+        value = self.information(self.linearised(z)).fisher + np.eye(len(NAMES))
         slope = self.objective(z)[1]
         for index in self.noise:
             nudged = z.copy()
@@ -172,7 +175,7 @@ class Problem:
         count = len(self.spots)
         valid, weight = np.array(spots.valid[:count]), np.array(spots.weight[:count])
         readings = np.asarray(spots.has_aperture[:count])
-        chi2 = leave_one_out_chi2(stop_information(self.linear_spots(z)[1]), weight)
+        chi2 = leave_one_out_chi2(self.information(self.linearised(z)), weight)
         used = valid > 0
         # The noise scales were fitted with the outliers in: the median restores the scale of the clean spots.
         scale2 = np.median(chi2[used] / chi2_quantile(readings[used], 0.5))

@@ -295,7 +295,7 @@ def _drive(moves: Sequence[Move], truth: Truth, harmonic_period_deg: Mapping[str
     start_draws = streams.stops.uniform(-0.5, 0.5, (len(moves), 2))
     resting, errors = np.empty_like(counters), np.empty_like(counters)
     for i, (axis, (negative, positive)) in enumerate(SIDES.items()):
-        approach = [m.pan_approach if axis == "pan" else m.tilt_approach for m in moves]
+        approach = [getattr(m, f"{axis}_approach") for m in moves]
         side = {positive: -0.5, negative: 0.5}
         start = np.array([side.get(name, draw) for name, draw in zip(approach, start_draws[:, i], strict=True)])
         ratios = p[f"degrees_per_step.{axis}"], p[f"ratio_contrast_deg_per_step.{axis}"]
