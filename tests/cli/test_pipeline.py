@@ -60,7 +60,7 @@ def test_results_from_python_are_those_of_the_command(ask, grid_folder, tmp_path
     """The same document and draws, but for the command that made them; without a folder nothing is written."""
     assert ask("fit", grid_folder, "--no-sample", "--seed", 3)[0] == 0
     campaign = read_campaign(grid_folder)
-    results = tvsbayes.calibrate(campaign, tmp_path / "mine", sampled=False, seed=3)
+    results = tvsbayes.calibrate(campaign, str(tmp_path / "mine"), sampled=False, seed=3)
     assert set(results.files) == {"draws", "fit"} and results.error is None
     by_command, mine = (tvsbayes.read_fit(f / "fit.json") for f in (grid_folder / "results", tmp_path / "mine"))
     assert {**by_command.as_json(), "command": ""} == {**mine.as_json(), "command": ""}

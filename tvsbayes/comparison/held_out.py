@@ -112,7 +112,7 @@ def refit(fit_of_all: JointFit, without: frozenset[int]) -> JointFit:
     return fit(held, without=without | set(fit_of_all.excluded_spots))
 
 
-class ClassicForecast(NamedTuple):
+class ClassicAngle(NamedTuple):
     """An angle as the classic foretells it, deg: its standard uncertainty has few degrees of freedom."""
 
     angle_deg: float
@@ -120,13 +120,13 @@ class ClassicForecast(NamedTuple):
     dof: int
 
 
-def foretell_classic(angle: np.ndarray, selection: Selection, out: np.ndarray) -> dict[int, ClassicForecast]:
+def foretell_classic(angle: np.ndarray, selection: Selection, out: np.ndarray) -> dict[int, ClassicAngle]:
     """What N times the mean of a direction says of each left-out experiment with two others there, by row.
 
     Its uncertainty is the scatter of angles (e,) about N times the mean, and that of the mean.
     Experiments without a finite angle (pixels beyond the lens model) neither teach nor are asked.
     """
-    found: dict[int, ClassicForecast] = {}
+    found: dict[int, ClassicAngle] = {}
     seen = np.isfinite(angle)
     for direction in DIRECTIONS:
         mine = seen & (selection.direction == direction)
@@ -139,11 +139,11 @@ def foretell_classic(angle: np.ndarray, selection: Selection, out: np.ndarray) -
         for e in asked:
             steps = float(selection.steps[e])
             u = float(np.sqrt(noise + (steps * sd) ** 2 / len(taught)))
-            found[int(e)] = ClassicForecast(float(mean * steps), u, len(taught) - 1)
+            found[int(e)] = ClassicAngle(float(mean * steps), u, len(taught) - 1)
     return found
 
 
-class JointForecast(NamedTuple):
+class JointAngle(NamedTuple):
     """An angle as the joint foretells it, deg."""
 
     angle_deg: float
@@ -152,7 +152,7 @@ class JointForecast(NamedTuple):
 
 def foretell_joint(
     taught: JointFit, selection: Selection, out: np.ndarray, generator: np.random.Generator
-) -> dict[int, JointForecast]:
+) -> dict[int, JointAngle]:
     """What the classic chain would measure on the joint's beams for each left-out experiment, by row.
 
     Stop errors and pixel noise are drawn anew. Draws beyond the cameras' lens model tell no angle.
@@ -167,5 +167,5 @@ def foretell_joint(
     for k, e in enumerate(np.flatnonzero(out).tolist()):
         told = draws[np.isfinite(draws[:, k]), k]
         if len(told) > 1:
-            found[e] = JointForecast(float(told.mean()), float(told.std(ddof=1)))
+            found[e] = JointAngle(float(told.mean()), float(told.std(ddof=1)))
     return found

@@ -160,7 +160,7 @@ def use_compilation_cache() -> bool:
     """Keep compiled functions in the user's cache folder (or `TVSBAYES_CACHE`).
 
     For programs such as the command line, which own their process: it changes a global setting of JAX, so
-    `pipeline.compile_for` alone calls it, for commands.
+    only commands and worker processes call it.
 
     Returns:
         Whether nothing is in the folder yet: the model has to be compiled first, half a minute to two minutes.
