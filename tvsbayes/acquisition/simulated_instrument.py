@@ -155,20 +155,12 @@ class Instrument:
         seed: of everything random.
         start: how often this campaign was started before: stop errors go on, they do not repeat.
         truth: the true rig; None draws one, the same for every start of a seed.
-        clock: virtual time.
     """
 
-    def __init__(
-        self,
-        rig: Rig,
-        seed: int,
-        start: int = 0,
-        truth: Truth | None = None,
-        clock: VirtualClock | None = None,
-    ):
+    def __init__(self, rig: Rig, seed: int, start: int = 0, truth: Truth | None = None):
         self.rig, self.seed = rig, int(seed)
         self.truth = draw_truth(rig, self._stream("truth")) if truth is None else truth
-        self.clock = clock or VirtualClock()
+        self.clock = VirtualClock()
         self._stops, self._homes = self._stream("stops", start), self._stream("homes", start)
         self._pixels = self._stream("pixels", start)
         self._first_home, self._from_switch = [start == 0, start == 0], [False, False]
