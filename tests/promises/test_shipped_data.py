@@ -210,9 +210,11 @@ def test_make_twins_writes_what_is_shipped():
 def test_truth_file_that_is_none(tmp_path):
     """A truth.json without its entries is bad input, not a traceback."""
     path = tmp_path / "truth.json"
-    path.write_text('{"format": "tvsbayes-truth/1", "parameters": 3}', encoding="utf-8")
-    with pytest.raises(InputError, match=r"truth\.json"):
-        read_truth(path, mounted().stereo)
+    whole = json.loads((DATA / "twins" / "paper_twin" / "truth.json").read_text(encoding="utf-8"))
+    for document in ({"format": whole["format"], "parameters": 3}, {**whole, "parameters": 3}):
+        path.write_text(json.dumps(document), encoding="utf-8")
+        with pytest.raises(InputError, match=r"truth\.json"):
+            read_truth(path, mounted().stereo)
 
 
 def test_simulated_campaign_survives_writing(tmp_path):

@@ -159,7 +159,7 @@ def read_truth(path: str | Path, stated: Stereo) -> Truth:
     try:
         # What stands in the entries is converted, or refused below.
         return Truth.from_json(cast("TruthDocument", keys.values), stated)
-    except (KeyError, TypeError, ValueError, IndexError) as error:
+    except (AttributeError, KeyError, TypeError, ValueError, IndexError) as error:
         raise InputError(
             "truth",
             f"{path.name} does not hold a truth file's entries: {error}",
