@@ -37,6 +37,8 @@ def served(device: SimulatedDevice, pause_us: int) -> Iterator[str]:
                 os.write(master, lines.pop(0))
 
     threading.Thread(target=serve, daemon=True).start()
-    yield os.ttyname(slave)
-    os.close(slave)
-    os.close(master)
+    try:
+        yield os.ttyname(slave)
+    finally:
+        os.close(slave)
+        os.close(master)
