@@ -13,8 +13,8 @@ import equinox as eqx
 import jax
 import numpy as np
 import pytest
-from conftest import coordinates
 from scipy import stats
+from support.dozen_spots import coordinates
 from support.small_results import small_summary
 
 from tvsbayes.assessment.score_tests import VALIDATION_LEVEL, _Answer, _holm, validate

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import jax
 import numpy as np
 import pytest
-from conftest import ROOT, coordinates
+from support.dozen_spots import coordinates
 
 from tvsbayes.assessment.summary import summarise
 from tvsbayes.comparison.gap import BACKLASH, CHANCE, PROJECTION, STEREO_SCALE, explain_gap
@@ -18,7 +19,7 @@ from tvsbayes.instrument.axes import DIRECTIONS
 from tvsbayes.results.comparison_record import Gap
 from tvsbayes.twin.simulated_campaign import Truth, read_truth
 
-TWIN = ROOT / "data" / "twins" / "paper_twin"
+TWIN = Path(__file__).resolve().parents[2] / "data" / "twins" / "paper_twin"
 
 
 @pytest.fixture(scope="module")

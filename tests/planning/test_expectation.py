@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from conftest import dozen_plan
 from support.coarse_planning import ROUNDING, with_priors
+from support.dozen_spots import dozen_plan
 
 from tvsbayes.instrument.parameters import INDEX, Prior
 from tvsbayes.instrument.plan import PlanStep, run_plan
