@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 from support.coarse_planning import with_priors
 
+from tvsbayes.instrument.axes import HOME_APPROACH
 from tvsbayes.instrument.parameters import INDEX, Prior
-from tvsbayes.instrument.plan import HOME_APPROACH, run_plan
+from tvsbayes.instrument.plan import run_plan
 from tvsbayes.planning import planner
 from tvsbayes.planning.candidates import LookArrays, arrange, candidates, information_of_looks
 from tvsbayes.planning.expectation import LOOKS_PER_EXPERIMENT, PARAMETERS, information_of, prior_knowledge

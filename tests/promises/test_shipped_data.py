@@ -138,7 +138,7 @@ def test_every_spot_of_every_drawn_rig_is_in_view(name: str):
 
 
 def test_plans_are_the_protocols():
-    """The shipped plans are what `campaign.PROTOCOLS` makes."""
+    """The shipped plans are what `protocols.PROTOCOLS` makes."""
     for name, make in PROTOCOLS.items():
         assert read_plan(DATA / "rigs" / "mounted" / f"{name}.csv") == make(), name
 

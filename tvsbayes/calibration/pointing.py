@@ -29,7 +29,7 @@ from tvsbayes.calibration.optics import (
     unit_vector,
 )
 from tvsbayes.errors import InputError
-from tvsbayes.instrument.axes import AXES, SIDES, sides_of
+from tvsbayes.instrument.axes import AXES, HOME_APPROACH, SIDES, sides_of
 from tvsbayes.instrument.parameters import names_of
 from tvsbayes.statistics.intervals import NORMAL_95
 
@@ -145,7 +145,7 @@ class Calibration:
         )
         return beam_components(self.estimates, pan_deg, tilt_deg, m)
 
-    def ray(self, pan_steps: float, tilt_steps: float, approach: tuple[str, str] = ("left", "up")) -> Ray:
+    def ray(self, pan_steps: float, tilt_steps: float, approach: tuple[str, str] = HOME_APPROACH) -> Ray:
         """The beam at counters that were reached from a side.
 
         Args:
@@ -160,7 +160,7 @@ class Calibration:
         return Ray(np.array(beam.origin), np.array(beam.direction))
 
     def locate(
-        self, pan_steps: float, tilt_steps: float, aperture_deg: float, approach: tuple[str, str] = ("left", "up")
+        self, pan_steps: float, tilt_steps: float, aperture_deg: float, approach: tuple[str, str] = HOME_APPROACH
     ) -> Located:
         """The point that beam and aperture reading agree on, with its covariance by the law of propagation (GUM 5.2).
 
@@ -238,7 +238,7 @@ class Calibration:
         return beam_components(values, angles[0], angles[1])
 
     def derivatives(
-        self, pan_steps: float, tilt_steps: float, aperture_deg: float, approach: tuple[str, str] = ("left", "up")
+        self, pan_steps: float, tilt_steps: float, aperture_deg: float, approach: tuple[str, str] = HOME_APPROACH
     ) -> np.ndarray:
         """Sensitivities of a point to `INPUT_NAMES` (their units) and to the unit noises of the look, mm.
 

@@ -155,11 +155,14 @@ def _imported(paths: list[Path], image_size: str | None, import_unit: str | None
 def _write_pair(made: MadePair, places: dict[str, Path], export: Format | None, as_json: bool) -> None:
     """Write a pair where it was asked for, and say so."""
     from tvsbayes.cameras.calibration_formats import exported
-    from tvsbayes.instrument.stereo_pair import stereo_bytes
+    from tvsbayes.instrument.stereo_pair import write_stereo
 
     contents = {} if export is None else exported(made.stereo, export)
     for name, path in places.items():
-        write_atomically(path, stereo_bytes(made.stereo) if name == "stereo" else contents[name])
+        if name == "stereo":
+            write_stereo(made.stereo, path)
+        else:
+            write_atomically(path, contents[name])
     written = {name: str(path) for name, path in places.items()}
     said = f"written: {', '.join(written.values())}" if written else "nothing written: give -o stereo.json"
     finish({**made.document, "files": written}, f"{made.text}\n{said}", as_json)

@@ -19,7 +19,7 @@ import numpy as np
 from tvsbayes.calibration.pointing import DIVERGING_SHARE, INPUT_NAMES, Calibration
 from tvsbayes.coordinates.beam_meeting import Carried, Linear, Settings, Sources, carry, propagate, sources
 from tvsbayes.errors import InputError
-from tvsbayes.instrument.axes import sides_of
+from tvsbayes.instrument.axes import HOME_APPROACH, sides_of
 from tvsbayes.statistics.intervals import NORMAL_95, Validation, symmetric_interval, validate
 
 DRAWS = 1000
@@ -94,7 +94,7 @@ def settings_of(
     pan_steps: float | Sequence[float] | np.ndarray,
     tilt_steps: float | Sequence[float] | np.ndarray,
     aperture_deg: float | Sequence[float] | np.ndarray,
-    approach: tuple[str, str] | Sequence[tuple[str, str]] = ("left", "up"),
+    approach: tuple[str, str] | Sequence[tuple[str, str]] = HOME_APPROACH,
 ) -> Settings:
     """Settings of many points; arguments and errors as in `locate`."""
     numbers = [np.atleast_1d(np.asarray(x, dtype=float)) for x in (pan_steps, tilt_steps, aperture_deg)]
@@ -138,7 +138,7 @@ def locate(
     pan_steps: float | Sequence[float] | np.ndarray,
     tilt_steps: float | Sequence[float] | np.ndarray,
     aperture_deg: float | Sequence[float] | np.ndarray,
-    approach: tuple[str, str] | Sequence[tuple[str, str]] = ("left", "up"),
+    approach: tuple[str, str] | Sequence[tuple[str, str]] = HOME_APPROACH,
     *,
     draws: int = DRAWS,
     seed: int = 0,

@@ -25,6 +25,8 @@ DIRECTION_SIGNS: dict[str, tuple[Axis, int]] = {
 """Axis and sense of motion of a direction."""
 APPROACH_SIGN = {**{direction: sign for direction, (_, sign) in DIRECTION_SIGNS.items()}, "unknown": 0}
 """Sense of motion of an approach (formulation 2)."""
+HOME_APPROACH: tuple[PanApproach, TiltApproach] = ("left", "up")
+"""Side from which homing ends, per axis, where the caller names none."""
 FULL_TURN_DEG = 360.0
 """Period of the wheel (the output member); a shorter one is the pinion's."""
 HOME_SD_DEG = 0.05

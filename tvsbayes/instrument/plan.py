@@ -15,7 +15,7 @@ from typing import Literal
 from tvsbayes.errors import InputError, escaped, refusal
 from tvsbayes.files.csv_table import CSV_BYTES_MAX, csv_bytes, parse_table
 from tvsbayes.files.disk import read_bytes, write_atomically
-from tvsbayes.instrument.axes import AXES, Axis, PanApproach, TiltApproach, direction_of
+from tvsbayes.instrument.axes import AXES, HOME_APPROACH, Axis, PanApproach, TiltApproach, direction_of
 from tvsbayes.instrument.campaign import ID_MAX, Move, check_experiments
 from tvsbayes.instrument.counter_limits import COUNTER_MAX
 from tvsbayes.instrument.rig import Rig
@@ -146,10 +146,6 @@ COST_KEYS = {"home": "move_s", "place": "placement_s", "move": "move_s", "look":
 def plan_seconds(rig: Rig, plan: Iterable[PlanStep]) -> float:
     """Duration of a plan by `[costs]`, s; what a rig that no file describes leaves unstated costs nothing."""
     return sum(float(rig.costs_s.get(COST_KEYS[step.action], 0.0)) for step in plan)
-
-
-HOME_APPROACH: tuple[PanApproach, TiltApproach] = ("left", "up")
-"""Side from which homing ends, per axis, where the caller names none."""
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from tvsbayes.calibration.pointing import INPUT_NAMES, UNIT_NOISES, Calibration
+from tvsbayes.instrument.axes import HOME_APPROACH
 from tvsbayes.instrument.parameters import unit_of
 from tvsbayes.metrology.budget_tables import BudgetTable, Source, budget_table
 
@@ -63,7 +64,7 @@ def budget(
     pan_steps: float,
     tilt_steps: float,
     aperture_deg: float,
-    approach: tuple[str, str] = ("left", "up"),
+    approach: tuple[str, str] = HOME_APPROACH,
 ) -> Budget:
     """The uncertainty budget of one point (GUM 7.2.7 asks for it): by cause, and by parameter with correlations.
 

@@ -15,7 +15,7 @@ from tvsbayes.calibration.pointing import Calibration
 from tvsbayes.coordinates.error_map import ErrorMap, error_map, simple_calibration
 from tvsbayes.errors import NothingToEstimate
 from tvsbayes.estimators.four_point import ClassicResult, classic
-from tvsbayes.instrument.axes import DIRECTIONS
+from tvsbayes.instrument.axes import DIRECTIONS, HOME_APPROACH
 from tvsbayes.instrument.campaign import Campaign
 from tvsbayes.metrology.look_budget import Budget, budget, coordinate_budget
 from tvsbayes.results.comparison_record import CANNOT_TELL, HoldOut, stored_hold_out
@@ -131,7 +131,7 @@ def gather(
         errors = _inflation(fit) * found["joint"]
         criteria.append(criterion(f"3D point at {range_mm:g} mm", errors, limit_mm, "mm"))
     pan, tilt = (float(value) for value in calibration.range_steps.mean(axis=1))
-    ray = calibration.ray(pan, tilt, ("left", "up"))
+    ray = calibration.ray(pan, tilt, HOME_APPROACH)
     point = np.asarray(ray.origin_mm) + range_mm * np.asarray(ray.direction)
     own = budget(calibration, pan, tilt, calibration.reading(point))
     least = "xyz"[int(np.argmax(np.diag(own.covariance_mm2)))]

@@ -18,10 +18,10 @@ import numpy as np
 from tvsbayes.errors import InputError
 from tvsbayes.files.disk import read_bytes, write_atomically
 from tvsbayes.files.documents import JSON_BYTES_MAX, parse_json
-from tvsbayes.instrument.axes import FULL_TURN_DEG, HOME_SD_DEG, SIDES, PanApproach, TiltApproach
+from tvsbayes.instrument.axes import FULL_TURN_DEG, HOME_APPROACH, HOME_SD_DEG, SIDES, PanApproach, TiltApproach
 from tvsbayes.instrument.campaign import NO_PIXELS, Campaign, Move, Spot, with_pixels, write_campaign
 from tvsbayes.instrument.parameters import HARMONIC_NAMES, RIG_NAMES, STEREO_PARAMETER_NAMES, Prior
-from tvsbayes.instrument.plan import HOME_APPROACH, PlanLog, PlannedLook, PlanStep, run_plan
+from tvsbayes.instrument.plan import PlanLog, PlannedLook, PlanStep, run_plan
 from tvsbayes.instrument.rig import Rig, require_periods
 from tvsbayes.instrument.stereo_pair import Stereo
 from tvsbayes.twin.physics import (
