@@ -18,6 +18,7 @@ from tvsbayes.estimators.four_point import (
     four_point_angle_deg,
     four_point_ratios,
     ratio_deg_per_step,
+    ratio_slopes,
     select_experiments,
     stereo_variance,
 )
@@ -239,6 +240,32 @@ def test_focal_error_shifts_the_ratio_as_no_repeat_can_show():
     # The near and far points share the intercept, which scales with depth and leaves the slope alone.
     assert ratio == pytest.approx((seen[1] - seen[0]) / 200, abs=ROUNDING_DEG)
     assert ratio / 0.0595 - 1 == pytest.approx(-0.0033, abs=0.00005)  # two digits
+
+
+def test_slopes_by_pixels_are_those_of_the_closed_form():
+    """Ideal parallel cameras: depth and width by the disparity in one row, differentiated by the complex step.
+
+    Vertical pixels count for nothing in a pan; the DLT agrees with the closed form in them, where both rows are equal,
+    to first order.
+    """
+    ideal = replace(make_stereo(), D1=np.zeros(5), D2=np.zeros(5), R=np.eye(3), T=np.array([-85.0, 0.0, 0.0]))
+    pixels = project(four_points(18.5, 30.4, "pan"), ideal).reshape(4, 4)
+
+    def ratio(seen: np.ndarray) -> complex:
+        left, right = ((seen[:, k] - m[0, 2]) / m[0, 0] for k, m in ((0, ideal.M1), (2, ideal.M2)))
+        depth = 85.0 / (left - right)
+        across = -left * depth
+        after, before = ((across[j] - across[i]) / (depth[j] - depth[i]) for i, j in ((3, 2), (0, 1)))
+        return np.degrees(1) * (np.arctan(after) - np.arctan(before)) / 200
+
+    step = 1e-30
+    expected = [
+        [ratio(pixels + 1j * step * np.eye(16)[4 * p + k].reshape(4, 4)).imag / step for k in (0, 2)] for p in range(4)
+    ]
+    found = ratio_slopes(pixels, np.array([200]), "pan", ideal)
+    assert found.ratio[0] == pytest.approx(ratio(pixels).real, abs=ROUNDING_DEG)
+    # A difference quotient over 0.01 px of what bends within 10 px: 1e-3 at most.
+    assert found.by_pixel[0][:, [0, 2]] == pytest.approx(np.array(expected), rel=1e-3)
 
 
 def test_fixed_parameters_are_skipped():

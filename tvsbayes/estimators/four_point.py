@@ -23,6 +23,8 @@ from tvsbayes.instrument.campaign import Campaign, Move, Spot, ordered_spots, pi
 from tvsbayes.instrument.stereo_pair import Stereo, triangulate
 from tvsbayes.statistics.intervals import coverage_factor, effective_dof
 
+PROBE_PX = 0.01
+"""Step of the ratios' derivatives: far above rounding (1e-9 px), far below curvature (10 px)."""
 STEP_HALVINGS = 40
 """Of a difference quotient's step, until both ends lie in the lens model: a 10^-13th of a standard deviation."""
 
@@ -169,6 +171,32 @@ def four_point_ratios(
     points = triangulate(stereo, pixels.reshape(-1, 4), focal_scale).reshape(-1, 4, 3)
     angles = four_point_angle_deg(points, axis)
     return np.asarray(ratio_deg_per_step(angles.theta_i_deg, angles.theta_f_deg, np.asarray(steps)))
+
+
+@dataclass(frozen=True)
+class RatioSlopes:
+    """Ratios of experiments and how they hang on their pixels, for propagation to first order.
+
+    Attributes:
+        ratio: (e,) deg/step.
+        by_pixel: (e, 4, 4) its derivative by the pixels (u_left, v_left, u_right, v_right) of points 1 to 4,
+            deg/step/px.
+    """
+
+    ratio: np.ndarray
+    by_pixel: np.ndarray
+
+
+def ratio_slopes(pixels: np.ndarray, steps: np.ndarray, axis: str | np.ndarray, stereo: Stereo) -> RatioSlopes:
+    """Ratios as `four_point_ratios` finds them, with difference quotients; NaN where a pixel has no ratio."""
+    pixels = np.asarray(pixels, float).reshape(-1, 4, 4)
+    ratio = four_point_ratios(pixels, steps, axis, stereo)
+    by_pixel = np.empty(pixels.shape)
+    for entry in np.ndindex(4, 4):
+        moved = pixels.copy()
+        moved[:, *entry] += PROBE_PX
+        by_pixel[:, *entry] = (four_point_ratios(moved, steps, axis, stereo) - ratio) / PROBE_PX
+    return RatioSlopes(ratio, by_pixel)
 
 
 def select_experiments(campaign: Campaign) -> Selection:

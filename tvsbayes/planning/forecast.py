@@ -17,7 +17,7 @@ import numpy as np
 from scipy import stats
 
 from tvsbayes.errors import InputError, TvsError
-from tvsbayes.estimators.four_point import classic, four_point_ratios, select_experiments
+from tvsbayes.estimators.four_point import classic, ratio_slopes, select_experiments
 from tvsbayes.instrument.axes import DIRECTIONS
 from tvsbayes.instrument.campaign import Campaign
 from tvsbayes.instrument.parameters import INDEX, NAMES, RIG_NAMES
@@ -233,8 +233,6 @@ class ClassicForecast:
     stereo_u: np.ndarray
 
 
-PROBE_PX = 0.01
-"""Step of the classic estimator's derivatives: far above rounding (1e-9 px), far below curvature (10 px)."""
 CLASSIC_DRAWS = 100
 
 
@@ -262,19 +260,16 @@ def classic_forecast(knowledge: Knowledge, truths: Sequence[DrawnTruth]) -> Clas
         pose = run.truth.reference_pose_deg
         if len(later) < len(DIRECTIONS) or pose is None:
             continue
-        pixels, steps, axis = selection.pixels[later], selection.steps[later], selection.axis[later]
-        moved = np.concatenate([pixels[None], pixels + PROBE_PX * np.eye(16).reshape(16, 1, 4, 4)])
-        flat = four_point_ratios(moved.reshape(-1, 4, 4), np.tile(steps, 17), np.tile(axis, 17), rig.stereo)
-        ratios = flat.reshape(17, 4)
-        by_pixel = np.sum(((ratios[1:] - ratios[0]) / PROBE_PX) ** 2, axis=0)
+        steps = selection.steps[later]
+        found = ratio_slopes(selection.pixels[later], steps, selection.axis[later], rig.stereo)
         effective = effective_deg_per_step(with_derived(parameters), pose)
         true = np.array([effective[d] for d in DIRECTIONS])
         stops = np.array([parameters[f"stop_sd_deg.{d}"] ** 2 for d in DIRECTIONS])
         pair = stops + stops[[1, 0, 3, 2]]
         spot_sd = rig.spot_sd_px * parameters["pixel_scale"]
-        variance = by_pixel * spot_sd**2 + pair * (ratios[0] / true / steps) ** 2
+        variance = np.sum(found.by_pixel**2, axis=(1, 2)) * spot_sd**2 + pair * (found.ratio / true / steps) ** 2
         sds.append(np.sqrt(variance))
-        errors.append(ratios[0] - true)
+        errors.append(found.ratio - true)
         first = run.campaign if first is None else first
     if first is None:
         return None

@@ -170,8 +170,8 @@ FAULTS = (
     Fault(
         "classic forecast: systematic error with the wrong sign",
         "planning/forecast.py",
-        "errors.append(ratios[0] - true)",
-        "errors.append(true - ratios[0])",
+        "errors.append(found.ratio - true)",
+        "errors.append(true - found.ratio)",
         "a correction goes the wrong way",
         ("planning/forecast::test_the_classics_forecast_is_what_its_experiments_do",),
         survived="planted by a reviewer: no test read the classic's answer.",
