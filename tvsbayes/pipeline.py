@@ -53,7 +53,7 @@ def _unwatched() -> AbstractContextManager[Callable[[Progress], None]]:
 
 def compile_for(tell: Tell) -> None:
     """Use the compilation cache; whoever waits at a terminal for the first compilation is told so."""
-    from tvsbayes.estimators.campaign_arrays import use_compilation_cache
+    from tvsbayes.model.compiled import use_compilation_cache
 
     if use_compilation_cache() and sys.stderr.isatty():
         tell("first run: the model is compiled, half a minute to two minutes; later runs take it from the cache")

@@ -10,6 +10,7 @@ from tvsbayes.estimators.joint_fit import JointFit, fit, fit_at
 from tvsbayes.estimators.mode_search import Problem
 from tvsbayes.instrument.campaign import Campaign
 from tvsbayes.instrument.parameters import RIG_NAMES
+from tvsbayes.model.compiled import use_compilation_cache
 from tvsbayes.model.parameter_space import coordinates_of
 from tvsbayes.statistics.least_squares import newton_mode
 from tvsbayes.twin.simulated_campaign import Truth
@@ -21,7 +22,7 @@ def compile_for(spots: int) -> None:
     Ordinary fits pad to 512 spots so that campaigns share a compilation; in a study every campaign is alike.
     """
     campaign_arrays.SMALLEST_BUCKET = spots
-    campaign_arrays.use_compilation_cache()
+    use_compilation_cache()
 
 
 def physical_of(truth: Truth) -> np.ndarray:

@@ -23,12 +23,12 @@ from experiments.common.rows import ROOT
 from experiments.common.worth import full_turn_plan, worth_of
 from experiments.paper.table1 import paper_values
 from tvsbayes.assessment.causes import headline_causes
-from tvsbayes.estimators.campaign_arrays import use_compilation_cache
 from tvsbayes.estimators.four_point import four_point_ratios, select_experiments
 from tvsbayes.estimators.joint_fit import fit
 from tvsbayes.instrument.axes import DIRECTIONS
 from tvsbayes.instrument.parameters import INDEX
 from tvsbayes.instrument.protocols import four_point_protocol, mixed_protocol, paper_protocol
+from tvsbayes.model.compiled import use_compilation_cache
 from tvsbayes.planning.expectation import Knowledge, information_of, prior_knowledge
 from tvsbayes.twin.physics import project
 from tvsbayes.twin.simulated_campaign import simulate

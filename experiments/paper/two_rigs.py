@@ -41,7 +41,6 @@ from experiments.common.rigs import mounted_rig, unseen
 from experiments.common.rows import output, read_rows, run_rows
 from experiments.paper.table1 import paper_values
 from experiments.paper.two_machines import HOME_SIDES, RIGS, classic_readings, plan_of, solved
-from tvsbayes.estimators.campaign_arrays import use_compilation_cache
 from tvsbayes.estimators.joint_fit import JointFit, fit
 from tvsbayes.files.disk import shipped_data
 from tvsbayes.instrument.axes import AXES, DIRECTIONS
@@ -51,6 +50,7 @@ from tvsbayes.instrument.parameters import INDEX, Prior
 from tvsbayes.instrument.plan import read_plan, run_plan, write_plan
 from tvsbayes.instrument.protocols import twin_protocol
 from tvsbayes.instrument.rig import Rig, read_rig
+from tvsbayes.model.compiled import use_compilation_cache
 from tvsbayes.report.figures import BLACK, BLUE, RED, STYLE, WIDTH_IN
 from tvsbayes.twin.simulated_campaign import simulate
 

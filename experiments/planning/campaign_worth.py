@@ -32,12 +32,12 @@ from experiments.common.headlines import marked
 from experiments.common.rigs import mounted_rig
 from experiments.common.rows import output, read_rows, run_rows
 from experiments.common.worth import CAUSES, Worth, full_turn_plan, searched_family, worth_of_plan
-from tvsbayes.estimators.campaign_arrays import use_compilation_cache
 from tvsbayes.instrument.axes import DIRECTIONS
 from tvsbayes.instrument.parameters import Prior
 from tvsbayes.instrument.plan import PlanStep
 from tvsbayes.instrument.protocols import grid_protocol, mixed_protocol, paper_protocol
 from tvsbayes.instrument.rig import Rig
+from tvsbayes.model.compiled import use_compilation_cache
 from tvsbayes.planning.candidates import candidates
 from tvsbayes.planning.expectation import Knowledge, prior_knowledge
 from tvsbayes.planning.forecast import Family

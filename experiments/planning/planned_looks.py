@@ -22,9 +22,9 @@ from matplotlib.figure import Figure
 from experiments.common.command_line import print_only
 from experiments.common.rigs import mounted_rig
 from experiments.common.worth import UNREACHED, searched_family
-from tvsbayes.estimators.campaign_arrays import use_compilation_cache
 from tvsbayes.instrument.plan import PlanStep
 from tvsbayes.instrument.protocols import grid_protocol, mixed_protocol, paper_protocol
+from tvsbayes.model.compiled import use_compilation_cache
 from tvsbayes.planning.candidates import LookArrays, candidates, covariance_of
 from tvsbayes.planning.expectation import Knowledge, PlanInformation, information_of, prior_knowledge
 from tvsbayes.planning.forecast import Family

@@ -29,12 +29,12 @@ from experiments.common.command_line import parser
 from experiments.common.headlines import headlines
 from experiments.common.rigs import dense_plan, mounted_rig
 from experiments.common.rows import commit, output
-from tvsbayes.estimators.campaign_arrays import use_compilation_cache
 from tvsbayes.estimators.joint_fit import JointFit, fit
 from tvsbayes.estimators.plausibility import check_campaign
 from tvsbayes.instrument.campaign import campaign_toml, moves_bytes, spots_bytes
 from tvsbayes.instrument.plan import PlanStep
 from tvsbayes.instrument.rig import Rig
+from tvsbayes.model.compiled import use_compilation_cache
 from tvsbayes.planning.target import DEFAULT_TARGET, parse_target
 from tvsbayes.posterior.sampling import sample
 from tvsbayes.studies.rows import StudyRows

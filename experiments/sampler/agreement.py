@@ -21,11 +21,11 @@ from arviz_stats.base import array_stats
 from experiments.common.command_line import print_only
 from experiments.common.reference_samplers import AXES, STRETCH_STEPS, stretch
 from experiments.common.rigs import twin_campaign
-from tvsbayes.estimators.campaign_arrays import use_compilation_cache
 from tvsbayes.estimators.joint_fit import fit
 from tvsbayes.files.disk import shipped_data
 from tvsbayes.instrument.campaign import input_hashes
 from tvsbayes.instrument.parameters import NAMES
+from tvsbayes.model.compiled import use_compilation_cache
 from tvsbayes.posterior.draws import Posterior
 from tvsbayes.posterior.proposal import Target, pilot
 from tvsbayes.posterior.ridges import transport

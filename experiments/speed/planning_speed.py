@@ -19,8 +19,9 @@ import numpy as np
 from experiments.common.clock import shortest
 from experiments.common.command_line import print_only
 from experiments.common.rigs import mounted_rig
-from tvsbayes.estimators.campaign_arrays import bucket, use_compilation_cache
+from tvsbayes.estimators.campaign_arrays import bucket
 from tvsbayes.instrument.protocols import grid_protocol, paper_protocol
+from tvsbayes.model.compiled import use_compilation_cache
 from tvsbayes.planning.candidates import LookArrays, Looks
 from tvsbayes.planning.expectation import (
     DESIGN_GROWTH,

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import pytest
 from scipy import stats
+from support.commands import caching_in
 from support.drawn_boards import PAIR, POSES, pictures, write_pair
 
 from experiments.cameras.stereo_coverage import calibrate
@@ -324,23 +325,15 @@ def test_correlation_factor_is_the_design_effect(shared):
 
 
 @pytest.fixture
-def ask(capsys, monkeypatch, tmp_path):
+def ask(capsys, tmp_path):
     """Run `stereo` with --json; the compilation cache stays in this test's folder."""
-    import jax
-    from jax.experimental.compilation_cache import compilation_cache
-
-    names = ("jax_compilation_cache_dir", "jax_persistent_cache_min_compile_time_secs")
-    before = {name: jax.config.values[name] for name in names}
-    monkeypatch.setenv("TVSBAYES_CACHE", str(tmp_path / "cache"))
 
     def run_json(*arguments: object) -> tuple[int, dict]:
         code = run(["stereo", *map(str, arguments), "--json"])
         return code, json.loads(capsys.readouterr().out)
 
-    yield run_json
-    for name, value in before.items():
-        jax.config.update(name, value)
-    compilation_cache.reset_cache()
+    with caching_in(tmp_path / "cache"):
+        yield run_json
 
 
 def test_command_writes_what_it_says(ask, tmp_path):

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from support.commands import caching_in
 
 from tvsbayes.cli.main import run
 
@@ -110,18 +111,8 @@ def test_the_whole_page_prints_what_it_says(tmp_path, monkeypatch, capsys):
     steps = shown()
     wanted = {"fit", "compare", "steps-for", "locate", "plan", "report"}
     assert wanted <= {step.arguments[0] for step in steps}
-    import jax
-    from jax.experimental.compilation_cache import compilation_cache
-
-    names = ("jax_compilation_cache_dir", "jax_persistent_cache_min_compile_time_secs")
-    before = {name: jax.config.values[name] for name in names}
-    monkeypatch.setenv("TVSBAYES_CACHE", str(tmp_path / "cache"))
-    try:
+    with caching_in(tmp_path / "cache"):
         follow(steps, tmp_path, monkeypatch, capsys)
-    finally:
-        for name, value in before.items():
-            jax.config.update(name, value)
-        compilation_cache.reset_cache()
     assert (tmp_path / "trial" / "results" / "report.html").stat().st_size > 100_000
 
 

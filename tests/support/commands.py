@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import json
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -39,20 +41,34 @@ def no_constant(name: str) -> None:
     raise AssertionError(f"{name} is no JSON")
 
 
-@pytest.fixture(scope="module")
-def own_compilation_cache():
-    """`fit` and `demo` point JAX at the folder of the tests; afterwards JAX is as it was."""
+@contextmanager
+def caching_in(folder: str | Path) -> Iterator[None]:
+    """Commands of this process keep compiled functions in a folder; afterwards JAX and the package are as before."""
     import jax
     from jax.experimental.compilation_cache import compilation_cache
 
-    names = ("jax_compilation_cache_dir", "jax_persistent_cache_min_compile_time_secs")
+    from tvsbayes.model.compiled import Traces
+
+    names = (
+        "jax_compilation_cache_dir",
+        "jax_persistent_cache_min_compile_time_secs",
+        "jax_persistent_cache_min_entry_size_bytes",
+    )
     before = {name: jax.config.values[name] for name in names}
     with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("TVSBAYES_CACHE", os.environ["JAX_COMPILATION_CACHE_DIR"])
+        patch.setenv("TVSBAYES_CACHE", str(folder))
+        patch.setattr(Traces, "used", None)
         yield
     for name, value in before.items():
         jax.config.update(name, value)
     compilation_cache.reset_cache()
+
+
+@pytest.fixture(scope="module")
+def own_compilation_cache():
+    """`fit` and `demo` point JAX at the folder of the tests."""
+    with caching_in(os.environ["JAX_COMPILATION_CACHE_DIR"]):
+        yield
 
 
 @pytest.fixture

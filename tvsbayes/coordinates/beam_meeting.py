@@ -19,6 +19,7 @@ from tvsbayes.calibration.optics import ROUNDING
 from tvsbayes.calibration.pointing import INPUT_NAMES, NOISE_NAMES, NOISES, Calibration, drawn
 from tvsbayes.instrument.axes import AXES, FULL_TURN_DEG
 from tvsbayes.instrument.parameters import INDEX, NAMES
+from tvsbayes.model.compiled import compiled
 from tvsbayes.model.geometry import Scalar, along_batch, dot, rotate_about_z
 from tvsbayes.model.laser_path import Beam, beam
 from tvsbayes.model.parameter_space import Model, model_of
@@ -211,7 +212,7 @@ class Carried(eqx.Module):
     meets: Bool[Array, "*draws points"]
 
 
-@eqx.filter_jit
+@compiled(Carried)
 def carry(settings: Settings, given: Sources) -> Carried:
     """Every draw through the geometry for every point."""
 
@@ -222,7 +223,7 @@ def carry(settings: Settings, given: Sources) -> Carried:
     return jax.vmap(one)(given.inputs, given.noise)
 
 
-@eqx.filter_jit
+@compiled(Linear)
 def propagate(settings: Settings, given: Sources) -> Linear:
     """The law of propagation at every point, not a number where there is none; fields get a leading axis `points`.
 

@@ -6,9 +6,7 @@ aperture readings in rad; padded rows are not valid and count nothing.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
-from pathlib import Path
 
 import equinox as eqx
 import jax
@@ -16,7 +14,6 @@ import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
-from platformdirs import user_cache_path
 
 from tvsbayes.instrument.axes import APPROACH_SIGN
 from tvsbayes.instrument.campaign import Campaign, Move, Spot, ordered_spots, pixels_of
@@ -154,18 +151,3 @@ def spot_constants(campaign: Campaign) -> np.ndarray:
 def log_constant(campaign: Campaign) -> float:
     """Their sum: terms of the log likelihood that no parameter changes."""
     return float(np.sum(spot_constants(campaign)))
-
-
-def use_compilation_cache() -> bool:
-    """Keep compiled functions in the user's cache folder (or `TVSBAYES_CACHE`).
-
-    For programs such as the command line, which own their process: it changes a global setting of JAX, so
-    only commands and worker processes call it.
-
-    Returns:
-        Whether nothing is in the folder yet: the model has to be compiled first, half a minute to two minutes.
-    """
-    folder = Path(os.environ.get("TVSBAYES_CACHE") or user_cache_path("tvsbayes") / "jax")
-    jax.config.update("jax_compilation_cache_dir", str(folder))
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
-    return next(folder.glob("*-cache"), None) is None

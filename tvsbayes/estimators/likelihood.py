@@ -19,6 +19,7 @@ from jaxtyping import Array, Bool, Float
 
 from tvsbayes.estimators.campaign_arrays import CampaignArrays, SpotArrays
 from tvsbayes.instrument.axes import HOME_SD_DEG
+from tvsbayes.model.compiled import compiled
 from tvsbayes.model.geometry import (
     Scalar,
     along_batch,
@@ -324,12 +325,19 @@ def log_density(z: Float[Array, " parameters"], space: ParameterSpace, arrays: C
     return innovations(space.model(z), arrays).log_density - 0.5 * jnp.dot(z, z)
 
 
-@eqx.filter_jit
+class SlopedDensity(eqx.Module):
+    """Log posterior density at a point, and its gradient."""
+
+    log_density: Scalar
+    gradient: Float[Array, " parameters"]
+
+
+@compiled(SlopedDensity)
 def density_and_gradient(
-    z: Float[Array, " parameters"], space: ParameterSpace, arrays: CampaignArrays
-) -> tuple[Scalar, Float[Array, " parameters"]]:
+    z: Float[Array | np.ndarray, " parameters"], space: ParameterSpace, arrays: CampaignArrays
+) -> SlopedDensity:
     """`log_density` and its gradient; the one compiled function that the Newton steps and Hessians share."""
-    return jax.value_and_grad(log_density)(z, space, arrays)
+    return SlopedDensity(*jax.value_and_grad(log_density)(z, space, arrays))
 
 
 class Evaluation(eqx.Module):
@@ -339,7 +347,7 @@ class Evaluation(eqx.Module):
     standardised: Float[Array, "*batch spots 4"]
 
 
-@eqx.filter_jit
+@compiled(Evaluation)
 def evaluate(z: Float[Array, "batch parameters"], space: ParameterSpace, arrays: CampaignArrays) -> Evaluation:
     """`log_density` of many points in one call; call it with one batch size, each compiles anew."""
 
@@ -350,7 +358,7 @@ def evaluate(z: Float[Array, "batch parameters"], space: ParameterSpace, arrays:
     return jax.vmap(one)(z)
 
 
-@eqx.filter_jit
+@compiled(jax.Array)
 def observe_with_stop_errors(
     z: Float[Array, "batch parameters"],
     stop_error_rad: Float[Array, "batch spots 2"],

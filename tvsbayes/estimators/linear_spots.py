@@ -20,6 +20,7 @@ from scipy import linalg
 
 from tvsbayes.estimators.campaign_arrays import CampaignArrays
 from tvsbayes.estimators.likelihood import filter_rows, spot_residuals, stop_variances
+from tvsbayes.model.compiled import compiled
 from tvsbayes.model.laser_path import mirror_angles
 from tvsbayes.model.parameter_space import ParameterSpace
 
@@ -57,7 +58,7 @@ class SpotDeviations:
     covariance_rad2: np.ndarray
 
 
-@eqx.filter_jit
+@compiled(Linearised)
 def linearise(z: Float[Array, " parameters"], space: ParameterSpace, arrays: CampaignArrays) -> Linearised:
     """Residuals, ideal observations at the observed ranges, and d/d(coordinates) of both."""
 

@@ -105,8 +105,8 @@ class Problem:
 
     def objective(self, z: np.ndarray) -> tuple[float, np.ndarray]:
         """Negative log density and its gradient."""
-        value, slope = density_and_gradient(jnp.asarray(z), self.space, self.arrays)
-        return -float(value), -np.asarray(slope)
+        found = density_and_gradient(z, self.space, self.arrays)
+        return -float(found.log_density), -np.asarray(found.gradient)
 
     def noise_scales(self, z: np.ndarray) -> np.ndarray:
         """Best noise scales for given geometry, under their priors."""

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from tvsbayes.instrument.axes import AXES, DIRECTIONS
+from tvsbayes.model.compiled import compiled
 from tvsbayes.model.geometry import Scalar
 from tvsbayes.model.laser_path import BeamAngles, Transmission, beam_angles
 from tvsbayes.model.parameter_space import ParameterSpace
@@ -38,7 +39,7 @@ def effective_deg_per_step(gears: Transmission, angles: BeamAngles) -> Float[Arr
     return jnp.stack([(ratio + half) * slope, (ratio - half) * slope], axis=1).ravel() * DEGREES
 
 
-@eqx.filter_jit
+@compiled(Headlines)
 def headlines(z: Float[Array, " parameters"], space: ParameterSpace, pose_rad: Float[Array, "2"]) -> Headlines:
     """Headlines at one pose (formulation 3.2) with their derivatives."""
 
@@ -61,7 +62,7 @@ class Physical(eqx.Module):
     slope: Float[Array, "parameters parameters"]
 
 
-@eqx.filter_jit
+@compiled(Physical)
 def _physical(z: Float[Array, " parameters"], space: ParameterSpace) -> Physical:
     return Physical(space.physical(z), jax.jacfwd(space.physical)(z))
 
@@ -85,7 +86,7 @@ class Derived(eqx.Module):
     effective_mirror_offset_mm: Scalar
 
 
-@eqx.filter_jit
+@compiled(Derived)
 def derived_quantities(
     z: Float[Array, "draws parameters"], space: ParameterSpace, reference_pose_rad: Float[Array, "2"]
 ) -> Derived:

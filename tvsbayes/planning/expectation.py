@@ -30,6 +30,7 @@ from tvsbayes.instrument.parameters import NAMES, NOISE_NAMES
 from tvsbayes.instrument.plan import PlanLog, PlanStep, plan_seconds, run_plan
 from tvsbayes.instrument.rig import Rig
 from tvsbayes.instrument.stops import redraws
+from tvsbayes.model.compiled import compiled
 from tvsbayes.model.geometry import along_batch, materialise, project, rotation_matrix, transform
 from tvsbayes.model.laser_path import beam, mirror_angles
 from tvsbayes.model.parameter_space import ParameterSpace, parameter_space
@@ -103,7 +104,7 @@ class Expectation(eqx.Module):
 NOISE_COLUMNS = np.isin(NAMES, NOISE_NAMES)
 
 
-@eqx.filter_jit
+@compiled(Expectation)
 def expect(
     z: Float[Array, " parameters"],
     space: ParameterSpace,

@@ -26,6 +26,7 @@ from tvsbayes.estimators.likelihood import (
 from tvsbayes.instrument.axes import HOME_SD_DEG
 from tvsbayes.instrument.campaign import PIXELS, ordered_spots
 from tvsbayes.instrument.parameters import INDEX
+from tvsbayes.model.compiled import compiled
 from tvsbayes.model.parameter_space import STOP_COLUMNS, ParameterSpace
 from tvsbayes.posterior.draws import Posterior
 from tvsbayes.posterior.transport import in_batches
@@ -79,7 +80,7 @@ class LaterSpots(eqx.Module):
         return Belief(mean, covariance)
 
 
-@eqx.filter_jit
+@compiled(jax.Array)
 def move_log_density(
     z: Float[Array, "batch parameters"], space: ParameterSpace, arrays: CampaignArrays
 ) -> Float[Array, "batch spots"]:

@@ -1,0 +1,110 @@
+"""A folder that nobody but its user can have written, and sealed files in it: what a program may run again.
+
+A file begins with a magic and the SHA-256 of what follows. It is read only where file and folder belong to the user
+who runs this and neither may be written by anybody else (POSIX; Windows keeps a user's folders apart by itself). A
+cache that cannot be read or written is no error: whoever asked makes its content anew.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import secrets
+import stat
+from dataclasses import dataclass
+from pathlib import Path
+
+MAGIC = b"tvsbayes sealed 1\n"
+OTHERS_WRITE = stat.S_IWGRP | stat.S_IWOTH
+
+
+def _others_may_change(status: os.stat_result) -> bool:
+    return os.name == "posix" and (status.st_uid != os.geteuid() or bool(status.st_mode & OTHERS_WRITE))
+
+
+@dataclass(frozen=True)
+class OwnFolder:
+    """A folder of sealed files.
+
+    Attributes:
+        path: where it lies; `make` creates it.
+        file_bytes_max: a larger file is not read.
+        bytes_max: of all files together, those used longest ago are removed by `write`.
+    """
+
+    path: Path
+    file_bytes_max: int = 16 * 2**20
+    bytes_max: int = 128 * 2**20
+
+    def fault(self) -> str:
+        """Why the folder is not to be trusted, in words; "" where it may be."""
+        try:
+            status = os.lstat(self.path)
+        except FileNotFoundError:
+            return "it does not exist"
+        except OSError as error:
+            return error.strerror or "it cannot be looked at"
+        if not stat.S_ISDIR(status.st_mode):
+            return "it is no folder"
+        if os.name == "posix" and status.st_uid != os.geteuid():
+            return "it belongs to somebody else"
+        return "others may write into it" if _others_may_change(status) else ""
+
+    def make(self) -> str:
+        """Create the folder for this user alone where there is none; the answer is that of `fault`."""
+        try:
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            self.path.mkdir(mode=0o700, exist_ok=True)
+        except OSError as error:
+            return error.strerror or "it cannot be created"
+        return self.fault()
+
+    def read(self, name: str) -> bytes | None:
+        """The content of a sealed file, None where it is missing, damaged, too large or may be of another's making."""
+        if self.fault():
+            return None
+        try:
+            flags = os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
+            descriptor = os.open(self.path / name, flags | getattr(os, "O_BINARY", 0))
+            with open(descriptor, "rb") as stream:
+                status = os.fstat(descriptor)
+                if not stat.S_ISREG(status.st_mode) or _others_may_change(status):
+                    return None
+                data = stream.read(self.file_bytes_max + 1)
+            # The time of last use, by which `write` chooses what to remove.
+            os.utime(self.path / name)
+        except OSError:
+            return None
+        seal, content = data[: len(MAGIC) + 32], data[len(MAGIC) + 32 :]
+        whole = len(data) <= self.file_bytes_max and seal == MAGIC + hashlib.sha256(content).digest()
+        return content if whole else None
+
+    def write(self, name: str, content: bytes) -> bool:
+        """Seal a content under a name, whole or not at all; whether it was kept."""
+        data = MAGIC + hashlib.sha256(content).digest() + content
+        if self.make() or len(data) > self.file_bytes_max:
+            return False
+        temporary = self.path / f".{secrets.token_hex(8)}.tmp"
+        try:
+            with open(os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as stream:
+                stream.write(data)
+            os.replace(temporary, self.path / name)
+        except OSError:
+            temporary.unlink(missing_ok=True)
+            return False
+        self._prune()
+        return True
+
+    def _prune(self) -> None:
+        """Remove the files used longest ago, as many as are too many."""
+        try:
+            files = [(entry.stat(), Path(entry.path)) for entry in os.scandir(self.path) if entry.is_file()]
+            total = sum(status.st_size for status, _ in files)
+            for status, path in sorted(files, key=lambda file: file[0].st_mtime):
+                if total <= self.bytes_max:
+                    break
+                path.unlink(missing_ok=True)
+                total -= status.st_size
+        except OSError:
+            # Another process may be at the same work.
+            return

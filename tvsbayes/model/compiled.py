@@ -1,0 +1,212 @@
+"""Functions of arrays that are traced once for all processes, and the folder in which what was compiled is kept.
+
+Tracing a large function takes JAX seconds in every process, and its compilation cache saves none of them. A `compiled`
+function is traced once for every shape of its arguments; where a program has asked for a cache folder, what the trace
+gave (StableHLO, by `jax.export`) is kept there and run by later processes, which neither trace nor compile. A stored
+trace belongs to one state of the package's source, one version of the libraries that took part, and one shape of the
+arguments; it is code, and read only as `files.own_folder` allows.
+"""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import os
+import threading
+import time
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, fields
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, cast
+
+import jax
+import numpy as np
+from jax import export
+from platformdirs import user_cache_path
+
+from tvsbayes.files.own_folder import OwnFolder
+
+LIBRARIES = ("jax", "jaxlib", "equinox", "optimistix", "lineax", "numpy")
+"""Whose versions decide what a trace gives."""
+PACKAGE = Path(__file__).resolve().parents[1]
+LOADED_TIME_S = time.time()
+"""When this process read its code, seconds since the epoch: source written later is not what it runs."""
+
+
+class Traces:
+    """Traces of one state of the code in a cache folder.
+
+    `used` is the folder of this process, None until a program asks for one: who imports the package as a library has
+    nothing written.
+    """
+
+    used: Traces | None = None
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = OwnFolder(folder)
+
+    @functools.cached_property
+    def code(self) -> bytes:
+        """Hash of the source of the whole package and of the versions of the libraries."""
+        found = hashlib.sha256(" ".join(version(library) for library in LIBRARIES).encode())
+        for path in sorted(PACKAGE.rglob("*.py")):
+            content = path.read_bytes()
+            found.update(f"{path.relative_to(PACKAGE)} {len(content)}\n".encode() + content)
+        return found.digest()
+
+    def name(self, key: str) -> str:
+        """The file of a trace; "" where the source has changed since this process read it, or cannot be read."""
+        try:
+            if any(path.stat().st_mtime > LOADED_TIME_S for path in PACKAGE.rglob("*.py")):
+                return ""
+            return hashlib.sha256(self.code + key.encode()).hexdigest()
+        except OSError:
+            return ""
+
+    def load(self, name: str) -> export.Exported | None:
+        """A stored trace."""
+        content = self.folder.read(name)
+        if content is None:
+            return None
+        try:
+            return export.deserialize(bytearray(content))
+        except Exception:
+            # Whatever a reader of a foreign format raises, flatbuffers missing among it: it is traced anew.
+            return None
+
+    def store(self, name: str, function: Callable, leaves: Iterable[Any]) -> export.Exported | None:
+        """Trace a function of arrays and keep that; None where it cannot be exported."""
+        try:
+            exported = export.export(jax.jit(function))(*leaves)
+            self.folder.write(name, bytes(exported.serialize()))
+        except (ImportError, ValueError, NotImplementedError):
+            # Without flatbuffers nothing is written, and a call into a library may have no stable form.
+            return None
+        return exported
+
+
+@dataclass(frozen=True)
+class Kind:
+    """Shape and type of one array."""
+
+    shape: tuple[int, ...]
+    dtype: np.dtype
+
+
+def _as_array(leaf: Any) -> np.ndarray | jax.Array:
+    """An array of a type of its own: Python's numbers, and what JAX took from them, would fit in with any."""
+    found = leaf if isinstance(leaf, jax.Array) and not leaf.weak_type else np.asarray(leaf)
+    if found.dtype == object or found.dtype.kind in "USV":
+        raise TypeError(f"a compiled function takes arrays, not {type(leaf).__name__}")
+    return found
+
+
+class Compiled[**P, Result]:
+    """A function of arrays, or of trees of arrays, whose result is one array or a flat `eqx.Module` of arrays.
+
+    Called inside another function that JAX traces it is that plain function; else its arguments and results are
+    float64 whatever the process has set, and it is traced for every new shape only. Threads may call it.
+
+    Attributes:
+        plain: the function as it was written.
+        traces: how often this process had to trace it.
+    """
+
+    def __init__(self, plain: Callable[P, Result], result: type[Result]) -> None:
+        self.plain, self._result = plain, result
+        self.traces = 0
+        self._ready: dict[Any, Callable] = {}
+        self._lock = threading.Lock()
+        functools.update_wrapper(self, plain)
+
+    def __call__(self, *args: P.args, **kwargs: P.kwargs) -> Result:
+        """Run it; `TypeError` for arguments that hold anything but arrays and numbers."""
+        leaves, structure = jax.tree.flatten((args, kwargs))
+        if any(isinstance(leaf, jax.core.Tracer) for leaf in leaves):
+            return self.plain(*args, **kwargs)
+        with jax.enable_x64(True):
+            arrays = [leaf if type(leaf) is np.ndarray else _as_array(leaf) for leaf in leaves]
+            key = structure, *((array.shape, array.dtype) for array in arrays)
+            run = self._ready.get(key)
+            return self._whole(self._first(key, structure, arrays) if run is None else run(*arrays))
+
+    def _first(self, key: Any, structure: Any, arrays: list) -> Any:
+        """Make what runs these shapes, and run it: another thread waits instead of compiling the same."""
+        with self._lock:
+            run = self._ready.get(key)
+            run = self._made(structure, arrays) if run is None else run
+            found = run(*arrays)
+            self._ready[key] = run
+            return found
+
+    def _made(self, structure: Any, arrays: list) -> Callable:
+        def flat(*leaves):
+            self.traces += 1
+            args, kwargs = jax.tree.unflatten(structure, leaves)
+            found = self.plain(*args, **kwargs)
+            parts = jax.tree.leaves(found)
+            if not isinstance(found, self._result) or len(parts) != len(self._fields()):
+                raise TypeError(f"{self.plain.__name__} must return a flat {self._result.__name__}")
+            return tuple(parts)
+
+        flat.__name__ = self.plain.__name__
+        traces = Traces.used
+        kinds = [Kind(array.shape, array.dtype) for array in arrays]
+        backend = jax.default_backend()
+        key = repr((self.plain.__module__, self.plain.__qualname__, str(structure), kinds, backend))
+        name = traces.name(key) if traces is not None else ""
+        if traces is None or not name:
+            return jax.jit(flat)
+        exported = traces.load(name)
+        if exported is None or not self._fits(exported, kinds, backend):
+            exported = traces.store(name, flat, arrays)
+        return jax.jit(flat if exported is None else exported.call)
+
+    def _fits(self, exported: export.Exported, kinds: list[Kind], backend: str) -> bool:
+        """Whether a stored trace takes these arguments and gives such a result."""
+        taken = [Kind(aval.shape, np.dtype(aval.dtype)) for aval in exported.in_avals]
+        return taken == kinds and len(exported.out_avals) == len(self._fields()) and backend in exported.platforms
+
+    def _fields(self) -> tuple:
+        """Of the result; one array is its own only field."""
+        return (self._result,) if self._result is jax.Array else fields(cast(Any, self._result))
+
+    @functools.cached_property
+    def _structure(self) -> Any:
+        """Of a result; made without its constructor, which is for one point where a result may hold many."""
+        blank = object.__new__(self._result)
+        for field in self._fields():
+            object.__setattr__(blank, field.name, 0.0)
+        return jax.tree.structure(blank)
+
+    def _whole(self, parts: tuple) -> Result:
+        return parts[0] if self._result is jax.Array else jax.tree.unflatten(self._structure, parts)
+
+
+def compiled[**P, Result](result: type[Result]) -> Callable[[Callable[P, Result]], Compiled[P, Result]]:
+    """Decorator of a function that returns `result`: one array (`jax.Array`) or a flat `eqx.Module`; see `Compiled`."""
+    return lambda plain: Compiled(plain, result)
+
+
+def cache_folder() -> Path:
+    """Where compiled functions are kept: the user's cache folder, or `TVSBAYES_CACHE`."""
+    return Path(os.environ.get("TVSBAYES_CACHE") or user_cache_path("tvsbayes") / "jax")
+
+
+def use_compilation_cache() -> bool:
+    """Keep traces and compiled functions in `cache_folder`.
+
+    For programs such as the command line, which own their process: it changes a global setting of JAX, so
+    only commands and worker processes call it.
+
+    Returns:
+        Whether nothing is in the folder yet: the model has to be compiled first, half a minute to two minutes.
+    """
+    folder = cache_folder()
+    jax.config.update("jax_compilation_cache_dir", str(folder))
+    # Small functions too: a process of a command compiles some dozens, and their sum is seconds.
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+    jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+    Traces.used = Traces(folder / "traced")
+    return next(folder.glob("*-cache"), None) is None
