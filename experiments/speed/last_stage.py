@@ -62,7 +62,7 @@ class LastStage:
     def jacobian(self, z: np.ndarray, kind: Residuals = stage_residuals) -> np.ndarray:
         """Derivative, with slopes and projection held fixed or not."""
         self.calls["Jacobians"] += 1
-        return np.asarray(residuals_and_jacobian(kind, jnp.asarray(z), self.args)[1])
+        return np.asarray(residuals_and_jacobian(kind, jnp.asarray(z), self.args).jacobian)
 
     def ours(self, tolerance: float, steps: int, kind: Residuals = stage_residuals) -> np.ndarray:
         """Where our solver ends."""

@@ -16,6 +16,8 @@ from support.bent_rig import (
 from support.published_equations import published_point
 
 from tvsbayes.coordinates.beam_meeting import meeting
+from tvsbayes.model.geometry import Vectors
+from tvsbayes.model.laser_path import Ray
 from tvsbayes.twin.physics import aperture_angle_deg
 
 ROUNDING_MM = 1e-9
@@ -41,7 +43,7 @@ def bent_beams(count: int, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarra
 
 @jax.jit
 def compiled_meeting(origin, direction, reading, azimuth):
-    return meeting(origin, direction, jnp.asarray(A_MM), reading, azimuth)
+    return meeting(Ray(Vectors.of(origin), Vectors.of(direction)), jnp.asarray(A_MM), reading, azimuth)
 
 
 def met(origin, direction, reading_deg, azimuth: bool):

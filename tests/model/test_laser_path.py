@@ -13,9 +13,9 @@ from tvsbayes.model.laser_path import (
     MoveArrays,
     Optics,
     Transmission,
-    beam,
     beam_angles,
     mirror_angles,
+    trace,
 )
 
 pytestmark = pytest.mark.usefixtures("x64")
@@ -63,8 +63,8 @@ def chain():
     """Beam (origin, direction) of a batch of [optics (10), psi, beta] and its Jacobian."""
 
     def one(values):
-        ray = beam(optics_of(values[:10]), values[10], values[11])
-        return jnp.concatenate([ray.origin_mm, ray.direction])
+        ray = trace(optics_of(values[:10]), values[10], values[11])
+        return jnp.concatenate([ray.origin_mm.stacked(), ray.direction.stacked()])
 
     both = jax.jit(jax.vmap(lambda v: (one(v), jax.jacfwd(one)(v))))
     single = jax.jit(jax.vmap(one))

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from support.printed_vector import LAST_6, LAST_7, LAST_9, LAST_12, VECTOR
 
-from tvsbayes.estimators.likelihood import aperture_angle, observe
+from tvsbayes.estimators.looks import aperture_angle, observe
 from tvsbayes.instrument.parameters import INDEX, NAMES
 from tvsbayes.instrument.rig import RigTable
-from tvsbayes.model.geometry import project, rotate_about_z, rotation_matrix
-from tvsbayes.model.laser_path import MoveArrays, Transmission, beam, beam_angles, mirror_angles
+from tvsbayes.model.geometry import Turn, Vectors, project, rotation_matrix
+from tvsbayes.model.laser_path import MoveArrays, Transmission, beam_angles, mirror_angles, trace
 from tvsbayes.model.parameter_space import Receiver, model_of, parameter_space
 from tvsbayes.statistics.intervals import NORMAL_95, coverage_factor
 
@@ -48,8 +48,8 @@ def looks():
 
     def one(values, poses):
         model = model_of(values)
-        rays = beam(model.optics, poses[0], poses[1])
-        return rays.origin_mm.T, rays.direction.T, observe(model, poses, jnp.asarray(False)).T
+        rays = trace(model.optics, poses[0], poses[1])
+        return rays.origin_mm.stacked().T, rays.direction.stacked().T, observe(model, poses, jnp.asarray(False)).T
 
     compiled = jax.jit(one)
 
@@ -81,9 +81,9 @@ def test_jacobian_of_the_test_vector(nominal):
 def test_tvs_point_and_aperture_of_the_test_vector(nominal, looks, azimuth, printed_deg):
     """250 mm along the beam: p_T = Rz(C0 - 90 deg) p_P + (0, a/2, 0), and B as either convention reads it."""
     origin, direction, _ = looks(with_values(nominal, **VECTOR), [[PAN_RAD, TILT_RAD, RANGE_MM]])
-    point_p = jnp.asarray(origin[0] + RANGE_MM * direction[0])
-    point_t = rotate_about_z(jnp.asarray(C0_RAD - np.pi / 2), point_p) + np.array([0.0, BASELINE_MM / 2, 0.0])
-    assert np.abs(point_t - np.array([250.365237, 119.492704, 18.238043])).max() <= LAST_6 * 1.01
+    point_p = Vectors.of(jnp.asarray(origin[0] + RANGE_MM * direction[0]))
+    point_t = Turn.by(jnp.asarray(C0_RAD - np.pi / 2)).forward(point_p) + Vectors(0.0, BASELINE_MM / 2, 0.0)
+    assert np.abs(point_t.stacked() - np.array([250.365237, 119.492704, 18.238043])).max() <= LAST_6 * 1.01
     receiver = Receiver(*map(jnp.asarray, (BASELINE_MM, C0_RAD, 0.0, 1.0)))
     angle_deg = np.degrees(aperture_angle(receiver, point_p, jnp.asarray(azimuth)))
     assert abs(float(angle_deg) - printed_deg) <= LAST_6 * 1.01
@@ -116,23 +116,25 @@ def test_pan_positive_is_left_and_tilt_positive_is_up(nominal, looks):
     # With P parallel to S, left in the room is left in both images, up is up (v falls).
     assert np.all(pixels[1, [0, 2]] < pixels[0, [0, 2]] - 1.0)
     assert np.all(pixels[2, [1, 3]] < pixels[0, [1, 3]] - 1.0)
-    in_t = np.asarray(rotate_about_z(jnp.asarray(C0_RAD - np.pi / 2), jnp.asarray(direction[1])))
-    emission = np.pi / 2 + np.arctan2(in_t[1], in_t[0])
+    in_t = Turn.by(jnp.asarray(C0_RAD - np.pi / 2)).forward(Vectors.of(jnp.asarray(direction[1])))
+    emission = np.pi / 2 + np.arctan2(in_t.y, in_t.x)
     assert emission == pytest.approx(C0_RAD + 0.1, abs=ROUNDING)
 
 
 def test_left_and_up_are_growing_counters():
     """A left move turns the pan by k_pan + c_pan / 2 per step; right, up and down accordingly."""
     transmission = Transmission(*(jnp.asarray(v) for v in ([1e-3, 2e-3], [1e-4, 4e-4], [0.0, 0.0])))
-    ratios = [np.asarray(transmission.directional_ratio(jnp.full(2, sign))) for sign in (True, False)]
-    np.testing.assert_allclose(ratios, [[1.05e-3, 2.2e-3], [0.95e-3, 1.8e-3]], rtol=1e-15)
+    counters = jnp.asarray([[0.0, 0.0], [1.0, 1.0], [0.0, 0.0]])
+    moves = MoveArrays(counters, jnp.arange(3) == 0, jnp.zeros((3, 2)))
+    turned = np.diff(mirror_angles(transmission, jnp.zeros(()), moves).angle_rad, axis=0)
+    np.testing.assert_allclose(turned, [[1.05e-3, 2.2e-3], [-0.95e-3, -1.8e-3]], rtol=4e-15)
 
 
 def test_aperture_reads_the_angle_from_plus_y():
     """A spot straight ahead of the aperture, in the plane z = 0: 90 deg; towards the positioner: less."""
     receiver = Receiver(*map(jnp.asarray, (BASELINE_MM, np.pi / 2, 0.0, 1.0)))
     points_p = jnp.asarray([[300.0, 300.0, 300.0], [-200.0, -100.0, 0.0], [0.0, 0.0, 0.0]])
-    angles = np.asarray(aperture_angle(receiver, points_p, jnp.asarray(False)))
+    angles = np.asarray(aperture_angle(receiver, Vectors.of(points_p), jnp.asarray(False)))
     np.testing.assert_allclose(angles, [np.pi / 2, np.arctan2(300, 100), np.arctan2(300, 200)], atol=ROUNDING)
 
 
@@ -140,7 +142,7 @@ def test_aperture_reads_the_angle_from_plus_y():
 def test_aperture_angle_has_a_derivative_on_the_baseline(azimuth):
     """A spot on the line between both instruments has no lateral direction; the gradient stays finite."""
     receiver = Receiver(*map(jnp.asarray, (BASELINE_MM, np.pi / 2, 0.0, 1.0)))
-    gradient = jax.grad(lambda p: aperture_angle(receiver, p, jnp.asarray(azimuth)))
+    gradient = jax.grad(lambda p: aperture_angle(receiver, Vectors.of(p), jnp.asarray(azimuth)))
     for y_mm in (-50.0, 0.0, -250.0):
         assert np.isfinite(gradient(jnp.asarray([0.0, y_mm, 0.0]))).all()
 
@@ -162,7 +164,7 @@ def test_observation_is_the_chain_of_transforms(nominal, looks):
     np.testing.assert_allclose(
         seen[0, :4], np.asarray(project(model.cameras, jnp.asarray(point_s)[:, None]))[:, 0], atol=1e3 * ROUNDING
     )
-    angle = aperture_angle(model.receiver, jnp.asarray(point_p), jnp.asarray(False))
+    angle = aperture_angle(model.receiver, Vectors.of(jnp.asarray(point_p)), jnp.asarray(False))
     assert seen[0, 4] == pytest.approx(float(angle) + np.radians(0.7), abs=ROUNDING)
 
 

@@ -12,11 +12,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from tvsbayes.estimators.likelihood import aperture_angle
+from tvsbayes.estimators.looks import aperture_angle
 from tvsbayes.instrument.parameters import HARMONIC_NAMES, NAMES, RIG_NAMES, Prior
-from tvsbayes.model.geometry import project
+from tvsbayes.model.geometry import Vectors, project
 from tvsbayes.model.headlines import derived_quantities
-from tvsbayes.model.laser_path import MoveArrays, beam, beam_angles, mirror_angles
+from tvsbayes.model.headlines import effective_deg_per_step as effective_of_model
+from tvsbayes.model.laser_path import MoveArrays, beam_angles, mirror_angles, trace
 from tvsbayes.model.parameter_space import model_of, parameter_space
 from tvsbayes.twin import physics
 from tvsbayes.twin.physics import (
@@ -67,11 +68,15 @@ def batched(function, *arrays):
 
 
 def test_mirror_chain(truths, values, poses_rad):
-    rays = batched(lambda v, p: beam(model_of(v).optics, p[:, 0], p[:, 1]), values, poses_rad)
+    rays = batched(lambda v, p: trace(model_of(v).optics, p[:, 0], p[:, 1]), values, poses_rad)
     for rig, truth in enumerate(truths):
         origin, direction = mirror_chain(*poses_rad[rig].T, truth.parameters)
-        assert np.abs(rays.origin_mm[rig].T - origin).max() < LENGTH_MM
-        assert np.abs(rays.direction[rig].T - direction).max() < ANGLE_RAD
+        for found, expected, tolerance in (
+            (rays.origin_mm, origin, LENGTH_MM),
+            (rays.direction, direction, ANGLE_RAD),
+        ):
+            seen = np.stack([found.x[rig], found.y[rig], found.z[rig]], axis=1)
+            assert np.abs(seen - expected).max() < tolerance
 
 
 def test_cameras(truths, values):
@@ -122,7 +127,7 @@ def test_aperture_angle(truths, values, convention):
     points = np.random.default_rng(81).uniform([150.0, -250.0, -80.0], [1000.0, 100.0, 80.0], (RIGS, 20, 3))
 
     def angle(v, p):
-        return aperture_angle(model_of(v).receiver, p.T, jnp.asarray(convention == "azimuth"))
+        return aperture_angle(model_of(v).receiver, Vectors.of(p.T), jnp.asarray(convention == "azimuth"))
 
     found = batched(angle, values, points)
     for rig, truth in enumerate(truths):
@@ -154,8 +159,7 @@ def test_headlines(truths, values, poses_rad):
     def headlines(v, pose):
         model = model_of(v)
         angles = beam_angles(model.optics, pose[0], pose[1])
-        both = jnp.stack([model.transmission.directional_ratio(jnp.full(2, sign)) for sign in (True, False)])
-        ratios = jnp.rad2deg((both * jnp.diagonal(angles.jacobian)).T.ravel())
+        ratios = effective_of_model(model.transmission, angles)
         return ratios, angles.effective_mirror_offset_mm, angles.jacobian
 
     ratios, offset_mm, jacobian = batched(headlines, values, poses_rad[:, 0])

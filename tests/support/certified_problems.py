@@ -128,7 +128,8 @@ class End:
 
 def descended(residual, start: np.ndarray, args, steps: int = STEPS) -> End:
     value = levenberg_marquardt(residual, jnp.asarray(start), args, jnp.asarray(TOLERANCE), steps)
-    residuals, jacobian = (np.asarray(x) for x in residuals_and_jacobian(residual, value, args))
+    found = residuals_and_jacobian(residual, value, args)
+    residuals, jacobian = np.asarray(found.value), np.asarray(found.jacobian)
     sd = np.linalg.norm(residuals) / np.sqrt(max(residuals.size - value.size, 1))
     left = np.linalg.norm(np.linalg.qr(jacobian)[0].T @ residuals)
     # At a perfect fit the residuals are rounding errors and their direction means nothing.

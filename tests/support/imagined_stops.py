@@ -23,7 +23,7 @@ def linearised(residual: np.ndarray, slope: np.ndarray, angles: np.ndarray) -> L
     spots, count = len(residual), len(INPUT_NAMES)
     shapes = {"play_sd_rad": (2,), "predicted": (5,), "stop_variance": (2,)}
     shapes |= {"residual_jacobian": (4, count), "predicted_jacobian": (5, count)}
-    arrays = {"residual": residual, "slope": slope, "mirror_angles_rad": angles}
+    arrays = {"z": np.zeros(count), "residual": residual, "slope": slope, "mirror_angles_rad": angles}
     arrays |= {name: np.zeros((spots, *shape)) for name, shape in shapes.items()}
     with jax.enable_x64(True):
         return Linearised(**{name: jnp.asarray(array) for name, array in arrays.items()})

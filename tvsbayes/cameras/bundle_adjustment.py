@@ -207,7 +207,7 @@ def bundle_adjustment(
         if dof < 1:
             raise undetermined("fewer corner coordinates than unknowns")
         zero = np.zeros(24)
-        jacobian = np.asarray(residuals_and_jacobian(reduced_residuals, jnp.asarray(zero), arrays)[1])
+        jacobian = np.asarray(residuals_and_jacobian(reduced_residuals, jnp.asarray(zero), arrays).jacobian)
         # Whitened at the start: a unit of z is one standard error for corners of 1 px. In their own units a focal
         # length and a k3 would share one damping.
         root = np.zeros((24, 24))
@@ -288,8 +288,8 @@ def _descended(z: np.ndarray, arrays: BoardArrays) -> _End:
     """Where Levenberg-Marquardt ends."""
     tolerance = jnp.asarray(TOLERANCE)
     end = levenberg_marquardt(reduced_residuals, jnp.asarray(z), arrays, tolerance, STEPS_MAX)
-    residuals, jacobian = residuals_and_jacobian(reduced_residuals, end, arrays)
-    return _End(np.asarray(end), np.asarray(residuals), np.asarray(jacobian))
+    found = residuals_and_jacobian(reduced_residuals, end, arrays)
+    return _End(np.asarray(end), np.asarray(found.value), np.asarray(found.jacobian))
 
 
 def undetermined(reason: str) -> NothingToEstimate:

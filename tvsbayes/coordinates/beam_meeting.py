@@ -20,8 +20,8 @@ from tvsbayes.calibration.pointing import INPUT_NAMES, NOISE_NAMES, NOISES, Cali
 from tvsbayes.instrument.axes import AXES, FULL_TURN_DEG
 from tvsbayes.instrument.parameters import INDEX, NAMES
 from tvsbayes.model.compiled import compiled
-from tvsbayes.model.geometry import Scalar, along_batch, dot, rotate_about_z
-from tvsbayes.model.laser_path import Beam, beam
+from tvsbayes.model.geometry import Scalar, Turn, Vectors
+from tvsbayes.model.laser_path import Ray, trace
 from tvsbayes.model.parameter_space import Model, model_of
 
 
@@ -67,8 +67,7 @@ class Meeting(eqx.Module):
 
 
 def meeting(
-    origin_mm: Float[Array, "3 *batch"],
-    direction: Float[Array, "3 *batch"],
+    rays: Ray,
     baseline_mm: Scalar,
     aperture_rad: Float[Array, "*batch"],
     azimuth_convention: Bool[Array, ""],
@@ -83,8 +82,7 @@ def meeting(
     beams that start on the positioner's side of the aperture (w_y > 0).
 
     Args:
-        origin_mm: origins of the beams, frame T.
-        direction: unit directions.
+        rays: the beams, frame T.
         baseline_mm: a.
         aperture_rad: true angles B in (0, pi), without the aperture's zero.
         azimuth_convention: B is the azimuth of the spot instead of the angle in the plane of baseline and spot.
@@ -93,29 +91,23 @@ def meeting(
         Points; `meets` is False where the beam misses the cone (grazing), only its backward extension meets it
         (diverging), or the point lies on the other nappe.
     """
-    w = origin_mm + half_baseline(baseline_mm, origin_mm[0])
+    w, direction = rays.origin_mm + half_baseline(baseline_mm), rays.direction
     sin_b, cos_b = jnp.sin(aperture_rad), jnp.cos(aperture_rad)
-    moment = jnp.stack(
-        [
-            w[1] * direction[2] - w[2] * direction[1],
-            w[2] * direction[0] - w[0] * direction[2],
-            w[0] * direction[1] - w[1] * direction[0],
-        ]
-    )
-    inside = (moment[0] ** 2 + moment[2] ** 2) * sin_b**2 - (moment[1] * cos_b) ** 2
+    moment = w.cross(direction)
+    inside = (moment.x**2 + moment.z**2) * sin_b**2 - (moment.y * cos_b) ** 2
     touches = inside > 0
     # The root's derivative is infinite where the beam touches the cone; such beams are refused anyway.
     root = jnp.sqrt(jnp.where(touches, inside, 1.0))
-    ahead = cos_b * root - w[1] * direction[1] + cos_b**2 * dot(w, direction)
-    cone = (w[1] ** 2 - cos_b**2 * dot(w, w)) / ahead
-    plane = (w[1] * sin_b - w[0] * cos_b) / (direction[0] * cos_b - direction[1] * sin_b)
+    ahead = cos_b * root - w.y * direction.y + cos_b**2 * w.dot(direction)
+    cone = (w.y**2 - cos_b**2 * w.dot(w)) / ahead
+    plane = (w.y * sin_b - w.x * cos_b) / (direction.x * cos_b - direction.y * sin_b)
     range_mm = jnp.where(azimuth_convention, plane, cone)
-    seen = w + range_mm * direction
-    in_sight = jnp.where(azimuth_convention, seen[0] * sin_b, 0.0) + seen[1] * cos_b
+    seen = w + direction * range_mm
+    in_sight = jnp.where(azimuth_convention, seen.x * sin_b, 0.0) + seen.y * cos_b
     # At B = 90 deg both nappes are one plane, and y is nought but for rounding.
     faces = in_sight >= -ROUNDING * jnp.abs(range_mm * cos_b)
     meets = (azimuth_convention | touches) & (range_mm > 0) & faces & jnp.isfinite(range_mm)
-    return Meeting(origin_mm + range_mm * direction, range_mm, meets)
+    return Meeting(rays.at(range_mm).stacked(), range_mm, meets)
 
 
 class Settings(eqx.Module):
@@ -126,7 +118,7 @@ class Settings(eqx.Module):
     aperture_rad: Float[Array, "*points"]
 
 
-def beams_at(model: Model, steps: Array, side: Array, noise: Float[Array, "noises"]) -> Beam:
+def beams_at(model: Model, steps: Array, side: Array, noise: Float[Array, "noises"]) -> Ray:
     """Beams of one rig at many settings, frame T: q = k n after homing, play taken up on the approach side.
 
     Source: formulation 3.1.
@@ -149,16 +141,16 @@ def beams_at(model: Model, steps: Array, side: Array, noise: Float[Array, "noise
     return _in_frame_t(model, angle[..., 0], angle[..., 1] + model.tilt_zero_rad)
 
 
-def _in_frame_t(model: Model, pan_rad: Array, tilt_rad: Array) -> Beam:
-    ray = beam(model.optics, pan_rad, tilt_rad)
-    turn = model.receiver.pan_zero_emission_rad - jnp.pi / 2
-    origin = rotate_about_z(turn, ray.origin_mm) + half_baseline(model.receiver.baseline_mm, pan_rad)
-    return Beam(origin, rotate_about_z(turn, ray.direction))
+def _in_frame_t(model: Model, pan_rad: Array, tilt_rad: Array) -> Ray:
+    ray = trace(model.optics, pan_rad, tilt_rad)
+    turn = Turn.by(model.receiver.pan_zero_emission_rad - jnp.pi / 2)
+    origin = turn.forward(ray.origin_mm) + half_baseline(model.receiver.baseline_mm)
+    return Ray(origin, turn.forward(ray.direction))
 
 
-def half_baseline(baseline_mm: Scalar, like: Float[Array, "*batch"]) -> Float[Array, "3 ..."]:
-    """(0, a/2, 0), from the middle of the baseline to the pan axis, for a batch like `like`."""
-    return along_batch(jnp.stack([jnp.zeros(()), 0.5 * baseline_mm, jnp.zeros(())]), like)
+def half_baseline(baseline_mm: Scalar) -> Vectors:
+    """(0, a/2, 0), from the middle of the baseline to the pan axis."""
+    return Vectors(0.0, 0.5 * baseline_mm, 0.0)
 
 
 class Sources(eqx.Module):
@@ -202,7 +194,7 @@ def _look(inputs: Array, noise: Array, settings: Settings, given: Sources) -> Me
     rays = beams_at(model, settings.steps, settings.side, noise)
     receiver = model.receiver
     true_rad = settings.aperture_rad - receiver.aperture_zero_rad - receiver.aperture_sd_rad * noise[4]
-    return meeting(rays.origin_mm, rays.direction, receiver.baseline_mm, true_rad, given.azimuth_convention)
+    return meeting(rays, receiver.baseline_mm, true_rad, given.azimuth_convention)
 
 
 class Carried(eqx.Module):

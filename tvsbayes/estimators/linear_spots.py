@@ -9,7 +9,7 @@ State Space Methods, 4.5): leave-one-out residuals, and what a fit would lose wi
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import equinox as eqx
 import jax
@@ -19,15 +19,16 @@ from jaxtyping import Array, Float
 from scipy import linalg
 
 from tvsbayes.estimators.campaign_arrays import CampaignArrays
-from tvsbayes.estimators.likelihood import filter_rows, spot_residuals, stop_variances
-from tvsbayes.model.compiled import compiled
-from tvsbayes.model.laser_path import mirror_angles
+from tvsbayes.estimators.likelihood import filter_rows, standing
+from tvsbayes.estimators.look_jacobian import look_jacobian
+from tvsbayes.model.geometry import Scalar
 from tvsbayes.model.parameter_space import ParameterSpace
 
 
 class Linearised(eqx.Module):
-    """The campaign linearised at a point; first axis of the Jacobians is the spot."""
+    """The campaign linearised at coordinates `z`; first axis of the Jacobians is the spot."""
 
+    z: Float[Array, " parameters"]
     residual: Float[Array, "spots 4"]
     slope: Float[Array, "spots 4 2"]
     play_sd_rad: Float[Array, "spots 2"]
@@ -36,6 +37,11 @@ class Linearised(eqx.Module):
     stop_variance: Float[Array, "spots 2"]
     residual_jacobian: Float[Array, "spots 4 parameters"]
     predicted_jacobian: Float[Array, "spots 5 parameters"]
+
+    def of_spots(self, count: int) -> Linearised:
+        """The first `count` spots, as NumPy arrays: padding comes last."""
+        parts = {field.name: np.asarray(getattr(self, field.name)) for field in fields(self)}
+        return Linearised(**{name: part if name == "z" else part[:count] for name, part in parts.items()})
 
     def spot_deviations(self) -> SpotDeviations:
         """Least squares of the whitened residuals, spot by spot; covariance 0 where a spot tells neither angle."""
@@ -58,29 +64,31 @@ class SpotDeviations:
     covariance_rad2: np.ndarray
 
 
-@compiled(Linearised)
-def linearise(z: Float[Array, " parameters"], space: ParameterSpace, arrays: CampaignArrays) -> Linearised:
-    """Residuals, ideal observations at the observed ranges, and d/d(coordinates) of both."""
+def linearise(
+    z: Float[Array, " parameters"], space: ParameterSpace, arrays: CampaignArrays, inflation: Scalar | float = 1.0
+) -> Linearised:
+    """Residuals, ideal observations at the observed ranges, and d/d(coordinates) of both; noise scales are held.
 
-    def forward(z):
-        model = space.model(z)
-        angles = mirror_angles(model.transmission, model.tilt_zero_rad, arrays.moves)
-        terms = spot_residuals(model, angles, arrays, jnp.ones(()), frozen=True)
-        return (terms.residual, terms.predicted), (terms, angles)
-
-    (residual, predicted), push, (terms, angles) = jax.linearize(forward, z, has_aux=True)
-    residual_jacobian, predicted_jacobian = jax.vmap(push, out_axes=-1)(jnp.eye(z.size))
-    index = arrays.spots.move_index
-    stop_sd_rad = space.model(z).noise.stop_sd_rad
+    Args:
+        z: coordinates.
+        space: priors.
+        arrays: the campaign.
+        inflation: factor on pixel and aperture noise.
+    """
+    found = standing(space.model(z), arrays, inflation)
+    looks, terms = found.looks, found.terms
+    by_coordinates = look_jacobian(z, space, looks, arrays)
+    residuals = terms.range_out.of_many(found.noise.whitened(by_coordinates, arrays.spots))[1:]
     return Linearised(
-        residual=residual,
-        slope=terms.slope,
-        play_sd_rad=angles.play_sd_rad[index],
-        mirror_angles_rad=angles.angle_rad[index],
-        predicted=predicted,
-        stop_variance=stop_variances(stop_sd_rad, arrays.spots),
-        residual_jacobian=residual_jacobian,
-        predicted_jacobian=predicted_jacobian,
+        z=z,
+        residual=jnp.stack(terms.residual, axis=1),
+        slope=jnp.stack([jnp.stack(terms.by_pan, axis=1), jnp.stack(terms.by_tilt, axis=1)], axis=2),
+        play_sd_rad=found.play_sd_rad,
+        mirror_angles_rad=jnp.stack([looks.pan_rad, looks.tilt_rad], axis=1),
+        predicted=jnp.stack(looks.predicted, axis=1),
+        stop_variance=found.stop_variance,
+        residual_jacobian=-jnp.stack(residuals).transpose(2, 0, 1),
+        predicted_jacobian=jnp.stack(by_coordinates).transpose(2, 0, 1),
     )
 
 

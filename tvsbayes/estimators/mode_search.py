@@ -12,34 +12,28 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
 from scipy import optimize
 
-from tvsbayes.estimators.campaign_arrays import CampaignArrays, campaign_arrays
-from tvsbayes.estimators.likelihood import density_and_gradient, innovations
+from tvsbayes.estimators.annealed_stage import NO_STEP, STAGE_TOLERANCE, Fixed, stage
+from tvsbayes.estimators.campaign_arrays import campaign_arrays
+from tvsbayes.estimators.likelihood import density_and_gradient
 from tvsbayes.estimators.linear_spots import (
     Linearised,
     StopInformation,
     leave_one_out_chi2,
     linear_spots,
-    linearise,
     stop_information,
 )
 from tvsbayes.instrument.campaign import Campaign, ordered_spots
 from tvsbayes.instrument.parameters import NAMES, NOISE_NAMES
 from tvsbayes.instrument.rig import RigTable
-from tvsbayes.model.geometry import Scalar
-from tvsbayes.model.parameter_space import ParameterSpace, free_mask, parameter_space
+from tvsbayes.model.parameter_space import free_mask, parameter_space
 from tvsbayes.statistics.chances import chi2_quantile
-from tvsbayes.statistics.least_squares import NEWTON_STEP, levenberg_marquardt
+from tvsbayes.statistics.least_squares import NEWTON_STEP
 
 ANNEALING = (60.0, 10.0, 2.0, 1.0)
 """Factors on the pixel noise before it takes its own value: plain Levenberg-Marquardt from the nominal rig goes
 astray when the extrinsics are off by 0.3 rad and 60 mm (formulation 4.2)."""
-STAGE_TOLERANCE = 1e-2
-STAGE_STEPS = 12
-"""Levenberg-Marquardt only has to reach the basin: its frozen Jacobian (`spot_residuals`) is not exact at the level
-of the noise, where it would stall; the Newton steps on the full density finish the work."""
 NOISE_SETTLED = 0.05
 """Change of every noise coordinate (prior sds) below which the alternation stops: half a posterior sd."""
 GATE_PROBABILITY = 1e-6
@@ -48,24 +42,6 @@ HUBER_CORE = 0.8214
 """Share of clean spots with full weight: P(|z| < 1.345), the constant of 95 % efficiency (Huber 1964)."""
 ROUNDS_MAX, WEIGHTS_SETTLED = 20, 0.02
 """Rounds of the robust option, and the largest change of a weight at which they end."""
-
-
-class Fixed(eqx.Module):
-    """What a least-squares stage holds: coordinates kept at a value, and the factor on the noise."""
-
-    held: Bool[Array, " parameters"]
-    value: Float[Array, " parameters"]
-    inflation: Scalar
-
-
-def stage_residuals(
-    z: Float[Array, " parameters"], args: tuple[ParameterSpace, CampaignArrays, Fixed]
-) -> Float[Array, " residuals"]:
-    """[standardised innovations; prior residuals] with the noise scales held (formulation 4.2)."""
-    space, arrays, fixed = args
-    full = jnp.where(fixed.held, fixed.value, z)
-    errors = innovations(space.model(full), arrays, fixed.inflation, frozen=True).standardised
-    return jnp.concatenate([errors.ravel(), jnp.where(fixed.held, z - fixed.value, z)])
 
 
 class Problem:
@@ -86,22 +62,23 @@ class Problem:
         self.held = is_noise | ~self.free
 
     def compile_aside(self, executor: ThreadPoolExecutor) -> None:
-        """Start the compilations that later steps need while the first stage runs on the other core."""
+        """Start the compilation that later steps need while the first stage runs on the other core."""
 
         def work():
             with jax.enable_x64(True):
                 z = jnp.zeros(len(NAMES))
                 density_and_gradient(z, self.space, self.arrays)
-                linearise(z, self.space, self.arrays)
 
         executor.submit(work)
 
     def least_squares(self, z: np.ndarray, inflation: float) -> np.ndarray:
         """Geometry and stereo for given noise scales."""
-        fixed = Fixed(jnp.asarray(self.held), jnp.asarray(z), jnp.asarray(inflation))
-        args = (self.space, self.arrays, fixed)
-        tolerance = jnp.asarray(STAGE_TOLERANCE)
-        return np.array(levenberg_marquardt(stage_residuals, jnp.asarray(z), args, tolerance, STAGE_STEPS))
+        return np.array(self.stage(z, inflation, STAGE_TOLERANCE).z)
+
+    def stage(self, z: np.ndarray, inflation: float, tolerance: float) -> Linearised:
+        """The campaign linearised where a least-squares stage from z ends."""
+        fixed = Fixed(self.held, z, np.array(inflation))
+        return stage(z, self.space, self.arrays, fixed, np.array(tolerance))
 
     def objective(self, z: np.ndarray) -> tuple[float, np.ndarray]:
         """Negative log density and its gradient."""
@@ -147,8 +124,7 @@ class Problem:
 
     def linearised(self, z: np.ndarray) -> Linearised:
         """The campaign linearised at a point, without padding."""
-        full = linearise(jnp.asarray(z), self.space, self.arrays)
-        return jax.tree.map(lambda x: np.asarray(x)[: len(self.spots)], full)
+        return self.stage(z, 1.0, NO_STEP).of_spots(len(self.spots))
 
     def information(self, lin: Linearised) -> StopInformation:
         """What its stops tell of geometry and stereo, noise scales held."""

@@ -1,9 +1,10 @@
 """Vectors, rotations, reflections and cameras in JAX: what the laser's path and the pixels are made of.
 
-A vector is an array whose first axis is x, y, z; any batch axes follow. mm, rad. Frame S: origin in the left camera's
-centre, X depth, Y left, Z up; OpenCV's camera axes are x = -Y, y = -Z, z = X. Pinhole with Brown-Conrady distortion;
-the right camera sees x_right = R x_left + T. Image px with the integer at the centre of a pixel, ordered (u_left,
-v_left, u_right, v_right).
+Many vectors are three arrays, one for each of x, y, z (`Vectors`): XLA's loops over one wide array run several times
+faster than over an axis of three. Where one array is handed over its first axis is x, y, z. mm, rad. Frame S: origin in
+the left camera's centre, X depth, Y left, Z up; OpenCV's camera axes are x = -Y, y = -Z, z = X. Pinhole with
+Brown-Conrady distortion; the right camera sees x_right = R x_left + T. Image px with the integer at the centre of a
+pixel, ordered (u_left, v_left, u_right, v_right).
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 Scalar = Float[Array, ""]
@@ -20,7 +22,6 @@ CROSS = np.zeros((3, 3, 3))
 """CROSS[i, j] . r = the matrix of the cross product r x."""
 CROSS[0, 1, 2], CROSS[1, 2, 0], CROSS[2, 0, 1] = -1.0, -1.0, -1.0
 CROSS[1, 0, 2], CROSS[2, 1, 0], CROSS[0, 2, 1] = 1.0, 1.0, 1.0
-HORIZONTAL = np.array([1.0, 1.0, 0.0])
 CV_FROM_S = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
 """OpenCV's camera axes from frame S: x = -Y, y = -Z, z = X."""
 NEAREST_MM = 1.0
@@ -60,43 +61,78 @@ def rotation_matrix(rotation_rad: Vector) -> Float[Array, "3 3"]:
     return jnp.eye(3) + sinc * cross + versine * (cross @ cross)
 
 
-def along_batch(vector: Vector, like: Array) -> Float[Array, "3 ..."]:
-    """Give one vector as many batch axes of length 1 as `like` has axes."""
-    return jnp.reshape(vector, (3,) + (1,) * like.ndim)
+class Vectors(eqx.Module):
+    """Many vectors by their components; a single one broadcasts against them."""
+
+    x: Float[ArrayLike, "..."]
+    y: Float[ArrayLike, "..."]
+    z: Float[ArrayLike, "..."]
+
+    @classmethod
+    def of(cls, stacked: Float[Array | np.ndarray, "3 *batch"]) -> Vectors:
+        """From one array whose first axis is x, y, z."""
+        return cls(stacked[0], stacked[1], stacked[2])
+
+    def stacked(self) -> Float[Array, "3 ..."]:
+        """One array whose first axis is x, y, z."""
+        return jnp.stack(jnp.broadcast_arrays(self.x, self.y, self.z))
+
+    def __add__(self, other: Vectors) -> Vectors:
+        """Componentwise."""
+        return Vectors(self.x + other.x, self.y + other.y, self.z + other.z)
+
+    def __sub__(self, other: Vectors) -> Vectors:
+        """Componentwise."""
+        return Vectors(self.x - other.x, self.y - other.y, self.z - other.z)
+
+    def __mul__(self, factor: Float[ArrayLike, "..."]) -> Vectors:
+        """Longer by a factor."""
+        return Vectors(self.x * factor, self.y * factor, self.z * factor)
+
+    def dot(self, other: Vectors) -> Float[Array, "..."]:
+        """Scalar product."""
+        return self.x * other.x + self.y * other.y + self.z * other.z
+
+    def cross(self, other: Vectors) -> Vectors:
+        """Vector product."""
+        x = self.y * other.z - self.z * other.y
+        y = self.z * other.x - self.x * other.z
+        return Vectors(x, y, self.x * other.y - self.y * other.x)
 
 
-def dot(first: Float[Array, "3 ..."], second: Float[Array, "3 ..."]) -> Float[Array, "..."]:
-    """Scalar product over the first axis."""
-    product = first * second
-    return product[0] + product[1] + product[2]
+def transform(matrix: Float[Array | np.ndarray, "3 3"], vectors: Vectors) -> Vectors:
+    """Matrix times vectors."""
+    return Vectors(*(row[0] * vectors.x + row[1] * vectors.y + row[2] * vectors.z for row in matrix))
 
 
-def transform(matrix: Float[Array | np.ndarray, "3 3"], vectors: Float[Array, "3 *batch"]) -> Float[Array, "3 *batch"]:
-    """Matrix times vectors, written out: XLA's small matrix products and reductions run far slower."""
-    wide = jnp.reshape(matrix, (3, 3) + (1,) * (vectors.ndim - 1))
-    return wide[:, 0] * vectors[0] + wide[:, 1] * vectors[1] + wide[:, 2] * vectors[2]
+class Turn(eqx.Module):
+    """Turns about z, counter-clockwise seen from +z, by the cosine and sine of their angles."""
+
+    cosine: Float[Array, "..."]
+    sine: Float[Array, "..."]
+
+    @classmethod
+    def by(cls, angle_rad: Float[Array, "..."]) -> Turn:
+        """The turn by an angle."""
+        return cls(jnp.cos(angle_rad), jnp.sin(angle_rad))
+
+    def forward(self, v: Vectors) -> Vectors:
+        """Turned vectors."""
+        return Vectors(self.cosine * v.x - self.sine * v.y, self.sine * v.x + self.cosine * v.y, v.z)
+
+    def back(self, v: Vectors) -> Vectors:
+        """Vectors turned the other way."""
+        return Vectors(self.cosine * v.x + self.sine * v.y, self.cosine * v.y - self.sine * v.x, v.z)
 
 
-def rotate_about_z(angle_rad: Float[Array, "..."], vector: Float[Array, "3 ..."]) -> Float[Array, "3 ..."]:
-    """Turn vectors about z, counter-clockwise seen from +z; batch axes of both broadcast."""
-    turned = transform(CROSS[:, :, 2], vector)
-    level = vector * HORIZONTAL.reshape((3,) + (1,) * (vector.ndim - 1))
-    return vector + jnp.sin(angle_rad) * turned + (jnp.cos(angle_rad) - 1) * level
-
-
-def reflect(direction: Float[Array, "3 ..."], normal: Float[Array, "3 ..."]) -> Float[Array, "3 ..."]:
+def reflect(direction: Vectors, normal: Vectors) -> Vectors:
     """Mirror directions at a plane with unit normal: d - 2 (d.n) n (formulation 3.2)."""
-    return direction - 2 * dot(direction, normal) * normal
+    return direction - normal * (2 * direction.dot(normal))
 
 
-def intersect_plane(
-    origin: Float[Array, "3 ..."],
-    direction: Float[Array, "3 ..."],
-    point: Float[Array, "3 ..."],
-    normal: Float[Array, "3 ..."],
-) -> Float[Array, "3 ..."]:
+def intersect_plane(origin: Vectors, direction: Vectors, point: Vectors, normal: Vectors) -> Vectors:
     """Points where lines meet the plane through `point`; not finite where they are parallel."""
-    return origin + dot(point - origin, normal) / dot(direction, normal) * direction
+    return origin + direction * ((point - origin).dot(normal) / direction.dot(normal))
 
 
 class StereoCameras(eqx.Module):
@@ -121,6 +157,25 @@ class StereoCameras(eqx.Module):
     focal_scale: Scalar
 
 
+def image(cameras: StereoCameras, points_s_mm: Vectors) -> tuple[Float[Array, "..."], ...]:
+    """Pixels of points of frame S in both images: u_left, v_left, u_right, v_right, an array each, px."""
+    left = transform(CV_FROM_S, points_s_mm)
+    right = transform(rotation_matrix(cameras.rotation_rad), left) + Vectors.of(cameras.translation_mm)
+    pixels = []
+    for camera, point in enumerate((left, right)):
+        nearness = 1 / jnp.maximum(point.z, NEAREST_MM)
+        x, y = materialise((point.x * nearness, point.y * nearness))
+        r2 = jnp.minimum(x**2 + y**2, WIDEST_TAN2)
+        k1, k2, k3 = cameras.radial[camera]
+        p1, p2 = cameras.tangential[camera]
+        # OpenCV's tangential terms are (p2, p1) r^2 + 2 (p2 x + p1 y) (x, y).
+        factor = 1 + r2 * (k1 + r2 * (k2 + r2 * k3)) + 2 * (p2 * x + p1 * y)
+        focal_px, centre_px = cameras.focal_px[camera] * cameras.focal_scale, cameras.centre_px[camera]
+        pixels.append(focal_px[0] * (x * factor + p2 * r2) + centre_px[0])
+        pixels.append(focal_px[1] * (y * factor + p1 * r2) + centre_px[1])
+    return tuple(pixels)
+
+
 def project(cameras: StereoCameras, points_s_mm: Float[Array, "3 *batch"]) -> Float[Array, "4 *batch"]:
     """Pixels of points of frame S in both images.
 
@@ -131,25 +186,4 @@ def project(cameras: StereoCameras, points_s_mm: Float[Array, "3 *batch"]) -> Fl
     Returns:
         First axis (u_left, v_left, u_right, v_right), px.
     """
-    batch = points_s_mm.shape[1:]
-    ones = (1,) * len(batch)
-
-    def per_camera(values):
-        return jnp.reshape(values, values.shape + ones)
-
-    left = transform(CV_FROM_S, points_s_mm)
-    translation = jnp.reshape(cameras.translation_mm, (3, *ones))
-    right = transform(rotation_matrix(cameras.rotation_rad), left) + translation
-    points = materialise(jnp.stack([left, right]))
-    depth = jnp.maximum(points[:, 2:], NEAREST_MM)
-    xy = materialise(points[:, :2] / depth)
-    r2 = materialise(jnp.minimum(xy[:, 0] ** 2 + xy[:, 1] ** 2, WIDEST_TAN2))
-    k1, k2, k3 = (per_camera(cameras.radial[:, i]) for i in range(3))
-    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    # With q = (p2, p1) OpenCV's tangential terms are q r^2 + 2 (q . xy) xy.
-    q = per_camera(cameras.tangential[:, ::-1])
-    distorted = materialise(
-        xy * materialise(radial + 2 * (q[:, 0] * xy[:, 0] + q[:, 1] * xy[:, 1]))[:, None] + q * r2[:, None]
-    )
-    pixels = per_camera(cameras.focal_px * cameras.focal_scale) * distorted + per_camera(cameras.centre_px)
-    return jnp.reshape(pixels, (4, *batch))
+    return jnp.stack(image(cameras, Vectors.of(points_s_mm)))

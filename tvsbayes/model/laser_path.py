@@ -1,7 +1,6 @@
 """The way of the laser: counters -> gears, play -> mirror angles -> beam. Differentiable (formulation 3.1 and 3.2).
 
-A vector is an array whose first axis is x, y, z; any batch axes follow. Lengths in mm, angles in rad. All functions
-are written for JAX with few, wide operations: compile time grows with their number.
+Lengths in mm, angles in rad. Vectors by their components (`geometry.Vectors`).
 
 Frame P: z along the pan axis, up; x along the nominal beam at pan angle 0; y left; origin where the nominal laser
 meets mirror 1. Frame Q is P turned by the pan angle. Pan positive = left, tilt positive = up; arrays over axes are
@@ -17,7 +16,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from tvsbayes.instrument.parameters import HARMONIC_ORDERS
-from tvsbayes.model.geometry import Scalar, along_batch, intersect_plane, materialise, reflect, rotate_about_z
+from tvsbayes.model.geometry import Scalar, Turn, Vectors, intersect_plane, materialise, reflect
 
 UNIFORM_SD = 1 / 12**0.5
 """Standard deviation of a uniform distribution of unit width."""
@@ -58,10 +57,6 @@ class Transmission(eqx.Module):
     backlash_rad: Float[Array, "2"]
     harmonics: Harmonics = eqx.field(default_factory=no_harmonics)
 
-    def directional_ratio(self, positive: Bool[Array, "2"]) -> Float[Array, "2"]:
-        """Ratio of left and up moves (`positive`) or right and down moves, rad per step."""
-        return self.ratio_rad_per_step + jnp.where(positive, 0.5, -0.5) * self.contrast_rad_per_step
-
 
 class MoveArrays(eqx.Module):
     """Moves of a campaign, padded; `approach` is +1 left/up, -1 right/down, 0 unknown, read at `first` rows."""
@@ -83,6 +78,13 @@ class MirrorAngles(eqx.Module):
     play_sd_rad: Float[Array, "moves 2"]
 
 
+def way_steps(moves: MoveArrays) -> Float[Array, "moves 2"]:
+    """Steps that each axis has gone, forwards and backwards, since its segment began."""
+    gone = jnp.abs(jnp.diff(moves.steps, axis=0, prepend=jnp.zeros((1, 2))))
+    total = jnp.cumsum(jnp.where(moves.first[:, None], 0.0, gone), axis=0)
+    return total - jax.lax.cummax(jnp.where(moves.first[:, None], total, 0.0))
+
+
 def mirror_angles(transmission: Transmission, tilt_zero_rad: Scalar, moves: MoveArrays) -> MirrorAngles:
     """Follow the counters through gears, play and transmission error.
 
@@ -100,15 +102,11 @@ def mirror_angles(transmission: Transmission, tilt_zero_rad: Scalar, moves: Move
     """
     half = transmission.backlash_rad / 2
     harmonics = transmission.harmonics
-
-    def turn(state, move):
-        previous_steps, q = state
-        steps, first = move
-        delta = steps - previous_steps
-        q_moved = q + transmission.directional_ratio(delta > 0) * delta
-        q_homed = transmission.ratio_rad_per_step * steps
-        q = jnp.where(first, q_homed, q_moved)
-        return (steps, q), q
+    # Since the segment began: k n + c/2 times the way gone, for k + c/2 forwards and k - c/2 backwards.
+    travelled = 0.5 * transmission.contrast_rad_per_step * way_steps(moves)
+    q = transmission.ratio_rad_per_step * moves.steps + travelled
+    # The errors know no history: outside the scan they cost one vector operation.
+    driven = q + jnp.where(harmonics.on_wheel, 0.0, harmonics.error_rad(q))
 
     def take_up(band, move):
         low, high = band
@@ -119,9 +117,6 @@ def mirror_angles(transmission: Transmission, tilt_zero_rad: Scalar, moves: Move
         return (low, high), (0.5 * (low + high), UNIFORM_SD * (high - low))
 
     zero = jnp.zeros(2)
-    _, q = jax.lax.scan(turn, (zero, zero), (moves.steps, moves.first))
-    # The errors know no history: outside the scans they cost one vector operation.
-    driven = q + jnp.where(harmonics.on_wheel, 0.0, harmonics.error_rad(q))
     _, (output, play_sd_rad) = jax.lax.scan(take_up, (zero, zero), (driven, moves.first, moves.approach))
     output += jnp.where(harmonics.on_wheel, harmonics.error_rad(output), 0.0)
     return MirrorAngles(output + jnp.stack([jnp.zeros(()), tilt_zero_rad]), play_sd_rad)
@@ -139,14 +134,18 @@ class Optics(eqx.Module):
     tilt_axis_offset_mm: Float[Array, "2"]
 
 
-class Beam(eqx.Module):
+class Ray(eqx.Module):
     """Rays, in frame P unless said otherwise: they leave mirror 2 at `origin_mm` along the unit vectors `direction`."""
 
-    origin_mm: Float[Array, "3 *batch"]
-    direction: Float[Array, "3 *batch"]
+    origin_mm: Vectors
+    direction: Vectors
+
+    def at(self, range_mm: Float[Array, "..."]) -> Vectors:
+        """Points along the rays."""
+        return self.origin_mm + self.direction * range_mm
 
 
-def beam(optics: Optics, pan_rad: Float[Array, "*batch"], tilt_rad: Float[Array, "*batch"]) -> Beam:
+def trace(optics: Optics, pan_rad: Float[Array, "*batch"], tilt_rad: Float[Array, "*batch"]) -> Ray:
     """Trace the laser over both mirrors (formulation 3.2; the signs are part of the contract).
 
     Args:
@@ -157,36 +156,30 @@ def beam(optics: Optics, pan_rad: Float[Array, "*batch"], tilt_rad: Float[Array,
     Returns:
         The rays in frame P.
     """
-    zero, one = jnp.zeros(()), jnp.ones(())
-    tangents = jnp.tan(optics.laser_tilt_rad)
-    laser = jnp.concatenate([tangents, -one[None]]) / jnp.sqrt(1 + jnp.dot(tangents, tangents))
-    laser_origin = jnp.concatenate([optics.laser_offset_mm, zero[None]])
+    tangent_x, tangent_y = jnp.tan(optics.laser_tilt_rad)
+    shorter = 1 / jnp.sqrt(1 + tangent_x**2 + tangent_y**2)
+    laser = Vectors(tangent_x * shorter, tangent_y * shorter, -shorter)
+    laser_origin = Vectors(optics.laser_offset_mm[0], optics.laser_offset_mm[1], 0.0)
+    pan, tilt = materialise((Turn.by(pan_rad), Turn.by(tilt_rad)))
     # The laser stands still in P; in the pan stage's frame Q it turns backwards.
-    laser, laser_origin = materialise(
-        (
-            rotate_about_z(-pan_rad, along_batch(laser, pan_rad)),
-            rotate_about_z(-pan_rad, along_batch(laser_origin, pan_rad)),
-        )
-    )
+    laser, laser_origin = pan.back(laser), pan.back(laser_origin)
 
     mirror1 = jnp.pi / 4 + optics.mirror1_error_rad
-    normal1 = along_batch(jnp.stack([zero, -jnp.sin(mirror1), jnp.cos(mirror1)]), pan_rad)
-    hit1 = intersect_plane(laser_origin, laser, jnp.zeros_like(normal1), normal1)
-    between = reflect(laser, normal1)
-    hit1, between = materialise((hit1, between))
+    normal1 = Vectors(0.0, -jnp.sin(mirror1), jnp.cos(mirror1))
+    hit1 = intersect_plane(laser_origin, laser, Vectors(0.0, 0.0, 0.0), normal1)
+    hit1, between = materialise((hit1, reflect(laser, normal1)))
 
     ax, az = optics.tilt_axis_offset_mm
-    centre = along_batch(jnp.stack([ax, -optics.mirror_offset_mm, az]), pan_rad)
+    centre = Vectors(ax, -optics.mirror_offset_mm, az)
     sin_skew, cos_skew = jnp.sin(optics.tilt_axis_skew_rad), jnp.cos(optics.tilt_axis_skew_rad)
     mirror2 = jnp.pi / 4 + optics.mirror2_error_rad
-    ahead = jnp.sin(mirror2) * jnp.array([1.0, 0.0, 0.0])
-    above = jnp.sin(mirror2) * jnp.stack([zero, -sin_skew, cos_skew])
-    axial = jnp.cos(mirror2) * jnp.stack([zero, cos_skew, sin_skew])
-    ahead, above, axial = (along_batch(v, pan_rad) for v in (ahead, above, axial))
-    normal2 = materialise(jnp.cos(tilt_rad) * ahead + jnp.sin(tilt_rad) * above + axial)
-    hit2 = materialise(intersect_plane(hit1, between, centre, normal2))
-    outgoing = materialise(reflect(between, normal2))
-    return Beam(*materialise((rotate_about_z(pan_rad, hit2), rotate_about_z(pan_rad, outgoing))))
+    ahead = Vectors(jnp.sin(mirror2), 0.0, 0.0)
+    above = Vectors(0.0, -sin_skew, cos_skew) * jnp.sin(mirror2)
+    axial = Vectors(0.0, cos_skew, sin_skew) * jnp.cos(mirror2)
+    normal2 = ahead * tilt.cosine + above * tilt.sine + axial
+    hit2 = intersect_plane(hit1, between, centre, normal2)
+    hit2, outgoing = materialise((hit2, reflect(between, normal2)))
+    return Ray(pan.forward(hit2), pan.forward(outgoing))
 
 
 class BeamAngles(eqx.Module):
@@ -207,12 +200,12 @@ def beam_angles(optics: Optics, pan_rad: Scalar, tilt_rad: Scalar) -> BeamAngles
     """Direction of the beam and its local slope against the mirror angles at one pose (formulation 3.2)."""
 
     def azimuth_elevation(angles):
-        d = beam(optics, angles[0], angles[1]).direction
-        return jnp.stack([jnp.arctan2(d[1], d[0]), jnp.arctan2(d[2], jnp.hypot(d[0], d[1]))])
+        d = trace(optics, angles[0], angles[1]).direction
+        return jnp.stack([jnp.arctan2(d.y, d.x), jnp.arctan2(d.z, jnp.hypot(d.x, d.y))])
 
     pose = jnp.stack([pan_rad, tilt_rad])
     azimuth, elevation = azimuth_elevation(pose)
-    ray = beam(optics, pan_rad, tilt_rad)
+    ray = trace(optics, pan_rad, tilt_rad)
     o, d = ray.origin_mm, ray.direction
-    offset = (d[1] * o[0] - d[0] * o[1]) / jnp.hypot(d[0], d[1])
+    offset = (d.y * o.x - d.x * o.y) / jnp.hypot(d.x, d.y)
     return BeamAngles(azimuth, elevation, jax.jacfwd(azimuth_elevation)(pose), offset)

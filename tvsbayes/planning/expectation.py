@@ -24,6 +24,7 @@ from tvsbayes.estimators.campaign_arrays import NOWHERE_MM, CampaignArrays, Spot
 from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.estimators.likelihood import filter_rows, kalman_update, no_belief
 from tvsbayes.estimators.linear_spots import linearise
+from tvsbayes.estimators.looks import in_frame_s
 from tvsbayes.instrument.axes import HOME_SD_DEG
 from tvsbayes.instrument.campaign import Move
 from tvsbayes.instrument.parameters import NAMES, NOISE_NAMES
@@ -31,8 +32,8 @@ from tvsbayes.instrument.plan import PlanLog, PlanStep, plan_seconds, run_plan
 from tvsbayes.instrument.rig import Rig
 from tvsbayes.instrument.stops import redraws
 from tvsbayes.model.compiled import compiled
-from tvsbayes.model.geometry import along_batch, materialise, project, rotation_matrix, transform
-from tvsbayes.model.laser_path import beam, mirror_angles
+from tvsbayes.model.geometry import image, materialise, rotation_matrix, transform
+from tvsbayes.model.laser_path import Ray, mirror_angles, trace
 from tvsbayes.model.parameter_space import ParameterSpace, parameter_space
 
 LOOKS_PER_EXPERIMENT = 4
@@ -127,20 +128,19 @@ def expect(
     model = space.model(z)
     spots = arrays.spots
     pan, tilt = mirror_angles(model.transmission, model.tilt_zero_rad, arrays.moves).angle_rad[spots.move_index].T
-    ray = beam(model.optics, pan, tilt)
+    ray = trace(model.optics, pan, tilt)
     turn = rotation_matrix(model.extrinsics.rotation_rad)
-    origin = materialise(transform(turn, ray.origin_mm) + along_batch(model.extrinsics.translation_mm, pan))
-    direction = materialise(transform(turn, ray.direction))
-    reach = (depth_mm - origin[0]) / direction[0]
-    points = materialise(origin + jnp.where(jnp.isfinite(reach), reach, 0.0) * direction)
-    pixels = project(model.cameras, points)
+    ray = materialise(Ray(in_frame_s(model.extrinsics, ray.origin_mm), transform(turn, ray.direction)))
+    reach = (depth_mm - ray.origin_mm.x) / ray.direction.x
+    points = materialise(ray.at(jnp.where(jnp.isfinite(reach), reach, 0.0)))
+    pixels = jnp.stack(image(model.cameras, points))
     inside = jnp.all((pixels >= 0) & (pixels <= image_px[:, None]), axis=0)
     seen = (reach > 0) & inside & (spots.valid > 0)
     harmless = jnp.array(NOWHERE_MM)[:, None]
     arrays = eqx.tree_at(
         lambda a: (a.spots.valid, a.spots.triangulated_mm),
         arrays,
-        (jnp.where(seen, 1.0, 0.0), jnp.where(seen, points, harmless).T),
+        (jnp.where(seen, 1.0, 0.0), jnp.where(seen, points.stacked(), harmless).T),
     )
     spots = arrays.spots
     lin = linearise(z, space, arrays)

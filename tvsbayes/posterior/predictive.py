@@ -21,8 +21,8 @@ from tvsbayes.estimators.likelihood import (
     filter_input,
     kalman_update,
     no_belief,
-    observe_with_stop_errors,
 )
+from tvsbayes.estimators.looks import observe_with_stop_errors
 from tvsbayes.instrument.axes import HOME_SD_DEG
 from tvsbayes.instrument.campaign import PIXELS, ordered_spots
 from tvsbayes.instrument.parameters import INDEX

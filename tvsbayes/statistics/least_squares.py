@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import cast
 
 import equinox as eqx
@@ -32,7 +33,24 @@ Objective = Callable[[np.ndarray], tuple[float, np.ndarray]]
 Residual = Callable[[Float[Array, " parameters"], PyTree], Float[Array, " residuals"]]
 
 
-def damped_solver(tolerance: Float[Array, ""]) -> optx.LevenbergMarquardt:
+class LinearResidual(eqx.Module):
+    """Residuals at a point, their Jacobian there, exact or good enough to descend by, and what else came of it."""
+
+    value: Float[Array, " residuals"]
+    jacobian: Float[Array, "residuals parameters"]
+    also: PyTree = None
+
+
+class Descent(eqx.Module):
+    """Where a descent ended, and what else came of the residuals there."""
+
+    value: Float[Array, " parameters"]
+    also: PyTree
+
+
+def damped_solver(
+    tolerance: Float[Array, ""], linear_solver: lx.AbstractLinearSolver | None = None
+) -> optx.LevenbergMarquardt:
     """Levenberg-Marquardt whose damping falls tenfold after every step that the linear model predicted well.
 
     By default optimistix asks for 99 % agreement and divides by 3.5: in directions that only a prior holds, where
@@ -42,7 +60,7 @@ def damped_solver(tolerance: Float[Array, ""]) -> optx.LevenbergMarquardt:
         # A traced tolerance, so that every stage shares the compilation, is a float to all of optimistix.
         rtol=cast(float, tolerance),
         atol=cast(float, tolerance),
-        linear_solver=lx.QR(),
+        linear_solver=lx.QR() if linear_solver is None else linear_solver,
     )
     search: optx.ClassicalTrustRegion = optx.ClassicalTrustRegion(
         high_cutoff=0.75, low_cutoff=0.1, high_constant=10.0, low_constant=0.2
@@ -50,36 +68,37 @@ def damped_solver(tolerance: Float[Array, ""]) -> optx.LevenbergMarquardt:
     return eqx.tree_at(lambda s: s.search, solver, search)
 
 
-def with_dense_jacobian(residual: Residual) -> Residual:
-    """The same residual, whose derivative is one matrix.
-
-    A Levenberg-Marquardt step asks its linear model for columns, for products and for transposed products. Left to
-    itself JAX compiles (and runs) the residual's tangent code once for each; here it is compiled once, to fill the
-    matrix, and everything else is a product with it.
-    """
-
-    @eqx.filter_custom_jvp
-    def dense(value, *, args):
-        return residual(value, args)
-
-    @dense.def_jvp
-    def dense_jvp(primals, tangents, *, args):
-        (value,), (direction,) = primals, tangents
-        residuals, jacobian = jacobian_of(residual, value, args)
-        return residuals, jacobian @ direction
-
-    return lambda value, args: dense(value, args=args)
-
-
-def jacobian_of(
-    residual: Residual, value: Float[Array, " parameters"], args: PyTree
-) -> tuple[Float[Array, " residuals"], Float[Array, "residuals parameters"]]:
+def linear_residual(residual: Residual, value: Float[Array, " parameters"], args: PyTree) -> LinearResidual:
     """Residuals and their Jacobian, the tangents of all parameters pushed forward side by side."""
     residuals, push = jax.linearize(lambda x: residual(x, args), value)
-    return residuals, jax.vmap(push, out_axes=1)(jnp.eye(value.size))
+    return LinearResidual(residuals, jax.vmap(push, out_axes=1)(jnp.eye(value.size)))
 
 
-residuals_and_jacobian = eqx.filter_jit(jacobian_of)
+residuals_and_jacobian = eqx.filter_jit(linear_residual)
+
+
+def descend(
+    linearised: Callable[[Float[Array, " parameters"], PyTree], LinearResidual],
+    solver: optx.LevenbergMarquardt,
+    start: Float[Array, " parameters"],
+    args: PyTree,
+    max_steps: int,
+) -> Descent:
+    """Where optimistix ends that starts there; to be compiled by the caller.
+
+    A step asks its linear model for columns, for products and for transposed products. Left to itself JAX compiles
+    (and runs) the residual's tangent code once for each; here the derivative is the one matrix that is given.
+    """
+
+    def attached(value, args):
+        at = jax.lax.stop_gradient(value)
+        found = linearised(at, args)
+        return found.value + found.jacobian @ (value - at), found.also
+
+    solution: optx.Solution = optx.least_squares(
+        attached, solver, start, args, has_aux=True, max_steps=max_steps, throw=False
+    )
+    return Descent(solution.value, solution.aux)
 
 
 @eqx.filter_jit
@@ -90,12 +109,8 @@ def levenberg_marquardt(
     tolerance: Float[Array, ""],
     max_steps: int,
 ) -> Float[Array, " parameters"]:
-    """One Levenberg-Marquardt run; tolerances are traced so that every stage of a fit shares the compilation."""
-    solver = damped_solver(tolerance)
-    solution: optx.Solution = optx.least_squares(
-        with_dense_jacobian(residual), solver, start, args, max_steps=max_steps, throw=False
-    )
-    return solution.value
+    """One Levenberg-Marquardt run; the tolerance is traced so that every run of a residual shares the compilation."""
+    return descend(partial(linear_residual, residual), damped_solver(tolerance), start, args, max_steps).value
 
 
 @dataclass(frozen=True)

@@ -45,7 +45,7 @@ class Problems:
     def jacobian(self, name: str, value: np.ndarray) -> np.ndarray:
         """By JAX."""
         residual = self.strd.RESIDUALS[name]
-        return np.asarray(residuals_and_jacobian(residual, jnp.asarray(value), self.data[name])[1])
+        return np.asarray(residuals_and_jacobian(residual, jnp.asarray(value), self.data[name]).jacobian)
 
     def ours(self, name: str, start: np.ndarray) -> np.ndarray:
         """The descent of `stereo` and of the fit, with residuals and Jacobian at its end."""

@@ -1,0 +1,90 @@
+"""How ideal looks move with every coordinate at held ranges, block by block.
+
+A gear moves looks through their mirror angles only, a mirror through the point that is hit, a lens through its own two
+pixels: derivatives of the parts, chained, cost a fraction of those of the whole. Angles rad, px; derivatives are by the
+coordinates of `model.parameter_space`. Columns come first, spots last.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PyTree
+
+from tvsbayes.estimators.campaign_arrays import CampaignArrays
+from tvsbayes.estimators.looks import Looks, Numbers, aperture_reading, in_frame_s
+from tvsbayes.instrument.parameters import INDEX, NAMES, NOISE_NAMES, RIG_NAMES, STEREO_PARAMETER_NAMES, names_of
+from tvsbayes.model.geometry import image, materialise, rotation_matrix, transform
+from tvsbayes.model.laser_path import mirror_angles, trace
+from tvsbayes.model.parameter_space import Model, ParameterSpace, model_of
+
+
+def _columns(*blocks: str) -> np.ndarray:
+    return np.array([INDEX[name] for name in names_of(*blocks)])
+
+
+GEARS = _columns("degrees_per_step", "ratio_contrast_deg_per_step", "backlash_deg", "harmonic_deg", "tilt_zero_deg")
+OPTICS = _columns(
+    *("mirror_offset_mm", "mirror1_error_deg", "mirror2_error_deg", "laser_tilt_deg", "laser_offset_mm"),
+    *("tilt_axis_skew_deg", "tilt_axis_offset_mm"),
+)
+FRAMES = _columns("extrinsics.rotation_rad", "extrinsics.translation_mm")
+CAMERAS = np.array([INDEX["focal_scale"], *(INDEX[name] for name in STEREO_PARAMETER_NAMES)])
+RECEIVER = _columns("baseline_mm", "pan_zero_emission_deg", "aperture_zero_deg")
+NOISE = np.array([INDEX[name] for name in NOISE_NAMES])
+IN_ORDER = np.argsort(np.concatenate([GEARS, OPTICS, FRAMES, CAMERAS, RECEIVER, NOISE]))
+"""Places of the coordinates in these blocks, one after the other: every coordinate has one."""
+
+
+def look_jacobian(
+    z: Float[Array, " parameters"], space: ParameterSpace, looks: Looks, arrays: CampaignArrays
+) -> Numbers:
+    """d(predicted)/d(coordinates) at held ranges, shape (parameters, spots) for each of the five components.
+
+    Args:
+        z: coordinates.
+        space: priors.
+        looks: at these coordinates.
+        arrays: the campaign.
+    """
+    physical, period_deg = space.physical(z), space.harmonic_period_deg
+
+    def moved(columns: np.ndarray, part: Callable[[Model], PyTree]) -> PyTree:
+        """How a part of the model moves with some parameters in the units of their names, columns first."""
+
+        def along(direction: Float[Array, " parameters"]) -> PyTree:
+            return jax.jvp(lambda at: part(model_of(at, period_deg)), (physical,), (direction,))[1]
+
+        return materialise(jax.vmap(along)(jnp.asarray(np.eye(len(NAMES))[columns])))
+
+    turn = rotation_matrix(space.model(z).extrinsics.rotation_rad)
+    angles = moved(GEARS, lambda m: mirror_angles(m.transmission, m.tilt_zero_rad, arrays.moves).angle_rad)
+    pan, tilt = (angles[:, arrays.spots.move_index, axis] for axis in range(2))
+    ways_p = moved(OPTICS, lambda m: trace(m.optics, looks.pan_rad, looks.tilt_rad)).at(looks.range_mm)
+    ways_s = moved(FRAMES, lambda m: in_frame_s(m.extrinsics, looks.points_p_mm))
+    pixels = moved(CAMERAS, lambda m: image(m.cameras, looks.points_s_mm))
+    reading = moved(RECEIVER, lambda m: aperture_reading(m.receiver, looks.points_p_mm, arrays.azimuth_convention))
+
+    by_gears = tuple(p * pan + t * tilt for p, t in zip(looks.by_pan, looks.by_tilt, strict=True))
+    by_optics = looks.moved(transform(turn, ways_p), ways_p)
+    by_frames = tuple(by_point.dot(ways_s) for by_point in looks.pixels_by_point)
+    spots = looks.range_mm.shape
+    still = [jnp.zeros((len(columns), *spots)) for columns in (NOISE, FRAMES, CAMERAS, RECEIVER)]
+    blocks = [[by_gears[k], by_optics[k], by_frames[k], pixels[k], still[3], still[0]] for k in range(4)] + [
+        [by_gears[4], by_optics[4], still[1], still[2], reading, still[0]]
+    ]
+    return tuple(_by_coordinates(jnp.concatenate(own)[IN_ORDER], z, space) for own in blocks)
+
+
+def _by_coordinates(
+    by_values: Float[Array, "parameters spots"], z: Float[Array, " parameters"], space: ParameterSpace
+) -> Float[Array, "parameters spots"]:
+    """From derivatives by values in the units of their names to those by coordinates."""
+    rig = len(RIG_NAMES)
+    unit = jnp.zeros_like(z).at[:rig].set(1.0)
+    # Of the rig every value has a coordinate of its own; the cameras' values share theirs.
+    slope = jax.jvp(space.physical, (z,), (unit,))[1][:rig]
+    return jnp.concatenate([by_values[:rig] * slope[:, None], space.stereo_root.T @ by_values[rig:]])

@@ -1,0 +1,173 @@
+"""Ideal looks: what a spot's pixels and aperture angle are, and how they move with mirror angles, range and parameters.
+
+Angles rad, lengths mm, px. The range of a look is where its beam passes closest to the spot that the cameras
+triangulated (formulation 4.1). Components of looks are separate arrays, as vectors are (`model.geometry.Vectors`).
+"""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from tvsbayes.estimators.campaign_arrays import CampaignArrays
+from tvsbayes.model.compiled import compiled
+from tvsbayes.model.geometry import Turn, Vectors, image, materialise, rotation_matrix, transform
+from tvsbayes.model.laser_path import Ray, mirror_angles, trace
+from tvsbayes.model.parameter_space import Extrinsics, Model, ParameterSpace, Receiver
+
+Numbers = tuple[Float[Array, "..."], ...]
+"""Components of many looks, an array each: pixels (u_left, v_left, u_right, v_right) and the aperture's angle."""
+
+
+def aperture_angle(
+    receiver: Receiver, points_p_mm: Vectors, azimuth_convention: Bool[Array, ""]
+) -> Float[Array, "*batch"]:
+    """Angle B at the aperture between +y of frame T and the spot, or its projection on x-y (formulation 5)."""
+    turned = Turn.by(receiver.pan_zero_emission_rad - jnp.pi / 2).forward(points_p_mm)
+    lateral2 = turned.x**2 + jnp.where(azimuth_convention, 0.0, 1.0) * turned.z**2
+    # A spot on the baseline itself has no direction; the floor keeps the derivative finite there.
+    return jnp.arctan2(jnp.sqrt(jnp.maximum(lateral2, 1e-12)), turned.y + receiver.baseline_mm)
+
+
+def observe(
+    model: Model, pose: Float[Array, "3 *batch"], azimuth_convention: Bool[Array, ""]
+) -> Float[Array, "5 *batch"]:
+    """What ideal looks return.
+
+    Args:
+        model: parameters.
+        pose: first axis pan (rad), tilt (rad), range along the beam (mm).
+        azimuth_convention: convention of the aperture's reading.
+
+    Returns:
+        First axis u_left, v_left, u_right, v_right (px), aperture reading (rad).
+    """
+    pan, tilt, range_mm = pose
+    points_p = trace(model.optics, pan, tilt).at(range_mm)
+    pixels = image(model.cameras, in_frame_s(model.extrinsics, points_p))
+    return jnp.stack([*pixels, aperture_reading(model.receiver, points_p, azimuth_convention)])
+
+
+def in_frame_s(extrinsics: Extrinsics, points_p_mm: Vectors) -> Vectors:
+    """Points of frame P in frame S."""
+    turned = transform(rotation_matrix(extrinsics.rotation_rad), points_p_mm)
+    return turned + Vectors.of(extrinsics.translation_mm)
+
+
+def aperture_reading(
+    receiver: Receiver, points_p_mm: Vectors, azimuth_convention: Bool[Array, ""]
+) -> Float[Array, "*batch"]:
+    """What the aperture reads of points, its zero included, rad."""
+    return aperture_angle(receiver, points_p_mm, azimuth_convention) + receiver.aperture_zero_rad
+
+
+def nearest_range(extrinsics: Extrinsics, ray: Ray, points_s_mm: Vectors) -> Float[Array, "*batch"]:
+    """Ranges at which beams pass closest to points of frame S, mm."""
+    from_origin = points_s_mm - Vectors.of(extrinsics.translation_mm)
+    points_p = transform(rotation_matrix(extrinsics.rotation_rad).T, from_origin)
+    return (points_p - ray.origin_mm).dot(ray.direction)
+
+
+class Looks(eqx.Module):
+    """Ideal looks at the ranges where the beams pass closest to the triangulated points, and how they move.
+
+    `by_pan`, `by_tilt` and `by_range` are the derivatives of `predicted`, `pixels_by_point` and `reading_by_point`
+    those of pixels and reading by the points in frames S and P.
+    """
+
+    pan_rad: Float[Array, " spots"]
+    tilt_rad: Float[Array, " spots"]
+    range_mm: Float[Array, " spots"]
+    points_p_mm: Vectors
+    points_s_mm: Vectors
+    predicted: Numbers
+    by_pan: Numbers
+    by_tilt: Numbers
+    by_range: Numbers
+    pixels_by_point: tuple[Vectors, ...]
+    reading_by_point: Vectors
+
+    def moved(self, way_s_mm: Vectors, way_p_mm: Vectors) -> Numbers:
+        """How predicted numbers change as the points move so in both frames."""
+        return moved(self.pixels_by_point, self.reading_by_point, way_s_mm, way_p_mm)
+
+
+def moved(
+    pixels_by_point: tuple[Vectors, ...], reading_by_point: Vectors, way_s_mm: Vectors, way_p_mm: Vectors
+) -> Numbers:
+    """How pixels and reading change as points move so in frames S and P."""
+    return (*(by_point.dot(way_s_mm) for by_point in pixels_by_point), reading_by_point.dot(way_p_mm))
+
+
+def looks_at(model: Model, pan_rad: Array, tilt_rad: Array, arrays: CampaignArrays) -> Looks:
+    """Linearise every look in its mirror angles and its range (formulation 4.1)."""
+    optics, extrinsics, receiver = model.optics, model.extrinsics, model.receiver
+    triangulated = Vectors.of(arrays.spots.triangulated_mm.T)
+    pan_rad, tilt_rad = materialise((pan_rad, tilt_rad))
+    unit = jnp.ones_like(pan_rad)
+    ray, by_pan = jax.jvp(lambda angle: trace(optics, angle, tilt_rad), (pan_rad,), (unit,))
+    _, by_tilt = jax.jvp(lambda angle: trace(optics, pan_rad, angle), (tilt_rad,), (unit,))
+    ray, by_pan, by_tilt = materialise((ray, by_pan, by_tilt))
+    range_mm = nearest_range(extrinsics, ray, triangulated)
+    points_p = ray.at(range_mm)
+    ways_p = by_pan.at(range_mm), by_tilt.at(range_mm), ray.direction
+    turn = rotation_matrix(extrinsics.rotation_rad)
+    points_s = in_frame_s(extrinsics, points_p)
+    ways_s = [transform(turn, way) for way in ways_p]
+    points_p, points_s, ways_p, ways_s = materialise((points_p, points_s, ways_p, ways_s))
+    pixels, pixels_along = jax.linearize(lambda points: image(model.cameras, points), points_s)
+    reading, reading_along = jax.linearize(
+        lambda points: aperture_reading(receiver, points, arrays.azimuth_convention), points_p
+    )
+    none = jnp.zeros_like(unit)
+    along_axes = Vectors(unit, none, none), Vectors(none, unit, none), Vectors(none, none, unit)
+    columns = [(*pixels_along(axis), reading_along(axis)) for axis in along_axes]
+    *by_point, reading_by_point = materialise([Vectors(*entries) for entries in zip(*columns, strict=True)])
+    by_pan, by_tilt, by_range = (
+        moved(tuple(by_point), reading_by_point, s, p) for s, p in zip(ways_s, ways_p, strict=True)
+    )
+    return Looks(
+        pan_rad=pan_rad,
+        tilt_rad=tilt_rad,
+        range_mm=range_mm,
+        points_p_mm=points_p,
+        points_s_mm=points_s,
+        predicted=(*pixels, reading),
+        by_pan=by_pan,
+        by_tilt=by_tilt,
+        by_range=by_range,
+        pixels_by_point=tuple(by_point),
+        reading_by_point=reading_by_point,
+    )
+
+
+@compiled(jax.Array)
+def observe_with_stop_errors(
+    z: Float[Array, "batch parameters"],
+    stop_error_rad: Float[Array, "batch spots 2"],
+    space: ParameterSpace,
+    arrays: CampaignArrays,
+) -> Float[Array, "batch spots 5"]:
+    """Noiseless looks at the ranges of the observed spots, the mirrors off by given angles (pan, tilt).
+
+    Args:
+        z: coordinates.
+        stop_error_rad: added to the mirror angles, rad; stop error, home offset and position in the play.
+        space: priors.
+        arrays: the campaign.
+
+    Returns:
+        u_left, v_left, u_right, v_right (px), aperture reading (rad).
+    """
+
+    def one(z, error):
+        model = space.model(z)
+        angles = mirror_angles(model.transmission, model.tilt_zero_rad, arrays.moves)
+        pan, tilt = angles.angle_rad[arrays.spots.move_index].T + error.T
+        triangulated = Vectors.of(arrays.spots.triangulated_mm.T)
+        ranges_mm = nearest_range(model.extrinsics, trace(model.optics, pan, tilt), triangulated)
+        return observe(model, jnp.stack([pan, tilt, ranges_mm]), arrays.azimuth_convention).T
+
+    return jax.vmap(one)(z, stop_error_rad)

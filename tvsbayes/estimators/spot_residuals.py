@@ -1,0 +1,140 @@
+"""Residuals of spots in units of their noise, ranges projected out, turned towards what the stops can move.
+
+Each spot gives four pixels and perhaps an aperture angle. Its range along the beam is unknown and flat in image
+displacement: the part of the residual along d(pixels)/d(range) is projected out (formulation 4.1). Reflections do it:
+they keep the noise independent.
+"""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from tvsbayes.estimators.campaign_arrays import SpotArrays
+from tvsbayes.estimators.looks import Looks, Numbers
+from tvsbayes.model.geometry import Scalar, materialise
+from tvsbayes.model.parameter_space import Model
+
+
+class NoiseScales(eqx.Module):
+    """Factors from stated standard deviations to units of the noise: pixels and aperture of every spot."""
+
+    pixels: Float[Array, " spots"]
+    aperture: Float[Array, " spots"]
+
+    def whitened(self, numbers: Numbers, spots: SpotArrays) -> Numbers:
+        """Differences of observations in units of their noise; the noise of a pair of pixels is that of one camera."""
+        u_left, v_left, u_right, v_right, reading = numbers
+        w = spots.whitening
+        return (
+            self.pixels * (w[:, 0, 0] * u_left),
+            self.pixels * (w[:, 1, 0] * u_left + w[:, 1, 1] * v_left),
+            self.pixels * (w[:, 2, 2] * u_right),
+            self.pixels * (w[:, 3, 2] * u_right + w[:, 3, 3] * v_right),
+            self.aperture * reading,
+        )
+
+
+def noise_scales(model: Model, spots: SpotArrays, inflation: Scalar | float) -> NoiseScales:
+    """Noise of every spot at the model's scales; robust weights make it larger, padding infinite."""
+    root_weight = jnp.sqrt(spots.weight) * spots.valid
+    return NoiseScales(
+        root_weight / (model.noise.pixel_scale * inflation),
+        root_weight * spots.has_aperture / (model.receiver.aperture_sd_rad * inflation),
+    )
+
+
+class Reflection(eqx.Module):
+    """Householder reflections that take a direction per spot to the first axis.
+
+    `first` is what becomes of the direction: its length, with the sign that avoids cancellation. Without a direction
+    (padding) the first axis stands for it, and the length is 0.
+    """
+
+    mirror: Numbers
+    half: Float[Array, " spots"]
+    first: Float[Array, " spots"]
+
+    @classmethod
+    def of(cls, direction: Numbers) -> Reflection:
+        """The reflection of a direction given by its components."""
+        length2 = sum(number**2 for number in direction)
+        there = length2 > 0
+        length = jnp.sqrt(jnp.where(there, length2, 1.0))
+        unit = [number / length for number in direction]
+        unit[0] = jnp.where(there, unit[0], 1.0)
+        sign = jnp.where(unit[0] < 0, -1.0, 1.0)
+        mirror = materialise((unit[0] + sign, *unit[1:]))
+        return cls(mirror, 0.5 * sum(number**2 for number in mirror), -sign * jnp.where(there, length, 0.0))
+
+    def of_many(self, numbers: Numbers) -> Numbers:
+        """Reflected components; an axis of columns may come before the spots."""
+        share = sum(m * number for m, number in zip(self.mirror, numbers, strict=True)) / self.half
+        return tuple(number - share * m for m, number in zip(self.mirror, numbers, strict=True))
+
+
+class SpotResiduals(eqx.Module):
+    """All spots after their ranges are projected out, in units of their noise (stated sd x pixel scale).
+
+    `residual` = observed - predicted; `by_pan`, `by_tilt` = d(predicted)/d(pan, tilt): four components each.
+    `log_scale` holds each spot's -3 log(pixel_scale) and, with an aperture reading, what the fifth observation adds:
+    zero for padding. `range_out` takes the range out of whitened numbers: its reflections' first component.
+    """
+
+    residual: Numbers
+    by_pan: Numbers
+    by_tilt: Numbers
+    log_scale: Float[Array, " spots"]
+    range_out: Reflection
+
+
+def spot_residuals(looks: Looks, noise: NoiseScales, model: Model, spots: SpotArrays) -> SpotResiduals:
+    """Compare looks with what was seen, and project their ranges out (formulation 4.1)."""
+    *pixels, reading = looks.predicted
+    off = spots.aperture_rad - reading
+    # Angles are compared on the circle.
+    off = off - jnp.round(off / (2 * jnp.pi)) * (2 * jnp.pi)
+    misfit = (*(seen - pixel for seen, pixel in zip(spots.pixels.T, pixels, strict=True)), off)
+    misfit, by_pan, by_tilt, by_range = materialise(
+        tuple(noise.whitened(numbers, spots) for numbers in (misfit, looks.by_pan, looks.by_tilt, looks.by_range))
+    )
+    range_out = Reflection.of(by_range)
+    residual, by_pan, by_tilt = (range_out.of_many(numbers)[1:] for numbers in (misfit, by_pan, by_tilt))
+    # Four pixels give s^-4, their range integral s; the aperture's noise takes part in that integral.
+    pixel_part = sum(number**2 for number in by_range[:4])
+    log_scale = -3 * jnp.log(model.noise.pixel_scale) - 0.5 * jnp.log1p(
+        by_range[4] ** 2 / jnp.where(spots.valid > 0, pixel_part, 1.0)
+    )
+    log_scale -= spots.has_aperture * jnp.log(model.receiver.aperture_sd_rad)
+    return SpotResiduals(residual, by_pan, by_tilt, log_scale * spots.valid, range_out)
+
+
+class ToStates(eqx.Module):
+    """Turns four components so that two see the mirror angles, the first of them pan and tilt, and two see neither.
+
+    Components have independent unit noise before and after; the filter then has two to look at instead of four.
+    """
+
+    pan_out: Reflection
+    tilt_out: Reflection
+    tilt_load: Float[Array, " spots"]
+
+    @classmethod
+    def of(cls, by_pan: Numbers, by_tilt: Numbers) -> ToStates:
+        """The turn for looks that move so with pan and tilt."""
+        pan_out = Reflection.of(by_pan)
+        tilt_load, *beyond = pan_out.of_many(by_tilt)
+        return cls(pan_out, Reflection.of(tuple(beyond)), tilt_load)
+
+    @property
+    def slope(self) -> Float[Array, "spots 2 2"]:
+        """d(predicted)/d(pan, tilt) of the two components."""
+        none = jnp.zeros_like(self.tilt_load)
+        first = jnp.stack([self.pan_out.first, self.tilt_load], axis=1)
+        return jnp.stack([first, jnp.stack([none, self.tilt_out.first], axis=1)], axis=1)
+
+    def of_many(self, numbers: Numbers) -> Numbers:
+        """All four components turned, the two that see the states first; columns may come before the spots."""
+        first, *beyond = self.pan_out.of_many(numbers)
+        return (first, *self.tilt_out.of_many(tuple(beyond)))
