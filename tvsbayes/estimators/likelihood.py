@@ -334,7 +334,7 @@ class SlopedDensity(eqx.Module):
 
 @compiled(SlopedDensity)
 def density_and_gradient(
-    z: Float[Array | np.ndarray, " parameters"], space: ParameterSpace, arrays: CampaignArrays
+    z: Float[Array, " parameters"], space: ParameterSpace, arrays: CampaignArrays
 ) -> SlopedDensity:
     """`log_density` and its gradient; the one compiled function that the Newton steps and Hessians share."""
     return SlopedDensity(*jax.value_and_grad(log_density)(z, space, arrays))

@@ -28,6 +28,7 @@ from tvsbayes.estimators.linear_spots import (
 from tvsbayes.instrument.campaign import Campaign, ordered_spots
 from tvsbayes.instrument.parameters import NAMES, NOISE_NAMES
 from tvsbayes.instrument.rig import RigTable
+from tvsbayes.model.compiled import placed
 from tvsbayes.model.geometry import Scalar
 from tvsbayes.model.parameter_space import ParameterSpace, free_mask, parameter_space
 from tvsbayes.statistics.chances import chi2_quantile
@@ -78,7 +79,7 @@ class Problem:
         arrays = campaign_arrays(campaign)
         valid = np.array(arrays.spots.valid)
         valid[: len(used)] *= used
-        self.arrays = eqx.tree_at(lambda a: a.spots.valid, arrays, jnp.asarray(valid))
+        self.arrays = eqx.tree_at(lambda a: a.spots.valid, arrays, placed(valid))
         readings = (spot.aperture_deg is not None for spot, use in zip(self.spots, used, strict=True) if use)
         self.free = free_mask(self.space, any(readings))
         is_noise = np.isin(NAMES, NOISE_NAMES)
@@ -89,19 +90,18 @@ class Problem:
         """Start the compilations that later steps need while the first stage runs on the other core."""
 
         def work():
-            with jax.enable_x64(True):
-                z = jnp.zeros(len(NAMES))
-                density_and_gradient(z, self.space, self.arrays)
-                linearise(z, self.space, self.arrays)
+            z = np.zeros(len(NAMES))
+            density_and_gradient(z, self.space, self.arrays)
+            linearise(z, self.space, self.arrays)
 
         executor.submit(work)
 
     def least_squares(self, z: np.ndarray, inflation: float) -> np.ndarray:
         """Geometry and stereo for given noise scales."""
-        fixed = Fixed(jnp.asarray(self.held), jnp.asarray(z), jnp.asarray(inflation))
+        fixed = Fixed(placed(self.held), placed(z), placed(inflation))
         args = (self.space, self.arrays, fixed)
-        tolerance = jnp.asarray(STAGE_TOLERANCE)
-        return np.array(levenberg_marquardt(stage_residuals, jnp.asarray(z), args, tolerance, STAGE_STEPS))
+        tolerance = placed(STAGE_TOLERANCE)
+        return np.array(levenberg_marquardt(stage_residuals, placed(z), args, tolerance, STAGE_STEPS))
 
     def objective(self, z: np.ndarray) -> tuple[float, np.ndarray]:
         """Negative log density and its gradient."""
@@ -147,7 +147,7 @@ class Problem:
 
     def linearised(self, z: np.ndarray) -> Linearised:
         """The campaign linearised at a point, without padding."""
-        full = linearise(jnp.asarray(z), self.space, self.arrays)
+        full = linearise(z, self.space, self.arrays)
         return jax.tree.map(lambda x: np.asarray(x)[: len(self.spots)], full)
 
     def information(self, lin: Linearised) -> StopInformation:
@@ -173,8 +173,8 @@ class Problem:
         """
         spots = self.arrays.spots
         count = len(self.spots)
-        valid, weight = np.array(spots.valid[:count]), np.array(spots.weight[:count])
-        readings = np.asarray(spots.has_aperture[:count])
+        valid, weight = np.array(spots.valid)[:count], np.array(spots.weight)[:count]
+        readings = np.asarray(spots.has_aperture)[:count]
         chi2 = leave_one_out_chi2(self.information(self.linearised(z)), weight)
         used = valid > 0
         # The noise scales were fitted with the outliers in: the median restores the scale of the clean spots.
@@ -191,7 +191,7 @@ class Problem:
         change = float(np.max(np.abs(new_weight - weight) + (valid != used)))
 
         def padded(array, values):
-            return jnp.asarray(np.concatenate([values, np.asarray(array)[count:]]))
+            return placed(np.concatenate([values, np.asarray(array)[count:]]))
 
         self.arrays = eqx.tree_at(
             lambda a: (a.spots.valid, a.spots.weight),
