@@ -10,8 +10,6 @@ import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from tvsbayes.assessment.weaknesses import gradients, moved_directions
@@ -20,6 +18,7 @@ from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.instrument.axes import DIRECTIONS, SENSES
 from tvsbayes.instrument.parameters import INDEX, KINDS, NAMES, PRIOR_GROUPS, RIG_NAMES, unit_of
 from tvsbayes.metrology.budget_tables import BudgetTable, Source, budget_table
+from tvsbayes.model.headlines import physical_at
 from tvsbayes.model.parameter_space import HALF_NORMAL_MEAN, HALF_NORMAL_SD
 from tvsbayes.results.estimates import Estimate, HeadlineCauses
 
@@ -74,8 +73,7 @@ def causes_of(fit: JointFit) -> Causes:
         share[columns, columns] = 1.0
         parts[stem] = share
     inputs = [INDEX[name] for name in INPUT_NAMES]
-    with jax.enable_x64(True):
-        slope = np.asarray(jax.jacfwd(fit.space.physical)(jnp.asarray(fit.z)))[inputs]
+    slope = np.asarray(physical_at(fit.z, fit.space).slope)[inputs]
     spread = slope @ posterior
     covariance = {name: spread @ part @ spread.T for name, part in parts.items()}
     # A prior that was fixed, or that no coordinate hangs on, is no cause.

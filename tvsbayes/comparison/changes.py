@@ -26,15 +26,10 @@ QUANTITIES = (*(f"effective_deg_per_step.{d}" for d in DIRECTIONS), *(f"backlash
 
 def _draws_at(found: JointFit, pose_rad: np.ndarray) -> np.ndarray:
     """`QUANTITIES` at a pose, shape (1 + draws, quantities): the estimate, then the Laplace draws."""
-    import jax
-    import jax.numpy as jnp
-
     from tvsbayes.instrument.parameters import INDEX
     from tvsbayes.model.headlines import derived_quantities
 
-    with jax.enable_x64(True):
-        z = jnp.asarray(np.vstack([found.z, found.draws_z]))
-        at_pose = derived_quantities(z, found.space, jnp.asarray(pose_rad))
+    at_pose = derived_quantities(np.vstack([found.z, found.draws_z]), found.space, pose_rad)
     backlash = np.asarray(at_pose.physical)[:, [INDEX[f"backlash_deg.{axis}"] for axis in AXES]]
     return np.concatenate([np.asarray(at_pose.effective_deg_per_step), backlash], axis=1)
 

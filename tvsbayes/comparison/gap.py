@@ -43,15 +43,16 @@ BACKLASH, STEREO_SCALE, SKEW, PROJECTION, CHANCE = (
 
 def _ideal(space: ParameterSpace, names: Sequence[str]) -> ParameterSpace:
     """The priors with parameters fixed at their ideal values: 0, or 1 for the focal scale; cameras as stated."""
-    import jax.numpy as jnp
-
     from tvsbayes.instrument.parameters import INDEX, RIG_NAMES
+    from tvsbayes.model.compiled import placed
 
-    rows = jnp.asarray([INDEX[name] for name in names if name in RIG_NAMES])
-    ideal = jnp.asarray([1.0 if name == "focal_scale" else 0.0 for name in names if name in RIG_NAMES])
-    space = replace(space, value=space.value.at[rows].set(ideal), u=space.u.at[rows].set(0.0))
+    value, u = np.array(space.value), np.array(space.u)
+    for name in names:
+        if name in RIG_NAMES:
+            value[INDEX[name]], u[INDEX[name]] = float(name == "focal_scale"), 0.0
+    space = replace(space, value=placed(value), u=placed(u))
     if "focal_scale" in names:
-        space = replace(space, stereo_root=jnp.zeros_like(space.stereo_root))
+        space = replace(space, stereo_root=placed(np.zeros(space.stereo_root.shape)))
     return space
 
 
@@ -132,21 +133,16 @@ class _Idealised:
 
 
 def _idealised(found: JointFit, selection: Selection, z: np.ndarray) -> _Idealised:
-    import jax
-    import jax.numpy as jnp
-
     from tvsbayes.model.headlines import derived_quantities
     from tvsbayes.posterior.predictive import looks
 
-    with jax.enable_x64(True):
-        spaces = [found.space]
-        for names in (("backlash_deg.pan", "backlash_deg.tilt"), ("focal_scale",), OPTICS):
-            spaces.append(_ideal(spaces[-1], names))
-        pose = jnp.asarray(found.reference_pose_rad)
-        full, ideal = (
-            np.asarray(derived_quantities(jnp.asarray(z), space, pose).effective_deg_per_step)
-            for space in (spaces[0], spaces[-1])
-        )
+    spaces = [found.space]
+    for names in (("backlash_deg.pan", "backlash_deg.tilt"), ("focal_scale",), OPTICS):
+        spaces.append(_ideal(spaces[-1], names))
+    full, ideal = (
+        np.asarray(derived_quantities(z, space, found.reference_pose_rad).effective_deg_per_step)
+        for space in (spaces[0], spaces[-1])
+    )
     rows = experiment_rows(found.campaign, selection)
     quiet = np.zeros((len(z), len(found.arrays.spots.valid), 2))
     ratios = []

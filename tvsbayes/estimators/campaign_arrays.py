@@ -10,7 +10,6 @@ from collections.abc import Sequence
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
@@ -19,6 +18,7 @@ from tvsbayes.instrument.axes import APPROACH_SIGN
 from tvsbayes.instrument.campaign import Campaign, Move, Spot, ordered_spots, pixels_of
 from tvsbayes.instrument.stereo_pair import triangulate
 from tvsbayes.instrument.stops import redraws
+from tvsbayes.model.compiled import placed
 from tvsbayes.model.laser_path import MoveArrays
 
 SMALLEST_BUCKET = 512
@@ -67,13 +67,11 @@ def bucket(count: int, smallest: int | None = None, growth: int = 2) -> int:
     return size
 
 
-def padded(
-    rows: Sequence[object] | np.ndarray, size: int, fill: ArrayLike = 0.0, dtype: type = np.float64
-) -> jax.Array:
+def padded(rows: Sequence[object] | ArrayLike, size: int, fill: ArrayLike = 0.0, dtype: type = np.float64) -> jax.Array:
     """Rows (n, ...) with as many like `fill` behind them as make `size`."""
     given: np.ndarray = np.asarray(rows, dtype)
     rest: np.ndarray = np.broadcast_to(np.asarray(fill, dtype), (size - len(given), *given.shape[1:]))
-    return jnp.asarray(np.concatenate([given, rest]))
+    return placed(np.concatenate([given, rest]))
 
 
 def move_arrays(moves: Sequence[Move], size: int | None = None) -> MoveArrays:
@@ -113,24 +111,23 @@ def campaign_arrays(campaign: Campaign) -> CampaignArrays:
     points_mm = triangulate(campaign.stereo, pixels)
     seen = np.isfinite(points_mm).all(axis=1)
     points_mm[~seen] = NOWHERE_MM
-    with jax.enable_x64(True):
-        spot_arrays = SpotArrays(
-            move_index=padded([s.move for s in spots], size, spots[-1].move, np.int32),
-            pixels=padded(pixels, size),
-            whitening=padded(whitening, size, np.eye(4)),
-            aperture_rad=padded(np.nan_to_num(np.radians(aperture)), size),
-            has_aperture=padded(np.isfinite(aperture), size),
-            triangulated_mm=padded(points_mm, size, NOWHERE_MM),
-            valid=padded(seen, size),
-            weight=jnp.ones(size),
-            redraw=padded(new.redraw, size, False, bool),
-            redraw_mix=padded(new.redraw_mix, size),
-            new_segment=padded(new.new_segment, size, False, bool),
-            homed=padded(new.homed, size, False, bool),
-        )
-        return CampaignArrays(
-            move_arrays(campaign.moves), spot_arrays, jnp.asarray(campaign.rig.aperture_convention == "azimuth")
-        )
+    spot_arrays = SpotArrays(
+        move_index=padded([s.move for s in spots], size, spots[-1].move, np.int32),
+        pixels=padded(pixels, size),
+        whitening=padded(whitening, size, np.eye(4)),
+        aperture_rad=padded(np.nan_to_num(np.radians(aperture)), size),
+        has_aperture=padded(np.isfinite(aperture), size),
+        triangulated_mm=padded(points_mm, size, NOWHERE_MM),
+        valid=padded(seen, size),
+        weight=placed(np.ones(size)),
+        redraw=padded(new.redraw, size, False, bool),
+        redraw_mix=padded(new.redraw_mix, size),
+        new_segment=padded(new.new_segment, size, False, bool),
+        homed=padded(new.homed, size, False, bool),
+    )
+    return CampaignArrays(
+        move_arrays(campaign.moves), spot_arrays, placed(campaign.rig.aperture_convention == "azimuth")
+    )
 
 
 def in_sight(campaign: Campaign) -> np.ndarray:

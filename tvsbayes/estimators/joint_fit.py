@@ -13,7 +13,6 @@ from dataclasses import dataclass, replace
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool
 
@@ -24,6 +23,7 @@ from tvsbayes.estimators.mode_search import GATE_PROBABILITY, Problem
 from tvsbayes.instrument.campaign import Campaign, ordered_spots
 from tvsbayes.instrument.model_choice import AS_STATED, ModelChoice
 from tvsbayes.instrument.parameters import INDEX, NAMES, RIG_NAMES, Prior
+from tvsbayes.model.compiled import placed
 from tvsbayes.model.headlines import Derived, derived_quantities
 from tvsbayes.model.parameter_space import ParameterSpace
 from tvsbayes.results.stored_draws import StoredMode
@@ -196,7 +196,7 @@ def restored(campaign: Campaign, stored: StoredMode, seed: int = 0) -> JointFit 
         problem = Problem(campaign, table, valid)
         weight = np.array(problem.arrays.spots.weight)
         weight[: len(valid)] = stored.weight
-        problem.arrays = eqx.tree_at(lambda a: a.spots.weight, problem.arrays, jnp.asarray(weight))
+        problem.arrays = eqx.tree_at(lambda a: a.spots.weight, problem.arrays, placed(weight))
         mode = Mode(stored.z, stored.covariance, -stored.log_density, ())
         return fit_at(campaign, problem, mode, seed)
 
@@ -210,30 +210,26 @@ def fit_at(campaign: Campaign, problem: Problem, mode: Mode, seed: int) -> Joint
         mode: converged, or with the problems that `JointFit.problems` then states.
         seed: of the Laplace draws.
     """
-    used = np.asarray(problem.arrays.spots.valid[: len(problem.spots)]) > 0
+    used = np.asarray(problem.arrays.spots.valid)[: len(problem.spots)] > 0
     lin = problem.linearised(mode.z)
     information = problem.information(lin)
-    chi2_spots = leave_one_out_chi2(information, np.asarray(problem.arrays.spots.weight[: len(problem.spots)]))
-    readings = np.asarray(problem.arrays.spots.has_aperture[: len(problem.spots)])
+    chi2_spots = leave_one_out_chi2(information, np.asarray(problem.arrays.spots.weight)[: len(problem.spots)])
+    readings = np.asarray(problem.arrays.spots.has_aperture)[: len(problem.spots)]
     suspect = used & (chi2_spots > chi2_quantile(readings, GATE_PROBABILITY))
     pose = lin.mirror_angles_rad[used].mean(axis=0)
     draws_z = laplace_draws(mode.z, mode.covariance, seed)
     identity = np.eye(len(NAMES))
     prior_z = laplace_draws(np.zeros(len(NAMES)), identity, seed + 1)
-    at_mode_and_draws = derived_quantities(jnp.asarray(np.vstack([mode.z, draws_z])), problem.space, jnp.asarray(pose))
-    prior = derived_quantities(jnp.asarray(np.vstack([mode.z, prior_z])), problem.space, jnp.asarray(pose))
+    at_mode_and_draws = derived_quantities(np.vstack([mode.z, draws_z]), problem.space, pose)
+    prior = derived_quantities(np.vstack([mode.z, prior_z]), problem.space, pose)
     reach = NORMAL_95 * np.sqrt(np.diag(mode.covariance))
-    ends = derived_quantities(
-        jnp.asarray(np.vstack([mode.z - reach, mode.z + reach, prior_z[1:]])),
-        problem.space,
-        jnp.asarray(pose),
-    )
+    ends = derived_quantities(np.vstack([mode.z - reach, mode.z + reach, prior_z[1:]]), problem.space, pose)
     ids = np.array([s.spot for s in problem.spots])
     problems = mode.problems
     chi2 = sum(float(np.asarray(lin.residual)[g.rows].ravel() @ g.residual) for g in information.groups)
     # Where the scale is fixed the misfit stays in chi-square.
     looks = max(float(np.sum(used * (3 + readings))), 1.0)
-    misfit = float(at_mode_and_draws.physical[0, INDEX["pixel_scale"]]) * max(1.0, np.sqrt(chi2 / looks))
+    misfit = float(np.asarray(at_mode_and_draws.physical)[0, INDEX["pixel_scale"]]) * max(1.0, np.sqrt(chi2 / looks))
     if misfit > MISFIT_LIMIT:
         problems += (f"the spots miss the fitted beams by {misfit:.0f} times their stated uncertainty",)
     return JointFit(

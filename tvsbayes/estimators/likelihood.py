@@ -13,7 +13,6 @@ from __future__ import annotations
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
 from tvsbayes.estimators.campaign_arrays import CampaignArrays, SpotArrays
@@ -229,7 +228,7 @@ class SlopedDensity(eqx.Module):
 
 @compiled(SlopedDensity)
 def density_and_gradient(
-    z: Float[Array | np.ndarray, " parameters"], space: ParameterSpace, arrays: CampaignArrays
+    z: Float[Array, " parameters"], space: ParameterSpace, arrays: CampaignArrays
 ) -> SlopedDensity:
     """`log_density` and its gradient; the one compiled function that the Newton steps and Hessians share."""
     return SlopedDensity(*jax.value_and_grad(log_density)(z, space, arrays))

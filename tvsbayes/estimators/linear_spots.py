@@ -18,8 +18,8 @@ import numpy as np
 from jaxtyping import Array, Float
 from scipy import linalg
 
-from tvsbayes.estimators.campaign_arrays import CampaignArrays
-from tvsbayes.estimators.likelihood import filter_rows, standing
+from tvsbayes.estimators.campaign_arrays import CampaignArrays, padded
+from tvsbayes.estimators.likelihood import FilterRows, filter_rows, standing
 from tvsbayes.estimators.look_jacobian import look_jacobian
 from tvsbayes.model.geometry import Scalar
 from tvsbayes.model.parameter_space import ParameterSpace
@@ -111,6 +111,9 @@ class LinearSpots:
     jacobian: np.ndarray
 
 
+_rows = compiled(FilterRows)(filter_rows)
+
+
 def linear_spots(lin: Linearised, arrays: CampaignArrays, jacobian: np.ndarray) -> LinearSpots:
     """A linearised campaign as the smoother reads it.
 
@@ -119,11 +122,9 @@ def linear_spots(lin: Linearised, arrays: CampaignArrays, jacobian: np.ndarray) 
         arrays: the campaign it comes from.
         jacobian: d(prediction)/d(whatever is asked about), shape (spots, 4, columns).
     """
-    with jax.enable_x64(True):
-        spots = jax.tree.map(lambda x: jnp.asarray(x)[: len(lin.residual)], arrays.spots)
-        lin = jax.tree.map(jnp.asarray, lin)
-        found = filter_rows(lin.residual, lin.slope, lin.play_sd_rad, lin.stop_variance, spots)
-        rows = jax.tree.map(np.asarray, found)
+    count, size = len(lin.residual), len(arrays.spots.valid)
+    given = (padded(x, size) for x in (lin.residual, lin.slope, lin.play_sd_rad, lin.stop_variance))
+    rows = jax.tree.map(lambda x: np.asarray(x)[:count], _rows(*given, arrays.spots))
     return LinearSpots(rows.residual, rows.load, rows.keep == 0, rows.variance, jacobian)
 
 

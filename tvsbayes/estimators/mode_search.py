@@ -9,8 +9,6 @@ from __future__ import annotations
 from concurrent.futures import ThreadPoolExecutor
 
 import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
 from scipy import optimize
 
@@ -27,6 +25,7 @@ from tvsbayes.estimators.linear_spots import (
 from tvsbayes.instrument.campaign import Campaign, ordered_spots
 from tvsbayes.instrument.parameters import NAMES, NOISE_NAMES
 from tvsbayes.instrument.rig import RigTable
+from tvsbayes.model.compiled import placed
 from tvsbayes.model.parameter_space import free_mask, parameter_space
 from tvsbayes.statistics.chances import chi2_quantile
 from tvsbayes.statistics.least_squares import NEWTON_STEP
@@ -54,7 +53,7 @@ class Problem:
         arrays = campaign_arrays(campaign)
         valid = np.array(arrays.spots.valid)
         valid[: len(used)] *= used
-        self.arrays = eqx.tree_at(lambda a: a.spots.valid, arrays, jnp.asarray(valid))
+        self.arrays = eqx.tree_at(lambda a: a.spots.valid, arrays, placed(valid))
         readings = (spot.aperture_deg is not None for spot, use in zip(self.spots, used, strict=True) if use)
         self.free = free_mask(self.space, any(readings))
         is_noise = np.isin(NAMES, NOISE_NAMES)
@@ -65,9 +64,7 @@ class Problem:
         """Start the compilation that later steps need while the first stage runs on the other core."""
 
         def work():
-            with jax.enable_x64(True):
-                z = jnp.zeros(len(NAMES))
-                density_and_gradient(z, self.space, self.arrays)
+            density_and_gradient(np.zeros(len(NAMES)), self.space, self.arrays)
 
         executor.submit(work)
 
@@ -149,8 +146,8 @@ class Problem:
         """
         spots = self.arrays.spots
         count = len(self.spots)
-        valid, weight = np.array(spots.valid[:count]), np.array(spots.weight[:count])
-        readings = np.asarray(spots.has_aperture[:count])
+        valid, weight = np.array(spots.valid)[:count], np.array(spots.weight)[:count]
+        readings = np.asarray(spots.has_aperture)[:count]
         chi2 = leave_one_out_chi2(self.information(self.linearised(z)), weight)
         used = valid > 0
         # The noise scales were fitted with the outliers in: the median restores the scale of the clean spots.
@@ -167,7 +164,7 @@ class Problem:
         change = float(np.max(np.abs(new_weight - weight) + (valid != used)))
 
         def padded(array, values):
-            return jnp.asarray(np.concatenate([values, np.asarray(array)[count:]]))
+            return placed(np.concatenate([values, np.asarray(array)[count:]]))
 
         self.arrays = eqx.tree_at(
             lambda a: (a.spots.valid, a.spots.weight),

@@ -23,6 +23,7 @@ from typing import Any, cast
 import jax
 import numpy as np
 from jax import export
+from jax.typing import ArrayLike
 from platformdirs import user_cache_path
 
 from tvsbayes.files.own_folder import OwnFolder
@@ -120,8 +121,8 @@ class Compiled[**P, Result]:
         self._lock = threading.Lock()
         functools.update_wrapper(self, plain)
 
-    def __call__(self, *args: P.args, **kwargs: P.kwargs) -> Result:
-        """Run it; `TypeError` for arguments that hold anything but arrays and numbers."""
+    def __call__(self, *args: Any, **kwargs: Any) -> Result:
+        """Run it on arrays of JAX or NumPy or numbers; `TypeError` for anything else."""
         leaves, structure = jax.tree.flatten((args, kwargs))
         if any(isinstance(leaf, jax.core.Tracer) for leaf in leaves):
             return self.plain(*args, **kwargs)
@@ -187,6 +188,12 @@ class Compiled[**P, Result]:
 def compiled[**P, Result](result: type[Result]) -> Callable[[Callable[P, Result]], Compiled[P, Result]]:
     """Decorator of a function that returns `result`: one array (`jax.Array`) or a flat `eqx.Module`; see `Compiled`."""
     return lambda plain: Compiled(plain, result)
+
+
+def placed(values: ArrayLike) -> jax.Array:
+    """A NumPy array as JAX's, in its own precision: without `jnp.asarray`, which compiles anew for every shape."""
+    with jax.enable_x64(True):
+        return jax.device_put(np.asarray(values), may_alias=False)
 
 
 def cache_folder() -> Path:

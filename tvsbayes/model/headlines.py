@@ -69,8 +69,7 @@ def _physical(z: Float[Array, " parameters"], space: ParameterSpace) -> Physical
 
 def physical_at(z: np.ndarray, space: ParameterSpace) -> Physical:
     """Values and slopes at a point, NumPy arrays."""
-    with jax.enable_x64(True):
-        return jax.tree.map(np.asarray, _physical(jnp.asarray(z), space))
+    return jax.tree.map(np.asarray, _physical(z, space))
 
 
 class Derived(eqx.Module):

@@ -22,6 +22,7 @@ from tvsbayes.instrument.axes import AXES, FULL_TURN_DEG, SIDES
 from tvsbayes.instrument.parameters import BLOCKS, INDEX, KINDS, NAMES, RECEIVER_NAMES, REGISTRY, RIG_NAMES
 from tvsbayes.instrument.rig import RigTable
 from tvsbayes.instrument.stereo_pair import Stereo
+from tvsbayes.model.compiled import placed
 from tvsbayes.model.geometry import Scalar, StereoCameras, Vector
 from tvsbayes.model.laser_path import Harmonics, Optics, Transmission
 
@@ -220,15 +221,14 @@ def parameter_space(table: RigTable, stereo: Stereo) -> ParameterSpace:
     eigenvalues, vectors = np.linalg.eigh(covariance / np.outer(safe, safe))
     # The symmetric root keeps coordinate j closest to parameter j.
     root = scale[:, None] * (vectors * np.sqrt(np.clip(eigenvalues, 0.0, None))) @ vectors.T
-    with jax.enable_x64(True):
-        return ParameterSpace(
-            value=jnp.array([p.value for p in priors]),
-            u=jnp.array([p.u for p in priors]),
-            kind=jnp.array([KINDS.index(p.distribution) for p in priors]),
-            stereo_mean=jnp.asarray(stereo.vector),
-            stereo_root=jnp.asarray(root),
-            harmonic_period_deg=jnp.array([table.harmonic_period_deg.get(a, FULL_TURN_DEG) for a in AXES]),
-        )
+    return ParameterSpace(
+        value=placed(np.array([float(p.value) for p in priors])),
+        u=placed(np.array([float(p.u) for p in priors])),
+        kind=placed(np.array([KINDS.index(p.distribution) for p in priors])),
+        stereo_mean=placed(stereo.vector),
+        stereo_root=placed(root),
+        harmonic_period_deg=placed(np.array([float(table.harmonic_period_deg.get(a, FULL_TURN_DEG)) for a in AXES])),
+    )
 
 
 def coordinates_of(space: ParameterSpace, physical: np.ndarray) -> np.ndarray:

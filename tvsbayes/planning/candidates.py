@@ -12,7 +12,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 
-import jax
 import numpy as np
 
 from tvsbayes.errors import InputError
@@ -124,15 +123,13 @@ class LookArrays:
                 Move(i, i, 0.0, *steps, *map(direction_of, AXES, side))
                 for i, (steps, side) in enumerate(zip(looks.steps[part].tolist(), looks.side[part], strict=True))
             ]
-            with jax.enable_x64(True):
-                # Each look stands for itself: no home offsets.
-                arrays = design_arrays(moves, range(len(moves)), self.rig, homed_from=len(moves), aperture=aperture)
+            # Each look stands for itself: no home offsets.
+            arrays = design_arrays(moves, range(len(moves)), self.rig, homed_from=len(moves), aperture=aperture)
             self.blocks.append((arrays, depth[part]))
 
     def at(self, z: np.ndarray, space: ParameterSpace) -> Seen:
         """Evaluate at a point."""
-        with jax.enable_x64(True):
-            found = [expected_information(arrays, depth, self.rig, z, space) for arrays, depth in self.blocks]
+        found = [expected_information(arrays, depth, self.rig, z, space) for arrays, depth in self.blocks]
         return Seen(*(np.concatenate([getattr(block, part.name) for block in found]) for part in fields(Seen)))
 
 

@@ -31,7 +31,7 @@ from tvsbayes.instrument.parameters import NAMES, NOISE_NAMES
 from tvsbayes.instrument.plan import PlanLog, PlanStep, plan_seconds, run_plan
 from tvsbayes.instrument.rig import Rig
 from tvsbayes.instrument.stops import redraws
-from tvsbayes.model.compiled import compiled
+from tvsbayes.model.compiled import compiled, placed
 from tvsbayes.model.geometry import image, materialise, rotation_matrix, transform
 from tvsbayes.model.laser_path import Ray, mirror_angles, trace
 from tvsbayes.model.parameter_space import ParameterSpace, parameter_space
@@ -169,19 +169,19 @@ def design_arrays(
         move_arrays(moves, 2 * size),
         SpotArrays(
             move_index=padded(look_moves, size, look_moves[-1], np.int32),
-            pixels=jnp.zeros((size, 4)),
-            whitening=jnp.asarray(np.tile(np.eye(4) / rig.spot_sd_px, (size, 1, 1))),
-            aperture_rad=jnp.zeros(size),
+            pixels=placed(np.zeros((size, 4))),
+            whitening=placed(np.tile(np.eye(4) / rig.spot_sd_px, (size, 1, 1))),
+            aperture_rad=placed(np.zeros(size)),
             has_aperture=padded([float(aperture)] * count, size),
-            triangulated_mm=jnp.zeros((size, 3)),
+            triangulated_mm=placed(np.zeros((size, 3))),
             valid=padded([1.0] * count, size),
-            weight=jnp.ones(size),
+            weight=placed(np.ones(size)),
             redraw=padded(new.redraw, size, False, bool),
             redraw_mix=padded(new.redraw_mix, size),
             new_segment=padded(new.new_segment, size, False, bool),
             homed=padded(new.homed, size, False, bool),
         ),
-        jnp.asarray(rig.table.aperture_convention == "azimuth"),
+        placed(rig.table.aperture_convention == "azimuth"),
     )
 
 
@@ -192,7 +192,7 @@ def expected_information(
     count = len(depth_mm)
     last = np.tile([rig.stereo.image_width - 1.0, rig.stereo.image_height - 1.0], 2)
     depths = padded(depth_mm, len(arrays.spots.valid), depth_mm[-1])
-    found = expect(jnp.asarray(z), space, arrays, depths, jnp.asarray(last))
+    found = expect(z, space, arrays, depths, last)
     return jax.tree.map(lambda x: np.asarray(x)[:count], found)
 
 
@@ -259,11 +259,8 @@ def information_of(
     log = _logged(steps, rig)
     look_moves = tuple(look.move for look in log.looks)
     depth = np.array([rig.sheets_mm[log.targets[look.placement]] for look in log.looks])
-    with jax.enable_x64(True):
-        arrays = design_arrays(
-            log.moves, look_moves, rig, homed_from=0 if knowledge.after_data else 1, aperture=aperture
-        )
-        found = expected_information(arrays, depth, rig, knowledge.z if z is None else z, space or knowledge.space)
+    arrays = design_arrays(log.moves, look_moves, rig, homed_from=0 if knowledge.after_data else 1, aperture=aperture)
+    found = expected_information(arrays, depth, rig, knowledge.z if z is None else z, space or knowledge.space)
     rows = np.asarray(found.rows)[..., :PARAMETERS].reshape(-1, PARAMETERS)
     seen = np.asarray(found.seen) if found.seen.any() else np.ones(len(depth), dtype=bool)
     pose = np.asarray(found.mirror_angles_rad)[seen].mean(axis=0)

@@ -10,9 +10,6 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
-import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
 from scipy import stats
 
@@ -22,6 +19,7 @@ from tvsbayes.instrument.axes import DIRECTIONS
 from tvsbayes.instrument.campaign import Campaign
 from tvsbayes.instrument.parameters import INDEX, NAMES, RIG_NAMES
 from tvsbayes.instrument.protocols import four_point_protocol
+from tvsbayes.model.compiled import placed
 from tvsbayes.model.headlines import physical_at
 from tvsbayes.model.parameter_space import STOP_COLUMNS, ParameterSpace, coordinates_of
 from tvsbayes.planning.candidates import (
@@ -63,8 +61,7 @@ def truth_in(knowledge: Knowledge, parameters: Mapping[str, float], stereo_vecto
     z = coordinates_of(space, np.concatenate([true, stereo_vector]))
     # A half-normal with u = 0 is 0 whatever its value; nothing else can be stated for it.
     held = np.where(np.asarray(space.u) > 0, np.asarray(space.value), true)
-    with jax.enable_x64(True):
-        return DrawnTruth(z, eqx.tree_at(lambda s: s.value, space, jnp.asarray(held)))
+    return DrawnTruth(z, replace(space, value=placed(held)))
 
 
 def draw_truths(knowledge: Knowledge, count: int, seed: int) -> list[DrawnTruth]:

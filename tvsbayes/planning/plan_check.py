@@ -10,8 +10,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from tvsbayes.errors import InputError
@@ -146,9 +144,7 @@ def judge(steps: Sequence[PlanStep], knowledge: Knowledge, *, aperture: bool = F
         InputError: a plan that looks at nothing or places an unknown sheet.
     """
     found = information_of(steps, knowledge, aperture=aperture)
-    with jax.enable_x64(True):
-        at = headlines(jnp.asarray(knowledge.z), knowledge.space, jnp.asarray(found.pose_rad))
-    gradient = np.asarray(at.gradient)
+    gradient = np.asarray(headlines(knowledge.z, knowledge.space, found.pose_rad).gradient)
     covariance = gradient @ covariance_of(knowledge.precision + found.fisher) @ gradient.T
     prior = np.einsum("qi,ij,qj->q", gradient, knowledge.covariance, gradient)
     return Judged(found, covariance, gradient, prior)

@@ -11,8 +11,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from tvsbayes.model.headlines import QUANTITIES, headlines
@@ -174,9 +172,8 @@ def search_designs(knowledge: Knowledge, seen: Seen, at_centre: Sensitivity, cri
 
 def _of_all_gears(knowledge: Knowledge, seen: Seen) -> Sensitivity:
     """Ratios and backlashes of both axes, in the middle of the looks."""
-    with jax.enable_x64(True):
-        pose = jnp.asarray(seen.mirror_angles_rad.mean(axis=0))
-        everything = np.asarray(headlines(jnp.asarray(knowledge.z), knowledge.space, pose).gradient)
+    pose_rad = seen.mirror_angles_rad.mean(axis=0)
+    everything = np.asarray(headlines(knowledge.z, knowledge.space, pose_rad).gradient)
     return Sensitivity(everything[[QUANTITIES.index(q) for q in ("left", "up", "backlash.pan", "backlash.tilt")]])
 
 

@@ -9,7 +9,6 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from arviz_stats.base import array_stats
 
@@ -151,8 +150,7 @@ class Posterior:
 
     def effective_deg_per_step(self, pan_deg: float, tilt_deg: float) -> Propagated:
         """Effective degrees per step (left, right, up, down) at any pose of the mirrors (formulation 3.2)."""
-        with jax.enable_x64(True):
-            found = derived_at(self.fit, self.z, np.radians([pan_deg, tilt_deg]))
+        found = derived_at(self.fit, self.z, np.radians([pan_deg, tilt_deg]))
         return propagated(np.asarray(found.effective_deg_per_step))
 
     def lost_motion_deg(self, direction: str, steps: np.ndarray) -> Propagated:
@@ -206,7 +204,6 @@ def propagated(values: np.ndarray) -> Propagated:
 def derived_at(fit: JointFit, z: np.ndarray, pose_rad: np.ndarray) -> Derived:
     """Parameters and headlines of draws (chain, draw, p) at a pose (pan, tilt)."""
     shape = z.shape[:2]
-    pose = jnp.asarray(pose_rad)
     points = z.reshape(-1, z.shape[-1])
-    flat = in_batches(lambda block: derived_quantities(block, fit.space, pose), points, size=DERIVED_BATCH)
+    flat = in_batches(lambda block: derived_quantities(block, fit.space, pose_rad), points, size=DERIVED_BATCH)
     return jax.tree.map(lambda x: x.reshape(*shape, *x.shape[1:]), flat)

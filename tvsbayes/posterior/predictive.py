@@ -137,8 +137,7 @@ def move_log_likelihood(posterior: Posterior) -> xr.DataArray:
     spots = ordered_spots(fit.campaign)
     used = np.asarray(fit.arrays.spots.valid)[: len(spots)] > 0
     z = posterior.z.reshape(-1, posterior.z.shape[-1])
-    with jax.enable_x64(True):
-        by_spot = in_batches(lambda block: move_log_density(block, fit.space, fit.arrays), z)[:, : len(spots)]
+    by_spot = in_batches(lambda block: move_log_density(block, fit.space, fit.arrays), z)[:, : len(spots)]
     by_spot = by_spot + spot_constants(fit.campaign)
     index = np.array([spot.move for spot in spots])
     moves_seen = np.unique(index[used])
@@ -150,8 +149,7 @@ def move_log_likelihood(posterior: Posterior) -> xr.DataArray:
 
 def looks(fit: JointFit, z: np.ndarray, stop_error_rad: np.ndarray) -> np.ndarray:
     """Noiseless pixels of all ordered spots, shape (draws, spots, 4), for coordinates (draws, p)."""
-    with jax.enable_x64(True):
-        seen = in_batches(lambda z, e: observe_with_stop_errors(z, e, fit.space, fit.arrays), z, stop_error_rad)
+    seen = in_batches(lambda z, e: observe_with_stop_errors(z, e, fit.space, fit.arrays), z, stop_error_rad)
     return np.asarray(seen)[:, : len(ordered_spots(fit.campaign)), :4]
 
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
-import jax
 import numpy as np
 from scipy import linalg
 
@@ -215,7 +214,6 @@ def transport(fit: JointFit) -> Transport:
         seen = in_batches(lambda z: evaluate(z, fit.space, fit.arrays).standardised, plain.from_whitened(y))
         return np.nan_to_num(np.asarray(seen).reshape(len(y), -1))
 
-    with jax.enable_x64(True):
-        bend = bends(route, residuals)
-        # Where the whole covariance follows the noise scales there is no table.
-        return replace(route, bend=bend, stretch=route.stretch if len(route.constant) else stretches(route, residuals))
+    bend = bends(route, residuals)
+    # Where the whole covariance follows the noise scales there is no table.
+    return replace(route, bend=bend, stretch=route.stretch if len(route.constant) else stretches(route, residuals))

@@ -14,7 +14,6 @@ from dataclasses import dataclass, fields, replace
 from functools import cached_property
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from tvsbayes.instrument.parameters import BLOCKS, NAMES, NOISE_NAMES
@@ -251,6 +250,6 @@ def in_batches[Result](function: Callable[..., Result], *points: np.ndarray, siz
     blocks, total = [], len(points[0])
     for start in range(0, total, size):
         rows = np.minimum(np.arange(start, start + size), total - 1)
-        result = function(*(jnp.asarray(x[rows]) for x in points))
+        result = function(*(x[rows] for x in points))
         blocks.append(jax.tree.map(lambda x, n=total - start: np.asarray(x)[:n], result))
     return jax.tree.map(lambda *parts: np.concatenate(parts), *blocks)

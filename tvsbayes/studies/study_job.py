@@ -14,8 +14,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from importlib.metadata import version
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from tvsbayes.errors import InputError, TvsError
@@ -118,9 +116,8 @@ def _compared(job: StudyJob, result: JointFit, true: Truth) -> dict[str, Headlin
     knowledge, pose = prior_knowledge(job.rig), result.reference_pose_rad
     truth = truth_in(knowledge, true.parameters, true.stereo.vector)
     information = information_of(job.steps, knowledge, aperture=job.aperture, z=truth.z, space=truth.space)
-    with jax.enable_x64(True):
-        at_truth = headlines(jnp.asarray(truth.z), truth.space, jnp.asarray(pose))
-        at_mode = headlines(jnp.asarray(result.z), result.space, jnp.asarray(pose))
+    at_truth = headlines(truth.z, truth.space, pose)
+    at_mode = headlines(result.z, result.space, pose)
     predicted = predicted_sds(knowledge, information.fisher, np.asarray(at_truth.gradient), truth.z)
     values, draws = true_headlines(true.parameters, pose), _headline_draws(result)
     low, high = np.quantile(draws, [0.025, 0.975], axis=0)
