@@ -18,6 +18,7 @@ os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(Path(__file__).resolve().
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.2")
 
 from dataclasses import dataclass, replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -133,7 +134,10 @@ def ctrl_c_works():
 
 @dataclass(frozen=True)
 class Evaluated:
-    """Everything between coordinates and log likelihood, as NumPy arrays: see the library's own records."""
+    """Everything between coordinates and log likelihood, as NumPy arrays: see the library's own records.
+
+    `terms` are the residuals (spots, 4), slopes (spots, 4, 2), log scales and predicted looks (spots, 5).
+    """
 
     model: Any
     angles: Any
@@ -147,19 +151,26 @@ def evaluate():
     import jax
     import jax.numpy as jnp
 
-    from tvsbayes.estimators.likelihood import innovations, spot_residuals
+    from tvsbayes.estimators.likelihood import innovations, standing
     from tvsbayes.model.laser_path import mirror_angles
 
     @jax.jit
     def compiled(z, space, arrays):
         model = space.model(z)
         angles = mirror_angles(model.transmission, model.tilt_zero_rad, arrays.moves)
-        terms = spot_residuals(model, angles, arrays, jnp.ones(()), False)
+        found = standing(model, arrays)
+        terms = {
+            "residual": jnp.stack(found.terms.residual, axis=1),
+            "slope": jnp.stack([jnp.stack(found.terms.by_pan, 1), jnp.stack(found.terms.by_tilt, 1)], axis=2),
+            "log_scale": found.terms.log_scale,
+            "predicted": jnp.stack(found.looks.predicted, axis=1),
+        }
         return model, angles, terms, innovations(model, arrays)
 
     def run(z, space, arrays) -> Evaluated:
         with jax.enable_x64(True):
-            return Evaluated(*jax.tree.map(np.asarray, compiled(jnp.asarray(z), space, arrays)))
+            model, angles, terms, seen = jax.tree.map(np.asarray, compiled(jnp.asarray(z), space, arrays))
+            return Evaluated(model, angles, SimpleNamespace(**terms), seen)
 
     return run
 

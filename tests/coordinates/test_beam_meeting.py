@@ -97,7 +97,7 @@ def test_meeting_has_the_derivative_of_central_differences(azimuth, reading_deg)
 
     @jax.jit
     def point(x):
-        return meeting(x[:3], x[3:6], x[6], x[7], jnp.asarray(azimuth)).xyz_mm
+        return meeting(Ray(Vectors.of(x[:3]), Vectors.of(x[3:6])), x[6], x[7], jnp.asarray(azimuth)).xyz_mm
 
     with jax.enable_x64(True):
         jacobian = np.asarray(jax.jit(jax.jacfwd(point))(jnp.asarray(inputs)))

@@ -16,6 +16,8 @@ from tvsbayes.coordinates.beam_meeting import meeting
 from tvsbayes.coordinates.error_map import SimpleCalibration, error_map, simple_calibration, simple_rays
 from tvsbayes.estimators.four_point import ClassicResult, DirectionResult
 from tvsbayes.instrument.parameters import RIG_PRIORS, Prior
+from tvsbayes.model.geometry import Vectors
+from tvsbayes.model.laser_path import Ray
 from tvsbayes.twin.physics import aperture_angle_deg
 
 ROUNDING_MM = 1e-9
@@ -52,8 +54,7 @@ def test_simple_rays_with_readings_are_the_published_equations(pan, tilt):
         with jax.enable_x64(True):
             # The aperture stays at -a/2 = -100 mm.
             found = meeting(
-                jnp.asarray(np.array([[0.0], [70.0], [0.0]])),
-                jnp.asarray(d[:, None]),
+                Ray(Vectors.of(np.array([[0.0], [70.0], [0.0]])), Vectors.of(d[:, None])),
                 jnp.asarray(2 * (simple.baseline_mm - simple.origin_y_mm)),
                 jnp.asarray(np.radians([reading])),
                 jnp.asarray(False),

@@ -121,7 +121,7 @@ def test_vectors_know_their_products():
 
 def test_one_vector_goes_with_many():
     many = Vectors.of(jnp.asarray(np.random.default_rng(5).standard_normal((3, 4))))
-    both = (many + Vectors(0.0, 2.0, 0.0) - many) * 0.5
+    both = (many + Vectors.of(np.array([0.0, 2.0, 0.0])) - many) * 0.5
     np.testing.assert_allclose(both.stacked(), np.repeat([[0.0], [1.0], [0.0]], 4, axis=1), atol=4 * ROUNDING)
 
 

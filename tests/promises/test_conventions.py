@@ -82,7 +82,9 @@ def test_tvs_point_and_aperture_of_the_test_vector(nominal, looks, azimuth, prin
     """250 mm along the beam: p_T = Rz(C0 - 90 deg) p_P + (0, a/2, 0), and B as either convention reads it."""
     origin, direction, _ = looks(with_values(nominal, **VECTOR), [[PAN_RAD, TILT_RAD, RANGE_MM]])
     point_p = Vectors.of(jnp.asarray(origin[0] + RANGE_MM * direction[0]))
-    point_t = Turn.by(jnp.asarray(C0_RAD - np.pi / 2)).forward(point_p) + Vectors(0.0, BASELINE_MM / 2, 0.0)
+    point_t = Turn.by(jnp.asarray(C0_RAD - np.pi / 2)).forward(point_p) + Vectors.of(
+        np.array([0.0, BASELINE_MM / 2, 0.0])
+    )
     assert np.abs(point_t.stacked() - np.array([250.365237, 119.492704, 18.238043])).max() <= LAST_6 * 1.01
     receiver = Receiver(*map(jnp.asarray, (BASELINE_MM, C0_RAD, 0.0, 1.0)))
     angle_deg = np.degrees(aperture_angle(receiver, point_p, jnp.asarray(azimuth)))

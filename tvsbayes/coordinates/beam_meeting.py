@@ -150,7 +150,8 @@ def _in_frame_t(model: Model, pan_rad: Array, tilt_rad: Array) -> Ray:
 
 def half_baseline(baseline_mm: Scalar) -> Vectors:
     """(0, a/2, 0), from the middle of the baseline to the pan axis."""
-    return Vectors(0.0, 0.5 * baseline_mm, 0.0)
+    none = jnp.zeros(())
+    return Vectors(none, 0.5 * baseline_mm, none)
 
 
 class Sources(eqx.Module):

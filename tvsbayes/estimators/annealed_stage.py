@@ -11,6 +11,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import lineax as lx
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from tvsbayes.estimators.campaign_arrays import CampaignArrays
@@ -18,7 +19,6 @@ from tvsbayes.estimators.likelihood import filter_rows, filtered
 from tvsbayes.estimators.linear_spots import Linearised, linearise
 from tvsbayes.estimators.spot_residuals import ToStates
 from tvsbayes.model.compiled import compiled
-from tvsbayes.model.geometry import Scalar
 from tvsbayes.model.parameter_space import ParameterSpace
 from tvsbayes.statistics.least_squares import LinearResidual, damped_solver, descend
 
@@ -33,9 +33,9 @@ NO_STEP = 1e300
 class Fixed(eqx.Module):
     """What a least-squares stage holds: coordinates kept at a value, and the factor on the noise."""
 
-    held: Bool[Array, " parameters"]
-    value: Float[Array, " parameters"]
-    inflation: Scalar
+    held: Bool[Array | np.ndarray, " parameters"]
+    value: Float[Array | np.ndarray, " parameters"]
+    inflation: Float[Array | np.ndarray, ""]
 
 
 def innovations(lin: Linearised, arrays: CampaignArrays) -> Float[Array, "innovations columns"]:

@@ -13,6 +13,7 @@ from __future__ import annotations
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from tvsbayes.estimators.campaign_arrays import CampaignArrays, SpotArrays
@@ -47,10 +48,10 @@ class FilterRows(eqx.Module):
 
 
 def filter_rows(
-    residual: Float[Array, "spots components *columns"],
-    slope: Float[Array, "spots components 2"],
-    play_sd_rad: Float[Array, "spots 2"],
-    stop_variance: Float[Array, "spots 2"],
+    residual: Float[Array | np.ndarray, "spots components *columns"],
+    slope: Float[Array | np.ndarray, "spots components 2"],
+    play_sd_rad: Float[Array | np.ndarray, "spots 2"],
+    stop_variance: Float[Array | np.ndarray, "spots 2"],
     spots: SpotArrays,
 ) -> FilterRows:
     """States of the filter at every spot: stop errors, home offsets, places in an unknown play.
@@ -66,7 +67,7 @@ def filter_rows(
     home = jnp.where(spots.homed, (HOME_SD_DEG * jnp.pi / 180) ** 2, 0.0)[:, None]
     segment = jnp.broadcast_to(spots.new_segment[:, None], pairs)
     return FilterRows(
-        residual=residual,
+        residual=jnp.asarray(residual),
         load=jnp.concatenate([slope, slope, slope * play_sd_rad[:, None]], axis=2),
         keep=jnp.where(jnp.concatenate([spots.redraw, segment, segment], axis=1), 0.0, 1.0),
         variance=jnp.concatenate([stop_variance, jnp.broadcast_to(home, pairs), jnp.ones(pairs)], axis=1),
@@ -129,7 +130,7 @@ class Standing(eqx.Module):
     stop_variance: Float[Array, "spots 2"]
 
 
-def standing(model: Model, arrays: CampaignArrays, inflation: Scalar | float = 1.0) -> Standing:
+def standing(model: Model, arrays: CampaignArrays, inflation: Float[Array | np.ndarray, ""] | float = 1.0) -> Standing:
     """Linearise all spots; `inflation` is a factor on pixel and aperture noise (annealing)."""
     spots = arrays.spots
     angles = mirror_angles(model.transmission, model.tilt_zero_rad, arrays.moves)
@@ -180,10 +181,10 @@ class Innovations(eqx.Module):
 
 
 class Seen(eqx.Module):
-    """All spots seen by the filter: standardised errors, and the logs of their variances' products."""
+    """Spots seen by the filter: standardised errors (spots, components, ...), and logs of their variances' products."""
 
-    standardised: Float[Array, "spots components *columns"]
-    log_variance: Float[Array, " spots"]
+    standardised: Float[Array, "..."]
+    log_variance: Float[Array, "*spots"]
 
 
 def filtered(rows: FilterRows) -> Seen:

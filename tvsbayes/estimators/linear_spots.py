@@ -21,22 +21,22 @@ from scipy import linalg
 from tvsbayes.estimators.campaign_arrays import CampaignArrays, padded
 from tvsbayes.estimators.likelihood import FilterRows, filter_rows, standing
 from tvsbayes.estimators.look_jacobian import look_jacobian
-from tvsbayes.model.geometry import Scalar
+from tvsbayes.model.compiled import compiled
 from tvsbayes.model.parameter_space import ParameterSpace
 
 
 class Linearised(eqx.Module):
     """The campaign linearised at coordinates `z`; first axis of the Jacobians is the spot."""
 
-    z: Float[Array, " parameters"]
-    residual: Float[Array, "spots 4"]
-    slope: Float[Array, "spots 4 2"]
-    play_sd_rad: Float[Array, "spots 2"]
-    mirror_angles_rad: Float[Array, "spots 2"]
-    predicted: Float[Array, "spots 5"]
-    stop_variance: Float[Array, "spots 2"]
-    residual_jacobian: Float[Array, "spots 4 parameters"]
-    predicted_jacobian: Float[Array, "spots 5 parameters"]
+    z: Float[Array | np.ndarray, " parameters"]
+    residual: Float[Array | np.ndarray, "spots 4"]
+    slope: Float[Array | np.ndarray, "spots 4 2"]
+    play_sd_rad: Float[Array | np.ndarray, "spots 2"]
+    mirror_angles_rad: Float[Array | np.ndarray, "spots 2"]
+    predicted: Float[Array | np.ndarray, "spots 5"]
+    stop_variance: Float[Array | np.ndarray, "spots 2"]
+    residual_jacobian: Float[Array | np.ndarray, "spots 4 parameters"]
+    predicted_jacobian: Float[Array | np.ndarray, "spots 5 parameters"]
 
     def of_spots(self, count: int) -> Linearised:
         """The first `count` spots, as NumPy arrays: padding comes last."""
@@ -65,7 +65,10 @@ class SpotDeviations:
 
 
 def linearise(
-    z: Float[Array, " parameters"], space: ParameterSpace, arrays: CampaignArrays, inflation: Scalar | float = 1.0
+    z: Float[Array, " parameters"],
+    space: ParameterSpace,
+    arrays: CampaignArrays,
+    inflation: Float[Array | np.ndarray, ""] | float = 1.0,
 ) -> Linearised:
     """Residuals, ideal observations at the observed ranges, and d/d(coordinates) of both; noise scales are held.
 

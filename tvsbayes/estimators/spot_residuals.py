@@ -9,11 +9,12 @@ from __future__ import annotations
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from tvsbayes.estimators.campaign_arrays import SpotArrays
 from tvsbayes.estimators.looks import Looks, Numbers
-from tvsbayes.model.geometry import Scalar, materialise
+from tvsbayes.model.geometry import materialise
 from tvsbayes.model.parameter_space import Model
 
 
@@ -36,7 +37,7 @@ class NoiseScales(eqx.Module):
         )
 
 
-def noise_scales(model: Model, spots: SpotArrays, inflation: Scalar | float) -> NoiseScales:
+def noise_scales(model: Model, spots: SpotArrays, inflation: Float[Array | np.ndarray, ""] | float) -> NoiseScales:
     """Noise of every spot at the model's scales; robust weights make it larger, padding infinite."""
     root_weight = jnp.sqrt(spots.weight) * spots.valid
     return NoiseScales(

@@ -13,7 +13,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 Scalar = Float[Array, ""]
@@ -64,14 +63,15 @@ def rotation_matrix(rotation_rad: Vector) -> Float[Array, "3 3"]:
 class Vectors(eqx.Module):
     """Many vectors by their components; a single one broadcasts against them."""
 
-    x: Float[ArrayLike, "..."]
-    y: Float[ArrayLike, "..."]
-    z: Float[ArrayLike, "..."]
+    x: Float[Array, "..."]
+    y: Float[Array, "..."]
+    z: Float[Array, "..."]
 
     @classmethod
     def of(cls, stacked: Float[Array | np.ndarray, "3 *batch"]) -> Vectors:
         """From one array whose first axis is x, y, z."""
-        return cls(stacked[0], stacked[1], stacked[2])
+        array = jnp.asarray(stacked)
+        return cls(array[0], array[1], array[2])
 
     def stacked(self) -> Float[Array, "3 ..."]:
         """One array whose first axis is x, y, z."""
@@ -85,7 +85,7 @@ class Vectors(eqx.Module):
         """Componentwise."""
         return Vectors(self.x - other.x, self.y - other.y, self.z - other.z)
 
-    def __mul__(self, factor: Float[ArrayLike, "..."]) -> Vectors:
+    def __mul__(self, factor: Float[Array, "..."] | float) -> Vectors:
         """Longer by a factor."""
         return Vectors(self.x * factor, self.y * factor, self.z * factor)
 

@@ -156,26 +156,27 @@ def trace(optics: Optics, pan_rad: Float[Array, "*batch"], tilt_rad: Float[Array
     Returns:
         The rays in frame P.
     """
+    none = jnp.zeros(())
     tangent_x, tangent_y = jnp.tan(optics.laser_tilt_rad)
     shorter = 1 / jnp.sqrt(1 + tangent_x**2 + tangent_y**2)
     laser = Vectors(tangent_x * shorter, tangent_y * shorter, -shorter)
-    laser_origin = Vectors(optics.laser_offset_mm[0], optics.laser_offset_mm[1], 0.0)
+    laser_origin = Vectors(optics.laser_offset_mm[0], optics.laser_offset_mm[1], none)
     pan, tilt = materialise((Turn.by(pan_rad), Turn.by(tilt_rad)))
     # The laser stands still in P; in the pan stage's frame Q it turns backwards.
     laser, laser_origin = pan.back(laser), pan.back(laser_origin)
 
     mirror1 = jnp.pi / 4 + optics.mirror1_error_rad
-    normal1 = Vectors(0.0, -jnp.sin(mirror1), jnp.cos(mirror1))
-    hit1 = intersect_plane(laser_origin, laser, Vectors(0.0, 0.0, 0.0), normal1)
+    normal1 = Vectors(none, -jnp.sin(mirror1), jnp.cos(mirror1))
+    hit1 = intersect_plane(laser_origin, laser, Vectors(none, none, none), normal1)
     hit1, between = materialise((hit1, reflect(laser, normal1)))
 
     ax, az = optics.tilt_axis_offset_mm
     centre = Vectors(ax, -optics.mirror_offset_mm, az)
     sin_skew, cos_skew = jnp.sin(optics.tilt_axis_skew_rad), jnp.cos(optics.tilt_axis_skew_rad)
     mirror2 = jnp.pi / 4 + optics.mirror2_error_rad
-    ahead = Vectors(jnp.sin(mirror2), 0.0, 0.0)
-    above = Vectors(0.0, -sin_skew, cos_skew) * jnp.sin(mirror2)
-    axial = Vectors(0.0, cos_skew, sin_skew) * jnp.cos(mirror2)
+    ahead = Vectors(jnp.sin(mirror2), none, none)
+    above = Vectors(none, -sin_skew, cos_skew) * jnp.sin(mirror2)
+    axial = Vectors(none, cos_skew, sin_skew) * jnp.cos(mirror2)
     normal2 = ahead * tilt.cosine + above * tilt.sine + axial
     hit2 = intersect_plane(hit1, between, centre, normal2)
     hit2, outgoing = materialise((hit2, reflect(between, normal2)))

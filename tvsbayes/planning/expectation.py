@@ -92,14 +92,14 @@ class Expectation(eqx.Module):
     its sheet or an image is not `seen` and its rows are zero.
     """
 
-    rows: Float[Array, "looks 4 columns"]
-    jacobian: Float[Array, "looks 4 parameters"]
-    slope: Float[Array, "looks 4 2"]
-    load: Float[Array, "looks 4 6"]
-    keep: Float[Array, "looks 6"]
-    variance: Float[Array, "looks 6"]
-    seen: Bool[Array, " looks"]
-    mirror_angles_rad: Float[Array, "looks 2"]
+    rows: Float[Array | np.ndarray, "looks 4 columns"]
+    jacobian: Float[Array | np.ndarray, "looks 4 parameters"]
+    slope: Float[Array | np.ndarray, "looks 4 2"]
+    load: Float[Array | np.ndarray, "looks 4 6"]
+    keep: Float[Array | np.ndarray, "looks 6"]
+    variance: Float[Array | np.ndarray, "looks 6"]
+    seen: Bool[Array | np.ndarray, " looks"]
+    mirror_angles_rad: Float[Array | np.ndarray, "looks 2"]
 
 
 NOISE_COLUMNS = np.isin(NAMES, NOISE_NAMES)

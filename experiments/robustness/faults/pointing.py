@@ -31,8 +31,8 @@ FAULTS = (
     Fault(
         "other root of the cone",
         "coordinates/beam_meeting.py",
-        "ahead = cos_b * root - w[1] * direction[1]",
-        "ahead = -cos_b * root - w[1] * direction[1]",
+        "ahead = cos_b * root - w.y * direction.y",
+        "ahead = -cos_b * root - w.y * direction.y",
         "points behind the scanner",
         ("coordinates/beam_meeting",),
     ),

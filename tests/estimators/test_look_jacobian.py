@@ -1,0 +1,67 @@
+"""The Jacobian of looks, put together from its parts, against JAX's own of the whole."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from tvsbayes.estimators.likelihood import standing
+from tvsbayes.estimators.look_jacobian import look_jacobian
+from tvsbayes.estimators.looks import observe
+from tvsbayes.instrument.parameters import INDEX, NAMES, NOISE_NAMES
+from tvsbayes.model.laser_path import mirror_angles
+
+pytestmark = pytest.mark.usefixtures("x64")
+
+ROUNDING = 1e-11
+"""Of a derivative, relative to the largest of its column: a hundred operations and the product with the root."""
+
+
+@pytest.fixture(scope="module")
+def both(dozen):
+    """(columns put together, columns of the whole), shape (5, parameters, spots), at a point beside the truth."""
+
+    def whole(z, ranges_mm):
+        model = dozen.space.model(z)
+        angles = mirror_angles(model.transmission, model.tilt_zero_rad, dozen.arrays.moves).angle_rad
+        pan, tilt = angles[dozen.arrays.spots.move_index].T
+        return observe(model, jnp.stack([pan, tilt, ranges_mm]), dozen.arrays.azimuth_convention)
+
+    @jax.jit
+    def compute(z):
+        looks = standing(dozen.space.model(z), dozen.arrays).looks
+        parts = jnp.stack(look_jacobian(z, dozen.space, looks, dozen.arrays))
+        return parts, jax.jacfwd(whole)(z, looks.range_mm).transpose(0, 2, 1), looks
+
+    z = dozen.z + 0.5 * np.random.default_rng(61).standard_normal(len(NAMES))
+    with jax.enable_x64(True):
+        return jax.tree.map(np.asarray, compute(jnp.asarray(z)))
+
+
+def test_parts_make_the_whole(both, dozen):
+    """Gears, optics, frames, cameras, receiver; harmonics have u = 0 here and columns of nought."""
+    parts, whole, _ = both
+    count = len(dozen.campaign.spots)
+    scale = np.abs(whole[:, :, :count]).max(axis=2, keepdims=True)
+    assert np.max(np.abs(parts - whole)[:, :, :count] - ROUNDING * scale) <= 0
+    moving = scale[:, :, 0].max(axis=0) > 0
+    assert not moving[[INDEX[name] for name in NOISE_NAMES]].any()
+    # Of 65 coordinates the noise scales (6) and the harmonics (8) move no look of this rig.
+    assert moving.sum() == len(NAMES) - len(NOISE_NAMES) - 8
+
+
+def test_slopes_are_the_derivatives_by_angles_and_range(both, dozen):
+    """Of the ideal look along pan, tilt and range, by central differences: truncation and rounding 1e-6 of them."""
+    looks = both[2]
+    z = dozen.z + 0.5 * np.random.default_rng(61).standard_normal(len(NAMES))
+    pose = np.stack([looks.pan_rad, looks.tilt_rad, looks.range_mm])
+    with jax.enable_x64(True):
+        model = dozen.space.model(jnp.asarray(z))
+        seen = jax.jit(lambda at: observe(model, at, dozen.arrays.azimuth_convention))
+        for axis, (slopes, step) in enumerate(((looks.by_pan, 1e-5), (looks.by_tilt, 1e-5), (looks.by_range, 1e-2))):
+            nudge = step * np.eye(3)[axis][:, None]
+            expected = (np.asarray(seen(pose + nudge)) - np.asarray(seen(pose - nudge))) / (2 * step)
+            found = np.stack(slopes)
+            assert np.max(np.abs(found - expected)) < 1e-6 * np.max(np.abs(expected))

@@ -1,0 +1,80 @@
+"""Reflections keep lengths and products; whitening is that of the stated covariance."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from tvsbayes.estimators.campaign_arrays import pixel_covariance
+from tvsbayes.estimators.spot_residuals import NoiseScales, Reflection, ToStates
+from tvsbayes.instrument.campaign import ordered_spots
+
+pytestmark = pytest.mark.usefixtures("x64")
+
+ROUNDING = 1e-13
+"""Of a few dozen operations on numbers of order ten."""
+
+
+def numbers(rows: np.ndarray) -> tuple:
+    """Components (k, n) as the library takes them."""
+    return tuple(jnp.asarray(row) for row in rows)
+
+
+def drawn(components: int, seed: int) -> np.ndarray:
+    return np.random.default_rng(seed).standard_normal((components, 40))
+
+
+def test_a_reflection_takes_its_direction_to_the_first_axis_and_keeps_products():
+    direction, first, second = drawn(5, 1), drawn(5, 2), drawn(5, 3)
+    with jax.enable_x64(True):
+        reflection = Reflection.of(numbers(direction))
+        turned, a, b = (np.stack(reflection.of_many(numbers(v))) for v in (direction, first, second))
+    np.testing.assert_allclose(turned[1:], 0.0, atol=ROUNDING)
+    np.testing.assert_allclose(turned[0], reflection.first, atol=ROUNDING)
+    np.testing.assert_allclose(np.abs(turned[0]), np.linalg.norm(direction, axis=0), rtol=ROUNDING)
+    np.testing.assert_allclose(np.sum(a * b, axis=0), np.sum(first * second, axis=0), atol=10 * ROUNDING)
+
+
+def test_without_a_direction_a_reflection_is_finite_and_still_one():
+    """Padding has no slopes: lengths stay, the load is nought, and so is every derivative by the direction."""
+    vector = drawn(4, 4)
+    with jax.enable_x64(True):
+        reflection = Reflection.of(numbers(np.zeros((4, 40))))
+        turned = np.stack(reflection.of_many(numbers(vector)))
+
+        def total(direction):
+            found = Reflection.of(tuple(direction))
+            return sum(jnp.sum(part) for part in found.of_many(numbers(vector))) + jnp.sum(found.first)
+
+        slope = np.asarray(jax.grad(total)(jnp.zeros((4, 40))))
+    np.testing.assert_allclose(np.linalg.norm(turned, axis=0), np.linalg.norm(vector, axis=0), rtol=ROUNDING)
+    assert np.all(np.asarray(reflection.first) == 0)
+    assert np.isfinite(slope).all()
+
+
+def test_only_two_components_see_the_mirror_angles():
+    by_pan, by_tilt, residual = drawn(4, 5), drawn(4, 6), drawn(4, 7)
+    with jax.enable_x64(True):
+        turn = ToStates.of(numbers(by_pan), numbers(by_tilt))
+        slope = np.asarray(turn.slope)
+        pan, tilt, turned = (np.stack(turn.of_many(numbers(v))) for v in (by_pan, by_tilt, residual))
+    for seen, column in ((pan, 0), (tilt, 1)):
+        np.testing.assert_allclose(seen[:2].T, slope[:, :, column], atol=ROUNDING)
+        np.testing.assert_allclose(seen[2:], 0.0, atol=ROUNDING)
+    np.testing.assert_allclose(np.sum(turned**2, axis=0), np.sum(residual**2, axis=0), rtol=ROUNDING)
+
+
+def test_whitened_differences_have_the_stated_covariance(dozen):
+    """D' C^-1 d of pixels is the squared length after whitening, for correlated centres too."""
+    spots = ordered_spots(dozen.campaign)
+    difference = np.zeros((5, len(dozen.arrays.spots.valid)))
+    difference[:4, : len(spots)] = np.random.default_rng(8).standard_normal((4, len(spots)))
+    with jax.enable_x64(True):
+        unit = jnp.ones(difference.shape[1])
+        found = np.stack(NoiseScales(unit, unit).whitened(numbers(difference), dozen.arrays.spots))
+    for k, spot in enumerate(spots):
+        d = difference[:4, k]
+        expected = d @ np.linalg.solve(pixel_covariance(spot), d)
+        assert np.sum(found[:4, k] ** 2) == pytest.approx(expected, rel=1e-12)
