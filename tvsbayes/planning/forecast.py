@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import stats
+from scipy import special
 
 from tvsbayes.errors import InputError, TvsError
 from tvsbayes.estimators.four_point import classic, ratio_slopes, select_experiments
@@ -327,7 +327,7 @@ def classic_answer(target: Target, forecast: ClassicForecast | None, campaign: C
         low, sd, high = np.quantile(forecast.sd[:, index], [0.025, 0.5, 0.975])
         if measured is not None and measured.get(direction) is not None:
             sd, n = measured[direction]
-            low, high = (sd * math.sqrt((n - 1) / stats.chi2.ppf(p, n - 1)) for p in (0.975, 0.025))
+            low, high = (sd * math.sqrt((n - 1) / special.chdtri(n - 1, p)) for p in (0.025, 0.975))
         error = np.quantile(forecast.error[:, index], [0.5, 0.025, 0.975])
         counts = [classic_count(float(s), half_width) for s in (low, sd, high)]
         answers.append(

@@ -10,7 +10,6 @@ from dataclasses import dataclass
 
 import jax
 import numpy as np
-from arviz_stats.base import array_stats
 
 from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.instrument.axes import AXES, DIRECTION_SIGNS, DIRECTIONS, SENSES
@@ -176,6 +175,9 @@ class Posterior:
 
 def propagated(values: np.ndarray) -> Propagated:
     """Summary of draws (chain, draw, ...)."""
+    # Loading it takes as long as a fit of stored functions: only who asks for draws waits.
+    from arviz_stats.base import array_stats
+
     tails = (0.025, 0.975)
     quantiles = np.quantile(values, tails, axis=(0, 1))
     flat = values.reshape(*values.shape[:2], -1)
