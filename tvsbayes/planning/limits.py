@@ -11,8 +11,9 @@ import numpy as np
 from tvsbayes.instrument.parameters import NAMES, PRIOR_GROUPS, RIG_NAMES
 from tvsbayes.instrument.plan import described
 from tvsbayes.instrument.rig import RigTable
-from tvsbayes.planning.candidates import Candidates, Seen, arrange, covariance_of, information_of_looks
+from tvsbayes.planning.candidates import Candidates
 from tvsbayes.planning.expectation import LOOKS_PER_EXPERIMENT, Knowledge, plan_minutes
+from tvsbayes.planning.looks import Seen, arrange, covariance_of, information_of_looks
 from tvsbayes.planning.search import search_designs
 from tvsbayes.planning.target import Sensitivity, Target
 from tvsbayes.results.plan_record import Advice, Batch

@@ -21,8 +21,9 @@ from tvsbayes.instrument.plan import PlanStep, described, run_plan, step_json
 from tvsbayes.instrument.rig import Rig
 from tvsbayes.instrument.stops import Stop, few_stops, inseparable, observed_stops, one_sided, separation
 from tvsbayes.model.headlines import QUANTITIES, headlines
-from tvsbayes.planning.candidates import Candidates, LookArrays, Looks, arrange, candidates, covariance_of
+from tvsbayes.planning.candidates import Candidates, candidates
 from tvsbayes.planning.expectation import PARAMETERS, Knowledge, PlanInformation, information_of, prior_knowledge
+from tvsbayes.planning.looks import LookArrays, Looks, arrange, covariance_of
 from tvsbayes.planning.search import Search
 from tvsbayes.results.estimates import CONTRACTION_LIMIT
 

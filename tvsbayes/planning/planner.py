@@ -20,15 +20,8 @@ from tvsbayes.instrument.plan import PlanStep, step_json
 from tvsbayes.instrument.protocols import grid_protocol, mixed_protocol, paper_protocol
 from tvsbayes.instrument.rig import Rig
 from tvsbayes.instrument.stops import FEW_STOPS, inseparable, too_few
-from tvsbayes.planning.candidates import (
-    Candidates,
-    LookArrays,
-    Looks,
-    Seen,
-    candidates,
-    covariance_of,
-    information_of_looks,
-)
+from tvsbayes.planning.assurance import Assurance, Family
+from tvsbayes.planning.candidates import Candidates, candidates
 from tvsbayes.planning.expectation import (
     Expectation,
     Knowledge,
@@ -39,15 +32,14 @@ from tvsbayes.planning.expectation import (
     prior_knowledge,
 )
 from tvsbayes.planning.forecast import (
-    Assurance,
     ClassicAnswer,
     ClassicForecast,
-    Family,
     classic_answer,
     classic_forecast,
     value_of_classic,
 )
 from tvsbayes.planning.limits import Limit, limit_of, next_experiments, split_of, stop_now
+from tvsbayes.planning.looks import LookArrays, Looks, Seen, covariance_of, information_of_looks
 from tvsbayes.planning.plan_check import judge
 from tvsbayes.planning.search import LADDER, Scope, design_family, refine, smallest_design
 from tvsbayes.planning.target import Sensitivity, Target, sensitivity
@@ -227,7 +219,7 @@ def _curve(
     Noise scales estimated from few stops make single draws jump; a row states the best of all sizes up to its own,
     so that more experiments never look worse. A best of estimates leans towards the hopeful side.
     """
-    target, draws = assurance.target, len(assurance.truths)
+    target, draws = assurance.target, len(assurance.instruments)
     rows, best, surest = [], math.inf, 0.0
     for n in sorted(set(sizes)):
         reported = assurance.values([n])[n]
@@ -342,7 +334,7 @@ def plan_from(
     family = design_family(knowledge, asked.found, asked.seen, target, asked.at_centre, scope)
     durations = _durations(family, scope)
     assurance = Assurance(family, target, draws, seed)
-    forecast = classic_forecast(knowledge, assurance.truths)
+    forecast = classic_forecast(knowledge, assurance.instruments)
     size = _size(assurance, forecast, durations)
     refined = refine(family, asked.seen, target, asked.at_centre, size.experiments, scope, assurance)
     steps = refined.family.arranged(size.experiments).steps

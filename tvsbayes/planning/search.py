@@ -14,9 +14,10 @@ from itertools import combinations
 import numpy as np
 
 from tvsbayes.model.headlines import QUANTITIES, headlines
-from tvsbayes.planning.candidates import CONTRAST_COLUMNS, Candidates, Seen, covariance_of, information_of_looks
+from tvsbayes.planning.assurance import Assurance, Family
+from tvsbayes.planning.candidates import Candidates
 from tvsbayes.planning.expectation import HOME_VARIANCE_RAD2, LOOKS_PER_EXPERIMENT, PARAMETERS, Knowledge, plan_minutes
-from tvsbayes.planning.forecast import Assurance, Family
+from tvsbayes.planning.looks import CONTRAST_COLUMNS, Seen, covariance_of, information_of_looks
 from tvsbayes.planning.target import Sensitivity, Target
 
 CRITERIA = ("c", "D", "A")

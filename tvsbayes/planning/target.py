@@ -133,7 +133,7 @@ def parse_target(text: str) -> Target:
 
 @dataclass(frozen=True)
 class Sensitivity:
-    """How a target hangs on the coordinates.
+    """How a target hangs on the coordinates, at one point of parameter space or with a leading axis at several.
 
     Attributes:
         gradient: d(quantity)/d(coordinates) of each quantity whose worst is meant, shape (q, p).
@@ -146,12 +146,16 @@ class Sensitivity:
     @property
     def own_variance(self) -> np.ndarray:
         """Shape (q,)."""
-        return sum(self.own.values(), np.zeros(len(self.gradient)))
+        return sum(self.own.values(), np.zeros(self.gradient.shape[:-1]))
+
+    def values(self, covariance: np.ndarray, factor: float = 1.0) -> np.ndarray:
+        """The target's values under covariances (..., p, p) of the coordinates."""
+        variance = np.sum((self.gradient @ covariance) * self.gradient, axis=-1) + self.own_variance
+        return factor * np.sqrt(variance.max(axis=-1))
 
     def value(self, covariance: np.ndarray, factor: float = 1.0) -> float:
-        """The target's value under a covariance (p, p) of the coordinates."""
-        variance = np.einsum("qi,ij,qj->q", self.gradient, covariance, self.gradient) + self.own_variance
-        return float(factor * np.sqrt(variance.max()))
+        """The target's value under a covariance (p, p), at one point."""
+        return float(self.values(covariance, factor))
 
 
 AT_POINT = ("stop error at the point", "aperture noise at the point")
@@ -173,10 +177,8 @@ def sensitivity(
         InputError: no beam reaches the target's point.
     """
     rows = list(target.indices)
-    with jax.enable_x64(True):
-        if target.point_mm is None:
-            found = headlines(jnp.asarray(z), space, jnp.asarray(pose_rad))
-            return Sensitivity(np.asarray(found.gradient)[rows])
+    if target.point_mm is None:
+        return Sensitivity(np.asarray(headlines(z, space, pose_rad).gradient)[rows])
     at = physical_at(z, space)
     physical, slope = np.asarray(at.value), np.asarray(at.slope)
     inputs = [INDEX[name] for name in INPUT_NAMES]
