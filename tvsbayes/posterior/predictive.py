@@ -160,10 +160,9 @@ def looks(fit: JointFit, z: np.ndarray, stop_error_rad: np.ndarray) -> np.ndarra
 
 
 def ideal_pixels(posterior: Posterior, draws: int) -> np.ndarray:
-    """Pixels without noise and stop errors for evenly chosen draws, shape (draws, spots, 4)."""
-    z = posterior.z.reshape(-1, posterior.z.shape[-1])
-    chosen = z[np.linspace(0, len(z) - 1, draws).astype(int)]
-    return looks(posterior.fit, chosen, np.zeros((draws, len(posterior.fit.arrays.spots.valid), 2)))
+    """Pixels without noise and stop errors for draws that weigh the same, shape (draws, spots, 4)."""
+    z = posterior.coordinates(draws)
+    return looks(posterior.fit, z, np.zeros((len(z), len(posterior.fit.arrays.spots.valid), 2)))
 
 
 def predictive_pixels(posterior: Posterior, draws_per_chain: int = 8) -> xr.DataArray:
