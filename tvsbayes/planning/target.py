@@ -9,14 +9,10 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
-from tvsbayes.calibration.pointing import INPUT_NAMES, NOISES, Calibration
+from tvsbayes.calibration.pointing import INPUT_NAMES, Calibration
 from tvsbayes.calibration.pointing import NOISE_NAMES as CALIBRATION_NOISE
-from tvsbayes.coordinates.beam_meeting import Sources, propagate
-from tvsbayes.coordinates.location import settings_of
 from tvsbayes.errors import InputError, escaped
 from tvsbayes.instrument.axes import DIRECTIONS
 from tvsbayes.instrument.parameters import INDEX
@@ -194,22 +190,8 @@ def sensitivity(
     )
     goal = machine.steps_for(target.point_mm)
     assert goal.aperture_deg is not None, "a point has a reading"
-    settings = settings_of(float(goal.pan_steps), float(goal.tilt_steps), goal.aperture_deg, goal.approach)
     count = len(inputs)
-    with jax.enable_x64(True):
-        law = propagate(
-            settings,
-            Sources(
-                mean=jnp.asarray(np.concatenate([physical[inputs], np.zeros(NOISES)])),
-                covariance=jnp.zeros((count + NOISES, count + NOISES)),
-                stop_sd_deg=jnp.asarray(stop_sd),
-                inputs=jnp.zeros((1, count + len(stop_sd))),
-                noise=jnp.zeros((1, NOISES)),
-                period_deg=space.harmonic_period_deg,
-                azimuth_convention=jnp.asarray(azimuth),
-            ),
-        )
-    jacobian = np.asarray(law.jacobian)[0][rows]
+    jacobian = machine.derivatives(goal.pan_steps, goal.tilt_steps, goal.aperture_deg, goal.approach)[rows]
     own = jacobian[:, count:] ** 2
     here = {AT_POINT[0]: own[:, :2].sum(axis=1), AT_POINT[1]: own[:, 4]}
     return Sensitivity(jacobian[:, :count] @ slope[inputs], here)
