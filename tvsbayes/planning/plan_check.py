@@ -181,8 +181,8 @@ def _cure(
     search = Search(seen.rows[..., :PARAMETERS], precision, before.gradient[rows], own, "A")
     placed = run_plan(steps, knowledge.rig).sheet
     here = found.looks.sheet == (knowledge.sheets.index(placed) if placed in knowledge.sheets else 0)
-    picks = np.array(search.among(here).greedy(CURE_LOOKS))
-    for count in range(1, CURE_LOOKS + 1):
+    picks = np.array(search.among(here).greedy(CURE_LOOKS), dtype=int)
+    for count in range(1, len(picks) + 1):
         addition = extended(steps, found.looks[picks[:count]], knowledge, found.overshoot)
         after = judge((*steps, *addition), knowledge)
         if after.fault(axis) is None:

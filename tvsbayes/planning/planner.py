@@ -8,11 +8,11 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from tvsbayes.errors import InputError, NotConverged
-from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.estimators.linear_spots import LinearSpots, stop_information
 from tvsbayes.instrument.axes import AXES, DIRECTION_SIGNS
 from tvsbayes.instrument.campaign import Campaign
@@ -45,6 +45,9 @@ from tvsbayes.planning.search import LADDER, Scope, design_family, refine, small
 from tvsbayes.planning.target import Sensitivity, Target, sensitivity
 from tvsbayes.results.plan_record import Advice, Batch
 from tvsbayes.statistics.chances import ASSURED, share_error
+
+if TYPE_CHECKING:
+    from tvsbayes.estimators.joint_fit import JointFit
 
 
 @dataclass(frozen=True)
