@@ -23,7 +23,7 @@ pytestmark = pytest.mark.usefixtures("small_searches")
 def believers(knowledge, *z) -> Instruments:
     """Instruments at points of the space that is known."""
     value = np.asarray(knowledge.space.value)
-    return Instruments(np.array(z), np.broadcast_to(value, (len(z), len(value))), knowledge.space)
+    return Instruments.at(np.array(z), np.broadcast_to(value, (len(z), len(value))), knowledge.space)
 
 
 @pytest.mark.parametrize(("together", "kept"), [(4096, 16), (1, 2)])
@@ -38,7 +38,9 @@ def test_what_is_reported_is_the_whole_plan_judged_at_each_instrument(knowledge,
     family = Family(knowledge, found, np.concatenate([picks, picks]), False)
     target = parse_target(DEFAULT_TARGET)
     assurance = Assurance(family, target, 3, 5)
-    assurance.instruments.z[:, CONTRAST_COLUMNS] = 0.0
+    drawn = assurance.instruments
+    drawn.z[:, CONTRAST_COLUMNS] = 0.0
+    assurance.instruments = Instruments.at(drawn.z, drawn.value, drawn.common)
     first = assurance.values([2])
     reported = {**first, **assurance.values([6, 2])}
     instruments = assurance.instruments

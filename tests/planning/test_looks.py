@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import replace
 
 import numpy as np
@@ -10,7 +11,7 @@ from support.coarse_planning import ROUNDING
 
 from tvsbayes.planning.candidates import Positions
 from tvsbayes.planning.drawn_rigs import draw_instruments
-from tvsbayes.planning.expectation import HOME_VARIANCE_RAD2, PARAMETERS, information_of
+from tvsbayes.planning.expectation import HOME_VARIANCE_RAD2, PARAMETERS, information_of, plan_minutes
 from tvsbayes.planning.looks import (
     CONTRAST_COLUMNS,
     LookArrays,
@@ -68,6 +69,25 @@ def test_every_look_is_reached_from_its_side(found, knowledge):
             assert (last * found.looks.side[look] >= found.overshoot).all()
             row += 1
     assert row == len(found.looks)
+
+
+@pytest.mark.parametrize("home", [(0, 0), (120, -40)])
+def test_an_arranged_plan_travels_and_costs_what_its_steps_do(knowledge, found, home):
+    """Step by step; with a look that is taken twice running, and one where the homing ends."""
+    picks = np.random.default_rng(2).integers(0, len(found.looks), 30)
+    looks = found.looks[np.concatenate([picks, picks[:1]])]
+    looks.steps[5], looks.side[5], looks.sheet[5] = home, (1, 1), 0
+    arranged = arrange(looks, knowledge.sheets, found.overshoot, home)
+    at, far, travelled = np.array(home), np.zeros(2, dtype=int), []
+    for step in arranged.steps[1:]:
+        if step.action == "move":
+            goal = np.array([step.pan_steps, step.tilt_steps])
+            at, far = goal, far + np.abs(goal - at)
+        elif step.action == "look":
+            travelled.append(far)
+    assert np.array_equal(arranged.path[arranged.order], travelled)
+    assert arranged.actions == Counter(step.action for step in arranged.steps)
+    assert arranged.minutes(knowledge.rig) == pytest.approx(plan_minutes(arranged.steps, knowledge.rig), rel=1e-12)
 
 
 def test_looks_taken_again_count_as_often_as_they_are_taken():

@@ -53,8 +53,8 @@ def believed(
         Shape (n, p).
     """
     z, u = instruments.z.copy(), np.asarray(knowledge.space.u)
-    slope, in_view, side = seen.slope[:, chosen], seen.seen[:, chosen], side[chosen]
-    looks = np.maximum(in_view.sum(axis=1), 1)
+    taken = seen.seen * np.bincount(chosen, minlength=len(side))
+    looks = np.maximum(taken.sum(axis=1), 1)
     rig_columns = ~NOISE_COLUMNS & (np.arange(PARAMETERS) < len(RIG_NAMES))
     precision = np.diag(knowledge.precision)
     variance = np.diagonal(covariance, axis1=-2, axis2=-1)
@@ -68,12 +68,13 @@ def believed(
         z[:, column] = mean / (before + information)
 
     for axis in range(2):
-        known = np.sum(slope[..., axis] ** 2, axis=2) * in_view
+        known = np.sum(seen.slope[..., axis] ** 2, axis=2)
         for which, sign in enumerate((-1, 1)):
             column = STOP_COLUMNS[axis, which]
-            share = known[:, side[:, axis] == sign] * np.radians(instruments.physical[:, column, None]) ** 2
+            share = known * np.radians(instruments.physical[:, column, None]) ** 2
             share = share / (1 + share)
-            estimate(column, 2 * np.sum(share**2, axis=1), noise[:, 2 * axis + which])
+            stops = taken * (side[:, axis] == sign)
+            estimate(column, 2 * np.sum(stops * share**2, axis=1), noise[:, 2 * axis + which])
     estimate(PIXEL_COLUMN, 2.0 * looks, noise[:, 4])
     return z
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 
@@ -23,28 +22,31 @@ class Instruments:
     Attributes:
         z: coordinates, shape (n, p).
         value: of their spaces, shape (n, rig): what the priors hold fixed is held at its true value.
+        physical: values in the units of `NAMES`, shape (n, p).
         common: the rest of their spaces.
     """
 
     z: np.ndarray
     value: np.ndarray
+    physical: np.ndarray
     common: ParameterSpace
+
+    @classmethod
+    def at(cls, z: np.ndarray, value: np.ndarray, common: ParameterSpace) -> Instruments:
+        """Points with coordinates (n, p) in spaces that differ by `value` (n, rig)."""
+        bare = cls(z, value, np.empty_like(z), common)
+        physical = [physical_at(point, bare.space_of(row)).value for row, point in enumerate(z)]
+        return replace(bare, physical=np.array(physical).reshape(z.shape))
 
     def __len__(self) -> int:
         return len(self.z)
 
     def __getitem__(self, chosen: np.ndarray) -> Instruments:
-        return Instruments(self.z[chosen], self.value[chosen], self.common)
+        return Instruments(self.z[chosen], self.value[chosen], self.physical[chosen], self.common)
 
     def space_of(self, row: int) -> ParameterSpace:
         """The space in which one of them has its coordinates."""
         return replace(self.common, value=placed(self.value[row]))
-
-    @cached_property
-    def physical(self) -> np.ndarray:
-        """Values in the units of `NAMES`, shape (n, p)."""
-        every = [physical_at(z, self.space_of(row)).value for row, z in enumerate(self.z)]
-        return np.array(every).reshape(-1, PARAMETERS)
 
 
 def instruments_in(knowledge: Knowledge, truths: Sequence[Truth]) -> Instruments:
@@ -54,7 +56,7 @@ def instruments_in(knowledge: Knowledge, truths: Sequence[Truth]) -> Instruments
     cameras = np.array([truth.stereo.vector for truth in truths]).reshape(len(true), -1)
     # A half-normal with u = 0 is 0 whatever its value; nothing else can be stated for it.
     held = np.where(np.asarray(space.u) > 0, np.asarray(space.value), true)
-    return Instruments(coordinates_of(space, np.concatenate([true, cameras], axis=1)), held, space)
+    return Instruments.at(coordinates_of(space, np.concatenate([true, cameras], axis=1)), held, space)
 
 
 def draws_of(knowledge: Knowledge, count: int, generator: np.random.Generator) -> np.ndarray:
@@ -69,5 +71,5 @@ def draw_instruments(knowledge: Knowledge, count: int, seed: int) -> Instruments
     if knowledge.after_data:
         z = draws_of(knowledge, count, generator)
         value = np.asarray(knowledge.space.value)
-        return Instruments(z, np.broadcast_to(value, (count, len(value))), knowledge.space)
+        return Instruments.at(z, np.broadcast_to(value, (count, len(value))), knowledge.space)
     return instruments_in(knowledge, [draw_truth(knowledge.rig, generator) for _ in range(count)])

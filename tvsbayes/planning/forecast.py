@@ -50,7 +50,7 @@ def classic_forecast(knowledge: Knowledge, instruments: Instruments) -> ClassicF
         return None
     near, far = knowledge.sheets[0], knowledge.sheets[1]
     plan = four_point_protocol(2, targets=(near, far))
-    sds, errors = [], []
+    pixels, steps, axes, effective, stops, spot_sds = [], [], [], [], [], []
     first = None
     for physical in instruments.physical[:CLASSIC_DRAWS]:
         parameters = dict(zip(NAMES, map(float, physical), strict=True))
@@ -63,22 +63,24 @@ def classic_forecast(knowledge: Knowledge, instruments: Instruments) -> ClassicF
         pose = run.truth.reference_pose_deg
         if len(later) < len(DIRECTIONS) or pose is None:
             continue
-        steps = selection.steps[later]
-        found = ratio_slopes(selection.pixels[later], steps, selection.axis[later], rig.stereo)
-        effective = effective_deg_per_step(with_derived(parameters), pose)
-        true = np.array([effective[d] for d in DIRECTIONS])
-        stops = np.array([parameters[f"stop_sd_deg.{d}"] ** 2 for d in DIRECTIONS])
-        pair = stops + stops[[1, 0, 3, 2]]
-        spot_sd = rig.spot_sd_px * parameters["pixel_scale"]
-        variance = np.sum(found.by_pixel**2, axis=(1, 2)) * spot_sd**2 + pair * (found.ratio / true / steps) ** 2
-        sds.append(np.sqrt(variance))
-        errors.append(found.ratio - true)
+        pixels.append(selection.pixels[later])
+        steps.append(selection.steps[later])
+        axes.append(selection.axis[later])
+        true = effective_deg_per_step(with_derived(parameters), pose)
+        effective.append([true[d] for d in DIRECTIONS])
+        stops.append([parameters[f"stop_sd_deg.{d}"] ** 2 for d in DIRECTIONS])
+        spot_sds.append([rig.spot_sd_px * parameters["pixel_scale"]])
         first = run.campaign if first is None else first
     if first is None:
         return None
+    found = ratio_slopes(np.concatenate(pixels), np.concatenate(steps), np.concatenate(axes), rig.stereo)
+    ratio = found.ratio.reshape(-1, len(DIRECTIONS))
+    by_pixel = np.sum(found.by_pixel**2, axis=(1, 2)).reshape(ratio.shape)
+    pair = np.array(stops) + np.array(stops)[:, [1, 0, 3, 2]]
+    variance = by_pixel * np.array(spot_sds) ** 2 + pair * (ratio / np.array(effective) / np.array(steps)) ** 2
     # Every direction has its experiments, else the draw was left out.
     stereo_u = np.array([r.u_stereo_deg_per_step for r in classic(first).directions.values() if r is not None])
-    return ClassicForecast(np.array(sds), np.array(errors), stereo_u)
+    return ClassicForecast(np.sqrt(variance), ratio - np.array(effective), stereo_u)
 
 
 def classic_count(sd: float, half_width: float) -> int:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
+from functools import cached_property
 
 import equinox as eqx
 import jax
@@ -18,7 +19,8 @@ from jaxtyping import Array, Bool, Float
 
 from tvsbayes.estimators.campaign_arrays import CampaignArrays, SpotArrays
 from tvsbayes.instrument.parameters import INDEX
-from tvsbayes.instrument.plan import PlanBuilder, PlanStep
+from tvsbayes.instrument.plan import PlanBuilder, PlanStep, action_seconds
+from tvsbayes.instrument.rig import Rig
 from tvsbayes.model.compiled import compiled, placed
 from tvsbayes.model.laser_path import MoveArrays
 from tvsbayes.model.parameter_space import ParameterSpace
@@ -48,21 +50,63 @@ class Looks:
 
 @dataclass(frozen=True)
 class Arranged:
-    """Looks in the order of a plan.
+    """Looks in the order of a plan: each sheet placed once, side by side, every look with a run-up where it needs one.
 
     Attributes:
-        steps: the plan.
         order: look at each place of the plan, shape (m,).
-        path: steps travelled per axis since homing when each look (in the caller's order) is taken, shape (m, 2).
+        sheet: name of the sheet at each place.
+        via: counters from which each place is reached: where its run-up begins, or where the one before ended; (m, 2).
+        goal: counters of each place, shape (m, 2).
+        home: counters of the homing.
     """
 
-    steps: tuple[PlanStep, ...]
     order: np.ndarray
-    path: np.ndarray
+    sheet: tuple[str, ...]
+    via: np.ndarray
+    goal: np.ndarray
+    home: tuple[int, int]
+
+    @cached_property
+    def _legs(self) -> np.ndarray:
+        """Steps to the start of every run-up and from there to the look, shape (m, 2, 2)."""
+        ends = np.stack([self.via, self.goal], axis=1).reshape(-1, 2)
+        return np.diff(ends, axis=0, prepend=[self.home]).reshape(-1, 2, 2)
+
+    @property
+    def path(self) -> np.ndarray:
+        """Steps travelled per axis since homing when each look (in the caller's order) is taken, shape (m, 2)."""
+        path = np.empty_like(self.goal)
+        path[self.order] = np.cumsum(np.abs(self._legs).sum(axis=1), axis=0)
+        return path
+
+    @property
+    def actions(self) -> dict[str, int]:
+        """How many of each kind the plan has."""
+        moves, looks = int(self._legs.any(axis=2).sum()), len(self.order)
+        places = sum(now != before for now, before in zip(self.sheet, ("", *self.sheet[:-1]), strict=True))
+        return {"home": 1, "place": places, "move": moves, "look": looks}
+
+    def minutes(self, rig: Rig) -> float:
+        """Duration by `[costs]`."""
+        return action_seconds(rig, self.actions) / 60
+
+    @cached_property
+    def steps(self) -> tuple[PlanStep, ...]:
+        """The plan."""
+        plan, placed = PlanBuilder(), ""
+        plan.home(*self.home)
+        for sheet, via, goal in zip(self.sheet, self.via.tolist(), self.goal.tolist(), strict=True):
+            if sheet != placed:
+                placed = sheet
+                plan.place(placed)
+            plan.move(*via)
+            plan.move(*goal)
+            plan.look()
+        return tuple(plan.steps)
 
 
 def arrange(looks: Looks, sheets: Sequence[str], overshoot: np.ndarray, home: tuple[int, int] = (0, 0)) -> Arranged:
-    """Order looks into a plan: each sheet placed once, side by side, every look with a run-up where it needs one.
+    """Order looks into a plan.
 
     Args:
         looks: what is to be seen.
@@ -70,22 +114,11 @@ def arrange(looks: Looks, sheets: Sequence[str], overshoot: np.ndarray, home: tu
         overshoot: run-up (pan, tilt) in steps that takes up all play, shape (2,).
         home: counters of the homing.
     """
-    plan = PlanBuilder()
-    plan.home(*home)
     order = np.lexsort((looks.steps[:, 0] * looks.side[:, 0], looks.side[:, 0], looks.side[:, 1], looks.sheet))
-    path = np.zeros((len(looks), 2), dtype=int)
-    placed = -1
-    for look in order:
-        if looks.sheet[look] != placed:
-            placed = int(looks.sheet[look])
-            plan.place(sheets[placed])
-        goal, side = looks.steps[look], looks.side[look]
-        run_up = (goal - plan.at) * side < overshoot
-        plan.move(*np.where(run_up, goal - side * overshoot, plan.at).tolist())
-        plan.move(*goal.tolist())
-        path[look] = plan.travelled
-        plan.look()
-    return Arranged(tuple(plan.steps), order, path)
+    goal, side = looks.steps[order], looks.side[order]
+    before = np.concatenate([np.array([home]), goal])[:-1]
+    via = np.where((goal - before) * side < overshoot, goal - side * overshoot, before)
+    return Arranged(order, tuple(sheets[number] for number in looks.sheet[order]), via, goal, home)
 
 
 @dataclass(frozen=True)

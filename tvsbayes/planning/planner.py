@@ -28,7 +28,6 @@ from tvsbayes.planning.expectation import (
     PlanInformation,
     information_of,
     knowledge_of,
-    plan_minutes,
     prior_knowledge,
 )
 from tvsbayes.planning.forecast import (
@@ -286,7 +285,7 @@ def _question(knowledge: Knowledge, target: Target, pose_rad: np.ndarray | None,
 
 def _durations(family: Family, scope: Scope) -> dict[int, float]:
     """Minutes of every number of experiments that the time allows."""
-    durations = {n: plan_minutes(family.arranged(n).steps, family.knowledge.rig) for n in range(1, scope.largest + 1)}
+    durations = {n: family.arranged(n).minutes(family.knowledge.rig) for n in range(1, scope.largest + 1)}
     allowed = {n: minutes for n, minutes in durations.items() if scope.minutes is None or minutes <= scope.minutes}
     if not allowed:
         raise InputError(

@@ -16,7 +16,7 @@ import numpy as np
 from tvsbayes.model.headlines import QUANTITIES, headlines
 from tvsbayes.planning.assurance import Assurance, Family
 from tvsbayes.planning.candidates import Candidates
-from tvsbayes.planning.expectation import HOME_VARIANCE_RAD2, LOOKS_PER_EXPERIMENT, PARAMETERS, Knowledge, plan_minutes
+from tvsbayes.planning.expectation import HOME_VARIANCE_RAD2, LOOKS_PER_EXPERIMENT, PARAMETERS, Knowledge
 from tvsbayes.planning.looks import CONTRAST_COLUMNS, Seen, covariance_of, information_of_looks
 from tvsbayes.planning.target import Sensitivity, Target
 
@@ -248,7 +248,7 @@ def _reached(family: Family, seen: Seen, target: Target, at_centre: Sensitivity,
     knowledge, best = family.knowledge, _Reached()
     for n in (n for n in LADDER if n <= scope.largest):
         design = family.arranged(n)
-        duration = plan_minutes(design.steps, knowledge.rig)
+        duration = design.minutes(knowledge.rig)
         if scope.minutes is not None and duration > scope.minutes:
             break
         chosen = family.picks[: LOOKS_PER_EXPERIMENT * n]
@@ -324,7 +324,7 @@ def refine(
     search = search_designs(knowledge, seen, at_centre, scope.criterion)
     here = np.isin(found.looks.sheet, found.looks.sheet[picks])
     exchanged = replace(family, picks=np.array(search.among(here).exchange(picks.tolist())))
-    duration = plan_minutes(exchanged.arranged(experiments).steps, knowledge.rig)
+    duration = exchanged.arranged(experiments).minutes(knowledge.rig)
     if scope.minutes is not None and duration > scope.minutes:
         return plain
     other = Refined(exchanged, assurance.of(exchanged).values([experiments])[experiments])

@@ -54,6 +54,14 @@ FAULTS = (
         ("planning/looks::test_looks_taken_again_count_as_often_as_they_are_taken",),
     ),
     Fault(
+        "path of a plan without its run-ups",
+        "planning/looks.py",
+        "np.cumsum(np.abs(self._legs).sum(axis=1), axis=0)",
+        "np.cumsum(np.abs(self._legs.sum(axis=1)), axis=0)",
+        "contrasts seem known worse than they are",
+        ("planning/looks::test_an_arranged_plan_travels_and_costs_what_its_steps_do",),
+    ),
+    Fault(
         "instruments in the order of looks",
         "planning/looks.py",
         "instrument, look = pair // m, pair % m",
@@ -185,8 +193,8 @@ FAULTS = (
     Fault(
         "classic forecast: one stop of two",
         "planning/forecast.py",
-        "pair = stops + stops[[1, 0, 3, 2]]",
-        "pair = stops",
+        "pair = np.array(stops) + np.array(stops)[:, [1, 0, 3, 2]]",
+        "pair = np.array(stops)",
         "the classic method looks better than it is",
         ("planning/forecast::test_the_classics_forecast_is_what_its_experiments_do",),
         survived="planted by a reviewer: the classic's curve was asked to fall, not to be right.",
@@ -194,8 +202,8 @@ FAULTS = (
     Fault(
         "classic forecast: systematic error with the wrong sign",
         "planning/forecast.py",
-        "errors.append(found.ratio - true)",
-        "errors.append(true - found.ratio)",
+        "ratio - np.array(effective), stereo_u)",
+        "np.array(effective) - ratio, stereo_u)",
         "a correction goes the wrong way",
         ("planning/forecast::test_the_classics_forecast_is_what_its_experiments_do",),
         survived="planted by a reviewer: no test read the classic's answer.",
