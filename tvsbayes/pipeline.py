@@ -24,8 +24,8 @@ if TYPE_CHECKING:
     from tvsbayes.calibration.pointing import Calibration
     from tvsbayes.estimators.joint_fit import JointFit
     from tvsbayes.instrument.campaign import Campaign
+    from tvsbayes.posterior.chain import Progress
     from tvsbayes.posterior.draws import Posterior
-    from tvsbayes.posterior.sampling import Progress
     from tvsbayes.results.estimates import FitSummary
     from tvsbayes.results.fit_record import FitEvidence, FitRecord
     from tvsbayes.results.stored_draws import ResultDraws
@@ -62,10 +62,11 @@ def compile_for(tell: Tell) -> None:
 def unusable(summary: FitSummary) -> TvsError | None:
     """Why a fit that ran to its end must not be used: not converged (4) or nothing learned (3)."""
     if not summary.converged and summary.sampling is not None and not summary.sampling.converged:
+        chain = summary.sampling.steps is not None
         return NotConverged(
             "unconverged",
             "UNCONVERGED: " + "; ".join(summary.sampling.missing) + ". The table is the Laplace approximation",
-            remedy="run again with --resume and more --max-minutes",
+            remedy="run again with --resume and more --max-minutes" if chain else "run again without --quick",
         )
     if not summary.converged:
         return NotConverged.of(
@@ -110,11 +111,13 @@ def calibrate(
     *,
     model: ModelChoice = AS_STATED,
     sampled: bool = True,
+    tier: str = "emcee",
     max_minutes: float = 10.0,
     resume: bool = False,
     seed: int = 0,
     tell: Tell = untold,
     watch: Watch = _unwatched,
+    first: Callable[[FitSummary], None] | None = None,
 ) -> CampaignResults:
     """Fit a campaign, sample its posterior, and make complete results of both, as the command `fit` does.
 
@@ -124,11 +127,14 @@ def calibrate(
             commands this is `results` in the campaign's folder.
         model: what is asked for beyond the rig's priors.
         sampled: sample the posterior; else the Laplace approximation stands alone.
+        tier: "importance" for weighted draws alone, seconds, which write no `posterior.nc` and no `chain.npz`; "emcee"
+            for the chain that must agree with them.
         max_minutes: time for sampling.
         resume: go on with the chain in the folder.
         seed: of everything random.
         tell: shows what takes long.
         watch: opens what shows the sampler's progress.
+        first: shows what importance sampling says before a chain starts.
 
     Raises:
         InputError: as `fit` and `sample`, or the folder cannot be written.
@@ -145,14 +151,25 @@ def calibrate(
     if sampled and unusable(summarise(found)) is None:
         from tvsbayes.posterior.sampling import sample
 
-        checkpoint = None if place is None else place / "chain.npz"
         if place is not None:
             make_folder(place)
-        with watch() as progress:
-            posterior = sample(
-                found, max_minutes=max_minutes, seed=seed, checkpoint=checkpoint, resume=resume, progress=progress
-            )
-        files = _posterior_files(posterior, place, tell)
+        if tier == "importance":
+            posterior = sample(found, tier, seed=seed)
+        else:
+            show = None if first is None else lambda early: first(summarise(found, early))
+            checkpoint = None if place is None else place / "chain.npz"
+            with watch() as progress:
+                posterior = sample(
+                    found,
+                    tier,
+                    max_minutes=max_minutes,
+                    seed=seed,
+                    checkpoint=checkpoint,
+                    resume=resume,
+                    progress=progress,
+                    first=show,
+                )
+            files = _posterior_files(posterior, place, tell)
     if place is not None and "posterior" not in files and (stale := place / "posterior.nc").exists():
         stale.unlink()
         tell("posterior.nc of an earlier fit is removed: it would not be that of fit.json")

@@ -13,10 +13,11 @@ import numpy as np
 from experiments.common.rigs import numbered
 from tvsbayes.instrument.plan import PlanStep
 from tvsbayes.instrument.protocols import OVERSHOOT_STEPS
-from tvsbayes.planning.candidates import Candidates, LookArrays, candidates, covariance_of
+from tvsbayes.planning.assurance import Family
+from tvsbayes.planning.candidates import Candidates, candidates
 from tvsbayes.planning.expectation import Knowledge, information_of
-from tvsbayes.planning.forecast import Family
 from tvsbayes.planning.limits import MANY, split_of
+from tvsbayes.planning.looks import LookArrays, covariance_of
 from tvsbayes.planning.search import Scope, design_family
 from tvsbayes.planning.target import DEFAULT_TARGET, parse_target, sensitivity
 

@@ -9,12 +9,10 @@ from __future__ import annotations
 from contextlib import suppress
 from dataclasses import dataclass, field
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from scipy import stats
 
-from tvsbayes.coordinates.beam_meeting import meeting
+from tvsbayes.calibration.optics import Components, range_components
 from tvsbayes.coordinates.error_map import simple_calibration, simple_rays
 from tvsbayes.errors import NothingToEstimate
 from tvsbayes.estimators.four_point import ClassicResult, classic
@@ -82,14 +80,12 @@ class TrueLooks:
             estimates["classic"] = classic(campaign)
         for name, estimate in estimates.items():
             simple = simple_calibration(campaign.rig.priors, estimate)
-            with jax.enable_x64(True):
-                rays = simple_rays(simple, self.counters_steps)
-                base = jnp.asarray(2 * (simple.baseline_mm - simple.origin_y_mm))
-                azimuth = jnp.asarray(campaign.rig.aperture_convention == "azimuth")
-                readings_rad = jnp.radians(jnp.asarray(self.readings))
-                met = meeting(rays.origin_mm, rays.direction, base, readings_rad, azimuth)
-            found = np.where(np.asarray(met.meets)[:, None], np.asarray(met.xyz_mm).T, np.nan)
-            result[name] = found - self.points_mm
+            rays = simple_rays(simple, self.counters_steps)
+            base = 2 * (simple.baseline_mm - simple.origin_y_mm)
+            azimuth = campaign.rig.aperture_convention == "azimuth"
+            beam = Components(tuple(rays.origin_mm), tuple(rays.direction))
+            reach = np.asarray(range_components(*beam, base, np.array(self.readings), azimuth))
+            result[name] = beam.at(np.where((reach > 0) & np.isfinite(reach), reach, np.nan)).T - self.points_mm
         return result
 
 

@@ -38,9 +38,9 @@ from tvsbayes.instrument.plan import PlanStep
 from tvsbayes.instrument.protocols import grid_protocol, mixed_protocol, paper_protocol
 from tvsbayes.instrument.rig import Rig
 from tvsbayes.model.compiled import use_compilation_cache
+from tvsbayes.planning.assurance import Family
 from tvsbayes.planning.candidates import candidates
 from tvsbayes.planning.expectation import Knowledge, prior_knowledge
-from tvsbayes.planning.forecast import Family
 from tvsbayes.planning.search import LADDER
 from tvsbayes.planning.target import DEFAULT_TARGET, parse_target
 from tvsbayes.report.figures import BLUE, GREEN, ORANGE, PURPLE, RED, STYLE, WIDTH_IN

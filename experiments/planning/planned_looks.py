@@ -25,10 +25,11 @@ from experiments.common.worth import UNREACHED, searched_family
 from tvsbayes.instrument.plan import PlanStep
 from tvsbayes.instrument.protocols import grid_protocol, mixed_protocol, paper_protocol
 from tvsbayes.model.compiled import use_compilation_cache
-from tvsbayes.planning.candidates import LookArrays, candidates, covariance_of
+from tvsbayes.planning.assurance import Family
+from tvsbayes.planning.candidates import candidates
 from tvsbayes.planning.expectation import Knowledge, PlanInformation, information_of, prior_knowledge
-from tvsbayes.planning.forecast import Family
 from tvsbayes.planning.limits import MANY, limit_of, split_of
+from tvsbayes.planning.looks import LookArrays, covariance_of
 from tvsbayes.planning.search import LADDER, Scope, design_family
 from tvsbayes.planning.target import DEFAULT_TARGET, Sensitivity, parse_target, sensitivity
 

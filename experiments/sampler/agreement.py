@@ -27,8 +27,8 @@ from tvsbayes.instrument.campaign import input_hashes
 from tvsbayes.instrument.parameters import NAMES
 from tvsbayes.model.compiled import use_compilation_cache
 from tvsbayes.posterior.draws import Posterior
-from tvsbayes.posterior.proposal import Target, pilot
-from tvsbayes.posterior.ridges import transport
+from tvsbayes.posterior.ensemble import WALKERS
+from tvsbayes.posterior.importance import importance_run
 from tvsbayes.posterior.sampling import sample
 from tvsbayes.results.records import plain
 
@@ -71,8 +71,8 @@ def main() -> None:
             raise SystemExit(f"the reference of the {name} twin was made from other data: run nuts_reference.py")
         joint = fit(campaign)
         with jax.enable_x64(True):
-            path = transport(joint)
-            start = pilot(Target(joint, path), 0).start
+            run = importance_run(joint, 0)
+            path, start = run.path, run.starts(WALKERS)
         wall, cpu = time.perf_counter(), time.process_time()
         posterior = sample(joint, seed=0, max_minutes=10.0)
         wall, cpu = time.perf_counter() - wall, time.process_time() - cpu

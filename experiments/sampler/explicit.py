@@ -26,10 +26,12 @@ from experiments.common.reference_samplers import AXES
 from experiments.common.rigs import mounted_rig, numbered
 from tvsbayes.estimators.campaign_arrays import campaign_arrays
 from tvsbayes.estimators.joint_fit import JointFit, fit
-from tvsbayes.estimators.likelihood import nearest_range, observe, stop_variances
+from tvsbayes.estimators.likelihood import stop_variances
+from tvsbayes.estimators.looks import nearest_range, observe
 from tvsbayes.instrument.campaign import Campaign
 from tvsbayes.instrument.parameters import NAMES, Prior
-from tvsbayes.model.laser_path import mirror_angles
+from tvsbayes.model.geometry import Vectors
+from tvsbayes.model.laser_path import mirror_angles, trace
 from tvsbayes.model.parameter_space import parameter_space
 from tvsbayes.posterior.sampling import sample
 from tvsbayes.twin.simulated_campaign import simulate
@@ -69,7 +71,8 @@ def explicit_density(campaign: Campaign, joint: JointFit):
     free = np.flatnonzero(joint.free)
     mode = joint.space.model(jnp.asarray(joint.z))
     at_mode = mirror_angles(mode.transmission, mode.tilt_zero_rad, arrays.moves).angle_rad[spots.move_index].T
-    middle = nearest_range(mode, *at_mode, spots.triangulated_mm.T)
+    triangulated = Vectors.of(spots.triangulated_mm.T)
+    middle = nearest_range(mode.extrinsics, trace(mode.optics, *at_mode), triangulated)
 
     variance_at_mode = stop_variances(mode.noise.stop_sd_rad, spots)
     sizes = {"z": len(free), "pan": len(drawn_at[0]), "tilt": len(drawn_at[1]), "range_mm": count}

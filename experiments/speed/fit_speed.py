@@ -30,8 +30,8 @@ from experiments.common.command_line import parser
 from experiments.common.rigs import mounted_rig, twin_campaign
 from experiments.common.rows import ROOT
 from experiments.speed.last_stage import last_stage
+from tvsbayes.estimators.annealed_stage import STAGE_STEPS
 from tvsbayes.estimators.joint_fit import fit
-from tvsbayes.estimators.mode_search import STAGE_STEPS
 from tvsbayes.files.disk import shipped_data
 from tvsbayes.instrument.campaign import read_campaign, write_campaign
 from tvsbayes.instrument.protocols import mixed_protocol

@@ -14,24 +14,40 @@ import jax.numpy as jnp
 import numpy as np
 from scipy import optimize
 
-from tvsbayes.estimators.likelihood import innovations
-from tvsbayes.estimators.mode_search import Fixed, Problem, stage_residuals
+from tvsbayes.estimators.annealed_stage import Fixed, innovations, stage
+from tvsbayes.estimators.likelihood import innovations as exact_innovations
+from tvsbayes.estimators.linear_spots import linearise
+from tvsbayes.estimators.mode_search import Problem
 from tvsbayes.instrument.campaign import Campaign, ordered_spots
 from tvsbayes.instrument.parameters import NAMES
-from tvsbayes.statistics.least_squares import levenberg_marquardt, residuals_and_jacobian
+from tvsbayes.statistics.least_squares import LinearResidual, levenberg_marquardt, linear_residual
 
 PEER_TOLERANCE = 1e-6
 ANNEALING = (60.0, 10.0, 2.0)
 """Inflations of the stages before."""
-Residuals = Callable[..., jax.Array]
+Linear = Callable[..., LinearResidual]
 
 
-def exact_residuals(z, args):
-    """`stage_residuals` whose derivative holds nothing fixed."""
+def exact_values(z, args):
+    """Standardised innovations and prior residuals."""
     space, arrays, fixed = args
     full = jnp.where(fixed.held, fixed.value, z)
-    errors = innovations(space.model(full), arrays, fixed.inflation, frozen=False).standardised
+    errors = exact_innovations(space.model(full), arrays).standardised
     return jnp.concatenate([errors.ravel(), jnp.where(fixed.held, z - fixed.value, z)])
+
+
+def exact_residuals(z, args) -> LinearResidual:
+    """With the Jacobian that holds nothing fixed."""
+    return linear_residual(exact_values, z, args)
+
+
+def stage_residuals(z, args) -> LinearResidual:
+    """With the Jacobian of the fit's stage, which holds slopes and projections."""
+    space, arrays, fixed = args
+    columns = innovations(linearise(jnp.where(fixed.held, fixed.value, z), space, arrays), arrays)
+    prior = jnp.where(fixed.held, z - fixed.value, z)
+    jacobian = jnp.where(fixed.held, 0.0, columns[:, 1:])
+    return LinearResidual(jnp.append(columns[:, 0], prior), jnp.concatenate([jacobian, jnp.eye(z.size)]))
 
 
 @dataclass
@@ -52,24 +68,30 @@ class LastStage:
 
     def __post_init__(self) -> None:
         """Both kinds of residuals have the same values."""
-        self._values = jax.jit(lambda z: stage_residuals(z, self.args))
+        self._linear = {
+            kind: jax.jit(lambda z, kind=kind: kind(z, self.args)) for kind in (stage_residuals, exact_residuals)
+        }
+        self._values = jax.jit(lambda z: exact_values(z, self.args))
 
     def residuals(self, z: np.ndarray) -> np.ndarray:
         """Values."""
         self.calls["residuals"] += 1
         return np.asarray(self._values(jnp.asarray(z)))
 
-    def jacobian(self, z: np.ndarray, kind: Residuals = stage_residuals) -> np.ndarray:
+    def jacobian(self, z: np.ndarray, kind: Linear = stage_residuals) -> np.ndarray:
         """Derivative, with slopes and projection held fixed or not."""
         self.calls["Jacobians"] += 1
-        return np.asarray(residuals_and_jacobian(kind, jnp.asarray(z), self.args).jacobian)
+        return np.asarray(self._linear[kind](jnp.asarray(z)).jacobian)
 
-    def ours(self, tolerance: float, steps: int, kind: Residuals = stage_residuals) -> np.ndarray:
-        """Where our solver ends."""
-        limit = jnp.asarray(tolerance)
-        return np.asarray(levenberg_marquardt(kind, jnp.asarray(self.start), self.args, limit, steps))
+    def ours(self, tolerance: float, steps: int, kind: Linear = stage_residuals) -> np.ndarray:
+        """Where our solver ends: the compiled stage, or Levenberg-Marquardt with the exact Jacobian."""
+        if kind is stage_residuals:
+            return np.asarray(stage(self.start, *self.args, np.array(tolerance)).z)
+        return np.asarray(
+            levenberg_marquardt(exact_values, jnp.asarray(self.start), self.args, jnp.asarray(tolerance), steps)
+        )
 
-    def peer(self, method: str, differences: bool = False, kind: Residuals = stage_residuals) -> np.ndarray:
+    def peer(self, method: str, differences: bool = False, kind: Linear = stage_residuals) -> np.ndarray:
         """Where `scipy.optimize.least_squares` ends, with the same Jacobian or with finite differences."""
         options = {"method": method, "xtol": PEER_TOLERANCE, "ftol": PEER_TOLERANCE, "gtol": PEER_TOLERANCE}
         jac = "2-point" if differences else lambda z: self.jacobian(z, kind)
@@ -84,5 +106,5 @@ def last_stage(campaign: Campaign) -> LastStage:
     compiling_s = time.process_time() - begun
     for inflation in ANNEALING[1:]:
         start = problem.least_squares(start, inflation)
-    args = problem.space, problem.arrays, Fixed(jnp.asarray(problem.held), jnp.asarray(start), jnp.asarray(1.0))
+    args = problem.space, problem.arrays, Fixed(problem.held, start, np.array(1.0))
     return LastStage(start, args, compiling_s, {"residuals": 0, "Jacobians": 0})

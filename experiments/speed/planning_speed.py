@@ -22,7 +22,6 @@ from experiments.common.rigs import mounted_rig
 from tvsbayes.estimators.campaign_arrays import bucket
 from tvsbayes.instrument.protocols import grid_protocol, paper_protocol
 from tvsbayes.model.compiled import use_compilation_cache
-from tvsbayes.planning.candidates import LookArrays, Looks
 from tvsbayes.planning.expectation import (
     DESIGN_GROWTH,
     PARAMETERS,
@@ -31,6 +30,7 @@ from tvsbayes.planning.expectation import (
     information_of,
     prior_knowledge,
 )
+from tvsbayes.planning.looks import LookArrays, Looks
 from tvsbayes.planning.search import Search
 
 SIZES = (100, 1000, 10_000)

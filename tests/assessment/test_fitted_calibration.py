@@ -18,9 +18,8 @@ from tvsbayes.assessment.fitted_calibration import (
     calibration_of_draws,
 )
 from tvsbayes.calibration.pointing import INPUT_NAMES, NOISE_NAMES
-from tvsbayes.coordinates.beam_meeting import INPUT_COLUMNS
 from tvsbayes.instrument.campaign import input_hashes
-from tvsbayes.instrument.parameters import Prior
+from tvsbayes.instrument.parameters import INDEX, Prior
 
 ROUNDING = 1e-12
 """Of a hundred operations on numbers of order 1."""
@@ -81,4 +80,4 @@ def test_calibration_of_a_fit_brings_its_causes(mounted_rig):
     causes = causes_of(fit)
     assert (one.estimator, one.causes) == ("laplace", causes.names)
     np.testing.assert_array_equal(one.cause_covariance, causes.covariance)
-    np.testing.assert_array_equal(one.inputs, fit.draws.physical[:, INPUT_COLUMNS[: len(INPUT_NAMES)]])
+    np.testing.assert_array_equal(one.inputs, fit.draws.physical[:, [INDEX[name] for name in INPUT_NAMES]])

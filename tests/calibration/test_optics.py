@@ -8,20 +8,19 @@ from itertools import product
 import jax
 import numpy as np
 import pytest
-from support.bent_rig import (
-    AXES,
-    BENT,
-    twin_angle_deg,
-)
+from support.bent_rig import AXES, BENT, SD, twin_angle_deg, twin_ray_at
+from support.jax_meeting import meeting
+from support.published_equations import published_point
 from support.two_poses import PERIODS_DEG
 
-from tvsbayes.calibration.optics import beam_deg_per_step, output_deg, range_components
-from tvsbayes.coordinates.beam_meeting import meeting
-from tvsbayes.twin.physics import effective_deg_per_step
+from tvsbayes.calibration.optics import TO_RAD, beam_deg_per_step, output_deg, range_components
+from tvsbayes.twin.physics import aperture_angle_deg, effective_deg_per_step
 from tvsbayes.twin.simulated_campaign import with_derived
 
 ROUNDING = 1e-12
 """Of a hundred operations on numbers of order 1."""
+ROUNDING_MM = 1e-9
+"""Of a hundred operations on lengths up to 1000 mm, magnified tenfold by a grazing line of sight."""
 
 
 def test_transmission_error_is_that_of_wheel_or_pinion(wobbling):
@@ -70,3 +69,142 @@ def test_ratio_of_the_beam_is_the_twins():
         mean = 0.5 * sum(true[d] for d in pair)
         # Two central differences, with steps of 1e-3 deg and the twin's own.
         assert beam_deg_per_step(BENT, axis, pose) == pytest.approx(mean, rel=1e-6)
+
+
+A_MM = 200.0
+
+
+def bent_beams(count: int, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Origins (n, 3), directions (n, 3) by the twin, and points (n, 3) on them 100 to 1500 mm away."""
+    rng = np.random.default_rng(seed)
+    origins, directions = [], []
+    for pan, tilt in rng.uniform([-55.0, -35.0], [55.0, 35.0], (count, 2)):
+        values = {name: BENT[name] + rng.normal() * SD.get(name, SD.get(name.split(".")[0], 0)) for name in BENT}
+        values |= {"baseline_mm": A_MM, "mirror1_error_deg": rng.normal(), "laser_tilt_deg.x": rng.normal()}
+        origin, direction = twin_ray_at(values, pan, tilt)
+        origins.append(origin)
+        directions.append(direction)
+    o, d = np.array(origins), np.array(directions)
+    return o, d, o + rng.uniform(100.0, 1500.0, (count, 1)) * d
+
+
+def met(origin, direction, reading_deg, azimuth: bool):
+    """Points (n, 3), ranges (n,), and whether they meet."""
+    origin, direction = np.asarray(origin, float), np.asarray(direction, float)
+    range_mm = range_components(tuple(origin.T), tuple(direction.T), A_MM, np.asarray(reading_deg, float), azimuth)
+    meets = (range_mm > 0) & np.isfinite(range_mm)
+    with np.errstate(invalid="ignore"):
+        return origin + range_mm[:, None] * direction, range_mm, meets
+
+
+@pytest.mark.parametrize("azimuth", [False, True])
+def test_the_reading_of_a_point_leads_back_to_it(azimuth):
+    origin, direction, points = bent_beams(200, 3)
+    reading = aperture_angle_deg(points, A_MM, "azimuth" if azimuth else "in-plane")
+    assert (reading > 90).sum() > 20 and (reading < 90).sum() > 20
+    found, range_mm, meets = met(origin, direction, reading, azimuth)
+    assert meets.all()
+    # The reading's rounding of 2e-14 deg at up to r^2 / (a sin) = 200 mm per degree, and of the discriminant's root.
+    np.testing.assert_allclose(found, points, atol=1e-7)
+    np.testing.assert_allclose(range_mm, np.linalg.norm(points - origin, axis=1), atol=1e-7)
+
+
+@pytest.mark.parametrize("azimuth", [False, True])
+def test_a_right_angle_is_no_exception(azimuth):
+    """B = 90 deg exactly: the plane y = -a/2."""
+    origin, direction, _ = bent_beams(200, 4)
+    reach = (-A_MM / 2 - origin[:, 1]) / direction[:, 1]
+    ahead = (reach > 0) & (origin[:, 0] + reach * direction[:, 0] > 0)
+    points = origin + reach[:, None] * direction
+    found, _, meets = met(origin, direction, np.full(200, 90.0), azimuth)
+    assert ahead.sum() > 50
+    # cos(90 deg) is 6e-17, not 0: it decides about beams that run behind the positioner only.
+    np.testing.assert_array_equal(meets, ahead)
+    np.testing.assert_allclose(found[ahead], points[ahead], atol=ROUNDING_MM, rtol=1e-10)
+
+
+@pytest.mark.parametrize("azimuth", [False, True])
+@pytest.mark.parametrize("reading_deg", [40.0, 70.0, 90.0, 100.0])
+def test_meeting_has_the_derivative_of_central_differences(azimuth, reading_deg):
+    """With respect to origin, direction, baseline and reading, also where the square's leading term vanishes."""
+    # A beam with C = 60 deg: it meets all of these readings.
+    values = BENT | {"pan_zero_emission_deg": 60.0}
+    origin, direction = twin_ray_at(values, 1.0, 12.0)
+    inputs = np.concatenate([origin, direction, [A_MM, math.radians(reading_deg)]])
+
+    def point(x):
+        reach = range_components(
+            tuple(x[:3]), tuple(x[3:6]), x[6], np.degrees(x[7].real) + 1j * x[7].imag / TO_RAD, azimuth
+        )
+        return x[:3] + reach * x[3:6]
+
+    jacobian = point(inputs[:, None] + 1e-30j * np.eye(8)).imag / 1e-30
+    step = 1e-5 * np.array([100.0] * 3 + [1.0] * 3 + [100.0, 1.0])
+    for i in range(8):
+        moved = [point(inputs + s * step[i] * np.eye(8)[i] + 0j).real for s in (1, -1)]
+        slope = (moved[0] - moved[1]) / (2 * step[i])
+        # Truncation 1e-10 and rounding 1e-11 of points of 1000 mm over a step of 1e-5.
+        np.testing.assert_allclose(jacobian[:, i], slope, rtol=1e-6, atol=1e-6)
+
+
+def test_beams_from_the_baseline_give_the_published_point():
+    rng = np.random.default_rng(6)
+    B, C, beta = rng.uniform(20, 130, 200), rng.uniform(15, 120, 200), rng.uniform(-60, 60, 200)
+    C = np.minimum(C, 172.0 - B)
+    cr, br = np.radians(C), np.radians(beta)
+    direction = np.stack([np.sin(cr) * np.cos(br), -np.cos(cr), np.sin(cr) * np.sin(br)], axis=1)
+    origin = np.tile([0.0, A_MM / 2, 0.0], (200, 1))
+    found, _, meets = met(origin, direction, B, False)
+    assert meets.all()
+    np.testing.assert_allclose(found, published_point(B, C, beta, A_MM).T, atol=1e-7)
+
+
+def test_conventions_differ_by_the_documented_share():
+    """B = C = 80 deg, a = 200 mm: printed to 0.1 mm; 3.4 % in x at 15 deg."""
+    origin = np.array([[0.0, A_MM / 2, 0.0]])
+    for elevation, in_plane, azimuth in ((5.0, (565.0, 49.4), (567.1, 50.4)), (15.0, (547.8, 146.8), (567.1, 154.3))):
+        C, el = np.radians([80.0, elevation])
+        plane = np.array([[math.sin(C) * math.cos(el), -math.cos(C), math.sin(C) * math.sin(el)]])
+        level = np.array([[math.cos(el) * math.sin(C), -math.cos(el) * math.cos(C), math.sin(el)]])
+        one, two = met(origin, plane, [80.0], False)[0][0], met(origin, level, [80.0], True)[0][0]
+        assert one[[0, 2]] == pytest.approx(in_plane, abs=0.05)
+        assert two[[0, 2]] == pytest.approx(azimuth, abs=0.05)
+    assert one[0] / two[0] - 1 == pytest.approx(-0.034, abs=0.0005)
+
+
+def level_beam(C_deg: float) -> np.ndarray:
+    return np.array([math.sin(math.radians(C_deg)), -math.cos(math.radians(C_deg)), 0.0])
+
+
+@pytest.mark.parametrize("azimuth", [False, True])
+def test_beams_without_a_point_do_not_meet(azimuth):
+    origin = np.array([0.0, A_MM / 2, 0.0])
+    cases = {
+        "diverging": (origin, level_beam(85.0), 96.0),
+        "parallel to a micro-degree": (origin, level_beam(80.0), 100.000001),
+        "away from the aperture": (origin, level_beam(150.0), 60.0),
+        "far behind the aperture's side": (origin, level_beam(120.0), 120.0),
+    }
+    for name, case in cases.items():
+        assert not met(*(np.array([part]) for part in case), azimuth)[2][0], name
+    near = met(origin[None], level_beam(85.0)[None], [94.9], azimuth)
+    assert near[2][0] and near[0][0, 0] > 1e4, "the point before it diverges is far and exists"
+
+
+def test_a_beam_that_passes_beside_the_cone_does_not_meet():
+    """Straight up in front of the aperture at 100 mm, 300 mm to the side: never nearer to +y than 18 deg."""
+    nearest = math.degrees(math.atan2(100.0, 300.0))
+    origin = np.array([[100.0, -A_MM / 2 + 300.0, -900.0]])
+    up = np.array([[0.0, 0.0, 1.0]])
+    for reading, expected in ((nearest - 0.1, False), (nearest + 0.1, True)):
+        assert met(origin, up, [reading], False)[2][0] == expected
+    found = met(origin, up, [nearest + 0.1], False)[0]
+    assert aperture_angle_deg(found[0], A_MM, "in-plane") == pytest.approx(nearest + 0.1, abs=1e-9)
+
+
+def test_a_point_behind_the_scanner_is_no_azimuth():
+    """A beam that runs back meets the azimuth's line only on the far side of the aperture."""
+    origin = np.array([[0.0, A_MM / 2, 0.0]])
+    back = level_beam(60.0) * [-1.0, 1.0, 1.0]
+    assert not met(origin, back[None], [120.0], True)[2][0]
+    assert not met(origin, back[None], [60.0], True)[2][0]

@@ -6,7 +6,6 @@ import math
 from dataclasses import replace
 from itertools import product
 
-import jax
 import numpy as np
 import pytest
 from support.bent_rig import (
@@ -19,13 +18,13 @@ from support.bent_rig import (
     twin_points,
     twin_ray,
 )
+from support.jax_meeting import jax_carry, jax_law
 from support.printed_vector import LAST_6, LAST_9, LAST_12, VECTOR
 from support.refusals import refusal
 from support.two_poses import POSES
 
-from tvsbayes.calibration.pointing import DIVERGING_SHARE, INPUT_NAMES, NOISE_NAMES
-from tvsbayes.coordinates.beam_meeting import carry, sources
-from tvsbayes.coordinates.location import locate, locate_linear, settings_of
+from tvsbayes.calibration.pointing import DIVERGING_SHARE, INPUT_NAMES, NOISE_NAMES, drawn
+from tvsbayes.coordinates.location import carry, locate, locate_linear, settings_of
 from tvsbayes.errors import InputError
 from tvsbayes.statistics.intervals import NORMAL_95
 from tvsbayes.twin.physics import to_tvs
@@ -103,11 +102,16 @@ def test_locate_is_the_law_of_propagation_in_jax(rig, request):
     one = request.getfixturevalue(rig)
     asked = [(*pose, side) for pose in POSES for side in SIDES]
     pan, tilt, reading = np.array([a[:3] for a in asked]).T
-    law = locate_linear(one, settings_of(pan, tilt, reading, [a[3] for a in asked]))
+    settings = settings_of(pan, tilt, reading, [a[3] for a in asked])
+    law, numpy = jax_law(one, settings), locate_linear(one, settings)
+    varies = np.diag(one.covariance_with_noise) > 0
+    slopes = np.asarray(law.jacobian)[..., varies]
+    np.testing.assert_allclose(numpy.value, law.value, atol=ROUNDING_MM)
+    np.testing.assert_allclose(numpy.jacobian[..., varies], slopes, rtol=ROUNDING, atol=ROUNDING * np.abs(slopes).max())
     for i, (pan, tilt, reading, approach) in enumerate(asked):
         found = one.locate(pan, tilt, reading, approach)
         np.testing.assert_allclose(found.xyz_mm, law.value[i], atol=ROUNDING_MM)
-        scale = np.sqrt(np.outer(np.diag(law.covariance[i]), np.diag(law.covariance[i])))
+        scale = np.sqrt(np.outer(np.diag(numpy.covariance[i]), np.diag(numpy.covariance[i])))
         assert np.abs((found.covariance_mm2 - law.covariance[i]) / scale).max() < 100 * ROUNDING
         np.testing.assert_allclose(found.u95_mm, NORMAL_95 * np.sqrt(np.diag(found.covariance_mm2)), rtol=ROUNDING)
 
@@ -119,7 +123,7 @@ def test_derivatives_are_the_jacobian_of_jax(rig, request):
     varies = np.diag(one.covariance_with_noise) > 0
     assert varies.sum() >= 20
     for pose, side in product(POSES, SIDES):
-        expected = locate_linear(one, settings_of(*pose, side)).jacobian[0][:, varies]
+        expected = np.asarray(jax_law(one, settings_of(*pose, side)).jacobian)[0][:, varies]
         found = one.derivatives(*pose, side)[:, varies]
         np.testing.assert_allclose(found, expected, rtol=ROUNDING, atol=ROUNDING * np.abs(expected).max())
 
@@ -131,9 +135,9 @@ def test_numpy_and_jax_refuse_the_same_settings(azimuth):
     rng = np.random.default_rng(5)
     pan, tilt = rng.uniform(-3000, 3000, 256), rng.uniform(-900, 900, 256)
     reading = rng.uniform(0.5, 179.5, 256)
-    with jax.enable_x64(True):
-        found = carry(settings_of(pan, tilt, reading), sources(one, 1, 0))
-    meets = np.asarray(found.meets)[0]
+    settings, draws = settings_of(pan, tilt, reading), drawn(one, 1, 0)
+    meets = np.isfinite(jax_carry(one, draws, settings)).all(axis=-1)[0]
+    np.testing.assert_array_equal(carry(one, draws, settings).meets[0], meets)
     assert 30 < meets.sum() < 226
     codes = set()
     for i in range(256):
@@ -174,7 +178,7 @@ def test_points_that_too_many_draws_lose_are_refused_as_by_the_draws(bent):
     for name, sd in sds.items():
         inputs[:, INPUT_NAMES.index(name)] += sd * rng.standard_normal(count)
     noise = np.full((count, len(NOISE_NAMES)), 0.05)
-    drawn = replace(
+    many = replace(
         calibration(NOMINAL, {}, NO_NOISE_DEG),
         mean=inputs.mean(axis=0),
         covariance=np.cov(inputs, rowvar=False),
@@ -183,12 +187,12 @@ def test_points_that_too_many_draws_lose_are_refused_as_by_the_draws(bent):
         noise=noise,
     )
     for reading, meets in ((57.0, True), (59.0, True), (59.6, False), (59.9, False)):
-        share = locate(drawn, 500.0, 0.0, reading, draws=count).diverging_share[0]
+        share = locate(many, 500.0, 0.0, reading, draws=count).diverging_share[0]
         assert (share <= DIVERGING_SHARE) == meets, (reading, share)
         if meets:
-            assert np.isfinite(drawn.locate(500, 0, reading).u95_mm).all()
+            assert np.isfinite(many.locate(500, 0, reading).u95_mm).all()
         else:
-            assert refusal(lambda reading=reading: drawn.locate(500, 0, reading)).code == "diverging"
+            assert refusal(lambda reading=reading: many.locate(500, 0, reading)).code == "diverging"
 
 
 def test_unknown_approaches_are_refused(bent):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import jax
 import numpy as np
@@ -16,6 +15,7 @@ from tvsbayes.comparison.gap import BACKLASH, CHANCE, PROJECTION, STEREO_SCALE, 
 from tvsbayes.estimators.four_point import classic
 from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.instrument.axes import DIRECTIONS
+from tvsbayes.posterior.draws import Posterior
 from tvsbayes.results.comparison_record import Gap
 from tvsbayes.twin.simulated_campaign import Truth, read_truth
 
@@ -57,7 +57,9 @@ def test_terms_add_up_to_the_gap(paper_fit, paper_gaps):
 def test_terms_of_a_posterior_add_up_to_the_ratio_of_all_its_draws(paper_fit):
     """64 of 2048 draws carry the terms; the ratio's mean over all of them is a control variate."""
     chains = jax.tree.map(lambda x: x.reshape(2, -1, *x.shape[1:]), paper_fit.draws)
-    posterior = SimpleNamespace(z=paper_fit.draws_z.reshape(2, -1, paper_fit.draws_z.shape[1]), draws=chains)
+    z = paper_fit.draws_z.reshape(2, -1, paper_fit.draws_z.shape[1])
+    weights = np.full(z.shape[:2], 1 / len(paper_fit.draws_z))
+    posterior = Posterior(paper_fit, z, np.zeros(z.shape[:2]), chains, weights, None, 0, 0.0)
     for k, (direction, gap) in enumerate(explain_gap(paper_fit, posterior, draws=64).items()):
         ratio = paper_fit.draws.effective_deg_per_step[:, k]
         assert gap.joint.value == pytest.approx(ratio.mean(), rel=1e-12), direction

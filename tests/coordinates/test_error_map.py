@@ -2,22 +2,19 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from support.bent_rig import BENT, NO_NOISE_DEG, NOMINAL, calibration, twin_points, twin_ray
 from support.published_equations import published_point
 
+from tvsbayes.calibration.optics import range_components
 from tvsbayes.calibration.pointing import Calibration
-from tvsbayes.coordinates.beam_meeting import meeting
 from tvsbayes.coordinates.error_map import SimpleCalibration, error_map, simple_calibration, simple_rays
 from tvsbayes.estimators.four_point import ClassicResult, DirectionResult
 from tvsbayes.instrument.parameters import RIG_PRIORS, Prior
-from tvsbayes.model.geometry import Vectors
-from tvsbayes.model.laser_path import Ray
 from tvsbayes.twin.physics import aperture_angle_deg
 
 ROUNDING_MM = 1e-9
@@ -51,17 +48,11 @@ def test_simple_rays_with_readings_are_the_published_equations(pan, tilt):
     np.testing.assert_array_equal(np.asarray(rays.origin_mm)[:, 0], [0.0, 70.0, 0.0])
     C, beta = np.degrees(np.arccos(-d[1])), np.degrees(np.arctan2(d[2], d[0]))
     for reading in (50.0, 75.0):
-        with jax.enable_x64(True):
-            # The aperture stays at -a/2 = -100 mm.
-            found = meeting(
-                Ray(Vectors.of(np.array([[0.0], [70.0], [0.0]])), Vectors.of(d[:, None])),
-                jnp.asarray(2 * (simple.baseline_mm - simple.origin_y_mm)),
-                jnp.asarray(np.radians([reading])),
-                jnp.asarray(False),
-            )
+        # The aperture stays at -a/2 = -100 mm.
+        baseline_mm = 2 * (simple.baseline_mm - simple.origin_y_mm)
+        reach = range_components((0.0, 70.0, 0.0), tuple(d.tolist()), baseline_mm, reading, False, math)
         expected = published_point(reading, C, beta, 170.0) - np.array([0.0, 15.0, 0.0])
-        assert found.meets[0]
-        np.testing.assert_allclose(np.asarray(found.xyz_mm)[:, 0], expected, atol=10 * ROUNDING_MM)
+        np.testing.assert_allclose(np.array([0.0, 70.0, 0.0]) + reach * d, expected, atol=10 * ROUNDING_MM)
 
 
 PAN, TILT, RANGE_MM = np.array([-120.0, 90.0]), np.array([-100.0, 0.0, 150.0]), np.array([200.0, 350.0, 500.0, 800.0])

@@ -7,54 +7,18 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.coarse_planning import ROUNDING, with_priors
+from support.coarse_planning import with_priors
 
 from tvsbayes.errors import InputError
 from tvsbayes.instrument.parameters import INDEX, Prior
 from tvsbayes.instrument.plan import PlanStep
-from tvsbayes.planning.candidates import (
-    Looks,
-    Positions,
-    arrange,
-    candidates,
-    covariance_of,
-    information_of_looks,
-    sided,
-)
+from tvsbayes.planning.candidates import Positions, candidates, sided
 from tvsbayes.planning.expectation import PARAMETERS, information_of, prior_knowledge
+from tvsbayes.planning.looks import Looks, arrange, covariance_of
 from tvsbayes.planning.plan_check import check_plan
-from tvsbayes.planning.target import DEFAULT_TARGET, parse_target, sensitivity
+from tvsbayes.planning.target import parse_target, sensitivity
 
 pytestmark = pytest.mark.usefixtures("small_searches")
-
-
-def test_looks_add_up_to_the_plan_they_make(knowledge, found, seen):
-    """The fast sum equals the filter's pass over the arranged plan, with and without an unknown home offset."""
-    picks = np.random.default_rng(5).integers(0, len(found.looks), 24)
-    arranged = arrange(found.looks[picks], knowledge.sheets, found.overshoot)
-    for after_data in (False, True):
-        known = replace(knowledge, after_data=after_data)
-        exact = information_of(arranged.steps, known).fisher
-        quick = information_of_looks(seen, picks, arranged.path, knowledge.space, after_data)
-        assert np.abs(quick - exact).max() < ROUNDING * np.abs(exact).max()
-
-
-def test_order_of_experiments_does_not_matter(knowledge, found, seen):
-    generator = np.random.default_rng(6)
-    picks = generator.permutation(len(found.looks))[:16]
-    at = sensitivity(
-        parse_target(DEFAULT_TARGET),
-        knowledge.z,
-        knowledge.space,
-        knowledge.rig.table,
-        seen.mirror_angles_rad.mean(axis=0),
-    )
-    values = []
-    for order in (picks, generator.permutation(picks)):
-        path = arrange(found.looks[order], knowledge.sheets, found.overshoot).path
-        information = information_of_looks(seen, order, path, knowledge.space, False)
-        values.append(at.value(covariance_of(knowledge.precision + information)))
-    assert values[1] == pytest.approx(values[0], rel=ROUNDING)
 
 
 def test_limits_are_kept(mounted_rig, found):
@@ -71,22 +35,6 @@ def test_limits_are_kept(mounted_rig, found):
     assert not inside.notes
     assert "pan_min_steps" in found.notes[0] and "pan -100 to 280" in found.notes[0]
     assert np.abs(found.looks.steps).max() <= 280
-
-
-def test_every_look_is_reached_from_its_side(found, knowledge):
-    arranged = arrange(found.looks, knowledge.sheets, found.overshoot)
-    assert [s.target for s in arranged.steps if s.action == "place"] == list(knowledge.sheets)
-    counters, last, row = np.zeros(2, dtype=int), np.zeros(2, dtype=int), 0
-    for step in arranged.steps:
-        if step.action == "move":
-            last = np.array([step.pan_steps, step.tilt_steps]) - counters
-            counters = counters + last
-        elif step.action == "look":
-            look = arranged.order[row]
-            assert (counters == found.looks.steps[look]).all()
-            assert (last * found.looks.side[look] >= found.overshoot).all()
-            row += 1
-    assert row == len(found.looks)
 
 
 def test_a_full_turn_waits_until_the_ratio_is_known(mounted_rig):

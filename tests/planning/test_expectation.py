@@ -13,9 +13,9 @@ from tvsbayes.instrument.parameters import INDEX, Prior
 from tvsbayes.instrument.plan import PlanStep, run_plan
 from tvsbayes.instrument.protocols import four_point_protocol, paper_protocol
 from tvsbayes.model.headlines import QUANTITIES
-from tvsbayes.planning.candidates import covariance_of
+from tvsbayes.planning.drawn_rigs import instruments_in
 from tvsbayes.planning.expectation import NOISE_COLUMNS, design_arrays, information_of, plan_minutes, prior_knowledge
-from tvsbayes.planning.forecast import truth_in
+from tvsbayes.planning.looks import covariance_of
 from tvsbayes.planning.target import Target, sensitivity
 from tvsbayes.twin.simulated_campaign import Truth, draw_truth, simulate
 
@@ -46,14 +46,14 @@ def test_a_plans_information_is_the_fits_own(mounted_rig, knowledge, monkeypatch
     monkeypatch.setattr("tvsbayes.twin.simulated_campaign.HOME_SD_DEG", 0.0)
     # Cameras as stated: a campaign is triangulated with the stated ones, a plan's sheets stand where they stand.
     drawn = draw_truth(mounted_rig, np.random.default_rng(3)).parameters | {"focal_scale": 1.0}
-    truth = truth_in(knowledge, drawn, mounted_rig.stereo.vector)
+    z = instruments_in(knowledge, [Truth(drawn, mounted_rig.stereo)]).z[0]
     quiet = {name: 0.0 for name in drawn if name.startswith("stop_sd_deg")} | {"pixel_scale": 0.0}
     run = simulate(mounted_rig, dozen_plan(), 4, Truth({**drawn, **quiet}, mounted_rig.stereo), aperture=True)
     assert all(spot.status == "ok" for spot in run.campaign.spots)
     problem = Problem(run.campaign, mounted_rig.table)
     with jax.enable_x64(True):
-        own = problem.information(problem.linearised(truth.z)).fisher
-    planned = information_of(dozen_plan(), knowledge, aperture=True, z=truth.z).fisher
+        own = problem.information(problem.linearised(z)).fisher
+    planned = information_of(dozen_plan(), knowledge, aperture=True, z=z).fisher
     scale = np.sqrt(np.diag(own))
     safe = np.where(scale > 0, scale, 1.0)
     # The spots are triangulated from pixels without noise: linear triangulation is exact to 1e-9 of its point.

@@ -1,4 +1,4 @@
-"""Drawn rigs: what fits will report of them, and the classic estimator's own answer."""
+"""What the classic estimator does on drawn rigs, and its own number of experiments."""
 
 from __future__ import annotations
 
@@ -8,104 +8,23 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy import stats
-from support.coarse_planning import ROUNDING
 
 from tvsbayes.estimators.four_point import classic
 from tvsbayes.instrument.axes import DIRECTIONS
-from tvsbayes.instrument.parameters import INDEX, RIG_NAMES
 from tvsbayes.instrument.protocols import four_point_protocol
-from tvsbayes.model.headlines import physical_at
-from tvsbayes.model.parameter_space import STOP_COLUMNS
-from tvsbayes.planning.candidates import Seen
-from tvsbayes.planning.expectation import NOISE_COLUMNS, PARAMETERS
+from tvsbayes.planning.drawn_rigs import instruments_in
 from tvsbayes.planning.forecast import (
-    PIXEL_COLUMN,
-    Assurance,
     ClassicForecast,
-    DrawnTruth,
-    Family,
-    believed,
     classic_answer,
     classic_count,
     classic_forecast,
-    truth_in,
     value_of_classic,
 )
-from tvsbayes.planning.target import DEFAULT_TARGET, parse_target
+from tvsbayes.planning.target import parse_target
 from tvsbayes.twin.physics import effective_deg_per_step
 from tvsbayes.twin.simulated_campaign import Truth, draw_truth, simulate, with_derived
 
 pytestmark = pytest.mark.usefixtures("small_searches")
-
-
-def test_truths_have_coordinates(mounted_rig, knowledge):
-    drawn = draw_truth(mounted_rig, np.random.default_rng(8))
-    truth = truth_in(knowledge, drawn.parameters, drawn.stereo.vector)
-    physical = physical_at(truth.z, truth.space).value
-    for name, index in INDEX.items():
-        true = drawn.parameters.get(name)
-        if true is not None:
-            assert physical[index] == pytest.approx(true, rel=ROUNDING, abs=ROUNDING), name
-    assert physical[-24:] == pytest.approx(drawn.stereo.vector, rel=ROUNDING, abs=1e-6)
-
-
-def test_other_noise_scales_need_no_new_look(knowledge, found, seen):
-    """Looks whitened anew for other stop errors and pixels carry the information that looking again would give."""
-    family = Family(knowledge, found, np.arange(len(found.looks)), False)
-    assurance = Assurance(family, parse_target(DEFAULT_TARGET), 1, 0)
-    truth = DrawnTruth(knowledge.z, knowledge.space)
-    z = knowledge.z.copy()
-    z[[*STOP_COLUMNS.ravel(), PIXEL_COLUMN]] = (0.7, -1.1, 0.4, 1.3, -0.6)
-    again = assurance.arrays.at(z, knowledge.space).rows
-    quick = assurance.rescaled(assurance.arrays.at(truth.z, truth.space), truth, z).rows
-    one, other = (np.einsum("mij,mik->jk", rows, rows) for rows in (again, quick))
-    assert np.abs(one - other).max() < ROUNDING * np.abs(one).max()
-    before = np.einsum("mij,mik->jk", seen.rows, seen.rows)
-    assert np.abs(one - before).max() > 0.1 * np.abs(one).max(), "the scales matter, or the law would be empty"
-
-
-def test_a_noise_scale_is_believed_by_the_weight_of_the_stops(knowledge, found, seen):
-    """Thousands of stops tell the true sd; none leave the prior's median; the scatter is 1 / sqrt(2 n)."""
-    true = knowledge.z.copy()
-    columns = STOP_COLUMNS.ravel()
-    true[columns] = 1.5
-    truth, exact = DrawnTruth(true, knowledge.space), np.zeros((PARAMETERS, PARAMETERS))
-    many = np.tile(np.arange(len(found.looks)), 40)
-
-    def scales(chosen, noise):
-        taken = Seen(*(getattr(seen, n)[chosen] for n in ("rows", "slope", "seen", "mirror_angles_rad")))
-        side = found.looks.side[chosen]
-        return believed(truth, taken, side, exact, knowledge, np.full(5, noise))[columns]
-
-    assert scales(many, 0.0) == pytest.approx(1.5, abs=0.01)
-    assert (np.abs(scales(many[:1], 0.0)) < 1.5).all()
-    per_direction = len(many) / 2
-    # Stops of 0.18 deg against pixels: what pixels leave open lowers the information by a few per cent.
-    assert scales(many, 1.0) - scales(many, 0.0) == pytest.approx(1 / math.sqrt(2 * per_direction), rel=0.1)
-
-
-def test_what_the_geometry_takes_from_the_stops_is_not_left_for_their_scatter(knowledge, found, seen):
-    """Less p for n: with every geometric coordinate determined by L looks, 1 - p / (2 L) of the information is left."""
-    columns = STOP_COLUMNS.ravel()
-    true = knowledge.z.copy()
-    true[columns] = 1.5
-    truth = DrawnTruth(true, knowledge.space)
-    chosen = np.resize(np.arange(len(found.looks)), 60)
-    taken = Seen(*(getattr(seen, n)[chosen] for n in ("rows", "slope", "seen", "mirror_angles_rad")))
-    side = found.looks.side[chosen]
-
-    def scatter(covariance):
-        low, high = (believed(truth, taken, side, covariance, knowledge, np.full(5, x))[columns] for x in (0.0, 1.0))
-        return high - low
-
-    exact = np.zeros((PARAMETERS, PARAMETERS))
-    geometry = ~NOISE_COLUMNS & (np.arange(PARAMETERS) < len(RIG_NAMES))
-    # Nothing is learned where the covariance is the prior's; a precision of 0 is a coordinate held fixed.
-    precision = np.diag(knowledge.precision)
-    unknown = np.diag(np.divide(1.0, precision, out=np.zeros(PARAMETERS), where=precision > 0))
-    left_over = 1 - np.sum(geometry & (precision > 0)) / (2 * seen.seen[chosen].sum())
-    # Scatter is 1 / sqrt(information) but for the prior, which 30 stops of a direction outweigh 50 times.
-    assert scatter(exact) / scatter(unknown) == pytest.approx(1 / math.sqrt(left_over), rel=0.03)
 
 
 @pytest.mark.parametrize(
@@ -132,7 +51,7 @@ def test_the_classics_forecast_is_what_its_experiments_do(mounted_rig, knowledge
     quiet = {"ratio_contrast_deg_per_step.pan": 0.0, "ratio_contrast_deg_per_step.tilt": 0.0, "pixel_scale": 1.5}
     stops = {f"stop_sd_deg.{d}": sd for d, sd in zip(DIRECTIONS, (0.05, 0.02, 0.06, 0.02), strict=True)}
     parameters = with_derived({**drawn.parameters, **quiet, **stops})
-    forecast = classic_forecast(knowledge, [truth_in(knowledge, parameters, drawn.stereo.vector)])
+    forecast = classic_forecast(knowledge, instruments_in(knowledge, [Truth(parameters, drawn.stereo)]))
     count, standard_errors = 400, 4.0
     run = simulate(mounted_rig, four_point_protocol(count), 6, Truth(parameters, drawn.stereo))
     effective = effective_deg_per_step(parameters, run.truth.reference_pose_deg)

@@ -14,9 +14,10 @@ from tvsbayes.instrument.axes import HOME_APPROACH
 from tvsbayes.instrument.parameters import INDEX, Prior
 from tvsbayes.instrument.plan import run_plan
 from tvsbayes.planning import planner
-from tvsbayes.planning.candidates import LookArrays, arrange, candidates, information_of_looks
+from tvsbayes.planning.candidates import candidates
 from tvsbayes.planning.expectation import LOOKS_PER_EXPERIMENT, PARAMETERS, information_of, prior_knowledge
 from tvsbayes.planning.limits import Batch, Limit, limit_of, next_experiments, split_of, stop_now
+from tvsbayes.planning.looks import LookArrays, arrange, information_of_looks
 from tvsbayes.planning.target import AT_POINT, Sensitivity, Target, parse_target, sensitivity
 
 pytestmark = pytest.mark.usefixtures("small_searches")

@@ -15,8 +15,8 @@ from tvsbayes.instrument.counter_limits import CounterLimits
 from tvsbayes.instrument.plan import PlanStep, described, run_plan
 from tvsbayes.instrument.protocols import four_point_protocol, grid_protocol, paper_protocol
 from tvsbayes.instrument.stops import INSEPARABLE, inseparable, separation
-from tvsbayes.planning.candidates import Looks
 from tvsbayes.planning.expectation import prior_knowledge
+from tvsbayes.planning.looks import Looks
 from tvsbayes.planning.plan_check import beyond_limits, check_plan, extended, judge
 
 pytestmark = pytest.mark.usefixtures("small_searches")

@@ -15,8 +15,8 @@ from tvsbayes.instrument.parameters import Prior
 from tvsbayes.instrument.plan import read_plan, write_plan
 from tvsbayes.instrument.protocols import paper_protocol
 from tvsbayes.instrument.stops import FEW_STOPS
-from tvsbayes.planning.candidates import Looks
 from tvsbayes.planning.expectation import information_of, plan_minutes, prior_knowledge
+from tvsbayes.planning.looks import Looks
 from tvsbayes.planning.planner import few_looks, plan_from
 from tvsbayes.planning.search import Scope
 from tvsbayes.planning.target import DEFAULT_TARGET, parse_target

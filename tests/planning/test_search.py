@@ -10,9 +10,9 @@ import pytest
 from support.coarse_planning import ROUNDING
 
 from tvsbayes.planning import search
-from tvsbayes.planning.candidates import CONTRAST_COLUMNS, covariance_of, information_of_looks
+from tvsbayes.planning.assurance import Assurance, Family
 from tvsbayes.planning.expectation import LOOKS_PER_EXPERIMENT, PARAMETERS
-from tvsbayes.planning.forecast import Assurance, Family
+from tvsbayes.planning.looks import CONTRAST_COLUMNS, covariance_of, information_of_looks
 from tvsbayes.planning.search import CRITERIA, KNOWN, MEAN_WEIGHT, Scope, Search, scores, search_rows, smallest_design
 from tvsbayes.planning.target import parse_target, sensitivity
 
@@ -33,6 +33,30 @@ def test_greedy_takes_the_best_look_and_exchange_never_worsens():
     assert search.value(exchanged) < 1.05 * every
     worst = 3 * [int(np.argmax(one))]
     assert search.value(search.exchange(worst)) < 1.05 * every < 0.9 * search.value(worst)
+
+
+@pytest.mark.parametrize("criterion", CRITERIA)
+@pytest.mark.parametrize("share", [1.0, 0.4])
+def test_greedy_choices_are_those_of_covariances_inverted_anew(criterion, share):
+    """Every candidate beside everything chosen before it, by a whole inverse each; prior sds from 1 to 1000."""
+    generator = np.random.default_rng(11)
+    rows, gradient = generator.normal(size=(30, 4, 7)), generator.normal(size=(3, 7))
+    precision, own = np.diag(np.logspace(0, -6, 7)), np.array([0.0, 1e-3, 0.0])
+    here = generator.uniform(size=30) < share
+    search = Search(rows, precision, gradient, own, criterion)
+    reference = np.diag(gradient @ np.linalg.inv(precision) @ gradient.T) + own
+    expected, known = [], precision
+    for _ in range(40):
+        found = {}
+        for k in np.flatnonzero(here).tolist():
+            covariance = gradient @ np.linalg.inv(known + rows[k].T @ rows[k]) @ gradient.T + np.diag(own)
+            found[k] = float(scores(covariance, reference, criterion))
+        expected.append(min(found, key=found.__getitem__))
+        known = known + rows[expected[-1]].T @ rows[expected[-1]]
+    # Scores of the best two differ by 1e-6 of themselves or more: rounding decides nothing.
+    assert search.among(here).greedy(40) == expected
+    assert search.among(here).value(expected) == pytest.approx(search.value(expected), rel=1e-12)
+    assert search.among(np.zeros(30, dtype=bool)).greedy(3) == []
 
 
 @pytest.mark.parametrize("criterion", CRITERIA)

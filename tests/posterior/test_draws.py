@@ -14,10 +14,11 @@ import pytest
 from scipy import stats
 
 from tvsbayes.instrument.parameters import INDEX, NAMES
+from tvsbayes.posterior.chain import Chain
+from tvsbayes.posterior.diagnosis import GROUPS, diagnose
 from tvsbayes.posterior.draws import Posterior, propagated
 from tvsbayes.posterior.proposal import Target
 from tvsbayes.posterior.ridges import by_width
-from tvsbayes.posterior.sampling import Chain, diagnose
 from tvsbayes.posterior.transport import STRETCH_NODES, Transport
 
 WALKERS, STEPS = 64, 400
@@ -85,7 +86,7 @@ def chain_of(z: np.ndarray) -> Chain:
     w = np.stack([z[..., 0], z[..., 1] * np.exp(-log_factor)], axis=-1)
     log_density = -0.5 * np.sum(z**2, axis=-1) + log_factor
     accepted = np.full(z.shape[1], 0.4 * len(z))
-    return Chain(w, log_density, accepted, (), 0, 1.0)
+    return Chain(w, log_density, accepted, (), 0, 1.0, len(z))
 
 
 def independent(steps: int = STEPS) -> np.ndarray:
@@ -112,11 +113,12 @@ def judged(monkeypatch):
         )
 
     monkeypatch.setattr("tvsbayes.posterior.draws.derived_at", derived_at)
-    monkeypatch.setattr("tvsbayes.posterior.sampling.derived_at", derived_at)
-    weights = np.random.default_rng(3).standard_normal(500)
+    monkeypatch.setattr("tvsbayes.posterior.diagnosis.derived_at", derived_at)
+    # Importance sampling that was not accepted: the chain is judged alone.
+    first = SimpleNamespace(converged=False, seed=0, convergence=SimpleNamespace(importance=None))
 
     def judge(chain: Chain) -> Posterior:
-        return diagnose(fit(), route(), SimpleNamespace(log_weights=weights), chain, 0)
+        return diagnose(fit(), SimpleNamespace(path=route(), posterior=first), chain)
 
     return judge
 
@@ -145,14 +147,14 @@ def test_independent_draws_have_converged_and_keep_their_density(judged):
     np.testing.assert_allclose(found.log_density, log_normal_density(found.z), rtol=1e-12)
 
 
-def test_walkers_of_other_means_are_told_by_r_hat(judged):
-    """Means that scatter by a quarter of an sd: R-hat is sqrt(1 + 1/16) = 1.03, over the limit and under a lax one."""
+def test_groups_of_other_means_are_told_by_r_hat(judged):
+    """Halves of four groups count as eight chains: of means +-0.25 their variance is 8/7 of 1/16, R-hat 1.035."""
     z = independent()
-    z[..., 1] += 0.25 * np.random.default_rng(5).standard_normal(WALKERS)
+    z[..., 1] += 0.25 * np.repeat([1.0, -1.0] * (GROUPS // 2), WALKERS // GROUPS)
     missing = "; ".join(judged(chain_of(z)).convergence.missing)
     value = float(re.search(r"R-hat of \S+ is ([\d.]+), wanted 1.01", missing)[1])
-    # The scatter of 64 means is known to 9 %.
-    assert value == pytest.approx(1.03, abs=0.015)
+    # The 500 draws of half a group tell its mean to 0.045: 0.25 +- 0.045 is 1.035 +- 0.012.
+    assert value == pytest.approx(1.035, abs=0.02)
 
 
 def test_too_few_effective_draws_are_told(judged):
@@ -220,7 +222,7 @@ def test_lost_motion_takes_ratio_and_backlash_of_its_own_axis():
     draws = SimpleNamespace(
         physical=physical, effective_deg_per_step=np.zeros((*shape, 4)), effective_mirror_offset_mm=np.zeros(shape)
     )
-    known = Posterior(None, physical, np.zeros(shape), draws, None, 0, 0.0)
+    known = Posterior(None, physical, np.zeros(shape), draws, np.full(shape, 1 / 6), None, 0, 0.0)
     expected = {"left": (0.122, 0.3), "right": (0.118, 0.3), "up": (0.144, 0.5), "down": (0.136, 0.5)}
     for direction, lost in expected.items():
         found = known.lost_motion_deg(direction, np.array([2, 200]))

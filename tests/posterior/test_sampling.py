@@ -10,8 +10,10 @@ import pytest
 from support.small_posterior import ROUNDING, SIGMAS, small_fit
 
 from tvsbayes.errors import InputError, NotConverged
+from tvsbayes.posterior.chain import stored_chain
+from tvsbayes.posterior.diagnosis import diagnose
 from tvsbayes.posterior.proposal import Target
-from tvsbayes.posterior.sampling import diagnose, sample, stored_chain
+from tvsbayes.posterior.sampling import sample
 
 LONG, SHORT, BLOCK = 96, 12, 6
 SEED = 3
@@ -21,30 +23,37 @@ stop scatters, which widen it, have skewed posteriors; a chain of 190 steps show
 
 
 INTERRUPTED_CALL = 14
-"""Of the density: after the rounds of the pilot and some steps."""
+"""Of the density: after the rounds of importance sampling and some steps."""
 
 
 def limits(patch: pytest.MonkeyPatch, steps: int) -> None:
     """Stop after so many steps, whatever they are worth."""
-    values = {"RHAT_LIMIT": np.inf, "ESS_LIMIT": 0, "TAU_LIMIT": 0, "STUCK_ACCEPTANCE": 0.0, "STUCK_DEVIATION": np.inf}
-    for name, value in {**values, "BLOCK": BLOCK, "FIRST_CHECK": steps}.items():
-        patch.setattr(f"tvsbayes.posterior.sampling.{name}", value)
-    # The map takes seconds and no random number; the pilot needs few draws for a start.
-    patch.setattr("tvsbayes.posterior.ridges.transport", lambda fit: small_fit()[1])
-    patch.setattr("tvsbayes.posterior.sampling.transport", lambda fit: small_fit()[1])
-    patch.setattr("tvsbayes.posterior.proposal.PILOT_DRAWS", 512)
+    anything = {"RHAT_LIMIT": np.inf, "ESS_LIMIT": 0, "TAU_LIMIT": 0, "AGREEMENT_LIMIT": np.inf}
+    for name, value in {**anything, "STUCK_ACCEPTANCE": 0.0, "STUCK_DEVIATION": np.inf}.items():
+        patch.setattr(f"tvsbayes.posterior.diagnosis.{name}", value)
+    for name, value in {"BLOCK": BLOCK, "FIRST_CHECK": steps}.items():
+        patch.setattr(f"tvsbayes.posterior.ensemble.{name}", value)
+    quickly(patch)
+
+
+def quickly(patch: pytest.MonkeyPatch) -> None:
+    """The map takes seconds and no random number; three small rounds are enough for a start."""
+    patch.setattr("tvsbayes.posterior.importance.transport", lambda fit: small_fit()[1])
+    patch.setattr("tvsbayes.posterior.importance.ROUND", 512)
+    patch.setattr("tvsbayes.posterior.importance.ESS_WANTED", 0)
+    patch.setattr("tvsbayes.posterior.importance.ESS_LIMIT", 0)
 
 
 def only_when_long(patch: pytest.MonkeyPatch) -> None:
     """`sample` looks at a resumed chain at once, and under `limits` any chain has converged."""
     judge = diagnose
 
-    def strict(fit, route, start, chain, seed):
-        result = judge(fit, route, start, chain, seed)
+    def strict(fit, start, chain):
+        result = judge(fit, start, chain)
         missing = () if len(chain.w) >= SHORT else ("too short",)
         return replace(result, convergence=replace(result.convergence, missing=missing))
 
-    patch.setattr("tvsbayes.posterior.sampling.diagnose", strict)
+    patch.setattr("tvsbayes.posterior.ensemble.diagnose", strict)
 
 
 @pytest.fixture(scope="module")
@@ -146,10 +155,8 @@ def test_only_a_converged_fit_is_sampled(fitted):
 
 
 def test_what_is_missing_when_the_time_is_over_is_said(fitted, monkeypatch):
-    monkeypatch.setattr("tvsbayes.posterior.sampling.BLOCK", BLOCK)
-    monkeypatch.setattr("tvsbayes.posterior.ridges.transport", lambda fit: small_fit()[1])
-    monkeypatch.setattr("tvsbayes.posterior.sampling.transport", lambda fit: small_fit()[1])
-    monkeypatch.setattr("tvsbayes.posterior.proposal.PILOT_DRAWS", 512)
+    monkeypatch.setattr("tvsbayes.posterior.ensemble.BLOCK", BLOCK)
+    quickly(monkeypatch)
     result = sample(fitted, max_minutes=1e-9, seed=SEED)
     assert not result.converged and result.convergence.steps == BLOCK
     said = "; ".join(result.convergence.missing)
@@ -158,15 +165,15 @@ def test_what_is_missing_when_the_time_is_over_is_said(fitted, monkeypatch):
 
 
 def test_a_stuck_walker_is_found(fitted, long):
-    route, start, chain = stored_chain(long[1], fitted, SEED)
     with jax.enable_x64(True):
-        before = diagnose(fitted, route, start, chain, SEED).convergence
+        start, chain = stored_chain(long[1], fitted, SEED)
+        before = diagnose(fitted, start, chain).convergence
         walker = int(np.argmax(before.acceptance))
         assert walker not in before.stuck_walkers
         w, density, accepted = chain.w.copy(), chain.log_density.copy(), chain.accepted.copy()
         w[:, walker], density[:, walker], accepted[walker] = w[0, walker], density[0, walker], 0
         frozen = replace(chain, w=w, log_density=density, accepted=accepted)
-        after = diagnose(fitted, route, start, frozen, SEED).convergence
+        after = diagnose(fitted, start, frozen).convergence
     assert walker in after.stuck_walkers and not after.converged
     sentence = next(m for m in after.missing if m.startswith("stuck walkers: "))
     assert str(walker) in sentence.removeprefix("stuck walkers: ").split(", ")

@@ -7,12 +7,15 @@ import json
 import math
 from dataclasses import asdict, replace
 
+import numpy as np
 import pytest
 from jsonschema import Draft202012Validator
 from support.fit_documents import OLD, changed, kept, problems, schema_of
 from support.small_results import estimate, small_record, small_summary
 
 from tvsbayes.errors import InputError
+from tvsbayes.results.convergence import Agreement, Convergence, Importance, NamedValue, Reweighted
+from tvsbayes.results.estimates import FitSummary
 from tvsbayes.results.fit_record import FIT_FORMAT, FIT_FORMATS, read_fit
 
 
@@ -32,18 +35,46 @@ def test_old_documents_stay_valid_and_readable(path):
     document = json.loads(path.read_text())
     assert problems(document, schema_of(document)) == []
     # Keys that came within the version, as they are where nothing is said.
-    assert read_fit(path).as_json() == {"validation": None, "few_stops": {}, **document}
+    if document["sampling"] is not None:
+        document["sampling"] |= {"importance": None, "agreement": None}
+    assert read_fit(path).as_json() == {"validation": None, "few_stops": {}, "tier": None, **document}
+
+
+def whole_summary() -> FitSummary:
+    """With every parameter that the schema wants."""
+    summary = small_summary()
+    names = ("degrees_per_step.pan", "degrees_per_step.tilt")
+    return replace(summary, parameters={**summary.parameters, **{name: estimate(0.06, 1e-4) for name in names}})
 
 
 def test_a_new_document_obeys_the_schema(tmp_path):
     """The writer's own path, with everything that may be null; a real fit is checked in test_cli."""
-    summary = small_summary()
-    names = ("degrees_per_step.pan", "degrees_per_step.tilt")
-    summary = replace(summary, parameters={**summary.parameters, **{name: estimate(0.06, 1e-4) for name in names}})
+    summary = whole_summary()
     (tmp_path / "fit.json").write_text(json.dumps(small_record(summary, seed=3).as_json()))
     document = json.loads((tmp_path / "fit.json").read_text())
     assert problems(document, schema_of(document)) == []
     assert json.dumps(read_fit(tmp_path / "fit.json").as_json()) == json.dumps(document), "in its order, too"
+
+
+def test_both_tiers_obey_the_schema(tmp_path):
+    """Weighted draws have no walkers and no R-hat; a chain says whether it agrees with them."""
+    worst = NamedValue("backlash_deg.tilt", 0.41)
+    importance = Importance(True, (), 4, 4096, 0.7, worst, 0.33, worst, 0.003, -1189.2, 0.01, 0)
+    effective = {"backlash_deg.tilt": 2100.0}
+    weighted = Reweighted(importance, effective, effective)
+    chain = Convergence(
+        *(200, 20, 2, 3.1, {"backlash_deg.tilt": 1.002}, effective, effective, np.array([0.5, 0.6]), (), 0, ()),
+        importance=importance,
+        agreement=Agreement(True, 4.0, worst),
+    )
+    for tier, found in (("importance", weighted), ("emcee", chain)):
+        summary = replace(whole_summary(), estimator="posterior", tier=tier, sampling=found.sampling)
+        (tmp_path / "fit.json").write_text(json.dumps(small_record(summary, seed=3).as_json()))
+        document = json.loads((tmp_path / "fit.json").read_text())
+        assert problems(document, schema_of(document)) == []
+        assert read_fit(tmp_path / "fit.json").summary == summary
+        assert document["sampling"]["importance"]["log_evidence"] == -1189.2
+    assert weighted.sampling.worst_rhat is None and weighted.rhat == {}
 
 
 def test_what_reports_show_besides_obeys_the_schema():

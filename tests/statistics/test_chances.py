@@ -5,7 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tvsbayes.statistics.chances import recursive_residuals, share_error
+from tvsbayes.statistics.chances import (
+    chi2_quantile,
+    log_chance,
+    one_way_chance,
+    recursive_residuals,
+    rms_bounds,
+    share_error,
+    share_interval95,
+)
 
 
 @pytest.mark.parametrize("backwards", [False, True])
@@ -29,3 +37,33 @@ def test_no_number_of_draws_makes_an_assurance_certain():
         assert share_error(1.0, draws) == share_error(0.0, draws)
         assert share_error(0.0, draws) == pytest.approx(stats.beta(0.5, draws + 0.5).std(), rel=1e-12)
         assert share_error(0.8, draws) == pytest.approx(stats.binom(draws, 0.8).std() / draws, rel=1e-12)
+
+
+def test_distributions_are_those_of_scipy_stats():
+    """Which takes half a second to load; 1e-12 relative is a few thousand roundings of its iterations.
+
+    The log of a probability near 1 has that probability's rounding, 1e-16.
+    """
+    from scipy import stats
+
+    chi2, dof = np.meshgrid([0.1, 1.0, 10.0, 300.0], [1, 2, 5, 40])
+    np.testing.assert_allclose(log_chance(chi2, dof), stats.chi2.logsf(chi2, dof), rtol=1e-12, atol=1e-15)
+    for p in (1e-6, 0.05, 0.5):
+        found = chi2_quantile(np.array([0.0, 1.0]), p)
+        np.testing.assert_allclose(found, stats.chi2.isf(p, np.array([3, 4])), rtol=1e-12)
+    for count in (1, 20, 1000):
+        expected = np.sqrt(stats.chi2.ppf([0.5e-4, 1 - 0.5e-4], count) / count)
+        np.testing.assert_allclose(rms_bounds(count), expected, rtol=1e-12)
+    for hits, count in ((0, 10), (3, 10), (10, 10), (940, 1000)):
+        interval = stats.binomtest(hits, count).proportion_ci(0.95, "exact")
+        np.testing.assert_allclose(share_interval95(hits, count), interval, rtol=1e-12)
+
+
+def test_one_way_chance_is_that_of_the_f_test():
+    from scipy import stats
+
+    generator = np.random.default_rng(3)
+    for shift in (0.0, 0.5, 5.0):
+        groups = [generator.standard_normal(n) + shift * k for k, n in enumerate((2, 7, 30))]
+        # 1e-10 relative: far out the probability is steep in F, whose sums differ by rounding.
+        assert one_way_chance(groups) == pytest.approx(stats.f_oneway(*groups).pvalue, rel=1e-10)

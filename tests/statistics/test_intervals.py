@@ -12,8 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy import optimize, stats
+from support.jax_meeting import linear
 
-from tvsbayes.coordinates.beam_meeting import linear
 from tvsbayes.statistics.intervals import (
     NORMAL_95,
     coverage_factor,

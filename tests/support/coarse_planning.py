@@ -14,8 +14,9 @@ from tvsbayes.instrument.parameters import Prior
 from tvsbayes.instrument.rig import Rig
 
 if TYPE_CHECKING:
-    from tvsbayes.planning.candidates import Candidates, Seen
+    from tvsbayes.planning.candidates import Candidates
     from tvsbayes.planning.expectation import Knowledge
+    from tvsbayes.planning.looks import Seen
 
 ROUNDING = 1e-9
 """Relative; sums of a thousand products in float64, condition numbers up to 1e5."""
@@ -27,7 +28,6 @@ def small_searches():
     from tvsbayes.planning import planner
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("tvsbayes.planning.expectation.SMALLEST_DESIGN", 512)
         for name, value in (("PAN_LEVELS", 4), ("TILT_LEVELS", 3), ("COARSE_PAN", 7), ("COARSE_TILT", 5)):
             patch.setattr(f"tvsbayes.planning.candidates.{name}", value)
         patch.setattr("tvsbayes.planning.candidates.VISIBILITY_DRAWS", 8)
@@ -55,7 +55,7 @@ def found(knowledge, small_searches) -> Candidates:
 @pytest.fixture(scope="module")
 def seen(knowledge, found) -> Seen:
     """What they show at the most probable instrument."""
-    from tvsbayes.planning.candidates import LookArrays
+    from tvsbayes.planning.looks import LookArrays
 
     return LookArrays(found.looks, knowledge, False).at(knowledge.z, knowledge.space)
 

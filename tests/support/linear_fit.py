@@ -10,7 +10,6 @@ import numpy as np
 from support.small_campaign import small_campaign
 
 from tvsbayes.calibration.pointing import INPUT_NAMES
-from tvsbayes.coordinates.beam_meeting import INPUT_COLUMNS
 from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.estimators.linear_spots import StopGroup, StopInformation
 from tvsbayes.instrument.parameters import HARMONIC_NAMES, INDEX, NAMES, RIG_NAMES
@@ -76,7 +75,7 @@ def refitted(jacobian: np.ndarray, load: np.ndarray) -> tuple[np.ndarray, np.nda
 
 def slope_of(fit: JointFit) -> np.ndarray:
     """d(inputs)/dz by central differences."""
-    columns = INPUT_COLUMNS[: len(INPUT_NAMES)]
+    columns = [INDEX[name] for name in INPUT_NAMES]
     with jax.enable_x64(True):
         physical = jax.jit(lambda z: fit.space.physical(z))
         moved = [

@@ -22,7 +22,7 @@ from tvsbayes.posterior.draws import Posterior
 CLEARED_PROBABILITY = 0.99
 """With this probability an overshoot takes up all the play."""
 DRAWS_KEPT = 4096
-"""Posterior draws in a calibration, evenly chosen; posterior.nc holds them all."""
+"""Posterior draws in a calibration, at most, that weigh the same."""
 
 
 def calibration_of_draws(

@@ -9,7 +9,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import stats
 
 from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.estimators.plausibility import SHALLOW
@@ -18,7 +17,7 @@ from tvsbayes.instrument.campaign import ordered_spots
 from tvsbayes.instrument.stops import Rest, rests_of
 from tvsbayes.metrology.positioning_table import StopReadings
 from tvsbayes.results.estimates import Cause, CauseGroup, StopResidual
-from tvsbayes.statistics.chances import recursive_residuals
+from tvsbayes.statistics.chances import one_way_chance, recursive_residuals
 
 CAUSE_BINS = 6
 PLACEMENT_GAP = 1.03
@@ -169,7 +168,7 @@ def residual_causes(residuals: Sequence[StopResidual]) -> tuple[Cause, ...]:
                 groups.append(CauseGroup(label, len(part), float(part.mean()), spread / np.sqrt(len(part))))
                 members.append(part)
             testable = [part for part in members if len(part) > 1 and np.ptp(part) > 0]
-            p = float(stats.f_oneway(*testable).pvalue) if len(testable) > 1 else None
+            p = one_way_chance(testable) if len(testable) > 1 else None
             found.append(Cause(name, axis, tuple(groups), p, False))
     tests = sum(cause.p is not None for cause in found)
     return tuple(replace(c, suspicious=c.p is not None and c.p * tests < CAUSE_LIMIT) for c in found)

@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 
-import jax
 import numpy as np
 
 from tvsbayes.assessment.score_tests import validate
@@ -30,17 +29,20 @@ from tvsbayes.posterior.draws import Posterior
 from tvsbayes.posterior.predictive import ideal_pixels
 from tvsbayes.results.estimates import CurvePoint, Curves, Estimate, FitSummary, LostMotion, RatioAt
 from tvsbayes.statistics.intervals import NORMAL_95, interval95
+from tvsbayes.statistics.weighted_draws import TAILS, weighted_mean, weighted_quantiles
 
 CLASSIC_DRAWS = 256
 CURVE_POINTS = 7
 
 
-def _estimate(mode: float, draws: np.ndarray, prior_draws: np.ndarray) -> Estimate:
-    """From draws: equal-tailed interval, sample standard deviations."""
+def _estimate(value: float, draws: np.ndarray, weights: np.ndarray, prior_draws: np.ndarray) -> Estimate:
+    """From weighted draws: equal-tailed interval, standard deviations."""
     # The mean of equal numbers may be off by a rounding: what is fixed would scatter by 1e-17 of itself.
-    sd, prior_sd = (float(np.std(x)) if np.ptp(x) > 0 else 0.0 for x in (draws, prior_draws))
+    prior_sd = float(np.std(prior_draws)) if np.ptp(prior_draws) > 0 else 0.0
+    sd = float(np.sqrt(weights @ (draws - weighted_mean(draws, weights)) ** 2))
     contraction = float(1 - (sd / prior_sd) ** 2) if prior_sd > 0 else None
-    return Estimate(float(mode), sd, interval95(draws), prior_sd, contraction)
+    low, high = weighted_quantiles(draws, weights, TAILS)
+    return Estimate(float(value), sd, (float(low), float(high)), prior_sd, contraction)
 
 
 type _Quantity = Callable[[Derived], np.ndarray]
@@ -70,13 +72,13 @@ class _Source:
         self.prior = fit.prior_draws
         if posterior is None:
             self.centre, self.draws = fit.mode, fit.draws
+            self.weights = np.full(len(fit.draws_z), 1 / len(fit.draws_z))
         else:
-            self.draws = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), posterior.draws)
-            self.centre = jax.tree.map(lambda x: x.mean(axis=0), self.draws)
+            self.centre, self.draws, self.weights = posterior.centre, posterior.joined, posterior.weights.ravel()
 
     def estimate(self, name: str, of: _Quantity) -> Estimate:
         """A quantity that is linear in the fields of `Derived`, with the sampler's diagnosis of `name`."""
-        plain = _estimate(float(of(self.centre)), of(self.draws), of(self.prior))
+        plain = _estimate(float(of(self.centre)), of(self.draws), self.weights, of(self.prior))
         if self.posterior is None:
             return plain
         found = self.posterior.convergence
@@ -245,6 +247,7 @@ def summarise(fit: JointFit, posterior: Posterior | None = None) -> FitSummary:
         prior_conflicts=prior_conflicts(fit),
         prior_sensitivity=prior_sensitivity(fit, moved),
         estimator="laplace" if usable is None else "posterior",
+        tier=None if usable is None else usable.tier,
         sampling=None if posterior is None else posterior.convergence.sampling,
         curves=None if usable is None else _curves(usable, moved),
         validation=validate(fit),

@@ -121,7 +121,14 @@ def beam_components(values: Values, pan_deg: Number, tilt_deg: Number, m: Module
 def range_components(
     origin: Vector, direction: Vector, baseline_mm: Number, aperture_deg: Number, azimuth: bool, m: ModuleType = np
 ) -> Number:
-    """Range along the beam at which the aperture sees it under angle B, mm (derivation: `beam_meeting.meeting`).
+    """Range along the beam at which the aperture sees it under angle B, mm (formulation 5); closed form.
+
+    With w the beam's origin seen from the aperture and c = cos B, the in-plane reading asks for (w + r d)_y =
+    c |w + r d|. Squared this is a quadratic in r whose discriminant is c^2 S^2, S^2 = |m|^2 sin^2 B - m_y^2 with the
+    moment m = w x d. The root on B's own nappe is r = (w_y^2 - c^2 |w|^2) / (c S - w_y d_y + c^2 w.d), which has no
+    0/0 at B = 90 deg, nor where the beam runs parallel to the cone's opposite side; the denominator vanishes where
+    beam and line of sight are parallel. On the baseline's plane it is a sin B / sin(B + C). It is the right root for
+    beams that start on the positioner's side of the aperture (w_y > 0).
 
     Not a number where the beam misses the cone or half-plane of B; zero, negative or minus infinite where only its
     backward extension or the other nappe is met.
@@ -134,8 +141,9 @@ def range_components(
         closing = u * cos_b - v * sin_b
         if m is math and closing == 0:
             return math.inf
-        reach = (y * sin_b - x * cos_b) / closing
-        ahead = (x + reach * u) * sin_b + (y + reach * v) * cos_b
+        with np.errstate(divide="ignore", invalid="ignore"):
+            reach = (y * sin_b - x * cos_b) / closing
+            ahead = (x + reach * u) * sin_b + (y + reach * v) * cos_b
         # The other half of B's plane is behind the aperture.
         return (reach if ahead >= 0 else math.nan) if m is math else np.where(ahead >= 0, reach, np.nan)
     mx, my, mz = y * w - z * v, z * u - x * w, x * v - y * u

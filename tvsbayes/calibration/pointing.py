@@ -257,13 +257,41 @@ class Calibration:
             InputError: an approach that does not exist, or beam and line of sight do not meet.
         """
         sides = sides_of(approach)
-        values, noise = self._moved.values, self._moved.noise
-        beam = self._moved_beam((pan_steps, tilt_steps), sides)
-        true_deg = aperture_deg - values["aperture_zero_deg"] - values["aperture_sd_deg"] * noise[4]
-        reach = range_components(*beam, values["baseline_mm"], true_deg, self.azimuth)
-        if not np.all(np.asarray(reach).real > 0):
+        moved = self.moved_points((np.array([pan_steps]), np.array([tilt_steps])), sides, np.array([aperture_deg]))
+        if not np.all(np.isfinite(moved)):
             raise self.refusal(pan_steps, tilt_steps, aperture_deg, sides)
-        return beam.at(reach).imag / COMPLEX_STEP
+        return moved[..., 0].imag / COMPLEX_STEP
+
+    def points(
+        self, values: Values, noise: np.ndarray, steps: Counters, sides: Sides, aperture_deg: np.ndarray
+    ) -> np.ndarray:
+        """Points where beams meet the aperture's readings, x, y, z first; not a number where they do not.
+
+        Args:
+            values: as for `noisy_beam`, as are the next three.
+            noise: unit noises.
+            steps: counters; their shape and that of the readings is broadcast with that of the values.
+            sides: approach sides.
+            aperture_deg: readings B.
+        """
+        beam = self.noisy_beam(values, noise, steps, sides)
+        true_deg = aperture_deg - values["aperture_zero_deg"] - values["aperture_sd_deg"] * noise[4]
+        reach = np.asarray(range_components(*beam, values["baseline_mm"], true_deg, self.azimuth))
+        return beam.at(np.where((reach.real > 0) & np.isfinite(reach), reach, np.nan))
+
+    def moved_points(self, steps: Counters, sides: Sides, aperture_deg: np.ndarray) -> np.ndarray:
+        """Points of many looks of one approach, complex, shape (3, inputs + NOISES, n).
+
+        The real part is the point, the same in every row of the second axis or not a number where there is none; the
+        imaginary part over `COMPLEX_STEP` its derivative by that input or unit noise.
+
+        Args:
+            steps: counters (pan, tilt), each (n,).
+            sides: approach sides of all.
+            aperture_deg: readings B, shape (n,).
+        """
+        values = {k: v[:, None] if isinstance(v, np.ndarray) else v for k, v in self._moved.values.items()}
+        return self.points(values, self._moved.noise[..., None], steps, sides, aperture_deg)
 
     def steps_for(
         self,

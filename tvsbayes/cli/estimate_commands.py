@@ -22,8 +22,9 @@ from tvsbayes.pipeline import calibrate, compile_for, fit_for, record_for
 if TYPE_CHECKING:
     from tvsbayes.estimators.joint_fit import JointFit
     from tvsbayes.instrument.campaign import Campaign
-    from tvsbayes.posterior.sampling import Progress
+    from tvsbayes.posterior.chain import Progress
     from tvsbayes.results.comparison_record import ComparisonRecord
+    from tvsbayes.results.estimates import FitSummary
     from tvsbayes.results.fit_record import FitRecord
 
 
@@ -54,6 +55,7 @@ def classic(campaign: CampaignFolder, as_json: Json = False) -> None:
 
 def fit(
     campaign: CampaignFolder,
+    quick: Annotated[bool, typer.Option("--quick", help="Importance sampling only: the posterior in seconds.")] = False,
     no_sample: Annotated[bool, typer.Option("--no-sample", help="Laplace approximation only.")] = False,
     max_minutes: Annotated[
         float | None,
@@ -74,7 +76,12 @@ def fit(
     if resume and no_sample:
         raise InputError("usage", "--resume continues a chain and --no-sample makes none", remedy="give one of them")
     if no_sample:
-        refuse_options("for a sampler, and --no-sample runs none", "give one of them", max_minutes=max_minutes)
+        given = {"max_minutes": max_minutes, "quick": quick}
+        refuse_options("for a sampler, and --no-sample runs none", "give one of them", **given)
+    if quick:
+        refuse_options(
+            "for a chain, and --quick makes none", "give one of them", max_minutes=max_minutes, resume=resume
+        )
     data = read_campaign(campaign)
     _warn_of(data)
     from tvsbayes.instrument.model_choice import ModelChoice
@@ -86,15 +93,25 @@ def fit(
         out or output_place(campaign, "results"),
         model=ModelChoice(robust=robust, per_axis=per_axis, harmonics=harmonics, no_backlash=no_backlash),
         sampled=not no_sample,
+        tier="importance" if quick else "emcee",
         max_minutes=MAX_MINUTES if max_minutes is None else max_minutes,
         resume=resume,
         seed=seed,
         tell=report_line,
         watch=_sampling_progress,
+        first=_show_first,
     )
     summary, files = results.record.summary, results.files
     document = {**summary.as_json(), "seed": seed, "files": files}
     finish(document, f"{fit_text(summary)}\nwritten: {', '.join(files.values())}", as_json, results.error)
+
+
+def _show_first(summary: FitSummary) -> None:
+    """What importance sampling says, on stderr, before the chain that must agree with it."""
+    from tvsbayes.report.fit_text import first_text
+
+    for line in first_text(summary).splitlines():
+        report_line(line)
 
 
 LimitRatio = Annotated[

@@ -106,7 +106,6 @@ def locate(
     from tvsbayes.coordinates.location import locate as locate_points
     from tvsbayes.report.command_text import budget_text, locations_text
 
-    compile_for(report_line)
     found = locate_points(calibration, *where, draws=draws, seed=seed)
     if found.refused[0] is not None:
         raise found.refused[0]
@@ -127,7 +126,6 @@ def _locate_all(campaign: Path, points: Points, draws: int, seed: int, as_json: 
     from tvsbayes.coordinates.location import locate as locate_points
     from tvsbayes.report.command_text import locations_text
 
-    compile_for(report_line)
     where = (points.pan_steps, points.tilt_steps, points.aperture_deg, points.approach)
     found = locate_points(calibration, *where, draws=draws, seed=seed)
     entries = [found.as_json(k) for k in range(len(found.refused))]

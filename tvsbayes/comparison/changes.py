@@ -45,7 +45,7 @@ def compare(first: JointFit, second: JointFit) -> Comparison:
         first: converged fit of A.
         second: converged fit of B.
     """
-    from scipy import stats
+    from scipy import special
 
     pose = first.reference_pose_rad
     cameras = first.campaign.stereo, second.campaign.stereo
@@ -54,7 +54,7 @@ def compare(first: JointFit, second: JointFit) -> Comparison:
         and np.array_equal(cameras[0].parameter_covariance, cameras[1].parameter_covariance)
     )
     before, after = _draws_at(first, pose), _draws_at(second, pose)
-    limit = float(stats.norm.isf(0.5 * (1 - 0.95 ** (1 / len(QUANTITIES)))))
+    limit = -float(special.ndtri(0.5 * (1 - 0.95 ** (1 / len(QUANTITIES)))))
     variance = before[1:].var(axis=0, ddof=1) + after[1:].var(axis=0, ddof=1)
     if shared:
         influence = camera_influence(first, before[1:]), camera_influence(second, after[1:])

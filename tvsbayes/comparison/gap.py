@@ -18,6 +18,7 @@ from tvsbayes.instrument.axes import DIRECTIONS
 from tvsbayes.instrument.parameters import names_of
 from tvsbayes.results.comparison_record import Gap, GapTerm
 from tvsbayes.statistics.intervals import interval95
+from tvsbayes.statistics.weighted_draws import TAILS, weighted_mean, weighted_quantiles
 
 if TYPE_CHECKING:
     from tvsbayes.estimators.joint_fit import JointFit
@@ -100,20 +101,22 @@ class _Chosen:
         z: coordinates (n, p); of the Laplace approximation the mode, then draws.
         mode_first: so it is; else the estimate is the mean of the draws.
         ratios: effective ratios of all draws, shape (N, 4), deg/step.
+        weights: of all draws, sum 1, shape (N,).
     """
 
     z: np.ndarray
     mode_first: bool
     ratios: np.ndarray
+    weights: np.ndarray
 
 
 def _chosen_draws(found: JointFit, posterior: Posterior | None, draws: int) -> _Chosen:
     if posterior is None:
         z = np.vstack([found.z, found.draws_z[:draws]])
-        return _Chosen(z, True, np.asarray(found.draws.effective_deg_per_step))
-    every = posterior.z.reshape(-1, posterior.z.shape[-1])
-    z = every[np.linspace(0, len(every) - 1, draws).astype(int)]
-    return _Chosen(z, False, np.asarray(posterior.draws.effective_deg_per_step).reshape(-1, len(DIRECTIONS)))
+        ratios = np.asarray(found.draws.effective_deg_per_step)
+        return _Chosen(z, True, ratios, np.full(len(ratios), 1 / len(ratios)))
+    ratios = np.asarray(posterior.joined.effective_deg_per_step)
+    return _Chosen(posterior.coordinates(draws), False, ratios, posterior.weights.ravel())
 
 
 @dataclass(frozen=True)
@@ -166,8 +169,9 @@ def _gap(seen: float, chosen: _Chosen, idealised: _Idealised, k: int, rows: np.n
     }
     # The ratio itself as every table states it, from all draws; its mean is a control variate for those of the
     # terms, which then add up to the gap.
-    ratio = chosen.ratios[:, k]
-    centre = float(own[0] if chosen.mode_first else ratio.mean())
+    ratio, weights = chosen.ratios[:, k], chosen.weights
+    mean = weighted_mean(ratio, weights)
+    centre = float(own[0] if chosen.mode_first else mean)
 
     def term(name: str, values: np.ndarray) -> GapTerm:
         if chosen.mode_first:
@@ -177,9 +181,10 @@ def _gap(seen: float, chosen: _Chosen, idealised: _Idealised, k: int, rows: np.n
             value, sampled = values.mean() + slope * (centre - own.mean()), values
         return GapTerm(name, float(value), float(sampled.std()), interval95(sampled))
 
-    sd = float(ratio.std())
-    joint = GapTerm("effective ratio", centre, sd, interval95(ratio))
-    total = GapTerm("classic - joint", float(seen - centre), sd, interval95(seen - ratio))
+    sd = float(np.sqrt(weights @ (ratio - mean) ** 2))
+    low, high = weighted_quantiles(ratio, weights, TAILS).tolist()
+    joint = GapTerm("effective ratio", centre, sd, (low, high))
+    total = GapTerm("classic - joint", float(seen - centre), sd, (seen - high, seen - low))
     return Gap(seen, joint, total, tuple(term(name, values) for name, values in parts.items()))
 
 

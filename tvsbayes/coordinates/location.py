@@ -1,4 +1,4 @@
-"""TVS coordinates: points where beam and aperture reading meet, in mm, and how sure that is.
+"""TVS coordinates: points where beam and aperture reading meet, in mm, and how sure that is; NumPy.
 
 Frame T: origin mid-baseline, x depth, y along the baseline towards the positioner at +a/2, z up; the aperture stands
 at (0, -a/2, 0). Uncertainty is propagated by the law (GUM 5) and by distributions (JCGM 101, 102), and the one is
@@ -12,20 +12,26 @@ from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Any, cast
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
-from tvsbayes.calibration.pointing import DIVERGING_SHARE, INPUT_NAMES, Calibration
-from tvsbayes.coordinates.beam_meeting import Carried, Linear, Settings, Sources, carry, propagate, sources
+from tvsbayes.calibration.pointing import (
+    COMPLEX_STEP,
+    DIVERGING_SHARE,
+    INPUT_NAMES,
+    NOISE_NAMES,
+    NOISES,
+    Calibration,
+    Drawn,
+    drawn,
+)
 from tvsbayes.errors import InputError
 from tvsbayes.instrument.axes import HOME_APPROACH, sides_of
 from tvsbayes.statistics.intervals import NORMAL_95, Validation, symmetric_interval, validate
 
 DRAWS = 1000
 """Draws carried to a point unless the caller wants others; formulation 5 asks for 500 at least."""
-POINTS = 256
-"""Points per call of the compiled functions."""
+BLOCK = 2**15
+"""Numbers per array while draws are carried to points: more than a processor's own memory holds takes longer."""
 
 
 @dataclass(frozen=True)
@@ -90,6 +96,57 @@ class Locations:
         }
 
 
+@dataclass(frozen=True)
+class Settings:
+    """Where the machine stood and what the aperture read.
+
+    Attributes:
+        steps: counters (pan, tilt), shape (n, 2).
+        side: approach sides, +1 left or up, -1 right or down, 0 unknown, shape (n, 2).
+        aperture_deg: readings, shape (n,).
+    """
+
+    steps: np.ndarray
+    side: np.ndarray
+    aperture_deg: np.ndarray
+
+    def __getitem__(self, chosen: slice) -> Settings:
+        return Settings(self.steps[chosen], self.side[chosen], self.aperture_deg[chosen])
+
+    def of_one_approach(self) -> Iterator[np.ndarray]:
+        """Rows of the points that were reached from the same sides."""
+        _, kind = np.unique(self.side, axis=0, return_inverse=True)
+        for number in range(kind.max() + 1):
+            yield np.flatnonzero(kind == number)
+
+
+@dataclass(frozen=True)
+class Carried:
+    """Draws of points, shape (draws, points, 3), not a number where beam and reading do not meet."""
+
+    xyz_mm: np.ndarray
+
+    @property
+    def meets(self) -> np.ndarray:
+        """Whether each exists, shape (draws, points)."""
+        return np.isfinite(self.xyz_mm).all(axis=-1)
+
+
+@dataclass(frozen=True)
+class Linear:
+    """The law of propagation of uncertainty: y = f(x), J = df/dx, U_y = J U_x J^T (GUM 5.2.2, JCGM 102 6.2).
+
+    Attributes:
+        value: points, shape (n, 3), not a number where there is none.
+        jacobian: by `INPUT_NAMES` and the unit noises, shape (n, 3, inputs + NOISES).
+        covariance: shape (n, 3, 3).
+    """
+
+    value: np.ndarray
+    jacobian: np.ndarray
+    covariance: np.ndarray
+
+
 def settings_of(
     pan_steps: float | Sequence[float] | np.ndarray,
     tilt_steps: float | Sequence[float] | np.ndarray,
@@ -103,21 +160,20 @@ def settings_of(
     pairs = cast("Sequence[tuple[str, str]]", [approach] if single else approach)
     known = {(pan_side, tilt_side): sides_of((pan_side, tilt_side)) for pan_side, tilt_side in pairs}
     side = np.broadcast_to(np.array([known[pan_side, tilt_side] for pan_side, tilt_side in pairs]), (len(pan), 2))
-    with jax.enable_x64(True):
-        return Settings(
-            steps=jnp.asarray(np.stack([pan, tilt], axis=1)),
-            side=jnp.asarray(side),
-            aperture_rad=jnp.asarray(np.radians(reading)),
-        )
+    return Settings(np.stack([pan, tilt], axis=1), side, np.array(reading))
 
 
-def _blocks(settings: Settings) -> Iterator[tuple[Settings, int]]:
-    """Equal blocks of settings, the last one filled up with its last point, and how many points of each count."""
-    count = len(settings.aperture_rad)
-    size = min(POINTS, 1 << max(count - 1, 0).bit_length())
-    for begin in range(0, count, size):
-        chosen = np.minimum(np.arange(begin, begin + size), count - 1)
-        yield jax.tree.map(lambda x, chosen=chosen: x[chosen], settings), min(size, count - begin)
+def carry(calibration: Calibration, found: Drawn, settings: Settings) -> Carried:
+    """Every draw through the geometry for every point."""
+    columns = found.inputs.T[:, :, None]
+    values = dict(zip((*INPUT_NAMES, *NOISE_NAMES), columns, strict=True))
+    noise = found.noise.T[:, :, None]
+    xyz = np.empty((len(found.inputs), len(settings.steps), 3))
+    for rows in settings.of_one_approach():
+        steps, side = settings.steps[rows].T, settings.side[rows[0]]
+        points = calibration.points(values, noise, (steps[0], steps[1]), (*side,), settings.aperture_deg[rows])
+        xyz[:, rows] = points.transpose(1, 2, 0)
+    return Carried(xyz)
 
 
 def locate_linear(calibration: Calibration, settings: Settings) -> Linear:
@@ -125,12 +181,16 @@ def locate_linear(calibration: Calibration, settings: Settings) -> Linear:
 
     No draws: a million points a minute. Validate some of them with `locate`.
     """
-    given = sources(calibration, 1, 0)
-    with jax.enable_x64(True):
-        found = [
-            jax.tree.map(lambda x, n=n: np.asarray(x)[:n], propagate(block, given)) for block, n in _blocks(settings)
-        ]
-    return jax.tree.map(lambda *parts: np.concatenate(parts), *found)
+    count, inputs = len(settings.steps), len(INPUT_NAMES) + NOISES
+    value, jacobian = np.empty((count, 3)), np.empty((count, 3, inputs))
+    for rows in settings.of_one_approach():
+        for part in np.array_split(rows, -(-len(rows) * inputs // BLOCK)):
+            steps, side = settings.steps[part].T, settings.side[part[0]]
+            moved = calibration.moved_points((steps[0], steps[1]), (*side,), settings.aperture_deg[part])
+            value[part] = moved[:, 0].real.T
+            jacobian[part] = (moved.imag / COMPLEX_STEP).transpose(2, 0, 1)
+    covariance = jacobian @ calibration.covariance_with_noise @ jacobian.transpose(0, 2, 1)
+    return Linear(value, jacobian, covariance)
 
 
 def locate(
@@ -170,18 +230,15 @@ def locate(
     settings = settings_of(pan_steps, tilt_steps, aperture_deg, approach)
     if not len(settings.steps):
         raise ValueError("no points: the lists are empty")
-    given = sources(calibration, draws, seed)
-    parts = []
-    with jax.enable_x64(True):
-        for block, n in _blocks(settings):
-            carried, law = carry(block, given), propagate(block, given)
-            trimmed = jax.tree.map(lambda x, n=n: np.asarray(x)[..., :n], carried)
-            law = jax.tree.map(lambda x, n=n: np.asarray(x)[:n], law)
-            parts.append(_statistics(trimmed, law, given, calibration.estimator))
+    given = drawn(calibration, draws, seed)
+    size, parts = max(BLOCK // draws, 1), []
+    for begin in range(0, len(settings.steps), size):
+        block = settings[begin : begin + size]
+        parts.append(
+            _statistics(carry(calibration, given, block), locate_linear(calibration, block), given, calibration)
+        )
     found = _together(parts)
-    asked = zip(
-        settings.steps.tolist(), np.degrees(settings.aperture_rad).tolist(), settings.side.tolist(), strict=True
-    )
+    asked = zip(settings.steps.tolist(), settings.aperture_deg.tolist(), settings.side.tolist(), strict=True)
     refused = tuple(
         None if share <= DIVERGING_SHARE else calibration.refusal(pan, tilt, deg, (pan_side, tilt_side))
         for share, ((pan, tilt), deg, (pan_side, tilt_side)) in zip(found.diverging_share.tolist(), asked, strict=True)
@@ -201,35 +258,33 @@ def _together[T: (Locations, Validation)](parts: Sequence[T]) -> T:
     return replace(parts[0], **{name: joined([getattr(part, name) for part in parts]) for name in names})
 
 
-def _statistics(carried: Carried, law: Linear, given: Sources, estimator: str) -> Locations:
+def _statistics(carried: Carried, law: Linear, given: Drawn, calibration: Calibration) -> Locations:
     """Moments, intervals and validation of one block of points; none of them is refused by name yet."""
-    meets, xyz = np.asarray(carried.meets), np.array(carried.xyz_mm)
-    value, law_covariance = np.asarray(law.value), np.asarray(law.covariance)
+    meets, xyz = carried.meets, carried.xyz_mm.copy()
     lost = (~meets).mean(axis=0)
     count = len(meets)
     # The few draws without a point take the point's median place: at most one in a thousand, or the point is refused.
     for point in np.flatnonzero(~meets.all(axis=0) & meets.any(axis=0)):
         seen = meets[:, point]
-        xyz[~seen, :, point] = np.median(xyz[seen, :, point], axis=0)
+        xyz[~seen, point] = np.median(xyz[seen, point], axis=0)
     mean = xyz.mean(axis=0)
     centred = xyz - mean
-    covariance = np.einsum("dip,djp->pij", centred, centred) / (count - 1)
-    inputs = np.concatenate([np.asarray(given.inputs)[:, : len(INPUT_NAMES)], np.asarray(given.noise)], axis=1)
-    u = np.sqrt(np.einsum("pii->pi", law_covariance))
-    linearised = value + np.einsum("pik,dk->dpi", law.jacobian, inputs - np.asarray(given.mean))
-    draws = np.ascontiguousarray(xyz.transpose(0, 2, 1))
-    interval = symmetric_interval(draws)
+    covariance = np.einsum("dpi,dpj->pij", centred, centred) / (count - 1)
+    away = np.concatenate([given.inputs[:, : len(INPUT_NAMES)] - calibration.mean, given.noise], axis=1)
+    u = np.sqrt(np.einsum("pii->pi", law.covariance))
+    linearised = law.value + np.einsum("pik,dk->dpi", law.jacobian, away)
+    interval = symmetric_interval(xyz)
     empty = np.where(lost <= DIVERGING_SHARE, 0.0, np.nan)
     return Locations(
-        xyz_mm=mean.T + empty[:, None],
+        xyz_mm=mean + empty[:, None],
         covariance_mm2=covariance + empty[:, None, None],
         interval95_mm=interval.transpose(1, 0, 2) + empty[:, None, None],
         u95_mm=0.5 * (interval[1] - interval[0]) + empty[:, None],
         diverging_share=lost,
-        linear_xyz_mm=value + empty[:, None],
-        linear_covariance_mm2=law_covariance + empty[:, None, None],
-        validation=validate(draws, linearised, value, u),
+        linear_xyz_mm=law.value + empty[:, None],
+        linear_covariance_mm2=law.covariance + empty[:, None, None],
+        validation=validate(xyz, linearised, law.value, u),
         refused=(),
-        estimator=estimator,
+        estimator=calibration.estimator,
         draws=count,
     )

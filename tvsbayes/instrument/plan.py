@@ -7,7 +7,8 @@ axis where it is; `look` observes. A plan that does not begin with `home` begins
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
@@ -105,15 +106,14 @@ def write_plan(steps: Sequence[PlanStep], path: Path) -> None:
 
 @dataclass
 class PlanBuilder:
-    """Plan steps under construction, the counters (pan, tilt) they lead to, and the steps travelled since homing."""
+    """Plan steps under construction, and the counters (pan, tilt) they lead to."""
 
     steps: list[PlanStep] = field(default_factory=list)
     at: tuple[int, int] = (0, 0)
-    travelled: tuple[int, int] = (0, 0)
 
     def home(self, pan: int = 0, tilt: int = 0) -> None:
         """Begin a segment at these counters."""
-        self.at, self.travelled = (pan, tilt), (0, 0)
+        self.at = (pan, tilt)
         self.steps.append(PlanStep(len(self.steps), "home", pan, tilt))
 
     def place(self, target: str) -> None:
@@ -124,8 +124,6 @@ class PlanBuilder:
         """Move to absolute counters; nothing is ordered where they are reached already."""
         before, self.at = self.at, PlanStep(0, "move", pan, tilt).counters(self.at)
         if self.at != before:
-            far = [abs(after - start) for after, start in zip(self.at, before, strict=True)]
-            self.travelled = self.travelled[0] + far[0], self.travelled[1] + far[1]
             self.steps.append(PlanStep(len(self.steps), "move", *self.at))
 
     def look(self, experiment: int | None = None, point: int | None = None) -> None:
@@ -143,9 +141,14 @@ COST_KEYS = {"home": "move_s", "place": "placement_s", "move": "move_s", "look":
 """Entry of `[costs]` that each action of a plan takes; a homing counts as a move."""
 
 
+def action_seconds(rig: Rig, actions: Mapping[str, int]) -> float:
+    """Duration by `[costs]` of so many actions of each kind, s; what is left unstated costs nothing."""
+    return sum(count * float(rig.costs_s.get(COST_KEYS[action], 0.0)) for action, count in actions.items())
+
+
 def plan_seconds(rig: Rig, plan: Iterable[PlanStep]) -> float:
-    """Duration of a plan by `[costs]`, s; what a rig that no file describes leaves unstated costs nothing."""
-    return sum(float(rig.costs_s.get(COST_KEYS[step.action], 0.0)) for step in plan)
+    """Duration of a plan by `[costs]`, s."""
+    return action_seconds(rig, Counter(step.action for step in plan))
 
 
 @dataclass(frozen=True)
@@ -212,7 +215,7 @@ def run_plan(
                     remedy="put a `place` step before the first `look`",
                 )
             log.looks.append(PlannedLook(step, len(log.moves) - 1, len(log.targets) - 1))
-        time_s += plan_seconds(rig, (step,))
+        time_s += action_seconds(rig, {step.action: 1})
     return log
 
 

@@ -1,9 +1,4 @@
-"""Looks that the rig can make, and what each adds to what is known.
-
-`Looks` are plans whose every look is reached anew on both axes from a known side: their stop errors are independent and
-information adds up look by look; of the history only the length of the path remains (it carries the contrast of the two
-directions), and thousands of candidates are scored by low-rank updates. Counters in steps, angles in rad.
-"""
+"""Looks that the rig can make: within its limits, on its sheets, in both images. Counters in steps."""
 
 from __future__ import annotations
 
@@ -15,157 +10,14 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from tvsbayes.errors import InputError
-from tvsbayes.instrument.axes import AXES, FULL_TURN_DEG, SENSES, direction_of
-from tvsbayes.instrument.campaign import Move
+from tvsbayes.instrument.axes import AXES, FULL_TURN_DEG, SENSES
 from tvsbayes.instrument.counter_limits import CounterLimits
 from tvsbayes.instrument.parameters import INDEX
-from tvsbayes.instrument.plan import PlanBuilder, PlanStep
 from tvsbayes.instrument.protocols import UNSTATED_STEPS
 from tvsbayes.model.headlines import physical_at
-from tvsbayes.model.parameter_space import ParameterSpace
-from tvsbayes.planning.expectation import (
-    HOME_VARIANCE_RAD2,
-    LOOKS_PER_EXPERIMENT,
-    PARAMETERS,
-    Knowledge,
-    design_arrays,
-    expected_information,
-)
-
-
-@dataclass(frozen=True)
-class Looks:
-    """Looks that are each reached anew on both axes, arrays over looks.
-
-    Attributes:
-        steps: counters (pan, tilt), shape (m, 2).
-        side: +1 reached left or up, -1 right or down, shape (m, 2).
-        sheet: number of the sheet in the knowledge's order, shape (m,).
-    """
-
-    steps: np.ndarray
-    side: np.ndarray
-    sheet: np.ndarray
-
-    def __len__(self) -> int:
-        return len(self.sheet)
-
-    def __getitem__(self, chosen: np.ndarray) -> Looks:
-        return Looks(self.steps[chosen], self.side[chosen], self.sheet[chosen])
-
-
-@dataclass(frozen=True)
-class Arranged:
-    """Looks in the order of a plan.
-
-    Attributes:
-        steps: the plan.
-        order: look at each place of the plan, shape (m,).
-        path: steps travelled per axis since homing when each look (in the caller's order) is taken, shape (m, 2).
-    """
-
-    steps: tuple[PlanStep, ...]
-    order: np.ndarray
-    path: np.ndarray
-
-
-def arrange(looks: Looks, sheets: Sequence[str], overshoot: np.ndarray, home: tuple[int, int] = (0, 0)) -> Arranged:
-    """Order looks into a plan: each sheet placed once, side by side, every look with a run-up where it needs one.
-
-    Args:
-        looks: what is to be seen.
-        sheets: names, as `Looks.sheet` counts them.
-        overshoot: run-up (pan, tilt) in steps that takes up all play, shape (2,).
-        home: counters of the homing.
-    """
-    plan = PlanBuilder()
-    plan.home(*home)
-    order = np.lexsort((looks.steps[:, 0] * looks.side[:, 0], looks.side[:, 0], looks.side[:, 1], looks.sheet))
-    path = np.zeros((len(looks), 2), dtype=int)
-    placed = -1
-    for look in order:
-        if looks.sheet[look] != placed:
-            placed = int(looks.sheet[look])
-            plan.place(sheets[placed])
-        goal, side = looks.steps[look], looks.side[look]
-        run_up = (goal - plan.at) * side < overshoot
-        plan.move(*np.where(run_up, goal - side * overshoot, plan.at).tolist())
-        plan.move(*goal.tolist())
-        path[look] = plan.travelled
-        plan.look()
-    return Arranged(tuple(plan.steps), order, path)
-
-
-@dataclass(frozen=True)
-class Seen:
-    """What looks show at one point of parameter space: rows (m, 4, p + 2), slopes (m, 4, 2), and whether they do."""
-
-    rows: np.ndarray
-    slope: np.ndarray
-    seen: np.ndarray
-    mirror_angles_rad: np.ndarray
-
-    def __getitem__(self, chosen: np.ndarray) -> Seen:
-        return Seen(*(getattr(self, part.name)[chosen] for part in fields(Seen)))
-
-
-class LookArrays:
-    """Looks in front of the compiled function, in blocks of one size."""
-
-    BLOCK = 512
-
-    def __init__(self, looks: Looks, knowledge: Knowledge, aperture: bool):
-        self.rig, self.knowledge, self.blocks = knowledge.rig, knowledge, []
-        depth = np.array([knowledge.rig.sheets_mm[name] for name in knowledge.sheets])[looks.sheet]
-        for begin in range(0, len(looks), self.BLOCK):
-            part = slice(begin, begin + self.BLOCK)
-            moves = [
-                Move(i, i, 0.0, *steps, *map(direction_of, AXES, side))
-                for i, (steps, side) in enumerate(zip(looks.steps[part].tolist(), looks.side[part], strict=True))
-            ]
-            # Each look stands for itself: no home offsets.
-            arrays = design_arrays(moves, range(len(moves)), self.rig, homed_from=len(moves), aperture=aperture)
-            self.blocks.append((arrays, depth[part]))
-
-    def at(self, z: np.ndarray, space: ParameterSpace) -> Seen:
-        """Evaluate at a point."""
-        found = [expected_information(arrays, depth, self.rig, z, space) for arrays, depth in self.blocks]
-        return Seen(*(np.concatenate([getattr(block, part.name) for block in found]) for part in fields(Seen)))
-
-
-CONTRAST_COLUMNS = [INDEX["ratio_contrast_deg_per_step.pan"], INDEX["ratio_contrast_deg_per_step.tilt"]]
-
-
-def information_of_looks(
-    seen: Seen, chosen: np.ndarray, path: np.ndarray, space: ParameterSpace, homed: bool
-) -> np.ndarray:
-    """Fisher information of chosen looks, shape (p, p); equal to `information_of` of the arranged plan.
-
-    Args:
-        seen: all looks at one point.
-        chosen: numbers of those taken, repeats allowed, shape (k,).
-        path: steps travelled when each is taken, shape (k, 2).
-        space: priors, for the scale of the contrast.
-        homed: the session begins with an unknown home offset.
-    """
-    rows = seen.rows[chosen].copy()
-    # q = sum of k_dir dn = k n + (contrast / 2) x path.
-    scale = np.asarray(space.u)[CONTRAST_COLUMNS] * np.pi / 360
-    rows[..., CONTRAST_COLUMNS] = rows[..., PARAMETERS:] * (path * scale)[:, None, :]
-    flat = rows.reshape(-1, rows.shape[2])
-    information = flat.T @ flat
-    if not homed:
-        return information[:PARAMETERS, :PARAMETERS]
-    coupling = information[:PARAMETERS, PARAMETERS:]
-    offsets = information[PARAMETERS:, PARAMETERS:] + np.eye(2) / HOME_VARIANCE_RAD2
-    return information[:PARAMETERS, :PARAMETERS] - coupling @ np.linalg.solve(offsets, coupling.T)
-
-
-def covariance_of(information: np.ndarray) -> np.ndarray:
-    """Inverse of a positive definite matrix whose diagonal spans many orders of magnitude."""
-    scale = 1 / np.sqrt(np.diag(information))
-    return np.linalg.inv(information * np.outer(scale, scale)) * np.outer(scale, scale)
-
+from tvsbayes.planning.drawn_rigs import draws_of
+from tvsbayes.planning.expectation import LOOKS_PER_EXPERIMENT, Knowledge
+from tvsbayes.planning.looks import LookArrays, Looks
 
 PAN_LEVELS, TILT_LEVELS = 9, 5
 COARSE_PAN, COARSE_TILT = 31, 17
@@ -193,12 +45,6 @@ class Candidates:
     limits: np.ndarray
     turned: np.ndarray
     notes: tuple[str, ...]
-
-
-def draws_of(knowledge: Knowledge, count: int, generator: np.random.Generator) -> np.ndarray:
-    """Coordinates of instruments that may stand there, shape (count, p)."""
-    root = np.linalg.cholesky(knowledge.covariance)
-    return knowledge.z + generator.standard_normal((count, PARAMETERS)) @ root.T
 
 
 def overshoot_steps(knowledge: Knowledge) -> np.ndarray:
@@ -239,7 +85,7 @@ class Positions:
     def visible(self, knowledge: Knowledge, points: np.ndarray) -> np.ndarray:
         """Share of instruments at points (n, p) whose images both show the spot, shape (m,)."""
         arrays = LookArrays(Looks(self.steps, np.ones_like(self.steps), self.sheet), knowledge, False)
-        return np.mean([arrays.at(z, knowledge.space).seen for z in points], axis=0)
+        return arrays.in_images(points).mean(axis=0)
 
 
 def sided(positions: Positions, limits: np.ndarray, overshoot: np.ndarray) -> Looks:

@@ -12,16 +12,16 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from tvsbayes.errors import InputError
 from tvsbayes.estimators.campaign_arrays import NOWHERE_MM, CampaignArrays, SpotArrays, bucket, move_arrays, padded
-from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.estimators.likelihood import filter_rows, kalman_update, no_belief
 from tvsbayes.estimators.linear_spots import linearise
 from tvsbayes.estimators.looks import in_frame_s
@@ -33,14 +33,17 @@ from tvsbayes.instrument.rig import Rig
 from tvsbayes.instrument.stops import redraws
 from tvsbayes.model.compiled import compiled, placed
 from tvsbayes.model.geometry import image, materialise, rotation_matrix, transform
-from tvsbayes.model.laser_path import Ray, mirror_angles, trace
-from tvsbayes.model.parameter_space import ParameterSpace, parameter_space
+from tvsbayes.model.laser_path import MoveArrays, Ray, mirror_angles, trace
+from tvsbayes.model.parameter_space import Model, ParameterSpace, parameter_space
+
+if TYPE_CHECKING:
+    from tvsbayes.estimators.joint_fit import JointFit
 
 LOOKS_PER_EXPERIMENT = 4
 """The paper counts four spots as one experiment; so do all curves here, whatever the looks are."""
 PARAMETERS = len(NAMES)
 HOME_VARIANCE_RAD2 = math.radians(HOME_SD_DEG) ** 2
-SMALLEST_DESIGN, DESIGN_GROWTH = 128, 4
+SMALLEST_DESIGN, DESIGN_GROWTH = 512, 4
 """Looks are padded to this size or a power of four above it; moves to twice that."""
 
 
@@ -105,6 +108,32 @@ class Expectation(eqx.Module):
 NOISE_COLUMNS = np.isin(NAMES, NOISE_NAMES)
 
 
+class _MetSheet(eqx.Module):
+    """Where beams meet sheets of given depths X in frame S, and whether the points are in both images."""
+
+    points_mm: Float[Array, "3 looks"]
+    inside: Bool[Array, " looks"]
+
+
+def met_sheet(
+    model: Model,
+    moves: MoveArrays,
+    depth_mm: Float[Array, " looks"],
+    image_px: Float[Array, "4"],
+    look_moves: Int[Array, " looks"] | slice = slice(None),
+) -> _MetSheet:
+    """Looks after some of the moves, by default after each, at sheets across X without an error of their own."""
+    pan, tilt = mirror_angles(model.transmission, model.tilt_zero_rad, moves).angle_rad[look_moves].T
+    ray = trace(model.optics, pan, tilt)
+    turn = rotation_matrix(model.extrinsics.rotation_rad)
+    ray = materialise(Ray(in_frame_s(model.extrinsics, ray.origin_mm), transform(turn, ray.direction)))
+    reach = (depth_mm - ray.origin_mm.x) / ray.direction.x
+    points = materialise(ray.at(jnp.where(jnp.isfinite(reach), reach, 0.0)))
+    pixels = jnp.stack(image(model.cameras, points))
+    inside = jnp.all((pixels >= 0) & (pixels <= image_px[:, None]), axis=0)
+    return _MetSheet(points.stacked(), (reach > 0) & inside)
+
+
 @compiled(Expectation)
 def expect(
     z: Float[Array, " parameters"],
@@ -125,22 +154,14 @@ def expect(
     Returns:
         Expectation of every look, padding included.
     """
-    model = space.model(z)
     spots = arrays.spots
-    pan, tilt = mirror_angles(model.transmission, model.tilt_zero_rad, arrays.moves).angle_rad[spots.move_index].T
-    ray = trace(model.optics, pan, tilt)
-    turn = rotation_matrix(model.extrinsics.rotation_rad)
-    ray = materialise(Ray(in_frame_s(model.extrinsics, ray.origin_mm), transform(turn, ray.direction)))
-    reach = (depth_mm - ray.origin_mm.x) / ray.direction.x
-    points = materialise(ray.at(jnp.where(jnp.isfinite(reach), reach, 0.0)))
-    pixels = jnp.stack(image(model.cameras, points))
-    inside = jnp.all((pixels >= 0) & (pixels <= image_px[:, None]), axis=0)
-    seen = (reach > 0) & inside & (spots.valid > 0)
+    met = met_sheet(space.model(z), arrays.moves, depth_mm, image_px, spots.move_index)
+    seen = met.inside & (spots.valid > 0)
     harmless = jnp.array(NOWHERE_MM)[:, None]
     arrays = eqx.tree_at(
         lambda a: (a.spots.valid, a.spots.triangulated_mm),
         arrays,
-        (jnp.where(seen, 1.0, 0.0), jnp.where(seen, points.stacked(), harmless).T),
+        (jnp.where(seen, 1.0, 0.0), jnp.where(seen, met.points_mm, harmless).T),
     )
     spots = arrays.spots
     lin = linearise(z, space, arrays)
@@ -169,13 +190,13 @@ def design_arrays(
         move_arrays(moves, 2 * size),
         SpotArrays(
             move_index=padded(look_moves, size, look_moves[-1], np.int32),
-            pixels=placed(np.zeros((size, 4))),
-            whitening=placed(np.tile(np.eye(4) / rig.spot_sd_px, (size, 1, 1))),
-            aperture_rad=placed(np.zeros(size)),
+            pixels=padded(np.zeros((count, 4)), size),
+            whitening=padded(np.tile(np.eye(4) / rig.spot_sd_px, (count, 1, 1)), size, np.eye(4)),
+            aperture_rad=padded(np.zeros(count), size),
             has_aperture=padded([float(aperture)] * count, size),
-            triangulated_mm=placed(np.zeros((size, 3))),
+            triangulated_mm=padded(np.zeros((count, 3)), size),
             valid=padded([1.0] * count, size),
-            weight=placed(np.ones(size)),
+            weight=padded([1.0] * count, size, 1.0),
             redraw=padded(new.redraw, size, False, bool),
             redraw_mix=padded(new.redraw_mix, size),
             new_segment=padded(new.new_segment, size, False, bool),
@@ -185,14 +206,18 @@ def design_arrays(
     )
 
 
+def largest_px(rig: Rig) -> np.ndarray:
+    """Largest (u, v, u, v) inside the images of a rig, shape (4,)."""
+    return np.tile([rig.stereo.image_width - 1.0, rig.stereo.image_height - 1.0], 2)
+
+
 def expected_information(
     arrays: CampaignArrays, depth_mm: np.ndarray, rig: Rig, z: np.ndarray, space: ParameterSpace
 ) -> Expectation:
     """`expect` without padding, as NumPy arrays."""
     count = len(depth_mm)
-    last = np.tile([rig.stereo.image_width - 1.0, rig.stereo.image_height - 1.0], 2)
     depths = padded(depth_mm, len(arrays.spots.valid), depth_mm[-1])
-    found = expect(z, space, arrays, depths, last)
+    found = expect(z, space, arrays, depths, largest_px(rig))
     return jax.tree.map(lambda x: np.asarray(x)[:count], found)
 
 

@@ -1,218 +1,25 @@
-"""Drawn rigs: the chance that the joint fit of a design meets the target, and what the classic estimator would do.
-
-An instrument is drawn from `[truth]` of the rig file, or from the posterior of a campaign. Values in the target's unit,
-the classic's in deg/step.
-"""
+"""What the paper's four-point estimator would do on drawn rigs, and its own number of experiments; deg/step."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
-from scipy import stats
+from scipy import special
 
-from tvsbayes.errors import InputError, TvsError
+from tvsbayes.errors import TvsError
 from tvsbayes.estimators.four_point import classic, ratio_slopes, select_experiments
 from tvsbayes.instrument.axes import DIRECTIONS
 from tvsbayes.instrument.campaign import Campaign
-from tvsbayes.instrument.parameters import INDEX, NAMES, RIG_NAMES
+from tvsbayes.instrument.parameters import NAMES, RIG_NAMES
 from tvsbayes.instrument.protocols import four_point_protocol
-from tvsbayes.model.compiled import placed
-from tvsbayes.model.headlines import physical_at
-from tvsbayes.model.parameter_space import STOP_COLUMNS, ParameterSpace, coordinates_of
-from tvsbayes.planning.candidates import (
-    Arranged,
-    Candidates,
-    LookArrays,
-    Looks,
-    Seen,
-    arrange,
-    covariance_of,
-    draws_of,
-    information_of_looks,
-)
-from tvsbayes.planning.expectation import LOOKS_PER_EXPERIMENT, NOISE_COLUMNS, PARAMETERS, Knowledge
-from tvsbayes.planning.target import Sensitivity, Target, sensitivity
+from tvsbayes.planning.drawn_rigs import Instruments
+from tvsbayes.planning.expectation import Knowledge
+from tvsbayes.planning.target import Target
 from tvsbayes.statistics.intervals import NORMAL_95, coverage_factor
 from tvsbayes.twin.physics import effective_deg_per_step
-from tvsbayes.twin.simulated_campaign import Truth, draw_truth, simulate, with_derived
-
-
-@dataclass(frozen=True)
-class DrawnTruth:
-    """A point of parameter space that may be true, and the space in which it has coordinates."""
-
-    z: np.ndarray
-    space: ParameterSpace
-
-
-def truth_in(knowledge: Knowledge, parameters: Mapping[str, float], stereo_vector: np.ndarray) -> DrawnTruth:
-    """Coordinates of a rig under the ANALYSIS priors; what these hold fixed is held at its true value.
-
-    Args:
-        knowledge: gives the analysis priors.
-        parameters: physical values by contract name.
-        stereo_vector: true cameras, shape (24,).
-    """
-    space = knowledge.space
-    true = np.array([parameters[name] for name in RIG_NAMES])
-    z = coordinates_of(space, np.concatenate([true, stereo_vector]))
-    # A half-normal with u = 0 is 0 whatever its value; nothing else can be stated for it.
-    held = np.where(np.asarray(space.u) > 0, np.asarray(space.value), true)
-    return DrawnTruth(z, replace(space, value=placed(held)))
-
-
-def draw_truths(knowledge: Knowledge, count: int, seed: int) -> list[DrawnTruth]:
-    """Instruments that may stand there: from `[truth]` of the rig file (the design prior), or from the posterior."""
-    generator = np.random.default_rng([seed, 31])
-    if knowledge.after_data:
-        return [DrawnTruth(z, knowledge.space) for z in draws_of(knowledge, count, generator)]
-    drawn = (draw_truth(knowledge.rig, generator) for _ in range(count))
-    return [truth_in(knowledge, t.parameters, t.stereo.vector) for t in drawn]
-
-
-PIXEL_COLUMN = INDEX["pixel_scale"]
-
-
-def believed(
-    truth: DrawnTruth, seen: Seen, side: np.ndarray, covariance: np.ndarray, knowledge: Knowledge, noise: np.ndarray
-) -> np.ndarray:
-    """Coordinates at which a fit will judge its own uncertainty: the true ones, noise scales as it will estimate them.
-
-    A standard deviation is known from n stops to 1 / sqrt(2 n): the log of each scale has the expected information
-    2 sum (s^2 m / (1 + s^2 m))^2 over the stops of its direction, m what the pixels know of one stop, less what the
-    geometry takes from them; its estimate lies between prior and truth by the weights of both, and scatters.
-
-    Args:
-        truth: the instrument.
-        seen: the looks taken.
-        side: their sides, shape (m, 2).
-        covariance: of the coordinates after the looks, shape (p, p).
-        knowledge: before the looks.
-        noise: five standard normal numbers: stops by direction (right, left, down, up), pixels.
-
-    Returns:
-        Shape (p,).
-    """
-    z, u = truth.z.copy(), np.asarray(truth.space.u)
-    physical = physical_at(z, truth.space).value
-    looks = max(int(seen.seen.sum()), 1)
-    rig_columns = ~NOISE_COLUMNS & (np.arange(PARAMETERS) < len(RIG_NAMES))
-    determined = np.sum(1 - np.diag(covariance)[rig_columns] * np.diag(knowledge.precision)[rig_columns])
-    left_over = max(0.0, 1 - determined / (2 * looks))
-
-    def estimated(column: int, information: float, normal: float) -> None:
-        information *= u[column] ** 2 * left_over
-        before = knowledge.precision[column, column]
-        mean = before * knowledge.z[column] + information * z[column] + math.sqrt(information) * normal
-        z[column] = mean / (before + information)
-
-    for axis in range(2):
-        known = np.sum(seen.slope[..., axis] ** 2, axis=1) * seen.seen
-        for which, sign in enumerate((-1, 1)):
-            column = STOP_COLUMNS[axis, which]
-            share = known * math.radians(physical[column]) ** 2
-            share = (share / (1 + share))[side[:, axis] == sign]
-            estimated(column, 2 * float(np.sum(share**2)), noise[2 * axis + which])
-    estimated(PIXEL_COLUMN, 2.0 * looks, noise[4])
-    return z
-
-
-@dataclass(frozen=True)
-class Family:
-    """Designs that grow by one look at a time: the first 4 n of `picks` are n experiments."""
-
-    knowledge: Knowledge
-    found: Candidates
-    picks: np.ndarray
-    aperture: bool
-
-    def looks(self, experiments: int) -> Looks:
-        """Looks of n experiments."""
-        return self.found.looks[self.picks[: LOOKS_PER_EXPERIMENT * experiments]]
-
-    def arranged(self, experiments: int) -> Arranged:
-        """Their plan."""
-        return arrange(self.looks(experiments), self.knowledge.sheets, self.found.overshoot)
-
-    @property
-    def largest(self) -> int:
-        """Experiments of the largest design."""
-        return len(self.picks) // LOOKS_PER_EXPERIMENT
-
-
-class Assurance:
-    """What fits of the designs of a family will report, over drawn truths; one evaluation of the looks per truth."""
-
-    def __init__(self, family: Family, target: Target, draws: int, seed: int):
-        self.family, self.target, self.seed = family, target, seed
-        self.truths = draw_truths(family.knowledge, draws, seed)
-        self.noise = np.random.default_rng([seed, 37]).standard_normal((draws, 5))
-        self.distinct, self.index = np.unique(family.picks, return_inverse=True)
-        self.looks = family.found.looks[self.distinct]
-        self.arrays = LookArrays(self.looks, family.knowledge, family.aperture)
-        self._values: dict[int, np.ndarray] = {}
-
-    def of(self, family: Family) -> Assurance:
-        """The same instruments before other designs."""
-        return Assurance(family, self.target, len(self.truths), self.seed)
-
-    def values(self, sizes: Sequence[int]) -> dict[int, np.ndarray]:
-        """Reported uncertainty of the target at each truth, shape (draws,), by number of experiments."""
-        wanted = [n for n in sizes if n not in self._values]
-        knowledge, designs = self.family.knowledge, {n: self.family.arranged(n) for n in wanted}
-        found = {n: np.full(len(self.truths), np.inf) for n in wanted}
-        for row, (truth, noise) in enumerate(zip(self.truths, self.noise, strict=True)):
-            if not wanted:
-                break
-            seen = self.arrays.at(truth.z, truth.space)
-            if not seen.seen.any():
-                continue
-            pose = seen.mirror_angles_rad[self.index].mean(axis=0)
-            try:
-                at_truth = sensitivity(self.target, truth.z, truth.space, knowledge.rig.table, pose)
-            except InputError:
-                continue
-            for n in wanted:
-                found[n][row] = self._reported(truth, noise, seen, at_truth, n, designs[n])
-        self._values |= found
-        return {n: self._values[n] for n in sizes}
-
-    def met_share(self, experiments: int) -> float:
-        """Share of the truths whose fit of n experiments reports the target as met."""
-        return float(np.mean(self.values([experiments])[experiments] <= self.target.limit))
-
-    def _reported(
-        self, truth: DrawnTruth, noise: np.ndarray, seen: Seen, at_truth: Sensitivity, n: int, design: Arranged
-    ) -> float:
-        knowledge, chosen = self.family.knowledge, self.index[: LOOKS_PER_EXPERIMENT * n]
-
-        def covariance(scene: Seen) -> np.ndarray:
-            information = information_of_looks(scene, chosen, design.path, truth.space, knowledge.after_data)
-            return covariance_of(knowledge.precision + information)
-
-        z = believed(truth, seen[chosen], self.looks.side[chosen], covariance(seen), knowledge, noise)
-        return at_truth.value(covariance(self.rescaled(seen, truth, z)), self.target.factor)
-
-    def rescaled(self, seen: Seen, truth: DrawnTruth, z: np.ndarray) -> Seen:
-        """The same looks whitened with other noise scales: I s^2 + slope S slope^T per look."""
-        names = [*STOP_COLUMNS.ravel(), PIXEL_COLUMN]
-        u, true = np.asarray(truth.space.u)[names], np.asarray(truth.space.value)[names]
-        before, after = (true * np.exp(u * point[names]) for point in (truth.z, z))
-        pixel = after[4] / before[4]
-        variance = [
-            np.radians(scale[:4].reshape(2, 2)[[0, 1], (self.looks.side > 0).astype(int)]) ** 2
-            for scale in (before, after)
-        ]
-        # Both roots are taken in the three dimensions that the residual has; rows are turned, not only scaled.
-        old, new = (
-            p**2 * np.eye(4) + np.einsum("mia,ma,mja->mij", seen.slope, v, seen.slope)
-            for p, v in zip((1.0, pixel), variance, strict=True)
-        )
-        raw = np.linalg.cholesky(old) @ seen.rows
-        return replace(seen, rows=np.linalg.solve(np.linalg.cholesky(new), raw))
+from tvsbayes.twin.simulated_campaign import Truth, simulate, with_derived
 
 
 @dataclass(frozen=True)
@@ -233,7 +40,7 @@ class ClassicForecast:
 CLASSIC_DRAWS = 100
 
 
-def classic_forecast(knowledge: Knowledge, truths: Sequence[DrawnTruth]) -> ClassicForecast | None:
+def classic_forecast(knowledge: Knowledge, instruments: Instruments) -> ClassicForecast | None:
     """Run the paper's experiments on drawn instruments without noise; None where the rig has no two sheets.
 
     Pixels by the twin; noise by first-order propagation of pixel noise and of the two stops of an experiment.
@@ -243,10 +50,9 @@ def classic_forecast(knowledge: Knowledge, truths: Sequence[DrawnTruth]) -> Clas
         return None
     near, far = knowledge.sheets[0], knowledge.sheets[1]
     plan = four_point_protocol(2, targets=(near, far))
-    sds, errors = [], []
+    pixels, steps, axes, effective, stops, spot_sds = [], [], [], [], [], []
     first = None
-    for truth in truths[:CLASSIC_DRAWS]:
-        physical = np.asarray(physical_at(truth.z, truth.space).value)
+    for physical in instruments.physical[:CLASSIC_DRAWS]:
         parameters = dict(zip(NAMES, map(float, physical), strict=True))
         quiet = dict.fromkeys([f"stop_sd_deg.{d}" for d in DIRECTIONS] + ["pixel_scale"], 0.0)
         stereo = rig.stereo.with_vector(physical[len(RIG_NAMES) :])
@@ -257,22 +63,24 @@ def classic_forecast(knowledge: Knowledge, truths: Sequence[DrawnTruth]) -> Clas
         pose = run.truth.reference_pose_deg
         if len(later) < len(DIRECTIONS) or pose is None:
             continue
-        steps = selection.steps[later]
-        found = ratio_slopes(selection.pixels[later], steps, selection.axis[later], rig.stereo)
-        effective = effective_deg_per_step(with_derived(parameters), pose)
-        true = np.array([effective[d] for d in DIRECTIONS])
-        stops = np.array([parameters[f"stop_sd_deg.{d}"] ** 2 for d in DIRECTIONS])
-        pair = stops + stops[[1, 0, 3, 2]]
-        spot_sd = rig.spot_sd_px * parameters["pixel_scale"]
-        variance = np.sum(found.by_pixel**2, axis=(1, 2)) * spot_sd**2 + pair * (found.ratio / true / steps) ** 2
-        sds.append(np.sqrt(variance))
-        errors.append(found.ratio - true)
+        pixels.append(selection.pixels[later])
+        steps.append(selection.steps[later])
+        axes.append(selection.axis[later])
+        true = effective_deg_per_step(with_derived(parameters), pose)
+        effective.append([true[d] for d in DIRECTIONS])
+        stops.append([parameters[f"stop_sd_deg.{d}"] ** 2 for d in DIRECTIONS])
+        spot_sds.append([rig.spot_sd_px * parameters["pixel_scale"]])
         first = run.campaign if first is None else first
     if first is None:
         return None
+    found = ratio_slopes(np.concatenate(pixels), np.concatenate(steps), np.concatenate(axes), rig.stereo)
+    ratio = found.ratio.reshape(-1, len(DIRECTIONS))
+    by_pixel = np.sum(found.by_pixel**2, axis=(1, 2)).reshape(ratio.shape)
+    pair = np.array(stops) + np.array(stops)[:, [1, 0, 3, 2]]
+    variance = by_pixel * np.array(spot_sds) ** 2 + pair * (ratio / np.array(effective) / np.array(steps)) ** 2
     # Every direction has its experiments, else the draw was left out.
     stereo_u = np.array([r.u_stereo_deg_per_step for r in classic(first).directions.values() if r is not None])
-    return ClassicForecast(np.array(sds), np.array(errors), stereo_u)
+    return ClassicForecast(np.sqrt(variance), ratio - np.array(effective), stereo_u)
 
 
 def classic_count(sd: float, half_width: float) -> int:
@@ -327,7 +135,7 @@ def classic_answer(target: Target, forecast: ClassicForecast | None, campaign: C
         low, sd, high = np.quantile(forecast.sd[:, index], [0.025, 0.5, 0.975])
         if measured is not None and measured.get(direction) is not None:
             sd, n = measured[direction]
-            low, high = (sd * math.sqrt((n - 1) / stats.chi2.ppf(p, n - 1)) for p in (0.975, 0.025))
+            low, high = (sd * math.sqrt((n - 1) / special.chdtri(n - 1, p)) for p in (0.025, 0.975))
         error = np.quantile(forecast.error[:, index], [0.5, 0.025, 0.975])
         counts = [classic_count(float(s), half_width) for s in (low, sd, high)]
         answers.append(

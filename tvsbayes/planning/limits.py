@@ -11,8 +11,9 @@ import numpy as np
 from tvsbayes.instrument.parameters import NAMES, PRIOR_GROUPS, RIG_NAMES
 from tvsbayes.instrument.plan import described
 from tvsbayes.instrument.rig import RigTable
-from tvsbayes.planning.candidates import Candidates, Seen, arrange, covariance_of, information_of_looks
-from tvsbayes.planning.expectation import LOOKS_PER_EXPERIMENT, Knowledge, plan_minutes
+from tvsbayes.planning.candidates import Candidates
+from tvsbayes.planning.expectation import LOOKS_PER_EXPERIMENT, Knowledge
+from tvsbayes.planning.looks import Seen, arrange, covariance_of, information_of_looks
 from tvsbayes.planning.search import search_designs
 from tvsbayes.planning.target import Sensitivity, Target
 from tvsbayes.results.plan_record import Advice, Batch
@@ -162,7 +163,7 @@ def next_experiments(
             design = arrange(found.looks[picks], knowledge.sheets, found.overshoot)
             information = information_of_looks(seen, picks, design.path, knowledge.space, knowledge.after_data)
             after = at_centre.value(covariance_of(knowledge.precision + information), target.factor)
-            minutes = plan_minutes(design.steps, knowledge.rig)
+            minutes = design.minutes(knowledge.rig)
             text = f"{'a full turn of pan away, ' if turned else ''}{described(knowledge.rig, design.steps)}"
             gain = max(now - after, 0.0)
             batches.append(Batch(design.steps, minutes, gain, gain / max(minutes, 1e-9), text))

@@ -21,8 +21,9 @@ from tvsbayes.instrument.plan import PlanStep, described, run_plan, step_json
 from tvsbayes.instrument.rig import Rig
 from tvsbayes.instrument.stops import Stop, few_stops, inseparable, observed_stops, one_sided, separation
 from tvsbayes.model.headlines import QUANTITIES, headlines
-from tvsbayes.planning.candidates import Candidates, LookArrays, Looks, arrange, candidates, covariance_of
+from tvsbayes.planning.candidates import Candidates, candidates
 from tvsbayes.planning.expectation import PARAMETERS, Knowledge, PlanInformation, information_of, prior_knowledge
+from tvsbayes.planning.looks import LookArrays, Looks, arrange, covariance_of
 from tvsbayes.planning.search import Search
 from tvsbayes.results.estimates import CONTRACTION_LIMIT
 
@@ -180,8 +181,8 @@ def _cure(
     search = Search(seen.rows[..., :PARAMETERS], precision, before.gradient[rows], own, "A")
     placed = run_plan(steps, knowledge.rig).sheet
     here = found.looks.sheet == (knowledge.sheets.index(placed) if placed in knowledge.sheets else 0)
-    picks = np.array(search.among(here).greedy(CURE_LOOKS))
-    for count in range(1, CURE_LOOKS + 1):
+    picks = np.array(search.among(here).greedy(CURE_LOOKS), dtype=int)
+    for count in range(1, len(picks) + 1):
         addition = extended(steps, found.looks[picks[:count]], knowledge, found.overshoot)
         after = judge((*steps, *addition), knowledge)
         if after.fault(axis) is None:

@@ -8,11 +8,11 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from tvsbayes.errors import InputError, NotConverged
-from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.estimators.linear_spots import LinearSpots, stop_information
 from tvsbayes.instrument.axes import AXES, DIRECTION_SIGNS
 from tvsbayes.instrument.campaign import Campaign
@@ -20,39 +20,33 @@ from tvsbayes.instrument.plan import PlanStep, step_json
 from tvsbayes.instrument.protocols import grid_protocol, mixed_protocol, paper_protocol
 from tvsbayes.instrument.rig import Rig
 from tvsbayes.instrument.stops import FEW_STOPS, inseparable, too_few
-from tvsbayes.planning.candidates import (
-    Candidates,
-    LookArrays,
-    Looks,
-    Seen,
-    candidates,
-    covariance_of,
-    information_of_looks,
-)
+from tvsbayes.planning.assurance import Assurance, Family
+from tvsbayes.planning.candidates import Candidates, candidates
 from tvsbayes.planning.expectation import (
     Expectation,
     Knowledge,
     PlanInformation,
     information_of,
     knowledge_of,
-    plan_minutes,
     prior_knowledge,
 )
 from tvsbayes.planning.forecast import (
-    Assurance,
     ClassicAnswer,
     ClassicForecast,
-    Family,
     classic_answer,
     classic_forecast,
     value_of_classic,
 )
 from tvsbayes.planning.limits import Limit, limit_of, next_experiments, split_of, stop_now
+from tvsbayes.planning.looks import LookArrays, Looks, Seen, covariance_of, information_of_looks
 from tvsbayes.planning.plan_check import judge
 from tvsbayes.planning.search import LADDER, Scope, design_family, refine, smallest_design
 from tvsbayes.planning.target import Sensitivity, Target, sensitivity
 from tvsbayes.results.plan_record import Advice, Batch
 from tvsbayes.statistics.chances import ASSURED, share_error
+
+if TYPE_CHECKING:
+    from tvsbayes.estimators.joint_fit import JointFit
 
 
 @dataclass(frozen=True)
@@ -227,7 +221,7 @@ def _curve(
     Noise scales estimated from few stops make single draws jump; a row states the best of all sizes up to its own,
     so that more experiments never look worse. A best of estimates leans towards the hopeful side.
     """
-    target, draws = assurance.target, len(assurance.truths)
+    target, draws = assurance.target, len(assurance.instruments)
     rows, best, surest = [], math.inf, 0.0
     for n in sorted(set(sizes)):
         reported = assurance.values([n])[n]
@@ -291,7 +285,7 @@ def _question(knowledge: Knowledge, target: Target, pose_rad: np.ndarray | None,
 
 def _durations(family: Family, scope: Scope) -> dict[int, float]:
     """Minutes of every number of experiments that the time allows."""
-    durations = {n: plan_minutes(family.arranged(n).steps, family.knowledge.rig) for n in range(1, scope.largest + 1)}
+    durations = {n: family.arranged(n).minutes(family.knowledge.rig) for n in range(1, scope.largest + 1)}
     allowed = {n: minutes for n, minutes in durations.items() if scope.minutes is None or minutes <= scope.minutes}
     if not allowed:
         raise InputError(
@@ -342,7 +336,7 @@ def plan_from(
     family = design_family(knowledge, asked.found, asked.seen, target, asked.at_centre, scope)
     durations = _durations(family, scope)
     assurance = Assurance(family, target, draws, seed)
-    forecast = classic_forecast(knowledge, assurance.truths)
+    forecast = classic_forecast(knowledge, assurance.instruments)
     size = _size(assurance, forecast, durations)
     refined = refine(family, asked.seen, target, asked.at_centre, size.experiments, scope, assurance)
     steps = refined.family.arranged(size.experiments).steps

@@ -14,9 +14,10 @@ from itertools import combinations
 import numpy as np
 
 from tvsbayes.model.headlines import QUANTITIES, headlines
-from tvsbayes.planning.candidates import CONTRAST_COLUMNS, Candidates, Seen, covariance_of, information_of_looks
-from tvsbayes.planning.expectation import HOME_VARIANCE_RAD2, LOOKS_PER_EXPERIMENT, PARAMETERS, Knowledge, plan_minutes
-from tvsbayes.planning.forecast import Assurance, Family
+from tvsbayes.planning.assurance import Assurance, Family
+from tvsbayes.planning.candidates import Candidates
+from tvsbayes.planning.expectation import HOME_VARIANCE_RAD2, LOOKS_PER_EXPERIMENT, PARAMETERS, Knowledge
+from tvsbayes.planning.looks import CONTRAST_COLUMNS, Seen, covariance_of, information_of_looks
 from tvsbayes.planning.target import Sensitivity, Target
 
 CRITERIA = ("c", "D", "A")
@@ -38,6 +39,39 @@ def scores(variances: np.ndarray, reference: np.ndarray, criterion: str) -> np.n
     return diagonal.max(axis=-1) + MEAN_WEIGHT * diagonal.mean(axis=-1)
 
 
+@dataclass(frozen=True)
+class _Prospects:
+    """What every candidate would tell if it were the next look; the last axis counts the candidates.
+
+    Attributes:
+        covariance: of the columns, before it, shape (P, P).
+        inner: of what it shows, its noise included, shape (4, 4, m).
+        moved: of that with the quantities, shape (4, q, m).
+    """
+
+    covariance: np.ndarray
+    inner: np.ndarray
+    moved: np.ndarray
+
+    def gain(self) -> np.ndarray:
+        """What it takes from the covariance of the quantities, moved^T inner^-1 moved, shape (q, q, m).
+
+        By elimination of all candidates at once: LAPACK takes longer to be called for each.
+        """
+        inner, moved = self.inner.copy(), self.moved.copy()
+        gain = np.zeros((moved.shape[1], *moved.shape[1:]))
+        for i in range(len(inner)):
+            gain += moved[i, :, None] * (moved[i] / inner[i, i])
+            factor = inner[i + 1 :, i] / inner[i, i]
+            inner[i + 1 :, i + 1 :] -= factor[:, None] * inner[i, i + 1 :]
+            moved[i + 1 :] -= factor[:, None] * moved[i]
+        return gain
+
+
+REFRESHED = 16
+"""Looks added before prospects are computed anew: what differences lose adds up."""
+
+
 @dataclass
 class Search:
     """Greedy choice and exchange of looks by low-rank updates of one covariance.
@@ -48,6 +82,7 @@ class Search:
         gradient: d(quantity)/d(column), shape (q, P).
         own: variance beside it, shape (q,).
         criterion: see `scores`.
+        numbers: by which candidates are called, ascending, shape (m,); by default their places in `rows`.
 
     A quantity that the priors hold fixed has no variance to lower and is left out.
     """
@@ -57,65 +92,89 @@ class Search:
     gradient: np.ndarray
     own: np.ndarray
     criterion: str = "c"
+    numbers: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         self.covariance = covariance_of(self.precision)
         uncertain = np.diag(self._quantities(self.covariance)) > 0
         self.gradient, self.own = self.gradient[uncertain], self.own[uncertain]
         self.reference = np.diag(self._quantities(self.covariance)).copy()
+        self.numbers = np.arange(len(self.rows)) if self.numbers is None else self.numbers
+        # Candidates last, as prospects have them: the wide products then need no copy.
+        self.columns = np.ascontiguousarray(self.rows.transpose(2, 1, 0)).reshape(self.rows.shape[2], -1)
 
     def _quantities(self, covariance: np.ndarray) -> np.ndarray:
         return self.gradient @ covariance @ self.gradient.T + np.diag(self.own)
 
-    def after_one_more(self, covariance: np.ndarray) -> np.ndarray:
-        """Score of every candidate if it were added, shape (m,): C - B^T K^-1 B, one 4 x 4 solve each."""
-        count, _, columns = self.rows.shape
-        spread = (self.rows.reshape(-1, columns) @ covariance).reshape(count, 4, columns)
-        inner = spread @ self.rows.transpose(0, 2, 1) + np.eye(4)
-        moved = spread @ self.gradient.T
-        gain = np.swapaxes(moved, 1, 2) @ np.linalg.solve(inner, moved)
-        return scores(self._quantities(covariance) - gain, self.reference, self.criterion)
+    def _prospects(self, covariance: np.ndarray) -> _Prospects:
+        count, components, columns = self.rows.shape
+        spread = (self.rows.reshape(-1, columns) @ covariance).reshape(self.rows.shape)
+        inner = (spread @ self.rows.transpose(0, 2, 1)).transpose(1, 2, 0) + np.eye(components)[:, :, None]
+        moved = (self.gradient @ covariance @ self.columns).reshape(len(self.gradient), components, count)
+        return _Prospects(covariance, inner, moved.swapaxes(0, 1))
 
-    def _with(self, covariance: np.ndarray, look: int) -> np.ndarray:
-        """Covariance with one look more."""
-        row = self.rows[look]
-        spread = row @ covariance
-        updated = covariance - spread.T @ np.linalg.solve(np.eye(4) + spread @ row.T, spread)
-        return 0.5 * (updated + updated.T)
+    def _scores(self, prospects: _Prospects) -> np.ndarray:
+        left = self._quantities(prospects.covariance)[:, :, None] - prospects.gain()
+        return scores(np.moveaxis(left, -1, 0), self.reference, self.criterion)
+
+    def after_one_more(self, covariance: np.ndarray) -> np.ndarray:
+        """Score of every candidate if it were added, shape (m,): C - B^T K^-1 B, K of four components."""
+        return self._scores(self._prospects(covariance))
+
+    def _with(self, prospects: _Prospects, place: int) -> _Prospects:
+        """Prospects after one look more: every covariance loses the product of its parts along the look."""
+        row, (components, _, count) = self.rows[place], prospects.inner.shape
+        root = np.linalg.cholesky(np.eye(components) + row @ prospects.covariance @ row.T)
+        along = np.linalg.solve(root, row @ prospects.covariance)
+        seen = (along @ self.columns).reshape(components, components, count)
+        inner = prospects.inner - sum(part[:, None] * part for part in seen)
+        told = along @ self.gradient.T
+        moved = prospects.moved - sum(part[:, None] * one[:, None] for part, one in zip(seen, told, strict=True))
+        covariance = prospects.covariance - along.T @ along
+        return _Prospects(0.5 * (covariance + covariance.T), inner, moved)
 
     def greedy(self, count: int) -> list[int]:
-        """The best look, then the best beside it, and so on."""
-        covariance, picks = self.covariance, []
-        for _ in range(count):
-            picks.append(int(np.argmin(self.after_one_more(covariance))))
-            covariance = self._with(covariance, picks[-1])
-        return picks
+        """The best look, then the best beside it, and so on; nothing where there is no candidate."""
+        prospects, places = self._prospects(self.covariance), []
+        for chosen in range(1, count + 1 if len(self.rows) else 1):
+            places.append(int(np.argmin(self._scores(prospects))))
+            prospects = self._with(prospects, places[-1])
+            if chosen % REFRESHED == 0:
+                prospects = self._prospects(prospects.covariance)
+        return self._called(places)
+
+    def _called(self, places: Sequence[int]) -> list[int]:
+        return np.asarray(self.numbers)[list(places)].tolist()
+
+    def _places(self, picks: Sequence[int]) -> list[int]:
+        return np.searchsorted(np.asarray(self.numbers), list(picks)).tolist()
 
     def among(self, here: np.ndarray) -> Search:
         """The same search with only some candidates to choose from, shape (m,)."""
-        return replace(self, rows=np.where(here[:, None, None], self.rows, 0.0))
+        return replace(self, rows=self.rows[here], numbers=np.asarray(self.numbers)[here])
+
+    def _after(self, places: Sequence[int]) -> np.ndarray:
+        """Covariance of the columns after a design."""
+        rows = self.rows[list(places)].reshape(-1, self.rows.shape[2])
+        return covariance_of(self.precision + rows.T @ rows)
 
     def value(self, picks: Sequence[int]) -> float:
         """Score of a design."""
-        rows = self.rows[list(picks)].reshape(-1, self.rows.shape[2])
-        covariance = covariance_of(self.precision + rows.T @ rows)
-        return float(scores(self._quantities(covariance), self.reference, self.criterion))
+        return float(scores(self._quantities(self._after(self._places(picks))), self.reference, self.criterion))
 
     def exchange(self, picks: Sequence[int], passes: int = 2, worth: float = 1e-3) -> list[int]:
         """Replace looks one by one while that lowers the score by more than `worth` of it (Fedorov's exchange)."""
-        picks = list(picks)
+        places = self._places(picks)
         for _ in range(passes):
             changed = False
-            for place, look in enumerate(picks):
-                rows = self.rows[picks[:place] + picks[place + 1 :]].reshape(-1, self.rows.shape[2])
-                without = covariance_of(self.precision + rows.T @ rows)
-                found = self.after_one_more(without)
+            for number, look in enumerate(places):
+                found = self.after_one_more(self._after(places[:number] + places[number + 1 :]))
                 best = int(np.argmin(found))
                 if found[look] - found[best] > worth * abs(found[look]):
-                    picks[place], changed = best, True
+                    places[number], changed = best, True
             if not changed:
                 break
-        return picks
+        return self._called(places)
 
 
 LADDER = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96)
@@ -189,7 +248,7 @@ def _reached(family: Family, seen: Seen, target: Target, at_centre: Sensitivity,
     knowledge, best = family.knowledge, _Reached()
     for n in (n for n in LADDER if n <= scope.largest):
         design = family.arranged(n)
-        duration = plan_minutes(design.steps, knowledge.rig)
+        duration = design.minutes(knowledge.rig)
         if scope.minutes is not None and duration > scope.minutes:
             break
         chosen = family.picks[: LOOKS_PER_EXPERIMENT * n]
@@ -265,7 +324,7 @@ def refine(
     search = search_designs(knowledge, seen, at_centre, scope.criterion)
     here = np.isin(found.looks.sheet, found.looks.sheet[picks])
     exchanged = replace(family, picks=np.array(search.among(here).exchange(picks.tolist())))
-    duration = plan_minutes(exchanged.arranged(experiments).steps, knowledge.rig)
+    duration = exchanged.arranged(experiments).minutes(knowledge.rig)
     if scope.minutes is not None and duration > scope.minutes:
         return plain
     other = Refined(exchanged, assurance.of(exchanged).values([experiments])[experiments])

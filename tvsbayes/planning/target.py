@@ -9,14 +9,10 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
-from tvsbayes.calibration.pointing import INPUT_NAMES, NOISES, Calibration
+from tvsbayes.calibration.pointing import INPUT_NAMES, Calibration
 from tvsbayes.calibration.pointing import NOISE_NAMES as CALIBRATION_NOISE
-from tvsbayes.coordinates.beam_meeting import Sources, propagate
-from tvsbayes.coordinates.location import settings_of
 from tvsbayes.errors import InputError, escaped
 from tvsbayes.instrument.axes import DIRECTIONS
 from tvsbayes.instrument.parameters import INDEX
@@ -133,7 +129,7 @@ def parse_target(text: str) -> Target:
 
 @dataclass(frozen=True)
 class Sensitivity:
-    """How a target hangs on the coordinates.
+    """How a target hangs on the coordinates, at one point of parameter space or with a leading axis at several.
 
     Attributes:
         gradient: d(quantity)/d(coordinates) of each quantity whose worst is meant, shape (q, p).
@@ -146,12 +142,16 @@ class Sensitivity:
     @property
     def own_variance(self) -> np.ndarray:
         """Shape (q,)."""
-        return sum(self.own.values(), np.zeros(len(self.gradient)))
+        return sum(self.own.values(), np.zeros(self.gradient.shape[:-1]))
+
+    def values(self, covariance: np.ndarray, factor: float = 1.0) -> np.ndarray:
+        """The target's values under covariances (..., p, p) of the coordinates."""
+        variance = np.sum((self.gradient @ covariance) * self.gradient, axis=-1) + self.own_variance
+        return factor * np.sqrt(variance.max(axis=-1))
 
     def value(self, covariance: np.ndarray, factor: float = 1.0) -> float:
-        """The target's value under a covariance (p, p) of the coordinates."""
-        variance = np.einsum("qi,ij,qj->q", self.gradient, covariance, self.gradient) + self.own_variance
-        return float(factor * np.sqrt(variance.max()))
+        """The target's value under a covariance (p, p), at one point."""
+        return float(self.values(covariance, factor))
 
 
 AT_POINT = ("stop error at the point", "aperture noise at the point")
@@ -173,10 +173,8 @@ def sensitivity(
         InputError: no beam reaches the target's point.
     """
     rows = list(target.indices)
-    with jax.enable_x64(True):
-        if target.point_mm is None:
-            found = headlines(jnp.asarray(z), space, jnp.asarray(pose_rad))
-            return Sensitivity(np.asarray(found.gradient)[rows])
+    if target.point_mm is None:
+        return Sensitivity(np.asarray(headlines(z, space, pose_rad).gradient)[rows])
     at = physical_at(z, space)
     physical, slope = np.asarray(at.value), np.asarray(at.slope)
     inputs = [INDEX[name] for name in INPUT_NAMES]
@@ -192,22 +190,8 @@ def sensitivity(
     )
     goal = machine.steps_for(target.point_mm)
     assert goal.aperture_deg is not None, "a point has a reading"
-    settings = settings_of(float(goal.pan_steps), float(goal.tilt_steps), goal.aperture_deg, goal.approach)
     count = len(inputs)
-    with jax.enable_x64(True):
-        law = propagate(
-            settings,
-            Sources(
-                mean=jnp.asarray(np.concatenate([physical[inputs], np.zeros(NOISES)])),
-                covariance=jnp.zeros((count + NOISES, count + NOISES)),
-                stop_sd_deg=jnp.asarray(stop_sd),
-                inputs=jnp.zeros((1, count + len(stop_sd))),
-                noise=jnp.zeros((1, NOISES)),
-                period_deg=space.harmonic_period_deg,
-                azimuth_convention=jnp.asarray(azimuth),
-            ),
-        )
-    jacobian = np.asarray(law.jacobian)[0][rows]
+    jacobian = machine.derivatives(goal.pan_steps, goal.tilt_steps, goal.aperture_deg, goal.approach)[rows]
     own = jacobian[:, count:] ** 2
     here = {AT_POINT[0]: own[:, :2].sum(axis=1), AT_POINT[1]: own[:, 4]}
     return Sensitivity(jacobian[:, :count] @ slope[inputs], here)

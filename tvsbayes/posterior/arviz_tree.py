@@ -21,11 +21,14 @@ from tvsbayes.instrument.axes import AXES, DIRECTIONS, SENSES
 from tvsbayes.instrument.campaign import input_hashes, ordered_spots, pixels_of
 from tvsbayes.instrument.parameters import BLOCKS, HARMONIC_NAMES, NAMES, RIG_NAMES, STEREO_PARAMETER_NAMES
 from tvsbayes.model.headlines import Derived
+from tvsbayes.posterior.chain import fingerprint
 from tvsbayes.posterior.draws import Draws, Posterior
 from tvsbayes.posterior.predictive import PIXEL_LABELS, move_log_likelihood, predictive_pixels
-from tvsbayes.posterior.sampling import fingerprint
+from tvsbayes.results.convergence import Convergence
 
 POSTERIOR_FORMAT = "tvsbayes-posterior/1"
+RESAMPLED = 4, 1024
+"""Chains and draws of weighted draws that were made equal."""
 COORDS: dict[str, tuple[str, ...]] = {
     "direction": DIRECTIONS,
     "axis": AXES,
@@ -107,7 +110,10 @@ def data_tree(posterior: Posterior) -> xr.DataTree:
 
     Returns:
         A tree for `az.summary`, `az.loo`, `az.compare` and ArviZ's plots. The unit of the log likelihood is a move.
+        Weighted draws are resampled: ArviZ knows no weights.
     """
+    if posterior.tier == "importance":
+        posterior = posterior.resampled(*RESAMPLED)
     fit = posterior.fit
     shape = posterior.z.shape[:2]
     varying = {NAMES[i] for i in np.flatnonzero(fit.free)} | {"effective_mirror_offset_mm"}
@@ -117,10 +123,12 @@ def data_tree(posterior: Posterior) -> xr.DataTree:
     prior_draws = jax.tree.map(lambda x: np.asarray(x)[None], fit.prior_draws)
     spots = ordered_spots(fit.campaign)
     coords = {"chain": np.arange(shape[0]), "draw": np.arange(shape[1])}
-    stats = {
-        "lp": xr.DataArray(posterior.log_density, coords, ("chain", "draw")),
-        "acceptance_rate": xr.DataArray(posterior.convergence.acceptance, {"chain": coords["chain"]}, ("chain",)),
-    }
+    stats = {"lp": xr.DataArray(posterior.log_density, coords, ("chain", "draw"))}
+    lengths: dict[str, int] = {}
+    if isinstance(posterior.convergence, Convergence):
+        found = posterior.convergence
+        stats["acceptance_rate"] = xr.DataArray(found.acceptance, {"chain": coords["chain"]}, ("chain",))
+        lengths = {"steps": found.steps, "discarded": found.discarded, "thin": found.thin}
     places = {"spot": [s.spot for s in spots], "pixel": list(PIXEL_LABELS)}
     observed = xr.DataArray(pixels_of(spots), places, tuple(places), name="pixels")
     tree = xr.DataTree.from_dict(
@@ -133,16 +141,14 @@ def data_tree(posterior: Posterior) -> xr.DataTree:
             "sample_stats": xr.Dataset(stats),
         }
     )
-    convergence = posterior.convergence
     tree.attrs = {
         "format": POSTERIOR_FORMAT,
-        "sampling_library": "emcee",
+        "sampling_library": posterior.tier if lengths else "tvsbayes",
+        "tier": posterior.tier,
         "sampling_time": posterior.seconds,
         "seed": posterior.seed,
-        "converged": int(convergence.converged),
-        "steps": convergence.steps,
-        "discarded": convergence.discarded,
-        "thin": convergence.thin,
+        "converged": int(posterior.converged),
+        **lengths,
         "versions": json.dumps({name: version(name) for name in ("tvsbayes", "emcee", "arviz", "jax", "numpy")}),
         "inputs": json.dumps(input_hashes(fit.campaign)),
         "fingerprint": fingerprint(fit),

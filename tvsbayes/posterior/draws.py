@@ -1,23 +1,25 @@
 """Draws of the posterior, carried into any quantity with their Monte Carlo error.
 
-One row a draw, parameters and headlines in the units of their names; chains are walkers of the ensemble.
+One row a draw, parameters and headlines in the units of their names. Draws of importance sampling have weights, those
+of a chain weigh the same; chains are walkers of the ensemble.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import jax
 import numpy as np
-from arviz_stats.base import array_stats
 
 from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.instrument.axes import AXES, DIRECTION_SIGNS, DIRECTIONS, SENSES
-from tvsbayes.instrument.parameters import NAMES
+from tvsbayes.instrument.parameters import BLOCKS, NAMES
+from tvsbayes.instrument.stops import legs_of
 from tvsbayes.model.headlines import Derived, derived_quantities
 from tvsbayes.posterior.transport import in_batches
-from tvsbayes.results.convergence import Convergence
+from tvsbayes.results.convergence import Convergence, Reweighted
+from tvsbayes.statistics.weighted_draws import TAILS, systematic, weighted_mean, weighted_summary
 
 DERIVED_BATCH = 2049
 """The batch in which the fit computes its headlines: the compilation is shared."""
@@ -59,16 +61,29 @@ class Draws(Mapping[str, np.ndarray]):
         return len(self._columns)
 
 
+def headline_names(fit: JointFit) -> tuple[str, ...]:
+    """Names in `Draws` of what a fit is for, as far as the campaign moved and priors leave it open.
+
+    Effective ratios and contrasts of directions that moved, mean ratios, backlashes, effective mirror offset.
+    """
+    moved = set(legs_of(fit.campaign.moves))
+    ratios = [f"effective_deg_per_step.{d}" for d in DIRECTIONS if d in moved]
+    contrasts = [f"effective_contrast_deg_per_step.{axis}" for axis, pair in SENSES.items() if set(pair) <= moved]
+    names = [*ratios, *contrasts, *BLOCKS["degrees_per_step"], *BLOCKS["backlash_deg"], "effective_mirror_offset_mm"]
+    return tuple(name for name in names if name not in NAMES or fit.free[NAMES.index(name)])
+
+
 @dataclass(frozen=True)
 class Propagated:
-    """A quantity under the posterior; every field has the quantity's own shape.
+    """A quantity under the posterior; every field but the last two has the quantity's own shape.
 
     Attributes:
         mean, sd: of the posterior.
         interval95: equal-tailed, first axis (low, high).
         mcse_mean, mcse_sd, mcse_interval95: Monte Carlo standard errors of the above.
-        ess: bulk effective draws behind them.
+        ess: effective draws behind the mean.
         draws: the values, shape (chain, draw, ...).
+        weights: of the draws, sum 1, shape (chain, draw).
     """
 
     mean: np.ndarray
@@ -79,6 +94,7 @@ class Propagated:
     mcse_interval95: np.ndarray
     ess: np.ndarray
     draws: np.ndarray
+    weights: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -87,12 +103,13 @@ class Posterior:
 
     Attributes:
         fit: the fit whose posterior it is.
-        z: stored draws of the prior-normal coordinates, shape (chain, draw, p).
+        z: draws of the prior-normal coordinates, shape (chain, draw, p); of importance sampling all are one chain.
         log_density: their log posterior density, without `campaign_arrays.log_constant`, shape (chain, draw).
         draws: parameters and headlines in the units of data/docs/conventions.md, fields with leading axes (chain,
             draw).
+        weights: of the draws, sum 1, shape (chain, draw).
         convergence: the diagnosis.
-        seed: of the chain.
+        seed: of everything random.
         seconds: spent sampling, earlier runs of a resumed chain included.
     """
 
@@ -100,7 +117,8 @@ class Posterior:
     z: np.ndarray
     log_density: np.ndarray
     draws: Derived
-    convergence: Convergence
+    weights: np.ndarray
+    convergence: Convergence | Reweighted
     seed: int
     seconds: float
 
@@ -110,15 +128,55 @@ class Posterior:
         return self.convergence.converged
 
     @property
+    def tier(self) -> str:
+        """What made the draws: "importance" (independent, weighted) or "emcee" (a chain, equal)."""
+        return "importance" if isinstance(self.convergence, Reweighted) else "emcee"
+
+    @property
     def by_name(self) -> Draws:
-        """All draws by contract name, chains joined."""
+        """All draws by contract name, chains joined; their weights are `weights.ravel()`."""
         return Draws(self.draws)
 
+    @property
+    def joined(self) -> Derived:
+        """All draws, chains joined: every field of `draws` with one leading axis."""
+        return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), self.draws)
+
+    @property
+    def centre(self) -> Derived:
+        """Means of all fields of `draws`."""
+        return jax.tree.map(lambda x: weighted_mean(np.asarray(x), self.weights.ravel()), self.joined)
+
+    def chosen(self, count: int) -> np.ndarray:
+        """Places of at most `count` draws that weigh the same, chains joined; evenly spaced in a chain."""
+        offset = np.random.default_rng([self.seed, 2]).uniform()
+        return systematic(self.weights.ravel(), min(count, self.weights.size), float(offset))
+
     def thinned(self, count: int) -> Derived:
-        """At most `count` evenly chosen draws, chains joined: every field with one leading axis."""
-        total = self.z.shape[0] * self.z.shape[1]
-        chosen = np.linspace(0, total - 1, min(count, total)).astype(int)
-        return jax.tree.map(lambda x: x.reshape(total, *x.shape[2:])[chosen], self.draws)
+        """The draws at `chosen` places: every field with one leading axis."""
+        places = self.chosen(count)
+        return jax.tree.map(lambda x: x[places], self.joined)
+
+    def coordinates(self, count: int) -> np.ndarray:
+        """The coordinates z of the draws at `chosen` places, shape (count, p)."""
+        return self.z.reshape(-1, self.z.shape[-1])[self.chosen(count)]
+
+    def resampled(self, chains: int, draws: int) -> Posterior:
+        """Draws that weigh the same, in chains; a draw of much weight is repeated."""
+        places = systematic(self.weights.ravel(), chains * draws, 0.5)
+        # In order, the repeats of a draw would stand in one chain.
+        places = np.random.default_rng([self.seed, 3]).permutation(places).reshape(chains, draws)
+        return replace(
+            self,
+            z=self.z.reshape(-1, self.z.shape[-1])[places],
+            log_density=self.log_density.ravel()[places],
+            draws=jax.tree.map(lambda x: x[places], self.joined),
+            weights=np.full((chains, draws), 1 / (chains * draws)),
+        )
+
+    def summarised(self, values: np.ndarray) -> Propagated:
+        """Mean, sd, interval and errors of values (chain, draw, ...), one for every draw."""
+        return reweighted(values, self.weights) if self.tier == "importance" else propagated(values)
 
     def propagate(self, function: Callable[[Draws], np.ndarray]) -> Propagated:
         """Carry the posterior into a quantity of your own.
@@ -130,8 +188,8 @@ class Posterior:
                 The names are those of `fit.json` and of `list(posterior.by_name)`.
 
         Returns:
-            Mean, sd, interval and their Monte Carlo errors (JCGM 101 clause 7, with correlated draws), each of the
-            shape (...) of one value.
+            Mean, sd, interval and their Monte Carlo errors (JCGM 101 clause 7, with weighted or correlated draws), each
+            of the shape (...) of one value.
 
         Raises:
             ValueError: the function returned another number of rows, or values that are not finite.
@@ -146,12 +204,12 @@ class Posterior:
         if not np.all(np.isfinite(values)):
             share = np.mean(~np.isfinite(values.reshape(len(values), -1)).all(axis=1))
             raise ValueError(f"the function has no finite value for {100 * share:.2g} % of the draws")
-        return propagated(values.reshape(chains, draws, *values.shape[1:]))
+        return self.summarised(values.reshape(chains, draws, *values.shape[1:]))
 
     def effective_deg_per_step(self, pan_deg: float, tilt_deg: float) -> Propagated:
         """Effective degrees per step (left, right, up, down) at any pose of the mirrors (formulation 3.2)."""
         found = derived_at(self.fit, self.z, np.radians([pan_deg, tilt_deg]))
-        return propagated(np.asarray(found.effective_deg_per_step))
+        return self.summarised(np.asarray(found.effective_deg_per_step))
 
     def lost_motion_deg(self, direction: str, steps: np.ndarray) -> Propagated:
         """Mirror angle that a move of `steps` loses after a reversal: min(k N, b) (play operator, formulation 3.1).
@@ -174,11 +232,29 @@ class Posterior:
         )
 
 
+def reweighted(values: np.ndarray, weights: np.ndarray) -> Propagated:
+    """Summary of independent draws (chain, draw, ...) with weights (chain, draw)."""
+    found = weighted_summary(values.reshape(-1, *values.shape[2:]), weights.ravel())
+    return Propagated(
+        mean=found.mean,
+        sd=found.sd,
+        interval95=found.interval95,
+        mcse_mean=found.mcse_mean,
+        mcse_sd=found.mcse_sd,
+        mcse_interval95=found.mcse_interval95,
+        ess=found.ess_mean,
+        draws=values,
+        weights=weights,
+    )
+
+
 def propagated(values: np.ndarray) -> Propagated:
-    """Summary of draws (chain, draw, ...)."""
-    tails = (0.025, 0.975)
-    quantiles = np.quantile(values, tails, axis=(0, 1))
+    """Summary of draws (chain, draw, ...) of chains with memory, which weigh the same."""
+    # Loading it takes as long as a fit of stored functions: only who asks for a chain waits.
+    from arviz_stats.base import array_stats
+
     flat = values.reshape(*values.shape[:2], -1)
+    weights = np.full(values.shape[:2], 1 / (values.shape[0] * values.shape[1]))
     # A quantity that no draw changes has no effective number of draws and no Monte Carlo error.
     moving = np.ptp(flat, axis=(0, 1)) > 0
 
@@ -188,16 +264,17 @@ def propagated(values: np.ndarray) -> Propagated:
             result[moving] = statistic(flat[..., moving], chain_axis=0, draw_axis=1, **options)
         return result.reshape(values.shape[2:])
 
-    errors = [each(array_stats.mcse, 0.0, method="quantile", prob=prob) for prob in tails]
+    errors = [each(array_stats.mcse, 0.0, method="quantile", prob=prob) for prob in TAILS]
     return Propagated(
         mean=values.mean(axis=(0, 1)),
         sd=values.std(axis=(0, 1)),
-        interval95=quantiles,
+        interval95=np.quantile(values, TAILS, axis=(0, 1)),
         mcse_mean=each(array_stats.mcse, 0.0, method="mean"),
         mcse_sd=each(array_stats.mcse, 0.0, method="sd"),
         mcse_interval95=np.stack(errors),
         ess=each(array_stats.ess, float(values.shape[0] * values.shape[1]), method="bulk"),
         draws=values,
+        weights=weights,
     )
 
 

@@ -5,11 +5,12 @@ The unit of the log likelihood is a move: the spots between two moves share thei
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import xarray as xr
 from jaxtyping import Array, Float
 
 from tvsbayes.estimators.campaign_arrays import CampaignArrays, spot_constants
@@ -30,6 +31,9 @@ from tvsbayes.model.compiled import compiled
 from tvsbayes.model.parameter_space import STOP_COLUMNS, ParameterSpace
 from tvsbayes.posterior.draws import Posterior
 from tvsbayes.posterior.transport import in_batches
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 RANK_TOLERANCE = 1e-12
 """Share of a state's precision below which what other states leave of it is rounding, not information."""
@@ -133,6 +137,8 @@ PIXEL_LABELS = tuple(name.removesuffix("_px") for name in PIXELS)
 
 def move_log_likelihood(posterior: Posterior) -> xr.DataArray:
     """Log p(spots of a move | all other spots, parameters), dimensions (chain, draw, move); constants included."""
+    import xarray as xr
+
     fit = posterior.fit
     spots = ordered_spots(fit.campaign)
     used = np.asarray(fit.arrays.spots.valid)[: len(spots)] > 0
@@ -154,10 +160,9 @@ def looks(fit: JointFit, z: np.ndarray, stop_error_rad: np.ndarray) -> np.ndarra
 
 
 def ideal_pixels(posterior: Posterior, draws: int) -> np.ndarray:
-    """Pixels without noise and stop errors for evenly chosen draws, shape (draws, spots, 4)."""
-    z = posterior.z.reshape(-1, posterior.z.shape[-1])
-    chosen = z[np.linspace(0, len(z) - 1, draws).astype(int)]
-    return looks(posterior.fit, chosen, np.zeros((draws, len(posterior.fit.arrays.spots.valid), 2)))
+    """Pixels without noise and stop errors for draws that weigh the same, shape (draws, spots, 4)."""
+    z = posterior.coordinates(draws)
+    return looks(posterior.fit, z, np.zeros((len(z), len(posterior.fit.arrays.spots.valid), 2)))
 
 
 def predictive_pixels(posterior: Posterior, draws_per_chain: int = 8) -> xr.DataArray:
@@ -166,6 +171,8 @@ def predictive_pixels(posterior: Posterior, draws_per_chain: int = 8) -> xr.Data
     Returns:
         Dimensions (chain, draw, spot, pixel); the draws are a subset of the posterior's, by its own coordinate.
     """
+    import xarray as xr
+
     fit = posterior.fit
     generator = np.random.default_rng([posterior.seed, 1])
     chains, draws = posterior.z.shape[:2]

@@ -1,38 +1,46 @@
-"""What is sampled and how a step is proposed: the target in the map's coordinates, its pilot, the moves of emcee.
+"""What is sampled and from where draws are proposed: the target in the map's coordinates, and the proposal's shape.
 
 Coordinates w of `posterior.transport`, nearly standard normal; log densities are exact, the map's Jacobian in them.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 
-import emcee
 import numpy as np
 from scipy import special
 
 from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.estimators.likelihood import evaluate
-from tvsbayes.posterior.transport import BATCH, Transport, in_batches
+from tvsbayes.posterior.transport import Transport, in_batches
 
-WALKERS = 64
-PILOT_DRAWS = 2048
-PILOT_ROUNDS = 3
-"""The first is drawn about the mode, each further one from the proposal that the last one gave."""
-VARIANCE_RANGE, HEAVY_VARIANCE_RANGE = (0.8, 1.7), (0.8, 4.0)
-"""Of the proposal, relative to the Laplace approximation's."""
+NODES = np.linspace(-8.0, 12.0, 41)
+"""Of the tabulated densities, in w. Noise scales have their long tail above."""
+STEP = float(NODES[1] - NODES[0])
+FLOOR = -40.0
+"""Of a tabulated log density below its largest: what lies lower is never drawn, and nought has no logarithm."""
 HEAVY_DOF = 5.0
+OWN_SHARE = 0.1
+"""Share of the proposals of a tabulated coordinate from a t of its mean and sd: the table is a cut, not a marginal."""
 HEAVY_SHARE = 0.1
 """Share of the proposals from a multivariate t: it bounds the ratio target / proposal in the tails. In fifty
 dimensions a t alone puts most draws off the shell where the target lives: effective draws fell threefold."""
 INFLATION = 1.03
-"""Factor on the proposal's sds: a proposal lighter than the target lets walkers freeze in its tails."""
-SHARES = (0.85, 0.1, 0.05)
-"""Independence proposal, differential evolution, differential evolution with full steps."""
+"""Factor on the proposal's sds: one lighter than the target lets single draws weigh much, and walkers freeze."""
+VARIANCE_RANGE = 0.8, 1.7
+"""Of a normal coordinate of the proposal, relative to the Laplace approximation's."""
+TILT_LIMITS = 0.5, 0.2
+"""Largest slope and curvature by which one fit changes a tabulated log density, per sd and its square."""
+REACH = 4.0
+"""Sds within which a fit's tilt of a table grows; beyond, it stays."""
+MATTERS = 12.0
+"""Draws whose log weight lies farther below the largest tell nothing of the target's shape."""
 
 
 class Target:
-    """The log posterior density of walkers, as emcee calls it: NumPy in, NumPy out, NaN refused and counted."""
+    """The log posterior density of points w, as samplers call it: NumPy in, NumPy out, NaN refused and counted."""
 
     def __init__(self, fit: JointFit, path: Transport):
         self.fit, self.path = fit, path
@@ -54,111 +62,161 @@ def _t_constant(dimension: int) -> float:
 
 
 @dataclass(frozen=True)
+class Tables:
+    """Densities of h coordinates whose logarithm is a broken line through `NODES`, shape (h, nodes), nought outside."""
+
+    log_density: np.ndarray
+
+    @classmethod
+    def normalised(cls, log_density: np.ndarray) -> Tables:
+        """From log densities up to a constant each, -inf and NaN where there is none."""
+        seen = np.where(np.isfinite(log_density), log_density, -np.inf)
+        seen = np.maximum(seen - seen.max(axis=1, keepdims=True), FLOOR)
+        return cls(seen - np.log(cls(seen).masses.sum(axis=1, keepdims=True)))
+
+    @cached_property
+    def masses(self) -> np.ndarray:
+        """Probability between neighbouring nodes, shape (h, nodes - 1)."""
+        low, rise = self.log_density[:, :-1], np.diff(self.log_density)
+        steep = np.abs(rise) > 1e-9
+        return STEP * np.exp(low) * np.where(steep, np.expm1(rise) / np.where(steep, rise, 1.0), 1.0)
+
+    @cached_property
+    def moments(self) -> tuple[np.ndarray, np.ndarray]:
+        """Means and sds, shape (h,) each, by the trapezoid rule on ten points a step."""
+        x = np.linspace(NODES[0], NODES[-1], 10 * (len(NODES) - 1) + 1)
+        lines = np.array([np.interp(x, NODES, each) for each in self.log_density])
+        density = np.exp(lines.reshape(len(self.log_density), len(x)))
+        density /= density.sum(axis=1, keepdims=True)
+        mean = density @ x
+        return mean, np.sqrt(density @ x**2 - mean**2)
+
+    def at(self, w: np.ndarray) -> np.ndarray:
+        """Log densities of w (n, h)."""
+        every = zip(w.T, self.log_density, strict=True)
+        found = [np.interp(x, NODES, line, left=-np.inf, right=-np.inf) for x, line in every]
+        return np.reshape(np.transpose(found), w.shape)
+
+    def draw(self, share: np.ndarray) -> np.ndarray:
+        """Points (n, h) below which these shares (n, h) of the densities lie."""
+        found = np.empty(share.shape)
+        for k, line in enumerate(self.log_density):
+            reached = np.concatenate([[0.0], np.cumsum(self.masses[k])])
+            node = np.clip(np.searchsorted(reached, share[:, k], side="right") - 1, 0, len(NODES) - 2)
+            low, slope = line[node], np.diff(line)[node] / STEP
+            rest = (share[:, k] - reached[node]) * np.exp(-low)
+            steep = np.abs(slope) > 1e-9
+            along = np.where(steep, np.log1p(rest * slope) / np.where(steep, slope, 1.0), rest)
+            found[:, k] = NODES[node] + np.clip(along, 0.0, STEP)
+        return found
+
+
+@dataclass(frozen=True)
 class Independence:
-    """Independence proposal: normal, in heavy coordinates t, and a share of a multivariate t of the same scale.
+    """Independent draws: every coordinate normal or tabulated, and a share of a multivariate t of the same scale.
 
     Called by `emcee.moves.MHMove` with (points, generator); returns new points and ln q(old) - ln q(new).
 
     Attributes:
         mean, sd: of every coordinate, shape (d,).
-        heavy: coordinates proposed from a t of their own, shape (d,), boolean.
+        places: tabulated coordinates, shape (h,).
+        tables: their densities.
     """
 
     mean: np.ndarray
     sd: np.ndarray
-    heavy: np.ndarray
+    places: np.ndarray
+    tables: Tables
+
+    @classmethod
+    def of(cls, mean: np.ndarray, sd: np.ndarray, places: np.ndarray, tables: Tables) -> Independence:
+        """With the means and sds of the tabulated coordinates as their tables have them."""
+        mean, sd = mean.copy(), sd.copy()
+        mean[places], sd[places] = tables.moments
+        sd[places] *= INFLATION
+        return cls(mean, sd, places, tables)
+
+    def _each(self, w: np.ndarray) -> np.ndarray:
+        """Log density of the coordinates one by one, all together (n,)."""
+        distance2 = ((w - self.mean) / self.sd) ** 2
+        normal = -0.5 * np.log(2 * np.pi) - 0.5 * distance2 - np.log(self.sd)
+        own = distance2[:, self.places]
+        single = _t_constant(1) - 0.5 * (HEAVY_DOF + 1) * np.log1p(own / HEAVY_DOF) - np.log(self.sd[self.places])
+        table = self.tables.at(w[:, self.places])
+        normal[:, self.places] = np.logaddexp(np.log(1 - OWN_SHARE) + table, np.log(OWN_SHARE) + single)
+        return np.sum(normal, axis=1)
 
     def log_density(self, w: np.ndarray) -> np.ndarray:
         """Log density, shape (n,)."""
         dimension = len(self.mean)
-        distance2 = ((w - self.mean) / self.sd) ** 2
-        normal = -0.5 * np.log(2 * np.pi) - 0.5 * distance2
-        single = _t_constant(1) - 0.5 * (HEAVY_DOF + 1) * np.log1p(distance2 / HEAVY_DOF)
-        each = np.sum(np.where(self.heavy, single, normal), axis=1)
-        total2 = np.sum(distance2, axis=1)
+        total2 = np.sum(((w - self.mean) / self.sd) ** 2, axis=1)
         joint = _t_constant(dimension) - 0.5 * (HEAVY_DOF + dimension) * np.log1p(total2 / HEAVY_DOF)
-        mixture = np.logaddexp(np.log(1 - HEAVY_SHARE) + each, np.log(HEAVY_SHARE) + joint)
-        return mixture - np.sum(np.log(self.sd))
+        joint -= np.sum(np.log(self.sd))
+        return np.logaddexp(np.log(1 - HEAVY_SHARE) + self._each(w), np.log(HEAVY_SHARE) + joint)
 
     def draw(self, count: int, generator: np.random.RandomState) -> np.ndarray:
         """Independent draws, shape (count, d)."""
-        dimension = len(self.mean)
-        normal = generator.standard_normal((count, dimension))
-        single = np.sqrt(generator.chisquare(HEAVY_DOF, (count, dimension)) / HEAVY_DOF)
+        own = (count, len(self.places))
+        normal = generator.standard_normal((count, len(self.mean)))
+        single = np.sqrt(generator.chisquare(HEAVY_DOF, own) / HEAVY_DOF)
         joint = np.sqrt(generator.chisquare(HEAVY_DOF, (count, 1)) / HEAVY_DOF)
+        tabulated = self.tables.draw(generator.uniform(size=own))
+        alone = generator.uniform(size=own) < OWN_SHARE
         together = generator.uniform(size=(count, 1)) < HEAVY_SHARE
-        return self.mean + self.sd * normal / np.where(together, joint, np.where(self.heavy, single, 1.0))
+        each = self.mean + self.sd * normal
+        at, sd = self.mean[self.places], self.sd[self.places]
+        each[:, self.places] = np.where(alone, at + sd * normal[:, self.places] / single, tabulated)
+        return np.where(together, self.mean + self.sd * normal / joint, each)
 
     def __call__(self, w: np.ndarray, generator: np.random.RandomState) -> tuple[np.ndarray, np.ndarray]:
         """The protocol of `emcee.moves.MHMove`."""
         proposed = self.draw(len(w), generator)
         return proposed, self.log_density(w) - self.log_density(proposed)
 
+    def fitted(self, w: np.ndarray, log_target: np.ndarray, log_weights: np.ndarray) -> Independence:
+        """Nearer to the target, as weighted draws show it; the same where too few of them matter.
 
-def moves(proposal: Independence) -> list[tuple[emcee.moves.Move, float]]:
-    """The moves and their shares; never emcee 3.1.6's snooker or full-covariance Gaussian (both are biased)."""
-    # Fewer walkers than twice the dimension let differential evolution explore a subspace only; the
-    # independence proposal leaves it at six steps of seven.
-    evolution = emcee.moves.DEMove(live_dangerously=True), emcee.moves.DEMove(gamma0=1.0, live_dangerously=True)
-    return list(zip((emcee.moves.MHMove(proposal), *evolution), SHARES, strict=True))
+        Where the target is the proposal but for means and sds, the log of their ratio is linear in w and w^2: the
+        coefficients give both, and tilt the tables. A regression on the draws that matter is far steadier than
+        weighted moments.
 
-
-def walkers_for(dimension: int) -> int:
-    """Ensemble size: more walkers than dimensions, whole batches in each half."""
-    return max(WALKERS, 2 * BATCH * -(-(dimension + 1) // (2 * BATCH)))
-
-
-@dataclass(frozen=True)
-class Pilot:
-    """What importance sampling from the transported Laplace approximation tells before the chain starts.
-
-    Attributes:
-        proposal: centred where the posterior's mean is, which is not its mode.
-        start: first positions, importance-resampled, shape (walkers, d).
-        log_weights: log (target / proposal) of the last round's draws.
-    """
-
-    proposal: Independence
-    start: np.ndarray
-    log_weights: np.ndarray
-
-
-def pilot(target: Target, seed: int) -> Pilot:
-    """Shift the proposal to the posterior mean and choose starting points.
-
-    Args:
-        target: the log density.
-        seed: of the pilot draws.
-
-    Raises:
-        FloatingPointError: no draw has a finite density.
-    """
-    generator = np.random.RandomState(seed)
-    dimension = target.path.dimension
-    heavy = target.path.heavy
-    proposal = Independence(np.zeros(dimension), np.ones(dimension), heavy)
-    limits = np.where(heavy, np.array(HEAVY_VARIANCE_RANGE)[:, None], np.array(VARIANCE_RANGE)[:, None])
-    for _ in range(PILOT_ROUNDS):
-        w = proposal.draw(PILOT_DRAWS, generator)
-        log_target = target(w)
-        log_weights = log_target - proposal.log_density(w)
-        finite = np.isfinite(log_weights)
-        if finite.sum() < walkers_for(dimension):
-            raise FloatingPointError("the posterior density is not finite around the mode")
-        # Where the target is normal, log(target / normal of the proposal) is linear in w and w^2: the coefficients give
-        # its mean and sds. A regression on the draws that matter is far steadier than weighted moments.
-        matters = finite & (log_weights > np.max(log_weights[finite]) - 12)
-        if matters.sum() <= 8 * dimension:
-            break
-        near = (w[matters] - proposal.mean) / proposal.sd
+        Args:
+            w: draws, shape (n, d).
+            log_target: their log densities, shape (n,).
+            log_weights: log (target / what they were drawn from), shape (n,).
+        """
+        matters = np.isfinite(log_weights) & (log_weights > np.max(log_weights) - MATTERS)
+        if matters.sum() <= 8 * len(self.mean):
+            return self
+        near = np.clip((w[matters] - self.mean) / self.sd, -REACH, REACH)
         design = np.column_stack([np.ones(len(near)), near, near**2])
-        ratio = log_target[matters] + 0.5 * np.sum(near**2, axis=1)
+        ratio = log_target[matters] - self._each(w[matters])
         slope, square = np.split(np.linalg.lstsq(design, ratio, rcond=None)[0][1:], 2)
         variance = 1 / np.clip(1 - 2 * square, 0.6, 1.6)
-        mean = proposal.mean + proposal.sd * np.clip(slope * variance, -1.0, 1.0)
-        variance = np.clip(proposal.sd**2 * variance, *limits)
-        proposal = Independence(mean, INFLATION * np.sqrt(variance), heavy)
-    # Gumbel's trick: the largest perturbed weights are a weighted sample without replacement.
-    keys = np.where(finite, log_weights, -np.inf) + generator.gumbel(size=len(w))
-    start = w[np.argsort(-keys)[: walkers_for(dimension)]]
-    return Pilot(proposal, start, log_weights)
+        mean = self.mean + self.sd * np.clip(slope * variance, -1.0, 1.0)
+        sd = INFLATION * np.sqrt(np.clip(self.sd**2 * variance, *VARIANCE_RANGE))
+        at = np.clip((NODES - self.mean[self.places, None]) / self.sd[self.places, None], -REACH, REACH)
+        tilt, bend = (
+            np.clip(x[self.places, None], -limit, limit) for x, limit in zip((slope, square), TILT_LIMITS, strict=True)
+        )
+        tables = Tables.normalised(self.tables.log_density + tilt * at + bend * at**2)
+        return Independence.of(mean, sd, self.places, tables)
+
+
+def first_proposal(target: Callable[[np.ndarray], np.ndarray], dimension: int, heavy: np.ndarray) -> Independence:
+    """Standard normal but for the heavy coordinates, whose densities are the target's along each of them.
+
+    In w, where everything else is measured from its mean at a coordinate's value and by its width there, a cut through
+    the mode is the marginal density but for what the others' curvature does.
+
+    Args:
+        target: log density of points (n, d).
+        dimension: d.
+        heavy: coordinates to be tabulated, shape (d,), boolean.
+    """
+    places = np.flatnonzero(heavy)
+    along = np.zeros((len(places), len(NODES), dimension))
+    along[np.arange(len(places)), :, places] = NODES
+    cuts = target(along.reshape(-1, dimension)) if len(places) else np.zeros(0)
+    tables = Tables.normalised(cuts.reshape(len(places), len(NODES)))
+    return Independence.of(np.zeros(dimension), np.full(dimension, INFLATION), places, tables)

@@ -18,7 +18,7 @@ from tvsbayes.instrument.parameters import INDEX, NAMES, NOISE_NAMES
 from tvsbayes.model.parameter_space import STOP_COLUMNS
 from tvsbayes.posterior.transport import STRETCH_NODES, Transport, in_batches
 
-NARROW = 0.05
+NARROW = 0.15
 """Conditional posterior sd, in prior sds, below which a coordinate is moved by the shear. Wider ones would be moved
 far enough for cubic terms to matter."""
 SHEAR_STEP = 0.5

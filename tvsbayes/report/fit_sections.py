@@ -12,7 +12,7 @@ import numpy as np
 from tvsbayes.instrument.axes import AXES, DIRECTIONS
 from tvsbayes.metrology.traceability import stated_value
 from tvsbayes.report import figures
-from tvsbayes.report.fit_text import sampling_line
+from tvsbayes.report.fit_text import agreement_line, sampling_line
 from tvsbayes.report.result_tables import gap_table, hold_out_table
 from tvsbayes.report.tables import FigureView, Section, TableView, concise, figure_view, interval_text, two_digits
 from tvsbayes.results.estimates import Cause, Validation
@@ -296,7 +296,8 @@ def validation_section(e: Evidence) -> Section:
     if sampling is None:
         text.append("The posterior was not sampled: intervals are those of the Laplace approximation.")
     else:
-        text.append(f"{sampling_line(sampling)}.")
+        told = sampling_line(sampling), agreement_line(sampling)
+        text += [f"{line}." for line in told if line is not None]
         items += [f"UNCONVERGED: {sentence}" for sentence in sampling.missing]
     tables.append(_foretold(e))
     if e.held_out is None:

@@ -10,7 +10,7 @@ from tvsbayes.estimators.four_point import ClassicResult
 from tvsbayes.instrument.axes import DIRECTIONS
 from tvsbayes.report.result_tables import KEY_PARAMETERS, classic_table, headline_table
 from tvsbayes.report.tables import TableView, concise
-from tvsbayes.results.convergence import Sampling
+from tvsbayes.results.convergence import Importance, Sampling
 from tvsbayes.results.estimates import FitSummary, LostMotion, Validation
 
 SPOTS_LISTED = 20
@@ -39,6 +39,8 @@ def fit_text(summary: FitSummary) -> str:
         lines.append(f"the classic estimator should report, deg/step: {', '.join(predicted)}")
     if summary.sampling is not None:
         lines.append(sampling_line(summary.sampling))
+        agreed = agreement_line(summary.sampling)
+        lines += [agreed] if agreed is not None else []
     if summary.curves is not None:
         lines += lost_motion_lines(summary.curves.lost_motion)
     for entry in summary.prior_sensitivity:
@@ -111,10 +113,42 @@ def validation_lines(validation: Validation) -> list[str]:
 def sampling_line(sampling: Sampling) -> str:
     """What stands behind a posterior, in one line."""
     rhat, ess, tail = sampling.worst_rhat, sampling.least_ess_bulk, sampling.least_ess_tail
-    text = f"{sampling.walkers} walkers, {sampling.steps} steps ({sampling.discarded} left out); worst R-hat "
-    text += f"{rhat.value:.3f} ({rhat.quantity}), least effective draws {ess.value:.0f} "
-    text += f"({ess.quantity}) and {tail.value:.0f} in the tails ({tail.quantity})"
+    if rhat is None:
+        text = "" if sampling.importance is None else importance_line(sampling.importance)
+    else:
+        text = f"{sampling.walkers} walkers, {sampling.steps} steps ({sampling.discarded} left out); worst R-hat "
+        text += f"{rhat.value:.3f} ({rhat.quantity}), least effective draws {ess.value:.0f} "
+        text += f"({ess.quantity}) and {tail.value:.0f} in the tails ({tail.quantity})"
     return text if sampling.converged else f"UNCONVERGED, the table is Laplace's: {text}"
+
+
+def importance_line(found: Importance) -> str:
+    """What importance sampling is worth, in one line."""
+    text = f"importance sampling: {found.draws} draws, {100 * found.effective_share:.0f} % effective, at least "
+    text += f"{found.least_ess.value:.0f} for a headline ({found.least_ess.quantity}); Pareto k {found.pareto_k:.2f}, "
+    return f"{text}of headlines at most {found.worst_pareto_k.value:.2f}"
+
+
+def agreement_line(sampling: Sampling) -> str | None:
+    """Whether the chain says what importance sampling said; None without a chain."""
+    if sampling.steps is None or sampling.importance is None:
+        return None
+    if sampling.agreement is None:
+        return "importance sampling was not accepted: the chain stands alone"
+    said = "agree on every headline" if sampling.agreement.agrees else "DISAGREE"
+    worst = sampling.agreement.worst
+    text = f"emcee and importance sampling {said}: the largest difference is {worst.value:.1f} Monte Carlo errors"
+    return f"{text} ({worst.quantity})"
+
+
+def first_text(summary: FitSummary) -> str:
+    """What importance sampling says while a chain is still to come."""
+    sampling = summary.sampling
+    if sampling is None or sampling.importance is None:
+        return ""
+    if not sampling.converged:
+        return f"importance sampling alone does not do: {'; '.join(sampling.missing)}; emcee goes on ..."
+    return f"{headline_table(summary).text()}\n{importance_line(sampling.importance)}; emcee goes on ..."
 
 
 def lost_motion_lines(lost: Mapping[str, Sequence[LostMotion]]) -> list[str]:

@@ -20,7 +20,12 @@ if TYPE_CHECKING:
     from tvsbayes.report.evidence import Evidence
 
 
-ESTIMATORS = {"laplace": "Laplace approximation at the mode", "posterior": "posterior sampled by emcee"}
+MADE_BY = {
+    "laplace": "Laplace approximation at the mode",
+    "importance": "posterior by importance sampling",
+    **dict.fromkeys(("emcee", "posterior"), "posterior sampled by emcee"),
+}
+"""By tier, or by estimator where results name no tier."""
 
 
 def maps_section(e: Evidence) -> Section:
@@ -174,7 +179,7 @@ def method_section(e: Evidence) -> Section:
         "by a calibrated stereo pair; all spots at once; stop errors integrated out; stereo calibration and focal "
         "scale uncertain within their stated covariance. Classic: the four-point method of "
         "doi 10.3390/metrology5040058.",
-        f"Estimator: {ESTIMATORS[e.fit.summary.estimator]}. Intervals are equal-tailed "
+        f"Estimator: {MADE_BY[e.fit.summary.tier or e.fit.summary.estimator]}. Intervals are equal-tailed "
         "(JCGM 101:2008, 5.3.3), coverage probability 95 %.",
         f"Command: {made.command}. Seed {made.seed}.",
     ]

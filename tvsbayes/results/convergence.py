@@ -1,6 +1,6 @@
-"""Whether a chain may be used: its diagnosis by quantity, and what `fit.json` says of it under `sampling`.
+"""Whether a sampled posterior may be used: its diagnosis by quantity, and what `fit.json` says of it under `sampling`.
 
-Lengths in steps of the sampler; effective draws and R-hat as ArviZ computes them, by contract name.
+Lengths in steps of the sampler; effective draws and R-hat by contract name.
 """
 
 from __future__ import annotations
@@ -20,27 +20,132 @@ class NamedValue:
 
 
 @dataclass(frozen=True)
+class Importance:
+    """What importance sampling says of itself.
+
+    Attributes:
+        accepted: its intervals may be used.
+        missing: sentences on why not.
+        rounds, draws: how many were made.
+        effective_share: equal draws that the weights are worth, over the draws.
+        least_ess: least effective draws of a headline's mean, sd or interval ends.
+        pareto_k: tail index of the weights; worst_pareto_k: largest of a headline's squared deviations times weights.
+        heaviest_share: of the weight, in one draw.
+        log_evidence: log of the integral of likelihood and prior; likelihoods have the constants of
+            `estimators.campaign_arrays.spot_constants`, and ranges are flat in image displacement.
+        log_evidence_mcse: its Monte Carlo standard error.
+        invalid_evaluations: draws whose density has no value.
+    """
+
+    accepted: bool
+    missing: tuple[str, ...]
+    rounds: int
+    draws: int
+    effective_share: float
+    least_ess: NamedValue
+    pareto_k: float
+    worst_pareto_k: NamedValue
+    heaviest_share: float
+    log_evidence: float
+    log_evidence_mcse: float
+    invalid_evaluations: int
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """Whether a chain and importance sampling say the same of every headline.
+
+    `worst` is the largest difference of a mean or an interval's end, in Monte Carlo standard errors of both; it agrees
+    below `limit`.
+    """
+
+    agrees: bool
+    limit: float
+    worst: NamedValue
+
+
+@dataclass(frozen=True)
 class Sampling:
-    """A chain's diagnosis in brief; fields as in `Convergence`.
+    """The diagnosis of a posterior in brief; fields of a chain as in `Convergence`, None where there is no chain.
 
     `missing` says what is not reached; `acceptance` is the mean over walkers, `least_acceptance` that of the worst.
+    `agreement` is None where importance sampling was not accepted, or alone.
     """
 
     converged: bool
     missing: tuple[str, ...]
-    walkers: int
-    steps: int
-    discarded: int
-    thin: int
-    tau_steps: float
-    worst_rhat: NamedValue
+    walkers: int | None
+    steps: int | None
+    discarded: int | None
+    thin: int | None
+    tau_steps: float | None
+    worst_rhat: NamedValue | None
     least_ess_bulk: NamedValue
     least_ess_tail: NamedValue
-    acceptance: float
-    least_acceptance: float
+    acceptance: float | None
+    least_acceptance: float | None
     stuck_walkers: tuple[int, ...]
     invalid_evaluations: int
     proposal_pareto_k: float
+    importance: Importance | None = None
+    agreement: Agreement | None = None
+
+
+def extreme(of: dict[str, float], chosen: Callable[..., str]) -> NamedValue:
+    """The largest (`max`) or least (`min`) entry with its name."""
+    name = chosen(of, key=lambda each: of[each])
+    return NamedValue(name, of[name])
+
+
+@dataclass(frozen=True)
+class Reweighted:
+    """Whether weighted draws may be used alone.
+
+    Attributes:
+        importance: their diagnosis.
+        ess_bulk, ess_tail: effective draws of the mean and of the worse end of the interval, by contract name.
+    """
+
+    importance: Importance
+    ess_bulk: dict[str, float]
+    ess_tail: dict[str, float]
+
+    @property
+    def rhat(self) -> dict[str, float]:
+        """Independent draws have none."""
+        return {}
+
+    @property
+    def missing(self) -> tuple[str, ...]:
+        """Sentences on what is not reached; empty when accepted."""
+        return self.importance.missing
+
+    @property
+    def converged(self) -> bool:
+        """All limits of formulation 4.3 are met."""
+        return self.importance.accepted
+
+    @property
+    def sampling(self) -> Sampling:
+        """What is said of the draws."""
+        return Sampling(
+            converged=self.converged,
+            missing=self.missing,
+            walkers=None,
+            steps=None,
+            discarded=None,
+            thin=None,
+            tau_steps=None,
+            worst_rhat=None,
+            least_ess_bulk=extreme(self.ess_bulk, min),
+            least_ess_tail=extreme(self.ess_tail, min),
+            acceptance=None,
+            least_acceptance=None,
+            stuck_walkers=(),
+            invalid_evaluations=self.importance.invalid_evaluations,
+            proposal_pareto_k=self.importance.pareto_k,
+            importance=self.importance,
+        )
 
 
 @dataclass(frozen=True)
@@ -50,12 +155,14 @@ class Convergence:
     Attributes:
         steps: length of the chain; discarded: first steps left out; thin: one in so many is stored.
         tau_steps: longest integrated autocorrelation time.
-        rhat, ess_bulk, ess_tail: by contract name, of every sampled or derived quantity.
+        rhat: over groups of walkers, by contract name, of every sampled or derived quantity.
+        ess_bulk, ess_tail: effective draws, likewise.
         acceptance: share of accepted moves by walker.
         stuck_walkers: walkers that hardly moved or live at another density.
         invalid: evaluations that gave no number.
-        pareto_k: tail index of target / proposal in the last pilot draws; above 0.7 the proposal is a poor guide.
         missing: sentences on what is not reached; empty when converged.
+        importance: diagnosis of the draws that the chain started from.
+        agreement: with them; None where they were not accepted.
     """
 
     steps: int
@@ -68,8 +175,9 @@ class Convergence:
     acceptance: np.ndarray
     stuck_walkers: tuple[int, ...]
     invalid: int
-    pareto_k: float
     missing: tuple[str, ...]
+    importance: Importance
+    agreement: Agreement | None
 
     @property
     def converged(self) -> bool:
@@ -79,11 +187,6 @@ class Convergence:
     @property
     def sampling(self) -> Sampling:
         """What is said of the chain."""
-
-        def worst(of: dict[str, float], extreme: Callable[..., str]) -> NamedValue:
-            name = extreme(of, key=lambda each: of[each])
-            return NamedValue(name, of[name])
-
         return Sampling(
             converged=self.converged,
             missing=self.missing,
@@ -92,12 +195,14 @@ class Convergence:
             discarded=self.discarded,
             thin=self.thin,
             tau_steps=self.tau_steps,
-            worst_rhat=worst(self.rhat, max),
-            least_ess_bulk=worst(self.ess_bulk, min),
-            least_ess_tail=worst(self.ess_tail, min),
+            worst_rhat=extreme(self.rhat, max),
+            least_ess_bulk=extreme(self.ess_bulk, min),
+            least_ess_tail=extreme(self.ess_tail, min),
             acceptance=float(self.acceptance.mean()),
             least_acceptance=float(self.acceptance.min()),
             stuck_walkers=self.stuck_walkers,
             invalid_evaluations=self.invalid,
-            proposal_pareto_k=self.pareto_k,
+            proposal_pareto_k=self.importance.pareto_k,
+            importance=self.importance,
+            agreement=self.agreement,
         )

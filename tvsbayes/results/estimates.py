@@ -18,7 +18,7 @@ CONTRACTION_LIMIT = 0.1
 
 
 SUMMARY_KEYS = (
-    *("estimator", "converged", "problems", "effective_deg_per_step", "effective_contrast_deg_per_step"),
+    *("estimator", "tier", "converged", "problems", "effective_deg_per_step", "effective_contrast_deg_per_step"),
     *("reference_pose_deg", "effective_jacobian", "parameters", "noise", "weak_directions", "leverage"),
     *("classic_predicted_deg_per_step", "excluded_spots", "suspect_spots", "prior_conflicts", "prior_sensitivity"),
     *("sampling", "curves", "validation", "few_stops"),
@@ -203,7 +203,8 @@ class FitSummary:
         prior_conflicts: parameters that the data pull far from what was stated, in words.
         prior_sensitivity: priors that would move a headline if they were twice or half as wide.
         estimator: "posterior" if a converged sample stands behind the numbers, else "laplace".
-        sampling: diagnosis of the chain, None where nothing was sampled.
+        tier: what made a posterior's draws, "importance" or "emcee"; None of a Laplace approximation.
+        sampling: diagnosis of the draws, None where nothing was sampled.
         curves: effective ratios over the range and lost motion against steps; only from a posterior.
         validation: whether the residuals look as the model says; None where nobody asked.
         few_stops: directions in which so few stops were seen that their scatter is poorly known, with the number.
@@ -226,6 +227,7 @@ class FitSummary:
     prior_conflicts: tuple[str, ...]
     prior_sensitivity: tuple[PriorSensitivity, ...]
     estimator: str = "laplace"
+    tier: str | None = None
     sampling: Sampling | None = None
     curves: Curves | None = None
     validation: Validation | None = None

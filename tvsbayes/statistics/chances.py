@@ -6,6 +6,7 @@ Numbers without units; NumPy, and SciPy inside what needs it.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -50,10 +51,10 @@ def log_chance(chi2: np.ndarray | float, dof: np.ndarray | float) -> np.ndarray:
     Far out Q(a, x) = Gamma(a, x) / Gamma(a) with Gamma(a, x) = e^-x U(1 - a, 1 - a, x) (DLMF 8.5.3): two gross
     defects must not tie at minus infinity, the worse one is the cause.
     """
-    from scipy import special, stats
+    from scipy import special
 
     with np.errstate(divide="ignore"):
-        plain = stats.chi2.logsf(chi2, dof)
+        plain = np.log(special.chdtrc(dof, chi2))
     a, x = 0.5 * np.asarray(dof, dtype=float), 0.5 * np.asarray(chi2, dtype=float)
     far = -x + np.log(special.hyperu(1 - a, 1 - a, x)) - special.gammaln(a)
     return np.where(np.isfinite(plain), plain, far)
@@ -61,9 +62,24 @@ def log_chance(chi2: np.ndarray | float, dof: np.ndarray | float) -> np.ndarray:
 
 def chi2_quantile(readings: np.ndarray, probability: float) -> np.ndarray:
     """Chi-square that a spot of three residuals and so many aperture readings exceeds with this probability."""
-    from scipy import stats
+    from scipy import special
 
-    return stats.chi2.isf(probability, 3 + readings)
+    return special.chdtri(3.0 + readings, probability)
+
+
+def one_way_chance(groups: Sequence[np.ndarray]) -> float:
+    """Probability that groups of one mean and variance differ by so much: the F test of a one-way layout.
+
+    Args:
+        groups: at least two of shape (n,), n > 1, not all of their values equal.
+    """
+    from scipy import special
+
+    every = np.concatenate(groups)
+    between = sum(len(group) * (group.mean() - every.mean()) ** 2 for group in groups)
+    within = sum(np.sum((group - group.mean()) ** 2) for group in groups)
+    free, left = len(groups) - 1, len(every) - len(groups)
+    return float(special.fdtrc(free, left, (between / free) / (within / left)))
 
 
 def share_error(share: float, draws: int) -> float:
@@ -79,6 +95,7 @@ def share_error(share: float, draws: int) -> float:
 
 def binomial_bounds(count: int, probability: float) -> tuple[float, float]:
     """Share that an event of this probability keeps within in `count` trials, but for `BOUND`."""
+    # The only one that needs `scipy.stats`, which takes half a second to load: inverting a discrete distribution.
     from scipy import stats
 
     low, high = stats.binom.ppf(BOUND / 2, count, probability), stats.binom.isf(BOUND / 2, count, probability)
@@ -87,16 +104,16 @@ def binomial_bounds(count: int, probability: float) -> tuple[float, float]:
 
 def rms_bounds(count: int) -> tuple[float, float]:
     """RMS that `count` standard normal numbers keep within, but for `BOUND`."""
-    from scipy import stats
+    from scipy import special
 
-    low, high = np.sqrt(stats.chi2.ppf([BOUND / 2, 1 - BOUND / 2], count) / count)
+    low, high = np.sqrt(2 * special.gammaincinv(0.5 * count, [BOUND / 2, 1 - BOUND / 2]) / count)
     return float(low), float(high)
 
 
 def share_interval95(hits: int, count: int) -> tuple[float, float]:
     """Clopper and Pearson's interval of a probability."""
-    from scipy import stats
+    from scipy import special
 
-    low = 0.0 if hits == 0 else float(stats.beta.ppf(0.025, hits, count - hits + 1))
-    high = 1.0 if hits == count else float(stats.beta.ppf(0.975, hits + 1, count - hits))
+    low = 0.0 if hits == 0 else float(special.betaincinv(hits, count - hits + 1, 0.025))
+    high = 1.0 if hits == count else float(special.betaincinv(hits + 1, count - hits, 0.975))
     return low, high

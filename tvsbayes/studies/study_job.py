@@ -25,9 +25,9 @@ from tvsbayes.instrument.rig import Rig, rig_table_toml
 from tvsbayes.instrument.stereo_pair import stereo_bytes
 from tvsbayes.model.headlines import QUANTITIES, headlines
 from tvsbayes.model.parameter_space import half_normal_sd, half_normal_slope
-from tvsbayes.planning.candidates import covariance_of
+from tvsbayes.planning.drawn_rigs import instruments_in
 from tvsbayes.planning.expectation import Knowledge, information_of, prior_knowledge
-from tvsbayes.planning.forecast import truth_in
+from tvsbayes.planning.looks import covariance_of
 from tvsbayes.planning.target import Target, sensitivity
 from tvsbayes.studies.rows import STUDY_FORMAT, HeadlineRow, StudyRow
 from tvsbayes.twin.physics import effective_deg_per_step, effective_mirror_offset_mm
@@ -114,11 +114,12 @@ def study_row(job: StudyJob, index: int) -> StudyRow:
 def _compared(job: StudyJob, result: JointFit, true: Truth) -> dict[str, HeadlineRow]:
     """Every headline of a fit beside the truth, and beside what the planner predicts at that truth."""
     knowledge, pose = prior_knowledge(job.rig), result.reference_pose_rad
-    truth = truth_in(knowledge, true.parameters, true.stereo.vector)
-    information = information_of(job.steps, knowledge, aperture=job.aperture, z=truth.z, space=truth.space)
-    at_truth = headlines(truth.z, truth.space, pose)
+    instruments = instruments_in(knowledge, [true])
+    z, space = instruments.z[0], instruments.space_of(0)
+    information = information_of(job.steps, knowledge, aperture=job.aperture, z=z, space=space)
+    at_truth = headlines(z, space, pose)
     at_mode = headlines(result.z, result.space, pose)
-    predicted = predicted_sds(knowledge, information.fisher, np.asarray(at_truth.gradient), truth.z)
+    predicted = predicted_sds(knowledge, information.fisher, np.asarray(at_truth.gradient), z)
     values, draws = true_headlines(true.parameters, pose), _headline_draws(result)
     low, high = np.quantile(draws, [0.025, 0.975], axis=0)
     sd = draws.std(axis=0)

@@ -11,8 +11,8 @@ import numpy as np
 from experiments.common.clock import timed
 from experiments.common.rigs import twin_campaign
 from experiments.speed.benchmarks.measure import Bench, Case, Column, Work
-from experiments.speed.last_stage import PEER_TOLERANCE, LastStage, exact_residuals, last_stage
-from tvsbayes.estimators.mode_search import STAGE_STEPS, STAGE_TOLERANCE, stage_residuals
+from experiments.speed.last_stage import PEER_TOLERANCE, LastStage, exact_residuals, last_stage, stage_residuals
+from tvsbayes.estimators.annealed_stage import STAGE_STEPS, STAGE_TOLERANCE
 
 TITLE = "Least squares"
 TWIN = "paper_twin"

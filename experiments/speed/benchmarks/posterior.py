@@ -17,8 +17,8 @@ from experiments.common.rigs import dense_plan, mounted_rig
 from experiments.speed.benchmarks.measure import Bench, Case, Column
 from tvsbayes.estimators.joint_fit import JointFit, fit
 from tvsbayes.estimators.likelihood import log_density
-from tvsbayes.posterior.proposal import Target, pilot
-from tvsbayes.posterior.ridges import transport
+from tvsbayes.posterior.ensemble import WALKERS
+from tvsbayes.posterior.importance import importance_run
 from tvsbayes.posterior.sampling import sample
 from tvsbayes.posterior.transport import Transport
 from tvsbayes.twin.simulated_campaign import simulate
@@ -39,7 +39,7 @@ class Contenders:
     Attributes:
         joint: the fit.
         path: our map to nearly normal coordinates.
-        walkers: draws of our pilot, from which the stretch move starts.
+        walkers: our weighted draws, from which the stretch move starts.
     """
 
     joint: JointFit
@@ -96,9 +96,9 @@ def measure(bench: Bench) -> None:
     compile_for(BUCKET)
     jax.config.update("jax_enable_x64", True)
     joint = fit(simulate(mounted_rig(), dense_plan(("d1", "d3")), seed=1).campaign)
-    path = transport(joint)
     # Compiles everything that `sample` calls, and gives the stretch move walkers that are draws already.
-    samplers = Contenders(joint, path, pilot(Target(joint, path), 0).start)
+    run = importance_run(joint, 0)
+    samplers = Contenders(joint, run.path, run.starts(WALKERS))
     works = {OURS: samplers.ours, NUTS: samplers.hamiltonian, STRETCH: samplers.stretched}
     bench.interleaved(NAME, works, repeats)
 
@@ -107,11 +107,12 @@ def cases(rows: Sequence[Mapping]) -> list[Case]:
     """Tables of the part."""
     about = (
         "Worst bulk effective draws of all free parameters over the process' CPU seconds, compilation apart. "
-        "`tvsbayes` is `sample` from the fit until its own limits are met, transport, pilot and diagnosis included. "
+        "`tvsbayes` is `sample` from the fit until its own limits are met, transport, importance sampling and "
+        "diagnosis included. "
         f"NUTS ({CHAINS} chains in step, {WARMUP} + {DRAWS} draws each) samples Laplace-whitened coordinates, "
         "sheared as in `sampler/nuts_reference.py`; its seconds hold transport and warm-up, the last rate only the "
         "draws; without the shear it did not finish its warm-up on a larger campaign (`sampler/nuts_reference.md`). "
-        "The stretch move makes 400 steps in Laplace-whitened coordinates from draws of our pilot; a quarter of its "
+        "The stretch move makes 400 steps in Laplace-whitened coordinates from our weighted draws; a quarter of its "
         "steps is left out, none of its seconds."
     )
     columns = (

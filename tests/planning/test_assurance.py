@@ -1,0 +1,148 @@
+"""What fits will report of drawn rigs: noise scales as they will be estimated, many instruments at once."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from support.coarse_planning import ROUNDING
+
+from tvsbayes.errors import InputError
+from tvsbayes.instrument.parameters import RIG_NAMES
+from tvsbayes.model.parameter_space import STOP_COLUMNS
+from tvsbayes.planning.assurance import SCALES, Assurance, Family, believed
+from tvsbayes.planning.drawn_rigs import Instruments
+from tvsbayes.planning.expectation import NOISE_COLUMNS, PARAMETERS, information_of
+from tvsbayes.planning.looks import CONTRAST_COLUMNS, covariance_of
+from tvsbayes.planning.target import DEFAULT_TARGET, parse_target, sensitivity
+
+pytestmark = pytest.mark.usefixtures("small_searches")
+
+
+def believers(knowledge, *z) -> Instruments:
+    """Instruments at points of the space that is known."""
+    value = np.asarray(knowledge.space.value)
+    return Instruments.at(np.array(z), np.broadcast_to(value, (len(z), len(value))), knowledge.space)
+
+
+@pytest.mark.parametrize(("together", "kept"), [(4096, 16), (1, 2)])
+def test_what_is_reported_is_the_whole_plan_judged_at_each_instrument(knowledge, found, monkeypatch, together, kept):
+    """One by one, move by move through the filter: at the true noise for the scales, at these for the covariance.
+
+    In parts of any size, and a design asked for later than others.
+    """
+    monkeypatch.setattr(Assurance, "PAIRS", together)
+    monkeypatch.setattr(Assurance, "KEPT", kept)
+    picks = np.random.default_rng(4).integers(0, len(found.looks), 12)
+    family = Family(knowledge, found, np.concatenate([picks, picks]), False)
+    target = parse_target(DEFAULT_TARGET)
+    assurance = Assurance(family, target, 3, 5)
+    drawn = assurance.instruments
+    drawn.z[:, CONTRAST_COLUMNS] = 0.0
+    assurance.instruments = Instruments.at(drawn.z, drawn.value, drawn.common)
+    first = assurance.values([2])
+    reported = {**first, **assurance.values([6, 2])}
+    instruments = assurance.instruments
+    for row in range(3):
+        here, z, space = instruments[np.array([row])], instruments.z[row], instruments.space_of(row)
+        seen = assurance.arrays.at(z, space)
+        for n in (2, 6):
+            steps, chosen = family.arranged(n).steps, assurance.index[: 4 * n]
+            exact = information_of(steps, knowledge, z=z, space=space).fisher
+            noise = assurance.noise[None, row]
+            covariance = covariance_of(knowledge.precision + exact)[None]
+            at = believed(here, seen[None], assurance.looks.side, chosen, covariance, knowledge, noise)[0]
+            pose = seen.mirror_angles_rad[assurance.index].mean(axis=0)
+            judged = information_of(steps, knowledge, z=at, space=space).fisher
+            expected = sensitivity(target, z, space, knowledge.rig.table, pose).value(
+                covariance_of(knowledge.precision + judged)
+            )
+            assert reported[n][row] == pytest.approx(expected, rel=ROUNDING)
+
+
+def test_instruments_that_miss_the_point_or_see_nothing_report_no_uncertainty(knowledge, found, monkeypatch):
+    """Infinite, and the others as if those were not there."""
+    family = Family(knowledge, found, np.arange(8), False)
+    target = parse_target("u(left) <= 1 deg/step")
+    every = Assurance(family, target, 4, 1).values([2])[2]
+    poses = []
+
+    def refused(*asked):
+        poses.append(asked)
+        if len(poses) == 2:
+            raise InputError("out-of-reach", "no beam")
+        return sensitivity(*asked)
+
+    monkeypatch.setattr("tvsbayes.planning.assurance.sensitivity", refused)
+    blind = Assurance(family, target, 4, 1)
+    shown = blind.arrays.at_all
+
+    def closed(z, value):
+        seen = shown(z, value)
+        seen.seen[3] = False
+        return seen
+
+    monkeypatch.setattr(blind.arrays, "at_all", closed)
+    values = blind.values([2])[2]
+    assert np.isinf(values[[1, 3]]).all() and len(poses) == 3
+    assert values[[0, 2]] == pytest.approx(every[[0, 2]], rel=1e-12) and np.isfinite(every).all()
+
+
+def test_other_noise_scales_need_no_new_look(knowledge, found, seen):
+    """Looks whitened anew for other stop errors and pixels carry the information that looking again would give."""
+    family = Family(knowledge, found, np.arange(len(found.looks)), False)
+    assurance = Assurance(family, parse_target(DEFAULT_TARGET), 1, 0)
+    truth = believers(knowledge, knowledge.z)
+    z = knowledge.z.copy()
+    z[SCALES] = (0.7, -1.1, 0.4, 1.3, -0.6)
+    again = assurance.arrays.at(z, knowledge.space).rows
+    quick = assurance.rescaled(assurance.arrays.at_all(truth.z, truth.value), truth, z[None]).rows[0]
+    one, other = (np.einsum("mij,mik->jk", rows, rows) for rows in (again, quick))
+    assert np.abs(one - other).max() < ROUNDING * np.abs(one).max()
+    before = np.einsum("mij,mik->jk", seen.rows, seen.rows)
+    assert np.abs(one - before).max() > 0.1 * np.abs(one).max(), "the scales matter, or the law would be empty"
+
+
+def test_a_noise_scale_is_believed_by_the_weight_of_the_stops(knowledge, found, seen):
+    """Thousands of stops tell the true sd; none leave the prior's median; the scatter is 1 / sqrt(2 n)."""
+    true = knowledge.z.copy()
+    columns = STOP_COLUMNS.ravel()
+    true[columns] = 1.5
+    truth, exact = believers(knowledge, true), np.zeros((1, PARAMETERS, PARAMETERS))
+    many = np.tile(np.arange(len(found.looks)), 40)
+
+    def scales(chosen, noise):
+        noise = np.full((1, 5), noise)
+        return believed(truth, seen[None], found.looks.side, chosen, exact, knowledge, noise)[0, columns]
+
+    assert scales(many, 0.0) == pytest.approx(1.5, abs=0.01)
+    assert (np.abs(scales(many[:1], 0.0)) < 1.5).all()
+    per_direction = len(many) / 2
+    # Stops of 0.18 deg against pixels: what pixels leave open lowers the information by a few per cent.
+    assert scales(many, 1.0) - scales(many, 0.0) == pytest.approx(1 / math.sqrt(2 * per_direction), rel=0.1)
+
+
+def test_what_the_geometry_takes_from_the_stops_is_not_left_for_their_scatter(knowledge, found, seen):
+    """Less p for n: with every geometric coordinate determined by L looks, 1 - p / (2 L) of the information is left."""
+    columns = STOP_COLUMNS.ravel()
+    true = knowledge.z.copy()
+    true[columns] = 1.5
+    truth = believers(knowledge, true)
+    chosen = np.resize(np.arange(len(found.looks)), 60)
+
+    def scatter(covariance):
+        low, high = (
+            believed(truth, seen[None], found.looks.side, chosen, covariance[None], knowledge, np.full((1, 5), x))
+            for x in (0.0, 1.0)
+        )
+        return (high - low)[0, columns]
+
+    exact = np.zeros((PARAMETERS, PARAMETERS))
+    geometry = ~NOISE_COLUMNS & (np.arange(PARAMETERS) < len(RIG_NAMES))
+    # Nothing is learned where the covariance is the prior's; a precision of 0 is a coordinate held fixed.
+    precision = np.diag(knowledge.precision)
+    unknown = np.diag(np.divide(1.0, precision, out=np.zeros(PARAMETERS), where=precision > 0))
+    left_over = 1 - np.sum(geometry & (precision > 0)) / (2 * seen.seen[chosen].sum())
+    # Scatter is 1 / sqrt(information) but for the prior, which 30 stops of a direction outweigh 50 times.
+    assert scatter(exact) / scatter(unknown) == pytest.approx(1 / math.sqrt(left_over), rel=0.03)

@@ -1,0 +1,49 @@
+"""Instruments that may stand there have coordinates under the priors of the analysis."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.coarse_planning import ROUNDING, with_priors
+
+from tvsbayes.instrument.parameters import INDEX, Prior
+from tvsbayes.planning.drawn_rigs import draw_instruments, instruments_in
+from tvsbayes.planning.expectation import prior_knowledge
+from tvsbayes.twin.simulated_campaign import draw_truth
+
+pytestmark = pytest.mark.usefixtures("small_searches")
+
+
+def test_truths_have_coordinates(mounted_rig, knowledge):
+    generator = np.random.default_rng(8)
+    truths = [draw_truth(mounted_rig, generator) for _ in range(3)]
+    instruments = instruments_in(knowledge, truths)
+    assert len(instruments) == 3
+    for drawn, physical in zip(truths, instruments.physical, strict=True):
+        for name, index in INDEX.items():
+            true = drawn.parameters.get(name)
+            if true is not None:
+                assert physical[index] == pytest.approx(true, rel=ROUNDING, abs=ROUNDING), name
+        assert physical[-24:] == pytest.approx(drawn.stereo.vector, rel=ROUNDING, abs=1e-6)
+
+
+def test_what_the_priors_hold_fixed_is_held_at_its_true_value(mounted_rig):
+    """U = 0 in the analysis, a spread in [truth]: coordinate 0, in a space of its own."""
+    name = "mirror_offset_mm"
+    stated = prior_knowledge(with_priors(mounted_rig, mirror_offset_mm=Prior(40.0, 0.0)))
+    known = replace(stated, rig=mounted_rig)
+    instruments = draw_instruments(known, 4, seed=2)
+    assert (instruments.z[:, INDEX[name]] == 0).all() and len(set(instruments.physical[:, INDEX[name]])) == 4
+    second = instruments[np.array([1])]
+    assert np.array_equal(second.physical[0], instruments.physical[1])
+    assert np.asarray(second.space_of(0).value)[INDEX[name]] == instruments.physical[1, INDEX[name]]
+
+
+def test_after_data_instruments_are_drawn_from_the_posterior(knowledge):
+    """Their mean and covariance are those of what is known: 4 standard errors of 400 draws."""
+    known = replace(knowledge, after_data=True, z=knowledge.z + 0.5, precision=4.0 * knowledge.precision)
+    z = draw_instruments(known, 400, seed=3).z
+    assert np.abs(z.mean(axis=0) - 0.5).max() < 5 * 0.5 / 20
+    assert z.std() == pytest.approx(0.5, rel=4 / np.sqrt(2 * z.size))

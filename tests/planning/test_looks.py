@@ -1,0 +1,148 @@
+"""Looks that stand for themselves: they add up to the plan they make, whatever their order, repeats and blocks."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.coarse_planning import ROUNDING
+
+from tvsbayes.planning.candidates import Positions
+from tvsbayes.planning.drawn_rigs import draw_instruments
+from tvsbayes.planning.expectation import HOME_VARIANCE_RAD2, PARAMETERS, information_of, plan_minutes
+from tvsbayes.planning.looks import (
+    CONTRAST_COLUMNS,
+    LookArrays,
+    Looks,
+    Seen,
+    arrange,
+    covariance_of,
+    information_of_looks,
+)
+from tvsbayes.planning.target import DEFAULT_TARGET, parse_target, sensitivity
+
+pytestmark = pytest.mark.usefixtures("small_searches")
+
+
+def test_looks_add_up_to_the_plan_they_make(knowledge, found, seen):
+    """The fast sum equals the filter's pass over the arranged plan, with and without an unknown home offset."""
+    picks = np.random.default_rng(5).integers(0, len(found.looks), 24)
+    arranged = arrange(found.looks[picks], knowledge.sheets, found.overshoot)
+    for after_data in (False, True):
+        known = replace(knowledge, after_data=after_data)
+        exact = information_of(arranged.steps, known).fisher
+        quick = information_of_looks(seen, picks, arranged.path, knowledge.space, after_data)
+        assert np.abs(quick - exact).max() < ROUNDING * np.abs(exact).max()
+
+
+def test_order_of_experiments_does_not_matter(knowledge, found, seen):
+    generator = np.random.default_rng(6)
+    picks = generator.permutation(len(found.looks))[:16]
+    at = sensitivity(
+        parse_target(DEFAULT_TARGET),
+        knowledge.z,
+        knowledge.space,
+        knowledge.rig.table,
+        seen.mirror_angles_rad.mean(axis=0),
+    )
+    values = []
+    for order in (picks, generator.permutation(picks)):
+        path = arrange(found.looks[order], knowledge.sheets, found.overshoot).path
+        information = information_of_looks(seen, order, path, knowledge.space, False)
+        values.append(at.value(covariance_of(knowledge.precision + information)))
+    assert values[1] == pytest.approx(values[0], rel=ROUNDING)
+
+
+def test_every_look_is_reached_from_its_side(found, knowledge):
+    arranged = arrange(found.looks, knowledge.sheets, found.overshoot)
+    assert [s.target for s in arranged.steps if s.action == "place"] == list(knowledge.sheets)
+    counters, last, row = np.zeros(2, dtype=int), np.zeros(2, dtype=int), 0
+    for step in arranged.steps:
+        if step.action == "move":
+            last = np.array([step.pan_steps, step.tilt_steps]) - counters
+            counters = counters + last
+        elif step.action == "look":
+            look = arranged.order[row]
+            assert (counters == found.looks.steps[look]).all()
+            assert (last * found.looks.side[look] >= found.overshoot).all()
+            row += 1
+    assert row == len(found.looks)
+
+
+@pytest.mark.parametrize("home", [(0, 0), (120, -40)])
+def test_an_arranged_plan_travels_and_costs_what_its_steps_do(knowledge, found, home):
+    """Step by step; with a look that is taken twice running, and one where the homing ends."""
+    picks = np.random.default_rng(2).integers(0, len(found.looks), 30)
+    looks = found.looks[np.concatenate([picks, picks[:1]])]
+    looks.steps[5], looks.side[5], looks.sheet[5] = home, (1, 1), 0
+    arranged = arrange(looks, knowledge.sheets, found.overshoot, home)
+    at, far, travelled = np.array(home), np.zeros(2, dtype=int), []
+    for step in arranged.steps[1:]:
+        if step.action == "move":
+            goal = np.array([step.pan_steps, step.tilt_steps])
+            at, far = goal, far + np.abs(goal - at)
+        elif step.action == "look":
+            travelled.append(far)
+    assert np.array_equal(arranged.path[arranged.order], travelled)
+    assert arranged.actions == Counter(step.action for step in arranged.steps)
+    assert arranged.minutes(knowledge.rig) == pytest.approx(plan_minutes(arranged.steps, knowledge.rig), rel=1e-12)
+
+
+def test_looks_taken_again_count_as_often_as_they_are_taken():
+    """Row by row with the contrast's column written out, at two points of parameter space."""
+    generator = np.random.default_rng(7)
+    rows = generator.standard_normal((2, 5, 4, PARAMETERS + 2))
+    seen = Seen(rows, rows[..., :2], np.ones((2, 5), dtype=bool), np.zeros((2, 5, 2)))
+    chosen, path = np.array([3, 0, 3, 3, 1, 0]), generator.integers(0, 900, (6, 2))
+
+    class Space:
+        u = generator.uniform(0.5, 1.0, PARAMETERS)
+
+    for homed in (False, True):
+        found = information_of_looks(seen, chosen, path, Space, homed)
+        for one, information in zip(rows, found, strict=True):
+            every = one[chosen].copy()
+            for axis, column in enumerate(CONTRAST_COLUMNS):
+                every[:, :, column] = every[:, :, PARAMETERS + axis] * path[:, axis, None]
+                every[:, :, column] *= Space.u[column] * np.pi / 360
+            whole = np.einsum("kia,kib->ab", every, every)
+            if homed:
+                whole[PARAMETERS:, PARAMETERS:] += np.eye(2) / HOME_VARIANCE_RAD2
+                # Beside a prior that is taken off again: few looks leave most directions open.
+                prior = np.diag([1.0] * PARAMETERS + [0.0] * 2)
+                covariance = np.linalg.inv(whole + prior)[:PARAMETERS, :PARAMETERS]
+                whole = np.linalg.inv(covariance) - np.eye(PARAMETERS)
+            whole = whole[:PARAMETERS, :PARAMETERS]
+            assert np.abs(information - whole).max() < ROUNDING * np.abs(whole).max()
+
+
+@pytest.mark.parametrize("block", [1, 7, 1000])
+def test_looks_and_instruments_keep_their_places_whatever_the_block(knowledge, monkeypatch, block):
+    """One by one, and in blocks that end within an instrument or hold all of them; those out of view with them."""
+    steps = np.array([[0, 0], [100, 20], [900, 0], [40, -30], [60, 400]])
+    looks = Looks(steps, np.array([[1, 1], [-1, 1], [1, 1], [1, -1], [-1, -1]]), np.array([0, 1, 2, 0, 1]))
+    drawn = draw_instruments(knowledge, 3, seed=1)
+    # The truth lies in another space where something is held fixed; whether it is seen is asked in the common one.
+    z = drawn.z
+    one_by_one = [LookArrays(looks, knowledge, False).at(point, knowledge.space) for point in z]
+    monkeypatch.setattr(LookArrays, "SHOWN", block)
+    monkeypatch.setattr(LookArrays, "IN_IMAGES", block)
+    arrays = LookArrays(looks, knowledge, False)
+    value = np.broadcast_to(np.asarray(knowledge.space.value), drawn.value.shape)
+    together = arrays.at_all(z, value)
+    for one, other in zip(one_by_one, (together[row] for row in range(3)), strict=True):
+        assert np.array_equal(one.seen, other.seen)
+        assert one.rows == pytest.approx(other.rows, rel=ROUNDING, abs=ROUNDING * np.abs(one.rows).max())
+        assert one.mirror_angles_rad == pytest.approx(other.mirror_angles_rad, rel=ROUNDING)
+    assert np.array_equal(arrays.in_images(z), together.seen) and together.seen.any() and not together.seen.all()
+
+
+def test_a_position_is_visible_to_the_share_of_instruments_that_see_it(knowledge):
+    z = draw_instruments(knowledge, 4, seed=1).z
+    positions = Positions(np.array([[0, 0], [240, 0], [900, 0]]), np.array([0, 0, 1]))
+    looks = Looks(positions.steps, np.ones((3, 2), dtype=int), positions.sheet)
+    shown = [LookArrays(looks, knowledge, False).at(point, knowledge.space).seen for point in z]
+    share = positions.visible(knowledge, z)
+    assert share == pytest.approx(np.mean(shown, axis=0), abs=1e-12) and share[2] == 0 < share[0]

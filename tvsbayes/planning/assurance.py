@@ -1,0 +1,201 @@
+"""What fits of a design will report, over drawn instruments: the chance that they meet the target.
+
+An instrument is drawn from `[truth]` of the rig file, or from the posterior of a campaign. Values in the target's unit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import numpy as np
+
+from tvsbayes.errors import InputError
+from tvsbayes.instrument.parameters import INDEX, RIG_NAMES
+from tvsbayes.model.parameter_space import STOP_COLUMNS
+from tvsbayes.planning.candidates import Candidates
+from tvsbayes.planning.drawn_rigs import Instruments, draw_instruments
+from tvsbayes.planning.expectation import LOOKS_PER_EXPERIMENT, NOISE_COLUMNS, PARAMETERS, Knowledge
+from tvsbayes.planning.looks import Arranged, LookArrays, Looks, Seen, arrange, covariance_of, information_of_looks
+from tvsbayes.planning.target import Sensitivity, Target, sensitivity
+
+PIXEL_COLUMN = INDEX["pixel_scale"]
+SCALES = [*STOP_COLUMNS.ravel(), PIXEL_COLUMN]
+"""Columns of the noise scales: stops by direction (right, left, down, up), pixels."""
+
+
+def believed(
+    instruments: Instruments,
+    seen: Seen,
+    side: np.ndarray,
+    chosen: np.ndarray,
+    covariance: np.ndarray,
+    knowledge: Knowledge,
+    noise: np.ndarray,
+) -> np.ndarray:
+    """Coordinates at which fits will judge their uncertainty: the true ones, noise scales as they will estimate them.
+
+    A standard deviation is known from n stops to 1 / sqrt(2 n): the log of each scale has the expected information
+    2 sum (s^2 m / (1 + s^2 m))^2 over the stops of its direction, m what the pixels know of one stop, less what the
+    geometry takes from them; its estimate lies between prior and truth by the weights of both, and scatters.
+
+    Args:
+        instruments: the true ones, n of them.
+        seen: what they see of m looks, shapes (n, m, ...).
+        side: sides of these, shape (m, 2).
+        chosen: numbers of those taken, repeats allowed, shape (k,).
+        covariance: of the coordinates after the looks, shape (n, p, p).
+        knowledge: before the looks.
+        noise: standard normal numbers in the order of `SCALES`, shape (n, 5).
+
+    Returns:
+        Shape (n, p).
+    """
+    z, u = instruments.z.copy(), np.asarray(knowledge.space.u)
+    taken = seen.seen * np.bincount(chosen, minlength=len(side))
+    looks = np.maximum(taken.sum(axis=1), 1)
+    rig_columns = ~NOISE_COLUMNS & (np.arange(PARAMETERS) < len(RIG_NAMES))
+    precision = np.diag(knowledge.precision)
+    variance = np.diagonal(covariance, axis1=-2, axis2=-1)
+    determined = np.sum(1 - variance[:, rig_columns] * precision[rig_columns], axis=1)
+    left_over = np.maximum(0.0, 1 - determined / (2 * looks))
+
+    def estimate(column: int, information: np.ndarray, normal: np.ndarray) -> None:
+        information = information * u[column] ** 2 * left_over
+        before = precision[column]
+        mean = before * knowledge.z[column] + information * z[:, column] + np.sqrt(information) * normal
+        z[:, column] = mean / (before + information)
+
+    for axis in range(2):
+        known = np.sum(seen.slope[..., axis] ** 2, axis=2)
+        for which, sign in enumerate((-1, 1)):
+            column = STOP_COLUMNS[axis, which]
+            share = known * np.radians(instruments.physical[:, column, None]) ** 2
+            share = share / (1 + share)
+            stops = taken * (side[:, axis] == sign)
+            estimate(column, 2 * np.sum(stops * share**2, axis=1), noise[:, 2 * axis + which])
+    estimate(PIXEL_COLUMN, 2.0 * looks, noise[:, 4])
+    return z
+
+
+@dataclass(frozen=True)
+class Family:
+    """Designs that grow by one look at a time: the first 4 n of `picks` are n experiments."""
+
+    knowledge: Knowledge
+    found: Candidates
+    picks: np.ndarray
+    aperture: bool
+
+    def looks(self, experiments: int) -> Looks:
+        """Looks of n experiments."""
+        return self.found.looks[self.picks[: LOOKS_PER_EXPERIMENT * experiments]]
+
+    def arranged(self, experiments: int) -> Arranged:
+        """Their plan."""
+        return arrange(self.looks(experiments), self.knowledge.sheets, self.found.overshoot)
+
+    @property
+    def largest(self) -> int:
+        """Experiments of the largest design."""
+        return len(self.picks) // LOOKS_PER_EXPERIMENT
+
+
+@dataclass(frozen=True)
+class _Scene:
+    """Some of the instruments, what they see of a family's looks, and the target there.
+
+    Attributes:
+        rows: numbers of those that see any look and reach the target's point, n of them.
+        instruments: these.
+        seen: shapes (n, looks, ...).
+        target: gradients (n, q, p) and variances of its own (n, q).
+    """
+
+    rows: np.ndarray
+    instruments: Instruments
+    seen: Seen
+    target: Sensitivity
+
+
+class Assurance:
+    """What fits of the designs of a family will report, over drawn truths."""
+
+    PAIRS, KEPT = 4096, 16
+    """Looks of all instruments that are evaluated together, and how often so many are kept: 10 MB each."""
+
+    def __init__(self, family: Family, target: Target, draws: int, seed: int):
+        self.family, self.target, self.seed = family, target, seed
+        self.instruments = draw_instruments(family.knowledge, draws, seed)
+        self.noise = np.random.default_rng([seed, 37]).standard_normal((draws, len(SCALES)))
+        self.distinct, self.index = np.unique(family.picks, return_inverse=True)
+        self.looks = family.found.looks[self.distinct]
+        self.arrays = LookArrays(self.looks, family.knowledge, family.aperture)
+        self._scene = lru_cache(maxsize=self.KEPT)(self._evaluated)
+        self._values: dict[int, np.ndarray] = {}
+
+    def of(self, family: Family) -> Assurance:
+        """The same instruments before other designs."""
+        return Assurance(family, self.target, len(self.instruments), self.seed)
+
+    def values(self, sizes: Sequence[int]) -> dict[int, np.ndarray]:
+        """Reported uncertainty of the target at each truth, shape (draws,), by number of experiments."""
+        draws, together = len(self.instruments), max(1, self.PAIRS // len(self.looks))
+        wanted = {n: self.family.arranged(n).path for n in sizes if n not in self._values}
+        found = {n: np.full(draws, np.inf) for n in wanted}
+        for first in range(0, draws, together) if wanted else ():
+            scene = self._scene(first, min(first + together, draws))
+            for n, path in wanted.items():
+                found[n][scene.rows] = self._reported(scene, n, path)
+        self._values |= found
+        return {n: self._values[n] for n in sizes}
+
+    def met_share(self, experiments: int) -> float:
+        """Share of the truths whose fit of n experiments reports the target as met."""
+        return float(np.mean(self.values([experiments])[experiments] <= self.target.limit))
+
+    def _evaluated(self, first: int, end: int) -> _Scene:
+        every, table = self.instruments[np.arange(first, end)], self.family.knowledge.rig.table
+        seen = self.arrays.at_all(every.z, every.value)
+        poses = seen.mirror_angles_rad[:, self.index].mean(axis=1)
+        rows, found = [], []
+        for row in np.flatnonzero(seen.seen.any(axis=1)).tolist():
+            try:
+                found.append(sensitivity(self.target, every.z[row], every.space_of(row), table, poses[row]))
+            except InputError:
+                continue
+            rows.append(row)
+        gradient = np.array([one.gradient for one in found]).reshape(len(rows), -1, PARAMETERS)
+        own = {"at the point": np.array([one.own_variance for one in found]).reshape(len(rows), -1)}
+        chosen = np.array(rows, dtype=int)
+        return _Scene(first + chosen, every[chosen], seen[chosen], Sensitivity(gradient, own))
+
+    def _reported(self, scene: _Scene, experiments: int, path: np.ndarray) -> np.ndarray:
+        """Of the instruments of a scene, shape (n,)."""
+        knowledge, chosen = self.family.knowledge, self.index[: LOOKS_PER_EXPERIMENT * experiments]
+
+        def covariance(seen: Seen) -> np.ndarray:
+            information = information_of_looks(seen, chosen, path, knowledge.space, knowledge.after_data)
+            return covariance_of(knowledge.precision + information)
+
+        first = covariance(scene.seen)
+        noise = self.noise[scene.rows]
+        z = believed(scene.instruments, scene.seen, self.looks.side, chosen, first, knowledge, noise)
+        return scene.target.values(covariance(self.rescaled(scene.seen, scene.instruments, z)), self.target.factor)
+
+    def rescaled(self, seen: Seen, instruments: Instruments, z: np.ndarray) -> Seen:
+        """The same looks (n, m) whitened with noise scales of other coordinates (n, p): I s^2 + slope S slope^T."""
+        u, true = np.asarray(self.family.knowledge.space.u)[SCALES], instruments.value[:, SCALES]
+        before, after = (true * np.exp(u * point[:, SCALES]) for point in (instruments.z, z))
+        pixel = after[:, 4] / before[:, 4]
+        sides = (self.looks.side > 0).astype(int)
+        # Both roots are taken in the three dimensions that the residual has; rows are turned, not only scaled.
+        old, new = (
+            p[:, None, None, None] ** 2 * np.eye(4)
+            + (seen.slope * np.radians(scale[:, :4].reshape(-1, 2, 2)[:, [0, 1], sides])[:, :, None] ** 2)
+            @ np.swapaxes(seen.slope, -1, -2)
+            for p, scale in ((np.ones(len(pixel)), before), (pixel, after))
+        )
+        turn = np.linalg.solve(np.linalg.cholesky(new), np.linalg.cholesky(old))
+        return replace(seen, rows=turn @ seen.rows)

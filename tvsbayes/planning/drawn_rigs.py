@@ -1,0 +1,75 @@
+"""Instruments that may stand there: drawn from `[truth]` of the rig file, or from the posterior of a campaign."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from tvsbayes.instrument.parameters import RIG_NAMES
+from tvsbayes.model.compiled import placed
+from tvsbayes.model.headlines import physical_at
+from tvsbayes.model.parameter_space import ParameterSpace, coordinates_of
+from tvsbayes.planning.expectation import PARAMETERS, Knowledge
+from tvsbayes.twin.simulated_campaign import Truth, draw_truth
+
+
+@dataclass(frozen=True)
+class Instruments:
+    """Points of parameter space that may be true, n of them.
+
+    Attributes:
+        z: coordinates, shape (n, p).
+        value: of their spaces, shape (n, rig): what the priors hold fixed is held at its true value.
+        physical: values in the units of `NAMES`, shape (n, p).
+        common: the rest of their spaces.
+    """
+
+    z: np.ndarray
+    value: np.ndarray
+    physical: np.ndarray
+    common: ParameterSpace
+
+    @classmethod
+    def at(cls, z: np.ndarray, value: np.ndarray, common: ParameterSpace) -> Instruments:
+        """Points with coordinates (n, p) in spaces that differ by `value` (n, rig)."""
+        bare = cls(z, value, np.empty_like(z), common)
+        physical = [physical_at(point, bare.space_of(row)).value for row, point in enumerate(z)]
+        return replace(bare, physical=np.array(physical).reshape(z.shape))
+
+    def __len__(self) -> int:
+        return len(self.z)
+
+    def __getitem__(self, chosen: np.ndarray) -> Instruments:
+        return Instruments(self.z[chosen], self.value[chosen], self.physical[chosen], self.common)
+
+    def space_of(self, row: int) -> ParameterSpace:
+        """The space in which one of them has its coordinates."""
+        return replace(self.common, value=placed(self.value[row]))
+
+
+def instruments_in(knowledge: Knowledge, truths: Sequence[Truth]) -> Instruments:
+    """Coordinates of rigs under the ANALYSIS priors; what these hold fixed is held at its true value."""
+    space = knowledge.space
+    true = np.array([[truth.parameters[name] for name in RIG_NAMES] for truth in truths]).reshape(-1, len(RIG_NAMES))
+    cameras = np.array([truth.stereo.vector for truth in truths]).reshape(len(true), -1)
+    # A half-normal with u = 0 is 0 whatever its value; nothing else can be stated for it.
+    held = np.where(np.asarray(space.u) > 0, np.asarray(space.value), true)
+    return Instruments.at(coordinates_of(space, np.concatenate([true, cameras], axis=1)), held, space)
+
+
+def draws_of(knowledge: Knowledge, count: int, generator: np.random.Generator) -> np.ndarray:
+    """Coordinates of instruments that may stand there, shape (count, p)."""
+    root = np.linalg.cholesky(knowledge.covariance)
+    return knowledge.z + generator.standard_normal((count, PARAMETERS)) @ root.T
+
+
+def draw_instruments(knowledge: Knowledge, count: int, seed: int) -> Instruments:
+    """Instruments from `[truth]` of the rig file (the design prior), or from the posterior where there are data."""
+    generator = np.random.default_rng([seed, 31])
+    if knowledge.after_data:
+        z = draws_of(knowledge, count, generator)
+        value = np.asarray(knowledge.space.value)
+        return Instruments.at(z, np.broadcast_to(value, (count, len(value))), knowledge.space)
+    return instruments_in(knowledge, [draw_truth(knowledge.rig, generator) for _ in range(count)])

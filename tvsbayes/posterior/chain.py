@@ -1,0 +1,177 @@
+"""A chain of emcee and what it began with: all that continues it bit for bit, and the file that keeps it.
+
+Coordinates w of `posterior.transport`; arrays of a chain are ordered (step, walker, ...).
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+from dataclasses import dataclass, fields
+from importlib.metadata import version
+from pathlib import Path
+
+import jax
+import numpy as np
+
+from tvsbayes.errors import InputError, escaped
+from tvsbayes.estimators.joint_fit import JointFit
+from tvsbayes.files.disk import read_arrays, write_atomically
+from tvsbayes.instrument.campaign import input_hashes
+from tvsbayes.posterior.importance import ImportanceRun, Pool, reweighted_posterior
+from tvsbayes.posterior.proposal import Independence, Tables
+from tvsbayes.posterior.transport import Transport
+
+CHAIN_FORMAT = "tvsbayes-chain/5"
+CHAIN_BYTES_MAX = 2**32
+"""A chain is the user's own file: what was in memory when it was written fits there again."""
+
+
+@dataclass(frozen=True)
+class Progress:
+    """What a progress display shows of a chain.
+
+    `worst_ess` is None before the first check; seconds since the start, and left until the next check.
+    """
+
+    steps: int
+    expected_steps: int
+    worst_ess: float | None
+    seconds: float
+    seconds_left: float
+
+
+@dataclass(frozen=True)
+class Chain:
+    """Everything a run has done: enough to continue it bit for bit.
+
+    Attributes:
+        w: positions, shape (steps, walkers, d); log_density: relative to the mode, shape (steps, walkers).
+        accepted: accepted moves by walker.
+        random_state: NumPy's legacy generator after the last step.
+        invalid: evaluations that gave no number.
+        seconds: spent so far, importance sampling included.
+        goal: steps at which convergence is looked at next.
+    """
+
+    w: np.ndarray
+    log_density: np.ndarray
+    accepted: np.ndarray
+    random_state: tuple
+    invalid: int
+    seconds: float
+    goal: int
+
+
+def fingerprint(fit: JointFit) -> str:
+    """Hash of what a chain depends on: data, weights, model options and priors, versions of what computes it."""
+    digest = hashlib.sha256(json.dumps(input_hashes(fit.campaign), sort_keys=True).encode())
+    for array in (*jax.tree.leaves(fit.space), *jax.tree.leaves(fit.arrays), fit.free):
+        array = np.asarray(array)
+        digest.update(f"{array.dtype} {array.shape}".encode() + np.ascontiguousarray(array).tobytes())
+    for package in ("tvsbayes", "emcee", "jax", "numpy"):
+        digest.update(f"{package} {version(package)}".encode())
+    return digest.hexdigest()
+
+
+def _pool_arrays(pool: Pool) -> dict[str, np.ndarray]:
+    """A pool as arrays; the proposal that comes next is the last of them."""
+    every = (*pool.proposals, pool.next_proposal)
+    return {
+        "pool_w": pool.w,
+        "pool_log_target": pool.log_target,
+        "pool_counts": np.array(pool.counts),
+        "pool_invalid": np.array(pool.invalid),
+        "proposal_mean": np.stack([each.mean for each in every]),
+        "proposal_sd": np.stack([each.sd for each in every]),
+        "proposal_places": pool.next_proposal.places,
+        "proposal_tables": np.stack([each.tables.log_density for each in every]),
+    }
+
+
+def _pool_of(stored: dict[str, np.ndarray]) -> Pool:
+    """The pool of `_pool_arrays`."""
+    parts = zip(stored["proposal_mean"], stored["proposal_sd"], stored["proposal_tables"], strict=True)
+    every = tuple(Independence(mean, sd, stored["proposal_places"], Tables(table)) for mean, sd, table in parts)
+    counts = tuple(stored["pool_counts"].tolist())
+    pool = Pool(stored["pool_w"], stored["pool_log_target"], every[:-1], counts, every[-1], int(stored["pool_invalid"]))
+    if len(counts) != len(every) - 1 or not len(pool.w) == len(pool.log_target) == sum(counts):
+        raise ValueError(f"{len(pool.w)} weighted draws with parts of other lengths")
+    return pool
+
+
+def write_chain(path: Path, fit: JointFit, start: ImportanceRun, chain: Chain) -> None:
+    """Keep a chain and what it started from, whole or not at all."""
+    buffer = io.BytesIO()
+    kind, keys, position, has_gauss, gauss = chain.random_state
+    kept = {f"transport_{f.name}": getattr(start.path, f.name) for f in fields(Transport)} | _pool_arrays(start.pool)
+    np.savez(
+        buffer,
+        allow_pickle=False,
+        format=CHAIN_FORMAT,
+        fingerprint=fingerprint(fit),
+        seed=start.posterior.seed,
+        **kept,
+        start_seconds=start.posterior.seconds,
+        w=chain.w,
+        log_density=chain.log_density,
+        accepted=chain.accepted,
+        invalid=chain.invalid,
+        seconds=chain.seconds,
+        goal=chain.goal,
+        random_kind=kind,
+        random_keys=keys,
+        random_rest=np.array([position, has_gauss, gauss]),
+    )
+    write_atomically(path, buffer.getvalue())
+
+
+def stored_chain(path: Path, fit: JointFit, seed: int) -> tuple[ImportanceRun, Chain]:
+    """Read a chain; refuse one of other data, model, priors, versions or seed."""
+    name = escaped(path.name)
+    if not path.exists():
+        raise InputError("no-chain", f"{name}: there is no chain to resume", file=name, remedy="run without --resume")
+    try:
+        stored = read_arrays(path, CHAIN_BYTES_MAX, CHAIN_BYTES_MAX)
+        if str(stored["format"]) != CHAIN_FORMAT:
+            raise ValueError(f"format {str(stored['format'])[:60]!r}")
+        same = str(stored["fingerprint"]) == fingerprint(fit) and int(stored["seed"]) == seed
+        route = Transport(**{f.name: stored[f"transport_{f.name}"] for f in fields(Transport)})
+        pool, chain, spent = _pool_of(stored), _chain_of(stored), float(stored["start_seconds"])
+        if not pool.w.shape[1] == chain.w.shape[2] == len(pool.next_proposal.mean):
+            raise ValueError(f"weighted draws of {pool.w.shape[1]} coordinates, walkers of {chain.w.shape[2]}")
+    except (KeyError, TypeError, ValueError, IndexError, OverflowError) as error:
+        raise InputError(
+            "damaged-chain",
+            f"{name} is not a chain that tvsbayes wrote: {escaped(str(error), 200)}",
+            file=name,
+            allowed=f"format {CHAIN_FORMAT}",
+            remedy="run without --resume; the chain starts anew",
+        ) from error
+    if not same:
+        raise InputError(
+            "other-chain",
+            f"{name} was sampled from other data, another model, other priors, another seed or other versions",
+            file=name,
+            allowed="the chain of the same campaign, options and versions",
+            remedy="run without --resume, or restore the inputs and options it was started with",
+        )
+    return ImportanceRun(route, pool, reweighted_posterior(fit, route, pool, seed, spent)), chain
+
+
+def _chain_of(stored: dict[str, np.ndarray]) -> Chain:
+    position, has_gauss, gauss = stored["random_rest"]
+    chain = Chain(
+        stored["w"],
+        stored["log_density"],
+        stored["accepted"],
+        (str(stored["random_kind"]), stored["random_keys"], int(position), int(has_gauss), float(gauss)),
+        int(stored["invalid"]),
+        float(stored["seconds"]),
+        int(stored["goal"]),
+    )
+    steps, walkers, _ = chain.w.shape
+    if chain.log_density.shape != (steps, walkers) or chain.accepted.shape != (walkers,):
+        raise ValueError(f"{steps} steps of {walkers} walkers with parts of other lengths")
+    return chain

@@ -1,0 +1,170 @@
+"""Whether a chain may be used: R-hat over groups of walkers, effective draws, stuck walkers, agreement with tier 1.
+
+Judged on the stored draws, so that what ArviZ computes from `posterior.nc` is what was judged. Draws are ordered
+(chain, draw, ...); a chain is a walker.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import emcee
+import numpy as np
+from arviz_stats.base import array_stats
+
+from tvsbayes.estimators.joint_fit import JointFit
+from tvsbayes.instrument.parameters import NAMES
+from tvsbayes.model.headlines import Derived
+from tvsbayes.posterior.chain import Chain
+from tvsbayes.posterior.draws import Draws, Posterior, derived_at, headline_names, propagated
+from tvsbayes.posterior.importance import ImportanceRun
+from tvsbayes.results.convergence import Agreement, Convergence, extreme
+
+GROUPS = 4
+"""Of walkers that share no partners: chains that know nothing of each other, for R-hat."""
+RHAT_LIMIT = 1.01
+ESS_LIMIT = 1000
+TAU_LIMIT = 50
+"""Limits of formulation 4.3: rank R-hat by group, bulk and tail effective draws, steps in autocorrelation times."""
+AGREEMENT_LIMIT = 4.0
+"""Monte Carlo errors by which a headline's mean or interval end may differ from importance sampling's. Of some thirty
+comparisons one lies farther out in two of a thousand fits."""
+STUCK_ACCEPTANCE = 0.25
+"""A walker is stuck that accepts less than this share of what the median walker accepts ..."""
+STUCK_DEVIATION = 8.0
+"""... or whose mean log density lies this many median absolute deviations, and a standard deviation of a single draw,
+off the others': the means of long chains spread so little that one rare excursion would fail the first alone."""
+STORED_DRAWS = 64
+"""Draws stored per walker: from this many to twice as many, some four thousand in all."""
+
+
+@dataclass(frozen=True)
+class ChainQuality:
+    """Numbers behind the verdict: of the columns `names`, and of the walkers."""
+
+    names: tuple[str, ...]
+    rhat: np.ndarray
+    ess_bulk: np.ndarray
+    ess_tail: np.ndarray
+    kept: int
+    tau_steps: float
+    stuck: np.ndarray
+
+    @property
+    def missing(self) -> list[str]:
+        """Which limits are not met, in sentences; NaN meets none."""
+        missing = []
+        if not np.max(self.rhat) <= RHAT_LIMIT:
+            worst = self.names[int(np.nanargmax(self.rhat))]
+            missing.append(f"R-hat of {worst} is {np.max(self.rhat):.4f}, wanted {RHAT_LIMIT}")
+        for kind, ess in (("bulk", self.ess_bulk), ("tail", self.ess_tail)):
+            if not np.min(ess) >= ESS_LIMIT:
+                least = int(np.nanargmin(ess))
+                missing.append(f"{self.names[least]} has {ess[least]:.0f} {kind} effective draws, wanted {ESS_LIMIT}")
+        if not self.kept >= TAU_LIMIT * self.tau_steps:
+            times = f"{self.kept / self.tau_steps:.0f} autocorrelation times"
+            missing.append(f"{self.kept} steps are {times}, wanted {TAU_LIMIT}")
+        if self.stuck.any():
+            missing.append(f"stuck walkers: {', '.join(map(str, np.flatnonzero(self.stuck)))}")
+        return missing
+
+    def by_name(self, values: np.ndarray) -> dict[str, float]:
+        """One of the arrays by the names of its columns."""
+        return dict(zip(self.names, map(float, values), strict=True))
+
+
+def autocorrelation_steps(w: np.ndarray) -> float:
+    """Longest integrated autocorrelation time of positions (steps, walkers, d), steps; infinite if none moved.
+
+    A walker that never moved has no autocorrelation; it is found by its acceptance.
+    """
+    moved = np.ptp(w[:, :, 0], axis=0) > 0
+    if not moved.any():
+        return float("inf")
+    return float(np.max(emcee.autocorr.integrated_time(w[:, moved], tol=0, quiet=True)))
+
+
+def grouped(values: np.ndarray) -> np.ndarray:
+    """Draws (walker, draw, ...) as those of `GROUPS` groups of neighbours (group, draws, ...), in order of time."""
+    walkers, draws, *rest = values.shape
+    parts = values.reshape(GROUPS, walkers // GROUPS, draws, *rest)
+    return np.swapaxes(parts, 1, 2).reshape(GROUPS, -1, *rest)
+
+
+def stuck_walkers(chain: Chain, discarded: int) -> np.ndarray:
+    """Walkers that hardly move, or live at another density than most, shape (walkers,)."""
+    acceptance = chain.accepted / len(chain.w)
+    means = chain.log_density[discarded:].mean(axis=0)
+    deviation = np.abs(means - np.median(means))
+    stuck = acceptance < STUCK_ACCEPTANCE * np.median(acceptance)
+    single_draw = float(np.median(chain.log_density[discarded:].std(axis=0)))
+    return stuck | (deviation > max(STUCK_DEVIATION * float(np.median(deviation)), single_draw))
+
+
+def agreement(first: Posterior, chain_draws: Derived, names: tuple[str, ...]) -> Agreement:
+    """Of draws (chain, draw) with the weighted ones, by the columns of those names that vary."""
+    own, theirs = Draws(chain_draws), first.by_name
+    shape = np.shape(chain_draws.effective_mirror_offset_mm)
+    names = tuple(name for name in names if np.ptp(own[name]) > 0 and np.ptp(theirs[name]) > 0)
+    ours = propagated(np.stack([own[name].reshape(shape) for name in names], axis=-1))
+    weighted = first.summarised(np.stack([theirs[name].reshape(first.weights.shape) for name in names], axis=-1))
+    gaps: dict[str, float] = {}
+    for label, one, other, error_one, error_other in (
+        ("mean", ours.mean, weighted.mean, ours.mcse_mean, weighted.mcse_mean),
+        ("lower end", ours.interval95[0], weighted.interval95[0], ours.mcse_interval95[0], weighted.mcse_interval95[0]),
+        ("upper end", ours.interval95[1], weighted.interval95[1], ours.mcse_interval95[1], weighted.mcse_interval95[1]),
+    ):
+        gap = np.abs(one - other) / np.hypot(error_one, error_other)
+        gaps |= {f"{name}, {label}": float(each) for name, each in zip(names, gap, strict=True)}
+    worst = extreme(gaps, max)
+    return Agreement(worst.value < AGREEMENT_LIMIT, AGREEMENT_LIMIT, worst)
+
+
+def diagnose(fit: JointFit, start: ImportanceRun, chain: Chain) -> Posterior:
+    """Leave out the warm-up, thin, and judge what is left."""
+    steps = len(chain.w)
+    discarded = int(min(steps // 4, max(20.0, 5 * autocorrelation_steps(chain.w))))
+    kept = chain.w[discarded:]
+    thin = max(1, len(kept) // STORED_DRAWS)
+    stored = kept[::thin].transpose(1, 0, 2)
+    walkers, draws, dimension = stored.shape
+    found = start.path.mapped(stored.reshape(-1, dimension))
+    z = found.z.reshape(walkers, draws, -1)
+    log_density = chain.log_density[discarded:][::thin].T + fit.log_density - found.log_jacobian.reshape(walkers, draws)
+    derived = derived_at(fit, z, fit.reference_pose_rad)
+    columns = {**Draws(derived), "log_density": log_density.ravel()}
+    fixed = {NAMES[i] for i in np.flatnonzero(~fit.free)}
+    names = tuple(name for name, column in columns.items() if name not in fixed and np.ptp(column) > 0)
+    values = np.stack([columns[name].reshape(walkers, draws) for name in names], axis=2)
+    axes = {"chain_axis": 0, "draw_axis": 1}
+    quality = ChainQuality(
+        names,
+        rhat=array_stats.rhat(grouped(values), method="rank", **axes),
+        ess_bulk=array_stats.ess(values, method="bulk", **axes),
+        ess_tail=array_stats.ess(values, method="tail", prob=(0.05, 0.95), **axes),
+        kept=len(kept),
+        tau_steps=autocorrelation_steps(kept),
+        stuck=stuck_walkers(chain, discarded),
+    )
+    missing, first = quality.missing, start.posterior
+    same = agreement(first, derived, headline_names(fit)) if first.converged else None
+    if same is not None and not same.agrees:
+        gap = f"by {same.worst.value:.1f} Monte Carlo errors, wanted below {AGREEMENT_LIMIT:g}"
+        missing.append(f"emcee and importance sampling differ on {same.worst.quantity} {gap}")
+    convergence = Convergence(
+        steps=steps,
+        discarded=discarded,
+        thin=thin,
+        tau_steps=quality.tau_steps,
+        rhat=quality.by_name(quality.rhat),
+        ess_bulk=quality.by_name(quality.ess_bulk),
+        ess_tail=quality.by_name(quality.ess_tail),
+        acceptance=chain.accepted / steps,
+        stuck_walkers=tuple(int(i) for i in np.flatnonzero(quality.stuck)),
+        invalid=chain.invalid,
+        missing=tuple(missing),
+        importance=first.convergence.importance,
+        agreement=same,
+    )
+    weights = np.full((walkers, draws), 1 / (walkers * draws))
+    return Posterior(fit, z, log_density, derived, weights, convergence, first.seed, chain.seconds)

@@ -1,0 +1,226 @@
+"""The posterior by importance sampling: independent draws from a proposal that follows it, weighted (formulation 4.3).
+
+Rounds of draws in the coordinates w of `posterior.transport` are pooled: each is weighted by the target over the
+mixture of all proposals that made them, the balance heuristic (Veach and Guibas, SIGGRAPH 95, 419; Owen and Zhou, J.
+Am. Stat. Assoc. 95 (2000) 135), so that a poor first round costs little.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from tvsbayes.errors import NotConverged
+from tvsbayes.estimators.campaign_arrays import spot_constants
+from tvsbayes.estimators.joint_fit import JointFit
+from tvsbayes.instrument.campaign import ordered_spots
+from tvsbayes.instrument.parameters import NAMES
+from tvsbayes.posterior.draws import Draws, Posterior, derived_at, headline_names
+from tvsbayes.posterior.proposal import Independence, Target, first_proposal
+from tvsbayes.posterior.ridges import transport
+from tvsbayes.posterior.transport import Transport
+from tvsbayes.results.convergence import Importance, Reweighted, extreme
+from tvsbayes.statistics.weighted_draws import effective_draws, pareto_k, smoothed_weights, weighted_summary
+
+ROUND = 1024
+FITTED_ROUNDS = 3
+"""Rounds after each of which the proposal is fitted to all draws so far; later ones are drawn from the last."""
+ROUNDS_MAX = 24
+ESS_WANTED = 2000
+"""Effective draws of the worst statistic of the worst headline at which no further round is drawn ..."""
+ESS_LIMIT = 1000
+"""... and fewer than which are not accepted."""
+K_LIMIT = 0.7
+"""Tail index from which weighted means cannot be trusted (Vehtari et al., J. Mach. Learn. Res. 25 (2024) 72)."""
+HEAVIEST_LIMIT = 0.02
+"""Share of the weight that one draw may have."""
+
+
+@dataclass(frozen=True)
+class Pool:
+    """Weighted draws and what they were drawn from.
+
+    Attributes:
+        w: draws, shape (n, d), round by round.
+        log_target: their log densities as `Target` gives them, shape (n,).
+        proposals: that made them; counts: how many each, in order.
+        next_proposal: fitted to all of them.
+        invalid: draws whose density has no value.
+    """
+
+    w: np.ndarray
+    log_target: np.ndarray
+    proposals: tuple[Independence, ...]
+    counts: tuple[int, ...]
+    next_proposal: Independence
+    invalid: int = 0
+
+    @property
+    def log_weights(self) -> np.ndarray:
+        """Log (target / mixture of the proposals), shape (n,)."""
+        each = np.stack([proposal.log_density(self.w) for proposal in self.proposals])
+        share = np.log(np.array(self.counts) / len(self.w))
+        return self.log_target - np.logaddexp.reduce(each + share[:, None], axis=0)
+
+    def extended(self, target: Target, generator: np.random.RandomState, fitted: bool) -> Pool:
+        """With another round; the proposal is fitted again if `fitted`."""
+        proposal, before = self.next_proposal, target.invalid
+        w = proposal.draw(ROUND, generator)
+        proposals, counts = self.proposals, self.counts
+        if proposals and proposals[-1] is proposal:
+            counts = (*counts[:-1], counts[-1] + ROUND)
+        else:
+            proposals, counts = (*proposals, proposal), (*counts, ROUND)
+        found = Pool(
+            np.concatenate([self.w, w]),
+            np.concatenate([self.log_target, target(w)]),
+            proposals,
+            counts,
+            proposal,
+            self.invalid + target.invalid - before,
+        )
+        if not np.isfinite(found.log_target).sum() > 8 * w.shape[1]:
+            raise FloatingPointError("the posterior density is not finite around the mode")
+        if fitted:
+            found = replace(found, next_proposal=proposal.fitted(found.w, found.log_target, found.log_weights))
+        return found
+
+
+def empty_pool(target: Target) -> Pool:
+    """Before the first round."""
+    dimension = target.path.dimension
+    first = first_proposal(target, dimension, target.path.heavy)
+    return Pool(np.zeros((0, dimension)), np.zeros(0), (), (), first)
+
+
+def log_evidence(fit: JointFit, path: Transport, log_weights: np.ndarray) -> float:
+    """Log of the integral of likelihood times prior over the free parameters.
+
+    The mean weight is the integral of exp(log density - that at the mode) over w; |det root| takes it to the
+    coordinates z, whose normal priors `likelihood.log_density` has without their constants.
+    """
+    highest = np.max(log_weights)
+    integral = highest + np.log(np.mean(np.exp(log_weights - highest)))
+    used = np.asarray(fit.arrays.spots.valid)[: len(ordered_spots(fit.campaign))] > 0
+    constants = float(spot_constants(fit.campaign)[used].sum()) - 0.5 * path.dimension * np.log(2 * np.pi)
+    # What is held fixed has no prior to be integrated over.
+    held = 0.5 * float(np.sum(fit.z[~fit.free] ** 2))
+    volume = float(np.sum(np.log(np.diag(path.root))))
+    return float(integral + volume + fit.log_density + constants + held)
+
+
+def reweighted_posterior(fit: JointFit, path: Transport, pool: Pool, seed: int, seconds: float) -> Posterior:
+    """The draws of a pool with their weights, and whether they may be used."""
+    log_weights = pool.log_weights
+    finite = np.isfinite(log_weights)
+    smoothed = smoothed_weights(log_weights[finite])
+    weights = smoothed.weights
+    found = path.mapped(pool.w[finite])
+    log_density = pool.log_target[finite] + fit.log_density - found.log_jacobian
+    derived = derived_at(fit, found.z[None], fit.reference_pose_rad)
+    columns = {**Draws(derived), "log_density": log_density}
+    fixed = {NAMES[i] for i in np.flatnonzero(~fit.free)}
+    names = [name for name, column in columns.items() if name not in fixed and np.ptp(column) > 0]
+    every = weighted_summary(np.stack([columns[name] for name in names], axis=1), weights)
+    least = dict(zip(names, every.ess_least.tolist(), strict=True))
+    headlines = [name for name in headline_names(fit) if name in least]
+    tails = {}
+    for name in headlines:
+        deviation = columns[name] - every.mean[names.index(name)]
+        tails[name] = pareto_k(weights * deviation**2)
+    raw = np.exp(log_weights - np.max(log_weights))
+    kish = effective_draws(raw)
+    importance = Importance(
+        accepted=True,
+        missing=(),
+        rounds=len(log_weights) // ROUND,
+        draws=len(log_weights),
+        effective_share=kish / len(log_weights),
+        least_ess=extreme({name: least[name] for name in headlines}, min),
+        pareto_k=smoothed.pareto_k,
+        worst_pareto_k=extreme(tails, max),
+        heaviest_share=float(np.max(weights)),
+        log_evidence=log_evidence(fit, path, log_weights),
+        log_evidence_mcse=float(np.sqrt(max(1 / kish - 1 / len(log_weights), 0.0))),
+        invalid_evaluations=pool.invalid,
+    )
+    missing = lacking(importance)
+    convergence = Reweighted(
+        replace(importance, accepted=not missing, missing=missing),
+        dict(zip(names, every.ess_mean.tolist(), strict=True)),
+        dict(zip(names, every.ess_interval95.min(axis=0).tolist(), strict=True)),
+    )
+    return Posterior(fit, found.z[None], log_density[None], derived, weights[None], convergence, seed, seconds)
+
+
+def lacking(found: Importance) -> tuple[str, ...]:
+    """What is not reached, in sentences."""
+    missing = []
+    if not found.pareto_k < K_LIMIT:
+        missing.append(f"the weights of importance sampling have Pareto k {found.pareto_k:.2f}, wanted below {K_LIMIT}")
+    if not found.worst_pareto_k.value < K_LIMIT:
+        worst = found.worst_pareto_k
+        missing.append(f"those of {worst.quantity} have Pareto k {worst.value:.2f}, wanted below {K_LIMIT}")
+    if not found.heaviest_share <= HEAVIEST_LIMIT:
+        share = f"{100 * found.heaviest_share:.1f} %"
+        missing.append(f"one draw holds {share} of the weight, wanted at most {100 * HEAVIEST_LIMIT:.0f} %")
+    if not found.least_ess.value >= ESS_LIMIT:
+        least = found.least_ess
+        missing.append(f"{least.quantity} has {least.value:.0f} effective draws, wanted {ESS_LIMIT}")
+    return tuple(missing)
+
+
+@dataclass(frozen=True)
+class ImportanceRun:
+    """What importance sampling leaves for a chain: the map, the pool of draws, and the posterior by them."""
+
+    path: Transport
+    pool: Pool
+    posterior: Posterior
+
+    @property
+    def proposal(self) -> Independence:
+        """Fitted to all draws."""
+        return self.pool.next_proposal
+
+    def starts(self, count: int) -> np.ndarray:
+        """Weighted draws of w without replacement, shape (count, d)."""
+        log_weights = self.pool.log_weights
+        generator = np.random.RandomState(self.posterior.seed)
+        # Gumbel's trick: the largest perturbed weights are a weighted sample without replacement.
+        keys = np.where(np.isfinite(log_weights), log_weights, -np.inf) + generator.gumbel(size=len(log_weights))
+        return self.pool.w[np.argsort(-keys)[:count]]
+
+
+def importance_run(fit: JointFit, seed: int) -> ImportanceRun:
+    """Draw rounds until every headline is known by `ESS_WANTED` draws and the weights are sound, at most `ROUNDS_MAX`.
+
+    Args:
+        fit: a converged fit.
+        seed: of the draws.
+
+    Raises:
+        NotConverged: the density is not finite around the mode.
+    """
+    began = time.monotonic()
+    generator = np.random.RandomState(seed)
+    wanted, rounds = FITTED_ROUNDS, 0
+    path = transport(fit)
+    target = Target(fit, path)
+    try:
+        pool = empty_pool(target)
+        while True:
+            while rounds < wanted:
+                rounds += 1
+                pool = pool.extended(target, generator, fitted=rounds <= FITTED_ROUNDS)
+            posterior = reweighted_posterior(fit, path, pool, seed, time.monotonic() - began)
+            ess = posterior.convergence.importance.least_ess.value
+            if rounds >= ROUNDS_MAX or (posterior.converged and ess >= ESS_WANTED):
+                return ImportanceRun(path, pool, posterior)
+            # Effective draws of few rounds are known badly: never more than half as many again.
+            enough = min(np.ceil(rounds * ESS_WANTED / max(ess, 1.0)), np.ceil(1.5 * rounds))
+            wanted = min(ROUNDS_MAX, max(rounds + 1, int(enough)))
+    except FloatingPointError as error:
+        raise NotConverged("no-density", str(error), remedy="see the weak directions of --no-sample") from error

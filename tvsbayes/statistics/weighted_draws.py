@@ -1,0 +1,201 @@
+"""Draws with weights: moments and intervals with their Monte Carlo errors, the tail of the weights, resampling.
+
+Weights sum to one; the first axis of values is that of the draws. NumPy.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+TAILS = (0.025, 0.975)
+"""Probabilities of the ends of an equal-tailed 95 % interval."""
+TAIL_SHARE_MAX = 0.2
+"""Of the draws, at most, to which a generalised Pareto distribution is fitted."""
+PRIOR_DRAWS, PRIOR_K = 10, 0.5
+"""Weight and centre of the prior of k (Vehtari et al., J. Mach. Learn. Res. 25 (2024) 72, appendix G)."""
+
+
+@dataclass(frozen=True)
+class WeightedSummary:
+    """Quantities by weighted draws; every field has the quantities' own shape.
+
+    Errors are those of self-normalised importance sampling (Owen, Monte Carlo theory, methods and examples, 9.2); the
+    effective draws of a statistic are the equal, independent ones that would know it as well.
+
+    Attributes:
+        mean, sd: of the weighted draws.
+        interval95: equal-tailed, first axis (low, high).
+        mcse_mean, mcse_sd, mcse_interval95: Monte Carlo standard errors of the above.
+        ess_mean, ess_sd, ess_interval95: effective draws behind each of them.
+    """
+
+    mean: np.ndarray
+    sd: np.ndarray
+    interval95: np.ndarray
+    mcse_mean: np.ndarray
+    mcse_sd: np.ndarray
+    mcse_interval95: np.ndarray
+    ess_mean: np.ndarray
+    ess_sd: np.ndarray
+    ess_interval95: np.ndarray
+
+    @property
+    def ess_least(self) -> np.ndarray:
+        """Of the four statistics."""
+        return np.min([self.ess_mean, self.ess_sd, *self.ess_interval95], axis=0)
+
+
+def effective_draws(weights: np.ndarray) -> float:
+    """Equal draws that weights (n,) are worth whatever is asked (Kish)."""
+    return float(np.sum(weights) ** 2 / np.sum(weights**2))
+
+
+def weighted_mean(values: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Mean over the first axis; that of equal numbers is the number."""
+    return values[0] + np.tensordot(weights, values - values[0], axes=1)
+
+
+def weighted_quantiles(values: np.ndarray, weights: np.ndarray, probabilities: Sequence[float]) -> np.ndarray:
+    """Quantiles over the first axis, shape (probabilities, ...); NumPy's own (type 7) where weights are equal.
+
+    The cumulative weight at each draw counts half of its own, stretched so that the least draw has probability 0 and
+    the largest 1; lines in between.
+    """
+    flat = values.reshape(len(values), -1)
+    found = np.empty((len(probabilities), flat.shape[1]))
+    for column, each in enumerate(flat.T):
+        order = np.argsort(each, kind="stable")
+        ordered = weights[order]
+        middle = np.cumsum(ordered) - 0.5 * ordered
+        found[:, column] = np.interp(probabilities, (middle - middle[0]) / (middle[-1] - middle[0]), each[order])
+    return found.reshape(len(probabilities), *values.shape[1:])
+
+
+def weighted_summary(values: np.ndarray, weights: np.ndarray) -> WeightedSummary:
+    """Moments, interval, errors and effective draws of values (n, ...) with weights (n,)."""
+    shape = values.shape[1:]
+    flat, square = values.reshape(len(values), -1), weights**2
+    centre = weighted_mean(flat, weights)
+    deviation2 = (flat - centre) ** 2
+    variance = weights @ deviation2
+    sd = np.sqrt(variance)
+    spread2 = (deviation2 - variance) ** 2
+    # A quantity that no draw changes has no error; any draw knows it.
+    moving = np.ptp(flat, axis=0) > 0
+    safe = np.where(moving, variance, 1.0)
+    error2, spread_error2 = square @ deviation2, square @ spread2
+    kish = effective_draws(weights)
+
+    def ess(whole: np.ndarray, error: np.ndarray) -> np.ndarray:
+        return np.where(moving, whole / np.where(error > 0, error, np.inf), kish)
+
+    ends = weighted_quantiles(flat, weights, TAILS)
+    errors, ess_ends = np.zeros_like(ends), np.empty_like(ends)
+    for k, tail in enumerate(TAILS):
+        chance2 = square @ ((flat <= ends[k]) - tail) ** 2
+        ess_ends[k] = ess(np.full(flat.shape[1], tail * (1 - tail)), chance2)
+        for column in np.flatnonzero(moving):
+            # One standard error of the probability, carried to the quantity, as ArviZ does for equal draws.
+            about = np.clip(tail + np.sqrt(chance2[column]) * np.array([-1.0, 1.0]), 0.0, 1.0)
+            low, high = weighted_quantiles(flat[:, column], weights, about.tolist())
+            errors[k, column] = 0.5 * (high - low)
+    return WeightedSummary(
+        mean=centre.reshape(shape),
+        sd=sd.reshape(shape),
+        interval95=ends.reshape(2, *shape),
+        mcse_mean=np.sqrt(np.where(moving, error2, 0.0)).reshape(shape),
+        mcse_sd=np.where(moving, 0.5 * np.sqrt(spread_error2 / safe), 0.0).reshape(shape),
+        mcse_interval95=errors.reshape(2, *shape),
+        ess_mean=ess(variance, error2).reshape(shape),
+        ess_sd=ess(weights @ spread2, spread_error2).reshape(shape),
+        ess_interval95=ess_ends.reshape(2, *shape),
+    )
+
+
+def systematic(weights: np.ndarray, count: int, offset: float) -> np.ndarray:
+    """Places of `count` equal draws, ascending: systematic resampling (Kitagawa, J. Comput. Graph. Stat. 5 (1996) 1).
+
+    Of equal weights it takes evenly spaced draws.
+
+    Args:
+        weights: shape (n,), sum 1.
+        count: of draws wanted.
+        offset: in [0, 1), the only thing that is random.
+    """
+    reached = np.cumsum(weights)
+    places = np.searchsorted(reached / reached[-1], (np.arange(count) + offset) / count, side="right")
+    return np.minimum(places, len(weights) - 1)
+
+
+@dataclass(frozen=True)
+class ParetoTail:
+    """A generalised Pareto distribution of what exceeds a threshold: shape k and scale."""
+
+    k: float
+    scale: float
+
+    def quantiles(self, probabilities: np.ndarray) -> np.ndarray:
+        """Exceedances at probabilities (n,)."""
+        if abs(self.k) < 1e-30:
+            return -self.scale * np.log1p(-probabilities)
+        return self.scale * np.expm1(-self.k * np.log1p(-probabilities)) / self.k
+
+
+def pareto_tail(exceedances: np.ndarray) -> ParetoTail:
+    """Fit to ascending exceedances (n,) by Zhang and Stephens, Technometrics 51 (2009) 316, k drawn towards a half."""
+    n = len(exceedances)
+    grid = 30 + int(np.sqrt(n))
+    b = 1 - np.sqrt(grid / (np.arange(1, grid + 1) - 0.5))
+    b = b / (3 * exceedances[int(n / 4 + 0.5) - 1]) + 1 / exceedances[-1]
+    k = np.mean(np.log1p(-b[:, None] * exceedances), axis=1)
+    log_likelihood = n * (np.log(-b / k) - k - 1)
+    share = np.exp(log_likelihood - np.max(log_likelihood))
+    share = np.where(share >= 10 * np.finfo(float).eps * share.sum(), share, 0.0)
+    centre = float(b @ share / share.sum())
+    found = float(np.mean(np.log1p(-centre * exceedances)))
+    return ParetoTail((n * found + PRIOR_DRAWS * PRIOR_K) / (n + PRIOR_DRAWS), -found / centre)
+
+
+def _tail_count(count: int) -> int:
+    """Largest draws that stand for the tail (Vehtari et al. 2024, 3)."""
+    return int(3 * np.sqrt(count)) if count > 225 else int(TAIL_SHARE_MAX * count)
+
+
+def pareto_k(values: np.ndarray) -> float:
+    """Tail index of positive numbers (n,), n >= 25: from 0.7 on their mean cannot be told from so many."""
+    ordered = np.sort(values)
+    count = _tail_count(len(values))
+    exceedances = ordered[-count:] - ordered[-count - 1]
+    # Where no number exceeds the others there is no tail.
+    return pareto_tail(exceedances).k if exceedances[int(count / 4 + 0.5) - 1] > 0 else 0.0
+
+
+@dataclass(frozen=True)
+class SmoothedWeights:
+    """Weights (n,) of sum 1 whose largest were replaced by quantiles of their fitted tail, and its index."""
+
+    weights: np.ndarray
+    pareto_k: float
+
+
+def smoothed_weights(log_ratios: np.ndarray) -> SmoothedWeights:
+    """Pareto smoothed importance sampling (Vehtari et al., J. Mach. Learn. Res. 25 (2024) 72).
+
+    Args:
+        log_ratios: log (target / proposal) of n >= 25 draws up to a constant; -inf where the target is nought.
+    """
+    ratios = np.exp(log_ratios - np.max(log_ratios))
+    count = _tail_count(len(ratios))
+    order = np.argsort(ratios, kind="stable")
+    tail, cutoff = order[-count:], ratios[order[-count - 1]]
+    exceedances = ratios[tail] - cutoff
+    if exceedances[int(count / 4 + 0.5) - 1] <= 0:
+        return SmoothedWeights(ratios / ratios.sum(), 0.0)
+    found = pareto_tail(exceedances)
+    raised = cutoff + found.quantiles((np.arange(count) + 0.5) / count)
+    smooth = ratios.copy()
+    smooth[tail] = np.minimum(raised, ratios[order[-1]])
+    return SmoothedWeights(smooth / smooth.sum(), found.k)
