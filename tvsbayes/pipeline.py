@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from tvsbayes.errors import NotConverged, NothingToEstimate, TvsError
+from tvsbayes.errors import NotConverged, NothingToEstimate, TvsError, escaped
 from tvsbayes.files.disk import make_folder, output_place
 from tvsbayes.instrument.axes import AXES
 from tvsbayes.instrument.model_choice import AS_STATED, ModelChoice
@@ -53,9 +53,13 @@ def _unwatched() -> AbstractContextManager[Callable[[Progress], None]]:
 
 def compile_for(tell: Tell) -> None:
     """Use the compilation cache; whoever waits at a terminal for the first compilation is told so."""
-    from tvsbayes.model.compiled import use_compilation_cache
+    from tvsbayes.model.compilation_cache import own_cache_folder, use_compilation_cache
 
-    if use_compilation_cache() and sys.stderr.isatty():
+    empty, folder = use_compilation_cache(), own_cache_folder()
+    if fault := folder.fault():
+        place = escaped(str(folder.path), 200)
+        tell(f"warning: {place} is not used to keep compiled functions: {fault}; see `tvsbayes doctor`")
+    elif empty and sys.stderr.isatty():
         tell("first run: the model is compiled, half a minute to two minutes; later runs take it from the cache")
 
 

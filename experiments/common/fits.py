@@ -10,7 +10,7 @@ from tvsbayes.estimators.joint_fit import JointFit, fit, fit_at
 from tvsbayes.estimators.mode_search import Problem
 from tvsbayes.instrument.campaign import Campaign
 from tvsbayes.instrument.parameters import RIG_NAMES
-from tvsbayes.model.compiled import use_compilation_cache
+from tvsbayes.model.compilation_cache import use_compilation_cache
 from tvsbayes.model.parameter_space import coordinates_of
 from tvsbayes.statistics.least_squares import newton_mode
 from tvsbayes.twin.simulated_campaign import Truth

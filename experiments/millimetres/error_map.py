@@ -22,7 +22,7 @@ from tvsbayes.coordinates.error_map import error_map, simple_calibration
 from tvsbayes.estimators.four_point import classic
 from tvsbayes.estimators.joint_fit import fit
 from tvsbayes.metrology.look_budget import budget
-from tvsbayes.model.compiled import use_compilation_cache
+from tvsbayes.model.compilation_cache import use_compilation_cache
 
 RANGES_MM = (200.0, 300.0, 400.0, 500.0, 700.0, 1000.0, 1400.0)
 PICTURE = Path(__file__).with_suffix(".png")

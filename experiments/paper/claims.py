@@ -28,7 +28,7 @@ from tvsbayes.estimators.joint_fit import fit
 from tvsbayes.instrument.axes import DIRECTIONS
 from tvsbayes.instrument.parameters import INDEX
 from tvsbayes.instrument.protocols import four_point_protocol, mixed_protocol, paper_protocol
-from tvsbayes.model.compiled import use_compilation_cache
+from tvsbayes.model.compilation_cache import use_compilation_cache
 from tvsbayes.planning.expectation import Knowledge, information_of, prior_knowledge
 from tvsbayes.twin.physics import project
 from tvsbayes.twin.simulated_campaign import simulate

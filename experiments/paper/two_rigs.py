@@ -50,7 +50,7 @@ from tvsbayes.instrument.parameters import INDEX, Prior
 from tvsbayes.instrument.plan import read_plan, run_plan, write_plan
 from tvsbayes.instrument.protocols import twin_protocol
 from tvsbayes.instrument.rig import Rig, read_rig
-from tvsbayes.model.compiled import use_compilation_cache
+from tvsbayes.model.compilation_cache import use_compilation_cache
 from tvsbayes.report.figures import BLACK, BLUE, RED, STYLE, WIDTH_IN
 from tvsbayes.twin.simulated_campaign import simulate
 

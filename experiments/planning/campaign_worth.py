@@ -37,7 +37,7 @@ from tvsbayes.instrument.parameters import Prior
 from tvsbayes.instrument.plan import PlanStep
 from tvsbayes.instrument.protocols import grid_protocol, mixed_protocol, paper_protocol
 from tvsbayes.instrument.rig import Rig
-from tvsbayes.model.compiled import use_compilation_cache
+from tvsbayes.model.compilation_cache import use_compilation_cache
 from tvsbayes.planning.assurance import Family
 from tvsbayes.planning.candidates import candidates
 from tvsbayes.planning.expectation import Knowledge, prior_knowledge

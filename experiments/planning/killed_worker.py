@@ -16,7 +16,7 @@ from pathlib import Path
 
 from experiments.common.command_line import print_only
 from experiments.common.rigs import mounted_rig, small_plan
-from tvsbayes.model.compiled import use_compilation_cache
+from tvsbayes.model.compilation_cache import use_compilation_cache
 from tvsbayes.planning.target import DEFAULT_TARGET, parse_target
 from tvsbayes.studies.executors import SINGLE_THREADED
 from tvsbayes.studies.rows import StudyRow, StudyRows

@@ -24,7 +24,7 @@ from experiments.common.rigs import mounted_rig
 from experiments.common.worth import UNREACHED, searched_family
 from tvsbayes.instrument.plan import PlanStep
 from tvsbayes.instrument.protocols import grid_protocol, mixed_protocol, paper_protocol
-from tvsbayes.model.compiled import use_compilation_cache
+from tvsbayes.model.compilation_cache import use_compilation_cache
 from tvsbayes.planning.assurance import Family
 from tvsbayes.planning.candidates import candidates
 from tvsbayes.planning.expectation import Knowledge, PlanInformation, information_of, prior_knowledge

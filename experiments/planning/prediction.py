@@ -28,7 +28,7 @@ from experiments.common.headlines import SHRINK
 from experiments.common.rigs import mounted_rig, shipped_plan
 from experiments.common.rows import output, read_rows, run_rows
 from tvsbayes.instrument.plan import read_plan, write_plan
-from tvsbayes.model.compiled import use_compilation_cache
+from tvsbayes.model.compilation_cache import use_compilation_cache
 from tvsbayes.model.headlines import QUANTITIES
 from tvsbayes.planning.planner import plan
 from tvsbayes.planning.target import DEFAULT_TARGET, parse_target

@@ -34,7 +34,7 @@ from tvsbayes.estimators.plausibility import check_campaign
 from tvsbayes.instrument.campaign import campaign_toml, moves_bytes, spots_bytes
 from tvsbayes.instrument.plan import PlanStep
 from tvsbayes.instrument.rig import Rig
-from tvsbayes.model.compiled import use_compilation_cache
+from tvsbayes.model.compilation_cache import use_compilation_cache
 from tvsbayes.planning.target import DEFAULT_TARGET, parse_target
 from tvsbayes.posterior.sampling import sample
 from tvsbayes.studies.rows import StudyRows

@@ -25,7 +25,7 @@ from tvsbayes.estimators.joint_fit import fit
 from tvsbayes.files.disk import shipped_data
 from tvsbayes.instrument.campaign import input_hashes
 from tvsbayes.instrument.parameters import NAMES
-from tvsbayes.model.compiled import use_compilation_cache
+from tvsbayes.model.compilation_cache import use_compilation_cache
 from tvsbayes.posterior.draws import Posterior
 from tvsbayes.posterior.ensemble import WALKERS
 from tvsbayes.posterior.importance import importance_run

@@ -26,7 +26,7 @@ from tvsbayes.calibration.calibration_file import calibration_bytes, load_calibr
 from tvsbayes.calibration.pointing import INPUT_NAMES, NOISE_NAMES
 from tvsbayes.coordinates.location import locate, locate_linear, settings_of
 from tvsbayes.estimators.joint_fit import fit
-from tvsbayes.model.compiled import use_compilation_cache
+from tvsbayes.model.compilation_cache import use_compilation_cache
 from tvsbayes.twin.physics import mirror_chain, to_tvs
 
 DRAWS = 500

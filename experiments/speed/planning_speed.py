@@ -21,7 +21,7 @@ from experiments.common.command_line import print_only
 from experiments.common.rigs import mounted_rig
 from tvsbayes.estimators.campaign_arrays import bucket
 from tvsbayes.instrument.protocols import grid_protocol, paper_protocol
-from tvsbayes.model.compiled import use_compilation_cache
+from tvsbayes.model.compilation_cache import use_compilation_cache
 from tvsbayes.planning.expectation import (
     DESIGN_GROWTH,
     PARAMETERS,

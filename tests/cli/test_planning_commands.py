@@ -20,7 +20,7 @@ def ask(capsys, monkeypatch):
     """Run a command with --json without touching JAX's settings: exit code and document."""
     from tvsbayes.cli.main import run
 
-    monkeypatch.setattr("tvsbayes.model.compiled.use_compilation_cache", lambda: False)
+    monkeypatch.setattr("tvsbayes.model.compilation_cache.use_compilation_cache", lambda: False)
     monkeypatch.setattr("tvsbayes.studies.executors.use_compilation_cache", lambda: False)
 
     def command(*arguments) -> tuple[int, dict]:
@@ -50,7 +50,7 @@ def test_a_plan_with_nothing_left_to_measure_says_that_it_wrote_none(capsys, tmp
     from tvsbayes.cli.main import run
 
     whole = planner.plan
-    monkeypatch.setattr("tvsbayes.model.compiled.use_compilation_cache", lambda: False)
+    monkeypatch.setattr("tvsbayes.model.compilation_cache.use_compilation_cache", lambda: False)
     monkeypatch.setattr("tvsbayes.studies.executors.use_compilation_cache", lambda: False)
     monkeypatch.setattr(
         "tvsbayes.planning.planner.plan", lambda *given, **options: replace(whole(*given, **options), steps=())

@@ -290,13 +290,17 @@ def doctor(
 ) -> None:
     """Is the instrument fit for a campaign? Nothing moves.
 
-    Checks ports, firmware, cameras, exposure, focus, laser, timing and disk.
+    Checks ports, firmware, cameras, exposure, focus, laser, timing, disk and the compilation cache.
     """
-    from tvsbayes.acquisition.doctor import examine
+    from tvsbayes.acquisition.doctor import Check, examine
     from tvsbayes.errors import DeviceFault
     from tvsbayes.instrument.rig import read_rig
+    from tvsbayes.model.compilation_cache import cache_state
 
     checks = examine(read_rig(rig), Path.cwd(), laser=laser)
+    cache = cache_state()
+    status = "ok" if cache.used else "warning"
+    checks.append(Check("compilation cache", status, escaped(cache.found, 400), escaped(cache.remedy, 400)))
     lines = [f"{c.status:8} {c.name}: {c.found}" + (f"; {c.remedy}" if c.remedy else "") for c in checks]
     faults = [c for c in checks if c.status == "fault"]
     error = None

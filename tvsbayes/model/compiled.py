@@ -1,4 +1,4 @@
-"""Functions of arrays that are traced once for all processes, and the folder in which what was compiled is kept.
+"""Functions of arrays that are traced once for all processes.
 
 Tracing a large function takes JAX seconds in every process, and its compilation cache saves none of them. A `compiled`
 function is traced once for every shape of its arguments; where a program has asked for a cache folder, what the trace
@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import functools
 import hashlib
-import os
 import threading
 import time
 from collections.abc import Callable, Iterable
@@ -24,7 +23,6 @@ import jax
 import numpy as np
 from jax import export
 from jax.typing import ArrayLike
-from platformdirs import user_cache_path
 
 from tvsbayes.files.own_folder import OwnFolder
 
@@ -194,26 +192,3 @@ def placed(values: ArrayLike) -> jax.Array:
     """A NumPy array as JAX's, in its own precision: without `jnp.asarray`, which compiles anew for every shape."""
     with jax.enable_x64(True):
         return jax.device_put(np.asarray(values), may_alias=False)
-
-
-def cache_folder() -> Path:
-    """Where compiled functions are kept: the user's cache folder, or `TVSBAYES_CACHE`."""
-    return Path(os.environ.get("TVSBAYES_CACHE") or user_cache_path("tvsbayes") / "jax")
-
-
-def use_compilation_cache() -> bool:
-    """Keep traces and compiled functions in `cache_folder`.
-
-    For programs such as the command line, which own their process: it changes a global setting of JAX, so
-    only commands and worker processes call it.
-
-    Returns:
-        Whether nothing is in the folder yet: the model has to be compiled first, half a minute to two minutes.
-    """
-    folder = cache_folder()
-    jax.config.update("jax_compilation_cache_dir", str(folder))
-    # Small functions too: a process of a command compiles some dozens, and their sum is seconds.
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
-    jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
-    Traces.used = Traces(folder / "traced")
-    return next(folder.glob("*-cache"), None) is None

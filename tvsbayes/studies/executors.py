@@ -14,7 +14,7 @@ from contextlib import contextmanager
 from typing import Protocol
 
 from tvsbayes.errors import InputError, escaped
-from tvsbayes.model.compiled import use_compilation_cache
+from tvsbayes.model.compilation_cache import use_compilation_cache
 from tvsbayes.studies.rows import StudyRow
 from tvsbayes.studies.study_job import StudyJob, study_row
 

@@ -16,7 +16,7 @@ from experiments.speed.benchmarks.measure import Bench, Case, Column, Work
 from tvsbayes.cameras.boards import View
 from tvsbayes.cameras.stereo_calibration import calibrate_stereo
 from tvsbayes.instrument.stereo_pair import Stereo, rotation_vector
-from tvsbayes.model.compiled import use_compilation_cache
+from tvsbayes.model.compilation_cache import use_compilation_cache
 
 TITLE = "Stereo calibration"
 NAME = "12 views of a 9 x 6 board, rendered; every repeat is another rig"

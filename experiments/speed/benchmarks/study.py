@@ -22,7 +22,7 @@ def measure(bench: Bench) -> None:
         return
     os.sched_setaffinity(0, range(os.cpu_count() or 1))
     from experiments.common.rigs import mounted_rig, small_plan
-    from tvsbayes.model.compiled import use_compilation_cache
+    from tvsbayes.model.compilation_cache import use_compilation_cache
     from tvsbayes.planning.target import DEFAULT_TARGET, parse_target
     from tvsbayes.studies.rows import StudyRows
     from tvsbayes.studies.study import study

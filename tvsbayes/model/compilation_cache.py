@@ -1,0 +1,126 @@
+"""The folder in which compiled functions and their traces are kept, and whether it does its work.
+
+What lies there is code that later processes run: the folder must be the user's own, and nobody else's to write.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from platformdirs import user_cache_path
+
+from tvsbayes.files.own_folder import OwnFolder
+from tvsbayes.model.compiled import Traces, compiled
+
+VARIABLE = "TVSBAYES_CACHE"
+TRIAL_SECONDS_MAX = 120.0
+"""For a process that compiles one small function; longer, and something else is wrong."""
+REJECTED = "Machine type used for XLA:CPU compilation doesn't match"
+"""What XLA logs when it refuses its own code on the machine that made it (jax issue 38445)."""
+
+
+def cache_folder() -> Path:
+    """The user's cache folder, or `TVSBAYES_CACHE`."""
+    return Path(os.environ.get(VARIABLE) or user_cache_path("tvsbayes") / "jax")
+
+
+def own_cache_folder() -> OwnFolder:
+    """`cache_folder`, created for this user alone where there is none; look at its `fault`."""
+    folder = OwnFolder(cache_folder())
+    if not os.environ.get(VARIABLE):
+        # Its place is ours to decide, its mode too; a folder that the user has named stays as it is.
+        with suppress(OSError):
+            folder.path.chmod(0o700)
+    folder.make()
+    return folder
+
+
+def use_compilation_cache() -> bool:
+    """Keep traces and compiled functions in `cache_folder`, unless others may write into it.
+
+    For programs such as the command line, which own their process: it changes a global setting of JAX, so
+    only commands and worker processes call it.
+
+    Returns:
+        Whether there is nothing to take from it: the model has to be compiled first, half a minute to two minutes.
+    """
+    folder = own_cache_folder()
+    if folder.fault():
+        return True
+    jax.config.update("jax_compilation_cache_dir", str(folder.path))
+    # Small functions too: a process of a command compiles some dozens, and their sum is seconds.
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+    jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+    Traces.used = Traces(folder.path / "traced")
+    return next(folder.path.glob("*-cache"), None) is None
+
+
+@dataclass(frozen=True)
+class CacheState:
+    """Whether the folder does its work: `used`, what was found, and what to do ("" where all is well)."""
+
+    used: bool
+    found: str
+    remedy: str = ""
+
+
+@compiled(jax.Array)
+def _trial(values: Float[Array, " n"]) -> Float[Array, " n"]:
+    """Small, yet compiled to code of its own."""
+    return jnp.cumsum(jnp.sin(values)) / jnp.exp(values)
+
+
+def trial() -> None:
+    """Run one small function as commands do, and print how it was come by: for a process of `cache_state`."""
+    events: list[str] = []
+    jax.monitoring.register_event_listener(lambda event, **_: events.append(event.rsplit("/")[-1]))
+    use_compilation_cache()
+    _trial(np.linspace(0.0, 1.0, 64)).block_until_ready()
+    print(json.dumps({"traces": _trial.traces, "hits": events.count("cache_hits")}))
+
+
+def _tried() -> subprocess.CompletedProcess[str]:
+    """`trial` in a process of its own, with what XLA has to say."""
+    code = f"from {__name__} import trial; trial()"
+    return subprocess.run(
+        [sys.executable, "-c", code],
+        check=True,
+        capture_output=True,
+        text=True,
+        timeout=TRIAL_SECONDS_MAX,
+        env={**os.environ, "TF_CPP_MIN_LOG_LEVEL": "0"},
+    )
+
+
+def cache_state() -> CacheState:
+    """Whether a second process takes from the folder what a first one has left there; two seconds."""
+    folder = own_cache_folder()
+    place = folder.path
+    if fault := folder.fault():
+        remedy = f"let nobody else write into it (chmod go-w), or name a folder of your own in {VARIABLE}"
+        return CacheState(False, f"not used, every run compiles anew: {place}: {fault}", remedy)
+    try:
+        first, second = _tried(), _tried()
+        told = json.loads(second.stdout)
+    except (OSError, subprocess.SubprocessError, ValueError) as error:
+        return CacheState(False, f"could not be tried: {type(error).__name__}", "run a fit and see what it says")
+    if REJECTED in first.stderr + second.stderr or not told["hits"]:
+        found = f"rejected, every run compiles anew: what is written to {place} is refused when it is read"
+        remedy = "free space there; else try another version of jaxlib (github.com/jax-ml/jax/issues/38445)"
+        return CacheState(False, found, remedy)
+    if told["traces"]:
+        remedy = f"pip install flatbuffers; remove {place / 'traced'} if it is not yours"
+        return CacheState(False, f"compiled functions are used, their traces not: {place}", remedy)
+    entries = list(place.glob("*-cache"))
+    size = sum(entry.stat().st_size for entry in entries) / 1e6
+    return CacheState(True, f"used: {len(entries)} functions, {size:.0f} MB in {place}")
