@@ -26,7 +26,7 @@ VARIABLE = "TVSBAYES_CACHE"
 TRIAL_SECONDS_MAX = 120.0
 """For a process that compiles one small function; longer, and something else is wrong."""
 REJECTED = "Machine type used for XLA:CPU compilation doesn't match"
-"""What XLA logs when it refuses its own code on the machine that made it (jax issue 38445)."""
+"""What XLA logs when it refuses its own code on the machine that made it."""
 
 
 def cache_folder() -> Path:
