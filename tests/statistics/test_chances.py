@@ -13,6 +13,7 @@ from tvsbayes.statistics.chances import (
     rms_bounds,
     share_error,
     share_interval95,
+    student_log_density,
 )
 
 
@@ -27,6 +28,16 @@ def test_recursive_residuals_are_independent_and_standard(backwards):
     np.testing.assert_allclose(kept @ np.diag(variances) @ kept.T, np.eye(3), atol=1e-12)
     np.testing.assert_allclose(kept.sum(axis=1), 0.0, atol=1e-12)
     assert recursive_residuals(np.ones(1), np.ones(1), backwards=backwards) == ()
+
+
+def test_the_log_density_of_student_is_scipys():
+    """Few, many and infinitely many degrees of freedom, near and far; gammaln(5e5) is 6e6, rounded at 1e-9."""
+    from scipy import stats
+
+    errors, scale = np.array([0.0, 0.3, -40.0, 2.0, 7.0]), np.array([1.0, 0.1, 2.0, 3.0, 0.5])
+    dof = np.array([1.0, 2.5, 30.0, 1e6, np.inf])
+    expected = np.append(stats.t.logpdf(errors, dof, scale=scale)[:4], stats.norm.logpdf(7.0, scale=0.5))
+    assert student_log_density(errors, dof, scale) == pytest.approx(expected, rel=1e-9, abs=1e-12)
 
 
 def test_no_number_of_draws_makes_an_assurance_certain():

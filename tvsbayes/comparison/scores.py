@@ -8,6 +8,8 @@ from __future__ import annotations
 import numpy as np
 
 from tvsbayes.results.comparison_record import BETTER_CLASSIC, BETTER_JOINT, CANNOT_TELL, HoldOut, Prediction, Score
+from tvsbayes.statistics.chances import student_log_density
+from tvsbayes.statistics.intervals import coverage_factor
 
 BLOCKS_MIN = 3
 """Fewest blocks whose scatter is worth an interval."""
@@ -22,12 +24,10 @@ def judge(by: str, predictions: list[Prediction], lengths: np.ndarray, unseen: d
         lengths: distinct |N| of the campaign.
         unseen: as in `HoldOut`.
     """
-    from scipy import stats
-
     angle, blocks = np.array([p.angle_deg for p in predictions]), [(p.fold, p.direction) for p in predictions]
     of_block = {b: np.array([x == b for x in blocks]) for b in dict.fromkeys(blocks)}
     scores, means = {}, {}
-    dof = {"classic": np.array([p.classic_dof for p in predictions]), "joint": np.inf}
+    dof = {"classic": [p.classic_dof for p in predictions], "joint": [np.inf] * len(predictions)}
     for name in ("classic", "joint"):
         told = np.array([getattr(p, f"{name}_deg") for p in predictions])
         u = np.array([getattr(p, f"{name}_u_deg") for p in predictions])
@@ -36,8 +36,8 @@ def judge(by: str, predictions: list[Prediction], lengths: np.ndarray, unseen: d
         scores[name] = Score(
             rms_deg=float(np.sqrt(np.mean(error**2))),
             rms_block_deg=float(np.sqrt(np.mean(means[name] ** 2))),
-            coverage=float(np.mean(np.abs(error) <= stats.t.ppf(0.975, dof[name]) * u)),
-            log_density=float(np.mean(stats.t.logpdf(error, dof[name], scale=u))),
+            coverage=float(np.mean(np.abs(error) <= np.array([coverage_factor(n) for n in dof[name]]) * u)),
+            log_density=float(np.mean(student_log_density(error, np.array(dof[name]), u))),
         )
     blocks_seen = len(of_block)
     ratio = scores["classic"].rms_block_deg / scores["joint"].rms_block_deg
@@ -65,12 +65,10 @@ def ratio_interval(first: np.ndarray, second: np.ndarray) -> tuple[float, float]
     First and c second have equal mean squares if their sum and difference are uncorrelated: those c for which the
     t test of that correlation (n - 1 degrees of freedom, means known to be 0) does not reject are the interval.
     """
-    from scipy import stats
-
     n = len(first)
     ratio = np.sqrt(np.sum(first**2) / np.sum(second**2))
     correlation = first @ second / np.sqrt(np.sum(first**2) * np.sum(second**2))
     # Of proportional errors the correlation may exceed 1 by rounding.
-    k = 1 + 2 * max(0.0, 1 - correlation**2) * stats.t.ppf(0.975, n - 1) ** 2 / (n - 1)
+    k = 1 + 2 * max(0.0, 1 - correlation**2) * coverage_factor(n - 1) ** 2 / (n - 1)
     root = np.sqrt(k**2 - 1)
     return float(ratio * np.sqrt(k - root)), float(ratio * np.sqrt(k + root))

@@ -67,6 +67,18 @@ def chi2_quantile(readings: np.ndarray, probability: float) -> np.ndarray:
     return special.chdtri(3.0 + readings, probability)
 
 
+def student_log_density(errors: np.ndarray, dof: np.ndarray, scale: np.ndarray) -> np.ndarray:
+    """Log density of Student's t with a scale, the normal's where the degrees of freedom are infinite; shapes alike."""
+    from scipy import special
+
+    ratio2 = (errors / scale) ** 2
+    n = np.where(np.isfinite(dof), dof, 1.0)
+    tail = special.gammaln(0.5 * (n + 1)) - special.gammaln(0.5 * n) - 0.5 * np.log(n)
+    student = tail - 0.5 * (n + 1) * np.log1p(ratio2 / n)
+    normal = -0.5 * (ratio2 + math.log(2))
+    return np.where(np.isfinite(dof), student, normal) - 0.5 * math.log(math.pi) - np.log(scale)
+
+
 def one_way_chance(groups: Sequence[np.ndarray]) -> float:
     """Probability that groups of one mean and variance differ by so much: the F test of a one-way layout.
 
