@@ -63,6 +63,7 @@ def test_only_two_components_see_the_mirror_angles():
     for seen, column in ((pan, 0), (tilt, 1)):
         np.testing.assert_allclose(seen[:2].T, slope[:, :, column], atol=ROUNDING)
         np.testing.assert_allclose(seen[2:], 0.0, atol=ROUNDING)
+    # What is left has the length of two components.
     np.testing.assert_allclose(np.sum(turned**2, axis=0), np.sum(residual**2, axis=0), rtol=ROUNDING)
 
 
@@ -78,3 +79,17 @@ def test_whitened_differences_have_the_stated_covariance(dozen):
         d = difference[:4, k]
         expected = d @ np.linalg.solve(pixel_covariance(spot), d)
         assert np.sum(found[:4, k] ** 2) == pytest.approx(expected, rel=1e-12)
+
+
+def test_what_the_filter_sees_is_smooth_where_a_slope_changes_its_sign():
+    """Second differences of the innovations measure the posterior's ridges: a basis that flips would ruin them."""
+    by_tilt, residual = drawn(4, 9), drawn(4, 10)
+    step = 1e-6
+    seen = []
+    with jax.enable_x64(True):
+        for small in (-step, step):
+            by_pan = drawn(4, 11)
+            by_pan[0] = small
+            seen.append(np.stack(ToStates.of(numbers(by_pan), numbers(by_tilt)).of_many(numbers(residual))))
+    # Ten units of a residual per unit of slope: slopes are of order one here, none is shorter than a tenth.
+    assert np.max(np.abs(seen[1] - seen[0])) < 100 * 2 * step

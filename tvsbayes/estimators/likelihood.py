@@ -149,12 +149,12 @@ def standing(model: Model, arrays: CampaignArrays, inflation: Float[Array | np.n
 class FilterInput(eqx.Module):
     """Rows of the filter, and what no state can change.
 
-    `free` are the standardised components that see no state; `log_scale` is what each spot adds to the log density
-    besides the rows: theirs in it.
+    `free` is what is left of the standardised components, which no state changes; `log_scale` is what each spot adds to
+    the log density besides the rows: theirs in it.
     """
 
     rows: FilterRows
-    free: Float[Array, "spots 2"]
+    free: Float[Array, "spots 4"]
     log_scale: Float[Array, " spots"]
 
 
@@ -173,10 +173,11 @@ def filter_input(model: Model, arrays: CampaignArrays) -> FilterInput:
 class Innovations(eqx.Module):
     """Standardised one-step prediction errors, N(0, 1) and independent under the model.
 
+    Of each spot two by the filter, then what no stop error changes: four components with the freedom of two at most.
     `log_density` is the campaign's log likelihood without the terms of `log_constant`.
     """
 
-    standardised: Float[Array, "spots 4"]
+    standardised: Float[Array, "spots 6"]
     log_density: Scalar
 
 
@@ -239,7 +240,7 @@ class Evaluation(eqx.Module):
     """Log posterior density and standardised innovations; many points give every field a leading axis."""
 
     log_density: Float[Array, "*batch"]
-    standardised: Float[Array, "*batch spots 4"]
+    standardised: Float[Array, "*batch spots 6"]
 
 
 @compiled(Evaluation)

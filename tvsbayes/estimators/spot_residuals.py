@@ -111,31 +111,45 @@ def spot_residuals(looks: Looks, noise: NoiseScales, model: Model, spots: SpotAr
     return SpotResiduals(residual, by_pan, by_tilt, log_scale * spots.valid, range_out)
 
 
-class ToStates(eqx.Module):
-    """Turns four components so that two see the mirror angles, the first of them pan and tilt, and two see neither.
+def _unit(direction: Numbers) -> tuple[Numbers, Float[Array, " spots"]]:
+    """Directions of length 1 and the lengths; nought where there is no direction (padding)."""
+    length2 = sum(number**2 for number in direction)
+    there = length2 > 0
+    length = jnp.sqrt(jnp.where(there, length2, 1.0))
+    return materialise(tuple(number / length for number in direction)), jnp.where(there, length, 0.0)
 
-    Components have independent unit noise before and after; the filter then has two to look at instead of four.
+
+class ToStates(eqx.Module):
+    """The two directions in which looks see the mirror angles, the first of them pan and tilt, the second tilt alone.
+
+    Four components with independent unit noise become one along each, which have it too, and what is left: the filter
+    then has two to look at instead of four. Everything is smooth in the slopes (Gram and Schmidt's directions, where a
+    reflection would change its sign).
     """
 
-    pan_out: Reflection
-    tilt_out: Reflection
+    first: Numbers
+    second: Numbers
+    pan_load: Float[Array, " spots"]
     tilt_load: Float[Array, " spots"]
+    tilt_rest: Float[Array, " spots"]
 
     @classmethod
     def of(cls, by_pan: Numbers, by_tilt: Numbers) -> ToStates:
-        """The turn for looks that move so with pan and tilt."""
-        pan_out = Reflection.of(by_pan)
-        tilt_load, *beyond = pan_out.of_many(by_tilt)
-        return cls(pan_out, Reflection.of(tuple(beyond)), tilt_load)
+        """The directions of looks that move so with pan and tilt."""
+        first, pan_load = _unit(by_pan)
+        tilt_load = sum(a * b for a, b in zip(first, by_tilt, strict=True))
+        second, tilt_rest = _unit(tuple(b - tilt_load * a for a, b in zip(first, by_tilt, strict=True)))
+        return cls(first, second, pan_load, tilt_load, tilt_rest)
 
     @property
     def slope(self) -> Float[Array, "spots 2 2"]:
         """d(predicted)/d(pan, tilt) of the two components."""
         none = jnp.zeros_like(self.tilt_load)
-        first = jnp.stack([self.pan_out.first, self.tilt_load], axis=1)
-        return jnp.stack([first, jnp.stack([none, self.tilt_out.first], axis=1)], axis=1)
+        first = jnp.stack([self.pan_load, self.tilt_load], axis=1)
+        return jnp.stack([first, jnp.stack([none, self.tilt_rest], axis=1)], axis=1)
 
     def of_many(self, numbers: Numbers) -> Numbers:
-        """All four components turned, the two that see the states first; columns may come before the spots."""
-        first, *beyond = self.pan_out.of_many(numbers)
-        return (first, *self.tilt_out.of_many(tuple(beyond)))
+        """The components along both directions, and the four of what is left; columns may come before the spots."""
+        along = [sum(q * n for q, n in zip(way, numbers, strict=True)) for way in (self.first, self.second)]
+        left = (n - p * along[0] - q * along[1] for p, q, n in zip(self.first, self.second, numbers, strict=True))
+        return (*along, *left)

@@ -198,8 +198,8 @@ FAULTS = (
     Fault(
         "filter sees half of the tilt",
         "estimators/spot_residuals.py",
-        "first = jnp.stack([self.pan_out.first, self.tilt_load], axis=1)",
-        "first = jnp.stack([self.pan_out.first, 0.5 * self.tilt_load], axis=1)",
+        "first = jnp.stack([self.pan_load, self.tilt_load], axis=1)",
+        "first = jnp.stack([self.pan_load, 0.5 * self.tilt_load], axis=1)",
         "stop errors of the tilt are told apart from those of the pan by too much",
         ("estimators/likelihood",),
     ),
