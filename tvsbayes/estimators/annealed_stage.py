@@ -10,7 +10,6 @@ from __future__ import annotations
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import lineax as lx
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
@@ -81,6 +80,5 @@ def stage(
 
     With the tolerance `NO_STEP` the campaign linearised at z: one compiled function serves both.
     """
-    # Of the solvers that lineax has, this one asks for nothing that a stored trace may not ask for.
-    solver = damped_solver(tolerance, lx.Normal(lx.Cholesky()))
+    solver = damped_solver(tolerance, normal_equations=True)
     return descend(reduced_residuals, solver, z, (space, arrays, fixed), STAGE_STEPS).also

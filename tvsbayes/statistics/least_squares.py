@@ -16,9 +16,7 @@ from typing import cast
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import lineax as lx
 import numpy as np
-import optimistix as optx
 from jaxtyping import Array, Float, PyTree
 
 NEWTON_STEP = 1e-4
@@ -48,19 +46,26 @@ class Descent(eqx.Module):
     also: PyTree
 
 
-def damped_solver(
-    tolerance: Float[Array, ""], linear_solver: lx.AbstractLinearSolver | None = None
-) -> optx.LevenbergMarquardt:
+def damped_solver(tolerance: Float[Array, ""], *, normal_equations: bool = False) -> eqx.Module:
     """Levenberg-Marquardt whose damping falls tenfold after every step that the linear model predicted well.
 
     By default optimistix asks for 99 % agreement and divides by 3.5: in directions that only a prior holds, where
     the damping is as large as the curvature, it then creeps.
+
+    Args:
+        tolerance: relative and absolute, of steps and of the sum of squares.
+        normal_equations: solve them by Cholesky instead of the Jacobian by QR: faster where their condition is
+            harmless, and it asks for nothing that a stored trace may not ask for.
     """
+    # Here, since whoever takes a descent from its stored trace needs neither.
+    import lineax as lx
+    import optimistix as optx
+
     solver: optx.LevenbergMarquardt = optx.LevenbergMarquardt(
         # A traced tolerance, so that every stage shares the compilation, is a float to all of optimistix.
         rtol=cast(float, tolerance),
         atol=cast(float, tolerance),
-        linear_solver=lx.QR() if linear_solver is None else linear_solver,
+        linear_solver=lx.Normal(lx.Cholesky()) if normal_equations else lx.QR(),
     )
     search: optx.ClassicalTrustRegion = optx.ClassicalTrustRegion(
         high_cutoff=0.75, low_cutoff=0.1, high_constant=10.0, low_constant=0.2
@@ -79,7 +84,7 @@ residuals_and_jacobian = eqx.filter_jit(linear_residual)
 
 def descend(
     linearised: Callable[[Float[Array, " parameters"], PyTree], LinearResidual],
-    solver: optx.LevenbergMarquardt,
+    solver: eqx.Module,
     start: Float[Array, " parameters"],
     args: PyTree,
     max_steps: int,
@@ -89,6 +94,7 @@ def descend(
     A step asks its linear model for columns, for products and for transposed products. Left to itself JAX compiles
     (and runs) the residual's tangent code once for each; here the derivative is the one matrix that is given.
     """
+    import optimistix as optx
 
     def attached(value, args):
         at = jax.lax.stop_gradient(value)
@@ -96,7 +102,13 @@ def descend(
         return found.value + found.jacobian @ (value - at), found.also
 
     solution: optx.Solution = optx.least_squares(
-        attached, solver, start, args, has_aux=True, max_steps=max_steps, throw=False
+        attached,
+        cast(optx.AbstractLeastSquaresSolver, solver),
+        start,
+        args,
+        has_aux=True,
+        max_steps=max_steps,
+        throw=False,
     )
     return Descent(solution.value, solution.aux)
 
