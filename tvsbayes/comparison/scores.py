@@ -27,7 +27,10 @@ def judge(by: str, predictions: list[Prediction], lengths: np.ndarray, unseen: d
     angle, blocks = np.array([p.angle_deg for p in predictions]), [(p.fold, p.direction) for p in predictions]
     of_block = {b: np.array([x == b for x in blocks]) for b in dict.fromkeys(blocks)}
     scores, means = {}, {}
-    dof = {"classic": [p.classic_dof for p in predictions], "joint": [np.inf] * len(predictions)}
+    dof: dict[str, list[float]] = {
+        "classic": [p.classic_dof for p in predictions],
+        "joint": [np.inf] * len(predictions),
+    }
     for name in ("classic", "joint"):
         told = np.array([getattr(p, f"{name}_deg") for p in predictions])
         u = np.array([getattr(p, f"{name}_u_deg") for p in predictions])
