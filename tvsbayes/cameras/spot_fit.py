@@ -143,9 +143,12 @@ def patch_around(picture: np.ndarray) -> Patch | str:
     if peak < max(DETECTION_SIGMAS * noise, DETECTION_MIN_DN):
         return "no-spot"
     bright = (above > max(SECOND_SHARE * peak, DETECTION_SIGMAS / 2 * noise)).astype(np.uint8)
-    count, labels, stats, centroids = cv2.connectedComponentsWithStats(bright, connectivity=8)
-    flux = np.bincount(labels.ravel().astype(np.intp), weights=above.ravel(), minlength=count)
-    flux[0] = 0.0
+    # What follows looks at a few cells: it takes the time of the whole picture unless it is shown these alone.
+    column, row, columns, rows = cv2.boundingRect(bright)
+    around = np.s_[row : row + rows, column : column + columns]
+    count, labels, stats, centroids = cv2.connectedComponentsWithStats(bright[around], connectivity=8)
+    lit = labels > 0
+    flux = np.bincount(labels[lit], weights=above[around][lit], minlength=count)
     main = int(flux.argmax())
     if np.sort(flux)[-2] > SECOND_SHARE * flux[main]:
         return "two-spots"
@@ -155,7 +158,7 @@ def patch_around(picture: np.ndarray) -> Patch | str:
     # A Gaussian is above a quarter of its peak within a radius of sqrt(2 ln 4) = 1.67 sds.
     sd = _SHRINK * sqrt(area / pi) / 1.67
     # The cell's centre, and the half cell that the 2 x 2 blur moved it by.
-    start = (centroids[main] + 0.5) * _SHRINK - 0.5 - _SHRINK / 2
+    start = (centroids[main] + (column, row) + 0.5) * _SHRINK - 0.5 - _SHRINK / 2
     half = int(min(max(4 * sd + 5, 14), max(height, width)))
     left, top = np.maximum(np.round(start).astype(int) - half, 0)
     right, bottom = np.minimum(np.round(start).astype(int) + half + 1, (width, height))
