@@ -1,7 +1,7 @@
 """Shared by the tests of the model: float64, one small campaign, and compiled functions that many tests use.
 
-Compile time rules the run time of these tests: whatever needs the whole optical chain goes through `evaluate` or
-through `likelihood.density_and_gradient`, which are compiled once per session for the one 512 bucket.
+Compile time rules the run time of these tests: whatever needs the whole optical chain goes through the fixture
+`evaluate` or through `likelihood.evaluate`, which are compiled once per session for the one 512 bucket.
 pyproject.toml has every array checked against its annotation (jaxtyping's import hook, at trace time).
 """
 

@@ -39,7 +39,7 @@ def fit_from_truth(campaign: Campaign, truth: Truth) -> JointFit:
     with jax.enable_x64(True):
         problem = Problem(campaign, campaign.rig)
         z = np.where(problem.free, np.clip(coordinates_of(problem.space, physical_of(truth)), -4.0, 4.0), 0.0)
-        mode = newton_mode(problem.objective, z, problem.free, problem.curvature(z))
+        mode = newton_mode(problem.negative_log_density, z, problem.free, problem.curvature(z))
         if not mode.problems:
             return fit_at(campaign, problem, mode, 0)
     return fit(campaign)

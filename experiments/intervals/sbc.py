@@ -44,10 +44,10 @@ from tvsbayes.estimators.joint_fit import fit
 from tvsbayes.estimators.likelihood import evaluate
 from tvsbayes.instrument.axes import DIRECTIONS
 from tvsbayes.instrument.parameters import NAMES
+from tvsbayes.model.compiled import in_batches
 from tvsbayes.model.parameter_space import parameter_space
 from tvsbayes.posterior.draws import derived_at
 from tvsbayes.posterior.sampling import sample
-from tvsbayes.posterior.transport import in_batches
 from tvsbayes.twin.physics import effective_deg_per_step, effective_mirror_offset_mm
 from tvsbayes.twin.simulated_campaign import simulate
 

@@ -226,19 +226,19 @@ def test_a_fixed_parameter_stays_and_the_rest_follows(simulated, fitted):
 
 
 def test_the_mode_is_a_stationary_maximum(fitted):
-    from tvsbayes.estimators.likelihood import density_and_gradient
+    from support.sloped_density import value_and_gradient
 
     with jax.enable_x64(True):
-        found = density_and_gradient(fitted.z, fitted.space, fitted.arrays)
+        value, gradient = value_and_gradient(fitted.z, fitted.space, fitted.arrays)
         root = np.linalg.cholesky(fitted.covariance)
         # Squared length of the remaining Newton step in sds: the fit stops at 1e-8.
-        assert np.sum((root.T @ np.asarray(found.gradient))[fitted.free] ** 2) < 1e-6 * SD**2
-        assert float(found.log_density) == pytest.approx(fitted.log_density)
+        assert np.sum((root.T @ np.asarray(gradient))[fitted.free] ** 2) < 1e-6 * SD**2
+        assert float(value) == pytest.approx(fitted.log_density)
         for column in root.T[fitted.free][::7]:
             for sign in (-1, 1):
-                nearby = density_and_gradient(fitted.z + sign * 0.5 * column, fitted.space, fitted.arrays)
+                nearby, _ = value_and_gradient(fitted.z + sign * 0.5 * column, fitted.space, fitted.arrays)
                 # One half sd away a Gaussian falls by 1/8; half or twice that bounds its non-Gaussian shape.
-                assert 1 / 16 < float(found.log_density - nearby.log_density) < 1 / 4
+                assert 1 / 16 < float(value - nearby) < 1 / 4
 
 
 def test_laplace_draws_have_exactly_their_moments():

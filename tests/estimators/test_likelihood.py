@@ -10,9 +10,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from support.sloped_density import value_and_gradient
 
 from tvsbayes.estimators.campaign_arrays import bucket, campaign_arrays, log_constant
-from tvsbayes.estimators.likelihood import density_and_gradient
 from tvsbayes.instrument.axes import HOME_SD_DEG
 from tvsbayes.instrument.campaign import ordered_spots
 from tvsbayes.instrument.parameters import INDEX, NAMES, RIG_NAMES
@@ -135,7 +135,7 @@ def test_filter_equals_dense_gaussian(dozen, evaluate, offset_sds):
 
 def test_log_density_adds_the_prior(dozen, evaluate):
     z = random_points(dozen, 1, 0.3)[0]
-    value = density_and_gradient(jnp.asarray(z), dozen.space, dozen.arrays).log_density
+    value, _ = value_and_gradient(jnp.asarray(z), dozen.space, dozen.arrays)
     expected = evaluate(z, dozen.space, dozen.arrays).innovations.log_density - 0.5 * z @ z
     assert float(value) == pytest.approx(expected, abs=FINE_UNIT, rel=1e-12)
 
@@ -223,9 +223,9 @@ def test_gradient_against_differences(dozen, where):
     }[where]
 
     def value(at):
-        return float(density_and_gradient(jnp.asarray(at), dozen.space, dozen.arrays).log_density)
+        return float(value_and_gradient(jnp.asarray(at), dozen.space, dozen.arrays)[0])
 
-    gradient = np.asarray(density_and_gradient(jnp.asarray(z), dozen.space, dozen.arrays).gradient)
+    gradient = np.asarray(value_and_gradient(jnp.asarray(z), dozen.space, dozen.arrays)[1])
     differences = central_gradient(value, z, 1e-3)
     # Truncation (1e-3 prior sds)^4, rounding 1e-16 x density / 1e-3: 1e-6 of the steepest coordinate.
     assert np.abs(gradient - differences).max() < 1e-6 * np.abs(gradient).max()
@@ -234,8 +234,8 @@ def test_gradient_against_differences(dozen, where):
 def test_gradient_is_finite_everywhere(dozen):
     """Three prior standard deviations in every coordinate at once: behind the cameras, off the image."""
     for z in 3.0 * np.random.default_rng(41).standard_normal((100, len(NAMES))):
-        found = density_and_gradient(jnp.asarray(z), dozen.space, dozen.arrays)
-        assert np.isfinite(float(found.log_density)) and np.all(np.isfinite(found.gradient))
+        value, gradient = value_and_gradient(jnp.asarray(z), dozen.space, dozen.arrays)
+        assert np.isfinite(float(value)) and np.all(np.isfinite(gradient))
 
 
 def stated_covariance(spot) -> np.ndarray:
@@ -369,7 +369,7 @@ def test_receiver_matters_only_with_readings(dozen):
     names = ("baseline_mm", "pan_zero_emission_deg", "aperture_zero_deg")
     rows = [RIG_NAMES.index(name) for name in names]
     bare, full = (
-        np.asarray(density_and_gradient(jnp.asarray(z), dozen.space, a).gradient)[rows] for a in (arrays, dozen.arrays)
+        np.asarray(value_and_gradient(jnp.asarray(z), dozen.space, a)[1])[rows] for a in (arrays, dozen.arrays)
     )
     np.testing.assert_allclose(bare, -z[rows], atol=FINE_UNIT)
     assert np.all(np.abs(full + z[rows]) > 1e-3 * LOG_UNIT)

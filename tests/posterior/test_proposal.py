@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 from support.small_posterior import ROUNDING, SIGMAS
 
+from tvsbayes.model.compiled import BATCH
 from tvsbayes.posterior import ensemble
 from tvsbayes.posterior.ensemble import WALKERS, GroupEvolution, walkers_for
 from tvsbayes.posterior.proposal import NODES, Independence, Tables
-from tvsbayes.posterior.transport import BATCH
 
 RESOLVED = 0.05
 """Five standard errors of E[x.x]/d have to be below this, or the run could not see a bias of sd x0.97."""

@@ -149,9 +149,9 @@ def fit(
         problem.compile_aside(executor)
         try:
             z = problem.searched(model.robust)
-            if not np.all(np.isfinite(problem.objective(z)[1])):
+            if not np.isfinite(problem.negative_log_density(z[None])[0]):
                 raise diverged
-            mode = newton_mode(problem.objective, z, problem.free, problem.curvature(z))
+            mode = newton_mode(problem.negative_log_density, z, problem.free, problem.curvature(z))
             return fit_at(campaign, problem, mode, seed)
         except np.linalg.LinAlgError as error:
             raise diverged from error

@@ -221,21 +221,6 @@ def log_density(z: Float[Array, " parameters"], space: ParameterSpace, arrays: C
     return innovations(space.model(z), arrays).log_density - 0.5 * jnp.dot(z, z)
 
 
-class SlopedDensity(eqx.Module):
-    """Log posterior density at a point, and its gradient."""
-
-    log_density: Scalar
-    gradient: Float[Array, " parameters"]
-
-
-@compiled(SlopedDensity)
-def density_and_gradient(
-    z: Float[Array, " parameters"], space: ParameterSpace, arrays: CampaignArrays
-) -> SlopedDensity:
-    """`log_density` and its gradient; the one compiled function that the Newton steps and Hessians share."""
-    return SlopedDensity(*jax.value_and_grad(log_density)(z, space, arrays))
-
-
 class Evaluation(eqx.Module):
     """Log posterior density and standardised innovations; many points give every field a leading axis."""
 

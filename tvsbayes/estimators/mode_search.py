@@ -14,7 +14,7 @@ from scipy import optimize
 
 from tvsbayes.estimators.annealed_stage import NO_STEP, STAGE_TOLERANCE, Fixed, stage
 from tvsbayes.estimators.campaign_arrays import campaign_arrays
-from tvsbayes.estimators.likelihood import density_and_gradient
+from tvsbayes.estimators.likelihood import evaluate
 from tvsbayes.estimators.linear_spots import (
     Linearised,
     StopInformation,
@@ -25,14 +25,15 @@ from tvsbayes.estimators.linear_spots import (
 from tvsbayes.instrument.campaign import Campaign, ordered_spots
 from tvsbayes.instrument.parameters import NAMES, NOISE_NAMES
 from tvsbayes.instrument.rig import RigTable
-from tvsbayes.model.compiled import placed
+from tvsbayes.model.compiled import in_batches, placed
 from tvsbayes.model.parameter_space import free_mask, parameter_space
 from tvsbayes.statistics.chances import chi2_quantile
-from tvsbayes.statistics.least_squares import NEWTON_STEP
 
 ANNEALING = (60.0, 10.0, 2.0, 1.0)
 """Factors on the pixel noise before it takes its own value: plain Levenberg-Marquardt from the nominal rig goes
 astray when the extrinsics are off by 0.3 rad and 60 mm (formulation 4.2)."""
+NOISE_STEP = 1e-3
+"""Of differences along noise coordinates, in prior sds: a hundredth of a posterior sd."""
 NOISE_SETTLED = 0.05
 """Change of every noise coordinate (prior sds) below which the alternation stops: half a posterior sd."""
 GATE_PROBABILITY = 1e-6
@@ -64,7 +65,7 @@ class Problem:
         """Start the compilation that later steps need while the first stage runs on the other core."""
 
         def work():
-            density_and_gradient(np.zeros(len(NAMES)), self.space, self.arrays)
+            self.negative_log_density(np.zeros((1, len(NAMES))))
 
         executor.submit(work)
 
@@ -77,25 +78,32 @@ class Problem:
         fixed = Fixed(self.held, z, np.array(inflation))
         return stage(z, self.space, self.arrays, fixed, np.array(tolerance))
 
-    def objective(self, z: np.ndarray) -> tuple[float, np.ndarray]:
-        """Negative log density and its gradient."""
-        found = density_and_gradient(z, self.space, self.arrays)
-        return -float(found.log_density), -np.asarray(found.gradient)
+    def negative_log_density(self, z: np.ndarray) -> np.ndarray:
+        """Of many points (n, p); infinite where the model has no value."""
+        found = in_batches(lambda block: evaluate(block, self.space, self.arrays).log_density, z)
+        return np.where(np.isfinite(found), -found, np.inf)
 
     def noise_scales(self, z: np.ndarray) -> np.ndarray:
         """Best noise scales for given geometry, under their priors."""
+        count = self.noise.size
+        if not count:
+            return z
+        steps = np.concatenate([np.zeros((1, count)), np.eye(count), -np.eye(count)]) * NOISE_STEP
 
-        def part(values):
-            full = z.copy()
-            full[self.noise] = values
-            value, slope = self.objective(full)
-            return value, slope[self.noise]
+        def value_and_slope(values: np.ndarray) -> tuple[float, np.ndarray]:
+            points = np.repeat(z[None], len(steps), axis=0)
+            points[:, self.noise] = values + steps
+            centre, ahead, behind = np.split(self.negative_log_density(points), [1, 1 + count])
+            return float(centre[0]), (ahead - behind) / (2 * NOISE_STEP)
 
+        # Eight prior standard deviations: a factor 3000 on a stop sd, 55 on the pixel scale.
+        bounds = [(-8.0, 8.0)] * count
+        settled = {"ftol": 1e-8, "gtol": 1e-2}
+        found = optimize.minimize(
+            value_and_slope, z[self.noise], jac=True, method="L-BFGS-B", bounds=bounds, options=settled
+        )
         result = z.copy()
-        if self.noise.size:
-            # Eight prior standard deviations: a factor 3000 on a stop sd, 55 on the pixel scale.
-            bounds = [(-8.0, 8.0)] * self.noise.size
-            result[self.noise] = optimize.minimize(part, z[self.noise], jac=True, method="L-BFGS-B", bounds=bounds).x
+        result[self.noise] = found.x
         return result
 
     def alternate(self, z: np.ndarray) -> np.ndarray:
@@ -131,11 +139,10 @@ class Problem:
     def curvature(self, z: np.ndarray) -> np.ndarray:
         """Expected information of the coordinates: Fisher's of geometry and stereo, measured for the noise."""
         value = self.information(self.linearised(z)).fisher + np.eye(len(NAMES))
-        slope = self.objective(z)[1]
-        for index in self.noise:
-            nudged = z.copy()
-            nudged[index] += NEWTON_STEP
-            value[index, index] = max(1.0, (self.objective(nudged)[1] - slope)[index] / NEWTON_STEP)
+        steps = NOISE_STEP * np.eye(len(NAMES))[self.noise]
+        centre, *nudged = self.negative_log_density(np.concatenate([z[None], z + steps, z - steps]))
+        both = np.sum(np.reshape(nudged, (2, -1)), axis=0)
+        value[self.noise, self.noise] = np.maximum(1.0, (both - 2 * centre) / NOISE_STEP**2)
         return value
 
     def reweighted(self, z: np.ndarray) -> float:

@@ -46,6 +46,11 @@ def noise_scales(model: Model, spots: SpotArrays, inflation: Float[Array | np.nd
     )
 
 
+def _dot(first: Numbers, second: Numbers) -> Float[Array, "..."]:
+    """Scalar product of components."""
+    return jnp.asarray(sum(a * b for a, b in zip(first, second, strict=True)))
+
+
 class Reflection(eqx.Module):
     """Householder reflections that take a direction per spot to the first axis.
 
@@ -60,18 +65,18 @@ class Reflection(eqx.Module):
     @classmethod
     def of(cls, direction: Numbers) -> Reflection:
         """The reflection of a direction given by its components."""
-        length2 = sum(number**2 for number in direction)
+        length2 = _dot(direction, direction)
         there = length2 > 0
         length = jnp.sqrt(jnp.where(there, length2, 1.0))
         unit = [number / length for number in direction]
         unit[0] = jnp.where(there, unit[0], 1.0)
         sign = jnp.where(unit[0] < 0, -1.0, 1.0)
         mirror = materialise((unit[0] + sign, *unit[1:]))
-        return cls(mirror, 0.5 * sum(number**2 for number in mirror), -sign * jnp.where(there, length, 0.0))
+        return cls(mirror, 0.5 * _dot(mirror, mirror), -sign * jnp.where(there, length, 0.0))
 
     def of_many(self, numbers: Numbers) -> Numbers:
         """Reflected components; an axis of columns may come before the spots."""
-        share = sum(m * number for m, number in zip(self.mirror, numbers, strict=True)) / self.half
+        share = _dot(self.mirror, numbers) / self.half
         return tuple(number - share * m for m, number in zip(self.mirror, numbers, strict=True))
 
 
@@ -103,7 +108,7 @@ def spot_residuals(looks: Looks, noise: NoiseScales, model: Model, spots: SpotAr
     range_out = Reflection.of(by_range)
     residual, by_pan, by_tilt = (range_out.of_many(numbers)[1:] for numbers in (misfit, by_pan, by_tilt))
     # Four pixels give s^-4, their range integral s; the aperture's noise takes part in that integral.
-    pixel_part = sum(number**2 for number in by_range[:4])
+    pixel_part = _dot(by_range[:4], by_range[:4])
     log_scale = -3 * jnp.log(model.noise.pixel_scale) - 0.5 * jnp.log1p(
         by_range[4] ** 2 / jnp.where(spots.valid > 0, pixel_part, 1.0)
     )
@@ -113,7 +118,7 @@ def spot_residuals(looks: Looks, noise: NoiseScales, model: Model, spots: SpotAr
 
 def _unit(direction: Numbers) -> tuple[Numbers, Float[Array, " spots"]]:
     """Directions of length 1 and the lengths; nought where there is no direction (padding)."""
-    length2 = sum(number**2 for number in direction)
+    length2 = _dot(direction, direction)
     there = length2 > 0
     length = jnp.sqrt(jnp.where(there, length2, 1.0))
     return materialise(tuple(number / length for number in direction)), jnp.where(there, length, 0.0)
@@ -137,7 +142,7 @@ class ToStates(eqx.Module):
     def of(cls, by_pan: Numbers, by_tilt: Numbers) -> ToStates:
         """The directions of looks that move so with pan and tilt."""
         first, pan_load = _unit(by_pan)
-        tilt_load = sum(a * b for a, b in zip(first, by_tilt, strict=True))
+        tilt_load = _dot(first, by_tilt)
         second, tilt_rest = _unit(tuple(b - tilt_load * a for a, b in zip(first, by_tilt, strict=True)))
         return cls(first, second, pan_load, tilt_load, tilt_rest)
 
@@ -150,6 +155,6 @@ class ToStates(eqx.Module):
 
     def of_many(self, numbers: Numbers) -> Numbers:
         """The components along both directions, and the four of what is left; columns may come before the spots."""
-        along = [sum(q * n for q, n in zip(way, numbers, strict=True)) for way in (self.first, self.second)]
-        left = (n - p * along[0] - q * along[1] for p, q, n in zip(self.first, self.second, numbers, strict=True))
-        return (*along, *left)
+        one, two = _dot(self.first, numbers), _dot(self.second, numbers)
+        left = (n - p * one - q * two for p, q, n in zip(self.first, self.second, numbers, strict=True))
+        return (one, two, *left)

@@ -28,6 +28,8 @@ from tvsbayes.files.own_folder import OwnFolder
 
 LIBRARIES = ("jax", "jaxlib", "equinox", "optimistix", "lineax", "numpy")
 """Whose versions decide what a trace gives."""
+BATCH = 32
+"""Points per call of a function of many: half an ensemble of 64, the calls of a differential-evolution step."""
 PACKAGE = Path(__file__).resolve().parents[1]
 LOADED_TIME_S = time.time()
 """When this process read its code, seconds since the epoch: source written later is not what it runs."""
@@ -186,6 +188,19 @@ class Compiled[**P, Result]:
 def compiled[**P, Result](result: type[Result]) -> Callable[[Callable[P, Result]], Compiled[P, Result]]:
     """Decorator of a function that returns `result`: one array (`jax.Array`) or a flat `eqx.Module`; see `Compiled`."""
     return lambda plain: Compiled(plain, result)
+
+
+def in_batches[Result](function: Callable[..., Result], *points: np.ndarray, size: int = BATCH) -> Result:
+    """Call a compiled function on blocks of one size of each of `points` and join the results along the first axis.
+
+    The last block is filled up with its last row, so that nothing is compiled for a rest.
+    """
+    blocks, total = [], len(points[0])
+    for start in range(0, total, size):
+        rows = np.minimum(np.arange(start, start + size), total - 1)
+        result = function(*(x[rows] for x in points))
+        blocks.append(jax.tree.map(lambda x, n=total - start: np.asarray(x)[:n], result))
+    return jax.tree.map(lambda *parts: np.concatenate(parts), *blocks)
 
 
 def placed(values: ArrayLike) -> jax.Array:

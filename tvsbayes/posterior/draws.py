@@ -16,8 +16,8 @@ from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.instrument.axes import AXES, DIRECTION_SIGNS, DIRECTIONS, SENSES
 from tvsbayes.instrument.parameters import BLOCKS, NAMES
 from tvsbayes.instrument.stops import legs_of
+from tvsbayes.model.compiled import in_batches
 from tvsbayes.model.headlines import Derived, derived_quantities
-from tvsbayes.posterior.transport import in_batches
 from tvsbayes.results.convergence import Convergence, Reweighted
 from tvsbayes.statistics.weighted_draws import TAILS, systematic, weighted_mean, weighted_summary
 

@@ -14,12 +14,12 @@ import emcee
 import numpy as np
 
 from tvsbayes.estimators.joint_fit import JointFit
+from tvsbayes.model.compiled import BATCH
 from tvsbayes.posterior.chain import Chain, Progress, write_chain
 from tvsbayes.posterior.diagnosis import ESS_LIMIT, GROUPS, TAU_LIMIT, diagnose
 from tvsbayes.posterior.draws import Posterior
 from tvsbayes.posterior.importance import ImportanceRun
 from tvsbayes.posterior.proposal import Independence, Target
-from tvsbayes.posterior.transport import BATCH
 from tvsbayes.results.convergence import Convergence
 
 WALKERS = 64

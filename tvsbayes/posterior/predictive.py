@@ -27,10 +27,9 @@ from tvsbayes.estimators.looks import observe_with_stop_errors
 from tvsbayes.instrument.axes import HOME_SD_DEG
 from tvsbayes.instrument.campaign import PIXELS, ordered_spots
 from tvsbayes.instrument.parameters import INDEX
-from tvsbayes.model.compiled import compiled
+from tvsbayes.model.compiled import compiled, in_batches
 from tvsbayes.model.parameter_space import STOP_COLUMNS, ParameterSpace
 from tvsbayes.posterior.draws import Posterior
-from tvsbayes.posterior.transport import in_batches
 
 if TYPE_CHECKING:
     import xarray as xr

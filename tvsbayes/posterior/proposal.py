@@ -14,7 +14,8 @@ from scipy import special
 
 from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.estimators.likelihood import evaluate
-from tvsbayes.posterior.transport import Transport, in_batches
+from tvsbayes.model.compiled import in_batches
+from tvsbayes.posterior.transport import Transport
 
 NODES = np.linspace(-8.0, 12.0, 41)
 """Of the tabulated densities, in w. Noise scales have their long tail above."""

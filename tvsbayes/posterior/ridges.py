@@ -15,8 +15,9 @@ from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.estimators.likelihood import evaluate
 from tvsbayes.estimators.linear_spots import LinearSpots, linear_spots
 from tvsbayes.instrument.parameters import INDEX, NAMES, NOISE_NAMES
+from tvsbayes.model.compiled import in_batches
 from tvsbayes.model.parameter_space import STOP_COLUMNS
-from tvsbayes.posterior.transport import STRETCH_NODES, Transport, in_batches
+from tvsbayes.posterior.transport import STRETCH_NODES, Transport
 
 NARROW = 0.15
 """Conditional posterior sd, in prior sds, below which a coordinate is moved by the shear. Wider ones would be moved

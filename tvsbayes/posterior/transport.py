@@ -9,18 +9,14 @@ that the linearised campaign has at the noise scales of the walker. NumPy outsid
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 
-import jax
 import numpy as np
 
 from tvsbayes.instrument.parameters import BLOCKS, NAMES, NOISE_NAMES
 from tvsbayes.model.parameter_space import half_normal, half_normal_slope
 
-BATCH = 32
-"""Points per call of the compiled density: half an ensemble of 64, the calls of a differential-evolution step."""
 BLOCK_ROWS = 256
 """Points that are mapped at a time: their matrices take 64 MB at most."""
 STRETCH_NODES = (-2.0, 0.0, 2.0, 4.0, 6.0)
@@ -240,16 +236,3 @@ class Transport:
         else:
             straight *= np.exp(-self._log_width(noise))
         return straight
-
-
-def in_batches[Result](function: Callable[..., Result], *points: np.ndarray, size: int = BATCH) -> Result:
-    """Call a compiled function on blocks of one size of each of `points` and join the results along the first axis.
-
-    The last block is filled up with its last row, so that nothing is compiled for a rest.
-    """
-    blocks, total = [], len(points[0])
-    for start in range(0, total, size):
-        rows = np.minimum(np.arange(start, start + size), total - 1)
-        result = function(*(x[rows] for x in points))
-        blocks.append(jax.tree.map(lambda x, n=total - start: np.asarray(x)[:n], result))
-    return jax.tree.map(lambda *parts: np.concatenate(parts), *blocks)
