@@ -12,7 +12,7 @@ from tvsbayes.errors import InputError
 from tvsbayes.instrument.parameters import RIG_NAMES
 from tvsbayes.model.parameter_space import STOP_COLUMNS
 from tvsbayes.planning.assurance import SCALES, Assurance, Family, believed
-from tvsbayes.planning.drawn_rigs import Instruments
+from tvsbayes.planning.drawn_rigs import Instruments, draw_instruments
 from tvsbayes.planning.expectation import NOISE_COLUMNS, PARAMETERS, information_of
 from tvsbayes.planning.looks import CONTRAST_COLUMNS, covariance_of
 from tvsbayes.planning.target import DEFAULT_TARGET, parse_target, sensitivity
@@ -37,10 +37,9 @@ def test_what_is_reported_is_the_whole_plan_judged_at_each_instrument(knowledge,
     picks = np.random.default_rng(4).integers(0, len(found.looks), 12)
     family = Family(knowledge, found, np.concatenate([picks, picks]), False)
     target = parse_target(DEFAULT_TARGET)
-    assurance = Assurance(family, target, 3, 5)
-    drawn = assurance.instruments
+    drawn = draw_instruments(knowledge, 3, 5)
     drawn.z[:, CONTRAST_COLUMNS] = 0.0
-    assurance.instruments = Instruments.at(drawn.z, drawn.value, drawn.common)
+    assurance = Assurance(family, target, Instruments.at(drawn.z, drawn.value, drawn.common), 5)
     first = assurance.values([2])
     reported = {**first, **assurance.values([6, 2])}
     instruments = assurance.instruments
@@ -65,7 +64,8 @@ def test_instruments_that_miss_the_point_or_see_nothing_report_no_uncertainty(kn
     """Infinite, and the others as if those were not there."""
     family = Family(knowledge, found, np.arange(8), False)
     target = parse_target("u(left) <= 1 deg/step")
-    every = Assurance(family, target, 4, 1).values([2])[2]
+    instruments = draw_instruments(knowledge, 4, 1)
+    every = Assurance(family, target, instruments, 1).values([2])[2]
     poses = []
 
     def refused(*asked):
@@ -75,7 +75,7 @@ def test_instruments_that_miss_the_point_or_see_nothing_report_no_uncertainty(kn
         return sensitivity(*asked)
 
     monkeypatch.setattr("tvsbayes.planning.assurance.sensitivity", refused)
-    blind = Assurance(family, target, 4, 1)
+    blind = Assurance(family, target, instruments, 1)
     shown = blind.arrays.at_all
 
     def closed(z, value):
@@ -92,8 +92,8 @@ def test_instruments_that_miss_the_point_or_see_nothing_report_no_uncertainty(kn
 def test_other_noise_scales_need_no_new_look(knowledge, found, seen):
     """Looks whitened anew for other stop errors and pixels carry the information that looking again would give."""
     family = Family(knowledge, found, np.arange(len(found.looks)), False)
-    assurance = Assurance(family, parse_target(DEFAULT_TARGET), 1, 0)
     truth = believers(knowledge, knowledge.z)
+    assurance = Assurance(family, parse_target(DEFAULT_TARGET), truth, 0)
     z = knowledge.z.copy()
     z[SCALES] = (0.7, -1.1, 0.4, 1.3, -0.6)
     again = assurance.arrays.at(z, knowledge.space).rows

@@ -11,6 +11,7 @@ from support.coarse_planning import ROUNDING
 
 from tvsbayes.planning import search
 from tvsbayes.planning.assurance import Assurance, Family
+from tvsbayes.planning.drawn_rigs import draw_instruments
 from tvsbayes.planning.expectation import LOOKS_PER_EXPERIMENT, PARAMETERS
 from tvsbayes.planning.looks import CONTRAST_COLUMNS, covariance_of, information_of_looks
 from tvsbayes.planning.search import CRITERIA, KNOWN, MEAN_WEIGHT, Scope, Search, scores, search_rows, smallest_design
@@ -103,7 +104,7 @@ def refine(knowledge, found, seen):
         family = Family(knowledge, found, np.asarray(picks), False)
         pose = seen.mirror_angles_rad.mean(axis=0)
         at = sensitivity(target, knowledge.z, knowledge.space, knowledge.rig.table, pose)
-        assurance = Assurance(family, target, 10, 3)
+        assurance = Assurance(family, target, draw_instruments(knowledge, 10, 3), 3)
         plain = assurance.values([2])[2]
         return plain, search.refine(family, seen, target, at, 2, Scope(minutes=minutes), assurance)
 

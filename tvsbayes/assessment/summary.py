@@ -144,9 +144,7 @@ def _classic_predicted(source: _Source) -> dict[str, Estimate | None]:
         centre, slope = found.ratio, np.einsum("epq,epqz->ez", found.by_pixel, push)
         draws = centre + (fit.draws_z[:CLASSIC_DRAWS] - fit.z) @ slope.T
     else:
-        draws = np.stack(
-            [four_point_ratios(pixels[rows], *asked) for pixels in ideal_pixels(source.posterior, CLASSIC_DRAWS)]
-        )
+        draws = four_point_ratios(ideal_pixels(source.posterior, CLASSIC_DRAWS)[:, rows], *asked)
         centre = draws.mean(axis=0)
     for direction in DIRECTIONS:
         # Pixels far from the image, of a fit that went astray, cannot be undistorted: there is no ratio then.

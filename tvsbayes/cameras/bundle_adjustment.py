@@ -15,6 +15,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import equinox as eqx
 import jax
@@ -25,8 +26,9 @@ from jaxtyping import Array, Float
 from tvsbayes.cameras.boards import Board, View
 from tvsbayes.errors import NotConverged, NothingToEstimate
 from tvsbayes.instrument.parameters import STEREO_PARAMETER_NAMES
+from tvsbayes.model.compiled import compiled, placed
 from tvsbayes.model.geometry import CV_FROM_S, StereoCameras, project, rotation_matrix
-from tvsbayes.statistics.least_squares import least_squares_covariance, levenberg_marquardt, residuals_and_jacobian
+from tvsbayes.statistics.least_squares import damped_solver, descend, least_squares_covariance, linear_residual
 
 VIEWS_PER_BUCKET, CORNERS_PER_BUCKET = 16, 32
 """Padding: calibrations of like size share one compilation."""
@@ -135,6 +137,26 @@ def reduced_residuals(z: Float[Array, "24"], arrays: BoardArrays) -> Float[Array
     return (residuals - jnp.einsum("vrp,vps,vs->vr", by_pose, gain, residuals)).ravel()
 
 
+class _Linear(eqx.Module):
+    """`reduced_residuals` at a point and their Jacobian there."""
+
+    residuals: Float[Array, " residuals"]
+    jacobian: Float[Array, "residuals 24"]
+
+
+@compiled(_Linear)
+def _linearised(z: Float[Array, "24"], arrays: BoardArrays) -> _Linear:
+    found = linear_residual(reduced_residuals, z, arrays)
+    return _Linear(found.value, found.jacobian)
+
+
+@compiled(jax.Array)
+def _descent(z: Float[Array, "24"], arrays: BoardArrays, tolerance: Float[Array, ""]) -> Float[Array, "24"]:
+    """Where Levenberg-Marquardt ends; whitened coordinates keep the condition of its normal equations harmless."""
+    solver = damped_solver(tolerance, normal_equations=True)
+    return descend(partial(linear_residual, reduced_residuals), solver, z, arrays, STEPS_MAX).value
+
+
 @dataclass(frozen=True)
 class Adjustment:
     """Least squares over all views, poses eliminated.
@@ -199,38 +221,37 @@ def bundle_adjustment(
         NothingToEstimate: the views leave a combination of parameters open.
         NotConverged: no minimum was found.
     """
-    with jax.enable_x64(True):
-        arrays = _padded(views, board, start, poses, free)
-        seen = np.asarray(arrays.weight) > 0
-        kept = seen.ravel()
-        dof = int(kept.sum()) - int(free.sum()) - 6 * len(views)
-        if dof < 1:
-            raise undetermined("fewer corner coordinates than unknowns")
-        zero = np.zeros(24)
-        jacobian = np.asarray(residuals_and_jacobian(reduced_residuals, jnp.asarray(zero), arrays).jacobian)
-        # Whitened at the start: a unit of z is one standard error for corners of 1 px. In their own units a focal
-        # length and a k3 would share one damping.
-        root = np.zeros((24, 24))
-        root[np.ix_(free, free)] = _whitening(jacobian[:, free], np.flatnonzero(free))
-        arrays = replace(arrays, root=jnp.asarray(root))
-        end = _descended(zero, arrays)
-        noise_sd = math.sqrt(float(end.residuals @ end.residuals) / dof)
-        # Alternating signs, so that no parameter's shift can be taken up by another's.
-        shift = RESTART_SD * noise_sd * np.where(np.arange(24) % 2, -1.0, 1.0) * free
-        again = _descended(end.z + shift, arrays)
+    arrays = _padded(views, board, start, poses, free)
+    seen = np.asarray(arrays.weight) > 0
+    kept = seen.ravel()
+    dof = int(kept.sum()) - int(free.sum()) - 6 * len(views)
+    if dof < 1:
+        raise undetermined("fewer corner coordinates than unknowns")
+    zero = np.zeros(24)
+    jacobian = np.asarray(_linearised(zero, arrays).jacobian)
+    # Whitened at the start: a unit of z is one standard error for corners of 1 px. In their own units a focal
+    # length and a k3 would share one damping.
+    root = np.zeros((24, 24))
+    root[np.ix_(free, free)] = _whitening(jacobian[:, free], np.flatnonzero(free))
+    arrays = replace(arrays, root=placed(root))
+    end = _descended(zero, arrays)
+    noise_sd = math.sqrt(float(end.residuals @ end.residuals) / dof)
+    # Alternating signs, so that no parameter's shift can be taken up by another's.
+    shift = RESTART_SD * noise_sd * np.where(np.arange(24) % 2, -1.0, 1.0) * free
+    again = _descended(end.z + shift, arrays)
     jacobian, residuals = end.jacobian[kept][:, free], end.residuals[kept]
     _check_minimum(jacobian, residuals, (again.z - end.z)[free], noise_sd)
     try:
         z_covariance = least_squares_covariance(jacobian)
     except np.linalg.LinAlgError as error:
         raise undetermined(str(error)) from error
-    placed = np.full(seen.shape, np.nan)
-    placed[seen] = residuals
+    residuals_px = np.full(seen.shape, np.nan)
+    residuals_px[seen] = residuals
     view_of = np.repeat(np.arange(len(seen)), seen[0].size)[kept]
     return Adjustment(
         vector=start + root @ end.z,
         covariance=noise_sd**2 * root[:, free] @ z_covariance @ root[:, free].T,
-        residuals_px=placed[: len(views), :, : board.corners],
+        residuals_px=residuals_px[: len(views), :, : board.corners],
         noise_sd_px=noise_sd,
         dof=dof,
         correlation_factor=correlation_factor(jacobian, residuals, view_of, noise_sd),
@@ -252,7 +273,7 @@ def _padded(views: Sequence[View], board: Board, start: np.ndarray, poses: np.nd
                 seen[k, 2 * side : 2 * side + 2, : board.corners] = found.T
                 weight[k, 2 * side : 2 * side + 2, : board.corners] = 1.0
     unit = np.diag(free.astype(float))
-    return BoardArrays(*map(jnp.asarray, (points, seen, weight, start_poses, np.asarray(start, float), unit)))
+    return BoardArrays(*map(placed, (points, seen, weight, start_poses, np.asarray(start, float), unit)))
 
 
 def _check_minimum(jacobian: np.ndarray, residuals: np.ndarray, apart: np.ndarray, noise_sd: float) -> None:
@@ -286,10 +307,9 @@ class _End:
 
 def _descended(z: np.ndarray, arrays: BoardArrays) -> _End:
     """Where Levenberg-Marquardt ends."""
-    tolerance = jnp.asarray(TOLERANCE)
-    end = levenberg_marquardt(reduced_residuals, jnp.asarray(z), arrays, tolerance, STEPS_MAX)
-    found = residuals_and_jacobian(reduced_residuals, end, arrays)
-    return _End(np.asarray(end), np.asarray(found.value), np.asarray(found.jacobian))
+    end = np.asarray(_descent(z, arrays, TOLERANCE))
+    found = _linearised(end, arrays)
+    return _End(end, np.asarray(found.residuals), np.asarray(found.jacobian))
 
 
 def undetermined(reason: str) -> NothingToEstimate:

@@ -148,7 +148,7 @@ def patch_around(picture: np.ndarray) -> Patch | str:
     around = np.s_[row : row + rows, column : column + columns]
     count, labels, stats, centroids = cv2.connectedComponentsWithStats(bright[around], connectivity=8)
     lit = labels > 0
-    flux = np.bincount(labels[lit], weights=above[around][lit], minlength=count)
+    flux = np.bincount(labels[lit].astype(np.intp), weights=above[around][lit], minlength=count)
     main = int(flux.argmax())
     if np.sort(flux)[-2] > SECOND_SHARE * flux[main]:
         return "two-spots"

@@ -151,8 +151,7 @@ def _idealised(found: JointFit, selection: Selection, z: np.ndarray) -> _Idealis
     ratios = []
     for space in spaces:
         pixels = looks(replace(found, space=space), z, quiet)[:, rows]
-        every = [four_point_ratios(p, selection.steps, selection.axis, found.campaign.stereo) for p in pixels]
-        ratios.append(np.stack(every))
+        ratios.append(four_point_ratios(pixels, selection.steps, selection.axis, found.campaign.stereo))
     return _Idealised(tuple(ratios), full, ideal)
 
 

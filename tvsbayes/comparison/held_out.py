@@ -162,7 +162,7 @@ def foretell_joint(
     z, physical = taught.draws_z[:HOLD_OUT_DRAWS], np.asarray(taught.draws.physical[:HOLD_OUT_DRAWS])
     pixels = looks_again(taught, z, physical, generator)[:, experiment_rows(taught.campaign, selection)[out]]
     steps, axis = selection.steps[out], selection.axis[out]
-    draws = np.stack([four_point_ratios(p, steps, axis, taught.campaign.stereo) for p in pixels]) * steps
+    draws = four_point_ratios(pixels, steps, axis, taught.campaign.stereo) * steps
     found = {}
     for k, e in enumerate(np.flatnonzero(out).tolist()):
         told = draws[np.isfinite(draws[:, k]), k]

@@ -158,17 +158,17 @@ def four_point_angle_deg(points_S_mm: np.ndarray, axis: str | np.ndarray) -> Fou
 def four_point_ratios(
     pixels: np.ndarray, steps: np.ndarray, axis: str | np.ndarray, stereo: Stereo, focal_scale: float = 1.0
 ) -> np.ndarray:
-    """Degrees per step (e,) of many experiments at once, through the paper's whole chain.
+    """Degrees per step (..., e) of many experiments at once, through the paper's whole chain.
 
     Args:
-        pixels: (e, 4, 4) raw pixels (u_left, v_left, u_right, v_right) of points 1 to 4.
+        pixels: (..., e, 4, 4) raw pixels (u_left, v_left, u_right, v_right) of points 1 to 4.
         steps: (e,) signed N.
         axis: "pan" or "tilt", one or (e,).
         stereo: the calibration to triangulate with.
         focal_scale: common factor on fx, fy of both cameras.
     """
-    pixels = np.asarray(pixels, float).reshape(-1, 4, 4)
-    points = triangulate(stereo, pixels.reshape(-1, 4), focal_scale).reshape(-1, 4, 3)
+    pixels = np.asarray(pixels, float)
+    points = triangulate(stereo, pixels.reshape(-1, 4), focal_scale).reshape(*pixels.shape[:-1], 3)
     angles = four_point_angle_deg(points, axis)
     return np.asarray(ratio_deg_per_step(angles.theta_i_deg, angles.theta_f_deg, np.asarray(steps)))
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import functools
 import hashlib
+import os
 import threading
 import time
 from collections.abc import Callable, Iterable
@@ -48,18 +49,25 @@ class Traces:
         self.folder = OwnFolder(folder)
 
     @functools.cached_property
+    def sources(self) -> list[str]:
+        """Every file of the package, sorted."""
+        found = [os.path.join(folder, name) for folder, _, names in os.walk(PACKAGE) for name in names]
+        return sorted(path for path in found if path.endswith(".py"))
+
+    @functools.cached_property
     def code(self) -> bytes:
         """Hash of the source of the whole package and of the versions of the libraries."""
         found = hashlib.sha256(" ".join(version(library) for library in LIBRARIES).encode())
-        for path in sorted(PACKAGE.rglob("*.py")):
-            content = path.read_bytes()
-            found.update(f"{path.relative_to(PACKAGE)} {len(content)}\n".encode() + content)
+        for path in self.sources:
+            with open(path, "rb") as stream:
+                content = stream.read()
+            found.update(f"{os.path.relpath(path, PACKAGE)} {len(content)}\n".encode() + content)
         return found.digest()
 
     def name(self, key: str) -> str:
         """The file of a trace; "" where the source has changed since this process read it, or cannot be read."""
         try:
-            if any(path.stat().st_mtime > LOADED_TIME_S for path in PACKAGE.rglob("*.py")):
+            if any(os.stat(path).st_mtime > LOADED_TIME_S for path in self.sources):
                 return ""
             return hashlib.sha256(self.code + key.encode()).hexdigest()
         except OSError:

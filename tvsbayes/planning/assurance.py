@@ -15,7 +15,7 @@ from tvsbayes.errors import InputError
 from tvsbayes.instrument.parameters import INDEX, RIG_NAMES
 from tvsbayes.model.parameter_space import STOP_COLUMNS
 from tvsbayes.planning.candidates import Candidates
-from tvsbayes.planning.drawn_rigs import Instruments, draw_instruments
+from tvsbayes.planning.drawn_rigs import Instruments
 from tvsbayes.planning.expectation import LOOKS_PER_EXPERIMENT, NOISE_COLUMNS, PARAMETERS, Knowledge
 from tvsbayes.planning.looks import Arranged, LookArrays, Looks, Seen, arrange, covariance_of, information_of_looks
 from tvsbayes.planning.target import Sensitivity, Target, sensitivity
@@ -125,10 +125,9 @@ class Assurance:
     PAIRS, KEPT = 4096, 16
     """Looks of all instruments that are evaluated together, and how often so many are kept: 10 MB each."""
 
-    def __init__(self, family: Family, target: Target, draws: int, seed: int):
-        self.family, self.target, self.seed = family, target, seed
-        self.instruments = draw_instruments(family.knowledge, draws, seed)
-        self.noise = np.random.default_rng([seed, 37]).standard_normal((draws, len(SCALES)))
+    def __init__(self, family: Family, target: Target, instruments: Instruments, seed: int):
+        self.family, self.target, self.instruments, self.seed = family, target, instruments, seed
+        self.noise = np.random.default_rng([seed, 37]).standard_normal((len(instruments), len(SCALES)))
         self.distinct, self.index = np.unique(family.picks, return_inverse=True)
         self.looks = family.found.looks[self.distinct]
         self.arrays = LookArrays(self.looks, family.knowledge, family.aperture)
@@ -137,7 +136,7 @@ class Assurance:
 
     def of(self, family: Family) -> Assurance:
         """The same instruments before other designs."""
-        return Assurance(family, self.target, len(self.instruments), self.seed)
+        return Assurance(family, self.target, self.instruments, self.seed)
 
     def values(self, sizes: Sequence[int]) -> dict[int, np.ndarray]:
         """Reported uncertainty of the target at each truth, shape (draws,), by number of experiments."""

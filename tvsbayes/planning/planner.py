@@ -22,6 +22,7 @@ from tvsbayes.instrument.rig import Rig
 from tvsbayes.instrument.stops import FEW_STOPS, inseparable, too_few
 from tvsbayes.planning.assurance import Assurance, Family
 from tvsbayes.planning.candidates import Candidates, candidates
+from tvsbayes.planning.drawn_rigs import draw_instruments
 from tvsbayes.planning.expectation import (
     Expectation,
     Knowledge,
@@ -335,7 +336,7 @@ def plan_from(
     asked = _question(knowledge, target, pose_rad, scope.aperture)
     family = design_family(knowledge, asked.found, asked.seen, target, asked.at_centre, scope)
     durations = _durations(family, scope)
-    assurance = Assurance(family, target, draws, seed)
+    assurance = Assurance(family, target, draw_instruments(knowledge, draws, seed), seed)
     forecast = classic_forecast(knowledge, assurance.instruments)
     size = _size(assurance, forecast, durations)
     refined = refine(family, asked.seen, target, asked.at_centre, size.experiments, scope, assurance)
