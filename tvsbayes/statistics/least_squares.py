@@ -211,8 +211,9 @@ def newton_mode(objective: Objective, start: np.ndarray, free: np.ndarray, curva
     rows = np.flatnonzero(free)
     ways = np.zeros((start.size, len(rows)))
     ways[rows] = np.linalg.inv(np.linalg.cholesky(curvature[np.ix_(rows, rows)])).T
+    here = _Surroundings(objective, start, ways)
     # The guess brings most of the way; every Hessian costs as much as two dozen slopes.
-    here, _ = _descended(_Surroundings(objective, start, ways), np.eye(len(rows)), GUESSED_STEPS, (0.2 * HESSIAN_KEPT) ** 2)
+    here, _ = _descended(here, np.eye(len(rows)), GUESSED_STEPS, (0.2 * HESSIAN_KEPT) ** 2)
     problems: list[str] = []
     for _ in range(6):
         begin = here.z
