@@ -18,15 +18,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree
+from scipy import optimize
 
-DIFFERENCE_STEP = 5e-3
-"""Of central differences, in posterior standard deviations. Third and fourth derivatives are of order one there: slopes
-are off by 4e-6, curvatures by 1e-5; rounding of a density of 1e4 (1e-12) makes 1e-10 and 1e-7."""
+DIFFERENCE_STEP = 2e-3
+"""Of central differences, in posterior standard deviations. Along a bent ridge third derivatives reach ten and fourth
+three hundred: slopes are off by 1e-5, curvatures by 1e-4; rounding of a density of 1e4 (1e-11) makes 1e-8 and 1e-5."""
 NEWTON_SETTLED = 1e-8
 """Squared Newton step, in posterior sds, at which the mode is reached."""
-HESSIAN_KEPT = 0.1
-"""The Hessian is taken anew if the mode moved farther than this many sds since it was computed."""
-GUESSED_STEPS = 12
+HESSIAN_KEPT = 2e-3
+"""The Hessian is taken anew if the mode moved farther than this many sds since it was computed: along a bent ridge it
+changes by 1 % then."""
+QUASI_STEPS = 40
 LAPLACE_DRAWS = 2048
 Objective = Callable[[np.ndarray], np.ndarray]
 """Negative log density of points (n, p), shape (n,); not finite where there is none."""
@@ -170,15 +172,28 @@ class _Surroundings:
         return found
 
 
-def _descended(
-    here: _Surroundings, inverse: np.ndarray, steps: int, settled: float = NEWTON_SETTLED
-) -> tuple[_Surroundings, bool]:
+def _nearly_there(begin: _Surroundings) -> _Surroundings:
+    """Where quasi-Newton steps (BFGS) end: they cost slopes, of which a Hessian costs two dozen."""
+    count = begin.ways.shape[1]
+    around = DIFFERENCE_STEP * np.concatenate([np.zeros((1, count)), np.eye(count), -np.eye(count)])
+
+    def value_and_slope(step: np.ndarray) -> tuple[float, np.ndarray]:
+        centre, ahead, behind = np.split(begin.at(step + around), [1, 1 + count])
+        return float(centre[0]), (ahead - behind) / (2 * DIFFERENCE_STEP)
+
+    before = value_and_slope(np.zeros(count))[0]
+    options = {"gtol": HESSIAN_KEPT, "norm": 2, "maxiter": QUASI_STEPS}
+    found = optimize.minimize(value_and_slope, np.zeros(count), jac=True, method="BFGS", options=options)
+    return replace(begin, z=begin.z + begin.ways @ found.x) if found.fun < before else begin
+
+
+def _descended(here: _Surroundings, inverse: np.ndarray) -> tuple[_Surroundings, bool]:
     """Newton steps with one inverse curvature; whether the last would have been too short to matter."""
     value = here.at(np.zeros((1, len(inverse))))[0]
     shortened = 0.5 ** np.arange(12)[:, None]
-    for _ in range(steps):
+    for _ in range(12):
         step = -inverse @ here.slope()
-        if step @ step < settled:
+        if step @ step < NEWTON_SETTLED:
             return here, True
         trials = here.at(shortened * step)
         lower = np.isfinite(trials) & (trials < value + 1e-9 * abs(value))
@@ -211,9 +226,7 @@ def newton_mode(objective: Objective, start: np.ndarray, free: np.ndarray, curva
     rows = np.flatnonzero(free)
     ways = np.zeros((start.size, len(rows)))
     ways[rows] = np.linalg.inv(np.linalg.cholesky(curvature[np.ix_(rows, rows)])).T
-    here = _Surroundings(objective, start, ways)
-    # The guess brings most of the way; every Hessian costs as much as two dozen slopes.
-    here, _ = _descended(here, np.eye(len(rows)), GUESSED_STEPS, (0.2 * HESSIAN_KEPT) ** 2)
+    here = _nearly_there(_Surroundings(objective, start, ways))
     problems: list[str] = []
     for _ in range(6):
         begin = here.z
@@ -222,7 +235,7 @@ def newton_mode(objective: Objective, start: np.ndarray, free: np.ndarray, curva
             raise np.linalg.LinAlgError("the density is not finite about the mode")
         eigenvalues, vectors = np.linalg.eigh(hessian)
         # Far from the mode the density may be flat or convex along a direction: step by the expected scale.
-        here, settled = _descended(here, (vectors / np.maximum(np.abs(eigenvalues), 0.1)) @ vectors.T, 12)
+        here, settled = _descended(here, (vectors / np.maximum(np.abs(eigenvalues), 0.1)) @ vectors.T)
         if settled and np.linalg.norm(np.linalg.solve(here.ways[rows], (here.z - begin)[rows])) < HESSIAN_KEPT:
             break
         here = replace(here, ways=here.ways @ (vectors / np.sqrt(np.maximum(np.abs(eigenvalues), 0.1))) @ vectors.T)
