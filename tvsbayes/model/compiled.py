@@ -73,6 +73,14 @@ class Traces:
         except OSError:
             return ""
 
+    @property
+    def empty(self) -> bool:
+        """Whether nothing is kept there."""
+        try:
+            return next(self.folder.path.iterdir(), None) is None
+        except OSError:
+            return True
+
     def load(self, name: str) -> export.Exported | None:
         """A stored trace."""
         content = self.folder.read(name)
@@ -128,6 +136,11 @@ class Compiled[**P, Result]:
         self._ready: dict[Any, Callable] = {}
         self._lock = threading.Lock()
         functools.update_wrapper(self, plain)
+
+    @property
+    def fresh(self) -> bool:
+        """Whether this process has yet to make it ready."""
+        return not self._ready
 
     def __call__(self, *args: Any, **kwargs: Any) -> Result:
         """Run it on arrays of JAX or NumPy or numbers; `TypeError` for anything else."""

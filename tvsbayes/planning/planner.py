@@ -43,6 +43,7 @@ from tvsbayes.planning.looks import LookArrays, Looks, Seen, covariance_of, info
 from tvsbayes.planning.plan_check import judge
 from tvsbayes.planning.search import LADDER, Scope, design_family, refine, smallest_design
 from tvsbayes.planning.target import Sensitivity, Target, sensitivity
+from tvsbayes.progress import Job, Show
 from tvsbayes.results.plan_record import Advice, Batch
 from tvsbayes.statistics.chances import ASSURED, share_error
 
@@ -185,6 +186,7 @@ def plan(
     draws: int = PLAN_DRAWS,
     largest: int = LADDER[-1],
     seed: int = 0,
+    progress: Show | None = None,
 ) -> PlanResult:
     """Find the cheapest plan that meets a target, and say what it will give, or why none can (formulation 6).
 
@@ -198,6 +200,7 @@ def plan(
         draws: instruments over which the assurance is taken.
         largest: experiments (of four looks) beyond which no plan is sought.
         seed: of the draws.
+        progress: told how far it is.
 
     Returns:
         The plan, its curve and the advice.
@@ -211,7 +214,7 @@ def plan(
     knowledge = prior_knowledge(rig) if given is None else knowledge_of(given, rig)
     campaign, pose = (None, None) if given is None else (given.campaign, given.reference_pose_rad)
     scope = Scope(criterion, aperture, largest, minutes)
-    return plan_from(knowledge, target, campaign, pose, scope=scope, draws=draws, seed=seed)
+    return plan_from(knowledge, target, campaign, pose, scope=scope, draws=draws, seed=seed, progress=progress)
 
 
 def _curve(
@@ -331,6 +334,7 @@ def plan_from(
     scope: Scope,
     draws: int,
     seed: int,
+    progress: Show | None = None,
 ) -> PlanResult:
     """`plan` from what is known; effective ratios hold at `pose_rad`, by default in the middle of the candidates."""
     asked = _question(knowledge, target, pose_rad, scope.aperture)
