@@ -305,9 +305,7 @@ def _converged_fit(campaign: Campaign, tell: Tell, progress: Show | None) -> Joi
     return result
 
 
-def record_for(
-    campaign: Campaign, folder: Path, tell: Tell = untold, progress: Show | None = None
-) -> FitRecord:
+def record_for(campaign: Campaign, folder: Path, tell: Tell = untold, progress: Show | None = None) -> FitRecord:
     """`results/fit.json` where it was made from exactly this campaign and whole; else fit first."""
     from tvsbayes.calibration.calibration_file import stored_calibration
     from tvsbayes.instrument.campaign import input_hashes

@@ -87,9 +87,10 @@ def stereo(
 
         compile_for(report_line)
         kind: Finder = "sector" if finder == "sector" else "classic"
-        options = {"swap": swap, "fix_k3": fix_k3, "robust": robust}
         with waiting() as progress:
-            result = calibrate_folder(folder, pattern, finder=kind, **options, progress=progress)
+            result = calibrate_folder(
+                folder, pattern, finder=kind, swap=swap, fix_k3=fix_k3, robust=robust, progress=progress
+            )
         document = {"source": "pictures", **result.as_json()}
         made = MadePair(result.stereo, stereo_calibration_text(result), document)
     _write_pair(made, places, form, as_json)

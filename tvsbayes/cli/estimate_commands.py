@@ -222,7 +222,8 @@ def compare(
     data = [read_campaign(folder) for folder in folders]
     results = output_place(campaign, "results")
     fitting = [f"{FITTING} of {escaped(str(folder), 60)}" for folder in folders]
-    with waiting() as progress, Job(dict.fromkeys(fitting, 1.0) | {HOLDING_OUT: 0.0 if other else 6.0}, progress) as job:
+    stages = dict.fromkeys(fitting, 1.0) | {HOLDING_OUT: 0.0 if other else 6.0}
+    with waiting() as progress, Job(stages, progress) as job:
         fits = [fit_for(each, report_line, job.part(stage)) for each, stage in zip(data, fitting, strict=True)]
         record = None if other else _classic_against_joint(fits[0], by or "steps", seed or 0, job.part(HOLDING_OUT))
     if record is None:

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import json
 import math
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -26,14 +25,17 @@ from tvsbayes.cli.app import (
     refuse_options,
     report_line,
 )
+from tvsbayes.cli.progress_bar import waiting
 from tvsbayes.errors import InputError, escaped
 from tvsbayes.files.csv_table import CSV_BYTES_MAX, parse_table
 from tvsbayes.files.disk import output_place, read_bytes
-from tvsbayes.pipeline import calibration_for, compile_for, fit_for
+from tvsbayes.pipeline import FITTING, calibration_for, compile_for, fit_for
+from tvsbayes.progress import Job
 
 POINT_COLUMNS = ("pan_steps", "tilt_steps", "pan_approach", "tilt_approach", "aperture_deg")
 STEPS_MAX, ANGLE_MAX_DEG = 1e8, 360.0
 WORKERS = 2
+PLANNING = "plan"
 
 
 @dataclass(frozen=True)
@@ -286,8 +288,9 @@ def study(
     report_line(f"{n} campaigns, {missing} to go on engine {escaped(engine)}; rows in {escaped(str(kept.path), 200)}")
 
     with waiting() as progress:
-        options = {"engine": engine, "workers": workers or WORKERS, "address": scheduler}
-        result = run_study(job, n, kept, **options, progress=progress)
+        result = run_study(
+            job, n, kept, engine=engine, workers=workers or WORKERS, address=scheduler, progress=progress
+        )
     document = {**result.as_json(), "rows": str(kept.path), "engine": engine, "seed": seed}
     finish(document, study_text(result), as_json)
     if target is not None and result.assurance < ASSURED[0]:

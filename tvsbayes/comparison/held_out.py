@@ -53,9 +53,7 @@ def folds_of(campaign: Campaign, selection: Selection, by: str) -> dict[str, np.
     return folds
 
 
-def hold_out(
-    fit_of_all: JointFit, by: str = "steps", seed: int = 0, *, progress: Show | None = None
-) -> HoldOut:
+def hold_out(fit_of_all: JointFit, by: str = "steps", seed: int = 0, *, progress: Show | None = None) -> HoldOut:
     """Leave experiments out, fold by fold, refit, and ask both estimators for their four-point angles.
 
     The classic foretells N times its mean of the direction; its uncertainty is the scatter of angles about N times

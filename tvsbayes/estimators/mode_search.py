@@ -25,7 +25,7 @@ from tvsbayes.estimators.linear_spots import (
 from tvsbayes.instrument.campaign import Campaign, ordered_spots
 from tvsbayes.instrument.parameters import NAMES, NOISE_NAMES
 from tvsbayes.instrument.rig import RigTable
-from tvsbayes.model.compiled import Traces, in_batches, placed
+from tvsbayes.model.compiled import in_batches, placed
 from tvsbayes.model.parameter_space import free_mask, parameter_space
 from tvsbayes.progress import Job
 from tvsbayes.statistics.chances import chi2_quantile
@@ -46,15 +46,13 @@ ROUNDS_MAX, WEIGHTS_SETTLED = 20, 0.02
 ALTERNATIONS_MAX, ROUNDS_FORESEEN = 6, 6
 """Of geometry and noise in turn at most, and rounds of the robust option as progress foretells them."""
 COMPILING, SEARCHING = "compiling the model", "searching the mode"
-COMPILED_SECONDS, LOADED_SECONDS, SEARCHED_SECONDS = 40.0, 3.0, 1.0
-"""For the first call in a process, without and with traces of an earlier one, and for the search: what progress
-foretells with."""
+COMPILED_SECONDS, SEARCHED_SECONDS = 40.0, 1.0
+"""What progress foretells with."""
 
 
 def search_stages(robust: bool) -> dict[str, float]:
     """Stages of a search, with seconds."""
-    wait = COMPILED_SECONDS if Traces.used is None or Traces.used.empty else LOADED_SECONDS
-    return {COMPILING: wait if stage.fresh else 0.0, SEARCHING: SEARCHED_SECONDS * (2 if robust else 1)}
+    return {COMPILING: stage.wait(COMPILED_SECONDS), SEARCHING: SEARCHED_SECONDS * (2 if robust else 1)}
 
 
 class Problem:
