@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
-from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -17,6 +16,7 @@ from tvsbayes.errors import NotConverged, NothingToEstimate, TvsError, escaped
 from tvsbayes.files.disk import make_folder, output_place
 from tvsbayes.instrument.axes import AXES
 from tvsbayes.instrument.model_choice import AS_STATED, ModelChoice
+from tvsbayes.progress import Job, Show
 
 if TYPE_CHECKING:
     import numpy as np
@@ -24,7 +24,6 @@ if TYPE_CHECKING:
     from tvsbayes.calibration.pointing import Calibration
     from tvsbayes.estimators.joint_fit import JointFit
     from tvsbayes.instrument.campaign import Campaign
-    from tvsbayes.posterior.chain import Progress
     from tvsbayes.posterior.draws import Posterior
     from tvsbayes.results.estimates import FitSummary
     from tvsbayes.results.fit_record import FitEvidence, FitRecord
@@ -33,8 +32,9 @@ if TYPE_CHECKING:
 
 Tell = Callable[[str], None]
 """Shows a line to whoever waits."""
-Watch = Callable[[], AbstractContextManager["Callable[[Progress], None]"]]
-"""Opens what shows the progress of a sampler."""
+FITTING, SAMPLING, FILING, SUMMARISING = "fit", "posterior", "writing posterior.nc", "summarising"
+FILED_SECONDS, SUMMARISED_SECONDS = 3.0, 1.5
+"""For posterior.nc and for the results: what progress foretells with."""
 RESIDUALS_LISTED = 4096
 """Stops in `fit.json`, evenly chosen: a long campaign's file stays readable within its cap."""
 FITTING_FIRST = (
@@ -45,10 +45,6 @@ FITTING_FIRST = (
 
 def untold(line: str) -> None:
     """For whoever does not want to be told."""
-
-
-def _unwatched() -> AbstractContextManager[Callable[[Progress], None]]:
-    return nullcontext(lambda state: None)
 
 
 def compile_for(tell: Tell) -> None:
@@ -120,7 +116,7 @@ def calibrate(
     resume: bool = False,
     seed: int = 0,
     tell: Tell = untold,
-    watch: Watch = _unwatched,
+    progress: Show | None = None,
     first: Callable[[FitSummary], None] | None = None,
 ) -> CampaignResults:
     """Fit a campaign, sample its posterior, and make complete results of both, as the command `fit` does.
@@ -137,7 +133,7 @@ def calibrate(
         resume: go on with the chain in the folder.
         seed: of everything random.
         tell: shows what takes long.
-        watch: opens what shows the sampler's progress.
+        progress: told how far it is.
         first: shows what importance sampling says before a chain starts.
 
     Raises:
@@ -147,37 +143,49 @@ def calibrate(
     """
     from tvsbayes.assessment.summary import summarise
     from tvsbayes.estimators.joint_fit import fit as fit_joint
+    from tvsbayes.estimators.joint_fit import fit_stages
 
     place = None if folder is None else Path(folder)
-    found = fit_joint(campaign, model=model, seed=seed)
-    posterior, files = None, {}
-    # A sample of what must not be used anyway would only take time.
-    if sampled and unusable(summarise(found)) is None:
-        from tvsbayes.posterior.sampling import sample
+    fitting = {FITTING: sum(fit_stages(model.robust).values())}
+    with Job(fitting | _later_stages(sampled, tier, place), progress) as job:
+        found = fit_joint(campaign, model=model, seed=seed, progress=job.part(FITTING))
+        posterior, files = None, {}
+        # A sample of what must not be used anyway would only take time.
+        if sampled and unusable(summarise(found)) is None:
+            from tvsbayes.posterior.sampling import sample
 
-        if place is not None:
-            make_folder(place)
-        if tier == "importance":
-            posterior = sample(found, tier, seed=seed)
-        else:
-            show = None if first is None else lambda early: first(summarise(found, early))
-            checkpoint = None if place is None else place / "chain.npz"
-            with watch() as progress:
+            if place is not None:
+                make_folder(place)
+            shown = job.part(SAMPLING)
+            if tier == "importance":
+                posterior = sample(found, tier, seed=seed, progress=shown)
+            else:
                 posterior = sample(
                     found,
                     tier,
                     max_minutes=max_minutes,
                     seed=seed,
-                    checkpoint=checkpoint,
+                    checkpoint=None if place is None else place / "chain.npz",
                     resume=resume,
-                    progress=progress,
-                    first=show,
+                    progress=shown,
+                    first=None if first is None else lambda early: first(summarise(found, early)),
                 )
-            files = _posterior_files(posterior, place, tell)
-    if place is not None and "posterior" not in files and (stale := place / "posterior.nc").exists():
-        stale.unlink()
-        tell("posterior.nc of an earlier fit is removed: it would not be that of fit.json")
-    return _results(found, posterior, seed, place, files)
+                job.begin(FILING)
+                files = _posterior_files(posterior, place, tell)
+        if place is not None and "posterior" not in files and (stale := place / "posterior.nc").exists():
+            stale.unlink()
+            tell("posterior.nc of an earlier fit is removed: it would not be that of fit.json")
+        job.begin(SUMMARISING)
+        return _results(found, posterior, seed, place, files)
+
+
+def _later_stages(sampled: bool, tier: str, folder: Path | None) -> dict[str, float]:
+    """What `calibrate` does after its fit, with seconds; what is not done has none."""
+    from tvsbayes.posterior.sampling import sampling_stages
+
+    sampling = sum(sampling_stages(tier).values()) if sampled else 0.0
+    filing = FILED_SECONDS if sampled and tier == "emcee" and folder is not None else 0.0
+    return {SAMPLING: sampling, FILING: filing, SUMMARISING: SUMMARISED_SECONDS}
 
 
 def _posterior_files(posterior: Posterior, folder: Path | None, tell: Tell) -> dict[str, str]:
@@ -259,7 +267,7 @@ def evidence_of(
     return FitEvidence(listed, causes, gaps if any(gaps.values()) else None, budgets, tuple(axes))
 
 
-def calibration_for(folder: Path, tell: Tell = untold) -> Calibration:
+def calibration_for(folder: Path, tell: Tell = untold, progress: Show | None = None) -> Calibration:
     """The calibration in `results/` where its hashes agree with the campaign; else fit first."""
     from tvsbayes.calibration.calibration_file import stored_calibration
     from tvsbayes.instrument.campaign import read_campaign
@@ -268,13 +276,13 @@ def calibration_for(folder: Path, tell: Tell = untold) -> Calibration:
     found = stored_calibration(campaign)
     if found is not None:
         return found
-    result = _converged_fit(campaign, tell)
+    result = _converged_fit(campaign, tell, progress)
     from tvsbayes.assessment.fitted_calibration import calibration_of
 
     return calibration_of(result)
 
 
-def fit_for(campaign: Campaign, tell: Tell = untold) -> JointFit:
+def fit_for(campaign: Campaign, tell: Tell = untold, progress: Show | None = None) -> JointFit:
     """The fit in `results/` where its hashes agree with the campaign; else fit first."""
     from tvsbayes.estimators.joint_fit import restored
     from tvsbayes.results.stored_draws import stored_mode
@@ -282,22 +290,22 @@ def fit_for(campaign: Campaign, tell: Tell = untold) -> JointFit:
     compile_for(tell)
     stored = stored_mode(campaign)
     found = None if stored is None else restored(campaign, stored)
-    return _converged_fit(campaign, tell) if found is None else found
+    return _converged_fit(campaign, tell, progress) if found is None else found
 
 
-def _converged_fit(campaign: Campaign, tell: Tell) -> JointFit:
+def _converged_fit(campaign: Campaign, tell: Tell, progress: Show | None) -> JointFit:
     """A fit for a command that needs one in passing."""
     tell(FITTING_FIRST)
     from tvsbayes.estimators.joint_fit import fit as fit_joint
 
     compile_for(tell)
-    result = fit_joint(campaign)
+    result = fit_joint(campaign, progress=progress)
     if not result.converged:
         raise NotConverged.of(result.problems, "see `tvsbayes fit`; this command needs a fit that has converged")
     return result
 
 
-def record_for(campaign: Campaign, folder: Path, tell: Tell = untold) -> FitRecord:
+def record_for(campaign: Campaign, folder: Path, tell: Tell = untold, progress: Show | None = None) -> FitRecord:
     """`results/fit.json` where it was made from exactly this campaign and whole; else fit first."""
     from tvsbayes.calibration.calibration_file import stored_calibration
     from tvsbayes.instrument.campaign import input_hashes
@@ -309,4 +317,5 @@ def record_for(campaign: Campaign, folder: Path, tell: Tell = untold) -> FitReco
         # An old fit.json beside new draws would be the report of other data.
         if record.evidence is not None and record.provenance.inputs == input_hashes(campaign):
             return record
-    return _results(_converged_fit(campaign, tell), None, 0, output_place(folder, "results"), {}).record
+    found = _converged_fit(campaign, tell, progress)
+    return _results(found, None, 0, output_place(folder, "results"), {}).record

@@ -18,6 +18,7 @@ from experiments.common.command_line import print_only
 from experiments.common.rigs import mounted_rig, small_plan
 from tvsbayes.model.compilation_cache import use_compilation_cache
 from tvsbayes.planning.target import DEFAULT_TARGET, parse_target
+from tvsbayes.progress import Progress
 from tvsbayes.studies.executors import SINGLE_THREADED
 from tvsbayes.studies.rows import StudyRow, StudyRows
 from tvsbayes.studies.study import study
@@ -46,11 +47,12 @@ def main() -> None:
             workers = client.run(os.getpid)
             print("worker processes:", sorted(workers.values()), flush=True)
 
-            def progress(done: int, wanted: int) -> None:
+            def progress(state: Progress) -> None:
+                done = len(rows.of(job.key))
                 if done == KILL_AFTER:
                     victim = min(client.run(os.getpid).values())
                     os.kill(victim, signal.SIGKILL)
-                    print(f"killed worker {victim} after {done} of {wanted} rows", flush=True)
+                    print(f"killed worker {victim} after {done} of {CAMPAIGNS} rows", flush=True)
 
             rows = StudyRows(on_cluster)
             study(job, CAMPAIGNS, rows, engine="dask", address=cluster.scheduler_address, progress=progress)

@@ -24,7 +24,14 @@ from tvsbayes.instrument.parameters import (
     Prior,
 )
 from tvsbayes.instrument.rig import RigTable
-from tvsbayes.model.parameter_space import coordinates_of, free_mask, half_normal_sd, model_of, parameter_space
+from tvsbayes.model.parameter_space import (
+    coordinates_of,
+    free_mask,
+    half_normal_sd,
+    model_of,
+    parameter_space,
+    physical_at,
+)
 
 pytestmark = pytest.mark.usefixtures("x64")
 
@@ -269,3 +276,16 @@ def test_the_spread_of_a_half_normal_is_that_of_its_draws():
         values = stats.halfnorm.isf(stats.norm.sf(mean + sd * draws))
         assert half_normal_sd(mean, sd) == pytest.approx(values.std(), rel=0.012)
     assert half_normal_sd(6.0, 0.01) == pytest.approx(0.01, rel=0.02)
+
+
+def test_one_point_in_numpy_is_that_of_jax():
+    """Values and slopes of every kind of prior, in the bulk, in the tails and beyond what a half-normal can tell."""
+    space = parameter_space(table(), small_stereo())
+    rng = np.random.default_rng(6)
+    for scale in (1.0, 4.0, 60.0):
+        z = scale * rng.standard_normal(len(NAMES))
+        found = physical_at(z, space)
+        # The tails of both inverses of Phi agree to some hundred roundings.
+        np.testing.assert_allclose(found.value, space.physical(jnp.asarray(z)), rtol=1e-12, atol=1e-300)
+        slope = jax.jit(jax.jacfwd(space.physical))(jnp.asarray(z))
+        np.testing.assert_allclose(found.slope, slope, rtol=1e-11, atol=1e-300)

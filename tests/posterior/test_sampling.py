@@ -13,7 +13,7 @@ from tvsbayes.errors import InputError, NotConverged
 from tvsbayes.posterior.chain import stored_chain
 from tvsbayes.posterior.diagnosis import diagnose
 from tvsbayes.posterior.proposal import Target
-from tvsbayes.posterior.sampling import sample
+from tvsbayes.posterior.sampling import WALKING, sample
 
 LONG, SHORT, BLOCK = 96, 12, 6
 SEED = 3
@@ -81,8 +81,12 @@ def test_a_seed_gives_one_chain_also_when_interrupted(fitted, long, tmp_path, mo
     unbroken = sample(fitted, seed=SEED, checkpoint=tmp_path / "unbroken.npz")
     assert unbroken.convergence.steps == SHORT
 
-    def interrupt(progress):
-        if progress.steps == BLOCK:
+    told = []
+
+    def interrupt(state):
+        told.append(state.doing)
+        # Told of once when the chain begins, then after every block.
+        if told.count(WALKING) == 2:
             raise KeyboardInterrupt
 
     broken = tmp_path / "broken.npz"

@@ -423,7 +423,7 @@ def test_a_report_is_not_made_from_the_fit_of_other_data(good, tmp_path, monkeyp
     assert record_for(data, folder, report_line).provenance.inputs == input_hashes(data)
     CRAFTED["fit.json of other data"].edit(folder)
 
-    def fitted(campaign, tell):
+    def fitted(campaign, tell, progress):
         raise NotConverged("not-converged", "fitted anew", remedy="-")
 
     monkeypatch.setattr("tvsbayes.pipeline._converged_fit", fitted)

@@ -33,7 +33,7 @@ MODEL = {"model", "estimators", "posterior", "assessment", "coordinates", "compa
 BESIDE_THE_TWIN = {"calibration", "metrology", "results", *MODEL}
 """What the digital twin shares no formula with."""
 JAX_FREE_PACKAGES = (
-    *("errors", "files", "instrument", "calibration", "metrology", "results", "twin"),
+    *("errors", "progress", "files", "instrument", "calibration", "metrology", "results", "twin"),
     *("positioner", "acquisition", "report"),
 )
 JAX_FREE_MODULES = (

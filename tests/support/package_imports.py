@@ -9,7 +9,7 @@ from pathlib import Path
 
 PACKAGE = Path(__file__).resolve().parents[2] / "tvsbayes"
 ORDER = (
-    *("errors", "files", "statistics", "instrument"),
+    *("errors", "progress", "files", "statistics", "instrument"),
     *("calibration", "results", "metrology", "twin", "model"),
     *("estimators", "posterior", "assessment", "coordinates", "comparison", "planning", "studies"),
     *("positioner", "cameras", "acquisition"),

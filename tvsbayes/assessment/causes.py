@@ -18,8 +18,7 @@ from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.instrument.axes import DIRECTIONS, SENSES
 from tvsbayes.instrument.parameters import INDEX, KINDS, NAMES, PRIOR_GROUPS, RIG_NAMES, unit_of
 from tvsbayes.metrology.budget_tables import BudgetTable, Source, budget_table
-from tvsbayes.model.headlines import physical_at
-from tvsbayes.model.parameter_space import HALF_NORMAL_MEAN, HALF_NORMAL_SD
+from tvsbayes.model.parameter_space import HALF_NORMAL_MEAN, HALF_NORMAL_SD, physical_at
 from tvsbayes.results.estimates import Estimate, HeadlineCauses
 
 STOP_ERRORS = "stop errors of the campaign"

@@ -24,6 +24,7 @@ from tvsbayes.errors import InputError, NothingToEstimate, escaped, refusal
 from tvsbayes.files.disk import read_bytes
 from tvsbayes.files.images import IMAGE_BYTES_MAX, image_size, read_image
 from tvsbayes.instrument.campaign import CAMERAS
+from tvsbayes.progress import Advance, unshown
 
 Finder = Literal["classic", "sector"]
 SUFFIXES = (".png", ".jpg", ".jpeg")
@@ -292,7 +293,9 @@ def _pictures(folder: Path, swap: bool) -> list[_Picture]:
     return [_Picture(path.stem, path, CAMERAS[::-1] if swap else CAMERAS) for path in images]
 
 
-def find_views(folder: Path, board: Board, *, finder: Finder = "classic", swap: bool = False) -> Views:
+def find_views(
+    folder: Path, board: Board, *, finder: Finder = "classic", swap: bool = False, advance: Advance = unshown
+) -> Views:
     """Finds the board in all pictures of a folder.
 
     `left*` and `right*` (PNG, JPEG) are paired by the rest of the name without its suffix. Where no file has such a
@@ -303,6 +306,7 @@ def find_views(folder: Path, board: Board, *, finder: Finder = "classic", swap: 
         board: what to look for.
         finder: see `find_corners`.
         swap: the left camera's image is the right half of a wide frame.
+        advance: told the share of the pictures that is done.
 
     Raises:
         InputError: no folder, an unreadable picture, or two for one camera and view.
@@ -316,7 +320,10 @@ def find_views(folder: Path, board: Board, *, finder: Finder = "classic", swap: 
     boards: dict[str, dict[str, _Detection]] = {}
     names: dict[tuple[str, str], str] = {}
     without, fallback = [], []
-    for picture, detections in zip(used, _detections(folder, used, size, board, finder), strict=True):
+    for count, (picture, detections) in enumerate(
+        zip(used, _detections(folder, used, size, board, finder), strict=True), 1
+    ):
+        advance(count / len(used))
         for side, detection in detections.items():
             name = picture.path.name + (f" ({side})" if len(picture.sides) > 1 else "")
             names[picture.view, side] = name

@@ -41,6 +41,7 @@ from tvsbayes.files.disk import make_folder, read_bytes, write_atomically
 from tvsbayes.files.images import IMAGE_BYTES_MAX, decode_image, image_size, png_bytes
 from tvsbayes.instrument.campaign import CAMERAS, Campaign, Spot, frame_name, with_pixels
 from tvsbayes.instrument.stereo_pair import Stereo
+from tvsbayes.progress import Job, Show
 
 METHODS = ("fit", "contour")
 _Patches = tuple[Patch | str, Patch | str]
@@ -57,6 +58,7 @@ REASONS = {
     "unfitted": "the fit did not settle",
     "epipolar": "left and right are not images of one point",
 }
+LEARNING, DETECTING = "learning the noise", "detecting"
 PILOTS_MAX = 24
 """Looks from which the weights of the fits are learned; uncertainties are stated from all."""
 LEARNING_ROUNDS = 3
@@ -178,7 +180,7 @@ def detect(
     speckle_contrast: float | None = None,
     workers: int | None = None,
     overlay: Path | None = None,
-    done: Callable[[int, int], None] | None = None,
+    progress: Show | None = None,
 ) -> Detection:
     """Find the spots in the frames of a campaign folder; nothing is written but overlay pictures.
 
@@ -189,7 +191,7 @@ def detect(
             looks of each camera and `contour` takes 0.4.
         workers: threads; default one per core.
         overlay: folder for one picture per look: outline of the bright area and centre.
-        done: called with the number of looks finished and their total.
+        progress: told how far it is.
 
     Raises:
         InputError: a frame that cannot be read safely, has another size, or a campaign without folder.
@@ -206,12 +208,15 @@ def detect(
             remedy="put the pictures there, or write centroids into spots.csv yourself",
         )
     workers = workers or os.cpu_count() or 1
-    looks = _looks(campaign, method, frames, present, speckle_contrast, workers, overlay)
-    pairs = []
-    for pair in _parallel(looks.centres, present, workers):
-        pairs.append(pair)
-        if done is not None:
-            done(len(pairs), len(present))
+    learning = min(PILOTS_MAX, len(present)) if method == "fit" else 0
+    with Job({LEARNING: learning, DETECTING: len(present)}, progress) as job:
+        job.begin(LEARNING)
+        looks = _looks(campaign, method, frames, present, speckle_contrast, workers, overlay)
+        job.begin(DETECTING)
+        pairs = []
+        for pair in _parallel(looks.centres, present, workers):
+            pairs.append(pair)
+            job.at(len(pairs) / len(present), f"{len(pairs)} of {len(present)} looks")
     noise = _relearned(looks.noise, pairs, speckle_contrast) if method == "fit" else looks.noise
     seen = [(left.under(noise["left"]), right.under(noise["right"])) for left, right in pairs]
     spots = _rows(campaign.spots, present, seen, campaign.stereo)

@@ -23,10 +23,14 @@ from tvsbayes.errors import escaped
 from tvsbayes.instrument.campaign import CAMERAS
 from tvsbayes.instrument.parameters import STEREO_PARAMETER_NAMES
 from tvsbayes.instrument.stereo_pair import Stereo, pair_doubts, rotation_matrix
+from tvsbayes.progress import Job, Show
 
 OUTLIER_Z, OUTLIER_SPREAD_MIN = 4.0, 0.2
 """A view is an outlier if the logarithm of its residual rms lies more than 4 robust standard deviations (1.4826 MAD,
 at least 0.2) above the median: never below 2.2 times the median rms. On clean views the logarithm scatters by 0.05."""
+FINDING, ADJUSTING = "finding corners", "adjusting all corners"
+STAGES = {FINDING: 2.0, ADJUSTING: 3.0}
+"""Of a calibration, with seconds: what progress foretells with."""
 VIEWS_ADVISED = 10
 """Zhang (2000), figure 3: the errors have fallen to a floor by about ten views."""
 TILT_ADVISED_DEG = 15.0
@@ -240,14 +244,18 @@ def calibrate_folder(
     swap: bool = False,
     fix_k3: bool = False,
     robust: bool = False,
+    progress: Show | None = None,
 ) -> StereoCalibration:
-    """`find_views`, then `calibrate_stereo`; their arguments and errors."""
+    """`find_views`, then `calibrate_stereo`; their arguments and errors. `progress` is told how far it is."""
     began = time.perf_counter()
-    found = find_views(folder, board, finder=finder, swap=swap)
-    seconds = {"corners": time.perf_counter() - began}
-    size = (found.image_width, found.image_height)
-    result = calibrate_stereo(found.views, board, size, fix_k3=fix_k3, robust=robust, found=found)
-    return replace(result, seconds=seconds | result.seconds)
+    with Job(STAGES, progress) as job:
+        job.begin(FINDING)
+        found = find_views(folder, board, finder=finder, swap=swap, advance=job.at)
+        seconds = {"corners": time.perf_counter() - began}
+        size = (found.image_width, found.image_height)
+        job.begin(ADJUSTING)
+        result = calibrate_stereo(found.views, board, size, fix_k3=fix_k3, robust=robust, found=found)
+        return replace(result, seconds=seconds | result.seconds)
 
 
 def _rms(residuals_px: np.ndarray) -> float:

@@ -1,4 +1,4 @@
-"""The command, and what all commands share: options, output as text or one JSON document, errors, progress."""
+"""The command, and what all commands share: options, output as text or one JSON document, errors."""
 
 from __future__ import annotations
 
@@ -6,8 +6,7 @@ import json
 import math
 import os
 import sys
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -140,17 +139,3 @@ def finite(**values: float | None) -> None:
             option = "--" + name.replace("_", "-")
             allowed, remedy = "a finite number", "write a decimal number"
             raise InputError("number", f"{option} is {value}", column=option, allowed=allowed, remedy=remedy)
-
-
-@contextmanager
-def counting(what: str) -> Iterator[Callable[[int, int], None]]:
-    """A bar for work of known length on a terminal, nothing elsewhere."""
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
-    from rich.progress import Progress as Bar
-
-    console = Console(stderr=True)
-    columns = TextColumn(what), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
-    with Bar(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
-        task = bar.add_task(what, total=None)
-        yield lambda count, total: bar.update(task, completed=count, total=total)

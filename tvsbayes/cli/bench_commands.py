@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from tvsbayes.cli.app import INTERRUPTED, TARGET_MISSED, Ended, Json, finish, finite, refuse_options, report_line
+from tvsbayes.cli.progress_bar import waiting
 from tvsbayes.errors import InputError, escaped, refusal
 from tvsbayes.files.disk import write_atomically
 from tvsbayes.pipeline import compile_for
@@ -86,7 +87,10 @@ def stereo(
 
         compile_for(report_line)
         kind: Finder = "sector" if finder == "sector" else "classic"
-        result = calibrate_folder(folder, pattern, finder=kind, swap=swap, fix_k3=fix_k3, robust=robust)
+        with waiting() as progress:
+            result = calibrate_folder(
+                folder, pattern, finder=kind, swap=swap, fix_k3=fix_k3, robust=robust, progress=progress
+            )
         document = {"source": "pictures", **result.as_json()}
         made = MadePair(result.stereo, stereo_calibration_text(result), document)
     _write_pair(made, places, form, as_json)

@@ -10,7 +10,8 @@ from typing import Annotated, Any
 
 import typer
 
-from tvsbayes.cli.app import CampaignFolder, Json, Seed, counting, finish, finite, report_line
+from tvsbayes.cli.app import CampaignFolder, Json, Seed, finish, finite, report_line
+from tvsbayes.cli.progress_bar import waiting
 from tvsbayes.errors import InputError, escaped
 from tvsbayes.files.disk import make_folder, output_place, shipped_data, write_atomically
 from tvsbayes.pipeline import calibrate, compile_for, unusable
@@ -45,8 +46,11 @@ def demo(
         true = read_truth(folder / "truth.json", campaign.stereo).parameters
         classic_result = estimate_classic(campaign)
         # Evidence for reports takes as long again: only where it is kept.
-        kept = None if out is None else calibrate(campaign, out / "results", sampled=False)
-        summary = summarise(fit_joint(campaign)) if kept is None else kept.record.summary
+        with waiting() as progress:
+            if out is None:
+                summary = summarise(fit_joint(campaign, progress=progress))
+            else:
+                summary = calibrate(campaign, out / "results", sampled=False, progress=progress).record.summary
     pose = (summary.reference_pose_deg["pan"], summary.reference_pose_deg["tilt"])
     truth = {
         **effective_deg_per_step(true, pose),
@@ -94,8 +98,8 @@ def simulate(
 
         result = result.undetected()
         result.write(out)
-        with counting("rendering") as show:
-            pictures = write_frames(out, result, seed, done=show)
+        with waiting() as progress:
+            pictures = write_frames(out, result, seed, progress=progress)
         document |= {"ok": 0, "in_view": seen, "pictures": pictures}
         text += f"\n{pictures} pictures in frames/ and boards/; spots.csv waits for `tvsbayes detect`"
     else:
@@ -121,8 +125,8 @@ def detect(
 
     pictures = output_place(campaign, "results", "overlay") if overlay else None
     data = read_campaign(campaign)
-    with counting("detecting") as show:
-        found = find(data, method, speckle_contrast=speckle_contrast, overlay=pictures, done=show)
+    with waiting() as progress:
+        found = find(data, method, speckle_contrast=speckle_contrast, overlay=pictures, progress=progress)
     write_atomically(campaign / "spots.csv", spots_bytes(found.campaign.spots))
     document = {"campaign": str(campaign), **found.as_json()}
     text = detection_text(found) + f"\nwritten: {escaped(str(campaign / 'spots.csv'), 200)}"

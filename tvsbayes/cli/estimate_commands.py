@@ -6,7 +6,7 @@ Options in, library called, table or JSON out; heavy imports stand inside the co
 from __future__ import annotations
 
 import datetime
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
@@ -15,14 +15,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from tvsbayes.cli.app import TARGET_MISSED, CampaignFolder, Ended, Json, Seed, finish, keep, refuse_options, report_line
+from tvsbayes.cli.progress_bar import waiting
 from tvsbayes.errors import InputError, NothingToEstimate, escaped
 from tvsbayes.files.disk import output_place, write_atomically
-from tvsbayes.pipeline import calibrate, compile_for, fit_for, record_for
+from tvsbayes.pipeline import FITTING, SAMPLING, calibrate, compile_for, fit_for, record_for
+from tvsbayes.progress import Job, Progress, Show
 
 if TYPE_CHECKING:
     from tvsbayes.estimators.joint_fit import JointFit
     from tvsbayes.instrument.campaign import Campaign
-    from tvsbayes.posterior.chain import Progress
     from tvsbayes.results.comparison_record import ComparisonRecord
     from tvsbayes.results.estimates import FitSummary
     from tvsbayes.results.fit_record import FitRecord
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
 DCC_MESSAGES = 20
 """Of a schema validator, shown at most."""
 MAX_MINUTES = 10.0
+HOLDING_OUT, PRINTING = "hold-out", "printing to PDF"
 
 
 def _warn_of(campaign: Campaign) -> None:
@@ -88,19 +90,20 @@ def fit(
     from tvsbayes.report.fit_text import fit_text
 
     compile_for(report_line)
-    results = calibrate(
-        data,
-        out or output_place(campaign, "results"),
-        model=ModelChoice(robust=robust, per_axis=per_axis, harmonics=harmonics, no_backlash=no_backlash),
-        sampled=not no_sample,
-        tier="importance" if quick else "emcee",
-        max_minutes=MAX_MINUTES if max_minutes is None else max_minutes,
-        resume=resume,
-        seed=seed,
-        tell=report_line,
-        watch=_sampling_progress,
-        first=_show_first,
-    )
+    with _chain_kept() as progress:
+        results = calibrate(
+            data,
+            out or output_place(campaign, "results"),
+            model=ModelChoice(robust=robust, per_axis=per_axis, harmonics=harmonics, no_backlash=no_backlash),
+            sampled=not no_sample,
+            tier="importance" if quick else "emcee",
+            max_minutes=MAX_MINUTES if max_minutes is None else max_minutes,
+            resume=resume,
+            seed=seed,
+            tell=report_line,
+            progress=progress,
+            first=_show_first,
+        )
     summary, files = results.record.summary, results.files
     document = {**summary.as_json(), "seed": seed, "files": files}
     finish(document, f"{fit_text(summary)}\nwritten: {', '.join(files.values())}", as_json, results.error)
@@ -150,17 +153,22 @@ def report(
 
     if pdf:
         find_browser()
-    record = record_for(data, campaign, report_line)
     from tvsbayes.metrology.schema_check import check_dcc
     from tvsbayes.report.evidence import MET, gather
 
     limits = {"limit_deg_per_step": limit_deg_per_step, "limit_mm": limit_mm}
-    evidence = gather(data, record, load_calibration(campaign), range_mm=range_mm, **limits)
     path = out or results / "report.html"
-    write_atomically(path, report_html(evidence))
     files = {"report": str(path)}
-    if pdf:
-        files["pdf"] = str(print_to_pdf(path))
+    stages = {FITTING: 3.0, "gathering evidence": 1.5, "drawing the page": 1.5, PRINTING: 3.0 if pdf else 0.0}
+    with waiting() as progress, Job(stages, progress) as job:
+        record = record_for(data, campaign, report_line, job.part(FITTING))
+        job.begin("gathering evidence")
+        evidence = gather(data, record, load_calibration(campaign), range_mm=range_mm, **limits)
+        job.begin("drawing the page")
+        write_atomically(path, report_html(evidence))
+        if pdf:
+            job.begin(PRINTING)
+            files["pdf"] = str(print_to_pdf(path))
     result: dict[str, Any] = {"criteria": [asdict(c) for c in evidence.criteria], "files": files}
     lines = [
         f"{c.quantity} within {c.limit:g} {c.unit}: {c.verdict} (P = {c.probability:.3f})" for c in evidence.criteria
@@ -210,10 +218,15 @@ def compare(
         refuse_options("for one campaign: with B nothing is left out", "leave it out, or leave out B", by=by, seed=seed)
     if by not in (None, "steps", "regions"):
         raise InputError("usage", f"--by {escaped(by)}: allowed are steps and regions", remedy="choose one of them")
-    data = [read_campaign(folder) for folder in (campaign, *([other] if other is not None else ()))]
+    folders = [campaign] if other is None else [campaign, other]
+    data = [read_campaign(folder) for folder in folders]
     results = output_place(campaign, "results")
-    fits = [fit_for(each, report_line) for each in data]
-    if other is not None:
+    fitting = [f"{FITTING} of {escaped(str(folder), 60)}" for folder in folders]
+    stages = dict.fromkeys(fitting, 1.0) | {HOLDING_OUT: 0.0 if other else 6.0}
+    with waiting() as progress, Job(stages, progress) as job:
+        fits = [fit_for(each, report_line, job.part(stage)) for each, stage in zip(data, fitting, strict=True)]
+        record = None if other else _classic_against_joint(fits[0], by or "steps", seed or 0, job.part(HOLDING_OUT))
+    if record is None:
         from tvsbayes.comparison.changes import compare as compare_fits
         from tvsbayes.report.command_text import changes_text
 
@@ -222,7 +235,6 @@ def compare(
         return
     from tvsbayes.report.command_text import gap_text, hold_out_text
 
-    record = _classic_against_joint(fits[0], by or "steps", seed or 0)
     document = record.as_json()
     files, text = {}, f"{gap_text(record.directions)}\n\n{hold_out_text(record.held_out)}"
     if keep(document, path := results / "compare.json"):
@@ -230,7 +242,7 @@ def compare(
     finish({**document, "files": files}, text, as_json)
 
 
-def _classic_against_joint(found: JointFit, by: str, seed: int) -> ComparisonRecord:
+def _classic_against_joint(found: JointFit, by: str, seed: int, progress: Show | None) -> ComparisonRecord:
     """Why both estimators differ, and which foretells what it has not seen.
 
     Raises:
@@ -249,32 +261,27 @@ def _classic_against_joint(found: JointFit, by: str, seed: int) -> ComparisonRec
             file="spots.csv",
             remedy="number the looks in the columns experiment and point, or use `tvsbayes fit`",
         )
-    return ComparisonRecord(gaps, hold_out(found, by, seed), input_hashes(found.campaign), seed)
+    return ComparisonRecord(gaps, hold_out(found, by, seed, progress=progress), input_hashes(found.campaign), seed)
 
 
 @contextmanager
-def _sampling_progress() -> Iterator[Callable[[Progress], None]]:
-    """A bar on a terminal, nothing elsewhere; Ctrl-C says how to go on."""
-    from rich.console import Console
-    from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
-    from rich.progress import Progress as Bar
+def _chain_kept() -> Iterator[Show]:
+    """`waiting` for a fit; Ctrl-C says how to go on with its chain."""
+    from tvsbayes.posterior.sampling import WALKING
 
-    console, kept = Console(stderr=True), False
-    columns = TextColumn("sampling"), BarColumn(), TextColumn("{task.fields[note]}"), TimeElapsedColumn()
+    told = 0
     try:
-        with Bar(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
-            task = bar.add_task("sampling", total=None, note="preparing")
+        with waiting() as shown:
 
             def show(state: Progress) -> None:
-                nonlocal kept
-                kept = True
-                ess = "" if state.worst_ess is None else f", least effective draws {state.worst_ess:.0f}"
-                note = f"step {state.steps}{ess}, next look in {max(state.seconds_left, 0):.0f} s"
-                bar.update(task, completed=state.steps, total=state.expected_steps, note=note)
+                nonlocal told
+                told += state.doing == f"{SAMPLING}: {WALKING}"
+                if shown is not None:
+                    shown(state)
 
             yield show
     except KeyboardInterrupt:
-        # Before the first block of steps there is no chain to keep.
-        if kept:
+        # It is told of once when it begins: before the first block of steps there is no chain to keep.
+        if told > 1:
             report_line("the chain so far is kept in chain.npz; go on with --resume")
         raise

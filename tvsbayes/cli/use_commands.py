@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import json
 import math
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -26,14 +25,17 @@ from tvsbayes.cli.app import (
     refuse_options,
     report_line,
 )
+from tvsbayes.cli.progress_bar import waiting
 from tvsbayes.errors import InputError, escaped
 from tvsbayes.files.csv_table import CSV_BYTES_MAX, parse_table
 from tvsbayes.files.disk import output_place, read_bytes
-from tvsbayes.pipeline import calibration_for, compile_for, fit_for
+from tvsbayes.pipeline import FITTING, calibration_for, compile_for, fit_for
+from tvsbayes.progress import Job
 
 POINT_COLUMNS = ("pan_steps", "tilt_steps", "pan_approach", "tilt_approach", "aperture_deg")
 STEPS_MAX, ANGLE_MAX_DEG = 1e8, 360.0
 WORKERS = 2
+PLANNING = "plan"
 
 
 @dataclass(frozen=True)
@@ -102,7 +104,8 @@ def locate(
 
     where = (pan_steps, tilt_steps, aperture_deg, (pan_approach or "left", tilt_approach or "up"))
     sides_of(where[-1])
-    calibration = calibration_for(campaign, report_line)
+    with waiting() as progress:
+        calibration = calibration_for(campaign, report_line, progress)
     from tvsbayes.coordinates.location import locate as locate_points
     from tvsbayes.report.command_text import budget_text, locations_text
 
@@ -122,7 +125,8 @@ def locate(
 
 def _locate_all(campaign: Path, points: Points, draws: int, seed: int, as_json: bool) -> None:
     """Every point of a file, refused one by one."""
-    calibration = calibration_for(campaign, report_line)
+    with waiting() as progress:
+        calibration = calibration_for(campaign, report_line, progress)
     from tvsbayes.coordinates.location import locate as locate_points
     from tvsbayes.report.command_text import locations_text
 
@@ -160,7 +164,8 @@ def steps_for(
         remedy = "give --x-mm --y-mm --z-mm, or --azimuth-deg --elevation-deg, or --export alone"
         raise InputError("usage", "steps-for needs one target", remedy=remedy)
     limits = None if rig is None else _limits(rig)
-    calibration = calibration_for(campaign, report_line)
+    with waiting() as progress:
+        calibration = calibration_for(campaign, report_line, progress)
     from tvsbayes.calibration.calibration_file import calibration_header, calibration_json
 
     if export:
@@ -213,17 +218,19 @@ def plan(
         message, allowed = f"--criterion {escaped(criterion)}", ", ".join(CRITERIA)
         raise InputError("criterion", message, column="--criterion", allowed=allowed, remedy="name one of them")
     compile_for(report_line)
-    fitted = None if data is None else fit_for(data, report_line)
-    result = find_plan(
-        instrument,
-        wanted,
-        given=fitted,
-        minutes=minutes,
-        criterion=criterion,
-        aperture=aperture,
-        draws=draws,
-        seed=seed,
-    )
+    with waiting() as progress, Job({FITTING: 0.0 if data is None else 1.0, PLANNING: 3.0}, progress) as job:
+        fitted = None if data is None else fit_for(data, report_line, job.part(FITTING))
+        result = find_plan(
+            instrument,
+            wanted,
+            given=fitted,
+            minutes=minutes,
+            criterion=criterion,
+            aperture=aperture,
+            draws=draws,
+            seed=seed,
+            progress=job.part(PLANNING),
+        )
     text, document = plan_text(result), result.as_json()
     if output is not None and result.steps:
         write_plan(result.steps, output)
@@ -280,11 +287,10 @@ def study(
     missing = n - sum(index < n for index in kept.of(job.key))
     report_line(f"{n} campaigns, {missing} to go on engine {escaped(engine)}; rows in {escaped(str(kept.path), 200)}")
 
-    def progress(done: int, wanted: int) -> None:
-        if sys.stderr.isatty():
-            report_line(f"{done} of {wanted}")
-
-    result = run_study(job, n, kept, engine=engine, workers=workers or WORKERS, address=scheduler, progress=progress)
+    with waiting() as progress:
+        result = run_study(
+            job, n, kept, engine=engine, workers=workers or WORKERS, address=scheduler, progress=progress
+        )
     document = {**result.as_json(), "rows": str(kept.path), "engine": engine, "seed": seed}
     finish(document, study_text(result), as_json)
     if target is not None and result.assurance < ASSURED[0]:

@@ -16,6 +16,7 @@ from tvsbayes.errors import TvsError
 from tvsbayes.estimators.four_point import Selection, experiment_rows, four_point_ratios, select_experiments
 from tvsbayes.instrument.axes import AXES, DIRECTIONS
 from tvsbayes.instrument.campaign import Campaign
+from tvsbayes.progress import Job, Show
 from tvsbayes.results.comparison_record import CANNOT_TELL, HoldOut, Prediction
 
 if TYPE_CHECKING:
@@ -52,7 +53,7 @@ def folds_of(campaign: Campaign, selection: Selection, by: str) -> dict[str, np.
     return folds
 
 
-def hold_out(fit_of_all: JointFit, by: str = "steps", seed: int = 0) -> HoldOut:
+def hold_out(fit_of_all: JointFit, by: str = "steps", seed: int = 0, *, progress: Show | None = None) -> HoldOut:
     """Leave experiments out, fold by fold, refit, and ask both estimators for their four-point angles.
 
     The classic foretells N times its mean of the direction; its uncertainty is the scatter of angles about N times
@@ -64,6 +65,7 @@ def hold_out(fit_of_all: JointFit, by: str = "steps", seed: int = 0) -> HoldOut:
         fit_of_all: a converged fit; its campaign and model are used.
         by: "steps" or "regions", see `folds_of`.
         seed: of the predictive draws.
+        progress: told how far it is.
     """
     campaign = fit_of_all.campaign
     selection = select_experiments(campaign)
@@ -81,35 +83,37 @@ def hold_out(fit_of_all: JointFit, by: str = "steps", seed: int = 0) -> HoldOut:
         return undecided(f"{what}: a constant lost motion looks like a ratio there; measure a second |N|")
     angle = four_point_ratios(selection.pixels, selection.steps, selection.axis, campaign.stereo) * selection.steps
     predictions: list[Prediction] = []
-    for index, (name, out) in enumerate(folds.items()):
-        foretold = foretell_classic(angle, selection, out)
-        if not foretold:
-            continue
-        without = f"without the experiments {name}"
-        try:
-            taught = refit(fit_of_all, frozenset(campaign.spots[r].spot for r in selection.spot_rows[out].ravel()))
-        except TvsError as error:
-            return undecided(f"{without} there is no fit: {error.message}")
-        if not taught.converged:
-            return undecided(f"{without} the fit does not converge: {'; '.join(taught.problems)}")
-        by_model = foretell_joint(taught, selection, out, np.random.default_rng([seed, index]))
-        for e, joint in by_model.items():
-            if e in foretold:
-                about = (int(selection.experiments[e]), name, str(selection.direction[e]), int(selection.steps[e]))
-                predictions.append(Prediction(*about, float(angle[e]), *foretold[e], *joint))
+    with Job(dict.fromkeys(folds, 1.0), progress) as job:
+        for index, (name, out) in enumerate(folds.items()):
+            foretold = foretell_classic(angle, selection, out)
+            if not foretold:
+                continue
+            left_out = frozenset(campaign.spots[r].spot for r in selection.spot_rows[out].ravel())
+            without = f"without the experiments {name}"
+            try:
+                taught = refit(fit_of_all, left_out, job.part(name))
+            except TvsError as error:
+                return undecided(f"{without} there is no fit: {error.message}")
+            if not taught.converged:
+                return undecided(f"{without} the fit does not converge: {'; '.join(taught.problems)}")
+            by_model = foretell_joint(taught, selection, out, np.random.default_rng([seed, index]))
+            for e, joint in by_model.items():
+                if e in foretold:
+                    about = (int(selection.experiments[e]), name, str(selection.direction[e]), int(selection.steps[e]))
+                    predictions.append(Prediction(*about, float(angle[e]), *foretold[e], *joint))
     if not predictions:
         return undecided("no direction has two experiments outside of every fold")
     return judge(by, predictions, lengths, unseen)
 
 
-def refit(fit_of_all: JointFit, without: frozenset[int]) -> JointFit:
+def refit(fit_of_all: JointFit, without: frozenset[int], progress: Show | None = None) -> JointFit:
     """The same model without some spots; its harmonics, contrasts and backlash are free where they were."""
     from tvsbayes.estimators.joint_fit import fit, priors_used
 
     rig, space = fit_of_all.campaign.rig, fit_of_all.space
     priors = priors_used(rig.priors, np.asarray(space.value), np.asarray(space.u))
     held = replace(fit_of_all.campaign, rig=replace(rig, priors=priors))
-    return fit(held, without=without | set(fit_of_all.excluded_spots))
+    return fit(held, without=without | set(fit_of_all.excluded_spots), progress=progress)
 
 
 class ClassicAngle(NamedTuple):

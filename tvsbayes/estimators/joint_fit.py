@@ -19,13 +19,14 @@ from jaxtyping import Bool
 from tvsbayes.errors import NotConverged, NothingToEstimate
 from tvsbayes.estimators.campaign_arrays import CampaignArrays, in_sight
 from tvsbayes.estimators.linear_spots import Linearised, StopInformation, leave_one_out_chi2
-from tvsbayes.estimators.mode_search import GATE_PROBABILITY, Problem
+from tvsbayes.estimators.mode_search import GATE_PROBABILITY, Problem, search_stages
 from tvsbayes.instrument.campaign import Campaign, ordered_spots
 from tvsbayes.instrument.model_choice import AS_STATED, ModelChoice
 from tvsbayes.instrument.parameters import INDEX, NAMES, RIG_NAMES, Prior
 from tvsbayes.model.compiled import placed
 from tvsbayes.model.headlines import Derived, derived_quantities
 from tvsbayes.model.parameter_space import ParameterSpace
+from tvsbayes.progress import Job, Show
 from tvsbayes.results.stored_draws import StoredMode
 from tvsbayes.statistics.chances import chi2_quantile
 from tvsbayes.statistics.intervals import NORMAL_95
@@ -36,6 +37,16 @@ SMALLEST_CAMPAIGN = 8
 MISFIT_LIMIT = 20.0
 """Factor on the stated pixel noise beyond which the mode explains no spot: a wrong basin, swapped cameras or wrong
 counters, not noise."""
+
+
+NEWTON, DIAGNOSING = "Newton steps to the mode", "diagnosing the fit"
+LAST_SECONDS = {NEWTON: 0.8, DIAGNOSING: 0.3}
+"""After the search: what progress foretells with."""
+
+
+def fit_stages(robust: bool) -> dict[str, float]:
+    """Stages of a fit, with seconds."""
+    return search_stages(robust) | LAST_SECONDS
 
 
 @dataclass(frozen=True)
@@ -109,7 +120,12 @@ class JointFit:
 
 
 def fit(
-    campaign: Campaign, *, model: ModelChoice = AS_STATED, without: Collection[int] = (), seed: int = 0
+    campaign: Campaign,
+    *,
+    model: ModelChoice = AS_STATED,
+    without: Collection[int] = (),
+    seed: int = 0,
+    progress: Show | None = None,
 ) -> JointFit:
     """Fit the joint model to every usable spot (formulation 4).
 
@@ -121,6 +137,7 @@ def fit(
         model: simpler or richer gears than the rig states, robust against outliers or not.
         without: ids of spots that teach the fit nothing but can be predicted by it.
         seed: seed of the Laplace draws.
+        progress: told how far it is.
 
     Returns:
         Mode, Laplace approximation and diagnostics; look at `converged` before using it.
@@ -137,7 +154,7 @@ def fit(
         "the fit left the region where the model is finite",
         remedy="check for swapped cameras or wrong counters, or state the extrinsics better in [rig.prior]",
     )
-    with jax.enable_x64(True), ThreadPoolExecutor(1) as executor:
+    with jax.enable_x64(True), ThreadPoolExecutor(1) as executor, Job(fit_stages(model.robust), progress) as job:
         problem = Problem(campaign, table, used)
         if not problem.free.any():
             raise NothingToEstimate(
@@ -148,10 +165,12 @@ def fit(
             )
         problem.compile_aside(executor)
         try:
-            z = problem.searched(model.robust)
+            z = problem.searched(model.robust, job)
             if not np.isfinite(problem.negative_log_density(z[None])[0]):
                 raise diverged
+            job.begin(NEWTON)
             mode = newton_mode(problem.negative_log_density, z, problem.free, problem.curvature(z))
+            job.begin(DIAGNOSING)
             return fit_at(campaign, problem, mode, seed)
         except np.linalg.LinAlgError as error:
             raise diverged from error

@@ -27,6 +27,7 @@ from tvsbayes.instrument.parameters import NAMES, NOISE_NAMES
 from tvsbayes.instrument.rig import RigTable
 from tvsbayes.model.compiled import in_batches, placed
 from tvsbayes.model.parameter_space import free_mask, parameter_space
+from tvsbayes.progress import Job
 from tvsbayes.statistics.chances import chi2_quantile
 
 ANNEALING = (60.0, 10.0, 2.0, 1.0)
@@ -42,6 +43,16 @@ HUBER_CORE = 0.8214
 """Share of clean spots with full weight: P(|z| < 1.345), the constant of 95 % efficiency (Huber 1964)."""
 ROUNDS_MAX, WEIGHTS_SETTLED = 20, 0.02
 """Rounds of the robust option, and the largest change of a weight at which they end."""
+ALTERNATIONS_MAX, ROUNDS_FORESEEN = 6, 6
+"""Of geometry and noise in turn at most, and rounds of the robust option as progress foretells them."""
+COMPILING, SEARCHING = "compiling the model", "searching the mode"
+COMPILED_SECONDS, SEARCHED_SECONDS = 40.0, 1.0
+"""What progress foretells with."""
+
+
+def search_stages(robust: bool) -> dict[str, float]:
+    """Stages of a search, with seconds."""
+    return {COMPILING: stage.wait(COMPILED_SECONDS), SEARCHING: SEARCHED_SECONDS * (2 if robust else 1)}
 
 
 class Problem:
@@ -108,20 +119,27 @@ class Problem:
 
     def alternate(self, z: np.ndarray) -> np.ndarray:
         """Geometry and noise scales in turn until the noise settles (formulation 4.2)."""
-        for _ in range(6):
+        for _ in range(ALTERNATIONS_MAX):
             previous = z
             z = self.least_squares(self.noise_scales(z), 1.0)
             if np.max(np.abs(z - previous)[self.noise], initial=0.0) < NOISE_SETTLED:
                 break
         return z
 
-    def searched(self, robust: bool) -> np.ndarray:
-        """Where the Newton steps on the full density may begin: the basin of the mode, weights settled if `robust`."""
-        z = np.zeros(len(NAMES))
-        for inflation in ANNEALING:
+    def searched(self, robust: bool, job: Job) -> np.ndarray:
+        """Where the Newton steps on the full density may begin: the basin of the mode, weights settled if `robust`.
+
+        `job` has the stages of `search_stages`.
+        """
+        z, passes = np.zeros(len(NAMES)), len(ANNEALING) + 1 + (ROUNDS_FORESEEN if robust else 0)
+        job.begin(COMPILING)
+        for number, inflation in enumerate(ANNEALING, 1):
             z = self.least_squares(z, inflation)
+            job.begin(SEARCHING)
+            job.at(number / passes)
         z = self.alternate(z)
-        for _ in range(ROUNDS_MAX if robust else 0):
+        for number in range(ROUNDS_MAX if robust else 0):
+            job.at((len(ANNEALING) + 1 + number) / passes)
             if self.reweighted(z) < WEIGHTS_SETTLED:
                 break
             z = self.alternate(z)

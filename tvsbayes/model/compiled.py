@@ -31,6 +31,8 @@ LIBRARIES = ("jax", "jaxlib", "equinox", "optimistix", "lineax", "numpy")
 """Whose versions decide what a trace gives."""
 BATCH = 32
 """Points per call of a function of many: half an ensemble of 64, the calls of a differential-evolution step."""
+KEPT_SHARE = 0.1
+"""Of the time of a first call, where another process has left trace and code: what progress foretells with."""
 PACKAGE = Path(__file__).resolve().parents[1]
 LOADED_TIME_S = time.time()
 """When this process read its code, seconds since the epoch: source written later is not what it runs."""
@@ -72,6 +74,14 @@ class Traces:
             return hashlib.sha256(self.code + key.encode()).hexdigest()
         except OSError:
             return ""
+
+    @property
+    def empty(self) -> bool:
+        """Whether nothing is kept there."""
+        try:
+            return next(self.folder.path.iterdir(), None) is None
+        except OSError:
+            return True
 
     def load(self, name: str) -> export.Exported | None:
         """A stored trace."""
@@ -128,6 +138,12 @@ class Compiled[**P, Result]:
         self._ready: dict[Any, Callable] = {}
         self._lock = threading.Lock()
         functools.update_wrapper(self, plain)
+
+    def wait(self, seconds: float) -> float:
+        """What to expect of the next call beyond its work, where tracing and compiling take `seconds`; 0 once ready."""
+        if self._ready:
+            return 0.0
+        return seconds if Traces.used is None or Traces.used.empty else KEPT_SHARE * seconds
 
     def __call__(self, *args: Any, **kwargs: Any) -> Result:
         """Run it on arrays of JAX or NumPy or numbers; `TypeError` for anything else."""

@@ -55,23 +55,6 @@ def headlines(z: Float[Array, " parameters"], space: ParameterSpace, pose_rad: F
     return Headlines(values(z), jax.jacfwd(values)(z))
 
 
-class Physical(eqx.Module):
-    """Values in the units of `NAMES` and d/d(coordinates)."""
-
-    value: Float[Array, " parameters"]
-    slope: Float[Array, "parameters parameters"]
-
-
-@compiled(Physical)
-def _physical(z: Float[Array, " parameters"], space: ParameterSpace) -> Physical:
-    return Physical(space.physical(z), jax.jacfwd(space.physical)(z))
-
-
-def physical_at(z: np.ndarray, space: ParameterSpace) -> Physical:
-    """Values and slopes at a point, NumPy arrays."""
-    return jax.tree.map(np.asarray, _physical(z, space))
-
-
 class Derived(eqx.Module):
     """Headlines at one pose for one point of parameter space, in the units of data/docs/conventions.md.
 

@@ -9,7 +9,9 @@ one compiled function serves every choice of fixed parameters. Physical values h
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from types import ModuleType
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -104,6 +106,10 @@ def half_normal_sd(mean: float, sd: float) -> float:
     return float(np.sqrt(weights @ (values - centre) ** 2))
 
 
+FARTHEST_SD = 36.0
+"""Coordinates of half-normals beyond are taken for this."""
+
+
 class ParameterSpace(eqx.Module):
     """Priors of one rig as arrays; an argument of the jitted functions, never a constant in them.
 
@@ -120,20 +126,24 @@ class ParameterSpace(eqx.Module):
 
     def physical(self, z: Float[Array, " parameters"]) -> Float[Array, " parameters"]:
         """Coordinates -> values in the units of `NAMES`."""
-        rig_z, stereo_z = z[: len(RIG_NAMES)], z[len(RIG_NAMES) :]
-        half, log = (self.kind == KINDS.index(kind) for kind in ("half-normal", "log-normal"))
-        # Unused branches are fed harmless numbers: `where` lets their infinities into the gradient.
-        # Beyond 37 sd Phi underflows and its inverse has no value: a fit may stray there, and must come back.
-        w = jnp.where(half, jnp.minimum(rig_z, 36.0), 0.0)
-        log_normal = self.value * jnp.exp(jnp.where(log, self.u, 0.0) * rig_z)
-        rig = jnp.where(
-            half, self.u * half_normal(w, jax.scipy.special), jnp.where(log, log_normal, self.value + self.u * rig_z)
-        )
-        return jnp.concatenate([rig, self.stereo_mean + self.stereo_root @ stereo_z])
+        return _values(self, z, jnp, jax.scipy.special)
 
     def model(self, z: Float[Array, " parameters"]) -> Model:
         """Coordinates -> model."""
         return model_of(self.physical(z), self.harmonic_period_deg)
+
+
+def _values(space: ParameterSpace, z: Any, functions: ModuleType, distributions: ModuleType) -> Any:
+    """Coordinates -> values in the units of `NAMES`, by functions of JAX, or of NumPy and SciPy."""
+    rig_z, stereo_z = z[: len(RIG_NAMES)], z[len(RIG_NAMES) :]
+    half, log = (space.kind == KINDS.index(kind) for kind in ("half-normal", "log-normal"))
+    # Unused branches are fed harmless numbers: `where` lets their infinities into the gradient.
+    # Beyond 37 sd Phi underflows and its inverse has no value: a fit may stray there, and must come back.
+    w = functions.where(half, functions.minimum(rig_z, FARTHEST_SD), 0.0)
+    log_normal = space.value * functions.exp(functions.where(log, space.u, 0.0) * rig_z)
+    other = functions.where(log, log_normal, space.value + space.u * rig_z)
+    rig = functions.where(half, space.u * half_normal(w, distributions), other)
+    return functions.concatenate([rig, space.stereo_mean + space.stereo_root @ stereo_z])
 
 
 SCALE = np.array([np.pi / 180 if REGISTRY[name].unit.startswith("deg") else 1.0 for name in NAMES])
@@ -229,6 +239,27 @@ def parameter_space(table: RigTable, stereo: Stereo) -> ParameterSpace:
         stereo_root=placed(root),
         harmonic_period_deg=placed(np.array([float(table.harmonic_period_deg.get(a, FULL_TURN_DEG)) for a in AXES])),
     )
+
+
+@dataclass(frozen=True)
+class Physical:
+    """Values in the units of `NAMES`, shape (p,), and d/d(coordinates), shape (p, p)."""
+
+    value: np.ndarray
+    slope: np.ndarray
+
+
+def physical_at(z: np.ndarray, space: ParameterSpace) -> Physical:
+    """Values and slopes at a point (p,), in NumPy: nothing is compiled for one point."""
+    known: ParameterSpace = jax.tree.map(np.asarray, space)
+    value = _values(known, z, np, special)
+    rig_z, kind, u = z[: len(RIG_NAMES)], np.asarray(known.kind), np.asarray(known.u)
+    bent = np.where(rig_z < FARTHEST_SD, half_normal_slope(np.minimum(rig_z, FARTHEST_SD)), 0.0)
+    own = np.where(kind == KINDS.index("log-normal"), value[: len(RIG_NAMES)], 1.0)
+    slope = np.zeros((len(z), len(z)))
+    slope[: len(RIG_NAMES), : len(RIG_NAMES)] = np.diag(u * np.where(kind == KINDS.index("half-normal"), bent, own))
+    slope[len(RIG_NAMES) :, len(RIG_NAMES) :] = known.stereo_root
+    return Physical(value, slope)
 
 
 def coordinates_of(space: ParameterSpace, physical: np.ndarray) -> np.ndarray:

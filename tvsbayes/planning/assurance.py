@@ -19,6 +19,7 @@ from tvsbayes.planning.drawn_rigs import Instruments
 from tvsbayes.planning.expectation import LOOKS_PER_EXPERIMENT, NOISE_COLUMNS, PARAMETERS, Knowledge
 from tvsbayes.planning.looks import Arranged, LookArrays, Looks, Seen, arrange, covariance_of, information_of_looks
 from tvsbayes.planning.target import Sensitivity, Target, sensitivity
+from tvsbayes.progress import Advance, unshown
 
 PIXEL_COLUMN = INDEX["pixel_scale"]
 SCALES = [*STOP_COLUMNS.ravel(), PIXEL_COLUMN]
@@ -138,7 +139,7 @@ class Assurance:
         """The same instruments before other designs."""
         return Assurance(family, self.target, self.instruments, self.seed)
 
-    def values(self, sizes: Sequence[int]) -> dict[int, np.ndarray]:
+    def values(self, sizes: Sequence[int], advance: Advance = unshown) -> dict[int, np.ndarray]:
         """Reported uncertainty of the target at each truth, shape (draws,), by number of experiments."""
         draws, together = len(self.instruments), max(1, self.PAIRS // len(self.looks))
         wanted = {n: self.family.arranged(n).path for n in sizes if n not in self._values}
@@ -147,6 +148,7 @@ class Assurance:
             scene = self._scene(first, min(first + together, draws))
             for n, path in wanted.items():
                 found[n][scene.rows] = self._reported(scene, n, path)
+            advance((first + together) / draws)
         self._values |= found
         return {n: self._values[n] for n in sizes}
 

@@ -9,8 +9,7 @@ import numpy as np
 
 from tvsbayes.instrument.parameters import RIG_NAMES
 from tvsbayes.model.compiled import placed
-from tvsbayes.model.headlines import physical_at
-from tvsbayes.model.parameter_space import ParameterSpace, coordinates_of
+from tvsbayes.model.parameter_space import ParameterSpace, coordinates_of, physical_at
 from tvsbayes.planning.expectation import PARAMETERS, Knowledge
 from tvsbayes.twin.simulated_campaign import Truth, draw_truth
 

@@ -204,6 +204,14 @@ def _shown(pairs: _Pairs, space: ParameterSpace, eyes: _Eyes) -> _Shown:
     return jax.vmap(one)(pairs)
 
 
+LOOKS_COMPILED_SECONDS = 20.0
+
+
+def looks_wait() -> float:
+    """Seconds to expect of the first looks of a process, beyond their work."""
+    return _shown.wait(LOOKS_COMPILED_SECONDS)
+
+
 @compiled(jax.Array)
 def _in_images(pairs: _Pairs, space: ParameterSpace, eyes: _Eyes) -> Bool[Array, " pairs"]:
     """Whether every pair's look puts its spot into both images."""

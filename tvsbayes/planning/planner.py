@@ -27,6 +27,7 @@ from tvsbayes.planning.expectation import (
     Expectation,
     Knowledge,
     PlanInformation,
+    expect,
     information_of,
     knowledge_of,
     prior_knowledge,
@@ -39,10 +40,11 @@ from tvsbayes.planning.forecast import (
     value_of_classic,
 )
 from tvsbayes.planning.limits import Limit, limit_of, next_experiments, split_of, stop_now
-from tvsbayes.planning.looks import LookArrays, Looks, Seen, covariance_of, information_of_looks
+from tvsbayes.planning.looks import LookArrays, Looks, Seen, covariance_of, information_of_looks, looks_wait
 from tvsbayes.planning.plan_check import judge
 from tvsbayes.planning.search import LADDER, Scope, design_family, refine, smallest_design
 from tvsbayes.planning.target import Sensitivity, Target, sensitivity
+from tvsbayes.progress import Advance, Job, Show
 from tvsbayes.results.plan_record import Advice, Batch
 from tvsbayes.statistics.chances import ASSURED, share_error
 
@@ -185,6 +187,7 @@ def plan(
     draws: int = PLAN_DRAWS,
     largest: int = LADDER[-1],
     seed: int = 0,
+    progress: Show | None = None,
 ) -> PlanResult:
     """Find the cheapest plan that meets a target, and say what it will give, or why none can (formulation 6).
 
@@ -198,6 +201,7 @@ def plan(
         draws: instruments over which the assurance is taken.
         largest: experiments (of four looks) beyond which no plan is sought.
         seed: of the draws.
+        progress: told how far it is.
 
     Returns:
         The plan, its curve and the advice.
@@ -211,7 +215,7 @@ def plan(
     knowledge = prior_knowledge(rig) if given is None else knowledge_of(given, rig)
     campaign, pose = (None, None) if given is None else (given.campaign, given.reference_pose_rad)
     scope = Scope(criterion, aperture, largest, minutes)
-    return plan_from(knowledge, target, campaign, pose, scope=scope, draws=draws, seed=seed)
+    return plan_from(knowledge, target, campaign, pose, scope=scope, draws=draws, seed=seed, progress=progress)
 
 
 def _curve(
@@ -309,10 +313,12 @@ class _Size:
     experiments: int
 
 
-def _size(assurance: Assurance, forecast: ClassicForecast | None, durations: Mapping[int, float]) -> _Size:
+def _size(
+    assurance: Assurance, forecast: ClassicForecast | None, durations: Mapping[int, float], advance: Advance
+) -> _Size:
     largest = max(durations)
     sizes = sorted({n for n in LADDER if n <= largest} | {largest})
-    assurance.values(sizes)
+    assurance.values(sizes, advance)
 
     def smallest(level: float) -> int | None:
         return smallest_design(lambda n: assurance.met_share(n) >= level, sizes)
@@ -320,6 +326,25 @@ def _size(assurance: Assurance, forecast: ClassicForecast | None, durations: Map
     n80, n95 = map(smallest, ASSURED)
     curve = _curve(assurance, forecast, durations, [*sizes, *(n for n in (n80, n95) if n)])
     return _Size(curve, n80, n95, n95 or n80 or largest)
+
+
+LOOKING, CHOOSING, COUNTING, EXCHANGING, JUDGING = (
+    *("looking from every place", "choosing looks", "counting experiments"),
+    *("exchanging looks", "judging the plan"),
+)
+"""Stages of planning."""
+EXPECT_COMPILED_SECONDS = 12.0
+
+
+def _stages(draws: int) -> dict[str, float]:
+    """Stages of planning, with seconds."""
+    return {
+        LOOKING: 0.1 + looks_wait(),
+        CHOOSING: 2.5,
+        COUNTING: 2.0 * draws / PLAN_DRAWS,
+        EXCHANGING: 3.0,
+        JUDGING: 0.2 + expect.wait(EXPECT_COMPILED_SECONDS),
+    }
 
 
 def plan_from(
@@ -331,15 +356,35 @@ def plan_from(
     scope: Scope,
     draws: int,
     seed: int,
+    progress: Show | None = None,
 ) -> PlanResult:
     """`plan` from what is known; effective ratios hold at `pose_rad`, by default in the middle of the candidates."""
+    with Job(_stages(draws), progress) as job:
+        return _planned(knowledge, target, campaign, pose_rad, scope, draws, seed, job)
+
+
+def _planned(
+    knowledge: Knowledge,
+    target: Target,
+    campaign: Campaign | None,
+    pose_rad: np.ndarray | None,
+    scope: Scope,
+    draws: int,
+    seed: int,
+    job: Job,
+) -> PlanResult:
+    job.begin(LOOKING)
     asked = _question(knowledge, target, pose_rad, scope.aperture)
-    family = design_family(knowledge, asked.found, asked.seen, target, asked.at_centre, scope)
+    job.begin(CHOOSING)
+    family = design_family(knowledge, asked.found, asked.seen, target, asked.at_centre, scope, job.at)
     durations = _durations(family, scope)
+    job.begin(COUNTING)
     assurance = Assurance(family, target, draw_instruments(knowledge, draws, seed), seed)
     forecast = classic_forecast(knowledge, assurance.instruments)
-    size = _size(assurance, forecast, durations)
-    refined = refine(family, asked.seen, target, asked.at_centre, size.experiments, scope, assurance)
+    size = _size(assurance, forecast, durations, job.at)
+    job.begin(EXCHANGING)
+    refined = refine(family, asked.seen, target, asked.at_centre, size.experiments, scope, assurance, job.at)
+    job.begin(JUDGING)
     steps = refined.family.arranged(size.experiments).steps
     exact = judge(steps, knowledge, aperture=scope.aperture)
     chosen = judged("planned", exact.information, knowledge, target, pose_rad)

@@ -19,8 +19,11 @@ from tvsbayes.planning.candidates import Candidates
 from tvsbayes.planning.expectation import HOME_VARIANCE_RAD2, LOOKS_PER_EXPERIMENT, PARAMETERS, Knowledge
 from tvsbayes.planning.looks import CONTRAST_COLUMNS, Seen, covariance_of, information_of_looks
 from tvsbayes.planning.target import Sensitivity, Target
+from tvsbayes.progress import Advance, unshown
 
 CRITERIA = ("c", "D", "A")
+EXCHANGED_SHARE = 0.6
+"""Of the time of `refine`, for the exchanges themselves: what progress foretells with."""
 MEAN_WEIGHT = 0.05
 """Of the mean variance beside the worst: looks that help only the others still count a little."""
 
@@ -265,6 +268,7 @@ def design_family(
     target: Target,
     at_centre: Sensitivity,
     scope: Scope | None = None,
+    advance: Advance = unshown,
 ) -> Family:
     """The choice of sheets and the order of looks that reach the target soonest.
 
@@ -275,7 +279,9 @@ def design_family(
     sought = at_centre if scope.criterion == "c" else _of_all_gears(knowledge, seen)
     search = search_designs(knowledge, seen, sought, scope.criterion)
     families = []
-    for subset in _sheet_subsets(len(knowledge.sheets)):
+    subsets = list(_sheet_subsets(len(knowledge.sheets)))
+    for number, subset in enumerate(subsets):
+        advance(number / len(subsets))
         here = np.isin(found.looks.sheet, subset)
         if here.any():
             picks = search.among(here).greedy(LOOKS_PER_EXPERIMENT * scope.largest)
@@ -311,6 +317,7 @@ def refine(
     experiments: int,
     scope: Scope,
     assurance: Assurance,
+    advance: Advance = unshown,
 ) -> Refined:
     """The design of n experiments after exchanges.
 
@@ -327,6 +334,7 @@ def refine(
     duration = exchanged.arranged(experiments).minutes(knowledge.rig)
     if scope.minutes is not None and duration > scope.minutes:
         return plain
+    advance(EXCHANGED_SHARE)
     other = Refined(exchanged, assurance.of(exchanged).values([experiments])[experiments])
 
     def merit(of: Refined) -> tuple[float, float]:

@@ -18,8 +18,8 @@ from tvsbayes.instrument.axes import DIRECTIONS
 from tvsbayes.instrument.parameters import INDEX
 from tvsbayes.instrument.protocols import OVERSHOOT_STEPS
 from tvsbayes.instrument.rig import RigTable
-from tvsbayes.model.headlines import QUANTITIES, headlines, physical_at
-from tvsbayes.model.parameter_space import ParameterSpace
+from tvsbayes.model.headlines import QUANTITIES, headlines
+from tvsbayes.model.parameter_space import ParameterSpace, physical_at
 from tvsbayes.statistics.intervals import NORMAL_95
 
 UNITS = {

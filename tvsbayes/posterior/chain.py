@@ -29,20 +29,6 @@ CHAIN_BYTES_MAX = 2**32
 
 
 @dataclass(frozen=True)
-class Progress:
-    """What a progress display shows of a chain.
-
-    `worst_ess` is None before the first check; seconds since the start, and left until the next check.
-    """
-
-    steps: int
-    expected_steps: int
-    worst_ess: float | None
-    seconds: float
-    seconds_left: float
-
-
-@dataclass(frozen=True)
 class Chain:
     """Everything a run has done: enough to continue it bit for bit.
 

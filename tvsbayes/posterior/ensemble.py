@@ -7,7 +7,6 @@ independent chains.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 import emcee
@@ -15,11 +14,12 @@ import numpy as np
 
 from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.model.compiled import BATCH
-from tvsbayes.posterior.chain import Chain, Progress, write_chain
+from tvsbayes.posterior.chain import Chain, write_chain
 from tvsbayes.posterior.diagnosis import ESS_LIMIT, GROUPS, TAU_LIMIT, diagnose
 from tvsbayes.posterior.draws import Posterior
 from tvsbayes.posterior.importance import ImportanceRun
 from tvsbayes.posterior.proposal import Independence, Target
+from tvsbayes.progress import Advance, OpenEnded
 from tvsbayes.results.convergence import Convergence
 
 WALKERS = 64
@@ -89,11 +89,11 @@ class Run:
         start: ImportanceRun,
         chain: Chain | None,
         checkpoint: Path | None,
-        progress: Callable[[Progress], None] | None,
+        advance: Advance,
         began: float,
     ):
         self.fit, self.start = fit, start
-        self.checkpoint, self.progress, self.began = checkpoint, progress, began
+        self.checkpoint, self.told, self.began = checkpoint, advance, began
         self.positions = start.starts(walkers_for(start.path.dimension))
         walkers, dimension = self.positions.shape
         if chain is None:
@@ -157,7 +157,7 @@ class Run:
 
     def until_converged(self, seconds: float) -> Posterior:
         """Extend, look, extend."""
-        done, worst_ess = len(self.before.w), None
+        done, towards = len(self.before.w), OpenEnded()
         # An interrupted chain is first brought to its next look: it ends where an unbroken run ends.
         if done >= self.goal:
             posterior, ended = self.look()
@@ -172,15 +172,12 @@ class Run:
                 over = elapsed > seconds
                 if done >= self.goal or over:
                     posterior, ended = self.look()
-                    worst_ess = min(posterior.convergence.ess_bulk.values())
                     if ended or over:
                         self.save()
                         return posterior
                 elif time.monotonic() - self.saved_at > CHECKPOINT_SECONDS:
                     self.save()
-                if self.progress is not None:
-                    left = (self.goal - done) * elapsed / max(done - len(self.before.w), 1)
-                    self.progress(Progress(done, self.goal, worst_ess, elapsed, min(left, seconds - elapsed)))
+                self.told(max(towards.share(done, self.goal), elapsed / seconds))
         except KeyboardInterrupt:
             self.save()
             raise

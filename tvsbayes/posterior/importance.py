@@ -21,6 +21,7 @@ from tvsbayes.posterior.draws import Draws, Posterior, derived_at, headline_name
 from tvsbayes.posterior.proposal import Independence, Target, first_proposal
 from tvsbayes.posterior.ridges import transport
 from tvsbayes.posterior.transport import Transport
+from tvsbayes.progress import Advance, OpenEnded, unshown
 from tvsbayes.results.convergence import Importance, Reweighted, extreme
 from tvsbayes.statistics.weighted_draws import effective_draws, pareto_k, smoothed_weights, weighted_summary
 
@@ -34,6 +35,8 @@ ESS_LIMIT = 1000
 """... and fewer than which are not accepted."""
 K_LIMIT = 0.7
 """Tail index from which weighted means cannot be trusted (Vehtari et al., J. Mach. Learn. Res. 25 (2024) 72)."""
+MAPPED_SHARE = 0.25
+"""Of the time, for the map to nearly normal coordinates: what progress foretells with."""
 HEAVIEST_LIMIT = 0.02
 """Share of the weight that one draw may have."""
 
@@ -194,20 +197,22 @@ class ImportanceRun:
         return self.pool.w[np.argsort(-keys)[:count]]
 
 
-def importance_run(fit: JointFit, seed: int) -> ImportanceRun:
+def importance_run(fit: JointFit, seed: int, advance: Advance = unshown) -> ImportanceRun:
     """Draw rounds until every headline is known by `ESS_WANTED` draws and the weights are sound, at most `ROUNDS_MAX`.
 
     Args:
         fit: a converged fit.
         seed: of the draws.
+        advance: told how far it is.
 
     Raises:
         NotConverged: the density is not finite around the mode.
     """
     began = time.monotonic()
     generator = np.random.RandomState(seed)
-    wanted, rounds = FITTED_ROUNDS, 0
+    wanted, rounds, drawn = FITTED_ROUNDS, 0, OpenEnded()
     path = transport(fit)
+    advance(MAPPED_SHARE)
     target = Target(fit, path)
     try:
         pool = empty_pool(target)
@@ -215,6 +220,7 @@ def importance_run(fit: JointFit, seed: int) -> ImportanceRun:
             while rounds < wanted:
                 rounds += 1
                 pool = pool.extended(target, generator, fitted=rounds <= FITTED_ROUNDS)
+                advance(MAPPED_SHARE + (1 - MAPPED_SHARE) * drawn.share(rounds, wanted))
             posterior = reweighted_posterior(fit, path, pool, seed, time.monotonic() - began)
             ess = posterior.convergence.importance.least_ess.value
             if rounds >= ROUNDS_MAX or (posterior.converged and ess >= ESS_WANTED):

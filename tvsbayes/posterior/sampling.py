@@ -10,11 +10,20 @@ import jax
 
 from tvsbayes.errors import NotConverged
 from tvsbayes.estimators.joint_fit import JointFit
-from tvsbayes.posterior.chain import Progress, stored_chain
+from tvsbayes.posterior.chain import stored_chain
 from tvsbayes.posterior.draws import Posterior
 from tvsbayes.posterior.importance import importance_run
+from tvsbayes.progress import Job, Show
 
 TIERS = ("importance", "emcee")
+DRAWING, WALKING = "drawing weighted samples", "sampling with emcee"
+DRAWN_SECONDS, WALKED_SECONDS = 3.0, 8.0
+"""What progress foretells with."""
+
+
+def sampling_stages(tier: str) -> dict[str, float]:
+    """Stages of sampling, with seconds."""
+    return {DRAWING: DRAWN_SECONDS, WALKING: WALKED_SECONDS if tier == "emcee" else 0.0}
 
 
 def sample(
@@ -25,7 +34,7 @@ def sample(
     seed: int = 0,
     checkpoint: Path | None = None,
     resume: bool = False,
-    progress: Callable[[Progress], None] | None = None,
+    progress: Show | None = None,
     first: Callable[[Posterior], None] | None = None,
 ) -> Posterior:
     """Sample the posterior of a fit (formulation 4.3).
@@ -38,7 +47,8 @@ def sample(
         seed: of everything random. The same fit, seed and versions give the same draws bit for bit.
         checkpoint: file in which the chain is kept as it grows (written whole or not at all), also on Ctrl-C.
         resume: continue the chain of `checkpoint`.
-        progress: called after every block of steps of the chain.
+        progress: told how far it is: rounds of draws towards the effective draws wanted, steps of the chain towards the
+            next look at it.
         first: called with the posterior of importance sampling before the chain starts.
 
     Returns:
@@ -61,15 +71,17 @@ def sample(
     if tier == "importance" and checkpoint is not None:
         raise ValueError("importance sampling has no chain to keep or to resume")
     began = time.monotonic()
-    with jax.enable_x64(True):
+    with jax.enable_x64(True), Job(sampling_stages(tier), progress) as job:
         if resume and checkpoint is not None:
             start, chain = stored_chain(checkpoint, fit, seed)
         else:
-            start, chain = importance_run(fit, seed), None
+            job.begin(DRAWING)
+            start, chain = importance_run(fit, seed, job.at), None
         if tier == "importance":
             return start.posterior
         if first is not None:
             first(start.posterior)
         from tvsbayes.posterior.ensemble import Run
 
-        return Run(fit, start, chain, checkpoint, progress, began).until_converged(60 * max_minutes)
+        job.begin(WALKING)
+        return Run(fit, start, chain, checkpoint, job.at, began).until_converged(60 * max_minutes)

@@ -7,7 +7,7 @@ on the engine. Headlines in deg/step, deg and mm.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,11 +16,14 @@ from tvsbayes.errors import NotConverged
 from tvsbayes.instrument.axes import DIRECTION_SIGNS
 from tvsbayes.model.headlines import QUANTITIES
 from tvsbayes.planning.target import Target
+from tvsbayes.progress import Job, Show
 from tvsbayes.statistics.chances import LEVELS, binomial_bounds, rms_bounds, share_interval95
 from tvsbayes.statistics.intervals import NORMAL_95
 from tvsbayes.studies.executors import executor
 from tvsbayes.studies.rows import StudyRow, StudyRows
 from tvsbayes.studies.study_job import StudyJob
+
+CAMPAIGNS = "campaigns"
 
 
 @dataclass(frozen=True)
@@ -148,7 +151,7 @@ def study(
     engine: str = "serial",
     workers: int = 2,
     address: str | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Show | None = None,
 ) -> StudyResult:
     """Make the rows 0 ... count - 1 of a study that are not there yet, and count them all.
 
@@ -159,7 +162,7 @@ def study(
         engine: where they are made; the numbers are the same on each.
         workers: processes.
         address: of a Dask scheduler.
-        progress: called with rows done and rows wanted.
+        progress: told how far it is, after every row.
 
     Raises:
         InputError: no such engine.
@@ -167,13 +170,14 @@ def study(
     """
     done = rows.of(job.key)
     missing = [index for index in range(count) if index not in done]
-    if missing:
-        with executor(engine, min(workers, len(missing)), address) as running:
-            for index in missing:
-                running.submit(job, index)
-            for finished, row in enumerate(running.as_completed(), count - len(missing) + 1):
-                rows.append(row)
-                if progress is not None:
-                    progress(finished, count)
-    made = rows.of(job.key)
-    return study_result(job, [made[index] for index in range(count)])
+    with Job({CAMPAIGNS: 1.0}, progress) as told:
+        if missing:
+            with executor(engine, min(workers, len(missing)), address) as running:
+                told.at(0.0, f"{count - len(missing)} of {count}")
+                for index in missing:
+                    running.submit(job, index)
+                for made, row in enumerate(running.as_completed(), 1):
+                    rows.append(row)
+                    told.at(made / len(missing), f"{count - len(missing) + made} of {count}")
+        every = rows.of(job.key)
+        return study_result(job, [every[index] for index in range(count)])

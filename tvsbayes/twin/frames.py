@@ -6,7 +6,6 @@ are those of `Scene()` and `Sensor()`, the board is the paper's.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
@@ -18,6 +17,7 @@ import numpy as np
 from tvsbayes.files.disk import make_folder, write_atomically
 from tvsbayes.files.images import png_bytes
 from tvsbayes.instrument.campaign import CAMERAS, frame_name
+from tvsbayes.progress import Job, Show
 from tvsbayes.twin.board_pictures import Board, BoardPose, board_poses, render_board
 from tvsbayes.twin.physics import CameraPair, cameras_of
 from tvsbayes.twin.simulated_campaign import SimulatedCampaign
@@ -34,7 +34,7 @@ def write_frames(
     seed: int,
     *,
     views: int | None = None,
-    done: Callable[[int, int], None] | None = None,
+    progress: Show | None = None,
 ) -> int:
     """Write `frames/000000_left.png`, `_right.png` of every look and `boards/left01.png`, `right01.png` ...
 
@@ -43,7 +43,7 @@ def write_frames(
         simulated: what the twin did.
         seed: of speckle, noise and board poses.
         views: how many board views, by default `BOARD_VIEWS`; 0 writes no `boards/`.
-        done: called with the number of pairs written and their total.
+        progress: told how far it is.
 
     Returns:
         How many pictures were written.
@@ -64,9 +64,9 @@ def write_frames(
     # NumPy's generators, OpenCV and the writing of files leave Python's lock: threads are enough.
     pool = ThreadPoolExecutor(min(WORKERS_MAX, cpu_count() or 1))
     try:
-        for count, _ in enumerate(pool.map(lambda job: job(), jobs), start=1):
-            if done is not None:
-                done(count, len(jobs))
+        with Job({"rendering": 1.0}, progress) as told:
+            for count, _ in enumerate(pool.map(lambda job: job(), jobs), start=1):
+                told.at(count / len(jobs), f"{count} of {len(jobs)} pairs")
     finally:
         pool.shutdown(cancel_futures=True)
     return 2 * len(jobs)

@@ -46,8 +46,8 @@ FAULTS = (
     Fault(
         "prior sd doubled",
         "model/parameter_space.py",
-        "jnp.where(log, log_normal, self.value + self.u * rig_z)",
-        "jnp.where(log, log_normal, self.value + 2 * self.u * rig_z)",
+        "functions.where(log, log_normal, space.value + space.u * rig_z)",
+        "functions.where(log, log_normal, space.value + 2 * space.u * rig_z)",
         "priors count a quarter of what the rig file states",
         ("model/parameter_space",),
     ),

@@ -44,7 +44,7 @@ def measure(bench: Bench) -> None:
                     StudyRows(Path(folder) / "rows.jsonl"),
                     engine=name.split(",")[0],
                     workers=workers,
-                    progress=lambda done, wanted: times.append(time.perf_counter()),
+                    progress=lambda state: times.append(time.perf_counter()),
                 )
                 whole = time.perf_counter() - begun
             # Every worker's first campaign carries its start and the reading of compiled functions.

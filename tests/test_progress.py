@@ -1,0 +1,138 @@
+"""How far a wait has come: never backwards, to the end, and whoever listens may stop it."""
+
+from __future__ import annotations
+
+import itertools
+
+import pytest
+
+from tvsbayes.progress import FORESEEN_SECONDS, FORESEEN_SHARE, Job, OpenEnded
+
+ROUNDING = 2.0**-50
+"""Of a sum of a few shares near 1, four units of float64's last place."""
+
+
+class Clock:
+    """A clock that somebody else turns."""
+
+    now_s = 100.0
+
+    def __call__(self) -> float:
+        return self.now_s
+
+
+def followed(stages, steps):
+    """What is told of a job whose steps are (seconds that pass, stage to begin or share of the present one)."""
+    clock, told = Clock(), []
+    with Job(stages, told.append, clock) as job:
+        for seconds, step in steps:
+            clock.now_s += seconds
+            if isinstance(step, str):
+                job.begin(step)
+            else:
+                job.at(step)
+    return told
+
+
+def never_backwards(told):
+    """The rules that hold of whatever is told of one wait."""
+    assert told[-1].share == 1 and told[-1].seconds_left == 0
+    for before, after in itertools.pairwise(told):
+        passed = after.seconds - before.seconds
+        assert after.share >= before.share and passed >= 0
+        if before.seconds_left is not None:
+            # Rounding of seconds that are read to 1e-16 of a hundred.
+            assert after.seconds_left <= before.seconds_left + passed + 1e-12
+    return True
+
+
+def test_stages_add_up_to_the_whole():
+    told = followed({"one": 1.0, "nothing": 0.0, "two": 2.0, "three": 5.0}, [(1, n) for n in ("one", "two", "three")])
+    assert [state.share for state in told] == pytest.approx([0, 1 / 8, 3 / 8, 1], abs=ROUNDING)
+    assert [state.doing for state in told] == ["one", "two", "three", "three"]
+    assert never_backwards(told)
+    again = followed({"one": 3.0, "two": 1.0}, [(1, 0.5), (1, 1.0), (1, "two"), (1, 0.25), (0, 9.0)])
+    assert [state.share for state in again] == pytest.approx([3 / 8, 3 / 4, 3 / 4, 13 / 16, 1, 1], abs=ROUNDING)
+
+
+def test_stages_without_time_are_not_told():
+    told = followed({"nothing": 0.0, "all": 2.0}, [(1, "nothing"), (1, 0.5), (1, "all")])
+    assert [state.doing for state in told] == ["all", "all"]
+    for stages in ({}, {"nothing": 0.0}, {"back": -1.0, "forth": 3.0}):
+        with pytest.raises(ValueError, match="shares of the time"):
+            Job(stages)
+
+
+def test_what_goes_backwards_is_not_told_so():
+    told = followed({"one": 1.0, "two": 1.0}, [(1, 0.9), (1, 0.2), (1, "two"), (1, -3.0), (-9, 0.5), (1, "one")])
+    assert never_backwards(told)
+    assert [state.share for state in told] == pytest.approx([0.45, 0.45, 0.5, 0.5, 0.75, 0.75, 1], abs=ROUNDING)
+
+
+def test_time_left_of_an_even_job_is_right_from_the_beginning():
+    """A hundred steps of half a second: 50 s less what has passed, once there is something to foretell by."""
+    told = followed({"all": 1.0}, [(0.5, (k + 1) / 100) for k in range(100)])
+    known = [state for state in told if state.seconds_left is not None]
+    assert known[0].share >= FORESEEN_SHARE and known[0].seconds >= FORESEEN_SECONDS and len(known) >= 99
+    for state in known:
+        assert state.seconds_left == pytest.approx(50 - state.seconds, abs=1e-9), "50 s, shares rounded to 1e-16"
+    assert never_backwards(told)
+
+
+def test_time_left_of_an_uneven_job_rises_with_the_clock_at_most():
+    """A stage that takes fifty times what was expected, and one that takes nothing."""
+    steps = [(0.1, k / 10) for k in range(10)] + [(0.0, "slow")] + [(5, k / 10) for k in range(10)] + [(0, "none")]
+    told = followed({"fast": 1.0, "slow": 1.0, "none": 8.0}, steps)
+    assert never_backwards(told)
+    assert max(state.seconds_left for state in told if state.seconds_left is not None) > 20, "or nothing could rise"
+
+
+def test_a_job_within_a_job_fills_its_stage():
+    clock, told = Clock(), []
+    with Job({"first": 1.0, "second": 3.0}, told.append, clock) as job:
+        with Job({"a": 1.0, "b": 1.0}, job.part("first"), clock) as inner:
+            inner.begin("b")
+        with Job({"c": 1.0}, job.part("second"), clock) as inner:
+            inner.at(0.5, "2 of 4")
+    assert [(state.doing, state.share) for state in told] == [
+        *(("first", 0), ("first: b", 1 / 8), ("first: b", 1 / 4)),
+        *(("second", 1 / 4), ("second: c: 2 of 4", 5 / 8), ("second: c: 2 of 4", 1)),
+        ("second: c: 2 of 4", 1),
+    ]
+    assert never_backwards(told)
+
+
+def test_nobody_listens_nothing_is_read():
+    def clock():
+        calls.append(1)
+        return 0.0
+
+    calls: list[int] = []
+    with Job({"all": 1.0}, None, clock) as job:
+        job.at(0.5)
+        assert job.part("all") is None
+    assert len(calls) == 1
+
+
+def test_who_listens_may_end_the_work():
+    """The exception is the listener's own, and the end is not told of a job that was ended."""
+    told = []
+
+    def stop(state):
+        told.append(state)
+        if state.share > 0.3:
+            raise LookupError("enough")
+
+    with pytest.raises(LookupError, match="enough"), Job({"all": 1.0}, stop) as job:
+        for k in range(10):
+            job.at(k / 10)
+    assert [state.share for state in told] == [0, 0.1, 0.2, 0.3, 0.4]
+
+
+def test_a_stage_of_unknown_length_goes_on_when_more_is_expected():
+    stage = OpenEnded()
+    shares = [stage.share(done, 200) for done in (0, 100, 200)] + [stage.share(done, 300) for done in (200, 250, 300)]
+    # Four fifths by the first expectation, then four fifths of what is left.
+    assert shares == pytest.approx([0, 0.4, 0.8, 0.8, 0.88, 0.96], abs=ROUNDING)
+    assert stage.share(400, 300) == pytest.approx(0.96, abs=ROUNDING), "never at its end before it is"
+    assert OpenEnded().share(0, 0) == 0

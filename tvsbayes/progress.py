@@ -1,0 +1,142 @@
+"""How far a wait has come: what is being done, how far, time left; it never goes backwards.
+
+A `Job` is a wait in named stages, each with the share of the time that it is expected to take. Whoever does the work
+says where it stands, and whoever waits is told by a callback, in the thread that works. An exception of the callback
+passes through and so ends the work.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from types import TracebackType
+
+
+@dataclass(frozen=True)
+class Progress:
+    """Where a wait stands.
+
+    Attributes:
+        doing: what is being done, in words.
+        share: of the whole work, from 0 to 1; it never falls, and 1 is the end.
+        seconds: since the beginning.
+        seconds_left: expected; it rises by no more than has passed. None while too little is known.
+    """
+
+    doing: str
+    share: float
+    seconds: float
+    seconds_left: float | None
+
+
+Show = Callable[[Progress], None]
+"""Takes the news of a wait."""
+Advance = Callable[[float], None]
+"""Takes the share of a stage that is done, from 0 to 1."""
+FORESEEN_SHARE, FORESEEN_SECONDS = 0.02, 0.5
+"""Share done and time passed from which the rest is foretold."""
+MEMORY = 0.2
+"""Part of the time passed over which the speed is averaged: stages are not equally well foreseen."""
+EXPECTED_LAST = 0.8
+"""Of what is left of a stage of unknown length, the share that ends at the length expected now: it may not suffice."""
+
+
+def unshown(share: float) -> None:
+    """For whoever need not know how far a stage is."""
+
+
+class Job:
+    """A wait in named stages, a context manager: the end is told where its block ends well.
+
+    Args:
+        stages: expected share of the time by what is done, in order, in any unit; those with 0 are not taken.
+        show: told how it stands; None for nobody.
+        clock: seconds.
+
+    Raises:
+        ValueError: no stage takes any time, or one takes less than none.
+    """
+
+    def __init__(
+        self, stages: Mapping[str, float], show: Show | None = None, clock: Callable[[], float] = time.monotonic
+    ):
+        total = sum(stages.values())
+        if not total > 0 or any(weight < 0 for weight in stages.values()):
+            raise ValueError(f"stages {dict(stages)}: shares of the time are not negative, and some are positive")
+        self._ends: dict[str, tuple[float, float]] = {}
+        before = 0.0
+        for doing, weight in stages.items():
+            after = before + weight / total
+            self._ends[doing] = before, after
+            before = after
+        self._show, self._clock, self._began = show, clock, clock()
+        self._stage = next(iter(stages))
+        self._told = Progress(self._stage, 0.0, 0.0, None)
+
+    def __enter__(self) -> Job:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if kind is None:
+            self._tell(self._told.doing, 1.0)
+
+    def begin(self, doing: str) -> None:
+        """Begin a stage; those before it are done, or were not needed. `KeyError` where there is no such stage."""
+        self._stage = doing
+        self.at(0.0)
+
+    def at(self, share: float, detail: str = "") -> None:
+        """Say how much of the present stage is done, with a detail in words; less than before changes no share."""
+        first, end = self._ends[self._stage]
+        if end > first:
+            doing = f"{self._stage}: {detail}" if detail else self._stage
+            self._tell(doing, first + min(max(share, 0.0), 1.0) * (end - first))
+
+    def part(self, doing: str) -> Show | None:
+        """Begin a stage that is a job of its own: its callback, None where nobody is told."""
+        self.begin(doing)
+        return None if self._show is None else lambda state: self.at(state.share, state.doing)
+
+    def _tell(self, doing: str, share: float) -> None:
+        if self._show is None:
+            return
+        seconds = max(self._clock() - self._began, self._told.seconds)
+        share = max(min(share, 1.0), self._told.share)
+        self._told = Progress(doing, share, seconds, self._left(share, seconds))
+        self._show(self._told)
+
+    def _left(self, share: float, seconds: float) -> float | None:
+        """Seconds left, by the speed so far, averaged."""
+        if share >= 1:
+            return 0.0
+        before, passed = self._told.seconds_left, seconds - self._told.seconds
+        if before is None and (share < FORESEEN_SHARE or seconds < FORESEEN_SECONDS):
+            return None
+        now = seconds * (1 - share) / max(share, FORESEEN_SHARE)
+        if before is None:
+            return now
+        expected = max(before - passed, 0.0)
+        weight = passed / (passed + MEMORY * seconds) if passed > 0 else 0.0
+        return min(expected + weight * (now - expected), before + passed)
+
+
+class OpenEnded:
+    """The share of a stage whose length is expected anew as it goes on: it nears its end without reaching it early."""
+
+    def __init__(self) -> None:
+        self._since, self._share, self._expected = 0.0, 0.0, 0.0
+
+    def share(self, done: float, expected: float) -> float:
+        """How much is done, after `done` of the `expected` steps or rounds; never falls while `done` does not."""
+        if expected > self._expected:
+            self._share = self._of(done)
+            self._since, self._expected = done, expected
+        return self._of(done)
+
+    def _of(self, done: float) -> float:
+        length = self._expected - self._since
+        part = min(max((done - self._since) / length, 0.0), 1.0) if length > 0 else 0.0
+        return self._share + EXPECTED_LAST * part * (1 - self._share)
