@@ -44,7 +44,7 @@ from tvsbayes.planning.search import Search
 from tvsbayes.planning.target import DEFAULT_TARGET, parse_target
 
 SIZES = (100, 1000, 10_000)
-REPEATS = 5
+REPEATS = 3
 INSTRUMENTS, DISTINCT, DESIGNS = 200, 24, (4, 8, 16, 32, 64)
 IMPORT = (sys.executable, "-c", "import jax, optimistix, scipy.stats")
 COMMAND = (sys.executable, "-m", "tvsbayes")
