@@ -34,10 +34,10 @@ BESIDE_THE_TWIN = {"calibration", "metrology", "results", *MODEL}
 """What the digital twin shares no formula with."""
 JAX_FREE_PACKAGES = (
     *("errors", "progress", "files", "instrument", "calibration", "metrology", "results", "twin"),
-    *("positioner", "acquisition", "report"),
+    *("coordinates", "positioner", "acquisition", "report"),
 )
 JAX_FREE_MODULES = (
-    *("statistics.intervals", "estimators.four_point", "estimators.plausibility", "coordinates.error_map"),
+    *("statistics.intervals", "estimators.four_point", "estimators.plausibility"),
     *("comparison.gap", "comparison.changes", "comparison.held_out"),
 )
 """Free of JAX until a function that fits is called, in packages that are not."""
