@@ -53,6 +53,10 @@ def effective_draws(weights: np.ndarray) -> float:
     return float(np.sum(weights) ** 2 / np.sum(weights**2))
 
 
+WEIGHTLESS = 1e-16
+"""Of the heaviest draw's weight: below it a draw changes no digit of any sum."""
+
+
 def weighted_mean(values: np.ndarray, weights: np.ndarray) -> np.ndarray:
     """Mean over the first axis; that of equal numbers is the number."""
     return values[0] + np.tensordot(weights, values - values[0], axes=1)
@@ -77,6 +81,9 @@ def weighted_quantiles(values: np.ndarray, weights: np.ndarray, probabilities: S
 def weighted_summary(values: np.ndarray, weights: np.ndarray) -> WeightedSummary:
     """Moments, interval, errors and effective draws of values (n, ...) with weights (n,)."""
     shape = values.shape[1:]
+    # Where a proposal went astray a value may be beyond all numbers, and nought times that is none.
+    counts = weights > WEIGHTLESS * weights.max()
+    values, weights = values[counts], weights[counts]
     flat, square = values.reshape(len(values), -1), weights**2
     centre = weighted_mean(flat, weights)
     deviation2 = (flat - centre) ** 2
