@@ -56,7 +56,8 @@ def bias(chain: np.ndarray) -> str:
 def tabulated(mean: np.ndarray, sd: np.ndarray, places: np.ndarray) -> Independence:
     """A proposal whose coordinates at `places` are skewed, Gumbel's density with that mode and scale."""
     at = (NODES - mean[places, None]) / sd[places, None]
-    return Independence.of(mean, sd, places, Tables.normalised(-at - np.exp(-at)))
+    tables, coupled = Tables.normalised(-at - np.exp(-at)), np.flatnonzero(np.arange(len(mean)) % 4 == 0)
+    return Independence(mean, sd, places, tables, coupled).moved(mean, sd, tables)
 
 
 def off_target(dimension: int) -> Independence:

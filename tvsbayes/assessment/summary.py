@@ -10,13 +10,13 @@ from dataclasses import replace
 
 import numpy as np
 
+from tvsbayes.assessment.prior_sensitivity import prior_sensitivity
 from tvsbayes.assessment.score_tests import validate
 from tvsbayes.assessment.weaknesses import (
     leverage,
     moved_directions,
     poorly_known_stops,
     prior_conflicts,
-    prior_sensitivity,
     weak_directions,
 )
 from tvsbayes.estimators.four_point import experiment_rows, four_point_ratios, ratio_slopes, select_experiments
@@ -243,7 +243,7 @@ def summarise(fit: JointFit, posterior: Posterior | None = None) -> FitSummary:
         excluded_spots=fit.excluded_spots,
         suspect_spots=fit.suspect_spots,
         prior_conflicts=prior_conflicts(fit),
-        prior_sensitivity=prior_sensitivity(fit, moved),
+        prior_sensitivity=prior_sensitivity(fit, moved, usable),
         estimator="laplace" if usable is None else "posterior",
         tier=None if usable is None else usable.tier,
         sampling=None if posterior is None else posterior.convergence.sampling,

@@ -1,4 +1,4 @@
-"""What the data leave open: weak directions, stops on which all hangs, priors that decide, directions with few stops.
+"""What the data leave open: weak directions, stops on which all hangs, priors in conflict, directions with few stops.
 
 Directions and gradients are those of the coordinates, each in sds of its prior; the linear model about the mode.
 """
@@ -13,7 +13,7 @@ from tvsbayes.instrument.axes import AXES, DIRECTIONS, SENSES
 from tvsbayes.instrument.campaign import ordered_spots
 from tvsbayes.instrument.parameters import INDEX, NAMES
 from tvsbayes.instrument.stops import few_stops, inseparable, legs_of, observed_stops, one_sided, separation
-from tvsbayes.results.estimates import Leverage, PriorSensitivity, WeakDirection
+from tvsbayes.results.estimates import Leverage, WeakDirection
 
 LEVERAGE_LIMIT = 2.0
 """A stop is named if a headline's sd would grow by more than this factor without it (formulation 4.2)."""
@@ -22,11 +22,6 @@ WEAK_VARIANCE = 0.5
 """A direction of parameter space is weak if more than this share of its prior variance is left."""
 CONFLICT_LIMIT = 4.0
 """Prior standard deviations; of fifty parameters one lies beyond it in 3 of 1000 honest campaigns."""
-SENSITIVE_SHIFT = 0.2
-"""Change of a headline, in its sds, when a prior is doubled or halved, from which it is listed."""
-SENSITIVE_SD = 0.1
-"""Relative change of a headline's sd from which it is listed."""
-SENSITIVITIES_LISTED = 16
 LISTED = 8
 
 
@@ -114,37 +109,6 @@ def gradients(fit: JointFit, values: np.ndarray) -> np.ndarray:
     centred = fit.draws_z - fit.draws_z.mean(axis=0)
     cross = (values - values.mean(axis=0)).T @ centred / len(centred)
     return np.linalg.solve(fit.covariance, cross.T).T
-
-
-def prior_sensitivity(fit: JointFit, moved: set[str]) -> tuple[PriorSensitivity, ...]:
-    """Each prior in turn doubled and halved in u, to first order about the mode (a refit of the linear model).
-
-    Twice the u divides the prior's precision 1 of a coordinate by four. The stereo calibration is one prior: all its
-    coordinates are scaled together. A half-normal is treated as normal in its coordinate.
-    """
-    quantities, gradients = headline_gradients(fit, moved)
-    rows = np.flatnonzero(fit.free)
-    hessian = np.linalg.inv(fit.covariance[np.ix_(rows, rows)])
-    gradients = gradients[:, rows]
-    sd = np.sqrt(np.einsum("qi,ij,qj->q", gradients, fit.covariance[np.ix_(rows, rows)], gradients))
-    pull = hessian @ fit.z[rows]
-    names = np.array(NAMES)[rows]
-    groups = {name: np.flatnonzero(names == name) for name in names if not name.startswith("stereo.")}
-    groups["stereo calibration"] = np.flatnonzero(np.char.startswith(names, "stereo."))
-    found = []
-    for parameter, members in groups.items():
-        for factor in (2.0, 0.5):
-            changed = hessian.copy()
-            changed[members, members] += factor**-2 - 1
-            values, vectors = np.linalg.eigh(changed)
-            inverse = (vectors / np.maximum(values, 1e-6)) @ vectors.T
-            shift = gradients @ (inverse @ pull - fit.z[rows]) / sd
-            ratio = np.sqrt(np.einsum("qi,ij,qj->q", gradients, inverse, gradients)) / sd
-            for k, quantity in enumerate(quantities):
-                if abs(shift[k]) > SENSITIVE_SHIFT or abs(np.log(ratio[k])) > np.log1p(SENSITIVE_SD):
-                    found.append(PriorSensitivity(str(parameter), quantity, factor, float(shift[k]), float(ratio[k])))
-    found.sort(key=lambda e: -max(abs(e.shift_sd), abs(np.log(e.sd_ratio))))
-    return tuple(found[:SENSITIVITIES_LISTED])
 
 
 def leverage(fit: JointFit, moved: set[str]) -> tuple[Leverage, ...]:

@@ -72,6 +72,7 @@ def _pool_arrays(pool: Pool) -> dict[str, np.ndarray]:
         "proposal_mean": np.stack([each.mean for each in every]),
         "proposal_sd": np.stack([each.sd for each in every]),
         "proposal_places": pool.next_proposal.places,
+        "proposal_coupled": pool.next_proposal.coupled,
         "proposal_tables": np.stack([each.tables.log_density for each in every]),
     }
 
@@ -79,7 +80,8 @@ def _pool_arrays(pool: Pool) -> dict[str, np.ndarray]:
 def _pool_of(stored: dict[str, np.ndarray]) -> Pool:
     """The pool of `_pool_arrays`."""
     parts = zip(stored["proposal_mean"], stored["proposal_sd"], stored["proposal_tables"], strict=True)
-    every = tuple(Independence(mean, sd, stored["proposal_places"], Tables(table)) for mean, sd, table in parts)
+    places, coupled = stored["proposal_places"], stored["proposal_coupled"]
+    every = tuple(Independence(mean, sd, places, Tables(table), coupled) for mean, sd, table in parts)
     counts = tuple(stored["pool_counts"].tolist())
     pool = Pool(stored["pool_w"], stored["pool_log_target"], every[:-1], counts, every[-1], int(stored["pool_invalid"]))
     if len(counts) != len(every) - 1 or not len(pool.w) == len(pool.log_target) == sum(counts):

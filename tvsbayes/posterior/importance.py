@@ -93,8 +93,9 @@ class Pool:
 
 def empty_pool(target: Target) -> Pool:
     """Before the first round."""
-    dimension = target.path.dimension
-    first = first_proposal(target, dimension, target.path.heavy)
+    path = target.path
+    dimension = path.dimension
+    first = first_proposal(target, dimension, path.heavy, path.coupled)
     return Pool(np.zeros((0, dimension)), np.zeros(0), (), (), first)
 
 

@@ -23,11 +23,15 @@ STEP = float(NODES[1] - NODES[0])
 FLOOR = -40.0
 """Of a tabulated log density below its largest: what lies lower is never drawn, and nought has no logarithm."""
 HEAVY_DOF = 5.0
+"""Of all t distributions but the one of the coupled coordinates."""
 OWN_SHARE = 0.1
 """Share of the proposals of a tabulated coordinate from a t of its mean and sd: the table is a cut, not a marginal."""
-HEAVY_SHARE = 0.1
+HEAVY_SHARE = 0.05
 """Share of the proposals from a multivariate t: it bounds the ratio target / proposal in the tails. In fifty
 dimensions a t alone puts most draws off the shell where the target lives: effective draws fell threefold."""
+COUPLED_SHARE, COUPLED_DOF, COUPLED_WIDTH = 0.2, 10.0, 1.2
+"""Share of the proposals whose coupled coordinates come from a multivariate t of so many times their sds. Without them
+single draws of the paper's protocol carried so much weight that half as many again were needed."""
 INFLATION = 1.03
 """Factor on the proposal's sds: one lighter than the target lets single draws weigh much, and walkers freeze."""
 VARIANCE_RANGE = 0.8, 1.7
@@ -56,10 +60,11 @@ class Target:
         return np.where(invalid, -np.inf, value - self.fit.log_density + found.log_jacobian)
 
 
-def _t_constant(dimension: int) -> float:
-    """Log of the normalisation of a multivariate t with `HEAVY_DOF` degrees of freedom and unit scale."""
-    value = special.gammaln(0.5 * (HEAVY_DOF + dimension)) - special.gammaln(0.5 * HEAVY_DOF)
-    return float(value - 0.5 * dimension * np.log(HEAVY_DOF * np.pi))
+def _log_t(distance2: np.ndarray, dimension: int, dof: float = HEAVY_DOF) -> np.ndarray:
+    """Log density of a multivariate t of unit scale at squared distances."""
+    constant = special.gammaln(0.5 * (dof + dimension)) - special.gammaln(0.5 * dof)
+    constant -= 0.5 * dimension * np.log(dof * np.pi)
+    return constant - 0.5 * (dof + dimension) * np.log1p(distance2 / dof)
 
 
 @dataclass(frozen=True)
@@ -114,60 +119,67 @@ class Tables:
 
 @dataclass(frozen=True)
 class Independence:
-    """Independent draws: every coordinate normal or tabulated, and a share of a multivariate t of the same scale.
+    """Independent draws of coordinates that are normal or tabulated, a share of them with a heavier part.
 
+    The mixture: every coordinate on its own; the coupled ones together from a multivariate t; all of them from another.
     Called by `emcee.moves.MHMove` with (points, generator); returns new points and ln q(old) - ln q(new).
 
     Attributes:
         mean, sd: of every coordinate, shape (d,).
         places: tabulated coordinates, shape (h,).
         tables: their densities.
+        coupled: places of the coupled coordinates, shape (c,).
     """
 
     mean: np.ndarray
     sd: np.ndarray
     places: np.ndarray
     tables: Tables
+    coupled: np.ndarray
 
-    @classmethod
-    def of(cls, mean: np.ndarray, sd: np.ndarray, places: np.ndarray, tables: Tables) -> Independence:
-        """With the means and sds of the tabulated coordinates as their tables have them."""
+    def moved(self, mean: np.ndarray, sd: np.ndarray, tables: Tables) -> Independence:
+        """Of other means, sds and tables; those of tabulated coordinates are as their tables have them."""
         mean, sd = mean.copy(), sd.copy()
-        mean[places], sd[places] = tables.moments
-        sd[places] *= INFLATION
-        return cls(mean, sd, places, tables)
+        mean[self.places], sd[self.places] = tables.moments
+        sd[self.places] *= INFLATION
+        return Independence(mean, sd, self.places, tables, self.coupled)
 
     def _each(self, w: np.ndarray) -> np.ndarray:
-        """Log density of the coordinates one by one, all together (n,)."""
+        """Log densities of the coordinates one by one, shape (n, d)."""
         distance2 = ((w - self.mean) / self.sd) ** 2
-        normal = -0.5 * np.log(2 * np.pi) - 0.5 * distance2 - np.log(self.sd)
-        own = distance2[:, self.places]
-        single = _t_constant(1) - 0.5 * (HEAVY_DOF + 1) * np.log1p(own / HEAVY_DOF) - np.log(self.sd[self.places])
+        found = -0.5 * np.log(2 * np.pi) - 0.5 * distance2 - np.log(self.sd)
+        single = _log_t(distance2[:, self.places], 1) - np.log(self.sd[self.places])
         table = self.tables.at(w[:, self.places])
-        normal[:, self.places] = np.logaddexp(np.log(1 - OWN_SHARE) + table, np.log(OWN_SHARE) + single)
-        return np.sum(normal, axis=1)
+        found[:, self.places] = np.logaddexp(np.log(1 - OWN_SHARE) + table, np.log(OWN_SHARE) + single)
+        return found
 
     def log_density(self, w: np.ndarray) -> np.ndarray:
         """Log density, shape (n,)."""
-        dimension = len(self.mean)
-        total2 = np.sum(((w - self.mean) / self.sd) ** 2, axis=1)
-        joint = _t_constant(dimension) - 0.5 * (HEAVY_DOF + dimension) * np.log1p(total2 / HEAVY_DOF)
-        joint -= np.sum(np.log(self.sd))
-        return np.logaddexp(np.log(1 - HEAVY_SHARE) + self._each(w), np.log(HEAVY_SHARE) + joint)
+        each, log_sd, some = self._each(w), np.log(self.sd), self.coupled
+        distance2 = ((w - self.mean) / self.sd) ** 2
+        alone = np.sum(each, axis=1)
+        partly = _log_t(np.sum(distance2[:, some], axis=1) / COUPLED_WIDTH**2, len(some), COUPLED_DOF)
+        partly += alone - np.sum(each[:, some], axis=1) - np.sum(log_sd[some] + np.log(COUPLED_WIDTH))
+        whole = _log_t(np.sum(distance2, axis=1), len(log_sd)) - np.sum(log_sd)
+        shares = np.log([1 - COUPLED_SHARE - HEAVY_SHARE, COUPLED_SHARE, HEAVY_SHARE])
+        return np.logaddexp.reduce(shares[:, None] + np.stack([alone, partly, whole]), axis=0)
 
     def draw(self, count: int, generator: np.random.RandomState) -> np.ndarray:
         """Independent draws, shape (count, d)."""
-        own = (count, len(self.places))
+        own, one = (count, len(self.places)), (count, 1)
         normal = generator.standard_normal((count, len(self.mean)))
         single = np.sqrt(generator.chisquare(HEAVY_DOF, own) / HEAVY_DOF)
-        joint = np.sqrt(generator.chisquare(HEAVY_DOF, (count, 1)) / HEAVY_DOF)
+        partly = np.sqrt(generator.chisquare(COUPLED_DOF, one) / COUPLED_DOF) / COUPLED_WIDTH
+        whole = np.sqrt(generator.chisquare(HEAVY_DOF, one) / HEAVY_DOF)
         tabulated = self.tables.draw(generator.uniform(size=own))
         alone = generator.uniform(size=own) < OWN_SHARE
-        together = generator.uniform(size=(count, 1)) < HEAVY_SHARE
-        each = self.mean + self.sd * normal
+        chance = generator.uniform(size=one)
+        found = self.mean + self.sd * normal
         at, sd = self.mean[self.places], self.sd[self.places]
-        each[:, self.places] = np.where(alone, at + sd * normal[:, self.places] / single, tabulated)
-        return np.where(together, self.mean + self.sd * normal / joint, each)
+        found[:, self.places] = np.where(alone, at + sd * normal[:, self.places] / single, tabulated)
+        some = np.isin(np.arange(len(self.mean)), self.coupled)
+        found = np.where((chance < COUPLED_SHARE) & some, self.mean + self.sd * normal / partly, found)
+        return np.where(chance > 1 - HEAVY_SHARE, self.mean + self.sd * normal / whole, found)
 
     def __call__(self, w: np.ndarray, generator: np.random.RandomState) -> tuple[np.ndarray, np.ndarray]:
         """The protocol of `emcee.moves.MHMove`."""
@@ -191,7 +203,7 @@ class Independence:
             return self
         near = np.clip((w[matters] - self.mean) / self.sd, -REACH, REACH)
         design = np.column_stack([np.ones(len(near)), near, near**2])
-        ratio = log_target[matters] - self._each(w[matters])
+        ratio = log_target[matters] - self._each(w[matters]).sum(axis=1)
         slope, square = np.split(np.linalg.lstsq(design, ratio, rcond=None)[0][1:], 2)
         variance = 1 / np.clip(1 - 2 * square, 0.6, 1.6)
         mean = self.mean + self.sd * np.clip(slope * variance, -1.0, 1.0)
@@ -201,10 +213,12 @@ class Independence:
             np.clip(x[self.places, None], -limit, limit) for x, limit in zip((slope, square), TILT_LIMITS, strict=True)
         )
         tables = Tables.normalised(self.tables.log_density + tilt * at + bend * at**2)
-        return Independence.of(mean, sd, self.places, tables)
+        return self.moved(mean, sd, tables)
 
 
-def first_proposal(target: Callable[[np.ndarray], np.ndarray], dimension: int, heavy: np.ndarray) -> Independence:
+def first_proposal(
+    target: Callable[[np.ndarray], np.ndarray], dimension: int, heavy: np.ndarray, coupled: np.ndarray
+) -> Independence:
     """Standard normal but for the heavy coordinates, whose densities are the target's along each of them.
 
     In w, where everything else is measured from its mean at a coordinate's value and by its width there, a cut through
@@ -214,10 +228,12 @@ def first_proposal(target: Callable[[np.ndarray], np.ndarray], dimension: int, h
         target: log density of points (n, d).
         dimension: d.
         heavy: coordinates to be tabulated, shape (d,), boolean.
+        coupled: those of which a share is drawn together, likewise.
     """
     places = np.flatnonzero(heavy)
     along = np.zeros((len(places), len(NODES), dimension))
     along[np.arange(len(places)), :, places] = NODES
     cuts = target(along.reshape(-1, dimension)) if len(places) else np.zeros(0)
     tables = Tables.normalised(cuts.reshape(len(places), len(NODES)))
-    return Independence.of(np.zeros(dimension), np.full(dimension, INFLATION), places, tables)
+    mean, sd = np.zeros(dimension), np.full(dimension, INFLATION)
+    return Independence(mean, sd, places, tables, np.flatnonzero(coupled)).moved(mean, sd, tables)

@@ -1,0 +1,155 @@
+"""What each stated prior does to the headlines: its u doubled and halved.
+
+Draws of a posterior are weighted by the ratio of the priors, which is exact; where too few draws bear it (a prior of
+many coordinates, or one that the data hardly touch), and for the Laplace approximation, the normal distribution with
+the same moments is changed instead.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from tvsbayes.assessment.weaknesses import headline_gradients
+from tvsbayes.estimators.joint_fit import JointFit
+from tvsbayes.instrument.axes import AXES, DIRECTIONS
+from tvsbayes.instrument.parameters import INDEX, KINDS, NAMES
+from tvsbayes.model.parameter_space import half_normal
+from tvsbayes.posterior.draws import Posterior
+from tvsbayes.results.estimates import PriorSensitivity
+from tvsbayes.statistics.weighted_draws import effective_draws, smoothed_weights, weighted_mean
+
+FACTORS = 2.0, 0.5
+SENSITIVE_SHIFT = 0.2
+"""Change of a headline, in its sds, when a prior is doubled or halved, from which it is listed."""
+SENSITIVE_SD = 0.1
+"""Relative change of a headline's sd from which it is listed."""
+LISTED = 16
+K_LIMIT, ENOUGH = 0.5, 1000
+"""Tail index of the new weights below which they are believed, and effective draws that they must leave: what lies two
+sds out in a posterior, where a prior in conflict with the data would pull, is known by few of its draws."""
+
+
+@dataclass(frozen=True)
+class Change:
+    """Of the headlines: shift in their present sds, and new sd over the present one; shape (quantities,)."""
+
+    shift_sd: np.ndarray
+    sd_ratio: np.ndarray
+
+
+@dataclass(frozen=True)
+class NormalModel:
+    """The d free coordinates as normal, and headlines linear in them.
+
+    Attributes:
+        mean: shape (d,).
+        precision: shape (d, d), that of the priors (the identity) in it.
+        gradient: of the headlines, shape (quantities, d).
+        sd: of the headlines, shape (quantities,).
+    """
+
+    mean: np.ndarray
+    precision: np.ndarray
+    gradient: np.ndarray
+    sd: np.ndarray
+
+    def changed(self, members: np.ndarray, factor: float) -> Change:
+        """With the u of some coordinates' prior times a factor, which divides its precision 1 by the square."""
+        precision = self.precision.copy()
+        precision[members, members] += factor**-2 - 1
+        values, vectors = np.linalg.eigh(precision)
+        covariance = (vectors / np.maximum(values, 1e-6)) @ vectors.T
+        # The data's share of the slope at nought stays.
+        mean = covariance @ (self.precision @ self.mean)
+        variance = np.einsum("qi,ij,qj->q", self.gradient, covariance, self.gradient)
+        before = np.einsum("qi,ij,qj->q", self.gradient, np.linalg.inv(self.precision), self.gradient)
+        return Change(self.gradient @ (mean - self.mean) / self.sd, np.sqrt(variance / before))
+
+
+@dataclass(frozen=True)
+class SampledHeadlines:
+    """Draws of the free coordinates z (n, d) and of the headlines (n, quantities), with their weights (n,)."""
+
+    z: np.ndarray
+    values: np.ndarray
+    weights: np.ndarray
+    half: np.ndarray
+    """Coordinates whose quantity is half-normal a priori, shape (d,)."""
+
+    @property
+    def normal(self) -> NormalModel:
+        """With the moments of the draws."""
+        mean, centre = weighted_mean(self.z, self.weights), weighted_mean(self.values, self.weights)
+        away, off = self.z - mean, self.values - centre
+        precision = np.linalg.inv((away * self.weights[:, None]).T @ away)
+        gradient = (off * self.weights[:, None]).T @ away @ precision
+        return NormalModel(mean, precision, gradient, np.sqrt(self.weights @ off**2))
+
+    def changed(self, members: np.ndarray, factor: float) -> Change | None:
+        """By the ratio of the priors; None where too few draws bear it."""
+        z = self.z[:, members]
+        # In units of the stated u: a half-normal quantity of its own value, all others of their coordinate.
+        stated = np.where(self.half[members], half_normal(z), z)
+        log_ratio = -0.5 * (factor**-2 - 1) * np.sum(stated**2, axis=1)
+        found = smoothed_weights(np.log(np.maximum(self.weights, np.finfo(float).tiny)) + log_ratio)
+        if found.pareto_k >= K_LIMIT or effective_draws(found.weights) < ENOUGH:
+            return None
+        mean, centre = weighted_mean(self.values, found.weights), weighted_mean(self.values, self.weights)
+        sd = np.sqrt(self.weights @ (self.values - centre) ** 2)
+        return Change((mean - centre) / sd, np.sqrt(found.weights @ (self.values - mean) ** 2) / sd)
+
+
+def sampled_headlines(fit: JointFit, moved: set[str], posterior: Posterior) -> tuple[list[str], SampledHeadlines]:
+    """Effective ratios and backlashes of a posterior's draws, with their names."""
+    draws, rows = posterior.joined, np.flatnonzero(fit.free)
+    ratios, physical = np.asarray(draws.effective_deg_per_step), np.asarray(draws.physical)
+    columns = {f"effective {d}": ratios[:, k] for k, d in enumerate(DIRECTIONS) if d in moved}
+    columns |= {f"backlash {axis}": physical[:, INDEX[f"backlash_deg.{axis}"]] for axis in AXES}
+    columns = {name: values for name, values in columns.items() if np.ptp(values) > 1e-12 * np.max(np.abs(values))}
+    half = np.zeros(len(NAMES), dtype=bool)
+    half[: len(fit.space.kind)] = np.asarray(fit.space.kind) == KINDS.index("half-normal")
+    z = posterior.z.reshape(-1, posterior.z.shape[-1])[:, rows]
+    values = np.stack(list(columns.values()), axis=1)
+    return list(columns), SampledHeadlines(z, values, posterior.weights.ravel(), half[rows])
+
+
+def prior_sensitivity(
+    fit: JointFit, moved: set[str], posterior: Posterior | None = None
+) -> tuple[PriorSensitivity, ...]:
+    """Each prior in turn doubled and halved in u. The stereo calibration is one prior: its coordinates go together.
+
+    Args:
+        fit: a joint fit.
+        moved: directions in which the campaign ever moved.
+        posterior: its sample; without it the Laplace approximation is changed, a half-normal as normal in its
+            coordinate.
+
+    Returns:
+        What changes a headline noticeably, largest first.
+    """
+    rows = np.flatnonzero(fit.free)
+    sampled = None
+    if posterior is None:
+        quantities, gradient = headline_gradients(fit, moved)
+        covariance = fit.covariance[np.ix_(rows, rows)]
+        gradient = gradient[:, rows]
+        sd = np.sqrt(np.einsum("qi,ij,qj->q", gradient, covariance, gradient))
+        normal = NormalModel(fit.z[rows], np.linalg.inv(covariance), gradient, sd)
+    else:
+        quantities, sampled = sampled_headlines(fit, moved, posterior)
+        normal = sampled.normal
+    names = np.array(NAMES)[rows]
+    groups = {name: np.flatnonzero(names == name) for name in names if not name.startswith("stereo.")}
+    groups["stereo calibration"] = np.flatnonzero(np.char.startswith(names, "stereo."))
+    found = []
+    for parameter, members in groups.items():
+        for factor in FACTORS:
+            change = None if sampled is None else sampled.changed(members, factor)
+            change = normal.changed(members, factor) if change is None else change
+            for quantity, shift, ratio in zip(quantities, change.shift_sd, change.sd_ratio, strict=True):
+                if abs(shift) > SENSITIVE_SHIFT or abs(np.log(ratio)) > np.log1p(SENSITIVE_SD):
+                    found.append(PriorSensitivity(str(parameter), quantity, factor, float(shift), float(ratio)))
+    found.sort(key=lambda e: -max(abs(e.shift_sd), abs(np.log(e.sd_ratio))))
+    return tuple(found[:LISTED])
