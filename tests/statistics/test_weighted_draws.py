@@ -70,4 +70,4 @@ def test_systematic_draws_take_each_as_often_as_its_weight_says():
     weights /= weights.sum()
     counts = np.bincount(systematic(weights, 1000, 0.5), minlength=400)
     assert np.all(np.abs(counts - 1000 * weights) < 1.0)
-    np.testing.assert_array_equal(systematic(np.full(10, 0.1), 5, 0.5), [1, 3, 5, 7, 9])
+    np.testing.assert_array_equal(systematic(np.full(10, 0.1), 5, 0.25), [0, 2, 4, 6, 8])
