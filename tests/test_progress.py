@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import itertools
-
 import pytest
+from support.waits import check_forward
 
 from tvsbayes.progress import FORESEEN_SECONDS, FORESEEN_SHARE, Job, OpenEnded
 
@@ -34,23 +33,11 @@ def followed(stages, steps):
     return told
 
 
-def never_backwards(told):
-    """The rules that hold of whatever is told of one wait."""
-    assert told[-1].share == 1 and told[-1].seconds_left == 0
-    for before, after in itertools.pairwise(told):
-        passed = after.seconds - before.seconds
-        assert after.share >= before.share and passed >= 0
-        if before.seconds_left is not None:
-            # Rounding of seconds that are read to 1e-16 of a hundred.
-            assert after.seconds_left <= before.seconds_left + passed + 1e-12
-    return True
-
-
 def test_stages_add_up_to_the_whole():
     told = followed({"one": 1.0, "nothing": 0.0, "two": 2.0, "three": 5.0}, [(1, n) for n in ("one", "two", "three")])
     assert [state.share for state in told] == pytest.approx([0, 1 / 8, 3 / 8, 1], abs=ROUNDING)
     assert [state.doing for state in told] == ["one", "two", "three", "three"]
-    assert never_backwards(told)
+    check_forward(told)
     again = followed({"one": 3.0, "two": 1.0}, [(1, 0.5), (1, 1.0), (1, "two"), (1, 0.25), (0, 9.0)])
     assert [state.share for state in again] == pytest.approx([3 / 8, 3 / 4, 3 / 4, 13 / 16, 1, 1], abs=ROUNDING)
 
@@ -65,7 +52,7 @@ def test_stages_without_time_are_not_told():
 
 def test_what_goes_backwards_is_not_told_so():
     told = followed({"one": 1.0, "two": 1.0}, [(1, 0.9), (1, 0.2), (1, "two"), (1, -3.0), (-9, 0.5), (1, "one")])
-    assert never_backwards(told)
+    check_forward(told)
     assert [state.share for state in told] == pytest.approx([0.45, 0.45, 0.5, 0.5, 0.75, 0.75, 1], abs=ROUNDING)
 
 
@@ -76,15 +63,34 @@ def test_time_left_of_an_even_job_is_right_from_the_beginning():
     assert known[0].share >= FORESEEN_SHARE and known[0].seconds >= FORESEEN_SECONDS and len(known) >= 99
     for state in known:
         assert state.seconds_left == pytest.approx(50 - state.seconds, abs=1e-9), "50 s, shares rounded to 1e-16"
-    assert never_backwards(told)
+    check_forward(told)
 
 
 def test_time_left_of_an_uneven_job_rises_with_the_clock_at_most():
     """A stage that takes fifty times what was expected, and one that takes nothing."""
     steps = [(0.1, k / 10) for k in range(10)] + [(0.0, "slow")] + [(5, k / 10) for k in range(10)] + [(0, "none")]
     told = followed({"fast": 1.0, "slow": 1.0, "none": 8.0}, steps)
-    assert never_backwards(told)
+    check_forward(told)
     assert max(state.seconds_left for state in told if state.seconds_left is not None) > 20, "or nothing could rise"
+
+
+@pytest.mark.parametrize("asked", [True, False])
+def test_what_was_not_needed_foretells_nothing(asked):
+    """Ten steps of a second each, after a stage of nine tenths whose result was there already."""
+    clock, told = Clock(), []
+    with Job({"fit": 9.0, "work": 1.0, "more": 0.0}, told.append, clock) as job:
+        if asked:
+            job.part("fit")
+        job.begin("work")
+        for k in range(1, 11):
+            clock.now_s += 1
+            job.at(k / 10)
+    check_forward(told)
+    known = [state for state in told if state.seconds_left is not None]
+    # A step is a hundredth of the whole: two of them are enough to foretell by.
+    assert len(known) == 10
+    for state in known:
+        assert state.seconds_left == pytest.approx(10 - state.seconds, abs=1e-9), "shares rounded to 1e-16"
 
 
 def test_a_job_within_a_job_fills_its_stage():
@@ -99,7 +105,7 @@ def test_a_job_within_a_job_fills_its_stage():
         *(("second", 1 / 4), ("second: c: 2 of 4", 5 / 8), ("second: c: 2 of 4", 1)),
         ("second: c: 2 of 4", 1),
     ]
-    assert never_backwards(told)
+    check_forward(told)
 
 
 def test_nobody_listens_nothing_is_read():

@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     from tvsbayes.pipeline import calibrate as calibrate
     from tvsbayes.posterior.draws import Posterior as Posterior
     from tvsbayes.posterior.sampling import sample as sample
+    from tvsbayes.progress import Progress as Progress
     from tvsbayes.report import figures as plots
     from tvsbayes.results.comparison_record import Comparison as Comparison
     from tvsbayes.results.estimates import FitSummary as FitSummary
@@ -55,6 +56,7 @@ _HOME = {
     "Locations": "coordinates.location",
     "ModelChoice": "instrument.model_choice",
     "Posterior": "posterior.draws",
+    "Progress": "progress",
     "TvsError": "errors",
     "calibrate": "pipeline",
     "calibration_of": "assessment.fitted_calibration",

@@ -73,6 +73,7 @@ class Job:
         self._show, self._clock, self._began = show, clock, clock()
         self._stage = next(iter(stages))
         self._told = Progress(self._stage, 0.0, 0.0, None)
+        self._silent, self._skipped = True, 0.0
 
     def __enter__(self) -> Job:
         return self
@@ -85,12 +86,16 @@ class Job:
 
     def begin(self, doing: str) -> None:
         """Begin a stage; those before it are done, or were not needed. `KeyError` where there is no such stage."""
+        before, done = self._ends[self._stage]
+        # What was passed over, or had nothing to tell, took no time by which the rest could be foretold.
+        self._skipped += max(self._ends[doing][0] - (before if self._silent else done), 0.0)
         self._stage = doing
         self.at(0.0)
 
     def at(self, share: float, detail: str = "") -> None:
         """Say how much of the present stage is done, with a detail in words; less than before changes no share."""
         first, end = self._ends[self._stage]
+        self._silent = False
         if end > first:
             doing = f"{self._stage}: {detail}" if detail else self._stage
             self._tell(doing, first + min(max(share, 0.0), 1.0) * (end - first))
@@ -98,6 +103,7 @@ class Job:
     def part(self, doing: str) -> Show | None:
         """Begin a stage that is a job of its own: its callback, None where nobody is told."""
         self.begin(doing)
+        self._silent = True
         return None if self._show is None else lambda state: self.at(state.share, state.doing)
 
     def _tell(self, doing: str, share: float) -> None:
@@ -113,9 +119,10 @@ class Job:
         if share >= 1:
             return 0.0
         before, passed = self._told.seconds_left, seconds - self._told.seconds
-        if before is None and (share < FORESEEN_SHARE or seconds < FORESEEN_SECONDS):
+        worked = share - self._skipped
+        if before is None and (worked < FORESEEN_SHARE or seconds < FORESEEN_SECONDS):
             return None
-        now = seconds * (1 - share) / max(share, FORESEEN_SHARE)
+        now = seconds * (1 - share) / max(worked, FORESEEN_SHARE)
         if before is None:
             return now
         expected = max(before - passed, 0.0)

@@ -9,9 +9,10 @@ import cv2
 import numpy as np
 import pytest
 from support.drawn_spots import HEIGHT, WIDTH, oval, picture, small_pair
+from support.waits import check_forward, doings
 
 from tvsbayes.cameras.contour import epipolar_refused
-from tvsbayes.cameras.detection import detect
+from tvsbayes.cameras.detection import DETECTING, LEARNING, detect
 from tvsbayes.cli.main import run
 from tvsbayes.errors import InputError, NothingToEstimate
 from tvsbayes.files.images import png_bytes
@@ -67,7 +68,12 @@ def speckled(tmp_path_factory) -> Folder:
 
 @pytest.fixture(scope="module")
 def found_plain(plain):
-    return detect(read_campaign(plain.path))
+    told = []
+    found = detect(read_campaign(plain.path), progress=told.append)
+    check_forward(told)
+    assert doings(told) == [LEARNING, DETECTING]
+    assert told[-2].doing == f"{DETECTING}: {found.processed} of {found.processed} looks"
+    return found
 
 
 @pytest.fixture(scope="module")

@@ -7,12 +7,13 @@ import sys
 
 import numpy as np
 import pytest
+from support.waits import check_forward, doings
 
 import tvsbayes
 from tvsbayes.cli.app import report_line
 from tvsbayes.instrument.campaign import read_campaign
 from tvsbayes.instrument.model_choice import ModelChoice
-from tvsbayes.pipeline import compile_for, fit_for
+from tvsbayes.pipeline import FITTING, SUMMARISING, compile_for, fit_for
 
 pytestmark = pytest.mark.usefixtures("own_compilation_cache")
 
@@ -60,7 +61,10 @@ def test_results_from_python_are_those_of_the_command(ask, grid_folder, tmp_path
     """The same document and draws, but for the command that made them; without a folder nothing is written."""
     assert ask("fit", grid_folder, "--no-sample", "--seed", 3)[0] == 0
     campaign = read_campaign(grid_folder)
-    results = tvsbayes.calibrate(campaign, str(tmp_path / "mine"), sampled=False, seed=3)
+    told = []
+    results = tvsbayes.calibrate(campaign, str(tmp_path / "mine"), sampled=False, seed=3, progress=told.append)
+    check_forward(told)
+    assert doings(told) == [FITTING, SUMMARISING]
     assert set(results.files) == {"draws", "fit"} and results.error is None
     by_command, mine = (tvsbayes.read_fit(f / "fit.json") for f in (grid_folder / "results", tmp_path / "mine"))
     assert {**by_command.as_json(), "command": ""} == {**mine.as_json(), "command": ""}

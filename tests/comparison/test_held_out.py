@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy import stats
+from support.waits import check_forward, doings
 
 from tvsbayes.comparison.held_out import folds_of, foretell_classic, hold_out
 from tvsbayes.comparison.scores import judge
@@ -38,7 +39,10 @@ def test_a_single_step_count_cannot_tell(paper_fit):
 
 
 def test_joint_foretells_a_step_count_it_never_saw(mixed_fit):
-    held = hold_out(mixed_fit)
+    told = []
+    held = hold_out(mixed_fit, progress=told.append)
+    check_forward(told)
+    assert [name.split(" =")[0] for name in doings(told)] == ["|N|"] * len(doings(told)) and len(doings(told)) > 1
     assert held.verdict == BETTER_JOINT and held.interval95[0] > 1
     assert held.joint.rms_block_deg < held.classic.rms_block_deg
     assert len(held.predictions) == len(select_experiments(mixed_fit.campaign).experiments)

@@ -22,6 +22,7 @@ from support.bent_rig import (
     twin_ray_at,
 )
 from support.published_equations import published_point
+from support.waits import check_forward
 
 from tvsbayes.calibration.pointing import DIVERGING_SHARE, INPUT_NAMES, NOISE_NAMES, Calibration, drawn
 from tvsbayes.coordinates.location import BLOCK, carry, locate, locate_linear, settings_of
@@ -121,7 +122,10 @@ def test_a_point_does_not_depend_on_its_neighbours():
     reading = rng.uniform(40.0, 65.0, 260)
     approach = [("left", "up"), ("right", "down"), ("unknown", "up"), ("left", "unknown")] * 65
     reading[7] = 150.0
-    many = locate(one, pan, tilt, reading, approach, draws=DRAWS)
+    told = []
+    many = locate(one, pan, tilt, reading, approach, draws=DRAWS, progress=told.append)
+    check_forward(told)
+    assert told[-1].doing == f"locating: {len(pan)} of {len(pan)} points"
     assert [i for i, error in enumerate(many.refused) if error is not None] == [7]
     for i in (0, 7, 8, 255, 256, 259):
         single = locate(one, pan[i], tilt[i], reading[i], approach[i], draws=DRAWS)

@@ -10,9 +10,11 @@ from itertools import pairwise
 import jax
 import numpy as np
 import pytest
+from support.waits import check_forward, doings
 
 from tvsbayes.errors import InputError, NothingToEstimate
-from tvsbayes.estimators.joint_fit import fit
+from tvsbayes.estimators.joint_fit import DIAGNOSING, NEWTON, fit
+from tvsbayes.estimators.mode_search import SEARCHING
 from tvsbayes.files.disk import shipped_data
 from tvsbayes.instrument.campaign import Campaign, ordered_spots
 from tvsbayes.instrument.model_choice import ModelChoice
@@ -38,7 +40,11 @@ def simulated(mounted_rig) -> SimulatedCampaign:
 
 @pytest.fixture(scope="module")
 def fitted(simulated):
-    return fit(simulated.campaign)
+    told = []
+    found = fit(simulated.campaign, progress=told.append)
+    check_forward(told)
+    assert doings(told)[-3:] == [SEARCHING, NEWTON, DIAGNOSING]
+    return found
 
 
 def with_priors(campaign: Campaign, **priors: Prior) -> Campaign:

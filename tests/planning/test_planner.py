@@ -9,6 +9,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from support.coarse_planning import with_priors
+from support.waits import check_forward, doings
 
 from tvsbayes.errors import InputError
 from tvsbayes.instrument.parameters import Prior
@@ -17,7 +18,7 @@ from tvsbayes.instrument.protocols import paper_protocol
 from tvsbayes.instrument.stops import FEW_STOPS
 from tvsbayes.planning.expectation import information_of, plan_minutes, prior_knowledge
 from tvsbayes.planning.looks import Looks
-from tvsbayes.planning.planner import few_looks, plan_from
+from tvsbayes.planning.planner import CHOOSING, COUNTING, EXCHANGING, JUDGING, LOOKING, few_looks, plan_from
 from tvsbayes.planning.search import Scope
 from tvsbayes.planning.target import DEFAULT_TARGET, parse_target
 from tvsbayes.report.command_text import plan_text
@@ -31,7 +32,11 @@ pytestmark = pytest.mark.usefixtures("small_searches")
 def result(knowledge):
     target = parse_target("u(worst) <= 5e-4 deg/step")
     scope = Scope(largest=12)
-    return plan_from(knowledge, target, scope=scope, draws=20, seed=1)
+    told = []
+    found = plan_from(knowledge, target, scope=scope, draws=20, seed=1, progress=told.append)
+    check_forward(told)
+    assert doings(told) == [LOOKING, CHOOSING, COUNTING, EXCHANGING, JUDGING]
+    return found
 
 
 def test_the_curve_is_monotone(result):

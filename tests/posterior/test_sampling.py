@@ -8,12 +8,13 @@ import jax
 import numpy as np
 import pytest
 from support.small_posterior import ROUNDING, SIGMAS, small_fit
+from support.waits import check_forward, doings
 
 from tvsbayes.errors import InputError, NotConverged
 from tvsbayes.posterior.chain import stored_chain
 from tvsbayes.posterior.diagnosis import diagnose
 from tvsbayes.posterior.proposal import Target
-from tvsbayes.posterior.sampling import WALKING, sample
+from tvsbayes.posterior.sampling import DRAWING, WALKING, sample
 
 LONG, SHORT, BLOCK = 96, 12, 6
 SEED = 3
@@ -78,10 +79,11 @@ def stored(file):
 
 def test_a_seed_gives_one_chain_also_when_interrupted(fitted, long, tmp_path, monkeypatch):
     limits(monkeypatch, SHORT)
-    unbroken = sample(fitted, seed=SEED, checkpoint=tmp_path / "unbroken.npz")
+    whole_wait, told = [], []
+    unbroken = sample(fitted, seed=SEED, checkpoint=tmp_path / "unbroken.npz", progress=whole_wait.append)
     assert unbroken.convergence.steps == SHORT
-
-    told = []
+    check_forward(whole_wait)
+    assert doings(whole_wait) == [DRAWING, WALKING] and len(whole_wait) > SHORT // BLOCK
 
     def interrupt(state):
         told.append(state.doing)

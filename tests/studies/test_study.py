@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import pytest
 from support.invented_studies import invented
+from support.waits import check_forward
 
 from tvsbayes.errors import NotConverged
 from tvsbayes.model.headlines import QUANTITIES
@@ -19,7 +20,10 @@ from tvsbayes.studies.study import study, study_result
 def test_a_study_goes_on_where_it_was_killed(job, quick, tmp_path):
     """The last row is torn, as a kill in the middle of a write leaves it: it is made again, the others are not."""
     path = tmp_path / "rows.jsonl"
-    whole = study(job, 9, StudyRows(path))
+    told = []
+    whole = study(job, 9, StudyRows(path), progress=told.append)
+    check_forward(told)
+    assert [state.doing for state in told[:-1]] == [f"campaigns: {n} of 9" for n in range(10)]
     data = path.read_bytes()
     assert data.count(b"\n") == 9
     cut = data[: data.rfind(b"\n", 0, -1) + 40]
@@ -27,11 +31,25 @@ def test_a_study_goes_on_where_it_was_killed(job, quick, tmp_path):
     quick.clear()
     again = StudyRows(path)
     assert again.torn == 39
-    assert study(job, 9, again) == whole
+    assert study(job, 9, again, progress=told.append) == whole
+    assert [state.doing for state in told[11:]] == [f"campaigns: {n} of 9" for n in (8, 9, 9)]
     assert quick == [8]
     assert path.read_bytes() == data
     quick.clear()
     assert study(job, 9, StudyRows(path)) == whole and quick == []
+
+
+def test_who_is_told_may_end_a_study_and_loses_no_row(job, quick, tmp_path):
+    def stop(state):
+        if "3 of 9" in state.doing:
+            raise LookupError("enough")
+
+    rows = StudyRows(tmp_path / "rows.jsonl")
+    with pytest.raises(LookupError, match="enough"):
+        study(job, 9, rows, progress=stop)
+    assert sorted(rows.of(job.key)) == [0, 1, 2]
+    whole = study(job, 9, StudyRows(tmp_path / "rows.jsonl"))
+    assert whole == study(job, 9, StudyRows(tmp_path / "other.jsonl"))
 
 
 def test_counts_of_a_perfect_estimator_are_within_bounds_and_of_a_boastful_one_outside(job):

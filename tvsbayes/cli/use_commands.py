@@ -35,7 +35,7 @@ from tvsbayes.progress import Job
 POINT_COLUMNS = ("pan_steps", "tilt_steps", "pan_approach", "tilt_approach", "aperture_deg")
 STEPS_MAX, ANGLE_MAX_DEG = 1e8, 360.0
 WORKERS = 2
-PLANNING = "plan"
+PLANNING, LOCATING = "plan", "points"
 
 
 @dataclass(frozen=True)
@@ -125,13 +125,13 @@ def locate(
 
 def _locate_all(campaign: Path, points: Points, draws: int, seed: int, as_json: bool) -> None:
     """Every point of a file, refused one by one."""
-    with waiting() as progress:
-        calibration = calibration_for(campaign, report_line, progress)
-    from tvsbayes.coordinates.location import locate as locate_points
-    from tvsbayes.report.command_text import locations_text
-
     where = (points.pan_steps, points.tilt_steps, points.aperture_deg, points.approach)
-    found = locate_points(calibration, *where, draws=draws, seed=seed)
+    with waiting() as progress, Job({FITTING: 1.0, LOCATING: 1.0}, progress) as job:
+        calibration = calibration_for(campaign, report_line, job.part(FITTING))
+        from tvsbayes.coordinates.location import locate as locate_points
+        from tvsbayes.report.command_text import locations_text
+
+        found = locate_points(calibration, *where, draws=draws, seed=seed, progress=job.part(LOCATING))
     entries = [found.as_json(k) for k in range(len(found.refused))]
     document = {"estimator": found.estimator, "draws": found.draws, "points": entries}
     finish(document, locations_text(found), as_json)

@@ -26,6 +26,7 @@ from tvsbayes.calibration.pointing import (
 )
 from tvsbayes.errors import InputError
 from tvsbayes.instrument.axes import HOME_APPROACH, sides_of
+from tvsbayes.progress import Job, Show
 from tvsbayes.statistics.intervals import NORMAL_95, Validation, symmetric_interval, validate
 
 DRAWS = 1000
@@ -202,6 +203,7 @@ def locate(
     *,
     draws: int = DRAWS,
     seed: int = 0,
+    progress: Show | None = None,
 ) -> Locations:
     """Where the scanner points: a calibration carried into frame T, draw by draw and by the law of propagation.
 
@@ -217,6 +219,7 @@ def locate(
         draws: number of draws, at least 500; 1000 give a 95 % half width to about 3 %.
         seed: of stop errors and aperture noise; they are the same for every point, so that a point does not depend
             on its neighbours in the list.
+        progress: told how far it is.
 
     Returns:
         Points with covariance and intervals; look at `refused`.
@@ -232,12 +235,15 @@ def locate(
         raise ValueError("no points: the lists are empty")
     given = drawn(calibration, draws, seed)
     size, parts = max(BLOCK // draws, 1), []
-    for begin in range(0, len(settings.steps), size):
-        block = settings[begin : begin + size]
-        parts.append(
-            _statistics(carry(calibration, given, block), locate_linear(calibration, block), given, calibration)
-        )
-    found = _together(parts)
+    with Job({"locating": 1.0}, progress) as job:
+        for begin in range(0, len(settings.steps), size):
+            block = settings[begin : begin + size]
+            parts.append(
+                _statistics(carry(calibration, given, block), locate_linear(calibration, block), given, calibration)
+            )
+            done = begin + len(block.steps)
+            job.at(done / len(settings.steps), f"{done} of {len(settings.steps)} points")
+        found = _together(parts)
     asked = zip(settings.steps.tolist(), settings.aperture_deg.tolist(), settings.side.tolist(), strict=True)
     refused = tuple(
         None if share <= DIVERGING_SHARE else calibration.refusal(pan, tilt, deg, (pan_side, tilt_side))

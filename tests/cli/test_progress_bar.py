@@ -1,0 +1,128 @@
+"""The bar is seen by whoever sits at a terminal and waits; nobody else gets a byte of it."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import pytest
+from support.commands import MOUNTED
+from support.pseudo_terminal import needs_pseudo_terminals
+
+from tvsbayes.cli.progress_bar import time_left
+
+SCRIPT = """
+import sys, threading
+from tvsbayes.cli import progress_bar
+from tvsbayes.progress import Job
+progress_bar.SHOWN_AFTER_SECONDS = float(sys.argv[1])
+with progress_bar.waiting() as show, Job({"looking": 1.0, "thinking": 3.0}, show) as job:
+    for thread in threading.enumerate():
+        if isinstance(thread, threading.Timer) and "silent" in sys.argv:
+            thread.join()
+    if "silent" not in sys.argv:
+        job.begin("thinking")
+        job.at(0.5, "2 of 4")
+    print("bar" if "rich" in sys.modules else "no bar")
+print("result")
+"""
+RENDERING = """
+import sys
+from tvsbayes.cli import main, progress_bar
+progress_bar.SHOWN_AFTER_SECONDS = 0.0
+sys.exit(main.run(sys.argv[1:]))
+"""
+AT_ONCE, NEVER = "0", "1000"
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What a process left: exit code, standard output, and what its terminal showed."""
+
+    code: int
+    stdout: str
+    terminal: str
+
+
+@contextmanager
+def screen() -> Iterator[tuple[int, int]]:
+    """Both ends of a pseudo-terminal."""
+    ends = os.openpty()
+    try:
+        yield ends
+    finally:
+        os.close(ends[0])
+
+
+def on_terminal(code: str, *arguments: str) -> Seen:
+    """Run Python with standard error on a pseudo-terminal."""
+    with screen() as (master, slave):
+        environment = {**os.environ, "TERM": "xterm-256color", "COLUMNS": "120"}
+        process = subprocess.Popen(
+            [sys.executable, "-c", code, *arguments], stdout=subprocess.PIPE, stderr=slave, env=environment
+        )
+        os.close(slave)
+        shown = b""
+        while True:
+            try:
+                part = os.read(master, 65536)
+            except OSError:
+                # Linux: nobody holds the other end any more.
+                break
+            if not part:
+                break
+            shown += part
+        stdout, _ = process.communicate()
+    return Seen(process.returncode, stdout.decode(), shown.decode())
+
+
+@needs_pseudo_terminals
+def test_a_wait_at_a_terminal_shows_what_how_far_and_goes_away():
+    seen = on_terminal(SCRIPT, AT_ONCE)
+    assert (seen.code, seen.stdout) == (0, "bar\nresult\n")
+    assert "thinking: 2 of 4" in seen.terminal and "100%" in seen.terminal
+    assert seen.terminal.endswith("\x1b[2K"), "the line is erased at last"
+
+
+@needs_pseudo_terminals
+def test_the_bar_comes_also_while_nothing_is_told():
+    """As in the first compilation, which says nothing for half a minute."""
+    seen = on_terminal(SCRIPT, AT_ONCE, "silent")
+    assert (seen.code, seen.stdout) == (0, "bar\nresult\n") and "%" in seen.terminal
+
+
+@needs_pseudo_terminals
+def test_a_short_wait_shows_nothing():
+    assert on_terminal(SCRIPT, NEVER) == Seen(0, "no bar\nresult\n", "")
+
+
+def test_without_a_terminal_nothing_is_shown_and_rich_stays_away():
+    done = subprocess.run([sys.executable, "-c", SCRIPT, AT_ONCE], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "no bar\nresult\n", "")
+
+
+@needs_pseudo_terminals
+def test_a_command_keeps_its_document_apart_from_the_bar(tmp_path):
+    plan = tmp_path / "plan.csv"
+    plan.write_text(
+        "step,action,pan_steps,tilt_steps,target,experiment,point\n0,home,0,0,,,\n1,place,,,d1,,\n2,look,,,,,\n"
+    )
+    rig = str(MOUNTED / "rig.toml")
+    seen = on_terminal(RENDERING, "simulate", rig, str(plan), str(tmp_path / "c"), "--frames", "--json")
+    document = json.loads(seen.stdout)
+    assert seen.code == 0 and document["pictures"] > 2
+    pairs = document["pictures"] // 2
+    assert f"rendering: {pairs} of {pairs} pairs" in seen.terminal
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text"),
+    [(None, ""), (0.2, "0 s left"), (99.4, "99 s left"), (150.0, "2 min left"), (3570.0, "60 min left")],
+)
+def test_time_left_in_words(seconds, text):
+    assert time_left(seconds) == text
