@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from support.coarse_planning import with_priors
+from support.waits import check_forward, doings
 
 from tvsbayes.errors import InputError
 from tvsbayes.instrument.axes import AXES, DIRECTION_SIGNS
@@ -17,7 +18,7 @@ from tvsbayes.instrument.protocols import four_point_protocol, grid_protocol, pa
 from tvsbayes.instrument.stops import INSEPARABLE, inseparable, separation
 from tvsbayes.planning.expectation import prior_knowledge
 from tvsbayes.planning.looks import Looks
-from tvsbayes.planning.plan_check import beyond_limits, check_plan, extended, judge
+from tvsbayes.planning.plan_check import CURING, JUDGING, beyond_limits, check_plan, extended, judge
 
 pytestmark = pytest.mark.usefixtures("small_searches")
 
@@ -43,7 +44,10 @@ def test_what_the_rig_holds_fixed_has_no_contraction(mounted_rig, fixed):
     """The model with one ratio per axis (formulation 3.1) is such a rig."""
     given = mounted_rig.table.priors
     rig = with_priors(mounted_rig, **{f"{fixed}__{a}": replace(given[f"{fixed}.{a}"], u=0.0) for a in ("pan", "tilt")})
-    check = check_plan(rig, grid_protocol(pan_steps=(0, 120, 240), tilt_steps=(-90, 0, 90)))
+    told = []
+    check = check_plan(rig, grid_protocol(pan_steps=(0, 120, 240), tilt_steps=(-90, 0, 90)), progress=told.append)
+    check_forward(told)
+    assert doings(told) == [JUDGING, CURING]
     name = "contrast" if fixed.startswith("ratio") else "backlash"
     document = json.loads(json.dumps(check.as_json(), allow_nan=False))
     assert {k for k, share in document["contraction"].items() if share is None} == {f"{name}.pan", f"{name}.tilt"}

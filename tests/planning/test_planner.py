@@ -18,7 +18,8 @@ from tvsbayes.instrument.protocols import paper_protocol
 from tvsbayes.instrument.stops import FEW_STOPS
 from tvsbayes.planning.expectation import information_of, plan_minutes, prior_knowledge
 from tvsbayes.planning.looks import Looks
-from tvsbayes.planning.planner import CHOOSING, COUNTING, EXCHANGING, JUDGING, LOOKING, few_looks, plan_from
+from tvsbayes.planning.plan_check import JUDGING
+from tvsbayes.planning.planner import CHOOSING, COUNTING, EXCHANGING, LOOKING, few_looks, plan_from
 from tvsbayes.planning.search import Scope
 from tvsbayes.planning.target import DEFAULT_TARGET, parse_target
 from tvsbayes.report.command_text import plan_text

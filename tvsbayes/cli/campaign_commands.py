@@ -177,7 +177,8 @@ def _held(path: Path, plan_file: Path | None) -> dict[str, Any]:
         from tvsbayes.planning.plan_check import check_plan
 
         compile_for(report_line)
-        return check_plan(rig, steps).as_json()
+        with waiting() as progress:
+            return check_plan(rig, steps, progress=progress).as_json()
     if path.suffix == ".csv" and not path.is_dir():
         steps = read_plan(path)
         actions = {action: sum(s.action == action for s in steps) for action in ("home", "place", "move", "look")}

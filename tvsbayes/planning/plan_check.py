@@ -22,13 +22,29 @@ from tvsbayes.instrument.rig import Rig
 from tvsbayes.instrument.stops import Stop, few_stops, inseparable, observed_stops, one_sided, separation
 from tvsbayes.model.headlines import QUANTITIES, headlines
 from tvsbayes.planning.candidates import Candidates, candidates
-from tvsbayes.planning.expectation import PARAMETERS, Knowledge, PlanInformation, information_of, prior_knowledge
+from tvsbayes.planning.expectation import (
+    PARAMETERS,
+    Knowledge,
+    PlanInformation,
+    expect,
+    information_of,
+    prior_knowledge,
+)
 from tvsbayes.planning.looks import LookArrays, Looks, arrange, covariance_of
 from tvsbayes.planning.search import Search
+from tvsbayes.progress import Job, Show
 from tvsbayes.results.estimates import CONTRACTION_LIMIT
 
 CURE_LOOKS = 24
 """Looks beyond which an addition is no small cure."""
+JUDGING, CURING = "judging the plan", "seeking a cure"
+JUDGED_SECONDS, EXPECT_COMPILED_SECONDS, CURED_SECONDS = 0.2, 12.0, 1.0
+"""What progress foretells with."""
+
+
+def judging_seconds() -> float:
+    """To expect of a plan's judgement."""
+    return JUDGED_SECONDS + expect.wait(EXPECT_COMPILED_SECONDS)
 
 
 @dataclass(frozen=True)
@@ -225,32 +241,36 @@ def _few_stops(knowledge: Knowledge, plan: Judged) -> list[str]:
     return [f"few stops ({named}): they will hardly tell their own scatter; add stops"] if named else []
 
 
-def check_plan(rig: Rig, steps: Sequence[PlanStep]) -> PlanCheck:
+def check_plan(rig: Rig, steps: Sequence[PlanStep], *, progress: Show | None = None) -> PlanCheck:
     """What a plan on a rig cannot tell apart, in words, and the smallest addition that would (formulation 6).
 
     Args:
         rig: priors, sheets, limits.
         steps: the plan.
+        progress: told how far it is.
 
     Raises:
         InputError: a plan that looks at nothing or places an unknown sheet.
     """
     knowledge = prior_knowledge(rig)
-    plan = judge(steps, knowledge)
-    information = plan.information
-    looks, seen = len(information.look_moves), int(information.expectation.seen.sum())
-    warnings = []
-    if seen < looks:
-        warnings.append(f"{looks - seen} of {looks} looks miss an image at the most probable instrument")
-    warnings += beyond_limits(rig.limits, information.moves)
-    found = None
-    texts = {axis: text for axis in AXES if (text := plan.fault(axis)) is not None}
-    if texts:
-        try:
-            found = candidates(knowledge)
-        except InputError as error:
-            warnings.append(f"no cure can be sought on this rig: {error.message}")
-    faults = tuple(_fault(steps, knowledge, found, plan, axis, text) for axis, text in texts.items())
+    with Job({JUDGING: judging_seconds(), CURING: CURED_SECONDS}, progress) as job:
+        job.begin(JUDGING)
+        plan = judge(steps, knowledge)
+        job.begin(CURING)
+        information = plan.information
+        looks, seen = len(information.look_moves), int(information.expectation.seen.sum())
+        warnings = []
+        if seen < looks:
+            warnings.append(f"{looks - seen} of {looks} looks miss an image at the most probable instrument")
+        warnings += beyond_limits(rig.limits, information.moves)
+        found = None
+        texts = {axis: text for axis in AXES if (text := plan.fault(axis)) is not None}
+        if texts:
+            try:
+                found = candidates(knowledge)
+            except InputError as error:
+                warnings.append(f"no cure can be sought on this rig: {error.message}")
+        faults = tuple(_fault(steps, knowledge, found, plan, axis, text) for axis, text in texts.items())
     warnings += [fault.text for fault in faults]
     warnings += _few_stops(knowledge, plan)
     depths = {s.target for s in steps if s.action == "place"}

@@ -27,7 +27,6 @@ from tvsbayes.planning.expectation import (
     Expectation,
     Knowledge,
     PlanInformation,
-    expect,
     information_of,
     knowledge_of,
     prior_knowledge,
@@ -41,7 +40,7 @@ from tvsbayes.planning.forecast import (
 )
 from tvsbayes.planning.limits import Limit, limit_of, next_experiments, split_of, stop_now
 from tvsbayes.planning.looks import LookArrays, Looks, Seen, covariance_of, information_of_looks, looks_wait
-from tvsbayes.planning.plan_check import judge
+from tvsbayes.planning.plan_check import JUDGING, judge, judging_seconds
 from tvsbayes.planning.search import LADDER, Scope, design_family, refine, smallest_design
 from tvsbayes.planning.target import Sensitivity, Target, sensitivity
 from tvsbayes.progress import Advance, Job, Show
@@ -328,12 +327,8 @@ def _size(
     return _Size(curve, n80, n95, n95 or n80 or largest)
 
 
-LOOKING, CHOOSING, COUNTING, EXCHANGING, JUDGING = (
-    *("looking from every place", "choosing looks", "counting experiments"),
-    *("exchanging looks", "judging the plan"),
-)
-"""Stages of planning."""
-EXPECT_COMPILED_SECONDS = 12.0
+LOOKING, CHOOSING = "looking from every place", "choosing looks"
+COUNTING, EXCHANGING = "counting experiments", "exchanging looks"
 
 
 def _stages(draws: int) -> dict[str, float]:
@@ -343,7 +338,7 @@ def _stages(draws: int) -> dict[str, float]:
         CHOOSING: 2.5,
         COUNTING: 2.0 * draws / PLAN_DRAWS,
         EXCHANGING: 3.0,
-        JUDGING: 0.2 + expect.wait(EXPECT_COMPILED_SECONDS),
+        JUDGING: judging_seconds(),
     }
 
 
