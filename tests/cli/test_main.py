@@ -125,6 +125,24 @@ def test_interrupt_is_130(say, monkeypatch):
     assert "interrupted" in log
 
 
+@pytest.mark.parametrize(("blocks", "kept"), [(0, False), (1, True)])
+def test_an_interrupted_fit_says_how_to_go_on_where_a_chain_is_kept(say, monkeypatch, blocks, kept):
+    """The chain is told of once when it begins; before its first block of steps there is none to keep."""
+    from tvsbayes.pipeline import SAMPLING
+    from tvsbayes.posterior.sampling import WALKING
+    from tvsbayes.progress import Progress
+
+    def interrupted(*_, progress, **__):
+        for _ in range(1 + blocks):
+            progress(Progress(f"{SAMPLING}: {WALKING}", 0.5, 1.0, None))
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("tvsbayes.cli.estimate_commands.compile_for", lambda tell: None)
+    monkeypatch.setattr("tvsbayes.cli.estimate_commands.calibrate", interrupted)
+    code, out, log = say("fit", PAPER_TWIN)
+    assert (code, out) == (130, "") and ("go on with --resume" in log) == kept
+
+
 def test_a_bug_is_no_bad_input(monkeypatch):
     """Only errors a user can act on become exit codes; anything else must not be hidden."""
 
