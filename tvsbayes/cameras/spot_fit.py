@@ -264,16 +264,17 @@ def fit_spot(patch: Patch, noise: SpotNoise) -> _Fitted | None:
         weights = usable / variance
         weighted = jacobian * weights
         normal = weighted @ jacobian.T
-        scale = np.sqrt(np.diag(normal)) + 1e-30
-        damping = 1e-12 if settled else 1e-3
+        scale = np.sqrt(normal.diagonal()) + 1e-30
+        normal /= scale[:, None] * scale
+        normal.flat[::10] += 1e-12 if settled else 1e-3
         try:
-            step = np.linalg.solve(normal / np.outer(scale, scale) + damping * np.eye(9), weighted @ residual / scale)
+            step = np.linalg.solve(normal, weighted @ residual / scale)
         except np.linalg.LinAlgError:
             return None
         step /= scale
         limits[1] = limits[2] = 1 / min(model.a, model.c)
         limits[4] = 0.4 * model.c
-        step *= min(1.0, float(np.min(limits / np.maximum(np.abs(step), 1e-300))))
+        step *= min(1.0, float((limits / np.maximum(np.abs(step), 1e-300)).min()))
         move, change = np.abs(step[1:3]).max() * max(model.a, model.c), np.abs(step[[0, 3, 5]]).max()
         # In sds of the spot; what is left after the last step is ten times less.
         if settled > 1 and move < 5e-4 and change < 5e-3:
