@@ -1,11 +1,43 @@
-"""What decides a row."""
+"""What decides a row, and what it takes from an estimator's draws."""
 
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from tvsbayes.instrument.parameters import INDEX, NAMES
 
 
 def test_seeds_do_not_depend_on_the_number_of_campaigns(job):
     seeds = [job.campaign_seed(i) for i in range(200)]
     assert len(set(seeds)) == 200 and all(0 <= s < 2**63 for s in seeds)
     assert replace(job, seed=8).campaign_seed(0) != seeds[0]
+
+
+def test_estimates_of_a_posterior_go_by_its_weights():
+    """Three draws of weights 1/2, 1/4, 1/4: means and variances by hand, and no draw counts as another."""
+    from tvsbayes.posterior.draws import Posterior
+    from tvsbayes.studies.study_job import sampled_estimates
+
+    weights = np.array([[0.5, 0.25, 0.25]])
+    physical = np.zeros((1, 3, len(NAMES)))
+    physical[0, :, INDEX["backlash_deg.pan"]] = [0.1, 0.3, 0.5]
+    ratio = np.zeros((1, 3, 4))
+    ratio[0, :, 0], ratio[0, :, 1] = [0.06, 0.07, 0.08], [0.05, 0.05, 0.09]
+    draws = SimpleNamespace(
+        physical=physical, effective_deg_per_step=ratio, effective_mirror_offset_mm=np.zeros((1, 3))
+    )
+    z = np.array([[[0.0, 1.0], [2.0, 1.0], [2.0, 5.0]]])
+    joined = SimpleNamespace(**{name: values[0] for name, values in vars(draws).items()})
+    posterior = Posterior(None, z, np.zeros((1, 3)), draws, weights, None, 0, 0.0)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Posterior, "joined", joined)
+        found = sampled_estimates(posterior)
+    np.testing.assert_allclose(found.z, [1.0, 2.0], rtol=1e-15)
+    np.testing.assert_allclose(found.covariance, [[1.0, 1.0], [1.0, 3.0]], rtol=1e-14)
+    left, right, *_, pan_contrast, tilt_contrast, pan_play, tilt_play, _ = found.value
+    assert (left, right, pan_contrast) == pytest.approx((0.0675, 0.06, 0.0075), rel=1e-12)
+    assert (tilt_contrast, pan_play, tilt_play) == pytest.approx((0.0, 0.25, 0.0), rel=1e-12)

@@ -37,7 +37,7 @@ def invented(job: StudyJob, index: int) -> StudyRow:
     one = HeadlineRow(0.06, 0.06 + 1e-4 * error, 1e-4, (0.0, 1.0), pit, 1e-4)
     target = 5e-4 if index % 4 else 2e-3
     headlines = dict.fromkeys(QUANTITIES, one)
-    return StudyRow(job.key, index, job.campaign_seed(index), True, 0, (), 1.0, headlines, target)
+    return StudyRow(job.key, index, job.campaign_seed(index), True, 0, (), 1.0, headlines, target, job.estimator)
 
 
 @pytest.fixture

@@ -6,7 +6,7 @@ Options in, library called, table or JSON out; heavy imports stand inside the co
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -14,7 +14,12 @@ from tvsbayes.cli.app import CampaignFolder, Json, Seed, finish, finite, report_
 from tvsbayes.cli.progress_bar import waiting
 from tvsbayes.errors import InputError, escaped
 from tvsbayes.files.disk import make_folder, output_place, shipped_data, write_atomically
-from tvsbayes.pipeline import calibrate, compile_for, unusable
+from tvsbayes.pipeline import FITTING, SAMPLING, calibrate, compile_for, unusable
+from tvsbayes.progress import Job, Show
+
+if TYPE_CHECKING:
+    from tvsbayes.instrument.campaign import Campaign
+    from tvsbayes.results.estimates import FitSummary
 
 DEMO_NOTE = "The twin's move history is our assumption, made so that the classic answer is the paper's Table 1."
 
@@ -33,9 +38,7 @@ def demo(
         for part in sorted(source.iterdir()):
             write_atomically(folder / part.name, part.read_bytes())
         report_line("paper twin: 96 four-point experiments of a simulated rig with known truth; fitting ...")
-        from tvsbayes.assessment.summary import summarise
         from tvsbayes.estimators.four_point import classic as estimate_classic
-        from tvsbayes.estimators.joint_fit import fit as fit_joint
         from tvsbayes.instrument.campaign import read_campaign
         from tvsbayes.report.fit_text import demo_text
         from tvsbayes.twin.physics import effective_deg_per_step, effective_mirror_offset_mm
@@ -48,9 +51,10 @@ def demo(
         # Evidence for reports takes as long again: only where it is kept.
         with waiting() as progress:
             if out is None:
-                summary = summarise(fit_joint(campaign, progress=progress))
+                summary = _sampled(campaign, progress)
             else:
-                summary = calibrate(campaign, out / "results", sampled=False, progress=progress).record.summary
+                results = calibrate(campaign, out / "results", tier="importance", progress=progress)
+                summary = results.record.summary
     pose = (summary.reference_pose_deg["pan"], summary.reference_pose_deg["tilt"])
     truth = {
         **effective_deg_per_step(true, pose),
@@ -60,6 +64,17 @@ def demo(
     }
     document = {"classic": classic_result.as_json(), "fit": summary.as_json(), "truth": truth}
     finish(document, f"{demo_text(classic_result, summary, truth)}\n\n{DEMO_NOTE}", as_json, unusable(summary))
+
+
+def _sampled(campaign: Campaign, progress: Show | None) -> FitSummary:
+    """A fit and its posterior by importance sampling."""
+    from tvsbayes.assessment.summary import summarise
+    from tvsbayes.estimators.joint_fit import fit
+    from tvsbayes.posterior.sampling import sample
+
+    with Job({FITTING: 1.0, SAMPLING: 1.0}, progress) as job:
+        found = fit(campaign, progress=job.part(FITTING))
+        return summarise(found, sample(found, "importance", progress=job.part(SAMPLING)))
 
 
 def new(out: Annotated[Path, typer.Argument(metavar="OUT", help="Folder to create.")], as_json: Json = False) -> None:

@@ -257,6 +257,9 @@ def study(
     scheduler: Annotated[str | None, typer.Option("--scheduler", help="Address of a Dask scheduler.")] = None,
     rows: Annotated[Path | None, typer.Option("--rows", help="File of rows (default: PLAN with .study.jsonl).")] = None,
     target: TargetText = None,
+    estimator: Annotated[
+        str, typer.Option("--estimator", help="importance (the posterior), or laplace, in half the time.")
+    ] = "importance",
     aperture: Annotated[bool, typer.Option("--aperture/--no-aperture", help="Looks also read the aperture.")] = False,
     seed: Seed = 0,
     as_json: Json = False,
@@ -279,10 +282,13 @@ def study(
     from tvsbayes.statistics.chances import ASSURED
     from tvsbayes.studies.rows import StudyRows
     from tvsbayes.studies.study import study as run_study
-    from tvsbayes.studies.study_job import StudyJob
+    from tvsbayes.studies.study_job import ESTIMATORS, StudyJob
 
+    if estimator not in ESTIMATORS:
+        allowed = " and ".join(ESTIMATORS)
+        raise InputError("usage", f"--estimator {escaped(estimator)}: allowed are {allowed}", remedy="choose one")
     compile_for(report_line)
-    job = StudyJob(instrument, steps, parse_target(target or DEFAULT_TARGET), seed, aperture)
+    job = StudyJob(instrument, steps, parse_target(target or DEFAULT_TARGET), seed, aperture, estimator)
     kept = StudyRows(rows or plan_file.with_suffix(".study.jsonl"))
     missing = n - sum(index < n for index in kept.of(job.key))
     report_line(f"{n} campaigns, {missing} to go on engine {escaped(engine)}; rows in {escaped(str(kept.path), 200)}")

@@ -219,12 +219,16 @@ def changes_text(comparison: Comparison) -> str:
     return f"{table}\n{comparison.verdict}{days} (limit {comparison.limit:.2f} u for all together; {cameras})"
 
 
+MADE_BY = {"importance": "posterior by importance sampling", "laplace": "Laplace approximation"}
+
+
 def study_text(result: StudyResult) -> str:
     """A study for people."""
     n, t = result.converged, result.target
     low, high = rms_bounds(n)
     lines = [
-        f"{result.campaigns} simulated campaigns, {n} fits converged; {result.seconds:.1f} s each",
+        f"{result.campaigns} simulated campaigns, {n} fits converged ({MADE_BY[result.estimator]}); "
+        f"{result.seconds:.1f} s each",
         "headline        median sd  RMS z  predicted  " + "  ".join(f"{100 * x:3.0f} %" for x in LEVELS) + "  power",
         f"bounds at {BOUND:g}        {low:.2f}-{high:.2f}".ljust(48)
         + "  ".join("{:.0f}-{:.0f}".format(*(100 * b for b in binomial_bounds(n, x))) for x in LEVELS),

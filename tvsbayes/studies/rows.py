@@ -30,7 +30,7 @@ class HeadlineRow:
         value: estimate.
         sd: its reported standard deviation.
         interval95: as reported.
-        pit: share of the fit's draws below the truth.
+        pit: weight of the estimator's draws below the truth.
         predicted_sd: what the planner predicted at that truth.
     """
 
@@ -57,12 +57,13 @@ class StudyRow:
         design: hash of what it belongs to.
         index: number of the campaign.
         seed: of the campaign.
-        converged: the fit ended well.
+        converged: the fit ended well, and so did its sampling.
         unseen: looks without a spot.
         problems: of the fit, in words.
         seconds: simulation and fit.
         headlines: by name.
         target: reported value of the target, None where the fit has none.
+        estimator: "importance" or "laplace", which rows without the word are of.
     """
 
     design: str
@@ -74,12 +75,13 @@ class StudyRow:
     seconds: float
     headlines: dict[str, HeadlineRow] = field(default_factory=dict)
     target: float | None = None
+    estimator: str = "laplace"
 
     def as_json(self) -> dict[str, object]:
         """Its line in a file of rows, less the format."""
         document = {**asdict(self), "problems": list(self.problems)}
         told = ("headlines", "target") if self.headlines else ()
-        order = ("design", "index", "seed", "converged", "unseen", "problems", *told, "seconds")
+        order = ("design", "index", "seed", "estimator", "converged", "unseen", "problems", *told, "seconds")
         return {name: document[name] for name in order}
 
     @classmethod
@@ -100,6 +102,7 @@ class StudyRow:
             seconds=float(document["seconds"]),
             headlines={str(k): HeadlineRow.from_json(h) for k, h in document.get("headlines", {}).items()},
             target=None if target is None else float(target),
+            estimator=str(document.get("estimator", "laplace")),
         )
 
 

@@ -62,6 +62,7 @@ class StudyResult:
 
     Attributes:
         design: its hash.
+        estimator: what the values of the rows come from, "importance" or "laplace".
         campaigns, converged: how many were simulated, and how many fits ended well.
         headlines: by name; one that the priors hold fixed is not estimated and left out.
         target: what was wanted.
@@ -72,6 +73,7 @@ class StudyResult:
     """
 
     design: str
+    estimator: str
     campaigns: int
     converged: int
     headlines: dict[str, HeadlineStudy]
@@ -130,6 +132,7 @@ def study_result(job: StudyJob, rows: Sequence[StudyRow]) -> StudyResult:
     low, middle, high = np.quantile(reported, [0.05, 0.5, 0.95]) if len(reported) else (math.nan,) * 3
     return StudyResult(
         design=job.key,
+        estimator=job.estimator,
         campaigns=len(rows),
         converged=n,
         headlines=found,

@@ -23,34 +23,40 @@ from tvsbayes.instrument.parameters import BLOCKS, INDEX
 from tvsbayes.instrument.plan import PlanStep
 from tvsbayes.instrument.rig import Rig, rig_table_toml
 from tvsbayes.instrument.stereo_pair import stereo_bytes
-from tvsbayes.model.headlines import QUANTITIES, headlines
+from tvsbayes.model.headlines import QUANTITIES, Derived, headlines
 from tvsbayes.model.parameter_space import half_normal_sd, half_normal_slope
 from tvsbayes.planning.drawn_rigs import instruments_in
 from tvsbayes.planning.expectation import Knowledge, information_of, prior_knowledge
 from tvsbayes.planning.looks import covariance_of
 from tvsbayes.planning.target import Target, sensitivity
+from tvsbayes.posterior.draws import Posterior
+from tvsbayes.posterior.sampling import sample
+from tvsbayes.statistics.weighted_draws import TAILS, weighted_mean, weighted_quantiles
 from tvsbayes.studies.rows import STUDY_FORMAT, HeadlineRow, StudyRow
 from tvsbayes.twin.physics import effective_deg_per_step, effective_mirror_offset_mm
 from tvsbayes.twin.simulated_campaign import Truth, simulate
 
 BACKLASH_COLUMNS = [INDEX[name] for name in BLOCKS["backlash_deg"]]
+ESTIMATORS = ("importance", "laplace")
+"""What a row's values come from: importance sampling of the posterior, or the Laplace approximation."""
 ITERATIONS = 6
 """Of slope and width of a backlash: the width's error falls at least threefold each."""
 
 
 @dataclass(frozen=True)
 class StudyJob:
-    """What a worker needs to make any row of a study."""
+    """What a worker needs to make any row of a study; `estimator` is one of `ESTIMATORS`."""
 
     rig: Rig
     steps: tuple[PlanStep, ...]
     target: Target
     seed: int = 0
     aperture: bool = False
+    estimator: str = "importance"
 
     @cached_property
     def key(self) -> str:
-        """SHA-256 of everything that decides the rows: program, rig, truth, cameras, plan, target, seed, reading."""
+        """SHA-256 of what decides the rows: program, rig, truth, cameras, plan, target, seed, reading, estimator."""
         rig = self.rig
         parts = [
             STUDY_FORMAT,
@@ -61,6 +67,8 @@ class StudyJob:
             json.dumps([sorted(rig.sheets_mm.items()), rig.spot_sd_px, sorted(rig.costs_s.items())]),
             json.dumps([[s.action, s.pan_steps, s.tilt_steps, s.target, s.experiment, s.point] for s in self.steps]),
             json.dumps([self.target.text, self.seed, self.aperture]),
+            # Rows of the days when there was no other keep their design.
+            *([] if self.estimator == "laplace" else [self.estimator]),
         ]
         return hashlib.sha256("\0".join(parts).encode()).hexdigest()
 
@@ -85,51 +93,89 @@ def true_headlines(parameters: Mapping[str, float], pose_rad: np.ndarray) -> np.
 
 
 def study_row(job: StudyJob, index: int) -> StudyRow:
-    """Simulate one campaign, fit it (Laplace), compare with the truth and with what the planner predicted there.
+    """Simulate one campaign, fit and sample it, compare with the truth and with what the planner predicted there.
 
-    Whatever fails is a row as well: failures are counted, never dropped.
+    Whatever fails is a row as well, weights that are not sound among it: failures are counted, never dropped.
     """
     start, seed = time.perf_counter(), job.campaign_seed(index)
     run = simulate(job.rig, job.steps, seed, aperture=job.aperture)
-    row = StudyRow(job.key, index, seed, False, sum(spot.status != "ok" for spot in run.campaign.spots), (), 0.0)
+    unseen = sum(spot.status != "ok" for spot in run.campaign.spots)
+    row = StudyRow(job.key, index, seed, False, unseen, (), 0.0, estimator=job.estimator)
     try:
         result = fit(run.campaign)
+        problems, found = tuple(result.problems), laplace_estimates(result)
+        if job.estimator == "importance" and result.converged:
+            posterior = sample(result, "importance", seed=seed % 2**32)
+            problems, found = posterior.convergence.missing, sampled_estimates(posterior)
     except TvsError as error:
         return replace(row, problems=(error.message,), seconds=time.perf_counter() - start)
     try:
-        at = sensitivity(job.target, result.z, result.space, job.rig.table, result.reference_pose_rad)
-        value = at.value(result.covariance, job.target.factor)
+        at = sensitivity(job.target, found.z, result.space, job.rig.table, result.reference_pose_rad)
+        value = at.value(found.covariance, job.target.factor)
     except InputError:
         value = None
     return replace(
         row,
-        converged=result.converged,
-        problems=tuple(result.problems),
-        headlines=_compared(job, result, run.truth),
+        converged=not problems,
+        problems=problems,
+        headlines=_compared(job, result, found, run.truth),
         target=value,
         seconds=time.perf_counter() - start,
     )
 
 
-def _compared(job: StudyJob, result: JointFit, true: Truth) -> dict[str, HeadlineRow]:
-    """Every headline of a fit beside the truth, and beside what the planner predicts at that truth."""
+@dataclass(frozen=True)
+class Estimates:
+    """What an estimator says of coordinates and headlines.
+
+    Attributes:
+        z: centre of the coordinates, shape (p,).
+        covariance: theirs, shape (p, p).
+        value: of `QUANTITIES`, shape (9,).
+        draws: of them, shape (n, 9).
+        weights: of the draws, sum 1, shape (n,).
+    """
+
+    z: np.ndarray
+    covariance: np.ndarray
+    value: np.ndarray
+    draws: np.ndarray
+    weights: np.ndarray
+
+
+def laplace_estimates(result: JointFit) -> Estimates:
+    """Of the mode and the approximation's draws."""
+    value = np.asarray(headlines(result.z, result.space, result.reference_pose_rad).value)
+    draws = _headline_draws(result.draws)
+    return Estimates(result.z, result.covariance, value, draws, np.full(len(draws), 1 / len(draws)))
+
+
+def sampled_estimates(posterior: Posterior) -> Estimates:
+    """Of a posterior's draws."""
+    z, weights = posterior.z.reshape(-1, posterior.z.shape[-1]), posterior.weights.ravel()
+    draws = _headline_draws(posterior.joined)
+    covariance = np.cov(z, rowvar=False, aweights=weights, ddof=0)
+    return Estimates(weighted_mean(z, weights), covariance, weighted_mean(draws, weights), draws, weights)
+
+
+def _compared(job: StudyJob, result: JointFit, found: Estimates, true: Truth) -> dict[str, HeadlineRow]:
+    """Every headline beside the truth, and beside what the planner predicts at that truth."""
     knowledge, pose = prior_knowledge(job.rig), result.reference_pose_rad
     instruments = instruments_in(knowledge, [true])
     z, space = instruments.z[0], instruments.space_of(0)
     information = information_of(job.steps, knowledge, aperture=job.aperture, z=z, space=space)
     at_truth = headlines(z, space, pose)
-    at_mode = headlines(result.z, result.space, pose)
     predicted = predicted_sds(knowledge, information.fisher, np.asarray(at_truth.gradient), z)
-    values, draws = true_headlines(true.parameters, pose), _headline_draws(result)
-    low, high = np.quantile(draws, [0.025, 0.975], axis=0)
-    sd = draws.std(axis=0)
+    values = true_headlines(true.parameters, pose)
+    low, high = weighted_quantiles(found.draws, found.weights, TAILS)
+    sd = np.sqrt(found.weights @ (found.draws - weighted_mean(found.draws, found.weights)) ** 2)
     return {
         name: HeadlineRow(
             truth=float(values[k]),
-            value=float(at_mode.value[k]),
+            value=float(found.value[k]),
             sd=float(sd[k]),
             interval95=(float(low[k]), float(high[k])),
-            pit=float(np.mean(draws[:, k] < values[k])),
+            pit=float(found.weights @ (found.draws[:, k] < values[k])),
             predicted_sd=float(predicted[k]),
         )
         for k, name in enumerate(QUANTITIES)
@@ -161,8 +207,8 @@ def predicted_sds(knowledge: Knowledge, fisher: np.ndarray, gradient: np.ndarray
     return np.sqrt(np.einsum("qi,ij,qj->q", gradient * scale, covariance, gradient * scale))
 
 
-def _headline_draws(result: JointFit) -> np.ndarray:
-    """`QUANTITIES` of the Laplace draws, shape (draws, 9)."""
-    ratio, offset_mm = np.asarray(result.draws.effective_deg_per_step), result.draws.effective_mirror_offset_mm
-    backlash = np.asarray(result.draws.physical)[:, BACKLASH_COLUMNS]
+def _headline_draws(draws: Derived) -> np.ndarray:
+    """`QUANTITIES` of draws, shape (draws, 9)."""
+    ratio, offset_mm = np.asarray(draws.effective_deg_per_step), draws.effective_mirror_offset_mm
+    backlash = np.asarray(draws.physical)[:, BACKLASH_COLUMNS]
     return np.column_stack([ratio, ratio[:, ::2] - ratio[:, 1::2], backlash, offset_mm])
