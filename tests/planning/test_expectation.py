@@ -14,7 +14,14 @@ from tvsbayes.instrument.plan import PlanStep, run_plan
 from tvsbayes.instrument.protocols import four_point_protocol, paper_protocol
 from tvsbayes.model.headlines import QUANTITIES
 from tvsbayes.planning.drawn_rigs import instruments_in
-from tvsbayes.planning.expectation import NOISE_COLUMNS, design_arrays, information_of, plan_minutes, prior_knowledge
+from tvsbayes.planning.expectation import (
+    NOISE_COLUMNS,
+    design_arrays,
+    expect,
+    information_of,
+    plan_minutes,
+    prior_knowledge,
+)
 from tvsbayes.planning.looks import covariance_of
 from tvsbayes.planning.target import Target, sensitivity
 from tvsbayes.twin.simulated_campaign import Truth, draw_truth, simulate
@@ -82,6 +89,14 @@ def test_more_looks_never_raise_a_variance(knowledge):
         assert np.all(variance <= previous * (1 + ROUNDING)), count
         previous = variance
     assert previous[INDEX["degrees_per_step.pan"]] < 0.01
+
+
+def test_plans_of_any_ordinary_size_share_one_trace(knowledge):
+    information_of(paper_protocol(1), knowledge)
+    traces = expect.traces
+    for plan in (paper_protocol(1)[:7], four_point_protocol(30), paper_protocol()):
+        information_of(plan, knowledge)
+    assert expect.traces == traces
 
 
 def test_mirroring_a_counter_swaps_names(mounted_rig, knowledge):
