@@ -9,10 +9,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy import stats
 from support.small_posterior import ROUNDING, small_fit, small_path
+from support.two_parameters import BACKLASH, RATIO, route
 
 from tvsbayes.estimators.linear_spots import linear_spots, stop_information
-from tvsbayes.instrument.parameters import INDEX
+from tvsbayes.instrument.parameters import INDEX, NAMES
 from tvsbayes.model.compiled import BATCH, in_batches
 from tvsbayes.posterior.proposal import Target
 from tvsbayes.posterior.ridges import by_width, stop_states
@@ -186,3 +188,29 @@ def test_a_density_without_value_is_refused_and_counted(x64, monkeypatch):
     assert target.invalid == len(without), "the filling of the last batch is no evaluation"
     target(w)
     assert target.invalid == 2 * len(without)
+
+
+def test_a_ratio_follows_the_degrees_of_a_backlash():
+    """Along the ridge of both the ratio is linear in b, and b = halfnorm.ppf(Phi(z)) by SciPy's own law."""
+    at = 0.4
+    mode = np.zeros(len(NAMES))
+    mode[BACKLASH] = at
+    ridge = replace(route(), mode=mode, root=np.array([[1.2, 0.0], [-0.6, 0.05]]))
+    y = np.column_stack([np.linspace(-3.0, 3.0, 13), np.zeros(13)])
+    z = ridge.from_whitened(y)
+
+    def play(z):
+        return stats.halfnorm.ppf(stats.norm.cdf(z))
+
+    np.testing.assert_allclose(z[:, BACKLASH], at + 1.2 * y[:, 0], rtol=1e-12)
+    slope = (play(at + 1e-5) - play(at - 1e-5)) / 2e-5
+    # A central difference of 1e-5 is good to 1e-10 of the slope, SciPy's two laws to 1e-12.
+    np.testing.assert_allclose(z[:, RATIO], -0.5 * (play(z[:, BACKLASH]) - play(at)) / slope, atol=1e-8)
+    apart = ridge.from_whitened(y + np.array([0.0, 1.0])) - z
+    np.testing.assert_allclose(apart[:, RATIO], 0.05, rtol=1e-9)
+
+
+def test_no_coordinates_have_an_order():
+    """Where only the noise is estimated, nothing is left to whiten."""
+    order = by_width(np.zeros((0, 0)))
+    assert order.shape == (0,) and np.zeros(3)[order].shape == (0,)

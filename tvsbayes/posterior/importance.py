@@ -129,13 +129,13 @@ def reweighted_posterior(fit: JointFit, path: Transport, pool: Pool, seed: int, 
     names = [name for name, column in columns.items() if name not in fixed and np.ptp(column) > 0]
     every = weighted_summary(np.stack([columns[name] for name in names], axis=1), weights)
     least = dict(zip(names, every.ess_least.tolist(), strict=True))
-    headlines = [name for name in headline_names(fit) if name in least]
-    tails = {}
+    # Where nothing that a fit is for is left open, everything else stands for it.
+    headlines = [name for name in headline_names(fit) if name in least] or names
+    raw = np.exp(log_weights - np.max(log_weights))
+    kish, tails = effective_draws(raw), {}
     for name in headlines:
         deviation = columns[name] - every.mean[names.index(name)]
-        tails[name] = pareto_k(weights * deviation**2)
-    raw = np.exp(log_weights - np.max(log_weights))
-    kish = effective_draws(raw)
+        tails[name] = pareto_k(raw[finite] * deviation**2)
     importance = Importance(
         accepted=True,
         missing=(),

@@ -1,0 +1,141 @@
+"""Verdicts on chains whose quality is known (formulation 4.3): every limit is crossed alone."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from support.two_parameters import AT_MODE, BACKLASH, RATIO, STRETCH, autoregressive, fit, route
+
+from tvsbayes.instrument.parameters import NAMES
+from tvsbayes.posterior.chain import Chain
+from tvsbayes.posterior.diagnosis import AGREEMENT_LIMIT, GROUPS, diagnose, grouped
+from tvsbayes.posterior.draws import Posterior
+from tvsbayes.posterior.transport import STRETCH_NODES
+from tvsbayes.results.convergence import Importance, NamedValue, Reweighted
+
+WALKERS, STEPS = 64, 400
+
+
+def log_normal_density(z: np.ndarray) -> np.ndarray:
+    """The target in z: standard normal in both coordinates, `AT_MODE` at the mode."""
+    return AT_MODE - 0.5 * (z[..., RATIO] ** 2 + z[..., BACKLASH] ** 2)
+
+
+def chain_of(z: np.ndarray) -> Chain:
+    """A chain (steps, walkers, 2) of z as the sampler would hold it: w, and the density that `Target` gives it."""
+    log_factor = STRETCH * np.maximum(z[..., 0], STRETCH_NODES[0])
+    w = np.stack([z[..., 0], z[..., 1] * np.exp(-log_factor)], axis=-1)
+    log_density = -0.5 * np.sum(z**2, axis=-1) + log_factor
+    accepted = np.full(z.shape[1], 0.4 * len(z))
+    return Chain(w, log_density, accepted, (), 0, 1.0, len(z))
+
+
+def independent(steps: int = STEPS) -> np.ndarray:
+    return np.random.default_rng(1).standard_normal((steps, WALKERS, 2))
+
+
+def derived_at(fit, z, pose):
+    """Headlines of the two parameters alone."""
+    zero = np.zeros(z.shape[:2])
+    return SimpleNamespace(
+        physical=z, effective_deg_per_step=np.zeros((*z.shape[:2], 4)), effective_mirror_offset_mm=zero
+    )
+
+
+@pytest.fixture
+def judged(monkeypatch):
+    """Diagnosis of a chain, by default after importance sampling that was not accepted: it is judged alone."""
+    monkeypatch.setattr("tvsbayes.posterior.diagnosis.derived_at", derived_at)
+    monkeypatch.setattr("tvsbayes.posterior.diagnosis.headline_names", lambda fit: (NAMES[RATIO], NAMES[BACKLASH]))
+    refused = SimpleNamespace(converged=False, seed=0, convergence=SimpleNamespace(importance=None))
+
+    def judge(chain: Chain, first: object = refused) -> Posterior:
+        return diagnose(fit(), SimpleNamespace(path=route(), posterior=first), chain)
+
+    return judge
+
+
+def test_independent_draws_have_converged_and_keep_their_density(judged):
+    found = judged(chain_of(independent()))
+    assert found.converged, found.convergence.missing
+    assert found.convergence.stuck_walkers == ()
+    np.testing.assert_allclose(found.log_density, log_normal_density(found.z), rtol=1e-12)
+
+
+def test_groups_of_other_means_are_told_by_r_hat(judged):
+    """Halves of four groups count as eight chains: of means +-0.25 their variance is 8/7 of 1/16, R-hat 1.035."""
+    z = independent()
+    z[..., 1] += 0.25 * np.repeat([1.0, -1.0] * (GROUPS // 2), WALKERS // GROUPS)
+    missing = "; ".join(judged(chain_of(z)).convergence.missing)
+    value = float(re.search(r"R-hat of \S+ is ([\d.]+), wanted 1.01", missing)[1])
+    # The 500 draws of half a group tell its mean to 0.045: 0.25 +- 0.045 is 1.035 +- 0.012.
+    assert value == pytest.approx(1.035, abs=0.02)
+
+
+def test_too_few_effective_draws_are_told(judged):
+    """80 of 100 steps of 64 walkers with memory 0.9, nineteen steps to an independent draw: 270, of the tails more."""
+    missing = "; ".join(judged(chain_of(autoregressive(100, WALKERS, 0.9))).convergence.missing)
+    for kind in ("bulk", "tail"):
+        value = int(re.search(rf"has (\d+) {kind} effective draws, wanted 1000", missing)[1])
+        assert 100 < value < 1000
+
+
+def test_a_chain_of_few_autocorrelation_times_is_told(judged):
+    """Memory 0.9: 19 steps to an independent draw, 16 of them in the chain, known badly from so few."""
+    missing = "; ".join(judged(chain_of(autoregressive(STEPS, WALKERS, 0.9))).convergence.missing)
+    value = int(re.search(r"steps are (\d+) autocorrelation times, wanted 50", missing)[1])
+    assert 8 < value < 40
+
+
+def test_a_walker_is_stuck_that_hardly_moves_or_lives_at_another_density(judged):
+    chain = chain_of(independent())
+    idle, away = chain.accepted.copy(), chain.log_density.copy()
+    idle[7] *= 0.2
+    away[:, 9] -= 40.0
+    for changed, stuck in ((replace(chain, accepted=idle), 7), (replace(chain, log_density=away), 9)):
+        convergence = judged(changed).convergence
+        assert convergence.stuck_walkers == (stuck,)
+        assert convergence.missing[-1] == f"stuck walkers: {stuck}"
+
+
+def weighted(shift: float = 0.0) -> Posterior:
+    """The same two normals by 8000 draws of twice their variance, accepted; the ratio shifted by so many sds."""
+    draws = np.sqrt(2) * np.random.default_rng(7).standard_normal((8000, 2))
+    weights = np.exp(-0.25 * np.sum(draws**2, axis=1))
+    weights /= weights.sum()
+    z = np.zeros((1, 8000, len(NAMES)))
+    z[0][:, [BACKLASH, RATIO]] = draws + np.array([0.0, shift])
+    worst = NamedValue(NAMES[RATIO], 0.1)
+    importance = Importance(True, (), 8, 8000, 0.5, worst, 0.1, worst, 0.001, 0.0, 0.01, 0)
+    found = derived_at(None, z, None)
+    return Posterior(None, z, np.zeros((1, 8000)), found, weights[None], Reweighted(importance, {}, {}), 0, 0.0)
+
+
+def test_a_chain_that_says_the_same_as_importance_sampling_agrees(judged):
+    found = judged(chain_of(independent()), weighted())
+    assert found.converged and found.convergence.agreement.agrees
+    assert found.convergence.agreement.worst.value < AGREEMENT_LIMIT
+    assert found.convergence.importance.draws == 8000
+
+
+def test_a_chain_that_says_something_else_has_not_converged(judged):
+    """A tenth of an sd: the chain's 5000 draws know a mean to 0.014, the weighted 8000, worth 3600, to 0.017: 4.5."""
+    found = judged(chain_of(independent()), weighted(-0.15))
+    agreement = found.convergence.agreement
+    assert not found.converged and not agreement.agrees
+    assert agreement.worst.quantity.startswith(NAMES[RATIO]) and agreement.worst.value > AGREEMENT_LIMIT
+    (said,) = found.convergence.missing
+    words = f"emcee and importance sampling differ on {agreement.worst.quantity} by {agreement.worst.value:.1f} Monte"
+    assert said.startswith(words)
+
+
+def test_groups_are_neighbours_in_order_of_time():
+    """Of eight walkers, two each: their draws alternate, the first of both before the second of both."""
+    values = 10 * np.arange(2 * GROUPS)[:, None] + np.arange(3)
+    found = grouped(values)
+    assert found.shape == (GROUPS, 6)
+    np.testing.assert_array_equal(found[1], [20, 30, 21, 31, 22, 32])
