@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from tvsbayes.instrument.axes import DIRECTIONS
-from tvsbayes.instrument.parameters import INDEX
+from tvsbayes.instrument.parameters import BLOCKS, INDEX
 from tvsbayes.statistics.chances import BOUND, LEVELS, binomial_bounds, rms_bounds
 from tvsbayes.studies import study_job
 
@@ -21,6 +21,8 @@ HEADLINES = (
     *("contrast pan", "contrast tilt", "backlash pan", "backlash tilt", "effective mirror offset"),
 )
 """In the order of `tvsbayes.model.headlines.QUANTITIES`."""
+MEAN_RATIOS = ("mean ratio pan", "mean ratio tilt")
+"""Headlines too, in the tables that name them: the gears' own, without the mirrors."""
 SHRINK = 0.8
 """A table whose sds are multiplied by this has to fail, or its test could not."""
 LEAST_CONTRACTION = 0.1
@@ -40,16 +42,22 @@ def headlines(draws) -> dict[str, np.ndarray]:
         physical[..., INDEX["backlash_deg.pan"]],
         physical[..., INDEX["backlash_deg.tilt"]],
         np.asarray(draws.effective_mirror_offset_mm),
+        *(physical[..., INDEX[name]] for name in BLOCKS["degrees_per_step"]),
     )
-    return dict(zip(HEADLINES, each, strict=True))
+    return dict(zip(HEADLINES + MEAN_RATIOS, each, strict=True))
 
 
 def true_headlines(parameters: Mapping[str, float], pose_rad: np.ndarray) -> dict[str, float]:
     """The same of a true rig, by the twin's formulas, at the pose of the fit."""
-    return dict(zip(HEADLINES, study_job.true_headlines(parameters, pose_rad).tolist(), strict=True))
+    found = dict(zip(HEADLINES, study_job.true_headlines(parameters, pose_rad).tolist(), strict=True))
+    return found | {
+        name: float(parameters[key]) for name, key in zip(MEAN_RATIOS, BLOCKS["degrees_per_step"], strict=True)
+    }
 
 
-def judged(draws, centre, prior_draws, parameters: Mapping[str, float], pose_rad: np.ndarray) -> dict[str, dict]:
+def judged(
+    draws, centre, prior_draws, parameters: Mapping[str, float], pose_rad: np.ndarray, weights: np.ndarray | None = None
+) -> dict[str, dict]:
     """PIT, also of draws shrunk about the centre by `SHRINK`, z and contraction of every headline.
 
     Args:
@@ -58,18 +66,22 @@ def judged(draws, centre, prior_draws, parameters: Mapping[str, float], pose_rad
         prior_draws: as the draws.
         parameters: of the true rig.
         pose_rad: of the fit.
+        weights: of the draws, of sum 1, with their leading axes; equal if None.
     """
     true, prior = true_headlines(parameters, pose_rad), headlines(prior_draws)
     middle = None if centre is None else headlines(centre)
     result = {}
     for name, values in headlines(draws).items():
         values = values.ravel()
-        at = float(values.mean() if middle is None else middle[name])
+        weight = np.full(values.shape, 1 / values.size) if weights is None else weights.ravel()
+        mean = weight @ values
+        at = float(mean if middle is None else middle[name])
+        variance = weight @ (values - mean) ** 2
         result[name] = {
-            "pit": float(np.mean(values < true[name])),
-            "pit_shrunk": float(np.mean(at + SHRINK * (values - at) < true[name])),
-            "z": float((at - true[name]) / values.std()),
-            "contraction": float(1 - values.var() / prior[name].var()),
+            "pit": float(weight @ (values < true[name])),
+            "pit_shrunk": float(weight @ (at + SHRINK * (values - at) < true[name])),
+            "z": float((at - true[name]) / np.sqrt(variance)),
+            "contraction": float(1 - variance / prior[name].var()),
         }
     return result
 
