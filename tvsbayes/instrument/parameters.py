@@ -17,7 +17,9 @@ KINDS: tuple[Distribution, ...] = get_args(Distribution)
 Unit = Literal["deg/step", "deg", "rad", "mm", "px", "1"]
 Place = Literal["rig", "rig.prior", "stereo"]
 HARMONIC_ORDERS = (1, 2)
-"""Of the transmission error: turns per period."""
+"""Of a transmission error with a stated shape: turns per period."""
+PERIODS_MAX = 3
+"""Of the transmission error of one axis: of its wheel, its pinion, its teeth."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,6 +104,8 @@ def _cameras() -> tuple[Parameter, ...]:
 
 _SMALL, _XYZ = Prior(0.0, 0.5), ("x", "y", "z")
 _RATIO, _ANGLE, _LENGTH, _SD = (1e-6, 10.0, 10.0), (-30.0, 30.0, 30.0), (-100.0, 100.0, 100.0), (1e-6, 10.0, 5.0)
+_SCALE, _REACH = (0.0, 0.0, 10.0), (0.1, 360.0, 5.0)
+_AMPLITUDES = tuple(f"{axis}.{number}" for axis in AXES for number in range(1, PERIODS_MAX + 1))
 _HARMONICS = tuple(f"{axis}.{order}.{part}" for axis in AXES for order in HARMONIC_ORDERS for part in ("cos", "sin"))
 _PARAMETERS = (
     Parameter("degrees_per_step.pan", "degrees_per_step", "deg/step", "rig.prior", Prior(0.06, 0.01), *_RATIO),
@@ -127,6 +131,11 @@ _PARAMETERS = (
     *_block("aperture_sd_deg", (), "deg", Prior(0.02, 0.0, "log-normal"), _SD, "rig", noise=True, receiver=True),
     # No transmission error unless a rig states one or a fit is asked to free it.
     *_block("harmonic_deg", _HARMONICS, "deg", UNSTATED, (-10.0, 10.0, 10.0)),
+    *_block("transmission_error_deg", AXES, "deg", Prior(0.0, 0.0, "half-normal"), _SCALE, noise=True),
+    *_block("transmission_error_length_deg", AXES, "deg", Prior(8.0, 0.0, "log-normal"), _REACH, noise=True),
+    *_block("play_variation_deg", AXES, "deg", Prior(0.0, 0.0, "half-normal"), _SCALE, noise=True),
+    *_block("drift_deg_per_root_hour", AXES, "deg", Prior(0.0, 0.0, "half-normal"), _SCALE, noise=True),
+    *_block("harmonic_amplitude_deg", _AMPLITUDES, "deg", Prior(0.0, 0.0, "half-normal"), _SCALE, noise=True),
     *_cameras(),
 )
 
@@ -145,6 +154,8 @@ STEREO_PARAMETER_NAMES: tuple[str, ...] = tuple(p.name for p in _PARAMETERS if p
 """The 24 stereo parameters in the order of `parameter_covariance` of a stereo file."""
 HARMONIC_NAMES: tuple[str, ...] = BLOCKS["harmonic_deg"]
 """Transmission error by axis, order and phase."""
+AMPLITUDE_NAMES: tuple[str, ...] = BLOCKS["harmonic_amplitude_deg"]
+"""Amplitudes of the periodic parts of the transmission error by axis and number of the stated period."""
 NOISE_NAMES: tuple[str, ...] = tuple(p.name for p in _PARAMETERS if p.noise)
 RECEIVER_NAMES: tuple[str, ...] = tuple(p.name for p in _PARAMETERS if p.receiver)
 DERIVED_UNITS: dict[str, Unit] = {
