@@ -47,7 +47,7 @@ def broken_campaign(condition: str, seed: int):
     generator = np.random.default_rng([seed, 0x6272])
     if condition == "pinion error":
         rig = replace(
-            rig, table=replace(rig.table, harmonic_period_deg=dict.fromkeys(("pan", "tilt"), PINION_PERIOD_DEG))
+            rig, table=replace(rig.table, harmonic_period_deg=dict.fromkeys(("pan", "tilt"), (PINION_PERIOD_DEG,)))
         )
     truth = drawn_truth(rig, seed)
     scale = truth.parameters["pixel_scale"]

@@ -196,7 +196,7 @@ def test_harmonics_are_listed_where_they_are_free_or_known(paper):
     table = replace(
         paper.rig,
         priors={**paper.rig.priors, "harmonic_deg.tilt.1.cos": Prior(0.05, 0.0)},
-        harmonic_period_deg={"pan": 7.0, "tilt": 360.0},
+        harmonic_period_deg={"pan": (7.0,), "tilt": (360.0,)},
     )
     stated = replace(paper, rig=replace(table, priors={**table.priors, "harmonic_deg.pan.1.sin": Prior(0.0, 0.05)}))
     parameters = summarise(fit(stated)).parameters

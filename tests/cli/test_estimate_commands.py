@@ -180,7 +180,7 @@ def test_per_axis_fit_has_one_gear_ratio_per_axis(ask, grid_folder):
 def test_fit_without_backlash_and_with_harmonics(ask, grid_campaign, grid_folder, tmp_path):
     code, document = ask("fit", grid_folder, "--no-sample", "--harmonics")
     assert code == 2 and "harmonic_period_deg.pan" in document["error"]["remedy"]
-    table = replace(grid_campaign.rig, harmonic_period_deg={"tilt": 360.0})
+    table = replace(grid_campaign.rig, harmonic_period_deg={"tilt": (360.0,)})
     write_campaign(replace(grid_campaign, rig=table), tmp_path / "wheel")
     code, document = ask("fit", tmp_path / "wheel", "--no-sample", "--harmonics", "--no-backlash")
     assert code == 0

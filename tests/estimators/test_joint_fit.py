@@ -175,7 +175,7 @@ def wobbling(mounted_rig) -> SimulatedCampaign:
     errors = {name: Prior(value, 0.0) for name, value in PAN_ERROR_DEG.items()}
     rig = replace(
         mounted_rig,
-        table=replace(mounted_rig.table, harmonic_period_deg={"pan": 6.0}),
+        table=replace(mounted_rig.table, harmonic_period_deg={"pan": (6.0,)}),
         truth={**mounted_rig.truth, **stop_sds, **errors},
     )
     plan = grid_protocol(targets=("d1", "d3"), pan_steps=range(-40, 241, 20), tilt_steps=(-60, 0, 60))

@@ -160,10 +160,10 @@ def test_transmission_error_is_written_read_and_hashed(tmp_path):
     seen = {input_hashes(campaign)["rig"]}
     for number, (priors, periods) in enumerate(
         [
-            ({}, {"pan": 30.0}),
-            ({}, {"pan": 40.0}),
-            ({"harmonic_deg.pan.2.cos": Prior(0.01, 0.1)}, {"pan": 30.0}),
-            ({"harmonic_deg.tilt.1.sin": Prior(0.0, 0.1)}, {"pan": 30.0, "tilt": 360.0}),
+            ({}, {"pan": (30.0,)}),
+            ({}, {"pan": (40.0, 2.5)}),
+            ({"harmonic_deg.pan.2.cos": Prior(0.01, 0.1)}, {"pan": (30.0,)}),
+            ({"harmonic_deg.tilt.1.sin": Prior(0.0, 0.1)}, {"pan": (30.0,), "tilt": (360.0,)}),
         ]
     ):
         table = dataclasses.replace(campaign.rig, priors={**campaign.rig.priors, **priors}, harmonic_period_deg=periods)

@@ -9,7 +9,7 @@ from tvsbayes.instrument.rig import RigTable
 
 def test_the_choice_of_a_model_keeps_what_the_rig_states():
     stated = {"harmonic_deg.pan.2.cos": Prior(0.02, 0.005), "harmonic_deg.pan.2.sin": Prior(0.03, 0.0)}
-    table = RigTable(stated, harmonic_period_deg={"pan": 30.0})
+    table = RigTable(stated, harmonic_period_deg={"pan": (30.0,)})
     assert ModelChoice().table(table) == table
     chosen = ModelChoice(harmonics=True).table(table)
     asked = {"harmonic_deg.pan.1.cos", "harmonic_deg.pan.1.sin"}

@@ -12,11 +12,12 @@ from support.small_campaign import small_stereo
 from tvsbayes.errors import InputError
 from tvsbayes.files.documents import parse_toml
 from tvsbayes.instrument.parameters import (
+    AMPLITUDE_NAMES,
     HARMONIC_NAMES,
     RIG_PRIORS,
     Prior,
 )
-from tvsbayes.instrument.rig import RigTable, parse_rig_table, read_rig, rig_table_toml
+from tvsbayes.instrument.rig import PERIODIC_NAMES, RigTable, parse_rig_table, read_rig, rig_table_toml
 from tvsbayes.instrument.stereo_pair import write_stereo
 
 
@@ -52,15 +53,32 @@ def test_rig_table_round_trip():
     priors = {
         name: Prior(p.value if p.distribution == "half-normal" else p.value * 1.1 + 0.001, p.u / 3, p.distribution)
         for name, p in RIG_PRIORS.items()
-        if name not in HARMONIC_NAMES
+        if name not in PERIODIC_NAMES
     }
     table = RigTable(priors, "azimuth")
     assert rig_table(rig_table_toml(table)) == table
     assert "harmonic" not in rig_table_toml(table), "a table without a period has nothing to say of them"
     stated = {name: Prior(0.01 * i, 0.02) for i, name in enumerate(HARMONIC_NAMES)}
-    for periods in ({"pan": 22.5}, {"tilt": 360.0}, {"pan": 360.0, "tilt": 1.25}):
+    for periods in ({"pan": (22.5,)}, {"tilt": (360.0, 36.0)}, {"pan": (360.0, 0.1, 30.0), "tilt": (1.25,)}):
         own = {name: prior for name, prior in stated.items() if name.split(".")[1] in periods}
+        for axis, known in periods.items():
+            for number in range(1, len(known) + 1):
+                own[f"harmonic_amplitude_deg.{axis}.{number}"] = Prior(0.0, 0.01 * number, "half-normal")
         table = RigTable({**priors, **own}, "azimuth", periods)
+        assert rig_table(rig_table_toml(table)) == table
+        assert {name for name in AMPLITUDE_NAMES if f'"{name}"' in rig_table_toml(table)} == own.keys() - {*stated}
+
+
+def test_periods_in_every_spelling():
+    for text, periods in (
+        ("30", (30.0,)),
+        ("{ value = 30, u = 0 }", (30.0,)),
+        ("[360.0, 36, 1.5]", (360.0, 36.0, 1.5)),
+        ("{ value = [36.0, 360.0], u = 0.0 }", (36.0, 360.0)),
+    ):
+        table = rig_table(f"[rig]\nharmonic_period_deg.tilt = {text}\n")
+        assert table.harmonic_period_deg == {"tilt": periods}
+        assert table.first_period_deg == {"tilt": periods[0]}
         assert rig_table(rig_table_toml(table)) == table
 
 
@@ -74,7 +92,7 @@ def test_harmonics_in_every_spelling():
         "[rig.prior]\nharmonic_deg.pan.2.sin = { value = 0.0, u = 0.05 }\n"
     )
     assert quoted == dotted
-    assert quoted.harmonic_period_deg == {"pan": 30.0}
+    assert quoted.harmonic_period_deg == {"pan": (30.0,)}
     assert quoted.priors["harmonic_deg.pan.2.sin"] == Prior(0.0, 0.05)
     assert quoted.priors["harmonic_deg.pan.1.sin"] == Prior(0.0, 0.0)
 
@@ -86,8 +104,14 @@ def test_a_table_completes_its_priors_and_refuses_harmonics_without_a_period():
     }
     for prior in (Prior(0.05, 0.0), Prior(0.0, 0.1)):
         with pytest.raises(InputError, match=r"harmonic_deg\.tilt\.1\.cos has no period") as caught:
-            RigTable({"harmonic_deg.tilt.1.cos": prior}, harmonic_period_deg={"pan": 360.0})
+            RigTable({"harmonic_deg.tilt.1.cos": prior}, harmonic_period_deg={"pan": (360.0,)})
         assert '"harmonic_period_deg.tilt" = { value = P, u = 0.0 }' in caught.value.remedy
+    with pytest.raises(InputError, match=r"harmonic_amplitude_deg\.pan\.2 has no period") as caught:
+        RigTable(
+            {f"harmonic_amplitude_deg.pan.{number}": Prior(0.0, 0.1, "half-normal") for number in (1, 2)},
+            harmonic_period_deg={"pan": (360.0,)},
+        )
+    assert "value = [P1, P2]" in caught.value.remedy
 
 
 RIG_REFUSED = {
@@ -126,7 +150,37 @@ RIG_REFUSED = {
     ),
     "period 0": ("[rig]\n'harmonic_period_deg.pan' = { value = 0, u = 0 }", 2, "to 360"),
     "period of two turns": ("[rig]\n'harmonic_period_deg.pan' = { value = 720, u = 0 }", 2, "to 360"),
-    "period as number": ("[rig]\n'harmonic_period_deg.pan' = 30", 2, "u = 0 states"),
+    "period as text": ("[rig]\n'harmonic_period_deg.pan' = '30'", 2, "a list of up to 3"),
+    "no periods": ("[rig]\n'harmonic_period_deg.pan' = []", 2, "a list of up to 3"),
+    "four periods": ("[rig]\n'harmonic_period_deg.pan' = [360, 36, 12, 1]", 2, "a list of up to 3"),
+    "a period twice": ("[rig]\n'harmonic_period_deg.pan' = [36, 36.0]", 2, "different"),
+    "period of two turns in a list": ("[rig]\n'harmonic_period_deg.pan' = [36, 720]", 2, "to 360"),
+    "uncertain periods": (
+        "[rig]\n'harmonic_period_deg.pan' = { value = [36, 12], u = 1 }",
+        2,
+        "tooth counts give the period exactly",
+    ),
+    "period and sd": ("[rig]\n'harmonic_period_deg.pan' = { value = 36, sd = 0 }", 2, "u = 0 states"),
+    "both spellings of a period": (
+        "[rig]\n'harmonic_period_deg.pan' = 36\nharmonic_period_deg.pan = 36",
+        None,
+        "remove one",
+    ),
+    "amplitude without period": (
+        "[rig.prior]\n'harmonic_amplitude_deg.pan.1' = { value = 0, u = 0.1 }",
+        2,
+        r'add "harmonic_period_deg.pan" = \{ value = P, u = 0.0 \} to \[rig\]',
+    ),
+    "second amplitude of one period": (
+        "[rig]\nharmonic_period_deg.pan = 36\n[rig.prior]\n'harmonic_amplitude_deg.pan.2' = { value = 0, u = 0.1 }",
+        4,
+        r"value = \[P1, P2\]",
+    ),
+    "fourth amplitude": (
+        "[rig.prior]\n'harmonic_amplitude_deg.pan.4' = { value = 0, u = 0.1 }",
+        2,
+        r"harmonic_amplitude_deg.pan\|tilt.1\|2\|3",
+    ),
     "period in prior": (
         "[rig.prior]\n'harmonic_period_deg.pan' = { value = 30, u = 0 }",
         2,
@@ -271,7 +325,7 @@ def test_a_true_rig_may_have_a_transmission_error_that_no_prior_admits(tmp_path)
     rig = read_rig(write_rig(tmp_path, text))
     assert rig.truth["harmonic_deg.tilt.1.sin"] == Prior(0.0, 0.1)
     assert rig.table.priors["harmonic_deg.tilt.1.sin"] == Prior(0.0, 0.0)
-    assert rig.table.harmonic_period_deg == {"tilt": 45.0}
+    assert rig.table.harmonic_period_deg == {"tilt": (45.0,)}
 
 
 RIG_FILE_REFUSED = {

@@ -182,6 +182,7 @@ HALF_POINT = 0.5
 def test_shipped_picture_is_what_the_script_draws(drawing, tmp_path, monkeypatch):
     made = tmp_path / "rig.svg"
     monkeypatch.setattr(drawing, "OUT", made)
+    monkeypatch.setattr("sys.argv", ["draw_rig"])
     drawing.main()
     texts = [path.read_text(encoding="utf-8") for path in (made, ROOT / "data" / "tutorial" / "rig.svg")]
     words, shipped_words = (re.findall(r"<!-- (.*?) -->", text, flags=re.DOTALL) for text in texts)

@@ -188,7 +188,7 @@ def test_transmission_error_leaves_every_other_draw_as_it_was():
     names = [name for name in HARMONIC_NAMES if ".tilt." in name]
     wobbling = replace(
         rig,
-        table=replace(rig.table, harmonic_period_deg={"tilt": 360.0}),
+        table=replace(rig.table, harmonic_period_deg={"tilt": (360.0,)}),
         truth={**rig.truth, **dict.fromkeys(names, Prior(0.0, 0.1))},
     )
     plain, error = simulate(rig, plan, 8).truth, simulate(wobbling, plan, 8).truth

@@ -216,7 +216,7 @@ class Instrument:
 
     def _wobble_deg(self, axis: int, angle_deg: float, wheel: bool) -> float:
         """Transmission error of the wheel (behind the play) or of the pinion (before it), degrees."""
-        period = self.rig.table.harmonic_period_deg.get(AXES[axis], FULL_TURN_DEG)
+        period = self.rig.table.first_period_deg.get(AXES[axis], FULL_TURN_DEG)
         if (period == FULL_TURN_DEG) != wheel:
             return 0.0
         return float(wobble_deg(angle_deg, harmonics_deg(self.truth.parameters, AXES[axis]), period))

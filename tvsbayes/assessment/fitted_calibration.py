@@ -62,7 +62,7 @@ def calibration_of_draws(
         noise_variance=dict(zip(NOISE_NAMES, (noise**2).mean(axis=0).tolist(), strict=True)),
         overshoot_steps={axis: _overshoot_steps(column, axis) for axis in AXES},
         azimuth=campaign.rig.aperture_convention == "azimuth",
-        period_deg=dict(campaign.rig.harmonic_period_deg),
+        period_deg=campaign.rig.first_period_deg,
         estimator=estimator,
         range_steps=np.stack([counters.min(axis=0), counters.max(axis=0)], axis=1),
         inputs_sha256=input_hashes(campaign),

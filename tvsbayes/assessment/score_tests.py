@@ -147,7 +147,7 @@ def _defects_in_place(fit: JointFit, axes: Sequence[_SeenAxis]) -> list[_Defect]
         stops = len(np.unique(axis.counter))
         # Fewer stops than this fit any wave.
         periods = 2 * np.ptp(axis.angle_deg) / np.arange(1, min(WAVES, 2 * stops) + 1) if stops > 3 else ()
-        for period in [*periods, *filter(None, [fit.campaign.rig.harmonic_period_deg.get(axis.name)])]:
+        for period in [*periods, *fit.campaign.rig.harmonic_period_deg.get(axis.name, ())]:
             phase = 2 * np.pi * axis.angle_deg / period
             waves.append(np.concatenate([_times(axis.push, np.cos(phase)), _times(axis.push, np.sin(phase))], axis=2))
             places.append(f"{axis.name}, period near {period:.3g} deg")

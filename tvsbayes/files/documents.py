@@ -140,6 +140,18 @@ class Keys:
             raise self.refuse(key, "word", allowed, remedy or closest(str(value)[:100], words))
         return str(value)
 
+    def numbers(self, key: str, low: float, high: float, most: int) -> tuple[float, ...]:
+        """One number in [low, high], or a list of 1 to `most` different ones."""
+        allowed = f"a number from {low:g} to {high:g}, or a list of up to {most} different ones"
+        value = self._get(key, allowed)
+        entries = value if isinstance(value, list) else [value]
+        found = [
+            float(e) for e in entries if isinstance(e, int | float) and not isinstance(e, bool) and low <= e <= high
+        ]
+        if len(found) != len(entries) or not 1 <= len(found) <= most or len(set(found)) != len(found):
+            raise self.refuse(key, "numbers", allowed, "correct the values and mind their unit")
+        return tuple(found)
+
     def table(self, key: str) -> Keys:
         """The table under `key`; an absent one is empty."""
         value = self.values.get(key, {})
@@ -244,7 +256,7 @@ def parse_json(data: bytes, file: str) -> Keys:
 
 
 def toml_value(value: object) -> str:
-    """One value in TOML; a dictionary becomes an inline table.
+    """One value in TOML; a dictionary becomes an inline table, a list or tuple an array.
 
     Raises:
         TypeError: for what no campaign or rig file holds.
@@ -259,6 +271,8 @@ def toml_value(value: object) -> str:
         return repr(float(value))
     if isinstance(value, datetime.datetime | datetime.date):
         return value.isoformat()
+    if isinstance(value, list | tuple):
+        return "[" + ", ".join(map(toml_value, value)) + "]"
     if isinstance(value, dict):
         return "{ " + ", ".join(toml_line(k, v) for k, v in value.items()) + " }"
     raise TypeError(f"no TOML for {type(value).__name__}")

@@ -156,6 +156,14 @@ HARMONIC_NAMES: tuple[str, ...] = BLOCKS["harmonic_deg"]
 """Transmission error by axis, order and phase."""
 AMPLITUDE_NAMES: tuple[str, ...] = BLOCKS["harmonic_amplitude_deg"]
 """Amplitudes of the periodic parts of the transmission error by axis and number of the stated period."""
+GEAR_ERROR_NAMES: tuple[str, ...] = (
+    *BLOCKS["transmission_error_deg"],
+    *BLOCKS["transmission_error_length_deg"],
+    *BLOCKS["play_variation_deg"],
+    *BLOCKS["drift_deg_per_root_hour"],
+    *AMPLITUDE_NAMES,
+)
+"""Scales of the gears' errors that repeat by position, of play that varies and of zeros that drift."""
 NOISE_NAMES: tuple[str, ...] = tuple(p.name for p in _PARAMETERS if p.noise)
 RECEIVER_NAMES: tuple[str, ...] = tuple(p.name for p in _PARAMETERS if p.receiver)
 DERIVED_UNITS: dict[str, Unit] = {

@@ -5,8 +5,8 @@ Units are those of the names: mm, degrees, radians, px, s; counters in steps. No
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path, PureWindowsPath
 from typing import Literal
 
@@ -15,11 +15,22 @@ from tvsbayes.files.disk import read_bytes
 from tvsbayes.files.documents import TOML_BYTES_MAX, Keys, parse_toml, toml_line
 from tvsbayes.instrument.axes import AXES, DIRECTION_SIGNS, FULL_TURN_DEG
 from tvsbayes.instrument.counter_limits import COUNTER_MAX, LIMIT_KEYS, CounterLimits
-from tvsbayes.instrument.parameters import HARMONIC_NAMES, NAMES, REGISTRY, RIG_NAMES, RIG_PRIORS, Prior
+from tvsbayes.instrument.parameters import (
+    AMPLITUDE_NAMES,
+    HARMONIC_NAMES,
+    NAMES,
+    PERIODS_MAX,
+    REGISTRY,
+    RIG_NAMES,
+    RIG_PRIORS,
+    Prior,
+)
 from tvsbayes.instrument.stereo_pair import Stereo, read_stereo
 
 SPOT_SD_PX = 0.08
 """Standard uncertainty stated for a spot centre where nobody names one."""
+PERIODIC_NAMES = (*HARMONIC_NAMES, *AMPLITUDE_NAMES)
+"""Parameters that mean nothing on an axis without their period."""
 Setting = str | int | float
 """A value of `[positioner]` or `[cameras]`, by the kind that its key asks for."""
 
@@ -28,21 +39,30 @@ Setting = str | int | float
 class RigTable:
     """The `[rig]` table of a campaign or rig file: every prior the estimators use.
 
-    `priors` maps every name of `RIG_PRIORS` to its `Prior`; names left out take the default.
-    `harmonic_period_deg` maps "pan" and "tilt", where declared, to the period of the transmission error in
-    degrees of the output: `FULL_TURN_DEG` for the wheel, less for the pinion.
+    `priors` maps every name of `RIG_PRIORS` to its `Prior`; names left out take the default, where the axis has
+    the period that they need, and else are fixed at 0.
+    `harmonic_period_deg` maps "pan" and "tilt", where declared, to the periods of the transmission error in
+    degrees of the output, 1 to `PERIODS_MAX` different ones: `FULL_TURN_DEG` for the wheel, less for pinion and teeth.
+    `harmonic_deg` is an error of the first one's, `harmonic_amplitude_deg.<axis>.<number>` of each.
 
     Raises:
-        InputError: harmonics of an axis without a period.
+        InputError: harmonics or amplitudes of an axis without their period.
     """
 
     priors: dict[str, Prior] = field(default_factory=dict)
     aperture_convention: Literal["in-plane", "azimuth"] = "in-plane"
-    harmonic_period_deg: dict[str, float] = field(default_factory=dict)
+    harmonic_period_deg: dict[str, tuple[float, ...]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "priors", {**RIG_PRIORS, **self.priors})
+        periodic = (name for name in PERIODIC_NAMES if not _has_period(name, self.harmonic_period_deg))
+        absent = {name: replace(RIG_PRIORS[name], value=0.0, u=0.0) for name in periodic}
+        object.__setattr__(self, "priors", {**RIG_PRIORS, **absent, **self.priors})
         require_periods(self.priors, self.harmonic_period_deg)
+
+    @property
+    def first_period_deg(self) -> dict[str, float]:
+        """The first stated period of each axis that states one: that of its `harmonic_deg`."""
+        return {axis: periods[0] for axis, periods in self.harmonic_period_deg.items()}
 
 
 @dataclass(frozen=True)
@@ -84,31 +104,42 @@ _PERIOD_MIN_DEG = 1e-6
 _GROUPS = {name.rsplit(".", n)[0] for name in (*NAMES, *_PERIOD_NAMES) for n in (1, 2, 3)}
 
 
-def _harmonic_without_period(priors: Mapping[str, Prior], period_deg: Mapping[str, float]) -> str | None:
-    """The first harmonic that is not fixed at 0 on an axis whose period nobody stated."""
-    for name in HARMONIC_NAMES:
+def _period_number(name: str) -> int:
+    """Which of its axis' periods a periodic parameter belongs to, from 1: the first, or the number of an amplitude."""
+    return int(name.rpartition(".")[2]) if name in AMPLITUDE_NAMES else 1
+
+
+def _has_period(name: str, period_deg: Mapping[str, tuple[float, ...]]) -> bool:
+    """Whether the axis of a periodic parameter states its period."""
+    return len(period_deg.get(name.split(".")[1], ())) >= _period_number(name)
+
+
+def _without_period(priors: Mapping[str, Prior], period_deg: Mapping[str, tuple[float, ...]]) -> str | None:
+    """The first periodic parameter that is not fixed at 0 and whose period nobody stated."""
+    for name in PERIODIC_NAMES:
         prior = priors.get(name)
-        if prior is not None and (prior.value != 0 or prior.u != 0) and name.split(".")[1] not in period_deg:
+        if prior is not None and (prior.value != 0 or prior.u != 0) and not _has_period(name, period_deg):
             return name
     return None
 
 
 def _period_remedy(name: str) -> str:
-    axis = name.split(".")[1]
+    axis, number = name.split(".")[1], _period_number(name)
+    value = "P" if number == 1 else "[" + ", ".join(f"P{n}" for n in range(1, number + 1)) + "]"
     return (
-        f'add "harmonic_period_deg.{axis}" = {{ value = P, u = 0.0 }} to [rig]: degrees of the output per turn of the '
-        f"faulty member, {FULL_TURN_DEG:g} for the wheel, {FULL_TURN_DEG:g} x teeth of the pinion / teeth of the wheel "
-        "for the pinion"
+        f'add "harmonic_period_deg.{axis}" = {{ value = {value}, u = 0.0 }} to [rig]: degrees of the output per turn '
+        f"of the faulty member, {FULL_TURN_DEG:g} for the wheel, {FULL_TURN_DEG:g} x teeth of the pinion / teeth of "
+        "the wheel for the pinion"
     )
 
 
-def require_periods(priors: Mapping[str, Prior], period_deg: Mapping[str, float]) -> None:
-    """Refuse harmonics whose period is unknown: they would be an error at no known angle.
+def require_periods(priors: Mapping[str, Prior], period_deg: Mapping[str, tuple[float, ...]]) -> None:
+    """Refuse harmonics and amplitudes whose period is unknown: they would be an error at no known angle.
 
     Raises:
-        InputError: a harmonic with a value or u other than 0 on an axis without a period.
+        InputError: one with a value or u other than 0 on an axis without its period.
     """
-    name = _harmonic_without_period(priors, period_deg)
+    name = _without_period(priors, period_deg)
     if name is not None:
         message = f"{name} has no period"
         raise InputError("missing-period", message, column=name, remedy=_period_remedy(name))
@@ -141,42 +172,65 @@ def _entries(table: Keys, prefix: str = "") -> Iterator[tuple[Keys, str, str]]:
             yield table, key, name
 
 
-def _parse_priors(table: Keys, allowed: tuple[str, ...]) -> dict[str, Prior]:
-    """The priors of one table, checked; `allowed` lists the names that may stand in it."""
-    priors: dict[str, Prior] = {}
+def _in_blocks(names: Iterable[str]) -> str:
+    """Names in short: those of a block in one word, as `harmonic_deg.pan|tilt.1|2.cos|sin`."""
+    blocks: dict[str, list[list[str]]] = {}
+    for name in names:
+        block = REGISTRY[name].block if name in REGISTRY else name.split(".")[0]
+        blocks.setdefault(block, []).append(name.removeprefix(block).split(".")[1:])
+    return ", ".join(
+        ".".join([block, *("|".join(dict.fromkeys(part)) for part in zip(*parts, strict=True))])
+        for block, parts in blocks.items()
+    )
+
+
+def _named_entries(table: Keys, allowed: tuple[str, ...]) -> dict[str, tuple[Keys, str]]:
+    """Where each name of a table stands; `allowed` lists those that may."""
+    found: dict[str, tuple[Keys, str]] = {}
     for keys, key, name in _entries(table):
         if name not in allowed:
             # Keys of [rig] itself that are no priors are read before.
             more = () if "rig" not in table.path or "prior" in table.path else ("aperture_convention", "prior")
-            names = "only " + ", ".join((*allowed, *more))
-            found = f"the name {escaped(name)}"
-            raise keys.refuse(key, "unknown-key", names, _explanation(name, allowed), found)
-        if name in priors:
+            names = "only " + _in_blocks((*allowed, *more))
+            stands = f"the name {escaped(name)}"
+            raise keys.refuse(key, "unknown-key", names, _explanation(name, allowed), stands)
+        if name in found:
             raise keys.refuse(key, "duplicate-key", "every name once", "remove one", f"{name} twice")
-        if name in _PERIOD_NAMES:
-            priors[name] = Prior(_parse_period(keys, key), 0.0)
-            continue
+        found[name] = keys, key
+    return found
+
+
+def _parse_priors(entries: Mapping[str, tuple[Keys, str]]) -> dict[str, Prior]:
+    """The priors that stand there, checked."""
+    priors: dict[str, Prior] = {}
+    for name, (keys, key) in entries.items():
         parameter = REGISTRY[name]
         value, u = keys.quantity(key, parameter.low, parameter.high, parameter.u_max)
         priors[name] = Prior(value, u, parameter.prior.distribution)
     return priors
 
 
-def _parse_period(keys: Keys, key: str) -> float:
-    """A period in degrees of the output; exact, since it follows from tooth counts."""
-    period_deg, u = keys.quantity(key, _PERIOD_MIN_DEG, FULL_TURN_DEG, FULL_TURN_DEG)
-    if u != 0:
-        remedy = "write u = 0.0: tooth counts give the period exactly (the wheel's is 360)"
-        raise keys.refuse(key, "period-uncertain", "a period with u = 0", remedy)
-    return period_deg
+def _parse_periods(keys: Keys, key: str) -> tuple[float, ...]:
+    """Periods in degrees of the output, bare or as { value, u }; exact, since they follow from tooth counts."""
+    value = keys.values[key]
+    if isinstance(value, dict):
+        allowed = "{ value = period or list of periods, u = 0.0 }, both and nothing else"
+        if set(value) != {"value", "u"}:
+            raise keys.refuse(key, "quantity", allowed, "u = 0 states that the value is exact")
+        if keys.table(key).number("u", 0.0, FULL_TURN_DEG) != 0:
+            remedy = "write u = 0.0: tooth counts give the period exactly (the wheel's is 360)"
+            raise keys.refuse(key, "period-uncertain", "a period with u = 0", remedy)
+        keys, key = keys.table(key), "value"
+    return keys.numbers(key, _PERIOD_MIN_DEG, FULL_TURN_DEG, PERIODS_MAX)
 
 
-def _check_periods(table: Keys, priors: Mapping[str, Prior], period_deg: Mapping[str, float]) -> None:
+def _check_periods(table: Keys, priors: Mapping[str, Prior], period_deg: Mapping[str, tuple[float, ...]]) -> None:
     """`require_periods` with the place in the file."""
-    name = _harmonic_without_period(priors, period_deg)
+    name = _without_period(priors, period_deg)
     if name is not None:
-        allowed = "harmonics of an axis whose period is stated"
-        raise table.refuse(name, "missing-period", allowed, _period_remedy(name), "a harmonic without a period")
+        allowed = "harmonics and amplitudes of an axis whose periods are stated"
+        found = f"{name.split('.')[0]} without a period"
+        raise table.refuse(name, "missing-period", allowed, _period_remedy(name), found)
 
 
 def parse_rig_table(table: Keys) -> RigTable:
@@ -184,16 +238,17 @@ def parse_rig_table(table: Keys) -> RigTable:
 
     Raises:
         InputError: unknown or misplaced names, entries that are not { value, u }, values out of range,
-            a half-normal with a value other than 0, harmonics without a period, a period with u > 0.
+            a half-normal with a value other than 0, harmonics or amplitudes without a period, a period with u > 0.
     """
     own = {k: v for k, v in table.values.items() if k not in ("aperture_convention", "prior")}
     own_keys = Keys(own, table.file, table.text, table.path)
-    declared = _parse_priors(own_keys, (*_DECLARED_NAMES, *_PERIOD_NAMES))
-    period_deg: dict[str, float] = {
-        axis: declared.pop(name).value for name, axis in _PERIOD_NAMES.items() if name in declared
+    own_entries = _named_entries(own_keys, (*_DECLARED_NAMES, *_PERIOD_NAMES))
+    period_deg: dict[str, tuple[float, ...]] = {
+        axis: _parse_periods(*own_entries.pop(n)) for n, axis in _PERIOD_NAMES.items() if n in own_entries
     }
+    declared = _parse_priors(own_entries)
     # Any parameter may stand in [rig.prior], also one that has its place in [rig].
-    prior = _parse_priors(table.table("prior"), (*_PRIOR_NAMES, *_DECLARED_NAMES))
+    prior = _parse_priors(_named_entries(table.table("prior"), (*_PRIOR_NAMES, *_DECLARED_NAMES)))
     for name in declared:
         if name in prior:
             found = f"{name} in [rig] and in [rig.prior]"
@@ -207,7 +262,7 @@ def parse_rig_table(table: Keys) -> RigTable:
 def rig_table_toml(table: RigTable) -> str:
     """`[rig]` and `[rig.prior]` with every entry, also those at their defaults, so that a file says all.
 
-    Harmonics stand only where they mean something: on an axis with a period.
+    Harmonics and amplitudes stand only where they mean something: on an axis with their period.
     """
 
     def entry(name: str) -> str:
@@ -215,15 +270,14 @@ def rig_table_toml(table: RigTable) -> str:
         return toml_line(name, {"value": float(prior.value), "u": float(prior.u)})
 
     convention = toml_line("aperture_convention", table.aperture_convention)
+    stated = {name: table.harmonic_period_deg.get(axis, ()) for name, axis in _PERIOD_NAMES.items()}
     periods = [
-        toml_line(name, {"value": float(table.harmonic_period_deg[axis]), "u": 0.0})
-        for name, axis in _PERIOD_NAMES.items()
-        if axis in table.harmonic_period_deg
+        toml_line(name, {"value": own[0] if len(own) == 1 else own, "u": 0.0}) for name, own in stated.items() if own
     ]
-    harmonics = [entry(name) for name in HARMONIC_NAMES if name.split(".")[1] in table.harmonic_period_deg]
+    periodic = [entry(name) for name in PERIODIC_NAMES if _has_period(name, table.harmonic_period_deg)]
     declared = map(entry, _DECLARED_NAMES)
-    priors = (entry(name) for name in _PRIOR_NAMES if name not in HARMONIC_NAMES)
-    return "\n".join(["[rig]", *declared, *periods, convention, "[rig.prior]", *priors, *harmonics]) + "\n"
+    priors = (entry(name) for name in _PRIOR_NAMES if name not in PERIODIC_NAMES)
+    return "\n".join(["[rig]", *declared, *periods, convention, "[rig.prior]", *priors, *periodic]) + "\n"
 
 
 _COSTS_S = {"move_s": 1.5, "look_s": 1.0, "placement_s": 60.0}
@@ -301,7 +355,7 @@ def read_rig(path: Path) -> Rig:
             raise sheets.refuse(name, "text", "a printable name of 1 to 100 characters", "rename the sheet")
     costs = keys.table("costs")
     costs.only(_COSTS_S)
-    truth = {**table.priors, **_parse_priors(keys.table("truth"), RIG_NAMES)}
+    truth = {**table.priors, **_parse_priors(_named_entries(keys.table("truth"), RIG_NAMES))}
     _check_periods(keys.table("truth"), truth, table.harmonic_period_deg)
     return Rig(
         table=table,

@@ -237,7 +237,7 @@ def parameter_space(table: RigTable, stereo: Stereo) -> ParameterSpace:
         kind=placed(np.array([KINDS.index(p.distribution) for p in priors])),
         stereo_mean=placed(stereo.vector),
         stereo_root=placed(root),
-        harmonic_period_deg=placed(np.array([float(table.harmonic_period_deg.get(a, FULL_TURN_DEG)) for a in AXES])),
+        harmonic_period_deg=placed(np.array([table.first_period_deg.get(a, FULL_TURN_DEG) for a in AXES])),
     )
 
 

@@ -186,7 +186,7 @@ def sensitivity(
         noise_variance=dict(zip(CALIBRATION_NOISE, stop_sd**2, strict=True)),
         overshoot_steps={"pan": OVERSHOOT_STEPS, "tilt": OVERSHOOT_STEPS},
         azimuth=azimuth,
-        period_deg=table.harmonic_period_deg,
+        period_deg=table.first_period_deg,
     )
     goal = machine.steps_for(target.point_mm)
     assert goal.aperture_deg is not None, "a point has a reading"

@@ -1,7 +1,7 @@
 """Stationary Gaussian processes of one variable: the correlations that repeat errors of position are described by.
 
-Rasmussen and Williams, Gaussian Processes for Machine Learning, MIT Press 2006, 4.2. Distances, lengths and periods of a
-call share one unit. Written for NumPy's and JAX's functions alike.
+Rasmussen and Williams, Gaussian Processes for Machine Learning, MIT Press 2006, 4.2. Distances, lengths and periods of
+a call share one unit. Written for NumPy's and JAX's functions alike.
 """
 
 from __future__ import annotations

@@ -20,9 +20,9 @@ from tvsbayes.files.disk import read_bytes, write_atomically
 from tvsbayes.files.documents import JSON_BYTES_MAX, parse_json
 from tvsbayes.instrument.axes import FULL_TURN_DEG, HOME_APPROACH, HOME_SD_DEG, SIDES, PanApproach, TiltApproach
 from tvsbayes.instrument.campaign import NO_PIXELS, Campaign, Move, Spot, with_pixels, write_campaign
-from tvsbayes.instrument.parameters import HARMONIC_NAMES, RIG_NAMES, STEREO_PARAMETER_NAMES, Prior
+from tvsbayes.instrument.parameters import GEAR_ERROR_NAMES, HARMONIC_NAMES, RIG_NAMES, STEREO_PARAMETER_NAMES, Prior
 from tvsbayes.instrument.plan import PlanLog, PlannedLook, PlanStep, run_plan
-from tvsbayes.instrument.rig import Rig, require_periods
+from tvsbayes.instrument.rig import PERIODIC_NAMES, Rig, require_periods
 from tvsbayes.instrument.stereo_pair import Stereo
 from tvsbayes.twin.physics import (
     Light,
@@ -175,16 +175,18 @@ def draw_truth(rig: Rig, rng: np.random.Generator) -> Truth:
     Nothing is left at its stated value unless its `u` is 0: a study whose cameras were exact would
     report a coverage that no real calibration has.
     """
-    parameters = {
-        name: _draw(rig.truth.get(name, rig.table.priors[name]), rng)
-        for name in RIG_NAMES
-        if name not in HARMONIC_NAMES
-    }
+    # Of a stream of its own: rigs with perfect gears are the same rigs whatever is drawn here.
+    (gears,) = rng.spawn(1)
+
+    def drawn(names: Iterable[str], stream: np.random.Generator) -> dict[str, float]:
+        return {name: _draw(rig.truth.get(name, rig.table.priors[name]), stream) for name in names}
+
+    parameters = drawn((n for n in RIG_NAMES if n not in (*HARMONIC_NAMES, *GEAR_ERROR_NAMES)), rng)
     # Through the eigenvectors: fixed parameters give a semi-definite covariance that Cholesky refuses.
     variances, vectors = np.linalg.eigh(np.asarray(rig.stereo.parameter_covariance, float))
     offset = vectors @ (np.sqrt(np.clip(variances, 0.0, None)) * rng.standard_normal(len(variances)))
     # Last: rigs without transmission error are the same rigs whatever is drawn here.
-    parameters |= {name: _draw(rig.truth.get(name, rig.table.priors[name]), rng) for name in HARMONIC_NAMES}
+    parameters |= drawn(HARMONIC_NAMES, rng) | drawn(GEAR_ERROR_NAMES, gears)
     return Truth(with_derived(parameters), rig.stereo.with_vector(rig.stereo.vector + offset))
 
 
@@ -253,9 +255,9 @@ def simulate(
         truth = draw_truth(rig, streams.truth)
     sd_px = rig.spot_sd_px if spot_sd_px is None else float(spot_sd_px)
     log = run_plan(plan, rig, home_approach)
-    fixed = {name: Prior(value, 0.0) for name, value in truth.parameters.items() if name in HARMONIC_NAMES}
+    fixed = {name: Prior(value, 0.0) for name, value in truth.parameters.items() if name in PERIODIC_NAMES}
     require_periods(fixed, rig.table.harmonic_period_deg)
-    driven = _drive(log.moves, truth, rig.table.harmonic_period_deg, streams)
+    driven = _drive(log.moves, truth, rig.table.first_period_deg, streams)
     truth = driven.truth
     light = _light(log, rig, truth, streams.sheets)
     pixels = project(light.points_mm, truth.stereo, truth.parameters["focal_scale"])
@@ -283,7 +285,7 @@ class _Driven:
     resting_deg: np.ndarray
 
 
-def _drive(moves: Sequence[Move], truth: Truth, harmonic_period_deg: Mapping[str, float], streams: _Streams) -> _Driven:
+def _drive(moves: Sequence[Move], truth: Truth, first_period_deg: Mapping[str, float], streams: _Streams) -> _Driven:
     """Realise the mirror angles of all moves."""
     p = truth.parameters
     counters = np.array([(m.pan_steps, m.tilt_steps) for m in moves], float).reshape(-1, 2)
@@ -308,7 +310,7 @@ def _drive(moves: Sequence[Move], truth: Truth, harmonic_period_deg: Mapping[str
             ratios,
             backlash,
             harmonics_deg(p, axis),
-            harmonic_period_deg.get(axis, FULL_TURN_DEG),
+            first_period_deg.get(axis, FULL_TURN_DEG),
         )
         sds = {"+": p[f"stop_sd_deg.{positive}"], "-": p[f"stop_sd_deg.{negative}"]}
         errors[:, i] = stop_errors(counters[:, i], first, approach, stop_draws[:, i], sds)
