@@ -42,8 +42,9 @@ from tvsbayes.instrument.protocols import four_point_protocol
 from tvsbayes.results.estimates import Estimate, FitSummary
 from tvsbayes.statistics.chances import BOUND, rms_bounds
 from tvsbayes.twin.frames import write_frames
-from tvsbayes.twin.physics import effective_deg_per_step, effective_mirror_offset_mm, project
-from tvsbayes.twin.simulated_campaign import Truth, read_truth, simulate
+from tvsbayes.twin.physics import effective_mirror_offset_mm, project
+from tvsbayes.twin.simulated_campaign import simulate
+from tvsbayes.twin.true_rig import Truth, read_truth
 
 SOURCES = ("centroids", "frames")
 ROWS = output(__file__, "frames_to_fit.jsonl")
@@ -112,7 +113,7 @@ def one_campaign(task: tuple[str, int]) -> dict[str, object]:
     pose = (summary.reference_pose_deg["pan"], summary.reference_pose_deg["tilt"])
     row["quantities"] = {
         name: [true, one.value, one.sd, *one.interval95]
-        for name, true, one in compared(summary, {**known, **at_pose(seen.truth, pose)})
+        for name, true, one in compared(summary, {**known, **at_pose(seen.truth, seen.campaign, pose)})
     }
     return {**row, "converged": summary.converged, "problems": list(summary.problems)}
 
@@ -122,9 +123,9 @@ def known_truth(truth: Truth) -> dict[str, float]:
     return {k: truth.parameters[k] for k in ("backlash_deg.pan", "backlash_deg.tilt", "focal_scale", "pixel_scale")}
 
 
-def at_pose(truth: Truth, pose: tuple[float, float]) -> dict[str, float]:
-    """True effective ratios and mirror offset at the pose of the fit."""
-    ratio = effective_deg_per_step(truth.parameters, pose)
+def at_pose(truth: Truth, campaign: Campaign, pose: tuple[float, float]) -> dict[str, float]:
+    """True effective ratios over the looks, and mirror offset at the pose of the fit."""
+    ratio = truth.effective_deg_per_step(campaign)
     offset = effective_mirror_offset_mm(truth.parameters, pose)
     return {**{f"effective {d}": ratio[d] for d in DIRECTIONS}, "effective_mirror_offset_mm": offset}
 
@@ -225,7 +226,7 @@ def report(place: Path, twin: str) -> None:
         print(
             "| quantity | truth | classic mean (sd) | 95 % type A | joint | 95 % | truth inside | z |\n|" + "---|" * 8
         )
-        for name, value, one in compared(summary, {**known_truth(truth), **at_pose(truth, pose)}):
+        for name, value, one in compared(summary, {**known_truth(truth), **at_pose(truth, found.campaign, pose)}):
             low, high = one.interval95
             hand, hands = by_hand.get(name.removeprefix("effective ")), "| | "
             if hand is not None:

@@ -13,7 +13,7 @@ from tvsbayes.instrument.parameters import RIG_NAMES
 from tvsbayes.model.compilation_cache import use_compilation_cache
 from tvsbayes.model.parameter_space import coordinates_of
 from tvsbayes.statistics.least_squares import newton_mode
-from tvsbayes.twin.simulated_campaign import Truth
+from tvsbayes.twin.true_rig import Truth
 
 
 def compile_for(spots: int) -> None:

@@ -12,9 +12,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from tvsbayes.instrument.axes import DIRECTIONS
+from tvsbayes.instrument.campaign import Campaign
 from tvsbayes.instrument.parameters import BLOCKS, INDEX
 from tvsbayes.statistics.chances import BOUND, LEVELS, binomial_bounds, rms_bounds
 from tvsbayes.studies import study_job
+from tvsbayes.twin.true_rig import Truth
 
 HEADLINES = (
     *(f"effective {direction}" for direction in DIRECTIONS),
@@ -47,28 +49,25 @@ def headlines(draws) -> dict[str, np.ndarray]:
     return dict(zip(HEADLINES + MEAN_RATIOS, each, strict=True))
 
 
-def true_headlines(parameters: Mapping[str, float], pose_rad: np.ndarray) -> dict[str, float]:
-    """The same of a true rig, by the twin's formulas, at the pose of the fit."""
-    found = dict(zip(HEADLINES, study_job.true_headlines(parameters, pose_rad).tolist(), strict=True))
+def true_headlines(truth: Truth, campaign: Campaign, pose_rad: np.ndarray) -> dict[str, float]:
+    """The same of a true rig, by the twin's formulas, over the looks of a campaign and at the pose of its fit."""
+    found = dict(zip(HEADLINES, study_job.true_headlines(truth, campaign, pose_rad).tolist(), strict=True))
     return found | {
-        name: float(parameters[key]) for name, key in zip(MEAN_RATIOS, BLOCKS["degrees_per_step"], strict=True)
+        name: float(truth.parameters[key]) for name, key in zip(MEAN_RATIOS, BLOCKS["degrees_per_step"], strict=True)
     }
 
 
-def judged(
-    draws, centre, prior_draws, parameters: Mapping[str, float], pose_rad: np.ndarray, weights: np.ndarray | None = None
-) -> dict[str, dict]:
+def judged(draws, centre, prior_draws, true: Mapping[str, float], weights: np.ndarray | None = None) -> dict[str, dict]:
     """PIT, also of draws shrunk about the centre by `SHRINK`, z and contraction of every headline.
 
     Args:
         draws: a `Derived` with leading axes.
         centre: one without; None takes the draws' mean.
         prior_draws: as the draws.
-        parameters: of the true rig.
-        pose_rad: of the fit.
+        true: of `true_headlines`.
         weights: of the draws, of sum 1, with their leading axes; equal if None.
     """
-    true, prior = true_headlines(parameters, pose_rad), headlines(prior_draws)
+    prior = headlines(prior_draws)
     middle = None if centre is None else headlines(centre)
     result = {}
     for name, values in headlines(draws).items():

@@ -11,7 +11,8 @@ from tvsbayes.files.disk import shipped_data
 from tvsbayes.instrument.campaign import Campaign, Spot, read_campaign
 from tvsbayes.instrument.plan import PlanStep, read_plan
 from tvsbayes.instrument.rig import Rig, read_rig
-from tvsbayes.twin.simulated_campaign import SimulatedCampaign, Truth, draw_truth, read_truth
+from tvsbayes.twin.simulated_campaign import SimulatedCampaign
+from tvsbayes.twin.true_rig import Truth, draw_truth, read_truth
 
 TWINS = ("paper_twin", "grid_twin")
 PIXELS = ("u_left_px", "v_left_px", "u_right_px", "v_right_px")

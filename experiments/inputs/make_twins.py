@@ -24,7 +24,8 @@ from tvsbayes.instrument.protocols import PROTOCOLS
 from tvsbayes.instrument.rig import Rig, read_rig
 from tvsbayes.instrument.stereo_pair import Stereo, rotation_matrix, write_stereo
 from tvsbayes.twin.physics import project
-from tvsbayes.twin.simulated_campaign import SimulatedCampaign, Truth, draw_truth, simulate, with_derived
+from tvsbayes.twin.simulated_campaign import SimulatedCampaign, simulate
+from tvsbayes.twin.true_rig import Truth, draw_truth, with_derived
 
 DATA = ROOT / "data"
 SHEETS_MM = {"d1": 175.0, "d2": 275.0, "d3": 375.0}

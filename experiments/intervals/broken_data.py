@@ -20,7 +20,15 @@ import numpy as np
 
 from experiments.common.command_line import act, study_parser
 from experiments.common.fits import compile_for
-from experiments.common.headlines import HEADLINES, judged, level_limits, level_titles, rms_limits, verdict
+from experiments.common.headlines import (
+    HEADLINES,
+    judged,
+    level_limits,
+    level_titles,
+    rms_limits,
+    true_headlines,
+    verdict,
+)
 from experiments.common.rigs import PIXELS, drawn_truth, mounted_rig, pixels_of, small_plan, unseen, with_pixels
 from experiments.common.rows import output, read_rows, run_rows
 from tvsbayes.estimators.joint_fit import fit
@@ -89,7 +97,10 @@ def broken_rig(task: tuple[str, int]) -> dict[str, object]:
             entry["excluded"] = len(result.excluded_spots)
             entry["suspect"] = len(result.suspect_spots)
             entry["values"] = judged(
-                result.draws, result.mode, result.prior_draws, truth.parameters, result.reference_pose_rad
+                result.draws,
+                result.mode,
+                result.prior_draws,
+                true_headlines(truth, result.campaign, result.reference_pose_rad),
             )
         except Exception as error:
             entry = {"converged": False, "problems": [repr(error)]}

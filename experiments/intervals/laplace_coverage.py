@@ -27,6 +27,7 @@ from experiments.common.headlines import (
     level_limits,
     level_titles,
     rms_limits,
+    true_headlines,
     verdict,
 )
 from experiments.common.rigs import mounted_rig, shipped_plan, unseen
@@ -35,7 +36,6 @@ from tvsbayes.estimators.four_point import classic
 from tvsbayes.estimators.joint_fit import fit
 from tvsbayes.instrument.axes import DIRECTIONS
 from tvsbayes.statistics.chances import LEVELS
-from tvsbayes.twin.physics import effective_deg_per_step
 from tvsbayes.twin.simulated_campaign import simulate
 
 PROTOCOLS = ("paper", "mixed", "grid")
@@ -47,7 +47,7 @@ def one_rig(task: tuple[str, int]) -> dict[str, object]:
     protocol, seed = task
     compile_for(96)
     simulated = simulate(mounted_rig(), shipped_plan(protocol), seed, aperture=protocol == "grid")
-    campaign, truth = simulated.campaign, simulated.truth.parameters
+    campaign, truth = simulated.campaign, simulated.truth
     row: dict[str, object] = {"protocol": protocol, "seed": seed, "unseen": unseen(campaign)}
     start = time.perf_counter()
     try:
@@ -56,12 +56,12 @@ def one_rig(task: tuple[str, int]) -> dict[str, object]:
         return {**row, "converged": False, "problems": [repr(error)]}
     row["seconds"] = time.perf_counter() - start
     row["converged"], row["problems"] = result.converged, list(result.problems)
-    row["joint"] = judged(result.draws, result.mode, result.prior_draws, truth, result.reference_pose_rad)
+    true = true_headlines(truth, campaign, result.reference_pose_rad)
+    row["joint"] = judged(result.draws, result.mode, result.prior_draws, true)
     if protocol != "grid":
-        true = effective_deg_per_step(truth, tuple(np.degrees(result.reference_pose_rad)))
         row["classic"] = {
             direction: {
-                "true": true[direction],
+                "true": true[f"effective {direction}"],
                 "mean": r.mean_deg_per_step,
                 "type_a": r.interval95_type_a,
                 "gum": r.interval95_gum,

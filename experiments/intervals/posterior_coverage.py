@@ -33,6 +33,7 @@ from experiments.common.headlines import (
     level_titles,
     marked,
     rms_limits,
+    true_headlines,
     verdict,
 )
 from experiments.common.rigs import mounted_rig, shipped_plan, unseen
@@ -67,15 +68,15 @@ def one_rig(task: tuple[str, str, int]) -> dict[str, object]:
     tier, protocol, seed = task
     compile_for(SMALLEST_BUCKET)
     simulated = simulate(mounted_rig(), shipped_plan(protocol), seed, aperture=protocol == "grid")
-    truth = simulated.truth.parameters
     row: dict[str, object] = {"tier": tier, "protocol": protocol, "seed": seed, "converged": False, "sampled": False}
     row["unseen"] = unseen(simulated.campaign)
     start = time.process_time()
     try:
         result = fit(simulated.campaign)
         row |= {"converged": result.converged, "problems": list(result.problems)}
-        pose, prior = result.reference_pose_rad, result.prior_draws
-        row["laplace"] = judged(result.draws, result.mode, prior, truth, pose)
+        prior = result.prior_draws
+        true = true_headlines(simulated.truth, simulated.campaign, result.reference_pose_rad)
+        row["laplace"] = judged(result.draws, result.mode, prior, true)
         row["fit_cpu_s"] = time.process_time() - start
         start = time.process_time()
         posterior = sample(result, tier=tier, seed=seed, max_minutes=MAX_MINUTES)
@@ -83,7 +84,7 @@ def one_rig(task: tuple[str, str, int]) -> dict[str, object]:
         row["sampled"] = bool(posterior.converged)
         row["problems"] = [*result.problems, *posterior.convergence.missing]
         row["sampling"] = plain(posterior.convergence.sampling)
-        row["posterior"] = judged(posterior.draws, None, prior, truth, pose, posterior.weights)
+        row["posterior"] = judged(posterior.draws, None, prior, true, posterior.weights)
     except Exception as error:
         row["problems"] = [*row.get("problems", []), repr(error)]
     return row

@@ -54,7 +54,7 @@ from tvsbayes.model.parameter_space import coordinates_of, parameter_space
 from tvsbayes.posterior.draws import Posterior, derived_at
 from tvsbayes.posterior.ridges import transport
 from tvsbayes.posterior.sampling import TIERS, sample
-from tvsbayes.twin.physics import effective_deg_per_step, effective_mirror_offset_mm
+from tvsbayes.twin.physics import effective_mirror_offset_mm
 from tvsbayes.twin.simulated_campaign import simulate
 
 ROWS = output(__file__, "sbc.jsonl")
@@ -138,7 +138,7 @@ def ranks(simulated, result, z: np.ndarray) -> dict[str, int]:
     log_likelihood = log_posterior + 0.5 * np.sum(both**2, axis=1)
     values = {"log-likelihood": log_likelihood, "log-posterior": log_posterior}
     values |= {NAMES[i]: np.append(true[i], physical[:, i]) for i in np.flatnonzero(result.free)}
-    ratio = effective_deg_per_step(truth.parameters, tuple(np.degrees(pose)))
+    ratio = truth.effective_deg_per_step(simulated.campaign)
     for k, direction in enumerate(DIRECTIONS):
         effective = draws.effective_deg_per_step[0, :, k]
         values[f"effective_deg_per_step.{direction}"] = np.append(ratio[direction], effective)

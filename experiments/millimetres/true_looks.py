@@ -19,7 +19,7 @@ from tvsbayes.estimators.four_point import ClassicResult, classic
 from tvsbayes.instrument.axes import AXES, SIDES
 from tvsbayes.instrument.campaign import Campaign
 from tvsbayes.twin.physics import aperture_angle_deg, mirror_chain, to_tvs
-from tvsbayes.twin.simulated_campaign import Truth
+from tvsbayes.twin.true_rig import Truth
 
 ELLIPSOID = stats.chi2.isf(0.05, 3)
 """d^T S^-1 d of the border of a 95 % ellipsoid."""

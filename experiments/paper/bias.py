@@ -27,7 +27,6 @@ from experiments.common.rows import output, read_rows, run_rows
 from tvsbayes.estimators.four_point import classic
 from tvsbayes.instrument.axes import DIRECTIONS
 from tvsbayes.instrument.protocols import four_point_protocol
-from tvsbayes.twin.physics import effective_deg_per_step
 from tvsbayes.twin.simulated_campaign import simulate
 
 ROWS, FIGURE = output(__file__, "bias.jsonl"), Path(__file__).with_suffix(".png")
@@ -74,7 +73,7 @@ def one_campaign(task: tuple[str, float, int, bool]) -> dict[str, object]:
     campaign, truth = drawn_campaign(factor, level, seed)
     row: dict[str, object] = {"factor": factor, "level": level, "seed": seed, "joint": joint}
     if not joint:
-        true = effective_deg_per_step(truth.parameters, truth.reference_pose_deg)
+        true = truth.effective_deg_per_step(campaign)
         return row | {
             "classic": {
                 d: {
@@ -90,7 +89,7 @@ def one_campaign(task: tuple[str, float, int, bool]) -> dict[str, object]:
 
     try:
         fit = fit_from_truth(campaign, truth)
-        true = true_headlines(truth.parameters, fit.reference_pose_rad)
+        true = true_headlines(truth, campaign, fit.reference_pose_rad)
         row |= {"converged": fit.converged, "problems": list(fit.problems), "values": {}}
         for k, d in enumerate(DIRECTIONS):
             draws, at = fit.draws.effective_deg_per_step[:, k], fit.mode.effective_deg_per_step[k]

@@ -24,7 +24,8 @@ from tvsbayes.instrument.axes import DIRECTIONS
 from tvsbayes.instrument.campaign import read_campaign
 from tvsbayes.instrument.stereo_pair import triangulate
 from tvsbayes.twin.physics import project
-from tvsbayes.twin.simulated_campaign import read_truth, simulate
+from tvsbayes.twin.simulated_campaign import simulate
+from tvsbayes.twin.true_rig import read_truth
 
 AGAIN = 100
 """Campaigns of the same true rig: their sd is known to 7 %."""
@@ -80,11 +81,11 @@ def table(paper: dict[str, tuple[int, float, float]]) -> None:
         "\nUp and down scatter more than their u of type A says: pan stands still for all 48 of them, so that one stop"
     )
     print(f"error of pan ({truth.parameters['stop_sd_deg.left']:.2f} deg) is common to all and turns the azimuth.")
-    true = truth.as_json()["effective_deg_per_step"]
+    true = truth.effective_deg_per_step(campaign)
     shown = ", ".join(f"{name} {true[name]:.5f}" for name in DIRECTIONS)
     interval = {name: found[name].interval95_type_a for name in DIRECTIONS}
     held = [name for name in DIRECTIONS if interval[name][0] <= true[name] <= interval[name][1]]
-    print(f"\nTrue effective ratios at the reference pose, deg/step: {shown}. The twin's own 95 % intervals of type A")
+    print(f"\nTrue effective ratios over the looks, deg/step: {shown}. The twin's own 95 % intervals of type A")
     print(f"hold {len(held)} of these 4{': ' + ', '.join(held) if held else ''}.")
 
 

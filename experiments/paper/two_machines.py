@@ -25,7 +25,7 @@ from tvsbayes.instrument.stereo_pair import Stereo, rotation_matrix
 from tvsbayes.planning.expectation import prior_knowledge
 from tvsbayes.planning.search import Scope
 from tvsbayes.twin.physics import mirror_chain, project
-from tvsbayes.twin.simulated_campaign import Truth, draw_truth, with_derived
+from tvsbayes.twin.true_rig import Truth, draw_truth, with_derived
 
 Kind = Literal["lost motion", "literal"]
 RIGS: tuple[Kind, Kind] = ("lost motion", "literal")

@@ -24,7 +24,7 @@ from scipy import stats
 
 from experiments.common.command_line import act, study_parser
 from experiments.common.fits import compile_for, fit_from_truth
-from experiments.common.headlines import judged
+from experiments.common.headlines import judged, true_headlines
 from experiments.common.rigs import PIXELS, mounted_rig, pixels_of, shipped_plan, unseen, with_pixels
 from experiments.common.rows import output, read_rows, run_rows
 from tvsbayes.assessment.residuals import residual_causes, stop_residuals
@@ -126,7 +126,9 @@ def one_campaign(task: tuple[str, float, int]) -> dict[str, object]:
         row["validate_s"] = time.process_time() - start
         row["validation"] = plain(found)
         row["grouped"] = sorted({c.name for c in residual_causes(stop_residuals(fit)) if c.suspicious})
-        row["values"] = judged(fit.draws, fit.mode, fit.prior_draws, truth.parameters, fit.reference_pose_rad)
+        row["values"] = judged(
+            fit.draws, fit.mode, fit.prior_draws, true_headlines(truth, campaign, fit.reference_pose_rad)
+        )
     except Exception as error:
         row |= {"converged": False, "problems": [repr(error)]}
     return row

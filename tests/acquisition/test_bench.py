@@ -22,7 +22,7 @@ from tvsbayes.cameras.virtual_camera import VirtualCamera
 from tvsbayes.instrument.campaign import read_campaign
 from tvsbayes.instrument.plan import PlanStep
 from tvsbayes.twin.physics import project
-from tvsbayes.twin.simulated_campaign import read_truth
+from tvsbayes.twin.true_rig import read_truth
 
 
 def blob(shape, u, v, peak):

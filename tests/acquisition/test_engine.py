@@ -23,7 +23,7 @@ from tvsbayes.acquisition.session import acquire, begin
 from tvsbayes.errors import DeviceFault, InputError
 from tvsbayes.instrument.campaign import read_campaign
 from tvsbayes.positioner.protocol import request
-from tvsbayes.twin.simulated_campaign import read_truth
+from tvsbayes.twin.true_rig import read_truth
 
 pytestmark = pytest.mark.usefixtures("ctrl_c_works")
 

@@ -15,7 +15,8 @@ from tvsbayes.acquisition.operator import SimulatedOperator
 from tvsbayes.acquisition.session import begin
 from tvsbayes.acquisition.simulated_instrument import Instrument
 from tvsbayes.instrument.campaign import read_campaign
-from tvsbayes.twin.simulated_campaign import draw_truth, simulate
+from tvsbayes.twin.simulated_campaign import simulate
+from tvsbayes.twin.true_rig import draw_truth
 
 
 def test_light_behind_the_device_is_that_of_the_twin(mounted_rig, tmp_path, monkeypatch):

@@ -14,8 +14,8 @@ from support.published_equations import published_point
 from support.two_poses import PERIODS_DEG
 
 from tvsbayes.calibration.optics import TO_RAD, beam_deg_per_step, output_deg, range_components
-from tvsbayes.twin.physics import aperture_angle_deg, effective_deg_per_step
-from tvsbayes.twin.simulated_campaign import with_derived
+from tvsbayes.twin.physics import aperture_angle_deg, local_deg_per_step
+from tvsbayes.twin.true_rig import with_derived
 
 ROUNDING = 1e-12
 """Of a hundred operations on numbers of order 1."""
@@ -64,7 +64,7 @@ def test_ratio_of_the_beam_is_the_twins():
     """Against the twin's own optics, whose slope is differentiated elsewhere."""
     pose = (7.0, 4.0)
     contrasts = dict.fromkeys(("ratio_contrast_deg_per_step.pan", "ratio_contrast_deg_per_step.tilt"), 0.0)
-    true = effective_deg_per_step(with_derived({**BENT, **contrasts}), pose)
+    true = local_deg_per_step(with_derived({**BENT, **contrasts}), pose)
     for axis, pair in (("pan", ("left", "right")), ("tilt", ("up", "down"))):
         mean = 0.5 * sum(true[d] for d in pair)
         # Two central differences, with steps of 1e-3 deg and the twin's own.

@@ -17,7 +17,7 @@ from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.instrument.axes import DIRECTIONS
 from tvsbayes.posterior.draws import Posterior
 from tvsbayes.results.comparison_record import Gap
-from tvsbayes.twin.simulated_campaign import Truth, read_truth
+from tvsbayes.twin.true_rig import Truth, read_truth
 
 TWIN = Path(__file__).resolve().parents[2] / "data" / "twins" / "paper_twin"
 

@@ -11,7 +11,7 @@ from support.coarse_planning import ROUNDING, with_priors
 from tvsbayes.instrument.parameters import INDEX, Prior
 from tvsbayes.planning.drawn_rigs import draw_instruments, instruments_in
 from tvsbayes.planning.expectation import prior_knowledge
-from tvsbayes.twin.simulated_campaign import draw_truth
+from tvsbayes.twin.true_rig import draw_truth
 
 pytestmark = pytest.mark.usefixtures("small_searches")
 

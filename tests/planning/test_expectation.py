@@ -24,7 +24,8 @@ from tvsbayes.planning.expectation import (
 )
 from tvsbayes.planning.looks import covariance_of
 from tvsbayes.planning.target import Target, sensitivity
-from tvsbayes.twin.simulated_campaign import Truth, draw_truth, simulate
+from tvsbayes.twin.simulated_campaign import simulate
+from tvsbayes.twin.true_rig import Truth, draw_truth
 
 pytestmark = pytest.mark.usefixtures("small_searches")
 

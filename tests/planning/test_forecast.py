@@ -21,8 +21,9 @@ from tvsbayes.planning.forecast import (
     value_of_classic,
 )
 from tvsbayes.planning.target import parse_target
-from tvsbayes.twin.physics import effective_deg_per_step
-from tvsbayes.twin.simulated_campaign import Truth, draw_truth, simulate, with_derived
+from tvsbayes.twin.physics import local_deg_per_step
+from tvsbayes.twin.simulated_campaign import simulate
+from tvsbayes.twin.true_rig import Truth, draw_truth, with_derived
 
 pytestmark = pytest.mark.usefixtures("small_searches")
 
@@ -54,7 +55,7 @@ def test_the_classics_forecast_is_what_its_experiments_do(mounted_rig, knowledge
     forecast = classic_forecast(knowledge, instruments_in(knowledge, [Truth(parameters, drawn.stereo)]))
     count, standard_errors = 400, 4.0
     run = simulate(mounted_rig, four_point_protocol(count), 6, Truth(parameters, drawn.stereo))
-    effective = effective_deg_per_step(parameters, run.truth.reference_pose_deg)
+    effective = local_deg_per_step(parameters, run.truth.reference_pose_deg)
     for index, (name, found) in enumerate(classic(run.campaign).directions.items()):
         assert found.n == count and DIRECTIONS[index] == name
         sd = found.sd_deg_per_step

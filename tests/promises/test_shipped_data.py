@@ -18,7 +18,8 @@ from tvsbayes.instrument.parameters import REGISTRY, RIG_PRIORS
 from tvsbayes.instrument.plan import read_plan
 from tvsbayes.instrument.protocols import PROTOCOLS
 from tvsbayes.instrument.rig import Rig, RigTable, read_rig
-from tvsbayes.twin.simulated_campaign import draw_truth, read_truth, simulate
+from tvsbayes.twin.simulated_campaign import simulate
+from tvsbayes.twin.true_rig import draw_truth, read_truth
 
 DATA = shipped_data()
 TWINS = ("paper_twin", "grid_twin")

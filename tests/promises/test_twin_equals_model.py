@@ -23,14 +23,14 @@ from tvsbayes.twin import physics
 from tvsbayes.twin.physics import (
     aperture_angle_deg,
     beam_jacobian,
-    effective_deg_per_step,
     effective_mirror_offset_mm,
     harmonics_deg,
+    local_deg_per_step,
     mirror_chain,
     to_tvs,
     transmission,
 )
-from tvsbayes.twin.simulated_campaign import draw_truth, with_derived
+from tvsbayes.twin.true_rig import draw_truth, with_derived
 
 pytestmark = pytest.mark.usefixtures("x64")
 
@@ -148,7 +148,7 @@ def test_headlines_of_a_fit(mounted_rig, poses_rad):
         found.physical, found.effective_deg_per_step, found.effective_mirror_offset_mm, strict=True
     ):
         rig = with_derived(dict(zip(RIG_NAMES, physical.tolist(), strict=False)))
-        expected = effective_deg_per_step(rig, pose_deg)
+        expected = local_deg_per_step(rig, pose_deg)
         assert np.abs(ratios - list(expected.values())).max() < 1e-9 * 0.1
         assert abs(offset_mm - effective_mirror_offset_mm(rig, pose_deg)) < LENGTH_MM
 
@@ -165,7 +165,7 @@ def test_headlines(truths, values, poses_rad):
     ratios, offset_mm, jacobian = batched(headlines, values, poses_rad[:, 0])
     for rig, truth in enumerate(truths):
         pose_deg = tuple(np.degrees(poses_rad[rig, 0]))
-        expected = effective_deg_per_step(truth.parameters, pose_deg)
+        expected = local_deg_per_step(truth.parameters, pose_deg)
         # The twin differences its own chain: 1e-9 of a slope, hence of 0.07 deg per step.
         assert np.abs(ratios[rig] - list(expected.values())).max() < 1e-9 * 0.1
         assert np.abs(jacobian[rig] - beam_jacobian(truth.parameters, pose_deg)).max() < 1e-9

@@ -11,7 +11,8 @@ import pytest
 from tvsbayes.instrument.campaign import Campaign
 from tvsbayes.instrument.plan import PlanStep
 from tvsbayes.instrument.rig import Rig
-from tvsbayes.twin.simulated_campaign import SimulatedCampaign, Truth, simulate
+from tvsbayes.twin.simulated_campaign import SimulatedCampaign, simulate
+from tvsbayes.twin.true_rig import Truth
 
 
 @dataclass(frozen=True)

@@ -13,8 +13,8 @@ from tvsbayes.instrument.parameters import (
 from tvsbayes.twin.physics import (
     aperture_angle_deg,
     beam_jacobian,
-    effective_deg_per_step,
     effective_mirror_offset_mm,
+    local_deg_per_step,
     mirror_chain,
     play,
     stop_errors,
@@ -80,12 +80,12 @@ def test_effective_ratios_and_offset_of_the_nominal_rig():
     """Nominal: the beam turns as the mirrors do and passes the pan axis at +L, at any pose."""
     parameters = NOMINAL | {"degrees_per_step.left": 0.0601, "degrees_per_step.right": 0.0599}
     parameters |= {"degrees_per_step.up": 0.0701, "degrees_per_step.down": 0.0699}
-    effective = effective_deg_per_step(parameters, (12.0, 7.0))
+    effective = local_deg_per_step(parameters, (12.0, 7.0))
     # Differences of angles of order 0.1 rad over 2e-5 rad: rounding 1e-16 / 2e-5 = 1e-11, times ten.
     assert effective == pytest.approx({"left": 0.0601, "right": 0.0599, "up": 0.0701, "down": 0.0699}, rel=1e-10)
     assert effective_mirror_offset_mm(parameters, (12.0, 7.0)) == pytest.approx(30.0, abs=1e-10)
     tilted = parameters | {"laser_tilt_deg.x": 1.0}
-    slope = effective_deg_per_step(tilted, (12.0, 7.0))["left"] / 0.0601
+    slope = local_deg_per_step(tilted, (12.0, 7.0))["left"] / 0.0601
     assert 0.001 < abs(slope - 1) < 0.02, "a laser tilt changes the local slope by up to 1.7 % (formulation 3.2)"
 
 

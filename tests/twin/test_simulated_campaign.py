@@ -26,11 +26,12 @@ from tvsbayes.instrument.protocols import grid_protocol
 from tvsbayes.instrument.rig import Rig, RigTable
 from tvsbayes.instrument.stereo_pair import Stereo, rotation_matrix
 from tvsbayes.twin.physics import (
-    effective_deg_per_step,
+    local_deg_per_step,
     mirror_chain,
     project,
 )
-from tvsbayes.twin.simulated_campaign import Truth, draw_truth, simulate
+from tvsbayes.twin.simulated_campaign import simulate
+from tvsbayes.twin.true_rig import Truth, draw_truth
 
 
 def make_rig(truth_u: float | None = None) -> Rig:
@@ -164,14 +165,17 @@ def test_draws_follow_their_distributions():
 def test_truth_round_trip():
     """truth.json returns the same truth, with the effective values it implies."""
     rig = make_rig()
-    truth = simulate(rig, small_plan(), 4).truth
-    document = json.loads(json.dumps(truth.as_json(), allow_nan=False))
+    run = simulate(rig, small_plan(), 4)
+    truth = run.truth
+    document = json.loads(json.dumps(truth.as_json(run.campaign), allow_nan=False))
     again = Truth.from_json(document, rig.stereo)
     assert again.parameters == truth.parameters and again.mirror_angles_deg == truth.mirror_angles_deg
     # The rotation goes through its matrix once: rounding only.
     assert np.abs(again.stereo.vector - truth.stereo.vector).max() < 1e-12
     assert set(document["stereo"]) == set(STEREO_PARAMETER_NAMES)
-    assert document["effective_deg_per_step"] == effective_deg_per_step(truth.parameters, truth.reference_pose_deg)
+    assert document["local_deg_per_step"] == local_deg_per_step(truth.parameters, truth.reference_pose_deg)
+    assert document["effective_deg_per_step"] == truth.effective_deg_per_step(run.campaign)
+    assert again.effective_deg_per_step(run.campaign) == pytest.approx(document["effective_deg_per_step"], rel=1e-12)
 
 
 def test_same_seed_same_campaign_other_seed_another():

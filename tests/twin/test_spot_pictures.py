@@ -17,7 +17,7 @@ from tvsbayes.instrument.plan import read_plan
 from tvsbayes.instrument.stereo_pair import rotation_matrix
 from tvsbayes.twin.board_pictures import Board, BoardPose, board_irradiance, board_poses, render_board
 from tvsbayes.twin.physics import Camera, cameras_of, project
-from tvsbayes.twin.simulated_campaign import read_truth, simulate
+from tvsbayes.twin.simulated_campaign import simulate
 from tvsbayes.twin.spot_pictures import (
     Footprint,
     Scene,
@@ -29,6 +29,7 @@ from tvsbayes.twin.spot_pictures import (
     speckle,
     spot_irradiance,
 )
+from tvsbayes.twin.true_rig import read_truth
 
 WIDTH, HEIGHT = 1280, 720
 MOUNTED = shipped_data() / "rigs" / "mounted"

@@ -25,10 +25,11 @@ from tvsbayes.acquisition.simulated_instrument import Instrument, Renderer, refe
 from tvsbayes.cameras.capture import StereoImage, open_cameras
 from tvsbayes.cameras.virtual_camera import VirtualCamera
 from tvsbayes.files.disk import write_atomically
+from tvsbayes.instrument.campaign import Campaign
 from tvsbayes.instrument.rig import Rig
 from tvsbayes.positioner.driver import Clock, Positioner
 from tvsbayes.positioner.serial_port import positioner_of
-from tvsbayes.twin.simulated_campaign import pan_and_tilt
+from tvsbayes.twin.true_rig import pan_and_tilt
 
 SIMULATED_START = datetime.datetime(2026, 1, 1, tzinfo=datetime.UTC)
 """Time of day at which every simulated campaign begins: same seed, same bytes."""
@@ -172,5 +173,6 @@ def write_truth(folder: Path, instrument: Instrument) -> None:
         stop_errors_deg=pan_and_tilt(m["stop_errors_deg"] for m in motions),
         reference_pose_deg=reference_pose_deg(seen),
     )
-    text = json.dumps(truth.as_json(), indent=1, allow_nan=False) + "\n"
+    campaign = Campaign(record.moves, record.spots, instrument.rig.stereo, instrument.rig.table)
+    text = json.dumps(truth.as_json(campaign), indent=1, allow_nan=False) + "\n"
     write_atomically(folder / "truth.json", text.encode())

@@ -25,10 +25,12 @@ from tvsbayes.instrument.rig import Rig
 from tvsbayes.positioner.driver import SerialPositioner
 from tvsbayes.positioner.firmware_model import DeviceModel, Mechanics
 from tvsbayes.positioner.protocol import SETTINGS, device_settings
+from tvsbayes.twin.gear_errors import PERFECT, SECONDS_PER_HOUR, draw_gear_errors
 from tvsbayes.twin.physics import Light, Sheet, harmonics_deg, light_on_sheet, project, take_up, wobble_deg
-from tvsbayes.twin.simulated_campaign import Truth, draw_truth, placed_sheet
+from tvsbayes.twin.simulated_campaign import placed_sheet
+from tvsbayes.twin.true_rig import Truth, draw_truth
 
-_STREAMS = {"truth": 0, "stops": 1, "homes": 2, "sheets": 3, "pixels": 4}
+_STREAMS = {"truth": 0, "stops": 1, "homes": 2, "sheets": 3, "pixels": 4, "gears": 5, "drift": 6}
 LATENCY_US = 300
 """One way of a request or an answer over USB; a round trip measured on a pseudo-terminal took 0.64 ms."""
 
@@ -159,14 +161,21 @@ class Instrument:
 
     def __init__(self, rig: Rig, seed: int, start: int = 0, truth: Truth | None = None):
         self.rig, self.seed = rig, int(seed)
-        self.truth = draw_truth(rig, self._stream("truth")) if truth is None else truth
+        truth = draw_truth(rig, self._stream("truth")) if truth is None else truth
+        if truth.gear_errors is None:
+            period_deg, stream = rig.table.harmonic_period_deg, self._stream("gears")
+            truth = replace(truth, gear_errors=draw_gear_errors(truth.parameters, period_deg, stream))
+        self.truth, self._errors = truth, [(truth.gear_errors or PERFECT)[axis] for axis in AXES]
         self.clock = VirtualClock()
         self._stops, self._homes = self._stream("stops", start), self._stream("homes", start)
-        self._pixels = self._stream("pixels", start)
+        self._pixels, self._drifts = self._stream("pixels", start), self._stream("drift", start)
         self._first_home, self._from_switch = [start == 0, start == 0], [False, False]
         p = self.truth.parameters
         self._backlash = [p[f"backlash_deg.{axis}"] for axis in AXES]
         self._q = [0.0, 0.0]
+        # Mean ratio x counter, were no step ever lost: the place of errors that repeat.
+        self._place_deg = [0.0, 0.0]
+        self._drift_deg, self._drifted_us = [0.0, 0.0], [0, 0]
         self._y = [b * self._stops.uniform(-0.5, 0.5) for b in self._backlash]
         self._eta = [0.0, 0.0]
         home = SETTINGS["hp"][2], SETTINGS["ht"][2]
@@ -197,6 +206,8 @@ class Instrument:
         ratio = AXES[axis] if self._from_switch[axis] else sense
         self._from_switch[axis] = False
         self._q[axis] += steps * p[f"degrees_per_step.{ratio}"]
+        self._place_deg[axis] += steps * p[f"degrees_per_step.{AXES[axis]}"]
+        self._drift(axis)
         self._take_up(axis)
         self._eta[axis] = p[f"stop_sd_deg.{sense}"] * self._stops.standard_normal()
 
@@ -207,12 +218,28 @@ class Instrument:
         ratio = self.truth.parameters[f"degrees_per_step.{AXES[axis]}"]
         angle = ratio * self.mechanics.home_steps[axis] + offset
         self._y[axis] += angle - self._q[axis]
-        self._q[axis] = angle
+        self._q[axis], self._place_deg[axis] = angle, angle - offset
+        self._drift(axis)
+        self._drift_deg[axis] = 0.0
         self._take_up(axis)
 
     def _take_up(self, axis: int) -> None:
         driving = self._q[axis] + self._wobble_deg(axis, self._q[axis], wheel=False)
-        self._y[axis] = take_up(self._y[axis], driving, self._backlash[axis])
+        width = self._errors[axis].play_at(self._backlash[axis], np.array(self._place_deg[axis]))
+        self._y[axis] = take_up(self._y[axis], driving, float(width))
+
+    def _drift(self, axis: int) -> None:
+        """Let the zero drift over the time since it last did; a camera that looks on must not make it do so."""
+        before_us, now_us = self._drifted_us[axis], self.clock.now_us
+        self._drifted_us[axis] = now_us
+        scale = self.truth.parameters.get(f"drift_deg_per_root_hour.{AXES[axis]}", 0.0)
+        hours = np.array([before_us, now_us]) / (1e6 * SECONDS_PER_HOUR)
+        step = scale * np.sqrt(hours[1] - hours[0]) * self._drifts.standard_normal()
+        self._drift_deg[axis] += float(step + np.diff(self._errors[axis].warming_deg(hours))[0])
+
+    def _repeated_deg(self, axis: int) -> float:
+        """Error of the output's angle at its place, and the drift of the zero."""
+        return float(self._errors[axis].error_deg(np.array(self._place_deg[axis]))) + self._drift_deg[axis]
 
     def _wobble_deg(self, axis: int, angle_deg: float, wheel: bool) -> float:
         """Transmission error of the wheel (behind the play) or of the pinion (before it), degrees."""
@@ -230,7 +257,10 @@ class Instrument:
         return {"mirror_angles_deg": self._mirror_angles_deg(), "stop_errors_deg": (self._eta[0], self._eta[1])}
 
     def _mirror_angles_deg(self) -> tuple[float, float]:
-        psi, beta = (self._y[i] + self._wobble_deg(i, self._y[i], wheel=True) + self._eta[i] for i in (0, 1))
+        psi, beta = (
+            self._y[i] + self._wobble_deg(i, self._y[i], wheel=True) + self._repeated_deg(i) + self._eta[i]
+            for i in (0, 1)
+        )
         return psi, beta + self.truth.parameters["tilt_zero_deg"]
 
     def light(self) -> Light:

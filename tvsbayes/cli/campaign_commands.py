@@ -41,12 +41,12 @@ def demo(
         from tvsbayes.estimators.four_point import classic as estimate_classic
         from tvsbayes.instrument.campaign import read_campaign
         from tvsbayes.report.fit_text import demo_text
-        from tvsbayes.twin.physics import effective_deg_per_step, effective_mirror_offset_mm
-        from tvsbayes.twin.simulated_campaign import read_truth
+        from tvsbayes.twin.physics import effective_mirror_offset_mm
+        from tvsbayes.twin.true_rig import read_truth
 
         compile_for(report_line)
         campaign = read_campaign(folder)
-        true = read_truth(folder / "truth.json", campaign.stereo).parameters
+        rig = read_truth(folder / "truth.json", campaign.stereo)
         classic_result = estimate_classic(campaign)
         # Evidence for reports takes as long again: only where it is kept.
         with waiting() as progress:
@@ -56,8 +56,9 @@ def demo(
                 results = calibrate(campaign, out / "results", tier="importance", progress=progress)
                 summary = results.record.summary
     pose = (summary.reference_pose_deg["pan"], summary.reference_pose_deg["tilt"])
+    true = rig.parameters
     truth = {
-        **effective_deg_per_step(true, pose),
+        **(rig.effective_deg_per_step(campaign) or {}),
         "backlash_deg.pan": true["backlash_deg.pan"],
         "backlash_deg.tilt": true["backlash_deg.tilt"],
         "effective_mirror_offset_mm": effective_mirror_offset_mm(true, pose),

@@ -11,7 +11,7 @@ from tvsbayes.instrument.parameters import RIG_NAMES
 from tvsbayes.model.compiled import placed
 from tvsbayes.model.parameter_space import ParameterSpace, coordinates_of, physical_at
 from tvsbayes.planning.expectation import PARAMETERS, Knowledge
-from tvsbayes.twin.simulated_campaign import Truth, draw_truth
+from tvsbayes.twin.true_rig import Truth, draw_truth
 
 
 @dataclass(frozen=True)

@@ -18,8 +18,9 @@ from tvsbayes.planning.drawn_rigs import Instruments
 from tvsbayes.planning.expectation import Knowledge
 from tvsbayes.planning.target import Target
 from tvsbayes.statistics.intervals import NORMAL_95, coverage_factor
-from tvsbayes.twin.physics import effective_deg_per_step
-from tvsbayes.twin.simulated_campaign import Truth, simulate, with_derived
+from tvsbayes.twin.physics import local_deg_per_step
+from tvsbayes.twin.simulated_campaign import simulate
+from tvsbayes.twin.true_rig import Truth, with_derived
 
 
 @dataclass(frozen=True)
@@ -66,7 +67,7 @@ def classic_forecast(knowledge: Knowledge, instruments: Instruments) -> ClassicF
         pixels.append(selection.pixels[later])
         steps.append(selection.steps[later])
         axes.append(selection.axis[later])
-        true = effective_deg_per_step(with_derived(parameters), pose)
+        true = local_deg_per_step(with_derived(parameters), pose)
         effective.append([true[d] for d in DIRECTIONS])
         stops.append([parameters[f"stop_sd_deg.{d}"] ** 2 for d in DIRECTIONS])
         spot_sds.append([rig.spot_sd_px * parameters["pixel_scale"]])

@@ -9,16 +9,16 @@ import hashlib
 import json
 import math
 import time
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from importlib.metadata import version
 
 import numpy as np
 
-from tvsbayes.errors import InputError, TvsError
+from tvsbayes.errors import InputError, NothingToEstimate, TvsError
 from tvsbayes.estimators.joint_fit import JointFit, fit
 from tvsbayes.instrument.axes import DIRECTIONS, SENSES
+from tvsbayes.instrument.campaign import Campaign
 from tvsbayes.instrument.parameters import BLOCKS, INDEX
 from tvsbayes.instrument.plan import PlanStep
 from tvsbayes.instrument.rig import Rig, rig_table_toml
@@ -33,8 +33,9 @@ from tvsbayes.posterior.draws import Posterior
 from tvsbayes.posterior.sampling import sample
 from tvsbayes.statistics.weighted_draws import TAILS, weighted_mean, weighted_quantiles
 from tvsbayes.studies.rows import STUDY_FORMAT, HeadlineRow, StudyRow
-from tvsbayes.twin.physics import effective_deg_per_step, effective_mirror_offset_mm
-from tvsbayes.twin.simulated_campaign import Truth, simulate
+from tvsbayes.twin.physics import effective_mirror_offset_mm
+from tvsbayes.twin.simulated_campaign import simulate
+from tvsbayes.twin.true_rig import Truth
 
 BACKLASH_COLUMNS = [INDEX[name] for name in BLOCKS["backlash_deg"]]
 ESTIMATORS = ("importance", "laplace")
@@ -78,10 +79,16 @@ class StudyJob:
         return (int(high) >> 10) << 32 | int(low)
 
 
-def true_headlines(parameters: Mapping[str, float], pose_rad: np.ndarray) -> np.ndarray:
-    """`QUANTITIES` of a true rig by the twin's formulas, at a pose."""
-    pose = float(np.degrees(pose_rad[0])), float(np.degrees(pose_rad[1]))
-    ratio = effective_deg_per_step(parameters, pose)
+def true_headlines(truth: Truth, campaign: Campaign, pose_rad: np.ndarray) -> np.ndarray:
+    """`QUANTITIES` of a true rig by the twin's formulas: ratios over the looks of a campaign, the offset at a pose.
+
+    Raises:
+        NothingToEstimate: a campaign without looks.
+    """
+    parameters, pose = truth.parameters, (float(np.degrees(pose_rad[0])), float(np.degrees(pose_rad[1])))
+    ratio = truth.effective_deg_per_step(campaign)
+    if ratio is None:
+        raise NothingToEstimate("no-looks", "no look of this campaign has a spot: it has no ratios")
     return np.array(
         [
             *(ratio[d] for d in DIRECTIONS),
@@ -166,7 +173,7 @@ def _compared(job: StudyJob, result: JointFit, found: Estimates, true: Truth) ->
     information = information_of(job.steps, knowledge, aperture=job.aperture, z=z, space=space)
     at_truth = headlines(z, space, pose)
     predicted = predicted_sds(knowledge, information.fisher, np.asarray(at_truth.gradient), z)
-    values = true_headlines(true.parameters, pose)
+    values = true_headlines(true, result.campaign, pose)
     low, high = weighted_quantiles(found.draws, found.weights, TAILS)
     sd = np.sqrt(found.weights @ (found.draws - weighted_mean(found.draws, found.weights)) ** 2)
     return {

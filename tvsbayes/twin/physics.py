@@ -24,11 +24,15 @@ def take_up(output_deg: float, driving_deg: float, backlash_deg: float) -> float
     return min(max(output_deg, driving_deg - backlash_deg / 2), driving_deg + backlash_deg / 2)
 
 
-def play(q_deg: Sequence[float], start_deg: float, backlash_deg: float) -> np.ndarray:
-    """Output of a gear with play for driving angles q (n,), from output `start_deg` on."""
+def play(q_deg: Sequence[float], start_deg: float, backlash_deg: float | np.ndarray) -> np.ndarray:
+    """Output of a gear with play for driving angles q (n,), from output `start_deg` on.
+
+    Play (n,) that varies is that of the place: a move takes up what it finds at its end, as long as the play changes
+    by less than the angle does.
+    """
     output, y = np.empty(len(q_deg)), start_deg
-    for i, q in enumerate(q_deg):
-        output[i] = y = take_up(y, q, backlash_deg)
+    for i, (q, width) in enumerate(zip(q_deg, np.broadcast_to(backlash_deg, len(q_deg)), strict=True)):
+        output[i] = y = take_up(y, q, width)
     return output
 
 
@@ -38,7 +42,7 @@ def transmission(
     start_fraction: np.ndarray,
     home_deg: np.ndarray,
     ratios_deg_per_step: tuple[float, float],
-    backlash_deg: float,
+    backlash_deg: float | np.ndarray,
     harmonics_deg: Sequence[complex] = (),
     period_deg: float = FULL_TURN_DEG,
 ) -> np.ndarray:
@@ -50,13 +54,13 @@ def transmission(
         start_fraction: (n,) where the play stands at such a row, -1/2 (left, up) to +1/2; unused elsewhere.
         home_deg: (n,) home offset of the row's segment.
         ratios_deg_per_step: mean ratio and contrast; positive moves turn by mean + contrast / 2 per step.
-        backlash_deg: full width of the play.
+        backlash_deg: full width of the play, everywhere or (n,) where each move ends.
         harmonics_deg: cosine part - i sine part of the transmission error for orders 1, 2 ...
         period_deg: its period in degrees of the output: a full turn for the wheel, behind the play; less for the
             pinion, before it.
     """
     mean, contrast = ratios_deg_per_step
-    wheel = period_deg == FULL_TURN_DEG
+    wheel, width = period_deg == FULL_TURN_DEG, np.broadcast_to(backlash_deg, len(counters))
     output = np.empty(len(counters))
     starts = [*np.flatnonzero(first), len(counters)]
     for begin, end in pairwise(starts):
@@ -65,7 +69,7 @@ def transmission(
         q = mean * counters[begin] + home_deg[begin] + np.concatenate(([0.0], np.cumsum(turned)))
         if not wheel:
             q = q + wobble_deg(q, harmonics_deg, period_deg)
-        output[begin:end] = play(q, q[0] + start_fraction[begin] * backlash_deg, backlash_deg)
+        output[begin:end] = play(q, q[0] + start_fraction[begin] * width[begin], width[begin:end])
     return output + wobble_deg(output, harmonics_deg, period_deg) if wheel else output
 
 
@@ -294,12 +298,10 @@ def beam_jacobian(geometry: Mapping[str, float], pose_deg: tuple[float, float]) 
     return np.stack((angles[:, 0] - angles[:, 1], angles[:, 2] - angles[:, 3]), axis=1) / (2 * step)
 
 
-def effective_deg_per_step(
-    parameters: Mapping[str, float], reference_pose_deg: tuple[float, float]
-) -> dict[str, float]:
+def local_deg_per_step(parameters: Mapping[str, float], reference_pose_deg: tuple[float, float]) -> dict[str, float]:
     """Degrees of the beam per step at a pose: k_dir d(az)/d(psi) and k_dir d(el)/d(beta) (formulation 3.2).
 
-    The mean over a period of the transmission error, without its local slope.
+    Of the mirrors alone, without the slope of a transmission error.
     """
     slope = dict(zip(AXES, np.diagonal(beam_jacobian(parameters, reference_pose_deg)), strict=True))
     return {

@@ -1,0 +1,161 @@
+"""Errors that true gears repeat: of the output's angle and of the play by position, of the zero with time.
+
+Functions of an axis' angle, mean ratio x counter, in degrees: fixed for a rig, whatever is measured on it and however
+often. Written from data/docs/formulation.md alone; the estimators' covariances of the same errors are written
+elsewhere, so that an error in one of them shows.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from tvsbayes.instrument.axes import AXES
+from tvsbayes.instrument.parameters import PERIODS_MAX
+
+FEATURES = 200
+"""Waves that an error is the sum of: its covariance, given their lengths, is that of a Matern process to 1 part in 14,
+and exactly on average."""
+MATERN_FREEDOM = 5
+"""Frequencies of a Matern process of smoothness 5/2, times its length, have Student's t with 2 x 5/2 degrees of freedom
+(Rasmussen and Williams, Gaussian Processes for Machine Learning, 2006, 4.15: its spectral density)."""
+SECONDS_PER_HOUR = 3600.0
+ErrorFunction = Callable[[np.ndarray], np.ndarray]
+"""Degrees at places (n,), in degrees of the output; of time: at hours (n,) since switching on."""
+
+
+@dataclass(frozen=True, eq=False)
+class Waves:
+    """A sum of waves; without any, 0 everywhere.
+
+    Attributes:
+        rate_rad_per_deg: (m,) phase per degree of the output.
+        cosine_deg, sine_deg: (m,) their parts.
+    """
+
+    rate_rad_per_deg: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    cosine_deg: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    sine_deg: np.ndarray = field(default_factory=lambda: np.zeros(0))
+
+    def __call__(self, angle_deg: np.ndarray) -> np.ndarray:
+        """The sum at angles, their shape."""
+        # Campaigns come back to few places: to the same value there, and in little memory.
+        places, at = np.unique(np.asarray(angle_deg, float), return_inverse=True)
+        phase = np.multiply.outer(places, self.rate_rad_per_deg)
+        values = np.sum(self.cosine_deg * np.cos(phase) + self.sine_deg * np.sin(phase), axis=-1)
+        return values[at].reshape(np.shape(angle_deg))
+
+
+@dataclass(frozen=True, eq=False)
+class Tabulated:
+    """An error known at some places (n,), between them on straight lines, outside as at the last one: from a file."""
+
+    angle_deg: np.ndarray
+    error_deg: np.ndarray
+
+    def __call__(self, angle_deg: np.ndarray) -> np.ndarray:
+        """The error at angles, their shape; 0 where nothing is known at all."""
+        order = np.argsort(self.angle_deg)
+        if not order.size:
+            return np.zeros(np.shape(angle_deg))
+        return np.interp(angle_deg, self.angle_deg[order], self.error_deg[order])
+
+
+@dataclass(frozen=True, eq=False)
+class AxisErrors:
+    """What one axis repeats.
+
+    Attributes:
+        error_deg: of the output's angle, by place.
+        play_deg: what the play is wider by than its mean, by place.
+        warming_deg: of the zero, by hours since switching on; a homing finds the zero of its time.
+    """
+
+    error_deg: ErrorFunction = field(default_factory=Waves)
+    play_deg: ErrorFunction = field(default_factory=Waves)
+    warming_deg: ErrorFunction = field(default_factory=Waves)
+
+    def play_at(self, backlash_deg: float, angle_deg: np.ndarray) -> np.ndarray:
+        """Width of the play at places (n,); gears may touch, not overlap."""
+        return np.maximum(backlash_deg + self.play_deg(angle_deg), 0.0)
+
+
+GearErrors = Mapping[str, AxisErrors]
+"""By axis."""
+PERFECT: GearErrors = {axis: AxisErrors() for axis in AXES}
+"""Gears that repeat no error."""
+
+
+def matern_waves(sd_deg: float, length_deg: float, rng: np.random.Generator) -> Waves:
+    """A draw of a Matern process of smoothness 5/2; the generator advances alike whatever the scales.
+
+    Random Fourier features (Rahimi and Recht, NIPS 2007) with normal parts: Gaussian for given frequencies.
+    """
+    rate = rng.standard_t(MATERN_FREEDOM, FEATURES)
+    parts = rng.standard_normal((2, FEATURES)) * (sd_deg / np.sqrt(FEATURES))
+    return Waves(rate / length_deg, *parts) if sd_deg > 0 else Waves()
+
+
+def _joined(*waves: Waves) -> Waves:
+    """Their sum."""
+    return Waves(
+        np.concatenate([wave.rate_rad_per_deg for wave in waves]),
+        np.concatenate([wave.cosine_deg for wave in waves]),
+        np.concatenate([wave.sine_deg for wave in waves]),
+    )
+
+
+def periodic_waves(amplitude_deg: Mapping[float, float], parts: np.ndarray) -> Waves:
+    """Waves of any phase: `amplitude_deg` maps periods to the sd of either part, `parts` (2, n) are standard normal."""
+    rate = 2 * np.pi / np.array(list(amplitude_deg), float)
+    scale = np.array(list(amplitude_deg.values()), float)
+    return Waves(rate, *(scale * parts[:, : len(scale)]))
+
+
+def draw_gear_errors(
+    parameters: Mapping[str, float], period_deg: Mapping[str, tuple[float, ...]], rng: np.random.Generator
+) -> GearErrors:
+    """Errors of both axes with the scales of a true rig; a rig that names none has perfect gears.
+
+    Args:
+        parameters: of the true rig, by contract name.
+        period_deg: stated periods of each axis, in the order of `harmonic_amplitude_deg`.
+        rng: advances alike whatever the scales.
+    """
+    errors: dict[str, AxisErrors] = {}
+    for axis in AXES:
+        length_deg = parameters.get(f"transmission_error_length_deg.{axis}", 1.0)
+        error, width = (
+            matern_waves(parameters.get(f"{name}.{axis}", 0.0), length_deg, rng)
+            for name in ("transmission_error_deg", "play_variation_deg")
+        )
+        amplitude_deg = {
+            period: parameters.get(f"harmonic_amplitude_deg.{axis}.{number}", 0.0)
+            for number, period in enumerate(period_deg.get(axis, ()), start=1)
+        }
+        parts = rng.standard_normal((2, PERIODS_MAX))
+        errors[axis] = AxisErrors(_joined(error, periodic_waves(amplitude_deg, parts)), width)
+    return errors
+
+
+def drift_deg(
+    time_s: np.ndarray, first: np.ndarray, scale_deg_per_root_hour: float, draws: np.ndarray, warming_deg: ErrorFunction
+) -> np.ndarray:
+    """How far the zero of one axis has drifted at each move (n,), 0 at every homing.
+
+    Args:
+        time_s: (n,) of the moves, since switching on.
+        first: (n,) True at the first row of a segment.
+        scale_deg_per_root_hour: of the random walk.
+        draws: (n,) standard normal.
+        warming_deg: see `AxisErrors`.
+    """
+    hours = np.asarray(time_s, float) / SECONDS_PER_HOUR
+    step = scale_deg_per_root_hour * np.sqrt(np.diff(hours, prepend=hours[:1])) * draws
+    warm = np.diff(warming_deg(hours), prepend=0.0)
+    drift, at = np.empty(len(hours)), 0.0
+    for row, change in enumerate(step + warm):
+        drift[row] = at = 0.0 if first[row] else at + change
+    return drift

@@ -1,0 +1,234 @@
+"""A true rig: its parameters, cameras and gears drawn, what a run makes of them, and `truth.json`.
+
+Degrees where a name says `_deg`, mm, pixels. No estimator reads any of it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NotRequired, TypedDict, cast
+
+import numpy as np
+
+from tvsbayes.errors import InputError
+from tvsbayes.files.disk import read_bytes
+from tvsbayes.files.documents import JSON_BYTES_MAX, parse_json
+from tvsbayes.instrument.axes import AXES, SIDES
+from tvsbayes.instrument.campaign import Campaign
+from tvsbayes.instrument.parameters import (
+    GEAR_ERROR_NAMES,
+    HARMONIC_NAMES,
+    RIG_NAMES,
+    RIG_PRIORS,
+    STEREO_PARAMETER_NAMES,
+    Prior,
+)
+from tvsbayes.instrument.rig import Rig
+from tvsbayes.instrument.stereo_pair import Stereo
+from tvsbayes.twin.gear_errors import PERFECT, AxisErrors, GearErrors, Tabulated, draw_gear_errors
+from tvsbayes.twin.physics import effective_mirror_offset_mm, local_deg_per_step
+from tvsbayes.twin.true_headlines import effective_deg_per_step
+
+TRUTH_FORMAT = "tvsbayes-truth/1"
+Pair = tuple[float, float]
+"""Of pan and tilt."""
+
+
+class GearErrorTable(TypedDict):
+    """What an axis repeats, at the counters of a campaign: error of the output, play beyond its mean."""
+
+    steps: list[int]
+    error_deg: list[float]
+    play_deg: list[float]
+
+
+class TruthDocument(TypedDict):
+    """truth.json; see `Truth`."""
+
+    format: str
+    note: str
+    parameters: dict[str, float]
+    stereo: dict[str, float]
+    mirror_angles_deg: Sequence[Pair]
+    stop_errors_deg: Sequence[Pair]
+    home_offsets_deg: Sequence[Pair]
+    drift_deg: NotRequired[Sequence[Pair]]
+    homing_side: NotRequired[dict[str, str] | None]
+    reference_pose_deg: Pair | None
+    gear_error: NotRequired[dict[str, GearErrorTable]]
+    effective_deg_per_step: NotRequired[dict[str, float]]
+    local_deg_per_step: NotRequired[dict[str, float]]
+    effective_mirror_offset_mm: NotRequired[float]
+
+
+@dataclass(frozen=True)
+class Truth:
+    """A true rig: what no estimator may read.
+
+    Attributes:
+        parameters: every physical parameter by its contract name, derived ones included.
+        stereo: the true cameras (the campaign carries the stated ones).
+        mirror_angles_deg: (psi, beta) of each move as realised, stop errors included; empty before a run.
+        stop_errors_deg: (pan, tilt) stop error of each move, as held.
+        home_offsets_deg: (pan, tilt) per segment.
+        drift_deg: (pan, tilt) of the zero at each move, since its homing.
+        homing_side: side from which each homing of pan and tilt ends, "unknown" for anywhere anew; None before a run.
+        reference_pose_deg: mean (psi, beta) over the ok spots without stop errors, None before a run.
+        gear_errors: what the gears repeat by position; None leaves it to each run to draw it by the scales in
+            `parameters`. As read from a truth.json it is known at the counters of its campaign.
+        note: what a reader of truth.json should know.
+    """
+
+    parameters: dict[str, float]
+    stereo: Stereo
+    mirror_angles_deg: tuple[Pair, ...] = ()
+    stop_errors_deg: tuple[Pair, ...] = ()
+    home_offsets_deg: tuple[Pair, ...] = ()
+    drift_deg: tuple[Pair, ...] = ()
+    homing_side: tuple[str, str] | None = None
+    reference_pose_deg: Pair | None = None
+    gear_errors: GearErrors | None = None
+    note: str = "The true rig of a simulated campaign; no estimator reads this file."
+
+    def effective_deg_per_step(self, campaign: Campaign) -> dict[str, float] | None:
+        """True headlines over the looks of a campaign of this rig, see `true_headlines`; None where it has no looks."""
+        return effective_deg_per_step(self.parameters, self.gear_errors or PERFECT, campaign)
+
+    def as_json(self, campaign: Campaign) -> TruthDocument:
+        """The document of truth.json of a campaign of this rig, with the effective ratios where there are looks."""
+        document: TruthDocument = {
+            "format": TRUTH_FORMAT,
+            "note": self.note,
+            "parameters": {name: float(value) for name, value in self.parameters.items()},
+            "stereo": dict(zip(STEREO_PARAMETER_NAMES, map(float, self.stereo.vector), strict=True)),
+            "mirror_angles_deg": self.mirror_angles_deg,
+            "stop_errors_deg": self.stop_errors_deg,
+            "home_offsets_deg": self.home_offsets_deg,
+            "drift_deg": self.drift_deg,
+            "homing_side": None if self.homing_side is None else dict(zip(AXES, self.homing_side, strict=True)),
+            "reference_pose_deg": self.reference_pose_deg,
+            "gear_error": {axis: self._gear_error(axis, campaign) for axis in AXES},
+        }
+        effective = self.effective_deg_per_step(campaign)
+        if effective is not None:
+            document["effective_deg_per_step"] = effective
+        if self.reference_pose_deg is not None:
+            document["local_deg_per_step"] = local_deg_per_step(self.parameters, self.reference_pose_deg)
+            document["effective_mirror_offset_mm"] = effective_mirror_offset_mm(
+                self.parameters, self.reference_pose_deg
+            )
+        return document
+
+    def _gear_error(self, axis: str, campaign: Campaign) -> GearErrorTable:
+        steps = sorted({getattr(move, f"{axis}_steps") for move in campaign.moves})
+        angle_deg = self.parameters[f"degrees_per_step.{axis}"] * np.array(steps, float)
+        errors = (self.gear_errors or PERFECT)[axis]
+        return {
+            "steps": steps,
+            "error_deg": errors.error_deg(angle_deg).tolist(),
+            "play_deg": errors.play_deg(angle_deg).tolist(),
+        }
+
+    @classmethod
+    def from_json(cls, document: TruthDocument, stated: Stereo) -> Truth:
+        """Rebuild from truth.json; image size and covariance come from the campaign's `stated` stereo."""
+        pose, known = document["reference_pose_deg"], document["stereo"]
+        # Files from before the gears repeated errors are of perfect ones.
+        perfect = {name: RIG_PRIORS[name].value for name in GEAR_ERROR_NAMES}
+        parameters = perfect | {name: float(value) for name, value in document["parameters"].items()}
+        side, tables = document.get("homing_side"), document.get("gear_error")
+        return cls(
+            parameters=parameters,
+            stereo=stated.with_vector(np.array([float(known[name]) for name in STEREO_PARAMETER_NAMES])),
+            mirror_angles_deg=pan_and_tilt(document["mirror_angles_deg"]),
+            stop_errors_deg=pan_and_tilt(document["stop_errors_deg"]),
+            home_offsets_deg=pan_and_tilt(document["home_offsets_deg"]),
+            drift_deg=pan_and_tilt(document.get("drift_deg", ())),
+            homing_side=None if side is None else (str(side["pan"]), str(side["tilt"])),
+            reference_pose_deg=None if pose is None else (float(pose[0]), float(pose[1])),
+            gear_errors=PERFECT if tables is None else _tabulated(tables, parameters),
+            note=str(document["note"]),
+        )
+
+
+def _tabulated(tables: Mapping[str, GearErrorTable], parameters: Mapping[str, float]) -> GearErrors:
+    """The errors that a truth.json knows."""
+    errors: dict[str, AxisErrors] = {}
+    for axis in AXES:
+        table = tables[axis]
+        angle_deg = parameters[f"degrees_per_step.{axis}"] * np.array(table["steps"], float)
+        known = (Tabulated(angle_deg, np.array(table[name], float)) for name in ("error_deg", "play_deg"))
+        errors[axis] = AxisErrors(*known)
+    return errors
+
+
+def pan_and_tilt(rows: Iterable[Sequence[float]]) -> tuple[Pair, ...]:
+    """Rows of two numbers as a `Truth` holds them."""
+    return tuple((float(pan), float(tilt)) for pan, tilt in rows)
+
+
+def read_truth(path: str | Path, stated: Stereo) -> Truth:
+    """Read a truth.json; `stated` is the stereo calibration of its campaign.
+
+    Raises:
+        InputError: unreadable, or not a truth file of this format.
+    """
+    path = Path(path)
+    keys = parse_json(read_bytes(path, JSON_BYTES_MAX), path.name)
+    keys.word("format", (TRUTH_FORMAT,))
+    try:
+        # What stands in the entries is converted, or refused below.
+        return Truth.from_json(cast("TruthDocument", keys.values), stated)
+    except (AttributeError, KeyError, TypeError, ValueError, IndexError) as error:
+        raise InputError(
+            "truth",
+            f"{path.name} does not hold a truth file's entries: {error}",
+            file=path.name,
+            allowed="a truth.json as `tvsbayes simulate` writes it",
+            remedy="simulate the campaign again, or delete the file: no estimator needs it",
+        ) from error
+
+
+def draw_truth(rig: Rig, rng: np.random.Generator) -> Truth:
+    """Draw a true rig: every quantity of `rig.truth` anew, the cameras from their own covariance.
+
+    Nothing is left at its stated value unless its `u` is 0: a study whose cameras were exact would
+    report a coverage that no real calibration has.
+    """
+    # Of a stream of its own: rigs with perfect gears are the same rigs whatever is drawn here.
+    (gears,) = rng.spawn(1)
+
+    def drawn(names: Iterable[str], stream: np.random.Generator) -> dict[str, float]:
+        return {name: _draw(rig.truth.get(name, rig.table.priors[name]), stream) for name in names}
+
+    parameters = drawn((n for n in RIG_NAMES if n not in (*HARMONIC_NAMES, *GEAR_ERROR_NAMES)), rng)
+    # Through the eigenvectors: fixed parameters give a semi-definite covariance that Cholesky refuses.
+    variances, vectors = np.linalg.eigh(np.asarray(rig.stereo.parameter_covariance, float))
+    offset = vectors @ (np.sqrt(np.clip(variances, 0.0, None)) * rng.standard_normal(len(variances)))
+    # Last: rigs without transmission error are the same rigs whatever is drawn here.
+    parameters |= drawn(HARMONIC_NAMES, rng) | drawn(GEAR_ERROR_NAMES, gears)
+    stereo = rig.stereo.with_vector(rig.stereo.vector + offset)
+    errors = draw_gear_errors(parameters, rig.table.harmonic_period_deg, gears)
+    return Truth(with_derived(parameters), stereo, gear_errors=errors)
+
+
+def _draw(prior: Prior, rng: np.random.Generator) -> float:
+    """One draw; the generator always advances by one, so that fixing a parameter moves no other."""
+    z = rng.standard_normal()
+    if prior.distribution == "log-normal":
+        return float(prior.value * np.exp(prior.u * z))
+    if prior.distribution == "half-normal":
+        return float(prior.value + prior.u * abs(z))
+    return float(prior.value + prior.u * z)
+
+
+def with_derived(parameters: Mapping[str, float]) -> dict[str, float]:
+    """Add the four directional ratios that mean ratios and contrasts imply (formulation 3.1)."""
+    result = dict(parameters)
+    for axis, (negative, positive) in SIDES.items():
+        ratio, contrast = result[f"degrees_per_step.{axis}"], result[f"ratio_contrast_deg_per_step.{axis}"]
+        result[f"degrees_per_step.{positive}"] = ratio + contrast / 2
+        result[f"degrees_per_step.{negative}"] = ratio - contrast / 2
+    return result
