@@ -208,6 +208,9 @@ def test_truth_file_knows_the_errors_at_its_counters(mounted_rig):
     second = simulate(rig, sweep(), 5, again)
     assert second.truth.mirror_angles_deg == pytest.approx(np.array(run.truth.mirror_angles_deg), abs=1e-12)
     assert again.effective_deg_per_step(run.campaign) == pytest.approx(document["effective_deg_per_step"], rel=1e-12)
+    document["gear_error"]["pan"]["error_deg"].pop()
+    with pytest.raises(ValueError, match="different lengths"):
+        Truth.from_json(document, rig.stereo)
     assert not Tabulated(np.zeros(0), np.zeros(0))(np.array([1.0])).any()
 
 

@@ -159,8 +159,10 @@ def _tabulated(tables: Mapping[str, GearErrorTable], parameters: Mapping[str, fl
     for axis in AXES:
         table = tables[axis]
         angle_deg = parameters[f"degrees_per_step.{axis}"] * np.array(table["steps"], float)
-        known = (Tabulated(angle_deg, np.array(table[name], float)) for name in ("error_deg", "play_deg"))
-        errors[axis] = AxisErrors(*known)
+        values = [np.array(table[name], float) for name in ("error_deg", "play_deg")]
+        if any(value.shape != angle_deg.shape or value.ndim != 1 for value in values):
+            raise ValueError(f"gear_error.{axis} has columns of different lengths")
+        errors[axis] = AxisErrors(*(Tabulated(angle_deg, value) for value in values))
     return errors
 
 
