@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import shutil
 from dataclasses import replace
@@ -82,6 +83,18 @@ def test_simulate_writes_a_campaign_and_repeats_itself(ask, tmp_path):
     code, document = ask("simulate", MOUNTED / "rig.toml", plan, tmp_path / "a")
     assert code == 2
     assert_error(document, "occupied")
+
+
+def test_simulate_can_keep_the_homing_sides_to_itself(ask, tmp_path):
+    """The campaign says nothing; truth.json has the side, the errors of the gears and both kinds of ratios."""
+    plan = tmp_path / "plan.csv"
+    write_plan(two_sheets((100, 30)), plan)
+    assert ask("simulate", MOUNTED / "rig.toml", plan, tmp_path / "a", "--unrecorded-sides", "--seed", 7)[0] == 0
+    assert {(m.pan_approach, m.tilt_approach) for m in read_campaign(tmp_path / "a").moves[:1]} == {("unknown",) * 2}
+    truth = json.loads((tmp_path / "a" / "truth.json").read_text())
+    assert truth["homing_side"]["pan"] in ("left", "right", "unknown")
+    assert {axis: table["steps"] for axis, table in truth["gear_error"].items()} == {"pan": [0, 100], "tilt": [0, 30]}
+    assert truth["effective_deg_per_step"] == pytest.approx(truth["local_deg_per_step"], rel=1e-3)
 
 
 def test_new_campaign_lacks_only_its_stereo_calibration(ask, say, tmp_path):

@@ -96,15 +96,25 @@ def simulate(
     out: Annotated[Path, typer.Argument(metavar="OUT", help="Campaign folder to write.")],
     aperture: Annotated[bool, typer.Option("--aperture/--no-aperture", help="Looks also read the aperture.")] = False,
     frames: Annotated[bool, typer.Option("--frames", help="Pictures for `detect` and `stereo`, no centroids.")] = False,
+    unrecorded_sides: Annotated[
+        bool, typer.Option("--unrecorded-sides", help="Homing ends on sides that are drawn and not recorded.")
+    ] = False,
     seed: Seed = 0,
     as_json: Json = False,
 ) -> None:
     """The digital twin runs a plan on a true rig that it draws. Writes the campaign and truth.json."""
+    from tvsbayes.instrument.axes import HOME_APPROACH
     from tvsbayes.instrument.plan import read_plan
     from tvsbayes.instrument.rig import read_rig
     from tvsbayes.twin.simulated_campaign import simulate as run_plan
 
-    result = run_plan(read_rig(rig), read_plan(plan), seed, aperture=aperture)
+    home_approach = None if unrecorded_sides else HOME_APPROACH
+    result = run_plan(
+        *(read_rig(rig), read_plan(plan), seed),
+        aperture=aperture,
+        home_approach=home_approach,
+        sides_recorded=not unrecorded_sides,
+    )
     moves, spots = len(result.campaign.moves), result.campaign.spots
     seen = sum(spot.status == "ok" for spot in spots)
     document = {"campaign": str(out), "moves": moves, "spots": len(spots), "ok": seen, "seed": seed}
