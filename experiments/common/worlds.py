@@ -1,7 +1,7 @@
 """Worlds that no prior holds: true rigs whose gears err otherwise than the model says, and campaigns on them.
 
 Errors of both axes, in degrees of the output: `pinion`, a wave of the pinion's turn; `tooth`, one of its teeth;
-`step`, a jump at one place, as of a tooth that is damaged or a wheel joined of two halves; `warm-up`, a zero that creeps
+`step`, a jump at one place, as of a damaged tooth or of a wheel joined of two halves; `warm-up`, a zero that creeps
 after switching on and settles. `size_deg` is the amplitude of a wave, the height of a step, the whole way of a zero.
 """
 

@@ -6,6 +6,7 @@ import datetime
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from support.bench_runs import HEADER, small_plan
 
 from tvsbayes.acquisition.bench import SIMULATED_START, Bench
@@ -14,7 +15,9 @@ from tvsbayes.acquisition.observation import TwinObserver
 from tvsbayes.acquisition.operator import SimulatedOperator
 from tvsbayes.acquisition.session import begin
 from tvsbayes.acquisition.simulated_instrument import Instrument
+from tvsbayes.instrument.axes import AXES, HOME_SD_DEG
 from tvsbayes.instrument.campaign import read_campaign
+from tvsbayes.instrument.parameters import Prior
 from tvsbayes.twin.simulated_campaign import simulate
 from tvsbayes.twin.true_rig import draw_truth
 
@@ -24,8 +27,11 @@ def test_light_behind_the_device_is_that_of_the_twin(mounted_rig, tmp_path, monk
     for name in ("SHEET_DEPTH_SD_MM", "SHEET_TILT_SD_DEG", "HOME_SD_DEG"):
         monkeypatch.setattr(f"tvsbayes.twin.simulated_campaign.{name}", 0.0)
     monkeypatch.setattr("tvsbayes.acquisition.simulated_instrument.HOME_SD_DEG", 0.0)
-    truth = draw_truth(mounted_rig, np.random.default_rng(3))
-    still = {name: 0.0 for name in truth.parameters if name.startswith("stop_sd_deg")}
+    # Gears that repeat their errors; drift goes with the time, and the engine's clock is not the plan's.
+    scales = {"transmission_error_deg": 0.05, "play_variation_deg": 0.02}
+    geared = {f"{name}.{axis}": Prior(scale, 0.0) for name, scale in scales.items() for axis in AXES}
+    truth = draw_truth(replace(mounted_rig, truth={**mounted_rig.truth, **geared}), np.random.default_rng(3))
+    still = {name: 0.0 for name in truth.parameters if name.startswith(("stop_sd_deg", "drift"))}
     truth = replace(truth, parameters={**truth.parameters, **still, "pixel_scale": 0.0})
     plan = small_plan(3, rehome=True)
     wanted = simulate(mounted_rig, plan, 1, truth).campaign
@@ -51,6 +57,34 @@ def test_light_behind_the_device_is_that_of_the_twin(mounted_rig, tmp_path, monk
     ours, theirs = ([[getattr(s, n) for n in names] for s in c.spots] for c in (found, wanted))
     # Motion by motion against commanded counters: the same angles to rounding, 1e-12 rad x 1000 px.
     assert np.abs(np.subtract(ours, theirs)).max() < 1e-8
+
+
+def test_zero_drifts_with_the_clock_and_a_homing_finds_it(mounted_rig):
+    """Scale x root of the hours between two motions, over 200 of them; nothing moves while a camera looks on."""
+    truth = draw_truth(mounted_rig, np.random.default_rng(4))
+    still = {name: 0.0 for name in truth.parameters if name.startswith(("stop_sd_deg", "backlash_deg"))}
+    truth = replace(truth, parameters={**truth.parameters, **still, "drift_deg_per_root_hour.pan": 0.3})
+    instrument = Instrument(mounted_rig, 6, truth=truth)
+    positioner = instrument.positioner()
+    positioner.home()
+    positioner.move_to(0, 0)
+    changes, angle_deg = [], instrument.state_deg()["mirror_angles_deg"][0]
+    for number in range(200):
+        instrument.clock.sleep(3600.0)
+        instrument.light()
+        assert instrument.state_deg()["mirror_angles_deg"][0] == angle_deg
+        positioner.move_to(0 if number % 2 else 1, 0)
+        now_deg = instrument.state_deg()["mirror_angles_deg"][0]
+        changes.append(now_deg - angle_deg)
+        angle_deg = now_deg
+    p = truth.parameters
+    driven = np.where(np.arange(200) % 2, -p["degrees_per_step.right"], p["degrees_per_step.left"])
+    # Four standard errors of an sd of 200.
+    assert np.std(np.array(changes) - driven) == pytest.approx(0.3, rel=4 / np.sqrt(400))
+    positioner.home()
+    positioner.move_to(0, 0)
+    # What is left is the home offset.
+    assert abs(instrument.state_deg()["mirror_angles_deg"][0]) < 5 * HOME_SD_DEG
 
 
 def test_camera_that_looks_on_does_not_change_the_motion(mounted_rig):

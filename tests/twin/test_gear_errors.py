@@ -17,7 +17,7 @@ from tvsbayes.instrument.plan import PlanStep
 from tvsbayes.instrument.rig import Rig
 from tvsbayes.statistics.gaussian_process import matern52
 from tvsbayes.twin.gear_errors import PERFECT, AxisErrors, Tabulated, Waves, draw_gear_errors, drift_deg, matern_waves
-from tvsbayes.twin.physics import local_deg_per_step
+from tvsbayes.twin.physics import local_deg_per_step, mirror_chain
 from tvsbayes.twin.simulated_campaign import draw_home_approach, simulate
 from tvsbayes.twin.true_headlines import effective_deg_per_step
 from tvsbayes.twin.true_rig import Truth, draw_truth, with_derived
@@ -61,18 +61,22 @@ def geared(rig: Rig, period_deg: dict[str, tuple[float, ...]] | None = None, **s
 
 
 def test_errors_are_draws_of_a_matern_process():
-    """400 rigs: sd, and correlation at half a length and at two; each rig's error is Gaussian about 0."""
-    places = np.array([3.0, 7.0, 19.0])
+    """4000 rigs: sd, and correlation at half a length, at one and a half, at two; each error is Gaussian about 0.
+
+    Enough to tell it from one of smoothness 3/2, whose correlation at half a length is less by 0.044.
+    """
+    count, places = 4000, np.array([3.0, 7.0, 19.0])
     rng = np.random.default_rng(5)
-    draws = np.array([matern_waves(0.05, 8.0, rng)(places) for _ in range(SEEDS)]) / 0.05
-    assert np.abs(draws.mean(axis=0)).max() < FOUR_SE
-    assert draws.std(axis=0) == pytest.approx(1.0, abs=FOUR_SE / np.sqrt(2))
+    draws = np.array([matern_waves(0.05, 8.0, rng)(places) for _ in range(count)]) / 0.05
+    four_se = 4 / np.sqrt(count)
+    assert np.abs(draws.mean(axis=0)).max() < four_se
+    assert draws.std(axis=0) == pytest.approx(1.0, abs=four_se / np.sqrt(2))
+    found = np.corrcoef(draws.T)
     for one, other in ((0, 1), (0, 2), (1, 2)):
         expected = float(matern52(places[other] - places[one], 8.0))
-        found = np.mean(draws[:, one] * draws[:, other])
-        # The variance of a product of two correlated normals is 1 + rho^2.
-        assert found == pytest.approx(expected, abs=FOUR_SE * np.sqrt(1 + expected**2))
-    assert np.mean(np.abs(draws) < 1.96) == pytest.approx(0.95, abs=4 * np.sqrt(0.95 * 0.05 / SEEDS))
+        # The standard error of a correlation coefficient of normals is (1 - rho^2) / sqrt(N).
+        assert found[one, other] == pytest.approx(expected, abs=four_se * (1 - expected**2))
+    assert np.mean(np.abs(draws) < 1.96) == pytest.approx(0.95, abs=4 * np.sqrt(0.95 * 0.05 / count))
 
 
 def test_periodic_parts_repeat_after_their_period():
@@ -230,6 +234,13 @@ def test_the_headline_is_the_line_through_the_looks(mounted_rig):
     assert list(plain) == list(DIRECTIONS)
     many = simulate(mounted_rig, sweep((20, 40, 60, 80, 100, 120)), 1, truth).campaign
     counters = np.array([0.0, 20, 40, 60, 80, 100, 120])
+    tilt_deg = p["degrees_per_step.tilt"] * counters.mean() / 2 + p["tilt_zero_deg"]
+    direction = mirror_chain(np.radians(p["degrees_per_step.pan"] * counters), np.radians(tilt_deg), p)[1]
+    line = np.polyfit(counters, np.degrees(np.arctan2(direction[:, 1], direction[:, 0])), 1)[0]
+    found = effective_deg_per_step(p, PERFECT, many)
+    assert (found["left"] + found["right"]) / 2 == pytest.approx(line, rel=1e-9)
+    contrast = p["ratio_contrast_deg_per_step.pan"] * slope
+    assert found["left"] - found["right"] == pytest.approx(contrast, rel=1e-3)
     ramp = np.polyfit(counters, 0.1 * (p["degrees_per_step.pan"] * counters > 3.0), 1)[0]
     rise = effective_deg_per_step(p, errors, many)["left"] - effective_deg_per_step(p, PERFECT, many)["left"]
     assert rise == pytest.approx(ramp * slope, rel=2e-3)

@@ -137,7 +137,8 @@ class Truth:
         pose, known = document["reference_pose_deg"], document["stereo"]
         # Files from before the gears repeated errors are of perfect ones.
         perfect = {name: RIG_PRIORS[name].value for name in GEAR_ERROR_NAMES}
-        parameters = perfect | {name: float(value) for name, value in document["parameters"].items()}
+        parameters = {name: float(value) for name, value in document["parameters"].items()}
+        parameters |= {name: value for name, value in perfect.items() if name not in parameters}
         side, tables = document.get("homing_side"), document.get("gear_error")
         return cls(
             parameters=parameters,
