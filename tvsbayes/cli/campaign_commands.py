@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from tvsbayes.cli.app import CampaignFolder, Json, Seed, finish, finite, report_line
+from tvsbayes.cli import axis_commands
+from tvsbayes.cli.app import CampaignFolder, Json, Seed, finish, finite, refuse_options, report_line
 from tvsbayes.cli.progress_bar import waiting
 from tvsbayes.errors import InputError, escaped
 from tvsbayes.files.disk import make_folder, output_place, shipped_data, write_atomically
@@ -78,8 +79,15 @@ def _sampled(campaign: Campaign, progress: Show | None) -> FitSummary:
         return summarise(found, sample(found, "importance", progress=job.part(SAMPLING)))
 
 
-def new(out: Annotated[Path, typer.Argument(metavar="OUT", help="Folder to create.")], as_json: Json = False) -> None:
+def new(
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="Folder to create.")],
+    axis: Annotated[bool, typer.Option("--axis", help="One axis and its readings, no optics.")] = False,
+    as_json: Json = False,
+) -> None:
     """An empty campaign, explained in campaign.toml, and a rig file. Fill them, or plan and simulate with the rig."""
+    if axis:
+        axis_commands.new_axis(out, as_json)
+        return
     make_folder(out, empty=True)
     templates = sorted((shipped_data() / "templates").iterdir())
     for template in templates:
@@ -91,9 +99,9 @@ def new(out: Annotated[Path, typer.Argument(metavar="OUT", help="Folder to creat
 
 
 def simulate(
-    rig: Annotated[Path, typer.Argument(metavar="RIG", help="Rig file.")],
-    plan: Annotated[Path, typer.Argument(metavar="PLAN", help="plan.csv.")],
-    out: Annotated[Path, typer.Argument(metavar="OUT", help="Campaign folder to write.")],
+    rig: Annotated[Path, typer.Argument(metavar="RIG", help="Rig file, or an axis folder.")],
+    plan: Annotated[Path, typer.Argument(metavar="PLAN", help="plan.csv; of an axis its moves.csv, or left out.")],
+    out: Annotated[Path | None, typer.Argument(metavar="OUT", help="Campaign folder to write.")] = None,
     aperture: Annotated[bool, typer.Option("--aperture/--no-aperture", help="Looks also read the aperture.")] = False,
     frames: Annotated[bool, typer.Option("--frames", help="Pictures for `detect` and `stereo`, no centroids.")] = False,
     unrecorded_sides: Annotated[
@@ -103,6 +111,13 @@ def simulate(
     as_json: Json = False,
 ) -> None:
     """The digital twin runs a plan on a true rig that it draws. Writes the campaign and truth.json."""
+    if axis_commands.is_axis(rig):
+        given = {"aperture": aperture, "frames": frames, "unrecorded_sides": unrecorded_sides}
+        refuse_options(axis_commands.NOT_OF_AN_AXIS, "leave it out", **given)
+        axis_commands.simulate(rig, None if out is None else plan, out or plan, seed=seed, as_json=as_json)
+        return
+    if out is None:
+        raise InputError("usage", "Missing argument 'OUT'.", remedy="see tvsbayes --help")
     from tvsbayes.instrument.axes import HOME_APPROACH
     from tvsbayes.instrument.plan import read_plan
     from tvsbayes.instrument.rig import read_rig
@@ -212,7 +227,7 @@ def _held(path: Path, plan_file: Path | None) -> dict[str, Any]:
     if path.suffix == ".toml" and not path.is_dir():
         rig = read_rig(path)
         return {"kind": "rig", "sheets_mm": rig.sheets_mm, "costs_s": rig.costs_s, "warnings": []}
-    return _campaign_held(path)
+    return axis_commands.axis_held(path) if axis_commands.is_axis(path) else _campaign_held(path)
 
 
 def _campaign_held(path: Path) -> dict[str, Any]:

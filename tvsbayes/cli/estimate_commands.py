@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from tvsbayes.cli import axis_commands
 from tvsbayes.cli.app import TARGET_MISSED, CampaignFolder, Ended, Json, Seed, finish, keep, refuse_options, report_line
 from tvsbayes.cli.progress_bar import waiting
 from tvsbayes.errors import InputError, NothingToEstimate, escaped
@@ -32,6 +33,7 @@ if TYPE_CHECKING:
 DCC_MESSAGES = 20
 """Of a schema validator, shown at most."""
 MAX_MINUTES = 10.0
+RANGE_MM = 1e3
 HOLDING_OUT, PRINTING = "hold-out", "printing to PDF"
 
 
@@ -73,8 +75,6 @@ def fit(
     as_json: Json = False,
 ) -> None:
     """Fit the joint model to every spot and sample its posterior. Ratios, backlash, mirror offset, extrinsics."""
-    from tvsbayes.instrument.campaign import read_campaign
-
     if resume and no_sample:
         raise InputError("usage", "--resume continues a chain and --no-sample makes none", remedy="give one of them")
     if no_sample:
@@ -84,6 +84,15 @@ def fit(
         refuse_options(
             "for a chain, and --quick makes none", "give one of them", max_minutes=max_minutes, resume=resume
         )
+    if axis_commands.is_axis(campaign):
+        choice = {"robust": robust, "per_axis": per_axis, "harmonics": harmonics, "no_backlash": no_backlash}
+        refuse_options(axis_commands.NOT_OF_AN_AXIS, "leave it out, or state priors in [axis]", resume=resume, **choice)
+        minutes = MAX_MINUTES if max_minutes is None else max_minutes
+        ways = {"quick": quick, "no_sample": no_sample, "max_minutes": minutes}
+        axis_commands.fit(campaign, **ways, out=out, seed=seed, as_json=as_json)  # type: ignore[arg-type]
+        return
+    from tvsbayes.instrument.campaign import read_campaign
+
     data = read_campaign(campaign)
     _warn_of(data)
     from tvsbayes.instrument.model_choice import ModelChoice
@@ -120,6 +129,7 @@ def _show_first(summary: FitSummary) -> None:
 LimitRatio = Annotated[
     float | None, typer.Option("--limit-deg-per-step", min=0, help="Largest error allowed of any ratio: for a verdict.")
 ]
+Range = Annotated[float, typer.Option("--range-mm", min=1, help="Range at which millimetres are stated.")]
 Schema = Annotated[
     Path | None, typer.Option("--dcc-schema", help="PTB's dcc.xsd on this machine: validate the XML against it.")
 ]
@@ -129,7 +139,9 @@ def report(
     campaign: CampaignFolder,
     limit_deg_per_step: LimitRatio = None,
     limit_mm: Annotated[float | None, typer.Option("--limit-mm", min=0, help="Largest 3D error allowed.")] = None,
-    range_mm: Annotated[float, typer.Option("--range-mm", min=1, help="Range at which millimetres are stated.")] = 1e3,
+    range_mm: Annotated[
+        float, typer.Option("--range-mm", min=1, help="Range at which millimetres are stated.")
+    ] = RANGE_MM,
     pdf: Annotated[bool, typer.Option("--pdf", help="Also print to PDF with an installed Chromium.")] = False,
     dcc: Annotated[bool, typer.Option("--dcc", help="Also write DCC-schema XML (unsigned, not accredited).")] = False,
     laboratory: Annotated[str | None, typer.Option("--laboratory", help="Who measured, for --dcc.")] = None,
@@ -146,6 +158,12 @@ def report(
     parties = {"laboratory": laboratory, "customer": customer, "country": country}
     if not (dcc or dcc_schema):
         refuse_options("for a certificate", "add --dcc", **parties)
+    if axis_commands.is_axis(campaign):
+        unfit = {"limit_deg_per_step": limit_deg_per_step, "limit_mm": limit_mm, "dcc": dcc, "dcc_schema": dcc_schema}
+        unfit["range_mm"] = range_mm if range_mm != RANGE_MM else None
+        refuse_options(axis_commands.NOT_OF_AN_AXIS, "leave it out", **unfit)
+        axis_commands.report(campaign, pdf=pdf, out=out, as_json=as_json)
+        return
     data = read_campaign(campaign)
     results = output_place(campaign, "results")
     from tvsbayes.report.fit_text import validation_lines
@@ -201,10 +219,17 @@ def _certificate(campaign: Campaign, record: FitRecord, report: bytes, parties: 
     return dcc_bytes(campaign, record, issued=today, parties=Parties(**stated), report=report)
 
 
+By = Annotated[
+    str | None, typer.Option("--by", help="Left out together: steps (default), regions; positions of an axis.")
+]
+
+
 def compare(
     campaign: CampaignFolder,
     other: Annotated[Path | None, typer.Argument(metavar="B", help="Later campaign of the same instrument.")] = None,
-    by: Annotated[str | None, typer.Option("--by", help="Left out together: steps (default) or regions.")] = None,
+    by: Annotated[
+        str | None, typer.Option("--by", help="Left out together: steps (default), regions; positions.")
+    ] = None,
     seed: Annotated[int | None, typer.Option("--seed", min=0, help="Seed of everything random (default 0).")] = None,
     as_json: Json = False,
 ) -> None:
@@ -216,6 +241,15 @@ def compare(
 
     if other is not None:
         refuse_options("for one campaign: with B nothing is left out", "leave it out, or leave out B", by=by, seed=seed)
+    if axis_commands.is_axis(campaign):
+        if other is not None:
+            raise InputError(
+                "usage", "B is a later campaign of a scanner; axes are compared one by one", remedy="leave out B"
+            )
+        axis_commands.compare(campaign, by=by, seed=seed or 0, as_json=as_json)
+        return
+    if by == "positions":
+        raise InputError("usage", "--by positions is for axis folders", remedy="choose steps or regions")
     if by not in (None, "steps", "regions"):
         raise InputError("usage", f"--by {escaped(by)}: allowed are steps and regions", remedy="choose one of them")
     folders = [campaign] if other is None else [campaign, other]

@@ -13,6 +13,7 @@ from typing import Annotated
 
 import typer
 
+from tvsbayes.cli import axis_commands
 from tvsbayes.cli.app import (
     TARGET_MISSED,
     CampaignFolder,
@@ -190,7 +191,7 @@ TargetText = Annotated[
 
 
 def plan(
-    rig: Annotated[Path, typer.Argument(metavar="RIG", help="Rig file.")],
+    rig: Annotated[Path | None, typer.Argument(metavar="RIG", help="Rig file; none with an axis folder.")] = None,
     given: Annotated[Path | None, typer.Option("--given", help="Campaign measured already: what next?")] = None,
     target: TargetText = None,
     minutes: Annotated[float | None, typer.Option("--minutes", min=0.1, help="Longest plan.")] = None,
@@ -202,6 +203,16 @@ def plan(
     as_json: Json = False,
 ) -> None:
     """How many experiments, which ones, and when to stop. With --given: what next."""
+    if axis_commands.is_axis(given or rig):
+        refuse_options(axis_commands.NOT_OF_AN_AXIS, "leave it out", aperture=aperture)
+        if given is None or rig is not None:
+            raise InputError(
+                "usage", "an axis is planned from its folder alone", remedy="give --given FOLDER without RIG"
+            )
+        axis_commands.plan(given, target=target, minutes=minutes, output=output, seed=seed, as_json=as_json)
+        return
+    if rig is None:
+        raise InputError("usage", "Missing argument 'RIG'.", remedy="see tvsbayes --help")
     from tvsbayes.instrument.campaign import input_hashes, read_campaign
     from tvsbayes.instrument.plan import write_plan
     from tvsbayes.instrument.rig import read_rig

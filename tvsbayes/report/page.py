@@ -95,11 +95,15 @@ def report_html(evidence: Evidence) -> bytes:
     Args:
         evidence: computed beforehand; nothing is computed here.
     """
+    return page_html(_page(evidence))
+
+
+def page_html(page: Page) -> bytes:
+    """A page by the template, UTF-8."""
     folder = shipped_data() / "report"
     environment = Environment(
         loader=FileSystemLoader(str(folder)), autoescape=True, undefined=StrictUndefined, trim_blocks=True
     )
-    page = _page(evidence)
     css = (folder / "report.css").read_text(encoding="utf-8").replace("@ID@", page.report_id)
     digest = base64.b64encode(hashlib.sha256(css.encode()).digest()).decode()
     policy = f"default-src 'none'; img-src data:; style-src 'sha256-{digest}'; base-uri 'none'; form-action 'none'"

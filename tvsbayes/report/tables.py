@@ -125,6 +125,7 @@ class Page:
     warnings: Sequence[str]
     versions: Mapping[str, str]
     sections: Sequence[Section] = field(default_factory=tuple)
+    title: str = "Calibration of a laser positioner"
 
 
 def figure_view(figure: Figure, alt: str, caption: str) -> FigureView:

@@ -11,15 +11,24 @@ from collections.abc import Iterable, Mapping
 from dataclasses import MISSING, fields, is_dataclass
 from functools import cache
 from itertools import repeat
+from pathlib import Path
 from types import NoneType, UnionType
-from typing import Any, get_args, get_origin, get_type_hints
+from typing import Any, Protocol, get_args, get_origin, get_type_hints
 
 import numpy as np
 
 from tvsbayes.errors import shown
 from tvsbayes.files.disk import read_bytes
 from tvsbayes.files.documents import JSON_BYTES_MAX, Keys, parse_json
-from tvsbayes.instrument.campaign import Campaign
+
+
+class HasFolder(Protocol):
+    """A campaign of any kind; `path` is None of one that was never written."""
+
+    @property
+    def path(self) -> Path | None:
+        """Its folder."""
+
 
 TEXT_CHARS_MAX = 20_000
 """Of one text in a document that tvsbayes wrote."""
@@ -117,7 +126,7 @@ def _is_a(kind: type, value: object) -> bool:
     return kind is float and isinstance(value, int | float) and math.isfinite(value)
 
 
-def stored_document(campaign: Campaign, name: str, formats: tuple[str, ...], inputs: Mapping[str, str]) -> Keys | None:
+def stored_document(campaign: HasFolder, name: str, formats: tuple[str, ...], inputs: Mapping[str, str]) -> Keys | None:
     """A document in `results/` that was made from the data and priors with these hashes; None where there is none.
 
     Raises:

@@ -1,0 +1,168 @@
+"""Do the intervals hold on real axes, and on simulated ones?
+
+    python -m experiments.real.axes run FOLDER                        # tables as experiments.real.axis_files takes them
+    python -m experiments.real.axes simulate --n 100 --cores 0 1      # drawn axes of three protocols, resumable
+    python -m experiments.real.axes table > experiments/real/axes.md
+
+`run` leaves every position of every table out in turn and foretells the mean of its readings in each direction: by the
+model with error and play as processes of position, and by the first edition's: offset, scale, play and independent
+stops (least squares, as `classic_predicted` of `compare`). `simulate` draws axes from the default priors and counts how
+often the intervals of a fit hold the truth.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+
+from experiments.common.command_line import parser
+from experiments.common.rows import append_row, output, read_rows, run_rows
+from experiments.real.axis_files import axis_of
+from tvsbayes.single_axis.axis_campaign import AxisCampaign, AxisMove
+from tvsbayes.single_axis.axis_fit import fit_axis
+from tvsbayes.single_axis.axis_parameters import AxisPrior
+from tvsbayes.single_axis.held_out_positions import hold_out_positions
+from tvsbayes.single_axis.simulated_axis import simulate_axis
+from tvsbayes.statistics.chances import binomial_bounds, rms_bounds
+
+HELD, DRAWN = output(__file__, "axes_held.jsonl"), output(__file__, "axes_drawn.jsonl")
+LEVELS = (0.5, 0.95)
+QUANTITIES = ("per_command", "backlash")
+PROTOCOLS = {
+    "iso": "9 positions, 5 runs to and fro beyond both ends",
+    "few": "5 positions, 3 runs to and fro beyond both ends",
+    "walk": "60 stops at random among 12 positions, homed twice, sides unknown",
+}
+"""Of drawn axes, 0.01 deg per command, 4000 commands of travel, read to 0.001 deg once a minute."""
+
+
+def runs(positions: int, cycles: int) -> tuple[list[float], set[int]]:
+    """Commands of runs to and fro, and which of them are read."""
+    places = np.linspace(-2000, 2000, positions)
+    commands, read = [-2200.0], set()
+    for _ in range(cycles):
+        for run, beyond in ((places, 2200.0), (places[::-1], -2200.0)):
+            read |= set(range(len(commands), len(commands) + positions))
+            commands += [*map(float, run), beyond]
+    return commands, read
+
+
+def template(protocol: str, seed: int) -> tuple[AxisCampaign, set[int]]:
+    """Moves of a protocol, and which of them are read."""
+    segments: list[int]
+    if protocol == "walk":
+        rng = np.random.default_rng([seed, 99])
+        commands = [float(c) for c in rng.choice(np.linspace(-2000, 2000, 12), 60)]
+        segments, read, approach = [k // 20 for k in range(60)], set(range(60)), "unknown"
+    else:
+        commands, read = runs(*((9, 5) if protocol == "iso" else (5, 3)))
+        segments, approach = [0] * len(commands), "backward"
+    moves = []
+    for k, (command, segment) in enumerate(zip(commands, segments, strict=True)):
+        first = k == 0 or segment != segments[k - 1]
+        moves.append(AxisMove(k, segment, 60.0 * k, command, approach if first else ""))  # type: ignore[arg-type]
+    stated = {"per_command": AxisPrior(0.01, 0.002)}
+    return AxisCampaign("deg", tuple(moves), (), stated), read
+
+
+def one_axis(task: tuple[str, int]) -> dict[str, object]:
+    """Draw, read and fit one axis."""
+    protocol, seed = task
+    moves, read = template(protocol, seed)
+    drawn = simulate_axis(moves, seed=seed)
+    kept = tuple(r for r in drawn.campaign.readings if r.move in read)
+    found = fit_axis(AxisCampaign("deg", drawn.campaign.moves, kept, moves.stated), tier="importance", seed=seed)
+    row: dict[str, object] = {"protocol": protocol, "seed": seed, "problems": list(found.missing)}
+    for name in QUANTITIES:
+        draws, true = found.draws[name], drawn.truth.parameters[name]
+        row[name] = {"z": float((draws.mean() - true) / draws.std()), "below": float(np.mean(draws < true))}
+    return row
+
+
+def simulate(arguments: argparse.Namespace) -> None:
+    """Rows of drawn axes."""
+    tasks = [(protocol, seed) for seed in range(arguments.n) for protocol in PROTOCOLS]
+    run_rows(one_axis, tasks, DRAWN, ("protocol", "seed"), arguments.cores)
+
+
+def run(arguments: argparse.Namespace) -> None:
+    """Rows of held-out positions of every table in a folder."""
+    HELD.unlink(missing_ok=True)
+    for file in sorted(arguments.folder.glob("*.csv")):
+        found = hold_out_positions(axis_of(file))
+        for p in found.positions:
+            z, classic_z = (p.mean - p.predicted) / p.u, (p.mean - p.classic_predicted) / p.classic_u
+            row = {"axis": file.stem, "position": p.position, "direction": p.direction, "end": p.end}
+            append_row(HELD, {**row, "z": z, "classic_z": classic_z, "rows": p.rows, "inside": p.inside})
+        print(file.stem, f"{found.rms_z:.2f}", *found.warnings)
+
+
+def _rms(z: list[float]) -> str:
+    return f"{np.sqrt(np.mean(np.square(z))):.2f}" if z else ""
+
+
+def _held_lines(name: str, rows: list[dict]) -> str:
+    inner, ends = [r for r in rows if not r["end"]], [r for r in rows if r["end"]]
+    z = [r["z"] for r in inner]
+    inside = sum(r["inside"] for r in inner) / sum(r["rows"] for r in inner)
+    within = np.mean(np.abs(z) <= 1.96)
+    cells = [name, str(len(inner)), _rms(z), f"{np.abs(z).max():.1f}", f"{100 * within:.0f} %", f"{100 * inside:.0f} %"]
+    cells += [_rms([r["z"] for r in ends]), _rms([r["classic_z"] for r in inner])]
+    return "| " + " | ".join(cells) + " |"
+
+
+HELD_TEXT = """# Real axes, positions left out
+
+Made by `python -m experiments.real.axes`. Axes: figures printed in the test reports of the public repository
+anderssandstrom/ecmc_target_muts_logger (commit ee350e4c81): ISO 230-2 runs of stepper-driven screw axes read by laser
+triangulation. Every position left out in turn, the axis fitted without it, the mean of its readings in each direction
+foretold. z = (mean - predicted) / u; first edition: offset, scale, play, independent stops.
+
+| axis | inner means | RMS z | worst | in 1.96 u | readings in 95 % | ends: RMS z | first edition: RMS z |
+|---|---|---|---|---|---|---|---|"""
+DRAWN_TEXT = """
+## Drawn axes
+
+Axes drawn from the default priors and fitted by `fit --quick`: share of truths in central intervals, RMS of
+z = (mean - truth) / sd. Bounds are two-sided at 1e-4 for so many axes.
+
+| protocol | quantity | axes | in 50 % | bounds | in 95 % | bounds | RMS z | bounds | not accepted |
+|---|---|---|---|---|---|---|---|---|---|"""
+
+
+def table(_: argparse.Namespace) -> None:
+    """Both tables."""
+    held, drawn = read_rows(HELD), read_rows(DRAWN)
+    print(HELD_TEXT)
+    for axis in dict.fromkeys(r["axis"] for r in held):
+        print(_held_lines(axis, [r for r in held if r["axis"] == axis]))
+    print(_held_lines("**all**", held))
+    print(DRAWN_TEXT)
+    for protocol, what in PROTOCOLS.items():
+        rows = [r for r in drawn if r["protocol"] == protocol]
+        for name in QUANTITIES if rows else ():
+            below = np.array([r[name]["below"] for r in rows])
+            cells = [f"{protocol}: {what}", f"`{name}`", str(len(rows))]
+            for level in LEVELS:
+                low, high = binomial_bounds(len(rows), level)
+                cells += [f"{100 * np.mean(np.abs(below - 0.5) <= level / 2):.0f} %", f"{low:.2f} to {high:.2f}"]
+            low, high = rms_bounds(len(rows))
+            cells += [_rms([r[name]["z"] for r in rows]), f"{low:.2f} to {high:.2f}"]
+            print("| " + " | ".join([*cells, str(sum(bool(r["problems"]) for r in rows))]) + " |")
+
+
+def main() -> None:
+    """Do what the command line asks for."""
+    made = parser(__doc__)
+    made.add_argument("action", choices=("run", "simulate", "table"))
+    made.add_argument("folder", type=Path, nargs="?", help="of tables, for run")
+    made.add_argument("--n", type=int, default=100, help="drawn axes of each protocol (%(default)s)")
+    made.add_argument("--cores", type=int, nargs="+", default=[0], metavar="CORE")
+    arguments = made.parse_args()
+    {"run": run, "simulate": simulate, "table": table}[arguments.action](arguments)
+
+
+if __name__ == "__main__":
+    main()

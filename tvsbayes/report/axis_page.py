@@ -1,0 +1,127 @@
+"""The calibration report of one axis as an HTML page: ratio, what repeats by position, ISO 230-2, what next."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from tvsbayes.report.axis_text import (
+    deviation_table,
+    iso230_table,
+    parameter_table,
+    ratio_table,
+)
+from tvsbayes.report.figures import BLUE, GREY, RED, SKY, STYLE, WIDTH_IN
+from tvsbayes.report.page import page_html
+from tvsbayes.report.tables import FigureView, Number, Page, Section, concise, figure_view, two_digits
+from tvsbayes.results.fit_record import provenance
+from tvsbayes.results.records import plain
+from tvsbayes.single_axis.axis_campaign import axis_hashes
+from tvsbayes.single_axis.axis_record import AxisResults, deviation_functionals
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from tvsbayes.single_axis.axis_fit import AxisFit
+
+CURVE_POINTS = 81
+"""Of the figure of the error by position."""
+OF_SIDE = {1: (">", BLUE, "forward"), -1: ("<", RED, "backward"), 0: ("o", GREY, "side unknown")}
+TABLE_ROWS = 60
+
+
+def curve_commands(low: float, high: float) -> np.ndarray:
+    """Where the figure's curve is asked for; `results_for` wants them beforehand."""
+    return np.linspace(low, high, CURVE_POINTS)
+
+
+def error_figure(fit: AxisFit) -> Figure:
+    """The error by position with its 95 % band, and the stops on it, off the line through them."""
+    from matplotlib import rc_context
+    from matplotlib.figure import Figure
+
+    model, rows = fit.model, fit.rows
+    commands = curve_commands(float(rows.command.min()), float(rows.command.max()))
+    drawn = fit.linear.drawn(deviation_functionals(fit, commands), np.random.default_rng([fit.seed, 6]))
+    low, high = np.percentile(drawn, (2.5, 97.5), axis=0)
+    design = np.column_stack([np.ones(len(rows.value)), rows.command - model.middle])
+    off = rows.value - design @ np.linalg.lstsq(design, rows.value, rcond=None)[0]
+    with rc_context(STYLE):
+        figure = Figure(figsize=(WIDTH_IN, 3.2), layout="constrained")
+        axes = figure.add_subplot()
+        axes.fill_between(commands, low, high, color=SKY, alpha=0.4, linewidth=0, label="error by position, 95 %")
+        axes.plot(commands, drawn.mean(axis=0), color=BLUE, linewidth=1.2, label="its mean")
+        for side, marker, colour, name in (
+            (1, ">", BLUE, "forward"),
+            (-1, "<", RED, "backward"),
+            (0, "o", GREY, "side unknown"),
+        ):
+            mine = rows.side == side
+            if mine.any():
+                axes.plot(rows.command[mine], off[mine], marker, color=colour, markersize=3.5, label=f"stops, {name}")
+        axes.set(xlabel="command", ylabel=f"off the line, {fit.campaign.unit}")
+        axes.legend()
+    return figure
+
+
+def _figure_of(fit: AxisFit) -> FigureView:
+    alt = "The error that repeats by position over the command as a curve with a band, and every stop as a marker."
+    caption = "Deviation from the line through the stops: what repeats by position with its 95 % band, and the stops."
+    return figure_view(error_figure(fit), alt, caption)
+
+
+def axis_page(results: AxisResults) -> Page:
+    """The page; `results.fit` holds `curve_commands` of its range."""
+    summary, fit = results.summary, results.fit
+    unit, (low, high) = summary.unit, summary.range_command
+    made = plain(provenance(axis_hashes(fit.campaign), fit.seed))
+    said = json.dumps([summary.as_json(), made["inputs"]], sort_keys=True)
+    numbers = []
+    for side, of in summary.effective_per_command.items():
+        numbers.append(
+            Number(f"{unit} per command, {side}", concise(of.value, of.sd), f"line from {low:g} to {high:g}")
+        )
+    backlash = summary.parameters["backlash"]
+    numbers.append(Number("play", concise(backlash.value, backlash.sd), unit))
+    method = [
+        "Readings = offset + unit per command x command, play taken up on the side of arrival, an error and a play "
+        "that repeat by position (Matern processes), a drifting zero, an error of every stop, noise. What is linear is "
+        "integrated out exactly; scales are sampled, never maximised.",
+        "The ratio of the gears holds beyond the range read; the line through the stops belongs to that range.",
+    ]
+    iso230 = iso230_table(summary.classic, unit)
+    classic = summary.classic
+    told = f"Least-squares line: {concise(classic.per_command, classic.u_per_command)} {unit} per command, stops "
+    told += f"independent, residual scatter {two_digits(classic.residual_sd)} {unit}."
+    converged = "The intervals may be used." if summary.converged else "NOT CONVERGED: the numbers must not be used"
+    return Page(
+        report_id=hashlib.sha256(said.encode()).hexdigest()[:12].upper(),
+        name=str(fit.campaign.header.get("name") or "axis without a name"),
+        verdict=f"{converged} No limit was stated." if summary.converged else converged,
+        verdict_class="cannot-tell" if summary.converged else "not-met",
+        numbers=numbers,
+        criteria=None,
+        traceable="The readings are taken as stated.",
+        warnings=[*summary.problems, *summary.warnings],
+        versions=made["versions"],
+        sections=[
+            Section("Result", tables=[ratio_table(summary), parameter_table(summary)]),
+            Section(
+                "What repeats by position",
+                tables=[deviation_table(summary.deviations[:TABLE_ROWS], unit)],
+                figures=[_figure_of(fit)],
+            ),
+            Section("What the readings cannot tell", items=summary.weak_directions or ["Nothing of note."]),
+            Section("Classic", text=[told], tables=[iso230]),
+            Section("Method", text=method),
+        ],
+        title="Calibration of an axis",
+    )
+
+
+def axis_html(results: AxisResults) -> bytes:
+    """The page, UTF-8."""
+    return page_html(axis_page(results))

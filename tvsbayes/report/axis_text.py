@@ -1,0 +1,131 @@
+"""An axis in words: what `fit`, `compare`, `plan` and `check` print of one."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from tvsbayes.errors import escaped
+from tvsbayes.report.tables import TableView, concise, interval_text, two_digits
+from tvsbayes.results.estimates import Estimate
+from tvsbayes.single_axis.axis_parameters import AXIS_KEYS
+from tvsbayes.single_axis.axis_record import AxisSummary, PositionDeviation
+from tvsbayes.single_axis.classic_line import ClassicAxis
+from tvsbayes.single_axis.held_out_positions import AxisHoldOut
+from tvsbayes.single_axis.next_stops import AxisPlan
+
+WHAT = {
+    **{name: key.what for name, key in AXIS_KEYS.items()},
+    "stop_sd.forward": "scatter of stops reached forward",
+    "stop_sd.backward": "scatter of stops reached backward",
+    "ratio_contrast": "unit per command, forward less backward",
+    "offset": "reading at command 0, middle of the play",
+}
+"""Parameters in words."""
+
+
+def _row(name: str, of: Estimate) -> list[str]:
+    return [name, concise(of.value, of.sd), interval_text(*of.interval95, of.sd)]
+
+
+def ratio_table(summary: AxisSummary) -> TableView:
+    """Unit per command by direction: of the gears, of the line through what was read, and the classic."""
+    unit = escaped(summary.unit)
+    low, high = summary.range_command
+    rows = [_row(f"gears, {side}", of) for side, of in summary.per_command.items()]
+    rows += [_row(f"line from {low:g} to {high:g}, {side}", of) for side, of in summary.effective_per_command.items()]
+    classic = summary.classic
+    rows.append(["classic: least-squares line", concise(classic.per_command, classic.u_per_command), ""])
+    return TableView(f"{unit} per command, value(u)", ["", "value(u)", "95 % interval"], rows)
+
+
+def parameter_table(summary: AxisSummary) -> TableView:
+    """All parameters but the ratio."""
+    rows = []
+    for name, of in summary.parameters.items():
+        if name != "per_command":
+            said = "" if of.contraction is None else f"{of.contraction:.2f}"
+            rows.append([WHAT.get(name, name), *_row(name, of)[1:], said])
+    caption = f"parameters, {escaped(summary.unit)}; contraction 1: the readings tell it, 0: the prior does"
+    return TableView(caption, ["", "value(u)", "95 % interval", "contraction"], rows)
+
+
+def deviation_table(deviations: Sequence[PositionDeviation], unit: str) -> TableView:
+    """What repeats by position, off the line."""
+    rows = [[f"{d.position:g}", concise(d.value, d.sd), interval_text(*d.interval95, d.sd)] for d in deviations]
+    caption = f"error that repeats by position, off the line through the stops, {escaped(unit)}"
+    return TableView(caption, ["command", "value(u)", "95 % interval"], rows)
+
+
+def iso230_table(classic: ClassicAxis, unit: str) -> TableView | None:
+    """ISO 230-2-style figures; None where the runs do not allow them."""
+    if classic.iso230 is None:
+        return None
+    rows = [
+        [name.replace("_", " "), two_digits(abs(v)) if v >= 0 else f"-{two_digits(-v)}"]
+        for name, v in classic.iso230.items()
+    ]
+    caption = f"ISO 230-2 figures of the deviations from the least-squares line, {escaped(unit)}"
+    return TableView(caption, ["", "value"], rows)
+
+
+def _lines(title: str, texts: Sequence[str]) -> list[str]:
+    return [f"{title}: {text}" for text in texts]
+
+
+def axis_fit_text(summary: AxisSummary) -> str:
+    """A fit in words."""
+    how = {None: "Laplace approximation", "importance": "weighted draws", "emcee": "chain of emcee"}[summary.tier]
+    parts = [
+        f"{summary.readings} readings of {summary.moves} moves at {summary.positions} positions; {how}",
+        ratio_table(summary).text(),
+        parameter_table(summary).text(),
+        deviation_table(summary.deviations[:40], summary.unit).text(),
+    ]
+    iso230 = iso230_table(summary.classic, summary.unit)
+    if iso230 is not None:
+        parts.append(iso230.text())
+    notes = [*_lines("NOT CONVERGED", summary.problems), *_lines("weak", summary.weak_directions)]
+    notes += _lines("warning", summary.warnings)
+    return "\n\n".join(parts + ["\n".join(notes)] * bool(notes))
+
+
+def hold_out_table(found: AxisHoldOut, unit: str) -> TableView:
+    """Positions left out, beside what was foretold of them."""
+    rows = []
+    for p in found.positions:
+        z, classic_z = (p.mean - p.predicted) / p.u, (p.mean - p.classic_predicted) / max(p.classic_u, 1e-300)
+        row = [f"{p.position:g}", p.direction, str(p.n), f"{p.mean:.6g}", concise(p.predicted, p.u), f"{z:+.1f}"]
+        rows.append([*row, f"{classic_z:+.1f}"])
+    caption = f"positions left out and foretold, {escaped(unit)}; z in stated uncertainties"
+    return TableView(caption, ["position", "direction", "n", "mean", "predicted(u)", "z", "z classic"], rows)
+
+
+def axis_hold_out_text(found: AxisHoldOut, unit: str) -> str:
+    """A hold-out in words."""
+    told = f"RMS z {found.rms_z:.2f}, classic {found.classic_rms_z:.2f}; "
+    told += f"{100 * found.inside_share:.0f} % of the left-out readings in their 95 % intervals"
+    return "\n".join([hold_out_table(found, unit).text(), told, *_lines("warning", found.warnings)])
+
+
+def next_table(plan: AxisPlan, unit: str) -> TableView:
+    """Stops to be read next."""
+    rows = []
+    for stop in plan.next:
+        over = "" if stop.via is None else f"{stop.via:g}"
+        rows.append([f"{stop.command:g}", stop.direction, over, two_digits(stop.u)])
+    u = f"u of {plan.target} afterwards"
+    caption = f"stops to read next, in this order; now u = {two_digits(plan.u_now)} {escaped(unit)}"
+    return TableView(caption, ["command", "direction", "go first to", u], rows)
+
+
+def axis_plan_text(plan: AxisPlan, unit: str) -> str:
+    """What next, in words."""
+    if not plan.next:
+        return "there is no time for a single stop"
+    return f"{next_table(plan, unit).text()}\n{plan.minutes:.0f} minutes"
+
+
+def axis_held_text(document: Mapping[str, object], warnings: Sequence[str]) -> str:
+    """What `check` prints."""
+    lines = [f"{key}: {value}" for key, value in document.items() if key not in ("warnings", "weak_directions")]
+    return "\n".join([*lines, *_lines("warning", warnings)])

@@ -1,0 +1,252 @@
+"""One geared axis and whoever reads it: `campaign.toml`, `moves.csv`, `readings.csv` of an axis folder.
+
+Readings in the unit that the folder states, commands in steps or in whatever the controller counts; s. Columns are
+found by name. No JAX.
+"""
+
+from __future__ import annotations
+
+import datetime
+import hashlib
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+from tvsbayes.errors import InputError, escaped, refusal
+from tvsbayes.files.csv_table import CSV_BYTES_MAX, csv_bytes, parse_table
+from tvsbayes.files.disk import make_folder, read_bytes, write_atomically
+from tvsbayes.files.documents import TOML_BYTES_MAX, Keys, parse_toml, toml_line
+from tvsbayes.single_axis.axis_parameters import AXIS_KEYS, STATED_KEYS, AxisPrior
+
+FORMAT = "tvsbayes-axis/1"
+Approach = Literal["forward", "backward", "unknown"]
+APPROACHES: tuple[Approach, ...] = ("forward", "backward", "unknown")
+"""Forward is a rising command, whatever the sign of the unit per command."""
+COMMAND_MAX = 1e12
+"""Of a command or a reading, either sign."""
+TURNS = {"deg": 360.0, "rad": 6.283185307179586, "arcmin": 21_600.0, "arcsec": 1_296_000.0, "turn": 1.0}
+"""One turn in the units of angles."""
+_ID_MAX = 10**9
+
+
+@dataclass(frozen=True, slots=True)
+class AxisMove:
+    """A row of `moves.csv`: the command AFTER the move; `approach` in the first row of a segment, else empty."""
+
+    move: int
+    segment: int
+    time_s: float
+    command: float
+    approach: Approach | Literal[""] = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Reading:
+    """A row of `readings.csv`: value and standard uncertainty in the folder's unit; u 0 is unknown.
+
+    `value` is a number where `status` is "ok", and may be None elsewhere.
+    """
+
+    reading: int
+    move: int
+    value: float | None
+    u: float = 0.0
+    status: str = "ok"
+
+
+@dataclass(frozen=True)
+class AxisCampaign:
+    """An axis folder, checked.
+
+    Attributes:
+        unit: of readings.
+        moves: in time order.
+        readings: in the order of the file.
+        stated: entries of `[axis]`; names left out take the default, which scales with the travel.
+        header: keys of `campaign.toml` outside `[axis]` but `format` and `unit`.
+        path: the folder, None of one that was never written.
+    """
+
+    unit: str
+    moves: tuple[AxisMove, ...]
+    readings: tuple[Reading, ...]
+    stated: dict[str, AxisPrior] = field(default_factory=dict)
+    header: dict[str, object] = field(default_factory=dict)
+    path: Path | None = None
+
+
+_MOVE_COLUMNS = ("move", "segment", "time_s", "command", "approach")
+_READING_COLUMNS = ("reading", "move", "value", "u", "status")
+_TEXTS = {**dict.fromkeys(("name", "operator", "instrument", "serial", "method"), 200), "notes": 4000}
+_FILES = {"moves.csv": CSV_BYTES_MAX, "readings.csv": CSV_BYTES_MAX, "campaign.toml": TOML_BYTES_MAX}
+"""campaign.toml is written last: a folder without it is recognisably unfinished."""
+
+
+def parse_axis_moves(data: bytes, file: str = "moves.csv") -> tuple[AxisMove, ...]:
+    """The checked rows of `moves.csv`; at least one."""
+    table = parse_table(data, file, _MOVE_COLUMNS)
+    if not len(table):
+        allowed, remedy = "at least one row", "write row 0: the command and the approach to the first stop"
+        raise refusal("empty", file=file, line=1, found="no rows", allowed=allowed, remedy=remedy)
+    moves = table.integers("move", 0, _ID_MAX)
+    segments = table.integers("segment", 0, _ID_MAX)
+    times_s = table.numbers("time_s", -1e12, 1e12)
+    commands = table.numbers("command", -COMMAND_MAX, COMMAND_MAX)
+    table.check_counting("move", moves)
+    approaches = table.columns["approach"]
+    for row, word in enumerate(approaches):
+        before = segments[row - 1] if row else -1
+        if segments[row] not in ((before, before + 1) if row else (0,)):
+            allowed = f"{before} or {before + 1}" if row else "0"
+            raise table.refuse(row, "segment", "order", allowed, "count segments 0, 1, 2 ... without gaps")
+        if row and times_s[row] < times_s[row - 1]:
+            allowed = f"at least {times_s[row - 1]!r}, the time of the row before"
+            raise table.refuse(row, "time_s", "order", allowed, "list the moves in order of time")
+        first = row == 0 or segments[row] != segments[row - 1]
+        if word not in (APPROACHES if first else ("",)):
+            allowed = ", ".join(APPROACHES) if first else "an empty cell inside a segment"
+            remedy = "state how the axis arrived there" if first else "leave it empty, or begin a segment"
+            raise table.refuse(row, "approach", "approach", allowed, remedy)
+    return tuple(map(AxisMove, moves, segments, times_s, commands, approaches))  # type: ignore[arg-type]
+
+
+def parse_readings(data: bytes, file: str, moves: int) -> tuple[Reading, ...]:
+    """The checked rows of `readings.csv`; `moves` is the number of moves, which `move` must name."""
+    table = parse_table(data, file, _READING_COLUMNS)
+    ids = table.integers("reading", 0, _ID_MAX)
+    table.check_unique("reading", ids, "unique ids")
+    move_ids = table.integers("move", 0, _ID_MAX)
+    for row, move in enumerate(move_ids):
+        if move >= moves:
+            allowed = f"a row of moves.csv: 0 to {moves - 1}"
+            raise table.refuse(row, "move", "missing-move", allowed, "name the last move before the reading")
+    values = table.numbers("value", -COMMAND_MAX, COMMAND_MAX, True)
+    sds = table.numbers("u", 0.0, COMMAND_MAX, True)
+    statuses = table.texts("status", 200, empty=False)
+    for row, value in enumerate(values):
+        if value is None and statuses[row] == "ok":
+            allowed = "a finite decimal number, or an empty cell with a status other than ok"
+            raise table.refuse(row, "value", "missing", allowed, "give the value, or say why there is none")
+    return tuple(map(Reading, ids, move_ids, values, (u or 0.0 for u in sds), statuses))
+
+
+def _parse_header(keys: Keys) -> dict[str, object]:
+    keys.only(("format", "unit", *_TEXTS, "created", "synthetic", "seed", "axis"))
+    header: dict[str, object] = {}
+    for key in keys.values:
+        if key in _TEXTS:
+            header[key] = keys.text_value(key, _TEXTS[key])
+        elif key == "synthetic":
+            header[key] = keys.flag(key)
+        elif key == "seed":
+            header[key] = keys.integer(key, 0, 2**63 - 1)
+        elif key == "created":
+            if not isinstance(keys.values[key], datetime.date):
+                allowed = "a date or time such as 2026-01-15T10:00:00Z"
+                raise keys.refuse(key, "date", allowed, "write it without quotes")
+            header[key] = keys.values[key]
+    return header
+
+
+def _parse_axis_table(keys: Keys) -> dict[str, AxisPrior]:
+    """The `[axis]` table; a half-normal entry has value 0, or u = 0 and the value that it is fixed at."""
+    keys.only(STATED_KEYS)
+    stated: dict[str, AxisPrior] = {}
+    for name in keys.values:
+        kind = AXIS_KEYS[name].kind
+        low = -COMMAND_MAX if kind == "normal" else 0.0
+        value, u = keys.quantity(name, low, COMMAND_MAX, COMMAND_MAX)
+        entry = keys.table(name)
+        if kind == "half-normal" and value and u:
+            raise entry.refuse("value", "half-normal", "0 where u is not 0", "give the scale as u, or fix it by u = 0")
+        if kind == "log-normal" and not value and (u or name == "transmission_error_length"):
+            raise entry.refuse("value", "log-normal", "a positive median", "u is the sd of the logarithm")
+        if name == "per_command" and not value:
+            raise entry.refuse("value", "zero", "a number other than 0", "state what one command does, or leave it out")
+        stated[name] = AxisPrior(value, u)
+    return stated
+
+
+def _parse_files(files: dict[str, bytes], path: Path | None) -> AxisCampaign:
+    keys = parse_toml(files["campaign.toml"], "campaign.toml")
+    keys.word("format", (FORMAT,))
+    header, unit = _parse_header(keys), keys.text_value("unit", 20)
+    if not unit.strip():
+        raise keys.refuse("unit", "text", 'the unit of readings, such as "deg" or "mm"', "name it")
+    stated = _parse_axis_table(keys.table("axis"))
+    moves = parse_axis_moves(files["moves.csv"])
+    readings = parse_readings(files["readings.csv"], "readings.csv", len(moves))
+    return AxisCampaign(unit, moves, readings, stated, header, path)
+
+
+def is_axis_folder(folder: Path) -> bool:
+    """Whether the `format` line of a folder's `campaign.toml` names an axis; False where it cannot be read."""
+    try:
+        keys = parse_toml(read_bytes(folder / "campaign.toml", TOML_BYTES_MAX, folder), "campaign.toml")
+    except InputError:
+        return False
+    found = keys.values.get("format")
+    return isinstance(found, str) and found.startswith("tvsbayes-axis/")
+
+
+def read_axis(folder: Path | str) -> AxisCampaign:
+    """Reads and checks an axis folder (data/docs/campaign-files.md). Never `truth.json` or results.
+
+    Raises:
+        InputError: anything that is missing, malformed or contradicts itself, with file, line and column.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        place, found = escaped(str(folder), 200), "no such folder" if not folder.exists() else "a file"
+        allowed, remedy = "an axis folder", "give the folder that holds campaign.toml"
+        raise refusal("missing-file", file=place, found=found, allowed=allowed, remedy=remedy)
+    return _parse_files({name: read_bytes(folder / name, cap, folder) for name, cap in _FILES.items()}, folder)
+
+
+def axis_moves_bytes(moves: Iterable[AxisMove]) -> bytes:
+    """The content of `moves.csv`."""
+    return csv_bytes(_MOVE_COLUMNS, ([getattr(m, c) for c in _MOVE_COLUMNS] for m in moves))
+
+
+def readings_bytes(readings: Iterable[Reading]) -> bytes:
+    """The content of `readings.csv`."""
+    return csv_bytes(_READING_COLUMNS, ([getattr(r, c) for c in _READING_COLUMNS] for r in readings))
+
+
+def _axis_table_lines(stated: dict[str, AxisPrior]) -> list[str]:
+    return [toml_line(name, {"value": p.value, "u": p.u}) for name, p in sorted(stated.items())]
+
+
+def axis_toml(campaign: AxisCampaign) -> bytes:
+    """The content of `campaign.toml`."""
+    lines = [toml_line("format", FORMAT), toml_line("unit", campaign.unit)]
+    lines += [toml_line(key, value) for key, value in campaign.header.items()]
+    return ("\n".join([*lines, "[axis]", *_axis_table_lines(campaign.stated)]) + "\n").encode()
+
+
+def write_axis(campaign: AxisCampaign, folder: Path) -> None:
+    """Writes the three files into a new or empty folder; what is read back is the same.
+
+    Raises:
+        InputError: the folder holds something, cannot be written, or `campaign` holds what `read_axis` would refuse
+            (then nothing is written).
+    """
+    contents = axis_moves_bytes(campaign.moves), readings_bytes(campaign.readings), axis_toml(campaign)
+    files = dict(zip(_FILES, contents, strict=True))
+    _parse_files(files, None)
+    make_folder(Path(folder), empty=True)
+    for name, data in files.items():
+        write_atomically(Path(folder) / name, data)
+
+
+def axis_hashes(campaign: AxisCampaign) -> dict[str, str]:
+    """SHA-256 of what an estimate depends on, by "moves", "readings" and "axis", over values in canonical text."""
+    readings = sorted(campaign.readings, key=lambda reading: reading.reading)
+    axis = "\n".join([campaign.unit, *_axis_table_lines(campaign.stated)])
+    contents = {
+        "moves": axis_moves_bytes(campaign.moves),
+        "readings": readings_bytes(readings),
+        "axis": axis.encode(),
+    }
+    return {name: hashlib.sha256(data).hexdigest() for name, data in contents.items()}

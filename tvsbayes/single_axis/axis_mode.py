@@ -1,0 +1,94 @@
+"""Where the density of an axis' scales is highest, and how it is curved there."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from tvsbayes.single_axis.axis_model import AxisModel
+from tvsbayes.single_axis.axis_rows import reversal_of
+
+STEP, CURVATURE_STEP = 1e-2, 5e-2
+"""Of differences, in units of the coordinates' expected widths: a third derivative of 1 makes 2e-5 of a gradient."""
+CURVATURE_MIN = 0.3
+"""Least curvature taken, in units of the prior's: where a scale is not needed the density is bent the other way."""
+
+
+@dataclass(frozen=True)
+class AxisMode:
+    """Mode and Laplace approximation.
+
+    Attributes:
+        w: coordinates, shape (d,).
+        covariance: shape (d, d).
+        log_density: there.
+    """
+
+    w: np.ndarray
+    covariance: np.ndarray
+    log_density: float
+
+
+def _repeat_sd(model: AxisModel) -> float:
+    """Scatter of rows at one position from one side, unit; 1e-4 of the travel where none repeat."""
+    rows = model.rows
+    squares, freedom = 0.0, 0
+    for command in rows.positions:
+        for side in (-1, 0, 1):
+            mine = rows.value[(rows.command == command) & (rows.side == side)]
+            if len(mine) > 1:
+                squares += len(mine) * float(np.var(mine))
+                freedom += len(mine) - 1
+    return max(float(np.sqrt(squares / freedom)) if freedom else 0.0, 1e-4 * rows.travel)
+
+
+def _start(model: AxisModel) -> tuple[np.ndarray, np.ndarray]:
+    """Coordinates to begin at, and their expected widths, each (d,)."""
+    names = model.coordinates.names
+    w, width = np.zeros(len(names)), np.ones(len(names))
+    for k, name in enumerate(names):
+        if name == "backlash":
+            reversal, error = reversal_of(model.rows)
+            w[k] = model.coordinates.coordinate(name, reversal)
+            width[k] = min(max(error / model.priors[name].u, 1e-9), 1.0)
+        elif name.startswith("stop_sd"):
+            w[k] = np.clip(model.coordinates.coordinate(name, _repeat_sd(model)), -4.0, 4.0)
+    return w, width
+
+
+def _gradients(model: AxisModel, w: np.ndarray, width: np.ndarray, step: float) -> np.ndarray:
+    """Gradients (n, d) of the log density by the scaled coordinates, at coordinates (n, d)."""
+    d = w.shape[1]
+    shift = np.concatenate([np.diag(step * width), np.diag(-step * width)])
+    value = model.log_density((w[:, None] + shift).reshape(-1, d)).reshape(len(w), 2, d)
+    return (value[:, 0] - value[:, 1]) / (2 * step)
+
+
+def find_mode(model: AxisModel) -> AxisMode:
+    """The mode by a quasi-Newton search from the least-squares line."""
+    from scipy.optimize import minimize
+
+    start, width = _start(model)
+    if not len(start):
+        return AxisMode(start, np.zeros((0, 0)), float(model.log_density(start[None])[0]))
+
+    def value(v: np.ndarray) -> float:
+        found = float(model.log_density((start + width * v)[None])[0])
+        return -found if np.isfinite(found) else 1e30
+
+    def slope(v: np.ndarray) -> np.ndarray:
+        found = _gradients(model, (start + width * v)[None], width, STEP)[0]
+        return -np.where(np.isfinite(found), found, 0.0)
+
+    best = minimize(value, np.zeros(len(start)), jac=slope, method="BFGS", options={"gtol": 1e-2, "maxiter": 200})
+    v = np.asarray(best.x)
+    w = start + width * v
+    shift = np.concatenate([np.diag(CURVATURE_STEP * width), np.diag(-CURVATURE_STEP * width)])
+    slopes = _gradients(model, w + shift, width, CURVATURE_STEP)
+    count = len(w)
+    curvature = -(slopes[:count] - slopes[count:]) / (2 * CURVATURE_STEP)
+    curvature = np.where(np.isfinite(curvature), curvature, 0.0)
+    values, vectors = np.linalg.eigh(0.5 * (curvature + curvature.T))
+    inverse = vectors @ np.diag(1 / np.maximum(values, CURVATURE_MIN)) @ vectors.T
+    return AxisMode(w, width[:, None] * inverse * width, -float(best.fun))

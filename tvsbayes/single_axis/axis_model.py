@@ -1,0 +1,427 @@
+"""The density of an axis' readings: everything linear integrated out exactly, many draws of the scales at once.
+
+A reading = offset + unit per command x command + contrast + place in the play x (backlash + its variation) / 2
++ error by position + drift + stop error + noise (formulation 8.1). Drift and held stop errors by a Kalman filter of two
+states over the rows, whose innovations whiten the columns of everything else; cost linear in the rows. NumPy.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from tvsbayes.single_axis.axis_parameters import CONTRAST_SHARE, AxisCoordinates, AxisPrior
+from tvsbayes.single_axis.axis_rows import AxisRows, legs_are_long, play_places
+from tvsbayes.statistics.gaussian_process import JITTER, matern52
+
+PLACES_MAX = 60
+"""Positions up to which both processes stand at every one of them; beyond it at `NODES` nodes, lines of third order
+in between."""
+NODES = 41
+OFFSET_TRAVELS = 10.0
+"""sd of the offset's prior, in travels: flat."""
+FLOOR = 1e-9
+"""Least scatter of a row, of the travel: a reading that repeats exactly was rounded."""
+NUMBERS_MAX = 3_000_000
+"""Of a block of draws held at once."""
+OFFSET, SLOPE, CONTRAST, BACKLASH = 0, 1, 2, 3
+"""First columns."""
+HEAD = 4
+
+
+@dataclass(frozen=True)
+class ProcessPlaces:
+    """Where the processes of position stand.
+
+    Attributes:
+        command: their places, ascending, shape (places,).
+        exact: whether every position that was read is one of them; else places are even.
+    """
+
+    command: np.ndarray
+    exact: bool
+
+    def weights(self, command: np.ndarray) -> np.ndarray:
+        """What each place contributes at commands (n,): shape (n, places).
+
+        Raises:
+            ValueError: a command that is no place, of exact ones.
+        """
+        found = np.zeros((len(command), len(self.command)))
+        if self.exact:
+            at = np.searchsorted(self.command, command)
+            if not np.array_equal(self.command[np.minimum(at, len(self.command) - 1)], command):
+                raise ValueError("a command at which no process stands")
+            found[np.arange(len(command)), at] = 1.0
+            return found
+        spacing = self.command[1] - self.command[0]
+        first = np.clip(((command - self.command[0]) // spacing).astype(int) - 1, 0, len(self.command) - 4)
+        t = (command - self.command[first]) / spacing
+        # Lagrange's polynomial of third order through four nodes.
+        for k in range(4):
+            others = [j for j in range(4) if j != k]
+            found[np.arange(len(command)), first + k] = np.prod([(t - j) / (k - j) for j in others], axis=0)
+        return found
+
+
+def process_places(commands: np.ndarray, more: np.ndarray) -> ProcessPlaces:
+    """For rows at `commands` and whatever is asked for at `more`."""
+    every = np.unique(np.concatenate([commands, more]))
+    if len(np.unique(commands)) <= PLACES_MAX:
+        return ProcessPlaces(every, True)
+    return ProcessPlaces(np.linspace(every[0], every[-1], NODES), False)
+
+
+@dataclass(frozen=True)
+class LinearPosterior:
+    """What is linear, given the scales: normal, by column of the model.
+
+    Attributes:
+        mean: shape (n, columns).
+        covariance: shape (n, columns, columns).
+    """
+
+    mean: np.ndarray
+    covariance: np.ndarray
+
+    def of(self, functionals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Mean (n, t) and sd (n, t) of functionals (t, columns)."""
+        variance = np.einsum("ti,nij,tj->nt", functionals, self.covariance, functionals, optimize=True)
+        return self.mean @ functionals.T, np.sqrt(np.maximum(variance, 0.0))
+
+    def drawn(self, functionals: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        """One draw of functionals (t, columns) for each of the n, shape (n, t)."""
+        covariance = functionals @ self.covariance @ functionals.T
+        values, vectors = np.linalg.eigh(covariance)
+        normal = rng.standard_normal(values.shape) * np.sqrt(np.maximum(values, 0.0))
+        return self.mean @ functionals.T + np.einsum("nij,nj->ni", vectors, normal)
+
+
+@dataclass(frozen=True)
+class _Block:
+    """Draws of a block made ready.
+
+    Attributes:
+        products: of whitened columns, shape (n, 1 + columns, 1 + columns).
+        log_scatter: log-determinant of the innovations, shape (n,).
+        factor: of the prior covariance, shape (n, columns, columns).
+    """
+
+    products: np.ndarray
+    log_scatter: np.ndarray
+    factor: np.ndarray
+
+
+@dataclass(frozen=True)
+class AxisModel:
+    """Rows with priors; coordinates of the sampled parameters as `AxisCoordinates` has them.
+
+    Attributes:
+        rows: what was read.
+        priors: of every key of `[axis]`.
+        coordinates: of what is sampled.
+        places: of the processes.
+        unknown_segments: numbers of segments whose rows do not all know where they stand in the play.
+    """
+
+    rows: AxisRows
+    priors: dict[str, AxisPrior]
+    coordinates: AxisCoordinates
+    places: ProcessPlaces
+    unknown_segments: tuple[int, ...]
+
+    @classmethod
+    def of(cls, rows: AxisRows, priors: Mapping[str, AxisPrior], more: np.ndarray | None = None) -> AxisModel:
+        """Of rows and complete priors.
+
+        Args:
+            rows: what was read.
+            priors: from `axis_priors`.
+            more: further commands at which the processes will be asked for.
+        """
+        unused = set()
+        if not np.any(rows.variance > 0):
+            unused.add("reading_scale")
+        if len(np.unique(rows.segment)) < 2:
+            unused.add("home_sd")
+        if not np.any(rows.hours > 0):
+            unused.add("drift_per_root_hour")
+        if not np.any(rows.side >= 0):
+            unused.add("stop_sd.forward")
+        if not np.any(rows.side <= 0):
+            unused.add("stop_sd.backward")
+        if priors["transmission_error"].u == 0 == priors["transmission_error"].value:
+            if priors["play_variation"].u == 0 == priors["play_variation"].value:
+                unused.add("transmission_error_length")
+        firsts = np.flatnonzero(rows.legs.first)
+        unknown = tuple(int(k) for k in rows.legs.segment[firsts[rows.legs.side[firsts] == 0]])
+        lost = play_places(rows, np.array([rows.travel])).spread[0]
+        unknown = tuple(k for k in unknown if np.any(lost[rows.segment == k] > 0))
+        if not unknown and legs_are_long(rows):
+            unused.add("backlash")
+        places = process_places(rows.command, np.zeros(0) if more is None else more)
+        return cls(rows, dict(priors), AxisCoordinates.of(priors, frozenset(unused)), places, unknown)
+
+    @cached_property
+    def homed(self) -> np.ndarray:
+        """Segments after the first that were read: each has a zero of its own."""
+        return np.unique(self.rows.segment)[1:]
+
+    @property
+    def play_is_sampled(self) -> bool:
+        """Whether stops may lie inside the play, which makes the backlash nonlinear."""
+        return "backlash" in self.coordinates.names
+
+    @property
+    def middle(self) -> float:
+        """The command to which the offset belongs."""
+        return float(self.rows.command.mean())
+
+    @property
+    def processes(self) -> int:
+        """First column of the error by position; that of the play follows it."""
+        return HEAD + len(self.homed) + len(self.unknown_segments)
+
+    @property
+    def columns(self) -> int:
+        """How many quantities are linear."""
+        return self.processes + 2 * len(self.places.command)
+
+    @cached_property
+    def _weights(self) -> np.ndarray:
+        return self.places.weights(self.rows.command)
+
+    def _columns(self, backlash: np.ndarray, extra: np.ndarray | None) -> np.ndarray:
+        """Readings less what the priors' means say, then all columns: shape (n or 1, rows, 1 + columns + extra)."""
+        rows = self.rows
+        play = play_places(rows, backlash if self.play_is_sampled else np.zeros(1))
+        # Draws that differ in nothing share their columns.
+        blocks = len(backlash) if self.play_is_sampled else 1
+        width = 1 + self.columns + (0 if extra is None else extra.shape[1])
+        found = np.zeros((blocks, len(rows.move), width))
+        level = rows.line[0] + rows.line[1] * self.middle
+        anchor = play.anchor - self.middle
+        found[:, :, 0] = rows.value - level - self.priors["per_command"].value * anchor
+        found[:, :, 0] -= 0.5 * play.side * backlash[:blocks, None]
+        found[:, :, 1 + OFFSET], found[:, :, 1 + SLOPE], found[:, :, 1 + CONTRAST] = 1.0, anchor, 0.5 * play.path
+        found[:, :, 1 + BACKLASH] = 0.5 * play.side
+        for k, segment in enumerate(self.homed):
+            found[:, :, 1 + HEAD + k] = rows.segment == segment
+        for k, segment in enumerate(self.unknown_segments):
+            found[:, :, 1 + HEAD + len(self.homed) + k] = play.spread * (rows.segment == segment)
+        start, count = 1 + self.processes, len(self.places.command)
+        found[:, :, start : start + count] = self._weights
+        found[:, :, start + count : start + 2 * count] = 0.5 * play.share[:, :, None] * self._weights
+        if extra is not None:
+            found[:, :, 1 + self.columns :] = extra
+        return found
+
+    def _scatter(self, values: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+        """Variances of stop errors and of readings, each (n, rows)."""
+        rows = self.rows
+        forward = 0.5 * (1.0 + rows.side)
+        stop = np.outer(values["stop_sd.forward"] ** 2, forward)
+        stop += np.outer(values["stop_sd.backward"] ** 2, 1.0 - forward)
+        reading = np.outer(values["reading_scale"] ** 2, rows.variance) + (FLOOR * rows.travel) ** 2
+        if not self.places.exact:
+            reading += self._between_nodes(values)[:, None]
+        return stop, reading
+
+    def _between_nodes(self, values: Mapping[str, np.ndarray]) -> np.ndarray:
+        """Variance (n,) that both processes have midway between nodes and lines of third order do not carry."""
+        spacing = abs(self.rows.line[1]) * (self.places.command[1] - self.places.command[0])
+        length = values["transmission_error_length"]
+        weight = np.array([1.0, -0.0625, 0.5625, 0.5625, -0.0625])
+        at = np.array([1.5, 0.0, 1.0, 2.0, 3.0]) * spacing
+        weight[1:] *= -1
+        correlation = matern52((at[:, None] - at)[None], length[:, None, None])
+        missing = np.maximum(np.einsum("i,nij,j->n", weight, correlation, weight), 0.0)
+        return missing * (values["transmission_error"] ** 2 + 0.25 * values["play_variation"] ** 2)
+
+    def _factor(self, values: Mapping[str, np.ndarray]) -> np.ndarray:
+        """Cholesky factor of the prior covariance of the columns, shape (n, columns, columns)."""
+        count, n = len(self.places.command), len(values["backlash"])
+        factor = np.zeros((n, self.columns, self.columns))
+        slope = abs(self.rows.line[1])
+        factor[:, OFFSET, OFFSET] = OFFSET_TRAVELS * self.rows.travel
+        factor[:, SLOPE, SLOPE] = self.priors["per_command"].u
+        factor[:, CONTRAST, CONTRAST] = CONTRAST_SHARE * slope
+        factor[:, BACKLASH, BACKLASH] = 0.0 if self.play_is_sampled else self.priors["backlash"].u
+        homes = HEAD + np.arange(len(self.homed))
+        factor[:, homes, homes] = values["home_sd"][:, None]
+        unknown = HEAD + len(self.homed) + np.arange(len(self.unknown_segments))
+        # Uniform from -1 to 1.
+        factor[:, unknown, unknown] = np.sqrt(1 / 3)
+        distance = slope * (self.places.command[:, None] - self.places.command)
+        length = values["transmission_error_length"][:, None, None]
+        root = np.linalg.cholesky(matern52(distance[None], length) + JITTER * np.eye(count))
+        error = slice(self.processes, self.processes + count)
+        play = slice(self.processes + count, self.columns)
+        factor[:, error, error] = values["transmission_error"][:, None, None] * root
+        factor[:, play, play] = values["play_variation"][:, None, None] * root
+        return factor
+
+    def _blocks(self, w: np.ndarray, extra: np.ndarray | None = None) -> Iterator[tuple[slice, _Block]]:
+        """The draws w (n, d) in blocks that fit into memory."""
+        width = 1 + self.columns + (0 if extra is None else extra.shape[1])
+        size = max(1, NUMBERS_MAX // (width * max(len(self.rows.move), width)))
+        for start in range(0, len(w), size):
+            part = slice(start, start + size)
+            values = self.coordinates.values(w[part])
+            stop, reading = self._scatter(values)
+            columns = self._columns(values["backlash"], extra)
+            drift = values["drift_per_root_hour"] ** 2
+            white, log_scatter = whitened(columns, self.rows, drift, stop, reading)
+            products = np.swapaxes(white, 1, 2) @ white
+            spread = rows_log_density(self.rows, values["reading_scale"])
+            yield part, _Block(products, log_scatter - 2 * spread, self._factor(values))
+
+    def log_likelihood(self, w: np.ndarray) -> np.ndarray:
+        """Log density of the readings at coordinates (n, d), shape (n,)."""
+        found = np.empty(len(w))
+        rows = len(self.rows.move)
+        for part, block in self._blocks(w):
+            information, towards = _information(block, 0)
+            root, scaled, scale = _equilibrated(information)
+            solved = np.linalg.solve(scaled, (towards / scale)[..., None])[..., 0]
+            explained = np.sum(towards / scale * solved, axis=1)
+            log_det = 2 * np.sum(np.log(np.diagonal(root, axis1=1, axis2=2)) + np.log(scale), axis=1)
+            left = block.products[:, 0, 0] - explained
+            found[part] = -0.5 * (block.log_scatter + log_det + left + rows * np.log(2 * np.pi))
+        return found
+
+    def log_density(self, w: np.ndarray) -> np.ndarray:
+        """Log posterior density at coordinates (n, d) up to a constant, shape (n,); -inf where it has no value."""
+        found = np.full(len(w), -np.inf)
+        usable = np.flatnonzero(np.all(np.abs(w) < 40.0, axis=1))
+        if len(usable):
+            value = self.log_likelihood(w[usable]) - 0.5 * np.sum(w[usable] ** 2, axis=1)
+            found[usable] = np.where(np.isfinite(value), value, -np.inf)
+        return found
+
+    def linear(self, w: np.ndarray) -> LinearPosterior:
+        """What is linear, given coordinates (n, d); means are whole, not deviations from the priors'."""
+        means, covariances = np.empty((len(w), self.columns)), np.empty((len(w), self.columns, self.columns))
+        for part, block in self._blocks(w):
+            information, towards = _information(block, 0)
+            _, scaled, scale = _equilibrated(information)
+            inverse = np.linalg.inv(scaled) / (scale[:, :, None] * scale[:, None, :])
+            means[part] = np.einsum("nij,njk,nk->ni", block.factor, inverse, towards, optimize=True)
+            covariances[part] = block.factor @ inverse @ np.swapaxes(block.factor, 1, 2)
+        means[:, OFFSET] += self.rows.line[0] + self.rows.line[1] * self.middle
+        means[:, SLOPE] += self.priors["per_command"].value
+        means[:, BACKLASH] += self.coordinates.values(w)["backlash"]
+        return LinearPosterior(means, covariances)
+
+    def left_out(self, w: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """What is foretold of some rows by all others, given the scales.
+
+        A row with an unknown of its own and a flat prior counts as not read; the unknown is the reading less what the
+        others foretell.
+
+        Args:
+            w: coordinates (n, d).
+            rows: numbers of the rows left out.
+
+        Returns:
+            Means (n, rows) and covariances (n, rows, rows) of their readings, noise and stop errors in them.
+        """
+        extra = np.zeros((len(self.rows.move), len(rows)))
+        extra[rows, np.arange(len(rows))] = 1.0
+        means, covariances = np.empty((len(w), len(rows))), np.empty((len(w), len(rows), len(rows)))
+        for part, block in self._blocks(w, extra):
+            information, towards = _information(block, len(rows))
+            _, scaled, scale = _equilibrated(information)
+            inverse = np.linalg.inv(scaled) / (scale[:, :, None] * scale[:, None, :])
+            found = np.einsum("nij,nj->ni", inverse, towards)
+            means[part] = self.rows.value[rows] - found[:, self.columns :]
+            covariances[part] = inverse[:, self.columns :, self.columns :]
+        return means, covariances
+
+    def head(self, **of: float) -> np.ndarray:
+        """A functional (columns,) of `offset`, `slope`, `contrast`, `backlash` by their factors."""
+        found = np.zeros(self.columns)
+        for name, factor in of.items():
+            found[_HEAD_COLUMNS[name]] = factor
+        return found
+
+    def functional(self, command: np.ndarray) -> np.ndarray:
+        """The error by position at commands (t,): functionals (t, columns)."""
+        found = np.zeros((len(command), self.columns))
+        found[:, self.processes : self.processes + len(self.places.command)] = self.places.weights(command)
+        return found
+
+
+_HEAD_COLUMNS = {"offset": OFFSET, "slope": SLOPE, "contrast": CONTRAST, "backlash": BACKLASH}
+
+
+def _information(block: _Block, flat: int) -> tuple[np.ndarray, np.ndarray]:
+    """Information (n, c, c) and right-hand side (n, c) of the columns in units of their prior, then of flat ones."""
+    products, columns = block.products, block.factor.shape[1]
+    factor = block.factor
+    if flat:
+        size = columns + flat
+        factor = np.zeros((len(block.factor), size, size))
+        factor[:, :columns, :columns] = block.factor
+        factor[:, range(columns, size), range(columns, size)] = 1.0
+    across = np.swapaxes(factor, 1, 2)
+    information = across @ products[:, 1:, 1:] @ factor
+    information[:, range(columns), range(columns)] += 1.0
+    return information, np.einsum("nij,nj->ni", across, products[:, 1:, 0])
+
+
+def _equilibrated(information: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Cholesky factor of the matrix scaled to a unit diagonal, that matrix, and the scale (n, c)."""
+    scale = np.sqrt(np.diagonal(information, axis1=1, axis2=2))
+    scaled = information / (scale[:, :, None] * scale[:, None, :])
+    return np.linalg.cholesky(scaled), scaled, scale
+
+
+def rows_log_density(rows: AxisRows, reading_scale: np.ndarray) -> np.ndarray:
+    """Log density (n,) of the scatter of readings about the means of their rows; constants left out but of u."""
+    known = rows.variance > 0
+    freedom = float(np.sum(rows.count[known] - 1))
+    return -freedom * np.log(reading_scale) - 0.5 * float(rows.within[known].sum()) / reading_scale**2
+
+
+def whitened(
+    columns: np.ndarray, rows: AxisRows, drift: np.ndarray, stop: np.ndarray, reading: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Columns in units of the scatter of drift, stop errors and readings, decorrelated: innovations of the filter.
+
+    Args:
+        columns: shape (n or 1, rows, c).
+        rows: their times, segments and whether each stop's error is a new one.
+        drift: variance per hour, shape (n,).
+        stop: variances of stop errors, shape (n, rows).
+        reading: variances of readings, shape (n, rows).
+
+    Returns:
+        Innovations over their sd (n, rows, c), and the log-determinant of the scatter (n,).
+    """
+    n, count, width = len(drift), columns.shape[1], columns.shape[2]
+    white = np.empty((n, count, width))
+    log_scatter = np.zeros(n)
+    zero, held = np.zeros((n, width)), np.zeros((n, width))
+    p_zero, p_held, p_both = np.zeros(n), np.zeros(n), np.zeros(n)
+    for k in range(count):
+        if k and rows.segment[k] != rows.segment[k - 1]:
+            zero, p_zero, p_both = np.zeros((n, width)), np.zeros(n), np.zeros(n)
+        p_zero = p_zero + drift * rows.hours[k]
+        if rows.redrawn[k]:
+            held, p_held, p_both = np.zeros((n, width)), stop[:, k], np.zeros(n)
+        variance = p_zero + 2 * p_both + p_held + reading[:, k]
+        innovation = columns[:, k] - zero - held
+        white[:, k] = innovation / np.sqrt(variance)[:, None]
+        log_scatter += np.log(variance)
+        gain_zero, gain_held = (p_zero + p_both) / variance, (p_held + p_both) / variance
+        zero = zero + gain_zero[:, None] * innovation
+        p_zero, p_both_after = p_zero - gain_zero**2 * variance, p_both - gain_zero * gain_held * variance
+        if k + 1 < count and not rows.redrawn[k + 1]:
+            held = held + gain_held[:, None] * innovation
+            p_held = p_held - gain_held**2 * variance
+        p_both = p_both_after
+    return white, log_scatter

@@ -1,0 +1,318 @@
+"""What is said of a fitted axis, as `fit --json` and `results/fit.json` hold it; all lengths in the folder's unit."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from tvsbayes.errors import InputError, NothingToEstimate, TvsError, listed
+from tvsbayes.files.disk import make_folder, read_arrays, write_atomically
+from tvsbayes.progress import Show
+from tvsbayes.results.estimates import CONTRACTION_LIMIT, Estimate
+from tvsbayes.results.fit_record import provenance
+from tvsbayes.results.records import plain, read_record, stored_document
+from tvsbayes.single_axis.axis_campaign import AxisCampaign, axis_hashes
+from tvsbayes.single_axis.axis_fit import AxisFit, fit_axis, line_weights, model_of
+from tvsbayes.single_axis.axis_parameters import CONTRAST_SHARE, kind_of, prior_sd
+from tvsbayes.single_axis.axis_rows import AxisRows
+from tvsbayes.single_axis.classic_line import ClassicAxis, classic_axis
+
+AXIS_FIT_FORMAT = "tvsbayes-axis-fit/1"
+DRAWS_BYTES_MAX = 64 * 1024 * 1024
+POSITIONS_FEW = 5
+"""Below it a process of position is mostly its prior."""
+REVERSED = 0.975
+"""Probability of a negative backlash from which it is said."""
+TAILS_PERCENT = (2.5, 97.5)
+POSITIONS_LISTED = 400
+
+
+@dataclass(frozen=True)
+class PositionDeviation:
+    """What the axis does at a position, off the line through the stops: the error that repeats, drift and play apart.
+
+    `position` is a command; `value` and the rest in the folder's unit.
+    """
+
+    position: float
+    value: float
+    sd: float
+    interval95: tuple[float, float]
+
+
+@dataclass(frozen=True)
+class AxisSummary:
+    """A fit in the terms of `fit.json`.
+
+    Attributes:
+        unit: of everything but commands, hours and shares.
+        estimator: "laplace" or "posterior"; `tier` "importance", "emcee" or None.
+        converged: whether the intervals may be used; `problems` why not.
+        per_command: ratio by direction, "forward" and "backward"; it holds beyond the range read.
+        effective_per_command: slope of the least-squares line through the positions read, by direction.
+        range_command: least and largest command read; `effective_per_command` belongs to it.
+        parameters: by name.
+        deviations: off that line, by position read.
+        classic: beside it.
+        moves, readings, positions: how many were used.
+        weak_directions, warnings: sentences.
+        sampling: diagnosis of the draws.
+    """
+
+    unit: str
+    estimator: str
+    tier: str | None
+    converged: bool
+    problems: tuple[str, ...]
+    per_command: dict[str, Estimate]
+    effective_per_command: dict[str, Estimate]
+    range_command: tuple[float, float]
+    parameters: dict[str, Estimate]
+    deviations: tuple[PositionDeviation, ...]
+    classic: ClassicAxis
+    moves: int
+    readings: int
+    positions: int
+    weak_directions: tuple[str, ...]
+    warnings: tuple[str, ...]
+    sampling: dict[str, float | int | None]
+
+    def as_json(self) -> dict[str, object]:
+        """Plain types."""
+        return plain(self)
+
+
+def _estimate(
+    draws: np.ndarray, prior: float | None, diagnosis: tuple[float | None, float | None, float | None]
+) -> Estimate:
+    low, high = np.percentile(draws, TAILS_PERCENT)
+    sd = float(draws.std())
+    contraction = None if not prior else float(max(1 - (sd / prior) ** 2, -1.0))
+    return Estimate(float(draws.mean()), sd, (float(low), float(high)), prior, contraction, *diagnosis)
+
+
+def _diagnoses(fit: AxisFit) -> dict[str, tuple[float | None, float | None, float | None]]:
+    """R-hat, bulk and tail effective draws by sampled parameter; what is linear has those of the least known."""
+    nothing = (None, None, None)
+    names = fit.free
+    if fit.first is None or not names:
+        return {"": nothing}
+    if fit.chain is None:
+        worth = (None, fit.first.effective, fit.first.effective)
+        return {"": worth}
+    chain = fit.chain
+    each: dict[str, tuple[float | None, float | None, float | None]] = {
+        name: (float(chain.rhat[k]), float(chain.ess_bulk[k]), float(chain.ess_tail[k])) for k, name in enumerate(names)
+    }
+    each[""] = (float(chain.rhat.max()), float(chain.ess_bulk.min()), float(chain.ess_tail.min()))
+    return each
+
+
+def _prior_sds(fit: AxisFit) -> dict[str, float]:
+    priors = fit.model.priors
+    found = {name: prior_sd(kind_of(name), priors[name.split(".")[0]]) for name in fit.free}
+    contrast = CONTRAST_SHARE * abs(fit.rows.line[1])
+    side = float(np.hypot(priors["per_command"].u, 0.5 * contrast))
+    return found | {
+        "per_command": priors["per_command"].u,
+        "backlash": priors["backlash"].u,
+        "ratio_contrast": contrast,
+        "per_command.forward": side,
+        "per_command.backward": side,
+    }
+
+
+def summarise_axis(fit: AxisFit) -> AxisSummary:
+    """Everything that is said of a fit."""
+    draws, sds, diagnoses = fit.draws, _prior_sds(fit), _diagnoses(fit)
+
+    def of(name: str, values: np.ndarray | None = None) -> Estimate:
+        diagnosis = diagnoses.get(name, diagnoses[""])
+        return _estimate(draws[name] if values is None else values, sds.get(name), diagnosis)
+
+    effective, contrast = draws["effective_per_command"], draws["ratio_contrast"]
+    sides = {"forward": 0.5, "backward": -0.5}
+    names = [*fit.free, "per_command", "ratio_contrast", "backlash", "offset"]
+    return AxisSummary(
+        unit=fit.campaign.unit,
+        estimator=fit.estimator,
+        tier=fit.tier,
+        converged=not fit.missing,
+        problems=fit.missing,
+        per_command={side: of(f"per_command.{side}") for side in sides},
+        effective_per_command={
+            side: _estimate(effective + half * contrast, None, diagnoses[""]) for side, half in sides.items()
+        },
+        range_command=(float(fit.rows.command.min()), float(fit.rows.command.max())),
+        parameters={name: of(name) for name in dict.fromkeys(names)},
+        deviations=_deviations(fit),
+        classic=classic_axis(fit.rows),
+        moves=len(fit.rows.move),
+        readings=int(fit.rows.count.sum()),
+        positions=len(fit.rows.positions),
+        weak_directions=tuple(_weak(fit)),
+        warnings=tuple([*axis_warnings(fit.campaign, fit.rows), *_reversed(fit)]),
+        sampling=_sampling(fit),
+    )
+
+
+def deviation_functionals(fit: AxisFit, commands: np.ndarray) -> np.ndarray:
+    """The error by position at commands (t,), less the line that the rows put through it: (t, columns)."""
+    model = fit.model
+    level = model.functional(fit.rows.command).mean(axis=0)
+    slope = line_weights(model)
+    return model.functional(commands) - level - np.outer(commands - model.middle, slope)
+
+
+def _deviations(fit: AxisFit) -> tuple[PositionDeviation, ...]:
+    positions = fit.rows.positions
+    if len(positions) > POSITIONS_LISTED:
+        positions = positions[np.linspace(0, len(positions) - 1, POSITIONS_LISTED).astype(int)]
+    functionals = deviation_functionals(fit, positions)
+    drawn = fit.linear.drawn(functionals, np.random.default_rng([fit.seed, 4]))
+    low, high = np.percentile(drawn, TAILS_PERCENT, axis=0)
+    return tuple(
+        PositionDeviation(float(p), float(v.mean()), float(v.std()), (float(a), float(b)))
+        for p, v, a, b in zip(positions, drawn.T, low, high, strict=True)
+    )
+
+
+def _sampling(fit: AxisFit) -> dict[str, float | int | None]:
+    first, chain = fit.first, fit.chain
+    if first is None:
+        return {}
+    found: dict[str, float | int | None] = {
+        "draws": len(first.w),
+        "rounds": first.rounds,
+        "effective": float(first.effective) if np.isfinite(first.effective) else None,
+        "pareto_k": first.pareto_k,
+    }
+    if chain is not None:
+        found |= {"steps": chain.steps, "acceptance": chain.acceptance, "autocorrelation_times": chain.taus}
+    if fit.agreement is not None:
+        found["agreement"] = fit.agreement.worst
+    return found
+
+
+def axis_warnings(campaign: AxisCampaign, rows: AxisRows) -> list[str]:
+    """What is odd about the data, in sentences."""
+    found = []
+    legs = rows.legs
+    idle = (legs.step == 0) & ~legs.first
+    again = [int(m) for m in rows.move if idle[m]]
+    if again:
+        found.append(
+            f"moves {listed(again, 5)} repeat the command before: nothing moved, so they are of one stop and side; "
+            "list the moves in between if the axis went on and came back"
+        )
+    if len({m.time_s for m in campaign.moves}) == 1:
+        found.append("all moves have the same time: drift cannot be told")
+    if not np.any(rows.variance > 0):
+        found.append("no reading has a stated u: the scatter of stops includes that of the readings")
+    unread = len(campaign.readings) - int(rows.count.sum())
+    if unread:
+        found.append(f"{unread} readings are not used: their status is not ok")
+    return found
+
+
+def _reversed(fit: AxisFit) -> list[str]:
+    """Where the sign of the reversal is not that of lost motion."""
+    if np.mean(fit.draws["backlash"] < 0) < REVERSED:
+        return []
+    return [
+        "the backlash is negative: stops reached forward lie ahead of those reached backward, which is no play; the "
+        "controller compensates too much, the reading turns with the direction, or directions are exchanged"
+    ]
+
+
+def _weak(fit: AxisFit) -> list[str]:
+    """What the data leave to the priors, and what would tell."""
+    rows, found = fit.rows, []
+    sides = set(rows.side.tolist()) - {0}
+    if len(sides) < 2:
+        found.append("backlash cannot be told: every stop was reached from one side; add stops from the other")
+    if len(rows.positions) < POSITIONS_FEW:
+        found.append(
+            f"{len(rows.positions)} positions cannot tell the error by position from the ratio; read at least "
+            f"{POSITIONS_FEW}, spread over the travel"
+        )
+    repeats = [np.sum((rows.command == p) & (rows.side == s)) for p in rows.positions for s in sides]
+    if max(repeats, default=0) < 2:
+        found.append("no position was reached twice from one side: scatter and error by position hardly come apart")
+    return found
+
+
+def uninformed(summary: AxisSummary) -> TvsError | None:
+    """Nothing learned of the ratio."""
+    of = summary.per_command.values()
+    if any(e.contraction is None or e.contraction >= CONTRACTION_LIMIT for e in of):
+        return None
+    return NothingToEstimate(
+        "uninformed",
+        "the readings tell no more about the unit per command than its prior does (contraction below 0.1)",
+        remedy="read stops farther apart, or state a wider prior",
+    )
+
+
+def keep_fit(fit: AxisFit, summary: AxisSummary, folder: Path) -> dict[str, str]:
+    """Write `fit.json` and `draws.npz`; their paths by kind.
+
+    Raises:
+        InputError: the folder cannot be written.
+    """
+    import io
+
+    made = plain(provenance(axis_hashes(fit.campaign), fit.seed))
+    document = {"format": AXIS_FIT_FORMAT, **summary.as_json(), **made}
+    buffer = io.BytesIO()
+    draws = np.stack(list(fit.draws.values()), axis=-1)
+    np.savez_compressed(buffer, names=np.array(list(fit.draws)), w=fit.w, draws=draws)
+    make_folder(folder)
+    paths = {"draws": folder / "draws.npz", "fit": folder / "fit.json"}
+    write_atomically(paths["draws"], buffer.getvalue())
+    write_atomically(paths["fit"], json.dumps(document, indent=1, allow_nan=False).encode())
+    return {kind: str(path) for kind, path in paths.items()}
+
+
+@dataclass(frozen=True)
+class AxisResults:
+    """A fit and what is said of it; `stored` where both were taken from `results/`."""
+
+    summary: AxisSummary
+    fit: AxisFit
+    stored: bool
+
+
+def results_for(
+    campaign: AxisCampaign, more: np.ndarray | None = None, progress: Show | None = None, seed: int = 0
+) -> AxisResults:
+    """Those in `results/` if they are of these data and converged; else of a fit by weighted draws.
+
+    Args:
+        campaign: from `read_axis`.
+        more: further commands at which the error will be asked for, shape (n,).
+        progress: told how far the fit is.
+        seed: of that fit.
+
+    Raises:
+        InputError: stored results are damaged.
+        NotConverged: the fit did not converge.
+    """
+    document = stored_document(campaign, "fit.json", (AXIS_FIT_FORMAT,), axis_hashes(campaign))
+    if document is not None and document.values.get("converged") is True and campaign.path is not None:
+        again = "run `tvsbayes fit` again"
+        summary = read_record(AxisSummary, document, again)
+        model = model_of(campaign, more)
+        arrays = read_arrays(campaign.path / "results" / "draws.npz", DRAWS_BYTES_MAX, 4 * DRAWS_BYTES_MAX)
+        w = arrays.get("w")
+        if w is None or w.ndim != 2 or w.shape[1] != len(model.coordinates.names) or not np.all(np.isfinite(w)):
+            raise InputError("damaged", "results/draws.npz does not fit results/fit.json", remedy=again)
+        stored_seed = document.values.get("seed")
+        return AxisResults(summary, AxisFit.of_draws(campaign, model, w, int(str(stored_seed))), True)
+    fit = fit_axis(campaign, tier="importance", seed=seed, more=more, progress=progress)
+    if fit.error is not None:
+        raise fit.error
+    return AxisResults(summarise_axis(fit), fit, False)

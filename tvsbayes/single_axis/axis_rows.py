@@ -1,0 +1,354 @@
+"""An axis campaign as arrays: where stops were read, from which side they were reached, where the play stood.
+
+A row is a move with readings, averaged. Positions are commands; `unit` is that of the readings. Formulation 8.1.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+
+from tvsbayes.errors import InputError, NothingToEstimate, listed
+from tvsbayes.single_axis.axis_campaign import TURNS, AxisCampaign, AxisMove, Reading
+
+SIDES = {"forward": 1, "backward": -1, "unknown": 0}
+DIRECTIONS = {1: "forward", -1: "backward", 0: "unknown"}
+HOUR_S = 3600.0
+ROWS_MAX = 5000
+"""Moves with readings that a fit takes: at this many a thousand draws take a minute."""
+LONG_LEGS, LONG_ERRORS = 2.0, 10.0
+"""Where the shortest leg is so many reversals and standard errors of one long, no stop lies inside the play."""
+WRAP_SHARE = 0.7
+"""Of a turn: a step of the readings that is off by more has jumped by whole turns."""
+
+
+@dataclass(frozen=True)
+class Legs:
+    """Every move of the campaign, read or not; arrays (moves,).
+
+    Attributes:
+        command: after the move.
+        step: change of the command; 0 in the first row of a segment.
+        first: whether a segment begins.
+        side: 1 arrived forward, -1 backward, 0 unknown; of a move that changes nothing that of the one before.
+        segment: number.
+    """
+
+    command: np.ndarray
+    step: np.ndarray
+    first: np.ndarray
+    side: np.ndarray
+    segment: np.ndarray
+
+
+@dataclass(frozen=True)
+class AxisRows:
+    """Moves with readings; arrays (rows,).
+
+    Attributes:
+        unit: of readings.
+        legs: all moves.
+        move: number of the move.
+        command, side, segment: as in `Legs`.
+        hours: since the row before in the segment; since the segment's first move in its first row.
+        path: commands travelled since the segment began.
+        redrawn: whether the stop's error is another than that of the row before.
+        value: mean of the readings, unit.
+        variance: of that mean by the stated u, unit^2; 0 where no u is known.
+        within: sum of squares of the readings about their mean, in units of their u.
+        count: readings in the mean.
+        line: offset and unit per command of the least-squares line with a reversal.
+        readings: number of each reading used, and the row that it is in.
+    """
+
+    unit: str
+    legs: Legs
+    move: np.ndarray
+    command: np.ndarray
+    side: np.ndarray
+    segment: np.ndarray
+    hours: np.ndarray
+    path: np.ndarray
+    redrawn: np.ndarray
+    value: np.ndarray
+    variance: np.ndarray
+    within: np.ndarray
+    count: np.ndarray
+    line: tuple[float, float]
+    readings: tuple[tuple[int, int], ...] = ()
+
+    @property
+    def travel(self) -> float:
+        """Range of the positions read, unit."""
+        return float(np.ptp(self.command)) * abs(self.line[1])
+
+    @property
+    def positions(self) -> np.ndarray:
+        """Commands at which something was read, ascending, each once."""
+        return np.unique(self.command)
+
+    def without(self, left_out: np.ndarray) -> AxisRows:
+        """The rows where `left_out` is false; times and redrawing follow, the line stays."""
+        kept = np.flatnonzero(~left_out)
+        hours, redrawn = np.zeros(len(kept)), np.ones(len(kept), dtype=bool)
+        since = np.cumsum(self.hours)
+        for row, at in enumerate(kept):
+            before = kept[row - 1] if row else -1
+            begins = np.flatnonzero(self.segment == self.segment[at])[0]
+            same = before >= begins
+            hours[row] = since[at] - since[before] if same else since[at] - since[begins] + self.hours[begins]
+            redrawn[row] = not same or bool(self.redrawn[before + 1 : at + 1].any())
+        arrays = ("move", "command", "side", "segment", "path", "value", "variance", "within", "count")
+        picked = {name: getattr(self, name)[kept] for name in arrays}
+        return replace(self, hours=hours, redrawn=redrawn, **picked)
+
+
+def legs_of(moves: Sequence[AxisMove]) -> Legs:
+    """The moves of a campaign."""
+    command = np.array([m.command for m in moves])
+    segment = np.array([m.segment for m in moves])
+    first = np.r_[True, np.diff(segment) > 0]
+    step = np.where(first, 0.0, np.r_[0.0, np.diff(command)])
+    side = np.sign(step).astype(int)
+    for row, move in enumerate(moves):
+        if first[row]:
+            side[row] = SIDES[move.approach or "unknown"]
+        elif side[row] == 0:
+            side[row] = side[row - 1]
+    return Legs(command, step, first, side, segment)
+
+
+def _means(used: Sequence[Reading]) -> dict[int, tuple[float, float, float, int]]:
+    """Mean, variance, scatter within and number of the readings of every move.
+
+    Where no u is stated, readings of one move that were repeated tell it; else it stays unknown, 0.
+    """
+    by_move: dict[int, list[Reading]] = defaultdict(list)
+    for reading in used:
+        by_move[reading.move].append(reading)
+    unknown = [[float(r.value or 0.0) for r in each if r.u == 0] for each in by_move.values()]
+    repeated = [values for values in unknown if len(values) > 1]
+    squares = sum(len(values) * float(np.var(values)) for values in repeated)
+    freedom = sum(len(values) - 1 for values in repeated)
+    pooled = float(np.sqrt(squares / freedom)) if freedom else 0.0
+    means = {}
+    for move, each in by_move.items():
+        values = np.array([r.value for r in each], dtype=float)
+        u = np.array([r.u or pooled for r in each])
+        if np.all(u > 0):
+            weight = 1 / u**2
+            mean = float(weight @ values / weight.sum())
+            means[move] = mean, float(1 / weight.sum()), float(weight @ (values - mean) ** 2), len(each)
+        else:
+            means[move] = float(values.mean()), 0.0, 0.0, len(each)
+    return means
+
+
+def _check_turns(campaign: AxisCampaign, command: np.ndarray, value: np.ndarray, moves: np.ndarray) -> None:
+    """Refuse angles that jump by whole turns.
+
+    Raises:
+        InputError: readings of an angle wrap.
+    """
+    turn = TURNS.get(campaign.unit)
+    step = np.diff(command)
+    moved = step != 0
+    if turn is None or moved.sum() < 3:
+        return
+    rise = np.diff(value)
+    slope = float(np.median(rise[moved] / step[moved]))
+    jumps = np.flatnonzero(np.abs(rise - slope * step) > WRAP_SHARE * turn)
+    # A slope that is itself wrong by a turn per step makes every step jump, or none; only rare jumps are wraps.
+    if len(jumps) and 2 * len(jumps) < len(step):
+        named = listed([int(moves[k + 1]) for k in jumps], 5)
+        raise InputError(
+            "wrapped",
+            f"readings.csv: the angle jumps by whole turns at move {named}; allowed: a continuous angle",
+            file="readings.csv",
+            column="value",
+            remedy=f"unwrap the readings: add or subtract {turn:g} {campaign.unit}",
+        )
+
+
+def rows_of(campaign: AxisCampaign) -> AxisRows:
+    """The rows of a campaign.
+
+    Raises:
+        NothingToEstimate: fewer than two positions were read, fewer than three moves, or the readings do not move.
+        InputError: too many moves, or angles that wrap.
+    """
+    used = [r for r in campaign.readings if r.status == "ok" and r.value is not None]
+    means = _means(used)
+    moves = np.array(sorted(means), dtype=int)
+    legs = legs_of(campaign.moves)
+    if len(moves) < 3 or len(np.unique(legs.command[moves])) < 2:
+        raise NothingToEstimate(
+            "too-few-positions",
+            f"readings of {len(moves)} moves at {len(np.unique(legs.command[moves]))} positions: nothing to estimate",
+            file="readings.csv",
+            remedy="read at least three moves at two positions, better at five or more, from both directions",
+        )
+    if len(moves) > ROWS_MAX:
+        raise InputError(
+            "too-many",
+            f"readings.csv: readings of {len(moves)} moves; allowed: at most {ROWS_MAX}",
+            file="readings.csv",
+            remedy="thin them out, or give readings at one standstill one move: they are averaged exactly",
+        )
+    value, variance, within, count = (np.array(column) for column in zip(*(means[m] for m in moves), strict=True))
+    command = legs.command[moves]
+    _check_turns(campaign, command, value, moves)
+    design = np.column_stack([np.ones(len(command)), command - command.mean(), legs.side[moves]])
+    line = np.linalg.lstsq(design, value, rcond=None)[0]
+    if not abs(line[1]) * np.ptp(command) > 1e-9 * max(float(np.max(np.abs(value))), 1e-300):
+        raise NothingToEstimate(
+            "no-motion",
+            "the readings do not move with the command: nothing to estimate",
+            file="readings.csv",
+            remedy="check the columns move and value, and that the reading follows this axis",
+        )
+    times_h = np.array([m.time_s for m in campaign.moves]) / HOUR_S
+    rows = {int(move): row for row, move in enumerate(moves)}
+    return AxisRows(
+        unit=campaign.unit,
+        legs=legs,
+        move=moves,
+        command=command,
+        side=legs.side[moves],
+        segment=legs.segment[moves],
+        hours=_hours(times_h, legs, moves),
+        path=_path(legs)[moves],
+        redrawn=_redrawn(legs, moves) | (variance == 0),
+        value=value,
+        variance=variance,
+        within=within,
+        count=count,
+        line=(float(line[0] - line[1] * command.mean()), float(line[1])),
+        readings=tuple((r.reading, rows[r.move]) for r in used),
+    )
+
+
+def _hours(times_h: np.ndarray, legs: Legs, moves: np.ndarray) -> np.ndarray:
+    hours = np.zeros(len(moves))
+    for row, move in enumerate(moves):
+        begins = int(np.flatnonzero(legs.segment == legs.segment[move])[0])
+        before = int(moves[row - 1]) if row and legs.segment[moves[row - 1]] == legs.segment[move] else begins
+        hours[row] = times_h[move] - times_h[before]
+    return hours
+
+
+def _path(legs: Legs) -> np.ndarray:
+    """Commands travelled since the segment began."""
+    total = np.cumsum(np.abs(legs.step))
+    return total - total[legs.first][np.cumsum(legs.first) - 1]
+
+
+def _redrawn(legs: Legs, moves: np.ndarray) -> np.ndarray:
+    """Whether something moved, or homed, since the row before."""
+    changes = np.cumsum(legs.first | (legs.step != 0))
+    return np.array([True, *(changes[after] > changes[before] for before, after in pairwise(moves))])
+
+
+@dataclass(frozen=True)
+class PlayPlaces:
+    """Where the output stands in the play; shapes (n or 1, rows).
+
+    While a leg is lost in the play the output stays where an earlier move left it: `anchor` is the command of that
+    move, `path` the commands travelled up to it, `side` where in the play it stood then, in halves of the play. Where
+    nobody knows from which side a segment began, all are means of the two ends that are possible.
+
+    Attributes:
+        anchor, path, side: of the move that last moved the output.
+        share: where the output stands in the play now, in halves of it, -1 to 1.
+        spread: half of the distance between the ends that are possible, unit.
+    """
+
+    anchor: np.ndarray
+    path: np.ndarray
+    side: np.ndarray
+    share: np.ndarray
+    spread: np.ndarray
+
+
+class _End:
+    """One possible place of the output, for every draw of the backlash; arrays (n,)."""
+
+    def __init__(self, command: float, path: float, side: float, n: int):
+        self.anchor, self.path, self.side = np.full(n, command), np.full(n, path), np.full(n, side)
+
+    def place(self, slope: float, half: np.ndarray) -> np.ndarray:
+        return slope * self.anchor + self.side * half
+
+    def follow(self, command: float, path: float, slope: float, half: np.ndarray) -> None:
+        """What a move does: the wheel takes the output along where the play is used up."""
+        stands, wheel = self.place(slope, half), slope * command
+        # Where there is no play the side is that of the leg, and both sides are one place.
+        for side, taken in ((-1.0, stands < wheel - half), (1.0, stands > wheel + half)):
+            self.anchor = np.where(taken, command, self.anchor)
+            self.path = np.where(taken, path, self.path)
+            self.side = np.where(taken, side, self.side)
+
+
+def play_places(rows: AxisRows, backlash: np.ndarray) -> PlayPlaces:
+    """The play operator for backlash (n,), unit; which legs it swallows is judged at the least-squares line's slope.
+
+    A negative backlash is no play but a reversal that overshoots: every stop lies on its own side at once.
+    """
+    legs, slope = rows.legs, rows.line[1]
+    motion = legs.step * slope
+    least = np.min(np.abs(motion[motion != 0]), initial=np.inf)
+    if np.all(backlash < least) and not np.any(legs.first & (legs.side == 0)):
+        # Every leg takes the output along, whatever the play is.
+        backlash = backlash[:1]
+    half = 0.5 * np.maximum(backlash, 0.0)
+    n, count, turned = len(half), len(rows.move), float(np.sign(slope))
+    found = [np.empty((n, count)) for _ in range(5)]
+    path = _path(legs)
+    ends: list[_End] = []
+    row = 0
+    for move in range(len(legs.command)):
+        command, travelled = float(legs.command[move]), float(path[move])
+        if legs.first[move]:
+            side = -float(legs.side[move]) * turned
+            ends = [_End(command, travelled, s, n) for s in ((side, side) if side else (-1.0, 1.0))]
+        elif motion[move]:
+            for end in ends:
+                end.follow(command, travelled, slope, half)
+        if row < count and rows.move[row] == move:
+            low, high = ends
+            places = low.place(slope, half), high.place(slope, half)
+            off = 0.5 * (places[0] + places[1]) - slope * command
+            middle_side = 0.5 * (low.side + high.side)
+            found[0][:, row] = 0.5 * (low.anchor + high.anchor)
+            found[1][:, row] = 0.5 * (low.path + high.path)
+            found[2][:, row] = middle_side
+            found[3][:, row] = np.where(half > 0, off / np.where(half > 0, half, 1.0), middle_side)
+            found[4][:, row] = 0.5 * (places[1] - places[0])
+            row += 1
+    return PlayPlaces(*found)
+
+
+def reversal_of(rows: AxisRows) -> tuple[float, float]:
+    """Backlash of the least-squares line with one reversal, unit, and its standard error: infinite where none tells."""
+    turned = np.sign(rows.line[1])
+    design = np.column_stack([np.ones(len(rows.value)), rows.command - rows.command.mean(), -0.5 * turned * rows.side])
+    solved, _, rank, _ = np.linalg.lstsq(design, rows.value, rcond=None)
+    if rank < 3:
+        return 0.0, np.inf
+    scatter = float(np.sqrt(np.sum((rows.value - design @ solved) ** 2) / max(len(rows.value) - 3, 1)))
+    return float(solved[2]), scatter * float(np.sqrt(np.linalg.inv(design.T @ design)[2, 2]))
+
+
+def legs_are_long(rows: AxisRows) -> bool:
+    """Whether every leg takes up the play for certain, so that the backlash too is linear."""
+    reversal, error = reversal_of(rows)
+    motion = np.abs(rows.legs.step * rows.line[1])
+    least = np.min(motion[motion > 0], initial=np.inf)
+    if np.all(rows.side >= 0) or np.all(rows.side <= 0):
+        # Arrived from one side alone: the backlash stays at its prior, and the offset takes it.
+        return True
+    return bool(least > LONG_LEGS * abs(reversal) + LONG_ERRORS * error)

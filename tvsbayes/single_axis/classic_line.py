@@ -1,0 +1,131 @@
+"""The classic of an axis: the least-squares line with one reversal and independent stops, and the ISO 230-2 table."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from tvsbayes.metrology.iso230 import RUNS_MIN, figures_of
+from tvsbayes.results.metrology_tables import Positioning
+from tvsbayes.single_axis.axis_rows import AxisRows
+
+
+@dataclass(frozen=True)
+class ClassicAxis:
+    """The least-squares line with one reversal and independent stops, and the ISO 230-2 table.
+
+    Attributes:
+        per_command, u_per_command: slope and its standard error.
+        backlash, u_backlash: of the reversal; None where stops were reached from one side.
+        residual_sd: of the rows about it.
+        iso230: figures by name; None where positions were not read twice from both sides.
+    """
+
+    per_command: float
+    u_per_command: float
+    backlash: float | None
+    u_backlash: float | None
+    residual_sd: float
+    iso230: dict[str, float] | None
+
+
+def line_design(rows: AxisRows) -> np.ndarray:
+    """Columns of offset (at the mean command), unit per command and backlash, shape (rows, 3)."""
+    turned = np.sign(rows.line[1])
+    return np.column_stack([np.ones(len(rows.value)), rows.command - rows.command.mean(), -0.5 * turned * rows.side])
+
+
+@dataclass(frozen=True)
+class LineFit:
+    """The line through some rows.
+
+    Attributes:
+        solved: offset, unit per command, backlash; those that cannot be told are 0.
+        covariance: shape (3, 3); of what cannot be told 0.
+        scatter: of the rows about it, unit.
+    """
+
+    solved: np.ndarray
+    covariance: np.ndarray
+    scatter: float
+
+
+def fit_line(rows: AxisRows, kept: np.ndarray | None = None) -> LineFit:
+    """Least squares over the rows that are `kept` (None: all)."""
+    used = np.ones(len(rows.value), dtype=bool) if kept is None else kept
+    told = np.array([True, np.ptp(rows.command[used]) > 0, np.ptp(rows.side[used]) > 0])
+    design = line_design(rows)[used][:, told]
+    solved, covariance = np.zeros(3), np.zeros((3, 3))
+    solved[told] = np.linalg.lstsq(design, rows.value[used], rcond=None)[0]
+    freedom = max(int(used.sum()) - int(told.sum()), 1)
+    scatter = float(np.sqrt(np.sum((rows.value[used] - design @ solved[told]) ** 2) / freedom))
+    covariance[np.ix_(told, told)] = scatter**2 * np.linalg.pinv(design.T @ design)
+    return LineFit(solved, covariance, scatter)
+
+
+def classic_axis(rows: AxisRows) -> ClassicAxis:
+    """The least-squares line with a reversal, and ISO 230-2."""
+    line = fit_line(rows)
+    u = np.sqrt(np.maximum(np.diag(line.covariance), 0.0))
+    both = np.ptp(rows.side) > 0
+    return ClassicAxis(
+        per_command=float(line.solved[1]),
+        u_per_command=float(u[1]),
+        backlash=float(line.solved[2]) if both else None,
+        u_backlash=float(u[2]) if both else None,
+        residual_sd=line.scatter,
+        iso230=iso230_figures(rows),
+    )
+
+
+@dataclass(frozen=True)
+class PositionRuns:
+    """Positions (m,) that were read twice from both sides, and what was read there, off the least-squares line.
+
+    `forward` and `backward` have shape (m, runs), not a number where there are fewer runs.
+    """
+
+    position: np.ndarray
+    forward: np.ndarray
+    backward: np.ndarray
+
+
+def position_runs(rows: AxisRows) -> PositionRuns:
+    """The runs of ISO 230-2."""
+    off = rows.value - rows.command * rows.line[1] - rows.line[0]
+    by_side = [[off[(rows.command == p) & (rows.side == side)] for p in rows.positions] for side in (1, -1)]
+    kept = [k for k in range(len(rows.positions)) if min(len(by_side[0][k]), len(by_side[1][k])) >= RUNS_MIN]
+    tables = []
+    for runs in by_side:
+        table = np.full((len(kept), max((len(runs[k]) for k in kept), default=0)), np.nan)
+        for row, k in enumerate(kept):
+            table[row, : len(runs[k])] = runs[k]
+        tables.append(table)
+    return PositionRuns(rows.positions[kept], *tables)
+
+
+def positioning_of(rows: AxisRows) -> Positioning | None:
+    """ISO 230-2 figures of the deviations from the line; None where nothing was read twice from both sides.
+
+    Its fields say degrees and are in the folder's unit; "up" is forward.
+    """
+    runs = position_runs(rows)
+    return figures_of(runs.forward, runs.backward) if len(runs.position) else None
+
+
+ISO_FIGURES = (
+    *("reversal", "mean_reversal", "repeatability_forward", "repeatability_backward", "repeatability"),
+    *("systematic_forward", "systematic_backward", "systematic", "mean_systematic"),
+    *("accuracy_forward", "accuracy_backward", "accuracy"),
+)
+"""Figures of a whole axis, by ISO 230-2's words."""
+
+
+def iso230_figures(rows: AxisRows) -> dict[str, float] | None:
+    """Those of the whole axis, by name, in the folder's unit."""
+    found = positioning_of(rows)
+    if found is None:
+        return None
+    kept_as = {name: name.replace("_forward", "_up").replace("_backward", "_down") for name in ISO_FIGURES}
+    return {name: float(getattr(found, f"{kept_as[name]}_deg")) for name in ISO_FIGURES}

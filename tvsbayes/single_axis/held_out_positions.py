@@ -1,0 +1,201 @@
+"""Hold-out of one axis: every commanded position left out in turn, fitted without it, foretold."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from tvsbayes.errors import NothingToEstimate
+from tvsbayes.progress import Job, Show
+from tvsbayes.results.records import plain
+from tvsbayes.single_axis.axis_campaign import AxisCampaign
+from tvsbayes.single_axis.axis_fit import model_of
+from tvsbayes.single_axis.axis_mode import find_mode
+from tvsbayes.single_axis.axis_model import AxisModel
+from tvsbayes.single_axis.axis_rows import DIRECTIONS, AxisRows
+from tvsbayes.single_axis.axis_sampling import WeightedSample, weighted_sample
+from tvsbayes.single_axis.classic_line import fit_line, line_design
+
+EFFECTIVE, DRAWS = 600.0, 300
+"""Effective draws of every fit without a position, and draws that foretell."""
+POSITIONS_MIN = 3
+INSIDE = 1.959963984540054
+"""Standard uncertainties to either side of a 95 % interval."""
+
+
+@dataclass(frozen=True)
+class HeldOutPosition:
+    """One position from one side, foretold by all others.
+
+    Attributes:
+        position: command.
+        direction: "forward", "backward" or "unknown".
+        n: readings in the mean.
+        mean: of the readings, unit.
+        predicted, u: of that mean; stop errors and noise of its readings in u.
+        rows, inside: moves in it, and how many of their readings lie within 95 % of what was foretold of each.
+        classic_predicted, classic_u: by the least-squares line with one reversal and independent stops.
+        end: whether nothing was read beyond it on one side.
+    """
+
+    position: float
+    direction: str
+    n: int
+    mean: float
+    predicted: float
+    u: float
+    rows: int
+    inside: int
+    classic_predicted: float
+    classic_u: float
+    end: bool
+
+
+@dataclass(frozen=True)
+class AxisHoldOut:
+    """All positions foretold.
+
+    Attributes:
+        by: "positions".
+        positions: each from each side.
+        rms_z: root mean square of (mean - predicted) / u; `classic_rms_z` of the classic's.
+        inside_share: of the readings left out, in their 95 % intervals.
+        warnings: sentences.
+    """
+
+    by: str
+    positions: tuple[HeldOutPosition, ...]
+    rms_z: float
+    classic_rms_z: float
+    inside_share: float
+    warnings: tuple[str, ...]
+
+    def as_json(self) -> dict[str, object]:
+        """Plain types."""
+        return plain(self)
+
+
+def _means_of(rows: AxisRows, members: np.ndarray) -> tuple[np.ndarray, int]:
+    """Weights (rows,) of the mean of all readings in these rows, and how many there are."""
+    count = rows.count[members]
+    return count / count.sum(), int(count.sum())
+
+
+def classic_prediction(rows: AxisRows, left_out: np.ndarray, members: np.ndarray) -> tuple[float, float]:
+    """Mean of rows `members` by offset, scale and play fitted to the rows that are not left out, and its u."""
+    line = fit_line(rows, ~left_out)
+    weights, _ = _means_of(rows, members)
+    at = weights @ line_design(rows)[members]
+    variance = float(at @ line.covariance @ at + line.scatter**2 * weights @ weights)
+    return float(at @ line.solved), float(np.sqrt(variance))
+
+
+def _foretold(model: AxisModel, w: np.ndarray, left: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Mean and covariance of the rows left out, over the draws: shapes (rows,) and (rows, rows)."""
+    means, covariances = model.left_out(w, left)
+    return means.mean(axis=0), covariances.mean(axis=0) + np.atleast_2d(np.cov(means.T, bias=True))
+
+
+def hold_out_positions(campaign: AxisCampaign, seed: int = 0, progress: Show | None = None) -> AxisHoldOut:
+    """Every commanded position left out in turn, with all its readings from both sides.
+
+    Args:
+        campaign: from `read_axis`.
+        seed: of everything random.
+        progress: told how far it is.
+
+    Raises:
+        NothingToEstimate: fewer than three positions, or what `fit_axis` refuses.
+        InputError: what `fit_axis` refuses.
+    """
+    model = model_of(campaign)
+    rows = model.rows
+    positions = rows.positions
+    if len(positions) < POSITIONS_MIN:
+        raise NothingToEstimate(
+            "too-few-positions",
+            f"{len(positions)} positions: with one left out no line is left",
+            file="moves.csv",
+            remedy="read at least three positions",
+        )
+    found: list[HeldOutPosition] = []
+    warnings = []
+    with Job({"hold-out": 1.0}, progress) as job:
+        for number, position in enumerate(positions):
+            job.at(number / len(positions), f"position {position:g}")
+            out = rows.command == position
+            if len(np.unique(rows.command[~out])) < 2 or (~out).sum() < 3:
+                warnings.append(f"position {position:g}: too few readings elsewhere to foretell it")
+                continue
+            w, fault = _fitted_without(model, out, seed + number)
+            if fault:
+                warnings.append(f"position {position:g}: {fault}")
+            left = np.flatnonzero(out)
+            mean, covariance = _foretold(model, w, left)
+            found += _scored(rows, position, left, mean, covariance)
+    return AxisHoldOut(
+        "positions",
+        tuple(found),
+        _rms([(p.mean - p.predicted) / p.u for p in found]),
+        _rms([(p.mean - p.classic_predicted) / p.classic_u for p in found if p.classic_u > 0]),
+        sum(p.inside for p in found) / max(sum(p.rows for p in found), 1),
+        tuple(warnings),
+    )
+
+
+def _rms(z: list[float]) -> float:
+    return float(np.sqrt(np.mean(np.square(z)))) if z else 0.0
+
+
+def _fitted_without(model: AxisModel, out: np.ndarray, seed: int) -> tuple[np.ndarray, str]:
+    """Coordinates of the scales, for the whole model, from the rows not left out; what is wrong with them, or ""."""
+    without = AxisModel.of(model.rows.without(out), model.priors)
+    rng = np.random.default_rng([seed, 5])
+    start = find_mode(without)
+    sample: WeightedSample = weighted_sample(without.log_density, start, rng, EFFECTIVE)
+    drawn = sample.equal(DRAWS, rng)
+    # What the others cannot tell, as the scatter from a side that only this position was reached from, has its prior.
+    w = rng.standard_normal((DRAWS, len(model.coordinates.names)))
+    for column, name in enumerate(model.coordinates.names):
+        if name in without.coordinates.names:
+            w[:, column] = drawn[:, without.coordinates.names.index(name)]
+        elif name == "backlash":
+            values, sd = without.linear(drawn).of(without.head(backlash=1.0)[None])
+            prior = model.priors[name]
+            w[:, column] = (values[:, 0] + sd[:, 0] * rng.standard_normal(DRAWS) - prior.value) / prior.u
+    return w, "; ".join(sample.missing)
+
+
+def _scored(
+    rows: AxisRows, position: float, left: np.ndarray, mean: np.ndarray, covariance: np.ndarray
+) -> list[HeldOutPosition]:
+    """The position from each side it was reached from."""
+    found = []
+    out = rows.command == position
+    for side in (1, -1, 0):
+        mine = np.flatnonzero(rows.side[left] == side)
+        if not len(mine):
+            continue
+        members = left[mine]
+        weights, n = _means_of(rows, members)
+        predicted = float(weights @ mean[mine])
+        u = float(np.sqrt(weights @ covariance[np.ix_(mine, mine)] @ weights))
+        z = (rows.value[members] - mean[mine]) / np.sqrt(np.diag(covariance)[mine])
+        classic, classic_u = classic_prediction(rows, out, members)
+        found.append(
+            HeldOutPosition(
+                position=float(position),
+                direction=DIRECTIONS[side],
+                n=n,
+                mean=float(weights @ rows.value[members]),
+                predicted=predicted,
+                u=u,
+                rows=len(members),
+                inside=int(np.sum(np.abs(z) <= INSIDE)),
+                classic_predicted=classic,
+                classic_u=classic_u,
+                end=position in (rows.positions[0], rows.positions[-1]),
+            )
+        )
+    return found

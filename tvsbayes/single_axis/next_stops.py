@@ -1,0 +1,169 @@
+"""What to read next on an axis: stops that lower the uncertainty of its ratio, or of positions, most per move.
+
+Linear and normal given the scales, averaged over their posterior: a stop that is yet to be read changes covariances
+alone.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+
+from tvsbayes.errors import InputError
+from tvsbayes.files.csv_table import csv_bytes
+from tvsbayes.progress import Job, Show
+from tvsbayes.single_axis.axis_campaign import AxisCampaign, AxisMove, Reading
+from tvsbayes.single_axis.axis_fit import HEADLINE_DRAWS, AxisFit, headline_functionals
+from tvsbayes.single_axis.axis_model import AxisModel
+from tvsbayes.single_axis.axis_record import deviation_functionals
+from tvsbayes.single_axis.axis_rows import rows_of
+
+TARGETS = ("per_command", "effective_per_command", "backlash", "position")
+"""What may be made surer; "position" is the mean uncertainty of the error by position over the range."""
+CANDIDATES, AT_ONCE, DRAWS = 17, 8, 24
+"""Places tried along the range, moves proposed, draws of the scales."""
+MOVE_S = 60.0
+"""Time of a move where the campaign does not tell."""
+OVERRUN = 0.05
+"""Of the range: how far beyond a place a move goes that will come back to it."""
+
+
+@dataclass(frozen=True)
+class NextStop:
+    """A stop to be read.
+
+    Attributes:
+        command: where.
+        direction: from which side, "forward" or "backward".
+        via: command to visit first, without reading, so that the side is right; None where it is.
+        u: of the target after it, unit; `gain`: what it takes off; `gain_per_minute`.
+    """
+
+    command: float
+    direction: str
+    via: float | None
+    u: float
+    gain: float
+    gain_per_minute: float
+
+
+@dataclass(frozen=True)
+class AxisPlan:
+    """Stops to be read next, each given those before it.
+
+    Attributes:
+        target: what they lower.
+        u_now: of the target, unit.
+        next: stops, first things first.
+        minutes: of all of them.
+    """
+
+    target: str
+    u_now: float
+    next: tuple[NextStop, ...]
+    minutes: float
+
+    def plan_bytes(self) -> bytes:
+        """`plan.csv`: step, command, direction, read (1 or 0)."""
+        rows: list[tuple[int, float, str, int]] = []
+        for stop in self.next:
+            if stop.via is not None:
+                rows.append((len(rows), stop.via, "backward" if stop.direction == "forward" else "forward", 0))
+            rows.append((len(rows), stop.command, stop.direction, 1))
+        return csv_bytes(("step", "command", "direction", "read"), rows)
+
+
+def _move_seconds(campaign: AxisCampaign) -> float:
+    times = [m.time_s for m in campaign.moves]
+    gaps = [b - a for a, b in pairwise(times) if b > a]
+    return float(np.median(gaps)) if gaps else MOVE_S
+
+
+def _with_stop(
+    campaign: AxisCampaign, command: float, direction: str, seconds: float
+) -> tuple[AxisCampaign, float | None]:
+    """The campaign with one more stop, reached from that side, and the command visited before it, None if none was."""
+    moves, last = list(campaign.moves), campaign.moves[-1]
+    commands = [m.command for m in campaign.moves]
+    sign = 1 if direction == "forward" else -1
+    via = None
+    if sign * (command - last.command) <= 0:
+        via = command - sign * OVERRUN * (max(commands) - min(commands))
+        moves.append(AxisMove(len(moves), last.segment, moves[-1].time_s + seconds, via))
+    moves.append(AxisMove(len(moves), last.segment, moves[-1].time_s + seconds, command))
+    u = float(np.median([r.u for r in campaign.readings])) if campaign.readings else 0.0
+    number = max((r.reading for r in campaign.readings), default=-1) + 1
+    reading = Reading(number, len(moves) - 1, campaign.readings[-1].value, u)
+    return replace(campaign, moves=tuple(moves), readings=(*campaign.readings, reading)), via
+
+
+def _u_of(fit: AxisFit, campaign: AxisCampaign, target: str, places: np.ndarray, w: np.ndarray) -> float:
+    """Root mean square over draws of the target's standard uncertainty, with these rows."""
+    rows = replace(rows_of(campaign), line=fit.rows.line)
+    model = AxisModel.of(rows, fit.model.priors, places)
+    model = replace(model, coordinates=fit.model.coordinates)
+    stand_in = replace(fit, rows=rows, model=model)
+    if target == "position":
+        functionals = deviation_functionals(stand_in, places)
+    else:
+        functionals = headline_functionals(model)[[HEADLINE_DRAWS.index(target)]]
+    _, sd = model.linear(w).of(functionals)
+    return float(np.sqrt(np.mean(sd**2)))
+
+
+def plan_next(
+    fit: AxisFit,
+    target: str = "per_command",
+    *,
+    minutes: float | None = None,
+    count: int = AT_ONCE,
+    progress: Show | None = None,
+) -> AxisPlan:
+    """Greedy choice of the next stops to be read.
+
+    Args:
+        fit: of what was read so far.
+        target: one of `TARGETS`.
+        minutes: for all moves at most; None for `count` stops.
+        count: stops at most.
+        progress: told how far it is.
+
+    Raises:
+        InputError: an unknown target.
+    """
+    if target not in TARGETS:
+        allowed = ", ".join(TARGETS)
+        raise InputError("target", f"--target {target[:60]!r}", allowed=allowed, remedy="name one of them")
+    commands = np.array([m.command for m in fit.campaign.moves])
+    low, high = float(commands.min()), float(commands.max())
+    grid = np.unique(np.concatenate([np.linspace(low, high, CANDIDATES), [fit.rows.command.min()]]))
+    if np.all(commands == np.round(commands)):
+        grid = np.unique(np.round(grid))
+    w = fit.w[np.linspace(0, len(fit.w) - 1, DRAWS).astype(int)]
+    seconds = _move_seconds(fit.campaign)
+    campaign, chosen, spent = fit.campaign, [], 0.0
+    u_now = now = _u_of(fit, campaign, target, grid, w)
+    with Job({"choosing stops": 1.0}, progress) as job:
+        for number in range(count):
+            best: tuple[float, NextStop, AxisCampaign] | None = None
+            for k, command in enumerate(grid):
+                job.at((number + k / len(grid)) / count)
+                for direction in ("forward", "backward"):
+                    longer, via = _with_stop(campaign, float(command), direction, seconds)
+                    took = (1 + (via is not None)) * seconds / 60.0
+                    if minutes is not None and spent + took > minutes:
+                        continue
+                    u = _u_of(fit, longer, target, grid, w)
+                    rate = (now - u) / took
+                    if best is None or rate > best[0]:
+                        stop = NextStop(float(command), direction, via, u, now - u, rate)
+                        best = rate, stop, longer
+            if best is None:
+                break
+            _, stop, campaign = best
+            chosen.append(stop)
+            spent += (1 + (stop.via is not None)) * seconds / 60.0
+            now = stop.u
+    return AxisPlan(target, u_now, tuple(chosen), spent)
