@@ -8,13 +8,12 @@ after switching on and settles. `size_deg` is the amplitude of a wave, the heigh
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal, get_args
 
 import numpy as np
 
 from tvsbayes.instrument.axes import AXES
-from tvsbayes.instrument.parameters import GEAR_ERROR_NAMES
 from tvsbayes.instrument.plan import PlanStep
 from tvsbayes.instrument.rig import Rig
 from tvsbayes.twin.gear_errors import AxisErrors, Waves
@@ -74,8 +73,7 @@ def gear_errors_of(world: World, size_deg: float, seed: int) -> dict[str, AxisEr
 def truth_of(rig: Rig, world: World, size_deg: float, seed: int) -> Truth:
     """The rig that `simulate` draws from the seed, with these errors in place of any that its gears would repeat."""
     truth = draw_truth(rig, np.random.default_rng(np.random.SeedSequence(seed).spawn(1)[0]))
-    none = {name: 0.0 for name in GEAR_ERROR_NAMES if "length" not in name}
-    return replace(truth, parameters={**truth.parameters, **none}, gear_errors=gear_errors_of(world, size_deg, seed))
+    return truth.with_gears(gear_errors_of(world, size_deg, seed))
 
 
 def campaign_of(rig: Rig, plan: Iterable[PlanStep], world: World, size_deg: float, seed: int) -> SimulatedCampaign:

@@ -15,6 +15,7 @@ from datetime import UTC, datetime
 import numpy as np
 
 from experiments.common.command_line import print_only
+from experiments.common.rigs import drawn_truth
 from experiments.common.rows import ROOT
 from tvsbayes.estimators.four_point import classic, four_point_ratios, select_experiments
 from tvsbayes.instrument.axes import DIRECTIONS
@@ -23,6 +24,7 @@ from tvsbayes.instrument.plan import PlanStep, write_plan
 from tvsbayes.instrument.protocols import PROTOCOLS
 from tvsbayes.instrument.rig import Rig, read_rig
 from tvsbayes.instrument.stereo_pair import Stereo, rotation_matrix, write_stereo
+from tvsbayes.twin.gear_errors import PERFECT
 from tvsbayes.twin.physics import project
 from tvsbayes.twin.simulated_campaign import SimulatedCampaign, simulate
 from tvsbayes.twin.true_rig import Truth, draw_truth, with_derived
@@ -211,8 +213,8 @@ def paper_twin(rig: Rig) -> SimulatedCampaign:
 
 
 def matched(rig: Rig, seed: int) -> SimulatedCampaign:
-    """Twin of one seed with ratios, backlashes and pan stop sds solved."""
-    drawn = draw_truth(rig, np.random.default_rng(seed))
+    """Twin of one seed with ratios, backlashes and pan stop sds solved; perfect gears, as the classic method has it."""
+    drawn = draw_truth(rig, np.random.default_rng(seed)).with_gears()
     p = {
         **drawn.parameters,
         "degrees_per_step.pan": 0.0615,
@@ -229,7 +231,7 @@ def matched(rig: Rig, seed: int) -> SimulatedCampaign:
     }
     pairs = {"pan": ("right", "left"), "tilt": ("up", "down")}  # cleared, reversed
     for _ in range(12):
-        twin = _twin(rig, Truth(with_derived(p), drawn.stereo), seed)
+        twin = _twin(rig, Truth(with_derived(p), drawn.stereo, gear_errors=PERFECT), seed)
         mean, sd = _realised(twin)
         for axis, (cleared, reverse) in pairs.items():
             p[f"backlash_deg.{axis}"] += 200 * (
@@ -239,7 +241,8 @@ def matched(rig: Rig, seed: int) -> SimulatedCampaign:
         for name in ("left", "right"):
             p[f"stop_sd_deg.{name}"] *= np.clip(TABLE_1[name][1] / sd[name], 0.8, 1.25)
     p = {name: float(f"{value:.7g}") for name, value in p.items()}
-    return _twin(rig, Truth(with_derived(p), drawn.stereo, note=PAPER_TWIN_NOTE), seed)
+    truth = Truth(with_derived(p), drawn.stereo, gear_errors=PERFECT, note=PAPER_TWIN_NOTE)
+    return _twin(rig, truth, seed)
 
 
 def _twin(rig: Rig, truth: Truth, seed: int) -> SimulatedCampaign:
@@ -260,9 +263,10 @@ def _realised(twin: SimulatedCampaign) -> tuple[dict[str, float], dict[str, floa
 
 
 def grid_twin(rig: Rig) -> SimulatedCampaign:
-    """A grid of poses at three sheets with aperture readings, on a rig drawn from the mounted priors."""
+    """A grid of poses at three sheets with aperture readings, on a rig of the mounted priors, its gears perfect."""
     header = {"name": "grid twin", "created": CREATED, "notes": GRID_TWIN_NOTE}
-    twin = simulate(rig, PROTOCOLS["grid"](), GRID_TWIN_SEED, aperture=True, header=header)
+    truth = drawn_truth(rig, GRID_TWIN_SEED).with_gears()
+    twin = simulate(rig, PROTOCOLS["grid"](), GRID_TWIN_SEED, truth, aperture=True, header=header)
     return replace(twin, truth=replace(twin.truth, note=GRID_TWIN_NOTE))
 
 

@@ -100,7 +100,13 @@ def test_harmonics_in_every_spelling():
 def test_a_table_completes_its_priors_and_refuses_harmonics_without_a_period():
     assert RigTable({"mirror_offset_mm": Prior(31.0, 1.0)}).priors == {
         **RIG_PRIORS,
+        **dict.fromkeys(AMPLITUDE_NAMES, Prior(0.0, 0.0, "half-normal")),
         "mirror_offset_mm": Prior(31.0, 1.0),
+    }
+    assert RigTable(RIG_PRIORS) == RigTable()
+    assert RigTable(harmonic_period_deg={"pan": (360.0, 36.0)}).priors == {
+        **RigTable().priors,
+        **{f"harmonic_amplitude_deg.pan.{number}": RIG_PRIORS["harmonic_amplitude_deg.pan.1"] for number in (1, 2)},
     }
     for prior in (Prior(0.05, 0.0), Prior(0.0, 0.1)):
         with pytest.raises(InputError, match=r"harmonic_deg\.tilt\.1\.cos has no period") as caught:

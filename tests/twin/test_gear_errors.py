@@ -172,7 +172,7 @@ def test_without_scales_nothing_changes(mounted_rig):
     zero, full = geared(mounted_rig, **nothing), geared(mounted_rig)
     plain = simulate(zero, sweep(), 4, aperture=True)
     truth = draw_truth(mounted_rig, np.random.default_rng(np.random.SeedSequence(4).spawn(1)[0]))
-    perfect = simulate(mounted_rig, sweep(), 4, replace(truth, gear_errors=PERFECT), aperture=True)
+    perfect = simulate(mounted_rig, sweep(), 4, truth.with_gears(), aperture=True)
     assert plain.campaign.spots == perfect.campaign.spots and plain.campaign.moves == perfect.campaign.moves
     assert plain.truth.mirror_angles_deg == perfect.truth.mirror_angles_deg
     bent = simulate(full, sweep(), 4, aperture=True).truth
@@ -252,14 +252,14 @@ def test_the_headline_is_the_line_through_the_looks(mounted_rig):
 
 def test_homing_sides_that_nobody_recorded(mounted_rig):
     """The mirrors stand where the true side puts them, and the campaign does not say which."""
-    truth = quiet(draw_truth(mounted_rig, np.random.default_rng(13)), **{"backlash_deg.pan": 1.0})
+    truth = quiet(draw_truth(mounted_rig, np.random.default_rng(13)).with_gears(), **{"backlash_deg.pan": 1.0})
     plan = tuple(PlanStep(number, "home", 0, 0) for number in range(30))
     for side, angle_deg in (("left", -0.5), ("right", 0.5)):
         told, untold = (
             simulate(mounted_rig, plan, 2, truth, home_approach=(side, "up"), sides_recorded=recorded)
             for recorded in (True, False)
         )
-        assert told.truth == replace(untold.truth, gear_errors=told.truth.gear_errors)
+        assert told.truth == untold.truth
         assert {move.pan_approach for move in told.campaign.moves} == {side}
         assert {(move.pan_approach, move.tilt_approach) for move in untold.campaign.moves} == {("unknown", "unknown")}
         at = np.array(untold.truth.mirror_angles_deg)[:, 0] - np.array(untold.truth.home_offsets_deg)[:, 0]

@@ -16,6 +16,7 @@ import pytest
 from tvsbayes.errors import InputError
 from tvsbayes.instrument.axes import DIRECTION_SIGNS, HOME_SD_DEG
 from tvsbayes.instrument.parameters import (
+    GEAR_ERROR_NAMES,
     HARMONIC_NAMES,
     RIG_PRIORS,
     STEREO_PARAMETER_NAMES,
@@ -52,8 +53,9 @@ def make_rig(truth_u: float | None = None) -> Rig:
     for axis in "xyz":
         priors[f"extrinsics.rotation_rad.{axis}"] = Prior(0.0, 0.02)
         priors[f"extrinsics.translation_mm.{axis}"] = Prior(-20.0 if axis == "y" else 0.0, 5.0)
-    truth = {name: replace(p, u=p.u if truth_u is None else truth_u) for name, p in priors.items()}
-    return Rig(RigTable(priors), stereo, truth, {"d1": 175.0, "d2": 275.0, "d3": 375.0}, {}, {}, {})
+    table = RigTable(priors)
+    truth = {name: replace(p, u=p.u if truth_u is None else truth_u) for name, p in table.priors.items()}
+    return Rig(table, stereo, truth, {"d1": 175.0, "d2": 275.0, "d3": 375.0}, {}, {}, {})
 
 
 def small_plan() -> tuple[PlanStep, ...]:
@@ -189,6 +191,7 @@ def test_same_seed_same_campaign_other_seed_another():
 def test_transmission_error_leaves_every_other_draw_as_it_was():
     """The same rig, stop errors, sheets and noise, whose mirrors stand off by the error of the wheel."""
     rig, plan = make_rig(), small_plan()
+    rig = replace(rig, truth={**rig.truth, **{name: replace(rig.truth[name], u=0.0) for name in GEAR_ERROR_NAMES}})
     names = [name for name in HARMONIC_NAMES if ".tilt." in name]
     wobbling = replace(
         rig,

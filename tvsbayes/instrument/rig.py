@@ -39,8 +39,8 @@ Setting = str | int | float
 class RigTable:
     """The `[rig]` table of a campaign or rig file: every prior the estimators use.
 
-    `priors` maps every name of `RIG_PRIORS` to its `Prior`; names left out take the default, where the axis has
-    the period that they need, and else are fixed at 0.
+    `priors` maps every name of `RIG_PRIORS` to its `Prior`; names left out take the default. Where the axis lacks the
+    period that a name needs, its default is 0, fixed.
     `harmonic_period_deg` maps "pan" and "tilt", where declared, to the periods of the transmission error in
     degrees of the output, 1 to `PERIODS_MAX` different ones: `FULL_TURN_DEG` for the wheel, less for pinion and teeth.
     `harmonic_deg` is an error of the first one's, `harmonic_amplitude_deg.<axis>.<number>` of each.
@@ -54,9 +54,11 @@ class RigTable:
     harmonic_period_deg: dict[str, tuple[float, ...]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        periodic = (name for name in PERIODIC_NAMES if not _has_period(name, self.harmonic_period_deg))
-        absent = {name: replace(RIG_PRIORS[name], value=0.0, u=0.0) for name in periodic}
-        object.__setattr__(self, "priors", {**RIG_PRIORS, **absent, **self.priors})
+        priors = {**RIG_PRIORS, **self.priors}
+        for name in PERIODIC_NAMES:
+            if priors[name] == RIG_PRIORS[name] and not _has_period(name, self.harmonic_period_deg):
+                priors[name] = replace(priors[name], value=0.0, u=0.0)
+        object.__setattr__(self, "priors", priors)
         require_periods(self.priors, self.harmonic_period_deg)
 
     @property

@@ -6,7 +6,7 @@ Degrees where a name says `_deg`, mm, pixels. No estimator reads any of it.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NotRequired, TypedDict, cast
 
@@ -20,6 +20,7 @@ from tvsbayes.instrument.campaign import Campaign
 from tvsbayes.instrument.parameters import (
     GEAR_ERROR_NAMES,
     HARMONIC_NAMES,
+    REGISTRY,
     RIG_NAMES,
     RIG_PRIORS,
     STEREO_PARAMETER_NAMES,
@@ -91,6 +92,11 @@ class Truth:
     reference_pose_deg: Pair | None = None
     gear_errors: GearErrors | None = None
     note: str = "The true rig of a simulated campaign; no estimator reads this file."
+
+    def with_gears(self, errors: GearErrors = PERFECT) -> Truth:
+        """The rig with these errors of its gears and no others: the scales that they are drawn by at 0, and no drift."""
+        scales = {name: 0.0 for name in GEAR_ERROR_NAMES if REGISTRY[name].prior.distribution == "half-normal"}
+        return replace(self, parameters={**self.parameters, **scales}, gear_errors=errors)
 
     def effective_deg_per_step(self, campaign: Campaign) -> dict[str, float] | None:
         """True headlines over the looks of a campaign of this rig, see `true_headlines`; None where it has no looks."""
