@@ -38,14 +38,17 @@ class Fixed(eqx.Module):
 
 
 def innovations(lin: Linearised, arrays: CampaignArrays) -> Float[Array, "innovations columns"]:
-    """Standardised innovations of the linearised campaign, and in the further columns how coordinates move them."""
+    """Standardised innovations of the linearised campaign; in the further columns how coordinates move them.
+
+    The errors at places stand last among them, as coordinates with standard normal priors.
+    """
     by_pan, by_tilt = (tuple(lin.slope[:, :, axis].T) for axis in range(2))
     turned = ToStates.of(by_pan, by_tilt)
-    both = jnp.concatenate([lin.residual[..., None], lin.residual_jacobian], axis=2)
+    both = jnp.concatenate([lin.residual[..., None], lin.residual_jacobian, -lin.place_load], axis=2)
     columns = turned.of_many(tuple(both.transpose(1, 2, 0)))
     seen, free = (jnp.stack(part).transpose(2, 0, 1) for part in (columns[:2], columns[2:]))
-    rows = filter_rows(seen, turned.slope, lin.play_sd_rad, lin.stop_variance, arrays.spots)
-    return jnp.concatenate([filtered(rows).standardised, free], axis=1).reshape(-1, 1 + lin.z.size)
+    rows = filter_rows(seen, turned.slope, lin.play_sd_rad, lin.stop_variance, lin.drift_variance, arrays.spots)
+    return jnp.concatenate([filtered(rows).standardised, free], axis=1).reshape(-1, both.shape[2])
 
 
 def reduced_residuals(
@@ -54,18 +57,22 @@ def reduced_residuals(
     """As few residuals as have the sum of squares, slope and normal equations of innovations and prior.
 
     With N = J'J + 1 = L L' and the slope g they are [L^-1 g; what is left of the length], their Jacobian [L'; 0]: prior
-    coordinates keep N's condition harmless, and every later product is a thirtieth of the size.
+    coordinates keep N's condition harmless, and every later product is a thirtieth of the size. The errors at places
+    are least squares in every step: they stand before the coordinates in N, and what L has of them is left out.
     """
     space, arrays, fixed = args
     lin = linearise(jnp.where(fixed.held, fixed.value, z), space, arrays, fixed.inflation)
     columns = innovations(lin, arrays)
-    residual, jacobian = columns[:, 0], jnp.where(fixed.held, 0.0, columns[:, 1:])
-    prior = jnp.where(fixed.held, z - fixed.value, z)
-    root = jnp.linalg.cholesky(jacobian.T @ jacobian + jnp.eye(z.size))
+    places = lin.place_load.shape[2]
+    residual, jacobian = columns[:, 0], jnp.where(fixed.held, 0.0, columns[:, 1 : 1 + z.size])
+    jacobian = jnp.concatenate([columns[:, 1 + z.size :], jacobian], axis=1)
+    prior = jnp.concatenate([jnp.zeros(places), jnp.where(fixed.held, z - fixed.value, z)])
+    root = jnp.linalg.cholesky(jacobian.T @ jacobian + jnp.eye(prior.size))
     explained = jax.scipy.linalg.solve_triangular(root, jacobian.T @ residual + prior, lower=True)
     left = jnp.dot(residual, residual) + jnp.dot(prior, prior) - jnp.dot(explained, explained)
-    reduced = jnp.append(explained, jnp.sqrt(jnp.maximum(left, 0.0)))
-    return LinearResidual(reduced, jnp.concatenate([root.T, jnp.zeros((1, z.size))]), lin)
+    reduced = jnp.append(explained[places:], jnp.sqrt(jnp.maximum(left, 0.0)))
+    slope = jnp.concatenate([root[places:, places:].T, jnp.zeros((1, z.size))])
+    return LinearResidual(reduced, slope, lin)
 
 
 @compiled(Linearised)

@@ -16,11 +16,17 @@ from jaxtyping import Array, Bool, Float, Int
 
 from tvsbayes.instrument.axes import APPROACH_SIGN
 from tvsbayes.instrument.campaign import Campaign, Move, Spot, ordered_spots, pixels_of
+from tvsbayes.instrument.rig import RigTable
 from tvsbayes.instrument.stereo_pair import triangulate
+from tvsbayes.instrument.places import SeenPlaces, gears_vary, seen_places
 from tvsbayes.instrument.stops import redraws
 from tvsbayes.model.compiled import placed
+from tvsbayes.model.gear_processes import Places
 from tvsbayes.model.laser_path import MoveArrays
 
+SMALLEST_PLACES = 6
+"""Places of both axes together are padded to this number or it times a power of two. Columns of the filter are what a
+density costs: the paper's protocol has these six counters."""
 SMALLEST_BUCKET = 512
 """Spots and moves are padded to this size or the next power of two above it: campaigns of ordinary size
 share one compiled function."""
@@ -34,7 +40,8 @@ class SpotArrays(eqx.Module):
     `whitening` maps a pixel residual to stated standard deviations. `weight` scales a spot's information
     (1, or below for the robust option), `valid` is 0 for padding and excluded spots. `redraw[axis]` says that the
     stop error of the axis was drawn anew since the previous spot, with variance
-    `redraw_mix[axis] @ (sd_right^2, sd_left^2)` (or down, up).
+    `redraw_mix[axis] @ (sd_right^2, sd_left^2)` (or down, up). `hours` have passed since the spot before, or since the
+    homing that came after it.
     """
 
     move_index: Int[Array, " spots"]
@@ -49,6 +56,19 @@ class SpotArrays(eqx.Module):
     redraw_mix: Float[Array, "spots 2 2"]
     new_segment: Bool[Array, " spots"]
     homed: Bool[Array, " spots"]
+    hours: Float[Array, " spots"]
+
+
+class GearArrays(eqx.Module):
+    """Where looks found the gears: places of both axes, and what the errors there do to each spot.
+
+    The angle of the spot's axis of a place holds the transmission error there times `error_share`, and the play there
+    times `play_share`: minus half of it where the axis came from the right or from below, with the other sign else.
+    """
+
+    places: Places
+    error_share: Float[Array, "spots places"]
+    play_share: Float[Array, "spots places"]
 
 
 class CampaignArrays(eqx.Module):
@@ -56,6 +76,7 @@ class CampaignArrays(eqx.Module):
 
     moves: MoveArrays
     spots: SpotArrays
+    gears: GearArrays
     azimuth_convention: Bool[Array, ""]
 
 
@@ -83,6 +104,31 @@ def move_arrays(moves: Sequence[Move], size: int | None = None) -> MoveArrays:
     return MoveArrays(padded(steps, size, steps[-1]), padded(first, size, False, bool), padded(approach, size))
 
 
+def place_arrays(seen: SeenPlaces) -> Places:
+    """Pad places to their bucket."""
+    count = len(seen.steps)
+    size = bucket(count, SMALLEST_PLACES)
+    return Places(
+        padded(seen.steps, size), padded(seen.on_tilt, size, False, bool), padded(np.ones(count), size, False, bool)
+    )
+
+
+def gear_arrays(seen: SeenPlaces, size: int, vary: bool) -> GearArrays:
+    """Pad the places of looks; gears that do not vary have none.
+
+    Args:
+        seen: from `seen_places`.
+        size: padded number of spots.
+        vary: whether transmission error or play differ from place to place.
+    """
+    if not vary:
+        none = padded(np.zeros((0, 0)), size)
+        return GearArrays(Places(placed(np.zeros(0)), *2 * [placed(np.zeros(0, dtype=bool))]), none, none)
+    places = place_arrays(seen)
+    wider = (0, 0), (0, len(places.steps) - len(seen.steps))
+    return GearArrays(places, *(padded(np.pad(share, wider), size) for share in (seen.error_share, seen.play_share)))
+
+
 def pixel_covariance(spot: Spot) -> np.ndarray:
     """Stated covariance of (u_left, v_left, u_right, v_right), px^2."""
     sd = np.array([spot.su_left_px, spot.sv_left_px, spot.su_right_px, spot.sv_right_px], dtype=float)
@@ -92,11 +138,12 @@ def pixel_covariance(spot: Spot) -> np.ndarray:
     return covariance
 
 
-def campaign_arrays(campaign: Campaign) -> CampaignArrays:
+def campaign_arrays(campaign: Campaign, table: RigTable | None = None) -> CampaignArrays:
     """Pack a campaign for the jitted functions.
 
     Args:
         campaign: a checked campaign with at least one spot of status ok.
+        table: the priors of the fit, by default those of the campaign; gears without repeating errors have no places.
 
     Returns:
         Arrays padded to `bucket` sizes.
@@ -106,7 +153,10 @@ def campaign_arrays(campaign: Campaign) -> CampaignArrays:
     pixels = pixels_of(spots)
     covariance = np.stack([pixel_covariance(s) for s in spots])
     whitening = np.linalg.inv(np.linalg.cholesky(covariance))
-    new = redraws(campaign.moves, [s.move for s in spots])
+    looks = [s.move for s in spots]
+    priors = campaign.rig if table is None else table
+    new = redraws(campaign.moves, looks)
+    gears = gear_arrays(seen_places(campaign.moves, looks, priors), size, gears_vary(priors))
     aperture = [np.nan if s.aperture_deg is None else s.aperture_deg for s in spots]
     points_mm = triangulate(campaign.stereo, pixels)
     seen = np.isfinite(points_mm).all(axis=1)
@@ -124,10 +174,10 @@ def campaign_arrays(campaign: Campaign) -> CampaignArrays:
         redraw_mix=padded(new.redraw_mix, size),
         new_segment=padded(new.new_segment, size, False, bool),
         homed=padded(new.homed, size, False, bool),
+        hours=padded(new.hours, size),
     )
-    return CampaignArrays(
-        move_arrays(campaign.moves), spot_arrays, placed(campaign.rig.aperture_convention == "azimuth")
-    )
+    azimuth = placed(campaign.rig.aperture_convention == "azimuth")
+    return CampaignArrays(move_arrays(campaign.moves), spot_arrays, gears, azimuth)
 
 
 def in_sight(campaign: Campaign) -> np.ndarray:

@@ -17,14 +17,16 @@ import numpy as np
 from jaxtyping import Bool
 
 from tvsbayes.errors import NotConverged, NothingToEstimate
-from tvsbayes.estimators.campaign_arrays import CampaignArrays, in_sight
+from tvsbayes.estimators.campaign_arrays import CampaignArrays, in_sight, place_arrays
+from tvsbayes.estimators.likelihood import prior_errors_at_places
 from tvsbayes.estimators.linear_spots import Linearised, StopInformation, leave_one_out_chi2
 from tvsbayes.estimators.mode_search import GATE_PROBABILITY, Problem, search_stages
 from tvsbayes.instrument.campaign import Campaign, ordered_spots
 from tvsbayes.instrument.model_choice import AS_STATED, ModelChoice
 from tvsbayes.instrument.parameters import INDEX, NAMES, RIG_NAMES, Prior
+from tvsbayes.instrument.places import line_share, seen_places
 from tvsbayes.model.compiled import placed
-from tvsbayes.model.headlines import Derived, derived_quantities
+from tvsbayes.model.headlines import Derived, SeenLine, derived_quantities
 from tvsbayes.model.parameter_space import ParameterSpace
 from tvsbayes.progress import Job, Show
 from tvsbayes.results.stored_draws import StoredMode
@@ -67,6 +69,7 @@ class JointFit:
         information: leave-one-out quantities per stop.
         chi2: squared standardised innovations of the spots used.
         reference_pose_rad: mean mirror angles (pan, tilt) over the spots used.
+        seen_line: their counters, over which the headlines are slopes.
         free: parameters that are estimated, shape (p,).
         draws_z: Laplace draws, shape (draws, p), with mean and covariance exactly those of the approximation.
         draws: headlines and parameters of the draws.
@@ -89,6 +92,7 @@ class JointFit:
     information: StopInformation
     chi2: float
     reference_pose_rad: np.ndarray
+    seen_line: SeenLine
     free: np.ndarray
     draws_z: np.ndarray
     draws: Derived
@@ -220,6 +224,25 @@ def restored(campaign: Campaign, stored: StoredMode, seed: int = 0) -> JointFit 
         return fit_at(campaign, problem, mode, seed)
 
 
+@dataclass(frozen=True)
+class Gaussian:
+    """A normal distribution of n numbers: mean (n,) and covariance (n, n)."""
+
+    mean: np.ndarray
+    covariance: np.ndarray
+
+
+def with_places(mode: Mode, information: StopInformation) -> Gaussian:
+    """The Laplace approximation of coordinates and errors at places, these in units of N(0, 1) a priori.
+
+    At the noise scales of the mode the errors follow the coordinates linearly.
+    """
+    slope, own = information.place_slope, mode.covariance
+    follows = slope @ own
+    lower = follows @ slope.T + information.place_covariance
+    return Gaussian(np.append(mode.z, information.place_mean), np.block([[own, follows.T], [follows, lower]]))
+
+
 def fit_at(campaign: Campaign, problem: Problem, mode: Mode, seed: int) -> JointFit:
     """The fit that ends at a mode: residuals, information, Laplace draws and diagnoses there.
 
@@ -236,13 +259,26 @@ def fit_at(campaign: Campaign, problem: Problem, mode: Mode, seed: int) -> Joint
     readings = np.asarray(problem.arrays.spots.has_aperture)[: len(problem.spots)]
     suspect = used & (chi2_spots > chi2_quantile(readings, GATE_PROBABILITY))
     pose = lin.mirror_angles_rad[used].mean(axis=0)
-    draws_z = laplace_draws(mode.z, mode.covariance, seed)
-    identity = np.eye(len(NAMES))
-    prior_z = laplace_draws(np.zeros(len(NAMES)), identity, seed + 1)
-    at_mode_and_draws = derived_quantities(np.vstack([mode.z, draws_z]), problem.space, pose)
-    prior = derived_quantities(np.vstack([mode.z, prior_z]), problem.space, pose)
+    seen_at = seen_places(campaign.moves, [spot.move for spot in problem.spots], campaign.rig)
+    places = place_arrays(seen_at)
+    share = placed(np.pad(line_share(seen_at, used), (0, len(places.steps) - len(seen_at.steps))))
+    seen = SeenLine(np.asarray(pose), places, share)
+    count, joint = len(NAMES), with_places(mode, information)
+    both = laplace_draws(joint.mean, joint.covariance, seed)
+    draws_z, draws_rad = both[:, :count], both[:, count:] @ np.asarray(lin.place_root).T
+    centre_rad = np.asarray(lin.place_root) @ information.place_mean
+    prior_both = laplace_draws(np.zeros(both.shape[1]), np.eye(both.shape[1]), seed + 1)
+    prior_z = prior_both[:, :count]
+    prior_rad = np.asarray(prior_errors_at_places(prior_z, prior_both[:, count:], problem.space, problem.arrays))
+
+    def derived(*parts: tuple[np.ndarray, np.ndarray]) -> Derived:
+        z, errors = (np.concatenate([np.atleast_2d(part[k]) for part in parts]) for k in range(2))
+        return jax.tree.map(np.asarray, derived_quantities(z, errors, problem.space, seen))
+
+    at_mode_and_draws = derived((mode.z, centre_rad), (draws_z, draws_rad))
+    prior = derived((mode.z, centre_rad), (prior_z, prior_rad))
     reach = NORMAL_95 * np.sqrt(np.diag(mode.covariance))
-    ends = derived_quantities(np.vstack([mode.z - reach, mode.z + reach, prior_z[1:]]), problem.space, pose)
+    ends = derived((mode.z - reach, centre_rad), (mode.z + reach, centre_rad), (prior_z[1:], prior_rad[1:]))
     ids = np.array([s.spot for s in problem.spots])
     problems = mode.problems
     chi2 = sum(float(np.asarray(lin.residual)[g.rows].ravel() @ g.residual) for g in information.groups)
@@ -262,6 +298,7 @@ def fit_at(campaign: Campaign, problem: Problem, mode: Mode, seed: int) -> Joint
         information=information,
         chi2=chi2,
         reference_pose_rad=np.asarray(pose),
+        seen_line=seen,
         free=problem.free,
         draws_z=draws_z,
         draws=jax.tree.map(lambda x: np.asarray(x)[1:], at_mode_and_draws),

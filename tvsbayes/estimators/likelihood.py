@@ -1,8 +1,9 @@
-"""Likelihood of all spots of a campaign: flat ranges, marginal stop errors and home offsets (formulation 4.1).
+"""Likelihood of all spots of a campaign: flat ranges, marginal errors of stops, homings and gears (formulation 4.1).
 
-Stop errors (persistent while
-their axis stands still), home offsets and unknown play at the start of a segment are Gaussian states of a Kalman
-filter in time order. Angles rad, lengths mm; residuals are in units of their stated standard deviations.
+Stop errors (persistent while their axis stands still), drifting home offsets and unknown play at the start of a segment
+are Gaussian states of a Kalman filter in time order. Errors that repeat by position stay for the whole campaign: their
+columns go through the filter like the residuals, and normal equations take them out. Angles rad, lengths mm; residuals
+are in units of their stated standard deviations.
 
 State of the filter: stop error (pan, tilt), home offset (pan, tilt), position in the unknown play band (pan, tilt)
 in units of its standard deviation.
@@ -16,11 +17,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from tvsbayes.estimators.campaign_arrays import CampaignArrays, SpotArrays
+from tvsbayes.estimators.campaign_arrays import CampaignArrays, GearArrays, SpotArrays
 from tvsbayes.estimators.looks import Looks, looks_at
 from tvsbayes.estimators.spot_residuals import NoiseScales, SpotResiduals, ToStates, noise_scales, spot_residuals
 from tvsbayes.instrument.axes import HOME_SD_DEG
 from tvsbayes.model.compiled import compiled
+from tvsbayes.model.gear_processes import place_root
 from tvsbayes.model.geometry import Scalar
 from tvsbayes.model.laser_path import mirror_angles
 from tvsbayes.model.parameter_space import Model, ParameterSpace
@@ -33,12 +35,17 @@ def stop_variances(stop_sd_rad: Float[Array, "2 2"], spots: SpotArrays) -> Float
     return jnp.sum(spots.redraw_mix * stop_sd_rad**2, axis=2)
 
 
+def drift_variances(drift_rad_per_root_hour: Float[Array, "2"], spots: SpotArrays) -> Float[Array, "spots 2"]:
+    """Variance of what the zeros (pan, tilt) walked since the spot before, or since the homing after it."""
+    return spots.hours[:, None] * drift_rad_per_root_hour**2
+
+
 class FilterRows(eqx.Module):
     """What the filter meets at each spot, in time order: its residual, how its states move it, which are new.
 
     `residual` has the shape (spots, components), or (spots, components, columns) where several are filtered at once;
     `load` is d(predicted)/d(state), `keep` is 0 for a state drawn anew since the previous spot and 1 otherwise,
-    `variance` the variance it is then drawn with.
+    `variance` what is added to its variance since then: that of the draw, or of a random walk.
     """
 
     residual: Float[Array, "..."]
@@ -52,26 +59,37 @@ def filter_rows(
     slope: Float[Array | np.ndarray, "spots components 2"],
     play_sd_rad: Float[Array | np.ndarray, "spots 2"],
     stop_variance: Float[Array | np.ndarray, "spots 2"],
+    drift_variance: Float[Array | np.ndarray, "spots 2"],
     spots: SpotArrays,
 ) -> FilterRows:
-    """States of the filter at every spot: stop errors, home offsets, places in an unknown play.
+    """States of the filter at every spot: stop errors, home offsets with their drift, places in an unknown play.
 
     Args:
         residual: observed - predicted, or whatever else goes through the filter.
         slope: d(predicted)/d(pan, tilt).
         play_sd_rad: of the place in the play, zero where it is known.
         stop_variance: from `stop_variances`.
+        drift_variance: from `drift_variances`.
         spots: which of them re-home and draw stop errors anew.
     """
     pairs = (len(spots.valid), 2)
     home = jnp.where(spots.homed, (HOME_SD_DEG * jnp.pi / 180) ** 2, 0.0)[:, None]
     segment = jnp.broadcast_to(spots.new_segment[:, None], pairs)
+    drawn = jnp.where(spots.redraw, stop_variance, 0.0)
     return FilterRows(
         residual=jnp.asarray(residual),
         load=jnp.concatenate([slope, slope, slope * play_sd_rad[:, None]], axis=2),
         keep=jnp.where(jnp.concatenate([spots.redraw, segment, segment], axis=1), 0.0, 1.0),
-        variance=jnp.concatenate([stop_variance, jnp.broadcast_to(home, pairs), jnp.ones(pairs)], axis=1),
+        variance=jnp.concatenate([drawn, home + drift_variance, jnp.where(segment, 1.0, 0.0)], axis=1),
     )
+
+
+def place_columns(
+    slope: Float[Array | np.ndarray, "spots components 2"], gears: GearArrays
+) -> Float[Array, "spots components errors"]:
+    """d(predicted)/d(transmission errors, then plays, at the places), rad^-1."""
+    by_place = jnp.where(gears.places.on_tilt, slope[..., 1:], slope[..., :1])
+    return jnp.concatenate([by_place * gears.error_share[:, None], by_place * gears.play_share[:, None]], axis=2)
 
 
 def _along(states: Float[Array, "6"], like: Array) -> Float[Array, "6 ..."]:
@@ -87,7 +105,7 @@ class Belief(eqx.Module):
 
     def renewed(self, row: FilterRows) -> Belief:
         """The state as the spot finds it, before the spot is looked at."""
-        new = jnp.diag(row.variance * (1 - row.keep))
+        new = jnp.diag(row.variance)
         return Belief(self.mean * _along(row.keep, self.mean), self.covariance * (row.keep[:, None] * row.keep) + new)
 
 
@@ -128,6 +146,7 @@ class Standing(eqx.Module):
     terms: SpotResiduals
     play_sd_rad: Float[Array, "spots 2"]
     stop_variance: Float[Array, "spots 2"]
+    drift_variance: Float[Array, "spots 2"]
 
 
 def standing(model: Model, arrays: CampaignArrays, inflation: Float[Array | np.ndarray, ""] | float = 1.0) -> Standing:
@@ -143,19 +162,31 @@ def standing(model: Model, arrays: CampaignArrays, inflation: Float[Array | np.n
         spot_residuals(looks, noise, model, spots),
         angles.play_sd_rad[spots.move_index],
         stop_variances(model.noise.stop_sd_rad, spots),
+        drift_variances(model.gears.drift_rad_per_root_hour, spots),
     )
 
 
 class FilterInput(eqx.Module):
     """Rows of the filter, and what no state can change.
 
-    `free` is what is left of the standardised components, which no state changes; `log_scale` is what each spot adds to
-    the log density besides the rows: theirs in it.
+    The rows' columns are the residual, then how the errors at places move it. `free` is what is left of the
+    standardised components, which no state changes; `log_scale` is what each spot adds to the log density besides the
+    rows: theirs in it. `place_root` is the factor of the covariance of the errors at places.
     """
 
     rows: FilterRows
     free: Float[Array, "spots 4"]
     log_scale: Float[Array, " spots"]
+    place_root: Float[Array, "errors errors"]
+
+
+def root_at_places(model: Model, gears: GearArrays) -> Float[Array, "errors errors"]:
+    """Factor of the covariance of transmission errors, then plays, at the places, rad."""
+    places = gears.places
+    if not len(places.steps):
+        return jnp.zeros((0, 0))
+    angle_rad = places.steps * places.by_axis(model.transmission.ratio_rad_per_step)
+    return place_root(model.gears, angle_rad, places.on_tilt, places.valid)
 
 
 def filter_input(model: Model, arrays: CampaignArrays) -> FilterInput:
@@ -165,20 +196,12 @@ def filter_input(model: Model, arrays: CampaignArrays) -> FilterInput:
     turned = ToStates.of(terms.by_pan, terms.by_tilt)
     first, second, *free = turned.of_many(terms.residual)
     seen = jnp.stack([first, second], axis=1)
-    rows = filter_rows(seen, turned.slope, found.play_sd_rad, found.stop_variance, arrays.spots)
+    columns = jnp.concatenate([seen[..., None], place_columns(turned.slope, arrays.gears)], axis=2)
+    rows = filter_rows(
+        columns, turned.slope, found.play_sd_rad, found.stop_variance, found.drift_variance, arrays.spots
+    )
     log_scale = terms.log_scale - 0.5 * sum(number**2 for number in free)
-    return FilterInput(rows, jnp.stack(free, axis=1), log_scale)
-
-
-class Innovations(eqx.Module):
-    """Standardised one-step prediction errors, N(0, 1) and independent under the model.
-
-    Of each spot two by the filter, then what no stop error changes: four components with the freedom of two at most.
-    `log_density` is the campaign's log likelihood without the terms of `log_constant`.
-    """
-
-    standardised: Float[Array, "spots 6"]
-    log_density: Scalar
+    return FilterInput(rows, jnp.stack(free, axis=1), log_scale, root_at_places(model, arrays.gears))
 
 
 class Seen(eqx.Module):
@@ -199,41 +222,138 @@ def filtered(rows: FilterRows) -> Seen:
     return jax.lax.scan(step, no_belief(*columns), rows)[1]
 
 
-def innovations(model: Model, arrays: CampaignArrays) -> Innovations:
-    """Run the filter over all spots in time order.
+class RepeatedErrors(eqx.Module):
+    """What all looks say of the errors at places: those divided by `root` are N(mean, (factor factor')^-1).
+
+    A priori they are N(0, 1). `log_determinant` is that of the variance which they add to all looks.
+    """
+
+    root: Float[Array, "errors errors"]
+    mean: Float[Array, " errors"]
+    factor: Float[Array, "errors errors"]
+    log_determinant: Scalar
+
+    @property
+    def errors_rad(self) -> Float[Array, " errors"]:
+        """Their mean, rad."""
+        return self.root @ self.mean
+
+    def drawn_rad(self, normal: Float[Array, " errors"]) -> Float[Array, " errors"]:
+        """One draw of them, rad, from standard normal numbers."""
+        return self.root @ (self.mean + jax.scipy.linalg.solve_triangular(self.factor, normal, lower=True, trans=1))
+
+
+def repeated_errors(standardised: Float[Array, "rows columns"], root: Float[Array, "errors errors"]) -> RepeatedErrors:
+    """Normal equations of the errors at places.
+
+    Args:
+        standardised: what the filter made of the residual and of the columns of those errors.
+        root: of their prior covariance.
+    """
+    gram = standardised[:, 1:].T @ standardised
+    precision = jnp.eye(len(root)) + root.T @ gram[:, 1:] @ root
+    factor = jnp.linalg.cholesky(precision)
+    mean = jax.scipy.linalg.cho_solve((factor, True), root.T @ gram[:, 0])
+    return RepeatedErrors(root, mean, factor, 2 * jnp.sum(jnp.log(jnp.diagonal(factor))))
+
+
+class Innovations(eqx.Module):
+    """Standardised one-step prediction errors, N(0, 1) and independent under the model at given errors of places.
+
+    Of each spot two by the filter, then what no stop error changes: four components with the freedom of two at most.
+    They hold at the means of the errors at places, whose standardised values are in `places`; squares of both together
+    are the quadratic form of the campaign. `log_density` is its log likelihood without the terms of `log_constant`;
+    `place_errors_rad` a draw of the errors at places, or their means.
+    """
+
+    standardised: Float[Array, "spots 6"]
+    places: Float[Array, " errors"]
+    place_errors_rad: Float[Array, " errors"]
+    log_density: Scalar
+
+
+def innovations(model: Model, arrays: CampaignArrays, normal: Float[Array, " errors"]) -> Innovations:
+    """Run the filter over all spots in time order, and take out what repeats.
 
     Args:
         model: parameters.
         arrays: the campaign.
+        normal: what moves the errors at places from their means, in units of their sds: nought, or a draw's numbers.
 
     Returns:
         Standardised innovations and log likelihood; cost linear in the number of spots.
     """
     given = filter_input(model, arrays)
     seen = filtered(given.rows)
-    explained = jnp.sum(seen.log_variance) + jnp.sum(seen.standardised**2)
-    standardised = jnp.concatenate([seen.standardised, given.free], axis=1)
-    return Innovations(standardised, jnp.sum(given.log_scale) - 0.5 * explained)
+    own, places, errors_rad = seen.standardised[..., 0], normal, normal
+    log_variance = jnp.sum(seen.log_variance)
+    if len(given.place_root):
+        found = repeated_errors(seen.standardised.reshape(-1, seen.standardised.shape[2]), given.place_root)
+        own, places = own - seen.standardised[..., 1:] @ found.errors_rad, found.mean
+        errors_rad = found.drawn_rad(normal)
+        log_variance += found.log_determinant
+    squares = jnp.sum(own**2) + jnp.sum(places**2)
+    log_density = jnp.sum(given.log_scale) - 0.5 * (log_variance + squares)
+    return Innovations(jnp.concatenate([own, given.free], axis=1), places, errors_rad, log_density)
+
+
+@compiled(jax.Array)
+def prior_errors_at_places(
+    z: Float[Array, "batch parameters"],
+    normal: Float[Array, "batch errors"],
+    space: ParameterSpace,
+    arrays: CampaignArrays,
+) -> Float[Array, "batch errors"]:
+    """Transmission errors, then plays, at the places before any look, rad: a draw each.
+
+    Args:
+        z: coordinates of many points, which have the scales.
+        normal: standard normal numbers.
+        space: priors.
+        arrays: the campaign.
+    """
+    return jax.vmap(lambda z, normal: root_at_places(space.model(z), arrays.gears) @ normal)(z, normal)
 
 
 def log_density(z: Float[Array, " parameters"], space: ParameterSpace, arrays: CampaignArrays) -> Scalar:
     """Log posterior density of the coordinates, up to a constant: likelihood and standard-normal priors."""
-    return innovations(space.model(z), arrays).log_density - 0.5 * jnp.dot(z, z)
+    still = jnp.zeros(2 * len(arrays.gears.places.steps))
+    return innovations(space.model(z), arrays, still).log_density - 0.5 * jnp.dot(z, z)
 
 
 class Evaluation(eqx.Module):
-    """Log posterior density and standardised innovations; many points give every field a leading axis."""
+    """Log posterior density and innovations as in `Innovations`; many points give every field a leading axis."""
 
     log_density: Float[Array, "*batch"]
     standardised: Float[Array, "*batch spots 6"]
+    places: Float[Array, "*batch errors"]
+    place_errors_rad: Float[Array, "*batch errors"]
 
 
 @compiled(Evaluation)
-def evaluate(z: Float[Array, "batch parameters"], space: ParameterSpace, arrays: CampaignArrays) -> Evaluation:
-    """`log_density` of many points in one call; call it with one batch size, each compiles anew."""
+def evaluate(
+    z: Float[Array, "batch parameters"],
+    normal: Float[Array, "batch errors"],
+    space: ParameterSpace,
+    arrays: CampaignArrays,
+) -> Evaluation:
+    """`log_density` of many points in one call; call it with one batch size, each compiles anew.
 
-    def one(z):
-        seen = innovations(space.model(z), arrays)
-        return Evaluation(seen.log_density - 0.5 * jnp.dot(z, z), seen.standardised)
+    Args:
+        z: coordinates.
+        normal: `no_draw`, or standard normal numbers for a draw of the errors at places for each point.
+        space: priors.
+        arrays: the campaign.
+    """
 
-    return jax.vmap(one)(z)
+    def one(z, normal):
+        seen = innovations(space.model(z), arrays, normal)
+        value = seen.log_density - 0.5 * jnp.dot(z, z)
+        return Evaluation(value, seen.standardised, seen.places, seen.place_errors_rad)
+
+    return jax.vmap(one)(z, normal)
+
+
+def no_draw(count: int, arrays: CampaignArrays) -> np.ndarray:
+    """For `evaluate`: the errors at places of this many points are their means."""
+    return np.zeros((count, 2 * len(arrays.gears.places.steps)))

@@ -19,14 +19,17 @@ from jaxtyping import Array, Float
 from scipy import linalg
 
 from tvsbayes.estimators.campaign_arrays import CampaignArrays, padded
-from tvsbayes.estimators.likelihood import FilterRows, filter_rows, standing
+from tvsbayes.estimators.likelihood import FilterRows, filter_rows, place_columns, root_at_places, standing
 from tvsbayes.estimators.look_jacobian import look_jacobian
 from tvsbayes.model.compiled import compiled
 from tvsbayes.model.parameter_space import ParameterSpace
 
 
 class Linearised(eqx.Module):
-    """The campaign linearised at coordinates `z`; first axis of the Jacobians is the spot."""
+    """The campaign linearised at coordinates `z`; first axis of the Jacobians is the spot.
+
+    `place_columns` is d(predicted)/d(errors at places, rad), `place_root` the factor of their prior covariance.
+    """
 
     z: Float[Array | np.ndarray, " parameters"]
     residual: Float[Array | np.ndarray, "spots 4"]
@@ -35,13 +38,21 @@ class Linearised(eqx.Module):
     mirror_angles_rad: Float[Array | np.ndarray, "spots 2"]
     predicted: Float[Array | np.ndarray, "spots 5"]
     stop_variance: Float[Array | np.ndarray, "spots 2"]
+    drift_variance: Float[Array | np.ndarray, "spots 2"]
+    place_columns: Float[Array | np.ndarray, "spots 4 errors"]
+    place_root: Float[Array | np.ndarray, "errors errors"]
     residual_jacobian: Float[Array | np.ndarray, "spots 4 parameters"]
     predicted_jacobian: Float[Array | np.ndarray, "spots 5 parameters"]
+
+    @property
+    def place_load(self) -> Float[Array | np.ndarray, "spots 4 errors"]:
+        """d(predicted)/d(errors at places) in units in which they are N(0, 1) a priori."""
+        return self.place_columns @ self.place_root
 
     def of_spots(self, count: int) -> Linearised:
         """The first `count` spots, as NumPy arrays: padding comes last."""
         parts = {field.name: np.asarray(getattr(self, field.name)) for field in fields(self)}
-        return Linearised(**{name: part if name == "z" else part[:count] for name, part in parts.items()})
+        return Linearised(**{n: part if n in ("z", "place_root") else part[:count] for n, part in parts.items()})
 
     def spot_deviations(self) -> SpotDeviations:
         """Least squares of the whitened residuals, spot by spot; covariance 0 where a spot tells neither angle."""
@@ -78,18 +89,24 @@ def linearise(
         arrays: the campaign.
         inflation: factor on pixel and aperture noise.
     """
-    found = standing(space.model(z), arrays, inflation)
+    model = space.model(z)
+    found = standing(model, arrays, inflation)
     looks, terms = found.looks, found.terms
     by_coordinates = look_jacobian(z, space, looks, arrays)
     residuals = terms.range_out.of_many(found.noise.whitened(by_coordinates, arrays.spots))[1:]
+    slope = jnp.stack([jnp.stack(terms.by_pan, axis=1), jnp.stack(terms.by_tilt, axis=1)], axis=2)
+    root = root_at_places(model, arrays.gears)
     return Linearised(
         z=z,
         residual=jnp.stack(terms.residual, axis=1),
-        slope=jnp.stack([jnp.stack(terms.by_pan, axis=1), jnp.stack(terms.by_tilt, axis=1)], axis=2),
+        slope=slope,
         play_sd_rad=found.play_sd_rad,
         mirror_angles_rad=jnp.stack([looks.pan_rad, looks.tilt_rad], axis=1),
         predicted=jnp.stack(looks.predicted, axis=1),
         stop_variance=found.stop_variance,
+        drift_variance=found.drift_variance,
+        place_columns=place_columns(slope, arrays.gears),
+        place_root=root,
         residual_jacobian=-jnp.stack(residuals).transpose(2, 0, 1),
         predicted_jacobian=jnp.stack(by_coordinates).transpose(2, 0, 1),
     )
@@ -103,8 +120,9 @@ class LinearSpots:
         residual: observed - predicted, shape (n, 4).
         load: d(predicted)/d(filter state), shape (n, 4, 6).
         renewed: states drawn anew since the previous spot, shape (n, 6).
-        variance: their variances, shape (n, 6).
+        variance: added to theirs since the previous spot, shape (n, 6).
         jacobian: -d(residual)/d(coordinates), shape (n, 4, p).
+        places: d(predicted)/d(errors at places, N(0, 1) a priori), shape (n, 4, e).
     """
 
     residual: np.ndarray
@@ -112,6 +130,7 @@ class LinearSpots:
     renewed: np.ndarray
     variance: np.ndarray
     jacobian: np.ndarray
+    places: np.ndarray
 
 
 _rows = compiled(FilterRows)(filter_rows)
@@ -126,9 +145,10 @@ def linear_spots(lin: Linearised, arrays: CampaignArrays, jacobian: np.ndarray) 
         jacobian: d(prediction)/d(whatever is asked about), shape (spots, 4, columns).
     """
     count, size = len(lin.residual), len(arrays.spots.valid)
-    given = (padded(x, size) for x in (lin.residual, lin.slope, lin.play_sd_rad, lin.stop_variance))
+    variances = lin.stop_variance, lin.drift_variance
+    given = (padded(x, size) for x in (lin.residual, lin.slope, lin.play_sd_rad, *variances))
     rows = jax.tree.map(lambda x: np.asarray(x)[:count], _rows(*given, arrays.spots))
-    return LinearSpots(rows.residual, rows.load, rows.keep == 0, rows.variance, jacobian)
+    return LinearSpots(rows.residual, rows.load, rows.keep == 0, rows.variance, jacobian, np.asarray(lin.place_load))
 
 
 @dataclass(frozen=True)
@@ -150,19 +170,31 @@ class StopGroup:
 
 @dataclass(frozen=True)
 class StopInformation:
-    """All groups, and the likelihood's Fisher information J^T C^-1 J, shape (p, p)."""
+    """All groups, what they tell of the coordinates, and what is left of the errors at places.
+
+    Attributes:
+        groups: in time order.
+        fisher: the likelihood's information J^T C^-1 J, shape (p, p).
+        place_mean: of the errors at places given the coordinates, in units of N(0, 1) a priori, shape (e,).
+        place_slope: how that mean moves with the coordinates, shape (e, p).
+        place_covariance: of those errors given the coordinates, shape (e, e).
+    """
 
     groups: tuple[StopGroup, ...]
     fisher: np.ndarray
+    place_mean: np.ndarray
+    place_slope: np.ndarray
+    place_covariance: np.ndarray
 
 
-def _group_rows(renewed: np.ndarray) -> list[slice]:
-    starts = [i for i in range(len(renewed)) if i == 0 or renewed[i].any()]
-    return [slice(a, b) for a, b in zip(starts, [*starts[1:], len(renewed)], strict=True)]
+def _group_rows(spots: LinearSpots) -> list[slice]:
+    fresh = spots.renewed.any(axis=1) | (spots.variance > 0).any(axis=1)
+    starts = [i for i in range(len(fresh)) if i == 0 or fresh[i]]
+    return [slice(a, b) for a, b in zip(starts, [*starts[1:], len(fresh)], strict=True)]
 
 
 def stop_information(spots: LinearSpots) -> StopInformation:
-    """Filter forward, smooth backward.
+    """Filter forward, smooth backward, and take out what repeats (Woodbury's identity).
 
     Args:
         spots: the linearised campaign.
@@ -170,23 +202,24 @@ def stop_information(spots: LinearSpots) -> StopInformation:
     Returns:
         Groups in time order and the Fisher information of the coordinates.
     """
-    parameters = spots.jacobian.shape[-1]
+    places = spots.places.shape[-1]
+    parameters = spots.jacobian.shape[-1] + places
     states = spots.load.shape[-1]
-    targets = np.concatenate([spots.residual[..., None], spots.jacobian], axis=2)
-    slices = _group_rows(spots.renewed)
+    targets = np.concatenate([spots.residual[..., None], spots.jacobian, spots.places], axis=2)
+    slices = _group_rows(spots)
     mean, covariance = np.zeros((states, 1 + parameters)), np.zeros((states, states))
     forward, aheads = [], []
     for rows in slices:
         keep = ~spots.renewed[rows.start]
         mean = mean * keep[:, None]
-        covariance = covariance * np.outer(keep, keep) + np.diag(spots.variance[rows.start] * ~keep)
+        covariance = covariance * np.outer(keep, keep) + np.diag(spots.variance[rows.start])
         load = spots.load[rows].reshape(-1, states)
         ahead = targets[rows].reshape(-1, 1 + parameters) - load @ mean
         covariance_ahead = load @ covariance @ load.T + np.eye(len(load))
         inverse = linalg.cho_solve(linalg.cho_factor(covariance_ahead), np.eye(len(load)))
         gain = covariance @ load.T @ inverse
         whitened = inverse @ ahead
-        aheads.append(ahead[:, 1:])
+        aheads.append(ahead)
         forward.append((keep, load, inverse, gain, whitened))
         mean = mean + gain @ ahead
         covariance = covariance - gain @ load @ covariance
@@ -203,9 +236,35 @@ def stop_information(spots: LinearSpots) -> StopInformation:
         score = (load.T @ disturbance + score) * keep[:, None]
         information = (load.T @ inverse @ load + through.T @ information @ through) * np.outer(keep, keep)
     # One product of all rows: with many columns the sum over the groups would cost more than everything else.
-    whitened = np.concatenate([np.zeros((0, parameters)), *(entry[-1][:, 1:] for entry in forward)])
-    fisher = np.concatenate([np.zeros((0, parameters)), *aheads]).T @ whitened
-    return StopInformation(tuple(groups[::-1]), fisher)
+    nothing = np.zeros((0, 1 + parameters))
+    whole = np.concatenate([nothing, *aheads]).T @ np.concatenate([nothing, *(entry[-1] for entry in forward)])
+    return _without_places(groups[::-1], whole, parameters - places)
+
+
+def _without_places(groups: list[StopGroup], whole: np.ndarray, parameters: int) -> StopInformation:
+    """Integrate the errors at places out.
+
+    Args:
+        groups: with those errors as further coordinates.
+        whole: products of the columns residual, coordinates and errors by the inverse covariance without the latter.
+        parameters: number of coordinates.
+    """
+    own = slice(1 + parameters, None)
+    count = len(whole) - 1 - parameters
+    covariance = np.linalg.inv(np.eye(count) + whole[own, own])
+    explained = covariance @ whole[own, : 1 + parameters]
+    fisher = whole[1 : 1 + parameters, 1 : 1 + parameters] - whole[1 : 1 + parameters, own] @ explained[:, 1:]
+    if count:
+        groups = [
+            StopGroup(
+                g.rows,
+                g.residual - g.jacobian[:, parameters:] @ explained[:, 0],
+                g.jacobian[:, :parameters] - g.jacobian[:, parameters:] @ explained[:, 1:],
+                g.precision - g.jacobian[:, parameters:] @ covariance @ g.jacobian[:, parameters:].T,
+            )
+            for g in groups
+        ]
+    return StopInformation(tuple(groups), fisher, explained[:, 0], -explained[:, 1:], covariance)
 
 
 def leave_one_out_chi2(information: StopInformation, weight: np.ndarray | None = None) -> np.ndarray:

@@ -14,7 +14,7 @@ from scipy import optimize
 
 from tvsbayes.estimators.annealed_stage import NO_STEP, STAGE_TOLERANCE, Fixed, stage
 from tvsbayes.estimators.campaign_arrays import campaign_arrays
-from tvsbayes.estimators.likelihood import evaluate
+from tvsbayes.estimators.likelihood import evaluate, no_draw
 from tvsbayes.estimators.linear_spots import (
     Linearised,
     StopInformation,
@@ -62,7 +62,7 @@ class Problem:
         self.spots = ordered_spots(campaign)
         used = np.ones(len(self.spots), dtype=bool) if used is None else used
         self.space = parameter_space(table, campaign.stereo)
-        arrays = campaign_arrays(campaign)
+        arrays = campaign_arrays(campaign, table)
         valid = np.array(arrays.spots.valid)
         valid[: len(used)] *= used
         self.arrays = eqx.tree_at(lambda a: a.spots.valid, arrays, placed(valid))
@@ -91,7 +91,8 @@ class Problem:
 
     def negative_log_density(self, z: np.ndarray) -> np.ndarray:
         """Of many points (n, p); infinite where the model has no value."""
-        found = in_batches(lambda block: evaluate(block, self.space, self.arrays).log_density, z)
+        still = no_draw(len(z), self.arrays)
+        found = in_batches(lambda at, draw: evaluate(at, draw, self.space, self.arrays).log_density, z, still)
         return np.where(np.isfinite(found), -found, np.inf)
 
     def noise_scales(self, z: np.ndarray) -> np.ndarray:

@@ -18,6 +18,9 @@ from tvsbayes.instrument.axes import APPROACH_SIGN, AXES, DIRECTIONS, direction_
 from tvsbayes.instrument.campaign import Move
 
 
+SECONDS_PER_HOUR = 3600.0
+
+
 @dataclass(frozen=True, slots=True)
 class Stop:
     """A rest of one axis at which a usable spot was seen; `sign` is the sense of the move that led there."""
@@ -176,12 +179,14 @@ class Redraws:
             the direction is unknown.
         new_segment: there was a homing, shape (n,).
         homed: one whose home offset is unknown, shape (n,).
+        hours: since the look before, or since the homing where that came after it, shape (n,).
     """
 
     redraw: np.ndarray
     redraw_mix: np.ndarray
     new_segment: np.ndarray
     homed: np.ndarray
+    hours: np.ndarray
 
 
 def redraws(moves: Sequence[Move], looks: Sequence[int], homed_from: int = 1) -> Redraws:
@@ -199,4 +204,8 @@ def redraws(moves: Sequence[Move], looks: Sequence[int], homed_from: int = 1) ->
     mix = (1 + sign[..., None] * np.array([-1, 1])) / 2
     new_segment = np.diff([rest.homing for rest in at[0]], prepend=-1) != 0
     segment = np.array([rest.segment for rest in at[0]], dtype=int)
-    return Redraws(redraw, np.where(redraw[..., None], mix, 0.0), new_segment, new_segment & (segment >= homed_from))
+    seen_s = np.array([moves[move].time_s for move in looks], dtype=float)
+    homed_s = np.array([moves[rest.homing].time_s for rest in at[0]], dtype=float)
+    since_s = seen_s - np.where(new_segment, homed_s, np.concatenate([homed_s[:1], seen_s[:-1]]))
+    mixed, homed = np.where(redraw[..., None], mix, 0.0), new_segment & (segment >= homed_from)
+    return Redraws(redraw, mixed, new_segment, homed, since_s / SECONDS_PER_HOUR)

@@ -15,8 +15,9 @@ from jaxtyping import Array, Float
 from tvsbayes.instrument.axes import AXES, DIRECTIONS
 from tvsbayes.model.compiled import compiled
 from tvsbayes.model.geometry import Scalar
-from tvsbayes.model.laser_path import BeamAngles, Transmission, beam_angles
-from tvsbayes.model.parameter_space import ParameterSpace
+from tvsbayes.model.gear_processes import Places
+from tvsbayes.model.laser_path import BeamAngles, Transmission, beam_angles, trace
+from tvsbayes.model.parameter_space import Model, ParameterSpace
 
 QUANTITIES = (*DIRECTIONS, *(f"{kind}.{axis}" for kind in ("contrast", "backlash") for axis in AXES), "mirror_offset")
 """Headlines in the order of `headlines`: effective deg/step, their differences, lost motion (deg), offset (mm)."""
@@ -55,30 +56,86 @@ def headlines(z: Float[Array, " parameters"], space: ParameterSpace, pose_rad: F
     return Headlines(values(z), jax.jacfwd(values)(z))
 
 
-class Derived(eqx.Module):
-    """Headlines at one pose for one point of parameter space, in the units of data/docs/conventions.md.
+class SeenLine(eqx.Module):
+    """Where a campaign's looks stand on the counters of both axes: what its headlines are the slopes over.
 
-    `effective_deg_per_step` is ordered left, right, up, down: gear ratio times the slope of the mirrors, the mean over
-    a period of the transmission error, without its local slope. `jacobian` is d(azimuth, elevation)/d(pan, tilt).
+    Attributes:
+        pose_rad: mean mirror angles (pan, tilt) over the looks used.
+        places: counters.
+        share: of the value at each place in the slope of the least-squares line through the looks of its axis, steps^-1.
+    """
+
+    pose_rad: Float[Array | np.ndarray, "2"]
+    places: Places
+    share: Float[Array | np.ndarray, " places"]
+
+
+class Derived(eqx.Module):
+    """Headlines of one point of parameter space, in the units of data/docs/conventions.md.
+
+    Ratios are ordered left, right, up, down. `effective_deg_per_step` are slopes of the lines through the looks,
+    transmission error included; `local_deg_per_step` gear ratio times the slope of the mirrors at the reference pose,
+    without it. `jacobian` is d(azimuth, elevation)/d(pan, tilt) there. `place_errors_rad`: transmission errors, then
+    plays, at the places; empty where gears do not vary.
     """
 
     physical: Float[Array, " parameters"]
     effective_deg_per_step: Float[Array, "4"]
+    local_deg_per_step: Float[Array, "4"]
     jacobian: Float[Array, "2 2"]
     effective_mirror_offset_mm: Scalar
+    place_errors_rad: Float[Array, " errors"]
+
+
+def line_deg_per_step(
+    model: Model, seen: SeenLine, place_errors_rad: Float[Array, " errors"], mirrors: BeamAngles
+) -> Float[Array, "4"]:
+    """Slopes of the beam's azimuth and elevation over the counters seen, by direction (formulation 3.2).
+
+    Through one counter there is no line: the slope is then that of `mirrors`, at the reference pose.
+    """
+    gears, places = model.transmission, seen.places
+    zero = jnp.stack([jnp.zeros(()), model.tilt_zero_rad])
+    ideal = places.by_axis(gears.ratio_rad_per_step) * places.steps + places.by_axis(zero)
+    # No play, no stop error, no drift: nothing but what the counter itself says.
+    count = len(places.steps)
+    turned = ideal + (place_errors_rad[:count] if place_errors_rad.size else 0.0)
+    pan = jnp.where(places.on_tilt, seen.pose_rad[0], turned)
+    tilt = jnp.where(places.on_tilt, turned, seen.pose_rad[1])
+    beam = trace(model.optics, pan, tilt).direction
+    azimuth, elevation = jnp.arctan2(beam.y, beam.x), jnp.arctan2(beam.z, jnp.hypot(beam.x, beam.y))
+    # The beam turns with the mirrors but for degrees: the rest tells on which turn it is.
+    rest = jnp.where(places.on_tilt, elevation, azimuth) - turned
+    rest = rest - jnp.round(rest / (2 * jnp.pi)) * (2 * jnp.pi)
+    parts = seen.share * (turned + rest)
+    own = jnp.stack([~places.on_tilt, places.on_tilt])
+    slope = jnp.sum(jnp.where(own, parts, 0.0), axis=1)
+    lined = jnp.any(own & (seen.share != 0), axis=1)
+    slope = jnp.where(lined, slope, gears.ratio_rad_per_step * jnp.diagonal(mirrors.jacobian))
+    half = 0.5 * gears.contrast_rad_per_step * slope / gears.ratio_rad_per_step
+    return jnp.stack([slope + half, slope - half], axis=1).ravel() * DEGREES
 
 
 @compiled(Derived)
 def derived_quantities(
-    z: Float[Array, "draws parameters"], space: ParameterSpace, reference_pose_rad: Float[Array, "2"]
+    z: Float[Array, "draws parameters"],
+    place_errors_rad: Float[Array, "draws errors"],
+    space: ParameterSpace,
+    seen: SeenLine,
 ) -> Derived:
     """Headlines of many points at once (formulation 3.2); every field has the leading axis `draws`."""
 
-    def one(z):
+    def one(z, errors):
         physical = space.physical(z)
         model = space.model(z)
-        angles = beam_angles(model.optics, reference_pose_rad[0], reference_pose_rad[1])
-        effective = effective_deg_per_step(model.transmission, angles)
-        return Derived(physical, effective, angles.jacobian, angles.effective_mirror_offset_mm)
+        angles = beam_angles(model.optics, seen.pose_rad[0], seen.pose_rad[1])
+        return Derived(
+            physical,
+            line_deg_per_step(model, seen, errors, angles),
+            effective_deg_per_step(model.transmission, angles),
+            angles.jacobian,
+            angles.effective_mirror_offset_mm,
+            errors,
+        )
 
-    return jax.vmap(one)(z)
+    return jax.vmap(one)(z, place_errors_rad)

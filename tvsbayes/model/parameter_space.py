@@ -21,14 +21,24 @@ from jaxtyping import Array, Bool, Float, Int
 from scipy import special
 
 from tvsbayes.instrument.axes import AXES, FULL_TURN_DEG, SIDES
-from tvsbayes.instrument.parameters import BLOCKS, INDEX, KINDS, NAMES, RECEIVER_NAMES, REGISTRY, RIG_NAMES
+from tvsbayes.instrument.parameters import (
+    BLOCKS,
+    INDEX,
+    KINDS,
+    NAMES,
+    PERIODS_MAX,
+    RECEIVER_NAMES,
+    REGISTRY,
+    RIG_NAMES,
+)
 from tvsbayes.instrument.rig import RigTable
 from tvsbayes.instrument.stereo_pair import Stereo
 from tvsbayes.model.compiled import placed
+from tvsbayes.model.gear_processes import GearScales
 from tvsbayes.model.geometry import Scalar, StereoCameras, Vector
 from tvsbayes.model.laser_path import Harmonics, Optics, Transmission
 
-NO_PERIOD_DEG = np.full(2, FULL_TURN_DEG)
+NO_PERIOD_DEG = np.full((2, PERIODS_MAX), FULL_TURN_DEG)
 """Stands for the periods of transmission errors that nobody stated; harmless, since those errors are 0."""
 
 
@@ -65,6 +75,7 @@ class Model(eqx.Module):
     cameras: StereoCameras
     receiver: Receiver
     noise: Noise
+    gears: GearScales
 
 
 HALF_NORMAL_MEAN, HALF_NORMAL_SD = math.sqrt(2 / math.pi), math.sqrt(1 - 2 / math.pi)
@@ -114,7 +125,7 @@ class ParameterSpace(eqx.Module):
     """Priors of one rig as arrays; an argument of the jitted functions, never a constant in them.
 
     `harmonic_period_deg` holds the periods of the transmission errors of (pan, tilt), as `NO_PERIOD_DEG` where none
-    is stated.
+    or fewer are stated.
     """
 
     value: Float[Array, " rig"]
@@ -122,7 +133,7 @@ class ParameterSpace(eqx.Module):
     kind: Int[Array, " rig"]
     stereo_mean: Float[Array, "24"]
     stereo_root: Float[Array, "24 24"]
-    harmonic_period_deg: Float[Array, "2"]
+    harmonic_period_deg: Float[Array, "2 3"]
 
     def physical(self, z: Float[Array, " parameters"]) -> Float[Array, " parameters"]:
         """Coordinates -> values in the units of `NAMES`."""
@@ -160,13 +171,14 @@ def _camera_columns(*parts: str) -> slice | np.ndarray:
 
 
 def model_of(
-    physical: Float[Array, " parameters"], harmonic_period_deg: Float[Array | np.ndarray, "2"] = NO_PERIOD_DEG
+    physical: Float[Array, " parameters"], harmonic_period_deg: Float[Array | np.ndarray, "2 3"] = NO_PERIOD_DEG
 ) -> Model:
     """Assemble the model (deg -> rad happens here and nowhere else).
 
     Args:
         physical: values in the units of `NAMES`.
-        harmonic_period_deg: periods of the transmission error (pan, tilt), see `ParameterSpace`.
+        harmonic_period_deg: periods of the transmission error by axis, see `ParameterSpace`; the first of each axis is
+            that of the harmonics of known shape.
 
     Returns:
         The model in rad and mm.
@@ -186,8 +198,8 @@ def model_of(
             backlash_rad=block("backlash_deg"),
             harmonics=Harmonics(
                 amplitude_rad=jnp.reshape(block("harmonic_deg"), (2, 2, 2)),
-                period_rad=period_deg * (jnp.pi / 180),
-                on_wheel=period_deg == FULL_TURN_DEG,
+                period_rad=period_deg[:, 0] * (jnp.pi / 180),
+                on_wheel=period_deg[:, 0] == FULL_TURN_DEG,
             ),
         ),
         optics=Optics(
@@ -217,6 +229,14 @@ def model_of(
             aperture_sd_rad=block("aperture_sd_deg"),
         ),
         noise=Noise(stop_sd_rad=jnp.reshape(block("stop_sd_deg"), (2, 2))[:, ::-1], pixel_scale=block("pixel_scale")),
+        gears=GearScales(
+            error_rad=block("transmission_error_deg"),
+            length_rad=block("transmission_error_length_deg"),
+            play_rad=block("play_variation_deg"),
+            drift_rad_per_root_hour=block("drift_deg_per_root_hour"),
+            amplitude_rad=jnp.reshape(block("harmonic_amplitude_deg"), (2, PERIODS_MAX)),
+            period_rad=period_deg * (jnp.pi / 180),
+        ),
     )
 
 
@@ -237,8 +257,14 @@ def parameter_space(table: RigTable, stereo: Stereo) -> ParameterSpace:
         kind=placed(np.array([KINDS.index(p.distribution) for p in priors])),
         stereo_mean=placed(stereo.vector),
         stereo_root=placed(root),
-        harmonic_period_deg=placed(np.array([table.first_period_deg.get(a, FULL_TURN_DEG) for a in AXES])),
+        harmonic_period_deg=placed(np.stack([_periods_deg(table, axis) for axis in AXES])),
     )
+
+
+def _periods_deg(table: RigTable, axis: str) -> np.ndarray:
+    """Of the transmission error of an axis, as many as there may be."""
+    stated = np.ravel(table.harmonic_period_deg.get(axis, ()))
+    return np.append(stated, np.full(PERIODS_MAX - len(stated), FULL_TURN_DEG))
 
 
 @dataclass(frozen=True)

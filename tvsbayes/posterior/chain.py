@@ -67,6 +67,7 @@ def _pool_arrays(pool: Pool) -> dict[str, np.ndarray]:
     return {
         "pool_w": pool.w,
         "pool_log_target": pool.log_target,
+        "pool_place_errors_rad": pool.place_errors_rad,
         "pool_counts": np.array(pool.counts),
         "pool_invalid": np.array(pool.invalid),
         "proposal_mean": np.stack([each.mean for each in every]),
@@ -83,8 +84,9 @@ def _pool_of(stored: dict[str, np.ndarray]) -> Pool:
     places, coupled = stored["proposal_places"], stored["proposal_coupled"]
     every = tuple(Independence(mean, sd, places, Tables(table), coupled) for mean, sd, table in parts)
     counts = tuple(stored["pool_counts"].tolist())
-    pool = Pool(stored["pool_w"], stored["pool_log_target"], every[:-1], counts, every[-1], int(stored["pool_invalid"]))
-    if len(counts) != len(every) - 1 or not len(pool.w) == len(pool.log_target) == sum(counts):
+    draws = stored["pool_w"], stored["pool_log_target"], stored["pool_place_errors_rad"]
+    pool = Pool(*draws, every[:-1], counts, every[-1], int(stored["pool_invalid"]))
+    if len(counts) != len(every) - 1 or {len(each) for each in draws} != {sum(counts)}:
         raise ValueError(f"{len(pool.w)} weighted draws with parts of other lengths")
     return pool
 

@@ -16,7 +16,7 @@ from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.instrument.parameters import NAMES
 from tvsbayes.model.headlines import Derived
 from tvsbayes.posterior.chain import Chain
-from tvsbayes.posterior.draws import Draws, Posterior, derived_at, headline_names, propagated
+from tvsbayes.posterior.draws import Draws, Posterior, derived_of, headline_names, propagated
 from tvsbayes.posterior.importance import ImportanceRun
 from tvsbayes.results.convergence import Agreement, Convergence, extreme
 
@@ -131,7 +131,9 @@ def diagnose(fit: JointFit, start: ImportanceRun, chain: Chain) -> Posterior:
     found = start.path.mapped(stored.reshape(-1, dimension))
     z = found.z.reshape(walkers, draws, -1)
     log_density = chain.log_density[discarded:][::thin].T + fit.log_density - found.log_jacobian.reshape(walkers, draws)
-    derived = derived_at(fit, z, fit.reference_pose_rad)
+    normal = place_normals(len(found.z), fit, np.random.default_rng([start.posterior.seed, 5]))
+    errors_rad = Target(fit, start.path).valued(stored.reshape(-1, dimension), normal).place_errors_rad
+    derived = derived_of(fit, z, errors_rad.reshape(walkers, draws, -1))
     columns = {**Draws(derived), "log_density": log_density.ravel()}
     fixed = {NAMES[i] for i in np.flatnonzero(~fit.free)}
     names = tuple(name for name, column in columns.items() if name not in fixed and np.ptp(column) > 0)

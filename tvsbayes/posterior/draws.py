@@ -13,6 +13,7 @@ import jax
 import numpy as np
 
 from tvsbayes.estimators.joint_fit import JointFit
+from tvsbayes.estimators.likelihood import no_draw
 from tvsbayes.instrument.axes import AXES, DIRECTION_SIGNS, DIRECTIONS, SENSES
 from tvsbayes.instrument.parameters import BLOCKS, NAMES
 from tvsbayes.instrument.stops import legs_of
@@ -29,7 +30,8 @@ class Draws(Mapping[str, np.ndarray]):
     """Posterior draws by name: every parameter, and derived quantities, each of shape (n,).
 
     Derived: `degrees_per_step.left|right|up|down`, `effective_deg_per_step.left|right|up|down`,
-    `effective_contrast_deg_per_step.pan|tilt` (left - right, up - down), `effective_mirror_offset_mm`.
+    `effective_contrast_deg_per_step.pan|tilt` (left - right, up - down), `local_deg_per_step.left|right|up|down`,
+    `effective_mirror_offset_mm`.
     """
 
     def __init__(self, draws: Derived):
@@ -42,6 +44,8 @@ class Draws(Mapping[str, np.ndarray]):
             self._columns[f"degrees_per_step.{negative}"] = ratio - half
         effective = np.asarray(draws.effective_deg_per_step).reshape(-1, len(DIRECTIONS))
         self._columns |= {f"effective_deg_per_step.{d}": effective[:, k] for k, d in enumerate(DIRECTIONS)}
+        local = np.asarray(draws.local_deg_per_step).reshape(-1, len(DIRECTIONS))
+        self._columns |= {f"local_deg_per_step.{d}": local[:, k] for k, d in enumerate(DIRECTIONS)}
         contrast = effective[:, ::2] - effective[:, 1::2]
         self._columns |= {f"effective_contrast_deg_per_step.{a}": contrast[:, k] for k, a in enumerate(AXES)}
         self._columns["effective_mirror_offset_mm"] = np.asarray(draws.effective_mirror_offset_mm).ravel()
@@ -207,9 +211,8 @@ class Posterior:
         return self.summarised(values.reshape(chains, draws, *values.shape[1:]))
 
     def effective_deg_per_step(self, pan_deg: float, tilt_deg: float) -> Propagated:
-        """Effective degrees per step (left, right, up, down) at any pose of the mirrors (formulation 3.2)."""
-        found = derived_at(self.fit, self.z, np.radians([pan_deg, tilt_deg]))
-        return self.summarised(np.asarray(found.effective_deg_per_step))
+        """Local degrees per step (left, right, up, down) at any pose of the mirrors (formulation 3.2)."""
+        return self.summarised(local_deg_per_step(self.fit, self.z, np.radians([pan_deg, tilt_deg])))
 
     def lost_motion_deg(self, direction: str, steps: np.ndarray) -> Propagated:
         """Mirror angle that a move of `steps` loses after a reversal: min(k N, b) (play operator, formulation 3.1).
@@ -278,9 +281,25 @@ def propagated(values: np.ndarray) -> Propagated:
     )
 
 
-def derived_at(fit: JointFit, z: np.ndarray, pose_rad: np.ndarray) -> Derived:
-    """Parameters and headlines of draws (chain, draw, p) at a pose (pan, tilt)."""
+def derived_of(fit: JointFit, z: np.ndarray, place_errors_rad: np.ndarray) -> Derived:
+    """Parameters and headlines of draws (chain, draw, p) with their errors at places (chain, draw, e)."""
     shape = z.shape[:2]
-    points = z.reshape(-1, z.shape[-1])
-    flat = in_batches(lambda block: derived_quantities(block, fit.space, pose_rad), points, size=DERIVED_BATCH)
+    count = shape[0] * shape[1]
+    given = z.reshape(count, -1), place_errors_rad.reshape(count, place_errors_rad.shape[-1])
+    flat = in_batches(
+        lambda z, errors: derived_quantities(z, errors, fit.space, fit.seen_line), *given, size=DERIVED_BATCH
+    )
     return jax.tree.map(lambda x: x.reshape(*shape, *x.shape[1:]), flat)
+
+
+def local_deg_per_step(fit: JointFit, z: np.ndarray, pose_rad: np.ndarray) -> np.ndarray:
+    """Gear ratio times the slope of the mirrors at a pose (pan, tilt), by direction, of draws (..., p)."""
+    seen = replace(fit.seen_line, pose_rad=pose_rad)
+    points = z.reshape(-1, z.shape[-1])
+    none = no_draw(len(points), fit.arrays)
+    flat = in_batches(
+        lambda z, errors: derived_quantities(z, errors, fit.space, seen).local_deg_per_step,
+        *(points, none),
+        size=DERIVED_BATCH,
+    )
+    return np.reshape(flat, (*z.shape[:-1], len(DIRECTIONS)))

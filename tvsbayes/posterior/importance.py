@@ -15,10 +15,11 @@ import numpy as np
 from tvsbayes.errors import NotConverged
 from tvsbayes.estimators.campaign_arrays import spot_constants
 from tvsbayes.estimators.joint_fit import JointFit
+from tvsbayes.estimators.likelihood import no_draw
 from tvsbayes.instrument.campaign import ordered_spots
 from tvsbayes.instrument.parameters import NAMES
-from tvsbayes.posterior.draws import Draws, Posterior, derived_at, headline_names
-from tvsbayes.posterior.proposal import Independence, Target, first_proposal
+from tvsbayes.posterior.draws import Draws, Posterior, derived_of, headline_names
+from tvsbayes.posterior.proposal import Independence, Target, first_proposal, place_normals
 from tvsbayes.posterior.ridges import transport
 from tvsbayes.posterior.transport import Transport
 from tvsbayes.progress import Advance, OpenEnded, unshown
@@ -48,6 +49,7 @@ class Pool:
     Attributes:
         w: draws, shape (n, d), round by round.
         log_target: their log densities as `Target` gives them, shape (n,).
+        place_errors_rad: a draw of the errors at places for each, shape (n, e).
         proposals: that made them; counts: how many each, in order.
         next_proposal: fitted to all of them.
         invalid: draws whose density has no value.
@@ -55,6 +57,7 @@ class Pool:
 
     w: np.ndarray
     log_target: np.ndarray
+    place_errors_rad: np.ndarray
     proposals: tuple[Independence, ...]
     counts: tuple[int, ...]
     next_proposal: Independence
@@ -71,6 +74,9 @@ class Pool:
         """With another round; the proposal is fitted again if `fitted`."""
         proposal, before = self.next_proposal, target.invalid
         w = proposal.draw(ROUND, generator)
+        # A stream of its own: gears without repeating errors leave the draws of w as they are.
+        errors = np.random.default_rng([len(self.w), 4])
+        valued = target.valued(w, place_normals(ROUND, target.fit, errors))
         proposals, counts = self.proposals, self.counts
         if proposals and proposals[-1] is proposal:
             counts = (*counts[:-1], counts[-1] + ROUND)
@@ -78,7 +84,8 @@ class Pool:
             proposals, counts = (*proposals, proposal), (*counts, ROUND)
         found = Pool(
             np.concatenate([self.w, w]),
-            np.concatenate([self.log_target, target(w)]),
+            np.concatenate([self.log_target, valued.log_target]),
+            np.concatenate([self.place_errors_rad, valued.place_errors_rad]),
             proposals,
             counts,
             proposal,
@@ -96,7 +103,8 @@ def empty_pool(target: Target) -> Pool:
     path = target.path
     dimension = path.dimension
     first = first_proposal(target, dimension, path.heavy, path.coupled)
-    return Pool(np.zeros((0, dimension)), np.zeros(0), (), (), first)
+    errors = no_draw(0, target.fit.arrays)
+    return Pool(np.zeros((0, dimension)), np.zeros(0), errors, (), (), first)
 
 
 def log_evidence(fit: JointFit, path: Transport, log_weights: np.ndarray) -> float:
@@ -123,7 +131,7 @@ def reweighted_posterior(fit: JointFit, path: Transport, pool: Pool, seed: int, 
     weights = smoothed.weights
     found = path.mapped(pool.w[finite])
     log_density = pool.log_target[finite] + fit.log_density - found.log_jacobian
-    derived = derived_at(fit, found.z[None], fit.reference_pose_rad)
+    derived = derived_of(fit, found.z[None], pool.place_errors_rad[finite][None])
     columns = {**Draws(derived), "log_density": log_density}
     fixed = {NAMES[i] for i in np.flatnonzero(~fit.free)}
     names = [name for name, column in columns.items() if name not in fixed and np.ptp(column) > 0]

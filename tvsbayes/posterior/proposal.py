@@ -9,11 +9,12 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 
+import jax
 import numpy as np
 from scipy import special
 
 from tvsbayes.estimators.joint_fit import JointFit
-from tvsbayes.estimators.likelihood import evaluate
+from tvsbayes.estimators.likelihood import evaluate, no_draw
 from tvsbayes.model.compiled import in_batches
 from tvsbayes.posterior.transport import Transport
 
@@ -44,6 +45,24 @@ MATTERS = 12.0
 """Draws whose log weight lies farther below the largest tell nothing of the target's shape."""
 
 
+@dataclass(frozen=True)
+class Valued:
+    """Points by their density, and a draw of the errors at places for each.
+
+    Attributes:
+        log_target: log density of w relative to z's at the mode, -inf where the model has no value, shape (n,).
+        place_errors_rad: shape (n, e).
+    """
+
+    log_target: np.ndarray
+    place_errors_rad: np.ndarray
+
+
+def place_normals(count: int, fit: JointFit, generator: np.random.Generator) -> np.ndarray:
+    """What `evaluate` makes draws of the errors at places from."""
+    return generator.standard_normal((count, 2 * len(fit.arrays.gears.places.steps)))
+
+
 class Target:
     """The log posterior density of points w, as samplers call it: NumPy in, NumPy out, NaN refused and counted."""
 
@@ -53,11 +72,21 @@ class Target:
 
     def __call__(self, w: np.ndarray) -> np.ndarray:
         """Log density of w (n, d), relative to z's at the mode; -inf where the model has no value."""
+        return self.valued(w, no_draw(len(w), self.fit.arrays)).log_target
+
+    def valued(self, w: np.ndarray, normal: np.ndarray) -> Valued:
+        """The same, with draws of the errors at places from standard normal numbers (n, e)."""
         found = self.path.mapped(w)
-        value = in_batches(lambda block: evaluate(block, self.fit.space, self.fit.arrays).log_density, found.z)
+
+        def value_and_errors(z: np.ndarray, normal: np.ndarray) -> tuple[jax.Array, jax.Array]:
+            seen = evaluate(z, normal, self.fit.space, self.fit.arrays)
+            return seen.log_density, seen.place_errors_rad
+
+        value, errors_rad = in_batches(value_and_errors, found.z, normal)
         invalid = np.isnan(value)
         self.invalid += int(invalid.sum())
-        return np.where(invalid, -np.inf, value - self.fit.log_density + found.log_jacobian)
+        log_target = np.where(invalid, -np.inf, value - self.fit.log_density + found.log_jacobian)
+        return Valued(log_target, errors_rad)
 
 
 def _log_t(distance2: np.ndarray, dimension: int, dof: float = HEAVY_DOF) -> np.ndarray:

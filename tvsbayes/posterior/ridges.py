@@ -8,16 +8,17 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
+import jax
 import numpy as np
 from scipy import linalg
 
 from tvsbayes.estimators.joint_fit import JointFit
-from tvsbayes.estimators.likelihood import evaluate
-from tvsbayes.estimators.linear_spots import LinearSpots, linear_spots
-from tvsbayes.instrument.parameters import INDEX, NAMES, NOISE_NAMES
+from tvsbayes.estimators.likelihood import evaluate, no_draw
+from tvsbayes.estimators.linear_spots import LinearSpots, linear_spots, stop_information
+from tvsbayes.instrument.parameters import INDEX, KINDS, NAMES, NOISE_NAMES, names_of
 from tvsbayes.model.compiled import in_batches
 from tvsbayes.model.parameter_space import STOP_COLUMNS
-from tvsbayes.posterior.transport import STRETCH_NODES, Transport
+from tvsbayes.posterior.transport import GEAR_SCALES, STRETCH_NODES, Transport
 
 NARROW = 0.15
 """Conditional posterior sd, in prior sds, below which a coordinate is moved by the shear. Wider ones would be moved
@@ -27,6 +28,9 @@ SHEAR_STEP = 0.5
 STATES_MAX = 64
 """Most stop errors for which the whole covariance follows the noise scales of every walker. With more stops its
 matrices cost several times the density, the scales are known better, and widths from a table do."""
+UNTABLED_NAMES = tuple(NAMES[column] for column in GEAR_SCALES) + names_of("drift_deg_per_root_hour")
+"""Noise scales for which no table of widths is made: the map follows those of the gears, and few coordinates see the
+drift."""
 STRETCH_LIMITS = 1e-2, 1e2
 """Of the information of a coordinate, 1 at the mode."""
 
@@ -118,18 +122,54 @@ def whitening(fit: JointFit, whole: bool) -> Whitening:
     return Whitening(free, root, np.flatnonzero(scales), np.flatnonzero(~scales))
 
 
+@dataclass(frozen=True)
+class Products:
+    """Of the columns J, G (coordinates y; states, then errors at places in rad) and the residual r, by the inverse
+    covariance of everything else: fields as in `Transport`."""
+
+    known: np.ndarray
+    load: np.ndarray
+    states: np.ndarray
+    score: np.ndarray
+    state_score: np.ndarray
+
+    @classmethod
+    def of(cls, gram: np.ndarray, moment: np.ndarray, coordinates: int) -> Products:
+        """From the products of all columns and of them with r."""
+        own, rest = slice(coordinates), slice(coordinates, None)
+        return cls(gram[own, own], gram[own, rest], gram[rest, rest], moment[own], moment[rest])
+
+
+def _products(fit: JointFit, linear: LinearSpots, stops: StopStates, ways: np.ndarray) -> Products:
+    """With few stops their errors are states; with many they stay in the covariance as the mode has it."""
+    along = linear.jacobian @ ways
+    places = np.asarray(fit.linearised.place_columns)
+    count = along.shape[2]
+    if stops.load.shape[1]:
+        rows = along.reshape(-1, count), stops.load, places.reshape(len(stops.load), -1)
+        columns = np.concatenate(rows, axis=1)
+        return Products.of(columns.T @ columns, columns.T @ linear.residual.ravel(), count)
+    columns = np.concatenate([along, places], axis=2)
+    found = stop_information(replace(linear, jacobian=columns, places=linear.places[..., :0]))
+    seen = np.concatenate([group.residual for group in found.groups])
+    return Products.of(found.fisher, columns.reshape(-1, columns.shape[2]).T @ seen, count)
+
+
 def unbent(fit: JointFit) -> Transport:
     """The map whose ridges are straight and whose widths do not follow the noise scales by a table."""
     linear = linear_spots(fit.linearised, fit.arrays, -np.asarray(fit.linearised.residual_jacobian))
     stops = stop_states(fit, linear)
-    found = whitening(fit, len(stops.constant) > 0)
+    few, places = len(stops.constant) > 0, jax.tree.map(np.asarray, fit.arrays.gears.places)
+    found = whitening(fit, few or len(places.steps) > 0)
     free, root, noise = found.free, found.root, found.noise
     narrow = np.flatnonzero(np.diag(root) < NARROW)
-    wide = root[np.ix_(found.geometry, found.geometry)]
-    jacobian = linear.jacobian.reshape(-1, len(NAMES))[:, free[found.geometry]] @ wide
-    residual = linear.residual.ravel()
-    of_noise = STOP_COLUMNS.reshape(4, 1) == free[noise]
     narrow = narrow[np.isin(narrow, found.geometry)]
+    wide = root[np.ix_(found.geometry, found.geometry)]
+    ways = np.zeros((len(NAMES), len(found.geometry)))
+    ways[free[found.geometry]] = wide
+    of_noise = STOP_COLUMNS.reshape(4, 1) == free[noise]
+    half = np.asarray(fit.space.kind)[free[noise]] == KINDS.index("half-normal")
+    ratio = np.radians([fit.mode.physical[INDEX[name]] for name in names_of("degrees_per_step")])
     return Transport(
         mode=fit.z,
         free=free,
@@ -138,17 +178,20 @@ def unbent(fit: JointFit) -> Transport:
         narrow=narrow,
         bend=np.zeros((len(narrow), len(free), len(free))),
         stretch=np.zeros((len(noise), len(STRETCH_NODES), len(free))),
-        slope=np.asarray(fit.space.u)[free[noise]][:, None] * root[np.ix_(noise, noise)],
-        pixels=(free[noise] == INDEX["pixel_scale"]).astype(float),
+        slope=np.where(half, 1.0, np.asarray(fit.space.u)[free[noise]])[:, None] * root[np.ix_(noise, noise)],
+        half=half,
+        pixels=(free[noise] == INDEX["pixel_scale"]) * float(few),
         variance=stops.variance @ of_noise,
         # Stop errors whose sd is not estimated keep their variance.
         constant=stops.constant + stops.variance @ ~of_noise.any(axis=1),
         prior=wide.T @ wide,
-        known=jacobian.T @ jacobian,
-        load=jacobian.T @ stops.load,
-        states=stops.load.T @ stops.load,
-        score=jacobian.T @ residual,
-        state_score=stops.load.T @ residual,
+        **vars(_products(fit, linear, stops, ways)),
+        place_angle_rad=places.steps * ratio[places.on_tilt.astype(int)],
+        place_on_tilt=places.on_tilt,
+        place_valid=places.valid,
+        gear_scale=np.asarray(fit.mode.physical)[GEAR_SCALES],
+        gear_noise=(GEAR_SCALES[:, None] == free[noise]).astype(float),
+        period_deg=np.asarray(fit.space.harmonic_period_deg),
     )
 
 
@@ -181,7 +224,8 @@ def bends(route: Transport, residuals: Residuals) -> np.ndarray:
 def stretches(route: Transport, residuals: Residuals) -> np.ndarray:
     """Table of widths, shape (q, nodes, d): the data's share of each place's information as a noise scale goes."""
     stretch = np.zeros_like(route.stretch)
-    for which, place in enumerate(route.noise):
+    followed = np.isin(np.array(NAMES)[route.free[route.noise]], UNTABLED_NAMES, invert=True)
+    for which, place in zip(np.flatnonzero(followed), route.noise[followed], strict=True):
         later = route.geometry[route.geometry > place]
         shares = []
         for node in STRETCH_NODES:
@@ -212,8 +256,12 @@ def transport(fit: JointFit) -> Transport:
     plain = route.straight()
 
     def residuals(y: np.ndarray) -> np.ndarray:
-        seen = in_batches(lambda z: evaluate(z, fit.space, fit.arrays).standardised, plain.from_whitened(y))
-        return np.nan_to_num(np.asarray(seen).reshape(len(y), -1))
+        def both(z: np.ndarray, still: np.ndarray) -> np.ndarray:
+            found = evaluate(z, still, fit.space, fit.arrays)
+            return np.concatenate([np.reshape(found.standardised, (len(z), -1)), np.asarray(found.places)], axis=1)
+
+        seen = in_batches(both, plain.from_whitened(y), no_draw(len(y), fit.arrays))
+        return np.nan_to_num(np.asarray(seen))
 
     bend = bends(route, residuals)
     # Where the whole covariance follows the noise scales there is no table.

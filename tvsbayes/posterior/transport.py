@@ -14,9 +14,21 @@ from functools import cached_property
 
 import numpy as np
 
-from tvsbayes.instrument.parameters import BLOCKS, NAMES, NOISE_NAMES
-from tvsbayes.model.parameter_space import half_normal, half_normal_slope
+from tvsbayes.instrument.parameters import BLOCKS, INDEX, NAMES, NOISE_NAMES, PERIODS_MAX, names_of
+from tvsbayes.model.gear_processes import GearScales, place_root
+from tvsbayes.model.parameter_space import FARTHEST_SD, half_normal, half_normal_slope
 
+GEAR_SCALES = np.array(
+    [
+        INDEX[name]
+        for name in names_of(
+            *("transmission_error_deg", "transmission_error_length_deg", "play_variation_deg", "harmonic_amplitude_deg")
+        )
+    ]
+)
+"""Coordinates of what the covariance of the errors at places depends on."""
+LEAST_SCALE = 1e-6
+"""Of a noise scale over that at the mode: what is smaller moves nothing."""
 BLOCK_ROWS = 256
 """Points that are mapped at a time: their matrices take 64 MB at most."""
 STRETCH_NODES = (-2.0, 0.0, 2.0, 4.0, 6.0)
@@ -65,28 +77,35 @@ class Mapped:
 class Transport:
     """The map w -> z; its Jacobian is |det root| exp(`Mapped.log_jacobian`).
 
-    With stop errors e of variance S and pixels in units of their noise, the linearised residuals are r - J y - G e:
-    the precision of y is then prior + J'J - J'G (S^-1 + G'G)^-1 G'J (Woodbury), at any noise scales from the same
-    products. Beyond `ridges.STATES_MAX` stop errors (m = 0 here) only the widths follow, from a table for every scale.
+    With stop errors e of variance S, errors at places of covariance K and pixels in units of their noise, the linearised
+    residuals are r - J y - G e: the precision of y is then prior + J'J - J'G ((S, K)^-1 + G'G)^-1 G'J (Woodbury), at any
+    noise scales from the same products. Beyond `ridges.STATES_MAX` stop errors (m = 0 here) those stay in the covariance
+    by which the products are taken, and widths alone follow their scales, from a table.
 
     Attributes:
         mode: z at w = 0, shape (p,).
-        free: columns of z that are sampled, (d,): widest conditional sd first; if m > 0, noise coordinates before all.
-        root: lower-triangular factor of their covariance in that order, shape (d, d); if m > 0, of noise coordinates
+        free: columns of z that are sampled, (d,): widest conditional sd first; with states, noise coordinates before all.
+        root: lower-triangular factor of their covariance in that order, shape (d, d); with states, of noise coordinates
             and others apart, whose mean at other scales follows from r.
         noise: places in `free` of the noise coordinates, shape (q,).
         narrow: places in `free` that the shear moves, ascending, shape (k,).
         bend: its quadratic forms, nonzero only among places before the narrow one, shape (k, d, d).
         stretch: if m is 0, log of the factor on every place at `STRETCH_NODES` of each noise coordinate, (q, nodes, d).
-        slope: ln of the noise scales over those at the mode, by w of the noise coordinates, shape (q, q).
+        slope: ln of the noise scales over those at the mode, by w of the noise coordinates, shape (q, q); of half-normal
+            scales, whose logarithm is no linear function, the step of z instead.
+        half: which noise scales are half-normal, shape (q,).
         pixels: 1 at the noise coordinate that scales all pixels, shape (q,).
         variance: of every stop error at the mode, by the noise coordinate that scales it, shape (m, q).
         constant: what scales with none, shape (m,).
         prior: precision of y of the g other coordinates without data, shape (g, g).
         known: J'J, what the data add if no stop errs, shape (g, g).
-        load: J'G, shape (g, m).
-        states: G'G, shape (m, m).
-        score, state_score: J'r, shape (g,), and G'r, shape (m,).
+        load: J'G, shape (g, m + e), the errors at places last.
+        states: G'G, shape (m + e, m + e).
+        score, state_score: J'r, shape (g,), and G'r, shape (m + e,).
+        place_angle_rad, place_on_tilt, place_valid: of the e / 2 places, as `gear_processes.place_root` takes them.
+        gear_scale: values of `GEAR_SCALES` at the mode, in the units of their names, shape (12,).
+        gear_noise: which noise coordinate each of them is, shape (12, q).
+        period_deg: of the gears, shape (2, 3).
     """
 
     mode: np.ndarray
@@ -97,6 +116,7 @@ class Transport:
     bend: np.ndarray
     stretch: np.ndarray
     slope: np.ndarray
+    half: np.ndarray
     pixels: np.ndarray
     variance: np.ndarray
     constant: np.ndarray
@@ -106,6 +126,12 @@ class Transport:
     states: np.ndarray
     score: np.ndarray
     state_score: np.ndarray
+    place_angle_rad: np.ndarray
+    place_on_tilt: np.ndarray
+    place_valid: np.ndarray
+    gear_scale: np.ndarray
+    gear_noise: np.ndarray
+    period_deg: np.ndarray
 
     @property
     def dimension(self) -> int:
@@ -139,6 +165,9 @@ class Transport:
             load=self.load[:, :0],
             states=self.states[:0, :0],
             state_score=self.state_score[:0],
+            place_angle_rad=self.place_angle_rad[:0],
+            place_on_tilt=self.place_on_tilt[:0],
+            place_valid=self.place_valid[:0],
         )
 
     @cached_property
@@ -168,16 +197,46 @@ class Transport:
         z[:, self.free] += step
         return z
 
+    def _log_scale(self, noise: np.ndarray) -> np.ndarray:
+        """Ln of the noise scales over those at the mode, at noise coordinates (n, q)."""
+        step = noise @ self.slope.T
+        at = self.mode[self.free[self.noise]]
+        z = np.minimum(np.where(self.half, at + step, 0.0), FARTHEST_SD)
+        ratio = half_normal(z) / half_normal(np.where(self.half, at, 0.0))
+        return np.where(self.half, np.log(np.maximum(ratio, LEAST_SCALE)), step)
+
+    def _place_roots(self, log_scale: np.ndarray) -> np.ndarray:
+        """Factors of the covariance of the errors at places, shape (n, e, e), at logs of the noise scales (n, q)."""
+        value = self.gear_scale * np.exp(log_scale @ self.gear_noise.T)
+        error, length, play, amplitude = np.split(value, [2, 4, 6], axis=1)
+        scales = GearScales(
+            error_rad=np.radians(error),
+            length_rad=np.radians(length),
+            play_rad=np.radians(play),
+            drift_rad_per_root_hour=np.zeros_like(error),
+            amplitude_rad=np.radians(amplitude).reshape(-1, 2, PERIODS_MAX),
+            period_rad=np.radians(np.broadcast_to(self.period_deg, (len(value), 2, PERIODS_MAX))),
+        )
+        return place_root(scales, self.place_angle_rad, self.place_on_tilt, self.place_valid, np)
+
     def _quadratic(self, noise: np.ndarray) -> Quadratic:
         """What the linearised campaign and the prior say of y at noise coordinates (n, q)."""
-        log_scale = noise @ self.slope.T
+        log_scale = self._log_scale(noise)
         weight = np.exp(-2 * log_scale @ self.pixels)[:, None, None]
-        inner = weight * self.states
-        own = np.arange(len(self.states))
-        inner[:, own, own] += 1 / (np.exp(2 * log_scale) @ self.variance.T + self.constant)
+        stops = len(self.constant)
         right = np.column_stack([self.load.T, self.state_score])
-        solved = weight * np.linalg.solve(inner, np.broadcast_to(right, (len(noise), *right.shape)))
-        explained = weight * (self.load @ solved)
+        # Errors at places in units of their prior sds: their covariance may be as good as singular.
+        turn = np.zeros((len(noise), *self.states.shape))
+        own = np.arange(stops)
+        turn[:, own, own] = 1.0
+        turn[:, stops:, stops:] = self._place_roots(log_scale)
+        back = np.swapaxes(turn, 1, 2)
+        right = back @ right
+        inner = weight * (back @ self.states @ turn)
+        inner[:, own, own] += 1 / (np.exp(2 * log_scale) @ self.variance.T + self.constant)
+        places = np.arange(stops, len(self.states))
+        inner[:, places, places] += 1.0
+        explained = weight**2 * (np.swapaxes(right[..., :-1], 1, 2) @ np.linalg.solve(inner, right))
         precision = self.prior + weight * self.known - explained[..., :-1]
         return Quadratic(precision, weight[..., 0] * self.score - explained[..., -1])
 
@@ -211,16 +270,14 @@ class Transport:
 
     def _mapped(self, w: np.ndarray) -> Mapped:
         count = len(self.noise)
-        noise, y = w[:, self.noise], w.copy()
+        noise = w[:, self.noise]
+        log_width = self._log_width(noise)
+        y, log_jacobian = w * np.exp(log_width), log_width.sum(axis=1)
         if len(self.states):
             found = self.conditional(noise)
-            straight = (w[:, count:] + found.shift)[..., None]
+            straight = (y[:, count:] + found.shift)[..., None]
             y[:, count:] = np.linalg.solve(np.swapaxes(found.factor, 1, 2), straight)[..., 0]
-            log_jacobian = -np.log(np.diagonal(found.factor, axis1=1, axis2=2)).sum(axis=1)
-        else:
-            log_width = self._log_width(noise)
-            y *= np.exp(log_width)
-            log_jacobian = log_width.sum(axis=1)
+            log_jacobian -= np.log(np.diagonal(found.factor, axis1=1, axis2=2)).sum(axis=1)
         for place, form in zip(self.narrow, self.bend, strict=True):
             before = y[:, :place]
             y[:, place] -= 0.5 * np.sum((before @ form[:place, :place]) * before, axis=1)
@@ -244,6 +301,4 @@ class Transport:
             found = self.conditional(noise)
             turned = np.swapaxes(found.factor, 1, 2) @ straight[:, count:, None]
             straight[:, count:] = turned[..., 0] - found.shift
-        else:
-            straight *= np.exp(-self._log_width(noise))
-        return straight
+        return straight * np.exp(-self._log_width(noise))

@@ -1,0 +1,95 @@
+"""Errors of gears that repeat by position: transmission error and play as Gaussian processes of the output's angle.
+
+Both are told apart at the counters where looks found the axes; rad. Arrays over axes are ordered (pan, tilt), arrays
+over places as `Places` lists them (formulation 3.1).
+"""
+
+from __future__ import annotations
+
+from types import ModuleType
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from tvsbayes.instrument.parameters import PERIODS_MAX
+from tvsbayes.statistics.gaussian_process import JITTER, matern52, periodic
+
+FLOOR_RAD2 = 1e-24
+"""Least variance of a place: below every angle that anybody measures, above nought."""
+
+
+class GearScales(eqx.Module):
+    """How large repeating errors are, over what angle they change, and how the zero drifts.
+
+    Attributes:
+        error_rad: sd of the transmission error's aperiodic part, by axis.
+        length_rad: of its correlation and of the play's.
+        play_rad: sd of the play over position.
+        drift_rad_per_root_hour: of the zero's random walk.
+        amplitude_rad: sd of the parts of stated period, by axis and number.
+        period_rad: their periods, angle of the output.
+    """
+
+    error_rad: Float[Array, "2"]
+    length_rad: Float[Array, "2"]
+    play_rad: Float[Array, "2"]
+    drift_rad_per_root_hour: Float[Array, "2"]
+    amplitude_rad: Float[Array, "2 3"]
+    period_rad: Float[Array, "2 3"]
+
+
+class Places(eqx.Module):
+    """Counters of both axes, one list, at which the processes have values; padding is not valid."""
+
+    steps: Float[Array, " places"]
+    on_tilt: Bool[Array, " places"]
+    valid: Bool[Array, " places"]
+
+    def by_axis(self, of_axis: Float[Array, "2"]) -> Float[Array, " places"]:
+        """The number of each place's axis."""
+        return jnp.where(self.on_tilt, of_axis[1], of_axis[0])
+
+
+def _by_axis(of_axis: Any, on_tilt: Any, functions: ModuleType) -> Any:
+    """Numbers (..., 2) of the axes at the places, shape (..., places)."""
+    return functions.where(on_tilt, of_axis[..., 1:], of_axis[..., :1])
+
+
+def place_root(
+    scales: GearScales, angle_rad: Any, on_tilt: Any, valid: Any, functions: ModuleType = jnp
+) -> Float[Array, "*batch errors errors"]:
+    """Lower triangular factor of the covariance of transmission errors, then plays, at places (formulation 3.1).
+
+    Written for NumPy's and JAX's functions alike.
+
+    Args:
+        scales: of the processes, fields with any leading axes.
+        angle_rad: k n of the places, shape (places,).
+        on_tilt, valid: as in `Places`.
+        functions: jax.numpy or numpy.
+
+    Returns:
+        Rad; nought but on the diagonal for padding.
+    """
+    xp, size = functions, len(angle_rad)
+    distance = angle_rad[:, None] - angle_rad[None, :]
+    together = (on_tilt[:, None] == on_tilt[None, :]) & valid[:, None] & valid[None, :]
+    length = _by_axis(scales.length_rad, on_tilt, xp)
+    near = xp.where(together, matern52(distance, length[..., None], xp), xp.eye(size))
+    repeated, own = 0.0, _by_axis(scales.error_rad, on_tilt, xp) ** 2
+    for number in range(PERIODS_MAX):
+        amplitude = _by_axis(scales.amplitude_rad[..., number], on_tilt, xp)
+        period = _by_axis(scales.period_rad[..., number], on_tilt, xp)
+        wave = xp.where(together, periodic(distance, period[..., None], xp), 0.0)
+        repeated = repeated + amplitude[..., None] ** 2 * wave
+        own = own + amplitude**2
+    error = _by_axis(scales.error_rad, on_tilt, xp)
+    floor = (JITTER * own + FLOOR_RAD2)[..., None] * xp.eye(size)
+    error_root = xp.linalg.cholesky(error[..., None] * near * error[..., None, :] + repeated + floor)
+    play = _by_axis(scales.play_rad, on_tilt, xp)
+    play_root = play[..., None] * xp.linalg.cholesky(near + JITTER * xp.eye(size))
+    nothing = xp.zeros_like(error_root)
+    above = xp.concatenate([error_root, nothing], axis=-1)
+    return xp.concatenate([above, xp.concatenate([nothing, play_root], axis=-1)], axis=-2)
