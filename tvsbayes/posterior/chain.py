@@ -20,7 +20,7 @@ from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.files.disk import read_arrays, write_atomically
 from tvsbayes.instrument.campaign import input_hashes
 from tvsbayes.posterior.importance import ImportanceRun, Pool, reweighted_posterior
-from tvsbayes.posterior.proposal import Independence, Tables
+from tvsbayes.posterior.proposal import Followers, Independence, Tables
 from tvsbayes.posterior.transport import Transport
 
 CHAIN_FORMAT = "tvsbayes-chain/5"
@@ -75,14 +75,21 @@ def _pool_arrays(pool: Pool) -> dict[str, np.ndarray]:
         "proposal_places": pool.next_proposal.places,
         "proposal_coupled": pool.next_proposal.coupled,
         "proposal_tables": np.stack([each.tables.log_density for each in every]),
+        "proposal_leader": pool.next_proposal.followers.leader,
+        "proposal_follower": pool.next_proposal.followers.follower,
+        "proposal_followers": np.stack([each.followers.log_density for each in every]),
     }
 
 
 def _pool_of(stored: dict[str, np.ndarray]) -> Pool:
     """The pool of `_pool_arrays`."""
-    parts = zip(stored["proposal_mean"], stored["proposal_sd"], stored["proposal_tables"], strict=True)
+    parts = zip(*(stored[f"proposal_{part}"] for part in ("mean", "sd", "tables", "followers")), strict=True)
     places, coupled = stored["proposal_places"], stored["proposal_coupled"]
-    every = tuple(Independence(mean, sd, places, Tables(table), coupled) for mean, sd, table in parts)
+    leads = stored["proposal_leader"], stored["proposal_follower"]
+    every = tuple(
+        Independence(mean, sd, places, Tables(table), coupled, Followers(*leads, rows))
+        for mean, sd, table, rows in parts
+    )
     counts = tuple(stored["pool_counts"].tolist())
     draws = stored["pool_w"], stored["pool_log_target"], stored["pool_place_errors_rad"]
     pool = Pool(*draws, every[:-1], counts, every[-1], int(stored["pool_invalid"]))

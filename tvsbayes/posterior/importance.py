@@ -102,7 +102,7 @@ def empty_pool(target: Target) -> Pool:
     """Before the first round."""
     path = target.path
     dimension = path.dimension
-    first = first_proposal(target, dimension, path.heavy, path.coupled)
+    first = first_proposal(target, dimension, path.heavy, path.coupled, path.pairs)
     errors = no_draw(0, target.fit.arrays)
     return Pool(np.zeros((0, dimension)), np.zeros(0), errors, (), (), first)
 

@@ -5,8 +5,8 @@ Coordinates w of `posterior.transport`, nearly standard normal; log densities ar
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import jax
@@ -146,6 +146,54 @@ class Tables:
         return found
 
 
+LEADER_NODES = np.linspace(-4.0, 8.0, 9)
+"""Places of a leader, in w, at which its follower has tables of its own."""
+
+
+@dataclass(frozen=True)
+class Followers:
+    """Coordinates whose density depends on another: of two scales that explain the same scatter one may be large.
+
+    Between a leader's nodes the two tables are mixed.
+
+    Attributes:
+        leader, follower: their rows among the tabulated coordinates, shape (f,) each.
+        log_density: of the follower at `NODES`, by the leader's node, shape (f, leader nodes, nodes).
+    """
+
+    leader: np.ndarray
+    follower: np.ndarray
+    log_density: np.ndarray
+
+    def share(self, leaders: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Node below leaders (n,) and the share of the node above."""
+        at = np.clip((leaders - LEADER_NODES[0]) / (LEADER_NODES[1] - LEADER_NODES[0]), 0, len(LEADER_NODES) - 1)
+        node = np.minimum(at.astype(int), len(LEADER_NODES) - 2)
+        return node, at - node
+
+    def at(self, w: np.ndarray) -> np.ndarray:
+        """Log densities of the followers, shape (n, f), of tabulated coordinates w (n, h)."""
+        found = np.empty((len(w), len(self.leader)))
+        for k, (leader, follower) in enumerate(zip(self.leader, self.follower, strict=True)):
+            node, above = self.share(w[:, leader])
+            rows = Tables(self.log_density[k]).at(np.repeat(w[:, [follower]], len(LEADER_NODES), axis=1))
+            every = np.arange(len(w))
+            low, high = rows[every, node], rows[every, node + 1]
+            with np.errstate(divide="ignore"):
+                found[:, k] = np.logaddexp(np.log1p(-above) + low, np.log(above) + high)
+        return found
+
+    def drawn(self, w: np.ndarray, share: np.ndarray, chance: np.ndarray) -> np.ndarray:
+        """Tabulated coordinates (n, h) with their followers drawn anew: shares (n, h) of densities, chances (n, f)."""
+        found = w.copy()
+        for k, (leader, follower) in enumerate(zip(self.leader, self.follower, strict=True)):
+            node, above = self.share(w[:, leader])
+            chosen = node + (chance[:, k] < above)
+            rows = Tables(self.log_density[k]).draw(np.repeat(share[:, [follower]], len(LEADER_NODES), axis=1))
+            found[:, follower] = rows[np.arange(len(w)), chosen]
+        return found
+
+
 @dataclass(frozen=True)
 class Independence:
     """Independent draws of coordinates that are normal or tabulated, a share of them with a heavier part.
@@ -158,6 +206,7 @@ class Independence:
         places: tabulated coordinates, shape (h,).
         tables: their densities.
         coupled: places of the coupled coordinates, shape (c,).
+        followers: those of them that depend on another; their tables stand for means and sds alone.
     """
 
     mean: np.ndarray
@@ -165,13 +214,14 @@ class Independence:
     places: np.ndarray
     tables: Tables
     coupled: np.ndarray
+    followers: Followers
 
-    def moved(self, mean: np.ndarray, sd: np.ndarray, tables: Tables) -> Independence:
+    def moved(self, mean: np.ndarray, sd: np.ndarray, tables: Tables, followers: Followers) -> Independence:
         """Of other means, sds and tables; those of tabulated coordinates are as their tables have them."""
         mean, sd = mean.copy(), sd.copy()
         mean[self.places], sd[self.places] = tables.moments
         sd[self.places] *= INFLATION
-        return Independence(mean, sd, self.places, tables, self.coupled)
+        return Independence(mean, sd, self.places, tables, self.coupled, followers)
 
     def _each(self, w: np.ndarray) -> np.ndarray:
         """Log densities of the coordinates one by one, shape (n, d)."""
@@ -179,6 +229,7 @@ class Independence:
         found = -0.5 * np.log(2 * np.pi) - 0.5 * distance2 - np.log(self.sd)
         single = _log_t(distance2[:, self.places], 1) - np.log(self.sd[self.places])
         table = self.tables.at(w[:, self.places])
+        table[:, self.followers.follower] = self.followers.at(w[:, self.places])
         found[:, self.places] = np.logaddexp(np.log(1 - OWN_SHARE) + table, np.log(OWN_SHARE) + single)
         return found
 
@@ -200,12 +251,17 @@ class Independence:
         single = np.sqrt(generator.chisquare(HEAVY_DOF, own) / HEAVY_DOF)
         partly = np.sqrt(generator.chisquare(COUPLED_DOF, one) / COUPLED_DOF) / COUPLED_WIDTH
         whole = np.sqrt(generator.chisquare(HEAVY_DOF, one) / HEAVY_DOF)
-        tabulated = self.tables.draw(generator.uniform(size=own))
+        share = generator.uniform(size=own)
+        tabulated = self.tables.draw(share)
         alone = generator.uniform(size=own) < OWN_SHARE
         chance = generator.uniform(size=one)
         found = self.mean + self.sd * normal
         at, sd = self.mean[self.places], self.sd[self.places]
-        found[:, self.places] = np.where(alone, at + sd * normal[:, self.places] / single, tabulated)
+        single = at + sd * normal[:, self.places] / single
+        # A follower follows its leader, however that was drawn.
+        led = np.where(alone, single, tabulated)
+        chances = generator.uniform(size=(count, len(self.followers.leader)))
+        found[:, self.places] = np.where(alone, single, self.followers.drawn(led, share, chances))
         some = np.isin(np.arange(len(self.mean)), self.coupled)
         found = np.where((chance < COUPLED_SHARE) & some, self.mean + self.sd * normal / partly, found)
         return np.where(chance > 1 - HEAVY_SHARE, self.mean + self.sd * normal / whole, found)
@@ -241,12 +297,21 @@ class Independence:
         tilt, bend = (
             np.clip(x[self.places, None], -limit, limit) for x, limit in zip((slope, square), TILT_LIMITS, strict=True)
         )
-        tables = Tables.normalised(self.tables.log_density + tilt * at + bend * at**2)
-        return self.moved(mean, sd, tables)
+        change = tilt * at + bend * at**2
+        every = [
+            Tables.normalised(rows + change[row]).log_density
+            for rows, row in zip(self.followers.log_density, self.followers.follower, strict=True)
+        ]
+        followers = replace(self.followers, log_density=np.reshape(every, self.followers.log_density.shape))
+        return self.moved(mean, sd, Tables.normalised(self.tables.log_density + change), followers)
 
 
 def first_proposal(
-    target: Callable[[np.ndarray], np.ndarray], dimension: int, heavy: np.ndarray, coupled: np.ndarray
+    target: Callable[[np.ndarray], np.ndarray],
+    dimension: int,
+    heavy: np.ndarray,
+    coupled: np.ndarray,
+    pairs: Sequence[tuple[int, int]] = (),
 ) -> Independence:
     """Standard normal but for the heavy coordinates, whose densities are the target's along each of them.
 
@@ -258,11 +323,30 @@ def first_proposal(
         dimension: d.
         heavy: coordinates to be tabulated, shape (d,), boolean.
         coupled: those of which a share is drawn together, likewise.
+        pairs: of heavy coordinates, leader and follower: a cut through the plane of both.
     """
     places = np.flatnonzero(heavy)
     along = np.zeros((len(places), len(NODES), dimension))
     along[np.arange(len(places)), :, places] = NODES
-    cuts = target(along.reshape(-1, dimension)) if len(places) else np.zeros(0)
-    tables = Tables.normalised(cuts.reshape(len(places), len(NODES)))
+    planes = np.zeros((len(pairs), len(LEADER_NODES), len(NODES), dimension))
+    for k, (leader, follower) in enumerate(pairs):
+        planes[k, :, :, leader] = LEADER_NODES[:, None]
+        planes[k, :, :, follower] = NODES
+    points = np.concatenate([along.reshape(-1, dimension), planes.reshape(-1, dimension)])
+    cuts = target(points) if len(points) else np.zeros(0)
+    lines, rows = np.split(cuts, [along.shape[0] * along.shape[1]])
+    lines, rows = lines.reshape(along.shape[:2]), rows.reshape(planes.shape[:3])
+    row_of = {int(place): row for row, place in enumerate(places)}
+    leader, follower = (np.array([row_of[pair[k]] for pair in pairs], dtype=int) for k in range(2))
+    for k in range(len(pairs)):
+        # What both say together, as the leader's own density and the follower's whatever the leader is.
+        seen = np.where(np.isfinite(rows[k]), rows[k], -np.inf)
+        gain = special.logsumexp(seen, axis=1) - np.interp(LEADER_NODES, NODES, lines[leader[k]])
+        lines[leader[k]] += np.interp(NODES, LEADER_NODES, np.where(np.isfinite(gain), gain, 0.0))
+        lines[follower[k]] = special.logsumexp(seen, axis=0)
+    conditional = np.reshape([Tables.normalised(each).log_density for each in rows], rows.shape)
+    followers = Followers(leader, follower, conditional)
+    tables = Tables.normalised(lines)
     mean, sd = np.zeros(dimension), np.full(dimension, INFLATION)
-    return Independence(mean, sd, places, tables, np.flatnonzero(coupled)).moved(mean, sd, tables)
+    first = Independence(mean, sd, places, tables, np.flatnonzero(coupled), followers)
+    return first.moved(mean, sd, tables, followers)

@@ -153,6 +153,13 @@ class Transport:
         """Coordinates of `COUPLED_NAMES`, shape (d,)."""
         return np.isin(np.array(NAMES)[self.free], COUPLED_NAMES)
 
+    @property
+    def pairs(self) -> list[tuple[int, int]]:
+        """Leader and follower of scales that explain the same scatter: play's variation, then transmission error."""
+        names = [NAMES[column] for column in self.free]
+        wanted = zip(names_of("play_variation_deg"), names_of("transmission_error_deg"), strict=True)
+        return [(names.index(one), names.index(other)) for one, other in wanted if {one, other} <= set(names)]
+
     def straight(self) -> Transport:
         """The same without shear, and with the covariance of the mode everywhere: the Laplace approximation."""
         return replace(
