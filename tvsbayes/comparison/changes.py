@@ -27,11 +27,12 @@ QUANTITIES = (*(f"effective_deg_per_step.{d}" for d in DIRECTIONS), *(f"backlash
 def _draws_at(found: JointFit, pose_rad: np.ndarray) -> np.ndarray:
     """`QUANTITIES` at a pose, shape (1 + draws, quantities): the estimate, then the Laplace draws."""
     from tvsbayes.instrument.parameters import INDEX
-    from tvsbayes.model.headlines import derived_quantities
+    from tvsbayes.posterior.draws import local_deg_per_step
 
-    at_pose = derived_quantities(np.vstack([found.z, found.draws_z]), found.space, pose_rad)
-    backlash = np.asarray(at_pose.physical)[:, [INDEX[f"backlash_deg.{axis}"] for axis in AXES]]
-    return np.concatenate([np.asarray(at_pose.effective_deg_per_step), backlash], axis=1)
+    physical = np.vstack([found.mode.physical, found.draws.physical])
+    backlash = physical[:, [INDEX[f"backlash_deg.{axis}"] for axis in AXES]]
+    local = local_deg_per_step(found, np.vstack([found.z, found.draws_z]), pose_rad)
+    return np.concatenate([local, backlash], axis=1)
 
 
 def compare(first: JointFit, second: JointFit) -> Comparison:

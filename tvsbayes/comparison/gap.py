@@ -136,14 +136,14 @@ class _Idealised:
 
 
 def _idealised(found: JointFit, selection: Selection, z: np.ndarray) -> _Idealised:
-    from tvsbayes.posterior.draws import derived_at
+    from tvsbayes.posterior.draws import local_deg_per_step
     from tvsbayes.posterior.predictive import looks
 
     spaces = [found.space]
     for names in (("backlash_deg.pan", "backlash_deg.tilt"), ("focal_scale",), OPTICS):
         spaces.append(_ideal(spaces[-1], names))
     full, ideal = (
-        np.asarray(derived_at(replace(found, space=space), z[None], found.reference_pose_rad).effective_deg_per_step)[0]
+        local_deg_per_step(replace(found, space=space), z, found.reference_pose_rad)
         for space in (spaces[0], spaces[-1])
     )
     rows = experiment_rows(found.campaign, selection)

@@ -72,6 +72,7 @@ class JointFit:
         seen_line: their counters, over which the headlines are slopes.
         free: parameters that are estimated, shape (p,).
         draws_z: Laplace draws, shape (draws, p), with mean and covariance exactly those of the approximation.
+        draws_places: with them, the errors at places in units of `linearised.place_root`, shape (draws, e).
         draws: headlines and parameters of the draws.
         prior_draws: the same under the priors, at the same pose.
         mode: headlines and parameters at the mode (fields without leading axis).
@@ -95,6 +96,7 @@ class JointFit:
     seen_line: SeenLine
     free: np.ndarray
     draws_z: np.ndarray
+    draws_places: np.ndarray
     draws: Derived
     prior_draws: Derived
     mode: Derived
@@ -301,6 +303,7 @@ def fit_at(campaign: Campaign, problem: Problem, mode: Mode, seed: int) -> Joint
         seen_line=seen,
         free=problem.free,
         draws_z=draws_z,
+        draws_places=both[:, count:],
         draws=jax.tree.map(lambda x: np.asarray(x)[1:], at_mode_and_draws),
         prior_draws=jax.tree.map(lambda x: np.asarray(x)[1:], prior),
         mode=jax.tree.map(lambda x: np.asarray(x)[0], at_mode_and_draws),

@@ -21,7 +21,15 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from tvsbayes.errors import InputError
-from tvsbayes.estimators.campaign_arrays import NOWHERE_MM, CampaignArrays, SpotArrays, bucket, move_arrays, padded
+from tvsbayes.estimators.campaign_arrays import (
+    NOWHERE_MM,
+    CampaignArrays,
+    SpotArrays,
+    bucket,
+    gear_arrays,
+    move_arrays,
+    padded,
+)
 from tvsbayes.estimators.likelihood import filter_rows, kalman_update, no_belief
 from tvsbayes.estimators.linear_spots import linearise
 from tvsbayes.estimators.looks import in_frame_s
@@ -30,6 +38,7 @@ from tvsbayes.instrument.campaign import Move
 from tvsbayes.instrument.parameters import NAMES, NOISE_NAMES
 from tvsbayes.instrument.plan import PlanLog, PlanStep, plan_seconds, run_plan
 from tvsbayes.instrument.rig import Rig
+from tvsbayes.instrument.places import seen_places
 from tvsbayes.instrument.stops import redraws
 from tvsbayes.model.compiled import compiled, placed
 from tvsbayes.model.geometry import image, materialise, rotation_matrix, transform
@@ -167,7 +176,7 @@ def expect(
     lin = linearise(z, space, arrays)
     jacobian = jnp.where(NOISE_COLUMNS, 0.0, -lin.residual_jacobian)
     columns = jnp.concatenate([jacobian, lin.slope], axis=2)
-    given = filter_rows(columns, lin.slope, lin.play_sd_rad, lin.stop_variance, spots)
+    given = filter_rows(columns, lin.slope, lin.play_sd_rad, lin.stop_variance, lin.drift_variance, spots)
 
     def step(belief, row):
         found = kalman_update(belief.renewed(row), row)
@@ -201,7 +210,9 @@ def design_arrays(
             redraw_mix=padded(new.redraw_mix, size),
             new_segment=padded(new.new_segment, size, False, bool),
             homed=padded(new.homed, size, False, bool),
+            hours=padded(new.hours, size),
         ),
+        gear_arrays(seen_places(moves, look_moves, rig.table), size, vary=False),
         placed(rig.table.aperture_convention == "azimuth"),
     )
 

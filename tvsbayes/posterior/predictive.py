@@ -26,7 +26,7 @@ from tvsbayes.estimators.likelihood import (
 from tvsbayes.estimators.looks import observe_with_stop_errors
 from tvsbayes.instrument.axes import HOME_SD_DEG
 from tvsbayes.instrument.campaign import PIXELS, ordered_spots
-from tvsbayes.instrument.parameters import INDEX
+from tvsbayes.instrument.parameters import INDEX, names_of
 from tvsbayes.model.compiled import compiled, in_batches
 from tvsbayes.model.parameter_space import STOP_COLUMNS, ParameterSpace
 from tvsbayes.posterior.draws import Posterior
@@ -34,6 +34,7 @@ from tvsbayes.posterior.draws import Posterior
 if TYPE_CHECKING:
     import xarray as xr
 
+DRIFT_COLUMNS = [INDEX[name] for name in names_of("drift_deg_per_root_hour")]
 RANK_TOLERANCE = 1e-12
 """Share of a state's precision below which what other states leave of it is rounding, not information."""
 
@@ -50,10 +51,10 @@ class LaterSpots(eqx.Module):
         return LaterSpots(self.precision + precision, self.score + jnp.sum(row.load * row.residual[:, None], axis=0))
 
     def before(self, row: FilterRows) -> LaterSpots:
-        """Pass to the state of the previous spot: states drawn anew in between are integrated out, one by one."""
+        """Pass to the state of the previous spot: what was drawn or walked in between is integrated out, one by one."""
         precision, score = self.precision, self.score
         for state in range(STATES):
-            variance = row.variance[state] * (1 - row.keep[state])
+            variance = row.variance[state]
             column = precision[:, state]
             share = column * (variance / (1 + variance * column[state]))
             score = score - share * score[state]
@@ -85,9 +86,12 @@ class LaterSpots(eqx.Module):
 
 @compiled(jax.Array)
 def move_log_density(
-    z: Float[Array, "batch parameters"], space: ParameterSpace, arrays: CampaignArrays
+    z: Float[Array, "batch parameters"],
+    place_errors_rad: Float[Array, "batch errors"],
+    space: ParameterSpace,
+    arrays: CampaignArrays,
 ) -> Float[Array, "batch spots"]:
-    """Log density of the spots of each move given ALL other spots and the parameters (formulation 4.3).
+    """Log density of the spots of each move given ALL other spots, parameters and gear errors (formulation 4.3).
 
     Stop errors persist while their axis stands, so spots are not independent given the parameters; whole moves
     are the unit that can be left out. Backward and forward passes meet at each move (two-filter smoother: Fraser
@@ -95,6 +99,7 @@ def move_log_density(
 
     Args:
         z: coordinates of many points.
+        place_errors_rad: transmission errors, then plays, at the places; a draw for each point.
         space: priors.
         arrays: the campaign.
 
@@ -121,14 +126,17 @@ def move_log_density(
         log_density = log_scale - 0.5 * seen.log_variance - 0.5 * jnp.sum(seen.standardised**2)
         return (kalman_update(belief, row).belief, seen.belief), log_density
 
-    def one(z):
+    def one(z, errors_rad):
         given = filter_input(space.model(z), arrays)
+        columns = given.rows.residual
+        left = columns[..., 0] - columns[..., 1:] @ errors_rad
+        given = eqx.tree_at(lambda x: x.rows.residual, given, left)
         nothing = LaterSpots(jnp.zeros((STATES, STATES)), jnp.zeros(STATES))
         _, beyond = jax.lax.scan(backward, (nothing, nothing), (given.rows, last), reverse=True)
         rows = (given.rows, first, beyond, given.log_scale)
         return jax.lax.scan(forward, (no_belief(), no_belief()), rows)[1]
 
-    return jax.vmap(one)(z)
+    return jax.vmap(one)(z, place_errors_rad)
 
 
 PIXEL_LABELS = tuple(name.removesuffix("_px") for name in PIXELS)
@@ -142,7 +150,8 @@ def move_log_likelihood(posterior: Posterior) -> xr.DataArray:
     spots = ordered_spots(fit.campaign)
     used = np.asarray(fit.arrays.spots.valid)[: len(spots)] > 0
     z = posterior.z.reshape(-1, posterior.z.shape[-1])
-    by_spot = in_batches(lambda block: move_log_density(block, fit.space, fit.arrays), z)[:, : len(spots)]
+    errors_rad = np.asarray(posterior.joined.place_errors_rad)
+    by_spot = in_batches(lambda z, e: move_log_density(z, e, fit.space, fit.arrays), z, errors_rad)[:, : len(spots)]
     by_spot = by_spot + spot_constants(fit.campaign)
     index = np.array([spot.move for spot in spots])
     moves_seen = np.unique(index[used])
@@ -158,10 +167,21 @@ def looks(fit: JointFit, z: np.ndarray, stop_error_rad: np.ndarray) -> np.ndarra
     return np.asarray(seen)[:, : len(ordered_spots(fit.campaign)), :4]
 
 
+def repeated_rad(fit: JointFit, place_errors_rad: np.ndarray) -> np.ndarray:
+    """What the gears' repeating errors (draws, e) do to the angles (pan, tilt) of spots, shape (draws, spots, 2)."""
+    gears = jax.tree.map(np.asarray, fit.arrays.gears)
+    count = len(gears.places.steps)
+    axes = []
+    for own in (~gears.places.on_tilt, gears.places.on_tilt):
+        error = place_errors_rad[:, :count][:, own] @ gears.error_share[:, own].T
+        axes.append(error + place_errors_rad[:, count:][:, own] @ gears.play_share[:, own].T)
+    return np.stack(axes, axis=2)
+
+
 def ideal_pixels(posterior: Posterior, draws: int) -> np.ndarray:
     """Pixels without noise and stop errors for draws that weigh the same, shape (draws, spots, 4)."""
     z = posterior.coordinates(draws)
-    return looks(posterior.fit, z, np.zeros((len(z), len(posterior.fit.arrays.spots.valid), 2)))
+    return looks(posterior.fit, z, repeated_rad(posterior.fit, posterior.thinned(draws).place_errors_rad))
 
 
 def predictive_pixels(posterior: Posterior, draws_per_chain: int = 8) -> xr.DataArray:
@@ -178,16 +198,24 @@ def predictive_pixels(posterior: Posterior, draws_per_chain: int = 8) -> xr.Data
     chosen = np.unique(np.linspace(0, draws - 1, min(draws_per_chain, draws)).astype(int))
     z = posterior.z[:, chosen].reshape(-1, posterior.z.shape[-1])
     physical = np.asarray(posterior.draws.physical)[:, chosen].reshape(len(z), -1)
-    values = looks_again(fit, z, physical, generator).reshape(chains, len(chosen), -1, 4)
+    errors_rad = np.asarray(posterior.draws.place_errors_rad)[:, chosen].reshape(len(z), -1)
+    values = looks_again(fit, z, physical, errors_rad, generator).reshape(chains, len(chosen), -1, 4)
     spots = [spot.spot for spot in ordered_spots(fit.campaign)]
     coords = {"chain": np.arange(chains), "draw": chosen, "spot": spots, "pixel": list(PIXEL_LABELS)}
     return xr.DataArray(values.astype(np.float32), coords, ("chain", "draw", "spot", "pixel"))
 
 
-def looks_again(fit: JointFit, z: np.ndarray, physical: np.ndarray, generator: np.random.Generator) -> np.ndarray:
+def looks_again(
+    fit: JointFit,
+    z: np.ndarray,
+    physical: np.ndarray,
+    place_errors_rad: np.ndarray,
+    generator: np.random.Generator,
+) -> np.ndarray:
     """Pixels (draws, spots, 4) of the same looks taken again at coordinates z (draws, p) with values `physical`.
 
-    Stop errors, home offsets, place in the play and pixel noise are drawn anew; ranges are those observed.
+    Gears repeat their errors at places (draws, e); stop errors, home offsets, drifts, place in the play and pixel noise
+    are drawn anew; ranges are those observed.
     """
     count = len(ordered_spots(fit.campaign))
     arrays = jax.tree.map(np.asarray, fit.arrays.spots)
@@ -199,7 +227,12 @@ def looks_again(fit: JointFit, z: np.ndarray, physical: np.ndarray, generator: n
     error = np.take_along_axis(fresh, np.maximum.accumulate(np.where(arrays.redraw, rows, 0), axis=0)[None], axis=1)
     home = np.radians(HOME_SD_DEG) * generator.standard_normal((len(z), size, 2)) * arrays.homed[:, None]
     segment = np.maximum.accumulate(np.where(arrays.new_segment, np.arange(size), 0))
-    error = error + home[:, segment]
+    drift_rad = np.radians(physical[:, DRIFT_COLUMNS])
+    walked = drift_rad[:, None] * np.sqrt(arrays.hours)[:, None] * generator.standard_normal(home.shape)
+    total = np.cumsum(walked, axis=1)
+    # The zero walks from its homing on.
+    error = error + home[:, segment] + total - (total - walked)[:, segment]
+    error = error + repeated_rad(fit, place_errors_rad)
     # Where the play stands is unknown after an unknown approach: Gaussian, as in the filter.
     place = generator.standard_normal(home.shape)[:, segment]
     error[:, :count] += fit.linearised.play_sd_rad * place[:, :count]
