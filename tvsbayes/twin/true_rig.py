@@ -94,7 +94,7 @@ class Truth:
     note: str = "The true rig of a simulated campaign; no estimator reads this file."
 
     def with_gears(self, errors: GearErrors = PERFECT) -> Truth:
-        """The rig with these errors of its gears and no others: the scales that they are drawn by at 0, and no drift."""
+        """The rig with these errors of its gears and no others: all scales that errors are drawn by at 0."""
         scales = {name: 0.0 for name in GEAR_ERROR_NAMES if REGISTRY[name].prior.distribution == "half-normal"}
         return replace(self, parameters={**self.parameters, **scales}, gear_errors=errors)
 
