@@ -12,13 +12,19 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from tvsbayes.estimators.campaign_arrays import campaign_arrays
+from tvsbayes.estimators.likelihood import evaluate, no_draw
 from tvsbayes.estimators.looks import aperture_angle
-from tvsbayes.instrument.parameters import HARMONIC_NAMES, NAMES, RIG_NAMES, Prior
+from tvsbayes.instrument.axes import AXES
+from tvsbayes.instrument.parameters import HARMONIC_NAMES, RIG_NAMES, Prior
+from tvsbayes.instrument.places import line_share, seen_places
+from tvsbayes.instrument.protocols import grid_protocol
+from tvsbayes.model.gear_processes import Places
 from tvsbayes.model.geometry import Vectors, project
-from tvsbayes.model.headlines import derived_quantities
+from tvsbayes.model.headlines import SeenLine, derived_quantities
 from tvsbayes.model.headlines import effective_deg_per_step as effective_of_model
 from tvsbayes.model.laser_path import MoveArrays, beam_angles, mirror_angles, trace
-from tvsbayes.model.parameter_space import model_of, parameter_space
+from tvsbayes.model.parameter_space import coordinates_of, model_of, parameter_space
 from tvsbayes.twin import physics
 from tvsbayes.twin.physics import (
     aperture_angle_deg,
@@ -30,7 +36,8 @@ from tvsbayes.twin.physics import (
     to_tvs,
     transmission,
 )
-from tvsbayes.twin.true_rig import draw_truth, with_derived
+from tvsbayes.twin.simulated_campaign import simulate
+from tvsbayes.twin.true_rig import draw_truth
 
 pytestmark = pytest.mark.usefixtures("x64")
 
@@ -38,6 +45,7 @@ RIGS, POSES, MOVES = 100, 8, 40
 LENGTH_MM = 1e-9
 """1e-12 of a metre, a thousand times rounding."""
 PIXEL_PX = 1e-9
+GEAR_ERRORS = "transmission_error_deg", "play_variation_deg"
 ANGLE_RAD = LENGTH_MM / 1000.0
 """What moves a spot at 1 m by that length."""
 
@@ -106,7 +114,7 @@ def test_gears_and_play(truths, values, period_deg):
     approach = np.where(first[..., None], rng.choice([-1.0, 1.0], (RIGS, MOVES, 2)), 0.0)
 
     def angles(v, steps, first, approach):
-        model = model_of(v, np.array(period_deg))
+        model = model_of(v, np.tile(np.array(period_deg)[:, None], 3))
         return mirror_angles(model.transmission, model.tilt_zero_rad, MoveArrays(steps, first, approach))
 
     found = batched(angles, values, counters, first, approach)
@@ -137,20 +145,43 @@ def test_aperture_angle(truths, values, convention):
         assert np.abs(found[rig] - expected).max() < ANGLE_RAD
 
 
-def test_headlines_of_a_fit(mounted_rig, poses_rad):
+def test_headlines_of_a_fit(mounted_rig):
     """What a fit reports at any point of parameter space is the twin's headline for the rig of that point."""
-    with jax.enable_x64(True):
-        space = parameter_space(mounted_rig.table, mounted_rig.stereo)
-        z = np.random.default_rng(79).standard_normal((RIGS, len(NAMES)))
-        found = jax.tree.map(np.asarray, derived_quantities(jnp.asarray(z), space, jnp.asarray(poses_rad[0, 0])))
-    pose_deg = tuple(np.degrees(poses_rad[0, 0]))
-    for physical, ratios, offset_mm in zip(
-        found.physical, found.effective_deg_per_step, found.effective_mirror_offset_mm, strict=True
-    ):
-        rig = with_derived(dict(zip(RIG_NAMES, physical.tolist(), strict=False)))
-        expected = local_deg_per_step(rig, pose_deg)
-        assert np.abs(ratios - list(expected.values())).max() < 1e-9 * 0.1
-        assert abs(offset_mm - effective_mirror_offset_mm(rig, pose_deg)) < LENGTH_MM
+    errors = {f"{name}.{axis}": Prior(0.0, 0.1, "half-normal") for name in GEAR_ERRORS for axis in AXES}
+    rig = replace(mounted_rig, truth={**mounted_rig.truth, **errors})
+    plan = grid_protocol(targets=("d1",), pan_steps=range(-60, 241, 60), tilt_steps=(-60, 0, 70))
+    for seed in range(8):
+        run = simulate(rig, plan, seed)
+        campaign, truth, p = run.campaign, run.truth, run.truth.parameters
+        at = seen_places(campaign.moves, [spot.move for spot in campaign.spots], mounted_rig.table)
+        ratios = np.array([p[f"degrees_per_step.{axis}"] for axis in AXES])
+        places_deg = at.steps * ratios[at.on_tilt.astype(int)]
+        error_deg, play_deg = (
+            np.concatenate([getattr(truth.gear_errors[a], n)(places_deg[at.on_tilt == k]) for k, a in enumerate(AXES)])
+            for n in ("error_deg", "play_deg")
+        )
+        turned = places_deg + error_deg + np.where(at.on_tilt, p["tilt_zero_deg"], 0.0)
+        pose_deg = tuple((at.error_share[:, at.on_tilt == k] @ turned[at.on_tilt == k]).mean() for k in (0, 1))
+        used = np.ones(len(campaign.spots), bool)
+        with jax.enable_x64(True):
+            space = parameter_space(mounted_rig.table, mounted_rig.stereo)
+            places = Places(*map(jnp.asarray, (at.steps, at.on_tilt, np.ones(len(at.steps), bool))))
+            seen = SeenLine(np.radians(pose_deg), places, line_share(at, used))
+            true = np.array([*(p[name] for name in RIG_NAMES), *truth.stereo.vector])
+            # What the priors hold fixed is at its value here, as in the rig that the point stands for.
+            z = coordinates_of(space, true)[None]
+            repeated = np.radians(np.concatenate([error_deg, play_deg]))[None]
+            found = jax.tree.map(lambda x: np.asarray(x)[0], derived_quantities(z, repeated, space, seen))
+        local = local_deg_per_step(p, pose_deg)
+        assert np.abs(found.local_deg_per_step - list(local.values())).max() < 1e-9 * 0.1
+        assert abs(found.effective_mirror_offset_mm - effective_mirror_offset_mm(p, pose_deg)) < LENGTH_MM
+        line = np.array(list(truth.effective_deg_per_step(campaign).values()))
+        pairs = found.effective_deg_per_step.reshape(2, 2)
+        assert np.abs(pairs.mean(axis=1) - line.reshape(2, 2).mean(axis=1)).max() < 1e-9 * 0.1
+        # The twin's half contrast turns the mirrors' mean slope, the model's that of the line: 2 % of one, errors being
+        # 0.1 deg over some 8.
+        contrast = [abs(p[f"ratio_contrast_deg_per_step.{axis}"]) for axis in AXES]
+        assert np.all(np.abs(pairs - line.reshape(2, 2)) < 0.02 * 0.5 * np.array(contrast)[:, None] + 1e-9 * 0.1)
 
 
 def test_headlines(truths, values, poses_rad):
@@ -171,3 +202,33 @@ def test_headlines(truths, values, poses_rad):
         assert np.abs(jacobian[rig] - beam_jacobian(truth.parameters, pose_deg)).max() < 1e-9
         assert list(expected) == ["left", "right", "up", "down"]
         assert abs(offset_mm[rig] - effective_mirror_offset_mm(truth.parameters, pose_deg)) < LENGTH_MM
+
+
+def test_errors_that_repeat_and_drift(mounted_rig):
+    """Chi-square of six campaigns at their truths: gears that repeat errors and zeros that drift, as the twin has them.
+
+    The estimators integrate them out; without their scales the same campaigns stand off by far more than chance.
+    """
+    scales = {"transmission_error_deg": 0.05, "play_variation_deg": 0.05, "drift_deg_per_root_hour": 0.05}
+    priors = {f"{name}.{axis}": Prior(0.0, u, "half-normal") for name, u in scales.items() for axis in AXES}
+    priors |= {f"harmonic_amplitude_deg.{axis}.1": Prior(0.0, 0.05, "half-normal") for axis in AXES}
+    priors |= {f"transmission_error_length_deg.{axis}": Prior(8.0, 0.7, "log-normal") for axis in AXES}
+    table = replace(
+        mounted_rig.table,
+        priors={**mounted_rig.table.priors, **priors},
+        harmonic_period_deg=dict.fromkeys(AXES, (36.0,)),
+    )
+    rig = replace(mounted_rig, table=table, truth={**table.priors})
+    plan = grid_protocol(targets=("d1", "d2", "d3"))
+    squares, count = [], 0
+    for seed in range(6):
+        run = simulate(rig, plan, seed)
+        with jax.enable_x64(True):
+            space, arrays = parameter_space(table, rig.stereo), campaign_arrays(run.campaign)
+            true = np.array([*(run.truth.parameters[name] for name in RIG_NAMES), *run.truth.stereo.vector])
+            z = coordinates_of(space, true)[None]
+            found = jax.tree.map(np.asarray, evaluate(z, no_draw(1, arrays), space, arrays))
+        squares.append(np.sum(found.standardised**2) + np.sum(found.places**2))
+        # Four pixels of a spot less its range.
+        count += 3 * sum(spot.status == "ok" for spot in run.campaign.spots)
+    assert np.sum(squares) / count == pytest.approx(1.0, abs=4 * np.sqrt(2 / count))
