@@ -211,6 +211,21 @@ FIELDS: dict[str, tuple[str, tuple[int, ...], float]] = {
         for order in (1, 2)
         for j, part in enumerate(("cos", "sin"))
     },
+    **{
+        f"{name}.{axis}": (f"gears.{field}", (i,), DEG)
+        for name, field in (
+            ("transmission_error_deg", "error_rad"),
+            ("transmission_error_length_deg", "length_rad"),
+            ("play_variation_deg", "play_rad"),
+            ("drift_deg_per_root_hour", "drift_rad_per_root_hour"),
+        )
+        for i, axis in enumerate(("pan", "tilt"))
+    },
+    **{
+        f"harmonic_amplitude_deg.{axis}.{number}": ("gears.amplitude_rad", (i, number - 1), DEG)
+        for i, axis in enumerate(("pan", "tilt"))
+        for number in (1, 2, 3)
+    },
     **{f"stereo.rotation_rad.{a}": ("cameras.rotation_rad", (i,), 1.0) for i, a in enumerate("xyz")},
     **{f"stereo.translation_mm.{a}": ("cameras.translation_mm", (i,), 1.0) for i, a in enumerate("xyz")},
 }
@@ -223,15 +238,14 @@ def leaves(model) -> dict[str, np.ndarray]:
 
 
 def test_every_name_drives_its_field_and_nothing_else():
-    assert set(FIELDS) == set(NAMES) - set(GEAR_ERROR_NAMES), "what repeats by position is integrated out"
+    assert set(FIELDS) == set(NAMES)
     base = 10.0 + np.arange(len(NAMES))
     rows = np.vstack([base, base + np.eye(len(NAMES))])
     models = leaves(eqx.filter_jit(jax.vmap(model_of))(jnp.asarray(rows)))
-    for known in ("period_rad", "on_wheel"):
-        models.pop(f"transmission.harmonics.{known}")
-    assert sum(leaf[0].size for leaf in models.values()) == len(FIELDS)
-    for name in FIELDS:
-        row = INDEX[name] + 1
+    for known in ("transmission.harmonics.period_rad", "transmission.harmonics.on_wheel", "gears.period_rad"):
+        models.pop(known)
+    assert sum(leaf[0].size for leaf in models.values()) == len(NAMES)
+    for row, name in enumerate(NAMES, start=1):
         path, index, unit = FIELDS[name]
         for field, values in models.items():
             change = values[row] - values[0]
@@ -254,6 +268,11 @@ def test_a_full_turn_is_the_wheels_period_and_less_the_pinions(stated, period_de
     space = parameter_space(RigTable(harmonic_period_deg=stated), small_stereo())
     harmonics = space.model(jnp.zeros(len(NAMES))).transmission.harmonics
     np.testing.assert_allclose(harmonics.period_rad, np.radians(period_deg), rtol=1e-15)
+    # Those of amplitudes: as many as are stated, in their order.
+    periods = space.model(jnp.zeros(len(NAMES))).gears.period_rad
+    for axis, name in enumerate(("pan", "tilt")):
+        own = stated.get(name, ())
+        np.testing.assert_allclose(periods[axis, : len(own)], np.radians(own), rtol=1e-15)
     assert harmonics.on_wheel.tolist() == on_wheel
 
 
