@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from tvsbayes.assessment.weaknesses import gradients, moved_directions
+from tvsbayes.assessment.weaknesses import moved_directions, whole_gradients
 from tvsbayes.calibration.pointing import INPUT_NAMES
 from tvsbayes.estimators.joint_fit import JointFit
+from tvsbayes.estimators.linear_spots import linear_spots, stop_information
 from tvsbayes.instrument.axes import DIRECTIONS, SENSES
 from tvsbayes.instrument.parameters import INDEX, KINDS, NAMES, PRIOR_GROUPS, RIG_NAMES, unit_of
 from tvsbayes.metrology.budget_tables import BudgetTable, Source, budget_table
@@ -22,25 +23,46 @@ from tvsbayes.model.parameter_space import HALF_NORMAL_MEAN, HALF_NORMAL_SD, phy
 from tvsbayes.results.estimates import Estimate, HeadlineCauses
 
 STOP_ERRORS = "stop errors of the campaign"
+TRANSMISSION_ERROR, PLAY_VARIATION = "transmission error", "play variation"
 
 
 @dataclass(frozen=True)
 class _Told:
-    """What the campaign tells, J^T C^-1 J, by the noise that limits it, matrices (p, p).
+    """What the campaign tells of coordinates and errors at places, J^T C^-1 J, by the noise that limits it.
 
-    With C = 1 + (stop errors), whitened by the pixel noise: (C^-1 J)^T (C^-1 J), and the rest.
+    With C = 1 + (stop errors), whitened by the pixel noise: (C^-1 J)^T (C^-1 J), and the rest; matrices (p + e, p + e).
+
+    Attributes:
+        pixels: name of the noise of the first part.
+        by_pixels, by_stops: the parts.
+        posterior: inverse of both together with the priors.
+        groups: coordinates and errors by the prior that they have.
     """
 
     pixels: str
     by_pixels: np.ndarray
     by_stops: np.ndarray
+    posterior: np.ndarray
+    groups: dict[str, list[int]]
 
 
 def _told(fit: JointFit) -> _Told:
     readings = np.any(np.asarray(fit.arrays.spots.has_aperture) * np.asarray(fit.arrays.spots.valid))
-    gain = np.concatenate([group.jacobian for group in fit.information.groups])
-    noise = gain.T @ gain
-    return _Told("pixel and aperture noise" if readings else "pixel noise", noise, fit.information.fisher - noise)
+    held = np.isin(np.arange(len(NAMES)), fit.held)
+    linear = linear_spots(fit.linearised, fit.arrays, np.where(held, 0.0, -np.asarray(fit.linearised.residual_jacobian)))
+    both = np.concatenate([linear.jacobian, linear.places], axis=2)
+    found = stop_information(replace(linear, jacobian=both, places=linear.places[..., :0]))
+    gain = np.concatenate([group.jacobian for group in found.groups])
+    noise, places = gain.T @ gain, linear.places.shape[2] // 2
+    own = len(NAMES) + np.arange(places)
+    groups = {**PRIOR_GROUPS, TRANSMISSION_ERROR: own.tolist(), PLAY_VARIATION: (own + places).tolist()}
+    return _Told(
+        "pixel and aperture noise" if readings else "pixel noise",
+        noise,
+        found.fisher - noise,
+        np.linalg.inv(found.fisher + np.eye(len(noise))),
+        {cause: columns for cause, columns in groups.items() if columns},
+    )
 
 
 @dataclass(frozen=True)
@@ -63,17 +85,15 @@ def causes_of(fit: JointFit) -> Causes:
     posterior covariance. With C = 1 + (stop errors) the parts S (C^-1 J)^T (C^-1 J) S, S (J^T C^-1 J - that) S and
     S e_j e_j^T S add up to S. Expected information about geometry and cameras; noise scales are taken as known.
     """
-    fisher = fit.information.fisher
-    posterior = np.linalg.inv(fisher + np.eye(len(NAMES)))
     told = _told(fit)
     parts = {told.pixels: told.by_pixels, STOP_ERRORS: told.by_stops}
-    for stem, columns in PRIOR_GROUPS.items():
-        share = np.zeros_like(fisher)
+    for stem, columns in told.groups.items():
+        share = np.zeros_like(told.posterior)
         share[columns, columns] = 1.0
         parts[stem] = share
     inputs = [INDEX[name] for name in INPUT_NAMES]
     slope = np.asarray(physical_at(fit.z, fit.space).slope)[inputs]
-    spread = slope @ posterior
+    spread = slope @ told.posterior[: len(NAMES)]
     covariance = {name: spread @ part @ spread.T for name, part in parts.items()}
     # A prior that was fixed, or that no coordinate hangs on, is no cause.
     kept = {name: c for name, c in covariance.items() if np.any(np.diag(c) > 0)}
@@ -102,9 +122,9 @@ def headline_causes(fit: JointFit) -> HeadlineCauses:
     if not columns:
         none = np.zeros((0, 0))
         return HeadlineCauses((), (), none, np.zeros(0), np.zeros(0), (), none)
-    gradient = gradients(fit, np.stack(list(columns.values()), axis=1))
-    spread = gradient @ np.linalg.inv(fit.information.fisher + np.eye(len(NAMES)))
-    causes = [*_noise_causes(fit, tuple(columns), spread), *_prior_causes(fit, spread)]
+    told = _told(fit)
+    spread = whole_gradients(fit, np.stack(list(columns.values()), axis=1)) @ told.posterior
+    causes = [*_noise_causes(fit, told, tuple(columns), spread), *_prior_causes(fit, spread)]
     kept = [cause for cause in causes if np.any(cause.contribution != 0)]
     return HeadlineCauses(
         quantities=tuple(columns),
@@ -128,9 +148,9 @@ def _headline_draws(fit: JointFit) -> dict[str, np.ndarray]:
     return columns
 
 
-def _noise_causes(fit: JointFit, quantities: tuple[str, ...], spread: np.ndarray) -> list[_Cause]:
-    """What is no single quantity: noise of the campaign, and the cameras' calibration as one."""
-    moved, told, every = moved_directions(fit), _told(fit), np.ones(len(quantities))
+def _noise_causes(fit: JointFit, told: _Told, quantities: tuple[str, ...], spread: np.ndarray) -> list[_Cause]:
+    """What is no single quantity: noise of the campaign, errors of the gears, the cameras' calibration as one."""
+    moved, every = moved_directions(fit), np.ones(len(quantities))
     physical = np.asarray(fit.draws.physical)
 
     def root(part: np.ndarray) -> np.ndarray:
@@ -150,7 +170,11 @@ def _noise_causes(fit: JointFit, quantities: tuple[str, ...], spread: np.ndarray
     return [
         _Cause(told.pixels, root(told.by_pixels), freedom(["pixel_scale"]) * every),
         _Cause(STOP_ERRORS, root(told.by_stops), np.array([stop_freedom(q) for q in quantities])),
-        _Cause("stereo calibration", np.linalg.norm(spread[:, len(RIG_NAMES) :], axis=1), np.inf * every),
+        *(
+            _Cause(name, np.linalg.norm(spread[:, told.groups[name]], axis=1), np.inf * every)
+            for name in (TRANSMISSION_ERROR, PLAY_VARIATION, "stereo calibration")
+            if name in told.groups
+        ),
     ]
 
 

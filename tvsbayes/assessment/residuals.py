@@ -16,6 +16,7 @@ from tvsbayes.instrument.axes import AXES, direction_of
 from tvsbayes.instrument.campaign import ordered_spots
 from tvsbayes.instrument.stops import Rest, rests_of
 from tvsbayes.metrology.positioning_table import StopReadings
+from tvsbayes.posterior.predictive import repeated_rad
 from tvsbayes.results.estimates import Cause, CauseGroup, StopResidual
 from tvsbayes.statistics.chances import one_way_chance, recursive_residuals
 
@@ -56,7 +57,10 @@ class _SeenRest:
 def _seen_rests(fit: JointFit, axis: str) -> list[_SeenRest]:
     """Rests of an axis that usable spots tell of, in order."""
     index, rests = AXES.index(axis), rests_of(fit.campaign.moves, axis)
-    seen = fit.linearised.spot_deviations()
+    lin, information = fit.linearised, fit.information
+    # What the gears repeat is known, not a deviation.
+    repeated = np.asarray(lin.place_load) @ information.place_mean
+    seen = replace(lin, residual=np.asarray(lin.residual) - repeated).spot_deviations()
     deviation, variance = seen.deviation_rad[:, index], seen.covariance_rad2[:, index, index]
     valid = np.asarray(fit.arrays.spots.valid)
     rows_of: dict[Rest, list[int]] = {}
@@ -90,13 +94,15 @@ def stop_readings(fit: JointFit, axis: str) -> StopReadings:
     needed = values[f"backlash_deg.{axis}"] / abs(values[f"degrees_per_step.{axis}"])
     seen = _seen_rests(fit, axis)
     kept = [one for one in seen if one.rest.sign != 0 and one.rest.leg >= needed]
-    predicted = np.asarray(fit.linearised.mirror_angles_rad)[[one.rows[0] for one in kept], AXES.index(axis)]
+    first = [one.rows[0] for one in kept]
+    predicted = np.asarray(fit.linearised.mirror_angles_rad)[first, AXES.index(axis)]
+    repeated = repeated_rad(fit, np.asarray(fit.mode.place_errors_rad)[None])[0, :, AXES.index(axis)]
     pan, tilt = np.degrees(fit.reference_pose_rad).tolist()
     return StopReadings(
         axis=axis,
         steps=np.array([one.rest.steps for one in kept], dtype=int),
         side=np.array([one.rest.sign for one in kept], dtype=int),
-        mirror_deg=np.degrees(predicted + [one.mean_rad for one in kept]),
+        mirror_deg=np.degrees(predicted + repeated[first] + [one.mean_rad for one in kept]),
         u_deg=np.degrees(np.sqrt([one.mean_variance_rad2 for one in kept])),
         play_left_out=len(seen) - len(kept),
         reference_pose_deg=(pan, tilt),

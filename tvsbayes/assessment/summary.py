@@ -22,7 +22,7 @@ from tvsbayes.assessment.weaknesses import (
 from tvsbayes.estimators.four_point import experiment_rows, four_point_ratios, ratio_slopes, select_experiments
 from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.instrument.axes import AXES, DIRECTIONS, SENSES
-from tvsbayes.instrument.parameters import HARMONIC_NAMES, INDEX, NAMES, RECEIVER_NAMES, RIG_NAMES
+from tvsbayes.instrument.parameters import HARMONIC_NAMES, INDEX, NAMES, RECEIVER_NAMES, RIG_NAMES, names_of
 from tvsbayes.instrument.stops import legs_of
 from tvsbayes.model.headlines import Derived
 from tvsbayes.posterior.draws import Posterior
@@ -32,6 +32,11 @@ from tvsbayes.statistics.intervals import NORMAL_95, interval95
 from tvsbayes.statistics.weighted_draws import TAILS, weighted_mean, weighted_quantiles
 
 CLASSIC_DRAWS = 256
+GEAR_ERROR_NAMES = (
+    *HARMONIC_NAMES,
+    *names_of("transmission_error_deg", "play_variation_deg", "drift_deg_per_root_hour", "harmonic_amplitude_deg"),
+)
+"""Parameters that are not told of where they are held at 0."""
 CURVE_POINTS = 7
 
 
@@ -52,6 +57,11 @@ type _Quantity = Callable[[Derived], np.ndarray]
 def _ratio(index: int) -> _Quantity:
     """Effective ratio of one of `DIRECTIONS`, deg/step."""
     return lambda derived: np.asarray(derived.effective_deg_per_step)[..., index]
+
+
+def _local(index: int) -> _Quantity:
+    """Local ratio of one of `DIRECTIONS`, deg/step."""
+    return lambda derived: np.asarray(derived.local_deg_per_step)[..., index]
 
 
 def _parameter(name: str) -> _Quantity:
@@ -87,6 +97,16 @@ class _Source:
         )
 
 
+def _absent(fit: JointFit) -> set[str]:
+    """Errors of the gears that the model does not have, and the lengths of those."""
+    value = dict(zip(NAMES, np.asarray(fit.mode.physical).tolist(), strict=True))
+    none = {name for name in GEAR_ERROR_NAMES if not fit.free[INDEX[name]] and value[name] == 0}
+    for axis in AXES:
+        if {f"transmission_error_deg.{axis}", f"play_variation_deg.{axis}"} <= none:
+            none.add(f"transmission_error_length_deg.{axis}")
+    return none
+
+
 def _parameters(source: _Source) -> dict[str, Estimate]:
     """Parameters with a coordinate; Laplace interval ends are exact images of z -+ 1.96 sd under monotone maps."""
     fit = source.fit
@@ -96,7 +116,7 @@ def _parameters(source: _Source) -> dict[str, Estimate]:
     for index, name in enumerate(NAMES):
         if name in RECEIVER_NAMES and not has_readings:
             continue
-        if name in HARMONIC_NAMES and not fit.free[index] and fit.mode.physical[index] == 0:
+        if name in _absent(fit):
             continue
         estimate = source.estimate(name, _parameter(name))
         if source.posterior is not None:
@@ -196,6 +216,14 @@ def _lost_motion(posterior: Posterior, direction: str) -> tuple[LostMotion, ...]
     )
 
 
+def seen_range(fit: JointFit) -> dict[str, tuple[int, int]]:
+    """Lowest and highest counter of each axis that the looks used saw."""
+    used = np.asarray(fit.arrays.spots.valid) > 0
+    moves = np.unique(np.asarray(fit.arrays.spots.move_index)[used])
+    steps = {axis: [getattr(fit.campaign.moves[move], f"{axis}_steps") for move in moves] for axis in AXES}
+    return {axis: (min(seen), max(seen)) for axis, seen in steps.items()}
+
+
 def summarise(fit: JointFit, posterior: Posterior | None = None) -> FitSummary:
     """Put a fit into the contract's terms.
 
@@ -250,4 +278,9 @@ def summarise(fit: JointFit, posterior: Posterior | None = None) -> FitSummary:
         curves=None if usable is None else _curves(usable, moved),
         validation=validate(fit),
         few_stops=poorly_known_stops(fit),
+        local={
+            d: source.estimate(f"local_deg_per_step.{d}", _local(k)) if d in moved else None
+            for k, d in enumerate(DIRECTIONS)
+        },
+        range_steps=seen_range(fit),
     )

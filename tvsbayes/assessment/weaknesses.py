@@ -7,11 +7,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from tvsbayes.estimators.joint_fit import JointFit
+from tvsbayes.estimators.joint_fit import JointFit, with_places
 from tvsbayes.estimators.linear_spots import standard_deviations_without
 from tvsbayes.instrument.axes import AXES, DIRECTIONS, SENSES
 from tvsbayes.instrument.campaign import ordered_spots
-from tvsbayes.instrument.parameters import INDEX, NAMES
+from tvsbayes.instrument.parameters import INDEX, NAMES, NOISE_NAMES, STEREO_PARAMETER_NAMES
 from tvsbayes.instrument.stops import few_stops, inseparable, legs_of, observed_stops, one_sided, separation
 from tvsbayes.results.estimates import Leverage, WeakDirection
 
@@ -64,7 +64,7 @@ def weak_directions(fit: JointFit, moved: set[str]) -> tuple[WeakDirection, ...]
         weak = _backlash_direction(fit, axis, pair[0] if pair[0] in moved else pair[1])
         if weak is not None:
             found.append(weak)
-    noise = {"pixel_scale", *(n for n in NAMES if n.startswith(("stop_sd", "stereo")))}
+    noise = {*NOISE_NAMES, *STEREO_PARAMETER_NAMES}
     rows = np.array([i for i, name in enumerate(NAMES) if fit.free[i] and name not in noise])
     if rows.size == 0:
         return tuple(found)
@@ -109,6 +109,14 @@ def gradients(fit: JointFit, values: np.ndarray) -> np.ndarray:
     centred = fit.draws_z - fit.draws_z.mean(axis=0)
     cross = (values - values.mean(axis=0)).T @ centred / len(centred)
     return np.linalg.solve(fit.covariance, cross.T).T
+
+
+def whole_gradients(fit: JointFit, values: np.ndarray) -> np.ndarray:
+    """d(quantity)/d(coordinates, then errors at places), shape (q, p + e), as `gradients` finds them."""
+    draws = np.concatenate([fit.draws_z, fit.draws_places], axis=1)
+    centred = draws - draws.mean(axis=0)
+    cross = (values - values.mean(axis=0)).T @ centred / len(centred)
+    return np.linalg.solve(with_places(fit.z, fit.covariance, fit.information).covariance, cross.T).T
 
 
 def leverage(fit: JointFit, moved: set[str]) -> tuple[Leverage, ...]:

@@ -71,6 +71,7 @@ class JointFit:
         reference_pose_rad: mean mirror angles (pan, tilt) over the spots used.
         seen_line: their counters, over which the headlines are slopes.
         free: parameters that are estimated, shape (p,).
+        held: coordinates of noise scales and of what is not estimated: the linearisation knows them.
         draws_z: Laplace draws, shape (draws, p), with mean and covariance exactly those of the approximation.
         draws_places: with them, the errors at places in units of `linearised.place_root`, shape (draws, e).
         draws: headlines and parameters of the draws.
@@ -95,6 +96,7 @@ class JointFit:
     reference_pose_rad: np.ndarray
     seen_line: SeenLine
     free: np.ndarray
+    held: np.ndarray
     draws_z: np.ndarray
     draws_places: np.ndarray
     draws: Derived
@@ -234,15 +236,19 @@ class Gaussian:
     covariance: np.ndarray
 
 
-def with_places(mode: Mode, information: StopInformation) -> Gaussian:
+def with_places(z: np.ndarray, covariance: np.ndarray, information: StopInformation) -> Gaussian:
     """The Laplace approximation of coordinates and errors at places, these in units of N(0, 1) a priori.
 
     At the noise scales of the mode the errors follow the coordinates linearly.
+
+    Args:
+        z, covariance: of the coordinates.
+        information: of the stops there.
     """
-    slope, own = information.place_slope, mode.covariance
+    slope, own = information.place_slope, covariance
     follows = slope @ own
     lower = follows @ slope.T + information.place_covariance
-    return Gaussian(np.append(mode.z, information.place_mean), np.block([[own, follows.T], [follows, lower]]))
+    return Gaussian(np.append(z, information.place_mean), np.block([[own, follows.T], [follows, lower]]))
 
 
 def fit_at(campaign: Campaign, problem: Problem, mode: Mode, seed: int) -> JointFit:
@@ -265,7 +271,7 @@ def fit_at(campaign: Campaign, problem: Problem, mode: Mode, seed: int) -> Joint
     places = place_arrays(seen_at)
     share = placed(np.pad(line_share(seen_at, used), (0, len(places.steps) - len(seen_at.steps))))
     seen = SeenLine(np.asarray(pose), places, share)
-    count, joint = len(NAMES), with_places(mode, information)
+    count, joint = len(NAMES), with_places(mode.z, mode.covariance, information)
     both = laplace_draws(joint.mean, joint.covariance, seed)
     draws_z, draws_rad = both[:, :count], both[:, count:] @ np.asarray(lin.place_root).T
     centre_rad = np.asarray(lin.place_root) @ information.place_mean
@@ -302,6 +308,7 @@ def fit_at(campaign: Campaign, problem: Problem, mode: Mode, seed: int) -> Joint
         reference_pose_rad=np.asarray(pose),
         seen_line=seen,
         free=problem.free,
+        held=np.flatnonzero(problem.held),
         draws_z=draws_z,
         draws_places=both[:, count:],
         draws=jax.tree.map(lambda x: np.asarray(x)[1:], at_mode_and_draws),

@@ -168,6 +168,7 @@ NOISE_NAMES: tuple[str, ...] = tuple(p.name for p in _PARAMETERS if p.noise)
 RECEIVER_NAMES: tuple[str, ...] = tuple(p.name for p in _PARAMETERS if p.receiver)
 DERIVED_UNITS: dict[str, Unit] = {
     **dict.fromkeys(("degrees_per_step", "effective_deg_per_step", "effective_contrast_deg_per_step"), "deg/step"),
+    "local_deg_per_step": "deg/step",
     "effective_mirror_offset_mm": "mm",
 }
 """Of quantities that follow from parameters, by the first part of their names: ratios by direction, for instance."""

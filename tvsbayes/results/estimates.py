@@ -19,7 +19,7 @@ CONTRACTION_LIMIT = 0.1
 
 SUMMARY_KEYS = (
     *("estimator", "tier", "converged", "problems", "effective_deg_per_step", "effective_contrast_deg_per_step"),
-    *("reference_pose_deg", "effective_jacobian", "parameters", "noise", "weak_directions", "leverage"),
+    *("local_deg_per_step", "range_steps", "homing_side", "reference_pose_deg", "effective_jacobian", "parameters", "noise", "weak_directions", "leverage"),
     *("classic_predicted_deg_per_step", "excluded_spots", "suspect_spots", "prior_conflicts", "prior_sensitivity"),
     *("sampling", "curves", "validation", "few_stops"),
 )
@@ -27,6 +27,7 @@ SUMMARY_KEYS = (
 KEPT_AS = {
     "effective_deg_per_step": "effective",
     "effective_contrast_deg_per_step": "contrasts",
+    "local_deg_per_step": "local",
     "effective_jacobian": "jacobian",
     "classic_predicted_deg_per_step": "classic_predicted",
 }
@@ -189,9 +190,13 @@ class FitSummary:
     Attributes:
         converged: whether the mode was reached.
         problems: sentences on what failed.
-        effective: left, right, up, down in deg/step; None for a direction that was never moved.
+        effective: left, right, up, down in deg/step, slopes of the lines through the looks used; None for a direction
+            that was never moved.
         contrasts: effective left - right and up - down, deg/step.
-        reference_pose_deg: pan and tilt at which the effective ratios hold.
+        local: gear ratio times the slope of the mirrors at the reference pose, without transmission error; deg/step.
+        range_steps: lowest and highest counter of each axis that the looks used saw: where the effective ratios hold.
+        homing_side: of an axis whose homing sides nobody recorded: probability of each way of homing.
+        reference_pose_deg: mean mirror angles, pan and tilt, of the looks used.
         jacobian: d(azimuth, elevation)/d(pan, tilt) there.
         parameters: every estimated or derived parameter by its name.
         chi2: squared standardised innovations; dof: their number less the parameters they determine.
@@ -232,6 +237,9 @@ class FitSummary:
     curves: Curves | None = None
     validation: Validation | None = None
     few_stops: dict[str, int] = field(default_factory=dict)
+    local: dict[str, Estimate | None] = field(default_factory=dict)
+    range_steps: dict[str, tuple[int, int]] = field(default_factory=dict)
+    homing_side: dict[str, dict[str, float]] = field(default_factory=dict)
 
     @property
     def headline_informed(self) -> bool:
