@@ -165,7 +165,8 @@ def evaluate():
             "log_scale": found.terms.log_scale,
             "predicted": jnp.stack(found.looks.predicted, axis=1),
         }
-        return model, angles, terms, innovations(model, arrays)
+        still = jnp.zeros(2 * len(arrays.gears.places.steps))
+        return model, angles, terms, innovations(model, arrays, still)
 
     def run(z, space, arrays) -> Evaluated:
         with jax.enable_x64(True):

@@ -17,7 +17,7 @@ import numpy as np
 from arviz_stats.base import array_stats
 
 from tvsbayes.estimators.joint_fit import JointFit
-from tvsbayes.estimators.likelihood import evaluate
+from tvsbayes.estimators.likelihood import evaluate, no_draw
 from tvsbayes.instrument.parameters import NAMES, NOISE_NAMES
 from tvsbayes.posterior import transport
 from tvsbayes.posterior.proposal import Target
@@ -84,8 +84,9 @@ def build_transport(joint: JointFit) -> Transport:
             part = y[first : first + BATCH]
             z = np.repeat(joint.z[None], BATCH, axis=0)
             z[: len(part), index] += part @ root.T
-            seen = evaluate(jnp.asarray(z), joint.space, joint.arrays).standardised
-            out.append(np.asarray(seen)[: len(part)].reshape(len(part), -1))
+            seen = evaluate(jnp.asarray(z), no_draw(BATCH, joint.arrays), joint.space, joint.arrays)
+            both = np.concatenate([np.reshape(seen.standardised, (BATCH, -1)), seen.places], axis=1)
+            out.append(both[: len(part)])
         return np.concatenate(out)
 
     geometry = [k for k in range(size) if NAMES[index[k]] not in NOISE_NAMES]

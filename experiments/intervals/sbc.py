@@ -46,12 +46,12 @@ from experiments.common.rows import output, read_rows, run_rows
 from experiments.common.uniformity import ALPHA, BAND_SAMPLES, DRAWS, FAULT_SIMULATIONS, Band, pit_values
 from tvsbayes.estimators.campaign_arrays import campaign_arrays
 from tvsbayes.estimators.joint_fit import fit
-from tvsbayes.estimators.likelihood import evaluate
+from tvsbayes.estimators.likelihood import evaluate, no_draw
 from tvsbayes.instrument.axes import DIRECTIONS
 from tvsbayes.instrument.parameters import NAMES
 from tvsbayes.model.compiled import in_batches
 from tvsbayes.model.parameter_space import coordinates_of, parameter_space
-from tvsbayes.posterior.draws import Posterior, derived_at
+from tvsbayes.posterior.draws import Posterior, derived_of
 from tvsbayes.posterior.ridges import transport
 from tvsbayes.posterior.sampling import TIERS, sample
 from tvsbayes.twin.physics import effective_mirror_offset_mm
@@ -102,12 +102,17 @@ def one_simulation(task: tuple[str, str, int]) -> dict[str, object]:
         row |= {"cpu_s": time.process_time() - start, "draws": told.draws, "effective_share": told.effective_share}
         row |= {"pareto_k": told.pareto_k, "worst_pareto_k": told.worst_pareto_k.value, "ess": told.least_ess.value}
         chosen = posterior.coordinates(DRAWS)
-        row["ranks"] = ranks(simulated, result, chosen)
+        errors_rad = posterior.thinned(DRAWS).place_errors_rad
+        row["ranks"] = ranks(simulated, result, chosen, errors_rad)
         if variant == CLEAN and seed < FAULT_SIMULATIONS:
             mean = np.tensordot(posterior.weights, posterior.z, axes=2)
-            row["ranks_shrunk"] = ranks(simulated, result, mean + SHRINK * (chosen - mean))
+            centre_rad = posterior.centre.place_errors_rad
+            nearer_rad = centre_rad + SHRINK * (errors_rad - centre_rad)
+            row["ranks_shrunk"] = ranks(simulated, result, mean + SHRINK * (chosen - mean), nearer_rad)
         if variant == FEW and tier == TIERS[0]:
-            row["ranks_jacobian"] = ranks(simulated, result, without_jacobian(posterior).coordinates(DRAWS))
+            wrong = without_jacobian(posterior)
+            errors_rad = wrong.thinned(DRAWS).place_errors_rad
+            row["ranks_jacobian"] = ranks(simulated, result, wrong.coordinates(DRAWS), errors_rad)
     except Exception as error:
         row |= {"converged": False, "problems": [*row["problems"], repr(error)]}
     return row
@@ -123,18 +128,26 @@ def without_jacobian(posterior: Posterior) -> Posterior:
     return replace(posterior, weights=weights[None] / weights.sum())
 
 
-def ranks(simulated, result, z: np.ndarray) -> dict[str, int]:
-    """Number of draws z (n, 65), coordinates of the fit, below the truth, for every quantity of the true model."""
+def ranks(simulated, result, z: np.ndarray, place_errors_rad: np.ndarray) -> dict[str, int]:
+    """How many draws lie below the truth, for every quantity of the true model.
+
+    Args:
+        simulated: with its truth.
+        result: the fit.
+        z: its coordinates, shape (n, p).
+        place_errors_rad: what the gears repeat, shape (n, e).
+    """
     truth = simulated.truth
     pose = result.reference_pose_rad
     with jax.enable_x64(True):
-        draws = derived_at(result, z[None], pose)
+        draws = derived_of(result, z[None], place_errors_rad[None])
         physical = draws.physical[0]
         true = physical_of(truth)
         space = parameter_space(simulated.campaign.rig, simulated.campaign.stereo)
         arrays = campaign_arrays(simulated.campaign)
         both = coordinates_of(space, np.vstack([true, physical]))
-        log_posterior = in_batches(lambda block: evaluate(block, space, arrays).log_density, both)
+        still = no_draw(len(both), arrays)
+        log_posterior = in_batches(lambda *block: evaluate(*block, space, arrays).log_density, both, still)
     log_likelihood = log_posterior + 0.5 * np.sum(both**2, axis=1)
     values = {"log-likelihood": log_likelihood, "log-posterior": log_posterior}
     values |= {NAMES[i]: np.append(true[i], physical[:, i]) for i in np.flatnonzero(result.free)}

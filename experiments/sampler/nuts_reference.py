@@ -30,29 +30,35 @@ from experiments.common.reference_samplers import AXES, Run, Setting, build_tran
 from experiments.common.rigs import twin_campaign
 from experiments.common.rows import ROOT
 from tvsbayes.estimators.joint_fit import JointFit, fit
-from tvsbayes.estimators.likelihood import log_density
+from tvsbayes.estimators.likelihood import evaluate, log_density, no_draw
 from tvsbayes.instrument.axes import DIRECTIONS
 from tvsbayes.instrument.campaign import Campaign, input_hashes, ordered_spots
 from tvsbayes.instrument.parameters import NAMES
+from tvsbayes.model.compiled import in_batches
 from tvsbayes.model.headlines import derived_quantities
 
-HEADLINES = (
-    *(f"effective_deg_per_step.{direction}" for direction in DIRECTIONS),
-    "effective_mirror_offset_mm",
-)
+RATIOS = ("effective_deg_per_step", "local_deg_per_step")
+OFFSET = "effective_mirror_offset_mm"
+ERRORS_SEED = 8
+"""Of the errors at places, drawn for every draw of the coordinates."""
 QUANTILES = {"q05": 0.05, "q50": 0.50, "q95": 0.95}
 
 
 def quantities(joint: JointFit, z_of: Callable[[jax.Array], jax.Array], draws: np.ndarray) -> dict[str, np.ndarray]:
     """Free parameters and headlines by contract name, each (chain, draw)."""
     z = jax.jit(jax.vmap(z_of))(draws.reshape(-1, draws.shape[-1]))
-    derived = derived_quantities(z, joint.space, jnp.asarray(joint.reference_pose_rad))
+    normal = np.random.default_rng(ERRORS_SEED).standard_normal(no_draw(len(z), joint.arrays).shape)
+    errors_rad = in_batches(
+        lambda *block: evaluate(*block, joint.space, joint.arrays).place_errors_rad, np.asarray(z), normal
+    )
+    derived = derived_quantities(z, errors_rad, joint.space, joint.seen_line)
     shape = draws.shape[:2]
     physical = np.asarray(derived.physical)
     named = {NAMES[k]: physical[:, k].reshape(shape) for k in np.flatnonzero(joint.free)}
-    effective = np.asarray(derived.effective_deg_per_step)
-    named |= {name: effective[:, k].reshape(shape) for k, name in enumerate(HEADLINES[:4])}
-    return named | {HEADLINES[4]: np.asarray(derived.effective_mirror_offset_mm).reshape(shape)}
+    for kind in RATIOS:
+        ratio = np.asarray(getattr(derived, kind)).reshape(*shape, len(DIRECTIONS))
+        named |= {f"{kind}.{direction}": ratio[..., k] for k, direction in enumerate(DIRECTIONS)}
+    return named | {OFFSET: np.asarray(derived.effective_mirror_offset_mm).reshape(shape)}
 
 
 def summary(values: np.ndarray) -> dict[str, float]:

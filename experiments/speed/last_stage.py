@@ -29,11 +29,12 @@ Linear = Callable[..., LinearResidual]
 
 
 def exact_values(z, args):
-    """Standardised innovations and prior residuals."""
+    """Standardised innovations, errors at places and prior residuals."""
     space, arrays, fixed = args
     full = jnp.where(fixed.held, fixed.value, z)
-    errors = exact_innovations(space.model(full), arrays).standardised
-    return jnp.concatenate([errors.ravel(), jnp.where(fixed.held, z - fixed.value, z)])
+    found = exact_innovations(space.model(full), arrays, jnp.zeros(2 * len(arrays.gears.places.steps)))
+    prior = jnp.where(fixed.held, z - fixed.value, z)
+    return jnp.concatenate([found.standardised.ravel(), found.places, prior])
 
 
 def exact_residuals(z, args) -> LinearResidual:
@@ -46,8 +47,13 @@ def stage_residuals(z, args) -> LinearResidual:
     space, arrays, fixed = args
     columns = innovations(linearise(jnp.where(fixed.held, fixed.value, z), space, arrays), arrays)
     prior = jnp.where(fixed.held, z - fixed.value, z)
-    jacobian = jnp.where(fixed.held, 0.0, columns[:, 1:])
-    return LinearResidual(jnp.append(columns[:, 0], prior), jnp.concatenate([jacobian, jnp.eye(z.size)]))
+    # The errors at places are least squares in every step.
+    places = columns.shape[1] - 1 - z.size
+    own = jnp.concatenate([columns[:, : 1 + z.size], jnp.zeros((places, 1 + z.size))])
+    across = jnp.linalg.qr(jnp.concatenate([columns[:, 1 + z.size :], jnp.eye(places)]))[0]
+    own = own - across @ (across.T @ own)
+    jacobian = jnp.where(fixed.held, 0.0, own[:, 1:])
+    return LinearResidual(jnp.append(own[:, 0], prior), jnp.concatenate([jacobian, jnp.eye(z.size)]))
 
 
 @dataclass

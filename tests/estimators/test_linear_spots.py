@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from tvsbayes.estimators.likelihood import evaluate
+from tvsbayes.estimators.likelihood import evaluate, no_draw
 from tvsbayes.estimators.linear_spots import (
     LinearSpots,
     leave_one_out_chi2,
@@ -53,6 +53,7 @@ def campaign(seed: int = 1, stops: int = 7) -> LinearSpots:
         renewed=np.array(renewed),
         variance=np.array(variance),
         jacobian=rng.standard_normal((n, 4, PARAMETERS)),
+        places=np.zeros((n, 4, 0)),
     )
 
 
@@ -185,14 +186,15 @@ def test_log_density_of_a_move_is_what_the_campaign_loses_without_it(x64, dozen)
     spots = dozen.arrays.spots
     count = int(np.sum(np.asarray(spots.valid)))
     index = np.asarray(spots.move_index)[:count]
-    found = np.asarray(move_log_density(z, dozen.space, dozen.arrays))
+    still = no_draw(len(z), dozen.arrays)
+    found = np.asarray(move_log_density(z, still, dozen.space, dozen.arrays))
     assert np.all(found[:, count:] == 0)
-    whole = np.asarray(evaluate(z, dozen.space, dozen.arrays).log_density)
+    whole = np.asarray(evaluate(z, still, dozen.space, dozen.arrays).log_density)
     assert len(set(index)) < count
     for move in set(index):
         valid = np.asarray(spots.valid).copy()
         valid[:count][index == move] = 0.0
         rest = eqx.tree_at(lambda a: a.spots.valid, dozen.arrays, jnp.asarray(valid))
-        lost = whole - np.asarray(evaluate(z, dozen.space, rest).log_density)
+        lost = whole - np.asarray(evaluate(z, still, dozen.space, rest).log_density)
         # Sums of a few hundred terms of order 100: rounding leaves 1e-9.
         np.testing.assert_allclose(found[:, :count][:, index == move].sum(axis=1), lost, atol=1e-7)

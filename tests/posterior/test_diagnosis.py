@@ -38,18 +38,24 @@ def independent(steps: int = STEPS) -> np.ndarray:
     return np.random.default_rng(1).standard_normal((steps, WALKERS, 2))
 
 
-def derived_at(fit, z, pose):
+def derived_of(fit, z, place_errors_rad):
     """Headlines of the two parameters alone."""
-    zero = np.zeros(z.shape[:2])
+    zero, ratios = np.zeros(z.shape[:2]), np.zeros((*z.shape[:2], 4))
     return SimpleNamespace(
-        physical=z, effective_deg_per_step=np.zeros((*z.shape[:2], 4)), effective_mirror_offset_mm=zero
+        physical=z, effective_deg_per_step=ratios, local_deg_per_step=ratios, effective_mirror_offset_mm=zero
     )
+
+
+def evaluate(z, normal, space, arrays):
+    """No campaign: only what errors at places would be drawn, none."""
+    return SimpleNamespace(log_density=np.zeros(len(z)), place_errors_rad=normal)
 
 
 @pytest.fixture
 def judged(monkeypatch):
     """Diagnosis of a chain, by default after importance sampling that was not accepted: it is judged alone."""
-    monkeypatch.setattr("tvsbayes.posterior.diagnosis.derived_at", derived_at)
+    monkeypatch.setattr("tvsbayes.posterior.diagnosis.derived_of", derived_of)
+    monkeypatch.setattr("tvsbayes.posterior.proposal.evaluate", evaluate)
     monkeypatch.setattr("tvsbayes.posterior.diagnosis.headline_names", lambda fit: (NAMES[RATIO], NAMES[BACKLASH]))
     refused = SimpleNamespace(converged=False, seed=0, convergence=SimpleNamespace(importance=None))
 
@@ -111,7 +117,7 @@ def weighted(shift: float = 0.0) -> Posterior:
     z[0][:, [BACKLASH, RATIO]] = draws + np.array([0.0, shift])
     worst = NamedValue(NAMES[RATIO], 0.1)
     importance = Importance(True, (), 8, 8000, 0.5, worst, 0.1, worst, 0.001, 0.0, 0.01, 0)
-    found = derived_at(None, z, None)
+    found = derived_of(None, z, None)
     return Posterior(None, z, np.zeros((1, 8000)), found, weights[None], Reweighted(importance, {}, {}), 0, 0.0)
 
 

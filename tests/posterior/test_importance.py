@@ -11,13 +11,15 @@ import pytest
 from scipy import stats
 from scipy.special import gamma
 from support.small_posterior import SIGMAS, small_fit, small_path
+from support.tabulated import no_followers
+from support.two_parameters import no_places
 
 from tvsbayes.errors import NotConverged
 from tvsbayes.estimators.campaign_arrays import log_constant
 from tvsbayes.files.disk import shipped_data
 from tvsbayes.posterior import importance
 from tvsbayes.posterior.importance import Pool, empty_pool, importance_run, lacking, reweighted_posterior
-from tvsbayes.posterior.proposal import Independence, Tables, Target
+from tvsbayes.posterior.proposal import Independence, Tables, Target, Valued
 from tvsbayes.posterior.sampling import sample
 from tvsbayes.statistics.weighted_draws import smoothed_weights, weighted_summary
 
@@ -27,13 +29,14 @@ SEED = 3
 def normal(mean: float, sd: float, dimension: int) -> Independence:
     """Without tabulated or coupled coordinates."""
     nothing, tables = np.zeros(0, int), Tables(np.zeros((0, 41)))
-    return Independence(np.full(dimension, mean), np.full(dimension, sd), nothing, tables, nothing)
+    return Independence(np.full(dimension, mean), np.full(dimension, sd), nothing, tables, nothing, no_followers())
 
 
 class Skewed:
     """A target of mass e^1.7: Gumbel's density in the first coordinate, whom the second follows, the rest normal."""
 
-    path = SimpleNamespace(dimension=5, heavy=np.arange(5) == 0, coupled=np.arange(5) >= 3)
+    path = SimpleNamespace(dimension=5, heavy=np.arange(5) == 0, coupled=np.arange(5) >= 3, pairs=())
+    fit = SimpleNamespace(arrays=no_places())
     invalid = 0
 
     def __call__(self, w: np.ndarray) -> np.ndarray:
@@ -41,6 +44,10 @@ class Skewed:
         first = stats.gumbel_r.logpdf(w[:, 0])
         second = stats.norm.logpdf(w[:, 1], 0.3 * w[:, 0], np.exp(0.05 * w[:, 0]))
         return first + second + stats.norm.logpdf(w[:, 2:], 0.2, 1.1).sum(axis=1) + 1.7
+
+    def valued(self, w: np.ndarray, normal: np.ndarray) -> Valued:
+        """With errors at no places."""
+        return Valued(self(w), normal)
 
 
 def skewed_pool(rounds: int = 5) -> Pool:
@@ -55,7 +62,7 @@ def test_weights_are_the_target_over_the_mixture_of_all_proposals():
     """By hand, for two proposals of other numbers of draws; by each draw's own proposal alone they are others."""
     one, other = normal(0.0, 1.0, 2), normal(0.8, 1.5, 2)
     w = np.random.default_rng(1).standard_normal((6, 2))
-    pool = Pool(w, np.arange(6.0), (one, other), (2, 4), other)
+    pool = Pool(w, np.arange(6.0), np.zeros((6, 0)), (one, other), (2, 4), other)
     densities = np.exp([q.log_density(w) for q in (one, other)])
     expected = np.exp(np.arange(6.0)) / (densities[0] * 2 / 6 + densities[1] * 4 / 6)
     np.testing.assert_allclose(np.exp(pool.log_weights), expected, rtol=1e-12)
@@ -91,9 +98,10 @@ def normal_fit(request, monkeypatch):
     free = np.flatnonzero(fitted.free)
     precision = np.linalg.inv(fitted.covariance[np.ix_(free, free)])
 
-    def evaluate(z, space, arrays):
+    def evaluate(z, normal, space, arrays):
         away = np.asarray(z)[:, free] - fitted.z[free]
-        return SimpleNamespace(log_density=fitted.log_density - 0.5 * np.sum(away @ precision * away, axis=1))
+        value = fitted.log_density - 0.5 * np.sum(away @ precision * away, axis=1)
+        return SimpleNamespace(log_density=value, place_errors_rad=normal)
 
     monkeypatch.setattr("tvsbayes.posterior.proposal.evaluate", evaluate)
     return fitted, path
@@ -204,7 +212,11 @@ def test_every_limit_is_said(sampled):
 def test_a_density_without_values_is_refused(sampled, monkeypatch):
     fitted, run = sampled
     monkeypatch.setattr(importance, "transport", lambda fit: run.path)
-    monkeypatch.setattr(Target, "__call__", lambda target, w: np.where(np.abs(w).max(axis=1) > 0, -np.inf, 0.0))
+
+    def valued(target, w, normal):
+        return Valued(np.where(np.abs(w).max(axis=1) > 0, -np.inf, 0.0), normal)
+
+    monkeypatch.setattr(Target, "valued", valued)
     with pytest.raises(NotConverged, match="not finite"):
         importance_run(fitted, SEED)
 

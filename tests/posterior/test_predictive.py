@@ -7,9 +7,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from tvsbayes.estimators.likelihood import no_draw
 from tvsbayes.instrument.axes import HOME_SD_DEG
 from tvsbayes.instrument.campaign import ordered_spots
-from tvsbayes.instrument.parameters import INDEX, NAMES
+from tvsbayes.instrument.parameters import INDEX, NAMES, names_of
 from tvsbayes.posterior.predictive import looks_again
 
 DRAWS = 2000
@@ -52,7 +53,8 @@ def errors_deg(dozen):
     physical = np.ones((DRAWS, len(NAMES)))
     for name, sd in SDS_DEG.items():
         physical[:, INDEX[f"stop_sd_deg.{name}"]] = sd
-    physical[:, INDEX["pixel_scale"]] = 0.0
+    for name in ("pixel_scale", *names_of("drift_deg_per_root_hour")):
+        physical[:, INDEX[name]] = 0.0
     caught = []
 
     def looks(fit, z, stop_error_rad):
@@ -62,7 +64,7 @@ def errors_deg(dozen):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("tvsbayes.posterior.predictive.looks", looks)
         z = np.zeros((DRAWS, 1))
-        assert not looks_again(fit, z, physical, np.random.default_rng(4)).any()
+        assert not looks_again(fit, z, physical, no_draw(DRAWS, dozen.arrays), np.random.default_rng(4)).any()
     return caught[0], play_deg
 
 

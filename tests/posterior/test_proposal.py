@@ -15,8 +15,9 @@ from tvsbayes.posterior.transport import STRETCH_NODES
 
 
 def test_the_density_of_walkers_is_the_models_times_the_jacobian(x64, monkeypatch):
-    def evaluate(z, space, arrays):
-        return SimpleNamespace(log_density=AT_MODE - 0.5 * (z[:, RATIO] ** 2 + z[:, BACKLASH] ** 2))
+    def evaluate(z, normal, space, arrays):
+        value = AT_MODE - 0.5 * (z[:, RATIO] ** 2 + z[:, BACKLASH] ** 2)
+        return SimpleNamespace(log_density=value, place_errors_rad=normal)
 
     monkeypatch.setattr("tvsbayes.posterior.proposal.evaluate", evaluate)
     monkeypatch.setattr("tvsbayes.posterior.ridges.evaluate", evaluate)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from scipy import stats
 from support.small_posterior import ROUNDING, small_fit, small_path
-from support.two_parameters import BACKLASH, RATIO, route
+from support.two_parameters import BACKLASH, RATIO, no_places, route
 
 from tvsbayes.estimators.linear_spots import linear_spots, stop_information
 from tvsbayes.instrument.parameters import INDEX, NAMES
@@ -175,12 +175,13 @@ def test_a_density_without_value_is_refused_and_counted(x64, monkeypatch):
     without = np.array([0, 7, count - 1])
     w[without, 2] = 100.0
 
-    def evaluate(z, space, arrays):
-        return SimpleNamespace(log_density=jnp.where(z[:, 3] > 50, jnp.nan, 5.0 - z[:, 0]))
+    def evaluate(z, normal, space, arrays):
+        value = jnp.where(z[:, 3] > 50, jnp.nan, 5.0 - z[:, 0])
+        return SimpleNamespace(log_density=value, place_errors_rad=normal)
 
     monkeypatch.setattr("tvsbayes.posterior.proposal.evaluate", evaluate)
     monkeypatch.setattr("tvsbayes.posterior.ridges.evaluate", evaluate)
-    target = Target(SimpleNamespace(space=None, arrays=None, log_density=2.0), path)
+    target = Target(SimpleNamespace(space=None, arrays=no_places(), log_density=2.0), path)
     value = target(w)
     expected = (5.0 - w[:, 0]) - 2.0
     expected[without] = -np.inf

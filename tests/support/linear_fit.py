@@ -50,7 +50,7 @@ def fit_of(jacobian: np.ndarray, load: np.ndarray, rig, readings: bool = False) 
     aperture = np.array([False, readings, True])
     physical = np.full((50, len(NAMES)), 0.5) + 1e-3 * np.random.default_rng(3).normal(size=(50, len(NAMES)))
     values = {
-        "information": StopInformation(groups, jacobian.T @ gain),
+        "information": StopInformation(groups, jacobian.T @ gain, *without_places(jacobian.shape[1])),
         "arrays": SimpleNamespace(spots=SimpleNamespace(has_aperture=aperture, valid=seen)),
         "space": space,
         "z": 0.1 * np.random.default_rng(4).normal(size=len(NAMES)),
@@ -60,6 +60,11 @@ def fit_of(jacobian: np.ndarray, load: np.ndarray, rig, readings: bool = False) 
     for name, value in values.items():
         object.__setattr__(fit, name, value)
     return fit
+
+
+def without_places(parameters: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """What `StopInformation` says of errors at places where there are none."""
+    return np.zeros(0), np.zeros((0, parameters)), np.zeros((0, 0))
 
 
 def refitted(jacobian: np.ndarray, load: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

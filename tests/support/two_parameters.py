@@ -6,8 +6,10 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from tvsbayes.instrument.parameters import INDEX, NAMES
-from tvsbayes.posterior.transport import STRETCH_NODES, Transport
+from tvsbayes.estimators.campaign_arrays import CampaignArrays, GearArrays
+from tvsbayes.instrument.parameters import INDEX, NAMES, PERIODS_MAX
+from tvsbayes.model.gear_processes import Places
+from tvsbayes.posterior.transport import GEAR_SCALES, STRETCH_NODES, Transport
 
 RATIO, BACKLASH = INDEX["degrees_per_step.pan"], INDEX["backlash_deg.pan"]
 STRETCH = 0.3
@@ -18,6 +20,8 @@ AT_MODE = 7.0
 def route() -> Transport:
     """The map z_1 = w_1, z_2 = w_2 exp(0.3 max(w_1, -2)) at two of the parameters."""
     empty = {"variance": (0, 1), "constant": (0,), "load": (1, 0), "states": (0, 0), "state_score": (0,)}
+    empty |= {"place_angle_rad": (0,), "place_on_tilt": (0,), "place_valid": (0,), "period_deg": (2, PERIODS_MAX)}
+    empty |= {"gear_scale": (len(GEAR_SCALES),), "gear_noise": (len(GEAR_SCALES), 1)}
     return Transport(
         mode=np.zeros(len(NAMES)),
         free=np.array([BACKLASH, RATIO]),
@@ -26,6 +30,7 @@ def route() -> Transport:
         narrow=np.zeros(0, int),
         bend=np.zeros((0, 2, 2)),
         slope=np.zeros((1, 1)),
+        half=np.zeros(1, bool),
         pixels=np.zeros(1),
         prior=np.zeros((1, 1)),
         known=np.ones((1, 1)),
@@ -38,7 +43,15 @@ def route() -> Transport:
 def fit() -> SimpleNamespace:
     """What a diagnosis reads of a fit."""
     free = np.isin(np.arange(len(NAMES)), [RATIO, BACKLASH])
-    return SimpleNamespace(free=free, log_density=AT_MODE, reference_pose_rad=np.zeros(2), space=None, arrays=None)
+    return SimpleNamespace(free=free, log_density=AT_MODE, reference_pose_rad=np.zeros(2), space=None, arrays=no_places())
+
+
+def no_places() -> CampaignArrays:
+    """Of a campaign's arrays what a posterior reads besides its density: gears that do not vary."""
+    found, none = object.__new__(CampaignArrays), np.zeros((0, 0))
+    nowhere = Places(np.zeros(0), *2 * [np.zeros(0, dtype=bool)])
+    object.__setattr__(found, "gears", GearArrays(nowhere, none, none))
+    return found
 
 
 def autoregressive(steps: int, walkers: int, memory: float) -> np.ndarray:

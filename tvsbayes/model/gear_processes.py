@@ -11,6 +11,7 @@ from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from tvsbayes.instrument.parameters import PERIODS_MAX
@@ -23,6 +24,8 @@ FLOOR_RAD2 = 1e-24
 class GearScales(eqx.Module):
     """How large repeating errors are, over what angle they change, and how the zero drifts.
 
+    Fields may have leading axes: many points at once.
+
     Attributes:
         error_rad: sd of the transmission error's aperiodic part, by axis.
         length_rad: of its correlation and of the play's.
@@ -32,12 +35,12 @@ class GearScales(eqx.Module):
         period_rad: their periods, angle of the output.
     """
 
-    error_rad: Float[Array, "2"]
-    length_rad: Float[Array, "2"]
-    play_rad: Float[Array, "2"]
-    drift_rad_per_root_hour: Float[Array, "2"]
-    amplitude_rad: Float[Array, "2 3"]
-    period_rad: Float[Array, "2 3"]
+    error_rad: Float[Array | np.ndarray, "*batch 2"]
+    length_rad: Float[Array | np.ndarray, "*batch 2"]
+    play_rad: Float[Array | np.ndarray, "*batch 2"]
+    drift_rad_per_root_hour: Float[Array | np.ndarray, "*batch 2"]
+    amplitude_rad: Float[Array | np.ndarray, "*batch 2 3"]
+    period_rad: Float[Array | np.ndarray, "*batch 2 3"]
 
 
 class Places(eqx.Module):
@@ -59,7 +62,7 @@ def _by_axis(of_axis: Any, on_tilt: Any, functions: ModuleType) -> Any:
 
 def place_root(
     scales: GearScales, angle_rad: Any, on_tilt: Any, valid: Any, functions: ModuleType = jnp
-) -> Float[Array, "*batch errors errors"]:
+) -> Float[Array | np.ndarray, "*batch errors errors"]:
     """Lower triangular factor of the covariance of transmission errors, then plays, at places (formulation 3.1).
 
     Written for NumPy's and JAX's functions alike.

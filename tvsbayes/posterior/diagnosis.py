@@ -18,6 +18,7 @@ from tvsbayes.model.headlines import Derived
 from tvsbayes.posterior.chain import Chain
 from tvsbayes.posterior.draws import Draws, Posterior, derived_of, headline_names, propagated
 from tvsbayes.posterior.importance import ImportanceRun
+from tvsbayes.posterior.proposal import Target, place_normals
 from tvsbayes.results.convergence import Agreement, Convergence, extreme
 
 GROUPS = 4
