@@ -22,7 +22,7 @@ from tvsbayes.instrument.parameters import HARMONIC_NAMES, INDEX, NAMES, Prior
 from tvsbayes.instrument.protocols import four_point_protocol, grid_protocol
 from tvsbayes.instrument.rig import read_rig
 from tvsbayes.statistics.least_squares import laplace_draws
-from tvsbayes.twin.physics import effective_mirror_offset_mm, local_deg_per_step
+from tvsbayes.twin.physics import effective_mirror_offset_mm
 from tvsbayes.twin.simulated_campaign import SimulatedCampaign, simulate
 
 SD = 1.0
@@ -56,7 +56,7 @@ def test_truth_is_found_within_its_uncertainty(simulated, fitted):
     assert fitted.converged, fitted.problems
     pose = tuple(np.degrees(fitted.reference_pose_rad))
     true = simulated.truth.parameters
-    ratios = local_deg_per_step(true, pose)
+    ratios = simulated.truth.effective_deg_per_step(simulated.campaign)
     sd = fitted.draws.effective_deg_per_step.std(axis=0)
     z = (fitted.mode.effective_deg_per_step - [ratios[d] for d in ("left", "right", "up", "down")]) / sd
     assert np.all(np.abs(z) < FAR)

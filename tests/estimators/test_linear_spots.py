@@ -28,8 +28,11 @@ def stop_of_looks(stops: int = 7) -> np.ndarray:
     return np.repeat(np.arange(stops), 1 + np.arange(stops) % 3)
 
 
-def campaign(seed: int = 1, stops: int = 7) -> LinearSpots:
-    """Random loads and Jacobians in two segments; looks share stops, stop errors outlive moves of the other axis."""
+def campaign(seed: int = 1, stops: int = 7, places: int = 0) -> LinearSpots:
+    """Random loads and Jacobians in two segments; looks share stops, stop errors outlive moves of the other axis.
+
+    Zeros walk between stops; errors at places are seen by all looks.
+    """
     rng = np.random.default_rng(seed)
     renewed, variance = [], []
     stop_of_look = stop_of_looks(stops)
@@ -41,9 +44,11 @@ def campaign(seed: int = 1, stops: int = 7) -> LinearSpots:
         row[2:] = segment
         # Home offsets only after the first segment; unknown play as unit states.
         values = np.array([*rng.uniform(0.5, 3.0, 2), *([0.4, 0.4] if stop >= 4 else [0.0, 0.0]), 1.0, 1.0])
+        values = np.where(row, values, 0.0)
+        values[2:4] += rng.uniform(0.05, 0.2, 2)
         for look in range(np.sum(stop_of_look == stop)):
             renewed.append(row if look == 0 else np.zeros(6, bool))
-            variance.append(values)
+            variance.append(values if look == 0 else np.zeros(6))
     n = len(stop_of_look)
     slope = 3.0 * rng.standard_normal((n, 4, 2))
     play_sd = np.where(stop_of_look >= 4, rng.uniform(0.1, 0.5, n), 0.0)
@@ -53,20 +58,26 @@ def campaign(seed: int = 1, stops: int = 7) -> LinearSpots:
         renewed=np.array(renewed),
         variance=np.array(variance),
         jacobian=rng.standard_normal((n, 4, PARAMETERS)),
-        places=np.zeros((n, 4, 0)),
+        places=rng.standard_normal((n, 4, places)),
     )
 
 
 def dense_covariance(spots: LinearSpots) -> np.ndarray:
-    """C (4n, 4n): unit noise plus, for every state, one variance shared from renewal to renewal."""
+    """C (4n, 4n): unit noise, what every state is at both looks, and what all looks have of the errors at places.
+
+    From its renewal on a state's variance grows; two looks share what the earlier one found.
+    """
     n = len(spots.residual)
-    covariance = np.eye(4 * n)
+    places = spots.places.reshape(4 * n, -1)
+    covariance = np.eye(4 * n) + places @ places.T
     for state in range(6):
-        epoch = np.cumsum(spots.renewed[:, state])
-        for value in np.unique(epoch):
-            rows = epoch == value
-            load = (spots.load[:, :, state] * rows[:, None]).ravel()
-            covariance += spots.variance[np.argmax(rows), state] * np.outer(load, load)
+        load, epoch = spots.load[:, :, state], np.cumsum(spots.renewed[:, state])
+        for i in range(n):
+            for j in range(n):
+                if epoch[i] == epoch[j]:
+                    before = (epoch == epoch[i]) & (np.arange(n) <= min(i, j))
+                    shared = spots.variance[before, state].sum()
+                    covariance[4 * i : 4 * i + 4, 4 * j : 4 * j + 4] += shared * np.outer(load[i], load[j])
     return covariance
 
 
@@ -74,10 +85,10 @@ def rows_of(part: slice) -> slice:
     return slice(4 * part.start, 4 * part.stop)
 
 
-@pytest.mark.parametrize("seed", [1, 2, 3])
-def test_groups_hold_the_dense_quantities(seed):
+@pytest.mark.parametrize(("seed", "places"), [(1, 0), (2, 1), (3, 6)])
+def test_groups_hold_the_dense_quantities(seed, places):
     """Residual u = [C^-1 r], [C^-1 J], the diagonal blocks of C^-1, and J^T C^-1 J."""
-    spots = campaign(seed)
+    spots = campaign(seed, places=places)
     precision = np.linalg.inv(dense_covariance(spots))
     jacobian = spots.jacobian.reshape(-1, PARAMETERS)
     information = stop_information(spots)
@@ -93,9 +104,23 @@ def test_groups_hold_the_dense_quantities(seed):
         np.testing.assert_allclose(group.precision, precision[rows, rows], rtol=DENSE, atol=DENSE)
 
 
+@pytest.mark.parametrize("places", [0, 5])
+def test_errors_at_places_are_what_the_residuals_leave_of_them(places):
+    """N(0, 1) a priori: their mean and covariance given residual r - J dz, by the dense joint normal density."""
+    spots = campaign(places=places)
+    residual, jacobian = spots.residual.ravel(), spots.jacobian.reshape(-1, PARAMETERS)
+    # Covariance of errors and residuals is the errors' own columns.
+    gain = np.linalg.solve(dense_covariance(spots), spots.places.reshape(len(residual), places)).T
+    found = stop_information(spots)
+    np.testing.assert_allclose(found.place_mean, gain @ residual, rtol=DENSE, atol=DENSE)
+    np.testing.assert_allclose(found.place_slope, -gain @ jacobian, rtol=DENSE, atol=DENSE)
+    left = np.eye(places) - gain @ spots.places.reshape(len(residual), places)
+    np.testing.assert_allclose(found.place_covariance, left, rtol=DENSE, atol=DENSE)
+
+
 def test_leave_one_out_is_the_prediction_by_all_others():
     """Conditional mean and covariance of each spot given the rest, computed by brute force."""
-    spots = campaign()
+    spots = campaign(places=3)
     covariance, residual = dense_covariance(spots), spots.residual.ravel()
     expected = []
     for k in range(len(spots.residual)):
@@ -124,7 +149,7 @@ def test_leave_one_out_of_weighted_spots_is_that_of_full_weight():
 
 def test_standard_deviations_without_a_stop_are_those_of_a_fit_without_it():
     """Priors N(0, 1) on every coordinate; each stop is taken out of the dense problem in turn."""
-    spots = campaign()
+    spots = campaign(places=3)
     jacobian, covariance_spots = spots.jacobian.reshape(-1, PARAMETERS), dense_covariance(spots)
     information = stop_information(spots)
     posterior = np.linalg.inv(information.fisher + np.eye(PARAMETERS))
@@ -160,9 +185,10 @@ def test_outlier_of_a_stop_is_blamed_on_its_spot(seed, blamed):
     """
     spots = campaign(seed)
     rng = np.random.default_rng(100 + seed)
-    states = rng.standard_normal(spots.variance.shape) * np.sqrt(spots.variance)
-    last = np.maximum.accumulate(np.where(spots.renewed, np.arange(len(states))[:, None], 0), axis=0)
-    held = np.take_along_axis(states, last, axis=0)
+    walked = np.cumsum(rng.standard_normal(spots.variance.shape) * np.sqrt(spots.variance), axis=0)
+    before = np.concatenate([np.zeros((1, 6)), walked[:-1]])
+    last = np.maximum.accumulate(np.where(spots.renewed, np.arange(len(walked))[:, None], 0), axis=0)
+    held = walked - np.take_along_axis(before, last, axis=0)
     clean = np.einsum("nks,ns->nk", spots.load, held) + rng.standard_normal(spots.residual.shape)
     pair = np.flatnonzero(stop_of_looks() == 1)
     assert len(pair) == 2

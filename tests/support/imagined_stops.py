@@ -24,7 +24,13 @@ def linearised(residual: np.ndarray, slope: np.ndarray, angles: np.ndarray) -> L
     shapes = {"play_sd_rad": (2,), "predicted": (5,), "stop_variance": (2,), "drift_variance": (2,)}
     shapes |= {"place_columns": (4, 0)}
     shapes |= {"residual_jacobian": (4, count), "predicted_jacobian": (5, count)}
-    arrays = {"z": np.zeros(count), "place_root": np.zeros((0, 0)), "residual": residual, "slope": slope, "mirror_angles_rad": angles}
+    arrays = {
+        "z": np.zeros(count),
+        "place_root": np.zeros((0, 0)),
+        "residual": residual,
+        "slope": slope,
+        "mirror_angles_rad": angles,
+    }
     arrays |= {name: np.zeros((spots, *shape)) for name, shape in shapes.items()}
     with jax.enable_x64(True):
         return Linearised(**{name: jnp.asarray(array) for name, array in arrays.items()})

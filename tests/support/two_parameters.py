@@ -8,6 +8,7 @@ import numpy as np
 
 from tvsbayes.estimators.campaign_arrays import CampaignArrays, GearArrays
 from tvsbayes.instrument.parameters import INDEX, NAMES, PERIODS_MAX
+from tvsbayes.model.compiled import placed
 from tvsbayes.model.gear_processes import Places
 from tvsbayes.posterior.transport import GEAR_SCALES, STRETCH_NODES, Transport
 
@@ -43,13 +44,15 @@ def route() -> Transport:
 def fit() -> SimpleNamespace:
     """What a diagnosis reads of a fit."""
     free = np.isin(np.arange(len(NAMES)), [RATIO, BACKLASH])
-    return SimpleNamespace(free=free, log_density=AT_MODE, reference_pose_rad=np.zeros(2), space=None, arrays=no_places())
+    return SimpleNamespace(
+        free=free, log_density=AT_MODE, reference_pose_rad=np.zeros(2), space=None, arrays=no_places()
+    )
 
 
 def no_places() -> CampaignArrays:
     """Of a campaign's arrays what a posterior reads besides its density: gears that do not vary."""
-    found, none = object.__new__(CampaignArrays), np.zeros((0, 0))
-    nowhere = Places(np.zeros(0), *2 * [np.zeros(0, dtype=bool)])
+    found, none = object.__new__(CampaignArrays), placed(np.zeros((0, 0)))
+    nowhere = Places(placed(np.zeros(0)), *2 * [placed(np.zeros(0, dtype=bool))])
     object.__setattr__(found, "gears", GearArrays(nowhere, none, none))
     return found
 

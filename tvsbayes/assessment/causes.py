@@ -49,7 +49,9 @@ class _Told:
 def _told(fit: JointFit) -> _Told:
     readings = np.any(np.asarray(fit.arrays.spots.has_aperture) * np.asarray(fit.arrays.spots.valid))
     held = np.isin(np.arange(len(NAMES)), fit.held)
-    linear = linear_spots(fit.linearised, fit.arrays, np.where(held, 0.0, -np.asarray(fit.linearised.residual_jacobian)))
+    linear = linear_spots(
+        fit.linearised, fit.arrays, np.where(held, 0.0, -np.asarray(fit.linearised.residual_jacobian))
+    )
     both = np.concatenate([linear.jacobian, linear.places], axis=2)
     found = stop_information(replace(linear, jacobian=both, places=linear.places[..., :0]))
     gain = np.concatenate([group.jacobian for group in found.groups])

@@ -16,9 +16,9 @@ from jaxtyping import Array, Bool, Float, Int
 
 from tvsbayes.instrument.axes import APPROACH_SIGN
 from tvsbayes.instrument.campaign import Campaign, Move, Spot, ordered_spots, pixels_of
+from tvsbayes.instrument.places import SeenPlaces, gears_vary, seen_places
 from tvsbayes.instrument.rig import RigTable
 from tvsbayes.instrument.stereo_pair import triangulate
-from tvsbayes.instrument.places import SeenPlaces, gears_vary, seen_places
 from tvsbayes.instrument.stops import redraws
 from tvsbayes.model.compiled import placed
 from tvsbayes.model.gear_processes import Places
@@ -104,10 +104,10 @@ def move_arrays(moves: Sequence[Move], size: int | None = None) -> MoveArrays:
     return MoveArrays(padded(steps, size, steps[-1]), padded(first, size, False, bool), padded(approach, size))
 
 
-def place_arrays(seen: SeenPlaces) -> Places:
+def place_arrays(seen: SeenPlaces, smallest: int = SMALLEST_PLACES) -> Places:
     """Pad places to their bucket."""
     count = len(seen.steps)
-    size = bucket(count, SMALLEST_PLACES)
+    size = bucket(count, smallest)
     return Places(
         padded(seen.steps, size), padded(seen.on_tilt, size, False, bool), padded(np.ones(count), size, False, bool)
     )

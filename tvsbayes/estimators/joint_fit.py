@@ -24,7 +24,7 @@ from tvsbayes.estimators.mode_search import GATE_PROBABILITY, Problem, search_st
 from tvsbayes.instrument.campaign import Campaign, ordered_spots
 from tvsbayes.instrument.model_choice import AS_STATED, ModelChoice
 from tvsbayes.instrument.parameters import INDEX, NAMES, RIG_NAMES, Prior
-from tvsbayes.instrument.places import line_share, seen_places
+from tvsbayes.instrument.places import PLACES_MAX, line_share, seen_places
 from tvsbayes.model.compiled import placed
 from tvsbayes.model.headlines import Derived, SeenLine, derived_quantities
 from tvsbayes.model.parameter_space import ParameterSpace
@@ -268,7 +268,8 @@ def fit_at(campaign: Campaign, problem: Problem, mode: Mode, seed: int) -> Joint
     suspect = used & (chi2_spots > chi2_quantile(readings, GATE_PROBABILITY))
     pose = lin.mirror_angles_rad[used].mean(axis=0)
     seen_at = seen_places(campaign.moves, [spot.move for spot in problem.spots], campaign.rig)
-    places = place_arrays(seen_at)
+    # As many for every campaign: headlines of gears that do not vary are compiled once.
+    places = place_arrays(seen_at, 2 * PLACES_MAX)
     share = placed(np.pad(line_share(seen_at, used), (0, len(places.steps) - len(seen_at.steps))))
     seen = SeenLine(np.asarray(pose), places, share)
     count, joint = len(NAMES), with_places(mode.z, mode.covariance, information)

@@ -17,7 +17,6 @@ import numpy as np
 from tvsbayes.instrument.axes import APPROACH_SIGN, AXES, DIRECTIONS, direction_of
 from tvsbayes.instrument.campaign import Move
 
-
 SECONDS_PER_HOUR = 3600.0
 
 

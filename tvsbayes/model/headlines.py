@@ -14,8 +14,8 @@ from jaxtyping import Array, Float
 
 from tvsbayes.instrument.axes import AXES, DIRECTIONS
 from tvsbayes.model.compiled import compiled
-from tvsbayes.model.geometry import Scalar
 from tvsbayes.model.gear_processes import Places
+from tvsbayes.model.geometry import Scalar
 from tvsbayes.model.laser_path import BeamAngles, Transmission, beam_angles, trace
 from tvsbayes.model.parameter_space import Model, ParameterSpace
 
@@ -97,9 +97,9 @@ def line_deg_per_step(
     gears, places = model.transmission, seen.places
     zero = jnp.stack([jnp.zeros(()), model.tilt_zero_rad])
     ideal = places.by_axis(gears.ratio_rad_per_step) * places.steps + places.by_axis(zero)
-    # No play, no stop error, no drift: nothing but what the counter itself says.
-    count = len(places.steps)
-    turned = ideal + (place_errors_rad[:count] if place_errors_rad.size else 0.0)
+    # No play, no stop error, no drift: nothing but what the counter itself says. Gears that do not vary have no errors.
+    count = place_errors_rad.size // 2
+    turned = ideal.at[:count].add(place_errors_rad[:count])
     pan = jnp.where(places.on_tilt, seen.pose_rad[0], turned)
     tilt = jnp.where(places.on_tilt, turned, seen.pose_rad[1])
     beam = trace(model.optics, pan, tilt).direction

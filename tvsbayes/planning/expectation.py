@@ -36,9 +36,9 @@ from tvsbayes.estimators.looks import in_frame_s
 from tvsbayes.instrument.axes import HOME_SD_DEG
 from tvsbayes.instrument.campaign import Move
 from tvsbayes.instrument.parameters import NAMES, NOISE_NAMES
+from tvsbayes.instrument.places import seen_places
 from tvsbayes.instrument.plan import PlanLog, PlanStep, plan_seconds, run_plan
 from tvsbayes.instrument.rig import Rig
-from tvsbayes.instrument.places import seen_places
 from tvsbayes.instrument.stops import redraws
 from tvsbayes.model.compiled import compiled, placed
 from tvsbayes.model.geometry import image, materialise, rotation_matrix, transform

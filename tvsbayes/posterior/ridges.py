@@ -125,7 +125,8 @@ def whitening(fit: JointFit, whole: bool) -> Whitening:
 @dataclass(frozen=True)
 class Products:
     """Of the columns J, G (coordinates y; states, then errors at places in rad) and the residual r, by the inverse
-    covariance of everything else: fields as in `Transport`."""
+    covariance of everything else: fields as in `Transport`.
+    """
 
     known: np.ndarray
     load: np.ndarray

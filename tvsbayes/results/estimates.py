@@ -19,7 +19,17 @@ CONTRACTION_LIMIT = 0.1
 
 SUMMARY_KEYS = (
     *("estimator", "tier", "converged", "problems", "effective_deg_per_step", "effective_contrast_deg_per_step"),
-    *("local_deg_per_step", "range_steps", "homing_side", "reference_pose_deg", "effective_jacobian", "parameters", "noise", "weak_directions", "leverage"),
+    *(
+        "local_deg_per_step",
+        "range_steps",
+        "homing_side",
+        "reference_pose_deg",
+        "effective_jacobian",
+        "parameters",
+        "noise",
+        "weak_directions",
+        "leverage",
+    ),
     *("classic_predicted_deg_per_step", "excluded_spots", "suspect_spots", "prior_conflicts", "prior_sensitivity"),
     *("sampling", "curves", "validation", "few_stops"),
 )
