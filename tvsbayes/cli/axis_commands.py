@@ -150,7 +150,6 @@ def plan(
 ) -> None:
     """What to read next."""
     from tvsbayes.report.axis_text import axis_plan_text
-    from tvsbayes.results.records import plain
     from tvsbayes.single_axis.axis_campaign import read_axis
     from tvsbayes.single_axis.axis_record import results_for
     from tvsbayes.single_axis.next_stops import TARGETS, plan_next
@@ -165,7 +164,7 @@ def plan(
         if not results.stored:
             report_line(STORED)
         found = plan_next(results.fit, wanted, minutes=minutes, progress=job.part(PLANNING))
-    document, text = {**plain(found), "unit": data.unit, "seed": seed}, axis_plan_text(found, data.unit)
+    document, text = {**found.as_json(), "unit": data.unit, "seed": seed}, axis_plan_text(found, data.unit)
     if output is not None and found.next:
         write_atomically(output, found.plan_bytes())
         document["plan"] = str(output)

@@ -23,6 +23,7 @@ from tvsbayes.single_axis.axis_sampling import (
     run_chain,
     weighted_sample,
 )
+from tvsbayes.single_axis.classic_line import fit_line
 from tvsbayes.statistics.weighted_draws import TAILS, weighted_summary
 
 MODE, WEIGHING, WALKING, TELLING = "mode", "weighted draws", "chain", "summarising"
@@ -158,7 +159,8 @@ def model_of(campaign: AxisCampaign, more: np.ndarray | None = None) -> AxisMode
         InputError: too many moves, or angles that wrap.
     """
     rows = rows_of(campaign)
-    return AxisModel.of(rows, axis_priors(campaign.stated, rows.travel, rows.line[1]), more)
+    u = float(np.sqrt(fit_line(rows).covariance[1, 1]))
+    return AxisModel.of(rows, axis_priors(campaign.stated, rows.travel, rows.line[1], u), more)
 
 
 def fit_axis(

@@ -62,7 +62,9 @@ def _gradients(model: AxisModel, w: np.ndarray, width: np.ndarray, step: float) 
     d = w.shape[1]
     shift = np.concatenate([np.diag(step * width), np.diag(-step * width)])
     value = model.log_density((w[:, None] + shift).reshape(-1, d)).reshape(len(w), 2, d)
-    return (value[:, 0] - value[:, 1]) / (2 * step)
+    # Where a density has no value neither has its slope.
+    with np.errstate(invalid="ignore"):
+        return (value[:, 0] - value[:, 1]) / (2 * step)
 
 
 def find_mode(model: AxisModel) -> AxisMode:

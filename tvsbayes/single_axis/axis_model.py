@@ -14,65 +14,21 @@ from functools import cached_property
 import numpy as np
 
 from tvsbayes.single_axis.axis_parameters import CONTRAST_SHARE, AxisCoordinates, AxisPrior
-from tvsbayes.single_axis.axis_rows import AxisRows, legs_are_long, play_places
+from tvsbayes.single_axis.axis_rows import AxisRows, legs_are_long, play_places, reversal_of
+from tvsbayes.single_axis.process_places import ProcessPlaces, process_places
 from tvsbayes.statistics.gaussian_process import JITTER, matern52
 
-PLACES_MAX = 60
-"""Positions up to which both processes stand at every one of them; beyond it at `NODES` nodes, lines of third order
-in between."""
-NODES = 41
-OFFSET_TRAVELS = 10.0
-"""sd of the offset's prior, in travels: flat."""
-FLOOR = 1e-9
+OFFSET_TRAVELS = 1.0
+"""sd of the offset's prior about the least-squares line, in travels: flat."""
+FLOOR = 1e-7
 """Least scatter of a row, of the travel: a reading that repeats exactly was rounded."""
-NUMBERS_MAX = 3_000_000
+FARTHEST = 12.0
+"""Coordinates beyond it are impossible: a standard normal number exceeds it once in 1e32."""
+NUMBERS_MAX = 8_000_000
 """Of a block of draws held at once."""
 OFFSET, SLOPE, CONTRAST, BACKLASH = 0, 1, 2, 3
 """First columns."""
 HEAD = 4
-
-
-@dataclass(frozen=True)
-class ProcessPlaces:
-    """Where the processes of position stand.
-
-    Attributes:
-        command: their places, ascending, shape (places,).
-        exact: whether every position that was read is one of them; else places are even.
-    """
-
-    command: np.ndarray
-    exact: bool
-
-    def weights(self, command: np.ndarray) -> np.ndarray:
-        """What each place contributes at commands (n,): shape (n, places).
-
-        Raises:
-            ValueError: a command that is no place, of exact ones.
-        """
-        found = np.zeros((len(command), len(self.command)))
-        if self.exact:
-            at = np.searchsorted(self.command, command)
-            if not np.array_equal(self.command[np.minimum(at, len(self.command) - 1)], command):
-                raise ValueError("a command at which no process stands")
-            found[np.arange(len(command)), at] = 1.0
-            return found
-        spacing = self.command[1] - self.command[0]
-        first = np.clip(((command - self.command[0]) // spacing).astype(int) - 1, 0, len(self.command) - 4)
-        t = (command - self.command[first]) / spacing
-        # Lagrange's polynomial of third order through four nodes.
-        for k in range(4):
-            others = [j for j in range(4) if j != k]
-            found[np.arange(len(command)), first + k] = np.prod([(t - j) / (k - j) for j in others], axis=0)
-        return found
-
-
-def process_places(commands: np.ndarray, more: np.ndarray) -> ProcessPlaces:
-    """For rows at `commands` and whatever is asked for at `more`."""
-    every = np.unique(np.concatenate([commands, more]))
-    if len(np.unique(commands)) <= PLACES_MAX:
-        return ProcessPlaces(every, True)
-    return ProcessPlaces(np.linspace(every[0], every[-1], NODES), False)
 
 
 @dataclass(frozen=True)
@@ -160,7 +116,7 @@ class AxisModel:
         unknown = tuple(int(k) for k in rows.legs.segment[firsts[rows.legs.side[firsts] == 0]])
         lost = play_places(rows, np.array([rows.travel])).spread[0]
         unknown = tuple(k for k in unknown if np.any(lost[rows.segment == k] > 0))
-        if not unknown and legs_are_long(rows):
+        if legs_are_long(rows):
             unused.add("backlash")
         places = process_places(rows.command, np.zeros(0) if more is None else more)
         return cls(rows, dict(priors), AxisCoordinates.of(priors, frozenset(unused)), places, unknown)
@@ -194,10 +150,17 @@ class AxisModel:
     def _weights(self) -> np.ndarray:
         return self.places.weights(self.rows.command)
 
+    @cached_property
+    def _unknown_spread(self) -> np.ndarray:
+        """Half of the distance (1, rows) between the sides that a stop may lie on, by the line's reversal."""
+        reversal, error = reversal_of(self.rows)
+        return play_places(self.rows, np.array([max(abs(reversal), min(error, self.rows.travel))])).spread
+
     def _columns(self, backlash: np.ndarray, extra: np.ndarray | None) -> np.ndarray:
         """Readings less what the priors' means say, then all columns: shape (n or 1, rows, 1 + columns + extra)."""
         rows = self.rows
         play = play_places(rows, backlash if self.play_is_sampled else np.zeros(1))
+        spread = play.spread if self.play_is_sampled else self._unknown_spread
         # Draws that differ in nothing share their columns.
         blocks = len(backlash) if self.play_is_sampled else 1
         width = 1 + self.columns + (0 if extra is None else extra.shape[1])
@@ -211,7 +174,7 @@ class AxisModel:
         for k, segment in enumerate(self.homed):
             found[:, :, 1 + HEAD + k] = rows.segment == segment
         for k, segment in enumerate(self.unknown_segments):
-            found[:, :, 1 + HEAD + len(self.homed) + k] = play.spread * (rows.segment == segment)
+            found[:, :, 1 + HEAD + len(self.homed) + k] = spread * (rows.segment == segment)
         start, count = 1 + self.processes, len(self.places.command)
         found[:, :, start : start + count] = self._weights
         found[:, :, start + count : start + 2 * count] = 0.5 * play.share[:, :, None] * self._weights
@@ -296,11 +259,21 @@ class AxisModel:
     def log_density(self, w: np.ndarray) -> np.ndarray:
         """Log posterior density at coordinates (n, d) up to a constant, shape (n,); -inf where it has no value."""
         found = np.full(len(w), -np.inf)
-        usable = np.flatnonzero(np.all(np.abs(w) < 40.0, axis=1))
+        usable = np.flatnonzero(np.all(np.abs(w) < FARTHEST, axis=1))
         if len(usable):
-            value = self.log_likelihood(w[usable]) - 0.5 * np.sum(w[usable] ** 2, axis=1)
+            value = self._possible(w[usable]) - 0.5 * np.sum(w[usable] ** 2, axis=1)
             found[usable] = np.where(np.isfinite(value), value, -np.inf)
         return found
+
+    def _possible(self, w: np.ndarray) -> np.ndarray:
+        """`log_likelihood`, -inf where rounding leaves a matrix no factor."""
+        try:
+            return self.log_likelihood(w)
+        except np.linalg.LinAlgError:
+            if len(w) == 1:
+                return np.array([-np.inf])
+            middle = len(w) // 2
+            return np.concatenate([self._possible(w[:middle]), self._possible(w[middle:])])
 
     def linear(self, w: np.ndarray) -> LinearPosterior:
         """What is linear, given coordinates (n, d); means are whole, not deviations from the priors'."""
@@ -413,15 +386,24 @@ def whitened(
         p_zero = p_zero + drift * rows.hours[k]
         if rows.redrawn[k]:
             held, p_held, p_both = np.zeros((n, width)), stop[:, k], np.zeros(n)
-        variance = p_zero + 2 * p_both + p_held + reading[:, k]
+        noise = reading[:, k]
+        variance = p_zero + 2 * p_both + p_held + noise
         innovation = columns[:, k] - zero - held
         white[:, k] = innovation / np.sqrt(variance)[:, None]
         log_scatter += np.log(variance)
         gain_zero, gain_held = (p_zero + p_both) / variance, (p_held + p_both) / variance
         zero = zero + gain_zero[:, None] * innovation
-        p_zero, p_both_after = p_zero - gain_zero**2 * variance, p_both - gain_zero * gain_held * variance
         if k + 1 < count and not rows.redrawn[k + 1]:
             held = held + gain_held[:, None] * innovation
-            p_held = p_held - gain_held**2 * variance
-        p_both = p_both_after
+        # Joseph's form: differences of large variances keep the rest positive.
+        left_zero, left_held = 1 - gain_zero, 1 - gain_held
+        after_zero = left_zero**2 * p_zero - 2 * left_zero * gain_zero * p_both + gain_zero**2 * (p_held + noise)
+        after_held = left_held**2 * p_held - 2 * left_held * gain_held * p_both + gain_held**2 * (p_zero + noise)
+        p_both = (
+            (left_zero * left_held + gain_zero * gain_held) * p_both
+            - left_zero * gain_held * p_zero
+            - gain_zero * left_held * p_held
+            + gain_zero * gain_held * noise
+        )
+        p_zero, p_held = after_zero, after_held
     return white, log_scatter

@@ -71,18 +71,21 @@ def kind_of(name: str) -> Kind:
     return AXIS_KEYS[name.split(".")[0]].kind
 
 
-def axis_priors(stated: Mapping[str, AxisPrior], travel: float, per_command: float) -> dict[str, AxisPrior]:
+def axis_priors(
+    stated: Mapping[str, AxisPrior], travel: float, per_command: float, u_per_command: float = 0.0
+) -> dict[str, AxisPrior]:
     """Every prior of an axis, defaults filled in.
 
     Args:
         stated: entries of `[axis]`.
         travel: range of the readings' quantity, > 0: range of commands times |unit per command|.
         per_command: of the least-squares line: centre of a prior as wide as itself, where nothing is stated.
+        u_per_command: its standard error, which widens that prior.
     """
     priors = {}
     for name, key in AXIS_KEYS.items():
         if name == "per_command":
-            default = AxisPrior(per_command, abs(per_command))
+            default = AxisPrior(per_command, abs(per_command) + 2 * u_per_command)
         elif key.share is None:
             default = AxisPrior(1.0, key.u)
         elif key.kind == "log-normal":

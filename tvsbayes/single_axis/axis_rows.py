@@ -18,8 +18,8 @@ from tvsbayes.single_axis.axis_campaign import TURNS, AxisCampaign, AxisMove, Re
 SIDES = {"forward": 1, "backward": -1, "unknown": 0}
 DIRECTIONS = {1: "forward", -1: "backward", 0: "unknown"}
 HOUR_S = 3600.0
-ROWS_MAX = 5000
-"""Moves with readings that a fit takes: at this many a thousand draws take a minute."""
+ROWS_MAX = 2000
+"""Moves with readings that a fit takes: at this many it takes minutes."""
 LONG_LEGS, LONG_ERRORS = 2.0, 10.0
 """Where the shortest leg is so many reversals and standard errors of one long, no stop lies inside the play."""
 WRAP_SHARE = 0.7

@@ -19,8 +19,8 @@ Density = Callable[[np.ndarray], np.ndarray]
 ROUND_DRAWS, ROUNDS_MAX = 1500, 14
 EFFECTIVE_WANTED = 2000.0
 PARETO_K_MAX, HEAVIEST_MAX = 0.7, 0.02
-DEGREES, INFLATION = 6.0, 1.25
-"""Of the Student proposals: freedom, and variance over what was found."""
+DEGREES, INFLATION, WIDE = 5.0, 1.25, 6.0
+"""Of the Student proposals: freedom, and variances over what was found."""
 EQUAL_DRAWS = 2000
 """Kept of a sample, of equal weight."""
 WALKERS, BLOCK_STEPS, BURN_STEPS = 48, 150, 30
@@ -127,7 +127,7 @@ def weighted_sample(
         proposal.add(start.w, 4.0 * start.covariance, 0.3)
     else:
         d = len(start.means[0])
-        proposal = Proposal(list(start.means[-2:]), list(start.roots[-2:]), [0.5, 0.5][: len(start.means[-2:])])
+        proposal = start
     made, drawn, target, used = [], [], [], []
     k, worth, weights, w = np.inf, 0.0, np.ones(1), np.zeros((0, d))
     for number in range(1, ROUNDS_MAX + 1):
@@ -146,9 +146,9 @@ def weighted_sample(
             break
         mean, covariance = _moments(w, weights)
         proposal = Proposal()
-        proposal.add(mean, INFLATION * covariance, 0.6)
-        tail = _tail_component(w, weights, mean, covariance)
-        proposal.add(*tail, 0.4)
+        proposal.add(mean, WIDE * covariance, 0.1)
+        proposal.add(*_tail_component(w, weights, mean, covariance), 0.35)
+        proposal.add(mean, INFLATION * covariance, 0.55)
     missing = []
     if not worth >= effective:
         missing.append(f"{worth:.0f} effective draws, wanted {effective:.0f}")

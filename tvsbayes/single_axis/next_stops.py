@@ -14,6 +14,7 @@ import numpy as np
 from tvsbayes.errors import InputError
 from tvsbayes.files.csv_table import csv_bytes
 from tvsbayes.progress import Job, Show
+from tvsbayes.results.records import plain
 from tvsbayes.single_axis.axis_campaign import AxisCampaign, AxisMove, Reading
 from tvsbayes.single_axis.axis_fit import HEADLINE_DRAWS, AxisFit, headline_functionals
 from tvsbayes.single_axis.axis_model import AxisModel
@@ -48,6 +49,12 @@ class NextStop:
     gain: float
     gain_per_minute: float
 
+    @property
+    def actions(self) -> list[str]:
+        """What to do, in order."""
+        first = [] if self.via is None else [f"move {self.via:g}"]
+        return [*first, f"move {self.command:g}", "read"]
+
 
 @dataclass(frozen=True)
 class AxisPlan:
@@ -64,6 +71,11 @@ class AxisPlan:
     u_now: float
     next: tuple[NextStop, ...]
     minutes: float
+
+    def as_json(self) -> dict[str, object]:
+        """Plain types; every stop with its actions in words."""
+        steps = [{**plain(stop), "actions": stop.actions} for stop in self.next]
+        return {**plain(self), "next": steps}
 
     def plan_bytes(self) -> bytes:
         """`plan.csv`: step, command, direction, read (1 or 0)."""
@@ -91,6 +103,7 @@ def _with_stop(
     via = None
     if sign * (command - last.command) <= 0:
         via = command - sign * OVERRUN * (max(commands) - min(commands))
+        via = float(np.round(via)) if np.all(np.array(commands) == np.round(commands)) else via
         moves.append(AxisMove(len(moves), last.segment, moves[-1].time_s + seconds, via))
     moves.append(AxisMove(len(moves), last.segment, moves[-1].time_s + seconds, command))
     u = float(np.median([r.u for r in campaign.readings])) if campaign.readings else 0.0
@@ -152,6 +165,8 @@ def plan_next(
                 job.at((number + k / len(grid)) / count)
                 for direction in ("forward", "backward"):
                     longer, via = _with_stop(campaign, float(command), direction, seconds)
+                    if via is not None and not low <= via <= high:
+                        continue
                     took = (1 + (via is not None)) * seconds / 60.0
                     if minutes is not None and spent + took > minutes:
                         continue
