@@ -90,15 +90,6 @@ def forget_sides(campaign: Campaign) -> Campaign:
     return replace(campaign, moves=tuple(replace(m, **first) if m.pan_approach else m for m in campaign.moves))
 
 
-def log_evidence(result: JointFit) -> float:
-    """Laplace's ln p(data), up to the constant that all models of a campaign share.
-
-    The coordinates have N(0, 1) priors, whose (2 pi)^(-p/2) the Gaussian integral cancels; a fixed one stays at 0
-    with unit variance and adds nothing.
-    """
-    return float(result.log_density + 0.5 * np.linalg.slogdet(result.covariance)[1])
-
-
 def one_row(task: tuple[str, str, int]) -> dict[str, object]:
     """Simulate one campaign of one machine and fit the three models."""
     compile_for(96)
@@ -121,7 +112,8 @@ def one_row(task: tuple[str, str, int]) -> dict[str, object]:
             row["models"][model] = {"converged": False, "problems": [repr(error)]}
             continue
         draws, found = result.draws.physical, {"converged": bool(result.converged), "problems": list(result.problems)}
-        found["log_evidence"], found["chi2"] = log_evidence(result), result.chi2
+        found["log_evidence"], found["chi2"] = result.log_evidence, result.chi2
+        found["homing_side"] = result.homing_side
         for axis in AXES:
             for quantity in ("ratio_contrast_deg_per_step", "backlash_deg"):
                 column = draws[:, INDEX[f"{quantity}.{axis}"]]

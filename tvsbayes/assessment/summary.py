@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 
+import jax
 import numpy as np
 
 from tvsbayes.assessment.prior_sensitivity import prior_sensitivity
@@ -81,8 +82,12 @@ class _Source:
         self.fit, self.posterior = fit, posterior
         self.prior = fit.prior_draws
         if posterior is None:
-            self.centre, self.draws = fit.mode, fit.draws
-            self.weights = np.full(len(fit.draws_z), 1 / len(fit.draws_z))
+            parts = [(way.probability, way.fit.draws) for way in fit.mixture if way.fit is not None]
+            counts = [len(part.physical) for _, part in parts]
+            self.centre = fit.mode
+            self.draws = jax.tree.map(lambda *each: np.concatenate(each), *(part for _, part in parts))
+            weights = np.concatenate([np.full(n, p / n) for n, (p, _) in zip(counts, parts, strict=True)])
+            self.weights = weights / weights.sum()
         else:
             self.centre, self.draws, self.weights = posterior.centre, posterior.joined, posterior.weights.ravel()
 
@@ -283,4 +288,5 @@ def summarise(fit: JointFit, posterior: Posterior | None = None) -> FitSummary:
             for k, d in enumerate(DIRECTIONS)
         },
         range_steps=seen_range(fit),
+        homing_side=fit.homing_side,
     )

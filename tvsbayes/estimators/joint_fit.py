@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import equinox as eqx
 import jax
@@ -21,7 +21,9 @@ from tvsbayes.estimators.campaign_arrays import CampaignArrays, in_sight, place_
 from tvsbayes.estimators.likelihood import prior_errors_at_places
 from tvsbayes.estimators.linear_spots import Linearised, StopInformation, leave_one_out_chi2
 from tvsbayes.estimators.mode_search import GATE_PROBABILITY, Problem, search_stages
+from tvsbayes.instrument.axes import AXES
 from tvsbayes.instrument.campaign import Campaign, ordered_spots
+from tvsbayes.instrument.homing import ANYWHERE, every_way, homed, prior_chance, unrecorded, ways
 from tvsbayes.instrument.model_choice import AS_STATED, ModelChoice
 from tvsbayes.instrument.parameters import INDEX, NAMES, RIG_NAMES, Prior
 from tvsbayes.instrument.places import PLACES_MAX, line_share, seen_places
@@ -41,6 +43,8 @@ MISFIT_LIMIT = 20.0
 counters, not noise."""
 
 
+WORTH_A_FIT = 1e-3
+"""Probability from which a way of homing takes part in the posterior."""
 NEWTON, DIAGNOSING = "Newton steps to the mode", "diagnosing the fit"
 LAST_SECONDS = {NEWTON: 0.8, DIAGNOSING: 0.3}
 """After the search: what progress foretells with."""
@@ -49,6 +53,21 @@ LAST_SECONDS = {NEWTON: 0.8, DIAGNOSING: 0.3}
 def fit_stages(robust: bool) -> dict[str, float]:
     """Stages of a fit, with seconds."""
     return search_stages(robust) | LAST_SECONDS
+
+
+@dataclass(frozen=True)
+class Alternative:
+    """A way in which the axes may have come home.
+
+    Attributes:
+        sides: by axis.
+        probability: of all ways, by the evidence of their Laplace approximations.
+        fit: under it; None for one that is less probable than `WORTH_A_FIT`.
+    """
+
+    sides: Mapping[str, str]
+    probability: float
+    fit: JointFit | None
 
 
 @dataclass(frozen=True)
@@ -82,6 +101,8 @@ class JointFit:
         suspect_spots: ids of spots used although a clean spot would look so less often than `GATE_PROBABILITY`.
         converged: the mode was reached and is a maximum.
         problems: sentences on what failed; empty when converged.
+        sides: how the axes came home whose sides nobody recorded, as this fit has it.
+        alternatives: every way that is worth a thought, this fit's first; empty where the sides were recorded.
     """
 
     campaign: Campaign
@@ -107,6 +128,8 @@ class JointFit:
     suspect_spots: tuple[int, ...]
     converged: bool
     problems: tuple[str, ...] = ()
+    sides: Mapping[str, str] = field(default_factory=dict)
+    alternatives: tuple[Alternative, ...] = ()
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -124,7 +147,40 @@ class JointFit:
             self.log_density,
             np.stack([np.asarray(self.space.value), np.asarray(self.space.u)]),
             *(np.asarray(x)[:count] for x in (self.arrays.spots.valid, self.arrays.spots.weight)),
+            tuple(self.sides.get(axis, "") for axis in AXES),
         )
+
+    @property
+    def laplace_evidence(self) -> float:
+        """Log of the integral of the density over the estimated coordinates and of its way of homing.
+
+        By the Laplace approximation, without `campaign_arrays.log_constant`. The coordinates have N(0, 1) priors, whose
+        (2 pi)^(-p/2) the Gaussian integral cancels.
+        """
+        free = np.flatnonzero(self.free)
+        own = 0.5 * float(np.linalg.slogdet(self.covariance[np.ix_(free, free)])[1])
+        return self.log_density + own + float(np.log(prior_chance(self.sides)))
+
+    @property
+    def log_evidence(self) -> float:
+        """The same of all ways of homing together."""
+        return self.laplace_evidence - float(np.log(self.mixture[0].probability))
+
+    @property
+    def mixture(self) -> tuple[Alternative, ...]:
+        """What the posterior is made of, this fit first: itself, or the ways of homing that count."""
+        counted = tuple(way for way in self.alternatives if way.fit is not None)
+        return counted or (Alternative(self.sides, 1.0, self),)
+
+    @property
+    def homing_side(self) -> dict[str, dict[str, float]]:
+        """Probability of each way of homing, by axis whose sides nobody recorded."""
+        found: dict[str, dict[str, float]] = {}
+        for way in self.alternatives:
+            for axis, side in way.sides.items():
+                own = found.setdefault(axis, {})
+                own[side] = own.get(side, 0.0) + way.probability
+        return found
 
 
 def fit(
@@ -179,9 +235,59 @@ def fit(
             job.begin(NEWTON)
             mode = newton_mode(problem.negative_log_density, z, problem.free, problem.curvature(z))
             job.begin(DIAGNOSING)
-            return fit_at(campaign, problem, mode, seed)
+            found = fit_at(campaign, problem, mode, seed)
+            axes = unrecorded(campaign.moves)
+            return _by_homing(found, problem, axes, seed) if axes and found.converged else found
         except np.linalg.LinAlgError as error:
             raise diverged from error
+
+
+def _by_homing(found: JointFit, problem: Problem, axes: tuple[str, ...], seed: int) -> JointFit:
+    """The fit under the most probable way of homing, with all that count.
+
+    Ways of one axis are weighed with the other axis' homing left open, then together where both may matter.
+
+    Args:
+        found: under "anywhere" for every axis.
+        problem: that it came from.
+        axes: whose sides nobody recorded.
+        seed: of the Laplace draws.
+    """
+    known: dict[tuple[tuple[str, str], ...], JointFit] = {}
+
+    def under(sides: Mapping[str, str]) -> JointFit:
+        key = tuple(sorted(sides.items()))
+        if key not in known:
+            known[key] = _fit_under(found, problem, sides, seed)
+        return known[key]
+
+    def evidence(fits: Mapping[str, str]) -> float:
+        return under(fits).laplace_evidence
+
+    open_sides = dict.fromkeys(axes, ANYWHERE)
+    known[tuple(sorted(open_sides.items()))] = replace(found, sides=open_sides)
+    alone = {axis: {side: evidence({**open_sides, axis: side}) for side in ways(axis)} for axis in axes}
+    foreseen = [(sides, sum(alone[axis][side] for axis, side in sides.items())) for sides in every_way(axes)]
+    highest = max(value for _, value in foreseen)
+    told = [(sides, evidence(sides)) for sides, value in foreseen if value > highest + np.log(WORTH_A_FIT)]
+    values = np.array([value for _, value in told])
+    chance = np.exp(values - values.max())
+    chance /= chance.sum()
+    order = np.argsort(-chance)
+    best = under(told[order[0]][0])
+    alternatives = tuple(
+        Alternative(told[k][0], float(chance[k]), under(told[k][0]) if chance[k] > WORTH_A_FIT else None) for k in order
+    )
+    return replace(best, alternatives=alternatives)
+
+
+def _fit_under(found: JointFit, problem: Problem, sides: Mapping[str, str], seed: int) -> JointFit:
+    """The fit if the axes came home in these ways, from the mode of another."""
+    own = Problem(homed(found.campaign, sides), problem.table, np.asarray(found.arrays.spots.valid)[: len(problem.spots)] > 0)
+    own.arrays = eqx.tree_at(lambda a: a.spots.weight, own.arrays, problem.arrays.spots.weight)
+    z = own.alternate(found.z.copy())
+    mode = newton_mode(own.negative_log_density, z, own.free, own.curvature(z))
+    return replace(fit_at(found.campaign, own, mode, seed), sides=dict(sides))
 
 
 def _usable(campaign: Campaign, without: Collection[int]) -> Bool[np.ndarray, " spots"]:
@@ -220,12 +326,13 @@ def restored(campaign: Campaign, stored: StoredMode, seed: int = 0) -> JointFit 
     table = replace(campaign.rig, priors=priors_used(campaign.rig.priors, *stored.prior))
     valid = stored.valid > 0
     with jax.enable_x64(True):
-        problem = Problem(campaign, table, valid)
+        sides = {axis: side for axis, side in zip(AXES, stored.sides, strict=True) if side}
+        problem = Problem(homed(campaign, sides), table, valid)
         weight = np.array(problem.arrays.spots.weight)
         weight[: len(valid)] = stored.weight
         problem.arrays = eqx.tree_at(lambda a: a.spots.weight, problem.arrays, placed(weight))
         mode = Mode(stored.z, stored.covariance, -stored.log_density, ())
-        return fit_at(campaign, problem, mode, seed)
+        return replace(fit_at(campaign, problem, mode, seed), sides=sides)
 
 
 @dataclass(frozen=True)

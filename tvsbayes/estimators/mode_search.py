@@ -59,7 +59,7 @@ class Problem:
     """One campaign in front of the compiled functions."""
 
     def __init__(self, campaign: Campaign, table: RigTable, used: np.ndarray | None = None):
-        self.spots = ordered_spots(campaign)
+        self.spots, self.table = ordered_spots(campaign), table
         used = np.ones(len(self.spots), dtype=bool) if used is None else used
         self.space = parameter_space(table, campaign.stereo)
         arrays = campaign_arrays(campaign, table)

@@ -8,8 +8,10 @@ Am. Stat. Assoc. 95 (2000) 135), so that a poor first round costs little.
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+import jax
 import numpy as np
 
 from tvsbayes.errors import NotConverged
@@ -17,6 +19,7 @@ from tvsbayes.estimators.campaign_arrays import spot_constants
 from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.estimators.likelihood import no_draw
 from tvsbayes.instrument.campaign import ordered_spots
+from tvsbayes.instrument.homing import prior_chance
 from tvsbayes.instrument.parameters import NAMES
 from tvsbayes.posterior.draws import Draws, Posterior, derived_of, headline_names
 from tvsbayes.posterior.proposal import Independence, Target, first_proposal, place_normals
@@ -239,3 +242,31 @@ def importance_run(fit: JointFit, seed: int, advance: Advance = unshown) -> Impo
             wanted = min(ROUNDS_MAX, max(rounds + 1, int(enough)))
     except FloatingPointError as error:
         raise NotConverged("no-density", str(error), remedy="see the weak directions of --no-sample") from error
+
+
+def mixed(parts: Sequence[Posterior]) -> Posterior:
+    """One posterior of the fits under several ways of homing, by their evidence and prior probabilities.
+
+    Args:
+        parts: by importance sampling, of `JointFit.mixture` in its order.
+    """
+    first = parts[0]
+    evidence = np.array([part.convergence.importance.log_evidence for part in parts])
+    evidence += np.log([prior_chance(part.fit.sides) for part in parts])
+    chance = np.exp(evidence - evidence.max())
+    chance /= chance.sum()
+    worst = min(parts, key=lambda part: (part.converged, part.convergence.importance.least_ess.value))
+    ways = tuple(
+        replace(way, probability=float(p))
+        for way, p in zip([way for way in first.fit.mixture if way.fit is not None], chance, strict=True)
+    )
+    return replace(
+        first,
+        fit=replace(first.fit, alternatives=ways),
+        z=np.concatenate([part.z for part in parts], axis=1),
+        log_density=np.concatenate([part.log_density for part in parts], axis=1),
+        draws=jax.tree.map(lambda *each: np.concatenate(each, axis=1), *(part.draws for part in parts)),
+        weights=np.concatenate([p * part.weights for p, part in zip(chance, parts, strict=True)], axis=1),
+        convergence=worst.convergence,
+        seconds=sum(part.seconds for part in parts),
+    )

@@ -12,7 +12,7 @@ from tvsbayes.errors import NotConverged
 from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.posterior.chain import stored_chain
 from tvsbayes.posterior.draws import Posterior
-from tvsbayes.posterior.importance import importance_run
+from tvsbayes.posterior.importance import importance_run, mixed
 from tvsbayes.progress import Job, Show
 
 TIERS = ("importance", "emcee")
@@ -77,11 +77,16 @@ def sample(
         else:
             job.begin(DRAWING)
             start, chain = importance_run(fit, seed, job.at), None
+        early = start.posterior
+        if len(fit.mixture) > 1:
+            early = mixed([early, *(importance_run(way.fit, seed).posterior for way in fit.mixture[1:] if way.fit)])
         if tier == "importance":
-            return start.posterior
+            return early
         if first is not None:
-            first(start.posterior)
+            first(early)
         from tvsbayes.posterior.ensemble import Run
 
         job.begin(WALKING)
-        return Run(fit, start, chain, checkpoint, job.at, began).until_converged(60 * max_minutes)
+        walked = Run(fit, start, chain, checkpoint, job.at, began).until_converged(60 * max_minutes)
+        # A chain knows one way of homing; where others count, the weighted draws of all have the last word.
+        return early if len(fit.mixture) > 1 and walked.converged else walked

@@ -21,7 +21,9 @@ from tvsbayes.calibration.calibration_file import (
 )
 from tvsbayes.calibration.pointing import Calibration
 from tvsbayes.files.disk import make_folder, read_arrays, write_atomically
+from tvsbayes.instrument.axes import AXES, SENSES
 from tvsbayes.instrument.campaign import Campaign
+from tvsbayes.instrument.homing import ANYWHERE
 from tvsbayes.results.fit_record import FitRecord
 
 
@@ -35,6 +37,7 @@ class StoredMode:
         log_density: at the mode.
         prior: value and u of every parameter of the rig that the fit used, shape (2, r).
         valid, weight: whether each spot, in the order of the fit, was used, and its weight; shape (spots,).
+        sides: how pan and tilt came home, as the fit has it; "" where the campaign recorded it.
     """
 
     names: tuple[str, ...]
@@ -44,6 +47,7 @@ class StoredMode:
     prior: np.ndarray
     valid: np.ndarray
     weight: np.ndarray
+    sides: tuple[str, ...] = ("", "")
 
 
 @dataclass(frozen=True)
@@ -78,6 +82,7 @@ def _draws_bytes(
     if mode is not None:
         arrays |= {f"mode_{name}": getattr(mode, name) for name in _MODE_ARRAYS}
         arrays["mode_log_density"] = np.array(mode.log_density)
+        arrays["mode_sides"] = np.array(mode.sides)
     return calibration_bytes(calibration, **arrays)
 
 
@@ -134,6 +139,9 @@ def stored_mode(campaign: Campaign) -> StoredMode | None:
             raise ValueError("a mode of another shape")
         if log_density.shape or not all(np.isfinite(array).all() for array in (*found.values(), log_density)):
             raise ValueError("a mode that is not finite")
-        return StoredMode(names, log_density=float(log_density), **found)
+        sides = tuple(map(str, file["mode_sides"].tolist())) if "mode_sides" in file else ("", "")
+        if any(side not in ("", ANYWHERE, *SENSES[axis]) for axis, side in zip(AXES, sides, strict=True)):
+            raise ValueError("a way of homing that there is not")
+        return StoredMode(names, log_density=float(log_density), sides=sides, **found)
     except (KeyError, TypeError, ValueError) as error:
         raise damaged_calibration(path, error) from error
