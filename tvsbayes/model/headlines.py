@@ -96,24 +96,30 @@ def line_deg_per_step(
     """
     gears, places = model.transmission, seen.places
     zero = jnp.stack([jnp.zeros(()), model.tilt_zero_rad])
-    ideal = places.by_axis(gears.ratio_rad_per_step) * places.steps + places.by_axis(zero)
-    # No play, no stop error, no drift: nothing but what the counter itself says. Gears that do not vary have no errors.
-    count = place_errors_rad.size // 2
-    turned = ideal.at[:count].add(place_errors_rad[:count])
-    pan = jnp.where(places.on_tilt, seen.pose_rad[0], turned)
-    tilt = jnp.where(places.on_tilt, turned, seen.pose_rad[1])
-    beam = trace(model.optics, pan, tilt).direction
-    azimuth, elevation = jnp.arctan2(beam.y, beam.x), jnp.arctan2(beam.z, jnp.hypot(beam.x, beam.y))
-    # The beam turns with the mirrors but for degrees: the rest tells on which turn it is.
-    rest = jnp.where(places.on_tilt, elevation, azimuth) - turned
-    rest = rest - jnp.round(rest / (2 * jnp.pi)) * (2 * jnp.pi)
-    parts = seen.share * (turned + rest)
+    counted = places.by_axis(gears.ratio_rad_per_step) * places.steps
+    # No play, no stop error, no drift: nothing but what the counter itself says.
+    shaped = gears.harmonics.error_rad(jnp.stack([counted, counted], axis=1))
+    error = jnp.where(places.on_tilt, shaped[:, 1], shaped[:, 0])
+    if place_errors_rad.size:
+        error = error + place_errors_rad[: len(places.steps)]
+
+    def slope(turned: Float[Array, " places"]) -> Float[Array, "2"]:
+        pan = jnp.where(places.on_tilt, seen.pose_rad[0], turned)
+        tilt = jnp.where(places.on_tilt, turned, seen.pose_rad[1])
+        beam = trace(model.optics, pan, tilt).direction
+        azimuth, elevation = jnp.arctan2(beam.y, beam.x), jnp.arctan2(beam.z, jnp.hypot(beam.x, beam.y))
+        # The beam turns with the mirrors but for degrees: the rest tells on which turn it is.
+        rest = jnp.where(places.on_tilt, elevation, azimuth) - turned
+        parts = seen.share * (turned + rest - jnp.round(rest / (2 * jnp.pi)) * (2 * jnp.pi))
+        return jnp.sum(jnp.where(own, parts, 0.0), axis=1)
+
     own = jnp.stack([~places.on_tilt, places.on_tilt])
-    slope = jnp.sum(jnp.where(own, parts, 0.0), axis=1)
-    lined = jnp.any(own & (seen.share != 0), axis=1)
-    slope = jnp.where(lined, slope, gears.ratio_rad_per_step * jnp.diagonal(mirrors.jacobian))
-    half = 0.5 * gears.contrast_rad_per_step * slope / gears.ratio_rad_per_step
-    return jnp.stack([slope + half, slope - half], axis=1).ravel() * DEGREES
+    lined, local = jnp.any(own & (seen.share != 0), axis=1), jnp.diagonal(mirrors.jacobian)
+    ideal = counted + places.by_axis(zero)
+    whole = jnp.where(lined, slope(ideal + error), gears.ratio_rad_per_step * local)
+    of_mirrors = jnp.where(lined, slope(ideal) / gears.ratio_rad_per_step, local)
+    half = 0.5 * gears.contrast_rad_per_step * of_mirrors
+    return jnp.stack([whole + half, whole - half], axis=1).ravel() * DEGREES
 
 
 @compiled(Derived)

@@ -144,7 +144,7 @@ class Posterior:
     @property
     def joined(self) -> Derived:
         """All draws, chains joined: every field of `draws` with one leading axis."""
-        return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), self.draws)
+        return jax.tree.map(lambda x: x.reshape(self.weights.size, *x.shape[2:]), self.draws)
 
     @property
     def centre(self) -> Derived:
