@@ -3,6 +3,8 @@
  * Frame T: origin mid-baseline, x depth, y along the baseline towards the positioner, z up; mm.
  * Counters are absolute steps after homing; a side is +1 (reached left or up) or -1 (right or down).
  * To arrive on a side, start TVS_OVERSHOOT_*_STEPS before the target on the other side of it.
+ * Errors of the gears (transmission error, change of play) are interpolated in tables over the counters; ask
+ * tvs_extrapolated whether the campaign looked there: outside, tvs_error_u_deg tells how little is known.
  */
 #ifndef TVS_CALIBRATION_H
 #define TVS_CALIBRATION_H
@@ -31,17 +33,69 @@ static double tvs_output_deg(double steps, int side, double ratio, double backla
     return angle;
 }
 
+/* A table of regular counters at a counter (cubic interpolation), and what holds beyond the table. */
+static double tvs_table(const double *table, int size, double first, double last, double steps, double beyond)
+{
+    double found = 0, at = last > first ? (steps - first) * (size - 1) / (last - first) : 0;
+    int begin = 0;
+    if (last > first && (steps < first || steps > last))
+        return beyond;
+    while (begin < size - 4 && at >= begin + 2)
+        begin++;
+    for (int k = 0; k < 4; k++) {
+        double share = table[begin + k];
+        for (int other = 0; other < 4; other++)
+            if (other != k)
+                share *= (at - begin - other) / (k - other);
+        found += share;
+    }
+    return found;
+}
+
+/* Whether no look of the campaign reached these counters. */
+static int tvs_extrapolated(double pan_steps, double tilt_steps)
+{
+    return !(pan_steps >= TVS_SEEN_PAN_LOW && pan_steps <= TVS_SEEN_PAN_HIGH && tilt_steps >= TVS_SEEN_TILT_LOW &&
+             tilt_steps <= TVS_SEEN_TILT_HIGH);
+}
+
+/* What errors of the gears add to the mirror angle of pan (0) or tilt (1) at a counter, degrees. */
+static double tvs_gear_deg(int tilt, double steps, int side)
+{
+    if (tilt)
+        return tvs_table(TVS_ERROR_TILT_DEG, TVS_TABLE_TILT_SIZE, TVS_TABLE_TILT_FIRST, TVS_TABLE_TILT_LAST, steps, 0) -
+               0.5 * side *
+                   tvs_table(TVS_PLAY_TILT_DEG, TVS_TABLE_TILT_SIZE, TVS_TABLE_TILT_FIRST, TVS_TABLE_TILT_LAST, steps, 0);
+    return tvs_table(TVS_ERROR_PAN_DEG, TVS_TABLE_PAN_SIZE, TVS_TABLE_PAN_FIRST, TVS_TABLE_PAN_LAST, steps, 0) -
+           0.5 * side *
+               tvs_table(TVS_PLAY_PAN_DEG, TVS_TABLE_PAN_SIZE, TVS_TABLE_PAN_FIRST, TVS_TABLE_PAN_LAST, steps, 0);
+}
+
+/* Standard uncertainty of the transmission error and of half the change of play there, degrees. */
+static inline double tvs_error_u_deg(int tilt, double steps)
+{
+    double error = tilt ? tvs_table(TVS_ERROR_U_TILT_DEG, TVS_TABLE_TILT_SIZE, TVS_TABLE_TILT_FIRST,
+                                    TVS_TABLE_TILT_LAST, steps, TVS_BEYOND_TILT_ERROR_U_DEG)
+                        : tvs_table(TVS_ERROR_U_PAN_DEG, TVS_TABLE_PAN_SIZE, TVS_TABLE_PAN_FIRST, TVS_TABLE_PAN_LAST,
+                                    steps, TVS_BEYOND_PAN_ERROR_U_DEG);
+    double play = tilt ? tvs_table(TVS_PLAY_U_TILT_DEG, TVS_TABLE_TILT_SIZE, TVS_TABLE_TILT_FIRST, TVS_TABLE_TILT_LAST,
+                                   steps, TVS_BEYOND_TILT_PLAY_U_DEG)
+                       : tvs_table(TVS_PLAY_U_PAN_DEG, TVS_TABLE_PAN_SIZE, TVS_TABLE_PAN_FIRST, TVS_TABLE_PAN_LAST,
+                                   steps, TVS_BEYOND_PAN_PLAY_U_DEG);
+    return sqrt(error * error + 0.25 * play * play);
+}
+
 /* Mirror angles in degrees. */
 static double tvs_pan_deg(double steps, int side)
 {
-    return tvs_output_deg(steps, side, TVS_DEGREES_PER_STEP_PAN, TVS_BACKLASH_DEG_PAN, TVS_PERIOD_PAN_DEG,
+    return tvs_gear_deg(0, steps, side) + tvs_output_deg(steps, side, TVS_DEGREES_PER_STEP_PAN, TVS_BACKLASH_DEG_PAN, TVS_PERIOD_PAN_DEG,
                           TVS_HARMONIC_DEG_PAN_1_COS, TVS_HARMONIC_DEG_PAN_1_SIN, TVS_HARMONIC_DEG_PAN_2_COS,
                           TVS_HARMONIC_DEG_PAN_2_SIN);
 }
 
 static double tvs_tilt_deg(double steps, int side)
 {
-    return TVS_TILT_ZERO_DEG + tvs_output_deg(steps, side, TVS_DEGREES_PER_STEP_TILT, TVS_BACKLASH_DEG_TILT,
+    return TVS_TILT_ZERO_DEG + tvs_gear_deg(1, steps, side) + tvs_output_deg(steps, side, TVS_DEGREES_PER_STEP_TILT, TVS_BACKLASH_DEG_TILT,
                                               TVS_PERIOD_TILT_DEG, TVS_HARMONIC_DEG_TILT_1_COS,
                                               TVS_HARMONIC_DEG_TILT_1_SIN, TVS_HARMONIC_DEG_TILT_2_COS,
                                               TVS_HARMONIC_DEG_TILT_2_SIN);
@@ -92,7 +146,8 @@ static void tvs_beam(double pan_steps, double tilt_steps, int pan_side, int tilt
     }
 }
 
-/* The point where the beam meets what the aperture read, frame T, mm; returns 0 where they do not meet. */
+/* The point where the beam meets what the aperture read, frame T, mm; returns 0 where they do not meet, 1 where they
+ * do, 2 where they do at counters at which the campaign never looked. */
 static int tvs_locate(double pan_steps, double tilt_steps, int pan_side, int tilt_side, double aperture_deg,
                       double xyz[3])
 {
@@ -116,7 +171,7 @@ static int tvs_locate(double pan_steps, double tilt_steps, int pan_side, int til
         return 0;
     for (int i = 0; i < 3; i++)
         xyz[i] = o[i] + reach * d[i];
-    return 1;
+    return tvs_extrapolated(pan_steps, tilt_steps) ? 2 : 1;
 }
 
 #endif

@@ -23,7 +23,8 @@ from support.printed_vector import LAST_6, LAST_9, LAST_12, VECTOR
 from support.refusals import refusal
 from support.two_poses import POSES
 
-from tvsbayes.calibration.pointing import DIVERGING_SHARE, INPUT_NAMES, NOISE_NAMES, drawn
+from tvsbayes.calibration.drawn_looks import drawn
+from tvsbayes.calibration.pointing import DIVERGING_SHARE, INPUT_NAMES, NOISE_NAMES
 from tvsbayes.coordinates.location import carry, locate, locate_linear, settings_of
 from tvsbayes.errors import InputError
 from tvsbayes.statistics.intervals import NORMAL_95

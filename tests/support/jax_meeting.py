@@ -16,7 +16,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from tvsbayes.calibration.optics import ROUNDING
-from tvsbayes.calibration.pointing import INPUT_NAMES, NOISE_NAMES, NOISES, Calibration, Drawn
+from tvsbayes.calibration.drawn_looks import Drawn
+from tvsbayes.calibration.pointing import INPUT_NAMES, NOISE_NAMES, NOISES, Calibration
 from tvsbayes.coordinates.location import Settings
 from tvsbayes.instrument.axes import AXES, FULL_TURN_DEG
 from tvsbayes.instrument.parameters import INDEX, NAMES
@@ -143,7 +144,7 @@ def half_baseline(baseline_mm: Scalar) -> Vectors:
 
 def model_from(inputs: Float[Array, " columns"], period_deg: Float[Array, "2"]) -> Model:
     """A model that knows what coordinates depend on; its cameras are empty."""
-    return model_of(jnp.zeros(len(NAMES)).at[INPUT_COLUMNS].set(inputs), period_deg)
+    return model_of(jnp.zeros(len(NAMES)).at[INPUT_COLUMNS].set(inputs), jnp.tile(period_deg[:, None], 3))
 
 
 def look(calibration: Calibration, inputs: Array, noise: Array, settings: Settings) -> Meeting:

@@ -73,19 +73,24 @@ class Causes:
 
     Attributes:
         names: causes.
-        covariance: their parts, shape (causes, inputs, inputs), ordered as `INPUT_NAMES`; they add up.
+        covariance: their parts, shape (causes, inputs, inputs), ordered as `INPUT_NAMES`, then what else was asked
+            for; they add up.
     """
 
     names: tuple[str, ...]
     covariance: np.ndarray
 
 
-def causes_of(fit: JointFit) -> Causes:
+def causes_of(fit: JointFit, by_places: np.ndarray | None = None) -> Causes:
     """Split the covariance of a fit by cause (formulation 5).
 
     An estimate moves by S J^T C^-1 e when the data err by e, and by S e_j when prior j is off by its sd, S the
     posterior covariance. With C = 1 + (stop errors) the parts S (C^-1 J)^T (C^-1 J) S, S (J^T C^-1 J - that) S and
     S e_j e_j^T S add up to S. Expected information about geometry and cameras; noise scales are taken as known.
+
+    Args:
+        fit: a converged fit.
+        by_places: further inputs, as d(input)/d(errors at places, N(0, 1) a priori), shape (inputs, errors).
     """
     told = _told(fit)
     parts = {told.pixels: told.by_pixels, STOP_ERRORS: told.by_stops}
@@ -96,6 +101,8 @@ def causes_of(fit: JointFit) -> Causes:
     inputs = [INDEX[name] for name in INPUT_NAMES]
     slope = np.asarray(physical_at(fit.z, fit.space).slope)[inputs]
     spread = slope @ told.posterior[: len(NAMES)]
+    if by_places is not None:
+        spread = np.concatenate([spread, by_places @ told.posterior[len(NAMES) :]])
     covariance = {name: spread @ part @ spread.T for name, part in parts.items()}
     # A prior that was fixed, or that no coordinate hangs on, is no cause.
     kept = {name: c for name, c in covariance.items() if np.any(np.diag(c) > 0)}

@@ -11,7 +11,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from tvsbayes.assessment.causes import causes_of
+from tvsbayes.assessment.causes import PLAY_VARIATION, TRANSMISSION_ERROR, Causes, causes_of
+from tvsbayes.assessment.gear_tables import DrawnGears, drawn_gears
+from tvsbayes.calibration.gear_table import NO_GEARS, GearTable
+from tvsbayes.calibration.optics import ERROR_AT, PLAY_AT
 from tvsbayes.calibration.pointing import INPUT_NAMES, NOISE_NAMES, Calibration
 from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.instrument.axes import AXES
@@ -26,7 +29,12 @@ DRAWS_KEPT = 4096
 
 
 def calibration_of_draws(
-    names: tuple[str, ...], physical: np.ndarray, campaign: Campaign, estimator: str, seed: int
+    names: tuple[str, ...],
+    physical: np.ndarray,
+    campaign: Campaign,
+    estimator: str,
+    seed: int,
+    gears: DrawnGears | None = None,
 ) -> Calibration:
     """Choose the columns that coordinates depend on.
 
@@ -39,6 +47,7 @@ def calibration_of_draws(
         campaign: what was fitted.
         estimator: "posterior" or "laplace".
         seed: of the draws from priors.
+        gears: errors of the gears that the draws allow; None where gears do not vary.
     """
     column = {name: physical[:, i] for i, name in enumerate(names)}
     generator = np.random.default_rng([seed, 5])
@@ -55,24 +64,43 @@ def calibration_of_draws(
             column[name] = prior.value * np.exp(prior.u * off) if log else prior.value + prior.u * off
     inputs = np.stack([column[name] for name in INPUT_NAMES], axis=1)
     noise = np.stack([column[name] for name in NOISE_NAMES], axis=1)
-    counters = np.array([(m.pan_steps, m.tilt_steps) for m in campaign.moves], dtype=float)
+    table = NO_GEARS if gears is None else gears.table
+    if gears is not None:
+        inputs = np.concatenate([inputs, gears.expected + gears.left_open], axis=1)
+    mean = inputs.mean(axis=0)
+    # Means of what nobody knows are nought but for rounding.
+    mean[len(INPUT_NAMES) + np.array([part.stop - 1 for part in table.parts.values()], dtype=int)] = 0.0
     return Calibration(
-        mean=inputs.mean(axis=0),
+        mean=mean,
         covariance=np.cov(inputs, rowvar=False),
         noise_variance=dict(zip(NOISE_NAMES, (noise**2).mean(axis=0).tolist(), strict=True)),
-        overshoot_steps={axis: _overshoot_steps(column, axis) for axis in AXES},
+        overshoot_steps={axis: _overshoot_steps(column, axis, _widest(table, inputs, axis)) for axis in AXES},
         azimuth=campaign.rig.aperture_convention == "azimuth",
         period_deg=campaign.rig.first_period_deg,
         estimator=estimator,
-        range_steps=np.stack([counters.min(axis=0), counters.max(axis=0)], axis=1),
+        range_steps=_range_steps(campaign),
         inputs_sha256=input_hashes(campaign),
         inputs=inputs,
         noise=noise,
+        gears=table,
     )
 
 
-def _overshoot_steps(column: Mapping[str, np.ndarray], axis: str) -> int:
-    play_steps = column[f"backlash_deg.{axis}"] / np.abs(column[f"degrees_per_step.{axis}"])
+def _range_steps(campaign: Campaign) -> np.ndarray:
+    """Lowest and highest counter of each axis that a look saw, shape (2, 2)."""
+    seen = [campaign.moves[spot.move] for spot in campaign.spots if spot.status == "ok"]
+    counters = np.array([(m.pan_steps, m.tilt_steps) for m in seen], dtype=float)
+    return np.stack([counters.min(axis=0), counters.max(axis=0)], axis=1)
+
+
+def _widest(table: GearTable, inputs: np.ndarray, axis: str) -> np.ndarray | float:
+    """What the play of each draw gains at most where it varies, deg."""
+    part = table.parts.get(f"{PLAY_AT}.{axis}")
+    return 0.0 if part is None else np.maximum(inputs[:, len(INPUT_NAMES) :][:, part].max(axis=1), 0.0)
+
+
+def _overshoot_steps(column: Mapping[str, np.ndarray], axis: str, widest_deg: np.ndarray | float) -> int:
+    play_steps = (column[f"backlash_deg.{axis}"] + widest_deg) / np.abs(column[f"degrees_per_step.{axis}"])
     return math.ceil(np.quantile(play_steps, CLEARED_PROBABILITY))
 
 
@@ -90,6 +118,21 @@ def calibration_of(fit: JointFit, posterior: Posterior | None = None, *, seed: i
     draws, estimator = fit.draws, "laplace"
     if posterior is not None and posterior.converged:
         draws, estimator = posterior.thinned(DRAWS_KEPT), "posterior"
-    found = calibration_of_draws(fit.names, np.asarray(draws.physical), fit.campaign, estimator, seed)
-    causes = causes_of(fit)
+    physical = np.asarray(draws.physical)
+    gears = drawn_gears(fit, physical, np.asarray(draws.place_errors_rad), seed)
+    found = calibration_of_draws(fit.names, physical, fit.campaign, estimator, seed, gears)
+    causes = _with_left_open(causes_of(fit, gears.by_places), gears) if gears.table.size else causes_of(fit)
     return replace(found, causes=causes.names, cause_covariance=causes.covariance)
+
+
+def _with_left_open(causes: Causes, gears: DrawnGears) -> Causes:
+    """Causes, with what the looks leave open of the gears' errors between and beyond the counters seen."""
+    parts, first = dict(zip(causes.names, causes.covariance, strict=True)), len(INPUT_NAMES)
+    for name, part in gears.table.parts.items():
+        cause = TRANSMISSION_ERROR if name.startswith(ERROR_AT) else PLAY_VARIATION
+        own = np.zeros(causes.covariance.shape[1:])
+        place = slice(first + part.start, first + part.stop)
+        own[place, place] = np.cov(gears.left_open[:, part], rowvar=False)
+        if np.any(own):
+            parts[cause] = parts.get(cause, 0.0) + own
+    return Causes(tuple(parts), np.stack(list(parts.values())))

@@ -6,7 +6,7 @@ Frame T (see `optics`), mm, degrees, counters in steps; best estimates in Python
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -32,6 +32,7 @@ class Steps:
         aperture_deg: what the aperture should read there, or None.
         rounding_mm, rounding_deg: distance from the wanted point or direction that whole steps leave.
         u95_mm, u95_deg: 95 % half widths of the beam's position at the point (3,), or of its azimuth and elevation.
+        extrapolated: no look of the campaign reached these counters: errors of the gears are extrapolated.
     """
 
     pan_steps: int
@@ -46,6 +47,7 @@ class Steps:
     rounding_deg: float | None = None
     u95_mm: np.ndarray | None = None
     u95_deg: np.ndarray | None = None
+    extrapolated: bool = False
 
     def as_json(self) -> dict[str, object]:
         """The document of `steps-for`."""
@@ -55,7 +57,7 @@ class Steps:
 
         document = {key: plain(value) for key, value in vars(self).items() if key not in ("ray", "approach")}
         document["approach"] = dict(zip(AXES, self.approach, strict=True))
-        document["ray"] = {key: plain(value) for key, value in vars(self.ray).items()}
+        document["ray"] = {key: plain(getattr(self.ray, key)) for key in ("origin_mm", "direction")}
         return document
 
 
@@ -139,21 +141,26 @@ class Drive:
 
     Attributes:
         axis: pan or tilt.
-        values: best estimates by name.
+        values_at: best estimates by name, with the errors of the gears at a counter of this axis.
         period_deg: period of its transmission error, None without one.
         overshoot_steps: steps that take up all its play.
     """
 
     axis: str
-    values: Mapping[str, float]
+    values_at: Callable[[float], Mapping[str, float]]
     period_deg: float | None
     overshoot_steps: int
 
+    @property
+    def ratio(self) -> float:
+        """Mean degrees per step."""
+        return self.values_at(0.0)[f"degrees_per_step.{self.axis}"]
+
     def counter(self, angle_deg: float, side: int) -> int:
         """The counter whose mirror angle is nearest to the wanted one, reached on a side (+1 left or up, -1)."""
-        ratio, steps = self.values[f"degrees_per_step.{self.axis}"], 0.0
+        ratio, steps = self.ratio, 0.0
         for _ in range(AIM_STEPS):
-            at = output_deg(self.values, self.axis, steps, side, self.period_deg, math)
+            at = output_deg(self.values_at(steps), self.axis, steps, side, self.period_deg, math)
             change = float((angle_deg - at) / ratio)
             steps += change
             if abs(change) < 1e-9:
@@ -178,7 +185,7 @@ class Drive:
                 raise bad_approach(self.axis, name, SIDES[self.axis][::-1])
             sign = APPROACH_SIGN[name]
             steps = self.counter(angle_deg, sign)
-            ratio_sign = 1 if self.values[f"degrees_per_step.{self.axis}"] > 0 else -1
+            ratio_sign = 1 if self.ratio > 0 else -1
             first = steps - sign * ratio_sign * self.overshoot_steps
             if low <= steps <= high and low <= first <= high:
                 return Arrival(name, steps, first)

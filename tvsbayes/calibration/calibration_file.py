@@ -12,10 +12,12 @@ import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TypedDict, cast
+from typing import NotRequired, TypedDict, cast
 
 import numpy as np
 
+from tvsbayes.calibration.gear_table import NO_GEARS, table_of
+from tvsbayes.calibration.optics import ERROR_AT, PLAY_AT
 from tvsbayes.calibration.pointing import INPUT_NAMES, NOISE_NAMES, Calibration
 from tvsbayes.errors import InputError, escaped
 from tvsbayes.files.disk import read_arrays, read_bytes, shipped_data
@@ -23,12 +25,15 @@ from tvsbayes.files.documents import parse_json
 from tvsbayes.instrument.axes import AXES
 from tvsbayes.instrument.campaign import Campaign, input_hashes
 
-CALIBRATION_FORMAT = "tvsbayes-calibration/1"
+CALIBRATION_FORMAT = "tvsbayes-calibration/2"
+FORMATS = ("tvsbayes-calibration/1", CALIBRATION_FORMAT)
+"""What is read; the first one knows no errors of the gears."""
 NO_CALIBRATION = "no-calibration"
 """Code of the refusal of results that are whole but hold no calibration."""
 RESULTS_BYTES_MAX = 64 * 1024 * 1024
 UNPACKED_BYTES_MAX = 2 * RESULTS_BYTES_MAX
 NAME_CHARS_MAX = 200
+_TABLED = ("transmission_error_deg", "u_transmission_error_deg", "play_variation_deg", "u_play_variation_deg")
 _ARRAYS = ("mean", "covariance", "range_steps", "inputs", "noise", "cause_covariance")
 
 
@@ -40,6 +45,7 @@ class _Tables(TypedDict):
     period_deg: Mapping[str, float]
     inputs_sha256: Mapping[str, str]
     causes: list[str]
+    gear_steps: NotRequired[Mapping[str, list[float]]]
 
 
 class _Moments(TypedDict):
@@ -47,6 +53,18 @@ class _Moments(TypedDict):
 
     names: list[str]
     matrix: list[list[float]]
+
+
+class _GearErrors(TypedDict):
+    """Errors of one axis at regular counters, and beyond them, with their standard uncertainties; deg."""
+
+    steps: list[float]
+    transmission_error_deg: list[float]
+    u_transmission_error_deg: list[float]
+    play_variation_deg: list[float]
+    u_play_variation_deg: list[float]
+    beyond_u_transmission_error_deg: float
+    beyond_u_play_variation_deg: float
 
 
 class CalibrationDocument(TypedDict):
@@ -61,6 +79,7 @@ class CalibrationDocument(TypedDict):
     noise_variance_deg2: Mapping[str, float]
     overshoot_steps: Mapping[str, int]
     range_steps: Mapping[str, list[float]]
+    gear_errors: NotRequired[Mapping[str, _GearErrors]]
     inputs: Mapping[str, str]
     expected_error: dict[str, object]
 
@@ -73,6 +92,7 @@ def calibration_bytes(calibration: Calibration, **more: np.ndarray) -> bytes:
         period_deg=calibration.period_deg,
         inputs_sha256=calibration.inputs_sha256,
         causes=list(calibration.causes),
+        gear_steps=_gear_steps(calibration),
     )
     arrays = {name: getattr(calibration, name) for name in _ARRAYS} | more
     buffer = io.BytesIO()
@@ -97,13 +117,43 @@ def calibration_json(calibration: Calibration) -> CalibrationDocument:
         "aperture_convention": "azimuth" if calibration.azimuth else "in-plane",
         "harmonic_period_deg": dict(calibration.period_deg),
         "estimates": calibration.estimates,
-        "covariance": {"names": list(INPUT_NAMES), "matrix": calibration.covariance.tolist()},
+        "covariance": {
+            "names": [*INPUT_NAMES, *calibration.gears.names],
+            "matrix": calibration.covariance.tolist(),
+        },
         "noise_variance_deg2": dict(calibration.noise_variance),
         "overshoot_steps": dict(calibration.overshoot_steps),
         "range_steps": dict(zip(AXES, calibration.range_steps.tolist(), strict=True)),
+        "gear_errors": _gear_errors(calibration),
         "inputs": dict(calibration.inputs_sha256),
         "expected_error": asdict(expected_error(calibration)),
     }
+
+
+def _gear_steps(calibration: Calibration) -> dict[str, list[float]]:
+    """Table counters by axis."""
+    return {axis: list(steps) for axis, steps in zip(AXES, calibration.gears.steps, strict=True)}
+
+
+def _gear_errors(calibration: Calibration) -> dict[str, _GearErrors]:
+    """The table by axis; empty where gears do not vary."""
+    first, table = len(INPUT_NAMES), calibration.gears
+    u = np.sqrt(np.maximum(np.diag(calibration.covariance)[first:], 0.0))
+    found: dict[str, _GearErrors] = {}
+    for axis, steps in zip(AXES, table.steps, strict=True):
+        if not table.size:
+            break
+        error, play = (table.parts[f"{kind}.{axis}"] for kind in (ERROR_AT, PLAY_AT))
+        found[axis] = {
+            "steps": list(steps),
+            "transmission_error_deg": calibration.mean[first:][error][:-1].tolist(),
+            "u_transmission_error_deg": u[error][:-1].tolist(),
+            "play_variation_deg": calibration.mean[first:][play][:-1].tolist(),
+            "u_play_variation_deg": u[play][:-1].tolist(),
+            "beyond_u_transmission_error_deg": float(u[error][-1]),
+            "beyond_u_play_variation_deg": float(u[play][-1]),
+        }
+    return found
 
 
 @dataclass(frozen=True)
@@ -136,12 +186,39 @@ def calibration_header(calibration: Calibration) -> str:
         lines.append(f"#define TVS_PERIOD_{axis.upper()}_DEG {float(calibration.period_deg.get(axis, 0.0))!r}")
         lines.append(f"#define TVS_OVERSHOOT_{axis.upper()}_STEPS {calibration.overshoot_steps[axis]}")
     lines.append(f"#define TVS_AZIMUTH_CONVENTION {int(calibration.azimuth)}")
+    lines += _header_gears(calibration)
     stated = (
         f"Expected error ({calibration.estimator}, 95 %) at pan {error.pan_steps}, tilt {error.tilt_steps} "
         f"steps: azimuth {error.u95_azimuth_deg:.3f} deg, elevation {error.u95_elevation_deg:.3f} deg; "
         f"at 1 m {max(error.u95_at_1_m_mm):.2f} mm."
     )
     return template.replace("@EXPECTED_ERROR@", stated).replace("@VALUES@", "\n".join(lines))
+
+
+def _header_gears(calibration: Calibration) -> list[str]:
+    """Counters seen, and the table of the gears' errors; of gears that do not vary a table of nought."""
+    lines, errors = [], _gear_errors(calibration)
+    none: _GearErrors = {
+        "steps": [0.0] * 4,
+        **{name: [0.0] * 4 for name in _TABLED},
+        **{f"beyond_{name}": 0.0 for name in _TABLED[1::2]},
+    }
+    for axis, (low, high) in zip(AXES, calibration.range_steps.tolist(), strict=True):
+        upper, table = axis.upper(), errors.get(axis, none)
+        nodes = table["steps"]
+        lines += [
+            f"#define TVS_SEEN_{upper}_LOW {low!r}",
+            f"#define TVS_SEEN_{upper}_HIGH {high!r}",
+            f"#define TVS_TABLE_{upper}_SIZE {len(nodes)}",
+            f"#define TVS_TABLE_{upper}_FIRST {nodes[0]!r}",
+            f"#define TVS_TABLE_{upper}_LAST {nodes[-1]!r}",
+            f"#define TVS_BEYOND_{upper}_ERROR_U_DEG {table['beyond_u_transmission_error_deg']!r}",
+            f"#define TVS_BEYOND_{upper}_PLAY_U_DEG {table['beyond_u_play_variation_deg']!r}",
+        ]
+        for name, values in zip(("ERROR", "ERROR_U", "PLAY", "PLAY_U"), (table[n] for n in _TABLED), strict=True):
+            listed = ",\n    ".join(", ".join(map(repr, values[k : k + 4])) for k in range(0, len(values), 4))
+            lines.append(f"static const double TVS_{name}_{upper}_DEG[] = {{\n    {listed}}};")
+    return lines
 
 
 def load_calibration(path: Path | str) -> Calibration:
@@ -174,14 +251,14 @@ def damaged_calibration(path: Path, reason: object) -> InputError:
         "damaged-results",
         f"{escaped(path.name)} is not a calibration that tvsbayes wrote: {escaped(str(reason), 200)}",
         file=escaped(path.name),
-        allowed=f"format {CALIBRATION_FORMAT}",
+        allowed=f"format {' or '.join(FORMATS)}",
         remedy="run `tvsbayes fit` on the campaign again",
     )
 
 
 def _shaped(calibration: Calibration) -> Calibration:
     """Refuse arrays of other shapes or with values that are not finite."""
-    n, count = len(calibration.inputs), len(INPUT_NAMES)
+    n, count = len(calibration.inputs), len(INPUT_NAMES) + calibration.gears.size
     shapes = {"mean": (count,), "covariance": (count, count), "range_steps": (2, 2), "inputs": (n, count)}
     shapes |= {"noise": (n, len(NOISE_NAMES)), "cause_covariance": (len(calibration.causes), count, count)}
     for name, shape in shapes.items():
@@ -216,7 +293,7 @@ def read_draws(path: Path) -> Calibration:
                 remedy="run `tvsbayes fit` on the campaign again",
             )
         columns = (file["input_names"].tolist(), file["noise_names"].tolist())
-        if str(file["format"]) != CALIBRATION_FORMAT or columns != (list(INPUT_NAMES), list(NOISE_NAMES)):
+        if str(file["format"]) not in FORMATS or columns != (list(INPUT_NAMES), list(NOISE_NAMES)):
             raise ValueError(f"format {str(file['format'])[:60]!r} or other columns")
         tables = _tables(str(file["tables"]), path)
         return _shaped(
@@ -234,6 +311,7 @@ def read_draws(path: Path) -> Calibration:
                 noise=file["noise"],
                 causes=tuple(tables["causes"]),
                 cause_covariance=file["cause_covariance"],
+                gears=NO_GEARS if str(file["format"]) == FORMATS[0] else table_of(tables["gear_steps"]),
             )
         )
     except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
@@ -250,16 +328,23 @@ def _tables(text: str, path: Path) -> _Tables:
 
 def _from_json(path: Path) -> Calibration:
     keys = parse_json(read_bytes(path, RESULTS_BYTES_MAX), escaped(path.name))
-    keys.word("format", (CALIBRATION_FORMAT,))
+    known = keys.word("format", FORMATS)
     convention = keys.word("aperture_convention", ("in-plane", "azimuth"))
     try:
         # What does not fit its type fails below or in `_shaped`.
         d = cast(CalibrationDocument, keys.values)
-        if tuple(d["covariance"]["names"]) != INPUT_NAMES:
+        errors = {} if known == FORMATS[0] else d["gear_errors"]
+        gears = table_of({axis: errors[axis]["steps"] for axis in AXES}) if errors else NO_GEARS
+        if tuple(d["covariance"]["names"]) != (*INPUT_NAMES, *gears.names):
             raise ValueError("the covariance names other inputs")
+        mean = [d["estimates"][name] for name in INPUT_NAMES]
+        for name in gears.inputs:
+            kind, axis = name.split(".")
+            # Beyond the table no error is expected.
+            mean += [*(errors[axis]["transmission_error_deg" if kind == ERROR_AT else "play_variation_deg"]), 0.0]
         return _shaped(
             Calibration(
-                mean=np.array([d["estimates"][name] for name in INPUT_NAMES], dtype=float),
+                mean=np.array(mean, dtype=float),
                 covariance=np.array(d["covariance"]["matrix"], dtype=float),
                 noise_variance={name: float(value) for name, value in d["noise_variance_deg2"].items()},
                 overshoot_steps={axis: int(value) for axis, value in d["overshoot_steps"].items()},
@@ -268,6 +353,7 @@ def _from_json(path: Path) -> Calibration:
                 estimator=str(d["estimator"]),
                 range_steps=np.array([d["range_steps"][axis] for axis in AXES], dtype=float),
                 inputs_sha256=dict(d["inputs"]),
+                gears=gears,
             )
         )
     except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:

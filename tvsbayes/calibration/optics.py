@@ -18,6 +18,9 @@ import numpy as np
 from tvsbayes.instrument.axes import AXES, FULL_TURN_DEG
 from tvsbayes.instrument.parameters import HARMONIC_ORDERS
 
+ERROR_AT, PLAY_AT = "transmission_error_at_deg", "play_variation_at_deg"
+GEAR_INPUTS: tuple[str, ...] = tuple(f"{kind}.{axis}" for kind in (ERROR_AT, PLAY_AT) for axis in AXES)
+"""What the gears add to a look: transmission error and change of play at its counters, deg."""
 ROUNDING = 1e-12
 """Of coordinates, relative to the range."""
 TO_RAD = math.pi / 180
@@ -31,10 +34,14 @@ type Values = Mapping[str, Number]
 
 @dataclass(frozen=True)
 class Ray:
-    """A beam in frame T: it leaves the positioner at `origin_mm` along the unit vector `direction`; shape (3, ...)."""
+    """A beam in frame T: it leaves the positioner at `origin_mm` along the unit vector `direction`; shape (3, ...).
+
+    `extrapolated` tells that no look of the campaign reached its counters.
+    """
 
     origin_mm: np.ndarray
     direction: np.ndarray
+    extrapolated: bool = False
 
 
 def _harmonic(values: Values, axis: str, angle_deg: Number, period_deg: float, m: ModuleType) -> Number:
@@ -53,7 +60,8 @@ def output_deg(
     """Mirror angle of an axis after homing: q = k n, play taken up on the approach side (formulation 3.1).
 
     Args:
-        values: parameters by name; floats, or arrays of one shape.
+        values: parameters by name; floats, or arrays of one shape. Where gears vary, also their errors at this counter,
+            by `GEAR_INPUTS`.
         axis: pan or tilt.
         steps: absolute counter.
         side: +1 reached left or up, -1 right or down, any number between for a place in the play.
@@ -66,6 +74,8 @@ def output_deg(
     output = q - 0.5 * side * values[f"backlash_deg.{axis}"]
     if period_deg == FULL_TURN_DEG:
         output = output + _harmonic(values, axis, output, period_deg, m)
+    if (error := values.get(f"{ERROR_AT}.{axis}")) is not None:
+        output = output + error - 0.5 * side * values[f"{PLAY_AT}.{axis}"]
     return output if axis == "pan" else output + values["tilt_zero_deg"]
 
 

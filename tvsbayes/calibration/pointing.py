@@ -11,11 +11,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from types import ModuleType
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from tvsbayes.calibration.aiming import Direction, Drive, Point, Steps, mirror_angles
+from tvsbayes.calibration.gear_table import NO_GEARS, GearTable
 from tvsbayes.calibration.optics import (
     TO_RAD,
     Components,
@@ -63,18 +65,26 @@ type Sides = tuple[float, float]
 
 @dataclass(frozen=True)
 class Located:
-    """A point of frame T by linear propagation: estimate (3,), covariance (3, 3) and 95 % half widths (3,)."""
+    """A point of frame T by linear propagation: estimate (3,), covariance (3, 3) and 95 % half widths (3,).
+
+    `extrapolated` tells that no look of the campaign reached its counters.
+    """
 
     xyz_mm: np.ndarray
     covariance_mm2: np.ndarray
     u95_mm: np.ndarray
+    extrapolated: bool = False
 
 
 @dataclass(frozen=True)
 class _Moved:
-    """Parameters by name and unit noises of a look, each moved by an imaginary step in one of (inputs + NOISES)."""
+    """Parameters by name, what the gears add to them, and unit noises, each moved by an imaginary step.
+
+    The moves are one of `Calibration.look_inputs` or of the noises each; `gears` holds moves alone, by name.
+    """
 
     values: Values
+    gears: Values
     noise: np.ndarray
 
 
@@ -83,19 +93,21 @@ class Calibration:
     """Estimates and uncertainty of everything that a coordinate depends on.
 
     Attributes:
-        mean: best estimates, shape (inputs,), ordered as `INPUT_NAMES`, units of the names.
+        mean: best estimates, shape (inputs,), ordered as `INPUT_NAMES`, then the columns of `gears`; units of the
+            names.
         covariance: their covariance, shape (inputs, inputs).
         noise_variance: mean variance of each of `NOISE_NAMES`, deg^2.
         overshoot_steps: by axis, steps that take up all play with a probability of `CLEARED_PROBABILITY`.
         azimuth: the aperture reads the azimuth of the spot, not the angle in the plane of beam and baseline.
         period_deg: period of the transmission error by axis, where there is one.
         estimator: "posterior" or "laplace".
-        range_steps: lowest and highest counter per axis in the campaign, shape (2, 2).
+        range_steps: lowest and highest counter per axis at which the campaign looked, shape (2, 2).
         inputs_sha256: hashes of the campaign's data.
         inputs: draws (n, inputs) behind the moments; none where only the moments were kept.
         noise: draws (n, 5) of `NOISE_NAMES`, likewise.
         causes: names of the causes of uncertainty behind `cause_covariance`; empty where unknown.
         cause_covariance: what each contributes to `covariance`, shape (causes, inputs, inputs).
+        gears: counters at which errors of the gears are told; none where gears do not vary.
     """
 
     mean: np.ndarray
@@ -111,36 +123,62 @@ class Calibration:
     noise: np.ndarray = field(default_factory=lambda: np.zeros((0, len(NOISE_NAMES))))
     causes: tuple[str, ...] = ()
     cause_covariance: np.ndarray = field(default_factory=lambda: np.zeros((0, len(INPUT_NAMES), len(INPUT_NAMES))))
+    gears: GearTable = NO_GEARS
 
     @cached_property
     def estimates(self) -> dict[str, float]:
-        """Best estimates by name."""
-        return dict(zip(INPUT_NAMES, self.mean.tolist(), strict=True))
+        """Best estimates by name, without the errors of the gears."""
+        return dict(zip(INPUT_NAMES, self.mean[: len(INPUT_NAMES)].tolist(), strict=True))
+
+    @property
+    def look_inputs(self) -> tuple[str, ...]:
+        """What the point of one look depends on besides its noises: `INPUT_NAMES`, then the gears' errors there."""
+        return (*INPUT_NAMES, *self.gears.inputs)
+
+    def estimates_at(self, steps: Counters) -> dict[str, Any]:
+        """Best estimates by name of `look_inputs`, floats, or for arrays of counters arrays of their shape."""
+        found = self.gears.at(self.mean[len(INPUT_NAMES) :], steps)
+        return self.estimates | {name: x if np.ndim(x) else float(x) for name, x in found.items()}
 
     @cached_property
     def _moved(self) -> _Moved:
-        count = len(INPUT_NAMES)
-        sets = np.concatenate([self.mean, np.zeros(NOISES)]) + 1j * COMPLEX_STEP * np.eye(count + NOISES)
-        values: dict[str, Number] = dict(zip(INPUT_NAMES, sets[:, :count].T, strict=True))
+        count = len(self.look_inputs)
+        centre = np.zeros(count + NOISES)
+        centre[: len(INPUT_NAMES)] = self.mean[: len(INPUT_NAMES)]
+        sets = centre + 1j * COMPLEX_STEP * np.eye(count + NOISES)
+        values: dict[str, Number] = dict(zip(self.look_inputs, sets[:, :count].T, strict=True))
+        gears = {name: values.pop(name) for name in self.gears.inputs}
         values |= {name: math.sqrt(self.noise_variance[name]) for name in NOISE_NAMES}
-        return _Moved(values, sets[:, count:].T)
+        return _Moved(values, gears, sets[:, count:].T)
 
     @cached_property
     def covariance_with_noise(self) -> np.ndarray:
-        """Covariance of `INPUT_NAMES` and the unit noises of a look, shape (inputs + NOISES, inputs + NOISES)."""
-        count = len(INPUT_NAMES)
+        """Covariance of `mean` and the unit noises of a look, shape (inputs + NOISES, inputs + NOISES)."""
+        count = len(self.mean)
         covariance = np.diag([*np.zeros(count), *UNIT_NOISES.values()])
         covariance[:count, :count] = self.covariance
         return covariance
 
+    def look_covariance(self, steps: Counters) -> np.ndarray:
+        """Covariance of `look_inputs` and the unit noises at counters, numbers or arrays (n,): shape (..., k, k)."""
+        if not self.gears.size:
+            return self.covariance_with_noise
+        own = self.gears.look_covariance(self.covariance, steps)
+        count = own.shape[-1]
+        found = np.zeros((*own.shape[:-2], count + NOISES, count + NOISES))
+        found[..., :count, :count] = own
+        found[..., np.arange(count, count + NOISES), np.arange(count, count + NOISES)] = [*UNIT_NOISES.values()]
+        return found
+
     def covers(self, pan_steps: float, tilt_steps: float) -> bool:
-        """Whether the campaign reached these counters."""
+        """Whether looks of the campaign reached as far as these counters."""
         return all(low <= n <= high for n, (low, high) in zip((pan_steps, tilt_steps), self.range_steps, strict=True))
 
     def beam_at(self, steps: Counters, sides: Sides, m: ModuleType = np) -> Components:
         """The beam of the best estimates at counters and approach sides; `m` as in `output_deg`."""
+        values = self.estimates_at(steps)
         pan_deg, tilt_deg = (
-            output_deg(self.estimates, axis, n, side, self.period_deg.get(axis), m)
+            output_deg(values, axis, n, side, self.period_deg.get(axis), m)
             for axis, n, side in zip(AXES, steps, sides, strict=True)
         )
         return beam_components(self.estimates, pan_deg, tilt_deg, m)
@@ -157,7 +195,7 @@ class Calibration:
             InputError: an approach that does not exist.
         """
         beam = self.beam_at((pan_steps, tilt_steps), sides_of(approach), math)
-        return Ray(np.array(beam.origin), np.array(beam.direction))
+        return Ray(np.array(beam.origin), np.array(beam.direction), not self.covers(pan_steps, tilt_steps))
 
     def locate(
         self, pan_steps: float, tilt_steps: float, aperture_deg: float, approach: tuple[str, str] = HOME_APPROACH
@@ -188,12 +226,13 @@ class Calibration:
             raise self.refusal(pan_steps, tilt_steps, aperture_deg, sides)
         direction = np.array(beam.direction)
         jacobian = self.derivatives(*steps, aperture_deg, approach)
-        covariance = jacobian @ self.covariance_with_noise @ jacobian.T
+        covariance = jacobian @ self.look_covariance(steps) @ jacobian.T
         # The inverse of the range is nearly normal: its tail beyond zero is the share of draws that diverge.
         least = DIVERGING_SDS * math.sqrt(max(direction @ covariance @ direction, 0.0))
         if not (np.all(np.isfinite(covariance)) and reach > least):
             raise self.refusal(pan_steps, tilt_steps, aperture_deg, sides)
-        return Located(np.array(beam.origin) + reach * direction, covariance, NORMAL_95 * np.sqrt(np.diag(covariance)))
+        point, u95 = np.array(beam.origin) + reach * direction, NORMAL_95 * np.sqrt(np.diag(covariance))
+        return Located(point, covariance, u95, not self.covers(*steps))
 
     def refusal(self, pan_steps: float, tilt_steps: float, aperture_deg: float, sides: Sides) -> InputError:
         """Why beam and line of sight of a look have no point in common, or none that can be told: by name.
@@ -223,7 +262,7 @@ class Calibration:
         """The beam with stop errors, and from somewhere in the play where the side is unknown.
 
         Args:
-            values: by name, of `INPUT_NAMES` and `NOISE_NAMES`; arrays of one shape.
+            values: by name, of `look_inputs` at these counters and `NOISE_NAMES`; arrays of one shape.
             noise: `NOISES` unit noises, first axis, arrays of that shape (`Drawn`).
             steps: counters.
             sides: approach sides.
@@ -240,7 +279,7 @@ class Calibration:
     def derivatives(
         self, pan_steps: float, tilt_steps: float, aperture_deg: float, approach: tuple[str, str] = HOME_APPROACH
     ) -> np.ndarray:
-        """Sensitivities of a point to `INPUT_NAMES` (their units) and to the unit noises of the look, mm.
+        """Sensitivities of a point to `look_inputs` (their units) and to the unit noises of the look, mm.
 
         Noises have the root mean square of their standard deviations.
 
@@ -251,7 +290,7 @@ class Calibration:
             approach: last move of (pan, tilt): left or right, up or down, or unknown.
 
         Returns:
-            Shape (3, inputs + NOISES).
+            Shape (3, look inputs + NOISES).
 
         Raises:
             InputError: an approach that does not exist, or beam and line of sight do not meet.
@@ -280,7 +319,7 @@ class Calibration:
         return beam.at(np.where((reach.real > 0) & np.isfinite(reach), reach, np.nan))
 
     def moved_points(self, steps: Counters, sides: Sides, aperture_deg: np.ndarray) -> np.ndarray:
-        """Points of many looks of one approach, complex, shape (3, inputs + NOISES, n).
+        """Points of many looks of one approach, complex, shape (3, look inputs + NOISES, n).
 
         The real part is the point, the same in every row of the second axis or not a number where there is none; the
         imaginary part over `COMPLEX_STEP` its derivative by that input or unit noise.
@@ -291,7 +330,13 @@ class Calibration:
             aperture_deg: readings B, shape (n,).
         """
         values = {k: v[:, None] if isinstance(v, np.ndarray) else v for k, v in self._moved.values.items()}
+        values |= self._moved_gears(steps)
         return self.points(values, self._moved.noise[..., None], steps, sides, aperture_deg)
+
+    def _moved_gears(self, steps: Counters) -> dict[str, np.ndarray]:
+        """Moved errors of the gears at counters, numbers or arrays (n,); shape (look inputs + NOISES, ...)."""
+        found = self.gears.at(self.mean[len(INPUT_NAMES) :], steps)
+        return {name: np.add.outer(self._moved.gears[name], x) for name, x in found.items()}
 
     def steps_for(
         self,
@@ -317,13 +362,15 @@ class Calibration:
         target = self._target(xyz_mm, azimuth_deg, elevation_deg)
         arrivals = []
         for index, (axis, angle_deg) in enumerate(zip(AXES, mirror_angles(self.estimates, target), strict=True)):
-            drive = Drive(axis, self.estimates, self.period_deg.get(axis), self.overshoot_steps[axis])
+            drive = Drive(axis, partial(self._values_on, index), self.period_deg.get(axis), self.overshoot_steps[axis])
             wanted = None if approach is None else approach[index]
             arrivals.append(drive.arrival(angle_deg, wanted, (limits or {}).get(axis)))
         pan, tilt = arrivals
         reached = pan.side, tilt.side
         ray = self.ray(pan.steps, tilt.steps, reached)
-        found = Steps(pan.steps, tilt.steps, reached, pan.via_steps, tilt.via_steps, ray)
+        found = Steps(
+            *(pan.steps, tilt.steps, reached, pan.via_steps, tilt.via_steps, ray), extrapolated=ray.extrapolated
+        )
         counters, sides = (float(pan.steps), float(tilt.steps)), sides_of(reached)
         o, d = ray.origin_mm, ray.direction
         if isinstance(target, Direction):
@@ -339,6 +386,10 @@ class Calibration:
             rounding_mm=float(np.linalg.norm(target.xyz_mm - point)),
             u95_mm=self.beam_u95_mm(counters, sides, reach),
         )
+
+    def _values_on(self, index: int, counter: float) -> dict[str, Any]:
+        """Best estimates with one axis at a counter."""
+        return self.estimates_at((counter, 0.0) if index == 0 else (0.0, counter))
 
     @staticmethod
     def _target(xyz_mm: ArrayLike | None, azimuth_deg: float | None, elevation_deg: float | None) -> Point | Direction:
@@ -360,52 +411,17 @@ class Calibration:
         """95 % half widths of the beam's azimuth and elevation (2,), degrees."""
         _, (u, v, w) = self._moved_beam(steps, sides)
         # Of the azimuth atan2(y, x), whose derivatives those of atan(y / x) are.
-        return self._u95(np.array([np.arctan(v / u), np.arcsin(w)]) / TO_RAD)
+        return self._u95(np.array([np.arctan(v / u), np.arcsin(w)]) / TO_RAD, steps)
 
     def beam_u95_mm(self, steps: Counters, sides: Sides, range_mm: float) -> np.ndarray:
         """95 % half widths of the beam's position at a range (3,), mm."""
-        return self._u95(self._moved_beam(steps, sides).at(range_mm))
+        return self._u95(self._moved_beam(steps, sides).at(range_mm), steps)
 
     def _moved_beam(self, steps: Counters, sides: Sides) -> Components:
-        return self.noisy_beam(self._moved.values, self._moved.noise, steps, sides)
+        values = {**self._moved.values, **self._moved_gears(steps)}
+        return self.noisy_beam(values, self._moved.noise, steps, sides)
 
-    def _u95(self, moved: np.ndarray) -> np.ndarray:
-        """Half widths (q,) of quantities (q, inputs + NOISES) of the moved parameters."""
+    def _u95(self, moved: np.ndarray, steps: Counters) -> np.ndarray:
+        """Half widths (q,) of quantities (q, look inputs + NOISES) of the moved parameters."""
         jacobian = moved.imag / COMPLEX_STEP
-        return NORMAL_95 * np.sqrt(np.diag(jacobian @ self.covariance_with_noise @ jacobian.T))
-
-
-@dataclass(frozen=True)
-class Drawn:
-    """Rigs that the data allow, each with the unit noises of one look.
-
-    Attributes:
-        inputs: shape (draws, columns), ordered as `INPUT_NAMES`, then `NOISE_NAMES`.
-        noise: standard-normal stop errors (pan, tilt), uniform places in the play in [-1/2, 1/2] (pan, tilt), the
-            aperture's standard-normal noise, shape (draws, `NOISES`).
-    """
-
-    inputs: np.ndarray
-    noise: np.ndarray
-
-
-def drawn(calibration: Calibration, draws: int, seed: int) -> Drawn:
-    """Draws of parameters, evenly chosen, with noises of their own; the same for every point of a call.
-
-    Raises:
-        InputError: a calibration without draws.
-    """
-    stored = len(calibration.inputs)
-    if stored == 0:
-        raise InputError(
-            "no-draws",
-            "this calibration keeps moments only, as exported for a robot",
-            remedy="locate from the campaign folder, or use calibration.locate, which needs no draws",
-        )
-    generator = np.random.default_rng([seed, 6])
-    # Fewer draws than are stored: evenly chosen; more: all, again and again, with new noises.
-    chosen = np.arange(draws) % stored if draws > stored else np.linspace(0, stored - 1, draws).astype(int)
-    columns = np.concatenate([calibration.inputs, calibration.noise], axis=1)[chosen]
-    normal = generator.standard_normal((draws, NOISES))
-    noise = np.column_stack([normal[:, :2], generator.uniform(-0.5, 0.5, (draws, 2)), normal[:, 4]])
-    return Drawn(columns, noise)
+        return NORMAL_95 * np.sqrt(np.diag(jacobian @ self.look_covariance(steps) @ jacobian.T))

@@ -12,8 +12,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from tvsbayes.calibration.drawn_looks import Drawn, drawn
 from tvsbayes.calibration.optics import Components, Ray, aperture_angle_deg, range_components, unit_vector
-from tvsbayes.calibration.pointing import DIVERGING_SHARE, INPUT_NAMES, NOISE_NAMES, Calibration, Drawn, Sides, drawn
+from tvsbayes.calibration.pointing import DIVERGING_SHARE, Calibration, Sides
 from tvsbayes.estimators.four_point import ClassicResult
 from tvsbayes.instrument.axes import SENSES
 from tvsbayes.instrument.parameters import RIG_PRIORS, Prior
@@ -77,7 +78,7 @@ class ErrorMap:
         pan_steps, tilt_steps, range_mm: the axes; ranges along the beam.
         rms_mm: root mean square distance from the true point, by estimator.
         bias_mm: mean error vector, by estimator, shape (pan, tilt, range, 3).
-        inside: counters within those of the campaign.
+        inside: counters within those at which the campaign looked.
         valid: every estimator asked finds a point in all but `DIVERGING_SHARE` of the draws.
         distance_mm: 3D errors by estimator, arrays (draws, pan, tilt, range), infinite where there is no point.
     """
@@ -103,7 +104,7 @@ class _Truth:
 def _truth(
     calibration: Calibration, pan: np.ndarray, tilt: np.ndarray, range_mm: np.ndarray, approach: Sides, rigs: Drawn
 ) -> _Truth:
-    values = dict(zip((*INPUT_NAMES, *NOISE_NAMES), rigs.inputs.T[..., None], strict=True))
+    values = rigs.values_at(calibration, (pan, tilt))
     noise = rigs.noise.T[..., None]
     points = calibration.noisy_beam(values, noise, (pan, tilt), approach).at(range_mm)
     reading = aperture_angle_deg((points[0], points[1], points[2]), values["baseline_mm"], calibration.azimuth)

@@ -14,15 +14,13 @@ from typing import Any, cast
 
 import numpy as np
 
+from tvsbayes.calibration.drawn_looks import Drawn, drawn
 from tvsbayes.calibration.pointing import (
     COMPLEX_STEP,
     DIVERGING_SHARE,
     INPUT_NAMES,
-    NOISE_NAMES,
     NOISES,
     Calibration,
-    Drawn,
-    drawn,
 )
 from tvsbayes.errors import InputError
 from tvsbayes.instrument.axes import HOME_APPROACH, sides_of
@@ -45,6 +43,7 @@ class Locations:
         interval95_mm: equal-tailed intervals, shape (n, 2, 3).
         u95_mm: their half widths, shape (n, 3).
         diverging_share: share of draws without a point, shape (n,).
+        extrapolated: no look of the campaign reached the counters of the point, shape (n,).
         linear_xyz_mm, linear_covariance_mm2: by the law of propagation, shapes (n, 3) and (n, 3, 3).
         validation: of the law of propagation by the draws (JCGM 101 clause 8), fields of shape (n, 3).
         refused: the refusal of each point, or None.
@@ -57,6 +56,7 @@ class Locations:
     interval95_mm: np.ndarray
     u95_mm: np.ndarray
     diverging_share: np.ndarray
+    extrapolated: np.ndarray
     linear_xyz_mm: np.ndarray
     linear_covariance_mm2: np.ndarray
     validation: Validation
@@ -74,7 +74,8 @@ class Locations:
         error = self.refused[index]
         if error is not None:
             empty = dict.fromkeys(("xyz_mm", "covariance_mm2", "u95_mm"))
-            return {**empty, "refused": {"code": error.code, "message": error.message}}
+            refused = {"code": error.code, "message": error.message}
+            return {**empty, "extrapolated": bool(self.extrapolated[index]), "refused": refused}
         u = np.sqrt(np.diag(self.linear_covariance_mm2[index]))
         v = self.validation
         return {
@@ -83,6 +84,7 @@ class Locations:
             "u95_mm": self.u95_mm[index].tolist(),
             "interval95_mm": self.interval95_mm[index].T.tolist(),
             "diverging_share": float(self.diverging_share[index]),
+            "extrapolated": bool(self.extrapolated[index]),
             "linear": {
                 "xyz_mm": self.linear_xyz_mm[index].tolist(),
                 "covariance_mm2": self.linear_covariance_mm2[index].tolist(),
@@ -139,7 +141,7 @@ class Linear:
 
     Attributes:
         value: points, shape (n, 3), not a number where there is none.
-        jacobian: by `INPUT_NAMES` and the unit noises, shape (n, 3, inputs + NOISES).
+        jacobian: by the calibration's `look_inputs` and the unit noises, shape (n, 3, inputs + NOISES).
         covariance: shape (n, 3, 3).
     """
 
@@ -166,12 +168,11 @@ def settings_of(
 
 def carry(calibration: Calibration, found: Drawn, settings: Settings) -> Carried:
     """Every draw through the geometry for every point."""
-    columns = found.inputs.T[:, :, None]
-    values = dict(zip((*INPUT_NAMES, *NOISE_NAMES), columns, strict=True))
     noise = found.noise.T[:, :, None]
     xyz = np.empty((len(found.inputs), len(settings.steps), 3))
     for rows in settings.of_one_approach():
         steps, side = settings.steps[rows].T, settings.side[rows[0]]
+        values = found.values_at(calibration, (steps[0], steps[1]))
         points = calibration.points(values, noise, (steps[0], steps[1]), (*side,), settings.aperture_deg[rows])
         xyz[:, rows] = points.transpose(1, 2, 0)
     return Carried(xyz)
@@ -182,15 +183,17 @@ def locate_linear(calibration: Calibration, settings: Settings) -> Linear:
 
     No draws: a million points a minute. Validate some of them with `locate`.
     """
-    count, inputs = len(settings.steps), len(INPUT_NAMES) + NOISES
+    count, inputs = len(settings.steps), len(calibration.look_inputs) + NOISES
     value, jacobian = np.empty((count, 3)), np.empty((count, 3, inputs))
+    covariance = np.empty((count, 3, 3))
     for rows in settings.of_one_approach():
         for part in np.array_split(rows, -(-len(rows) * inputs // BLOCK)):
             steps, side = settings.steps[part].T, settings.side[part[0]]
             moved = calibration.moved_points((steps[0], steps[1]), (*side,), settings.aperture_deg[part])
             value[part] = moved[:, 0].real.T
-            jacobian[part] = (moved.imag / COMPLEX_STEP).transpose(2, 0, 1)
-    covariance = jacobian @ calibration.covariance_with_noise @ jacobian.transpose(0, 2, 1)
+            slope = (moved.imag / COMPLEX_STEP).transpose(2, 0, 1)
+            jacobian[part] = slope
+            covariance[part] = slope @ calibration.look_covariance((steps[0], steps[1])) @ slope.transpose(0, 2, 1)
     return Linear(value, jacobian, covariance)
 
 
@@ -238,9 +241,8 @@ def locate(
     with Job({"locating": 1.0}, progress) as job:
         for begin in range(0, len(settings.steps), size):
             block = settings[begin : begin + size]
-            parts.append(
-                _statistics(carry(calibration, given, block), locate_linear(calibration, block), given, calibration)
-            )
+            points = carry(calibration, given, block), locate_linear(calibration, block)
+            parts.append(_statistics(block, *points, given, calibration))
             done = begin + len(block.steps)
             job.at(done / len(settings.steps), f"{done} of {len(settings.steps)} points")
         found = _together(parts)
@@ -264,7 +266,7 @@ def _together[T: (Locations, Validation)](parts: Sequence[T]) -> T:
     return replace(parts[0], **{name: joined([getattr(part, name) for part in parts]) for name in names})
 
 
-def _statistics(carried: Carried, law: Linear, given: Drawn, calibration: Calibration) -> Locations:
+def _statistics(settings: Settings, carried: Carried, law: Linear, given: Drawn, calibration: Calibration) -> Locations:
     """Moments, intervals and validation of one block of points; none of them is refused by name yet."""
     meets, xyz = carried.meets, carried.xyz_mm.copy()
     lost = (~meets).mean(axis=0)
@@ -276,9 +278,17 @@ def _statistics(carried: Carried, law: Linear, given: Drawn, calibration: Calibr
     mean = xyz.mean(axis=0)
     centred = xyz - mean
     covariance = np.einsum("dpi,dpj->pij", centred, centred) / (count - 1)
-    away = np.concatenate([given.inputs[:, : len(INPUT_NAMES)] - calibration.mean, given.noise], axis=1)
+    own, inputs = len(INPUT_NAMES), len(calibration.look_inputs)
+    away = np.concatenate([given.inputs[:, :own] - calibration.mean[:own], given.noise], axis=1)
+    fixed = np.delete(law.jacobian, np.arange(own, inputs), axis=2)
     u = np.sqrt(np.einsum("pii->pi", law.covariance))
-    linearised = law.value + np.einsum("pik,dk->dpi", law.jacobian, away)
+    linearised = law.value + np.einsum("pik,dk->dpi", fixed, away)
+    pan, tilt = settings.steps.T
+    off = calibration.gears.at(given.gears - calibration.mean[own:], (pan, tilt))
+    for place, name in enumerate(calibration.gears.inputs, own):
+        linearised += law.jacobian[:, :, place] * off[name][..., None]
+    (pan_low, pan_high), (tilt_low, tilt_high) = calibration.range_steps
+    outside = (pan < pan_low) | (pan > pan_high) | (tilt < tilt_low) | (tilt > tilt_high)
     interval = symmetric_interval(xyz)
     empty = np.where(lost <= DIVERGING_SHARE, 0.0, np.nan)
     return Locations(
@@ -287,6 +297,7 @@ def _statistics(carried: Carried, law: Linear, given: Drawn, calibration: Calibr
         interval95_mm=interval.transpose(1, 0, 2) + empty[:, None, None],
         u95_mm=0.5 * (interval[1] - interval[0]) + empty[:, None],
         diverging_share=lost,
+        extrapolated=outside,
         linear_xyz_mm=law.value + empty[:, None],
         linear_covariance_mm2=law.covariance + empty[:, None, None],
         validation=validate(xyz, linearised, law.value, u),

@@ -137,10 +137,11 @@ def _predicted(runs: Runs) -> dict[str, Predicted]:
 
 def _middle_deg_per_step(calibration: Calibration, axis: str) -> float:
     """The beam's mean ratio of both directions at the middle of the counters, in mid-play."""
-    estimates = calibration.estimates
+    middle_pan, middle_tilt = calibration.range_steps.mean(axis=1).tolist()
+    estimates = calibration.estimates_at((middle_pan, middle_tilt))
     pan, tilt = (
         float(output_deg(estimates, a, n, 0.0, calibration.period_deg.get(a)))
-        for a, n in zip(AXES, calibration.range_steps.mean(axis=1).tolist(), strict=True)
+        for a, n in zip(AXES, (middle_pan, middle_tilt), strict=True)
     )
     return beam_deg_per_step(estimates, axis, (pan, tilt))
 

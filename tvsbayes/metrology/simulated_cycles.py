@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tvsbayes.calibration.optics import beam_angle_deg, output_deg
+from tvsbayes.calibration.optics import Number, beam_angle_deg, output_deg
 from tvsbayes.calibration.pointing import INPUT_NAMES, NOISE_NAMES, Calibration
 from tvsbayes.instrument.axes import AXES, SIDES
 
@@ -94,13 +94,17 @@ def simulated_runs(
         Arrays of shape (tests, m, runs).
     """
     rows = np.linspace(0, len(calibration.inputs) - 1, tests).astype(int)
-    values = {name: calibration.inputs[rows, k, None, None] for k, name in enumerate(INPUT_NAMES)}
+    values: dict[str, Number] = {name: calibration.inputs[rows, k, None, None] for k, name in enumerate(INPUT_NAMES)}
     noise = {name: calibration.noise[rows, k, None, None] for k, name in enumerate(NOISE_NAMES)}
     contrast = 0.0 if contrast_deg_per_step is None else np.asarray(contrast_deg_per_step)[rows, None, None]
     steps = np.asarray(targets, dtype=float)[:, None]
     low, high = steps.min(), steps.max()
     other = AXES[1 - AXES.index(axis)]
     middle = float(calibration.range_steps[AXES.index(other)].mean())
+    at = (steps[:, 0], np.full(len(steps), middle)) if axis == AXES[0] else (np.full(len(steps), middle), steps[:, 0])
+    # What repeats by position is told at the counter: what the contrast has gained by then moves it by far less.
+    found = calibration.gears.at(calibration.inputs[rows, len(INPUT_NAMES) :], at)
+    values |= {name: errors[..., None] for name, errors in found.items()}
     other_deg = output_deg(values, other, middle, 0.0, calibration.period_deg.get(other))
     ratio = values[f"degrees_per_step.{axis}"]
     # Upwards a step is k + c/2, downwards k - c/2 (formulation 3.1): a whole cycle of 2 L steps gains c L.

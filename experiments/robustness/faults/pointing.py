@@ -55,8 +55,8 @@ FAULTS = (
     Fault(
         "steps for the other approach",
         "calibration/aiming.py",
-        "at = output_deg(self.values, self.axis, steps, side,",
-        "at = output_deg(self.values, self.axis, steps, -side,",
+        "at = output_deg(self.values_at(steps), self.axis, steps, side,",
+        "at = output_deg(self.values_at(steps), self.axis, steps, -side,",
         "every target is missed by the backlash",
         ("calibration/aiming",),
     ),

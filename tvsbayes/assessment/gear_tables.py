@@ -1,0 +1,184 @@
+"""Errors of the gears at counters that nobody saw, drawn given what a fit's draws hold at the counters seen.
+
+Transmission error e and change of play d are Gaussian processes of the output's angle k n (formulation 3.1). Every draw
+has values of its own at the places, scales and lengths of its own: its table is the mean of the processes there plus
+what the places leave open. deg, steps.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from tvsbayes.calibration.gear_table import NO_GEARS, GearTable, regular_counters
+from tvsbayes.calibration.optics import ERROR_AT
+from tvsbayes.estimators.joint_fit import JointFit
+from tvsbayes.instrument.axes import AXES
+from tvsbayes.instrument.parameters import INDEX, PERIODS_MAX
+from tvsbayes.model.gear_processes import FLOOR_RAD2
+from tvsbayes.model.headlines import DEGREES
+from tvsbayes.statistics.gaussian_process import JITTER, matern52, periodic
+
+MARGIN_LENGTHS = 3.0
+"""A table reaches as many correlation lengths beyond the counters seen: 97 % of a process has forgotten them there."""
+COUNTERS_PER_LENGTH = 3.0
+"""Cubic interpolation between them is within 1 % of the sd."""
+BLOCK = 256
+"""Draws whose covariances are held at once."""
+
+
+@dataclass(frozen=True)
+class DrawnGears:
+    """Columns of a table, a row for every draw, deg.
+
+    Attributes:
+        table: its counters.
+        expected: means given the errors at the places, shape (draws, table.size).
+        left_open: what those leave open, drawn, likewise; the sum of both is the draw.
+        by_places: d(expected)/d(errors at the places, in units of N(0, 1) a priori), at the fit's own scales, shape
+            (table.size, errors).
+    """
+
+    table: GearTable
+    expected: np.ndarray
+    left_open: np.ndarray
+    by_places: np.ndarray
+
+
+@dataclass(frozen=True)
+class Process:
+    """Scales of one error of one axis by draw.
+
+    Attributes:
+        sd, length: shapes (draws,); deg.
+        amplitudes: sds of the parts of stated period, shape (draws, periods).
+        periods: deg.
+    """
+
+    sd: np.ndarray
+    length: np.ndarray
+    amplitudes: np.ndarray
+    periods: tuple[float, ...] = ()
+
+    def covariance(self, angle_deg: np.ndarray) -> np.ndarray:
+        """Of values at angles (draws, n): shape (draws, n, n), deg^2."""
+        distance = angle_deg[:, :, None] - angle_deg[:, None, :]
+        found = self.sd[:, None, None] ** 2 * matern52(distance, self.length[:, None, None])
+        for number, period in enumerate(self.periods):
+            found += self.amplitudes[:, number, None, None] ** 2 * periodic(distance, period)
+        floor = JITTER * self.variance + FLOOR_RAD2 * DEGREES**2
+        return found + floor[:, None, None] * np.eye(angle_deg.shape[1])
+
+    @property
+    def variance(self) -> np.ndarray:
+        """Of a value anywhere, shape (draws,), deg^2."""
+        return self.sd**2 + np.sum(self.amplitudes**2, axis=1)
+
+    def __getitem__(self, chosen: slice) -> Process:
+        return Process(self.sd[chosen], self.length[chosen], self.amplitudes[chosen], self.periods)
+
+
+@dataclass(frozen=True)
+class Conditional:
+    """Values at new angles: means given those at places, and what is left open; shapes (draws, n)."""
+
+    expected: np.ndarray
+    left_open: np.ndarray
+
+
+def conditional(
+    process: Process, seen_deg: np.ndarray, values: np.ndarray, new_deg: np.ndarray, normal: np.ndarray
+) -> Conditional:
+    """A process at new angles given its values at places (Rasmussen and Williams 2.19, by one Cholesky factor).
+
+    Args:
+        process: scales by draw.
+        seen_deg: angles of the places, shape (draws, p).
+        values: there, shape (draws, p).
+        new_deg: shape (draws, n).
+        normal: standard normal numbers for what is left open, shape (draws, n).
+    """
+    expected, left_open = np.empty(new_deg.shape), np.empty(new_deg.shape)
+    count = seen_deg.shape[1]
+    for begin in range(0, len(values), BLOCK):
+        rows = slice(begin, begin + BLOCK)
+        root = np.linalg.cholesky(process[rows].covariance(np.concatenate([seen_deg[rows], new_deg[rows]], axis=1)))
+        own = np.linalg.solve(root[:, :count, :count], values[rows, :, None])
+        expected[rows] = (root[:, count:, :count] @ own)[..., 0]
+        left_open[rows] = (root[:, count:, count:] @ normal[rows, :, None])[..., 0]
+    return Conditional(expected, left_open)
+
+
+def _process(physical: np.ndarray, name: str, periods: tuple[float, ...]) -> Process:
+    """Scales of one of `GEAR_INPUTS`, of draws (n, parameters)."""
+    kind, axis = name.split(".")
+    length = physical[:, INDEX[f"transmission_error_length_deg.{axis}"]]
+    if kind != ERROR_AT:
+        return Process(physical[:, INDEX[f"play_variation_deg.{axis}"]], length, np.zeros((len(physical), 0)))
+    columns = [INDEX[f"harmonic_amplitude_deg.{axis}.{k + 1}"] for k in range(min(len(periods), PERIODS_MAX))]
+    sd = physical[:, INDEX[f"transmission_error_deg.{axis}"]]
+    return Process(sd, length, physical[:, columns], periods[: len(columns)])
+
+
+def _table(physical: np.ndarray, seen_steps: Mapping[str, np.ndarray]) -> GearTable:
+    """Regular counters around those seen, by the draws' middle lengths."""
+    found = []
+    for axis in AXES:
+        length = float(np.median(physical[:, INDEX[f"transmission_error_length_deg.{axis}"]]))
+        steps = length / abs(float(np.median(physical[:, INDEX[f"degrees_per_step.{axis}"]])))
+        low, high = float(seen_steps[axis].min()), float(seen_steps[axis].max())
+        reach = MARGIN_LENGTHS * steps
+        nodes = regular_counters(low - reach, high + reach, steps / COUNTERS_PER_LENGTH)
+        found.append(tuple(nodes.tolist()))
+    return GearTable((found[0], found[1]))
+
+
+def drawn_gears(fit: JointFit, physical: np.ndarray, place_errors_rad: np.ndarray, seed: int) -> DrawnGears:
+    """Tables of draws.
+
+    Args:
+        fit: whose campaign the places are of.
+        physical: draws in the units of the names, shape (n, parameters).
+        place_errors_rad: with them the transmission errors at the places, then the plays, shape (n, errors).
+        seed: of what the places leave open.
+
+    Returns:
+        Columns as a calibration keeps them; none where gears do not vary.
+    """
+    count, errors = place_errors_rad.shape
+    if not errors:
+        none = np.zeros((count, 0))
+        return DrawnGears(NO_GEARS, none, none, np.zeros((0, 0)))
+    places = fit.arrays.gears.places
+    steps, valid = np.asarray(places.steps), np.asarray(places.valid)
+    own = {axis: np.flatnonzero(valid & (np.asarray(places.on_tilt) == (axis == AXES[1]))) for axis in AXES}
+    table = _table(physical, {axis: steps[own[axis]] for axis in AXES})
+    # The fit's own scales too: how its table follows the places, in units in which they are N(0, 1) a priori.
+    mode, root = np.asarray(fit.mode.physical), np.asarray(fit.linearised.place_root) * DEGREES
+    generator = np.random.default_rng([seed, 7])
+    expected, left_open = np.zeros((count, table.size)), np.zeros((count, table.size))
+    by_places = np.zeros((table.size, errors))
+    for name, part in table.parts.items():
+        axis = name.split(".")[1]
+        at = own[axis] + (0 if name.startswith(ERROR_AT) else errors // 2)
+        periods = tuple(np.ravel(fit.campaign.rig.harmonic_period_deg.get(axis, ())).tolist())
+        seen, new = steps[own[axis]], np.array(table.steps[AXES.index(axis)])
+        normal = generator.standard_normal((count, len(new) + 1))
+        process, ratio = _process(physical, name, periods), physical[:, INDEX[f"degrees_per_step.{axis}"], None]
+        found = conditional(process, ratio * seen, place_errors_rad[:, at] * DEGREES, ratio * new, normal[:, :-1])
+        inner = slice(part.start, part.stop - 1)
+        expected[:, inner], left_open[:, inner] = found.expected, found.left_open
+        left_open[:, part.stop - 1] = np.sqrt(process.variance) * normal[:, -1]
+        own_ratio = float(mode[INDEX[f"degrees_per_step.{axis}"]])
+        by_places[inner] = _following(_process(mode[None], name, periods), own_ratio * seen, own_ratio * new) @ root[at]
+    # What nobody knows moves no estimate.
+    return DrawnGears(table, expected, left_open - left_open.mean(axis=0), by_places)
+
+
+def _following(process: Process, seen_deg: np.ndarray, new_deg: np.ndarray) -> np.ndarray:
+    """How means at new angles follow the values at places: shape (new, seen)."""
+    covariance = process.covariance(np.concatenate([seen_deg, new_deg])[None])[0]
+    count = len(seen_deg)
+    return np.linalg.solve(covariance[:count, :count], covariance[:count, count:]).T

@@ -1,0 +1,54 @@
+"""Rigs that the data allow, drawn from a calibration's stored draws, each with the noises of one look. NumPy."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from tvsbayes.calibration.optics import Number
+from tvsbayes.calibration.pointing import INPUT_NAMES, NOISE_NAMES, NOISES, Calibration, Counters
+from tvsbayes.errors import InputError
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """Rigs that the data allow, each with the unit noises of one look.
+
+    Attributes:
+        inputs: shape (draws, columns), ordered as `INPUT_NAMES`, then `NOISE_NAMES`.
+        gears: columns of the gears' errors, shape (draws, columns).
+        noise: standard-normal stop errors (pan, tilt), uniform places in the play in [-1/2, 1/2] (pan, tilt), the
+            aperture's standard-normal noise, shape (draws, `NOISES`).
+    """
+
+    inputs: np.ndarray
+    gears: np.ndarray
+    noise: np.ndarray
+
+    def values_at(self, calibration: Calibration, steps: Counters) -> dict[str, Number]:
+        """Parameters by name of `look_inputs` and `NOISE_NAMES` at counters (n,), arrays (draws, 1) or (draws, n)."""
+        names = (*INPUT_NAMES, *NOISE_NAMES)
+        return {**dict(zip(names, self.inputs.T[..., None], strict=True)), **calibration.gears.at(self.gears, steps)}
+
+
+def drawn(calibration: Calibration, draws: int, seed: int) -> Drawn:
+    """Draws of parameters, evenly chosen, with noises of their own; the same for every point of a call.
+
+    Raises:
+        InputError: a calibration without draws.
+    """
+    stored = len(calibration.inputs)
+    if stored == 0:
+        raise InputError(
+            "no-draws",
+            "this calibration keeps moments only, as exported for a robot",
+            remedy="locate from the campaign folder, or use calibration.locate, which needs no draws",
+        )
+    generator = np.random.default_rng([seed, 6])
+    # Fewer draws than are stored: evenly chosen; more: all, again and again, with new noises.
+    chosen = np.arange(draws) % stored if draws > stored else np.linspace(0, stored - 1, draws).astype(int)
+    own, gears = np.split(calibration.inputs[chosen], [len(INPUT_NAMES)], axis=1)
+    normal = generator.standard_normal((draws, NOISES))
+    noise = np.column_stack([normal[:, :2], generator.uniform(-0.5, 0.5, (draws, 2)), normal[:, 4]])
+    return Drawn(np.concatenate([own, calibration.noise[chosen]], axis=1), gears, noise)

@@ -1,0 +1,138 @@
+"""Errors of the gears over their counters, as a robot keeps them: columns at regular counters, and one beyond them.
+
+Transmission error e and change of play d of both axes, deg, of the output's angle (formulation 3.1). Between table
+counters both are interpolated with fixed weights; beyond the table nothing is known of them but how large they are:
+one column each stands for every counter there. NumPy.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from tvsbayes.calibration.optics import GEAR_INPUTS, Number
+from tvsbayes.instrument.axes import AXES
+from tvsbayes.instrument.places import interpolation
+
+COUNTERS_MAX = 64
+"""Counters of a table, at most, by axis."""
+BEYOND = "beyond"
+"""Ends the name of the column for counters beyond the table."""
+
+
+@dataclass(frozen=True)
+class GearTable:
+    """Where a calibration tells errors of the gears; its columns follow `GEAR_INPUTS`, counters and beyond of each.
+
+    Attributes:
+        steps: counters of (pan, tilt), regular, ascending; both empty where gears do not vary.
+    """
+
+    steps: tuple[tuple[float, ...], tuple[float, ...]] = ((), ())
+
+    @property
+    def size(self) -> int:
+        """Number of columns."""
+        return sum(2 * (len(steps) + 1) for steps in self.steps if len(steps))
+
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        """`GEAR_INPUTS`, or none where gears do not vary."""
+        return GEAR_INPUTS if self.size else ()
+
+    @cached_property
+    def parts(self) -> dict[str, slice]:
+        """Columns of each of `inputs`; the last one of each stands for counters beyond the table."""
+        found, begin = {}, 0
+        for name in self.inputs:
+            end = begin + len(self.steps[_axis(name)]) + 1
+            found[name] = slice(begin, end)
+            begin = end
+        return found
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """Of the columns: `transmission_error_at_deg.pan.-120`, the last part a counter or `beyond`."""
+        return tuple(
+            f"{name}.{place}"
+            for name in self.inputs
+            for place in (*(f"{n:.12g}" for n in self.steps[_axis(name)]), BEYOND)
+        )
+
+    def shares(self, axis: int, counters: Number) -> np.ndarray:
+        """Share of the columns of one error of an axis in its value at counters (...), shape (..., columns)."""
+        nodes, flat = np.array(self.steps[axis]), np.ravel(counters).astype(float)
+        inside = (flat >= nodes[0]) & (flat <= nodes[-1])
+        found = np.zeros((len(flat), len(nodes) + 1))
+        found[inside, :-1] = interpolation(flat[inside], nodes)
+        found[~inside, -1] = 1.0
+        return found.reshape(*np.shape(counters), -1)
+
+    def at(self, columns: np.ndarray, steps: tuple[Number, Number]) -> dict[str, np.ndarray]:
+        """Errors at counters, by name of `inputs`.
+
+        Args:
+            columns: of the table, shape (..., size).
+            steps: counters (pan, tilt), numbers or arrays of shape (n,).
+
+        Returns:
+            Arrays (...) or (..., n), deg; none where gears do not vary.
+        """
+        shares = [self.shares(axis, n) for axis, n in enumerate(steps)] if self.size else []
+        return {name: columns[..., part] @ shares[_axis(name)].T for name, part in self.parts.items()}
+
+    def look_covariance(self, covariance: np.ndarray, steps: tuple[Number, Number]) -> np.ndarray:
+        """Covariance of other inputs and of the errors at the counters of looks.
+
+        Args:
+            covariance: of the others and the columns, shape (..., others + size, others + size).
+            steps: counters as for `at`.
+
+        Returns:
+            Shape (..., others + inputs, others + inputs), for arrays of counters with n before the last two.
+        """
+        others = covariance.shape[-1] - self.size
+        shape = np.shape(steps[0])
+        share = np.zeros((*shape, others + len(self.inputs), covariance.shape[-1]))
+        share[..., np.arange(others), np.arange(others)] = 1.0
+        for row, (name, part) in enumerate(self.parts.items(), others):
+            share[..., row, others + part.start : others + part.stop] = self.shares(_axis(name), steps[_axis(name)])
+        return share @ covariance[(..., *(None for _ in shape), slice(None), slice(None))] @ np.swapaxes(share, -1, -2)
+
+
+NO_GEARS = GearTable()
+"""Of gears that do not vary."""
+
+
+def _axis(name: str) -> int:
+    """Index of the axis of one of `GEAR_INPUTS`."""
+    return AXES.index(name.split(".")[1])
+
+
+def regular_counters(first: float, last: float, spacing: float) -> np.ndarray:
+    """Counters of a table from a first to a last one, not much farther apart than `spacing` and not too many."""
+    count = int(np.clip(np.ceil((last - first) / spacing) + 1, 4, COUNTERS_MAX))
+    return np.linspace(first, last, count)
+
+
+def table_of(steps: Mapping[str, object]) -> GearTable:
+    """A table from a file, by axis.
+
+    Raises:
+        ValueError: counters that are no regular, ascending, finite ones.
+        KeyError: an axis is missing.
+    """
+    found = [np.array(steps[axis], dtype=float) for axis in AXES]
+    for nodes in found:
+        regular = nodes.ndim == 1 and len(nodes) <= 4 * COUNTERS_MAX and np.all(np.isfinite(nodes))
+        if not regular or len(nodes) in (1, 2, 3):
+            raise ValueError("counters of a gear table")
+        gaps = np.diff(nodes)
+        if len(nodes) and (gaps.min() <= 0 or np.ptp(gaps) > 1e-6 * gaps.max()):
+            raise ValueError("a gear table's counters are not regular")
+    if (len(found[0]) == 0) != (len(found[1]) == 0):
+        raise ValueError("a gear table of one axis")
+    return GearTable((tuple(found[0].tolist()), tuple(found[1].tolist())))
