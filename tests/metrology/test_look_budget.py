@@ -35,7 +35,8 @@ def test_coordinate_budgets_by_parameter():
     covariance = contribution.T @ correlation @ contribution
     parts = rng.dirichlet(np.ones(5), 3).T * np.diag(covariance)
     causes = ("pixel noise", "prior of extrinsics", STOP_HERE, PLAY_HERE, APERTURE_HERE)
-    found = Budget(causes, parts.sum(axis=1) / parts.sum(), parts, names, contribution, correlation, covariance)
+    share = parts.sum(axis=1) / parts.sum()
+    found = Budget(causes, share, parts, names, contribution, correlation, covariance, (0.0, 0.0))
     for index, component in enumerate("xyz"):
         table = coordinate_budget(found, one, (1.0, 2.0, 3.0), component)
         assert (table.estimate, table.unit) == (float(index + 1), "mm")

@@ -54,7 +54,7 @@ def fit_of(jacobian: np.ndarray, load: np.ndarray, rig, readings: bool = False) 
         "arrays": SimpleNamespace(spots=SimpleNamespace(has_aperture=aperture, valid=seen)),
         "space": space,
         "z": 0.1 * np.random.default_rng(4).normal(size=len(NAMES)),
-        "draws": SimpleNamespace(physical=physical),
+        "draws": SimpleNamespace(physical=physical, place_errors_rad=np.zeros((len(physical), 0))),
         "campaign": small_campaign(),
     }
     for name, value in values.items():

@@ -99,7 +99,7 @@ def _widest(table: GearTable, inputs: np.ndarray, axis: str) -> np.ndarray | flo
     return 0.0 if part is None else np.maximum(inputs[:, len(INPUT_NAMES) :][:, part].max(axis=1), 0.0)
 
 
-def _overshoot_steps(column: Mapping[str, np.ndarray], axis: str, widest_deg: np.ndarray | float) -> int:
+def _overshoot_steps(column: Mapping[str, np.ndarray], axis: str, widest_deg: np.ndarray | float = 0.0) -> int:
     play_steps = (column[f"backlash_deg.{axis}"] + widest_deg) / np.abs(column[f"degrees_per_step.{axis}"])
     return math.ceil(np.quantile(play_steps, CLEARED_PROBABILITY))
 
@@ -119,7 +119,9 @@ def calibration_of(fit: JointFit, posterior: Posterior | None = None, *, seed: i
     if posterior is not None and posterior.converged:
         draws, estimator = posterior.thinned(DRAWS_KEPT), "posterior"
     physical = np.asarray(draws.physical)
-    gears = drawn_gears(fit, physical, np.asarray(draws.place_errors_rad), seed)
+    # Laplace draws of the errors at places hold at the mode's scales, those of a posterior at their own.
+    own = estimator == "posterior"
+    gears = drawn_gears(fit, physical, np.asarray(draws.place_errors_rad), seed, own_scales=own)
     found = calibration_of_draws(fit.names, physical, fit.campaign, estimator, seed, gears)
     causes = _with_left_open(causes_of(fit, gears.by_places), gears) if gears.table.size else causes_of(fit)
     return replace(found, causes=causes.names, cause_covariance=causes.covariance)

@@ -15,7 +15,7 @@ import numpy as np
 from tvsbayes.calibration.gear_table import NO_GEARS, GearTable, regular_counters
 from tvsbayes.calibration.optics import ERROR_AT
 from tvsbayes.estimators.joint_fit import JointFit
-from tvsbayes.instrument.axes import AXES
+from tvsbayes.instrument.axes import AXES, Axis
 from tvsbayes.instrument.parameters import INDEX, PERIODS_MAX
 from tvsbayes.model.gear_processes import FLOOR_RAD2
 from tvsbayes.model.headlines import DEGREES
@@ -111,11 +111,16 @@ def conditional(
     return Conditional(expected, left_open)
 
 
+def _axis(name: str) -> Axis:
+    """Of one of `GEAR_INPUTS`."""
+    return AXES[0] if name.endswith(AXES[0]) else AXES[1]
+
+
 def _process(physical: np.ndarray, name: str, periods: tuple[float, ...]) -> Process:
     """Scales of one of `GEAR_INPUTS`, of draws (n, parameters)."""
-    kind, axis = name.split(".")
+    axis = _axis(name)
     length = physical[:, INDEX[f"transmission_error_length_deg.{axis}"]]
-    if kind != ERROR_AT:
+    if not name.startswith(ERROR_AT):
         return Process(physical[:, INDEX[f"play_variation_deg.{axis}"]], length, np.zeros((len(physical), 0)))
     columns = [INDEX[f"harmonic_amplitude_deg.{axis}.{k + 1}"] for k in range(min(len(periods), PERIODS_MAX))]
     sd = physical[:, INDEX[f"transmission_error_deg.{axis}"]]
@@ -135,7 +140,9 @@ def _table(physical: np.ndarray, seen_steps: Mapping[str, np.ndarray]) -> GearTa
     return GearTable((found[0], found[1]))
 
 
-def drawn_gears(fit: JointFit, physical: np.ndarray, place_errors_rad: np.ndarray, seed: int) -> DrawnGears:
+def drawn_gears(
+    fit: JointFit, physical: np.ndarray, place_errors_rad: np.ndarray, seed: int, own_scales: bool = True
+) -> DrawnGears:
     """Tables of draws.
 
     Args:
@@ -143,6 +150,7 @@ def drawn_gears(fit: JointFit, physical: np.ndarray, place_errors_rad: np.ndarra
         physical: draws in the units of the names, shape (n, parameters).
         place_errors_rad: with them the transmission errors at the places, then the plays, shape (n, errors).
         seed: of what the places leave open.
+        own_scales: the errors at places were drawn at the scales of their own draws, else at those of the fit's mode.
 
     Returns:
         Columns as a calibration keeps them; none where gears do not vary.
@@ -161,18 +169,21 @@ def drawn_gears(fit: JointFit, physical: np.ndarray, place_errors_rad: np.ndarra
     expected, left_open = np.zeros((count, table.size)), np.zeros((count, table.size))
     by_places = np.zeros((table.size, errors))
     for name, part in table.parts.items():
-        axis = name.split(".")[1]
+        axis = _axis(name)
         at = own[axis] + (0 if name.startswith(ERROR_AT) else errors // 2)
         periods = tuple(np.ravel(fit.campaign.rig.harmonic_period_deg.get(axis, ())).tolist())
         seen, new = steps[own[axis]], np.array(table.steps[AXES.index(axis)])
         normal = generator.standard_normal((count, len(new) + 1))
         process, ratio = _process(physical, name, periods), physical[:, INDEX[f"degrees_per_step.{axis}"], None]
-        found = conditional(process, ratio * seen, place_errors_rad[:, at] * DEGREES, ratio * new, normal[:, :-1])
-        inner = slice(part.start, part.stop - 1)
-        expected[:, inner], left_open[:, inner] = found.expected, found.left_open
-        left_open[:, part.stop - 1] = np.sqrt(process.variance) * normal[:, -1]
+        values = place_errors_rad[:, at] * DEGREES
+        found = conditional(process, ratio * seen, values, ratio * new, normal[:, :-1])
         own_ratio = float(mode[INDEX[f"degrees_per_step.{axis}"]])
-        by_places[inner] = _following(_process(mode[None], name, periods), own_ratio * seen, own_ratio * new) @ root[at]
+        follows = _following(_process(mode[None], name, periods), own_ratio * seen, own_ratio * new)
+        inner = slice(part.start, part.stop - 1)
+        by_places[inner] = follows @ root[at]
+        expected[:, inner] = found.expected if own_scales else values @ follows.T
+        left_open[:, inner] = found.left_open
+        left_open[:, part.stop - 1] = np.sqrt(process.variance) * normal[:, -1]
     # What nobody knows moves no estimate.
     return DrawnGears(table, expected, left_open - left_open.mean(axis=0), by_places)
 

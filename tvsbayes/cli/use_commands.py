@@ -179,8 +179,6 @@ def steps_for(
     azimuth, elevation = direction or (None, None)
     sides = None if pan_approach is tilt_approach is None else (pan_approach or "left", tilt_approach or "up")
     found = calibration.steps_for(point, azimuth_deg=azimuth, elevation_deg=elevation, approach=sides, limits=limits)
-    if not calibration.covers(found.pan_steps, found.tilt_steps):
-        report_line("warning: these counters lie outside those of the campaign: the calibration extrapolates")
     document = {"estimator": calibration.estimator, **found.as_json()}
     finish(document, steps_text(found), as_json)
 

@@ -170,6 +170,7 @@ DERIVED_UNITS: dict[str, Unit] = {
     **dict.fromkeys(("degrees_per_step", "effective_deg_per_step", "effective_contrast_deg_per_step"), "deg/step"),
     "local_deg_per_step": "deg/step",
     "effective_mirror_offset_mm": "mm",
+    **dict.fromkeys(("transmission_error_at_deg", "play_variation_at_deg"), "deg"),
 }
 """Of quantities that follow from parameters, by the first part of their names: ratios by direction, for instance."""
 PRIOR_GROUPS: dict[str, list[int]] = {

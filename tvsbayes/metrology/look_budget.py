@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tvsbayes.calibration.pointing import INPUT_NAMES, UNIT_NOISES, Calibration
+from tvsbayes.calibration.pointing import UNIT_NOISES, Calibration
 from tvsbayes.instrument.axes import HOME_APPROACH
 from tvsbayes.instrument.parameters import unit_of
 from tvsbayes.metrology.budget_tables import BudgetTable, Source, budget_table
@@ -25,14 +25,15 @@ class Budget:
     """What the variance of one point consists of, by the law of propagation.
 
     Attributes:
-        causes: pixel noise, stop errors of the campaign, stereo calibration, focal scale, every prior, and what this
-            one look adds.
+        causes: pixel noise, stop errors of the campaign, stereo calibration, focal scale, every prior, transmission
+            error and play variation, and what this one look adds.
         share: of the total variance (sum over x, y, z), shape (causes,); sums to 1.
         variance_mm2: by cause and coordinate, shape (causes, 3).
-        parameters: names of the inputs and of this look's noises.
+        parameters: names of the calibration's `look_inputs` and of this look's noises.
         contribution_mm: sensitivity times standard uncertainty, shape (parameters, 3).
         correlation: of the parameters, shape (parameters, parameters); their contributions do not add up without it.
         covariance_mm2: of the point, shape (3, 3).
+        steps: counters (pan, tilt) of the look.
     """
 
     causes: tuple[str, ...]
@@ -42,6 +43,7 @@ class Budget:
     contribution_mm: np.ndarray
     correlation: np.ndarray
     covariance_mm2: np.ndarray
+    steps: tuple[float, float]
 
     def as_json(self) -> dict[str, object]:
         """Causes with share and standard uncertainty, parameters with signed contributions and correlations."""
@@ -82,10 +84,13 @@ def budget(
     if not calibration.causes:
         raise ValueError("this calibration does not know its causes: fit the campaign again")
     jacobian = calibration.derivatives(pan_steps, tilt_steps, aperture_deg, approach)
-    covariance = calibration.covariance_with_noise
-    count = len(INPUT_NAMES)
+    steps = float(pan_steps), float(tilt_steps)
+    covariance, parts = calibration.look_covariance(steps), calibration.cause_covariance
+    if calibration.gears.size:
+        parts = calibration.gears.look_covariance(parts, steps)
+    count = len(calibration.look_inputs)
     calibrated, here = jacobian[:, :count], jacobian[:, count:]
-    by_cause = [np.einsum("ij,jk,ik->i", calibrated, c, calibrated) for c in calibration.cause_covariance]
+    by_cause = [np.einsum("ij,jk,ik->i", calibrated, c, calibrated) for c in parts]
     own = here**2 * np.diag(covariance)[count:]
     by_cause += [own[:, :2].sum(axis=1), own[:, 2:4].sum(axis=1), own[:, 4]]
     variance = np.array(by_cause)
@@ -96,10 +101,11 @@ def budget(
         causes=(*calibration.causes, STOP_HERE, PLAY_HERE, APERTURE_HERE),
         share=variance.sum(axis=1) / variance.sum(),
         variance_mm2=variance,
-        parameters=(*INPUT_NAMES, *UNIT_NOISES),
+        parameters=(*calibration.look_inputs, *UNIT_NOISES),
         contribution_mm=(jacobian * u).T,
         correlation=covariance / np.outer(safe, safe),
         covariance_mm2=jacobian @ covariance @ jacobian.T,
+        steps=steps,
     )
 
 
@@ -123,7 +129,8 @@ def coordinate_budget(budget: Budget, calibration: Calibration, xyz_mm: Sequence
         raise ValueError(f"component {component!r}; allowed: x, y, z")
     index = "xyz".index(component)
     u = math.sqrt(float(budget.covariance_mm2[index, index]))
-    sd = np.sqrt(np.diag(calibration.covariance_with_noise)).tolist()
+    sd = np.sqrt(np.diag(calibration.look_covariance(budget.steps))).tolist()
+    estimates = calibration.estimates_at(budget.steps)
     sources = []
     for name, width, moved in zip(budget.parameters, sd, budget.contribution_mm[:, index].tolist(), strict=True):
         if width == 0:
@@ -132,7 +139,8 @@ def coordinate_budget(budget: Budget, calibration: Calibration, xyz_mm: Sequence
             kind, shape = _KINDS[name.split()[0]]
             sources.append(Source(name, "1", 0.0, width, kind, shape, math.inf, moved / width))
         else:
-            estimate = calibration.estimates[name]
-            sources.append(Source(name, unit_of(name), estimate, width, "A, B", "normal", math.inf, moved / width))
+            sources.append(
+                Source(name, unit_of(name), estimates[name], width, "A, B", "normal", math.inf, moved / width)
+            )
     notes = ("by parameter; parameters fitted together are correlated (GUM 5.2.2)",)
     return budget_table(f"{component} of the point", "mm", float(xyz_mm[index]), u, sources, notes=notes)

@@ -24,6 +24,12 @@ if TYPE_CHECKING:
     from tvsbayes.studies.study import StudyResult
 
 
+EXTRAPOLATED = (
+    "EXTRAPOLATED: no look of the campaign reached these counters; errors of the gears are foretold there by their "
+    "size alone"
+)
+
+
 def plan_text(result: PlanResult) -> str:
     """A result for people."""
     unit = result.target.unit
@@ -154,9 +160,11 @@ def locations_text(found: Locations) -> str:
         half = " ".join(map(two_digits, found.u95_mm[index]))
         held = int(found.digits_held[index].min())
         verdict = f"validated at {held} digit{'s' * (held > 1)}" if held else "not validated"
+        verdict += ", EXTRAPOLATED" * bool(found.extrapolated[index])
         rows.append([str(index), *cells, half, verdict])
     columns = ["point", "x(u) mm", "y(u) mm", "z(u) mm", "U95 mm", "linear propagation"]
-    return TableView(f"frame T, {found.draws} draws ({found.estimator})", columns, rows).text()
+    table = TableView(f"frame T, {found.draws} draws ({found.estimator})", columns, rows).text()
+    return f"{table}\n{EXTRAPOLATED}" if found.extrapolated.any() else table
 
 
 def budget_text(budget: Budget) -> str:
@@ -186,6 +194,8 @@ def steps_text(steps: Steps) -> str:
     if steps.u95_deg is not None:
         half = ", ".join(map(two_digits, steps.u95_deg))
         lines.append(f"whole steps leave {steps.rounding_deg:.3g} deg; azimuth and elevation +- ({half}) deg (95 %)")
+    if steps.extrapolated:
+        lines.append(EXTRAPOLATED)
     return "\n".join(lines)
 
 
