@@ -314,12 +314,12 @@ def play_places(rows: AxisRows, backlash: np.ndarray) -> PlayPlaces:
         command, travelled = float(legs.command[move]), float(path[move])
         if legs.first[move]:
             side = -float(legs.side[move]) * turned
-            ends = [_End(command, travelled, s, n) for s in ((side, side) if side else (-1.0, 1.0))]
+            ends = [_End(command, travelled, s, n) for s in ((side,) if side else (-1.0, 1.0))]
         elif motion[move]:
             for end in ends:
                 end.follow(command, travelled, slope, half)
         if row < count and rows.move[row] == move:
-            low, high = ends
+            low, high = ends[0], ends[-1]
             places = low.place(slope, half), high.place(slope, half)
             off = 0.5 * (places[0] + places[1]) - slope * command
             middle_side = 0.5 * (low.side + high.side)

@@ -215,6 +215,15 @@ def chain_quality(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarra
     return rhat, np.array(bulk), np.array(tail)
 
 
+def _autocorrelation_steps(kept: np.ndarray) -> float:
+    """Longest integrated autocorrelation time of positions (walkers, steps, d); infinite where a walker never moved."""
+    import emcee
+
+    if not np.all(np.ptp(kept, axis=1) > 0):
+        return np.inf
+    return float(np.max(emcee.autocorr.integrated_time(np.swapaxes(kept, 0, 1), tol=0, quiet=True)))
+
+
 def run_chain(
     density: Density, first: WeightedSample, seed: int, max_seconds: float, advance: Advance = unshown
 ) -> AxisChain:
@@ -246,8 +255,7 @@ def run_chain(
         state = sampler.run_mcmc(state, BLOCK_STEPS, skip_initial_state_check=True)
         kept = np.swapaxes(sampler.get_chain(discard=BURN_STEPS), 0, 1)
         rhat, bulk, tail = chain_quality(kept)
-        times = emcee.autocorr.integrated_time(np.swapaxes(kept, 0, 1), tol=0, quiet=True)
-        taus = kept.shape[1] / float(np.max(times))
+        taus = kept.shape[1] / _autocorrelation_steps(kept)
         missing = []
         if not np.max(rhat) <= RHAT_MAX:
             missing.append(f"R-hat is {np.max(rhat):.4f}, wanted {RHAT_MAX}")

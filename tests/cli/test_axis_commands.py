@@ -1,0 +1,98 @@
+"""Commands on an axis folder: documents, exit codes, what is refused."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+from support.axes import campaign, drawn, runs
+from support.commands import ESTIMATE_KEYS, assert_error
+
+from tvsbayes.single_axis.axis_campaign import write_axis
+from tvsbayes.single_axis.axis_parameters import AxisPrior
+
+
+@pytest.fixture
+def folder(tmp_path):
+    drawn(7, runs(2), backlash=AxisPrior(0.0, 0.1)).write(tmp_path / "axis")
+    return tmp_path / "axis"
+
+
+def test_check_says_what_it_holds(ask, folder):
+    code, document = ask("check", folder)
+    assert code == 0
+    assert (document["kind"], document["moves"], document["readings"], document["positions"]) == ("axis", 33, 33, 9)
+
+
+def test_fit_and_what_goes_on_from_it(ask, say, folder, tmp_path):
+    code, document = ask("fit", folder, "--quick")
+    assert code == 0
+    assert (document["estimator"], document["tier"], document["converged"]) == ("posterior", "importance", True)
+    for side in ("forward", "backward"):
+        assert set(document["per_command"][side]) == ESTIMATE_KEYS
+        assert document["per_command"][side]["value"] == pytest.approx(0.01, rel=0.03)
+    assert document["range_command"] == [-2300.0, 2300.0]
+    assert {"per_command", "backlash", "transmission_error", "stop_sd.forward"} <= set(document["parameters"])
+    kept = json.loads((folder / "results" / "fit.json").read_text())
+    assert kept["per_command"] == document["per_command"] and set(kept["inputs"]) == {"moves", "readings", "axis"}
+
+    code, planned = ask("plan", "--given", folder, "-o", tmp_path / "plan.csv", "--minutes", "1")
+    assert code == 0 and planned["next"] and planned["next"][0]["actions"][-1] == "read"
+    assert (tmp_path / "plan.csv").read_text().startswith("step,command,direction,read")
+    code, _, err = say("report", folder)
+    assert code == 0 and "fitting first" not in err
+    page = (folder / "results" / "report.html").read_text()
+    assert "Calibration of an axis" in page and "data:image/svg+xml" in page
+
+
+def test_positions_left_out(ask, folder):
+    code, document = ask("compare", folder, "--by", "positions")
+    held = document["hold_out"]
+    assert code == 0 and held["by"] == "positions" and held["rms_z"] > 0
+    assert {"position", "direction", "n", "mean", "predicted", "u"} <= set(held["positions"][0])
+    inner = [p for p in held["positions"] if abs(p["position"]) < 2300]
+    assert len(inner) == 14 and all(p["n"] == 2 for p in inner)
+
+
+def test_simulate_and_new(ask, folder, tmp_path):
+    code, document = ask("simulate", folder, tmp_path / "again", "--seed", "3")
+    assert code == 0 and document["readings"] == 33 and (tmp_path / "again" / "truth.json").exists()
+    code, document = ask("simulate", folder, folder / "moves.csv", tmp_path / "listed")
+    assert code == 0 and document["moves"] == 33
+    code, document = ask("new", tmp_path / "new", "--axis")
+    assert code == 0 and set(document["files"]) == {"campaign.toml", "moves.csv", "readings.csv"}
+    assert ask("check", tmp_path / "new")[0] == 0
+    code, document = ask("fit", tmp_path / "new")
+    assert code == 3 and assert_error(document, "too-few-positions")
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        ("fit", "AXIS", "--robust"),
+        ("fit", "AXIS", "--no-sample", "--quick"),
+        ("compare", "AXIS", "--by", "steps"),
+        ("compare", "AXIS", "AXIS"),
+        ("report", "AXIS", "--limit-mm", "1"),
+        ("plan", "--given", "AXIS", "--target", "speed"),
+        ("plan", "AXIS"),
+        ("simulate", "AXIS", "OUT", "--frames"),
+    ],
+)
+def test_options_of_scanners_are_refused(ask, folder, tmp_path, line):
+    words = [{"AXIS": folder, "OUT": tmp_path / "out"}.get(word, word) for word in line]
+    code, document = ask(*words)
+    assert code == 2 and assert_error(document, "target" if "speed" in line else "usage")
+
+
+def test_two_positions_leave_nothing_to_foretell(ask, tmp_path):
+    moves = runs(2, (0.0, 1000.0), 0.0)
+    write_axis(campaign(moves, [0.01 * m.command for m in moves]), tmp_path / "two")
+    code, document = ask("compare", tmp_path / "two")
+    assert code == 3 and assert_error(document, "too-few-positions")
+
+
+def test_a_chain_that_has_no_time_ends_with_4(ask, folder, monkeypatch):
+    monkeypatch.setattr("tvsbayes.single_axis.axis_sampling.BLOCK_STEPS", 40)
+    code, document = ask("fit", folder, "--max-minutes", "0.01")
+    assert code == 4 and document["error"]["code"] == "unconverged" and not document["converged"]

@@ -1,0 +1,84 @@
+"""Axis folders: what is read back, what is refused and how."""
+
+from __future__ import annotations
+
+import pytest
+from support.axes import campaign, runs
+
+from tvsbayes.errors import InputError
+from tvsbayes.single_axis.axis_campaign import axis_hashes, is_axis_folder, read_axis, write_axis
+from tvsbayes.single_axis.axis_parameters import AxisPrior
+
+TOML = 'format = "tvsbayes-axis/1"\nunit = "deg"\n'
+MOVES = "move,segment,time_s,command,approach\n0,0,0,0,forward\n1,0,1,10.5,\n"
+READINGS = "reading,move,value,u,status\n0,0,0.1,0.01,ok\n1,1,,,lost\n"
+
+
+def folder(path, toml=TOML, moves=MOVES, readings=READINGS):
+    path.mkdir(exist_ok=True)
+    for name, text in (("campaign.toml", toml), ("moves.csv", moves), ("readings.csv", readings)):
+        (path / name).write_bytes(text.encode())
+    return path
+
+
+def test_what_is_written_is_read_back(tmp_path):
+    moves = runs(1)
+    made = campaign(moves, [0.01 * m.command + 0.1 for m in moves], 0.002, per_command=AxisPrior(0.01, 0.001))
+    write_axis(made, tmp_path / "a")
+    found = read_axis(tmp_path / "a")
+    assert (found.moves, found.readings, found.stated, found.unit) == (made.moves, made.readings, made.stated, "deg")
+    assert axis_hashes(found) == axis_hashes(made)
+    assert is_axis_folder(tmp_path / "a") and not is_axis_folder(tmp_path)
+
+
+def test_marks_line_ends_and_empty_cells_are_accepted(tmp_path):
+    found = read_axis(folder(tmp_path / "a", "\ufeff" + TOML, MOVES.replace("\n", "\r\n")))
+    assert found.moves[1].command == 10.5
+    assert [(r.value, r.u, r.status) for r in found.readings] == [(0.1, 0.01, "ok"), (None, 0.0, "lost")]
+
+
+@pytest.mark.parametrize(
+    ("change", "file", "line", "column", "code"),
+    [
+        ({"toml": TOML.replace("axis/1", "axis/2")}, "campaign.toml", 1, "format", "word"),
+        ({"toml": TOML.replace('unit = "deg"', "")}, "campaign.toml", None, "unit", "missing-key"),
+        ({"toml": TOML + "colour = 1\n"}, "campaign.toml", 3, "colour", "unknown-key"),
+        ({"toml": TOML + "[axis]\nspeed = 1\n"}, "campaign.toml", 4, "axis.speed", "unknown-key"),
+        ({"toml": TOML + "[axis]\nbacklash = 1\n"}, "campaign.toml", 4, "axis.backlash", "quantity"),
+        (
+            {"toml": TOML + "[axis]\ntransmission_error = { value = 1.0, u = 1.0 }\n"},
+            *("campaign.toml", 4, "axis.transmission_error.value", "half-normal"),
+        ),
+        (
+            {"toml": TOML + "[axis]\nstop_sd = { value = 0.0, u = 1.0 }\n"},
+            *("campaign.toml", 4, "axis.stop_sd.value", "log-normal"),
+        ),
+        ({"moves": MOVES.replace("0,0,0,0,forward", "0,0,0,0,left")}, "moves.csv", 2, "approach", "approach"),
+        ({"moves": MOVES.replace("10.5,", "10.5,forward")}, "moves.csv", 3, "approach", "approach"),
+        ({"moves": MOVES.replace("10.5", "10;5")}, "moves.csv", 3, "command", "number"),
+        ({"moves": MOVES.replace("1,0,1", "1,0,-1")}, "moves.csv", 3, "time_s", "order"),
+        ({"moves": MOVES.replace("1,0,1", "1,2,1")}, "moves.csv", 3, "segment", "order"),
+        ({"moves": MOVES.replace("1,0,1", "2,0,1")}, "moves.csv", 3, "move", "order"),
+        ({"moves": MOVES.replace("command", "steps")}, "moves.csv", 1, "steps", "unknown-column"),
+        ({"moves": MOVES.split("\n")[0] + "\n"}, "moves.csv", 1, None, "empty"),
+        ({"readings": READINGS.replace("1,1,,", "1,7,,")}, "readings.csv", 3, "move", "missing-move"),
+        ({"readings": READINGS.replace("1,1,,", "0,1,,")}, "readings.csv", 3, "reading", "duplicate"),
+        ({"readings": READINGS.replace("0.1,0.01,ok", ",0.01,ok")}, "readings.csv", 2, "value", "missing"),
+        ({"readings": READINGS.replace("0.1,0.01,ok", "0.1,-1,ok")}, "readings.csv", 2, "u", "number"),
+        ({"readings": READINGS.replace("0.1,0.01,ok", "nan,0.01,ok")}, "readings.csv", 2, "value", "number"),
+    ],
+)
+def test_refusals_say_where_and_what_to_do(tmp_path, change, file, line, column, code):
+    with pytest.raises(InputError) as caught:
+        read_axis(folder(tmp_path / "a", **change))
+    error = caught.value
+    assert (error.file, error.line, error.column, error.code) == (file, line, column, code)
+    assert error.found and error.allowed and error.remedy
+
+
+def test_the_hash_follows_what_counts(tmp_path):
+    one = read_axis(folder(tmp_path / "a"))
+    other = read_axis(folder(tmp_path / "b", TOML + 'name = "x"\n', MOVES, READINGS.replace("0.01,ok", "0.010,ok")))
+    assert axis_hashes(one) == axis_hashes(other)
+    third = read_axis(folder(tmp_path / "c", TOML + "[axis]\nbacklash = { value = 0.0, u = 0.2 }\n"))
+    assert axis_hashes(one)["axis"] != axis_hashes(third)["axis"]

@@ -1,0 +1,94 @@
+"""Fits of drawn axes: the truth comes back, both tiers agree, everything held fixed works too."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from support.axes import FIRST_EDITION, campaign, drawn, random_moves, runs
+
+from tvsbayes.single_axis.axis_campaign import AxisCampaign, AxisMove
+from tvsbayes.single_axis.axis_fit import fit_axis
+from tvsbayes.single_axis.axis_parameters import AxisPrior
+from tvsbayes.single_axis.axis_record import summarise_axis
+
+
+def test_truths_lie_where_the_fit_says():
+    """Twelve drawn axes of two protocols; a sum of squares that 1 in 1e4 sets of honest z exceeds."""
+    z = []
+    for seed in range(6):
+        for moves in (runs(3), random_moves(seed, 40, 2)):
+            made = drawn(seed, moves, backlash=AxisPrior(0.0, 0.1))
+            found = fit_axis(made.campaign, tier="importance", seed=seed)
+            assert found.error is None
+            z += [
+                (draws.mean() - made.truth.parameters[name]) / draws.std()
+                for name in ("per_command", "backlash")
+                for draws in [found.draws[name]]
+            ]
+    # 24 numbers: chi-square at 1e-4 is 59.
+    assert np.sum(np.square(z)) < 59
+    assert np.sum(np.square(z)) > 4
+
+
+def test_both_tiers_agree_and_a_seed_gives_the_same():
+    made = drawn(3, runs(2), backlash=AxisPrior(0.0, 0.1)).campaign
+    one = fit_axis(made, seed=1)
+    assert one.tier == "emcee" and one.error is None
+    assert one.agreement is not None and one.agreement.agrees
+    quick, again = (fit_axis(made, tier="importance", seed=1) for _ in range(2))
+    np.testing.assert_array_equal(quick.draws["backlash"], again.draws["backlash"])
+    json.dumps(summarise_axis(one).as_json(), allow_nan=False)
+
+
+def test_nothing_left_to_sample():
+    moves = runs(2)
+    fixed = campaign(moves, [0.01 * m.command + 0.002 * (k % 3) for k, m in enumerate(moves)], **FIRST_EDITION)
+    for way in ({"tier": "emcee"}, {"tier": "importance"}, {"sampled": False}):
+        found = fit_axis(fixed, **way)
+        assert found.free == () and found.error is None
+        assert summarise_axis(found).per_command["forward"].value == pytest.approx(0.01, rel=1e-3)
+
+
+def test_play_swallows_short_legs():
+    """Backlash of five legs, stops inside it."""
+    commands = [*range(0, 12), *range(12, 0, -1), *range(0, 12)]
+    moves = [AxisMove(k, 0, 0.0, float(c), "" if k else "forward") for k, c in enumerate(commands)]
+    rng = np.random.default_rng(8)
+    y, values = -2.5, []
+    for c in commands:
+        y = min(max(y, c - 2.5), c + 2.5)
+        values.append(y + 0.05 * rng.standard_normal())
+    found = fit_axis(campaign(moves, values, backlash=AxisPrior(0.0, 10.0)), tier="importance")
+    assert found.model.play_is_sampled
+    draws = found.draws["backlash"]
+    # Scatter 0.05 over ten stops on either side would give 0.02; play and error vary by position besides.
+    assert draws.mean() == pytest.approx(5.0, abs=3 * draws.std())
+    assert draws.std() < 0.2
+
+
+def test_what_the_data_cannot_tell_is_said():
+    moves = [AxisMove(k, 0, 60.0 * k, 100.0 * k, "" if k else "forward") for k in range(4)]
+    summary = summarise_axis(fit_axis(campaign(moves, [0.0, 1.0, 2.1, 3.0]), tier="importance"))
+    said = " ".join(summary.weak_directions)
+    assert "one side" in said and "4 positions" in said and "twice" in said
+    assert summary.parameters["backlash"].contraction == pytest.approx(0.0, abs=0.15)
+    assert summary.classic.backlash is None and summary.classic.iso230 is None
+
+
+def test_a_reversal_of_the_wrong_sign_is_said():
+    moves = runs(3)
+    side = [-1.0, *np.sign(np.diff([m.command for m in moves]))]
+    rng = np.random.default_rng(2)
+    values = [0.01 * m.command + 0.1 * s + 0.003 * rng.standard_normal() for m, s in zip(moves, side, strict=True)]
+    summary = summarise_axis(fit_axis(campaign(moves, values), tier="importance"))
+    assert summary.parameters["backlash"].value == pytest.approx(-0.2, abs=0.05)
+    assert any("negative" in text for text in summary.warnings)
+
+
+def test_a_constant_unit_is_held():
+    made = drawn(2, None, per_command=AxisPrior(0.01, 0.0)).campaign
+    found = fit_axis(AxisCampaign("deg", made.moves, made.readings, made.stated), tier="importance")
+    # What rounding leaves of a variance that is nought.
+    assert np.ptp(found.draws["per_command"]) < 1e-10

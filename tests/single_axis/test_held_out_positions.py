@@ -1,0 +1,41 @@
+"""Positions left out: foretold within their u on drawn axes, and beside the classic where errors repeat."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from support.axes import PLACES, campaign, drawn, runs
+
+from tvsbayes.errors import NothingToEstimate
+from tvsbayes.single_axis.axis_parameters import AxisPrior
+from tvsbayes.single_axis.held_out_positions import hold_out_positions
+
+
+def test_positions_are_foretold_and_the_first_edition_is_too_sure():
+    """Errors by position ten times the scatter: independent stops are too sure, processes are not."""
+    stated = {
+        "backlash": AxisPrior(0.0, 0.1),
+        "stop_sd": AxisPrior(0.003, 0.0),
+        "transmission_error": AxisPrior(0.05, 0.0),
+        "transmission_error_length": AxisPrior(6.0, 0.0),
+    }
+    z, classic = [], []
+    for seed in range(3):
+        made = drawn(seed, runs(3), **stated).campaign
+        blind = campaign(made.moves, [float(r.value or 0.0) for r in made.readings], made.readings[0].u)
+        kept = [r for r in blind.readings if abs(blind.moves[r.move].command) <= 2000]
+        found = hold_out_positions(type(blind)("deg", blind.moves, tuple(kept)))
+        assert {p.position for p in found.positions} == set(PLACES)
+        assert {p.direction for p in found.positions} == {"forward", "backward"}
+        assert all(p.n == 3 and p.u > 0 for p in found.positions)
+        z.append(found.rms_z)
+        classic.append(found.classic_rms_z)
+    # Of 42 means in correlated pairs.
+    assert 0.4 < np.sqrt(np.mean(np.square(z))) < 1.5
+    assert np.sqrt(np.mean(np.square(classic))) > 1.7
+
+
+def test_two_positions_leave_no_line():
+    moves = runs(3, (0.0, 1000.0), 0.0)
+    with pytest.raises(NothingToEstimate):
+        hold_out_positions(campaign(moves, [0.01 * m.command for m in moves]))

@@ -1,0 +1,68 @@
+"""What to read next, and drawn axes."""
+
+from __future__ import annotations
+
+import json
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from support.axes import campaign, drawn, runs
+
+from tvsbayes.errors import InputError
+from tvsbayes.single_axis.axis_campaign import read_axis
+from tvsbayes.single_axis.axis_fit import fit_axis
+from tvsbayes.single_axis.axis_parameters import AxisPrior
+from tvsbayes.single_axis.next_stops import plan_next
+from tvsbayes.single_axis.simulated_axis import simulate_axis
+
+
+@pytest.fixture(scope="module")
+def fitted():
+    return fit_axis(drawn(4, runs(2), backlash=AxisPrior(0.0, 0.1)).campaign, tier="importance")
+
+
+def test_every_stop_lowers_u_and_stays_within_the_commands(fitted):
+    found = plan_next(fitted, "position", count=3)
+    u = [found.u_now, *(stop.u for stop in found.next)]
+    assert len(found.next) == 3 and all(after < before for before, after in pairwise(u))
+    for stop in found.next:
+        for command in (stop.command, stop.via):
+            assert command is None or -2300 <= command <= 2300
+    assert found.plan_bytes().startswith(b"step,command,direction,read\n0,")
+    json.dumps(found.as_json(), allow_nan=False)
+
+
+def test_a_plan_keeps_its_time(fitted):
+    assert plan_next(fitted, minutes=2.0).minutes <= 2.0
+    with pytest.raises(InputError):
+        plan_next(fitted, "speed")
+
+
+def test_what_is_drawn_is_read_back_and_repeats_by_seed(tmp_path):
+    one, other = drawn(9), drawn(9)
+    assert one.campaign.readings == other.campaign.readings != drawn(10).campaign.readings
+    one.write(tmp_path / "a")
+    assert read_axis(tmp_path / "a").readings == one.campaign.readings
+    truth = json.loads((tmp_path / "a" / "truth.json").read_text())
+    assert truth["parameters"]["per_command"] == 0.01 and len(truth["command"]) == len(truth["error"])
+
+
+def test_an_axis_without_a_ratio_is_refused():
+    moves = runs(1)
+    empty = campaign(moves, [0.0] * len(moves))
+    with pytest.raises(InputError) as caught:
+        simulate_axis(type(empty)("deg", moves, ()))
+    assert "per_command" in caught.value.remedy
+
+
+def test_without_errors_the_stops_are_the_play_operator():
+    still = {
+        name: AxisPrior(0.0, 0.0)
+        for name in ("transmission_error", "play_variation", "drift_per_root_hour", "stop_sd", "home_sd", "backlash")
+    }
+    made = drawn(1, runs(1), reading_scale=AxisPrior(0.0, 0.0), **still)
+    values = np.array([r.value for r in made.campaign.readings])
+    commands = np.array([m.command for m in made.campaign.moves])
+    # Without play or any error only the contrast is left, 1e-4 of the path.
+    np.testing.assert_allclose(values, 0.01 * commands, atol=0.05)
