@@ -10,89 +10,20 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from support.dense_likelihood import dense_log_density, physical, play_band_deg, stop_labels
 from support.sloped_density import value_and_gradient
 
 from tvsbayes.estimators.campaign_arrays import bucket, campaign_arrays, log_constant
-from tvsbayes.instrument.axes import HOME_SD_DEG
 from tvsbayes.instrument.campaign import ordered_spots
 from tvsbayes.instrument.parameters import INDEX, NAMES, RIG_NAMES
 from tvsbayes.instrument.stereo_pair import rotation_matrix
-from tvsbayes.twin.physics import aperture_angle_deg, mirror_chain, play, project, to_tvs
+from tvsbayes.twin.physics import aperture_angle_deg, mirror_chain, project, to_tvs
 
 pytestmark = pytest.mark.usefixtures("x64")
 
 LOG_UNIT = 1.0
 """One unit of log density; exact algebra on a dozen spots leaves 1e-8 of it."""
 FINE_UNIT = 1e-8 * LOG_UNIT
-
-
-def physical(evaluated) -> dict[str, float]:
-    """Values behind an evaluation that the dense computation needs, by contract name, in deg."""
-    transmission, noise = evaluated.model.transmission, evaluated.model.noise
-    values = {}
-    for axis, name in enumerate(("pan", "tilt")):
-        values[f"degrees_per_step.{name}"] = np.degrees(transmission.ratio_rad_per_step[axis])
-        values[f"ratio_contrast_deg_per_step.{name}"] = np.degrees(transmission.contrast_rad_per_step[axis])
-        values[f"backlash_deg.{name}"] = np.degrees(transmission.backlash_rad[axis])
-    for name, index in (("left", (0, 1)), ("right", (0, 0)), ("up", (1, 1)), ("down", (1, 0))):
-        values[f"stop_sd_deg.{name}"] = np.degrees(noise.stop_sd_rad[index])
-    return values
-
-
-def stop_labels(moves, axis: str) -> list[tuple[int, tuple[str, ...]]]:
-    """For each move: which draw of the axis' stop error stands, and from which direction(s) it was drawn."""
-    positive, negative = {"pan": ("left", "right"), "tilt": ("up", "down")}[axis]
-    labels, number, directions = [], -1, ()
-    for k, move in enumerate(moves):
-        approach, steps = getattr(move, f"{axis}_approach"), getattr(move, f"{axis}_steps")
-        if approach:
-            number, directions = k, (positive, negative) if approach == "unknown" else (approach,)
-        elif steps != getattr(moves[k - 1], f"{axis}_steps"):
-            number = k
-            directions = (positive,) if steps > getattr(moves[k - 1], f"{axis}_steps") else (negative,)
-        labels.append((number, directions))
-    return labels
-
-
-def play_band_deg(moves, axis: str, values: dict[str, float]) -> np.ndarray:
-    """Width of the band in which the output may stand after each move, by playing both ends through."""
-    mean, contrast = values[f"degrees_per_step.{axis}"], values[f"ratio_contrast_deg_per_step.{axis}"]
-    b = values[f"backlash_deg.{axis}"]
-    widths = np.zeros(len(moves))
-    starts = [k for k, m in enumerate(moves) if m.pan_approach]
-    for begin, end in pairwise([*starts, len(moves)]):
-        if getattr(moves[begin], f"{axis}_approach") != "unknown":
-            continue
-        steps = np.array([getattr(m, f"{axis}_steps") for m in moves[begin:end]], float)
-        turned = np.diff(steps)
-        q = mean * steps[0] + np.concatenate([[0.0], np.cumsum(turned * (mean + np.sign(turned) * contrast / 2))])
-        widths[begin:end] = play(q, q[0] + b / 2, b) - play(q, q[0] - b / 2, b)
-    return widths
-
-
-def dense_log_density(campaign, evaluated, *, persistent: bool = True) -> float:
-    """Log likelihood from the covariance of all residuals written out, without any filter."""
-    values, moves, spots = physical(evaluated), campaign.moves, ordered_spots(campaign)
-    n = len(spots)
-    residual, slope = evaluated.terms.residual[:n].ravel(), evaluated.terms.slope[:n]
-    covariance = np.eye(4 * n)
-    for axis, name in enumerate(("pan", "tilt")):
-        labels = stop_labels(moves, name)
-        band_sd = np.radians(play_band_deg(moves, name, values)) / np.sqrt(12)
-        for i, first in enumerate(spots):
-            for j, second in enumerate(spots):
-                shared = 0.0
-                number, directions = labels[first.move]
-                if number == labels[second.move][0] and (persistent or first.move == second.move):
-                    shared += np.mean([np.radians(values[f"stop_sd_deg.{d}"]) ** 2 for d in directions])
-                segment = moves[first.move].segment
-                if segment == moves[second.move].segment:
-                    shared += np.radians(HOME_SD_DEG) ** 2 * (segment > 0)
-                    shared += band_sd[first.move] * band_sd[second.move]
-                block = shared * np.outer(slope[i, :, axis], slope[j, :, axis])
-                covariance[4 * i : 4 * i + 4, 4 * j : 4 * j + 4] += block
-    chi2 = residual @ np.linalg.solve(covariance, residual)
-    return float(evaluated.terms.log_scale[:n].sum() - 0.5 * np.linalg.slogdet(covariance)[1] - 0.5 * chi2)
 
 
 def random_points(dozen, count: int, scale: float) -> np.ndarray:

@@ -1,0 +1,225 @@
+"""Errors that gears repeat by position, and drift: likelihood, draws and normal equations against dense Gaussians.
+
+A dozen spots, linearised; the dense side is written from formulation 3.1 (`support.dense_likelihood`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from types import SimpleNamespace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from support.dense_likelihood import (
+    SENSES,
+    RepeatedCovariances,
+    angle_covariances,
+    dense_log_density,
+    physical,
+    residual_covariance,
+    side,
+    stop_labels,
+)
+from support.varying_gears import PERIODS_DEG, coordinates_with, perfect_gears, varying_gears
+
+from tvsbayes.estimators.annealed_stage import Fixed, reduced_residuals
+from tvsbayes.estimators.campaign_arrays import campaign_arrays
+from tvsbayes.estimators.likelihood import innovations, no_draw, standing
+from tvsbayes.instrument.campaign import ordered_spots
+from tvsbayes.instrument.parameters import NAMES, NOISE_NAMES
+from tvsbayes.model.parameter_space import coordinates_of, parameter_space, physical_at
+
+pytestmark = pytest.mark.usefixtures("x64")
+
+NOISE = np.isin(NAMES, NOISE_NAMES)
+LOG_UNIT = 1.0
+"""One unit of log density; a covariance of nearly equal places, factored, leaves 1e-8 of it."""
+FINE_UNIT = 1e-8 * LOG_UNIT
+ALGEBRA = 1e-7
+"""Relative: dense solves of a covariance of condition 1e8."""
+SCALES = {
+    "rough": {
+        **{"transmission_error_deg.pan": 0.06, "transmission_error_deg.tilt": 0.03},
+        **{"transmission_error_length_deg.pan": 1.5, "transmission_error_length_deg.tilt": 0.4},
+        **{"play_variation_deg.pan": 0.04, "play_variation_deg.tilt": 0.02},
+        **{"drift_deg_per_root_hour.pan": 0.1, "drift_deg_per_root_hour.tilt": 0.3},
+    },
+    "smooth": {
+        **{"transmission_error_deg.pan": 0.01, "transmission_error_deg.tilt": 0.2},
+        **{"transmission_error_length_deg.pan": 40.0, "transmission_error_length_deg.tilt": 12.0},
+        **{"play_variation_deg.pan": 0.15, "play_variation_deg.tilt": 0.001},
+        **{"drift_deg_per_root_hour.pan": 0.02, "drift_deg_per_root_hour.tilt": 0.0},
+    },
+    "periodic": {
+        **{"transmission_error_deg.pan": 0.02, "transmission_error_deg.tilt": 0.02},
+        **{"transmission_error_length_deg.pan": 5.0, "transmission_error_length_deg.tilt": 8.0},
+        **{"play_variation_deg.pan": 0.03, "play_variation_deg.tilt": 0.03},
+        **{"drift_deg_per_root_hour.pan": 0.05, "drift_deg_per_root_hour.tilt": 0.05},
+        **{"harmonic_amplitude_deg.pan.1": 0.08, "harmonic_amplitude_deg.pan.2": 0.03},
+        **{"harmonic_amplitude_deg.tilt.1": 0.05},
+    },
+}
+AMPLITUDES = ("harmonic_amplitude_deg.pan.1", "harmonic_amplitude_deg.pan.2", "harmonic_amplitude_deg.tilt.1")
+SCALES = {name: dict.fromkeys(AMPLITUDES, 0.0) | values for name, values in SCALES.items()}
+
+
+@dataclass(frozen=True)
+class Varying:
+    """The dozen spots with gears of which all is estimated; arrays of JAX."""
+
+    campaign: Any
+    space: Any
+    arrays: Any
+    z: np.ndarray
+
+
+@pytest.fixture(scope="module")
+def varying(dozen) -> Varying:
+    table = varying_gears(dozen.campaign.rig)
+    assert table.harmonic_period_deg == PERIODS_DEG
+    with jax.enable_x64(True):
+        space = jax.tree.map(jnp.asarray, parameter_space(table, dozen.campaign.stereo))
+        arrays = jax.tree.map(jnp.asarray, campaign_arrays(dozen.campaign, table))
+        true = physical_at(dozen.z, dozen.space).value
+        return Varying(dozen.campaign, space, arrays, coordinates_of(space, true))
+
+
+@jax.jit
+def _found(z, normals, space, arrays, fixed):
+    model = space.model(z)
+    found = standing(model, arrays)
+    terms = {
+        "residual": jnp.stack(found.terms.residual, axis=1),
+        "slope": jnp.stack([jnp.stack(found.terms.by_pan, 1), jnp.stack(found.terms.by_tilt, 1)], axis=2),
+        "log_scale": found.terms.log_scale,
+    }
+    seen = jax.vmap(lambda normal: innovations(model, arrays, normal))(normals)
+    return model, terms, seen, reduced_residuals(z, (space, arrays, fixed))
+
+
+def found_at(varying: Varying, z: np.ndarray) -> SimpleNamespace:
+    """Everything of one point, as NumPy; errors at places at their means, then moved by each normal number by itself."""
+    size = 2 * len(varying.arrays.gears.places.steps)
+    normals = np.concatenate([no_draw(1, varying.arrays), np.eye(size)])
+    fixed = Fixed(jnp.asarray(NOISE), jnp.asarray(z), jnp.asarray(1.0))
+    arguments = jnp.asarray(z), jnp.asarray(normals), varying.space, varying.arrays, fixed
+    model, terms, seen, reduced = jax.tree.map(np.asarray, _found(*arguments))
+    return SimpleNamespace(model=model, terms=SimpleNamespace(**terms), seen=seen, reduced=reduced)
+
+
+@pytest.fixture(scope="module", params=SCALES)
+def found(request, varying) -> SimpleNamespace:
+    moved = varying.z + np.where(NOISE, 0.0, 0.3 * np.random.default_rng(33).standard_normal(len(NAMES)))
+    with jax.enable_x64(True):
+        z = coordinates_with(varying.space, moved, SCALES[request.param])
+        here = found_at(varying, z)
+    values = physical(here)
+    for name, value in SCALES[request.param].items():
+        assert values[name] == pytest.approx(value, rel=1e-9, abs=1e-12), name
+    return SimpleNamespace(z=z, values=values, **vars(here))
+
+
+def test_log_density_is_that_of_the_dense_gaussian(varying, found):
+    dense = dense_log_density(varying.campaign, found)
+    assert found.seen.log_density[0] == pytest.approx(dense, abs=FINE_UNIT, rel=1e-10)
+    # Quadratic form and determinant as the fit and its diagnoses read them.
+    count = len(ordered_spots(varying.campaign))
+    residual, slope = found.terms.residual[:count], found.terms.slope[:count]
+    covariance = residual_covariance(angle_covariances(varying.campaign, found.values), slope)
+    chi2 = residual.ravel() @ np.linalg.solve(covariance, residual.ravel())
+    squares = np.sum(found.seen.standardised[0] ** 2) + np.sum(found.seen.places[0] ** 2)
+    assert squares == pytest.approx(chi2, rel=ALGEBRA)
+
+
+def test_every_scale_matters(varying, found):
+    """Each error left out of the dense covariance is seen a thousand times above what the comparison allows."""
+    dense = dense_log_density(varying.campaign, found)
+    for name, value in found.values.items():
+        scale = any(part in name for part in ("transmission_error", "play_var", "drift", "amplitude"))
+        if not scale or value < 1e-9:
+            continue
+        without = SimpleNamespace(**vars(found))
+        values = {**found.values, name: value * 1.1}
+        count = len(ordered_spots(varying.campaign))
+        residual, slope = without.terms.residual[:count].ravel(), without.terms.slope[:count]
+        covariance = residual_covariance(angle_covariances(varying.campaign, values), slope)
+        chi2 = residual @ np.linalg.solve(covariance, residual)
+        other = without.terms.log_scale[:count].sum() - 0.5 * (np.linalg.slogdet(covariance)[1] + chi2)
+        assert abs(other - dense) > 1e3 * FINE_UNIT, name
+
+
+def dense_places(varying: Varying, values: dict[str, float]) -> tuple[np.ndarray, np.ndarray]:
+    """Prior covariance of errors at the places, rad^2, and what each does to the angles of spots, (2, spots, errors).
+
+    Transmission errors of all places first, then plays, without padding.
+    """
+    places = jax.tree.map(np.asarray, varying.arrays.gears.places)
+    steps, on_tilt = places.steps[places.valid], places.on_tilt[places.valid]
+    spots, moves = ordered_spots(varying.campaign), varying.campaign.moves
+    size = len(steps)
+    covariance, angles = np.zeros((2 * size, 2 * size)), np.zeros((2, len(spots), 2 * size))
+    for axis, name in enumerate(SENSES):
+        repeated, labels = RepeatedCovariances(values, name), stop_labels(moves, name)
+        own = np.flatnonzero(on_tilt == bool(axis))
+        for i in own:
+            for j in own:
+                covariance[i, j] = np.radians(np.radians(repeated.error(steps[i], steps[j])))
+                covariance[size + i, size + j] = np.radians(np.radians(repeated.play(steps[i], steps[j])))
+            for row, spot in enumerate(spots):
+                if getattr(moves[spot.move], f"{name}_steps") == steps[i]:
+                    angles[axis, row, i] = 1.0
+                    angles[axis, row, size + i] = -side(labels[spot.move][1]) / 2
+    return covariance, angles
+
+
+def test_draws_of_errors_at_places_have_the_conditional_gaussians_moments(varying, found):
+    """Mean, and covariance from what each normal number moves: no draw is left to chance."""
+    count, valid = len(ordered_spots(varying.campaign)), np.asarray(varying.arrays.gears.places.valid)
+    residual, slope = found.terms.residual[:count], found.terms.slope[:count]
+    prior, angles = dense_places(varying, found.values)
+    load = np.einsum("iua,aie->iue", slope, angles).reshape(4 * count, -1)
+    whole = residual_covariance(angle_covariances(varying.campaign, found.values), slope)
+    gain = np.linalg.solve(whole, load @ prior).T
+    own = np.tile(valid, 2)
+    drawn = found.seen.place_errors_rad
+    mean, moved = drawn[0][own], (drawn[1:] - drawn[0])[:, own]
+    scale = np.sqrt(np.diag(prior)) + 1e-12
+    np.testing.assert_allclose(mean / scale, gain @ residual.ravel() / scale, atol=ALGEBRA * 100)
+    left = prior - gain @ load @ prior
+    # Covariances by prior sds; of a scale of nought the floor of 1e-12 rad is left.
+    np.testing.assert_allclose(moved.T @ moved / np.outer(scale, scale), left / np.outer(scale, scale), atol=1e-6)
+    gears = varying.arrays.gears
+    assert not np.asarray(gears.error_share)[:, ~valid].any() and not np.asarray(gears.play_share)[:, ~valid].any()
+
+
+def test_a_stage_has_the_normal_equations_of_the_dense_marginal_problem(varying, found):
+    """r'C^-1 r + z'z, J'C^-1 r and J'C^-1 J + 1, held coordinates without a part."""
+    lin = found.reduced.also.of_spots(len(ordered_spots(varying.campaign)))
+    covariance = residual_covariance(angle_covariances(varying.campaign, found.values), lin.slope)
+    residual, jacobian = lin.residual.ravel(), np.where(NOISE, 0.0, -lin.residual_jacobian).reshape(-1, len(NAMES))
+    solved = np.linalg.solve(covariance, np.column_stack([residual, jacobian]))
+    prior = np.where(NOISE, 0.0, found.z)
+    value, root = found.reduced.value, found.reduced.jacobian
+    assert value @ value == pytest.approx(residual @ solved[:, 0] + prior @ prior, rel=ALGEBRA)
+    slope = -jacobian.T @ solved[:, 0] + prior
+    np.testing.assert_allclose(root.T @ value, slope, atol=ALGEBRA * np.abs(slope).max())
+    curvature = jacobian.T @ solved[:, 1:] + np.eye(len(NAMES))
+    np.testing.assert_allclose(root.T @ root, curvature, atol=ALGEBRA * np.abs(curvature).max())
+
+
+def test_scales_of_nought_are_perfect_gears(varying, dozen, evaluate):
+    """With all scales nought the density is that of a campaign that has no places at all."""
+    table = perfect_gears(dozen.campaign.rig)
+    assert not len(campaign_arrays(dozen.campaign, table).gears.places.steps)
+    with jax.enable_x64(True):
+        arrays = jax.tree.map(jnp.asarray, campaign_arrays(dozen.campaign, table))
+        space = jax.tree.map(jnp.asarray, parameter_space(table, dozen.campaign.stereo))
+        none = {n: 0.0 for n in SCALES["rough"] if "length" not in n}
+        here = found_at(varying, coordinates_with(varying.space, varying.z, none))
+        z = coordinates_of(space, physical_at(varying.z, varying.space).value)
+        perfect = evaluate(z, space, arrays).innovations.log_density
+    # What is left is the floor of 1e-12 rad under every place: with slopes of 1e4 per rad 1e-16 of a variance.
+    assert here.seen.log_density[0] == pytest.approx(perfect, abs=1e-9 * LOG_UNIT, rel=1e-12)

@@ -1,0 +1,116 @@
+"""Coordinates whose density depends on another's: draws follow it, it is a density, and it comes from the target."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy import stats
+from support.small_posterior import SIGMAS
+from support.tabulated import tabulated
+
+from tvsbayes.posterior.proposal import LEADER_NODES, NODES, Followers, Independence, Tables, first_proposal
+
+GRID = np.linspace(-12.0, 16.0, 561)
+
+
+def of_a_leader(leader: np.ndarray) -> np.ndarray:
+    """Where the follower's density lies, by its leader: the larger the one the smaller the other."""
+    return 1.5 - 0.8 * leader
+
+
+def followed() -> Independence:
+    """Two tabulated coordinates, the second of which follows the first; both are Gumbel's, all shares are the real."""
+    alone = tabulated(np.array([0.5, 0.0]), np.array([1.0, 0.8]), np.arange(2))
+    at = (NODES - of_a_leader(LEADER_NODES)[:, None]) / 0.8
+    tables = Tables.normalised(-at - np.exp(-at)).log_density
+    followers = Followers(np.array([0]), np.array([1]), tables[None])
+    return replace(alone, coupled=np.zeros(0, int), followers=followers)
+
+
+def densities(proposal: Independence) -> np.ndarray:
+    """On the grid of both coordinates, leader first."""
+    one, two = np.meshgrid(GRID, GRID, indexing="ij")
+    return np.exp(proposal.log_density(np.column_stack([one.ravel(), two.ravel()]))).reshape(one.shape)
+
+
+def test_the_density_of_a_pair_is_one_and_its_draws_follow_it():
+    proposal = followed()
+    density = densities(proposal)
+    cell = (GRID[1] - GRID[0]) ** 2
+    # The tables' broken lines cost the rule step^2 / 12 times the jumps of their slopes, 5e-4; of the twentieth that is
+    # a t of 5 degrees of freedom less than 4e-3 lies beyond the grid.
+    assert density.sum() * cell == pytest.approx(1.0, abs=1e-3)
+    draws = proposal.draw(200_000, np.random.RandomState(3))
+    # Cells of 20 x 20 grid points inside, by chi-square.
+    edges = GRID[80:401:20]
+    seen = np.histogram2d(*draws.T, bins=[edges, edges])[0].ravel()
+    weights = np.full(21, 1.0)
+    weights[[0, -1]] = 0.5
+    expected = [
+        len(draws) * cell * weights @ density[i : i + 21, j : j + 21] @ weights
+        for i in range(80, 400, 20)
+        for j in range(80, 400, 20)
+    ]
+    expected = np.array(expected)
+    many = expected > 25
+    assert many.sum() > 20
+    chi2 = np.sum((seen[many] - expected[many]) ** 2 / expected[many])
+    assert abs(chi2 - many.sum()) < SIGMAS * np.sqrt(2 * many.sum())
+
+
+def test_followers_go_with_their_leaders():
+    """Mean of the follower at a leader, by regression on draws, within what the heavy part blurs."""
+    draws = followed().draw(100_000, np.random.RandomState(4))
+    inside = np.abs(draws[:, 0]) < 3
+    slope = stats.theilslopes(*draws[inside][:2000].T[::-1])[0]
+    assert slope == pytest.approx(-0.8, abs=0.1)
+
+
+def test_between_two_nodes_the_tables_are_mixed():
+    followers = followed().followers
+    w = np.column_stack([np.full(len(GRID), LEADER_NODES[2] + 0.25 * (LEADER_NODES[1] - LEADER_NODES[0])), GRID])
+    low, high = (np.exp(Tables(followers.log_density[0][[node]]).at(GRID[:, None]))[:, 0] for node in (2, 3))
+    np.testing.assert_allclose(np.exp(followers.at(w)[:, 0]), 0.75 * low + 0.25 * high, rtol=1e-12)
+    # Beyond the outermost nodes the outermost tables stay.
+    for end, node in ((-9.0, 0), (11.0, -1)):
+        w[:, 0] = end
+        expected = Tables(followers.log_density[0][[node]]).at(GRID[:, None])
+        np.testing.assert_allclose(followers.at(w), expected, rtol=1e-12)
+
+
+def test_a_pair_that_explains_the_same_scatter_is_proposed_as_the_target_has_it():
+    """Two scales of which one suffices: weights of independent draws have a long tail, of followed ones hardly."""
+
+    def target(w: np.ndarray) -> np.ndarray:
+        both = np.logaddexp(1.5 * w[:, 0], 1.5 * w[:, 1])
+        return -0.5 * np.sum(w**2, axis=1) / 4 - 0.5 * (both - 3.0) ** 2 / 0.15
+
+    effective = {}
+    for pairs in ((), ((0, 1),)):
+        proposal = first_proposal(target, 2, np.ones(2, bool), np.zeros(2, bool), pairs)
+        w = proposal.draw(20_000, np.random.RandomState(5))
+        weights = np.exp(target(w) - proposal.log_density(w) - 3.0)
+        effective[len(pairs)] = weights.sum() ** 2 / np.sum(weights**2) / len(w)
+    # Between the leader's nodes, 1.5 apart, tables are mixed: that costs a part.
+    assert effective[1] > 0.2 > 20 * effective[0], effective
+
+
+def test_fitting_tilts_the_tables_of_followers():
+    """A target that is the proposal times e^0.2 w of the follower: every row of its tables turns by that."""
+    proposal = followed()
+    w = proposal.draw(20_000, np.random.RandomState(6))
+    tilt = 0.2 * w[:, 1]
+    fitted = proposal.fitted(w, proposal._each(w).sum(axis=1) + tilt, tilt)
+    # Beyond four sds a tilt does not grow.
+    mean, sd = proposal.mean[1], proposal.sd[1]
+    turned = 0.2 * (mean + sd * np.clip((NODES - mean) / sd, -4, 4))
+    expected = Tables.normalised(proposal.followers.log_density[0] + turned).log_density
+    inside = np.abs(NODES - mean) < 4 * sd
+    # The few draws out there are seen at four sds, which turns the regression by a few per cent.
+    found = fitted.followers.log_density[0][:, inside]
+    np.testing.assert_allclose(found, expected[:, inside], atol=0.1)
+    assert np.abs(found - proposal.followers.log_density[0][:, inside]).max() > 0.5
+    masses = Tables(fitted.followers.log_density[0]).masses.sum(axis=1)
+    np.testing.assert_allclose(masses, 1.0, rtol=1e-9)

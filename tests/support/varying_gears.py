@@ -1,0 +1,46 @@
+"""Rigs whose gears repeat errors by position, or do not, whatever the defaults say."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from tvsbayes.instrument.parameters import GEAR_ERROR_NAMES, INDEX, NAMES, Prior
+from tvsbayes.instrument.rig import RigTable
+from tvsbayes.model.parameter_space import ParameterSpace, coordinates_of, physical_at
+
+PERIODS_DEG = {"pan": (30.0, 7.0), "tilt": (45.0,)}
+SCALE_U_DEG = 0.05
+LENGTH = Prior(8.0, 0.7, "log-normal")
+OFF, ON = Prior(0.0, 0.0, "half-normal"), Prior(0.0, SCALE_U_DEG, "half-normal")
+
+
+def perfect_gears(table: RigTable) -> RigTable:
+    """Gears that repeat no error and do not drift."""
+    scales = {name: LENGTH if "length" in name else OFF for name in GEAR_ERROR_NAMES}
+    return replace(table, priors={**table.priors, **scales}, harmonic_period_deg={})
+
+
+def varying_gears(table: RigTable, scale_u_deg: float = SCALE_U_DEG, periods: bool = True) -> RigTable:
+    """Gears of which every scale is estimated; two periods are stated on pan, one on tilt."""
+    stated = PERIODS_DEG if periods else {}
+    scales = {name: LENGTH if "length" in name else Prior(0.0, scale_u_deg, "half-normal") for name in GEAR_ERROR_NAMES}
+    for name in scales:
+        block, axis, *number = name.split(".")
+        if block == "harmonic_amplitude_deg" and int(number[0]) > len(stated.get(axis, ())):
+            scales[name] = OFF
+    return replace(table, priors={**table.priors, **scales}, harmonic_period_deg=stated)
+
+
+def coordinates_with(space: ParameterSpace, z: np.ndarray, values: Mapping[str, float]) -> np.ndarray:
+    """The point z with these parameters, in the units of their names, in place of its own."""
+    physical = physical_at(z, space).value
+    for name, value in values.items():
+        physical[INDEX[name]] = value
+    named = [INDEX[name] for name in values]
+    found = z.copy()
+    found[named] = coordinates_of(space, physical)[named]
+    assert found.shape == (len(NAMES),)
+    return found
