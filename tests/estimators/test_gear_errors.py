@@ -101,7 +101,7 @@ def _found(z, normals, space, arrays, fixed):
 
 
 def found_at(varying: Varying, z: np.ndarray) -> SimpleNamespace:
-    """Everything of one point, as NumPy; errors at places at their means, then moved by each normal number by itself."""
+    """Everything of one point; errors at places at their means, then moved by each normal number by itself."""
     size = 2 * len(varying.arrays.gears.places.steps)
     normals = np.concatenate([no_draw(1, varying.arrays), np.eye(size)])
     fixed = Fixed(jnp.asarray(NOISE), jnp.asarray(z), jnp.asarray(1.0))

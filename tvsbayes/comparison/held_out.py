@@ -164,7 +164,9 @@ def foretell_joint(
     from tvsbayes.posterior.predictive import looks_again
 
     z, physical = taught.draws_z[:HOLD_OUT_DRAWS], np.asarray(taught.draws.physical[:HOLD_OUT_DRAWS])
-    pixels = looks_again(taught, z, physical, generator)[:, experiment_rows(taught.campaign, selection)[out]]
+    errors_rad = np.asarray(taught.draws.place_errors_rad[:HOLD_OUT_DRAWS])
+    pixels = looks_again(taught, z, physical, errors_rad, generator)
+    pixels = pixels[:, experiment_rows(taught.campaign, selection)[out]]
     steps, axis = selection.steps[out], selection.axis[out]
     draws = four_point_ratios(pixels, steps, axis, taught.campaign.stereo) * steps
     found = {}

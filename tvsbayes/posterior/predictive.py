@@ -181,7 +181,8 @@ def repeated_rad(fit: JointFit, place_errors_rad: np.ndarray) -> np.ndarray:
 def ideal_pixels(posterior: Posterior, draws: int) -> np.ndarray:
     """Pixels without noise and stop errors for draws that weigh the same, shape (draws, spots, 4)."""
     z = posterior.coordinates(draws)
-    return looks(posterior.fit, z, repeated_rad(posterior.fit, posterior.thinned(draws).place_errors_rad))
+    errors_rad = np.asarray(posterior.thinned(draws).place_errors_rad)
+    return looks(posterior.fit, z, repeated_rad(posterior.fit, errors_rad))
 
 
 def predictive_pixels(posterior: Posterior, draws_per_chain: int = 8) -> xr.DataArray:

@@ -86,7 +86,7 @@ class Target:
         invalid = np.isnan(value)
         self.invalid += int(invalid.sum())
         log_target = np.where(invalid, -np.inf, value - self.fit.log_density + found.log_jacobian)
-        return Valued(log_target, errors_rad)
+        return Valued(log_target, np.asarray(errors_rad))
 
 
 def _log_t(distance2: np.ndarray, dimension: int, dof: float = HEAVY_DOF) -> np.ndarray:
@@ -329,9 +329,9 @@ def first_proposal(
     along = np.zeros((len(places), len(NODES), dimension))
     along[np.arange(len(places)), :, places] = NODES
     planes = np.zeros((len(pairs), len(LEADER_NODES), len(NODES), dimension))
-    for k, (leader, follower) in enumerate(pairs):
-        planes[k, :, :, leader] = LEADER_NODES[:, None]
-        planes[k, :, :, follower] = NODES
+    for k, (leading, following) in enumerate(pairs):
+        planes[k, :, :, leading] = LEADER_NODES[:, None]
+        planes[k, :, :, following] = NODES
     points = np.concatenate([along.reshape(-1, dimension), planes.reshape(-1, dimension)])
     cuts = target(points) if len(points) else np.zeros(0)
     lines, rows = np.split(cuts, [along.shape[0] * along.shape[1]])
