@@ -11,11 +11,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from tvsbayes.calibration.calibration_file import stored_ratios
-from tvsbayes.calibration.pointing import Calibration
+from tvsbayes.calibration.optics import ERROR_AT, PLAY_AT
+from tvsbayes.calibration.pointing import INPUT_NAMES, Calibration
 from tvsbayes.coordinates.error_map import ErrorMap, error_map, simple_calibration
 from tvsbayes.errors import NothingToEstimate
 from tvsbayes.estimators.four_point import ClassicResult, classic
-from tvsbayes.instrument.axes import DIRECTIONS, HOME_APPROACH
+from tvsbayes.instrument.axes import AXES, DIRECTIONS, HOME_APPROACH, Axis
 from tvsbayes.instrument.campaign import Campaign
 from tvsbayes.metrology.look_budget import Budget, budget, coordinate_budget
 from tvsbayes.results.comparison_record import CANNOT_TELL, HoldOut, stored_hold_out
@@ -57,8 +58,45 @@ MAP_CELLS = 5
 """Per axis; odd, so that one lies in the middle."""
 MAP_DRAWS = 1000
 """Rigs of the maps: a probability near 0.95 is then known to 0.007."""
+BAND_POINTS = 161
+"""Counters of the curves of the gears' errors."""
 MAP_RANGES_MM = (300.0, 2000.0)
 """Ranges mapped besides the stated one: the scanner's near and far ends."""
+
+
+@dataclass(frozen=True)
+class GearBand:
+    """What is known of one axis' gears over its counters.
+
+    Attributes:
+        axis: pan or tilt.
+        steps: counters, shape (n,).
+        error_deg, play_deg: transmission error and change of play: low, mean, high of 95 %, shape (3, n).
+        seen_steps: lowest and highest counter that a look reached.
+    """
+
+    axis: Axis
+    steps: np.ndarray
+    error_deg: np.ndarray
+    play_deg: np.ndarray
+    seen_steps: tuple[float, float]
+
+
+def gear_bands(calibration: Calibration) -> tuple[GearBand, ...]:
+    """Of both axes; none where gears do not vary."""
+    found, columns = [], calibration.inputs[:, len(INPUT_NAMES) :]
+    for index, axis in enumerate(AXES if calibration.gears.size else ()):
+        nodes = calibration.gears.steps[index]
+        steps = np.linspace(nodes[0], nodes[-1], BAND_POINTS)
+        drawn = calibration.gears.at(columns, (steps, steps))
+        bands = []
+        for kind in (ERROR_AT, PLAY_AT):
+            values = drawn[f"{kind}.{axis}"]
+            low, high = np.quantile(values, (0.025, 0.975), axis=0)
+            bands.append(np.stack([low, values.mean(axis=0), high]))
+        low_seen, high_seen = calibration.range_steps[index].tolist()
+        found.append(GearBand(axis, steps, bands[0], bands[1], (low_seen, high_seen)))
+    return tuple(found)
 
 
 @dataclass(frozen=True)
@@ -77,6 +115,7 @@ class Evidence:
         maps: error maps.
         budget: of a point at that range.
         point: the same for its least certain coordinate, by parameter.
+        gears: what they repeat over the counters, by axis; none where they do not vary.
     """
 
     campaign: Campaign
@@ -90,6 +129,7 @@ class Evidence:
     maps: ErrorMap
     budget: Budget
     point: BudgetTable
+    gears: tuple[GearBand, ...]
 
     @property
     def shown(self) -> FitEvidence:
@@ -147,6 +187,7 @@ def gather(
         maps=maps,
         budget=own,
         point=coordinate_budget(own, calibration, point.tolist(), least),
+        gears=gear_bands(calibration),
     )
 
 

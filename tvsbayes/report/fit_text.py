@@ -8,7 +8,7 @@ from itertools import groupby
 from tvsbayes.errors import NotConverged, listed
 from tvsbayes.estimators.four_point import ClassicResult
 from tvsbayes.instrument.axes import DIRECTIONS
-from tvsbayes.report.result_tables import KEY_PARAMETERS, classic_table, headline_table
+from tvsbayes.report.result_tables import KEY_PARAMETERS, classic_table, gears_table, headline_table, range_text
 from tvsbayes.report.tables import TableView, concise
 from tvsbayes.results.convergence import Importance, Sampling
 from tvsbayes.results.estimates import FitSummary, LostMotion, Validation
@@ -27,6 +27,9 @@ def fit_text(summary: FitSummary) -> str:
     if not summary.converged and summary.sampling is None:
         return astray_text(summary)
     lines = [headline_table(summary).text()]
+    gears = gears_table(summary)
+    if gears is not None:
+        lines += [gears.text(), *gear_lines(summary)]
     lines.append(f"chi2 {summary.chi2:.1f} for {summary.dof:.1f} degrees of freedom")
     if summary.validation is not None:
         told = validation_lines(summary.validation)
@@ -59,6 +62,13 @@ def fit_text(summary: FitSummary) -> str:
     if summary.suspect_spots:
         lines.append(f"{suspect_line(summary.suspect_spots)}; look at them, or fit with --robust")
     return "\n".join(lines)
+
+
+def gear_lines(summary: FitSummary) -> list[str]:
+    """Where effective ratios hold that have errors of the gears in them, and what they are without."""
+    found = [f"effective ratios are slopes of lines through the looks, {range_text(summary)}; elsewhere errors differ"]
+    local = [f"{d} {concise(e.value, e.sd)}" for d, e in summary.local.items() if e is not None]
+    return found + [f"local ratios, without errors of the gears, deg/step: {', '.join(local)}"] * bool(local)
 
 
 def astray_text(summary: FitSummary) -> str:

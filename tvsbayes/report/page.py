@@ -33,6 +33,7 @@ from tvsbayes.report.fit_sections import (
     validation_section,
 )
 from tvsbayes.report.fit_text import few_stops_line, suspect_line, validation_lines
+from tvsbayes.report.gear_section import gear_section
 from tvsbayes.report.tables import Number, Page, TableView, concise, two_digits
 from tvsbayes.report.uncertainty_sections import (
     axes_section,
@@ -117,6 +118,7 @@ def _page(e: Evidence) -> Page:
     sections = [
         setup_section(e),
         results_section(e),
+        *gear_section(e),
         identifiability_section(e),
         residuals_section(e),
         validation_section(e),

@@ -10,7 +10,8 @@ from collections.abc import Mapping
 import numpy as np
 
 from tvsbayes.estimators.four_point import ClassicResult
-from tvsbayes.instrument.axes import DIRECTIONS, SENSES
+from tvsbayes.instrument.axes import AXES, DIRECTIONS, SENSES
+from tvsbayes.instrument.parameters import PERIODS_MAX
 from tvsbayes.metrology.look_budget import Budget
 from tvsbayes.report.tables import TableView, concise, interval_text, signed
 from tvsbayes.results.comparison_record import Gap, GapTerm, HoldOut
@@ -67,6 +68,35 @@ def headline_table(summary: FitSummary) -> TableView:
     kind = {"laplace": "Laplace", "posterior": "posterior"}[summary.estimator]
     title = f"joint estimator ({kind}) at pan {pose['pan']:.2f} deg, tilt {pose['tilt']:.2f} deg"
     return TableView(title, ["quantity", "value(u)", "unit", "95 % interval", "set by"], rows)
+
+
+def range_text(summary: FitSummary) -> str:
+    """Counters over which the effective ratios hold."""
+    return ", ".join(f"{axis} {low} to {high}" for axis, (low, high) in summary.range_steps.items()) + " steps"
+
+
+GEAR_SCALES = (
+    ("transmission_error_deg", "transmission error sd", "deg"),
+    ("transmission_error_length_deg", "over an angle of", "deg"),
+    ("play_variation_deg", "play variation sd", "deg"),
+    ("drift_deg_per_root_hour", "drift in a root hour", "deg"),
+    *((f"harmonic_amplitude_deg.{{axis}}.{n}", f"period {n}, amplitude sd", "deg") for n in range(1, PERIODS_MAX + 1)),
+)
+"""Scales of what gears repeat and how zeros drift: block, or name with its axis, label and unit."""
+
+
+def gears_table(summary: FitSummary) -> TableView | None:
+    """Scales of the gears' errors of both axes; None where they are taken as perfect."""
+    rows = []
+    for block, label, unit in GEAR_SCALES:
+        for axis in AXES:
+            name = block.format(axis=axis) if "{axis}" in block else f"{block}.{axis}"
+            if name in summary.parameters:
+                rows.append(estimate_row(f"{label}, {axis}", summary.parameters[name], unit))
+    if not any(row[0].startswith(("transmission", "play", "period")) for row in rows):
+        return None
+    columns = ["gears: what repeats by position", "value(u)", "unit", "95 % interval", "set by"]
+    return TableView("errors of the gears", columns, rows)
 
 
 def gap_table(gaps: Mapping[str, Gap | None]) -> TableView:
