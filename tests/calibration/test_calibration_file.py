@@ -19,12 +19,14 @@ from support.bent_rig import (
     WOBBLE,
     calibration,
 )
+from support.geared_rig import geared
 from support.refusals import refusal
 from support.small_campaign import small_campaign
 from support.two_poses import PERIODS_DEG, POSES
 
 from tvsbayes.calibration.calibration_file import (
     CALIBRATION_FORMAT,
+    FORMATS,
     NO_CALIBRATION,
     calibration_bytes,
     calibration_header,
@@ -33,6 +35,7 @@ from tvsbayes.calibration.calibration_file import (
     load_calibration,
     stored_calibration,
 )
+from tvsbayes.calibration.optics import GEAR_INPUTS
 from tvsbayes.calibration.pointing import INPUT_NAMES, NOISE_NAMES, Calibration
 from tvsbayes.instrument.campaign import input_hashes
 from tvsbayes.instrument.parameters import HARMONIC_NAMES
@@ -64,8 +67,43 @@ def complete() -> Calibration:
     return replace(one, causes=("pixel noise", "stereo"), cause_covariance=parts, estimator="laplace")
 
 
-def test_draws_file_brings_everything_back(tmp_path):
-    one = complete()
+def geared_complete() -> Calibration:
+    """The same with gears that vary."""
+    one = geared(complete())
+    parts = np.stack([0.25 * one.covariance, 0.75 * one.covariance])
+    return replace(one, cause_covariance=parts)
+
+
+def test_files_of_the_first_format_are_of_gears_without_errors(tmp_path):
+    """Neither draws.npz nor JSON of it know a table: they are read as they were written."""
+    one, path = complete(), tmp_path / "draws.npz"
+    arrays = arrays_of(one)
+    tables = json.loads(str(arrays["tables"]))
+    del tables["gear_steps"]
+    np.savez(path, **arrays | {"format": np.array(FORMATS[0]), "tables": np.array(json.dumps(tables))})
+    assert differing(one, load_calibration(path)) == []
+    document = {**calibration_json(one), "format": FORMATS[0]}
+    del document["gear_errors"]
+    (tmp_path / "robot.json").write_text(json.dumps(document))
+    found = load_calibration(tmp_path / "robot.json")
+    assert differing(one, found, without=("inputs", "noise", "causes", "cause_covariance")) == []
+
+
+def test_json_export_tells_the_gears_errors():
+    one = geared_complete()
+    told, count = calibration_json(one)["gear_errors"], len(one.mean) - one.gears.size
+    assert calibration_json(complete())["gear_errors"] == {}
+    for axis, nodes in zip(("pan", "tilt"), one.gears.steps, strict=True):
+        assert told[axis]["steps"] == list(nodes)
+        part = one.gears.parts[f"play_variation_at_deg.{axis}"]
+        u = np.sqrt(np.diag(one.covariance)[count:][part])
+        assert told[axis]["play_variation_deg"] == one.mean[count:][part][:-1].tolist()
+        assert [*told[axis]["u_play_variation_deg"], told[axis]["beyond_u_play_variation_deg"]] == u.tolist()
+
+
+@pytest.mark.parametrize("vary", [False, True])
+def test_draws_file_brings_everything_back(tmp_path, vary):
+    one = geared_complete() if vary else complete()
     (tmp_path / "results").mkdir()
     path = tmp_path / "results" / "draws.npz"
     path.write_bytes(calibration_bytes(one, physical=np.zeros((3, 65))))
@@ -85,8 +123,9 @@ def test_results_without_a_calibration_are_no_damage(tmp_path):
     assert refusal(lambda: stored_calibration(campaign)).code == "damaged-results"
 
 
-def test_json_export_brings_back_all_but_the_draws(tmp_path):
-    one = complete()
+@pytest.mark.parametrize("vary", [False, True])
+def test_json_export_brings_back_all_but_the_draws(tmp_path, vary):
+    one = geared_complete() if vary else complete()
     path = tmp_path / "robot.json"
     path.write_text(json.dumps(calibration_json(one), allow_nan=False))
     other = load_calibration(path)
@@ -150,6 +189,9 @@ DAMAGES = {
     "period zero": lambda a: table(a, "period_deg", {"pan": 0.0}),
     "period text": lambda a: table(a, "period_deg", {"pan": "360"}),
     "periods a list": lambda a: table(a, "period_deg", [360.0]),
+    "a gear table without columns": lambda a: table(a, "gear_steps", {"pan": [0, 1, 2, 3], "tilt": [0, 1, 2, 3]}),
+    "no gear table": lambda a: table(a, "gear_steps", None),
+    "gear counters text": lambda a: table(a, "gear_steps", {"pan": ["a"], "tilt": ["b"]}),
 }
 
 
@@ -219,6 +261,8 @@ JSON_DAMAGES = {
     "range": lambda d: d | {"range_steps": {"pan": [0, 1]}},
     "period": lambda d: d | {"harmonic_period_deg": {"pan": 0}},
     "convention": lambda d: d | {"aperture_convention": "sideways"},
+    "gears a number": lambda d: d | {"gear_errors": 3},
+    "gears of one axis": lambda d: d | {"gear_errors": {"pan": {"steps": [0, 1, 2, 3]}}},
     "a list": lambda d: [d],
 }
 
@@ -258,7 +302,7 @@ int main(void)
     while (scanf("%lf %lf %d %d %lf", &pan, &tilt, &left, &up, &reading) == 5) {
         tvs_beam(pan, tilt, left, up, o, d);
         int found = tvs_locate(pan, tilt, left, up, reading, p);
-        printf("%d", found);
+        printf("%d %.17g %.17g", found, tvs_error_u_deg(0, pan), tvs_error_u_deg(1, tilt));
         for (int i = 0; i < 3; i++)
             printf(" %.17g %.17g %.17g", o[i], d[i], found ? p[i] : 0.0);
         puts("");
@@ -270,27 +314,35 @@ int main(void)
 
 @pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler here")
 @pytest.mark.parametrize("periods", [{}, PERIODS_DEG, {"pan": 25.0, "tilt": 360.0}])
-@pytest.mark.parametrize("azimuth", [False, True])
-def test_the_c_header_computes_the_same(tmp_path, periods, azimuth):
+@pytest.mark.parametrize(("azimuth", "vary"), [(False, False), (True, False), (False, True)])
+def test_the_c_header_computes_the_same(tmp_path, periods, azimuth, vary):
     one = calibration(BENT | (WOBBLE if periods else {}), period_deg=periods, azimuth=azimuth)
+    one = geared(one) if vary else one
     (tmp_path / "tvs_calibration.h").write_text(calibration_header(one))
     (tmp_path / "main.c").write_text(MAIN)
-    strict = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic")
+    strict = ("-std=c99", "-Wall", "-Wextra", "-Wconversion", "-Werror", "-pedantic")
     subprocess.run(["cc", *strict, "main.c", "-o", "main", "-lm"], cwd=tmp_path, check=True)
-    poses = (*POSES, (2600, 90, 110.0), (350, 10, 120.0))
+    poses = (*POSES, (2600, 90, 110.0), (350, 10, 120.0), (-799.5, 3, 95.0), (-850, 500.25, 100.0), (-400, 300, 95.0))
     asked = [(pan, tilt, left, up, reading) for (pan, tilt, reading), left, up in product(poses, (1, -1), (1, -1))]
     text = "".join(" ".join(map(repr, row)) + "\n" for row in asked)
     done = subprocess.run([tmp_path / "main"], input=text, capture_output=True, text=True, check=True)
     rows = [list(map(float, line.split())) for line in done.stdout.splitlines()]
-    refused = 0
-    for (pan, tilt, left, up, reading), (found, *numbers) in zip(asked, rows, strict=True):
+    refused, count = 0, len(INPUT_NAMES)
+    for (pan, tilt, left, up, reading), (found, u_pan, u_tilt, *numbers) in zip(asked, rows, strict=True):
         approach = ("left" if left > 0 else "right", "up" if up > 0 else "down")
         origin, direction, point = np.array(numbers).reshape(3, 3).T
         ray = one.ray(pan, tilt, approach)
+        u = dict.fromkeys(GEAR_INPUTS, 0.0)
+        u |= one.gears.at(np.sqrt(np.diag(one.covariance))[count:], (float(pan), float(tilt)))
+        for axis, told in (("pan", u_pan), ("tilt", u_tilt)):
+            wanted = math.hypot(u[f"transmission_error_at_deg.{axis}"], 0.5 * u[f"play_variation_at_deg.{axis}"])
+            assert told == pytest.approx(wanted, abs=ROUNDING)
         np.testing.assert_allclose(origin, ray.origin_mm, atol=ROUNDING_MM)
         np.testing.assert_allclose(direction, ray.direction, atol=ROUNDING_MM / 1000)
         if found:
-            np.testing.assert_allclose(point, one.locate(pan, tilt, reading, approach).xyz_mm, atol=ROUNDING_MM)
+            there = one.locate(pan, tilt, reading, approach)
+            np.testing.assert_allclose(point, there.xyz_mm, atol=ROUNDING_MM)
+            assert found == (2 if there.extrapolated else 1)
         else:
             assert refusal(lambda a=(pan, tilt, reading, approach): one.locate(*a)).code in ("diverging", "grazing")
             refused += 1

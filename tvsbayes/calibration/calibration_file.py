@@ -353,6 +353,8 @@ def _from_json(path: Path) -> Calibration:
                 estimator=str(d["estimator"]),
                 range_steps=np.array([d["range_steps"][axis] for axis in AXES], dtype=float),
                 inputs_sha256=dict(d["inputs"]),
+                inputs=np.zeros((0, len(mean))),
+                cause_covariance=np.zeros((0, len(mean), len(mean))),
                 gears=gears,
             )
         )

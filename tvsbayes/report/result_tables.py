@@ -95,8 +95,8 @@ def gears_table(summary: FitSummary) -> TableView | None:
                 rows.append(estimate_row(f"{label}, {axis}", summary.parameters[name], unit))
     if not any(row[0].startswith(("transmission", "play", "period")) for row in rows):
         return None
-    columns = ["gears: what repeats by position", "value(u)", "unit", "95 % interval", "set by"]
-    return TableView("errors of the gears", columns, rows)
+    columns = ["quantity", "value(u)", "unit", "95 % interval", "set by"]
+    return TableView("gears: what repeats by position", columns, rows)
 
 
 def gap_table(gaps: Mapping[str, Gap | None]) -> TableView:
