@@ -131,11 +131,11 @@ _PARAMETERS = (
     *_block("aperture_sd_deg", (), "deg", Prior(0.02, 0.0, "log-normal"), _SD, "rig", noise=True, receiver=True),
     # No transmission error unless a rig states one or a fit is asked to free it.
     *_block("harmonic_deg", _HARMONICS, "deg", UNSTATED, (-10.0, 10.0, 10.0)),
-    *_block("transmission_error_deg", AXES, "deg", Prior(0.0, 0.0, "half-normal"), _SCALE, noise=True),
-    *_block("transmission_error_length_deg", AXES, "deg", Prior(8.0, 0.0, "log-normal"), _REACH, noise=True),
-    *_block("play_variation_deg", AXES, "deg", Prior(0.0, 0.0, "half-normal"), _SCALE, noise=True),
-    *_block("drift_deg_per_root_hour", AXES, "deg", Prior(0.0, 0.0, "half-normal"), _SCALE, noise=True),
-    *_block("harmonic_amplitude_deg", _AMPLITUDES, "deg", Prior(0.0, 0.0, "half-normal"), _SCALE, noise=True),
+    *_block("transmission_error_deg", AXES, "deg", Prior(0.0, 0.05, "half-normal"), _SCALE, noise=True),
+    *_block("transmission_error_length_deg", AXES, "deg", Prior(8.0, 0.7, "log-normal"), _REACH, noise=True),
+    *_block("play_variation_deg", AXES, "deg", Prior(0.0, 0.02, "half-normal"), _SCALE, noise=True),
+    *_block("drift_deg_per_root_hour", AXES, "deg", Prior(0.0, 0.02, "half-normal"), _SCALE, noise=True),
+    *_block("harmonic_amplitude_deg", _AMPLITUDES, "deg", Prior(0.0, 0.05, "half-normal"), _SCALE, noise=True),
     *_cameras(),
 )
 

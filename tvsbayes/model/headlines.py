@@ -100,8 +100,9 @@ def line_deg_per_step(
     # No play, no stop error, no drift: nothing but what the counter itself says.
     shaped = gears.harmonics.error_rad(jnp.stack([counted, counted], axis=1))
     error = jnp.where(places.on_tilt, shaped[:, 1], shaped[:, 0])
-    if place_errors_rad.size:
-        error = error + place_errors_rad[: len(places.steps)]
+    count = len(place_errors_rad) // 2
+    # Both lists of places begin alike; padding ends them.
+    error = error + jnp.pad(place_errors_rad[:count], (0, max(len(error) - count, 0)))[: len(error)]
 
     def slope(turned: Float[Array, " places"]) -> Float[Array, "2"]:
         pan = jnp.where(places.on_tilt, seen.pose_rad[0], turned)
