@@ -23,6 +23,8 @@ OWN_PLACES_MAX = 12
 SPACING_DEG, PLACES_MAX = 2.7, 24
 """... one on so many degrees of the output, but no more than this."""
 NEAREST = 4
+FEW_COUNTERS = 3
+"""An axis seen at so many counters or fewer tells its transmission error and its ratio apart hardly or not at all."""
 
 
 def gears_vary(table: RigTable) -> bool:
@@ -98,6 +100,22 @@ def seen_places(moves: Sequence[Move], looks: Sequence[int], table: RigTable) ->
         np.concatenate(error_share, axis=1),
         np.concatenate(play_share, axis=1),
     )
+
+
+def too_few_counters(axis: str, counters: Sequence[int], telling: Sequence[int]) -> str:
+    """That an axis is seen at few counters: what that means for its use elsewhere, and which looks would tell.
+
+    Args:
+        axis: pan or tilt.
+        counters: at which it is seen.
+        telling: others.
+    """
+    seen = ", ".join(map(str, counters))
+    text = (
+        f"{axis} is seen at {len(counters)} counters only ({seen}), which cannot tell gear error from ratio: the ratio "
+        "holds between them, elsewhere the gear error of the prior is added"
+    )
+    return f"{text}; looks at {axis} {', '.join(map(str, telling))} would tell" if telling else text
 
 
 def line_share(seen: SeenPlaces, used: np.ndarray) -> np.ndarray:

@@ -46,7 +46,7 @@ def believed(
         seen: what they see of m looks, shapes (n, m, ...).
         side: sides of these, shape (m, 2).
         chosen: numbers of those taken, repeats allowed, shape (k,).
-        covariance: of the coordinates after the looks, shape (n, p, p).
+        covariance: of coordinates and errors of gears after the looks, shape (n, p + e, p + e).
         knowledge: before the looks.
         noise: standard normal numbers in the order of `SCALES`, shape (n, 5).
 
@@ -56,7 +56,8 @@ def believed(
     z, u = instruments.z.copy(), np.asarray(knowledge.space.u)
     taken = seen.seen * np.bincount(chosen, minlength=len(side))
     looks = np.maximum(taken.sum(axis=1), 1)
-    rig_columns = ~NOISE_COLUMNS & (np.arange(PARAMETERS) < len(RIG_NAMES))
+    rig_columns = np.ones(knowledge.size, dtype=bool)
+    rig_columns[:PARAMETERS] = ~NOISE_COLUMNS & (np.arange(PARAMETERS) < len(RIG_NAMES))
     precision = np.diag(knowledge.precision)
     variance = np.diagonal(covariance, axis1=-2, axis2=-1)
     determined = np.sum(1 - variance[:, rig_columns] * precision[rig_columns], axis=1)
@@ -111,7 +112,7 @@ class _Scene:
         rows: numbers of those that see any look and reach the target's point, n of them.
         instruments: these.
         seen: shapes (n, looks, ...).
-        target: gradients (n, q, p) and variances of its own (n, q).
+        target: gradients (n, q, p + e) and variances of its own (n, q).
     """
 
     rows: np.ndarray
@@ -157,17 +158,18 @@ class Assurance:
         return float(np.mean(self.values([experiments])[experiments] <= self.target.limit))
 
     def _evaluated(self, first: int, end: int) -> _Scene:
-        every, table = self.instruments[np.arange(first, end)], self.family.knowledge.rig.table
+        every, knowledge = self.instruments[np.arange(first, end)], self.family.knowledge
+        table, gears = knowledge.rig.table, knowledge.gears
         seen = self.arrays.at_all(every.z, every.value)
         poses = seen.mirror_angles_rad[:, self.index].mean(axis=1)
         rows, found = [], []
         for row in np.flatnonzero(seen.seen.any(axis=1)).tolist():
             try:
-                found.append(sensitivity(self.target, every.z[row], every.space_of(row), table, poses[row]))
+                found.append(sensitivity(self.target, every.z[row], every.space_of(row), table, poses[row], gears))
             except InputError:
                 continue
             rows.append(row)
-        gradient = np.array([one.gradient for one in found]).reshape(len(rows), -1, PARAMETERS)
+        gradient = np.array([one.gradient for one in found]).reshape(len(rows), -1, knowledge.size)
         own = {"at the point": np.array([one.own_variance for one in found]).reshape(len(rows), -1)}
         chosen = np.array(rows, dtype=int)
         return _Scene(first + chosen, every[chosen], seen[chosen], Sensitivity(gradient, own))

@@ -60,7 +60,7 @@ def instruments_in(knowledge: Knowledge, truths: Sequence[Truth]) -> Instruments
 
 def draws_of(knowledge: Knowledge, count: int, generator: np.random.Generator) -> np.ndarray:
     """Coordinates of instruments that may stand there, shape (count, p)."""
-    root = np.linalg.cholesky(knowledge.covariance)
+    root = np.linalg.cholesky(knowledge.covariance[:PARAMETERS, :PARAMETERS])
     return knowledge.z + generator.standard_normal((count, PARAMETERS)) @ root.T
 
 

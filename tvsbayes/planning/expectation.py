@@ -3,16 +3,15 @@
 The model says what the looks would show; the information of the priors (or of a fit) plus J^T C^-1 J of all looks gives
 the covariance that a fit will report. `information_of` judges any plan move by move, through the filter of the
 likelihood: shared stops, home offsets and unknown play as in a fit. Counters in steps, mm, rad; coordinates z have
-prior N(0, 1) each.
+prior N(0, 1) each, and so have what the gears repeat at regular counters, further coordinates behind them.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import equinox as eqx
 import jax
@@ -30,23 +29,28 @@ from tvsbayes.estimators.campaign_arrays import (
     move_arrays,
     padded,
 )
+from tvsbayes.estimators.joint_fit import JointFit, with_places
 from tvsbayes.estimators.likelihood import filter_rows, kalman_update, no_belief
 from tvsbayes.estimators.linear_spots import linearise
 from tvsbayes.estimators.looks import in_frame_s
-from tvsbayes.instrument.axes import HOME_SD_DEG
+from tvsbayes.instrument.axes import AXES, HOME_SD_DEG
 from tvsbayes.instrument.campaign import Move
-from tvsbayes.instrument.parameters import NAMES, NOISE_NAMES
-from tvsbayes.instrument.places import seen_places
+from tvsbayes.instrument.parameters import INDEX, NAMES, NOISE_NAMES
+from tvsbayes.instrument.places import gears_vary, seen_places
 from tvsbayes.instrument.plan import PlanLog, PlanStep, plan_seconds, run_plan
 from tvsbayes.instrument.rig import Rig
 from tvsbayes.instrument.stops import redraws
 from tvsbayes.model.compiled import compiled, placed
 from tvsbayes.model.geometry import image, materialise, rotation_matrix, transform
 from tvsbayes.model.laser_path import MoveArrays, Ray, mirror_angles, trace
-from tvsbayes.model.parameter_space import Model, ParameterSpace, parameter_space
-
-if TYPE_CHECKING:
-    from tvsbayes.estimators.joint_fit import JointFit
+from tvsbayes.model.parameter_space import Model, ParameterSpace, parameter_space, physical_at
+from tvsbayes.planning.gear_places import (
+    NO_PLACES,
+    GearPlaces,
+    TaughtErrors,
+    believed_scales,
+    regular_places,
+)
 
 LOOKS_PER_EXPERIMENT = 4
 """The paper counts four spots as one experiment; so do all curves here, whatever the looks are."""
@@ -64,8 +68,10 @@ class Knowledge:
         rig: limits, sheets, costs; its table and stereo calibration are those of the data where there are any.
         space: priors as arrays.
         z: most probable coordinates, shape (p,).
-        precision: their inverse covariance, shape (p, p).
+        precision: inverse covariance of the coordinates and of the errors at `gears`, shape (p + e, p + e).
         after_data: there is a campaign already: a new session begins with an unknown home offset.
+        gears: counters at which the gears' repeating errors are told apart, see `with_gears`.
+        taught: what a fit says of those errors at its own places.
     """
 
     rig: Rig
@@ -73,16 +79,47 @@ class Knowledge:
     z: np.ndarray
     precision: np.ndarray
     after_data: bool = False
+    gears: GearPlaces = field(default=NO_PLACES)
+    taught: TaughtErrors | None = None
+
+    @property
+    def size(self) -> int:
+        """Number of coordinates and errors, p + e."""
+        return len(self.precision)
 
     @cached_property
     def covariance(self) -> np.ndarray:
-        """Shape (p, p)."""
+        """Shape (p + e, p + e)."""
         return np.linalg.inv(self.precision)
 
     @property
     def sheets(self) -> tuple[str, ...]:
         """Names of the sheets, nearest first."""
         return tuple(sorted(self.rig.sheets_mm, key=self.rig.sheets_mm.__getitem__))
+
+    @property
+    def gears_vary(self) -> bool:
+        """Whether transmission error or play may differ from place to place."""
+        return gears_vary(self.rig.table)
+
+    def with_gears(self, reached: np.ndarray) -> Knowledge:
+        """The same with the errors of gears at regular places over counters (m, 2); as it is where none repeats.
+
+        Ratios are then the slopes of lines over these counters.
+        """
+        if not self.gears_vary:
+            return self
+        physical = np.asarray(physical_at(self.z, self.space).value)
+        ratio = physical[[INDEX[f"degrees_per_step.{axis}"] for axis in AXES]]
+        return self.with_places(regular_places(reached, ratio, believed_scales(self.z, self.space, self.after_data)))
+
+    def with_places(self, gears: GearPlaces) -> Knowledge:
+        """The same with the errors of gears at given places."""
+        if self.taught is not None:
+            return replace(self, precision=np.linalg.inv(self.taught.carried(gears)), gears=gears)
+        precision = np.eye(PARAMETERS + gears.size)
+        precision[:PARAMETERS, :PARAMETERS] = self.precision[:PARAMETERS, :PARAMETERS]
+        return replace(self, precision=precision, gears=gears)
 
 
 def prior_knowledge(rig: Rig) -> Knowledge:
@@ -93,19 +130,40 @@ def prior_knowledge(rig: Rig) -> Knowledge:
 def knowledge_of(result: JointFit, rig: Rig) -> Knowledge:
     """After a fit: its mode and Laplace covariance; sheets, limits and costs of the rig file."""
     of_data = replace(rig, table=result.campaign.rig, stereo=result.campaign.stereo)
-    return Knowledge(of_data, result.space, result.z, np.linalg.inv(result.covariance), True)
+    precision = np.linalg.inv(result.covariance)
+    return Knowledge(of_data, result.space, result.z, precision, True, taught=_taught(result))
+
+
+def _taught(result: JointFit) -> TaughtErrors | None:
+    """What a fit says of the errors at the places of its looks, padding left out."""
+    if not len(result.information.place_mean):
+        return None
+    both = with_places(result.z, result.covariance, result.information)
+    valid = np.asarray(result.arrays.gears.places.valid)
+    rows = np.concatenate([np.ones(PARAMETERS, dtype=bool), valid, valid])
+    return TaughtErrors(fit_places(result), both.covariance[np.ix_(rows, rows)])
+
+
+def fit_places(result: JointFit) -> GearPlaces:
+    """The places of a fit's looks, with the scales of its mode; ratios are its own, lines over its looks."""
+    places = result.seen_line.places
+    valid = np.asarray(places.valid)
+    steps, on_tilt, share = (np.asarray(part)[valid] for part in (places.steps, places.on_tilt, result.seen_line.share))
+    ratio = np.asarray(result.mode.physical)[[INDEX[f"degrees_per_step.{axis}"] for axis in AXES]]
+    return GearPlaces(steps, on_tilt, np.radians(ratio), believed_scales(result.z, result.space, True), share)
 
 
 class Expectation(eqx.Module):
     """The looks of a plan as the model expects them at one point of parameter space; first axis: looks.
 
-    `rows` = d(standardised innovations)/d(coordinates, common offset of pan, of tilt in rad): over all looks
-    rows^T rows is the Fisher information. The other arrays are those of `linear_spots.LinearSpots`. A look that misses
-    its sheet or an image is not `seen` and its rows are zero.
+    `rows` = d(standardised innovations)/d(coordinates, errors of gears, common offset of pan, of tilt in rad): over all
+    looks rows^T rows is the Fisher information. `jacobian` is that of the predictions by coordinates and errors. The
+    other arrays are those of `linear_spots.LinearSpots`. A look that misses its sheet or an image is not `seen` and its
+    rows are zero.
     """
 
     rows: Float[Array | np.ndarray, "looks 4 columns"]
-    jacobian: Float[Array | np.ndarray, "looks 4 parameters"]
+    jacobian: Float[Array | np.ndarray, "looks 4 unknowns"]
     slope: Float[Array | np.ndarray, "looks 4 2"]
     load: Float[Array | np.ndarray, "looks 4 6"]
     keep: Float[Array | np.ndarray, "looks 6"]
@@ -150,6 +208,7 @@ def expect(
     arrays: CampaignArrays,
     depth_mm: Float[Array, " looks"],
     image_px: Float[Array, "4"],
+    turning: Float[Array, "looks 2 errors"],
 ) -> Expectation:
     """Expected looks on sheets at given depths X, linearised and whitened by the filter in time order.
 
@@ -159,6 +218,7 @@ def expect(
         arrays: moves and looks; pixels and points are not read.
         depth_mm: X of each look's sheet in frame S.
         image_px: largest (u, v, u, v) inside the images.
+        turning: how errors of the gears turn (pan, tilt), see `GearPlaces.turning`.
 
     Returns:
         Expectation of every look, padding included.
@@ -175,6 +235,7 @@ def expect(
     spots = arrays.spots
     lin = linearise(z, space, arrays)
     jacobian = jnp.where(NOISE_COLUMNS, 0.0, -lin.residual_jacobian)
+    jacobian = jnp.concatenate([jacobian, lin.slope @ turning], axis=2)
     columns = jnp.concatenate([jacobian, lin.slope], axis=2)
     given = filter_rows(columns, lin.slope, lin.play_sd_rad, lin.stop_variance, lin.drift_variance, spots)
 
@@ -223,12 +284,18 @@ def largest_px(rig: Rig) -> np.ndarray:
 
 
 def expected_information(
-    arrays: CampaignArrays, depth_mm: np.ndarray, rig: Rig, z: np.ndarray, space: ParameterSpace
+    arrays: CampaignArrays,
+    depth_mm: np.ndarray,
+    rig: Rig,
+    z: np.ndarray,
+    space: ParameterSpace,
+    turning: np.ndarray,
 ) -> Expectation:
     """`expect` without padding, as NumPy arrays."""
     count = len(depth_mm)
     depths = padded(depth_mm, len(arrays.spots.valid), depth_mm[-1])
-    found = expect(z, space, arrays, depths, largest_px(rig))
+    turns = padded(turning, len(arrays.spots.valid))
+    found = expect(z, space, arrays, depths, largest_px(rig), turns)
     return jax.tree.map(lambda x: np.asarray(x)[:count], found)
 
 
@@ -237,7 +304,7 @@ class PlanInformation:
     """What a plan will tell.
 
     Attributes:
-        fisher: J^T C^-1 J of all its looks, shape (p, p), without that of priors or earlier data.
+        fisher: J^T C^-1 J of all its looks, shape (p + e, p + e), without that of priors or earlier data.
         expectation: of its looks, shape (looks, ...).
         moves: its moves.
         look_moves: move of each look.
@@ -296,8 +363,9 @@ def information_of(
     look_moves = tuple(look.move for look in log.looks)
     depth = np.array([rig.sheets_mm[log.targets[look.placement]] for look in log.looks])
     arrays = design_arrays(log.moves, look_moves, rig, homed_from=0 if knowledge.after_data else 1, aperture=aperture)
-    found = expected_information(arrays, depth, rig, knowledge.z if z is None else z, space or knowledge.space)
-    rows = np.asarray(found.rows)[..., :PARAMETERS].reshape(-1, PARAMETERS)
+    turning = knowledge.gears.turning_after(log.moves, look_moves)
+    found = expected_information(arrays, depth, rig, knowledge.z if z is None else z, space or knowledge.space, turning)
+    rows = np.asarray(found.rows)[..., : knowledge.size].reshape(-1, knowledge.size)
     seen = np.asarray(found.seen) if found.seen.any() else np.ones(len(depth), dtype=bool)
     pose = np.asarray(found.mirror_angles_rad)[seen].mean(axis=0)
     return PlanInformation(rows.T @ rows, found, tuple(log.moves), look_moves, plan_minutes(steps, rig), pose)

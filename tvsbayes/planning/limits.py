@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from tvsbayes.assessment.causes import PLAY_VARIATION, TRANSMISSION_ERROR
 from tvsbayes.instrument.parameters import NAMES, PRIOR_GROUPS, RIG_NAMES
 from tvsbayes.instrument.plan import described
 from tvsbayes.instrument.rig import RigTable
@@ -51,7 +52,7 @@ def split_of(knowledge: Knowledge, data: np.ndarray, noise: np.ndarray | None, f
 
     Args:
         knowledge: before the looks.
-        data: information of the looks, shape (p, p).
+        data: information of the looks, shape (p + e, p + e).
         noise: its part that pixel noise alone stands for, or None to leave the looks whole.
         found: the target.
     """
@@ -70,6 +71,10 @@ def split_of(knowledge: Knowledge, data: np.ndarray, noise: np.ndarray | None, f
     else:
         for name, columns in PRIOR_GROUPS.items():
             parts[name] = float(np.sum(pull[columns] ** 2))
+        errors = np.split(pull[len(NAMES) :], 2)
+        parts |= {
+            name: float(own @ own) for name, own in zip((TRANSMISSION_ERROR, PLAY_VARIATION), errors, strict=True)
+        }
     parts |= {name: float(value[worst]) for name, value in found.own.items()}
     total = sum(parts.values())
     kept = {name: value / total for name, value in parts.items() if value > 1e-12 * total}
@@ -96,7 +101,7 @@ def limit_of(knowledge: Knowledge, data: np.ndarray, found: Sensitivity, target:
 
     Args:
         knowledge: before the looks.
-        data: information of the largest design, shape (p, p).
+        data: information of the largest design, shape (p + e, p + e).
         found: the target's sensitivities.
         target: the target.
     """

@@ -8,7 +8,7 @@ thousands of candidates are scored by low-rank updates. Counters in steps, angle
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 
 import equinox as eqx
@@ -17,14 +17,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from tvsbayes.estimators.campaign_arrays import CampaignArrays, SpotArrays
+from tvsbayes.estimators.campaign_arrays import CampaignArrays, GearArrays, SpotArrays
 from tvsbayes.instrument.parameters import INDEX
 from tvsbayes.instrument.plan import PlanBuilder, PlanStep, action_seconds
 from tvsbayes.instrument.rig import Rig
 from tvsbayes.model.compiled import compiled, placed
+from tvsbayes.model.gear_processes import Places
 from tvsbayes.model.laser_path import MoveArrays
 from tvsbayes.model.parameter_space import ParameterSpace
-from tvsbayes.planning.expectation import HOME_VARIANCE_RAD2, PARAMETERS, Knowledge, expect, largest_px, met_sheet
+from tvsbayes.planning.expectation import HOME_VARIANCE_RAD2, Knowledge, expect, largest_px, met_sheet
 
 
 @dataclass(frozen=True)
@@ -126,7 +127,7 @@ class Seen:
     """What m looks show, at one point of parameter space or, with a leading axis, at several.
 
     Attributes:
-        rows: shape (m, 4, p + 2), see `expectation.Expectation`.
+        rows: shape (m, 4, p + e + 2), see `expectation.Expectation`.
         slope: shape (m, 4, 2).
         seen: whether they are in both images, shape (m,).
         mirror_angles_rad: (pan, tilt), shape (m, 2).
@@ -196,9 +197,14 @@ def _shown(pairs: _Pairs, space: ParameterSpace, eyes: _Eyes) -> _Shown:
             redraw_mix=jnp.where(pair.side[None, :, None] * np.array([-1.0, 1.0]) > 0, 1.0, 0.0),
             new_segment=jnp.ones(1, dtype=bool),
             homed=jnp.zeros(1, dtype=bool),
+            hours=jnp.zeros(1),
         )
-        arrays = CampaignArrays(pair.moves, spot, eyes.azimuth_convention)
-        found = expect(pair.z, pair.space(space), arrays, pair.depth_mm[None], eyes.image_px)
+        none = jnp.zeros(0, dtype=bool)
+        gears = GearArrays(Places(jnp.zeros(0), none, none), jnp.zeros((1, 0)), jnp.zeros((1, 0)))
+        arrays = CampaignArrays(pair.moves, spot, gears, eyes.azimuth_convention)
+        # Errors of the gears turn the mirrors as an offset does: their columns follow from its, outside.
+        still = jnp.zeros((1, 2, 0))
+        found = expect(pair.z, pair.space(space), arrays, pair.depth_mm[None], eyes.image_px, still)
         return _Shown(*(getattr(found, part.name)[0] for part in fields(_Shown)))
 
     return jax.vmap(one)(pairs)
@@ -232,6 +238,7 @@ class LookArrays:
         rig, self.looks, self.space = knowledge.rig, looks, knowledge.space
         self.depth_mm = np.array([rig.sheets_mm[name] for name in knowledge.sheets])[looks.sheet]
         azimuth = rig.table.aperture_convention == "azimuth"
+        self.turning = knowledge.gears.turning(looks.steps, looks.side)
         self.eyes = _Eyes(placed(largest_px(rig)), placed(rig.spot_sd_px), placed(float(aperture)), placed(azimuth))
 
     def _blocks(self, z: np.ndarray, value: np.ndarray, size: int) -> list[_Pairs]:
@@ -254,7 +261,11 @@ class LookArrays:
         ]
         shape = len(z), len(self.looks)
         whole = (np.concatenate(parts)[: shape[0] * shape[1]] for parts in zip(*found, strict=True))
-        return Seen(*(part.reshape(*shape, *part.shape[1:]) for part in whole))
+        seen = Seen(*(part.reshape(*shape, *part.shape[1:]) for part in whole))
+        if not self.turning.shape[2]:
+            return seen
+        own, offset = seen.rows[..., :-2], seen.rows[..., -2:]
+        return replace(seen, rows=np.concatenate([own, offset @ self.turning, offset], axis=-1))
 
     def at(self, z: np.ndarray, space: ParameterSpace) -> Seen:
         """At one instrument: coordinates (p,) in a space that differs from the knowledge's by `value` at most."""
@@ -275,7 +286,7 @@ CONTRAST_COLUMNS = [INDEX["ratio_contrast_deg_per_step.pan"], INDEX["ratio_contr
 def information_of_looks(
     seen: Seen, chosen: np.ndarray, path: np.ndarray, space: ParameterSpace, homed: bool
 ) -> np.ndarray:
-    """Fisher information of chosen looks, shape (..., p, p); equal to `information_of` of the arranged plan.
+    """Fisher information of chosen looks, shape (..., p + e, p + e); equal to `information_of` of the arranged plan.
 
     A look that is taken again differs by its path alone: each is multiplied out once, whatever its repeats.
 
@@ -295,7 +306,7 @@ def information_of_looks(
     rows = seen.rows[..., looks, :, :]
     rows[..., CONTRAST_COLUMNS] = 0.0
     *lead, m, components, columns = rows.shape
-    flat, offset = rows.reshape(*lead, m * components, columns), rows[..., PARAMETERS:]
+    flat, offset = rows.reshape(*lead, m * components, columns), rows[..., -2:]
     turned = np.swapaxes(flat, -1, -2)
     information = turned @ (flat * np.repeat(count, components)[:, None])
     across = turned @ (offset * once[:, None, :]).reshape(*lead, m * components, 2)
@@ -305,12 +316,10 @@ def information_of_looks(
         "...mia,...mib,mab->...ab", offset, offset, twice
     )
     if not homed:
-        return information[..., :PARAMETERS, :PARAMETERS]
-    coupling = information[..., :PARAMETERS, PARAMETERS:]
-    offsets = information[..., PARAMETERS:, PARAMETERS:] + np.eye(2) / HOME_VARIANCE_RAD2
-    return information[..., :PARAMETERS, :PARAMETERS] - coupling @ np.linalg.solve(
-        offsets, np.swapaxes(coupling, -1, -2)
-    )
+        return information[..., :-2, :-2]
+    coupling = information[..., :-2, -2:]
+    offsets = information[..., -2:, -2:] + np.eye(2) / HOME_VARIANCE_RAD2
+    return information[..., :-2, :-2] - coupling @ np.linalg.solve(offsets, np.swapaxes(coupling, -1, -2))
 
 
 def covariance_of(information: np.ndarray) -> np.ndarray:

@@ -17,13 +17,13 @@ from tvsbayes.instrument.axes import AXES, SENSES, Axis
 from tvsbayes.instrument.campaign import Move
 from tvsbayes.instrument.counter_limits import CounterLimits
 from tvsbayes.instrument.parameters import INDEX
+from tvsbayes.instrument.places import FEW_COUNTERS, too_few_counters
 from tvsbayes.instrument.plan import PlanStep, described, run_plan, step_json
 from tvsbayes.instrument.rig import Rig
 from tvsbayes.instrument.stops import Stop, few_stops, inseparable, observed_stops, one_sided, separation
-from tvsbayes.model.headlines import QUANTITIES, headlines
+from tvsbayes.model.headlines import QUANTITIES
 from tvsbayes.planning.candidates import Candidates, candidates
 from tvsbayes.planning.expectation import (
-    PARAMETERS,
     Knowledge,
     PlanInformation,
     expect,
@@ -35,6 +35,8 @@ from tvsbayes.planning.search import Search
 from tvsbayes.progress import Job, Show
 from tvsbayes.results.estimates import CONTRACTION_LIMIT
 
+LEAST_ERROR_RAD = 1e-9
+"""Transmission errors below nobody measures: the floor of their covariance is not worth a word."""
 CURE_LOOKS = 24
 """Looks beyond which an addition is no small cure."""
 JUDGING, CURING = "judging the plan", "seeking a cure"
@@ -161,7 +163,7 @@ def judge(steps: Sequence[PlanStep], knowledge: Knowledge, *, aperture: bool = F
         InputError: a plan that looks at nothing or places an unknown sheet.
     """
     found = information_of(steps, knowledge, aperture=aperture)
-    gradient = np.asarray(headlines(knowledge.z, knowledge.space, found.pose_rad).gradient)
+    gradient = np.asarray(knowledge.gears.headlines(knowledge.z, knowledge.space, found.pose_rad).gradient)
     covariance = gradient @ covariance_of(knowledge.precision + found.fisher) @ gradient.T
     prior = np.einsum("qi,ij,qj->q", gradient, knowledge.covariance, gradient)
     return Judged(found, covariance, gradient, prior)
@@ -194,7 +196,7 @@ def _cure(
     rows = before.rows(axis)
     own = np.zeros(len(rows))
     precision = knowledge.precision + before.information.fisher
-    search = Search(seen.rows[..., :PARAMETERS], precision, before.gradient[rows], own, "A")
+    search = Search(seen.rows[..., :-2], precision, before.gradient[rows], own, "A")
     placed = run_plan(steps, knowledge.rig).sheet
     here = found.looks.sheet == (knowledge.sheets.index(placed) if placed in knowledge.sheets else 0)
     picks = np.array(search.among(here).greedy(CURE_LOOKS), dtype=int)
@@ -233,12 +235,48 @@ def _fault(
     return PlanFault(axis, text, cure.addition, before, after)
 
 
+def _candidates(knowledge: Knowledge, warnings: list[str]) -> Candidates | None:
+    """Looks that the rig can make; where it can make none, a warning says so."""
+    try:
+        return candidates(knowledge)
+    except InputError as error:
+        warnings.append(f"no cure can be sought on this rig: {error.message}")
+        return None
+
+
 def _few_stops(knowledge: Knowledge, plan: Judged) -> list[str]:
     """Directions whose stops will hardly tell their own scatter, as a sentence."""
     few = few_stops(plan.information.moves, plan.information.seen_moves)
     free = np.asarray(knowledge.space.u) > 0
     named = ", ".join(f"{name} {count}" for name, count in few.items() if free[INDEX[f"stop_sd_deg.{name}"]])
     return [f"few stops ({named}): they will hardly tell their own scatter; add stops"] if named else []
+
+
+def _sees_few_counters(knowledge: Knowledge, plan: Judged) -> list[str]:
+    """Axes whose looks cannot tell gear error from ratio, as sentences."""
+    gears, found = knowledge.gears, list[str]()
+    if not gears.size:
+        return found
+    seen = [move for move in plan.information.moves if move.move in plan.information.seen_moves]
+    uncertain = np.linalg.norm(gears.root, axis=1)[: len(gears.steps)] > LEAST_ERROR_RAD
+    for number, axis in enumerate(AXES):
+        counters = sorted({getattr(move, f"{axis}_steps") for move in seen})
+        own = (gears.on_tilt == (number == 1)) & (gears.share != 0)
+        if 2 <= len(counters) <= FEW_COUNTERS and uncertain[own].any():
+            places = gears.steps[own].round().astype(int).tolist()
+            room = np.diff(places).min() / 2
+            telling = [n for n in places if np.abs(np.subtract(counters, n)).min() > room]
+            found.append(too_few_counters(axis, counters, telling))
+    return found
+
+
+def _with_gears(knowledge: Knowledge, steps: Sequence[PlanStep], found: Candidates | None) -> Knowledge:
+    """What is known, with errors of gears over the counters of the plan and all that the rig could look from."""
+    log = run_plan(steps, knowledge.rig)
+    looks = [log.moves[look.move] for look in log.looks]
+    reached = np.array([(move.pan_steps, move.tilt_steps) for move in looks]).reshape(-1, 2)
+    reached = reached if found is None else np.concatenate([reached, found.looks.steps])
+    return knowledge.with_gears(reached) if len(reached) else knowledge
 
 
 def check_plan(rig: Rig, steps: Sequence[PlanStep], *, progress: Show | None = None) -> PlanCheck:
@@ -255,23 +293,23 @@ def check_plan(rig: Rig, steps: Sequence[PlanStep], *, progress: Show | None = N
     knowledge = prior_knowledge(rig)
     with Job({JUDGING: judging_seconds(), CURING: CURED_SECONDS}, progress) as job:
         job.begin(JUDGING)
+        found, warnings = None, list[str]()
+        if knowledge.gears_vary:
+            found = _candidates(knowledge, warnings)
+            knowledge = _with_gears(knowledge, steps, found)
         plan = judge(steps, knowledge)
         job.begin(CURING)
         information = plan.information
         looks, seen = len(information.look_moves), int(information.expectation.seen.sum())
-        warnings = []
         if seen < looks:
             warnings.append(f"{looks - seen} of {looks} looks miss an image at the most probable instrument")
         warnings += beyond_limits(rig.limits, information.moves)
-        found = None
         texts = {axis: text for axis in AXES if (text := plan.fault(axis)) is not None}
-        if texts:
-            try:
-                found = candidates(knowledge)
-            except InputError as error:
-                warnings.append(f"no cure can be sought on this rig: {error.message}")
+        if texts and not knowledge.gears_vary:
+            found = _candidates(knowledge, warnings)
         faults = tuple(_fault(steps, knowledge, found, plan, axis, text) for axis, text in texts.items())
     warnings += [fault.text for fault in faults]
+    warnings += _sees_few_counters(knowledge, plan)
     warnings += _few_stops(knowledge, plan)
     depths = {s.target for s in steps if s.action == "place"}
     if len({rig.sheets_mm[name] for name in depths}) == 1 and len(rig.sheets_mm) > 1:

@@ -169,7 +169,7 @@ def judged(
 ) -> Baseline:
     """One plan at the most probable instrument; ratios hold at `pose_rad`, by default the plan's own, as in a fit."""
     pose = found.pose_rad if pose_rad is None else pose_rad
-    at = sensitivity(target, knowledge.z, knowledge.space, knowledge.rig.table, pose)
+    at = sensitivity(target, knowledge.z, knowledge.space, knowledge.rig.table, pose, knowledge.gears)
     value = at.value(covariance_of(knowledge.precision + found.fisher), target.factor)
     seen = int(found.expectation.seen.sum())
     return Baseline(name, len(found.look_moves), seen, found.minutes, value)
@@ -257,12 +257,14 @@ class _Question:
     """What is asked of a search: the candidates, what they show at the most probable instrument, and the target there.
 
     Attributes:
+        knowledge: with the errors of the gears at places over all candidates.
         found: candidates.
         seen: what they show.
         at_centre: how the target hangs on the coordinates.
         now: the target's value before any further look.
     """
 
+    knowledge: Knowledge
     found: Candidates
     seen: Seen
     at_centre: Sensitivity
@@ -271,9 +273,10 @@ class _Question:
 
 def _question(knowledge: Knowledge, target: Target, pose_rad: np.ndarray | None, aperture: bool) -> _Question:
     found = candidates(knowledge)
+    knowledge = knowledge.with_gears(found.looks.steps)
     seen = LookArrays(found.looks, knowledge, aperture).at(knowledge.z, knowledge.space)
     pose = seen.mirror_angles_rad.mean(axis=0) if pose_rad is None else pose_rad
-    at_centre = sensitivity(target, knowledge.z, knowledge.space, knowledge.rig.table, pose)
+    at_centre = sensitivity(target, knowledge.z, knowledge.space, knowledge.rig.table, pose, knowledge.gears)
     now = at_centre.value(knowledge.covariance, target.factor)
     if now == 0:
         raise InputError(
@@ -284,7 +287,7 @@ def _question(knowledge: Knowledge, target: Target, pose_rad: np.ndarray | None,
             allowed="a quantity that is to be estimated",
             remedy="state u > 0 for it in [rig.prior], or another target",
         )
-    return _Question(found, seen, at_centre, now)
+    return _Question(knowledge, found, seen, at_centre, now)
 
 
 def _durations(family: Family, scope: Scope) -> dict[int, float]:
@@ -370,6 +373,7 @@ def _planned(
 ) -> PlanResult:
     job.begin(LOOKING)
     asked = _question(knowledge, target, pose_rad, scope.aperture)
+    knowledge = asked.knowledge
     job.begin(CHOOSING)
     family = design_family(knowledge, asked.found, asked.seen, target, asked.at_centre, scope, job.at)
     durations = _durations(family, scope)
@@ -420,13 +424,14 @@ def _planned(
 
 
 def _pixel_part(found: Expectation) -> np.ndarray:
-    """What pixel noise alone contributes to the information, (C^-1 J)^T (C^-1 J), shape (p, p)."""
+    """What pixel noise alone contributes to the information, (C^-1 J)^T (C^-1 J), shape (p + e, p + e)."""
     spots = LinearSpots(
         residual=np.zeros(found.jacobian.shape[:2]),
         load=np.asarray(found.load),
         renewed=np.asarray(found.keep) == 0,
         variance=np.asarray(found.variance),
         jacobian=np.asarray(found.jacobian),
+        places=np.zeros((*found.jacobian.shape[:2], 0)),
     )
     gain = np.concatenate([group.jacobian for group in stop_information(spots).groups])
     return gain.T @ gain

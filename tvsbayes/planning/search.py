@@ -13,10 +13,10 @@ from itertools import combinations
 
 import numpy as np
 
-from tvsbayes.model.headlines import QUANTITIES, headlines
+from tvsbayes.model.headlines import QUANTITIES
 from tvsbayes.planning.assurance import Assurance, Family
 from tvsbayes.planning.candidates import Candidates
-from tvsbayes.planning.expectation import HOME_VARIANCE_RAD2, LOOKS_PER_EXPERIMENT, PARAMETERS, Knowledge
+from tvsbayes.planning.expectation import HOME_VARIANCE_RAD2, LOOKS_PER_EXPERIMENT, Knowledge
 from tvsbayes.planning.looks import CONTRAST_COLUMNS, Seen, covariance_of, information_of_looks
 from tvsbayes.planning.target import Sensitivity, Target
 from tvsbayes.progress import Advance, unshown
@@ -191,10 +191,11 @@ def search_rows(seen: Seen, knowledge: Knowledge) -> tuple[np.ndarray, np.ndarra
     precision = knowledge.precision.copy()
     precision[CONTRAST_COLUMNS, CONTRAST_COLUMNS] += KNOWN
     if not knowledge.after_data:
-        return seen.rows[..., :PARAMETERS], precision
-    full = np.zeros((PARAMETERS + 2, PARAMETERS + 2))
-    full[:PARAMETERS, :PARAMETERS] = precision
-    full[range(PARAMETERS, PARAMETERS + 2), range(PARAMETERS, PARAMETERS + 2)] = 1 / HOME_VARIANCE_RAD2
+        return seen.rows[..., :-2], precision
+    size = len(precision)
+    full = np.zeros((size + 2, size + 2))
+    full[:size, :size] = precision
+    full[range(size, size + 2), range(size, size + 2)] = 1 / HOME_VARIANCE_RAD2
     return seen.rows, full
 
 
@@ -228,14 +229,14 @@ def search_designs(knowledge: Knowledge, seen: Seen, at_centre: Sensitivity, cri
     """A search for the target's sensitivities among looks; contrasts count as known, see `KNOWN`."""
     rows, precision = search_rows(seen, knowledge)
     wide = np.zeros((len(at_centre.gradient), rows.shape[2]))
-    wide[:, :PARAMETERS] = at_centre.gradient
+    wide[:, : knowledge.size] = at_centre.gradient
     return Search(rows, precision, wide, at_centre.own_variance, criterion)
 
 
 def _of_all_gears(knowledge: Knowledge, seen: Seen) -> Sensitivity:
     """Ratios and backlashes of both axes, in the middle of the looks."""
     pose_rad = seen.mirror_angles_rad.mean(axis=0)
-    everything = np.asarray(headlines(knowledge.z, knowledge.space, pose_rad).gradient)
+    everything = np.asarray(knowledge.gears.headlines(knowledge.z, knowledge.space, pose_rad).gradient)
     return Sensitivity(everything[[QUANTITIES.index(q) for q in ("left", "up", "backlash.pan", "backlash.tilt")]])
 
 

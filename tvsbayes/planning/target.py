@@ -14,12 +14,13 @@ import numpy as np
 from tvsbayes.calibration.pointing import INPUT_NAMES, Calibration
 from tvsbayes.calibration.pointing import NOISE_NAMES as CALIBRATION_NOISE
 from tvsbayes.errors import InputError, escaped
-from tvsbayes.instrument.axes import DIRECTIONS
+from tvsbayes.instrument.axes import APPROACH_SIGN, DIRECTIONS
 from tvsbayes.instrument.parameters import INDEX
 from tvsbayes.instrument.protocols import OVERSHOOT_STEPS
 from tvsbayes.instrument.rig import RigTable
-from tvsbayes.model.headlines import QUANTITIES, headlines
+from tvsbayes.model.headlines import QUANTITIES
 from tvsbayes.model.parameter_space import ParameterSpace, physical_at
+from tvsbayes.planning.gear_places import NO_PLACES, GearPlaces
 from tvsbayes.statistics.intervals import NORMAL_95
 
 UNITS = {
@@ -132,8 +133,9 @@ class Sensitivity:
     """How a target hangs on the coordinates, at one point of parameter space or with a leading axis at several.
 
     Attributes:
-        gradient: d(quantity)/d(coordinates) of each quantity whose worst is meant, shape (q, p).
-        own: variance that no calibration lowers, by cause, shapes (q,): the stop and the reading at the point itself.
+        gradient: d(quantity)/d(coordinates, errors of gears) of each quantity whose worst is meant, shape (q, p + e).
+        own: variance that no calibration lowers, by cause, shapes (q,): the stop and the reading at the point itself,
+            and what its counters have of the gears' errors that those at the places do not tell.
     """
 
     gradient: np.ndarray
@@ -145,20 +147,26 @@ class Sensitivity:
         return sum(self.own.values(), np.zeros(self.gradient.shape[:-1]))
 
     def values(self, covariance: np.ndarray, factor: float = 1.0) -> np.ndarray:
-        """The target's values under covariances (..., p, p) of the coordinates."""
+        """The target's values under covariances (..., p + e, p + e) of coordinates and errors."""
         variance = np.sum((self.gradient @ covariance) * self.gradient, axis=-1) + self.own_variance
         return factor * np.sqrt(variance.max(axis=-1))
 
     def value(self, covariance: np.ndarray, factor: float = 1.0) -> float:
-        """The target's value under a covariance (p, p), at one point."""
+        """The target's value under a covariance (p + e, p + e), at one point."""
         return float(self.values(covariance, factor))
 
 
 AT_POINT = ("stop error at the point", "aperture noise at the point")
+GEARS_AT_POINT = "gear errors between the places"
 
 
 def sensitivity(
-    target: Target, z: np.ndarray, space: ParameterSpace, table: RigTable, pose_rad: np.ndarray
+    target: Target,
+    z: np.ndarray,
+    space: ParameterSpace,
+    table: RigTable,
+    pose_rad: np.ndarray,
+    gears: GearPlaces = NO_PLACES,
 ) -> Sensitivity:
     """Linearise a target at a point of parameter space.
 
@@ -168,13 +176,14 @@ def sensitivity(
         space: priors.
         table: gives the aperture's convention and the periods.
         pose_rad: where effective ratios hold, shape (2,).
+        gears: where errors of the gears are further coordinates; ratios are then lines over these places.
 
     Raises:
         InputError: no beam reaches the target's point.
     """
     rows = list(target.indices)
     if target.point_mm is None:
-        return Sensitivity(np.asarray(headlines(z, space, pose_rad).gradient)[rows])
+        return Sensitivity(np.asarray(gears.headlines(z, space, pose_rad).gradient)[rows])
     at = physical_at(z, space)
     physical, slope = np.asarray(at.value), np.asarray(at.slope)
     inputs = [INDEX[name] for name in INPUT_NAMES]
@@ -194,4 +203,15 @@ def sensitivity(
     jacobian = machine.derivatives(goal.pan_steps, goal.tilt_steps, goal.aperture_deg, goal.approach)[rows]
     own = jacobian[:, count:] ** 2
     here = {AT_POINT[0]: own[:, :2].sum(axis=1), AT_POINT[1]: own[:, 4]}
-    return Sensitivity(jacobian[:, :count] @ slope[inputs], here)
+    gradient = jacobian[:, :count] @ slope[inputs]
+    if not gears.size:
+        return Sensitivity(gradient, here)
+    # Per rad of both mirrors: what a stop error of sd 1 does.
+    reached = [CALIBRATION_NOISE.index(f"stop_sd_deg.{name}") for name in goal.approach]
+    by_angle = jacobian[:, count : count + 2] / np.radians(stop_sd[reached])
+    at = [gears.between(np.array([steps]), axis) for axis, steps in enumerate((goal.pan_steps, goal.tilt_steps))]
+    side = [APPROACH_SIGN[name] for name in goal.approach]
+    turning = np.stack([np.append(one.error[0], -0.5 * s * one.play[0]) for one, s in zip(at, side, strict=True)])
+    rest = np.array([one.error_rest[0] ** 2 + 0.25 * one.play_rest[0] ** 2 for one in at])
+    here[GEARS_AT_POINT] = by_angle**2 @ rest
+    return Sensitivity(np.concatenate([gradient, by_angle @ turning], axis=1), here)

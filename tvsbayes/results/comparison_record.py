@@ -111,6 +111,49 @@ class HoldOut:
 
 
 @dataclass(frozen=True)
+class HeldOutPosition:
+    """One counter of an axis from one side, foretold by the looks at all others; mirror angles, deg.
+
+    Attributes:
+        axis: "pan" or "tilt".
+        position: counter, steps.
+        direction: "left", "right", "up", "down" or "unknown": that of the move to it.
+        n: looks in the mean.
+        mean: of the angles seen.
+        predicted, u: of that mean; stop errors and noise of its looks in u.
+    """
+
+    axis: str
+    position: int
+    direction: str
+    n: int
+    mean: float
+    predicted: float
+    u: float
+
+
+@dataclass(frozen=True)
+class PositionHoldOut:
+    """All counters foretold.
+
+    Attributes:
+        by: "positions".
+        positions: each from each side.
+        rms_z: root mean square of (mean - predicted) / u; None where nothing could be foretold.
+        warnings: sentences on what could not.
+    """
+
+    by: str
+    positions: tuple[HeldOutPosition, ...]
+    rms_z: float | None
+    warnings: tuple[str, ...]
+
+    def as_json(self) -> dict[str, object]:
+        """The document of `compare --by positions --json`, without what the caller adds (`files`)."""
+        return {"kind": "positions left out", "unit": "deg", "hold_out": plain(self)}
+
+
+@dataclass(frozen=True)
 class Change:
     """One quantity of two calibrations.
 

@@ -1,0 +1,208 @@
+"""Gears that repeat their errors, in planning: what places say of counters, and what plans do about it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.coarse_planning import ROUNDING, with_priors
+
+from tvsbayes.instrument.axes import DIRECTIONS
+from tvsbayes.instrument.parameters import NAMES, Prior, names_of
+from tvsbayes.instrument.plan import PlanStep
+from tvsbayes.instrument.protocols import grid_protocol, paper_protocol
+from tvsbayes.model.gear_kriging import scales_at
+from tvsbayes.model.parameter_space import HALF_NORMAL_MEAN
+from tvsbayes.planning.candidates import candidates
+from tvsbayes.planning.expectation import PARAMETERS, information_of, prior_knowledge
+from tvsbayes.planning.gear_places import NO_PLACES, GearPlaces, TaughtErrors, regular_places, windows_of
+from tvsbayes.planning.looks import LookArrays, arrange, covariance_of, information_of_looks
+from tvsbayes.planning.plan_check import check_plan
+from tvsbayes.planning.planner import judged
+from tvsbayes.planning.search import search_designs
+from tvsbayes.planning.target import AT_POINT, GEARS_AT_POINT, parse_target, sensitivity
+from tvsbayes.statistics.gaussian_process import matern52
+
+pytestmark = pytest.mark.usefixtures("small_searches")
+LENGTH_DEG, PAN, TILT = 8.0, 0.06, 0.07
+MIRRORS = names_of(
+    *("mirror1_error_deg", "mirror2_error_deg", "laser_tilt_deg", "laser_offset_mm"),
+    *("tilt_axis_skew_deg", "tilt_axis_offset_mm"),
+)
+WORST = parse_target("u(worst) <= 2e-4 deg/step")
+
+
+@pytest.fixture(scope="module")
+def real_rig(mounted_rig):
+    """Gears with a transmission error of some 0.04 deg and a play that varies."""
+    scales = {f"transmission_error_deg__{axis}": Prior(0.0, 0.05, "half-normal") for axis in ("pan", "tilt")}
+    scales |= {f"play_variation_deg__{axis}": Prior(0.0, 0.02, "half-normal") for axis in ("pan", "tilt")}
+    return with_priors(mounted_rig, **scales)
+
+
+@pytest.fixture(scope="module")
+def real(real_rig, small_searches):
+    """Before any data, and the candidates over which its places lie."""
+    bare = prior_knowledge(real_rig)
+    found = candidates(bare)
+    return bare.with_gears(found.looks.steps), found
+
+
+def some_places(error_deg=0.04, play_deg=0.02) -> GearPlaces:
+    physical = np.zeros(len(NAMES))
+    for index, name in enumerate(NAMES):
+        block = name.split(".")[0]
+        values = {"transmission_error_deg": error_deg, "play_variation_deg": play_deg}
+        physical[index] = {**values, "transmission_error_length_deg": LENGTH_DEG}.get(block, 0.0)
+    scales = scales_at(physical, np.full((2, 3), 360.0))
+    reached = np.column_stack([np.linspace(0, 240, 9), np.linspace(-90, 90, 9)])
+    return regular_places(reached, np.array([PAN, TILT]), scales)
+
+
+def test_counters_between_places_are_the_process_itself():
+    """Places no farther apart than a third of the length leave 5 % of the sd open; at a place nothing."""
+    gears, counters = some_places(), np.array([0.0, 37.0, 120.0, 240.0])
+    at = gears.between(counters, 0)
+    correlation = matern52(np.subtract.outer(counters, counters) * PAN, LENGTH_DEG)
+    known = at.error @ at.error.T
+    assert known == pytest.approx(np.radians(0.04) ** 2 * correlation, abs=np.radians(0.04) ** 2 * 0.05**2)
+    assert at.error_rest[[0, 3]] == pytest.approx(0, abs=1e-4 * np.radians(0.04))
+    far = gears.between(np.array([6000.0]), 0)
+    assert far.error_rest == pytest.approx(np.radians([0.04])) and far.play_rest == pytest.approx(np.radians([0.02]))
+    turning = gears.turning(np.array([[37, -20]]), np.array([[1, -1]]))
+    half = len(gears.steps)
+    assert turning[0, 0, :half] == pytest.approx(at.error[1]) and turning[0, 0, half:] == pytest.approx(-at.play[1] / 2)
+    assert np.all(turning[0, 0, np.tile(gears.on_tilt, 2)] == 0)
+
+
+def test_a_full_turn_away_is_a_window_of_its_own_and_no_part_of_the_line():
+    windows = windows_of(np.array([0, 100, 200, 6000, 6100, -6000]), PAN)
+    assert [window.tolist() for window in windows] == [[0, 100, 200], [6000, 6100], [-6000]]
+    gears = some_places()
+    for axis, range_steps in ((False, 240), (True, 180)):
+        own = gears.on_tilt == axis
+        assert np.ptp(gears.steps[own]) == range_steps
+        assert gears.share[own] @ gears.steps[own] == pytest.approx(1) and gears.share[own].sum() == pytest.approx(0)
+
+
+def test_what_a_fit_says_at_its_places_is_carried_to_others():
+    """Nothing taught leaves the prior; errors known at the fit's counters are known at those of the plan between."""
+    gears = some_places(play_deg=0.0)
+    own = replace(gears, steps=gears.steps * 0.9, share=gears.share / 0.9)
+    nothing = np.eye(PARAMETERS + own.size)
+    assert TaughtErrors(own, nothing).carried(gears) == pytest.approx(np.eye(PARAMETERS + gears.size), abs=1e-6)
+    known = nothing.copy()
+    known[PARAMETERS:, PARAMETERS:] *= 1e-6
+    known[0, PARAMETERS] = known[PARAMETERS, 0] = 1e-4
+    left = gears.root @ TaughtErrors(own, known).carried(gears)[PARAMETERS:, PARAMETERS:] @ gears.root.T
+    inside = np.abs(gears.steps) < 80
+    count = len(gears.steps)
+    assert np.sqrt(np.diag(left)[:count][inside]).max() < 0.1 * np.radians(0.04)
+    follows = TaughtErrors(own, known).carried(gears)[0, PARAMETERS:]
+    assert follows[:count] @ gears.root[:count, :count].T @ np.ones(count) != 0
+
+
+def test_looks_of_real_gears_add_up_to_the_plan_they_make(real):
+    """The fast sum equals the filter's pass over the arranged plan: errors are columns of both."""
+    known, found = real
+    seen = LookArrays(found.looks, known, False).at(known.z, known.space)
+    picks = np.random.default_rng(5).integers(0, len(found.looks), 24)
+    arranged = arrange(found.looks[picks], known.sheets, found.overshoot)
+    exact = information_of(arranged.steps, known).fisher
+    quick = information_of_looks(seen, picks, arranged.path, known.space, False)
+    assert exact.shape == (known.size, known.size) and known.gears.size > 20
+    assert np.abs(quick - exact).max() < ROUNDING * np.abs(exact).max()
+
+
+def test_expected_ratio_is_that_of_dense_matrices(real):
+    """Errors integrated out of the looks beforehand, as fits do, leave the u of a line that columns of theirs leave.
+
+    By the matrices themselves: whitened looks, of which the errors are a part of the noise.
+    """
+    known, found = real
+    seen = LookArrays(found.looks, known, False).at(known.z, known.space)
+    rows = seen.rows[seen.seen][::7, :, :-2].reshape(-1, known.size)
+    at = sensitivity(WORST, known.z, known.space, known.rig.table, seen.mirror_angles_rad.mean(axis=0), known.gears)
+    by_columns = at.values(covariance_of(known.precision + rows.T @ rows))
+    own, errors = rows[:, :PARAMETERS], rows[:, PARAMETERS:]
+    noise = np.eye(len(rows)) + errors @ errors.T
+    gain = np.linalg.solve(own @ own.T + noise, rows)
+    left = np.eye(known.size) - rows.T @ gain
+    assert by_columns == pytest.approx(
+        np.sqrt(np.einsum("qi,ij,qj->q", at.gradient, left, at.gradient).max()), rel=1e-6
+    )
+
+
+def test_perfect_gears_have_no_places(knowledge, found):
+    assert knowledge.with_gears(found.looks.steps) is knowledge and knowledge.gears is NO_PLACES
+
+
+def test_a_plan_for_real_gears_looks_from_more_counters(mounted_rig, real_rig, monkeypatch):
+    """Ends alone tell a perfect gear's ratio where mirrors are known and stops precise; a line along errors does not.
+
+    At stop errors of 0.04 deg and unknown mirrors both plans look from all over: the mirrors ask for as much.
+    """
+    monkeypatch.setattr("tvsbayes.planning.candidates.PAN_LEVELS", 9)
+    monkeypatch.setattr("tvsbayes.planning.candidates.TILT_LEVELS", 5)
+    stops = {f"stop_sd_deg__{d}": Prior(0.01, 0.5, "log-normal") for d in DIRECTIONS}
+    mirrors = {name.replace(".", "__"): replace(mounted_rig.table.priors[name], u=0.0) for name in MIRRORS}
+    counts = {}
+    for name, rig in (("real", real_rig), ("perfect", mounted_rig)):
+        bare = prior_knowledge(with_priors(rig, **stops, **mirrors))
+        offered = candidates(bare)
+        known = bare.with_gears(offered.looks.steps)
+        seen = LookArrays(offered.looks, known, False).at(known.z, known.space)
+        pose = seen.mirror_angles_rad.mean(axis=0)
+        at = sensitivity(WORST, known.z, known.space, known.rig.table, pose, known.gears)
+        picks = search_designs(known, seen, at).greedy(24)
+        counts[name] = [len(np.unique(offered.looks.steps[picks, axis])) for axis in range(2)]
+    assert all(np.subtract(counts["real"], counts["perfect"]) >= 0), counts
+    assert sum(counts["real"]) >= sum(counts["perfect"]) + 2, counts
+
+
+def test_the_papers_two_counters_are_worse_off_elsewhere_and_named(real, real_rig):
+    known, _ = real
+    paper = judged("paper", information_of(paper_protocol(12), known), known, WORST)
+    grid = grid_protocol(pan_steps=(0, 60, 120, 180, 240), tilt_steps=(-90, -45, 0, 45, 90))
+    assert judged("grid", information_of(grid, known), known, WORST).joint < 0.8 * paper.joint
+    warnings = check_plan(real_rig, paper_protocol(12)).warnings
+    named = [text for text in warnings if "cannot tell gear error from ratio" in text]
+    assert [text.split()[0] for text in named] == ["pan", "tilt"]
+    assert "would tell" in named[0] and "elsewhere" in named[0]
+    assert not [text for text in check_plan(real_rig, grid).warnings if "gear error" in text]
+
+
+def test_a_point_between_the_places_has_what_they_leave_open(real):
+    known, _ = real
+    pose = np.zeros(2)
+    own = {}
+    for y_mm in (0.0, 900.0):
+        target = parse_target(f"U95(y) at 1000,{y_mm},0 mm <= 5 mm")
+        at = sensitivity(target, known.z, known.space, known.rig.table, pose, known.gears)
+        assert at.gradient.shape == (1, known.size)
+        own[y_mm] = float(at.own[GEARS_AT_POINT][0])
+        errors = float(np.sum(at.gradient[0, PARAMETERS:] ** 2)) + own[y_mm]
+        # Stop errors of 0.04 deg; errors of 0.05 and half the play's 0.02 deg times the mean of a half-normal.
+        assert np.sqrt(errors / at.own[AT_POINT[0]][0]) == pytest.approx(
+            np.hypot(0.05, 0.01) * HALF_NORMAL_MEAN / 0.04, rel=1e-3
+        )
+    assert own[0.0] < 0.1 * own[900.0]
+
+
+def test_limits_name_the_transmission_error(real):
+    from tvsbayes.planning.limits import split_of
+
+    known, _ = real
+    steps = (
+        *(PlanStep(0, "home", 0, 0), PlanStep(1, "place", target="d1")),
+        *(
+            s
+            for n, (pan, tilt) in enumerate([(0, -90), (240, 90)] * 6)
+            for s in (PlanStep(n, "move", pan, tilt), PlanStep(n, "look"))
+        ),
+    )
+    found = information_of(steps, known)
+    at = sensitivity(WORST, known.z, known.space, known.rig.table, found.pose_rad, known.gears)
+    shares = split_of(known, found.fisher, None, at)
+    assert "transmission error" in shares and sum(shares.values()) == pytest.approx(1)

@@ -1,0 +1,123 @@
+"""Hold-out by position: every counter of an axis left out in turn with all its looks, fitted without, foretold.
+
+A rest's angle is foretold by all other looks: ratio and mirrors, and what the gears repeat at neighbouring counters. The
+looks left out are given angles of their own, free in the linear model about the mode that was found without them; what
+these add to the prediction, and how well they are known, is the deviation of the position and its u. Mirror angles in
+deg, counters in steps.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from tvsbayes.comparison.held_out import refit
+from tvsbayes.errors import NothingToEstimate, TvsError
+from tvsbayes.estimators.annealed_stage import NO_STEP, Fixed, stage
+from tvsbayes.estimators.joint_fit import JointFit
+from tvsbayes.estimators.linear_spots import Linearised, linear_spots, stop_information
+from tvsbayes.instrument.axes import AXES, SENSES
+from tvsbayes.instrument.campaign import ordered_spots
+from tvsbayes.instrument.parameters import NAMES
+from tvsbayes.instrument.stops import rests_of
+from tvsbayes.progress import Job, Show
+from tvsbayes.results.comparison_record import HeldOutPosition, PositionHoldOut
+
+POSITIONS_MIN = 3
+"""Counters of an axis: with one left out, two make a line."""
+
+
+def hold_out_positions(fit_of_all: JointFit, *, progress: Show | None = None) -> PositionHoldOut:
+    """Every counter at which an axis was seen left out in turn, with all its looks from both sides.
+
+    Args:
+        fit_of_all: a converged fit; its campaign and model are used.
+        progress: told how far it is.
+
+    Raises:
+        NothingToEstimate: neither axis was seen at three counters.
+    """
+    campaign = fit_of_all.campaign
+    spots = ordered_spots(campaign)
+    used = np.asarray(fit_of_all.arrays.spots.valid)[: len(spots)] > 0
+    folds: dict[str, tuple[int, np.ndarray, np.ndarray]] = {}
+    warnings = []
+    for number, axis in enumerate(AXES):
+        rests = [rests_of(campaign.moves, axis)[spot.move] for spot in spots]
+        steps, sign = (np.array([getattr(rest, name) for rest in rests]) for name in ("steps", "sign"))
+        counters = np.unique(steps[used])
+        if len(counters) < POSITIONS_MIN:
+            warnings.append(f"{axis} is seen at {len(counters)} counters: with one left out no line is left")
+            continue
+        folds |= {f"{axis} {counter}": (number, used & (steps == counter), sign) for counter in counters.tolist()}
+    if not folds:
+        raise NothingToEstimate(
+            "too-few-positions",
+            "neither axis was seen at three counters: with one left out no line is left",
+            file="moves.csv",
+            remedy="look from at least three counters of an axis",
+        )
+    found: list[HeldOutPosition] = []
+    with Job(dict.fromkeys(folds, 1.0), progress) as job:
+        for name, (number, out, sign) in folds.items():
+            try:
+                taught = refit(fit_of_all, frozenset(spots[k].spot for k in np.flatnonzero(out)), job.part(name))
+            except TvsError as error:
+                warnings.append(f"without {name} there is no fit: {error.message}")
+                continue
+            if not taught.converged:
+                warnings.append(f"without {name} the fit does not converge: {'; '.join(taught.problems)}")
+                continue
+            found += foretold(fit_of_all, taught, number, int(name.split()[1]), out, sign)
+    z = [(position.mean - position.predicted) / position.u for position in found]
+    rms = float(np.sqrt(np.mean(np.square(z)))) if z else None
+    return PositionHoldOut("positions", tuple(found), rms, tuple(warnings))
+
+
+def _of_all_looks(fit_of_all: JointFit, taught: JointFit) -> Linearised:
+    """All looks linearised at the mode that some of them taught."""
+    held = np.isin(np.arange(len(NAMES)), fit_of_all.held)
+    fixed = Fixed(held, taught.z, np.array(1.0))
+    at_mode = stage(taught.z, fit_of_all.space, fit_of_all.arrays, fixed, np.array(NO_STEP))
+    return at_mode.of_spots(len(ordered_spots(fit_of_all.campaign)))
+
+
+def foretold(
+    fit_of_all: JointFit, taught: JointFit, axis: int, counter: int, out: np.ndarray, sign: np.ndarray
+) -> list[HeldOutPosition]:
+    """A counter from each side from which its looks came.
+
+    Args:
+        fit_of_all: has all looks.
+        taught: the fit without those left out.
+        axis: number of the axis.
+        counter: of the axis.
+        out: looks left out, shape (spots,).
+        sign: side from which the axis came, shape (spots,).
+    """
+    lin = _of_all_looks(fit_of_all, taught)
+    held = np.isin(np.arange(len(NAMES)), fit_of_all.held)
+    own, rows = np.where(held, 0.0, -np.asarray(lin.residual_jacobian)), np.flatnonzero(out)
+    free = np.zeros((len(out), 4, 2 * len(rows)))
+    for k, row in enumerate(rows.tolist()):
+        free[row, :, 2 * k : 2 * k + 2] = np.asarray(lin.slope)[row]
+    linear = linear_spots(lin, fit_of_all.arrays, np.concatenate([own, free], axis=2))
+    told, count = stop_information(linear), len(NAMES)
+    # Coordinates have their priors; angles of the looks left out have none.
+    precision = told.fisher + np.diag(np.arange(len(told.fisher)) < count)
+    score = np.zeros(len(precision))
+    for group in told.groups:
+        score += np.einsum("nic,ni->c", linear.jacobian[group.rows], group.residual.reshape(-1, 4))
+    score[:count] -= taught.z
+    mine = slice(count + axis, None, 2)
+    deviation, covariance = np.linalg.solve(precision, score)[mine], np.linalg.inv(precision)[mine, mine]
+    seen = lin.mirror_angles_rad[rows, axis] + lin.spot_deviations().deviation_rad[rows, axis]
+    names = dict(zip((1, -1, 0), (*SENSES[AXES[axis]], "unknown"), strict=True))
+    found = []
+    for side, direction in names.items():
+        weight = (sign[rows] == side) / max(np.sum(sign[rows] == side), 1)
+        if not weight.any():
+            continue
+        mean, off, u = np.degrees([weight @ seen, weight @ deviation, np.sqrt(weight @ covariance @ weight)]).tolist()
+        n = int(np.sum(weight > 0))
+        found.append(HeldOutPosition(AXES[axis], counter, direction, n, mean, mean - off, u))
+    return found

@@ -1,0 +1,176 @@
+"""What gears repeat, as further coordinates of a plan: their errors at regular counters that plans may use.
+
+In a fit these errors are integrated out at the counters seen; before one nobody knows which those will be. Of the
+regular places each is N(0, 1) in units of the factor of their covariance at the believed scales (formulation 3.1, 6),
+transmission errors first, then plays; what lies between follows from them (kriging). Counters in steps, angles in rad.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from scipy import linalg
+
+from tvsbayes.instrument.axes import AXES
+from tvsbayes.instrument.campaign import Move
+from tvsbayes.instrument.parameters import KINDS, NAMES
+from tvsbayes.instrument.places import SPACING_DEG
+from tvsbayes.instrument.stops import rests_of
+from tvsbayes.model.compiled import compiled, placed
+from tvsbayes.model.gear_kriging import KnownPlaces, scales_at
+from tvsbayes.model.gear_processes import GearScales, Places
+from tvsbayes.model.headlines import DEGREES, Headlines, SeenLine, headlines, line_deg_per_step
+from tvsbayes.model.laser_path import beam_angles
+from tvsbayes.model.parameter_space import HALF_NORMAL_MEAN, ParameterSpace, physical_at
+
+PLACES_MAX = 12
+"""Of one axis in one window."""
+GAP_DEG = 60.0
+"""Counters of an axis that lie farther apart are windows of their own: a full turn away, for instance."""
+
+
+@dataclass(frozen=True)
+class GearPlaces(KnownPlaces):
+    """Places of both axes, and the lines that ratios are.
+
+    Attributes:
+        share: of the value at each place in the slope of the line of its axis, steps^-1, shape (c,).
+    """
+
+    share: np.ndarray
+
+    def turning(self, steps: np.ndarray, side: np.ndarray) -> np.ndarray:
+        """How the errors turn (pan, tilt) of looks, d(angle)/d(errors), rad, shape (m, 2, 2 c).
+
+        Args:
+            steps: counters, shape (m, 2).
+            side: +1 reached left or up, -1 right or down, 0 unknown, shape (m, 2).
+        """
+        found = np.zeros((len(steps), 2, self.size))
+        if self.size:
+            for axis in range(2):
+                at = self.between(steps[:, axis], axis)
+                found[:, axis] = np.concatenate([at.error, -0.5 * side[:, axis, None] * at.play], axis=1)
+        return found
+
+    def turning_after(self, moves: Sequence[Move], looks: Sequence[int]) -> np.ndarray:
+        """`turning` of the looks after some of the moves."""
+        rests = [[rests[move] for move in looks] for rests in (rests_of(moves, axis) for axis in AXES)]
+        steps, side = (
+            np.array([[getattr(rest, name) for rest in axis] for axis in rests]).T for name in ("steps", "sign")
+        )
+        return self.turning(steps, side)
+
+    def headlines(self, z: np.ndarray, space: ParameterSpace, pose_rad: np.ndarray) -> Headlines:
+        """Headlines at coordinates, with derivatives by coordinates and errors, shape (9, p + 2 c).
+
+        Ratios are slopes of the lines over the places, at a pose where gears repeat no error.
+        """
+        if not self.size:
+            return headlines(z, space, pose_rad)
+        valid = placed(np.ones(len(self.steps), dtype=bool))
+        places = Places(placed(self.steps), placed(self.on_tilt), valid)
+        return line_headlines(z, space, SeenLine(placed(pose_rad), places, placed(self.share)), placed(self.root))
+
+
+NO_PLACES = GearPlaces(np.zeros(0), np.zeros(0, dtype=bool), np.zeros(2), None, np.zeros(0))
+"""Of gears that repeat no error."""
+
+
+@compiled(Headlines)
+def line_headlines(
+    z: Float[Array, " parameters"], space: ParameterSpace, seen: SeenLine, root: Float[Array, "errors errors"]
+) -> Headlines:
+    """Headlines with ratios along lines (formulation 3.2); derivatives by coordinates and errors at places."""
+
+    def values(point):
+        model = space.model(point[: len(NAMES)])
+        mirrors = beam_angles(model.optics, seen.pose_rad[0], seen.pose_rad[1])
+        slopes = line_deg_per_step(model, seen, root @ point[len(NAMES) :], mirrors)
+        lost = model.transmission.backlash_rad * DEGREES
+        offset = mirrors.effective_mirror_offset_mm[None]
+        return jnp.concatenate([slopes, slopes[::2] - slopes[1::2], lost, offset])
+
+    point = jnp.concatenate([z, jnp.zeros(len(root))])
+    return Headlines(values(point), jax.jacfwd(values)(point))
+
+
+def believed_scales(z: np.ndarray, space: ParameterSpace, after_data: bool) -> GearScales:
+    """Scales of the gears' errors at coordinates; before any data means instead of medians of those that may be nought.
+
+    How much a design gains hangs on variances: the mean of a half-normal is nearer to its root mean square.
+    """
+    physical = np.array(physical_at(z, space).value)
+    if not after_data:
+        own = np.asarray(space.kind) == KINDS.index("half-normal")
+        physical[: len(own)] = np.where(own, np.asarray(space.u) * HALF_NORMAL_MEAN, physical[: len(own)])
+
+    return scales_at(physical, np.asarray(space.harmonic_period_deg))
+
+
+def windows_of(counters: np.ndarray, deg_per_step: float) -> list[np.ndarray]:
+    """Different counters (n,) of an axis, apart where nothing lies within `GAP_DEG`; best filled, nearest 0 first."""
+    different = np.unique(counters).astype(float)
+    apart = np.flatnonzero(np.diff(different) * deg_per_step > GAP_DEG) + 1
+    return sorted(np.split(different, apart), key=lambda own: (-len(own), abs(own.mean())))
+
+
+def regular_places(reached: np.ndarray, ratio_deg_per_step: np.ndarray, scales: GearScales) -> GearPlaces:
+    """Places over the counters that plans may use; a ratio is the line over those of its axis' first window.
+
+    Args:
+        reached: counters (pan, tilt), shape (m, 2).
+        ratio_deg_per_step: mean ratios, shape (2,).
+        scales: believed.
+    """
+    steps, on_tilt, share = [], [], []
+    for axis in range(2):
+        deg_per_step = abs(float(ratio_deg_per_step[axis]))
+        for number, own in enumerate(windows_of(reached[:, axis], deg_per_step)):
+            wanted = math.ceil(np.ptp(own) * deg_per_step / SPACING_DEG) + 1
+            nodes = np.linspace(own[0], own[-1], min(max(wanted, 2), PLACES_MAX)) if len(own) > 1 else own
+            off = nodes - nodes.mean()
+            lined = number == 0 and len(nodes) > 1
+            steps.append(nodes)
+            on_tilt.append(np.full(len(nodes), axis == 1))
+            share.append(off / (off @ off) if lined else np.zeros(len(nodes)))
+    at, axis_of, line = (np.concatenate(part) for part in (steps, on_tilt, share))
+    return GearPlaces(at, axis_of, np.radians(ratio_deg_per_step), scales, line)
+
+
+@dataclass(frozen=True)
+class TaughtErrors:
+    """What a fit says of the errors at its own places.
+
+    Attributes:
+        places: its places.
+        covariance: of the coordinates and of the errors at these places, shape (p + e, p + e).
+    """
+
+    places: GearPlaces
+    covariance: np.ndarray
+
+    def carried(self, places: GearPlaces) -> np.ndarray:
+        """The same covariance of the coordinates and of the errors at other places."""
+        own, count = len(self.places.steps), len(NAMES)
+        scales = self.places.scales
+        assert scales is not None, "a fit with places has scales"
+        # In their units errors hang together whatever their size; no play would leave nothing to divide by.
+        sized = replace(scales, play_rad=np.where(scales.play_rad > 0, scales.play_rad, 1.0))
+        taught, asked = replace(self.places, scales=sized), replace(places, scales=sized)
+        here = np.split(asked.root, 2)
+        factors = taught.factors_with(asked.steps, asked.on_tilt)
+        follows, rest = [], []
+        for part, factor in zip((here[0][:, : len(here[0])], here[1][:, len(here[0]) :]), factors, strict=True):
+            turned = linalg.solve_triangular(part, factor[own:], lower=True)
+            follows.append(turned[:, :own])
+            rest.append(turned[:, own:])
+        move = linalg.block_diag(np.eye(count), *follows)
+        left = linalg.block_diag(np.zeros((count, count)), *(part @ part.T for part in rest))
+        return move @ self.covariance @ move.T + left
