@@ -7,6 +7,7 @@ import pytest
 from support.axes import PLACES, campaign, drawn, runs
 
 from tvsbayes.errors import NothingToEstimate
+from tvsbayes.single_axis import held_out_positions
 from tvsbayes.single_axis.axis_parameters import AxisPrior
 from tvsbayes.single_axis.held_out_positions import hold_out_positions
 
@@ -39,3 +40,20 @@ def test_two_positions_leave_no_line():
     moves = runs(3, (0.0, 1000.0), 0.0)
     with pytest.raises(NothingToEstimate):
         hold_out_positions(campaign(moves, [0.01 * m.command for m in moves]))
+
+
+def test_weighted_draws_of_one_fit_say_what_fits_without_a_position_say(monkeypatch):
+    made = drawn(11, runs(3), backlash=AxisPrior(0.0, 0.1)).campaign
+    refitted = hold_out_positions(made).positions
+    monkeypatch.setattr(held_out_positions, "REFITTED_MAX", 0)
+    weighted = hold_out_positions(made).positions
+    for one, other in zip(refitted, weighted, strict=True):
+        # Some hundred effective draws either way: means to a few tenths of u, u to a quarter.
+        assert one.predicted == pytest.approx(other.predicted, abs=0.3 * one.u)
+        assert one.u == pytest.approx(other.u, rel=0.25)
+
+
+def test_many_positions_are_thinned_in_words(monkeypatch):
+    monkeypatch.setattr(held_out_positions, "POSITIONS_MAX", 4)
+    found = hold_out_positions(drawn(11, runs(2), backlash=AxisPrior(0.0, 0.1)).campaign)
+    assert len({p.position for p in found.positions}) == 4 and "evenly" in found.warnings[0]

@@ -63,6 +63,19 @@ def axis_held(folder: Path) -> dict[str, Any]:
     return {**document, "positions": len(rows.positions), "warnings": axis_warnings(data, rows)}
 
 
+def classic(folder: Path, as_json: bool) -> None:
+    """The least-squares line with one reversal, and ISO 230-2."""
+    from tvsbayes.report.axis_text import classic_text
+    from tvsbayes.results.records import plain
+    from tvsbayes.single_axis.axis_campaign import read_axis
+    from tvsbayes.single_axis.axis_rows import rows_of
+    from tvsbayes.single_axis.classic_line import classic_axis
+
+    data = read_axis(folder)
+    found = classic_axis(rows_of(data))
+    finish({"unit": data.unit, **plain(found)}, classic_text(found, data.unit), as_json)
+
+
 def fit(
     folder: Path,
     *,

@@ -47,6 +47,9 @@ def _warn_of(campaign: Campaign) -> None:
 
 def classic(campaign: CampaignFolder, as_json: Json = False) -> None:
     """The paper's four-point estimator. Mean, sd, type A and GUM uncertainty per direction."""
+    if axis_commands.is_axis(campaign):
+        axis_commands.classic(campaign, as_json)
+        return
     from tvsbayes.estimators.four_point import classic as estimate
     from tvsbayes.instrument.campaign import read_campaign
     from tvsbayes.report.fit_text import classic_text

@@ -68,6 +68,18 @@ def iso230_table(classic: ClassicAxis, unit: str) -> TableView | None:
     return TableView(caption, ["", "value"], rows)
 
 
+def classic_text(classic: ClassicAxis, unit: str) -> str:
+    """The classic of an axis in words."""
+    lines = [f"{concise(classic.per_command, classic.u_per_command)} {escaped(unit)} per command"]
+    if classic.backlash is not None and classic.u_backlash is not None:
+        lines.append(f"backlash {concise(classic.backlash, classic.u_backlash)} {escaped(unit)}")
+    lines.append(
+        f"scatter about the line {two_digits(classic.residual_sd)} {escaped(unit)}; stops taken as independent"
+    )
+    table = iso230_table(classic, unit)
+    return "\n".join(lines) + ("" if table is None else f"\n\n{table.text()}")
+
+
 def _lines(title: str, texts: Sequence[str]) -> list[str]:
     return [f"{title}: {text}" for text in texts]
 

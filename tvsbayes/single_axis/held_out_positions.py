@@ -14,12 +14,16 @@ from tvsbayes.single_axis.axis_fit import model_of
 from tvsbayes.single_axis.axis_mode import find_mode
 from tvsbayes.single_axis.axis_model import AxisModel
 from tvsbayes.single_axis.axis_rows import DIRECTIONS, AxisRows
-from tvsbayes.single_axis.axis_sampling import WeightedSample, weighted_sample
+from tvsbayes.single_axis.axis_sampling import PARETO_K_MAX, WeightedSample, weighted_sample
 from tvsbayes.single_axis.classic_line import fit_line, line_design
+from tvsbayes.statistics.weighted_draws import effective_draws, smoothed_weights
 
 EFFECTIVE, DRAWS = 600.0, 300
 """Effective draws of every fit without a position, and draws that foretell."""
-POSITIONS_MIN = 3
+POSITIONS_MIN, POSITIONS_MAX = 3, 200
+REFITTED_MAX, WEIGHED, WEIGHED_MIN = 30, 400, 80
+"""Positions up to which each has a fit of its own; beyond, draws of one fit are weighted, as long as so many of them
+count. `POSITIONS_MAX` are foretold at most."""
 INSIDE = 1.959963984540054
 """Standard uncertainties to either side of a 95 % interval."""
 
@@ -91,10 +95,43 @@ def classic_prediction(rows: AxisRows, left_out: np.ndarray, members: np.ndarray
     return float(at @ line.solved), float(np.sqrt(variance))
 
 
-def _foretold(model: AxisModel, w: np.ndarray, left: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Mean and covariance of the rows left out, over the draws: shapes (rows,) and (rows, rows)."""
+@dataclass(frozen=True)
+class _Foretold:
+    """Of the rows left out: mean (rows,), covariance (rows, rows), and what is wrong with them, or ""."""
+
+    mean: np.ndarray
+    covariance: np.ndarray
+    fault: str
+
+
+def _mixture(means: np.ndarray, covariances: np.ndarray, weights: np.ndarray, fault: str = "") -> _Foretold:
+    """Of normal distributions (n, rows), (n, rows, rows) by weights (n,)."""
+    mean = weights @ means
+    off = means - mean
+    within = np.einsum("n,nij->ij", weights, covariances)
+    return _Foretold(mean, within + np.einsum("n,ni,nj->ij", weights, off, off), fault)
+
+
+def _reweighted(model: AxisModel, w: np.ndarray, left: np.ndarray) -> _Foretold | None:
+    """By draws (n, d) of the posterior of all rows, weighted by what each makes of those left out.
+
+    None where the weights cannot be trusted. Leave-one-out by importance (Vehtari, Gelman and Gabry, Stat. Comput. 27
+    (2017) 1413), whole positions left out.
+    """
     means, covariances = model.left_out(w, left)
-    return means.mean(axis=0), covariances.mean(axis=0) + np.atleast_2d(np.cov(means.T, bias=True))
+    off = model.rows.value[left] - means
+    _, log_det = np.linalg.slogdet(covariances)
+    square = np.einsum("ni,ni->n", off, np.linalg.solve(covariances, off[..., None])[..., 0])
+    smooth = smoothed_weights(0.5 * (log_det + square))
+    if not smooth.pareto_k < PARETO_K_MAX or effective_draws(smooth.weights) < WEIGHED_MIN:
+        return None
+    return _mixture(means, covariances, smooth.weights)
+
+
+def _refitted(model: AxisModel, out: np.ndarray, seed: int) -> _Foretold:
+    """By a fit of the rows that are not left out."""
+    w, fault = _fitted_without(model, out, seed)
+    return _mixture(*model.left_out(w, np.flatnonzero(out)), np.full(len(w), 1 / len(w)), fault)
 
 
 def hold_out_positions(campaign: AxisCampaign, seed: int = 0, progress: Show | None = None) -> AxisHoldOut:
@@ -121,6 +158,10 @@ def hold_out_positions(campaign: AxisCampaign, seed: int = 0, progress: Show | N
         )
     found: list[HeldOutPosition] = []
     warnings = []
+    if len(positions) > POSITIONS_MAX:
+        warnings.append(f"of {len(positions)} positions {POSITIONS_MAX} are left out in turn, evenly chosen")
+        positions = positions[np.linspace(0, len(positions) - 1, POSITIONS_MAX).astype(int)]
+    drawn = None
     with Job({"hold-out": 1.0}, progress) as job:
         for number, position in enumerate(positions):
             job.at(number / len(positions), f"position {position:g}")
@@ -128,12 +169,14 @@ def hold_out_positions(campaign: AxisCampaign, seed: int = 0, progress: Show | N
             if len(np.unique(rows.command[~out])) < 2 or (~out).sum() < 3:
                 warnings.append(f"position {position:g}: too few readings elsewhere to foretell it")
                 continue
-            w, fault = _fitted_without(model, out, seed + number)
-            if fault:
-                warnings.append(f"position {position:g}: {fault}")
-            left = np.flatnonzero(out)
-            mean, covariance = _foretold(model, w, left)
-            found += _scored(rows, position, left, mean, covariance)
+            left, foretold = np.flatnonzero(out), None
+            if len(positions) > REFITTED_MAX:
+                drawn = _whole_draws(model, seed) if drawn is None else drawn
+                foretold = _reweighted(model, drawn, left)
+            foretold = foretold or _refitted(model, out, seed + number)
+            if foretold.fault:
+                warnings.append(f"position {position:g}: {foretold.fault}")
+            found += _scored(rows, position, left, foretold.mean, foretold.covariance)
     return AxisHoldOut(
         "positions",
         tuple(found),
@@ -142,6 +185,12 @@ def hold_out_positions(campaign: AxisCampaign, seed: int = 0, progress: Show | N
         sum(p.inside for p in found) / max(sum(p.rows for p in found), 1),
         tuple(warnings),
     )
+
+
+def _whole_draws(model: AxisModel, seed: int) -> np.ndarray:
+    """Coordinates (`WEIGHED`, d) of the scales by all rows."""
+    rng = np.random.default_rng([seed, 8])
+    return weighted_sample(model.log_density, find_mode(model), rng, EFFECTIVE).equal(WEIGHED, rng)
 
 
 def _rms(z: list[float]) -> float:
