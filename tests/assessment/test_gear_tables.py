@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from support.bent_rig import BENT, twin_points, twin_ray
+from support.small_campaign import small_campaign
 
+from tvsbayes.assessment.fitted_calibration import calibration_of_draws
 from tvsbayes.assessment.gear_tables import Process, conditional, drawn_gears
-from tvsbayes.calibration.gear_table import GEAR_INPUTS
+from tvsbayes.calibration.optics import GEAR_INPUTS
+from tvsbayes.calibration.pointing import NOISE_NAMES, Calibration
 from tvsbayes.instrument.parameters import INDEX, NAMES, RIG_PRIORS
 from tvsbayes.model.gear_processes import GearScales, place_root
+from tvsbayes.twin.gear_errors import AxisErrors, matern_waves
 
 AGREEMENT = 1e-8
 """Relative to the sd: a Cholesky factor and a solution of normal equations of condition 1e6."""
@@ -46,13 +52,13 @@ def test_a_table_is_the_process_given_its_places(wave):
     np.testing.assert_allclose(factor.T @ factor, left, atol=0.05 * AGREEMENT)
 
 
-def fitted(steps: dict[str, list[float]], scales: dict[str, float]):
+def fitted(steps: dict[str, list[float]], scales: dict[str, float], ratios: dict[str, float] = RATIO):
     """What `drawn_gears` reads of a fit: padded places, their prior's factor, the mode."""
     counters = np.array([*steps["pan"], *steps["tilt"], 0.0, 0.0])
     on_tilt = np.array([*(False for _ in steps["pan"]), *(True for _ in steps["tilt"]), False, False])
     valid = np.arange(len(counters)) < len(counters) - 2
     mode = np.array([RIG_PRIORS[name].value if name in RIG_PRIORS else 0.0 for name in NAMES])
-    for axis, ratio in RATIO.items():
+    for axis, ratio in ratios.items():
         mode[INDEX[f"degrees_per_step.{axis}"]] = ratio
         for block, value in scales.items():
             mode[INDEX[f"{block}.{axis}"]] = value
@@ -65,7 +71,7 @@ def fitted(steps: dict[str, list[float]], scales: dict[str, float]):
         np.zeros((2, 3)),
         np.full((2, 3), 2 * np.pi),
     )
-    angle = np.radians(counters * np.where(on_tilt, RATIO["tilt"], RATIO["pan"]))
+    angle = np.radians(counters * np.where(on_tilt, ratios["tilt"], ratios["pan"]))
     root = np.asarray(place_root(shape, angle, on_tilt, valid, np))
     places = SimpleNamespace(steps=counters, on_tilt=on_tilt, valid=valid)
     fit = SimpleNamespace(
@@ -135,3 +141,71 @@ def test_every_draw_has_scales_of_its_own():
 def test_gears_that_do_not_vary_have_no_table():
     found = drawn_gears(SimpleNamespace(), np.zeros((7, len(NAMES))), np.zeros((7, 0)), 0)
     assert found.table.size == 0 and found.expected.shape == found.left_open.shape == (7, 0)
+
+
+TWINS, TWIN_DRAWS = 30, 200
+POSES = {"seen": (77.0, 90.0), "between": (40.0, 45.0), "outside": (-500.0, -260.0), "beyond": (-900.0, 30.0)}
+"""Counters (pan, tilt): places of `STEPS`, between them, half a table beyond, and beyond the table."""
+READINGS_DEG = {"seen": 80.0, "between": 80.0, "outside": 95.0, "beyond": 110.0}
+
+
+TRUE = {**BENT, "degrees_per_step.pan": 0.06, "degrees_per_step.tilt": 0.07}
+RATIOS = {axis: TRUE[f"degrees_per_step.{axis}"] for axis in ("pan", "tilt")}
+
+
+def twin_gears(number: int) -> list[AxisErrors]:
+    """Errors of pan and tilt as the twin draws them."""
+    rng = np.random.default_rng([7, number])
+    sds = SCALES["transmission_error_deg"], SCALES["play_variation_deg"]
+    length = SCALES["transmission_error_length_deg"]
+    return [AxisErrors(*(matern_waves(sd, length, rng) for sd in sds)) for _ in RATIOS]
+
+
+def calibrated(gears: list[AxisErrors], seed: int) -> Calibration:
+    """A calibration that knows the true rig but for errors of its gears away from the places."""
+    fit, mode, _ = fitted(STEPS, SCALES, RATIOS)
+    for name, value in {**TRUE, **dict.fromkeys(NOISE_NAMES, 1e-9)}.items():
+        mode[INDEX[name]] = value
+    angles = [np.array(STEPS[axis]) * ratio for axis, ratio in RATIOS.items()]
+    known = [
+        np.concatenate([*(getattr(one, kind)(at) for one, at in zip(gears, angles, strict=True)), np.zeros(2)])
+        for kind in ("error_deg", "play_deg")
+    ]
+    tiled = np.tile(mode, (TWIN_DRAWS, 1))
+    drawn = drawn_gears(fit, tiled, np.tile(np.radians(np.concatenate(known)), (TWIN_DRAWS, 1)), seed)
+    found = calibration_of_draws(NAMES, tiled, small_campaign(), "posterior", 0, drawn)
+    return replace(found, range_steps=np.array([[-200.0, 210.0], [-90.0, 140.0]]), azimuth=False, period_deg={})
+
+
+def true_point(gears: list[AxisErrors], steps: tuple[float, float], reading_deg: float) -> np.ndarray:
+    """Where the twin's beam, reached from left and up, meets the aperture's reading."""
+    moved = []
+    for one, n, ratio in zip(gears, steps, RATIOS.values(), strict=True):
+        angle = np.array([n * ratio])
+        moved.append(n + float(one.error_deg(angle)[0] - 0.5 * one.play_deg(angle)[0]) / ratio)
+    origin, direction = twin_ray(TRUE, moved, ("left", "up"))
+    true_deg = reading_deg - TRUE["aperture_zero_deg"]
+    return twin_points(origin[None], direction[None], TRUE["baseline_mm"], true_deg, False)[0]
+
+
+def test_located_points_of_twins_whose_gears_err():
+    """Points where the twin's beam truly is, as near as the calibration says; wider where nobody looked, and told so.
+
+    The twin draws errors by waves and has mirrors and a meeting of beam and reading of its own.
+    """
+    scores: dict[str, list[np.ndarray]] = {name: [] for name in POSES}
+    widths: dict[str, list[np.ndarray]] = {name: [] for name in POSES}
+    for number in range(TWINS):
+        gears = twin_gears(number)
+        found = calibrated(gears, number)
+        for name, steps in POSES.items():
+            told = found.locate(*steps, READINGS_DEG[name])
+            assert told.extrapolated is (name in ("outside", "beyond"))
+            off = true_point(gears, steps, READINGS_DEG[name]) - told.xyz_mm
+            scores[name].append(off / np.sqrt(np.diag(told.covariance_mm2)))
+            widths[name].append(found.beam_u95_deg(steps, (1.0, 1.0)))
+    seen, between, outside, _ = (np.mean(widths[name], axis=0) for name in POSES)
+    assert np.all(seen < 0.2 * between) and np.all(between < 0.5 * outside)
+    # Two angles err of each of 30 twins: RMS z to 9 %, and to a few more for the twin's sums of waves.
+    for name in ("between", "outside", "beyond"):
+        assert 0.7 < np.sqrt(np.mean(np.square(scores[name]))) < 1.35, name

@@ -80,6 +80,29 @@ def test_locate_one_point(ask, folder):
     assert ask("locate", folder, *POINT)[1] == document
 
 
+def test_counters_that_no_look_reached_are_told(ask, folder, tmp_path, capsys):
+    """In JSON, in the text, of one point, of many, and of the counters for a target."""
+    (low, high), _ = load_calibration(folder).range_steps.astype(int).tolist()
+    far = ("--pan-steps", high + 1, "--tilt-steps", 20, "--aperture-deg", 70)
+    assert ask("locate", folder, *POINT)[1]["extrapolated"] is False
+    assert ask("locate", folder, *far)[1]["extrapolated"] is True
+    rows = ["tilt_steps,pan_steps,aperture_deg,pan_approach,tilt_approach"]
+    rows += [f"20,{n},{deg},left,up" for n in (low - 1, low, high) for deg in (70, 175)]
+    points = tmp_path / "points.csv"
+    points.write_text("\n".join(rows) + "\n")
+    entries = ask("locate", folder, "--points", points)[1]["points"]
+    assert [entry["extrapolated"] for entry in entries] == [True, True, False, False, False, False]
+    assert "refused" in entries[1] and entries[0]["xyz_mm"]
+    for direction, told in ((0.0, False), (-40.0, True)):
+        asked = ("steps-for", folder, "--azimuth-deg", direction, "--elevation-deg", 1.0)
+        assert ask(*asked)[1]["extrapolated"] is told
+        assert run([*map(str, asked)]) == 0
+        assert ("EXTRAPOLATED" in capsys.readouterr().out) is told
+    for options, told in ((POINT, 0), (far, 2)):
+        assert run([*map(str, ("locate", folder, *options))]) == 0
+        assert capsys.readouterr().out.count("EXTRAPOLATED") == told
+
+
 def test_sides_differ_by_the_backlash(ask, folder):
     left = ask("locate", folder, *POINT)[1]["linear"]["xyz_mm"]
     right = ask("locate", folder, *POINT, "--pan-approach", "right")[1]["linear"]["xyz_mm"]
