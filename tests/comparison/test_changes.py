@@ -6,6 +6,7 @@ import datetime
 import json
 from dataclasses import replace
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -41,7 +42,12 @@ def test_what_both_hold_fixed_is_compared_as_stated(mixed_fit):
         stated[row], u[row], kind[row] = value, 0.0, 0
         with jax.enable_x64(True):
             space = replace(mixed_fit.space, value=jnp.asarray(stated), u=jnp.asarray(u), kind=jnp.asarray(kind))
-        fits.append(replace(mixed_fit, space=space))
+        physical = [np.array(part.physical) for part in (mixed_fit.mode, mixed_fit.draws)]
+        for values in physical:
+            values[..., row] = value
+        mode = eqx.tree_at(lambda d: d.physical, mixed_fit.mode, physical[0])
+        draws = eqx.tree_at(lambda d: d.physical, mixed_fit.draws, physical[1])
+        fits.append(replace(mixed_fit, space=space, mode=mode, draws=draws))
     same, other = (compare(fits[0], second).changes[-1] for second in fits[1:])
     assert (same.normalised, same.significant) == (None, False)
     assert (other.normalised, other.significant) == (None, True)

@@ -56,7 +56,7 @@ def test_terms_add_up_to_the_gap(paper_fit, paper_gaps):
 
 def test_terms_of_a_posterior_add_up_to_the_ratio_of_all_its_draws(paper_fit):
     """64 of 2048 draws carry the terms; the ratio's mean over all of them is a control variate."""
-    chains = jax.tree.map(lambda x: x.reshape(2, -1, *x.shape[1:]), paper_fit.draws)
+    chains = jax.tree.map(lambda x: x.reshape(2, len(x) // 2, *x.shape[1:]), paper_fit.draws)
     z = paper_fit.draws_z.reshape(2, -1, paper_fit.draws_z.shape[1])
     weights = np.full(z.shape[:2], 1 / len(paper_fit.draws_z))
     posterior = Posterior(paper_fit, z, np.zeros(z.shape[:2]), chains, weights, None, 0, 0.0)

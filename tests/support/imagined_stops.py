@@ -5,10 +5,9 @@ from __future__ import annotations
 from dataclasses import replace
 from types import SimpleNamespace
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from support.known_calibration import known_calibration
+from support.partial_arrays import no_gears
 from support.small_campaign import small_campaign
 
 from tvsbayes.calibration.pointing import INPUT_NAMES
@@ -32,8 +31,7 @@ def linearised(residual: np.ndarray, slope: np.ndarray, angles: np.ndarray) -> L
         "mirror_angles_rad": angles,
     }
     arrays |= {name: np.zeros((spots, *shape)) for name, shape in shapes.items()}
-    with jax.enable_x64(True):
-        return Linearised(**{name: jnp.asarray(array) for name, array in arrays.items()})
+    return Linearised(**arrays)
 
 
 def stops_of(offsets_deg: np.ndarray, looks: int = 2, noise: float = 0.0) -> SimpleNamespace:
@@ -66,9 +64,12 @@ def stops_of(offsets_deg: np.ndarray, looks: int = 2, noise: float = 0.0) -> Sim
     campaign = replace(small_campaign(), moves=tuple(moves), spots=tuple(spots))
     return SimpleNamespace(
         names=INPUT_NAMES,
-        mode=SimpleNamespace(physical=calibration.mean),
+        mode=SimpleNamespace(physical=calibration.mean, place_errors_rad=np.zeros(0)),
         campaign=campaign,
+        information=SimpleNamespace(place_mean=np.zeros(0)),
         linearised=linearised(residual, slope, angles),
-        arrays=SimpleNamespace(spots=SimpleNamespace(valid=(np.arange(len(rows)) > 0).astype(float))),
+        arrays=SimpleNamespace(
+            spots=SimpleNamespace(valid=(np.arange(len(rows)) > 0).astype(float)), gears=no_gears(len(rows))
+        ),
         reference_pose_rad=np.zeros(2),
     )

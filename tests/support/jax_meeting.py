@@ -15,8 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from tvsbayes.calibration.optics import ROUNDING
 from tvsbayes.calibration.drawn_looks import Drawn
+from tvsbayes.calibration.optics import ROUNDING
 from tvsbayes.calibration.pointing import INPUT_NAMES, NOISE_NAMES, NOISES, Calibration
 from tvsbayes.coordinates.location import Settings
 from tvsbayes.instrument.axes import AXES, FULL_TURN_DEG

@@ -2,20 +2,27 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from support.partial_arrays import partial_arrays
 from support.small_campaign import small_campaign
 
 from tvsbayes.calibration.pointing import INPUT_NAMES
+from tvsbayes.estimators.campaign_arrays import SpotArrays
 from tvsbayes.estimators.joint_fit import JointFit
-from tvsbayes.estimators.linear_spots import StopGroup, StopInformation
-from tvsbayes.instrument.parameters import HARMONIC_NAMES, INDEX, NAMES, RIG_NAMES
+from tvsbayes.estimators.linear_spots import Linearised, StopGroup, StopInformation
+from tvsbayes.instrument.parameters import GEAR_ERROR_NAMES, HARMONIC_NAMES, INDEX, NAMES, RIG_NAMES
+from tvsbayes.model.compiled import placed
 from tvsbayes.model.parameter_space import parameter_space
 
-ROWS, STATES = 160, 12
+SPOTS = 40
+ROWS, STATES = 4 * SPOTS, 12
+REDRAWN = (0, 7, 14, 21, 28, 35), (0, 4, 11, 18, 25, 32)
+"""Spots at which the stop error of pan, of tilt is drawn anew."""
 
 
 def linear_problem(stereo: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
@@ -28,12 +35,53 @@ def linear_problem(stereo: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
     # What the cameras do looks like what the rig does: no data tell one from the other.
     mix = rng.normal(size=(len(RIG_NAMES), len(NAMES) - len(RIG_NAMES)))
     jacobian[:, len(RIG_NAMES) :] = 0.02 * stereo * jacobian[:, : len(RIG_NAMES)] @ mix
-    # Fixed in the rig, which has no transmission error.
-    jacobian[:, [INDEX[name] for name in HARMONIC_NAMES]] = 0.0
-    load = np.zeros((ROWS, STATES))
-    for state in range(STATES):
-        load[13 * state : 13 * state + 20, state] = 2.0 * rng.normal(size=len(load[13 * state : 13 * state + 20]))
-    return jacobian, load
+    # Fixed in the rig, which has no transmission error; scales of errors move no spot.
+    jacobian[:, [INDEX[name] for name in (*HARMONIC_NAMES, *GEAR_ERROR_NAMES)]] = 0.0
+    load = np.zeros((SPOTS, 4, STATES))
+    starts = [(begin, end) for spots in REDRAWN for begin, end in pairwise((*spots, SPOTS))]
+    for state, (begin, end) in enumerate(starts):
+        load[begin:end, :, state] = 2.0 * rng.normal(size=(end - begin, 4))
+    return jacobian, load.reshape(ROWS, STATES)
+
+
+def linearised(jacobian: np.ndarray, load: np.ndarray) -> Linearised:
+    """The campaign of a linear problem; states are stop errors of unit variance, those of pan first."""
+    half = STATES // 2
+    slope = np.stack([load[:, :half].sum(axis=1), load[:, half:].sum(axis=1)], axis=1)
+    shapes = {"play_sd_rad": (2,), "mirror_angles_rad": (2,), "predicted": (5,), "drift_variance": (2,)}
+    shapes |= {"residual": (4,), "place_columns": (4, 0), "predicted_jacobian": (5, len(NAMES))}
+    arrays = {name: np.zeros((SPOTS, *shape)) for name, shape in shapes.items()}
+    return Linearised(
+        z=np.zeros(len(NAMES)),
+        slope=slope.reshape(SPOTS, 4, 2),
+        stop_variance=np.ones((SPOTS, 2)),
+        place_root=np.zeros((0, 0)),
+        residual_jacobian=-jacobian.reshape(SPOTS, 4, -1),
+        **arrays,
+    )
+
+
+def spot_arrays(readings: bool) -> SpotArrays:
+    """Its spots, in one segment; one has a reading, if any has."""
+    size = SPOTS + 1
+    redraw = np.zeros((size, 2), bool)
+    for axis, spots in enumerate(REDRAWN):
+        redraw[list(spots), axis] = True
+    aperture = np.zeros(size)
+    # A spot of the padding does not count.
+    aperture[[1, -1]] = readings, 1.0
+    shapes = {"pixels": (4,), "whitening": (4, 4), "aperture_rad": (), "triangulated_mm": (3,), "weight": ()}
+    shapes |= {"redraw_mix": (2, 2), "hours": ()}
+    with jax.enable_x64(True):
+        return SpotArrays(
+            move_index=placed(np.zeros(size, np.int32)),
+            has_aperture=placed(aperture),
+            valid=placed((np.arange(size) < SPOTS).astype(float)),
+            redraw=placed(redraw),
+            new_segment=placed(np.arange(size) == 0),
+            homed=placed(np.zeros(size, bool)),
+            **{name: placed(np.zeros((size, *shape))) for name, shape in shapes.items()},
+        )
 
 
 def fit_of(jacobian: np.ndarray, load: np.ndarray, rig, readings: bool = False) -> JointFit:
@@ -45,13 +93,13 @@ def fit_of(jacobian: np.ndarray, load: np.ndarray, rig, readings: bool = False) 
     fit = object.__new__(JointFit)
     with jax.enable_x64(True):
         space = jax.tree.map(jnp.asarray, parameter_space(rig.table, rig.stereo))
-    seen = np.array([True, True, False])
-    # A spot of the padding does not count.
-    aperture = np.array([False, readings, True])
     physical = np.full((50, len(NAMES)), 0.5) + 1e-3 * np.random.default_rng(3).normal(size=(50, len(NAMES)))
     values = {
         "information": StopInformation(groups, jacobian.T @ gain, *without_places(jacobian.shape[1])),
-        "arrays": SimpleNamespace(spots=SimpleNamespace(has_aperture=aperture, valid=seen)),
+        "linearised": linearised(jacobian, load),
+        "arrays": partial_arrays(spots=spot_arrays(readings)),
+        "held": np.zeros(0, int),
+        "draws_places": np.zeros((2048, 0)),
         "space": space,
         "z": 0.1 * np.random.default_rng(4).normal(size=len(NAMES)),
         "draws": SimpleNamespace(physical=physical, place_errors_rad=np.zeros((len(physical), 0))),

@@ -5,11 +5,10 @@ from __future__ import annotations
 from types import SimpleNamespace
 
 import numpy as np
+from support.partial_arrays import no_gears, partial_arrays
 
-from tvsbayes.estimators.campaign_arrays import CampaignArrays, GearArrays
+from tvsbayes.estimators.campaign_arrays import CampaignArrays
 from tvsbayes.instrument.parameters import INDEX, NAMES, PERIODS_MAX
-from tvsbayes.model.compiled import placed
-from tvsbayes.model.gear_processes import Places
 from tvsbayes.posterior.transport import GEAR_SCALES, STRETCH_NODES, Transport
 
 RATIO, BACKLASH = INDEX["degrees_per_step.pan"], INDEX["backlash_deg.pan"]
@@ -51,10 +50,7 @@ def fit() -> SimpleNamespace:
 
 def no_places() -> CampaignArrays:
     """Of a campaign's arrays what a posterior reads besides its density: gears that do not vary."""
-    found, none = object.__new__(CampaignArrays), placed(np.zeros((0, 0)))
-    nowhere = Places(placed(np.zeros(0)), *2 * [placed(np.zeros(0, dtype=bool))])
-    object.__setattr__(found, "gears", GearArrays(nowhere, none, none))
-    return found
+    return partial_arrays(gears=no_gears(0))
 
 
 def autoregressive(steps: int, walkers: int, memory: float) -> np.ndarray:

@@ -83,7 +83,7 @@ def explain_gap(found: JointFit, posterior: Posterior | None = None, draws: int 
     except NothingToEstimate:
         return result
     chosen = _chosen_draws(found, posterior, draws)
-    idealised = _idealised(found, selection, chosen.z)
+    idealised = _idealised(found, selection, chosen)
     # An experiment whose spots lie on one another, or beyond the lens model, has no ratio.
     sound = np.all([np.isfinite(r).all(axis=0) for r in idealised.classic], axis=0)
     for k, direction in enumerate(DIRECTIONS):
@@ -99,12 +99,14 @@ class _Chosen:
 
     Attributes:
         z: coordinates (n, p); of the Laplace approximation the mode, then draws.
+        place_errors_rad: what the gears repeat, shape (n, e).
         mode_first: so it is; else the estimate is the mean of the draws.
         ratios: effective ratios of all draws, shape (N, 4), deg/step.
         weights: of all draws, sum 1, shape (N,).
     """
 
     z: np.ndarray
+    place_errors_rad: np.ndarray
     mode_first: bool
     ratios: np.ndarray
     weights: np.ndarray
@@ -113,10 +115,12 @@ class _Chosen:
 def _chosen_draws(found: JointFit, posterior: Posterior | None, draws: int) -> _Chosen:
     if posterior is None:
         z = np.vstack([found.z, found.draws_z[:draws]])
+        errors_rad = np.vstack([found.mode.place_errors_rad, found.draws.place_errors_rad[:draws]])
         ratios = np.asarray(found.draws.effective_deg_per_step)
-        return _Chosen(z, True, ratios, np.full(len(ratios), 1 / len(ratios)))
+        return _Chosen(z, errors_rad, True, ratios, np.full(len(ratios), 1 / len(ratios)))
+    errors_rad = np.asarray(posterior.thinned(draws).place_errors_rad)
     ratios = np.asarray(posterior.joined.effective_deg_per_step)
-    return _Chosen(posterior.coordinates(draws), False, ratios, posterior.weights.ravel())
+    return _Chosen(posterior.coordinates(draws), errors_rad, False, ratios, posterior.weights.ravel())
 
 
 @dataclass(frozen=True)
@@ -135,22 +139,26 @@ class _Idealised:
     ideal: np.ndarray
 
 
-def _idealised(found: JointFit, selection: Selection, z: np.ndarray) -> _Idealised:
-    from tvsbayes.posterior.draws import local_deg_per_step
-    from tvsbayes.posterior.predictive import looks
+def _idealised(found: JointFit, selection: Selection, chosen: _Chosen) -> _Idealised:
+    from tvsbayes.posterior.draws import derived_of
+    from tvsbayes.posterior.predictive import looks, repeated_rad
+
+    z, errors_rad = chosen.z, chosen.place_errors_rad
+    # Without play there is none that varies.
+    straight_rad = np.where(np.arange(errors_rad.shape[1]) < errors_rad.shape[1] // 2, errors_rad, 0.0)
 
     spaces = [found.space]
     for names in (("backlash_deg.pan", "backlash_deg.tilt"), ("focal_scale",), OPTICS):
         spaces.append(_ideal(spaces[-1], names))
     full, ideal = (
-        local_deg_per_step(replace(found, space=space), z, found.reference_pose_rad)
+        np.asarray(derived_of(replace(found, space=space), z[None], errors_rad[None]).effective_deg_per_step)[0]
         for space in (spaces[0], spaces[-1])
     )
     rows = experiment_rows(found.campaign, selection)
-    quiet = np.zeros((len(z), len(found.arrays.spots.valid), 2))
     ratios = []
     for space in spaces:
-        pixels = looks(replace(found, space=space), z, quiet)[:, rows]
+        repeated = repeated_rad(found, errors_rad if space is spaces[0] else straight_rad)
+        pixels = looks(replace(found, space=space), z, repeated)[:, rows]
         ratios.append(four_point_ratios(pixels, selection.steps, selection.axis, found.campaign.stereo))
     return _Idealised(tuple(ratios), full, ideal)
 

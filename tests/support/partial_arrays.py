@@ -1,0 +1,25 @@
+"""Of a campaign's arrays only what a test needs."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from tvsbayes.estimators.campaign_arrays import CampaignArrays, GearArrays
+from tvsbayes.model.compiled import placed
+from tvsbayes.model.gear_processes import Places
+
+
+def partial_arrays(**parts: Any) -> CampaignArrays:
+    """A campaign of which nothing but these parts is there."""
+    found = object.__new__(CampaignArrays)
+    for name, part in parts.items():
+        object.__setattr__(found, name, part)
+    return found
+
+
+def no_gears(spots: int) -> GearArrays:
+    """Gears that repeat no error."""
+    none = placed(np.zeros((spots, 0)))
+    return GearArrays(Places(placed(np.zeros(0)), *2 * [placed(np.zeros(0, bool))]), none, none)
