@@ -18,6 +18,7 @@ from tvsbayes.errors import NothingToEstimate
 from tvsbayes.estimators.four_point import ClassicResult, classic
 from tvsbayes.instrument.axes import AXES, SIDES
 from tvsbayes.instrument.campaign import Campaign
+from tvsbayes.twin.gear_errors import PERFECT
 from tvsbayes.twin.physics import aperture_angle_deg, mirror_chain, to_tvs
 from tvsbayes.twin.true_rig import Truth
 
@@ -62,7 +63,10 @@ class TrueLooks:
         p, angles, names = self.truth.parameters, [], []
         for k, axis in enumerate(AXES):
             names.append(SIDES[axis][int(signs[k] > 0)])
-            rest = p[f"degrees_per_step.{axis}"] * counters[k] - 0.5 * signs[k] * p[f"backlash_deg.{axis}"]
+            place = np.array([p[f"degrees_per_step.{axis}"] * counters[k]])
+            repeated = (self.truth.gear_errors or PERFECT)[axis]
+            play_deg = repeated.play_at(p[f"backlash_deg.{axis}"], place)[0]
+            rest = place[0] + repeated.error_deg(place)[0] - 0.5 * signs[k] * play_deg
             angles.append(rest + self.generator.standard_normal() * p[f"stop_sd_deg.{names[k]}"])
         origin, direction = mirror_chain(np.radians(angles[0]), np.radians(angles[1] + p["tilt_zero_deg"]), p)
         point = to_tvs(origin + reach * direction, p["baseline_mm"], p["pan_zero_emission_deg"])

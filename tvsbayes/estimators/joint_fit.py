@@ -283,7 +283,9 @@ def _by_homing(found: JointFit, problem: Problem, axes: tuple[str, ...], seed: i
 
 def _fit_under(found: JointFit, problem: Problem, sides: Mapping[str, str], seed: int) -> JointFit:
     """The fit if the axes came home in these ways, from the mode of another."""
-    own = Problem(homed(found.campaign, sides), problem.table, np.asarray(found.arrays.spots.valid)[: len(problem.spots)] > 0)
+    own = Problem(
+        homed(found.campaign, sides), problem.table, np.asarray(found.arrays.spots.valid)[: len(problem.spots)] > 0
+    )
     own.arrays = eqx.tree_at(lambda a: a.spots.weight, own.arrays, problem.arrays.spots.weight)
     z = own.alternate(found.z.copy())
     mode = newton_mode(own.negative_log_density, z, own.free, own.curvature(z))

@@ -26,12 +26,14 @@ class ModelChoice:
         harmonics: free the transmission error of every axis with a stated period, N(0, 0.1 deg) each, where
             `[rig.prior]` says nothing else; a harmonic stated as exactly 0 counts as nothing said.
         no_backlash: gears without play, both backlashes fixed at 0.
+        perfect_gears: gears that repeat no error, do not drift and have the same play everywhere.
     """
 
     robust: bool = False
     per_axis: bool = False
     harmonics: bool = False
     no_backlash: bool = False
+    perfect_gears: bool = False
 
     def table(self, stated: RigTable) -> RigTable:
         """The rig with the priors of the gears that are chosen.
@@ -44,6 +46,14 @@ class ModelChoice:
             changed |= dict.fromkeys(names_of("ratio_contrast_deg_per_step"), Prior(0.0, 0.0))
         if self.no_backlash:
             changed |= dict.fromkeys(names_of("backlash_deg"), Prior(0.0, 0.0, "half-normal"))
+        if self.no_backlash or self.perfect_gears:
+            changed |= dict.fromkeys(names_of("play_variation_deg"), Prior(0.0, 0.0, "half-normal"))
+        if self.perfect_gears:
+            repeated = names_of("transmission_error_deg", "drift_deg_per_root_hour", "harmonic_amplitude_deg")
+            changed |= dict.fromkeys(repeated, Prior(0.0, 0.0, "half-normal"))
+            # A length of nothing is not estimated.
+            for name in names_of("transmission_error_length_deg"):
+                changed[name] = Prior(stated.priors[name].value, 0.0, "log-normal")
         if self.harmonics:
             if not stated.harmonic_period_deg:
                 raise InputError(
