@@ -41,7 +41,7 @@ from experiments.common.rigs import mounted_rig, unseen
 from experiments.common.rows import output, read_rows, run_rows
 from experiments.paper.table1 import paper_values
 from experiments.paper.two_machines import HOME_SIDES, RIGS, classic_readings, plan_of, solved
-from tvsbayes.estimators.joint_fit import JointFit, fit
+from tvsbayes.estimators.joint_fit import fit
 from tvsbayes.files.disk import shipped_data
 from tvsbayes.instrument.axes import AXES, DIRECTIONS
 from tvsbayes.instrument.campaign import Campaign

@@ -146,8 +146,9 @@ class JointFit:
             self.covariance,
             self.log_density,
             np.stack([np.asarray(self.space.value), np.asarray(self.space.u)]),
-            *(np.asarray(x)[:count] for x in (self.arrays.spots.valid, self.arrays.spots.weight)),
-            tuple(self.sides.get(axis, "") for axis in AXES),
+            valid=np.asarray(self.arrays.spots.valid)[:count],
+            weight=np.asarray(self.arrays.spots.weight)[:count],
+            sides=tuple(self.sides.get(axis, "") for axis in AXES),
         )
 
     @property
@@ -328,7 +329,7 @@ def restored(campaign: Campaign, stored: StoredMode, seed: int = 0) -> JointFit 
     table = replace(campaign.rig, priors=priors_used(campaign.rig.priors, *stored.prior))
     valid = stored.valid > 0
     with jax.enable_x64(True):
-        sides = {axis: side for axis, side in zip(AXES, stored.sides, strict=True) if side}
+        sides: dict[str, str] = {axis: side for axis, side in zip(AXES, stored.sides, strict=True) if side}
         problem = Problem(homed(campaign, sides), table, valid)
         weight = np.array(problem.arrays.spots.weight)
         weight[: len(valid)] = stored.weight
@@ -351,7 +352,8 @@ def with_places(z: np.ndarray, covariance: np.ndarray, information: StopInformat
     At the noise scales of the mode the errors follow the coordinates linearly.
 
     Args:
-        z, covariance: of the coordinates.
+        z: the mode of the coordinates, shape (p,).
+        covariance: theirs, shape (p, p).
         information: of the stops there.
     """
     slope, own = information.place_slope, covariance

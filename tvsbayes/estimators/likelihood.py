@@ -162,7 +162,7 @@ def standing(model: Model, arrays: CampaignArrays, inflation: Float[Array | np.n
         spot_residuals(looks, noise, model, spots),
         angles.play_sd_rad[spots.move_index],
         stop_variances(model.noise.stop_sd_rad, spots),
-        drift_variances(model.gears.drift_rad_per_root_hour, spots),
+        drift_variances(jnp.asarray(model.gears.drift_rad_per_root_hour), spots),
     )
 
 
@@ -186,7 +186,7 @@ def root_at_places(model: Model, gears: GearArrays) -> Float[Array, "errors erro
     if not len(places.steps):
         return jnp.zeros((0, 0))
     angle_rad = places.steps * places.by_axis(model.transmission.ratio_rad_per_step)
-    return place_root(model.gears, angle_rad, places.on_tilt, places.valid)
+    return jnp.asarray(place_root(model.gears, angle_rad, places.on_tilt, places.valid))
 
 
 def filter_input(model: Model, arrays: CampaignArrays) -> FilterInput:

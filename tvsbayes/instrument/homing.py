@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import product
+from typing import Any
 
 from tvsbayes.instrument.axes import AXES, SENSES
 from tvsbayes.instrument.campaign import Campaign, Move
@@ -51,7 +52,7 @@ def homed(campaign: Campaign, sides: Sides) -> Campaign:
         return campaign
 
     def one(move: Move) -> Move:
-        first = {name: side for name, side in told.items() if getattr(move, name) == "unknown"}
+        first: dict[str, Any] = {name: side for name, side in told.items() if getattr(move, name) == "unknown"}
         return replace(move, **first) if first else move
 
     return replace(campaign, moves=tuple(map(one, campaign.moves)))

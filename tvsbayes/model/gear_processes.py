@@ -70,7 +70,8 @@ def place_root(
     Args:
         scales: of the processes, fields with any leading axes.
         angle_rad: k n of the places, shape (places,).
-        on_tilt, valid: as in `Places`.
+        on_tilt: as in `Places`.
+        valid: likewise.
         functions: jax.numpy or numpy.
 
     Returns:

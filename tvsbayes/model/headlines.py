@@ -62,7 +62,8 @@ class SeenLine(eqx.Module):
     Attributes:
         pose_rad: mean mirror angles (pan, tilt) over the looks used.
         places: counters.
-        share: of the value at each place in the slope of the least-squares line through the looks of its axis, steps^-1.
+        share: of the value at each place in the slope of the least-squares line through the looks of its axis,
+            steps^-1.
     """
 
     pose_rad: Float[Array | np.ndarray, "2"]

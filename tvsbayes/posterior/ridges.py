@@ -124,8 +124,9 @@ def whitening(fit: JointFit, whole: bool) -> Whitening:
 
 @dataclass(frozen=True)
 class Products:
-    """Of the columns J, G (coordinates y; states, then errors at places in rad) and the residual r, by the inverse
-    covariance of everything else: fields as in `Transport`.
+    """Of coordinates y (J), states with errors at places in rad (G) and the residual r; fields as in `Transport`.
+
+    By the inverse covariance of everything else.
     """
 
     known: np.ndarray

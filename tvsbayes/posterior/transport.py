@@ -77,22 +77,23 @@ class Mapped:
 class Transport:
     """The map w -> z; its Jacobian is |det root| exp(`Mapped.log_jacobian`).
 
-    With stop errors e of variance S, errors at places of covariance K and pixels in units of their noise, the linearised
-    residuals are r - J y - G e: the precision of y is then prior + J'J - J'G ((S, K)^-1 + G'G)^-1 G'J (Woodbury), at any
-    noise scales from the same products. Beyond `ridges.STATES_MAX` stop errors (m = 0 here) those stay in the covariance
-    by which the products are taken, and widths alone follow their scales, from a table.
+    With stop errors e of variance S, errors at places of covariance K and pixels in units of their noise, the
+    linearised residuals are r - J y - G e: the precision of y is then prior + J'J - J'G ((S, K)^-1 + G'G)^-1 G'J
+    (Woodbury), at any noise scales from the same products. Beyond `ridges.STATES_MAX` stop errors (m = 0 here) those
+    stay in the covariance by which the products are taken, and widths alone follow their scales, from a table.
 
     Attributes:
         mode: z at w = 0, shape (p,).
-        free: columns of z that are sampled, (d,): widest conditional sd first; with states, noise coordinates before all.
-        root: lower-triangular factor of their covariance in that order, shape (d, d); with states, of noise coordinates
-            and others apart, whose mean at other scales follows from r.
+        free: columns of z that are sampled, (d,): widest conditional sd first; with states, noise coordinates before
+            all others.
+        root: lower-triangular factor of their covariance in that order, shape (d, d); with states, of noise
+            coordinates and others apart, whose mean at other scales follows from r.
         noise: places in `free` of the noise coordinates, shape (q,).
         narrow: places in `free` that the shear moves, ascending, shape (k,).
         bend: its quadratic forms, nonzero only among places before the narrow one, shape (k, d, d).
         stretch: if m is 0, log of the factor on every place at `STRETCH_NODES` of each noise coordinate, (q, nodes, d).
-        slope: ln of the noise scales over those at the mode, by w of the noise coordinates, shape (q, q); of half-normal
-            scales, whose logarithm is no linear function, the step of z instead.
+        slope: ln of the noise scales over those at the mode, by w of the noise coordinates, shape (q, q); of
+            half-normal scales, whose logarithm is no linear function, the step of z instead.
         half: which noise scales are half-normal, shape (q,).
         pixels: 1 at the noise coordinate that scales all pixels, shape (q,).
         variance: of every stop error at the mode, by the noise coordinate that scales it, shape (m, q).
@@ -224,7 +225,7 @@ class Transport:
             amplitude_rad=np.radians(amplitude).reshape(-1, 2, PERIODS_MAX),
             period_rad=np.radians(np.broadcast_to(self.period_deg, (len(value), 2, PERIODS_MAX))),
         )
-        return place_root(scales, self.place_angle_rad, self.place_on_tilt, self.place_valid, np)
+        return np.asarray(place_root(scales, self.place_angle_rad, self.place_on_tilt, self.place_valid, np))
 
     def _quadratic(self, noise: np.ndarray) -> Quadratic:
         """What the linearised campaign and the prior say of y at noise coordinates (n, q)."""
