@@ -7,6 +7,7 @@ one column each stands for every counter there. NumPy.
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -15,7 +16,7 @@ import numpy as np
 
 from tvsbayes.calibration.optics import GEAR_INPUTS, Number
 from tvsbayes.instrument.axes import AXES
-from tvsbayes.instrument.places import interpolation
+from tvsbayes.instrument.places import NEAREST, interpolation
 
 COUNTERS_MAX = 64
 """Counters of a table, at most, by axis."""
@@ -71,6 +72,30 @@ class GearTable:
         found[~inside, -1] = 1.0
         return found.reshape(*np.shape(counters), -1)
 
+    def _near(self, axis: int, counter: float) -> tuple[slice, list[float]]:
+        """Columns of one error that have a share in its value at a counter, and their shares, as `shares` has them."""
+        nodes = self.steps[axis]
+        if not nodes[0] <= counter <= nodes[-1]:
+            return slice(len(nodes), len(nodes) + 1), [1.0]
+        begin = min(max(bisect_right(nodes, counter) - NEAREST // 2, 0), len(nodes) - NEAREST)
+        at, found = nodes[begin : begin + NEAREST], []
+        for k in range(NEAREST):
+            share = 1.0
+            for other in range(NEAREST):
+                if other != k:
+                    share *= (counter - at[other]) / (at[k] - at[other])
+            found.append(share)
+        return slice(begin, begin + NEAREST), found
+
+    def estimates_at(self, columns: np.ndarray, steps: tuple[float, float]) -> dict[str, float]:
+        """The same as `at` of one row of columns (size,) at one pair of counters, sooner: a robot asks often."""
+        found, places = {}, [self._near(axis, n) for axis, n in enumerate(steps)] if self.size else []
+        for name, part in self.parts.items():
+            chosen, share = places[_axis(name)]
+            values = columns[part.start + chosen.start : part.start + chosen.stop].tolist()
+            found[name] = sum(a * b for a, b in zip(values, share, strict=True))
+        return found
+
     def at(self, columns: np.ndarray, steps: tuple[Number, Number]) -> dict[str, np.ndarray]:
         """Errors at counters, by name of `inputs`.
 
@@ -88,19 +113,30 @@ class GearTable:
         """Covariance of other inputs and of the errors at the counters of looks.
 
         Args:
-            covariance: of the others and the columns, shape (..., others + size, others + size).
+            covariance: of the others and the columns, shape (..., others + size, others + size); two axes for arrays of
+                counters.
             steps: counters as for `at`.
 
         Returns:
             Shape (..., others + inputs, others + inputs), for arrays of counters with n before the last two.
         """
-        others = covariance.shape[-1] - self.size
-        shape = np.shape(steps[0])
-        share = np.zeros((*shape, others + len(self.inputs), covariance.shape[-1]))
-        share[..., np.arange(others), np.arange(others)] = 1.0
-        for row, (name, part) in enumerate(self.parts.items(), others):
-            share[..., row, others + part.start : others + part.stop] = self.shares(_axis(name), steps[_axis(name)])
-        return share @ covariance[(..., *(None for _ in shape), slice(None), slice(None))] @ np.swapaxes(share, -1, -2)
+        others, count, shape = covariance.shape[-1] - self.size, len(self.inputs), np.shape(steps[0])
+        share = np.zeros((*shape, count, self.size))
+        shares = [self.shares(axis, n) for axis, n in enumerate(steps)]
+        for row, (name, part) in enumerate(self.parts.items()):
+            share[..., row, part] = shares[_axis(name)]
+        rows = covariance[..., others:, :]
+        if shape:
+            # One product of matrices for all looks.
+            moved = (share.reshape(-1, self.size) @ rows).reshape(*shape, count, -1)
+        else:
+            moved = share @ rows
+        found = np.empty((*moved.shape[:-2], others + count, others + count))
+        found[..., :others, :others] = covariance[..., :others, :others]
+        found[..., others:, :others] = moved[..., :others]
+        found[..., :others, others:] = np.swapaxes(moved[..., :others], -1, -2)
+        found[..., others:, others:] = moved[..., others:] @ np.swapaxes(share, -1, -2)
+        return found
 
 
 NO_GEARS = GearTable()

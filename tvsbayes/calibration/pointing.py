@@ -137,8 +137,11 @@ class Calibration:
 
     def estimates_at(self, steps: Counters) -> dict[str, Any]:
         """Best estimates by name of `look_inputs`, floats, or for arrays of counters arrays of their shape."""
-        found = self.gears.at(self.mean[len(INPUT_NAMES) :], steps)
-        return self.estimates | {name: x if np.ndim(x) else float(x) for name, x in found.items()}
+        pan, tilt = steps
+        columns = self.mean[len(INPUT_NAMES) :]
+        if isinstance(pan, np.ndarray) or isinstance(tilt, np.ndarray):
+            return self.estimates | self.gears.at(columns, steps)
+        return self.estimates | self.gears.estimates_at(columns, (pan, tilt))
 
     @cached_property
     def _moved(self) -> _Moved:
@@ -335,8 +338,8 @@ class Calibration:
 
     def _moved_gears(self, steps: Counters) -> dict[str, np.ndarray]:
         """Moved errors of the gears at counters, numbers or arrays (n,); shape (look inputs + NOISES, ...)."""
-        found = self.gears.at(self.mean[len(INPUT_NAMES) :], steps)
-        return {name: np.add.outer(self._moved.gears[name], x) for name, x in found.items()}
+        found = self.estimates_at(steps) if self.gears.size else {}
+        return {name: np.add.outer(self._moved.gears[name], found[name]) for name in self.gears.inputs}
 
     def steps_for(
         self,
