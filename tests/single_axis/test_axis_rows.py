@@ -84,3 +84,11 @@ def test_rows_left_out_keep_times_and_stops():
     found = rows.without(out)
     for name in ("hours", "redrawn", "path", "side", "command", "value"):
         np.testing.assert_allclose(getattr(found, name), getattr(wanted, name), atol=1e-12, err_msg=name)
+
+
+def test_repeats_at_one_stop_share_its_error():
+    moves = [AxisMove(k, 0, 10.0 * k, c, "" if k else "forward") for k, c in enumerate((0.0, 0.0, 9.0, 9.0, 0.0))]
+    values = [0.1, 0.1, 1.0, 1.0, 0.1]
+    assert rows_of(campaign(moves, values, 0.01)).redrawn.tolist() == [True, False, True, False, True]
+    # Where nobody knows how well a reading is read, the scatter of stops covers it.
+    assert rows_of(campaign(moves, values)).redrawn.all()

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from experiments.common.rows import ROOT
 from experiments.robustness.faults import (
+    axis,
     certification,
     declaration,
     estimation,
@@ -26,6 +27,7 @@ FAULTS: tuple[Fault, ...] = (
     *certification.FAULTS,
     *planning.FAULTS,
     *instrument.FAULTS,
+    *axis.FAULTS,
 )
 
 

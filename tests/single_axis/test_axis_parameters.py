@@ -1,0 +1,38 @@
+"""Coordinates with standard normal priors: medians and tails of what they stand for."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tvsbayes.single_axis.axis_parameters import AxisCoordinates, AxisPrior, axis_priors, prior_sd
+
+
+def test_coordinates_have_the_quantiles_of_their_priors():
+    priors = axis_priors({"backlash": AxisPrior(0.1, 0.2)}, 40.0, 0.01)
+    found = AxisCoordinates.of(priors, frozenset({"home_sd"}))
+    assert "home_sd" not in found.names
+    # Median, and the 97.7 % point of a normal number.
+    values = found.values(np.array([[0.0] * len(found.names), [2.0] * len(found.names)]))
+    # A half-normal's: Phi^-1(0.75), and Phi^-1((1 + 0.97725) / 2).
+    np.testing.assert_allclose(values["transmission_error"], 0.08 * np.array([0.67449, 2.27760]), rtol=1e-4)
+    np.testing.assert_allclose(values["stop_sd.forward"], 0.02 * np.exp([0.0, 3.0]), rtol=1e-12)
+    np.testing.assert_allclose(values["backlash"], [0.1, 0.5], rtol=1e-12)
+    np.testing.assert_allclose(values["home_sd"], 0.04, rtol=1e-12)
+    assert found.coordinate("stop_sd.forward", 0.02 * np.exp(3.0)) == pytest.approx(2.0)
+
+
+def test_defaults_grow_with_the_travel():
+    small, large = axis_priors({}, 1.0, 0.5), axis_priors({}, 10.0, 0.5)
+    for name in small:
+        if name not in ("per_command", "reading_scale"):
+            grown = (large[name].value or large[name].u) / (small[name].value or small[name].u)
+            assert grown == pytest.approx(10.0), name
+    assert small["per_command"] == AxisPrior(0.5, 0.5)
+
+
+def test_sds_of_priors():
+    draws = np.random.default_rng(1).standard_normal(400_000)
+    # Sampling errors of 4e5 draws.
+    assert prior_sd("half-normal", AxisPrior(0.0, 2.0)) == pytest.approx(np.abs(2 * draws).std(), rel=0.01)
+    assert prior_sd("log-normal", AxisPrior(2.0, 0.5)) == pytest.approx((2 * np.exp(0.5 * draws)).std(), rel=0.02)
