@@ -12,7 +12,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import NotRequired, TypedDict, cast
+from typing import Any, NotRequired, TypedDict, cast
 
 import numpy as np
 
@@ -197,8 +197,9 @@ def calibration_header(calibration: Calibration) -> str:
 
 def _header_gears(calibration: Calibration) -> list[str]:
     """Counters seen, and the table of the gears' errors; of gears that do not vary a table of nought."""
-    lines, errors = [], _gear_errors(calibration)
-    none: _GearErrors = {
+    lines: list[str] = []
+    errors: Mapping[str, Mapping[str, Any]] = _gear_errors(calibration)
+    none: Mapping[str, Any] = {
         "steps": [0.0] * 4,
         **{name: [0.0] * 4 for name in _TABLED},
         **{f"beyond_{name}": 0.0 for name in _TABLED[1::2]},
