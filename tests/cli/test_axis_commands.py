@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import json
 
+import jsonschema
 import pytest
 from support.axes import campaign, drawn, runs
-from support.commands import ESTIMATE_KEYS, assert_error
+from support.commands import DATA, ESTIMATE_KEYS, assert_error
 
 from tvsbayes.single_axis.axis_campaign import write_axis
 from tvsbayes.single_axis.axis_parameters import AxisPrior
@@ -35,6 +36,10 @@ def test_fit_and_what_goes_on_from_it(ask, say, folder, tmp_path):
     assert {"per_command", "backlash", "transmission_error", "stop_sd.forward"} <= set(document["parameters"])
     kept = json.loads((folder / "results" / "fit.json").read_text())
     assert kept["per_command"] == document["per_command"] and set(kept["inputs"]) == {"moves", "readings", "axis"}
+
+    schema = json.loads((DATA / "schemas" / "axis-fit-1.schema.json").read_text())
+    jsonschema.validate(kept, schema)
+    assert set(kept) == set(schema["properties"])
 
     code, planned = ask("plan", "--given", folder, "-o", tmp_path / "plan.csv", "--minutes", "1")
     assert code == 0 and planned["next"] and planned["next"][0]["actions"][-1] == "read"
