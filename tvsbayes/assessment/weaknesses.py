@@ -9,10 +9,12 @@ import numpy as np
 
 from tvsbayes.estimators.joint_fit import JointFit, with_places
 from tvsbayes.estimators.linear_spots import standard_deviations_without
-from tvsbayes.instrument.axes import AXES, DIRECTIONS, SENSES
+from tvsbayes.instrument.axes import AXES, DIRECTIONS, SENSES, Axis
 from tvsbayes.instrument.campaign import ordered_spots
 from tvsbayes.instrument.parameters import INDEX, NAMES, NOISE_NAMES, STEREO_PARAMETER_NAMES
+from tvsbayes.instrument.places import FEW_COUNTERS, LEAST_ERROR_RAD, SPACING_DEG, too_few_counters
 from tvsbayes.instrument.stops import few_stops, inseparable, legs_of, observed_stops, one_sided, separation
+from tvsbayes.model.gear_kriging import KnownPlaces, scales_at
 from tvsbayes.results.estimates import Leverage, WeakDirection
 
 LEVERAGE_LIMIT = 2.0
@@ -53,6 +55,34 @@ def _backlash_direction(fit: JointFit, axis: str, direction: str) -> WeakDirecti
     return WeakDirection(text, {f"effective.{direction}": 1.0, f"backlash_deg.{axis}": correlation})
 
 
+def _counters_direction(fit: JointFit, axis: Axis) -> WeakDirection | None:
+    """Gear error and ratio of an axis seen at few counters, if the error halfway between them is the prior's."""
+    steps = {getattr(fit.campaign.moves[move], f"{axis}_steps") for move in _used_moves(fit)}
+    counters, count = sorted(steps), len(NAMES)
+    if not 2 <= len(counters) <= FEW_COUNTERS or not len(fit.information.place_mean):
+        return None
+    places = fit.arrays.gears.places
+    valid = np.asarray(places.valid)
+    physical = np.asarray(fit.mode.physical)
+    ratio = np.radians(physical[[INDEX[f"degrees_per_step.{a}"] for a in AXES]])
+    scales = scales_at(physical, np.asarray(fit.space.harmonic_period_deg))
+    known = KnownPlaces(np.asarray(places.steps)[valid], np.asarray(places.on_tilt)[valid], ratio, scales)
+    both = with_places(fit.z, fit.covariance, fit.information).covariance
+    own = count + np.flatnonzero(valid)
+    widest = int(np.argmax(np.diff(counters)))
+    at = known.between(np.array([counters[widest : widest + 2]]).mean(axis=1), AXES.index(axis))
+    share, rest = at.error[0], at.error_rest[0]
+    left, prior = share @ both[np.ix_(own, own)] @ share + rest**2, share @ share + rest**2
+    if left < WEAK_VARIANCE * prior or prior <= LEAST_ERROR_RAD**2:
+        return None
+    wanted = int(np.clip(np.ceil(np.ptp(counters) * abs(np.degrees(ratio[AXES.index(axis)])) / SPACING_DEG) + 1, 4, 7))
+    regular = np.linspace(counters[0], counters[-1], wanted).round().astype(int).tolist()
+    room = np.ptp(counters) / (wanted - 1) / 2
+    telling = [n for n in regular if np.abs(np.subtract(counters, n)).min() > room]
+    names = {f"effective.{SENSES[axis][0]}": 1.0, f"transmission_error_deg.{axis}": 1.0}
+    return WeakDirection(too_few_counters(axis, counters, telling), names)
+
+
 def weak_directions(fit: JointFit, moved: set[str]) -> tuple[WeakDirection, ...]:
     """Combinations of parameters that data and priors leave wide, in words: axes never moved, play, priors alone."""
     found = []
@@ -62,8 +92,8 @@ def weak_directions(fit: JointFit, moved: set[str]) -> tuple[WeakDirection, ...]
             found.append(WeakDirection(text, {f"degrees_per_step.{axis}": 1.0}))
             continue
         weak = _backlash_direction(fit, axis, pair[0] if pair[0] in moved else pair[1])
-        if weak is not None:
-            found.append(weak)
+        seen_at_few = _counters_direction(fit, axis)
+        found += [one for one in (weak, seen_at_few) if one is not None]
     noise = {*NOISE_NAMES, *STEREO_PARAMETER_NAMES}
     rows = np.array([i for i, name in enumerate(NAMES) if fit.free[i] and name not in noise])
     if rows.size == 0:

@@ -251,10 +251,13 @@ def compare(
             )
         axis_commands.compare(campaign, by=by, seed=seed or 0, as_json=as_json)
         return
+    if by not in (None, "steps", "regions", "positions"):
+        allowed = "steps, regions and positions"
+        raise InputError("usage", f"--by {escaped(by)}: allowed are {allowed}", remedy="choose one of them")
     if by == "positions":
-        raise InputError("usage", "--by positions is for axis folders", remedy="choose steps or regions")
-    if by not in (None, "steps", "regions"):
-        raise InputError("usage", f"--by {escaped(by)}: allowed are steps and regions", remedy="choose one of them")
+        refuse_options("for steps and regions: positions are foretold without draws", "leave it out", seed=seed)
+        _compare_positions(campaign, as_json)
+        return
     folders = [campaign] if other is None else [campaign, other]
     data = [read_campaign(folder) for folder in folders]
     results = output_place(campaign, "results")
@@ -277,6 +280,19 @@ def compare(
     if keep(document, path := results / "compare.json"):
         files, text = {"compare": str(path)}, f"{text}\nwritten: {path}"
     finish({**document, "files": files}, text, as_json)
+
+
+def _compare_positions(campaign: Path, as_json: bool) -> None:
+    """Every counter left out and foretold by the looks at all others."""
+    from tvsbayes.comparison.held_positions import hold_out_positions
+    from tvsbayes.instrument.campaign import read_campaign
+    from tvsbayes.report.command_text import positions_text
+
+    data = read_campaign(campaign)
+    with waiting() as progress, Job({FITTING: 1.0, HOLDING_OUT: 6.0}, progress) as job:
+        fitted = fit_for(data, report_line, job.part(FITTING))
+        found = hold_out_positions(fitted, progress=job.part(HOLDING_OUT))
+    finish({**found.as_json(), "files": {}}, positions_text(found), as_json)
 
 
 def _classic_against_joint(found: JointFit, by: str, seed: int, progress: Show | None) -> ComparisonRecord:

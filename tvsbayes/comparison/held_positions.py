@@ -1,6 +1,6 @@
 """Hold-out by position: every counter of an axis left out in turn with all its looks, fitted without, foretold.
 
-A rest's angle is foretold by all other looks: ratio and mirrors, and what the gears repeat at neighbouring counters. The
+A rest is foretold by all other looks: ratio and mirrors, and what the gears repeat at neighbouring counters. The
 looks left out are given angles of their own, free in the linear model about the mode that was found without them; what
 these add to the prediction, and how well they are known, is the deviation of the position and its u. Mirror angles in
 deg, counters in steps.

@@ -23,6 +23,8 @@ OWN_PLACES_MAX = 12
 SPACING_DEG, PLACES_MAX = 2.7, 24
 """... one on so many degrees of the output, but no more than this."""
 NEAREST = 4
+LEAST_ERROR_RAD = 1e-9
+"""Transmission errors below nobody measures: the floor of their covariance is not worth a word."""
 FEW_COUNTERS = 3
 """An axis seen at so many counters or fewer tells its transmission error and its ratio apart hardly or not at all."""
 

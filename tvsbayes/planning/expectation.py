@@ -131,14 +131,19 @@ def knowledge_of(result: JointFit, rig: Rig) -> Knowledge:
     """After a fit: its mode and Laplace covariance; sheets, limits and costs of the rig file."""
     of_data = replace(rig, table=result.campaign.rig, stereo=result.campaign.stereo)
     precision = np.linalg.inv(result.covariance)
-    return Knowledge(of_data, result.space, result.z, precision, True, taught=_taught(result))
+    return Knowledge(of_data, result.space, result.z, precision, True, taught=taught_errors(result, result.covariance))
 
 
-def _taught(result: JointFit) -> TaughtErrors | None:
-    """What a fit says of the errors at the places of its looks, padding left out."""
+def taught_errors(result: JointFit, covariance: np.ndarray) -> TaughtErrors | None:
+    """What a fit says of the errors at the places of its looks, padding left out; None of perfect gears.
+
+    Args:
+        result: the fit.
+        covariance: of the coordinates, shape (p, p), which the errors follow.
+    """
     if not len(result.information.place_mean):
         return None
-    both = with_places(result.z, result.covariance, result.information)
+    both = with_places(result.z, covariance, result.information)
     valid = np.asarray(result.arrays.gears.places.valid)
     rows = np.concatenate([np.ones(PARAMETERS, dtype=bool), valid, valid])
     return TaughtErrors(fit_places(result), both.covariance[np.ix_(rows, rows)])

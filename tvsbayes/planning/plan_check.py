@@ -17,7 +17,7 @@ from tvsbayes.instrument.axes import AXES, SENSES, Axis
 from tvsbayes.instrument.campaign import Move
 from tvsbayes.instrument.counter_limits import CounterLimits
 from tvsbayes.instrument.parameters import INDEX
-from tvsbayes.instrument.places import FEW_COUNTERS, too_few_counters
+from tvsbayes.instrument.places import FEW_COUNTERS, LEAST_ERROR_RAD, too_few_counters
 from tvsbayes.instrument.plan import PlanStep, described, run_plan, step_json
 from tvsbayes.instrument.rig import Rig
 from tvsbayes.instrument.stops import Stop, few_stops, inseparable, observed_stops, one_sided, separation
@@ -35,8 +35,6 @@ from tvsbayes.planning.search import Search
 from tvsbayes.progress import Job, Show
 from tvsbayes.results.estimates import CONTRACTION_LIMIT
 
-LEAST_ERROR_RAD = 1e-9
-"""Transmission errors below nobody measures: the floor of their covariance is not worth a word."""
 CURE_LOOKS = 24
 """Looks beyond which an addition is no small cure."""
 JUDGING, CURING = "judging the plan", "seeking a cure"

@@ -209,9 +209,9 @@ def sensitivity(
     # Per rad of both mirrors: what a stop error of sd 1 does.
     reached = [CALIBRATION_NOISE.index(f"stop_sd_deg.{name}") for name in goal.approach]
     by_angle = jacobian[:, count : count + 2] / np.radians(stop_sd[reached])
-    at = [gears.between(np.array([steps]), axis) for axis, steps in enumerate((goal.pan_steps, goal.tilt_steps))]
+    between = [gears.between(np.array([steps]), axis) for axis, steps in enumerate((goal.pan_steps, goal.tilt_steps))]
     side = [APPROACH_SIGN[name] for name in goal.approach]
-    turning = np.stack([np.append(one.error[0], -0.5 * s * one.play[0]) for one, s in zip(at, side, strict=True)])
-    rest = np.array([one.error_rest[0] ** 2 + 0.25 * one.play_rest[0] ** 2 for one in at])
+    turning = np.stack([np.append(one.error[0], -0.5 * s * one.play[0]) for one, s in zip(between, side, strict=True)])
+    rest = np.array([one.error_rest[0] ** 2 + 0.25 * one.play_rest[0] ** 2 for one in between])
     here[GEARS_AT_POINT] = by_angle**2 @ rest
     return Sensitivity(np.concatenate([gradient, by_angle @ turning], axis=1), here)

@@ -11,7 +11,7 @@ from tvsbayes.calibration.pointing import Steps
 from tvsbayes.errors import escaped
 from tvsbayes.report.result_tables import gap_table, hold_out_table, point_budget_table
 from tvsbayes.report.tables import TableView, concise, two_digits
-from tvsbayes.results.comparison_record import Comparison, Gap, HoldOut
+from tvsbayes.results.comparison_record import Comparison, Gap, HoldOut, PositionHoldOut
 from tvsbayes.statistics.chances import ASSURED, BOUND, LEVELS, binomial_bounds, rms_bounds
 
 if TYPE_CHECKING:
@@ -212,6 +212,18 @@ def hold_out_text(held: HoldOut) -> str:
     common = ", ".join(f"{d} {u:.1e}" for d, u in held.unseen.items())
     lines.append(f"not seen by any hold-out, common to all spots: u by stereo and focal scale, deg/step: {common}")
     return "\n".join(lines)
+
+
+def positions_text(found: PositionHoldOut) -> str:
+    """Counters left out, beside what was foretold of them."""
+    rows = []
+    for p in found.positions:
+        z = f"{(p.mean - p.predicted) / p.u:+.1f}"
+        rows.append([p.axis, str(p.position), p.direction, str(p.n), f"{p.mean:.4f}", concise(p.predicted, p.u), z])
+    caption = "counters left out and foretold, mirror angles in deg; z in stated uncertainties"
+    table = TableView(caption, ["axis", "counter", "direction", "n", "mean", "predicted(u)", "z"], rows).text()
+    told = [] if found.rms_z is None else [f"RMS z {found.rms_z:.2f}"]
+    return "\n".join([table, *told, *(f"warning: {text}" for text in found.warnings)])
 
 
 def changes_text(comparison: Comparison) -> str:

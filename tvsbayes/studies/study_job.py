@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from importlib.metadata import version
 
+import jax
 import numpy as np
 
 from tvsbayes.errors import InputError, NothingToEstimate, TvsError
@@ -23,10 +24,11 @@ from tvsbayes.instrument.parameters import BLOCKS, INDEX
 from tvsbayes.instrument.plan import PlanStep
 from tvsbayes.instrument.rig import Rig, rig_table_toml
 from tvsbayes.instrument.stereo_pair import stereo_bytes
-from tvsbayes.model.headlines import QUANTITIES, Derived, headlines
+from tvsbayes.model.headlines import QUANTITIES, Derived
 from tvsbayes.model.parameter_space import half_normal_sd, half_normal_slope
 from tvsbayes.planning.drawn_rigs import instruments_in
-from tvsbayes.planning.expectation import Knowledge, information_of, prior_knowledge
+from tvsbayes.planning.expectation import Knowledge, fit_places, information_of, prior_knowledge, taught_errors
+from tvsbayes.planning.gear_places import NO_PLACES, believed_scales
 from tvsbayes.planning.looks import covariance_of
 from tvsbayes.planning.target import Target, sensitivity
 from tvsbayes.posterior.draws import Posterior
@@ -116,17 +118,12 @@ def study_row(job: StudyJob, index: int) -> StudyRow:
             problems, found = posterior.convergence.missing, sampled_estimates(posterior)
     except TvsError as error:
         return replace(row, problems=(error.message,), seconds=time.perf_counter() - start)
-    try:
-        at = sensitivity(job.target, found.z, result.space, job.rig.table, result.reference_pose_rad)
-        value = at.value(found.covariance, job.target.factor)
-    except InputError:
-        value = None
     return replace(
         row,
         converged=not problems,
         problems=problems,
         headlines=_compared(job, result, found, run.truth),
-        target=value,
+        target=reported(job, result, found),
         seconds=time.perf_counter() - start,
     )
 
@@ -150,11 +147,32 @@ class Estimates:
     weights: np.ndarray
 
 
+def reported(job: StudyJob, result: JointFit, found: Estimates) -> float | None:
+    """The target's value by an estimator; None where no beam reaches its point."""
+    target = job.target
+    if target.point_mm is None:
+        return target.factor * float(spread(found)[list(target.indices)].max())
+    taught = taught_errors(result, found.covariance)
+    gears, covariance = (NO_PLACES, found.covariance) if taught is None else (taught.places, taught.covariance)
+    try:
+        at = sensitivity(target, found.z, result.space, job.rig.table, result.reference_pose_rad, gears)
+    except InputError:
+        return None
+    return at.value(covariance, target.factor)
+
+
+def spread(found: Estimates) -> np.ndarray:
+    """Sd of every headline, shape (9,)."""
+    return np.sqrt(found.weights @ (found.draws - weighted_mean(found.draws, found.weights)) ** 2)
+
+
 def laplace_estimates(result: JointFit) -> Estimates:
     """Of the mode and the approximation's draws."""
-    value = np.asarray(headlines(result.z, result.space, result.reference_pose_rad).value)
-    draws = _headline_draws(result.draws)
-    return Estimates(result.z, result.covariance, value, draws, np.full(len(draws), 1 / len(draws)))
+    mode, draws = (
+        _headline_draws(jax.tree.map(lambda part: np.asarray(part)[None], result.mode)),
+        _headline_draws(result.draws),
+    )
+    return Estimates(result.z, result.covariance, mode[0], draws, np.full(len(draws), 1 / len(draws)))
 
 
 def sampled_estimates(posterior: Posterior) -> Estimates:
@@ -167,15 +185,17 @@ def sampled_estimates(posterior: Posterior) -> Estimates:
 
 def _compared(job: StudyJob, result: JointFit, found: Estimates, true: Truth) -> dict[str, HeadlineRow]:
     """Every headline beside the truth, and beside what the planner predicts at that truth."""
-    knowledge, pose = prior_knowledge(job.rig), result.reference_pose_rad
-    instruments = instruments_in(knowledge, [true])
+    bare, pose = prior_knowledge(job.rig), result.reference_pose_rad
+    instruments = instruments_in(bare, [true])
     z, space = instruments.z[0], instruments.space_of(0)
+    # Ratios are the lines that the fit's are, over gears as good as the true ones.
+    knowledge = bare.with_places(replace(fit_places(result), scales=believed_scales(z, space, True)))
     information = information_of(job.steps, knowledge, aperture=job.aperture, z=z, space=space)
-    at_truth = headlines(z, space, pose)
+    at_truth = knowledge.gears.headlines(z, space, pose)
     predicted = predicted_sds(knowledge, information.fisher, np.asarray(at_truth.gradient), z)
     values = true_headlines(true, result.campaign, pose)
     low, high = weighted_quantiles(found.draws, found.weights, TAILS)
-    sd = np.sqrt(found.weights @ (found.draws - weighted_mean(found.draws, found.weights)) ** 2)
+    sd = spread(found)
     return {
         name: HeadlineRow(
             truth=float(values[k]),
@@ -197,15 +217,15 @@ def predicted_sds(knowledge: Knowledge, fisher: np.ndarray, gradient: np.ndarray
 
     Args:
         knowledge: before the plan.
-        fisher: information of the plan at the truth, shape (p, p).
-        gradient: d(quantity)/d(coordinates) there, shape (q, p).
+        fisher: information of the plan at the truth, shape (p + e, p + e).
+        gradient: d(quantity)/d(coordinates, errors of gears) there, shape (q, p + e).
         z: coordinates of the truth, shape (p,).
 
     Returns:
         Shape (q,).
     """
     slope = half_normal_slope(z[BACKLASH_COLUMNS])
-    scale, covariance = np.ones(len(z)), np.eye(len(z))
+    scale, covariance = np.ones(len(fisher)), np.eye(len(fisher))
     for _ in range(ITERATIONS):
         for column, at in zip(BACKLASH_COLUMNS, slope, strict=True):
             width = math.sqrt(covariance[column, column])
