@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 from support.bent_rig import calibration
 from support.bent_rig import calibration as bent_calibration
+from support.geared_rig import geared
 
+from tvsbayes.calibration.optics import GEAR_INPUTS
 from tvsbayes.calibration.pointing import INPUT_NAMES, NOISE_NAMES, Calibration
 from tvsbayes.coordinates.location import locate_linear, settings_of
 from tvsbayes.errors import InputError
@@ -110,6 +112,31 @@ def test_each_cause_of_a_budget_is_its_own_propagation(caused):
     np.testing.assert_allclose(found.variance_mm2[3], alone(nothing, settled, play=True), rtol=1e-6)
     readings = settled | {"aperture_sd_deg": rms["aperture_sd_deg"]}
     np.testing.assert_allclose(found.variance_mm2[4], alone(nothing, readings), rtol=1e-6)
+
+
+def test_budgets_of_gears_that_vary_have_their_rows():
+    """Causes and parameters add up at counters seen and beyond; u of the gears is the larger where nobody looked."""
+    one = geared(calibration(noise_spread=0.0))
+    count, variances = len(INPUT_NAMES), np.linalg.eigh(one.covariance)
+    root = variances.eigenvectors * np.sqrt(np.clip(variances.eigenvalues, 0.0, None))
+    weights = np.where(np.arange(len(one.mean)) < len(one.mean) // 2, 0.3, 0.7)
+    parts = np.stack([root * weights @ root.T, root * (1 - weights) @ root.T])
+    one = replace(one, causes=("pixel noise", "transmission error"), cause_covariance=parts)
+    known = []
+    for pan, reading in ((130.0, 60.0), (-780.0, 100.0)):
+        found = budget(one, pan, 90.0, reading, ("left", "up"))
+        law = one.locate(pan, 90.0, reading, ("left", "up")).covariance_mm2
+        np.testing.assert_allclose(found.variance_mm2.sum(axis=0), np.diag(law), rtol=1e-6)
+        assert found.causes[:2] == ("pixel noise", "transmission error")
+        assert found.parameters[count : count + 4] == GEAR_INPUTS
+        rebuilt = found.contribution_mm.T @ found.correlation @ found.contribution_mm
+        np.testing.assert_allclose(rebuilt, law, rtol=1e-6)
+        point = one.locate(pan, 90.0, reading).xyz_mm.tolist()
+        rows = {row.quantity: row for row in coordinate_budget(found, one, point, "y").rows}
+        row = rows["transmission_error_at_deg.pan"]
+        assert row.unit == "deg" and row.estimate == one.estimates_at((pan, 90.0))["transmission_error_at_deg.pan"]
+        known.append(row.u)
+    assert known[1] > 3 * known[0]
 
 
 def test_a_budget_needs_causes_and_a_point(caused):
