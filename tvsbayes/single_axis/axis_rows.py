@@ -213,7 +213,7 @@ def rows_of(campaign: AxisCampaign) -> AxisRows:
         )
     times_h = np.array([m.time_s for m in campaign.moves]) / HOUR_S
     rows = {int(move): row for row, move in enumerate(moves)}
-    return AxisRows(
+    rows_found = AxisRows(
         unit=campaign.unit,
         legs=legs,
         move=moves,
@@ -230,6 +230,7 @@ def rows_of(campaign: AxisCampaign) -> AxisRows:
         line=(float(line[0] - line[1] * command.mean()), float(line[1])),
         readings=tuple((r.reading, rows[r.move]) for r in used),
     )
+    return rows_found if legs_are_long(rows_found) else _line_with_play(rows_found)
 
 
 def _hours(times_h: np.ndarray, legs: Legs, moves: np.ndarray) -> np.ndarray:
@@ -352,3 +353,25 @@ def legs_are_long(rows: AxisRows) -> bool:
         # Arrived from one side alone: the backlash stays at its prior, and the offset takes it.
         return True
     return bool(least > LONG_LEGS * abs(reversal) + LONG_ERRORS * error)
+
+
+LINE_ROUNDS, LINE_PLAYS, LINE_PLAY_MAX = 3, 61, 0.5
+"""Rounds, and plays tried up to a share of the travel, for the line where stops may lie inside the play."""
+
+
+def _line_with_play(rows: AxisRows) -> AxisRows:
+    """The rows with the least-squares line that knows the play: which legs are lost is judged by its slope."""
+    slope = rows.line[1]
+    for _ in range(LINE_ROUNDS):
+        play = play_places(rows, np.linspace(0.0, LINE_PLAY_MAX * rows.travel, LINE_PLAYS))
+        best = None
+        for anchor, side in zip(play.anchor, play.side, strict=True):
+            design = np.column_stack([np.ones(len(anchor)), anchor, side])
+            solved = np.linalg.lstsq(design, rows.value, rcond=None)[0]
+            square = float(np.sum((rows.value - design @ solved) ** 2))
+            if best is None or square < best[0]:
+                best = square, solved
+        if best is None or not 0.5 < best[1][1] / slope < 2.0:
+            break
+        rows = replace(rows, line=(float(best[1][0]), float(best[1][1])))
+    return rows
