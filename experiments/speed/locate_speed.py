@@ -23,6 +23,7 @@ from experiments.common.command_line import print_only
 from experiments.common.rigs import twin_campaign
 from tvsbayes.assessment.fitted_calibration import calibration_of
 from tvsbayes.calibration.calibration_file import calibration_bytes, load_calibration
+from tvsbayes.calibration.optics import GEAR_INPUTS
 from tvsbayes.calibration.pointing import INPUT_NAMES, NOISE_NAMES
 from tvsbayes.coordinates.location import locate, locate_linear, settings_of
 from tvsbayes.estimators.joint_fit import fit
@@ -51,11 +52,15 @@ def peer(calibration, pan: float, tilt: float, reading: float, seed: int = 0) ->
     """Points (DRAWS, 3) of one setting by NumPy: the twin's optics, the cone solved as a quadratic."""
     generator = np.random.default_rng(seed)
     rows = np.linspace(0, len(calibration.inputs) - 1, DRAWS).astype(int)
-    p = dict(zip(INPUT_NAMES, calibration.inputs[rows].T, strict=True))
+    p = dict(zip(INPUT_NAMES, calibration.inputs[rows, : len(INPUT_NAMES)].T, strict=True))
+    gears = dict.fromkeys(GEAR_INPUTS, 0.0)
+    gears |= calibration.gears.at(calibration.inputs[rows, len(INPUT_NAMES) :], (pan, tilt))
     p |= dict(zip(NOISE_NAMES, calibration.noise[rows].T, strict=True))
     stop = generator.standard_normal((2, DRAWS))
     psi = p["degrees_per_step.pan"] * pan - 0.5 * p["backlash_deg.pan"] + stop[0] * p["stop_sd_deg.left"]
     beta = p["degrees_per_step.tilt"] * tilt - 0.5 * p["backlash_deg.tilt"] + stop[1] * p["stop_sd_deg.up"]
+    psi = psi + gears["transmission_error_at_deg.pan"] - 0.5 * gears["play_variation_at_deg.pan"]
+    beta = beta + gears["transmission_error_at_deg.tilt"] - 0.5 * gears["play_variation_at_deg.tilt"]
     out = []
     for k in range(DRAWS):
         # The twin's optics take one geometry at a time.
