@@ -111,7 +111,10 @@ def test_with_two_counters_the_ratio_is_the_secant_of_the_azimuth(line):
     ratio = float(line.model.transmission.ratio_rad_per_step[0])
     ends = [azimuth(line.model, ratio * n + e, line.pose_rad[1]) for n, e in ((-200, 2e-3), (300, -1e-3))]
     secant = (ends[1] - ends[0]) / 500
-    half = 0.5 * float(line.model.transmission.contrast_rad_per_step[0]) / ratio * secant
+    # A contrast is one of gears: the mirrors alone change it.
+    still = [azimuth(line.model, ratio * n, line.pose_rad[1]) for n in (-200, 300)]
+    mirrors = (still[1] - still[0]) / 500 / ratio
+    half = 0.5 * float(line.model.transmission.contrast_rad_per_step[0]) * mirrors
     assert half != 0
     np.testing.assert_allclose(found[:2], [secant + half, secant - half], rtol=1e-12)
     # One counter of tilt: no line.
