@@ -13,6 +13,7 @@ import numpy as np
 
 from tvsbayes.assessment.causes import PLAY_VARIATION, TRANSMISSION_ERROR, Causes, causes_of
 from tvsbayes.assessment.gear_tables import DrawnGears, drawn_gears
+from tvsbayes.assessment.summary import seen_range
 from tvsbayes.calibration.gear_table import NO_GEARS, GearTable
 from tvsbayes.calibration.optics import ERROR_AT, PLAY_AT
 from tvsbayes.calibration.pointing import INPUT_NAMES, NOISE_NAMES, Calibration
@@ -124,7 +125,14 @@ def calibration_of(fit: JointFit, posterior: Posterior | None = None, *, seed: i
     gears = drawn_gears(fit, physical, np.asarray(draws.place_errors_rad), seed, own_scales=own)
     found = calibration_of_draws(fit.names, physical, fit.campaign, estimator, seed, gears)
     causes = _with_left_open(causes_of(fit, gears.by_places), gears) if gears.table.size else causes_of(fit)
-    return replace(found, causes=causes.names, cause_covariance=causes.covariance)
+    # Looks that the fit left out reached nothing.
+    seen = seen_range(fit)
+    return replace(
+        found,
+        causes=causes.names,
+        cause_covariance=causes.covariance,
+        range_steps=np.array([seen[axis] for axis in AXES], dtype=float),
+    )
 
 
 def _with_left_open(causes: Causes, gears: DrawnGears) -> Causes:
