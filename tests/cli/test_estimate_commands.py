@@ -335,3 +335,17 @@ def test_a_report_for_a_browser_that_is_not_there_ends_at_once(ask, grid_folder,
     monkeypatch.setattr("tvsbayes.cli.estimate_commands.record_for", None)
     code, document = ask("report", grid_folder, "--pdf")
     assert (code, document["error"]["code"]) == (2, "no-browser")
+
+
+def test_counters_of_a_scanner_are_left_out_and_foretold(ask, say, grid_folder, monkeypatch):
+    """Three counters of pan; two of tilt are too few. No experiments are needed, nothing is kept."""
+    monkeypatch.setattr("tvsbayes.comparison.held_positions.refit", lambda fit_of_all, *_: fit_of_all)
+    code, document = ask("compare", grid_folder, "--by", "positions")
+    assert code == 0 and document["kind"] == "positions left out" and document["unit"] == "deg"
+    held = document["hold_out"]
+    assert {(p["axis"], p["position"]) for p in held["positions"]} == {("pan", 0), ("pan", 100), ("pan", 200)}
+    assert held["rms_z"] < 3 and held["warnings"] == ["tilt is seen at 2 counters: with one left out no line is left"]
+    code, text, _ = say("compare", grid_folder, "--by", "positions")
+    assert code == 0 and "RMS z" in text and "foretold" in text
+    code, refused = ask("compare", grid_folder, "--by", "weeks")
+    assert code == 2 and "positions" in json.dumps(refused)

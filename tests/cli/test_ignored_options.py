@@ -10,6 +10,7 @@ IGNORED = [
     ("report c --laboratory A --country MX", "--laboratory and --country are for a certificate"),
     ("report c --customer B", "--customer is for a certificate"),
     ("compare a b --by regions", "--by is for one campaign"),
+    ("compare c --by positions --seed 3", "--seed is for steps and regions"),
     ("compare a b --seed 3", "--seed is for one campaign"),
     ("compare a b --by steps --seed 0", "--by and --seed are for one campaign"),
     ("locate c --points p.csv --pan-approach right", "--pan-approach is for one point"),

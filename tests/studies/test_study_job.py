@@ -41,3 +41,25 @@ def test_estimates_of_a_posterior_go_by_its_weights():
     left, right, *_, pan_contrast, tilt_contrast, pan_play, tilt_play, _ = found.value
     assert (left, right, pan_contrast) == pytest.approx((0.0675, 0.06, 0.0075), rel=1e-12)
     assert (tilt_contrast, pan_play, tilt_play) == pytest.approx((0.0, 0.25, 0.0), rel=1e-12)
+
+
+def test_the_planner_predicts_what_a_fit_of_real_gears_reports(mounted_rig):
+    """Ratios, lines over the looks with the gears' errors: sds of a fit within 15 % of those foretold at its truth.
+
+    Stop errors are estimated from 40 stops a direction, to 11 % each.
+    """
+    from tvsbayes.instrument.axes import DIRECTIONS
+    from tvsbayes.instrument.protocols import grid_protocol
+    from tvsbayes.planning.target import parse_target
+    from tvsbayes.studies.study_job import StudyJob, study_row
+
+    assert mounted_rig.table.priors["transmission_error_deg.pan"].u > 0
+    plan = grid_protocol(targets=("d1", "d2"), pan_steps=(0, 60, 120, 180, 240), tilt_steps=(-80, -30, 30, 80))
+    target = parse_target("u(worst) <= 1e-3 deg/step")
+    row = study_row(StudyJob(mounted_rig, plan, target, seed=7, estimator="laplace"), 2)
+    assert row.converged
+    for direction in DIRECTIONS:
+        told = row.headlines[direction]
+        assert told.sd == pytest.approx(told.predicted_sd, rel=0.15)
+        assert abs(told.value - told.truth) < 4 * told.sd
+    assert row.target == pytest.approx(max(row.headlines[direction].sd for direction in DIRECTIONS))

@@ -93,9 +93,12 @@ def line_headlines(
         model = space.model(point[: len(NAMES)])
         mirrors = beam_angles(model.optics, seen.pose_rad[0], seen.pose_rad[1])
         slopes = line_deg_per_step(model, seen, root @ point[len(NAMES) :], mirrors)
-        lost = model.transmission.backlash_rad * DEGREES
+        gears = model.transmission
+        # By their own parameters: what priors hold fixed shall hang on nothing, not even by rounding.
+        contrast = gears.contrast_rad_per_step / gears.ratio_rad_per_step * (slopes[::2] + slopes[1::2]) / 2
+        lost = gears.backlash_rad * DEGREES
         offset = mirrors.effective_mirror_offset_mm[None]
-        return jnp.concatenate([slopes, slopes[::2] - slopes[1::2], lost, offset])
+        return jnp.concatenate([slopes, contrast, lost, offset])
 
     point = jnp.concatenate([z, jnp.zeros(len(root))])
     return Headlines(values(point), jax.jacfwd(values)(point))
