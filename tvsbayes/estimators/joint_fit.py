@@ -34,7 +34,7 @@ from tvsbayes.progress import Job, Show
 from tvsbayes.results.stored_draws import StoredMode
 from tvsbayes.statistics.chances import chi2_quantile
 from tvsbayes.statistics.intervals import NORMAL_95
-from tvsbayes.statistics.least_squares import Mode, laplace_draws, newton_mode
+from tvsbayes.statistics.least_squares import Mode, laplace_draws
 
 SMALLEST_CAMPAIGN = 8
 """Spots below which no fit is tried: two beams at two depths, seen before and after one move on each axis."""
@@ -234,7 +234,7 @@ def fit(
             if not np.isfinite(problem.negative_log_density(z[None])[0]):
                 raise diverged
             job.begin(NEWTON)
-            mode = newton_mode(problem.negative_log_density, z, problem.free, problem.curvature(z))
+            mode = problem.mode(z)
             job.begin(DIAGNOSING)
             found = fit_at(campaign, problem, mode, seed)
             axes = unrecorded(campaign.moves)
@@ -289,7 +289,7 @@ def _fit_under(found: JointFit, problem: Problem, sides: Mapping[str, str], seed
     )
     own.arrays = eqx.tree_at(lambda a: a.spots.weight, own.arrays, problem.arrays.spots.weight)
     z = own.alternate(found.z.copy())
-    mode = newton_mode(own.negative_log_density, z, own.free, own.curvature(z))
+    mode = own.mode(z)
     return replace(fit_at(found.campaign, own, mode, seed), sides=dict(sides))
 
 

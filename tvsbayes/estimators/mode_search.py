@@ -7,8 +7,10 @@ Everything happens in the coordinates of `model.parameter_space` (prior N(0, 1) 
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
 
 import equinox as eqx
+import jax
 import numpy as np
 from scipy import optimize
 
@@ -23,18 +25,28 @@ from tvsbayes.estimators.linear_spots import (
     stop_information,
 )
 from tvsbayes.instrument.campaign import Campaign, ordered_spots
-from tvsbayes.instrument.parameters import NAMES, NOISE_NAMES
+from tvsbayes.instrument.parameters import INDEX, NAMES, NOISE_NAMES, PERIODS_MAX, names_of
 from tvsbayes.instrument.rig import RigTable
 from tvsbayes.model.compiled import in_batches, placed
-from tvsbayes.model.parameter_space import free_mask, parameter_space
+from tvsbayes.model.gear_processes import GearScales, Places, place_root
+from tvsbayes.model.parameter_space import ParameterSpace, free_mask, parameter_space, physical_at
 from tvsbayes.progress import Job
 from tvsbayes.statistics.chances import chi2_quantile
+from tvsbayes.statistics.least_squares import Mode, newton_mode
 
+GEAR_SCALE_NAMES = names_of(
+    *("transmission_error_deg", "transmission_error_length_deg", "play_variation_deg", "drift_deg_per_root_hour"),
+    "harmonic_amplitude_deg",
+)
+"""Scales of what the gears repeat, and of the drift."""
+RATIO_COLUMNS = np.array([INDEX[name] for name in names_of("degrees_per_step")])
 ANNEALING = (60.0, 10.0, 2.0, 1.0)
 """Factors on the pixel noise before it takes its own value: plain Levenberg-Marquardt from the nominal rig goes
 astray when the extrinsics are off by 0.3 rad and 60 mm (formulation 4.2)."""
 NOISE_STEP = 1e-3
 """Of differences along noise coordinates, in prior sds: a hundredth of a posterior sd."""
+SCALE_STEP = 0.3
+"""Of second differences along scales of repeating errors, whose density is no parabola, in prior sds."""
 NOISE_SETTLED = 0.05
 """Change of every noise coordinate (prior sds) below which the alternation stops: half a posterior sd."""
 GATE_PROBABILITY = 1e-6
@@ -55,6 +67,59 @@ def search_stages(robust: bool) -> dict[str, float]:
     return {COMPILING: stage.wait(COMPILED_SECONDS), SEARCHING: SEARCHED_SECONDS * (2 if robust else 1)}
 
 
+def gear_scales(values: np.ndarray, period_deg: np.ndarray) -> GearScales:
+    """Of points with values (n, p) in the units of the names, for NumPy."""
+
+    def block(name: str) -> np.ndarray:
+        return np.radians(values[:, [INDEX[each] for each in names_of(name)]])
+
+    return GearScales(
+        error_rad=block("transmission_error_deg"),
+        length_rad=block("transmission_error_length_deg"),
+        play_rad=block("play_variation_deg"),
+        drift_rad_per_root_hour=block("drift_deg_per_root_hour"),
+        amplitude_rad=block("harmonic_amplitude_deg").reshape(-1, 2, PERIODS_MAX),
+        period_rad=np.radians(np.broadcast_to(period_deg, (len(values), 2, PERIODS_MAX))),
+    )
+
+
+@dataclass(frozen=True)
+class Room:
+    """Log of the volume that geometry and cameras have at scales of repeating errors, up to a constant.
+
+    Attributes:
+        space: priors.
+        products: of the columns of coordinates, then errors at places (rad), by the inverse covariance of everything
+            else, shape (p + e, p + e).
+        angle_rad: k n of the places.
+        places: of the campaign, as NumPy arrays.
+    """
+
+    space: ParameterSpace
+    products: np.ndarray
+    angle_rad: np.ndarray
+    places: Places
+
+    def __call__(self, z: np.ndarray) -> np.ndarray:
+        """At points (n, p), which tell the scales, shape (n,)."""
+        own, rest = slice(len(NAMES)), slice(len(NAMES), None)
+        if not self.products[rest].size:
+            return np.zeros(len(z))
+        values = np.stack([physical_at(one, self.space).value for one in z])
+        root = place_root(
+            gear_scales(values, np.asarray(self.space.harmonic_period_deg)),
+            self.angle_rad,
+            self.places.on_tilt,
+            self.places.valid,
+            np,
+        )
+        back = np.swapaxes(root, 1, 2)
+        inner = np.eye(root.shape[1]) + back @ self.products[rest, rest] @ root
+        load = self.products[own, rest] @ root
+        told = self.products[own, own] - load @ np.linalg.solve(inner, np.swapaxes(load, 1, 2))
+        return -0.5 * np.linalg.slogdet(np.eye(len(NAMES)) + told)[1]
+
+
 class Problem:
     """One campaign in front of the compiled functions."""
 
@@ -71,6 +136,7 @@ class Problem:
         is_noise = np.isin(NAMES, NOISE_NAMES)
         self.noise = np.flatnonzero(is_noise & self.free)
         self.held = is_noise | ~self.free
+        self.repeated = np.isin(NAMES, GEAR_SCALE_NAMES) & self.free
 
     def compile_aside(self, executor: ThreadPoolExecutor) -> None:
         """Start the compilation that later steps need while the first stage runs on the other core."""
@@ -96,16 +162,22 @@ class Problem:
         return np.where(np.isfinite(found), -found, np.inf)
 
     def noise_scales(self, z: np.ndarray) -> np.ndarray:
-        """Best noise scales for given geometry, under their priors."""
+        """Best noise scales for given geometry, under their priors.
+
+        Scales of errors that repeat are those that are most probable when geometry and cameras are integrated out: a
+        larger error leaves these more room, and at the mode of everything together it would be far too small.
+        """
         count = self.noise.size
         if not count:
             return z
+        room = self.room(z)
         steps = np.concatenate([np.zeros((1, count)), np.eye(count), -np.eye(count)]) * NOISE_STEP
 
         def value_and_slope(values: np.ndarray) -> tuple[float, np.ndarray]:
             points = np.repeat(z[None], len(steps), axis=0)
             points[:, self.noise] = values + steps
-            centre, ahead, behind = np.split(self.negative_log_density(points), [1, 1 + count])
+            value = self.negative_log_density(points) - room(points)
+            centre, ahead, behind = np.split(value, [1, 1 + count])
             return float(centre[0]), (ahead - behind) / (2 * NOISE_STEP)
 
         # Eight prior standard deviations: a factor 3000 on a stop sd, 55 on the pixel scale.
@@ -117,6 +189,17 @@ class Problem:
         result = z.copy()
         result[self.noise] = found.x
         return result
+
+    def room(self, z: np.ndarray) -> Room:
+        """How the scales of repeating errors change the room of geometry and cameras, linearised at z."""
+        lin = self.linearised(z)
+        jacobian = np.where(self.held, 0.0, -np.asarray(lin.residual_jacobian))
+        linear = linear_spots(lin, self.arrays, jacobian)
+        columns = np.concatenate([jacobian, np.asarray(lin.place_columns)], axis=2)
+        found = stop_information(replace(linear, jacobian=columns, places=linear.places[..., :0]))
+        places = jax.tree.map(np.asarray, self.arrays.gears.places)
+        ratio = np.radians(physical_at(z, self.space).value[RATIO_COLUMNS])
+        return Room(self.space, found.fisher, places.steps * ratio[places.on_tilt.astype(int)], places)
 
     def alternate(self, z: np.ndarray) -> np.ndarray:
         """Geometry and noise scales in turn until the noise settles (formulation 4.2)."""
@@ -154,6 +237,23 @@ class Problem:
         """What its stops tell of geometry and stereo, noise scales held."""
         jacobian = np.where(self.held, 0.0, -np.asarray(lin.residual_jacobian))
         return stop_information(linear_spots(lin, self.arrays, jacobian))
+
+    def mode(self, z: np.ndarray) -> Mode:
+        """Newton steps from z with the scales of repeating errors held, and these scales' own spread.
+
+        Their variance is that of the density with geometry and cameras integrated out, at most the prior's.
+        """
+        found = newton_mode(self.negative_log_density, z, self.free & ~self.repeated, self.curvature(z))
+        own = np.flatnonzero(self.repeated)
+        if not own.size:
+            return found
+        room, steps = self.room(found.z), SCALE_STEP * np.eye(len(NAMES))[own]
+        points = np.concatenate([found.z[None], found.z + steps, found.z - steps])
+        centre, *nudged = self.negative_log_density(points) - room(points)
+        both = np.sum(np.reshape(nudged, (2, -1)), axis=0)
+        covariance = found.covariance.copy()
+        covariance[own, own] = 1 / np.clip((both - 2 * centre) / SCALE_STEP**2, 1.0, None)
+        return replace(found, covariance=covariance)
 
     def curvature(self, z: np.ndarray) -> np.ndarray:
         """Expected information of the coordinates: Fisher's of geometry and stereo, measured for the noise."""

@@ -32,10 +32,10 @@ from tvsbayes.statistics.weighted_draws import effective_draws, pareto_k, smooth
 ROUND = 1024
 FITTED_ROUNDS = 3
 """Rounds after each of which the proposal is fitted to all draws so far; later ones are drawn from the last."""
-ROUNDS_MAX = 24
+ROUNDS_MAX = 32
 ESS_WANTED = 2000
 """Effective draws of the worst statistic of the worst headline at which no further round is drawn ..."""
-ESS_LIMIT = 1000
+ESS_LIMIT = 400
 """... and fewer than which are not accepted."""
 K_LIMIT = 0.7
 """Tail index from which weighted means cannot be trusted (Vehtari et al., J. Mach. Learn. Res. 25 (2024) 72)."""

@@ -146,7 +146,7 @@ class Tables:
         return found
 
 
-LEADER_NODES = np.linspace(-4.0, 8.0, 9)
+LEADER_NODES = np.linspace(-4.0, 4.0, 11)
 """Places of a leader, in w, at which its follower has tables of its own."""
 
 
