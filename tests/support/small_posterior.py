@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from support.varying_gears import perfect_rig
 
 from tvsbayes.estimators.joint_fit import JointFit, fit
 from tvsbayes.instrument.protocols import four_point_protocol
@@ -28,7 +29,7 @@ def small_fit() -> tuple[JointFit, Transport]:
 
     With the 21 of the cameras the pairs of second differences would be three times as many.
     """
-    rig = read_rig(Path(__file__).resolve().parents[2] / "data" / "rigs" / "mounted" / "rig.toml")
+    rig = perfect_rig(read_rig(Path(__file__).resolve().parents[2] / "data" / "rigs" / "mounted" / "rig.toml"))
     rig = replace(rig, stereo=replace(rig.stereo, parameter_covariance=np.zeros((24, 24))))
     fitted = fit(simulate(rig, four_point_protocol(repeats=4, steps=(100, 200)), seed=21).campaign)
     assert fitted.converged, fitted.problems

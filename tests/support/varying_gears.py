@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from tvsbayes.instrument.parameters import GEAR_ERROR_NAMES, INDEX, NAMES, Prior
-from tvsbayes.instrument.rig import RigTable
+from tvsbayes.instrument.rig import Rig, RigTable
 from tvsbayes.model.parameter_space import ParameterSpace, coordinates_of, physical_at
 
 PERIODS_DEG = {"pan": (30.0, 7.0), "tilt": (45.0,)}
@@ -21,6 +21,12 @@ def perfect_gears(table: RigTable) -> RigTable:
     """Gears that repeat no error and do not drift."""
     scales = {name: LENGTH if "length" in name else OFF for name in GEAR_ERROR_NAMES}
     return replace(table, priors={**table.priors, **scales}, harmonic_period_deg={})
+
+
+def perfect_rig(rig: Rig) -> Rig:
+    """A rig of such gears, true rigs drawn from it included."""
+    none = {name: Prior(0.0, 0.0, "half-normal") for name in GEAR_ERROR_NAMES if "length" not in name}
+    return replace(rig, table=perfect_gears(rig.table), truth={**rig.truth, **none})
 
 
 def varying_gears(table: RigTable, scale_u_deg: float = SCALE_U_DEG, periods: bool = True) -> RigTable:

@@ -341,7 +341,8 @@ def first_proposal(
     for k in range(len(pairs)):
         # What both say together, as the leader's own density and the follower's whatever the leader is.
         seen = np.where(np.isfinite(rows[k]), rows[k], -np.inf)
-        gain = special.logsumexp(seen, axis=1) - np.interp(LEADER_NODES, NODES, lines[leader[k]])
+        with np.errstate(invalid="ignore"):
+            gain = special.logsumexp(seen, axis=1) - np.interp(LEADER_NODES, NODES, lines[leader[k]])
         lines[leader[k]] += np.interp(NODES, LEADER_NODES, np.where(np.isfinite(gain), gain, 0.0))
         lines[follower[k]] = special.logsumexp(seen, axis=0)
     conditional = np.reshape([Tables.normalised(each).log_density for each in rows], rows.shape)
