@@ -196,7 +196,7 @@ def test_a_proposal_made_too_narrow_is_not_accepted(sampled, monkeypatch):
 def test_every_limit_is_said(sampled):
     sound = sampled[1].posterior.convergence.importance
     assert lacking(sound) == ()
-    few = replace(sound.least_ess, quantity="backlash_deg.tilt", value=999.4)
+    few = replace(sound.least_ess, quantity="backlash_deg.tilt", value=importance.ESS_LIMIT - 0.6)
     for changed, words in (
         ({"pareto_k": 0.71}, "the weights of importance sampling have Pareto k 0.71, wanted below 0.7"),
         (
@@ -204,7 +204,10 @@ def test_every_limit_is_said(sampled):
             "those of backlash_deg.tilt have Pareto k 0.90, wanted below 0.7",
         ),
         ({"heaviest_share": 0.031}, "one draw holds 3.1 % of the weight, wanted at most 2 %"),
-        ({"least_ess": few}, "backlash_deg.tilt has 999 effective draws, wanted 1000"),
+        (
+            {"least_ess": few},
+            f"backlash_deg.tilt has {importance.ESS_LIMIT - 1} effective draws, wanted {importance.ESS_LIMIT}",
+        ),
         ({"pareto_k": np.nan}, "Pareto k nan"),
     ):
         (sentence,) = lacking(replace(sound, **changed))

@@ -19,7 +19,7 @@ OFF, ON = Prior(0.0, 0.0, "half-normal"), Prior(0.0, SCALE_U_DEG, "half-normal")
 
 def perfect_gears(table: RigTable) -> RigTable:
     """Gears that repeat no error and do not drift."""
-    scales = {name: LENGTH if "length" in name else OFF for name in GEAR_ERROR_NAMES}
+    scales = {name: replace(LENGTH, u=0.0) if "length" in name else OFF for name in GEAR_ERROR_NAMES}
     return replace(table, priors={**table.priors, **scales}, harmonic_period_deg={})
 
 
