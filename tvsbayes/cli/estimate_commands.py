@@ -73,6 +73,7 @@ def fit(
     per_axis: Annotated[bool, typer.Option("--per-axis", help="One ratio per axis: contrasts fixed at 0.")] = False,
     harmonics: Annotated[bool, typer.Option("--harmonics", help="Free transmission errors of known period.")] = False,
     no_backlash: Annotated[bool, typer.Option("--no-backlash", help="No play: backlash fixed at 0.")] = False,
+    perfect_gears: Annotated[bool, typer.Option("--perfect-gears", help="No errors by position, no drift.")] = False,
     out: Annotated[Path | None, typer.Option("--out", help="Folder for results (default CAMPAIGN/results).")] = None,
     seed: Seed = 0,
     as_json: Json = False,
@@ -89,7 +90,8 @@ def fit(
         )
     if axis_commands.is_axis(campaign):
         choice = {"robust": robust, "per_axis": per_axis, "harmonics": harmonics, "no_backlash": no_backlash}
-        refuse_options(axis_commands.NOT_OF_AN_AXIS, "leave it out, or state priors in [axis]", resume=resume, **choice)
+        choice |= {"perfect_gears": perfect_gears, "resume": resume}
+        refuse_options(axis_commands.NOT_OF_AN_AXIS, "leave it out, or state priors in [axis]", **choice)
         minutes = MAX_MINUTES if max_minutes is None else max_minutes
         ways = {"quick": quick, "no_sample": no_sample, "max_minutes": minutes}
         axis_commands.fit(campaign, **ways, out=out, seed=seed, as_json=as_json)  # type: ignore[arg-type]
@@ -106,7 +108,13 @@ def fit(
         results = calibrate(
             data,
             out or output_place(campaign, "results"),
-            model=ModelChoice(robust=robust, per_axis=per_axis, harmonics=harmonics, no_backlash=no_backlash),
+            model=ModelChoice(
+                robust=robust,
+                per_axis=per_axis,
+                harmonics=harmonics,
+                no_backlash=no_backlash,
+                perfect_gears=perfect_gears,
+            ),
             sampled=not no_sample,
             tier="importance" if quick else "emcee",
             max_minutes=MAX_MINUTES if max_minutes is None else max_minutes,
