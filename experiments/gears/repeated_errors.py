@@ -5,11 +5,11 @@
 
 Rig s of a protocol is drawn from `data/rigs/mounted` with seed s: geometry, cameras, and a transmission error, a
 varying play and a drift by the default priors ("priors"), or in a world that no prior holds
-(`experiments.common.worlds`). It is fitted as the package does, with tier 1 (at most `ROUNDS` rounds; accepted by Pareto
-k alone), and with perfect gears, the model without repeating errors. `WITHIN` looks inside the counters seen and as many
-outside them (up to half the range beyond) are located, stop errors and play of the true gears in them. RMS z and
-coverage of 95 % intervals; **!** marks a figure outside its two-sided bounds at 1e-4. With errors by the priors
-everything has to lie within; in other worlds an RMS z of 1.3 is what is aimed at.
+(`experiments.common.worlds`). It is fitted as the package does, with tier 1 (at most `ROUNDS` rounds; accepted by
+Pareto k alone), and with perfect gears, the model without repeating errors. `WITHIN` looks inside the counters seen
+and as many outside them (up to half the range beyond) are located, stop errors and play of the true gears in them.
+RMS z and coverage of 95 % intervals; **!** marks a figure outside its two-sided bounds at 1e-4. With errors by the
+priors everything has to lie within; in other worlds an RMS z of 1.3 is what is aimed at.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ from experiments.common.headlines import (
 )
 from experiments.common.rigs import mounted_rig, shipped_plan
 from experiments.common.rows import output, read_rows, run_rows
+from experiments.common.true_looks import TrueLooks
 from experiments.common.worlds import campaign_of
-from experiments.millimetres.true_looks import TrueLooks
 from tvsbayes.assessment.fitted_calibration import calibration_of
 from tvsbayes.coordinates.location import locate
 from tvsbayes.estimators.joint_fit import fit

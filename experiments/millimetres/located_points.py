@@ -25,7 +25,7 @@ from experiments.common.fits import compile_for
 from experiments.common.headlines import marked
 from experiments.common.rigs import mounted_rig, shipped_plan
 from experiments.common.rows import output, read_rows, run_rows
-from experiments.millimetres.true_looks import ELLIPSOID, ESTIMATORS, TrueLooks, or_none, squared_distance
+from experiments.common.true_looks import ELLIPSOID, ESTIMATORS, TrueLooks, or_none, squared_distance
 from tvsbayes.assessment.fitted_calibration import calibration_of
 from tvsbayes.calibration.pointing import Calibration
 from tvsbayes.coordinates.location import locate

@@ -28,7 +28,7 @@ from experiments.common.command_line import act, study_parser
 from experiments.common.fits import compile_for
 from experiments.common.rigs import TWINS, mounted_rig, shipped_plan, shipped_twin
 from experiments.common.rows import output, read_rows, run_rows
-from experiments.millimetres.true_looks import ELLIPSOID, ESTIMATORS, TrueLooks, or_none, squared_distance
+from experiments.common.true_looks import ELLIPSOID, ESTIMATORS, TrueLooks, or_none, squared_distance
 from tvsbayes.assessment.fitted_calibration import calibration_of
 from tvsbayes.coordinates.location import locate_linear, settings_of
 from tvsbayes.estimators.joint_fit import fit

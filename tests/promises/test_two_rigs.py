@@ -10,7 +10,7 @@ from scipy import stats
 from experiments.common.rigs import mounted_rig
 from experiments.paper.table1 import paper_values
 from experiments.paper.two_machines import HOME_SIDES, NOISE, RIGS, classic_readings, four_point_plan, solved
-from experiments.paper.two_rigs import log_evidence
+from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.twin.simulated_campaign import simulate
 
 
@@ -33,6 +33,7 @@ def test_evidence_is_that_of_a_conjugate_gaussian():
     for reading in (0.2, 1.7):
         mode = reading / (1 + sd**2)
         density = -0.5 * mode**2 + stats.norm.logpdf(reading, mode, sd)
-        result = SimpleNamespace(log_density=density, covariance=np.array([[sd**2 / (1 + sd**2)]]))
+        covariance = np.array([[sd**2 / (1 + sd**2)]])
+        result = SimpleNamespace(log_density=density, covariance=covariance, free=np.array([True]), sides={})
         exact = stats.norm.logpdf(reading, 0.0, np.sqrt(1 + sd**2))
-        assert log_evidence(result) == pytest.approx(exact, abs=1e-12)
+        assert JointFit.laplace_evidence.fget(result) == pytest.approx(exact, abs=1e-12)

@@ -11,7 +11,7 @@ from dataclasses import replace
 from itertools import product
 from typing import Any
 
-from tvsbayes.instrument.axes import AXES, SENSES
+from tvsbayes.instrument.axes import AXES, DIRECTION_SIGNS
 from tvsbayes.instrument.campaign import Campaign, Move
 
 ANYWHERE = "anywhere"
@@ -29,7 +29,8 @@ def unrecorded(moves: Sequence[Move]) -> tuple[str, ...]:
 
 def ways(axis: str) -> dict[str, float]:
     """Ways in which an axis may come home, with their prior probabilities."""
-    return {**dict.fromkeys(SENSES[axis], ONE_SIDED_CHANCE), ANYWHERE: 1 - 2 * ONE_SIDED_CHANCE}
+    sides = (side for side, (of, _) in DIRECTION_SIGNS.items() if of == axis)
+    return {**dict.fromkeys(sides, ONE_SIDED_CHANCE), ANYWHERE: 1 - 2 * ONE_SIDED_CHANCE}
 
 
 def every_way(axes: Sequence[str]) -> list[dict[str, str]]:

@@ -6,8 +6,8 @@ FAULTS = (
     Fault(
         "information of the last look dropped",
         "planning/expectation.py",
-        "rows = np.asarray(found.rows)[..., :PARAMETERS].reshape(-1, PARAMETERS)",
-        "rows = np.asarray(found.rows)[:-1, :, :PARAMETERS].reshape(-1, PARAMETERS)",
+        "rows = np.asarray(found.rows)[..., : knowledge.size].reshape(-1, knowledge.size)",
+        "rows = np.asarray(found.rows)[:-1, :, : knowledge.size].reshape(-1, knowledge.size)",
         "plans look slightly worse than they are",
         ("planning/expectation::test_a_plans_information_is_the_fits_own",),
     ),
@@ -113,8 +113,8 @@ FAULTS = (
     Fault(
         "search after data: home variance for its inverse",
         "planning/search.py",
-        "range(PARAMETERS, PARAMETERS + 2)] = 1 / HOME_VARIANCE_RAD2",
-        "range(PARAMETERS, PARAMETERS + 2)] = HOME_VARIANCE_RAD2",
+        "range(size, size + 2)] = 1 / HOME_VARIANCE_RAD2",
+        "range(size, size + 2)] = HOME_VARIANCE_RAD2",
         "looks after a campaign are chosen as if homing told nothing",
         ("planning/search::test_a_search_after_data_knows_no_home_offset",),
         survived="planted by a reviewer: any design of the search was good enough for its test.",
