@@ -54,6 +54,7 @@ def fit_text(summary: FitSummary) -> str:
         )
     if summary.few_stops:
         lines.append(few_stops_line(summary.few_stops, summary.estimator))
+    lines += homing_lines(summary)
     lines += [f"weak: {weak.text}" for weak in summary.weak_directions]
     lines += [f"leverage: {entry.text}" for entry in summary.leverage]
     lines += [f"prior conflict: {text}" for text in summary.prior_conflicts]
@@ -62,6 +63,16 @@ def fit_text(summary: FitSummary) -> str:
     if summary.suspect_spots:
         lines.append(f"{suspect_line(summary.suspect_spots)}; look at them, or fit with --robust")
     return "\n".join(lines)
+
+
+def homing_lines(summary: FitSummary) -> list[str]:
+    """How the axes came home whose sides nobody recorded."""
+    found = []
+    for axis, chances in summary.homing_side.items():
+        ordered = sorted(chances.items(), key=lambda each: -each[1])
+        ways = ", ".join(f"{side} {100 * chance:.1f} %" for side, chance in ordered)
+        found.append(f"{axis} homing side, not recorded: {ways}")
+    return found
 
 
 def gear_lines(summary: FitSummary) -> list[str]:

@@ -161,7 +161,7 @@ FAULTS = (
         "log_variance += found.log_determinant",
         "log_variance += 0.0 * found.log_determinant",
         "gears are fitted with ever larger errors",
-        ("estimators/gear_errors",),
+        ("estimators/repeated_errors",),
     ),
     Fault(
         "errors at places drawn without their scatter",
@@ -169,7 +169,7 @@ FAULTS = (
         "return self.root @ (self.mean + jax.scipy",
         "return self.root @ (self.mean + 0.0 * jax.scipy",
         "the line through the looks is called too certain",
-        ("estimators/gear_errors",),
+        ("estimators/repeated_errors",),
     ),
     Fault(
         "transmission error of half its smoothness",
@@ -177,7 +177,7 @@ FAULTS = (
         "(1 + scaled + scaled**2 / 3)",
         "(1 + scaled)",
         "gears are taken for rougher than they are: counters between those seen are foretold too wide",
-        ("model/gear_processes", "estimators/gear_errors"),
+        ("model/gear_processes", "estimators/repeated_errors"),
     ),
     Fault(
         "play's variation with the sign of the other side",
@@ -193,7 +193,7 @@ FAULTS = (
         "return spots.hours[:, None] * drift_rad_per_root_hour**2",
         "return jnp.where(spots.new_segment, spots.hours, 0.0)[:, None] * drift_rad_per_root_hour**2",
         "a drifting zero is taken for the scatter of stops",
-        ("estimators/gear_errors",),
+        ("estimators/repeated_errors",),
     ),
     Fault(
         "correlation of the left camera used for the right",

@@ -1,0 +1,45 @@
+"""Ways of coming home that nobody recorded, as variants of a campaign."""
+
+from dataclasses import replace
+
+import pytest
+from support.small_campaign import small_campaign
+
+from tvsbayes.instrument.campaign import Move
+from tvsbayes.instrument.homing import ANYWHERE, every_way, homed, prior_chance, unrecorded, ways
+
+
+def moves(*first: tuple[str, str]) -> tuple[Move, ...]:
+    """A segment of two moves for every pair of approaches."""
+    found = []
+    for segment, (pan, tilt) in enumerate(first):
+        found.append(Move(2 * segment, segment, 0.0, 0, 0, pan, tilt))
+        found.append(Move(2 * segment + 1, segment, 0.0, 100, 0))
+    return tuple(found)
+
+
+def test_an_axis_is_unrecorded_only_if_every_homing_is():
+    assert unrecorded(moves(("unknown", "up"), ("unknown", "up"))) == ("pan",)
+    assert unrecorded(moves(("unknown", "unknown"), ("left", "unknown"))) == ("tilt",)
+    assert unrecorded(moves(("left", "up"))) == ()
+
+
+@pytest.mark.parametrize("axis", ["pan", "tilt"])
+def test_chances_of_an_axis_sum_to_one(axis):
+    # Three numbers of two digits: exact but for a rounding.
+    assert sum(ways(axis).values()) == pytest.approx(1.0, abs=1e-15)
+    assert ways(axis)[ANYWHERE] == pytest.approx(0.1, abs=1e-15)
+
+
+def test_every_combination_once():
+    found = every_way(("pan", "tilt"))
+    assert len(found) == 9 and len({tuple(sorted(sides.items())) for sides in found}) == 9
+    assert sum(map(prior_chance, found)) == pytest.approx(1.0, abs=1e-14)
+
+
+def test_only_unknown_approaches_are_told():
+    campaign = replace(small_campaign(), moves=moves(("unknown", "up"), ("left", "unknown")))
+    found = homed(campaign, {"pan": "right", "tilt": ANYWHERE}).moves
+    assert [m.pan_approach for m in found] == ["right", "", "left", ""]
+    assert [m.tilt_approach for m in found] == ["up", "", "unknown", ""]
+    assert homed(campaign, {"pan": ANYWHERE}) is campaign
