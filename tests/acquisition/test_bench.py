@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from support.bench_runs import small_plan
 from support.pseudo_terminal import needs_pseudo_terminals, served
+from support.varying_gears import perfect_rig
 
 from tvsbayes.acquisition.bench import Vision
 from tvsbayes.acquisition.journal import read_journal
@@ -60,6 +61,7 @@ TWO_LOOKS = (
 
 
 def test_truth_file_is_that_of_the_run(mounted_rig, tmp_path):
+    mounted_rig = perfect_rig(mounted_rig)
     acquire(mounted_rig, small_plan(2), tmp_path / "c", simulate=True, seed=4)
     campaign = read_campaign(tmp_path / "c")
     truth = read_truth(tmp_path / "c" / "truth.json", campaign.stereo)
@@ -72,6 +74,7 @@ def test_truth_file_is_that_of_the_run(mounted_rig, tmp_path):
 
 def test_pictures_through_the_virtual_camera(small_rig, tmp_path):
     """Renderer, MJPEG server, OpenCV, background, detection, journal: spots where the twin has them."""
+    small_rig = perfect_rig(small_rig)
     instrument = Instrument(small_rig, 7)
     rng = np.random.default_rng(0)
     size = (small_rig.stereo.image_height, small_rig.stereo.image_width)

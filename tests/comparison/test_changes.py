@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from support.varying_gears import perfect_rig
 
 from tvsbayes.comparison.changes import compare
 from tvsbayes.estimators.joint_fit import fit
@@ -54,8 +55,9 @@ def test_what_both_hold_fixed_is_compared_as_stated(mixed_fit):
     json.dumps(compare(fits[0], fits[2]).as_json(), allow_nan=False)
 
 
-def test_a_changed_gear_is_named(mounted_rig, mixed_fit):
-    """The same rig with 2 % more degrees per pan step, measured again 30 days later."""
+def test_a_changed_gear_is_named(mounted_rig):
+    """The same rig with 2 % more degrees per pan step, measured again 30 days later; gears known to be perfect."""
+    mounted_rig = perfect_rig(mounted_rig)
     protocol = four_point_protocol(repeats=6, steps=(100, 200))
     first = simulate(mounted_rig, protocol, seed=3)
     parameters = dict(first.truth.parameters)
@@ -64,9 +66,9 @@ def test_a_changed_gear_is_named(mounted_rig, mixed_fit):
     made = datetime.datetime(2026, 1, 1, tzinfo=datetime.UTC)
     dated = [
         replace(campaign, header={**campaign.header, "created": made + datetime.timedelta(days=30 * k)})
-        for k, campaign in enumerate((mixed_fit.campaign, second))
+        for k, campaign in enumerate((first.campaign, second))
     ]
-    found = compare(replace(mixed_fit, campaign=dated[0]), replace(fit(second), campaign=dated[1]))
+    found = compare(*map(fit, dated))
     moved = {c.quantity for c in found.changes if c.significant}
     assert moved == {"effective_deg_per_step.left", "effective_deg_per_step.right"}
     assert found.days == 30.0 and found.verdict.startswith("changed: effective_deg_per_step.left by +")

@@ -18,6 +18,6 @@ def test_the_choice_of_a_model_keeps_what_the_rig_states():
     assert all(p == Prior(0.0, 0.0) for n, p in chosen.priors.items() if n.startswith("harmonic_deg.tilt"))
     bare = ModelChoice(no_backlash=True, per_axis=True).table(table).priors
     changed = {name for name, prior in bare.items() if prior != table.priors[name]}
-    stems = ("backlash_deg", "ratio_contrast_deg_per_step")
+    stems = ("backlash_deg", "play_variation_deg", "ratio_contrast_deg_per_step")
     assert changed == {f"{stem}.{axis}" for stem in stems for axis in ("pan", "tilt")}
     assert all(bare[name].u == 0 for name in changed)
