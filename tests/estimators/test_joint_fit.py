@@ -14,11 +14,11 @@ from support.waits import check_forward, doings
 
 from tvsbayes.errors import InputError, NothingToEstimate
 from tvsbayes.estimators.joint_fit import DIAGNOSING, NEWTON, fit
-from tvsbayes.estimators.mode_search import GEAR_SCALE_NAMES, SEARCHING
+from tvsbayes.estimators.mode_search import SEARCHING
 from tvsbayes.files.disk import shipped_data
 from tvsbayes.instrument.campaign import Campaign, ordered_spots
 from tvsbayes.instrument.model_choice import ModelChoice
-from tvsbayes.instrument.parameters import HARMONIC_NAMES, INDEX, NAMES, Prior
+from tvsbayes.instrument.parameters import GEAR_ERROR_NAMES, HARMONIC_NAMES, INDEX, NAMES, Prior
 from tvsbayes.instrument.protocols import four_point_protocol, grid_protocol
 from tvsbayes.instrument.rig import read_rig
 from tvsbayes.statistics.least_squares import laplace_draws
@@ -173,7 +173,7 @@ def wobbling(mounted_rig) -> SimulatedCampaign:
     """A pinion of 6 deg per turn under a grid of 15 pan angles, 1.2 deg apart, over three turns."""
     stop_sds = {f"stop_sd_deg.{d}": Prior(0.02, 0.0, "log-normal") for d in ("left", "right", "up", "down")}
     errors = {name: Prior(value, 0.0) for name, value in PAN_ERROR_DEG.items()}
-    errors |= {name: Prior(0.0, 0.0, "half-normal") for name in GEAR_SCALE_NAMES if "length" not in name}
+    errors |= {name: Prior(0.0, 0.0, "half-normal") for name in GEAR_ERROR_NAMES if "length" not in name}
     rig = replace(
         mounted_rig,
         table=replace(mounted_rig.table, harmonic_period_deg={"pan": (6.0,)}),
@@ -239,7 +239,7 @@ def test_the_mode_is_a_stationary_maximum(fitted):
         value, gradient = value_and_gradient(fitted.z, fitted.space, fitted.arrays)
         root = np.linalg.cholesky(fitted.covariance)
         # Scales of repeating errors are where the density is highest with everything else integrated out.
-        own = fitted.free & ~np.isin(NAMES, GEAR_SCALE_NAMES)
+        own = fitted.free & ~np.isin(NAMES, GEAR_ERROR_NAMES)
         # Squared length of the remaining Newton step in sds: the fit stops at 1e-8.
         assert np.sum((root.T @ np.asarray(gradient))[own] ** 2) < 1e-6 * SD**2
         assert float(value) == pytest.approx(fitted.log_density)

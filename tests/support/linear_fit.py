@@ -15,7 +15,8 @@ from tvsbayes.calibration.pointing import INPUT_NAMES
 from tvsbayes.estimators.campaign_arrays import SpotArrays
 from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.estimators.linear_spots import Linearised, StopGroup, StopInformation
-from tvsbayes.instrument.parameters import GEAR_ERROR_NAMES, HARMONIC_NAMES, INDEX, NAMES, RIG_NAMES
+from tvsbayes.estimators.mode_search import NOISE_NAMES
+from tvsbayes.instrument.parameters import HARMONIC_NAMES, INDEX, NAMES, RIG_NAMES
 from tvsbayes.model.compiled import placed
 from tvsbayes.model.parameter_space import parameter_space
 
@@ -36,7 +37,7 @@ def linear_problem(stereo: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
     mix = rng.normal(size=(len(RIG_NAMES), len(NAMES) - len(RIG_NAMES)))
     jacobian[:, len(RIG_NAMES) :] = 0.02 * stereo * jacobian[:, : len(RIG_NAMES)] @ mix
     # Fixed in the rig, which has no transmission error; scales of errors move no spot.
-    jacobian[:, [INDEX[name] for name in (*HARMONIC_NAMES, *GEAR_ERROR_NAMES)]] = 0.0
+    jacobian[:, [INDEX[name] for name in (*HARMONIC_NAMES, *NOISE_NAMES)]] = 0.0
     load = np.zeros((SPOTS, 4, STATES))
     starts = [(begin, end) for spots in REDRAWN for begin, end in pairwise((*spots, SPOTS))]
     for state, (begin, end) in enumerate(starts):
@@ -97,8 +98,8 @@ def fit_of(jacobian: np.ndarray, load: np.ndarray, rig, readings: bool = False) 
     values = {
         "information": StopInformation(groups, jacobian.T @ gain, *without_places(jacobian.shape[1])),
         "linearised": linearised(jacobian, load),
+        "free": np.ones(len(NAMES), dtype=bool),
         "arrays": partial_arrays(spots=spot_arrays(readings)),
-        "held": np.zeros(0, int),
         "draws_places": np.zeros((2048, 0)),
         "space": space,
         "z": 0.1 * np.random.default_rng(4).normal(size=len(NAMES)),

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -48,12 +48,10 @@ class _Told:
 
 def _told(fit: JointFit) -> _Told:
     readings = np.any(np.asarray(fit.arrays.spots.has_aperture) * np.asarray(fit.arrays.spots.valid))
-    held = np.isin(np.arange(len(NAMES)), fit.held)
     linear = linear_spots(
-        fit.linearised, fit.arrays, np.where(held, 0.0, -np.asarray(fit.linearised.residual_jacobian))
+        fit.linearised, fit.arrays, np.where(fit.held, 0.0, -np.asarray(fit.linearised.residual_jacobian))
     )
-    both = np.concatenate([linear.jacobian, linear.places], axis=2)
-    found = stop_information(replace(linear, jacobian=both, places=linear.places[..., :0]))
+    found = stop_information(linear.spelled_out(linear.places))
     gain = np.concatenate([group.jacobian for group in found.groups])
     noise, places = gain.T @ gain, linear.places.shape[2] // 2
     own = len(NAMES) + np.arange(places)

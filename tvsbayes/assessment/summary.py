@@ -23,7 +23,15 @@ from tvsbayes.assessment.weaknesses import (
 from tvsbayes.estimators.four_point import experiment_rows, four_point_ratios, ratio_slopes, select_experiments
 from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.instrument.axes import AXES, DIRECTIONS, SENSES
-from tvsbayes.instrument.parameters import HARMONIC_NAMES, INDEX, NAMES, RECEIVER_NAMES, RIG_NAMES, names_of
+from tvsbayes.instrument.parameters import (
+    GEAR_ERROR_NAMES,
+    HARMONIC_NAMES,
+    INDEX,
+    NAMES,
+    RECEIVER_NAMES,
+    RIG_NAMES,
+    names_of,
+)
 from tvsbayes.instrument.stops import legs_of
 from tvsbayes.model.headlines import Derived
 from tvsbayes.posterior.draws import Posterior
@@ -33,10 +41,8 @@ from tvsbayes.statistics.intervals import NORMAL_95, interval95
 from tvsbayes.statistics.weighted_draws import TAILS, weighted_mean, weighted_quantiles
 
 CLASSIC_DRAWS = 256
-GEAR_ERROR_NAMES = (
-    *HARMONIC_NAMES,
-    *names_of("transmission_error_deg", "play_variation_deg", "drift_deg_per_root_hour", "harmonic_amplitude_deg"),
-)
+LENGTH_NAMES = names_of("transmission_error_length_deg")
+ABSENT_AT_NOUGHT = tuple(name for name in (*HARMONIC_NAMES, *GEAR_ERROR_NAMES) if name not in LENGTH_NAMES)
 """Parameters that are not told of where they are held at 0."""
 CURVE_POINTS = 7
 
@@ -105,7 +111,7 @@ class _Source:
 def _absent(fit: JointFit) -> set[str]:
     """Errors of the gears that the model does not have, and the lengths of those."""
     value = dict(zip(NAMES, np.asarray(fit.mode.physical).tolist(), strict=True))
-    none = {name for name in GEAR_ERROR_NAMES if not fit.free[INDEX[name]] and value[name] == 0}
+    none = {name for name in ABSENT_AT_NOUGHT if not fit.free[INDEX[name]] and value[name] == 0}
     for axis in AXES:
         if {f"transmission_error_deg.{axis}", f"play_variation_deg.{axis}"} <= none:
             none.add(f"transmission_error_length_deg.{axis}")

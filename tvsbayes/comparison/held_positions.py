@@ -75,7 +75,7 @@ def hold_out_positions(fit_of_all: JointFit, *, progress: Show | None = None) ->
 
 def _of_all_looks(fit_of_all: JointFit, taught: JointFit) -> Linearised:
     """All looks linearised at the mode that some of them taught."""
-    held = np.isin(np.arange(len(NAMES)), fit_of_all.held)
+    held = fit_of_all.held
     fixed = Fixed(held, taught.z, np.array(1.0))
     at_mode = stage(taught.z, fit_of_all.space, fit_of_all.arrays, fixed, np.array(NO_STEP))
     return at_mode.of_spots(len(ordered_spots(fit_of_all.campaign)))
@@ -95,7 +95,7 @@ def foretold(
         sign: side from which the axis came, shape (spots,).
     """
     lin = _of_all_looks(fit_of_all, taught)
-    held = np.isin(np.arange(len(NAMES)), fit_of_all.held)
+    held = fit_of_all.held
     own, rows = np.where(held, 0.0, -np.asarray(lin.residual_jacobian)), np.flatnonzero(out)
     free = np.zeros((len(out), 4, 2 * len(rows)))
     for k, row in enumerate(rows.tolist()):

@@ -20,7 +20,7 @@ from tvsbayes.errors import NotConverged, NothingToEstimate
 from tvsbayes.estimators.campaign_arrays import CampaignArrays, in_sight, place_arrays
 from tvsbayes.estimators.likelihood import prior_errors_at_places
 from tvsbayes.estimators.linear_spots import Linearised, StopInformation, leave_one_out_chi2
-from tvsbayes.estimators.mode_search import GATE_PROBABILITY, Problem, search_stages
+from tvsbayes.estimators.mode_search import GATE_PROBABILITY, Problem, held_by, search_stages
 from tvsbayes.instrument.axes import AXES
 from tvsbayes.instrument.campaign import Campaign, ordered_spots
 from tvsbayes.instrument.homing import ANYWHERE, every_way, homed, prior_chance, unrecorded, ways
@@ -90,7 +90,6 @@ class JointFit:
         reference_pose_rad: mean mirror angles (pan, tilt) over the spots used.
         seen_line: their counters, over which the headlines are slopes.
         free: parameters that are estimated, shape (p,).
-        held: coordinates of noise scales and of what is not estimated: the linearisation knows them.
         draws_z: Laplace draws, shape (draws, p), with mean and covariance exactly those of the approximation.
         draws_places: with them, the errors at places in units of `linearised.place_root`, shape (draws, e).
         draws: headlines and parameters of the draws.
@@ -117,7 +116,6 @@ class JointFit:
     reference_pose_rad: np.ndarray
     seen_line: SeenLine
     free: np.ndarray
-    held: np.ndarray
     draws_z: np.ndarray
     draws_places: np.ndarray
     draws: Derived
@@ -135,6 +133,11 @@ class JointFit:
     def names(self) -> tuple[str, ...]:
         """Contract names of the coordinates and of the columns of `draws.physical`."""
         return NAMES
+
+    @property
+    def held(self) -> np.ndarray:
+        """What the linearisation takes as known, shape (p,)."""
+        return held_by(self.free)
 
     @property
     def stored(self) -> StoredMode:
@@ -420,7 +423,6 @@ def fit_at(campaign: Campaign, problem: Problem, mode: Mode, seed: int) -> Joint
         reference_pose_rad=np.asarray(pose),
         seen_line=seen,
         free=problem.free,
-        held=np.flatnonzero(problem.held),
         draws_z=draws_z,
         draws_places=both[:, count:],
         draws=jax.tree.map(lambda x: np.asarray(x)[1:], at_mode_and_draws),

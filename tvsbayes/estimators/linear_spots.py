@@ -9,7 +9,7 @@ State Space Methods, 4.5): leave-one-out residuals, and what a fit would lose wi
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import equinox as eqx
 import jax
@@ -131,6 +131,10 @@ class LinearSpots:
     variance: np.ndarray
     jacobian: np.ndarray
     places: np.ndarray
+
+    def spelled_out(self, columns: np.ndarray) -> LinearSpots:
+        """The same with the errors at places as further coordinates; `columns` (n, 4, e) are theirs, in any unit."""
+        return replace(self, jacobian=np.concatenate([self.jacobian, columns], axis=2), places=self.places[..., :0])
 
 
 _rows = compiled(FilterRows)(filter_rows)

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import equinox as eqx
 import jax
 import numpy as np
+from jaxtyping import Bool
 from scipy import optimize
 
 from tvsbayes.estimators.annealed_stage import NO_STEP, STAGE_TOLERANCE, Fixed, stage
@@ -25,20 +26,16 @@ from tvsbayes.estimators.linear_spots import (
     stop_information,
 )
 from tvsbayes.instrument.campaign import Campaign, ordered_spots
-from tvsbayes.instrument.parameters import INDEX, NAMES, NOISE_NAMES, PERIODS_MAX, names_of
+from tvsbayes.instrument.parameters import GEAR_ERROR_NAMES, INDEX, NAMES, NOISE_NAMES, names_of
 from tvsbayes.instrument.rig import RigTable
 from tvsbayes.model.compiled import in_batches, placed
-from tvsbayes.model.gear_processes import GearScales, Places, place_root
+from tvsbayes.model.gear_kriging import scales_at
+from tvsbayes.model.gear_processes import Places, place_root
 from tvsbayes.model.parameter_space import ParameterSpace, free_mask, parameter_space, physical_at
 from tvsbayes.progress import Job
 from tvsbayes.statistics.chances import chi2_quantile
 from tvsbayes.statistics.least_squares import Mode, newton_mode
 
-GEAR_SCALE_NAMES = names_of(
-    *("transmission_error_deg", "transmission_error_length_deg", "play_variation_deg", "drift_deg_per_root_hour"),
-    "harmonic_amplitude_deg",
-)
-"""Scales of what the gears repeat, and of the drift."""
 RATIO_COLUMNS = np.array([INDEX[name] for name in names_of("degrees_per_step")])
 ANNEALING = (60.0, 10.0, 2.0, 1.0)
 """Factors on the pixel noise before it takes its own value: plain Levenberg-Marquardt from the nominal rig goes
@@ -67,22 +64,6 @@ def search_stages(robust: bool) -> dict[str, float]:
     return {COMPILING: stage.wait(COMPILED_SECONDS), SEARCHING: SEARCHED_SECONDS * (2 if robust else 1)}
 
 
-def gear_scales(values: np.ndarray, period_deg: np.ndarray) -> GearScales:
-    """Of points with values (n, p) in the units of the names, for NumPy."""
-
-    def block(name: str) -> np.ndarray:
-        return np.radians(values[:, [INDEX[each] for each in names_of(name)]])
-
-    return GearScales(
-        error_rad=block("transmission_error_deg"),
-        length_rad=block("transmission_error_length_deg"),
-        play_rad=block("play_variation_deg"),
-        drift_rad_per_root_hour=block("drift_deg_per_root_hour"),
-        amplitude_rad=block("harmonic_amplitude_deg").reshape(-1, 2, PERIODS_MAX),
-        period_rad=np.radians(np.broadcast_to(period_deg, (len(values), 2, PERIODS_MAX))),
-    )
-
-
 @dataclass(frozen=True)
 class Room:
     """Log of the volume that geometry and cameras have at scales of repeating errors, up to a constant.
@@ -107,7 +88,7 @@ class Room:
             return np.zeros(len(z))
         values = np.stack([physical_at(one, self.space).value for one in z])
         root = place_root(
-            gear_scales(values, np.asarray(self.space.harmonic_period_deg)),
+            scales_at(values, np.asarray(self.space.harmonic_period_deg)),
             self.angle_rad,
             self.places.on_tilt,
             self.places.valid,
@@ -118,6 +99,11 @@ class Room:
         load = self.products[own, rest] @ root
         told = self.products[own, own] - load @ np.linalg.solve(inner, np.swapaxes(load, 1, 2))
         return -0.5 * np.linalg.slogdet(np.eye(len(NAMES)) + told)[1]
+
+
+def held_by(free: Bool[np.ndarray, " parameters"]) -> Bool[np.ndarray, " parameters"]:
+    """What a linearisation takes as known: noise scales, and what is not estimated."""
+    return np.isin(NAMES, NOISE_NAMES) | ~free
 
 
 class Problem:
@@ -133,10 +119,9 @@ class Problem:
         self.arrays = eqx.tree_at(lambda a: a.spots.valid, arrays, placed(valid))
         readings = (spot.aperture_deg is not None for spot, use in zip(self.spots, used, strict=True) if use)
         self.free = free_mask(self.space, any(readings))
-        is_noise = np.isin(NAMES, NOISE_NAMES)
-        self.noise = np.flatnonzero(is_noise & self.free)
-        self.held = is_noise | ~self.free
-        self.repeated = np.isin(NAMES, GEAR_SCALE_NAMES) & self.free
+        self.noise = np.flatnonzero(np.isin(NAMES, NOISE_NAMES) & self.free)
+        self.held = held_by(self.free)
+        self.repeated = np.isin(NAMES, GEAR_ERROR_NAMES) & self.free
 
     def compile_aside(self, executor: ThreadPoolExecutor) -> None:
         """Start the compilation that later steps need while the first stage runs on the other core."""
@@ -192,12 +177,13 @@ class Problem:
 
     def room(self, z: np.ndarray) -> Room:
         """How the scales of repeating errors change the room of geometry and cameras, linearised at z."""
+        places = jax.tree.map(np.asarray, self.arrays.gears.places)
+        if not len(places.steps):
+            return Room(self.space, np.zeros((len(NAMES), len(NAMES))), places.steps, places)
         lin = self.linearised(z)
         jacobian = np.where(self.held, 0.0, -np.asarray(lin.residual_jacobian))
         linear = linear_spots(lin, self.arrays, jacobian)
-        columns = np.concatenate([jacobian, np.asarray(lin.place_columns)], axis=2)
-        found = stop_information(replace(linear, jacobian=columns, places=linear.places[..., :0]))
-        places = jax.tree.map(np.asarray, self.arrays.gears.places)
+        found = stop_information(linear.spelled_out(np.asarray(lin.place_columns)))
         ratio = np.radians(physical_at(z, self.space).value[RATIO_COLUMNS])
         return Room(self.space, found.fisher, places.steps * ratio[places.on_tilt.astype(int)], places)
 

@@ -17,18 +17,19 @@ from tvsbayes.model.gear_processes import GearScales, place_root
 
 
 def scales_at(physical: np.ndarray, harmonic_period_deg: np.ndarray) -> GearScales:
-    """Scales among the values of all parameters, shape (p,); periods of shape (2, 3)."""
+    """Scales among the values of all parameters, of one point (p,) or of many (n, p); periods of shape (2, 3)."""
+    leading = physical.shape[:-1]
 
     def block(name: str) -> np.ndarray:
-        return np.radians(physical[[INDEX[each] for each in BLOCKS[name]]])
+        return np.radians(physical[..., [INDEX[each] for each in BLOCKS[name]]])
 
     return GearScales(
         error_rad=block("transmission_error_deg"),
         length_rad=block("transmission_error_length_deg"),
         play_rad=block("play_variation_deg"),
         drift_rad_per_root_hour=block("drift_deg_per_root_hour"),
-        amplitude_rad=block("harmonic_amplitude_deg").reshape(2, PERIODS_MAX),
-        period_rad=np.radians(harmonic_period_deg),
+        amplitude_rad=block("harmonic_amplitude_deg").reshape(*leading, 2, PERIODS_MAX),
+        period_rad=np.radians(np.broadcast_to(harmonic_period_deg, (*leading, 2, PERIODS_MAX))),
     )
 
 

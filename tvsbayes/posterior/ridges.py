@@ -15,7 +15,7 @@ from scipy import linalg
 from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.estimators.likelihood import evaluate, no_draw
 from tvsbayes.estimators.linear_spots import LinearSpots, linear_spots, stop_information
-from tvsbayes.instrument.parameters import INDEX, KINDS, NAMES, NOISE_NAMES, names_of
+from tvsbayes.instrument.parameters import GEAR_ERROR_NAMES, INDEX, KINDS, NAMES, NOISE_NAMES, names_of
 from tvsbayes.model.compiled import in_batches
 from tvsbayes.model.parameter_space import STOP_COLUMNS
 from tvsbayes.posterior.transport import GEAR_SCALES, STRETCH_NODES, Transport
@@ -28,7 +28,7 @@ SHEAR_STEP = 0.5
 STATES_MAX = 64
 """Most stop errors for which the whole covariance follows the noise scales of every walker. With more stops its
 matrices cost several times the density, the scales are known better, and widths from a table do."""
-UNTABLED_NAMES = tuple(NAMES[column] for column in GEAR_SCALES) + names_of("drift_deg_per_root_hour")
+UNTABLED_NAMES = GEAR_ERROR_NAMES
 """Noise scales for which no table of widths is made: the map follows those of the gears, and few coordinates see the
 drift."""
 STRETCH_LIMITS = 1e-2, 1e2
@@ -152,7 +152,7 @@ def _products(fit: JointFit, linear: LinearSpots, stops: StopStates, ways: np.nd
         columns = np.concatenate(rows, axis=1)
         return Products.of(columns.T @ columns, columns.T @ linear.residual.ravel(), count)
     columns = np.concatenate([along, places], axis=2)
-    found = stop_information(replace(linear, jacobian=columns, places=linear.places[..., :0]))
+    found = stop_information(replace(linear, jacobian=along).spelled_out(places))
     seen = np.concatenate([group.residual for group in found.groups])
     return Products.of(found.fisher, columns.reshape(-1, columns.shape[2]).T @ seen, count)
 

@@ -14,8 +14,9 @@ from functools import cached_property
 
 import numpy as np
 
-from tvsbayes.instrument.parameters import BLOCKS, INDEX, NAMES, NOISE_NAMES, PERIODS_MAX, names_of
-from tvsbayes.model.gear_processes import GearScales, place_root
+from tvsbayes.instrument.parameters import BLOCKS, INDEX, NAMES, NOISE_NAMES, names_of
+from tvsbayes.model.gear_kriging import scales_at
+from tvsbayes.model.gear_processes import place_root
 from tvsbayes.model.parameter_space import FARTHEST_SD, half_normal, half_normal_slope
 
 GEAR_SCALES = np.array(
@@ -215,16 +216,9 @@ class Transport:
 
     def _place_roots(self, log_scale: np.ndarray) -> np.ndarray:
         """Factors of the covariance of the errors at places, shape (n, e, e), at logs of the noise scales (n, q)."""
-        value = self.gear_scale * np.exp(log_scale @ self.gear_noise.T)
-        error, length, play, amplitude = np.split(value, [2, 4, 6], axis=1)
-        scales = GearScales(
-            error_rad=np.radians(error),
-            length_rad=np.radians(length),
-            play_rad=np.radians(play),
-            drift_rad_per_root_hour=np.zeros_like(error),
-            amplitude_rad=np.radians(amplitude).reshape(-1, 2, PERIODS_MAX),
-            period_rad=np.radians(np.broadcast_to(self.period_deg, (len(value), 2, PERIODS_MAX))),
-        )
+        values = np.zeros((len(log_scale), len(NAMES)))
+        values[:, GEAR_SCALES] = self.gear_scale * np.exp(log_scale @ self.gear_noise.T)
+        scales = scales_at(values, self.period_deg)
         return np.asarray(place_root(scales, self.place_angle_rad, self.place_on_tilt, self.place_valid, np))
 
     def _quadratic(self, noise: np.ndarray) -> Quadratic:

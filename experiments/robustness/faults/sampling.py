@@ -62,8 +62,8 @@ FAULTS = (
     Fault(
         "errors at places as if scales were always as at the mode",
         "posterior/transport.py",
-        "value = self.gear_scale * np.exp(log_scale @ self.gear_noise.T)",
-        "value = self.gear_scale * np.exp(0.0 * log_scale @ self.gear_noise.T)",
+        "values[:, GEAR_SCALES] = self.gear_scale * np.exp(log_scale @ self.gear_noise.T)",
+        "values[:, GEAR_SCALES] = self.gear_scale * np.exp(0.0 * log_scale @ self.gear_noise.T)",
         "campaigns of uneven gears are sampled many times slower",
         ("posterior/gear_transport",),
     ),
