@@ -36,9 +36,7 @@ def test_same_seed_same_bytes(mounted_rig, tmp_path):
 
 def test_resume_with_another_plan_rig_or_seed_is_refused(mounted_rig, tmp_path):
     folder, plan = tmp_path / "c", small_plan()
-    Run(
-        mounted_rig, folder, plan, observer=lambda i: Failing(i, 2, lambda i: signal.raise_signal(signal.SIGINT))
-    ).engine.run()
+    stopped_run(mounted_rig, folder, plan)
     size = (folder / LOG).stat().st_size
     other_plan = [*plan[:-1], replace(plan[-1], point=None, experiment=None)]
     other_rig = replace(mounted_rig, sheets_mm={**mounted_rig.sheets_mm, "d1": 180.0})
@@ -53,6 +51,60 @@ def test_resume_with_another_plan_rig_or_seed_is_refused(mounted_rig, tmp_path):
     begin(folder, mounted_rig, plan, True, HEADER).close()
     with pytest.raises(InputError, match="no journal"):
         acquire(mounted_rig, plan, tmp_path / "nowhere", simulate=True, resume=True)
+
+
+def stopped_run(rig, folder, plan) -> None:
+    """A run that Ctrl-C ended at its second look."""
+    Run(rig, folder, plan, observer=lambda i: Failing(i, 2, lambda i: signal.raise_signal(signal.SIGINT))).engine.run()
+
+
+SETUPS = {
+    "port": ("positioner", {"port": "/dev/ttyACM1"}),
+    "speed": ("positioner", {"speed_steps_per_s": 400.0}),
+    "limits": ("positioner", {"pan_max_steps": 500}),
+    "settling": ("positioner", {"settle_s": 0.5}),
+    "camera": ("cameras", {"right": "/dev/video2"}),
+    "exposure": ("cameras", {"exposure": -5.0}),
+    "costs": ("costs_s", {"move_s": 9.0}),
+}
+
+
+@pytest.mark.parametrize("what", SETUPS)
+def test_a_rig_that_is_reached_or_driven_otherwise_goes_on(mounted_rig, tmp_path, what):
+    """Whatever says nothing about what was measured; the change is written down."""
+    plan, (table, change) = small_plan(1), SETUPS[what]
+    stopped_run(mounted_rig, tmp_path / "c", plan)
+    changed = replace(mounted_rig, **{table: {**getattr(mounted_rig, table), **change}})
+    assert Run(changed, tmp_path / "c", plan, resume=True, start=1).engine.run().reason == "done"
+    starts = [r.data["setup"] for r in read_journal(tmp_path / "c").records if r.event == "start"]
+    key, value = next(iter(change.items()))
+    assert key == "move_s" or (f"{table}.{key}" not in starts[0] and starts[1][f"{table}.{key}"] == value)
+
+
+def test_what_changes_the_data_is_refused_by_name(mounted_rig, tmp_path):
+    """With the old and the new value; on the bench a sheet may stand elsewhere, in the twin not."""
+    folder, plan = tmp_path / "c", small_plan(1)
+    stopped_run(mounted_rig, folder, plan)
+    table, stereo = mounted_rig.table, mounted_rig.stereo
+    priors = {**table.priors, "mirror_offset_mm": replace(table.priors["mirror_offset_mm"], value=31.5)}
+    positioners = {"driver": {"driver": "grbl"}, "home": {"pan_home_steps": -900}}
+    changed = {
+        "[rig] mirror_offset_mm": (replace(mounted_rig, table=replace(table, priors=priors)), "31.5", "value = 30"),
+        "stereo": (replace(mounted_rig, stereo=replace(stereo, rms_px=0.5)), '"', '"'),
+        "[positioner] driver": (replace(mounted_rig, positioner=positioners["driver"]), '"grbl"', '"serial"'),
+        "[positioner] pan_home_steps": (replace(mounted_rig, positioner=positioners["home"]), "-900", "not stated"),
+        "[sheets] d1": (replace(mounted_rig, sheets_mm={**mounted_rig.sheets_mm, "d1": 180.0}), "180.0", "175.0"),
+        "[cameras] spot_sd_px": (replace(mounted_rig, cameras={"spot_sd_px": 0.2}), "0.2", "0.08"),
+    }
+    for place, (rig, new, old) in changed.items():
+        with pytest.raises(InputError, match="begin a new campaign") as caught:
+            begin(folder, rig, plan, True, HEADER)
+        assert caught.value.column == place and new in caught.value.found and old in caught.value.allowed, place
+    bench = {"name": "test", "created": HEADER["created"]}
+    begin(tmp_path / "bench", mounted_rig, plan, False, bench).close()
+    begin(tmp_path / "bench", changed["[sheets] d1"][0], plan, True, bench).close()
+    with pytest.raises(InputError, match="mirror_offset_mm"):
+        begin(tmp_path / "bench", changed["[rig] mirror_offset_mm"][0], plan, True, bench)
 
 
 def test_plans_that_the_rig_cannot_run_are_refused_before_anything_moves(mounted_rig):

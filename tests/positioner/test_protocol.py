@@ -80,3 +80,6 @@ def test_unknown_fields_are_kept_apart():
 def test_settings_of_a_rig_file():
     table = {"driver": "serial", "pan_min_steps": -400, "tilt_max_steps": 10, "speed_steps_per_s": 1e6}
     assert device_settings(table) == {"pmin": -400, "tmax": 10, "vmax": 20_000}
+    home = {"pan_home_steps": -900, "tilt_home_steps": 300}
+    ramp = {"acceleration_steps_per_s2": 2500.0, "laser_watchdog_s": 1.5}
+    assert device_settings({**home, **ramp}) == {"hp": -900, "ht": 300, "amax": 2_500, "wd": 1_500}

@@ -21,6 +21,7 @@ from tvsbayes.acquisition.journal_events import Four
 from tvsbayes.acquisition.observation import Observation
 from tvsbayes.acquisition.operator import HAZARD, Progress, StopKey
 from tvsbayes.acquisition.recorder import Recorded
+from tvsbayes.acquisition.run_identity import setup_entries
 from tvsbayes.acquisition.run_log import Outcome, RunLog
 from tvsbayes.acquisition.running_estimate import RunningEstimate
 from tvsbayes.errors import DeviceFault, TvsError
@@ -130,7 +131,8 @@ class Acquisition:
     def _run(self) -> str:
         if not self.bench.operator.accept(HAZARD):
             return "declined"
-        self._log.write("start", utc=self._log.utc_text(), **self.bench.details)
+        setup = setup_entries(self.rig, bool(self.journal.records[0].data.get("synthetic")))
+        self._log.write("start", utc=self._log.utc_text(), setup=setup, **self.bench.details)
         resumed = self._log.recorder.result()
         # Before the first homing nothing counts, whatever was placed.
         next_row = resumed.next_step if resumed.moves else 0

@@ -18,7 +18,10 @@ Four = tuple[float, float, float, float]
 
 
 class Created(TypedDict):
-    """The first event: whose journal it is; a plan and a rig are known by their SHA-256."""
+    """The first event: whose journal it is; a plan is known by its SHA-256, a rig by the entries that may not change.
+
+    Earlier journals know the rig by a SHA-256 too.
+    """
 
     format: str
     created: str
@@ -26,6 +29,7 @@ class Created(TypedDict):
     synthetic: NotRequired[bool]
     seed: NotRequired[int]
     plan_sha256: NotRequired[str]
+    rig: NotRequired[dict[str, object]]
     rig_sha256: NotRequired[str]
     repaired: NotRequired[bool]
 

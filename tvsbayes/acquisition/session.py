@@ -6,8 +6,6 @@
 from __future__ import annotations
 
 import datetime
-import hashlib
-import json
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
@@ -18,13 +16,13 @@ from tvsbayes.acquisition.engine import Acquisition, Outcome
 from tvsbayes.acquisition.journal import Journal, read_journal, require_journal
 from tvsbayes.acquisition.operator import StopKey, Terminal, TerminalOperator, check_hazard
 from tvsbayes.acquisition.recorder import Recorded, recorded
+from tvsbayes.acquisition.run_identity import check_same, identity, setup_changes
 from tvsbayes.acquisition.running_estimate import EstimateWish, RunningEstimate
 from tvsbayes.errors import escaped, refusal
 from tvsbayes.instrument.axes import AXES
 from tvsbayes.instrument.counter_limits import LIMIT_KEYS
 from tvsbayes.instrument.plan import PlanStep, run_plan
-from tvsbayes.instrument.rig import Rig, rig_table_toml
-from tvsbayes.instrument.stereo_pair import stereo_bytes
+from tvsbayes.instrument.rig import Rig
 from tvsbayes.instrument.stops import legs_of
 from tvsbayes.positioner.protocol import LIMIT_SETTINGS, SETTINGS
 
@@ -78,6 +76,8 @@ def acquire(
         stack.callback(journal.close)
         if journal.torn:
             terminal.say(f"{len(journal.torn)} bytes of an unfinished line were cut off and kept in log.torn-*")
+        for change in setup_changes(journal.records, rig, simulate):
+            terminal.say(change)
         running = None
         if estimate is not None and estimate.holds(simulate):
             target, directions = estimate.target_u_deg_per_step, set(legs_of(run_plan(plan, rig).moves))
@@ -132,44 +132,19 @@ def begin(folder: Path, rig: Rig, plan: Sequence[PlanStep], resume: bool, header
     Raises:
         InputError: nothing to go on with, another plan or rig than before, or a folder that has a journal.
     """
-    hashes = {"plan_sha256": plan_sha256(plan), "rig_sha256": rig_sha256(rig)}
     if not resume:
         if folder.is_dir() and any(folder.iterdir()):
             place, remedy = escaped(str(folder), 200), "name another folder, or go on with --resume"
             found, allowed = "a folder with files", "a new or empty folder"
             raise refusal("occupied", file=place, found=found, allowed=allowed, remedy=remedy)
         created = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
-        return Journal.create(folder, **{"created": created, **header}, **hashes)
+        return Journal.create(
+            folder, **{"created": created, **header}, **identity(rig, plan, bool(header.get("synthetic")))
+        )
     journal = Journal.open(folder)
     try:
-        _check_same(journal.records[0].data, hashes, header)
+        check_same(journal.records[0].data, rig, plan, header)
     except BaseException:
         journal.close()
         raise
     return journal
-
-
-def _check_same(before: Mapping[str, object], hashes: Mapping[str, str], header: Mapping[str, object]) -> None:
-    """Refuses to go on with another plan, rig or seed than the journal's first event states."""
-    for name, now in hashes.items():
-        if before.get(name) != now:
-            what = name.partition("_")[0]
-            allowed = f"the {what} that this campaign began with (SHA-256 {before.get(name)})"
-            remedy = f"give the unchanged {what}, or begin a new campaign in another folder"
-            raise refusal("changed", file=what, found=f"another {what}", allowed=allowed, remedy=remedy)
-    for name in ("synthetic", "seed"):
-        if before.get(name) != header.get(name):
-            allowed, remedy = f"{name} {before.get(name)}, as before", "give the options of the first run"
-            raise refusal("changed", file=name, found=str(header.get(name)), allowed=allowed, remedy=remedy)
-
-
-def plan_sha256(plan: Sequence[PlanStep]) -> str:
-    """What makes a plan the same plan: its steps, not its file."""
-    rows = [(s.step, s.action, s.pan_steps, s.tilt_steps, s.target, s.experiment, s.point) for s in plan]
-    return hashlib.sha256(json.dumps(rows).encode()).hexdigest()
-
-
-def rig_sha256(rig: Rig) -> str:
-    """What makes a rig the same rig: priors, stereo calibration, sheets, positioner and cameras."""
-    tables = json.dumps([rig.sheets_mm, rig.positioner, rig.cameras], sort_keys=True)
-    return hashlib.sha256(rig_table_toml(rig.table).encode() + stereo_bytes(rig.stereo) + tables.encode()).hexdigest()

@@ -178,7 +178,8 @@ class Instrument:
         self._drift_deg, self._drifted_us = [0.0, 0.0], [0, 0]
         self._y = [b * self._stops.uniform(-0.5, 0.5) for b in self._backlash]
         self._eta = [0.0, 0.0]
-        home = SETTINGS["hp"][2], SETTINGS["ht"][2]
+        stated = device_settings(rig.positioner)
+        home = stated.get("hp", SETTINGS["hp"][2]), stated.get("ht", SETTINGS["ht"][2])
         self.mechanics = Mechanics(home_steps=home, moved=self._moved, found_home=self._found_home)
         # A boot id of its own for every start: a simulated device does not outlive its process.
         self.device = SimulatedDevice(self.clock, self.mechanics, first_boot=1 + 1000 * start)

@@ -11,6 +11,8 @@ COUNTER_MAX = 10**8
 """No counter of a plan, a campaign or a limit lies beyond."""
 LIMIT_KEYS = {axis: (f"{axis}_min_steps", f"{axis}_max_steps") for axis in AXES}
 """Entries of `[positioner]`, lowest first."""
+HOME_KEYS = {axis: f"{axis}_home_steps" for axis in AXES}
+"""Entries of `[positioner]` that give the counter at the home switch."""
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from tvsbayes.errors import InputError, closest, escaped
 from tvsbayes.files.disk import read_bytes
 from tvsbayes.files.documents import TOML_BYTES_MAX, Keys, parse_toml, toml_line
 from tvsbayes.instrument.axes import AXES, DIRECTION_SIGNS, FULL_TURN_DEG
-from tvsbayes.instrument.counter_limits import COUNTER_MAX, LIMIT_KEYS, CounterLimits
+from tvsbayes.instrument.counter_limits import COUNTER_MAX, HOME_KEYS, LIMIT_KEYS, CounterLimits
 from tvsbayes.instrument.parameters import (
     AMPLITUDE_NAMES,
     HARMONIC_NAMES,
@@ -285,10 +285,38 @@ def rig_table_toml(table: RigTable) -> str:
 _COSTS_S = {"move_s": 1.5, "look_s": 1.0, "placement_s": 60.0}
 
 
+_NUMBERS = {
+    "speed_steps_per_s": (1e-3, 1e7),
+    "acceleration_steps_per_s2": (10.0, 1e5),
+    "laser_watchdog_s": (0.1, 10.0),
+    "settle_s": (0.0, 3600.0),
+}
+"""Entries of `[positioner]` that are numbers, with their range."""
+
+
+def _parse_options(table: Keys) -> dict[str, Setting]:
+    """The table `options` of a driver, which checks it itself: entries as `options.NAME`."""
+    if "options" not in table:
+        return {}
+    options = table.table("options")
+    values: dict[str, Setting] = {}
+    for key, value in options.values.items():
+        if isinstance(value, str):
+            values[f"options.{key}"] = options.text_value(key)
+        elif isinstance(value, bool):
+            values[f"options.{key}"] = int(value)
+        else:
+            whole = isinstance(value, int)
+            values[f"options.{key}"] = (
+                options.integer(key, -(2**53), 2**53) if whole else options.number(key, -1e300, 1e300)
+            )
+    return values
+
+
 def _parse_positioner(table: Keys) -> dict[str, Setting]:
-    """`[positioner]`: driver, port, limits and speeds."""
-    keys = [key for pair in LIMIT_KEYS.values() for key in pair]
-    table.only(("driver", "port", "baud", *keys, "speed_steps_per_s", "settle_s"))
+    """`[positioner]`: driver, port, limits, counters at the home switches, speeds; `options` of other drivers."""
+    keys = [key for pair in LIMIT_KEYS.values() for key in pair] + list(HOME_KEYS.values())
+    table.only(("driver", "port", "baud", *keys, *_NUMBERS, "options"))
     values: dict[str, Setting] = {key: table.text_value(key) for key in ("driver", "port") if key in table}
     # Serial libraries read an address as instructions: one of them writes a file of the address' choice.
     if "://" in str(values.get("port", "")):
@@ -300,16 +328,16 @@ def _parse_positioner(table: Keys) -> dict[str, Setting]:
     for lowest, highest in LIMIT_KEYS.values():
         if lowest in steps and highest in steps and steps[lowest] > steps[highest]:
             raise table.refuse(highest, "limits", f"at least {lowest} = {steps[lowest]}", "swap the two limits")
-    for key, low_s, high_s in (("speed_steps_per_s", 1e-3, 1e7), ("settle_s", 0.0, 3600.0)):
-        if key in table:
-            values[key] = table.number(key, low_s, high_s)
-    return {**values, **steps}
+    values |= {key: table.number(key, *ends) for key, ends in _NUMBERS.items() if key in table}
+    return {**values, **steps, **_parse_options(table)}
 
 
 def _parse_cameras(table: Keys, stereo: Stereo) -> dict[str, Setting]:
-    """`[cameras]`: source, devices, size (that of the calibration), exposure, spot uncertainty."""
-    table.only(("source", "left", "right", "width", "height", "exposure", "spot_sd_px"))
-    values: dict[str, Setting] = {"spot_sd_px": SPOT_SD_PX}
+    """`[cameras]`: driver, devices, size (that of the calibration), exposure, spot uncertainty, `options`."""
+    table.only(("driver", "source", "left", "right", "width", "height", "exposure", "spot_sd_px", "options"))
+    values: dict[str, Setting] = {"spot_sd_px": SPOT_SD_PX, **_parse_options(table)}
+    if "driver" in table:
+        values["driver"] = table.text_value("driver")
     for key in ("source", "left", "right"):
         if key in table:
             device = isinstance(table.values[key], str)

@@ -26,7 +26,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Literal, cast
 
-from tvsbayes.instrument.counter_limits import CounterLimits
+from tvsbayes.instrument.counter_limits import HOME_KEYS, CounterLimits
 
 VERSION = 1
 """Version of this protocol; a device with another one is refused."""
@@ -55,6 +55,11 @@ SETTINGS: dict[str, tuple[int, int, int]] = {
 (steps), counters at the home switches (steps), laser watchdog (ms)."""
 LIMIT_SETTINGS = {"pan": ("pmin", "pmax"), "tilt": ("tmin", "tmax")}
 """Soft limits of an axis, lowest first, by their names in the protocol."""
+OTHER_SETTINGS = (
+    *(("hp", HOME_KEYS["pan"], 1.0), ("ht", HOME_KEYS["tilt"], 1.0)),
+    *(("amax", "acceleration_steps_per_s2", 1.0), ("wd", "laser_watchdog_s", 1e-3)),
+)
+"""Other settings: name in the protocol, entry of `[positioner]`, the protocol's unit in that of the entry."""
 _INTEGER = re.compile(r"0|-?[1-9][0-9]{0,9}")
 _UNSIGNED = re.compile(r"0|[1-9][0-9]{0,9}")
 _FRAME = re.compile(rb"([><!][ -)+-~]*)\*([0-9A-F]{4})")
@@ -229,7 +234,7 @@ def _state(fields: dict[str, str]) -> DeviceState:
 
 
 def device_settings(positioner: Mapping[str, str | int | float]) -> dict[str, int]:
-    """Device settings that `[positioner]` of a rig file states: limits and top speed."""
+    """Device settings that `[positioner]` of a rig file states: limits, counters at home, ramp and laser watchdog."""
     stated = CounterLimits.of(positioner).steps
     settings = {
         key: limit
@@ -240,4 +245,7 @@ def device_settings(positioner: Mapping[str, str | int | float]) -> dict[str, in
     if "speed_steps_per_s" in positioner:
         low, high, _ = SETTINGS["vmax"]
         settings["vmax"] = min(max(round(float(positioner["speed_steps_per_s"])), low), high)
+    for key, name, unit in OTHER_SETTINGS:
+        if name in positioner:
+            settings[key] = round(float(positioner[name]) / unit)
     return settings
