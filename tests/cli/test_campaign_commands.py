@@ -98,24 +98,6 @@ def test_simulate_can_keep_the_homing_sides_to_itself(ask, tmp_path):
     assert truth["effective_deg_per_step"] == pytest.approx(truth["local_deg_per_step"], rel=5 * 0.05 * 2**0.5 / 1.8)
 
 
-def test_new_campaign_lacks_only_its_stereo_calibration(ask, say, tmp_path):
-    out = tmp_path / "mine"
-    code, document = ask("new", out)
-    assert code == 0
-    assert sorted(document["files"]) == ["campaign.toml", "moves.csv", "rig.toml", "spots.csv"]
-    code, document = ask("check", out)
-    assert code == 2
-    assert assert_error(document, "missing-file")["file"] == "stereo.json"
-    (out / "stereo.json").write_bytes((MOUNTED / "stereo.json").read_bytes())
-    code, document = ask("check", out)
-    assert code == 0
-    assert (document["moves"], document["spots"]) == (1, 0)
-    assert ask("check", out / "rig.toml")[0] == 0
-    code, text, log = say("new", out)
-    assert (code, text) == (2, "")
-    assert "nothing is overwritten" in log
-
-
 def test_demo_shows_classic_and_joint_beside_the_truth(ask, tmp_path):
     out = tmp_path / "kept"
     code, document = ask("demo", out)

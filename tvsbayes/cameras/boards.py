@@ -1,4 +1,4 @@
-"""Checkerboards in pictures: which files are a pair, where the inner corners are, in an order both cameras share.
+"""Checkerboards in pictures: where the inner corners are, in an order both cameras share.
 
 Corners are px with the integer at a pixel's centre, shape (corners, 2), row by row. The board's frame: origin in the
 middle, x along the columns, y along the rows, z away from the viewer, mm. Pictures pass the checks of `files` before
@@ -20,6 +20,7 @@ from typing import Literal
 import cv2
 import numpy as np
 
+from tvsbayes.cameras.picture_pairs import NAMING, SIDE_BY_SIDE_RATIO, Picture, natural_order, pictures_of
 from tvsbayes.errors import InputError, NothingToEstimate, escaped, refusal
 from tvsbayes.files.disk import read_bytes
 from tvsbayes.files.images import IMAGE_BYTES_MAX, image_size, read_image
@@ -27,9 +28,6 @@ from tvsbayes.instrument.campaign import CAMERAS
 from tvsbayes.progress import Advance, unshown
 
 Finder = Literal["classic", "sector"]
-SUFFIXES = (".png", ".jpg", ".jpeg")
-SIDE_BY_SIDE_RATIO = 2.0
-"""Width over height from which a picture that is named neither left nor right holds both cameras' images."""
 REFINING_SHARE = 0.25
 """Half the window of cornerSubPix over the smallest distance of two corners: the window must hold one corner only,
 and a wide one averages more noise. On OpenCV's pairs (22 to 37 px) fixed halves of 3, 5, 7, 9, 11 px leave 0.23,
@@ -250,56 +248,13 @@ def _unit(vector: np.ndarray) -> np.ndarray:
     return vector / max(float(np.linalg.norm(vector)), 1e-12)
 
 
-def _natural(name: str) -> list[tuple[int, str]]:
-    """Sorts 2 before 10."""
-    return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"([0-9]{1,18})", name.lower())]
-
-
-@dataclass(frozen=True)
-class _Picture:
-    """A file and whose images its equal parts, from left to right, are."""
-
-    view: str
-    path: Path
-    sides: tuple[str, ...]
-
-
-def _pictures(folder: Path, swap: bool) -> list[_Picture]:
-    """The pictures of a folder: `left*` and `right*`, or where there are none, wide frames of both cameras."""
-    try:
-        names = sorted((entry.name for entry in os.scandir(folder)), key=_natural)
-    except OSError as error:
-        place, remedy = escaped(str(folder), 200), "name the folder of the checkerboard pictures"
-        found, allowed = escaped(error.strerror or str(error)), "a readable folder"
-        raise refusal("unreadable", file=place, found=found, allowed=allowed, remedy=remedy) from error
-    images = [Path(folder) / name for name in names if name.lower().endswith(SUFFIXES) and not name.startswith(".")]
-    if len(images) > PICTURES_MAX:
-        place, remedy = escaped(str(folder), 200), "20 to 100 views are plenty; move the others away"
-        found, allowed = f"{len(images)} pictures", f"at most {PICTURES_MAX}"
-        raise refusal("size", file=place, found=found, allowed=allowed, remedy=remedy)
-    sided = [
-        _Picture(path.stem[len(side) :], path, (side,))
-        for path in images
-        for side in CAMERAS
-        if path.stem.lower().startswith(side)
-    ]
-    twice = [key for key, count in Counter((p.view, p.sides) for p in sided).items() if count > 1]
-    if twice:
-        (view, (side,)), remedy = twice[0], "keep one file per camera and view"
-        found = f"two pictures {escaped(side + view)}"
-        raise refusal("duplicate", file=escaped(str(folder), 200), found=found, allowed="one", remedy=remedy)
-    if sided:
-        return sided
-    return [_Picture(path.stem, path, CAMERAS[::-1] if swap else CAMERAS) for path in images]
-
-
 def find_views(
     folder: Path, board: Board, *, finder: Finder = "classic", swap: bool = False, advance: Advance = unshown
 ) -> Views:
     """Finds the board in all pictures of a folder.
 
-    `left*` and `right*` (PNG, JPEG) are paired by the rest of the name without its suffix. Where no file has such a
-    name, pictures at least twice as wide as high are split in the middle. Other files are ignored.
+    Pictures (PNG, JPEG) are paired as `picture_pairs` says. Where no file is named after a camera, pictures at least
+    twice as wide as high are split in the middle. Other files are ignored.
 
     Args:
         folder: of the pictures.
@@ -334,7 +289,7 @@ def find_views(
             if detection.by_fallback:
                 fallback.append(name)
     views, reordered = [], []
-    for name in sorted(boards, key=_natural):
+    for name in sorted(boards, key=natural_order):
         left, right = (boards[name].get(side) for side in CAMERAS)
         corners = None if right is None else right.corners
         if left is not None and right is not None:
@@ -346,7 +301,7 @@ def find_views(
         views=tuple(views),
         image_width=size[0],
         image_height=size[1],
-        unpaired=tuple(sorted(lonely, key=_natural)),
+        unpaired=tuple(sorted(lonely, key=natural_order)),
         without_board=tuple(without),
         other_size=tuple(picture.path.name for picture, own in sizes.items() if own != size),
         by_fallback=tuple(fallback),
@@ -354,13 +309,13 @@ def find_views(
     )
 
 
-def _sizes(folder: Path, swap: bool) -> dict[_Picture, tuple[int, int]]:
+def _sizes(folder: Path, swap: bool) -> dict[Picture, tuple[int, int]]:
     """Width and height of one camera's image in every picture of a board, by their headers.
 
     The pictures of the majority are one calibration, and only those are decoded.
     """
     sizes = {}
-    for picture in _pictures(folder, swap):
+    for picture in pictures_of(folder, swap=swap, most=PICTURES_MAX):
         data = read_bytes(picture.path, IMAGE_BYTES_MAX, folder)
         width, height = image_size(data, escaped(picture.path.name))
         if width * height > PIXELS_MAX:
@@ -373,18 +328,18 @@ def _sizes(folder: Path, swap: bool) -> dict[_Picture, tuple[int, int]]:
         raise NothingToEstimate(
             "no-pictures",
             f"{escaped(str(folder), 200)}: no checkerboard picture",
-            allowed="left*.png with right*.png (or .jpg), or frames of both cameras side by side",
+            allowed=f"{NAMING} (PNG or JPEG); or frames of both cameras side by side",
             remedy="name the pictures left01.png, right01.png, left02.png ...",
         )
     return sizes
 
 
 def _detections(
-    folder: Path, pictures: Sequence[_Picture], size: tuple[int, int], board: Board, finder: Finder
+    folder: Path, pictures: Sequence[Picture], size: tuple[int, int], board: Board, finder: Finder
 ) -> Iterator[dict[str, _Detection | None]]:
     """The boards in pictures, by the camera whose image holds it."""
 
-    def detect(picture: _Picture) -> dict[str, _Detection | None]:
+    def detect(picture: Picture) -> dict[str, _Detection | None]:
         grey = cv2.cvtColor(read_image(picture.path, folder), cv2.COLOR_BGR2GRAY)
         parts = (grey[:, k * size[0] : (k + 1) * size[0]] for k in range(len(picture.sides)))
         return {

@@ -201,12 +201,7 @@ def detect(
     rows = [row for row, spot in enumerate(campaign.spots) if _ours(spot.status)]
     present = [row for row in rows if frames.there(campaign.spots[row])]
     if not present:
-        raise NothingToEstimate(
-            "no-frames",
-            f"frames/ holds pictures of none of the {len(campaign.spots)} rows of spots.csv",
-            allowed="frames/000012_left.png and frames/000012_right.png for spot 12",
-            remedy="put the pictures there, or write centroids into spots.csv yourself",
-        )
+        raise _no_frames(campaign)
     workers = workers or os.cpu_count() or 1
     learning = min(PILOTS_MAX, len(present)) if method == "fit" else 0
     with Job({LEARNING: learning, DETECTING: len(present)}, progress) as job:
@@ -231,6 +226,21 @@ def detect(
         statuses=dict(Counter(spot.status for spot in after).most_common()),
         noise=noise,
         median_sd_px=float(np.median(stated)) if stated else None,
+    )
+
+
+def _no_frames(campaign: Campaign) -> NothingToEstimate:
+    """Why there is nothing to detect, and how pictures get there."""
+    place = escaped(str(campaign.path), 200)
+    pairing = f"`tvsbayes new {place} --pictures FOLDER` lists the pictures of a folder and copies them there"
+    message = f"frames/ holds pictures of none of the {len(campaign.spots)} rows of spots.csv"
+    if not campaign.spots:
+        message = "spots.csv has no rows: nothing says after which move a picture was taken"
+    return NothingToEstimate(
+        "no-frames",
+        message,
+        allowed="frames/000012_left.png and frames/000012_right.png for spot 12, its status undetected",
+        remedy=f"{pairing}; or write centroids into spots.csv yourself",
     )
 
 

@@ -1,4 +1,4 @@
-"""Commands on campaigns: demo, new, simulate, detect, check.
+"""Commands on campaigns: demo, simulate, detect, check.
 
 Options in, library called, table or JSON out; heavy imports stand inside the commands.
 """
@@ -77,25 +77,6 @@ def _sampled(campaign: Campaign, progress: Show | None) -> FitSummary:
     with Job({FITTING: 1.0, SAMPLING: 1.0}, progress) as job:
         found = fit(campaign, progress=job.part(FITTING))
         return summarise(found, sample(found, "importance", progress=job.part(SAMPLING)))
-
-
-def new(
-    out: Annotated[Path, typer.Argument(metavar="OUT", help="Folder to create.")],
-    axis: Annotated[bool, typer.Option("--axis", help="One axis and its readings, no optics.")] = False,
-    as_json: Json = False,
-) -> None:
-    """An empty campaign, explained in campaign.toml, and a rig file. Fill them, or plan and simulate with the rig."""
-    if axis:
-        axis_commands.new_axis(out, as_json)
-        return
-    make_folder(out, empty=True)
-    templates = sorted((shipped_data() / "templates").iterdir())
-    for template in templates:
-        write_atomically(out / template.name, template.read_bytes())
-    names = [template.name for template in templates]
-    text = f"{escaped(str(out), 200)}: {', '.join(names)}\n"
-    text += "next: put stereo.json beside them, log moves and spots, then `tvsbayes check` this folder"
-    finish({"campaign": str(out), "files": names}, text, as_json)
 
 
 def simulate(

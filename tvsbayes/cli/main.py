@@ -22,8 +22,9 @@ from tvsbayes.cli.app import (
     report_error,
     report_line,
 )
+from tvsbayes.cli.begin_commands import new
 from tvsbayes.cli.bench_commands import acquire, doctor, stereo
-from tvsbayes.cli.campaign_commands import check, demo, detect, new, simulate
+from tvsbayes.cli.campaign_commands import check, demo, detect, simulate
 from tvsbayes.cli.estimate_commands import classic, compare, fit, report
 from tvsbayes.cli.use_commands import locate, plan, steps_for, study
 from tvsbayes.errors import InputError, TvsError

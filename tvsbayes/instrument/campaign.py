@@ -87,9 +87,9 @@ PIXELS = ("u_left_px", "v_left_px", "u_right_px", "v_right_px")
 """Columns of a spot's centres."""
 NO_PIXELS = (None, None, None, None)
 """Pixels, or their standard uncertainties, of a look without a spot."""
-_MOVE_COLUMNS = ("move", "segment", "time_s", "pan_steps", "tilt_steps", "pan_approach", "tilt_approach")
+MOVE_COLUMNS = ("move", "segment", "time_s", "pan_steps", "tilt_steps", "pan_approach", "tilt_approach")
 _PIXEL_SDS = ("su_left_px", "sv_left_px", "su_right_px", "sv_right_px")
-_SPOT_COLUMNS = (
+SPOT_COLUMNS = (
     *("spot", "move", "target", "experiment", "point"),
     *(*PIXELS, *_PIXEL_SDS, "aperture_deg", "status"),
 )
@@ -139,7 +139,7 @@ def with_pixels(
 
 def parse_moves(data: bytes, file: str = "moves.csv") -> tuple[Move, ...]:
     """The checked rows of `moves.csv`; at least one."""
-    table = parse_table(data, file, _MOVE_COLUMNS)
+    table = parse_table(data, file, MOVE_COLUMNS)
     if not len(table):
         allowed, remedy = "at least one row", "write row 0: the counters and approaches after homing"
         raise refusal("empty", file=file, line=1, found="no rows", allowed=allowed, remedy=remedy)
@@ -194,7 +194,7 @@ def parse_spots(data: bytes, file: str, moves: int, stereo: Stereo) -> tuple[Spo
         moves: number of moves, which `move` must name.
         stereo: gives the image size.
     """
-    table = parse_table(data, file, _SPOT_COLUMNS, _CORRELATIONS)
+    table = parse_table(data, file, SPOT_COLUMNS, _CORRELATIONS)
     spots = table.integers("spot", 0, ID_MAX)
     table.check_unique("spot", spots, "unique ids")
     move_ids = table.integers("move", 0, ID_MAX)
@@ -332,13 +332,13 @@ def read_campaign(folder: Path | str) -> Campaign:
 
 def moves_bytes(moves: Iterable[Move]) -> bytes:
     """The content of `moves.csv`."""
-    return csv_bytes(_MOVE_COLUMNS, ([getattr(m, c) for c in _MOVE_COLUMNS] for m in moves))
+    return csv_bytes(MOVE_COLUMNS, ([getattr(m, c) for c in MOVE_COLUMNS] for m in moves))
 
 
 def spots_bytes(spots: Sequence[Spot]) -> bytes:
     """The content of `spots.csv`; the correlations appear only where one is not zero."""
     correlated = any(s.ruv_left or s.ruv_right for s in spots)
-    columns = (*_SPOT_COLUMNS, *(_CORRELATIONS if correlated else ()))
+    columns = (*SPOT_COLUMNS, *(_CORRELATIONS if correlated else ()))
     return csv_bytes(columns, ([getattr(s, c) for c in columns] for s in spots))
 
 

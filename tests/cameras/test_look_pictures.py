@@ -1,0 +1,113 @@
+"""To which look a pair of pictures belongs, and how it comes into `frames/`."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+from support.drawn_pictures import SIZE, drawn, pairs
+
+from tvsbayes.cameras.look_pictures import copy_frames, pair_looks, views_of
+from tvsbayes.errors import InputError
+from tvsbayes.files.images import png_bytes, read_image
+from tvsbayes.instrument.campaign import Spot
+
+
+def test_the_number_in_the_name_is_the_move(tmp_path):
+    """Of several numbers the one that tells most looks apart; the rest of the name is the sheet."""
+    drawn(tmp_path, *pairs("_d1_000", "_d1_007", "_d2_007", "_d1_012"))
+    found = pair_looks(views_of(tmp_path).views, range(20))
+    assert found.matching == "number"
+    assert [(s.spot, s.move, s.target, s.status) for s in found.spots] == [
+        (0, 0, "d1", "undetected"),
+        (1, 7, "d1", "undetected"),
+        (2, 7, "d2", "undetected"),
+        (3, 12, "d1", "undetected"),
+    ]
+    assert found.pictures[2].name == "_d2_007"
+    assert found.without == tuple(move for move in range(20) if move not in (0, 7, 12))
+
+
+def test_names_without_a_fitting_number_count_in_order(tmp_path):
+    """1, 2 ... 10 for moves 0 to 9: the names sort as people count."""
+    drawn(tmp_path, *pairs(*map(str, range(1, 11))))
+    views = views_of(tmp_path).views
+    found = pair_looks(views, range(10))
+    assert (found.matching, [s.move for s in found.spots]) == ("order", list(range(10)))
+    assert [found.pictures[k].name for k in (0, 1, 9)] == ["1", "2", "10"]
+    assert pair_looks(views, range(11)).matching == "number"
+    assert pair_looks(views, range(10), matching="order").spots == found.spots
+    for moves, matching in ((9, None), (10, "number"), (12, "order")):
+        with pytest.raises(InputError, match="number of its row"):
+            pair_looks(views, range(moves), matching=matching)
+
+
+def test_without_moves_every_number_is_one(tmp_path):
+    drawn(tmp_path, *pairs("_5", "_7_a", "_7_b", "_12"))
+    found = pair_looks(views_of(tmp_path).views, None)
+    assert [s.move for s in found.spots] == [0, 1, 1, 2]
+    assert [s.target for s in found.spots] == ["", "a", "b", ""]
+
+
+def test_rows_that_wait_take_their_own_pictures(tmp_path):
+    drawn(tmp_path, *pairs("3", "5"))
+    numbers = (0.1,) * 4
+    rows = [
+        Spot(3, 0, "near", 1, 1, *(None,) * 8, status="undetected"),
+        Spot(4, 0, "far", 1, 2, *(9.0,) * 4, *numbers),
+        Spot(5, 1, "far", 1, 3, *(None,) * 8, status="undetected"),
+        Spot(6, 1, "near", 1, 4, *(None,) * 8, status="undetected"),
+    ]
+    found = pair_looks(views_of(tmp_path).views, range(2), rows)
+    assert found.spots == tuple(rows)
+    assert ({spot: view.name for spot, view in found.pictures.items()}, found.without) == ({3: "3", 5: "5"}, (6,))
+    with pytest.raises(InputError, match="none of which waits"):
+        pair_looks(views_of(tmp_path).views, range(2), rows[1:2])
+
+
+def test_what_is_no_pair_is_said(tmp_path):
+    drawn(tmp_path, *pairs("1", "2"), "left3.png")
+    drawn(tmp_path, *pairs("4"), size=(3, 4))
+    (tmp_path / "left5.tif").write_bytes(b"")
+    seen = views_of(tmp_path)
+    assert [view.name for view in seen.views] == ["1", "2"]
+    assert (seen.unpaired, seen.other_size, seen.unread) == (
+        ("left3.png",),
+        ("left4.png", "right4.png"),
+        ("left5.tif",),
+    )
+    assert (seen.image_width, seen.image_height) == SIZE[::-1]
+    drawn(tmp_path / "lonely", "left1.png")
+    with pytest.raises(InputError, match="no pair among 1"):
+        views_of(tmp_path / "lonely")
+    (tmp_path / "tiff").mkdir()
+    (tmp_path / "tiff" / "a.tif").write_bytes(b"")
+    with pytest.raises(InputError, match="save them as PNG"):
+        views_of(tmp_path / "tiff")
+
+
+@pytest.mark.parametrize("swap", (False, True))
+def test_wide_pictures_are_split_and_nothing_is_overwritten(tmp_path, swap):
+    drawn(tmp_path / "wide", "look_0.png", size=(6, 16))
+    seen = views_of(tmp_path / "wide", swap=swap)
+    out = tmp_path / "mine"
+    out.mkdir()
+    pictures = pair_looks(seen.views, range(1)).pictures
+    assert copy_frames(pictures, out) == copy_frames(pictures, out) == 2
+    whole = cv2.imread(str(tmp_path / "wide" / "look_0.png"))
+    names = ("right", "left") if swap else ("left", "right")
+    halves = [read_image(out / "frames" / f"000000_{name}.png") for name in names]
+    np.testing.assert_array_equal(np.hstack(halves), whole)
+    (out / "frames" / "000000_left.png").write_bytes(png_bytes(whole))
+    with pytest.raises(InputError, match="another picture"):
+        copy_frames(pictures, out)
+
+
+def test_a_png_is_copied_as_it_is_and_a_jpeg_decoded(tmp_path):
+    drawn(tmp_path / "mixed", "left1.png", "right1.jpg")
+    pictures = pair_looks(views_of(tmp_path / "mixed").views, range(1)).pictures
+    copy_frames(pictures, tmp_path)
+    frames = tmp_path / "frames"
+    assert (frames / "000000_left.png").read_bytes() == (tmp_path / "mixed" / "left1.png").read_bytes()
+    right = read_image(tmp_path / "mixed" / "right1.jpg")
+    np.testing.assert_array_equal(read_image(frames / "000000_right.png"), right)

@@ -1,0 +1,100 @@
+"""`new`: what people have becomes a campaign, nothing is overwritten, and what to do next is said."""
+
+from __future__ import annotations
+
+import shutil
+
+import numpy as np
+import pytest
+from support.commands import MOUNTED, assert_error, steps
+from support.drawn_pictures import drawn, pairs
+
+from tvsbayes.instrument.campaign import moves_bytes, pixels_of, read_campaign
+from tvsbayes.instrument.stereo_pair import write_stereo
+from tvsbayes.twin.frames import write_frames
+from tvsbayes.twin.simulated_campaign import simulate
+
+
+def test_new_campaign_lacks_only_its_stereo_calibration(ask, say, tmp_path):
+    out = tmp_path / "mine"
+    code, document = ask("new", out)
+    assert code == 0
+    assert sorted(document["files"]) == ["campaign.toml", "moves.csv", "rig.toml", "spots.csv"]
+    code, document = ask("check", out)
+    assert code == 2
+    assert assert_error(document, "missing-file")["file"] == "stereo.json"
+    (out / "stereo.json").write_bytes((MOUNTED / "stereo.json").read_bytes())
+    code, document = ask("check", out)
+    assert code == 0
+    assert (document["moves"], document["spots"]) == (1, 0)
+    assert ask("check", out / "rig.toml")[0] == 0
+    code, text, log = say("new", out)
+    assert (code, text) == (2, "")
+    assert "nothing is overwritten" in log
+
+
+@pytest.fixture(scope="module")
+def two_looks(mounted_rig, tmp_path_factory):
+    """A simulated campaign of two moves and its pictures, named as somebody might."""
+    plan = steps(("home", 0, 0), ("place", "d1"), ("look",), ("move", 100, 30), ("look",))
+    run = simulate(mounted_rig, plan, seed=5)
+    folder = tmp_path_factory.mktemp("rendered")
+    write_frames(folder, run, 5, views=0)
+    for path in (folder / "frames").iterdir():
+        number, side = path.stem.split("_")
+        path.rename(folder / f"{side.title()}_{int(number) + 1}.png")
+    (folder / "frames").rmdir()
+    return run.campaign, folder
+
+
+def test_pictures_become_looks_that_detect_finds(ask, say, two_looks, tmp_path):
+    """From a folder of pictures to centres; the twin's own centroids lie within a few of their uncertainties."""
+    campaign, pictures = two_looks
+    out = tmp_path / "mine"
+    assert ask("new", out)[0] == 0
+    (out / "moves.csv").write_bytes(moves_bytes(campaign.moves))
+    write_stereo(campaign.stereo, out / "stereo.json")
+    code, document = ask("detect", out)
+    assert code == 3 and "--pictures" in assert_error(document, "no-frames")["remedy"]
+    code, text, _ = say("new", out, "--pictures", pictures)
+    assert code == 0 and "next: `tvsbayes detect" in text
+    code, document = ask("detect", out)
+    assert (code, document["ok"], document["missing"]) == (0, 2, 0)
+    found = pixels_of(read_campaign(out).spots)
+    # Both scatter by 0.1 px or less; five of those.
+    np.testing.assert_allclose(found, pixels_of(campaign.spots), rtol=0, atol=0.5)
+    code, document = ask("new", out, "--pictures", pictures)
+    assert code == 2 and "none of which waits" in assert_error(document, "occupied")["message"]
+
+
+def test_moves_beside_the_pictures_come_along(ask, two_looks, tmp_path):
+    campaign, pictures = two_looks
+    shutil.copytree(pictures, tmp_path / "pictures")
+    (tmp_path / "pictures" / "moves.csv").write_bytes(moves_bytes(campaign.moves))
+    code, document = ask("new", tmp_path / "mine", "--pictures", tmp_path / "pictures")
+    assert (code, document["looks"], document["moves_to_fill_in"]) == (0, 2, False)
+    assert (tmp_path / "mine" / "moves.csv").read_bytes() == moves_bytes(campaign.moves)
+
+
+def test_without_moves_their_counters_are_asked_for(ask, say, tmp_path):
+    drawn(tmp_path / "pictures", *pairs("1", "2", "3"), "left4.png")
+    out = tmp_path / "mine"
+    code, text, _ = say("new", out, "--pictures", tmp_path / "pictures")
+    assert code == 0 and "fill in moves.csv: pan_steps and tilt_steps" in text
+    assert "not paired: left4.png: without the picture of the other camera" in text
+    shutil.copy(MOUNTED / "stereo.json", out)
+    code, document = ask("check", out)
+    error = assert_error(document, "integer")
+    assert (code, error["file"], error["line"], error["column"]) == (2, "moves.csv", 2, "pan_steps")
+    code, document = ask("new", tmp_path / "other", "--pictures", tmp_path / "pictures", "--pair", "name")
+    assert code == 2 and "number, order" in assert_error(document, "usage")["message"]
+
+
+def test_pictures_are_for_a_calibration_of_their_size(ask, tmp_path):
+    drawn(tmp_path / "pictures", *pairs("0"))
+    assert ask("new", tmp_path / "mine")[0] == 0
+    shutil.copy(MOUNTED / "stereo.json", tmp_path / "mine")
+    code, document = ask("new", tmp_path / "mine", "--pictures", tmp_path / "pictures")
+    assert code == 2 and "8 x 6 px" in assert_error(document, "image-size")["message"]
+    assert not (tmp_path / "mine" / "frames").exists()
+    assert ask("new", tmp_path / "mine", "--swap")[0] == 2

@@ -1,0 +1,261 @@
+"""Pictures of spots from a folder of any names: to which look each pair belongs, and their way into `frames/`.
+
+A pair belongs to the row of `spots.csv` (where there are rows), else to the move, whose number stands in its name;
+where no number does, pairs and rows are matched one by one in the order of the names. Nothing is overwritten.
+"""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from tvsbayes.cameras.picture_pairs import NAMING, SIDE_BY_SIDE_RATIO, Picture, natural_order, pictures_of
+from tvsbayes.errors import InputError, escaped, refusal
+from tvsbayes.files.disk import make_folder, read_bytes, write_atomically
+from tvsbayes.files.images import IMAGE_BYTES_MAX, decode_image, image_size, png_bytes
+from tvsbayes.instrument.campaign import CAMERAS, NO_PIXELS, Spot, frame_name
+from tvsbayes.progress import Advance, unshown
+
+Matching = Literal["number", "order"]
+LOOKS_MAX = 100_000
+UNDETECTED = "undetected"
+"""Status of a row whose pictures wait for `detect`."""
+OTHER_KINDS = (".bmp", ".tif", ".tiff", ".webp", ".gif", ".raw", ".dng", ".pgm", ".ppm")
+"""Suffixes of pictures that are not read, for a word about them."""
+_NUMBER = re.compile(r"[0-9]{1,9}")
+
+
+@dataclass(frozen=True)
+class View:
+    """Both pictures of one moment.
+
+    Attributes:
+        name: what their names share.
+        pictures: left and right; twice the same where one file holds both.
+    """
+
+    name: str
+    pictures: tuple[Picture, Picture]
+
+    @property
+    def numbers(self) -> list[int]:
+        """The numbers in its name, in order."""
+        return [int(number) for number in _NUMBER.findall(self.name)]
+
+    def without_number(self, place: int) -> str:
+        """Its name without one of its numbers: what else it says, such as the sheet."""
+        found = list(_NUMBER.finditer(self.name))[place]
+        rest = f"{self.name[: found.start()]} {self.name[found.end() :]}"
+        return re.sub(r"[\s_.-]+", " ", rest).strip(" =+-@")
+
+
+@dataclass(frozen=True)
+class ViewedFolder:
+    """The pairs of a folder.
+
+    Attributes:
+        views: pairs of one size, in the natural order of their names.
+        image_width, image_height: size of one camera's picture, px.
+        unpaired: files without their other camera.
+        other_size: files of another size than most.
+        unread: files of kinds that are not read.
+    """
+
+    views: tuple[View, ...]
+    image_width: int
+    image_height: int
+    unpaired: tuple[str, ...]
+    other_size: tuple[str, ...]
+    unread: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class PairedLooks:
+    """Rows of `spots.csv` with their pictures.
+
+    Attributes:
+        spots: all rows, as they are to be written.
+        pictures: of each of them that has some, by its `spot`.
+        matching: by number or in order.
+        left_over: views whose number is that of no row.
+        without: numbers of the rows, or moves, that have no pictures.
+    """
+
+    spots: tuple[Spot, ...]
+    pictures: dict[int, View]
+    matching: Matching
+    left_over: tuple[str, ...]
+    without: tuple[int, ...]
+
+
+def views_of(folder: Path, *, swap: bool = False) -> ViewedFolder:
+    """The pairs of pictures in a folder.
+
+    Args:
+        folder: where they lie; see `picture_pairs` for names.
+        swap: the left camera's image is the right half of a wide picture.
+
+    Raises:
+        InputError: no folder, no pair, an unreadable picture.
+    """
+    pictures = pictures_of(folder, swap=swap, most=2 * LOOKS_MAX)
+    sizes: dict[Picture, tuple[int, int]] = {}
+    for picture in pictures:
+        data = read_bytes(picture.path, IMAGE_BYTES_MAX, folder)
+        width, height = image_size(data, escaped(picture.path.name))
+        if len(picture.sides) == 1 or width >= SIDE_BY_SIDE_RATIO * height:
+            sizes[picture] = width // len(picture.sides), height
+    unread = [path.name for path in sorted(Path(folder).iterdir()) if path.suffix.lower() in OTHER_KINDS]
+    counted = Counter(sizes.values())
+    size = max(counted, key=lambda one: (counted[one], one), default=(0, 0))
+    by_view: dict[str, dict[str, Picture]] = {}
+    for picture in (one for one, own in sizes.items() if own == size):
+        by_view.setdefault(picture.view, {}).update(dict.fromkeys(picture.sides, picture))
+    whole = {name: both for name, both in by_view.items() if len(both) == 2}
+    if not whole:
+        raise _no_pairs(folder, len(pictures), unread)
+    return ViewedFolder(
+        views=tuple(View(n, (whole[n]["left"], whole[n]["right"])) for n in sorted(whole, key=natural_order)),
+        image_width=size[0],
+        image_height=size[1],
+        unpaired=tuple(p.path.name for both in by_view.values() if len(both) == 1 for p in both.values()),
+        other_size=tuple(picture.path.name for picture, own in sizes.items() if own != size),
+        unread=tuple(unread),
+    )
+
+
+def _no_pairs(folder: Path, pictures: int, unread: Sequence[str]) -> InputError:
+    place = escaped(str(folder), 200)
+    found = f"no pair among {pictures} PNG and JPEG pictures"
+    remedy = "rename them so that one word tells the camera and the rest of both names is the same"
+    if unread and not pictures:
+        found, remedy = f"{len(unread)} pictures such as {escaped(unread[0])}", "save them as PNG of 8 bits"
+    allowed = f"{NAMING} (PNG or JPEG); or pictures of both cameras side by side"
+    return refusal("no-pictures", file=place, found=found, allowed=allowed, remedy=remedy)
+
+
+def _numbered(views: Sequence[View], ids: Sequence[int] | None) -> int | None:
+    """Which number of the names tells the look: the one that differs most, where all of them are among `ids`."""
+    places = range(min(len(view.numbers) for view in views))
+    known = None if ids is None else set(ids)
+    told = {place: {view.numbers[place] for view in views} for place in places}
+    fitting = [place for place in places if known is None or told[place] <= known]
+    best = max(fitting, key=lambda place: (len(told[place]), place), default=None)
+    return best if best is not None and (len(told[best]) > 1 or len(views) == 1) else None
+
+
+def pair_looks(
+    views: Sequence[View], moves: Sequence[int] | None, rows: Sequence[Spot] = (), matching: Matching | None = None
+) -> PairedLooks:
+    """Find the look of every view.
+
+    Args:
+        views: of a folder.
+        moves: numbers of the moves; None where nobody has listed any yet: every number in the names is then one, in
+            their order, or every view.
+        rows: of `spots.csv`; where there are any, pictures belong to those that wait for them ("undetected").
+        matching: "number" or "order"; None takes the number where every name has one that fits, else the order.
+
+    Raises:
+        InputError: neither numbers nor counts fit.
+    """
+    waiting = [spot.spot for spot in rows if spot.status == UNDETECTED and spot.u_left_px is None]
+    if rows and not waiting:
+        found, allowed = f"{len(rows)} looks, none of which waits for pictures", "rows with the status undetected"
+        raise refusal("occupied", file="spots.csv", found=found, allowed=allowed, remedy="name a new folder")
+    ids, file = (waiting, "spots.csv") if rows else (moves, "moves.csv")
+    place = None if matching == "order" else _numbered(views, ids)
+    names = [""] * len(views)
+    if place is not None:
+        told, names = [view.numbers[place] for view in views], [view.without_number(place) for view in views]
+        ranks = {number: rank for rank, number in enumerate(sorted(set(told)))}
+        numbers = told if ids is not None else [ranks[number] for number in told]
+    elif matching == "number" or (ids is not None and len(views) != len(ids)):
+        raise _unmatched(views, ids or (), file)
+    else:
+        numbers = list(range(len(views)) if ids is None else ids)
+    how: Matching = "order" if place is None else "number"
+    if rows:
+        return _onto_rows(views, numbers, rows, waiting, how)
+    order = sorted(range(len(views)), key=lambda k: (numbers[k], natural_order(views[k].name)))
+    targets = _differences(names)
+    empty = (*NO_PIXELS, *NO_PIXELS)
+    spots = [Spot(spot, numbers[k], targets[k], None, None, *empty, status=UNDETECTED) for spot, k in enumerate(order)]
+    without = tuple(move for move in moves or () if move not in set(numbers))
+    return PairedLooks(tuple(spots), {spot: views[k] for spot, k in enumerate(order)}, how, (), without)
+
+
+def _differences(names: Sequence[str]) -> list[str]:
+    """What names say that not all of them say, cut to the length of a target."""
+    words = [name.split() for name in names]
+    common = set.intersection(*map(set, words))
+    return [" ".join(word for word in own if word not in common)[:100] for own in words]
+
+
+def _onto_rows(
+    views: Sequence[View], numbers: Sequence[int], rows: Sequence[Spot], waiting: Sequence[int], how: Matching
+) -> PairedLooks:
+    """Each row that waits with the first view of its number."""
+    pictures: dict[int, View] = {}
+    left_over = []
+    for number, view in zip(numbers, views, strict=True):
+        if pictures.setdefault(number, view) is not view:
+            left_over.append(view.name)
+    without = tuple(spot for spot in waiting if spot not in pictures)
+    return PairedLooks(tuple(rows), pictures, how, tuple(left_over), without)
+
+
+def _unmatched(views: Sequence[View], ids: Sequence[int], file: str) -> InputError:
+    what = "moves" if file == "moves.csv" else "rows with the status undetected"
+    span = f" ({min(ids)} to {max(ids)})" if ids else ""
+    found = f"{len(views)} pairs of pictures for {len(ids)} {what}{span}, and no number in the names that tells which"
+    allowed = "as many pairs as rows, or in every name the number of its row"
+    remedy = f"name them after their row (left_0012.png, right_0012.png for {what[:-1] if len(what) < 6 else 'row'} 12)"
+    if file == "moves.csv":
+        remedy += ", or list the looks in spots.csv with the status undetected and call it again"
+    return refusal("pictures", file=file, found=found, allowed=allowed, remedy=remedy)
+
+
+def _part(view: View, camera: int) -> bytes:
+    """The PNG of one camera: the file itself where it is one, else its pixels."""
+    picture = view.pictures[camera]
+    data = read_bytes(picture.path, IMAGE_BYTES_MAX)
+    if len(picture.sides) == 1 and data.startswith(b"\x89PNG"):
+        return data
+    pixels = decode_image(data, escaped(picture.path.name))
+    width, part = pixels.shape[1] // len(picture.sides), picture.sides.index(CAMERAS[camera])
+    return png_bytes(np.ascontiguousarray(pixels[:, part * width : (part + 1) * width]))
+
+
+def copy_frames(pictures: dict[int, View], campaign: Path, advance: Advance = unshown) -> int:
+    """Copy pictures into `frames/` under the names that `detect` reads.
+
+    Args:
+        pictures: both pictures of each look, by its `spot`.
+        campaign: the folder that is to hold `frames/`; a picture that is there already and the same stays.
+        advance: told the share that is done.
+
+    Returns:
+        How many pictures lie there now.
+
+    Raises:
+        InputError: another picture has the name already, one cannot be read, or the folder not be written.
+    """
+    make_folder(campaign / "frames")
+    for count, (spot, view) in enumerate(pictures.items(), start=1):
+        for camera, side in enumerate(CAMERAS):
+            path, data = campaign / frame_name(spot, side), _part(view, camera)
+            if not path.exists():
+                write_atomically(path, data)
+            elif read_bytes(path, IMAGE_BYTES_MAX, campaign) != data:
+                remedy = "move the frames folder away, or name a new folder; nothing is overwritten"
+                place, allowed = frame_name(spot, side), "no picture there, or the same"
+                raise refusal("occupied", file=place, found="another picture", allowed=allowed, remedy=remedy)
+        advance(count / len(pictures))
+    return 2 * len(pictures)

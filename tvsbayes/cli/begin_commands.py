@@ -1,0 +1,192 @@
+"""Commands that begin a campaign with what somebody has: new.
+
+Options in, library called, table or JSON out; heavy imports stand inside the commands.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from tvsbayes.cli import axis_commands
+from tvsbayes.cli.app import Json, finish, refuse_options
+from tvsbayes.cli.progress_bar import waiting
+from tvsbayes.errors import InputError, escaped, listed, refusal
+from tvsbayes.files.csv_table import CSV_BYTES_MAX, csv_bytes
+from tvsbayes.files.disk import make_folder, read_bytes, shipped_data, write_atomically
+from tvsbayes.progress import Job
+
+if TYPE_CHECKING:
+    from tvsbayes.cameras.look_pictures import PairedLooks, ViewedFolder
+    from tvsbayes.instrument.campaign import Spot
+
+COPYING = "copying pictures"
+NAMES_LISTED = 6
+"""Of files and numbers that could not be paired, in a line."""
+
+
+def new(
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="Folder to create; with --pictures also one of `new`.")],
+    axis: Annotated[bool, typer.Option("--axis", help="One axis and its readings, no optics.")] = False,
+    pictures: Annotated[
+        Path | None, typer.Option("--pictures", help="Folder of spot pictures, left and right or side by side.")
+    ] = None,
+    pair: Annotated[
+        str | None, typer.Option("--pair", help="number: in the name, that of the move; order: of the names.")
+    ] = None,
+    swap: Annotated[bool, typer.Option("--swap", help="Wide pictures hold the left camera's on the right.")] = False,
+    as_json: Json = False,
+) -> None:
+    """An empty campaign, explained in campaign.toml, and a rig file. With --pictures: its looks and their frames."""
+    if pictures is None:
+        refuse_options("for pictures", "add --pictures FOLDER, or leave it out", pair=pair, swap=swap)
+    if axis:
+        refuse_options(axis_commands.NOT_OF_AN_AXIS, "leave it out", pictures=pictures)
+        axis_commands.new_axis(out, as_json)
+        return
+    if pictures is not None:
+        _with_pictures(out, pictures, pair, swap, as_json)
+        return
+    make_folder(out, empty=True)
+    names = _write_templates(out)
+    text = f"{escaped(str(out), 200)}: {', '.join(names)}\n"
+    text += "next: put stereo.json beside them, log moves and spots, then `tvsbayes check` this folder\n"
+    text += (
+        "you have pictures of the spots: `tvsbayes new` this folder --pictures FOLDER, once moves.csv is filled in\n"
+    )
+    text += "you have a table: `tvsbayes import FILE --to` another folder"
+    finish({"campaign": str(out), "files": names}, text, as_json)
+
+
+def _write_templates(out: Path) -> list[str]:
+    """The commented files of an empty campaign."""
+    templates = sorted((shipped_data() / "templates").iterdir())
+    for template in templates:
+        write_atomically(out / template.name, template.read_bytes())
+    return [template.name for template in templates]
+
+
+def _with_pictures(out: Path, folder: Path, pair: str | None, swap: bool, as_json: bool) -> None:
+    """Looks and frames of a folder of pictures, in a new campaign or in one that waits for them."""
+    from tvsbayes.cameras.look_pictures import copy_frames, pair_looks, views_of
+    from tvsbayes.instrument.campaign import spots_bytes
+
+    if pair is not None and pair not in ("number", "order"):
+        found, remedy = f"--pair {escaped(pair)}", "write --pair number or --pair order, or leave it out"
+        raise InputError("usage", f"{found}; allowed: number, order", allowed="number, order", remedy=remedy)
+    moves_file = _moves_file(out, folder)
+    rows = _rows_of(out)
+    seen = views_of(folder, swap=swap)
+    paired = pair_looks(seen.views, _move_numbers(moves_file), rows, pair)  # type: ignore[arg-type]
+    _refuse_other_size(out, seen)
+    if not (out / "campaign.toml").is_file():
+        make_folder(out, empty=True)
+        _write_templates(out)
+    if moves_file is None:
+        write_atomically(out / "moves.csv", _moves_to_fill_in(1 + max(spot.move for spot in paired.spots)))
+    elif moves_file.parent != out:
+        write_atomically(out / "moves.csv", read_bytes(moves_file, CSV_BYTES_MAX))
+    with waiting() as progress, Job({COPYING: 1.0}, progress) as job:
+        job.begin(COPYING)
+        copied = copy_frames(paired.pictures, out, job.at)
+    # Last: a folder whose looks are listed has all their pictures.
+    write_atomically(out / "spots.csv", spots_bytes(paired.spots))
+    lines = _unpaired_lines(seen, paired, "spots" if rows else "moves")
+    text = _paired_text(out, paired, copied, "pan_steps and tilt_steps" if moves_file is None else None)
+    document: dict[str, Any] = {"campaign": str(out), "looks": len(paired.pictures), "pictures": copied}
+    document |= {"paired_by": paired.matching, "warnings": lines, "moves_to_fill_in": moves_file is None}
+    finish(document, "\n".join([text, *(f"not paired: {line}" for line in lines)]), as_json)
+
+
+def _moves_file(out: Path, folder: Path) -> Path | None:
+    """Where the moves of the pictures are listed: in the campaign, beside the pictures, or not yet."""
+    template = (shipped_data() / "templates" / "moves.csv").read_bytes()
+    own, beside = out / "moves.csv", folder / "moves.csv"
+    if own.is_file() and read_bytes(own, CSV_BYTES_MAX) != template:
+        return own
+    return beside if beside.is_file() else None
+
+
+def _move_numbers(file: Path | None) -> range | None:
+    """The moves of a file, checked; those of a file to fill in are counted, not read."""
+    from tvsbayes.instrument.campaign import parse_moves
+
+    if file is None:
+        return None
+    data = read_bytes(file, CSV_BYTES_MAX)
+    rows = len(data.splitlines()) - 1
+    return range(rows) if data == _moves_to_fill_in(rows) else range(len(parse_moves(data, str(file))))
+
+
+def _moves_to_fill_in(count: int) -> bytes:
+    """A `moves.csv` whose counters are left to its owner."""
+    from tvsbayes.instrument.campaign import MOVE_COLUMNS
+
+    rows = ((k, 0, float(k), None, None, *(("unknown",) * 2 if k == 0 else ("", ""))) for k in range(count))
+    return csv_bytes(MOVE_COLUMNS, rows)
+
+
+def _rows_of(out: Path) -> tuple[Spot, ...]:
+    """The looks that a campaign lists already; none of a folder that is not there."""
+    from tvsbayes.instrument.campaign import read_campaign
+
+    spots = out / "spots.csv"
+    if not spots.is_file() or len(read_bytes(spots, CSV_BYTES_MAX).splitlines()) < 2:
+        return ()
+    return read_campaign(out).spots
+
+
+def _refuse_other_size(out: Path, seen: ViewedFolder) -> None:
+    """Pictures of another size than those of the calibration beside them give no usable centre."""
+    from tvsbayes.instrument.stereo_pair import read_stereo
+
+    if not (out / "stereo.json").is_file():
+        return
+    stereo = read_stereo(out / "stereo.json")
+    wanted, size = (stereo.image_width, stereo.image_height), (seen.image_width, seen.image_height)
+    if size != wanted:
+        found, allowed = f"pictures of {size[0]} x {size[1]} px", f"{wanted[0]} x {wanted[1]} px as in stereo.json"
+        place, remedy = escaped(str(out / "stereo.json"), 200), "calibrate and observe at one image size"
+        raise refusal("image-size", file=place, found=found, allowed=allowed, remedy=remedy)
+
+
+def _paired_text(out: Path, found: PairedLooks, copied: int, to_fill_in: str | None) -> str:
+    """How many pictures went where, by what rule, and what to do next."""
+    place = escaped(str(out), 200)
+    first = next(iter(found.pictures.items()), None)
+    how = "the number in the name" if found.matching == "number" else "the order of the names"
+    lines = [f"{place}: {copied} pictures in frames/, {len(found.pictures)} looks in spots.csv, paired by {how}"]
+    if first is not None:
+        left, right = (escaped(picture.path.name) for picture in first[1].pictures)
+        move = next(spot.move for spot in found.spots if spot.spot == first[0])
+        both = left if left == right else f"{left} and {right}"
+        lines.append(f"for example {both}: spot {first[0]}, seen after move {move}")
+    if to_fill_in is not None:
+        lines.append(f"fill in moves.csv: {to_fill_in} of every row, absolute counters AFTER the move")
+    if not (out / "stereo.json").is_file():
+        lines.append(
+            "put stereo.json beside it: `tvsbayes stereo BOARD_PICTURES --board 9x6 --pitch-mm 25 -o stereo.json`"
+        )
+    lines.append(f"next: `tvsbayes detect {place}`, then `tvsbayes check {place}`")
+    return "\n".join(lines)
+
+
+def _unpaired_lines(seen: ViewedFolder, found: PairedLooks, rows: str) -> list[str]:
+    """What could not be paired, a line for each kind."""
+    files = {
+        "without the picture of the other camera": seen.unpaired,
+        f"not of {seen.image_width} x {seen.image_height} px as most": seen.other_size,
+        "of a kind that is not read; save them as PNG of 8 bits": seen.unread,
+        "a second pair for its row": found.left_over,
+    }
+    lines = [f"{_few(names)}: {why}" for why, names in files.items() if names]
+    if found.without:
+        lines.append(f"{rows} {listed(found.without, NAMES_LISTED)}: no pictures")
+    return lines
+
+
+def _few(names: tuple[str, ...]) -> str:
+    more = f" and {len(names) - NAMES_LISTED} more" if len(names) > NAMES_LISTED else ""
+    return ", ".join(escaped(name) for name in names[:NAMES_LISTED]) + more
