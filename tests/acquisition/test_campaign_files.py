@@ -10,8 +10,10 @@ from pathlib import Path
 import pytest
 from support.bench_runs import HEADER, Failing, Run, small_plan
 
+from tvsbayes.acquisition.journal import EMPTY_REMEDY, LOG
 from tvsbayes.acquisition.session import begin
 from tvsbayes.cli.main import run
+from tvsbayes.errors import InputError
 from tvsbayes.instrument.campaign import read_campaign
 
 pytestmark = pytest.mark.usefixtures("ctrl_c_works")
@@ -74,6 +76,61 @@ def test_what_somebody_changed_since_is_kept_beside(mounted_rig, tmp_path):
         not any("edited" in warning for warning in again.warnings)
         and len(list((tmp_path / "c").glob("*.edited-*"))) == 2
     )
+
+
+def interrupted_at_the_third(instrument) -> Failing:
+    return Failing(instrument, 3, lambda _: signal.raise_signal(signal.SIGINT))
+
+
+@pytest.mark.parametrize("kept", ["half", "created"])
+def test_a_journal_that_lost_its_end_is_told_from_tables_behind(mounted_rig, tmp_path, capsys, kept):
+    """Rows that only the tables have are lost looks: nobody edited anything, and nothing of them is thrown away."""
+    folder, plan = tmp_path / "c", small_plan(2)
+    Run(mounted_rig, folder, plan).engine.run()
+    before = {name: (folder / name).read_bytes() for name in ("moves.csv", "spots.csv")}
+    lines = (folder / LOG).read_bytes().splitlines(keepends=True)
+    (folder / LOG).write_bytes(b"".join(lines[: len(lines) // 2 if kept == "half" else 1]))
+    assert run(["check", str(folder), "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    looks = document["journal"]["looks"] if kept == "half" else 0
+    told = [warning for warning in document["warnings"] if "lost looks" in warning]
+    assert len(told) == 1 and f"{8 - looks} looks" in told[0] and "-" not in told[0].split(" looks and ")[0][-5:]
+    assert not any("behind the journal" in warning for warning in document["warnings"])
+    outcome = Run(mounted_rig, folder, plan, resume=True, start=1).engine.run()
+    assert outcome.reason == "done" and sum(s.experiment is not None for s in read_campaign(folder).spots) == 8
+    assert not any("edited" in warning for warning in outcome.warnings) and not list(folder.glob("*.edited-*"))
+    assert sum("lost its end" in warning for warning in outcome.warnings) == 2
+    copies = {name: (folder / name.replace(".csv", ".longer-1.csv")).read_bytes() for name in before}
+    assert copies == before
+
+
+def test_what_a_killed_run_left_unfinished_is_removed_at_its_resume(mounted_rig, tmp_path):
+    folder = tmp_path / "c"
+    Run(
+        mounted_rig, folder, observer=lambda i: Failing(i, 3, lambda _: signal.raise_signal(signal.SIGINT))
+    ).engine.run()
+    (folder / "frames").mkdir()
+    unfinished = [folder / ".moves.csv.0123456789ab.tmp", folder / ".campaign.toml.ba9876543210.tmp"]
+    unfinished += [folder / "frames" / ".000004_left.png.tmp"]
+    others = [folder / ".notes.csv.0123456789ab.tmp", folder / ".moves.csv.mine.tmp"]
+    for path in unfinished + others:
+        path.write_bytes(b"half")
+    Run(mounted_rig, folder, resume=True, start=1).engine.run()
+    assert not any(path.exists() for path in unfinished) and all(path.exists() for path in others)
+
+
+def test_an_empty_journal_has_one_remedy(mounted_rig, tmp_path, capsys):
+    """`check`, --resume and a new beginning all say the same."""
+    folder = tmp_path / "c"
+    folder.mkdir()
+    (folder / LOG).write_bytes(b"")
+    assert run(["check", str(folder), "--json"]) == 0
+    told = [warning for warning in json.loads(capsys.readouterr().out)["warnings"] if "no event" in warning]
+    assert len(told) == 1 and EMPTY_REMEDY in told[0]
+    for resume in (True, False):
+        with pytest.raises(InputError) as caught:
+            begin(folder, mounted_rig, small_plan(), resume, HEADER)
+        assert caught.value.remedy == EMPTY_REMEDY
 
 
 def test_folder_without_a_homing_is_told_so(mounted_rig, tmp_path, capsys):

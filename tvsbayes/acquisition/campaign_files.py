@@ -7,17 +7,18 @@ once a homing is logged. A reader finds a whole campaign at any moment.
 from __future__ import annotations
 
 import datetime
-from dataclasses import asdict
+from collections.abc import Sequence
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import cast
 
-from tvsbayes.acquisition.journal import Journal, read_journal, require_journal
+from tvsbayes.acquisition.journal import EMPTY_REMEDY, LOG, Journal, read_journal, require_journal
 from tvsbayes.acquisition.journal_check import repair, verify
 from tvsbayes.acquisition.journal_events import Created
-from tvsbayes.acquisition.recorder import Recorded, Recorder, recorded
+from tvsbayes.acquisition.recorder import LOST_STEPS, Recorded, Recorder, recorded
 from tvsbayes.errors import InputError, TvsError
 from tvsbayes.files.csv_table import CSV_BYTES_MAX
-from tvsbayes.files.disk import read_bytes, write_atomically
+from tvsbayes.files.disk import read_bytes, remove_unfinished, write_atomically
 from tvsbayes.files.documents import TOML_BYTES_MAX, parse_toml
 from tvsbayes.instrument.campaign import (
     Campaign,
@@ -37,6 +38,7 @@ DERIVED_EVERY = 100
 """Up to this many spots the campaign files are written after every look, then ever more rarely: at least 99 % of the
 looks are in them at any time, all of them in the journal."""
 NAME_DEFAULT = "acquired campaign"
+_DERIVED = ("campaign.toml", "stereo.json", "moves.csv", "spots.csv", "truth.json")
 
 
 class CampaignFiles:
@@ -71,9 +73,19 @@ class CampaignFiles:
             self.behind = error.message
 
     def keep_edited(self) -> list[str]:
-        """Copies files that somebody has changed since a run was interrupted; what to say about each."""
-        kept = keep_edited(self._campaign(), self._journal.folder)
-        return [f"{name} was edited since: what stood in it is kept in {copy.name}" for name, copy in kept.items()]
+        """Copies files that hold what the journal does not, before they are written anew; what to say about each.
+
+        What killed runs left unfinished of these files is removed.
+        """
+        folder, campaign = self._journal.folder, self._campaign()
+        remove_unfinished(folder, _DERIVED)
+        return [
+            f"{name} had rows that {LOG} lacks, which has lost its end: they are kept in {copy.name}, lost looks are "
+            "taken again"
+            if copy.stem.rpartition("-")[0].endswith(".longer")
+            else f"{name} was edited since: what stood in it is kept in {copy.name}"
+            for name, copy in keep_edited(campaign, folder).items()
+        ]
 
     def _campaign(self) -> Campaign:
         """What the journal holds so far; there has been a homing."""
@@ -118,7 +130,8 @@ def _files(campaign: Campaign, folder: Path, tables_only: bool = False) -> dict[
         for spot in campaign.spots
     ]
     moves, table = moves_bytes(campaign.moves), spots_bytes(spots)
-    parse_spots(table, "spots.csv", len(parse_moves(moves)), campaign.stereo)
+    if campaign.moves:
+        parse_spots(table, "spots.csv", len(parse_moves(moves)), campaign.stereo)
     files = {"moves.csv": moves, "spots.csv": table}
     if tables_only:
         return files
@@ -136,9 +149,11 @@ def keep_edited(campaign: Campaign, folder: Path) -> dict[str, Path]:
         folder: campaign folder.
 
     Returns:
-        The copies made, `spots.edited-1.csv` and so on, by the name of the file.
+        The copies made, by the name of the file: `spots.edited-1.csv` and so on, or `spots.longer-1.csv` where the
+        table only goes on behind what the journal has, as after a loss of the journal's end.
     """
     folder, kept = Path(folder), {}
+    longer = _longer(campaign, folder)
     for name, data in _files(campaign, folder).items():
         path = folder / name
         if not path.is_file():
@@ -146,12 +161,35 @@ def keep_edited(campaign: Campaign, folder: Path) -> dict[str, Path]:
         present = read_bytes(path, CSV_BYTES_MAX, folder)
         if not set(present.splitlines()) - set(data.splitlines()):
             continue
-        number = 1
-        while (copy := path.with_name(f"{path.stem}.edited-{number}{path.suffix}")).exists():
+        kind, number = "longer" if name in longer else "edited", 1
+        while (copy := path.with_name(f"{path.stem}.{kind}-{number}{path.suffix}")).exists():
             number += 1
         write_atomically(copy, present)
         kept[name] = copy
     return kept
+
+
+def _longer(campaign: Campaign, folder: Path) -> dict[str, int]:
+    """Tables that have what the journal has and more behind it, by name with the number of rows more.
+
+    Whether steps were lost in a segment stands in the journal at its end: a status may be older or newer.
+    """
+    try:
+        present = read_campaign(folder)
+    except InputError:
+        return {}
+
+    def same(spots: Sequence[Spot]) -> list[Spot]:
+        waiting = [replace(s, status="ok") if s.status == LOST_STEPS else s for s in spots]
+        return [s if s.spot not in undetected else undetected[s.spot] for s in waiting]
+
+    undetected = {spot.spot: spot for spot in campaign.spots if spot.status == "undetected"}
+    moves, looks = len(campaign.moves), len(campaign.spots)
+    more = {
+        "moves.csv": len(present.moves) - moves if present.moves[:moves] == campaign.moves else 0,
+        "spots.csv": len(present.spots) - looks if same(present.spots[:looks]) == same(campaign.spots) else 0,
+    }
+    return {name: rows for name, rows in more.items() if rows > 0}
 
 
 def _detected(campaign: Campaign, folder: Path) -> dict[int, Spot]:
@@ -196,14 +234,8 @@ def check_journal(folder: Path) -> dict[str, object]:
         warnings.append(
             f"whether steps were lost in segment {names} is not known: the run or the device was interrupted"
         )
-    if record.moves:
-        present = read_campaign(folder)
-        behind = len(record.moves) - len(present.moves), len(record.spots) - len(present.spots)
-        if behind != (0, 0):
-            warnings.append(
-                f"moves.csv and spots.csv are {behind[0]} moves and {behind[1]} looks behind the journal: "
-                "acquire --resume writes them again"
-            )
+    if record.moves or (folder / "campaign.toml").is_file():
+        warnings += _compared(record, read_campaign(folder), empty=not checked.records)
     else:
         warnings.append("no homing has been logged: there is no campaign yet")
     return {
@@ -214,6 +246,25 @@ def check_journal(folder: Path) -> dict[str, object]:
         "moves": len(record.moves),
         "looks": len(record.spots),
     }
+
+
+def _compared(record: Recorded, present: Campaign, empty: bool) -> list[str]:
+    """What the tables of a campaign lack of its journal, and what the journal lacks of them."""
+    moves, looks = len(record.moves) - len(present.moves), len(record.spots) - len(present.spots)
+    warnings = []
+    if moves > 0 or looks > 0:
+        warnings.append(
+            f"moves.csv and spots.csv are {max(moves, 0)} moves and {max(looks, 0)} looks behind the journal: "
+            "acquire --resume writes them again"
+        )
+    if moves < 0 or looks < 0:
+        remedy = EMPTY_REMEDY if empty else "acquire --resume takes lost looks again and keeps the tables"
+        warnings.append(
+            f"lost looks: the end of {LOG} is missing, {max(-looks, 0)} looks and {max(-moves, 0)} moves that "
+            f"spots.csv and moves.csv have are not in it. Copy the folder, and bring {LOG} back from a backup if there "
+            f"is one; else {remedy}"
+        )
+    return warnings
 
 
 def repair_campaign(folder: Path, to: Path) -> dict[str, object]:

@@ -136,8 +136,7 @@ class Acquisition:
         resumed = self._log.recorder.result()
         # Before the first homing nothing counts, whatever was placed.
         next_row = resumed.next_step if resumed.moves else 0
-        if resumed.moves:
-            self._log.warnings += self._log.files.keep_edited()
+        self._log.warnings += self._log.files.keep_edited()
         self._recover(resumed, next_row)
         for step in self.plan[next_row:]:
             if self._stop.requested:

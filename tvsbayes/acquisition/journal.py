@@ -44,6 +44,8 @@ FRAME_FOLDERS = ("frames", "dark")
 FRAME_NAME = re.compile(r"(?:frames|dark)/[0-9]{6}_(?:left|right)\.png")
 """As `instrument.campaign.frame_name` makes them."""
 LOG_LINE = re.compile(rb"([0-9a-f]{8}) (0|[1-9][0-9]{0,8}) ([0-9a-f]{8}) (\{[ -~]*\})")
+EMPTY_REMEDY = "nothing was written down: begin anew in another folder, without --resume"
+"""For a run that was killed before its first event, or whose journal was emptied."""
 REPAIR_REMEDY = "copy what is whole to a new folder: tvsbayes check FOLDER --repair-to NEW"
 
 
@@ -277,7 +279,7 @@ class Journal:
 
     @classmethod
     def open(cls, folder: Path, disk: Disk | None = None) -> Journal:
-        """An existing journal, to go on with; a torn last line is kept aside and cut off.
+        """An existing journal, to go on with; a torn last line is kept aside and cut off, half a frame removed.
 
         Raises:
             InputError: damaged, or another program writes it.
@@ -298,8 +300,13 @@ class Journal:
                 os.ftruncate(descriptor, reading.size)
                 disk.fsync(descriptor)
             if not reading.records:
-                allowed, remedy = "at least the event created", "begin anew in another folder"
-                raise refusal("journal", file=LOG, found="no event", allowed=allowed, remedy=remedy)
+                raise refusal(
+                    "journal", file=LOG, found="no event", allowed="at least the event created", remedy=EMPTY_REMEDY
+                )
+            for name in FRAME_FOLDERS:
+                # Nobody else writes frames, and their lock is ours.
+                for unfinished in (folder / name).glob(".*.png.tmp"):
+                    unfinished.unlink(missing_ok=True)
         except OSError as error:
             os.close(descriptor)
             raise _disk_fault(error) from error

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from tvsbayes.acquisition.journal import (
+    EMPTY_REMEDY,
     FRAME_BYTES_MAX,
     FRAME_FOLDERS,
     FRAME_NAME,
@@ -55,7 +56,9 @@ class Verification:
         if self.orphans:
             names = ", ".join(self.orphans[:5]) + (", ..." if len(self.orphans) > 5 else "")
             warnings.append(f"{len(self.orphans)} frames without an event, of interrupted looks: {names}")
-        if self.stopped is None:
+        if not self.records:
+            warnings.append(f"{LOG} holds no event; {EMPTY_REMEDY}")
+        elif self.stopped is None:
             warnings.append("the run did not end by itself: go on with tvsbayes acquire --resume")
         return warnings
 

@@ -13,7 +13,7 @@ from pathlib import Path
 from tvsbayes.acquisition.bench import SIMULATED_START, Vision, hardware, simulated
 from tvsbayes.acquisition.campaign_files import NAME_DEFAULT
 from tvsbayes.acquisition.engine import Acquisition, Outcome
-from tvsbayes.acquisition.journal import Journal, read_journal, require_journal
+from tvsbayes.acquisition.journal import EMPTY_REMEDY, LOG, Journal, read_journal, require_journal
 from tvsbayes.acquisition.operator import StopKey, Terminal, TerminalOperator, check_hazard
 from tvsbayes.acquisition.recorder import Recorded, recorded
 from tvsbayes.acquisition.run_identity import check_same, identity, setup_changes
@@ -135,6 +135,8 @@ def begin(folder: Path, rig: Rig, plan: Sequence[PlanStep], resume: bool, header
     if not resume:
         if folder.is_dir() and any(folder.iterdir()):
             place, remedy = escaped(str(folder), 200), "name another folder, or go on with --resume"
+            if (folder / LOG).is_file() and not (folder / LOG).stat().st_size:
+                remedy = EMPTY_REMEDY
             found, allowed = "a folder with files", "a new or empty folder"
             raise refusal("occupied", file=place, found=found, allowed=allowed, remedy=remedy)
         created = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")

@@ -8,6 +8,7 @@ is; lines count from 1.
 from __future__ import annotations
 
 import errno
+import glob
 import io
 import math
 import os
@@ -16,6 +17,7 @@ import secrets
 import stat
 import zipfile
 import zlib
+from collections.abc import Iterable
 from functools import partial
 from importlib import resources
 from pathlib import Path
@@ -165,6 +167,22 @@ def write_atomically(path: Path, data: bytes) -> None:
         found, allowed = escaped(error.strerror or str(error)), "a writable folder with free space"
         remedy, file = "name another place or free this one", escaped(str(path), 200)
         raise refusal("write", file=file, found=found, allowed=allowed, remedy=remedy) from error
+
+
+def remove_unfinished(folder: Path, names: Iterable[str]) -> list[str]:
+    """Removes what `write_atomically` left of files with these names when its process was killed.
+
+    Only for a folder that nobody else writes these files into.
+
+    Returns:
+        Names of the temporary files that were removed.
+    """
+    removed = []
+    for name in names:
+        for path in sorted(Path(folder).glob(f".{glob.escape(name)}.{'[0-9a-f]' * 12}.tmp")):
+            path.unlink(missing_ok=True)
+            removed.append(path.name)
+    return removed
 
 
 def make_folder(folder: Path, *, empty: bool = False) -> None:
