@@ -106,9 +106,7 @@ def test_a_journal_that_lost_its_end_is_told_from_tables_behind(mounted_rig, tmp
 
 def test_what_a_killed_run_left_unfinished_is_removed_at_its_resume(mounted_rig, tmp_path):
     folder = tmp_path / "c"
-    Run(
-        mounted_rig, folder, observer=lambda i: Failing(i, 3, lambda _: signal.raise_signal(signal.SIGINT))
-    ).engine.run()
+    Run(mounted_rig, folder, observer=interrupted_at_the_third).engine.run()
     (folder / "frames").mkdir()
     unfinished = [folder / ".moves.csv.0123456789ab.tmp", folder / ".campaign.toml.ba9876543210.tmp"]
     unfinished += [folder / "frames" / ".000004_left.png.tmp"]

@@ -27,7 +27,7 @@ from tvsbayes.cameras.virtual_camera import VirtualCamera
 from tvsbayes.files.disk import write_atomically
 from tvsbayes.instrument.campaign import Campaign
 from tvsbayes.instrument.rig import Rig
-from tvsbayes.positioner.driver import Clock, Positioner
+from tvsbayes.positioner.interface import Clock, Positioner
 from tvsbayes.positioner.serial_port import positioner_of
 from tvsbayes.twin.true_rig import pan_and_tilt
 

@@ -23,7 +23,8 @@ from tvsbayes.acquisition.operator import StopKey
 from tvsbayes.cameras.capture import StereoCamera, open_cameras
 from tvsbayes.errors import TvsError, escaped
 from tvsbayes.instrument.rig import Rig
-from tvsbayes.positioner.driver import SEE_DOCTOR, Clock, SerialPositioner
+from tvsbayes.positioner.driver import SerialPositioner
+from tvsbayes.positioner.interface import SEE_DOCTOR, Clock
 from tvsbayes.positioner.protocol import FIRMWARE_VERSION
 from tvsbayes.positioner.serial_port import positioner_of, serial_ports
 

@@ -26,7 +26,7 @@ from tvsbayes.files.images import png_bytes
 from tvsbayes.instrument.campaign import CAMERAS, frame_name
 from tvsbayes.instrument.rig import Rig
 from tvsbayes.instrument.stereo_pair import Stereo
-from tvsbayes.positioner.driver import Positioner
+from tvsbayes.positioner.interface import Positioner
 from tvsbayes.twin.physics import Light, cameras_of
 from tvsbayes.twin.spot_pictures import Scene, Sensor, render_spots
 

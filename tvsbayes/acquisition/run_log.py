@@ -15,7 +15,7 @@ from tvsbayes.acquisition.journal_check import orphans
 from tvsbayes.acquisition.recorder import HOME_TOLERANCE_STEPS, Recorder
 from tvsbayes.errors import DeviceFault
 from tvsbayes.instrument.rig import Rig
-from tvsbayes.positioner.driver import HomeReport
+from tvsbayes.positioner.interface import HomeReport
 
 
 @dataclass(frozen=True)

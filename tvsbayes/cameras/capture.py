@@ -23,7 +23,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from tvsbayes.errors import DeviceFault, InputError, escaped
-from tvsbayes.positioner.driver import Clock
+from tvsbayes.positioner.interface import Clock
 
 LIVE_S = 0.004
 """A frame that took less than this was in a buffer, whatever the rate: cameras up to 200 frames/s are slower."""

@@ -14,13 +14,13 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from functools import partial
-from typing import Protocol
 
 from tvsbayes.errors import DeviceFault, escaped
+from tvsbayes.positioner.interface import Clock, HomeReport, Link, PositionLost, fault, opened, reason
 from tvsbayes.positioner.protocol import (
     REPLY_CHARS_MAX,
+    SEQUENCE_MAX,
     SETTINGS,
     VERSION,
     DeviceState,
@@ -30,6 +30,7 @@ from tvsbayes.positioner.protocol import (
     request,
     unsigned,
 )
+from tvsbayes.positioner.silence import HEARD_BYTES_MAX, explained
 
 ATTEMPTS = 6
 """How often a request is sent before the device counts as dead."""
@@ -49,9 +50,6 @@ HOME_S = 300.0
 """Longest homing: 20 000 steps per axis at 200 steps/s are 200 s."""
 RECONNECT_S = 10.0
 """How long an unplugged device may stay away."""
-SEE_DOCTOR = "; see `tvsbayes doctor`"
-"""Ends a remedy; `doctor` leaves it out of its own."""
-_PORT_REMEDY = "check [positioner] port in the rig file, the cable and your rights on the port" + SEE_DOCTOR
 _REFUSALS = {
     "limit": "the target lies outside the soft limits: correct the plan or [positioner] in the rig file",
     "unhomed": "home first",
@@ -63,71 +61,6 @@ _ALARMS = {
     "home": "a home switch was not found: check its wiring, then home",
     "abort": "somebody aborted: make sure that all is well, then home",
 }
-
-
-class PositionLost(DeviceFault):
-    """The device was reset or moved by others: counters mean nothing until it is homed again."""
-
-
-class Clock(Protocol):
-    """Time as the driver sees it."""
-
-    def monotonic(self) -> float:
-        """Seconds, never going back."""
-
-    def sleep(self, seconds: float) -> None:
-        """Let time pass."""
-
-
-class Link(Protocol):
-    """A byte pipe to the device; any call raises OSError once it is gone."""
-
-    def write(self, data: bytes) -> None:
-        """Send all of `data`, or raise."""
-
-    def read(self, timeout_s: float) -> bytes:
-        """Whatever has arrived; waits up to `timeout_s` for the first byte; may be empty."""
-
-    def close(self) -> None:
-        """Give the port back; never raises."""
-
-
-@dataclass(frozen=True, slots=True)
-class HomeReport:
-    """A finished homing.
-
-    Attributes:
-        state: the device afterwards: idle, counters at the home switches.
-        deviation_steps: (pan, tilt) counter where each switch was found minus where it should have been, since the
-            homing before; not zero after lost steps. (0, 0) for the first homing of a device.
-        known: whether this connection homed before, to which the deviation refers.
-        compared: whether the device was homed at all when this homing began; if not (unhomed, in alarm) it reports
-            (0, 0) whatever happened.
-    """
-
-    state: DeviceState
-    deviation_steps: tuple[int, int]
-    known: bool
-    compared: bool
-
-
-class Positioner(Protocol):
-    """A two-axis positioner with a laser, whatever drives it."""
-
-    def home(self) -> HomeReport:
-        """Find the home switches; the laser is off afterwards."""
-
-    def move_to(self, pan_steps: int, tilt_steps: int) -> DeviceState:
-        """Go to absolute counters; returns when the device has said that it is there."""
-
-    def laser(self, on: bool) -> DeviceState:
-        """Switch the laser; returns when the device has said so."""
-
-    def state(self) -> DeviceState:
-        """Ask the device; also a sign of life for its laser watchdog."""
-
-    def close(self) -> None:
-        """Laser off and motors at rest as well as possible, then the line closed; never raises."""
 
 
 class SerialPositioner:
@@ -156,10 +89,8 @@ class SerialPositioner:
         self._homed_here, self._compares = False, False
         self.repeats = 0
         """Requests sent again so far: the quality of the line."""
-        try:
-            self._link = open_link()
-        except OSError as error:
-            raise _fault("port", f"the port cannot be opened: {_reason(error)}", _PORT_REMEDY) from error
+        self._heard = bytearray()
+        self._link = opened(open_link)
         try:
             self._drain()
             identity = self._identify()
@@ -180,7 +111,7 @@ class SerialPositioner:
         state = self._wait(self._command("HOME"), HOME_S)
         self._homed_here = self._compares = True
         if state.laser_on:
-            raise _fault("laser", "the laser is on after homing", "cut the laser's supply and check the firmware")
+            raise fault("laser", "the laser is on after homing", "cut the laser's supply and check the firmware")
         return HomeReport(state, (state.pan_home_deviation_steps, state.tilt_home_deviation_steps), known, compared)
 
     def move_to(self, pan_steps: int, tilt_steps: int) -> DeviceState:
@@ -199,7 +130,7 @@ class SerialPositioner:
         reached = (state.pan_steps, state.tilt_steps)
         if reached != wanted or (state.pan_target_steps, state.tilt_target_steps) != wanted:
             found = f"the device says done at {reached}, ordered was {wanted}"
-            raise _fault("position", found, "home again; if it happens twice, flash the firmware anew")
+            raise fault("position", found, "home again; if it happens twice, flash the firmware anew")
         return state
 
     def laser(self, on: bool) -> DeviceState:
@@ -209,7 +140,7 @@ class SerialPositioner:
             state = self.state()
         if state.laser_on != on:
             found = f"the laser line stayed {'off' if on else 'on'} ({state.last_error})"
-            raise _fault("laser", found, "cut the laser's supply and check its wiring")
+            raise fault("laser", found, "cut the laser's supply and check its wiring")
         return state
 
     def state(self) -> DeviceState:
@@ -223,6 +154,10 @@ class SerialPositioner:
         try:
             if self._boot >= 0:
                 self._switch_off()
+            else:
+                # Whoever is there and understands it: a run before this one may have left the light on.
+                self._link.write(b"\n" + request(0, "L", 0))
+                self._link.read(NAK_S)
         except (DeviceFault, OSError):
             # The device's own watchdog switches the laser off when it no longer hears from us.
             pass
@@ -233,7 +168,7 @@ class SerialPositioner:
     def _switch_off(self) -> None:
         """Laser off and motors at rest, with few attempts."""
         few = partial(self._exchange, attempts=CLOSING_ATTEMPTS, reconnect=False)
-        reply = few("L", 0)
+        reply = few("L", 0, sequence=None if self._sequence < SEQUENCE_MAX else 0)
         if reply.error == "seq":
             # Another program has counted on. Whatever it does, our laser goes off: take up its number.
             last = few("ID", sequence=0).extra.get("q", "")
@@ -248,8 +183,8 @@ class SerialPositioner:
         """Throw away what an earlier conversation left on the line."""
         deadline = self._clock.monotonic() + DRAIN_MAX_S
         try:
-            while self._link is not None and self._link.read(DRAIN_S) and self._clock.monotonic() < deadline:
-                pass
+            while self._link is not None and (data := self._link.read(DRAIN_S)) and self._clock.monotonic() < deadline:
+                self._hear(data)
         except OSError:
             # The first request meets the same error and reconnects.
             pass
@@ -259,12 +194,12 @@ class SerialPositioner:
         reply = self._exchange("SET", key, value)
         if reply.error is not None or reply.extra.get("v") != str(value):
             found = f"setting {key} = {value} was answered {reply.error or reply.extra.get('v')}"
-            raise _fault("setting", found, f"allowed: {low} to {high}, at rest; flash the shipped firmware")
+            raise fault("setting", found, f"allowed: {low} to {high}, at rest; flash the shipped firmware")
 
     def _get(self, key: str) -> int:
         text = self._exchange("GET", key).extra.get("v", "")
         if not text.isdigit() or not text.isascii() or int(text) == 0:
-            raise _fault("setting", f"{key} was answered {escaped(text)!r}", "flash the shipped firmware")
+            raise fault("setting", f"{key} was answered {escaped(text)!r}", "flash the shipped firmware")
         return int(text)
 
     def _identify(self) -> Reply:
@@ -274,11 +209,13 @@ class SerialPositioner:
         if version != str(VERSION):
             found = f"firmware {firmware} speaks protocol {escaped(str(version))}, this program speaks {VERSION}"
             remedy = "flash the firmware shipped with tvsbayes: see README.md in its positioner/firmware folder"
-            raise _fault("firmware", found, remedy)
+            raise fault("firmware", found, remedy)
         last = unsigned(reply.extra.get("q", ""))
         if last is None:
-            raise _fault("firmware", f"firmware {firmware} names no last sequence", "flash the shipped firmware")
+            raise fault("firmware", f"firmware {firmware} names no last sequence", "flash the shipped firmware")
         self._sequence = max(self._sequence, last)
+        if self._sequence == SEQUENCE_MAX:
+            raise _used_up(self._sequence)
         return reply
 
     def _command(self, *words: object) -> Reply:
@@ -287,7 +224,7 @@ class SerialPositioner:
         self._check(reply.state)
         if reply.error is not None:
             found = f"{' '.join(map(str, words))} was refused: {reply.error}"
-            raise _fault(f"refused-{reply.error}", found, _REFUSALS.get(reply.error, "home and try again"))
+            raise fault(f"refused-{reply.error}", found, _REFUSALS.get(reply.error, "home and try again"))
         return reply
 
     def _check(self, state: DeviceState) -> None:
@@ -301,7 +238,7 @@ class SerialPositioner:
         if state.status == "alarm":
             self._homed_here = self._compares = False
             remedy = _ALARMS.get(state.last_error, "home again")
-            raise _fault(f"alarm-{state.last_error}", f"the device is in alarm: {state.last_error}", remedy)
+            raise fault(f"alarm-{state.last_error}", f"the device is in alarm: {state.last_error}", remedy)
 
     def _wait(self, reply: Reply, longest_s: float) -> DeviceState:
         """Until the motion that `reply` accepted is done."""
@@ -315,11 +252,11 @@ class SerialPositioner:
                     break
                 if state.status != "moving":
                     found = f"the motion ended without reaching its target ({state.status}, {state.last_error})"
-                    raise _fault("stopped", found, "home again")
+                    raise fault("stopped", found, "home again")
             if self._clock.monotonic() > deadline:
                 self._exchange("STOP")
                 found = f"the motion is not done after {longest_s:.0f} s"
-                raise _fault("stall", found, "look for a blocked axis or a missing home switch; then home again")
+                raise fault("stall", found, "look for a blocked axis or a missing home switch; then home again")
             self._clock.sleep(POLL_S)
             state = self._command("?").state
         return state
@@ -329,6 +266,8 @@ class SerialPositioner:
     ) -> Reply:
         """One request and its answer, repeated while it is unanswered and reconnected when the line is gone."""
         if sequence is None:
+            if self._sequence == SEQUENCE_MAX:
+                raise _used_up(self._sequence)
             self._sequence += 1
             sequence = self._sequence
         line = request(sequence, *map(str, words))
@@ -348,9 +287,13 @@ class SerialPositioner:
                 self._reconnect(error)
                 continue
             if reply is not None:
+                self._heard.clear()
                 return reply
-        found = f"no answer to {' '.join(map(str, words))} after {attempts} attempts"
-        raise _fault("no-answer", found, "check cable, supply and firmware; unplug and plug in again")
+        heard = explained(bytes(self._heard))
+        found = f"no answer to {' '.join(map(str, words))} after {attempts} attempts: {heard.found}"
+        # What was ours a moment ago has no other speed and no other firmware now.
+        ours = "check cable and supply; unplug it and plug it in again, then go on with --resume"
+        raise fault("no-answer", found, ours if self._boot >= 0 else heard.remedy)
 
     def _await(self, sequence: int) -> Reply | None:
         """The answer to `sequence`; None for silence, at once after a negative acknowledgement."""
@@ -375,6 +318,11 @@ class SerialPositioner:
             if data:
                 deadline = min(self._clock.monotonic() + REPLY_S, start + REPLY_MAX_S)
                 self._buffer += data
+                self._hear(data)
+
+    def _hear(self, data: bytes) -> None:
+        """Keep the beginning of what arrives before an answer: it tells why there is none."""
+        self._heard += data[: max(HEARD_BYTES_MAX - len(self._heard), 0)]
 
     def _next_line(self) -> bytes | None:
         """A complete line from the buffer; one that is too long to be an answer is thrown away."""
@@ -400,8 +348,8 @@ class SerialPositioner:
                 self._link = self._open_link()
             except OSError:
                 if self._clock.monotonic() > deadline:
-                    found = f"the device is gone: {_reason(cause)}"
-                    raise _fault("unplugged", found, "plug it in, then go on with --resume") from cause
+                    found = f"the device is gone: {reason(cause)}"
+                    raise fault("unplugged", found, "plug it in, then go on with --resume") from cause
                 self._clock.sleep(POLL_S)
         self._buffer.clear()
         self._dropping = False
@@ -427,9 +375,6 @@ class SerialPositioner:
             )
 
 
-def _reason(error: OSError) -> str:
-    return escaped(error.strerror or str(error), 200)
-
-
-def _fault(code: str, found: str, remedy: str) -> DeviceFault:
-    return DeviceFault(code, f"positioner: {found}; {remedy}", found=found, remedy=remedy)
+def _used_up(sequence: int) -> DeviceFault:
+    found = f"the device has used up its sequence numbers (the last one was {sequence})"
+    return fault("sequence", found, "unplug it and plug it in again: they begin anew with a reset; then home")

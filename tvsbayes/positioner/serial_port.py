@@ -10,7 +10,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 from tvsbayes.errors import InputError
-from tvsbayes.positioner.driver import Link, SerialPositioner
+from tvsbayes.positioner.driver import SerialPositioner
+from tvsbayes.positioner.interface import Link
 from tvsbayes.positioner.protocol import device_settings
 
 BAUD = 115_200

@@ -4,6 +4,30 @@ from experiments.robustness.faults.fault import Fault
 
 FAULTS = (
     Fault(
+        "journal: a lost end taken for tables that are behind",
+        "acquisition/campaign_files.py",
+        "if moves < 0 or looks < 0:",
+        "if False:",
+        "looks that were taken are gone and nobody says so",
+        ("acquisition/campaign_files",),
+    ),
+    Fault(
+        "resume: another home counter goes on",
+        "acquisition/run_identity.py",
+        "return key in HOME_KEYS.values() or",
+        "return",
+        "two halves of a campaign count from different zeros",
+        ("acquisition/session",),
+    ),
+    Fault(
+        "driver: no laser-off to a device that was not identified",
+        "positioner/driver.py",
+        'self._link.write(b"\n" + request(0, "L", 0))',
+        'self._link.write(b"\n")',
+        "a light left on by another run stays on",
+        ("positioner/silence",),
+    ),
+    Fault(
         "journal: CRC not compared",
         "acquisition/journal.py",
         "if zlib.crc32(line[9:]) != crc:",

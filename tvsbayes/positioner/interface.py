@@ -1,0 +1,127 @@
+"""What a positioner is to whoever drives it: orders, what they promise, and the faults in which they end.
+
+Drivers of other hardware keep these promises too (data/docs/instrument.md, "Your own hardware"): `move_to` and `home`
+return only after the device has said that this very motion has ended at the counters asked for; what else happens ends
+in a `DeviceFault` within a bounded time; the laser is off after `home` and `close`, whatever happened.
+
+Counters are absolute motor steps (pan, tilt); seconds where a name says `_s`. Time comes from a `Clock`, bytes from a
+`Link`: tests drive both without hardware and without waiting.
+"""
+
+from __future__ import annotations
+
+import errno
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Protocol
+
+from tvsbayes.errors import DeviceFault, escaped
+from tvsbayes.positioner.protocol import DeviceState
+
+SEE_DOCTOR = "; see `tvsbayes doctor`"
+"""Ends a remedy; `doctor` leaves it out of its own."""
+_PORT_REMEDY = "check [positioner] port in the rig file, the cable and your rights on the port" + SEE_DOCTOR
+_HELD_REMEDY = (
+    "close the other program (a serial monitor, another run); `fuser -v PORT` names it on Linux and macOS" + SEE_DOCTOR
+)
+_HELD = (errno.EWOULDBLOCK, errno.EBUSY)
+"""What a port says that another program has opened for itself alone (flock(2), TIOCEXCL)."""
+
+
+class PositionLost(DeviceFault):
+    """The device was reset or moved by others: counters mean nothing until it is homed again."""
+
+
+class Clock(Protocol):
+    """Time as the driver sees it."""
+
+    def monotonic(self) -> float:
+        """Seconds, never going back."""
+
+    def sleep(self, seconds: float) -> None:
+        """Let time pass."""
+
+
+class Link(Protocol):
+    """A byte pipe to the device; any call raises OSError once it is gone."""
+
+    def write(self, data: bytes) -> None:
+        """Send all of `data`, or raise."""
+
+    def read(self, timeout_s: float) -> bytes:
+        """Whatever has arrived; waits up to `timeout_s` for the first byte; may be empty."""
+
+    def close(self) -> None:
+        """Give the port back; never raises."""
+
+
+@dataclass(frozen=True, slots=True)
+class HomeReport:
+    """A finished homing.
+
+    Attributes:
+        state: the device afterwards: idle, counters at the home switches.
+        deviation_steps: (pan, tilt) counter where each switch was found minus where it should have been, since the
+            homing before; not zero after lost steps. (0, 0) for the first homing of a device.
+        known: whether this connection homed before, to which the deviation refers.
+        compared: whether the device was homed at all when this homing began; if not (unhomed, in alarm) it reports
+            (0, 0) whatever happened.
+    """
+
+    state: DeviceState
+    deviation_steps: tuple[int, int]
+    known: bool
+    compared: bool
+
+
+class Positioner(Protocol):
+    """A two-axis positioner with a laser, whatever drives it."""
+
+    @property
+    def identity(self) -> Mapping[str, str]:
+        """What the device says of itself: "fw" is its firmware's version; goes into the journal."""
+
+    @property
+    def repeats(self) -> int:
+        """Requests sent again so far: the quality of the line."""
+
+    def home(self) -> HomeReport:
+        """Find the home switches; the laser is off afterwards."""
+
+    def move_to(self, pan_steps: int, tilt_steps: int) -> DeviceState:
+        """Go to absolute counters; returns when the device has said that it is there."""
+
+    def laser(self, on: bool) -> DeviceState:
+        """Switch the laser; returns when the device has said so."""
+
+    def state(self) -> DeviceState:
+        """Ask the device; also a sign of life for its laser watchdog."""
+
+    def close(self) -> None:
+        """Laser off and motors at rest as well as possible, then the line closed; never raises."""
+
+
+def opened(open_link: Callable[[], Link]) -> Link:
+    """The line to a device.
+
+    Raises:
+        DeviceFault: "port-busy" where another program has it, else "port".
+    """
+    try:
+        return open_link()
+    except OSError as error:
+        # Windows says only that access is denied.
+        held = error.errno in _HELD or "PermissionError(13" in str(error)
+        what = "is held by another program" if held else "cannot be opened"
+        code, remedy = ("port-busy", _HELD_REMEDY) if held else ("port", _PORT_REMEDY)
+        raise fault(code, f"the port {what}: {reason(error)}", remedy) from error
+
+
+def reason(error: OSError) -> str:
+    """Why the system refused, printable."""
+    return escaped(error.strerror or str(error), 200)
+
+
+def fault(code: str, found: str, remedy: str) -> DeviceFault:
+    """A fault of the positioner."""
+    return DeviceFault(code, f"positioner: {found}; {remedy}", found=found, remedy=remedy)
