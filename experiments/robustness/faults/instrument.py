@@ -22,8 +22,8 @@ FAULTS = (
     Fault(
         "driver: no laser-off to a device that was not identified",
         "positioner/driver.py",
-        'self._link.write(b"\n" + request(0, "L", 0))',
-        'self._link.write(b"\n")',
+        'self._link.write(b"\\n" + request(0, "L", 0))',
+        'self._link.write(b"\\n")',
         "a light left on by another run stays on",
         ("positioner/silence",),
     ),
