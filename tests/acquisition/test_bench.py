@@ -162,4 +162,4 @@ def test_hardware_path_from_rig_file_to_campaign(small_rig, tmp_path):
     assert verify(tmp_path / "c").frames == 12 and len(read_campaign(tmp_path / "c").spots) == 3
     assert "synthetic" not in read_campaign(tmp_path / "c").header
     start = next(r for r in read_journal(tmp_path / "c").records if r.event == "start")
-    assert start.data["device"]["fw"] == "1.0.0" and "cameras" in start.data
+    assert start.data["device"]["fw"] == "1.1.0" and "cameras" in start.data

@@ -17,7 +17,7 @@ from tvsbayes.errors import DeviceFault
 from tvsbayes.files.disk import shipped_data
 from tvsbayes.instrument.rig import read_rig
 from tvsbayes.positioner.driver import SerialPositioner
-from tvsbayes.positioner.firmware_model import Mechanics
+from tvsbayes.positioner.mechanics import Mechanics
 
 RIG = read_rig(shipped_data() / "rigs" / "mounted" / "rig.toml")
 
@@ -79,7 +79,7 @@ def test_healthy_instrument(tmp_path):
     device, camera = bench()
     checks = found(device, camera, tmp_path, laser=True)
     assert {name for name, check in checks.items() if check.status != "ok"} == {"limits"}
-    assert checks["firmware"].found == "version 1.0.0" and "rises by" in checks["laser"].found
+    assert checks["firmware"].found == "version 1.1.0" and "rises by" in checks["laser"].found
     assert checks["timing"].found.startswith("0.6 ms, 0 of 20") and camera.closed
 
 

@@ -10,8 +10,9 @@ import pytest
 from tvsbayes.acquisition.simulated_instrument import ModelLink, SimulatedDevice, VirtualClock
 from tvsbayes.errors import DeviceFault
 from tvsbayes.positioner.driver import SerialPositioner
-from tvsbayes.positioner.firmware_model import DeviceModel, Mechanics
+from tvsbayes.positioner.firmware_model import DeviceModel
 from tvsbayes.positioner.interface import PositionLost
+from tvsbayes.positioner.mechanics import Mechanics
 from tvsbayes.positioner.protocol import frame, parse_answer, request
 
 SETTINGS = {"hp": -60, "ht": -40, "pmin": -300, "pmax": 300, "wd": 2000}
@@ -29,7 +30,7 @@ def connected(device: SimulatedDevice, settings=None) -> SerialPositioner:
 def test_a_session_from_connection_to_close():
     device = simulated()
     positioner = connected(device)
-    assert positioner.identity["fw"] == "1.0.0" and positioner.repeats == 0
+    assert positioner.identity["fw"] == "1.1.0" and positioner.repeats == 0
     report = positioner.home()
     assert not report.known and (report.state.pan_steps, report.state.tilt_steps) == (-60, -40)
     state = positioner.move_to(200, -15)
@@ -112,6 +113,36 @@ def test_homing_after_an_alarm_compares_nothing(order, compared):
     assert report.deviation_steps == ((4, 0) if compared else (0, 0))
 
 
+def test_close_darkens_though_another_program_has_counted_on():
+    device = simulated()
+    positioner = connected(device)
+    positioner.home()
+    positioner.laser(True)
+    device.model.receive(request(4_000_000_000, "MA", 50, 0), device.clock.now_us)
+    positioner.close()
+    assert not device.mechanics.laser_on
+    device.clock.sleep(5.0)
+    device.model.advance(device.clock.now_us)
+    assert device.mechanics.true_steps == [50, 0], "the other's motion goes on"
+
+
+def test_a_device_that_never_answers_is_darkened_all_the_same():
+    device = simulated()
+    before = connected(device)
+    before.home()
+    before.laser(True)
+    device.model._write = lambda line: None
+    # A watchdog that leaves the light to whoever connects.
+    device.model._settings["wd"] = 10**6
+    link = ModelLink(device)
+    with pytest.raises(DeviceFault):
+        SerialPositioner(lambda: link, {}, device.clock)
+    assert device.mechanics.laser_on
+    device.clock.sleep(0.001)
+    link.settle()
+    assert not device.mechanics.laser_on
+
+
 @pytest.mark.parametrize("words", [("MA", 300, 0), ("HOME",)])
 def test_close_in_mid_motion_stops_the_motors(words):
     device = simulated()
@@ -130,8 +161,8 @@ def test_close_in_mid_motion_stops_the_motors(words):
 
 def test_wrong_protocol_version_is_named():
     device = simulated()
-    device.model = DeviceModel(device.mechanics, 1, 0, device._send, protocol=2)
-    with pytest.raises(DeviceFault, match=r"firmware 1\.0\.0 speaks protocol 2, this program speaks 1"):
+    device.model = DeviceModel(device.mechanics, 1, 0, device._send, protocol=3)
+    with pytest.raises(DeviceFault, match=r"firmware 1\.1\.0 speaks protocol 3, this program speaks 2"):
         connected(device)
 
 

@@ -1,88 +1,19 @@
 """Device model and firmware core: both on the same bytes, ramps, homing, watchdog, laser.
 
-The differential test builds the C++ core with g++ in a temporary folder, sanitizers on where they link.
+The differential test builds the C++ core with g++ in a temporary folder (conftest), sanitizers on where they link.
 """
 
 from __future__ import annotations
 
-import random
 import re
-import shutil
-import subprocess
-from pathlib import Path
 
 import pytest
+from support.firmware_sessions import BOOT, Bench, random_orders, replay
 
 from tvsbayes.positioner import firmware_folder
-from tvsbayes.positioner.firmware_model import DeviceModel, Mechanics
-from tvsbayes.positioner.protocol import (
-    SETTINGS,
-    Reply,
-    Unasked,
-    frame,
-    parse_answer,
-    request,
-)
+from tvsbayes.positioner.protocol import SETTINGS, Unasked, parse_answer, request
 
 FIRMWARE = firmware_folder()
-BOOT = 4_000_000_001
-
-
-class Bench:
-    """A device model with a time of its own; keeps the transcript in the form of firmware/native/replay.cpp."""
-
-    def __init__(self, home=(-60, -40), limit=900, boot=BOOT):
-        self.now_us, self.transcript, self.sent = 0, [], []
-        bench = self
-
-        class Board(Mechanics):
-            def __setattr__(self, name, value):
-                super().__setattr__(name, value)
-                if name == "laser_on" and hasattr(bench, "device_started"):
-                    bench.transcript.append(f"l {bench.now_us} {int(value)}")
-
-        self.board = Board(home_steps=home, limit_steps=limit)
-        self.device_started = True
-        self.device = DeviceModel(self.board, boot, 0, self._write)
-
-    def _write(self, line: bytes) -> None:
-        self.transcript.append(f"w {self.now_us} {line.hex()}")
-        self.sent.append(line)
-
-    def run(self, orders: list[str]) -> list[str]:
-        for order in orders:
-            kind, _, rest = order.partition(" ")
-            if kind == "a":
-                self.now_us = int(rest)
-                self.device.advance(self.now_us)
-            elif kind == "x":
-                self.device.receive(bytes.fromhex(rest), self.now_us)
-            elif kind == "k":
-                axis, steps = map(int, rest.split())
-                self.board.missing_steps[axis] += steps
-            else:
-                pan, tilt = self.board.true_steps
-                self.transcript.append(f"q {pan} {tilt} {int(self.board.laser_on)}")
-        return self.transcript
-
-    def ask(self, sequence: int, *words: object) -> Reply:
-        """One request now, and its reply."""
-        self.device.receive(request(sequence, *words), self.now_us)
-        answer = parse_answer(self.sent[-1][:-1])
-        assert isinstance(answer, Reply)
-        return answer
-
-    def pass_time(self, seconds: float) -> None:
-        self.now_us += round(seconds * 1e6)
-        self.device.advance(self.now_us)
-
-    def homed(self) -> Bench:
-        self.ask(1, "SET", "hp", -60)
-        self.ask(2, "SET", "ht", -40)
-        self.ask(3, "HOME")
-        self.pass_time(20)
-        assert self.ask(4, "?").state.status == "idle"
-        return self
 
 
 def test_repeated_request_is_answered_from_the_cache_and_not_executed_again():
@@ -106,7 +37,7 @@ def test_lower_sequences_and_reused_ones_are_refused():
     assert bench.ask(0, "MA", 30, 0).error == "seq"
     bench.pass_time(5)
     assert bench.board.true_steps == [10, 0]
-    assert bench.ask(0, "ID").extra == {"fw": "1.0.0", "proto": "1", "q": "5"}
+    assert bench.ask(0, "ID").extra == {"fw": "1.1.0", "proto": "2", "q": "5"}
 
 
 def test_moves_need_homing_stay_inside_the_limits_and_never_overlap():
@@ -239,89 +170,9 @@ def test_mechanics_tell_every_stretch_in_one_sense():
     assert [steps for axis, steps in heard if axis == 1] == [40, -40, 20, -20]
 
 
-def _random_orders(seed: int) -> list[str]:
-    """A session with damage: commands of every kind, flips, losses, doubles, merges, noise, pauses, lost steps."""
-    rng = random.Random(seed)
-    now_us, sequence, orders = 0, 0, []
-    sent = b""
-    words = [f"SET hp {-60}", f"SET ht {-40}", "HOME"]
-    for turn in range(140):
-        if turn >= 3:
-            words = [
-                rng.choice(
-                    [
-                        f"MA {rng.randint(-300, 1100)} {rng.randint(-300, 520)}",
-                        f"MA {rng.randint(-40, 40)} {rng.randint(-30, 30)}",
-                        *("HOME", "?", "L 1", "L 0", "STOP", "ABORT", "ID", "L 2", "MA 1", "MA +1 01", "MA -0 0"),
-                        f"SET {rng.choice([*SETTINGS, 'xx'])} {rng.choice([-(10**9), -300, 10, 150, 900, 2**31])}",
-                        f"GET {rng.choice([*SETTINGS, 'xx'])}",
-                        *("MA 1 2 3", "", "ID 1", "MA  1 2", "?" + "x" * rng.randint(0, 120)),
-                    ]
-                )
-            ]
-        for word in words[:1]:
-            if turn < 3 or rng.random() < 0.9:
-                sequence += 1
-            number = sequence if rng.random() < 0.95 or turn < 3 else rng.choice([0, max(sequence - 1, 0), "x", "01"])
-            line = frame(f">{number} {word}")
-            if turn >= 3:
-                kind = rng.random()
-                place = rng.randrange(len(line))
-                if kind < 0.08:
-                    line = line[:place] + bytes([line[place] ^ (1 << rng.randrange(8))]) + line[place + 1 :]
-                elif kind < 0.14:
-                    line = line[:place] + line[place + 1 :]
-                elif kind < 0.2:
-                    line = line[:place] + line[place : place + 1] + line[place:]
-                elif kind < 0.25:
-                    line += line
-                elif kind < 0.3:
-                    line = sent + line
-                elif kind < 0.34:
-                    line = rng.randbytes(rng.randint(1, 300)) + b"\n" + line
-                elif kind < 0.38:
-                    line = line[:-1] + b"\r\n"
-            sent = line
-            orders.append(f"x {line.hex()}")
-        words = words[1:]
-        if rng.random() < 0.05:
-            orders.append(f"k {rng.randrange(2)} {rng.randint(1, 9)}")
-        now_us += rng.choice([0, 137, 20_000, 150_000, 900_000, 2_500_000, 14_000_000])
-        orders += [f"a {now_us}", "q"]
-    return orders
-
-
-def build(folder: Path, *options: str) -> Path | None:
-    """The native core, or None where the compiler refuses the options."""
-    program = folder / "replay"
-    sources = [FIRMWARE / "native" / "replay.cpp", FIRMWARE / "tvs_positioner" / "tvs_core.cpp"]
-    command = ["g++", "-std=c++11", "-Wall", "-Wextra", "-Werror", *options, f"-I{FIRMWARE / 'tvs_positioner'}"]
-    result = subprocess.run([*command, *map(str, sources), "-o", str(program)], capture_output=True, check=False)
-    return program if result.returncode == 0 else None
-
-
-@pytest.fixture(scope="module")
-def native(tmp_path_factory) -> Path:
-    """The C++ core on a native board."""
-    if shutil.which("g++") is None:
-        pytest.skip("no g++ to build the firmware core with")
-    folder = tmp_path_factory.mktemp("native")
-    program = build(folder, "-fsanitize=address,undefined", "-fno-sanitize-recover=all") or build(folder)
-    assert program is not None, "the firmware core does not compile without warnings"
-    return program
-
-
-def replay(program: Path, orders: list[str], *, boot=BOOT, home=(-60, -40), limit=900) -> list[str]:
-    arguments = [str(program), str(boot), *map(str, home), str(limit)]
-    script = "\n".join(orders) + "\n"
-    result = subprocess.run(arguments, input=script, capture_output=True, text=True, check=False)
-    assert result.returncode == 0, result.stderr
-    return result.stdout.splitlines()
-
-
 @pytest.mark.parametrize("seed", range(12))
 def test_firmware_core_and_model_do_the_same_with_the_same_bytes(native, seed):
-    orders = _random_orders(seed)
+    orders = random_orders(seed)
     ours, theirs = Bench().run(orders), replay(native, orders)
     assert theirs == ours
 
@@ -329,13 +180,13 @@ def test_firmware_core_and_model_do_the_same_with_the_same_bytes(native, seed):
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(100, 400))
 def test_firmware_core_and_model_do_the_same_in_300_sessions(native, seed):
-    orders = _random_orders(seed)
+    orders = random_orders(seed)
     assert replay(native, orders) == Bench().run(orders)
 
 
 def test_random_sessions_reach_every_branch():
     """The differential test is worth what its sessions exercise."""
-    seen = "\n".join(line for seed in range(12) for line in Bench().run(_random_orders(seed)))
+    seen = "\n".join(line for seed in range(12) for line in Bench().run(random_orders(seed)))
     text = "\n".join(bytes.fromhex(line.split()[2]).decode() for line in seen.splitlines() if line.startswith("w"))
     wanted = [f"err {word} " for word in ("command", "argument", "seq", "unhomed", "alarm", "busy", "limit")]
     wanted += [f"!nak {kind}" for kind in ("frame", "crc", "parse", "long")]
@@ -346,9 +197,9 @@ def test_random_sessions_reach_every_branch():
 def test_firmware_travels_with_the_package():
     """Everything that a user needs to flash the board lies in the installed package."""
     names = ["README.md", "tvs_positioner/tvs_positioner.ino", "tvs_positioner/tvs_core.h"]
-    names += ["tvs_positioner/tvs_core.cpp", "native/replay.cpp"]
+    names += ["tvs_positioner/tvs_core.cpp", "tvs_positioner/tvs_motion.cpp", "native/replay.cpp"]
     assert [name for name in names if not (FIRMWARE / name).is_file()] == []
-    core = "".join((FIRMWARE / "tvs_positioner" / f"tvs_core.{end}").read_text() for end in ("h", "cpp"))
+    core = "".join(path.read_text() for path in (FIRMWARE / "tvs_positioner").glob("tvs_*.[hc]*"))
     code = re.sub(r"//.*", "", core)
     line = request(0, "ID").decode().strip()
     assert f"`{line}`" in (FIRMWARE / "README.md").read_text(), "what the user types to see the board answer"
@@ -357,4 +208,4 @@ def test_firmware_travels_with_the_package():
 
 def test_boot_banner():
     banner = parse_answer(Bench().sent[0][:-1])
-    assert banner == Unasked("boot", f"b={BOOT} fw=1.0.0")
+    assert banner == Unasked("boot", f"b={BOOT} fw=1.1.0")

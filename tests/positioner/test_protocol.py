@@ -73,8 +73,8 @@ def test_replies_that_are_not_of_the_protocol_are_refused(body):
 
 
 def test_unknown_fields_are_kept_apart():
-    reply = parse_answer(frame("<1 ok b=1 st=idle p=0,0 t=0,0 d=0 l=0 h=0,0 e=none fw=1.0.0 zz=9")[:-1])
-    assert isinstance(reply, Reply) and reply.extra == {"fw": "1.0.0", "zz": "9"}
+    reply = parse_answer(frame("<1 ok b=1 st=idle p=0,0 t=0,0 d=0 l=0 h=0,0 e=none fw=1.1.0 zz=9")[:-1])
+    assert isinstance(reply, Reply) and reply.extra == {"fw": "1.1.0", "zz": "9"}
 
 
 def test_settings_of_a_rig_file():

@@ -8,7 +8,7 @@ from support.pseudo_terminal import needs_pseudo_terminals, served
 from tvsbayes.acquisition.simulated_instrument import SimulatedDevice, VirtualClock
 from tvsbayes.errors import DeviceFault
 from tvsbayes.positioner.driver import SerialPositioner
-from tvsbayes.positioner.firmware_model import Mechanics
+from tvsbayes.positioner.mechanics import Mechanics
 from tvsbayes.positioner.serial_port import serial_opener
 
 SETTINGS = {"hp": -60, "ht": -40, "pmin": -300, "pmax": 300, "wd": 10_000}

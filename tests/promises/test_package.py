@@ -76,7 +76,7 @@ def test_distributions_hold_what_belongs_in_them(built):
         *packages,
     }
     kept = {f"tvsbayes/data/{name}" for name in SHIPPED}
-    flashed = ("tvs_positioner.ino", "tvs_core.h", "tvs_core.cpp")
+    flashed = ("tvs_positioner.ino", "tvs_core.h", "tvs_core.cpp", "tvs_motion.cpp")
     kept |= {f"tvsbayes/positioner/firmware/tvs_positioner/{name}" for name in flashed}
     kept |= {f"tvsbayes/positioner/firmware/{name}" for name in ("README.md", "native/replay.cpp")}
     assert kept <= set(wheel)

@@ -57,7 +57,8 @@ _REFUSALS = {
     "seq": "another program drives the device: close it",
 }
 _ALARMS = {
-    "limit": "a limit switch opened: clear the way, check the limits in the rig file, then home",
+    "limit": "a limit switch opened: clear the way, check the limits in the rig file, then home; "
+    "should homing end like this too, turn the axis back by hand and check the wire of the limit switches",
     "home": "a home switch was not found: check its wiring, then home",
     "abort": "somebody aborted: make sure that all is well, then home",
 }
@@ -168,15 +169,10 @@ class SerialPositioner:
     def _switch_off(self) -> None:
         """Laser off and motors at rest, with few attempts."""
         few = partial(self._exchange, attempts=CLOSING_ATTEMPTS, reconnect=False)
-        reply = few("L", 0, sequence=None if self._sequence < SEQUENCE_MAX else 0)
-        if reply.error == "seq":
-            # Another program has counted on. Whatever it does, our laser goes off: take up its number.
-            last = few("ID", sequence=0).extra.get("q", "")
-            if last.isdigit() and last.isascii():
-                self._sequence = int(last)
-                few("L", 0)
-        elif reply.state.status == "moving":
-            # Interrupted in a motion: a blocked axis must not be driven on when nobody watches it any more.
+        # Without a number: another program may have counted on, and whatever it does, our laser goes off.
+        if few("L", 0, sequence=0).state.status == "moving":
+            # Interrupted in a motion: a blocked axis must not be driven on when nobody watches it any more. Numbered,
+            # so that the motion of another program goes on.
             few("STOP")
 
     def _drain(self) -> None:

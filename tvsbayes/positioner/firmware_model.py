@@ -1,8 +1,7 @@
-"""A positioner in software: the firmware's state machine, and the mechanics behind its counters.
+"""A positioner in software: the firmware's state machine.
 
-`DeviceModel` answers the same bytes at the same microseconds as the C++ core in firmware/tvs_positioner; a
-differential test drives both. `Mechanics` is what the firmware cannot see: where the motors truly stand. It can lose
-steps, and tells a listener every stretch of motion in one sense, from which the twin's gears follow.
+`DeviceModel` answers the same bytes at the same microseconds as the C++ core in firmware/tvs_positioner; differential
+tests drive both. What moves is `mechanics.Mechanics`.
 
 Times are microseconds since start, positions motor steps (pan, tilt). Nothing here sleeps or reads a clock.
 """
@@ -11,12 +10,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
+from tvsbayes.positioner.mechanics import Mechanics
 from tvsbayes.positioner.protocol import (
     FIRMWARE_VERSION,
     REQUEST_CHARS_MAX,
     SETTINGS,
+    TRIGGER_US,
+    UNNUMBERED,
     VERSION,
     DeviceState,
     FrameError,
@@ -36,55 +38,13 @@ HOME_CLEAR_STEPS = 20
 """Steps beyond the release of a home switch."""
 HOME_TRAVEL_MAX_STEPS = 20_000
 """The most that one axis may travel while homing."""
+HOME_OPEN_MAX_STEPS = 200
+"""The most of it with a limit switch open from the start: back from behind a switch, not into the stop."""
+HOME_READS, HOME_READ_US = 4, 500
+"""Readings of a home switch after the first that must agree with it, and the time between them: spikes are no zeros."""
+LIMIT_OPEN_US = 5_000
+"""How long a limit switch that opens at rest must stay open to count."""
 _NEVER = 2**63
-
-
-@dataclass
-class Mechanics:
-    """Motors, switches and laser of a simulated positioner.
-
-    Attributes:
-        home_steps: true position (pan, tilt) at and below which the home switch is pressed.
-        limit_steps: distance from 0 beyond which a limit switch opens.
-        true_steps: where the motors stand; starts at 0, wherever the counters are.
-        missing_steps: next steps that the motors will not do.
-        laser_on: whether light comes out.
-        moved: called with axis and signed steps after every stretch of motion in one sense.
-        found_home: called with the axis when homing has found its switch, at `home_steps`.
-    """
-
-    home_steps: tuple[int, int] = (-1_200, -700)
-    limit_steps: int = 30_000
-    true_steps: list[int] = field(default_factory=lambda: [0, 0])
-    missing_steps: list[int] = field(default_factory=lambda: [0, 0])
-    laser_on: bool = False
-    moved: Callable[[int, int], None] | None = None
-    found_home: Callable[[int], None] | None = None
-    _stretch: list[int] = field(default_factory=lambda: [0, 0])
-
-    def step(self, axis: int, sense: int) -> None:
-        """One pulse to a motor; `sense` is +1 or -1."""
-        if self.missing_steps[axis] > 0:
-            self.missing_steps[axis] -= 1
-            return
-        self.true_steps[axis] += sense
-        if self._stretch[axis] * sense < 0:
-            self.flush(axis)
-        self._stretch[axis] += sense
-
-    def flush(self, axis: int) -> None:
-        """Tell the listener the stretch of motion so far."""
-        stretch, self._stretch[axis] = self._stretch[axis], 0
-        if stretch and self.moved is not None:
-            self.moved(axis, stretch)
-
-    def home_switch(self, axis: int) -> bool:
-        """Whether the home switch is pressed."""
-        return self.true_steps[axis] <= self.home_steps[axis]
-
-    def limit_switch(self, axis: int) -> bool:
-        """Whether a limit switch is open."""
-        return abs(self.true_steps[axis]) > self.limit_steps
 
 
 @dataclass
@@ -124,13 +84,15 @@ class DeviceModel:
         self._error = "none"
         self._last_sequence = self._motion_sequence = self._done_sequence = 0
         self._last_request, self._last_reply = b"", b""
-        self._stopping = self._homing = self._homed_before = False
-        self._home_axis = self._home_clear = self._home_travel = 0
+        self._refused = self._stopping = self._homing = self._homed_before = False
+        self._home_axis = self._home_clear = self._home_travel = self._home_reads = 0
         self._home_limit, self._home_phase = False, "away"
         self._home_due_us, self._heard_us = _NEVER, now_us
+        self._trigger_off_us = self._limit_due_us = _NEVER
         self._line = bytearray()
         self._overlong = False
         self._set_laser(False)
+        self.mechanics.trigger_on = False
         self._write(frame(f"!boot b={boot} fw={FIRMWARE_VERSION}"))
 
     @property
@@ -149,6 +111,8 @@ class DeviceModel:
             pan.home_deviation,
             tilt.home_deviation,
             self._error,
+            self._switches(0),
+            self._switches(1),
         )
 
     def receive(self, data: bytes, now_us: int) -> None:
@@ -164,27 +128,66 @@ class DeviceModel:
                 self._overlong = True
 
     def advance(self, now_us: int) -> None:
-        """Does every step, and switches off the laser, that is due by now, in order of time."""
+        """Lets time pass for a main loop that is never late: everything happens when it is due."""
+        while (due_us := self.next_us()) <= now_us:
+            self.loop(due_us)
+        self.loop(now_us)
+
+    def next_us(self) -> int:
+        """When `loop` has something to do again, should nothing happen before."""
+        return min(self._step_us()[0], self._laser_off_us(), self._trigger_off_us, self._limit_due_us)
+
+    def loop(self, now_us: int) -> None:
+        """Does what is due by now: one step of an axis at most, laser and trigger off."""
+        if self._trigger_off_us <= now_us:
+            self._trigger_off_us = _NEVER
+            self.mechanics.trigger_on = False
         while True:
-            due_us, index = _NEVER, -1
-            if self._homing:
-                due_us = self._home_due_us
-            else:
-                for i, axis in enumerate(self._axes):
-                    if axis.direction and axis.due_us < due_us:
-                        due_us, index = axis.due_us, i
-            off_us = self._heard_us + self._settings["wd"] * 1000 if self.mechanics.laser_on else _NEVER
-            if off_us <= due_us:
-                if off_us > now_us:
-                    return
+            (due_us, index), off_us = self._step_us(), self._laser_off_us()
+            if off_us <= due_us and off_us <= now_us:
                 self._set_laser(False)
                 self._error = "watchdog"
             elif due_us > now_us:
-                return
+                break
             elif self._homing:
-                self._home_step()
+                self._home_step(now_us)
             else:
-                self._step_axis(index)
+                self._step_axis(index, now_us)
+        self._watch_limits(now_us)
+
+    def darkened(self) -> None:
+        """The board has switched the laser off by itself, because `loop` did not come round."""
+        if self.mechanics.laser_on:
+            self._set_laser(False)
+            self._error = "stall"
+
+    def _laser_off_us(self) -> int:
+        return self._heard_us + self._settings["wd"] * 1000 if self.mechanics.laser_on else _NEVER
+
+    def _step_us(self) -> tuple[int, int]:
+        """When the next step is due, and of which axis."""
+        if self._homing:
+            return self._home_due_us, self._home_axis
+        due_us, index = _NEVER, self._home_axis
+        for i, axis in enumerate(self._axes):
+            if axis.direction and axis.due_us < due_us:
+                due_us, index = axis.due_us, i
+        return due_us, index
+
+    def _limit_open(self) -> bool:
+        return self.mechanics.limit_switch(0) or self.mechanics.limit_switch(1)
+
+    def _switches(self, axis: int) -> int:
+        return int(self.mechanics.home_switch(axis)) + 2 * int(self.mechanics.limit_switch(axis))
+
+    def _watch_limits(self, now_us: int) -> None:
+        if self._status != "idle" or not self._limit_open():
+            self._limit_due_us = _NEVER
+        elif self._limit_due_us == _NEVER:
+            self._limit_due_us = now_us + LIMIT_OPEN_US
+        elif self._limit_due_us <= now_us:
+            self._limit_due_us = _NEVER
+            self._halt("alarm", "limit")
 
     def _take_line(self, line: bytes, now_us: int) -> None:
         if not self._overlong and line.endswith(b"\r"):
@@ -199,19 +202,23 @@ class DeviceModel:
             words = unframe(line)[1:].split(" ")
         except FrameError as error:
             return self._nak(error.kind)
-        self._heard_us = now_us
         sequence = unsigned(words[0])
         if sequence is None or len(words) < 2:
             return self._nak("parse")
         if sequence == 0:
-            refused, extra = self._command(0, words[1:], now_us) if words[1:] == ["ID"] else ("seq", "")
+            refused, extra = self._command(0, words[1:], now_us) if tuple(words[1:]) in UNNUMBERED else ("seq", "")
             return self._write(self._reply(0, refused, extra))
         if sequence == self._last_sequence and line == self._last_request:
+            if not self._refused:
+                self._heard_us = now_us
             return self._write(self._last_reply)
         if sequence <= self._last_sequence:
             return self._write(self._reply(sequence, "seq", ""))
         self._last_sequence, self._last_request = sequence, line
         refused, extra = self._command(sequence, words[1:], now_us)
+        self._refused = refused is not None
+        # Only a host that counts on and is obeyed keeps the light on.
+        self._heard_us = self._heard_us if self._refused else now_us
         self._last_reply = self._reply(sequence, refused, extra)
         return self._write(self._last_reply)
 
@@ -224,7 +231,7 @@ class DeviceModel:
     def _command(self, sequence: int, words: list[str], now_us: int) -> tuple[str | None, str]:
         """Executes one command: the reason of refusal or None, and fields beside the state."""
         name, arguments = words[0], words[1:]
-        counts = {"ID": 0, "?": 0, "MA": 2, "HOME": 0, "STOP": 0, "ABORT": 0, "L": 1, "GET": 1, "SET": 2}
+        counts = {"ID": 0, "?": 0, "MA": 2, "HOME": 0, "STOP": 0, "ABORT": 0, "L": 1, "TRIG": 1, "GET": 1, "SET": 2}
         if name not in counts:
             return "command", ""
         if len(arguments) != counts[name]:
@@ -241,6 +248,8 @@ class DeviceModel:
             self._halt("unhomed" if self._status == "unhomed" or self._homing else "alarm", "abort")
         elif name == "L":
             return self._laser(arguments[0]), ""
+        elif name == "TRIG":
+            return self._trigger(arguments[0], now_us), ""
         elif name in ("GET", "SET"):
             return self._setting(arguments)
         return None, ""
@@ -279,6 +288,14 @@ class DeviceModel:
         self._set_laser(argument == "1")
         return None
 
+    def _trigger(self, argument: str, now_us: int) -> str | None:
+        width_us, (shortest, longest) = unsigned(argument), TRIGGER_US
+        if width_us is None or not shortest <= width_us <= longest:
+            return "argument"
+        self._trigger_off_us = now_us + width_us
+        self.mechanics.trigger_on = True
+        return None
+
     def _setting(self, arguments: list[str]) -> tuple[str | None, str]:
         name = arguments[0]
         if name not in SETTINGS:
@@ -303,19 +320,21 @@ class DeviceModel:
         top = self._settings["vmax"]
         return 0 if top <= START_SPEED else (top * top - START_SPEED**2) // (2 * self._settings["amax"])
 
-    def _step_axis(self, index: int) -> None:
+    def _step_axis(self, index: int, now_us: int) -> None:
         axis = self._axes[index]
         self.mechanics.step(index, axis.direction)
         axis.position += axis.direction
-        if self.mechanics.limit_switch(index):
+        if self._limit_open():
             return self._halt("alarm", "limit")
         remaining = (axis.target - axis.position) * axis.direction
         if remaining == 0:
             axis.direction = 0
             return self._finish_if_at_rest()
+        # A motor that was left waiting stands: it starts up the ramp again.
+        stalled = now_us - axis.due_us > self._delay_us(0)
         # Slow down so that the last step is done at the starting speed.
-        axis.level = min(axis.level + 1, self._top_level(), remaining - 1)
-        axis.due_us += self._delay_us(axis.level)
+        axis.level = min(0 if stalled else axis.level + 1, self._top_level(), remaining - 1)
+        axis.due_us = now_us + self._delay_us(axis.level)
         return None
 
     def _finish_if_at_rest(self) -> None:
@@ -360,7 +379,7 @@ class DeviceModel:
         return None
 
     def _home_one(self, axis: int, now_us: int) -> None:
-        self._home_axis, self._home_travel = axis, 0
+        self._home_axis, self._home_travel, self._home_reads = axis, 0, 0
         self._home_limit = self.mechanics.limit_switch(axis)
         self._enter_phase("away" if self.mechanics.home_switch(axis) else "fast", now_us)
 
@@ -371,31 +390,50 @@ class DeviceModel:
     def _home_delay_us(self) -> int:
         return 1_000_000 // (HOME_SLOW_SPEED if self._home_phase == "slow" else START_SPEED)
 
-    def _home_step(self) -> None:
-        now_us, positive = self._home_due_us, self._home_phase in ("away", "back")
+    def _home_step(self, now_us: int) -> None:
+        if self._home_reads > 0:
+            return self._home_read(now_us)
+        positive = self._home_phase in ("away", "back")
         axis = self._axes[self._home_axis]
         self.mechanics.step(self._home_axis, 1 if positive else -1)
         axis.position += 1 if positive else -1
         axis.target = axis.position
-        # Homing also leads back from an open limit; one that opens on the way means that no home switch will come.
+        # Homing also leads back from an open limit, a little way; one that opens on the way means that no home switch
+        # will come.
         limit = self.mechanics.limit_switch(self._home_axis)
-        if limit and not self._home_limit:
+        self._home_travel += 1
+        if limit and (not self._home_limit or self._home_travel > HOME_OPEN_MAX_STEPS):
             return self._halt("alarm", "limit")
         self._home_limit = limit
-        self._home_travel += 1
         if self._home_travel > HOME_TRAVEL_MAX_STEPS:
             return self._halt("alarm", "home")
         pressed = self.mechanics.home_switch(self._home_axis)
-        if positive and not pressed:
-            self._home_clear -= 1
+        self._home_due_us = now_us + self._home_delay_us()
+        if positive:
+            self._home_clear = HOME_CLEAR_STEPS if pressed else self._home_clear - 1
             if self._home_clear == 0:
-                return self._enter_phase("fast" if self._home_phase == "away" else "slow", now_us)
-        if not positive and pressed:
-            return self._enter_phase("back", now_us) if self._home_phase == "fast" else self._home_found(now_us)
-        self._home_due_us += self._home_delay_us()
+                self._enter_phase("fast" if self._home_phase == "away" else "slow", now_us)
+        elif pressed:
+            self._home_reads = HOME_READS
+            self._home_due_us = now_us + HOME_READ_US
         return None
 
+    def _home_read(self, now_us: int) -> None:
+        """Whether the home switch is still pressed, the motor at rest."""
+        if not self.mechanics.home_switch(self._home_axis):
+            self._home_reads = 0
+            self._home_due_us = now_us + self._home_delay_us()
+            return None
+        self._home_reads -= 1
+        if self._home_reads > 0:
+            self._home_due_us = now_us + HOME_READ_US
+            return None
+        return self._enter_phase("back", now_us) if self._home_phase == "fast" else self._home_found(now_us)
+
     def _home_found(self, now_us: int) -> None:
+        # Behind an open limit the switch of a homed axis cannot lie: a wire is broken, or the wrong switch was found.
+        if self._limit_open() if self._home_axis else self.mechanics.limit_switch(0):
+            return self._halt("alarm", "limit")
         axis = self._axes[self._home_axis]
         home = self._settings["ht" if self._home_axis else "hp"]
         axis.home_deviation = axis.position - home if self._homed_before else 0

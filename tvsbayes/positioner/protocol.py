@@ -9,11 +9,14 @@ One text line per message, so that it can be typed, logged and searched:
 CRC is CRC-16/CCITT-FALSE over everything before `*`, four upper-case hexadecimal digits. SEQ is an unsigned 32 bit
 number. A request with the sequence of the last one and the same bytes is answered from the cached reply and not
 executed again; a lower sequence, or the same one with other content, is refused. All moves are absolute. So a host
-may repeat a request whose answer it did not get, as often as it wants. `>0 ID` is the only request without a place
-in the sequence: it reads the device's last number, from which a host goes on counting.
+may repeat a request whose answer it did not get, as often as it wants. Four requests come with sequence 0, without a
+place in the sequence, and are accepted at any time: `>0 ID` reads the device's last number, from which a host goes on
+counting; `>0 L 0`, `>0 STOP` and `>0 ABORT` need no number that a host may have lost. Light stays on while requests
+that have a place are accepted; what is refused or unnumbered is no sign of life.
 
 Every reply carries the state: b boot id, st status, p counters, t targets, d sequence of the last motion that
-reached its target, l laser, h home deviation, e last error. A motion is done when d is its sequence, never by time.
+reached its target, l laser, h home deviation, s switches (1 home pressed + 2 limit open), e last error. A motion is
+done when d is its sequence, never by time.
 
 Counters are absolute motor steps (pan, tilt). No state, no input or output here.
 """
@@ -28,9 +31,9 @@ from typing import Literal, cast
 
 from tvsbayes.instrument.counter_limits import HOME_KEYS, CounterLimits
 
-VERSION = 1
+VERSION = 2
 """Version of this protocol; a device with another one is refused."""
-FIRMWARE_VERSION = "1.0.0"
+FIRMWARE_VERSION = "1.1.0"
 """Version of the firmware shipped with this package, which the device model reports too."""
 REQUEST_CHARS_MAX = 96
 """Longest request line without its line feed; a longer one is dropped up to the next line feed."""
@@ -53,6 +56,10 @@ SETTINGS: dict[str, tuple[int, int, int]] = {
 }
 """Lowest, highest and boot value by name: top speed (steps/s), acceleration (steps/s^2), soft limits of pan and tilt
 (steps), counters at the home switches (steps), laser watchdog (ms)."""
+TRIGGER_US = (10, 1_000_000)
+"""Shortest and longest pulse on the trigger line, microseconds."""
+UNNUMBERED = frozenset({("ID",), ("L", "0"), ("STOP",), ("ABORT",)})
+"""Commands, as words, that come with sequence 0."""
 LIMIT_SETTINGS = {"pan": ("pmin", "pmax"), "tilt": ("tmin", "tmax")}
 """Soft limits of an axis, lowest first, by their names in the protocol."""
 OTHER_SETTINGS = (
@@ -66,6 +73,8 @@ _FRAME = re.compile(rb"([><!][ -)+-~]*)\*([0-9A-F]{4})")
 _WORD = re.compile(r"[a-z]+(-[a-z]+)*")
 _FIELD = re.compile(r"([a-z]+)=([ -~]+)")
 _STATE_KEYS = ("b", "st", "p", "t", "d", "l", "h", "e")
+_SWITCHES_KEY = "s"
+_OF_STATE = frozenset((*_STATE_KEYS, _SWITCHES_KEY))
 
 
 class FrameError(ValueError):
@@ -90,6 +99,7 @@ class DeviceState:
         pan_home_deviation_steps, tilt_home_deviation_steps: at the last homing, counter where the switch was found
             minus where it should have been: not zero after lost steps.
         last_error: "none" or a word.
+        pan_switches, tilt_switches: 1 where the home switch is pressed, plus 2 where the limit circuit is open.
     """
 
     boot: int
@@ -103,6 +113,18 @@ class DeviceState:
     pan_home_deviation_steps: int
     tilt_home_deviation_steps: int
     last_error: str
+    pan_switches: int = 0
+    tilt_switches: int = 0
+
+    @property
+    def home_pressed(self) -> tuple[bool, bool]:
+        """Whether the home switch of (pan, tilt) is pressed."""
+        return bool(self.pan_switches & 1), bool(self.tilt_switches & 1)
+
+    @property
+    def limit_open(self) -> tuple[bool, bool]:
+        """Whether the limit circuit of (pan, tilt) is open: a limit reached, or a broken wire."""
+        return bool(self.pan_switches & 2), bool(self.tilt_switches & 2)
 
 
 @dataclass(frozen=True, slots=True)
@@ -175,7 +197,8 @@ def state_text(state: DeviceState) -> str:
     return (
         f"b={state.boot} st={state.status} p={state.pan_steps},{state.tilt_steps} "
         f"t={state.pan_target_steps},{state.tilt_target_steps} d={state.done_sequence} l={int(state.laser_on)} "
-        f"h={state.pan_home_deviation_steps},{state.tilt_home_deviation_steps} e={state.last_error}"
+        f"h={state.pan_home_deviation_steps},{state.tilt_home_deviation_steps} "
+        f"s={state.pan_switches},{state.tilt_switches} e={state.last_error}"
     )
 
 
@@ -204,7 +227,7 @@ def parse_answer(line: bytes) -> Reply | Unasked:
         if match is None or match[1] in fields:
             raise FrameError("parse")
         fields[match[1]] = match[2]
-    return Reply(sequence, error, _state(fields), {k: v for k, v in fields.items() if k not in _STATE_KEYS})
+    return Reply(sequence, error, _state(fields), {k: v for k, v in fields.items() if k not in _OF_STATE})
 
 
 def _pair(text: str) -> tuple[int, int]:
@@ -221,6 +244,10 @@ def _state(fields: dict[str, str]) -> DeviceState:
     good = fields["st"] in STATUSES and fields["l"] in ("0", "1") and _WORD.fullmatch(fields["e"])
     if boot is None or done is None or not good:
         raise FrameError("parse")
+    # Firmware of protocol 1 tells no switches; that it is too old is said where its version is read.
+    switches = _pair(fields.get(_SWITCHES_KEY, "0,0"))
+    if not all(0 <= value <= 3 for value in switches):
+        raise FrameError("parse")
     return DeviceState(
         boot,
         cast("Status", fields["st"]),
@@ -230,6 +257,7 @@ def _state(fields: dict[str, str]) -> DeviceState:
         fields["l"] == "1",
         *_pair(fields["h"]),
         fields["e"],
+        *switches,
     )
 
 

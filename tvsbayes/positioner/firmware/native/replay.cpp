@@ -1,13 +1,19 @@
 // Runs the core without a board: reads a script from stdin, writes what happened to stdout.
 // The motors drive a counter of true steps per axis, with a home switch below a position and limit switches outside a
 // range. One order per line:
-//   a US         advance to a time
+//   a US         advance to a time, with a main loop that is never late
+//   j US         the main loop hangs until then and comes round once
+//   d            the board's guard has switched the laser off
 //   x HEX        bytes from the host, all at the present time
 //   k AXIS N     the motor misses its next N steps
+//   b AXIS N     the next N readings of the home switch are wrong
+//   c AXIS 0|1   the limit circuit of an axis is whole (0) or cut (1)
+//   e AXIS 0|1   the home switch is alive (0) or dead, never pressed (1)
 //   q            print true steps and laser
-// Output: "w US HEX" for bytes to the host, "l US 0|1" for the laser line, "q PAN TILT LASER".
+// Output: "w US HEX" for bytes to the host, "l US 0|1" for the laser line, "t US 0|1" for the trigger line,
+// "q PAN TILT LASER".
 //
-//   g++ -std=c++11 -Wall -Wextra -I../tvs_positioner replay.cpp ../tvs_positioner/tvs_core.cpp -o replay
+//   g++ -std=c++11 -Wall -Wextra -I../tvs_positioner replay.cpp ../tvs_positioner/tvs_*.cpp -o replay
 //   ./replay BOOT_ID PAN_SWITCH TILT_SWITCH LIMIT < script
 #include <stdio.h>
 #include <stdlib.h>
@@ -19,7 +25,8 @@ namespace {
 
 class Board : public tvs::Hooks {
  public:
-  long true_steps[2] = {0, 0}, missing[2] = {0, 0}, home[2], limit;
+  long true_steps[2] = {0, 0}, missing[2] = {0, 0}, wrong_reads[2] = {0, 0}, home[2], limit;
+  bool limit_cut[2] = {false, false}, home_dead[2] = {false, false};
   unsigned long long now_us = 0;
   bool laser_on = false;
 
@@ -30,18 +37,51 @@ class Board : public tvs::Hooks {
       true_steps[axis] += positive ? 1 : -1;
     }
   }
-  bool home_switch(int axis) override { return true_steps[axis] <= home[axis]; }
-  bool limit_switch(int axis) override { return labs(true_steps[axis]) > limit; }
+  bool home_switch(int axis) override {
+    const bool pressed = !home_dead[axis] && true_steps[axis] <= home[axis];
+    if (wrong_reads[axis] == 0) return pressed;
+    --wrong_reads[axis];
+    return !pressed;
+  }
+  bool limit_switch(int axis) override { return limit_cut[axis] || labs(true_steps[axis]) > limit; }
   void laser(bool on) override {
     laser_on = on;
     printf("l %llu %d\n", now_us, on ? 1 : 0);
   }
+  void trigger(bool on) override { printf("t %llu %d\n", now_us, on ? 1 : 0); }
   void write(const char* data, size_t size) override {
     printf("w %llu ", now_us);
     for (size_t i = 0; i < size; ++i) printf("%02x", static_cast<unsigned char>(data[i]));
     printf("\n");
   }
 };
+
+// An axis and a number.
+struct Pair {
+  explicit Pair(const char* text) {
+    char* rest;
+    axis = strtol(text, &rest, 10) == 1;
+    number = strtol(rest, nullptr, 10);
+  }
+  int axis;
+  long number;
+};
+
+void advance(tvs::Core& core, Board& board, unsigned long long now_us) {
+  while (core.next_us() <= now_us) {
+    board.now_us = core.next_us();
+    core.loop(board.now_us);
+  }
+  board.now_us = now_us;
+  core.loop(now_us);
+}
+
+void receive(tvs::Core& core, const Board& board, const char* hex) {
+  for (; hex[0] > ' ' && hex[1] > ' '; hex += 2) {
+    const char pair[3] = {hex[0], hex[1], '\0'};
+    core.receive(static_cast<uint8_t>(strtoul(pair, nullptr, 16)), board.now_us);
+  }
+}
 
 }  // namespace
 
@@ -55,18 +95,24 @@ int main(int count, char** words) {
   core.start(0);
   static char order[65536];
   while (fgets(order, sizeof order, stdin) != nullptr) {
+    const Pair pair(order + 1);
     if (order[0] == 'a') {
+      advance(core, board, strtoull(order + 2, nullptr, 10));
+    } else if (order[0] == 'j') {
       board.now_us = strtoull(order + 2, nullptr, 10);
-      core.advance(board.now_us);
+      core.loop(board.now_us);
+    } else if (order[0] == 'd') {
+      core.darkened();
     } else if (order[0] == 'x') {
-      for (const char* hex = order + 2; hex[0] > ' ' && hex[1] > ' '; hex += 2) {
-        const char pair[3] = {hex[0], hex[1], '\0'};
-        core.receive(static_cast<uint8_t>(strtoul(pair, nullptr, 16)), board.now_us);
-      }
+      receive(core, board, order + 2);
     } else if (order[0] == 'k') {
-      char* rest;
-      const long axis = strtol(order + 2, &rest, 10);
-      board.missing[axis == 1] += strtol(rest, nullptr, 10);
+      board.missing[pair.axis] += pair.number;
+    } else if (order[0] == 'b') {
+      board.wrong_reads[pair.axis] += pair.number;
+    } else if (order[0] == 'c') {
+      board.limit_cut[pair.axis] = pair.number != 0;
+    } else if (order[0] == 'e') {
+      board.home_dead[pair.axis] = pair.number != 0;
     } else if (order[0] == 'q') {
       printf("q %ld %ld %d\n", board.true_steps[0], board.true_steps[1], board.laser_on ? 1 : 0);
     }

@@ -1,6 +1,7 @@
-// Core of the positioner's firmware: frames, sequence numbers, ramps, homing, soft limits, laser watchdog.
+// Core of the positioner's firmware: frames and commands in tvs_core.cpp, motion in tvs_motion.cpp.
 // Portable C++11: no Arduino include, no heap, no floating point. The board is reached through Hooks only, so the
-// same core runs natively in the tests, where it must agree byte by byte with tvsbayes/positioner/firmware_model.py.
+// same core runs natively and on an emulated processor in the tests, where it must agree byte by byte with
+// tvsbayes/positioner/firmware_model.py.
 // The protocol is described in tvsbayes/positioner/protocol.py. Times are microseconds since start, positions motor steps.
 #pragma once
 
@@ -11,13 +12,14 @@ namespace tvs {
 
 enum { kPan = 0, kTilt = 1, kAxes = 2 };
 
-// What the core needs from a board. Called from receive() and advance() only, never from an interrupt.
+// What the core needs from a board. Called from start(), receive(), loop() and darkened() only, never from an interrupt.
 class Hooks {
  public:
   virtual void step(int axis, bool positive) = 0;
   virtual bool home_switch(int axis) = 0;
   virtual bool limit_switch(int axis) = 0;
   virtual void laser(bool on) = 0;
+  virtual void trigger(bool on) = 0;
   virtual void write(const char* data, size_t size) = 0;
 
  protected:
@@ -32,13 +34,18 @@ class Core {
   void start(uint64_t now_us);
   // Takes one byte from the host.
   void receive(uint8_t byte, uint64_t now_us);
-  // Does every step, and switches off the laser, that is due by now, in order of time.
-  void advance(uint64_t now_us);
+  // Does what is due by now: one step of an axis at most, laser and trigger off. To be called all the time.
+  void loop(uint64_t now_us);
+  // When loop() has something to do again, should nothing happen before.
+  uint64_t next_us() const;
+  // The board has switched the laser off by itself, because loop() did not come round.
+  void darkened();
 
  private:
   enum Status { kUnhomed, kIdle, kMoving, kAlarm };
   enum Phase { kAway, kFast, kBack, kSlow };
-  enum { kSettings = 9, kRequestMax = 96, kReplyMax = 192 };
+  enum { kVmax, kAmax, kPmin, kPmax, kTmin, kTmax, kHp, kHt, kWd, kSettings };
+  enum { kRequestMax = 96, kReplyMax = 192 };
   struct Axis {
     int32_t position, target, home_deviation;
     int32_t level;      // step number on the ramp: speed^2 = start^2 + 2 * acceleration * level
@@ -46,22 +53,36 @@ class Core {
     uint64_t due_us;
   };
 
+  static const uint64_t kNever = UINT64_MAX;
+
   void line(uint64_t now_us);
   void nak(const char* kind);
   void send(const char* body, size_t size);
   void execute(uint32_t sequence, const char* words[], int count, uint64_t now_us);
   const char* command(uint32_t sequence, const char* words[], int count, uint64_t now_us, char* extra);
-  const char* move(uint32_t sequence, int32_t pan, int32_t tilt, uint64_t now_us);
+  const char* light(const char* word);
+  const char* setting(const char* name, const char* word, char* extra);
   void reply(uint32_t sequence, const char* error, const char* extra);
+  int switches(int axis);  // 1 home pressed + 2 limit open
+
+  const char* move(uint32_t sequence, int32_t pan, int32_t tilt, uint64_t now_us);
+  void stop();
+  uint64_t laser_off_us() const;
+  uint64_t step_us(int* axis) const;
+  bool limit_open();
+  void watch_limits(uint64_t now_us);
   uint32_t delay_us(int32_t level) const;
   int32_t top_level() const;
-  void step_axis(int axis);
+  void step_axis(int axis, uint64_t now_us);
   void finish_if_at_rest();
   void halt(Status status, const char* error);
   void set_laser(bool on);
+  const char* home(uint32_t sequence, uint64_t now_us);
   void home_axis(int axis, uint64_t now_us);
   void home_phase(Phase phase, uint64_t now_us);
-  void home_step();
+  uint32_t home_delay_us() const;
+  void home_step(uint64_t now_us);
+  void home_read(uint64_t now_us);
   void home_found(uint64_t now_us);
 
   Hooks& hooks_;
@@ -71,12 +92,12 @@ class Core {
   Axis axes_[kAxes];
   int32_t settings_[kSettings];
   uint32_t last_sequence_, motion_sequence_, done_sequence_;
-  bool laser_, stopping_, homing_, homed_before_;
+  bool laser_, refused_, stopping_, homing_, homed_before_;
   int home_axis_;
   Phase home_phase_;
-  int32_t home_clear_, home_travel_;
+  int32_t home_clear_, home_travel_, home_reads_;
   bool home_limit_;
-  uint64_t home_due_us_, heard_us_;
+  uint64_t home_due_us_, heard_us_, trigger_off_us_, limit_due_us_;
   char request_[kRequestMax + 2], last_request_[kRequestMax + 2], last_reply_[kReplyMax + 8];
   size_t request_size_, last_request_size_, last_reply_size_;
   bool overlong_;

@@ -11,17 +11,26 @@ const uint8_t kStepPin[] = {2, 4}, kDirectionPin[] = {3, 5};  // pan, tilt
 const uint8_t kHomePin[] = {6, 7};   // switch to ground, closed at home
 const uint8_t kLimitPin[] = {8, 9};  // switch to ground, normally closed: a broken wire reads as a limit
 const uint8_t kLaserPin = 10;        // high = light; a 10 kOhm resistor to ground keeps it dark while the board resets
+const uint8_t kTriggerPin = 11;      // high while the order TRIG says so: the cameras' trigger input
 const bool kDirectionHighIsPositive[] = {true, true};
-const unsigned kPulseUs = 3;
+// Length of a step pulse, and how long the direction stands before it: 0.65 us for a DRV8825, 5 us for a DM542.
+const unsigned kPulseUs = 3, kDirectionSetupUs = 5;
 const uint32_t kStuckMs = 100;
+// Half seconds in which loop() must come round, or the processor resets itself.
+const unsigned kWatchdogHalfSeconds = 2;
 
 volatile uint32_t alive_ms = 0;
+volatile bool guard_darkened = false;
 
 class Board : public tvs::Hooks {
  public:
   void step(int axis, bool positive) override {
-    digitalWriteFast(kDirectionPin[axis], positive == kDirectionHighIsPositive[axis] ? HIGH : LOW);
-    delayMicroseconds(1);
+    const uint8_t direction = positive == kDirectionHighIsPositive[axis] ? HIGH : LOW;
+    if (direction != direction_[axis]) {
+      digitalWriteFast(kDirectionPin[axis], direction);
+      direction_[axis] = direction;
+      delayMicroseconds(kDirectionSetupUs);
+    }
     digitalWriteFast(kStepPin[axis], HIGH);
     delayMicroseconds(kPulseUs);
     digitalWriteFast(kStepPin[axis], LOW);
@@ -29,10 +38,14 @@ class Board : public tvs::Hooks {
   bool home_switch(int axis) override { return digitalReadFast(kHomePin[axis]) == LOW; }
   bool limit_switch(int axis) override { return digitalReadFast(kLimitPin[axis]) == HIGH; }
   void laser(bool on) override { digitalWriteFast(kLaserPin, on ? HIGH : LOW); }
+  void trigger(bool on) override { digitalWriteFast(kTriggerPin, on ? HIGH : LOW); }
   void write(const char* data, size_t size) override {
     // Without a listening host the line is dropped: waiting would stop the motors in mid-ramp.
     if (Serial && static_cast<size_t>(Serial.availableForWrite()) >= size) Serial.write(data, size);
   }
+
+ private:
+  uint8_t direction_[tvs::kAxes] = {0xFF, 0xFF};  // neither level: the first step sets it
 };
 
 // A number that no earlier start had: a counter in the EEPROM.
@@ -54,20 +67,56 @@ uint64_t now_us() {
   return wraps + now;
 }
 
-// Last resort beside the core's own watchdog: no light when the main loop hangs.
+// Beside the core's own watchdog: no light when the main loop hangs. The core is told when the loop comes round again.
 void dark_when_stuck() {
-  if (millis() - alive_ms > kStuckMs) digitalWriteFast(kLaserPin, LOW);
+  if (millis() - alive_ms <= kStuckMs) return;
+  digitalWriteFast(kLaserPin, LOW);
+  guard_darkened = true;
 }
+
+#if defined(__IMXRT1062__)
+// A fault stops every interrupt: the pin goes low here, and the processor's own watchdog resets the board.
+void dark_in_fault() {
+  digitalWriteFast(kLaserPin, LOW);
+  for (;;) {
+  }
+}
+
+void feed_watchdog() {
+  WDOG1_WSR = 0x5555;
+  WDOG1_WSR = 0xAAAA;
+}
+
+void start_watchdog() {
+  for (int vector = 3; vector <= 6; ++vector) _VectorsRam[vector] = dark_in_fault;  // hard fault to usage fault
+  CCM_CCGR3 |= CCM_CCGR3_WDOG1(CCM_CCGR_ON);
+  WDOG1_WMCR = 0;
+  WDOG1_WCR = WDOG_WCR_WT(kWatchdogHalfSeconds - 1) | WDOG_WCR_SRS | WDOG_WCR_WDA | WDOG_WCR_WDE;
+  feed_watchdog();
+}
+#else
+// Another board has another watchdog: put it here. Without it a crashed processor leaves the laser on.
+void feed_watchdog() {}
+void start_watchdog() {}
+#endif
 
 Board board;
 tvs::Core* core = nullptr;
 IntervalTimer guard;
+
+void tell_if_darkened() {
+  if (!guard_darkened) return;
+  guard_darkened = false;
+  core->darkened();
+}
 
 }  // namespace
 
 void setup() {
   pinMode(kLaserPin, OUTPUT);
   digitalWriteFast(kLaserPin, LOW);
+  pinMode(kTriggerPin, OUTPUT);
+  digitalWriteFast(kTriggerPin, LOW);
   for (int axis = 0; axis < tvs::kAxes; ++axis) {
     pinMode(kStepPin[axis], OUTPUT);
     pinMode(kDirectionPin[axis], OUTPUT);
@@ -80,13 +129,17 @@ void setup() {
   core->start(now_us());
   alive_ms = millis();
   guard.begin(dark_when_stuck, 10000);
+  start_watchdog();
 }
 
 void loop() {
-  core->advance(now_us());
-  while (Serial.available() > 0) {
+  feed_watchdog();
+  tell_if_darkened();
+  core->loop(now_us());
+  // A flood of bytes must not keep the loop from coming round.
+  for (int i = 0; i < 64 && Serial.available() > 0; ++i) {
     core->receive(static_cast<uint8_t>(Serial.read()), now_us());
-    core->advance(now_us());
+    core->loop(now_us());
   }
   alive_ms = millis();
 }
