@@ -134,12 +134,8 @@ def test_a_device_that_never_answers_is_darkened_all_the_same():
     device.model._write = lambda line: None
     # A watchdog that leaves the light to whoever connects.
     device.model._settings["wd"] = 10**6
-    link = ModelLink(device)
     with pytest.raises(DeviceFault):
-        SerialPositioner(lambda: link, {}, device.clock)
-    assert device.mechanics.laser_on
-    device.clock.sleep(0.001)
-    link.settle()
+        connected(device)
     assert not device.mechanics.laser_on
 
 
