@@ -5,7 +5,7 @@ frame says when it was exposed. So every `grab` first empties the buffers: a buf
 decoded, a live one at the camera's own rate, which is measured at opening; only behind the first live frames, which
 may still have been in the pipe, one is taken. A camera that never makes us wait is refused: its frames could be of any
 age. Where decoding takes as long as the camera's period the two cannot be told apart; then the proof by light holds
-that whoever drives the laser adds.
+that whoever drives the laser adds. Streams of the network are read all the time (`network_stream`).
 
 Pictures are (height, width, 3) uint8, blue, green, red, as OpenCV delivers them; raw pixels, nothing rectified.
 Seconds where a name says `_s`.
@@ -18,10 +18,12 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Protocol
 
 import numpy as np
 
+from tvsbayes.cameras.network_stream import Capture, NetworkStream
 from tvsbayes.errors import DeviceFault, InputError, escaped
 from tvsbayes.positioner.interface import Clock
 
@@ -33,9 +35,9 @@ RATE_FRAMES, RATE_S = 12, 0.4
 """The rate is measured over at least so many frames and seconds at opening, and read off the last eight."""
 PIPELINE_FRAMES = 2
 """Live frames to leave out: one was being exposed when it was asked for, one may be on its way."""
-FLUSH_FRAMES_MAX = 250
+FLUSH_FRAMES_MAX = 2_000
 FLUSH_MAX_S = 10.0
-"""The longest emptying of buffers, in frames and in seconds."""
+"""The longest emptying of buffers, in frames and in seconds: sockets hold some hundred small frames."""
 STREAM_TIMEOUT_MS = 5_000
 FFMPEG_QUIET = "-8"
 """FFmpeg's AV_LOG_QUIET."""
@@ -79,28 +81,6 @@ class StereoCamera(Protocol):
         """Give the cameras back; never raises."""
 
 
-class Capture(Protocol):
-    """The part of `cv2.VideoCapture` that is used."""
-
-    def grab(self) -> bool:
-        """Take the next frame from the driver."""
-
-    def retrieve(self) -> tuple[bool, Any]:
-        """Decode the frame taken last."""
-
-    def get(self, prop: int) -> float:
-        """A property; 0 or -1 where there is none."""
-
-    def set(self, prop: int, value: float) -> bool:
-        """Set a property; whether the driver took it."""
-
-    def getBackendName(self) -> str:
-        """Through which of OpenCV's backends it is open."""
-
-    def release(self) -> None:
-        """Give the device back."""
-
-
 @contextmanager
 def _quiet_opencv() -> Iterator[None]:
     """OpenCV and its FFmpeg write no warnings to stderr meanwhile: what fails is raised, with a remedy.
@@ -138,15 +118,20 @@ def open_capture(source: str | int) -> Capture:
         if not source.startswith(("http://", "https://", "rtsp://")):
             remedy = "give a device number, a device path, or an http, https or rtsp address"
             raise InputError("camera", f"[cameras] source {escaped(source)} is no camera", remedy=remedy)
-        waits = [
-            cv2.CAP_PROP_OPEN_TIMEOUT_MSEC,
-            STREAM_TIMEOUT_MS,
-            cv2.CAP_PROP_READ_TIMEOUT_MSEC,
-            STREAM_TIMEOUT_MS,
-        ]
-        capture = cv2.VideoCapture(source, cv2.CAP_FFMPEG, waits)
-    else:
-        capture = cv2.VideoCapture(source)
+        return NetworkStream(partial(_open_stream, source))
+    return _opened(cv2.VideoCapture(source), source)
+
+
+def _open_stream(address: str) -> Capture:
+    """A stream, whose opening and reading end in time."""
+    import cv2
+
+    waits = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, STREAM_TIMEOUT_MS, cv2.CAP_PROP_READ_TIMEOUT_MSEC, STREAM_TIMEOUT_MS]
+    with _quiet_opencv():
+        return _opened(cv2.VideoCapture(address, cv2.CAP_FFMPEG, waits), address)
+
+
+def _opened(capture: Any, source: str | int) -> Capture:
     if not capture.isOpened():
         capture.release()
         remedy = "check [cameras] in the rig file, the cable, and that no other program has the camera"

@@ -4,6 +4,14 @@ from experiments.robustness.faults.fault import Fault
 
 FAULTS = (
     Fault(
+        "network camera: only read when somebody asks",
+        "cameras/capture.py",
+        "return NetworkStream(partial(_open_stream, source))",
+        "return _open_stream(source)",
+        "a server drops the viewer during a homing, and the run ends",
+        ("cameras/network_stream",),
+    ),
+    Fault(
         "journal: a lost end taken for tables that are behind",
         "acquisition/campaign_files.py",
         "if moves < 0 or looks < 0:",

@@ -1,0 +1,112 @@
+"""Streams of the network: read while nobody asks, opened again where they end."""
+
+from __future__ import annotations
+
+import threading
+
+import numpy as np
+import pytest
+
+from tvsbayes.cameras import virtual_camera
+from tvsbayes.cameras.capture import StereoImage, open_cameras
+from tvsbayes.cameras.network_stream import NetworkStream
+from tvsbayes.cameras.virtual_camera import VirtualCamera
+from tvsbayes.errors import DeviceFault
+
+WAIT_S = 20.0
+"""Bound on what takes milliseconds."""
+
+
+class Stream:
+    """Frames 0, 1, 2, ... as fast as they are taken; ends by itself after `length`, and while `gate` is shut waits."""
+
+    def __init__(self, length: int = 10**9):
+        self.length, self.frames, self.released = length, 0, False
+        self.many, self.gate = threading.Event(), threading.Event()
+        self.gate.set()
+
+    def grab(self) -> bool:
+        self.gate.wait(WAIT_S)
+        self.frames += 1
+        if self.frames > 100:
+            self.many.set()
+        return self.frames <= self.length
+
+    def retrieve(self):
+        return True, self.frames
+
+    def get(self, prop: int) -> float:
+        return 7.0 + prop
+
+    def set(self, prop: int, value: float) -> bool:
+        return value > 0
+
+    def getBackendName(self) -> str:
+        return "FFMPEG"
+
+    def release(self) -> None:
+        self.released = True
+
+
+def test_frames_are_taken_while_nobody_asks_and_the_newest_is_handed_on():
+    inner = Stream()
+    stream = NetworkStream(lambda: inner)
+    assert inner.many.wait(WAIT_S), "a hundred frames are read although nobody wants one"
+    inner.gate.clear()
+    before = inner.frames
+    inner.gate.set()
+    assert stream.grab() and stream.retrieve()[1] >= before
+    first = stream.retrieve()[1]
+    assert stream.grab() and stream.retrieve()[1] > first
+    assert (stream.get(2), stream.set(1, 5.0), stream.set(1, -5.0)) == (9.0, True, False)
+    assert stream.getBackendName() == "FFMPEG"
+    stream.release()
+    assert inner.released
+
+
+def test_a_stream_that_ends_is_opened_again_once_for_every_time_that_it_ran():
+    streams = [Stream(5), Stream(3), Stream()]
+    opened = iter(streams)
+    stream = NetworkStream(lambda: next(opened))
+    assert streams[2].many.wait(WAIT_S)
+    assert stream.grab() and stream.reopened == 2 and streams[0].released and streams[1].released
+    stream.release()
+
+
+def _gone():
+    raise DeviceFault("camera", "gone", remedy="plug it in")
+
+
+@pytest.mark.parametrize("again", [lambda: Stream(0), _gone], ids=["no frame", "not opened"])
+def test_a_stream_that_does_not_come_back_delivers_no_frame(again):
+    first = Stream(3)
+    attempts = iter([lambda: first, again])
+    stream = NetworkStream(lambda: next(attempts)())
+    for _ in range(5):
+        if not stream.grab():
+            break
+    else:
+        pytest.fail("a stream that has ended delivers frames")
+    assert not stream.grab() and stream.get(1) == 0.0 and not stream.set(1, 1.0)
+    stream.release()
+
+
+def test_a_server_that_drops_idle_viewers_keeps_us(monkeypatch):
+    """As during a homing: nobody grabs until the server has sent more than all buffers between hold."""
+    monkeypatch.setattr(virtual_camera, "VIEWER_TIMEOUT_S", 0.3)
+    rng = np.random.default_rng(0)
+    # Noise does not compress: 120 kB a frame, of which sockets hold a hundred at most.
+    pair = StereoImage(*(rng.integers(0, 255, (240, 320, 3), dtype=np.uint8) for _ in range(2)))
+    sent, much = [0], threading.Event()
+
+    def render() -> StereoImage:
+        sent[0] += 1
+        if sent[0] > 300:
+            much.set()
+        return pair
+
+    with VirtualCamera(render, frames_per_s=200.0) as virtual:
+        camera = open_cameras({"source": virtual.address}, 320, 240)
+        assert much.wait(WAIT_S), "the server sends as long as we read"
+        assert camera.grab().left.shape == (240, 320, 3)
+        camera.close()
