@@ -50,7 +50,7 @@ def new(
         _with_pictures(out, pictures, pair, swap, as_json)
         return
     make_folder(out, empty=True)
-    names = _write_templates(out)
+    names = write_templates(out)
     text = f"{escaped(str(out), 200)}: {', '.join(names)}\n"
     text += "next: put stereo.json beside them, log moves and spots, then `tvsbayes check` this folder\n"
     text += (
@@ -60,7 +60,7 @@ def new(
     finish({"campaign": str(out), "files": names}, text, as_json)
 
 
-def _write_templates(out: Path) -> list[str]:
+def write_templates(out: Path) -> list[str]:
     """The commented files of an empty campaign."""
     templates = sorted((shipped_data() / "templates").iterdir())
     for template in templates:
@@ -76,31 +76,31 @@ def _with_pictures(out: Path, folder: Path, pair: str | None, swap: bool, as_jso
     if pair is not None and pair not in ("number", "order"):
         found, remedy = f"--pair {escaped(pair)}", "write --pair number or --pair order, or leave it out"
         raise InputError("usage", f"{found}; allowed: number, order", allowed="number, order", remedy=remedy)
-    moves_file = _moves_file(out, folder)
+    listed_in = moves_file(out, folder)
     rows = _rows_of(out)
     seen = views_of(folder, swap=swap)
-    paired = pair_looks(seen.views, _move_numbers(moves_file), rows, pair)  # type: ignore[arg-type]
+    paired = pair_looks(seen.views, _move_numbers(listed_in), rows, pair)  # type: ignore[arg-type]
     _refuse_other_size(out, seen)
     if not (out / "campaign.toml").is_file():
         make_folder(out, empty=True)
-        _write_templates(out)
-    if moves_file is None:
+        write_templates(out)
+    if listed_in is None:
         write_atomically(out / "moves.csv", _moves_to_fill_in(1 + max(spot.move for spot in paired.spots)))
-    elif moves_file.parent != out:
-        write_atomically(out / "moves.csv", read_bytes(moves_file, CSV_BYTES_MAX))
+    elif listed_in.parent != out:
+        write_atomically(out / "moves.csv", read_bytes(listed_in, CSV_BYTES_MAX))
     with waiting() as progress, Job({COPYING: 1.0}, progress) as job:
         job.begin(COPYING)
         copied = copy_frames(paired.pictures, out, job.at)
     # Last: a folder whose looks are listed has all their pictures.
     write_atomically(out / "spots.csv", spots_bytes(paired.spots))
     lines = _unpaired_lines(seen, paired, "spots" if rows else "moves")
-    text = _paired_text(out, paired, copied, "pan_steps and tilt_steps" if moves_file is None else None)
+    text = _paired_text(out, paired, copied, "pan_steps and tilt_steps" if listed_in is None else None)
     document: dict[str, Any] = {"campaign": str(out), "looks": len(paired.pictures), "pictures": copied}
-    document |= {"paired_by": paired.matching, "warnings": lines, "moves_to_fill_in": moves_file is None}
+    document |= {"paired_by": paired.matching, "warnings": lines, "moves_to_fill_in": listed_in is None}
     finish(document, "\n".join([text, *(f"not paired: {line}" for line in lines)]), as_json)
 
 
-def _moves_file(out: Path, folder: Path) -> Path | None:
+def moves_file(out: Path, folder: Path) -> Path | None:
     """Where the moves of the pictures are listed: in the campaign, beside the pictures, or not yet."""
     template = (shipped_data() / "templates" / "moves.csv").read_bytes()
     own, beside = out / "moves.csv", folder / "moves.csv"
@@ -132,10 +132,13 @@ def _rows_of(out: Path) -> tuple[Spot, ...]:
     """The looks that a campaign lists already; none of a folder that is not there."""
     from tvsbayes.instrument.campaign import read_campaign
 
+    return read_campaign(out).spots if rows_listed(out) else ()
+
+
+def rows_listed(out: Path) -> bool:
+    """Whether spots.csv has rows below its header."""
     spots = out / "spots.csv"
-    if not spots.is_file() or len(read_bytes(spots, CSV_BYTES_MAX).splitlines()) < 2:
-        return ()
-    return read_campaign(out).spots
+    return spots.is_file() and len(read_bytes(spots, CSV_BYTES_MAX).splitlines()) > 1
 
 
 def _refuse_other_size(out: Path, seen: ViewedFolder) -> None:
@@ -181,12 +184,13 @@ def _unpaired_lines(seen: ViewedFolder, found: PairedLooks, rows: str) -> list[s
         "of a kind that is not read; save them as PNG of 8 bits": seen.unread,
         "a second pair for its row": found.left_over,
     }
-    lines = [f"{_few(names)}: {why}" for why, names in files.items() if names]
+    lines = [f"{few(names)}: {why}" for why, names in files.items() if names]
     if found.without:
         lines.append(f"{rows} {listed(found.without, NAMES_LISTED)}: no pictures")
     return lines
 
 
-def _few(names: tuple[str, ...]) -> str:
+def few(names: tuple[str, ...]) -> str:
+    """The first of them, fit to print, and how many more there are."""
     more = f" and {len(names) - NAMES_LISTED} more" if len(names) > NAMES_LISTED else ""
     return ", ".join(escaped(name) for name in names[:NAMES_LISTED]) + more

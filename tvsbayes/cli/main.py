@@ -26,16 +26,17 @@ from tvsbayes.cli.begin_commands import new
 from tvsbayes.cli.bench_commands import acquire, doctor, stereo
 from tvsbayes.cli.campaign_commands import check, demo, detect, simulate
 from tvsbayes.cli.estimate_commands import classic, compare, fit, report
+from tvsbayes.cli.import_command import import_
 from tvsbayes.cli.use_commands import locate, plan, steps_for, study
 from tvsbayes.errors import InputError, TvsError
 
 COMMANDS = (
-    *(demo, new, simulate, detect, stereo, check, acquire, doctor),
+    *(demo, new, import_, simulate, detect, stereo, check, acquire, doctor),
     *(classic, fit, report, compare, locate, steps_for, plan, study),
 )
 """In the order of `--help`."""
 for command in COMMANDS:
-    app.command(command.__name__.replace("_", "-"))(command)
+    app.command(command.__name__.rstrip("_").replace("_", "-"))(command)
 
 
 def run(arguments: list[str]) -> int:

@@ -1,0 +1,91 @@
+"""`import`: shown before it is written, nothing overwritten, columns asked for at a terminal."""
+
+from __future__ import annotations
+
+import io
+import shutil
+
+import pytest
+from support.commands import MOUNTED, assert_error
+
+from tvsbayes.instrument.campaign import moves_bytes, pixels_of, read_campaign
+
+TABLE = "Nr;Pan;Tilt;XL;YL;XR;YR;Blatt\n1;0;0;640,5;360,25;500;360;nah\n2;200;0;700,5;360,25;560;360;nah\n"
+
+
+@pytest.fixture
+def table(tmp_path):
+    path = tmp_path / "looks.csv"
+    path.write_text(TABLE, encoding="utf-16")
+    return path
+
+
+def test_a_table_is_shown_then_written_and_read_by_check(ask, say, table, tmp_path):
+    out = tmp_path / "mine"
+    code, text, _ = say("import", table, "--to", out, "--pixels-from", 1)
+    assert code == 0 and not out.exists()
+    assert "semicolons between cells, UTF-16, decimal commas; 2 rows" in text
+    assert [line.split() for line in text.splitlines() if line.startswith("u_left_px")] == [
+        ["u_left_px", "XL", "px", "from", "1", "640.5,", "700.5"]
+    ]
+    assert "nothing written: add --yes" in text
+    code, document = ask("import", table, "--to", out, "--pixels-from", 1, "--yes", "--pan-approach", "left")
+    assert (code, document["moves"], document["spots"], document["unused"]) == (0, 2, 2, [])
+    assert document["columns"]["target"] == {"column": "Blatt", "first": ["nah", "nah"]}
+    shutil.copy(MOUNTED / "stereo.json", out)
+    campaign = read_campaign(out)
+    assert pixels_of(campaign.spots)[:, 0].tolist() == [639.5, 699.5]
+    assert (campaign.moves[0].pan_approach, campaign.moves[1].pan_steps) == ("left", 200)
+    assert ask("check", out)[0] == 0
+    before = {path: path.read_bytes() for path in out.iterdir()}
+    code, document = ask("import", table, "--to", out, "--yes")
+    assert code == 2 and assert_error(document, "occupied")["file"].endswith("moves.csv")
+    assert {path: path.read_bytes() for path in out.iterdir()} == before
+
+
+def test_looks_go_to_the_moves_of_a_campaign(ask, grid_campaign, tmp_path):
+    out, table = tmp_path / "mine", tmp_path / "t.csv"
+    assert ask("new", out)[0] == 0
+    (out / "moves.csv").write_bytes(moves_bytes(grid_campaign.moves))
+    table.write_text("move,x1,y1,x2,y2\n3,600,300,500,300\n")
+    code, document = ask("import", table, "--to", out, "--yes")
+    assert (code, document["moves"], document["spots"]) == (0, None, 1)
+    assert (out / "moves.csv").read_bytes() == moves_bytes(grid_campaign.moves)
+
+
+def test_what_is_not_understood_is_asked_for(ask, say, table, tmp_path, monkeypatch):
+    table.write_text("pan_goal,pan_pos,tilt,XL,YL,XR,bottom\n0,1,0,640,360,500,360\n")
+    code, document = ask("import", table, "--to", tmp_path / "mine", "--yes")
+    error = assert_error(document, "missing-column")
+    assert code == 2 and "pan_steps (pan_goal or pan_pos)" in error["found"] and "v_right_px" in error["found"]
+    stated = ("--column", "pan_steps=pan_pos", "--column", "v_right_px=bottom")
+    assert ask("import", table, "--to", tmp_path / "mine", *stated)[1]["columns"]["pan_steps"]["column"] == "pan_pos"
+
+    class Terminal(io.StringIO):
+        def isatty(self) -> bool:
+            return True
+
+    monkeypatch.setattr("sys.stdin", Terminal("\n\n"))
+    code, _, _ = say("import", table, "--to", tmp_path / "asked")
+    assert (code, (tmp_path / "asked" / "moves.csv").exists()) == (2, False)
+    monkeypatch.setattr("sys.stdin", Terminal("bottom\npan_pos\ny\n"))
+    code, _, log = say("import", table, "--to", tmp_path / "asked")
+    assert code == 0, log
+    assert (tmp_path / "asked" / "moves.csv").read_text().splitlines()[1].startswith("0,0,0.0,1,0,")
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (("--angles", "gon"), "deg, rad"),
+        (("--column", "XL"), "u_left_px=XL"),
+        (("--column", "uleft=XL"), "u_left_px"),
+        (("--column", "u_left_px=X"), "did you mean XL|allowed: Nr"),
+        (("--pan-approach", "up"), "left, right"),
+        (("--sheet", "one"), "no sheets"),
+    ],
+)
+def test_options_that_say_nothing_usable_are_refused(say, table, tmp_path, options, said):
+    code, _, log = say("import", table, "--to", tmp_path / "mine", *options)
+    assert code == 2
+    assert any(part in log for part in said.split("|")), log

@@ -1,0 +1,101 @@
+"""Tables of other programs: encodings, separators, decimal commas, XLSX; what is no table is refused."""
+
+from __future__ import annotations
+
+import datetime
+import io
+import zipfile
+
+import openpyxl
+import pytest
+
+from tvsbayes.errors import InputError
+from tvsbayes.files import foreign_table
+from tvsbayes.files.foreign_table import read_foreign
+
+ROWS = (("Pan", "XL", "Größe"), ("0", "640.25", "a"), ("-200", "1024.5", "b c"))
+"""The table of every file below, numbers with points."""
+
+
+def written(path, data: bytes):
+    path.write_bytes(data)
+    return read_foreign(path)
+
+
+def as_text(separator: str, point: str = ".") -> str:
+    lines = [list(ROWS[0]), *([a, b.replace(".", point), c] for a, b, c in ROWS[1:])]
+    return "".join(separator.join(line) + "\r\n" for line in lines)
+
+
+@pytest.mark.parametrize("encoding", ("utf-8", "utf-8-sig", "utf-16", "utf-16-le", "utf-32", "cp1252"))
+@pytest.mark.parametrize(("separator", "point"), [(",", "."), (";", ","), (";", "."), ("\t", ","), ("|", ".")])
+def test_every_notation_gives_the_same_table(tmp_path, encoding, separator, point):
+    table = written(tmp_path / "t.csv", as_text(separator, point).encode(encoding))
+    assert list(zip(*([name, *cells] for name, cells in table.columns.items()), strict=True)) == list(ROWS)
+    assert table.lines == (2, 3)
+    assert ("decimal commas" in table.kind) == (point == ",")
+
+
+def test_marks_between_thousands_go_and_mixed_points_stay(tmp_path):
+    assert written(tmp_path / "a.csv", b"x;y\n1.024,50;a\n2,25;b\n").columns["x"] == ("1024.50", "2.25")
+    assert written(tmp_path / "b.csv", b"x;y\n1,024.50;a\n").columns["x"] == ("1024.50",)
+    assert written(tmp_path / "c.csv", b"x;y\n1,5;a\n1.5;b\n").columns["x"] == ("1,5", "1.5")
+
+
+def test_remarks_empty_lines_and_missing_names(tmp_path):
+    """Lines are those of the file; a table without names gets numbers; a stated separator counts."""
+    table = written(tmp_path / "a.csv", b"sep=;\n# bench 3\n\n1;2,5\n3;4,5\n;\n")
+    assert table.columns == {"column 1": ("1", "3"), "column 2": ("2.5", "4.5")}
+    assert table.lines == (4, 5)
+    assert written(tmp_path / "b.txt", b" x  y\n 1  2\n").columns == {"x": ("1",), "y": ("2",)}
+    assert list(written(tmp_path / "c.csv", b"x,x,\n1,2,3\n").columns) == ["x", "x (2)"]
+
+
+def test_sheets_of_a_workbook(tmp_path):
+    book = openpyxl.Workbook()
+    book.active.title = "empty"
+    book.create_sheet("data")
+    for row in (("Pan", "time", "XL"), (200.0, datetime.datetime(2026, 1, 2, 3, 4, 5), 640.25), (None, "", True)):
+        book["data"].append(row)
+    book.save(tmp_path / "t.xlsx")
+    table = read_foreign(tmp_path / "t.xlsx")
+    assert table.kind == "XLSX, sheet data"
+    assert table.columns == {
+        "Pan": ("200", ""),
+        "time": ("2026-01-02T03:04:05", ""),
+        "XL": ("640.25", "true"),
+    }
+    for sheet, match in (("empty", "no cells"), ("other", "empty, data")):
+        with pytest.raises(InputError, match=match):
+            read_foreign(tmp_path / "t.xlsx", sheet)
+
+
+def bomb() -> bytes:
+    """A workbook that says it unpacks to a megabyte."""
+    stream = io.BytesIO()
+    with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("xl/workbook.xml", bytes(1_000_000))
+    return stream.getvalue()
+
+
+@pytest.mark.parametrize(
+    ("data", "match"),
+    [
+        (b"", "no cells"),
+        (b"\xd0\xcf\x11\xe0 old", "save it as XLSX"),
+        (b"PK\x03\x04 cut", "damaged XLSX"),
+        (bomb(), "when unpacked"),
+        (b"\x89PNG\r\n\x1a\n\0\0\x01", "binary data"),
+        (b'a,b\n"1,2\n', "close every quote"),
+        (b",".join(b"1" for _ in range(300)), "at most 200 columns"),
+        (b"a,b\n" + b"1,2\n" * 200_001, "at most 200000 rows"),
+    ],
+    ids=["empty", "xls", "zip", "bomb", "png", "quote", "wide", "long"],
+)
+def test_what_is_no_table_is_refused(tmp_path, monkeypatch, data, match):
+    monkeypatch.setattr(foreign_table, "UNPACKED_BYTES_MAX", 999_999)
+    with pytest.raises(InputError, match=match):
+        written(tmp_path / "t.csv", data)
+    (tmp_path / "text.csv").write_text("a,b\n1,2\n")
+    with pytest.raises(InputError, match="no sheets"):
+        read_foreign(tmp_path / "text.csv", "one")

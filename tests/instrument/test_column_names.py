@@ -1,0 +1,64 @@
+"""Which column of somebody's table is which of our fields."""
+
+from __future__ import annotations
+
+import pytest
+
+from tvsbayes.errors import InputError
+from tvsbayes.instrument.campaign import PIXELS, SPOT_COLUMNS
+from tvsbayes.instrument.column_names import COUNTERS, PIXEL_SDS, missing, understand, unit_of_name
+
+PIXEL_NAMES = [
+    ("XL", "YL", "XR", "YR"),
+    ("uL", "vL", "uR", "vR"),
+    ("x_left", "y_left", "x_right", "y_right"),
+    ("xLeft (px)", "yLeft (px)", "xRight (px)", "yRight (px)"),
+    ("left_x", "left_y", "right_x", "right_y"),
+    ("x1", "y1", "x2", "y2"),
+    ("Bild links x", "Bild links y", "Bild rechts x", "Bild rechts y"),
+    ("col izquierda", "fila izquierda", "col derecha", "fila derecha"),
+]
+
+
+@pytest.mark.parametrize("names", PIXEL_NAMES, ids=[names[0] for names in PIXEL_NAMES])
+def test_pixels_by_any_name(names):
+    """In any order, beside their spreads."""
+    spreads = tuple(f"std {name}" for name in names)
+    found = understand([*spreads, *names][::-1])
+    assert [found.columns[field] for field in PIXELS] == list(names)
+    assert [found.columns[field] for field in PIXEL_SDS] == list(spreads)
+    assert not found.unused and not found.claimed
+
+
+def test_our_own_names_and_other_words():
+    assert understand(SPOT_COLUMNS).columns == {name: name for name in SPOT_COLUMNS}
+    found = understand(["steps pan", "TiltCount", "t (ms)", "Blatt", "B (rad)", "pan_approach", "remark"])
+    assert found.columns == {
+        "pan_steps": "steps pan",
+        "tilt_steps": "TiltCount",
+        "time_s": "t (ms)",
+        "target": "Blatt",
+        "aperture_deg": "B (rad)",
+        "pan_approach": "pan_approach",
+    }
+    assert found.unused == ("remark",)
+    assert [unit_of_name(name) for name in ("t (ms)", "B (rad)", "angle_deg", "XL")] == ["ms", "rad", "deg", None]
+
+
+def test_what_two_columns_claim_is_asked_for():
+    found = understand(["pan_pos", "pan_goal", "tilt"])
+    assert found.claimed == {"pan_steps": ("pan_pos", "pan_goal")}
+    assert "pan_steps" not in found.columns
+    said = understand(["pan_pos", "pan_goal", "tilt"], {"pan_steps": "pan_goal", "tilt_steps": ""})
+    assert said.columns == {"pan_steps": "pan_goal"}
+    assert "pan_pos" in said.unused
+    for stated, match in (({"pan": "tilt"}, "did you mean|allowed: move"), ({"pan_steps": "Pan"}, "no such column")):
+        with pytest.raises(InputError, match=match):
+            understand(["pan_pos", "tilt"], stated)
+
+
+def test_what_a_table_must_have():
+    assert missing(["u_left_px"], moves_known=True) == list(PIXELS[1:])
+    assert missing(["u_left_px"], moves_known=False) == [*PIXELS[1:], *COUNTERS]
+    assert missing(["pan_steps"], moves_known=False) == ["tilt_steps"]
+    assert missing([], moves_known=True) == list(PIXELS)

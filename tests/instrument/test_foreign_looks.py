@@ -1,0 +1,100 @@
+"""Moves and looks of somebody's table."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from tvsbayes.errors import InputError
+from tvsbayes.files.foreign_table import ForeignTable
+from tvsbayes.instrument.column_names import understand
+from tvsbayes.instrument.foreign_looks import Notation, looks_of
+
+HEADER = "Pan Tilt XL YL XR YR Sheet"
+LOOKS = ("0 0 641 361 501 360 near", "0 0 651 361 561 360 far", "200 0 701 361 571 360 far", "200 30 1 361 2 360 far")
+
+
+def looks(*rows: str, header: str = HEADER, notation: Notation | None = None, listed=None):
+    """What a table of these cells gives; - is an empty one."""
+    names = header.split()
+    cells = list(
+        zip(*([cell.replace("-", "") if cell == "-" else cell for cell in row.split()] for row in rows), strict=True)
+    )
+    table = ForeignTable("t.csv", "drawn", tuple(range(2, 2 + len(rows))), dict(zip(names, cells, strict=True)))
+    return looks_of(table, understand(names).columns, notation or Notation(), listed)
+
+
+def test_rows_at_the_same_counters_are_looks_after_one_move():
+    found = looks(*LOOKS, notation=Notation(approach=("left", "up")))
+    assert [(m.move, m.pan_steps, m.tilt_steps, m.pan_approach) for m in found.moves] == [
+        (0, 0, 0, "left"),
+        (1, 200, 0, ""),
+        (2, 200, 30, ""),
+    ]
+    assert [(s.spot, s.move, s.target, s.status) for s in found.spots] == [
+        (0, 0, "near", "ok"),
+        (1, 0, "far", "ok"),
+        (2, 1, "far", "ok"),
+        (3, 2, "far", "ok"),
+    ]
+    assert (found.spots[0].u_left_px, found.spots[0].v_right_px, found.spots[0].su_left_px) == (641.0, 360.0, 0.1)
+    assert any("0.1 px" in text for text in found.assumed) and not any("approach" in text for text in found.assumed)
+
+
+def test_notations_of_others():
+    """Pixels from 1, radians, milliseconds, steps of each move, homings, good looks by 1 and 0."""
+    header = "Pan Tilt XL YL XR YR B_rad t_ms home valid"
+    rows = ("0 0 641 361 501 360 1.5 1000 1 1", "200 0 1 2 3 4 - 2500 1 0", "-150 5 1 2 3 4 0.5 4000 1 1")
+    found = looks(*rows, "10 0 5 6 7 8 0 5000 2 1", header=header, notation=Notation(pixels_from=1, relative=True))
+    assert [(m.segment, m.pan_steps, m.tilt_steps, m.time_s) for m in found.moves] == [
+        (0, 0, 0, 1.0),
+        (0, 200, 0, 2.5),
+        (0, 50, 5, 4.0),
+        (1, 10, 0, 5.0),
+    ]
+    assert [m.pan_approach for m in found.moves] == ["unknown", "", "", "unknown"]
+    assert [s.u_left_px for s in found.spots] == [640.0, None, 0.0, 4.0]
+    assert found.spots[1].status == "refused: 0"
+    assert found.spots[0].aperture_deg == pytest.approx(math.degrees(1.5), abs=1e-12)
+    degrees = looks("0 0 1 1 1 1 1.5", header="Pan Tilt XL YL XR YR B_rad", notation=Notation(angle_unit="deg"))
+    assert degrees.spots[0].aperture_deg == 1.5
+
+
+def test_dates_become_seconds_and_stated_spreads_stay():
+    found = looks("0 0 1 2 3 4 0.3 2026-01-02T03:04:05", "9 0 1 2 3 4 0.4 2026-01-02T03:05:07",
+                  header="Pan Tilt XL YL XR YR std_XL time")  # fmt: skip
+    assert [m.time_s for m in found.moves] == [0.0, 62.0]
+    assert [s.su_left_px for s in found.spots] == [0.3, 0.4]
+    assert found.spots[0].sv_right_px == 0.1
+
+
+def test_looks_alone_go_to_moves_that_are_listed():
+    moves = looks(*(row.rsplit(" ", 5)[0] for row in LOOKS), header="Pan Tilt").moves
+    assert len(moves) == 3
+    header = "XL YL XR YR move"
+    found = looks("1 2 3 4 2", "5 6 - - 0", header=header, listed=moves)
+    assert found.moves is None
+    assert [(s.move, s.status) for s in found.spots] == [(2, "ok"), (0, "no centre in the table")]
+    assert [s.move for s in looks(*["1 2 3 4"] * 3, header="XL YL XR YR", listed=moves).spots] == [0, 1, 2]
+
+
+@pytest.mark.parametrize(
+    ("rows", "header", "said"),
+    [
+        (("0.5 0",), "Pan Tilt", "line 2, Pan: .*angles are what the fit finds"),
+        (("0 x",), "Pan Tilt", "line 2, Tilt: "),
+        (("0 0 5", "1 0 4"), "Pan Tilt t", "line 3, t: .*do not decrease"),
+        (("0 0 yesterday",), "Pan Tilt t", "2026-01-15T10:00:00"),
+        (("0 0 3", "5 0 3"), "Pan Tilt move", "line 3, Pan: .*counters of its move"),
+        (("0 0 up",), "Pan Tilt pan_approach", "left, right, unknown"),
+        (("0 0 1 2 3 - ok",), "Pan Tilt XL YL XR YR status", "line 2, YR: found an empty cell"),
+        (("1 2 3 4",), "XL YL XR YR", "column move=NAME"),
+        (("1 2 3 4 7",), "XL YL XR YR move", "line 2, move: "),
+    ],
+)
+def test_cells_that_are_no_value_are_refused_with_their_place(rows, header, said):
+    with pytest.raises(InputError, match=said):
+        looks(
+            *rows, header=header, listed=looks("0 0", "1 0", header="Pan Tilt").moves if "Pan" not in header else None
+        )

@@ -1,0 +1,211 @@
+"""`import`: a table of somebody's own becomes moves and looks, after what was understood has been shown.
+
+Options in, library called, table or JSON out; heavy imports stand inside the command.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from tvsbayes.cli.app import Json, finish, report_line
+from tvsbayes.cli.begin_commands import few, moves_file, rows_listed, write_templates
+from tvsbayes.errors import InputError, escaped, refusal
+from tvsbayes.files.csv_table import CSV_BYTES_MAX
+from tvsbayes.files.disk import make_folder, read_bytes, shipped_data, write_atomically
+
+if TYPE_CHECKING:
+    from tvsbayes.files.foreign_table import ForeignTable
+    from tvsbayes.instrument.campaign import Move
+    from tvsbayes.instrument.column_names import Understood
+    from tvsbayes.instrument.foreign_looks import ForeignLooks, Notation
+
+SAMPLES = 3
+"""First values of a column that are shown."""
+
+
+def import_(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="Table of moves and looks: CSV of any kind, or XLSX.")],
+    to: Annotated[Path, typer.Option("--to", help="Campaign folder, new or still without these tables.")],
+    column: Annotated[
+        list[str] | None, typer.Option("--column", help="FIELD=NAME: which column it is, u_left_px=XL; repeatable.")
+    ] = None,
+    sheet: Annotated[str | None, typer.Option("--sheet", help="Of an XLSX file (default: first with cells).")] = None,
+    pixels_from: Annotated[
+        int, typer.Option("--pixels-from", min=0, max=1, help="Number of the first pixel: 0, or 1 as in MATLAB.")
+    ] = 0,
+    angles: Annotated[
+        str | None, typer.Option("--angles", help="deg or rad: unit of aperture readings (default: by the name).")
+    ] = None,
+    sd_px: Annotated[
+        float | None, typer.Option("--sd-px", min=1e-4, max=100.0, help="Of centroids, where no column has it: 0.1.")
+    ] = None,
+    relative: Annotated[bool, typer.Option("--relative", help="Counters are the steps of each move.")] = False,
+    pan_approach: Annotated[
+        str, typer.Option("--pan-approach", help="How pan came to the first row: left, right or unknown.")
+    ] = "unknown",
+    tilt_approach: Annotated[str, typer.Option("--tilt-approach", help="Likewise up, down or unknown.")] = "unknown",
+    yes: Annotated[bool, typer.Option("--yes", help="Write without asking.")] = False,
+    as_json: Json = False,
+) -> None:
+    """A table of your own into a campaign. Shows what it understood, then asks; overwrites nothing."""
+    from tvsbayes.files.foreign_table import read_foreign
+    from tvsbayes.instrument.axes import sides_of
+    from tvsbayes.instrument.column_names import understand
+    from tvsbayes.instrument.foreign_looks import SD_PX, Notation, looks_of
+
+    if angles not in (None, "deg", "rad"):
+        found, remedy = f"--angles {escaped(angles)}", "write --angles deg or --angles rad"
+        raise InputError("usage", f"{found}; allowed: deg, rad", allowed="deg, rad", remedy=remedy)
+    approach = (pan_approach, tilt_approach)
+    sides_of(approach)
+    stated = dict(_field_and_column(text) for text in column or ())
+    listed = _listed_moves(to)
+    table = read_foreign(file, sheet)
+    asking = not (yes or as_json) and sys.stdin.isatty()
+    known = _completed(table, understand(table.columns, stated), stated, listed is not None, asking)
+    notation = Notation(pixels_from, angles, SD_PX if sd_px is None else sd_px, relative, approach)
+    looks = looks_of(table, known.columns, notation, listed)
+    _refuse_listed(to, looks)
+    document = _understood_document(table, known, looks)
+    shown = _understood_text(table, known, notation, looks)
+    if asking:
+        typer.echo(shown)
+        yes = typer.confirm(f"write this into {escaped(str(to), 200)}?", default=False)
+        shown = ""
+    written = _write_looks(to, looks) if yes else []
+    document |= {"campaign": str(to), "files": written}
+    said = f"written: {', '.join(written)}" if written else "nothing written: add --yes, or correct it with --column"
+    place = escaped(str(to), 200)
+    after = "" if not written else f"\nnext: put stereo.json into {place}, then `tvsbayes check {place}`"
+    if (to / "stereo.json").is_file():
+        after = f"\nnext: `tvsbayes check {place}`" * bool(written)
+    finish(document, f"{shown}\n{said}{after}".lstrip("\n"), as_json)
+
+
+def _field_and_column(text: str) -> tuple[str, str]:
+    """The two sides of --column FIELD=NAME."""
+    field, sign, name = text.partition("=")
+    if not sign:
+        remedy = "write --column u_left_px=XL; --column target= where the table has none"
+        raise InputError("usage", f"--column {escaped(text)}: no =", allowed="FIELD=NAME", remedy=remedy)
+    return field.strip(), name.strip()
+
+
+def _listed_moves(to: Path) -> tuple[Move, ...] | None:
+    """The moves that a campaign lists already, beyond the row of the template."""
+    from tvsbayes.instrument.campaign import parse_moves
+
+    file = moves_file(to, to)
+    if file is None or (to / "campaign.toml").is_file() is False:
+        return None
+    data = read_bytes(file, CSV_BYTES_MAX)
+    template = (shipped_data() / "templates" / "moves.csv").read_bytes()
+    return None if data == template else parse_moves(data, str(file))
+
+
+def _completed(
+    table: ForeignTable, known: Understood, stated: Mapping[str, str], moves_known: bool, asking: bool
+) -> Understood:
+    """What was understood, with what was missing asked for at a terminal.
+
+    Raises:
+        InputError: something is missing, or claimed by two columns, and nobody can be asked.
+    """
+    from tvsbayes.instrument.column_names import missing, understand
+
+    open_fields = [*missing(known.columns, moves_known), *known.claimed]
+    if not open_fields:
+        return known
+    names = ", ".join(escaped(name) for name in table.columns)
+    if asking:
+        answers = dict(stated)
+        report_line(f"{table.file} has the columns {names}")
+        for field in dict.fromkeys(open_fields):
+            answers[field] = typer.prompt(f"which of them is {field}? (empty: none)", default="", show_default=False)
+        known = understand(table.columns, answers)
+        open_fields = missing(known.columns, moves_known)
+        if not open_fields:
+            return known
+    claims = [f"{field} ({' or '.join(escaped(name) for name in own)})" for field, own in known.claimed.items()]
+    found = f"no column that is surely {', '.join([*(f for f in open_fields if f not in known.claimed), *claims])}"
+    remedy = f"say which: --column {open_fields[0]}=NAME; --column {open_fields[0]}= where there is none"
+    raise refusal("missing-column", file=table.file, line=1, found=found, allowed=f"any of {names}", remedy=remedy)
+
+
+def _refuse_listed(to: Path, looks: ForeignLooks) -> None:
+    """Nothing is overwritten: a table goes only where none is."""
+    if to.exists() and not (to / "campaign.toml").is_file():
+        make_folder(to, empty=True)
+    remedy = "name another folder with --to; nothing is overwritten"
+    if looks.moves is not None and _listed_moves(to) is not None:
+        place, allowed = escaped(str(to / "moves.csv"), 200), "no moves yet"
+        raise refusal("occupied", file=place, found="moves", allowed=allowed, remedy=remedy)
+    if looks.spots is not None and rows_listed(to):
+        place, allowed = escaped(str(to / "spots.csv"), 200), "no looks yet"
+        raise refusal("occupied", file=place, found="looks", allowed=allowed, remedy=remedy)
+
+
+def _write_looks(to: Path, looks: ForeignLooks) -> list[str]:
+    """The tables, in a folder with everything else of a campaign."""
+    from tvsbayes.instrument.campaign import moves_bytes, spots_bytes
+
+    if not (to / "campaign.toml").is_file():
+        make_folder(to, empty=True)
+        write_templates(to)
+    contents = {} if looks.moves is None else {"moves.csv": moves_bytes(looks.moves)}
+    contents |= {} if looks.spots is None else {"spots.csv": spots_bytes(looks.spots)}
+    for name, data in contents.items():
+        write_atomically(to / name, data)
+    return [str(to / name) for name in contents]
+
+
+def _understood_document(table: ForeignTable, known: Understood, looks: ForeignLooks) -> dict[str, Any]:
+    """The same as `_understood_text`, for programs."""
+    columns = {
+        field: {"column": name, "first": list(table.columns[name][:SAMPLES])} for field, name in known.columns.items()
+    }
+    return {
+        **{
+            "file": table.file,
+            "kind": table.kind,
+            "rows": len(table),
+            "columns": columns,
+            "unused": list(known.unused),
+        },
+        "assumed": list(looks.assumed),
+        "moves": None if looks.moves is None else len(looks.moves),
+        "spots": None if looks.spots is None else len(looks.spots),
+        "ok": None if looks.spots is None else sum(spot.status == "ok" for spot in looks.spots),
+    }
+
+
+def _understood_text(table: ForeignTable, known: Understood, notation: Notation, looks: ForeignLooks) -> str:
+    """The columns that were found beside their fields, units and first values; what was assumed; what comes out."""
+    from tvsbayes.instrument.column_names import FIELDS, unit_of_name
+
+    rows = [("field", "column", "read as", "first values")]
+    for field in (field for field in FIELDS if field in known.columns):
+        name = known.columns[field]
+        unit = "px" if field.endswith("_px") else "steps" if field.endswith("_steps") else ""
+        if field.endswith("_px") and field.startswith(("u", "v")):
+            unit = f"px from {notation.pixels_from}"
+        elif field in ("aperture_deg", "time_s"):
+            stated = notation.angle_unit if field == "aperture_deg" else None
+            unit = stated or unit_of_name(name) or field.rpartition("_")[2]
+        first = ", ".join(escaped(cell, 12) or "empty" for cell in table.columns[name][:SAMPLES])
+        rows.append((field, escaped(name, 24), unit, first))
+    widths = [max(len(row[k]) for row in rows) for k in range(3)]
+    lines = [f"{table.file}: {table.kind}; {len(table)} rows"]
+    lines += ["  ".join([*(cell.ljust(w) for cell, w in zip(row, widths, strict=False)), row[3]]) for row in rows]
+    if known.unused:
+        lines.append(f"not used: {few(known.unused)}")
+    lines += [f"assumed: {text}" for text in looks.assumed]
+    ok = sum(spot.status == "ok" for spot in looks.spots or ())
+    counts = [] if looks.moves is None else [f"{len(looks.moves)} moves"]
+    counts += [] if looks.spots is None else [f"{len(looks.spots)} looks, {ok} with a spot"]
+    return "\n".join([*lines, f"gives: {', '.join(counts)}"])

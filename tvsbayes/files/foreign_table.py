@@ -1,0 +1,246 @@
+"""Tables that other programs wrote, as text cells: CSV of any usual kind, and the sheets of an XLSX file.
+
+Found out, and said in words: encoding, what stands between cells, decimal commas. Numbers come out with decimal points;
+nothing else of a cell changes. Rows count from 1 as in the file; sizes are capped before anything is unpacked.
+"""
+
+from __future__ import annotations
+
+import csv
+import datetime
+import io
+import re
+import warnings
+import zipfile
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+from tvsbayes.errors import CONTROL, InputError, escaped, refusal
+from tvsbayes.files.csv_table import CSV_BYTES_MAX, CSV_ROWS_MAX
+from tvsbayes.files.disk import read_bytes
+
+COLUMNS_MAX = 200
+UNPACKED_BYTES_MAX = 512 * 1024 * 1024
+"""Of all parts of an XLSX file together, as they state themselves."""
+CELL_CHARS_MAX = 1000
+SEPARATORS = {"\t": "tabs", ";": "semicolons", "|": "bars", ",": "commas", " ": "spaces"}
+"""In the order in which they are tried: a decimal comma must not pass for one between cells."""
+ROWS_TRIED = 50
+_MARKS = (
+    (b"\xff\xfe\x00\x00", "utf-32", "UTF-32"),
+    (b"\x00\x00\xfe\xff", "utf-32", "UTF-32"),
+    (b"\xff\xfe", "utf-16", "UTF-16"),
+    (b"\xfe\xff", "utf-16", "UTF-16"),
+    (b"\xef\xbb\xbf", "utf-8-sig", "UTF-8"),
+)
+_PLAIN = re.compile(r"[+-]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][+-]?[0-9]+)?")
+_COMMA = re.compile(r"[+-]?[0-9]*,[0-9]+(?:[eE][+-]?[0-9]+)?")
+_GROUPED_POINT = re.compile(r"[+-]?[0-9]{1,3}(?:,[0-9]{3})+\.[0-9]+")
+_GROUPED_COMMA = re.compile(r"[+-]?[0-9]{1,3}(?:\.[0-9]{3})+,[0-9]+")
+
+
+@dataclass(frozen=True)
+class ForeignTable:
+    """A table of text cells.
+
+    Attributes:
+        file: its name, for messages.
+        kind: what was found out of it, in words.
+        lines: the row of the file in which each row stands.
+        columns: cells by the name of their column; "column 1" ... where no row holds names.
+    """
+
+    file: str
+    kind: str
+    lines: tuple[int, ...]
+    columns: dict[str, tuple[str, ...]]
+
+    def __len__(self) -> int:
+        return len(self.lines)
+
+    def refuse(self, row: int, column: str, allowed: str, remedy: str) -> InputError:
+        """The error of one cell."""
+        cell = self.columns[column][row]
+        found = f'"{escaped(cell)}"' if cell else "an empty cell"
+        line = self.lines[row]
+        return refusal("cell", file=self.file, line=line, column=column, found=found, allowed=allowed, remedy=remedy)
+
+
+def read_foreign(path: Path, sheet: str | None = None) -> ForeignTable:
+    """The table in a file.
+
+    Args:
+        path: a CSV or XLSX file of at most 64 MiB and 200 000 rows.
+        sheet: of an XLSX file; by default the first that holds anything.
+
+    Raises:
+        InputError: unreadable, no table, too large, or another kind of file.
+    """
+    path = Path(path)
+    data, file = read_bytes(path, CSV_BYTES_MAX), escaped(path.name)
+    bad = partial(refusal, file=file, allowed="a table as CSV (text) or XLSX")
+    if data.startswith(b"\xd0\xcf\x11\xe0"):
+        raise bad("kind", found="a workbook of an old Excel", remedy="save it as XLSX or CSV")
+    if data.startswith(b"PK\x03\x04"):
+        rows, words = _sheet_rows(data, file, sheet)
+    elif sheet is not None:
+        raise bad("usage", found="text, which has no sheets", remedy="leave out --sheet")
+    else:
+        text, encoding = _text(data, file)
+        rows, between = _csv_rows(text, file)
+        words = [f"CSV with {between} between cells", encoding]
+    rows = [(line, cells) for line, cells in rows if any(cells)]
+    if not rows:
+        raise bad("empty", found="no cells", remedy="name the file, or with --sheet the sheet, that holds the table")
+    return _table(file, rows, words)
+
+
+def _text(data: bytes, file: str) -> tuple[str, str]:
+    """The text and the name of its encoding."""
+    marked = [(codec, name) for mark, codec, name in _MARKS if data.startswith(mark)]
+    codec, name = marked[0] if marked else ("utf-8", "UTF-8")
+    if not marked and b"\0" in data[:200]:
+        codec, name = ("utf-16-le" if data[1:2] == b"\0" else "utf-16-be"), "UTF-16"
+    try:
+        text = data.decode(codec)
+    except UnicodeDecodeError:
+        # Every byte is a letter there: only names of columns can be wrong.
+        text, name = data.decode("cp1252", errors="replace"), "Windows-1252"
+    if control := CONTROL.search(text):
+        line = text.count("\n", 0, control.start()) + 1
+        allowed, remedy = "a table as CSV (text) or XLSX", "export the table as CSV"
+        raise refusal("kind", file=file, line=line, found="binary data", allowed=allowed, remedy=remedy)
+    return text, name
+
+
+def _csv_rows(text: str, file: str) -> tuple[list[tuple[int, list[str]]], str]:
+    """Rows with their lines, and what stands between their cells; lines that begin with # or % are remarks."""
+    lines = [(number, line) for number, line in enumerate(text.splitlines(), start=1)]
+    stated = next((line[4:5] for _, line in lines[:1] if line.lower().startswith("sep=")), None)
+    kept = [(n, line) for n, line in lines if line.strip() and not line.startswith(("#", "%"))][stated is not None :]
+    if len(kept) > CSV_ROWS_MAX + 1:
+        allowed, remedy = f"at most {CSV_ROWS_MAX} rows", "split it"
+        raise refusal("size", file=file, found=f"{len(kept)} rows", allowed=allowed, remedy=remedy)
+    separator = stated or _separator([line for _, line in kept[:ROWS_TRIED]])
+    if separator == " ":
+        rows = [(number, line.split()) for number, line in kept]
+    else:
+        reader = csv.reader((line for _, line in kept), delimiter=separator, skipinitialspace=True, strict=True)
+        try:
+            rows = [(number, [cell.strip() for cell in row]) for (number, _), row in zip(kept, reader, strict=True)]
+        except (csv.Error, ValueError) as error:
+            found, remedy = escaped(str(error), 120), 'close every quote " in its own line'
+            raise refusal("csv", file=file, found=found, allowed="one row per line", remedy=remedy) from error
+    return rows, SEPARATORS.get(separator, f"'{escaped(separator)}'")
+
+
+def _separator(lines: Sequence[str]) -> str:
+    """The first that divides nine of ten lines into equally many cells, two or more."""
+    for separator in SEPARATORS:
+        counts = Counter(len(line.split(None if separator == " " else separator)) for line in lines)
+        cells, often = max(counts.items(), key=lambda item: item[1], default=(1, 0))
+        if cells > 1 and often >= 0.9 * len(lines):
+            return separator
+    return ","
+
+
+def _sheet_rows(data: bytes, file: str, sheet: str | None) -> tuple[list[tuple[int, list[str]]], list[str]]:
+    """Rows of one sheet of an XLSX file: values, not formulas."""
+    bad = partial(refusal, file=file)
+    try:
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            parts = archive.infolist()
+    except zipfile.BadZipFile as error:
+        raise bad("kind", found="a damaged XLSX file", allowed="CSV or XLSX", remedy="save it again") from error
+    packed = {zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED}
+    if sum(part.file_size for part in parts) > UNPACKED_BYTES_MAX or any(p.compress_type not in packed for p in parts):
+        allowed = f"at most {UNPACKED_BYTES_MAX // 2**20} MiB when unpacked"
+        raise bad("size", found="more", allowed=allowed, remedy="save the one sheet that is needed")
+    import openpyxl
+
+    with warnings.catch_warnings():
+        # Of styles and validation rules that it does not know.
+        warnings.simplefilter("ignore")
+        try:
+            book = openpyxl.load_workbook(io.BytesIO(data), read_only=True, data_only=True)
+            names = book.sheetnames
+            if sheet is not None and sheet not in names:
+                listed_names = ", ".join(escaped(name) for name in names)
+                raise bad("sheet", found=f"no sheet {escaped(sheet)}", allowed=listed_names, remedy="name one of them")
+            for name in [sheet] if sheet is not None else names:
+                rows = _cells(book[name].iter_rows(values_only=True), file)
+                if any(any(cells) for _, cells in rows):
+                    break
+        except InputError:
+            raise
+        except Exception as error:
+            # Whatever a damaged file makes the library raise.
+            raise bad("kind", found=escaped(str(error), 120), allowed="CSV or XLSX", remedy="save it as CSV") from error
+    return rows, [f"XLSX, sheet {escaped(str(name))}"]
+
+
+def _cells(rows: Iterable[tuple[object, ...]], file: str) -> list[tuple[int, list[str]]]:
+    """Cells of a sheet as text."""
+    found = []
+    for number, row in enumerate(rows, start=1):
+        if number > CSV_ROWS_MAX + 1 or len(row) > COLUMNS_MAX * 100:
+            allowed, remedy = f"at most {CSV_ROWS_MAX} rows", "save the table alone in a file"
+            raise refusal("size", file=file, found="more rows", allowed=allowed, remedy=remedy)
+        found.append((number, [_cell(value) for value in row]))
+    return found
+
+
+def _cell(value: object) -> str:
+    if value is None:
+        return ""
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, float) and value.is_integer() and abs(value) < 1e15:
+        return str(int(value))
+    if isinstance(value, datetime.datetime | datetime.date | datetime.time):
+        return value.isoformat()
+    return str(value).strip()
+
+
+def _table(file: str, rows: Sequence[tuple[int, list[str]]], words: list[str]) -> ForeignTable:
+    """Rows of equal length under their names, numbers with points."""
+    width = max(len(cells) for _, cells in rows)
+    if width > COLUMNS_MAX:
+        allowed, remedy = f"at most {COLUMNS_MAX} columns", "save the table alone in a file"
+        raise refusal("size", file=file, found=f"{width} columns", allowed=allowed, remedy=remedy)
+    filled = [(line, cells + [""] * (width - len(cells))) for line, cells in rows]
+    named = not all(_PLAIN.fullmatch(cell) or _COMMA.fullmatch(cell) for cell in filled[0][1] if cell)
+    names = _unique(filled[0][1]) if named else [f"column {k}" for k in range(1, width + 1)]
+    body = filled[1:] if named else filled
+    cells = [cell for _, row in body for cell in row]
+    commas = any(_COMMA.fullmatch(cell) or _GROUPED_COMMA.fullmatch(cell) for cell in cells)
+    # "1.5" beside "1,5" is nobody's notation: such cells stay as they are and are refused where a number is needed.
+    mixed = commas and any("." in cell and _PLAIN.fullmatch(cell) for cell in cells)
+    if commas and not mixed:
+        words = [*words, "decimal commas"]
+    columns = {}
+    for k, name in enumerate(names):
+        if name is not None:
+            own = tuple(row[k][:CELL_CHARS_MAX] for _, row in body)
+            columns[name] = own if mixed else tuple(_with_point(cell, commas) for cell in own)
+    return ForeignTable(file, ", ".join(words), tuple(line for line, _ in body), columns)
+
+
+def _unique(names: Sequence[str]) -> list[str | None]:
+    """Names of columns: numbered where they repeat, None without a name."""
+    seen: Counter[str] = Counter()
+    found: list[str | None] = []
+    for name in names:
+        seen[name] += 1
+        found.append(None if not name else name if seen[name] == 1 else f"{name} ({seen[name]})")
+    return found
+
+
+def _with_point(cell: str, commas: bool) -> str:
+    """A number with a decimal point and no marks between thousands; any other cell as it is."""
+    if commas and (_COMMA.fullmatch(cell) or _GROUPED_COMMA.fullmatch(cell)):
+        return cell.replace(".", "").replace(",", ".")
+    return cell.replace(",", "") if not commas and _GROUPED_POINT.fullmatch(cell) else cell

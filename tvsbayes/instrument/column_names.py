@@ -1,0 +1,140 @@
+"""Which column of somebody's table is which field of `moves.csv` and `spots.csv`, by the words in its name.
+
+A name is taken apart into words ("xLeft (px)" is x, left, px); a rule is a set of words that all stand in it. Units in
+the name are read too. What two columns claim is nobody's until it is said which.
+"""
+
+from __future__ import annotations
+
+import re
+import unicodedata
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+
+from tvsbayes.errors import InputError, closest, escaped
+from tvsbayes.instrument.campaign import MOVE_COLUMNS, PIXELS, SPOT_COLUMNS
+
+FIELDS: tuple[str, ...] = tuple(dict.fromkeys((*MOVE_COLUMNS, *SPOT_COLUMNS)))
+"""All that a table can give, by the columns of our files."""
+PIXEL_SDS = tuple(f"s{name}" for name in PIXELS)
+COUNTERS = ("pan_steps", "tilt_steps")
+_SIDES = {
+    "left": {"left", "l", "links", "izq", "izquierda", "gauche", "cam1", "1"},
+    "right": {"right", "r", "rechts", "der", "derecha", "droite", "cam2", "2"},
+}
+_IMAGE_AXES = {"u": {"u", "x", "col", "column", "spalte", "columna"}, "v": {"v", "y", "row", "zeile", "fila"}}
+_SPREAD = {"sd", "std", "sigma", "s", "stdev", "unc", "uncertainty", "err", "error"}
+_WORDS = {
+    "move": {"move", "movement", "bewegung", "movimiento", "pose"},
+    "segment": {"segment", "homing", "home"},
+    "time_s": {"time", "t", "timestamp", "zeit", "tiempo", "datetime", "date"},
+    "pan_steps": {"pan", "azimuth", "azimut", "horizontal", "hor"},
+    "tilt_steps": {"tilt", "elevation", "vertical", "vert"},
+    "spot": {"spot", "look", "id", "nr", "no", "index", "shot"},
+    "target": {"target", "sheet", "plane", "screen", "wall", "blatt", "schirm", "hoja", "plano"},
+    "experiment": {"experiment", "exp", "versuch", "experimento", "trial", "run"},
+    "point": {"point", "pt", "punkt", "punto"},
+    "aperture_deg": {"aperture", "b", "receiver", "rx", "apertura"},
+    "status": {"status", "state", "ok", "valid", "quality"},
+}
+_UNITS = {
+    "ms": {"ms", "msec", "millis", "milliseconds"},
+    "min": {"min", "minutes"},
+    "rad": {"rad", "radians"},
+    "deg": {"deg", "degrees", "grad"},
+    "mm": {"mm"},
+}
+
+
+@dataclass(frozen=True)
+class Understood:
+    """Columns of a table by the field that they give.
+
+    Attributes:
+        columns: column by field.
+        claimed: fields that several columns could give, with these.
+        unused: columns that give nothing.
+    """
+
+    columns: dict[str, str]
+    claimed: dict[str, tuple[str, ...]]
+    unused: tuple[str, ...]
+
+
+def words_of(name: str) -> list[str]:
+    """The words of a column's name in small letters without accents: "xLeft_px", "X left [px]" and "XL" alike."""
+    plain = unicodedata.normalize("NFKD", name).encode("ascii", "ignore").decode()
+    found = []
+    for part in re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|[0-9]+", plain):
+        word = part.lower()
+        # XL, ur, su: an axis and a camera written together.
+        glued = re.fullmatch(r"(s?)([xyuv])([lr])|([lr])([xyuv])|(s)([xyuv])", word)
+        found += [piece for piece in glued.groups() if piece] if glued else [word]
+    return found
+
+
+def unit_of_name(name: str) -> str | None:
+    """ms, min, rad, deg or mm where the name says so."""
+    words = set(words_of(name))
+    return next((unit for unit, spellings in _UNITS.items() if words & spellings), None)
+
+
+def _field_of(name: str) -> str | None:
+    """The field that a column's name tells of."""
+    listed = words_of(name)
+    words = set(listed)
+    axes = [axis for axis, spellings in _IMAGE_AXES.items() if words & spellings]
+    sides = [side for side, spellings in _SIDES.items() if words & spellings]
+    if len(axes) == len(sides) == 1:
+        return f"{'s' if words & _SPREAD else ''}{axes[0]}_{sides[0]}_px"
+    for axis in ("pan", "tilt"):
+        if words & {"approach", "side", "from"} and words & _WORDS[f"{axis}_steps"]:
+            return f"{axis}_approach"
+    # The first word tells most: "sheet_id" is of the sheet, "id of sheet" of the id.
+    return next((field for word in listed for field, spellings in _WORDS.items() if word in spellings), None)
+
+
+def understand(columns: Iterable[str], stated: Mapping[str, str] | None = None) -> Understood:
+    """Guess what columns are.
+
+    Args:
+        columns: their names.
+        stated: column by field, where somebody has said it; an empty column: the table has none.
+
+    Raises:
+        InputError: a field or column that does not exist.
+    """
+    names, stated = list(columns), stated or {}
+    for field, name in stated.items():
+        option = f"--column {escaped(field)}={escaped(name)}"
+        if field not in FIELDS:
+            allowed, remedy = ", ".join(FIELDS), closest(field, FIELDS)
+            raise InputError("usage", f"{option}: no such field; allowed: {allowed}", allowed=allowed, remedy=remedy)
+        if name and name not in names:
+            allowed, remedy = ", ".join(map(escaped, names)), closest(name, names)
+            raise InputError("usage", f"{option}: no such column; allowed: {allowed}", allowed=allowed, remedy=remedy)
+    found = {field: name for field, name in stated.items() if name}
+    free = [name for name in names if name not in found.values()]
+    found |= {name: name for name in free if name in FIELDS and name not in stated}
+    claims: dict[str, list[str]] = {}
+    for name in (n for n in free if n not in found.values()):
+        told = _field_of(name)
+        if told is not None and told not in found and told not in stated:
+            claims.setdefault(told, []).append(name)
+    found |= {field: own[0] for field, own in claims.items() if len(own) == 1}
+    claimed = {field: tuple(own) for field, own in claims.items() if len(own) > 1}
+    used = {*found.values(), *(name for own in claimed.values() for name in own)}
+    return Understood(found, claimed, tuple(name for name in names if name not in used))
+
+
+def missing(columns: Iterable[str], moves_known: bool) -> list[str]:
+    """Fields without which a table makes no campaign.
+
+    Args:
+        columns: fields that it gives.
+        moves_known: whether moves are listed elsewhere already.
+    """
+    given = set(columns)
+    seen, moved = bool(given & set(PIXELS)), bool(given & set(COUNTERS))
+    needed = [*(PIXELS if seen or not moved else ()), *(COUNTERS if moved or not moves_known else ())]
+    return [field for field in needed if field not in given]

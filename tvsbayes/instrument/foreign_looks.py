@@ -1,0 +1,261 @@
+"""Moves and looks of somebody's table: counters, pixels, times and angles turned into those of our files.
+
+One row is one look, one move, or both; rows that follow each other at the same counters are looks after one move. What
+a table does not say is assumed and listed in words. Px with the integer at the centre of a pixel, (0, 0) the first.
+"""
+
+from __future__ import annotations
+
+import datetime
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+from tvsbayes.errors import InputError, refusal
+from tvsbayes.files.csv_table import NUMBER
+from tvsbayes.files.foreign_table import ForeignTable
+from tvsbayes.instrument.axes import AXES, SENSES, Axis
+from tvsbayes.instrument.campaign import ID_MAX, NO_PIXELS, PIXELS, Move, Spot, with_pixels
+from tvsbayes.instrument.column_names import COUNTERS, PIXEL_SDS, unit_of_name
+from tvsbayes.instrument.counter_limits import COUNTER_MAX
+
+SD_PX = 0.1
+"""Standard uncertainty of a centroid where a table states none; the fit scales it by what the spots show."""
+_GOOD = {"ok", "1", "true", "yes", "good", "valid", "ja", "si"}
+_BAD = {"0", "false", "no", "bad", "invalid", "nein"}
+_SECONDS = {"ms": 1e-3, "min": 60.0}
+
+
+@dataclass(frozen=True)
+class Notation:
+    """How a table's numbers are meant.
+
+    Attributes:
+        pixels_from: coordinate of the centre of the first pixel: 0, or 1 as in MATLAB.
+        angle_unit: "deg" or "rad" of aperture readings; None: as the name of the column says, else degrees.
+        sd_px: standard uncertainty of a centroid where no column states it.
+        relative: counters are the steps of each move instead of where it ended.
+        approach: side from which pan and tilt came to the first row; "unknown" where nobody recorded it.
+    """
+
+    pixels_from: int = 0
+    angle_unit: str | None = None
+    sd_px: float = SD_PX
+    relative: bool = False
+    approach: tuple[str, str] = ("unknown", "unknown")
+
+
+@dataclass(frozen=True)
+class ForeignLooks:
+    """What a table gives.
+
+    Attributes:
+        moves: rows of `moves.csv`; None where the table has no counters.
+        spots: rows of `spots.csv`; None where it has no pixels.
+        assumed: what it does not say, in words.
+    """
+
+    moves: tuple[Move, ...] | None
+    spots: tuple[Spot, ...] | None
+    assumed: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class _Cells:
+    """Cells of a table by field."""
+
+    table: ForeignTable
+    columns: Mapping[str, str]
+
+    def __contains__(self, field: str) -> bool:
+        return field in self.columns
+
+    def text(self, field: str) -> list[str]:
+        """Cells of a field; empty ones where no column gives it."""
+        return list(self.table.columns[self.columns[field]]) if field in self else [""] * len(self.table)
+
+    def numbers(self, field: str, high: float, *, empty: bool = False) -> list[float | None]:
+        """Numbers of at most this size; None for an empty cell where `empty` allows it."""
+        found: list[float | None] = []
+        for row, cell in enumerate(self.text(field)):
+            value = float(cell) if NUMBER.fullmatch(cell) else math.nan
+            if not cell and empty:
+                found.append(None)
+            elif abs(value) <= high:
+                found.append(value)
+            else:
+                remedy = "correct the cell, or name another column"
+                raise self.refuse(row, field, f"a number from {-high:g} to {high:g} for {field}", remedy)
+        return found
+
+    def integers(self, field: str, high: int, *, empty: bool = False) -> list[int | None]:
+        """Whole numbers; "200.0" is one."""
+        values = self.numbers(field, high, empty=empty)
+        for row, value in enumerate(values):
+            if value is not None and not value.is_integer():
+                remedy = "give the counters of the motors; angles are what the fit finds" if field in COUNTERS else ""
+                raise self.refuse(row, field, f"a whole number for {field}", remedy or "correct the cell")
+        return [None if value is None else int(value) for value in values]
+
+    def refuse(self, row: int, field: str, allowed: str, remedy: str) -> InputError:
+        return self.table.refuse(row, self.columns[field], allowed, remedy)
+
+
+def looks_of(
+    table: ForeignTable, columns: Mapping[str, str], notation: Notation, listed: Sequence[Move] | None = None
+) -> ForeignLooks:
+    """Moves and looks of a table.
+
+    Args:
+        table: as it was read.
+        columns: its columns by field; see `column_names`.
+        notation: how its numbers are meant.
+        listed: moves that are there already, for a table of looks alone.
+
+    Raises:
+        InputError: a cell that is no value of its field; looks whose moves nobody knows.
+    """
+    cells = _Cells(table, columns)
+    if not len(table):
+        found, remedy = "no rows below the names of the columns", "name the sheet or file with the data"
+        raise refusal("empty", file=table.file, found=found, allowed="at least one row", remedy=remedy)
+    assumed: list[str] = []
+    moves: tuple[Move, ...] | None = None
+    if all(field in cells for field in COUNTERS):
+        moves, of_row = _moves(cells, notation, assumed)
+    else:
+        of_row = _listed_moves(cells, listed or ())
+    spots = _spots(cells, of_row, notation, assumed) if any(field in cells for field in PIXELS) else None
+    return ForeignLooks(moves, spots, tuple(assumed))
+
+
+def _listed_moves(cells: _Cells, listed: Sequence[Move]) -> list[int]:
+    """The move of every row of a table without counters."""
+    table, count = cells.table, len(cells.table)
+    if "move" not in cells:
+        if len(listed) != count:
+            found = f"{count} looks for {len(listed)} moves, and no column that tells which"
+            allowed, remedy = "a column of move numbers, or a look for every move", "add --column move=NAME"
+            raise refusal("missing-column", file=table.file, found=found, allowed=allowed, remedy=remedy)
+        return list(range(count))
+    numbers = cells.integers("move", ID_MAX)
+    for row, number in enumerate(numbers):
+        if number is None or not 0 <= number < len(listed):
+            allowed = f"the number of a move, 0 to {len(listed) - 1}"
+            raise cells.refuse(row, "move", allowed, "moves count from 0; list them first")
+    return [int(number or 0) for number in numbers]
+
+
+def _moves(cells: _Cells, notation: Notation, assumed: list[str]) -> tuple[tuple[Move, ...], list[int]]:
+    """The moves of a table with counters, and the move of every row."""
+    count = len(cells.table)
+    pairs = list(zip(*(cells.integers(field, COUNTER_MAX) for field in COUNTERS), strict=True))
+    numbers = cells.text("move") if "move" in cells else None
+    homings = cells.text("segment")
+    times_s = _times_s(cells, assumed)
+    approaches = [_approaches(cells, axis, notation.approach[k]) for k, axis in enumerate(AXES)]
+    moves: list[Move] = []
+    of_row: list[int] = []
+    at, segment = (0, 0), 0
+    for row in range(count):
+        step = pairs[row][0] or 0, pairs[row][1] or 0
+        homed = row > 0 and homings[row] != homings[row - 1]
+        segment += homed
+        again = row > 0 and (numbers[row] == numbers[row - 1] if numbers else True) and not homed
+        same = again and (numbers is not None or step == ((0, 0) if notation.relative else at))
+        if not same:
+            at = (at[0] + step[0], at[1] + step[1]) if notation.relative and row and not homed else step
+            first = row == 0 or homed
+            words = [own[row] if first else "" for own in approaches]
+            time_s = float(len(moves)) if times_s is None else times_s[row]
+            moves.append(Move(len(moves), segment, time_s, *at, *words))  # type: ignore[arg-type]
+        elif not notation.relative and step != at:
+            remedy = "a new move begins a new number; or leave the column out with --column move="
+            raise cells.refuse(
+                row, COUNTERS[step[1] != at[1]], f"the counters of its move, {at[0]} and {at[1]}", remedy
+            )
+        of_row.append(len(moves) - 1)
+    if times_s is None:
+        assumed.append("time_s: no column, so 0, 1, 2 ...; drift of the zero is then per move")
+    if "pan_approach" not in cells and "unknown" in notation.approach:
+        assumed.append("approach: unknown; say how the axes came to the first row, --pan-approach left or right ...")
+    if notation.relative:
+        assumed.append("counters: summed up, because --relative says that each is the steps of its move")
+    return tuple(moves), of_row
+
+
+def _approaches(cells: _Cells, axis: Axis, default: str) -> list[str]:
+    """The side from which an axis came, of every row."""
+    field, allowed = f"{axis}_approach", (*SENSES[axis], "unknown")
+    found = [word.lower() or default for word in cells.text(field)]
+    for row, word in enumerate(found):
+        if word not in allowed:
+            raise cells.refuse(row, field, ", ".join(allowed), "name the direction of the last move of the axis")
+    return found
+
+
+def _times_s(cells: _Cells, assumed: list[str]) -> list[float] | None:
+    """Seconds of every row: numbers in the unit of the column's name, or dates with times."""
+    if "time_s" not in cells:
+        return None
+    texts = cells.text("time_s")
+    if all(NUMBER.fullmatch(cell) for cell in texts):
+        scale = _SECONDS.get(unit_of_name(cells.columns["time_s"]) or "", 1.0)
+        found = [scale * float(cell) for cell in texts]
+    else:
+        found = []
+        for row, cell in enumerate(texts):
+            try:
+                found.append(datetime.datetime.fromisoformat(cell).timestamp())
+            except ValueError as error:
+                allowed = "seconds, or a date and time such as 2026-01-15T10:00:00"
+                raise cells.refuse(row, "time_s", allowed, "correct the cell, or write --column time_s=") from error
+        found = [value - found[0] for value in found]
+        assumed.append("time_s: seconds since the first row")
+    for row in range(1, len(found)):
+        if found[row] < found[row - 1]:
+            remedy = "sort the rows as they happened: play remembers the order"
+            raise cells.refuse(row, "time_s", "times that do not decrease", remedy)
+    return found
+
+
+def _spots(cells: _Cells, of_row: Sequence[int], notation: Notation, assumed: list[str]) -> tuple[Spot, ...]:
+    """The looks of a table with pixels."""
+    pixels = [cells.numbers(field, 1e6, empty=True) for field in PIXELS]
+    stated = [cells.numbers(field, 100.0, empty=True) if field in cells else None for field in PIXEL_SDS]
+    if any(column is None for column in stated):
+        text = f"standard uncertainty of a centroid: {notation.sd_px:g} px; --sd-px states another"
+        assumed.append(f"{text}, the fit finds the scale" if all(c is None for c in stated) else text)
+    experiments = cells.integers("experiment", ID_MAX, empty=True)
+    points = cells.integers("point", 4, empty=True)
+    numbers = cells.integers("spot", ID_MAX, empty=True)
+    unique = None not in numbers and len(set(numbers)) == len(numbers)
+    radians = (notation.angle_unit or unit_of_name(cells.columns.get("aperture_deg", ""))) == "rad"
+    readings = cells.numbers("aperture_deg", 1e4, empty=True)
+    statuses, targets = cells.text("status"), cells.text("target")
+    spots = []
+    for row, move in enumerate(of_row):
+        centre = [column[row] for column in pixels]
+        status = _status(statuses[row], centre, cells, row)
+        number = numbers[row] if unique else row
+        reading = readings[row] if readings[row] is None or not radians else math.degrees(readings[row] or 0.0)
+        both = (experiments[row], points[row]) if None not in (experiments[row], points[row]) else (None, None)
+        target = targets[row].lstrip("=+-@")[:100]
+        spot = Spot(number or 0, move, target, *both, *NO_PIXELS, *NO_PIXELS, status=status)
+        if status == "ok":
+            sds = [notation.sd_px if column is None else column[row] for column in stated]
+            spot = with_pixels(spot, "ok", [(value or 0.0) - notation.pixels_from for value in centre], sds)
+        spots.append(replace(spot, aperture_deg=reading))
+    return tuple(spots)
+
+
+def _status(text: str, centre: Sequence[float | None], cells: _Cells, row: int) -> str:
+    """The word "ok", or why a look is of no use."""
+    seen = None not in centre
+    word = text.strip().lower()
+    if word in _GOOD or not word:
+        if seen or not word:
+            return "ok" if seen else "no centre in the table"
+        field = PIXELS[centre.index(None)]
+        raise cells.refuse(row, field, "a number where the look is ok", "complete the cell, or its status")
+    return f"refused: {text}" if word in _BAD else text[:200]
