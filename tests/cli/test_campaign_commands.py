@@ -44,7 +44,7 @@ def test_check_reads_campaign_rig_and_plan(ask, say):
     assert (code, document["kind"], document["look"], document["home"]) == (0, "plan", 384, 1)
     code, out, _ = say("check", PAPER_TWIN)
     assert code == 0
-    assert "spots: 384" in out
+    assert "\nusable spots                  384\n" in out and "{" not in out
     assert out.endswith(", 0 warnings\n")
 
 

@@ -332,7 +332,7 @@ def test_a_fit_that_did_not_converge_is_exit_4(ask, say, grid_folder, monkeypatc
 def test_a_report_for_a_browser_that_is_not_there_ends_at_once(ask, grid_folder, monkeypatch):
     monkeypatch.setattr("tvsbayes.report.page.BROWSERS", ())
     monkeypatch.setattr("tvsbayes.pipeline.record_for", None)
-    monkeypatch.setattr("tvsbayes.cli.estimate_commands.record_for", None)
+    monkeypatch.setattr("tvsbayes.cli.report_commands.record_for", None)
     code, document = ask("report", grid_folder, "--pdf")
     assert (code, document["error"]["code"]) == (2, "no-browser")
 

@@ -7,8 +7,8 @@ import pytest
 IGNORED = [
     ("fit c --no-sample --max-minutes 3", "--max-minutes is for a sampler"),
     ("fit c --no-sample --resume", "--resume continues a chain"),
-    ("report c --laboratory A --country MX", "--laboratory and --country are for a certificate"),
-    ("report c --customer B", "--customer is for a certificate"),
+    ("report c --laboratory A --country MX", "--country is for a certificate"),
+    ("calibrate c --quick --no-sample", "--quick is for a sampler"),
     ("compare a b --by regions", "--by is for one campaign"),
     ("compare c --by positions --seed 3", "--seed is for steps and regions"),
     ("compare a b --seed 3", "--seed is for one campaign"),

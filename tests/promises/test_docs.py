@@ -23,7 +23,7 @@ from tvsbayes.instrument.parameters import RIG_PRIORS, unit_of
 ROOT = Path(__file__).resolve().parents[2]
 DOCS = ROOT / "data" / "docs"
 GROUP = typer.main.get_command(app)
-OUTPUT_OPTIONS = {"--json", "--help"}
+OUTPUT_OPTIONS = {"--json", "--help", "-h"}
 """What every command has: said once for all."""
 PAGES = [
     *("README.md", "CONTRIBUTING.md", "CHANGELOG.md", "experiments/README.md"),
@@ -98,7 +98,7 @@ def test_commands_are_those_that_exist():
 
 
 def options_of(name: str) -> set[str]:
-    parameters = GROUP.commands[name].params
+    parameters = [p for p in GROUP.commands[name].params if not getattr(p, "hidden", False)]
     return {option for parameter in parameters for option in (*parameter.opts, *parameter.secondary_opts)}
 
 

@@ -30,21 +30,33 @@ def test_few_stops_are_said(estimator, word):
 
 
 def test_fit_text_shows_what_the_reader_must_know():
-    text = fit_text(small_summary())
+    text = fit_text(small_summary(), details=True, written=["results/fit.json"])
     lines = {line.split("  ")[0]: line for line in text.splitlines()}
     assert "pan 6.00 deg, tilt 0.50 deg" in lines["joint estimator (Laplace) at pan 6.00 deg, tilt 0.50 deg"]
-    assert "0.06210(10)" in lines["effective left"]
-    assert "never moved" in lines["effective right"]
-    assert lines["mirror offset L"].endswith("prior")
-    assert lines["stop sd up"].endswith("fixed")
+    assert "0.06210(10)" in lines["effective left, deg/step"]
+    assert "never moved" in lines["effective right, deg/step"]
+    assert lines["mirror offset L, mm"].endswith("prior")
+    assert lines["stop scatter up, deg"].endswith("fixed")
     assert "left - right" not in text
     assert "chi2 31.0 for 30.5 degrees of freedom" in text
-    assert "weak: the tilt axis was never moved" in text
-    assert "leverage: without move 0 it is lost" in text
+    assert "weak (the data leave it to the priors): the tilt axis was never moved" in text
+    assert "hangs on one stop: without move 0 it is lost" in text
     assert "excluded spots: 17\n" in text
     # A flood of ids helps nobody.
     assert "spots that disagree with all others: 0, 1, 2" in text
     assert ", 19 and 10 more; look at them" in text
+
+
+def test_a_fit_ends_with_its_table_and_its_verdict():
+    """What a terminal of 80 columns still shows when it is done; the rest comes first, or with --details."""
+    lines = fit_text(small_summary(), written=["results/fit.json"]).splitlines()
+    assert lines[-1] == "verdict: usable; too few spots to look for model errors"
+    blank = lines.index("")
+    assert lines[blank + 1].startswith("joint estimator") and len(lines) - blank < 24
+    assert "written: results/fit.json" in lines[:blank]
+    assert "--details and the report say more: 1 weak direction, 1 stop on which a result hangs" in lines[:blank]
+    assert not [line for line in lines if line.startswith(("weak", "hangs"))]
+    assert max(map(len, lines[blank:])) <= 80
 
 
 def direction(mean: float, u: float | None) -> DirectionResult:

@@ -66,14 +66,17 @@ def test_the_section_states_scales_range_and_both_ratios(geared_evidence, eviden
     (section,) = gear_section(geared_evidence)
     assert "pan -60 to 280, tilt -140 to 140 steps" in section.text[0] and len(section.figures) == 2
     scales, ratios = section.tables
-    assert [row[0] for row in scales.rows[:2]] == ["transmission error sd, pan", "transmission error sd, tilt"]
+    assert [row[0] for row in scales.rows[:2]] == [
+        "transmission error sd, pan, deg",
+        "transmission error sd, tilt, deg",
+    ]
     assert scales.rows[0][1] == "0.0310(42)"
     told = {row[0]: row[1] for row in ratios.rows}
-    assert told["left, local"] == "0.06010(10)" and "left, line" in told
-    assert told["right, local"] == "never moved"
+    assert told["left, local, deg/step"] == "0.06010(10)" and "left, line, deg/step" in told
+    assert told["right, local, deg/step"] == "never moved"
 
 
 def test_the_text_of_a_fit_is_short_of_it(geared_evidence):
-    text = fit_text(geared_evidence.fit.summary)
+    text = fit_text(geared_evidence.fit.summary, details=True)
     assert "gears: what repeats by position" in text and "pan -60 to 280, tilt -140 to 140 steps" in text
     assert "local ratios, without errors of the gears, deg/step: left 0.06010(10)" in text

@@ -64,6 +64,15 @@ def test_interval_ends_carry_one_digit_more_than_the_uncertainty(low, high, sd, 
     assert interval_text(low, high, sd) == expected
 
 
+def test_a_table_wider_than_a_terminal_is_printed_in_parts_below_each_other():
+    names = ("left", "right", "up", "down")
+    text = TableView("title", ["", *names], [["a label of 20 letters", *(f"{name:>15}" for name in names)]]).text()
+    lines = text.splitlines()
+    assert [line.split() for line in lines[1::2]] == [["left", "right"], ["up", "down"]]
+    assert [line.split()[-2:] for line in lines[2::2]] == [["left", "right"], ["up", "down"]]
+    assert max(map(len, lines)) <= 80
+
+
 def test_tables_are_plain_text_whatever_the_terminal_says(monkeypatch):
     monkeypatch.setenv("FORCE_COLOR", "1")
     monkeypatch.setenv("COLUMNS", "20")

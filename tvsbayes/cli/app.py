@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import os
+import shlex
 import sys
 from collections.abc import Mapping
 from pathlib import Path
@@ -12,7 +13,9 @@ from typing import Annotated, Any
 
 import typer
 
-from tvsbayes.errors import InputError, TvsError
+from tvsbayes.cli.examples import FIRST, epilog
+from tvsbayes.cli.terminal import shown
+from tvsbayes.errors import InputError, TvsError, escaped
 from tvsbayes.files.disk import make_folder, write_atomically
 
 INTERRUPTED = 130
@@ -22,7 +25,7 @@ app = typer.Typer(
     name="tvsbayes",
     help="What one motor step of a geared laser positioner does to the beam, and how sure that is.",
     no_args_is_help=True,
-    add_completion=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
 )
@@ -36,7 +39,7 @@ def _print_version(wanted: bool) -> None:
         raise typer.Exit
 
 
-@app.callback()
+@app.callback(epilog=epilog(FIRST))
 def _options(
     _version: Annotated[
         bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and exit.")
@@ -47,6 +50,8 @@ def _options(
 
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON document on stdout.")]
 Seed = Annotated[int, typer.Option("--seed", min=0, help="Seed of everything random.")]
+OldOut = Annotated[Path | None, typer.Option("--output", hidden=True)]
+"""The former name of --out."""
 CampaignFolder = Annotated[Path, typer.Argument(metavar="CAMPAIGN", help="Campaign folder.")]
 
 
@@ -61,7 +66,7 @@ class Ended(Exception):
 def report_line(text: str) -> None:
     """A line for people, on stderr; text from files may hold control characters."""
     try:
-        typer.echo("".join(c if c.isprintable() else "?" for c in text), err=True)
+        typer.echo(shown("".join(c if c.isprintable() else "?" for c in text), sys.stderr), err=True)
     except OSError:
         # Ctrl-C ends the `tee` behind us too: nobody is left to be told, and the work goes on.
         pass
@@ -73,7 +78,7 @@ class OutputFailed(Exception):
 
 def _print(text: str) -> None:
     try:
-        typer.echo(text)
+        typer.echo(shown(text, sys.stdout))
     except OSError as error:
         # What is still in its buffer must not fail again while Python ends.
         sys.stdout = open(os.devnull, "w", encoding="utf-8")
@@ -112,6 +117,17 @@ def finish(document: Mapping[str, Any], text: str, as_json: bool, error: TvsErro
         if not as_json:
             report_error(error)
         raise Ended(error.exit_code)
+
+
+def tell_part(text: str, as_json: bool) -> None:
+    """A part of a longer command's text, as soon as it is known; under --json the document at the end has it."""
+    if not as_json:
+        _print(f"{text}\n")
+
+
+def command_line(*words: object) -> str:
+    """A command to be typed, its words quoted where a shell needs it."""
+    return "tvsbayes " + " ".join(shlex.quote(escaped(str(word), 400)) for word in words)
 
 
 def keep(document: Mapping[str, Any], path: Path) -> bool:

@@ -1,18 +1,24 @@
-"""What commands do with an axis folder: check, fit, compare, report, plan, simulate, new.
+"""What commands do with an axis folder: check, fit, calibrate, compare, report, plan, simulate, new.
 
 The commands themselves stand with their groups; they come here where `campaign.toml` says `tvsbayes-axis/1`.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from tvsbayes.cli.app import finish, keep, report_line
+from tvsbayes.cli.app import command_line, finish, keep, report_line, tell_part
 from tvsbayes.cli.progress_bar import waiting
-from tvsbayes.errors import InputError, NothingToEstimate, escaped
+from tvsbayes.errors import InputError, NothingToEstimate, TvsError, escaped
 from tvsbayes.files.disk import make_folder, output_place, shipped_data, write_atomically
 from tvsbayes.progress import Job
+
+if TYPE_CHECKING:
+    from tvsbayes.report.tables import Issue
+    from tvsbayes.single_axis.axis_campaign import AxisCampaign
+    from tvsbayes.single_axis.axis_record import AxisSummary
 
 STORED = "results/ are missing or older than the axis folder: fitting first (weighted draws) ..."
 NOT_OF_AN_AXIS = "for a scanner, and this is an axis folder"
@@ -82,6 +88,7 @@ def fit(
     quick: bool,
     no_sample: bool,
     max_minutes: float,
+    details: bool,
     out: Path | None,
     seed: int,
     as_json: bool,
@@ -89,25 +96,81 @@ def fit(
     """Fit an axis; results into its folder or `out`."""
     from tvsbayes.report.axis_text import axis_fit_text
     from tvsbayes.single_axis.axis_campaign import read_axis
+
+    place = out or output_place(folder, "results")
+    wish = Sampled(quick, no_sample, max_minutes, seed)
+    kept = _fitted(read_axis(folder), place, wish)
+    text = axis_fit_text(kept.summary, details, list(kept.files.values()))
+    if kept.error is None and out is None:
+        text += f"\nnext: {command_line('report', folder)}"
+    finish(kept.as_json(seed), text, as_json, kept.error)
+
+
+@dataclass(frozen=True)
+class Sampled:
+    """How an axis is to be fitted; fields as the options of `fit`."""
+
+    quick: bool
+    no_sample: bool
+    max_minutes: float
+    seed: int
+
+
+@dataclass(frozen=True)
+class Kept:
+    """A fit in its folder: what it says, its files by kind, and why it must not be used, None where it may."""
+
+    summary: AxisSummary
+    files: dict[str, str]
+    error: TvsError | None
+
+    def as_json(self, seed: int) -> dict[str, Any]:
+        """The document of `fit --json`."""
+        return {**self.summary.as_json(), "seed": seed, "files": self.files}
+
+
+def _fitted(data: AxisCampaign, place: Path, wish: Sampled) -> Kept:
+    """Fit an axis and keep the results in a folder."""
     from tvsbayes.single_axis.axis_fit import fit_axis
     from tvsbayes.single_axis.axis_record import keep_fit, summarise_axis, uninformed
 
-    data = read_axis(folder)
-    place = out or output_place(folder, "results")
     with waiting() as progress:
         found = fit_axis(
             data,
-            tier="importance" if quick else "emcee",
-            sampled=not no_sample,
-            max_minutes=max_minutes,
-            seed=seed,
+            tier="importance" if wish.quick else "emcee",
+            sampled=not wish.no_sample,
+            max_minutes=wish.max_minutes,
+            seed=wish.seed,
             progress=progress,
         )
     summary = summarise_axis(found)
-    files = keep_fit(found, summary, place)
-    document = {**summary.as_json(), "seed": seed, "files": files}
-    text = f"{axis_fit_text(summary)}\nwritten: {', '.join(files.values())}"
-    finish(document, text, as_json, found.error or uninformed(summary))
+    return Kept(summary, keep_fit(found, summary, place), found.error or uninformed(summary))
+
+
+def calibrate(folder: Path, *, issue: Issue, wish: Sampled, pdf: bool, as_json: bool) -> None:
+    """Check, classic, fit and report of an axis in one go."""
+    from tvsbayes.report.axis_text import axis_fit_text, classic_text
+    from tvsbayes.report.command_text import held_text
+    from tvsbayes.results.records import plain
+    from tvsbayes.single_axis.axis_campaign import read_axis
+    from tvsbayes.single_axis.axis_rows import rows_of
+    from tvsbayes.single_axis.classic_line import classic_axis
+
+    data = read_axis(folder)
+    documents: dict[str, Any] = {"check": axis_held(folder)}
+    tell_part(held_text(documents["check"]), as_json)
+    line = classic_axis(rows_of(data))
+    documents["classic"] = {"unit": data.unit, **plain(line)}
+    tell_part(classic_text(line, data.unit), as_json)
+    kept = _fitted(data, output_place(folder, "results"), wish)
+    documents["fit"] = kept.as_json(wish.seed)
+    told = axis_fit_text(kept.summary, written=list(kept.files.values()))
+    if kept.error is not None:
+        finish({**documents, "report": None}, told, as_json, kept.error)
+    tell_part(told, as_json)
+    files = _page(data, issue, output_place(folder, "results") / "report.html", pdf)
+    documents["report"] = {"criteria": [], "files": files}
+    finish(documents, f"next: open {', '.join(files.values())} in a browser", as_json)
 
 
 def compare(folder: Path, *, by: str | None, seed: int, as_json: bool) -> None:
@@ -130,11 +193,17 @@ def compare(folder: Path, *, by: str | None, seed: int, as_json: bool) -> None:
     finish({**document, "files": files}, text, as_json)
 
 
-def report(folder: Path, *, pdf: bool, out: Path | None, as_json: bool) -> None:
+def report(folder: Path, *, issue: Issue, pdf: bool, out: Path | None, as_json: bool) -> None:
     """The page of an axis."""
     from tvsbayes.single_axis.axis_campaign import read_axis
 
     data = read_axis(folder)
+    files = _page(data, issue, out or output_place(folder, "results") / "report.html", pdf)
+    finish({"criteria": [], "files": files}, f"written: {', '.join(files.values())}", as_json)
+
+
+def _page(data: AxisCampaign, issue: Issue, path: Path, pdf: bool) -> dict[str, str]:
+    """Write the page of an axis, and print it where that is wanted: files by kind."""
     from tvsbayes.report.axis_page import axis_html, curve_commands
     from tvsbayes.report.page import find_browser, print_to_pdf
     from tvsbayes.single_axis.axis_record import results_for
@@ -142,7 +211,6 @@ def report(folder: Path, *, pdf: bool, out: Path | None, as_json: bool) -> None:
 
     if pdf:
         find_browser()
-    path = out or output_place(folder, "results") / "report.html"
     files = {"report": str(path)}
     read = rows_of(data).command
     stages = {FITTING: 3.0, "drawing the page": 1.5, PRINTING: 3.0 if pdf else 0.0}
@@ -151,11 +219,11 @@ def report(folder: Path, *, pdf: bool, out: Path | None, as_json: bool) -> None:
         if not results.stored:
             report_line(STORED)
         job.begin("drawing the page")
-        write_atomically(path, axis_html(results))
+        write_atomically(path, axis_html(results, issue))
         if pdf:
             job.begin(PRINTING)
             files["pdf"] = str(print_to_pdf(path))
-    finish({"criteria": [], "files": files}, f"written: {', '.join(files.values())}", as_json)
+    return files
 
 
 def plan(

@@ -178,12 +178,12 @@ def check(
         lines = [f"{key}: {value}" for key, value in repaired.items()]
         finish(repaired, "\n".join([*lines, f"{escaped(str(repair_to), 200)}: written"]), as_json)
         return
+    from tvsbayes.report.command_text import held_text
+
     document = _held(path, plan_file)
     warnings = document["warnings"]
-    lines = [f"{key}: {value}" for key, value in document.items() if key not in ("warnings", "faults")]
-    lines += [f"warning: {warning}" for warning in warnings]
-    lines.append(f"{escaped(str(path), 200)}: readable, {len(warnings)} warning{'s' * (len(warnings) != 1)}")
-    finish(document, "\n".join(lines), as_json)
+    end = f"{escaped(str(path), 200)}: readable, {len(warnings)} warning{'s' * (len(warnings) != 1)}"
+    finish(document, f"{held_text(document)}\n{end}", as_json)
 
 
 def _held(path: Path, plan_file: Path | None) -> dict[str, Any]:
@@ -208,11 +208,14 @@ def _held(path: Path, plan_file: Path | None) -> dict[str, Any]:
     if path.suffix == ".toml" and not path.is_dir():
         rig = read_rig(path)
         return {"kind": "rig", "sheets_mm": rig.sheets_mm, "costs_s": rig.costs_s, "warnings": []}
-    return axis_commands.axis_held(path) if axis_commands.is_axis(path) else _campaign_held(path)
+    return axis_commands.axis_held(path) if axis_commands.is_axis(path) else campaign_held(path)
 
 
-def _campaign_held(path: Path) -> dict[str, Any]:
-    """A campaign and its journal; the journal alone where nothing has moved yet."""
+def campaign_held(path: Path, campaign: Campaign | None = None) -> dict[str, Any]:
+    """What `check` says of a campaign and its journal; of the journal alone where nothing has moved yet.
+
+    `campaign` is what lies at the path, where it was read already.
+    """
     from tvsbayes.estimators.plausibility import check_campaign
     from tvsbayes.instrument.campaign import read_campaign
 
@@ -223,7 +226,7 @@ def _campaign_held(path: Path) -> dict[str, Any]:
         journal = check_journal(path)
     if journal is not None and not journal["moves"]:
         return {"kind": "journal", **journal}
-    document: dict[str, Any] = check_campaign(read_campaign(path)).as_json()
+    document: dict[str, Any] = check_campaign(campaign or read_campaign(path)).as_json()
     if journal is not None:
         document["warnings"] = [*journal.pop("warnings"), *document["warnings"]]
         document["journal"] = journal

@@ -1,25 +1,23 @@
-"""Commands that estimate and tell: classic, fit, report, compare.
+"""Commands that estimate and tell: classic, fit, compare.
 
 Options in, library called, table or JSON out; heavy imports stand inside the commands.
 """
 
 from __future__ import annotations
 
-import datetime
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from tvsbayes.cli import axis_commands
-from tvsbayes.cli.app import TARGET_MISSED, CampaignFolder, Ended, Json, Seed, finish, keep, refuse_options, report_line
+from tvsbayes.cli.app import CampaignFolder, Json, Seed, command_line, finish, keep, refuse_options, report_line
 from tvsbayes.cli.progress_bar import waiting
 from tvsbayes.errors import InputError, NothingToEstimate, escaped
-from tvsbayes.files.disk import output_place, write_atomically
-from tvsbayes.pipeline import FITTING, SAMPLING, calibrate, compile_for, fit_for, record_for
+from tvsbayes.files.disk import output_place
+from tvsbayes.pipeline import FITTING, SAMPLING, calibrate, compile_for, fit_for
 from tvsbayes.progress import Job, Progress, Show
 
 if TYPE_CHECKING:
@@ -27,14 +25,8 @@ if TYPE_CHECKING:
     from tvsbayes.instrument.campaign import Campaign
     from tvsbayes.results.comparison_record import ComparisonRecord
     from tvsbayes.results.estimates import FitSummary
-    from tvsbayes.results.fit_record import FitRecord
-
-
-DCC_MESSAGES = 20
-"""Of a schema validator, shown at most."""
 MAX_MINUTES = 10.0
-RANGE_MM = 1e3
-HOLDING_OUT, PRINTING = "hold-out", "printing to PDF"
+HOLDING_OUT = "hold-out"
 
 
 def _warn_of(campaign: Campaign) -> None:
@@ -74,11 +66,16 @@ def fit(
     harmonics: Annotated[bool, typer.Option("--harmonics", help="Free transmission errors of known period.")] = False,
     no_backlash: Annotated[bool, typer.Option("--no-backlash", help="No play: backlash fixed at 0.")] = False,
     perfect_gears: Annotated[bool, typer.Option("--perfect-gears", help="No errors by position, no drift.")] = False,
-    out: Annotated[Path | None, typer.Option("--out", help="Folder for results (default CAMPAIGN/results).")] = None,
+    details: Annotated[
+        bool, typer.Option("--details", help="Also print what else the fit says: gears, priors, weak directions.")
+    ] = False,
+    out: Annotated[
+        Path | None, typer.Option("-o", "--out", help="Folder for results (default CAMPAIGN/results).")
+    ] = None,
     seed: Seed = 0,
     as_json: Json = False,
 ) -> None:
-    """Fit the joint model to every spot and sample its posterior. Ratios, backlash, mirror offset, extrinsics."""
+    """Fit the joint model to every spot and sample its posterior. The table of results ends it."""
     if resume and no_sample:
         raise InputError("usage", "--resume continues a chain and --no-sample makes none", remedy="give one of them")
     if no_sample:
@@ -94,7 +91,7 @@ def fit(
         refuse_options(axis_commands.NOT_OF_AN_AXIS, "leave it out, or state priors in [axis]", **choice)
         minutes = MAX_MINUTES if max_minutes is None else max_minutes
         ways = {"quick": quick, "no_sample": no_sample, "max_minutes": minutes}
-        axis_commands.fit(campaign, **ways, out=out, seed=seed, as_json=as_json)  # type: ignore[arg-type]
+        axis_commands.fit(campaign, **ways, details=details, out=out, seed=seed, as_json=as_json)  # type: ignore[arg-type]
         return
     from tvsbayes.instrument.campaign import read_campaign
 
@@ -126,7 +123,10 @@ def fit(
         )
     summary, files = results.record.summary, results.files
     document = {**summary.as_json(), "seed": seed, "files": files}
-    finish(document, f"{fit_text(summary)}\nwritten: {', '.join(files.values())}", as_json, results.error)
+    text = fit_text(summary, details, list(files.values()))
+    if results.error is None and out is None:
+        text += f"\nnext: {command_line('report', campaign)}"
+    finish(document, text, as_json, results.error)
 
 
 def _show_first(summary: FitSummary) -> None:
@@ -135,104 +135,6 @@ def _show_first(summary: FitSummary) -> None:
 
     for line in first_text(summary).splitlines():
         report_line(line)
-
-
-LimitRatio = Annotated[
-    float | None, typer.Option("--limit-deg-per-step", min=0, help="Largest error allowed of any ratio: for a verdict.")
-]
-Range = Annotated[float, typer.Option("--range-mm", min=1, help="Range at which millimetres are stated.")]
-Schema = Annotated[
-    Path | None, typer.Option("--dcc-schema", help="PTB's dcc.xsd on this machine: validate the XML against it.")
-]
-
-
-def report(
-    campaign: CampaignFolder,
-    limit_deg_per_step: LimitRatio = None,
-    limit_mm: Annotated[float | None, typer.Option("--limit-mm", min=0, help="Largest 3D error allowed.")] = None,
-    range_mm: Annotated[
-        float, typer.Option("--range-mm", min=1, help="Range at which millimetres are stated.")
-    ] = RANGE_MM,
-    pdf: Annotated[bool, typer.Option("--pdf", help="Also print to PDF with an installed Chromium.")] = False,
-    dcc: Annotated[bool, typer.Option("--dcc", help="Also write DCC-schema XML (unsigned, not accredited).")] = False,
-    laboratory: Annotated[str | None, typer.Option("--laboratory", help="Who measured, for --dcc.")] = None,
-    customer: Annotated[str | None, typer.Option("--customer", help="For whom, for --dcc.")] = None,
-    country: Annotated[str | None, typer.Option("--country", help="ISO 3166-1 code of the place, for --dcc.")] = None,
-    dcc_schema: Schema = None,
-    out: Annotated[Path | None, typer.Option("--out", help="File (default CAMPAIGN/results/report.html).")] = None,
-    as_json: Json = False,
-) -> None:
-    """The calibration report as one HTML page. Verdict, results, residuals, error maps, budgets, provenance."""
-    from tvsbayes.calibration.calibration_file import load_calibration
-    from tvsbayes.instrument.campaign import read_campaign
-
-    parties = {"laboratory": laboratory, "customer": customer, "country": country}
-    if not (dcc or dcc_schema):
-        refuse_options("for a certificate", "add --dcc", **parties)
-    if axis_commands.is_axis(campaign):
-        unfit = {"limit_deg_per_step": limit_deg_per_step, "limit_mm": limit_mm, "dcc": dcc, "dcc_schema": dcc_schema}
-        unfit["range_mm"] = range_mm if range_mm != RANGE_MM else None
-        refuse_options(axis_commands.NOT_OF_AN_AXIS, "leave it out", **unfit)
-        axis_commands.report(campaign, pdf=pdf, out=out, as_json=as_json)
-        return
-    data = read_campaign(campaign)
-    results = output_place(campaign, "results")
-    from tvsbayes.report.fit_text import validation_lines
-    from tvsbayes.report.page import find_browser, print_to_pdf, report_html
-
-    if pdf:
-        find_browser()
-    from tvsbayes.metrology.schema_check import check_dcc
-    from tvsbayes.report.evidence import MET, gather
-
-    limits = {"limit_deg_per_step": limit_deg_per_step, "limit_mm": limit_mm}
-    path = out or results / "report.html"
-    files = {"report": str(path)}
-    stages = {FITTING: 3.0, "gathering evidence": 1.5, "drawing the page": 1.5, PRINTING: 3.0 if pdf else 0.0}
-    with waiting() as progress, Job(stages, progress) as job:
-        record = record_for(data, campaign, report_line, job.part(FITTING))
-        job.begin("gathering evidence")
-        evidence = gather(data, record, load_calibration(campaign), range_mm=range_mm, **limits)
-        job.begin("drawing the page")
-        write_atomically(path, report_html(evidence))
-        if pdf:
-            job.begin(PRINTING)
-            files["pdf"] = str(print_to_pdf(path))
-    result: dict[str, Any] = {"criteria": [asdict(c) for c in evidence.criteria], "files": files}
-    lines = [
-        f"{c.quantity} within {c.limit:g} {c.unit}: {c.verdict} (P = {c.probability:.3f})" for c in evidence.criteria
-    ]
-    missed = any(c.verdict != MET for c in evidence.criteria)
-    if dcc or dcc_schema:
-        content = _certificate(data, record, path.read_bytes(), parties)
-        write_atomically(results / "dcc.xml", content)
-        files["dcc"] = str(results / "dcc.xml")
-        if dcc_schema:
-            checked = check_dcc(content, dcc_schema)
-            verdict = {True: "valid", False: "NOT VALID", None: "could not be checked"}[checked.valid]
-            lines += [f"DCC by {checked.tool} against {dcc_schema}: {verdict}", *checked.messages[:DCC_MESSAGES]]
-            result["dcc_schema"] = asdict(checked)
-            missed |= not checked.valid
-    validation = record.summary.validation
-    if validation is not None and not validation.passed:
-        lines.insert(0, validation_lines(validation)[0])
-    finish(result, "\n".join([*lines, f"written: {', '.join(files.values())}"]), as_json)
-    if missed:
-        raise Ended(TARGET_MISSED)
-
-
-def _certificate(campaign: Campaign, record: FitRecord, report: bytes, parties: dict[str, str | None]) -> bytes:
-    """DCC-schema XML, issued today (UTC)."""
-    from tvsbayes.metrology.dcc import Parties, dcc_bytes
-
-    today = datetime.datetime.now(datetime.UTC).date()
-    stated = {name: text for name, text in parties.items() if text is not None}
-    return dcc_bytes(campaign, record, issued=today, parties=Parties(**stated), report=report)
-
-
-By = Annotated[
-    str | None, typer.Option("--by", help="Left out together: steps (default), regions; positions of an axis.")
-]
 
 
 def compare(

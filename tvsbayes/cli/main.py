@@ -25,18 +25,21 @@ from tvsbayes.cli.app import (
 from tvsbayes.cli.begin_commands import new
 from tvsbayes.cli.bench_commands import acquire, doctor, stereo
 from tvsbayes.cli.campaign_commands import check, demo, detect, simulate
-from tvsbayes.cli.estimate_commands import classic, compare, fit, report
+from tvsbayes.cli.estimate_commands import classic, compare, fit
+from tvsbayes.cli.examples import EXAMPLES, epilog
 from tvsbayes.cli.import_command import import_
+from tvsbayes.cli.report_commands import calibrate, report
 from tvsbayes.cli.use_commands import locate, plan, steps_for, study
 from tvsbayes.errors import InputError, TvsError
 
 COMMANDS = (
     *(demo, new, import_, simulate, detect, stereo, check, acquire, doctor),
-    *(classic, fit, report, compare, locate, steps_for, plan, study),
+    *(classic, fit, calibrate, report, compare, locate, steps_for, plan, study),
 )
 """In the order of `--help`."""
 for command in COMMANDS:
-    app.command(command.__name__.rstrip("_").replace("_", "-"))(command)
+    name = command.__name__.rstrip("_").replace("_", "-")
+    app.command(name, epilog=epilog(EXAMPLES[name]))(command)
 
 
 def run(arguments: list[str]) -> int:

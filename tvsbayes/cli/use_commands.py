@@ -19,6 +19,7 @@ from tvsbayes.cli.app import (
     CampaignFolder,
     Ended,
     Json,
+    OldOut,
     Seed,
     finish,
     finite,
@@ -193,21 +194,23 @@ def plan(
     given: Annotated[Path | None, typer.Option("--given", help="Campaign measured already: what next?")] = None,
     target: TargetText = None,
     minutes: Annotated[float | None, typer.Option("--minutes", min=0.1, help="Longest plan.")] = None,
-    output: Annotated[Path | None, typer.Option("-o", "--output", help="Write the plan here (plan.csv).")] = None,
+    out: Annotated[Path | None, typer.Option("-o", "--out", help="Write the plan here (plan.csv).")] = None,
+    output: OldOut = None,
     criterion: Annotated[str, typer.Option("--criterion", help="c (the target), D or A (all headlines).")] = "c",
     aperture: Annotated[bool, typer.Option("--aperture/--no-aperture", help="Looks also read the aperture.")] = False,
     draws: Annotated[int, typer.Option("--draws", min=20, max=10_000, help="Instruments for the assurance.")] = 200,
     seed: Seed = 0,
     as_json: Json = False,
 ) -> None:
-    """How many experiments, which ones, and when to stop. With --given: what next."""
+    """How many looks, which ones, and when to stop. With --given: what next."""
+    out = out or output
     if axis_commands.is_axis(given or rig):
         refuse_options(axis_commands.NOT_OF_AN_AXIS, "leave it out", aperture=aperture)
         if given is None or rig is not None:
             raise InputError(
                 "usage", "an axis is planned from its folder alone", remedy="give --given FOLDER without RIG"
             )
-        axis_commands.plan(given, target=target, minutes=minutes, output=output, seed=seed, as_json=as_json)
+        axis_commands.plan(given, target=target, minutes=minutes, output=out, seed=seed, as_json=as_json)
         return
     if rig is None:
         raise InputError("usage", "Missing argument 'RIG'.", remedy="see tvsbayes --help")
@@ -241,12 +244,12 @@ def plan(
             progress=job.part(PLANNING),
         )
     text, document = plan_text(result), result.as_json()
-    if output is not None and result.steps:
-        write_plan(result.steps, output)
-        document["plan"] = str(output)
-        text += f"\nwritten: {escaped(str(output), 200)}"
-    elif output is not None:
-        text += f"\nnothing written to {escaped(str(output), 200)}: there is nothing more to measure"
+    if out is not None and result.steps:
+        write_plan(result.steps, out)
+        document["plan"] = str(out)
+        text += f"\nwritten: {escaped(str(out), 200)}"
+    elif out is not None:
+        text += f"\nnothing written to {escaped(str(out), 200)}: there is nothing more to measure"
     if data is not None and given is not None:
         # Where the report looks for what to measure next.
         keep(plan_document(document, input_hashes(data)), output_place(given, "results") / "plan.json")

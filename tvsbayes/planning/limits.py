@@ -189,7 +189,7 @@ def stop_now(now: float, target: Target, limit: Limit, batches: Sequence[Batch],
     best = batches[0].gain_per_minute if batches else 0.0
     worth = STOP_SHARE_PER_MINUTE * now
     rule = (
-        f"stop when {target.text} holds for a fit of all data, or when the best next experiment lowers it by less than "
+        f"stop when {target.text} holds for a fit of all data, or when the best next four looks lower it by less than "
         f"{100 * STOP_SHARE_PER_MINUTE:g} % a minute"
     )
     shown = f"{now:.3g} {target.unit}"
@@ -199,5 +199,5 @@ def stop_now(now: float, target: Target, limit: Limit, batches: Sequence[Batch],
         reason = f"no number of looks meets the target: the floor is {limit.floor:.3g} {target.unit}"
         return Advice(after_data, reason if after_data else f"{reason}; measure if that will do", rule)
     if best < worth:
-        return Advice(True, f"the best next experiment lowers {shown} by only {best:.2g} {target.unit} a minute", rule)
-    return Advice(False, f"{shown} now; the best next experiment lowers it by {best:.2g} {target.unit} a minute", rule)
+        return Advice(True, f"the best next four looks lower {shown} by only {best:.2g} {target.unit} a minute", rule)
+    return Advice(False, f"{shown} now; the best next four looks lower it by {best:.2g} {target.unit} a minute", rule)

@@ -16,7 +16,7 @@ from tvsbayes.report.axis_text import (
 )
 from tvsbayes.report.figures import BLUE, GREY, RED, SKY, STYLE, WIDTH_IN
 from tvsbayes.report.page import page_html
-from tvsbayes.report.tables import FigureView, Number, Page, Section, concise, figure_view, two_digits
+from tvsbayes.report.tables import FigureView, Issue, Number, Page, Section, concise, figure_view, two_digits
 from tvsbayes.results.fit_record import provenance
 from tvsbayes.results.records import plain
 from tvsbayes.single_axis.axis_campaign import axis_hashes
@@ -73,7 +73,7 @@ def _figure_of(fit: AxisFit) -> FigureView:
     return figure_view(error_figure(fit), alt, caption)
 
 
-def axis_page(results: AxisResults) -> Page:
+def axis_page(results: AxisResults, issue: Issue) -> Page:
     """The page; `results.fit` holds `curve_commands` of its range."""
     summary, fit = results.summary, results.fit
     unit, (low, high) = summary.unit, summary.range_command
@@ -119,9 +119,10 @@ def axis_page(results: AxisResults) -> Page:
             Section("Method", text=method),
         ],
         title="Calibration of an axis",
+        issue=issue,
     )
 
 
-def axis_html(results: AxisResults) -> bytes:
-    """The page, UTF-8."""
-    return page_html(axis_page(results))
+def axis_html(results: AxisResults, issue: Issue | None = None) -> bytes:
+    """The page, UTF-8; issued today where nothing else is said."""
+    return page_html(axis_page(results, issue or Issue.today()))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 from tvsbayes.errors import escaped
 from tvsbayes.report.tables import TableView, concise, interval_text, two_digits
@@ -13,6 +13,7 @@ from tvsbayes.single_axis.classic_line import ClassicAxis
 from tvsbayes.single_axis.held_out_positions import AxisHoldOut
 from tvsbayes.single_axis.next_stops import AxisPlan
 
+DEVIATIONS_SHOWN = 40
 WHAT = {
     **{name: key.what for name, key in AXIS_KEYS.items()},
     "stop_sd.forward": "scatter of stops reached forward",
@@ -43,10 +44,10 @@ def parameter_table(summary: AxisSummary) -> TableView:
     rows = []
     for name, of in summary.parameters.items():
         if name != "per_command":
-            said = "" if of.contraction is None else f"{of.contraction:.2f}"
+            said = "" if of.contraction is None else f"{100 * of.contraction:.0f} %"
             rows.append([WHAT.get(name, name), *_row(name, of)[1:], said])
-    caption = f"parameters, {escaped(summary.unit)}; contraction 1: the readings tell it, 0: the prior does"
-    return TableView(caption, ["", "value(u)", "95 % interval", "contraction"], rows)
+    caption = f"parameters, {escaped(summary.unit)}; 100 %: the readings tell it, 0 %: the prior does"
+    return TableView(caption, ["", "value(u)", "95 % interval", "told by data"], rows)
 
 
 def deviation_table(deviations: Sequence[PositionDeviation], unit: str) -> TableView:
@@ -84,21 +85,29 @@ def _lines(title: str, texts: Sequence[str]) -> list[str]:
     return [f"{title}: {text}" for text in texts]
 
 
-def axis_fit_text(summary: AxisSummary) -> str:
-    """A fit in words."""
+def axis_fit_text(summary: AxisSummary, details: bool = False, written: Sequence[str] = ()) -> str:
+    """What the reader must know, then the tables, then one line of verdict.
+
+    Args:
+        summary: the fit.
+        details: also the error by position, ISO 230-2 and what the readings leave to the priors.
+        written: files that hold all of it.
+    """
     how = {None: "Laplace approximation", "importance": "weighted draws", "emcee": "chain of emcee"}[summary.tier]
-    parts = [
-        f"{summary.readings} readings of {summary.moves} moves at {summary.positions} positions; {how}",
-        ratio_table(summary).text(),
-        parameter_table(summary).text(),
-        deviation_table(summary.deviations[:40], summary.unit).text(),
-    ]
     iso230 = iso230_table(summary.classic, summary.unit)
-    if iso230 is not None:
-        parts.append(iso230.text())
-    notes = [*_lines("NOT CONVERGED", summary.problems), *_lines("weak", summary.weak_directions)]
-    notes += _lines("warning", summary.warnings)
-    return "\n\n".join(parts + ["\n".join(notes)] * bool(notes))
+    lines = []
+    if details:
+        lines += [deviation_table(summary.deviations[:DEVIATIONS_SHOWN], summary.unit).text()]
+        lines += [] if iso230 is None else [iso230.text()]
+        lines += _lines("weak (the readings leave it to the priors)", summary.weak_directions)
+    elif summary.weak_directions:
+        lines.append(f"--details and the report say more: {len(summary.weak_directions)} weak directions")
+    lines += [*_lines("NOT CONVERGED", summary.problems), *_lines("warning", summary.warnings)]
+    lines += [f"written: {', '.join(written)}"] if written else []
+    counted = f"{summary.readings} readings of {summary.moves} moves at {summary.positions} positions; {how}"
+    parts = [counted, parameter_table(summary).text(), ratio_table(summary).text()]
+    verdict = "usable" if summary.converged else "NOT CONVERGED, use none of these numbers"
+    return "\n".join([*lines, *[""] * bool(lines), *parts, f"verdict: {verdict}"])
 
 
 def hold_out_table(found: AxisHoldOut, unit: str) -> TableView:
@@ -135,9 +144,3 @@ def axis_plan_text(plan: AxisPlan, unit: str) -> str:
     if not plan.next:
         return "there is no time for a single stop"
     return f"{next_table(plan, unit).text()}\n{plan.minutes:.0f} minutes"
-
-
-def axis_held_text(document: Mapping[str, object], warnings: Sequence[str]) -> str:
-    """What `check` prints."""
-    lines = [f"{key}: {value}" for key, value in document.items() if key not in ("warnings", "weak_directions")]
-    return "\n".join([*lines, *_lines("warning", warnings)])

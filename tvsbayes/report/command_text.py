@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -20,36 +20,97 @@ if TYPE_CHECKING:
     from tvsbayes.coordinates.location import Locations
     from tvsbayes.instrument.stereo_pair import Stereo
     from tvsbayes.metrology.look_budget import Budget
-    from tvsbayes.planning.planner import PlanResult
+    from tvsbayes.planning.planner import CurvePoint, PlanResult
     from tvsbayes.studies.study import StudyResult
 
 
+LOOKS = 4
+"""Of an experiment of a plan."""
 EXTRAPOLATED = (
     "EXTRAPOLATED: no look of the campaign reached these counters; errors of the gears are foretold there by their "
     "size alone"
 )
 
 
+HELD_WORDS = {
+    "ok_spots": "usable spots",
+    "refused": "refused spots, by reason",
+    "aperture_readings": "spots with aperture reading",
+    "experiments": "four-point experiments",
+    "sheets_mm": "sheets, depth in mm",
+    "costs_s": "costs, s",
+    "look": "looks",
+    "move": "moves",
+    "home": "homings",
+    "place": "placements of the sheet",
+    "seen": "looks in view of both cameras",
+    "range_command": "commands, from and to",
+}
+"""What `check` calls its keys."""
+PLAN_UNIT = {"contrast": "deg/step", "backlash": "deg", "mirror_offset": "mm"}
+"""Units of what a plan will tell, by how their names begin; the ratios' is deg/step."""
+
+
+def held_text(document: Mapping[str, Any]) -> str:
+    """What `check` found in a campaign, rig, plan, axis or journal: a table, and warnings."""
+    left_out = ("kind", "warnings", "faults", "expected", "contraction", "journal")
+    rows = [[HELD_WORDS.get(key, key), _held_value(value)] for key, value in document.items() if key not in left_out]
+    parts = [TableView(document["kind"], [], rows).text()]
+    if "expected" in document:
+        parts.append(_foreseen_table(document["expected"], document["contraction"]).text())
+    if (journal := document.get("journal")) is not None:
+        rows = [[key, _held_value(value)] for key, value in journal.items() if key != "kind"]
+        parts.append(TableView("journal of the run", [], rows).text())
+    return "\n".join([*parts, *(f"warning: {warning}" for warning in document["warnings"])])
+
+
+def _held_value(value: Any) -> str:
+    """One entry of `check`: numbers as they are, tables and lists in words."""
+    if isinstance(value, Mapping):
+        return ", ".join(f"{escaped(str(key), 80)} {_held_value(each)}" for key, each in value.items()) or "none"
+    if isinstance(value, list | tuple):
+        return ", ".join(map(_held_value, value)) or "none"
+    if isinstance(value, float):
+        return f"{value:.4g}"
+    return "not known" if value is None else escaped(str(value), 400)
+
+
+def _foreseen_table(expected: Mapping[str, float], contraction: Mapping[str, float | None]) -> TableView:
+    """What a plan will tell: u of every result, and how much of the prior variance it takes away."""
+    rows = []
+    for name, u in expected.items():
+        unit = next((unit for begin, unit in PLAN_UNIT.items() if name.startswith(begin)), "deg/step")
+        told = contraction.get(name)
+        rows.append([name, two_digits(u), unit, "fixed" if told is None else f"{100 * told:.0f} %"])
+    columns = ["result", "u expected", "unit", "told by the data"]
+    return TableView("what the plan will tell (100 %: the priors no longer matter)", columns, rows)
+
+
+LAW = "values are those of the draws; law: what the law of propagation (GUM) would give for u"
+"""Below a table of points."""
+
+
 def plan_text(result: PlanResult) -> str:
     """A result for people."""
     unit = result.target.unit
     lines = [f"target: {result.target.text}; now {result.now:.3g} {unit}", ""]
-    lines.append("experiments  minutes     classic       joint  assurance")
-    for p in result.curve:
+    lines.append("looks  minutes     classic       joint  chance of success")
+    for p in _curve_shown(result):
         classic_value = "-" if p.classic is None else f"{p.classic:.3g}"
         lines.append(
-            f"{p.experiments:11d}  {p.minutes:7.1f}  {classic_value:>10}  {p.joint:>10.3g}  "
-            f"{100 * p.assurance:5.0f} +- {100 * p.assurance_se:.1f} %"
+            f"{LOOKS * p.experiments:5d}  {p.minutes:7.1f}  {classic_value:>10}  {p.joint:>10.3g}  "
+            f"{100 * p.assurance:6.0f} +- {100 * p.assurance_se:.1f} %"
         )
-    lines.append(f"(four looks each; medians over {result.draws} drawn instruments, {unit})")
-    none = f"not reached with up to {result.curve[-1].experiments} experiments"
+    lines.append(f"u in {unit}, medians over {result.draws} drawn instruments;")
+    lines.append("chance of success (assurance): that the fit of such a campaign reports the target as met")
+    none = f"not reached with up to {LOOKS * result.curve[-1].experiments} looks"
     for level, n in zip(ASSURED, (result.n80, result.n95), strict=True):
-        lines.append(f"assurance {100 * level:.0f} %: {none if n is None else f'n = {n}'}")
+        lines.append(f"for a chance of {100 * level:.0f} %: {none if n is None else f'{LOOKS * n} looks'}")
     if result.assurance is None or result.assurance_se is None:
         lines.append("the target is met already: nothing is left to do")
     else:
         lines.append(
-            f"the plan: n = {result.experiments}, {result.looks} looks in {result.minutes:.1f} minutes; assurance "
+            f"the plan: {result.looks} looks in {result.minutes:.1f} minutes; chance of success "
             f"{100 * result.assurance:.0f} +- {100 * result.assurance_se:.1f} %"
         )
     lines += ["", f"{'plan':10}  spots  in view  minutes  expected {unit}"]
@@ -65,16 +126,22 @@ def plan_text(result: PlanResult) -> str:
         low, high = c.experiments_interval95
         source = "measured" if c.from_data else "predicted"
         lines.append(
-            f"classic, {c.direction}: n = (t s / E)^2 = {c.experiments} per direction ({low} to {high}) for s = "
-            f"{c.sd:.2g} deg/step ({source}), E = {c.half_width:.2g}; its systematic error {c.systematic:+.2g} "
+            f"classic, {c.direction}: n = (t s / E)^2 = {c.experiments} four-point experiments ({low} to {high}) for "
+            f"s = {c.sd:.2g} deg/step ({source}), E = {c.half_width:.2g}; its systematic error {c.systematic:+.2g} "
             f"({c.systematic_interval95[0]:+.2g} to {c.systematic_interval95[1]:+.2g}) stays whatever n"
         )
+    lines += [f"note: {note}" for note in result.notes]
     if result.next:
-        lines.append("next:")
+        lines.append("next four looks, best first:")
         lines += [f"  {b.gain_per_minute:.2g} {unit} a minute ({b.minutes:.1f} min): {b.text}" for b in result.next[:3]]
     lines.append(f"{'STOP' if result.stop.now else 'go on'}: {result.stop.reason}; {result.stop.rule}")
-    lines += [f"note: {note}" for note in result.notes]
     return "\n".join(lines)
+
+
+def _curve_shown(result: PlanResult) -> list[CurvePoint]:
+    """Points of the curve up to the first with the higher assurance, one beyond it, and the last."""
+    enough = next((k for k, p in enumerate(result.curve) if p.assurance >= ASSURED[1]), len(result.curve))
+    return [p for k, p in enumerate(result.curve) if k <= enough + 1 or k == len(result.curve) - 1]
 
 
 def stereo_text(stereo: Stereo) -> str:
@@ -153,18 +220,20 @@ def locations_text(found: Locations) -> str:
     rows = []
     for index, error in enumerate(found.refused):
         if error is not None:
-            rows.append([str(index), f"refused: {error.code}", "", "", "", ""])
+            rows.append([str(index), f"refused: {error.code}", "", "", "", "", ""])
             continue
         sd = np.sqrt(np.diag(found.covariance_mm2[index]))
         cells = [concise(float(x), float(u)) for x, u in zip(found.xyz_mm[index], sd, strict=True)]
         half = " ".join(map(two_digits, found.u95_mm[index]))
         held = int(found.digits_held[index].min())
-        verdict = f"validated at {held} digit{'s' * (held > 1)}" if held else "not validated"
-        verdict += ", EXTRAPOLATED" * bool(found.extrapolated[index])
-        rows.append([str(index), *cells, half, verdict])
-    columns = ["point", "x(u) mm", "y(u) mm", "z(u) mm", "U95 mm", "linear propagation"]
-    table = TableView(f"frame T, {found.draws} draws ({found.estimator})", columns, rows).text()
-    return f"{table}\n{EXTRAPOLATED}" if found.extrapolated.any() else table
+        verdict = f"same to {held} digit{'s' * (held > 1)}" if held else "differs"
+        rows.append([str(index), *cells, half, verdict, "EXTRAPOLATED" if found.extrapolated[index] else ""])
+    far = bool(found.extrapolated.any())
+    columns = ["point", "x(u) mm", "y(u) mm", "z(u) mm", "U95 mm", "law", ""][: 7 if far else 6]
+    table = TableView(
+        f"frame T, {found.draws} draws ({found.estimator})", columns, [row[: len(columns)] for row in rows]
+    )
+    return "\n".join([table.text(), LAW, *([EXTRAPOLATED] if far else [])])
 
 
 def budget_text(budget: Budget) -> str:
@@ -251,7 +320,7 @@ def study_text(result: StudyResult) -> str:
     lines = [
         f"{result.campaigns} simulated campaigns, {n} fits converged ({MADE_BY[result.estimator]}); "
         f"{result.seconds:.1f} s each",
-        "headline        median sd  RMS z  predicted  " + "  ".join(f"{100 * x:3.0f} %" for x in LEVELS) + "  power",
+        "quantity        median sd  RMS z  predicted  " + "  ".join(f"{100 * x:3.0f} %" for x in LEVELS) + "  power",
         f"bounds at {BOUND:g}        {low:.2f}-{high:.2f}".ljust(48)
         + "  ".join("{:.0f}-{:.0f}".format(*(100 * b for b in binomial_bounds(n, x))) for x in LEVELS),
     ]

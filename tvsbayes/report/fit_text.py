@@ -8,12 +8,22 @@ from itertools import groupby
 from tvsbayes.errors import NotConverged, listed
 from tvsbayes.estimators.four_point import ClassicResult
 from tvsbayes.instrument.axes import DIRECTIONS
-from tvsbayes.report.result_tables import KEY_PARAMETERS, classic_table, gears_table, headline_table, range_text
+from tvsbayes.report.advice import failed, noise_line, remedy, verdict_line
+from tvsbayes.report.result_tables import (
+    KEY_PARAMETERS,
+    MORE_PARAMETERS,
+    classic_table,
+    details_table,
+    gears_table,
+    headline_table,
+    range_text,
+)
 from tvsbayes.report.tables import TableView, concise
 from tvsbayes.results.convergence import Importance, Sampling
 from tvsbayes.results.estimates import FitSummary, LostMotion, Validation
 
 SPOTS_LISTED = 20
+PARAMETERS = (*KEY_PARAMETERS, *MORE_PARAMETERS)
 
 
 def classic_text(result: ClassicResult) -> str:
@@ -22,28 +32,72 @@ def classic_text(result: ClassicResult) -> str:
     return "\n".join([classic_table(result).text(), *skipped])
 
 
-def fit_text(summary: FitSummary) -> str:
-    """The joint estimator's table and everything the reader must know about it."""
+def fit_text(summary: FitSummary, details: bool = False, written: Sequence[str] = ()) -> str:
+    """What the reader must know, then the table, then one line of verdict: the end is what a terminal shows.
+
+    Args:
+        summary: the fit.
+        details: also what else it says: the positioner, the gears, priors that matter, weak directions, single stops.
+        written: files that hold all of it.
+    """
     if not summary.converged and summary.sampling is None:
         return astray_text(summary)
-    lines = [headline_table(summary).text()]
+    lines = detail_lines(summary) if details else []
+    validation = failed(summary)
+    if validation is not None:
+        # Above and below the table: who reads either end of the text must meet it.
+        told = validation_lines(validation)
+        lines = [told[0], *lines, *told[1:], f"what helps: {remedy(validation)}"]
+    if summary.sampling is not None and not summary.sampling.converged:
+        lines.append(sampling_line(summary.sampling))
+    if summary.few_stops:
+        lines.append(few_stops_line(summary.few_stops, summary.estimator))
+    lines += homing_lines(summary)
+    lines += [f"prior conflict: {text}" for text in summary.prior_conflicts]
+    if summary.excluded_spots:
+        lines.append(f"excluded spots: {', '.join(map(str, summary.excluded_spots))}")
+    if summary.suspect_spots:
+        lines.append(f"{suspect_line(summary.suspect_spots)}; look at them, or fit with --robust")
+    if (noise := noise_line(summary)) is not None:
+        lines.append(noise)
+    if written:
+        lines.append(f"written: {', '.join(written)}")
+    if not details and (more := more_line(summary)):
+        lines.append(more)
+    gap = [""] if lines else []
+    return "\n".join([*lines, *gap, headline_table(summary).text(), verdict_line(summary)])
+
+
+def more_line(summary: FitSummary) -> str:
+    """What --details and the report say besides; "" where that is nothing."""
+    counted = {
+        "weak direction": len(summary.weak_directions),
+        "stop on which a result hangs": len(summary.leverage),
+        "prior that matters": len({entry.parameter for entry in summary.prior_sensitivity}),
+    }
+    plural = {
+        "stop on which a result hangs": "stops on which a result hangs",
+        "prior that matters": "priors that matter",
+    }
+    named = [f"{n} {name if n == 1 else plural.get(name, name + 's')}" for name, n in counted.items() if n]
+    return f"--details and the report say more: {', '.join(named)}" if named else ""
+
+
+def detail_lines(summary: FitSummary) -> list[str]:
+    """What else a fit says: the positioner, the gears, what was tested, priors that matter, what stays unknown."""
+    lines = [details_table(summary).text()]
     gears = gears_table(summary)
     if gears is not None:
         lines += [gears.text(), *gear_lines(summary)]
     lines.append(f"chi2 {summary.chi2:.1f} for {summary.dof:.1f} degrees of freedom")
-    if summary.validation is not None:
-        told = validation_lines(summary.validation)
-        lines += told
-        if not summary.validation.passed:
-            # Above and below the table: who reads either end of the text must meet it.
-            lines.insert(0, told[0])
+    if summary.validation is not None and summary.validation.passed:
+        lines += validation_lines(summary.validation)
     predicted = [f"{d} {concise(e.value, e.sd)}" for d, e in summary.classic_predicted.items() if e is not None]
     if predicted:
         lines.append(f"the classic estimator should report, deg/step: {', '.join(predicted)}")
-    if summary.sampling is not None:
-        lines.append(sampling_line(summary.sampling))
+    if summary.sampling is not None and summary.sampling.converged:
         agreed = agreement_line(summary.sampling)
-        lines += [agreed] if agreed is not None else []
+        lines += [sampling_line(summary.sampling), *([] if agreed is None else [agreed])]
     if summary.curves is not None:
         lines += lost_motion_lines(summary.curves.lost_motion)
     for entry in summary.prior_sensitivity:
@@ -52,17 +106,9 @@ def fit_text(summary: FitSummary) -> str:
             f"prior: with {word} the u of {entry.parameter}, {entry.quantity} moves {entry.shift_sd:+.2f} sd and its "
             f"sd changes by a factor {entry.sd_ratio:.2f}"
         )
-    if summary.few_stops:
-        lines.append(few_stops_line(summary.few_stops, summary.estimator))
-    lines += homing_lines(summary)
-    lines += [f"weak: {weak.text}" for weak in summary.weak_directions]
-    lines += [f"leverage: {entry.text}" for entry in summary.leverage]
-    lines += [f"prior conflict: {text}" for text in summary.prior_conflicts]
-    if summary.excluded_spots:
-        lines.append(f"excluded spots: {', '.join(map(str, summary.excluded_spots))}")
-    if summary.suspect_spots:
-        lines.append(f"{suspect_line(summary.suspect_spots)}; look at them, or fit with --robust")
-    return "\n".join(lines)
+    lines += [f"weak (the data leave it to the priors): {weak.text}" for weak in summary.weak_directions]
+    lines += [f"hangs on one stop: {entry.text}" for entry in summary.leverage]
+    return lines
 
 
 def homing_lines(summary: FitSummary) -> list[str]:
@@ -84,7 +130,7 @@ def gear_lines(summary: FitSummary) -> list[str]:
 
 def astray_text(summary: FitSummary) -> str:
     """Where a fit that did not converge stopped: values without uncertainty, for whoever looks for the reason."""
-    rows = [[label, f"{summary.parameters[name].value:.4g}", unit] for name, label, unit in KEY_PARAMETERS]
+    rows = [[label, f"{summary.parameters[name].value:.4g}", unit] for name, label, unit in PARAMETERS]
     table = TableView("where the fit stopped: NOT results", ["quantity", "value", "unit"], rows)
     lines = [NotConverged.of(summary.problems, "").message, table.text()]
     if summary.suspect_spots:
@@ -123,7 +169,7 @@ def validation_lines(validation: Validation) -> list[str]:
     return [
         warning,
         *(
-            f"validation: {t.name}, {t.where}: chi2 {t.chi2:.1f} for {t.dof}, p {t.p:.1e}; would move a headline by "
+            f"validation: {t.name}, {t.where}: chi2 {t.chi2:.1f} for {t.dof}, p {t.p:.1e}; would move a result by "
             f"{t.shift_sd:.1f} of its u"
             for t in tests
             if t.failed
@@ -146,8 +192,8 @@ def sampling_line(sampling: Sampling) -> str:
 def importance_line(found: Importance) -> str:
     """What importance sampling is worth, in one line."""
     text = f"importance sampling: {found.draws} draws, {100 * found.effective_share:.0f} % effective, at least "
-    text += f"{found.least_ess.value:.0f} for a headline ({found.least_ess.quantity}); Pareto k {found.pareto_k:.2f}, "
-    return f"{text}of headlines at most {found.worst_pareto_k.value:.2f}"
+    text += f"{found.least_ess.value:.0f} for a result ({found.least_ess.quantity}); Pareto k {found.pareto_k:.2f}, "
+    return f"{text}of results at most {found.worst_pareto_k.value:.2f}"
 
 
 def agreement_line(sampling: Sampling) -> str | None:
@@ -156,7 +202,7 @@ def agreement_line(sampling: Sampling) -> str | None:
         return None
     if sampling.agreement is None:
         return "importance sampling was not accepted: the chain stands alone"
-    said = "agree on every headline" if sampling.agreement.agrees else "DISAGREE"
+    said = "agree on every result" if sampling.agreement.agrees else "DISAGREE"
     worst = sampling.agreement.worst
     text = f"emcee and importance sampling {said}: the largest difference is {worst.value:.1f} Monte Carlo errors"
     return f"{text} ({worst.quantity})"

@@ -12,7 +12,7 @@ import numpy as np
 
 from tvsbayes.instrument.axes import DIRECTIONS, SENSES
 from tvsbayes.report.figures import BLACK, BLUE, OF_DIRECTION, ORANGE, PURPLE, SKY, STYLE, WIDTH_IN
-from tvsbayes.report.result_tables import estimate_row, gears_table, range_text
+from tvsbayes.report.result_tables import ESTIMATE_COLUMNS, estimate_row, gears_table, range_text
 from tvsbayes.report.tables import FigureView, Section, TableView, figure_view
 
 if TYPE_CHECKING:
@@ -35,8 +35,7 @@ def gear_section(e: Evidence) -> list[Section]:
         if summary.effective[direction] is not None:
             rows.append(estimate_row(f"{direction}, line", summary.effective[direction], "deg/step"))
             rows.append(estimate_row(f"{direction}, local", summary.local.get(direction), "deg/step"))
-    columns = ["ratio", "value(u)", "unit", "95 % interval", "set by"]
-    ratios = TableView("Line through the looks, and gear ratio times slope of the mirrors", columns, rows)
+    ratios = TableView("Line through the looks, and gear ratio times slope of the mirrors", ESTIMATE_COLUMNS, rows)
     text = [
         f"Effective ratios are slopes of lines through the looks, {range_text(summary)}, errors of the gears included; "
         "over other counters these errors count anew. Local ratios are those of gears and mirrors without them, at the "

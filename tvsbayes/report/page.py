@@ -34,7 +34,7 @@ from tvsbayes.report.fit_sections import (
 )
 from tvsbayes.report.fit_text import few_stops_line, suspect_line, validation_lines
 from tvsbayes.report.gear_section import gear_section
-from tvsbayes.report.tables import Number, Page, TableView, concise, two_digits
+from tvsbayes.report.tables import Issue, Number, Page, TableView, concise, two_digits
 from tvsbayes.report.uncertainty_sections import (
     axes_section,
     budgets_section,
@@ -90,13 +90,14 @@ def print_to_pdf(page: Path) -> Path:
     return target
 
 
-def report_html(evidence: Evidence) -> bytes:
+def report_html(evidence: Evidence, issue: Issue | None = None) -> bytes:
     """The report, UTF-8.
 
     Args:
         evidence: computed beforehand; nothing is computed here.
+        issue: who issues it, for whom and when; None is today, by nobody.
     """
-    return page_html(_page(evidence))
+    return page_html(_page(evidence, issue or Issue.today()))
 
 
 def page_html(page: Page) -> bytes:
@@ -113,7 +114,7 @@ def page_html(page: Page) -> bytes:
     return html.encode()
 
 
-def _page(e: Evidence) -> Page:
+def _page(e: Evidence, issue: Issue) -> Page:
     verdict = verdict_of(e.fit.summary, e.criteria)
     sections = [
         setup_section(e),
@@ -145,6 +146,7 @@ def _page(e: Evidence) -> Page:
         warnings=_warnings(e),
         versions=e.fit.provenance.versions,
         sections=sections,
+        issue=issue,
     )
 
 

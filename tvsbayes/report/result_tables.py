@@ -20,13 +20,17 @@ from tvsbayes.results.estimates import Estimate, FitSummary
 KEY_PARAMETERS = (
     ("backlash_deg.pan", "backlash pan", "deg"),
     ("backlash_deg.tilt", "backlash tilt", "deg"),
-    ("effective_mirror_offset_mm", "mirror offset (effective)", "mm"),
-    ("mirror_offset_mm", "mirror offset L", "mm"),
-    *((f"extrinsics.rotation_rad.{axis}", f"extrinsics rotation {axis}", "rad") for axis in "xyz"),
-    *((f"extrinsics.translation_mm.{axis}", f"extrinsics translation {axis}", "mm") for axis in "xyz"),
-    *((f"stop_sd_deg.{direction}", f"stop sd {direction}", "deg") for direction in DIRECTIONS),
+    ("effective_mirror_offset_mm", "beam off the pan axis", "mm"),
+    *((f"stop_sd_deg.{direction}", f"stop scatter {direction}", "deg") for direction in DIRECTIONS),
     ("pixel_scale", "pixel noise / stated", ""),
 )
+"""Parameters of the table that ends a fit: name, label, unit."""
+MORE_PARAMETERS = (
+    ("mirror_offset_mm", "mirror offset L", "mm"),
+    *((f"extrinsics.rotation_rad.{axis}", f"positioner turned about {axis}", "rad") for axis in "xyz"),
+    *((f"extrinsics.translation_mm.{axis}", f"positioner at {axis}", "mm") for axis in "xyz"),
+)
+"""Those of its details."""
 SHARE_SHOWN = 5e-4
 """Of a variance: smaller ones print as 0.0 %."""
 
@@ -48,17 +52,22 @@ def classic_table(result: ClassicResult) -> TableView:
     return TableView("classic four-point estimator", columns, rows)
 
 
+ESTIMATE_COLUMNS = ("quantity", "value(u)", "95 % interval", "set by")
+"""Of `estimate_row`."""
+
+
 def estimate_row(label: str, estimate: Estimate | None, unit: str) -> list[str]:
-    """Cells of one quantity: value(u), unit, interval, and whether data or prior set it."""
+    """Cells of one quantity: name with unit, value(u), interval, and whether data or prior set it."""
+    label = f"{label}, {unit}" if unit else label
     if estimate is None:
-        return [label, "never moved", unit, "", ""]
+        return [label, "never moved", "", ""]
     origin = "fixed" if estimate.contraction is None else ("data" if estimate.informed else "prior")
     interval = interval_text(*estimate.interval95, estimate.sd)
-    return [label, concise(estimate.value, estimate.sd), unit, interval, origin]
+    return [label, concise(estimate.value, estimate.sd), interval, origin]
 
 
 def headline_table(summary: FitSummary) -> TableView:
-    """Ratios, contrasts and key parameters of the joint estimator."""
+    """Ratios, contrasts and key parameters of the joint estimator: what ends a fit."""
     pose = summary.reference_pose_deg
     rows = [estimate_row(f"effective {d}", summary.effective[d], "deg/step") for d in DIRECTIONS]
     for axis, pair in SENSES.items():
@@ -67,7 +76,13 @@ def headline_table(summary: FitSummary) -> TableView:
     rows += [estimate_row(label, summary.parameters[name], unit) for name, label, unit in KEY_PARAMETERS]
     kind = {"laplace": "Laplace", "posterior": "posterior"}[summary.estimator]
     title = f"joint estimator ({kind}) at pan {pose['pan']:.2f} deg, tilt {pose['tilt']:.2f} deg"
-    return TableView(title, ["quantity", "value(u)", "unit", "95 % interval", "set by"], rows)
+    return TableView(title, ESTIMATE_COLUMNS, rows)
+
+
+def details_table(summary: FitSummary) -> TableView:
+    """Where the positioner stands, and L."""
+    rows = [estimate_row(label, summary.parameters[name], unit) for name, label, unit in MORE_PARAMETERS]
+    return TableView("the positioner in frame S (the left camera's)", ESTIMATE_COLUMNS, rows)
 
 
 def range_text(summary: FitSummary) -> str:
@@ -95,8 +110,7 @@ def gears_table(summary: FitSummary) -> TableView | None:
                 rows.append(estimate_row(f"{label}, {axis}", summary.parameters[name], unit))
     if not any(row[0].startswith(("transmission", "play", "period")) for row in rows):
         return None
-    columns = ["quantity", "value(u)", "unit", "95 % interval", "set by"]
-    return TableView("gears: what repeats by position", columns, rows)
+    return TableView("gears: what repeats by position", ESTIMATE_COLUMNS, rows)
 
 
 def gap_table(gaps: Mapping[str, Gap | None]) -> TableView:

@@ -6,13 +6,16 @@ A table is made once and printed by either: `text()` on a terminal, the template
 from __future__ import annotations
 
 import base64
+import datetime
 import io
 import math
+import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
+from rich.cells import cell_len
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
@@ -21,6 +24,9 @@ from tvsbayes.report import figures
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+COLUMNS, GAP = 80, 2
+"""Of a terminal; between two columns of a table."""
 
 
 def two_digits(value: float) -> str:
@@ -68,15 +74,37 @@ class TableView:
         return not self.columns
 
     def text(self) -> str:
-        """The table without lines, for terminals and files alike."""
-        table = Table(title=self.caption, title_justify="left", title_style="", box=None, pad_edge=False)
-        for number, column in enumerate(self.columns):
-            table.add_column(column, justify="left" if number == 0 else "right", no_wrap=True)
+        """The table without lines, for terminals and files alike; in parts below each other where it is too wide."""
+        title = textwrap.wrap(self.caption, COLUMNS, break_long_words=False, break_on_hyphens=False)
+        return "\n".join([*title, *(self._part(chosen) for chosen in self._parts())])
+
+    def _parts(self) -> list[list[int]]:
+        """Columns of every part: the first one, and as many others as fit beside it, about equally many in each."""
+        cells = [self.columns, *self.rows]
+        others = max(1, *map(len, cells)) - 1
+        width = [max((cell_len(row[k]) for row in cells if k < len(row)), default=0) + GAP for k in range(others + 1)]
+
+        def parts(size: int) -> list[list[int]]:
+            return [[0, *range(k, min(k + size, others + 1))] for k in range(1, others + 1, size)] or [[0]]
+
+        def fits(size: int) -> bool:
+            return all(sum(width[k] for k in part) - GAP <= COLUMNS for part in parts(size))
+
+        most = next((size for size in range(others, 1, -1) if fits(size)), 1)
+        even = math.ceil(others / len(parts(most))) or 1
+        return parts(even if fits(even) else most)
+
+    def _part(self, chosen: Sequence[int]) -> str:
+        """Some columns as text."""
+        table = Table(box=None, pad_edge=False, show_header=not self.pairs)
+        for number in chosen:
+            head = "" if self.pairs else self.columns[number]
+            table.add_column(head, justify="left" if number == 0 else "right", no_wrap=True)
         for row in self.rows:
-            table.add_row(*map(Text, row))
+            table.add_row(*(Text(row[number] if number < len(row) else "") for number in chosen))
         stream = io.StringIO()
-        # Plain text whatever FORCE_COLOR and the like say: it also goes into files.
-        Console(file=stream, width=120, highlight=False, color_system=None, force_terminal=False).print(table)
+        # Plain text whatever FORCE_COLOR and the like say: it also goes into files. Nothing is folded here.
+        Console(file=stream, width=1000, highlight=False, color_system=None, force_terminal=False).print(table)
         return "\n".join(line.rstrip() for line in stream.getvalue().splitlines())
 
 
@@ -112,6 +140,20 @@ class Number:
 
 
 @dataclass(frozen=True)
+class Issue:
+    """Who issues a report, for whom, and on which day (UTC); "" where nobody is stated."""
+
+    day: datetime.date
+    laboratory: str = ""
+    customer: str = ""
+
+    @classmethod
+    def today(cls) -> Issue:
+        """Of today, by nobody for nobody."""
+        return cls(datetime.datetime.now(datetime.UTC).date())
+
+
+@dataclass(frozen=True)
 class Page:
     """What the template is filled with."""
 
@@ -126,6 +168,7 @@ class Page:
     versions: Mapping[str, str]
     sections: Sequence[Section] = field(default_factory=tuple)
     title: str = "Calibration of a laser positioner"
+    issue: Issue = field(default_factory=Issue.today)
 
 
 def figure_view(figure: Figure, alt: str, caption: str) -> FigureView:

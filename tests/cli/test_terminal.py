@@ -1,0 +1,71 @@
+"""Colours only where a terminal shows them; help with examples, completion, one spelling of --out."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+
+import pytest
+
+from tvsbayes.cli.examples import EXAMPLES
+from tvsbayes.cli.main import COMMANDS, run
+from tvsbayes.cli.terminal import shown
+
+
+class Terminal:
+    def __init__(self, tty: bool):
+        self.isatty = lambda: tty
+
+
+@pytest.mark.parametrize(("tty", "environment"), [(False, {}), (True, {"NO_COLOR": "1"}), (True, {"TERM": "dumb"})])
+def test_files_pipes_and_whoever_forbids_it_get_plain_text(monkeypatch, tty, environment):
+    monkeypatch.delenv("NO_COLOR", raising=False)
+    monkeypatch.setenv("TERM", "xterm")
+    for name, value in environment.items():
+        monkeypatch.setenv(name, value)
+    assert shown("error: no such file", Terminal(tty)) == "error: no such file"
+
+
+def test_a_terminal_gets_sentences_folded_between_words_and_tables_as_they_are(monkeypatch):
+    monkeypatch.setenv("NO_COLOR", "1")
+    monkeypatch.setenv("COLUMNS", "30")
+    sentence, row = "one sentence of more words than fit", "a row of a table      1.25     2.50"
+    assert shown(f"{sentence}\n{row}", Terminal(True)) == f"one sentence of more words\n  than fit\n{row}"
+    assert shown(sentence, Terminal(False)) == sentence
+
+
+def test_a_terminal_gets_verdicts_in_colour_line_by_line(monkeypatch):
+    monkeypatch.delenv("NO_COLOR", raising=False)
+    monkeypatch.setenv("TERM", "xterm")
+    plain, good, bad = "a table", "verdict: usable", "verdict: VALIDATION FAILED, multiply"
+    lines = shown(f"{plain}\n{good}\n{bad}", Terminal(True)).split("\n")
+    assert lines[0] == plain
+    assert lines[1] == f"\x1b[32m\x1b[1m{good}\x1b[0m" and lines[2] == f"\x1b[31m\x1b[1m{bad}\x1b[0m"
+
+
+@pytest.mark.parametrize("command", COMMANDS, ids=lambda command: command.__name__)
+def test_every_command_has_its_help_with_examples_that_parse(capsys, command):
+    name = command.__name__.rstrip("_").replace("_", "-")
+    assert run([name, "-h"]) == 0
+    shown = capsys.readouterr().out
+    for example in EXAMPLES[name]:
+        assert f"    {example}\n" in shown and example.startswith(f"tvsbayes {name}")
+        for option in (word.split("=")[0] for word in example.split() if word.startswith("--")):
+            assert f"{option} " in shown.split("Examples:")[0], option
+
+
+def test_a_shell_can_complete_commands():
+    environment = os.environ | {"_TVSBAYES_COMPLETE": "complete_bash", "COMP_WORDS": "tvsbayes cali", "COMP_CWORD": "1"}
+    done = subprocess.run(
+        [sys.executable, "-m", "tvsbayes"], capture_output=True, text=True, env=environment, check=False
+    )
+    assert done.stdout.split() == ["calibrate"]
+
+
+def test_the_old_spelling_of_out_is_still_taken(capsys, tmp_path):
+    for option in ("-o", "--out", "--output"):
+        assert run(["plan", str(tmp_path / "no rig.toml"), option, str(tmp_path / "plan.csv")]) == 2
+        assert "no rig.toml" in capsys.readouterr().err
+    assert run(["plan", "-h"]) == 0
+    assert "--output" not in capsys.readouterr().out

@@ -1,0 +1,54 @@
+"""Examples at the end of every command's help, and what `tvsbayes --help` begins with."""
+
+from __future__ import annotations
+
+EXAMPLES = {
+    "demo": ("tvsbayes demo", "tvsbayes demo kept"),
+    "new": ("tvsbayes new mine", "tvsbayes new mine --pictures FOLDER", "tvsbayes new stage --axis"),
+    "import": ("tvsbayes import looks.xlsx --to mine",),
+    "simulate": (
+        "tvsbayes simulate rig.toml plan.csv trial --aperture --seed 7",
+        "tvsbayes simulate rig.toml plan.csv trial --frames",
+    ),
+    "detect": ("tvsbayes detect mine", "tvsbayes detect mine --overlay"),
+    "stereo": (
+        "tvsbayes stereo pictures --board 9x6 --pitch-mm 25 -o stereo.json",
+        "tvsbayes stereo --import left.yaml --import right.yaml -o stereo.json",
+    ),
+    "check": ("tvsbayes check mine", "tvsbayes check rig.toml plan.csv"),
+    "acquire": (
+        "tvsbayes acquire rig.toml plan.csv run1 --dry-run",
+        "tvsbayes acquire rig.toml plan.csv run1 --laser-class 3B",
+        "tvsbayes acquire rig.toml plan.csv run1 --resume",
+    ),
+    "doctor": ("tvsbayes doctor rig.toml",),
+    "classic": ("tvsbayes classic mine", "tvsbayes classic mine --json"),
+    "fit": ("tvsbayes fit mine --quick", "tvsbayes fit mine", "tvsbayes fit mine --robust --details"),
+    "calibrate": ("tvsbayes calibrate mine", "tvsbayes calibrate mine --quick --limit-deg-per-step 4e-4 --pdf"),
+    "report": (
+        "tvsbayes report mine --limit-deg-per-step 4e-4 --pdf",
+        "tvsbayes report mine --laboratory 'Optics Lab' --customer 'Robotics group'",
+    ),
+    "compare": ("tvsbayes compare mine", "tvsbayes compare january march"),
+    "locate": (
+        "tvsbayes locate mine --pan-steps 169 --tilt-steps 46 --aperture-deg 63.4",
+        "tvsbayes locate mine --points points.csv --json",
+    ),
+    "steps-for": (
+        "tvsbayes steps-for mine --x-mm 500 --y-mm 150 --z-mm 40",
+        "tvsbayes steps-for mine --export header > tvs_calibration.h",
+    ),
+    "plan": (
+        "tvsbayes plan rig.toml --minutes 30 -o plan.csv",
+        "tvsbayes plan rig.toml --given mine --target 'u(worst) <= 8e-5 deg/step'",
+    ),
+    "study": ("tvsbayes study rig.toml plan.csv --n 100 --engine processes",),
+}
+"""By command; each runs as it stands where the files have these names."""
+FIRST = ("tvsbayes demo", "tvsbayes new mine", "tvsbayes calibrate mine")
+"""What somebody new does."""
+
+
+def epilog(examples: tuple[str, ...]) -> str:
+    r"""The end of a help page; `\b` keeps the lines as they are."""
+    return "\n".join(["\b", "Examples:", *(f"  {line}" for line in examples)])

@@ -1,0 +1,263 @@
+"""Commands that end on somebody's desk: report, and calibrate, which does all that comes before it too.
+
+Options in, library called, table or JSON out; heavy imports stand inside the commands.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from tvsbayes.cli import axis_commands
+from tvsbayes.cli.app import (
+    TARGET_MISSED,
+    CampaignFolder,
+    Ended,
+    Json,
+    Seed,
+    finish,
+    refuse_options,
+    report_line,
+    tell_part,
+)
+from tvsbayes.cli.campaign_commands import campaign_held
+from tvsbayes.cli.progress_bar import waiting
+from tvsbayes.errors import NothingToEstimate
+from tvsbayes.files.disk import output_place, write_atomically
+from tvsbayes.pipeline import FITTING, compile_for, record_for
+from tvsbayes.pipeline import calibrate as calibrate_campaign
+from tvsbayes.progress import Job
+
+if TYPE_CHECKING:
+    from tvsbayes.instrument.campaign import Campaign
+    from tvsbayes.report.evidence import Evidence
+    from tvsbayes.report.tables import Issue
+    from tvsbayes.results.fit_record import FitRecord
+
+DCC_MESSAGES = 20
+"""Of a schema validator, shown at most."""
+MAX_MINUTES = 10.0
+RANGE_MM = 1e3
+GATHERING, DRAWING, PRINTING = "gathering evidence", "drawing the page", "printing to PDF"
+
+LimitRatio = Annotated[
+    float | None, typer.Option("--limit-deg-per-step", min=0, help="Largest error allowed of any ratio: for a verdict.")
+]
+LimitMm = Annotated[float | None, typer.Option("--limit-mm", min=0, help="Largest 3D error allowed.")]
+Range = Annotated[float, typer.Option("--range-mm", min=1, help="Range at which millimetres are stated.")]
+Pdf = Annotated[bool, typer.Option("--pdf", help="Also print to PDF with an installed Chromium.")]
+Laboratory = Annotated[str | None, typer.Option("--laboratory", help="Who measured: on the first page.")]
+Customer = Annotated[str | None, typer.Option("--customer", help="For whom: on the first page.")]
+Schema = Annotated[
+    Path | None, typer.Option("--dcc-schema", help="PTB's dcc.xsd on this machine: validate the XML against it.")
+]
+
+
+def report(
+    campaign: CampaignFolder,
+    limit_deg_per_step: LimitRatio = None,
+    limit_mm: LimitMm = None,
+    range_mm: Range = RANGE_MM,
+    pdf: Pdf = False,
+    dcc: Annotated[bool, typer.Option("--dcc", help="Also write DCC-schema XML (unsigned, not accredited).")] = False,
+    laboratory: Laboratory = None,
+    customer: Customer = None,
+    country: Annotated[
+        str | None, typer.Option("--country", help="Two letters of the place (ISO 3166-1), for --dcc.")
+    ] = None,
+    dcc_schema: Schema = None,
+    out: Annotated[
+        Path | None, typer.Option("-o", "--out", help="File (default CAMPAIGN/results/report.html).")
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """The calibration report as one HTML page. Verdict and answer first, then everything behind them."""
+    from tvsbayes.instrument.campaign import read_campaign
+
+    if not (dcc or dcc_schema):
+        refuse_options("for a certificate", "add --dcc", country=country)
+    issue = _issue(laboratory, customer)
+    if axis_commands.is_axis(campaign):
+        unfit = {"limit_deg_per_step": limit_deg_per_step, "limit_mm": limit_mm, "dcc": dcc, "dcc_schema": dcc_schema}
+        unfit["range_mm"] = range_mm if range_mm != RANGE_MM else None
+        refuse_options(axis_commands.NOT_OF_AN_AXIS, "leave it out", **unfit)
+        axis_commands.report(campaign, issue=issue, pdf=pdf, out=out, as_json=as_json)
+        return
+    data = read_campaign(campaign)
+    wish = PageWish(campaign, issue, limit_deg_per_step, limit_mm, range_mm, pdf, out)
+    page = wish.write(data)
+    missed, lines, result = page.missed, page.lines(), page.as_json()
+    if dcc or dcc_schema:
+        content = _certificate(data, page.record, page.path.read_bytes(), issue, country)
+        place = output_place(campaign, "results") / "dcc.xml"
+        write_atomically(place, content)
+        page.files["dcc"] = str(place)
+        if dcc_schema:
+            from tvsbayes.metrology.schema_check import check_dcc
+
+            checked = check_dcc(content, dcc_schema)
+            verdict = {True: "valid", False: "NOT VALID", None: "could not be checked"}[checked.valid]
+            lines += [f"DCC by {checked.tool} against {dcc_schema}: {verdict}", *checked.messages[:DCC_MESSAGES]]
+            result["dcc_schema"] = asdict(checked)
+            missed |= not checked.valid
+    finish(result, "\n".join([*lines, f"written: {', '.join(page.files.values())}"]), as_json)
+    if missed:
+        raise Ended(TARGET_MISSED)
+
+
+def _issue(laboratory: str | None, customer: str | None) -> Issue:
+    from tvsbayes.report.tables import Issue
+
+    return replace(Issue.today(), laboratory=laboratory or "", customer=customer or "")
+
+
+@dataclass(frozen=True)
+class PageWish:
+    """What page is wanted of a campaign; fields as the options of `report`."""
+
+    campaign: Path
+    issue: Issue
+    limit_deg_per_step: float | None
+    limit_mm: float | None
+    range_mm: float
+    pdf: bool
+    out: Path | None = None
+
+    def write(self, data: Campaign) -> WrittenPage:
+        """Gather, draw and write it, and print it where that is wanted; fits first where results are missing."""
+        from tvsbayes.calibration.calibration_file import load_calibration
+        from tvsbayes.report.page import find_browser, print_to_pdf, report_html
+
+        if self.pdf:
+            find_browser()
+        from tvsbayes.report.evidence import gather
+
+        limits = {"limit_deg_per_step": self.limit_deg_per_step, "limit_mm": self.limit_mm}
+        path = self.out or output_place(self.campaign, "results") / "report.html"
+        files = {"report": str(path)}
+        stages = {FITTING: 3.0, GATHERING: 1.5, DRAWING: 1.5, PRINTING: 3.0 if self.pdf else 0.0}
+        with waiting() as progress, Job(stages, progress) as job:
+            record = record_for(data, self.campaign, report_line, job.part(FITTING))
+            job.begin(GATHERING)
+            evidence = gather(data, record, load_calibration(self.campaign), range_mm=self.range_mm, **limits)
+            job.begin(DRAWING)
+            write_atomically(path, report_html(evidence, self.issue))
+            if self.pdf:
+                job.begin(PRINTING)
+                files["pdf"] = str(print_to_pdf(path))
+        return WrittenPage(record, evidence, path, files)
+
+
+@dataclass(frozen=True)
+class WrittenPage:
+    """A page on disk: what it was made of, and where it lies; files by kind."""
+
+    record: FitRecord
+    evidence: Evidence
+    path: Path
+    files: dict[str, str]
+
+    @property
+    def missed(self) -> bool:
+        """Whether a limit that the user gave is not met."""
+        from tvsbayes.report.evidence import MET
+
+        return any(c.verdict != MET for c in self.evidence.criteria)
+
+    def lines(self) -> list[str]:
+        """What the limits have come to, for a terminal."""
+        from tvsbayes.report.fit_text import validation_lines
+
+        lines = [
+            f"{c.quantity} within {c.limit:g} {c.unit}: {c.verdict} (P = {c.probability:.3f})"
+            for c in self.evidence.criteria
+        ]
+        validation = self.record.summary.validation
+        failed = validation is not None and not validation.passed
+        return [*(validation_lines(validation)[:1] if validation is not None and failed else []), *lines]
+
+    def as_json(self) -> dict[str, Any]:
+        """The document of `report --json`."""
+        return {"criteria": [asdict(c) for c in self.evidence.criteria], "files": self.files}
+
+
+def _certificate(campaign: Campaign, record: FitRecord, report: bytes, issue: Issue, country: str | None) -> bytes:
+    """DCC-schema XML, issued on the day of the page (UTC)."""
+    from tvsbayes.metrology.dcc import Parties, dcc_bytes
+
+    parties = {"laboratory": issue.laboratory, "customer": issue.customer, "country": country}
+    stated = {name: text for name, text in parties.items() if text}
+    return dcc_bytes(campaign, record, issued=issue.day, parties=Parties(**stated), report=report)
+
+
+def calibrate(
+    campaign: CampaignFolder,
+    quick: Annotated[bool, typer.Option("--quick", help="Importance sampling only: seconds, not minutes.")] = False,
+    no_sample: Annotated[bool, typer.Option("--no-sample", help="Laplace approximation only.")] = False,
+    limit_deg_per_step: LimitRatio = None,
+    limit_mm: LimitMm = None,
+    range_mm: Range = RANGE_MM,
+    pdf: Pdf = False,
+    laboratory: Laboratory = None,
+    customer: Customer = None,
+    seed: Seed = 0,
+    as_json: Json = False,
+) -> None:
+    """Check, classic, fit and report in one go. From a campaign folder to the report on the desk."""
+    if no_sample:
+        refuse_options("for a sampler, and --no-sample runs none", "give one of them", quick=quick)
+    issue = _issue(laboratory, customer)
+    if axis_commands.is_axis(campaign):
+        unfit = {"limit_deg_per_step": limit_deg_per_step, "limit_mm": limit_mm}
+        unfit["range_mm"] = range_mm if range_mm != RANGE_MM else None
+        refuse_options(axis_commands.NOT_OF_AN_AXIS, "leave it out", **unfit)
+        wish = axis_commands.Sampled(quick, no_sample, MAX_MINUTES, seed)
+        axis_commands.calibrate(campaign, issue=issue, wish=wish, pdf=pdf, as_json=as_json)
+        return
+    from tvsbayes.instrument.campaign import read_campaign
+    from tvsbayes.report.command_text import held_text
+    from tvsbayes.report.fit_text import fit_text
+
+    data = read_campaign(campaign)
+    documents: dict[str, Any] = {"check": campaign_held(campaign, data)}
+    tell_part(held_text(documents["check"]), as_json)
+    documents["classic"], told = _classic(data)
+    tell_part(told, as_json)
+    compile_for(report_line)
+    with waiting() as progress:
+        results = calibrate_campaign(
+            data,
+            output_place(campaign, "results"),
+            sampled=not no_sample,
+            tier="importance" if quick else "emcee",
+            seed=seed,
+            tell=report_line,
+            progress=progress,
+        )
+    summary = results.record.summary
+    documents["fit"] = {**summary.as_json(), "seed": seed, "files": results.files}
+    told = fit_text(summary, written=list(results.files.values()))
+    if results.error is not None:
+        finish({**documents, "report": None}, told, as_json, results.error)
+    tell_part(told, as_json)
+    page = PageWish(campaign, issue, limit_deg_per_step, limit_mm, range_mm, pdf).write(data)
+    documents["report"] = page.as_json()
+    text = "\n".join([*page.lines(), f"next: open {', '.join(page.files.values())} in a browser"])
+    finish(documents, text, as_json)
+    if page.missed:
+        raise Ended(TARGET_MISSED)
+
+
+def _classic(data: Campaign) -> tuple[dict[str, Any] | None, str]:
+    """Document and table of the four-point estimator; None, and why, without a complete experiment."""
+    from tvsbayes.estimators.four_point import classic
+    from tvsbayes.report.fit_text import classic_text
+
+    try:
+        found = classic(data)
+    except NothingToEstimate as error:
+        return None, f"classic four-point estimator: {error.message}"
+    return found.as_json(), classic_text(found)

@@ -1,0 +1,93 @@
+"""What a fit amounts to in one line, why a validation may fail and what helps, and what to do next.
+
+Shared by the terminal and the page. Sentences for people; ratios in deg/step.
+"""
+
+from __future__ import annotations
+
+from tvsbayes.instrument.axes import DIRECTIONS
+from tvsbayes.results.estimates import FitSummary, Validation
+
+REMEDIES = {
+    "the cameras moved": "fix the cameras and measure again, or fit the looks before and after as two campaigns",
+    "the cameras drifted": "let cameras and mount warm up for half an hour and measure again in less time",
+    "one camera moved": "fix the cameras to one stiff bar, calibrate the pair again (`tvsbayes stereo`), measure again",
+    "a ratio drifted": "look for a slipping belt or coupling and for motors that grow warm; measure again",
+    "steps were lost": "drive slower or with more current, home more often, and measure again",
+    "the gears have a transmission error": "state its period in [rig] and fit with --harmonics, or visit more counters",
+    "stops depend on the step phase": "use full steps, or more current: microsteps are not even",
+    "stops depend on the length": "let the axis settle longer before each look, or arrive by moves of one length",
+    "the sheets disagree": "check that every sheet is flat, stands still and bears the right name in spots.csv",
+    "single spots disagree": "look at those spots, or fit with --robust, which leaves them out by name",
+}
+"""What helps, by how the name of the failed test begins."""
+ANY_REMEDY = "find the cause in the section Validation of the report, mend it and measure again"
+USUAL_SCALE = (0.5, 2.0)
+"""Pixel noise over the stated one that needs no word."""
+
+
+def remedy(validation: Validation) -> str:
+    """What helps against the defect that explains the residuals best."""
+    cause = validation.tests[0].name if validation.tests else ""
+    return next((told for begin, told in REMEDIES.items() if cause.startswith(begin)), ANY_REMEDY)
+
+
+def failed(summary: FitSummary) -> Validation | None:
+    """The validation where it failed."""
+    validation = summary.validation
+    return None if validation is None or validation.passed else validation
+
+
+def verdict_line(summary: FitSummary) -> str:
+    """Whether the numbers of a fit may be used, in one line."""
+    if not summary.converged:
+        return "verdict: NOT CONVERGED, use none of these numbers"
+    if (validation := failed(summary)) is not None:
+        return f"verdict: VALIDATION FAILED, multiply every u and half-width by {validation.inflation:.2f}"
+    unseen = [d for d in DIRECTIONS if (e := summary.effective[d]) is not None and not e.informed]
+    validation = summary.validation
+    if summary.sampling is not None and not summary.sampling.converged:
+        told = "UNCONVERGED, the table is the Laplace approximation"
+    elif validation is None or not validation.tests:
+        told = "usable; too few spots to look for model errors"
+    else:
+        told = (
+            f"usable; no sign of a model error in {len(validation.tests)} tests (least p {validation.tests[0].p:.2g})"
+        )
+    if unseen:
+        told += f"; the data say nothing of {', '.join(unseen)}"
+    return f"verdict: {told}"
+
+
+def noise_line(summary: FitSummary) -> str | None:
+    """What pixel noise far from the stated one means; None where it is as stated."""
+    scale = summary.parameters["pixel_scale"].value
+    if USUAL_SCALE[0] <= scale <= USUAL_SCALE[1]:
+        return None
+    worse = "larger" if scale > 1 else "smaller"
+    return (
+        f"the spots scatter {scale:.2g} times as much as su and sv of spots.csv say; the fit allows for it: "
+        f"state {worse} ones if you know them"
+    )
+
+
+def steps_ahead(summary: FitSummary) -> list[str]:
+    """What to do next, most urgent first, for whoever reads the page."""
+    found = []
+    if not summary.converged:
+        return [
+            "Use none of the numbers. Check for swapped cameras, wrong counters and pictures of another size, then "
+            "fit again.",
+        ]
+    if (validation := failed(summary)) is not None:
+        help_ = remedy(validation)
+        found.append(f"{validation.cause}: {help_}.")
+    if summary.suspect_spots and (validation is None or "single spots" not in validation.cause):
+        found.append("Look at the spots that disagree with all others, or fit with --robust, which leaves them out.")
+    if summary.few_stops:
+        named = ", ".join(f"{direction} ({count})" for direction, count in summary.few_stops.items())
+        found.append(f"Add stops reached by moving {named}: so few hardly tell their own scatter.")
+    if summary.estimator == "laplace":
+        found.append("Run `tvsbayes fit` without --no-sample: it samples the posterior.")
+    found += [f"{weak.text[0].upper()}{weak.text[1:]}." for weak in summary.weak_directions if "look" in weak.text]
+    return found
