@@ -15,7 +15,7 @@ from support.drawn_boards import PAIR, POSES, pictures, write_pair
 
 from experiments.cameras.stereo_coverage import calibrate
 from experiments.common.board_views import CORNER_SD_PX, corners_of, scenes, true_corners
-from tvsbayes.cameras.boards import Board, View, Views, find_views
+from tvsbayes.cameras.boards import Board, View, Views, corner_orders, find_views
 from tvsbayes.cameras.bundle_adjustment import bundle_adjustment, correlation_factor
 from tvsbayes.cameras.stereo_calibration import StereoCalibration, calibrate_stereo
 from tvsbayes.cameras.stereo_start import camera_start
@@ -237,6 +237,41 @@ def test_pictures_of_two_moments_are_left_out_by_name(views, calibration, withou
     assert any("05" in warning for warning in found.warnings)
     np.testing.assert_allclose(found.stereo.vector, without_the_sixth.stereo.vector, rtol=1e-6, atol=1e-9)
     assert calibration.outliers == ()
+
+
+def test_pictures_all_of_two_moments_are_refused(views):
+    """Left k with right k + 1, of all views or of more than half: no covariance would be true."""
+    shifted = [replace(view, right=after.right) for view, after in zip(views, [*views[1:], views[0]], strict=True)]
+    with pytest.raises(NothingToEstimate, match="most of the 14 pairs miss") as caught:
+        calibrate_stereo(shifted, BOARD, SIZE)
+    assert caught.value.code == "pairs-disagree" and "taken together" in caught.value.remedy
+    with pytest.raises(NothingToEstimate, match="only 08, 09, 10, 11, 12, 13 agree"):
+        calibrate_stereo([*shifted[:8], *views[8:]], BOARD, SIZE)
+
+
+@pytest.mark.parametrize("moved_px, doubt", ((0.0, "none"), (0.5, "warned"), (3.0, "refused")))
+def test_a_board_that_moved_between_the_two_pictures(views, moved_px, doubt):
+    """Each camera by itself sees nothing of it: the pair does."""
+    rng = np.random.default_rng(4)
+    moved = [replace(view, right=view.right + rng.normal(0, moved_px, 2)) for view in views]
+    if doubt == "refused":
+        with pytest.raises(NothingToEstimate, match="together they miss by"):
+            calibrate_stereo(moved, BOARD, SIZE)
+        return
+    found = calibrate_stereo(moved, BOARD, SIZE)
+    assert any("each camera by itself" in warning for warning in found.warnings) == (doubt == "warned")
+    assert found.alone_rms_px < 1.1 * np.sqrt(2) * CORNER_SD_PX
+
+
+@pytest.mark.parametrize("which", (slice(5, 6), slice(0, None), slice(0, None, 2)))
+def test_corners_in_another_order_are_put_right_and_named(views, calibration, which):
+    """One view, every view (a camera upside down), every second one: of two half turns the fewer, or the named."""
+    turn = corner_orders(BOARD)[1]
+    names = {view.name for view in views[which]}
+    turned = [replace(view, right=view.right[turn]) if view.name in names else view for view in views]
+    found = calibrate_stereo(turned, BOARD, SIZE)
+    assert found.excluded == () and set(found.reordered) == names and found.as_json()["reordered"]
+    np.testing.assert_allclose(found.stereo.vector, calibration.stereo.vector, rtol=1e-6, atol=1e-7)
 
 
 def test_doubtful_view_is_named_and_left_out_on_request(views, without_the_sixth):

@@ -20,7 +20,8 @@ from typing import Literal
 import cv2
 import numpy as np
 
-from tvsbayes.cameras.picture_pairs import NAMING, SIDE_BY_SIDE_RATIO, Picture, natural_order, pictures_of
+from tvsbayes.cameras.camera_marks import paired_pictures
+from tvsbayes.cameras.picture_pairs import NAMING, SIDE_BY_SIDE_RATIO, Picture, natural_order
 from tvsbayes.errors import InputError, NothingToEstimate, escaped, refusal
 from tvsbayes.files.disk import read_bytes
 from tvsbayes.files.images import IMAGE_BYTES_MAX, image_size, read_image
@@ -204,8 +205,8 @@ def _find_sector(grey: np.ndarray, board: Board) -> np.ndarray | None:
     return _refined(grey, ((corners + 0.5) * scale - 0.5).astype(np.float32), board)
 
 
-def _turns(board: Board) -> list[np.ndarray]:
-    """Corner orders that a finder may give to one picture of the board: half turns, for square ones quarter turns."""
+def corner_orders(board: Board) -> list[np.ndarray]:
+    """Orders that a finder may give to corners: as they are, half turns, of square boards quarter turns."""
     index = np.arange(board.corners).reshape(board.rows, board.columns)
     quarters = (0, 1, 2, 3) if board.rows == board.columns else (0, 2)
     return [np.rot90(index, quarter).ravel() for quarter in quarters]
@@ -223,7 +224,7 @@ def _first_colour(grey: np.ndarray, corners: np.ndarray, board: Board) -> bool:
 
 @dataclass(frozen=True)
 class _Detection:
-    """Corners of one picture; `colours[k]` is the first square's under the k-th order of `_turns`."""
+    """Corners of one picture; `colours[k]` is the first square's under the k-th order of `corner_orders`."""
 
     corners: np.ndarray
     colours: tuple[bool, ...]
@@ -236,7 +237,7 @@ def _agreeing(left: _Detection, right: _Detection, board: Board) -> tuple[np.nda
     The colours decide where the board's turned image differs from it (one of columns and rows odd, one even).
     Otherwise the two cameras are taken to be turned by less than half of the board's symmetry against each other.
     """
-    grids = [right.corners[turn].reshape(board.rows, board.columns, 2) for turn in _turns(board)]
+    grids = [right.corners[turn].reshape(board.rows, board.columns, 2) for turn in corner_orders(board)]
     kept = [k for k, colour in enumerate(right.colours) if colour == left.colours[0]] or list(range(len(grids)))
     grid = left.corners.reshape(board.rows, board.columns, 2)
     along = (grid[:, -1] - grid[:, 0]).mean(0)
@@ -253,7 +254,7 @@ def find_views(
 ) -> Views:
     """Finds the board in all pictures of a folder.
 
-    Pictures (PNG, JPEG) are paired as `picture_pairs` says. Where no file is named after a camera, pictures at least
+    Pictures (PNG, JPEG) are paired as `paired_pictures` says. Where no file is named after a camera, pictures at least
     twice as wide as high are split in the middle. Other files are ignored.
 
     Args:
@@ -280,7 +281,7 @@ def find_views(
     ):
         advance(count / len(used))
         for side, detection in detections.items():
-            name = picture.path.name + (f" ({side})" if len(picture.sides) > 1 else "")
+            name = picture.path.relative_to(folder).as_posix() + (f" ({side})" if len(picture.sides) > 1 else "")
             names[picture.view, side] = name
             if detection is None:
                 without.append(name)
@@ -303,7 +304,7 @@ def find_views(
         image_height=size[1],
         unpaired=tuple(sorted(lonely, key=natural_order)),
         without_board=tuple(without),
-        other_size=tuple(picture.path.name for picture, own in sizes.items() if own != size),
+        other_size=tuple(picture.path.relative_to(folder).as_posix() for picture, own in sizes.items() if own != size),
         by_fallback=tuple(fallback),
         reordered=tuple(reordered),
     )
@@ -315,7 +316,7 @@ def _sizes(folder: Path, swap: bool) -> dict[Picture, tuple[int, int]]:
     The pictures of the majority are one calibration, and only those are decoded.
     """
     sizes = {}
-    for picture in pictures_of(folder, swap=swap, most=PICTURES_MAX):
+    for picture in paired_pictures(folder, swap=swap, most=PICTURES_MAX):
         data = read_bytes(picture.path, IMAGE_BYTES_MAX, folder)
         width, height = image_size(data, escaped(picture.path.name))
         if width * height > PIXELS_MAX:
@@ -357,5 +358,5 @@ def _detection(grey: np.ndarray, board: Board, finder: Finder) -> _Detection | N
     if result is None:
         return None
     corners, by_fallback = result
-    colours = tuple(_first_colour(grey, corners[turn], board) for turn in _turns(board))
+    colours = tuple(_first_colour(grey, corners[turn], board) for turn in corner_orders(board))
     return _Detection(corners, colours, by_fallback)

@@ -39,6 +39,8 @@ TOLERANCE, STEPS_MAX = 1e-7, 200
 RESTART_SD = 3.0
 """The repeated adjustment starts this many standard errors away in every parameter."""
 RESTART_AGREEMENT_SD = 1e-2
+RESTARTS_MAX, LOWER_SHARE = 4, 1e-6
+"""A repetition that ends lower is taken and itself repeated: lenses far from the model have several minima."""
 STATIONARY_SD = 1e-3
 EXACT_PX = 1e-7
 """Exact corners leave rounding errors, whose direction means nothing."""
@@ -234,11 +236,8 @@ def bundle_adjustment(
     root = np.zeros((24, 24))
     root[np.ix_(free, free)] = _whitening(jacobian[:, free], np.flatnonzero(free))
     arrays = replace(arrays, root=placed(root))
-    end = _descended(zero, arrays)
-    noise_sd = math.sqrt(float(end.residuals @ end.residuals) / dof)
-    # Alternating signs, so that no parameter's shift can be taken up by another's.
-    shift = RESTART_SD * noise_sd * np.where(np.arange(24) % 2, -1.0, 1.0) * free
-    again = _descended(end.z + shift, arrays)
+    end, again = _lowest(_descended(zero, arrays), arrays, free, dof)
+    noise_sd = end.noise_sd(dof)
     jacobian, residuals = end.jacobian[kept][:, free], end.residuals[kept]
     _check_minimum(jacobian, residuals, (again.z - end.z)[free], noise_sd)
     try:
@@ -292,7 +291,8 @@ def _check_minimum(jacobian: np.ndarray, residuals: np.ndarray, apart: np.ndarra
         raise NotConverged(
             "not-converged",
             "the bundle adjustment did not converge: " + "; ".join(problems),
-            remedy="look at the pictures for wrong boards, a wrong --board, or add tilted views",
+            remedy="look at the pictures for wrong boards, a wrong --board, or add tilted views; five coefficients do "
+            "not describe lenses that see far more than 120 deg",
         )
 
 
@@ -303,6 +303,23 @@ class _End:
     z: np.ndarray
     residuals: np.ndarray
     jacobian: np.ndarray
+
+    def noise_sd(self, dof: int) -> float:
+        """Standard deviation of one residual, px."""
+        return math.sqrt(float(self.residuals @ self.residuals) / dof)
+
+
+def _lowest(end: _End, arrays: BoardArrays, free: np.ndarray, dof: int) -> tuple[_End, _End]:
+    """The lowest end that was found, and where the last repetition from beside it ended."""
+    for _ in range(RESTARTS_MAX):
+        noise_sd = end.noise_sd(dof)
+        # Alternating signs, so that no parameter's shift can be taken up by another's.
+        shift = RESTART_SD * noise_sd * np.where(np.arange(24) % 2, -1.0, 1.0) * free
+        again = _descended(end.z + shift, arrays)
+        if not again.noise_sd(dof) < (1 - LOWER_SHARE) * noise_sd:
+            break
+        end = again
+    return end, again
 
 
 def _descended(z: np.ndarray, arrays: BoardArrays) -> _End:

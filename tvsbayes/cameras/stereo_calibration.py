@@ -18,8 +18,16 @@ import numpy as np
 
 from tvsbayes.cameras.boards import Board, Finder, View, Views, find_views
 from tvsbayes.cameras.bundle_adjustment import Adjustment, bundle_adjustment
-from tvsbayes.cameras.stereo_start import pixels_of, pose_of, start_of
-from tvsbayes.errors import escaped
+from tvsbayes.cameras.stereo_start import (
+    DOUBTFUL_START_PX,
+    Start,
+    opencv_start,
+    pairs_disagree,
+    pixels_of,
+    pose_of,
+    start_of,
+)
+from tvsbayes.errors import TvsError, escaped
 from tvsbayes.instrument.campaign import CAMERAS
 from tvsbayes.instrument.parameters import STEREO_PARAMETER_NAMES
 from tvsbayes.instrument.stereo_pair import Stereo, pair_doubts, rotation_matrix
@@ -36,6 +44,11 @@ VIEWS_ADVISED = 10
 TILT_ADVISED_DEG = 15.0
 COVERAGE_ADVISED = 0.6
 CORNER_SD_ADVISED_PX = 0.5
+TOGETHER_TIMES = 1.5
+"""More than this times the rms of each camera by itself: pairs of one moment and one rig stay below 1.15."""
+TOGETHER_MIN_PX = 0.05
+CONTRADICTION_TIMES, CONTRADICTION_PX = 4.0, 1.0
+"""Beyond both, there is no one pair of cameras in the pictures, and no covariance would be true."""
 
 
 @dataclass(frozen=True)
@@ -68,6 +81,8 @@ class StereoCalibration:
         triangulated_pitch_mm: mean and standard deviation of all sides of squares, triangulated.
         found: what the folder held; None where corners were given.
         excluded: names of outlying views that were left out: no pairs at all, or by `robust`.
+        reordered: names of views whose right corners were put into another order, to agree with the left ones.
+        alone_rms_px: what each camera by itself would leave, rms over corners as in `stereo.rms_px`.
         warnings: plausibility in words.
         seconds: wall time by stage.
     """
@@ -86,6 +101,8 @@ class StereoCalibration:
     triangulated_pitch_mm: tuple[float, float]
     found: Views | None
     excluded: tuple[str, ...]
+    reordered: tuple[str, ...]
+    alone_rms_px: float
     warnings: tuple[str, ...]
     seconds: dict[str, float] = field(default_factory=dict)
 
@@ -109,7 +126,7 @@ class StereoCalibration:
         }
         vector = self.stereo.vector
         found = self.found
-        lists = ("unpaired", "without_board", "other_size", "by_fallback", "reordered")
+        lists = ("unpaired", "without_board", "other_size", "by_fallback")
         return {
             "image_width": self.stereo.image_width,
             "image_height": self.stereo.image_height,
@@ -124,6 +141,7 @@ class StereoCalibration:
             "rms_px": self.stereo.rms_px,
             "left_rms_px": self.left_rms_px,
             "right_rms_px": self.right_rms_px,
+            "alone_rms_px": self.alone_rms_px,
             "noise": {"sd_px": self.noise_sd_px, "dof": self.dof, "correlation_factor": self.correlation_factor},
             "parameters": {
                 name: {"value": float(vector[k]), **{key: float(sds[k]) for key, sds in parts.items()}}
@@ -135,6 +153,7 @@ class StereoCalibration:
             "views": [vars(view) for view in self.views],
             "outliers": list(self.outliers),
             "excluded": list(self.excluded),
+            "reordered": list(self.reordered),
             **{key: list(getattr(found, key)) if found is not None else [] for key in lists},
             "warnings": list(self.warnings),
             "assumed": self.stereo.assumed,
@@ -200,6 +219,8 @@ def calibrate_stereo(
         triangulated_pitch_mm=_triangulated_pitch(done.views, board, stereo),
         found=found,
         excluded=done.excluded,
+        reordered=_reordered(found, done.turned),
+        alone_rms_px=done.alone_rms_px,
         warnings=(),
         seconds={"adjustment": time.perf_counter() - began},
     )
@@ -208,12 +229,23 @@ def calibrate_stereo(
 
 @dataclass(frozen=True)
 class _Adjusted:
-    """A bundle adjustment: of which views, which of them lie off, and the names of those left out."""
+    """A bundle adjustment of views, and what was decided about them.
+
+    Attributes:
+        adjustment: the result.
+        views: those in it, right corners in the agreed order.
+        outliers: which of them lie off.
+        excluded: names of those left out.
+        turned: names of those whose right corners were put into another order.
+        alone_rms_px: what each camera by itself would have left, rms over corners.
+    """
 
     adjustment: Adjustment
     views: Sequence[View]
     outliers: np.ndarray
     excluded: tuple[str, ...]
+    turned: tuple[str, ...]
+    alone_rms_px: float
 
 
 def _adjusted(views: Sequence[View], board: Board, size: tuple[int, int], fix_k3: bool, robust: bool) -> _Adjusted:
@@ -223,17 +255,53 @@ def _adjusted(views: Sequence[View], board: Board, size: tuple[int, int], fix_k3
     free[[8, 17]] = not fix_k3
     excluded: list[str] = []
     start = start_of(views, board, size, fix_k3)
-    leave_out = start.mismatched
+    leave_out, turned = start.mismatched, start.turned
     while True:
+        views = list(start.views)
         if leave_out.any():
             excluded += [view.name for view, out in zip(views, leave_out, strict=True) if out]
             views = [view for view, out in zip(views, leave_out, strict=True) if not out]
             start = start_of(views, board, size, fix_k3)
-        done = bundle_adjustment(views, board, start.vector, start.poses, free)
+            views = list(start.views)
+        done = _lowest_adjustment(start, board, size, free)
+        _check_pairs(done, start.alone_rms_px)
         outliers = _outliers(done)
         if not (robust and outliers.any()):
-            return _Adjusted(done, views, outliers, tuple(excluded))
+            return _Adjusted(done, views, outliers, tuple(excluded), turned, start.alone_rms_px)
         leave_out, robust = outliers, False
+
+
+def _lowest_adjustment(start: Start, board: Board, size: tuple[int, int], free: np.ndarray) -> Adjustment:
+    """The adjustment from a start; where it misses by much, also from OpenCV's own end, and the lower of the two."""
+    failed = None
+    try:
+        done = bundle_adjustment(start.views, board, start.vector, start.poses, free)
+        if _rms(done.residuals_px) <= DOUBTFUL_START_PX:
+            return done
+    except TvsError as error:
+        failed = error
+    try:
+        other = opencv_start(start, board, size, not free[8])
+        again = bundle_adjustment(other.views, board, other.vector, other.poses, free)
+    except TvsError:
+        if failed is not None:
+            raise failed from None
+        return done
+    return again if failed is not None else min(done, again, key=lambda one: one.noise_sd_px)
+
+
+def _reordered(found: Views | None, turned: tuple[str, ...]) -> tuple[str, ...]:
+    """Views that by direction or by agreement, not by both, were put into another order: two half turns are none."""
+    before = () if found is None else found.reordered
+    return (*(name for name in before if name not in turned), *(name for name in turned if name not in before))
+
+
+def _check_pairs(done: Adjustment, alone_rms_px: float) -> None:
+    """Refuses pairs that two cameras by themselves fit far better than one pair of cameras does."""
+    together = _rms(done.residuals_px)
+    if together > max(CONTRADICTION_TIMES * alone_rms_px, CONTRADICTION_PX):
+        reason = f"together they miss by {together:.2f} px, each camera by itself by {alone_rms_px:.2f}"
+        raise pairs_disagree(reason)
 
 
 def calibrate_folder(
@@ -342,6 +410,11 @@ def _plausibility(result: StereoCalibration, poses: Sequence[np.ndarray]) -> lis
         warnings.append(
             f"corners miss by {result.noise_sd_px:.2f} px (one coordinate); 0.1 to 0.2 is usual: look for blur, "
             "pictures not of one moment, a bent board, or a lens that five coefficients do not describe"
+        )
+    if result.stereo.rms_px > TOGETHER_TIMES * result.alone_rms_px and result.noise_sd_px > TOGETHER_MIN_PX:
+        warnings.append(
+            f"the pair misses by {result.stereo.rms_px:.2f} px, each camera by itself by {result.alone_rms_px:.2f}: "
+            "look for pictures not of one moment, or cameras that moved against each other"
         )
     warnings += pair_doubts(result.stereo)
     mean, sd = result.triangulated_pitch_mm

@@ -8,12 +8,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 
-from tvsbayes.cameras.boards import Board, View
+from tvsbayes.cameras.boards import Board, View, corner_orders
 from tvsbayes.cameras.bundle_adjustment import undetermined
 from tvsbayes.errors import NothingToEstimate, escaped
 from tvsbayes.instrument.campaign import CAMERAS
@@ -24,17 +24,23 @@ VIEWS_MIN = 3
 START_VIEWS = 30
 """The start needs no more; every further view enters the bundle adjustment alone."""
 MISMATCH_TIMES, MISMATCH_SHARE = 5.0, 0.01
-"""A view is no pair if its right corners miss the place that the left ones and the median of all relative poses
-predict by more than five times the median view and by more than 1 % of the image width."""
+"""A view is no pair if its right corners miss the place that the left ones and the relative pose of most pairs predict
+by more than five times the median view and by more than 1 % of the image width."""
+DOUBTFUL_START_PX = 0.6
+"""A camera alone that misses by more may have ended in a local minimum: corners are found to 0.05 to 0.3 px."""
+DISAGREE_SHARE = 0.05
+"""Pairs whose median misses by more than this share of the image width show no one pose of the cameras: real pairs of a
+narrow or a wide lens miss by 0.1 to 1 %, pairs of other moments by 5 to 50 %."""
 
 
 @dataclass(frozen=True)
 class CameraStart:
-    """Zhang's solution for one camera: matrix, distortion, and a pose (6,) for every view that it saw."""
+    """Zhang's solution for one camera: matrix, distortion, a pose (6,) for every view that it saw, rms over corners."""
 
     matrix: np.ndarray
     distortion: np.ndarray
     poses: dict[int, np.ndarray]
+    rms_px: float
 
     @property
     def vector(self) -> np.ndarray:
@@ -44,38 +50,102 @@ class CameraStart:
 
 @dataclass(frozen=True)
 class Start:
-    """Where the adjustment starts: the 24 parameters, board poses (views, 6), and which views are no pair at all."""
+    """Where the adjustment starts.
+
+    Attributes:
+        vector: the 24 parameters.
+        poses: of the boards, (views, 6).
+        views: as given, right corners in the order in which most pairs agree.
+        turned: names of views whose right corners were put into another order.
+        mismatched: which views are no pair at all, (views,).
+        alone_rms_px: what each camera by itself leaves, rms over the corners of both.
+    """
 
     vector: np.ndarray
     poses: np.ndarray
+    views: tuple[View, ...]
+    turned: tuple[str, ...]
     mismatched: np.ndarray
+    alone_rms_px: float
 
 
 def start_of(views: Sequence[View], board: Board, size: tuple[int, int], fix_k3: bool) -> Start:
     """The start of both cameras and of all boards.
 
     Raises:
-        NothingToEstimate: too few views of a camera, no pair, or no start that OpenCV can find.
+        NothingToEstimate: too few views of a camera, no pair, pairs that disagree, or no start that OpenCV can find.
     """
     cameras = []
     for side in CAMERAS:
         corners = {k: getattr(v, side) for k, v in enumerate(views) if getattr(v, side) is not None}
         cameras.append(camera_start(corners, board, size, side, fix_k3))
     left, right = cameras
-    relative = _relative(left, right)
-    rotation, shift = rotation_matrix(relative[:3]), relative[3:]
-    poses, misses = [], np.zeros(len(views))
+    found = _relation(views, board, left, right, MISMATCH_SHARE * size[0])
+    limit = max(MISMATCH_TIMES * found.usual_px, MISMATCH_SHARE * size[0])
+    off = [k for k, miss in found.misses.items() if miss > limit]
+    if found.usual_px > DISAGREE_SHARE * size[0]:
+        agreeing = [escaped(views[k].name, 40) for k, miss in found.misses.items() if miss <= MISMATCH_SHARE * size[0]]
+        reason = f"most of the {len(found.misses)} pairs miss by {found.usual_px:.0f} px and more"
+        raise pairs_disagree(reason + (f"; only {', '.join(agreeing)} agree" if len(agreeing) > 1 else ""))
+    rotation, shift = rotation_matrix(found.pose[:3]), found.pose[3:]
+    poses, agreed, turned = [], list(views), []
     for k, view in enumerate(views):
         poses.append(left.poses[k] if k in left.poses else left_pose(right.poses[k], rotation, shift))
-        if k in left.poses and view.right is not None:
-            pose = poses[k]
-            seen_from_right = rotation_vector(rotation @ rotation_matrix(pose[:3])), rotation @ pose[3:] + shift
-            pixels, _ = cv2.projectPoints(board.points_mm, *seen_from_right, right.matrix, right.distortion)
-            misses[k] = math.sqrt(np.mean(np.sum((np.reshape(pixels, (-1, 2)) - view.right) ** 2, axis=1)))
-    usual = float(np.median(misses[misses > 0])) if misses.any() else 0.0
-    mismatched = misses > max(MISMATCH_TIMES * usual, MISMATCH_SHARE * size[0])
-    vector = np.concatenate([left.vector, right.vector, relative])
-    return Start(vector, np.array(poses), mismatched)
+        if found.orders.get(k, 0) and k not in off:
+            assert view.right is not None
+            agreed[k] = replace(view, right=view.right[corner_orders(board)[found.orders[k]]])
+            turned.append(view.name)
+    return Start(
+        vector=np.concatenate([left.vector, right.vector, found.pose]),
+        poses=np.array(poses),
+        views=tuple(agreed),
+        turned=tuple(turned),
+        mismatched=np.isin(np.arange(len(views)), off),
+        alone_rms_px=math.sqrt((left.rms_px**2 + right.rms_px**2) / 2),
+    )
+
+
+def opencv_start(start: Start, board: Board, size: tuple[int, int], fix_k3: bool) -> Start:
+    """Where cv2.stereoCalibrate ends on up to `START_VIEWS` pairs: for views that leave more than one minimum.
+
+    Raises:
+        NothingToEstimate: it ends nowhere.
+    """
+    pairs = [k for k, view in enumerate(start.views) if view.left is not None and view.right is not None]
+    pairs = [pairs[k] for k in np.unique(np.linspace(0, len(pairs) - 1, START_VIEWS).astype(int))]
+    left, right = ([np.asarray(getattr(start.views[k], side), np.float32) for k in pairs] for side in CAMERAS)
+    pair = Stereo(*size, *(np.zeros(1),) * 6, np.zeros((24, 24)), 0.0).with_vector(start.vector)
+    points = [board.points_mm.astype(np.float32)] * len(pairs)
+    flags = cv2.CALIB_USE_INTRINSIC_GUESS | (cv2.CALIB_FIX_K3 if fix_k3 else 0)
+    try:
+        _, *inner, turn, shift, _, _, turns, shifts, _ = cv2.stereoCalibrateExtended(
+            points, left, right, pair.M1, pair.D1, pair.M2, pair.D2, size, np.eye(3), np.zeros((3, 1)), flags=flags
+        )
+    except cv2.error as error:
+        raise undetermined(f"OpenCV found no pair ({escaped(str(error.err), 100)})") from error
+    cameras = [
+        CameraStart(np.asarray(matrix, float), np.asarray(distortion, float).ravel()[:5], {}, 0.0)
+        for matrix, distortion in (inner[:2], inner[2:])
+    ]
+    outer = rotation_vector(np.asarray(turn)), np.ravel(shift)
+    vector = np.concatenate([cameras[0].vector, cameras[1].vector, *outer])
+    if not np.isfinite(vector).all():
+        raise undetermined("OpenCV found no finite pair")
+    found = pair.with_vector(vector)
+    own = {k: np.concatenate([np.ravel(t), np.ravel(s)]) for k, t, s in zip(pairs, turns, shifts, strict=True)}
+    poses = [own[k] if k in own else pose_of(view, board, found) for k, view in enumerate(start.views)]
+    return replace(start, vector=vector, poses=np.array(poses))
+
+
+def pairs_disagree(reason: str) -> NothingToEstimate:
+    """The refusal of pairs that do not show one board to one pair of cameras."""
+    return NothingToEstimate(
+        "pairs-disagree",
+        f"the pairs contradict each other: {reason}",
+        allowed="pictures of one moment, by cameras that are fixed to each other",
+        remedy="check that the pictures named alike were taken together (none left out on one side, both cameras "
+        "triggered or the board held still) and that no camera moved; leave out the others",
+    )
 
 
 def camera_start(
@@ -91,39 +161,126 @@ def camera_start(
     keys = sorted(corners)
     chosen = [keys[k] for k in np.unique(np.linspace(0, len(keys) - 1, START_VIEWS).astype(int))]
     points = board.points_mm.astype(np.float32)
-    flags = cv2.CALIB_FIX_K3 if fix_k3 else 0
     found = [np.ascontiguousarray(corners[k], np.float32) for k in chosen]
+    start = _zhang([points] * len(found), found, size, side, cv2.CALIB_FIX_K3 if fix_k3 else 0)
+    if start.rms_px > DOUBTFUL_START_PX:
+        # Wide lenses have local minima: k1 alone first, then all from there.
+        simple = cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST | cv2.CALIB_FIX_PRINCIPAL_POINT
+        first = _zhang([points] * len(found), found, size, side, simple)
+        flags = cv2.CALIB_USE_INTRINSIC_GUESS | (cv2.CALIB_FIX_K3 if fix_k3 else 0)
+        start = min(start, _zhang([points] * len(found), found, size, side, flags, first), key=lambda one: one.rms_px)
+    matrix, distortion = start.matrix, start.distortion
+    poses = {k: board_pose(corners[k], board, matrix, distortion) for k in keys}
+    return replace(start, poses=poses)
+
+
+def _zhang(
+    points: Sequence[np.ndarray],
+    found: Sequence[np.ndarray],
+    size: tuple[int, int],
+    side: str,
+    flags: int,
+    first: CameraStart | None = None,
+) -> CameraStart:
+    """cv2.calibrateCamera under `flags`, from `first` where given; no poses.
+
+    Raises:
+        NothingToEstimate: OpenCV finds nothing.
+    """
+    matrix, distortion = (None, None) if first is None else (first.matrix.copy(), first.distortion.copy())
     try:
-        _, matrix, distortion, *_ = cv2.calibrateCamera([points] * len(found), found, size, None, None, flags=flags)
+        rms, matrix, distortion, *_ = cv2.calibrateCamera(points, found, size, matrix, distortion, flags=flags)
     except cv2.error as error:
         raise undetermined(f"OpenCV found no start for the {side} camera ({escaped(str(error.err), 100)})") from error
     matrix, distortion = np.asarray(matrix, float), np.asarray(distortion, float).ravel()[:5]
     if not (np.isfinite(matrix).all() and np.isfinite(distortion).all()):
         raise undetermined(f"OpenCV found no finite start for the {side} camera")
-    return CameraStart(matrix, distortion, {k: board_pose(corners[k], board, matrix, distortion) for k in keys})
+    return CameraStart(matrix, distortion, {}, float(rms))
 
 
-def _relative(left: CameraStart, right: CameraStart) -> np.ndarray:
-    """R and T, (6,), as the median over pairs: one wrong pair does not move them."""
-    rotations, translations = [], []
-    for k in sorted(set(left.poses) & set(right.poses)):
-        turn = rotation_matrix(right.poses[k][:3]) @ rotation_matrix(left.poses[k][:3]).T
-        rotations.append(turn)
-        translations.append(right.poses[k][3:] - turn @ left.poses[k][3:])
-    if not rotations:
+@dataclass(frozen=True)
+class _Relation:
+    """How the cameras stand to each other: R and T, (6,), and what that leaves.
+
+    Attributes:
+        pose: rotation vector and translation.
+        misses: rms distance of the right corners from where the left ones put them, px, by pair.
+        orders: which of `corner_orders` the right corners of a pair come nearest in.
+    """
+
+    pose: np.ndarray
+    misses: dict[int, float]
+    orders: dict[int, int]
+
+    @property
+    def usual_px(self) -> float:
+        """The miss that more than half of the pairs stay within."""
+        return sorted(self.misses.values())[len(self.misses) // 2]
+
+
+def _relation(views: Sequence[View], board: Board, left: CameraStart, right: CameraStart, limit_px: float) -> _Relation:
+    """The relation in which most pairs agree.
+
+    As the corners are ordered first: the median over pairs, which one wrong pair does not move. Where that leaves most
+    pairs beyond `limit_px`, every pair in every order is tried, and the one with the least median miss counts (least
+    median of squares: Rousseeuw 1984): half turns of a symmetric board and many wrong pairs do not move it.
+    """
+    pairs = sorted(set(left.poses) & set(right.poses))
+    if not pairs:
         raise NothingToEstimate(
             "no-pairs",
             "no view shows the board to both cameras",
             remedy="name the pictures of one moment alike: left01.png and right01.png",
         )
-    return np.concatenate([rotation_vector(np.median(rotations, axis=0)), np.median(translations, axis=0)])
+    orders = corner_orders(board)
+    own = np.linalg.lstsq(board.points_mm[:, :2], np.hstack([board.points_mm[order, :2] for order in orders]))[0]
+
+    def relative(k: int, order: int) -> np.ndarray:
+        # Corner i in another order is another corner of the board, which is then turned in its plane.
+        turn = np.eye(3)
+        turn[:2, :2] = own[:, 2 * order : 2 * order + 2].T
+        rotation = rotation_matrix(right.poses[k][:3]) @ turn @ rotation_matrix(left.poses[k][:3]).T
+        return np.concatenate([rotation_vector(rotation), right.poses[k][3:] - rotation @ left.poses[k][3:]])
+
+    def judged(pose: np.ndarray) -> _Relation:
+        misses, nearest = {}, {}
+        for k in pairs:
+            by_order = _misses(views[k], board, left.poses[k], pose, right)
+            nearest[k] = int(np.argmin(by_order))
+            misses[k] = float(by_order[nearest[k]])
+        return _Relation(pose, misses, nearest)
+
+    found = judged(_median_pose([relative(k, 0) for k in pairs]))
+    if found.usual_px > limit_px and len(pairs) > 2:
+        tried = [pairs[k] for k in np.unique(np.linspace(0, len(pairs) - 1, START_VIEWS).astype(int))]
+        best = min((judged(relative(k, t)) for k in tried for t in range(len(orders))), key=lambda one: one.usual_px)
+        near = [k for k in pairs if best.misses[k] <= best.usual_px]
+        found = min(best, judged(_median_pose([relative(k, best.orders[k]) for k in near])), key=lambda r: r.usual_px)
+    return found
+
+
+def _median_pose(poses: Sequence[np.ndarray]) -> np.ndarray:
+    rotation = np.median([rotation_matrix(pose[:3]) for pose in poses], axis=0)
+    return np.concatenate([rotation_vector(rotation), np.median([pose[3:] for pose in poses], axis=0)])
+
+
+def _misses(view: View, board: Board, pose: np.ndarray, relation: np.ndarray, right: CameraStart) -> np.ndarray:
+    """By corner order, how far the right corners lie from where a board's left pose puts them, rms, px."""
+    rotation, shift = rotation_matrix(relation[:3]), relation[3:]
+    seen = rotation_vector(rotation @ rotation_matrix(pose[:3])), rotation @ pose[3:] + shift
+    pixels, _ = cv2.projectPoints(board.points_mm, *seen, right.matrix, right.distortion)
+    assert view.right is not None
+    ordered = np.stack([view.right[order] for order in corner_orders(board)])
+    return np.sqrt(np.mean(np.sum((ordered - np.reshape(pixels, (-1, 2))) ** 2, axis=2), axis=1))
 
 
 def board_pose(corners: np.ndarray, board: Board, matrix: np.ndarray, distortion: np.ndarray) -> np.ndarray:
-    """Board to camera, shape (6,), from one picture by IPPE (Collins and Bartoli 2014)."""
+    """Board to camera, shape (6,), from one picture: IPPE (Collins and Bartoli 2014), then least squares in px."""
     done, turn, shift = cv2.solvePnP(board.points_mm, pixels_of(corners), matrix, distortion, flags=cv2.SOLVEPNP_IPPE)
     if not done or not (np.isfinite(turn).all() and np.isfinite(shift).all()):
         raise undetermined("a board has no pose that OpenCV can find")
+    # IPPE undistorts by a few iterations, which is not enough at the edge of a wide lens.
+    turn, shift = cv2.solvePnPRefineLM(board.points_mm, pixels_of(corners), matrix, distortion, turn, shift)
     return np.concatenate([np.ravel(turn), np.ravel(shift)])
 
 

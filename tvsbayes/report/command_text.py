@@ -187,9 +187,10 @@ def stereo_calibration_text(result: StereoCalibration) -> str:
             "no board found": found.without_board,
             "another size, not used": found.other_size,
             "found by the other finder": found.by_fallback,
-            "right corners turned to agree": found.reordered,
         }
         lines += [f"{what}: {escaped(', '.join(names), 400)}" for what, names in lists.items() if names]
+    if result.reordered:
+        lines.append(f"right corners turned to agree: {escaped(', '.join(result.reordered), 400)}")
     if result.excluded:
         lines.append(f"left out: {escaped(', '.join(result.excluded), 400)}")
     lines += [f"warning: {warning}" for warning in result.warnings]

@@ -181,4 +181,20 @@ FAULTS = (
         "the covariance of the cameras is too small",
         ("cameras/stereo_calibration::test_degrees_of_freedom_are_coordinates_less_unknowns",),
     ),
+    Fault(
+        "pairs of two moments are calibrated",
+        "cameras/stereo_start.py",
+        "if found.usual_px > DISAGREE_SHARE * size[0]:",
+        "if found.usual_px > size[0]:",
+        "pictures that were not taken together give a calibration, or a refusal about coverage",
+        ("cameras/stereo_calibration::test_pictures_all_of_two_moments_are_refused",),
+    ),
+    Fault(
+        "turned corners stay turned",
+        "cameras/stereo_start.py",
+        "if found.orders.get(k, 0) and k not in off:",
+        "if found.orders.get(k, 0) < 0:",
+        "a symmetric board that one finder turned spoils the calibration",
+        ("cameras/stereo_calibration::test_corners_in_another_order_are_put_right_and_named",),
+    ),
 )
