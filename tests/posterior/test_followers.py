@@ -10,7 +10,8 @@ from scipy import stats
 from support.small_posterior import SIGMAS
 from support.tabulated import tabulated
 
-from tvsbayes.posterior.proposal import LEADER_NODES, NODES, Followers, Independence, Tables, first_proposal
+from tvsbayes.posterior.proposal import Independence, first_proposal
+from tvsbayes.posterior.tables import LEADER_NODES, NODES, Followers, Tables
 
 GRID = np.linspace(-12.0, 16.0, 561)
 

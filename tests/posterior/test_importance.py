@@ -21,8 +21,9 @@ from tvsbayes.estimators.joint_fit import fit
 from tvsbayes.files.disk import shipped_data
 from tvsbayes.posterior import importance
 from tvsbayes.posterior.importance import Pool, empty_pool, importance_run, lacking, reweighted_posterior
-from tvsbayes.posterior.proposal import Independence, Tables, Target, Valued
+from tvsbayes.posterior.proposal import Independence, Target, Valued
 from tvsbayes.posterior.sampling import sample
+from tvsbayes.posterior.tables import Tables
 from tvsbayes.statistics.weighted_draws import smoothed_weights, weighted_summary
 
 SEED = 3
@@ -31,7 +32,9 @@ SEED = 3
 def normal(mean: float, sd: float, dimension: int) -> Independence:
     """Without tabulated or coupled coordinates."""
     nothing, tables = np.zeros(0, int), Tables(np.zeros((0, 41)))
-    return Independence(np.full(dimension, mean), np.full(dimension, sd), nothing, tables, nothing, no_followers())
+    straight = np.zeros(dimension), np.eye(dimension)
+    mean, sd = np.full(dimension, mean), np.full(dimension, sd)
+    return Independence(mean, sd, nothing, tables, nothing, no_followers(), *straight)
 
 
 class Skewed:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from tvsbayes.posterior.proposal import LEADER_NODES, NODES, Followers, Independence, Tables
+from tvsbayes.posterior.proposal import Independence
+from tvsbayes.posterior.tables import LEADER_NODES, NODES, Followers, Tables
 
 
 def tabulated(mean: np.ndarray, sd: np.ndarray, places: np.ndarray) -> Independence:
@@ -12,7 +13,8 @@ def tabulated(mean: np.ndarray, sd: np.ndarray, places: np.ndarray) -> Independe
     at = (NODES - mean[places, None]) / sd[places, None]
     tables, coupled = Tables.normalised(-at - np.exp(-at)), np.flatnonzero(np.arange(len(mean)) % 4 == 0)
     none = no_followers()
-    return Independence(mean, sd, places, tables, coupled, none).moved(mean, sd, tables, none)
+    straight = np.zeros(len(mean)), np.eye(len(mean))
+    return Independence(mean, sd, places, tables, coupled, none, *straight).moved(mean, sd, tables, none)
 
 
 def no_followers() -> Followers:

@@ -20,10 +20,11 @@ from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.files.disk import read_arrays, write_atomically
 from tvsbayes.instrument.campaign import input_hashes
 from tvsbayes.posterior.importance import ImportanceRun, Pool, reweighted_posterior
-from tvsbayes.posterior.proposal import Followers, Independence, Tables
+from tvsbayes.posterior.proposal import Independence
+from tvsbayes.posterior.tables import Followers, Tables
 from tvsbayes.posterior.transport import Transport
 
-CHAIN_FORMAT = "tvsbayes-chain/5"
+CHAIN_FORMAT = "tvsbayes-chain/6"
 CHAIN_BYTES_MAX = 2**32
 """A chain is the user's own file: what was in memory when it was written fits there again."""
 
@@ -78,17 +79,20 @@ def _pool_arrays(pool: Pool) -> dict[str, np.ndarray]:
         "proposal_leader": pool.next_proposal.followers.leader,
         "proposal_follower": pool.next_proposal.followers.follower,
         "proposal_followers": np.stack([each.followers.log_density for each in every]),
+        "proposal_origin": np.stack([each.origin for each in every]),
+        "proposal_turn": np.stack([each.turn for each in every]),
     }
 
 
 def _pool_of(stored: dict[str, np.ndarray]) -> Pool:
     """The pool of `_pool_arrays`."""
-    parts = zip(*(stored[f"proposal_{part}"] for part in ("mean", "sd", "tables", "followers")), strict=True)
+    names = "mean", "sd", "tables", "followers", "origin", "turn"
+    parts = zip(*(stored[f"proposal_{name}"] for name in names), strict=True)
     places, coupled = stored["proposal_places"], stored["proposal_coupled"]
     leads = stored["proposal_leader"], stored["proposal_follower"]
     every = tuple(
-        Independence(mean, sd, places, Tables(table), coupled, Followers(*leads, rows))
-        for mean, sd, table, rows in parts
+        Independence(mean, sd, places, Tables(table), coupled, Followers(*leads, rows), origin, turn)
+        for mean, sd, table, rows, origin, turn in parts
     )
     counts = tuple(stored["pool_counts"].tolist())
     draws = stored["pool_w"], stored["pool_log_target"], stored["pool_place_errors_rad"]

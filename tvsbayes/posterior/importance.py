@@ -33,7 +33,7 @@ ROUND = 1024
 FITTED_ROUNDS = 3
 """Rounds after each of which the proposal is fitted to all draws so far; later ones are drawn from the last."""
 ROUNDS_MAX = 32
-ESS_WANTED = 2000
+ESS_WANTED = 1000
 """Effective draws of the worst statistic of the worst headline at which no further round is drawn ..."""
 ESS_LIMIT = 400
 """... and fewer than which are not accepted."""

@@ -16,13 +16,9 @@ from scipy import special
 from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.estimators.likelihood import evaluate, no_draw
 from tvsbayes.model.compiled import in_batches
+from tvsbayes.posterior.tables import LEADER_NODES, NODES, Followers, Tables
 from tvsbayes.posterior.transport import Transport
 
-NODES = np.linspace(-8.0, 12.0, 41)
-"""Of the tabulated densities, in w. Noise scales have their long tail above."""
-STEP = float(NODES[1] - NODES[0])
-FLOOR = -40.0
-"""Of a tabulated log density below its largest: what lies lower is never drawn, and nought has no logarithm."""
 HEAVY_DOF = 5.0
 """Of all t distributions but the one of the coupled coordinates."""
 OWN_SHARE = 0.1
@@ -37,6 +33,17 @@ INFLATION = 1.03
 """Factor on the proposal's sds: one lighter than the target lets single draws weigh much, and walkers freeze."""
 VARIANCE_RANGE = 0.8, 1.7
 """Of a normal coordinate of the proposal, relative to the Laplace approximation's."""
+TURN_RANGE = 0.4, 2.5
+"""Of the precisions along the principal axes by which one fit turns normal coordinates, 1 where it does not."""
+LEAN_LIMIT = 0.5
+"""Largest step of a tabulated coordinate, in its sds, for a step of one sd of another, by one fit."""
+PAIR_T = 3.2
+"""Coefficient over its standard error from which the product of two coordinates is taken into a regression: of 2000
+products of independent coordinates three get there by chance."""
+PAIR_SEARCHES = 3
+"""How often products are looked for in what the regression leaves: large ones hide small ones."""
+PAIR_DRAWS = 16
+"""Draws for each product, at least."""
 TILT_LIMITS = 0.5, 0.2
 """Largest slope and curvature by which one fit changes a tabulated log density, per sd and its square."""
 REACH = 4.0
@@ -97,101 +104,50 @@ def _log_t(distance2: np.ndarray, dimension: int, dof: float = HEAVY_DOF) -> np.
 
 
 @dataclass(frozen=True)
-class Tables:
-    """Densities of h coordinates whose logarithm is a broken line through `NODES`, shape (h, nodes), nought outside."""
-
-    log_density: np.ndarray
-
-    @classmethod
-    def normalised(cls, log_density: np.ndarray) -> Tables:
-        """From log densities up to a constant each, -inf and NaN where there is none."""
-        seen = np.where(np.isfinite(log_density), log_density, -np.inf)
-        seen = np.maximum(seen - seen.max(axis=1, keepdims=True), FLOOR)
-        return cls(seen - np.log(cls(seen).masses.sum(axis=1, keepdims=True)))
-
-    @cached_property
-    def masses(self) -> np.ndarray:
-        """Probability between neighbouring nodes, shape (h, nodes - 1)."""
-        low, rise = self.log_density[:, :-1], np.diff(self.log_density)
-        steep = np.abs(rise) > 1e-9
-        return STEP * np.exp(low) * np.where(steep, np.expm1(rise) / np.where(steep, rise, 1.0), 1.0)
-
-    @cached_property
-    def moments(self) -> tuple[np.ndarray, np.ndarray]:
-        """Means and sds, shape (h,) each, by the trapezoid rule on ten points a step."""
-        x = np.linspace(NODES[0], NODES[-1], 10 * (len(NODES) - 1) + 1)
-        lines = np.array([np.interp(x, NODES, each) for each in self.log_density])
-        density = np.exp(lines.reshape(len(self.log_density), len(x)))
-        density /= density.sum(axis=1, keepdims=True)
-        mean = density @ x
-        return mean, np.sqrt(density @ x**2 - mean**2)
-
-    def at(self, w: np.ndarray) -> np.ndarray:
-        """Log densities of w (n, h)."""
-        every = zip(w.T, self.log_density, strict=True)
-        found = [np.interp(x, NODES, line, left=-np.inf, right=-np.inf) for x, line in every]
-        return np.reshape(np.transpose(found), w.shape)
-
-    def draw(self, share: np.ndarray) -> np.ndarray:
-        """Points (n, h) below which these shares (n, h) of the densities lie."""
-        found = np.empty(share.shape)
-        for k, line in enumerate(self.log_density):
-            reached = np.concatenate([[0.0], np.cumsum(self.masses[k])])
-            node = np.clip(np.searchsorted(reached, share[:, k], side="right") - 1, 0, len(NODES) - 2)
-            low, slope = line[node], np.diff(line)[node] / STEP
-            rest = (share[:, k] - reached[node]) * np.exp(-low)
-            steep = np.abs(slope) > 1e-9
-            along = np.where(steep, np.log1p(rest * slope) / np.where(steep, slope, 1.0), rest)
-            found[:, k] = NODES[node] + np.clip(along, 0.0, STEP)
-        return found
-
-
-LEADER_NODES = np.linspace(-4.0, 4.0, 11)
-"""Places of a leader, in w, at which its follower has tables of its own."""
-
-
-@dataclass(frozen=True)
-class Followers:
-    """Coordinates whose density depends on another: of two scales that explain the same scatter one may be large.
-
-    Between a leader's nodes the two tables are mixed.
+class Regression:
+    """Of the log of a ratio of densities on coordinates (d), their squares, and those products that tell something.
 
     Attributes:
-        leader, follower: their rows among the tabulated coordinates, shape (f,) each.
-        log_density: of the follower at `NODES`, by the leader's node, shape (f, leader nodes, nodes).
+        slope, square: coefficients, shape (d,).
+        cross: of products, symmetric, nought where none was taken, shape (d, d).
     """
 
-    leader: np.ndarray
-    follower: np.ndarray
-    log_density: np.ndarray
+    slope: np.ndarray
+    square: np.ndarray
+    cross: np.ndarray
 
-    def share(self, leaders: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Node below leaders (n,) and the share of the node above."""
-        at = np.clip((leaders - LEADER_NODES[0]) / (LEADER_NODES[1] - LEADER_NODES[0]), 0, len(LEADER_NODES) - 1)
-        node = np.minimum(at.astype(int), len(LEADER_NODES) - 2)
-        return node, at - node
 
-    def at(self, w: np.ndarray) -> np.ndarray:
-        """Log densities of the followers, shape (n, f), of tabulated coordinates w (n, h)."""
-        found = np.empty((len(w), len(self.leader)))
-        for k, (leader, follower) in enumerate(zip(self.leader, self.follower, strict=True)):
-            node, above = self.share(w[:, leader])
-            rows = Tables(self.log_density[k]).at(np.repeat(w[:, [follower]], len(LEADER_NODES), axis=1))
-            every = np.arange(len(w))
-            low, high = rows[every, node], rows[every, node + 1]
-            with np.errstate(divide="ignore"):
-                found[:, k] = np.logaddexp(np.log1p(-above) + low, np.log(above) + high)
-        return found
+def regression(x: np.ndarray, log_ratio: np.ndarray) -> Regression:
+    """Products are taken where what the others leave asks for them (forward selection).
 
-    def drawn(self, w: np.ndarray, share: np.ndarray, chance: np.ndarray) -> np.ndarray:
-        """Tabulated coordinates (n, h) with their followers drawn anew: shares (n, h) of densities, chances (n, f)."""
-        found = w.copy()
-        for k, (leader, follower) in enumerate(zip(self.leader, self.follower, strict=True)):
-            node, above = self.share(w[:, leader])
-            chosen = node + (chance[:, k] < above)
-            rows = Tables(self.log_density[k]).draw(np.repeat(share[:, [follower]], len(LEADER_NODES), axis=1))
-            found[:, follower] = rows[np.arange(len(w)), chosen]
-        return found
+    All d (d - 1) / 2 of them would add more scatter than they explain.
+
+    Args:
+        x: coordinates in units of their sds, shape (n, d).
+        log_ratio: shape (n,).
+    """
+    count, dimension = x.shape
+    design = np.column_stack([np.ones(count), x, x**2])
+    open_pairs = np.triu(np.ones((dimension, dimension), dtype=bool), 1)
+    pairs = np.zeros((0, 2), dtype=int)
+    spread = np.sqrt((x**2).T @ x**2)
+    for search in range(PAIR_SEARCHES + 1):
+        products = x[:, pairs[:, 0]] * x[:, pairs[:, 1]]
+        whole = np.concatenate([design, products], axis=1)
+        found = np.linalg.lstsq(whole, log_ratio, rcond=None)[0]
+        rest = log_ratio - whole @ found
+        t = np.where(open_pairs, np.abs((x * rest[:, None]).T @ x) / (spread * np.std(rest)), 0.0)
+        new = np.argwhere(t > PAIR_T)
+        room = count // PAIR_DRAWS - len(pairs)
+        if search == PAIR_SEARCHES or not len(new) or room <= 0:
+            break
+        new = new[np.argsort(-t[tuple(new.T)])[:room]]
+        open_pairs[tuple(new.T)] = False
+        pairs = np.concatenate([pairs, new])
+    _, slope, square, product = np.split(found, [1, 1 + dimension, 1 + 2 * dimension])
+    cross = np.zeros((dimension, dimension))
+    cross[tuple(pairs.T)] = product
+    return Regression(slope, square, cross + cross.T)
 
 
 @dataclass(frozen=True)
@@ -207,6 +163,8 @@ class Independence:
         tables: their densities.
         coupled: places of the coupled coordinates, shape (c,).
         followers: those of them that depend on another; their tables stand for means and sds alone.
+        origin, turn: w = origin + turn v, shapes (d,) and (d, d). Independent are the coordinates v; means, sds and
+            tables are theirs.
     """
 
     mean: np.ndarray
@@ -215,34 +173,76 @@ class Independence:
     tables: Tables
     coupled: np.ndarray
     followers: Followers
+    origin: np.ndarray
+    turn: np.ndarray
 
     def moved(self, mean: np.ndarray, sd: np.ndarray, tables: Tables, followers: Followers) -> Independence:
         """Of other means, sds and tables; those of tabulated coordinates are as their tables have them."""
         mean, sd = mean.copy(), sd.copy()
         mean[self.places], sd[self.places] = tables.moments
         sd[self.places] *= INFLATION
-        return Independence(mean, sd, self.places, tables, self.coupled, followers)
+        return replace(self, mean=mean, sd=sd, tables=tables, followers=followers)
 
-    def _each(self, w: np.ndarray) -> np.ndarray:
-        """Log densities of the coordinates one by one, shape (n, d)."""
-        distance2 = ((w - self.mean) / self.sd) ** 2
+    def turned(self, cross: np.ndarray) -> Independence:
+        """With products of coordinates in its log density.
+
+        Normal coordinates get the covariance that belongs to their products, and lean on tabulated ones; of two
+        tabulated ones the later leans on the earlier.
+
+        Args:
+            cross: coefficients of products of (v - mean) / sd, symmetric, shape (d, d).
+        """
+        tabulated = np.isin(np.arange(len(self.mean)), self.places)
+        plain = np.flatnonzero(~tabulated)
+        values, vectors = np.linalg.eigh(np.eye(len(plain)) - cross[np.ix_(plain, plain)])
+        covariance = (vectors / np.clip(values, *TURN_RANGE)) @ vectors.T
+        step = np.eye(len(self.mean))
+        step[np.ix_(plain, plain)] = np.linalg.cholesky(covariance)
+        lean = np.eye(len(self.places))
+        lean += np.clip(np.tril(cross[np.ix_(self.places, self.places)], -1), -LEAN_LIMIT, LEAN_LIMIT)
+        step[np.ix_(self.places, self.places)] = lean
+        step[np.ix_(plain, self.places)] = covariance @ cross[np.ix_(plain, self.places)] @ lean
+        step *= self.sd[:, None] / self.sd
+        return replace(self, origin=self.to_w(self.mean - step @ self.mean), turn=self.turn @ step)
+
+    @cached_property
+    def _back(self) -> np.ndarray:
+        return np.linalg.inv(self.turn)
+
+    @cached_property
+    def _log_volume(self) -> float:
+        """Ln |dw/dv|."""
+        return float(np.linalg.slogdet(self.turn)[1])
+
+    def to_v(self, w: np.ndarray) -> np.ndarray:
+        """From w (n, d) to v."""
+        return (w - self.origin) @ self._back.T
+
+    def to_w(self, v: np.ndarray) -> np.ndarray:
+        """From v (n, d) to w."""
+        return self.origin + v @ self.turn.T
+
+    def _each(self, v: np.ndarray) -> np.ndarray:
+        """Log densities of the coordinates v one by one, shape (n, d)."""
+        distance2 = ((v - self.mean) / self.sd) ** 2
         found = -0.5 * np.log(2 * np.pi) - 0.5 * distance2 - np.log(self.sd)
         single = _log_t(distance2[:, self.places], 1) - np.log(self.sd[self.places])
-        table = self.tables.at(w[:, self.places])
-        table[:, self.followers.follower] = self.followers.at(w[:, self.places])
+        table = self.tables.at(v[:, self.places])
+        table[:, self.followers.follower] = self.followers.at(v[:, self.places])
         found[:, self.places] = np.logaddexp(np.log(1 - OWN_SHARE) + table, np.log(OWN_SHARE) + single)
         return found
 
     def log_density(self, w: np.ndarray) -> np.ndarray:
         """Log density, shape (n,)."""
-        each, log_sd, some = self._each(w), np.log(self.sd), self.coupled
-        distance2 = ((w - self.mean) / self.sd) ** 2
+        v = self.to_v(w)
+        each, log_sd, some = self._each(v), np.log(self.sd), self.coupled
+        distance2 = ((v - self.mean) / self.sd) ** 2
         alone = np.sum(each, axis=1)
         partly = _log_t(np.sum(distance2[:, some], axis=1) / COUPLED_WIDTH**2, len(some), COUPLED_DOF)
         partly += alone - np.sum(each[:, some], axis=1) - np.sum(log_sd[some] + np.log(COUPLED_WIDTH))
         whole = _log_t(np.sum(distance2, axis=1), len(log_sd)) - np.sum(log_sd)
         shares = np.log([1 - COUPLED_SHARE - HEAVY_SHARE, COUPLED_SHARE, HEAVY_SHARE])
-        return np.logaddexp.reduce(shares[:, None] + np.stack([alone, partly, whole]), axis=0)
+        return np.logaddexp.reduce(shares[:, None] + np.stack([alone, partly, whole]), axis=0) - self._log_volume
 
     def draw(self, count: int, generator: np.random.RandomState) -> np.ndarray:
         """Independent draws, shape (count, d)."""
@@ -264,7 +264,7 @@ class Independence:
         found[:, self.places] = np.where(alone, single, self.followers.drawn(led, share, chances))
         some = np.isin(np.arange(len(self.mean)), self.coupled)
         found = np.where((chance < COUPLED_SHARE) & some, self.mean + self.sd * normal / partly, found)
-        return np.where(chance > 1 - HEAVY_SHARE, self.mean + self.sd * normal / whole, found)
+        return self.to_w(np.where(chance > 1 - HEAVY_SHARE, self.mean + self.sd * normal / whole, found))
 
     def __call__(self, w: np.ndarray, generator: np.random.RandomState) -> tuple[np.ndarray, np.ndarray]:
         """The protocol of `emcee.moves.MHMove`."""
@@ -274,9 +274,9 @@ class Independence:
     def fitted(self, w: np.ndarray, log_target: np.ndarray, log_weights: np.ndarray) -> Independence:
         """Nearer to the target, as weighted draws show it; the same where too few of them matter.
 
-        Where the target is the proposal but for means and sds, the log of their ratio is linear in w and w^2: the
-        coefficients give both, and tilt the tables. A regression on the draws that matter is far steadier than
-        weighted moments.
+        Where the target is the proposal but for means and covariance, the log of their ratio is linear in v and the
+        products of its coordinates: the coefficients give both, and tilt the tables. A regression on the draws that
+        matter is far steadier than weighted moments.
 
         Args:
             w: draws, shape (n, d).
@@ -286,16 +286,16 @@ class Independence:
         matters = np.isfinite(log_weights) & (log_weights > np.max(log_weights) - MATTERS)
         if matters.sum() <= 8 * len(self.mean):
             return self
-        near = np.clip((w[matters] - self.mean) / self.sd, -REACH, REACH)
-        design = np.column_stack([np.ones(len(near)), near, near**2])
-        ratio = log_target[matters] - self._each(w[matters]).sum(axis=1)
-        slope, square = np.split(np.linalg.lstsq(design, ratio, rcond=None)[0][1:], 2)
-        variance = 1 / np.clip(1 - 2 * square, 0.6, 1.6)
-        mean = self.mean + self.sd * np.clip(slope * variance, -1.0, 1.0)
+        v = self.to_v(w[matters])
+        near = np.clip((v - self.mean) / self.sd, -REACH, REACH)
+        found = regression(near, log_target[matters] - self._each(v).sum(axis=1))
+        variance = 1 / np.clip(1 - 2 * found.square, 0.6, 1.6)
+        mean = self.mean + self.sd * np.clip(found.slope * variance, -1.0, 1.0)
         sd = INFLATION * np.sqrt(np.clip(self.sd**2 * variance, *VARIANCE_RANGE))
         at = np.clip((NODES - self.mean[self.places, None]) / self.sd[self.places, None], -REACH, REACH)
         tilt, bend = (
-            np.clip(x[self.places, None], -limit, limit) for x, limit in zip((slope, square), TILT_LIMITS, strict=True)
+            np.clip(x[self.places, None], -limit, limit)
+            for x, limit in zip((found.slope, found.square), TILT_LIMITS, strict=True)
         )
         change = tilt * at + bend * at**2
         every = [
@@ -303,7 +303,8 @@ class Independence:
             for rows, row in zip(self.followers.log_density, self.followers.follower, strict=True)
         ]
         followers = replace(self.followers, log_density=np.reshape(every, self.followers.log_density.shape))
-        return self.moved(mean, sd, Tables.normalised(self.tables.log_density + change), followers)
+        straight = self.moved(mean, sd, Tables.normalised(self.tables.log_density + change), followers)
+        return straight.turned(found.cross * np.sqrt(np.outer(variance, variance)))
 
 
 def first_proposal(
@@ -349,5 +350,6 @@ def first_proposal(
     followers = Followers(leader, follower, conditional)
     tables = Tables.normalised(lines)
     mean, sd = np.zeros(dimension), np.full(dimension, INFLATION)
-    first = Independence(mean, sd, places, tables, np.flatnonzero(coupled), followers)
+    together, nought = np.flatnonzero(coupled), np.zeros(dimension)
+    first = Independence(mean, sd, places, tables, together, followers, nought, np.eye(dimension))
     return first.moved(mean, sd, tables, followers)

@@ -15,7 +15,7 @@ from scipy import linalg
 from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.estimators.likelihood import evaluate, no_draw
 from tvsbayes.estimators.linear_spots import LinearSpots, linear_spots, stop_information
-from tvsbayes.instrument.parameters import GEAR_ERROR_NAMES, INDEX, KINDS, NAMES, NOISE_NAMES, names_of
+from tvsbayes.instrument.parameters import INDEX, KINDS, NAMES, NOISE_NAMES, names_of
 from tvsbayes.model.compiled import in_batches
 from tvsbayes.model.parameter_space import STOP_COLUMNS
 from tvsbayes.posterior.transport import GEAR_SCALES, STRETCH_NODES, Transport
@@ -28,9 +28,6 @@ SHEAR_STEP = 0.5
 STATES_MAX = 64
 """Most stop errors for which the whole covariance follows the noise scales of every walker. With more stops its
 matrices cost several times the density, the scales are known better, and widths from a table do."""
-UNTABLED_NAMES = GEAR_ERROR_NAMES
-"""Noise scales for which no table of widths is made: the map follows those of the gears, and few coordinates see the
-drift."""
 STRETCH_LIMITS = 1e-2, 1e2
 """Of the information of a coordinate, 1 at the mode."""
 
@@ -226,7 +223,7 @@ def bends(route: Transport, residuals: Residuals) -> np.ndarray:
 def stretches(route: Transport, residuals: Residuals) -> np.ndarray:
     """Table of widths, shape (q, nodes, d): the data's share of each place's information as a noise scale goes."""
     stretch = np.zeros_like(route.stretch)
-    followed = np.isin(np.array(NAMES)[route.free[route.noise]], UNTABLED_NAMES, invert=True)
+    followed = np.isin(route.free[route.noise], GEAR_SCALES, invert=True)
     for which, place in zip(np.flatnonzero(followed), route.noise[followed], strict=True):
         later = route.geometry[route.geometry > place]
         shares = []

@@ -69,7 +69,7 @@ FAULTS = (
     ),
     Fault(
         "followers that know nothing of their leader",
-        "posterior/proposal.py",
+        "posterior/tables.py",
         "chosen = node + (chance[:, k] < above)",
         "chosen = node + (chance[:, k] < 2.0)",
         "draws are weighted by a density that is not theirs",
@@ -302,12 +302,28 @@ FAULTS = (
     ),
     Fault(
         "tabulated coordinates drawn from a flat density between nodes",
-        "posterior/proposal.py",
+        "posterior/tables.py",
         "along = np.where(steep, np.log1p(rest * slope) / np.where(steep, slope, 1.0), rest)",
         "along = STEP * (share[:, k] - reached[node]) / self.masses[k][node]",
         "weights belong to another proposal than the draws",
         ("posterior/proposal",),
         survived="read: the same density to half a node; moments of 200 000 draws tell it.",
+    ),
+    Fault(
+        "density of turned coordinates without the volume of the turn",
+        "posterior/proposal.py",
+        "np.stack([alone, partly, whole]), axis=0) - self._log_volume",
+        "np.stack([alone, partly, whole]), axis=0)",
+        "draws of rounds turned otherwise are weighed wrongly against each other",
+        ("posterior/turned_proposal",),
+    ),
+    Fault(
+        "products looked for in the ratio, not in what the regression leaves",
+        "posterior/proposal.py",
+        "np.abs((x * rest[:, None]).T @ x)",
+        "np.abs((x * log_ratio[:, None]).T @ x)",
+        "coordinates are turned where nothing asks for it, and fewer draws count",
+        ("posterior/turned_proposal",),
     ),
     Fault(
         "coupled coordinates drawn as wide as the others",

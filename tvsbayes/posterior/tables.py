@@ -1,0 +1,115 @@
+"""Densities of single coordinates by tables, and of coordinates that follow another: exact densities, exact draws.
+
+Coordinates w of `posterior.transport`; a table is a broken line through the logarithm at `NODES`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+NODES = np.linspace(-8.0, 12.0, 41)
+"""Of the tabulated densities, in w. Noise scales have their long tail above."""
+STEP = float(NODES[1] - NODES[0])
+FLOOR = -40.0
+"""Of a tabulated log density below its largest: what lies lower is never drawn, and nought has no logarithm."""
+
+
+@dataclass(frozen=True)
+class Tables:
+    """Densities of h coordinates whose logarithm is a broken line through `NODES`, shape (h, nodes), nought outside."""
+
+    log_density: np.ndarray
+
+    @classmethod
+    def normalised(cls, log_density: np.ndarray) -> Tables:
+        """From log densities up to a constant each, -inf and NaN where there is none."""
+        seen = np.where(np.isfinite(log_density), log_density, -np.inf)
+        seen = np.maximum(seen - seen.max(axis=1, keepdims=True), FLOOR)
+        return cls(seen - np.log(cls(seen).masses.sum(axis=1, keepdims=True)))
+
+    @cached_property
+    def masses(self) -> np.ndarray:
+        """Probability between neighbouring nodes, shape (h, nodes - 1)."""
+        low, rise = self.log_density[:, :-1], np.diff(self.log_density)
+        steep = np.abs(rise) > 1e-9
+        return STEP * np.exp(low) * np.where(steep, np.expm1(rise) / np.where(steep, rise, 1.0), 1.0)
+
+    @cached_property
+    def moments(self) -> tuple[np.ndarray, np.ndarray]:
+        """Means and sds, shape (h,) each, by the trapezoid rule on ten points a step."""
+        x = np.linspace(NODES[0], NODES[-1], 10 * (len(NODES) - 1) + 1)
+        lines = np.array([np.interp(x, NODES, each) for each in self.log_density])
+        density = np.exp(lines.reshape(len(self.log_density), len(x)))
+        density /= density.sum(axis=1, keepdims=True)
+        mean = density @ x
+        return mean, np.sqrt(density @ x**2 - mean**2)
+
+    def at(self, w: np.ndarray) -> np.ndarray:
+        """Log densities of w (n, h)."""
+        every = zip(w.T, self.log_density, strict=True)
+        found = [np.interp(x, NODES, line, left=-np.inf, right=-np.inf) for x, line in every]
+        return np.reshape(np.transpose(found), w.shape)
+
+    def draw(self, share: np.ndarray) -> np.ndarray:
+        """Points (n, h) below which these shares (n, h) of the densities lie."""
+        found = np.empty(share.shape)
+        for k, line in enumerate(self.log_density):
+            reached = np.concatenate([[0.0], np.cumsum(self.masses[k])])
+            node = np.clip(np.searchsorted(reached, share[:, k], side="right") - 1, 0, len(NODES) - 2)
+            low, slope = line[node], np.diff(line)[node] / STEP
+            rest = (share[:, k] - reached[node]) * np.exp(-low)
+            steep = np.abs(slope) > 1e-9
+            along = np.where(steep, np.log1p(rest * slope) / np.where(steep, slope, 1.0), rest)
+            found[:, k] = NODES[node] + np.clip(along, 0.0, STEP)
+        return found
+
+
+LEADER_NODES = np.linspace(-4.0, 4.0, 11)
+"""Places of a leader, in w, at which its follower has tables of its own."""
+
+
+@dataclass(frozen=True)
+class Followers:
+    """Coordinates whose density depends on another: of two scales that explain the same scatter one may be large.
+
+    Between a leader's nodes the two tables are mixed.
+
+    Attributes:
+        leader, follower: their rows among the tabulated coordinates, shape (f,) each.
+        log_density: of the follower at `NODES`, by the leader's node, shape (f, leader nodes, nodes).
+    """
+
+    leader: np.ndarray
+    follower: np.ndarray
+    log_density: np.ndarray
+
+    def share(self, leaders: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Node below leaders (n,) and the share of the node above."""
+        at = np.clip((leaders - LEADER_NODES[0]) / (LEADER_NODES[1] - LEADER_NODES[0]), 0, len(LEADER_NODES) - 1)
+        node = np.minimum(at.astype(int), len(LEADER_NODES) - 2)
+        return node, at - node
+
+    def at(self, w: np.ndarray) -> np.ndarray:
+        """Log densities of the followers, shape (n, f), of tabulated coordinates w (n, h)."""
+        found = np.empty((len(w), len(self.leader)))
+        for k, (leader, follower) in enumerate(zip(self.leader, self.follower, strict=True)):
+            node, above = self.share(w[:, leader])
+            rows = Tables(self.log_density[k]).at(np.repeat(w[:, [follower]], len(LEADER_NODES), axis=1))
+            every = np.arange(len(w))
+            low, high = rows[every, node], rows[every, node + 1]
+            with np.errstate(divide="ignore"):
+                found[:, k] = np.logaddexp(np.log1p(-above) + low, np.log(above) + high)
+        return found
+
+    def drawn(self, w: np.ndarray, share: np.ndarray, chance: np.ndarray) -> np.ndarray:
+        """Tabulated coordinates (n, h) with their followers drawn anew: shares (n, h) of densities, chances (n, f)."""
+        found = w.copy()
+        for k, (leader, follower) in enumerate(zip(self.leader, self.follower, strict=True)):
+            node, above = self.share(w[:, leader])
+            chosen = node + (chance[:, k] < above)
+            rows = Tables(self.log_density[k]).draw(np.repeat(share[:, [follower]], len(LEADER_NODES), axis=1))
+            found[:, follower] = rows[np.arange(len(w)), chosen]
+        return found
