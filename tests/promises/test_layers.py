@@ -37,7 +37,7 @@ JAX_FREE_PACKAGES = (
     *("coordinates", "positioner", "acquisition", "report"),
 )
 JAX_FREE_MODULES = (
-    *("statistics.intervals", "estimators.four_point", "estimators.plausibility"),
+    *("statistics.intervals", "estimators.four_point", "estimators.spot_pattern", "estimators.plausibility"),
     *("comparison.gap", "comparison.changes", "comparison.held_out"),
 )
 """Free of JAX until a function that fits is called, in packages that are not."""

@@ -6,15 +6,18 @@ Depths are triangulated, mm along X of frame S; counters in steps. Sentences for
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 
 import numpy as np
 
 from tvsbayes.errors import listed
-from tvsbayes.estimators.four_point import select_experiments
+from tvsbayes.estimators.four_point import SkippedExperiment, select_experiments
+from tvsbayes.estimators.spot_pattern import pattern_doubts, pattern_of
 from tvsbayes.instrument.axes import AXES
 from tvsbayes.instrument.campaign import Campaign, pixels_of
+from tvsbayes.instrument.parameters import names_of
 from tvsbayes.instrument.stereo_pair import pair_doubts, triangulate
 from tvsbayes.instrument.stops import observed_stops, separation
 
@@ -22,6 +25,10 @@ NEAREST_SHEET_MM, FARTHEST_SHEET_MM = 20.0, 100_000.0
 """Depths between which a sheet can stand: nearer than a lens barrel, or beyond a hall, is a mismatched pair."""
 SHORTEST_BASELINE_MM = 2.0
 """Two lenses cannot stand closer; the longest baseline in metres that anybody calls a stereo pair is shorter."""
+SHORTEST_MM = 0.5
+"""Nothing of a rig that is stated at all is shorter, and no length in metres is longer."""
+ODD_SHARE = 0.1
+"""Share of spots at impossible depths from which the others tell nothing of counters and names."""
 SPOTS_LISTED = 10
 SHALLOW = 1.2
 """Ratio of the largest to the smallest depth below which the sheet stood at one place (the paper's: 1.6)."""
@@ -45,23 +52,23 @@ class CampaignCheck:
         return {"kind": "campaign", **asdict(self), "warnings": list(self.warnings)}
 
 
-def _depths_mm(campaign: Campaign) -> np.ndarray:
-    """X of the usable spots, frame S; not a number where no undistorted point is seen."""
-    return triangulate(campaign.stereo, pixels_of(s for s in campaign.spots if s.status == "ok"))[:, 0]
+def _points_mm(campaign: Campaign) -> np.ndarray:
+    """The usable spots in frame S, (n, 3); not a number where no undistorted point is seen."""
+    return triangulate(campaign.stereo, pixels_of(s for s in campaign.spots if s.status == "ok"))
 
 
 def _can_stand(depths_mm: np.ndarray) -> np.ndarray:
     return (depths_mm > NEAREST_SHEET_MM) & (depths_mm < FARTHEST_SHEET_MM)
 
 
-def implausible(campaign: Campaign, depths_mm: np.ndarray | None = None) -> tuple[str, ...]:
-    """What no rig can have measured: wrong units, swapped cameras, words that miss their spelling.
+def implausible(campaign: Campaign, points_mm: np.ndarray | None = None) -> tuple[str, ...]:
+    """What no rig can have measured: wrong units, swapped cameras, counters that spots do not follow, misspelt words.
 
     Args:
         campaign: a campaign that its reader accepted.
-        depths_mm: of its usable spots, where they are known already.
+        points_mm: (n, 3) its usable spots in frame S, where they are known already.
     """
-    depths_mm = _depths_mm(campaign) if depths_mm is None else depths_mm
+    points_mm = _points_mm(campaign) if points_mm is None else points_mm
     few = partial(listed, most=SPOTS_LISTED)
     ok = [spot for spot in campaign.spots if spot.status == "ok"]
     found = []
@@ -77,11 +84,16 @@ def implausible(campaign: Campaign, depths_mm: np.ndarray | None = None) -> tupl
     baseline_mm = float(np.linalg.norm(campaign.stereo.T))
     if baseline_mm < SHORTEST_BASELINE_MM:
         found.append(f"T of stereo.json is {baseline_mm:.3g} mm long: is it in metres? Lengths are mm")
-    odd = [spot.spot for spot, can in zip(ok, _can_stand(depths_mm), strict=True) if not can]
+    found += _metres(campaign)
+    stands = _can_stand(points_mm[:, 0])
+    odd = [spot.spot for spot, can in zip(ok, stands, strict=True) if not can]
     if odd:
         limits = f"{NEAREST_SHEET_MM:g} to {FARTHEST_SHEET_MM:g} mm"
         question = "are left and right swapped, or mismatched?"
         found.append(f"spots {few(odd)} triangulate outside {limits}: {question}")
+    if len(odd) < ODD_SHARE * len(ok):
+        there = [spot for spot, can in zip(ok, stands, strict=True) if can]
+        found += pattern_doubts(pattern_of(campaign, there, points_mm[stands]))
     readings = {s.spot: s.aperture_deg for s in ok if s.aperture_deg is not None}
     beyond = [spot for spot, reading in readings.items() if not 0 < reading < 180]
     if beyond:
@@ -89,6 +101,33 @@ def implausible(campaign: Campaign, depths_mm: np.ndarray | None = None) -> tupl
     elif readings and max(readings.values()) < np.pi:
         found.append(f"all aperture readings lie below {np.pi:.2f}: are they in radians? aperture_deg is in degrees")
     return tuple(found)
+
+
+def _metres(campaign: Campaign) -> list[str]:
+    """Lengths that are stated in metres where the name says mm."""
+    stated = {"mirror_offset_mm": campaign.rig.priors["mirror_offset_mm"].value}
+    origin = [campaign.rig.priors[name].value for name in names_of("extrinsics.translation_mm")]
+    stated["extrinsics.translation_mm"] = max(origin, key=abs)
+    traceability = campaign.header.get("traceability")
+    if isinstance(traceability, dict) and isinstance(traceability.get("pitch_mm"), dict):
+        stated["pitch_mm"] = float(traceability["pitch_mm"]["value"])
+    return [
+        f"{name} of campaign.toml is {value:g}: is it in metres? Lengths are mm"
+        for name, value in stated.items()
+        if 0 < abs(value) < SHORTEST_MM
+    ]
+
+
+def _incomplete(skipped: Sequence[SkippedExperiment]) -> list[str]:
+    """One sentence for all experiments that lack the same."""
+    by_reason: dict[str, list[int]] = {}
+    for one in skipped:
+        by_reason.setdefault(one.reason, []).append(one.experiment)
+    return [
+        f"{'experiments' if len(own) > 1 else 'experiment'} {listed(own, SPOTS_LISTED)} "
+        f"{'are' if len(own) > 1 else 'is'} not complete: {reason}"
+        for reason, own in by_reason.items()
+    ]
 
 
 def check_campaign(campaign: Campaign) -> CampaignCheck:
@@ -103,7 +142,9 @@ def check_campaign(campaign: Campaign) -> CampaignCheck:
     ok = [spot for spot in campaign.spots if spot.status == "ok"]
     refused = Counter(spot.status for spot in campaign.spots if spot.status != "ok")
     selection = select_experiments(campaign)
-    warnings = [f"experiment {s.experiment} is not complete: {s.reason}" for s in selection.skipped]
+    points_mm = _points_mm(campaign)
+    # What is wrong first, then what follows from it.
+    warnings = [*implausible(campaign, points_mm), *_incomplete(selection.skipped)]
     if not ok:
         warnings.append("no spot has status ok: there is nothing to estimate from")
     observed = {spot.move for spot in ok}
@@ -111,11 +152,13 @@ def check_campaign(campaign: Campaign) -> CampaignCheck:
         reason = separation(observed_stops(campaign.moves, observed, axis), axis)
         if reason is not None:
             warnings.append(f"{axis} ratio and {axis} backlash are hard to tell apart: {reason}")
-    for move in campaign.moves:
-        if "unknown" in (move.pan_approach, move.tilt_approach):
-            warnings.append(f"segment {move.segment} begins with an unknown approach: its first reversal tells less")
-    depths_mm = _depths_mm(campaign)
-    warnings += implausible(campaign, depths_mm)
+    unknown = [m.segment for m in campaign.moves if "unknown" in (m.pan_approach, m.tilt_approach)]
+    if unknown:
+        begin = (
+            f"segments {listed(unknown, SPOTS_LISTED)} begin" if len(unknown) > 1 else f"segment {unknown[0]} begins"
+        )
+        warnings.append(f"{begin} with an unknown approach: the first reversal tells less")
+    depths_mm = points_mm[:, 0]
     if ok and np.all(_can_stand(depths_mm)) and depths_mm.max() < SHALLOW * depths_mm.min():
         warnings.append("all spots lie at one depth: a second sheet position sharpens ratios threefold")
     if campaign.stereo.assumed:

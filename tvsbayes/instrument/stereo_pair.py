@@ -82,6 +82,16 @@ def triangulate(stereo: Stereo, pixels: np.ndarray, focal_scale: float = 1.0) ->
     return points_S
 
 
+def project_pair(stereo: Stereo, points_S_mm: np.ndarray) -> np.ndarray:
+    """Raw pixels (n, 4: u_left, v_left, u_right, v_right) of points (n, 3) in frame S, mm: `triangulate` back."""
+    points = np.asarray(points_S_mm, float).reshape(-1, 3)
+    left = np.column_stack((-points[:, 1], -points[:, 2], points[:, 0]))
+    seen = []
+    for M, D, own in ((stereo.M1, stereo.D1, left), (stereo.M2, stereo.D2, left @ stereo.R.T + stereo.T)):
+        seen.append(distort(own[:, :2] / own[:, 2:], D) @ M[:2, :2].T + M[:2, 2])
+    return np.hstack(seen)
+
+
 @dataclass(frozen=True)
 class Stereo:
     """A stereo calibration in OpenCV's convention: x_right = R x_left + T (formulation 3.3).

@@ -1,0 +1,64 @@
+"""Mistakes in tables that the spots themselves give away, each named; good campaigns are not accused."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from experiments.robustness.mistakes import MISTAKES, PLANS
+from tvsbayes.estimators.plausibility import implausible
+from tvsbayes.estimators.spot_pattern import mismatch_px, pattern_doubts, pattern_of
+from tvsbayes.files.disk import shipped_data
+from tvsbayes.instrument.campaign import pixels_of, read_campaign
+from tvsbayes.instrument.plan import read_plan
+from tvsbayes.instrument.stereo_pair import project_pair, triangulate
+from tvsbayes.twin.simulated_campaign import simulate
+
+TWINS = ("paper_twin", "grid_twin")
+SEEN = [name for name in MISTAKES if name not in ("none", "spots one move early", "pan and tilt exchanged")]
+"""Those that every campaign shows (experiments/robustness/mistakes.md)."""
+
+
+@pytest.fixture(scope="module")
+def twins():
+    return {name: read_campaign(shipped_data() / "twins" / name) for name in TWINS}
+
+
+@pytest.mark.parametrize("twin", TWINS)
+@pytest.mark.parametrize("mistake", SEEN)
+def test_a_mistake_is_called_by_its_name(twins, twin, mistake):
+    """And nothing else is accused of it."""
+    change, words = MISTAKES[mistake]
+    said = implausible(change(twins[twin], np.random.default_rng(2)))
+    assert said and all(any(word in text for word in words.split("|")) for text in said), said
+
+
+def test_columns_exchanged_and_shifted_rows(twins):
+    rng = np.random.default_rng(1)
+    assert "columns exchanged" in implausible(MISTAKES["pan and tilt exchanged"][0](twins["grid_twin"], rng))[0]
+    assert "do not follow" in implausible(MISTAKES["spots one move early"][0](twins["paper_twin"], rng))[0]
+
+
+@pytest.mark.parametrize("plan", PLANS)
+def test_simulated_campaigns_are_not_accused(mounted_rig, plan):
+    steps = read_plan(shipped_data() / "rigs" / "mounted" / f"{plan}.csv")
+    for seed in (0, 1):
+        assert implausible(simulate(mounted_rig, steps, seed, aperture=True).campaign) == ()
+
+
+def test_few_spots_show_no_pattern(twins):
+    campaign = MISTAKES["tilt sign"][0](twins["grid_twin"], np.random.default_rng(0))
+    few = [spot for spot in campaign.spots if spot.status == "ok"][:7]
+    assert pattern_doubts(pattern_of(campaign, few, triangulate(campaign.stereo, pixels_of(few)))) == ()
+
+
+def test_points_return_to_their_pixels(twins):
+    """Through both lenses, to the 1e-6 px of undistortion; a spot off its epipolar line keeps half of the offset."""
+    stereo = twins["grid_twin"].stereo
+    points = np.array([[200.0, -30.0, 10.0], [400.0, 60.0, -20.0]])
+    pixels = project_pair(stereo, points)
+    np.testing.assert_allclose(triangulate(stereo, pixels), points, rtol=0, atol=1e-5)
+    assert np.all(mismatch_px(stereo, pixels, points) < 1e-9)
+    moved = pixels + np.array([0.0, 2.0, 0.0, 0.0])
+    # Least squares share the offset of one camera between both: 2 / sqrt(2), to the tilt of the epipolar lines.
+    np.testing.assert_allclose(mismatch_px(stereo, moved, triangulate(stereo, moved)), 2**0.5, rtol=0.1)
