@@ -16,6 +16,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import cast
 
+from tvsbayes.acquisition.drivers import cameras_of, positioner_of
 from tvsbayes.acquisition.journal import LOG, read_journal
 from tvsbayes.acquisition.journal_events import Moved
 from tvsbayes.acquisition.observation import CameraObserver, Detector, Observer, TwinObserver, wait_for_detection
@@ -28,7 +29,6 @@ from tvsbayes.files.disk import write_atomically
 from tvsbayes.instrument.campaign import Campaign
 from tvsbayes.instrument.rig import Rig
 from tvsbayes.positioner.interface import Clock, Positioner
-from tvsbayes.positioner.serial_port import positioner_of
 from tvsbayes.twin.true_rig import pan_and_tilt
 
 SIMULATED_START = datetime.datetime(2026, 1, 1, tzinfo=datetime.UTC)
@@ -87,15 +87,15 @@ def hardware(rig: Rig, detector: Detector, operator: Operator) -> Iterator[Bench
         InputError: the rig file names none.
         DeviceFault: they cannot be opened or set.
     """
-    positioner = positioner_of(rig.positioner)
+    positioner = positioner_of(rig)
     try:
-        camera = open_cameras(rig.cameras, rig.stereo.image_width, rig.stereo.image_height)
+        camera = cameras_of(rig)
     except BaseException:
         positioner.close()
         raise
     try:
         settings = camera.settings()
-        details = {"device": positioner.identity, "cameras": settings.as_json()}
+        details = {"device": dict(positioner.identity), "cameras": settings.as_json()}
         observer = CameraObserver(camera, detector)
         yield Bench(positioner, observer, operator, time, _utc_now, details, warnings=settings.warnings)
     finally:

@@ -17,17 +17,20 @@ from pathlib import Path
 
 import numpy as np
 
+from tvsbayes.acquisition.drivers import cameras_of, positioner_of
 from tvsbayes.acquisition.journal import Disk
 from tvsbayes.acquisition.observation import CHANGE_DN, rises_dn
 from tvsbayes.acquisition.operator import StopKey
-from tvsbayes.cameras.capture import StereoCamera, open_cameras
+from tvsbayes.cameras.capture import StereoCamera
 from tvsbayes.errors import TvsError, escaped
+from tvsbayes.instrument.axes import AXES
 from tvsbayes.instrument.rig import Rig
-from tvsbayes.positioner.driver import SerialPositioner
-from tvsbayes.positioner.interface import SEE_DOCTOR, Clock
-from tvsbayes.positioner.protocol import FIRMWARE_VERSION
-from tvsbayes.positioner.serial_port import positioner_of, serial_ports
+from tvsbayes.positioner.interface import DEFAULT_DRIVER, SEE_DOCTOR, Clock, Positioner
+from tvsbayes.positioner.protocol import FIRMWARE_VERSION, DeviceState
+from tvsbayes.positioner.serial_port import serial_ports
 
+ON_PORTS = ("serial", "grbl")
+"""Drivers of a board on a serial port."""
 DISK_FREE_BYTES = 5 * 10**9
 """Room for about 700 looks of four PNG of 1280 x 720 px, 1.8 MB each."""
 FLUSH_SLOW_S = 0.1
@@ -61,7 +64,7 @@ def examine(
     folder: Path,
     *,
     laser: bool = False,
-    open_positioner: Callable[[], SerialPositioner] | None = None,
+    open_positioner: Callable[[], Positioner] | None = None,
     open_camera: Callable[[], StereoCamera] | None = None,
     clock: Clock = time,
 ) -> list[Check]:
@@ -71,18 +74,20 @@ def examine(
         rig: the rig file.
         folder: where campaigns will be written.
         laser: whether the laser may be switched on for one picture; the caller has stated the hazard.
-        open_positioner: in place of the rig file's port.
+        open_positioner: in place of the rig file's.
         open_camera: in place of the rig file's cameras.
         clock: for the timings.
     """
     checks = [_rig(rig), *_disk(folder, clock)]
-    positioner: SerialPositioner | None = None
+    positioner: Positioner | None = None
     found: list[Check] = []
     try:
         if open_positioner is None:
-            checks.append(_ports(rig))
-            if rig.positioner.get("port"):
-                open_positioner = partial(positioner_of, rig.positioner)
+            on_port = rig.positioner.get("driver", DEFAULT_DRIVER) in ON_PORTS
+            if on_port:
+                checks.append(_ports(rig))
+            if rig.positioner.get("port") or not on_port:
+                open_positioner = partial(positioner_of, rig)
         if open_positioner is not None:
             positioner, found = _positioner(open_positioner, clock)
         checks += found
@@ -158,9 +163,7 @@ def _failed(name: str, error: TvsError) -> Check:
     return Check(name, "fault", found, remedy.removesuffix(SEE_DOCTOR) or "see the message")
 
 
-def _positioner(
-    open_positioner: Callable[[], SerialPositioner], clock: Clock
-) -> tuple[SerialPositioner | None, list[Check]]:
+def _positioner(open_positioner: Callable[[], Positioner], clock: Clock) -> tuple[Positioner | None, list[Check]]:
     """Firmware, state and round trip."""
     try:
         positioner = open_positioner()
@@ -168,7 +171,7 @@ def _positioner(
         return None, [_failed("firmware", error)]
     version = escaped(positioner.identity.get("fw", "unknown"))
     checks = [Check("firmware", "ok", f"version {version}")]
-    if version != FIRMWARE_VERSION:
+    if version != FIRMWARE_VERSION and "driver" not in positioner.identity:
         remedy = "flash the firmware shipped with tvsbayes; this one speaks the same protocol"
         checks = [Check("firmware", "warning", f"version {version}, shipped is {FIRMWARE_VERSION}", remedy)]
     times = []
@@ -180,6 +183,7 @@ def _positioner(
         if state.laser_on:
             state = positioner.laser(False)
             checks.append(Check("laser line", "warning", "it was on", "look for a program that left it on"))
+        checks.append(_switches(state))
         homed = state.status == "idle"
         remedy = "" if homed else "acquire homes by itself; for the laser check let a short plan run first"
         checks.append(Check("homing", "ok" if homed else "warning", state.status, remedy))
@@ -193,13 +197,26 @@ def _positioner(
     return positioner, [*checks, Check("timing", "warning" if bad else "ok", found, remedy)]
 
 
+def _switches(state: DeviceState) -> Check:
+    """Home and limit switches, so that their wiring shows before anything moves; press them by hand and ask again."""
+    pairs = zip(AXES, state.home_pressed, state.limit_open, strict=True)
+    told = (
+        f"{axis}: home {'pressed' if home else 'free'}, limit {'open' if limit else 'closed'}"
+        for axis, home, limit in pairs
+    )
+    remedy = "turn the axis back by hand; if it stands free, check the wire of its limit switches" * any(
+        state.limit_open
+    )
+    return Check("switches", "warning" if remedy else "ok", "; ".join(told), remedy)
+
+
 def _camera(
     rig: Rig, open_camera: Callable[[], StereoCamera] | None, clock: Clock
 ) -> tuple[StereoCamera | None, list[Check]]:
     """Opening, settings, time of a fresh pair, exposure and focus."""
     size = rig.stereo.image_width, rig.stereo.image_height
     try:
-        camera = open_camera() if open_camera is not None else open_cameras(rig.cameras, *size)
+        camera = open_camera() if open_camera is not None else cameras_of(rig)
     except TvsError as error:
         return None, [_failed("cameras", error)]
     try:
@@ -237,7 +254,7 @@ def _picture(side: str, picture: np.ndarray) -> list[Check]:
     return [exposure, focus]
 
 
-def _laser(positioner: SerialPositioner | None, camera: StereoCamera | None, wanted: bool) -> Check:
+def _laser(positioner: Positioner | None, camera: StereoCamera | None, wanted: bool) -> Check:
     """Whether both cameras see the spot; the laser is off afterwards, whatever happens."""
     if positioner is None or camera is None:
         return Check("laser", "skipped", "needs positioner and cameras", "cure the faults above first")

@@ -23,8 +23,8 @@ from tvsbayes.instrument.counter_limits import HOME_KEYS
 from tvsbayes.instrument.plan import PlanStep
 from tvsbayes.instrument.rig import Rig, rig_table_toml
 from tvsbayes.instrument.stereo_pair import stereo_bytes
+from tvsbayes.positioner.interface import DEFAULT_DRIVER
 
-DEFAULT_DRIVER = "serial"
 ENTRIES_BYTES_MAX = 12_000
 """Entries beyond this would not fit into a line of the journal: then only their SHA-256 stands there."""
 Entries = dict[str, object]

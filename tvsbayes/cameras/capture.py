@@ -25,6 +25,7 @@ import numpy as np
 
 from tvsbayes.cameras.network_stream import Capture, NetworkStream
 from tvsbayes.errors import DeviceFault, InputError, escaped
+from tvsbayes.instrument.rig import Rig
 from tvsbayes.positioner.interface import Clock
 
 LIVE_S = 0.004
@@ -167,6 +168,16 @@ def open_cameras(
                 capture.release()
             raise
         return OpenCVCamera(captures, width, height, exposure, clock)
+
+
+def opencv_cameras(rig: Rig) -> OpenCVCamera:
+    """The driver `opencv`.
+
+    Raises:
+        InputError: `[cameras]` names no cameras.
+        DeviceFault: they cannot be opened or set.
+    """
+    return open_cameras(rig.cameras, rig.stereo.image_width, rig.stereo.image_height)
 
 
 class OpenCVCamera:

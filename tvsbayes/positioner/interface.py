@@ -18,6 +18,8 @@ from typing import Protocol
 from tvsbayes.errors import DeviceFault, escaped
 from tvsbayes.positioner.protocol import DeviceState
 
+DEFAULT_DRIVER = "serial"
+"""Of a rig file that names none: the firmware shipped with this package."""
 SEE_DOCTOR = "; see `tvsbayes doctor`"
 """Ends a remedy; `doctor` leaves it out of its own."""
 _PORT_REMEDY = "check [positioner] port in the rig file, the cable and your rights on the port" + SEE_DOCTOR

@@ -6,11 +6,13 @@ whatever name it came back. Seconds where a name says `_s`.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 
 from tvsbayes.errors import InputError
+from tvsbayes.instrument.rig import Rig
 from tvsbayes.positioner.driver import SerialPositioner
+from tvsbayes.positioner.grbl import GrblPositioner, Wishes
 from tvsbayes.positioner.interface import Link
 from tvsbayes.positioner.protocol import device_settings
 
@@ -63,18 +65,34 @@ def serial_opener(port: str, baud: int) -> Callable[[], Link]:
     return open_link
 
 
-def positioner_of(table: Mapping[str, str | int | float]) -> SerialPositioner:
-    """The positioner that `[positioner]` of a rig file names, connected.
+def serial_positioner(rig: Rig) -> SerialPositioner:
+    """The driver `serial`: a board with the firmware shipped with this package, connected.
 
     Raises:
-        InputError: the table names no serial port.
+        InputError: `[positioner]` names no serial port.
         DeviceFault: the port cannot be opened, or nothing of ours answers.
     """
-    port = table.get("port")
-    if table.get("driver", "serial") != "serial" or not port:
-        remedy = 'write driver = "serial" and port = "/dev/ttyACM0" (or "COM3") into [positioner]; see tvsbayes doctor'
+    return SerialPositioner(_opener_of(rig), device_settings(rig.positioner))
+
+
+def grbl_positioner(rig: Rig) -> GrblPositioner:
+    """The driver `grbl`: a GRBL board, connected.
+
+    Raises:
+        InputError: `[positioner]` names no serial port, or has entries that a GRBL board does not; settings of the
+            board that do not fit.
+        DeviceFault: the port cannot be opened, or no GRBL board answers.
+    """
+    wishes = Wishes.of(rig.positioner)
+    return GrblPositioner(_opener_of(rig), wishes)
+
+
+def _opener_of(rig: Rig) -> Callable[[], Link]:
+    port = rig.positioner.get("port")
+    if not port:
+        remedy = 'write port = "/dev/ttyACM0" (or "COM3") into [positioner]; see tvsbayes doctor'
         raise InputError("positioner", "[positioner] of the rig file names no serial port", remedy=remedy)
-    return SerialPositioner(serial_opener(str(port), int(table.get("baud", BAUD))), device_settings(table))
+    return serial_opener(str(port), int(rig.positioner.get("baud", BAUD)))
 
 
 class _SerialLink:

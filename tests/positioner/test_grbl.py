@@ -1,0 +1,250 @@
+"""A GRBL board as positioner, against a model of its documented protocol: arrival, light, faults by name."""
+
+from __future__ import annotations
+
+import os
+import threading
+
+import pytest
+from support.grbl_board import BoardLink, GrblBoard
+from support.pseudo_terminal import needs_pseudo_terminals
+
+from tvsbayes.acquisition.simulated_instrument import ModelLink, SimulatedDevice, VirtualClock
+from tvsbayes.errors import DeviceFault, InputError
+from tvsbayes.instrument.counter_limits import CounterLimits
+from tvsbayes.positioner.grbl import GrblPositioner, Wishes
+from tvsbayes.positioner.grbl_messages import parse_greeting, parse_modes, parse_setting, parse_status
+from tvsbayes.positioner.interface import PositionLost
+from tvsbayes.positioner.mechanics import Mechanics
+from tvsbayes.positioner.serial_port import serial_opener
+
+LIMITS = CounterLimits({"pan": (-500, 1000), "tilt": (-500, 500)})
+
+
+def connected(board: GrblBoard, **wishes) -> GrblPositioner:
+    made = Wishes(**{"unwatched": True, "limits": LIMITS, **wishes})
+    return GrblPositioner(lambda: BoardLink(board), made, board.clock)
+
+
+def test_messages_of_a_board():
+    status = parse_status("<Idle|MPos:5.529,-0.560,7.000|FS:0,0|WCO:0.000,1.551,5.664|Pn:XZ>")
+    assert status is not None and (status.state, status.position_mm, status.pins) == ("Idle", (5.529, -0.56), "XZ")
+    assert parse_status("<Hold:0|MPos:0.000,0.000,0.000>").state == "Hold"
+    for line in ("<Idle|WPos:1,2,3>", "ok", "<Idle|MPos:1,x>", "[MSG:Reset to continue]"):
+        assert parse_status(line) is None
+    assert parse_setting("$100=250.000") == (100, 250.0) and parse_setting("$N0=G20") is None
+    assert parse_modes("[GC:G0 G54 G17 G21 G90 G94 M5 M9 T0 F0 S0]") >= {"M5", "M9", "G90"}
+    assert parse_greeting("Grbl 1.1h ['$' for help]") == "Grbl 1.1h"
+    assert parse_greeting("GrblHAL 1.1f ['$' or '$HELP' for help]") == "GrblHAL 1.1f"
+
+
+@pytest.mark.parametrize("laser", ["M3", "M8"])
+@pytest.mark.parametrize("speed", [None, 400.0])
+def test_a_session_from_connection_to_close(laser, speed):
+    board = GrblBoard()
+    positioner = connected(board, laser=laser, speed_steps_per_s=speed)
+    assert positioner.identity["fw"] == "Grbl 1.1h" and positioner.identity["$100"] == "80"
+    assert positioner.state().status == "alarm", "locked until homed"
+    report = positioner.home()
+    assert (report.state.pan_steps, report.state.tilt_steps) == (-80, -80) and not (report.known or report.compared)
+    # Every counter, not only those that are whole micrometres.
+    start_s = board.clock.monotonic()
+    for target in ((801, 33), (-37, -101), (800, 33)):
+        state = positioner.move_to(*target)
+        assert (state.pan_steps, state.tilt_steps) == target == tuple(board.steps) and state.status == "idle"
+    way = 881 + 838 + 837
+    seconds = board.clock.monotonic() - start_s
+    # At the rate of 8000 steps/s, or at the speed that the rig file states; a tenth of a second for each answer.
+    assert way / (speed or 8000) < seconds < way / (speed or 8000) + 1.5
+    assert positioner.laser(True).laser_on and board.laser_on
+    assert not positioner.laser(False).laser_on and not board.laser_on
+    positioner.laser(True)
+    positioner.close()
+    assert not board.laser_on and not board.lit_in_motion
+
+
+def _unhomed(positioner, board):
+    positioner.move_to(1, 1)
+
+
+def _dark_first(positioner, board):
+    positioner.laser(True)
+
+
+def _beyond(positioner, board):
+    positioner.home()
+    positioner.move_to(0, 501)
+
+
+def _limit(positioner, board):
+    positioner.home()
+    board.limit_steps = 300
+    positioner.move_to(900, 0)
+
+
+def _no_switch(positioner, board):
+    board.home_fails = True
+    positioner.home()
+
+
+def _blocked(positioner, board):
+    positioner.home()
+    board.blocked = True
+    positioner.move_to(900, 0)
+
+
+def _silent(positioner, board):
+    positioner.home()
+    board.silent = True
+    positioner.state()
+
+
+def _reset(positioner, board):
+    positioner.home()
+    board.power_on()
+    positioner.move_to(5, 5)
+
+
+def _elsewhere(positioner, board):
+    positioner.home()
+    board.missing_steps = 1
+    positioner.move_to(100, 0)
+
+
+@pytest.mark.parametrize(
+    ("action", "code"),
+    [
+        *((_unhomed, "refused-unhomed"), (_dark_first, "refused-unhomed"), (_beyond, "refused-limit")),
+        *((_limit, "alarm-1"), (_no_switch, "alarm-9"), (_blocked, "stall"), (_silent, "no-answer")),
+        *((_reset, "reset"), (_elsewhere, "position")),
+    ],
+)
+def test_faults_are_named_and_end_in_time_and_darkness(action, code):
+    board = GrblBoard()
+    positioner = connected(board)
+    with pytest.raises(DeviceFault) as caught:
+        action(positioner, board)
+    assert caught.value.code == code and caught.value.remedy and caught.value.message.isprintable()
+    assert isinstance(caught.value, PositionLost) == (code == "reset")
+    assert board.clock.monotonic() < 60.0
+    positioner.close()
+    assert not board.laser_on and not board.lit_in_motion
+
+
+def test_an_alarm_is_left_by_homing():
+    board = GrblBoard()
+    positioner = connected(board)
+    with pytest.raises(DeviceFault, match="hard limit"):
+        _limit(positioner, board)
+    with pytest.raises(DeviceFault, match="before homing"):
+        positioner.move_to(0, 0)
+    board.limit_steps = 10**9
+    positioner.home()
+    assert positioner.move_to(10, 10).pan_steps == 10
+
+
+def test_an_interrupted_order_does_not_answer_the_next():
+    """Ctrl-C between an order and its ok, then laser off: that ok is not taken for this one's."""
+    board = GrblBoard()
+    positioner = connected(board)
+    positioner.home()
+    positioner.laser(True)
+    link, read = positioner._link, positioner._link.read
+
+    def interrupted(timeout_s):
+        link.read = read
+        raise KeyboardInterrupt
+
+    link.read = interrupted
+    with pytest.raises(KeyboardInterrupt):
+        positioner._order("G4 P0.5", 5.0)
+    assert not positioner.laser(False).laser_on and not board.laser_on
+    assert board.clock.monotonic() < 60
+
+
+@pytest.mark.parametrize(
+    ("settings", "column"),
+    [
+        *(({1: 25}, "$1"), ({10: 0}, "$10"), ({13: 1}, "$13"), ({22: 0}, "$22"), ({32: 1}, "$32")),
+        *(({100: 640.0}, "$100"), ({101: 0.0}, "$101")),
+    ],
+)
+def test_a_board_that_is_set_otherwise_is_refused_by_its_setting(settings, column):
+    with pytest.raises(InputError) as caught:
+        connected(GrblBoard(settings))
+    assert caught.value.column == column and f"{column}=..." in caught.value.remedy
+
+
+def test_laser_mode_is_no_matter_of_a_coolant_output():
+    connected(GrblBoard({32: 1}), laser="M8").close()
+
+
+def test_light_without_a_watchdog_has_to_be_accepted():
+    board = GrblBoard()
+    positioner = connected(board, unwatched=False)
+    positioner.home()
+    with pytest.raises(DeviceFault, match="unwatched_laser") as caught:
+        positioner.laser(True)
+    assert caught.value.code == "laser" and not board.laser_on
+
+
+@pytest.mark.parametrize(
+    ("entries", "column"),
+    [
+        ({"laser_watchdog_s": 1.0}, "positioner.laser_watchdog_s"),
+        ({"pan_home_steps": 0}, "positioner.pan_home_steps"),
+        ({"options.lazer": "M3"}, "positioner.options.lazer"),
+        ({"options.laser": "M30"}, "positioner.options.laser"),
+    ],
+)
+def test_entries_that_a_board_does_not_have_are_refused(entries, column):
+    with pytest.raises(InputError) as caught:
+        Wishes.of(entries)
+    assert caught.value.column == column
+
+
+def test_our_own_firmware_under_this_driver_is_named():
+    device = SimulatedDevice(VirtualClock(), Mechanics())
+    with pytest.raises(DeviceFault, match='driver = "serial"'):
+        GrblPositioner(lambda: ModelLink(device), Wishes(), device.clock)
+
+
+def test_an_unplugged_board_is_named():
+    board = GrblBoard()
+    positioner = connected(board)
+    positioner.home()
+    positioner._link.gone = True
+    with pytest.raises(DeviceFault) as caught:
+        positioner.move_to(1, 1)
+    assert caught.value.code == "unplugged"
+    positioner.close()
+
+
+@needs_pseudo_terminals
+def test_a_board_on_a_pseudo_terminal():
+    """Pyserial and a real file descriptor; the board's time runs with the requests."""
+    board = GrblBoard()
+    master, slave = os.openpty()
+
+    def serve():
+        while True:
+            try:
+                data = os.read(master, 4096)
+            except OSError:
+                return
+            board.clock.sleep(1.0)
+            board.receive(data)
+            data, board.out = bytes(board.out), bytearray()
+            os.write(master, data)
+
+    threading.Thread(target=serve, daemon=True).start()
+    try:
+        positioner = GrblPositioner(serial_opener(os.ttyname(slave), 115_200), Wishes(unwatched=True, limits=LIMITS))
+        positioner.home()
+        assert positioner.move_to(300, -20).pan_steps == 300
+        assert positioner.laser(True).laser_on
+        positioner.close()
+        assert board.steps == [300, -20] and not board.lit_in_motion
+    finally:
+        os.close(slave)
+        os.close(master)

@@ -1,0 +1,96 @@
+"""Positioners and cameras by the name of their driver in the rig file, our own and those of other packages.
+
+A driver is an entry point of the group `tvsbayes.positioners` or `tvsbayes.cameras`: a function that takes the `Rig`
+and returns a connected `Positioner` or an open `StereoCamera` (data/docs/instrument.md, "Your own hardware"). Our own
+are registered in the same way; they are known here too, so that a source tree without an installation has them.
+"""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable, Mapping
+from importlib import metadata
+from typing import Any
+
+from tvsbayes.cameras.capture import StereoCamera
+from tvsbayes.errors import DeviceFault, InputError, TvsError, closest, escaped
+from tvsbayes.instrument.rig import Rig
+from tvsbayes.positioner.interface import DEFAULT_DRIVER, Positioner
+
+POSITIONERS = "tvsbayes.positioners"
+CAMERAS = "tvsbayes.cameras"
+DEFAULT_CAMERAS = "opencv"
+OWN: Mapping[str, Mapping[str, str]] = {
+    POSITIONERS: {
+        "serial": "tvsbayes.positioner.serial_port:serial_positioner",
+        "grbl": "tvsbayes.positioner.serial_port:grbl_positioner",
+        "simulated": "tvsbayes.acquisition.simulated_drivers:simulated_positioner",
+    },
+    CAMERAS: {
+        "opencv": "tvsbayes.cameras.capture:opencv_cameras",
+        "genicam": "tvsbayes.cameras.genicam:genicam_cameras",
+        "simulated": "tvsbayes.acquisition.simulated_drivers:simulated_cameras",
+    },
+}
+"""As in pyproject.toml."""
+_TABLES = {POSITIONERS: "positioner", CAMERAS: "cameras"}
+
+
+def positioner_of(rig: Rig) -> Positioner:
+    """The positioner that `[positioner]` of a rig file names, connected.
+
+    Raises:
+        InputError: no such driver, or one that cannot work with what the rig file states.
+        DeviceFault: it cannot be reached.
+    """
+    made: Positioner = _made(POSITIONERS, str(rig.positioner.get("driver", DEFAULT_DRIVER)), rig)
+    return made
+
+
+def cameras_of(rig: Rig) -> StereoCamera:
+    """The cameras that `[cameras]` of a rig file names, open.
+
+    Raises:
+        InputError: no such driver, or one that cannot work with what the rig file states.
+        DeviceFault: they cannot be opened or set.
+    """
+    made: StereoCamera = _made(CAMERAS, str(rig.cameras.get("driver", DEFAULT_CAMERAS)), rig)
+    return made
+
+
+def known(group: str) -> dict[str, str]:
+    """Drivers of a group, ours first, as "module:function" by name; no other package replaces one of ours."""
+    found = {entry.name: entry.value for entry in metadata.entry_points(group=group)}
+    return {**OWN[group], **{name: value for name, value in found.items() if name not in OWN[group]}}
+
+
+def _made(group: str, name: str, rig: Rig) -> Any:
+    """What a driver makes of a rig file; its own errors become faults with its name."""
+    factory = _factory(group, name)
+    try:
+        return factory(rig)
+    except TvsError:
+        raise
+    except Exception as error:
+        found = f"driver {escaped(name)} failed: {type(error).__name__}: {escaped(str(error), 200)}"
+        remedy = "see the manual of the package that brought it"
+        raise DeviceFault("driver", f"{found}; {remedy}", found=found, remedy=remedy) from error
+
+
+def _factory(group: str, name: str) -> Callable[[Rig], Any]:
+    drivers = known(group)
+    column = f"{_TABLES[group]}.driver"
+    if name not in drivers:
+        remedy = f"{closest(name, tuple(drivers))}, or install the package that brings it"
+        message = f"[{_TABLES[group]}] driver: found {escaped(name)}; allowed: {', '.join(drivers)}; {remedy}"
+        raise InputError(
+            "driver", message, column=column, found=escaped(name), allowed=", ".join(drivers), remedy=remedy
+        )
+    module, _, function = drivers[name].partition(":")
+    try:
+        made: Callable[[Rig], Any] = getattr(importlib.import_module(module), function)
+    except (ImportError, AttributeError) as error:
+        found = f"driver {escaped(name)} cannot be loaded: {escaped(str(error), 200)}"
+        remedy = "install the package that brings it anew, with all that it needs"
+        raise InputError("driver", f"{found}; {remedy}", column=column, found=found, remedy=remedy) from error
+    return made

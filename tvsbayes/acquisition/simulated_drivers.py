@@ -1,0 +1,67 @@
+"""The twin as drivers: `driver = "simulated"` in `[positioner]` and `[cameras]` of a rig file.
+
+For `doctor`, for trying out code that drives an instrument, and as the example that drivers of other hardware can be
+held against. Positioner and cameras of one rig file and seed (`options.seed`) share one twin, before whose cameras the
+first sheet of `[sheets]` stands. A whole run is rehearsed by `tvsbayes acquire --simulate`, where sheets change places.
+"""
+
+from __future__ import annotations
+
+from weakref import WeakValueDictionary
+
+from tvsbayes.acquisition.observation import twin_renderer
+from tvsbayes.acquisition.simulated_instrument import Instrument
+from tvsbayes.cameras.capture import CameraSettings, StereoImage
+from tvsbayes.errors import InputError
+from tvsbayes.instrument.rig import Rig, Setting
+from tvsbayes.positioner.driver import SerialPositioner
+
+_TWINS: WeakValueDictionary[tuple[str, int], Instrument] = WeakValueDictionary()
+"""Those in use, by rig file and seed."""
+
+
+def simulated_positioner(rig: Rig) -> SerialPositioner:
+    """Our driver on the device model with a clock of its own: homing takes no time."""
+    return _twin(rig, rig.positioner, "positioner").positioner()
+
+
+def simulated_cameras(rig: Rig) -> SimulatedCamera:
+    """What the twin's cameras see."""
+    return SimulatedCamera(_twin(rig, rig.cameras, "cameras"))
+
+
+class SimulatedCamera:
+    """See `StereoCamera`: a new exposure of the twin for every pair that is asked for."""
+
+    def __init__(self, instrument: Instrument):
+        self._instrument, self._frame = instrument, 0
+        self._render = twin_renderer(instrument.rig, instrument.seed)
+
+    def grab(self) -> StereoImage:
+        """See `StereoCamera.grab`."""
+        self._frame += 1
+        return self._render(self._instrument.light(), self._instrument.motions, self._frame)
+
+    def settings(self) -> CameraSettings:
+        """See `StereoCamera.settings`."""
+        return CameraSettings({})
+
+    def close(self) -> None:
+        """See `StereoCamera.close`."""
+
+
+def _twin(rig: Rig, table: dict[str, Setting], name: str) -> Instrument:
+    unknown = [key for key in table if key.startswith("options.") and key != "options.seed"]
+    seed = table.get("options.seed", 0)
+    if unknown or not isinstance(seed, int) or seed < 0:
+        remedy = "leave out what a simulated instrument does not have"
+        found, allowed = ", ".join(unknown) or f"seed {seed}", "options.seed, a whole number from 0"
+        message = f"[{name}] options: found {found}; allowed: {allowed}; {remedy}"
+        raise InputError("options", message, column=f"{name}.options", found=found, allowed=allowed, remedy=remedy)
+    key = str(rig.path), seed
+    twin = _TWINS.get(key)
+    if twin is None:
+        twin = _TWINS[key] = Instrument(rig, seed)
+        if rig.sheets_mm:
+            twin.place(next(iter(rig.sheets_mm)), 0)
+    return twin

@@ -1,0 +1,246 @@
+"""GenICam cameras (GigE Vision, USB3 Vision) through a GenTL producer, by `harvesters` (`driver = "genicam"`).
+
+The extra `tvsbayes[genicam]` brings `harvesters`; the producer, a `.cti` file, comes from the camera's maker and is
+named in `[cameras.options]`. Pictures are triggered by software: each is exposed after it was asked for, whatever was
+in the buffers, and both cameras at one call. Mono8 to Mono16 and colour of 8 bits are taken at their full depth.
+Seconds where a name says `_s`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from tvsbayes.cameras.capture import CameraSettings, StereoImage
+from tvsbayes.errors import DeviceFault, InputError, escaped
+from tvsbayes.instrument.rig import Rig, Setting
+
+FETCH_S = 5.0
+"""Longest wait for a picture after its trigger."""
+OPTIONS = ("producer", "pixel_format", "gain")
+PIXEL_BITS = {"Mono8": 8, "Mono10": 10, "Mono12": 12, "Mono14": 14, "Mono16": 16, "BGR8": 8, "RGB8": 8}
+"""Formats that are taken, by their PFNC name, with the bits that carry grey levels."""
+_NAMES = ("left", "right")
+
+
+@dataclass(frozen=True)
+class GenicamWishes:
+    """What the rig file states.
+
+    Attributes:
+        producer: the `.cti` file.
+        cameras: serial numbers or user-defined names of left and right.
+        pixel_format: of `PIXEL_BITS`.
+        exposure_us: microseconds; None leaves it as the camera has it.
+        gain: in the camera's unit; None leaves it as the camera has it.
+    """
+
+    producer: str
+    cameras: tuple[str, str]
+    pixel_format: str = "Mono8"
+    exposure_us: float | None = None
+    gain: float | None = None
+
+    @classmethod
+    def of(cls, table: Mapping[str, Setting]) -> GenicamWishes:
+        """Those of `[cameras]`.
+
+        Raises:
+            InputError: an entry that is missing or does not belong to GenICam cameras.
+        """
+        options = {key.partition(".")[2]: value for key, value in table.items() if key.startswith("options.")}
+        for key in options:
+            if key not in OPTIONS:
+                raise _refused(f"options.{key}", escaped(str(options[key])), ", ".join(OPTIONS), "remove it")
+        if "producer" not in options:
+            remedy = "name the maker's GenTL producer, a .cti file, in [cameras.options]"
+            raise _refused("options.producer", "nothing", "the path of a .cti file", remedy)
+        if "left" not in table or "right" not in table:
+            remedy = 'write left = "SERIAL" and right = "SERIAL"'
+            raise _refused("left", "no pair", "serial numbers or names of both cameras", remedy)
+        pixel_format = str(options.get("pixel_format", "Mono8"))
+        if pixel_format not in PIXEL_BITS:
+            raise _refused("options.pixel_format", escaped(pixel_format), ", ".join(PIXEL_BITS), "choose one of these")
+        exposure, gain = table.get("exposure"), options.get("gain")
+        return cls(
+            str(options["producer"]),
+            (str(table["left"]), str(table["right"])),
+            pixel_format,
+            None if exposure is None else float(exposure),
+            None if gain is None else float(gain),
+        )
+
+
+def genicam_cameras(rig: Rig) -> GenicamCamera:
+    """The driver `genicam`.
+
+    Raises:
+        InputError: `harvesters` is not installed, or `[cameras]` does not fit.
+        DeviceFault: a camera that is not there or does not obey.
+    """
+    wishes = GenicamWishes.of(rig.cameras)
+    try:
+        from harvesters.core import Harvester
+    except ImportError as error:
+        remedy = "pip install 'tvsbayes[genicam]'"
+        raise InputError("genicam", f"GenICam cameras need harvesters; {remedy}", remedy=remedy) from error
+    return GenicamCamera(Harvester(), wishes, rig.stereo.image_width, rig.stereo.image_height)
+
+
+class GenicamCamera:
+    """See `StereoCamera`.
+
+    Args:
+        harvester: a `harvesters.core.Harvester` without files; belongs to this object from now on.
+        wishes: what the rig file states.
+        width: of one picture, px.
+        height: px.
+
+    Raises:
+        DeviceFault: the producer cannot be used, a camera is not there, or does not obey.
+    """
+
+    def __init__(self, harvester: Any, wishes: GenicamWishes, width: int, height: int):
+        self._harvester, self._wishes = harvester, wishes
+        self._size = width, height
+        self._acquirers: list[Any] = []
+        self._warnings: list[str] = []
+        try:
+            self._open()
+        except Exception as error:
+            self.close()
+            if isinstance(error, DeviceFault):
+                raise
+            raise _fault(
+                "camera", f"the GenTL producer: {_said(error)}", "check the .cti file and the cables"
+            ) from error
+
+    def _open(self) -> None:
+        self._harvester.add_file(self._wishes.producer)
+        self._harvester.update()
+        for name, wanted in zip(_NAMES, self._wishes.cameras, strict=True):
+            known = self._harvester.device_info_list
+            fits = [
+                n for n, d in enumerate(known) if wanted in (_text(d, "serial_number"), _text(d, "user_defined_name"))
+            ]
+            if len(fits) != 1:
+                there = ", ".join(_text(d, "serial_number") for d in known) or "none"
+                found = f"{name}: {len(fits)} cameras are {escaped(wanted)}; there are: {escaped(there, 200)}"
+                raise _fault("camera", found, "correct [cameras], check cable and supply, close other programs")
+            acquirer = self._harvester.create(fits[0])
+            self._acquirers.append(acquirer)
+            self._fix(name, acquirer.remote_device.node_map)
+            acquirer.start()
+
+    def _fix(self, name: str, nodes: Any) -> None:
+        """Size, format, software trigger, exposure; automatics off."""
+        wishes = self._wishes
+        must: dict[str, object] = {"PixelFormat": wishes.pixel_format, "Width": self._size[0], "Height": self._size[1]}
+        must |= {"TriggerSelector": "FrameStart", "TriggerMode": "On", "TriggerSource": "Software"}
+        if wishes.exposure_us is not None:
+            must["ExposureTime"] = wishes.exposure_us
+        if wishes.gain is not None:
+            must["Gain"] = wishes.gain
+        for automatic in ("ExposureAuto", "GainAuto", "BalanceWhiteAuto"):
+            if not _set(nodes, automatic, "Off") and hasattr(nodes, automatic):
+                self._warnings.append(f"{name}: {automatic} cannot be switched off; fix it with the maker's program")
+        for node, value in must.items():
+            if not _set(nodes, node, value):
+                found = f"{name}: {node} = {value} was not taken"
+                raise _fault("camera-setting", found, "see what the maker's program allows, correct [cameras]")
+
+    def settings(self) -> CameraSettings:
+        """See `StereoCamera.settings`."""
+        values = {}
+        for name, acquirer in zip(_NAMES, self._acquirers, strict=True):
+            nodes = acquirer.remote_device.node_map
+            for key, node in {"exposure_us": "ExposureTime", "gain": "Gain"}.items():
+                if hasattr(nodes, node):
+                    values[f"{name}.{key}"] = float(getattr(nodes, node).value)
+            values[f"{name}.bits"] = float(PIXEL_BITS[self._wishes.pixel_format])
+        return CameraSettings(values, tuple(self._warnings))
+
+    def grab(self) -> StereoImage:
+        """See `StereoCamera.grab`: both are triggered now, one right behind the other.
+
+        Raises:
+            DeviceFault: no picture, or one of another size.
+        """
+        try:
+            for acquirer in self._acquirers:
+                _drain(acquirer)
+            for acquirer in self._acquirers:
+                acquirer.remote_device.node_map.TriggerSoftware.execute()
+            left, right = (self._picture(n, a) for n, a in zip(_NAMES, self._acquirers, strict=True))
+        except DeviceFault:
+            raise
+        except Exception as error:
+            raise _fault("no-frame", f"a camera delivers no frame: {_said(error)}", "check its cable") from error
+        return StereoImage(left, right)
+
+    def _picture(self, name: str, acquirer: Any) -> np.ndarray:
+        """(height, width, 3), uint8 or uint16, blue, green, red."""
+        with acquirer.fetch(timeout=FETCH_S) as buffer:
+            part = buffer.payload.components[0]
+            size = int(part.width), int(part.height)
+            if size != self._size:
+                found = f"{name}: pictures of {size[0]} x {size[1]} px"
+                raise _fault("image-size", found, f"{self._size[0]} x {self._size[1]} px were calibrated")
+            # The memory belongs to the producer again once the buffer is given back.
+            data = np.array(part.data)
+        shape = self._size[1], self._size[0]
+        if self._wishes.pixel_format.startswith("Mono"):
+            grey = data.reshape(shape)
+            return np.repeat(grey[..., None], 3, axis=2)
+        colour = data.reshape(*shape, 3)
+        return colour if self._wishes.pixel_format == "BGR8" else colour[..., ::-1].copy()
+
+    def close(self) -> None:
+        """See `StereoCamera.close`."""
+        for undo in [*(a.destroy for a in self._acquirers), self._harvester.reset]:
+            try:
+                undo()
+            except Exception:
+                # A camera that has gone cannot be given back.
+                continue
+        self._acquirers = []
+
+
+def _drain(acquirer: Any) -> None:
+    """Lets pictures go that nobody fetched, as after a fault."""
+    while (buffer := acquirer.try_fetch(timeout=0.001)) is not None:
+        buffer.queue()
+
+
+def _set(nodes: Any, name: str, value: object) -> bool:
+    """Sets a feature and reads it back; whether the camera has taken it."""
+    try:
+        node = getattr(nodes, name)
+        node.value = value
+        read = node.value
+    except Exception:
+        return False
+    # Cameras round to their own steps.
+    if isinstance(value, float) and isinstance(read, (int, float)):
+        return abs(read - value) <= max(0.05 * abs(value), 1.0)
+    return bool(read == value)
+
+
+def _text(device: Any, name: str) -> str:
+    return str(getattr(device, name, "") or "")
+
+
+def _said(error: Exception) -> str:
+    return f"{type(error).__name__}: {escaped(str(error), 200)}"
+
+
+def _refused(key: str, found: str, allowed: str, remedy: str) -> InputError:
+    message = f"[cameras] {key}: found {found}; allowed: {allowed}; {remedy}"
+    return InputError("cameras", message, column=f"cameras.{key}", found=found, allowed=allowed, remedy=remedy)
+
+
+def _fault(code: str, found: str, remedy: str) -> DeviceFault:
+    return DeviceFault(code, f"{found}; {remedy}", found=found, remedy=remedy)

@@ -1,0 +1,406 @@
+"""A positioner on a GRBL board: pan is X, tilt is Y, the laser hangs on spindle or coolant (`driver = "grbl"`).
+
+Counters are motor steps: machine position times `$100` (`$101`). Zero is where the board's homing puts it. GRBL 1.1 has
+no checksum, no sequence numbers and no boot id, so it promises less than our firmware: lost steps are not found at the
+next homing, and a computer that dies leaves the laser on, because no watchdog of the board switches it off. What it
+does say is used: every order waits for its `ok`, arrival is read back, a greeting in mid-run is a reset and with it the
+loss of the counters, an alarm ends the run, and the laser's mode is read back by `$G`.
+
+Counters in motor steps; seconds where a name says `_s`. Time from a `Clock`, bytes from a `Link`.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+from tvsbayes.errors import DeviceFault, InputError, escaped
+from tvsbayes.instrument.axes import AXES
+from tvsbayes.instrument.counter_limits import CounterLimits
+from tvsbayes.positioner.grbl_messages import (
+    ALARMS,
+    ASK,
+    ERRORS,
+    HOLD,
+    LASER_ORDERS,
+    RESET,
+    BoardSettings,
+    Status,
+    number_of,
+    parse_greeting,
+    parse_modes,
+    parse_setting,
+    parse_status,
+)
+from tvsbayes.positioner.interface import Clock, HomeReport, Link, PositionLost, fault, opened, reason
+from tvsbayes.positioner.protocol import DeviceState
+from tvsbayes.positioner.protocol import Status as DeviceStatus
+from tvsbayes.positioner.silence import HEARD_BYTES_MAX, explained
+
+GREETING_S, GREETING_ATTEMPTS = 1.5, 4
+"""An Arduino sits in its boot loader for about a second after its port was opened, and hears nothing."""
+REPLY_S = 2.0
+"""Longest wait for the answer to an order that moves nothing."""
+POLL_S = 0.1
+"""Time between two status reports; GRBL's manual asks for 5 Hz to 10 Hz."""
+HOME_S = 300.0
+LINE_CHARS_MAX = 256
+COUNTERS_MAX = 2_000_000
+"""GRBL computes in single precision: beyond this a position is off by more than an eighth of a step."""
+OPTIONS = ("laser", "laser_power", "unwatched_laser")
+FOREIGN_KEYS = ("pan_home_steps", "tilt_home_steps", "acceleration_steps_per_s2", "laser_watchdog_s")
+"""Entries of `[positioner]` that are settings of the board here ($23, $27, $120), or that it does not have."""
+UNLIMITED = CounterLimits({axis: (None, None) for axis in AXES})
+_MOVING = ("Run", "Home", "Jog", "Hold")
+
+
+@dataclass(frozen=True)
+class Wishes:
+    """What the rig file states.
+
+    Attributes:
+        laser: the order that switches it on.
+        laser_power: `S` of a spindle order, None for the board's full power.
+        unwatched: whether the user has said that the laser may stay on when the computer dies.
+        limits: soft limits, held here.
+        speed_steps_per_s: of the faster axis, None for the board's own.
+    """
+
+    laser: str = "M3"
+    laser_power: float | None = None
+    unwatched: bool = False
+    limits: CounterLimits = UNLIMITED
+    speed_steps_per_s: float | None = None
+
+    @classmethod
+    def of(cls, table: Mapping[str, str | int | float]) -> Wishes:
+        """Those of `[positioner]`.
+
+        Raises:
+            InputError: an entry or option that does not belong to a GRBL board.
+        """
+        for key in FOREIGN_KEYS:
+            if key in table:
+                remedy = "remove it: ramps and home position are settings of the board, a watchdog it does not have"
+                raise _refused(key, str(table[key]), "no entry with a GRBL board", remedy)
+        options = {key.partition(".")[2]: value for key, value in table.items() if key.startswith("options.")}
+        for key, value in options.items():
+            if key not in OPTIONS:
+                raise _refused(f"options.{key}", escaped(str(value)), ", ".join(OPTIONS), "remove it")
+        laser = str(options.get("laser", "M3"))
+        if laser not in LASER_ORDERS:
+            remedy = "name what the laser hangs on: M3 the spindle, M7 mist, M8 flood coolant"
+            raise _refused("options.laser", escaped(laser), ", ".join(LASER_ORDERS), remedy)
+        power, speed = options.get("laser_power"), table.get("speed_steps_per_s")
+        return cls(
+            laser,
+            None if power is None else float(power),
+            bool(options.get("unwatched_laser", 0)),
+            CounterLimits.of(table),
+            None if speed is None else float(speed),
+        )
+
+
+class GrblPositioner:
+    """See `interface.Positioner`.
+
+    Args:
+        open_link: opens the line; raises OSError while there is none.
+        wishes: what the rig file states.
+        clock: where time comes from.
+
+    Raises:
+        DeviceFault: nothing answers, or something else does.
+        InputError: a setting of the board that does not fit.
+    """
+
+    def __init__(self, open_link: Callable[[], Link], wishes: Wishes | None = None, clock: Clock = time):
+        self._wishes, self._clock = wishes or Wishes(), clock
+        self._buffer, self._heard = bytearray(), bytearray()
+        self._pending, self._homed, self._greeted, self._done = 0, False, False, 0
+        self._target: tuple[int, int] = (0, 0)
+        self._status: Status | None = None
+        self.repeats = 0
+        """Status reports asked for again."""
+        self._link = opened(open_link)
+        try:
+            self.identity: dict[str, str] = {"fw": self._greeting(), "driver": "grbl"}
+            values: dict[int, float] = {}
+            self._order("$$", REPLY_S, lambda line: values.update([found]) if (found := parse_setting(line)) else None)
+            self._board = BoardSettings.of(values, self._wishes.laser)
+            self.identity |= {f"${number}": f"{values[number]:g}" for number in (100, 101, 110, 111)}
+        except BaseException:
+            self.close()
+            raise
+
+    def home(self) -> HomeReport:
+        """See `Positioner.home`; what was lost before is not known afterwards."""
+        self._homed = False
+        # Out of any alarm, and dark.
+        self._greeting()
+        self._order("$H", HOME_S)
+        self._order("G21 G90 G94", REPLY_S)
+        self._homed = True
+        state = self.state()
+        if state.status != "idle":
+            raise fault("stopped", f"homing ended in {state.status}", "home again")
+        self._target = (state.pan_steps, state.tilt_steps)
+        return HomeReport(_dark(state), (0, 0), known=False, compared=False)
+
+    def move_to(self, pan_steps: int, tilt_steps: int) -> DeviceState:
+        """See `Positioner.move_to`."""
+        wanted = (int(pan_steps), int(tilt_steps))
+        self._require_homed("a motion")
+        for axis, counter in zip(AXES, wanted, strict=True):
+            if not self._wishes.limits.allow(axis, counter) or abs(counter) > COUNTERS_MAX:
+                found = f"{axis} {counter}, allowed is {self._wishes.limits.words(axis)}"
+                raise fault("refused-limit", found, "correct the plan or the limits in [positioner]")
+        before = self._asked()
+        self._target = wanted
+        words, seconds = self._way(self._board.counters(before.position_mm), wanted)
+        self._order(words, REPLY_S)
+        # Answered once everything before it has been done.
+        self._order("G4 P0.01", 5.0 + 2.0 * seconds)
+        status = self._asked()
+        if status.state != "Idle":
+            raise fault("stopped", f"the motion ended in {status.state}", "home again")
+        reached = self._board.counters(status.position_mm)
+        if reached != wanted:
+            found = f"the board stands at {reached}, ordered was {wanted}"
+            raise fault("position", found, "home again; look for soft limits ($20) and feed hold")
+        self._done += 1
+        return _dark(self._state(status, laser_on=self._laser_on()))
+
+    def laser(self, on: bool) -> DeviceState:
+        """See `Positioner.laser`."""
+        if on:
+            self._require_homed("light")
+            if not self._wishes.unwatched:
+                raise fault(
+                    "laser",
+                    "a GRBL board leaves the laser on when this computer dies",
+                    "have something else cut it, then write unwatched_laser = true into [positioner.options]",
+                )
+        try:
+            self._order(self._laser_order(on), REPLY_S)
+            state = self.state()
+        except DeviceFault:
+            if not on:
+                # Dark at any price; at rest a reset keeps the position.
+                self._write(RESET)
+            raise
+        if state.laser_on != on:
+            found = f"the laser's mode stayed {'off' if on else 'on'}"
+            raise fault("laser", found, "cut the laser's supply and check its wiring")
+        return state
+
+    def state(self) -> DeviceState:
+        """See `Positioner.state`."""
+        status = self._asked()
+        return self._state(status, laser_on=self._laser_on())
+
+    def close(self) -> None:
+        """See `Positioner.close`: a soft reset, which ends motion and light at once."""
+        try:
+            self._link.write(RESET)
+            self._link.read(POLL_S)
+        except OSError:
+            # Gone: nothing of ours reaches it any more.
+            pass
+        finally:
+            self._link.close()
+
+    def _greeting(self) -> str:
+        """Resets the board, which stands still and dark then, and reads its name."""
+        self._greeted, self._pending = False, 0
+        self._heard.clear()
+        for attempt in range(GREETING_ATTEMPTS):
+            # The empty line makes other firmware speak, too.
+            self._write(RESET + b"\n" if attempt else RESET)
+            deadline = self._clock.monotonic() + GREETING_S
+            while (line := self._next(deadline)) is not None:
+                name = parse_greeting(line)
+                if name is not None:
+                    self._settle_line()
+                    self._greeted = True
+                    return name
+        heard = explained(bytes(self._heard))
+        found, remedy = f"no GRBL board answers: {heard.found}", heard.remedy
+        if b"!boot" in self._heard or b"!nak" in self._heard or b"<0 " in self._heard:
+            found, remedy = f"our own firmware answers: {heard.found}", 'write driver = "serial" into [positioner]'
+        raise fault("no-answer", found, remedy)
+
+    def _settle_line(self) -> None:
+        """Lines behind a greeting, such as the reminder to unlock."""
+        deadline = self._clock.monotonic() + POLL_S
+        while self._next(deadline) is not None:
+            pass
+
+    def _laser_order(self, on: bool) -> str:
+        """What is written for light or darkness."""
+        wishes = self._wishes
+        if not on:
+            return LASER_ORDERS[wishes.laser]
+        if wishes.laser not in ("M3", "M4"):
+            return wishes.laser
+        power = self._board.power_max if wishes.laser_power is None else wishes.laser_power
+        return f"{wishes.laser} S{power:g}"
+
+    def _way(self, start: tuple[int, int], end: tuple[int, int]) -> tuple[str, float]:
+        """The order of a motion in machine coordinates, and the longest that it may take without ramps, s."""
+        x, y = self._board.position_mm(end)
+        steps = [abs(b - a) for a, b in zip(start, end, strict=True)]
+        rates = [r * k / 60 for r, k in zip(self._board.rate_mm_per_min, self._board.steps_per_mm, strict=True)]
+        speed = self._wishes.speed_steps_per_s
+        slowest = [rate if speed is None else min(rate, speed) for rate in rates]
+        seconds = max(n / rate for n, rate in zip(steps, slowest, strict=True))
+        if speed is None or not seconds:
+            return f"G53 G0 X{x:.5f} Y{y:.5f}", seconds
+        way_mm = sum((n / k) ** 2 for n, k in zip(steps, self._board.steps_per_mm, strict=True)) ** 0.5
+        return f"G53 G1 X{x:.5f} Y{y:.5f} F{60 * way_mm / seconds:.4f}", seconds
+
+    def _require_homed(self, what: str) -> None:
+        if not self._homed:
+            raise fault("refused-unhomed", f"{what} was ordered before homing", "home first")
+
+    def _state(self, status: Status, laser_on: bool) -> DeviceState:
+        pan, tilt = self._board.counters(status.position_mm)
+        word: DeviceStatus = "moving" if status.state in _MOVING else "alarm"
+        if status.state == "Idle":
+            word = "idle" if self._homed else "unhomed"
+        error = "none" if word != "alarm" else escaped(status.state).lower()
+        # GRBL homes onto its limit switches: pressed says nothing of a broken wire.
+        pressed = int("X" in status.pins), int("Y" in status.pins)
+        return DeviceState(0, word, pan, tilt, *self._target, self._done, laser_on, 0, 0, error, *pressed)
+
+    def _laser_on(self) -> bool:
+        modes: list[frozenset[str]] = []
+        self._order("$G", REPLY_S, lambda line: modes.append(found) if (found := parse_modes(line)) else None)
+        if not modes:
+            raise fault("no-answer", "$G was answered without modes", "check the board's firmware: GRBL 1.1 is known")
+        # Both coolants may be on at once; M5 and M9 stand for darkness.
+        return self._wishes.laser in modes[-1]
+
+    def _asked(self) -> Status:
+        """A status report."""
+        self._status = None
+        for attempt in range(3):
+            self.repeats += attempt > 0
+            self._write(ASK)
+            deadline = self._clock.monotonic() + REPLY_S
+            while self._status is None and (line := self._next(deadline)) is not None:
+                self._take(line)
+            if self._status is not None:
+                return self._status
+        raise self._silent("?")
+
+    def _order(self, words: str, longest_s: float, take: Callable[[str], object] = lambda line: None) -> None:
+        """One line, and everything up to its `ok`; lines between go to `take`."""
+        self._resynchronise()
+        self._write(words.encode("ascii") + b"\n")
+        self._pending = 1
+        deadline = self._clock.monotonic() + longest_s
+        asks = longest_s > REPLY_S
+        while self._pending:
+            now = self._clock.monotonic()
+            line = self._next(min(deadline, now + POLL_S) if asks else deadline)
+            if line is None:
+                if self._clock.monotonic() >= deadline:
+                    self._give_up(words, longest_s)
+                self._write(ASK)
+                continue
+            error = number_of(line, "error")
+            if line == "ok":
+                self._pending = 0
+            elif error is not None:
+                self._pending = 0
+                found = f"{words} was refused: error {error}, {ERRORS.get(error, 'see the GRBL manual')}"
+                raise fault(f"refused-{error}", found, "home first" if error == 9 else "see the GRBL manual")
+            else:
+                self._take(line)
+                take(line)
+
+    def _resynchronise(self) -> None:
+        """An order that was interrupted is still to be answered."""
+        deadline = self._clock.monotonic() + REPLY_S
+        while self._pending and (line := self._next(deadline)) is not None:
+            if line == "ok" or number_of(line, "error") is not None:
+                self._pending = 0
+        if self._pending:
+            self._write(RESET)
+            raise self._silent("an order that was interrupted")
+
+    def _give_up(self, words: str, longest_s: float) -> None:
+        if self._status is not None and self._status.state in _MOVING:
+            self._write(HOLD)
+            self._write(RESET)
+            found = f"{words} is not done after {longest_s:.0f} s"
+            raise fault("stall", found, "look for a blocked axis or a missing home switch; then home again")
+        raise self._silent(words)
+
+    def _silent(self, words: str) -> DeviceFault:
+        heard = explained(bytes(self._heard))
+        what = "nothing was heard" if heard.cause == "silence" else heard.found
+        return fault("no-answer", f"no answer to {words}: {what}", "check cable and supply, then go on with --resume")
+
+    def _take(self, line: str) -> None:
+        """What a board says unasked, and status reports."""
+        status, alarm = parse_status(line), number_of(line, "ALARM")
+        if status is not None:
+            self._status = status
+        if alarm is not None:
+            self._homed = False
+            found = f"the board is in alarm {alarm}: {ALARMS.get(alarm, 'see the GRBL manual')}"
+            raise fault(f"alarm-{alarm}", found, "clear the way, check the switches, then home again")
+        if parse_greeting(line) is not None and self._greeted:
+            self._homed = False
+            raise PositionLost(
+                "reset",
+                "positioner: the board was reset, its counters are lost",
+                remedy="check its supply and cable, then go on with --resume: it homes again",
+            )
+
+    def _write(self, data: bytes) -> None:
+        try:
+            self._link.write(data)
+        except OSError as error:
+            raise _unplugged(error) from error
+
+    def _next(self, deadline_s: float) -> str | None:
+        """The next line without its end, None if none is complete by then; empty ones are left out."""
+        while True:
+            while (end := self._buffer.find(b"\n")) >= 0:
+                line = self._buffer[:end].strip().decode("ascii", "replace")
+                del self._buffer[: end + 1]
+                if line:
+                    return line
+            if len(self._buffer) > LINE_CHARS_MAX:
+                self._buffer.clear()
+            left_s = deadline_s - self._clock.monotonic()
+            if left_s <= 0:
+                return None
+            try:
+                data = self._link.read(left_s)
+            except OSError as error:
+                raise _unplugged(error) from error
+            self._buffer += data
+            if not self._greeted:
+                self._heard += data[: max(HEARD_BYTES_MAX - len(self._heard), 0)]
+
+
+def _dark(state: DeviceState) -> DeviceState:
+    """The state behind a motion, in which no light may be."""
+    if state.laser_on:
+        raise fault("laser", "the laser is on after a motion", "cut the laser's supply and check the board")
+    return state
+
+
+def _unplugged(error: OSError) -> DeviceFault:
+    found = f"the board is gone: {reason(error)}"
+    return fault("unplugged", found, "plug it in, then go on with --resume: it homes again")
+
+
+def _refused(key: str, found: str, allowed: str, remedy: str) -> InputError:
+    message = f"[positioner] {key}: found {found}; allowed: {allowed}; {remedy}"
+    return InputError("positioner", message, column=f"positioner.{key}", found=found, allowed=allowed, remedy=remedy)
