@@ -3,7 +3,7 @@
     python -m experiments.gears.repeated_errors run --n 40 --cores 0 1      # 20 to 40 CPU s a rig, resumable
     python -m experiments.gears.repeated_errors table > experiments/gears/repeated_errors.md
 
-Rig s of a protocol is drawn from `data/rigs/mounted` with seed s: geometry, cameras, and a transmission error, a
+Rig s of a protocol ("planned" is what `tvsbayes plan` writes for it) is drawn from `data/rigs/mounted` with seed s: geometry, cameras, and a transmission error, a
 varying play and a drift by the default priors ("priors"), or in a world that no prior holds
 (`experiments.common.worlds`). It is fitted as the package does, with tier 1 (at most `ROUNDS` rounds; accepted by
 Pareto k alone), and with perfect gears, the model without repeating errors. `WITHIN` looks inside the counters seen
@@ -45,7 +45,7 @@ from tvsbayes.statistics.chances import LEVELS
 from tvsbayes.twin.simulated_campaign import SimulatedCampaign, simulate
 
 ROWS = output(__file__, "repeated_errors.jsonl")
-PROTOCOLS = ("paper", "mixed", "grid")
+PROTOCOLS = ("paper", "mixed", "grid", "planned")
 WORLDS = (("pinion", 0.05), ("pinion", 0.1), ("pinion", 0.2), ("tooth", 0.05), ("step", 0.1), ("warm-up", 0.1))
 ROUNDS = 8
 WITHIN = 8
