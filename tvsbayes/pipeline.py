@@ -8,10 +8,11 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from tvsbayes.display import Shown, View
 from tvsbayes.errors import NotConverged, NothingToEstimate, TvsError, escaped
 from tvsbayes.files.disk import make_folder, output_place
 from tvsbayes.instrument.axes import AXES
@@ -82,8 +83,8 @@ def unusable(summary: FitSummary) -> TvsError | None:
     return None
 
 
-@dataclass(frozen=True)
-class CampaignResults:
+@dataclass(frozen=True, repr=False)
+class CampaignResults(Shown):
     """Everything that is said of a campaign, and what it was taken from.
 
     Attributes:
@@ -103,6 +104,12 @@ class CampaignResults:
     draws: ResultDraws
     error: TvsError | None
     files: dict[str, str]
+
+    def shown(self) -> View:
+        """What its record says, and whether that may be used."""
+        view = self.record.summary.shown()
+        usable = "" if self.error is None else f"; DO NOT USE: {self.error.message}"
+        return replace(view, title=f"CampaignResults: {view.title}{usable}")
 
 
 def calibrate(

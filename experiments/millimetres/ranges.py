@@ -32,7 +32,7 @@ from experiments.common.true_looks import ELLIPSOID, ESTIMATORS, TrueLooks, or_n
 from tvsbayes.assessment.fitted_calibration import calibration_of
 from tvsbayes.coordinates.location import locate_linear, settings_of
 from tvsbayes.estimators.joint_fit import fit
-from tvsbayes.report.figures import BLACK, OF_ESTIMATOR, STYLE, WIDTH_IN
+from tvsbayes.report.drawing import BLACK, OF_ESTIMATOR, STYLE, WIDTH_IN
 from tvsbayes.statistics.chances import binomial_bounds
 from tvsbayes.twin.simulated_campaign import simulate
 

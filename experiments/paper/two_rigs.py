@@ -51,7 +51,7 @@ from tvsbayes.instrument.plan import read_plan, run_plan, write_plan
 from tvsbayes.instrument.protocols import twin_protocol
 from tvsbayes.instrument.rig import Rig, read_rig
 from tvsbayes.model.compilation_cache import use_compilation_cache
-from tvsbayes.report.figures import BLACK, BLUE, RED, STYLE, WIDTH_IN
+from tvsbayes.report.drawing import BLACK, BLUE, RED, STYLE, WIDTH_IN
 from tvsbayes.twin.simulated_campaign import simulate
 
 ROWS, PLANNED = output(__file__, "two_rigs.jsonl"), output(__file__, "two_rigs_planned.csv")

@@ -43,7 +43,7 @@ from tvsbayes.planning.candidates import candidates
 from tvsbayes.planning.expectation import Knowledge, prior_knowledge
 from tvsbayes.planning.search import LADDER
 from tvsbayes.planning.target import DEFAULT_TARGET, parse_target
-from tvsbayes.report.figures import BLUE, GREEN, ORANGE, PURPLE, RED, STYLE, WIDTH_IN
+from tvsbayes.report.drawing import BLUE, GREEN, ORANGE, PURPLE, RED, STYLE, WIDTH_IN
 from tvsbayes.statistics.chances import rms_bounds
 from tvsbayes.studies.study_job import StudyJob, study_row
 

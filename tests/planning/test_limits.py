@@ -12,10 +12,10 @@ from support.coarse_planning import with_priors
 
 from tvsbayes.instrument.axes import HOME_APPROACH
 from tvsbayes.instrument.parameters import INDEX, Prior
-from tvsbayes.instrument.plan import run_plan
+from tvsbayes.instrument.plan import LOOKS_PER_EXPERIMENT, run_plan
 from tvsbayes.planning import planner
 from tvsbayes.planning.candidates import candidates
-from tvsbayes.planning.expectation import LOOKS_PER_EXPERIMENT, PARAMETERS, information_of, prior_knowledge
+from tvsbayes.planning.expectation import PARAMETERS, information_of, prior_knowledge
 from tvsbayes.planning.limits import Batch, Limit, limit_of, next_experiments, split_of, stop_now
 from tvsbayes.planning.looks import LookArrays, arrange, information_of_looks
 from tvsbayes.planning.target import AT_POINT, Sensitivity, Target, parse_target, sensitivity

@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 from support.coarse_planning import ROUNDING
 
+from tvsbayes.instrument.plan import LOOKS_PER_EXPERIMENT
 from tvsbayes.planning import search
 from tvsbayes.planning.assurance import Assurance, Family
 from tvsbayes.planning.drawn_rigs import draw_instruments
-from tvsbayes.planning.expectation import LOOKS_PER_EXPERIMENT, PARAMETERS
+from tvsbayes.planning.expectation import PARAMETERS
 from tvsbayes.planning.looks import CONTRAST_COLUMNS, covariance_of, information_of_looks
 from tvsbayes.planning.search import CRITERIA, KNOWN, MEAN_WEIGHT, Scope, Search, scores, search_rows, smallest_design
 from tvsbayes.planning.target import parse_target, sensitivity

@@ -273,7 +273,7 @@ def test_longer_python_examples_run(followed, tmp_path, monkeypatch, capsys):
     assert "sample" in code
     exec(compile(code, "python.md", "exec"), followed["globals"])
     assert capsys.readouterr().out
-    assert {path.name for path in tmp_path.glob("*.svg")} == {"figure12.svg", "figure13.svg"}
+    assert {path.name for path in tmp_path.glob("*.svg")} == {"figure12.svg", "figure13.svg", "both.svg"}
 
 
 @pytest.mark.skipif(

@@ -19,6 +19,12 @@ def test_every_public_name_is_there_and_shown():
         assert getattr(tvsbayes, name).__doc__, name
 
 
+def test_completion_and_figures_work_after_a_plain_import():
+    code = "import tvsbayes; print('read_campaign' in dir(tvsbayes), callable(tvsbayes.plots.intervals))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["True", "True"]
+
+
 def test_no_public_name_is_that_of_a_package():
     """An attribute of the package that is also a module would be one or the other, by what was imported last."""
     assert not set(tvsbayes.__all__) & {module.name for module in pkgutil.iter_modules(tvsbayes.__path__)}

@@ -6,7 +6,8 @@ import pytest
 from support.small_results import estimate
 
 from tvsbayes.estimators.four_point import classic
-from tvsbayes.report.figures import WIDTH_IN, direction_scatter, points_3d, trajectories
+from tvsbayes.report.drawing import WIDTH_IN
+from tvsbayes.report.figures import direction_scatter, intervals, points_3d, trajectories
 
 
 def test_the_papers_figures_for_any_campaign(evidence):
@@ -24,3 +25,15 @@ def test_the_papers_figures_for_any_campaign(evidence):
     assert angles == [f"before: {first.theta_i_deg:.2f} deg", f"after: {first.theta_f_deg:.2f} deg"]
     with pytest.raises(ValueError, match="not complete"):
         trajectories(campaign, 10_000)
+    with pytest.raises(ValueError, match="allowed: left, right, up, down"):
+        direction_scatter(result, "Left")
+
+
+def test_figures_take_what_the_estimators_return(evidence):
+    """And not only their insides: a summary and a classic result as they are."""
+    result = classic(evidence.campaign)
+    whole = intervals(evidence.fit.summary, result)
+    parts = intervals(evidence.fit.summary.effective, result.directions)
+    drawn = [[line.get_xydata().tolist() for line in figure.axes[0].lines] for figure in (whole, parts)]
+    assert drawn[0] == drawn[1] and len(drawn[0]) >= 8
+    assert len(intervals(evidence.fit.summary).axes[0].lines) < len(drawn[0])

@@ -12,14 +12,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from tvsbayes.calibration.optics import Ray, Vector, beam_components, output_deg
+from tvsbayes.display import Shown, View
 from tvsbayes.errors import InputError
 from tvsbayes.instrument.axes import APPROACH_SIGN, AXES, SIDES, bad_approach
 
 AIM_STEPS, AIM_RAD = 40, 1e-11
 
 
-@dataclass(frozen=True)
-class Steps:
+@dataclass(frozen=True, repr=False)
+class Steps(Shown):
     """Counters that send the beam where it is wanted.
 
     Attributes:
@@ -48,6 +49,17 @@ class Steps:
     u95_mm: np.ndarray | None = None
     u95_deg: np.ndarray | None = None
     extrapolated: bool = False
+
+    def shown(self) -> View:
+        """Where to go, and by which way."""
+        pan, tilt = self.approach
+        title = f"Steps: arrive by moving {pan} and {tilt}"
+        title += ", EXTRAPOLATED: no look reached these counters" * self.extrapolated
+        rows = [
+            ("first, which takes up the play", self.via_pan_steps, self.via_tilt_steps),
+            ("then", self.pan_steps, self.tilt_steps),
+        ]
+        return View(title, ("go to", "pan, steps", "tilt, steps"), rows)
 
     def as_json(self) -> dict[str, object]:
         """The document of `steps-for`."""

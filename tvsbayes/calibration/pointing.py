@@ -30,6 +30,7 @@ from tvsbayes.calibration.optics import (
     range_components,
     unit_vector,
 )
+from tvsbayes.display import Shown, View
 from tvsbayes.errors import InputError
 from tvsbayes.instrument.axes import AXES, HOME_APPROACH, SIDES, sides_of
 from tvsbayes.instrument.parameters import names_of
@@ -63,8 +64,8 @@ type Sides = tuple[float, float]
 """Approach sides (pan, tilt): +1 left or up, -1 right or down, 0 unknown."""
 
 
-@dataclass(frozen=True)
-class Located:
+@dataclass(frozen=True, repr=False)
+class Located(Shown):
     """A point of frame T by linear propagation: estimate (3,), covariance (3, 3) and 95 % half widths (3,).
 
     `extrapolated` tells that no look of the campaign reached its counters.
@@ -74,6 +75,13 @@ class Located:
     covariance_mm2: np.ndarray
     u95_mm: np.ndarray
     extrapolated: bool = False
+
+    def shown(self) -> View:
+        """Coordinates with their uncertainty."""
+        u = np.sqrt(np.diag(self.covariance_mm2)).tolist()
+        rows = list(zip("xyz", self.xyz_mm.tolist(), u, self.u95_mm.tolist(), strict=True))
+        told = "Located point, frame T" + ", EXTRAPOLATED: no look reached these counters" * self.extrapolated
+        return View(told, ("axis", "mm", "u", "U95"), rows)
 
 
 @dataclass(frozen=True)
@@ -88,8 +96,8 @@ class _Moved:
     noise: np.ndarray
 
 
-@dataclass(frozen=True)
-class Calibration:
+@dataclass(frozen=True, repr=False)
+class Calibration(Shown):
     """Estimates and uncertainty of everything that a coordinate depends on.
 
     Attributes:
@@ -124,6 +132,14 @@ class Calibration:
     causes: tuple[str, ...] = ()
     cause_covariance: np.ndarray = field(default_factory=lambda: np.zeros((0, len(INPUT_NAMES), len(INPUT_NAMES))))
     gears: GearTable = NO_GEARS
+
+    def shown(self) -> View:
+        """Estimates with their standard uncertainties, and the counters that looks reached."""
+        (left, right), (low, high) = self.range_steps.tolist()
+        title = f"Calibration ({self.estimator}), seen at pan {left:g} to {right:g}, tilt {low:g} to {high:g} steps"
+        u = np.sqrt(np.maximum(np.diag(self.covariance), 0.0)).tolist()
+        rows = [(name, value, u[k]) for k, (name, value) in enumerate(self.estimates.items())]
+        return View(title, ("input", "value", "u"), rows)
 
     @cached_property
     def estimates(self) -> dict[str, float]:

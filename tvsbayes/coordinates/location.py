@@ -22,6 +22,7 @@ from tvsbayes.calibration.pointing import (
     NOISES,
     Calibration,
 )
+from tvsbayes.display import Shown, View
 from tvsbayes.errors import InputError
 from tvsbayes.instrument.axes import HOME_APPROACH, sides_of
 from tvsbayes.progress import Job, Show
@@ -33,8 +34,8 @@ BLOCK = 2**15
 """Numbers per array while draws are carried to points: more than a processor's own memory holds takes longer."""
 
 
-@dataclass(frozen=True)
-class Locations:
+@dataclass(frozen=True, repr=False)
+class Locations(Shown):
     """Points of frame T with their uncertainty; arrays over points, not a number where a point is refused.
 
     Attributes:
@@ -63,6 +64,17 @@ class Locations:
     refused: tuple[InputError | None, ...]
     estimator: str
     draws: int
+
+    def shown(self) -> View:
+        """Points with their uncertainty, refused ones with the reason."""
+        columns = ("point", *(f"{axis}, mm" for axis in "xyz"), *(f"U95({axis}), mm" for axis in "xyz"))
+        rows = []
+        for k, error in enumerate(self.refused):
+            note = f"refused: {error.code}" if error is not None else "EXTRAPOLATED" if self.extrapolated[k] else ""
+            numbers = [None] * 6 if error is not None else [*self.xyz_mm[k].tolist(), *self.u95_mm[k].tolist()]
+            rows.append((k, *numbers, note))
+        title = f"Locations of {len(self.refused)} points, frame T, {self.draws} draws ({self.estimator})"
+        return View(title, (*columns, "note"), rows)
 
     @cached_property
     def digits_held(self) -> np.ndarray:

@@ -17,6 +17,7 @@ from functools import partial
 
 import numpy as np
 
+from tvsbayes.display import Shown, View
 from tvsbayes.errors import NothingToEstimate
 from tvsbayes.instrument.axes import AXES, DIRECTIONS, SENSES
 from tvsbayes.instrument.campaign import Campaign, Move, Spot, ordered_spots, pixels_of
@@ -113,13 +114,25 @@ class DirectionResult:
         return document
 
 
-@dataclass(frozen=True)
-class ClassicResult:
+@dataclass(frozen=True, repr=False)
+class ClassicResult(Shown):
     """What the paper's method says of a campaign; a direction without experiments is None."""
 
     directions: dict[str, DirectionResult | None]
     experiments: tuple[Experiment, ...]
     skipped: tuple[SkippedExperiment, ...]
+
+    def shown(self) -> View:
+        """Mean, scatter and uncertainty by direction."""
+        columns = ("direction", "n", "mean, deg/step", "sd", "u type A", "u GUM", "2.5 % (GUM)", "97.5 % (GUM)")
+        rows = []
+        for name, r in self.directions.items():
+            if r is not None:
+                ends = r.interval95_gum or (None, None)
+                spread = (r.sd_deg_per_step, r.u_type_a_deg_per_step, r.u_gum_deg_per_step)
+                rows.append((name, r.n, r.mean_deg_per_step, *spread, *ends))
+        left_out = f", {len(self.skipped)} left out" if self.skipped else ""
+        return View(f"ClassicResult of {len(self.experiments)} experiments{left_out}", columns, rows)
 
     def as_json(self) -> dict[str, object]:
         """The document of `tvsbayes classic --json`."""

@@ -16,6 +16,7 @@ import jax
 import numpy as np
 from jaxtyping import Bool
 
+from tvsbayes.display import Shown, View
 from tvsbayes.errors import NotConverged, NothingToEstimate
 from tvsbayes.estimators.campaign_arrays import CampaignArrays, in_sight, place_arrays
 from tvsbayes.estimators.likelihood import prior_errors_at_places
@@ -27,8 +28,9 @@ from tvsbayes.instrument.homing import ANYWHERE, every_way, homed, prior_chance,
 from tvsbayes.instrument.model_choice import AS_STATED, ModelChoice
 from tvsbayes.instrument.parameters import INDEX, NAMES, RIG_NAMES, Prior
 from tvsbayes.instrument.places import PLACES_MAX, line_share, seen_places
+from tvsbayes.instrument.stops import legs_of
 from tvsbayes.model.compiled import placed
-from tvsbayes.model.headlines import Derived, SeenLine, derived_quantities
+from tvsbayes.model.headlines import Derived, SeenLine, derived_quantities, told_of
 from tvsbayes.model.parameter_space import ParameterSpace
 from tvsbayes.progress import Job, Show
 from tvsbayes.results.stored_draws import StoredMode
@@ -70,8 +72,8 @@ class Alternative:
     fit: JointFit | None
 
 
-@dataclass(frozen=True)
-class JointFit:
+@dataclass(frozen=True, repr=False)
+class JointFit(Shown):
     """Mode and Laplace approximation of the posterior: what `fit` returns.
 
     Read it through `summary.summarise` (values, intervals, diagnostics in words), `sampling.sample` (draws of the
@@ -128,6 +130,13 @@ class JointFit:
     problems: tuple[str, ...] = ()
     sides: Mapping[str, str] = field(default_factory=dict)
     alternatives: tuple[Alternative, ...] = ()
+
+    def shown(self) -> View:
+        """Mode and Laplace sd of what a fit is for."""
+        state = "converged" if self.converged else f"NOT CONVERGED: {'; '.join(self.problems)}"
+        used = sum(spot.status == "ok" for spot in self.campaign.spots) - len(self.excluded_spots)
+        rows = told_of(self.mode, self.draws, set(legs_of(self.campaign.moves)))
+        return View(f"JointFit of {used} spots, {state}; mode and Laplace sd", ("quantity", "mode", "sd"), rows)
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -15,6 +15,7 @@ from typing import Literal
 
 import numpy as np
 
+from tvsbayes.display import Shown, View
 from tvsbayes.errors import escaped, refusal
 from tvsbayes.files.csv_table import CSV_BYTES_MAX, Table, csv_bytes, parse_table
 from tvsbayes.files.disk import make_folder, read_bytes, write_atomically
@@ -69,8 +70,8 @@ class Spot:
     ruv_right: float = 0.0
 
 
-@dataclass(frozen=True)
-class Campaign:
+@dataclass(frozen=True, repr=False)
+class Campaign(Shown):
     """A campaign folder, checked. `header` holds the keys of `campaign.toml` outside `[rig]`."""
 
     moves: tuple[Move, ...]
@@ -79,6 +80,19 @@ class Campaign:
     rig: RigTable = field(default_factory=RigTable)
     header: dict[str, object] = field(default_factory=dict)
     path: Path | None = None
+
+    def shown(self) -> View:
+        """Counts, and the looks with the counters behind them."""
+        ok = sum(spot.status == "ok" for spot in self.spots)
+        name = str(self.header.get("name") or "without a name")
+        title = f"Campaign {name!r}: {len(self.moves)} moves, {len(self.spots)} spots ({ok} ok)"
+        at = {move.move: (move.pan_steps, move.tilt_steps) for move in self.moves}
+        columns = ("spot", "move", "pan_steps", "tilt_steps", *SPOT_COLUMNS[2:])
+        rows = [
+            (s.spot, s.move, *at.get(s.move, (None, None)), *(getattr(s, column) for column in SPOT_COLUMNS[2:]))
+            for s in self.spots
+        ]
+        return View(title, columns, rows, most=5)
 
 
 CAMERAS: tuple[Literal["left"], Literal["right"]] = ("left", "right")

@@ -22,6 +22,9 @@ from tvsbayes.instrument.counter_limits import COUNTER_MAX
 from tvsbayes.instrument.rig import Rig
 from tvsbayes.instrument.stops import rests_of
 
+LOOKS_PER_EXPERIMENT = 4
+"""The paper counts four spots as one experiment; so do all curves of plans, whatever the looks are."""
+
 
 @dataclass(frozen=True, slots=True)
 class PlanStep:

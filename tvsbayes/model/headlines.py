@@ -6,6 +6,8 @@ rad. With derivatives by the coordinates for planning, or for many points at onc
 
 from __future__ import annotations
 
+from collections.abc import Collection
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -13,6 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from tvsbayes.instrument.axes import AXES, DIRECTIONS
+from tvsbayes.instrument.parameters import INDEX
 from tvsbayes.model.compiled import compiled
 from tvsbayes.model.gear_processes import Places
 from tvsbayes.model.geometry import Scalar
@@ -147,3 +150,24 @@ def derived_quantities(
         )
 
     return jax.vmap(one)(z, place_errors_rad)
+
+
+def told_of(centre: Derived, draws: Derived, moved: Collection[str]) -> list[tuple[str, float, float]]:
+    """Name with unit, value and sd of what a fit is for, of the directions that moved.
+
+    Args:
+        centre: of one set of parameters, fields without leading axis.
+        draws: fields with one leading axis.
+        moved: directions.
+    """
+    effective, physical = np.asarray(draws.effective_deg_per_step), np.asarray(draws.physical)
+    rows = [
+        (f"effective {name}, deg/step", float(centre.effective_deg_per_step[k]), float(effective[:, k].std()))
+        for k, name in enumerate(DIRECTIONS)
+        if name in moved
+    ]
+    for axis in AXES:
+        k = INDEX[f"backlash_deg.{axis}"]
+        rows.append((f"backlash {axis}, deg", float(centre.physical[k]), float(physical[:, k].std())))
+    offset = float(np.asarray(draws.effective_mirror_offset_mm).std())
+    return [*rows, ("effective mirror offset, mm", float(centre.effective_mirror_offset_mm), offset)]

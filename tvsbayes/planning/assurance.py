@@ -13,10 +13,11 @@ import numpy as np
 
 from tvsbayes.errors import InputError
 from tvsbayes.instrument.parameters import INDEX, RIG_NAMES
+from tvsbayes.instrument.plan import LOOKS_PER_EXPERIMENT
 from tvsbayes.model.parameter_space import STOP_COLUMNS
 from tvsbayes.planning.candidates import Candidates
 from tvsbayes.planning.drawn_rigs import Instruments
-from tvsbayes.planning.expectation import LOOKS_PER_EXPERIMENT, NOISE_COLUMNS, PARAMETERS, Knowledge
+from tvsbayes.planning.expectation import NOISE_COLUMNS, PARAMETERS, Knowledge
 from tvsbayes.planning.looks import Arranged, LookArrays, Looks, Seen, arrange, covariance_of, information_of_looks
 from tvsbayes.planning.target import Sensitivity, Target, sensitivity
 from tvsbayes.progress import Advance, unshown

@@ -52,8 +52,6 @@ from tvsbayes.planning.gear_places import (
     regular_places,
 )
 
-LOOKS_PER_EXPERIMENT = 4
-"""The paper counts four spots as one experiment; so do all curves here, whatever the looks are."""
 PARAMETERS = len(NAMES)
 HOME_VARIANCE_RAD2 = math.radians(HOME_SD_DEG) ** 2
 SMALLEST_DESIGN, DESIGN_GROWTH = 512, 4

@@ -10,10 +10,10 @@ import numpy as np
 
 from tvsbayes.assessment.causes import PLAY_VARIATION, TRANSMISSION_ERROR
 from tvsbayes.instrument.parameters import NAMES, PRIOR_GROUPS, RIG_NAMES
-from tvsbayes.instrument.plan import described
+from tvsbayes.instrument.plan import LOOKS_PER_EXPERIMENT, described
 from tvsbayes.instrument.rig import RigTable
 from tvsbayes.planning.candidates import Candidates
-from tvsbayes.planning.expectation import LOOKS_PER_EXPERIMENT, Knowledge
+from tvsbayes.planning.expectation import Knowledge
 from tvsbayes.planning.looks import Seen, arrange, covariance_of, information_of_looks
 from tvsbayes.planning.search import search_designs
 from tvsbayes.planning.target import Sensitivity, Target

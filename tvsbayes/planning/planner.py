@@ -12,11 +12,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from tvsbayes.display import Shown, View
 from tvsbayes.errors import InputError, NotConverged
 from tvsbayes.estimators.linear_spots import LinearSpots, stop_information
 from tvsbayes.instrument.axes import AXES, DIRECTION_SIGNS
 from tvsbayes.instrument.campaign import Campaign
-from tvsbayes.instrument.plan import PlanStep, step_json
+from tvsbayes.instrument.plan import LOOKS_PER_EXPERIMENT, PlanStep, step_json
 from tvsbayes.instrument.protocols import grid_protocol, mixed_protocol, paper_protocol
 from tvsbayes.instrument.rig import Rig
 from tvsbayes.instrument.stops import FEW_STOPS, inseparable, too_few
@@ -77,8 +78,8 @@ class Baseline:
     joint: float
 
 
-@dataclass(frozen=True)
-class PlanResult:
+@dataclass(frozen=True, repr=False)
+class PlanResult(Shown):
     """How many, which ones, and when to stop.
 
     Attributes:
@@ -124,6 +125,13 @@ class PlanResult:
     draws: int
     seed: int
     criterion: str
+
+    def shown(self) -> View:
+        """The curve: what so many looks bring."""
+        said = "met already" if self.assurance is None else f"{self.looks} looks in {self.minutes:.1f} minutes"
+        columns = ("looks", "minutes", "classic", "joint", "chance of success")
+        rows = [(LOOKS_PER_EXPERIMENT * p.experiments, p.minutes, p.classic, p.joint, p.assurance) for p in self.curve]
+        return View(f"PlanResult for {self.target.text}: {said}", columns, rows)
 
     def as_json(self) -> dict[str, object]:
         """The document of `plan --json`."""

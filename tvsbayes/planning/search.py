@@ -13,10 +13,11 @@ from itertools import combinations
 
 import numpy as np
 
+from tvsbayes.instrument.plan import LOOKS_PER_EXPERIMENT
 from tvsbayes.model.headlines import QUANTITIES
 from tvsbayes.planning.assurance import Assurance, Family
 from tvsbayes.planning.candidates import Candidates
-from tvsbayes.planning.expectation import HOME_VARIANCE_RAD2, LOOKS_PER_EXPERIMENT, Knowledge
+from tvsbayes.planning.expectation import HOME_VARIANCE_RAD2, Knowledge
 from tvsbayes.planning.looks import CONTRAST_COLUMNS, Seen, covariance_of, information_of_looks
 from tvsbayes.planning.target import Sensitivity, Target
 from tvsbayes.progress import Advance, unshown

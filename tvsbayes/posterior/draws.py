@@ -8,10 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import jax
 import numpy as np
 
+from tvsbayes.display import Cell, Shown, View
 from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.estimators.likelihood import no_draw
 from tvsbayes.instrument.axes import AXES, DIRECTION_SIGNS, DIRECTIONS, SENSES
@@ -21,6 +23,9 @@ from tvsbayes.model.compiled import in_batches
 from tvsbayes.model.headlines import Derived, derived_quantities
 from tvsbayes.results.convergence import Convergence, Reweighted
 from tvsbayes.statistics.weighted_draws import TAILS, systematic, weighted_mean, weighted_summary
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 DERIVED_BATCH = 2049
 """The batch in which the fit computes its headlines: the compilation is shared."""
@@ -77,8 +82,8 @@ def headline_names(fit: JointFit) -> tuple[str, ...]:
     return tuple(name for name in names if name not in NAMES or fit.free[NAMES.index(name)])
 
 
-@dataclass(frozen=True)
-class Propagated:
+@dataclass(frozen=True, repr=False)
+class Propagated(Shown):
     """A quantity under the posterior; every field but the last two has the quantity's own shape.
 
     Attributes:
@@ -100,9 +105,17 @@ class Propagated:
     draws: np.ndarray
     weights: np.ndarray
 
+    def shown(self) -> View:
+        """Mean, sd and interval; of arrays, element by element."""
+        low, high = np.atleast_1d(self.interval95[0]).ravel(), np.atleast_1d(self.interval95[1]).ravel()
+        mean, sd, error = (np.atleast_1d(each).ravel().tolist() for each in (self.mean, self.sd, self.mcse_mean))
+        columns = zip(mean, sd, low.tolist(), high.tolist(), error, strict=True)
+        rows: list[tuple[Cell, ...]] = [(str(k), *row) for k, row in enumerate(columns)]
+        return View("Propagated quantity", ("element", "mean", "sd", "2.5 %", "97.5 %", "Monte Carlo error"), rows)
 
-@dataclass(frozen=True)
-class Posterior:
+
+@dataclass(frozen=True, repr=False)
+class Posterior(Shown):
     """A sampled posterior; look at `converged` before using it.
 
     Attributes:
@@ -125,6 +138,22 @@ class Posterior:
     convergence: Convergence | Reweighted
     seed: int
     seconds: float
+
+    def shown(self) -> View:
+        """Means, sds and 95 % intervals of what a fit is for."""
+        state = "converged" if self.converged else "NOT CONVERGED"
+        title = f"Posterior by {self.tier}, {self.weights.size} draws, {state}"
+        names = headline_names(self.fit)
+        told = self.propagate(lambda p: np.stack([p[name] for name in names], axis=1))
+        columns = (each.tolist() for each in (told.mean, told.sd, *told.interval95))
+        rows = list(zip(names, *columns, strict=True))
+        return View(title, ("quantity", "mean", "sd", "2.5 %", "97.5 %"), rows)
+
+    def to_dataframe(self) -> pd.DataFrame:
+        """All draws by name, one row each, with their `weight` (sum 1)."""
+        import pandas as pd
+
+        return pd.DataFrame({**self.by_name, "weight": self.weights.ravel()})
 
     @property
     def converged(self) -> bool:

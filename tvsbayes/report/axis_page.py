@@ -14,7 +14,7 @@ from tvsbayes.report.axis_text import (
     parameter_table,
     ratio_table,
 )
-from tvsbayes.report.figures import BLUE, GREY, RED, SKY, STYLE, WIDTH_IN
+from tvsbayes.report.drawing import BLUE, GREY, RED, SKY, STYLE, WIDTH_IN
 from tvsbayes.report.page import page_html
 from tvsbayes.report.tables import FigureView, Issue, Number, Page, Section, concise, figure_view, two_digits
 from tvsbayes.results.fit_record import provenance

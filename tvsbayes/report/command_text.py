@@ -9,6 +9,7 @@ import numpy as np
 
 from tvsbayes.calibration.pointing import Steps
 from tvsbayes.errors import escaped
+from tvsbayes.instrument.plan import LOOKS_PER_EXPERIMENT
 from tvsbayes.report.result_tables import gap_table, hold_out_table, point_budget_table
 from tvsbayes.report.tables import TableView, concise, two_digits
 from tvsbayes.results.comparison_record import Comparison, Gap, HoldOut, PositionHoldOut
@@ -24,8 +25,6 @@ if TYPE_CHECKING:
     from tvsbayes.studies.study import StudyResult
 
 
-LOOKS = 4
-"""Of an experiment of a plan."""
 EXTRAPOLATED = (
     "EXTRAPOLATED: no look of the campaign reached these counters; errors of the gears are foretold there by their "
     "size alone"
@@ -98,14 +97,15 @@ def plan_text(result: PlanResult) -> str:
     for p in _curve_shown(result):
         classic_value = "-" if p.classic is None else f"{p.classic:.3g}"
         lines.append(
-            f"{LOOKS * p.experiments:5d}  {p.minutes:7.1f}  {classic_value:>10}  {p.joint:>10.3g}  "
+            f"{LOOKS_PER_EXPERIMENT * p.experiments:5d}  {p.minutes:7.1f}  {classic_value:>10}  {p.joint:>10.3g}  "
             f"{100 * p.assurance:6.0f} +- {100 * p.assurance_se:.1f} %"
         )
     lines.append(f"u in {unit}, medians over {result.draws} drawn instruments;")
     lines.append("chance of success (assurance): that the fit of such a campaign reports the target as met")
-    none = f"not reached with up to {LOOKS * result.curve[-1].experiments} looks"
+    most = LOOKS_PER_EXPERIMENT * result.curve[-1].experiments
     for level, n in zip(ASSURED, (result.n80, result.n95), strict=True):
-        lines.append(f"for a chance of {100 * level:.0f} %: {none if n is None else f'{LOOKS * n} looks'}")
+        told = f"not reached with up to {most} looks" if n is None else f"{LOOKS_PER_EXPERIMENT * n} looks"
+        lines.append(f"for a chance of {100 * level:.0f} %: {told}")
     if result.assurance is None or result.assurance_se is None:
         lines.append("the target is met already: nothing is left to do")
     else:

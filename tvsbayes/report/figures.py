@@ -9,90 +9,41 @@ label says the same.
 
 from __future__ import annotations
 
-import io
-import re
 from collections.abc import Mapping, Sequence
-from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+from tvsbayes.errors import listed
 from tvsbayes.estimators.four_point import ClassicResult, DirectionResult, select_experiments
 from tvsbayes.instrument.axes import DIRECTIONS, SENSES, Axis
 from tvsbayes.instrument.stereo_pair import triangulate
+from tvsbayes.report.drawing import (
+    BLACK,
+    BLUE,
+    DIVERGING,
+    GREEN,
+    GREY,
+    OF_DIRECTION,
+    OF_ESTIMATOR,
+    ORANGE,
+    RED,
+    SEQUENTIAL,
+    SKY,
+    SMALLEST_SHARE,
+    colour_map,
+    drawing,
+)
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
     from matplotlib.axes import Axes
-    from matplotlib.colors import Colormap
     from matplotlib.figure import Figure
 
     from tvsbayes.coordinates.error_map import ErrorMap
     from tvsbayes.instrument.campaign import Campaign, Spot
     from tvsbayes.metrology.look_budget import Budget
-    from tvsbayes.results.comparison_record import Gap
-    from tvsbayes.results.estimates import Cause, Curves, Estimate, StopResidual
-
-
-WIDTH_IN = 4.6
-BLACK, ORANGE, SKY, GREEN, BLUE, RED, PURPLE, GREY = (
-    *("#000000", "#E69F00", "#56B4E9", "#009E73", "#0072B2", "#D55E00", "#CC79A7"),
-    "#767676",
-)
-OF_ESTIMATOR = {"nominal": (GREY, "s"), "classic": (RED, "^"), "joint": (BLUE, "o")}
-"""Colour and marker of each estimator in every figure."""
-OF_DIRECTION = {"left": ("<", BLUE), "right": (">", RED), "up": ("^", GREEN), "down": ("v", ORANGE)}
-"""Marker and colour of each direction in figures of ratios."""
-SMALLEST_SHARE = 0.005
-"""Of a variance, that has a bar of its own."""
-DIVERGING, SEQUENTIAL = (BLUE, "#FFFFFF", RED), ("#FFFFFF", SKY, BLUE, "#00263E")
-"""Colours of maps, from the lowest to the highest value."""
-RASTER_DPI = 150
-"""Of the parts of a figure with hundreds of points."""
-STYLE: dict[Any, object] = {
-    "font.size": 9.0,
-    "axes.titlesize": 9.5,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.grid": True,
-    "grid.color": "#DDDDDD",
-    "grid.linewidth": 0.6,
-    "legend.frameon": False,
-    "legend.fontsize": 8.0,
-    "svg.hashsalt": "tvsbayes",
-}
-
-
-@contextmanager
-def _figure(height_in: float) -> Iterator[Figure]:
-    """A figure in the house style; the caller fills it."""
-    from matplotlib import rc_context
-    from matplotlib.figure import Figure
-
-    with rc_context(STYLE):
-        yield Figure(figsize=(WIDTH_IN, height_in), layout="constrained")
-
-
-def _colours(stops: Sequence[str]) -> Colormap:
-    from matplotlib.colors import LinearSegmentedColormap
-
-    return LinearSegmentedColormap.from_list("-".join(stops), stops)
-
-
-def svg(figure: Figure) -> bytes:
-    """A figure as an SVG document; the same figure gives the same bytes."""
-    from matplotlib import rc_context
-    from matplotlib.backends.backend_svg import FigureCanvasSVG
-
-    buffer, dpi = io.BytesIO(), figure.dpi
-    # The identifiers in the file are drawn when it is written. The canvas draws once, where `savefig` draws a first
-    # time for the layout alone.
-    with rc_context(STYLE):
-        figure.dpi = RASTER_DPI
-        FigureCanvasSVG(figure).print_svg(buffer, metadata={"Date": None, "Creator": None})
-        figure.dpi = dpi
-    return re.sub(rb">\s+<", b"><", buffer.getvalue())
+    from tvsbayes.results.comparison_record import ComparisonRecord, Gap
+    from tvsbayes.results.estimates import Cause, Curves, Estimate, FitSummary, StopResidual
 
 
 def _measured(campaign: Campaign) -> tuple[list[Spot], np.ndarray]:
@@ -107,7 +58,7 @@ def _experiment(campaign: Campaign, experiment: int) -> tuple[np.ndarray, str, i
     selection = select_experiments(campaign)
     rows = np.flatnonzero(selection.experiments == experiment)
     if not len(rows):
-        known = ", ".join(map(str, selection.experiments[:10]))
+        known = listed(selection.experiments.tolist(), 10)
         raise ValueError(f"experiment {experiment} is not complete; complete are {known or 'none'}")
     row = rows[0]
     points = triangulate(campaign.stereo, selection.pixels[row])
@@ -123,7 +74,7 @@ def trajectories(campaign: Campaign, experiment: int) -> Figure:
     points, axis, steps = _experiment(campaign, experiment)
     across = 1 if axis == "pan" else 2
     before, after = points[[0, 1]], points[[3, 2]]
-    with _figure(3.6) as figure:
+    with drawing(3.6) as figure:
         axes = figure.add_subplot()
         for pair, name, colour, marker in ((before, "before", BLUE, "o"), (after, "after", RED, "^")):
             run = pair[1] - pair[0]
@@ -150,7 +101,7 @@ def points_3d(campaign: Campaign, experiment: int | None = None) -> Figure:
         _, points = _measured(campaign)
     else:
         points = _experiment(campaign, experiment)[0]
-    with _figure(4.0) as figure:
+    with drawing(4.0) as figure:
         axes = figure.add_subplot(projection="3d")
         axes.scatter(*points.T, s=12 if experiment is None else 40, color=BLUE, depthshade=False, rasterized=True)
         if experiment is not None:
@@ -171,14 +122,16 @@ def direction_scatter(result: ClassicResult, direction: str, joint: Estimate | N
         joint: of the joint estimator, drawn beside.
 
     Raises:
-        ValueError: the direction has no experiment.
+        ValueError: there is no such direction, or it has no experiment.
     """
+    if direction not in DIRECTIONS:
+        raise ValueError(f"direction {direction!r}; allowed: {', '.join(DIRECTIONS)}")
     summary = result.directions[direction]
     if summary is None:
         raise ValueError(f"no complete experiment moves {direction}")
     mine = [e for e in result.experiments if e.direction == direction]
     mean, sd = summary.mean_deg_per_step, summary.sd_deg_per_step
-    with _figure(3.2) as figure:
+    with drawing(3.2) as figure:
         axes = figure.add_subplot()
         if sd is not None:
             for k, shade in ((3, "#F0F0F0"), (2, "#E0E0E0"), (1, "#CCCCCC")):
@@ -206,7 +159,7 @@ def setup(
     _, points = _measured(campaign)
     right = -campaign.stereo.R.T @ campaign.stereo.T
     right_s = np.array([right[2], -right[0], -right[1]])
-    with _figure(5.4) as figure:
+    with drawing(5.4) as figure:
         panels = figure.subplots(2, 1, sharex=True, height_ratios=(3, 2))
         for axes, across, name in ((panels[0], 1, "Y (left), mm"), (panels[1], 2, "Z (up), mm")):
             axes.plot(points[:, 0], points[:, across], ".", color=RED, markersize=3, label="spots", rasterized=True)
@@ -235,7 +188,7 @@ def coverage(campaign: Campaign) -> Figure:
     spots, _ = _measured(campaign)
     moves = {move.move: move for move in campaign.moves}
     counters = np.array([(moves[s.move].pan_steps, moves[s.move].tilt_steps) for s in spots]).reshape(-1, 2)
-    with _figure(5.6) as figure:
+    with drawing(5.6) as figure:
         panels = figure.subplots(2, 1)
         poses, counts = np.unique(counters, axis=0, return_counts=True)
         panels[0].scatter(*poses.T, s=8 + 4 * np.sqrt(counts), color=BLUE, marker="o")
@@ -252,11 +205,21 @@ def coverage(campaign: Campaign) -> Figure:
     return figure
 
 
-def intervals(joint: Mapping[str, Estimate | None], classic: Mapping[str, DirectionResult | None]) -> Figure:
-    """Ratios of both estimators with their 95 % intervals by direction, deg/step."""
+def intervals(
+    joint: FitSummary | Mapping[str, Estimate | None],
+    classic: ClassicResult | Mapping[str, DirectionResult | None] | None = None,
+) -> Figure:
+    """Ratios of both estimators with their 95 % intervals by direction, deg/step.
+
+    Args:
+        joint: what a fit says (`results.record.summary`, `read_fit(path).summary`), or estimates by direction.
+        classic: of the classic estimator; None draws the joint one alone.
+    """
+    joint = joint if isinstance(joint, Mapping) else joint.effective
+    classic = {} if classic is None else classic if isinstance(classic, Mapping) else classic.directions
     told = {d: (x.value, x.interval95) for d, x in joint.items() if x is not None}
     seen = {d: (x.mean_deg_per_step, x.interval95_gum or (x.mean_deg_per_step,) * 2) for d, x in classic.items() if x}
-    with _figure(3.2) as figure:
+    with drawing(3.2) as figure:
         axes = figure.add_subplot()
         for offset, name, results in ((-0.12, "classic", seen), (0.12, "joint", told)):
             colour, marker = OF_ESTIMATOR[name]
@@ -276,11 +239,12 @@ def intervals(joint: Mapping[str, Estimate | None], classic: Mapping[str, Direct
     return figure
 
 
-def gap_terms(gaps: Mapping[str, Gap | None]) -> Figure:
-    """Terms of (classic - joint), deg/step, by direction."""
+def gap_terms(gaps: ComparisonRecord | Mapping[str, Gap | None]) -> Figure:
+    """Terms of (classic - joint), deg/step, by direction; `gaps` as `compare` found them, or its record."""
+    gaps = gaps if isinstance(gaps, Mapping) else gaps.directions
     found = {direction: each for direction, each in gaps.items() if each is not None}
     names = [term.name for term in next(iter(found.values())).terms]
-    with _figure(3.6) as figure:
+    with drawing(3.6) as figure:
         axes = figure.add_subplot()
         for shift, (direction, each) in zip(np.linspace(-0.24, 0.24, len(found)), found.items(), strict=True):
             values = np.array([term.value for term in each.terms])
@@ -300,9 +264,9 @@ def gap_terms(gaps: Mapping[str, Gap | None]) -> Figure:
 def correlations(names: Sequence[str], matrix: np.ndarray) -> Figure:
     """Correlations with their values in the cells."""
     count = len(names)
-    with _figure(0.9 + 0.42 * count) as figure:
+    with drawing(0.9 + 0.42 * count) as figure:
         axes = figure.add_subplot()
-        axes.imshow(matrix, cmap=_colours(DIVERGING), vmin=-1, vmax=1)
+        axes.imshow(matrix, cmap=colour_map(DIVERGING), vmin=-1, vmax=1)
         for row in range(count):
             for column in range(count):
                 shade = "white" if abs(matrix[row, column]) > 0.8 else "black"
@@ -318,7 +282,7 @@ def residuals(stops: Sequence[StopResidual], axis: Axis) -> Figure:
     """Deviations of one axis' stops over time and against their counters."""
     mine = [stop for stop in stops if stop.axis == axis]
     directions = SENSES[axis]
-    with _figure(4.6) as figure:
+    with drawing(4.6) as figure:
         panels = figure.subplots(2, 1, sharey=True)
         for direction, colour, marker in (*zip(directions, (BLUE, RED), "^v", strict=True), ("", GREY, "x")):
             part = [stop for stop in mine if stop.direction == direction]
@@ -345,7 +309,7 @@ def causes(found: Sequence[Cause], axis: str) -> Figure:
     """Mean deviation by group of each cause, with two standard errors."""
     mine = [cause for cause in found if cause.axis == axis and len(cause.groups) > 1]
     rows = sum(len(cause.groups) for cause in mine)
-    with _figure(1.2 + 0.22 * max(rows, 2)) as figure:
+    with drawing(1.2 + 0.22 * max(rows, 2)) as figure:
         axes = figure.add_subplot()
         labels: list[str] = []
         for cause in mine:
@@ -365,7 +329,7 @@ def causes(found: Sequence[Cause], axis: str) -> Figure:
 def error_maps(found: ErrorMap, range_index: int) -> Figure:
     """Root mean square 3D error of each estimator over pan and tilt at one range, mm."""
     names = [name for name in OF_ESTIMATOR if name in found.rms_mm]
-    with _figure(0.5 + 1.75 * len(names)) as figure:
+    with drawing(0.5 + 1.75 * len(names)) as figure:
         panels = np.atleast_1d(figure.subplots(len(names), 1, sharex=True))
         # One scale for all: equal colours are equal errors.
         every = np.concatenate([found.rms_mm[name][:, :, range_index].ravel() for name in names])
@@ -373,7 +337,7 @@ def error_maps(found: ErrorMap, range_index: int) -> Figure:
         low, high = (float(seen.min()), float(seen.max())) if len(seen) else (0.0, 1.0)
         for axes, name in zip(panels, names, strict=True):
             values = found.rms_mm[name][:, :, range_index].T
-            colours = _colours(SEQUENTIAL)
+            colours = colour_map(SEQUENTIAL)
             mesh = axes.pcolormesh(
                 found.pan_steps, found.tilt_steps, values, cmap=colours, vmin=low, vmax=high, rasterized=True
             )
@@ -405,7 +369,7 @@ def shares(budget: Budget) -> Figure:
     if rest > 0.05:
         names.append("all others")
         values.append(rest)
-    with _figure(0.9 + 0.26 * len(names)) as figure:
+    with drawing(0.9 + 0.26 * len(names)) as figure:
         axes = figure.add_subplot()
         bars = axes.barh(range(len(names)), values, color=SKY, edgecolor=BLACK, linewidth=0.5)
         axes.bar_label(bars, labels=[f"{value:.1f} %" for value in values], padding=3, fontsize=8)
@@ -417,7 +381,7 @@ def shares(budget: Budget) -> Figure:
 
 def ratio_curves(curves: Curves) -> Figure:
     """Effective ratios along both axes with 95 % intervals."""
-    with _figure(5.4) as figure:
+    with drawing(5.4) as figure:
         panels = figure.subplots(2, 1)
         for axes, axis, shown in zip(panels, SENSES, SENSES.values(), strict=True):
             points = curves.ratios[axis]

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tvsbayes.instrument.axes import DIRECTIONS, SENSES
-from tvsbayes.report.figures import BLACK, BLUE, OF_DIRECTION, ORANGE, PURPLE, SKY, STYLE, WIDTH_IN
+from tvsbayes.report.drawing import BLACK, BLUE, OF_DIRECTION, ORANGE, PURPLE, SKY, STYLE, WIDTH_IN
 from tvsbayes.report.result_tables import ESTIMATE_COLUMNS, estimate_row, gears_table, range_text
 from tvsbayes.report.tables import FigureView, Section, TableView, figure_view
 

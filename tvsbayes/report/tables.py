@@ -20,7 +20,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from tvsbayes.report import figures
+from tvsbayes.report.drawing import svg
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -174,5 +174,5 @@ class Page:
 def figure_view(figure: Figure, alt: str, caption: str) -> FigureView:
     """A figure as SVG in a `data:` address; the same figure gives the same bytes."""
     width, height = (round(96 * inch) for inch in figure.get_size_inches())
-    picture = base64.b64encode(figures.svg(figure)).decode()
+    picture = base64.b64encode(svg(figure)).decode()
     return FigureView(f"data:image/svg+xml;base64,{picture}", alt, caption, width, height)

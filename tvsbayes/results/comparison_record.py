@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+from tvsbayes.display import Shown, View
 from tvsbayes.instrument.axes import DIRECTIONS
 from tvsbayes.instrument.campaign import Campaign
 from tvsbayes.results.records import plain, read_record, stored_document
@@ -81,8 +82,8 @@ class Score:
     log_density: float
 
 
-@dataclass(frozen=True)
-class HoldOut:
+@dataclass(frozen=True, repr=False)
+class HoldOut(Shown):
     """Classic against joint on experiments that neither had seen.
 
     Attributes:
@@ -108,6 +109,17 @@ class HoldOut:
     verdict: str
     reason: str
     unseen: dict[str, float]
+
+    def shown(self) -> View:
+        """Scores of both estimators."""
+        named = {"classic": self.classic, "joint": self.joint}
+        rows = [
+            (name, s.rms_deg, s.rms_block_deg, 100 * s.coverage, s.log_density)
+            for name, s in named.items()
+            if s is not None
+        ]
+        columns = ("estimator", "rms, deg", "rms of block means, deg", "inside 95 %, %", "log density")
+        return View(f"HoldOut by {self.by}: {self.verdict}: {self.reason}", columns, rows)
 
 
 @dataclass(frozen=True)
@@ -178,8 +190,8 @@ class Change:
     significant: bool
 
 
-@dataclass(frozen=True)
-class Comparison:
+@dataclass(frozen=True, repr=False)
+class Comparison(Shown):
     """Two calibrations of one instrument at one pose.
 
     Attributes:
@@ -198,13 +210,22 @@ class Comparison:
     limit: float
     verdict: str
 
+    def shown(self) -> View:
+        """What has changed."""
+        columns = ("quantity", "unit", "A", "B", "B - A", "u", "normalised", "significant")
+        rows = [
+            (c.quantity, c.unit, c.first, c.second, c.difference, c.u, c.normalised, c.significant)
+            for c in self.changes
+        ]
+        return View(f"Comparison: {self.verdict}", columns, rows)
+
     def as_json(self) -> dict[str, object]:
         """Plain types."""
         return {"kind": "two calibrations", **plain(self)}
 
 
-@dataclass(frozen=True)
-class ComparisonRecord:
+@dataclass(frozen=True, repr=False)
+class ComparisonRecord(Shown):
     """Classic against joint, as `results/compare.json` holds it.
 
     Attributes:
@@ -218,6 +239,10 @@ class ComparisonRecord:
     held_out: HoldOut
     inputs: dict[str, str]
     seed: int
+
+    def shown(self) -> View:
+        """How both estimators foretell what neither had seen."""
+        return self.held_out.shown()
 
     def as_json(self) -> dict[str, object]:
         """The document of `compare --json`, without what the caller adds (`files`)."""

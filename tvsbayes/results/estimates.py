@@ -9,6 +9,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from tvsbayes.display import Shown, View
 from tvsbayes.instrument.axes import DIRECTIONS
 from tvsbayes.results.convergence import Sampling
 from tvsbayes.results.records import plain
@@ -193,8 +194,8 @@ class Curves:
         return {"effective_deg_per_step": along, "lost_motion": plain(self.lost_motion)}
 
 
-@dataclass(frozen=True)
-class FitSummary:
+@dataclass(frozen=True, repr=False)
+class FitSummary(Shown):
     """A joint fit in the contract's terms.
 
     Attributes:
@@ -250,6 +251,20 @@ class FitSummary:
     local: dict[str, Estimate | None] = field(default_factory=dict)
     range_steps: dict[str, tuple[int, int]] = field(default_factory=dict)
     homing_side: dict[str, dict[str, float]] = field(default_factory=dict)
+
+    def shown(self) -> View:
+        """Every estimate but the cameras' parameters."""
+        kind = {"laplace": "Laplace approximation", "posterior": "posterior"}[self.estimator]
+        title = f"FitSummary, {kind}, {'converged' if self.converged else 'NOT CONVERGED'}"
+        if self.validation is not None and not self.validation.passed:
+            title += f"; VALIDATION FAILED: {self.validation.cause}, u times {self.validation.inflation:.2f}"
+        named = {f"effective_deg_per_step.{d}": e for d, e in self.effective.items()} | self.parameters
+        rows = [
+            (name, e.value, e.sd, *e.interval95, None if e.contraction is None else round(100 * e.contraction, 1))
+            for name, e in named.items()
+            if e is not None and not name.startswith("stereo.")
+        ]
+        return View(title, ("quantity", "value", "sd", "2.5 %", "97.5 %", "told by the data, %"), rows)
 
     @property
     def headline_informed(self) -> bool:

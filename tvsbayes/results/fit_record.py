@@ -12,7 +12,7 @@ import json
 import shlex
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from functools import cache
 from importlib.metadata import version
 from itertools import islice
@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from tvsbayes.display import Shown, View
 from tvsbayes.errors import escaped, shown
 from tvsbayes.files.disk import read_bytes, shipped_data
 from tvsbayes.files.documents import JSON_BYTES_MAX, Keys, parse_json
@@ -103,8 +104,8 @@ def covariance_of_draws(names: Sequence[str], physical: np.ndarray, told: Mappin
     return NamedCovariance(tuple(names[i] for i in told_of), np.cov(physical[:, told_of], rowvar=False))
 
 
-@dataclass(frozen=True)
-class FitRecord:
+@dataclass(frozen=True, repr=False)
+class FitRecord(Shown):
     """Everything that `results/fit.json` holds.
 
     Attributes:
@@ -118,6 +119,10 @@ class FitRecord:
     covariance: NamedCovariance
     evidence: FitEvidence | None
     provenance: Provenance
+
+    def shown(self) -> View:
+        """Its summary, and which report it belongs to."""
+        return replace(self.summary.shown(), title=f"FitRecord {self.report_id}: {self.summary.shown().title}")
 
     def as_json(self) -> dict[str, object]:
         """The document."""

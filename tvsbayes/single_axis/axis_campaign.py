@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
+from tvsbayes.display import Shown, View
 from tvsbayes.errors import InputError, escaped, refusal
 from tvsbayes.files.csv_table import CSV_BYTES_MAX, csv_bytes, parse_table
 from tvsbayes.files.disk import make_folder, read_bytes, write_atomically
@@ -55,8 +56,8 @@ class Reading:
     status: str = "ok"
 
 
-@dataclass(frozen=True)
-class AxisCampaign:
+@dataclass(frozen=True, repr=False)
+class AxisCampaign(Shown):
     """An axis folder, checked.
 
     Attributes:
@@ -74,6 +75,16 @@ class AxisCampaign:
     stated: dict[str, AxisPrior] = field(default_factory=dict)
     header: dict[str, object] = field(default_factory=dict)
     path: Path | None = None
+
+    def shown(self) -> View:
+        """Counts, and the readings with the commands behind them."""
+        at = {move.move: move.command for move in self.moves}
+        ok = sum(reading.status == "ok" for reading in self.readings)
+        title = f"AxisCampaign in {self.unit}: {len(self.moves)} moves, {len(self.readings)} readings ({ok} ok)"
+        rows = [(r.reading, r.move, at.get(r.move), r.value, r.u, r.status) for r in self.readings]
+        return View(
+            title, ("reading", "move", "command", f"value, {self.unit}", f"u, {self.unit}", "status"), rows, most=5
+        )
 
 
 _MOVE_COLUMNS = ("move", "segment", "time_s", "command", "approach")

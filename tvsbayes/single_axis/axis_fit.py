@@ -7,6 +7,7 @@ from functools import cached_property
 
 import numpy as np
 
+from tvsbayes.display import Shown, View
 from tvsbayes.errors import NotConverged, TvsError
 from tvsbayes.progress import Job, Show
 from tvsbayes.single_axis.axis_campaign import AxisCampaign
@@ -41,8 +42,8 @@ class TierAgreement:
     quantity: str
 
 
-@dataclass(frozen=True)
-class AxisFit:
+@dataclass(frozen=True, repr=False)
+class AxisFit(Shown):
     """A fitted axis.
 
     Attributes:
@@ -64,6 +65,12 @@ class AxisFit:
     agreement: TierAgreement | None
     w: np.ndarray
     seed: int
+
+    def shown(self) -> View:
+        """What was fitted and how; `axis_record.summarise_axis` says what came out."""
+        rows, how = self.rows, self.tier or self.estimator
+        state = "converged" if self.error is None else f"NOT CONVERGED: {self.error.message}"
+        return View(f"AxisFit of {len(rows.value)} rows at {len(rows.positions)} positions by {how}, {state}")
 
     @classmethod
     def of_draws(cls, campaign: AxisCampaign, model: AxisModel, w: np.ndarray, seed: int) -> AxisFit:

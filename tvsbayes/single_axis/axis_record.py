@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from tvsbayes.display import Shown, View
 from tvsbayes.errors import InputError, NothingToEstimate, TvsError, listed
 from tvsbayes.files.disk import make_folder, read_arrays, write_atomically
 from tvsbayes.progress import Show
@@ -43,8 +44,8 @@ class PositionDeviation:
     interval95: tuple[float, float]
 
 
-@dataclass(frozen=True)
-class AxisSummary:
+@dataclass(frozen=True, repr=False)
+class AxisSummary(Shown):
     """A fit in the terms of `fit.json`.
 
     Attributes:
@@ -79,6 +80,19 @@ class AxisSummary:
     weak_directions: tuple[str, ...]
     warnings: tuple[str, ...]
     sampling: dict[str, float | int | None]
+
+    def shown(self) -> View:
+        """Ratios by direction, then every parameter."""
+        named = {f"per_command.{side}": e for side, e in self.per_command.items()}
+        named |= {f"effective_per_command.{side}": e for side, e in self.effective_per_command.items()}
+        named |= {name: e for name, e in self.parameters.items() if name != "per_command"}
+        rows = [
+            (name, e.value, e.sd, *e.interval95, None if e.contraction is None else round(100 * e.contraction, 1))
+            for name, e in named.items()
+        ]
+        state = "converged" if self.converged else "NOT CONVERGED"
+        title = f"AxisSummary in {self.unit}, {self.estimator}, {state}"
+        return View(title, ("quantity", "value", "sd", "2.5 %", "97.5 %", "told by the data, %"), rows)
 
     def as_json(self) -> dict[str, object]:
         """Plain types."""
@@ -277,13 +291,17 @@ def keep_fit(fit: AxisFit, summary: AxisSummary, folder: Path) -> dict[str, str]
     return {kind: str(path) for kind, path in paths.items()}
 
 
-@dataclass(frozen=True)
-class AxisResults:
+@dataclass(frozen=True, repr=False)
+class AxisResults(Shown):
     """A fit and what is said of it; `stored` where both were taken from `results/`."""
 
     summary: AxisSummary
     fit: AxisFit
     stored: bool
+
+    def shown(self) -> View:
+        """Its summary."""
+        return self.summary.shown()
 
 
 def results_for(

@@ -6,13 +6,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from tvsbayes.display import Shown, View
 from tvsbayes.metrology.iso230 import RUNS_MIN, figures_of
 from tvsbayes.results.metrology_tables import Positioning
 from tvsbayes.single_axis.axis_rows import AxisRows
 
 
-@dataclass(frozen=True)
-class ClassicAxis:
+@dataclass(frozen=True, repr=False)
+class ClassicAxis(Shown):
     """The least-squares line with one reversal and independent stops, and the ISO 230-2 table.
 
     Attributes:
@@ -28,6 +29,16 @@ class ClassicAxis:
     u_backlash: float | None
     residual_sd: float
     iso230: dict[str, float] | None
+
+    def shown(self) -> View:
+        """Slope, backlash, scatter, ISO 230-2 figures."""
+        rows: list[tuple[str, float | None, float | None]] = [
+            ("per_command", self.per_command, self.u_per_command),
+            ("backlash", self.backlash, self.u_backlash),
+            ("residual_sd", self.residual_sd, None),
+        ]
+        rows += [(name, value, None) for name, value in (self.iso230 or {}).items()]
+        return View("ClassicAxis: least-squares line with one reversal", ("quantity", "value", "u"), rows)
 
 
 def line_design(rows: AxisRows) -> np.ndarray:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from tvsbayes.display import Shown, View
 from tvsbayes.errors import NothingToEstimate
 from tvsbayes.progress import Job, Show
 from tvsbayes.results.records import plain
@@ -56,8 +57,8 @@ class HeldOutPosition:
     end: bool
 
 
-@dataclass(frozen=True)
-class AxisHoldOut:
+@dataclass(frozen=True, repr=False)
+class AxisHoldOut(Shown):
     """All positions foretold.
 
     Attributes:
@@ -74,6 +75,16 @@ class AxisHoldOut:
     classic_rms_z: float
     inside_share: float
     warnings: tuple[str, ...]
+
+    def shown(self) -> View:
+        """Every position beside what was foretold of it."""
+        rows = [
+            (p.position, p.direction, p.n, p.mean, p.predicted, p.u, p.classic_predicted, p.classic_u)
+            for p in self.positions
+        ]
+        columns = ("position", "direction", "n", "mean", "predicted", "u", "classic predicted", "classic u")
+        title = f"AxisHoldOut: RMS z {self.rms_z:.2f}, classic {self.classic_rms_z:.2f}"
+        return View(title, columns, rows)
 
     def as_json(self) -> dict[str, object]:
         """Plain types."""

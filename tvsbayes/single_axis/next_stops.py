@@ -11,6 +11,7 @@ from itertools import pairwise
 
 import numpy as np
 
+from tvsbayes.display import Shown, View
 from tvsbayes.errors import InputError
 from tvsbayes.files.csv_table import csv_bytes
 from tvsbayes.progress import Job, Show
@@ -56,8 +57,8 @@ class NextStop:
         return [*first, f"move {self.command:g}", "read"]
 
 
-@dataclass(frozen=True)
-class AxisPlan:
+@dataclass(frozen=True, repr=False)
+class AxisPlan(Shown):
     """Stops to be read next, each given those before it.
 
     Attributes:
@@ -71,6 +72,12 @@ class AxisPlan:
     u_now: float
     next: tuple[NextStop, ...]
     minutes: float
+
+    def shown(self) -> View:
+        """Stops to read next, in order."""
+        rows = [(stop.command, stop.direction, stop.via, stop.u, stop.gain_per_minute) for stop in self.next]
+        columns = ("command", "direction", "go first to", "u afterwards", "gain a minute")
+        return View(f"AxisPlan for {self.target}: {len(rows)} stops in {self.minutes:.0f} minutes", columns, rows)
 
     def as_json(self) -> dict[str, object]:
         """Plain types; every stop with its actions in words."""

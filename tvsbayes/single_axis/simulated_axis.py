@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
+from tvsbayes.display import Shown, View
 from tvsbayes.errors import InputError, NothingToEstimate
 from tvsbayes.files.disk import write_atomically
 from tvsbayes.single_axis.axis_campaign import AxisCampaign, AxisMove, Reading, write_axis
@@ -44,12 +45,17 @@ class AxisTruth:
         return {"format": TRUTH_FORMAT, "parameters": self.parameters, **lists}
 
 
-@dataclass(frozen=True)
-class SimulatedAxis:
+@dataclass(frozen=True, repr=False)
+class SimulatedAxis(Shown):
     """A campaign and the truth behind it."""
 
     campaign: AxisCampaign
     truth: AxisTruth
+
+    def shown(self) -> View:
+        """Its campaign; the truth stands in `truth`."""
+        view = self.campaign.shown()
+        return replace(view, title=f"Simulated {view.title}; the truth is in .truth")
 
     def write(self, folder: Path) -> None:
         """Campaign folder with `truth.json`."""

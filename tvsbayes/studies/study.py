@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from tvsbayes.display import Shown, View
 from tvsbayes.errors import NotConverged
 from tvsbayes.instrument.axes import DIRECTION_SIGNS
 from tvsbayes.model.headlines import QUANTITIES
@@ -56,8 +57,8 @@ class HeadlineStudy:
         return covered and low <= self.rms_z <= high
 
 
-@dataclass(frozen=True)
-class StudyResult:
+@dataclass(frozen=True, repr=False)
+class StudyResult(Shown):
     """Coverage, power and assurance of a plan, measured.
 
     Attributes:
@@ -83,6 +84,16 @@ class StudyResult:
     reported: tuple[float, float, float] | None
     seconds: float
     problems: tuple[str, ...]
+
+    def shown(self) -> View:
+        """Coverage and power by quantity."""
+        rows = [
+            (name, h.sd, h.rms_z, h.rms_predicted, 100 * h.coverage["95"], h.power)
+            for name, h in self.headlines.items()
+        ]
+        columns = ("quantity", "median sd", "RMS z", "predicted", "inside 95 %, %", "power")
+        title = f"StudyResult of {self.campaigns} campaigns: {100 * self.assurance:.1f} % meet {self.target.text}"
+        return View(title, columns, rows)
 
     def as_json(self) -> dict[str, object]:
         """The document of `study --json`."""

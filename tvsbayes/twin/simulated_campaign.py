@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
+from tvsbayes.display import Shown, View
 from tvsbayes.files.disk import write_atomically
 from tvsbayes.instrument.axes import FULL_TURN_DEG, HOME_APPROACH, HOME_SD_DEG, SIDES, PanApproach, TiltApproach
 from tvsbayes.instrument.campaign import NO_PIXELS, Campaign, Move, Spot, with_pixels, write_campaign
@@ -47,13 +48,18 @@ HOME_SIDE_CHANCES = 0.45, 0.45, 0.1
 """That a machine homes always from the left (up), always from the right (down), anywhere anew (formulation 3.1)."""
 
 
-@dataclass(frozen=True)
-class SimulatedCampaign:
+@dataclass(frozen=True, repr=False)
+class SimulatedCampaign(Shown):
     """What the twin wrote: the campaign as a stranger would get it, and the truth and the light behind it."""
 
     campaign: Campaign
     truth: Truth
     light: Light
+
+    def shown(self) -> View:
+        """Its campaign; the truth stands in `truth`."""
+        view = self.campaign.shown()
+        return replace(view, title=f"Simulated {view.title}; the truth is in .truth")
 
     def undetected(self) -> SimulatedCampaign:
         """The same run before anybody has looked at its pictures: no pixels, status "undetected"."""

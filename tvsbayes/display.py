@@ -1,0 +1,105 @@
+"""How results show themselves in a session and in a notebook: a short table instead of all their arrays.
+
+A result says what it is in `shown()`; `repr`, the notebook's HTML and `to_dataframe` are made of that. Plain Python;
+pandas is loaded by `to_dataframe` alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from html import escape
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+type Cell = str | float | int | bool | None
+"""One entry of a view: a number as it is, text, or nothing."""
+ROWS = 24
+"""Shown of a long table, at most; `to_dataframe` has all."""
+
+
+@dataclass(frozen=True)
+class View:
+    """What is shown of a result.
+
+    Attributes:
+        title: what it is, in one line.
+        columns: heads, units included.
+        rows: cells by column.
+        most: rows that are shown.
+    """
+
+    title: str
+    columns: Sequence[str] = ()
+    rows: Sequence[Sequence[Cell]] = ()
+    most: int = ROWS
+
+    def text(self) -> str:
+        """A few lines for a terminal."""
+        if not self.rows:
+            return self.title
+        cells = [list(self.columns), *([_told(cell) for cell in row] for row in self.rows[: self.most])]
+        width = [max(len(row[k]) for row in cells) for k in range(len(self.columns))]
+        lines = [self.title]
+        for first, *others in cells:
+            beside = (cell.rjust(wide) for cell, wide in zip(others, width[1:], strict=True))
+            lines.append("  ".join([first.ljust(width[0]), *beside]).rstrip())
+        return "\n".join([*lines, *self._rest()])
+
+    def html(self) -> str:
+        """A table for a notebook; what comes from files is escaped."""
+        if not self.rows:
+            return f"<p>{escape(self.title)}</p>"
+        head = "".join(f"<th>{escape(column)}</th>" for column in self.columns)
+        body = "".join(
+            f"<tr>{''.join(f'<td>{escape(_told(cell))}</td>' for cell in row)}</tr>" for row in self.rows[: self.most]
+        )
+        rest = "".join(f"<p>{line}</p>" for line in self._rest())
+        table = f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
+        return f"<p>{escape(self.title)}</p>{table}{rest}"
+
+    def _rest(self) -> list[str]:
+        more = len(self.rows) - self.most
+        return [f"... {more} more rows; to_dataframe() has all"] if more > 0 else []
+
+
+class Shown:
+    """Base of results: shows `shown()` wherever Python shows a value.
+
+    A dataclass of this base is declared with `repr=False`, or its own `repr` would list every array.
+    """
+
+    __slots__ = ()
+
+    def shown(self) -> View:
+        """What is shown of it; every class of this base says so itself."""
+        raise NotImplementedError
+
+    def __repr__(self) -> str:
+        """The view as text."""
+        return self.shown().text()
+
+    def _repr_html_(self) -> str:
+        return self.shown().html()
+
+    def to_dataframe(self) -> pd.DataFrame:
+        """All rows of the view as a pandas table.
+
+        Raises:
+            ImportError: pandas is not installed.
+        """
+        import pandas as pd
+
+        view = self.shown()
+        return pd.DataFrame([list(row) for row in view.rows], columns=list(view.columns))
+
+
+def _told(cell: Cell) -> str:
+    """A cell as text: numbers to six digits, nothing as a dash, control characters of files as question marks."""
+    if cell is None:
+        return "-"
+    if isinstance(cell, str):
+        return "".join(c if c.isprintable() else "?" for c in cell)
+    return str(cell) if isinstance(cell, bool) else f"{cell:.6g}"
