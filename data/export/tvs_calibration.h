@@ -2,7 +2,9 @@
  * @EXPECTED_ERROR@
  * Frame T: origin mid-baseline, x depth, y along the baseline towards the positioner, z up; mm.
  * Counters are absolute steps after homing; a side is +1 (reached left or up) or -1 (right or down).
- * To arrive on a side, start TVS_OVERSHOOT_*_STEPS before the target on the other side of it.
+ * tvs_beam and tvs_locate go from counters to the beam and to a point; tvs_steps_for_point and tvs_steps_for_direction
+ * back, with the counters to go to first: the move on from there takes up the play. Counters that the machine must not
+ * leave may be defined before this file is included: TVS_LIMIT_PAN_LOW, TVS_LIMIT_PAN_HIGH, and likewise TILT.
  * Errors of the gears (transmission error, change of play) are interpolated in tables over the counters; ask
  * tvs_extrapolated whether the campaign looked there: outside, tvs_error_u_deg tells how little is known.
  */
@@ -15,13 +17,13 @@
 
 #define TVS_RAD 0.017453292519943295
 
-static double tvs_error_deg(double angle_deg, double period_deg, double c1, double s1, double c2, double s2)
+static inline double tvs_error_deg(double angle_deg, double period_deg, double c1, double s1, double c2, double s2)
 {
     double phase = 360.0 * TVS_RAD * angle_deg / period_deg;
     return c1 * cos(phase) + s1 * sin(phase) + c2 * cos(2 * phase) + s2 * sin(2 * phase);
 }
 
-static double tvs_output_deg(double steps, int side, double ratio, double backlash, double period_deg, double c1,
+static inline double tvs_output_deg(double steps, int side, double ratio, double backlash, double period_deg, double c1,
                              double s1, double c2, double s2)
 {
     double angle = ratio * steps;
@@ -34,7 +36,7 @@ static double tvs_output_deg(double steps, int side, double ratio, double backla
 }
 
 /* A table of regular counters at a counter (cubic interpolation), and what holds beyond the table. */
-static double tvs_table(const double *table, int size, double first, double last, double steps, double beyond)
+static inline double tvs_table(const double *table, int size, double first, double last, double steps, double beyond)
 {
     double found = 0, at = last > first ? (steps - first) * (size - 1) / (last - first) : 0;
     int begin = 0;
@@ -53,14 +55,14 @@ static double tvs_table(const double *table, int size, double first, double last
 }
 
 /* Whether no look of the campaign reached these counters. */
-static int tvs_extrapolated(double pan_steps, double tilt_steps)
+static inline int tvs_extrapolated(double pan_steps, double tilt_steps)
 {
     return !(pan_steps >= TVS_SEEN_PAN_LOW && pan_steps <= TVS_SEEN_PAN_HIGH && tilt_steps >= TVS_SEEN_TILT_LOW &&
              tilt_steps <= TVS_SEEN_TILT_HIGH);
 }
 
 /* What errors of the gears add to the mirror angle of pan (0) or tilt (1) at a counter, degrees. */
-static double tvs_gear_deg(int tilt, double steps, int side)
+static inline double tvs_gear_deg(int tilt, double steps, int side)
 {
     if (tilt)
         return tvs_table(TVS_ERROR_TILT_DEG, TVS_TABLE_TILT_SIZE, TVS_TABLE_TILT_FIRST, TVS_TABLE_TILT_LAST, steps, 0) -
@@ -86,14 +88,14 @@ static inline double tvs_error_u_deg(int tilt, double steps)
 }
 
 /* Mirror angles in degrees. */
-static double tvs_pan_deg(double steps, int side)
+static inline double tvs_pan_deg(double steps, int side)
 {
     return tvs_gear_deg(0, steps, side) + tvs_output_deg(steps, side, TVS_DEGREES_PER_STEP_PAN, TVS_BACKLASH_DEG_PAN, TVS_PERIOD_PAN_DEG,
                           TVS_HARMONIC_DEG_PAN_1_COS, TVS_HARMONIC_DEG_PAN_1_SIN, TVS_HARMONIC_DEG_PAN_2_COS,
                           TVS_HARMONIC_DEG_PAN_2_SIN);
 }
 
-static double tvs_tilt_deg(double steps, int side)
+static inline double tvs_tilt_deg(double steps, int side)
 {
     return TVS_TILT_ZERO_DEG + tvs_gear_deg(1, steps, side) + tvs_output_deg(steps, side, TVS_DEGREES_PER_STEP_TILT, TVS_BACKLASH_DEG_TILT,
                                               TVS_PERIOD_TILT_DEG, TVS_HARMONIC_DEG_TILT_1_COS,
@@ -101,7 +103,7 @@ static double tvs_tilt_deg(double steps, int side)
                                               TVS_HARMONIC_DEG_TILT_2_SIN);
 }
 
-static void tvs_reflect(double p[3], double d[3], const double at[3], const double n[3])
+static inline void tvs_reflect(double p[3], double d[3], const double at[3], const double n[3])
 {
     double along = d[0] * n[0] + d[1] * n[1] + d[2] * n[2];
     double reach = ((at[0] - p[0]) * n[0] + (at[1] - p[1]) * n[1] + (at[2] - p[2]) * n[2]) / along;
@@ -111,18 +113,17 @@ static void tvs_reflect(double p[3], double d[3], const double at[3], const doub
     }
 }
 
-static void tvs_turn(double v[3], double angle)
+static inline void tvs_turn(double v[3], double angle)
 {
     double x = cos(angle) * v[0] - sin(angle) * v[1];
     v[1] = sin(angle) * v[0] + cos(angle) * v[1];
     v[0] = x;
 }
 
-/* The beam at counters that were reached from the given sides: origin in mm and unit direction, frame T. */
-static void tvs_beam(double pan_steps, double tilt_steps, int pan_side, int tilt_side, double origin[3],
-                     double direction[3])
+/* The beam at mirror angles in degrees: origin in mm and unit direction, frame T. */
+static inline void tvs_mirror_beam(double pan_deg, double tilt_deg, double origin[3], double direction[3])
 {
-    double psi = TVS_RAD * tvs_pan_deg(pan_steps, pan_side), beta = TVS_RAD * tvs_tilt_deg(tilt_steps, tilt_side);
+    double psi = TVS_RAD * pan_deg, beta = TVS_RAD * tilt_deg;
     double tx = tan(TVS_RAD * TVS_LASER_TILT_DEG_X), ty = tan(TVS_RAD * TVS_LASER_TILT_DEG_Y);
     double length = sqrt(1 + tx * tx + ty * ty);
     double m1 = TVS_RAD * (45 + TVS_MIRROR1_ERROR_DEG), m2 = TVS_RAD * (45 + TVS_MIRROR2_ERROR_DEG);
@@ -146,9 +147,16 @@ static void tvs_beam(double pan_steps, double tilt_steps, int pan_side, int tilt
     }
 }
 
+/* The beam at counters that were reached from the given sides: origin in mm and unit direction, frame T. */
+static inline void tvs_beam(double pan_steps, double tilt_steps, int pan_side, int tilt_side, double origin[3],
+                            double direction[3])
+{
+    tvs_mirror_beam(tvs_pan_deg(pan_steps, pan_side), tvs_tilt_deg(tilt_steps, tilt_side), origin, direction);
+}
+
 /* The point where the beam meets what the aperture read, frame T, mm; returns 0 where they do not meet, 1 where they
  * do, 2 where they do at counters at which the campaign never looked. */
-static int tvs_locate(double pan_steps, double tilt_steps, int pan_side, int tilt_side, double aperture_deg,
+static inline int tvs_locate(double pan_steps, double tilt_steps, int pan_side, int tilt_side, double aperture_deg,
                       double xyz[3])
 {
     double o[3], d[3], reach;
@@ -172,6 +180,128 @@ static int tvs_locate(double pan_steps, double tilt_steps, int pan_side, int til
     for (int i = 0; i < 3; i++)
         xyz[i] = o[i] + reach * d[i];
     return tvs_extrapolated(pan_steps, tilt_steps) ? 2 : 1;
+}
+
+/* What the aperture reads for a point of frame T, degrees. */
+static inline double tvs_reading_deg(const double xyz[3])
+{
+    double lateral = TVS_AZIMUTH_CONVENTION ? xyz[0] : hypot(xyz[0], xyz[2]);
+    return atan2(lateral, xyz[1] + 0.5 * TVS_BASELINE_MM) / TVS_RAD + TVS_APERTURE_ZERO_DEG;
+}
+
+/* Where to go, in whole steps. */
+struct tvs_steps {
+    long via_pan_steps, via_tilt_steps; /* first: the move on from there takes up the play */
+    long pan_steps, tilt_steps;         /* then */
+    int pan_side, tilt_side;            /* sides on which these are reached: +1 left or up, -1 right or down */
+    int extrapolated;                   /* whether no look of the campaign reached them */
+};
+
+#define TVS_NO_ANGLES 0
+#define TVS_OUTSIDE_LIMITS (-1)
+#define TVS_UNLIMITED 1e9
+#ifndef TVS_LIMIT_PAN_LOW
+#define TVS_LIMIT_PAN_LOW (-TVS_UNLIMITED)
+#endif
+#ifndef TVS_LIMIT_PAN_HIGH
+#define TVS_LIMIT_PAN_HIGH TVS_UNLIMITED
+#endif
+#ifndef TVS_LIMIT_TILT_LOW
+#define TVS_LIMIT_TILT_LOW (-TVS_UNLIMITED)
+#endif
+#ifndef TVS_LIMIT_TILT_HIGH
+#define TVS_LIMIT_TILT_HIGH TVS_UNLIMITED
+#endif
+
+/* Mirror angles (pan, tilt) that send the beam through a point (mm, frame T), or with a null pointer along azimuth and
+ * elevation, degrees; returns whether there are some. */
+static inline int tvs_aim(const double *point, double azimuth_deg, double elevation_deg, double mirror_deg[2])
+{
+    int ahead = point ? isfinite(point[0]) && isfinite(point[1]) && isfinite(point[2]) && point[0] > 0
+                      : isfinite(azimuth_deg) && isfinite(elevation_deg) && fabs(azimuth_deg) < 90;
+    mirror_deg[0] = mirror_deg[1] = 0;
+    for (int k = 0; ahead && k < 40; k++) {
+        double o[3], d[3], azimuth, elevation;
+        tvs_mirror_beam(mirror_deg[0], mirror_deg[1], o, d);
+        if (point) {
+            double x = point[0] - o[0], y = point[1] - o[1], z = point[2] - o[2];
+            azimuth_deg = atan2(y, x) / TVS_RAD;
+            elevation_deg = atan2(z, hypot(x, y)) / TVS_RAD;
+        }
+        azimuth = remainder(azimuth_deg - atan2(d[1], d[0]) / TVS_RAD, 360.0);
+        elevation = elevation_deg - atan2(d[2], hypot(d[0], d[1])) / TVS_RAD;
+        if (fmax(fabs(azimuth), fabs(elevation)) < 1e-11 / TVS_RAD)
+            return 1;
+        mirror_deg[0] += azimuth;
+        mirror_deg[1] += elevation;
+        if (fabs(mirror_deg[1]) > 90)
+            return 0;
+    }
+    return 0;
+}
+
+/* The whole counter of pan (0) or tilt (1) whose mirror angle, reached on a side, is nearest to the wanted one. */
+static inline double tvs_counter(int tilt, double mirror_deg, int side)
+{
+    double steps = 0;
+    for (int k = 0; k < 40; k++) {
+        double at = tilt ? tvs_tilt_deg(steps, side) : tvs_pan_deg(steps, side);
+        double change = (mirror_deg - at) / (tilt ? TVS_DEGREES_PER_STEP_TILT : TVS_DEGREES_PER_STEP_PAN);
+        steps += change;
+        if (fabs(change) < 1e-9)
+            break;
+    }
+    return rint(steps);
+}
+
+/* How an axis comes to a mirror angle on a side, 0 for left or up unless limits forbid it; returns whether it may. */
+static inline int tvs_arrive(int tilt, double mirror_deg, int *side, long *steps, long *via)
+{
+    double low = tilt ? TVS_LIMIT_TILT_LOW : TVS_LIMIT_PAN_LOW, high = tilt ? TVS_LIMIT_TILT_HIGH : TVS_LIMIT_PAN_HIGH;
+    double ratio = tilt ? TVS_DEGREES_PER_STEP_TILT : TVS_DEGREES_PER_STEP_PAN;
+    double overshoot = (ratio > 0 ? 1 : -1) * (tilt ? TVS_OVERSHOOT_TILT_STEPS : TVS_OVERSHOOT_PAN_STEPS);
+    int first = *side ? *side : 1, last = *side ? *side : -1;
+    for (int way = first;; way = last) {
+        double there = tvs_counter(tilt, mirror_deg, way), before = there - way * overshoot;
+        if (low <= there && there <= high && low <= before && before <= high) {
+            *side = way;
+            *steps = (long)there;
+            *via = (long)before;
+            return 1;
+        }
+        if (way == last)
+            return 0;
+    }
+}
+
+static inline int tvs_steps_to(const double *point, double azimuth_deg, double elevation_deg, int pan_side,
+                               int tilt_side, struct tvs_steps *found)
+{
+    double mirror_deg[2];
+    found->pan_side = pan_side;
+    found->tilt_side = tilt_side;
+    if (!tvs_aim(point, azimuth_deg, elevation_deg, mirror_deg))
+        return TVS_NO_ANGLES;
+    if (!tvs_arrive(0, mirror_deg[0], &found->pan_side, &found->pan_steps, &found->via_pan_steps) ||
+        !tvs_arrive(1, mirror_deg[1], &found->tilt_side, &found->tilt_steps, &found->via_tilt_steps))
+        return TVS_OUTSIDE_LIMITS;
+    found->extrapolated = tvs_extrapolated((double)found->pan_steps, (double)found->tilt_steps);
+    return found->extrapolated ? 2 : 1;
+}
+
+/* Counters that send the beam to a point of frame T, mm. Sides are +1, -1, or 0 for left and up unless limits forbid it.
+ * Returns 1, or 2 where no look of the campaign reached these counters, TVS_NO_ANGLES where no mirror angles do it, or
+ * TVS_OUTSIDE_LIMITS; `found` is whole after 1 and 2 alone. */
+static inline int tvs_steps_for_point(const double xyz[3], int pan_side, int tilt_side, struct tvs_steps *found)
+{
+    return tvs_steps_to(xyz, 0, 0, pan_side, tilt_side, found);
+}
+
+/* The same for a direction: azimuth atan2(y, x) and elevation above the horizontal, degrees. */
+static inline int tvs_steps_for_direction(double azimuth_deg, double elevation_deg, int pan_side, int tilt_side,
+                                          struct tvs_steps *found)
+{
+    return tvs_steps_to((const double *)0, azimuth_deg, elevation_deg, pan_side, tilt_side, found);
 }
 
 #endif
