@@ -118,10 +118,14 @@ def refusal(
     return InputError(code, message, file=file, line=line, column=column, found=found, allowed=allowed, remedy=remedy)
 
 
-def closest(name: str, names: Iterable[str]) -> str:
+CLOSE = 0.6
+"""Similarity (difflib) from which a word may be another one misspelt: "comment" and "point" have 0.5."""
+
+
+def closest(name: str, names: Iterable[str], otherwise: str = "remove it, or correct the spelling") -> str:
     """The remedy for an unknown name: the nearest allowed one, where any is near."""
-    near = difflib.get_close_matches(name[:100], list(names), n=1, cutoff=0.5)
-    return f"did you mean {near[0]}?" if near else "remove it, or correct the spelling"
+    near = difflib.get_close_matches(name[:100], list(names), n=1, cutoff=CLOSE)
+    return f"did you mean {near[0]}?" if near else otherwise
 
 
 def listed(numbers: Sequence[int], most: int) -> str:

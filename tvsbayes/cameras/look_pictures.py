@@ -15,7 +15,8 @@ from typing import Literal
 
 import numpy as np
 
-from tvsbayes.cameras.picture_pairs import NAMING, SIDE_BY_SIDE_RATIO, Picture, natural_order, pictures_of
+from tvsbayes.cameras.camera_marks import OTHER_SUFFIXES, paired_pictures
+from tvsbayes.cameras.picture_pairs import NAMING, SIDE_BY_SIDE_RATIO, Picture, natural_order
 from tvsbayes.errors import InputError, escaped, refusal
 from tvsbayes.files.disk import make_folder, read_bytes, write_atomically
 from tvsbayes.files.images import IMAGE_BYTES_MAX, decode_image, image_size, png_bytes
@@ -26,8 +27,6 @@ Matching = Literal["number", "order"]
 LOOKS_MAX = 100_000
 UNDETECTED = "undetected"
 """Status of a row whose pictures wait for `detect`."""
-OTHER_KINDS = (".bmp", ".tif", ".tiff", ".webp", ".gif", ".raw", ".dng", ".pgm", ".ppm")
-"""Suffixes of pictures that are not read, for a word about them."""
 _NUMBER = re.compile(r"[0-9]{1,9}")
 
 
@@ -98,20 +97,20 @@ def views_of(folder: Path, *, swap: bool = False) -> ViewedFolder:
     """The pairs of pictures in a folder.
 
     Args:
-        folder: where they lie; see `picture_pairs` for names.
+        folder: where they lie; see `picture_pairs` and `camera_marks` for names.
         swap: the left camera's image is the right half of a wide picture.
 
     Raises:
         InputError: no folder, no pair, an unreadable picture.
     """
-    pictures = pictures_of(folder, swap=swap, most=2 * LOOKS_MAX)
+    pictures = paired_pictures(folder, swap=swap, most=2 * LOOKS_MAX)
     sizes: dict[Picture, tuple[int, int]] = {}
     for picture in pictures:
         data = read_bytes(picture.path, IMAGE_BYTES_MAX, folder)
         width, height = image_size(data, escaped(picture.path.name))
         if len(picture.sides) == 1 or width >= SIDE_BY_SIDE_RATIO * height:
             sizes[picture] = width // len(picture.sides), height
-    unread = [path.name for path in sorted(Path(folder).iterdir()) if path.suffix.lower() in OTHER_KINDS]
+    unread = [path.name for path in sorted(Path(folder).iterdir()) if path.suffix.lower() in OTHER_SUFFIXES]
     counted = Counter(sizes.values())
     size = max(counted, key=lambda one: (counted[one], one), default=(0, 0))
     by_view: dict[str, dict[str, Picture]] = {}
@@ -119,7 +118,7 @@ def views_of(folder: Path, *, swap: bool = False) -> ViewedFolder:
         by_view.setdefault(picture.view, {}).update(dict.fromkeys(picture.sides, picture))
     whole = {name: both for name, both in by_view.items() if len(both) == 2}
     if not whole:
-        raise _no_pairs(folder, len(pictures), unread)
+        raise _no_pairs(folder, len(pictures))
     return ViewedFolder(
         views=tuple(View(n, (whole[n]["left"], whole[n]["right"])) for n in sorted(whole, key=natural_order)),
         image_width=size[0],
@@ -130,12 +129,10 @@ def views_of(folder: Path, *, swap: bool = False) -> ViewedFolder:
     )
 
 
-def _no_pairs(folder: Path, pictures: int, unread: Sequence[str]) -> InputError:
+def _no_pairs(folder: Path, pictures: int) -> InputError:
     place = escaped(str(folder), 200)
     found = f"no pair among {pictures} PNG and JPEG pictures"
     remedy = "rename them so that one word tells the camera and the rest of both names is the same"
-    if unread and not pictures:
-        found, remedy = f"{len(unread)} pictures such as {escaped(unread[0])}", "save them as PNG of 8 bits"
     allowed = f"{NAMING} (PNG or JPEG); or pictures of both cameras side by side"
     return refusal("no-pictures", file=place, found=found, allowed=allowed, remedy=remedy)
 

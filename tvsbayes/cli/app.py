@@ -148,6 +148,14 @@ def refuse_options(reason: str, remedy: str, **given: object) -> None:
         raise InputError("usage", f"{' and '.join(named)} {'are' if len(named) > 1 else 'is'} {reason}", remedy=remedy)
 
 
+def in_order(rig: Path, plan: Path) -> None:
+    """Refuse a rig file and a plan in each other's place."""
+    if rig.suffix.lower() == ".csv" and plan.suffix.lower() == ".toml":
+        both = f"{escaped(str(plan), 200)} {escaped(str(rig), 200)}"
+        message = "the plan stands where the rig file belongs: they are swapped"
+        raise InputError("usage", message, allowed="RIG PLAN", remedy=f"write {both}")
+
+
 def finite(**values: float | None) -> None:
     """Refuse NaN and infinity, which option parsing lets through."""
     for name, value in values.items():

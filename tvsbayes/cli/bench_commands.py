@@ -14,7 +14,17 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from tvsbayes.cli.app import INTERRUPTED, TARGET_MISSED, Ended, Json, finish, finite, refuse_options, report_line
+from tvsbayes.cli.app import (
+    INTERRUPTED,
+    TARGET_MISSED,
+    Ended,
+    Json,
+    finish,
+    finite,
+    in_order,
+    refuse_options,
+    report_line,
+)
 from tvsbayes.cli.progress_bar import waiting
 from tvsbayes.errors import InputError, escaped, refusal
 from tvsbayes.files.disk import write_atomically
@@ -229,6 +239,7 @@ def acquire(
     if target_u is not None and estimate is False:
         remedy = "leave out one of them"
         raise InputError("usage", "--target-u needs the fits that --no-estimate forbids", remedy=remedy)
+    in_order(rig, plan)
     instrument, steps = read_rig(rig), read_plan(plan)
     if dry_run:
         _rehearse(instrument, steps, as_json)

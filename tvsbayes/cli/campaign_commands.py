@@ -5,13 +5,15 @@ Options in, library called, table or JSON out; heavy imports stand inside the co
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from tvsbayes.cli import axis_commands
-from tvsbayes.cli.app import CampaignFolder, Json, Seed, finish, finite, refuse_options, report_line
+from tvsbayes.cli.app import CampaignFolder, Json, Seed, finish, finite, in_order, refuse_options, report_line
 from tvsbayes.cli.progress_bar import waiting
 from tvsbayes.errors import InputError, escaped
 from tvsbayes.files.disk import make_folder, output_place, shipped_data, write_atomically
@@ -22,6 +24,8 @@ if TYPE_CHECKING:
     from tvsbayes.instrument.campaign import Campaign
     from tvsbayes.results.estimates import FitSummary
 
+PARTS = ("campaign.toml", "stereo.json", "moves.csv", "spots.csv", "readings.csv")
+"""Files that nobody can check without those beside them."""
 DEMO_NOTE = "The twin's move history is our assumption, made so that the classic answer is the paper's Table 1."
 
 
@@ -99,6 +103,7 @@ def simulate(
         return
     if out is None:
         raise InputError("usage", "Missing argument 'OUT'.", remedy="see tvsbayes --help")
+    in_order(rig, plan)
     from tvsbayes.instrument.axes import HOME_APPROACH
     from tvsbayes.instrument.plan import read_plan
     from tvsbayes.instrument.rig import read_rig
@@ -116,17 +121,32 @@ def simulate(
     document = {"campaign": str(out), "moves": moves, "spots": len(spots), "ok": seen, "seed": seed}
     text = f"{escaped(str(out), 200)}: {moves} moves, {seen} of {len(spots)} spots seen; the truth is in truth.json"
     if frames:
-        from tvsbayes.twin.frames import write_frames
+        from tvsbayes.twin.board_pictures import Board
+        from tvsbayes.twin.frames import write_with_frames
 
-        result = result.undetected()
-        result.write(out)
-        with waiting() as progress:
-            pictures = write_frames(out, result, seed, progress=progress)
-        document |= {"ok": 0, "in_view": seen, "pictures": pictures}
-        text += f"\n{pictures} pictures in frames/ and boards/; spots.csv waits for `tvsbayes detect`"
+        board, place = Board(), escaped(str(out), 200)
+        with _frames_kept() as progress:
+            pictures = write_with_frames(out, result.undetected(), seed, progress=progress)
+        size = f"{board.columns}x{board.rows}"
+        drawn = {"columns": board.columns, "rows": board.rows, "pitch_mm": board.pitch_mm}
+        document |= {"ok": 0, "in_view": seen, "pictures": pictures, "board": drawn}
+        text += f"\n{pictures} pictures in frames/ and boards/; spots.csv waits for `tvsbayes detect {place}`"
+        text += f"\nboard: {size} inner corners, squares of {board.pitch_mm:g} mm: `tvsbayes stereo {place}/boards "
+        text += f"--board {size} --pitch-mm {board.pitch_mm:g} -o stereo.json`"
     else:
         result.write(out)
     finish(document, text, as_json)
+
+
+@contextmanager
+def _frames_kept() -> Iterator[Show | None]:
+    """`waiting` for pictures; Ctrl-C says how to go on with them."""
+    try:
+        with waiting() as shown:
+            yield shown
+    except KeyboardInterrupt:
+        report_line("the pictures so far are kept; the same command goes on with them")
+        raise
 
 
 def detect(
@@ -191,6 +211,8 @@ def _held(path: Path, plan_file: Path | None) -> dict[str, Any]:
     from tvsbayes.instrument.plan import read_plan
     from tvsbayes.instrument.rig import read_rig
 
+    if plan_file is not None:
+        in_order(path, plan_file)
     if plan_file is not None and path.suffix != ".toml":
         remedy = "give the rig file first, then the plan"
         raise InputError("usage", "a plan is checked together with a rig file", allowed="RIG PLAN", remedy=remedy)
@@ -201,6 +223,9 @@ def _held(path: Path, plan_file: Path | None) -> dict[str, Any]:
         compile_for(report_line)
         with waiting() as progress:
             return check_plan(rig, steps, progress=progress).as_json()
+    if path.is_file() and path.name in PARTS and (path.parent / "campaign.toml").is_file():
+        found, remedy = f"{escaped(path.name)} is a part of a campaign", f"check {escaped(str(path.parent), 200)}"
+        raise InputError("usage", f"{found}, checked as a whole", allowed="a campaign folder", remedy=remedy)
     if path.suffix == ".csv" and not path.is_dir():
         steps = read_plan(path)
         actions = {action: sum(s.action == action for s in steps) for action in ("home", "place", "move", "look")}

@@ -91,4 +91,9 @@ def main() -> None:
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     # XLA calls a compilation of more than two minutes, as on a small computer, an error to be filed with its authors.
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
-    sys.exit(run(sys.argv[1:]))
+    try:
+        code = run(sys.argv[1:])
+    except KeyboardInterrupt:
+        # Between the end of a command and the end of the process.
+        code = INTERRUPTED
+    sys.exit(code)

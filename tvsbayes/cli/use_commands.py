@@ -23,6 +23,7 @@ from tvsbayes.cli.app import (
     Seed,
     finish,
     finite,
+    in_order,
     keep,
     refuse_options,
     report_line,
@@ -37,6 +38,8 @@ from tvsbayes.progress import Job
 POINT_COLUMNS = ("pan_steps", "tilt_steps", "pan_approach", "tilt_approach", "aperture_deg")
 STEPS_MAX, ANGLE_MAX_DEG = 1e8, 360.0
 WORKERS = 2
+NEAREST_POINT_MM = 10.0
+"""A point nearer to the middle of the baseline is nowhere that the beam goes, and most rooms end before 10 m."""
 PLANNING, LOCATING = "plan", "points"
 
 
@@ -99,8 +102,11 @@ def locate(
         _locate_all(campaign, _read_points(points), draws, seed, as_json)
         return
     if pan_steps is None or tilt_steps is None or aperture_deg is None:
-        remedy = "give --pan-steps, --tilt-steps and --aperture-deg, or --points FILE.csv"
-        raise InputError("usage", "locate needs one point or a file of points", remedy=remedy)
+        given = {"--pan-steps": pan_steps, "--tilt-steps": tilt_steps, "--aperture-deg": aperture_deg}
+        lacking = [name for name, value in given.items() if value is None]
+        message = f"locate needs one point or a file of points; missing: {', '.join(lacking)}"
+        remedy = f"give {' and '.join(lacking)} too, or --points FILE.csv"
+        raise InputError("usage", message, allowed=", ".join(given), remedy=remedy)
     finite(pan_steps=pan_steps, tilt_steps=tilt_steps, aperture_deg=aperture_deg)
     from tvsbayes.instrument.axes import sides_of
 
@@ -158,13 +164,20 @@ def steps_for(
     direction = None if None in (azimuth_deg, elevation_deg) else (azimuth_deg, elevation_deg)
     given = sum(value is not None for value in (x_mm, y_mm, z_mm, azimuth_deg, elevation_deg))
     if export not in (None, "header", "json"):
-        raise InputError("usage", f"--export {escaped(export)}", allowed="header, json", remedy="name one of them")
+        message, remedy = f"--export {escaped(export)}: allowed are header and json", "write --export header for C"
+        raise InputError("usage", message, allowed="header, json", remedy=remedy)
     if export:
         options = {"pan_approach": pan_approach, "tilt_approach": tilt_approach, "rig": rig}
         refuse_options("for one target", "leave it out: --export writes the calibration itself", **options)
     if given != (0 if export else 3 if point else 2 if direction else -1):
         remedy = "give --x-mm --y-mm --z-mm, or --azimuth-deg --elevation-deg, or --export alone"
         raise InputError("usage", "steps-for needs one target", remedy=remedy)
+    if point is not None and math.dist(point, (0.0, 0.0, 0.0)) < NEAREST_POINT_MM:
+        numbers = ", ".join(f"{value:g}" for value in point)
+        message = f"the point ({numbers}) mm lies inside the scanner: are these metres?"
+        metres = " ".join(f"--{axis}-mm {1000 * v:g}" for axis, v in zip("xyz", point, strict=True))
+        allowed = f"a point at least {NEAREST_POINT_MM:g} mm from the middle of the baseline"
+        raise InputError("range", message, allowed=allowed, remedy=f"lengths are mm: {metres}")
     limits = None if rig is None else _limits(rig)
     with waiting() as progress:
         calibration = calibration_for(campaign, report_line, progress)
@@ -288,6 +301,7 @@ def study(
         refuse_options("for the engine dask", "add --engine dask", scheduler=scheduler)
     if scheduler is not None:
         refuse_options("for a cluster that is started here", "leave it out, or leave out --scheduler", workers=workers)
+    in_order(rig, plan_file)
     instrument, steps = read_rig(rig), read_plan(plan_file)
     from tvsbayes.planning.target import DEFAULT_TARGET, parse_target
     from tvsbayes.report.command_text import study_text

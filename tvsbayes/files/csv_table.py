@@ -22,7 +22,15 @@ CSV_ROWS_MAX = 200_000
 """At these caps a table of spots takes 0.6 GB and 6 s of processor time to read (experiments/robustness/hostile.md)."""
 CSV_LINE_CHARS_MAX = 16_384
 NUMBER = re.compile(r"[+-]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][+-]?[0-9]+)?")
+_DATE = re.compile(
+    r"\b(?:jan|feb|mar|apr|may|mai|jun|jul|aug|sep|oct|okt|nov|dec|dez)[a-z]*\b|[0-9]{1,4}[/-][0-9]{1,2}[/-][0-9]{1,4}",
+    re.IGNORECASE,
+)
 _CSV_LINE = re.compile(r"[^\r\n]*(?:\r\n?|\n)|[^\r\n]+")
+
+
+FOREIGN = "`tvsbayes import FILE --to NEW` reads it"
+"""What to do with a table that another program wrote in its own way."""
 
 
 def number_remedy(cell: str, *, whole: bool = False) -> str:
@@ -31,6 +39,10 @@ def number_remedy(cell: str, *, whole: bool = False) -> str:
         return "save the value, not the formula"
     if cell.strip().lower().lstrip("+-") in ("nan", "inf", "infinity"):
         return "write a finite number; the pixels of a spot that was not seen are empty, its status says why"
+    if _DATE.search(cell):
+        return "a spreadsheet made a date of it: format the column as text, then write the number again"
+    if "," in cell and "." in cell:
+        return "write the number without marks between thousands: 1024.50"
     if "," in cell:
         return "write a decimal point, not a comma"
     if "_" in cell or any(c.isspace() for c in cell):
@@ -71,6 +83,9 @@ class Table:
         self, row: int, column: str, code: str, allowed: str, remedy: str, found: str | None = None
     ) -> InputError:
         """The error of one cell; `found` defaults to what stands in it."""
+        if not any(cells[row] for cells in self.columns.values()):
+            # A spreadsheet ends with rows that hold separators alone.
+            found, remedy = "a line without any value", "delete the line"
         if found is None:
             found = shown(self.columns[column][row]) if self.columns[column][row] else "an empty cell"
         line = self.lines[row]
@@ -182,6 +197,8 @@ def parse_table(data: bytes, file: str, columns: Sequence[str], optional: Sequen
         InputError: not UTF-8, control characters, no or a wrong header, rows of another length than it.
     """
     bad = partial(refusal, file=file)
+    if data.startswith(b"PK\x03\x04"):
+        raise bad("encoding", found="a workbook (XLSX)", allowed="CSV as UTF-8 text", remedy=FOREIGN)
     rows = _csv_rows(decode(data, file), file)
     _, header = next(rows, (1, []))
     allowed = "the columns " + ",".join(columns) + (f" and optionally {','.join(optional)}" * bool(optional))
@@ -189,11 +206,12 @@ def parse_table(data: bytes, file: str, columns: Sequence[str], optional: Sequen
     if not header:
         raise bad_header("empty", found="no header", remedy="write the column names into the first line")
     if len(header) == 1 and re.search(r"[;\t]", header[0]):
-        raise bad_header("csv", found=shown(header[0]), remedy="use commas between cells, decimal points")
+        raise bad_header("csv", found=shown(header[0]), remedy=f"{FOREIGN}; or use commas between cells, decimal points")
     known = (*columns, *optional)
     for name in header:
         if name not in known:
-            found, remedy = f"an unknown column {shown(name)}", closest(name, known)
+            found, otherwise = f"an unknown column {shown(name)}", "remove it; remarks go into notes of campaign.toml"
+            remedy = closest(name, known, otherwise)
             raise bad_header("unknown-column", column=name, found=found, remedy=remedy)
         if header.count(name) > 1:
             raise bad_header("duplicate-column", column=name, found="the column twice", remedy="remove one")

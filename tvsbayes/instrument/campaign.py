@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import datetime
 import hashlib
+import os
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -16,7 +17,7 @@ from typing import Literal
 import numpy as np
 
 from tvsbayes.display import Shown, View
-from tvsbayes.errors import escaped, refusal
+from tvsbayes.errors import InputError, escaped, refusal
 from tvsbayes.files.csv_table import CSV_BYTES_MAX, Table, csv_bytes, parse_table
 from tvsbayes.files.disk import make_folder, read_bytes, write_atomically
 from tvsbayes.files.documents import JSON_BYTES_MAX, TOML_BYTES_MAX, Keys, parse_toml, toml_line
@@ -234,11 +235,25 @@ def parse_spots(data: bytes, file: str, moves: int, stereo: Stereo) -> tuple[Spo
             if column in PIXELS and not -_IMAGE_MARGIN <= value / extent <= 1 + _IMAGE_MARGIN:
                 allowed = f"a position in the image, 0 to {extent:g} px, or close to it"
                 remedy = "check the image size in stereo.json, or give the spot a refusal reason"
+                if _exchanged(pixels, statuses, stereo):
+                    remedy = "u and v are exchanged: u counts columns to the right, v rows down"
                 raise table.refuse(row, column, "outside-image", allowed, remedy)
     apertures = table.numbers("aperture_deg", -360.0, 360.0, empty=True)
     correlations = [_parse_correlations(table, column, statuses) for column in _CORRELATIONS]
     head = (spots, move_ids, table.texts("target"), experiments, points)
     return tuple(map(Spot, *head, *pixels, *sds, apertures, statuses, *correlations))
+
+
+def _exchanged(pixels: Sequence[Sequence[float | None]], statuses: Sequence[str], stereo: Stereo) -> bool:
+    """Whether all usable spots lie in the images once u and v of a row are exchanged; columns as in `PIXELS`."""
+    extents = (stereo.image_height, stereo.image_width) * 2
+    cells = [
+        (column[row], extent)
+        for column, extent in zip(pixels, extents, strict=True)
+        for row, status in enumerate(statuses)
+        if status == "ok"
+    ]
+    return all(value is None or -_IMAGE_MARGIN <= value / extent <= 1 + _IMAGE_MARGIN for value, extent in cells)
 
 
 def _parse_correlations(table: Table, column: str, statuses: Sequence[str]) -> list[float]:
@@ -340,8 +355,23 @@ def read_campaign(folder: Path | str) -> Campaign:
         place, found = escaped(str(folder), 200), "no such folder" if not folder.exists() else "a file"
         allowed, remedy = "a campaign folder", "give the folder that holds campaign.toml"
         raise refusal("missing-file", file=place, found=found, allowed=allowed, remedy=remedy)
+    if not os.path.lexists(folder / "campaign.toml"):
+        raise _no_campaign(folder)
     files = {name: read_bytes(folder / name, cap, folder) for name, cap in _FILES.items()}
     return _parse_files(files, folder)
+
+
+def _no_campaign(folder: Path) -> InputError:
+    """The error of a folder without campaign.toml, which names those below it that have one."""
+    below = sorted(path.parent.name for path in folder.glob("*/campaign.toml"))
+    remedy = "`tvsbayes new OUT` begins a campaign"
+    if below:
+        names = ", ".join(escaped(name) for name in below[:5])
+        remedy = f"name one of the campaigns in it: {names}{' ...' * (len(below) > 5)}"
+    elif (folder / "frames").is_dir() or (folder / "log.jsonl").is_file():
+        remedy = "an unfinished run: go on with the command that began it (`simulate`, or `acquire --resume`)"
+    found, allowed = f"no campaign.toml in {escaped(str(folder), 200)}", "the folder of a campaign"
+    return refusal("missing-file", file="campaign.toml", found=found, allowed=allowed, remedy=remedy)
 
 
 def moves_bytes(moves: Iterable[Move]) -> bytes:
@@ -366,17 +396,26 @@ def campaign_toml(campaign: Campaign) -> bytes:
     return ("\n".join(lines) + "\n" + rig_table_toml(campaign.rig)).encode()
 
 
-def write_campaign(campaign: Campaign, folder: Path) -> None:
-    """Writes the four files of a campaign into a new or empty folder; what is read back is the same.
+def campaign_bytes(campaign: Campaign) -> dict[str, bytes]:
+    """The four files of a campaign in the order in which they are to be written; what is read back is the same.
 
     Raises:
-        InputError: the folder holds something, cannot be written, or `campaign` holds what
-            `read_campaign` would refuse (then nothing is written).
+        InputError: `campaign` holds what `read_campaign` would refuse.
     """
-    folder = Path(folder)
     tables = moves_bytes(campaign.moves), spots_bytes(campaign.spots)
     files = dict(zip(_FILES, (stereo_bytes(campaign.stereo), *tables, campaign_toml(campaign)), strict=True))
     _parse_files(files, None)
+    return files
+
+
+def write_campaign(campaign: Campaign, folder: Path) -> None:
+    """Writes the four files of a campaign into a new or empty folder.
+
+    Raises:
+        InputError: the folder holds something or cannot be written; what `campaign_bytes` refuses (then nothing is
+            written).
+    """
+    folder, files = Path(folder), campaign_bytes(campaign)
     make_folder(folder, empty=True)
     for name, data in files.items():
         write_atomically(folder / name, data)

@@ -213,7 +213,7 @@ def _check_certifiable(campaign: Campaign, fit: FitRecord, country: str) -> None
             column="country",
             found=escaped(country),
             allowed="two capital letters of ISO 3166-1, such as MX or DE",
-            remedy="give the country in which the campaign was measured",
+            remedy="write the two letters of the country in which the campaign was measured: MX for Mexico",
         )
     again = "run `tvsbayes fit` on the campaign again"
     if fit.provenance.inputs != input_hashes(campaign):

@@ -6,6 +6,7 @@ are those of `Scene()` and `Sensor()`, the board is the paper's.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
@@ -28,6 +29,52 @@ BOARD_VIEWS = 20
 WORKERS_MAX = 8
 
 
+def write_with_frames(
+    folder: Path,
+    simulated: SimulatedCampaign,
+    seed: int,
+    *,
+    views: int | None = None,
+    progress: Show | None = None,
+) -> int:
+    """Write a campaign and its pictures, campaign.toml last: a folder without it is not finished.
+
+    In a folder that the same simulation began, pictures that are there stay and the others follow.
+
+    Args:
+        folder: new, empty, or begun by the same simulation.
+        simulated: what the twin did.
+        seed: see `write_frames`, as the others.
+        views: how many board views.
+        progress: told how far it is.
+
+    Returns:
+        How many pictures lie there.
+
+    Raises:
+        InputError: the folder holds anything else, or cannot be written.
+    """
+    files = simulated.files()
+    declaration = files.pop("campaign.toml")
+    make_folder(folder, empty=not _begun(folder, files))
+    for name, data in files.items():
+        write_atomically(folder / name, data)
+    written = write_frames(folder, simulated, seed, views=views, progress=progress)
+    write_atomically(folder / "campaign.toml", declaration)
+    return written
+
+
+def _begun(folder: Path, files: Mapping[str, bytes]) -> bool:
+    """Whether a folder holds nothing but what this simulation wrote before it was interrupted."""
+    if not folder.is_dir():
+        return False
+    # Hidden files are those that a killed process was writing.
+    there = {path.name for path in folder.iterdir() if not path.name.startswith(".")}
+    whole = there & set(files) if there <= {*files, "frames", "boards"} else set()
+    same = all((folder / name).is_file() and (folder / name).read_bytes() == files[name] for name in whole)
+    return bool(whole) and same and (whole == set(files) or there == whole)
+
+
 def write_frames(
     folder: Path,
     simulated: SimulatedCampaign,
@@ -38,6 +85,8 @@ def write_frames(
 ) -> int:
     """Write `frames/000000_left.png`, `_right.png` of every look and `boards/left01.png`, `right01.png` ...
 
+    Pairs that are there already stay: pictures are written whole or not at all.
+
     Args:
         folder: the campaign's folder, which exists.
         simulated: what the twin did.
@@ -46,7 +95,7 @@ def write_frames(
         progress: told how far it is.
 
     Returns:
-        How many pictures were written.
+        How many pictures lie there.
 
     Raises:
         InputError: the folder cannot be written.
@@ -84,9 +133,12 @@ class _Looks:
     def write(self, row: int) -> None:
         """Both pictures of a row of spots.csv."""
         number = self.simulated.campaign.spots[row].spot
+        paths = [self.folder / frame_name(number, camera) for camera in CAMERAS]
+        if all(path.is_file() for path in paths):
+            return
         made = render_spots(self.cameras, self.simulated.light.of(row), Scene(), Sensor(), self.seed, number)
-        for camera, picture in zip(CAMERAS, (made.left, made.right), strict=True):
-            _write(self.folder / frame_name(number, camera), picture)
+        for path, picture in zip(paths, (made.left, made.right), strict=True):
+            _write(path, picture)
 
 
 @dataclass(frozen=True)
@@ -102,8 +154,10 @@ class _Boards:
     def write(self, number: int) -> None:
         """Both pictures of a pose."""
         for side, (name, camera) in enumerate(zip(CAMERAS, (self.cameras.left, self.cameras.right), strict=True)):
-            picture = render_board(camera, self.poses[number], self.board, Sensor(), (self.seed, number, side))
-            _write(self.folder / "boards" / f"{name}{number + 1:02d}.png", picture)
+            path = self.folder / "boards" / f"{name}{number + 1:02d}.png"
+            if not path.is_file():
+                picture = render_board(camera, self.poses[number], self.board, Sensor(), (self.seed, number, side))
+                _write(path, picture)
 
 
 def _write(path: Path, picture: np.ndarray) -> None:

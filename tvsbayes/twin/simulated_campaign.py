@@ -15,9 +15,9 @@ from pathlib import Path
 import numpy as np
 
 from tvsbayes.display import Shown, View
-from tvsbayes.files.disk import write_atomically
+from tvsbayes.files.disk import make_folder, write_atomically
 from tvsbayes.instrument.axes import FULL_TURN_DEG, HOME_APPROACH, HOME_SD_DEG, SIDES, PanApproach, TiltApproach
-from tvsbayes.instrument.campaign import NO_PIXELS, Campaign, Move, Spot, with_pixels, write_campaign
+from tvsbayes.instrument.campaign import NO_PIXELS, Campaign, Move, Spot, campaign_bytes, with_pixels
 from tvsbayes.instrument.parameters import Prior
 from tvsbayes.instrument.plan import PlanLog, PlannedLook, PlanStep, run_plan
 from tvsbayes.instrument.rig import PERIODIC_NAMES, Rig, require_periods
@@ -66,14 +66,20 @@ class SimulatedCampaign(Shown):
         spots = tuple(with_pixels(spot, "undetected") for spot in self.campaign.spots)
         return replace(self, campaign=replace(self.campaign, spots=spots))
 
-    def write(self, folder: str | Path) -> None:
-        """Write the campaign folder and its truth.json."""
-        write_campaign(self.campaign, Path(folder))
+    def files(self) -> dict[str, bytes]:
+        """Contents of the campaign folder and of truth.json by name, campaign.toml last."""
         entries = (
             f' "{key}": {json.dumps(value, indent=2 if isinstance(value, dict) else None, allow_nan=False)}'
             for key, value in self.truth.as_json(self.campaign).items()
         )
-        write_atomically(Path(folder) / "truth.json", ("{\n" + ",\n".join(entries) + "\n}\n").encode())
+        truth = ("{\n" + ",\n".join(entries) + "\n}\n").encode()
+        return {"truth.json": truth, **campaign_bytes(self.campaign)}
+
+    def write(self, folder: str | Path) -> None:
+        """Write the campaign folder and its truth.json."""
+        make_folder(Path(folder), empty=True)
+        for name, data in self.files().items():
+            write_atomically(Path(folder) / name, data)
 
 
 @dataclass(frozen=True)
