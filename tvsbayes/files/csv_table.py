@@ -206,7 +206,9 @@ def parse_table(data: bytes, file: str, columns: Sequence[str], optional: Sequen
     if not header:
         raise bad_header("empty", found="no header", remedy="write the column names into the first line")
     if len(header) == 1 and re.search(r"[;\t]", header[0]):
-        raise bad_header("csv", found=shown(header[0]), remedy=f"{FOREIGN}; or use commas between cells, decimal points")
+        raise bad_header(
+            "csv", found=shown(header[0]), remedy=f"{FOREIGN}; or use commas between cells, decimal points"
+        )
     known = (*columns, *optional)
     for name in header:
         if name not in known:
