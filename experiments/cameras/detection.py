@@ -21,7 +21,7 @@ import numpy as np
 from experiments.common.command_line import act, parser
 from experiments.common.rigs import mounted_rig, shipped_plan
 from experiments.common.rows import append_row, output, read_rows
-from tvsbayes.cameras import contour, detection, spot_fit, spot_noise
+from tvsbayes.cameras import contour, detection, spot_fit, spot_noise, spot_window
 from tvsbayes.instrument.stereo_pair import Stereo
 from tvsbayes.twin.physics import cameras_of
 from tvsbayes.twin.simulated_campaign import simulate
@@ -109,14 +109,14 @@ def run_cell(size, peak, ambient, contrast, seed: int) -> dict:
         if k < 20:
             bounds.append(bound_px(mark, scene, sensor))
     row = {"size": size, "peak": peak, "ambient": ambient, "contrast": contrast, "bound": float(np.mean(bounds))}
-    patches = [spot_fit.patch_around(picture) for picture in pictures]
+    patches = [spot_window.patch_around(picture) for picture in pictures]
     camera = contour.rectified_pair(flat_stereo())[0]
     pilots = [one for one in patches[: detection.PILOTS_MAX] if not isinstance(one, str)]
-    learned = detection._learned([one for one in pilots if one.clipped_share <= spot_fit.CLIPPED_SHARE_MAX], None)
+    learned = detection._learned([one for one in pilots if one.clipped_share <= spot_window.CLIPPED_SHARE_MAX], None)
     for method in METHODS:
         if method == "fit":
             found = [spot_fit.centre_of(patch, learned) for patch in patches]
-            learned = spot_noise.learn_noise(np.vstack([one.skews for one in found if one.status == "ok"]))
+            learned = spot_noise.learn_noise(np.stack([one.skews for one in found if one.status == "ok"]))
             found = [one.under(learned) for one in found]
             row["learned"] = [learned.gain_dn, learned.speckle_contrast]
         else:

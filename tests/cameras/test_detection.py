@@ -111,6 +111,41 @@ def test_what_is_learned_of_the_noise(found_plain, found_speckled):
         assert found_speckled.noise[side].speckle_contrast == pytest.approx(0.4, rel=0.25)
 
 
+def test_deep_frames_are_detected_with_all_their_bits(plain, tmp_path):
+    """The same light in 12 bits of 16: finer than 8 bits, and a picture beyond the camera's full scale is refused."""
+    folder = Folder(tmp_path / "c", looks=6)
+    for name in sorted((folder.path / "frames").iterdir()):
+        deep = cv2.imread(str(name)).astype(np.uint16) * 16 + 7
+        name.write_bytes(png_bytes(np.minimum(deep, 4095)))
+    found = detect(read_campaign(folder.path))
+    assert found.statuses == {"ok": 6}
+    shallow = detect(read_campaign(Folder(tmp_path / "shallow", looks=6).path))
+    for deep, eight in zip(found.campaign.spots, shallow.campaign.spots, strict=True):
+        assert abs(deep.u_left_px - eight.u_left_px) < 0.1 * eight.su_left_px
+        # 8 bits are 255 levels and these 4095 / 16: noise is what it was.
+        assert deep.su_left_px == pytest.approx(eight.su_left_px, rel=0.1)
+
+
+def test_a_beam_s_own_skew_is_no_noise(tmp_path):
+    """Every spot has the same second maximum in its flank: learned as shape; one look without it is misshapen."""
+    folder = Folder(tmp_path / "c", looks=16, sd=3.0)
+    rng = np.random.default_rng(6)
+    for look in range(16):
+        for camera, side in enumerate(("left", "right")):
+            centre = folder.true_px[look, 2 * camera : 2 * camera + 2]
+            marks = [Footprint(centre, 9.0 * np.eye(2), 150.0)]
+            if (look, side) != (7, "left"):
+                marks.append(Footprint(centre + np.array([4.0, 0.0]), 4.0 * np.eye(2), 70.0))
+            light = sum(
+                render_spot(mark, WIDTH, HEIGHT, Scene(speckle_contrast=0.0), Sensor(), (look, camera, k)) / 1.0
+                for k, mark in enumerate(marks)
+            )
+            folder.put(look, side, np.clip(light + rng.normal(0, 0.1, light.shape), 0, 255).astype(np.uint8))
+    found = detect(read_campaign(folder.path))
+    assert found.statuses == {"ok": 15, "misshapen left": 1}
+    assert all(noise.speckle_contrast < 0.1 and max(np.abs(noise.skew)) > 0.01 for noise in found.noise.values())
+
+
 def test_the_paper_s_contour_is_several_times_worse_and_says_so(speckled, found_speckled):
     contour = detect(read_campaign(speckled.path), "contour")
     errors, stated = speckled.errors(contour)

@@ -8,8 +8,9 @@ import pytest
 from support.drawn_spots import HEIGHT, WIDTH, oval, picture
 
 from tvsbayes.cameras.detection import REASONS
-from tvsbayes.cameras.spot_fit import CLIPPED_DN, find_spot, patch_around
+from tvsbayes.cameras.spot_fit import find_spot
 from tvsbayes.cameras.spot_noise import SpotNoise
+from tvsbayes.cameras.spot_window import CLIPPED_DN, patch_around
 from tvsbayes.twin.spot_pictures import Footprint, Scene, Sensor, render_spot
 
 SMALL = 2.5**2 * np.eye(2)
@@ -106,3 +107,40 @@ def test_correlation_follows_a_turned_spot():
         # Against even noise a Gaussian's centre has the correlation of the Gaussian, 14 / 20; demosaicing, which mixes
         # neighbours, changes it by less than a tenth.
         assert sign * cov[0, 1] / cov[0, 0] == pytest.approx(0.7, abs=0.1)
+
+
+def beam(rng: np.random.Generator, white: int, gain_dn: float = 0.03) -> np.ndarray:
+    """A direct beam on a monochrome sensor of 480 x 400 px: skewed, with a ring, shot noise and nothing else."""
+    v, u = np.indices((400, 480))
+    x, y = (u - 231.4) / 24.0, (v - 187.7) / 28.0
+    light = 190 * np.exp(-(x**2 + y**2 + 0.4 * x * y) / 2) * (1 + 0.05 * (x**3 - 3 * x) / (1 + x**2) - 0.04 * y)
+    light += 4 * np.exp(-((np.hypot(x, y) - 3) ** 2) / 0.1) + 1.5
+    seen = np.clip(rng.normal(light, np.sqrt(gain_dn * light)), 0, 255) * (white / 255)
+    return np.rint(np.repeat(seen[..., None], 3, axis=2)).astype(np.uint8 if white == 255 else np.uint16)
+
+
+@pytest.mark.parametrize("white", (255, 4095, 65535))
+def test_pixels_of_a_wide_beam_tell_its_uncertainty(white):
+    """No truth: sixteen pictures of every fourth row and column must agree as they say, whatever the bits."""
+    picture_of = beam(np.random.default_rng(white), white)
+    centres, variances = [], []
+    for row in range(4):
+        for column in range(4):
+            seen = find_spot(np.ascontiguousarray(picture_of[row::4, column::4]))
+            assert seen.status == "ok"
+            centres.append(4 * seen.centre_px + [column, row])
+            variances.append(16 * np.diag(seen.covariance_px2))
+    z = (np.array(centres) - np.mean(centres, axis=0)) / np.sqrt(variances)
+    # 30 degrees of freedom: 1 / sqrt(60) of the root; four of them would be 0.52.
+    assert 0.6 < np.sqrt(np.sum(z**2) / 30) < 1.4
+    whole = find_spot(picture_of)
+    # Four times the pixels each way; the whole has no other centre than its parts.
+    assert np.sqrt(np.mean(variances) / np.trace(whole.covariance_px2) * 2) == pytest.approx(4, rel=0.3)
+    assert np.abs(whole.centre_px - np.mean(centres, axis=0)).max() < 0.05
+
+
+def test_a_beam_far_from_its_shape_is_refused():
+    """Half of it cut off by an edge: no shape of a beam."""
+    cut = beam(np.random.default_rng(1), 255)
+    cut[:, 240:] = np.minimum(cut[:, 240:], 3)
+    assert find_spot(cut).status != "ok"

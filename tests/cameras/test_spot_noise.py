@@ -19,14 +19,22 @@ def test_noise_through_demosaicing_has_the_correlation_that_is_assumed():
             assert lag == pytest.approx(_CORRELATION[2 + i, 2 + j], abs=0.003)
 
 
+SHAPE = np.array([50.0, -20.0, 0.0, 100.0])
+"""A beam's own skews, which every look shows: no noise."""
+
+
 def test_noise_is_learned_from_skews_drawn_from_it():
     rng = np.random.default_rng(3)
     parts = np.column_stack((rng.uniform(1, 2, 400), rng.uniform(50, 200, 400), rng.uniform(5e3, 2e4, 400)))
     for gain, contrast in ((0.04, 0.0), (0.05, 0.4)):
         variance = parts @ [1.0, gain, contrast**2]
-        learned = learn_noise(np.column_stack((variance * rng.chisquare(1, 400), parts)))
+        skews = np.tile(SHAPE, 100) + rng.normal(0, np.sqrt(variance))
+        learned = learn_noise(np.column_stack((skews, parts)).reshape(100, 4, 4))
         # 400 squares tell a variance to sqrt(2 / 400) = 7 %; what of it is gain and what contrast^2 they tell less.
         said = parts @ [1.0, learned.gain_dn, learned.speckle_contrast**2]
         assert said.mean() == pytest.approx(variance.mean(), rel=4 * np.sqrt(2 / 400))
+        # A median of 100 values is known to 1.25 sds / 10; four of them.
+        np.testing.assert_allclose(learned.skew, SHAPE, atol=4 * 0.125 * np.sqrt(variance.max()))
     assert learned.speckle_contrast == pytest.approx(0.4, rel=0.2)
-    assert learn_noise(np.column_stack((variance, parts)), 0.3).speckle_contrast == pytest.approx(0.3)
+    known = learn_noise(np.column_stack((skews, parts)).reshape(100, 4, 4), 0.3)
+    assert known.speckle_contrast == pytest.approx(0.3)

@@ -6,7 +6,15 @@ import numpy as np
 import pytest
 
 from tvsbayes.errors import InputError
-from tvsbayes.files.images import IMAGE_PIXELS_MAX, decode_image, image_size, png_bytes, read_image
+from tvsbayes.files.images import (
+    IMAGE_PIXELS_MAX,
+    decode_image,
+    image_size,
+    in_grey_levels,
+    png_bytes,
+    read_image,
+    white_level,
+)
 
 
 def picture(channels: int = 3) -> np.ndarray:
@@ -85,11 +93,31 @@ def test_jpegs_of_unusual_kinds_are_refused():
         refused(data[:length])
 
 
-def test_deep_pngs_and_links_out_of_the_folder_are_refused(tmp_path):
-    import cv2
+def test_deep_pngs_keep_every_bit_and_are_half_as_large():
+    deep = picture().astype(np.uint16) * 16 + 5
+    np.testing.assert_array_equal(decode_image(png_bytes(deep), "a.png"), deep)
+    np.testing.assert_array_equal(decode_image(png_bytes(deep[..., 0]), "a.png"), np.repeat(deep[..., :1], 3, axis=2))
+    data = bytearray(png_bytes(deep))
+    side = int((IMAGE_PIXELS_MAX // 2) ** 0.5)
+    data[16:24] = side.to_bytes(4) * 2
+    assert image_size(bytes(data), "a.png") == (side, side)
+    data[16:24] = (side + 1).to_bytes(4) * 2
+    assert refused(bytes(data)).code == "image-size"
 
-    deep = cv2.imencode(".png", picture().astype(np.uint16))[1].tobytes()
-    assert "16 bits" in refused(deep).message
+
+def test_grey_levels_of_deep_pictures():
+    """Full scale is 255 whatever the converter's bits; eight bits stay what they are."""
+    shallow = picture()
+    assert in_grey_levels(shallow) is shallow
+    assert [white_level(value) for value in (0, 255, 256, 1023, 4000, 4095, 4096, 65535)] == [
+        *(255, 255, 1023, 1023, 4095, 4095, 16383, 65535)
+    ]
+    deep = np.array([[0, 819, 4095]], np.uint16)
+    np.testing.assert_allclose(in_grey_levels(deep), [[0, 51, 255]], rtol=1e-6)
+    np.testing.assert_allclose(in_grey_levels(deep, 65535), [[0, 819 / 257, 4095 / 257]], rtol=1e-6)
+
+
+def test_links_out_of_the_folder_are_refused(tmp_path):
     (tmp_path / "in").mkdir()
     (tmp_path / "a.png").write_bytes(png_bytes(picture()))
     (tmp_path / "in" / "a.png").symlink_to(tmp_path / "a.png")

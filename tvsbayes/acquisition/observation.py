@@ -21,8 +21,9 @@ from tvsbayes.cameras.capture import StereoCamera, StereoImage
 from tvsbayes.cameras.contour import epipolar_refused
 from tvsbayes.cameras.detection import pair_status
 from tvsbayes.cameras.spot_fit import find_spot
+from tvsbayes.cameras.spot_noise import SpotNoise
 from tvsbayes.errors import DeviceFault
-from tvsbayes.files.images import png_bytes
+from tvsbayes.files.images import png_bytes, white_level
 from tvsbayes.instrument.campaign import CAMERAS, frame_name
 from tvsbayes.instrument.rig import Rig
 from tvsbayes.instrument.stereo_pair import Stereo
@@ -153,11 +154,14 @@ class CameraObserver:
 
 
 def rises_dn(before: StereoImage, after: StereoImage) -> tuple[int, int]:
-    """The most by which a pixel grew brighter, left and right, grey levels."""
+    """The most by which a pixel grew brighter, left and right, grey levels of 8 bits."""
     import cv2
 
-    left, right = cv2.subtract(after.left, before.left), cv2.subtract(after.right, before.right)
-    return int(left.max()), int(right.max())
+    rises = []
+    for dark, lit in ((before.left, after.left), (before.right, after.right)):
+        white = white_level(max(int(dark.max()), int(lit.max())))
+        rises.append(int(cv2.subtract(lit, dark).max()) * 255 // white)
+    return rises[0], rises[1]
 
 
 @dataclass
@@ -195,7 +199,7 @@ def live_detector(stereo: Stereo) -> Detector:
     """
 
     def found(lit: StereoImage, dark: StereoImage) -> Sighting:
-        left, right = find_spot(lit.left), find_spot(lit.right)
+        left, right = find_spot(lit.left, SpotNoise()), find_spot(lit.right, SpotNoise())
         status = pair_status(left, right)
         if status != "ok":
             return Sighting(status)

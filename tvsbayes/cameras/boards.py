@@ -24,7 +24,7 @@ from tvsbayes.cameras.camera_marks import paired_pictures
 from tvsbayes.cameras.picture_pairs import NAMING, SIDE_BY_SIDE_RATIO, Picture, natural_order
 from tvsbayes.errors import InputError, NothingToEstimate, escaped, refusal
 from tvsbayes.files.disk import read_bytes
-from tvsbayes.files.images import IMAGE_BYTES_MAX, image_size, read_image
+from tvsbayes.files.images import IMAGE_BYTES_MAX, image_size, in_grey_levels, read_image
 from tvsbayes.instrument.campaign import CAMERAS
 from tvsbayes.progress import Advance, unshown
 
@@ -341,7 +341,11 @@ def _detections(
     """The boards in pictures, by the camera whose image holds it."""
 
     def detect(picture: Picture) -> dict[str, _Detection | None]:
-        grey = cv2.cvtColor(read_image(picture.path, folder), cv2.COLOR_BGR2GRAY)
+        pixels = in_grey_levels(read_image(picture.path, folder))
+        # The finders want 8 bits; a corner is an average over hundreds of pixels.
+        if pixels.dtype != np.uint8:
+            pixels = np.rint(pixels).astype(np.uint8)
+        grey = cv2.cvtColor(pixels, cv2.COLOR_BGR2GRAY)
         parts = (grey[:, k * size[0] : (k + 1) * size[0]] for k in range(len(picture.sides)))
         return {
             side: _detection(np.ascontiguousarray(part), board, finder)

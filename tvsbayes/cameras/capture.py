@@ -7,7 +7,8 @@ may still have been in the pipe, one is taken. A camera that never makes us wait
 age. Where decoding takes as long as the camera's period the two cannot be told apart; then the proof by light holds
 that whoever drives the laser adds. Streams of the network are read all the time (`network_stream`).
 
-Pictures are (height, width, 3) uint8, blue, green, red, as OpenCV delivers them; raw pixels, nothing rectified.
+Pictures are (height, width, 3), blue, green, red, uint8 or uint16 as the camera gives them; raw pixels, nothing
+rectified, no depth lost.
 Seconds where a name says `_s`.
 """
 
@@ -46,7 +47,7 @@ FFMPEG_QUIET = "-8"
 
 @dataclass(frozen=True, eq=False)
 class StereoImage:
-    """Two pictures of one moment, each (height, width, 3) uint8, blue, green, red."""
+    """Two pictures of one moment, each (height, width, 3) uint8 or uint16, blue, green, red."""
 
     left: np.ndarray
     right: np.ndarray
@@ -302,11 +303,14 @@ class OpenCVCamera:
         if not good or picture is None:
             raise _no_frame(name)
         expected = self._height, self._width * (1 if len(self._captures) == 2 else 2)
-        if picture.shape[:2] != expected or picture.dtype != np.uint8:
+        if picture.shape[:2] != expected or picture.dtype not in (np.uint8, np.uint16):
             found = f"{name}: pictures of {picture.shape[1]} x {picture.shape[0]} px"
             remedy = f"{expected[1]} x {expected[0]} px were calibrated: set the camera to that size"
             raise DeviceFault("image-size", f"{found}; {remedy}", found=found, remedy=remedy)
-        return picture
+        # Monochrome cameras give one channel.
+        return (
+            picture if picture.ndim == 3 and picture.shape[2] == 3 else np.repeat(picture.reshape(*expected, 1), 3, 2)
+        )
 
     def _split(self, pictures: list[np.ndarray]) -> StereoImage:
         if len(pictures) == 2:

@@ -12,16 +12,9 @@ from math import log, pi, sqrt
 
 import numpy as np
 
-from tvsbayes.cameras.spot_fit import (
-    AREA_MAX_SHARE,
-    AREA_MIN_PX,
-    BRIGHT_SHARE,
-    CLIPPED_DN,
-    CLIPPED_SHARE_MAX,
-    SECOND_SHARE,
-    Centre,
-)
+from tvsbayes.cameras.spot_fit import AREA_MIN_PX, Centre
 from tvsbayes.cameras.spot_noise import SpotNoise, background_variance
+from tvsbayes.cameras.spot_window import AREA_MAX_SHARE, BRIGHT_SHARE, CLIPPED_DN, CLIPPED_SHARE_MAX, SECOND_SHARE
 from tvsbayes.instrument.stereo_pair import Stereo, distort, undistort
 
 EPIPOLAR_SIGMAS, EPIPOLAR_FLOOR_PX = 6.0, 0.5
@@ -72,6 +65,9 @@ def contour_of(picture: np.ndarray, camera: Rectified, noise: SpotNoise) -> Cent
     """
     import cv2
 
+    if picture.dtype != np.uint8:
+        # The paper's method has 8 bits.
+        picture = np.clip(np.rint(picture), 0, 255).astype(np.uint8)
     flat = cv2.remap(picture, *camera.maps, cv2.INTER_LINEAR)
     value = cv2.cvtColor(flat, cv2.COLOR_BGR2HSV)[..., 2]
     height, width = value.shape

@@ -25,20 +25,12 @@ from pathlib import Path
 import numpy as np
 
 from tvsbayes.cameras.contour import Rectified, contour_of, epipolar_refused, rectified_pair
-from tvsbayes.cameras.spot_fit import (
-    CLIPPED_SHARE_MAX,
-    Centre,
-    Located,
-    Patch,
-    centre_of,
-    fit_spot,
-    patch_around,
-    skewness,
-)
+from tvsbayes.cameras.spot_fit import Centre, Located, centre_of, fit_spot, skewness
 from tvsbayes.cameras.spot_noise import CONTRAST_DEFAULT, SpotNoise, learn_noise
+from tvsbayes.cameras.spot_window import CLIPPED_SHARE_MAX, Patch, patch_around
 from tvsbayes.errors import InputError, NothingToEstimate, escaped, refusal
 from tvsbayes.files.disk import make_folder, read_bytes, write_atomically
-from tvsbayes.files.images import IMAGE_BYTES_MAX, decode_image, image_size, png_bytes
+from tvsbayes.files.images import IMAGE_BYTES_MAX, decode_image, image_size, in_grey_levels, png_bytes, white_level
 from tvsbayes.instrument.campaign import CAMERAS, Campaign, Spot, frame_name, with_pixels
 from tvsbayes.instrument.stereo_pair import Stereo
 from tvsbayes.progress import Job, Show
@@ -62,7 +54,7 @@ LEARNING, DETECTING = "learning the noise", "detecting"
 PILOTS_MAX = 24
 """Looks from which the weights of the fits are learned; uncertainties are stated from all."""
 LEARNING_ROUNDS = 3
-SKEWS_MAX = 4000
+SKEW_SPOTS_MAX = 1000
 OVERLAY_HALF_PX, OVERLAY_ZOOM = 32, 8
 """Half the side of the square that an overlay shows, and how many of its pixels show one."""
 
@@ -137,10 +129,14 @@ def _row(spot: Spot, left: Centre, right: Centre) -> Spot:
 
 @dataclass(frozen=True)
 class _Frames:
-    """Reads the frames of a campaign: names are fixed by the format, links out of the folder are refused."""
+    """Reads the frames of a campaign: names are fixed by the format, links out of the folder are refused.
+
+    `white` is the largest value of its cameras where they give more than 8 bits; None before it is known.
+    """
 
     folder: Path
     size: tuple[int, int]
+    white: int | None = None
 
     def path(self, spot: Spot, side: str) -> Path:
         return self.folder / frame_name(spot.spot, side)
@@ -161,7 +157,24 @@ class _Frames:
                 allowed=f"{self.size[0]} x {self.size[1]} as in stereo.json",
                 remedy="calibrate and observe at one image size",
             )
-        return decode_image(data, escaped(path.name))
+        picture = decode_image(data, escaped(path.name))
+        if self.white is None or picture.dtype == np.uint8:
+            return picture
+        if int(picture.max()) > self.white:
+            raise refusal(
+                "image",
+                file=path.name,
+                found=f"values up to {int(picture.max())}",
+                allowed=f"up to {self.white}, as in the other pictures",
+                remedy="save all pictures of a campaign from one camera with the same number of bits",
+            )
+        return in_grey_levels(picture, self.white)
+
+    def with_white(self, spots: Sequence[Spot]) -> _Frames:
+        """The same with the level at which its cameras are full, by the largest value in some looks."""
+        pictures = (self.read(spot, side) for spot in spots for side in CAMERAS)
+        largest = max((int(picture.max()) for picture in pictures if picture.dtype != np.uint8), default=0)
+        return replace(self, white=white_level(largest)) if largest else self
 
 
 def _parallel[Item, Result](job: Callable[[Item], Result], items: Sequence[Item], workers: int) -> Iterator[Result]:
@@ -202,6 +215,7 @@ def detect(
     present = [row for row in rows if frames.there(campaign.spots[row])]
     if not present:
         raise _no_frames(campaign)
+    frames = frames.with_white([campaign.spots[row] for row in _spread(present)])
     workers = workers or os.cpu_count() or 1
     learning = min(PILOTS_MAX, len(present)) if method == "fit" else 0
     with Job({LEARNING: learning, DETECTING: len(present)}, progress) as job:
@@ -328,14 +342,19 @@ def _relearned(
         good = [pair[number] for pair in pairs if pair[number].status in ("ok", "misshapen")]
         skews = [centre.skews for centre in good if centre.skews is not None]
         if skews:
-            table = np.vstack(skews)
-            result[camera] = learn_noise(table[:: -(-len(table) // SKEWS_MAX)], speckle_contrast)
+            table = np.stack(skews)
+            result[camera] = learn_noise(table[:: -(-len(table) // SKEW_SPOTS_MAX)], speckle_contrast)
     return result
+
+
+def _spread(present: Sequence[int]) -> list[int]:
+    """Rows of some looks, spread evenly over the campaign."""
+    return [present[k] for k in np.unique(np.linspace(0, len(present) - 1, PILOTS_MAX).astype(int))]
 
 
 def _pilots(spots: Sequence[Spot], present: Sequence[int], frames: _Frames, workers: int) -> dict[int, _Patches]:
     """Left and right patch, or why there is none, of looks spread evenly over the campaign, by row of spots.csv."""
-    rows = [present[k] for k in np.unique(np.linspace(0, len(present) - 1, PILOTS_MAX).astype(int))]
+    rows = _spread(present)
 
     def patches(row: int) -> _Patches:
         return patch_around(frames.read(spots[row], "left")), patch_around(frames.read(spots[row], "right"))
@@ -380,13 +399,16 @@ def _learned(patches: Sequence[Patch], speckle_contrast: float | None) -> SpotNo
         fits = [(fitted, patch) for patch in patches if (fitted := fit_spot(patch, noise)) is not None]
         if not fits:
             return noise
-        noise = learn_noise(np.vstack([skewness(*pair) for pair in fits]), speckle_contrast)
+        noise = learn_noise(np.stack([skewness(*pair) for pair in fits]), speckle_contrast)
     return noise
 
 
 def _overlay(picture: np.ndarray, centre: Centre) -> np.ndarray:
     """The surroundings of a spot enlarged: outline green, centre red, the reason of a refusal in words (Figure 9)."""
     import cv2
+
+    if picture.dtype != np.uint8:
+        picture = np.clip(np.rint(picture), 0, 255).astype(np.uint8)
 
     half, zoom = OVERLAY_HALF_PX, OVERLAY_ZOOM
     height, width = picture.shape[:2]

@@ -6,8 +6,8 @@ uncertainty. Grey is (B + 2 G + R) / 4, in which every photosite of a Bayer sens
 dyes, so hue tells nothing. Variance of a pixel with signal S: background + gain * S + (contrast * S)^2: what the frame
 shows without spot, shot noise, speckle.
 
-Raw image px with the integer at the centre of a pixel; DN = grey levels of 8 bits; pictures (height, width, 3) uint8,
-blue, green, red.
+Raw image px with the integer at the centre of a pixel; DN = grey levels of 8 bits; pictures (height, width, 3), blue,
+green, red, uint8 or float32 DN of deeper ones.
 """
 
 from __future__ import annotations
@@ -18,28 +18,27 @@ from math import log, pi, sqrt
 
 import numpy as np
 
-from tvsbayes.cameras.spot_noise import SpotNoise, background_variance, grey_of, through_demosaicing
+from tvsbayes.cameras.spot_noise import SpotNoise, pixel_noise, through_demosaicing
+from tvsbayes.cameras.spot_window import CLIPPED_DN, CLIPPED_SHARE_MAX, SHRINK, Patch, patch_around
+from tvsbayes.files.images import in_grey_levels
 
-CLIPPED_DN = 250
-"""A channel at or above this counts as clipped: white balance and JPEG leave full wells a little below 255."""
-CLIPPED_SHARE_MAX = 0.5
-"""Half the bright area: about three times overexposed."""
-BRIGHT_SHARE = 0.3
-"""Level of the bright area and of the paper's contour between background and highest value."""
-SECOND_SHARE = 0.25
 AREA_MIN_PX = 4.0
 """Least area at half height, px^2: a hot pixel after demosaicing has 2."""
-AREA_MAX_SHARE = 0.03
-"""Of the picture; at 1280 x 720 px a spot of 50 px sd."""
 AXES_RATIO_MAX = 4.0
 """A sheet at 70 degrees to the beam gives 2.9."""
 BORDER_SDS = 3.0
 """A spot cut off nearer than this has lost what tells its place."""
-DETECTION_SIGMAS, DETECTION_MIN_DN = 8.0, 2.0
-"""Least height of a spot over the background, of means of 4 x 4 px: in sds of them and in DN."""
 SKEW_LIMIT = 80.0
 """Largest sum of a spot's four standardised squared skew residuals (normal: one in 10^15; speckle has longer tails)."""
-_SHRINK = 4
+OWN_ROUNDS = 2
+SKEW_SHAPE_MAX = 0.15
+"""Up to this amplitude a spot may be skewed where there is no other one to compare with: half a Gaussian has 0.17, the
+worst of nine real beams 0.13."""
+WIDE_FLOOR_SHARE = 0.02
+"""Of the height: what stands for the background in the weights of wide spots, whose noise is mostly shot noise."""
+REACH, REACH_PX = 4.0, 9.0
+"""Where pixels fade out of a fit, in sds of the spot and px beyond: no real beam is Gaussian in its wings, and with an
+edge there the centre would hang on which pixels happen to be inside."""
 
 
 @dataclass(frozen=True)
@@ -62,7 +61,7 @@ class Centre:
         clipped_share: clipped area over bright area.
         outline_px: (n, 2) outline of the bright area, for pictures; may be empty.
         parts_px2: (3, 2, 2) covariance from the background's noise, per gain and per contrast^2 (`fit`).
-        skews: (4, 4) as `learn_noise` takes them (`fit`).
+        skews: (4, 4) as `skewness` makes them (`fit`).
     """
 
     status: str
@@ -86,7 +85,7 @@ class Centre:
             return self
         units = np.array([1.0, noise.gain_dn, noise.speckle_contrast**2])
         covariance = np.einsum("k,kij->ij", units, self.parts_px2)
-        skewed = float(np.sum(self.skews[:, 0] / (self.skews[:, 1:] @ units))) > SKEW_LIMIT
+        skewed = float(np.sum((self.skews[:, 0] - noise.skew) ** 2 / (self.skews[:, 1:] @ units))) > SKEW_LIMIT
         status = self.status
         if status in ("ok", "misshapen"):
             status = "misshapen" if skewed else "ok"
@@ -94,23 +93,8 @@ class Centre:
 
 
 @dataclass(frozen=True)
-class Patch:
-    """The pixels around a spot: grey (h, w) DN, usable (h, w), where its corner lies, and first guesses."""
-
-    grey: np.ndarray
-    usable: np.ndarray
-    corner: tuple[int, int]
-    start_px: np.ndarray
-    start_sd_px: float
-    background_variance: float
-    clipped_share: float
-    outline_px: np.ndarray
-    size: tuple[int, int]
-
-
-@dataclass(frozen=True)
 class _Fitted:
-    """A converged fit: centre (2,), precision (2, 2), and what its covariance is made of.
+    """A converged fit: centre (2,), precision (2, 2), height, and what its covariance is made of.
 
     Over the n pixels of the patch: signal, its derivatives (9, n), weights (0 where not usable), residuals and the
     coordinates in sds of the spot.
@@ -118,71 +102,13 @@ class _Fitted:
 
     centre_px: np.ndarray
     precision: np.ndarray
+    height_dn: float
     signal: np.ndarray
     jacobian: np.ndarray
     weights: np.ndarray
     residual: np.ndarray
     z1: np.ndarray
     z2: np.ndarray
-
-
-def patch_around(picture: np.ndarray) -> Patch | str:
-    """Find the spot of a picture; the reason for refusal where there is not exactly one."""
-    import cv2
-
-    height, width = picture.shape[:2]
-    # To find the spot OpenCV's own weights of the colours will do; they are several times faster.
-    small = cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY)
-    small = cv2.resize(small, (width // _SHRINK, height // _SHRINK), interpolation=cv2.INTER_AREA)
-    # Lamps and gradients are wide, a spot is not: 11 cells of 8 px hold it several times.
-    wide = cv2.resize(small, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
-    wide = cv2.resize(cv2.medianBlur(wide, 11), small.shape[::-1], interpolation=cv2.INTER_LINEAR)
-    above = cv2.blur(cv2.subtract(small, wide, dtype=cv2.CV_32F), (2, 2))
-    noise = 1.4826 * float(np.median(np.abs(above[::3, ::3])))
-    peak = float(above.max())
-    if peak < max(DETECTION_SIGMAS * noise, DETECTION_MIN_DN):
-        return "no-spot"
-    bright = (above > max(SECOND_SHARE * peak, DETECTION_SIGMAS / 2 * noise)).astype(np.uint8)
-    # What follows looks at a few cells: it takes the time of the whole picture unless it is shown these alone.
-    column, row, columns, rows = cv2.boundingRect(bright)
-    around = np.s_[row : row + rows, column : column + columns]
-    count, labels, stats, centroids = cv2.connectedComponentsWithStats(bright[around], connectivity=8)
-    lit = labels > 0
-    flux = np.bincount(labels[lit].astype(np.intp), weights=above[around][lit], minlength=count)
-    main = int(flux.argmax())
-    if np.sort(flux)[-2] > SECOND_SHARE * flux[main]:
-        return "two-spots"
-    area = float(stats[main, cv2.CC_STAT_AREA])
-    if area > AREA_MAX_SHARE * bright.size:
-        return "too-large"
-    # A Gaussian is above a quarter of its peak within a radius of sqrt(2 ln 4) = 1.67 sds.
-    sd = _SHRINK * sqrt(area / pi) / 1.67
-    # The cell's centre, and the half cell that the 2 x 2 blur moved it by.
-    start = (centroids[main] + (column, row) + 0.5) * _SHRINK - 0.5 - _SHRINK / 2
-    half = int(min(max(4 * sd + 5, 14), max(height, width)))
-    left, top = np.maximum(np.round(start).astype(int) - half, 0)
-    right, bottom = np.minimum(np.round(start).astype(int) + half + 1, (width, height))
-    window = picture[top:bottom, left:right]
-    grey = grey_of(window)
-    clipped = (window >= CLIPPED_DN).any(axis=2).astype(np.uint8)
-    floor = float(np.median(np.concatenate((grey[0], grey[-1], grey[:, 0], grey[:, -1]))))
-    level = floor + BRIGHT_SHARE * (float(grey.max()) - floor)
-    bright = (grey > level).astype(np.uint8)
-    outlines, _ = cv2.findContours(bright, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-    outline = max(outlines, key=cv2.contourArea, default=np.empty((0, 1, 2), int)).reshape(-1, 2)
-    # Demosaicing spreads a clipped photosite over its neighbours.
-    usable = cv2.dilate(clipped, np.ones((3, 3), np.uint8)) == 0
-    return Patch(
-        grey=grey,
-        usable=usable,
-        corner=(int(left), int(top)),
-        start_px=start,
-        start_sd_px=max(sd, 1.0),
-        background_variance=background_variance(picture, start, half),
-        clipped_share=float(clipped.sum()) / max(1.0, float(bright.sum())),
-        outline_px=outline + np.array([left, top]),
-        size=(width, height),
-    )
 
 
 @dataclass(frozen=True)
@@ -212,8 +138,8 @@ class _Pixels:
 
     @classmethod
     def of(cls, patch: Patch) -> _Pixels:
-        v, u = (axis.ravel().astype(float) for axis in np.indices(patch.grey.shape))
-        middle_u, middle_v = (np.array(patch.grey.shape[::-1]) - 1) / 2
+        v, u = (axis.ravel() * patch.block + (patch.block - 1) / 2 for axis in np.indices(patch.grey.shape))
+        middle_u, middle_v = (patch.block * np.array(patch.grey.shape[::-1]) - 1) / 2
         jacobian = np.empty((9, patch.grey.size))
         jacobian[6], jacobian[7], jacobian[8] = 1.0, (u - middle_u) / (middle_u + 1), (v - middle_v) / (middle_v + 1)
         return cls(u, v, patch.grey.ravel().astype(float), patch.usable.ravel(), jacobian)
@@ -258,10 +184,18 @@ def fit_spot(patch: Patch, noise: SpotNoise) -> _Fitted | None:
         signal = model.signal
         residual = pixels.data - signal - p[6:] @ jacobian[6:]
         # Far from the solution the weights of a wrong model mislead: equal ones first.
-        variance = patch.background_variance + (
-            signal * (noise.gain_dn + noise.speckle_contrast**2 * signal) if settled else 0.0
-        )
+        if patch.wide:
+            # No real beam is Gaussian, and a wide spot shows it: its centre must not hang on a guess of the noise.
+            variance = signal + WIDE_FLOOR_SHARE * np.exp(p[0]) if settled else 1.0
+        else:
+            variance = patch.background_variance + (
+                signal * (noise.gain_dn + noise.speckle_contrast**2 * signal) if settled else 0.0
+            )
         weights = usable / variance
+        if settled:
+            reach = REACH + REACH_PX * sqrt(model.a * model.c)
+            ratio = (model.z1**2 + model.z2**2) / reach
+            weights /= 1 + np.exp(np.minimum(ratio - reach, 50.0))
         weighted = jacobian * weights
         normal = weighted @ jacobian.T
         scale = np.sqrt(normal.diagonal()) + 1e-30
@@ -277,10 +211,11 @@ def fit_spot(patch: Patch, noise: SpotNoise) -> _Fitted | None:
         step *= min(1.0, float((limits / np.maximum(np.abs(step), 1e-300)).min()))
         move, change = np.abs(step[1:3]).max() * max(model.a, model.c), np.abs(step[[0, 3, 5]]).max()
         # In sds of the spot; what is left after the last step is ten times less.
-        if settled > 1 and move < 5e-4 and change < 5e-3:
+        if settled > 1 and move < 5e-4 / patch.block and change < 5e-3 / patch.block:
             factor = np.array([[model.a, 0.0], [model.b, model.c]])
             centre = p[1:3] + step[1:3] + np.array(patch.corner)
-            return _Fitted(centre, factor @ factor.T, signal, jacobian, weights, residual, model.z1, model.z2)
+            height = float(np.exp(p[0]))
+            return _Fitted(centre, factor @ factor.T, height, signal, jacobian, weights, residual, model.z1, model.z2)
         settled += bool(settled or (move < 0.05 and change < 0.1) or iteration > 12)
         p = p + step
         if not np.isfinite(p).all() or max(abs(p[3]), abs(p[5])) > 6 or p[0] > 12:
@@ -297,16 +232,17 @@ def _covariance_parts(fitted: _Fitted, patch: Patch) -> np.ndarray:
     signal = fitted.signal
     parts = []
     for filters, size in ((gains, patch.background_variance), (gains * np.sqrt(signal), 1.0), (gains * signal, 1.0)):
-        u, v, both = size * through_demosaicing(filters, patch.grey.shape)
+        u, v, both = size * through_demosaicing(filters, patch.grey.shape, patch.block)
         mixed = (both - u - v) / 2
         parts.append([[u, mixed], [mixed, v]])
     return np.array(parts)
 
 
 def skewness(fitted: _Fitted, patch: Patch) -> np.ndarray:
-    """Rows (4, 4) of squared skew residual and its expectation from background, per gain and per contrast^2.
+    """Rows (4, 4): amplitude of a skew shape in the spot, its variance from background, per gain and per contrast^2.
 
-    The four third-order Hermite functions of the spot, less what the fit's own parameters take up.
+    The four third-order Hermite functions of the spot, less what the fit's own parameters take up; 1 is the spot's own
+    height.
     """
     z1, z2, signal = fitted.z1, fitted.z2, fitted.signal
     one, two = z1 * z1, z2 * z2
@@ -314,12 +250,30 @@ def skewness(fitted: _Fitted, patch: Patch) -> np.ndarray:
     weighted = fitted.jacobian * fitted.weights
     taken = np.linalg.solve(weighted @ fitted.jacobian.T, weighted @ shapes.T)
     filters = (shapes - taken.T @ fitted.jacobian) * fitted.weights
+    filters /= np.maximum(np.einsum("kn,kn->k", filters, shapes), 1e-300)[:, None]
     parts = [
-        patch.background_variance * through_demosaicing(filters, patch.grey.shape),
-        through_demosaicing(filters * np.sqrt(signal), patch.grey.shape),
-        through_demosaicing(filters * signal, patch.grey.shape),
+        patch.background_variance * through_demosaicing(filters, patch.grey.shape, patch.block),
+        through_demosaicing(filters * np.sqrt(signal), patch.grey.shape, patch.block),
+        through_demosaicing(filters * signal, patch.grey.shape, patch.block),
     ]
-    return np.column_stack(((filters @ fitted.residual) ** 2, *parts))
+    return np.column_stack((filters @ fitted.residual, *parts))
+
+
+def with_own_noise(patch: Patch) -> tuple[Patch, SpotNoise]:
+    """A patch and its noise by its own pixels; its skew is taken for the beam's shape up to `SKEW_SHAPE_MAX`."""
+    noise, fitted = SpotNoise(speckle_contrast=0.0), None
+    for _ in range(OWN_ROUNDS):
+        fitted = fit_spot(patch, noise)
+        if fitted is None:
+            return patch, SpotNoise()
+        v, u = np.indices(patch.raw.shape)
+        x, y = u - (fitted.centre_px[0] - patch.corner[0]), v - (fitted.centre_px[1] - patch.corner[1])
+        (p, q), (_, r) = fitted.precision
+        signal = fitted.height_dn * np.exp(-(p * x * x + 2 * q * x * y + r * y * y) / 2)
+        own = pixel_noise(patch.raw - signal, signal, patch.raw < CLIPPED_DN, patch.background_variance, patch.mono)
+        patch, noise = replace(patch, background_variance=own.background_dn2), own.noise
+    skew = skewness(fitted, patch)[:, 0] if fitted is not None else np.zeros(4)
+    return patch, replace(noise, skew=tuple(np.clip(skew, -SKEW_SHAPE_MAX, SKEW_SHAPE_MAX).tolist()))
 
 
 def centre_of(patch: Patch | str, noise: SpotNoise) -> Centre:
@@ -341,7 +295,7 @@ def centre_of(patch: Patch | str, noise: SpotNoise) -> Centre:
         status = reason
     elif long > AXES_RATIO_MAX * short:
         status = "elongated"
-    elif np.abs(fitted.centre_px - patch.start_px).max() > 3 * patch.start_sd_px + 2 * _SHRINK:
+    elif np.abs(fitted.centre_px - patch.start_px).max() > 3 * patch.start_sd_px + 2 * SHRINK:
         status = "unfitted"
     parts, skews = _covariance_parts(fitted, patch), skewness(fitted, patch)
     axes = float(long), float(short)
@@ -357,7 +311,11 @@ def find_spot(picture: np.ndarray, noise: SpotNoise | None = None) -> Centre:
     """The spot of one picture by the method `fit`.
 
     Args:
-        picture: (height, width, 3) uint8, blue, green, red.
-        noise: of the camera, as `detect` learns it; default the priors' medians.
+        picture: (height, width, 3), blue, green, red, uint8 or uint16.
+        noise: of the camera, as `detect` learns it from many looks; default what the pixels of a wide spot show,
+            which has no speckle whose grain is wider than a few pixels; of a narrow one the priors' medians.
     """
-    return centre_of(patch_around(picture), noise or SpotNoise())
+    patch = patch_around(in_grey_levels(picture))
+    if noise is None and not isinstance(patch, str) and patch.wide:
+        patch, noise = with_own_noise(patch)
+    return centre_of(patch, noise or SpotNoise())

@@ -1,7 +1,7 @@
 """The noise of a camera's pixels around a laser spot: what demosaicing makes of it, and what a campaign tells of it.
 
-DN = grey levels of 8 bits; pictures (height, width, 3) uint8, blue, green, red; grey is (B + 2 G + R) / 4, in which
-every photosite of a Bayer sensor weighs alike.
+DN = grey levels of 8 bits; pictures (height, width, 3), blue, green, red, uint8 or float32 DN of deeper ones; grey is
+(B + 2 G + R) / 4, in which every photosite of a Bayer sensor weighs alike.
 """
 
 from __future__ import annotations
@@ -19,6 +19,12 @@ CONTRAST_SCALE, CONTRAST_MAX = 0.5, 2.0
 1, and its grain in px multiplies that."""
 SKEW_OUTLIER = 30.0
 """A squared skew residual this many times its expectation teaches nothing about noise (normal: one in 10^7)."""
+DEEP_VARIANCE_MIN = 1e-5
+"""Least variance of a pixel of more than 8 bits, DN^2: rounding of 14 bits."""
+SHAPE_SPOTS_MIN = 4
+OWN_PIXELS_MIN, OWN_BINS, OWN_SHARE, OWN_DARK_SHARE, OWN_GAIN_MIN_DN = 200, 8, 0.05, 0.005, 1e-4
+"""Of `pixel_noise`: least pixels, bins of signal, the least signal that counts and the largest that is none, a gain
+that is as good as none."""
 _CELL = 8
 
 
@@ -41,11 +47,13 @@ _CELL_VARIANCE = float(np.sum(_CORRELATION * np.outer(_LAGS, _LAGS))) / _CELL**4
 class SpotNoise:
     """Variance of a grey pixel with signal S beyond the background's: gain_dn * S + (speckle_contrast * S)^2, DN^2.
 
-    The contrast is that per independent pixel: contrast times the root of the grain's area in px.
+    The contrast is that per independent pixel: contrast times the root of the grain's area in px. `skew` is the shape
+    that all spots of the camera share, as the amplitudes of four functions (`spot_fit.skewness`): no noise.
     """
 
     gain_dn: float = GAIN_MEDIAN_DN
     speckle_contrast: float = CONTRAST_DEFAULT
+    skew: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0)
 
 
 def learn_noise(skews: np.ndarray, speckle_contrast: float | None = None) -> SpotNoise:
@@ -54,9 +62,16 @@ def learn_noise(skews: np.ndarray, speckle_contrast: float | None = None) -> Spo
     Means of their squares would state too much where there is no speckle: the contrast's posterior begins at 0.
 
     Args:
-        skews: (n, 4) as `skewness` makes them, of any number of spots.
+        skews: (spots, 4, 4) as `skewness` makes them. From `SHAPE_SPOTS_MIN` spots on their median is the beam's own
+            shape and no noise: speckle differs from look to look, a beam does not.
         speckle_contrast: taken as known where given.
     """
+    count, shape = len(skews), np.zeros(4)
+    if count >= SHAPE_SPOTS_MIN:
+        shape = np.median(skews[:, :, 0], axis=0)
+    squared = np.array(skews, dtype=float)
+    squared[:, :, 0] = (skews[:, :, 0] - shape) ** 2 * (count / (count - 1) if shape.any() else 1.0)
+    skews = squared.reshape(-1, 4)
     away = np.linspace(-3, 3, 41)[:, None]
     gains = GAIN_MEDIAN_DN * np.exp(away * GAIN_SD_OF_LOG)
     # Equal steps of the root: fine near 0; each point weighs what lies around it.
@@ -76,7 +91,67 @@ def learn_noise(skews: np.ndarray, speckle_contrast: float | None = None) -> Spo
     weights = np.exp(logs - logs.max())
     weights /= weights.sum()
     gain_dn = GAIN_MEDIAN_DN * float(np.exp(GAIN_SD_OF_LOG * (weights.sum(axis=1) @ away.ravel())))
-    return SpotNoise(gain_dn, float(weights.sum(axis=0) @ contrasts))
+    return SpotNoise(gain_dn, float(weights.sum(axis=0) @ contrasts), tuple(shape.tolist()))
+
+
+@dataclass(frozen=True)
+class PixelNoise:
+    """The noise of one picture by its own pixels, and the variance of a photosite without light, DN^2."""
+
+    noise: SpotNoise
+    background_dn2: float
+
+
+def pixel_noise(
+    residual: np.ndarray, signal: np.ndarray, usable: np.ndarray, background: float, mono: bool
+) -> PixelNoise:
+    """Gain and contrast of one picture from its own pixels: second differences of what a fit leaves, by signal.
+
+    Differences over 1 px, of demosaiced pictures 3, see the noise of pixels and the finest grain of speckle, and little
+    of a beam's rings and fringes. A grain that is wider than that only the scatter between looks tells.
+
+    Args:
+        residual: grey less fitted (h, w), DN.
+        signal: fitted light of the spot (h, w), DN.
+        usable: which pixels count (h, w).
+        background: variance of one photosite without light, DN^2, where too few pixels around the spot are dark.
+        mono: whether the pixels are photosites of their own, not demosaiced.
+    """
+    from scipy.optimize import nnls
+
+    lag, own = (1, 1.0) if mono else (3, float(_CORRELATION[2, 2]))
+    rows = []
+    for axis in (0, 1):
+        length = residual.shape[axis]
+        if length <= 2 * lag:
+            continue
+        parts = [np.arange(k * lag, length - (2 - k) * lag) for k in range(3)]
+        before, here, after = (np.take(residual, part, axis) for part in parts)
+        seen = np.logical_and.reduce([np.take(usable, part, axis) for part in parts])
+        # Of one value and two halves of others: 1 + 1/4 + 1/4.
+        rows.append(
+            np.stack(((here - (before + after) / 2)[seen] ** 2 / 1.5 / own, np.take(signal, parts[1], axis)[seen]))
+        )
+    squares, light = np.hstack(rows) if rows else np.empty((2, 0))
+    if len(light) < OWN_PIXELS_MIN:
+        return PixelNoise(SpotNoise(), background)
+    dark = squares[light < OWN_DARK_SHARE * light.max()]
+    if len(dark) >= OWN_PIXELS_MIN:
+        background = max(float(dark.mean()), DEEP_VARIANCE_MIN)
+    order = np.argsort(light)
+    bins = np.array_split(order[light[order] > OWN_SHARE * light.max()], OWN_BINS)
+    level = np.array([light[part].mean() for part in bins])
+    mean = np.array([squares[part].mean() for part in bins])
+    # Relative errors of the means are alike, so relative misses count.
+    weight = 1 / np.maximum(mean, 1e-12)
+    excess = np.maximum(mean - background, 0.0)
+    gain, contrast2 = nnls(np.column_stack((level, level**2)) * weight[:, None], excess * weight)[0]
+    return PixelNoise(SpotNoise(max(float(gain), OWN_GAIN_MIN_DN), float(np.sqrt(contrast2))), background)
+
+
+def is_mono(picture: np.ndarray) -> bool:
+    """Whether the three channels are one: a monochrome camera, or grey saved as colour."""
+    return bool((picture[..., 0] == picture[..., 1]).all() and (picture[..., 0] == picture[..., 2]).all())
 
 
 def background_variance(picture: np.ndarray, centre: np.ndarray, half: int) -> float:
@@ -104,13 +179,16 @@ def background_variance(picture: np.ndarray, centre: np.ndarray, half: int) -> f
         return 1.0
     # MAD: edges of other things in the picture are few. 1.5: variance of the difference of independent means.
     variance = (1.4826 * float(np.median(np.abs(values)))) ** 2 / 1.5 / _CELL_VARIANCE
-    return max(variance, 1 / 12)  # rounding to whole grey levels
+    return max(variance, 1 / 12 if picture.dtype == np.uint8 else DEEP_VARIANCE_MIN)  # rounding to whole grey levels
 
 
-def through_demosaicing(filters: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+def through_demosaicing(filters: np.ndarray, shape: tuple[int, int], block: int = 1) -> np.ndarray:
     """Variance (k,) of filters (k, n) on a patch (h, w) of unit noise per photosite, as grey shows it."""
     import cv2
 
+    if block > 1:
+        # Demosaicing keeps the sum of its correlations at 1: wide blocks of pixels are independent.
+        return np.einsum("kn,kn->k", filters, filters) / block**2
     pictures = filters.reshape(len(filters), *shape)
     smooth = [cv2.filter2D(one, cv2.CV_64F, _CORRELATION, borderType=cv2.BORDER_CONSTANT) for one in pictures]
     return np.einsum("kij,kij->k", pictures, np.array(smooth))

@@ -1,7 +1,8 @@
 """PNG and JPEG: their size before anything is decoded, their pixels, and PNG written.
 
-Pictures are (height, width, 3) uint8, blue, green, red (OpenCV's order), pixel coordinates those of the sensor. What a
-header announces is checked against a cap first: a small file can ask for gigabytes.
+Pictures are (height, width, 3), blue, green, red (OpenCV's order), uint8 or, from PNG of 16 bits, uint16 as the file
+has them; pixel coordinates those of the sensor. What a header announces is checked against a cap first: a small file
+can ask for gigabytes.
 """
 
 from __future__ import annotations
@@ -23,14 +24,20 @@ IMAGE_PIXELS_MAX = 50_000_000
 _PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
 _PNG_END = b"\0\0\0\0IEND\xaeB`\x82"
 """The last chunk with its checksum: decoders forgive its loss, a copy cut short has lost more."""
-_PNG_DEPTHS = {0: (1, 2, 4, 8), 2: (8,), 3: (1, 2, 4, 8), 6: (8,)}
+_PNG_DEPTHS = {0: (1, 2, 4, 8, 16), 2: (8, 16), 3: (1, 2, 4, 8), 6: (8, 16)}
 """Colour type of a PNG -> bit depths taken: grey, RGB, palette, RGBA (PNG specification 3, 11.2.1)."""
 _JPEG_MAGIC = b"\xff\xd8\xff"
 _JPEG_FRAMES = (0xC0, 0xC1, 0xC2)
 """Baseline, extended and progressive Huffman frames (ITU-T T.81, table B.1)."""
 _JPEG_BARE = (0x01, 0xD8, *range(0xD0, 0xD8))
 """Markers without a length (ITU-T T.81 B.1.1.3)."""
-IMAGES_ALLOWED = f"PNG or JPEG of 8 bits per channel, at most {IMAGE_PIXELS_MAX // 1_000_000} million pixels"
+_PNG_DEEP = 16
+IMAGES_ALLOWED = (
+    f"PNG of 8 or 16 bits, or JPEG of 8 bits per channel; at most {IMAGE_PIXELS_MAX // 1_000_000} million pixels, "
+    "half as many of 16 bits"
+)
+WHITE_BITS = (8, 10, 12, 14, 16)
+"""Bits of cameras' converters; a file of 16 bits holds the values of any of them."""
 
 
 def image_size(data: bytes, file: str) -> tuple[int, int]:
@@ -55,9 +62,15 @@ def image_size(data: bytes, file: str) -> tuple[int, int]:
         width, height = _jpeg_size(data, bad)
     else:
         raise bad("image", f"a file that begins with {data[:8].hex(' ') or 'nothing'}", "save it as PNG")
-    if not 0 < width * height <= IMAGE_PIXELS_MAX:
+    most = IMAGE_PIXELS_MAX // (2 if _is_deep(data) else 1)
+    if not 0 < width * height <= most:
         raise bad("image-size", f"{width} x {height} pixels", "crop or scale it")
     return width, height
+
+
+def _is_deep(data: bytes) -> bool:
+    """Whether a PNG with a whole header has 16 bits per channel."""
+    return data.startswith(_PNG_MAGIC) and data[24] == _PNG_DEEP
 
 
 def _jpeg_size(data: bytes, bad: Callable[[str, str, str], InputError]) -> tuple[int, int]:
@@ -83,7 +96,7 @@ def _jpeg_size(data: bytes, bad: Callable[[str, str, str], InputError]) -> tuple
 
 
 def decode_image(data: bytes, file: str) -> np.ndarray:
-    """The picture in `data` as (height, width, 3) uint8, channels blue, green, red (OpenCV's order).
+    """The picture in `data` as (height, width, 3) uint8 or uint16, channels blue, green, red (OpenCV's order).
 
     The orientation tag of a JPEG is left out of account: pixel coordinates are those of the sensor.
 
@@ -94,8 +107,9 @@ def decode_image(data: bytes, file: str) -> np.ndarray:
     import cv2
     import numpy as np
 
+    flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION | (cv2.IMREAD_ANYDEPTH if _is_deep(data) else 0)
     try:
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     except cv2.error:
         image = None
     if image is None or image.shape != (height, width, 3):
@@ -105,7 +119,7 @@ def decode_image(data: bytes, file: str) -> np.ndarray:
 
 
 def read_image(path: Path, folder: Path | None = None) -> np.ndarray:
-    """A PNG or JPEG as (height, width, 3) uint8, blue, green, red; inside `folder` where given.
+    """A PNG or JPEG as (height, width, 3) uint8 or uint16, blue, green, red; inside `folder` where given.
 
     PNG is what the package writes: its checksum finds every damaged byte, a JPEG's damage shows only as wrong
     pixels.
@@ -117,13 +131,32 @@ def read_image(path: Path, folder: Path | None = None) -> np.ndarray:
 
 
 def png_bytes(image: np.ndarray) -> bytes:
-    """PNG of (height, width) or (height, width, 3) uint8 pixels, blue, green, red."""
+    """PNG of (height, width) or (height, width, 3) uint8 or uint16 pixels, blue, green, red."""
     import cv2
     import numpy as np
 
-    if image.dtype != np.uint8:
-        raise TypeError(f"pixels must be uint8, not {image.dtype}")
+    if image.dtype not in (np.uint8, np.uint16):
+        raise TypeError(f"pixels must be uint8 or uint16, not {image.dtype}")
     done, data = cv2.imencode(".png", image)
     if not done:
         raise ValueError(f"no PNG of shape {image.shape}")
     return data.tobytes()
+
+
+def white_level(largest: int) -> int:
+    """The largest value that a converter of usual bits has, which gave `largest`: 4095 for 3000."""
+    return next((2**bits - 1 for bits in WHITE_BITS if largest < 2**bits), 2 ** WHITE_BITS[-1] - 1)
+
+
+def in_grey_levels(image: np.ndarray, white: int | None = None) -> np.ndarray:
+    """Pixels in grey levels of 8 bits (DN): uint8 as they are, uint16 as float32 with `white` at 255, nothing rounded.
+
+    Args:
+        image: uint8 or uint16 of any shape.
+        white: the largest value that the camera gives; default by the picture itself.
+    """
+    import numpy as np
+
+    if image.dtype == np.uint8:
+        return image
+    return image.astype(np.float32) * np.float32(255 / (white or white_level(int(image.max()))))

@@ -127,7 +127,7 @@ FAULTS = (
     ),
     Fault(
         "neighbours of clipped pixels kept",
-        "cameras/spot_fit.py",
+        "cameras/spot_window.py",
         "usable = cv2.dilate(clipped, np.ones((3, 3), np.uint8)) == 0",
         "usable = clipped >= 0",
         "clipped cores pull the centre and widen the spot",
@@ -196,5 +196,21 @@ FAULTS = (
         "if found.orders.get(k, 0) < 0:",
         "a symmetric board that one finder turned spoils the calibration",
         ("cameras/stereo_calibration::test_corners_in_another_order_are_put_right_and_named",),
+    ),
+    Fault(
+        "a beam's own skew counts as noise",
+        "cameras/spot_noise.py",
+        "shape = np.median(skews[:, :, 0], axis=0)",
+        "shape = np.median(skews[:, :, 0], axis=0) * 0",
+        "real beams, none of which is symmetric, are known worse than they say",
+        ("cameras/spot_noise", "cameras/detection"),
+    ),
+    Fault(
+        "variance of blocks as if they were pixels",
+        "cameras/spot_noise.py",
+        'return np.einsum("kn,kn->k", filters, filters) / block**2',
+        'return np.einsum("kn,kn->k", filters, filters)',
+        "wide spots state sds several times too large",
+        ("cameras/spot_fit",),
     ),
 )

@@ -14,7 +14,7 @@ import numpy as np
 from experiments.common.clock import timed
 from experiments.common.rigs import mounted_rig, pixels_of, small_plan
 from experiments.speed.benchmarks.measure import Bench, Case, Column, Work
-from tvsbayes.cameras import detection, spot_fit
+from tvsbayes.cameras import detection, spot_window
 from tvsbayes.instrument.campaign import Campaign, read_campaign
 from tvsbayes.twin.frames import write_frames
 from tvsbayes.twin.physics import project
@@ -90,7 +90,7 @@ def photutils_centre(path: str, kind: str) -> np.ndarray:
     function: Callable = {"com": centroids.centroid_com, "bright": centroids.centroid_com}.get(
         kind, centroids.centroid_2dg
     )
-    patch = spot_fit.patch_around(cv2.imread(path))
+    patch = spot_window.patch_around(cv2.imread(path))
     if isinstance(patch, str):
         return np.full(2, np.nan)
     grey = patch.grey.astype(float)
