@@ -25,12 +25,12 @@ from tvsbayes.instrument.campaign import (
     Spot,
     campaign_toml,
     moves_bytes,
-    parse_header,
     parse_moves,
     parse_spots,
     read_campaign,
     spots_bytes,
 )
+from tvsbayes.instrument.campaign_header import parse_header
 from tvsbayes.instrument.rig import Rig, parse_rig_table
 from tvsbayes.instrument.stereo_pair import read_stereo, stereo_bytes
 

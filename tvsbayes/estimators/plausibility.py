@@ -27,6 +27,8 @@ SHORTEST_BASELINE_MM = 2.0
 """Two lenses cannot stand closer; the longest baseline in metres that anybody calls a stereo pair is shorter."""
 SHORTEST_MM = 0.5
 """Nothing of a rig that is stated at all is shorter, and no length in metres is longer."""
+CORNER_SHARE = 0.02
+"""Share of the picture's height: spots that all lie nearer than that to its first pixel were not measured in pixels."""
 ODD_SHARE = 0.1
 """Share of spots at impossible depths from which the others tell nothing of counters and names."""
 SPOTS_LISTED = 10
@@ -85,6 +87,9 @@ def implausible(campaign: Campaign, points_mm: np.ndarray | None = None) -> tupl
     if baseline_mm < SHORTEST_BASELINE_MM:
         found.append(f"T of stereo.json is {baseline_mm:.3g} mm long: is it in metres? Lengths are mm")
     found += _metres(campaign)
+    largest_px = float(np.abs(pixels_of(ok)).max())
+    if largest_px < CORNER_SHARE * campaign.stereo.image_height:
+        return (*found, f"no pixel is larger than {largest_px:.3g}: are the centres in millimetres? They are in px")
     stands = _can_stand(points_mm[:, 0])
     odd = [spot.spot for spot, can in zip(ok, stands, strict=True) if not can]
     if odd:

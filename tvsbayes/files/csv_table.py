@@ -197,8 +197,9 @@ def parse_table(data: bytes, file: str, columns: Sequence[str], optional: Sequen
         InputError: not UTF-8, control characters, no or a wrong header, rows of another length than it.
     """
     bad = partial(refusal, file=file)
-    if data.startswith(b"PK\x03\x04"):
-        raise bad("encoding", found="a workbook (XLSX)", allowed="CSV as UTF-8 text", remedy=FOREIGN)
+    for marks, found in (((b"PK\x03\x04",), "a workbook (XLSX)"), ((b"\xff\xfe", b"\xfe\xff"), "UTF-16")):
+        if data.startswith(marks):
+            raise bad("encoding", found=found, allowed="CSV as UTF-8 text", remedy=f"{FOREIGN}; or save it as UTF-8")
     rows = _csv_rows(decode(data, file), file)
     _, header = next(rows, (1, []))
     allowed = "the columns " + ",".join(columns) + (f" and optionally {','.join(optional)}" * bool(optional))

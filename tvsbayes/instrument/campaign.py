@@ -6,7 +6,6 @@ are found by name. No JAX.
 
 from __future__ import annotations
 
-import datetime
 import hashlib
 import os
 from collections.abc import Iterable, Sequence
@@ -20,8 +19,9 @@ from tvsbayes.display import Shown, View
 from tvsbayes.errors import InputError, escaped, refusal
 from tvsbayes.files.csv_table import CSV_BYTES_MAX, Table, csv_bytes, parse_table
 from tvsbayes.files.disk import make_folder, read_bytes, write_atomically
-from tvsbayes.files.documents import JSON_BYTES_MAX, TOML_BYTES_MAX, Keys, parse_toml, toml_line
+from tvsbayes.files.documents import JSON_BYTES_MAX, TOML_BYTES_MAX, parse_toml, toml_line
 from tvsbayes.instrument.axes import SENSES, PanApproach, TiltApproach
+from tvsbayes.instrument.campaign_header import parse_header
 from tvsbayes.instrument.counter_limits import COUNTER_MAX
 from tvsbayes.instrument.rig import RigTable, parse_rig_table, rig_table_toml
 from tvsbayes.instrument.stereo_pair import Stereo, parse_stereo, stereo_bytes
@@ -234,14 +234,22 @@ def parse_spots(data: bytes, file: str, moves: int, stereo: Stereo) -> tuple[Spo
                 raise table.refuse(row, column, "missing", allowed, "give the value or a refusal reason")
             if column in PIXELS and not -_IMAGE_MARGIN <= value / extent <= 1 + _IMAGE_MARGIN:
                 allowed = f"a position in the image, 0 to {extent:g} px, or close to it"
-                remedy = "check the image size in stereo.json, or give the spot a refusal reason"
-                if _exchanged(pixels, statuses, stereo):
-                    remedy = "u and v are exchanged: u counts columns to the right, v rows down"
+                remedy = _outside_remedy(values, extent, _exchanged(pixels, statuses, stereo))
                 raise table.refuse(row, column, "outside-image", allowed, remedy)
     apertures = table.numbers("aperture_deg", -360.0, 360.0, empty=True)
     correlations = [_parse_correlations(table, column, statuses) for column in _CORRELATIONS]
     head = (spots, move_ids, table.texts("target"), experiments, points)
     return tuple(map(Spot, *head, *pixels, *sds, apertures, statuses, *correlations))
+
+
+def _outside_remedy(values: Sequence[float | None], extent: float, exchanged: bool) -> str:
+    """What to do about pixels outside the image: a column, a cell, or the size of the pictures."""
+    if exchanged:
+        return "u and v are exchanged: u counts columns to the right, v rows down"
+    outside = sum(value is not None and not -_IMAGE_MARGIN <= value / extent <= 1 + _IMAGE_MARGIN for value in values)
+    if outside < 0.05 * len(values):
+        return "correct the cell (a decimal point left out?), or give the spot a refusal reason"
+    return "check the image size in stereo.json, or give the spot a refusal reason"
 
 
 def _exchanged(pixels: Sequence[Sequence[float | None]], statuses: Sequence[str], stereo: Stereo) -> bool:
@@ -267,56 +275,6 @@ def _parse_correlations(table: Table, column: str, statuses: Sequence[str]) -> l
             allowed = "a finite decimal number from -0.999999 to 0.999999"
             raise table.refuse(row, column, "number", allowed, "write 0 where it is not known")
     return [value or 0.0 for value in values]
-
-
-_TEXT_CHARS = {
-    **dict.fromkeys(("name", "operator", "instrument", "serial", "method", "board_certificate"), 200),
-    "notes": 4000,
-}
-_QUANTITIES = {
-    "temperature_degC": (-100.0, 200.0, 100.0),
-    "humidity_percent": (0.0, 100.0, 100.0),
-    "pitch_mm": (1e-3, 1e4, 1e3),
-}
-_HEADER_TABLES = {
-    "environment": ("temperature_degC", "humidity_percent"),
-    "traceability": ("board_certificate", "pitch_mm", "stereo_calibrated"),
-}
-_HEADER_KEYS = (
-    *("format", "name", "created", "synthetic", "seed"),
-    *("operator", "instrument", "serial", "method", "notes", *_HEADER_TABLES, "rig"),
-)
-
-
-def _header_value(keys: Keys, key: str) -> object:
-    """One checked value outside `[rig]`, by the kind its key asks for."""
-    if key in _TEXT_CHARS:
-        return keys.text_value(key, _TEXT_CHARS[key])
-    if key in _QUANTITIES:
-        value, u = keys.quantity(key, *_QUANTITIES[key])
-        return {"value": value, "u": u}
-    if key == "synthetic":
-        return keys.flag(key)
-    if key == "seed":
-        return keys.integer(key, 0, 2**63 - 1)
-    if not isinstance(keys.values[key], datetime.date):
-        allowed = "a date or time such as 2026-01-15T10:00:00Z"
-        raise keys.refuse(key, "date", allowed, "write it without quotes")
-    return keys.values[key]
-
-
-def parse_header(keys: Keys) -> dict[str, object]:
-    """The keys of `campaign.toml` outside `[rig]`, checked; their list is closed."""
-    keys.word("format", ("tvsbayes-campaign/1",))
-    keys.only(_HEADER_KEYS)
-    plain = [key for key in keys.values if key not in ("format", "rig", *_HEADER_TABLES)]
-    header = {key: _header_value(keys, key) for key in plain}
-    for name, allowed in _HEADER_TABLES.items():
-        table = keys.table(name)
-        table.only(allowed)
-        if table.values:
-            header[name] = {key: _header_value(table, key) for key in table.values}
-    return header
 
 
 # campaign.toml is written last: a folder without it is recognisably unfinished.

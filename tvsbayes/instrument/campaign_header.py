@@ -1,0 +1,56 @@
+"""The head of `campaign.toml`: what was measured, when, by whom, under which conditions; everything outside `[rig]`."""
+
+from __future__ import annotations
+
+import datetime
+
+from tvsbayes.files.documents import Keys
+
+_TEXT_CHARS = {
+    **dict.fromkeys(("name", "operator", "instrument", "serial", "method", "board_certificate"), 200),
+    "notes": 4000,
+}
+_QUANTITIES = {
+    "temperature_degC": (-100.0, 200.0, 100.0),
+    "humidity_percent": (0.0, 100.0, 100.0),
+    "pitch_mm": (1e-3, 1e4, 1e3),
+}
+_HEADER_TABLES = {
+    "environment": ("temperature_degC", "humidity_percent"),
+    "traceability": ("board_certificate", "pitch_mm", "stereo_calibrated"),
+}
+_HEADER_KEYS = (
+    *("format", "name", "created", "synthetic", "seed"),
+    *("operator", "instrument", "serial", "method", "notes", *_HEADER_TABLES, "rig"),
+)
+
+
+def _header_value(keys: Keys, key: str) -> object:
+    """One checked value outside `[rig]`, by the kind its key asks for."""
+    if key in _TEXT_CHARS:
+        return keys.text_value(key, _TEXT_CHARS[key])
+    if key in _QUANTITIES:
+        value, u = keys.quantity(key, *_QUANTITIES[key])
+        return {"value": value, "u": u}
+    if key == "synthetic":
+        return keys.flag(key)
+    if key == "seed":
+        return keys.integer(key, 0, 2**63 - 1)
+    if not isinstance(keys.values[key], datetime.date):
+        allowed = "a date or time such as 2026-01-15T10:00:00Z"
+        raise keys.refuse(key, "date", allowed, "write it without quotes")
+    return keys.values[key]
+
+
+def parse_header(keys: Keys) -> dict[str, object]:
+    """The keys of `campaign.toml` outside `[rig]`, checked; their list is closed."""
+    keys.word("format", ("tvsbayes-campaign/1",))
+    keys.only(_HEADER_KEYS)
+    plain = [key for key in keys.values if key not in ("format", "rig", *_HEADER_TABLES)]
+    header = {key: _header_value(keys, key) for key in plain}
+    for name, allowed in _HEADER_TABLES.items():
+        table = keys.table(name)
+        table.only(allowed)
+        if table.values:
+            header[name] = {key: _header_value(table, key) for key in table.values}
+    return header
