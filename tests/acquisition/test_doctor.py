@@ -83,6 +83,14 @@ def test_healthy_instrument(tmp_path):
     assert checks["timing"].found.startswith("0.6 ms, 0 of 20") and camera.closed
 
 
+def test_pictures_of_twelve_bits_are_judged_in_the_same_grey_levels(tmp_path):
+    device, camera = bench()
+    grab = camera.grab
+    camera.grab = lambda: (pair := grab(), StereoImage(*(p.astype(np.uint16) * 16 for p in (pair.left, pair.right))))[1]
+    checks = found(device, camera, tmp_path, laser=True)
+    assert {name for name, check in checks.items() if check.status != "ok"} == {"limits"}, checks
+
+
 @pytest.mark.parametrize(
     ("camera", "name", "word"),
     [

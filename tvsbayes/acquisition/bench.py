@@ -16,7 +16,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import cast
 
-from tvsbayes.acquisition.drivers import cameras_of, positioner_of
+from tvsbayes.acquisition.drivers import cameras_of, connect_trigger, positioner_of
 from tvsbayes.acquisition.journal import LOG, read_journal
 from tvsbayes.acquisition.journal_events import Moved
 from tvsbayes.acquisition.observation import CameraObserver, Detector, Observer, TwinObserver, wait_for_detection
@@ -94,6 +94,7 @@ def hardware(rig: Rig, detector: Detector, operator: Operator) -> Iterator[Bench
         positioner.close()
         raise
     try:
+        connect_trigger(positioner, camera)
         settings = camera.settings()
         details = {"device": dict(positioner.identity), "cameras": settings.as_json()}
         observer = CameraObserver(camera, detector)

@@ -17,12 +17,13 @@ from pathlib import Path
 
 import numpy as np
 
-from tvsbayes.acquisition.drivers import cameras_of, positioner_of
+from tvsbayes.acquisition.drivers import cameras_of, connect_trigger, positioner_of
 from tvsbayes.acquisition.journal import Disk
 from tvsbayes.acquisition.observation import CHANGE_DN, rises_dn
 from tvsbayes.acquisition.operator import StopKey
 from tvsbayes.cameras.capture import StereoCamera
 from tvsbayes.errors import TvsError, escaped
+from tvsbayes.files.images import in_grey_levels
 from tvsbayes.instrument.axes import AXES
 from tvsbayes.instrument.rig import Rig
 from tvsbayes.positioner.interface import DEFAULT_DRIVER, SEE_DOCTOR, Clock, Positioner
@@ -91,7 +92,7 @@ def examine(
         if open_positioner is not None:
             positioner, found = _positioner(open_positioner, clock)
         checks += found
-        camera, found = _camera(rig, open_camera, clock)
+        camera, found = _camera(rig, open_camera, positioner, clock)
         checks += found
         try:
             checks.append(_laser(positioner, camera, laser))
@@ -211,7 +212,7 @@ def _switches(state: DeviceState) -> Check:
 
 
 def _camera(
-    rig: Rig, open_camera: Callable[[], StereoCamera] | None, clock: Clock
+    rig: Rig, open_camera: Callable[[], StereoCamera] | None, positioner: Positioner | None, clock: Clock
 ) -> tuple[StereoCamera | None, list[Check]]:
     """Opening, settings, time of a fresh pair, exposure and focus."""
     size = rig.stereo.image_width, rig.stereo.image_height
@@ -220,6 +221,8 @@ def _camera(
     except TvsError as error:
         return None, [_failed("cameras", error)]
     try:
+        if positioner is not None:
+            connect_trigger(positioner, camera)
         settings = camera.settings()
         start = clock.monotonic()
         image = camera.grab()
@@ -238,7 +241,7 @@ def _picture(side: str, picture: np.ndarray) -> list[Check]:
     """Exposure and focus of a picture without laser."""
     import cv2
 
-    grey = cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY)
+    grey = cv2.cvtColor(in_grey_levels(picture), cv2.COLOR_BGR2GRAY)
     mean, clipped = float(grey.mean()), float((grey >= 250).mean())
     found = f"mean {mean:.0f} of 255, {100 * clipped:.2f} % clipped"
     remedy = ""
@@ -247,7 +250,7 @@ def _picture(side: str, picture: np.ndarray) -> list[Check]:
     elif mean < DARK_MEAN_MIN:
         remedy = "take the cap off, or lengthen the exposure"
     exposure = Check(f"exposure {side}", "warning" if remedy else "ok", found, remedy)
-    sharpness = float(cv2.Laplacian(grey, cv2.CV_64F).var())
+    sharpness = float(cv2.Laplacian(grey.astype(np.float64), cv2.CV_64F).var())
     blurred = sharpness < SHARPNESS_MIN
     remedy = "focus on the sheet with the checkerboard at its place, then calibrate again" if blurred else ""
     focus = Check(f"focus {side}", "warning" if blurred else "ok", f"Laplacian variance {sharpness:.1f}", remedy)

@@ -15,7 +15,7 @@ from typing import Any
 from tvsbayes.cameras.capture import StereoCamera
 from tvsbayes.errors import DeviceFault, InputError, TvsError, closest, escaped
 from tvsbayes.instrument.rig import Rig
-from tvsbayes.positioner.interface import DEFAULT_DRIVER, Positioner
+from tvsbayes.positioner.interface import DEFAULT_DRIVER, Positioner, Triggering
 
 POSITIONERS = "tvsbayes.positioners"
 CAMERAS = "tvsbayes.cameras"
@@ -56,6 +56,20 @@ def cameras_of(rig: Rig) -> StereoCamera:
     """
     made: StereoCamera = _made(CAMERAS, str(rig.cameras.get("driver", DEFAULT_CAMERAS)), rig)
     return made
+
+
+def connect_trigger(positioner: Positioner, camera: StereoCamera) -> None:
+    """Lets a positioner's trigger line start the exposures of cameras that wait for one.
+
+    Raises:
+        InputError: they wait, and the positioner has no such line.
+    """
+    if not getattr(camera, "wants_pulse", False):
+        return
+    if not isinstance(positioner, Triggering):
+        message, remedy = "this positioner offers no trigger line", "leave out [cameras.options] trigger"
+        raise InputError("trigger", f"{message}; {remedy}", column="cameras.options.trigger", remedy=remedy)
+    camera.use_trigger(positioner.trigger)  # type: ignore[attr-defined]
 
 
 def known(group: str) -> dict[str, str]:

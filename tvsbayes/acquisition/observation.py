@@ -5,7 +5,7 @@ older than the look, however deep the buffers are: pictures come in the order of
 wait for the spot to appear and after laser-off for it to vanish. A look then begins with no lit picture under way, and
 what shows a spot was exposed in it. That the spot vanishes shows, too, that the laser is off.
 
-Raw px with the integer at the centre of a pixel; grey levels 0 to 255.
+Raw px with the integer at the centre of a pixel; grey levels 0 to 255, also of pictures of 16 bits, kept as they are.
 """
 
 from __future__ import annotations

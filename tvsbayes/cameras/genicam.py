@@ -1,28 +1,35 @@
 """GenICam cameras (GigE Vision, USB3 Vision) through a GenTL producer, by `harvesters` (`driver = "genicam"`).
 
 The extra `tvsbayes[genicam]` brings `harvesters`; the producer, a `.cti` file, comes from the camera's maker and is
-named in `[cameras.options]`. Pictures are triggered by software: each is exposed after it was asked for, whatever was
-in the buffers, and both cameras at one call. Mono8 to Mono16 and colour of 8 bits are taken at their full depth.
-Seconds where a name says `_s`.
+named in `[cameras.options]`. Pictures are triggered: each is exposed after it was asked for, whatever was in the
+buffers, by software at one call, or by a line that the positioner pulses. A camera without a trigger runs freely; then
+its buffers are emptied first, and of what follows the frames that may have been under way are left out.
+
+Mono8 to Mono16 and colour of 8 bits are taken at their full depth, as the camera gives them. Seconds where a name says
+`_s`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from tvsbayes.cameras.capture import CameraSettings, StereoImage
+from tvsbayes.cameras.capture import PIPELINE_FRAMES, CameraSettings, StereoImage
 from tvsbayes.errors import DeviceFault, InputError, escaped
 from tvsbayes.instrument.rig import Rig, Setting
 
 FETCH_S = 5.0
 """Longest wait for a picture after its trigger."""
-OPTIONS = ("producer", "pixel_format", "gain")
+OPTIONS = ("producer", "pixel_format", "gain", "trigger")
 PIXEL_BITS = {"Mono8": 8, "Mono10": 10, "Mono12": 12, "Mono14": 14, "Mono16": 16, "BGR8": 8, "RGB8": 8}
 """Formats that are taken, by their PFNC name, with the bits that carry grey levels."""
+SOFTWARE = "Software"
+DRAIN_MAX = 64
+"""The most buffers that are emptied; producers use a handful."""
 _NAMES = ("left", "right")
 
 
@@ -36,6 +43,7 @@ class GenicamWishes:
         pixel_format: of `PIXEL_BITS`.
         exposure_us: microseconds; None leaves it as the camera has it.
         gain: in the camera's unit; None leaves it as the camera has it.
+        trigger: what starts an exposure, a `TriggerSource` of the camera: "Software", or a line.
     """
 
     producer: str
@@ -43,6 +51,7 @@ class GenicamWishes:
     pixel_format: str = "Mono8"
     exposure_us: float | None = None
     gain: float | None = None
+    trigger: str = SOFTWARE
 
     @classmethod
     def of(cls, table: Mapping[str, Setting]) -> GenicamWishes:
@@ -71,6 +80,7 @@ class GenicamWishes:
             pixel_format,
             None if exposure is None else float(exposure),
             None if gain is None else float(gain),
+            str(options.get("trigger", SOFTWARE)),
         )
 
 
@@ -87,6 +97,10 @@ def genicam_cameras(rig: Rig) -> GenicamCamera:
     except ImportError as error:
         remedy = "pip install 'tvsbayes[genicam]'"
         raise InputError("genicam", f"GenICam cameras need harvesters; {remedy}", remedy=remedy) from error
+    if not Path(wishes.producer).is_file():
+        # Harvesters would go on without it, and find no cameras.
+        allowed, remedy = "the GenTL producer of the cameras' maker", "install it, or correct the path of its .cti file"
+        raise _refused("options.producer", f"no file {escaped(wishes.producer, 200)}", allowed, remedy)
     return GenicamCamera(Harvester(), wishes, rig.stereo.image_width, rig.stereo.image_height)
 
 
@@ -108,6 +122,7 @@ class GenicamCamera:
         self._size = width, height
         self._acquirers: list[Any] = []
         self._warnings: list[str] = []
+        self._pulse: Callable[[], object] | None = None
         try:
             self._open()
         except Exception as error:
@@ -139,7 +154,12 @@ class GenicamCamera:
         """Size, format, software trigger, exposure; automatics off."""
         wishes = self._wishes
         must: dict[str, object] = {"PixelFormat": wishes.pixel_format, "Width": self._size[0], "Height": self._size[1]}
-        must |= {"TriggerSelector": "FrameStart", "TriggerMode": "On", "TriggerSource": "Software"}
+        if hasattr(nodes, "TriggerMode"):
+            must |= {"TriggerSelector": "FrameStart", "TriggerMode": "On", "TriggerSource": wishes.trigger}
+        elif wishes.trigger == SOFTWARE:
+            self._warnings.append(f"{name}: runs freely, without a trigger; buffers are emptied before every look")
+        else:
+            raise _fault("camera-setting", f"{name}: no trigger", "leave out [cameras.options] trigger")
         if wishes.exposure_us is not None:
             must["ExposureTime"] = wishes.exposure_us
         if wishes.gain is not None:
@@ -151,6 +171,15 @@ class GenicamCamera:
             if not _set(nodes, node, value):
                 found = f"{name}: {node} = {value} was not taken"
                 raise _fault("camera-setting", found, "see what the maker's program allows, correct [cameras]")
+
+    @property
+    def wants_pulse(self) -> bool:
+        """Whether exposures wait for a line that somebody has to pulse."""
+        return self._wishes.trigger != SOFTWARE
+
+    def use_trigger(self, pulse: Callable[[], object]) -> None:
+        """How the line is pulsed on which the cameras wait."""
+        self._pulse = pulse
 
     def settings(self) -> CameraSettings:
         """See `StereoCamera.settings`."""
@@ -167,22 +196,39 @@ class GenicamCamera:
         """See `StereoCamera.grab`: both are triggered now, one right behind the other.
 
         Raises:
-            DeviceFault: no picture, or one of another size.
+            DeviceFault: no picture, one of another size, or nobody who pulses the trigger line.
         """
+        if self.wants_pulse and self._pulse is None:
+            remedy = "use a positioner that offers one (driver serial), or leave out [cameras.options] trigger"
+            raise _fault("trigger", f"the cameras wait for {self._wishes.trigger} and nobody pulses it", remedy)
         try:
             for acquirer in self._acquirers:
                 _drain(acquirer)
-            for acquirer in self._acquirers:
-                acquirer.remote_device.node_map.TriggerSoftware.execute()
-            left, right = (self._picture(n, a) for n, a in zip(_NAMES, self._acquirers, strict=True))
+            free = [not hasattr(acquirer.remote_device.node_map, "TriggerMode") for acquirer in self._acquirers]
+            self._expose(free)
+            left, right = (
+                self._picture(name, acquirer, PIPELINE_FRAMES if runs else 0)
+                for name, acquirer, runs in zip(_NAMES, self._acquirers, free, strict=True)
+            )
         except DeviceFault:
             raise
         except Exception as error:
             raise _fault("no-frame", f"a camera delivers no frame: {_said(error)}", "check its cable") from error
         return StereoImage(left, right)
 
-    def _picture(self, name: str, acquirer: Any) -> np.ndarray:
-        """(height, width, 3), uint8 or uint16, blue, green, red."""
+    def _expose(self, free: Sequence[bool]) -> None:
+        """Trigger those that do not run by themselves."""
+        if self._pulse is not None:
+            self._pulse()
+            return
+        for acquirer, runs in zip(self._acquirers, free, strict=True):
+            if not runs:
+                acquirer.remote_device.node_map.TriggerSoftware.execute()
+
+    def _picture(self, name: str, acquirer: Any, skipped: int) -> np.ndarray:
+        """(height, width, 3), uint8 or uint16, blue, green, red: the next but `skipped`."""
+        for _ in range(skipped):
+            acquirer.fetch(timeout=FETCH_S).queue()
         with acquirer.fetch(timeout=FETCH_S) as buffer:
             part = buffer.payload.components[0]
             size = int(part.width), int(part.height)
@@ -191,12 +237,7 @@ class GenicamCamera:
                 raise _fault("image-size", found, f"{self._size[0]} x {self._size[1]} px were calibrated")
             # The memory belongs to the producer again once the buffer is given back.
             data = np.array(part.data)
-        shape = self._size[1], self._size[0]
-        if self._wishes.pixel_format.startswith("Mono"):
-            grey = data.reshape(shape)
-            return np.repeat(grey[..., None], 3, axis=2)
-        colour = data.reshape(*shape, 3)
-        return colour if self._wishes.pixel_format == "BGR8" else colour[..., ::-1].copy()
+        return _as_bgr(data, self._size, self._wishes.pixel_format)
 
     def close(self) -> None:
         """See `StereoCamera.close`."""
@@ -209,9 +250,21 @@ class GenicamCamera:
         self._acquirers = []
 
 
+def _as_bgr(data: np.ndarray, size: tuple[int, int], pixel_format: str) -> np.ndarray:
+    """Pixels of a format as (height, width, 3), blue, green, red; values as they are."""
+    if pixel_format.startswith("Mono"):
+        grey = data.reshape(size[1], size[0])
+        return np.repeat(grey[..., None], 3, axis=2)
+    colour = data.reshape(size[1], size[0], 3)
+    return colour if pixel_format == "BGR8" else colour[..., ::-1].copy()
+
+
 def _drain(acquirer: Any) -> None:
-    """Lets pictures go that nobody fetched, as after a fault."""
-    while (buffer := acquirer.try_fetch(timeout=0.001)) is not None:
+    """Lets pictures go that nobody fetched."""
+    for _ in range(DRAIN_MAX):
+        buffer = acquirer.try_fetch(timeout=0.001)
+        if buffer is None:
+            return
         buffer.queue()
 
 
@@ -230,7 +283,11 @@ def _set(nodes: Any, name: str, value: object) -> bool:
 
 
 def _text(device: Any, name: str) -> str:
-    return str(getattr(device, name, "") or "")
+    """An entry of the device list; producers raise errors of their own for one that a camera does not have."""
+    try:
+        return str(getattr(device, name) or "")
+    except Exception:
+        return ""
 
 
 def _said(error: Exception) -> str:

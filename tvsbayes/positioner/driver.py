@@ -46,6 +46,8 @@ DRAIN_S, DRAIN_MAX_S = 0.05, 1.0
 """Silence that ends the draining of a line just opened, and the longest draining."""
 POLL_S = 0.05
 """Time between two looks at a motion; far below the laser watchdog of the device."""
+TRIGGER_PULSE_US = 1_000
+"""Long enough for every camera's input, opto-coupled ones included."""
 HOME_S = 300.0
 """Longest homing: 20 000 steps per axis at 200 steps/s are 200 s."""
 RECONNECT_S = 10.0
@@ -143,6 +145,10 @@ class SerialPositioner:
             found = f"the laser line stayed {'off' if on else 'on'} ({state.last_error})"
             raise fault("laser", found, "cut the laser's supply and check its wiring")
         return state
+
+    def trigger(self) -> None:
+        """See `interface.Triggering`."""
+        self._command("TRIG", TRIGGER_PULSE_US)
 
     def state(self) -> DeviceState:
         """See `Positioner.state`."""

@@ -13,7 +13,7 @@ from __future__ import annotations
 import errno
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from tvsbayes.errors import DeviceFault, escaped
 from tvsbayes.positioner.protocol import DeviceState
@@ -101,6 +101,14 @@ class Positioner(Protocol):
 
     def close(self) -> None:
         """Laser off and motors at rest as well as possible, then the line closed; never raises."""
+
+
+@runtime_checkable
+class Triggering(Protocol):
+    """A positioner with a line that triggers cameras."""
+
+    def trigger(self) -> None:
+        """One pulse; returns when the device has begun it."""
 
 
 def opened(open_link: Callable[[], Link]) -> Link:
