@@ -197,7 +197,8 @@ def test_random_sessions_reach_every_branch():
 def test_firmware_travels_with_the_package():
     """Everything that a user needs to flash the board lies in the installed package."""
     names = ["README.md", "tvs_positioner/tvs_positioner.ino", "tvs_positioner/tvs_core.h"]
-    names += ["tvs_positioner/tvs_core.cpp", "tvs_positioner/tvs_motion.cpp", "native/replay.cpp"]
+    names += ["tvs_positioner/tvs_core.cpp", "tvs_positioner/tvs_motion.cpp", "native/replay.cpp", "platformio.ini"]
+    names += [f"emulated/{name}" for name in ("Arduino.h", "EEPROM.h", "IntervalTimer.h", "an500.ld", "board.cpp")]
     assert [name for name in names if not (FIRMWARE / name).is_file()] == []
     core = "".join(path.read_text() for path in (FIRMWARE / "tvs_positioner").glob("tvs_*.[hc]*"))
     code = re.sub(r"//.*", "", core)

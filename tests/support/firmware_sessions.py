@@ -7,12 +7,12 @@ import subprocess
 from pathlib import Path
 
 from tvsbayes.positioner import firmware_folder
+from tvsbayes.positioner.emulated_board import BOARD, core_sources, cross_compile, missing_tools
 from tvsbayes.positioner.firmware_model import DeviceModel
 from tvsbayes.positioner.mechanics import Mechanics
 from tvsbayes.positioner.protocol import SETTINGS, Reply, frame, parse_answer, request
 
 FIRMWARE = firmware_folder()
-CORE = [FIRMWARE / "tvs_positioner" / f"tvs_{part}.cpp" for part in ("core", "motion")]
 BOOT = 4_000_000_001
 LINES = {"laser_on": "l", "trigger_on": "t"}
 """Lines of the board by attribute of `Mechanics`, as replay.cpp names them."""
@@ -181,7 +181,7 @@ def _disturbances(rng: random.Random) -> list[str]:
 def build(folder: Path, *options: str) -> Path | None:
     """The native core, or None where the compiler refuses the options."""
     program = folder / "replay"
-    sources = [FIRMWARE / "native" / "replay.cpp", *CORE]
+    sources = [FIRMWARE / "native" / "replay.cpp", *core_sources()]
     command = ["g++", "-std=c++11", "-Wall", "-Wextra", "-Werror", *options, f"-I{FIRMWARE / 'tvs_positioner'}"]
     result = subprocess.run([*command, *map(str, sources), "-o", str(program)], capture_output=True, check=False)
     return program if result.returncode == 0 else None
@@ -191,5 +191,26 @@ def replay(program: Path, orders: list[str], *, boot=BOOT, home=(-60, -40), limi
     arguments = [str(program), str(boot), *map(str, home), str(limit)]
     script = "\n".join(orders) + "\n"
     result = subprocess.run(arguments, input=script, capture_output=True, text=True, check=False)
+    assert result.returncode == 0, result.stderr
+    return result.stdout.splitlines()
+
+
+NO_EMULATOR = f"not installed: {', '.join(missing_tools())}" if missing_tools() else ""
+"""Why tests on the emulated processor are skipped; empty where they are not."""
+
+
+def build_replay(program: Path, *options: str) -> subprocess.CompletedProcess[str]:
+    """replay.cpp for the emulated processor; input and output go through newlib's semihosting."""
+    sources = [FIRMWARE / "native" / "replay.cpp", *core_sources()]
+    return cross_compile(program, sources, "--specs=rdimon.specs", *options)
+
+
+def replay_on_processor(program: Path, orders: list[str], *, boot=BOOT, home=(-60, -40), limit=900) -> list[str]:
+    """As `replay`, on the emulated Cortex-M7."""
+    words = ",".join(f"arg={word}" for word in ("replay", boot, *home, limit))
+    hosted = ("-serial", "none", "-semihosting-config", f"enable=on,target=native,{words}")
+    script = "\n".join(orders) + "\n"
+    command = [*BOARD, *hosted, "-kernel", str(program)]
+    result = subprocess.run(command, input=script, capture_output=True, text=True, check=False, timeout=120)
     assert result.returncode == 0, result.stderr
     return result.stdout.splitlines()

@@ -1,0 +1,204 @@
+"""The shipped firmware on an emulated processor: QEMU's Cortex-M7 board with motors and switches behind its pins.
+
+The unchanged sketch is cross-compiled with `firmware/emulated` and run; the host reaches it through a serial port like
+any other. Guest time follows this computer's clock and falls behind where the computer is busy, never ahead. A hand at
+the bench breaks wires and holds motors, as `firmware/emulated/board.cpp` lists; the laser pin is read from outside the
+processor, so that it tells also of one that crashed.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import socket
+import subprocess
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+from tvsbayes.errors import DeviceFault, InputError
+from tvsbayes.positioner import firmware_folder
+
+COMPILER, EMULATOR = "arm-none-eabi-g++", "qemu-system-arm"
+PACKAGES = "qemu-system-arm gcc-arm-none-eabi libstdc++-arm-none-eabi-newlib"
+"""Debian's and Ubuntu's packages of both."""
+PROCESSOR = ("-mcpu=cortex-m7", "-mthumb", "-mfloat-abi=hard", "-mfpu=fpv5-d16")
+CODE = ("-std=gnu++17", "-Os", "-fno-exceptions", "-fno-rtti", "-ffunction-sections", "-Wl,--gc-sections")
+WARNINGS = ("-Wall", "-Wextra", "-Wconversion")
+BOARD = (EMULATOR, "-M", "mps2-an500", "-display", "none", "-monitor", "none")
+STARTED_S = 20.0
+"""Longest wait for the emulator to open its lines."""
+_LASER_PIN = "xp /1xw 0x40028000"
+_MOTORS = {"+": (0, 1), "-": (0, -1), "^": (1, 1), "v": (1, -1)}
+
+
+def missing_tools() -> list[str]:
+    """Programs that the emulation needs and this computer has not."""
+    return [name for name in (COMPILER, EMULATOR) if shutil.which(name) is None]
+
+
+def core_sources() -> list[Path]:
+    """The C++ of the firmware's core."""
+    return sorted((firmware_folder() / "tvs_positioner").glob("tvs_*.cpp"))
+
+
+def cross_compile(program: Path, sources: Sequence[Path], *options: str) -> subprocess.CompletedProcess[str]:
+    """Compiles and links for the emulated board, with every warning asked for; the compiler's result.
+
+    Args:
+        program: the file to write.
+        sources: beside the board's start-up, which is always linked; an `.ino` counts as C++.
+        options: further options, such as newlib's `--specs`.
+    """
+    firmware = firmware_folder()
+    emulated = firmware / "emulated"
+    files = [str(path) for path in (*sources, emulated / "startup.cpp")]
+    folders = (f"-I{firmware / 'tvs_positioner'}", f"-I{emulated}", "-T", str(emulated / "an500.ld"))
+    command = [COMPILER, *PROCESSOR, *CODE, *WARNINGS, *folders, *options, "-x", "c++", *files, "-o", str(program)]
+    return subprocess.run(command, capture_output=True, text=True, check=False)
+
+
+def build_sketch(program: Path) -> subprocess.CompletedProcess[str]:
+    """The sketch, its core and the board's pins, as `cross_compile`."""
+    firmware = firmware_folder()
+    sketch = firmware / "tvs_positioner" / "tvs_positioner.ino"
+    sources = [sketch, firmware / "emulated" / "board.cpp", *core_sources()]
+    return cross_compile(program, sources, "--specs=nosys.specs", "-include", "Arduino.h")
+
+
+class EmulatedBoard:
+    """A running board; a context manager that ends it.
+
+    Args:
+        on_step: called by `drain` with axis and sense (+1, -1) of every step that a motor did.
+        on_laser: called by `drain` with the state of the laser line after every change.
+
+    Attributes:
+        port: the serial port of the host's line.
+        starts: starts of the firmware that `drain` has seen.
+
+    Raises:
+        InputError: compiler or emulator are not installed, or do not work.
+    """
+
+    def __init__(
+        self,
+        on_step: Callable[[int, int], None] = lambda axis, sense: None,
+        on_laser: Callable[[bool], None] = lambda on: None,
+    ):
+        self.on_step, self.on_laser = on_step, on_laser
+        self.starts = 0
+        if missing := missing_tools():
+            remedy = f"install them (Debian, Ubuntu: apt install {PACKAGES}), or rehearse with --simulate alone"
+            raise InputError("emulator", f"--emulate needs {' and '.join(missing)}: not found", remedy=remedy)
+        self._folder = tempfile.TemporaryDirectory(prefix="tvsbayes-board-")
+        self._process: subprocess.Popen[bytes] | None = None
+        self._files: list[int] = []
+        try:
+            self._start(Path(self._folder.name))
+        except BaseException:
+            self.close()
+            raise
+
+    def __enter__(self) -> EmulatedBoard:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, value: object, trace: TracebackType | None) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Ends the emulator and removes its files."""
+        if self._process is not None:
+            self._process.kill()
+            self._process.wait()
+        for number in self._files:
+            os.close(number)
+        self._files.clear()
+        self._folder.cleanup()
+
+    def order(self, text: str) -> None:
+        """An order of the hand at the bench, such as "k 0 7": see `firmware/emulated/board.cpp`."""
+        os.write(self._files[1], text.encode("ascii") + b"\n")
+
+    def drain(self) -> None:
+        """Tells the listeners what has happened since: all of it that the host has had an answer to, and maybe more."""
+        while True:
+            try:
+                data = os.read(self._files[0], 65_536)
+            except BlockingIOError:
+                return
+            if not data:
+                return
+            for letter in data.decode("ascii"):
+                if letter in _MOTORS:
+                    self.on_step(*_MOTORS[letter])
+                elif letter in "Ll":
+                    self.on_laser(letter == "L")
+                elif letter == "B":
+                    self.starts += 1
+                    self.on_laser(False)
+                elif letter == "V":
+                    found = "emulated board: a direction stood too short before its step"
+                    raise DeviceFault("direction-set-up", found, remedy="raise kDirectionSetupUs in the sketch")
+
+    def laser_pin(self) -> bool:
+        """The level of the laser pin now, read from outside the processor."""
+        answer = self._ask("human-monitor-command", **{"command-line": _LASER_PIN})
+        return bool(int(str(answer).split()[-1], 16) & 1)
+
+    def _start(self, folder: Path) -> None:
+        program, hand, monitor = folder / "sketch.elf", folder / "hand", folder / "monitor"
+        built = build_sketch(program)
+        if built.returncode:
+            remedy = f"install {PACKAGES} anew, or rehearse with --simulate alone"
+            raise InputError("emulator", f"the firmware does not compile: {built.stderr[-300:]}", remedy=remedy)
+        for end in (".in", ".out"):
+            os.mkfifo(f"{hand}{end}")
+        # A pipe holds what nobody has read yet without holding up the board; a socket would, byte by byte.
+        self._process = subprocess.Popen(
+            [
+                *(*BOARD, "-kernel", str(program), "-icount", "shift=6,align=on"),
+                *("-chardev", "pty,id=host", "-serial", "chardev:host"),
+                *("-chardev", f"pipe,id=hand,path={hand}", "-serial", "chardev:hand"),
+                *("-qmp", f"unix:{monitor},server=on,wait=off"),
+            ],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
+        self._monitor = self._connect(monitor)
+        self._monitor.readline()
+        self._ask("qmp_capabilities")
+        lines = {line["label"]: line["filename"] for line in self._ask("query-chardev")}
+        self.port = str(lines["host"]).removeprefix("pty:")
+        self._files = [os.open(f"{hand}.out", os.O_RDONLY | os.O_NONBLOCK), os.open(f"{hand}.in", os.O_WRONLY)]
+
+    def _connect(self, monitor: Path) -> Any:
+        deadline = time.monotonic() + STARTED_S
+        while True:
+            link = socket.socket(socket.AF_UNIX)
+            try:
+                link.connect(str(monitor))
+                with link:
+                    return link.makefile("rwb", buffering=0)
+            except OSError as error:
+                link.close()
+                ended = self._process is None or self._process.poll() is not None
+                if ended or time.monotonic() > deadline:
+                    remedy = f"try `{EMULATOR} -M help`; QEMU 7 or later has the board mps2-an500"
+                    raise InputError("emulator", f"{EMULATOR} does not start: {error}", remedy=remedy) from error
+            time.sleep(0.02)
+
+    def _ask(self, command: str, **arguments: str) -> Any:
+        """An order to the emulator itself, and its answer; events in between are of no interest."""
+        self._monitor.write(json.dumps({"execute": command, "arguments": arguments}).encode() + b"\n")
+        while True:
+            answer = json.loads(self._monitor.readline() or '{"error": "ended"}')
+            if "error" in answer:
+                raise DeviceFault("emulator", f"emulated board: {answer['error']}", remedy="begin the rehearsal anew")
+            if "return" in answer:
+                return answer["return"]
