@@ -1,4 +1,4 @@
-"""Commands at the bench: stereo, acquire, doctor.
+"""Commands at the bench: stereo, acquire, doctor, export.
 
 Options in, library called, table or JSON out; heavy imports stand inside the commands.
 """
@@ -323,3 +323,16 @@ def doctor(
         message = f"{len(faults)} fault{'s' * (len(faults) > 1)}: {', '.join(c.name for c in faults)}"
         error = DeviceFault("doctor", message, remedy=faults[0].remedy)
     finish({"checks": [c.as_json() for c in checks]}, "\n".join(lines), as_json, error)
+
+
+def export(
+    folder: Annotated[Path, typer.Argument(metavar="CAMPAIGN", help="Campaign folder.")],
+    nexus: Annotated[Path, typer.Option("--nexus", help="NeXus file (HDF5) to write, such as run.nxs.")],
+    as_json: Json = False,
+) -> None:
+    """A campaign with its journal as one file of another format. Replaces no file."""
+    from tvsbayes.acquisition.nexus_file import write_nexus
+
+    done = write_nexus(folder, nexus)
+    text = f"{escaped(str(nexus), 200)}: {done.moves} moves, {done.looks} looks ({done.ok} ok), {done.events} events"
+    finish({"nexus": str(nexus), **done.as_json()}, text, as_json)

@@ -22,6 +22,7 @@ EXAMPLES = {
         "tvsbayes acquire rig.toml plan.csv run1 --resume",
     ),
     "doctor": ("tvsbayes doctor rig.toml",),
+    "export": ("tvsbayes export run1 --nexus run1.nxs",),
     "classic": ("tvsbayes classic mine", "tvsbayes classic mine --json"),
     "fit": ("tvsbayes fit mine --quick", "tvsbayes fit mine", "tvsbayes fit mine --robust --details"),
     "calibrate": ("tvsbayes calibrate mine", "tvsbayes calibrate mine --quick --limit-deg-per-step 4e-4 --pdf"),

@@ -23,7 +23,7 @@ from tvsbayes.cli.app import (
     report_line,
 )
 from tvsbayes.cli.begin_commands import new
-from tvsbayes.cli.bench_commands import acquire, doctor, stereo
+from tvsbayes.cli.bench_commands import acquire, doctor, export, stereo
 from tvsbayes.cli.campaign_commands import check, demo, detect, simulate
 from tvsbayes.cli.estimate_commands import classic, compare, fit
 from tvsbayes.cli.examples import EXAMPLES, epilog
@@ -33,7 +33,7 @@ from tvsbayes.cli.use_commands import locate, plan, steps_for, study
 from tvsbayes.errors import InputError, TvsError
 
 COMMANDS = (
-    *(demo, new, import_, simulate, detect, stereo, check, acquire, doctor),
+    *(demo, new, import_, simulate, detect, stereo, check, acquire, doctor, export),
     *(classic, fit, calibrate, report, compare, locate, steps_for, plan, study),
 )
 """In the order of `--help`."""

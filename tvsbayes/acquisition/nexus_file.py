@@ -1,0 +1,226 @@
+"""A campaign as one NeXus file (HDF5), for whoever reads such files and not ours.
+
+`/entry/looks` is the default plot: centroids with their uncertainties over the looks, with the counters behind each;
+`/entry/moves` has the counters over time, `/entry/instrument` axes and cameras. The campaign's own files and the
+journal stand in `/entry/files` byte for byte, so that nothing is lost; of pictures the names and SHA-256 that the
+journal has.
+
+Counters in steps, px with the integer at the centre of a pixel, mm, degrees, seconds since `/entry/start_time`; every
+number carries its unit. Source: NeXus base classes, https://manual.nexusformat.org.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from importlib import metadata
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+
+from tvsbayes.acquisition.journal import LOG, LOG_BYTES_MAX, Record, read_journal
+from tvsbayes.acquisition.journal_check import frames_of
+from tvsbayes.acquisition.journal_events import Looked, Stop
+from tvsbayes.errors import escaped, refusal
+from tvsbayes.files.csv_table import CSV_BYTES_MAX
+from tvsbayes.files.disk import read_bytes, write_atomically
+from tvsbayes.files.documents import JSON_BYTES_MAX, TOML_BYTES_MAX
+from tvsbayes.instrument.axes import AXES
+from tvsbayes.instrument.campaign import CAMERAS, Campaign, read_campaign
+
+NOTHING = -1
+"""In place of an experiment or point that a look does not have."""
+_FILES = {
+    "campaign.toml": TOML_BYTES_MAX,
+    "stereo.json": JSON_BYTES_MAX,
+    "moves.csv": CSV_BYTES_MAX,
+    "spots.csv": CSV_BYTES_MAX,
+    LOG: LOG_BYTES_MAX,
+}
+_LISTS = ("spot", "move", "experiment", "point")
+_WORDS = ("target", "status")
+
+
+@dataclass(frozen=True)
+class NexusSummary:
+    """What a file holds: rows of the tables, looks that count, events of the journal, pictures named."""
+
+    moves: int
+    looks: int
+    ok: int
+    events: int
+    pictures: int
+
+    def as_json(self) -> dict[str, int]:
+        """Entries of the document of `tvsbayes export`."""
+        return asdict(self)
+
+
+def write_nexus(folder: Path, path: Path) -> NexusSummary:
+    """Writes a campaign, with its journal where it has one, as a new NeXus file; whole or not at all.
+
+    Args:
+        folder: of the campaign.
+        path: the file.
+
+    Raises:
+        InputError: an unreadable campaign or journal, a file that is there, a folder that cannot be written.
+    """
+    import h5py
+
+    folder, path = Path(folder), Path(path)
+    if path.exists():
+        remedy = "name another file, or move this one away; nothing is overwritten"
+        place = escaped(str(path), 200)
+        raise refusal("occupied", file=place, found="a file that is there", allowed="a new file", remedy=remedy)
+    campaign = read_campaign(folder)
+    records = read_journal(folder).records if (folder / LOG).is_file() else ()
+    buffer = io.BytesIO()
+    with h5py.File(buffer, "w") as file:
+        _class(file, "NXroot", default="entry", creator="tvsbayes", h5py_version=h5py.__version__)
+        entry = _group(file, "entry", "NXentry", default="looks")
+        _entry(entry, campaign, records)
+        _instrument(_group(entry, "instrument", "NXinstrument"), campaign)
+        _moves(_group(entry, "moves", "NXdata"), campaign)
+        _looks(_group(entry, "looks", "NXdata"), campaign, records)
+        pictures = _pictures(_group(entry, "pictures", "NXcollection"), records)
+        _files(_group(entry, "files", "NXcollection"), folder)
+    write_atomically(path, buffer.getvalue())
+    ok = sum(spot.status == "ok" for spot in campaign.spots)
+    return NexusSummary(len(campaign.moves), len(campaign.spots), ok, len(records), pictures)
+
+
+def _class(group: Any, name: str, **attributes: object) -> None:
+    group.attrs["NX_class"] = name
+    for key, value in attributes.items():
+        group.attrs[key] = value
+
+
+def _group(parent: Any, name: str, nexus_class: str, **attributes: object) -> Any:
+    made = parent.create_group(name)
+    _class(made, nexus_class, **attributes)
+    return made
+
+
+def _put(group: Any, name: str, value: object, unit: str = "", **attributes: object) -> None:
+    """A dataset with its unit; text and lists of text as UTF-8."""
+    import h5py
+
+    text = isinstance(value, str) or (isinstance(value, list) and all(isinstance(item, str) for item in value))
+    data = group.create_dataset(name, data=value, dtype=h5py.string_dtype() if text else None)
+    if unit:
+        data.attrs["units"] = unit
+    for key, entry in attributes.items():
+        data.attrs[key] = entry
+
+
+def _entry(entry: Any, campaign: Campaign, records: Sequence[Record]) -> None:
+    header = campaign.header
+    _put(entry, "title", str(header.get("name", "")))
+    _put(entry, "program_name", "tvsbayes", version=metadata.version("tvsbayes"))
+    created = header.get("created")
+    if created is not None:
+        _put(entry, "start_time", created.isoformat() if hasattr(created, "isoformat") else str(created))
+    ends = [str(cast("Stop", record.data).get("utc", "")) for record in records if record.event == "stop"]
+    if ends and ends[-1]:
+        _put(entry, "end_time", ends[-1])
+    if header.get("synthetic"):
+        _put(entry, "simulated", True)
+    if "notes" in header:
+        _put(entry, "experiment_description", str(header["notes"]))
+    if "operator" in header:
+        _put(_group(entry, "user", "NXuser"), "name", str(header["operator"]))
+
+
+def _instrument(instrument: Any, campaign: Campaign) -> None:
+    """Axes with their counters, cameras with their calibration, and what the rig is believed to be."""
+    if "instrument" in campaign.header:
+        _put(instrument, "name", str(campaign.header["instrument"]))
+    for axis in AXES:
+        group = _group(instrument, axis, "NXpositioner")
+        _put(group, "name", axis)
+        _put(group, "description", f"{axis} axis: absolute motor counter after every move")
+        _put(group, "value", [getattr(move, f"{axis}_steps") for move in campaign.moves], "steps")
+    stereo = campaign.stereo
+    for side, matrix, distortion in (("left", stereo.M1, stereo.D1), ("right", stereo.M2, stereo.D2)):
+        group = _group(instrument, f"camera_{side}", "NXdetector")
+        _put(group, "description", f"{side} camera of the stereo pair; OpenCV's camera model")
+        _put(group, "image_size", [stereo.image_width, stereo.image_height], "px")
+        _put(group, "camera_matrix", np.asarray(matrix), "px")
+        _put(group, "distortion", np.asarray(distortion).ravel())
+    pair = _group(instrument, "stereo", "NXcollection")
+    _put(pair, "rotation", np.asarray(stereo.R))
+    _put(pair, "translation", np.asarray(stereo.T).ravel(), "mm")
+    _put(pair, "parameter_covariance", np.asarray(stereo.parameter_covariance))
+    believed = _group(instrument, "prior", "NXcollection")
+    for name, prior in campaign.rig.priors.items():
+        _put(believed, name, prior.value, uncertainty=prior.u, distribution=prior.distribution)
+
+
+def _moves(group: Any, campaign: Campaign) -> None:
+    moves = campaign.moves
+    _class(group, "NXdata", signal="pan_steps", axes=["time"], auxiliary_signals=["tilt_steps"])
+    _put(group, "time", [move.time_s for move in moves], "s")
+    for name in ("move", "segment"):
+        _put(group, name, [getattr(move, name) for move in moves])
+    for axis in AXES:
+        _put(group, f"{axis}_steps", [getattr(move, f"{axis}_steps") for move in moves], "steps")
+        _put(group, f"{axis}_approach", [str(getattr(move, f"{axis}_approach")) for move in moves])
+
+
+def _looks(group: Any, campaign: Campaign, records: Sequence[Record]) -> None:
+    """Centroids with uncertainties; what a look does not have is NaN, or -1 where numbers are whole."""
+    spots, moves = campaign.spots, campaign.moves
+    signals = [f"{way}_{side}" for side in CAMERAS for way in "uv"]
+    _class(group, "NXdata", signal=signals[0], axes=["spot"], auxiliary_signals=signals[1:])
+    times = _look_times(records)
+    _put(group, "time", [times.get(spot.spot, moves[spot.move].time_s) for spot in spots], "s")
+    for name in _LISTS:
+        values = [getattr(spot, name) for spot in spots]
+        _put(group, name, [NOTHING if value is None else value for value in values])
+    for name in _WORDS:
+        _put(group, name, [str(getattr(spot, name)) for spot in spots])
+    for axis in AXES:
+        _put(group, f"{axis}_steps", [getattr(moves[spot.move], f"{axis}_steps") for spot in spots], "steps")
+    for name in signals:
+        _put(group, name, _numbers([getattr(spot, f"{name}_px") for spot in spots]), "px")
+        _put(group, f"{name}_errors", _numbers([getattr(spot, f"s{name}_px") for spot in spots]), "px")
+    for side in CAMERAS:
+        _put(group, f"correlation_uv_{side}", [getattr(spot, f"ruv_{side}") for spot in spots])
+    _put(group, "aperture", _numbers([spot.aperture_deg for spot in spots]), "deg")
+
+
+def _numbers(values: Sequence[float | None]) -> np.ndarray:
+    return np.array([np.nan if value is None else value for value in values], dtype=float)
+
+
+def _look_times(records: Sequence[Record]) -> Mapping[int, float]:
+    """When looks were taken, by spot."""
+    looks = [cast("Looked", record.data) for record in records if record.event == "looked"]
+    return {int(look["spot"]): float(look["time_s"]) for look in looks if "time_s" in look}
+
+
+def _pictures(group: Any, records: Sequence[Record]) -> int:
+    """Names and hashes of the pictures; they themselves stay beside the campaign."""
+    frames = [frame for record in records for frame in frames_of(record)]
+    _put(group, "description", "pictures in the campaign's folder: frames/ with the laser on, dark/ with it off")
+    if frames:
+        _put(group, "file_name", [frame.name for frame in frames])
+        _put(group, "sha256", [frame.sha256 for frame in frames])
+        _put(group, "bytes", [frame.size for frame in frames])
+    return len(frames)
+
+
+def _files(group: Any, folder: Path) -> None:
+    """The campaign's files, byte for byte."""
+    for name, cap in _FILES.items():
+        if not (folder / name).is_file():
+            continue
+        data = read_bytes(folder / name, cap, folder)
+        note = _group(group, name.replace(".", "_"), "NXnote")
+        _put(note, "file_name", name)
+        _put(note, "sha256", hashlib.sha256(data).hexdigest())
+        note.create_dataset("data", data=np.frombuffer(data, dtype=np.uint8), compression="gzip")
