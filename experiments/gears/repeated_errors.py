@@ -3,13 +3,13 @@
     python -m experiments.gears.repeated_errors run --n 40 --cores 0 1      # 20 to 40 CPU s a rig, resumable
     python -m experiments.gears.repeated_errors table > experiments/gears/repeated_errors.md
 
-Rig s of a protocol ("planned" is what `tvsbayes plan` writes for it) is drawn from `data/rigs/mounted` with seed s: geometry, cameras, and a transmission error, a
-varying play and a drift by the default priors ("priors"), or in a world that no prior holds
-(`experiments.common.worlds`). It is fitted as the package does, with tier 1 (at most `ROUNDS` rounds; accepted by
-Pareto k alone), and with perfect gears, the model without repeating errors. `WITHIN` looks inside the counters seen
-and as many outside them (up to half the range beyond) are located, stop errors and play of the true gears in them.
-RMS z and coverage of 95 % intervals; **!** marks a figure outside its two-sided bounds at 1e-4. With errors by the
-priors everything has to lie within; in other worlds an RMS z of 1.3 is what is aimed at.
+Rig s of a protocol ("planned" is what `tvsbayes plan` writes for it) is drawn from `data/rigs/mounted` with seed s:
+geometry, cameras, and a transmission error, a varying play and a drift by the default priors ("priors"), or in a world
+that no prior holds (`experiments.common.worlds`). It is fitted as the package does, with tier 1 (at most `ROUNDS`
+rounds; accepted by Pareto k alone), and with perfect gears, the model without repeating errors. `WITHIN` looks inside
+the counters seen and as many outside them (up to half the range beyond) are located, stop errors and play of the true
+gears in them. RMS z and coverage of 95 % intervals; **!** marks a figure outside its two-sided bounds at 1e-4. With
+errors by the priors everything has to lie within; in other worlds an RMS z of 1.3 is what is aimed at.
 """
 
 from __future__ import annotations
