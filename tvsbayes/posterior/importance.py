@@ -1,8 +1,10 @@
 """The posterior by importance sampling: independent draws from a proposal that follows it, weighted (formulation 4.3).
 
-Rounds of draws in the coordinates w of `posterior.transport` are pooled: each is weighted by the target over the
-mixture of all proposals that made them, the balance heuristic (Veach and Guibas, SIGGRAPH 95, 419; Owen and Zhou, J.
-Am. Stat. Assoc. 95 (2000) 135), so that a poor first round costs little.
+Pilot rounds of draws in the coordinates w of `posterior.transport` teach the proposal: pooled, each draw weighted by the
+target over the mixture of all proposals that made them, the balance heuristic (Veach and Guibas, SIGGRAPH 95, 419; Owen
+and Zhou, J. Am. Stat. Assoc. 95 (2000) 135), so that a poor first round costs little. They take no part in the
+posterior: a proposal fitted to a draw is high where that draw is, whose weight would come out too small (Marin, Pudlo
+and Sedki, Bernoulli 25 (2019) 1977).
 """
 
 from __future__ import annotations
@@ -30,9 +32,12 @@ from tvsbayes.results.convergence import Importance, Reweighted, extreme
 from tvsbayes.statistics.weighted_draws import effective_draws, pareto_k, smoothed_weights, weighted_summary
 
 ROUND = 1024
-FITTED_ROUNDS = 3
-"""Rounds after each of which the proposal is fitted to all draws so far; later ones are drawn from the last."""
+PILOT_ROUNDS = 2
+"""Rounds after each of which the proposal is fitted to all draws so far."""
 ROUNDS_MAX = 32
+"""Drawn from the last proposal, at most."""
+ROUNDS_LEAST = 4
+"""Of fewer rounds nobody knows how many effective draws they have."""
 ESS_WANTED = 1000
 """Effective draws of the worst statistic of the worst headline at which no further round is drawn ..."""
 ESS_LIMIT = 400
@@ -101,13 +106,21 @@ class Pool:
         return found
 
 
-def empty_pool(target: Target) -> Pool:
-    """Before the first round."""
+def empty_pool(target: Target, proposal: Independence | None = None) -> Pool:
+    """Before the first round: from a proposal, or from the first."""
     path = target.path
     dimension = path.dimension
-    first = first_proposal(target, dimension, path.heavy, path.coupled, path.pairs)
+    first = proposal or first_proposal(target, dimension, path.heavy, path.coupled, path.pairs)
     errors = no_draw(0, target.fit.arrays)
     return Pool(np.zeros((0, dimension)), np.zeros(0), errors, (), (), first)
+
+
+def piloted(target: Target, generator: np.random.RandomState) -> Pool:
+    """Without draws, from the proposal that the pilot rounds arrive at."""
+    pilot = empty_pool(target)
+    for _ in range(PILOT_ROUNDS):
+        pilot = pilot.extended(target, generator, fitted=True)
+    return replace(empty_pool(target, pilot.next_proposal), invalid=pilot.invalid)
 
 
 def log_evidence(fit: JointFit, path: Transport, log_weights: np.ndarray) -> float:
@@ -222,16 +235,16 @@ def importance_run(fit: JointFit, seed: int, advance: Advance = unshown) -> Impo
     """
     began = time.monotonic()
     generator = np.random.RandomState(seed)
-    wanted, rounds, drawn = FITTED_ROUNDS, 0, OpenEnded()
+    wanted, rounds, drawn = ROUNDS_LEAST, 0, OpenEnded()
     path = transport(fit)
     advance(MAPPED_SHARE)
     target = Target(fit, path)
     try:
-        pool = empty_pool(target)
+        pool = piloted(target, generator)
         while True:
             while rounds < wanted:
                 rounds += 1
-                pool = pool.extended(target, generator, fitted=rounds <= FITTED_ROUNDS)
+                pool = pool.extended(target, generator, fitted=False)
                 advance(MAPPED_SHARE + (1 - MAPPED_SHARE) * drawn.share(rounds, wanted))
             posterior = reweighted_posterior(fit, path, pool, seed, time.monotonic() - began)
             ess = posterior.convergence.importance.least_ess.value
