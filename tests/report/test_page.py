@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import datetime
 import hashlib
 import json
 import re
@@ -21,14 +22,16 @@ from tvsbayes.instrument.axes import DIRECTIONS
 from tvsbayes.instrument.campaign import read_campaign, write_campaign
 from tvsbayes.metrology.positioning_table import positioning
 from tvsbayes.metrology.traceability import traceability
-from tvsbayes.report.page import BROWSERS, report_html
+from tvsbayes.report.page import BROWSERS, report_html, typeset
+from tvsbayes.report.tables import Issue
 
 BYTES_MAX = 3_000_000
 
 
 KNOWN = {
     *("html", "head", "meta", "title", "style", "body", "header", "main", "footer", "section", "figure", "figcaption"),
-    *("h1", "h2", "p", "strong", "ul", "li", "dl", "dt", "dd", "div", "img"),
+    *("h1", "h2", "p", "strong", "ul", "ol", "li", "dl", "dt", "dd", "div", "span", "img"),
+    *("nav", "a", "details", "summary"),
     *("table", "caption", "thead", "tbody", "tr", "th", "td"),
 }
 
@@ -42,8 +45,11 @@ def test_the_page_is_alone_and_its_policy_allows_only_itself(page):
     nodes = Nodes(page)
     assert {tag for tag, _ in nodes.elements} <= KNOWN and not nodes.open
     assert not any(name.startswith("on") for _, attributes in nodes.elements for name in attributes)
-    for name in ("href", "srcset", "action", "data", "style"):
+    for name in ("srcset", "action", "data", "style"):
         assert not any(name in attributes for _, attributes in nodes.elements)
+    ids = {attributes.get("id") for _, attributes in nodes.elements}
+    links = [attributes["href"] for _, attributes in nodes.elements if "href" in attributes]
+    assert len(links) > 8 and all(link[0] == "#" and link[1:] in ids for link in links)
     policy = next(m["content"] for m in nodes.of("meta") if m.get("http-equiv") == "Content-Security-Policy")
     style = page.split(b"<style>")[1].split(b"</style>")[0]
     digest = base64.b64encode(hashlib.sha256(style).digest()).decode()
@@ -90,7 +96,46 @@ def test_numbers_of_the_page_are_the_libraries(page, evidence):
         assert word in text
     for sha in evidence.fit.provenance.inputs.values():
         assert sha in text
-    assert "Not met" in text and "P at least" in text
+    assert "Not met" in text and "probability at most" in text
+
+
+def test_the_first_page_has_the_answer_and_who_asked(page, evidence):
+    """Before the contents: ratios, backlashes, millimetres, what to do next, day, laboratory, customer."""
+    issue = Issue(datetime.date(2026, 1, 15), "Optics Lab", "Robotics group")
+    for source, told in (
+        (report_html(evidence, issue), "2026-01-15. Laboratory: Optics Lab. Customer: Robotics group."),
+        (page, "Laboratory: not stated. Customer: not stated."),
+    ):
+        first = " ".join(" ".join(Nodes(source.split(b"<nav")[0] + b"</header></body></html>").text).split())
+        assert told in first and "What to do next" in first
+        for row in (*(f"{d}, deg/step" for d in DIRECTIONS), "backlash pan, deg", "backlash tilt, deg"):
+            assert row in first
+        assert [first.count(f"{name} calibration") for name in ("nominal", "classic", "joint")] == [1, 1, 1]
+        assert source.split(b"<nav")[0].count(b"<img") == 1
+
+
+def test_no_paragraph_stands_twice_and_details_are_folded(page):
+    html = page.decode()
+    told = [re.sub(r"<.*?>", "", part) for part in re.findall(r"<(?:p|li)\b.*?</(?:p|li)>", html, flags=re.DOTALL)]
+    long = [text for text in told if len(text) > 60]
+    assert len(long) > 15 and len(long) == len(set(long))
+    nodes = Nodes(page)
+    assert len(nodes.of("details")) == len(nodes.of("section")) > 8
+    assert sum("open" in each for each in nodes.of("details")) == 1
+
+
+@pytest.mark.parametrize(
+    ("plain", "set"),
+    [
+        ("-0.5 +- 0.1 <= 2", "\u22120.5 \u00b1 0.1 \u2264 2"),
+        ("[-0.1, -0.00]", "[\u22120.1, 0.00]"),
+        ("-0.00(12) and -0.01", "\u22120.00(12) and \u22120.01"),
+        ("1e-05, 2026-01-15, --limit-mm, numpy 2.1.0-1, a-1", "1e-05, 2026-01-15, --limit-mm, numpy 2.1.0-1, a-1"),
+        ("PTB 12/-3 <script>", "PTB 12/-3 <script>"),
+    ],
+)
+def test_numbers_get_true_signs_and_names_stay(plain, set):
+    assert typeset(plain) == set
 
 
 def test_the_same_results_give_the_same_bytes(page, reported):
@@ -188,9 +233,9 @@ def test_next_experiments_are_those_of_the_plan(reported, evidence, no_pictures)
     finally:
         path.unlink()
     text = report_html(replace(evidence, planned=planned)).decode()
-    for wanted in ("u(left) &lt;= 2e-4", "0.00031 deg/step", "focal scale to 0.1 %", "Go on measuring"):
+    for wanted in ("u(left) \u2264 2e-4", "0.00031 deg/step", "focal scale to 0.1 %", "Go on measuring"):
         assert wanted in text
-    row = text.split("sheet d9, &lt;b&gt;four&lt;/b&gt; looks")[1].split("</tr>")[0]
+    row = text.split("sheet d9, &lt;b&gt;four&lt;/b&gt; looks")[-1].split("</tr>")[0]
     assert [cell in row for cell in ("2.5", "1.2e-05", "4.8e-06")] == [True] * 3
 
 

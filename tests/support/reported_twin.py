@@ -93,4 +93,5 @@ def no_pictures(monkeypatch):
     view = FigureView("data:image/svg+xml;base64,", "a picture that was left out", "left out", 1, 1)
     monkeypatch.setattr("tvsbayes.report.tables.figure_view", lambda figure, alt, caption: view)
     monkeypatch.setattr("tvsbayes.report.fit_sections.figure_view", lambda figure, alt, caption: view)
+    monkeypatch.setattr("tvsbayes.report.first_page.figure_view", lambda figure, alt, caption: view)
     monkeypatch.setattr("tvsbayes.report.uncertainty_sections.figure_view", lambda figure, alt, caption: view)

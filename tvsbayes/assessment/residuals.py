@@ -192,7 +192,12 @@ def _placed(depths_mm: Sequence[float]) -> list[tuple[str, np.ndarray]]:
     if len(gaps) >= CAUSE_BINS or (not len(gaps) and array.max(initial=0.0) > SHALLOW * array.min(initial=np.inf)):
         return _binned(depths_mm, " mm")
     groups = [rows for rows in np.split(order, gaps) if len(rows)]
-    return [(f"{array[rows].min():.4g} to {array[rows].max():.4g} mm", np.sort(rows)) for rows in groups]
+    return [(f"{_told(array[rows].min())} to {_told(array[rows].max())} mm", np.sort(rows)) for rows in groups]
+
+
+def _told(value: float) -> str:
+    """Four digits, without an exponent."""
+    return f"{value:.0f}" if abs(value) >= 1000 else f"{value:.4g}"
 
 
 def _binned(values: Sequence[float | str], unit: str) -> list[tuple[str, np.ndarray]]:
@@ -204,5 +209,5 @@ def _binned(values: Sequence[float | str], unit: str) -> list[tuple[str, np.ndar
     bins = []
     for rows in np.array_split(np.argsort(array, kind="stable"), CAUSE_BINS):
         if len(rows):
-            bins.append((f"{array[rows].min():.4g} to {array[rows].max():.4g}{unit}", rows))
+            bins.append((f"{_told(array[rows].min())} to {_told(array[rows].max())}{unit}", rows))
     return bins

@@ -5,8 +5,9 @@ Shared by the terminal and the page. Sentences for people; ratios in deg/step.
 
 from __future__ import annotations
 
+from tvsbayes.errors import listed
 from tvsbayes.instrument.axes import DIRECTIONS
-from tvsbayes.results.estimates import FitSummary, Validation
+from tvsbayes.results.estimates import FitSummary, Validation, WeakDirection
 
 REMEDIES = {
     "the cameras moved": "fix the cameras and measure again, or fit the looks before and after as two campaigns",
@@ -22,6 +23,7 @@ REMEDIES = {
 }
 """What helps, by how the name of the failed test begins."""
 ANY_REMEDY = "find the cause in the section Validation of the report, mend it and measure again"
+SPOTS_LISTED = 20
 USUAL_SCALE = (0.5, 2.0)
 """Pixel noise over the stated one that needs no word."""
 
@@ -83,11 +85,19 @@ def steps_ahead(summary: FitSummary) -> list[str]:
         help_ = remedy(validation)
         found.append(f"{validation.cause}: {help_}.")
     if summary.suspect_spots and (validation is None or "single spots" not in validation.cause):
-        found.append("Look at the spots that disagree with all others, or fit with --robust, which leaves them out.")
+        ids = listed(summary.suspect_spots, SPOTS_LISTED)
+        found.append(
+            f"Look at spots {ids}, which disagree with all others, or fit with --robust, which leaves them out."
+        )
     if summary.few_stops:
         named = ", ".join(f"{direction} ({count})" for direction, count in summary.few_stops.items())
         found.append(f"Add stops reached by moving {named}: so few hardly tell their own scatter.")
     if summary.estimator == "laplace":
         found.append("Run `tvsbayes fit` without --no-sample: it samples the posterior.")
-    found += [f"{weak.text[0].upper()}{weak.text[1:]}." for weak in summary.weak_directions if "look" in weak.text]
-    return found
+    told = [weak.text for weak in summary.weak_directions if asks_for_looks(weak)]
+    return found + [f"{text[0].upper()}{text[1:]}." for text in told]
+
+
+def asks_for_looks(weak: WeakDirection) -> bool:
+    """Whether a weak direction says which looks would cure it: those stand under what to do next."""
+    return "looks at" in weak.text

@@ -34,14 +34,15 @@ RASTER_DPI = 150
 """Of the parts of a figure with hundreds of points."""
 STYLE: dict[Any, object] = {
     "font.size": 9.0,
-    "axes.titlesize": 9.5,
+    "axes.titlesize": 9.0,
+    "axes.axisbelow": True,
     "axes.spines.top": False,
     "axes.spines.right": False,
     "axes.grid": True,
     "grid.color": "#DDDDDD",
     "grid.linewidth": 0.6,
     "legend.frameon": False,
-    "legend.fontsize": 8.0,
+    "legend.fontsize": 9.0,
     "svg.hashsalt": "tvsbayes",
 }
 

@@ -81,11 +81,11 @@ def trajectories(campaign: Campaign, experiment: int) -> Figure:
             start, end = pair[0] - 0.6 * run, pair[1] + 0.2 * run
             axes.plot([start[0], end[0]], [start[across], end[across]], color=colour, linewidth=1)
             angle = np.degrees(np.arctan2(run[across], run[0]))
-            label = f"{name}: {angle:.2f} deg"
+            label = f"{name}: {angle:.2f} deg".replace("-", "\u2212")
             axes.plot(pair[:, 0], pair[:, across], marker, color=colour, label=label, linestyle="none")
         for number, point in enumerate(points, start=1):
             axes.annotate(f"P{number}", (point[0], point[across]), (4, 5), textcoords="offset points")
-        title = f"experiment {experiment}: {axis} by {steps:+d} steps"
+        title = f"experiment {experiment}: {axis} by {steps:+d} steps".replace("-", "\u2212")
         axes.set(xlabel="X (depth), mm", ylabel=f"{'Y (left)' if across == 1 else 'Z (up)'}, mm", title=title)
         axes.legend()
     return figure
@@ -129,21 +129,39 @@ def direction_scatter(result: ClassicResult, direction: str, joint: Estimate | N
     summary = result.directions[direction]
     if summary is None:
         raise ValueError(f"no complete experiment moves {direction}")
-    mine = [e for e in result.experiments if e.direction == direction]
-    mean, sd = summary.mean_deg_per_step, summary.sd_deg_per_step
     with drawing(3.2) as figure:
-        axes = figure.add_subplot()
-        if sd is not None:
-            for k, shade in ((3, "#F0F0F0"), (2, "#E0E0E0"), (1, "#CCCCCC")):
-                axes.axhspan(mean - k * sd, mean + k * sd, color=shade, label=f"{k} sigma", zorder=0)
-        axes.axhline(mean, color=RED, label=f"mean {mean:.6f}")
-        if joint is not None:
-            label = f"joint {joint.value:.6f}, 2 u"
-            axes.errorbar(len(mine) + 1.5, joint.value, 2 * joint.sd, fmt="o", color=BLUE, capsize=3, label=label)
-        axes.plot(range(1, len(mine) + 1), [e.deg_per_step for e in mine], "^", color=BLACK, markersize=4)
-        axes.set(xlabel="experiment of this direction", ylabel="deg/step", title=f"{direction}, n = {summary.n}")
+        _scatter(figure.add_subplot(), result, direction, joint)
         figure.legend(loc="outside lower center", ncols=3)
     return figure
+
+
+def direction_scatters(result: ClassicResult, joint: FitSummary | None = None) -> Figure:
+    """`direction_scatter` of all four directions in one figure."""
+    with drawing(5.2) as figure:
+        panels = figure.subplots(2, 2).ravel()
+        for axes, direction in zip(panels, DIRECTIONS, strict=True):
+            if result.directions[direction] is None:
+                axes.set(title=f"{direction}: no experiment")
+                continue
+            _scatter(axes, result, direction, None if joint is None else joint.effective[direction])
+    return figure
+
+
+def _scatter(axes: Axes, result: ClassicResult, direction: str, joint: Estimate | None) -> None:
+    """One direction's experiments into a panel."""
+    summary = result.directions[direction]
+    assert summary is not None
+    mine = [e for e in result.experiments if e.direction == direction]
+    mean, sd = summary.mean_deg_per_step, summary.sd_deg_per_step
+    if sd is not None:
+        for k, shade in ((3, "#F0F0F0"), (2, "#E0E0E0"), (1, "#CCCCCC")):
+            axes.axhspan(mean - k * sd, mean + k * sd, color=shade, label=f"{k} sigma", zorder=0)
+    axes.axhline(mean, color=RED, label=f"mean {mean:.6f}")
+    if joint is not None:
+        label = f"joint {joint.value:.6f}, 2 u"
+        axes.errorbar(len(mine) + 1.5, joint.value, 2 * joint.sd, fmt="o", color=BLUE, capsize=3, label=label)
+    axes.plot(range(1, len(mine) + 1), [e.deg_per_step for e in mine], "^", color=BLACK, markersize=4)
+    axes.set(xlabel="experiment of this direction", ylabel="deg/step", title=f"{direction}, n = {summary.n}")
 
 
 def setup(
@@ -270,8 +288,8 @@ def correlations(names: Sequence[str], matrix: np.ndarray) -> Figure:
         for row in range(count):
             for column in range(count):
                 shade = "white" if abs(matrix[row, column]) > 0.8 else "black"
-                text = f"{round(100 * matrix[row, column])}"
-                axes.text(column, row, text, ha="center", va="center", fontsize=8, color=shade)
+                text = f"{round(100 * matrix[row, column])}".replace("-", "\u2212")
+                axes.text(column, row, text, ha="center", va="center", color=shade)
         axes.set(xticks=range(count), yticks=range(count), yticklabels=names, title="correlation, %")
         axes.set_xticklabels(names, rotation=60, ha="right", rotation_mode="anchor")
         axes.grid(False)
@@ -356,7 +374,7 @@ def _cells(axes: Axes, x: np.ndarray, y: np.ndarray, values: np.ndarray, dark_ab
             value = values[row, column]
             if np.isfinite(value):
                 colour = "white" if value > dark_above else "black"
-                axes.text(xx, yy, f"{value:.3g}", ha="center", va="center", fontsize=7, color=colour)
+                axes.text(xx, yy, f"{value:.3g}", ha="center", va="center", color=colour)
 
 
 def shares(budget: Budget) -> Figure:
@@ -372,7 +390,7 @@ def shares(budget: Budget) -> Figure:
     with drawing(0.9 + 0.26 * len(names)) as figure:
         axes = figure.add_subplot()
         bars = axes.barh(range(len(names)), values, color=SKY, edgecolor=BLACK, linewidth=0.5)
-        axes.bar_label(bars, labels=[f"{value:.1f} %" for value in values], padding=3, fontsize=8)
+        axes.bar_label(bars, labels=[f"{value:.1f} %" for value in values], padding=3)
         axes.set(yticks=range(len(names)), yticklabels=names, xlabel="share of the variance, %")
         axes.set_xlim(0, 1.2 * max(values))
         axes.invert_yaxis()

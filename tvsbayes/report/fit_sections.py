@@ -9,12 +9,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tvsbayes.instrument.axes import AXES, DIRECTIONS
+from tvsbayes.instrument.axes import AXES
 from tvsbayes.metrology.traceability import stated_value
 from tvsbayes.report import figures
+from tvsbayes.report.advice import asks_for_looks
 from tvsbayes.report.fit_text import agreement_line, sampling_line
 from tvsbayes.report.result_tables import gap_table, hold_out_table
-from tvsbayes.report.tables import FigureView, Section, TableView, concise, figure_view, interval_text, two_digits
+from tvsbayes.report.tables import FigureView, Section, TableView, concise, figure_view, interval_text
 from tvsbayes.results.estimates import Cause, Validation
 
 if TYPE_CHECKING:
@@ -28,6 +29,8 @@ CORRELATED = (
 """Parameters of the correlation matrix, in order; those that were not estimated are left out."""
 
 
+PRIORS_SHOWN = 8
+"""Of those that a result is sensitive to, the strongest first; fit.json has all."""
 HEADER_SHOWN = (
     *(("instrument", "instrument"), ("serial", "serial number"), ("operator", "operator"), ("method", "method")),
     *(("created", "measured or made"), ("notes", "notes")),
@@ -70,23 +73,22 @@ def setup_section(e: Evidence) -> Section:
 
 
 def results_section(e: Evidence) -> Section:
-    """Both estimators beside each other, and why they differ."""
+    """Why both estimators differ, what their experiments say, and every parameter."""
     text = [
         "value(u): the digits in brackets are the standard uncertainty in units of the last place, or with their "
         "decimal point the uncertainty itself."
     ]
     if e.classic is None:
         text.append("Classic: not applicable, the campaign has no complete four-point experiment.")
-    tables, views = [_both(e), _parameters(e)], [_intervals(e), *_one_experiment(e), *_scatters(e)]
+    tables, views = [_parameters(e)], [*_one_experiment(e), *_scatters(e)]
     if e.shown.gap:
-        tables.append(gap_table(e.shown.gap))
-        views.append(
-            figure_view(
-                figures.gap_terms(e.shown.gap),
-                "Terms of the difference between both estimators; values in the table above",
-                "Why the classic differs from the joint.",
-            )
+        tables.insert(0, gap_table(e.shown.gap))
+        view = figure_view(
+            figures.gap_terms(e.shown.gap),
+            "Terms of the difference between both estimators; values in the table above",
+            "Why the classic differs from the joint.",
         )
+        views.insert(0, view)
     if e.fit.summary.curves is not None:
         views.append(
             figure_view(
@@ -95,36 +97,7 @@ def results_section(e: Evidence) -> Section:
                 "Effective ratios over the range that was seen.",
             )
         )
-    return Section("Results, classic beside joint", text, tables=tables, figures=views)
-
-
-def _both(e: Evidence) -> TableView:
-    """Effective ratios of both estimators by direction."""
-    rows = []
-    for direction in DIRECTIONS:
-        joint = e.fit.summary.effective[direction]
-        classic = None if e.classic is None else e.classic.directions[direction]
-        row = [direction]
-        if joint is None:
-            row += ["never moved", "", ""]
-        else:
-            low, high = joint.interval95
-            interval = interval_text(low, high, joint.sd)
-            row += [concise(joint.value, joint.sd), interval, two_digits(0.5 * (high - low))]
-        if e.classic is None:
-            row += ["not applicable", ""]
-        elif classic is None:
-            row += ["no experiment", ""]
-        else:
-            row += [concise(classic.mean_deg_per_step, classic.u_gum_deg_per_step or 0.0), str(classic.n)]
-        rows.append(row)
-    pose = e.fit.summary.reference_pose_deg
-    caption = (
-        f"Effective degrees of the beam per motor step at pan {pose['pan']:.2f} deg, tilt {pose['tilt']:.2f} "
-        "deg, deg/step"
-    )
-    columns = ["direction", "joint value(u)", "95 % interval", "half of it", "classic value(u)", "n"]
-    return TableView(caption, columns, rows)
+    return Section("Results in full", text, tables=tables, figures=views, opened=True)
 
 
 def _one_experiment(e: Evidence) -> list[FigureView]:
@@ -137,46 +110,30 @@ def _one_experiment(e: Evidence) -> list[FigureView]:
         f"Beams of experiment {number} before and after its steps, with the angle of each",
         f"Experiment {number}: the beam before and after, in the plane of its angle.",
     )
-    points = figure_view(
-        figures.points_3d(e.campaign, number),
-        f"The four points of experiment {number} in space, in the order of measurement",
-        f"Experiment {number}: its four points, frame S.",
-    )
-    return [beams, points]
-
-
-def _intervals(e: Evidence) -> FigureView:
-    """Ratios of both estimators with their intervals."""
-    classic = {} if e.classic is None else e.classic.directions
-    return figure_view(
-        figures.intervals(e.fit.summary.effective, classic),
-        "Ratios of both estimators with 95 % intervals; values in the table above",
-        "Effective ratios, joint (circles) and classic (triangles).",
-    )
+    return [beams]
 
 
 def _scatters(e: Evidence) -> list[FigureView]:
-    """The experiments of every direction that has some."""
+    """The experiments of all directions that have some, in one figure."""
     if e.classic is None:
         return []
-    views = []
-    for direction, result in e.classic.directions.items():
-        if result is None:
-            continue
-        alt = f"{result.n} experiments moving {direction}: mean {result.mean_deg_per_step:.6f} deg/step"
-        if result.sd_deg_per_step is not None:
-            alt += f", standard deviation {result.sd_deg_per_step:.6f}"
-        figure = figures.direction_scatter(e.classic, direction, e.fit.summary.effective[direction])
-        caption = f"Experiments moving {direction}, with the mean and bands of 1, 2 and 3 sigma."
-        views.append(figure_view(figure, alt, caption))
-    return views
+    told = {d: r for d, r in e.classic.directions.items() if r is not None}
+    means = ", ".join(f"{d} {r.mean_deg_per_step:.6f} deg/step of {r.n}" for d, r in told.items())
+    figure = figures.direction_scatters(e.classic, e.fit.summary)
+    return [
+        figure_view(
+            figure,
+            f"Experiments by direction with their means: {means}",
+            "Experiments of the classic method, with the mean and bands of 1, 2 and 3 sigma; blue: joint.",
+        )
+    ]
 
 
 def _parameters(e: Evidence) -> TableView:
     """Everything that was estimated, but for the cameras' parameters."""
     rows = []
     for name, x in e.fit.summary.parameters.items():
-        if name.startswith("stereo.") or x.sd == 0:
+        if name.startswith(("stereo.", "degrees_per_step.left", "degrees_per_step.right")) or x.sd == 0:
             continue
         rows.append(
             [
@@ -184,13 +141,12 @@ def _parameters(e: Evidence) -> TableView:
                 concise(x.value, x.sd),
                 interval_text(*x.interval95, x.sd),
                 "" if x.prior_sd is None else f"{x.prior_sd:.2g}",
-                "" if x.contraction is None else f"{x.contraction:.2f}",
-                "" if x.contraction is None else "data" if x.informed else "prior",
-                "" if x.rhat is None else f"{x.rhat:.3f}",
+                "" if x.contraction is None else f"{100 * x.contraction:.0f}",
             ]
         )
-    columns = ["parameter", "value(u)", "95 % interval", "u of the prior", "contraction", "set by", "R-hat"]
-    return TableView("Parameters of the joint model; the unit is in the name", columns, rows)
+    columns = ["parameter", "value(u)", "95 % interval", "u of the prior", "told by the data, %"]
+    caption = "Parameters of the joint model, units in the names; 100 %: the prior no longer matters"
+    return TableView(caption, columns, rows)
 
 
 def identifiability_section(e: Evidence) -> Section:
@@ -215,7 +171,8 @@ def identifiability_section(e: Evidence) -> Section:
             )
         )
     summary = e.fit.summary
-    items = [weak.text for weak in summary.weak_directions] + [entry.text for entry in summary.leverage]
+    items = [weak.text for weak in summary.weak_directions if not asks_for_looks(weak)]
+    items += [entry.text for entry in summary.leverage]
     sensitive = [
         [
             f"{x.parameter}, {'twice' if x.factor > 1 else 'half'} its u",
@@ -223,13 +180,13 @@ def identifiability_section(e: Evidence) -> Section:
             f"{x.shift_sd:+.2f}",
             f"{x.sd_ratio:.2f}",
         ]
-        for x in summary.prior_sensitivity
+        for x in summary.prior_sensitivity[:PRIORS_SHOWN]
     ]
     text = []
     if not items:
-        text.append("Every direction that matters is set by the data; no single stop rules a headline.")
-    caption = "Headlines that another prior would move: by how many of their sds, and the factor on the sd"
-    columns = ["prior", "headline", "shift, sd", "sd, factor"]
+        text.append("Every direction that matters is set by the data; no single stop decides a result.")
+    caption = "Results that another prior would move: by how many of their sds, and the factor on the sd"
+    columns = ["prior", "result", "shift, sd", "sd, factor"]
     priors = TableView(caption, columns, sensitive) if sensitive else None
     table = TableView("Correlations beyond 0.8", ["parameters", "correlation"], rows) if rows else None
     return Section("What the data tell apart", text, items, [table, priors], views)
@@ -245,15 +202,14 @@ def residuals_section(e: Evidence) -> Section:
     views = []
     for axis in AXES:
         if any(c.axis == axis for c in causes):
-            alt = f"Mean deviation by group, {axis} axis; values in the table above"
+            alt = f"Mean deviation by group, {axis} axis; values in fit.json"
             views.append(figure_view(figures.causes(causes, axis), alt, f"{axis} axis: mean deviation by group."))
         stops = [stop for stop in e.shown.residuals if stop.axis == axis]
         if stops:
-            alt = f"Deviations of {len(stops)} stops of the {axis} axis over time and counter; group means in the "
-            alt += "table above"
+            alt = f"Deviations of {len(stops)} stops of the {axis} axis over time and counter"
             caption = f"Stops of the {axis} axis: observed minus fitted angle."
             views.append(figure_view(figures.residuals(stops, axis), alt, caption))
-    tables = [_causes(causes), _groups(causes)] if causes else []
+    tables = [_causes(causes)] if causes else []
     return Section("Residuals by cause", text, tables=tables, figures=views)
 
 
@@ -268,17 +224,6 @@ def _causes(causes: tuple[Cause, ...]) -> TableView:
         for c in causes
     ]
     return TableView("Do the deviations of the stops depend on ...", ["cause", "groups", "p", "verdict"], rows)
-
-
-def _groups(causes: tuple[Cause, ...]) -> TableView | None:
-    rows = [
-        [f"{c.axis}, {c.name}: {g.label}", str(g.count), f"{g.mean:+.2f}", f"{g.standard_error:.2f}"]
-        for c in causes
-        for g in c.groups
-        if len(c.groups) > 1
-    ]
-    columns = ["group", "count", "mean", "standard error"]
-    return TableView("Mean deviation of stops in units of its standard deviation", columns, rows) if rows else None
 
 
 def validation_section(e: Evidence) -> Section:

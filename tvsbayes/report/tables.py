@@ -121,18 +121,19 @@ class FigureView:
 
 @dataclass(frozen=True)
 class Section:
-    """A part of the report."""
+    """A part of the report; `opened` ones are not folded on a screen."""
 
     title: str
     text: Sequence[str] = ()
     items: Sequence[str] = ()
     tables: Sequence[TableView | None] = ()
     figures: Sequence[FigureView] = ()
+    opened: bool = False
 
 
 @dataclass(frozen=True)
 class Number:
-    """One of the three numbers at the top."""
+    """One of the numbers at the top."""
 
     label: str
     value: str
@@ -155,13 +156,16 @@ class Issue:
 
 @dataclass(frozen=True)
 class Page:
-    """What the template is filled with."""
+    """What the template is filled with; `answer` is its first table, `picture` stands beside it."""
 
     report_id: str
     name: str
     verdict: str
     verdict_class: str
     numbers: Sequence[Number]
+    answer: TableView | None
+    picture: FigureView | None
+    steps: Sequence[str]
     criteria: TableView | None
     traceable: str
     warnings: Sequence[str]

@@ -10,16 +10,19 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from tvsbayes.instrument.axes import SENSES
 from tvsbayes.metrology.traceability import header_table
 from tvsbayes.report import figures
-from tvsbayes.report.result_tables import SHARE_SHOWN, point_budget_table
+from tvsbayes.report.result_tables import point_budget_table
 from tvsbayes.report.tables import Section, TableView, concise, figure_view, two_digits
-from tvsbayes.results.metrology_tables import FIGURES, AxisPositioning, BudgetTable
+from tvsbayes.results.metrology_tables import FIGURES, BudgetTable
 
 if TYPE_CHECKING:
     from tvsbayes.report.evidence import Evidence
 
 
+SHARE_PRINTED = 0.005
+"""Of a variance: a source below it stands in fit.json alone."""
 MADE_BY = {
     "laplace": "Laplace approximation at the mode",
     "importance": "posterior by importance sampling",
@@ -35,13 +38,14 @@ def maps_section(e: Evidence) -> Section:
     rows, views = [], []
     for k, reach in enumerate(e.maps.range_mm):
         rows.append([f"{reach:g}", *(_cell(values[k]) for values in at_middle.values())])
-        views.append(
-            figure_view(
-                figures.error_maps(e.maps, k),
-                f"Root mean square error over pan and tilt at {reach:g} mm; every cell holds its value in mm",
-                f"3D error at {reach:g} mm, root mean square over the rigs that the data allow.",
+        if reach == e.range_mm:
+            views.append(
+                figure_view(
+                    figures.error_maps(e.maps, k),
+                    f"Root mean square error over pan and tilt at {reach:g} mm; every cell holds its value in mm",
+                    f"3D error at {reach:g} mm, root mean square over the rigs that the data allow.",
+                )
             )
-        )
     at = f"pan {e.maps.pan_steps[pan]:.0f}, tilt {e.maps.tilt_steps[tilt]:.0f} steps"
     table = TableView(f"Root mean square 3D error in mm at {at}, by range in mm", ["range", *e.maps.rms_mm], rows)
     text = [
@@ -70,9 +74,9 @@ def _cell(value: float) -> str:
 
 
 def budgets_section(e: Evidence) -> Section:
-    """What the uncertainty of headlines and of a point consists of."""
-    tables = [
-        *(_gum_table(table) for table in e.shown.budgets),
+    """What the uncertainty of results and of a point consists of."""
+    tables = [_gum_table(one) if other is None else _pair_table(one, other) for one, other in _pairs(e.shown.budgets)]
+    tables += [
         point_budget_table(e.budget, f"Budget of a point {e.range_mm:g} mm away, by cause"),
         _gum_table(e.point, f"{e.range_mm:g} mm away: "),
     ]
@@ -81,12 +85,59 @@ def budgets_section(e: Evidence) -> Section:
         "Shares of the variance by cause; values at the bars and in the table above",
         f"What the uncertainty of a point {e.range_mm:g} mm away consists of.",
     )
-    return Section("Uncertainty budgets", tables=tables, figures=[view])
+    text = ["Sensitivities are contributions over u. fit.json holds every row, with distribution and sensitivity."]
+    return Section("Uncertainty budgets", text, tables=tables, figures=[view])
+
+
+def _pairs(tables: Sequence[BudgetTable]) -> list[tuple[BudgetTable, BudgetTable | None]]:
+    """Budgets of both directions, or of both axes, beside each other where the same kind of result has two."""
+    kinds: dict[str, list[BudgetTable]] = {}
+    for table in tables:
+        kind, _, part = table.quantity.rpartition(".")
+        axis = next((axis for axis, pair in SENSES.items() if part in pair), "")
+        kinds.setdefault(f"{kind}.{axis}", []).append(table)
+    found: list[tuple[BudgetTable, BudgetTable | None]] = []
+    for each in kinds.values():
+        found += [(each[0], each[1])] if len(each) == 2 else [(table, None) for table in each]
+    return found
+
+
+def _pair_table(first: BudgetTable, second: BudgetTable) -> TableView:
+    """Two budgets of the same sources, what matters to either."""
+    others = {row.quantity: row for row in second.rows}
+    rows = []
+    for row in first.rows:
+        other = others.get(row.quantity)
+        if other is None or max(abs(row.share), abs(other.share)) < SHARE_PRINTED:
+            continue
+        told = ["" if row.u is None else two_digits(row.u), "" if row.u is None else _freedom(row.dof)]
+        parts = [
+            cell
+            for each in (row, other)
+            for cell in (
+                "" if each.contribution is None else two_digits(each.contribution),
+                f"{100 * each.share:.1f}",
+            )
+        ]
+        rows.append([row.quantity, row.kind, *told, *parts])
+    names = [table.quantity.rpartition(".")[2] for table in (first, second)]
+    columns = ["source", "type", "u", "dof"]
+    columns += [f"{word}{name}" for name in names for word in ("contribution, ", "share %, ")]
+    return TableView(f"{_total(first)}; {_total(second)}", columns, rows)
+
+
+def _total(table: BudgetTable) -> str:
+    """The result of a budget with its expanded uncertainty (GUM 7.2.4)."""
+    return (
+        f"{table.quantity}: {concise(table.estimate, table.u)} {table.unit}, effective degrees of freedom "
+        f"{_freedom(table.dof)}, k = {table.coverage_factor:.2f}, p = {100 * table.probability:.0f} %, "
+        f"U = {two_digits(table.expanded)} {table.unit}"
+    )
 
 
 def _gum_table(table: BudgetTable, prefix: str = "") -> TableView:
     """A budget as GUM 7.2.7 asks for it; sources that matter to no digit are counted in one line."""
-    shown = [row for row in table.rows if row.u is None or abs(row.share) >= SHARE_SHOWN]
+    shown = [row for row in table.rows if row.u is None or abs(row.share) >= SHARE_PRINTED]
     rows = [
         [
             row.quantity,
@@ -103,11 +154,7 @@ def _gum_table(table: BudgetTable, prefix: str = "") -> TableView:
     if len(shown) < len(table.rows):
         rest = [row.share for row in table.rows if row not in shown]
         rows.insert(-1, [f"{len(rest)} smaller ones", "", "", "", "", "", "", f"{100 * sum(rest):.1f}"])
-    caption = (
-        f"{prefix}{table.quantity}: {concise(table.estimate, table.u)} {table.unit}; effective degrees of "
-        f"freedom {_freedom(table.dof)}, k = {table.coverage_factor:.2f}, "
-        f"p = {100 * table.probability:.0f} %, U = {two_digits(table.expanded)} {table.unit}"
-    )
+    caption = f"{prefix}{_total(table)}"
     if any(row.share > 1 for row in shown):
         # GUM 5.2.2: with correlated inputs the cross terms are as real as the squares.
         caption += "; the inputs are correlated: single shares exceed 100 %, the row of correlations takes them back"
@@ -120,42 +167,49 @@ def _freedom(dof: float | None) -> str:
 
 
 def axes_section(e: Evidence) -> Section:
-    """Figures of both axes as ISO 230-2 defines them."""
-    tables = [_axis_table(axis) for axis in e.shown.positioning if axis.predicted]
-    items = []
-    for axis in e.shown.positioning:
-        if axis.missing:
-            items.append(f"{axis.axis}, own stops: {axis.missing}")
-        items += [note for note in axis.notes if note not in items]
-    text = [] if tables or items else ["Not computed: the fit has not converged."]
-    return Section("ISO 230-2-style figures", text, items, tables)
+    """Figures of both axes as ISO 230-2 defines them, predicted for standard test cycles."""
+    axes = [axis for axis in e.shown.positioning if axis.predicted]
+    if not axes:
+        return Section("ISO 230-2-style figures", ["Not computed: the fit has not converged."])
+    items: list[str] = []
+    for axis in axes:
+        # Notes on the campaign's own stops belong to figures that mean something else: fit.json has both.
+        items += [note for note in axis.notes if note not in items and "plug-in" not in note]
+    rows = []
+    for name, (symbol, term) in FIGURES.items():
+        found = [(axis.predicted or {}).get(name) for axis in axes]
+        if any(figure is not None for figure in found):
+            cells = [
+                cell
+                for f in found
+                for cell in (
+                    ("", "") if f is None else (f"{f.median:.4f}", f"[{f.interval95[0]:.4f}, {f.interval95[1]:.4f}]")
+                )
+            ]
+            rows.append([f"{_growing(term)} {_arrow(symbol)}", *cells])
+    columns = ["figure", *(cell for axis in axes for cell in (f"{axis.axis}, median", f"{axis.axis}, 95 % interval"))]
+    first = axes[0]
+    caption = f"deg, predicted for {first.runs} runs per side at {len(first.target_steps)} targets"
+    return Section("ISO 230-2-style figures", items=items, tables=[TableView(caption, columns, rows)])
 
 
-def _axis_table(axis: AxisPositioning) -> TableView:
-    rows = [
-        [
-            " ".join(reversed(FIGURES[name])),
-            f"{p.median:.4f}",
-            f"[{p.interval95[0]:.4f}, {p.interval95[1]:.4f}]",
-            "" if axis.plug_in is None else f"{getattr(axis.plug_in, name):.4f}",
-        ]
-        for name, p in (axis.predicted or {}).items()
-    ]
-    caption = (
-        f"{axis.axis} axis, deg: predicted for {axis.runs} runs per side at {len(axis.target_steps)} "
-        "targets, and as the campaign's own stops have it"
-    )
-    return TableView(caption, ["figure", "median", "95 % interval", "own stops"], rows)
+def _growing(term: str) -> str:
+    """The standard's up and down are directions of approach, not those of the tilt axis."""
+    return term.replace(", up", ", counters growing").replace(", down", ", counters falling")
+
+
+def _arrow(symbol: str) -> str:
+    return symbol.replace(" up", "\u2191").replace(" down", "\u2193")
 
 
 def plan_section(e: Evidence) -> Section:
     """What further experiments would bring."""
-    items, plan = [weak.text for weak in e.fit.summary.weak_directions], e.planned
+    plan = e.planned
     if plan is None:
         text = [
             "tvsbayes plan RIG --given CAMPAIGN weighs further experiments; a report made after it shows them here."
         ]
-        return Section("What to measure next", text, items)
+        return Section("What to measure next", text)
     unit, stop = plan.target.unit, plan.stop
     text = [
         f"Wanted: {plan.target.text}; known now to {plan.now:.2g} {unit}. "
@@ -167,8 +221,8 @@ def plan_section(e: Evidence) -> Section:
         [batch.text, f"{batch.minutes:.1f}", f"{batch.gain:.2g}", f"{batch.gain_per_minute:.2g}"] for batch in plan.next
     ]
     columns = ["four looks", "minutes", f"gain, {unit}", f"gain a minute, {unit}"]
-    tables = [TableView("Next experiments, best first", columns, rows)] if rows else []
-    return Section("What to measure next", text, items, tables=tables)
+    tables = [TableView("Next looks, best first", columns, rows)] if rows else []
+    return Section("What to measure next", text, tables=tables)
 
 
 def method_section(e: Evidence) -> Section:
@@ -185,7 +239,7 @@ def method_section(e: Evidence) -> Section:
     ]
     rows = [["traceability", k, str(v)] for k, v in header_table(e.campaign, "traceability").items()]
     rows += [["sha256", name, value] for name, value in made.inputs.items()]
-    rows += [["version", name, value] for name, value in made.versions.items()]
+    rows.append(["versions", "", ", ".join(f"{name} {value}" for name, value in made.versions.items())])
     table = TableView("Traceability as declared, inputs, versions", ["", "name", "value"], rows)
     return Section("Method, traceability, provenance", text, tables=[table])
 

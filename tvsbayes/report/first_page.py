@@ -1,0 +1,129 @@
+"""The first page of a report: verdict, the answer of both estimators, millimetres, warnings.
+
+Ratios in deg/step, lost motion in deg, distances in mm.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from tvsbayes.instrument.axes import AXES, DIRECTIONS
+from tvsbayes.report import figures
+from tvsbayes.report.advice import verdict_line
+from tvsbayes.report.drawing import OF_ESTIMATOR
+from tvsbayes.report.evidence import MET, NOT_MET, Criterion, Evidence
+from tvsbayes.report.fit_text import validation_lines
+from tvsbayes.report.tables import FigureView, Number, TableView, concise, figure_view, interval_text, two_digits
+from tvsbayes.results.comparison_record import CANNOT_TELL
+from tvsbayes.results.estimates import Estimate, FitSummary
+
+CLASSIC_BLIND = "cannot see it"
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """One line, and the class that colours it: "met", "not-met" or "cannot-tell"."""
+
+    text: str
+    kind: str
+
+
+def verdict_of(summary: FitSummary, criteria: Sequence[Criterion]) -> Verdict:
+    """What the page says first: whether its numbers may be used, and whether the limits are met."""
+    if not summary.converged:
+        return Verdict("NOT CONVERGED: the numbers below must not be used", "not-met")
+    validation = summary.validation
+    failed = "" if validation is None or validation.passed else validation_lines(validation)[0] + ". "
+    if failed and not criteria:
+        return Verdict(f"{failed}No limit was stated", "cannot-tell")
+    if not criteria:
+        usable = verdict_line(summary).removeprefix("verdict: ")
+        text = (
+            f"{usable[0].upper()}{usable[1:]}. No limit was stated (state one with --limit-deg-per-step or --limit-mm)"
+        )
+        return Verdict(text, "cannot-tell")
+    told = []
+    for verdict in (NOT_MET, CANNOT_TELL, MET):
+        mine = [c for c in criteria if c.verdict == verdict]
+        limits = dict.fromkeys((c.limit, c.unit) for c in mine)
+        for limit, unit in limits:
+            part = [c for c in mine if (c.limit, c.unit) == (limit, unit)]
+            chances = [c.probability for c in part]
+            bound = f"at most {max(chances):.3f}" if verdict == NOT_MET else f"at least {min(chances):.3f}"
+            names = ", ".join(c.quantity for c in part)
+            told.append((verdict, f"{verdict}: {names} within {limit:.3g} {unit} (probability {bound})"))
+    text = "; ".join(sentence for _, sentence in told)
+    judged = "With that factor: " if failed else ""
+    return Verdict(failed + judged + text[0].upper() + text[1:], told[0][0].replace(" ", "-"))
+
+
+def criteria_table(criteria: Sequence[Criterion]) -> TableView | None:
+    """Every limit with its verdict and the rule; None where no limit was stated."""
+    if not criteria:
+        return None
+    rows = [[c.quantity, f"{c.limit:.3g} {c.unit}", f"{c.probability:.3f}", c.verdict] for c in criteria]
+    caption = "Decision rule: met if P(|error| <= limit) >= 0.95, not met if <= 0.05, else cannot tell"
+    return TableView(caption, ["error of", "limit", "probability", "verdict"], rows)
+
+
+def answer_table(e: Evidence) -> TableView:
+    """The four ratios and both backlashes, classic beside joint."""
+    summary, rows = e.fit.summary, []
+    for direction in DIRECTIONS:
+        classic = None if e.classic is None else e.classic.directions[direction]
+        told = "no experiment" if e.classic is not None else "not applicable"
+        if classic is not None:
+            told = f"{concise(classic.mean_deg_per_step, classic.u_gum_deg_per_step or 0.0)}, n = {classic.n}"
+        rows.append([f"{direction}, deg/step", *_cells(summary.effective[direction]), told])
+    for axis in AXES:
+        told = CLASSIC_BLIND if e.classic is not None else "not applicable"
+        rows.append([f"backlash {axis}, deg", *_cells(summary.parameters[f"backlash_deg.{axis}"]), told])
+    pose = summary.reference_pose_deg
+    caption = f"Degrees of the beam per motor step at pan {pose['pan']:.2f} deg, tilt {pose['tilt']:.2f} deg, and play"
+    return TableView(caption, ["", "joint value(u)", "95 % interval", "half of it", "classic value(u)"], rows)
+
+
+def _cells(estimate: Estimate | None) -> list[str]:
+    """Value, interval and its half."""
+    if estimate is None:
+        return ["never moved", "", ""]
+    low, high = estimate.interval95
+    interval = interval_text(low, high, estimate.sd)
+    return [concise(estimate.value, estimate.sd), interval, two_digits(0.5 * (high - low))]
+
+
+def both_estimators(e: Evidence) -> FigureView:
+    """Ratios of both estimators with their intervals."""
+    return figure_view(
+        figures.intervals(e.fit.summary, e.classic),
+        "Ratios of both estimators with 95 % intervals; values in the table beside it",
+        "Effective ratios, joint (circles) and classic (triangles).",
+    )
+
+
+def distances(e: Evidence) -> list[Number]:
+    """How far 3D points are off at the stated range, by estimator."""
+    below = {name: float(np.quantile(v, 0.95)) for name, v in e.distances_mm.items()}
+    note = f"95 % of 3D errors {e.range_mm:g} mm away stay below this"
+    return [Number(f"{name} calibration", _mm(below[name]), note) for name in OF_ESTIMATOR if name in below]
+
+
+def _mm(value: float) -> str:
+    return f"{two_digits(value)} mm" if value < 100 else f"{value:.0f} mm"
+
+
+def warnings_of(e: Evidence) -> list[str]:
+    """What must be known before the numbers are used; the verdict and what to do next say the rest."""
+    summary = e.fit.summary
+    found = list(summary.problems)
+    if summary.estimator == "laplace":
+        found.append("Intervals are those of the Laplace approximation: too short for a backlash seen at few stops.")
+    if e.campaign.header.get("synthetic"):
+        found.append("The campaign is synthetic: made by the digital twin, not measured.")
+    if e.campaign.stereo.assumed:
+        found.append("The stereo calibration's covariance is assumed, not estimated.")
+    found += [f"Prior conflict: {text}" for text in summary.prior_conflicts]
+    return found
