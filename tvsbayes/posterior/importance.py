@@ -1,8 +1,8 @@
 """The posterior by importance sampling: independent draws from a proposal that follows it, weighted (formulation 4.3).
 
-Pilot rounds of draws in the coordinates w of `posterior.transport` teach the proposal: pooled, each draw weighted by the
-target over the mixture of all proposals that made them, the balance heuristic (Veach and Guibas, SIGGRAPH 95, 419; Owen
-and Zhou, J. Am. Stat. Assoc. 95 (2000) 135), so that a poor first round costs little. They take no part in the
+Pilot rounds of draws in the coordinates w of `posterior.transport` teach the proposal: pooled, each draw weighted by
+the target over the mixture of all proposals that made them, the balance heuristic (Veach and Guibas, SIGGRAPH 95, 419;
+Owen and Zhou, J. Am. Stat. Assoc. 95 (2000) 135), so that a poor first round costs little. They take no part in the
 posterior: a proposal fitted to a draw is high where that draw is, whose weight would come out too small (Marin, Pudlo
 and Sedki, Bernoulli 25 (2019) 1977).
 """
