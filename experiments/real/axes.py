@@ -3,6 +3,7 @@
     python -m experiments.real.axes run FOLDER                        # tables as experiments.real.axis_files takes them
     python -m experiments.real.axes simulate --n 100 --cores 0 1      # drawn axes of three protocols, resumable
     python -m experiments.real.axes table > experiments/real/axes.md
+    python -m experiments.real.axes figure                            # of what `run` found, for data/docs/real.md
 
 `run` leaves every position of every table out in turn and foretells the mean of its readings in each direction: by the
 model with error and play as processes of position, and by the first edition's: offset, scale, play and independent
@@ -16,6 +17,7 @@ import argparse
 from pathlib import Path
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from experiments.common.command_line import parser
 from experiments.common.rows import append_row, output, read_rows, run_rows
@@ -28,6 +30,7 @@ from tvsbayes.single_axis.simulated_axis import simulate_axis
 from tvsbayes.statistics.chances import binomial_bounds, rms_bounds
 
 HELD, DRAWN = output(__file__, "axes_held.jsonl"), output(__file__, "axes_drawn.jsonl")
+FIGURE = Path("data/docs/real_axes.png")
 LEVELS = (0.5, 0.95)
 QUANTITIES = ("per_command", "backlash")
 PROTOCOLS = {
@@ -153,15 +156,34 @@ def table(_: argparse.Namespace) -> None:
             print("| " + " | ".join([*cells, str(sum(bool(r["problems"]) for r in rows))]) + " |")
 
 
+def figure(_: argparse.Namespace) -> None:
+    """Z of every inner position that was left out, by axis, for both models."""
+    rows = [row for row in read_rows(HELD) if not row["end"]]
+    names = list(dict.fromkeys(row["axis"] for row in rows))
+    made = Figure(figsize=(7.2, 3.0), layout="constrained")
+    axes = made.subplots()
+    axes.axhspan(-1.96, 1.96, color="tab:blue", alpha=0.15, linewidth=0)
+    for shift, key, colour, label in (
+        (-0.12, "z", "tab:blue", "processes of position"),
+        (0.12, "classic_z", "tab:red", "line, play, independent stops"),
+    ):
+        place = [names.index(row["axis"]) + shift for row in rows]
+        axes.plot(place, [row[key] for row in rows], "o", markersize=3, color=colour, alpha=0.7, label=label)
+    axes.set_xticks(range(len(names)), names, fontsize=8)
+    axes.set_ylabel("(mean - predicted) / u")
+    axes.legend(frameon=False, fontsize=8)
+    made.savefig(FIGURE, dpi=90)
+
+
 def main() -> None:
     """Do what the command line asks for."""
     made = parser(__doc__)
-    made.add_argument("action", choices=("run", "simulate", "table"))
+    made.add_argument("action", choices=("run", "simulate", "table", "figure"))
     made.add_argument("folder", type=Path, nargs="?", help="of tables, for run")
     made.add_argument("--n", type=int, default=100, help="drawn axes of each protocol (%(default)s)")
     made.add_argument("--cores", type=int, nargs="+", default=[0], metavar="CORE")
     arguments = made.parse_args()
-    {"run": run, "simulate": simulate, "table": table}[arguments.action](arguments)
+    {"run": run, "simulate": simulate, "table": table, "figure": figure}[arguments.action](arguments)
 
 
 if __name__ == "__main__":

@@ -48,6 +48,15 @@ def table_1() -> dict[str, tuple[float, float, int]]:
         }
 
 
+def test_the_package_has_all_of_data_but_the_real_pictures():
+    """Each folder by name: one that is left out of the list would be missing from an installed package."""
+    project = tomllib.loads((DATA.parent / "pyproject.toml").read_text(encoding="utf-8"))
+    listed = project["tool"]["hatch"]["build"]["targets"]["wheel"]["force-include"]
+    folders = {path.name for path in DATA.iterdir() if path.is_dir()} - {"real"}
+    assert listed == {f"data/{name}": f"tvsbayes/data/{name}" for name in folders}
+    assert not [path for path in DATA.iterdir() if path.is_file()]
+
+
 def test_reference_values_are_the_papers():
     """Table 1 and the worked example as formulation 1 quotes them, with their origin."""
     assert table_1() == {

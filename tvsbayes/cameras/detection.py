@@ -25,9 +25,9 @@ from pathlib import Path
 import numpy as np
 
 from tvsbayes.cameras.contour import Rectified, contour_of, epipolar_refused, rectified_pair
-from tvsbayes.cameras.spot_fit import Centre, Located, centre_of, fit_spot, skewness
-from tvsbayes.cameras.spot_noise import CONTRAST_DEFAULT, SpotNoise, learn_noise
-from tvsbayes.cameras.spot_window import CLIPPED_SHARE_MAX, Patch, patch_around
+from tvsbayes.cameras.spot_fit import Centre, Located, centre_of, fit_spot, skewness, with_own_noise
+from tvsbayes.cameras.spot_noise import CONTRAST_DEFAULT, SHAPE_SPOTS_MIN, SpotNoise, learn_noise, mean_noise
+from tvsbayes.cameras.spot_window import CLIPPED_SHARE_MAX, WIDE_SD_PX, Patch, patch_around
 from tvsbayes.errors import InputError, NothingToEstimate, escaped, refusal
 from tvsbayes.files.disk import make_folder, read_bytes, write_atomically
 from tvsbayes.files.images import IMAGE_BYTES_MAX, decode_image, image_size, in_grey_levels, png_bytes, white_level
@@ -341,7 +341,8 @@ def _relearned(
     for number, camera in enumerate(CAMERAS):
         good = [pair[number] for pair in pairs if pair[number].status in ("ok", "misshapen")]
         skews = [centre.skews for centre in good if centre.skews is not None]
-        if skews:
+        wide = all(min(centre.axes_px) >= WIDE_SD_PX for centre in good)
+        if len(skews) >= SHAPE_SPOTS_MIN or (skews and not wide):
             table = np.stack(skews)
             result[camera] = learn_noise(table[:: -(-len(table) // SKEW_SPOTS_MAX)], speckle_contrast)
     return result
@@ -393,7 +394,12 @@ def _contrast(given: float | None) -> float:
 
 
 def _learned(patches: Sequence[Patch], speckle_contrast: float | None) -> SpotNoise:
-    """The noise of one camera from some of its spots: weights follow what is learned, so a few rounds."""
+    """The noise of one camera from some of its spots: weights follow what is learned, so a few rounds.
+
+    Too few spots show no scatter between looks; the pixels of wide ones then tell what they can.
+    """
+    if 0 < len(patches) < SHAPE_SPOTS_MIN and all(patch.wide for patch in patches) and speckle_contrast is None:
+        return mean_noise([with_own_noise(patch)[1] for patch in patches])
     noise = SpotNoise(speckle_contrast=_contrast(speckle_contrast))
     for _ in range(LEARNING_ROUNDS):
         fits = [(fitted, patch) for patch in patches if (fitted := fit_spot(patch, noise)) is not None]

@@ -30,7 +30,8 @@ BORDER_SDS = 3.0
 """A spot cut off nearer than this has lost what tells its place."""
 SKEW_LIMIT = 80.0
 """Largest sum of a spot's four standardised squared skew residuals (normal: one in 10^15; speckle has longer tails)."""
-OWN_ROUNDS = 2
+OWN_REACH = 3.5
+"""Sds of a wide spot, each way, within which its pixels tell its noise."""
 SKEW_SHAPE_MAX = 0.15
 """Up to this amplitude a spot may be skewed where there is no other one to compare with: half a Gaussian has 0.17, the
 worst of nine real beams 0.13."""
@@ -260,20 +261,23 @@ def skewness(fitted: _Fitted, patch: Patch) -> np.ndarray:
 
 
 def with_own_noise(patch: Patch) -> tuple[Patch, SpotNoise]:
-    """A patch and its noise by its own pixels; its skew is taken for the beam's shape up to `SKEW_SHAPE_MAX`."""
-    noise, fitted = SpotNoise(speckle_contrast=0.0), None
-    for _ in range(OWN_ROUNDS):
-        fitted = fit_spot(patch, noise)
-        if fitted is None:
-            return patch, SpotNoise()
-        v, u = np.indices(patch.raw.shape)
-        x, y = u - (fitted.centre_px[0] - patch.corner[0]), v - (fitted.centre_px[1] - patch.corner[1])
-        (p, q), (_, r) = fitted.precision
-        signal = fitted.height_dn * np.exp(-(p * x * x + 2 * q * x * y + r * y * y) / 2)
-        own = pixel_noise(patch.raw - signal, signal, patch.raw < CLIPPED_DN, patch.background_variance, patch.mono)
-        patch, noise = replace(patch, background_variance=own.background_dn2), own.noise
-    skew = skewness(fitted, patch)[:, 0] if fitted is not None else np.zeros(4)
-    return patch, replace(noise, skew=tuple(np.clip(skew, -SKEW_SHAPE_MAX, SKEW_SHAPE_MAX).tolist()))
+    """A wide patch and its noise by its own pixels; its skew is taken for the beam's shape up to `SKEW_SHAPE_MAX`."""
+    # The weights of a wide spot know no noise, so any will do for this fit.
+    fitted = fit_spot(patch, SpotNoise())
+    if fitted is None:
+        return patch, SpotNoise()
+    height, width = patch.raw.shape
+    low = np.maximum(np.floor(fitted.centre_px - patch.corner - OWN_REACH * patch.start_sd_px), 0).astype(int)
+    high = np.minimum(low + int(2 * OWN_REACH * patch.start_sd_px) + 1, (width, height))
+    raw = patch.raw[low[1] : high[1], low[0] : high[0]]
+    x = np.arange(low[0], high[0], dtype=np.float32) - np.float32(fitted.centre_px[0] - patch.corner[0])
+    y = np.arange(low[1], high[1], dtype=np.float32)[:, None] - np.float32(fitted.centre_px[1] - patch.corner[1])
+    (p, q), (_, r) = fitted.precision.astype(np.float32)
+    signal = np.float32(fitted.height_dn) * np.exp(-(p * x * x + 2 * q * x * y + r * y * y) / 2)
+    own = pixel_noise(raw - signal, signal, raw < CLIPPED_DN, patch.background_variance, patch.mono)
+    patch = replace(patch, background_variance=own.background_dn2)
+    skew = skewness(fitted, patch)[:, 0]
+    return patch, replace(own.noise, skew=tuple(np.clip(skew, -SKEW_SHAPE_MAX, SKEW_SHAPE_MAX).tolist()))
 
 
 def centre_of(patch: Patch | str, noise: SpotNoise) -> Centre:
@@ -316,6 +320,6 @@ def find_spot(picture: np.ndarray, noise: SpotNoise | None = None) -> Centre:
             which has no speckle whose grain is wider than a few pixels; of a narrow one the priors' medians.
     """
     patch = patch_around(in_grey_levels(picture))
-    if noise is None and not isinstance(patch, str) and patch.wide:
+    if noise is None and not isinstance(patch, str) and patch.wide and patch.clipped_share <= CLIPPED_SHARE_MAX:
         patch, noise = with_own_noise(patch)
     return centre_of(patch, noise or SpotNoise())

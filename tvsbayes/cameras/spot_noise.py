@@ -6,6 +6,7 @@ DN = grey levels of 8 bits; pictures (height, width, 3), blue, green, red, uint8
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -147,6 +148,13 @@ def pixel_noise(
     excess = np.maximum(mean - background, 0.0)
     gain, contrast2 = nnls(np.column_stack((level, level**2)) * weight[:, None], excess * weight)[0]
     return PixelNoise(SpotNoise(max(float(gain), OWN_GAIN_MIN_DN), float(np.sqrt(contrast2))), background)
+
+
+def mean_noise(found: Sequence[SpotNoise]) -> SpotNoise:
+    """One camera's noise from that of a few pictures: means of variances, the middle of the shapes."""
+    gain = float(np.mean([noise.gain_dn for noise in found]))
+    contrast = float(np.sqrt(np.mean([noise.speckle_contrast**2 for noise in found])))
+    return SpotNoise(gain, contrast, tuple(np.median([noise.skew for noise in found], axis=0).tolist()))
 
 
 def is_mono(picture: np.ndarray) -> bool:

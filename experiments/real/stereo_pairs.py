@@ -1,0 +1,194 @@
+"""What does `stereo` say of pictures that others took, beside OpenCV's joint calibration, and is its covariance true?
+
+    python -m experiments.real.stereo_pairs > experiments/real/stereo_pairs.md
+    python -m experiments.real.stereo_pairs FOLDER --board 9x6 --pitch-mm 25       # any other set
+
+The shipped pairs by default, with a figure. No truth is needed: cv2.stereoCalibrate from the same corners with the same
+coefficients, all free; halves of the pairs against each other by the covariance that both state; then the same pairs
+spoiled in known ways: left k with right k + 1, corners turned by half a turn, boards missing.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+from matplotlib.figure import Figure
+from scipy import stats
+
+from experiments.common.command_line import parser
+from tvsbayes.cameras.boards import Board, View, Views, corner_orders, find_views
+from tvsbayes.cameras.stereo_calibration import StereoCalibration, calibrate_stereo
+from tvsbayes.errors import TvsError
+
+PAIRS, FIGURE = Path("data/real/stereo/bumblebee2"), Path("data/docs/real_stereo.png")
+SHIPPED_BASELINE_MM = 120.05
+"""|T| of `stereo.yaml`, which came with the pairs: another program, other coefficients, no uncertainty."""
+SPLITS = 60
+
+
+@dataclass(frozen=True)
+class Joint:
+    """What cv2.stereoCalibrate finds with everything free: rms over corners, px, and |T|, mm."""
+
+    rms_px: float
+    baseline_mm: float
+
+
+@dataclass(frozen=True)
+class Halves:
+    """Two calibrations against each other by what both state: chi-square per parameter, z of every one."""
+
+    chi2: float
+    z: np.ndarray
+
+
+def pairs_of(views: Sequence[View]) -> list[View]:
+    """Views that both cameras saw."""
+    return [view for view in views if view.left is not None and view.right is not None]
+
+
+def opencv_joint(views: Sequence[View], board: Board, size: tuple[int, int]) -> Joint:
+    """OpenCV's calibration from the same corners."""
+    points = [board.points_mm.astype(np.float32)] * len(views)
+    sides = [[np.asarray(getattr(view, side), np.float32) for view in views] for side in ("left", "right")]
+    alone = [cv2.calibrateCamera(points, seen, size, None, None)[1:3] for seen in sides]
+    ends = cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 300, 1e-12
+    found = cv2.stereoCalibrate(
+        points, *sides, *alone[0], *alone[1], size, flags=cv2.CALIB_USE_INTRINSIC_GUESS, criteria=ends
+    )
+    return Joint(float(found[0]), float(np.linalg.norm(found[6])))
+
+
+def against(one: StereoCalibration, other: StereoCalibration) -> Halves:
+    """The difference of two calibrations in what they state."""
+    covariance = one.stereo.parameter_covariance + other.stereo.parameter_covariance
+    sds = np.sqrt(np.diag(covariance))
+    free = sds > 0
+    z = ((one.stereo.vector - other.stereo.vector) / np.where(free, sds, 1))[free]
+    correlation = (covariance / np.outer(np.where(free, sds, 1), np.where(free, sds, 1)))[np.ix_(free, free)]
+    return Halves(float(z @ np.linalg.solve(correlation, z)) / int(free.sum()), z)
+
+
+def split(views: Sequence[View], first: Sequence[int], board: Board, size: tuple[int, int]) -> Halves:
+    """Calibrations of some views and of the others."""
+    parts = [[view for k, view in enumerate(views) if (k in set(first)) == which] for which in (True, False)]
+    one, two = (calibrate_stereo(part, board, size) for part in parts)
+    return against(one, two)
+
+
+def spoiled(views: Sequence[View], board: Board) -> dict[str, list[View]]:
+    """The pairs in ways in which they must not be believed, or must be put right."""
+    after = [*views[1:], views[0]]
+    shifted = [replace(view, right=later.right) for view, later in zip(views, after, strict=True)]
+    turned = [replace(view, right=view.right[corner_orders(board)[1]]) for view in views if view.right is not None]
+    half = len(views) // 2
+    return {
+        "as they are": list(views),
+        "every left k with right k + 1": shifted,
+        "the first pair so": [shifted[0], *views[1:]],
+        "the first three so": [*shifted[:3], *views[3:]],
+        "more than half so": [*shifted[: half + 1], *views[half + 1 :]],
+        "right corners of one pair turned by half a turn": [turned[0], *views[1:]],
+        "of all pairs": turned,
+        "board unseen by the right camera twice": [replace(view, right=None) for view in views[:2]] + list(views[2:]),
+        "four pairs only": list(views[:4]),
+    }
+
+
+def said(views: Sequence[View], board: Board, size: tuple[int, int]) -> str:
+    """A row: what comes of views."""
+    try:
+        found = calibrate_stereo(views, board, size)
+    except TvsError as error:
+        return f"| refused: {error.message} | | | |"
+    names = [", ".join(part) or "none" for part in (found.excluded, found.reordered)]
+    baseline = f"{np.linalg.norm(found.stereo.T):.2f} ({found.baseline_sd_mm:.2f})"
+    return f"| {found.stereo.rms_px:.3f} | {baseline} | {names[0]} | {names[1]} |"
+
+
+def draw(splits: Sequence[Halves], named: Halves) -> None:
+    """Z of all parameters of all splits beside the normal one, and chi-square by split."""
+    figure = Figure(figsize=(8.0, 3.2), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    z, x = np.concatenate([one.z for one in splits]), np.linspace(-4, 4, 161)
+    left.hist(z, np.arange(-4.25, 4.5, 0.5), density=True, color="tab:blue", alpha=0.6, label="halves")
+    left.plot(x, stats.norm.pdf(x), color="black", linewidth=1, label="stated")
+    left.set_xlabel("difference of two halves / stated sd, 24 parameters")
+    left.legend(frameon=False)
+    parameters = len(splits[0].z)
+    chi2 = np.sort([one.chi2 for one in splits])
+    share = (np.arange(len(chi2)) + 0.5) / len(chi2)
+    right.plot(stats.chi2(parameters).ppf(share) / parameters, chi2, ".", color="tab:blue", label="random halves")
+    right.axhline(named.chi2, color="tab:red", linewidth=0.8, label="odd against even")
+    right.plot([0.3, 2.2], [0.3, 2.2], color="black", linewidth=0.8)
+    right.set_xlabel("chi-square per parameter, expected")
+    right.set_ylabel("found")
+    right.legend(frameon=False)
+    figure.savefig(FIGURE, dpi=90)
+
+
+def report(found: Views, board: Board, folder: Path) -> None:
+    """The page."""
+    size = (found.image_width, found.image_height)
+    shipped = folder == PAIRS
+    views = pairs_of(found.views)
+    ours, theirs = calibrate_stereo(views, board, size), opencv_joint(views, board, size)
+    baseline = float(np.linalg.norm(ours.stereo.T))
+    print("# Real stereo pairs\n")
+    if shipped:
+        print(
+            "![Differences of halves of the pairs in stated standard uncertainties](../../data/docs/real_stereo.png)\n"
+        )
+    print(
+        f"Written by `python -m experiments.real.stereo_pairs`: {len(views)} pairs of `{folder}`, {size[0]} x {size[1]}"
+    )
+    print(
+        f"board {board.columns} x {board.rows}, squares of {board.pitch_mm:g} mm. Found in one picture only: ", end=""
+    )
+    print(f"{len(found.views) - len(views)}; no board: {', '.join(found.without_board) or 'none'}.\n")
+    print("| | rms px | baseline mm |\n|---|---|---|")
+    print(f"| `stereo` | {ours.stereo.rms_px:.5f} | {baseline:.3f}, u {ours.baseline_sd_mm:.3f} |")
+    print(f"| cv2.stereoCalibrate {cv2.__version__} | {theirs.rms_px:.5f} | {theirs.baseline_mm:.3f} |")
+    print(f"| ours / theirs | {ours.stereo.rms_px / theirs.rms_px:.6f} | {baseline / theirs.baseline_mm:.6f} |\n")
+    if shipped:
+        away = (baseline - SHIPPED_BASELINE_MM) / ours.baseline_sd_mm
+        print(f"The calibration that came with them has {SHIPPED_BASELINE_MM} mm: {away:+.1f} stated sds from ours.\n")
+    if len(views) >= 8:
+        rng = np.random.default_rng(1)
+        named = split(views, range(0, len(views), 2), board, size)
+        splits = [split(views, rng.permutation(len(views))[: len(views) // 2], board, size) for _ in range(SPLITS)]
+        chi2 = np.array([one.chi2 for one in splits])
+        z = np.concatenate([one.z for one in splits])
+        print(
+            f"Halves, chi-square per parameter: {chi2.mean():.2f} on average of {SPLITS} random splits (median ", end=""
+        )
+        print(
+            f"{np.median(chi2):.2f}, largest {chi2.max():.2f}), RMS z {np.sqrt(np.mean(z**2)):.2f}; odd against even ",
+            end="",
+        )
+        print(f"{named.chi2:.2f}.\n")
+        if shipped:
+            draw(splits, named)
+    print("| pairs | rms px | baseline mm (u) | left out | put into another order |\n|---|---|---|---|---|")
+    for what, changed in spoiled(views, board).items():
+        print(f"| {what} {said(changed, board, size)}")
+
+
+def main() -> None:
+    """Print the page of a set of pairs."""
+    made = parser(__doc__)
+    made.add_argument("folder", type=Path, nargs="?", default=PAIRS)
+    made.add_argument("--board", default="4x6", help="inner corners (%(default)s)")
+    made.add_argument("--pitch-mm", type=float, default=30.0, help="side of a square (%(default)s)")
+    arguments: argparse.Namespace = made.parse_args()
+    board = Board.named(arguments.board, arguments.pitch_mm)
+    report(find_views(arguments.folder, board), board, arguments.folder)
+
+
+if __name__ == "__main__":
+    main()
