@@ -283,7 +283,7 @@ SPOILT = {
     ),
     # In the command.
     "check of the folder above": WrongInput(
-        nothing, "check CAMPAIGN/..", ("no campaign.toml", "campaigns in it: mine"), 2
+        nothing, "check CAMPAIGN/..", ("campaign.toml: found no such file", "campaigns in it: mine"), 2
     ),
     "check of a part": WrongInput(nothing, "check CAMPAIGN/moves.csv", ("a part of a campaign", "check "), 2),
     "rig and plan exchanged": WrongInput(

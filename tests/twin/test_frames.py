@@ -39,7 +39,7 @@ def test_an_interrupted_run_goes_on(runs, tmp_path, monkeypatch):
     monkeypatch.setattr(frames, "cpu_count", lambda: 1)
     with pytest.raises(KeyboardInterrupt):
         write_with_frames(tmp_path / "begun", runs[0], 5, views=0)
-    with pytest.raises(InputError, match=r"no campaign\.toml .* an unfinished run"):
+    with pytest.raises(InputError, match=r"campaign\.toml: found no such file .* an unfinished run"):
         read_campaign(tmp_path / "begun")
     monkeypatch.setattr(frames, "render_spots", render)
     kept = tmp_path / "begun" / "frames" / "000000_left.png"

@@ -186,7 +186,7 @@ def _unpaired_lines(seen: ViewedFolder, found: PairedLooks, rows: str) -> list[s
     }
     lines = [f"{few(names)}: {why}" for why, names in files.items() if names]
     if found.without:
-        lines.append(f"{rows} {listed(found.without, NAMES_LISTED)}: no pictures")
+        lines.append(f"{rows} {listed(found.without, NAMES_LISTED)}: no pictures, which they need not have")
     return lines
 
 

@@ -328,7 +328,7 @@ def _no_campaign(folder: Path) -> InputError:
         remedy = f"name one of the campaigns in it: {names}{' ...' * (len(below) > 5)}"
     elif (folder / "frames").is_dir() or (folder / "log.jsonl").is_file():
         remedy = "an unfinished run: go on with the command that began it (`simulate`, or `acquire --resume`)"
-    found, allowed = f"no campaign.toml in {escaped(str(folder), 200)}", "the folder of a campaign"
+    found, allowed = f"no such file in {escaped(str(folder), 200)}", "the folder of a campaign"
     return refusal("missing-file", file="campaign.toml", found=found, allowed=allowed, remedy=remedy)
 
 
