@@ -1,0 +1,103 @@
+"""Pictures that others took: stereo pairs and laser beams, whose truth nobody knows but whose laws hold."""
+
+from __future__ import annotations
+
+import json
+import shutil
+
+import cv2
+import numpy as np
+import pytest
+
+from experiments.real.beams import beam_of
+from experiments.real.stereo_pairs import SHIPPED_BASELINE_MM, opencv_joint
+from tvsbayes.cameras.boards import Board, find_views
+from tvsbayes.cameras.stereo_calibration import calibrate_stereo
+from tvsbayes.cli.main import run
+from tvsbayes.files.disk import shipped_data
+from tvsbayes.files.images import read_image
+
+REAL = shipped_data() / "real"
+PAIRS, BEAMS = REAL / "stereo" / "bumblebee2", REAL / "spots"
+BOARD, SIZE = Board(4, 6, 30.0), (640, 480)
+
+if not REAL.is_dir():
+    pytest.skip("data/real is in the repository only", allow_module_level=True)
+
+
+@pytest.fixture(scope="module")
+def views():
+    return find_views(PAIRS, BOARD).views
+
+
+@pytest.fixture(scope="module")
+def calibration(views):
+    return calibrate_stereo(views, BOARD, SIZE)
+
+
+def test_pairs_are_calibrated_as_opencv_does(views, calibration):
+    """The minimum of one sum of squares: equal far within a standard error, 0.09 mm."""
+    theirs = opencv_joint(views, BOARD, SIZE)
+    assert len(views) == calibration.pairs == 11 and calibration.excluded == calibration.reordered == ()
+    assert calibration.stereo.rms_px == pytest.approx(theirs.rms_px, rel=1e-4)
+    baseline = np.linalg.norm(calibration.stereo.T)
+    assert abs(baseline - theirs.baseline_mm) < 0.01 * calibration.baseline_sd_mm
+    # Another program's, with two coefficients fewer: 1.8 standard uncertainties; three would be a find.
+    assert abs(baseline - SHIPPED_BASELINE_MM) < 3 * calibration.baseline_sd_mm
+
+
+def test_columns_and_rows_may_be_exchanged(calibration):
+    """6 x 4 for 4 x 6: corners in another order in all pictures, the same cameras."""
+    found = find_views(PAIRS, Board(6, 4, 30.0))
+    other = calibrate_stereo(found.views, Board(6, 4, 30.0), SIZE)
+    # The classic finder starts at other corners and ends a hundredth of a pixel beside.
+    assert abs(other.stereo.rms_px - calibration.stereo.rms_px) < 0.002
+    z = (other.stereo.vector - calibration.stereo.vector) / np.sqrt(np.diag(calibration.stereo.parameter_covariance))
+    assert np.abs(z).max() < 0.2
+
+
+@pytest.mark.parametrize("names", ("cam{camera}/{view:04d}.jpg", "take_{view}_{letter}.jpg"))
+def test_pairs_of_two_moments_are_refused_by_the_command(tmp_path, capsys, names):
+    """Left k with right k + 1, under other names than ours."""
+    for k in range(11):
+        for camera, letter, number in ((0, "L", k + 1), (1, "R", (k + 1) % 11 + 1)):
+            place = tmp_path / names.format(camera=camera, letter=letter, view=k)
+            place.parent.mkdir(exist_ok=True)
+            side = "left" if camera == 0 else "right"
+            shutil.copy(PAIRS / f"{side}{number:02d}.jpg", place)
+    code = run(["stereo", str(tmp_path), "--board", "4x6", "--pitch-mm", "30", "--json"])
+    error = json.loads(capsys.readouterr().out)["error"]
+    assert code == 3 and error["code"] == "pairs-disagree" and "taken together" in error["remedy"]
+
+
+def test_pictures_without_the_board_are_named_and_left_out(tmp_path, capsys):
+    for path in PAIRS.glob("*.jpg"):
+        shutil.copy(path, tmp_path)
+    cv2.imwrite(str(tmp_path / "right03.jpg"), np.full((480, 640), 90, np.uint8))
+    (tmp_path / "left07.jpg").unlink()
+    deep = read_image(tmp_path / "left01.jpg").astype(np.uint16) * 16
+    cv2.imwrite(str(tmp_path / "left01.png"), deep)
+    (tmp_path / "left01.jpg").unlink()
+    code = run(["stereo", str(tmp_path), "--board", "4x6", "--pitch-mm", "30", "--json"])
+    found = json.loads(capsys.readouterr().out)
+    assert code == 0 and found["pairs"] == 9 and found["without_board"] == ["right03.jpg"]
+    assert found["unpaired"] == ["right07.jpg"] and found["rms_px"] < 0.1
+
+
+@pytest.mark.parametrize("name", ("t-348mm", "t-770mm", "TEM00_140mm"))
+def test_parts_of_a_beam_agree_as_they_say(name):
+    """8 and 16 bits; 30 degrees of freedom: 1 / sqrt(60) of the root, of which three are 0.4."""
+    beam = beam_of(BEAMS / f"{name}.png")
+    assert beam.statuses == {"ok": 16} and beam.whole.status == "ok"
+    assert 0.6 < beam.rms < 1.4
+
+
+def test_deep_pictures_stay_deep():
+    """1977 different values, far more than 8 bits hold."""
+    picture = read_image(BEAMS / "TEM00_140mm.png")
+    assert picture.dtype == np.uint16 and len(np.unique(picture)) == 1977
+
+
+@pytest.mark.parametrize("name, reason", (("FBWR_151", "clipped"), ("sb_259mm_10", "two-spots")))
+def test_beams_that_tell_no_centre_are_refused(name, reason):
+    assert beam_of(BEAMS / f"{name}.png").whole.status == reason
