@@ -19,6 +19,7 @@ from tvsbayes.estimators.four_point import ClassicResult, classic
 from tvsbayes.instrument.axes import AXES, DIRECTIONS, HOME_APPROACH, Axis
 from tvsbayes.instrument.campaign import Campaign
 from tvsbayes.metrology.look_budget import Budget, budget, coordinate_budget
+from tvsbayes.report.spot_pictures import SpotCrop, spot_crops
 from tvsbayes.results.comparison_record import CANNOT_TELL, HoldOut, stored_hold_out
 from tvsbayes.results.fit_record import FitEvidence, FitRecord
 from tvsbayes.results.metrology_tables import BudgetTable
@@ -116,6 +117,7 @@ class Evidence:
         budget: of a point at that range.
         point: the same for its least certain coordinate, by parameter.
         gears: what they repeat over the counters, by axis; none where they do not vary.
+        crops: of a few spots, where there are frames.
     """
 
     campaign: Campaign
@@ -130,6 +132,7 @@ class Evidence:
     budget: Budget
     point: BudgetTable
     gears: tuple[GearBand, ...]
+    crops: tuple[SpotCrop, ...] = ()
 
     @property
     def shown(self) -> FitEvidence:
@@ -188,6 +191,7 @@ def gather(
         budget=own,
         point=coordinate_budget(own, calibration, point.tolist(), least),
         gears=gear_bands(calibration),
+        crops=spot_crops(campaign, fit.summary.suspect_spots),
     )
 
 

@@ -15,6 +15,7 @@ from tvsbayes.report import figures
 from tvsbayes.report.advice import asks_for_looks
 from tvsbayes.report.fit_text import agreement_line, sampling_line
 from tvsbayes.report.result_tables import gap_table, hold_out_table
+from tvsbayes.report.spot_pictures import spot_gallery
 from tvsbayes.report.tables import FigureView, Section, TableView, concise, figure_view, interval_text
 from tvsbayes.results.estimates import Cause, Validation
 
@@ -69,6 +70,14 @@ def setup_section(e: Evidence) -> Section:
             "Data coverage. What lies outside of it is extrapolated.",
         ),
     ]
+    if e.crops:
+        listed = ", ".join(dict.fromkeys(str(crop.spot) for crop in e.crops))
+        view = figure_view(
+            spot_gallery(e.crops),
+            f"Cut-outs of the pictures of spots {listed}, a cross at each centre",
+            "Spots as the cameras saw them, by number; suspect ones first. Red cross: the centre that was used.",
+        )
+        views.append(view)
     return Section("Set-up and data", tables=[TableView("What was measured", [], rows)], figures=views)
 
 
