@@ -30,6 +30,7 @@ IGNORED = [
     ("stereo --import a.yml --finder sector --swap", "--finder and --swap are for pictures"),
     ("stereo --import a.yml --fix-k3 --robust", "--fix-k3 and --robust are for pictures"),
     ("acquire r.toml p.csv o --centroids", "--centroids is for the twin"),
+    ("acquire r.toml p.csv o --emulate", "--emulate is for the twin"),
     ("acquire r.toml p.csv o --seed 0", "--seed is for the twin"),
     ("acquire r.toml p.csv o --simulate --laser-class 3B", "--laser-class is for a laser"),
     ("acquire r.toml p.csv o --target-u 1e-4 --no-estimate", "--target-u needs the fits"),

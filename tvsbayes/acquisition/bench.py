@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import cast
 
 from tvsbayes.acquisition.drivers import cameras_of, connect_trigger, positioner_of
+from tvsbayes.acquisition.emulated_instrument import EmulatedInstrument
 from tvsbayes.acquisition.journal import LOG, read_journal
 from tvsbayes.acquisition.journal_events import Moved
 from tvsbayes.acquisition.observation import CameraObserver, Detector, Observer, TwinObserver, wait_for_detection
@@ -28,6 +29,7 @@ from tvsbayes.cameras.virtual_camera import VirtualCamera
 from tvsbayes.files.disk import write_atomically
 from tvsbayes.instrument.campaign import Campaign
 from tvsbayes.instrument.rig import Rig
+from tvsbayes.positioner.emulated_board import EmulatedBoard
 from tvsbayes.positioner.interface import Clock, Positioner
 from tvsbayes.twin.true_rig import pan_and_tilt
 
@@ -105,7 +107,9 @@ def hardware(rig: Rig, detector: Detector, operator: Operator) -> Iterator[Bench
 
 
 @contextmanager
-def simulated(rig: Rig, seed: int, before: Recorded, vision: Vision) -> Iterator[Bench]:
+def simulated(
+    rig: Rig, seed: int, before: Recorded, vision: Vision, board: EmulatedBoard | None = None
+) -> Iterator[Bench]:
     """The twin on the device model; with a renderer, seen through a virtual camera.
 
     Args:
@@ -113,8 +117,10 @@ def simulated(rig: Rig, seed: int, before: Recorded, vision: Vision) -> Iterator
         seed: of everything random.
         before: what the journal holds of earlier runs.
         vision: how its pictures are made and seen.
+        board: runs the firmware itself, in real time, in the place of its model.
     """
-    instrument = Instrument(rig, seed, before.starts)
+    starts = before.starts
+    instrument = Instrument(rig, seed, starts) if board is None else EmulatedInstrument(rig, seed, starts, board)
     positioner, clock = instrument.positioner(), instrument.clock
     # Virtual time goes on where the last run stood.
     start = SIMULATED_START + datetime.timedelta(seconds=max((move.time_s for move in before.moves), default=0.0))

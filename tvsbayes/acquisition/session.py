@@ -24,6 +24,7 @@ from tvsbayes.instrument.counter_limits import LIMIT_KEYS
 from tvsbayes.instrument.plan import PlanStep, run_plan
 from tvsbayes.instrument.rig import Rig
 from tvsbayes.instrument.stops import legs_of
+from tvsbayes.positioner.emulated_board import EmulatedBoard
 from tvsbayes.positioner.protocol import LIMIT_SETTINGS, SETTINGS
 
 
@@ -33,6 +34,7 @@ def acquire(
     folder: Path,
     *,
     simulate: bool = False,
+    emulate: bool = False,
     resume: bool = False,
     laser_class: str | None = None,
     seed: int = 0,
@@ -47,6 +49,7 @@ def acquire(
         plan: its steps.
         folder: new or empty; with `resume` the folder of the interrupted run.
         simulate: the twin instead of hardware; `truth.json` is written beside the campaign.
+        emulate: of a simulation: the firmware runs on an emulated processor, in real time.
         resume: go on with an interrupted run.
         laser_class: states that the hazard is known; without it the operator is asked once.
         seed: of a simulation.
@@ -55,7 +58,7 @@ def acquire(
         terminal: where to speak and to ask; by default nothing is shown.
 
     Raises:
-        InputError: a plan this rig cannot run, another plan than before, nobody to ask.
+        InputError: a plan this rig cannot run, another plan than before, nobody to ask, no emulator.
         DeviceFault: device, camera or disk failed.
     """
     folder, vision, terminal = Path(folder), vision or Vision(), terminal or Terminal()
@@ -66,7 +69,8 @@ def acquire(
     with ExitStack() as stack:
         # Device and cameras first: what cannot be opened leaves no folder behind.
         if simulate:
-            bench = stack.enter_context(simulated(rig, seed, before, vision))
+            board = stack.enter_context(EmulatedBoard()) if emulate else None
+            bench = stack.enter_context(simulated(rig, seed, before, vision, board))
         else:
             operator = TerminalOperator(stop, terminal, laser_class)
             bench = stack.enter_context(hardware(rig, vision.detector, operator))

@@ -98,6 +98,7 @@ class EmulatedBoard:
         self._folder = tempfile.TemporaryDirectory(prefix="tvsbayes-board-")
         self._process: subprocess.Popen[bytes] | None = None
         self._files: list[int] = []
+        self._monitor: Any = None
         try:
             self._start(Path(self._folder.name))
         except BaseException:
@@ -115,6 +116,8 @@ class EmulatedBoard:
         if self._process is not None:
             self._process.kill()
             self._process.wait()
+        if self._monitor is not None:
+            self._monitor.close()
         for number in self._files:
             os.close(number)
         self._files.clear()
