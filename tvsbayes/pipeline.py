@@ -153,7 +153,7 @@ def calibrate(
     from tvsbayes.estimators.joint_fit import fit_stages
 
     place = None if folder is None else Path(folder)
-    fitting = {FITTING: sum(fit_stages(model.robust).values())}
+    fitting = {FITTING: sum(fit_stages(model.robust, campaign.moves).values())}
     with Job(fitting | _later_stages(sampled, tier, place), progress) as job:
         found = fit_joint(campaign, model=model, seed=seed, progress=job.part(FITTING))
         posterior, files = None, {}

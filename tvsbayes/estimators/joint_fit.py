@@ -7,7 +7,7 @@ results are handed out in the units of the names: deg, mm, px, rad.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 
@@ -19,12 +19,13 @@ from jaxtyping import Bool
 from tvsbayes.display import Shown, View
 from tvsbayes.errors import NotConverged, NothingToEstimate
 from tvsbayes.estimators.campaign_arrays import CampaignArrays, in_sight, place_arrays
+from tvsbayes.estimators.homing_evidence import WORTH_A_FIT, most_fits, weighed
 from tvsbayes.estimators.likelihood import prior_errors_at_places
 from tvsbayes.estimators.linear_spots import Linearised, StopInformation, leave_one_out_chi2
 from tvsbayes.estimators.mode_search import GATE_PROBABILITY, Problem, held_by, search_stages
 from tvsbayes.instrument.axes import AXES
-from tvsbayes.instrument.campaign import Campaign, ordered_spots
-from tvsbayes.instrument.homing import ANYWHERE, every_way, homed, prior_chance, unrecorded, ways
+from tvsbayes.instrument.campaign import Campaign, Move, ordered_spots
+from tvsbayes.instrument.homing import ANYWHERE, Sides, homed, prior_chance, unrecorded
 from tvsbayes.instrument.model_choice import AS_STATED, ModelChoice
 from tvsbayes.instrument.parameters import INDEX, NAMES, RIG_NAMES, Prior
 from tvsbayes.instrument.places import PLACES_MAX, line_share, seen_places
@@ -32,7 +33,7 @@ from tvsbayes.instrument.stops import legs_of
 from tvsbayes.model.compiled import placed
 from tvsbayes.model.headlines import Derived, SeenLine, derived_quantities, told_of
 from tvsbayes.model.parameter_space import ParameterSpace
-from tvsbayes.progress import Job, Show
+from tvsbayes.progress import Advance, Job, Show
 from tvsbayes.results.stored_draws import StoredMode
 from tvsbayes.statistics.chances import chi2_quantile
 from tvsbayes.statistics.intervals import NORMAL_95
@@ -45,16 +46,18 @@ MISFIT_LIMIT = 20.0
 counters, not noise."""
 
 
-WORTH_A_FIT = 1e-3
-"""Probability from which a way of homing takes part in the posterior."""
 NEWTON, DIAGNOSING = "Newton steps to the mode", "diagnosing the fit"
 LAST_SECONDS = {NEWTON: 0.8, DIAGNOSING: 0.3}
 """After the search: what progress foretells with."""
+HOMING = "weighing ways of homing"
+HOMING_SECONDS = 1.5
+"""Of the fit under one way."""
 
 
-def fit_stages(robust: bool) -> dict[str, float]:
+def fit_stages(robust: bool, moves: Sequence[Move]) -> dict[str, float]:
     """Stages of a fit, with seconds."""
-    return search_stages(robust) | LAST_SECONDS
+    ways = most_fits(unrecorded(moves))
+    return search_stages(robust) | LAST_SECONDS | ({HOMING: HOMING_SECONDS * ways} if ways else {})
 
 
 @dataclass(frozen=True)
@@ -231,7 +234,11 @@ def fit(
         "the fit left the region where the model is finite",
         remedy="check for swapped cameras or wrong counters, or state the extrinsics better in [rig.prior]",
     )
-    with jax.enable_x64(True), ThreadPoolExecutor(1) as executor, Job(fit_stages(model.robust), progress) as job:
+    with (
+        jax.enable_x64(True),
+        ThreadPoolExecutor(1) as executor,
+        Job(fit_stages(model.robust, campaign.moves), progress) as job,
+    ):
         problem = Problem(campaign, table, used)
         if not problem.free.any():
             raise NothingToEstimate(
@@ -250,51 +257,43 @@ def fit(
             job.begin(DIAGNOSING)
             found = fit_at(campaign, problem, mode, seed)
             axes = unrecorded(campaign.moves)
-            return _by_homing(found, problem, axes, seed) if axes and found.converged else found
+            if not axes or not found.converged:
+                return found
+            job.begin(HOMING)
+            return _by_homing(found, problem, axes, seed, job.at)
         except np.linalg.LinAlgError as error:
             raise diverged from error
 
 
-def _by_homing(found: JointFit, problem: Problem, axes: tuple[str, ...], seed: int) -> JointFit:
+def _by_homing(found: JointFit, problem: Problem, axes: tuple[str, ...], seed: int, advance: Advance) -> JointFit:
     """The fit under the most probable way of homing, with all that count.
-
-    Ways of one axis are weighed with the other axis' homing left open, then together where both may matter.
 
     Args:
         found: under "anywhere" for every axis.
         problem: that it came from.
         axes: whose sides nobody recorded.
         seed: of the Laplace draws.
+        advance: told how far it is.
     """
-    known: dict[tuple[tuple[str, str], ...], JointFit] = {}
+    open_sides = dict.fromkeys(axes, ANYWHERE)
+    known = {tuple(sorted(open_sides.items())): replace(found, sides=open_sides)}
 
-    def under(sides: Mapping[str, str]) -> JointFit:
+    def under(sides: Sides) -> JointFit:
         key = tuple(sorted(sides.items()))
         if key not in known:
             known[key] = _fit_under(found, problem, sides, seed)
+            advance(len(known) / most_fits(axes))
         return known[key]
 
-    def evidence(fits: Mapping[str, str]) -> float:
-        return under(fits).laplace_evidence
-
-    open_sides = dict.fromkeys(axes, ANYWHERE)
-    known[tuple(sorted(open_sides.items()))] = replace(found, sides=open_sides)
-    alone = {axis: {side: evidence({**open_sides, axis: side}) for side in ways(axis)} for axis in axes}
-    foreseen = [(sides, sum(alone[axis][side] for axis, side in sides.items())) for sides in every_way(axes)]
-    highest = max(value for _, value in foreseen)
-    told = [(sides, evidence(sides)) for sides, value in foreseen if value > highest + np.log(WORTH_A_FIT)]
-    values = np.array([value for _, value in told])
-    chance = np.exp(values - values.max())
-    chance /= chance.sum()
-    order = np.argsort(-chance)
-    best = under(told[order[0]][0])
+    told = weighed(axes, lambda sides: under(sides).laplace_evidence)
     alternatives = tuple(
-        Alternative(told[k][0], float(chance[k]), under(told[k][0]) if chance[k] > WORTH_A_FIT else None) for k in order
+        Alternative(way.sides, way.probability, under(way.sides) if way.probability > WORTH_A_FIT else None)
+        for way in told
     )
-    return replace(best, alternatives=alternatives)
+    return replace(under(told[0].sides), alternatives=alternatives)
 
 
-def _fit_under(found: JointFit, problem: Problem, sides: Mapping[str, str], seed: int) -> JointFit:
+def _fit_under(found: JointFit, problem: Problem, sides: Sides, seed: int) -> JointFit:
     """The fit if the axes came home in these ways, from the mode of another."""
     own = Problem(
         homed(found.campaign, sides), problem.table, np.asarray(found.arrays.spots.valid)[: len(problem.spots)] > 0
