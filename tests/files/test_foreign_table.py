@@ -78,6 +78,28 @@ def bomb() -> bytes:
     return stream.getvalue()
 
 
+def workbook(sheet: str) -> bytes:
+    """A workbook whose one sheet has this XML inside."""
+    stream, made = io.BytesIO(), io.BytesIO()
+    openpyxl.Workbook().save(stream)
+    name = "http://schemas.openxmlformats.org/spreadsheetml/2006/main"
+    with zipfile.ZipFile(stream) as old, zipfile.ZipFile(made, "w", zipfile.ZIP_DEFLATED) as new:
+        for part in old.namelist():
+            own = f'<worksheet xmlns="{name}">{sheet}</worksheet>'
+            new.writestr(part, own if part == "xl/worksheets/sheet1.xml" else old.read(part))
+    return made.getvalue()
+
+
+def test_a_stated_size_of_a_sheet_is_not_believed(tmp_path):
+    cell = '<sheetData><row r="1"><c r="A1"><v>1</v></c></row></sheetData>'
+    table = written(tmp_path / "t.xlsx", workbook(f'<dimension ref="A1:XFD1048576"/>{cell}'))
+    assert table.columns == {"column 1": ("1",)}
+
+
+LAST = '<sheetData><row r="1048576"><c r="A1048576"><v>1</v></c></row></sheetData>'
+"""One cell in the last row that there can be."""
+
+
 @pytest.mark.parametrize(
     ("data", "match"),
     [
@@ -85,12 +107,14 @@ def bomb() -> bytes:
         (b"\xd0\xcf\x11\xe0 old", "save it as XLSX"),
         (b"PK\x03\x04 cut", "damaged XLSX"),
         (bomb(), "when unpacked"),
+        (workbook(LAST), "at most 200000 rows"),
+        (workbook("<sheetData><row>&x;</row></sheetData>"), "undefined entity"),
         (b"\x89PNG\r\n\x1a\n\0\0\x01", "binary data"),
         (b'a,b\n"1,2\n', "close every quote"),
         (b",".join(b"1" for _ in range(300)), "at most 200 columns"),
         (b"a,b\n" + b"1,2\n" * 200_001, "at most 200000 rows"),
     ],
-    ids=["empty", "xls", "zip", "bomb", "png", "quote", "wide", "long"],
+    ids=["empty", "xls", "zip", "bomb", "last row", "entity", "png", "quote", "wide", "long"],
 )
 def test_what_is_no_table_is_refused(tmp_path, monkeypatch, data, match):
     monkeypatch.setattr(foreign_table, "UNPACKED_BYTES_MAX", 999_999)

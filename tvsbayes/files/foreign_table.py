@@ -26,6 +26,8 @@ COLUMNS_MAX = 200
 UNPACKED_BYTES_MAX = 512 * 1024 * 1024
 """Of all parts of an XLSX file together, as they state themselves."""
 CELL_CHARS_MAX = 1000
+CELLS_MAX = 10_000_000
+"""Of a sheet, empty ones before the last of each row included."""
 SEPARATORS = {"\t": "tabs", ";": "semicolons", "|": "bars", ",": "commas", " ": "spaces"}
 """In the order in which they are tried: a decimal comma must not pass for one between cells."""
 ROWS_TRIED = 50
@@ -166,11 +168,14 @@ def _sheet_rows(data: bytes, file: str, sheet: str | None) -> tuple[list[tuple[i
         warnings.simplefilter("ignore")
         try:
             book = openpyxl.load_workbook(io.BytesIO(data), read_only=True, data_only=True)
-            names = book.sheetnames
+            # Charts have sheets of their own, without cells.
+            names = [table.title for table in book.worksheets]
             if sheet is not None and sheet not in names:
                 listed_names = ", ".join(escaped(name) for name in names)
                 raise bad("sheet", found=f"no sheet {escaped(sheet)}", allowed=listed_names, remedy="name one of them")
             for name in [sheet] if sheet is not None else names:
+                # What a sheet says of its size is believed otherwise, and rows are filled up to it.
+                book[name].reset_dimensions()
                 rows = _cells(book[name].iter_rows(values_only=True), file)
                 if any(any(cells) for _, cells in rows):
                     break
@@ -184,11 +189,12 @@ def _sheet_rows(data: bytes, file: str, sheet: str | None) -> tuple[list[tuple[i
 
 def _cells(rows: Iterable[tuple[object, ...]], file: str) -> list[tuple[int, list[str]]]:
     """Cells of a sheet as text."""
-    found = []
+    found, cells = [], 0
     for number, row in enumerate(rows, start=1):
-        if number > CSV_ROWS_MAX + 1 or len(row) > COLUMNS_MAX * 100:
-            allowed, remedy = f"at most {CSV_ROWS_MAX} rows", "save the table alone in a file"
-            raise refusal("size", file=file, found="more rows", allowed=allowed, remedy=remedy)
+        cells += len(row)
+        if number > CSV_ROWS_MAX + 1 or cells > CELLS_MAX:
+            allowed, remedy = f"at most {CSV_ROWS_MAX} rows, {CELLS_MAX} cells", "save the table alone in a file"
+            raise refusal("size", file=file, found="more", allowed=allowed, remedy=remedy)
         found.append((number, [_cell(value) for value in row]))
     return found
 
