@@ -77,7 +77,8 @@ def unusable(summary: FitSummary) -> TvsError | None:
     if not summary.headline_informed:
         return NothingToEstimate(
             "uninformed",
-            "the spots tell no more about any effective ratio than the priors do (contraction below 0.1 everywhere)",
+            "the spots tell no more about any effective ratio than the priors do: they took away less than a tenth "
+            "of its variance",
             remedy="observe stops before and after moves of both axes",
         )
     return None

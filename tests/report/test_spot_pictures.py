@@ -50,6 +50,6 @@ def test_damaged_and_missing_pictures_cost_nobody_the_report(pictured):
     first = pictured.path / frame_name(seen(pictured)[0].spot, "left")
     first.write_bytes(b"no picture")
     crops = spot_crops(pictured, (seen(pictured)[0].spot,))
-    assert [(crop.spot, crop.camera) for crop in crops][0] == (seen(pictured)[0].spot, "right")
+    assert (crops[0].spot, crops[0].camera) == (seen(pictured)[0].spot, "right")
     assert spot_crops(replace(pictured, path=None), ()) == ()
     assert spot_crops(small_campaign(), ()) == ()

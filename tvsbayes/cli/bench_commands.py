@@ -74,9 +74,9 @@ def stereo(
 ) -> None:
     """Calibrate the camera pair from checkerboard pictures. With the covariance of all 24 parameters; or import one."""
     known = (export, ("opencv", "ros")), (finder, ("classic", "sector")), (import_unit, ("mm", "m"))
-    if any(value not in (None, *allowed) for value, allowed in known):
+    if odd := [escaped(str(value)) for value, allowed in known if value not in (None, *allowed)]:
         remedy = "--export opencv or ros, --finder classic or sector, --import-unit mm or m"
-        raise InputError("usage", "an option has a value that it does not know", remedy=remedy)
+        raise InputError("usage", f"{', '.join(odd)}: no option of stereo takes this value", remedy=remedy)
     if (folder is None) == (not imports):
         found = "stereo needs pictures of a board, or a calibration to import"
         found = found if folder is None else "stereo takes pictures or a calibration to import, not both"

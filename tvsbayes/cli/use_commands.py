@@ -209,9 +209,9 @@ def plan(
     minutes: Annotated[float | None, typer.Option("--minutes", min=0.1, help="Longest plan.")] = None,
     out: Annotated[Path | None, typer.Option("-o", "--out", help="Write the plan here (plan.csv).")] = None,
     output: OldOut = None,
-    criterion: Annotated[str, typer.Option("--criterion", help="c (the target), D or A (all headlines).")] = "c",
+    criterion: Annotated[str, typer.Option("--criterion", help="c (the target), D or A (all results).")] = "c",
     aperture: Annotated[bool, typer.Option("--aperture/--no-aperture", help="Looks also read the aperture.")] = False,
-    draws: Annotated[int, typer.Option("--draws", min=20, max=10_000, help="Instruments for the assurance.")] = 200,
+    draws: Annotated[int, typer.Option("--draws", min=20, max=10_000, help="Instruments for the chances.")] = 200,
     seed: Seed = 0,
     as_json: Json = False,
 ) -> None:

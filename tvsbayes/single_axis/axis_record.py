@@ -266,7 +266,8 @@ def uninformed(summary: AxisSummary) -> TvsError | None:
         return None
     return NothingToEstimate(
         "uninformed",
-        "the readings tell no more about the unit per command than its prior does (contraction below 0.1)",
+        "the readings tell no more about the unit per command than its prior does: they took away less than a tenth "
+        "of its variance",
         remedy="read stops farther apart, or state a wider prior",
     )
 
