@@ -53,10 +53,8 @@ def new(
     names = write_templates(out)
     text = f"{escaped(str(out), 200)}: {', '.join(names)}\n"
     text += "next: put stereo.json beside them, log moves and spots, then `tvsbayes check` this folder\n"
-    text += (
-        "you have pictures of the spots: `tvsbayes new` this folder --pictures FOLDER, once moves.csv is filled in\n"
-    )
-    text += "you have a table: `tvsbayes import FILE --to` another folder"
+    text += "pictures of the spots: fill in moves.csv, then `tvsbayes new` this folder again with --pictures FOLDER\n"
+    text += "a table of your own: `tvsbayes import FILE --to` this folder"
     finish({"campaign": str(out), "files": names}, text, as_json)
 
 
