@@ -15,6 +15,7 @@ from experiments.robustness.faults import (
     instrument,
     planning,
     pointing,
+    presentation,
     sampling,
 )
 from experiments.robustness.faults.fault import Fault
@@ -28,6 +29,7 @@ FAULTS: tuple[Fault, ...] = (
     *planning.FAULTS,
     *instrument.FAULTS,
     *axis.FAULTS,
+    *presentation.FAULTS,
 )
 
 
