@@ -20,14 +20,6 @@ FAULTS = (
         ("positioner/grbl",),
     ),
     Fault(
-        "GRBL: an interrupted order's ok taken for the next one's",
-        "positioner/grbl.py",
-        "        self._resynchronise()\n",
-        "        self._pending = 0\n",
-        "laser off is believed before it was heard",
-        ("positioner/grbl",),
-    ),
-    Fault(
         "GenICam: pictures from before the request",
         "cameras/genicam.py",
         "                _drain(acquirer)\n",
