@@ -125,6 +125,18 @@ def test_interrupt_is_130(say, monkeypatch):
     assert "interrupted" in log
 
 
+def test_interrupt_after_the_command_is_130_too(monkeypatch):
+    """Between the end of a command and the end of the process."""
+
+    def interrupted(arguments):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("tvsbayes.cli.main.run", interrupted)
+    with pytest.raises(SystemExit) as ended:
+        main()
+    assert ended.value.code == 130
+
+
 @pytest.mark.parametrize(("blocks", "kept"), [(0, False), (1, True)])
 def test_an_interrupted_fit_says_how_to_go_on_where_a_chain_is_kept(say, monkeypatch, blocks, kept):
     """The chain is told of once when it begins; before its first block of steps there is none to keep."""

@@ -61,6 +61,12 @@ def test_notations_of_others():
     assert degrees.spots[0].aperture_deg == 1.5
 
 
+def test_rows_without_pixels_are_moves_without_a_look():
+    found = looks("0 0 1 2 3 4", "50 0 - - - -", "20 0 1 2 3 4", header="Pan Tilt XL YL XR YR")
+    assert [m.pan_steps for m in found.moves] == [0, 50, 20]
+    assert [(s.spot, s.move) for s in found.spots] == [(0, 0), (2, 2)]
+
+
 def test_dates_become_seconds_and_stated_spreads_stay():
     found = looks("0 0 1 2 3 4 0.3 2026-01-02T03:04:05", "9 0 1 2 3 4 0.4 2026-01-02T03:05:07",
                   header="Pan Tilt XL YL XR YR std_XL time")  # fmt: skip

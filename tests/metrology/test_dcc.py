@@ -12,6 +12,7 @@ from dataclasses import replace
 import pytest
 from support.certified_campaign import certified, texts
 from support.dcc_structure import local, structure_problems
+from support.refusals import refusal
 
 from tvsbayes.errors import InputError, NotConverged
 from tvsbayes.instrument.campaign import input_hashes
@@ -238,6 +239,7 @@ def test_what_must_not_be_certified_is_refused():
     for country in ("de", "DEU", "", "D\n"):
         with pytest.raises(InputError, match="country"):
             made.certificate(parties=Parties(country=country))
+    assert "two letters" in refusal(lambda: made.certificate(parties=Parties(country="Mexico"))).remedy
     root = made.root(parties=Parties(country="MX"))
     assert set(texts(root, ".//dcc:countryCode")) == {"MX"} and "country" not in declared(root)
     assert COUNTRY_NOT_STATED in declared(made.root())["country"][0]

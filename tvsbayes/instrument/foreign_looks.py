@@ -179,6 +179,10 @@ def _moves(cells: _Cells, notation: Notation, assumed: list[str]) -> tuple[tuple
         assumed.append("time_s: no column, so 0, 1, 2 ...; drift of the zero is then per move")
     if "pan_approach" not in cells and "unknown" in notation.approach:
         assumed.append("approach: unknown; say how the axes came to the first row, --pan-approach left or right ...")
+    if any(field in cells for field in PIXELS):
+        assumed.append(
+            "moves: those of the table; rows without pixels are moves without a look, which play remembers too"
+        )
     if notation.relative:
         assumed.append("counters: summed up, because --relative says that each is the steps of its move")
     return tuple(moves), of_row
@@ -236,6 +240,9 @@ def _spots(cells: _Cells, of_row: Sequence[int], notation: Notation, assumed: li
     spots = []
     for row, move in enumerate(of_row):
         centre = [column[row] for column in pixels]
+        if not statuses[row] and all(value is None for value in centre):
+            # A move that nobody looked at.
+            continue
         status = _status(statuses[row], centre, cells, row)
         number = numbers[row] if unique else row
         reading = readings[row] if readings[row] is None or not radians else math.degrees(readings[row] or 0.0)
