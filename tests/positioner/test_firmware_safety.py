@@ -287,3 +287,17 @@ def test_sketch_resets_itself_and_darkens_in_a_fault():
     half_seconds = int(re.search(r"kWatchdogHalfSeconds = (\d+);", sketch)[1])
     assert half_seconds * 0.5 <= 1.0, "well within the promised 2 s"
     assert sketch.index("feed_watchdog();", sketch.index("void loop()")) > 0
+
+
+def test_a_switch_that_bounces_while_it_is_left_is_left_by_the_whole_way(agreed):
+    """Twenty steps without a contact, counted anew after one."""
+    bench = Twin().homed()
+    bench.ask(5, "HOME")
+    bench.pass_time(0.05)
+    left, step = [bench.board.true_steps[0]], bench.board.step
+    bench.board.step = lambda axis, sense: (step(axis, sense), left.append(bench.board.true_steps[0]))
+    bench.order("b 0 1")
+    bench.pass_time(20)
+    assert -60 < left[0] < -45 and max(left) == left[0] + 1 + 20
+    assert bench.board.true_steps == [-60, -40]
+    agreed(bench)

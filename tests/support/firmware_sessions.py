@@ -127,6 +127,8 @@ def random_orders(seed: int) -> list[str]:
                             "MA -0 0",
                         ),
                         f"SET {rng.choice([*SETTINGS, 'xx'])} {rng.choice([-(10**9), -300, 10, 150, 900, 2**31])}",
+                        *(f"SET {name} {SETTINGS[name][1] + 1}" for name in rng.sample(sorted(SETTINGS), 2)),
+                        f"MA {rng.choice([2**31 - 1, 2**31])} {rng.choice([0, -(2**31)])}",
                         f"GET {rng.choice([*SETTINGS, 'xx'])}",
                         *("MA 1 2 3", "", "ID 1", "MA  1 2", "?" + "x" * rng.randint(0, 120)),
                     ]

@@ -1,0 +1,215 @@
+"""What does `acquire` say, and what does the laser do, when firmware or bench fail in the middle of a run?
+
+    python -m experiments.firmware.faults_on_board run      # about 40 s a fault; needs QEMU and the cross compiler
+    python -m experiments.firmware.faults_on_board table > experiments/firmware/faults_on_board.md
+
+The unchanged sketch runs on QEMU's Cortex-M7, the driver reaches it over a pseudo-terminal, the engine runs a plan of
+twelve looks with two homings between them. A fault comes at the fifth look, with the laser on, or in the motion after
+it. The laser pin is read from outside the processor; a look is counted wrongly when it counts though the motors stood
+elsewhere than the counters said.
+"""
+
+from __future__ import annotations
+
+import argparse
+import platform
+import shutil
+import threading
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from experiments.common.command_line import act, parser
+from experiments.common.rows import ROOT, append_row, commit, output, read_rows
+from tvsbayes.acquisition.bench import SIMULATED_START, Bench
+from tvsbayes.acquisition.emulated_instrument import EmulatedInstrument
+from tvsbayes.acquisition.engine import Acquisition
+from tvsbayes.acquisition.journal import read_journal
+from tvsbayes.acquisition.observation import TwinObserver
+from tvsbayes.acquisition.operator import SimulatedOperator, StopKey
+from tvsbayes.acquisition.recorder import recorded
+from tvsbayes.acquisition.session import begin
+from tvsbayes.errors import DeviceFault
+from tvsbayes.instrument.plan import PlanStep
+from tvsbayes.instrument.rig import read_rig
+from tvsbayes.positioner.emulated_board import EMULATOR, EmulatedBoard
+
+ROWS, SCRATCH = output(__file__, "faults-on-board.jsonl"), output(__file__, "faults-scratch")
+AT_LOOK = 5
+SEED = 7
+DARK_S = 6.0
+"""Longest wait for the pin to go low; the promise is 2 s."""
+IN_MOTION_S = 0.15
+
+
+@dataclass(frozen=True)
+class Fault:
+    """Orders to the bench.
+
+    Attributes:
+        name: what fails.
+        order: in the words of `firmware/emulated/board.cpp`; empty for a run in which nothing fails.
+        lit: with the laser on; otherwise in the motion that follows.
+        expected: how `acquire` must end.
+    """
+
+    name: str
+    order: str
+    lit: bool
+    expected: str
+
+
+FAULTS = (
+    Fault("none", "", False, "done"),
+    Fault("main loop hangs 0.5 s, laser on", "s 500", True, "done"),
+    Fault("main loop hangs 3 s, laser on", "s 3000", True, "reset"),
+    Fault("main loop hangs for ever, laser on", "g", True, "reset"),
+    Fault("processor faults, laser on", "f", True, "reset"),
+    Fault("reset, laser on", "r", True, "reset"),
+    Fault("limit circuit opens, laser on", "c 0 1", True, "alarm-limit"),
+    Fault("main loop hangs 0.5 s in a motion", "s 500", False, "done"),
+    Fault("processor faults in a motion", "f", False, "reset"),
+    Fault("reset in a motion", "r", False, "reset"),
+    Fault("limit circuit opens in a motion", "c 1 1", False, "alarm-limit"),
+    Fault("motor misses 7 steps", "k 0 7", False, "done"),
+    Fault("home switch dies before a homing", "e 0 1", False, "alarm-home"),
+)
+
+
+@dataclass
+class Observer:
+    """The twin's looks, with a fault at one of them, and where the motors stood at each.
+
+    Attributes:
+        instrument: the twin behind the board.
+        sd_px: of its centroids.
+        fault: what happens.
+        true: whether counters and motors agreed, look by look.
+        dark_s: time from the fault until the pin was low, None where the laser was off.
+    """
+
+    instrument: EmulatedInstrument
+    sd_px: float
+    fault: Fault
+    true: list[bool] = field(default_factory=list)
+    dark_s: float | None = None
+    timer: threading.Timer | None = None
+
+    def observe(self, positioner, spot):
+        """See `observation.Observer`."""
+        board, number = self.instrument.board, len(self.true) + 1
+        state = positioner.state()
+        self.true.append(list(self.instrument.mechanics.true_steps) == [state.pan_steps, state.tilt_steps])
+        if number == AT_LOOK and self.fault.lit:
+            positioner.laser(True)
+            board.order(self.fault.order)
+            start = time.monotonic()
+            while board.laser_pin() and time.monotonic() - start < DARK_S:
+                time.sleep(0.002)
+            self.dark_s = time.monotonic() - start
+        seen = TwinObserver(self.instrument, self.sd_px).observe(positioner, spot)
+        if number == AT_LOOK and self.fault.order and not self.fault.lit:
+            self.timer = threading.Timer(IN_MOTION_S, board.order, [self.fault.order])
+            self.timer.start()
+        return seen
+
+
+def plan() -> list[PlanStep]:
+    """Twelve looks at one sheet, moves of both axes, homed again before the eighth and the eleventh."""
+    steps: list[tuple] = [("home", 0, 0), ("move", 40, 0), ("move", 0, 0), ("place", "d1")]
+    for number in range(12):
+        if number in (7, 10):
+            steps.append(("home", 0, 0))
+        steps += [("move", 60 if number % 2 else -60, 20 * (number % 3)), ("look", number // 4, number % 4 + 1)]
+    rows = []
+    for row, (action, *rest) in enumerate(steps):
+        if action == "place":
+            rows.append(PlanStep(row, action, target=rest[0]))
+        elif action == "look":
+            rows.append(PlanStep(row, action, experiment=rest[0], point=rest[1]))
+        else:
+            rows.append(PlanStep(row, action, *rest))
+    return rows
+
+
+def run_one(fault: Fault, folder: Path) -> dict:
+    """A run with a fault, and what became of it."""
+    rig, steps = read_rig(ROOT / "data" / "rigs" / "mounted" / "rig.toml"), plan()
+    header = {"name": "faults", "created": SIMULATED_START.isoformat(), "synthetic": True, "seed": SEED}
+    with EmulatedBoard() as board:
+        instrument = EmulatedInstrument(rig, SEED, 0, board)
+        positioner = instrument.positioner()
+        observer = Observer(instrument, rig.spot_sd_px, fault)
+        operator, journal = SimulatedOperator(instrument), begin(folder, rig, steps, False, header)
+        bench = Bench(positioner, observer, operator, instrument.clock, lambda: SIMULATED_START)
+        said, message = "", ""
+        try:
+            said = Acquisition(rig, steps, journal, bench, stop=StopKey()).run().reason
+        except DeviceFault as error:
+            said, message = error.code, str(error)
+        finally:
+            positioner.close()
+            journal.close()
+        if observer.timer is not None:
+            observer.timer.join()
+        pin = board.laser_pin()
+    spots = recorded(read_journal(folder).records).spots
+    wrong = sum(spot.status == "ok" and not true for spot, true in zip(spots, observer.true, strict=False))
+    statuses = [spot.status for spot in spots]
+    counts = {status: statuses.count(status) for status in dict.fromkeys(statuses)}
+    return {
+        "said": said,
+        "message": message,
+        "dark_s": observer.dark_s,
+        "pin_at_end": pin,
+        "wrong": wrong,
+        "looks": counts,
+    }
+
+
+def run(arguments: argparse.Namespace) -> None:
+    """Every fault once."""
+    ROWS.unlink(missing_ok=True)
+    shutil.rmtree(SCRATCH, ignore_errors=True)
+    for number, fault in enumerate(FAULTS):
+        SCRATCH.mkdir(parents=True, exist_ok=True)
+        row = {
+            "fault": fault.name,
+            "expected": fault.expected,
+            "commit": commit(),
+            **run_one(fault, SCRATCH / str(number)),
+        }
+        append_row(ROWS, row)
+        print({key: row[key] for key in ("fault", "said", "dark_s", "pin_at_end", "wrong", "looks")}, flush=True)
+
+
+def table(arguments: argparse.Namespace) -> None:
+    """The page."""
+    rows = read_rows(ROWS)
+    good = [row for row in rows if row["said"] == row["expected"] and not row["pin_at_end"] and not row["wrong"]]
+    print("# Faults of firmware and bench in the middle of a run\n")
+    print(f"Commit {rows[0]['commit']}, Python {platform.python_version()}, {EMULATOR}, machine mps2-an500.\n")
+    print(
+        f"{len(good)} of {len(rows)} runs end as they must, dark, with no look counted wrongly. The laser pin is read"
+    )
+    print("from outside the processor, on a computer that was busy with other work: seconds are an upper bound.\n")
+    print(
+        "| fault | `acquire` said | pin low after | pin at the end | looks | counted wrongly |\n"
+        "|---|---|---|---|---|---|"
+    )
+    for row in rows:
+        dark = "-" if row["dark_s"] is None else f"{row['dark_s']:.2f} s"
+        looks = ", ".join(f"{count} {status}" for status, count in row["looks"].items())
+        pin = "high" if row["pin_at_end"] else "low"
+        print(f"| {row['fault']} | {row['said']} | {dark} | {pin} | {looks} | {row['wrong']} |")
+
+
+def main() -> None:
+    """The command line."""
+    made = parser(__doc__)
+    made.add_argument("action", choices=("run", "table"))
+    act(made, run=run, table=table)
+
+
+if __name__ == "__main__":
+    main()
