@@ -9,6 +9,7 @@ import sys
 
 import numpy as np
 import pytest
+from support.grbl_board import BoardLink, GrblBoard
 
 from tvsbayes.acquisition.doctor import examine
 from tvsbayes.acquisition.simulated_instrument import ModelLink, SimulatedDevice, VirtualClock
@@ -17,6 +18,7 @@ from tvsbayes.errors import DeviceFault
 from tvsbayes.files.disk import shipped_data
 from tvsbayes.instrument.rig import read_rig
 from tvsbayes.positioner.driver import SerialPositioner
+from tvsbayes.positioner.grbl import GrblPositioner, Wishes
 from tvsbayes.positioner.mechanics import Mechanics
 
 RIG = read_rig(shipped_data() / "rigs" / "mounted" / "rig.toml")
@@ -81,6 +83,23 @@ def test_healthy_instrument(tmp_path):
     assert {name for name, check in checks.items() if check.status != "ok"} == {"limits"}
     assert checks["firmware"].found == "version 1.1.0" and "rises by" in checks["laser"].found
     assert checks["timing"].found.startswith("0.6 ms, 0 of 20") and camera.closed
+
+
+def test_a_grbl_board_is_examined_by_its_own_rules(tmp_path):
+    """No version of our firmware is asked of it, and that nothing watches its laser is said."""
+    board = GrblBoard()
+    device, camera = bench()
+    checks = examine(
+        RIG,
+        tmp_path,
+        open_positioner=lambda: GrblPositioner(lambda: BoardLink(board), Wishes(), board.clock),
+        open_camera=lambda: camera,
+        clock=device.clock,
+    )
+    found = {check.name: check for check in checks}
+    assert (found["firmware"].status, found["firmware"].found) == ("ok", "version Grbl 1.1h")
+    assert "no watchdog" in found["positioner"].found and found["positioner"].remedy
+    assert (found["homing"].status, found["homing"].found) == ("warning", "alarm") and board.steps == [400, 250]
 
 
 def test_pictures_of_twelve_bits_are_judged_in_the_same_grey_levels(tmp_path):

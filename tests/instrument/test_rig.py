@@ -388,6 +388,16 @@ def test_rig_file_refusals(tmp_path, name):
     assert error.line == line and error.message.isprintable()
 
 
+def test_options_of_drivers_stand_beside_the_other_entries(tmp_path):
+    options = (
+        "settle_s = 0.2\n[positioner.options]\nlaser = 'M8'\nunwatched = true\npower = 0.5\n[cameras.options]\nn = 3"
+    )
+    rig = read_rig(write_rig(tmp_path, RIG_FILE.replace("settle_s = 0.2", options)))
+    found = {key: value for key, value in rig.positioner.items() if key.startswith("options.")}
+    assert found == {"options.laser": "M8", "options.unwatched": 1, "options.power": 0.5}
+    assert rig.cameras["options.n"] == 3 and rig.cameras["source"] == "opencv"
+
+
 def test_stereo_of_a_rig_must_not_link_outside(tmp_path):
     folder = tmp_path / "rig"
     folder.mkdir()

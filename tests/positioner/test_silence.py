@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import fcntl
 import os
 import random
 
@@ -94,6 +93,8 @@ def test_a_used_up_sequence_is_named():
 
 @needs_pseudo_terminals
 def test_a_port_that_another_program_holds_is_named():
+    import fcntl
+
     master, slave = os.openpty()
     other = os.open(os.ttyname(slave), os.O_RDWR | os.O_NOCTTY)
     fcntl.flock(other, fcntl.LOCK_EX)

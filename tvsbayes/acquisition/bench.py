@@ -100,7 +100,8 @@ def hardware(rig: Rig, detector: Detector, operator: Operator) -> Iterator[Bench
         settings = camera.settings()
         details = {"device": dict(positioner.identity), "cameras": settings.as_json()}
         observer = CameraObserver(camera, detector)
-        yield Bench(positioner, observer, operator, time, _utc_now, details, warnings=settings.warnings)
+        warnings = (*getattr(positioner, "warnings", ()), *settings.warnings)
+        yield Bench(positioner, observer, operator, time, _utc_now, details, warnings=warnings)
     finally:
         positioner.close()
         camera.close()

@@ -175,6 +175,8 @@ def _positioner(open_positioner: Callable[[], Positioner], clock: Clock) -> tupl
     if version != FIRMWARE_VERSION and "driver" not in positioner.identity:
         remedy = "flash the firmware shipped with tvsbayes; this one speaks the same protocol"
         checks = [Check("firmware", "warning", f"version {version}, shipped is {FIRMWARE_VERSION}", remedy)]
+    for warning in getattr(positioner, "warnings", ()):
+        checks.append(Check("positioner", "warning", warning, "see data/docs/instrument.md, Your own hardware"))
     times = []
     try:
         for _ in range(ROUND_TRIPS):

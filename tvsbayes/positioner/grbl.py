@@ -46,6 +46,7 @@ POLL_S = 0.1
 """Time between two status reports; GRBL's manual asks for 5 Hz to 10 Hz."""
 HOME_S = 300.0
 LINE_CHARS_MAX = 256
+NO_WATCHDOG = "a GRBL board has no watchdog: when this computer dies the laser stays on, unless something else cuts it"
 COUNTERS_MAX = 2_000_000
 """GRBL computes in single precision: beyond this a position is off by more than an eighth of a step."""
 OPTIONS = ("laser", "laser_power", "unwatched_laser")
@@ -123,6 +124,8 @@ class GrblPositioner:
         self._status: Status | None = None
         self.repeats = 0
         """Status reports asked for again."""
+        self.warnings = (NO_WATCHDOG,)
+        """What the user should know of this kind of board."""
         self._link = opened(open_link)
         try:
             self.identity: dict[str, str] = {"fw": self._greeting(), "driver": "grbl"}
