@@ -41,7 +41,7 @@ struct Board : tvs::Hooks {
   long at[2] = {0, 0}, counted[2] = {0, 0}, home[2], limit;
   bool cut[2] = {false, false}, dead[2] = {false, false}, light = false;
   uint32_t glitch_percent = 0, loss_percent = 0;
-  int stepped[2] = {0, 0};
+  int stepped[2] = {0, 0}, into_limit[2] = {0, 0};
   std::string sent;
 
   bool glitch() { return glitch_percent != 0 && random->chance(glitch_percent); }
@@ -49,6 +49,8 @@ struct Board : tvs::Hooks {
     require(axis == 0 || axis == 1, "axis");
     ++steps;
     ++stepped[axis];
+    into_limit[axis] = limit_switch(axis) ? into_limit[axis] + 1 : 0;
+    require(into_limit[axis] <= 202, "no long way with an open limit");
     if (loss_percent == 0 || !random->chance(loss_percent)) at[axis] += positive ? 1 : -1;
   }
   bool home_switch(int axis) override { return (!dead[axis] && at[axis] <= home[axis]) != glitch(); }
@@ -135,7 +137,10 @@ class Session {
     std::string line = body + tail;
     if (random_.chance(10)) line[random_.below(static_cast<uint32_t>(line.size()))] ^= static_cast<char>(1 << random_.below(8));
     if (random_.chance(5)) line += line;
+    ordered_ = words;
+    ordered_sequence_ = unnumbered ? 0 : sequence_;
     send(line);
+    ordered_sequence_ = 0;
   }
 
   void noise() {
@@ -165,11 +170,25 @@ class Session {
     const bool cached = reply.ok && reply.sequence == last_.sequence && reply.sequence != 0;
     last_ = reply;
     if (cached) return;
+    if (reply.ok) board_.into_limit[0] = board_.into_limit[1] = 0;
+    if (reply.ok && reply.sequence == ordered_sequence_ && reply.sequence != 0) obeyed(reply);
     require((reply.light == 1) == board_.light, "the reply says what the laser does");
     const bool moving = strcmp(reply.status, "moving") == 0;
     may_move_ = moving;
     if (strcmp(reply.status, "idle") != 0 && !moving) require(!board_.light, "dark unhomed and in alarm");
     if (strcmp(reply.status, "idle") == 0) require(reply.p[0] == reply.t[0] && reply.p[1] == reply.t[1], "at rest on target");
+  }
+
+  // Soft limits as they were set, and targets within them.
+  void obeyed(const Reply& reply) {
+    static const char* const kLimits[] = {"SET pmin %d", "SET pmax %d", "SET tmin %d", "SET tmax %d"};
+    int value, pan, tilt;
+    for (int i = 0; i < 4; ++i) {
+      if (sscanf(ordered_.c_str(), kLimits[i], &value) == 1) limits_[i] = value;
+    }
+    if (sscanf(ordered_.c_str(), "MA %d %d", &pan, &tilt) != 2) return;
+    require(reply.t[0] == pan && reply.t[1] == tilt, "targets as ordered");
+    require(limits_[0] <= pan && pan <= limits_[1] && limits_[2] <= tilt && tilt <= limits_[3], "targets in the limits");
   }
 
   void disturb() {
@@ -217,6 +236,9 @@ class Session {
   uint64_t now_us_ = 1, fed_us_ = 1, stepped_us_[2] = {0, 0};
   uint32_t sequence_ = 0;
   bool may_move_ = false;
+  std::string ordered_;
+  uint32_t ordered_sequence_ = 0;
+  int limits_[4] = {-1000, 1000, -500, 500};
   Reply last_;
 };
 

@@ -161,10 +161,11 @@ class EmulatedBoard:
             raise InputError("emulator", f"the firmware does not compile: {built.stderr[-300:]}", remedy=remedy)
         for end in (".in", ".out"):
             os.mkfifo(f"{hand}{end}")
+        # 256 ns an instruction: a few percent of a core, so that a busy computer is fast enough.
         # A pipe holds what nobody has read yet without holding up the board; a socket would, byte by byte.
         self._process = subprocess.Popen(
             [
-                *(*BOARD, "-kernel", str(program), "-icount", "shift=6,align=on"),
+                *(*BOARD, "-kernel", str(program), "-icount", "shift=8,align=on"),
                 *("-chardev", "pty,id=host", "-serial", "chardev:host"),
                 *("-chardev", f"pipe,id=hand,path={hand}", "-serial", "chardev:hand"),
                 *("-qmp", f"unix:{monitor},server=on,wait=off"),
