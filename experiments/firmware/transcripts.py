@@ -164,6 +164,7 @@ def table(arguments: argparse.Namespace) -> None:
     )
     print(f"on the processor, {whole['s']:.0f} s with the model's, on a computer busy with other work.\n")
     print(f"Faults of the core: {len(caught)} of {len(mutants)} caught by at most {SESSIONS} of these sessions.\n")
+    print("What no session shows, `tests/positioner/test_firmware_safety.py` does.\n")
     print("| fault | first line that differs in session |\n|---|---|")
     for row in mutants:
         print(f"| {row['mutant']} | {row['seen_in_session'] or 'none'} |")
