@@ -18,7 +18,8 @@ from matplotlib.figure import Figure
 from experiments.common.command_line import print_only
 from experiments.common.rigs import twin_campaign
 from tvsbayes.assessment.fitted_calibration import calibration_of
-from tvsbayes.coordinates.error_map import error_map, simple_calibration
+from tvsbayes.coordinates.error_map import error_map
+from tvsbayes.coordinates.simple_calibration import simple_calibration
 from tvsbayes.estimators.four_point import classic
 from tvsbayes.estimators.joint_fit import fit
 from tvsbayes.metrology.look_budget import budget

@@ -236,3 +236,33 @@ def test_damaged_results_are_refused_and_not_replaced(ask, folder):
     code, document = ask("locate", folder, *POINT)
     assert (code, document["error"]["code"]) == (2, "damaged-results")
     assert draws.stat().st_size == 1000
+
+
+@pytest.mark.parametrize("ending", ["ply", "csv"])
+def test_a_file_of_points_becomes_a_cloud(ask, folder, tmp_path, capsys, ending):
+    rows = ["tilt_steps,pan_steps,aperture_deg,pan_approach,tilt_approach"]
+    rows += ["20,100,70,left,up", "20,100,150,left,up", "-20,0,75,right,down", "20,5000,70,left,up"]
+    points, out = tmp_path / "points.csv", tmp_path / f"cloud.{ending}"
+    points.write_text("\n".join(rows) + "\n")
+    code, document = ask("locate", folder, "--points", points, "--cloud", out)
+    assert code == 0 and out.exists() and document["cloud"] == str(out)
+    entries = ask("locate", folder, "--points", points)[1]["points"]
+    seen = [entry["xyz_mm"] is not None for entry in entries]
+    assert (document["written"], document["refused"]) == (sum(seen), 4 - sum(seen))
+    assert document["refused_file"] == str(tmp_path / "cloud.refused.csv") and 0 < document["checked"]["points"] <= 4
+    assert {"x", "sd_x", "nominal_x"} <= set(document["columns"])
+    assert document["extrapolated"] == sum(e["extrapolated"] for e, good in zip(entries, seen, strict=True) if good)
+    assert run([*map(str, ("locate", folder, "--points", points, "--cloud", out))]) == 0
+    assert "cloud.refused.csv" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("options", "code", "said"),
+    [
+        ((*POINT, "--cloud", "c.ply"), "usage", "--points"),
+        (("--points", "looks.csv", "--cloud", "c.xyz"), "usage", ".ply"),
+    ],
+)
+def test_clouds_that_cannot_be_written_say_what_to_do(ask, folder, options, code, said):
+    exit_code, document = ask("locate", folder, *options)
+    assert exit_code == 2 and document["error"]["code"] == code and said in document["error"]["remedy"]

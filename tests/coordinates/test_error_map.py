@@ -12,7 +12,8 @@ from support.published_equations import published_point
 
 from tvsbayes.calibration.optics import range_components
 from tvsbayes.calibration.pointing import Calibration
-from tvsbayes.coordinates.error_map import SimpleCalibration, error_map, simple_calibration, simple_rays
+from tvsbayes.coordinates.error_map import error_map
+from tvsbayes.coordinates.simple_calibration import SimpleCalibration, simple_calibration, simple_rays
 from tvsbayes.estimators.four_point import ClassicResult, DirectionResult
 from tvsbayes.instrument.parameters import RIG_PRIORS, Prior
 from tvsbayes.twin.physics import aperture_angle_deg

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -30,46 +29,14 @@ from tvsbayes.cli.app import (
 )
 from tvsbayes.cli.progress_bar import waiting
 from tvsbayes.errors import InputError, escaped
-from tvsbayes.files.csv_table import CSV_BYTES_MAX, parse_table
-from tvsbayes.files.disk import output_place, read_bytes
+from tvsbayes.files.disk import output_place
 from tvsbayes.pipeline import FITTING, calibration_for, compile_for, fit_for
 from tvsbayes.progress import Job
 
-POINT_COLUMNS = ("pan_steps", "tilt_steps", "pan_approach", "tilt_approach", "aperture_deg")
-STEPS_MAX, ANGLE_MAX_DEG = 1e8, 360.0
 WORKERS = 2
 NEAREST_POINT_MM = 10.0
 """A point nearer to the middle of the baseline is nowhere that the beam goes, and most rooms end before 10 m."""
 PLANNING, LOCATING = "plan", "points"
-
-
-@dataclass(frozen=True)
-class Points:
-    """Looks whose points are wanted, row by row."""
-
-    pan_steps: list[float]
-    tilt_steps: list[float]
-    aperture_deg: list[float]
-    approach: list[tuple[str, str]]
-
-
-def _read_points(path: Path) -> Points:
-    """Counters, readings and approaches of a CSV of points."""
-    from tvsbayes.instrument.axes import SENSES
-
-    table = parse_table(read_bytes(path, CSV_BYTES_MAX), escaped(path.name), POINT_COLUMNS)
-    if not len(table):
-        raise InputError("empty", f"{escaped(path.name)}: no points", file=escaped(path.name), remedy="add rows")
-    for axis, directions in SENSES.items():
-        allowed = (*directions, "unknown")
-        for row, word in enumerate(table.columns[f"{axis}_approach"]):
-            if word not in allowed:
-                remedy = "name the direction of the last move of the axis"
-                raise table.refuse(row, f"{axis}_approach", "approach", ", ".join(allowed), remedy)
-    pan, tilt = (table.numbers(name, -STEPS_MAX, STEPS_MAX) for name in ("pan_steps", "tilt_steps"))
-    readings = table.numbers("aperture_deg", -ANGLE_MAX_DEG, ANGLE_MAX_DEG)
-    pairs = list(zip(table.columns["pan_approach"], table.columns["tilt_approach"], strict=True))
-    return Points(pan, tilt, readings, pairs)
 
 
 def locate(
@@ -87,6 +54,9 @@ def locate(
             "--points", help="CSV with columns pan_steps, tilt_steps, pan_approach, tilt_approach, aperture_deg."
         ),
     ] = None,
+    cloud: Annotated[
+        Path | None, typer.Option("--cloud", help="Write the points of --points here: OUT.ply or OUT.csv; any number.")
+    ] = None,
     draws: Annotated[int, typer.Option("--draws", min=500, max=100_000, help="Draws per point.")] = 1000,
     budget: Annotated[
         bool, typer.Option("--budget", help="Also what the uncertainty of the point consists of.")
@@ -99,8 +69,12 @@ def locate(
         options = {"pan_approach": pan_approach, "tilt_approach": tilt_approach, "budget": budget or None}
         counters = {"pan_steps": pan_steps, "tilt_steps": tilt_steps, "aperture_deg": aperture_deg}
         refuse_options("for one point", "leave out --points, or give the columns of its file", **options, **counters)
-        _locate_all(campaign, _read_points(points), draws, seed, as_json)
+        if cloud is None:
+            _locate_all(campaign, points, draws, seed, as_json)
+        else:
+            _write_cloud(campaign, points, cloud, draws, seed, as_json)
         return
+    refuse_options("for files of points", "give --points FILE.csv with it", cloud=cloud)
     if pan_steps is None or tilt_steps is None or aperture_deg is None:
         given = {"--pan-steps": pan_steps, "--tilt-steps": tilt_steps, "--aperture-deg": aperture_deg}
         lacking = [name for name, value in given.items() if value is None]
@@ -131,8 +105,11 @@ def locate(
     finish(document, text, as_json)
 
 
-def _locate_all(campaign: Path, points: Points, draws: int, seed: int, as_json: bool) -> None:
+def _locate_all(campaign: Path, file: Path, draws: int, seed: int, as_json: bool) -> None:
     """Every point of a file, refused one by one."""
+    from tvsbayes.coordinates.looks_file import read_looks
+
+    points = read_looks(file)
     where = (points.pan_steps, points.tilt_steps, points.aperture_deg, points.approach)
     with waiting() as progress, Job({FITTING: 1.0, LOCATING: 1.0}, progress) as job:
         calibration = calibration_for(campaign, report_line, job.part(FITTING))
@@ -143,6 +120,32 @@ def _locate_all(campaign: Path, points: Points, draws: int, seed: int, as_json: 
     entries = [found.as_json(k) for k in range(len(found.refused))]
     document = {"estimator": found.estimator, "draws": found.draws, "points": entries}
     finish(document, locations_text(found), as_json)
+
+
+def _write_cloud(campaign: Path, file: Path, place: Path, draws: int, seed: int, as_json: bool) -> None:
+    """The points of a file of any length as a cloud."""
+    from tvsbayes.coordinates.cloud import EvenSample, checked
+    from tvsbayes.coordinates.cloud import cloud as points_of
+    from tvsbayes.coordinates.cloud_files import cloud_place, write_cloud
+    from tvsbayes.coordinates.looks_file import look_blocks
+    from tvsbayes.coordinates.simple_calibration import simple_calibrations
+    from tvsbayes.estimators.four_point import classic_of
+    from tvsbayes.instrument.campaign import read_campaign
+    from tvsbayes.report.command_text import cloud_text
+
+    cloud_place(place)
+    with waiting() as progress, Job({FITTING: 1.0, LOCATING: 1.0}, progress) as job:
+        calibration = calibration_for(campaign, report_line, job.part(FITTING))
+        measured = read_campaign(campaign)
+        simple = simple_calibrations(measured.rig.priors, classic_of(measured))
+        job.begin(LOCATING)
+        sample = EvenSample()
+        blocks = points_of(calibration, sample.of(look_blocks(file, job.at)), simple)
+        written = write_cloud(blocks, place, tuple(simple))
+        law = checked(calibration, sample, draws, seed)
+    told = {"points": law.points, "held": law.held}
+    document = {"estimator": calibration.estimator, **written.as_json(), "checked": told}
+    finish(document, cloud_text(written, law), as_json)
 
 
 def steps_for(

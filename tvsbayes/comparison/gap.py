@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tvsbayes.errors import NothingToEstimate
-from tvsbayes.estimators.four_point import Selection, classic, experiment_rows, four_point_ratios, select_experiments
+from tvsbayes.estimators.four_point import Selection, classic_of, experiment_rows, four_point_ratios, select_experiments
 from tvsbayes.instrument.axes import DIRECTIONS
 from tvsbayes.instrument.parameters import names_of
 from tvsbayes.results.comparison_record import Gap, GapTerm
@@ -78,9 +77,8 @@ def explain_gap(found: JointFit, posterior: Posterior | None = None, draws: int 
     result: dict[str, Gap | None] = dict.fromkeys(DIRECTIONS)
     if not len(selection.experiments):
         return result
-    try:
-        measured = classic(found.campaign)
-    except NothingToEstimate:
+    measured = classic_of(found.campaign)
+    if measured is None:
         return result
     chosen = _chosen_draws(found, posterior, draws)
     idealised = _idealised(found, selection, chosen)

@@ -1,8 +1,7 @@
 """Errors over the work space of the nominal, the classic and the joint calibration, on the rigs that the data allow.
 
 Frame T, mm; counters in steps. The beam of each drawn rig is followed to a range, the aperture reads it, and every
-estimator is asked where the spot is. Nominal and classic users are given what is fair: a baseline shortened by the
-mirror offset, its middle moved by half of that, and readings in the convention that their equations expect. NumPy.
+estimator is asked where the spot is. NumPy.
 """
 
 from __future__ import annotations
@@ -13,61 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from tvsbayes.calibration.drawn_looks import Drawn, drawn
-from tvsbayes.calibration.optics import Components, Ray, aperture_angle_deg, range_components, unit_vector
+from tvsbayes.calibration.optics import aperture_angle_deg
 from tvsbayes.calibration.pointing import DIVERGING_SHARE, Calibration, Sides
-from tvsbayes.estimators.four_point import ClassicResult
-from tvsbayes.instrument.axes import SENSES
-from tvsbayes.instrument.parameters import RIG_PRIORS, Prior
-
-
-@dataclass(frozen=True)
-class SimpleCalibration:
-    """What a user of published equations knows: C = C0 + k n, beta = k n, no backlash (formulation 5).
-
-    Attributes:
-        deg_per_step: by direction (left, right, up, down): counters above zero were reached left or up.
-        baseline_mm: distance from the aperture to where the beam leaves the positioner, a - L.
-        origin_y_mm: where it leaves it in frame T, a/2 - L: the middle between both is moved by -L/2.
-        pan_zero_emission_deg: C0.
-        aperture_zero_deg: what the aperture's readings are corrected by.
-    """
-
-    deg_per_step: Mapping[str, float]
-    baseline_mm: float
-    origin_y_mm: float
-    pan_zero_emission_deg: float
-    aperture_zero_deg: float
-
-
-def simple_calibration(
-    priors: Mapping[str, Prior] = RIG_PRIORS, classic: ClassicResult | None = None
-) -> SimpleCalibration:
-    """The nominal calibration of stated priors, or with the classic estimator's ratios.
-
-    Directions that the classic estimator did not measure keep their nominal ratio.
-    """
-    ratios = {d: priors[f"degrees_per_step.{axis}"].value for axis, pair in SENSES.items() for d in pair}
-    if classic is not None:
-        ratios |= {d: r.mean_deg_per_step for d, r in classic.directions.items() if r is not None}
-    a, offset = priors["baseline_mm"].value, priors["mirror_offset_mm"].value
-    zeros = (priors["pan_zero_emission_deg"].value, priors["aperture_zero_deg"].value)
-    return SimpleCalibration(ratios, a - offset, 0.5 * a - offset, *zeros)
-
-
-def simple_rays(simple: SimpleCalibration, steps: np.ndarray) -> Ray:
-    """Beams, fields of shape (3, points), of a simple calibration at counters (points, 2).
-
-    The azimuth C0 + k n and the elevation k n are turned into a direction, so that either convention of the
-    aperture's angle meets it as it should.
-    """
-    steps = np.asarray(steps, dtype=float)
-    k = simple.deg_per_step
-    pan = np.where(steps[:, 0] >= 0, k["left"], k["right"]) * steps[:, 0] + simple.pan_zero_emission_deg - 90.0
-    tilt = np.where(steps[:, 1] >= 0, k["up"], k["down"]) * steps[:, 1]
-    direction = unit_vector(pan, tilt)
-    origin = np.zeros_like(direction)
-    origin[1] = simple.origin_y_mm
-    return Ray(origin, direction)
+from tvsbayes.coordinates.simple_calibration import Belief, SimpleCalibration, simple_belief
 
 
 @dataclass(frozen=True)
@@ -112,23 +59,6 @@ def _truth(
 
 
 @dataclass(frozen=True)
-class _Belief:
-    """What an estimator takes for true: its beams (points,), twice the aperture's distance from y = 0, its zero."""
-
-    beam: Components
-    baseline_mm: float
-    aperture_zero_deg: float
-
-
-def _simple_belief(simple: SimpleCalibration, pan: np.ndarray, tilt: np.ndarray) -> _Belief:
-    ray = simple_rays(simple, np.stack([pan, tilt], axis=1))
-    (x, y, z), (u, v, w) = ray.origin_mm, ray.direction
-    # `range_components` puts the aperture at half the distance given; a simple user's stands at origin - baseline.
-    aperture_mm = 2 * (simple.baseline_mm - simple.origin_y_mm)
-    return _Belief(Components((x, y, z), (u, v, w)), aperture_mm, simple.aperture_zero_deg)
-
-
-@dataclass(frozen=True)
 class _Errors:
     """Errors of one estimator over the points; fields as in `ErrorMap`, `usable` as its `valid`."""
 
@@ -138,11 +68,9 @@ class _Errors:
     usable: np.ndarray
 
 
-def _errors(belief: _Belief, truth: _Truth, azimuth: bool) -> _Errors:
-    reading = truth.aperture_deg - belief.aperture_zero_deg
-    reach = range_components(*belief.beam, belief.baseline_mm, reading, azimuth)
-    meets = np.isfinite(reach) & (reach > 0)
-    error = belief.beam.at(np.where(meets, reach, 0.0)) - truth.xyz_mm
+def _errors(belief: Belief, truth: _Truth, azimuth: bool) -> _Errors:
+    error = belief.points(truth.aperture_deg, azimuth) - truth.xyz_mm
+    meets = np.isfinite(error[0])
     kept, count = np.where(meets, error, 0.0), np.maximum(meets.sum(axis=0), 1)
     usable = (~meets).mean(axis=0) <= DIVERGING_SHARE
     square = np.sum(kept**2, axis=(0, 1)) / count
@@ -185,8 +113,8 @@ def error_map(
     truth = _truth(calibration, pan, tilt, ranges, approach, drawn(calibration, draws, seed))
     best = calibration.estimates
     beam = calibration.beam_at((pan, tilt), approach)
-    beliefs = {"joint": _Belief(beam, best["baseline_mm"], best["aperture_zero_deg"])}
-    beliefs |= {name: _simple_belief(one, pan, tilt) for name, one in simple.items()}
+    beliefs = {"joint": Belief(beam, best["baseline_mm"], best["aperture_zero_deg"])}
+    beliefs |= {name: simple_belief(one, pan, tilt) for name, one in simple.items()}
     errors = {name: _errors(belief, truth, calibration.azimuth) for name, belief in beliefs.items()}
     (pan_low, pan_high), (tilt_low, tilt_high) = calibration.range_steps
     inside = (pan >= pan_low) & (pan <= pan_high) & (tilt >= tilt_low) & (tilt <= tilt_high)

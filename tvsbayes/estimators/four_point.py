@@ -388,3 +388,11 @@ def stereo_variance(function: Callable[[Stereo, float], float], stereo: Stereo, 
     if focal_scale_u > 0:
         variance += (slope(lambda step: function(stereo, 1 + step), 0.1 * focal_scale_u) * focal_scale_u) ** 2
     return max(variance, 0.0)
+
+
+def classic_of(campaign: Campaign) -> ClassicResult | None:
+    """The same, None where no experiment is complete."""
+    try:
+        return classic(campaign)
+    except NothingToEstimate:
+        return None

@@ -9,13 +9,17 @@ from __future__ import annotations
 import csv
 import io
 import math
+import os
 import re
 from collections.abc import Iterable, Iterator, Sequence
 from functools import partial
+from itertools import islice
+from pathlib import Path
 from typing import overload
 
 from tvsbayes.errors import INTEGER, InputError, closest, escaped, refusal, shown
-from tvsbayes.files.disk import decode
+from tvsbayes.files.disk import decode, opened
+from tvsbayes.progress import Advance, unshown
 
 CSV_BYTES_MAX = 64 * 1024 * 1024
 CSV_ROWS_MAX = 200_000
@@ -163,8 +167,12 @@ class Table:
                 raise self.refuse(row, column, "duplicate", what, "renumber one of them", found)
 
 
-def _csv_rows(text: str, file: str) -> Iterator[tuple[int, list[str]]]:
-    """Rows of a CSV text with the line on which each begins."""
+def _csv_rows(text: str, file: str, skipped: int) -> Iterator[tuple[int, list[str]]]:
+    """Rows of a CSV text with the line on which each begins; `skipped` lines of the file follow its first."""
+
+    def in_file(number: int) -> int:
+        return number + (skipped if number > 1 else 0)
+
     bad = partial(refusal, file=file)
 
     def capped_lines() -> Iterator[str]:
@@ -173,7 +181,7 @@ def _csv_rows(text: str, file: str) -> Iterator[tuple[int, list[str]]]:
             line = found_line.group()
             if len(line) > CSV_LINE_CHARS_MAX:
                 found, allowed = f"{len(line)} characters in one line", f"at most {CSV_LINE_CHARS_MAX}"
-                raise bad("size", line=number, found=found, allowed=allowed, remedy="one row per line")
+                raise bad("size", line=in_file(number), found=found, allowed=allowed, remedy="one row per line")
             yield line
 
     reader = csv.reader(capped_lines(), strict=True)
@@ -182,16 +190,49 @@ def _csv_rows(text: str, file: str) -> Iterator[tuple[int, list[str]]]:
         for row in reader:
             if reader.line_num > start:
                 raise csv.Error("a line break inside a cell")
-            yield start, row
+            yield in_file(start), row
             start = reader.line_num + 1
     except csv.Error as error:
         allowed, remedy = "comma-separated cells, one row per line", 'close every quote " in its own line'
         found = escaped(str(error), 120)
-        raise bad("csv", line=start, found=found, allowed=allowed, remedy=remedy) from error
+        raise bad("csv", line=in_file(start), found=found, allowed=allowed, remedy=remedy) from error
 
 
-def parse_table(data: bytes, file: str, columns: Sequence[str], optional: Sequence[str] = ()) -> Table:
+def table_blocks(path: Path, columns: Sequence[str], rows: int, advance: Advance = unshown) -> Iterator[Table]:
+    """A CSV table with exactly `columns`, of any length, `rows` lines of it at a time.
+
+    Args:
+        path: the file.
+        columns: found by name in any order.
+        rows: at most `CSV_ROWS_MAX`.
+        advance: told which share of the file is read.
+
+    Raises:
+        InputError: as `parse_table`, in the block where it stands.
+    """
+    file, skipped = escaped(path.name), 0
+    with opened(path, "a readable file") as stream:
+        size = max(os.fstat(stream.fileno()).st_size, 1)
+        header = stream.readline(CSV_LINE_CHARS_MAX)
+        while lines := list(islice(iter(partial(stream.readline, CSV_LINE_CHARS_MAX + 1), b""), rows)):
+            yield parse_table(header + b"".join(lines), file, columns, skipped=skipped)
+            skipped += len(lines)
+            advance(stream.tell() / size)
+        if not skipped:
+            yield parse_table(header, file, columns)
+
+
+def parse_table(
+    data: bytes, file: str, columns: Sequence[str], optional: Sequence[str] = (), skipped: int = 0
+) -> Table:
     """A CSV table with exactly `columns` and any of `optional`, found by name in any order.
+
+    Args:
+        data: the header's line and rows.
+        file: name of the file.
+        columns: that must be there.
+        optional: that may.
+        skipped: how many lines of the file stand between the header and these rows.
 
     Raises:
         InputError: not UTF-8, control characters, no or a wrong header, rows of another length than it.
@@ -200,7 +241,7 @@ def parse_table(data: bytes, file: str, columns: Sequence[str], optional: Sequen
     for marks, found in (((b"PK\x03\x04",), "a workbook (XLSX)"), ((b"\xff\xfe", b"\xfe\xff"), "UTF-16")):
         if data.startswith(marks):
             raise bad("encoding", found=found, allowed="CSV as UTF-8 text", remedy=f"{FOREIGN}; or save it as UTF-8")
-    rows = _csv_rows(decode(data, file), file)
+    rows = _csv_rows(decode(data, file), file, skipped)
     _, header = next(rows, (1, []))
     allowed = "the columns " + ",".join(columns) + (f" and optionally {','.join(optional)}" * bool(optional))
     bad_header = partial(bad, line=1, allowed=allowed)

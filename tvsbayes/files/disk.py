@@ -17,11 +17,12 @@ import secrets
 import stat
 import zipfile
 import zlib
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from functools import partial
 from importlib import resources
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, BinaryIO, Protocol
 
 from tvsbayes.errors import CONTROL, InputError, escaped, refusal, shown
 
@@ -50,11 +51,41 @@ def read_bytes(path: Path, cap: int, folder: Path | None = None) -> bytes:
     Raises:
         InputError: missing, unreadable, not a regular file, outside `folder` or too large.
     """
+    allowed = f"a readable file of at most {cap} bytes"
+    with opened(path, allowed, folder) as stream:
+        size = os.fstat(stream.fileno()).st_size
+        if size > cap:
+            raise _too_large(path, f"{size} bytes", allowed)
+        # As much as there is: a read of the cap would allocate the cap for every file.
+        data = stream.read(size + 1)
+        if len(data) > size:
+            data += stream.read(cap + 1 - len(data))
+    if len(data) > cap:
+        raise _too_large(path, f"more than {cap} bytes", allowed)
+    return data
+
+
+def _too_large(path: Path, found: str, allowed: str) -> InputError:
+    remedy = "split the data or remove what is not needed"
+    return refusal("size", file=escaped(Path(path).name), found=found, allowed=allowed, remedy=remedy)
+
+
+@contextmanager
+def opened(path: Path, allowed: str, folder: Path | None = None) -> Iterator[BinaryIO]:
+    """A regular file to be read.
+
+    Args:
+        path: the file.
+        allowed: what may stand there, for messages.
+        folder: where given, the file must lie inside it after following links.
+
+    Raises:
+        InputError: missing, unreadable, not a regular file, outside `folder`; also where reading it fails.
+    """
     path = Path(path)
     file = escaped(path.name) or escaped(str(path))
 
     def bad(code: str, found: str, remedy: str) -> InputError:
-        allowed = f"a readable file of at most {cap} bytes"
         return refusal(code, file=file, found=found, allowed=allowed, remedy=remedy)
 
     try:
@@ -65,16 +96,10 @@ def read_bytes(path: Path, cap: int, folder: Path | None = None) -> bytes:
         flags = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_NOFOLLOW", 0)
         descriptor = os.open(real, flags | getattr(os, "O_BINARY", 0))
         try:
-            status = os.fstat(descriptor)
-            if not stat.S_ISREG(status.st_mode):
+            if not stat.S_ISREG(os.fstat(descriptor).st_mode):
                 raise bad("not-a-file", "a folder, pipe or device", "name a regular file")
-            if status.st_size > cap:
-                raise bad("size", f"{status.st_size} bytes", "split the data or remove what is not needed")
             with open(descriptor, "rb", closefd=False) as stream:
-                # As much as there is: a read of the cap would allocate the cap for every file.
-                data = stream.read(status.st_size + 1)
-                if len(data) > status.st_size:
-                    data += stream.read(cap + 1 - len(data))
+                yield stream
         finally:
             os.close(descriptor)
     except FileNotFoundError as error:
@@ -85,9 +110,6 @@ def read_bytes(path: Path, cap: int, folder: Path | None = None) -> bytes:
     except (OSError, ValueError) as error:
         reason = escaped(getattr(error, "strerror", None) or str(error))
         raise bad("unreadable", reason, "check the path and its permissions") from error
-    if len(data) > cap:
-        raise bad("size", f"more than {cap} bytes", "split the data or remove what is not needed")
-    return data
 
 
 def decode(data: bytes, file: str) -> str:
@@ -146,6 +168,17 @@ def write_atomically(path: Path, data: bytes) -> None:
     """Replaces `path` by `data` so that a reader, or a crash, sees the old file or the new, never a part.
 
     Raises:
+        InputError: as `written_whole`.
+    """
+    with written_whole(path) as stream:
+        stream.write(data)
+
+
+@contextmanager
+def written_whole(path: Path) -> Iterator[BinaryIO]:
+    """A stream that replaces `path` when its block ends well; else there stands what stood there before.
+
+    Raises:
         InputError: the folder is missing, full or not writable; there stands the old file, or where only the flush
             of the folder failed, the new one.
     """
@@ -154,7 +187,7 @@ def write_atomically(path: Path, data: bytes) -> None:
     try:
         try:
             with open(temporary, "xb") as stream:
-                stream.write(data)
+                yield stream
                 stream.flush()
                 os.fsync(stream.fileno())
             os.replace(temporary, path)

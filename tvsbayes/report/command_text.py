@@ -18,6 +18,8 @@ from tvsbayes.statistics.chances import ASSURED, BOUND, LEVELS, binomial_bounds,
 if TYPE_CHECKING:
     from tvsbayes.cameras.detection import Detection
     from tvsbayes.cameras.stereo_calibration import StereoCalibration
+    from tvsbayes.coordinates.cloud import LawChecked
+    from tvsbayes.coordinates.cloud_files import CloudFile
     from tvsbayes.coordinates.location import Locations
     from tvsbayes.instrument.stereo_pair import Stereo
     from tvsbayes.metrology.look_budget import Budget
@@ -235,6 +237,22 @@ def locations_text(found: Locations) -> str:
         f"frame T, {found.draws} draws ({found.estimator})", columns, [row[: len(columns)] for row in rows]
     )
     return "\n".join([table.text(), LAW, *([EXTRAPOLATED] if far else [])])
+
+
+def cloud_text(found: CloudFile, law: LawChecked) -> str:
+    """What was written, what was not, and how far its uncertainties hold."""
+    lines = [f"written: {escaped(str(found.path), 200)}, {found.points} points, frame T, mm"]
+    lines.append(f"properties: {', '.join(found.columns)}")
+    lines.append(
+        f"sds by the law of propagation (GUM); at {law.held} of {law.points} points carried by draws too it holds to a "
+        "digit or more"
+    )
+    if found.extrapolated:
+        lines.append(f"{found.extrapolated} points {EXTRAPOLATED}")
+    if found.refused_path is not None:
+        name = escaped(str(found.refused_path), 200)
+        lines.append(f"{found.refused} looks have no point: lines and reasons in {name}")
+    return "\n".join(lines)
 
 
 def budget_text(budget: Budget) -> str:

@@ -13,9 +13,9 @@ import numpy as np
 from tvsbayes.calibration.calibration_file import stored_ratios
 from tvsbayes.calibration.optics import ERROR_AT, PLAY_AT
 from tvsbayes.calibration.pointing import INPUT_NAMES, Calibration
-from tvsbayes.coordinates.error_map import ErrorMap, error_map, simple_calibration
-from tvsbayes.errors import NothingToEstimate
-from tvsbayes.estimators.four_point import ClassicResult, classic
+from tvsbayes.coordinates.error_map import ErrorMap, error_map
+from tvsbayes.coordinates.simple_calibration import simple_calibrations
+from tvsbayes.estimators.four_point import ClassicResult, classic_of
 from tvsbayes.instrument.axes import AXES, DIRECTIONS, HOME_APPROACH, Axis
 from tvsbayes.instrument.campaign import Campaign
 from tvsbayes.metrology.look_budget import Budget, budget, coordinate_budget
@@ -159,10 +159,7 @@ def gather(
         limit_deg_per_step: largest error allowed of every effective ratio.
         limit_mm: largest 3D error allowed at that range, pan and tilt in the middle of the counters seen.
     """
-    try:
-        classic_result = classic(campaign)
-    except NothingToEstimate:
-        classic_result = None
+    classic_result = classic_of(campaign)
     maps = _maps(campaign, classic_result, calibration, range_mm)
     # The middle cell of an odd number is the middle of the counters.
     cell = MAP_CELLS // 2, MAP_CELLS // 2, maps.range_mm.tolist().index(range_mm)
@@ -197,9 +194,7 @@ def gather(
 
 def _maps(campaign: Campaign, result: ClassicResult | None, calibration: Calibration, range_mm: float) -> ErrorMap:
     """Errors over the counters seen, at the stated range and the scanner's ends."""
-    simple = {"nominal": simple_calibration(campaign.rig.priors)}
-    if result is not None:
-        simple["classic"] = simple_calibration(campaign.rig.priors, result)
+    simple = simple_calibrations(campaign.rig.priors, result)
     pan, tilt = (np.linspace(low, high, MAP_CELLS) for low, high in calibration.range_steps)
     ranges = sorted({*MAP_RANGES_MM, range_mm})
     return error_map(calibration, pan, tilt, ranges, simple=simple, draws=MAP_DRAWS)

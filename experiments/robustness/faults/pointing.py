@@ -22,7 +22,7 @@ FAULTS = (
     ),
     Fault(
         "published equations with the beam on the wrong side",
-        "coordinates/error_map.py",
+        "coordinates/simple_calibration.py",
         "origin[1] = simple.origin_y_mm",
         "origin[1] = -simple.origin_y_mm",
         "nominal and classic points on the wrong side of the baseline's middle",

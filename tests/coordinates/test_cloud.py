@@ -1,0 +1,155 @@
+"""Clouds: what stands in them, what is refused, files whole or not at all, memory that does not grow."""
+
+from __future__ import annotations
+
+import csv
+import tracemalloc
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+from plyfile import PlyData
+from support.bent_rig import calibration
+
+from tvsbayes.coordinates.cloud import CHECKED_MAX, EvenSample, checked, cloud
+from tvsbayes.coordinates.cloud_files import columns_of, write_cloud
+from tvsbayes.coordinates.location import locate_linear
+from tvsbayes.coordinates.looks_file import BLOCK_ROWS, LOOK_COLUMNS, LookRows, look_blocks
+from tvsbayes.coordinates.simple_calibration import SimpleCalibration, simple_rays
+from tvsbayes.errors import InputError
+
+SIMPLE = {"nominal": SimpleCalibration({"left": 0.06, "right": 0.05, "up": 0.07, "down": 0.08}, 170.0, 70.0, 88.0, 0.0)}
+FLOAT32 = 2.0**-23
+"""Relative step of what a PLY holds."""
+ROUNDING_MM = 1e-9
+"""Of a hundred operations on lengths up to 1000 mm; in deg of an angle seen from 100 mm more than enough too."""
+BEHIND_DEG = 150.0
+"""A reading that no beam of these looks meets."""
+
+
+def looks(count: int, seed: int = 1, first_line: int = 2) -> LookRows:
+    """Drawn looks; every seventh has no point."""
+    generator = np.random.default_rng(seed)
+    pan, tilt = generator.uniform(-80, 80, count), generator.uniform(-60, 60, count)
+    reading = np.where(np.arange(count) % 7 == 6, BEHIND_DEG, generator.uniform(60, 75, count))
+    sides = zip(generator.choice(["left", "right"], count), generator.choice(["up", "down"], count), strict=True)
+    approach = tuple((str(one), str(other)) for one, other in sides)
+    lines = range(first_line, first_line + count)
+    return LookRows(tuple(lines), tuple(pan.tolist()), tuple(tilt.tolist()), tuple(reading.tolist()), approach)
+
+
+def test_points_are_those_of_the_law_and_of_the_published_equations():
+    one, rows = calibration(), looks(50)
+    (block,) = cloud(one, [rows], SIMPLE)
+    law = locate_linear(one, rows.settings)
+    seen = np.isfinite(law.value).all(axis=1)
+    np.testing.assert_array_equal(block.xyz_mm, law.value[seen])
+    np.testing.assert_array_equal(block.sd_mm, np.sqrt(np.diagonal(law.covariance[seen], 0, 1, 2)))
+    np.testing.assert_array_equal(block.lines, np.arange(2, 52)[seen])
+    assert [each.line for each in block.refused] == [2 + k for k in range(6, 50, 7)]
+    assert {each.error.code for each in block.refused} == {"diverging"}
+    # What a simple calibration says lies on its beam, and the aperture, 170 mm from the beam's origin, reads the angle.
+    ray = simple_rays(SIMPLE["nominal"], rows.settings.steps[seen])
+    along = block.simple_xyz_mm["nominal"].T - ray.origin_mm
+    np.testing.assert_allclose(np.cross(along, ray.direction, axis=0), 0.0, atol=ROUNDING_MM)
+    sight = block.simple_xyz_mm["nominal"] - [0.0, 70.0 - 170.0, 0.0]
+    angle = np.degrees(np.arccos(sight[:, 1] / np.linalg.norm(sight, axis=1)))
+    np.testing.assert_allclose(angle, np.array(rows.aperture_deg)[seen], atol=ROUNDING_MM)
+
+
+def test_both_formats_hold_the_same_and_a_foreign_reader_opens_them(tmp_path):
+    one, blocks = calibration(), [looks(40), looks(30, seed=2, first_line=42)]
+    ply, table = (
+        write_cloud(cloud(one, blocks, SIMPLE), tmp_path / f"c.{kind}", ["nominal"]) for kind in ("ply", "csv")
+    )
+    assert (ply.points, ply.refused) == (61, 9) == (table.points, table.refused)
+    vertices = PlyData.read(str(ply.path))["vertex"].data
+    assert vertices.dtype.names == columns_of(["nominal"]) == ply.columns
+    with open(table.path, newline="") as stream:
+        rows = list(csv.DictReader(stream))
+    for name in columns_of(["nominal"]):
+        own = name if name in ("line", "extrapolated") else f"{name}_mm"
+        written = np.array([float(row[own]) for row in rows])
+        # Four digits after the point against single precision.
+        np.testing.assert_allclose(vertices[name], written, atol=0.5e-4, rtol=FLOAT32)
+    expected = np.concatenate([block.xyz_mm for block in cloud(one, blocks, SIMPLE)])
+    np.testing.assert_allclose(np.stack([vertices[axis] for axis in "xyz"], axis=1), expected, rtol=FLOAT32)
+    with open(ply.refused_path, newline="") as stream:
+        assert [int(row["line"]) for row in csv.DictReader(stream)] == [*range(8, 42, 7), *range(48, 72, 7)]
+
+
+def test_a_cloud_without_refused_looks_has_no_table_of_them(tmp_path):
+    rows = looks(6)
+    written = write_cloud(cloud(calibration(), [rows], {}), tmp_path / "c.ply", [])
+    assert written.refused_path is None and [path.name for path in tmp_path.iterdir()] == ["c.ply"]
+
+
+def test_what_fails_half_way_leaves_the_old_cloud(tmp_path):
+    def failing() -> Iterator[LookRows]:
+        yield looks(20)
+        raise InputError("number", "a bad cell")
+
+    place = tmp_path / "c.csv"
+    place.write_text("old")
+    with pytest.raises(InputError, match="a bad cell"):
+        write_cloud(cloud(calibration(), failing(), SIMPLE), place, ["nominal"])
+    assert place.read_text() == "old" and len(list(tmp_path.iterdir())) == 1
+    with pytest.raises(InputError) as refused:
+        write_cloud([], tmp_path / "c.xyz", [])
+    assert ".ply" in str(refused.value.remedy)
+
+
+def test_memory_does_not_grow_with_the_number_of_points(tmp_path):
+    one = calibration()
+
+    def peak(blocks: int) -> int:
+        tracemalloc.start()
+        stream = (looks(400, first_line=2 + 400 * k) for k in range(blocks))
+        write_cloud(cloud(one, EvenSample().of(stream), SIMPLE), tmp_path / "c.ply", ["nominal"])
+        found = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        return found
+
+    peak(1)
+    # The refused ones are kept, a seventh of the looks: 200 bytes each.
+    assert peak(12) < 1.3 * peak(3) + 9 * 60 * 400
+
+
+@pytest.mark.parametrize("count", [1, CHECKED_MAX, 3 * CHECKED_MAX + 1])
+def test_the_sample_is_even_whatever_the_blocks(count):
+    rows = looks(count)
+    samples = []
+    for size in (count, 7):
+        sample = EvenSample()
+        parts = (LookRows(*(getattr(rows, name)[k : k + size] for name in vars(rows))) for k in range(0, count, size))
+        assert sum(len(part.lines) for part in sample.of(parts)) == count
+        samples.append(sample.looks)
+    assert samples[0] == samples[1] and len(samples[0]) <= CHECKED_MAX
+    stride = 1 if count <= CHECKED_MAX else 4
+    assert [look[0] for look in samples[0]] == list(rows.pan_steps[::stride])
+
+
+def test_the_law_is_checked_by_draws():
+    sample = EvenSample()
+    list(sample.of([looks(28)]))
+    found = checked(calibration(), sample, 600, 0)
+    assert found.points == 24 and 0 < found.held <= 24
+
+
+def test_files_are_read_in_blocks_with_the_lines_of_the_file(tmp_path):
+    """A bad cell behind the first block is named by its own line; shares of the file rise to one."""
+    file, shares = tmp_path / "looks.csv", []
+    rows = ["10,20,left,up,70"] * (BLOCK_ROWS + 5)
+    file.write_text("\n".join([",".join(LOOK_COLUMNS), *rows]) + "\n")
+    found = list(look_blocks(file, shares.append))
+    assert [len(block.lines) for block in found] == [BLOCK_ROWS, 5]
+    assert (found[0].lines[0], found[1].lines[0], found[1].lines[-1]) == (2, BLOCK_ROWS + 2, BLOCK_ROWS + 6)
+    assert shares == sorted(shares) and shares[-1] == 1.0
+    rows[BLOCK_ROWS + 1] = "10,20,left,up,7O"
+    file.write_text("\n".join([",".join(LOOK_COLUMNS), *rows]) + "\n")
+    with pytest.raises(InputError) as refused:
+        list(look_blocks(file))
+    assert (refused.value.line, refused.value.column) == (BLOCK_ROWS + 3, "aperture_deg")
+    file.write_text(",".join(LOOK_COLUMNS) + "\n")
+    with pytest.raises(InputError, match="no points"):
+        list(look_blocks(file))

@@ -1,0 +1,133 @@
+"""Point clouds with error bars: looks in, block by block, points out with what simpler calibrations make of them.
+
+Frame T, mm. Standard uncertainties by the law of propagation, a part of the points checked by draws. Memory does not
+grow with the number of points. NumPy.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from tvsbayes.calibration.pointing import Calibration
+from tvsbayes.coordinates.location import Settings, locate, locate_linear
+from tvsbayes.coordinates.looks_file import LookRows
+from tvsbayes.coordinates.simple_calibration import SimpleCalibration, simple_belief
+from tvsbayes.errors import InputError
+
+CHECKED_MAX = 200
+"""Most looks kept for a check by draws."""
+
+
+@dataclass(frozen=True)
+class Refused:
+    """A look without a point: its line in the file, and why."""
+
+    line: int
+    error: InputError
+
+
+@dataclass(frozen=True)
+class CloudBlock:
+    """Points of one block of looks; arrays over the n points that exist.
+
+    Attributes:
+        lines: of the file, shape (n,).
+        xyz_mm: shape (n, 3).
+        covariance_mm2: by the law of propagation, shape (n, 3, 3).
+        extrapolated: no look of the campaign reached the counters, shape (n,).
+        simple_xyz_mm: what simpler calibrations say, by name, shapes (n, 3); not a number where they have no point.
+        refused: the other looks.
+    """
+
+    lines: np.ndarray
+    xyz_mm: np.ndarray
+    covariance_mm2: np.ndarray
+    extrapolated: np.ndarray
+    simple_xyz_mm: Mapping[str, np.ndarray]
+    refused: tuple[Refused, ...]
+
+    @property
+    def sd_mm(self) -> np.ndarray:
+        """Standard uncertainties of x, y, z, shape (n, 3)."""
+        return np.sqrt(np.einsum("pii->pi", self.covariance_mm2))
+
+
+def cloud(
+    calibration: Calibration, looks: Iterable[LookRows], simple: Mapping[str, SimpleCalibration]
+) -> Iterator[CloudBlock]:
+    """Points of looks, a block for each block.
+
+    Args:
+        calibration: from `load_calibration` or `calibration_of`.
+        looks: from `looks_file.look_blocks`, or made by hand.
+        simple: further calibrations by name, such as "nominal", from `simple_calibration`.
+
+    Raises:
+        InputError: a calibration without draws.
+    """
+    (pan_low, pan_high), (tilt_low, tilt_high) = calibration.range_steps
+    for rows in looks:
+        asked = rows.settings
+        found = locate_linear(calibration, asked)
+        seen = np.isfinite(found.value).all(axis=1)
+        pan, tilt = asked.steps[seen].T
+        reading = asked.aperture_deg[seen]
+        refused = tuple(Refused(rows.lines[k], _refusal(calibration, asked, k)) for k in np.flatnonzero(~seen).tolist())
+        yield CloudBlock(
+            lines=np.array(rows.lines)[seen],
+            xyz_mm=found.value[seen],
+            covariance_mm2=found.covariance[seen],
+            extrapolated=(pan < pan_low) | (pan > pan_high) | (tilt < tilt_low) | (tilt > tilt_high),
+            simple_xyz_mm={
+                name: simple_belief(one, pan, tilt).points(reading, calibration.azimuth).T
+                for name, one in simple.items()
+            },
+            refused=refused,
+        )
+
+
+def _refusal(calibration: Calibration, asked: Settings, row: int) -> InputError:
+    pan, tilt = asked.steps[row].tolist()
+    pan_side, tilt_side = asked.side[row].tolist()
+    return calibration.refusal(pan, tilt, float(asked.aperture_deg[row]), (pan_side, tilt_side))
+
+
+class EvenSample:
+    """Looks spread evenly over a stream of unknown length, at most `CHECKED_MAX`: pass the stream through `of`."""
+
+    def __init__(self) -> None:
+        self.looks: list[tuple[float, float, float, tuple[str, str]]] = []
+        self._stride, self._passed = 1, 0
+
+    def of(self, blocks: Iterable[LookRows]) -> Iterator[LookRows]:
+        """The same blocks."""
+        for rows in blocks:
+            for k in range(-self._passed % self._stride, len(rows.lines), self._stride):
+                if (self._passed + k) % self._stride:
+                    continue
+                self.looks.append((rows.pan_steps[k], rows.tilt_steps[k], rows.aperture_deg[k], rows.approach[k]))
+                if len(self.looks) > CHECKED_MAX:
+                    self.looks = self.looks[::2]
+                    self._stride *= 2
+            self._passed += len(rows.lines)
+            yield rows
+
+
+@dataclass(frozen=True)
+class LawChecked:
+    """How many points were carried by draws too, and at how many the law of propagation held to one digit of u."""
+
+    points: int
+    held: int
+
+
+def checked(calibration: Calibration, sample: EvenSample, draws: int, seed: int) -> LawChecked:
+    """Some of the points again, draw by draw (JCGM 101, 8)."""
+    pan, tilt, reading, approach = zip(*sample.looks, strict=True)
+    found = locate(calibration, pan, tilt, reading, approach, draws=draws, seed=seed)
+    seen = np.array([error is None for error in found.refused])
+    held = np.asarray(found.digits_held).min(axis=1) >= 1
+    return LawChecked(int(seen.sum()), int(np.sum(held & seen)))

@@ -1,0 +1,172 @@
+"""Clouds as files: CSV, or PLY with properties that CloudCompare and MeshLab show. mm, frame T.
+
+A file is written whole or not at all, in memory that does not grow with it. Looks without a point stand in a table
+beside it.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import shutil
+import tempfile
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import BinaryIO, Protocol
+
+import numpy as np
+
+from tvsbayes.coordinates.cloud import CloudBlock
+from tvsbayes.errors import InputError, escaped
+from tvsbayes.files.csv_table import csv_bytes
+from tvsbayes.files.disk import written_whole
+
+AXIS_NAMES = "x", "y", "z"
+DIGITS = 4
+"""After the point, mm, in CSV: a thousandth of what the best point is known to."""
+REFUSED_COLUMNS = "line", "code", "message"
+
+
+@dataclass(frozen=True)
+class CloudFile:
+    """What was written.
+
+    Attributes:
+        path: the cloud.
+        columns: its properties, in order.
+        points: in it.
+        extrapolated: of them, beyond the counters that the campaign saw.
+        refused: looks without a point.
+        refused_path: the table of these; None where there is none.
+    """
+
+    path: Path
+    columns: tuple[str, ...]
+    points: int
+    extrapolated: int
+    refused: int
+    refused_path: Path | None
+
+    def as_json(self) -> dict[str, object]:
+        """As `locate --cloud` tells it."""
+        return {
+            "cloud": str(self.path),
+            "columns": list(self.columns),
+            "written": self.points,
+            "extrapolated": self.extrapolated,
+            "refused": self.refused,
+            "refused_file": None if self.refused_path is None else str(self.refused_path),
+        }
+
+
+def columns_of(names: Sequence[str]) -> tuple[str, ...]:
+    """Properties of a point: line, coordinates, sds, what calibrations of these names say, the flag.
+
+    `quality` is the root of the summed variances, the property by which MeshLab colours points.
+    """
+    own = (*AXIS_NAMES, *(f"sd_{axis}" for axis in AXIS_NAMES), "quality")
+    return (*own, *(f"{name}_{axis}" for name in names for axis in AXIS_NAMES), "extrapolated", "line")
+
+
+def _numbers(block: CloudBlock, names: Sequence[str]) -> np.ndarray:
+    """What stands in `columns_of` but the last two, shape (n, columns - 2)."""
+    sd = block.sd_mm
+    parts = [block.xyz_mm, sd, np.linalg.norm(sd, axis=1, keepdims=True)]
+    return np.concatenate([*parts, *(block.simple_xyz_mm[name] for name in names)], axis=1)
+
+
+class _Body(Protocol):
+    """How the points of a format are written."""
+
+    def add(self, stream: BinaryIO, block: CloudBlock, names: Sequence[str]) -> None:
+        """A block's."""
+
+    def header(self, names: Sequence[str], points: int) -> bytes:
+        """What comes before all of them."""
+
+
+class _Csv:
+    def add(self, stream: BinaryIO, block: CloudBlock, names: Sequence[str]) -> None:
+        text = io.StringIO(newline="")
+        writer = csv.writer(text, lineterminator="\n")
+        numbers = _numbers(block, names).tolist()
+        for row, outside, line in zip(numbers, block.extrapolated.tolist(), block.lines.tolist(), strict=True):
+            # An empty cell where a simpler calibration has no point.
+            cells = ["" if value != value else f"{value:.{DIGITS}f}" for value in row]
+            writer.writerow([*cells, int(outside), line])
+        stream.write(text.getvalue().encode())
+
+    def header(self, names: Sequence[str], points: int) -> bytes:
+        units = [f"{column}_mm" for column in columns_of(names)[:-2]]
+        return (",".join([*units, "extrapolated", "line"]) + "\n").encode()
+
+
+class _Ply:
+    def add(self, stream: BinaryIO, block: CloudBlock, names: Sequence[str]) -> None:
+        *numbers, flag, line = columns_of(names)
+        rows = np.zeros(len(block.lines), [*((name, "<f4") for name in numbers), (flag, "u1"), (line, "<i4")])
+        for name, values in zip(numbers, _numbers(block, names).T, strict=True):
+            rows[name] = values
+        rows[flag], rows[line] = block.extrapolated, block.lines
+        stream.write(rows.tobytes())
+
+    def header(self, names: Sequence[str], points: int) -> bytes:
+        *numbers, flag, line = columns_of(names)
+        properties = [*(f"property float {name}" for name in numbers), f"property uchar {flag}", f"property int {line}"]
+        lines = [
+            *("ply", "format binary_little_endian 1.0"),
+            "comment mm; x depth, y along the baseline towards the positioner, z up; origin mid-baseline",
+            "comment sd_: standard uncertainty; quality: root of the summed variances",
+            f"element vertex {points}",
+            *(*properties, "end_header"),
+        ]
+        return ("\n".join(lines) + "\n").encode("ascii")
+
+
+FORMATS: dict[str, type[_Csv] | type[_Ply]] = {".csv": _Csv, ".ply": _Ply}
+
+
+def cloud_place(path: Path) -> Path:
+    """The same path, whose ending names a format.
+
+    Raises:
+        InputError: it does not.
+    """
+    if path.suffix.lower() not in FORMATS:
+        found, allowed = escaped(path.suffix or path.name), " or ".join(FORMATS)
+        message = f"--cloud {escaped(str(path), 200)}: the ending {found} names no format"
+        raise InputError("usage", message, found=found, allowed=allowed, remedy="name a file .ply or .csv")
+    return path
+
+
+def write_cloud(blocks: Iterable[CloudBlock], path: Path, names: Sequence[str]) -> CloudFile:
+    """Write a cloud, whole or not at all.
+
+    Args:
+        blocks: from `cloud.cloud`.
+        path: ending in .csv or .ply.
+        names: of the simpler calibrations in the blocks.
+
+    Raises:
+        InputError: of another ending, or the place cannot be written to; what the blocks raise passes through.
+    """
+    body: _Body = FORMATS[cloud_place(path).suffix.lower()]()
+    points = extrapolated = 0
+    refused: list[tuple[int, str, str]] = []
+    # How many points there are stands before them and is known after.
+    with tempfile.TemporaryFile() as kept:
+        for block in blocks:
+            body.add(kept, block, names)
+            points += len(block.lines)
+            extrapolated += int(block.extrapolated.sum())
+            refused += [(one.line, one.error.code, one.error.message) for one in block.refused]
+        kept.seek(0)
+        with written_whole(path) as stream:
+            stream.write(body.header(names, points))
+            shutil.copyfileobj(kept, stream)
+    table = path.with_name(f"{path.stem}.refused.csv") if refused else None
+    if table is not None:
+        with written_whole(table) as stream:
+            stream.write(csv_bytes(REFUSED_COLUMNS, refused))
+    return CloudFile(path, columns_of(names), points, extrapolated, len(refused), table)

@@ -1,0 +1,95 @@
+"""Looks whose points are wanted: a CSV of counters, approaches and aperture readings, whole or block by block.
+
+steps, deg.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from tvsbayes.coordinates.location import Settings, settings_of
+from tvsbayes.errors import InputError, escaped
+from tvsbayes.files.csv_table import CSV_BYTES_MAX, Table, parse_table, table_blocks
+from tvsbayes.files.disk import read_bytes
+from tvsbayes.instrument.axes import SENSES
+from tvsbayes.progress import Advance, unshown
+
+LOOK_COLUMNS = ("pan_steps", "tilt_steps", "pan_approach", "tilt_approach", "aperture_deg")
+STEPS_MAX, ANGLE_MAX_DEG = 1e8, 360.0
+BLOCK_ROWS = 8192
+"""Lines read at a time: 10 MB with everything that is made of them."""
+
+
+@dataclass(frozen=True)
+class LookRows:
+    """Rows of a file of looks.
+
+    Attributes:
+        lines: of the file, from 1.
+        pan_steps, tilt_steps: absolute counters.
+        aperture_deg: readings.
+        approach: directions of the last moves of (pan, tilt).
+    """
+
+    lines: tuple[int, ...]
+    pan_steps: tuple[float, ...]
+    tilt_steps: tuple[float, ...]
+    aperture_deg: tuple[float, ...]
+    approach: tuple[tuple[str, str], ...]
+
+    @property
+    def settings(self) -> Settings:
+        """As arrays."""
+        return settings_of(self.pan_steps, self.tilt_steps, self.aperture_deg, self.approach)
+
+
+def _rows(table: Table) -> LookRows:
+    """Checked cells of a table."""
+    for axis, directions in SENSES.items():
+        allowed = (*directions, "unknown")
+        for row, word in enumerate(table.columns[f"{axis}_approach"]):
+            if word not in allowed:
+                remedy = "name the direction of the last move of the axis"
+                raise table.refuse(row, f"{axis}_approach", "approach", ", ".join(allowed), remedy)
+    pan, tilt = (table.numbers(name, -STEPS_MAX, STEPS_MAX) for name in ("pan_steps", "tilt_steps"))
+    readings = table.numbers("aperture_deg", -ANGLE_MAX_DEG, ANGLE_MAX_DEG)
+    pairs = zip(table.columns["pan_approach"], table.columns["tilt_approach"], strict=True)
+    return LookRows(tuple(table.lines), tuple(pan), tuple(tilt), tuple(readings), tuple(pairs))
+
+
+def _no_points(path: Path) -> InputError:
+    file = escaped(path.name)
+    return InputError("empty", f"{file}: no points", file=file, remedy="add rows")
+
+
+def read_looks(path: Path) -> LookRows:
+    """All looks of a file.
+
+    Raises:
+        InputError: unreadable, no such columns, a cell that is none, or no row.
+    """
+    table = parse_table(read_bytes(path, CSV_BYTES_MAX), escaped(path.name), LOOK_COLUMNS)
+    if not len(table):
+        raise _no_points(path)
+    return _rows(table)
+
+
+def look_blocks(path: Path, advance: Advance = unshown) -> Iterator[LookRows]:
+    """The looks of a file of any length, block by block.
+
+    Args:
+        path: the file.
+        advance: told which share of it is read.
+
+    Raises:
+        InputError: as `read_looks`, in the block where it stands.
+    """
+    empty = True
+    for table in table_blocks(path, LOOK_COLUMNS, BLOCK_ROWS, advance):
+        if len(table):
+            empty = False
+            yield _rows(table)
+    if empty:
+        raise _no_points(path)
