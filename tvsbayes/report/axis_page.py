@@ -63,7 +63,7 @@ def error_figure(fit: AxisFit) -> Figure:
             if mine.any():
                 axes.plot(rows.command[mine], off[mine], marker, color=colour, markersize=3.5, label=f"stops, {name}")
         axes.set(xlabel="command", ylabel=f"off the line, {fit.campaign.unit}")
-        axes.legend()
+        figure.legend(loc="outside lower center", ncols=2)
     return figure
 
 
@@ -76,16 +76,11 @@ def _figure_of(fit: AxisFit) -> FigureView:
 def axis_page(results: AxisResults, issue: Issue) -> Page:
     """The page; `results.fit` holds `curve_commands` of its range."""
     summary, fit = results.summary, results.fit
-    unit, (low, high) = summary.unit, summary.range_command
+    unit = summary.unit
     made = plain(provenance(axis_hashes(fit.campaign), fit.seed))
     said = json.dumps([summary.as_json(), made["inputs"]], sort_keys=True)
-    numbers = []
-    for side, of in summary.effective_per_command.items():
-        numbers.append(
-            Number(f"{unit} per command, {side}", concise(of.value, of.sd), f"line from {low:g} to {high:g}")
-        )
     backlash = summary.parameters["backlash"]
-    numbers.append(Number("play", concise(backlash.value, backlash.sd), unit))
+    numbers = [Number("play", concise(backlash.value, backlash.sd), unit)]
     method = [
         "Readings = offset + unit per command x command, play taken up on the side of arrival, an error and a play "
         "that repeat by position (Matern processes), a drifting zero, an error of every stop, noise. What is linear is "

@@ -16,10 +16,10 @@ from tvsbayes.single_axis.next_stops import AxisPlan
 DEVIATIONS_SHOWN = 40
 WHAT = {
     **{name: key.what for name, key in AXIS_KEYS.items()},
-    "stop_sd.forward": "scatter of stops reached forward",
-    "stop_sd.backward": "scatter of stops reached backward",
-    "ratio_contrast": "unit per command, forward less backward",
-    "offset": "reading at command 0, middle of the play",
+    "stop_sd.forward": "scatter of stops, forward",
+    "stop_sd.backward": "scatter of stops, backward",
+    "ratio_contrast": "forward less backward",
+    "offset": "reading at command 0",
 }
 """Parameters in words."""
 
@@ -47,7 +47,7 @@ def parameter_table(summary: AxisSummary) -> TableView:
             said = "" if of.contraction is None else f"{100 * of.contraction:.0f} %"
             rows.append([WHAT.get(name, name), *_row(name, of)[1:], said])
     caption = f"parameters, {escaped(summary.unit)}; 100 %: the readings tell it, 0 %: the prior does"
-    return TableView(caption, ["", "value(u)", "95 % interval", "told by data"], rows)
+    return TableView(caption, ["", "value(u)", "95 % interval", "told"], rows)
 
 
 def deviation_table(deviations: Sequence[PositionDeviation], unit: str) -> TableView:

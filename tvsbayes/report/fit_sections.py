@@ -30,6 +30,8 @@ CORRELATED = (
 """Parameters of the correlation matrix, in order; those that were not estimated are left out."""
 
 
+LEAST_P = 0.001
+"""Printed of a probability; smaller ones are said to be below it."""
 PRIORS_SHOWN = 8
 """Of those that a result is sensitive to, the strongest first; fit.json has all."""
 HEADER_SHOWN = (
@@ -227,7 +229,7 @@ def _causes(causes: tuple[Cause, ...]) -> TableView:
         [
             f"{c.axis}: {c.name}",
             str(len(c.groups)),
-            "not tested" if c.p is None else f"{c.p:.3f}",
+            "not tested" if c.p is None else f"{c.p:.3f}" if c.p >= LEAST_P else f"below {LEAST_P:g}",
             "SUSPICIOUS" if c.suspicious else "" if c.p is None else "no sign",
         ]
         for c in causes

@@ -145,7 +145,7 @@ def _gum_table(table: BudgetTable, prefix: str = "") -> TableView:
             row.distribution,
             "" if row.u is None else two_digits(row.u),
             "" if row.u is None else _freedom(row.dof),
-            "" if row.sensitivity is None else f"{row.sensitivity:.3g}",
+            "" if row.sensitivity is None else _digits(row.sensitivity),
             "" if row.contribution is None else two_digits(row.contribution),
             f"{100 * row.share:.1f}",
         ]
@@ -160,6 +160,11 @@ def _gum_table(table: BudgetTable, prefix: str = "") -> TableView:
         caption += "; the inputs are correlated: single shares exceed 100 %, the row of correlations takes them back"
     columns = ["source", "type", "distribution", "u", "dof", "sensitivity", "contribution", "share %"]
     return TableView(caption, columns, rows)
+
+
+def _digits(value: float) -> str:
+    """Three digits, without an exponent where the number is large."""
+    return f"{value:.0f}" if abs(value) >= 100 else f"{value:.3g}"
 
 
 def _freedom(dof: float | None) -> str:

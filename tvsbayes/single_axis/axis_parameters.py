@@ -42,15 +42,15 @@ class AxisKey:
 
 
 AXIS_KEYS = {
-    "per_command": AxisKey("normal", None, 1.0, "unit per command, mean of both directions"),
-    "backlash": AxisKey("normal", 0.05, 0.0, "play: what a reversal loses"),
-    "transmission_error": AxisKey("half-normal", 0.002, 0.0, "sd of the error that repeats by position"),
-    "transmission_error_length": AxisKey("log-normal", 0.2, 0.7, "distance over which that error changes"),
-    "play_variation": AxisKey("half-normal", 0.001, 0.0, "sd of the play over positions"),
-    "drift_per_root_hour": AxisKey("half-normal", 0.0005, 0.0, "walk of the zero, per square root of an hour"),
-    "stop_sd": AxisKey("log-normal", 0.0005, 1.5, "scatter of stops, each direction its own"),
-    "home_sd": AxisKey("log-normal", 0.001, 1.5, "scatter of the zero over homings"),
-    "reading_scale": AxisKey("log-normal", None, 0.5, "scatter of readings over the stated u"),
+    "per_command": AxisKey("normal", None, 1.0, "unit per command"),
+    "backlash": AxisKey("normal", 0.05, 0.0, "play lost in a reversal"),
+    "transmission_error": AxisKey("half-normal", 0.002, 0.0, "error by position, sd"),
+    "transmission_error_length": AxisKey("log-normal", 0.2, 0.7, "it changes over a way of"),
+    "play_variation": AxisKey("half-normal", 0.001, 0.0, "play over positions, sd"),
+    "drift_per_root_hour": AxisKey("half-normal", 0.0005, 0.0, "zero walks in a root hour"),
+    "stop_sd": AxisKey("log-normal", 0.0005, 1.5, "scatter of stops"),
+    "home_sd": AxisKey("log-normal", 0.001, 1.5, "scatter of homings"),
+    "reading_scale": AxisKey("log-normal", None, 0.5, "scatter of readings / u"),
 }
 """Shares of the travel: half-normals and stop scatter by eleven stepper axes that others measured, on which the scales
 integrated out give left-out positions that lie within 1.96 u in 95 % of cases. Backlash: cheap gears lose up to some
