@@ -336,17 +336,15 @@ def study_text(result: StudyResult) -> str:
     """A study for people."""
     n, t = result.converged, result.target
     low, high = rms_bounds(n)
-    lines = [
-        f"{result.campaigns} simulated campaigns, {n} fits converged ({MADE_BY[result.estimator]}); "
-        f"{result.seconds:.1f} s each",
-        "quantity        median sd  RMS z  predicted  " + "  ".join(f"{100 * x:3.0f} %" for x in LEVELS) + "  power",
-        f"bounds at {BOUND:g}        {low:.2f}-{high:.2f}".ljust(48)
-        + "  ".join("{:.0f}-{:.0f}".format(*(100 * b for b in binomial_bounds(n, x))) for x in LEVELS),
-    ]
+    bounds = [f"{100 * low:.0f}-{100 * high:.0f}" for low, high in (binomial_bounds(n, x) for x in LEVELS)]
+    rows = [[f"bounds at {BOUND:g}", "", f"{low:.2f}-{high:.2f}", "", *bounds, "", ""]]
     for name, h in result.headlines.items():
-        shares = "  ".join(f"{100 * h.coverage[f'{100 * x:g}']:5.1f}" for x in LEVELS)
-        numbers = f"{h.sd:9.3g}  {h.rms_z:5.2f}  {h.rms_predicted:9.2f}  {shares}  {h.power:5.2f}"
-        lines.append(f"{name:14}  {numbers}  {'within' if h.within else 'OUTSIDE'}")
+        shares = [f"{100 * h.coverage[f'{100 * x:g}']:.1f}" for x in LEVELS]
+        numbers = [f"{h.sd:.3g}", f"{h.rms_z:.2f}", f"{h.rms_predicted:.2f}", *shares, f"{h.power:.2f}"]
+        rows.append([name, *numbers, "within" if h.within else "OUTSIDE"])
+    columns = ["quantity", "median sd", "RMS z", "predicted", *(f"{100 * x:g} %" for x in LEVELS), "power", ""]
+    title = f"{result.campaigns} simulated campaigns, {n} fits converged ({MADE_BY[result.estimator]}); "
+    lines = [TableView(f"{title}{result.seconds:.1f} s each", columns, rows).text()]
     a, b = result.assurance_interval95
     share = f"{100 * result.assurance:.1f} % of fits ({100 * a:.1f} to {100 * b:.1f} %)"
     lines.append(f"{t.text}: reported as met by {share}")

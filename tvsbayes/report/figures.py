@@ -87,7 +87,9 @@ def trajectories(campaign: Campaign, experiment: int) -> Figure:
             axes.annotate(f"P{number}", (point[0], point[across]), (4, 5), textcoords="offset points")
         title = f"experiment {experiment}: {axis} by {steps:+d} steps".replace("-", "\u2212")
         axes.set(xlabel="X (depth), mm", ylabel=f"{'Y (left)' if across == 1 else 'Z (up)'}, mm", title=title)
-        axes.legend()
+        # Angles are those of the picture.
+        axes.set_aspect("equal", adjustable="datalim")
+        figure.legend(loc="outside lower center", ncols=2)
     return figure
 
 
@@ -109,6 +111,7 @@ def points_3d(campaign: Campaign, experiment: int | None = None) -> Figure:
             for number, point in enumerate(points, start=1):
                 axes.text(*point, f"  P{number}")
         axes.set(xlabel="X (depth), mm", ylabel="Y (left), mm", zlabel="Z (up), mm")
+        axes.locator_params(nbins=4)
         axes.set_box_aspect(None, zoom=0.82)
     return figure
 
