@@ -158,6 +158,10 @@ def report(found: Views, board: Board, folder: Path) -> None:
     if shipped:
         away = (baseline - SHIPPED_BASELINE_MM) / ours.baseline_sd_mm
         print(f"The calibration that came with them has {SHIPPED_BASELINE_MM} mm: {away:+.1f} stated sds from ours.\n")
+    print(
+        f"Corners of the board off a grid by {ours.board_error_mm:.3f} mm (sd of a coordinate), variances of what is "
+    )
+    print(f"left {ours.correlation_factor:.1f} times those of independent corners.\n")
     if len(views) >= 8:
         rng = np.random.default_rng(1)
         named = split(views, range(0, len(views), 2), board, size)

@@ -13,8 +13,9 @@ from scipy import stats
 from support.commands import caching_in
 from support.drawn_boards import PAIR, POSES, pictures, write_pair
 
-from experiments.cameras.stereo_coverage import calibrate
+from experiments.cameras.stereo_coverage import calibrate, chi2
 from experiments.common.board_views import CORNER_SD_PX, corners_of, scenes, true_corners
+from tvsbayes.cameras.board_errors import _by_corner
 from tvsbayes.cameras.boards import Board, View, Views, corner_orders, find_views
 from tvsbayes.cameras.bundle_adjustment import bundle_adjustment, correlation_factor
 from tvsbayes.cameras.stereo_calibration import StereoCalibration, calibrate_stereo
@@ -82,6 +83,30 @@ def test_thinned_study_finds_the_covariance_true():
     noise = np.mean([row["noise_sd_px"] for row in rows])
     dof = len(rows) * (4 * 54 * VIEWS - 24 - 6 * VIEWS)
     assert abs(noise / CORNER_SD_PX - 1) < 4 / np.sqrt(2 * dof)
+
+
+@pytest.mark.parametrize("off_mm", (0.0, 0.2))
+def test_a_board_that_is_no_grid_is_in_the_covariance(off_mm):
+    """Corners off in all pictures alike: the residuals tell by how much, and the parameters miss by what is stated."""
+    total, alone = 0.0, 0.0
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        drawn = scenes(seed, "white", VIEWS)
+        away = rng.normal(0, off_mm, (BOARD.corners, 3))
+        views = []
+        for k, scene in enumerate(drawn):
+            view = corners_of(scene, f"{k:02d}", rng)
+            moved = np.einsum("qca,ca->cq", _by_corner(view, BOARD, scene.stereo), away)
+            views.append(replace(view, left=view.left + moved[:, :2], right=view.right + moved[:, 2:]))
+        found = calibrate_stereo(views, BOARD, SIZE)
+        # 155 displacements tell their sd to 6 %; three of them, and what noise of the corners leaves open.
+        assert abs(found.board_error_mm - off_mm) < 0.02 + 3 * 0.06 * off_mm
+        missed = found.stereo.vector - drawn[0].stereo.vector
+        total += chi2(missed, found.stereo.parameter_covariance)
+        alone += chi2(missed, found.covariance_independent)
+    low, high = stats.chi2(24 * 3).ppf([5e-5, 1 - 5e-5])
+    assert low / 1.3**2 < total < high
+    assert (alone > high) == (off_mm > 0)
 
 
 def test_errors_that_corners_share_are_in_the_covariance():
@@ -213,7 +238,7 @@ def test_lengths_follow_the_pitch_and_nothing_else_does(views, calibration):
     expected = np.zeros((24, 24))
     expected[21:, 21:] = (0.1 / 50) ** 2 * np.outer(doubled.stereo.T, doubled.stereo.T)
     np.testing.assert_allclose(doubled.covariance_pitch, expected, rtol=1e-12)
-    stored = doubled.correlation_factor * doubled.covariance_independent + expected
+    stored = doubled.correlation_factor * doubled.covariance_independent + doubled.covariance_board + expected
     np.testing.assert_allclose(doubled.stereo.parameter_covariance, stored, rtol=1e-9, atol=1e-30)
 
 

@@ -169,7 +169,9 @@ class Adjustment:
         residuals_px: projected minus found, shape (views, 4, corners), NaN where no corner was seen.
         noise_sd_px: standard deviation of one corner coordinate, from the residuals.
         dof: degrees of freedom behind it: coordinates - camera parameters - 6 per view.
-        correlation_factor: see `correlation_factor`.
+        jacobian: of the residuals by the whitened coordinates of the free parameters, boards following, shape (views,
+            4, corners, free); 0 where no corner was seen.
+        root: d(parameters)/d(whitened coordinates), (24, free).
     """
 
     vector: np.ndarray
@@ -177,10 +179,13 @@ class Adjustment:
     residuals_px: np.ndarray
     noise_sd_px: float
     dof: int
-    correlation_factor: float
+    jacobian: np.ndarray
+    root: np.ndarray
 
 
-def correlation_factor(jacobian: np.ndarray, residuals: np.ndarray, views: np.ndarray, noise_sd: float) -> float:
+def correlation_factor(
+    jacobian: np.ndarray, residuals: np.ndarray, views: np.ndarray, noise_sd: float, explained: float = 0.0
+) -> float:
     """How much larger the scores of whole views are than independent corners would make them; at least 1.
 
     Corner errors of one picture have common causes (light, defocus, a lens that is not quite the model, a bent
@@ -188,13 +193,14 @@ def correlation_factor(jacobian: np.ndarray, residuals: np.ndarray, views: np.nd
     it: independent errors give the sum of |J_i^T r_i|^2 in coordinates where J^T J = 1 the expectation
     s^2 (p - sum_i tr (J_i^T J_i)^2), the second term for the residuals having been fitted. The ratio scales the
     covariance: the cluster-robust variance of Liang and Zeger (1986) reduced to one number, since a dozen views
-    cannot support a 24 x 24 matrix of them. Errors common to ALL views stay unseen.
+    cannot support a 24 x 24 matrix of them. Errors common to ALL views stay unseen: see `board_errors`.
 
     Args:
         jacobian: (residuals, p), of full rank.
         residuals: (residuals,).
         views: (residuals,), which view each belongs to, numbered from 0.
         noise_sd: s.
+        explained: expectation of the scores' squares that something else accounts for.
     """
     q, _ = np.linalg.qr(jacobian / np.linalg.norm(jacobian, axis=0))
     count = int(views.max()) + 1
@@ -204,7 +210,7 @@ def correlation_factor(jacobian: np.ndarray, residuals: np.ndarray, views: np.nd
         score += float(np.sum((rows.T @ residuals[views == view]) ** 2))
         lost += float(np.sum((rows.T @ rows) ** 2))
     expected = noise_sd**2 * (q.shape[1] - lost)
-    return max(1.0, score / expected) if expected > 1e-3 * noise_sd**2 else 1.0
+    return max(1.0, (score - explained) / expected) if expected > 1e-3 * noise_sd**2 else 1.0
 
 
 def bundle_adjustment(
@@ -246,14 +252,14 @@ def bundle_adjustment(
         raise undetermined(str(error)) from error
     residuals_px = np.full(seen.shape, np.nan)
     residuals_px[seen] = residuals
-    view_of = np.repeat(np.arange(len(seen)), seen[0].size)[kept]
     return Adjustment(
         vector=start + root @ end.z,
         covariance=noise_sd**2 * root[:, free] @ z_covariance @ root[:, free].T,
         residuals_px=residuals_px[: len(views), :, : board.corners],
         noise_sd_px=noise_sd,
         dof=dof,
-        correlation_factor=correlation_factor(jacobian, residuals, view_of, noise_sd),
+        jacobian=(end.jacobian[:, free] * kept[:, None]).reshape(*seen.shape, -1)[: len(views), :, : board.corners],
+        root=root[:, free],
     )
 
 

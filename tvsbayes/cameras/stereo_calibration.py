@@ -1,8 +1,8 @@
 """From board pictures to a stereo calibration with its covariance, and what a careful reader would ask about it.
 
-Type A: all corners of all views in one bundle adjustment, widened for errors that the corners of a picture share. Type
-B: the pitch of the board, to which all lengths are proportional. mm, px with the integer at a pixel's centre,
-parameters in the order of `STEREO_PARAMETER_NAMES`.
+Type A: all corners of all views in one bundle adjustment, widened for errors that the corners of a picture share and
+for a board that is no perfect grid. Type B: the pitch of the board, to which all lengths are proportional. mm, px with
+the integer at a pixel's centre, parameters in the order of `STEREO_PARAMETER_NAMES`.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from tvsbayes.cameras.board_errors import board_errors
 from tvsbayes.cameras.boards import Board, Finder, View, Views, find_views
 from tvsbayes.cameras.bundle_adjustment import Adjustment, bundle_adjustment
 from tvsbayes.cameras.stereo_start import (
@@ -68,7 +69,7 @@ class StereoCalibration:
     """A stereo calibration with everything behind it.
 
     Attributes:
-        stereo: parameters and their full covariance (type A with `correlation_factor`, plus the pitch).
+        stereo: parameters and their full covariance (type A with `correlation_factor`, plus board and pitch).
         board: as given.
         views: every view used, with its residuals.
         left_rms_px, right_rms_px: rms over corners as OpenCV defines it; of both cameras in `stereo.rms_px`.
@@ -76,6 +77,8 @@ class StereoCalibration:
         dof: degrees of freedom behind it.
         correlation_factor: factor on the covariance for errors that the corners of a picture share.
         covariance_independent: (24, 24), type A for independent corners: what OpenCV and most tools report.
+        board_error_mm: how far corners of the board are off a grid, sd of one coordinate, by the residuals.
+        covariance_board: (24, 24), from that.
         covariance_pitch: (24, 24), type B, from the pitch: scales T.
         coverage: share of the image inside the boards, by camera.
         triangulated_pitch_mm: mean and standard deviation of all sides of squares, triangulated.
@@ -96,6 +99,8 @@ class StereoCalibration:
     dof: int
     correlation_factor: float
     covariance_independent: np.ndarray
+    board_error_mm: float
+    covariance_board: np.ndarray
     covariance_pitch: np.ndarray
     coverage: dict[str, float]
     triangulated_pitch_mm: tuple[float, float]
@@ -122,6 +127,7 @@ class StereoCalibration:
         parts = {
             "sd": total,
             "sd_independent_corners": np.sqrt(np.diag(self.covariance_independent)),
+            "sd_board": np.sqrt(np.diag(self.covariance_board)),
             "sd_pitch": np.sqrt(np.diag(self.covariance_pitch)),
         }
         vector = self.stereo.vector
@@ -147,6 +153,7 @@ class StereoCalibration:
                 name: {"value": float(vector[k]), **{key: float(sds[k]) for key, sds in parts.items()}}
                 for k, name in enumerate(STEREO_PARAMETER_NAMES)
             },
+            "board_error_mm": self.board_error_mm,
             "baseline_mm": {"value": float(np.linalg.norm(self.stereo.T)), "sd": self.baseline_sd_mm},
             "triangulated_pitch_mm": {"mean": self.triangulated_pitch_mm[0], "sd": self.triangulated_pitch_mm[1]},
             "coverage": self.coverage,
@@ -198,11 +205,12 @@ def calibrate_stereo(
     # The pixels know angles only: all lengths, T among them, are proportional to the pitch.
     shift = adjustment.vector[21:] * (board.pitch_u_mm / board.pitch_mm)
     pitch[21:, 21:] = np.outer(shift, shift)
-    covariance = adjustment.correlation_factor * adjustment.covariance + pitch
-    covariance, nothing = 0.5 * (covariance + covariance.T), np.zeros(1)
-    rms = _rms(adjustment.residuals_px)
-    empty = Stereo(*size, nothing, nothing, nothing, nothing, nothing, nothing, covariance, rms)
-    stereo = empty.with_vector(adjustment.vector)
+    rms, nothing = _rms(adjustment.residuals_px), np.zeros(1)
+    bare = Stereo(*size, nothing, nothing, nothing, nothing, nothing, nothing, pitch, rms)
+    stereo = bare.with_vector(adjustment.vector)
+    errors = board_errors(adjustment, done.views, board, stereo)
+    covariance = errors.correlation_factor * adjustment.covariance + errors.covariance + pitch
+    stereo = replace(stereo, parameter_covariance=0.5 * (covariance + covariance.T))
     poses = [pose_of(view, board, stereo) for view in done.views]
     result = StereoCalibration(
         stereo=stereo,
@@ -212,8 +220,10 @@ def calibrate_stereo(
         right_rms_px=_rms(adjustment.residuals_px[:, 2:]),
         noise_sd_px=adjustment.noise_sd_px,
         dof=adjustment.dof,
-        correlation_factor=adjustment.correlation_factor,
+        correlation_factor=errors.correlation_factor,
         covariance_independent=adjustment.covariance,
+        board_error_mm=errors.sd_mm,
+        covariance_board=errors.covariance,
         covariance_pitch=pitch,
         coverage={side: _coverage([getattr(v, side) for v in done.views], size) for side in CAMERAS},
         triangulated_pitch_mm=_triangulated_pitch(done.views, board, stereo),

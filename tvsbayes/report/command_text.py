@@ -178,6 +178,7 @@ def stereo_calibration_text(result: StereoCalibration) -> str:
         f"{px(result.right_rms_px)} px; one coordinate: sd {result.noise_sd_px:.3f} px, dof {result.dof}",
         "uncertainties hold for corner errors that the corners of a picture share: variances "
         f"{result.correlation_factor:.1f} times those of independent corners",
+        f"and for a board whose corners are {result.board_error_mm:.2g} mm off a grid, as the residuals show",
         f"baseline {concise(float(np.linalg.norm(result.stereo.T)), result.baseline_sd_mm)} mm; squares, triangulated: "
         f"{mean_sd[0]:.3f} mm on average, sd {mean_sd[1]:.3f}, stated {board.pitch_mm:g}",
         "boards cover "
