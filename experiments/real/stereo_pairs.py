@@ -145,7 +145,8 @@ def report(found: Views, board: Board, folder: Path) -> None:
             "![Differences of halves of the pairs in stated standard uncertainties](../../data/docs/real_stereo.png)\n"
         )
     print(
-        f"Written by `python -m experiments.real.stereo_pairs`: {len(views)} pairs of `{folder}`, {size[0]} x {size[1]}"
+        f"Written by `python -m experiments.real.stereo_pairs`: {len(views)} pairs of `{folder}`, "
+        f"{size[0]} x {size[1]} px,"
     )
     print(
         f"board {board.columns} x {board.rows}, squares of {board.pitch_mm:g} mm. Found in one picture only: ", end=""
