@@ -20,6 +20,7 @@ from tvsbayes.acquisition.session import acquire
 from tvsbayes.acquisition.simulated_instrument import Instrument
 from tvsbayes.cameras.capture import StereoImage
 from tvsbayes.cameras.virtual_camera import VirtualCamera
+from tvsbayes.errors import DeviceFault
 from tvsbayes.instrument.campaign import read_campaign
 from tvsbayes.instrument.plan import PlanStep
 from tvsbayes.twin.physics import project
@@ -113,29 +114,34 @@ def test_rendered_pictures_are_detected_while_the_plan_runs(small_rig, tmp_path)
         assert np.all(np.abs(centroids_of_the_twin(small_rig, truth, spot.move) - pixels) < 5 * sds)
 
 
-@needs_pseudo_terminals
-def test_hardware_path_from_rig_file_to_campaign(small_rig, tmp_path):
-    """Pyserial on a pseudo-terminal, OpenCV on a stream, questions on a terminal: all as on the bench."""
-    size = (small_rig.stereo.image_height, small_rig.stereo.image_width)
-    instrument = Instrument(small_rig, 7)
-    rng, lit_in_motion = np.random.default_rng(0), []
-    moved = instrument.mechanics.moved
-    instrument.mechanics.moved = lambda *a: (lit_in_motion.append(instrument.mechanics.laser_on), moved(*a))
-    noise = rng.integers(0, 9, (*size, 3)).astype(np.uint8)
+def cameras_before(instrument: Instrument):
+    """What renders noise, and a spot where the twin's laser shines."""
+    size = (instrument.rig.stereo.image_height, instrument.rig.stereo.image_width)
+    noise = np.random.default_rng(0).integers(0, 9, (*size, 3)).astype(np.uint8)
     frame = [0]
 
-    def render():
+    def render() -> StereoImage:
         frame[0] += 1
         pixels, pair = instrument.centroid_px(), []
         for k in (0, 2):
             # Never the same picture twice in a look, however many frames a busy computer needs: that would be a fault.
-            picture = 20 + np.roll(noise, frame[0], axis=k // 2)
+            picture = 20 + np.roll(noise, frame[0] + 1000 * k)
             if np.isfinite(pixels[k]):
                 u, v = map(round, pixels[k : k + 2])
                 picture[v - 5 : v + 6, u - 5 : u + 6] += blob((11, 11), 5, 5, 180).astype(np.uint8)
             pair.append(picture)
         return StereoImage(*pair)
 
+    return render
+
+
+@needs_pseudo_terminals
+def test_hardware_path_from_rig_file_to_campaign(small_rig, tmp_path):
+    """Pyserial on a pseudo-terminal, OpenCV on a stream, questions on a terminal: all as on the bench."""
+    instrument = Instrument(small_rig, 7)
+    lit_in_motion = []
+    moved = instrument.mechanics.moved
+    instrument.mechanics.moved = lambda *a: (lit_in_motion.append(instrument.mechanics.laser_on), moved(*a))
     asked = []
 
     def ask(question):
@@ -145,7 +151,10 @@ def test_hardware_path_from_rig_file_to_campaign(small_rig, tmp_path):
 
     plan = [PlanStep(0, "home", 0, 0), PlanStep(1, "place", target="d1"), PlanStep(2, "look")]
     plan += [PlanStep(3, "move", 60, 10), PlanStep(4, "look"), PlanStep(5, "place", target="d2"), PlanStep(6, "look")]
-    with VirtualCamera(render, frames_per_s=30) as virtual, served(instrument.device, 1_000_000) as port:
+    with (
+        VirtualCamera(cameras_before(instrument), frames_per_s=30) as virtual,
+        served(instrument.device, 1_000_000) as port,
+    ):
         table = {"driver": "serial", "port": port, "settle_s": 0.0}
         real = replace(small_rig, positioner=table, cameras={"source": virtual.address, "spot_sd_px": 0.08})
         said = []
@@ -164,3 +173,44 @@ def test_hardware_path_from_rig_file_to_campaign(small_rig, tmp_path):
     assert "synthetic" not in read_campaign(tmp_path / "c").header
     start = next(r for r in read_journal(tmp_path / "c").records if r.event == "start")
     assert start.data["device"]["fw"] == "1.1.0" and "cameras" in start.data
+
+
+@needs_pseudo_terminals
+def test_a_run_goes_on_at_another_port_with_another_camera(small_rig, tmp_path):
+    """As after a reboot: the board comes back as ttyACM1, the camera at another address, and both are logged."""
+    instrument, said = Instrument(small_rig, 7), []
+    instrument.place("d1", 0)
+    plan = [
+        PlanStep(0, "home", 0, 0),
+        PlanStep(1, "place", target="d1"),
+        PlanStep(2, "look"),
+        PlanStep(3, "move", 60, 10),
+    ]
+    plan += [PlanStep(4, "look")]
+    looks = [0]
+
+    def failing_once(lit, dark):
+        looks[0] += 1
+        if looks[0] == 2:
+            raise DeviceFault("no-frame", "the camera has gone", remedy="plug it in")
+        return centroids(lit, dark)
+
+    def go(resume):
+        with (
+            VirtualCamera(cameras_before(instrument), frames_per_s=30) as virtual,
+            served(instrument.device, 1_000_000) as port,
+        ):
+            # Another name of the same line, should the system give the same one twice.
+            name = tmp_path / f"tty{resume:d}"
+            name.symlink_to(port)
+            table = {"port": str(name), "settle_s": 0.0}
+            rig = replace(small_rig, positioner=table, cameras={"source": virtual.address, "spot_sd_px": 0.08})
+            terminal, vision = Terminal(said.append, ask=lambda question: ""), Vision(failing_once)
+            return acquire(rig, plan, tmp_path / "c", resume=resume, laser_class="3B", vision=vision, terminal=terminal)
+
+    with pytest.raises(DeviceFault, match="has gone"):
+        go(False)
+    assert go(True).reason == "done"
+    changed = [line for line in said if line.endswith(": logged")]
+    assert [line.split(" was ")[0] for line in changed] == ["[cameras] source", "[positioner] port"], said
+    assert 'tty0" and is ' in changed[1] and verify(tmp_path / "c").stopped == "done"
