@@ -187,7 +187,9 @@ class Transport:
     def _beyond_linear(self, place: int, step: np.ndarray) -> np.ndarray:
         """What steps of the z at a place (n,) move its physical value beyond the line at the mode, in units of z."""
         at = self.mode[self.free[place]]
-        return (half_normal(at + step) - half_normal(at)) / half_normal_slope(at) - step
+        # Where no value is distinguished any more, the line goes on.
+        near = np.clip(at + step, -FARTHEST_SD, FARTHEST_SD) - at
+        return (half_normal(at + near) - half_normal(at)) / half_normal_slope(at) - near
 
     def _follow(self, place: int) -> np.ndarray:
         """How far the places behind one follow a unit step of its z, shape (d - place - 1,)."""
