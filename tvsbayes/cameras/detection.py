@@ -398,9 +398,11 @@ def _learned(patches: Sequence[Patch], speckle_contrast: float | None) -> SpotNo
 
     Too few spots show no scatter between looks; the pixels of wide ones then tell what they can.
     """
-    if 0 < len(patches) < SHAPE_SPOTS_MIN and all(patch.wide for patch in patches) and speckle_contrast is None:
+    # Wide spots: first as if there were no speckle, whose weights would make much of wings that are no Gaussian's.
+    wide = bool(patches) and speckle_contrast is None and all(patch.wide for patch in patches)
+    if wide and len(patches) < SHAPE_SPOTS_MIN:
         return mean_noise([with_own_noise(patch)[1] for patch in patches])
-    noise = SpotNoise(speckle_contrast=_contrast(speckle_contrast))
+    noise = SpotNoise(speckle_contrast=0.0 if wide else _contrast(speckle_contrast))
     for _ in range(LEARNING_ROUNDS):
         fits = [(fitted, patch) for patch in patches if (fitted := fit_spot(patch, noise)) is not None]
         if not fits:

@@ -35,6 +35,8 @@ OWN_REACH = 3.5
 SKEW_SHAPE_MAX = 0.15
 """Up to this amplitude a spot may be skewed where there is no other one to compare with: half a Gaussian has 0.17, the
 worst of nine real beams 0.13."""
+SPECKLED = 0.1
+"""Contrast from which speckle is more than shot noise, and weights that know it are worth more than even ones."""
 WIDE_FLOOR_SHARE = 0.02
 """Of the height: what stands for the background in the weights of wide spots, whose noise is mostly shot noise."""
 REACH, REACH_PX = 4.0, 9.0
@@ -185,7 +187,7 @@ def fit_spot(patch: Patch, noise: SpotNoise) -> _Fitted | None:
         signal = model.signal
         residual = pixels.data - signal - p[6:] @ jacobian[6:]
         # Far from the solution the weights of a wrong model mislead: equal ones first.
-        if patch.wide:
+        if patch.wide and noise.speckle_contrast < SPECKLED:
             # No real beam is Gaussian, and a wide spot shows it: its centre must not hang on a guess of the noise.
             variance = signal + WIDE_FLOOR_SHARE * np.exp(p[0]) if settled else 1.0
         else:
@@ -262,8 +264,8 @@ def skewness(fitted: _Fitted, patch: Patch) -> np.ndarray:
 
 def with_own_noise(patch: Patch) -> tuple[Patch, SpotNoise]:
     """A wide patch and its noise by its own pixels; its skew is taken for the beam's shape up to `SKEW_SHAPE_MAX`."""
-    # The weights of a wide spot know no noise, so any will do for this fit.
-    fitted = fit_spot(patch, SpotNoise())
+    # The weights of a wide spot without speckle know no noise, so any will do for this fit.
+    fitted = fit_spot(patch, SpotNoise(speckle_contrast=0.0))
     if fitted is None:
         return patch, SpotNoise()
     height, width = patch.raw.shape
