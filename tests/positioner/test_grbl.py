@@ -26,6 +26,11 @@ def connected(board: GrblBoard, **wishes) -> GrblPositioner:
     return GrblPositioner(lambda: BoardLink(board), made, board.clock)
 
 
+def test_slow_ramps_are_waited_for():
+    """Full speed of 100 mm/s at 5 mm/s^2 takes 20 s, and as long to stop."""
+    assert connected(GrblBoard({120: 5.0}))._board.ramps_s == 40.0
+
+
 def test_messages_of_a_board():
     status = parse_status("<Idle|MPos:5.529,-0.560,7.000|FS:0,0|WCO:0.000,1.551,5.664|Pn:XZ>")
     assert status is not None and (status.state, status.position_mm, status.pins) == ("Idle", (5.529, -0.56), "XZ")

@@ -164,7 +164,7 @@ class GrblPositioner:
         words, seconds = self._way(self._board.counters(before.position_mm), wanted)
         self._order(words, REPLY_S)
         # Answered once everything before it has been done.
-        self._order("G4 P0.01", 5.0 + 2.0 * seconds)
+        self._order("G4 P0.01", 5.0 + 2.0 * (seconds + self._board.ramps_s))
         status = self._asked()
         if status.state != "Idle":
             raise fault("stopped", f"the motion ended in {status.state}", "home again")
@@ -194,6 +194,7 @@ class GrblPositioner:
                 self._write(RESET)
             raise
         if state.laser_on != on:
+            self._write(RESET)
             found = f"the laser's mode stayed {'off' if on else 'on'}"
             raise fault("laser", found, "cut the laser's supply and check its wiring")
         return state

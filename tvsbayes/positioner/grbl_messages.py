@@ -108,11 +108,13 @@ class BoardSettings:
         steps_per_mm: of pan (X) and tilt (Y).
         rate_mm_per_min: top speeds.
         power_max: `S` of full spindle power.
+        ramps_s: time of getting to full speed and back, of the slower axis, s.
     """
 
     steps_per_mm: tuple[float, float]
     rate_mm_per_min: tuple[float, float]
     power_max: float
+    ramps_s: float
 
     @classmethod
     def of(cls, values: Mapping[int, float], laser: str) -> BoardSettings:
@@ -139,13 +141,15 @@ class BoardSettings:
                 raise _unfit(number, found, f"{value:g}: {why}")
         if not int(values.get(10, 0)) & 1:
             raise _unfit(10, values.get(10), "an odd number, such as 1: machine positions in the status")
-        for number in (100, 101, 110, 111):
+        for number in (100, 101, 110, 111, 120, 121):
             high = STEPS_PER_MM_MAX if number < 110 else 1e9
             found = values.get(number)
             if found is None or not 0 < found <= high:
                 raise _unfit(number, found, f"more than 0, at most {high:g}")
         steps, rates = (values[100], values[101]), (values[110], values[111])
-        return cls(steps, rates, values.get(30, 1000.0))
+        pairs = zip(rates, (values[120], values[121]), strict=True)
+        ramps_s = max(2 * rate / 60 / acceleration for rate, acceleration in pairs)
+        return cls(steps, rates, values.get(30, 1000.0), ramps_s)
 
     def counters(self, position_mm: tuple[float, float]) -> tuple[int, int]:
         """Motor steps of (pan, tilt) at a machine position."""
