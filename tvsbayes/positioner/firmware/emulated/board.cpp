@@ -161,17 +161,14 @@ uint8_t digitalReadFast(uint8_t pin) {
 // The counter of the FPGA, divided to microseconds in main().
 uint32_t micros() { return at(kFpga + 0x18); }
 
-// From the same counter, over its wraps. The tick asks too: no interrupt between reading and remembering.
+// From the same counter, over its wraps. The tick asks too, maybe between reading and remembering: a step back of less
+// than half the counter's range is that, and no wrap.
 uint32_t millis() {
   static uint32_t last_us = 0, wraps = 0;
-  uint32_t masked;
-  __asm__ volatile("mrs %0, primask\n cpsid i" : "=r"(masked)::"memory");
   const uint32_t now_us = micros();
-  if (now_us < last_us) ++wraps;
+  if (now_us < last_us && last_us - now_us > UINT32_MAX / 2) ++wraps;
   last_us = now_us;
-  const uint64_t us = (static_cast<uint64_t>(wraps) << 32) + now_us;
-  __asm__ volatile("msr primask, %0" ::"r"(masked) : "memory");
-  return static_cast<uint32_t>(us / 1000);
+  return static_cast<uint32_t>(((static_cast<uint64_t>(wraps) << 32) + now_us) / 1000);
 }
 
 void delayMicroseconds(uint32_t us) {
