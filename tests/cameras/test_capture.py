@@ -118,6 +118,18 @@ def test_side_by_side_is_split_in_the_middle():
     assert (image.left == 10).all() and (image.right == 200).all()
 
 
+@pytest.mark.parametrize("shape", ((HEIGHT, 2 * WIDTH), (HEIGHT, 2 * WIDTH, 1), (HEIGHT, 2 * WIDTH, 3)))
+def test_deep_and_monochrome_pictures_are_kept(shape):
+    """16 bits stay 16 bits; one channel becomes three alike."""
+    deep = np.random.default_rng(2).integers(0, 65535, shape).astype(np.uint16)
+    capture = FakeCapture(VirtualClock())
+    capture.retrieve = lambda: (True, deep)
+    pair = OpenCVCamera([capture], WIDTH, HEIGHT, clock=capture.clock).grab()
+    both = np.hstack([pair.left, pair.right])
+    assert both.dtype == np.uint16 and both.shape == (HEIGHT, 2 * WIDTH, 3)
+    np.testing.assert_array_equal(both, np.broadcast_to(deep.reshape(HEIGHT, 2 * WIDTH, -1), both.shape))
+
+
 def test_settings_are_fixed_and_read_back():
     clock = VirtualClock()
     capture = FakeCapture(clock)
