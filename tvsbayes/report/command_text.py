@@ -221,22 +221,20 @@ def detection_text(found: Detection) -> str:
 
 def locations_text(found: Locations) -> str:
     """Points with their uncertainty."""
-    rows = []
+    far, rows = bool(found.extrapolated.any()), []
     for index, error in enumerate(found.refused):
         if error is not None:
-            rows.append([str(index), f"refused: {error.code}", "", "", "", "", ""])
+            rows.append([str(index), f"refused: {error.code}", "", "", "", ""])
             continue
         sd = np.sqrt(np.diag(found.covariance_mm2[index]))
         cells = [concise(float(x), float(u)) for x, u in zip(found.xyz_mm[index], sd, strict=True)]
         half = " ".join(map(two_digits, found.u95_mm[index]))
         held = int(found.digits_held[index].min())
         verdict = f"same to {held} digit{'s' * (held > 1)}" if held else "differs"
-        rows.append([str(index), *cells, half, verdict, "EXTRAPOLATED" if found.extrapolated[index] else ""])
-    far = bool(found.extrapolated.any())
-    columns = ["point", "x(u) mm", "y(u) mm", "z(u) mm", "U95 mm", "law", ""][: 7 if far else 6]
-    table = TableView(
-        f"frame T, {found.draws} draws ({found.estimator})", columns, [row[: len(columns)] for row in rows]
-    )
+        # What is only known to be far off needs no second opinion on its u.
+        rows.append([str(index), *cells, half, "EXTRAPOLATED" if found.extrapolated[index] else verdict])
+    columns = ["point", "x(u) mm", "y(u) mm", "z(u) mm", "U95 mm", "law"]
+    table = TableView(f"frame T, {found.draws} draws ({found.estimator})", columns, rows)
     return "\n".join([table.text(), LAW, *([EXTRAPOLATED] if far else [])])
 
 
