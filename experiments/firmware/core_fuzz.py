@@ -26,7 +26,7 @@ PROMISES = """\
   says what the line does.
 - Steps: only while the last reply said `moving`, never while receiving, at most one of an axis in a loop, never two
   within 50 us.
-- Targets: as ordered, within the soft limits as they were set; never more than 202 steps of an axis with its limit open.
+- Targets: as ordered, within the soft limits as they were set; at most 202 steps of an axis with its limit open.
 - Replies: form and CRC of every line; at rest the counters stand on the targets.
 """
 

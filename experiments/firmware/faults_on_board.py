@@ -192,7 +192,7 @@ def table(arguments: argparse.Namespace) -> None:
     print(
         f"{len(good)} of {len(rows)} runs end as they must, dark, with no look counted wrongly. The laser pin is read"
     )
-    print("from outside the processor, on a computer that was busy with other work: seconds are an upper bound.\n")
+    print("from outside the processor. Seconds are those of a busy computer: the board falls behind and catches up.\n")
     print(
         "| fault | `acquire` said | pin low after | pin at the end | looks | counted wrongly |\n"
         "|---|---|---|---|---|---|"
