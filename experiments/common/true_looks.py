@@ -6,16 +6,13 @@ range, and the aperture reads it. Points in mm of the frame T, readings in degre
 
 from __future__ import annotations
 
-from contextlib import suppress
 from dataclasses import dataclass, field
 
 import numpy as np
 from scipy import stats
 
-from tvsbayes.calibration.optics import Components, range_components
-from tvsbayes.coordinates.error_map import simple_calibration, simple_rays
-from tvsbayes.errors import NothingToEstimate
-from tvsbayes.estimators.four_point import ClassicResult, classic
+from tvsbayes.coordinates.simple_calibration import simple_belief, simple_calibrations
+from tvsbayes.estimators.four_point import classic_of
 from tvsbayes.instrument.axes import AXES, SIDES
 from tvsbayes.instrument.campaign import Campaign
 from tvsbayes.twin.gear_errors import PERFECT
@@ -78,18 +75,11 @@ class TrueLooks:
 
     def errors_of_others_mm(self, campaign: Campaign) -> dict[str, np.ndarray]:
         """Errors (looks, 3) of the nominal and the classic calibration; NaN without complete experiments."""
-        estimates: dict[str, ClassicResult | None] = {"nominal": None}
         result = {"classic": np.full_like(self.points_mm, np.nan)}
-        with suppress(NothingToEstimate):
-            estimates["classic"] = classic(campaign)
-        for name, estimate in estimates.items():
-            simple = simple_calibration(campaign.rig.priors, estimate)
-            rays = simple_rays(simple, self.counters_steps)
-            base = 2 * (simple.baseline_mm - simple.origin_y_mm)
-            azimuth = campaign.rig.aperture_convention == "azimuth"
-            beam = Components(tuple(rays.origin_mm), tuple(rays.direction))
-            reach = np.asarray(range_components(*beam, base, np.array(self.readings), azimuth))
-            result[name] = beam.at(np.where((reach > 0) & np.isfinite(reach), reach, np.nan)).T - self.points_mm
+        azimuth = campaign.rig.aperture_convention == "azimuth"
+        for name, simple in simple_calibrations(campaign.rig.priors, classic_of(campaign)).items():
+            found = simple_belief(simple, *self.counters_steps.T).points(np.array(self.readings), azimuth)
+            result[name] = found.T - self.points_mm
         return result
 
 
