@@ -31,6 +31,7 @@ EXAMPLES = {
         "tvsbayes report mine --laboratory 'Optics Lab' --customer 'Robotics group'",
     ),
     "compare": ("tvsbayes compare mine", "tvsbayes compare january march"),
+    "watch": ("tvsbayes watch mine tonight", "tvsbayes watch mine tonight --append nights.csv"),
     "locate": (
         "tvsbayes locate mine --pan-steps 169 --tilt-steps 46 --aperture-deg 63.4",
         "tvsbayes locate mine --points points.csv --json",

@@ -372,4 +372,28 @@ FAULTS = (
         "stop errors shrink with the weight of a spot",
         ("estimators/linear_spots::test_leave_one_out_of_weighted_spots_is_that_of_full_weight",),
     ),
+    Fault(
+        "a watched change is taken to have been there from the first day",
+        "comparison/watched_looks.py",
+        "shifts[: self.first] = 0.0",
+        "shifts[: self.first] *= 1.0",
+        "the old looks deny what the new ones show: knocked cameras pass as unmoved",
+        ("comparison/watched_looks",),
+    ),
+    Fault(
+        "a watched calibration without the chance of its many tests",
+        "comparison/watched_looks.py",
+        "return NullDistribution(np.sort(np.min(logs, axis=0)))",
+        "return NullDistribution(np.sort(logs[0]))",
+        "nine tests at 1 % each: false alarms far more often than stated",
+        ("comparison/watched_looks",),
+    ),
+    Fault(
+        "a change is told again under the names of its neighbours",
+        "comparison/watched_looks.py",
+        "logs = log_chances(departures, known)[1:]",
+        "logs = log_chances(departures, known[:0])[1:]",
+        "one knocked part is told without end instead of once",
+        ("comparison/watched_looks",),
+    ),
 )

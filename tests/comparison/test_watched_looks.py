@@ -1,0 +1,170 @@
+"""A watched calibration: the linear algebra against a dense Gaussian, planted knocks named, chances as stated."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tvsbayes.cli.main import run
+from tvsbayes.comparison import watched_looks
+from tvsbayes.comparison.watched_looks import (
+    CHANGES,
+    COLUMNS,
+    FALSE_ALARM_RATE,
+    Departure,
+    WatchedLooks,
+    null_distribution,
+    powers,
+    watch,
+)
+from tvsbayes.errors import NothingToEstimate
+from tvsbayes.instrument.campaign import Campaign, write_campaign
+from tvsbayes.instrument.parameters import STEREO_PARAMETER_NAMES
+from tvsbayes.instrument.protocols import four_point_protocol
+from tvsbayes.report.watch_text import HELPS, MISSED
+from tvsbayes.results.watch_record import CANNOT_TELL, MOVED, OK
+from tvsbayes.statistics.chances import binomial_bounds
+from tvsbayes.twin.simulated_campaign import simulate
+from tvsbayes.twin.true_rig import Truth
+
+
+@pytest.fixture(scope="module")
+def truth(mounted_rig) -> Truth:
+    """Of the rig that `mixed_fit` was made from."""
+    return simulate(mounted_rig, four_point_protocol(repeats=6, steps=(100, 200)), seed=3).truth
+
+
+def next_day(rig, truth: Truth, seed: int = 11, repeats: int = 1, **changed: float) -> Campaign:
+    """Looks at the same counters after parameters have changed by so much; `__` stands for a dot."""
+    vector, parameters = truth.stereo.vector.copy(), dict(truth.parameters)
+    for name, by in changed.items():
+        name = name.replace("__", ".")
+        if name in STEREO_PARAMETER_NAMES:
+            vector[STEREO_PARAMETER_NAMES.index(name)] += by
+        else:
+            parameters[name] += by
+    now = replace(truth, parameters=parameters, stereo=truth.stereo.with_vector(vector))
+    plan = four_point_protocol(repeats=repeats, steps=(100, 200))
+    return simulate(rig, plan, seed=seed, truth=now).campaign
+
+
+def test_the_departure_is_that_of_a_dense_gaussian(mounted_rig, mixed_fit, truth):
+    """Covariance of all residuals spelled out, the second day given the first by the rule of Gaussian conditioning."""
+    watched = WatchedLooks(mixed_fit, next_day(mounted_rig, truth))
+    found = watched.departure(mixed_fit.z)
+    spots = watched.linear(mixed_fit.z)
+    count, size = len(mixed_fit.z), len(spots.residual)
+    covariance, states = np.zeros((size, 6, size, 6)), np.zeros((6, 6))
+    for row in range(size):
+        keep = ~spots.renewed[row]
+        states = states * np.outer(keep, keep) + np.diag(spots.variance[row])
+        covariance[row, :, row] = states
+        if row:
+            covariance[row, :, :row] = keep[:, None, None] * covariance[row - 1, :, :row]
+            covariance[:row, :, row] = np.moveaxis(covariance[row, :, :row], 0, -1)
+    load = np.zeros((size, 4, size, 6))
+    load[np.arange(size), :, np.arange(size)] = spots.load
+    load = load.reshape(4 * size, -1)
+    dense = np.eye(4 * size) + load @ covariance.reshape(6 * size, -1) @ load.T
+    places = spots.places.reshape(4 * size, -1)
+    columns = spots.jacobian.reshape(4 * size, -1)
+    own, shifts = columns[:, :count], columns[:, count:]
+    dense += places @ places.T + own @ own.T
+    # A priori the coordinates are N(0, 1): z of them is taken back to nought.
+    residual = spots.residual.ravel() + own @ np.where(watched.problem.held, 0.0, mixed_fit.z)
+    new = np.arange(4 * size) >= 4 * watched.first
+    gain = dense[np.ix_(new, ~new)] @ np.linalg.inv(dense[np.ix_(~new, ~new)])
+    left = residual[new] - gain @ residual[~new]
+    inverse = np.linalg.inv(dense[np.ix_(new, new)] - gain @ dense[np.ix_(~new, new)])
+    asked = shifts[new]
+    # Priors of 1e5 sds of the spots: the dense inverse keeps six digits of what is large.
+    assert found.chi2 == pytest.approx(left @ inverse @ left, rel=1e-6)
+    dense_information = asked.T @ inverse @ asked
+    scale = 1 / np.sqrt(np.diag(dense_information))
+    both = np.outer(scale, scale)
+    np.testing.assert_allclose(found.information * both, dense_information * both, atol=1e-5)
+    np.testing.assert_allclose(found.score * scale, asked.T @ inverse @ left * scale, atol=1e-4)
+    assert found.dof == 3 * watched.looks and not shifts[~new].any()
+
+
+@pytest.mark.parametrize(
+    ("changed", "what", "size"),
+    [
+        ({"stereo__rotation_rad__x": np.radians(0.1)}, "cameras: rotation about x", 0.1),
+        ({"extrinsics__translation_mm__y": 3.0}, "positioner: shift along y", 3.0),
+        ({"degrees_per_step__tilt": 0.05 * 0.07}, "ratio: tilt", 5.0),
+        ({"backlash_deg__tilt": 0.8}, "play: tilt", 0.8),
+    ],
+)
+def test_a_planted_change_is_named(mounted_rig, mixed_fit, truth, changed, what, size):
+    found = watch(mixed_fit, next_day(mounted_rig, truth, **changed, repeats=2))
+    assert found.verdict == MOVED and found.p < FALSE_ALARM_RATE
+    part = found.moved[0]
+    assert part.what == what and len({other.what for other in found.moved}) == len(found.moved)
+    # Linear in the change: a tenth of it beside four u.
+    assert part.value == pytest.approx(size, abs=4 * part.u + 0.1 * size)
+
+
+def test_nothing_has_moved(mounted_rig, mixed_fit, truth, monkeypatch):
+    """The same looks are OK where their power is enough, and tell which change they cannot see where it is not."""
+    looks = next_day(mounted_rig, truth)
+    found = watch(mixed_fit, looks)
+    assert found.verdict == CANNOT_TELL and found.p > FALSE_ALARM_RATE and not found.moved and found.same_cameras
+    assert "ratio: pan" in {change.what for change in found.unseen(0.8)}
+    monkeypatch.setattr(watched_looks, "POWER_MIN", 0.0)
+    assert watch(mixed_fit, looks).verdict == OK
+    unseen = replace(looks, spots=tuple(replace(s, status="saturated") for s in looks.spots[3:]) + looks.spots[:3])
+    with pytest.raises(NothingToEstimate, match="3 new looks"):
+        watch(mixed_fit, unseen)
+
+
+def test_false_alarms_and_power_are_those_of_the_linear_model():
+    """Scores drawn from a model in which nothing, or one change, has moved: counted against what is stated."""
+    generator = np.random.default_rng(5)
+    columns = generator.standard_normal((40, COLUMNS[-1].stop)) * 0.6
+    # A size of 1 mm beside one of 0.05 deg: all changes about as visible.
+    columns /= np.concatenate([np.full(len(c.names), c.size) for c in CHANGES])
+    known = Departure(0.0, 40, np.zeros(columns.shape[1]), columns.T @ columns)
+    null, trials, shifted = null_distribution(known, 1), 400, COLUMNS[6]
+    stated = powers(known, null.limit, 1)[6]
+    alarms = noticed = 0
+    for _ in range(trials):
+        noise = generator.standard_normal(40)
+        for moved in (False, True):
+            seen = noise + moved * columns[:, shifted] @ [CHANGES[6].size]
+            trial = replace(known, chi2=float(seen @ seen), score=columns.T @ seen)
+            logs = watched_looks.log_chances([trial], [])
+            alarms += (not moved) and bool(logs.min() <= null.limit)
+            noticed += moved and bool(logs[1 + 6] <= null.limit)
+    low, high = binomial_bounds(trials, FALSE_ALARM_RATE)
+    assert low <= alarms / trials <= high
+    low, high = binomial_bounds(trials, stated)
+    assert low <= noticed / trials <= high and 0.05 < stated < 1
+    assert null.probability(null.limit) == pytest.approx(FALSE_ALARM_RATE, rel=0.02)
+    assert null.probability(-50.0) == pytest.approx(9 * np.exp(-50), rel=1e-9)
+
+
+def test_the_command_keeps_a_table(mounted_rig, mixed_fit, truth, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("tvsbayes.cli.watch_command.fit_for", lambda *_: mixed_fit)
+    for name, campaign in (
+        ("old", mixed_fit.campaign),
+        ("same", next_day(mounted_rig, truth)),
+        ("knocked", next_day(mounted_rig, truth, extrinsics__translation_mm__y=5.0)),
+    ):
+        write_campaign(campaign, tmp_path / name)
+    old, same, knocked, table = (str(tmp_path / name) for name in ("old", "same", "knocked", "nights.csv"))
+    assert run(["watch", old, same, "--append", table]) == 3
+    text = capsys.readouterr().out
+    assert text.startswith("CANNOT TELL (p = ") and "cannot see 0.3 % of ratio: pan: pan counters further apart" in text
+    assert run(["watch", old, knocked, "--append", table, "--json"]) == 1
+    document = json.loads(capsys.readouterr().out)
+    assert document["verdict"] == "MOVED" and document["looks"] == 16 and document["false_alarm_rate"] == 0.01
+    assert document["moved"][0]["what"] == "positioner: shift along y" and document["moved"][0]["unit"] == "mm"
+    head, first, second = (tmp_path / "nights.csv").read_text().splitlines()
+    assert head == "time,verdict,p,looks,moved"
+    assert first.split(",")[1] == "CANNOT TELL" and "positioner: shift along y" in second
+    assert set(HELPS) == {change.what for change in CHANGES}
+    assert set(MISSED) == {change.what.split(":")[0] for change in CHANGES}

@@ -1,0 +1,408 @@
+"""A few new looks against a stored fit: does the calibration still hold, and if not, what moved?
+
+Both days are linearised together at the mode of the first, the second as a run that begins with a homing. Stop errors,
+home offsets and errors of gears that repeat are in the covariance, those at counters of the first day as that day knows
+them; nothing is refitted. A change is a shift of parameters for the new looks alone (formulation 9). Degrees, mm.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+
+import equinox as eqx
+import numpy as np
+
+from tvsbayes.errors import NothingToEstimate
+from tvsbayes.estimators.annealed_stage import NO_STEP, Fixed, stage
+from tvsbayes.estimators.campaign_arrays import in_sight
+from tvsbayes.estimators.joint_fit import JointFit, priors_used
+from tvsbayes.estimators.linear_spots import LinearSpots, linear_spots, stop_information
+from tvsbayes.estimators.mode_search import Problem
+from tvsbayes.instrument.campaign import Campaign, input_hashes, ordered_spots
+from tvsbayes.instrument.homing import homed
+from tvsbayes.instrument.parameters import INDEX, NAMES, NOISE_NAMES, RIG_NAMES
+from tvsbayes.model.compiled import placed
+from tvsbayes.model.parameter_space import physical_at
+from tvsbayes.results.watch_record import CANNOT_TELL, MOVED, OK, MovedPart, SeenChange, Verdict, Watch
+from tvsbayes.statistics.chances import log_chance
+
+LOOKS_MIN = 4
+"""Usable new looks below which nothing is asked."""
+FALSE_ALARM_RATE = 0.01
+POWER_MIN = 0.8
+"""Probability with which a change of the stated size must be noticed for a verdict of OK."""
+NOISE_DRAWS = 24
+"""Of the noise scales, over which probabilities are averaged."""
+NULL_DRAWS, DIRECTIONS_ASKED = 20_000, 200
+"""Of the joint null distribution, and directions of a change over which its power is averaged."""
+FOLLOWED = 1e-6
+"""Share of a direction's information below which the old parameters can follow it entirely."""
+TOLD_U = 2.0
+"""Components of a change beyond so many u are told."""
+
+
+@dataclass(frozen=True)
+class StatedChange:
+    """A change that is asked about.
+
+    Attributes:
+        what: its name for people.
+        names: parameters that it shifts.
+        parts: how their shifts are called.
+        size: length of the shift that must be noticed, in `unit`.
+        unit: of it.
+    """
+
+    what: str
+    names: tuple[str, ...]
+    parts: tuple[str, ...]
+    size: float
+    unit: str
+
+
+def _pose(what: str, block: str) -> tuple[StatedChange, StatedChange]:
+    turned, shifted = (tuple(f"{block}.{kind}.{axis}" for axis in "xyz") for kind in ("rotation_rad", "translation_mm"))
+    about, along = (tuple(f"{what}: {how} {axis}" for axis in "xyz") for how in ("rotation about", "shift along"))
+    return (
+        StatedChange(f"{what}: rotation", turned, about, 0.05, "deg"),
+        StatedChange(f"{what}: shift", shifted, along, 1.0, "mm"),
+    )
+
+
+def _single(what: str, name: str, size: float, unit: str) -> StatedChange:
+    return StatedChange(what, (name,), (what,), size, unit)
+
+
+CHANGES = (
+    *_pose("cameras", "stereo"),
+    *_pose("positioner", "extrinsics"),
+    *(_single(f"ratio: {axis}", f"degrees_per_step.{axis}", 0.3, "%") for axis in ("pan", "tilt")),
+    *(_single(f"play: {axis}", f"backlash_deg.{axis}", 0.1, "deg") for axis in ("pan", "tilt")),
+)
+"""Everything that is asked about, and the size that must be noticed."""
+
+
+def _columns() -> tuple[slice, ...]:
+    ends = np.cumsum([len(change.names) for change in CHANGES])
+    return tuple(slice(int(end) - len(change.names), int(end)) for end, change in zip(ends, CHANGES, strict=True))
+
+
+COLUMNS = _columns()
+_SHIFTED = [INDEX[name] for change in CHANGES for name in change.names]
+
+
+def after_each_other(campaign: Campaign, looks: Campaign) -> Campaign:
+    """Two days as one campaign: the second begins with a homing of its own."""
+    moves, spots, last = len(campaign.moves), max(spot.spot for spot in campaign.spots) + 1, campaign.moves[-1]
+    later = tuple(
+        replace(m, move=m.move + moves, segment=m.segment + last.segment + 1, time_s=m.time_s + last.time_s)
+        for m in looks.moves
+    )
+    seen = tuple(replace(s, spot=s.spot + spots, move=s.move + moves, experiment=None, point=None) for s in looks.spots)
+    return replace(campaign, moves=(*campaign.moves, *later), spots=(*campaign.spots, *seen))
+
+
+@dataclass(frozen=True)
+class Departure:
+    """What new looks say beyond what the first day foretells of them, at one set of noise scales.
+
+    Attributes:
+        chi2: squared length of the foretold residuals in units of their covariance.
+        dof: observations in it.
+        score: of the shifts, in the units of `CHANGES`, shape (q,).
+        information: that the looks have of them, shape (q, q).
+    """
+
+    chi2: float
+    dof: int
+    score: np.ndarray
+    information: np.ndarray
+
+    def given(self, known: list[slice]) -> Departure:
+        """With some changes free: what is left for the others."""
+        if not known:
+            return self
+        rows = np.concatenate([np.arange(part.start, part.stop) for part in known])
+        load = self.information[:, rows] @ _inverse(self.information[np.ix_(rows, rows)])
+        information = self.information - load @ self.information[rows]
+        return replace(self, score=self.score - load @ self.score[rows], information=information)
+
+
+@dataclass(frozen=True)
+class Shift:
+    """Sizes of changes by generalised least squares: values (n,) and their covariance (n, n)."""
+
+    value: np.ndarray
+    covariance: np.ndarray
+
+
+def _directions(information: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Eigenvalues and vectors of the scaled information that the old parameters cannot follow; the scale back in."""
+    scale = np.sqrt(np.maximum(np.diag(information), 1e-300))
+    values, vectors = np.linalg.eigh(information / np.outer(scale, scale))
+    kept = values > FOLLOWED
+    return values[kept], vectors[:, kept] / scale[:, None]
+
+
+def _inverse(information: np.ndarray) -> np.ndarray:
+    values, vectors = _directions(information)
+    return (vectors / values) @ vectors.T
+
+
+def _test(score: np.ndarray, information: np.ndarray) -> tuple[np.ndarray, int]:
+    """Chi-squares of scores (..., q) and their degrees of freedom."""
+    values, vectors = _directions(information)
+    return np.sum((score @ vectors) ** 2 / values, axis=-1), len(values)
+
+
+@dataclass(frozen=True)
+class _Told:
+    """What linearised spots say where the coordinates follow them.
+
+    Attributes:
+        chi2: squared length of what is left of the residuals and the priors, up to a constant.
+        score: of the columns behind the coordinates, shape (q,).
+        information: of them, shape (q, q).
+    """
+
+    chi2: float
+    score: np.ndarray
+    information: np.ndarray
+
+    @classmethod
+    def of(cls, spots: LinearSpots, prior: np.ndarray) -> _Told:
+        """Of spots whose first columns are coordinates that stand at `prior`, shape (p,), before N(0, 1)."""
+        found, count = stop_information(spots), len(prior)
+        errors = np.concatenate([group.residual for group in found.groups])
+        score = spots.jacobian.reshape(len(errors), -1).T @ errors
+        own, cross = score[:count] - prior, found.fisher[:count, count:]
+        precision = found.fisher[:count, :count] + np.eye(count)
+        left = np.linalg.solve(precision, np.column_stack([own, cross]))
+        return cls(
+            chi2=float(spots.residual.ravel() @ errors - own @ left[:, 0]),
+            score=score[count:] - cross.T @ left[:, 0],
+            information=found.fisher[count:, count:] - cross.T @ left[:, 1:],
+        )
+
+
+class WatchedLooks:
+    """New looks and the campaign that they are watched against, in front of the compiled functions."""
+
+    def __init__(self, fit: JointFit, looks: Campaign):
+        campaign = homed(fit.campaign, fit.sides)
+        self.fit, self.first = fit, len(ordered_spots(campaign))
+        both = after_each_other(campaign, homed(looks, fit.sides))
+        seen, used = in_sight(both), np.asarray(fit.arrays.spots.valid)[: self.first] > 0
+        used = np.append(used, seen[self.first :])
+        table = replace(
+            campaign.rig,
+            priors=priors_used(campaign.rig.priors, np.asarray(fit.space.value), np.asarray(fit.space.u)),
+        )
+        self.problem = Problem(both, table, used)
+        weight = np.array(self.problem.arrays.spots.weight)
+        weight[: self.first] = np.asarray(fit.arrays.spots.weight)[: self.first]
+        self.problem.arrays = eqx.tree_at(lambda a: a.spots.weight, self.problem.arrays, placed(weight))
+        later = self.problem.spots[self.first :]
+        self.looks = int(used[self.first :].sum())
+        readings = sum(s.aperture_deg is not None for s, use in zip(later, used[self.first :], strict=True) if use)
+        self.dof = 3 * self.looks + readings
+
+    def departure(self, z: np.ndarray) -> Departure:
+        """What the looks say beyond the first day, both linearised at z; its noise scales are held."""
+        linear, prior = self.linear(z), np.where(self.problem.held, 0.0, z)
+        both, before = (_Told.of(spots, prior) for spots in (linear, _rows(linear, slice(self.first))))
+        return Departure(both.chi2 - before.chi2, self.dof, both.score, both.information)
+
+    def linear(self, z: np.ndarray) -> LinearSpots:
+        """Both days at z, with columns for the coordinates and, behind them, for the changes.
+
+        Linearised in physical values, not in coordinates: a change may shift what the fit holds fixed.
+        """
+        at, rig = physical_at(z, self.problem.space), len(RIG_NAMES)
+        plain = replace(
+            self.problem.space,
+            value=placed(at.value[:rig]),
+            u=placed(np.ones(rig)),
+            kind=placed(np.zeros(rig, dtype=np.asarray(self.problem.space.kind).dtype)),
+            stereo_mean=placed(at.value[rig:]),
+            stereo_root=placed(np.eye(len(NAMES) - rig)),
+        )
+        still = np.zeros(len(NAMES))
+        fixed = Fixed(np.zeros(len(NAMES), dtype=bool), still, np.array(1.0))
+        found = stage(still, plain, self.problem.arrays, fixed, np.array(NO_STEP)).of_spots(len(self.problem.spots))
+        physical = -np.asarray(found.residual_jacobian)
+        own = np.where(self.problem.held, 0.0, physical @ at.slope)
+        shifts = physical[:, :, _SHIFTED] * self._unit_sizes(at.value)
+        shifts[: self.first] = 0.0
+        return linear_spots(found, self.problem.arrays, np.concatenate([own, shifts], axis=2))
+
+    @staticmethod
+    def _unit_sizes(value: np.ndarray) -> np.ndarray:
+        """Physical values of a shift by one unit of `CHANGES`, shape (q,)."""
+        sizes = []
+        for change in CHANGES:
+            for name in change.names:
+                radians = np.radians(1.0) if "rotation_rad" in name else 1.0
+                sizes.append(0.01 * value[INDEX[name]] if change.unit == "%" else radians)
+        return np.array(sizes)
+
+    def departures(self, seed: int) -> list[Departure]:
+        """At the mode, then at draws of the noise scales."""
+        noise = np.isin(NAMES, NOISE_NAMES) & self.problem.free
+        rows = np.random.default_rng(seed).choice(len(self.fit.draws_z), NOISE_DRAWS, replace=False)
+        draws = [np.where(noise, self.fit.draws_z[row], self.fit.z) for row in rows]
+        return [self.departure(z) for z in (self.fit.z, *draws)]
+
+
+def _rows(spots: LinearSpots, rows: slice) -> LinearSpots:
+    return LinearSpots(**{part.name: getattr(spots, part.name)[rows] for part in fields(spots)})
+
+
+def _log_mean(values: list[np.ndarray]) -> np.ndarray:
+    return np.logaddexp.reduce(np.array(values), axis=0) - np.log(len(values))
+
+
+def log_chances(departures: list[Departure], known: list[slice]) -> np.ndarray:
+    """Log p of all tests, then of every change given those known, averaged over the noise scales; shape (1 + c,)."""
+    found = []
+    for departure in departures:
+        left, own = departure.given(known), [log_chance(departure.chi2, departure.dof)]
+        for rows in COLUMNS:
+            chi2, dof = _test(left.score[rows], left.information[rows, rows])
+            own.append(np.zeros(()) if rows in known or not dof else log_chance(chi2, dof))
+        found.append(np.array(own))
+    return _log_mean(found)
+
+
+@dataclass(frozen=True)
+class NullDistribution:
+    """Least log p of all tests if nothing has moved, sorted, shape (draws,)."""
+
+    least: np.ndarray
+
+    @property
+    def limit(self) -> float:
+        """Log p of a single test below which the false-alarm rate of all together is reached."""
+        return float(np.quantile(self.least, FALSE_ALARM_RATE))
+
+    def probability(self, log_p: float) -> float:
+        """Of a least log p like this; beyond the draws by Bonferroni's bound."""
+        counted = np.searchsorted(self.least, log_p, side="right")
+        if not counted:
+            return float(min(1 / len(self.least), (1 + len(CHANGES)) * np.exp(log_p)))
+        return float(counted / len(self.least))
+
+
+def null_distribution(departure: Departure, seed: int) -> NullDistribution:
+    """By simulation of the linear model: scores ~ N(0, information), and what no change explains besides."""
+    generator = np.random.default_rng(seed)
+    values, vectors = np.linalg.eigh(departure.information)
+    root = vectors * np.sqrt(np.maximum(values, 0.0))
+    scores = generator.standard_normal((NULL_DRAWS, len(root))) @ root.T
+    explained, rank = _test(scores, departure.information)
+    rest = generator.chisquare(departure.dof - rank, NULL_DRAWS) if departure.dof > rank else 0.0
+    logs = [log_chance(explained + rest, departure.dof)]
+    for rows in COLUMNS:
+        chi2, dof = _test(scores[:, rows], departure.information[rows, rows])
+        if dof:
+            logs.append(log_chance(chi2, dof))
+    return NullDistribution(np.sort(np.min(logs, axis=0)))
+
+
+def powers(departure: Departure, limit: float, seed: int) -> list[float]:
+    """Probability with which each change of its stated size fails its own test, over all directions of the shift.
+
+    A lower bound of the power of all tests together.
+
+    Args:
+        departure: only its information counts: a plan has one as well as looks.
+        limit: of log p.
+        seed: of the directions.
+    """
+    from scipy import special
+
+    generator, found = np.random.default_rng(seed), []
+    for change, rows in zip(CHANGES, COLUMNS, strict=True):
+        own = departure.information[rows, rows]
+        dof = len(_directions(own)[0])
+        if not dof:
+            found.append(0.0)
+            continue
+        ways = generator.standard_normal((DIRECTIONS_ASKED, len(change.names)))
+        ways *= change.size / np.linalg.norm(ways, axis=1, keepdims=True)
+        critical = special.chdtri(dof, np.exp(limit))
+        off = np.einsum("ni,ij,nj->n", ways, own, ways)
+        found.append(float(np.mean(1 - special.chndtr(critical, dof, off))))
+    return found
+
+
+def _moved(departures: list[Departure], limit: float) -> tuple[MovedPart, ...]:
+    """Changes that explain the looks, the best first, each beyond what those before it explain."""
+    known: list[slice] = []
+    while len(known) < len(COLUMNS):
+        logs = log_chances(departures, known)[1:]
+        best = int(np.argmin(logs))
+        if logs[best] > limit:
+            break
+        known.append(COLUMNS[best])
+    if not known:
+        return ()
+    rows = np.concatenate([np.arange(part.start, part.stop) for part in known])
+    covariance = _inverse(departures[0].information[np.ix_(rows, rows)])
+    shift = Shift(covariance @ departures[0].score[rows], covariance)
+    named = [(part, change.unit) for change in CHANGES for part in change.parts]
+    parts: list[MovedPart] = []
+    start = 0
+    for columns in known:
+        own = slice(start, start := start + columns.stop - columns.start)
+        value, u = shift.value[own], np.sqrt(np.diag(shift.covariance)[own])
+        ratio = np.abs(value) / u
+        told = [k for k in np.argsort(-ratio).tolist() if ratio[k] > TOLD_U] or [int(np.argmax(ratio))]
+        parts += [
+            MovedPart(named[columns.start + k][0], float(value[k]), float(u[k]), named[columns.start + k][1])
+            for k in told
+        ]
+    return tuple(parts)
+
+
+def watch(fit: JointFit, looks: Campaign, *, seed: int = 0) -> Watch:
+    """Whether a calibration still holds for new looks.
+
+    Args:
+        fit: converged fit of the campaign.
+        looks: new looks at the same rig, from a homing on.
+        seed: of the draws of noise scales and of the null distribution.
+
+    Raises:
+        NothingToEstimate: fewer than `LOOKS_MIN` usable looks.
+    """
+    usable = int(in_sight(looks).sum()) if ordered_spots(looks) else 0
+    if usable < LOOKS_MIN:
+        raise NothingToEstimate(
+            "too-few-looks",
+            f"spots.csv: {usable} new looks can be used; a calibration is watched with at least {LOOKS_MIN}",
+            file="spots.csv",
+            remedy="look at more places, or detect the refused spots again",
+        )
+    watched = WatchedLooks(fit, looks)
+    departures = watched.departures(seed)
+    null = null_distribution(departures[0], seed)
+    logs = log_chances(departures, [])
+    able = powers(departures[0], null.limit, seed)
+    changes = tuple(
+        SeenChange(change.what, change.size, change.unit, power, float(np.exp(log_p)))
+        for change, power, log_p in zip(CHANGES, able, logs[1:], strict=True)
+    )
+    found = bool(logs.min() <= null.limit)
+    verdict: Verdict = MOVED if found else OK if min(able) >= POWER_MIN else CANNOT_TELL
+    hashes = input_hashes(fit.campaign)["stereo"], input_hashes(looks)["stereo"]
+    return Watch(
+        verdict=verdict,
+        p=null.probability(float(logs.min())),
+        false_alarm_rate=FALSE_ALARM_RATE,
+        p_all=float(np.exp(logs[0])),
+        moved=_moved(departures, null.limit) if found else (),
+        changes=changes,
+        looks=watched.looks,
+        same_cameras=hashes[0] == hashes[1],
+    )

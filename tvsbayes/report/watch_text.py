@@ -1,0 +1,59 @@
+"""What `watch` prints: the verdict first, then what moved, what the looks can see, and what to do."""
+
+from __future__ import annotations
+
+from tvsbayes.report.tables import TableView, concise
+from tvsbayes.results.watch_record import CANNOT_TELL, MOVED, MovedPart, Watch
+
+HELPS = {
+    "cameras: rotation": "more looks on both sheets, over the whole picture",
+    "cameras: shift": "more looks on both sheets, over the whole picture",
+    "positioner: rotation": "more homings, each with its looks: what a homing leaves open looks the same",
+    "positioner: shift": "looks on both sheets at more counters",
+    "ratio: pan": "pan counters further apart, each reached several times",
+    "ratio: tilt": "tilt counters further apart, each reached several times",
+    "play: pan": "each pan counter from both sides, several times",
+    "play: tilt": "each tilt counter from both sides, several times",
+}
+"""Which looks see a change better, by change."""
+MISSED = {
+    "cameras": "calibrate the cameras anew, then the rig",
+    "positioner": "fasten it and calibrate anew; coordinates are off by what is told above until then",
+    "ratio": "look for a slipping gear or lost steps, then calibrate anew",
+    "play": "look for wear or a loose grub screw, then calibrate anew",
+}
+"""What to do where something moved, by the first word of its name."""
+
+
+def moved_words(part: MovedPart) -> str:
+    """`cameras: rotation about y 0.052(6) deg`."""
+    return f"{part.what} {concise(part.value, part.u)} {part.unit}"
+
+
+def watch_text(found: Watch, power_min: float) -> str:
+    """A watched calibration for people.
+
+    Args:
+        found: the result.
+        power_min: below which a change counts as unseen.
+    """
+    rows = [
+        [c.what, f"{c.size:g} {c.unit}", f"{100 * c.power:.0f} %", "< 1e-9" if c.p < 1e-9 else f"{c.p:.2g}"]
+        for c in found.changes
+    ]
+    table = TableView(
+        f"{found.looks} new looks against the calibration", ["change", "of", "would be noticed by", "p"], rows
+    )
+    p = "< 1e-9" if found.p < 1e-9 else f"= {found.p:.2g}"
+    lines = [f"{found.verdict} (p {p}; false alarms {100 * found.false_alarm_rate:g} %)"]
+    lines += [f"moved: {moved_words(part)}" for part in found.moved]
+    if found.verdict == MOVED:
+        causes = dict.fromkeys(part.what.split(":")[0] for part in found.moved)
+        lines += [f"what to do: {MISSED[cause]}" for cause in causes]
+        if not found.moved:
+            lines.append("moved: none of the changes below explains the looks")
+            lines.append("what to do: run `tvsbayes check` on the new looks; calibrate anew if they are sound")
+    unseen = found.unseen(power_min)
+    if found.verdict == CANNOT_TELL:
+        lines += [f"cannot see {c.size:g} {c.unit} of {c.what}: {HELPS[c.what]}" for c in unseen]
+    return "\n".join([*lines, "", table.text()])
