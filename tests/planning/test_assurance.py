@@ -26,7 +26,7 @@ def believers(knowledge, *z) -> Instruments:
     return Instruments.at(np.array(z), np.broadcast_to(value, (len(z), len(value))), knowledge.space)
 
 
-@pytest.mark.parametrize(("together", "kept"), [(4096, 16), (1, 2)])
+@pytest.mark.parametrize(("together", "kept"), [pytest.param(4096, 16, marks=pytest.mark.slow), (1, 2)])
 def test_what_is_reported_is_the_whole_plan_judged_at_each_instrument(knowledge, found, monkeypatch, together, kept):
     """One by one, move by move through the filter: at the true noise for the scales, at these for the covariance.
 

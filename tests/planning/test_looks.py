@@ -118,7 +118,7 @@ def test_looks_taken_again_count_as_often_as_they_are_taken():
             assert np.abs(information - whole).max() < ROUNDING * np.abs(whole).max()
 
 
-@pytest.mark.parametrize("block", [1, 7, 1000])
+@pytest.mark.parametrize("block", [7, *(pytest.param(n, marks=pytest.mark.slow) for n in (1, 1000))])
 def test_looks_and_instruments_keep_their_places_whatever_the_block(knowledge, monkeypatch, block):
     """One by one, and in blocks that end within an instrument or hold all of them; those out of view with them."""
     steps = np.array([[0, 0], [100, 20], [900, 0], [40, -30], [60, 400]])

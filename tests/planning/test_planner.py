@@ -13,7 +13,7 @@ from support.waits import check_forward, doings
 
 from tvsbayes.errors import InputError
 from tvsbayes.instrument.parameters import Prior
-from tvsbayes.instrument.plan import read_plan, write_plan
+from tvsbayes.instrument.plan import LOOKS_PER_EXPERIMENT, read_plan, write_plan
 from tvsbayes.instrument.protocols import paper_protocol
 from tvsbayes.instrument.stops import FEW_STOPS
 from tvsbayes.planning.expectation import information_of, plan_minutes, prior_knowledge
@@ -86,9 +86,9 @@ def test_the_document_has_the_contracts_keys(result):
 
 def test_the_text_names_the_plan_and_what_was_not_reached(result):
     text = plan_text(result)
-    assert f"the plan: n = {result.experiments}, {result.looks} looks" in text
-    last = result.curve[-1].experiments
-    assert f"assurance 95 %: not reached with up to {last} experiments" in plan_text(replace(result, n95=None))
+    assert f"the plan: {result.looks} looks in" in text
+    last = LOOKS_PER_EXPERIMENT * result.curve[-1].experiments
+    assert f"for a chance of 95 %: not reached with up to {last} looks" in plan_text(replace(result, n95=None))
 
 
 def test_gain_per_minute_falls_in_order(result):

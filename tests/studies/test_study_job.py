@@ -43,6 +43,7 @@ def test_estimates_of_a_posterior_go_by_its_weights():
     assert (tilt_contrast, pan_play, tilt_play) == pytest.approx((0.0, 0.25, 0.0), rel=1e-12)
 
 
+@pytest.mark.slow
 def test_the_planner_predicts_what_a_fit_of_real_gears_reports(mounted_rig):
     """Ratios, lines over the looks with the gears' errors: sds of a fit within 15 % of those foretold at its truth.
 

@@ -33,6 +33,6 @@ FAULTS = (
         "picture[top : round(v) + HALF_PX + 1, left : round(u) + HALF_PX + 1]",
         "picture[left : round(u) + HALF_PX + 1, top : round(v) + HALF_PX + 1]",
         "the report shows empty paper under the cross",
-        ("report/spot_pictures",),
+        ("report/spot_crops",),
     ),
 )
