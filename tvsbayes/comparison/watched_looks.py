@@ -309,8 +309,8 @@ def null_distribution(departure: Departure, seed: int) -> NullDistribution:
     return NullDistribution(np.sort(np.min(logs, axis=0)))
 
 
-def powers(departure: Departure, limit: float, seed: int) -> list[float]:
-    """Probability with which each change of its stated size fails its own test, over all directions of the shift.
+def powers(departure: Departure, limit: float, seed: int, times: float = 1.0) -> list[float]:
+    """Probability with which each change fails its own test, over all directions of the shift.
 
     A lower bound of the power of all tests together.
 
@@ -318,6 +318,7 @@ def powers(departure: Departure, limit: float, seed: int) -> list[float]:
         departure: only its information counts: a plan has one as well as looks.
         limit: of log p.
         seed: of the directions.
+        times: how often its stated size the change has.
     """
     from scipy import special
 
@@ -329,7 +330,7 @@ def powers(departure: Departure, limit: float, seed: int) -> list[float]:
             found.append(0.0)
             continue
         ways = generator.standard_normal((DIRECTIONS_ASKED, len(change.names)))
-        ways *= change.size / np.linalg.norm(ways, axis=1, keepdims=True)
+        ways *= times * change.size / np.linalg.norm(ways, axis=1, keepdims=True)
         critical = special.chdtri(dof, np.exp(limit))
         off = np.einsum("ni,ij,nj->n", ways, own, ways)
         found.append(float(np.mean(1 - special.chndtr(critical, dof, off))))
