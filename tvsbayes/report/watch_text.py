@@ -50,10 +50,9 @@ def watch_text(found: Watch, power_min: float) -> str:
     if found.verdict == MOVED:
         causes = dict.fromkeys(part.what.split(":")[0] for part in found.moved)
         lines += [f"what to do: {MISSED[cause]}" for cause in causes]
-        if not found.moved:
-            lines.append("moved: none of the changes below explains the looks")
-            lines.append("what to do: run `tvsbayes check` on the new looks; calibrate anew if they are sound")
     unseen = found.unseen(power_min)
     if found.verdict == CANNOT_TELL:
         lines += [f"cannot see {c.size:g} {c.unit} of {c.what}: {HELPS[c.what]}" for c in unseen]
+    if found.verdict != MOVED and found.p_all < found.false_alarm_rate:
+        lines.append(f"warning: the looks scatter more than the calibration says (p = {found.p_all:.2g})")
     return "\n".join([*lines, "", table.text()])

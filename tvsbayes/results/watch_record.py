@@ -50,10 +50,10 @@ class Watch(Shown):
 
     Attributes:
         verdict: `OK`, `MOVED` or `CANNOT_TELL`.
-        p: probability of a departure like the largest one if nothing has moved, all tests together.
+        p: probability of a departure like the largest one if nothing has moved, all changes together.
         false_alarm_rate: probability of `MOVED` if nothing has moved.
-        p_all: probability of residuals this large, whatever moved.
-        moved: what moved, the best explanation first; empty where no known change explains the looks.
+        p_all: probability of residuals this large at the fitted noise; it raises no alarm.
+        moved: what moved, the best explanation first.
         changes: every change that is asked about.
         looks: usable new looks.
         same_cameras: the new looks state the stereo calibration of the campaign.
