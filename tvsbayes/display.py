@@ -6,6 +6,7 @@ pandas is loaded by `to_dataframe` alone.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
@@ -65,7 +66,7 @@ class View:
         return [f"... {more} more rows; to_dataframe() has all"] if more > 0 else []
 
 
-class Shown:
+class Shown(ABC):
     """Base of results: shows `shown()` wherever Python shows a value.
 
     A dataclass of this base is declared with `repr=False`, or its own `repr` would list every array.
@@ -73,9 +74,9 @@ class Shown:
 
     __slots__ = ()
 
+    @abstractmethod
     def shown(self) -> View:
-        """What is shown of it; every class of this base says so itself."""
-        raise NotImplementedError
+        """What is shown of it."""
 
     def __repr__(self) -> str:
         """The view as text."""

@@ -181,7 +181,12 @@ def test_a_board_that_is_set_otherwise_is_refused_by_its_setting(settings, colum
 
 
 def test_laser_mode_is_no_matter_of_a_coolant_output():
-    connected(GrblBoard({32: 1}), laser="M8").close()
+    board = GrblBoard({32: 1})
+    positioner = connected(board, laser="M8")
+    positioner.home()
+    assert positioner.laser(True).laser_on and board.laser_on
+    positioner.close()
+    assert not board.laser_on
 
 
 def test_light_without_a_watchdog_has_to_be_accepted():
