@@ -108,7 +108,13 @@ def day(found: JointFit, first: Campaign, truth: Truth, what: str, times: float,
     second = simulate(mounted_rig(), SECOND_DAY, seed, truth=truth).campaign
     seen = watch(found, second)
     named = seen.moved[0].what if seen.moved else ""
-    told = {"verdict": seen.verdict, "p": seen.p, "named": named, "classic": classic_alarm(first, second)}
+    told = {
+        "verdict": seen.verdict,
+        "p": seen.p,
+        "p_all": seen.p_all,
+        "named": named,
+        "classic": classic_alarm(first, second),
+    }
     return {"what": what, "times": times, **told}
 
 

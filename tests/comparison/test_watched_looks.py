@@ -4,16 +4,20 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from pathlib import Path
 
+import jsonschema
 import numpy as np
 import pytest
 
+from tests.support.dense_spots import dense_covariance
 from tvsbayes.cli.main import run
 from tvsbayes.comparison import watched_looks
 from tvsbayes.comparison.watched_looks import (
     CHANGES,
     COLUMNS,
     FALSE_ALARM_RATE,
+    Believed,
     Departure,
     WatchedLooks,
     null_distribution,
@@ -29,6 +33,8 @@ from tvsbayes.results.watch_record import CANNOT_TELL, MOVED, OK
 from tvsbayes.statistics.chances import binomial_bounds
 from tvsbayes.twin.simulated_campaign import simulate
 from tvsbayes.twin.true_rig import Truth
+
+ROOT = Path(__file__).resolve().parents[2]
 
 
 @pytest.fixture(scope="module")
@@ -57,22 +63,9 @@ def test_the_departure_is_that_of_a_dense_gaussian(mounted_rig, mixed_fit, truth
     found = watched.departure(mixed_fit.z)
     spots = watched.linear(mixed_fit.z)
     count, size = len(mixed_fit.z), len(spots.residual)
-    covariance, states = np.zeros((size, 6, size, 6)), np.zeros((6, 6))
-    for row in range(size):
-        keep = ~spots.renewed[row]
-        states = states * np.outer(keep, keep) + np.diag(spots.variance[row])
-        covariance[row, :, row] = states
-        if row:
-            covariance[row, :, :row] = keep[:, None, None] * covariance[row - 1, :, :row]
-            covariance[:row, :, row] = np.moveaxis(covariance[row, :, :row], 0, -1)
-    load = np.zeros((size, 4, size, 6))
-    load[np.arange(size), :, np.arange(size)] = spots.load
-    load = load.reshape(4 * size, -1)
-    dense = np.eye(4 * size) + load @ covariance.reshape(6 * size, -1) @ load.T
-    places = spots.places.reshape(4 * size, -1)
     columns = spots.jacobian.reshape(4 * size, -1)
     own, shifts = columns[:, :count], columns[:, count:]
-    dense += places @ places.T + own @ own.T
+    dense = dense_covariance(spots) + own @ own.T
     # A priori the coordinates are N(0, 1): z of them is taken back to nought.
     residual = spots.residual.ravel() + own @ np.where(watched.problem.held, 0.0, mixed_fit.z)
     new = np.arange(4 * size) >= 4 * watched.first
@@ -136,7 +129,7 @@ def test_false_alarms_and_power_are_those_of_the_linear_model():
         for moved in (False, True):
             seen = noise + moved * columns[:, shifted] @ [CHANGES[6].size]
             trial = replace(known, chi2=float(seen @ seen), score=columns.T @ seen)
-            logs = watched_looks.log_chances([trial], [])
+            logs = watched_looks.log_chances(Believed(trial, (trial,), np.ones(1)), [])
             alarms += (not moved) and bool(logs[1:].min() <= null.limit)
             noticed += moved and bool(logs[1 + 6] <= null.limit)
     low, high = binomial_bounds(trials, FALSE_ALARM_RATE)
@@ -161,6 +154,7 @@ def test_the_command_keeps_a_table(mounted_rig, mixed_fit, truth, tmp_path, monk
     assert text.startswith("CANNOT TELL (p = ") and "cannot see 0.3 % of ratio: pan: pan counters further apart" in text
     assert run(["watch", old, knocked, "--append", table, "--json"]) == 1
     document = json.loads(capsys.readouterr().out)
+    jsonschema.validate(document, json.loads((ROOT / "data/schemas/watch-1.schema.json").read_text()))
     assert document["verdict"] == "MOVED" and document["looks"] == 16 and document["false_alarm_rate"] == 0.01
     assert document["moved"][0]["what"] == "positioner: shift along y" and document["moved"][0]["unit"] == "mm"
     head, first, second = (tmp_path / "nights.csv").read_text().splitlines()

@@ -18,9 +18,10 @@ from tvsbayes.estimators.campaign_arrays import in_sight
 from tvsbayes.estimators.joint_fit import JointFit, priors_used
 from tvsbayes.estimators.linear_spots import LinearSpots, linear_spots, stop_information
 from tvsbayes.estimators.mode_search import Problem
+from tvsbayes.estimators.noise_scales import noise_draws
 from tvsbayes.instrument.campaign import Campaign, input_hashes, ordered_spots
 from tvsbayes.instrument.homing import homed
-from tvsbayes.instrument.parameters import INDEX, NAMES, NOISE_NAMES, RIG_NAMES
+from tvsbayes.instrument.parameters import INDEX, NAMES, RIG_NAMES
 from tvsbayes.model.compiled import placed
 from tvsbayes.model.parameter_space import physical_at
 from tvsbayes.results.watch_record import CANNOT_TELL, MOVED, OK, MovedPart, SeenChange, Verdict, Watch
@@ -31,8 +32,8 @@ LOOKS_MIN = 4
 FALSE_ALARM_RATE = 0.01
 POWER_MIN = 0.8
 """Probability with which a change of the stated size must be noticed for a verdict of OK."""
-NOISE_DRAWS = 24
-"""Of the noise scales, over which probabilities are averaged."""
+NOISE_DRAWS = 32
+"""Of the noise scales, geometry and cameras integrated out, over which probabilities are averaged."""
 NULL_DRAWS, DIRECTIONS_ASKED = 20_000, 200
 """Of the joint null distribution, and directions of a change over which its power is averaged."""
 FOLLOWED = 1e-6
@@ -126,6 +127,21 @@ class Departure:
         load = self.information[:, rows] @ _inverse(self.information[np.ix_(rows, rows)])
         information = self.information - load @ self.information[rows]
         return replace(self, score=self.score - load @ self.score[rows], information=information)
+
+
+@dataclass(frozen=True)
+class Believed:
+    """Departures over what is believed of the noise scales.
+
+    Attributes:
+        centre: at their most probable values.
+        drawn: at draws of them.
+        weights: of the draws, their sum 1.
+    """
+
+    centre: Departure
+    drawn: tuple[Departure, ...]
+    weights: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -246,32 +262,29 @@ class WatchedLooks:
                 sizes.append(0.01 * value[INDEX[name]] if change.unit == "%" else radians)
         return np.array(sizes)
 
-    def departures(self, seed: int) -> list[Departure]:
-        """At the mode, then at draws of the noise scales."""
-        noise = np.isin(NAMES, NOISE_NAMES) & self.problem.free
-        rows = np.random.default_rng(seed).choice(len(self.fit.draws_z), NOISE_DRAWS, replace=False)
-        draws = [np.where(noise, self.fit.draws_z[row], self.fit.z) for row in rows]
-        return [self.departure(z) for z in (self.fit.z, *draws)]
+    def believed(self, seed: int) -> Believed:
+        """Over what the first day alone says of the noise scales."""
+        noise = noise_draws(self.fit, NOISE_DRAWS, seed)
+        drawn = tuple(self.departure(z) for z in noise.z)
+        return Believed(self.departure(noise.centre), drawn, noise.weights)
 
 
 def _rows(spots: LinearSpots, rows: slice) -> LinearSpots:
     return LinearSpots(**{part.name: getattr(spots, part.name)[rows] for part in fields(spots)})
 
 
-def _log_mean(values: list[np.ndarray]) -> np.ndarray:
-    return np.logaddexp.reduce(np.array(values), axis=0) - np.log(len(values))
-
-
-def log_chances(departures: list[Departure], known: list[slice]) -> np.ndarray:
+def log_chances(believed: Believed, known: list[slice]) -> np.ndarray:
     """Log p of all residuals, then of every change given those known, averaged over noise scales; shape (1 + c,)."""
     found = []
-    for departure in departures:
+    for departure in believed.drawn:
         left, own = departure.given(known), [log_chance(departure.chi2, departure.dof)]
         for rows in COLUMNS:
             chi2, dof = _test(left.score[rows], left.information[rows, rows])
             own.append(np.zeros(()) if rows in known or not dof else log_chance(chi2, dof))
         found.append(np.array(own))
-    return _log_mean(found)
+    with np.errstate(divide="ignore"):
+        weights = np.log(believed.weights)
+    return np.logaddexp.reduce(np.array(found) + weights[:, None], axis=0)
 
 
 @dataclass(frozen=True)
@@ -335,11 +348,11 @@ def powers(departure: Departure, limit: float, seed: int, times: float = 1.0) ->
     return found
 
 
-def _moved(departures: list[Departure], limit: float) -> tuple[MovedPart, ...]:
+def _moved(believed: Believed, limit: float) -> tuple[MovedPart, ...]:
     """Changes that explain the looks, the best first, each beyond what those before it explain."""
     known: list[slice] = []
     while len(known) < len(COLUMNS):
-        logs = log_chances(departures, known)[1:]
+        logs = log_chances(believed, known)[1:]
         best = int(np.argmin(logs))
         if logs[best] > limit:
             break
@@ -347,8 +360,8 @@ def _moved(departures: list[Departure], limit: float) -> tuple[MovedPart, ...]:
     if not known:
         return ()
     rows = np.concatenate([np.arange(part.start, part.stop) for part in known])
-    covariance = _inverse(departures[0].information[np.ix_(rows, rows)])
-    shift = Shift(covariance @ departures[0].score[rows], covariance)
+    covariance = _inverse(believed.centre.information[np.ix_(rows, rows)])
+    shift = Shift(covariance @ believed.centre.score[rows], covariance)
     named = [(part, change.unit) for change in CHANGES for part in change.parts]
     parts: list[MovedPart] = []
     start = 0
@@ -384,15 +397,15 @@ def watch(fit: JointFit, looks: Campaign, *, seed: int = 0) -> Watch:
             remedy="look at more places, or detect the refused spots again",
         )
     watched = WatchedLooks(fit, looks)
-    departures = watched.departures(seed)
-    null = null_distribution(departures[0], seed)
-    logs = log_chances(departures, [])
-    able = powers(departures[0], null.limit, seed)
+    believed = watched.believed(seed)
+    null = null_distribution(believed.centre, seed)
+    logs = log_chances(believed, [])
+    able = powers(believed.centre, null.limit, seed)
     changes = tuple(
         SeenChange(change.what, change.size, change.unit, power, float(np.exp(log_p)))
         for change, power, log_p in zip(CHANGES, able, logs[1:], strict=True)
     )
-    # All residuals together raise no alarm: on some drawn rigs they do so without a change.
+    # All residuals together raise no alarm: much that moves nothing makes single looks bad.
     found = bool(logs[1:].min() <= null.limit)
     verdict: Verdict = MOVED if found else OK if min(able) >= POWER_MIN else CANNOT_TELL
     hashes = input_hashes(fit.campaign)["stereo"], input_hashes(looks)["stereo"]
@@ -401,7 +414,7 @@ def watch(fit: JointFit, looks: Campaign, *, seed: int = 0) -> Watch:
         p=null.probability(float(logs[1:].min())),
         false_alarm_rate=FALSE_ALARM_RATE,
         p_all=float(np.exp(logs[0])),
-        moved=_moved(departures, null.limit) if found else (),
+        moved=_moved(believed, null.limit) if found else (),
         changes=changes,
         looks=watched.looks,
         same_cameras=hashes[0] == hashes[1],

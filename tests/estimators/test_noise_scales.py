@@ -1,0 +1,65 @@
+"""Noise scales with geometry and cameras integrated out: against a dense Gaussian, beside the joint mode."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tests.support.dense_spots import dense_covariance
+from tvsbayes.estimators.annealed_stage import NO_STEP, Fixed, stage
+from tvsbayes.estimators.linear_spots import linear_spots
+from tvsbayes.estimators.noise_scales import ScalesAlone, noise_draws
+from tvsbayes.instrument.parameters import INDEX, names_of
+from tvsbayes.model.parameter_space import physical_at
+
+STOPS = [INDEX[name] for name in names_of("stop_sd_deg")]
+PIXEL = INDEX["pixel_scale"]
+
+
+def dense_density(fit, z: np.ndarray) -> float:
+    """Log density of the looks at noise scales, up to a constant: one Gaussian of all their residuals."""
+    count = len(fit.linearised.residual)
+    fixed = Fixed(fit.held, z, np.array(1.0))
+    lin = stage(z, fit.space, fit.arrays, fixed, np.array(NO_STEP)).of_spots(count)
+    own = np.where(fit.held, 0.0, -np.asarray(lin.residual_jacobian))
+    spots = linear_spots(lin, fit.arrays, own)
+    columns = own.reshape(4 * count, -1)
+    residual = spots.residual.ravel() + columns @ np.where(fit.held, 0.0, z)
+    covariance = dense_covariance(spots) + columns @ columns.T
+    # Residuals are in units of the pixel noise; of four components of a look its range takes one.
+    scale = 3 * count * np.log(physical_at(z, fit.space).value[PIXEL])
+    prior = 0.5 * float(np.sum(z[fit.held & fit.free] ** 2))
+    return -0.5 * (np.linalg.slogdet(covariance)[1] + residual @ np.linalg.solve(covariance, residual)) - scale - prior
+
+
+@pytest.mark.parametrize("column", [*STOPS, PIXEL])
+def test_the_density_is_that_of_a_dense_gaussian(mixed_fit, column):
+    other = mixed_fit.z.copy()
+    other[column] += 0.4
+    found = np.diff(ScalesAlone(mixed_fit)(np.stack([mixed_fit.z, other])))[0]
+    # Priors of 1e5 sds of the looks: the dense determinant keeps that many digits.
+    assert found == pytest.approx(dense_density(mixed_fit, other) - dense_density(mixed_fit, mixed_fit.z), abs=1e-4)
+
+
+def test_what_geometry_took_is_given_back(mixed_fit):
+    """The centre is a maximum along every scale, and its pixel noise larger than at the mode of everything."""
+    found, alone = noise_draws(mixed_fit, 32, seed=0), ScalesAlone(mixed_fit)
+    sd = np.sqrt(np.diag(mixed_fit.covariance))
+    assert found.centre[PIXEL] - mixed_fit.z[PIXEL] > 0.3 * sd[PIXEL]
+    columns = [*STOPS, PIXEL]
+    points = np.repeat(found.centre[None], 1 + 2 * len(columns), axis=0)
+    for row, column in enumerate(columns):
+        points[1 + 2 * row : 3 + 2 * row, column] += np.array([0.5, -0.5]) * sd[column]
+    values = alone(points)
+    assert np.all(values[1:] < values[0])
+    assert found.weights.sum() == pytest.approx(1) and found.effective > 8
+    still = ~np.isin(np.arange(len(sd)), alone.columns)
+    assert np.all(found.z[:, still] == mixed_fit.z[still])
+
+
+def test_the_mean_is_that_of_many_more_draws(mixed_fit):
+    """A proposal narrower or askew is made good by the weights: within four standard errors of the few."""
+    few, many = noise_draws(mixed_fit, 32, seed=1), noise_draws(mixed_fit, 128, seed=2)
+    means = [draws.weights @ draws.z[:, PIXEL] for draws in (few, many)]
+    sd = np.sqrt(many.weights @ (many.z[:, PIXEL] - means[1]) ** 2)
+    assert abs(means[0] - means[1]) < 4 * sd * np.sqrt(1 / few.effective + 1 / many.effective)
