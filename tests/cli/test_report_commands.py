@@ -17,17 +17,38 @@ pytestmark = pytest.mark.usefixtures("own_compilation_cache")
 def no_page(monkeypatch):
     """What the page shows is not what is looked at, and takes seconds."""
     monkeypatch.setattr("tvsbayes.report.evidence.gather", lambda *_, **__: SimpleNamespace(criteria=()))
-    monkeypatch.setattr("tvsbayes.report.page.report_html", lambda evidence, issue: f"by {issue.laboratory}".encode())
+    page = SimpleNamespace(number="N1")
+
+    def told(evidence, issue):
+        page.text = f"by {issue.laboratory}"
+        return page
+
+    monkeypatch.setattr("tvsbayes.report.page.report_page", told)
+    monkeypatch.setattr("tvsbayes.report.page.page_html", lambda page: page.text.encode())
 
 
-def test_a_campaign_becomes_a_report_in_one_go(ask, grid_folder, no_page):
+def test_a_campaign_becomes_a_report_in_one_go(ask, say, grid_folder, no_page):
     code, document = ask("calibrate", grid_folder, "--no-sample", "--laboratory", "Optics Lab")
     assert code == 0
     assert list(document) == ["check", "classic", "fit", "report"]
     assert document["check"]["kind"] == "campaign" and document["classic"] is None
     assert document["fit"]["converged"] and set(document["fit"]["files"]) == {"draws", "fit"}
     assert (grid_folder / "results" / "report.html").read_text() == "by Optics Lab"
-    assert document["report"] == {"criteria": [], "files": {"report": str(grid_folder / "results" / "report.html")}}
+    files = {"report": str(grid_folder / "results" / "report.html")}
+    assert document["report"] == {"criteria": [], "number": "N1", "files": files}
+    stale = [grid_folder / "results" / name for name in ("report.pdf", "dcc.xml")]
+    for each in stale:
+        each.write_bytes(b"of an earlier page")
+    code, _, told = say("report", grid_folder, "--laboratory", "Another")
+    assert code == 0 and "removed: report.pdf, dcc.xml" in told and not any(each.exists() for each in stale)
+
+
+@pytest.mark.parametrize("option", ["--laboratory", "--customer", "--country", "--customer-country"])
+def test_nobody_has_an_empty_name(ask, tmp_path, option):
+    code, document = ask("report", tmp_path, "--dcc", option, " ")
+    assert (
+        code == 2 and option in document["error"]["message"] and "leave the option out" in document["error"]["remedy"]
+    )
 
 
 def test_it_stops_where_a_fit_must_not_be_used(ask, say, grid_campaign, tmp_path, no_page):

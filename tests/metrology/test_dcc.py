@@ -16,13 +16,13 @@ from support.refusals import refusal
 
 from tvsbayes.errors import InputError, NotConverged
 from tvsbayes.instrument.campaign import input_hashes
-from tvsbayes.metrology.dcc import COUNTRY_NOT_STATED, NOT_ACCREDITED, Parties
+from tvsbayes.metrology.dcc import COUNTRY_NOT_STATED, NOT_ACCREDITED, Embedded, Parties
 from tvsbayes.results.estimates import Validation
 
 
 def test_the_structure_is_the_schemas():
     for header in ({}, {"environment": {}, "traceability": {}, "created": None}):
-        root = certified(**header).with_positioning().root(report=b"<html></html>")
+        root = certified(**header).with_positioning().root(report=Embedded("0123456789AB", b"<html></html>"))
         assert structure_problems(root) == []
         assert root.get("schemaVersion") == "3.3.0"
         assert root.tag == "{https://ptb.de/dcc}digitalCalibrationCertificate"
@@ -239,14 +239,46 @@ def test_what_must_not_be_certified_is_refused():
     for country in ("de", "DEU", "", "D\n"):
         with pytest.raises(InputError, match="country"):
             made.certificate(parties=Parties(country=country))
+        with pytest.raises(InputError, match="country"):
+            made.certificate(parties=Parties(customer_country=country))
     assert "two letters" in refusal(lambda: made.certificate(parties=Parties(country="Mexico"))).remedy
-    root = made.root(parties=Parties(country="MX"))
-    assert set(texts(root, ".//dcc:countryCode")) == {"MX"} and "country" not in declared(root)
-    assert COUNTRY_NOT_STATED in declared(made.root())["country"][0]
     effective = made.fit.summary.effective
     bad = replace(effective["left"], value=math.inf)
     with pytest.raises(ValueError, match="finite"):
         made.with_summary(effective={**effective, "left": bad}).certificate()
+
+
+def test_each_country_stands_with_its_own_party():
+    """The place of the measurement is not where the customer lives."""
+    made, path = certified(), {"dcc": "https://ptb.de/dcc"}
+    for parties, codes, undeclared in (
+        (Parties(country="MX"), ("MX", COUNTRY_NOT_STATED), {"country of the customer"}),
+        (Parties(country="MX", customer_country="DE"), ("MX", "DE"), set()),
+        (Parties(), (COUNTRY_NOT_STATED, COUNTRY_NOT_STATED), {"country", "country of the customer"}),
+    ):
+        root = made.root(parties=parties)
+        place = "dcc:location/dcc:countryCode"
+        found = [root.findtext(f".//{where}/{place}", None, path) for where in ("dcc:contact", "dcc:customer")]
+        assert tuple(found) == codes and texts(root, ".//dcc:countryCodeISO3166_1") == [codes[0]]
+        statements = declared(root)
+        assert {name for name in statements if name.startswith("country")} == undeclared
+        assert all(COUNTRY_NOT_STATED in statements[name][0] for name in undeclared)
+
+
+def test_the_number_of_the_report_is_in_the_certificate_that_carries_it():
+    """And another report, customer or country makes another identifier."""
+    made, names = certified(), set()
+    for number, parties in (
+        ("A1", Parties()),
+        ("B2", Parties()),
+        ("A1", Parties("Lab")),
+        ("A1", Parties(country="MX")),
+    ):
+        root = made.root(report=Embedded(number, b"<html></html>"), parties=parties)
+        assert texts(root, ".//dcc:coreData/dcc:identifications/dcc:identification/dcc:value") == [number]
+        assert texts(root, ".//dcc:document/dcc:name/dcc:content") == [f"report {number}"]
+        names |= set(texts(root, ".//dcc:uniqueIdentifier"))
+    assert len(names) == 4
 
 
 def test_development_versions_are_cut_to_a_release():

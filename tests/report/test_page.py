@@ -22,7 +22,16 @@ from tvsbayes.instrument.axes import DIRECTIONS
 from tvsbayes.instrument.campaign import read_campaign, write_campaign
 from tvsbayes.metrology.positioning_table import positioning
 from tvsbayes.metrology.traceability import traceability
-from tvsbayes.report.page import BROWSERS, print_to_pdf, report_html, typeset
+from tvsbayes.report.page import (
+    BROWSERS,
+    page_html,
+    print_to_pdf,
+    prose,
+    replace_page,
+    report_html,
+    report_page,
+    typeset,
+)
 from tvsbayes.report.tables import Issue
 
 BYTES_MAX = 3_000_000
@@ -31,7 +40,7 @@ BYTES_MAX = 3_000_000
 KNOWN = {
     *("html", "head", "meta", "title", "style", "body", "header", "main", "footer", "section", "figure", "figcaption"),
     *("h1", "h2", "p", "strong", "ul", "ol", "li", "dl", "dt", "dd", "div", "span", "img"),
-    *("nav", "a", "details", "summary"),
+    *("nav", "a", "details", "summary", "code"),
     *("table", "caption", "thead", "tbody", "tr", "th", "td"),
 }
 
@@ -91,7 +100,7 @@ def test_numbers_of_the_page_are_the_libraries(page, evidence):
         assert f"{joint.value:.6f}"[:7] in text
         assert f"{evidence.classic.directions[direction].mean_deg_per_step:.5f}"[:7] in text
     assert not re.search(r"\b(nan|inf|None|undefined)\b", text)
-    assert text.count(f"Report {evidence.fit.report_id}") == 1
+    assert text.count(f"of results {evidence.fit.results_id}") == 1
     for word in ("Not an accredited", "Simulated data: not traceable", "synthetic", "End of report", "Seed"):
         assert word in text
     for sha in evidence.fit.provenance.inputs.values():
@@ -103,8 +112,10 @@ def test_the_first_page_has_the_answer_and_who_asked(page, evidence):
     """Before the contents: ratios, backlashes, millimetres, what to do next, day, laboratory, customer."""
     issue = Issue(datetime.date(2026, 1, 15), "Optics Lab", "Robotics group")
     for source, told in (
-        (report_html(evidence, issue), "2026-01-15. Laboratory: Optics Lab. Customer: Robotics group."),
-        (page, "Laboratory: not stated. Customer: not stated."),
+        (report_html(evidence, issue), "issued 2026-01-15"),
+        (report_html(evidence, issue), "laboratory Optics Lab customer Robotics group"),
+        (page, "measured 2026-01-15 instrument not recorded serial number not recorded operator not recorded"),
+        (page, "laboratory not stated customer not stated"),
     ):
         first = " ".join(" ".join(Nodes(source.split(b"<nav")[0] + b"</header></body></html>").text).split())
         assert told in first and "What to do next" in first
@@ -112,6 +123,50 @@ def test_the_first_page_has_the_answer_and_who_asked(page, evidence):
             assert row in first
         assert [first.count(f"{name} calibration") for name in ("nominal", "classic", "joint")] == [1, 1, 1]
         assert source.split(b"<nav")[0].count(b"<img") == 1
+        # Typed by nobody who reads: a command stands as code, with the folder's name, and no option of `fit` is undone.
+        assert "`" not in first and "--no-sample" not in first and "tvsbayes fit twin" in first
+        # What makes the millimetres: of the joint calibration, and why the classic is farther off.
+        assert "Why classic is off there" in first and "of the variance" in first
+
+
+def test_no_two_reports_have_one_number(evidence, page, no_pictures):
+    """Another laboratory, customer, day, limit or operator is another report; the same one has the same number."""
+    day = datetime.date(2026, 1, 15)
+    campaign = replace(evidence.campaign, header={**evidence.campaign.header, "operator": "A. B."})
+    pages = [
+        *(report_page(evidence, issue) for issue in (Issue(day), Issue(day, "A"), Issue(day, "", "A"))),
+        report_page(evidence, Issue(datetime.date(2026, 1, 16))),
+        report_page(replace(evidence, criteria=()), Issue(day)),
+        report_page(replace(evidence, campaign=campaign), Issue(day)),
+    ]
+    numbers = [each.number for each in pages]
+    assert len(set(numbers)) == len(numbers) and report_page(evidence, Issue(day)).number == numbers[0]
+    for each in pages:
+        assert page_html(each).decode().count(each.number) == 4  # title, head, foot of printed pages, end
+
+
+def test_what_was_made_of_an_earlier_page_goes(tmp_path):
+    """A PDF or certificate never stays beside a newer page; beside a page of somebody else nothing is touched."""
+    ours, newer = b'<meta name="generator" content="tvsbayes 1">old', b'<meta name="generator" content="tvsbayes 1">new'
+    page, pdf, certificate = (tmp_path / name for name in ("report.html", "report.pdf", "dcc.xml"))
+    for each in (pdf, certificate):
+        each.write_bytes(b"made of the old one")
+    page.write_bytes(ours)
+    assert replace_page(page, ours, None) == [] and pdf.exists() and certificate.exists()
+    assert replace_page(page, newer, None) == ["report.pdf", "dcc.xml"]
+    assert page.read_bytes() == newer and not pdf.exists() and not certificate.exists()
+    mine = tmp_path / "mine.html"
+    for before, gone in ((b"<p>somebody else's</p>", []), (ours, ["mine.pdf", "mine.dcc.xml"])):
+        mine.write_bytes(before)
+        for name in ("mine.pdf", "mine.dcc.xml"):
+            (tmp_path / name).write_bytes(b"")
+        assert replace_page(mine, newer, mine) == gone
+
+
+def test_commands_are_code_and_what_strangers_write_is_not():
+    assert prose("Do `tvsbayes fit -5`, u <= 2") == "Do <code>tvsbayes fit -5</code>, u \u2264 2"
+    assert prose("`<b>` and -1") == "<code>&lt;b&gt;</code> and \u22121"
+    assert prose("a ` alone <i>") == "a ` alone &lt;i&gt;"
 
 
 def test_no_paragraph_stands_twice_and_details_are_folded(page):
@@ -273,13 +328,14 @@ document.getElementById("f").onload = function () {{
   const d = this.contentDocument, images = Array.from(d.images);
   const small = i => i.naturalWidth === 0 || i.getBoundingClientRect().width < 200;
   const broken = images.filter(i => !i.complete || small(i)).length;
+  const answer = d.querySelector(".answer .scroll");
   document.title = JSON.stringify({{wide: d.documentElement.scrollWidth, images: images.length, broken: broken,
-    scripts: d.scripts.length}});
+    scripts: d.scripts.length, cut: answer.scrollWidth - answer.clientWidth}});
 }};
 </script></body></html>"""
 
 
-@pytest.mark.parametrize("width", [360, 1280])
+@pytest.mark.parametrize("width", [390, 1280])
 def test_chromium_shows_the_page_without_overflow_or_complaint(reported, tmp_path, width):
     browser = next(filter(None, map(shutil.which, BROWSERS)), None)
     if browser is None:
@@ -295,6 +351,7 @@ def test_chromium_shows_the_page_without_overflow_or_complaint(reported, tmp_pat
     )
     found = json.loads(re.search(r"<title>(.*?)</title>", done.stdout)[1])
     assert found["wide"] <= width and found["broken"] == 0 and found["scripts"] == 0
+    assert found["cut"] == 0, "the table of the answer scrolls sideways"
     assert found["images"] == len(Nodes((tmp_path / "report.html").read_bytes()).of("img"))
     assert "CONSOLE" not in done.stderr
 

@@ -227,11 +227,11 @@ def test_a_failure_without_its_test_and_foreign_figures_are_refused(tmp_path):
 
 
 def test_one_identity_of_results_names_report_and_certificate():
-    """Twelve digits of one digest; another seed or another version is another document."""
+    """Twelve digits of one digest; another seed, version or word besides is another document."""
     record = small_record()
     day = datetime.date(2026, 11, 22)
-    assert record.report_id == record.digest[:12].upper()
-    assert record.certificate_id("a", day) == small_record().certificate_id("a", day)
+    assert record.results_id == record.digest[:12].upper()
+    assert record.certificate_id(day, ["a"]) == small_record().certificate_id(day, ["a"])
     other = small_record(seed=1)
-    ids = {record.certificate_id("a", day), record.certificate_id("b", day), other.certificate_id("a", day)}
-    assert len(ids) == 3 and other.report_id != record.report_id
+    ids = {record.certificate_id(day, [name]) for name in "ab"} | {other.certificate_id(day, ["a"])}
+    assert len(ids) == 3 and other.results_id != record.results_id

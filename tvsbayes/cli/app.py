@@ -7,7 +7,7 @@ import math
 import os
 import shlex
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -123,6 +123,13 @@ def tell_part(text: str, as_json: bool) -> None:
     """A part of a longer command's text, as soon as it is known; under --json the document at the end has it."""
     if not as_json:
         _print(f"{text}\n")
+
+
+def tell_removed(names: Iterable[str], written: Mapping[str, str]) -> None:
+    """Say which files made of an earlier page are gone, but for those written anew."""
+    gone = [name for name in names if name not in {Path(place).name for place in written.values()}]
+    if gone:
+        report_line(f"removed: {', '.join(gone)}, made of an earlier report; --pdf or --dcc makes them again")
 
 
 def command_line(*words: object) -> str:

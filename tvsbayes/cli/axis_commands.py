@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from tvsbayes.cli.app import command_line, finish, keep, report_line, tell_part
+from tvsbayes.cli.app import command_line, finish, keep, report_line, tell_part, tell_removed
 from tvsbayes.cli.progress_bar import waiting
 from tvsbayes.errors import InputError, NothingToEstimate, TvsError, escaped
 from tvsbayes.files.disk import make_folder, output_place, shipped_data, write_atomically
@@ -168,9 +168,8 @@ def calibrate(folder: Path, *, issue: Issue, wish: Sampled, pdf: bool, as_json: 
     if kept.error is not None:
         finish({**documents, "report": None}, told, as_json, kept.error)
     tell_part(told, as_json)
-    files = _page(data, issue, output_place(folder, "results") / "report.html", pdf)
-    documents["report"] = {"criteria": [], "files": files}
-    finish(documents, f"next: open {', '.join(files.values())} in a browser", as_json)
+    page = documents["report"] = _page(data, folder, issue, pdf)
+    finish(documents, f"next: open {', '.join(page['files'].values())} in a browser", as_json)
 
 
 def compare(folder: Path, *, by: str | None, seed: int, as_json: bool) -> None:
@@ -198,19 +197,20 @@ def report(folder: Path, *, issue: Issue, pdf: bool, out: Path | None, as_json: 
     from tvsbayes.single_axis.axis_campaign import read_axis
 
     data = read_axis(folder)
-    files = _page(data, issue, out or output_place(folder, "results") / "report.html", pdf)
-    finish({"criteria": [], "files": files}, f"written: {', '.join(files.values())}", as_json)
+    page = _page(data, folder, issue, pdf, out)
+    finish(page, f"report {page['number']}\nwritten: {', '.join(page['files'].values())}", as_json)
 
 
-def _page(data: AxisCampaign, issue: Issue, path: Path, pdf: bool) -> dict[str, str]:
-    """Write the page of an axis, and print it where that is wanted: files by kind."""
-    from tvsbayes.report.axis_page import axis_html, curve_commands
-    from tvsbayes.report.page import find_browser, print_to_pdf
+def _page(data: AxisCampaign, folder: Path, issue: Issue, pdf: bool, out: Path | None = None) -> dict[str, Any]:
+    """Write the page of an axis, and print it where that is wanted: the document of `report --json`."""
+    from tvsbayes.report.axis_page import axis_page, curve_commands
+    from tvsbayes.report.page import find_browser, page_html, print_to_pdf, replace_page
     from tvsbayes.single_axis.axis_record import results_for
     from tvsbayes.single_axis.axis_rows import rows_of
 
     if pdf:
         find_browser()
+    path = out or output_place(folder, "results") / "report.html"
     files = {"report": str(path)}
     read = rows_of(data).command
     stages = {FITTING: 3.0, "drawing the page": 1.5, PRINTING: 3.0 if pdf else 0.0}
@@ -219,11 +219,13 @@ def _page(data: AxisCampaign, issue: Issue, path: Path, pdf: bool) -> dict[str, 
         if not results.stored:
             report_line(STORED)
         job.begin("drawing the page")
-        write_atomically(path, axis_html(results, issue))
+        page = axis_page(results, issue)
+        removed = replace_page(path, page_html(page), out)
         if pdf:
             job.begin(PRINTING)
             files["pdf"] = str(print_to_pdf(path))
-    return files
+    tell_removed(removed, files)
+    return {"criteria": [], "number": page.number, "files": files}
 
 
 def plan(

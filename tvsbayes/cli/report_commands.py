@@ -22,10 +22,11 @@ from tvsbayes.cli.app import (
     refuse_options,
     report_line,
     tell_part,
+    tell_removed,
 )
 from tvsbayes.cli.campaign_commands import campaign_held
 from tvsbayes.cli.progress_bar import waiting
-from tvsbayes.errors import NothingToEstimate
+from tvsbayes.errors import InputError, NothingToEstimate
 from tvsbayes.files.disk import output_place, write_atomically
 from tvsbayes.pipeline import FITTING, compile_for, record_for
 from tvsbayes.pipeline import calibrate as calibrate_campaign
@@ -68,6 +69,9 @@ def report(
     country: Annotated[
         str | None, typer.Option("--country", help="Two letters of the place (ISO 3166-1), for --dcc.")
     ] = None,
+    customer_country: Annotated[
+        str | None, typer.Option("--customer-country", help="Two letters of the customer's country, for --dcc.")
+    ] = None,
     dcc_schema: Schema = None,
     out: Annotated[
         Path | None, typer.Option("-o", "--out", help="File (default CAMPAIGN/results/report.html).")
@@ -78,8 +82,9 @@ def report(
     from tvsbayes.instrument.campaign import read_campaign
 
     if not (dcc or dcc_schema):
-        refuse_options("for a certificate", "add --dcc", country=country)
+        refuse_options("for a certificate", "add --dcc", country=country, customer_country=customer_country)
     issue = _issue(laboratory, customer)
+    countries = _countries(country, customer_country)
     if axis_commands.is_axis(campaign):
         unfit = {"limit_deg_per_step": limit_deg_per_step, "limit_mm": limit_mm, "dcc": dcc, "dcc_schema": dcc_schema}
         unfit["range_mm"] = range_mm if range_mm != RANGE_MM else None
@@ -91,8 +96,10 @@ def report(
     page = wish.write(data)
     missed, lines, result = page.missed, page.lines(), page.as_json()
     if dcc or dcc_schema:
-        content = _certificate(data, page.record, page.path.read_bytes(), issue, country)
-        place = output_place(campaign, "results") / "dcc.xml"
+        from tvsbayes.report.page import certificate_place
+
+        content = _certificate(data, page, issue, countries)
+        place = certificate_place(page.path, out)
         write_atomically(place, content)
         page.files["dcc"] = str(place)
         if dcc_schema:
@@ -103,6 +110,7 @@ def report(
             lines += [f"DCC by {checked.tool} against {dcc_schema}: {verdict}", *checked.messages[:DCC_MESSAGES]]
             result["dcc_schema"] = asdict(checked)
             missed |= not checked.valid
+    tell_removed(page.removed, page.files)
     finish(result, "\n".join([*lines, f"written: {', '.join(page.files.values())}"]), as_json)
     if missed:
         raise Ended(TARGET_MISSED)
@@ -111,7 +119,21 @@ def report(
 def _issue(laboratory: str | None, customer: str | None) -> Issue:
     from tvsbayes.report.tables import Issue
 
-    return replace(Issue.today(), laboratory=laboratory or "", customer=customer or "")
+    return replace(Issue.today(), laboratory=_named("laboratory", laboratory), customer=_named("customer", customer))
+
+
+def _named(option: str, text: str | None) -> str:
+    """What an option says, "" without it; an empty one is refused: nobody types it on purpose."""
+    if text is not None and not text.strip():
+        remedy = "write the name, or leave the option out: the report says `not stated` then"
+        raise InputError("usage", f"--{option} is empty", column=f"--{option}", allowed="a name", remedy=remedy)
+    return " ".join((text or "").split())
+
+
+def _countries(place: str | None, customer: str | None) -> dict[str, str]:
+    """Countries by the field of `Parties` that they go to, of those that were stated."""
+    stated = {"country": _named("country", place), "customer_country": _named("customer-country", customer)}
+    return {name: text for name, text in stated.items() if text}
 
 
 @dataclass(frozen=True)
@@ -129,7 +151,7 @@ class PageWish:
     def write(self, data: Campaign) -> WrittenPage:
         """Gather, draw and write it, and print it where that is wanted; fits first where results are missing."""
         from tvsbayes.calibration.calibration_file import load_calibration
-        from tvsbayes.report.page import find_browser, print_to_pdf, report_html
+        from tvsbayes.report.page import find_browser, page_html, print_to_pdf, replace_page, report_page
 
         if self.pdf:
             find_browser()
@@ -144,21 +166,35 @@ class PageWish:
             job.begin(GATHERING)
             evidence = gather(data, record, load_calibration(self.campaign), range_mm=self.range_mm, **limits)
             job.begin(DRAWING)
-            write_atomically(path, report_html(evidence, self.issue))
+            page = report_page(evidence, self.issue)
+            html = page_html(page)
+            removed = replace_page(path, html, self.out)
             if self.pdf:
                 job.begin(PRINTING)
                 files["pdf"] = str(print_to_pdf(path))
-        return WrittenPage(record, evidence, path, files)
+        return WrittenPage(record, evidence, page.number, html, path, files, removed)
 
 
 @dataclass(frozen=True)
 class WrittenPage:
-    """A page on disk: what it was made of, and where it lies; files by kind."""
+    """A page on disk.
+
+    Attributes:
+        record, evidence: what it was made of.
+        number: on its first page.
+        html: its bytes.
+        path: where it lies.
+        files: it and what was made of it, by kind.
+        removed: names of files that belonged to the page that stood there before.
+    """
 
     record: FitRecord
     evidence: Evidence
+    number: str
+    html: bytes
     path: Path
     files: dict[str, str]
+    removed: list[str]
 
     @property
     def missed(self) -> bool:
@@ -177,20 +213,25 @@ class WrittenPage:
         ]
         validation = self.record.summary.validation
         failed = validation is not None and not validation.passed
-        return [*(validation_lines(validation)[:1] if validation is not None and failed else []), *lines]
+        told = validation_lines(validation)[:1] if validation is not None and failed else []
+        return [*told, *lines, f"report {self.number}"]
 
     def as_json(self) -> dict[str, Any]:
         """The document of `report --json`."""
-        return {"criteria": [asdict(c) for c in self.evidence.criteria], "files": self.files}
+        return {
+            "criteria": [asdict(c) for c in self.evidence.criteria],
+            "number": self.number,
+            "files": self.files,
+        }
 
 
-def _certificate(campaign: Campaign, record: FitRecord, report: bytes, issue: Issue, country: str | None) -> bytes:
-    """DCC-schema XML, issued on the day of the page (UTC)."""
-    from tvsbayes.metrology.dcc import Parties, dcc_bytes
+def _certificate(campaign: Campaign, page: WrittenPage, issue: Issue, countries: dict[str, str]) -> bytes:
+    """DCC-schema XML with the page inside, issued on its day (UTC)."""
+    from tvsbayes.metrology.dcc import Embedded, Parties, dcc_bytes
 
-    parties = {"laboratory": issue.laboratory, "customer": issue.customer, "country": country}
-    stated = {name: text for name, text in parties.items() if text}
-    return dcc_bytes(campaign, record, issued=issue.day, parties=Parties(**stated), report=report)
+    stated = {name: text for name in ("laboratory", "customer") if (text := getattr(issue, name))}
+    parties = Parties(**stated, **countries)
+    return dcc_bytes(campaign, page.record, issued=issue.day, parties=parties, report=Embedded(page.number, page.html))
 
 
 def calibrate(
@@ -244,6 +285,7 @@ def calibrate(
         finish({**documents, "report": None}, told, as_json, results.error)
     tell_part(told, as_json)
     page = PageWish(campaign, issue, limit_deg_per_step, limit_mm, range_mm, pdf).write(data)
+    tell_removed(page.removed, page.files)
     documents["report"] = page.as_json()
     text = "\n".join([*page.lines(), f"next: open {', '.join(page.files.values())} in a browser"])
     finish(documents, text, as_json)

@@ -6,13 +6,14 @@ estimator is asked where the spot is. NumPy.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from tvsbayes.calibration.drawn_looks import Drawn, drawn
-from tvsbayes.calibration.optics import aperture_angle_deg
+from tvsbayes.calibration.optics import Components, aperture_angle_deg
 from tvsbayes.calibration.pointing import DIVERGING_SHARE, Calibration, Sides
 from tvsbayes.coordinates.simple_calibration import Belief, SimpleCalibration, simple_belief
 
@@ -80,6 +81,49 @@ def _errors(belief: Belief, truth: _Truth, azimuth: bool) -> _Errors:
         distance_mm=np.where(meets, np.linalg.norm(error, axis=0), np.inf),
         usable=usable,
     )
+
+
+@dataclass(frozen=True)
+class SimpleError:
+    """Why a simple calibration is off at counters and a range, by the best estimates.
+
+    Attributes:
+        azimuth_deg, elevation_deg: its beam's direction less that of the joint calibration.
+        by_direction_mm: 3D error if that alone were wrong.
+        by_place_mm: 3D error if the places of beam and aperture and its zero alone were.
+    """
+
+    azimuth_deg: float
+    elevation_deg: float
+    by_direction_mm: float
+    by_place_mm: float
+
+
+def simple_error(
+    calibration: Calibration, simple: SimpleCalibration, steps: tuple[float, float], range_mm: float
+) -> SimpleError:
+    """The error of a simple calibration taken apart, at counters reached from left and up; no noise.
+
+    A part is not a number where beam and reading do not meet.
+    """
+    best, azimuth = calibration.estimates, calibration.azimuth
+    beam = calibration.beam_at(steps, (1.0, 1.0))
+    point = np.array(beam.at(range_mm))
+    reading = np.array(calibration.reading(point))
+    own = simple_belief(simple, np.array(steps[:1]), np.array(steps[1:]))
+    joint = Belief(beam, best["baseline_mm"], best["aperture_zero_deg"])
+    turned = replace(joint, beam=Components(beam.origin, own.beam.direction))
+    moved = replace(own, beam=Components(own.beam.origin, beam.direction))
+    parts = [float(np.linalg.norm(np.ravel(b.points(reading, azimuth)) - point)) for b in (turned, moved)]
+    directions = [np.ravel(np.array(each.direction)) for each in (own.beam, beam)]
+    pan, tilt = (np.degrees(np.subtract(*angle)) for angle in zip(*map(_angles, directions), strict=True))
+    return SimpleError(float(pan), float(tilt), *parts)
+
+
+def _angles(direction: np.ndarray) -> tuple[float, float]:
+    """Azimuth and elevation of a unit vector (3,), rad."""
+    x, y, z = direction.tolist()
+    return math.atan2(y, x), math.asin(z)
 
 
 def error_map(

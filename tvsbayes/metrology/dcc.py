@@ -10,13 +10,20 @@ import base64
 import datetime
 import re
 import xml.etree.ElementTree as ET
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 
 from tvsbayes.errors import InputError, NotConverged, escaped
 from tvsbayes.instrument.axes import AXES, SIDES
 from tvsbayes.instrument.campaign import Campaign, input_hashes
 from tvsbayes.metrology.dcc_elements import UNIT_SI, add, add_contact, add_real, add_words
-from tvsbayes.metrology.traceability import NOT_STATED, header_table, stated_value, traceability
+from tvsbayes.metrology.traceability import (
+    NOT_STATED,
+    Performance,
+    header_table,
+    performed,
+    stated_value,
+    traceability,
+)
 from tvsbayes.results.estimates import Estimate
 from tvsbayes.results.fit_record import FitRecord, Provenance
 from tvsbayes.results.metrology_tables import FIGURES, AxisPositioning
@@ -50,36 +57,31 @@ class Parties:
     Attributes:
         laboratory: name of who measured.
         customer: name of for whom.
-        country: ISO 3166-1 code of the place, two capital letters.
+        country: ISO 3166-1 code of the place where it was measured, two capital letters.
+        customer_country: the same of the customer.
     """
 
     laboratory: str = NOT_STATED
     customer: str = NOT_STATED
     country: str = COUNTRY_NOT_STATED
+    customer_country: str = COUNTRY_NOT_STATED
 
 
 @dataclass(frozen=True)
-class Performance:
-    """First and last day of a campaign, and whether they were recorded."""
+class Embedded:
+    """The HTML report that a certificate carries, and the number on its first page."""
 
-    begin: datetime.date
-    end: datetime.date
-    recorded: bool
+    number: str
+    html: bytes
 
 
-def _dates(campaign: Campaign, issued: datetime.date) -> Performance:
-    """When the campaign was measured; the date of issue where it does not say."""
-    created = campaign.header.get("created")
-    if not isinstance(created, datetime.date):
-        return Performance(issued, issued, False)
-    if not isinstance(created, datetime.datetime):
-        return Performance(created, created, True)
-    # Times of moves count from any instant: a clock, or the start of the campaign.
-    seconds = campaign.moves[-1].time_s - campaign.moves[0].time_s if campaign.moves else 0.0
-    try:
-        return Performance(created.date(), (created + datetime.timedelta(seconds=seconds)).date(), True)
-    except OverflowError:
-        return Performance(created.date(), created.date(), True)
+@dataclass(frozen=True)
+class _Core:
+    """By what a certificate is known: its identifier, its day of issue, the number of the report that it carries."""
+
+    identifier: str
+    issued: datetime.date
+    report: str | None
 
 
 def _software(parent: ET.Element, tag: str, made: Provenance, **attributes: str) -> None:
@@ -92,13 +94,11 @@ def _software(parent: ET.Element, tag: str, made: Provenance, **attributes: str)
     add_words(software, "dcc:description", f"{listed}; seed {made.seed}; command: {made.command}")
 
 
-def _administrative(
-    root: ET.Element, campaign: Campaign, fit: FitRecord, issued: datetime.date, identifier: str, parties: Parties
-) -> None:
+def _administrative(root: ET.Element, campaign: Campaign, fit: FitRecord, core: _Core, parties: Parties) -> None:
     data = add(root, "dcc:administrativeData")
     _software(data, "dcc:dccSoftware", fit.provenance)
-    performed = _dates(campaign, issued)
-    _core_data(data, performed, issued, identifier, parties.country)
+    when = performed(campaign, core.issued)
+    _core_data(data, core, when, parties.country)
     _item(data, campaign)
     place = add(data, "dcc:calibrationLaboratory")
     add_contact(place, "dcc:contact", parties.laboratory, parties.country)
@@ -108,20 +108,25 @@ def _administrative(
     add_contact(person, "dcc:person", str(campaign.header.get("operator") or NOT_STATED))
     add(person, "dcc:role", "operator of the campaign")
     add(person, "dcc:mainSigner", "false")
-    add_contact(data, "dcc:customer", parties.customer, parties.country)
-    _statements(data, campaign, fit, performed, parties.country)
+    add_contact(data, "dcc:customer", parties.customer, parties.customer_country)
+    _statements(data, campaign, fit, when, parties)
 
 
-def _core_data(data: ET.Element, performed: Performance, issued: datetime.date, identifier: str, country: str) -> None:
+def _core_data(data: ET.Element, named: _Core, when: Performance, country: str) -> None:
     core = add(data, "dcc:coreData")
     add(core, "dcc:countryCodeISO3166_1", country)
     add(core, "dcc:usedLangCodeISO639_1", "en")
     add(core, "dcc:mandatoryLangCodeISO639_1", "en")
-    add(core, "dcc:uniqueIdentifier", identifier)
-    add(core, "dcc:beginPerformanceDate", performed.begin.isoformat())
-    add(core, "dcc:endPerformanceDate", performed.end.isoformat())
+    add(core, "dcc:uniqueIdentifier", named.identifier)
+    if named.report is not None:
+        number = add(add(core, "dcc:identifications"), "dcc:identification")
+        add(number, "dcc:issuer", "calibrationLaboratory")
+        add(number, "dcc:value", named.report)
+        add_words(number, "dcc:name", "number of the report")
+    add(core, "dcc:beginPerformanceDate", when.begin.isoformat())
+    add(core, "dcc:endPerformanceDate", when.end.isoformat())
     add(core, "dcc:performanceLocation", "other")
-    add(core, "dcc:issueDate", issued.isoformat())
+    add(core, "dcc:issueDate", named.issued.isoformat())
 
 
 def _item(data: ET.Element, campaign: Campaign) -> None:
@@ -136,7 +141,7 @@ def _item(data: ET.Element, campaign: Campaign) -> None:
         add_words(identification, "dcc:name", name)
 
 
-def _statements(data: ET.Element, campaign: Campaign, fit: FitRecord, performed: Performance, country: str) -> None:
+def _statements(data: ET.Element, campaign: Campaign, fit: FitRecord, when: Performance, parties: Parties) -> None:
     statements = add(data, "dcc:statements")
 
     def state(name: str, text: str, traceable: bool | None = None) -> None:
@@ -156,10 +161,11 @@ def _statements(data: ET.Element, campaign: Campaign, fit: FitRecord, performed:
         state("validation", f"{text}them by {validation.inflation:.2f}.")
     if campaign.header.get("synthetic"):
         state("synthetic data", "The campaign was simulated: no instrument was measured.")
-    if not performed.recorded:
+    if not when.recorded:
         state("dates", "The campaign does not record its date; the date of issue stands for it.")
-    if country == COUNTRY_NOT_STATED:
-        state("country", f"The country was not stated; {COUNTRY_NOT_STATED} stands for it.")
+    for name, country in (("country", parties.country), ("country of the customer", parties.customer_country)):
+        if country == COUNTRY_NOT_STATED:
+            state(name, f"The {name} was not stated; {COUNTRY_NOT_STATED} stands for it.")
 
 
 def _equipment(parent: ET.Element, campaign: Campaign) -> None:
@@ -204,17 +210,19 @@ def _conditions(parent: ET.Element, campaign: Campaign) -> None:
             add_words(data, "dcc:text", "not recorded")
 
 
-def _check_certifiable(campaign: Campaign, fit: FitRecord, country: str) -> None:
+def _check_certifiable(campaign: Campaign, fit: FitRecord, parties: Parties) -> None:
     """Refuse what no certificate may be made of; errors as in `dcc_bytes`."""
-    if not re.fullmatch("[A-Z]{2}", country):
-        raise InputError(
-            "country",
-            f"country {escaped(country)!r}",
-            column="country",
-            found=escaped(country),
-            allowed="two capital letters of ISO 3166-1, such as MX or DE",
-            remedy="write the two letters of the country in which the campaign was measured: MX for Mexico",
-        )
+    where = "in which the campaign was measured", "of the customer"
+    for country, told in zip((parties.country, parties.customer_country), where, strict=True):
+        if not re.fullmatch("[A-Z]{2}", country):
+            raise InputError(
+                "country",
+                f"country {escaped(country)!r}",
+                column="country",
+                found=escaped(country),
+                allowed="two capital letters of ISO 3166-1, such as MX or DE",
+                remedy=f"write the two letters of the country {told}: MX for Mexico",
+            )
     again = "run `tvsbayes fit` on the campaign again"
     if fit.provenance.inputs != input_hashes(campaign):
         message = "results/fit.json belongs to other data or priors than the campaign"
@@ -230,7 +238,7 @@ def dcc_bytes(
     issued: datetime.date,
     identifier: str | None = None,
     parties: Parties = Parties(),
-    report: bytes | None = None,
+    report: Embedded | None = None,
 ) -> bytes:
     """DCC-schema XML of a fit: unsigned, not accredited, traceable only as far as the campaign declares.
 
@@ -238,9 +246,9 @@ def dcc_bytes(
         campaign: what was fitted; names are taken as given and stay text.
         fit: its `results/fit.json`.
         issued: date of issue; the same inputs and date give the same bytes.
-        identifier: unique identifier; None makes one from results, name and date.
-        parties: laboratory, customer, country.
-        report: the HTML report to embed.
+        identifier: unique identifier; None makes one from results, name, date, parties and report.
+        parties: laboratory, customer, countries.
+        report: the HTML report to embed; its number stands among the core data.
 
     Returns:
         UTF-8 XML, DCC 3.3.0.
@@ -249,18 +257,21 @@ def dcc_bytes(
         InputError: a country that is no code, or results of other data or priors than the campaign's.
         NotConverged: the fit behind the results has not converged.
     """
-    _check_certifiable(campaign, fit, parties.country)
+    _check_certifiable(campaign, fit, parties)
     names = {f"xmlns:{prefix}": uri for prefix, uri in DCC_NAMESPACES.items()}
     # Prefixes are written out: registering them would change ElementTree for the whole process.
     root = ET.Element("dcc:digitalCalibrationCertificate", {**names, "schemaVersion": DCC_VERSION})
-    name = identifier or fit.certificate_id(campaign.header.get("name"), issued)
-    _administrative(root, campaign, fit, issued, name, parties)
+    number = None if report is None else report.number
+    besides = [str(campaign.header.get("name")), *astuple(parties), number]
+    core = _Core(identifier or fit.certificate_id(issued, besides), issued, number)
+    _administrative(root, campaign, fit, core, parties)
     _measurement(root, campaign, fit)
     if report is not None:
         embedded = add(root, "dcc:document")
+        add_words(embedded, "dcc:name", f"report {report.number}")
         add(embedded, "dcc:fileName", "report.html")
         add(embedded, "dcc:mimeType", "text/html")
-        add(embedded, "dcc:dataBase64", base64.b64encode(report).decode())
+        add(embedded, "dcc:dataBase64", base64.b64encode(report.html).decode())
     ET.indent(root)
     return ET.tostring(root, encoding="utf-8", xml_declaration=True) + b"\n"
 

@@ -1,10 +1,11 @@
-"""What a campaign states of its length standard and its conditions, passed on and never checked.
+"""What a campaign states of its date, its length standard and its conditions, passed on and never checked.
 
 Lengths in mm, temperatures in degC, relative humidity in %, each with its standard uncertainty.
 """
 
 from __future__ import annotations
 
+import datetime
 from dataclasses import dataclass
 
 from tvsbayes.instrument.campaign import Campaign
@@ -31,6 +32,30 @@ class Traceability:
 
     statement: str
     declared: bool
+
+
+@dataclass(frozen=True)
+class Performance:
+    """First and last day of a campaign, and whether they were recorded."""
+
+    begin: datetime.date
+    end: datetime.date
+    recorded: bool
+
+
+def performed(campaign: Campaign, issued: datetime.date) -> Performance:
+    """When the campaign was measured; the date of issue where it does not say."""
+    created = campaign.header.get("created")
+    if not isinstance(created, datetime.date):
+        return Performance(issued, issued, False)
+    if not isinstance(created, datetime.datetime):
+        return Performance(created, created, True)
+    # Times of moves count from any instant: a clock, or the start of the campaign.
+    seconds = campaign.moves[-1].time_s - campaign.moves[0].time_s if campaign.moves else 0.0
+    try:
+        return Performance(created.date(), (created + datetime.timedelta(seconds=seconds)).date(), True)
+    except OverflowError:
+        return Performance(created.date(), created.date(), True)
 
 
 def header_table(campaign: Campaign, name: str) -> dict[str, object]:

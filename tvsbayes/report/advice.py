@@ -73,8 +73,8 @@ def noise_line(summary: FitSummary) -> str | None:
     )
 
 
-def steps_ahead(summary: FitSummary) -> list[str]:
-    """What to do next, most urgent first, for whoever reads the page."""
+def steps_ahead(summary: FitSummary, folder: str) -> list[str]:
+    """What to do next, most urgent first, for whoever reads the page of the campaign in a folder of that name."""
     found = []
     if not summary.converged:
         return [
@@ -93,7 +93,7 @@ def steps_ahead(summary: FitSummary) -> list[str]:
         named = ", ".join(f"{direction} ({count})" for direction, count in summary.few_stops.items())
         found.append(f"Add stops reached by moving {named}: so few hardly tell their own scatter.")
     if summary.estimator == "laplace":
-        found.append("Run `tvsbayes fit` without --no-sample: it samples the posterior.")
+        found.append(f"Sample the posterior, which takes minutes: `tvsbayes fit {folder}`, then make the report again.")
     told = [weak.text for weak in summary.weak_directions if asks_for_looks(weak)]
     return found + [f"{text[0].upper()}{text[1:]}." for text in told]
 

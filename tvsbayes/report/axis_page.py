@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import hashlib
 import json
+import shlex
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from tvsbayes.errors import escaped
 from tvsbayes.report.axis_text import (
     deviation_table,
     iso230_table,
@@ -15,7 +17,8 @@ from tvsbayes.report.axis_text import (
     ratio_table,
 )
 from tvsbayes.report.drawing import BLUE, GREY, RED, SKY, STYLE, WIDTH_IN
-from tvsbayes.report.page import page_html
+from tvsbayes.report.first_page import about_table
+from tvsbayes.report.page import NUMBER_DIGITS, numbered
 from tvsbayes.report.tables import FigureView, Issue, Number, Page, Section, concise, figure_view, two_digits
 from tvsbayes.results.fit_record import provenance
 from tvsbayes.results.records import plain
@@ -74,7 +77,7 @@ def _figure_of(fit: AxisFit) -> FigureView:
 
 
 def axis_page(results: AxisResults, issue: Issue) -> Page:
-    """The page; `results.fit` holds `curve_commands` of its range."""
+    """The page with its number; `results.fit` holds `curve_commands` of its range."""
     summary, fit = results.summary, results.fit
     unit = summary.unit
     made = plain(provenance(axis_hashes(fit.campaign), fit.seed))
@@ -92,15 +95,20 @@ def axis_page(results: AxisResults, issue: Issue) -> Page:
     told = f"Least-squares line: {concise(classic.per_command, classic.u_per_command)} {unit} per command, stops "
     told += f"independent, residual scatter {two_digits(classic.residual_sd)} {unit}."
     converged = "The intervals may be used." if summary.converged else "NOT CONVERGED: the numbers must not be used"
-    return Page(
-        report_id=hashlib.sha256(said.encode()).hexdigest()[:12].upper(),
-        name=str(fit.campaign.header.get("name") or "axis without a name"),
+    header = fit.campaign.header
+    created = header.get("created")
+    folder = "AXIS" if fit.campaign.path is None else shlex.quote(escaped(fit.campaign.path.resolve().name, 200))
+    page = Page(
+        results=hashlib.sha256(said.encode()).hexdigest()[:NUMBER_DIGITS].upper(),
+        name=str(header.get("name") or "axis without a name"),
+        about=about_table(header, str(created) if created else "", issue),
         verdict=f"{converged} No limit was stated." if summary.converged else converged,
         verdict_class="cannot-tell" if summary.converged else "not-met",
         numbers=numbers,
+        why=(),
         answer=ratio_table(summary),
         picture=_figure_of(fit),
-        steps=["`tvsbayes plan --given` says which stops to read next."],
+        steps=[f"`tvsbayes plan --given {folder}` says which stops to read next."],
         criteria=None,
         traceable="The readings are taken as stated.",
         warnings=[*summary.problems, *summary.warnings],
@@ -118,8 +126,4 @@ def axis_page(results: AxisResults, issue: Issue) -> Page:
         title="Calibration of an axis",
         issue=issue,
     )
-
-
-def axis_html(results: AxisResults, issue: Issue | None = None) -> bytes:
-    """The page, UTF-8; issued today where nothing else is said."""
-    return page_html(axis_page(results, issue or Issue.today()))
+    return numbered(page)

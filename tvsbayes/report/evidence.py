@@ -13,7 +13,7 @@ import numpy as np
 from tvsbayes.calibration.calibration_file import stored_ratios
 from tvsbayes.calibration.optics import ERROR_AT, PLAY_AT
 from tvsbayes.calibration.pointing import INPUT_NAMES, Calibration
-from tvsbayes.coordinates.error_map import ErrorMap, error_map
+from tvsbayes.coordinates.error_map import ErrorMap, SimpleError, error_map, simple_error
 from tvsbayes.coordinates.simple_calibration import simple_calibrations
 from tvsbayes.estimators.four_point import ClassicResult, classic_of
 from tvsbayes.instrument.axes import AXES, DIRECTIONS, HOME_APPROACH, Axis
@@ -113,6 +113,7 @@ class Evidence:
         criteria: what was asked of the calibration, judged.
         distances_mm: draws of the 3D error by estimator at `range_mm` and the middle of the counters.
         range_mm: stated range.
+        simple_errors: why simple calibrations are off there, by their name.
         maps: error maps.
         budget: of a point at that range.
         point: the same for its least certain coordinate, by parameter.
@@ -128,6 +129,7 @@ class Evidence:
     criteria: Sequence[Criterion]
     distances_mm: Mapping[str, np.ndarray]
     range_mm: float
+    simple_errors: Mapping[str, SimpleError]
     maps: ErrorMap
     budget: Budget
     point: BudgetTable
@@ -184,6 +186,10 @@ def gather(
         criteria=criteria,
         distances_mm=found,
         range_mm=range_mm,
+        simple_errors={
+            name: simple_error(calibration, one, (pan, tilt), range_mm)
+            for name, one in simple_calibrations(campaign.rig.priors, classic_result).items()
+        },
         maps=maps,
         budget=own,
         point=coordinate_budget(own, calibration, point.tolist(), least),

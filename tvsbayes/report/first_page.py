@@ -5,22 +5,30 @@ Ratios in deg/step, lost motion in deg, distances in mm.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from tvsbayes.instrument.axes import AXES, DIRECTIONS
+from tvsbayes.instrument.campaign import Campaign
+from tvsbayes.metrology.traceability import NOT_STATED, performed
 from tvsbayes.report import figures
 from tvsbayes.report.advice import verdict_line
 from tvsbayes.report.drawing import OF_ESTIMATOR
 from tvsbayes.report.evidence import MET, NOT_MET, Criterion, Evidence
 from tvsbayes.report.fit_text import validation_lines
-from tvsbayes.report.tables import FigureView, Number, TableView, concise, figure_view, interval_text, two_digits
+from tvsbayes.report.tables import FigureView, Issue, Number, TableView, concise, figure_view, interval_text, two_digits
 from tvsbayes.results.comparison_record import CANNOT_TELL
 from tvsbayes.results.estimates import Estimate, FitSummary
 
 CLASSIC_BLIND = "cannot see it"
+NOT_RECORDED = "not recorded"
+"""Of what `campaign.toml` may say and does not."""
+CAUSES_TOLD = 3
+"""Of the uncertainty of a point; the section on budgets has all."""
+RECORDED = (("instrument", "instrument"), ("serial", "serial number"), ("operator", "operator"))
+"""Keys of `campaign.toml` on the first page, and what they are called there."""
 
 
 @dataclass(frozen=True)
@@ -41,10 +49,7 @@ def verdict_of(summary: FitSummary, criteria: Sequence[Criterion]) -> Verdict:
         return Verdict(f"{failed}No limit was stated", "cannot-tell")
     if not criteria:
         usable = verdict_line(summary).removeprefix("verdict: ")
-        text = (
-            f"{usable[0].upper()}{usable[1:]}. No limit was stated (state one with --limit-deg-per-step or --limit-mm)"
-        )
-        return Verdict(text, "cannot-tell")
+        return Verdict(f"{usable[0].upper()}{usable[1:]}. No limit was stated", "cannot-tell")
     told = []
     for verdict in (NOT_MET, CANNOT_TELL, MET):
         mine = [c for c in criteria if c.verdict == verdict]
@@ -69,6 +74,22 @@ def criteria_table(criteria: Sequence[Criterion]) -> TableView | None:
     return TableView(caption, ["error of", "limit", "probability", "verdict"], rows)
 
 
+def about_table(header: Mapping[str, object], measured: str, issue: Issue) -> TableView:
+    """What was measured, when, by whom and for whom; `measured` is a date or "" where nobody wrote it down."""
+    recorded = [("measured", measured)]
+    recorded += [(label, str(header.get(key) or "")) for key, label in RECORDED]
+    stated = [("laboratory", issue.laboratory), ("customer", issue.customer)]
+    rows = [[label, text or NOT_RECORDED] for label, text in recorded]
+    return TableView("What was measured", [], rows + [[label, text or NOT_STATED] for label, text in stated])
+
+
+def measured_days(campaign: Campaign, issue: Issue) -> str:
+    """The first and last day of a campaign; "" where it does not say."""
+    when = performed(campaign, issue.day)
+    days = dict.fromkeys((when.begin.isoformat(), when.end.isoformat()))
+    return " to ".join(days) if when.recorded else ""
+
+
 def answer_table(e: Evidence) -> TableView:
     """The four ratios and both backlashes, classic beside joint."""
     summary, rows = e.fit.summary, []
@@ -82,8 +103,9 @@ def answer_table(e: Evidence) -> TableView:
         told = CLASSIC_BLIND if e.classic is not None else "not applicable"
         rows.append([f"backlash {axis}, deg", *_cells(summary.parameters[f"backlash_deg.{axis}"]), told])
     pose = summary.reference_pose_deg
-    caption = f"Degrees of the beam per motor step at pan {pose['pan']:.2f} deg, tilt {pose['tilt']:.2f} deg, and play"
-    return TableView(caption, ["", "joint value(u)", "95 % interval", "half of it", "classic value(u)"], rows)
+    where = f"pan {pose['pan']:.2f} deg, tilt {pose['tilt']:.2f} deg"
+    caption = f"Degrees of the beam per motor step at {where}, and play; U: half the 95 % interval"
+    return TableView(caption, ["", "joint value(u)", "95 % interval", "U, 95 %", "classic value(u)"], rows)
 
 
 def _cells(estimate: Estimate | None) -> list[str]:
@@ -111,7 +133,24 @@ def distances(e: Evidence) -> list[Number]:
     return [Number(f"{name} calibration", _mm(below[name]), note) for name in OF_ESTIMATOR if name in below]
 
 
+def why_far(e: Evidence) -> list[str]:
+    """What the error of the joint calibration consists of, and why the last of the simple ones is farther off."""
+    order = np.argsort(-e.budget.share)[:CAUSES_TOLD]
+    causes = ", ".join(f"{e.budget.causes[k]} {100 * e.budget.share[k]:.0f} %" for k in order)
+    told = [f"What the joint one leaves comes from, as shares of the variance: {causes}."]
+    for name, off in list(e.simple_errors.items())[-1:]:
+        told.append(
+            f"Why {name} is off there: its beam points {off.azimuth_deg:+.2f} deg in azimuth and "
+            f"{off.elevation_deg:+.2f} deg in elevation from the joint one (ratios, lost motion, mirrors), which alone "
+            f"makes {_mm(off.by_direction_mm)}; where it takes beam and aperture to stand, and the aperture's zero, "
+            f"alone make {_mm(off.by_place_mm)}."
+        )
+    return told
+
+
 def _mm(value: float) -> str:
+    if not np.isfinite(value):
+        return "no point at all"
     return f"{two_digits(value)} mm" if value < 100 else f"{value:.0f} mm"
 
 

@@ -34,11 +34,8 @@ LEAST_P = 0.001
 """Printed of a probability; smaller ones are said to be below it."""
 PRIORS_SHOWN = 8
 """Of those that a result is sensitive to, the strongest first; fit.json has all."""
-HEADER_SHOWN = (
-    *(("instrument", "instrument"), ("serial", "serial number"), ("operator", "operator"), ("method", "method")),
-    *(("created", "measured or made"), ("notes", "notes")),
-)
-"""Keys of a campaign's header, and what they are called on the page."""
+HEADER_SHOWN = ("method", "notes")
+"""Keys of a campaign's header that the first page does not have."""
 
 
 def setup_section(e: Evidence) -> Section:
@@ -46,7 +43,7 @@ def setup_section(e: Evidence) -> Section:
     campaign, header, summary = e.campaign, e.campaign.header, e.fit.summary
     ok = sum(spot.status == "ok" for spot in campaign.spots)
     targets = sorted({spot.target for spot in campaign.spots if spot.target})
-    rows = [[label, str(header[key])] for key, label in HEADER_SHOWN if header.get(key)]
+    rows = [[key, str(header[key])] for key in HEADER_SHOWN if header.get(key)]
     rows += [
         ["moves, segments", f"{len(campaign.moves)}, {1 + campaign.moves[-1].segment}"],
         ["spots used, in all", f"{ok - len(summary.excluded_spots)}, {len(campaign.spots)}"],

@@ -150,7 +150,7 @@ def few_stops_line(few: Mapping[str, int], estimator: str) -> str:
     if estimator == "posterior":
         return f"{told}; the intervals hold it, more stops would shorten them"
     told += ", and the Laplace intervals of ratio and backlash are too short"
-    return f"{told}; sample the posterior (fit without --no-sample), or add stops"
+    return f"{told}; sample the posterior (`tvsbayes fit`), or add stops"
 
 
 def validation_lines(validation: Validation) -> list[str]:

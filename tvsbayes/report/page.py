@@ -11,20 +11,32 @@ import base64
 import hashlib
 import os
 import re
+import shlex
 import shutil
 import subprocess
 import tempfile
+from dataclasses import replace
 from pathlib import Path
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
-from markupsafe import Markup
+from markupsafe import Markup, escape
 
-from tvsbayes.errors import InputError
-from tvsbayes.files.disk import shipped_data, write_atomically
+from tvsbayes.errors import InputError, escaped
+from tvsbayes.files.disk import read_bytes, shipped_data, write_atomically
 from tvsbayes.metrology.traceability import traceability
 from tvsbayes.report.advice import steps_ahead
 from tvsbayes.report.evidence import Evidence
-from tvsbayes.report.first_page import answer_table, both_estimators, criteria_table, distances, verdict_of, warnings_of
+from tvsbayes.report.first_page import (
+    about_table,
+    answer_table,
+    both_estimators,
+    criteria_table,
+    distances,
+    measured_days,
+    verdict_of,
+    warnings_of,
+    why_far,
+)
 from tvsbayes.report.fit_sections import (
     identifiability_section,
     residuals_section,
@@ -45,6 +57,10 @@ from tvsbayes.report.uncertainty_sections import (
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome", "msedge")
 PDF_SECONDS = 120
+NUMBER_DIGITS = 12
+PAGE_BYTES_MAX = 64 * 1024 * 1024
+GENERATOR = b'<meta name="generator" content="tvsbayes '
+"""In the head of every page of ours."""
 
 
 def find_browser() -> str:
@@ -87,14 +103,58 @@ def print_to_pdf(page: Path) -> Path:
     return target
 
 
-def report_html(evidence: Evidence, issue: Issue | None = None) -> bytes:
-    """The report, UTF-8.
+def report_page(evidence: Evidence, issue: Issue | None = None) -> Page:
+    """The report with its number.
 
     Args:
         evidence: computed beforehand; nothing is computed here.
         issue: who issues it, for whom and when; None is today, by nobody.
     """
-    return page_html(_page(evidence, issue or Issue.today()))
+    return numbered(_page(evidence, issue or Issue.today()))
+
+
+def report_html(evidence: Evidence, issue: Issue | None = None) -> bytes:
+    """The report, UTF-8; arguments as of `report_page`."""
+    return page_html(report_page(evidence, issue))
+
+
+def certificate_place(page: Path, out: Path | None) -> Path:
+    """Where the certificate of a page lies: `dcc.xml` in `results/`, beside a page elsewhere by its name."""
+    return page.with_name("dcc.xml" if out is None else f"{page.stem}.dcc.xml")
+
+
+def replace_page(page: Path, html: bytes, out: Path | None) -> list[str]:
+    """Write a page, and remove what was made of another one that stood there: its PDF and its certificate.
+
+    Args:
+        page: where to.
+        html: its bytes; of the very page that stands there already nothing is removed.
+        out: as the user named it; there only what lies beside a page of ours is ours.
+
+    Returns:
+        Names of what was removed.
+
+    Raises:
+        InputError: the folder cannot be written.
+    """
+    try:
+        before = read_bytes(page, PAGE_BYTES_MAX)
+    except InputError:
+        before = b""
+    removed = []
+    if before != html and (out is None or GENERATOR in before):
+        for follower in (page.with_suffix(".pdf"), certificate_place(page, out)):
+            if follower.is_file():
+                follower.unlink()
+                removed.append(follower.name)
+    write_atomically(page, html)
+    return removed
+
+
+def numbered(page: Page) -> Page:
+    """The page with its number: hexadecimal digits of a digest of all that it says, so that no other page has it."""
+    digest = hashlib.sha256(page_html(replace(page, number=""))).hexdigest()
+    return replace(page, number=digest[:NUMBER_DIGITS].upper())
 
 
 MINUS, NOUGHT = re.compile(r"(?<![\w.)/-])-(?=\d)"), re.compile(r"(?<![\w.])[-\u2212](0(?:\.0+)?)(?![\d.(])")
@@ -108,16 +168,25 @@ def typeset(text: str) -> str:
     return MINUS.sub("\u2212", NOUGHT.sub(r"\1", text))
 
 
+def prose(text: str) -> Markup:
+    """A sentence as `typeset`, escaped; what stands between backticks, a command to be typed, as it is and as code."""
+    parts = str(text).split("`")
+    if len(parts) % 2 == 0:
+        return escape(typeset(text))
+    told = (Markup("<code>{}</code>").format(part) if k % 2 else escape(typeset(part)) for k, part in enumerate(parts))
+    return Markup("").join(told)
+
+
 def page_html(page: Page) -> bytes:
     """A page by the template, UTF-8."""
     folder = shipped_data() / "report"
     environment = Environment(
         loader=FileSystemLoader(str(folder)), autoescape=True, undefined=StrictUndefined, trim_blocks=True
     )
-    css = (folder / "report.css").read_text(encoding="utf-8").replace("@ID@", page.report_id)
+    css = (folder / "report.css").read_text(encoding="utf-8").replace("@ID@", page.number)
     digest = base64.b64encode(hashlib.sha256(css.encode()).digest()).decode()
     policy = f"default-src 'none'; img-src data:; style-src 'sha256-{digest}'; base-uri 'none'; form-action 'none'"
-    environment.filters["typeset"] = typeset
+    environment.filters |= {"typeset": typeset, "prose": prose}
     # The style sheet is ours; escaped quotes would change its hash.
     html = environment.get_template("report.html").render(r=page, css=Markup(css), policy=policy)
     return html.encode()
@@ -140,11 +209,13 @@ def _page(e: Evidence, issue: Issue) -> Page:
         limits_section(e),
     ]
     return Page(
-        report_id=e.fit.report_id,
+        results=e.fit.results_id,
         name=str(e.campaign.header.get("name") or "campaign without a name"),
+        about=about_table(e.campaign.header, measured_days(e.campaign, issue), issue),
         verdict=verdict.text,
         verdict_class=verdict.kind,
         numbers=distances(e),
+        why=why_far(e),
         answer=answer_table(e),
         picture=both_estimators(e),
         steps=_steps(e),
@@ -159,8 +230,14 @@ def _page(e: Evidence, issue: Issue) -> Page:
 
 def _steps(e: Evidence) -> list[str]:
     """What to do next: what the fit asks for, then the best of a plan; the plan's own section has all of it."""
-    found = steps_ahead(e.fit.summary)
+    folder = "CAMPAIGN" if e.campaign.path is None else shlex.quote(escaped(e.campaign.path.resolve().name, 200))
+    found = steps_ahead(e.fit.summary, folder)
     if e.planned is not None and not e.planned.stop.now and e.planned.next:
         best = e.planned.next[0]
         found.append(f"Look at {best.text} ({best.minutes:.1f} min): the best next four looks of the plan.")
-    return found or ["Nothing: use the calibration, and repeat it when the instrument was moved, opened or dropped."]
+    if not found:
+        found.append("Nothing: use the calibration, and repeat it when the instrument was moved, opened or dropped.")
+    if not e.criteria and e.fit.summary.converged:
+        limit = f"`tvsbayes report {folder} --limit-mm 5`, or `--limit-deg-per-step 0.0005`"
+        found.append(f"State the largest error that you can bear, and the page says whether it is kept: {limit}.")
+    return found

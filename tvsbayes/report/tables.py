@@ -156,13 +156,19 @@ class Issue:
 
 @dataclass(frozen=True)
 class Page:
-    """What the template is filled with; `answer` is its first table, `picture` stands beside it."""
+    """What the template is filled with; `answer` is its first table, `picture` stands beside it.
 
-    report_id: str
+    `number` is the page's own, `results` that of the results behind it; `about` says what was measured, when and by
+    whom.
+    """
+
+    results: str
     name: str
+    about: TableView
     verdict: str
     verdict_class: str
     numbers: Sequence[Number]
+    why: Sequence[str]
     answer: TableView | None
     picture: FigureView | None
     steps: Sequence[str]
@@ -173,6 +179,7 @@ class Page:
     sections: Sequence[Section] = field(default_factory=tuple)
     title: str = "Calibration of a laser positioner"
     issue: Issue = field(default_factory=Issue.today)
+    number: str = ""
 
 
 def figure_view(figure: Figure, alt: str, caption: str) -> FigureView:

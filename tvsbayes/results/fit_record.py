@@ -121,8 +121,8 @@ class FitRecord(Shown):
     provenance: Provenance
 
     def shown(self) -> View:
-        """Its summary, and which report it belongs to."""
-        return replace(self.summary.shown(), title=f"FitRecord {self.report_id}: {self.summary.shown().title}")
+        """Its summary, and the number of the results."""
+        return replace(self.summary.shown(), title=f"FitRecord {self.results_id}: {self.summary.shown().title}")
 
     def as_json(self) -> dict[str, object]:
         """The document."""
@@ -138,13 +138,13 @@ class FitRecord(Shown):
         return hashlib.sha256(json.dumps([said, made], sort_keys=True).encode()).hexdigest()
 
     @property
-    def report_id(self) -> str:
-        """Number of a report of these results: twelve hexadecimal digits."""
+    def results_id(self) -> str:
+        """Number of these results, the same in every report of them: twelve hexadecimal digits."""
         return self.digest[:12].upper()
 
-    def certificate_id(self, name: object, issued: datetime.date) -> str:
-        """Of a certificate of these results for the campaign of that name: `tvsbayes-` and 32 hexadecimal digits."""
-        text = json.dumps([self.digest, str(name), issued.isoformat()])
+    def certificate_id(self, issued: datetime.date, besides: Sequence[str | None]) -> str:
+        """Of a certificate of these results that says so much besides: `tvsbayes-` and 32 hexadecimal digits."""
+        text = json.dumps([self.digest, issued.isoformat(), *besides])
         return f"tvsbayes-{hashlib.sha256(text.encode()).hexdigest()[:32]}"
 
 
