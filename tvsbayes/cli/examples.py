@@ -43,6 +43,7 @@ EXAMPLES = {
     "plan": (
         "tvsbayes plan rig.toml --minutes 30 -o plan.csv",
         "tvsbayes plan rig.toml --given mine --target 'u(worst) <= 8e-5 deg/step'",
+        "tvsbayes plan mine --watch --minutes 10 -o looks.csv",
     ),
     "study": ("tvsbayes study rig.toml plan.csv --n 100 --engine processes",),
 }

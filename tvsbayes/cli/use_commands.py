@@ -28,12 +28,15 @@ from tvsbayes.cli.app import (
     report_line,
 )
 from tvsbayes.cli.progress_bar import waiting
+from tvsbayes.cli.watch_command import plan_watch
 from tvsbayes.errors import InputError, escaped
 from tvsbayes.files.disk import output_place
 from tvsbayes.pipeline import FITTING, calibration_for, compile_for, fit_for
 from tvsbayes.progress import Job
 
 WORKERS = 2
+PLAN_DRAWS = 200
+"""As `planning.planner` has it, which brings JAX."""
 NEAREST_POINT_MM = 10.0
 """A point nearer to the middle of the baseline is nowhere that the beam goes, and most rooms end before 10 m."""
 PLANNING, LOCATING = "plan", "points"
@@ -206,7 +209,9 @@ TargetText = Annotated[
 
 
 def plan(
-    rig: Annotated[Path | None, typer.Argument(metavar="RIG", help="Rig file; none with an axis folder.")] = None,
+    rig: Annotated[
+        Path | None, typer.Argument(metavar="RIG", help="Rig file; none with an axis folder; CAMPAIGN with --watch.")
+    ] = None,
     given: Annotated[Path | None, typer.Option("--given", help="Campaign measured already: what next?")] = None,
     target: TargetText = None,
     minutes: Annotated[float | None, typer.Option("--minutes", min=0.1, help="Longest plan.")] = None,
@@ -214,12 +219,20 @@ def plan(
     output: OldOut = None,
     criterion: Annotated[str, typer.Option("--criterion", help="c (the target), D or A (all results).")] = "c",
     aperture: Annotated[bool, typer.Option("--aperture/--no-aperture", help="Looks also read the aperture.")] = False,
-    draws: Annotated[int, typer.Option("--draws", min=20, max=10_000, help="Instruments for the chances.")] = 200,
+    draws: Annotated[
+        int, typer.Option("--draws", min=20, max=10_000, help="Instruments for the chances.")
+    ] = PLAN_DRAWS,
+    watch: Annotated[bool, typer.Option("--watch", help="Fewest looks for `watch`: plan CAMPAIGN --watch.")] = False,
     seed: Seed = 0,
     as_json: Json = False,
 ) -> None:
     """How many looks, which ones, and when to stop. With --given: what next."""
     out = out or output
+    if watch:
+        spare = {"criterion": criterion != "c", "draws": draws != PLAN_DRAWS}
+        refuse_options("for targets, not for --watch", "leave it out", target=target, aperture=aperture, **spare)
+        plan_watch(rig, given, minutes=minutes, out=out, seed=seed, as_json=as_json)
+        return
     if axis_commands.is_axis(given or rig):
         refuse_options(axis_commands.NOT_OF_AN_AXIS, "leave it out", aperture=aperture)
         if given is None or rig is not None:

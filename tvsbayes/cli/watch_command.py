@@ -1,4 +1,4 @@
-"""watch: a few new looks against a stored calibration, and the table that a nightly job keeps of it."""
+"""watch: new looks against a stored calibration, the table that a nightly job keeps, and the plan of the looks."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ import typer
 from tvsbayes.cli import axis_commands
 from tvsbayes.cli.app import TARGET_MISSED, CampaignFolder, Ended, Json, Seed, finish, report_line
 from tvsbayes.cli.progress_bar import waiting
-from tvsbayes.errors import InputError, NothingToEstimate
+from tvsbayes.errors import InputError, NothingToEstimate, escaped
 from tvsbayes.pipeline import FITTING, compile_for, fit_for
 from tvsbayes.progress import Job
 
 if TYPE_CHECKING:
     from tvsbayes.results.watch_record import Watch
 
-WATCHING = "looking at the new looks"
+WATCHING, PLANNING = "looking at the new looks", "choosing looks"
 TABLE_COLUMNS = ("time", "verdict", "p", "looks", "moved")
 
 
@@ -71,3 +71,45 @@ def _append(table: Path, found: Watch) -> None:
     now = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
     moved = "; ".join(map(moved_words, found.moved))
     append_line(table, TABLE_COLUMNS, (now, found.verdict, found.p, found.looks, moved))
+
+
+def plan_watch(
+    place: Path | None, given: Path | None, *, minutes: float | None, out: Path | None, seed: int, as_json: bool
+) -> None:
+    """`plan CAMPAIGN --watch`, or `plan RIG --given CAMPAIGN --watch`: limits and costs of the rig file.
+
+    Args:
+        place: the campaign, or the rig file where the campaign is given.
+        given: the campaign, or None.
+        minutes: that the plan may take.
+        out: where it is written.
+        seed: of the search.
+        as_json: print the document.
+    """
+    from tvsbayes.instrument.campaign import read_campaign
+    from tvsbayes.instrument.plan import write_plan
+    from tvsbayes.instrument.rig import read_rig
+
+    campaign = given or place
+    if campaign is None or axis_commands.is_axis(campaign):
+        raise InputError(
+            "usage",
+            "--watch needs the campaign of a scanner",
+            remedy="write tvsbayes plan CAMPAIGN --watch -o looks.csv",
+        )
+    known, rig = read_campaign(campaign), None if given is None or place is None else read_rig(place)
+    compile_for(report_line)
+    with waiting() as progress, Job({FITTING: 1.0, PLANNING: 8.0}, progress) as job:
+        fitted = fit_for(known, report_line, job.part(FITTING))
+        job.begin(PLANNING)
+        from tvsbayes.planning.watch_plan import MINUTES, watch_plan
+
+        found = watch_plan(fitted, rig, minutes=MINUTES if minutes is None else minutes, seed=seed)
+    from tvsbayes.report.watch_text import watch_plan_text
+
+    text, document = watch_plan_text(found), found.as_json()
+    if out is not None:
+        write_plan(found.steps, out)
+        document["plan"] = str(out)
+        text += f"\nwritten: {escaped(str(out), 200)}"
+    finish(document, text, as_json)

@@ -226,7 +226,7 @@ class WatchedLooks:
     def departure(self, z: np.ndarray) -> Departure:
         """What the looks say beyond the first day, both linearised at z; its noise scales are held."""
         linear, prior = self.linear(z), np.where(self.problem.held, 0.0, z)
-        both, before = (_Told.of(spots, prior) for spots in (linear, _rows(linear, slice(self.first))))
+        both, before = (_Told.of(spots, prior) for spots in (linear, rows_of(linear, slice(self.first))))
         return Departure(both.chi2 - before.chi2, self.dof, both.score, both.information)
 
     def linear(self, z: np.ndarray) -> LinearSpots:
@@ -269,7 +269,8 @@ class WatchedLooks:
         return Believed(self.departure(noise.centre), drawn, noise.weights)
 
 
-def _rows(spots: LinearSpots, rows: slice) -> LinearSpots:
+def rows_of(spots: LinearSpots, rows: slice) -> LinearSpots:
+    """Some spots of a linearised campaign, in their order."""
     return LinearSpots(**{part.name: getattr(spots, part.name)[rows] for part in fields(spots)})
 
 

@@ -282,7 +282,8 @@ def rig_table_toml(table: RigTable) -> str:
     return "\n".join(["[rig]", *declared, *periods, convention, "[rig.prior]", *priors, *periodic]) + "\n"
 
 
-_COSTS_S = {"move_s": 1.5, "look_s": 1.0, "placement_s": 60.0}
+COSTS_S = {"move_s": 1.5, "look_s": 1.0, "placement_s": 60.0}
+"""What a move, a look and the placement of a sheet cost where no rig file says so."""
 
 
 _NUMBERS = {
@@ -384,7 +385,7 @@ def read_rig(path: Path) -> Rig:
         if not (name.isprintable() and 0 < len(name) <= 100):
             raise sheets.refuse(name, "text", "a printable name of 1 to 100 characters", "rename the sheet")
     costs = keys.table("costs")
-    costs.only(_COSTS_S)
+    costs.only(COSTS_S)
     truth = {**table.priors, **_parse_priors(_named_entries(keys.table("truth"), RIG_NAMES))}
     _check_periods(keys.table("truth"), truth, table.harmonic_period_deg)
     return Rig(
@@ -394,7 +395,7 @@ def read_rig(path: Path) -> Rig:
         sheets_mm={name: sheets.number(name, 50.0, 100_000.0) for name in sheets.values},
         positioner=_parse_positioner(keys.table("positioner")),
         cameras=_parse_cameras(keys.table("cameras"), stereo),
-        costs_s={k: costs.number(k, 0.0, 1e6) if k in costs else v for k, v in _COSTS_S.items()},
+        costs_s={k: costs.number(k, 0.0, 1e6) if k in costs else v for k, v in COSTS_S.items()},
         path=path,
         header=header,
     )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from tvsbayes.report.tables import TableView, concise
-from tvsbayes.results.watch_record import CANNOT_TELL, MOVED, MovedPart, Watch
+from tvsbayes.results.watch_record import CANNOT_TELL, MOVED, MovedPart, PlannedChange, Watch, WatchPlan
 
 HELPS = {
     "cameras: rotation": "more looks on both sheets, over the whole picture",
@@ -55,4 +55,37 @@ def watch_text(found: Watch, power_min: float) -> str:
         lines += [f"cannot see {c.size:g} {c.unit} of {c.what}: {HELPS[c.what]}" for c in unseen]
     if found.verdict != MOVED and found.p_all < found.false_alarm_rate:
         lines.append(f"warning: the looks scatter more than the calibration says (p = {found.p_all:.2g})")
+    return "\n".join([*lines, "", table.text()])
+
+
+def _need(change: PlannedChange) -> str:
+    if change.looks_needed is None:
+        return "none do"
+    return f"{change.looks_needed} after {change.homings_needed} homings, {change.minutes_needed:.0f} min"
+
+
+def watch_plan_text(plan: WatchPlan) -> str:
+    """A plan for watching a calibration, for people."""
+    rows = [[c.what, f"{c.size:g} {c.unit}", f"{100 * c.power:.0f} %", _need(c)] for c in plan.changes]
+    wanted = f"{100 * plan.power_wanted:.0f} %"
+    head = (
+        f"{plan.looks} looks after {plan.homings} homings, {plan.minutes:.1f} of {plan.minutes_allowed:g} minutes; "
+        f"false alarms {100 * plan.false_alarm_rate:g} %"
+    )
+    table = TableView(
+        "What `watch` will notice", ["change", "of", "noticed by this plan", f"looks for {wanted} of it alone"], rows
+    )
+    lines = [head]
+    for c in plan.changes:
+        if c.power >= plan.power_wanted:
+            continue
+        missed = f"{c.size:g} {c.unit} of {c.what} is noticed in {100 * c.power:.0f} % of the cases"
+        if c.looks_needed is not None:
+            more = f"{c.looks_needed} looks after {c.homings_needed} homings ({c.minutes_needed:.0f} minutes) would do"
+            lines.append(f"{missed}: {more}; {HELPS[c.what]}")
+        else:
+            enough = "; what would do was not found"
+            if c.looks_to_add is not None:
+                enough = f": add about {c.looks_to_add} looks to it, and take as many at every watch"
+            lines.append(f"{missed}, and no number of looks does better: the campaign knows too little of it{enough}")
     return "\n".join([*lines, "", table.text()])

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from tvsbayes.display import Shown, View
+from tvsbayes.instrument.plan import PlanStep
 
 Verdict = Literal["OK", "MOVED", "CANNOT TELL"]
 OK: Verdict = "OK"
@@ -91,3 +92,66 @@ class Watch(Shown):
             ],
             "same_cameras": self.same_cameras,
         }
+
+
+@dataclass(frozen=True)
+class PlannedChange:
+    """What planned looks will see of one change.
+
+    Attributes:
+        what: the change.
+        size: that should be noticed, in `unit`.
+        power: probability with which the plan notices it.
+        looks_needed: of the fewest looks that notice it as often as wanted, None where no number of looks does.
+        homings_needed: of these.
+        minutes_needed: their duration.
+        looks_to_add: where no number does: looks to add to the campaign, and to take at every watch.
+    """
+
+    what: str
+    size: float
+    unit: str
+    power: float
+    looks_needed: int | None
+    homings_needed: int | None
+    minutes_needed: float | None
+    looks_to_add: int | None
+
+
+@dataclass(frozen=True, repr=False)
+class WatchPlan(Shown):
+    """The fewest looks that watch a calibration.
+
+    Attributes:
+        steps: the plan.
+        looks, homings, minutes: its size.
+        minutes_allowed: what it may take.
+        power_wanted: of every change.
+        false_alarm_rate: of all tests together.
+        changes: what it will notice.
+    """
+
+    steps: tuple[PlanStep, ...]
+    looks: int
+    homings: int
+    minutes: float
+    minutes_allowed: float
+    power_wanted: float
+    false_alarm_rate: float
+    changes: tuple[PlannedChange, ...]
+
+    @property
+    def met(self) -> bool:
+        """Whether every change is noticed as often as wanted."""
+        return all(change.power >= self.power_wanted for change in self.changes)
+
+    def shown(self) -> View:
+        """What will be noticed."""
+        rows = [(c.what, c.size, c.unit, c.power, c.looks_needed) for c in self.changes]
+        title = f"WatchPlan: {self.looks} looks, {self.homings} homings, {self.minutes:.1f} minutes"
+        return View(title, ("change", "size", "unit", "power", "looks needed"), rows)
+
+    def as_json(self) -> dict[str, Any]:
+        """The document of `plan --watch --json`."""
+        keys = ("looks", "homings", "minutes", "minutes_allowed", "power_wanted", "false_alarm_rate", "met")
+        return {**{key: getattr(self, key) for key in keys}, "changes": [vars(change) for change in self.changes]}

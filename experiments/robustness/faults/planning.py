@@ -242,4 +242,20 @@ FAULTS = (
         "every interval seems to hold the truth",
         ("studies/study::test_counts_of_a_perfect_estimator_are_within_bounds_and_of_a_boastful_one_outside",),
     ),
+    Fault(
+        "planned watch: homings are taken for exact",
+        "planning/watch_design.py",
+        "block[-2:, -2:] + np.eye(2) / HOME_VARIANCE_RAD2",
+        "block[-2:, -2:] + np.eye(2) * 1e15",
+        "a plan for watching promises to notice a turned positioner that it cannot",
+        ("planning/watch_plan::test_independent_stops_add_up_to_the_plan_itself",),
+    ),
+    Fault(
+        "planned watch: run-ups beyond the limits",
+        "planning/watch_design.py",
+        "start = np.array(one.steps) - np.array(one.side) * self._overshoot",
+        "start = np.array(one.steps) + np.array(one.side) * 0",
+        "the looks of a watch drive the mirrors where the campaign never was",
+        ("planning/watch_plan::test_candidates_keep_to_the_limits",),
+    ),
 )

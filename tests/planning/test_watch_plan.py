@@ -1,0 +1,119 @@
+"""Looks planned for a watch: powers are those of the looks taken, the budget holds, what is out of reach is said."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import jsonschema
+import numpy as np
+import pytest
+
+from tvsbayes.cli.main import run
+from tvsbayes.comparison.watched_looks import CHANGES, POWER_MIN, WatchedLooks, null_distribution, powers
+from tvsbayes.errors import InputError
+from tvsbayes.estimators.joint_fit import fit
+from tvsbayes.instrument.plan import plan_seconds, read_plan
+from tvsbayes.instrument.protocols import four_point_protocol
+from tvsbayes.instrument.rig import read_rig
+from tvsbayes.planning.watch_design import Pattern, WatchDesigns
+from tvsbayes.planning.watch_plan import watch_plan
+from tvsbayes.twin.simulated_campaign import simulate
+
+ROOT = Path(__file__).resolve().parents[2]
+RIG = ROOT / "data" / "rigs" / "mounted" / "rig.toml"
+NAMES = [change.what for change in CHANGES]
+
+
+@pytest.fixture(scope="module")
+def measured():
+    """A first day on the shipped rig, whose gears repeat errors and drift."""
+    return simulate(read_rig(RIG), four_point_protocol(repeats=6, steps=(100, 200)), seed=2)
+
+
+@pytest.fixture(scope="module")
+def watched_fit(measured):
+    return fit(measured.campaign)
+
+
+@pytest.fixture(scope="module")
+def planned(watched_fit):
+    return watch_plan(watched_fit)
+
+
+@pytest.fixture(scope="module")
+def designs(watched_fit):
+    return WatchDesigns(watched_fit, None, 0)
+
+
+def test_the_plan_notices_what_it_states(planned, measured, watched_fit, designs):
+    """Its looks, taken on the twin and watched: the powers of `watch` are those of the plan."""
+    taken = simulate(read_rig(RIG), planned.steps, seed=5, truth=measured.truth).campaign
+    assert len(taken.spots) == planned.looks <= 384 and planned.minutes <= planned.minutes_allowed == 10
+    assert sum(step.action == "home" for step in planned.steps) == planned.homings
+    departure = WatchedLooks(watched_fit, taken).departure(designs.z)
+    seen = powers(departure, null_distribution(departure, 0).limit, 0)
+    # Pixels elsewhere by their noise and by stops change slopes by a percent.
+    np.testing.assert_allclose(seen, [change.power for change in planned.changes], atol=0.03)
+
+
+def test_what_is_out_of_reach_is_said(planned):
+    by_name = {change.what: change for change in planned.changes}
+    assert list(by_name) == NAMES and not planned.met
+    # 0.3 % of a ratio over 200 steps is 0.036 deg, and the first day knows it to 0.4 %.
+    ratio = by_name["ratio: pan"]
+    assert ratio.power < POWER_MIN and ratio.looks_needed is None and ratio.looks_to_add > 100
+    cameras = by_name["cameras: shift"]
+    assert cameras.power >= POWER_MIN and 4 <= cameras.looks_needed <= planned.looks and cameras.looks_to_add is None
+
+
+def test_independent_stops_add_up_to_the_plan_itself(designs):
+    """The information that patterns are searched by, against the moves through the filter."""
+    pattern = designs.grown(("d1", "d2"), 4.0)[2]
+    limit = np.log(0.01 / len(CHANGES))
+    for homings in (1, 6):
+        np.testing.assert_allclose(designs.powers(pattern, homings), designs.judged(pattern, homings), atol=0.06)
+    # More homings with the same looks, never less seen; a turned positioner gains most.
+    few, many = (designs.powers(pattern, homings) for homings in (2, 24))
+    assert np.all(many >= few - 1e-9) and limit < 0
+    one_homing = Pattern({sheet: looks * 12 for sheet, looks in pattern.looks.items()})
+    turned = NAMES.index("positioner: rotation")
+    assert designs.powers(one_homing, 2)[turned] < many[turned]
+
+
+def test_candidates_keep_to_the_limits(designs, watched_fit):
+    reached = {axis: [getattr(m, f"{axis}_steps") for m in watched_fit.campaign.moves] for axis in ("pan", "tilt")}
+    steps = designs.steps(designs.grown(("d2",), 1.0)[-1], 2)
+    for axis, own in reached.items():
+        moved = [getattr(step, f"{axis}_steps") for step in steps if step.action in ("home", "move")]
+        assert min(own) <= min(moved) and max(moved) <= max(own)
+
+
+def test_a_short_budget_is_kept_or_refused(watched_fit):
+    found = watch_plan(watched_fit, read_rig(RIG), minutes=2.0)
+    assert found.minutes <= 2 and found.looks >= 4
+    with pytest.raises(InputError, match="4 looks take"):
+        watch_plan(watched_fit, minutes=0.5)  # a placement alone takes one
+
+
+def test_the_command_writes_the_plan(watched_fit, planned, tmp_path, monkeypatch, capsys):
+    asked = []
+    monkeypatch.setattr(
+        "tvsbayes.planning.watch_plan.watch_plan", lambda *rest, **named: asked.append((rest[1], named)) or planned
+    )
+    monkeypatch.setattr("tvsbayes.cli.watch_command.fit_for", lambda *_: watched_fit)
+    monkeypatch.setattr("tvsbayes.instrument.campaign.read_campaign", lambda _: watched_fit.campaign)
+    out, rig = tmp_path / "looks.csv", read_rig(RIG)
+    assert run(["plan", str(RIG), "--given", "mine", "--watch", "--minutes", "3", "-o", str(out), "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    jsonschema.validate(document, json.loads((ROOT / "data/schemas/watch-plan-1.schema.json").read_text()))
+    steps = read_plan(out)
+    assert document["plan"] == str(out) and sum(step.action == "look" for step in steps) == document["looks"]
+    assert plan_seconds(rig, steps) / 60 == pytest.approx(document["minutes"], abs=1e-9)
+    assert run(["plan", "mine", "--watch"]) == 0
+    assert asked[0][0].costs_s == rig.costs_s and asked[1][0] is None
+    assert [named["minutes"] for _, named in asked] == [3, 10]
+    text = capsys.readouterr().out
+    assert "no number of looks does better: the campaign knows too little of it: add about" in text
+    assert run(["plan", "mine", "--watch", "--target", "u(worst) <= 1e-4 deg/step"]) == 2
+    assert "--target is for targets" in capsys.readouterr().err
