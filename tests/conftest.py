@@ -30,7 +30,7 @@ from tvsbayes.twin.simulated_campaign import simulate
 ROOT = Path(__file__).resolve().parents[1]
 pytest_plugins = [
     *("support.dozen_spots", "support.commands", "support.reported_twin"),
-    *("support.coarse_planning", "support.invented_studies"),
+    *("support.coarse_planning", "support.invented_studies", "support.viewed_twin"),
 ]
 """Fixtures of one small campaign, of commands, of the report, of planning and of studies, with their helpers."""
 COMPILES = "cli/test_estimate_commands.py"

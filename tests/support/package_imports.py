@@ -13,7 +13,7 @@ ORDER = (
     *("calibration", "results", "metrology", "single_axis", "twin", "model"),
     *("estimators", "posterior", "assessment", "coordinates", "comparison", "planning", "studies"),
     *("positioner", "cameras", "acquisition"),
-    *("pipeline", "report", "cli"),
+    *("pipeline", "report", "view", "cli"),
 )
 """From bottom to top: packages and single modules; each imports only what stands before it."""
 MODULE = re.compile(r"\btvsbayes(?:\.\w+)+")

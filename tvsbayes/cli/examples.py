@@ -30,6 +30,7 @@ EXAMPLES = {
         "tvsbayes report mine --limit-deg-per-step 4e-4 --pdf",
         "tvsbayes report mine --laboratory 'Optics Lab' --customer 'Robotics group'",
     ),
+    "view": ("tvsbayes view mine", "tvsbayes view january --beside march"),
     "compare": ("tvsbayes compare mine", "tvsbayes compare january march"),
     "watch": ("tvsbayes watch mine tonight", "tvsbayes watch mine tonight --append nights.csv"),
     "locate": (

@@ -30,12 +30,13 @@ from tvsbayes.cli.examples import EXAMPLES, epilog
 from tvsbayes.cli.import_command import import_
 from tvsbayes.cli.report_commands import calibrate, report
 from tvsbayes.cli.use_commands import locate, plan, steps_for, study
+from tvsbayes.cli.view_command import view
 from tvsbayes.cli.watch_command import watch
 from tvsbayes.errors import InputError, TvsError
 
 COMMANDS = (
     *(demo, new, import_, simulate, detect, stereo, check, acquire, doctor, export),
-    *(classic, fit, calibrate, report, compare, watch, locate, steps_for, plan, study),
+    *(classic, fit, calibrate, report, view, compare, watch, locate, steps_for, plan, study),
 )
 """In the order of `--help`."""
 for command in COMMANDS:

@@ -145,6 +145,16 @@ class Ray(eqx.Module):
         return self.origin_mm + self.direction * range_mm
 
 
+class Reflections(eqx.Module):
+    """Where the laser meets both mirrors, mm, the mirrors' unit normals, and the direction in which it leaves."""
+
+    first_mm: Vectors
+    first_normal: Vectors
+    second_mm: Vectors
+    second_normal: Vectors
+    outgoing: Vectors
+
+
 def trace(optics: Optics, pan_rad: Float[Array, "*batch"], tilt_rad: Float[Array, "*batch"]) -> Ray:
     """Trace the laser over both mirrors (formulation 3.2; the signs are part of the contract).
 
@@ -156,6 +166,21 @@ def trace(optics: Optics, pan_rad: Float[Array, "*batch"], tilt_rad: Float[Array
     Returns:
         The rays in frame P.
     """
+    pan, found = _reflections(optics, pan_rad, tilt_rad)
+    return Ray(pan.forward(found.second_mm), pan.forward(found.outgoing))
+
+
+def reflections(optics: Optics, pan_rad: Float[Array, "*batch"], tilt_rad: Float[Array, "*batch"]) -> Reflections:
+    """What `trace` meets on its way, in frame P; arguments as there."""
+    pan, found = _reflections(optics, pan_rad, tilt_rad)
+    parts = (found.first_mm, found.first_normal, found.second_mm, found.second_normal, found.outgoing)
+    return Reflections(*map(pan.forward, parts))
+
+
+def _reflections(
+    optics: Optics, pan_rad: Float[Array, "*batch"], tilt_rad: Float[Array, "*batch"]
+) -> tuple[Turn, Reflections]:
+    """The turn of the pan stage, and the reflections in its frame Q."""
     none = jnp.zeros(())
     tangent_x, tangent_y = jnp.tan(optics.laser_tilt_rad)
     shorter = 1 / jnp.sqrt(1 + tangent_x**2 + tangent_y**2)
@@ -180,7 +205,7 @@ def trace(optics: Optics, pan_rad: Float[Array, "*batch"], tilt_rad: Float[Array
     normal2 = ahead * tilt.cosine + above * tilt.sine + axial
     hit2 = intersect_plane(hit1, between, centre, normal2)
     hit2, outgoing = materialise((hit2, reflect(between, normal2)))
-    return Ray(pan.forward(hit2), pan.forward(outgoing))
+    return pan, Reflections(hit1, normal1, hit2, normal2, outgoing)
 
 
 class BeamAngles(eqx.Module):

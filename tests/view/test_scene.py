@@ -1,0 +1,164 @@
+"""What a page shows, without a browser: from the fit, or from what is stated."""
+
+from __future__ import annotations
+
+import base64
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.small_campaign import small_campaign
+from support.viewed_twin import PICTURED, UNDETECTED
+
+from tvsbayes.errors import InputError
+from tvsbayes.instrument.campaign import ordered_spots, read_campaign, with_pixels
+from tvsbayes.instrument.parameters import names_of
+from tvsbayes.view.document import KINDS, document
+from tvsbayes.view.gathering import NOT_FITTED, NOT_OF_THESE, found_in, look_at
+from tvsbayes.view.scene import Looked, scene
+
+
+@pytest.fixture(scope="module")
+def found(viewed):
+    return found_in(viewed.folder)
+
+
+@pytest.fixture(scope="module")
+def shown(found):
+    return scene(found.campaign, found.fitted)
+
+
+def test_spots_expected_are_those_of_the_fit(found, shown):
+    from tvsbayes.posterior.predictive import looks, repeated_rad
+
+    fit = found.fitted.fit
+    turned = repeated_rad(fit, np.asarray(fit.mode.place_errors_rad)[None])
+    expected = looks(fit, fit.z[None], turned)[0]
+    seen = [spot.spot for spot in ordered_spots(found.campaign)]
+    rows = [shown.looks.spot.tolist().index(spot) for spot in seen]
+    # Rounding of pixels of a thousand.
+    np.testing.assert_allclose(shown.looks.predicted_px[rows], expected, atol=1e-8)
+    assert shown.fitted and shown.notes == ()
+
+
+def test_beams_leave_by_the_law_of_reflection(shown):
+    looks = shown.looks
+    used = np.isfinite(looks.end_mm).all(axis=1)
+
+    def unit(way):
+        return way / np.linalg.norm(way, axis=1, keepdims=True)
+
+    between, leaving = unit(looks.second_mm - looks.first_mm), unit(looks.end_mm - looks.second_mm)
+    normal = looks.second_normal
+    reflected = between - 2 * np.sum(between * normal, axis=1, keepdims=True) * normal
+    np.testing.assert_allclose(reflected[used], leaving[used], atol=1e-9)
+    # Stops of 0.1 deg, seen at 0.3 m: the spot lies within millimetres of the beam's end.
+    assert np.linalg.norm(looks.end_mm - looks.point_mm, axis=1)[used].max() < 5
+    assert np.linalg.norm(looks.first_mm[used] - shown.origin_mm, axis=1).max() < 20
+
+
+def test_look_without_a_spot_is_there_without_numbers(shown):
+    looks = shown.looks
+    (row,) = np.flatnonzero(looks.spot == UNDETECTED)
+    assert looks.status[row] == "undetected"
+    for column in (looks.pixels_px, looks.predicted_px, looks.point_mm, looks.end_mm, looks.sd_px):
+        assert np.isnan(column[row]).all()
+        assert np.isfinite(np.delete(column, row, axis=0)).all()
+
+
+def test_pictures_are_told_by_camera(shown):
+    kept = np.argwhere(shown.looks.pictures).tolist()
+    assert kept == [[shown.looks.spot.tolist().index(PICTURED), 0]]
+
+
+def test_stops_stand_at_their_looks(found, shown):
+    looks = shown.looks
+    for stop in found.fitted.stops[::17]:
+        column = ("pan", "tilt").index(stop.axis)
+        rows = np.isin(looks.spot, stop.spots)
+        assert set(looks.deviation_deg[rows, column]) == {stop.deviation_deg}
+        assert set(looks.steps[rows, column]) == {stop.steps}
+        assert {looks.direction[row][column] for row in np.flatnonzero(rows)} == {stop.direction}
+
+
+def test_parameters_and_correlations_are_those_of_the_record(found, shown):
+    record = found.fitted.record
+    told = {row.name: row for row in shown.parameters}
+    assert told["mirror_offset_mm"].value == record.summary.parameters["mirror_offset_mm"].value
+    assert told["effective_deg_per_step.left"].unit == "deg/step"
+    assert not [name for name in shown.correlated if name.startswith("stereo.")]
+    np.testing.assert_allclose(np.diag(shown.correlation), 1.0, atol=1e-12)
+    a, b = (record.covariance.names.index(name) for name in shown.correlated[:2])
+    matrix = np.asarray(record.covariance.matrix)
+    assert shown.correlation[0, 1] == pytest.approx(matrix[a, b] / np.sqrt(matrix[a, a] * matrix[b, b]))
+
+
+def test_folder_without_results_shows_the_stated_rig(viewed):
+    looked = look_at(viewed.bare)
+    (shown,) = looked.scenes
+    assert not shown.fitted and shown.notes == (NOT_FITTED,) and looked.changes is None
+    assert np.isnan(shown.looks.predicted_px).all() and np.isnan(shown.looks.deviation_deg).all()
+    priors = read_campaign(viewed.bare).rig.priors
+    stated = [priors[name].value for name in names_of("extrinsics.translation_mm")]
+    np.testing.assert_allclose(shown.origin_mm, stated)
+    assert {row.name for row in shown.parameters} >= set(priors)
+    assert np.isfinite(shown.looks.end_mm).all(axis=1).sum() == len(shown.looks.spot) - 1
+
+
+def test_results_of_other_data_are_not_used(viewed, tmp_path):
+    import shutil
+
+    folder = tmp_path / "changed"
+    shutil.copytree(viewed.folder, folder)
+    table = (folder / "spots.csv").read_text()
+    (folder / "spots.csv").write_text(table.replace(",ok", ",blurred", 1))
+    assert found_in(folder).note == NOT_OF_THESE
+    (folder / "results" / "fit.json").write_text("{")
+    shutil.copyfile(viewed.folder / "spots.csv", folder / "spots.csv")
+    with pytest.raises(InputError, match=r"fit\.json"):
+        found_in(folder)
+
+
+def test_campaign_without_a_usable_spot(viewed):
+    campaign = read_campaign(viewed.bare)
+    blind = replace(campaign, spots=tuple(with_pixels(spot, "undetected") for spot in campaign.spots))
+    shown = scene(blind)
+    assert np.isnan(shown.origin_mm).all() and shown.sheets == () and len(shown.cameras) == 2
+    told = json.loads(document(Looked((shown,))))
+    assert told["scenes"][0]["rig"]["origin_mm"] is None
+
+
+def test_unknown_approaches_and_correlated_pixels():
+    shown = scene(small_campaign())
+    campaign = small_campaign()
+    after = [campaign.moves[spot.move].segment for spot in campaign.spots]
+    assert {shown.looks.direction[row][0] for row in range(len(after)) if campaign.spots[row].move == 3} == {""}
+    assert shown.name == str(campaign.header["name"])
+
+
+def unpacked(sent) -> np.ndarray:
+    return np.frombuffer(base64.b64decode(sent["base64"]), sent["type"]).reshape(sent["shape"])
+
+
+def test_document_carries_every_column(shown):
+    told = json.loads(document(Looked((shown,))))
+    (one,) = told["scenes"]
+    assert told["changes"] is None and one["fitted"] is True
+    looks = one["looks"]
+    assert {sent["type"] for sent in looks.values() if isinstance(sent, dict)} == set(KINDS.values())
+    np.testing.assert_array_equal(unpacked(looks["spot"]), shown.looks.spot)
+    # Single precision of 1000 px.
+    np.testing.assert_allclose(unpacked(looks["pixels_px"]), shown.looks.pixels_px, rtol=1e-7)
+    np.testing.assert_allclose(
+        unpacked(looks["residual_px"]), shown.looks.pixels_px - shown.looks.predicted_px, rtol=1e-6, atol=1e-9
+    )
+    assert looks["status"] == list(shown.looks.status)
+
+
+def test_two_campaigns_with_what_has_changed(viewed):
+    looked = look_at(viewed.folder, viewed.folder)
+    assert len(looked.scenes) == 2 and looked.changes.verdict == "no significant change"
+    told = json.loads(document(looked))
+    assert [change["significant"] for change in told["changes"]["changes"]] == [False] * 6
+    assert look_at(viewed.folder, viewed.bare).changes is None

@@ -1,0 +1,76 @@
+"""Who may read a page on this machine: the browser that was given its link, from the page itself, and nobody else.
+
+A link is good for one browser. Its token stands behind the #, which browsers send to nobody; the page gives it back
+once and gets a key, which it sends as a header of its own with every request. No cookie: what another page makes this
+browser ask for carries no key (CSRF). A name that somebody else points at 127.0.0.1 (DNS rebinding) is refused by the
+Host header, another page by Origin and Sec-Fetch-Site (Fetch Metadata, W3C).
+"""
+
+from __future__ import annotations
+
+import hmac
+import secrets
+from collections.abc import Mapping
+
+HOSTS = ("127.0.0.1", "localhost")
+KEY_HEADER = "X-Tvsbayes-Key"
+TOKEN_BYTES = 32
+SECURITY_HEADERS = {
+    "Content-Security-Policy": (
+        "default-src 'none'; script-src 'self'; style-src 'self' 'unsafe-inline'; connect-src 'self'; "
+        "img-src 'self' data: blob:; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+    ),
+    "X-Content-Type-Options": "nosniff",
+    "X-Frame-Options": "DENY",
+    "Referrer-Policy": "no-referrer",
+    "Cross-Origin-Opener-Policy": "same-origin",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Cache-Control": "no-store",
+}
+"""Of every answer. The policy lets the page load from its own server only: no request leaves the machine. Plotly sets
+styles from its script."""
+
+
+class Access:
+    """Token, key and address of one page.
+
+    Attributes:
+        port: that the server listens on.
+    """
+
+    def __init__(self, port: int) -> None:
+        self.port = port
+        self._token: str | None = secrets.token_urlsafe(TOKEN_BYTES)
+        self._key = secrets.token_urlsafe(TOKEN_BYTES)
+
+    @property
+    def link(self) -> str:
+        """What to open; its token is void once it was used."""
+        return f"http://{HOSTS[0]}:{self.port}/#{self._token or ''}"
+
+    def stranger(self, headers: Mapping[str, str]) -> str | None:
+        """Why a request does not come from the page itself, None where it may.
+
+        Args:
+            headers: of the request.
+        """
+        own = [f"{host}:{self.port}" for host in HOSTS]
+        if headers.get("Host", "") not in own:
+            return "this server answers to 127.0.0.1 and localhost only"
+        origin = headers.get("Origin")
+        if origin is not None and origin not in [f"http://{host}" for host in own]:
+            return "another page asked"
+        if headers.get("Sec-Fetch-Site", "none") not in ("same-origin", "none"):
+            return "another page asked"
+        return None
+
+    def key_for(self, token: str) -> str | None:
+        """The key for whoever brings the token first; None for a wrong or used one."""
+        if self._token is None or not hmac.compare_digest(token.encode(), self._token.encode()):
+            return None
+        self._token = None
+        return self._key
+
+    def knows(self, headers: Mapping[str, str]) -> bool:
+        """Whether a request carries the key."""
+        return hmac.compare_digest(headers.get(KEY_HEADER, "").encode(), self._key.encode())

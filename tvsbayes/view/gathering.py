@@ -1,0 +1,74 @@
+"""From campaign folders to what a page shows of them: results where there are some of exactly these data.
+
+Nothing is fitted: a folder without results is shown as it is stated.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from tvsbayes.calibration.calibration_file import stored_calibration
+from tvsbayes.instrument.campaign import Campaign, input_hashes, read_campaign
+from tvsbayes.pipeline import Tell, compile_for, untold
+from tvsbayes.report.evidence import gear_bands
+from tvsbayes.results.fit_record import read_fit
+from tvsbayes.results.stored_draws import stored_mode
+from tvsbayes.view.scene import Fitted, Looked, scene
+
+NOT_FITTED = "no results: the rig is drawn as campaign.toml states it; `tvsbayes fit` adds residuals and the fitted rig"
+NOT_OF_THESE = (
+    "results/ are of other data, of a fit that did not converge, or of another version: the rig is drawn as "
+    "campaign.toml states it; run `tvsbayes fit` again"
+)
+
+
+@dataclass(frozen=True)
+class Found:
+    """A campaign with what its results say; `fitted` is None, and `note` says why, where there are none to use."""
+
+    campaign: Campaign
+    fitted: Fitted | None
+    note: str | None
+
+
+def found_in(folder: Path) -> Found:
+    """A campaign folder and its results.
+
+    Raises:
+        InputError: no campaign, or damaged results.
+    """
+    campaign = read_campaign(folder)
+    mode, path = stored_mode(campaign), Path(folder) / "results" / "fit.json"
+    if mode is None or not path.exists():
+        return Found(campaign, None, NOT_OF_THESE if path.exists() else NOT_FITTED)
+    record, calibration = read_fit(path), stored_calibration(campaign)
+    from tvsbayes.assessment.residuals import stop_residuals
+    from tvsbayes.estimators.joint_fit import restored
+
+    fit = None if record.provenance.inputs != input_hashes(campaign) else restored(campaign, mode)
+    if fit is None or calibration is None:
+        return Found(campaign, None, NOT_OF_THESE)
+    return Found(campaign, Fitted(fit, record, stop_residuals(fit), gear_bands(calibration)), None)
+
+
+def look_at(folder: Path, beside: Path | None = None, tell: Tell = untold) -> Looked:
+    """What a page shows of a campaign, beside another where one is named.
+
+    Args:
+        folder: of the campaign.
+        beside: of a later one of the same instrument.
+        tell: shows what takes long.
+
+    Raises:
+        InputError: no campaign, or damaged results.
+    """
+    compile_for(tell)
+    found = [found_in(one) for one in (folder, beside) if one is not None]
+    scenes = tuple(scene(one.campaign, one.fitted, [one.note] if one.note else []) for one in found)
+    fits = [one.fitted.fit for one in found if one.fitted is not None]
+    if len(fits) < 2:
+        return Looked(scenes)
+    from tvsbayes.comparison.changes import compare
+
+    return Looked(scenes, compare(*fits))

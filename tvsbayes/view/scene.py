@@ -1,0 +1,309 @@
+"""What a page shows of a campaign: the looks as columns, the rig around them, what a fit says; no browser.
+
+Computed from a campaign and, where there is one, its fit; nothing here knows how it is served. Frame S, mm; px; deg;
+counters in steps. What nobody knows is not a number.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+
+import numpy as np
+
+from tvsbayes.estimators.campaign_arrays import campaign_arrays, pixel_covariance
+from tvsbayes.estimators.joint_fit import JointFit
+from tvsbayes.instrument.axes import AXES, direction_of
+from tvsbayes.instrument.campaign import CAMERAS, PIXELS, Campaign, Spot, frame_name, ordered_spots, pixels_of
+from tvsbayes.instrument.parameters import NAMES, RIG_NAMES, unit_of
+from tvsbayes.instrument.stereo_pair import triangulate
+from tvsbayes.instrument.stops import rests_of
+from tvsbayes.model.parameter_space import parameter_space
+from tvsbayes.posterior.predictive import repeated_rad
+from tvsbayes.report.evidence import GearBand
+from tvsbayes.results.comparison_record import Comparison
+from tvsbayes.results.estimates import StopResidual
+from tvsbayes.results.fit_record import FitRecord
+from tvsbayes.view.laser_ways import Ways, laser_ways
+from tvsbayes.view.shapes import (
+    PYRAMID_MM,
+    PYRAMID_SHARE,
+    Pyramid,
+    Sheet,
+    ellipsoid_axes_mm,
+    point_covariance_mm2,
+    pyramids,
+    sheets,
+)
+
+
+@dataclass(frozen=True)
+class LookColumns:
+    """All looks of a campaign in the order of `spots.csv`, a row each.
+
+    Attributes:
+        spot, move: their numbers, shape (n,).
+        target, status: of the table, n texts.
+        direction: of the moves of (pan, tilt) that led there, n pairs; "" where the approach is unknown.
+        steps: counters (pan, tilt), shape (n, 2).
+        pictures: whether the left and the right picture is kept, shape (n, 2).
+        pixels_px, sd_px: centres found and their standard uncertainties, shape (n, 4).
+        predicted_px: where the fitted rig puts them, at the range seen, shape (n, 4).
+        point_mm: triangulated spot, shape (n, 3).
+        ellipsoid_mm: half axes of its 95 % ellipsoid by pixel noise, shape (n, 3, 3).
+        first_mm, second_mm, end_mm: the laser's way over both mirrors to where it passes the spot, shape (n, 3).
+        first_normal, second_normal: unit normals of the mirrors, shape (n, 3).
+        deviation_deg, u_deg: of the stops of (pan, tilt): seen less fitted mirror angle, and its sd, shape (n, 2).
+        suspect: whether the fit finds it unlikely, or left it out, shape (n,).
+    """
+
+    spot: np.ndarray
+    move: np.ndarray
+    target: tuple[str, ...]
+    status: tuple[str, ...]
+    direction: tuple[tuple[str, str], ...]
+    steps: np.ndarray
+    pictures: np.ndarray
+    pixels_px: np.ndarray
+    sd_px: np.ndarray
+    predicted_px: np.ndarray
+    point_mm: np.ndarray
+    ellipsoid_mm: np.ndarray
+    first_mm: np.ndarray
+    first_normal: np.ndarray
+    second_mm: np.ndarray
+    second_normal: np.ndarray
+    end_mm: np.ndarray
+    deviation_deg: np.ndarray
+    u_deg: np.ndarray
+    suspect: np.ndarray
+
+
+@dataclass(frozen=True)
+class ParameterRow:
+    """A parameter as the page lists it: its fit, or its prior where nothing is fitted.
+
+    `contraction` is the share of the prior's variance that the data took away; None of priors and of what is fixed.
+    """
+
+    name: str
+    unit: str
+    value: float
+    sd: float
+    contraction: float | None
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A campaign to be looked at.
+
+    Attributes:
+        name: of the campaign.
+        fitted: whether results lend it residuals, a fitted rig and correlations; else the rig is the stated one.
+        notes: what to know before reading it.
+        image_px: width and height of the pictures.
+        looks: all of them.
+        cameras: left and right.
+        sheets: as far as spots show them.
+        origin_mm: of the positioner on its pan axis, shape (3,); not a number without a usable look.
+        gears: what the gears repeat over the counters; none where they do not vary.
+        parameters: values with their uncertainty.
+        correlated: names of the rows and columns of `correlation`.
+        correlation: of the estimated parameters, shape (p, p).
+    """
+
+    name: str
+    fitted: bool
+    notes: tuple[str, ...]
+    image_px: tuple[int, int]
+    looks: LookColumns
+    cameras: tuple[Pyramid, ...]
+    sheets: tuple[Sheet, ...]
+    origin_mm: np.ndarray
+    gears: tuple[GearBand, ...]
+    parameters: tuple[ParameterRow, ...]
+    correlated: tuple[str, ...]
+    correlation: np.ndarray
+
+
+@dataclass(frozen=True)
+class Looked:
+    """What a page shows: one campaign, or two with what has changed between them."""
+
+    scenes: tuple[Scene, ...]
+    changes: Comparison | None = None
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """What results lend a scene.
+
+    Attributes:
+        fit: mode, residuals, linearised campaign.
+        record: estimates and covariance.
+        stops: deviations of all rests.
+        gears: curves of the gears' errors.
+    """
+
+    fit: JointFit
+    record: FitRecord
+    stops: tuple[StopResidual, ...]
+    gears: tuple[GearBand, ...]
+
+
+def scene(campaign: Campaign, fitted: Fitted | None = None, notes: Sequence[str] = ()) -> Scene:
+    """A campaign as a page shows it.
+
+    Args:
+        campaign: with or without usable spots.
+        fitted: of exactly this campaign; None shows the rig as `campaign.toml` states it.
+        notes: what to know before reading it.
+    """
+    ways = _ways(campaign, fitted)
+    looks = _looks(campaign, ways, fitted)
+    seen_mm = looks.point_mm[np.isfinite(looks.point_mm).all(axis=1)]
+    reach_mm = float(np.median(np.linalg.norm(seen_mm, axis=1))) if len(seen_mm) else 0.0
+    correlated, correlation = _correlation(fitted)
+    size = campaign.stereo.image_width, campaign.stereo.image_height
+    return Scene(
+        name=str(campaign.header.get("name") or (campaign.path.name if campaign.path else "campaign")),
+        fitted=fitted is not None,
+        notes=tuple(notes),
+        image_px=size,
+        looks=looks,
+        cameras=pyramids(campaign.stereo, PYRAMID_SHARE * reach_mm or PYRAMID_MM),
+        sheets=sheets(looks.target, looks.point_mm),
+        origin_mm=np.full(3, np.nan) if ways is None else np.asarray(ways.origin_mm)[:, 0],
+        gears=() if fitted is None else fitted.gears,
+        parameters=_parameters(campaign, fitted),
+        correlated=correlated,
+        correlation=correlation,
+    )
+
+
+def _ways(campaign: Campaign, fitted: Fitted | None) -> Ways | None:
+    """Of the usable spots in the order of the filter; of no spot there is none."""
+    if not any(spot.status == "ok" for spot in campaign.spots):
+        return None
+    if fitted is None:
+        arrays = campaign_arrays(campaign)
+        turned = np.zeros((len(arrays.spots.valid), 2))
+        return laser_ways(np.zeros(len(NAMES)), turned, parameter_space(campaign.rig, campaign.stereo), arrays)
+    fit = fitted.fit
+    turned = repeated_rad(fit, np.asarray(fit.mode.place_errors_rad)[None])[0]
+    return laser_ways(fit.z, turned, fit.space, fit.arrays)
+
+
+_WAY_FIELDS = ("first_mm", "first_normal", "second_mm", "second_normal", "end_mm", "predicted_px")
+
+
+def _looks(campaign: Campaign, ways: Ways | None, fitted: Fitted | None) -> LookColumns:
+    """The columns."""
+    spots, count = campaign.spots, len(campaign.spots)
+    row_of = {spot.spot: row for row, spot in enumerate(spots)}
+    used = ordered_spots(campaign)
+    rows = np.array([row_of[spot.spot] for spot in used], dtype=int)
+    laid = {name: np.full((count, 4 if name == "predicted_px" else 3), np.nan) for name in _WAY_FIELDS}
+    if ways is not None:
+        for name, column in laid.items():
+            column[rows] = np.asarray(getattr(ways, name)).T[: len(rows)]
+    point, covariance = np.full((count, 3), np.nan), np.full((count, 3, 3), np.nan)
+    pixels = np.full((count, 4), np.nan)
+    pixels[rows] = pixels_of(used)
+    suspect = np.zeros(count, dtype=bool)
+    scale = 1.0
+    if fitted is None:
+        # Residuals against a rig that nobody fitted are those of its mounting.
+        laid["predicted_px"][:] = np.nan
+    else:
+        scale = fitted.record.summary.parameters["pixel_scale"].value
+        suspect[[row_of[spot] for spot in (*fitted.fit.suspect_spots, *fitted.fit.excluded_spots)]] = True
+    if used:
+        point[rows] = triangulate(campaign.stereo, pixels[rows])
+        noise = scale**2 * np.stack([pixel_covariance(spot) for spot in used])
+        covariance[rows] = point_covariance_mm2(campaign.stereo, point[rows], noise)
+    deviation, u = _deviations(row_of, () if fitted is None else fitted.stops)
+    return LookColumns(
+        spot=np.array([spot.spot for spot in spots], dtype=int),
+        move=np.array([spot.move for spot in spots], dtype=int),
+        target=tuple(spot.target for spot in spots),
+        status=tuple(spot.status for spot in spots),
+        direction=_directions(campaign),
+        steps=_steps(campaign),
+        pictures=_pictures(campaign),
+        pixels_px=pixels,
+        sd_px=np.array([[_sd(spot, name) for name in PIXELS] for spot in spots]).reshape(-1, 4),
+        point_mm=point,
+        ellipsoid_mm=ellipsoid_axes_mm(covariance),
+        deviation_deg=deviation,
+        u_deg=u,
+        suspect=suspect,
+        **laid,
+    )
+
+
+def _sd(spot: Spot, pixel: str) -> float:
+    """Stated standard uncertainty of a pixel, px."""
+    sd = getattr(spot, f"s{pixel}")
+    return np.nan if sd is None or spot.status != "ok" else sd
+
+
+def _steps(campaign: Campaign) -> np.ndarray:
+    """Counters of the looks, shape (n, 2)."""
+    at = [campaign.moves[spot.move] for spot in campaign.spots]
+    return np.array([(move.pan_steps, move.tilt_steps) for move in at], dtype=int).reshape(-1, 2)
+
+
+def _directions(campaign: Campaign) -> tuple[tuple[str, str], ...]:
+    """From which side each axis came to each look."""
+    by_axis = []
+    for axis in AXES:
+        rests = rests_of(campaign.moves, axis)
+        by_axis.append([direction_of(axis, rests[spot.move].sign) for spot in campaign.spots])
+    return tuple(zip(*by_axis, strict=True))
+
+
+def _pictures(campaign: Campaign) -> np.ndarray:
+    """Which pictures lie in the folder, shape (n, 2)."""
+    kept: set[str] = set()
+    if campaign.path is not None and (campaign.path / "frames").is_dir():
+        kept = {f"frames/{path.name}" for path in (campaign.path / "frames").iterdir()}
+    held = [[frame_name(spot.spot, camera) in kept for camera in CAMERAS] for spot in campaign.spots]
+    return np.array(held, dtype=bool).reshape(-1, 2)
+
+
+def _deviations(row_of: dict[int, int], stops: Sequence[StopResidual]) -> tuple[np.ndarray, np.ndarray]:
+    """Deviation of the stops behind each look and its sd, deg, shapes (n, 2)."""
+    deviation, u = np.full((len(row_of), 2), np.nan), np.full((len(row_of), 2), np.nan)
+    for stop in stops:
+        rows = [row_of[spot] for spot in stop.spots]
+        deviation[rows, AXES.index(stop.axis)], u[rows, AXES.index(stop.axis)] = stop.deviation_deg, stop.u_deg
+    return deviation, u
+
+
+def _parameters(campaign: Campaign, fitted: Fitted | None) -> tuple[ParameterRow, ...]:
+    """Of the record, headlines first; else the stated priors."""
+    if fitted is None:
+        stated = campaign.rig.priors
+        return tuple(ParameterRow(n, unit_of(n), stated[n].value, stated[n].u, None) for n in RIG_NAMES)
+    summary = fitted.record.summary
+    told = {f"effective_deg_per_step.{d}": e for d, e in summary.effective.items() if e is not None}
+    return tuple(
+        ParameterRow(name, unit_of(name), e.value, e.sd, e.contraction)
+        for name, e in (told | summary.parameters).items()
+    )
+
+
+def _correlation(fitted: Fitted | None) -> tuple[tuple[str, ...], np.ndarray]:
+    """Names and correlations of what is estimated, the cameras' own parameters left out."""
+    if fitted is None:
+        return (), np.zeros((0, 0))
+    names, matrix = fitted.record.covariance.names, np.asarray(fitted.record.covariance.matrix, dtype=float)
+    sds = np.sqrt(np.diag(matrix))
+    kept = [k for k, name in enumerate(names) if sds[k] > 0 and not name.startswith("stereo.")]
+    return tuple(names[k] for k in kept), matrix[np.ix_(kept, kept)] / np.outer(sds[kept], sds[kept])
+
+
+def numbers_of(looks: LookColumns) -> dict[str, np.ndarray]:
+    """The columns of looks that are arrays, by name."""
+    return {f.name: value for f in fields(looks) if isinstance(value := getattr(looks, f.name), np.ndarray)}

@@ -1,0 +1,125 @@
+"""Shapes of what stands in a rig: cameras as pyramids, sheets as rectangles, errors of spots as ellipsoids. NumPy.
+
+Frame S: X depth, Y left, Z up, origin in the left camera's centre; mm, px.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import special
+
+from tvsbayes.instrument.stereo_pair import Stereo, project_pair, undistort
+from tvsbayes.model.geometry import CV_FROM_S
+
+STEP_MM = 0.1
+"""Of differences along a point: its square over that of the range is far below the rounding of a pixel."""
+PYRAMID_SHARE, PYRAMID_MM = 0.1, 100.0
+"""Depth of a camera's pyramid: share of the median range of the spots, and where there are none."""
+SHEET_SPOTS = 3
+"""Spots that a plane needs."""
+SHEET_MARGIN = 0.08
+"""By which a sheet is drawn beyond its outermost spots, of its longer side."""
+PROBABILITY = 0.95
+
+
+@dataclass(frozen=True)
+class Pyramid:
+    """What a camera sees.
+
+    Attributes:
+        camera: left or right.
+        corners_mm: its centre, then the corners of the image in turn, shape (5, 3).
+    """
+
+    camera: str
+    corners_mm: np.ndarray
+
+
+def pyramids(stereo: Stereo, depth_mm: float) -> tuple[Pyramid, Pyramid]:
+    """Both cameras, as deep as told."""
+    width, height = stereo.image_width - 0.5, stereo.image_height - 0.5
+    corners_px = np.array([(-0.5, -0.5), (width, -0.5), (width, height), (-0.5, height)])
+    rays = []
+    for matrix, distortion in ((stereo.M1, stereo.D1), (stereo.M2, stereo.D2)):
+        rays_cv = undistort(corners_px, matrix, distortion)
+        # A lens model need not reach the corners of its image.
+        pinhole = (corners_px - matrix[:2, 2]) / matrix[[0, 1], [0, 1]]
+        rays.append(np.column_stack([np.where(np.isfinite(rays_cv), rays_cv, pinhole), np.ones(4)]))
+    left, right = (np.vstack([np.zeros(3), depth_mm * ray]) for ray in rays)
+    right = (right - stereo.T) @ stereo.R
+    return Pyramid("left", left @ CV_FROM_S), Pyramid("right", right @ CV_FROM_S)
+
+
+@dataclass(frozen=True)
+class Sheet:
+    """A sheet as its spots show it.
+
+    Attributes:
+        target: its name.
+        corners_mm: of a rectangle around its spots, in turn, shape (4, 3).
+    """
+
+    target: str
+    corners_mm: np.ndarray
+
+
+def sheets(targets: Sequence[str], points_mm: np.ndarray) -> tuple[Sheet, ...]:
+    """Planes through the spots of each name (total least squares); none for fewer than three spots.
+
+    Args:
+        targets: of the spots.
+        points_mm: where they are, shape (n, 3); not a number where nobody knows.
+    """
+    names, known = np.array(targets, dtype=str), np.isfinite(points_mm).all(axis=1)
+    found = []
+    for target in dict.fromkeys(targets):
+        own = points_mm[known & (names == target)]
+        if len(own) < SHEET_SPOTS:
+            continue
+        middle = own.mean(axis=0)
+        # Rows: along the longer side, along the shorter, across the sheet.
+        along = np.linalg.svd(own - middle, full_matrices=False)[2][:2]
+        flat = (own - middle) @ along.T
+        low, high = flat.min(axis=0), flat.max(axis=0)
+        margin = SHEET_MARGIN * (high - low).max()
+        (a, c), (b, d) = low - margin, high + margin
+        found.append(Sheet(target, middle + np.array([(a, c), (b, c), (b, d), (a, d)]) @ along))
+    return tuple(found)
+
+
+def point_covariance_mm2(stereo: Stereo, points_mm: np.ndarray, covariance_px2: np.ndarray) -> np.ndarray:
+    """Covariance of triangulated points by the noise of their pixels, the cameras taken as known.
+
+    Args:
+        stereo: the cameras.
+        points_mm: shape (n, 3).
+        covariance_px2: of u_left, v_left, u_right, v_right, shape (n, 4, 4).
+
+    Returns:
+        Shape (n, 3, 3); not a number where a point is not.
+    """
+    steps = STEP_MM * np.eye(3)
+    ahead, behind = (np.stack([project_pair(stereo, points_mm + s * step) for step in steps], axis=2) for s in (1, -1))
+    slope = (ahead - behind) / (2 * STEP_MM)
+    information = np.einsum("nia,nij,njb->nab", slope, np.linalg.inv(covariance_px2), slope)
+    found = np.full(information.shape, np.nan)
+    known = np.isfinite(information).all(axis=(1, 2))
+    found[known] = np.linalg.inv(information[known])
+    return found
+
+
+def ellipsoid_axes_mm(covariance_mm2: np.ndarray) -> np.ndarray:
+    """Half axes of the ellipsoids that hold points with 95 %, shape (n, 3, 3): axis, then x, y, z.
+
+    `covariance_mm2` has shape (n, 3, 3); not a number gives axes that are none.
+    """
+    found = np.full(covariance_mm2.shape, np.nan)
+    known = np.isfinite(covariance_mm2).all(axis=(1, 2))
+    values, vectors = np.linalg.eigh(covariance_mm2[known])
+    # (p - x)' C^-1 (p - x) is chi-square with three degrees of freedom.
+    reach = np.sqrt(special.chdtri(3, 1 - PROBABILITY) * np.maximum(values, 0.0))
+    found[known] = reach[:, :, None] * np.swapaxes(vectors, 1, 2)
+    return found
