@@ -1,4 +1,5 @@
 /* Laser positioner calibration, written by tvsbayes (steps-for --export header). C99, no allocation.
+@ORIGIN@
  * @EXPECTED_ERROR@
  * Frame T: origin mid-baseline, x depth, y along the baseline towards the positioner, z up; mm.
  * Counters are absolute steps after homing; a side is +1 (reached left or up) or -1 (right or down).
@@ -154,8 +155,8 @@ static inline void tvs_beam(double pan_steps, double tilt_steps, int pan_side, i
     tvs_mirror_beam(tvs_pan_deg(pan_steps, pan_side), tvs_tilt_deg(tilt_steps, tilt_side), origin, direction);
 }
 
-/* The point where the beam meets what the aperture read, frame T, mm; returns 0 where they do not meet, 1 where they
- * do, 2 where they do at counters at which the campaign never looked. */
+/* The point where the beam meets what the aperture read, frame T, mm; returns 0 where they do not meet or
+ * meet behind the scanner, 1 where they do, 2 where they do at counters at which the campaign never looked. */
 static inline int tvs_locate(double pan_steps, double tilt_steps, int pan_side, int tilt_side, double aperture_deg,
                       double xyz[3])
 {
@@ -176,6 +177,8 @@ static inline int tvs_locate(double pan_steps, double tilt_steps, int pan_side, 
                 (cb * sqrt(inside) - (y * d[1] - cb * cb * (o[0] * d[0] + y * d[1] + o[2] * d[2])));
     }
     if (!(reach > 0) || isinf(reach))
+        return 0;
+    if (!(o[0] + reach * d[0] > 0))
         return 0;
     for (int i = 0; i < 3; i++)
         xyz[i] = o[i] + reach * d[i];

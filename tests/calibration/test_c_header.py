@@ -14,7 +14,7 @@ from support.geared_rig import geared
 from support.two_poses import PERIODS_DEG
 
 from tvsbayes.calibration.aiming import Direction, Point, mirror_angles
-from tvsbayes.calibration.calibration_file import calibration_header
+from tvsbayes.calibration.c_header import calibration_header
 from tvsbayes.errors import InputError
 from tvsbayes.instrument.axes import SIDES
 

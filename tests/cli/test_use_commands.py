@@ -15,6 +15,7 @@ from tvsbayes.assessment.fitted_calibration import calibration_of_draws
 from tvsbayes.calibration.calibration_file import CALIBRATION_FORMAT, calibration_bytes, load_calibration
 from tvsbayes.calibration.pointing import Calibration
 from tvsbayes.cli.main import run
+from tvsbayes.errors import InputError
 from tvsbayes.files.disk import shipped_data
 from tvsbayes.instrument.campaign import read_campaign, write_campaign
 from tvsbayes.instrument.parameters import NAMES, RIG_PRIORS
@@ -100,7 +101,63 @@ def test_counters_that_no_look_reached_are_told(ask, folder, tmp_path, capsys):
         assert ("EXTRAPOLATED" in capsys.readouterr().out) is told
     for options, told in ((POINT, 0), (far, 2)):
         assert run([*map(str, ("locate", folder, *options))]) == 0
-        assert capsys.readouterr().out.count("EXTRAPOLATED") == told
+        text = capsys.readouterr().out
+        assert text.count("EXTRAPOLATED") == told
+        # Which axis, and what looks reached.
+        assert (f"pan {high + 1} lies outside {low} to {high}" in text) is bool(told) and "tilt 20 lies" not in text
+    assert entries[0]["unseen"] == f"pan {low - 1} lies outside {low} to {high}" and entries[2]["unseen"] == ""
+
+
+def test_no_point_lies_behind_the_scanner(ask, folder, tmp_path, capsys):
+    """A beam turned to the back may meet the reading there: refused by name, of one point, of many and in a cloud."""
+    back = load_calibration(folder)
+    turned = next(n for n in range(2000, 4000, 10) if back.ray(n, 20).direction[0] < -0.5)
+    aim = back.ray(turned, 20)
+    reading = back.reading(aim.origin_mm + 500 * aim.direction)
+    code, document = ask("locate", folder, "--pan-steps", turned, "--tilt-steps", 20, "--aperture-deg", reading)
+    assert (code, document["error"]["code"]) == (2, "behind") and "behind the scanner" in document["error"]["message"]
+    with pytest.raises(InputError, match="behind the scanner"):
+        back.locate(turned, 20, reading)
+    with pytest.raises(InputError, match="no mirror angles"):
+        back.steps_for(aim.origin_mm + 500 * aim.direction)
+    points, out = tmp_path / "points.csv", tmp_path / "cloud.csv"
+    points.write_text(
+        f"tilt_steps,pan_steps,aperture_deg,pan_approach,tilt_approach\n20,{turned},{reading},left,up\n20,100,70,left,up\n"
+    )
+    entries = ask("locate", folder, "--points", points)[1]["points"]
+    assert entries[0]["refused"]["code"] == "behind" and "refused" not in entries[1]
+    document = ask("locate", folder, "--points", points, "--cloud", out)[1]
+    assert (document["written"], document["refused"]) == (1, 1)
+    assert "behind" in (tmp_path / "cloud.refused.csv").read_text()
+    assert set(document["checked"]) == {"points", "held", "off_mm", "most_off_mm"}
+    run([*map(str, ("locate", folder, "--points", points, "--cloud", out))])
+    text = capsys.readouterr().out
+    assert (
+        "1 point," in text and "of 1 point carried" in text and "1 look has no point" in text and "1 points" not in text
+    )
+
+
+@pytest.mark.parametrize("cloud", [False, True])
+def test_points_of_a_spreadsheet_are_read(ask, folder, tmp_path, cloud):
+    """Semicolons and decimal commas, as a spreadsheet in much of the world saves them."""
+    header = ["tilt_steps", "pan_steps", "aperture_deg", "pan_approach", "tilt_approach"]
+    rows = [header, ["20", "100", "70.5", "left", "up"], ["20", "100", "69.25", "left", "up"]]
+    ours, theirs = tmp_path / "ours.csv", tmp_path / "theirs.csv"
+    ours.write_text("\n".join(",".join(row) for row in rows) + "\n")
+    theirs.write_text("\n".join(";".join(row).replace(".", ",") for row in rows) + "\n")
+    found = []
+    for file in (ours, theirs):
+        out = ("--cloud", tmp_path / f"{file.stem}.ply") if cloud else ()
+        code, document = ask("locate", folder, "--points", file, *out)
+        assert code == 0
+        found.append((tmp_path / f"{file.stem}.ply").read_bytes() if cloud else document)
+    assert found[0] == found[1]
+    theirs.write_text(theirs.read_text().replace("aperture_deg", "B"))
+    code, document = ask("locate", folder, "--points", theirs)
+    assert code == 2 and document["error"]["column"] == "B" and "import" not in document["error"]["remedy"]
+    theirs.write_text("tilt_steps;pan_steps;aperture_deg;pan_approach;tilt_approach\n\n20;100;7O;left;up\n")
+    code, document = ask("locate", folder, "--points", theirs)
+    assert (document["error"]["line"], document["error"]["column"]) == (3, "aperture_deg")
 
 
 def test_sides_differ_by_the_backlash(ask, folder):
@@ -217,11 +274,34 @@ def test_exports_are_read_back(folder, capsys, tmp_path):
     assert json.loads(path.read_text())["format"] == CALIBRATION_FORMAT
     stored, exported = load_calibration(folder), load_calibration(path)
     point = (600.0, 10.0, 30.0)
-    assert stored.steps_for(point).as_json() == exported.steps_for(point).as_json()
+    there, here = (each.steps_for(point) for each in (stored, exported))
+    assert (there.pan_steps, there.tilt_steps) == (here.pan_steps, here.tilt_steps)
+    # Fifteen digits of every number.
+    np.testing.assert_allclose(there.u95_mm, here.u95_mm, rtol=1e-12)
     assert run(["steps-for", str(folder), "--export", "header"]) == 0
     header = capsys.readouterr().out
     assert "Expected error (posterior, 95 %)" in header
-    assert "@" not in header.split("#ifndef")[0]
+    assert "@" not in header.split("#ifndef")[0] and "Campaign: " in header
+    for kind in ("header", "json"):
+        place = tmp_path / f"out.{kind}"
+        assert run(["steps-for", str(folder), "--export", kind, "--out", str(place)]) == 0
+        assert str(place) in capsys.readouterr().out.replace("\n", "")
+    assert (tmp_path / "out.header").read_text() == header
+    assert load_calibration(path).steps_for(point).as_json() == exported.steps_for(point).as_json()
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (("--export", "header", "--x-mm", 1, "--y-mm", 2, "--z-mm", 3), "--x-mm and --y-mm and --z-mm are"),
+        (("--export", "json", "--azimuth-deg", 3), "--azimuth-deg is"),
+        (("--x-mm", 700, "--y-mm", 2, "--z-mm", 3, "--out", "c.h"), "--out is"),
+    ],
+)
+def test_an_export_has_no_target_and_a_target_no_file(ask, folder, options, said):
+    code, document = ask("steps-for", folder, *options)
+    assert (code, document["error"]["code"]) == (2, "usage")
+    assert document["error"]["message"].startswith(said) and "--export" in document["error"]["remedy"]
 
 
 @pytest.mark.parametrize("arguments", [(), ("--x-mm", 1, "--y-mm", 2), ("--azimuth-deg", 1), ("--export", "xml")])

@@ -103,8 +103,10 @@ def meeting(
     in_sight = jnp.where(azimuth_convention, seen.x * sin_b, 0.0) + seen.y * cos_b
     # At B = 90 deg both nappes are one plane, and y is nought but for rounding.
     faces = in_sight >= -ROUNDING * jnp.abs(range_mm * cos_b)
-    meets = (azimuth_convention | touches) & (range_mm > 0) & faces & jnp.isfinite(range_mm)
-    return Meeting(rays.at(range_mm).stacked(), range_mm, meets)
+    points = rays.at(range_mm)
+    # Behind the baseline there is no triangle for the aperture to close.
+    meets = (azimuth_convention | touches) & (range_mm > 0) & faces & jnp.isfinite(range_mm) & (points.x > 0)
+    return Meeting(points.stacked(), range_mm, meets)
 
 
 def beams_at(model: Model, steps: Array, side: Array, noise: Float[Array, "noises"]) -> Ray:

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tvsbayes.calibration.optics import Ray, Vector, beam_components, output_deg
+from tvsbayes.calibration.optics import Ray, Vector, ahead, beam_components, output_deg
 from tvsbayes.display import Shown, View
 from tvsbayes.errors import InputError
 from tvsbayes.instrument.axes import APPROACH_SIGN, AXES, SIDES, bad_approach
@@ -34,6 +34,7 @@ class Steps(Shown):
         rounding_mm, rounding_deg: distance from the wanted point or direction that whole steps leave.
         u95_mm, u95_deg: 95 % half widths of the beam's position at the point (3,), or of its azimuth and elevation.
         extrapolated: no look of the campaign reached these counters: errors of the gears are extrapolated.
+        unseen: which axis is outside which counters then, in words.
     """
 
     pan_steps: int
@@ -49,12 +50,13 @@ class Steps(Shown):
     u95_mm: np.ndarray | None = None
     u95_deg: np.ndarray | None = None
     extrapolated: bool = False
+    unseen: str = ""
 
     def shown(self) -> View:
         """Where to go, and by which way."""
         pan, tilt = self.approach
         title = f"Steps: arrive by moving {pan} and {tilt}"
-        title += ", EXTRAPOLATED: no look reached these counters" * self.extrapolated
+        title += f", EXTRAPOLATED: {self.unseen}, where looks were" * self.extrapolated
         rows = [
             ("first, which takes up the play", self.via_pan_steps, self.via_tilt_steps),
             ("then", self.pan_steps, self.tilt_steps),
@@ -98,8 +100,8 @@ class Point:
 
     @property
     def ahead(self) -> bool:
-        """Whether it lies before the baseline: behind it there is no triangle for the aperture to close."""
-        return bool(np.all(np.isfinite(self.xyz_mm)) and self.xyz_mm[0] > 0)
+        """Whether it is a point before the baseline."""
+        return bool(np.all(np.isfinite(self.xyz_mm)) and ahead(float(self.xyz_mm[0])))
 
     def seen_from(self, origin: Vector) -> Direction:
         """The direction that leads to it from the origin of a beam."""

@@ -1,4 +1,4 @@
-"""Calibrations on disk: `draws.npz` of `results/`, JSON for another language, a C header for a microcontroller.
+"""Calibrations on disk: `draws.npz` of `results/`, and JSON for another language.
 
 NumPy alone. What is read comes from a stranger: caps, shapes and finite numbers are checked before a calibration is
 made of it. Units as in the names; matrices in the order of `INPUT_NAMES`.
@@ -6,11 +6,14 @@ made of it. Units as in the names; matrices in the order of `INPUT_NAMES`.
 
 from __future__ import annotations
 
+import datetime
+import hashlib
 import io
 import json
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NotRequired, TypedDict, cast
 
@@ -20,7 +23,7 @@ from tvsbayes.calibration.gear_table import NO_GEARS, table_of
 from tvsbayes.calibration.optics import ERROR_AT, PLAY_AT
 from tvsbayes.calibration.pointing import INPUT_NAMES, NOISE_NAMES, Calibration
 from tvsbayes.errors import InputError, escaped
-from tvsbayes.files.disk import read_arrays, read_bytes, shipped_data
+from tvsbayes.files.disk import read_arrays, read_bytes
 from tvsbayes.files.documents import parse_json
 from tvsbayes.instrument.axes import AXES
 from tvsbayes.instrument.campaign import Campaign, input_hashes
@@ -33,7 +36,6 @@ NO_CALIBRATION = "no-calibration"
 RESULTS_BYTES_MAX = 64 * 1024 * 1024
 UNPACKED_BYTES_MAX = 2 * RESULTS_BYTES_MAX
 NAME_CHARS_MAX = 200
-_TABLED = ("transmission_error_deg", "u_transmission_error_deg", "play_variation_deg", "u_play_variation_deg")
 _ARRAYS = ("mean", "covariance", "range_steps", "inputs", "noise", "cause_covariance")
 
 
@@ -55,7 +57,7 @@ class _Moments(TypedDict):
     matrix: list[list[float]]
 
 
-class _GearErrors(TypedDict):
+class GearErrors(TypedDict):
     """Errors of one axis at regular counters, and beyond them, with their standard uncertainties; deg."""
 
     steps: list[float]
@@ -79,9 +81,10 @@ class CalibrationDocument(TypedDict):
     noise_variance_deg2: Mapping[str, float]
     overshoot_steps: Mapping[str, int]
     range_steps: Mapping[str, list[float]]
-    gear_errors: NotRequired[Mapping[str, _GearErrors]]
+    gear_errors: NotRequired[Mapping[str, GearErrors]]
     inputs: Mapping[str, str]
     expected_error: dict[str, object]
+    origin: NotRequired[dict[str, str]]
 
 
 def calibration_bytes(calibration: Calibration, **more: np.ndarray) -> bytes:
@@ -109,8 +112,61 @@ def calibration_bytes(calibration: Calibration, **more: np.ndarray) -> bytes:
     return buffer.getvalue()
 
 
-def calibration_json(calibration: Calibration) -> CalibrationDocument:
-    """A calibration without its draws, for a ROS node or another language; `load_calibration` reads it."""
+DIGITS = 15
+"""Significant digits that a double keeps of any decimal number: one more would print what is only rounding."""
+
+
+def _plain(value: Any) -> Any:
+    """A document whose numbers have as many digits as a double keeps."""
+    if isinstance(value, float):
+        return float(f"{value:.{DIGITS}g}")
+    if isinstance(value, Mapping):
+        return {key: _plain(each) for key, each in value.items()}
+    return [_plain(each) for each in value] if isinstance(value, list | tuple) else value
+
+
+@dataclass(frozen=True)
+class Origin:
+    """Of what an exported calibration is, so that whoever finds it on a controller knows.
+
+    Attributes:
+        campaign: its name.
+        measured: its date as `campaign.toml` has it; "" where it does not say.
+        exported: day of the export (UTC).
+        tvsbayes: version that exported it.
+    """
+
+    campaign: str
+    measured: str
+    exported: str
+    tvsbayes: str
+
+    @classmethod
+    def of(cls, campaign: Campaign) -> Origin:
+        """Of a campaign, exported today."""
+        created, today = campaign.header.get("created"), datetime.datetime.now(datetime.UTC).date()
+        measured = created.isoformat() if isinstance(created, datetime.date) else ""
+        return cls(str(campaign.header.get("name") or ""), measured, today.isoformat(), version("tvsbayes"))
+
+
+def content_sha256(document: Mapping[str, object]) -> str:
+    """SHA-256 of an exported calibration, whoever exports it and when."""
+    said = {key: value for key, value in document.items() if key != "origin"}
+    return hashlib.sha256(json.dumps(said, sort_keys=True).encode()).hexdigest()
+
+
+def calibration_json(calibration: Calibration, origin: Origin | None = None) -> CalibrationDocument:
+    """A calibration without its draws, for a ROS node or another language; `load_calibration` reads it.
+
+    `origin` goes into it with the SHA-256 of all else. Numbers have `DIGITS`.
+    """
+    document = _plain(_document(calibration))
+    if origin is not None:
+        document["origin"] = {**asdict(origin), "sha256": content_sha256(document)}
+    return cast(CalibrationDocument, document)
+
+
+def _document(calibration: Calibration) -> CalibrationDocument:
     return {
         "format": CALIBRATION_FORMAT,
         "estimator": calibration.estimator,
@@ -123,8 +179,8 @@ def calibration_json(calibration: Calibration) -> CalibrationDocument:
         },
         "noise_variance_deg2": dict(calibration.noise_variance),
         "overshoot_steps": dict(calibration.overshoot_steps),
-        "range_steps": dict(zip(AXES, calibration.range_steps.tolist(), strict=True)),
-        "gear_errors": _gear_errors(calibration),
+        "range_steps": {axis: list(seen) for axis, seen in calibration.seen_steps.items()},
+        "gear_errors": gear_errors(calibration),
         "inputs": dict(calibration.inputs_sha256),
         "expected_error": asdict(expected_error(calibration)),
     }
@@ -135,11 +191,11 @@ def _gear_steps(calibration: Calibration) -> dict[str, list[float]]:
     return {axis: list(steps) for axis, steps in zip(AXES, calibration.gears.steps, strict=True)}
 
 
-def _gear_errors(calibration: Calibration) -> dict[str, _GearErrors]:
+def gear_errors(calibration: Calibration) -> dict[str, GearErrors]:
     """The table by axis; empty where gears do not vary."""
     first, table = len(INPUT_NAMES), calibration.gears
     u = np.sqrt(np.maximum(np.diag(calibration.covariance)[first:], 0.0))
-    found: dict[str, _GearErrors] = {}
+    found: dict[str, GearErrors] = {}
     for axis, steps in zip(AXES, table.steps, strict=True):
         if not table.size:
             break
@@ -174,52 +230,6 @@ def expected_error(calibration: Calibration) -> ExpectedError:
     azimuth, elevation = calibration.beam_u95_deg(counters, sides).tolist()
     at_1_m = calibration.beam_u95_mm(counters, sides, 1000.0).tolist()
     return ExpectedError(pan, tilt, azimuth, elevation, at_1_m)
-
-
-def calibration_header(calibration: Calibration) -> str:
-    """A C header with the estimates and the beam as a function of the counters, for a Teensy and its like."""
-    template = (shipped_data() / "export" / "tvs_calibration.h").read_text()
-    error = expected_error(calibration)
-    macro = {name: "TVS_" + name.replace(".", "_").upper() for name in INPUT_NAMES}
-    lines = [f"#define {macro[name]} {value!r}" for name, value in calibration.estimates.items()]
-    for axis in AXES:
-        lines.append(f"#define TVS_PERIOD_{axis.upper()}_DEG {float(calibration.period_deg.get(axis, 0.0))!r}")
-        lines.append(f"#define TVS_OVERSHOOT_{axis.upper()}_STEPS {calibration.overshoot_steps[axis]}")
-    lines.append(f"#define TVS_AZIMUTH_CONVENTION {int(calibration.azimuth)}")
-    lines += _header_gears(calibration)
-    stated = (
-        f"Expected error ({calibration.estimator}, 95 %) at pan {error.pan_steps}, tilt {error.tilt_steps} "
-        f"steps: azimuth {error.u95_azimuth_deg:.3f} deg, elevation {error.u95_elevation_deg:.3f} deg; "
-        f"at 1 m {max(error.u95_at_1_m_mm):.2f} mm."
-    )
-    return template.replace("@EXPECTED_ERROR@", stated).replace("@VALUES@", "\n".join(lines))
-
-
-def _header_gears(calibration: Calibration) -> list[str]:
-    """Counters seen, and the table of the gears' errors; of gears that do not vary a table of nought."""
-    lines: list[str] = []
-    errors: Mapping[str, Mapping[str, Any]] = _gear_errors(calibration)
-    none: Mapping[str, Any] = {
-        "steps": [0.0] * 4,
-        **{name: [0.0] * 4 for name in _TABLED},
-        **{f"beyond_{name}": 0.0 for name in _TABLED[1::2]},
-    }
-    for axis, (low, high) in zip(AXES, calibration.range_steps.tolist(), strict=True):
-        upper, table = axis.upper(), errors.get(axis, none)
-        nodes = table["steps"]
-        lines += [
-            f"#define TVS_SEEN_{upper}_LOW {low!r}",
-            f"#define TVS_SEEN_{upper}_HIGH {high!r}",
-            f"#define TVS_TABLE_{upper}_SIZE {len(nodes)}",
-            f"#define TVS_TABLE_{upper}_FIRST {nodes[0]!r}",
-            f"#define TVS_TABLE_{upper}_LAST {nodes[-1]!r}",
-            f"#define TVS_BEYOND_{upper}_ERROR_U_DEG {table['beyond_u_transmission_error_deg']!r}",
-            f"#define TVS_BEYOND_{upper}_PLAY_U_DEG {table['beyond_u_play_variation_deg']!r}",
-        ]
-        for name, values in zip(("ERROR", "ERROR_U", "PLAY", "PLAY_U"), (table[n] for n in _TABLED), strict=True):
-            listed = ",\n    ".join(", ".join(map(repr, values[k : k + 4])) for k in range(0, len(values), 4))
-            lines.append(f"static const double TVS_{name}_{upper}_DEG[] = {{\n    {listed}}};")
-    return lines
 
 
 def load_calibration(path: Path | str) -> Calibration:

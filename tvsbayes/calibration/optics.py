@@ -79,6 +79,11 @@ def output_deg(
     return output if axis == "pan" else output + values["tilt_zero_deg"]
 
 
+def ahead(x_mm: Number) -> bool | np.ndarray:
+    """Whether a depth lies before the baseline: behind it there is no triangle for the aperture to close."""
+    return x_mm.real > 0
+
+
 class Components(NamedTuple):
     """A beam in components."""
 
@@ -88,6 +93,12 @@ class Components(NamedTuple):
     def at(self, range_mm: Number) -> np.ndarray:
         """Points at ranges along it, first axis x, y, z."""
         return np.array([o + range_mm * d for o, d in zip(self.origin, self.direction, strict=True)])
+
+    def met(self, range_mm: Number) -> np.ndarray:
+        """Points at ranges; not a number where the range is none or the point lies behind the baseline."""
+        points = self.at(np.where((np.asarray(range_mm).real > 0) & np.isfinite(range_mm), range_mm, np.nan))
+        # In both parts, where a derivative rides along.
+        return np.where(ahead(points[0]), points, complex(np.nan, np.nan) if np.iscomplexobj(points) else np.nan)
 
 
 def beam_components(values: Values, pan_deg: Number, tilt_deg: Number, m: ModuleType = np) -> Components:

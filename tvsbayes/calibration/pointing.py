@@ -18,12 +18,14 @@ from numpy.typing import ArrayLike
 
 from tvsbayes.calibration.aiming import Direction, Drive, Point, Steps, mirror_angles
 from tvsbayes.calibration.gear_table import NO_GEARS, GearTable
+from tvsbayes.calibration.located_point import Located
 from tvsbayes.calibration.optics import (
     TO_RAD,
     Components,
     Number,
     Ray,
     Values,
+    ahead,
     aperture_angle_deg,
     beam_components,
     output_deg,
@@ -32,7 +34,8 @@ from tvsbayes.calibration.optics import (
 )
 from tvsbayes.display import Shown, View
 from tvsbayes.errors import InputError
-from tvsbayes.instrument.axes import AXES, HOME_APPROACH, SIDES, sides_of
+from tvsbayes.instrument.axes import AXES, HOME_APPROACH, SIDES, Axis, sides_of
+from tvsbayes.instrument.counter_limits import unseen
 from tvsbayes.instrument.parameters import names_of
 from tvsbayes.statistics.intervals import NORMAL_95
 
@@ -62,26 +65,6 @@ type Counters = tuple[Number, Number]
 """Absolute counters (pan, tilt), steps."""
 type Sides = tuple[float, float]
 """Approach sides (pan, tilt): +1 left or up, -1 right or down, 0 unknown."""
-
-
-@dataclass(frozen=True, repr=False)
-class Located(Shown):
-    """A point of frame T by linear propagation: estimate (3,), covariance (3, 3) and 95 % half widths (3,).
-
-    `extrapolated` tells that no look of the campaign reached its counters.
-    """
-
-    xyz_mm: np.ndarray
-    covariance_mm2: np.ndarray
-    u95_mm: np.ndarray
-    extrapolated: bool = False
-
-    def shown(self) -> View:
-        """Coordinates with their uncertainty."""
-        u = np.sqrt(np.diag(self.covariance_mm2)).tolist()
-        rows = list(zip("xyz", self.xyz_mm.tolist(), u, self.u95_mm.tolist(), strict=True))
-        told = "Located point, frame T" + ", EXTRAPOLATED: no look reached these counters" * self.extrapolated
-        return View(told, ("axis", "mm", "u", "U95"), rows)
 
 
 @dataclass(frozen=True)
@@ -191,7 +174,16 @@ class Calibration(Shown):
 
     def covers(self, pan_steps: float, tilt_steps: float) -> bool:
         """Whether looks of the campaign reached as far as these counters."""
-        return all(low <= n <= high for n, (low, high) in zip((pan_steps, tilt_steps), self.range_steps, strict=True))
+        return not self.unseen(pan_steps, tilt_steps)
+
+    @property
+    def seen_steps(self) -> dict[Axis, list[float]]:
+        """Lowest and highest counter at which the campaign looked, by axis."""
+        return dict(zip(AXES, self.range_steps.tolist(), strict=True))
+
+    def unseen(self, pan_steps: float, tilt_steps: float) -> str:
+        """Which of these counters lies outside those that looks reached, in words; "" where none does."""
+        return unseen((pan_steps, tilt_steps), self.range_steps)
 
     def beam_at(self, steps: Counters, sides: Sides, m: ModuleType = np) -> Components:
         """The beam of the best estimates at counters and approach sides; `m` as in `output_deg`."""
@@ -241,7 +233,7 @@ class Calibration(Shown):
         beam = self.beam_at(steps, sides, math)
         true_deg = aperture_deg - self.estimates["aperture_zero_deg"]
         reach = range_components(*beam, self.estimates["baseline_mm"], true_deg, self.azimuth, math)
-        if not 0 < reach < math.inf:
+        if not (0 < reach < math.inf and ahead(beam.at(reach)[0])):
             raise self.refusal(pan_steps, tilt_steps, aperture_deg, sides)
         direction = np.array(beam.direction)
         jacobian = self.derivatives(*steps, aperture_deg, approach)
@@ -250,20 +242,29 @@ class Calibration(Shown):
         least = DIVERGING_SDS * math.sqrt(max(direction @ covariance @ direction, 0.0))
         if not (np.all(np.isfinite(covariance)) and reach > least):
             raise self.refusal(pan_steps, tilt_steps, aperture_deg, sides)
-        point, u95 = np.array(beam.origin) + reach * direction, NORMAL_95 * np.sqrt(np.diag(covariance))
-        return Located(point, covariance, u95, not self.covers(*steps))
+        point, u95 = beam.at(reach), NORMAL_95 * np.sqrt(np.diag(covariance))
+        return Located(point, covariance, u95, not self.covers(*steps), self.unseen(*steps))
 
     def refusal(self, pan_steps: float, tilt_steps: float, aperture_deg: float, sides: Sides) -> InputError:
         """Why beam and line of sight of a look have no point in common, or none that can be told: by name.
 
-        "grazing" where the estimated beam passes the aperture's cone without touching it, else "diverging".
+        "grazing" where the estimated beam passes the aperture's cone without touching it, "behind" where it meets the
+        reading behind the baseline, else "diverging".
         """
         where = f"pan {pan_steps:g}, tilt {tilt_steps:g} steps, aperture {aperture_deg:g} deg"
         refused = partial(InputError, column="aperture_deg", found=f"{aperture_deg:g}")
-        if all(map(math.isfinite, (pan_steps, tilt_steps, aperture_deg))) and not self.azimuth:
+        if all(map(math.isfinite, (pan_steps, tilt_steps, aperture_deg))):
             beam = self.beam_at((pan_steps, tilt_steps), sides, math)
             true_deg = aperture_deg - self.estimates["aperture_zero_deg"]
-            if math.isnan(range_components(*beam, self.estimates["baseline_mm"], true_deg, False, math)):
+            reach = range_components(*beam, self.estimates["baseline_mm"], true_deg, self.azimuth, math)
+            if 0 < reach < math.inf and not ahead(beam.at(reach)[0]):
+                return refused(
+                    "behind",
+                    f"{where}: the point ({', '.join(f'{x:.0f}' for x in beam.at(reach))}) mm lies behind the scanner",
+                    allowed="points before the baseline: x above 0",
+                    remedy="check the counters: they are absolute, after homing, and turn the beam to the back",
+                )
+            if math.isnan(reach) and not self.azimuth:
                 return refused(
                     "grazing",
                     f"{where}: the beam passes the cone of all points seen under this angle without touching it",
@@ -335,7 +336,7 @@ class Calibration(Shown):
         beam = self.noisy_beam(values, noise, steps, sides)
         true_deg = aperture_deg - values["aperture_zero_deg"] - values["aperture_sd_deg"] * noise[4]
         reach = np.asarray(range_components(*beam, values["baseline_mm"], true_deg, self.azimuth))
-        return beam.at(np.where((reach.real > 0) & np.isfinite(reach), reach, np.nan))
+        return beam.met(reach)
 
     def moved_points(self, steps: Counters, sides: Sides, aperture_deg: np.ndarray) -> np.ndarray:
         """Points of many looks of one approach, complex, shape (3, look inputs + NOISES, n).
@@ -388,7 +389,9 @@ class Calibration(Shown):
         reached = pan.side, tilt.side
         ray = self.ray(pan.steps, tilt.steps, reached)
         found = Steps(
-            *(pan.steps, tilt.steps, reached, pan.via_steps, tilt.via_steps, ray), extrapolated=ray.extrapolated
+            *(pan.steps, tilt.steps, reached, pan.via_steps, tilt.via_steps, ray),
+            extrapolated=ray.extrapolated,
+            unseen=self.unseen(pan.steps, tilt.steps),
         )
         counters, sides = (float(pan.steps), float(tilt.steps)), sides_of(reached)
         o, d = ray.origin_mm, ray.direction

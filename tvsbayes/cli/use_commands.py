@@ -7,8 +7,10 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Mapping
+from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -30,7 +32,7 @@ from tvsbayes.cli.app import (
 from tvsbayes.cli.progress_bar import waiting
 from tvsbayes.cli.watch_command import plan_watch
 from tvsbayes.errors import InputError, escaped
-from tvsbayes.files.disk import output_place
+from tvsbayes.files.disk import output_place, write_atomically
 from tvsbayes.pipeline import FITTING, calibration_for, compile_for, fit_for
 from tvsbayes.progress import Job
 
@@ -146,9 +148,8 @@ def _write_cloud(campaign: Path, file: Path, place: Path, draws: int, seed: int,
         blocks = points_of(calibration, sample.of(look_blocks(file, job.at)), simple)
         written = write_cloud(blocks, place, tuple(simple))
         law = checked(calibration, sample, draws, seed)
-    told = {"points": law.points, "held": law.held}
-    document = {"estimator": calibration.estimator, **written.as_json(), "checked": told}
-    finish(document, cloud_text(written, law), as_json)
+    document = {"estimator": calibration.estimator, **written.as_json(), "checked": asdict(law)}
+    finish(document, cloud_text(written, law, calibration), as_json)
 
 
 def steps_for(
@@ -162,6 +163,7 @@ def steps_for(
     tilt_approach: Annotated[str | None, typer.Option("--tilt-approach", help="up or down (default: up).")] = None,
     rig: Annotated[Path | None, typer.Option("--rig", help="Rig file whose [positioner] limits are kept.")] = None,
     export: Annotated[str | None, typer.Option("--export", help="header or json: the calibration itself.")] = None,
+    out: Annotated[Path | None, typer.Option("-o", "--out", help="File for --export (default: printed).")] = None,
     as_json: Json = False,
 ) -> None:
     """Counters that send the beam to a point or along a direction. With the approach that removes backlash."""
@@ -174,8 +176,13 @@ def steps_for(
         raise InputError("usage", message, allowed="header, json", remedy=remedy)
     if export:
         options = {"pan_approach": pan_approach, "tilt_approach": tilt_approach, "rig": rig}
-        refuse_options("for one target", "leave it out: --export writes the calibration itself", **options)
-    if given != (0 if export else 3 if point else 2 if direction else -1):
+        target = {"x_mm": x_mm, "y_mm": y_mm, "z_mm": z_mm, "azimuth_deg": azimuth_deg, "elevation_deg": elevation_deg}
+        remedy = "leave it out, --export writes the calibration itself; or leave out --export"
+        refuse_options("for one target", remedy, **target, **options)
+        _export(campaign, export, out, as_json)
+        return
+    refuse_options("for the exported calibration", "add --export header or --export json", out=out)
+    if given != (3 if point else 2 if direction else -1):
         remedy = "give --x-mm --y-mm --z-mm, or --azimuth-deg --elevation-deg, or --export alone"
         raise InputError("usage", "steps-for needs one target", remedy=remedy)
     if point is not None and math.dist(point, (0.0, 0.0, 0.0)) < NEAREST_POINT_MM:
@@ -187,13 +194,6 @@ def steps_for(
     limits = None if rig is None else _limits(rig)
     with waiting() as progress:
         calibration = calibration_for(campaign, report_line, progress)
-    from tvsbayes.calibration.calibration_file import calibration_header, calibration_json
-
-    if export:
-        stored = calibration_json(calibration)
-        text = calibration_header(calibration) if export == "header" else json.dumps(stored, indent=1)
-        finish({"header": text} if as_json and export == "header" else stored, text.rstrip("\n"), as_json)
-        return
     from tvsbayes.report.command_text import steps_text
 
     azimuth, elevation = direction or (None, None)
@@ -201,6 +201,25 @@ def steps_for(
     found = calibration.steps_for(point, azimuth_deg=azimuth, elevation_deg=elevation, approach=sides, limits=limits)
     document = {"estimator": calibration.estimator, **found.as_json()}
     finish(document, steps_text(found), as_json)
+
+
+def _export(campaign: Path, kind: str, out: Path | None, as_json: bool) -> None:
+    """The calibration for another language, printed or into a file."""
+    with waiting() as progress:
+        calibration = calibration_for(campaign, report_line, progress)
+    from tvsbayes.calibration.c_header import calibration_header
+    from tvsbayes.calibration.calibration_file import Origin, calibration_json
+    from tvsbayes.instrument.campaign import read_campaign
+
+    origin = Origin.of(read_campaign(campaign))
+    stored = calibration_json(calibration, origin)
+    text = calibration_header(calibration, origin) if kind == "header" else json.dumps(stored, indent=1)
+    document: Mapping[str, Any] = {"header": text} if kind == "header" else stored
+    if out is not None:
+        write_atomically(out, f"{text.rstrip()}\n".encode())
+        finish({"files": {kind: str(out)}}, f"written: {escaped(str(out), 200)}", as_json)
+        return
+    finish(document, text.rstrip("\n"), as_json)
 
 
 TargetText = Annotated[

@@ -118,10 +118,18 @@ class EvenSample:
 
 @dataclass(frozen=True)
 class LawChecked:
-    """How many points were carried by draws too, and at how many the law of propagation held to one digit of u."""
+    """How many points were carried by draws too, and how far the law of propagation held there.
+
+    Attributes:
+        points: how many.
+        held: at how many of them it held to one digit of u.
+        off_mm: by how much an end of a 95 % interval differs at half of the points; `most_off_mm` at the worst.
+    """
 
     points: int
     held: int
+    off_mm: float | None
+    most_off_mm: float | None
 
 
 def checked(calibration: Calibration, sample: EvenSample, draws: int, seed: int) -> LawChecked:
@@ -130,4 +138,6 @@ def checked(calibration: Calibration, sample: EvenSample, draws: int, seed: int)
     found = locate(calibration, pan, tilt, reading, approach, draws=draws, seed=seed)
     seen = np.array([error is None for error in found.refused])
     held = np.asarray(found.digits_held).min(axis=1) >= 1
-    return LawChecked(int(seen.sum()), int(np.sum(held & seen)))
+    off = found.law_off_mm[seen]
+    sizes = (float(np.median(off)), float(off.max())) if len(off) else (None, None)
+    return LawChecked(len(off), int(np.sum(held & seen)), *sizes)

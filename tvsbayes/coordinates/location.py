@@ -45,6 +45,7 @@ class Locations(Shown):
         u95_mm: their half widths, shape (n, 3).
         diverging_share: share of draws without a point, shape (n,).
         extrapolated: no look of the campaign reached the counters of the point, shape (n,).
+        unseen: which counters those are and what looks reached, in words; "" where looks did.
         linear_xyz_mm, linear_covariance_mm2: by the law of propagation, shapes (n, 3) and (n, 3, 3).
         validation: of the law of propagation by the draws (JCGM 101 clause 8), fields of shape (n, 3).
         refused: the refusal of each point, or None.
@@ -62,6 +63,7 @@ class Locations(Shown):
     linear_covariance_mm2: np.ndarray
     validation: Validation
     refused: tuple[InputError | None, ...]
+    unseen: tuple[str, ...]
     estimator: str
     draws: int
 
@@ -77,6 +79,11 @@ class Locations(Shown):
         return View(title, (*columns, "note"), rows)
 
     @cached_property
+    def law_off_mm(self) -> np.ndarray:
+        """By how much an end of the law's 95 % interval differs from that of the draws, at most, shape (n,)."""
+        return self.validation.deviation.max(axis=1)
+
+    @cached_property
     def digits_held(self) -> np.ndarray:
         """Significant digits of u, two at most, to which the law of propagation holds, shape (n, 3)."""
         return self.validation.digits_held(np.sqrt(np.diagonal(self.linear_covariance_mm2, 0, 1, 2)))
@@ -87,7 +94,8 @@ class Locations(Shown):
         if error is not None:
             empty = dict.fromkeys(("xyz_mm", "covariance_mm2", "u95_mm"))
             refused = {"code": error.code, "message": error.message}
-            return {**empty, "extrapolated": bool(self.extrapolated[index]), "refused": refused}
+            beyond = {"extrapolated": bool(self.extrapolated[index]), "unseen": self.unseen[index]}
+            return {**empty, **beyond, "refused": refused}
         u = np.sqrt(np.diag(self.linear_covariance_mm2[index]))
         v = self.validation
         return {
@@ -97,6 +105,7 @@ class Locations(Shown):
             "interval95_mm": self.interval95_mm[index].T.tolist(),
             "diverging_share": float(self.diverging_share[index]),
             "extrapolated": bool(self.extrapolated[index]),
+            "unseen": self.unseen[index],
             "linear": {
                 "xyz_mm": self.linear_xyz_mm[index].tolist(),
                 "covariance_mm2": self.linear_covariance_mm2[index].tolist(),
@@ -263,7 +272,8 @@ def locate(
         None if share <= DIVERGING_SHARE else calibration.refusal(pan, tilt, deg, (pan_side, tilt_side))
         for share, ((pan, tilt), deg, (pan_side, tilt_side)) in zip(found.diverging_share.tolist(), asked, strict=True)
     )
-    return replace(found, refused=refused)
+    unseen = tuple(calibration.unseen(pan, tilt) for pan, tilt in settings.steps.tolist())
+    return replace(found, refused=refused, unseen=unseen, extrapolated=np.array([bool(words) for words in unseen]))
 
 
 def _together[T: (Locations, Validation)](parts: Sequence[T]) -> T:
@@ -299,8 +309,6 @@ def _statistics(settings: Settings, carried: Carried, law: Linear, given: Drawn,
     off = calibration.gears.at(given.gears - calibration.mean[own:], (pan, tilt))
     for place, name in enumerate(calibration.gears.inputs, own):
         linearised += law.jacobian[:, :, place] * off[name][..., None]
-    (pan_low, pan_high), (tilt_low, tilt_high) = calibration.range_steps
-    outside = (pan < pan_low) | (pan > pan_high) | (tilt < tilt_low) | (tilt > tilt_high)
     interval = symmetric_interval(xyz)
     empty = np.where(lost <= DIVERGING_SHARE, 0.0, np.nan)
     return Locations(
@@ -309,11 +317,12 @@ def _statistics(settings: Settings, carried: Carried, law: Linear, given: Drawn,
         interval95_mm=interval.transpose(1, 0, 2) + empty[:, None, None],
         u95_mm=0.5 * (interval[1] - interval[0]) + empty[:, None],
         diverging_share=lost,
-        extrapolated=outside,
+        extrapolated=np.zeros(len(pan), dtype=bool),
         linear_xyz_mm=law.value + empty[:, None],
         linear_covariance_mm2=law.covariance + empty[:, None, None],
         validation=validate(xyz, linearised, law.value, u),
         refused=(),
+        unseen=(),
         estimator=calibration.estimator,
         draws=count,
     )

@@ -1,6 +1,6 @@
 """Looks whose points are wanted: a CSV of counters, approaches and aperture readings, whole or block by block.
 
-steps, deg.
+steps, deg. Semicolons, decimal commas and workbooks are read too, with the same names of columns.
 """
 
 from __future__ import annotations
@@ -11,13 +11,16 @@ from pathlib import Path
 
 from tvsbayes.coordinates.location import Settings, settings_of
 from tvsbayes.errors import InputError, escaped
-from tvsbayes.files.csv_table import CSV_BYTES_MAX, Table, parse_table, table_blocks
-from tvsbayes.files.disk import read_bytes
+from tvsbayes.files.csv_table import CSV_BYTES_MAX, Table, csv_bytes, parse_table, table_blocks
+from tvsbayes.files.disk import opened, read_bytes
+from tvsbayes.files.foreign_table import is_foreign, read_foreign
 from tvsbayes.instrument.axes import SENSES
 from tvsbayes.progress import Advance, unshown
 
 LOOK_COLUMNS = ("pan_steps", "tilt_steps", "pan_approach", "tilt_approach", "aperture_deg")
 STEPS_MAX, ANGLE_MAX_DEG = 1e8, 360.0
+HEAD_BYTES = 4096
+"""From which the kind of a file is known."""
 BLOCK_ROWS = 8192
 """Lines read at a time: 10 MB with everything that is made of them."""
 
@@ -64,13 +67,32 @@ def _no_points(path: Path) -> InputError:
     return InputError("empty", f"{file}: no points", file=file, remedy="add rows")
 
 
+def _foreign(path: Path) -> Table | None:
+    """A table that a spreadsheet wrote otherwise than we do, its numbers with points; None of one of ours."""
+    with opened(path, "a readable file") as stream:
+        if not is_foreign(stream.read(HEAD_BYTES)):
+            return None
+    found = read_foreign(path)
+    # The same columns are asked for, with the same words.
+    parse_table(csv_bytes(list(found.columns), ()), found.file, LOOK_COLUMNS)
+    return Table(found.file, list(found.lines), dict(found.columns))
+
+
+def _part(table: Table, begin: int) -> Table:
+    """`BLOCK_ROWS` of a table's rows."""
+    end = begin + BLOCK_ROWS
+    return Table(table.file, table.lines[begin:end], {name: cells[begin:end] for name, cells in table.columns.items()})
+
+
 def read_looks(path: Path) -> LookRows:
     """All looks of a file.
 
     Raises:
         InputError: unreadable, no such columns, a cell that is none, or no row.
     """
-    table = parse_table(read_bytes(path, CSV_BYTES_MAX), escaped(path.name), LOOK_COLUMNS)
+    table = _foreign(path)
+    if table is None:
+        table = parse_table(read_bytes(path, CSV_BYTES_MAX), escaped(path.name), LOOK_COLUMNS)
     if not len(table):
         raise _no_points(path)
     return _rows(table)
@@ -86,8 +108,12 @@ def look_blocks(path: Path, advance: Advance = unshown) -> Iterator[LookRows]:
     Raises:
         InputError: as `read_looks`, in the block where it stands.
     """
-    empty = True
-    for table in table_blocks(path, LOOK_COLUMNS, BLOCK_ROWS, advance):
+    empty, whole = True, _foreign(path)
+    if whole is None:
+        blocks = table_blocks(path, LOOK_COLUMNS, BLOCK_ROWS, advance)
+    else:
+        blocks = (_part(whole, begin) for begin in range(0, len(whole), BLOCK_ROWS))
+    for table in blocks:
         if len(table):
             empty = False
             yield _rows(table)

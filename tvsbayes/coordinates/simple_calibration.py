@@ -84,7 +84,7 @@ class Belief:
     def points(self, aperture_deg: np.ndarray, azimuth: bool) -> np.ndarray:
         """Where the beams meet readings (..., points): shape (3, ..., points), mm; not a number where they do not."""
         reach = range_components(*self.beam, self.baseline_mm, aperture_deg - self.aperture_zero_deg, azimuth)
-        return self.beam.at(np.where(np.isfinite(reach) & (reach > 0), reach, np.nan))
+        return self.beam.met(reach)
 
 
 def simple_belief(simple: SimpleCalibration, pan: np.ndarray, tilt: np.ndarray) -> Belief:

@@ -100,6 +100,12 @@ def read_foreign(path: Path, sheet: str | None = None) -> ForeignTable:
     return _table(file, rows, words)
 
 
+def is_foreign(head: bytes) -> bool:
+    """Whether a file that begins so is a table of another kind than ours: a workbook, UTF-16, other separators."""
+    marks = (b"PK\x03\x04", *(mark for mark, codec, _ in _MARKS if codec != "utf-8-sig"))
+    return head.startswith(marks) or re.search(rb"[;\t|]", head.partition(b"\n")[0]) is not None
+
+
 def _text(data: bytes, file: str) -> tuple[str, str]:
     """The text and the name of its encoding."""
     marked = [(codec, name) for mark, codec, name in _MARKS if data.startswith(mark)]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from tvsbayes.instrument.axes import AXES
@@ -13,6 +13,16 @@ LIMIT_KEYS = {axis: (f"{axis}_min_steps", f"{axis}_max_steps") for axis in AXES}
 """Entries of `[positioner]`, lowest first."""
 HOME_KEYS = {axis: f"{axis}_home_steps" for axis in AXES}
 """Entries of `[positioner]` that give the counter at the home switch."""
+
+
+def unseen(counters: Sequence[float], seen: Iterable[Sequence[float]]) -> str:
+    """Which counters (pan, tilt) lie outside the lowest and highest ones seen, in words; "" where none does."""
+    found = [
+        f"{axis} {counter:g} lies outside {low:g} to {high:g}"
+        for axis, counter, (low, high) in zip(AXES, counters, seen, strict=True)
+        if not low <= counter <= high
+    ]
+    return " and ".join(found)
 
 
 @dataclass(frozen=True)

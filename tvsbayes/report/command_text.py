@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -11,11 +12,12 @@ from tvsbayes.calibration.pointing import Steps
 from tvsbayes.errors import escaped
 from tvsbayes.instrument.plan import LOOKS_PER_EXPERIMENT
 from tvsbayes.report.result_tables import gap_table, hold_out_table, point_budget_table
-from tvsbayes.report.tables import TableView, concise, two_digits
+from tvsbayes.report.tables import COLUMNS, TableView, concise, two_digits
 from tvsbayes.results.comparison_record import Comparison, Gap, HoldOut, PositionHoldOut
 from tvsbayes.statistics.chances import ASSURED, BOUND, LEVELS, binomial_bounds, rms_bounds
 
 if TYPE_CHECKING:
+    from tvsbayes.calibration.pointing import Calibration
     from tvsbayes.cameras.detection import Detection
     from tvsbayes.cameras.stereo_calibration import StereoCalibration
     from tvsbayes.coordinates.cloud import LawChecked
@@ -27,10 +29,9 @@ if TYPE_CHECKING:
     from tvsbayes.studies.study import StudyResult
 
 
-EXTRAPOLATED = (
-    "EXTRAPOLATED: no look of the campaign reached these counters; errors of the gears are foretold there by their "
-    "size alone"
-)
+def extrapolated_text(unseen: str) -> str:
+    """What counters that no look reached mean for a result; `unseen` names them."""
+    return f"EXTRAPOLATED: {unseen}, where looks were; errors of the gears are foretold there by their size alone"
 
 
 HELD_WORDS = {
@@ -48,6 +49,8 @@ HELD_WORDS = {
     "range_command": "commands, from and to",
 }
 """What `check` calls its keys."""
+UNSEEN_SHOWN = 5
+"""Counters that no look reached, of a file of points."""
 PLAN_UNIT = {"contrast": "deg/step", "backlash": "deg", "mirror_offset": "mm"}
 """Units of what a plan will tell, by how their names begin; the ratios' is deg/step."""
 
@@ -87,7 +90,10 @@ def _foreseen_table(expected: Mapping[str, float], contraction: Mapping[str, flo
     return TableView("what the plan will tell (100 %: the priors no longer matter)", columns, rows)
 
 
-LAW = "values are those of the draws; law: what the law of propagation (GUM) would give for u"
+LAW = (
+    "values are those of the draws; law: digits of u to which the law of propagation (GUM) agrees, else by how much "
+    "an end of its 95 % interval differs"
+)
 """Below a table of points."""
 
 
@@ -221,7 +227,7 @@ def detection_text(found: Detection) -> str:
 
 def locations_text(found: Locations) -> str:
     """Points with their uncertainty."""
-    far, rows = bool(found.extrapolated.any()), []
+    rows: list[list[str]] = []
     for index, error in enumerate(found.refused):
         if error is not None:
             rows.append([str(index), f"refused: {error.code}", "", "", "", ""])
@@ -230,27 +236,45 @@ def locations_text(found: Locations) -> str:
         cells = [concise(float(x), float(u)) for x, u in zip(found.xyz_mm[index], sd, strict=True)]
         half = " ".join(map(two_digits, found.u95_mm[index]))
         held = int(found.digits_held[index].min())
-        verdict = f"same to {held} digit{'s' * (held > 1)}" if held else "differs"
+        off = two_digits(float(found.law_off_mm[index]))
+        verdict = f"same to {held} digit{'s' * (held > 1)}" if held else f"off by {off} mm"
         # What is only known to be far off needs no second opinion on its u.
         rows.append([str(index), *cells, half, "EXTRAPOLATED" if found.extrapolated[index] else verdict])
     columns = ["point", "x(u) mm", "y(u) mm", "z(u) mm", "U95 mm", "law"]
     table = TableView(f"frame T, {found.draws} draws ({found.estimator})", columns, rows)
-    return "\n".join([table.text(), LAW, *([EXTRAPOLATED] if far else [])])
+    # Every point of a file may be far off for a reason of its own.
+    seen = zip(found.unseen, found.refused, strict=True)
+    beyond = dict.fromkeys(words for words, error in seen if words and not error)
+    told = [extrapolated_text(words) for words in list(beyond)[:UNSEEN_SHOWN]]
+    if len(beyond) > UNSEEN_SHOWN:
+        told.append(f"and {len(beyond) - UNSEEN_SHOWN} more counters that no look reached")
+    return "\n".join([table.text(), *textwrap.wrap(LAW, COLUMNS), *told])
 
 
-def cloud_text(found: CloudFile, law: LawChecked) -> str:
+def _points(count: int) -> str:
+    return f"{count} point{'s' * (count != 1)}"
+
+
+def cloud_text(found: CloudFile, law: LawChecked, calibration: Calibration) -> str:
     """What was written, what was not, and how far its uncertainties hold."""
-    lines = [f"written: {escaped(str(found.path), 200)}, {found.points} points, frame T, mm"]
+    lines = [f"written: {escaped(str(found.path), 200)}, {_points(found.points)}, frame T, mm"]
     lines.append(f"properties: {', '.join(found.columns)}")
-    lines.append(
-        f"sds by the law of propagation (GUM); at {law.held} of {law.points} points carried by draws too it holds to a "
-        "digit or more"
-    )
+    told = f"sds by the law of propagation (GUM): of {_points(law.points)} carried by draws too it holds to a digit or "
+    told += f"more at {law.held}"
+    if law.off_mm is not None and law.most_off_mm is not None:
+        told += f"; ends of 95 % intervals differ by {two_digits(law.off_mm)} mm at half of them, at most by "
+        told += f"{two_digits(law.most_off_mm)} mm"
+    lines.append(told)
     if found.extrapolated:
-        lines.append(f"{found.extrapolated} points {EXTRAPOLATED}")
+        seen = ", ".join(f"{axis} {low:g} to {high:g}" for axis, (low, high) in calibration.seen_steps.items())
+        lines.append(
+            f"{_points(found.extrapolated)} EXTRAPOLATED: outside {seen}, where looks were; errors of the gears are "
+            "foretold there by their size alone"
+        )
     if found.refused_path is not None:
         name = escaped(str(found.refused_path), 200)
-        lines.append(f"{found.refused} looks have no point: lines and reasons in {name}")
+        looks = f"{found.refused} look{' has' if found.refused == 1 else 's have'}"
+        lines.append(f"{looks} no point: lines and reasons in {name}")
     return "\n".join(lines)
 
 
@@ -282,7 +306,7 @@ def steps_text(steps: Steps) -> str:
         half = ", ".join(map(two_digits, steps.u95_deg))
         lines.append(f"whole steps leave {steps.rounding_deg:.3g} deg; azimuth and elevation +- ({half}) deg (95 %)")
     if steps.extrapolated:
-        lines.append(EXTRAPOLATED)
+        lines.append(extrapolated_text(steps.unseen))
     return "\n".join(lines)
 
 

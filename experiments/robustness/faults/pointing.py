@@ -86,8 +86,8 @@ FAULTS = (
     ),
     Fault(
         "C header with four digits",
-        "calibration/calibration_file.py",
-        'f"#define {macro[name]} {value!r}"',
+        "calibration/c_header.py",
+        'f"#define {macro[name]} {_double(value)}"',
         'f"#define {macro[name]} {value:.4g}"',
         "the microcontroller misses by millimetres at 1 m",
         ("calibration/calibration_file",),
@@ -134,10 +134,18 @@ FAULTS = (
     ),
     Fault(
         "extrapolation never said",
-        "coordinates/location.py",
-        "outside = (pan < pan_low)",
-        "outside = (pan < -np.inf)",
+        "instrument/counter_limits.py",
+        "        if not low <= counter <= high",
+        "        if not -1e9 <= counter <= high",
         "nobody learns that no look reached these counters",
         ("calibration/gear_table", "cli/use_commands"),
+    ),
+    Fault(
+        "points behind the scanner are located",
+        "calibration/optics.py",
+        "return x_mm.real > 0",
+        "return x_mm.real > -1e6",
+        "locate answers with a point at which steps-for cannot aim",
+        ("cli/use_commands", "calibration/pointing"),
     ),
 )
