@@ -31,7 +31,7 @@ def test_a_table_is_shown_then_written_and_read_by_check(ask, say, table, tmp_pa
     assert "nothing written: add --yes" in text
     code, document = ask("import", table, "--to", out, "--pixels-from", 1, "--yes", "--pan-approach", "left")
     assert (code, document["moves"], document["spots"], document["unused"]) == (0, 2, 2, [])
-    assert document["columns"]["target"] == {"column": "Blatt", "first": ["nah", "nah"]}
+    assert document["columns"]["target"] == {"column": "Blatt", "first": ["nah", "nah"], "empty": 0}
     shutil.copy(MOUNTED / "stereo.json", out)
     campaign = read_campaign(out)
     assert pixels_of(campaign.spots)[:, 0].tolist() == [639.5, 699.5]
@@ -53,11 +53,20 @@ def test_looks_go_to_the_moves_of_a_campaign(ask, grid_campaign, tmp_path):
     assert (out / "moves.csv").read_bytes() == moves_bytes(grid_campaign.moves)
 
 
+def test_values_are_shown_where_rows_without_a_look_come_first(ask, say, table, tmp_path):
+    table.write_text("pan;tilt;XL;YL;XR;YR\n0;0;;;;\n9;0;;;;\n9;5;;;;\n20;5;640,5;360;500;360\n")
+    told = ask("import", table, "--to", tmp_path / "mine")[1]["columns"]["u_left_px"]
+    assert told == {"column": "XL", "first": ["640.5"], "empty": 3}
+    assert "640.5 (3 of 4 empty)" in say("import", table, "--to", tmp_path / "mine")[1]
+
+
 def test_what_is_not_understood_is_asked_for(ask, say, table, tmp_path, monkeypatch):
     table.write_text("pan_goal,pan_pos,tilt,XL,YL,XR,bottom\n0,1,0,640,360,500,360\n")
     code, document = ask("import", table, "--to", tmp_path / "mine", "--yes")
     error = assert_error(document, "missing-column")
     assert code == 2 and "pan_steps (pan_goal or pan_pos)" in error["found"] and "v_right_px" in error["found"]
+    # What was understood is worth knowing before anything is added to it.
+    assert "understood so far: tilt_steps = tilt, u_left_px = XL, v_left_px = YL, u_right_px = XR" in error["found"]
     stated = ("--column", "pan_steps=pan_pos", "--column", "v_right_px=bottom")
     assert ask("import", table, "--to", tmp_path / "mine", *stated)[1]["columns"]["pan_steps"]["column"] == "pan_pos"
 

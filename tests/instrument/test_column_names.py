@@ -17,6 +17,7 @@ PIXEL_NAMES = [
     ("x1", "y1", "x2", "y2"),
     ("Bild links x", "Bild links y", "Bild rechts x", "Bild rechts y"),
     ("col izquierda", "fila izquierda", "col derecha", "fila derecha"),
+    ("colonne gauche", "ligne gauche", "colonne droite", "ligne droite"),
 ]
 
 
@@ -28,6 +29,34 @@ def test_pixels_by_any_name(names):
     assert [found.columns[field] for field in PIXELS] == list(names)
     assert [found.columns[field] for field in PIXEL_SDS] == list(spreads)
     assert not found.unused and not found.claimed
+
+
+COUNTER_NAMES = [
+    ("Horizontal", "Vertikal"),
+    ("Schritte Schwenk", "Schritte Neigung"),
+    ("Azimut", "H\u00f6he"),
+    ("pasos horizontal", "pasos vertical"),
+    ("acimut", "elevaci\u00f3n"),
+    ("giro", "inclinaci\u00f3n"),
+    ("pas horizontale", "pas verticale"),
+    ("azimut", "inclinaison"),
+]
+
+
+@pytest.mark.parametrize("names", COUNTER_NAMES, ids=[" ".join(names) for names in COUNTER_NAMES])
+def test_counters_in_four_languages(names):
+    """A word that is known of one axis is known of the other one too."""
+    assert understand(names).columns == dict(zip(COUNTERS, names, strict=True))
+
+
+def test_other_fields_in_four_languages():
+    for names in (
+        ("Zeit (ms)", "Blende (Grad)", "Schirm", "G\u00fcltig", "Versuch", "Punkt", "Anfahrt horizontal"),
+        ("tiempo", "apertura (grados)", "pantalla", "estado", "ensayo", "punto", "lado horizontal"),
+        ("temps", "ouverture (degr\u00e9s)", "\u00e9cran", "\u00e9tat", "essai", "point", "c\u00f4t\u00e9 horizontal"),
+    ):
+        fields = ("time_s", "aperture_deg", "target", "status", "experiment", "point", "pan_approach")
+        assert understand(names).columns == dict(zip(fields, names, strict=True))
 
 
 def test_our_own_names_and_other_words():

@@ -6,7 +6,8 @@ Options in, library called, table or JSON out; heavy imports stand inside the co
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -116,7 +117,7 @@ def _completed(
     Raises:
         InputError: something is missing, or claimed by two columns, and nobody can be asked.
     """
-    from tvsbayes.instrument.column_names import missing, understand
+    from tvsbayes.instrument.column_names import FIELDS, missing, understand
 
     open_fields = [*missing(known.columns, moves_known), *known.claimed]
     if not open_fields:
@@ -133,6 +134,8 @@ def _completed(
             return known
     claims = [f"{field} ({' or '.join(escaped(name) for name in own)})" for field, own in known.claimed.items()]
     found = f"no column that is surely {', '.join([*(f for f in open_fields if f not in known.claimed), *claims])}"
+    told = ", ".join(f"{field} = {escaped(known.columns[field])}" for field in FIELDS if field in known.columns)
+    found += f"; understood so far: {told or 'nothing'}"
     remedy = f"say which: --column {open_fields[0]}=NAME; --column {open_fields[0]}= where there is none"
     raise refusal("missing-column", file=table.file, line=1, found=found, allowed=f"any of {names}", remedy=remedy)
 
@@ -164,10 +167,16 @@ def _write_looks(to: Path, looks: ForeignLooks) -> list[str]:
     return [str(to / name) for name in contents]
 
 
+def first_values(cells: Sequence[str]) -> list[str]:
+    """The first cells of a column that hold anything: rows without a look begin many tables."""
+    return list(islice(filter(None, cells), SAMPLES))
+
+
 def _understood_document(table: ForeignTable, known: Understood, looks: ForeignLooks) -> dict[str, Any]:
     """The same as `_understood_text`, for programs."""
     columns = {
-        field: {"column": name, "first": list(table.columns[name][:SAMPLES])} for field, name in known.columns.items()
+        field: {"column": name, "first": first_values(table.columns[name]), "empty": table.columns[name].count("")}
+        for field, name in known.columns.items()
     }
     return {
         **{
@@ -197,7 +206,9 @@ def _understood_text(table: ForeignTable, known: Understood, notation: Notation,
         elif field in ("aperture_deg", "time_s"):
             stated = notation.angle_unit if field == "aperture_deg" else None
             unit = stated or unit_of_name(name) or field.rpartition("_")[2]
-        first = ", ".join(escaped(cell, 12) or "empty" for cell in table.columns[name][:SAMPLES])
+        cells, empty = table.columns[name], table.columns[name].count("")
+        first = ", ".join(escaped(cell, 12) for cell in first_values(cells)) or "none"
+        first += f" ({empty} of {len(cells)} empty)" * bool(empty)
         rows.append((field, escaped(name, 24), unit, first))
     widths = [max(len(row[k]) for row in rows) for k in range(3)]
     lines = [f"{table.file}: {table.kind}; {len(table)} rows"]

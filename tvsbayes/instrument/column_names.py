@@ -18,30 +18,74 @@ FIELDS: tuple[str, ...] = tuple(dict.fromkeys((*MOVE_COLUMNS, *SPOT_COLUMNS)))
 """All that a table can give, by the columns of our files."""
 PIXEL_SDS = tuple(f"s{name}" for name in PIXELS)
 COUNTERS = ("pan_steps", "tilt_steps")
+# English, German, Spanish, French; without accents, as `words_of` takes names apart.
 _SIDES = {
-    "left": {"left", "l", "links", "izq", "izquierda", "gauche", "cam1", "1"},
-    "right": {"right", "r", "rechts", "der", "derecha", "droite", "cam2", "2"},
+    "left": {"left", "l", "links", "linke", "linker", "izq", "izquierda", "izquierdo", "gauche", "cam1", "1"},
+    "right": {"right", "r", "rechts", "rechte", "rechter", "der", "derecha", "derecho", "droite", "droit", "cam2", "2"},
 }
-_IMAGE_AXES = {"u": {"u", "x", "col", "column", "spalte", "columna"}, "v": {"v", "y", "row", "zeile", "fila"}}
-_SPREAD = {"sd", "std", "sigma", "s", "stdev", "unc", "uncertainty", "err", "error"}
+_IMAGE_AXES = {
+    "u": {"u", "x", "col", "column", "spalte", "columna", "colonne"},
+    "v": {"v", "y", "row", "zeile", "fila", "renglon", "ligne"},
+}
+_SPREAD = {
+    *("sd", "std", "sigma", "s", "stdev", "unc", "uncertainty", "err", "error", "streuung", "unsicherheit"),
+    *("desviacion", "incertidumbre", "ecart", "incertitude"),
+}
+_APPROACH = {
+    *(
+        "approach",
+        "side",
+        "from",
+        "anfahrt",
+        "seite",
+        "von",
+        "lado",
+        "desde",
+        "aproximacion",
+        "cote",
+        "approche",
+        "depuis",
+    ),
+}
 _WORDS = {
-    "move": {"move", "movement", "bewegung", "movimiento", "pose"},
-    "segment": {"segment", "homing", "home"},
-    "time_s": {"time", "t", "timestamp", "zeit", "tiempo", "datetime", "date"},
-    "pan_steps": {"pan", "azimuth", "azimut", "horizontal", "hor"},
-    "tilt_steps": {"tilt", "elevation", "vertical", "vert"},
-    "spot": {"spot", "look", "id", "nr", "no", "index", "shot"},
-    "target": {"target", "sheet", "plane", "screen", "wall", "blatt", "schirm", "hoja", "plano"},
-    "experiment": {"experiment", "exp", "versuch", "experimento", "trial", "run"},
+    "move": {"move", "movement", "bewegung", "fahrt", "movimiento", "mouvement", "deplacement", "pose"},
+    "segment": {"segment", "homing", "home", "referenzfahrt", "referenciado", "segmento", "reference"},
+    "time_s": {
+        *("time", "t", "timestamp", "datetime", "date", "zeit", "uhrzeit", "zeitstempel", "datum"),
+        *("tiempo", "hora", "fecha", "temps", "heure"),
+    },
+    "pan_steps": {
+        *("pan", "azimuth", "azimut", "acimut", "horizontal", "horizontale", "horiz", "hor", "schwenk", "schwenken"),
+        *("giro", "panoramique"),
+    },
+    "tilt_steps": {
+        *("tilt", "elevation", "vertical", "vert", "vertikal", "vertikale", "verticale", "hohe", "hoehe", "neigung"),
+        *("kippen", "elevacion", "inclinacion", "inclinaison"),
+    },
+    "spot": {
+        *("spot", "look", "id", "nr", "no", "num", "index", "shot", "nummer", "aufnahme", "fleck", "numero", "toma"),
+        *("mancha", "tache", "vue"),
+    },
+    "target": {
+        *("target", "sheet", "plane", "screen", "wall", "blatt", "schirm", "wand", "ebene", "tafel", "hoja", "plano"),
+        *("pantalla", "pared", "feuille", "ecran", "mur", "cible"),
+    },
+    "experiment": {"experiment", "exp", "versuch", "experimento", "ensayo", "essai", "experience", "trial", "run"},
     "point": {"point", "pt", "punkt", "punto"},
-    "aperture_deg": {"aperture", "b", "receiver", "rx", "apertura"},
-    "status": {"status", "state", "ok", "valid", "quality"},
+    "aperture_deg": {
+        *("aperture", "b", "receiver", "rx", "blende", "offnung", "empfanger", "apertura", "receptor", "ouverture"),
+        *("recepteur",),
+    },
+    "status": {
+        *("status", "state", "ok", "valid", "quality", "zustand", "gultig", "qualitat", "estado", "valido", "calidad"),
+        *("etat", "valide", "qualite"),
+    },
 }
 _UNITS = {
-    "ms": {"ms", "msec", "millis", "milliseconds"},
-    "min": {"min", "minutes"},
-    "rad": {"rad", "radians"},
-    "deg": {"deg", "degrees", "grad"},
+    "ms": {"ms", "msec", "millis", "milliseconds", "millisekunden", "milisegundos", "millisecondes"},
+    "min": {"min", "minutes", "minuten", "minutos"},
+    "rad": {"rad", "radians", "radianten", "radianes"},
+    "deg": {"deg", "degrees", "grad", "grados", "degres"},
     "mm": {"mm"},
 }
 
@@ -88,7 +132,7 @@ def _field_of(name: str) -> str | None:
     if len(axes) == len(sides) == 1:
         return f"{'s' if words & _SPREAD else ''}{axes[0]}_{sides[0]}_px"
     for axis in ("pan", "tilt"):
-        if words & {"approach", "side", "from"} and words & _WORDS[f"{axis}_steps"]:
+        if words & _APPROACH and words & _WORDS[f"{axis}_steps"]:
             return f"{axis}_approach"
     # The first word tells most: "sheet_id" is of the sheet, "id of sheet" of the id.
     return next((field for word in listed for field, spellings in _WORDS.items() if word in spellings), None)
