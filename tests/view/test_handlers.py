@@ -6,8 +6,6 @@ import asyncio
 import http.client
 import json
 import socket
-import threading
-from concurrent.futures import Future
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,6 +14,8 @@ import pytest
 
 pytest.importorskip("tornado", reason="the extra view is not installed")
 pytest.importorskip("plotly", reason="the extra view is not installed")
+
+from support.served_pages import page_served
 
 from tvsbayes.errors import InputError
 from tvsbayes.files.images import png_bytes
@@ -65,28 +65,9 @@ def contents_of(folder: Path) -> Contents:
 
 @pytest.fixture
 def served(tmp_path):
-    """In a thread of its own, ended with the test."""
-    link: Future[str] = Future()
-    loop = asyncio.new_event_loop()
-    task = loop.create_task(serving(contents_of(tmp_path / "campaign"), 0, link.set_result))
-
-    def run() -> None:
-        try:
-            loop.run_until_complete(task)
-        except asyncio.CancelledError:
-            pass
-        finally:
-            loop.close()
-
-    thread = threading.Thread(target=run)
-    thread.start()
-    try:
-        address, _, token = link.result(20).partition("/#")
+    with page_served(contents_of(tmp_path / "campaign")) as link:
+        address, _, token = link.partition("/#")
         yield Served(int(address.rpartition(":")[2]), token)
-    finally:
-        loop.call_soon_threadsafe(task.cancel)
-        thread.join(20)
-        assert not thread.is_alive()
 
 
 def test_page_and_its_files_are_served(served):

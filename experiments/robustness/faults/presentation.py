@@ -1,4 +1,4 @@
-"""Faults of what people see: terminal, report."""
+"""Faults of what people see: terminal, report, the page of `view` and who reaches it."""
 
 from experiments.robustness.faults.fault import Fault
 
@@ -34,5 +34,61 @@ FAULTS = (
         "picture[left : round(u) + HALF_PX + 1, top : round(v) + HALF_PX + 1]",
         "the report shows empty paper under the cross",
         ("report/spot_crops",),
+    ),
+    Fault(
+        "a link is good for ever",
+        "view/access.py",
+        "        self._token = None\n",
+        "",
+        "whoever finds the link in a history or a list of processes reads the campaign",
+        ("view/access",),
+    ),
+    Fault(
+        "any name may lead to the page",
+        "view/access.py",
+        'if headers.get("Host", "") not in own:',
+        'if not headers.get("Host", ""):',
+        "a page whose name is pointed at 127.0.0.1 talks to the server (DNS rebinding)",
+        ("view/access", "view/handlers"),
+    ),
+    Fault(
+        "links lead out of the folder",
+        "view/contents.py",
+        "read_bytes(folder / frame_name(spot, camera), IMAGE_BYTES_MAX, folder)",
+        "read_bytes(folder / frame_name(spot, camera), IMAGE_BYTES_MAX)",
+        "a campaign from somebody else shows pictures of other folders",
+        ("view/handlers",),
+    ),
+    Fault(
+        "ellipsoids of one coordinate",
+        "view/shapes.py",
+        "special.chdtri(3, 1 - PROBABILITY)",
+        "special.chdtri(1, 1 - PROBABILITY)",
+        "ellipsoids said to hold 95 % hold 72 %",
+        ("view/shapes",),
+    ),
+    Fault(
+        "the right camera stands to the left",
+        "view/shapes.py",
+        "right = (right - stereo.T) @ stereo.R",
+        "right = (right + stereo.T) @ stereo.R",
+        "the cameras of the scene are exchanged",
+        ("view/shapes",),
+    ),
+    Fault(
+        "what gears repeat is left out of the rig",
+        "view/scene.py",
+        "return laser_ways(fit.z, turned, fit.space, fit.arrays)",
+        "return laser_ways(fit.z, 0 * turned, fit.space, fit.arrays)",
+        "arrows over the images show errors that the fit has explained",
+        ("view/scene",),
+    ),
+    Fault(
+        "looks in the order of the filter",
+        "view/scene.py",
+        "rows = np.array([row_of[spot.spot] for spot in used], dtype=int)",
+        "rows = np.arange(len(used))",
+        "beams and points of other looks, wherever spots.csv is not in order or a look has none",
+        ("view/scene",),
     ),
 )
