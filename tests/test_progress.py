@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import sys
+import threading
+from functools import partial
+
 import pytest
 from support.waits import check_forward
 
-from tvsbayes.progress import FORESEEN_SECONDS, FORESEEN_SHARE, Job, OpenEnded
+from tvsbayes import progress
+from tvsbayes.progress import FORESEEN_SECONDS, FORESEEN_SHARE, Job, OpenEnded, SessionLine
 
 ROUNDING = 2.0**-50
 """Of a sum of a few shares near 1, four units of float64's last place."""
@@ -142,3 +147,50 @@ def test_a_stage_of_unknown_length_goes_on_when_more_is_expected():
     assert shares == pytest.approx([0, 0.4, 0.8, 0.8, 0.88, 0.96], abs=ROUNDING)
     assert stage.share(400, 300) == pytest.approx(0.96, abs=ROUNDING), "never at its end before it is"
     assert OpenEnded().share(0, 0) == 0
+
+
+PATIENCE_SECONDS = 20.0
+"""For a timer without delay on a busy machine."""
+
+
+@pytest.fixture
+def session(monkeypatch):
+    """Somebody types; lines appear at once. What they say, and an event of the first."""
+    lines, appeared = [], threading.Event()
+
+    def write(text: str) -> None:
+        lines.append(text)
+        appeared.set()
+
+    monkeypatch.setattr(sys, "ps1", ">>> ", raising=False)
+    monkeypatch.setattr(progress, "SHOWN_AFTER_SECONDS", 0.0)
+    monkeypatch.setattr(progress, "SessionLine", partial(SessionLine, writer=lambda: write))
+    return lines, appeared
+
+
+def test_a_session_sees_one_line_and_is_left_without(session):
+    """Also of a job inside the job, and after an exception."""
+    lines, appeared = session
+    with Job({"fit": 1.0, "sampling": 1.0}) as job:
+        assert appeared.wait(PATIENCE_SECONDS)
+        with Job({"inner": 1.0}) as inner:
+            inner.at(0.5)
+        job.begin("sampling")
+    assert lines[0] == "0 %, fit" and "50 %, sampling" in [line.rpartition(",")[0] or line for line in lines] + lines
+    assert lines[-1] == "" and not any("inner" in line for line in lines)
+    appeared.clear()
+    with pytest.raises(KeyboardInterrupt), Job({"fit": 1.0}):
+        assert appeared.wait(PATIENCE_SECONDS)
+        raise KeyboardInterrupt
+    assert lines[-1] == ""
+
+
+def test_scripts_and_whoever_listens_see_no_line(session, monkeypatch):
+    lines, _ = session
+    told = []
+    with Job({"fit": 1.0}, told.append):
+        pass
+    monkeypatch.delattr(sys, "ps1")
+    with Job({"fit": 1.0}):
+        pass
+    assert told and lines == []

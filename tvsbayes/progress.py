@@ -2,11 +2,14 @@
 
 A `Job` is a wait in named stages, each with the share of the time that it is expected to take. Whoever does the work
 says where it stands, and whoever waits is told by a callback, in the thread that works. An exception of the callback
-passes through and so ends the work.
+passes through and so ends the work. Where nobody gave a callback and somebody types (a Python prompt, IPython, a
+notebook), a wait that has lasted two seconds shows itself in one line and takes it away at its end; scripts are silent.
 """
 
 from __future__ import annotations
 
+import sys
+import threading
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -42,6 +45,88 @@ EXPECTED_LAST = 0.8
 """Of what is left of a stage of unknown length, the share that ends at the length expected now: it may not suffice."""
 
 
+SHOWN_AFTER_SECONDS = 2.0
+"""Of a wait that lasts so long is shown how it stands."""
+
+
+def time_left(seconds: float | None) -> str:
+    """Time left in words; "" where it is not known."""
+    if seconds is None:
+        return ""
+    return f"{seconds:.0f} s left" if seconds < 100 else f"{seconds / 60:.0f} min left"
+
+
+def _line_writer() -> Callable[[str], None] | None:
+    """What replaces the one line of a session; None where nobody types, or nobody would see it."""
+    if not hasattr(sys, "ps1"):
+        return None
+    if "ipykernel" in sys.modules:
+        from IPython.display import display
+
+        handle = display({"text/plain": ""}, raw=True, display_id=True)
+        return lambda text: handle.update({"text/plain": text}, raw=True)
+    if not sys.stderr.isatty():
+        return None
+
+    def write(text: str) -> None:
+        sys.stderr.write(f"\r\x1b[K{text}")
+        sys.stderr.flush()
+
+    return write
+
+
+class SessionLine:
+    """The line of a wait in a session; it appears after `SHOWN_AFTER_SECONDS`, also while nothing is told yet.
+
+    Args:
+        doing: what is being done, until something is told.
+        writer: makes what writes the line, asked when the line appears.
+    """
+
+    _shown = threading.Lock()
+    """Of one wait at a time: jobs inside a job are its own affair."""
+
+    def __init__(self, doing: str, writer: Callable[[], Callable[[str], None] | None] = _line_writer):
+        self._state, self._writer = Progress(doing, 0.0, 0.0, None), writer
+        self._write: Callable[[str], None] | None = None
+        self._lock = threading.RLock()
+        self._mine = self._shown.acquire(blocking=False)
+        self._timer = threading.Timer(SHOWN_AFTER_SECONDS, self._open)
+        self._timer.daemon = True
+        if self._mine:
+            self._timer.start()
+
+    def show(self, state: Progress) -> None:
+        """Takes the news."""
+        with self._lock:
+            self._state = state
+            self._update()
+
+    def close(self) -> None:
+        """Take the line away."""
+        self._timer.cancel()
+        with self._lock:
+            if self._write is not None:
+                self._write("")
+                self._write = None
+            if self._mine:
+                self._mine = False
+                self._shown.release()
+
+    def _open(self) -> None:
+        with self._lock:
+            # The timer may fire while the wait ends.
+            if self._mine:
+                self._write = self._writer()
+                self._update()
+
+    def _update(self) -> None:
+        if self._write is not None:
+            state = self._state
+            parts = (f"{100 * state.share:.0f} %", state.doing, time_left(state.seconds_left))
+            self._write(", ".join(filter(None, parts)))
+
+
 def unshown(share: float) -> None:
     """For whoever need not know how far a stage is."""
 
@@ -51,7 +136,7 @@ class Job:
 
     Args:
         stages: expected share of the time by what is done, in order, in any unit; those with 0 are not taken.
-        show: told how it stands; None for nobody.
+        show: told how it stands; None for nobody but the line of a session.
         clock: seconds.
 
     Raises:
@@ -74,13 +159,19 @@ class Job:
         self._stage = next(iter(stages))
         self._told = Progress(self._stage, 0.0, 0.0, None)
         self._silent, self._skipped = True, 0.0
+        self._line: SessionLine | None = None
 
     def __enter__(self) -> Job:
+        if self._show is None and hasattr(sys, "ps1"):
+            self._line = SessionLine(self._stage)
+            self._show = self._line.show
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        if self._line is not None:
+            self._line.close()
         if kind is None:
             self._tell(self._told.doing, 1.0)
 

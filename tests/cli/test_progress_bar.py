@@ -14,7 +14,7 @@ import pytest
 from support.commands import MOUNTED
 from support.pseudo_terminal import needs_pseudo_terminals
 
-from tvsbayes.cli.progress_bar import time_left
+from tvsbayes.progress import time_left
 
 SCRIPT = """
 import sys, threading

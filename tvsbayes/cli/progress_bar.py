@@ -9,12 +9,10 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
-from tvsbayes.progress import Progress, Show
+from tvsbayes.progress import SHOWN_AFTER_SECONDS, Progress, Show, time_left
 
 if TYPE_CHECKING:
     from rich.progress import Progress as Bar
-
-SHOWN_AFTER_SECONDS = 2.0
 
 
 @contextmanager
@@ -28,13 +26,6 @@ def waiting() -> Iterator[Show | None]:
         yield shown.show
     finally:
         shown.close()
-
-
-def time_left(seconds: float | None) -> str:
-    """Time left in words; "" where it is not known."""
-    if seconds is None:
-        return ""
-    return f"{seconds:.0f} s left" if seconds < 100 else f"{seconds / 60:.0f} min left"
 
 
 class _Shown:
