@@ -1,7 +1,7 @@
 """Shared by the tests of the model: float64, one small campaign, and compiled functions that many tests use.
 
 Compile time rules the run time of these tests: whatever needs the whole optical chain goes through the fixture
-`evaluate` or through `likelihood.evaluate`, which are compiled once per session for the one 512 bucket.
+`evaluate` or through `likelihood.evaluate`, which are compiled once per session for the one bucket of 96 spots.
 pyproject.toml has every array checked against its annotation (jaxtyping's import hook, at trace time).
 """
 
@@ -95,6 +95,26 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         return 0 if name == COMPILES else 2 + LONG.index(name) if name in LONG else 1
 
     items.sort(key=turn)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def shared_traces():
+    """What one process has traced and compiled the other takes: it waits for a function that the first is at."""
+    from support.compiled_once import sharing
+
+    with sharing(Path(os.environ["JAX_COMPILATION_CACHE_DIR"])):
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def short_arrays():
+    """Campaigns of the tests are short: filled up to 96 spots a fit costs a third of what it costs with 512.
+
+    The paper's 384 spots fill two doublings of it exactly.
+    """
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("tvsbayes.estimators.campaign_arrays.SMALLEST_BUCKET", 96)
+        yield
 
 
 @pytest.fixture

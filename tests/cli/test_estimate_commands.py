@@ -202,7 +202,7 @@ def test_robust_fit_names_the_spot_it_leaves_out(ask, grid_campaign, tmp_path):
 
 
 def test_a_direction_never_moved_is_null_and_one_side_is_weak(ask, say, mounted_rig, tmp_path):
-    plan = two_sheets((40, 0), (80, 30), (120, 30), (160, 60), (200, 90))
+    plan = two_sheets((80, 0), (80, 40), (160, 40), (160, 80))
     write_campaign(simulate(mounted_rig, plan, seed=5).campaign, tmp_path / "one way")
     code, document = ask("fit", tmp_path / "one way", "--no-sample")
     assert code == 0

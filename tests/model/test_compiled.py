@@ -207,7 +207,7 @@ def test_only_arrays_in_and_what_was_declared_out(traces):
         Compiled(sums, Pair)(pair(), 1.0)
 
 
-def test_threads_trace_once():
+def test_threads_trace_once(traces):
     function = Compiled(sums, Sums)
     threads = [threading.Thread(target=function, args=(pair(), 1.0)) for _ in range(4)]
     for thread in threads:

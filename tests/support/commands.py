@@ -1,6 +1,6 @@
 """Commands run in this process, and campaigns, plans and folders for them.
 
-One fit compiles the model (the paper twin, the grids and small campaigns share one bucket), all others reuse it.
+One fit compiles the model (the grids and small campaigns share one bucket), all others reuse it.
 """
 
 from __future__ import annotations
@@ -42,8 +42,11 @@ def no_constant(name: str) -> None:
 
 
 @contextmanager
-def caching_in(folder: str | Path) -> Iterator[None]:
-    """Commands of this process keep compiled functions in a folder; afterwards JAX and the package are as before."""
+def caching_in(folder: str | Path, at_once: bool = False) -> Iterator[None]:
+    """Commands of this process keep compiled functions in a folder; afterwards JAX and the package are as before.
+
+    Others find none, or `at_once` what lies there.
+    """
     import jax
     from jax.experimental.compilation_cache import compilation_cache
 
@@ -57,7 +60,7 @@ def caching_in(folder: str | Path) -> Iterator[None]:
     before = {name: jax.config.values[name] for name in names}
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("TVSBAYES_CACHE", str(folder))
-        patch.setattr(Traces, "used", None)
+        patch.setattr(Traces, "used", Traces(Path(folder) / "traced") if at_once else None)
         yield
     for name, value in before.items():
         jax.config.update(name, value)
@@ -67,7 +70,7 @@ def caching_in(folder: str | Path) -> Iterator[None]:
 @pytest.fixture(scope="module")
 def own_compilation_cache():
     """`fit` and `demo` point JAX at the folder of the tests."""
-    with caching_in(os.environ["JAX_COMPILATION_CACHE_DIR"]):
+    with caching_in(os.environ["JAX_COMPILATION_CACHE_DIR"], at_once=True):
         yield
 
 

@@ -59,6 +59,16 @@ def linear(
 INPUT_COLUMNS = np.array([INDEX[name] for name in (*INPUT_NAMES, *NOISE_NAMES)])
 
 
+class Case(eqx.Module):
+    """Settings of a calibrated rig, one a point, and what its coordinates depend on beside its parameters."""
+
+    steps: Float[Array, "points 2"]
+    side: Float[Array, "points 2"]
+    reading_rad: Float[Array, " points"]
+    period_deg: Float[Array, "2"]
+    azimuth: Bool[Array, ""]
+
+
 class Meeting(eqx.Module):
     """Where beams meet what the aperture saw: points (frame T, mm), ranges along the beams, and whether they do."""
 
@@ -149,27 +159,45 @@ def model_from(inputs: Float[Array, " columns"], period_deg: Float[Array, "2"]) 
     return model_of(jnp.zeros(len(NAMES)).at[INPUT_COLUMNS].set(inputs), jnp.tile(period_deg[:, None], 3))
 
 
-def look(calibration: Calibration, inputs: Array, noise: Array, settings: Settings) -> Meeting:
+def look(case: Case, inputs: Array, noise: Array) -> Meeting:
     """Points of one rig at many settings."""
-    period_deg = [float(calibration.period_deg.get(axis, FULL_TURN_DEG)) for axis in AXES]
-    model = model_from(inputs, jnp.asarray(period_deg))
-    rays = beams_at(model, jnp.asarray(settings.steps), jnp.asarray(settings.side), noise)
+    model = model_from(inputs, case.period_deg)
+    rays = beams_at(model, case.steps, case.side, noise)
     receiver = model.receiver
-    reading_rad = jnp.radians(jnp.asarray(settings.aperture_deg))
-    true_rad = reading_rad - receiver.aperture_zero_rad - receiver.aperture_sd_rad * noise[4]
-    azimuth = jnp.asarray(calibration.azimuth)
-    return meeting(rays.origin_mm.stacked(), rays.direction.stacked(), receiver.baseline_mm, true_rad, azimuth)
+    true_rad = case.reading_rad - receiver.aperture_zero_rad - receiver.aperture_sd_rad * noise[4]
+    return meeting(rays.origin_mm.stacked(), rays.direction.stacked(), receiver.baseline_mm, true_rad, case.azimuth)
+
+
+def case_of(calibration: Calibration, settings: Settings) -> Case:
+    """As arrays: calibrations and settings of one number share what is compiled."""
+    period_deg = [float(calibration.period_deg.get(axis, FULL_TURN_DEG)) for axis in AXES]
+    arrays = settings.steps, settings.side, np.radians(settings.aperture_deg), np.array(period_deg)
+    return Case(*map(jnp.asarray, arrays), jnp.asarray(calibration.azimuth))
+
+
+@jax.jit
+def _carried(case: Case, inputs: Array, noise: Array) -> Array:
+    def one(inputs, noise):
+        met = look(case, inputs, noise)
+        return jnp.where(met.meets, met.xyz_mm, jnp.nan).T
+
+    return jax.vmap(one)(inputs, noise)
+
+
+@jax.jit
+def _law(case: Case, mean: Array, stop_sd_deg: Array, covariance: Array) -> Linear:
+    def function(values):
+        inputs = jnp.concatenate([values[: len(INPUT_NAMES)], stop_sd_deg])
+        met = look(case, inputs, values[len(INPUT_NAMES) :])
+        return jnp.where(met.meets, met.xyz_mm, jnp.nan).T
+
+    return linear(function, mean, covariance)
 
 
 def jax_carry(calibration: Calibration, found: Drawn, settings: Settings) -> np.ndarray:
     """Every draw through the geometry: (draws, points, 3), not a number where there is no point."""
-
-    def one(inputs, noise):
-        met = look(calibration, inputs, noise, settings)
-        return jnp.where(met.meets, met.xyz_mm, jnp.nan).T
-
     with jax.enable_x64(True):
-        return np.asarray(jax.jit(jax.vmap(one))(jnp.asarray(found.inputs), jnp.asarray(found.noise)))
+        return np.asarray(_carried(case_of(calibration, settings), jnp.asarray(found.inputs), jnp.asarray(found.noise)))
 
 
 def jax_law(calibration: Calibration, settings: Settings) -> Linear:
@@ -179,16 +207,8 @@ def jax_law(calibration: Calibration, settings: Settings) -> Linear:
     """
     mean = np.concatenate([calibration.mean, np.zeros(NOISES)])
     stop_sd_deg = np.sqrt([calibration.noise_variance[name] for name in NOISE_NAMES])
-
-    def function(values):
-        inputs = jnp.concatenate([values[: len(INPUT_NAMES)], stop_sd_deg])
-        met = look(calibration, inputs, values[len(INPUT_NAMES) :], settings)
-        return jnp.where(met.meets, met.xyz_mm, jnp.nan).T
-
-    def law(mean, covariance):
-        return linear(function, mean, covariance)
-
     with jax.enable_x64(True):
-        found = jax.jit(law)(jnp.asarray(mean), jnp.asarray(calibration.covariance_with_noise))
+        given = map(jnp.asarray, (mean, stop_sd_deg, calibration.covariance_with_noise))
+        found = _law(case_of(calibration, settings), *given)
     lost = np.where(np.isnan(found.value), np.nan, 0.0)[..., None]
     return Linear(found.value, np.asarray(found.jacobian) + lost, np.asarray(found.covariance) + lost)
