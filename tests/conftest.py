@@ -228,4 +228,4 @@ def mixed_fit(mounted_rig: Rig):
     from tvsbayes.estimators.joint_fit import fit
     from tvsbayes.instrument.protocols import four_point_protocol
 
-    return fit(simulate(mounted_rig, four_point_protocol(repeats=6, steps=(100, 200)), seed=3).campaign)
+    return fit(simulate(mounted_rig, four_point_protocol(repeats=4, steps=(100, 200)), seed=3).campaign)

@@ -34,7 +34,9 @@ print("result")
 RENDERING = """
 import sys
 from tvsbayes.cli import main, progress_bar
+from tvsbayes.twin import frames
 progress_bar.SHOWN_AFTER_SECONDS = 0.0
+frames.BOARD_VIEWS = 1
 sys.exit(main.run(sys.argv[1:]))
 """
 AT_ONCE, NEVER = "0", "1000"

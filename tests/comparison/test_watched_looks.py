@@ -40,7 +40,7 @@ ROOT = Path(__file__).resolve().parents[2]
 @pytest.fixture(scope="module")
 def truth(mounted_rig) -> Truth:
     """Of the rig that `mixed_fit` was made from."""
-    return simulate(mounted_rig, four_point_protocol(repeats=6, steps=(100, 200)), seed=3).truth
+    return simulate(mounted_rig, four_point_protocol(repeats=4, steps=(100, 200)), seed=3).truth
 
 
 def next_day(rig, truth: Truth, seed: int = 11, repeats: int = 1, **changed: float) -> Campaign:

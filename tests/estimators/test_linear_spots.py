@@ -17,6 +17,7 @@ from tvsbayes.estimators.linear_spots import (
     standard_deviations_without,
     stop_information,
 )
+from tvsbayes.model.compiled import BATCH
 from tvsbayes.posterior.predictive import move_log_density
 
 DENSE = 1e-8
@@ -209,7 +210,8 @@ def test_log_density_of_a_move_is_what_the_campaign_loses_without_it(x64, dozen)
     Home offsets, unknown play, stop errors that outlive moves of the other axis, two looks at one stop.
     """
     rng = np.random.default_rng(5)
-    z = jnp.asarray(dozen.z + 0.1 * rng.standard_normal((2, dozen.z.size)))
+    # As many as a fit asks for at once: that is compiled.
+    z = jnp.asarray(dozen.z + 0.1 * rng.standard_normal((BATCH, dozen.z.size)))
     # Errors at places are given: what others say of them would be lost with a move.
     bare = eqx.tree_at(lambda a: a.gears, dozen.arrays, no_gears(len(dozen.arrays.spots.valid)))
     dozen = replace(dozen, arrays=bare)
