@@ -23,18 +23,16 @@ from support.dense_likelihood import (
     side,
     stop_labels,
 )
+from support.dozen_algebra import NOISE, found_at
 from support.varying_gears import PERIODS_DEG, coordinates_with, perfect_gears, varying_gears
 
-from tvsbayes.estimators.annealed_stage import Fixed, reduced_residuals
 from tvsbayes.estimators.campaign_arrays import campaign_arrays
-from tvsbayes.estimators.likelihood import innovations, no_draw, standing
 from tvsbayes.instrument.campaign import ordered_spots
-from tvsbayes.instrument.parameters import NAMES, NOISE_NAMES
+from tvsbayes.instrument.parameters import NAMES
 from tvsbayes.model.parameter_space import coordinates_of, parameter_space, physical_at
 
 pytestmark = pytest.mark.usefixtures("x64")
 
-NOISE = np.isin(NAMES, NOISE_NAMES)
 LOG_UNIT = 1.0
 """One unit of log density; a covariance of nearly equal places, factored, leaves 1e-8 of it."""
 FINE_UNIT = 1e-8 * LOG_UNIT
@@ -85,29 +83,6 @@ def varying(dozen) -> Varying:
         arrays = jax.tree.map(jnp.asarray, campaign_arrays(dozen.campaign, table))
         true = physical_at(dozen.z, dozen.space).value
         return Varying(dozen.campaign, space, arrays, coordinates_of(space, true))
-
-
-@jax.jit
-def _found(z, normals, space, arrays, fixed):
-    model = space.model(z)
-    found = standing(model, arrays)
-    terms = {
-        "residual": jnp.stack(found.terms.residual, axis=1),
-        "slope": jnp.stack([jnp.stack(found.terms.by_pan, 1), jnp.stack(found.terms.by_tilt, 1)], axis=2),
-        "log_scale": found.terms.log_scale,
-    }
-    seen = jax.vmap(lambda normal: innovations(model, arrays, normal))(normals)
-    return model, terms, seen, reduced_residuals(z, (space, arrays, fixed))
-
-
-def found_at(varying: Varying, z: np.ndarray) -> SimpleNamespace:
-    """Everything of one point; errors at places at their means, then moved by each normal number by itself."""
-    size = 2 * len(varying.arrays.gears.places.steps)
-    normals = np.concatenate([no_draw(1, varying.arrays), np.eye(size)])
-    fixed = Fixed(jnp.asarray(NOISE), jnp.asarray(z), jnp.asarray(1.0))
-    arguments = jnp.asarray(z), jnp.asarray(normals), varying.space, varying.arrays, fixed
-    model, terms, seen, reduced = jax.tree.map(np.asarray, _found(*arguments))
-    return SimpleNamespace(model=model, terms=SimpleNamespace(**terms), seen=seen, reduced=reduced)
 
 
 @pytest.fixture(scope="module", params=SCALES)
