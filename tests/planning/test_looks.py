@@ -118,21 +118,31 @@ def test_looks_taken_again_count_as_often_as_they_are_taken():
             assert np.abs(information - whole).max() < ROUNDING * np.abs(whole).max()
 
 
-@pytest.mark.parametrize("block", [7, *(pytest.param(n, marks=pytest.mark.slow) for n in (1, 1000))])
-def test_looks_and_instruments_keep_their_places_whatever_the_block(knowledge, monkeypatch, block):
-    """One by one, and in blocks that end within an instrument or hold all of them; those out of view with them."""
-    steps = np.array([[0, 0], [100, 20], [900, 0], [40, -30], [60, 400]])
-    looks = Looks(steps, np.array([[1, 1], [-1, 1], [1, 1], [1, -1], [-1, -1]]), np.array([0, 1, 2, 0, 1]))
-    drawn = draw_instruments(knowledge, 3, seed=1)
+STEPS = [[0, 0], [100, 20], [900, 0], [40, -30], [60, 400], [20, 20], [-30, 10]]
+SIDES = [[1, 1], [-1, 1], [1, 1], [1, -1], [-1, -1], [1, 1], [-1, 1]]
+
+
+@pytest.mark.parametrize(
+    ("block", "count"), [(None, 150), *(pytest.param(n, 3, marks=pytest.mark.slow) for n in (1, 5, 1000))]
+)
+def test_looks_and_instruments_keep_their_places_whatever_the_block(knowledge, monkeypatch, block, count):
+    """One by one, and in blocks that end within an instrument or hold all of them; those out of view with them.
+
+    Of seven looks the package's own blocks of 128 and 1024 pairs end within an instrument, and are compiled anyway.
+    """
+    looks = Looks(np.array(STEPS), np.array(SIDES), np.array([0, 1, 2, 0, 1, 0, 1]))
+    drawn = draw_instruments(knowledge, count, seed=1)
     # The truth lies in another space where something is held fixed; whether it is seen is asked in the common one.
     z = drawn.z
-    one_by_one = [LookArrays(looks, knowledge, False).at(point, knowledge.space) for point in z]
-    monkeypatch.setattr(LookArrays, "SHOWN", block)
-    monkeypatch.setattr(LookArrays, "IN_IMAGES", block)
+    rows = [row for row in (0, 1, 128 // 7, 256 // 7, 1024 // 7, count - 1) if row < count]
+    one_by_one = [LookArrays(looks, knowledge, False).at(z[row], knowledge.space) for row in rows]
+    if block is not None:
+        monkeypatch.setattr(LookArrays, "SHOWN", block)
+        monkeypatch.setattr(LookArrays, "IN_IMAGES", block)
     arrays = LookArrays(looks, knowledge, False)
     value = np.broadcast_to(np.asarray(knowledge.space.value), drawn.value.shape)
     together = arrays.at_all(z, value)
-    for one, other in zip(one_by_one, (together[row] for row in range(3)), strict=True):
+    for one, other in zip(one_by_one, (together[row] for row in rows), strict=True):
         assert np.array_equal(one.seen, other.seen)
         assert one.rows == pytest.approx(other.rows, rel=ROUNDING, abs=ROUNDING * np.abs(one.rows).max())
         assert one.mirror_angles_rad == pytest.approx(other.mirror_angles_rad, rel=ROUNDING)
