@@ -48,10 +48,13 @@ export class Looks {
     return Int32Array.from({ length: this.count }, (_, row) => this.first + row);
   }
 
-  /** At most so many rows, evenly chosen, among those whose numbers are known. */
-  some(name, most) {
+  /** At most so many rows, evenly chosen, among those whose numbers, or one of them, are known. */
+  some(name, most, part = null) {
     const known = [];
-    for (let row = 0; row < this.count; row++) if (this.row(name, row).every(Number.isFinite)) known.push(row);
+    for (let row = 0; row < this.count; row++) {
+      const told = part === null ? this.row(name, row).every(Number.isFinite) : Number.isFinite(this.at(name, row, part));
+      if (told) known.push(row);
+    }
     if (known.length <= most) return known;
     return Array.from({ length: most }, (_, k) => known[Math.floor((k * known.length) / most)]);
   }

@@ -235,7 +235,7 @@ class Page {
       by(id).on("plotly_click", (event) => { const places = placesOf(event); if (places.length) this.choose(places); });
     }
     for (const id of ["residuals", "stops"]) {
-      by(id).on("plotly_selected", (event) => { const places = placesOf(event); if (places.length) this.choose(places); });
+      by(id).on("plotly_selected", (event) => { const places = this[id].framed(event); if (places.length) this.choose(places); });
     }
     by("correlation").on("plotly_click", ({ points: [point] }) => this.mark([point.y, point.x]));
   }

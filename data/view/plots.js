@@ -2,9 +2,12 @@
 
 export const COLOURS = ["#1f6fb2", "#c77a12"];
 export const CHOSEN = "#c2185b";
-const POINTS_SVG = 3000;
-const ARROWS_MOST = 4000;
-const BARS_MOST = 2000;
+/** Of very many looks so many have a dot, an arrow, a bar: every change of a plot costs time for all it shows. */
+export const DOTS_MOST = 3000;
+const ARROWS_MOST = 2000;
+const BARS_MOST = 1000;
+export const MARKS_MOST = 3000;
+const MARK_PX = 6;
 const WINDOW_PX = 25;
 /** Nothing of what Plotly would send elsewhere: its cloud button is on by default. */
 export const CONFIG = {
@@ -26,11 +29,6 @@ export class Lines {
   get x() { return this.parts[0]; }
   get y() { return this.parts[1]; }
   get z() { return this.parts[2]; }
-}
-
-/** WebGL for many points; few stay vectors, also in an exported SVG. */
-function kindFor(count) {
-  return count > POINTS_SVG ? "scattergl" : "scatter";
 }
 
 function base(more) {
@@ -59,9 +57,104 @@ function arrows(looks, rows, camera, scale) {
   return lines;
 }
 
-export class Residuals {
+/** What both planes share: two plots side by side, each with a dot a look, marks on what is selected. */
+class Plane {
+  constructor(element, scenes, [x, y]) {
+    Object.assign(this, { element, scenes, names: [x, y], places: [] });
+  }
+
+  /** Dots of one campaign in one of its plots; `more` has text and what is shown of a dot. */
+  dots(number, k, more) {
+    const { looks } = this.scenes.all[number];
+    const rows = looks.some(this.names[1], DOTS_MOST, this.part(1, k));
+    const [x, y] = this.numbers(looks, k, rows);
+    return {
+      type: "scatter", mode: "markers", name: "looks", ...side(k), x, y, customdata: rows.map((row) => looks.first + row),
+      marker: { size: looks.count > DOTS_MOST ? 3 : 5, color: COLOURS[number] },
+      selected: { marker: { opacity: 1 } }, unselected: { marker: { opacity: 1 } }, ...more(looks, rows),
+    };
+  }
+
+  /** Where looks stand in one of the plots; all by default. */
+  numbers(looks, k, rows = null) {
+    return this.names.map((name, axis) => looks.column(name, this.part(axis, k), rows));
+  }
+
+  /** All looks within the frame or lasso that was drawn, also those without a dot. */
+  framed(event) {
+    const drawn = event?.range ?? event?.lassoPoints;
+    if (drawn === undefined) return [];
+    const k = "x2" in drawn ? 1 : 0;
+    const [xs, ys] = [drawn[k ? "x2" : "x"], drawn[k ? "y2" : "y"]];
+    const inside = event.range ? inFrame(xs, ys) : inLasso(xs, ys);
+    return this.scenes.all.flatMap(({ looks }) => {
+      const [x, y] = this.numbers(looks, k);
+      return [...looks.places()].filter((_, row) => inside(x[row], y[row]));
+    });
+  }
+
+  /** Marks keep their size on the screen. */
+  follow() {
+    this.element.on("plotly_relayout", (change) => {
+      if (Object.keys(change).some((key) => /^[xy]axis/.test(key))) this.choose(this.places);
+    });
+  }
+
+  choose(places) {
+    this.places = places;
+    const byScene = this.scenes.rowsBy(some(places, MARKS_MOST));
+    return Plotly.relayout(this.element, { shapes: [0, 1].flatMap((k) => this.shapes(byScene, k)) });
+  }
+
+  shapes(byScene, k) {
+    const [x, y] = [side(k).xaxis, side(k).yaxis];
+    const { layout, clientWidth, clientHeight } = this.element;
+    const size = (axis, length) => Math.abs(axis.range[1] - axis.range[0]) * MARK_PX / length;
+    const across = size(layout[x.replace("x", "xaxis")], 0.42 * clientWidth);
+    const down = size(layout[y.replace("y", "yaxis")], 0.75 * clientHeight);
+    let path = "";
+    byScene.forEach((rows, number) => {
+      const [us, vs] = this.numbers(this.scenes.all[number].looks, k, rows);
+      us.forEach((u, i) => { if (Number.isFinite(u + vs[i])) path += diamond(u, vs[i], across, down); });
+    });
+    return path ? [{ type: "path", xref: x, yref: y, path, name: "chosen", line: { color: CHOSEN, width: 2 } }] : [];
+  }
+}
+
+/** At most so many of a list, evenly chosen. */
+export function some(list, most) {
+  if (list.length <= most) return list;
+  return Array.from({ length: most }, (_, k) => list[Math.floor((k * list.length) / most)]);
+}
+
+function diamond(u, v, across, down) {
+  return `M${u - across},${v}L${u},${v - down}L${u + across},${v}L${u},${v + down}Z`;
+}
+
+function inFrame([x0, x1], [y0, y1]) {
+  const within = (value, a, b) => value >= Math.min(a, b) && value <= Math.max(a, b);
+  return (x, y) => within(x, x0, x1) && within(y, y0, y1);
+}
+
+/** By the number of sides that a ray to the left crosses. */
+function inLasso(xs, ys) {
+  return (x, y) => {
+    let inside = false;
+    for (let k = 0, j = xs.length - 1; k < xs.length; j = k++) {
+      if ((ys[k] > y) !== (ys[j] > y) && x < ((xs[j] - xs[k]) * (y - ys[k])) / (ys[j] - ys[k]) + xs[k]) inside = !inside;
+    }
+    return inside;
+  };
+}
+
+export class Residuals extends Plane {
   constructor(element, scenes) {
-    Object.assign(this, { element, scenes, scale: 30, places: [] });
+    super(element, scenes, ["pixels_px", "pixels_px"]);
+    this.scale = 30;
+  }
+
+  part(axis, camera) {
+    return 2 * camera + axis;
   }
 
   async draw() {
@@ -70,27 +163,16 @@ export class Residuals {
       const rows = looks.some("residual_px", ARROWS_MOST);
       for (const camera of [0, 1]) {
         const lines = arrows(looks, rows, camera, this.scale);
-        const text = looks.column("spot");
+        traces.push(this.dots(number, camera, (own, shown) => ({
+          text: own.column("spot", 0, shown), hovertemplate: "look %{text}<br>%{x:.2f}, %{y:.2f} px<extra></extra>",
+        })));
         traces.push({
-          type: kindFor(looks.count), mode: "markers", name: "looks", ...side(camera), customdata: looks.places(), text,
-          x: looks.column("pixels_px", 2 * camera), y: looks.column("pixels_px", 2 * camera + 1),
-          marker: { size: looks.count > POINTS_SVG ? 2 : 4, color: COLOURS[number], opacity: 0.6 },
-          selected: { marker: { opacity: 0.6 } }, unselected: { marker: { opacity: 0.6 } },
-          hovertemplate: "look %{text}<br>%{x:.2f}, %{y:.2f} px<extra></extra>",
-        });
-        traces.push({
-          type: kindFor(lines.x.length), mode: "lines", name: "arrows", ...side(camera), hoverinfo: "skip",
+          type: "scatter", mode: "lines", name: "arrows", ...side(camera), hoverinfo: "skip",
           x: lines.x, y: lines.y, line: { color: COLOURS[number], width: 1 }, meta: { number, camera },
         });
       }
     });
     this.traces = traces;
-    for (const camera of [0, 1]) {
-      traces.push({ type: "scatter", mode: "markers", name: "chosen", ...side(camera), hoverinfo: "skip", x: [], y: [],
-        marker: { size: 9, color: CHOSEN, symbol: "circle-open", line: { width: 2 } } });
-      traces.push({ type: "scatter", mode: "lines", name: "chosen", ...side(camera), hoverinfo: "skip", x: [], y: [],
-        line: { color: CHOSEN, width: 2 } });
-    }
     const [width, height] = this.scenes.all[0].image_px;
     const x = { ...AXIS, range: [-0.5, width - 0.5], title: { text: "u, px" }, constrain: "domain" };
     const y = { ...AXIS, range: [height - 0.5, -0.5], title: { text: "v, px" }, constrain: "domain" };
@@ -99,12 +181,16 @@ export class Residuals {
       xaxis: x, yaxis: { ...y, scaleanchor: "x" }, xaxis2: x, yaxis2: { ...y, scaleanchor: "x2" },
       annotations: titles(this.scenes.told.cameras),
     }), CONFIG);
+    this.follow();
   }
 
   remark() {
-    if (!this.scenes.all.some((scene) => scene.fitted)) return "No residuals without a fit; the dots are the centres found.";
+    const dots = this.scenes.all.map(({ looks }) => looks.some("pixels_px", DOTS_MOST).length).join(" and ");
+    if (!this.scenes.all.some((scene) => scene.fitted)) {
+      return `No residuals without a fit; dots: centres of ${dots} looks. Drag over looks to select them in all plots.`;
+    }
     const drawn = this.scenes.all.map(({ looks }) => looks.some("residual_px", ARROWS_MOST).length).join(" and ");
-    return `Arrows of ${drawn} looks. Drag over looks to select them in all plots.`;
+    return `Dots of ${dots} looks, arrows of ${drawn}. Drag over looks to select them, all of them, in all plots.`;
   }
 
   async enlarge(scale) {
@@ -118,26 +204,15 @@ export class Residuals {
     await this.choose(this.places);
   }
 
-  choose(places) {
-    this.places = places;
-    const data = { x: [], y: [] };
-    const byScene = this.scenes.rowsBy(places);
-    for (const camera of [0, 1]) {
-      const dots = { x: [], y: [] };
-      const lines = new Lines(2);
-      byScene.forEach((rows, number) => {
-        const { looks } = this.scenes.all[number];
-        dots.x.push(...looks.column("pixels_px", 2 * camera, rows));
-        dots.y.push(...looks.column("pixels_px", 2 * camera + 1, rows));
-        const own = arrows(looks, rows, camera, this.scale);
-        lines.x.push(...own.x);
-        lines.y.push(...own.y);
-      });
-      data.x.push(dots.x, lines.x);
-      data.y.push(dots.y, lines.y);
+  shapes(byScene, camera) {
+    const lines = byScene.map((rows, number) => arrows(this.scenes.all[number].looks, rows, camera, this.scale));
+    let path = "";
+    for (const { x, y } of lines) {
+      for (let k = 0; k + 1 < x.length; k += 3) path += `M${x[k]},${y[k]}L${x[k + 1]},${y[k + 1]}`;
     }
-    const last = this.traces.length;
-    return Plotly.restyle(this.element, data, [last - 4, last - 3, last - 2, last - 1]);
+    const arrow = { type: "path", xref: side(camera).xaxis, yref: side(camera).yaxis, path, name: "chosen arrows",
+      line: { color: CHOSEN, width: 2 } };
+    return path ? [...super.shapes(byScene, camera), arrow] : super.shapes(byScene, camera);
   }
 }
 
@@ -152,9 +227,13 @@ function bandTraces(band, number) {
   ];
 }
 
-export class Stops {
+export class Stops extends Plane {
   constructor(element, scenes) {
-    Object.assign(this, { element, scenes });
+    super(element, scenes, ["steps", "deviation_deg"]);
+  }
+
+  part(_, k) {
+    return k;
   }
 
   async draw() {
@@ -162,30 +241,21 @@ export class Stops {
     this.scenes.all.forEach(({ looks, gears }, number) => {
       traces.push(...gears.flatMap((band) => bandTraces(band, number)));
       AXES.forEach((axis, k) => {
-        const rows = looks.some("deviation_deg", BARS_MOST);
         const bars = new Lines(2);
-        for (const row of rows) {
+        for (const row of looks.some("deviation_deg", BARS_MOST, k)) {
           const [n, off, u] = [looks.at("steps", row, k), looks.at("deviation_deg", row, k), looks.at("u_deg", row, k)];
           bars.add([[n, off - u], [n, off + u]]);
         }
         traces.push({
-          type: kindFor(looks.count), mode: "lines", name: "u", ...side(k), hoverinfo: "skip", x: bars.x, y: bars.y,
+          type: "scatter", mode: "lines", name: "u", ...side(k), hoverinfo: "skip", x: bars.x, y: bars.y,
           line: { color: COLOURS[number], width: 1 }, opacity: 0.4,
         });
-        traces.push({
-          type: kindFor(looks.count), mode: "markers", name: "looks", ...side(k), customdata: looks.places(),
-          x: looks.column("steps", k), y: looks.column("deviation_deg", k),
-          text: looks.texts.direction.map((pair, row) => `look ${looks.at("spot", row)}, came ${pair[k] || "unknown"}`),
-          marker: { size: looks.count > POINTS_SVG ? 2 : 5, color: COLOURS[number] },
-          selected: { marker: { opacity: 1 } }, unselected: { marker: { opacity: 1 } },
-          hovertemplate: "%{text}<br>%{x} steps, %{y:.4f} deg<extra></extra>",
-        });
+        const came = (own, row) => `look ${own.at("spot", row)}, came ${own.texts.direction[row][k] || "unknown"}`;
+        traces.push(this.dots(number, k, (own, shown) => ({
+          text: shown.map((row) => came(own, row)), hovertemplate: "%{text}<br>%{x} steps, %{y:.4f} deg<extra></extra>",
+        })));
       });
     });
-    AXES.forEach((_, k) => traces.push({
-      type: "scatter", mode: "markers", name: "chosen", ...side(k), hoverinfo: "skip", x: [], y: [],
-      marker: { size: 9, color: CHOSEN, symbol: "circle-open", line: { width: 2 } },
-    }));
     this.traces = traces;
     const x = { ...AXIS, title: { text: "counter, steps" } };
     const y = { ...AXIS, title: { text: "deviation, deg" } };
@@ -193,19 +263,12 @@ export class Stops {
       grid: { rows: 1, columns: 2, pattern: "independent" }, dragmode: "select", xaxis: x, yaxis: y, xaxis2: x, yaxis2: y,
       annotations: titles(AXES),
     }), CONFIG);
+    this.follow();
   }
 
   show(name, wanted) {
     const own = this.traces.flatMap((trace, k) => (trace.name === name ? [k] : []));
     return own.length ? Plotly.restyle(this.element, { visible: wanted }, own) : null;
-  }
-
-  choose(places) {
-    const byScene = this.scenes.rowsBy(places);
-    const of = (name, k) =>
-      byScene.flatMap((rows, number) => [...this.scenes.all[number].looks.column(name, k, rows)]);
-    const data = { x: [of("steps", 0), of("steps", 1)], y: [of("deviation_deg", 0), of("deviation_deg", 1)] };
-    return Plotly.restyle(this.element, data, [this.traces.length - 2, this.traces.length - 1]);
   }
 }
 

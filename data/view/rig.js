@@ -1,6 +1,6 @@
 // The rig in 3D: cameras, positioner, mirrors, beams, sheets, spots and their error ellipsoids.
 
-import { CHOSEN, COLOURS, CONFIG, Lines } from "./plots.js";
+import { CHOSEN, COLOURS, CONFIG, DOTS_MOST, Lines, MARKS_MOST, some } from "./plots.js";
 
 const BEAMS_MOST = 300;
 const ELLIPSOIDS_MOST = 200;
@@ -8,7 +8,7 @@ const CHOSEN_MOST = 300;
 const RING = 24;
 const MIRROR_HALF_MM = 8;
 export const VIEWS = {
-  "from-above": { eye: { x: 0, y: 0, z: 1.7 }, up: { x: 1, y: 0, z: 0 } },
+  "from-above": { eye: { x: 0, y: 0, z: 2.3 }, up: { x: 1, y: 0, z: 0 } },
   "from-side": { eye: { x: 0, y: -1.7, z: 0.3 }, up: { x: 0, y: 0, z: 1 } },
   "from-behind": { eye: { x: -1.6, y: -0.3, z: 0.5 }, up: { x: 0, y: 0, z: 1 } },
 };
@@ -85,14 +85,15 @@ function sceneTraces(scene, number, scale) {
   const ellipsoids = new Lines(3);
   for (const row of looks.some("ellipsoid_mm", ELLIPSOIDS_MOST)) addEllipsoid(ellipsoids, looks, row, scale);
   const mirrors = new Lines(3);
+  const rows = looks.some("point_mm", DOTS_MOST);
   const [first] = looks.some("second_normal", 1);
   if (first !== undefined) addMirrors(mirrors, looks, first);
   const traces = [
     {
-      type: "scatter3d", mode: "markers", name: "spots", customdata: looks.places(),
-      x: looks.column("point_mm", 0), y: looks.column("point_mm", 1), z: looks.column("point_mm", 2),
-      marker: { size: looks.count > 5000 ? 1.5 : 3, color: colour },
-      hovertemplate: "look %{text}<br>%{x:.2f} %{y:.2f} %{z:.2f} mm<extra></extra>", text: looks.column("spot"),
+      type: "scatter3d", mode: "markers", name: "spots", customdata: rows.map((row) => looks.first + row),
+      x: looks.column("point_mm", 0, rows), y: looks.column("point_mm", 1, rows), z: looks.column("point_mm", 2, rows),
+      marker: { size: looks.count > DOTS_MOST ? 1.5 : 3, color: colour },
+      hovertemplate: "look %{text}<br>%{x:.2f} %{y:.2f} %{z:.2f} mm<extra></extra>", text: looks.column("spot", 0, rows),
     },
     lineTrace("ellipsoids", ellipsoids, colour, 1),
     lineTrace("beams", beams, colour, 1, { opacity: 0.35 }),
@@ -115,18 +116,19 @@ function chosenTraces(scenes, places, scale) {
   const marks = { x: [], y: [], z: [] };
   const ways = new Lines(3);
   const ellipsoids = new Lines(3);
-  const every = Math.ceil(places.length / CHOSEN_MOST);
-  places.forEach((place, k) => {
+  for (const place of some(places, MARKS_MOST)) {
     const { scene: { looks }, row } = scenes.at(place);
     const point = looks.row("point_mm", row);
     marks.x.push(point[0]);
     marks.y.push(point[1]);
     marks.z.push(point[2]);
-    if (k % every) return;
+  }
+  for (const place of some(places, CHOSEN_MOST)) {
+    const { scene: { looks }, row } = scenes.at(place);
     addWay(ways, looks, row);
     addEllipsoid(ellipsoids, looks, row, scale);
     if (places.length === 1) addMirrors(ways, looks, row);
-  });
+  }
   return [
     { type: "scatter3d", mode: "markers", name: "chosen", hoverinfo: "skip", ...marks,
       marker: { size: 5, color: CHOSEN, symbol: "circle-open" } },
@@ -165,7 +167,8 @@ export class Rig {
     const counts = this.scenes.all.map(({ looks }) => [looks.some("end_mm", Infinity).length, looks.count]);
     const shown = counts.map(([known]) => Math.min(known, BEAMS_MOST)).join(" and ");
     const told = counts.map(([known, all]) => `${known} of ${all}`).join(" and ");
-    return `${told} looks have a spot; beams of ${shown}, ellipsoids (95 %, pixel noise) of at most ${ELLIPSOIDS_MOST}, ` +
+    const dots = counts.map(([known]) => Math.min(known, DOTS_MOST)).join(" and ");
+    return `${told} looks have a spot; dots of ${dots}, beams of ${shown}, ellipsoids (95 %, pixel noise) of at most ${ELLIPSOIDS_MOST}, ` +
       "and of what is selected. Click a spot to select its look.";
   }
 

@@ -24,6 +24,7 @@ from selenium.webdriver.common.by import By
 from selenium.webdriver.support.ui import Select, WebDriverWait
 from support.served_pages import page_served
 
+from tvsbayes.instrument.campaign import read_campaign, with_pixels
 from tvsbayes.view.contents import Contents, page_files
 from tvsbayes.view.document import document
 from tvsbayes.view.gathering import look_at
@@ -45,10 +46,12 @@ FLAGS = (
     *("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"),
 )
 """No screen, perhaps root, no graphics card."""
-EMIT = (
-    "const [plot, name, places] = arguments; document.getElementById(plot).emit(name,"
+CLICK = (
+    "const [plot, places] = arguments; document.getElementById(plot).emit('plotly_click',"
     " {points: places.map((place) => ({customdata: place}))})"
 )
+FRAME = "const [plot, range] = arguments; document.getElementById(plot).emit('plotly_selected', {range})"
+LASSO = "const [plot, lassoPoints] = arguments; document.getElementById(plot).emit('plotly_selected', {lassoPoints})"
 """What Plotly tells the page when points are clicked or framed."""
 PLOTS = ("rig", "pictures", "residuals", "stops", "correlation", "changes")
 
@@ -85,6 +88,12 @@ class Browsed:
             ".map((t) => ({count: t.x.length, visible: t.visible ?? true, first: Array.from(t.x).slice(0, 9)}))"
         )
         return self.js(code, plot, name)
+
+    def marks(self, plot: str) -> list[int]:
+        """Of a plane plot, marks on what is selected: left and right."""
+        shapes = self.js("return document.getElementById(arguments[0]).layout.shapes ?? []", plot)
+        marks = {shape["xref"]: shape["path"].count("Z") for shape in shapes if shape["name"] == "chosen"}
+        return [marks.get(axis, 0) for axis in ("x", "x2")]
 
     def chosen(self) -> int:
         return int(self.js("return document.body.dataset.chosen"))
@@ -146,7 +155,7 @@ def test_page_shows_everything_and_sends_nothing(page):
     assert page.one("name").text == "paper twin beside paper twin"
     for plot in PLOTS:
         assert page.js("return document.getElementById(arguments[0]).querySelectorAll('.main-svg').length", plot) > 0
-    assert [trace["count"] for trace in page.traces("rig", "spots")] == [384, 384]
+    assert [trace["count"] for trace in page.traces("rig", "spots")] == [383, 383]
     assert len(page.traces("rig", "sheets")) == 4 and len(page.traces("residuals", "looks")) == 4
     assert page.one("verdict").text == "no significant change"
     rows = page.driver.find_elements(By.CSS_SELECTOR, "#changes-table tbody tr")
@@ -194,7 +203,7 @@ def test_looks_are_walked_by_number(page):
     page.until("document.getElementById('chosen').textContent === ''")
     page.click("none")
     page.until("document.body.dataset.chosen === '0'")
-    assert [trace["count"] for trace in page.traces("stops", "chosen")] == [0, 0]
+    assert page.marks("stops") == page.marks("residuals") == [0, 0]
 
 
 def test_picture_of_a_look_with_what_was_found(page):
@@ -213,15 +222,23 @@ def test_picture_of_a_look_with_what_was_found(page):
 
 
 def test_what_is_framed_in_one_plot_is_selected_in_all(page):
-    page.js(EMIT, "residuals", "plotly_selected", [4, 5, 390])
+    page.js(CLICK, "rig", [4, 5, 390])
     page.until("document.body.dataset.chosen === '3'")
     assert page.traces("rig", "chosen")[0]["count"] == 3
-    assert [trace["count"] for trace in page.traces("stops", "chosen")] == [3, 3]
+    assert page.marks("stops") == page.marks("residuals") == [3, 3]
     assert page.one("chosen").text == "3 looks are selected"
-    page.js(EMIT, "rig", "plotly_click", [9])
+    page.js(FRAME, "residuals", {"x2": [0, 1280], "y2": [720, 0]})
+    seen = 2 * 383
+    page.until(f"document.body.dataset.chosen === '{seen}'")
+    assert page.marks("stops") == [seen, seen]
+    # A triangle around the looks at the counter 200, whatever their deviation.
+    page.js(LASSO, "stops", {"x": [190, 210, 200], "y": [-50, -50, 50]})
+    page.until(f"document.body.dataset.chosen !== '{seen}'")
+    assert 0 < page.chosen() < seen and page.marks("residuals") == [page.chosen()] * 2
+    page.js(CLICK, "stops", [9])
     page.until("document.body.dataset.chosen === '1'")
-    assert page.traces("residuals", "chosen")[0]["count"] == 1
-    page.js(EMIT, "stops", "plotly_selected", [])
+    assert page.marks("residuals") == [1, 1]
+    page.js(FRAME, "stops", {"x": [1e6, 2e6], "y": [0, 1]})
     assert page.chosen() == 1
 
 
@@ -348,6 +365,27 @@ def test_another_origin_reaches_nothing(both, browsed):
     browsed.complaints()
 
 
+def test_folder_without_results_and_one_without_spots(viewed, browsed):
+    """The stated rig without residuals; then cameras alone."""
+    campaign = read_campaign(viewed.bare)
+    blind = replace(campaign, spots=tuple(with_pixels(spot, "undetected") for spot in campaign.spots))
+    browsed.complaints()
+    for looked, seen in ((look_at(viewed.bare), 383), (Looked((scene(blind),)), 0)):
+        with page_served(contents_of(looked, viewed.bare)) as link:
+            assert browsed.opened(link) == "ready"
+            assert browsed.traces("rig", "spots")[0]["count"] == seen
+            assert len(browsed.traces("rig", "cameras")) == 1
+            assert browsed.one("residuals-remark").text.startswith("No residuals without a fit")
+            assert not browsed.one("correlation-figure").is_displayed()
+            assert not browsed.one("changes-figure").is_displayed()
+            browsed.click("next")
+            browsed.until("document.getElementById('look').value === '1'")
+            browsed.click("unlikely")
+            browsed.until("document.getElementById('chosen').textContent === 'the fit doubts no look'")
+            browsed.driver.find_element(By.CSS_SELECTOR, "#parameters tbody tr").click()
+    assert browsed.complaints() == []
+
+
 def many(looks: LookColumns, count: int) -> LookColumns:
     """The same looks again and again, each a little aside."""
     rows = np.arange(count) % len(looks.spot)
@@ -369,13 +407,14 @@ def test_fifty_thousand_looks(viewed, browsed):
     browsed.complaints()
     with page_served(contents) as link:
         assert browsed.opened(link) == "ready"
-        assert browsed.traces("rig", "spots")[0]["count"] == MANY
-        kinds = browsed.js("return document.getElementById('residuals').data.map((t) => [t.name, t.type])")
-        assert ["looks", "scattergl"] in kinds and ["looks", "scatter"] not in kinds
+        assert browsed.traces("rig", "spots")[0]["count"] == 3000
         browsed.click("next")
         browsed.until("document.getElementById('look').value === '1'")
-        browsed.js(EMIT, "residuals", "plotly_selected", list(range(0, MANY, 5)))
-        browsed.until(f"document.body.dataset.chosen === '{MANY // 5}'")
-        assert browsed.traces("stops", "chosen")[0]["count"] == MANY // 5
-        assert "ellipsoids (95 %, pixel noise) of at most 200" in browsed.one("rig-remark").text
+        # All looks are selected, also those without a dot.
+        browsed.js(FRAME, "residuals", {"x": [-1e4, 1e4], "y": [-1e4, 1e4]})
+        known = MANY - MANY // 384 - 1
+        browsed.until(f"Number(document.body.dataset.chosen) >= {known - 1}")
+        assert browsed.chosen() < MANY
+        assert browsed.marks("stops") == browsed.marks("residuals") != [0, 0]
+        assert f"of {MANY} looks have a spot; dots of 3000" in browsed.one("rig-remark").text
     assert browsed.complaints() == []
