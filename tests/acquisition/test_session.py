@@ -16,8 +16,9 @@ from support.bench_runs import HEADER, RIG_FILE, Failing, Run, small_plan
 from tvsbayes.acquisition.journal import LOG, read_journal
 from tvsbayes.acquisition.journal_check import verify
 from tvsbayes.acquisition.recorder import recorded
+from tvsbayes.acquisition.replanning import check_plan
 from tvsbayes.acquisition.run_identity import setup_changes
-from tvsbayes.acquisition.session import acquire, begin, check_plan
+from tvsbayes.acquisition.session import acquire, begin
 from tvsbayes.cli.main import run
 from tvsbayes.errors import InputError
 from tvsbayes.instrument.campaign import read_campaign

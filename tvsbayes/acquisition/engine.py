@@ -21,10 +21,11 @@ from tvsbayes.acquisition.journal_events import Four
 from tvsbayes.acquisition.observation import Observation
 from tvsbayes.acquisition.operator import HAZARD, Progress, StopKey
 from tvsbayes.acquisition.recorder import Recorded
+from tvsbayes.acquisition.replanning import ADAPTED, Proposal, Replanning, adapted_entries, check_plan
 from tvsbayes.acquisition.run_identity import setup_entries
 from tvsbayes.acquisition.run_log import Outcome, RunLog
 from tvsbayes.acquisition.running_estimate import RunningEstimate
-from tvsbayes.errors import DeviceFault, TvsError
+from tvsbayes.errors import DeviceFault, InputError, TvsError
 from tvsbayes.instrument.axes import AXES, direction_of
 from tvsbayes.instrument.campaign import Spot, pixels_of
 from tvsbayes.instrument.plan import PlanStep, plan_seconds, run_plan
@@ -138,19 +139,46 @@ class Acquisition:
         next_row = resumed.next_step if resumed.moves else 0
         self._log.warnings += self._log.files.keep_edited()
         self._recover(resumed, next_row)
-        for step in self.plan[next_row:]:
-            if self._stop.requested:
-                return "interrupted"
-            self._tell(step)
-            self._do(step)
-            if step.action == "look" and self._estimate is not None and self._estimate.update(self._log.ok_looks):
-                reason = "target met"
-                break
-        else:
-            reason = "done"
-        if self._log.recorder.moves:
+        reason = self._followed(next_row)
+        if reason != "interrupted" and self._log.recorder.moves:
             self._log.close_segment(self.bench.positioner.home())
         return reason
+
+    def _followed(self, row: int) -> str:
+        """Follows the plan from a row on, as it is changed meanwhile; why it ended."""
+        while row < len(self.plan):
+            step = self.plan[row]
+            if self._stop.requested:
+                return "interrupted"
+            if isinstance(self._estimate, Replanning) and self._minutes(row + 1) > self._estimate.minutes:
+                return "time over"
+            self._tell(step)
+            self._do(step)
+            row += 1
+            if step.action == "look" and self._estimate is not None and self._estimate.update(self._log.ok_looks):
+                return "target met"
+            if isinstance(self._estimate, Replanning) and step.action == "look":
+                if row == len(self.plan) and self._estimate.last(self._log.ok_looks):
+                    return "target met"
+                self._adapt(row, self._estimate.proposal())
+        return "done"
+
+    def _minutes(self, row: int) -> float:
+        """Duration of the plan up to a row, by `[costs]`."""
+        return plan_seconds(self.rig, self.plan[:row]) / 60
+
+    def _adapt(self, row: int, proposal: Proposal | None) -> None:
+        """Puts proposed looks in the place of those that are left; the change is in the journal before it holds."""
+        if proposal is None:
+            return
+        steps = proposal.continued(row, self._log.recorder.state.target)
+        try:
+            check_plan(self.rig, steps)
+        except InputError as error:
+            self._log.warnings.append(f"proposed looks were not followed: {error}")
+            return
+        self._log.write(ADAPTED, **adapted_entries(proposal, row, steps))
+        self.plan = (*self.plan[:row], *steps)
 
     def _do(self, step: PlanStep) -> None:
         if step.action == "home":

@@ -1,9 +1,9 @@
 """The events of a run's journal, as their JSON objects stand in `log.jsonl`.
 
 `created` opens a journal. Every motion of the plan is an `intent` before, and an order has an event of its own once it
-is done: `homed`, `placed`, `moved`, `looked`. `verified` closes a segment, `start` and `stop` enclose a run, `gap`
-stands where a repair lost lines. Counters in motor steps, raw px, degrees and seconds by suffix; `utc` and `created`
-are ISO 8601.
+is done: `homed`, `placed`, `moved`, `looked`. `adapted` changes the plan, `verified` closes a segment, `start` and
+`stop` enclose a run, `gap` stands where a repair lost lines. Counters in motor steps, raw px, degrees and seconds by
+suffix; `utc` and `created` are ISO 8601.
 
 A checksum finds accidents, not forgery: who reads an event converts what its entries hold, and refuses what does not
 convert.
@@ -106,6 +106,18 @@ class Looked(TypedDict):
     aperture_deg: NotRequired[float | None]
     reference_of: NotRequired[int]
     shift_px: NotRequired[float | None]
+
+
+class Adapted(TypedDict):
+    """A change of plan: the steps that stand from row `row` on, and why they were chosen.
+
+    Each look says what the target was expected to be before it and after; `looks` are those of the estimate behind it.
+    """
+
+    row: int
+    looks: int
+    why: str
+    steps: list[dict[str, object]]
 
 
 class Stop(TypedDict):

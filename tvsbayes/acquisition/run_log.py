@@ -23,7 +23,7 @@ class Outcome:
     """How a run ended.
 
     Attributes:
-        reason: "done", "target met", "interrupted" or "declined".
+        reason: "done", "target met", "time over", "interrupted" or "declined".
         looks: looks of this campaign, of all its runs.
         ok: how many of them count.
         refused: how many found no usable spot.

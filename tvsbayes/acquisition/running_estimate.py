@@ -11,9 +11,10 @@ from __future__ import annotations
 import json
 import subprocess
 import tempfile
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 FIRST_LOOKS = 12
 """Fewer looks than three experiments of four points say next to nothing."""
@@ -114,11 +115,15 @@ class RunningEstimate:
                 self._wait_for_fit()
         return self.met
 
+    def _arguments(self, looks: int) -> list[str]:
+        """The command line of the fit of so many looks."""
+        results = Path(self._scratch.name) / "results"
+        return [*self._command, str(self.folder), "--no-sample", "--json", "--out", str(results)]
+
     def _begin(self, looks: int) -> None:
         """Starts a fit; where no process can be started the run goes on without an estimate."""
         self._looks = looks
-        results = Path(self._scratch.name) / "results"
-        arguments = [*self._command, str(self.folder), "--no-sample", "--json", "--out", str(results)]
+        arguments = self._arguments(looks)
         nothing = subprocess.DEVNULL
         try:
             with open(Path(self._scratch.name) / "fit.json", "wb") as stream:
@@ -143,11 +148,20 @@ class RunningEstimate:
         self._process = None
         try:
             document = json.loads((Path(self._scratch.name) / "fit.json").read_bytes())
-            found = {name: entry for name, entry in document["effective_deg_per_step"].items() if entry is not None}
-            if not document["converged"] or "error" in document:
+            if "error" in document:
                 return
-            values = {name: float(entry["value"]) for name, entry in found.items()}
-            sds = {name: float(entry["sd"]) for name, entry in found.items()}
+            self.latest = self._read(document)
         except (OSError, ValueError, KeyError, TypeError, AttributeError):
             return
-        self.latest = Estimate(self._looks, values, sds)
+
+    def _read(self, document: Mapping[str, Any]) -> Estimate:
+        """What a document of the command says.
+
+        Raises:
+            ValueError: not converged, or no document of this command; KeyError, TypeError, AttributeError likewise.
+        """
+        if not document["converged"]:
+            raise ValueError("not converged")
+        found = {name: entry for name, entry in document["effective_deg_per_step"].items() if entry is not None}
+        values = {name: float(entry["value"]) for name, entry in found.items()}
+        return Estimate(self._looks, values, {name: float(entry["sd"]) for name, entry in found.items()})

@@ -16,16 +16,14 @@ from tvsbayes.acquisition.engine import Acquisition, Outcome
 from tvsbayes.acquisition.journal import EMPTY_REMEDY, LOG, Journal, read_journal, require_journal
 from tvsbayes.acquisition.operator import StopKey, Terminal, TerminalOperator, check_hazard
 from tvsbayes.acquisition.recorder import Recorded, recorded
+from tvsbayes.acquisition.replanning import AdaptWish, Replanning, adapted_plan, check_plan
 from tvsbayes.acquisition.run_identity import check_same, identity, setup_changes
 from tvsbayes.acquisition.running_estimate import EstimateWish, RunningEstimate
 from tvsbayes.errors import escaped, refusal
-from tvsbayes.instrument.axes import AXES
-from tvsbayes.instrument.counter_limits import LIMIT_KEYS
-from tvsbayes.instrument.plan import PlanStep, run_plan
+from tvsbayes.instrument.plan import PlanStep, plan_seconds, run_plan
 from tvsbayes.instrument.rig import Rig
 from tvsbayes.instrument.stops import legs_of
 from tvsbayes.positioner.emulated_board import EmulatedBoard
-from tvsbayes.positioner.protocol import LIMIT_SETTINGS, SETTINGS
 
 
 def acquire(
@@ -39,6 +37,7 @@ def acquire(
     laser_class: str | None = None,
     seed: int = 0,
     estimate: EstimateWish | None = None,
+    adapt: AdaptWish | None = None,
     vision: Vision | None = None,
     terminal: Terminal | None = None,
 ) -> Outcome:
@@ -54,6 +53,7 @@ def acquire(
         laser_class: states that the hazard is known; without it the operator is asked once.
         seed: of a simulation.
         estimate: whether the looks so far are fitted beside the run. A simulation waits for every fit.
+        adapt: that the looks which are left are chosen from that fit; `estimate` must have a target.
         vision: how pictures are made and seen; by default they wait for `detect`, and a simulation states centroids.
         terminal: where to speak and to ask; by default nothing is shown.
 
@@ -82,13 +82,31 @@ def acquire(
             terminal.say(f"{len(journal.torn)} bytes of an unfinished line were cut off and kept in log.torn-*")
         for change in setup_changes(journal.records, rig, simulate):
             terminal.say(change)
-        running = None
-        if estimate is not None and estimate.holds(simulate):
-            target, directions = estimate.target_u_deg_per_step, set(legs_of(run_plan(plan, rig).moves))
-            running = RunningEstimate(folder, estimate.command, target, directions, wait=simulate)
+        running = _running(rig, plan, folder, estimate, adapt, simulate)
+        if running is not None:
             stack.enter_context(running)
         stack.callback(bench.conclude, folder)
-        return Acquisition(rig, plan, journal, bench, stop=stop, show=terminal.show, estimate=running).run()
+        now = adapted_plan(plan, journal.records)
+        return Acquisition(rig, now, journal, bench, stop=stop, show=terminal.show, estimate=running).run()
+
+
+def _running(
+    rig: Rig,
+    plan: Sequence[PlanStep],
+    folder: Path,
+    estimate: EstimateWish | None,
+    adapt: AdaptWish | None,
+    simulate: bool,
+) -> RunningEstimate | None:
+    """The fits beside a run, if it is to have any."""
+    target = None if estimate is None else estimate.target_u_deg_per_step
+    if adapt is not None and target is not None:
+        minutes = plan_seconds(rig, plan) / 60 if adapt.minutes is None else adapt.minutes
+        return Replanning(folder, adapt.command, target, minutes, wait=simulate)
+    if estimate is None or not estimate.holds(simulate):
+        return None
+    directions = set(legs_of(run_plan(plan, rig).moves))
+    return RunningEstimate(folder, estimate.command, target, directions, wait=simulate)
 
 
 def _before(folder: Path) -> Recorded:
@@ -103,31 +121,6 @@ def _header(rig: Rig, seed: int | None) -> dict[str, object]:
     if seed is not None:
         header |= {"created": SIMULATED_START.isoformat(), "synthetic": True, "seed": int(seed)}
     return header
-
-
-def check_plan(rig: Rig, plan: Sequence[PlanStep]) -> None:
-    """Refuses a plan that this rig cannot run, before anything moves.
-
-    Raises:
-        InputError: targets without a sheet position, counters outside the limits.
-    """
-    firmware = {axis: (SETTINGS[low][2], SETTINGS[high][2]) for axis, (low, high) in LIMIT_SETTINGS.items()}
-    limits = rig.limits.within(firmware)
-    for step in plan:
-        if step.action == "place" and step.target not in rig.sheets_mm:
-            allowed = ", ".join(rig.sheets_mm) or "a target named in [sheets]"
-            remedy = "add its nominal X to [sheets] of the rig file"
-            found = f"target {step.target} in step {step.step}"
-            raise refusal("unknown-target", file="plan", found=found, allowed=allowed, remedy=remedy, column="target")
-        for axis, counter in zip(AXES, (step.pan_steps, step.tilt_steps), strict=True):
-            if counter is None:
-                continue
-            low, high = limits[axis]
-            if not low <= counter <= high:
-                remedy = f"correct the plan, or {' and '.join(LIMIT_KEYS[axis])} in [positioner]"
-                found, allowed = f"{counter} in step {step.step}", f"{low} to {high}, the soft limits"
-                column = f"{axis}_steps"
-                raise refusal("limit", file="plan", found=found, allowed=allowed, remedy=remedy, column=column)
 
 
 def begin(folder: Path, rig: Rig, plan: Sequence[PlanStep], resume: bool, header: Mapping[str, object]) -> Journal:

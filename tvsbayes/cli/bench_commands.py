@@ -39,8 +39,8 @@ if TYPE_CHECKING:
     from tvsbayes.instrument.stereo_pair import Stereo
 
 IMAGE_SIDE_MAX = 65_535
-FIT_COMMAND = (sys.executable, "-m", "tvsbayes", "fit")
-"""`tvsbayes fit` in a process of its own."""
+FIT_COMMAND, PLAN_COMMAND = ((sys.executable, "-m", "tvsbayes", name) for name in ("fit", "plan"))
+"""`tvsbayes fit` and `tvsbayes plan` in processes of their own."""
 
 
 def stereo(
@@ -225,6 +225,8 @@ def acquire(
     laser_class: LaserClass = None,
     target_u: TargetU = None,
     estimate: Estimated = None,
+    adapt: Annotated[bool, typer.Option("--adapt", help="With --target-u: looks chosen from the fits.")] = False,
+    minutes: Annotated[float | None, typer.Option("--minutes", min=0.1, help="With --adapt: longest run.")] = None,
     seed: Annotated[int | None, typer.Option("--seed", min=0, help="Of a simulation (default 0).")] = None,
     as_json: Json = False,
 ) -> None:
@@ -243,6 +245,10 @@ def acquire(
     if target_u is not None and estimate is False:
         remedy = "leave out one of them"
         raise InputError("usage", "--target-u needs the fits that --no-estimate forbids", remedy=remedy)
+    if adapt and target_u is None:
+        raise InputError("usage", "--adapt needs a target to go for", remedy="add --target-u")
+    if not adapt:
+        refuse_options("for --adapt", "add --adapt, or leave it out", minutes=minutes)
     in_order(rig, plan)
     instrument, steps = read_rig(rig), read_plan(plan)
     if dry_run:
@@ -251,6 +257,7 @@ def acquire(
     from tvsbayes.acquisition.bench import Vision
     from tvsbayes.acquisition.observation import live_detector, twin_renderer
     from tvsbayes.acquisition.operator import LiveLine, Terminal
+    from tvsbayes.acquisition.replanning import AdaptWish
     from tvsbayes.acquisition.running_estimate import EstimateWish
     from tvsbayes.acquisition.session import acquire as run_plan
 
@@ -268,6 +275,7 @@ def acquire(
             laser_class=laser_class,
             seed=seed or 0,
             estimate=EstimateWish(FIT_COMMAND, target_u, estimate),
+            adapt=AdaptWish((*PLAN_COMMAND, str(rig)), minutes) if adapt else None,
             vision=vision,
             terminal=Terminal(report_line, line.show, line.ask),
         )
@@ -276,7 +284,7 @@ def acquire(
 
 def _rehearse(rig: Rig, plan: Sequence[PlanStep], as_json: bool) -> None:
     """What a run would do, step by step, and how long it would take."""
-    from tvsbayes.acquisition.session import check_plan
+    from tvsbayes.acquisition.replanning import check_plan
     from tvsbayes.instrument.plan import outline, plan_seconds
 
     check_plan(rig, plan)
@@ -297,7 +305,8 @@ def _end(outcome: Outcome, out: Path, target_u: float | None, as_json: bool) -> 
         report_line(f"{outcome.reason}; go on with --resume")
         raise Ended(INTERRUPTED)
     if target_u is not None and outcome.reason != "target met":
-        report_line("the plan is done and the target is not met: plan more with tvsbayes plan --given")
+        ended = "the time is over" if outcome.reason == "time over" else "the plan is done"
+        report_line(f"{ended} and the target is not met: plan more with tvsbayes plan --given")
         raise Ended(TARGET_MISSED)
 
 

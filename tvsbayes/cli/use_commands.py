@@ -10,7 +10,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -35,6 +35,11 @@ from tvsbayes.errors import InputError, escaped
 from tvsbayes.files.disk import output_place, write_atomically
 from tvsbayes.pipeline import FITTING, calibration_for, compile_for, fit_for
 from tvsbayes.progress import Job
+
+if TYPE_CHECKING:
+    from tvsbayes.instrument.campaign import Campaign
+    from tvsbayes.instrument.rig import Rig
+    from tvsbayes.planning.target import Target
 
 WORKERS = 2
 PLAN_DRAWS = 200
@@ -241,6 +246,9 @@ def plan(
     draws: Annotated[
         int, typer.Option("--draws", min=20, max=10_000, help="Instruments for the chances.")
     ] = PLAN_DRAWS,
+    count: Annotated[
+        int | None, typer.Option("--next", min=1, max=200, help="With --given: only the next so many looks, no homing.")
+    ] = None,
     watch: Annotated[bool, typer.Option("--watch", help="Fewest looks for `watch`: plan CAMPAIGN --watch.")] = False,
     seed: Seed = 0,
     as_json: Json = False,
@@ -249,7 +257,9 @@ def plan(
     out = out or output
     if watch:
         spare = {"criterion": criterion != "c", "draws": draws != PLAN_DRAWS}
-        refuse_options("for targets, not for --watch", "leave it out", target=target, aperture=aperture, **spare)
+        refuse_options(
+            "for targets, not for --watch", "leave it out", target=target, aperture=aperture, next=count, **spare
+        )
         plan_watch(rig, given, minutes=minutes, out=out, seed=seed, as_json=as_json)
         return
     if axis_commands.is_axis(given or rig):
@@ -274,6 +284,13 @@ def plan(
     from tvsbayes.results.plan_record import plan_document
 
     wanted = parse_target(target or DEFAULT_TARGET)
+    if count is not None:
+        spare = {"criterion": criterion != "c", "draws": draws != PLAN_DRAWS}
+        refuse_options(
+            "for whole plans, not for --next", "leave it out", aperture=aperture, minutes=minutes, out=out, **spare
+        )
+        _next_looks(instrument, data, wanted, count, as_json)
+        return
     if criterion not in CRITERIA:
         message, allowed = f"--criterion {escaped(criterion)}", ", ".join(CRITERIA)
         raise InputError("criterion", message, column="--criterion", allowed=allowed, remedy="name one of them")
@@ -304,6 +321,22 @@ def plan(
     finish(document, text, as_json)
     if target is not None and not result.met:
         raise Ended(TARGET_MISSED)
+
+
+def _next_looks(rig: Rig, data: Campaign | None, target: Target, count: int, as_json: bool) -> None:
+    """`plan --given --next`: a few looks that go on where the campaign ended."""
+    if data is None:
+        raise InputError("usage", "--next goes on from a campaign", remedy="add --given CAMPAIGN")
+    compile_for(report_line)
+    with waiting() as progress, Job({FITTING: 1.0, PLANNING: 1.0}, progress) as job:
+        fitted = fit_for(data, report_line, job.part(FITTING))
+        job.begin(PLANNING)
+        from tvsbayes.planning.next_looks import next_looks
+
+        found = next_looks(fitted, rig, target, count)
+    from tvsbayes.instrument.plan import outline
+
+    finish(found.as_json(), "\n".join([found.why, *outline(rig, found.steps)]), as_json)
 
 
 def study(

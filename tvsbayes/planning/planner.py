@@ -261,7 +261,7 @@ def few_looks(looks: Looks, target: Target) -> list[str]:
 
 
 @dataclass(frozen=True)
-class _Question:
+class Question:
     """What is asked of a search: the candidates, what they show at the most probable instrument, and the target there.
 
     Attributes:
@@ -279,7 +279,12 @@ class _Question:
     now: float
 
 
-def _question(knowledge: Knowledge, target: Target, pose_rad: np.ndarray | None, aperture: bool) -> _Question:
+def question(knowledge: Knowledge, target: Target, pose_rad: np.ndarray | None, aperture: bool) -> Question:
+    """The candidates of an instrument as it is known, and a target there.
+
+    Raises:
+        InputError: nothing to look at or in view; a target that is held fixed.
+    """
     found = candidates(knowledge)
     knowledge = knowledge.with_gears(found.looks.steps)
     seen = LookArrays(found.looks, knowledge, aperture).at(knowledge.z, knowledge.space)
@@ -295,7 +300,7 @@ def _question(knowledge: Knowledge, target: Target, pose_rad: np.ndarray | None,
             allowed="a quantity that is to be estimated",
             remedy="state u > 0 for it in [rig.prior], or another target",
         )
-    return _Question(knowledge, found, seen, at_centre, now)
+    return Question(knowledge, found, seen, at_centre, now)
 
 
 def _durations(family: Family, scope: Scope) -> dict[int, float]:
@@ -380,7 +385,7 @@ def _planned(
     job: Job,
 ) -> PlanResult:
     job.begin(LOOKING)
-    asked = _question(knowledge, target, pose_rad, scope.aperture)
+    asked = question(knowledge, target, pose_rad, scope.aperture)
     knowledge = asked.knowledge
     job.begin(CHOOSING)
     family = design_family(knowledge, asked.found, asked.seen, target, asked.at_centre, scope, job.at)

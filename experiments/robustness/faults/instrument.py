@@ -293,4 +293,20 @@ FAULTS = (
         "printed boards make calibrations worse than they say",
         ("cameras/stereo_calibration::test_a_board_that_is_no_grid_is_in_the_covariance",),
     ),
+    Fault(
+        "adapted run: a proposal is followed unseen",
+        "acquisition/engine.py",
+        "            check_plan(self.rig, steps)\n",
+        "            pass\n",
+        "a wrong proposal drives the mirrors into their stops, or asks for a sheet that does not exist",
+        ("acquisition/replanning",),
+    ),
+    Fault(
+        "adapted run: a resumed run forgets the changes",
+        "acquisition/session.py",
+        "now = adapted_plan(plan, journal.records)",
+        "now = tuple(plan)",
+        "after an interruption the looks of another plan are taken, under the numbers of the changed one",
+        ("acquisition/replanning::test_a_resumed_run_has_the_plan_of_the_interrupted_one",),
+    ),
 )

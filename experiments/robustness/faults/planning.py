@@ -258,4 +258,12 @@ FAULTS = (
         "the looks of a watch drive the mirrors where the campaign never was",
         ("planning/watch_plan::test_candidates_keep_to_the_limits",),
     ),
+    Fault(
+        "next looks: the last of the counters is the first of the path",
+        "planning/next_looks.py",
+        "via[0] = design.goal[0] - side * overshoot",
+        "via[0] = design.goal[0]",
+        "the first look of a proposal stands on an unknown side of the play",
+        ("planning/next_looks",),
+    ),
 )

@@ -1,0 +1,103 @@
+"""The next looks of a run that goes on: what they promise is what a fit of them reports, and they stay in reach."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tvsbayes.cli.main import run
+from tvsbayes.estimators.joint_fit import fit
+from tvsbayes.instrument.axes import AXES
+from tvsbayes.instrument.plan import PlanStep, run_plan
+from tvsbayes.instrument.protocols import grid_protocol
+from tvsbayes.instrument.stops import rests_of
+from tvsbayes.planning.candidates import allowed, overshoot_steps
+from tvsbayes.planning.expectation import Knowledge, information_of, knowledge_of
+from tvsbayes.planning.looks import covariance_of
+from tvsbayes.planning.next_looks import next_looks
+from tvsbayes.planning.target import parse_target, sensitivity
+from tvsbayes.twin.simulated_campaign import SimulatedCampaign, simulate
+
+TARGET = parse_target("u(worst) <= 1e-4 deg/step")
+
+
+def begun(rig, looks: int) -> tuple[PlanStep, ...]:
+    """The grid up to so many looks on the first sheet."""
+    plan = grid_protocol(targets=("d1",), pan_steps=(-60, 60, 180), tilt_steps=(-90, 30))
+    rows = [step.step for step in plan if step.action == "look"]
+    return plan[: rows[looks - 1] + 1]
+
+
+@pytest.fixture(scope="module")
+def first(mounted_rig) -> SimulatedCampaign:
+    return simulate(mounted_rig, begun(mounted_rig, 12), seed=8)
+
+
+@pytest.fixture(scope="module")
+def begun_fit(first):
+    return fit(first.campaign)
+
+
+@pytest.fixture(scope="module")
+def found(begun_fit, mounted_rig):
+    return next_looks(begun_fit, mounted_rig, TARGET, 12)
+
+
+def whole_plan(rig, found) -> tuple[PlanStep, ...]:
+    """The plan so far with the proposal behind it."""
+    before = begun(rig, 12)
+    return (*before, *(replace(step, step=len(before) + n) for n, step in enumerate(found.steps)))
+
+
+def test_what_is_promised_is_the_information_of_the_whole_run(found, mounted_rig, begun_fit):
+    """The plan so far and the proposal through the filter, move by move, at the point that the fit believes in."""
+    assert found.now == pytest.approx(max(found.u_deg_per_step.values()), rel=0.1)
+    assert found.expected == found.after_each[-1] < 0.7 * found.now
+    assert np.all(np.diff([found.now, *found.after_each]) < 1e-12)
+    after = knowledge_of(begun_fit, mounted_rig)
+    before = Knowledge(after.rig, after.space, after.z, np.eye(after.size))
+    told = information_of(whole_plan(mounted_rig, found), before)
+    at = sensitivity(TARGET, after.z, after.space, after.rig.table, begun_fit.reference_pose_rad, before.gears)
+    value = at.value(covariance_of(before.precision + told.fisher), TARGET.factor)
+    # The fit's Hessian beside Fisher's information of the first looks: a few percent.
+    assert found.expected == pytest.approx(value, rel=0.1)
+
+
+def test_every_look_is_reached_with_a_run_up_inside_the_limits(found, mounted_rig, begun_fit):
+    limits = allowed(mounted_rig.limits).limits
+    overshoot = overshoot_steps(knowledge_of(begun_fit, mounted_rig))
+    assert found.steps[0].action == "place" and sum(step.action == "look" for step in found.steps) == 12
+    log = run_plan(whole_plan(mounted_rig, found), mounted_rig)
+    for axis, (low, high), needed in zip(AXES, limits, overshoot, strict=True):
+        rests = rests_of(log.moves, axis)
+        for look in log.looks[12:]:
+            assert low <= rests[look.move].steps <= high and rests[look.move].leg >= needed
+    first_move = next(step for step in found.steps if step.action == "move")
+    after = found.steps[found.steps.index(first_move) + 1]
+    run_up = np.abs(np.array([after.pan_steps, after.tilt_steps]) - [first_move.pan_steps, first_move.tilt_steps])
+    assert np.all(run_up >= overshoot), "wherever the axes stood"
+
+
+def test_a_sheet_that_stands_there_costs_nothing(found, mounted_rig):
+    """Of equally good looks those without a placement come first: minutes say so."""
+    placements = [step.target for step in found.steps if step.action == "place"]
+    seconds = 60 * found.minutes
+    own = sum({"place": 60.0, "move": 1.5, "look": 1.0}[step.action] for step in found.steps)
+    assert seconds == pytest.approx(own - 60.0 * (placements[0] == "d1"))
+
+
+def test_the_command_prints_them(begun_fit, mounted_rig, tmp_path, monkeypatch, capsys):
+    from tvsbayes.files.disk import shipped_data
+
+    rig = str(shipped_data() / "rigs" / "mounted" / "rig.toml")
+    monkeypatch.setattr("tvsbayes.cli.use_commands.fit_for", lambda *_: begun_fit)
+    monkeypatch.setattr("tvsbayes.instrument.campaign.read_campaign", lambda _: begun_fit.campaign)
+    assert run(["plan", rig, "--given", "mine", "--next", "8", "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert sum(step["action"] == "look" for step in document["steps"]) == len(document["after_each"]) == 8
+    assert document["steps"][0]["action"] == "place" and "most per minute" in document["why"]
+    assert run(["plan", rig, "--next", "8"]) == 2 and "--given" in capsys.readouterr().err
+    assert run(["plan", rig, "--given", "mine", "--next", "8", "-o", "x.csv"]) == 2

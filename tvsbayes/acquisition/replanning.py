@@ -1,0 +1,185 @@
+"""`acquire --adapt`: looks that are left are chosen anew from the running estimate, until target or time is reached.
+
+`tvsbayes plan --given --next` runs beside the instrument as the running estimate does: one process, which fits what is
+on the disk and says what to look at next. A proposal that leaves the rig's limits is not followed. Every change of plan
+is an event of the journal, so that a resumed run has the same plan as the one that was interrupted.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, cast
+
+from tvsbayes.acquisition.journal import LOG, Record
+from tvsbayes.acquisition.journal_events import Adapted
+from tvsbayes.acquisition.running_estimate import Estimate, RunningEstimate
+from tvsbayes.errors import escaped, refusal
+from tvsbayes.instrument.axes import AXES, DIRECTIONS
+from tvsbayes.instrument.counter_limits import LIMIT_KEYS
+from tvsbayes.instrument.plan import PlanStep, step_json
+from tvsbayes.instrument.rig import Rig
+from tvsbayes.positioner.protocol import LIMIT_SETTINGS, SETTINGS
+
+ADAPTED = "adapted"
+"""The event of the journal."""
+NEXT_SHARE, NEXT_LEAST = 0.3, 8
+"""Looks of a proposal: this share of those that are there, more than come before the next one, at least so many."""
+
+
+def check_plan(rig: Rig, plan: Sequence[PlanStep]) -> None:
+    """Refuses a plan that this rig cannot run, before anything moves.
+
+    Raises:
+        InputError: targets without a sheet position, counters outside the limits.
+    """
+    firmware = {axis: (SETTINGS[low][2], SETTINGS[high][2]) for axis, (low, high) in LIMIT_SETTINGS.items()}
+    limits = rig.limits.within(firmware)
+    for step in plan:
+        if step.action == "place" and step.target not in rig.sheets_mm:
+            allowed = ", ".join(rig.sheets_mm) or "a target named in [sheets]"
+            remedy = "add its nominal X to [sheets] of the rig file"
+            found = f"target {step.target} in step {step.step}"
+            raise refusal("unknown-target", file="plan", found=found, allowed=allowed, remedy=remedy, column="target")
+        for axis, counter in zip(AXES, (step.pan_steps, step.tilt_steps), strict=True):
+            if counter is None:
+                continue
+            low, high = limits[axis]
+            if not low <= counter <= high:
+                remedy = f"correct the plan, or {' and '.join(LIMIT_KEYS[axis])} in [positioner]"
+                found, allowed = f"{counter} in step {step.step}", f"{low} to {high}, the soft limits"
+                column = f"{axis}_steps"
+                raise refusal("limit", file="plan", found=found, allowed=allowed, remedy=remedy, column=column)
+
+
+@dataclass(frozen=True)
+class Proposal:
+    """What to look at next.
+
+    Attributes:
+        steps: placements, moves and looks, numbered from 0; the first is a placement.
+        after_each: the target's value after each look, deg/step.
+        now: before them.
+        looks: of which the estimate was made.
+        why: in words.
+    """
+
+    steps: tuple[PlanStep, ...]
+    after_each: tuple[float, ...]
+    now: float
+    looks: int
+    why: str
+
+    def continued(self, row: int, sheet: str) -> tuple[PlanStep, ...]:
+        """The steps as they go on a plan from a row on, where a sheet stands already."""
+        own = self.steps[1:] if self.steps[0].target == sheet else self.steps
+        return tuple(replace(step, step=row + number) for number, step in enumerate(own))
+
+
+@dataclass(frozen=True)
+class AdaptWish:
+    """That the looks of a run are to be chosen while it runs.
+
+    Attributes:
+        command: `tvsbayes plan RIG`, as a process is started.
+        minutes: by `[costs]`, that the whole run may take; None: as long as its plan.
+    """
+
+    command: tuple[str, ...]
+    minutes: float | None = None
+
+
+class Replanning(RunningEstimate):
+    """The running estimate that also says what to look at next.
+
+    Args:
+        folder: the campaign folder.
+        command: `tvsbayes plan RIG`.
+        target_u_deg_per_step: wanted of the effective ratios of all directions.
+        minutes: that the run may take.
+        wait: whether to wait for every proposal.
+    """
+
+    def __init__(
+        self, folder: Path, command: Sequence[str], target_u_deg_per_step: float, minutes: float, *, wait: bool = False
+    ):
+        super().__init__(folder, command, target_u_deg_per_step, DIRECTIONS, wait=wait)
+        self.minutes = minutes
+        self._proposal: Proposal | None = None
+
+    def _arguments(self, looks: int) -> list[str]:
+        target = f"u(worst) <= {self.target:g} deg/step"
+        count = max(NEXT_LEAST, math.ceil(NEXT_SHARE * looks))
+        return [*self._command, "--given", str(self.folder), "--target", target, "--next", str(count), "--json"]
+
+    def _read(self, document: Mapping[str, Any]) -> Estimate:
+        steps = tuple(_step(number, entry) for number, entry in enumerate(document["steps"]))
+        after = tuple(map(float, document["after_each"]))
+        if not steps or steps[0].action != "place":
+            raise ValueError("the looks do not begin with a placement")
+        self._proposal = Proposal(steps, after, float(document["now"]), self._looks, str(document["why"]))
+        return super()._read({**document, "converged": True})
+
+    def proposal(self) -> Proposal | None:
+        """The newest one, once."""
+        found, self._proposal = self._proposal, None
+        return found
+
+    def last(self, looks: int) -> bool:
+        """At the end of the plan: one more estimate of all looks, waited for; whether the target is met."""
+        if self._process is not None:
+            self._wait_for_fit()
+        if self._proposal is None and looks > self._looks:
+            self._begin(looks)
+            self._wait_for_fit()
+        return self.met
+
+
+def _step(number: int, entry: Mapping[str, Any]) -> PlanStep:
+    action = str(entry["action"])
+    if action == "place":
+        return PlanStep(number, "place", target=str(entry["target"]))
+    if action == "move":
+        return PlanStep(number, "move", int(entry["pan_steps"]), int(entry["tilt_steps"]))
+    if action == "look":
+        return PlanStep(number, "look")
+    raise ValueError(f"no action of a continued plan: {escaped(action)}")
+
+
+def adapted_entries(proposal: Proposal, row: int, steps: Sequence[PlanStep]) -> Adapted:
+    """The event of a change of plan: from which row on, the steps, and why each look was chosen."""
+    looks = iter(proposal.after_each)
+    before, told = proposal.now, []
+    for step in steps:
+        entry = step_json(step)
+        if step.action == "look":
+            after = next(looks)
+            # What this look adds, those before it taken.
+            entry |= {"u_before_deg_per_step": before, "u_after_deg_per_step": after}
+            before = after
+        told.append(entry)
+    return {"row": row, "looks": proposal.looks, "why": proposal.why, "steps": told}
+
+
+def adapted_plan(plan: Sequence[PlanStep], records: Iterable[Record]) -> tuple[PlanStep, ...]:
+    """The plan as the changes in a journal have left it.
+
+    Raises:
+        InputError: an event that does not hold what it should.
+    """
+    now = tuple(plan)
+    for record in records:
+        if record.event != ADAPTED:
+            continue
+        try:
+            data = cast("Adapted", record.data)
+            row = int(data["row"])
+            now = (*now[:row], *(_step(row + n, entry) for n, entry in enumerate(data["steps"])))
+        except (KeyError, TypeError, ValueError) as error:
+            allowed, remedy = "row and steps of a changed plan", "tvsbayes check FOLDER --repair-to NEW"
+            found = escaped(repr(error), 80)
+            line = record.line
+            raise refusal("event", file=LOG, line=line, found=found, allowed=allowed, remedy=remedy) from error
+    return now

@@ -1,0 +1,170 @@
+"""The next best looks of a run that goes on: from where the axes stand, on the sheet that stands there, no homing.
+
+What `plan --given --next` prints and `acquire --adapt` follows. Counters in steps, values in the target's unit.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+
+from tvsbayes.errors import NotConverged
+from tvsbayes.estimators.joint_fit import JointFit
+from tvsbayes.instrument.axes import DIRECTIONS
+from tvsbayes.instrument.campaign import ordered_spots
+from tvsbayes.instrument.plan import PlanBuilder, PlanStep, plan_seconds, step_json
+from tvsbayes.instrument.rig import Rig
+from tvsbayes.planning.expectation import knowledge_of
+from tvsbayes.planning.looks import Arranged, arrange, covariance_of, information_of_looks
+from tvsbayes.planning.planner import Question, question
+from tvsbayes.planning.search import search_designs
+from tvsbayes.planning.target import Target
+
+
+@dataclass(frozen=True)
+class NextLooks:
+    """A few looks that go on where a campaign ended.
+
+    Attributes:
+        target: what is wanted.
+        steps: placements, moves and looks; they begin with a placement.
+        minutes: by `[costs]`, without that placement where its sheet stands there.
+        now: the target's value by the campaign; `expected` after the looks.
+        after_each: the target's value after each look, in their order.
+        deg_per_step, u_deg_per_step: effective ratios of the fit by direction, and their Laplace sds.
+        why: in words.
+    """
+
+    target: Target
+    steps: tuple[PlanStep, ...]
+    minutes: float
+    now: float
+    expected: float
+    after_each: tuple[float, ...]
+    deg_per_step: dict[str, float]
+    u_deg_per_step: dict[str, float]
+    why: str
+
+    def as_json(self) -> dict[str, Any]:
+        """The document of `plan --given --next`."""
+        ratios = {d: {"value": self.deg_per_step[d], "sd": self.u_deg_per_step[d]} for d in DIRECTIONS}
+        return {
+            "target": self.target.as_json(),
+            "now": self.now,
+            "expected": self.expected,
+            "minutes": self.minutes,
+            "steps": [step_json(step) for step in self.steps],
+            "after_each": list(self.after_each),
+            "effective_deg_per_step": ratios,
+            "why": self.why,
+        }
+
+
+@dataclass(frozen=True)
+class _Choice:
+    """Looks on some sheets: numbers of the candidates, their arrangement, minutes and the target's value after them."""
+
+    picks: np.ndarray
+    design: Arranged
+    steps: tuple[PlanStep, ...]
+    minutes: float
+    value: float
+
+
+def _with_run_up(design: Arranged, side: np.ndarray, overshoot: np.ndarray) -> Arranged:
+    """The first look reached by a run-up of its own: nobody knows where the axes stand when the looks begin."""
+    via = design.via.copy()
+    via[0] = design.goal[0] - side * overshoot
+    return replace(design, via=via)
+
+
+def _steps(design: Arranged) -> tuple[PlanStep, ...]:
+    plan = PlanBuilder(at=design.home)
+    sheet = ""
+    for name, via, goal in zip(design.sheet, design.via.tolist(), design.goal.tolist(), strict=True):
+        if name != sheet:
+            sheet = name
+            plan.place(sheet)
+        plan.move(*via)
+        plan.move(*goal)
+        plan.look()
+    return tuple(plan.steps)
+
+
+def next_looks(fit: JointFit, rig: Rig, target: Target, count: int) -> NextLooks:
+    """The looks that lower a target most per minute, by the fit of what was seen so far.
+
+    Args:
+        fit: of the campaign so far; its last homing holds on.
+        rig: sheets, limits, costs.
+        target: what is wanted.
+        count: looks.
+
+    Raises:
+        NotConverged: the fit.
+        InputError: no sheet, nothing in view.
+    """
+    if not fit.converged:
+        raise NotConverged.of(fit.problems, "see `tvsbayes fit`")
+    asked = question(knowledge_of(fit, rig), target, fit.reference_pose_rad, False)
+    # The segment goes on: no home offset is drawn anew.
+    asked = replace(asked, knowledge=replace(asked.knowledge, after_data=False))
+    last, sheet = fit.campaign.moves[-1], ordered_spots(fit.campaign)[-1].target
+    choices = _choices(asked, rig, target, count, (last.pan_steps, last.tilt_steps), sheet)
+    best = max(choices, key=lambda choice: (asked.now - choice.value) / max(choice.minutes, 1e-9))
+    effective = np.asarray(fit.draws.effective_deg_per_step)
+    places, wanted = ", ".join(dict.fromkeys(best.design.sheet)), target.text.split("<=")[0].strip()
+    return NextLooks(
+        target=target,
+        steps=best.steps,
+        minutes=best.minutes,
+        now=asked.now,
+        expected=best.value,
+        after_each=_after_each(asked, target, best),
+        deg_per_step=dict(zip(DIRECTIONS, map(float, np.asarray(fit.mode.effective_deg_per_step)), strict=True)),
+        u_deg_per_step=dict(zip(DIRECTIONS, map(float, effective.std(axis=0)), strict=True)),
+        why=(
+            f"{count} looks at {places} lower {wanted} most per minute: from {asked.now:.3g} to {best.value:.3g} "
+            f"{target.unit} in {best.minutes:.1f} minutes"
+        ),
+    )
+
+
+def _choices(asked: Question, rig: Rig, target: Target, count: int, at: tuple[int, int], sheet: str) -> list[_Choice]:
+    """The best looks on every sheet and on every pair of sheets."""
+    search, found, names = (
+        search_designs(asked.knowledge, asked.seen, asked.at_centre),
+        asked.found,
+        asked.knowledge.sheets,
+    )
+    choices = []
+    for size in (1, 2):
+        for chosen in combinations(range(len(names)), size):
+            here = np.isin(found.looks.sheet, chosen)
+            if not here.any():
+                continue
+            picks = np.array(search.among(here).greedy(count))
+            looks = found.looks[picks]
+            design = arrange(looks, names, found.overshoot, home=at)
+            design = _with_run_up(design, looks.side[design.order[0]], found.overshoot)
+            steps = _steps(design)
+            spared = steps[1:] if design.sheet[0] == sheet else steps
+            value = _value(asked, target, picks, design.path)
+            choices.append(_Choice(picks, design, steps, plan_seconds(rig, spared) / 60, value))
+    return choices
+
+
+def _value(asked: Question, target: Target, picks: np.ndarray, path: np.ndarray) -> float:
+    """The target's value after looks, paths in steps since the campaign ended."""
+    information = information_of_looks(asked.seen, picks, path, asked.knowledge.space, homed=False)
+    return asked.at_centre.value(covariance_of(asked.knowledge.precision + information), target.factor)
+
+
+def _after_each(asked: Question, target: Target, choice: _Choice) -> tuple[float, ...]:
+    order, path = choice.design.order, choice.design.path
+    return tuple(
+        _value(asked, target, choice.picks[order[:done]], path[order[:done]]) for done in range(1, len(order) + 1)
+    )
