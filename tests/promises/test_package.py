@@ -22,7 +22,7 @@ SIZES_MAX = {".whl": 1_000_000, ".gz": 2_000_000}
 SHIPPED = (
     *("rigs/mounted/rig.toml", "rigs/nominal/rig.toml", "twins/paper_twin/spots.csv", "twins/grid_twin/truth.json"),
     *("schemas/fit-1.schema.json", "report/report.html", "report/report.css", "templates/campaign.toml"),
-    *("export/tvs_calibration.h", "reference/table1.csv", "tutorial/rig.svg", "tutorial/README.md"),
+    *("export/tvs_calibration.h", "reference/table1.csv", "tutorial/rig.svg", "tutorial/README.md", "view/page.html"),
     *(path.relative_to(ROOT / "data").as_posix() for path in sorted((ROOT / "data" / "docs").glob("*.md"))),
 )
 

@@ -28,7 +28,7 @@ from tvsbayes.instrument.campaign import read_campaign, with_pixels
 from tvsbayes.view.contents import Contents, page_files
 from tvsbayes.view.document import document
 from tvsbayes.view.gathering import look_at
-from tvsbayes.view.scene import LookColumns, Looked
+from tvsbayes.view.scene import LookColumns, Looked, scene
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 DRIVER = shutil.which("chromedriver")
