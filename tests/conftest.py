@@ -23,6 +23,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from xdist.scheduler import LoadFileScheduling
 
 from tvsbayes.instrument.rig import Rig, read_rig
 from tvsbayes.twin.simulated_campaign import simulate
@@ -33,68 +34,39 @@ pytest_plugins = [
     *("support.coarse_planning", "support.invented_studies", "support.viewed_twin"),
 ]
 """Fixtures of one small campaign, of commands, of the report, of planning and of studies, with their helpers."""
-COMPILES = "cli/test_estimate_commands.py"
-LONG = (
-    *(
-        "report/test_page.py",
-        "cli/test_campaign_commands.py",
-        "posterior/test_sampling.py",
-        "comparison/test_held_out.py",
-        "assessment/test_summary.py",
-    ),
-    *(
-        "comparison/test_changes.py",
-        "comparison/test_gap.py",
-        "assessment/test_score_tests.py",
-        "assessment/test_residuals.py",
-        "assessment/test_causes.py",
-    ),
-    *(
-        "planning/test_candidates.py",
-        "planning/test_expectation.py",
-        "cli/test_planning_commands.py",
-        "planning/test_plan_check.py",
-        "planning/test_planner.py",
-        "planning/test_limits.py",
-    ),
-    *(
-        "posterior/test_proposal.py",
-        "posterior/test_transport.py",
-        "statistics/test_least_squares.py",
-        "estimators/test_likelihood.py",
-        "coordinates/test_error_map.py",
-        "estimators/test_linear_spots.py",
-    ),
-    *(
-        "cameras/test_stereo_calibration.py",
-        "coordinates/test_location.py",
-        "estimators/test_joint_fit.py",
-        "studies/test_executors.py",
-        "cli/test_use_commands.py",
-    ),
-    *(
-        "calibration/test_pointing.py",
-        "statistics/test_intervals.py",
-        "promises/test_docs.py",
-        "model/test_laser_path.py",
-        "promises/test_shipped_data.py",
-    ),
-)
-"""Files that compile the model or much of it, about ten seconds or more, roughly the longest first."""
+COMPILES = "cli"
+TOGETHER = {
+    **{"estimators": "estimators", "posterior": "posterior", "planning": "planning", "report": "report"},
+    **{"assessment": "judgements", "comparison": "judgements"},
+}
+"""Packages whose files share fits and compiled functions: one process takes them all. Roughly the longest first."""
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Order the files for two processes that take one file after the other.
+    """Order the packages for two processes.
 
-    One compiles the model while the other is at what needs no model, and then reads it from the cache; the long files
-    follow, so that neither is left alone with one at the end.
+    One compiles the model for the commands while the other is at what needs little of it, and then reads it from the
+    cache; the long packages follow, so that neither is left alone with one at the end.
     """
+    groups = list(dict.fromkeys(TOGETHER.values()))
 
     def turn(item: pytest.Item) -> int:
-        name = f"{item.path.parent.name}/{item.path.name}"
-        return 0 if name == COMPILES else 2 + LONG.index(name) if name in LONG else 1
+        package = item.path.parent.name
+        return 0 if package == COMPILES else 2 + groups.index(TOGETHER[package]) if package in TOGETHER else 1
 
     items.sort(key=turn)
+
+
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> LoadFileScheduling:
+    """Files stay whole, as xdist's own `loadfile` has it, and the packages above with theirs."""
+
+    class ByFixtures(LoadFileScheduling):
+        def _split_scope(self, nodeid: str) -> str:
+            file = super()._split_scope(nodeid)
+            package = Path(file).parent.name
+            return package if package == COMPILES else TOGETHER.get(package, file)
+
+    return ByFixtures(config, log)
 
 
 @pytest.fixture(scope="session", autouse=True)
