@@ -159,7 +159,7 @@ def table(arguments: argparse.Namespace) -> None:
     )
     print("|---|---|---|---|---|---|")
     for name in ("adapt", *FIXED):
-        own = [row[name] for row in rows]
+        own = [row[name] for row in rows if name in row]
         met = sum(o["met"] for o in own)
         minutes = np.quantile([o["minutes"] for o in own], [0.5, 0.1, 0.9])
         z = np.array([v for o in own for v in o["z"] if v is not None])

@@ -148,7 +148,7 @@ def table(arguments: argparse.Namespace) -> None:
     print(
         f"after {homings:.0f} homings in {minutes:.1f} minutes. In brackets 95 % intervals of the counts; days of one"
     )
-    print("one rig share its first day, so that they are somewhat wider in truth.\n")
+    print("rig share its first day, so that they are somewhat wider in truth.\n")
     print("| moved | size | MOVED, counted | stated at least | named right, of MOVED | classic |")
     print("|---|---|---|---|---|---|")
     groups = [
