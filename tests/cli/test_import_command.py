@@ -98,3 +98,23 @@ def test_options_that_say_nothing_usable_are_refused(say, table, tmp_path, optio
     code, _, log = say("import", table, "--to", tmp_path / "mine", *options)
     assert code == 2
     assert any(part in log for part in said.split("|")), log
+
+
+def test_a_log_of_one_axis_goes_to_an_axis_folder(ask, say, tmp_path):
+    """With --axis, or where the folder is one; nothing of it is overwritten."""
+    log, out = tmp_path / "log.csv", tmp_path / "axis"
+    turns = [*range(0, 7, 2), *range(4, -1, -2)] * 2
+    log.write_text(
+        "time;steps;encoder_deg\n" + "".join(f"{k};{n};{0.5 * n + 0.01 * k:.3f}\n" for k, n in enumerate(turns))
+    )
+    code, document = ask("import", log, "--to", out)
+    assert code == 2 and "--axis" in assert_error(document, "missing-column")["remedy"]
+    assert "value  " in say("import", log, "--to", out, "--axis")[1] and not out.exists()
+    code, document = ask("import", log, "--to", out, "--axis", "--pixels-from", 1)
+    assert code == 2 and "--pixels-from" in assert_error(document, "usage")["message"]
+    assert ask("new", out, "--axis")[0] == 0
+    code, document = ask("import", log, "--to", out, "--yes")
+    assert (code, document["readings"], document["columns"]["value"]["column"]) == (0, 14, "encoder_deg")
+    assert ask("check", out)[1]["readings"] == 14
+    code, document = ask("import", log, "--to", out, "--yes")
+    assert code == 2 and assert_error(document, "occupied")["file"].endswith("moves.csv")

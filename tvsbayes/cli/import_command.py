@@ -6,15 +6,16 @@ Options in, library called, table or JSON out; heavy imports stand inside the co
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping, Sequence
-from itertools import islice
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from tvsbayes.cli.app import Json, finish, report_line
-from tvsbayes.cli.begin_commands import few, moves_file, rows_listed, write_templates
+from tvsbayes.cli import axis_commands
+from tvsbayes.cli.app import Json, finish, refuse_options, report_line
+from tvsbayes.cli.begin_commands import moves_file, rows_listed, write_templates
+from tvsbayes.cli.understood_columns import not_sure, table_document, table_lines
 from tvsbayes.errors import InputError, escaped, refusal
 from tvsbayes.files.csv_table import CSV_BYTES_MAX
 from tvsbayes.files.disk import make_folder, read_bytes, shipped_data, write_atomically
@@ -24,9 +25,6 @@ if TYPE_CHECKING:
     from tvsbayes.instrument.campaign import Move
     from tvsbayes.instrument.column_names import Understood
     from tvsbayes.instrument.foreign_looks import ForeignLooks, Notation
-
-SAMPLES = 3
-"""First values of a column that are shown."""
 
 
 def import_(
@@ -45,6 +43,7 @@ def import_(
     sd_px: Annotated[
         float | None, typer.Option("--sd-px", min=1e-4, max=100.0, help="Of centroids, where no column has it: 0.1.")
     ] = None,
+    axis: Annotated[bool, typer.Option("--axis", help="Of one axis: commands and readings.")] = False,
     relative: Annotated[bool, typer.Option("--relative", help="Counters are the steps of each move.")] = False,
     pan_approach: Annotated[
         str, typer.Option("--pan-approach", help="How pan came to the first row: left, right or unknown.")
@@ -55,7 +54,7 @@ def import_(
 ) -> None:
     """A table of your own into a campaign. Shows what it understood, then asks; overwrites nothing."""
     from tvsbayes.files.foreign_table import read_foreign
-    from tvsbayes.instrument.axes import sides_of
+    from tvsbayes.instrument.axes import AXES, sides_of
     from tvsbayes.instrument.column_names import understand
     from tvsbayes.instrument.foreign_looks import SD_PX, Notation, looks_of
 
@@ -65,6 +64,14 @@ def import_(
     approach = (pan_approach, tilt_approach)
     sides_of(approach)
     stated = dict(_field_and_column(text) for text in column or ())
+    if axis or axis_commands.is_axis(to):
+        from tvsbayes.cli.axis_import import import_readings
+
+        unfit = {"pixels_from": pixels_from or None, "angles": angles, "sd_px": sd_px, "relative": relative}
+        sides = {f"{a}_approach": None if side == "unknown" else side for a, side in zip(AXES, approach, strict=True)}
+        refuse_options(axis_commands.NOT_OF_AN_AXIS, "leave it out", **unfit, **sides)
+        import_readings(file, to, stated, sheet, yes=yes, as_json=as_json)
+        return
     listed = _listed_moves(to)
     table = read_foreign(file, sheet)
     asking = not (yes or as_json) and sys.stdin.isatty()
@@ -117,7 +124,7 @@ def _completed(
     Raises:
         InputError: something is missing, or claimed by two columns, and nobody can be asked.
     """
-    from tvsbayes.instrument.column_names import FIELDS, missing, understand
+    from tvsbayes.instrument.column_names import COUNTERS, FIELDS, PIXELS, missing, understand
 
     open_fields = [*missing(known.columns, moves_known), *known.claimed]
     if not open_fields:
@@ -132,12 +139,9 @@ def _completed(
         open_fields = missing(known.columns, moves_known)
         if not open_fields:
             return known
-    claims = [f"{field} ({' or '.join(escaped(name) for name in own)})" for field, own in known.claimed.items()]
-    found = f"no column that is surely {', '.join([*(f for f in open_fields if f not in known.claimed), *claims])}"
-    told = ", ".join(f"{field} = {escaped(known.columns[field])}" for field in FIELDS if field in known.columns)
-    found += f"; understood so far: {told or 'nothing'}"
-    remedy = f"say which: --column {open_fields[0]}=NAME; --column {open_fields[0]}= where there is none"
-    raise refusal("missing-column", file=table.file, line=1, found=found, allowed=f"any of {names}", remedy=remedy)
+    strange = set(known.columns).isdisjoint((*PIXELS, *COUNTERS))
+    besides = "; or --axis, where one axis and its readings are meant" * strange
+    raise not_sure(table, known, open_fields, FIELDS, besides)
 
 
 def _refuse_listed(to: Path, looks: ForeignLooks) -> None:
@@ -167,25 +171,10 @@ def _write_looks(to: Path, looks: ForeignLooks) -> list[str]:
     return [str(to / name) for name in contents]
 
 
-def first_values(cells: Sequence[str]) -> list[str]:
-    """The first cells of a column that hold anything: rows without a look begin many tables."""
-    return list(islice(filter(None, cells), SAMPLES))
-
-
 def _understood_document(table: ForeignTable, known: Understood, looks: ForeignLooks) -> dict[str, Any]:
     """The same as `_understood_text`, for programs."""
-    columns = {
-        field: {"column": name, "first": first_values(table.columns[name]), "empty": table.columns[name].count("")}
-        for field, name in known.columns.items()
-    }
     return {
-        **{
-            "file": table.file,
-            "kind": table.kind,
-            "rows": len(table),
-            "columns": columns,
-            "unused": list(known.unused),
-        },
+        **table_document(table, known),
         "assumed": list(looks.assumed),
         "moves": None if looks.moves is None else len(looks.moves),
         "spots": None if looks.spots is None else len(looks.spots),
@@ -197,24 +186,15 @@ def _understood_text(table: ForeignTable, known: Understood, notation: Notation,
     """The columns that were found beside their fields, units and first values; what was assumed; what comes out."""
     from tvsbayes.instrument.column_names import FIELDS, unit_of_name
 
-    rows = [("field", "column", "read as", "first values")]
-    for field in (field for field in FIELDS if field in known.columns):
-        name = known.columns[field]
-        unit = "px" if field.endswith("_px") else "steps" if field.endswith("_steps") else ""
+    def unit(field: str, name: str) -> str:
         if field.endswith("_px") and field.startswith(("u", "v")):
-            unit = f"px from {notation.pixels_from}"
-        elif field in ("aperture_deg", "time_s"):
+            return f"px from {notation.pixels_from}"
+        if field in ("aperture_deg", "time_s"):
             stated = notation.angle_unit if field == "aperture_deg" else None
-            unit = stated or unit_of_name(name) or field.rpartition("_")[2]
-        cells, empty = table.columns[name], table.columns[name].count("")
-        first = ", ".join(escaped(cell, 12) for cell in first_values(cells)) or "none"
-        first += f" ({empty} of {len(cells)} empty)" * bool(empty)
-        rows.append((field, escaped(name, 24), unit, first))
-    widths = [max(len(row[k]) for row in rows) for k in range(3)]
-    lines = [f"{table.file}: {table.kind}; {len(table)} rows"]
-    lines += ["  ".join([*(cell.ljust(w) for cell, w in zip(row, widths, strict=False)), row[3]]) for row in rows]
-    if known.unused:
-        lines.append(f"not used: {few(known.unused)}")
+            return stated or unit_of_name(name) or field.rpartition("_")[2]
+        return "px" if field.endswith("_px") else "steps" if field.endswith("_steps") else ""
+
+    lines = table_lines(table, known, FIELDS, unit)
     lines += [f"assumed: {text}" for text in looks.assumed]
     ok = sum(spot.status == "ok" for spot in looks.spots or ())
     counts = [] if looks.moves is None else [f"{len(looks.moves)} moves"]

@@ -75,7 +75,8 @@ class Locations(Shown):
             note = f"refused: {error.code}" if error is not None else "EXTRAPOLATED" if self.extrapolated[k] else ""
             numbers = [None] * 6 if error is not None else [*self.xyz_mm[k].tolist(), *self.u95_mm[k].tolist()]
             rows.append((k, *numbers, note))
-        title = f"Locations of {len(self.refused)} points, frame T, {self.draws} draws ({self.estimator})"
+        points = f"{len(self.refused)} point{'s' * (len(self.refused) != 1)}"
+        title = f"Locations of {points}, frame T, {self.draws} draws ({self.estimator})"
         return View(title, (*columns, "note"), rows)
 
     @cached_property

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 import unicodedata
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from tvsbayes.errors import InputError, closest, escaped
@@ -138,12 +138,42 @@ def _field_of(name: str) -> str | None:
     return next((field for word in listed for field, spellings in _WORDS.items() if word in spellings), None)
 
 
-def understand(columns: Iterable[str], stated: Mapping[str, str] | None = None) -> Understood:
+AXIS_FIELDS = ("command", "value", "u", "time_s", "segment", "approach", "status")
+"""All that a table of an axis can give."""
+_AXIS_WORDS = {
+    "command": {
+        *("command", "commanded", "cmd", "counter", "steps", "step", "counts", "target", "goal", "position", "pos"),
+        *("schritte", "soll", "sollwert", "zahler", "pasos", "contador", "consigna", "posicion", "pas", "consigne"),
+    },
+    "value": {
+        *("value", "reading", "read", "measured", "encoder", "angle", "ist", "istwert", "messwert", "winkel", "lesung"),
+        *("lectura", "medida", "valor", "angulo", "codificador", "lecture", "mesure", "codeur", "autocollimator"),
+    },
+    "u": {"u", "sd", "std", "sigma", "unc", "uncertainty", *_SPREAD} - {"s"},
+    "approach": _APPROACH | {"direction", "richtung", "direccion"},
+    **{name: _WORDS[name] for name in ("time_s", "segment", "status")},
+}
+
+
+def axis_field_of(name: str) -> str | None:
+    """The field of an axis that a column's name tells of: by its first word that is known."""
+    known = (field for word in words_of(name) for field, spellings in _AXIS_WORDS.items() if word in spellings)
+    return next(known, None)
+
+
+def understand(
+    columns: Iterable[str],
+    stated: Mapping[str, str] | None = None,
+    fields: Sequence[str] = FIELDS,
+    field_of: Callable[[str], str | None] = _field_of,
+) -> Understood:
     """Guess what columns are.
 
     Args:
         columns: their names.
         stated: column by field, where somebody has said it; an empty column: the table has none.
+        fields: all that there are.
+        field_of: the field that a name tells of.
 
     Raises:
         InputError: a field or column that does not exist.
@@ -151,18 +181,18 @@ def understand(columns: Iterable[str], stated: Mapping[str, str] | None = None) 
     names, stated = list(columns), stated or {}
     for field, name in stated.items():
         option = f"--column {escaped(field)}={escaped(name)}"
-        if field not in FIELDS:
-            allowed, remedy = ", ".join(FIELDS), closest(field, FIELDS)
+        if field not in fields:
+            allowed, remedy = ", ".join(fields), closest(field, fields)
             raise InputError("usage", f"{option}: no such field; allowed: {allowed}", allowed=allowed, remedy=remedy)
         if name and name not in names:
             allowed, remedy = ", ".join(map(escaped, names)), closest(name, names)
             raise InputError("usage", f"{option}: no such column; allowed: {allowed}", allowed=allowed, remedy=remedy)
     found = {field: name for field, name in stated.items() if name}
     free = [name for name in names if name not in found.values()]
-    found |= {name: name for name in free if name in FIELDS and name not in stated}
+    found |= {name: name for name in free if name in fields and name not in stated}
     claims: dict[str, list[str]] = {}
     for name in (n for n in free if n not in found.values()):
-        told = _field_of(name)
+        told = field_of(name)
         if told is not None and told not in found and told not in stated:
             claims.setdefault(told, []).append(name)
     found |= {field: own[0] for field, own in claims.items() if len(own) == 1}

@@ -21,8 +21,9 @@ from tvsbayes.instrument.counter_limits import COUNTER_MAX
 
 SD_PX = 0.1
 """Standard uncertainty of a centroid where a table states none; the fit scales it by what the spots show."""
-_GOOD = {"ok", "1", "true", "yes", "good", "valid", "ja", "si"}
-_BAD = {"0", "false", "no", "bad", "invalid", "nein"}
+GOOD = {"ok", "1", "true", "yes", "good", "valid", "ja", "si"}
+BAD = {"0", "false", "no", "bad", "invalid", "nein"}
+"""Words of a status, in small letters."""
 _SECONDS = {"ms": 1e-3, "min": 60.0}
 
 
@@ -61,7 +62,7 @@ class ForeignLooks:
 
 
 @dataclass(frozen=True)
-class _Cells:
+class FieldCells:
     """Cells of a table by field."""
 
     table: ForeignTable
@@ -98,6 +99,7 @@ class _Cells:
         return [None if value is None else int(value) for value in values]
 
     def refuse(self, row: int, field: str, allowed: str, remedy: str) -> InputError:
+        """The error of one cell."""
         return self.table.refuse(row, self.columns[field], allowed, remedy)
 
 
@@ -115,7 +117,7 @@ def looks_of(
     Raises:
         InputError: a cell that is no value of its field; looks whose moves nobody knows.
     """
-    cells = _Cells(table, columns)
+    cells = FieldCells(table, columns)
     if not len(table):
         found, remedy = "no rows below the names of the columns", "name the sheet or file with the data"
         raise refusal("empty", file=table.file, found=found, allowed="at least one row", remedy=remedy)
@@ -129,7 +131,7 @@ def looks_of(
     return ForeignLooks(moves, spots, tuple(assumed))
 
 
-def _listed_moves(cells: _Cells, listed: Sequence[Move]) -> list[int]:
+def _listed_moves(cells: FieldCells, listed: Sequence[Move]) -> list[int]:
     """The move of every row of a table without counters."""
     table, count = cells.table, len(cells.table)
     if "move" not in cells:
@@ -146,13 +148,13 @@ def _listed_moves(cells: _Cells, listed: Sequence[Move]) -> list[int]:
     return [int(number or 0) for number in numbers]
 
 
-def _moves(cells: _Cells, notation: Notation, assumed: list[str]) -> tuple[tuple[Move, ...], list[int]]:
+def _moves(cells: FieldCells, notation: Notation, assumed: list[str]) -> tuple[tuple[Move, ...], list[int]]:
     """The moves of a table with counters, and the move of every row."""
     count = len(cells.table)
     pairs = list(zip(*(cells.integers(field, COUNTER_MAX) for field in COUNTERS), strict=True))
     numbers = cells.text("move") if "move" in cells else None
     homings = cells.text("segment")
-    times_s = _times_s(cells, assumed)
+    times_s = seconds_of(cells, assumed)
     approaches = [_approaches(cells, axis, notation.approach[k]) for k, axis in enumerate(AXES)]
     moves: list[Move] = []
     of_row: list[int] = []
@@ -188,7 +190,7 @@ def _moves(cells: _Cells, notation: Notation, assumed: list[str]) -> tuple[tuple
     return tuple(moves), of_row
 
 
-def _approaches(cells: _Cells, axis: Axis, default: str) -> list[str]:
+def _approaches(cells: FieldCells, axis: Axis, default: str) -> list[str]:
     """The side from which an axis came, of every row."""
     field, allowed = f"{axis}_approach", (*SENSES[axis], "unknown")
     found = [word.lower() or default for word in cells.text(field)]
@@ -198,7 +200,7 @@ def _approaches(cells: _Cells, axis: Axis, default: str) -> list[str]:
     return found
 
 
-def _times_s(cells: _Cells, assumed: list[str]) -> list[float] | None:
+def seconds_of(cells: FieldCells, assumed: list[str]) -> list[float] | None:
     """Seconds of every row: numbers in the unit of the column's name, or dates with times."""
     if "time_s" not in cells:
         return None
@@ -223,7 +225,7 @@ def _times_s(cells: _Cells, assumed: list[str]) -> list[float] | None:
     return found
 
 
-def _spots(cells: _Cells, of_row: Sequence[int], notation: Notation, assumed: list[str]) -> tuple[Spot, ...]:
+def _spots(cells: FieldCells, of_row: Sequence[int], notation: Notation, assumed: list[str]) -> tuple[Spot, ...]:
     """The looks of a table with pixels."""
     pixels = [cells.numbers(field, 1e6, empty=True) for field in PIXELS]
     stated = [cells.numbers(field, 100.0, empty=True) if field in cells else None for field in PIXEL_SDS]
@@ -256,13 +258,13 @@ def _spots(cells: _Cells, of_row: Sequence[int], notation: Notation, assumed: li
     return tuple(spots)
 
 
-def _status(text: str, centre: Sequence[float | None], cells: _Cells, row: int) -> str:
+def _status(text: str, centre: Sequence[float | None], cells: FieldCells, row: int) -> str:
     """The word "ok", or why a look is of no use."""
     seen = None not in centre
     word = text.strip().lower()
-    if word in _GOOD or not word:
+    if word in GOOD or not word:
         if seen or not word:
             return "ok" if seen else "no centre in the table"
         field = PIXELS[centre.index(None)]
         raise cells.refuse(row, field, "a number where the look is ok", "complete the cell, or its status")
-    return f"refused: {text}" if word in _BAD else text[:200]
+    return f"refused: {text}" if word in BAD else text[:200]

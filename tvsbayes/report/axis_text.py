@@ -143,4 +143,4 @@ def axis_plan_text(plan: AxisPlan, unit: str) -> str:
     """What next, in words."""
     if not plan.next:
         return "there is no time for a single stop"
-    return f"{next_table(plan, unit).text()}\n{plan.minutes:.0f} minutes"
+    return f"{next_table(plan, unit).text()}\n{plan.minutes:.1f} minutes in all"

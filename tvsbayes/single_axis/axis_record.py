@@ -219,8 +219,8 @@ def axis_warnings(campaign: AxisCampaign, rows: AxisRows) -> list[str]:
     again = [int(m) for m in rows.move if idle[m]]
     if again:
         found.append(
-            f"moves {listed(again, 5)} repeat the command before: nothing moved, so they are of one stop and side; "
-            "list the moves in between if the axis went on and came back"
+            f"same command as the move before: moves {listed(again, 5)}; nothing moved, so they are of one stop and "
+            "side; list the moves in between if the axis went on and came back"
         )
     if len({m.time_s for m in campaign.moves}) == 1:
         found.append("all moves have the same time: drift cannot be told")

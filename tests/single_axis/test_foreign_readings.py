@@ -1,0 +1,65 @@
+"""A table of an axis as a logger writes it becomes moves and readings."""
+
+from __future__ import annotations
+
+import pytest
+
+from tvsbayes.errors import InputError
+from tvsbayes.files.foreign_table import read_foreign
+from tvsbayes.instrument.column_names import AXIS_FIELDS, axis_field_of, understand
+from tvsbayes.single_axis.foreign_readings import readings_of
+
+NAMES = [
+    ("steps", "encoder_deg"),
+    ("commanded position", "measured position"),
+    ("Sollwert", "Istwert"),
+    ("pasos", "lectura (mm)"),
+    ("consigne", "mesure"),
+]
+
+
+@pytest.mark.parametrize("names", NAMES, ids=[names[0] for names in NAMES])
+def test_commands_and_readings_by_any_name(names):
+    found = understand(names[::-1], None, AXIS_FIELDS, axis_field_of)
+    assert (found.columns["command"], found.columns["value"]) == names and not found.claimed
+
+
+def table(tmp_path, *lines):
+    path = tmp_path / "log.csv"
+    path.write_text("\n".join(lines) + "\n")
+    read = read_foreign(path)
+    return read, understand(read.columns, None, AXIS_FIELDS, axis_field_of).columns
+
+
+def test_stops_are_read_again_passed_and_homed(tmp_path):
+    """A repeated command is the same stop, a row without a value a move, another home number another segment."""
+    found = readings_of(
+        *table(
+            tmp_path,
+            "t (min);home;steps;encoder;from;sd;ok",
+            "0;1;0;0,5;forward;0,1;1",
+            "1;1;100;1,5;;0,1;1",
+            "2;1;100;1,6;;0,1;1",
+            "3;1;200;;;;",
+            "4;1;100;1,4;;;no",
+            "5;2;100;1,7;backward;0,2;ja",
+        )
+    )
+    assert [(m.move, m.segment, m.time_s, m.command, m.approach) for m in found.moves] == [
+        *((0, 0, 0.0, 0.0, "forward"), (1, 0, 60.0, 100.0, ""), (2, 0, 180.0, 200.0, "")),
+        *((3, 0, 240.0, 100.0, ""), (4, 1, 300.0, 100.0, "backward")),
+    ]
+    assert [(r.move, r.value, r.u, r.status) for r in found.readings] == [
+        *((0, 0.5, 0.1, "ok"), (1, 1.5, 0.1, "ok"), (1, 1.6, 0.1, "ok")),
+        *((3, 1.4, 0.0, "refused: no"), (4, 1.7, 0.2, "ok")),
+    ]
+    assert any("1 row at the command before" in text for text in found.assumed)
+
+
+@pytest.mark.parametrize(
+    ("row", "column"), [("x,1,ok,forward", "steps"), ("0,,ok,forward", "angle"), ("0,1,ok,cw", "side")]
+)
+def test_cells_that_say_nothing_are_refused_with_their_column(tmp_path, row, column):
+    with pytest.raises(InputError) as refused:
+        readings_of(*table(tmp_path, "steps,angle,status,side", row))
+    assert (refused.value.line, refused.value.column) == (2, column)

@@ -1,0 +1,62 @@
+"""What `import` understood of a table's columns: shown before anything is written, and where it must be asked for."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from itertools import islice
+from typing import TYPE_CHECKING, Any
+
+from tvsbayes.cli.begin_commands import few
+from tvsbayes.errors import InputError, escaped, refusal
+
+if TYPE_CHECKING:
+    from tvsbayes.files.foreign_table import ForeignTable
+    from tvsbayes.instrument.column_names import Understood
+
+SAMPLES = 3
+"""First values of a column that are shown."""
+
+
+def first_values(cells: Sequence[str]) -> list[str]:
+    """The first cells of a column that hold anything: rows without a look begin many tables."""
+    return list(islice(filter(None, cells), SAMPLES))
+
+
+def table_document(table: ForeignTable, known: Understood) -> dict[str, Any]:
+    """What was understood, for programs."""
+    columns = {
+        field: {"column": name, "first": first_values(table.columns[name]), "empty": table.columns[name].count("")}
+        for field, name in known.columns.items()
+    }
+    head = {"file": table.file, "kind": table.kind, "rows": len(table)}
+    return {**head, "columns": columns, "unused": list(known.unused)}
+
+
+def table_lines(
+    table: ForeignTable, known: Understood, fields: Sequence[str], unit: Callable[[str, str], str]
+) -> list[str]:
+    """The columns that were found beside their fields, units and first values; `unit` of a field and its column."""
+    rows = [("field", "column", "read as", "first values")]
+    for field in (field for field in fields if field in known.columns):
+        name = known.columns[field]
+        cells, empty = table.columns[name], table.columns[name].count("")
+        first = ", ".join(escaped(cell, 12) for cell in first_values(cells)) or "none"
+        first += f" ({empty} of {len(cells)} empty)" * bool(empty)
+        rows.append((field, escaped(name, 24), unit(field, name), first))
+    widths = [max(len(row[k]) for row in rows) for k in range(3)]
+    lines = [f"{table.file}: {table.kind}; {len(table)} rows"]
+    lines += ["  ".join([*(cell.ljust(w) for cell, w in zip(row, widths, strict=False)), row[3]]) for row in rows]
+    return [*lines, *([f"not used: {few(known.unused)}"] if known.unused else [])]
+
+
+def not_sure(
+    table: ForeignTable, known: Understood, missing: Sequence[str], fields: Sequence[str], besides: str = ""
+) -> InputError:
+    """The refusal of a table whose columns do not say enough, with what they say; `besides` ends the remedy."""
+    claims = [f"{field} ({' or '.join(escaped(name) for name in own)})" for field, own in known.claimed.items()]
+    found = f"no column that is surely {', '.join([*(f for f in missing if f not in known.claimed), *claims])}"
+    told = ", ".join(f"{field} = {escaped(known.columns[field])}" for field in fields if field in known.columns)
+    found += f"; understood so far: {told or 'nothing'}"
+    remedy = f"say which: --column {missing[0]}=NAME; --column {missing[0]}= where there is none{besides}"
+    names = ", ".join(escaped(name) for name in table.columns)
+    return refusal("missing-column", file=table.file, line=1, found=found, allowed=f"any of {names}", remedy=remedy)

@@ -1,0 +1,85 @@
+"""Moves and readings of somebody's table of an axis: one row is a move, a reading, or both; unit of the folder.
+
+Rows that follow each other at the same command are readings of one stop; rows without a value are moves that nobody
+read. What a table does not say is assumed and listed in words.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from tvsbayes.errors import refusal
+from tvsbayes.files.foreign_table import ForeignTable
+from tvsbayes.instrument.foreign_looks import BAD, GOOD, FieldCells, seconds_of
+from tvsbayes.single_axis.axis_campaign import APPROACHES, COMMAND_MAX, Approach, AxisMove, Reading
+
+
+@dataclass(frozen=True)
+class ForeignReadings:
+    """Rows of `moves.csv` and `readings.csv`, and what the table does not say."""
+
+    moves: tuple[AxisMove, ...]
+    readings: tuple[Reading, ...]
+    assumed: tuple[str, ...]
+
+
+def readings_of(table: ForeignTable, columns: Mapping[str, str]) -> ForeignReadings:
+    """Moves and readings of a table.
+
+    Args:
+        table: as it was read.
+        columns: its columns by field, `column_names.AXIS_FIELDS`; "command" and "value" among them.
+
+    Raises:
+        InputError: a cell that is no value of its field, or no row.
+    """
+    cells = FieldCells(table, columns)
+    if not len(table):
+        found, remedy = "no rows below the names of the columns", "name the sheet or file with the data"
+        raise refusal("empty", file=table.file, found=found, allowed="at least one row", remedy=remedy)
+    assumed: list[str] = []
+    commands, values = cells.numbers("command", COMMAND_MAX), cells.numbers("value", COMMAND_MAX, empty=True)
+    stated_u = cells.numbers("u", COMMAND_MAX, empty=True) if "u" in cells else [None] * len(table)
+    times, homings, statuses = seconds_of(cells, assumed), cells.text("segment"), cells.text("status")
+    if times is None:
+        assumed.append("time_s: no column, so 0, 1, 2 ...; drift of the zero is then per move")
+    moves: list[AxisMove] = []
+    readings: list[Reading] = []
+    for row, (command, value) in enumerate(zip(commands, values, strict=True)):
+        homed = row > 0 and homings[row] != homings[row - 1]
+        if not moves or homed or command != moves[-1].command:
+            segment = 0 if not moves else moves[-1].segment + homed
+            side = _approach(cells, row) if not moves or homed else ""
+            at_s = float(len(moves)) if times is None else times[row]
+            moves.append(AxisMove(len(moves), segment, at_s, command or 0.0, side))
+        if value is not None or statuses[row]:
+            u = stated_u[row] or 0.0
+            readings.append(Reading(len(readings), moves[-1].move, value, u, _status(cells, row, value)))
+    if again := len(table) - len(moves):
+        assumed.append(f"{again} row{'s' * (again > 1)} at the command before: read at that stop again, without a move")
+    if "approach" not in cells:
+        assumed.append("approach: unknown at the beginning of each segment")
+    if "u" not in cells:
+        assumed.append("u: none, so that the scatter of stops covers the readings' own")
+    return ForeignReadings(tuple(moves), tuple(readings), tuple(assumed))
+
+
+def _approach(cells: FieldCells, row: int) -> Approach:
+    """How the axis came to the first stop of a segment."""
+    word = cells.text("approach")[row].lower() or "unknown"
+    for known in APPROACHES:
+        if word == known:
+            return known
+    raise cells.refuse(row, "approach", ", ".join(APPROACHES), "forward is the direction of rising commands")
+
+
+def _status(cells: FieldCells, row: int, value: float | None) -> str:
+    """The word "ok", or why a reading is of no use."""
+    text = cells.text("status")[row]
+    word = text.strip().lower()
+    if word and word not in GOOD:
+        return f"refused: {text}"[:100] if word in BAD else text[:100]
+    if value is None:
+        raise cells.refuse(row, "value", "a number where the reading is ok", "complete the cell, or its status")
+    return "ok"
