@@ -1,7 +1,7 @@
 // The page: the key for the link's token, the document, the plots, and one selection that all of them share.
 
 import { Scenes } from "./columns.js";
-import { Changes, Correlation, Pictures, Residuals, Stops } from "./plots.js";
+import { Changes, Correlation, MARKS_MOST, Pictures, Residuals, Stops } from "./plots.js";
 import { Rig, VIEWS } from "./rig.js";
 
 const KEY = "tvsbayes-key";
@@ -80,6 +80,7 @@ class Page {
     by("notes").textContent = all.flatMap((scene) => scene.notes.map((note) => `${scene.name}: ${note}`)).join("; ");
     for (const [k, scene] of all.entries()) by("campaign").add(new Option(scene.name, k));
     by("campaign").hidden = all.length < 2;
+    if (all.length > 1) by("whose").textContent = ` of the first, ${all[0].name}`;
     for (const plot of [this.rig, this.residuals, this.stops, this.pictures, this.correlation]) await plot.draw();
     by("rig-remark").textContent = this.rig.remark();
     by("residuals-remark").textContent = this.residuals.remark();
@@ -132,7 +133,8 @@ class Page {
 
   async choose(places) {
     this.places = places;
-    by("chosen").textContent = places.length > 1 ? `${places.length} looks are selected` : "";
+    const marked = places.length > MARKS_MOST ? `, ${MARKS_MOST} are marked` : "";
+    by("chosen").textContent = places.length > 1 ? `${places.length} looks are selected${marked}` : "";
     for (const plot of [this.rig, this.residuals, this.stops]) await plot.choose(places);
     if (places.length) await this.showLook(places[0]);
     document.body.dataset.chosen = places.length;

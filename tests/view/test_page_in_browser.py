@@ -158,6 +158,7 @@ def test_page_shows_everything_and_sends_nothing(page):
     assert [trace["count"] for trace in page.traces("rig", "spots")] == [383, 383]
     assert len(page.traces("rig", "sheets")) == 4 and len(page.traces("residuals", "looks")) == 4
     assert page.one("verdict").text == "no significant change"
+    assert page.one("parameters-figure").text.startswith("Parameters of the first, paper twin")
     rows = page.driver.find_elements(By.CSS_SELECTOR, "#changes-table tbody tr")
     assert len(rows) == 6
     titles = page.js("return [...document.querySelectorAll('.modebar-btn')].map((b) => b.dataset.title ?? '')")
@@ -415,6 +416,7 @@ def test_fifty_thousand_looks(viewed, browsed):
         known = MANY - MANY // 384 - 1
         browsed.until(f"Number(document.body.dataset.chosen) >= {known - 1}")
         assert browsed.chosen() < MANY
+        assert browsed.one("chosen").text.endswith("looks are selected, 3000 are marked")
         assert browsed.marks("stops") == browsed.marks("residuals") != [0, 0]
         assert f"of {MANY} looks have a spot; dots of 3000" in browsed.one("rig-remark").text
     assert browsed.complaints() == []
