@@ -103,6 +103,12 @@ def test_folder_without_results_shows_the_stated_rig(viewed):
     stated = [priors[name].value for name in names_of("extrinsics.translation_mm")]
     np.testing.assert_allclose(shown.origin_mm, stated)
     assert {row.name for row in shown.parameters} >= set(priors)
+    # The stated rig is not turned and its laser not tilted: straight down onto the first mirror, then to the second.
+    looks, down = shown.looks, np.array([0.0, 0.0, -1.0])
+    used = np.isfinite(looks.end_mm).all(axis=1)
+    between = (looks.second_mm - looks.first_mm)[used]
+    reflected = down - 2 * (looks.first_normal[used] @ down)[:, None] * looks.first_normal[used]
+    np.testing.assert_allclose(reflected, between / np.linalg.norm(between, axis=1, keepdims=True), atol=1e-9)
     assert np.isfinite(shown.looks.end_mm).all(axis=1).sum() == len(shown.looks.spot) - 1
 
 
