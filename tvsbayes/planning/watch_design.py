@@ -30,7 +30,7 @@ from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.estimators.linear_spots import LinearSpots, stop_information
 from tvsbayes.estimators.noise_scales import noise_draws
 from tvsbayes.instrument.axes import AXES
-from tvsbayes.instrument.campaign import Campaign, Spot, pixels_of
+from tvsbayes.instrument.campaign import Campaign, Spot, ordered_spots, pixels_of
 from tvsbayes.instrument.homing import homed
 from tvsbayes.instrument.parameters import INDEX, NAMES
 from tvsbayes.instrument.plan import PlanBuilder, PlanStep, plan_seconds, run_plan
@@ -57,7 +57,6 @@ class Candidate:
     side: tuple[int, int]
     target: str
     spot: Spot
-    row: int
 
 
 def _candidates(campaign: Campaign, spots: Sequence[Spot], used: np.ndarray) -> list[Candidate]:
@@ -69,7 +68,9 @@ def _candidates(campaign: Campaign, spots: Sequence[Spot], used: np.ndarray) -> 
         side = at[0].sign, at[1].sign
         if used[row] and all(side):
             steps = at[0].steps, at[1].steps
-            found.setdefault((steps, side, spot.target), Candidate(steps, side, spot.target, spot, row))
+            found.setdefault((steps, side, spot.target), Candidate(steps, side, spot.target, spot))
+    if not found:
+        return []
     every = np.array([one.steps for one in found.values()], dtype=float)
     middle, width = every.mean(axis=0), np.maximum(np.ptp(every, axis=0), 1.0)
     outer = sorted(found.values(), key=lambda one: -float(np.max(np.abs((one.steps - middle) / width))))
@@ -116,11 +117,8 @@ class WatchDesigns:
         self.fit, self.seed = fit, seed
         self.campaign = homed(fit.campaign, fit.sides)
         self.z = noise_draws(fit, 2, seed).centre
-        # The campaign as its own second day: every look of it, with the columns of the changes.
-        again = WatchedLooks(fit, fit.campaign)
-        linear, first = again.linear(self.z), again.first
-        spots = again.problem.spots[:first]
-        used = np.asarray(again.problem.arrays.spots.valid)[:first] > 0
+        spots = ordered_spots(self.campaign)
+        used = np.asarray(fit.arrays.spots.valid)[: len(spots)] > 0
         self.rig = _rig_of(self.campaign, spots, used) if rig is None else rig
         every = _candidates(self.campaign, spots, used)
         self.candidates = [one for one in every if self._reachable(one)]
@@ -130,7 +128,12 @@ class WatchDesigns:
                 "no look of the campaign can be taken again: sides unknown, or run-ups beyond the limits",
                 remedy="widen the limits in [positioner], or plan looks with `plan RIG`",
             )
-        self._learn(linear, first)
+        # The campaign as its own second day: what its looks show, with the columns of the changes.
+        again = WatchedLooks(fit, replace(fit.campaign, spots=tuple(one.spot for one in self.candidates)))
+        later = again.problem.spots[again.first :]
+        shift = max(spot.spot for spot in spots) + 1
+        rows = {spot.spot - shift: again.first + place for place, spot in enumerate(later)}
+        self._learn(again.linear(self.z), again.first, [rows[one.spot.spot] for one in self.candidates])
 
     @cached_property
     def _overshoot(self) -> np.ndarray:
@@ -156,8 +159,8 @@ class WatchDesigns:
         both = np.stack([np.array(one.steps), start])
         return bool(np.all((both >= self._limits[:, 0]) & (both <= self._limits[:, 1])))
 
-    def _learn(self, linear: LinearSpots, first: int) -> None:
-        """What the first day knows, and what every candidate would show, stop errors integrated out."""
+    def _learn(self, linear: LinearSpots, first: int, places: list[int]) -> None:
+        """What the first day knows, and what every candidate (its row) would show, stop errors integrated out."""
         errors = linear.places.shape[2]
         self.own = len(NAMES)
         spelled = linear.spelled_out(linear.places)
@@ -166,8 +169,7 @@ class WatchDesigns:
         keep = np.r_[: self.own, self.own + shifts : self.own + shifts + errors]
         self.known = fisher[np.ix_(keep, keep)] + np.eye(len(keep))
         shown = []
-        for one in self.candidates:
-            row = first + one.row
+        for one, row in zip(self.candidates, places, strict=True):
             slope = linear.load[row, :, :2]
             variance = self._stop_variance(one)
             columns = spelled.jacobian[row]
