@@ -91,4 +91,28 @@ FAULTS = (
         "beams and points of other looks, wherever spots.csv is not in order or a look has none",
         ("view/scene",),
     ),
+    Fault(
+        "one number for all reports of a fit",
+        "report/page.py",
+        'digest = hashlib.sha256(page_html(replace(page, number=""))).hexdigest()',
+        "digest = hashlib.sha256(page.results.encode()).hexdigest()",
+        "two different reports cannot be told apart by their number",
+        ("report/page",),
+    ),
+    Fault(
+        "a stale PDF stays",
+        "report/page.py",
+        "if before != html and (out is None or GENERATOR in before):",
+        "if before != html and GENERATOR in html and not before:",
+        "the PDF beside the page is of other results",
+        ("report/page",),
+    ),
+    Fault(
+        "the laboratory's country for the customer",
+        "metrology/dcc.py",
+        'add_contact(data, "dcc:customer", parties.customer, parties.customer_country)',
+        'add_contact(data, "dcc:customer", parties.customer, parties.country)',
+        "the certificate states a country that nobody stated",
+        ("metrology/dcc",),
+    ),
 )
