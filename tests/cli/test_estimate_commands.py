@@ -139,10 +139,15 @@ def test_fit_samples_writes_for_arviz_and_refuses_what_has_not_converged(ask, gr
     """The limits are loosened: what is tested is the way from options to files, not convergence."""
     import arviz
 
-    from tvsbayes.posterior import sampling
+    from tvsbayes.posterior import diagnosis, ensemble
 
-    for name, value in {"FIRST_CHECK": 40, "BLOCK": 20, "ESS_LIMIT": 50, "RHAT_LIMIT": 3.0, "TAU_LIMIT": 1}.items():
-        monkeypatch.setattr(sampling, name, value)
+    for module, loose in (
+        (ensemble, {"FIRST_CHECK": 40, "BLOCK": 20, "TAU_LIMIT": 1}),
+        (diagnosis, {"ESS_LIMIT": 50, "ESS_LIMIT_OTHERS": 10, "RHAT_LIMIT": 3.0, "TAU_LIMIT": 1}),
+        (diagnosis, {"AGREEMENT_LIMIT": 100.0, "STUCK_ACCEPTANCE": 0.0, "STUCK_DEVIATION": 1e9}),
+    ):
+        for name, value in loose.items():
+            monkeypatch.setattr(module, name, value)
     code, document = ask("fit", grid_folder, "--seed", 2)
     assert (code, document["estimator"], document["converged"]) == (0, "posterior", True)
     left = document["effective_deg_per_step"]["left"]
@@ -159,7 +164,7 @@ def test_fit_samples_writes_for_arviz_and_refuses_what_has_not_converged(ask, gr
     assert mean == pytest.approx(left["value"], rel=1e-12)
     assert arviz.summary(tree, var_names=["backlash_deg"]).shape[0] == 2
 
-    monkeypatch.setattr("tvsbayes.posterior.sampling.ESS_LIMIT", 10**9)
+    monkeypatch.setattr(diagnosis, "ESS_LIMIT", 10**9)
     code, document = ask("fit", grid_folder, "--seed", 2, "--resume", "--max-minutes", "0.01")
     assert (code, document["estimator"], document["converged"]) == (4, "laplace", False)
     assert document["error"]["code"] == "unconverged"

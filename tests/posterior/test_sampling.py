@@ -29,7 +29,7 @@ INTERRUPTED_CALL = 14
 
 def limits(patch: pytest.MonkeyPatch, steps: int) -> None:
     """Stop after so many steps, whatever they are worth."""
-    anything = {"RHAT_LIMIT": np.inf, "ESS_LIMIT": 0, "TAU_LIMIT": 0, "AGREEMENT_LIMIT": np.inf}
+    anything = {"RHAT_LIMIT": np.inf, "ESS_LIMIT": 0, "ESS_LIMIT_OTHERS": 0, "TAU_LIMIT": 0, "AGREEMENT_LIMIT": np.inf}
     for name, value in {**anything, "STUCK_ACCEPTANCE": 0.0, "STUCK_DEVIATION": np.inf}.items():
         patch.setattr(f"tvsbayes.posterior.diagnosis.{name}", value)
     for name, value in {"BLOCK": BLOCK, "FIRST_CHECK": steps}.items():

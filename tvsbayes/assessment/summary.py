@@ -45,6 +45,8 @@ LENGTH_NAMES = names_of("transmission_error_length_deg")
 ABSENT_AT_NOUGHT = tuple(name for name in (*HARMONIC_NAMES, *GEAR_ERROR_NAMES) if name not in LENGTH_NAMES)
 """Parameters that are not told of where they are held at 0."""
 CURVE_POINTS = 7
+CURVE_DRAWS = 2048
+"""Draws behind a curve's points: their Monte Carlo error is a thirtieth of the band's width, a line on the figure."""
 
 
 def _estimate(value: float, draws: np.ndarray, weights: np.ndarray, prior_draws: np.ndarray) -> Estimate:
@@ -200,12 +202,13 @@ def _curves(posterior: Posterior, moved: set[str]) -> Curves:
 def _along(posterior: Posterior, axis: int, moved: set[str]) -> tuple[CurvePoint, ...]:
     """Effective ratios at angles of one axis, the other at the reference pose."""
     angles = np.degrees(posterior.fit.linearised.mirror_angles_rad)[:, axis]
+    some = posterior.resampled(1, CURVE_DRAWS)
     points = []
     for angle in np.linspace(angles.min(), angles.max(), CURVE_POINTS):
         pose = np.degrees(posterior.fit.reference_pose_rad)
         pose[axis] = angle
         pan, tilt = pose.tolist()
-        found = posterior.effective_deg_per_step(pan, tilt)
+        found = some.effective_deg_per_step(pan, tilt)
         ratios = {
             direction: RatioAt(float(found.mean[k]), float(found.sd[k]), tuple(found.interval95[:, k].tolist()))
             for k, direction in enumerate(DIRECTIONS)

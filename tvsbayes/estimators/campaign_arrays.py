@@ -79,6 +79,15 @@ class CampaignArrays(eqx.Module):
     gears: GearArrays
     azimuth_convention: Bool[Array, ""]
 
+    def of_spots(self, start: Int[Array, ""], count: int) -> CampaignArrays:
+        """The same moves with `count` spots from one on: what follows the last is never asked for."""
+
+        def part(array):
+            return jax.lax.dynamic_slice_in_dim(array, start, count)
+
+        gears = GearArrays(self.gears.places, part(self.gears.error_share), part(self.gears.play_share))
+        return CampaignArrays(self.moves, jax.tree.map(part, self.spots), gears, self.azimuth_convention)
+
 
 def bucket(count: int, smallest: int | None = None, growth: int = 2) -> int:
     """Padded length for `count` rows: `smallest`, by default `SMALLEST_BUCKET`, times a power of `growth`."""

@@ -15,7 +15,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from tvsbayes.estimators.campaign_arrays import CampaignArrays, GearArrays, SpotArrays
 from tvsbayes.estimators.looks import Looks, looks_at
@@ -24,10 +24,13 @@ from tvsbayes.instrument.axes import HOME_SD_DEG
 from tvsbayes.model.compiled import compiled
 from tvsbayes.model.gear_processes import place_root
 from tvsbayes.model.geometry import Scalar
-from tvsbayes.model.laser_path import mirror_angles
+from tvsbayes.model.laser_path import MirrorAngles, mirror_angles
 from tvsbayes.model.parameter_space import Model, ParameterSpace
 
 STATES = 6
+BLOCK = 128
+"""Spots that go through the filter together: their numbers stay in the processor's cache, and a campaign costs what its
+own spots need, not what it was padded to."""
 
 
 def stop_variances(stop_sd_rad: Float[Array, "2 2"], spots: SpotArrays) -> Float[Array, "spots 2"]:
@@ -149,10 +152,15 @@ class Standing(eqx.Module):
     drift_variance: Float[Array, "spots 2"]
 
 
-def standing(model: Model, arrays: CampaignArrays, inflation: Float[Array | np.ndarray, ""] | float = 1.0) -> Standing:
-    """Linearise all spots; `inflation` is a factor on pixel and aperture noise (annealing)."""
+def standing(
+    model: Model,
+    arrays: CampaignArrays,
+    inflation: Float[Array | np.ndarray, ""] | float = 1.0,
+    angles: MirrorAngles | None = None,
+) -> Standing:
+    """Linearise all spots; `inflation` is a factor on pixel and aperture noise (annealing), `angles` those of moves."""
     spots = arrays.spots
-    angles = mirror_angles(model.transmission, model.tilt_zero_rad, arrays.moves)
+    angles = mirror_angles(model.transmission, model.tilt_zero_rad, arrays.moves) if angles is None else angles
     pan, tilt = (angles.angle_rad[:, axis][spots.move_index] for axis in range(2))
     looks = looks_at(model, pan, tilt, arrays)
     noise = noise_scales(model, spots, inflation)
@@ -171,13 +179,12 @@ class FilterInput(eqx.Module):
 
     The rows' columns are the residual, then how the errors at places move it. `free` is what is left of the
     standardised components, which no state changes; `log_scale` is what each spot adds to the log density besides the
-    rows: theirs in it. `place_root` is the factor of the covariance of the errors at places.
+    rows: theirs in it.
     """
 
     rows: FilterRows
     free: Float[Array, "spots 4"]
     log_scale: Float[Array, " spots"]
-    place_root: Float[Array, "errors errors"]
 
 
 def root_at_places(model: Model, gears: GearArrays) -> Float[Array, "errors errors"]:
@@ -189,9 +196,9 @@ def root_at_places(model: Model, gears: GearArrays) -> Float[Array, "errors erro
     return jnp.asarray(place_root(model.gears, angle_rad, places.on_tilt, places.valid))
 
 
-def filter_input(model: Model, arrays: CampaignArrays) -> FilterInput:
-    """Linearise all spots for the filter."""
-    found = standing(model, arrays)
+def filter_input(model: Model, arrays: CampaignArrays, angles: MirrorAngles | None = None) -> FilterInput:
+    """Linearise all spots for the filter; `angles` are those of the moves, if they are known."""
+    found = standing(model, arrays, angles=angles)
     terms = found.terms
     turned = ToStates.of(terms.by_pan, terms.by_tilt)
     first, second, *free = turned.of_many(terms.residual)
@@ -201,25 +208,69 @@ def filter_input(model: Model, arrays: CampaignArrays) -> FilterInput:
         columns, turned.slope, found.play_sd_rad, found.stop_variance, found.drift_variance, arrays.spots
     )
     log_scale = terms.log_scale - 0.5 * sum(number**2 for number in free)
-    return FilterInput(rows, jnp.stack(free, axis=1), log_scale, root_at_places(model, arrays.gears))
+    return FilterInput(rows, jnp.stack(free, axis=1), log_scale)
 
 
 class Seen(eqx.Module):
-    """Spots seen by the filter: standardised errors (spots, components, ...), and logs of their variances' products."""
+    """Spots seen by the filter: standardised errors (spots, components, ...), and logs of their variances' products.
+
+    `belief` is that after the last of them.
+    """
 
     standardised: Float[Array, "..."]
     log_variance: Float[Array, "*spots"]
+    belief: Belief
 
 
-def filtered(rows: FilterRows) -> Seen:
-    """Run the filter over all spots in time order."""
+def filtered(rows: FilterRows, before: Belief | None = None) -> Seen:
+    """Run the filter over spots in time order, from the belief before them."""
 
     def step(belief, row):
         seen = kalman_update(belief.renewed(row), row)
-        return seen.belief, Seen(seen.standardised, seen.log_variance)
+        return seen.belief, (seen.standardised, seen.log_variance)
 
-    columns = rows.residual.shape[2:]
-    return jax.lax.scan(step, no_belief(*columns), rows)[1]
+    start = no_belief(*rows.residual.shape[2:]) if before is None else before
+    after, (standardised, log_variance) = jax.lax.scan(step, start, rows)
+    return Seen(standardised, log_variance, after)
+
+
+class Passed(eqx.Module):
+    """A campaign on its way through the filter, block by block; rows of spots ahead are nought.
+
+    `log_density` is that of the spots passed without squares of what the filter standardised.
+    """
+
+    belief: Belief
+    standardised: Float[Array, "spots 2 columns"]
+    free: Float[Array, "spots 4"]
+    log_density: Scalar
+
+
+def blocks_filled(spots: SpotArrays) -> Int[Array, ""]:
+    """Blocks that hold a spot which counts: padding comes last."""
+    rows = jnp.arange(1, len(spots.valid) + 1)
+    return -(-jnp.max(jnp.where(spots.valid > 0, rows, 0)) // BLOCK)
+
+
+def passed(model: Model, arrays: CampaignArrays, blocks: Int[Array, ""] | int) -> Passed:
+    """Send the first blocks of spots through the filter; nothing depends on how they are cut."""
+    count, size = len(arrays.spots.valid), min(BLOCK, len(arrays.spots.valid))
+    angles = mirror_angles(model.transmission, model.tilt_zero_rad, arrays.moves)
+
+    def through(number, so_far):
+        start = jnp.asarray(number) * size
+        given = filter_input(model, arrays.of_spots(start, size), angles)
+        seen = filtered(given.rows, so_far.belief)
+        return Passed(
+            seen.belief,
+            jax.lax.dynamic_update_slice_in_dim(so_far.standardised, seen.standardised, start, 0),
+            jax.lax.dynamic_update_slice_in_dim(so_far.free, given.free, start, 0),
+            so_far.log_density + jnp.sum(given.log_scale) - 0.5 * jnp.sum(seen.log_variance),
+        )
+
+    columns = 1 + 2 * len(arrays.gears.places.steps)
+    nothing = Passed(no_belief(columns), jnp.zeros((count, 2, columns)), jnp.zeros((count, 4)), jnp.zeros(()))
+    return jax.lax.fori_loop(0, blocks, through, nothing)
 
 
 class RepeatedErrors(eqx.Module):
@@ -272,29 +323,33 @@ class Innovations(eqx.Module):
     log_density: Scalar
 
 
-def innovations(model: Model, arrays: CampaignArrays, normal: Float[Array, " errors"]) -> Innovations:
+def innovations(
+    model: Model, arrays: CampaignArrays, normal: Float[Array, " errors"], blocks: Int[Array, ""] | int | None = None
+) -> Innovations:
     """Run the filter over all spots in time order, and take out what repeats.
 
     Args:
         model: parameters.
         arrays: the campaign.
         normal: what moves the errors at places from their means, in units of their sds: nought, or a draw's numbers.
+        blocks: of spots to look at, by default all of them. A number that is no constant of the compiled function
+            (`blocks_filled`) saves what padding costs, and has no derivative in reverse mode.
 
     Returns:
         Standardised innovations and log likelihood; cost linear in the number of spots.
     """
-    given = filter_input(model, arrays)
-    seen = filtered(given.rows)
+    every = -(-len(arrays.spots.valid) // BLOCK)
+    seen = passed(model, arrays, every if blocks is None else blocks)
     own, places, errors_rad = seen.standardised[..., 0], normal, normal
-    log_variance = jnp.sum(seen.log_variance)
-    if len(given.place_root):
-        found = repeated_errors(seen.standardised.reshape(-1, seen.standardised.shape[2]), given.place_root)
+    log_density = seen.log_density
+    root = root_at_places(model, arrays.gears)
+    if len(root):
+        found = repeated_errors(seen.standardised.reshape(-1, seen.standardised.shape[2]), root)
         own, places = own - seen.standardised[..., 1:] @ found.errors_rad, found.mean
         errors_rad = found.drawn_rad(normal)
-        log_variance += found.log_determinant
-    squares = jnp.sum(own**2) + jnp.sum(places**2)
-    log_density = jnp.sum(given.log_scale) - 0.5 * (log_variance + squares)
-    return Innovations(jnp.concatenate([own, given.free], axis=1), places, errors_rad, log_density)
+        log_density -= 0.5 * found.log_determinant
+    log_density -= 0.5 * (jnp.sum(own**2) + jnp.sum(places**2))
+    return Innovations(jnp.concatenate([own, seen.free], axis=1), places, errors_rad, log_density)
 
 
 @compiled(jax.Array)
@@ -346,8 +401,10 @@ def evaluate(
         arrays: the campaign.
     """
 
+    blocks = blocks_filled(arrays.spots)
+
     def one(z, normal):
-        seen = innovations(space.model(z), arrays, normal)
+        seen = innovations(space.model(z), arrays, normal, blocks)
         value = seen.log_density - 0.5 * jnp.dot(z, z)
         return Evaluation(value, seen.standardised, seen.places, seen.place_errors_rad)
 

@@ -158,21 +158,29 @@ class Problem:
         room = self.room(z)
         steps = np.concatenate([np.zeros((1, count)), np.eye(count), -np.eye(count)]) * NOISE_STEP
 
-        def value_and_slope(values: np.ndarray) -> tuple[float, np.ndarray]:
+        def about(values: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
             points = np.repeat(z[None], len(steps), axis=0)
             points[:, self.noise] = values + steps
             value = self.negative_log_density(points) - room(points)
             centre, ahead, behind = np.split(value, [1, 1 + count])
-            return float(centre[0]), (ahead - behind) / (2 * NOISE_STEP)
+            curvature = (ahead + behind - 2 * centre) / NOISE_STEP**2
+            return float(centre[0]), (ahead - behind) / (2 * NOISE_STEP), curvature
+
+        # In units of what the density at the start says of their spread a quasi-Newton method knows its first step.
+        unit = 1 / np.sqrt(np.clip(about(z[self.noise])[2], 1.0, None))
+
+        def value_and_slope(values: np.ndarray) -> tuple[float, np.ndarray]:
+            value, slope, _ = about(values * unit)
+            return value, slope * unit
 
         # Eight prior standard deviations: a factor 3000 on a stop sd, 55 on the pixel scale.
-        bounds = [(-8.0, 8.0)] * count
+        bounds = list(zip(-8.0 / unit, 8.0 / unit, strict=True))
         settled = {"ftol": 1e-8, "gtol": 1e-2}
         found = optimize.minimize(
-            value_and_slope, z[self.noise], jac=True, method="L-BFGS-B", bounds=bounds, options=settled
+            value_and_slope, z[self.noise] / unit, jac=True, method="L-BFGS-B", bounds=bounds, options=settled
         )
         result = z.copy()
-        result[self.noise] = found.x
+        result[self.noise] = found.x * unit
         return result
 
     def room(self, z: np.ndarray) -> Room:

@@ -15,7 +15,7 @@ import numpy as np
 from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.model.compiled import BATCH
 from tvsbayes.posterior.chain import Chain, write_chain
-from tvsbayes.posterior.diagnosis import ESS_LIMIT, GROUPS, TAU_LIMIT, diagnose
+from tvsbayes.posterior.diagnosis import GROUPS, TAU_LIMIT, diagnose, wanted_ess
 from tvsbayes.posterior.draws import Posterior
 from tvsbayes.posterior.importance import ImportanceRun
 from tvsbayes.posterior.proposal import Independence, Target
@@ -70,13 +70,19 @@ def walkers_for(dimension: int) -> int:
     return max(WALKERS, 2 * BATCH * -(-(dimension + 1) // (2 * BATCH)))
 
 
-def next_look(chain: Chain, found: Convergence) -> int:
-    """Steps at which a chain that has not converged is worth another look; depends on the chain alone."""
-    kept = found.steps - found.discarded
-    wanted = TAU_LIMIT * found.tau_steps / kept
+def lengthening(fit: JointFit, found: Convergence) -> float:
+    """How many times longer a chain must be to have the autocorrelation times and effective draws that are wanted."""
+    wanted = TAU_LIMIT * found.tau_steps / (found.steps - found.discarded)
     for ess in (found.ess_bulk, found.ess_tail):
-        wanted = max(wanted, ESS_LIMIT / min(ess.values()))
-    growth = np.clip(MARGIN * wanted if np.isfinite(wanted) else np.inf, *GROWTH_RANGE)
+        wanted = max(wanted, float(np.max(wanted_ess(fit, ess) / np.array(list(ess.values())))))
+    return wanted
+
+
+def next_look(fit: JointFit, chain: Chain, found: Convergence) -> int:
+    """Steps at which a chain that has not converged is worth another look; depends on the chain alone."""
+    wanted = lengthening(fit, found)
+    # Where length is not what it lacks, a little more will not help either.
+    growth = np.clip(MARGIN * wanted if 1 < wanted < np.inf else np.inf, *GROWTH_RANGE)
     return int(np.ceil(len(chain.w) * growth))
 
 
@@ -149,10 +155,10 @@ class Run:
         posterior = diagnose(self.fit, self.start, chain)
         found = posterior.convergence
         assert isinstance(found, Convergence)
-        if posterior.converged or hopeless(found):
+        if posterior.converged or hopeless(self.fit, found):
             return posterior, True
         if len(chain.w) >= self.goal:
-            self.goal = next_look(chain, found)
+            self.goal = next_look(self.fit, chain, found)
         return posterior, False
 
     def until_converged(self, seconds: float) -> Posterior:
@@ -183,8 +189,7 @@ class Run:
             raise
 
 
-def hopeless(found: Convergence) -> bool:
+def hopeless(fit: JointFit, found: Convergence) -> bool:
     """Whether nothing but the agreement with importance sampling is missing of a chain far longer than wanted."""
     disagrees = found.agreement is not None and not found.agreement.agrees
-    least = min(min(found.ess_bulk.values()), min(found.ess_tail.values()))
-    return disagrees and len(found.missing) == 1 and least >= SETTLED * ESS_LIMIT
+    return disagrees and len(found.missing) == 1 and SETTLED * lengthening(fit, found) <= 1

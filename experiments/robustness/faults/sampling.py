@@ -145,8 +145,8 @@ FAULTS = (
     Fault(
         "a hundred effective draws pass",
         "posterior/diagnosis.py",
-        "ESS_LIMIT = 1000",
-        "ESS_LIMIT = 100",
+        "ESS_LIMIT, ESS_LIMIT_OTHERS = 1000, 400",
+        "ESS_LIMIT, ESS_LIMIT_OTHERS = 100, 100",
         "interval ends known to a third of an sd only",
         ("posterior/diagnosis",),
         survived="read: as for R-hat.",
