@@ -400,7 +400,6 @@ def evaluate(
         space: priors.
         arrays: the campaign.
     """
-
     blocks = blocks_filled(arrays.spots)
 
     def one(z, normal):

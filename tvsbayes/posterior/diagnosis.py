@@ -66,8 +66,8 @@ class ChainQuality:
             worst = self.names[int(np.nanargmax(self.rhat))]
             missing.append(f"R-hat of {worst} is {np.max(self.rhat):.4f}, wanted {RHAT_LIMIT}")
         for kind, ess in (("bulk", self.ess_bulk), ("tail", self.ess_tail)):
-            if not np.min(ess / self.wanted_ess) >= 1:
-                least = int(np.nanargmin(ess / self.wanted_ess))
+            if not np.all(ess >= self.wanted_ess):
+                least = int(np.nanargmin(ess - self.wanted_ess))
                 wanted = f"wanted {self.wanted_ess[least]:.0f}"
                 missing.append(f"{self.names[least]} has {ess[least]:.0f} {kind} effective draws, {wanted}")
         if not self.kept >= TAU_LIMIT * self.tau_steps:
