@@ -13,6 +13,7 @@ import tvsbayes
 from tvsbayes.cli.app import report_line
 from tvsbayes.instrument.campaign import read_campaign
 from tvsbayes.instrument.model_choice import ModelChoice
+from tvsbayes.model.compiled import Traces
 from tvsbayes.pipeline import FITTING, SUMMARISING, compile_for, fit_for
 
 pytestmark = pytest.mark.usefixtures("own_compilation_cache")
@@ -46,6 +47,7 @@ def test_whoever_waits_for_the_first_compilation_is_told(tmp_path, capsys, monke
     import jax
 
     monkeypatch.setenv("TVSBAYES_CACHE", str(tmp_path))
+    monkeypatch.setattr(Traces, "used", None)
     monkeypatch.setattr(jax.config, "update", lambda *_: None)
     compile_for(report_line)
     assert capsys.readouterr().err == "", "progress is for terminals"

@@ -29,8 +29,10 @@ def locked(place: Path) -> Iterator[None]:
 @contextmanager
 def sharing(folder: Path) -> Iterator[None]:
     """Traces lie in `folder`/traced; what a process is compiling others wait for, and then load."""
+    # For this user alone, or commands would not use it.
+    folder.mkdir(mode=0o700, parents=True, exist_ok=True)
     locks = folder / "locks"
-    locks.mkdir(parents=True, exist_ok=True)
+    locks.mkdir(exist_ok=True)
     first = Compiled._first
 
     def alone(self, key, structure, arrays):
