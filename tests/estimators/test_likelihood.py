@@ -68,6 +68,18 @@ def test_filter_equals_dense_gaussian(dozen, evaluate, offset_sds):
     assert evaluated.innovations.log_density == pytest.approx(dense, abs=FINE_UNIT, rel=1e-12)
 
 
+def test_blocks_of_spots_are_one_campaign(dozen, evaluate, monkeypatch):
+    """Cut into blocks of four: stop errors, homings and play of the dozen last from one block to the next."""
+    whole = evaluate(dozen.z, dozen.space, dozen.arrays).innovations
+    still = jnp.zeros(2 * len(dozen.arrays.gears.places.steps))
+    monkeypatch.setattr(density, "BLOCK", 4)
+    cut = jax.jit(
+        lambda z, space, arrays: density.innovations(space.model(z), arrays, still, density.blocks_filled(arrays.spots))
+    )(jnp.asarray(dozen.z), dozen.space, dozen.arrays)
+    assert float(cut.log_density) == pytest.approx(float(whole.log_density), abs=FINE_UNIT, rel=1e-12)
+    np.testing.assert_allclose(cut.standardised, whole.standardised, atol=1e-8)
+
+
 @pytest.mark.slow
 def test_log_density_adds_the_prior(dozen, evaluate):
     z = random_points(dozen, 1, 0.3)[0]

@@ -94,8 +94,8 @@ FAULTS = (
     Fault(
         "log-Jacobian added twice to the stored density",
         "posterior/diagnosis.py",
-        "fit.log_density - found.log_jacobian.reshape(walkers, draws)",
-        "fit.log_density + found.log_jacobian.reshape(walkers, draws)",
+        "fit.log_density - found.log_jacobian.reshape(w.shape[:2])",
+        "fit.log_density + found.log_jacobian.reshape(w.shape[:2])",
         "`lp` of posterior.nc is not the density of its draws",
         ("posterior/diagnosis",),
         survived="read: nothing compared the stored density with that of the stored draws.",
