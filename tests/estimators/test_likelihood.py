@@ -68,11 +68,15 @@ def test_filter_equals_dense_gaussian(dozen, evaluate, offset_sds):
     assert evaluated.innovations.log_density == pytest.approx(dense, abs=FINE_UNIT, rel=1e-12)
 
 
-def test_blocks_of_spots_are_one_campaign(dozen, evaluate, monkeypatch):
-    """Cut into blocks of four: stop errors, homings and play of the dozen last from one block to the next."""
+@pytest.mark.parametrize("size", [4, 20])
+def test_blocks_of_spots_are_one_campaign(dozen, evaluate, monkeypatch, size):
+    """Stop errors, homings and play of the dozen last from one block of four to the next.
+
+    Twenty do not divide the padded number: four do.
+    """
     whole = evaluate(dozen.z, dozen.space, dozen.arrays).innovations
     still = jnp.zeros(2 * len(dozen.arrays.gears.places.steps))
-    monkeypatch.setattr(density, "BLOCK", 4)
+    monkeypatch.setattr(density, "BLOCK", size)
     cut = jax.jit(
         lambda z, space, arrays: density.innovations(space.model(z), arrays, still, density.blocks_filled(arrays.spots))
     )(jnp.asarray(dozen.z), dozen.space, dozen.arrays)

@@ -11,6 +11,8 @@ in units of its standard deviation.
 
 from __future__ import annotations
 
+import math
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -246,15 +248,21 @@ class Passed(eqx.Module):
     log_density: Scalar
 
 
+def block_size(spots: SpotArrays) -> int:
+    """Spots of a block: `BLOCK`, or what divides the padded number evenly."""
+    count = len(spots.valid)
+    return count if count <= BLOCK else math.gcd(count, BLOCK)
+
+
 def blocks_filled(spots: SpotArrays) -> Int[Array, ""]:
     """Blocks that hold a spot which counts: padding comes last."""
     rows = jnp.arange(1, len(spots.valid) + 1)
-    return -(-jnp.max(jnp.where(spots.valid > 0, rows, 0)) // BLOCK)
+    return -(-jnp.max(jnp.where(spots.valid > 0, rows, 0)) // block_size(spots))
 
 
 def passed(model: Model, arrays: CampaignArrays, blocks: Int[Array, ""] | int) -> Passed:
     """Send the first blocks of spots through the filter; nothing depends on how they are cut."""
-    count, size = len(arrays.spots.valid), min(BLOCK, len(arrays.spots.valid))
+    count, size = len(arrays.spots.valid), block_size(arrays.spots)
     angles = mirror_angles(model.transmission, model.tilt_zero_rad, arrays.moves)
 
     def through(number, so_far):
@@ -338,7 +346,7 @@ def innovations(
     Returns:
         Standardised innovations and log likelihood; cost linear in the number of spots.
     """
-    every = -(-len(arrays.spots.valid) // BLOCK)
+    every = len(arrays.spots.valid) // block_size(arrays.spots)
     seen = passed(model, arrays, every if blocks is None else blocks)
     own, places, errors_rad = seen.standardised[..., 0], normal, normal
     log_density = seen.log_density
