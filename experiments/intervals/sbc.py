@@ -146,6 +146,8 @@ def ranks(simulated, result, z: np.ndarray, place_errors_rad: np.ndarray) -> dic
         space = parameter_space(simulated.campaign.rig, simulated.campaign.stereo)
         arrays = campaign_arrays(simulated.campaign)
         both = coordinates_of(space, np.vstack([true, physical]))
+        # What the fit does not estimate, without readings the aperture's, has one value in all draws.
+        both[0, ~result.free] = both[1, ~result.free]
         still = no_draw(len(both), arrays)
         log_posterior = in_batches(lambda *block: evaluate(*block, space, arrays).log_density, both, still)
     log_likelihood = log_posterior + 0.5 * np.sum(both**2, axis=1)
