@@ -54,4 +54,6 @@ def test_notebooks_are_executed_small_and_of_no_machine(path):
 def test_notebooks_run_as_they_stand(path, tmp_path, monkeypatch):
     pytest.importorskip("pandas")
     monkeypatch.chdir(tmp_path)
-    exec(compile(code_of(path), path.name, "exec"), {})
+    names: dict[str, object] = {}
+    exec(compile(code_of(path), path.name, "exec"), names)
+    assert "tvsbayes" in names

@@ -251,6 +251,7 @@ def test_a_frame_drawn_by_hand_selects(page):
     mouse.move_to_element_with_offset(box, -width // 2 + 5, -height // 2 + 5).click_and_hold()
     mouse.move_by_offset(width // 2, height // 2).move_by_offset(width // 2 - 12, height // 2 - 12).release().perform()
     page.until("Number(document.body.dataset.chosen) > 100")
+    assert page.marks("stops") == [page.chosen()] * 2
 
 
 def test_arrows_bars_and_bands(page):

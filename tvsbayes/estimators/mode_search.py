@@ -167,7 +167,8 @@ class Problem:
             return float(centre[0]), (ahead - behind) / (2 * NOISE_STEP), curvature
 
         # In units of what the density at the start says of their spread a quasi-Newton method knows its first step.
-        unit = 1 / np.sqrt(np.clip(about(z[self.noise])[2], 1.0, None))
+        curvature = about(z[self.noise])[2]
+        unit = 1 / np.sqrt(np.where(np.isfinite(curvature), np.clip(curvature, 1.0, None), 1.0))
 
         def value_and_slope(values: np.ndarray) -> tuple[float, np.ndarray]:
             value, slope, _ = about(values * unit)

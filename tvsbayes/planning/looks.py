@@ -93,9 +93,18 @@ class Arranged:
 
     @cached_property
     def steps(self) -> tuple[PlanStep, ...]:
-        """The plan."""
-        plan, placed = PlanBuilder(), ""
+        """The plan, from its homing on."""
+        plan = PlanBuilder()
         plan.home(*self.home)
+        return self._taken(plan)
+
+    @cached_property
+    def steps_onwards(self) -> tuple[PlanStep, ...]:
+        """The plan where the axes stand at `home` already."""
+        return self._taken(PlanBuilder(at=self.home))
+
+    def _taken(self, plan: PlanBuilder) -> tuple[PlanStep, ...]:
+        placed = ""
         for sheet, via, goal in zip(self.sheet, self.via.tolist(), self.goal.tolist(), strict=True):
             if sheet != placed:
                 placed = sheet

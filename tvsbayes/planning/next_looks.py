@@ -15,7 +15,7 @@ from tvsbayes.errors import NotConverged
 from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.instrument.axes import DIRECTIONS
 from tvsbayes.instrument.campaign import ordered_spots
-from tvsbayes.instrument.plan import PlanBuilder, PlanStep, plan_seconds, step_json
+from tvsbayes.instrument.plan import PlanStep, plan_seconds, step_json
 from tvsbayes.instrument.rig import Rig
 from tvsbayes.planning.expectation import knowledge_of
 from tvsbayes.planning.looks import Arranged, arrange, covariance_of, information_of_looks
@@ -81,19 +81,6 @@ def _with_run_up(design: Arranged, side: np.ndarray, overshoot: np.ndarray) -> A
     return replace(design, via=via)
 
 
-def _steps(design: Arranged) -> tuple[PlanStep, ...]:
-    plan = PlanBuilder(at=design.home)
-    sheet = ""
-    for name, via, goal in zip(design.sheet, design.via.tolist(), design.goal.tolist(), strict=True):
-        if name != sheet:
-            sheet = name
-            plan.place(sheet)
-        plan.move(*via)
-        plan.move(*goal)
-        plan.look()
-    return tuple(plan.steps)
-
-
 def next_looks(fit: JointFit, rig: Rig, target: Target, count: int) -> NextLooks:
     """The looks that lower a target most per minute, by the fit of what was seen so far.
 
@@ -150,7 +137,7 @@ def _choices(asked: Question, rig: Rig, target: Target, count: int, at: tuple[in
             looks = found.looks[picks]
             design = arrange(looks, names, found.overshoot, home=at)
             design = _with_run_up(design, looks.side[design.order[0]], found.overshoot)
-            steps = _steps(design)
+            steps = design.steps_onwards
             spared = steps[1:] if design.sheet[0] == sheet else steps
             value = _value(asked, target, picks, design.path)
             choices.append(_Choice(picks, design, steps, plan_seconds(rig, spared) / 60, value))

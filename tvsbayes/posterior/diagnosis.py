@@ -180,7 +180,7 @@ def diagnose(fit: JointFit, start: ImportanceRun, chain: Chain) -> Posterior:
     """Leave out the warm-up, thin, and judge what is left.
 
     Coordinates are judged first. Where they are in order, each draw gets errors at places, a density's work each, and
-    all is judged again; else their means stand for them.
+    all is judged again; else they are nought, in draws that must not be used.
     """
     stored = Stored.of(fit, start, chain)
     walkers, draws = stored.log_density.shape
