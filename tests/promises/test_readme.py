@@ -1,4 +1,4 @@
-"""The README's promises that a machine can check: size, set-up commands, printed answer, pinned versions."""
+"""The README's promises that a machine can check: size, set-up commands, printed answer, versions."""
 
 from __future__ import annotations
 
@@ -41,3 +41,13 @@ def test_constraints_pin_every_direct_dependency():
     wanted = project["dependencies"] + extras["test"] + extras["docs"]
     names = [re.match(r"[\w-]+", requirement).group() for requirement in wanted]
     assert [name for name in names if name not in pins] == []
+
+
+def test_version_is_one_and_the_same():
+    """`pyproject.toml` has it; the changelog's newest release and the citation say the same version and day."""
+    version = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["version"]
+    changes = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
+    released = re.search(r"^## \[(\d+\.\d+\.\d+)\] - (\d{4}-\d\d-\d\d)$", changes, flags=re.MULTILINE)
+    assert released and released[1] == version
+    citation = (ROOT / "CITATION.cff").read_text(encoding="utf-8")
+    assert f"\nversion: {version}\ndate-released: {released[2]}\n" in citation
