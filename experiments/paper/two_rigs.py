@@ -41,7 +41,8 @@ from experiments.common.rigs import mounted_rig, unseen
 from experiments.common.rows import output, read_rows, run_rows
 from experiments.paper.table1 import paper_values
 from experiments.paper.two_machines import HOME_SIDES, RIGS, classic_readings, plan_of, solved
-from tvsbayes.estimators.joint_fit import fit
+from tvsbayes.assessment.summary import summarise
+from tvsbayes.estimators.joint_fit import JointFit, fit
 from tvsbayes.files.disk import shipped_data
 from tvsbayes.instrument.axes import AXES, DIRECTIONS
 from tvsbayes.instrument.campaign import Campaign
@@ -51,6 +52,7 @@ from tvsbayes.instrument.plan import read_plan, run_plan, write_plan
 from tvsbayes.instrument.protocols import twin_protocol
 from tvsbayes.instrument.rig import Rig, read_rig
 from tvsbayes.model.compilation_cache import use_compilation_cache
+from tvsbayes.posterior.sampling import sample
 from tvsbayes.report.drawing import BLACK, BLUE, RED, STYLE, WIDTH_IN
 from tvsbayes.twin.simulated_campaign import simulate
 
@@ -90,6 +92,19 @@ def forget_sides(campaign: Campaign) -> Campaign:
     return replace(campaign, moves=tuple(replace(m, **first) if m.pan_approach else m for m in campaign.moves))
 
 
+def effective_ratios(found: JointFit) -> dict[str, object]:
+    """Mean, sd and 95 % interval of the effective ratio of every direction, by Laplace and by importance sampling."""
+    if not found.converged:
+        return {}
+    drawn = sample(found, "importance")
+    told = {"laplace": summarise(found), "importance": summarise(found, drawn)}
+    by_tier = {
+        tier: {d: [e.value, e.sd, *e.interval95] for d, e in summary.effective.items() if e is not None}
+        for tier, summary in told.items()
+    }
+    return {**by_tier, "accepted": drawn.converged}
+
+
 def one_row(task: tuple[str, str, int]) -> dict[str, object]:
     """Simulate one campaign of one machine and fit the three models."""
     compile_for(96)
@@ -120,12 +135,14 @@ def one_row(task: tuple[str, str, int]) -> dict[str, object]:
                 ends = np.quantile(column, (0.025, 0.975)).tolist()
                 mode = float(result.mode.physical[INDEX[f"{quantity}.{axis}"]])
                 found[f"{quantity}.{axis}"] = [mode, float(column.std()), *ends]
+        found["effective"] = effective_ratios(result) if model == "both" else {}
         equal = draws[:, INDEX["degrees_per_step.tilt"]] / draws[:, INDEX["degrees_per_step.pan"]]
         found["tilt over pan"] = [float(equal.mean()), float(equal.std())]
         row["models"][model] = found
     return {
         **row,
         "truth": {n: v for n, v in truth.parameters.items() if "step" in n},
+        "effective": truth.effective_deg_per_step(campaign),
         "cpu_s": time.process_time() - start,
     }
 

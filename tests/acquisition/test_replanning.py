@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import sys
+from contextlib import closing
 
 import pytest
 from support.bench_runs import Run, small_plan
@@ -21,25 +23,31 @@ from tvsbayes.instrument.plan import plan_seconds
 NEXT = """
 import json, sys
 from pathlib import Path
-looks = len((Path(sys.argv[2]) / "spots.csv").read_text().splitlines()) - 1
-count, sheet, step = int(sys.argv[sys.argv.index("--next") + 1]), "SHEET", STEP
+given, count, confirm = (sys.argv[sys.argv.index(name) + 1] for name in ("--given", "--next", "--confirm"))
+looks = len((Path(given) / "spots.csv").read_text().splitlines()) - 1
+count, sheet, step = int(count), "SHEET", STEP
 steps = [{"action": "place", "target": sheet}]
 for n in range(count):
     steps += [{"action": "move", "pan_steps": step * n + looks, "tilt_steps": -10}, {"action": "look"}]
 entry = {"value": 0.06, "sd": 0.012 / looks}
 document = {"steps": steps, "now": 0.012 / looks, "after_each": [0.012 / (looks + n + 1) for n in range(count)]}
 document["effective_deg_per_step"] = {d: entry for d in ("left", "right", "up", "down")}
+directions = document["effective_deg_per_step"]
+sampled = {d: {"value": 0.061, "sd": RATIO * 0.012 / looks} for d in directions}
+if 0.012 / looks <= float(confirm):
+    document["confirmed"] = {"tier": "importance", "accepted": ACCEPTED, "effective_deg_per_step": sampled}
 print(json.dumps({**document, "why": f"{count} looks at {sheet} help most"}))
 """
 
 
-def command(sheet: str = "d2", step: int = 5) -> tuple[str, ...]:
-    """A stand-in for `tvsbayes plan RIG`, whose u falls as 0.012 / looks."""
-    return sys.executable, "-c", NEXT.replace("SHEET", sheet).replace("STEP", str(step))
+def command(sheet: str = "d2", step: int = 5, ratio: float = 1.0, accepted: bool = True) -> tuple[str, ...]:
+    """A stand-in for `tvsbayes plan RIG`: Laplace u falls as 0.012 / looks, the sampled one is `ratio` times that."""
+    code = NEXT.replace("SHEET", sheet).replace("STEP", str(step))
+    return sys.executable, "-c", code.replace("RATIO", str(ratio)).replace("ACCEPTED", str(accepted))
 
 
-def changes(folder) -> list[dict]:
-    return [record.data for record in read_journal(folder).records if record.event == "adapted"]
+def changes(folder, event: str = "adapted") -> list[dict]:
+    return [record.data for record in read_journal(folder).records if record.event == event]
 
 
 def test_the_looks_left_are_those_proposed(mounted_rig, tmp_path):
@@ -66,6 +74,61 @@ def test_the_looks_left_are_those_proposed(mounted_rig, tmp_path):
     events = [record.event for record in records]
     assert events[events.index("adapted") :].count("placed") == 1
     assert adapted_plan(plan, records) == run_.engine.plan
+
+
+def test_the_sampled_posterior_has_the_last_word(mounted_rig, tmp_path):
+    """Half as much again as Laplace: 27 looks (4.4e-4) are not enough, 33 (3.6e-4) not worth asking, 40 are."""
+    with Replanning(tmp_path / "c", command(ratio=1.5), 4.6e-4, 60.0, wait=True) as estimate:
+        outcome = Run(mounted_rig, tmp_path / "c", small_plan(20), estimate=estimate).engine.run()
+    assert (outcome.reason, outcome.looks) == ("target met", 40)
+    told = changes(tmp_path / "c", "confirmed")
+    assert [(event["looks"], event["reached"]) for event in told] == [(27, False), (40, True)]
+    assert told[0]["importance_u_deg_per_step"] == pytest.approx(1.5 * told[0]["laplace_u_deg_per_step"])
+    assert [event["looks"] for event in changes(tmp_path / "c")] == [12, 15, 18, 22, 27, 33]
+    assert outcome.as_json()["estimate"]["tier"] == "importance"
+    assert outcome.estimate.looks == 40 and set(outcome.estimate.deg_per_step.values()) == {0.061}
+
+
+def test_weights_that_cannot_be_used_end_no_run(mounted_rig, tmp_path):
+    minutes = plan_seconds(mounted_rig, small_plan(3)) / 60 + 2.5
+    with Replanning(tmp_path / "c", command(accepted=False), 4.6e-4, minutes, wait=True) as estimate:
+        outcome = Run(mounted_rig, tmp_path / "c", small_plan(3), estimate=estimate).engine.run()
+    told = changes(tmp_path / "c", "confirmed")
+    assert outcome.reason == "time over" and outcome.looks > 33 and outcome.estimate.tier == "laplace"
+    assert [event["looks"] for event in told][:2] == [27, 33] and not any(event["reached"] for event in told)
+
+
+def test_a_proposal_of_many_looks_fits_into_the_journal(tmp_path):
+    """At the most that is asked for, with counters and u as long as they get."""
+    from tvsbayes.acquisition.journal import Journal
+    from tvsbayes.acquisition.replanning import Proposal, adapted_entries, looks_next
+    from tvsbayes.instrument.plan import PlanStep
+
+    assert (looks_next(12), looks_next(100)) == (8, 30)
+    count = looks_next(100_000)
+    pairs = [(PlanStep(0, "move", -12345, -12345), PlanStep(0, "look")) for _ in range(count)]
+    steps = tuple(step for pair in pairs for step in pair)
+    u = tuple(0.00012345678901234567 + n * 1e-17 for n in range(count))
+    proposal = Proposal(steps, u, u[0], 100_000, "80 looks at d1, d2 lower u(worst) most per minute" + 80 * ".")
+    with closing(Journal.create(tmp_path / "c", created="2026-01-01T00:00:00+00:00")) as journal:
+        assert journal.append("adapted", **adapted_entries(proposal, 99_999, steps)).event == "adapted"
+
+
+def test_the_command_says_by_what_it_ended(tmp_path, monkeypatch, capsys):
+    from tvsbayes.files.disk import shipped_data
+    from tvsbayes.instrument.plan import write_plan
+
+    monkeypatch.setattr("tvsbayes.cli.bench_commands.PLAN_COMMAND", command())
+    write_plan(small_plan(4), tmp_path / "plan.csv")
+    rig, plan = shipped_data() / "rigs" / "mounted" / "rig.toml", tmp_path / "plan.csv"
+    words = ["acquire", rig, plan, tmp_path / "c", "--simulate", "--centroids", "--adapt", "--target-u", "8e-4"]
+    assert run([*map(str, words), "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)["estimate"]
+    assert (told["tier"], told["looks"]) == ("importance", 15)
+    assert told["effective_deg_per_step"]["up"] == {"value": 0.061, "sd": pytest.approx(8e-4)}
+    assert run([*map(str, [*words[:3], tmp_path / "d", *words[4:]])]) == 0
+    line = "deg/step by the sampled posterior of 15 looks: left 0.061000 u 8.0e-04"
+    assert line in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(("sheet", "step"), [("d9", 5), ("d2", 5000)])

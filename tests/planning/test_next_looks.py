@@ -4,23 +4,28 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from tvsbayes.cli.main import run
 from tvsbayes.estimators.joint_fit import fit
-from tvsbayes.instrument.axes import AXES
+from tvsbayes.instrument.axes import AXES, DIRECTIONS
 from tvsbayes.instrument.plan import PlanStep, run_plan
 from tvsbayes.instrument.protocols import grid_protocol
 from tvsbayes.instrument.stops import rests_of
 from tvsbayes.planning.candidates import allowed, overshoot_steps
 from tvsbayes.planning.expectation import Knowledge, information_of, knowledge_of
 from tvsbayes.planning.looks import covariance_of
-from tvsbayes.planning.next_looks import next_looks
+from tvsbayes.planning.next_looks import Confirmation, next_looks
 from tvsbayes.planning.target import parse_target, sensitivity
+from tvsbayes.posterior.draws import Draws
 from tvsbayes.twin.simulated_campaign import SimulatedCampaign, simulate
 
+SAMPLED = Confirmation(
+    False, *(dict.fromkeys(DIRECTIONS, each) for each in (0.06, 3e-4)), dict.fromkeys(DIRECTIONS, (0.0594, 0.0606))
+)
 TARGET = parse_target("u(worst) <= 1e-4 deg/step")
 
 
@@ -89,6 +94,31 @@ def test_a_sheet_that_stands_there_costs_nothing(found, mounted_rig):
     assert seconds == pytest.approx(own - 60.0 * (placements[0] == "d1"))
 
 
+def test_the_posterior_confirms_where_it_is_asked_to(begun_fit, mounted_rig, found, monkeypatch):
+    """In place of draws of the posterior those of Laplace, spread by half as much again."""
+    asked = []
+
+    def sample(fit, tier, seed):
+        def propagate(quantity):
+            values = quantity(Draws(fit.draws))
+            mean, sd = values.mean(axis=0), 1.5 * values.std(axis=0)
+            return SimpleNamespace(mean=mean, sd=sd, interval95=np.stack([mean - 2 * sd, mean + 2 * sd]))
+
+        asked.append((tier, seed))
+        return SimpleNamespace(converged=True, propagate=propagate)
+
+    monkeypatch.setattr("tvsbayes.planning.next_looks.sample", sample)
+    worst = max(found.u_deg_per_step.values())
+    assert found.confirmed is None
+    assert next_looks(begun_fit, mounted_rig, TARGET, 2, confirm_below=0.99 * worst).confirmed is None and not asked
+    confirmed = next_looks(begun_fit, mounted_rig, TARGET, 2, confirm_below=1.01 * worst).confirmed
+    assert confirmed.accepted and asked == [("importance", 0)]
+    for direction, u in found.u_deg_per_step.items():
+        assert confirmed.u_deg_per_step[direction] == pytest.approx(1.5 * u)
+        low, high = confirmed.interval95[direction]
+        assert high - low == pytest.approx(6 * u) and low < found.deg_per_step[direction] < high
+
+
 def test_the_command_prints_them(begun_fit, mounted_rig, tmp_path, monkeypatch, capsys):
     from tvsbayes.files.disk import shipped_data
 
@@ -99,5 +129,14 @@ def test_the_command_prints_them(begun_fit, mounted_rig, tmp_path, monkeypatch, 
     document = json.loads(capsys.readouterr().out)
     assert sum(step["action"] == "look" for step in document["steps"]) == len(document["after_each"]) == 8
     assert document["steps"][0]["action"] == "place" and "most per minute" in document["why"]
+    assert document["confirmed"] is None
+    assert run(["plan", rig, "--confirm", "1"]) == 2 and "for --next" in capsys.readouterr().err
+    monkeypatch.setattr("tvsbayes.planning.next_looks.confirmation", lambda _: SAMPLED)
+    assert run(["plan", rig, "--given", "mine", "--next", "2", "--confirm", "1", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["confirmed"] == SAMPLED.as_json()
+    assert run(["plan", rig, "--given", "mine", "--next", "2", "--confirm", "1"]) == 0
+    assert (
+        "u by importance sampling, whose weights must not be used, deg/step: left 3.00e-04" in capsys.readouterr().out
+    )
     assert run(["plan", rig, "--next", "8"]) == 2 and "--given" in capsys.readouterr().err
     assert run(["plan", rig, "--given", "mine", "--next", "8", "-o", "x.csv"]) == 2

@@ -11,7 +11,7 @@ Counters in motor steps, seconds where a name says `_s`, raw px.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -21,7 +21,7 @@ from tvsbayes.acquisition.journal_events import Four
 from tvsbayes.acquisition.observation import Observation
 from tvsbayes.acquisition.operator import HAZARD, Progress, StopKey
 from tvsbayes.acquisition.recorder import Recorded
-from tvsbayes.acquisition.replanning import ADAPTED, Proposal, Replanning, adapted_entries, check_plan
+from tvsbayes.acquisition.replanning import ADAPTED, CONFIRMED, Proposal, Replanning, adapted_entries, check_plan
 from tvsbayes.acquisition.run_identity import setup_entries
 from tvsbayes.acquisition.run_log import Outcome, RunLog
 from tvsbayes.acquisition.running_estimate import RunningEstimate
@@ -127,7 +127,8 @@ class Acquisition:
                     self.bench.positioner.close()
                 finally:
                     self._log.end(reason, exit_code)
-        return self._log.outcome(reason, self._retries)
+        estimate = None if self._estimate is None else self._estimate.latest
+        return replace(self._log.outcome(reason, self._retries), estimate=estimate)
 
     def _run(self) -> str:
         if not self.bench.operator.accept(HAZARD):
@@ -155,13 +156,23 @@ class Acquisition:
             self._tell(step)
             self._do(step)
             row += 1
-            if step.action == "look" and self._estimate is not None and self._estimate.update(self._log.ok_looks):
+            if step.action == "look" and self._estimate is not None and self._estimated(row, self._estimate):
                 return "target met"
-            if isinstance(self._estimate, Replanning) and step.action == "look":
-                if row == len(self.plan) and self._estimate.last(self._log.ok_looks):
-                    return "target met"
-                self._adapt(row, self._estimate.proposal())
         return "done"
+
+    def _estimated(self, row: int, estimate: RunningEstimate) -> bool:
+        """Takes in what the fits say after the look before a row; whether the target is met."""
+        met = estimate.update(self._log.ok_looks)
+        if not isinstance(estimate, Replanning):
+            return met
+        if not met and row == len(self.plan):
+            met = estimate.last(self._log.ok_looks)
+        confirmed = estimate.confirmed()
+        if confirmed is not None:
+            self._log.write(CONFIRMED, **confirmed)
+        if not met:
+            self._adapt(row, estimate.proposal())
+        return met
 
     def _minutes(self, row: int) -> float:
         """Duration of the plan up to a row, by `[costs]`."""

@@ -1,9 +1,9 @@
 """The events of a run's journal, as their JSON objects stand in `log.jsonl`.
 
 `created` opens a journal. Every motion of the plan is an `intent` before, and an order has an event of its own once it
-is done: `homed`, `placed`, `moved`, `looked`. `adapted` changes the plan, `verified` closes a segment, `start` and
-`stop` enclose a run, `gap` stands where a repair lost lines. Counters in motor steps, raw px, degrees and seconds by
-suffix; `utc` and `created` are ISO 8601.
+is done: `homed`, `placed`, `moved`, `looked`. `adapted` changes the plan, `confirmed` says whether the posterior meets
+the target, `verified` closes a segment, `start` and `stop` enclose a run, `gap` stands where a repair lost lines.
+Counters in motor steps, raw px, degrees and seconds by suffix; `utc` and `created` are ISO 8601.
 
 A checksum finds accidents, not forgery: who reads an event converts what its entries hold, and refuses what does not
 convert.
@@ -118,6 +118,20 @@ class Adapted(TypedDict):
     looks: int
     why: str
     steps: list[dict[str, object]]
+
+
+class Confirmed(TypedDict):
+    """Whether the posterior, sampled where the Laplace approximation met the target, meets it too.
+
+    Of so many `looks`; worst u of the directions by both, deg/step; `accepted`: whether the weighted draws may be used.
+    """
+
+    looks: int
+    target_u_deg_per_step: float
+    laplace_u_deg_per_step: float
+    importance_u_deg_per_step: float
+    accepted: bool
+    reached: bool
 
 
 class Stop(TypedDict):

@@ -1,7 +1,9 @@
 """`acquire --adapt`: looks that are left are chosen anew from the running estimate, until target or time is reached.
 
 `tvsbayes plan --given --next` runs beside the instrument as the running estimate does: one process, which fits what is
-on the disk and says what to look at next. A proposal that leaves the rig's limits is not followed. Every change of plan
+on the disk and says what to look at next. A proposal that leaves the rig's limits is not followed. Where the Laplace
+approximation meets the target the same process samples the posterior, and only that ends the run: with few looks the
+scales of the noise are rough, and Laplace's sds too short. Every change of plan
 is an event of the journal, so that a resumed run has the same plan as the one that was interrupted.
 """
 
@@ -14,7 +16,7 @@ from pathlib import Path
 from typing import Any, cast
 
 from tvsbayes.acquisition.journal import LOG, Record
-from tvsbayes.acquisition.journal_events import Adapted
+from tvsbayes.acquisition.journal_events import Adapted, Confirmed
 from tvsbayes.acquisition.running_estimate import Estimate, RunningEstimate
 from tvsbayes.errors import escaped, refusal
 from tvsbayes.instrument.axes import AXES, DIRECTIONS
@@ -24,9 +26,19 @@ from tvsbayes.instrument.rig import Rig
 from tvsbayes.positioner.protocol import LIMIT_SETTINGS, SETTINGS
 
 ADAPTED = "adapted"
-"""The event of the journal."""
-NEXT_SHARE, NEXT_LEAST = 0.3, 8
-"""Looks of a proposal: this share of those that are there, more than come before the next one, at least so many."""
+CONFIRMED = "confirmed"
+"""Events of the journal."""
+NEXT_SHARE, NEXT_LEAST, NEXT_MOST = 0.3, 8, 80
+"""Looks of a proposal: this share of those that are there, more than come before the next one, at least so many.
+
+At most so many, or the event does not fit into a line of the journal (120 to 160 bytes a look); where they run out
+before the next fit, that is waited for.
+"""
+
+
+def looks_next(looks: int) -> int:
+    """How many looks to propose after so many."""
+    return min(NEXT_MOST, max(NEXT_LEAST, math.ceil(NEXT_SHARE * looks)))
 
 
 def check_plan(rig: Rig, plan: Sequence[PlanStep]) -> None:
@@ -108,11 +120,24 @@ class Replanning(RunningEstimate):
         super().__init__(folder, command, target_u_deg_per_step, DIRECTIONS, wait=wait)
         self.minutes = minutes
         self._proposal: Proposal | None = None
+        self._confirmed: Confirmed | None = None
+        self._ratio = 1.0
+
+    @property
+    def met(self) -> bool:
+        """Whether the sampled posterior knows every direction as well as wanted."""
+        return self.latest is not None and self.latest.tier == "importance" and super().met
+
+    @property
+    def confirm_below(self) -> float:
+        """Worst Laplace u at which sampling may confirm the target, by how far the two were apart the last time."""
+        return float(self.target or 0.0) / self._ratio
 
     def _arguments(self, looks: int) -> list[str]:
         target = f"u(worst) <= {self.target:g} deg/step"
-        count = max(NEXT_LEAST, math.ceil(NEXT_SHARE * looks))
-        return [*self._command, "--given", str(self.folder), "--target", target, "--next", str(count), "--json"]
+        confirm = "--confirm", repr(self.confirm_below)
+        given = "--given", str(self.folder), "--target", target
+        return [*self._command, *given, "--next", str(looks_next(looks)), *confirm, "--json"]
 
     def _read(self, document: Mapping[str, Any]) -> Estimate:
         steps = tuple(_step(number, entry) for number, entry in enumerate(document["steps"]))
@@ -120,11 +145,34 @@ class Replanning(RunningEstimate):
         if not steps or steps[0].action != "place":
             raise ValueError("the looks do not begin with a placement")
         self._proposal = Proposal(steps, after, float(document["now"]), self._looks, str(document["why"]))
-        return super()._read({**document, "converged": True})
+        laplace = super()._read({**document, "converged": True})
+        sampled = document.get("confirmed")
+        return laplace if sampled is None else self._sampled(laplace, sampled)
+
+    def _sampled(self, laplace: Estimate, document: Mapping[str, Any]) -> Estimate:
+        """What sampling has found, Laplace's where it cannot be used; both are told."""
+        sampled, accepted = self._estimate(document["effective_deg_per_step"], "importance"), bool(document["accepted"])
+        before, after = (max(each.u_deg_per_step.values()) for each in (laplace, sampled))
+        if accepted:
+            self._ratio = max(1.0, after / before)
+        self._confirmed = {
+            "looks": self._looks,
+            "target_u_deg_per_step": float(self.target or 0.0),
+            "laplace_u_deg_per_step": before,
+            "importance_u_deg_per_step": after,
+            "accepted": accepted,
+            "reached": accepted and after <= float(self.target or 0.0),
+        }
+        return sampled if accepted else laplace
 
     def proposal(self) -> Proposal | None:
         """The newest one, once."""
         found, self._proposal = self._proposal, None
+        return found
+
+    def confirmed(self) -> Confirmed | None:
+        """The newest event of a sampled posterior, once."""
+        found, self._confirmed = self._confirmed, None
         return found
 
     def last(self, looks: int) -> bool:

@@ -13,6 +13,7 @@ from tvsbayes.acquisition.campaign_files import CampaignFiles
 from tvsbayes.acquisition.journal import FRAME_NAME, Journal
 from tvsbayes.acquisition.journal_check import orphans
 from tvsbayes.acquisition.recorder import HOME_TOLERANCE_STEPS, Recorder
+from tvsbayes.acquisition.running_estimate import Estimate
 from tvsbayes.errors import DeviceFault
 from tvsbayes.instrument.rig import Rig
 from tvsbayes.positioner.interface import HomeReport
@@ -32,6 +33,7 @@ class Outcome:
         retries: looks repeated in this run.
         lost_segments: segments in which steps were lost.
         warnings: what the user should know.
+        estimate: the last of a run that was fitted beside itself.
     """
 
     reason: str
@@ -42,6 +44,7 @@ class Outcome:
     retries: int
     lost_segments: tuple[int, ...]
     warnings: tuple[str, ...]
+    estimate: Estimate | None = None
 
     def as_json(self) -> dict[str, object]:
         """The document of `tvsbayes acquire`."""
@@ -54,6 +57,7 @@ class Outcome:
             "retries": self.retries,
             "lost_segments": list(self.lost_segments),
             "warnings": list(self.warnings),
+            "estimate": None if self.estimate is None else self.estimate.as_json(),
         }
 
 

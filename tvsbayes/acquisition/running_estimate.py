@@ -45,11 +45,15 @@ class EstimateWish:
 
 @dataclass(frozen=True)
 class Estimate:
-    """Effective degrees per step and their standard uncertainties by direction, from so many looks."""
+    """Effective degrees per step and their standard uncertainties by direction, from so many looks.
+
+    `tier` is what made them: "laplace", or "importance" for the sampled posterior.
+    """
 
     looks: int
     deg_per_step: dict[str, float]
     u_deg_per_step: dict[str, float]
+    tier: str = "laplace"
 
     @property
     def text(self) -> str:
@@ -58,6 +62,11 @@ class Estimate:
             f"{name} {self.deg_per_step[name]:.6f} u {self.u_deg_per_step[name]:.1e}" for name in self.deg_per_step
         )
         return ", ".join(parts)
+
+    def as_json(self) -> dict[str, object]:
+        """As part of the document of `acquire`."""
+        ratios = {d: {"value": self.deg_per_step[d], "sd": self.u_deg_per_step[d]} for d in self.deg_per_step}
+        return {"tier": self.tier, "looks": self.looks, "effective_deg_per_step": ratios}
 
 
 class RunningEstimate:
@@ -162,6 +171,10 @@ class RunningEstimate:
         """
         if not document["converged"]:
             raise ValueError("not converged")
-        found = {name: entry for name, entry in document["effective_deg_per_step"].items() if entry is not None}
+        return self._estimate(document["effective_deg_per_step"])
+
+    def _estimate(self, ratios: Mapping[str, Any], tier: str = "laplace") -> Estimate:
+        """From the entries of directions; what did not move is None."""
+        found = {name: entry for name, entry in ratios.items() if entry is not None}
         values = {name: float(entry["value"]) for name, entry in found.items()}
-        return Estimate(self._looks, values, {name: float(entry["sd"]) for name, entry in found.items()})
+        return Estimate(self._looks, values, {name: float(entry["sd"]) for name, entry in found.items()}, tier)

@@ -299,8 +299,12 @@ def _end(outcome: Outcome, out: Path, target_u: float | None, as_json: bool) -> 
     if outcome.references:
         planned = outcome.looks - outcome.references
         text += f" ({planned} of the plan, {outcome.references} reference looks of resumed runs)"
-    warnings = [f"warning: {warning}" for warning in outcome.warnings]
-    finish({"campaign": str(out), **outcome.as_json()}, "\n".join([text, *warnings]), as_json)
+    lines = [text]
+    if outcome.estimate is not None:
+        way = {"importance": "the sampled posterior", "laplace": "the Laplace approximation"}[outcome.estimate.tier]
+        lines.append(f"deg/step by {way} of {outcome.estimate.looks} looks: {outcome.estimate.text}")
+    lines += [f"warning: {warning}" for warning in outcome.warnings]
+    finish({"campaign": str(out), **outcome.as_json()}, "\n".join(lines), as_json)
     if outcome.reason in ("interrupted", "declined"):
         report_line(f"{outcome.reason}; go on with --resume")
         raise Ended(INTERRUPTED)

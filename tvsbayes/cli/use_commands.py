@@ -249,6 +249,10 @@ def plan(
     count: Annotated[
         int | None, typer.Option("--next", min=1, max=200, help="With --given: only the next so many looks, no homing.")
     ] = None,
+    confirm: Annotated[
+        float | None,
+        typer.Option("--confirm", min=0, help="With --next: sample the posterior where u is at most this, deg/step."),
+    ] = None,
     watch: Annotated[bool, typer.Option("--watch", help="Fewest looks for `watch`: plan CAMPAIGN --watch.")] = False,
     seed: Seed = 0,
     as_json: Json = False,
@@ -289,8 +293,9 @@ def plan(
         refuse_options(
             "for whole plans, not for --next", "leave it out", aperture=aperture, minutes=minutes, out=out, **spare
         )
-        _next_looks(instrument, data, wanted, count, as_json)
+        _next_looks(instrument, data, wanted, count, confirm, as_json)
         return
+    refuse_options("for --next", "add --next, or leave it out", confirm=confirm)
     if criterion not in CRITERIA:
         message, allowed = f"--criterion {escaped(criterion)}", ", ".join(CRITERIA)
         raise InputError("criterion", message, column="--criterion", allowed=allowed, remedy="name one of them")
@@ -323,7 +328,9 @@ def plan(
         raise Ended(TARGET_MISSED)
 
 
-def _next_looks(rig: Rig, data: Campaign | None, target: Target, count: int, as_json: bool) -> None:
+def _next_looks(
+    rig: Rig, data: Campaign | None, target: Target, count: int, confirm: float | None, as_json: bool
+) -> None:
     """`plan --given --next`: a few looks that go on where the campaign ended."""
     if data is None:
         raise InputError("usage", "--next goes on from a campaign", remedy="add --given CAMPAIGN")
@@ -333,10 +340,15 @@ def _next_looks(rig: Rig, data: Campaign | None, target: Target, count: int, as_
         job.begin(PLANNING)
         from tvsbayes.planning.next_looks import next_looks
 
-        found = next_looks(fitted, rig, target, count)
+        found = next_looks(fitted, rig, target, count, confirm_below=confirm)
     from tvsbayes.instrument.plan import outline
 
-    finish(found.as_json(), "\n".join([found.why, *outline(rig, found.steps)]), as_json)
+    lines = [found.why, *outline(rig, found.steps)]
+    if found.confirmed is not None:
+        state = "" if found.confirmed.accepted else ", whose weights must not be used"
+        told = ", ".join(f"{d} {u:.2e}" for d, u in found.confirmed.u_deg_per_step.items())
+        lines.append(f"u by importance sampling{state}, deg/step: {told}")
+    finish(found.as_json(), "\n".join(lines), as_json)
 
 
 def study(

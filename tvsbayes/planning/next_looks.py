@@ -22,6 +22,31 @@ from tvsbayes.planning.looks import Arranged, arrange, covariance_of, informatio
 from tvsbayes.planning.planner import Question, question
 from tvsbayes.planning.search import search_designs
 from tvsbayes.planning.target import Target
+from tvsbayes.posterior.sampling import sample
+
+
+@dataclass(frozen=True)
+class Confirmation:
+    """What importance sampling says of the effective ratios by direction, deg/step.
+
+    Attributes:
+        accepted: whether its weights may be used.
+        deg_per_step, u_deg_per_step: means and sds.
+        interval95: low and high ends.
+    """
+
+    accepted: bool
+    deg_per_step: dict[str, float]
+    u_deg_per_step: dict[str, float]
+    interval95: dict[str, tuple[float, float]]
+
+    def as_json(self) -> dict[str, Any]:
+        """As part of the document of `plan --given --next`."""
+        ratios = {
+            d: {"value": self.deg_per_step[d], "sd": self.u_deg_per_step[d], "interval95": list(self.interval95[d])}
+            for d in DIRECTIONS
+        }
+        return {"tier": "importance", "accepted": self.accepted, "effective_deg_per_step": ratios}
 
 
 @dataclass(frozen=True)
@@ -36,6 +61,7 @@ class NextLooks:
         after_each: the target's value after each look, in their order.
         deg_per_step, u_deg_per_step: effective ratios of the fit by direction, and their Laplace sds.
         why: in words.
+        confirmed: what the sampled posterior says of them, where that was asked for.
     """
 
     target: Target
@@ -47,6 +73,7 @@ class NextLooks:
     deg_per_step: dict[str, float]
     u_deg_per_step: dict[str, float]
     why: str
+    confirmed: Confirmation | None = None
 
     def as_json(self) -> dict[str, Any]:
         """The document of `plan --given --next`."""
@@ -60,6 +87,7 @@ class NextLooks:
             "after_each": list(self.after_each),
             "effective_deg_per_step": ratios,
             "why": self.why,
+            "confirmed": None if self.confirmed is None else self.confirmed.as_json(),
         }
 
 
@@ -81,7 +109,16 @@ def _with_run_up(design: Arranged, side: np.ndarray, overshoot: np.ndarray) -> A
     return replace(design, via=via)
 
 
-def next_looks(fit: JointFit, rig: Rig, target: Target, count: int) -> NextLooks:
+def confirmation(fit: JointFit, seed: int = 0) -> Confirmation:
+    """The effective ratios of a converged fit by importance sampling: with rough scales Laplace's sds are short."""
+    drawn = sample(fit, "importance", seed=seed)
+    told = drawn.propagate(lambda p: np.stack([p[f"effective_deg_per_step.{d}"] for d in DIRECTIONS], axis=1))
+    means, sds, ends = told.mean.tolist(), told.sd.tolist(), [(low, high) for low, high in told.interval95.T.tolist()]
+    by_direction = (dict(zip(DIRECTIONS, each, strict=True)) for each in (means, sds, ends))
+    return Confirmation(drawn.converged, *by_direction)
+
+
+def next_looks(fit: JointFit, rig: Rig, target: Target, count: int, *, confirm_below: float | None = None) -> NextLooks:
     """The looks that lower a target most per minute, by the fit of what was seen so far.
 
     Args:
@@ -89,6 +126,7 @@ def next_looks(fit: JointFit, rig: Rig, target: Target, count: int) -> NextLooks
         rig: sheets, limits, costs.
         target: what is wanted.
         count: looks.
+        confirm_below: sample the posterior where the Laplace sd of every effective ratio is at most this, deg/step.
 
     Raises:
         NotConverged: the fit.
@@ -102,7 +140,8 @@ def next_looks(fit: JointFit, rig: Rig, target: Target, count: int) -> NextLooks
     last, sheet = fit.campaign.moves[-1], ordered_spots(fit.campaign)[-1].target
     choices = _choices(asked, rig, target, count, (last.pan_steps, last.tilt_steps), sheet)
     best = max(choices, key=lambda choice: (asked.now - choice.value) / max(choice.minutes, 1e-9))
-    effective = np.asarray(fit.draws.effective_deg_per_step)
+    sds = np.asarray(fit.draws.effective_deg_per_step).std(axis=0)
+    confirmed = confirmation(fit) if confirm_below is not None and sds.max() <= confirm_below else None
     places, wanted = ", ".join(dict.fromkeys(best.design.sheet)), target.text.split("<=")[0].strip()
     return NextLooks(
         target=target,
@@ -112,11 +151,12 @@ def next_looks(fit: JointFit, rig: Rig, target: Target, count: int) -> NextLooks
         expected=best.value,
         after_each=_after_each(asked, target, best),
         deg_per_step=dict(zip(DIRECTIONS, map(float, np.asarray(fit.mode.effective_deg_per_step)), strict=True)),
-        u_deg_per_step=dict(zip(DIRECTIONS, map(float, effective.std(axis=0)), strict=True)),
+        u_deg_per_step=dict(zip(DIRECTIONS, map(float, sds), strict=True)),
         why=(
             f"{count} looks at {places} lower {wanted} most per minute: from {asked.now:.3g} to {best.value:.3g} "
             f"{target.unit} in {best.minutes:.1f} minutes"
         ),
+        confirmed=confirmed,
     )
 
 

@@ -309,4 +309,20 @@ FAULTS = (
         "after an interruption the looks of another plan are taken, under the numbers of the changed one",
         ("acquisition/replanning::test_a_resumed_run_has_the_plan_of_the_interrupted_one",),
     ),
+    Fault(
+        "adapted run: Laplace alone ends it",
+        "acquisition/replanning.py",
+        'self.latest.tier == "importance" and super().met',
+        "super().met",
+        "a run ends with intervals that are too short, as the scales of the noise are rough",
+        ("acquisition/replanning::test_the_sampled_posterior_has_the_last_word",),
+    ),
+    Fault(
+        "adapted run: how far Laplace was off is forgotten",
+        "acquisition/replanning.py",
+        "self._ratio = max(1.0, after / before)",
+        "self._ratio = 1.0",
+        "the posterior is sampled after every fit that Laplace calls good enough",
+        ("acquisition/replanning::test_the_sampled_posterior_has_the_last_word",),
+    ),
 )

@@ -266,4 +266,12 @@ FAULTS = (
         "the first look of a proposal stands on an unknown side of the play",
         ("planning/next_looks",),
     ),
+    Fault(
+        "next looks: the posterior is asked where one direction is known, not all",
+        "planning/next_looks.py",
+        "sds.max() <= confirm_below",
+        "sds.min() <= confirm_below",
+        "an adaptive run spends seconds on sampling that cannot end it",
+        ("planning/next_looks::test_the_posterior_confirms_where_it_is_asked_to",),
+    ),
 )
