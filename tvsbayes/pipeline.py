@@ -38,10 +38,9 @@ FILED_SECONDS, SUMMARISED_SECONDS = 3.0, 1.5
 """For posterior.nc and for the results: what progress foretells with."""
 RESIDUALS_LISTED = 4096
 """Stops in `fit.json`, evenly chosen: a long campaign's file stays readable within its cap."""
-FITTING_FIRST = (
-    "results/ are missing, older than the campaign, or of a fit that did not converge: fitting first "
-    "(Laplace approximation) ..."
-)
+FITTING_FIRST = "fitting first (Laplace approximation) ..."
+HASHED = {"moves": "moves.csv", "spots": "spots.csv", "stereo": "stereo.json", "rig": "[rig]"}
+"""What an estimate depends on, as its owner knows it."""
 
 
 def untold(line: str) -> None:
@@ -301,9 +300,30 @@ def fit_for(campaign: Campaign, tell: Tell = untold, progress: Show | None = Non
     return _converged_fit(campaign, tell, progress) if found is None else found
 
 
+def _why_not_stored(campaign: Campaign) -> str:
+    """What keeps `results/` from being used: nobody should wait for a fit without knowing why."""
+    from tvsbayes.instrument.campaign import input_hashes
+    from tvsbayes.results.fit_record import provenance, read_fit
+
+    path = None if campaign.path is None else campaign.path / "results" / "fit.json"
+    if path is None or not path.exists():
+        return "there are no results/ yet"
+    record = read_fit(path)
+    now, told = input_hashes(campaign), record.provenance
+    others = [HASHED[name] for name in HASHED if told.inputs.get(name) != now[name]]
+    made_by = told.versions["tvsbayes"]
+    if others == [HASHED["rig"]] and made_by != provenance(now, 0).versions["tvsbayes"]:
+        return f"results/ are of tvsbayes {escaped(made_by, 40)}, which modelled less of the rig, or of another [rig]"
+    if others:
+        return f"results/ are of other {', '.join(others)}"
+    if not record.summary.converged:
+        return "results/ are of a fit that did not converge"
+    return "results/ lack what this command needs"
+
+
 def _converged_fit(campaign: Campaign, tell: Tell, progress: Show | None) -> JointFit:
     """A fit for a command that needs one in passing."""
-    tell(FITTING_FIRST)
+    tell(f"{_why_not_stored(campaign)}: {FITTING_FIRST}")
     from tvsbayes.estimators.joint_fit import fit as fit_joint
 
     compile_for(tell)

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import json
 import sys
+from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from support.small_results import small_record, whole_summary
 from support.waits import check_forward, doings
 
 import tvsbayes
 from tvsbayes.cli.app import report_line
-from tvsbayes.instrument.campaign import read_campaign
+from tvsbayes.instrument.campaign import input_hashes, read_campaign
 from tvsbayes.instrument.model_choice import ModelChoice
 from tvsbayes.model.compiled import Traces
 from tvsbayes.pipeline import FITTING, SUMMARISING, compile_for, fit_for
@@ -41,6 +44,43 @@ def test_what_a_fit_left_is_taken_up_again(grid_folder, monkeypatch):
     spots = (grid_folder / "spots.csv").read_text().replace("d2", "d3")
     (grid_folder / "spots.csv").write_text(spots)
     assert stored_mode(read_campaign(grid_folder)) is None
+
+
+def test_whoever_waits_for_a_fit_is_told_why(grid_folder, monkeypatch):
+    """Nobody should look for a mistake of theirs where a version changed."""
+    told = []
+    monkeypatch.setattr("tvsbayes.pipeline.compile_for", lambda _: None)
+    monkeypatch.setattr("tvsbayes.estimators.joint_fit.fit", lambda *_, **__: SimpleNamespace(converged=True))
+
+    def why() -> str:
+        told.clear()
+        fit_for(read_campaign(grid_folder), told.append)
+        return told[0].removesuffix(": fitting first (Laplace approximation) ...")
+
+    assert why() == "there are no results/ yet"
+    (grid_folder / "results").mkdir()
+    path, campaign = grid_folder / "results" / "fit.json", read_campaign(grid_folder)
+    own = small_record(whole_summary(), seed=3)
+
+    def keep(converged: bool, version: str, **others: str) -> None:
+        given = replace(own.provenance, inputs=input_hashes(campaign) | others)
+        given = replace(given, versions=given.versions | {"tvsbayes": version})
+        summary = replace(whole_summary(), converged=converged)
+        path.write_text(json.dumps(replace(own, summary=summary, provenance=given).as_json()))
+
+    now = own.provenance.versions["tvsbayes"]
+    for made, said in (
+        ((True, now, {"moves": "0" * 64, "rig": "0" * 64}), "results/ are of other moves.csv, [rig]"),
+        ((True, now, {"rig": "0" * 64}), "results/ are of other [rig]"),
+        (
+            (True, "0.0.9", {"rig": "0" * 64}),
+            "results/ are of tvsbayes 0.0.9, which modelled less of the rig, or of another [rig]",
+        ),
+        ((False, now, {}), "results/ are of a fit that did not converge"),
+        ((True, now, {}), "results/ lack what this command needs"),
+    ):
+        keep(made[0], made[1], **made[2])
+        assert why() == said
 
 
 def test_whoever_waits_for_the_first_compilation_is_told(tmp_path, capsys, monkeypatch):

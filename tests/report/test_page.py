@@ -20,8 +20,10 @@ from tvsbayes.calibration.calibration_file import load_calibration
 from tvsbayes.files.disk import shipped_data
 from tvsbayes.instrument.axes import DIRECTIONS
 from tvsbayes.instrument.campaign import read_campaign, write_campaign
+from tvsbayes.instrument.parameters import NOISE_NAMES, PRIOR_GROUPS, REGISTRY
 from tvsbayes.metrology.positioning_table import positioning
 from tvsbayes.metrology.traceability import traceability
+from tvsbayes.report.first_page import cause_in_words
 from tvsbayes.report.page import (
     BROWSERS,
     page_html,
@@ -127,6 +129,15 @@ def test_the_first_page_has_the_answer_and_who_asked(page, evidence):
         assert "`" not in first and "--no-sample" not in first and "tvsbayes fit twin" in first
         # What makes the millimetres: of the joint calibration, and why the classic is farther off.
         assert "Why classic is off there" in first and "of the variance" in first
+
+
+def test_the_first_page_calls_causes_by_words():
+    """Every prior that can be a cause of millimetres; scales of noise are causes of nothing by themselves."""
+    told = {cause: cause_in_words(cause) for cause in PRIOR_GROUPS if cause.startswith("prior of ")}
+    noises = {REGISTRY[name].cause for name in NOISE_NAMES} - {"prior of aperture_sd_deg"}
+    assert {cause for cause, words in told.items() if words == cause} == noises
+    assert told["prior of mirror2_error_deg"] == "the angle of mirror 2 as stated beforehand (mirror2_error_deg)"
+    assert cause_in_words("stereo calibration") == "stereo calibration"
 
 
 def test_no_two_reports_have_one_number(evidence, page, no_pictures):
@@ -235,6 +246,8 @@ def test_a_campaign_without_experiments_says_so(evidence, no_pictures):
     plain = replace(evidence, classic=None, campaign=replace(evidence.campaign, spots=spots))
     text = " ".join(Nodes(report_html(plain)).text)
     assert "Classic: not applicable" in text and "no complete four-point experiment" in text
+    first = text.split("Contents")[0]
+    assert "0.06" in first and "classic value(u)" not in first
 
 
 def test_no_limit_no_verdict_and_no_convergence_no_use(evidence, no_pictures):

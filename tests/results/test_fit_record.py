@@ -11,11 +11,10 @@ import numpy as np
 import pytest
 from jsonschema import Draft202012Validator
 from support.fit_documents import OLD, changed, kept, problems, schema_of
-from support.small_results import estimate, small_record, small_summary
+from support.small_results import small_record, whole_summary
 
 from tvsbayes.errors import InputError
 from tvsbayes.results.convergence import Agreement, Convergence, Importance, NamedValue, Reweighted
-from tvsbayes.results.estimates import FitSummary
 from tvsbayes.results.fit_record import FIT_FORMAT, FIT_FORMATS, read_fit
 
 
@@ -39,13 +38,6 @@ def test_old_documents_stay_valid_and_readable(path):
         document["sampling"] |= {"importance": None, "agreement": None}
     later = {"local_deg_per_step": {}, "range_steps": {}, "homing_side": {}}
     assert read_fit(path).as_json() == {"validation": None, "few_stops": {}, "tier": None, **later, **document}
-
-
-def whole_summary() -> FitSummary:
-    """With every parameter that the schema wants."""
-    summary = small_summary()
-    names = ("degrees_per_step.pan", "degrees_per_step.tilt")
-    return replace(summary, parameters={**summary.parameters, **{name: estimate(0.06, 1e-4) for name in names}})
 
 
 def test_a_new_document_obeys_the_schema(tmp_path):

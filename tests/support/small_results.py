@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from support.small_campaign import small_campaign
 
@@ -42,6 +44,13 @@ def small_summary() -> FitSummary:
 
 
 NAMES = ("backlash_deg.pan", "not estimated", "pixel_scale")
+
+
+def whole_summary() -> FitSummary:
+    """With every parameter that the schema wants."""
+    summary = small_summary()
+    names = ("degrees_per_step.pan", "degrees_per_step.tilt")
+    return replace(summary, parameters={**summary.parameters, **{name: estimate(0.06, 1e-4) for name in names}})
 
 
 def small_draws() -> ResultDraws:

@@ -20,6 +20,7 @@ from collections.abc import Mapping, Sequence
 from tvsbayes.acquisition.journal import Record
 from tvsbayes.errors import escaped, refusal
 from tvsbayes.instrument.counter_limits import HOME_KEYS
+from tvsbayes.instrument.parameters import GEAR_ERROR_NAMES
 from tvsbayes.instrument.plan import PlanStep
 from tvsbayes.instrument.rig import Rig, rig_table_toml
 from tvsbayes.instrument.stereo_pair import stereo_bytes
@@ -121,10 +122,14 @@ def check_same(before: Mapping[str, object], rig: Rig, plan: Sequence[PlanStep],
 def _check_earlier(before: Mapping[str, object], rig: Rig) -> None:
     """The same of a journal that knows its rig by one SHA-256 only, port and cameras included."""
     tables = json.dumps([rig.sheets_mm, rig.positioner, rig.cameras], sort_keys=True)
-    content = rig_table_toml(rig.table).encode() + stereo_bytes(rig.stereo) + tables.encode()
+    # The errors of the gears came later, with defaults.
+    later = tuple(f'"{name}" = ' for name in GEAR_ERROR_NAMES)
+    lines = rig_table_toml(rig.table).splitlines(keepends=True)
+    known = "".join(line for line in lines if not line.startswith(later))
+    content = known.encode() + stereo_bytes(rig.stereo) + tables.encode()
     if before.get("rig_sha256") != hashlib.sha256(content).hexdigest():
         allowed = f"the rig file that this campaign began with (SHA-256 {before.get('rig_sha256')})"
-        remedy = "give the unchanged rig file, or begin a new campaign in another folder"
+        remedy = "give the unchanged rig file (port and cameras count too), or begin a new campaign in another folder"
         raise refusal("changed", file="rig file", found="another rig", allowed=allowed, remedy=remedy)
 
 

@@ -74,7 +74,10 @@ def calibration_of_draws(
     return Calibration(
         mean=mean,
         covariance=np.cov(inputs, rowvar=False),
-        noise_variance=dict(zip(NOISE_NAMES, (noise**2).mean(axis=0).tolist(), strict=True)),
+        # Summed exactly: a variance that is stated, not estimated, comes out as it was stated.
+        noise_variance={
+            n: math.fsum(v**2 for v in each) / len(each) for n, each in zip(NOISE_NAMES, noise.T.tolist(), strict=True)
+        },
         overshoot_steps={axis: _overshoot_steps(column, axis, _widest(table, inputs, axis)) for axis in AXES},
         azimuth=campaign.rig.aperture_convention == "azimuth",
         period_deg=campaign.rig.first_period_deg,

@@ -30,6 +30,27 @@ CAUSES_TOLD = 3
 RECORDED = (("instrument", "instrument"), ("serial", "serial number"), ("operator", "operator"))
 """Keys of `campaign.toml` on the first page, and what they are called there."""
 
+IN_WORDS = {
+    "pan_zero_emission_deg": "the emission angle at pan 0",
+    "aperture_zero_deg": "the aperture's zero",
+    "aperture_sd_deg": "the scatter of aperture readings",
+    "baseline_mm": "the baseline",
+    "mirror_offset_mm": "the mirror offset",
+    "mirror1_error_deg": "the angle of mirror 1",
+    "mirror2_error_deg": "the angle of mirror 2",
+    "laser_tilt_deg": "the laser's direction",
+    "laser_offset_mm": "the laser's place",
+    "tilt_axis_skew_deg": "the skew of the tilt axis",
+    "tilt_axis_offset_mm": "the place of the tilt axis",
+    "tilt_zero_deg": "the tilt mirror at counter 0",
+    "extrinsics": "where the positioner stands before the cameras",
+    "degrees_per_step": "the ratio of the gears",
+    "ratio_contrast_deg_per_step": "the difference of the ratios of both directions",
+    "backlash_deg": "the backlash",
+    "harmonic_deg": "the periodic error of the gears",
+}
+"""What the first page calls parameters; the budgets behind it name them as files do."""
+
 
 @dataclass(frozen=True)
 class Verdict:
@@ -91,21 +112,22 @@ def measured_days(campaign: Campaign, issue: Issue) -> str:
 
 
 def answer_table(e: Evidence) -> TableView:
-    """The four ratios and both backlashes, classic beside joint."""
-    summary, rows = e.fit.summary, []
+    """The four ratios and both backlashes, classic beside joint where there are experiments for it."""
+    summary, rows, applicable = e.fit.summary, [], e.classic is not None
     for direction in DIRECTIONS:
         classic = None if e.classic is None else e.classic.directions[direction]
-        told = "no experiment" if e.classic is not None else "not applicable"
+        told = "no experiment"
         if classic is not None:
             told = f"{concise(classic.mean_deg_per_step, classic.u_gum_deg_per_step or 0.0)}, n = {classic.n}"
-        rows.append([f"{direction}, deg/step", *_cells(summary.effective[direction]), told])
+        rows.append([f"{direction}, deg/step", *_cells(summary.effective[direction]), *[told] * applicable])
     for axis in AXES:
-        told = CLASSIC_BLIND if e.classic is not None else "not applicable"
-        rows.append([f"backlash {axis}, deg", *_cells(summary.parameters[f"backlash_deg.{axis}"]), told])
+        play = _cells(summary.parameters[f"backlash_deg.{axis}"])
+        rows.append([f"backlash {axis}, deg", *play, *[CLASSIC_BLIND] * applicable])
     pose = summary.reference_pose_deg
     where = f"pan {pose['pan']:.2f} deg, tilt {pose['tilt']:.2f} deg"
     caption = f"Degrees of the beam per motor step at {where}, and play; U: half the 95 % interval"
-    return TableView(caption, ["", "joint value(u)", "95 % interval", "U, 95 %", "classic value(u)"], rows)
+    columns = ["", "joint value(u)", "95 % interval", "U, 95 %", *["classic value(u)"] * applicable]
+    return TableView(caption, columns, rows)
 
 
 def _cells(estimate: Estimate | None) -> list[str]:
@@ -118,9 +140,13 @@ def _cells(estimate: Estimate | None) -> list[str]:
 
 
 def both_estimators(e: Evidence) -> FigureView:
-    """Ratios of both estimators with their intervals."""
+    """Ratios of both estimators with their intervals; of the joint one alone where the other has no experiments."""
+    picture = figures.intervals(e.fit.summary, e.classic)
+    if e.classic is None:
+        told = "Effective ratios. The classic method needs four-point experiments: the campaign has none."
+        return figure_view(picture, "Ratios with 95 % intervals; values in the table beside it", told)
     return figure_view(
-        figures.intervals(e.fit.summary, e.classic),
+        picture,
         "Ratios of both estimators with 95 % intervals; values in the table beside it",
         "Effective ratios, joint (circles) and classic (triangles).",
     )
@@ -136,7 +162,7 @@ def distances(e: Evidence) -> list[Number]:
 def why_far(e: Evidence) -> list[str]:
     """What the error of the joint calibration consists of, and why the last of the simple ones is farther off."""
     order = np.argsort(-e.budget.share)[:CAUSES_TOLD]
-    causes = ", ".join(f"{e.budget.causes[k]} {100 * e.budget.share[k]:.0f} %" for k in order)
+    causes = ", ".join(f"{cause_in_words(e.budget.causes[k])} {100 * e.budget.share[k]:.0f} %" for k in order)
     told = [f"What the joint one leaves comes from, as shares of the variance: {causes}."]
     for name, off in list(e.simple_errors.items())[-1:]:
         told.append(
@@ -146,6 +172,12 @@ def why_far(e: Evidence) -> list[str]:
             f"alone make {_mm(off.by_place_mm)}."
         )
     return told
+
+
+def cause_in_words(cause: str) -> str:
+    """A cause of uncertainty for who has not read the list of parameters; the name in brackets is that of the files."""
+    name = cause.removeprefix("prior of ")
+    return f"{IN_WORDS[name]} as stated beforehand ({name})" if name in IN_WORDS else cause
 
 
 def _mm(value: float) -> str:

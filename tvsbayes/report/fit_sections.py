@@ -16,7 +16,7 @@ from tvsbayes.report.advice import asks_for_looks
 from tvsbayes.report.fit_text import agreement_line, sampling_line
 from tvsbayes.report.result_tables import gap_table, hold_out_table
 from tvsbayes.report.spot_pictures import spot_gallery
-from tvsbayes.report.tables import FigureView, Section, TableView, concise, figure_view, interval_text
+from tvsbayes.report.tables import FigureView, Section, TableView, concise, figure_view, interval_text, two_digits
 from tvsbayes.results.estimates import Cause, Validation
 
 if TYPE_CHECKING:
@@ -148,8 +148,8 @@ def _parameters(e: Evidence) -> TableView:
                 name,
                 concise(x.value, x.sd),
                 interval_text(*x.interval95, x.sd),
-                "" if x.prior_sd is None else f"{x.prior_sd:.2g}",
-                "" if x.contraction is None else f"{100 * x.contraction:.0f}",
+                "" if x.prior_sd is None else two_digits(x.prior_sd),
+                "" if x.contraction is None else f"{100 * max(x.contraction, 0.0):.0f}",
             ]
         )
     columns = ["parameter", "value(u)", "95 % interval", "u of the prior", "told by the data, %"]

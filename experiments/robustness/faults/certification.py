@@ -93,6 +93,22 @@ FAULTS = (
         ("report/page::test_traceability_is_what_the_certificate_says",),
     ),
     Fault(
+        "an older version's results called another [rig]",
+        "pipeline.py",
+        'if others == [HASHED["rig"]] and made_by !=',
+        'if others == [HASHED["rig"]] and made_by ==',
+        "the owner looks for a change that nobody made",
+        ("cli/pipeline::test_whoever_waits_for_a_fit_is_told_why", "promises/old_files"),
+    ),
+    Fault(
+        "an interrupted run of 0.1.0 held against today's entries",
+        "acquisition/run_identity.py",
+        "if not line.startswith(later)",
+        "if line",
+        "a campaign begun before the update can never be finished",
+        ("promises/old_files::test_an_interrupted_run_goes_on",),
+    ),
+    Fault(
         "contrast left out of the positioning figures",
         "pipeline.py",
         ", contrast_deg_per_step=contrast)",
