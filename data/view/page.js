@@ -1,34 +1,16 @@
 // The page: the key for the link's token, the document, the plots, and one selection that all of them share.
 
+import { asked, keyOf } from "./access.js";
 import { Scenes } from "./columns.js";
 import { Changes, Correlation, MARKS_MOST, Pictures, Residuals, Stops } from "./plots.js";
 import { Rig, VIEWS } from "./rig.js";
 
-const KEY = "tvsbayes-key";
 const by = (id) => document.getElementById(id);
 
 function refuse(text) {
   by("notes").textContent = text;
   by("notes").classList.add("refused");
   document.body.dataset.state = "refused";
-}
-
-/** The key of this tab: kept over a reload, else given for the token behind the #. */
-async function keyOf() {
-  const token = location.hash.slice(1);
-  if (token) {
-    history.replaceState(null, "", "/");
-    const answer = await fetch("/key", { method: "POST", body: JSON.stringify({ token }) });
-    if (!answer.ok) throw new Error(await answer.text());
-    sessionStorage.setItem(KEY, (await answer.json()).key);
-  }
-  return sessionStorage.getItem(KEY) ?? "";
-}
-
-async function asked(path, key) {
-  const answer = await fetch(path, { headers: { "X-Tvsbayes-Key": key } });
-  if (!answer.ok) throw new Error(await answer.text());
-  return answer;
 }
 
 function digits(value, sd) {

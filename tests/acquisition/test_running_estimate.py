@@ -13,7 +13,7 @@ from tvsbayes.acquisition.operator import Terminal
 from tvsbayes.acquisition.recorder import recorded
 from tvsbayes.acquisition.running_estimate import EstimateWish, RunningEstimate
 from tvsbayes.acquisition.session import acquire
-from tvsbayes.cli.bench_commands import FIT_COMMAND
+from tvsbayes.cli.acquire_command import FIT_COMMAND
 from tvsbayes.instrument.plan import run_plan
 from tvsbayes.instrument.stops import legs_of
 

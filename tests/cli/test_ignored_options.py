@@ -32,6 +32,8 @@ IGNORED = [
     ("acquire r.toml p.csv o --centroids", "--centroids is for the twin"),
     ("acquire r.toml p.csv o --emulate", "--emulate is for the twin"),
     ("acquire r.toml p.csv o --seed 0", "--seed is for the twin"),
+    ("acquire r.toml p.csv o --simulate --port 8000", "--port is for --live"),
+    ("acquire r.toml p.csv o --simulate --no-browser", "--no-browser is for --live"),
     ("acquire r.toml p.csv o --simulate --laser-class 3B", "--laser-class is for a laser"),
     ("acquire r.toml p.csv o --target-u 1e-4 --no-estimate", "--target-u needs the fits"),
 ]

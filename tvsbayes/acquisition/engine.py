@@ -18,13 +18,16 @@ import numpy as np
 from tvsbayes.acquisition.bench import Bench
 from tvsbayes.acquisition.journal import Journal
 from tvsbayes.acquisition.journal_events import Four
+from tvsbayes.acquisition.live_control import Control, HeedingPositioner, LightRefused
+from tvsbayes.acquisition.live_run import LiveRun
+from tvsbayes.acquisition.live_snapshot import COMING_MAX, PAUSED, REMARKS_MAX, RUNNING, SeenLook
 from tvsbayes.acquisition.observation import Observation
 from tvsbayes.acquisition.operator import HAZARD, Progress, StopKey
 from tvsbayes.acquisition.recorder import Recorded
 from tvsbayes.acquisition.replanning import ADAPTED, CONFIRMED, Proposal, Replanning, adapted_entries, check_plan
 from tvsbayes.acquisition.run_identity import setup_entries
 from tvsbayes.acquisition.run_log import Outcome, RunLog
-from tvsbayes.acquisition.running_estimate import RunningEstimate
+from tvsbayes.acquisition.running_estimate import Aim, RunningEstimate
 from tvsbayes.errors import DeviceFault, InputError, TvsError
 from tvsbayes.instrument.axes import AXES, direction_of
 from tvsbayes.instrument.campaign import Spot, pixels_of
@@ -78,6 +81,7 @@ class Acquisition:
         stop: the stop key, in force while `run` runs.
         show: told about progress.
         estimate: the running estimate; a run that meets its target ends.
+        live: where the run is published, and what is asked of it; by default nobody looks.
     """
 
     def __init__(
@@ -90,12 +94,16 @@ class Acquisition:
         stop: StopKey | None = None,
         show: Callable[[Progress], None] = lambda progress: None,
         estimate: RunningEstimate | None = None,
+        live: LiveRun | None = None,
     ):
-        self.rig, self.plan, self.journal, self.bench = rig, tuple(plan), journal, bench
+        self.rig, self.plan, self.journal = rig, tuple(plan), journal
         self._stop, self._show, self._estimate = stop or StopKey(), show, estimate
         self._settle_s = float(rig.positioner.get("settle_s", SETTLE_S))
         self._retries, self._check_depth, self._placement = 0, False, -1
         self._log = RunLog(journal, rig, bench.utc)
+        self._live = live or LiveRun()
+        self._control = Control(self._live.requests, bench.positioner, self._stop, self._log.write, self._publish)
+        self.bench = replace(bench, positioner=HeedingPositioner(bench.positioner, self._control))
         self._spot = self._log.next_spot()
 
     def run(self) -> Outcome:
@@ -106,9 +114,10 @@ class Acquisition:
             KeyboardInterrupt: interrupted twice, or ended from outside; laser off, journal closed.
         """
         # What stands in the journal where an error of the program itself ends the run.
-        reason, exit_code = "crashed", 1
+        reason, exit_code, fault = "crashed", 1, None
         with self._stop:
             try:
+                self._begin_live()
                 reason = self._run()
                 exit_code = 130 if reason == "interrupted" else 0
             except _Stopped:
@@ -116,8 +125,10 @@ class Acquisition:
             except KeyboardInterrupt:
                 reason, exit_code = "interrupted at once", 130
                 raise
-            except TvsError as error:
-                reason, exit_code = error.code, error.exit_code
+            except BaseException as error:
+                fault = error
+                if isinstance(error, TvsError):
+                    reason, exit_code = error.code, error.exit_code
                 raise
             finally:
                 # An assignment, no call: Python lets no signal in before it has taken effect.
@@ -127,6 +138,7 @@ class Acquisition:
                     self.bench.positioner.close()
                 finally:
                     self._log.end(reason, exit_code)
+                    self._live.ended(reason, fault)
         estimate = None if self._estimate is None else self._estimate.latest
         return replace(self._log.outcome(reason, self._retries), estimate=estimate)
 
@@ -149,6 +161,7 @@ class Acquisition:
         """Follows the plan from a row on, as it is changed meanwhile; why it ended."""
         while row < len(self.plan):
             step = self.plan[row]
+            self._control.heed()
             if self._stop.requested:
                 return "interrupted"
             if isinstance(self._estimate, Replanning) and self._minutes(row + 1) > self._estimate.minutes:
@@ -164,9 +177,11 @@ class Acquisition:
         """Takes in what the fits say after the look before a row; whether the target is met."""
         met = estimate.update(self._log.ok_looks)
         if not isinstance(estimate, Replanning):
+            self._live.estimated(estimate.latest)
             return met
         if not met and row == len(self.plan):
             met = estimate.last(self._log.ok_looks)
+        self._live.estimated(estimate.latest)
         confirmed = estimate.confirmed()
         if confirmed is not None:
             self._log.write(CONFIRMED, **confirmed)
@@ -257,6 +272,9 @@ class Acquisition:
             time_s=self._log.now_s(),
             **more,
         )
+        pictures = {name: data for name, data in observation.pictures.items() if name.startswith("frames/")}
+        sheet = self._log.recorder.state.target
+        self._live.looked(SeenLook(self._spot, found.status, sheet, found.pixels_px, found.sds_px, pictures))
         self._spot += 1
         self._log.files.derive()
 
@@ -270,12 +288,20 @@ class Acquisition:
 
     def _observe(self) -> Observation:
         """A look; one that finds no spot is repeated, the last one counts."""
-        for attempt in range(ATTEMPTS_PER_LOOK):
-            self._retries += attempt > 0
-            observation = self.bench.observer.observe(self.bench.positioner, self._spot)
-            if observation.sighting.status in ("ok", "undetected") or self._stop.requested:
-                break
-        return observation
+        attempt = 0
+        while True:
+            try:
+                observation = self.bench.observer.observe(self.bench.positioner, self._spot)
+            except LightRefused:
+                # Laser off was asked for in mid-look: the look is taken again once the run goes on.
+                self._heed_stop()
+                continue
+            attempt += 1
+            status = observation.sighting.status
+            if status in ("ok", "undetected") or self._stop.requested or attempt == ATTEMPTS_PER_LOOK:
+                return observation
+            self._retries += 1
+            self._live.remarked(f"look {self._spot}: {status}; taken again")
 
     def _misplaced(self, observation: Observation) -> str | None:
         """Why the sheet seems to stand elsewhere, judged by the first spot after it was placed."""
@@ -349,31 +375,55 @@ class Acquisition:
             self._place(scene.target, scene.placement, remark, None)
 
     def _heed_stop(self) -> None:
+        self._control.heed()
         if self._stop.requested:
             raise _Stopped
 
     def _tell(self, step: PlanStep) -> None:
         left = self.plan[step.step :]
         spots = self._log.recorder.spots
-        doing = {
-            "home": "homing",
-            "place": f"placing {step.target}",
-            "move": f"moving to {step.pan_steps}, {step.tilt_steps}",
-            "look": "looking",
-        }[step.action]
-        self._show(
-            Progress(
-                step.step,
-                len(self.plan),
-                sum(s.action == "look" for s in self.plan[: step.step]),
-                sum(s.action == "look" for s in self.plan),
-                sum(spot.status not in ("ok", "undetected") for spot in spots),
-                self._retries,
-                plan_seconds(self.rig, left),
-                doing,
-                "" if self._estimate is None or self._estimate.latest is None else self._estimate.latest.text,
-            )
+        latest = None if self._estimate is None else self._estimate.latest
+        progress = Progress(
+            step.step,
+            len(self.plan),
+            sum(s.action == "look" for s in self.plan[: step.step]),
+            sum(s.action == "look" for s in self.plan),
+            sum(spot.status not in ("ok", "undetected") for spot in spots),
+            self._retries,
+            plan_seconds(self.rig, left),
+            _doing(step),
+            "" if latest is None else latest.text,
         )
+        self._show(progress)
+        self._live.estimated(latest)
+        self._live.publish(progress=progress, coming=tuple(map(_doing, left[1 : 1 + COMING_MAX])))
+        self._publish()
+
+    def _begin_live(self) -> None:
+        """What does not change while the run goes on."""
+        stereo, created = self.rig.stereo, self.journal.records[0].data
+        self._live.publish(
+            name=str(created.get("name", "")),
+            simulated=bool(created.get("synthetic")),
+            image_px=(stereo.image_width, stereo.image_height),
+            aim=Aim() if self._estimate is None else self._estimate.aim,
+        )
+        self._live.begun()
+
+    def _publish(self) -> None:
+        """Device, pause and warnings as they are now."""
+        state = PAUSED if self._control.paused else RUNNING
+        self._live.publish(state=state, device=self._control.device, warnings=tuple(self._log.warnings[-REMARKS_MAX:]))
+
+
+def _doing(step: PlanStep) -> str:
+    """A step in words."""
+    return {
+        "home": "homing",
+        "place": f"placing {step.target}",
+        "move": f"moving to {step.pan_steps}, {step.tilt_steps}",
+        "look": "looking",
+    }[step.action]
 
 
 def _approach(axis: str, steps: int) -> str:

@@ -2,7 +2,8 @@
 
 `created` opens a journal. Every motion of the plan is an `intent` before, and an order has an event of its own once it
 is done: `homed`, `placed`, `moved`, `looked`. `adapted` changes the plan, `confirmed` says whether the posterior meets
-the target, `verified` closes a segment, `start` and `stop` enclose a run, `gap` stands where a repair lost lines.
+the target, `asked` is what somebody asked for on the live page, `verified` closes a segment, `start` and `stop` enclose
+a run, `gap` stands where a repair lost lines.
 Counters in motor steps, raw px, degrees and seconds by suffix; `utc` and `created` are ISO 8601.
 
 A checksum finds accidents, not forgery: who reads an event converts what its entries hold, and refuses what does not
@@ -132,6 +133,27 @@ class Confirmed(TypedDict):
     importance_u_deg_per_step: float
     accepted: bool
     reached: bool
+
+
+class AskedDevice(TypedDict):
+    """What the device answered: status, laser, boot id and counters."""
+
+    status: str
+    laser_on: bool
+    boot: int
+    pan_steps: int
+    tilt_steps: int
+
+
+class Asked(TypedDict):
+    """What somebody asked of a run while it went on (pause, resume, stop, laser off), once the device had answered.
+
+    `number` counts the requests of a run from 1.
+    """
+
+    number: int
+    what: str
+    device: AskedDevice
 
 
 class Stop(TypedDict):

@@ -16,6 +16,7 @@ from typing import Protocol
 import numpy as np
 
 from tvsbayes.acquisition.journal_events import Four
+from tvsbayes.acquisition.live_control import LightRefused
 from tvsbayes.acquisition.simulated_instrument import Instrument, Renderer
 from tvsbayes.cameras.capture import StereoCamera, StereoImage
 from tvsbayes.cameras.contour import epipolar_refused
@@ -105,12 +106,17 @@ class CameraObserver:
 
         Raises:
             DeviceFault: a camera repeats one picture, the laser went off while it was exposed, or does not go off.
+            LightRefused: somebody asked for the laser to be off; it is.
         """
         positioner.laser(False)
         dark = self.camera.grab()
         try:
             positioner.laser(True)
             lit, on = self._lit(positioner, dark)
+        except LightRefused:
+            # No lit picture may be under way when the look is taken again; and the light proves that it is off.
+            self._wait_for_darkness(dark)
+            raise
         finally:
             positioner.laser(False)
         if not on:

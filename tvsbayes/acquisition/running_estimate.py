@@ -69,6 +69,14 @@ class Estimate:
         return {"tier": self.tier, "looks": self.looks, "effective_deg_per_step": ratios}
 
 
+@dataclass(frozen=True)
+class Aim:
+    """What the running estimate is for: directions of the plan, and the u wanted of each, None for no target."""
+
+    directions: tuple[str, ...] = ()
+    target_u_deg_per_step: float | None = None
+
+
 class RunningEstimate:
     """Fits the folder of a running acquisition again and again.
 
@@ -105,6 +113,11 @@ class RunningEstimate:
             self._process.kill()
             self._process.wait()
         self._scratch.cleanup()
+
+    @property
+    def aim(self) -> Aim:
+        """What the fits are for."""
+        return Aim(tuple(sorted(self.directions)), self.target)
 
     @property
     def met(self) -> bool:

@@ -14,6 +14,7 @@ from tvsbayes.acquisition.bench import SIMULATED_START, Vision, hardware, simula
 from tvsbayes.acquisition.campaign_files import NAME_DEFAULT
 from tvsbayes.acquisition.engine import Acquisition, Outcome
 from tvsbayes.acquisition.journal import EMPTY_REMEDY, LOG, Journal, read_journal, require_journal
+from tvsbayes.acquisition.live_run import LiveRun
 from tvsbayes.acquisition.operator import StopKey, Terminal, TerminalOperator, check_hazard
 from tvsbayes.acquisition.recorder import Recorded, recorded
 from tvsbayes.acquisition.replanning import AdaptWish, Replanning, adapted_plan, check_plan
@@ -40,6 +41,7 @@ def acquire(
     adapt: AdaptWish | None = None,
     vision: Vision | None = None,
     terminal: Terminal | None = None,
+    live: LiveRun | None = None,
 ) -> Outcome:
     """Runs a plan on the instrument of a rig file, or on its twin, into a campaign folder.
 
@@ -56,6 +58,7 @@ def acquire(
         adapt: that the looks which are left are chosen from that fit; `estimate` must have a target.
         vision: how pictures are made and seen; by default they wait for `detect`, and a simulation states centroids.
         terminal: where to speak and to ask; by default nothing is shown.
+        live: where the run is published for whoever looks on, and what is asked of it.
 
     Raises:
         InputError: a plan this rig cannot run, another plan than before, nobody to ask, no emulator.
@@ -87,7 +90,7 @@ def acquire(
             stack.enter_context(running)
         stack.callback(bench.conclude, folder)
         now = adapted_plan(plan, journal.records)
-        return Acquisition(rig, now, journal, bench, stop=stop, show=terminal.show, estimate=running).run()
+        return Acquisition(rig, now, journal, bench, stop=stop, show=terminal.show, estimate=running, live=live).run()
 
 
 def _running(

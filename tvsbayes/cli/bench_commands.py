@@ -1,4 +1,4 @@
-"""Commands at the bench: stereo, acquire, doctor, export.
+"""Commands at the bench: stereo, doctor, export.
 
 Options in, library called, table or JSON out; heavy imports stand inside the commands.
 """
@@ -6,41 +6,24 @@ Options in, library called, table or JSON out; heavy imports stand inside the co
 from __future__ import annotations
 
 import os
-import sys
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from tvsbayes.cli.app import (
-    INTERRUPTED,
-    TARGET_MISSED,
-    Ended,
-    Json,
-    finish,
-    finite,
-    in_order,
-    refuse_options,
-    report_line,
-)
+from tvsbayes.cli.app import Json, finish, finite, refuse_options, report_line
 from tvsbayes.cli.progress_bar import waiting
 from tvsbayes.errors import InputError, escaped, refusal
 from tvsbayes.files.disk import write_atomically
 from tvsbayes.pipeline import compile_for
 
 if TYPE_CHECKING:
-    from tvsbayes.acquisition.run_log import Outcome
     from tvsbayes.cameras.boards import Board, Finder
     from tvsbayes.cameras.calibration_formats import Format
-    from tvsbayes.instrument.plan import PlanStep
-    from tvsbayes.instrument.rig import Rig
     from tvsbayes.instrument.stereo_pair import Stereo
 
 IMAGE_SIDE_MAX = 65_535
-FIT_COMMAND, PLAN_COMMAND = ((sys.executable, "-m", "tvsbayes", name) for name in ("fit", "plan"))
-"""`tvsbayes fit` and `tvsbayes plan` in processes of their own."""
 
 
 def stereo(
@@ -191,127 +174,6 @@ def _image_size(text: str | None) -> tuple[int, int] | None:
     if not all(0 < size <= IMAGE_SIDE_MAX for size in sizes):
         raise InputError("usage", f"--image-size {escaped(text)}", allowed="WIDTHxHEIGHT", remedy="write 1280x720")
     return sizes[0], sizes[1]
-
-
-LaserClass = Annotated[
-    str | None, typer.Option("--laser-class", help="Class on the laser's label: states the hazard is known.")
-]
-TargetU = Annotated[
-    float | None,
-    typer.Option("--target-u", min=0.0, help="Stop when every effective ratio is known to this u, deg/step."),
-]
-Estimated = Annotated[
-    bool | None,
-    typer.Option(
-        "--estimate/--no-estimate",
-        help="Fit the looks so far beside the run (default: on hardware only; a simulation waits for each fit).",
-    ),
-]
-
-
-def acquire(
-    rig: Annotated[Path, typer.Argument(metavar="RIG", help="Rig file.")],
-    plan: Annotated[Path, typer.Argument(metavar="PLAN", help="plan.csv.")],
-    out: Annotated[Path, typer.Argument(metavar="OUT", help="Campaign folder to write.")],
-    simulate: Annotated[bool, typer.Option("--simulate", help="The digital twin instead of hardware.")] = False,
-    centroids: Annotated[
-        bool, typer.Option("--centroids", help="With --simulate: the twin states centroids, no pictures are made.")
-    ] = False,
-    emulate: Annotated[
-        bool, typer.Option("--emulate", help="With --simulate: the firmware itself on an emulated board, in real time.")
-    ] = False,
-    resume: Annotated[bool, typer.Option("--resume", help="Go on with an interrupted run.")] = False,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="List what would happen; nothing moves.")] = False,
-    laser_class: LaserClass = None,
-    target_u: TargetU = None,
-    estimate: Estimated = None,
-    adapt: Annotated[bool, typer.Option("--adapt", help="With --target-u: looks chosen from the fits.")] = False,
-    minutes: Annotated[float | None, typer.Option("--minutes", min=0.1, help="With --adapt: longest run.")] = None,
-    seed: Annotated[int | None, typer.Option("--seed", min=0, help="Of a simulation (default 0).")] = None,
-    as_json: Json = False,
-) -> None:
-    """Drive positioner and cameras through a plan into a campaign. Nothing is lost, whatever ends it.
-
-    LASER: 808 nm is invisible and likely class 3B. Goggles on, beam path shut in.
-    """
-    from tvsbayes.instrument.plan import read_plan
-    from tvsbayes.instrument.rig import read_rig
-
-    if simulate:
-        refuse_options("for a laser, and --simulate has none", "leave out one of them", laser_class=laser_class)
-    else:
-        twin = {"centroids": centroids, "emulate": emulate, "seed": seed}
-        refuse_options("for the twin", "add --simulate, or leave it out", **twin)
-    if target_u is not None and estimate is False:
-        remedy = "leave out one of them"
-        raise InputError("usage", "--target-u needs the fits that --no-estimate forbids", remedy=remedy)
-    if adapt and target_u is None:
-        raise InputError("usage", "--adapt needs a target to go for", remedy="add --target-u")
-    if not adapt:
-        refuse_options("for --adapt", "add --adapt, or leave it out", minutes=minutes)
-    in_order(rig, plan)
-    instrument, steps = read_rig(rig), read_plan(plan)
-    if dry_run:
-        _rehearse(instrument, steps, as_json)
-        return
-    from tvsbayes.acquisition.bench import Vision
-    from tvsbayes.acquisition.observation import live_detector, twin_renderer
-    from tvsbayes.acquisition.operator import LiveLine, Terminal
-    from tvsbayes.acquisition.replanning import AdaptWish
-    from tvsbayes.acquisition.running_estimate import EstimateWish
-    from tvsbayes.acquisition.session import acquire as run_plan
-
-    vision = Vision()
-    if not centroids:
-        vision = Vision(live_detector(instrument.stereo), twin_renderer(instrument, seed or 0) if simulate else None)
-    with LiveLine() as line:
-        outcome = run_plan(
-            instrument,
-            steps,
-            out,
-            simulate=simulate,
-            emulate=emulate,
-            resume=resume,
-            laser_class=laser_class,
-            seed=seed or 0,
-            estimate=EstimateWish(FIT_COMMAND, target_u, estimate),
-            adapt=AdaptWish((*PLAN_COMMAND, str(rig)), minutes) if adapt else None,
-            vision=vision,
-            terminal=Terminal(report_line, line.show, line.ask),
-        )
-    _end(outcome, out, target_u, as_json)
-
-
-def _rehearse(rig: Rig, plan: Sequence[PlanStep], as_json: bool) -> None:
-    """What a run would do, step by step, and how long it would take."""
-    from tvsbayes.acquisition.replanning import check_plan
-    from tvsbayes.instrument.plan import outline, plan_seconds
-
-    check_plan(rig, plan)
-    lines, minutes = outline(rig, plan), plan_seconds(rig, plan) / 60
-    text = "\n".join([*lines, f"{len(lines)} steps, about {minutes:.0f} min"])
-    finish({"steps": lines, "minutes": minutes}, text, as_json)
-
-
-def _end(outcome: Outcome, out: Path, target_u: float | None, as_json: bool) -> None:
-    """What has become of a run, and the exit code that says so."""
-    text = f"{escaped(str(out), 200)}: {outcome.reason}, {outcome.ok} of {outcome.looks} looks count"
-    if outcome.references:
-        planned = outcome.looks - outcome.references
-        text += f" ({planned} of the plan, {outcome.references} reference looks of resumed runs)"
-    lines = [text]
-    if outcome.estimate is not None:
-        way = {"importance": "the sampled posterior", "laplace": "the Laplace approximation"}[outcome.estimate.tier]
-        lines.append(f"deg/step by {way} of {outcome.estimate.looks} looks: {outcome.estimate.text}")
-    lines += [f"warning: {warning}" for warning in outcome.warnings]
-    finish({"campaign": str(out), **outcome.as_json()}, "\n".join(lines), as_json)
-    if outcome.reason in ("interrupted", "declined"):
-        report_line(f"{outcome.reason}; go on with --resume")
-        raise Ended(INTERRUPTED)
-    if target_u is not None and outcome.reason != "target met":
-        ended = "the time is over" if outcome.reason == "time over" else "the plan is done"
-        report_line(f"{ended} and the target is not met: plan more with tvsbayes plan --given")
-        raise Ended(TARGET_MISSED)
 
 
 def doctor(

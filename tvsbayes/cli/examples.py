@@ -20,6 +20,7 @@ EXAMPLES = {
         "tvsbayes acquire rig.toml plan.csv run1 --dry-run",
         "tvsbayes acquire rig.toml plan.csv run1 --laser-class 3B",
         "tvsbayes acquire rig.toml plan.csv run1 --resume",
+        "tvsbayes acquire rig.toml plan.csv run1 --simulate --live",
     ),
     "doctor": ("tvsbayes doctor rig.toml",),
     "export": ("tvsbayes export run1 --nexus run1.nxs",),

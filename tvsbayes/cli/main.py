@@ -13,6 +13,7 @@ import sys
 
 import typer
 
+from tvsbayes.cli.acquire_command import acquire
 from tvsbayes.cli.app import (
     INTERRUPTED,
     Ended,
@@ -24,7 +25,7 @@ from tvsbayes.cli.app import (
     report_line,
 )
 from tvsbayes.cli.begin_commands import new
-from tvsbayes.cli.bench_commands import acquire, doctor, export, stereo
+from tvsbayes.cli.bench_commands import doctor, export, stereo
 from tvsbayes.cli.campaign_commands import check, demo, detect, simulate
 from tvsbayes.cli.estimate_commands import classic, compare, fit
 from tvsbayes.cli.examples import EXAMPLES, epilog

@@ -1,6 +1,7 @@
 """Who may read a page on this machine: the browser that was given its link, from the page itself, and nobody else.
 
-A link is good for one browser. Its token stands behind the #, which browsers send to nobody; the page gives it back
+A link is good for one browser; that of a live page is good for more, of which the first controls and the others only
+watch. Its token stands behind the #, which browsers send to nobody; the page gives it back
 once and gets a key, which it sends as a header of its own with every request. No cookie: what another page makes this
 browser ask for carries no key (CSRF). A name that somebody else points at 127.0.0.1 (DNS rebinding) is refused by the
 Host header, another page by Origin and Sec-Fetch-Site (Fetch Metadata, W3C).
@@ -32,20 +33,23 @@ styles from its script."""
 
 
 class Access:
-    """Token, key and address of one page.
+    """Token, keys and address of one page.
 
-    Attributes:
+    Args:
         port: that the server listens on.
+        watchers: whether further browsers may watch.
     """
 
-    def __init__(self, port: int) -> None:
+    def __init__(self, port: int, *, watchers: bool = False) -> None:
         self.port = port
         self._token: str | None = secrets.token_urlsafe(TOKEN_BYTES)
         self._key = secrets.token_urlsafe(TOKEN_BYTES)
+        self._watching = secrets.token_urlsafe(TOKEN_BYTES) if watchers else None
+        self._given = False
 
     @property
     def link(self) -> str:
-        """What to open; its token is void once it was used."""
+        """What to open; its token is void once it was used, but on a page that others may watch."""
         return f"http://{HOSTS[0]}:{self.port}/#{self._token or ''}"
 
     def stranger(self, headers: Mapping[str, str]) -> str | None:
@@ -65,12 +69,20 @@ class Access:
         return None
 
     def key_for(self, token: str) -> str | None:
-        """The key for whoever brings the token first; None for a wrong or used one."""
+        """The key for whoever brings the token first, one to watch for those after it; None for a wrong or used one."""
         if self._token is None or not hmac.compare_digest(token.encode(), self._token.encode()):
             return None
-        self._token = None
-        return self._key
+        first, self._given = not self._given, True
+        if self._watching is None:
+            self._token = None
+        return self._key if first else self._watching
+
+    def controls(self, headers: Mapping[str, str]) -> bool:
+        """Whether a request carries the key of the first browser."""
+        return hmac.compare_digest(headers.get(KEY_HEADER, "").encode(), self._key.encode())
 
     def knows(self, headers: Mapping[str, str]) -> bool:
-        """Whether a request carries the key."""
-        return hmac.compare_digest(headers.get(KEY_HEADER, "").encode(), self._key.encode())
+        """Whether a request carries a key."""
+        brought = headers.get(KEY_HEADER, "").encode()
+        watches = self._watching is not None and hmac.compare_digest(brought, self._watching.encode())
+        return self.controls(headers) or watches

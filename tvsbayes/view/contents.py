@@ -5,6 +5,7 @@ No path of a request is ever a path on the disk, and nothing can be written.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -13,15 +14,24 @@ from tvsbayes.files.disk import read_bytes, shipped_data
 from tvsbayes.files.images import IMAGE_BYTES_MAX
 from tvsbayes.instrument.campaign import CAMERAS, frame_name
 
+HTML, CSS, SCRIPT = ("text/html; charset=utf-8", "text/css; charset=utf-8", "text/javascript; charset=utf-8")
+SHARED_FILES = {"/page.css": ("page.css", CSS), "/access.js": ("access.js", SCRIPT)}
 PAGE_FILES = {
-    "/": ("page.html", "text/html; charset=utf-8"),
-    "/page.css": ("page.css", "text/css; charset=utf-8"),
-    "/columns.js": ("columns.js", "text/javascript; charset=utf-8"),
-    "/plots.js": ("plots.js", "text/javascript; charset=utf-8"),
-    "/rig.js": ("rig.js", "text/javascript; charset=utf-8"),
-    "/page.js": ("page.js", "text/javascript; charset=utf-8"),
+    "/": ("page.html", HTML),
+    **SHARED_FILES,
+    "/columns.js": ("columns.js", SCRIPT),
+    "/plots.js": ("plots.js", SCRIPT),
+    "/rig.js": ("rig.js", SCRIPT),
+    "/page.js": ("page.js", SCRIPT),
 }
-"""Paths of the page, their files in `data/view` and what they are."""
+"""Paths of the page of a campaign, their files in `data/view` and what they are."""
+LIVE_FILES = {
+    "/": ("live.html", HTML),
+    **SHARED_FILES,
+    "/live.css": ("live.css", CSS),
+    "/live.js": ("live.js", SCRIPT),
+}
+"""The same of the page of a run."""
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 
 
@@ -36,9 +46,9 @@ class Contents:
         pictures: looks by campaign whose pictures may be asked for.
     """
 
-    document: bytes
-    folders: tuple[Path, ...]
-    pictures: tuple[frozenset[int], ...]
+    document: bytes = b"{}"
+    folders: tuple[Path, ...] = ()
+    pictures: tuple[frozenset[int], ...] = ()
     files: dict[str, tuple[bytes, str]] = field(default_factory=dict)
 
     def picture(self, campaign: int, spot: int, camera: str) -> bytes | None:
@@ -53,8 +63,11 @@ class Contents:
         return content if content.startswith(PNG_SIGNATURE) else None
 
 
-def page_files() -> dict[str, tuple[bytes, str]]:
-    """The page and Plotly's script, by path.
+def page_files(names: Mapping[str, tuple[str, str]] = PAGE_FILES) -> dict[str, tuple[bytes, str]]:
+    """A page and Plotly's script, by path.
+
+    Args:
+        names: files in `data/view` and what they are, by path.
 
     Raises:
         InputError: without the extra.
@@ -64,8 +77,8 @@ def page_files() -> dict[str, tuple[bytes, str]]:
         from plotly.offline import get_plotlyjs
     except ImportError as error:
         raise InputError(
-            "no-view", "view needs the extra view (plotly, tornado)", remedy="pip install 'tvsbayes[view]'"
+            "no-view", "the page needs the extra view (plotly, tornado)", remedy="pip install 'tvsbayes[view]'"
         ) from error
     folder = shipped_data() / "view"
-    files = {path: ((folder / name).read_bytes(), kind) for path, (name, kind) in PAGE_FILES.items()}
-    return {**files, "/plotly.js": (get_plotlyjs().encode(), "text/javascript; charset=utf-8")}
+    files = {path: ((folder / name).read_bytes(), kind) for path, (name, kind) in names.items()}
+    return {**files, "/plotly.js": (get_plotlyjs().encode(), SCRIPT)}

@@ -8,43 +8,11 @@ from typing import Any
 from tornado import web
 
 from tvsbayes.instrument.campaign import CAMERAS
-from tvsbayes.view.access import SECURITY_HEADERS, Access
+from tvsbayes.view.access import Access
 from tvsbayes.view.contents import Contents
-
-
-class Guarded(web.RequestHandler):
-    """What all answers share.
-
-    Attributes:
-        access: who may ask.
-        contents: what is served.
-        open_to_all: whether the page's own browser is answered without the key.
-    """
-
-    open_to_all = False
-
-    def initialize(self, access: Access, contents: Contents) -> None:
-        """Called by Tornado for every request."""
-        self.access, self.contents = access, contents
-
-    def set_default_headers(self) -> None:
-        """Those of `SECURITY_HEADERS`, and nothing of the server's make."""
-        self.clear_header("Server")
-        for name, value in SECURITY_HEADERS.items():
-            self.set_header(name, value)
-
-    def prepare(self) -> None:
-        """Refuse strangers before anything else."""
-        reason = self.access.stranger(self.request.headers)
-        if reason is None and not self.open_to_all and not self.access.knows(self.request.headers):
-            reason = "this browser has no key: open the link that the terminal shows"
-        if reason is not None:
-            raise web.HTTPError(403, reason=reason)
-
-    def write_error(self, status_code: int, **kwargs: Any) -> None:
-        """In words, without a traceback."""
-        self.set_header("Content-Type", "text/plain; charset=utf-8")
-        self.finish(f"{status_code}: {self._reason}\n")
+from tvsbayes.view.guard import Guarded
+from tvsbayes.view.live_handlers import live_routes
+from tvsbayes.view.watched import Watched
 
 
 class Unknown(Guarded):
@@ -106,12 +74,16 @@ class Picture(Guarded):
         self.finish(found)
 
 
-def application(contents: Contents, access: Access) -> web.Application:
-    """All of them by path."""
-    given = {"access": access, "contents": contents}
+def application(contents: Contents, access: Access, live: Watched | None = None) -> web.Application:
+    """All of them by path; those of a run where there is one, else those of campaigns."""
+    given: dict[str, Any] = {"access": access, "contents": contents}
     routes: list[Any] = [(path.replace(".", r"\."), File, given) for path in contents.files]
-    pictures = rf"/picture/([0-9]{{1,2}})/([0-9]{{1,10}})/({'|'.join(CAMERAS)})"
-    routes += [("/key", Key, given), ("/scene", Document, given), (pictures, Picture, given)]
+    routes.append(("/key", Key, given))
+    if live is None:
+        pictures = rf"/picture/([0-9]{{1,2}})/([0-9]{{1,10}})/({'|'.join(CAMERAS)})"
+        routes += [("/scene", Document, given), (pictures, Picture, given)]
+    else:
+        routes += live_routes(given | {"live": live})
     return web.Application(
         routes, default_handler_class=Unknown, default_handler_args=given, log_function=lambda handler: None
     )

@@ -9,6 +9,7 @@ from collections.abc import Callable
 from tvsbayes.errors import InputError
 from tvsbayes.view.access import HOSTS, Access
 from tvsbayes.view.contents import Contents
+from tvsbayes.view.watched import Watched
 
 REQUEST_BYTES_MAX = 4096
 
@@ -27,8 +28,8 @@ def serve(contents: Contents, port: int, started: Callable[[str], None]) -> None
     asyncio.run(serving(contents, port, started))
 
 
-async def serving(contents: Contents, port: int, started: Callable[[str], None]) -> None:
-    """The same in a loop that runs already, until the task is cancelled."""
+async def serving(contents: Contents, port: int, started: Callable[[str], None], live: Watched | None = None) -> None:
+    """The same in a loop that runs already, until the task is cancelled; with a run, its page."""
     from tornado.httpserver import HTTPServer
 
     from tvsbayes.view.handlers import application
@@ -40,8 +41,8 @@ async def serving(contents: Contents, port: int, started: Callable[[str], None])
         found = f"port {port} of this machine cannot be used: {error.strerror or error}"
         raise InputError("port", found, column="--port", allowed=allowed, remedy=remedy) from error
     listening.setblocking(False)
-    access = Access(listening.getsockname()[1])
-    server = HTTPServer(application(contents, access), max_body_size=REQUEST_BYTES_MAX)
+    access = Access(listening.getsockname()[1], watchers=live is not None)
+    server = HTTPServer(application(contents, access, live), max_body_size=REQUEST_BYTES_MAX)
     server.add_sockets([listening])
     try:
         started(access.link)

@@ -1,0 +1,170 @@
+"""What a run publishes: the latest wins, bounded, read or not; and how an estimate that moves is judged."""
+
+from __future__ import annotations
+
+import json
+import tracemalloc
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.bench_runs import Failing, Run, raise_error
+
+from tvsbayes.acquisition.live_run import WHOLE_PX, WINDOW_PX, LiveRun, small_picture
+from tvsbayes.acquisition.live_snapshot import ESTIMATES_MAX, REMARKS_MAX, TRAIL_MAX, SeenLook, temperature
+from tvsbayes.acquisition.observation import Observation, Sighting, TwinObserver
+from tvsbayes.acquisition.running_estimate import Estimate
+from tvsbayes.errors import DeviceFault
+from tvsbayes.files.images import decode_image, png_bytes
+from tvsbayes.instrument.campaign import frame_name
+
+PIXELS = (600.0, 300.25, 500.5, 310.0)
+
+
+def looked(spot: int, side: int = 64) -> SeenLook:
+    png = png_bytes(np.full((side, side), 90, np.uint8))
+    pictures = {frame_name(spot, camera): png for camera in ("left", "right")}
+    return SeenLook(spot, "ok", "d1", PIXELS, (0.1,) * 4, pictures)
+
+
+def test_a_run_tells_where_it_stands(mounted_rig, tmp_path):
+    live = LiveRun()
+    told = []
+
+    class Told(TwinObserver):
+        def observe(self, positioner, spot):
+            told.append(live.told())
+            return super().observe(positioner, spot)
+
+    Run(mounted_rig, tmp_path / "c", observer=lambda i: Told(i, 0.08), live=live).engine.run()
+    assert [one["progress"]["looks"] for one in told] == list(range(8))
+    assert all(one["state"] == "running" and one["simulated"] and one["name"] == "test" for one in told)
+    third, last = told[2], live.told()
+    assert third["progress"]["doing"] == "looking" and third["coming"][0] == "placing d1"
+    assert third["progress"]["seconds_left"] > told[3]["progress"]["seconds_left"] > 0
+    assert third["look"]["spot"] == 1 and third["look"]["pictured"] == [] and len(third["trail"]) == 2
+    assert third["device"]["pan_steps"] == 100 and not third["device"]["laser_on"]
+    assert (last["state"], last["reason"], last["fault"]) == ("ended", "done", None)
+    assert [one["number"] for one in told] == sorted({one["number"] for one in told})
+    assert json.loads(json.dumps(last, allow_nan=False)) == json.loads(json.dumps(last))
+
+
+def test_faults_and_repeated_looks_are_told_in_words(mounted_rig, tmp_path):
+    live = LiveRun()
+
+    class Blind(TwinObserver):
+        def observe(self, positioner, spot):
+            return Observation(Sighting("no-spot"))
+
+    gone = DeviceFault("no-frame", "the left camera delivers nothing", remedy="plug it in")
+
+    class Dies(Blind):
+        def observe(self, positioner, spot):
+            return super().observe(positioner, spot) if spot < 2 else raise_error(gone)
+
+    with pytest.raises(DeviceFault):
+        Run(mounted_rig, tmp_path / "c", observer=lambda i: Dies(i, 0.08), live=live).engine.run()
+    told = live.told()
+    assert told["fault"] == {"code": "no-frame", "message": "the left camera delivers nothing", "remedy": "plug it in"}
+    assert told["remarks"] == tuple(f"look {spot}: no-spot; taken again" for spot in (0, 0, 1, 1))
+    assert told["look"]["status"] == "no-spot" and told["trail"] == []
+
+
+def test_an_error_of_the_program_is_told_too(mounted_rig, tmp_path):
+    live = LiveRun()
+    bug = Run(
+        mounted_rig,
+        tmp_path / "c",
+        observer=lambda i: Failing(i, 2, lambda i: raise_error(ZeroDivisionError())),
+        live=live,
+    )
+    with pytest.raises(ZeroDivisionError):
+        bug.engine.run()
+    assert (live.latest.reason, live.latest.fault.code) == ("crashed", "ZeroDivisionError") and bug.dark()
+
+
+def test_what_nobody_reads_costs_no_memory():
+    """A long run keeps the last look, and bounded tails of the rest."""
+    live = LiveRun()
+    estimate = {"left": 0.06}
+    tracemalloc.start()
+    for spot in range(400):
+        live.looked(looked(spot, side=256))
+        live.remarked(f"look {spot}")
+        live.estimated(Estimate(spot, estimate, estimate))
+    kept, _ = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    now = live.latest
+    assert (len(now.trail), len(now.remarks), len(now.estimates)) == (TRAIL_MAX, REMARKS_MAX, ESTIMATES_MAX)
+    assert now.look.spot == 399 and now.remarks[-1] == "look 399"
+    # Far more than the bounded tails, far less than 400 looks with their pictures.
+    assert kept < 300_000
+
+
+def test_a_reader_keeps_what_it_has_read():
+    live = LiveRun()
+    live.looked(looked(1))
+    before = live.latest
+    live.looked(looked(2))
+    assert before.look.spot == 1 and live.latest.look.spot == 2 and live.latest.number == before.number + 1
+
+
+def test_the_same_estimate_counts_once():
+    live = LiveRun()
+    one = Estimate(12, {"left": 0.06}, {"left": 1e-4})
+    for _ in range(3):
+        live.estimated(one)
+    live.estimated(None)
+    assert live.latest.estimates == (one,)
+
+
+def test_only_the_last_look_has_pictures():
+    live = LiveRun()
+    assert live.picture(1, "left", "whole") is None
+    live.looked(looked(1))
+    assert live.picture(1, "left", "whole").startswith(b"\xff\xd8")
+    for wrong in ((2, "left", "whole"), (1, "middle", "whole"), (1, "left", "raw")):
+        assert live.picture(*wrong) is None
+    live.looked(SeenLook(2, "no-spot", "d1", None, None, looked(2).pictures))
+    assert live.picture(2, "right", "spot") is None and live.picture(2, "right", "whole")
+
+
+def test_pictures_are_small_and_the_window_stands_on_the_spot():
+    image = np.zeros((720, 1280), np.uint8)
+    image[300:303, 700:703] = 250
+    whole = decode_image(small_picture(png_bytes(image), None), "whole")
+    assert whole.shape == (270, WHOLE_PX, 3)
+    window = decode_image(small_picture(png_bytes(image), (701.3, 301.4)), "window")
+    assert window.shape == (WINDOW_PX, WINDOW_PX, 3)
+    row, column = np.argwhere(window[..., 0] > 125).mean(axis=0)
+    assert (row, column) == (WINDOW_PX / 2, WINDOW_PX / 2)
+    corner = decode_image(small_picture(png_bytes(image), (0.0, 719.0)), "corner")
+    assert corner.shape == window.shape
+
+
+def test_pictures_of_twelve_bits_are_shown():
+    image = np.full((40, 40), 4000, np.uint16)
+    assert decode_image(small_picture(png_bytes(image), None), "picture").mean() > 240
+
+
+def test_temperature_of_looks_that_agree_and_of_some_that_do_not():
+    """Means of nested samples: their difference has the variance that was taken away."""
+    generator = np.random.default_rng(4)
+    first, more, sd, n = 20, 30, 2e-4, 4000
+    draws = 0.06 + sd * generator.standard_normal((n, more))
+    heats = []
+    for row in draws:
+        before = Estimate(first, {"left": row[:first].mean()}, {"left": sd / first**0.5})
+        after = Estimate(more, {"left": row.mean()}, {"left": sd / more**0.5})
+        heats.append(temperature([before, after]).moved["left"])
+    # A standard normal: mean and variance of 4000 within four of their standard errors.
+    assert abs(np.mean(heats)) < 4 / n**0.5 and abs(np.var(heats) - 1) < 4 * (2 / n) ** 0.5
+    before = Estimate(20, {"left": 0.06, "up": 0.06}, {"left": 1e-4, "up": 1e-4})
+    after = Estimate(30, {"left": 0.061, "up": 0.06}, {"left": 8e-5, "up": 1.1e-4})
+    knocked = temperature([before, after])
+    assert knocked.moved["left"] == pytest.approx(1e-3 / 6e-5) and knocked.moved["up"] is None
+    assert knocked.rms == knocked.moved["left"]
+    # The sampled posterior of the same looks is no news of theirs, and no measure of another kind of estimate.
+    sampled = replace(after, tier="importance", u_deg_per_step={"left": 7.9e-5, "up": 1e-4})
+    assert temperature([before, after, sampled]) is None and temperature([before]) is temperature([]) is None
+    assert temperature([before, sampled, after]) == knocked

@@ -1,0 +1,186 @@
+"""The page of a run over a real socket: one browser controls, others watch, strangers get nothing; the run goes on."""
+
+from __future__ import annotations
+
+import http.client
+import json
+import threading
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+pytest.importorskip("tornado", reason="the extra view is not installed")
+pytest.importorskip("plotly", reason="the extra view is not installed")
+
+from support.bench_runs import Failing, Run
+
+from tvsbayes.acquisition.live_run import LiveRun
+from tvsbayes.acquisition.live_snapshot import SeenLook
+from tvsbayes.errors import InputError
+from tvsbayes.files.images import png_bytes
+from tvsbayes.instrument.campaign import frame_name, read_campaign
+from tvsbayes.view.access import KEY_HEADER, SECURITY_HEADERS
+from tvsbayes.view.contents import LIVE_FILES, Contents, page_files
+from tvsbayes.view.live_server import LivePage
+
+FILES = Contents(files=page_files(LIVE_FILES))
+
+
+@dataclass(frozen=True)
+class Asker:
+    """A browser without a screen."""
+
+    port: int
+    token: str
+
+    def answer(self, path: str, method: str = "GET", body: object = None, **headers: str):
+        """Status and content."""
+        connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=20)
+        try:
+            sent = None if body is None else body if isinstance(body, bytes) else json.dumps(body).encode()
+            connection.request(method, path, sent, {k.replace("_", "-"): v for k, v in headers.items()})
+            got = connection.getresponse()
+            if got.status != 413:
+                assert {name: got.headers[name] for name in SECURITY_HEADERS} == SECURITY_HEADERS
+            return got.status, got.read()
+        finally:
+            connection.close()
+
+    def key(self) -> dict[str, str]:
+        """The header that the next browser with the link sends."""
+        status, content = self.answer("/key", "POST", {"token": self.token})
+        assert status == 200
+        return {KEY_HEADER: json.loads(content)["key"]}
+
+    def now(self, key: dict[str, str]) -> dict:
+        status, content = self.answer("/live", **key)
+        assert status == 200
+        return json.loads(content)
+
+
+@pytest.fixture
+def live():
+    run = LiveRun()
+    png = png_bytes(np.full((64, 64), 90, np.uint8))
+    pictures = {frame_name(3, camera): png for camera in ("left", "right")}
+    run.looked(SeenLook(3, "ok", "d1", (30.0, 30.0, 31.0, 31.0), (0.1,) * 4, pictures))
+    return run
+
+
+@pytest.fixture
+def asker(live):
+    with LivePage(FILES, live, 0) as page:
+        address, _, token = page.link.partition("/#")
+        yield Asker(int(address.rpartition(":")[2]), token)
+
+
+def test_first_browser_controls_and_others_watch(asker, live):
+    first, second = asker.key(), asker.key()
+    assert first != second and asker.key() == second
+    assert asker.now(first)["controls"] is True and asker.now(second)["controls"] is False
+    status, content = asker.answer("/ask", "POST", {"what": "stop"}, **second)
+    assert status == 403 and b"this browser only watches" in content and live.requests.told() == ()
+    assert asker.answer("/ask", "POST", {"what": "stop"}, **first)[0] == 202
+    for key in (first, second):
+        assert [(r["what"], r["state"]) for r in asker.now(key)["requests"]] == [("stop", "requested")]
+
+
+def test_nobody_without_a_key_sees_or_asks_anything(asker, live):
+    for key in ({}, {KEY_HEADER: "x"}, {KEY_HEADER: asker.token}, {KEY_HEADER: ""}):
+        for path in ("/live", "/live/3/left/whole"):
+            assert asker.answer(path, **key)[0] == 403
+        assert asker.answer("/ask", "POST", {"what": "pause"}, **key)[0] == 403
+    assert asker.answer("/key", "POST", {"token": asker.token + "x"})[0] == 403
+    assert live.requests.told() == ()
+
+
+@pytest.mark.parametrize(
+    "headers", [{"Host": "evil.example"}, {"Origin": "http://evil.example"}, {"Sec_Fetch_Site": "cross-site"}]
+)
+def test_another_page_with_the_key_asks_for_nothing(asker, live, headers):
+    """DNS rebinding, another origin, a form of another site."""
+    key = asker.key()
+    assert asker.answer("/ask", "POST", {"what": "resume"}, **key, **headers)[0] == 403
+    assert asker.answer("/live", **key, **headers)[0] == 403
+    assert live.requests.told() == ()
+
+
+@pytest.mark.parametrize("body", [b"", b"{}", b"[]", b"\xff", b'{"what": 1}', b'{"what": "laser on"}', b'{"what": []}'])
+def test_what_cannot_be_asked_for_is_refused(asker, live, body):
+    assert asker.answer("/ask", "POST", body, **asker.key())[0] == 400
+    assert live.requests.told() == ()
+
+
+def test_requests_are_posted_only(asker, live):
+    key = asker.key()
+    for method in ("GET", "PUT", "DELETE", "OPTIONS"):
+        assert asker.answer("/ask", method, b"" if method == "PUT" else None, **key)[0] == 405
+    assert live.requests.told() == ()
+
+
+@pytest.mark.parametrize(
+    "path",
+    ["/live/3/left/../right", "/live/3/left/raw", "/live/4/left/whole", "/live/../etc/passwd", "/scene", "/page.js"],
+)
+def test_no_path_leads_out_of_the_list(asker, path):
+    key = asker.key()
+    assert asker.answer(path, **key)[0] == 404
+    assert asker.answer("/live/3/left/whole", **key)[1].startswith(b"\xff\xd8")
+
+
+def test_nothing_is_taken_once_the_run_has_ended(asker, live):
+    key = asker.key()
+    live.ended("done")
+    assert asker.answer("/ask", "POST", {"what": "pause"}, **key)[0] == 409
+    assert asker.now(key)["state"] == "ended"
+
+
+def test_files_of_the_page(asker):
+    for path in (*LIVE_FILES, "/plotly.js"):
+        assert asker.answer(path)[0] == 200
+
+
+def test_taken_port_is_called_so(asker, live):
+    with pytest.raises(InputError, match="cannot be used"):
+        with LivePage(FILES, live, asker.port):
+            pass
+
+
+@pytest.mark.usefixtures("ctrl_c_works")
+def test_a_server_that_dies_does_not_disturb_the_run(mounted_rig, tmp_path):
+    live = LiveRun()
+    with LivePage(FILES, live, 0) as page:
+
+        def dies(instrument):
+            page.end()
+            page._thread.join()
+
+        outcome = Run(mounted_rig, tmp_path / "c", observer=lambda i: Failing(i, 3, dies), live=live).engine.run()
+    assert (outcome.reason, outcome.ok) == ("done", 8) and len(read_campaign(tmp_path / "c").spots) == 8
+
+
+@pytest.mark.usefixtures("ctrl_c_works")
+def test_a_reader_that_never_reads_and_one_that_hangs_delay_nothing(mounted_rig, tmp_path):
+    """The server's thread stands still in the middle of an answer as long as the run goes."""
+    live, ended, hanging = LiveRun(), threading.Event(), threading.Event()
+    told = live.told
+
+    def hangs():
+        if threading.current_thread() is not threading.main_thread():
+            hanging.set()
+            ended.wait(60)
+        return told()
+
+    live.told = hangs
+    with LivePage(FILES, live, 0) as page:
+        address, _, token = page.link.partition("/#")
+        asker = Asker(int(address.rpartition(":")[2]), token)
+        reader = threading.Thread(target=asker.now, args=(asker.key(),))
+        reader.start()
+        assert hanging.wait(60)
+        outcome = Run(mounted_rig, tmp_path / "c", live=live).engine.run()
+        assert not ended.is_set()
+        ended.set()
+        reader.join()
+    assert (outcome.reason, outcome.ok) == ("done", 8)
