@@ -8,6 +8,13 @@
  * leave may be defined before this file is included: TVS_LIMIT_PAN_LOW, TVS_LIMIT_PAN_HIGH, and likewise TILT.
  * Errors of the gears (transmission error, change of play) are interpolated in tables over the counters; ask
  * tvs_extrapolated whether the campaign looked there: outside, tvs_error_u_deg tells how little is known.
+ *
+ *     const double wanted[3] = {800.0, 100.0, 20.0};
+ *     struct tvs_steps go;
+ *     if (tvs_steps_for_point(wanted, 1, 1, &go) > 0) {
+ *         move(go.via_pan_steps, go.via_tilt_steps);
+ *         move(go.pan_steps, go.tilt_steps);
+ *     }
  */
 #ifndef TVS_CALIBRATION_H
 #define TVS_CALIBRATION_H

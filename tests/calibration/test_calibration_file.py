@@ -248,7 +248,8 @@ def test_files_that_are_no_archive_are_refused(tmp_path):
         path.write_bytes(content)
         assert refusal(lambda: load_calibration(path)).code == "damaged-results"
     assert refusal(lambda: load_calibration(tmp_path / "none")).exit_code == 2
-    assert refusal(lambda: load_calibration(tmp_path / "none.json")).exit_code == 2
+    error = refusal(lambda: load_calibration(tmp_path / "none.json"))
+    assert error.exit_code == 2 and "run `tvsbayes fit`" in error.remedy
 
 
 def test_an_archive_that_swells_is_refused(tmp_path):

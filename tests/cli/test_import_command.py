@@ -115,6 +115,20 @@ def test_a_log_of_one_axis_goes_to_an_axis_folder(ask, say, tmp_path):
     assert ask("new", out, "--axis")[0] == 0
     code, document = ask("import", log, "--to", out, "--yes")
     assert (code, document["readings"], document["columns"]["value"]["column"]) == (0, 14, "encoder_deg")
+    assert any("campaign.toml says; the column says deg" in text for text in document["assumed"])
     assert ask("check", out)[1]["readings"] == 14
     code, document = ask("import", log, "--to", out, "--yes")
     assert code == 2 and assert_error(document, "occupied")["file"].endswith("moves.csv")
+
+
+@pytest.mark.parametrize(("column", "unit"), [("reading [mm]", "mm"), ("encoder deg", "deg"), ("encoder", "deg")])
+def test_readings_are_reported_in_the_unit_of_their_column(ask, say, tmp_path, column, unit):
+    """A new folder says what the column says; where that says nothing, the template's degrees, and it is told."""
+    log, out = tmp_path / "log.csv", tmp_path / "axis"
+    turns = [*range(0, 40001, 20000), *range(20000, -1, -20000)] * 2
+    log.write_text(f"steps;{column}\n" + "".join(f"{n};{0.0005 * n:.4f}\n" for n in turns))
+    code, document = ask("import", log, "--to", out, "--axis", "--yes")
+    assert code == 0 and ask("check", out)[1]["unit"] == unit
+    said = f"unit: {unit}, as the column says" if column != "encoder" else "campaign.toml says, deg until you change it"
+    assert any(said in text for text in document["assumed"])
+    assert "0, 40000" in say("check", out)[1], "counters are no powers of ten"

@@ -6,6 +6,7 @@ import pytest
 from support.small_results import estimate
 
 from tvsbayes.estimators.four_point import classic
+from tvsbayes.report import figures
 from tvsbayes.report.drawing import WIDTH_IN
 from tvsbayes.report.figures import direction_scatter, intervals, points_3d, trajectories
 
@@ -37,3 +38,10 @@ def test_figures_take_what_the_estimators_return(evidence):
     drawn = [[line.get_xydata().tolist() for line in figure.axes[0].lines] for figure in (whole, parts)]
     assert drawn[0] == drawn[1] and len(drawn[0]) >= 8
     assert len(intervals(evidence.fit.summary).axes[0].lines) < len(drawn[0])
+    with pytest.raises(TypeError, match=r"record\.summary.* not a ClassicResult"):
+        intervals(result)
+
+
+def test_a_prompt_completes_figures_alone():
+    own = [name for name, value in vars(figures).items() if getattr(value, "__module__", "") == figures.__name__]
+    assert dir(figures) == sorted(name for name in own if not name.startswith("_")) and len(dir(figures)) > 10

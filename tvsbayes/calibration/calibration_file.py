@@ -22,7 +22,7 @@ import numpy as np
 from tvsbayes.calibration.gear_table import NO_GEARS, table_of
 from tvsbayes.calibration.optics import ERROR_AT, PLAY_AT
 from tvsbayes.calibration.pointing import INPUT_NAMES, NOISE_NAMES, Calibration
-from tvsbayes.errors import InputError, escaped
+from tvsbayes.errors import InputError, escaped, refusal
 from tvsbayes.files.disk import read_arrays, read_bytes
 from tvsbayes.files.documents import parse_json
 from tvsbayes.instrument.axes import AXES
@@ -251,6 +251,11 @@ def load_calibration(path: Path | str) -> Calibration:
     if path.is_dir():
         inner = path / "results" / "draws.npz"
         path = inner if inner.exists() or not (path / "draws.npz").exists() else path / "draws.npz"
+    if not path.exists():
+        allowed = "a campaign folder with results/, a draws.npz, or the JSON of `steps-for --export json`"
+        remedy = "run `tvsbayes fit` on the campaign first, or correct the path"
+        name = escaped(str(path), 200)
+        raise refusal("missing-file", file=name, found="no such file", allowed=allowed, remedy=remedy)
     if path.suffix == ".json":
         return _from_json(path)
     return read_draws(path)

@@ -18,6 +18,8 @@ if TYPE_CHECKING:
     from tvsbayes.single_axis.foreign_readings import ForeignReadings
 
 NEEDED = ("command", "value")
+UNITS = ("deg", "rad", "mm")
+"""What a column of readings may say of itself."""
 
 
 def import_readings(
@@ -40,7 +42,7 @@ def import_readings(
         return unit_of_name(name) or "s" if field == "time_s" else ""
 
     named = unit_of_name(known.columns["value"])
-    told = f"unit: of readings as campaign.toml says{f'; the column says {named}' if named else ''}"
+    told = _unit_told(to, named)
     lines = table_lines(table, known, AXIS_FIELDS, unit)
     lines += [f"assumed: {text}" for text in (*found.assumed, told)]
     shown = "\n".join([*lines, f"gives: {len(found.moves)} moves, {len(found.readings)} readings"])
@@ -48,7 +50,7 @@ def import_readings(
         typer.echo(shown)
         yes = typer.confirm(f"write this into {escaped(str(to), 200)}?", default=False)
         shown = ""
-    written = _write(to, found) if yes else []
+    written = _write(to, found, named) if yes else []
     document = {**table_document(table, known), "assumed": [*found.assumed, told], "moves": len(found.moves)}
     ok = sum(reading.status == "ok" for reading in found.readings)
     document |= {"readings": len(found.readings), "ok": ok, "campaign": str(to), "files": written}
@@ -56,6 +58,15 @@ def import_readings(
     place = escaped(str(to), 200)
     after = f"\nnext: `unit` and `[axis]` in {place}/campaign.toml, then `tvsbayes check {place}`" * bool(written)
     finish(document, f"{shown}\n{said}{after}".lstrip("\n"), as_json)
+
+
+def _unit_told(to: Path, named: str | None) -> str:
+    """Which unit results will have: a reading in mm must not be reported in degrees."""
+    kept = (to / "campaign.toml").is_file()
+    if named in UNITS and not kept:
+        return f"unit: {named}, as the column says; it goes into campaign.toml"
+    says = f"; the column says {named}" if named else ""
+    return f"unit: of readings as campaign.toml says{'' if kept else ', deg until you change it'}{says}"
 
 
 def _templates() -> dict[str, bytes]:
@@ -76,14 +87,16 @@ def _refuse_filled(to: Path) -> None:
             raise refusal("occupied", file=escaped(str(place), 200), found="rows", allowed=allowed, remedy=remedy)
 
 
-def _write(to: Path, found: ForeignReadings) -> list[str]:
-    """The tables, in a folder with the explained campaign.toml, which comes last."""
+def _write(to: Path, found: ForeignReadings, unit: str | None) -> list[str]:
+    """The tables, in a folder with the explained campaign.toml, which comes last; `unit` as the column says."""
     from tvsbayes.single_axis.axis_campaign import axis_moves_bytes, readings_bytes
 
     contents = {"moves.csv": axis_moves_bytes(found.moves), "readings.csv": readings_bytes(found.readings)}
     if not (to / "campaign.toml").is_file():
         make_folder(to, empty=True)
-        contents["campaign.toml"] = _templates()["campaign.toml"]
+        template = _templates()["campaign.toml"]
+        own = unit if unit in UNITS else "deg"
+        contents["campaign.toml"] = template.replace(b'\nunit = "deg"', f'\nunit = "{own}"'.encode())
     for name, data in contents.items():
         write_atomically(to / name, data)
     return [str(to / name) for name in contents]

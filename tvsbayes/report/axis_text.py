@@ -14,6 +14,8 @@ from tvsbayes.single_axis.held_out_positions import AxisHoldOut
 from tvsbayes.single_axis.next_stops import AxisPlan
 
 DEVIATIONS_SHOWN = 40
+HARDLY = 0.95
+"""Stops that leave more than this share of an uncertainty are not worth their time."""
 WHAT = {
     **{name: key.what for name, key in AXIS_KEYS.items()},
     "stop_sd.forward": "scatter of stops, forward",
@@ -33,7 +35,9 @@ def ratio_table(summary: AxisSummary) -> TableView:
     unit = escaped(summary.unit)
     low, high = summary.range_command
     rows = [_row(f"gears, {side}", of) for side, of in summary.per_command.items()]
-    rows += [_row(f"line from {low:g} to {high:g}, {side}", of) for side, of in summary.effective_per_command.items()]
+    rows += [
+        _row(f"line from {low:.10g} to {high:.10g}, {side}", of) for side, of in summary.effective_per_command.items()
+    ]
     classic = summary.classic
     rows.append(["classic: least-squares line", concise(classic.per_command, classic.u_per_command), ""])
     return TableView(f"{unit} per command, value(u)", ["", "value(u)", "95 % interval"], rows)
@@ -132,8 +136,8 @@ def next_table(plan: AxisPlan, unit: str) -> TableView:
     """Stops to be read next."""
     rows = []
     for stop in plan.next:
-        over = "" if stop.via is None else f"{stop.via:g}"
-        rows.append([f"{stop.command:g}", stop.direction, over, two_digits(stop.u)])
+        over = "" if stop.via is None else f"{stop.via:.10g}"
+        rows.append([f"{stop.command:.10g}", stop.direction, over, two_digits(stop.u)])
     u = f"u of {plan.target} afterwards"
     caption = f"stops to read next, in this order; now u = {two_digits(plan.u_now)} {escaped(unit)}"
     return TableView(caption, ["command", "direction", "go first to", u], rows)
@@ -143,4 +147,7 @@ def axis_plan_text(plan: AxisPlan, unit: str) -> str:
     """What next, in words."""
     if not plan.next:
         return "there is no time for a single stop"
-    return f"{next_table(plan, unit).text()}\n{plan.minutes:.1f} minutes in all"
+    told = f"{next_table(plan, unit).text()}\n{plan.minutes:.1f} minutes in all"
+    if plan.next[-1].u > HARDLY * plan.u_now:
+        told += f"\nthey hardly help: what is left of {plan.target} does not come from too few stops"
+    return told

@@ -75,7 +75,7 @@ def _held_value(value: Any) -> str:
     if isinstance(value, list | tuple):
         return ", ".join(map(_held_value, value)) or "none"
     if isinstance(value, float):
-        return f"{value:.4g}"
+        return f"{value:.10g}" if value == round(value) else f"{value:.4g}"
     return "not known" if value is None else escaped(str(value), 400)
 
 

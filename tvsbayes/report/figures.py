@@ -45,6 +45,16 @@ if TYPE_CHECKING:
     from tvsbayes.results.comparison_record import ComparisonRecord, Gap
     from tvsbayes.results.estimates import Cause, Curves, Estimate, FitSummary, StopResidual
 
+__all__ = [
+    *("causes", "correlations", "coverage", "direction_scatter", "direction_scatters", "error_maps", "gap_terms"),
+    *("intervals", "points_3d", "ratio_curves", "residuals", "setup", "shares", "trajectories"),
+]
+
+
+def __dir__() -> list[str]:
+    """The figures: what a prompt completes after `tvsbayes.plots.`."""
+    return __all__
+
 
 def _measured(campaign: Campaign) -> tuple[list[Spot], np.ndarray]:
     """The usable spots and where the stated cameras see them, shape (n, 3), mm in frame S."""
@@ -236,7 +246,11 @@ def intervals(
         joint: what a fit says (`results.record.summary`, `read_fit(path).summary`), or estimates by direction.
         classic: of the classic estimator; None draws the joint one alone.
     """
-    joint = joint if isinstance(joint, Mapping) else joint.effective
+    if not isinstance(joint, Mapping):
+        if not hasattr(joint, "effective"):
+            told = "takes what a fit says: tvsbayes.calibrate(campaign, sampled=False).record.summary"
+            raise TypeError(f"intervals {told}, or read_fit(path).summary; not a {type(joint).__name__}")
+        joint = joint.effective
     classic = {} if classic is None else classic if isinstance(classic, Mapping) else classic.directions
     told = {d: (x.value, x.interval95) for d, x in joint.items() if x is not None}
     seen = {d: (x.mean_deg_per_step, x.interval95_gum or (x.mean_deg_per_step,) * 2) for d, x in classic.items() if x}
