@@ -14,9 +14,8 @@ export async function keyOf() {
   return sessionStorage.getItem(KEY) ?? "";
 }
 
-/** An answer of the page's own server; with a body it is sent. */
-export async function asked(path, key, body = undefined) {
-  const how = body === undefined ? {} : { method: "POST", body: JSON.stringify(body) };
+/** An answer of the page's own server; `how` as of fetch. */
+export async function asked(path, key, how = {}) {
   const answer = await fetch(path, { ...how, headers: { "X-Tvsbayes-Key": key } });
   if (!answer.ok) throw new Error(await answer.text());
   return answer;

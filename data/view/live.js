@@ -3,6 +3,7 @@
 import { asked, keyOf } from "./access.js";
 
 const POLL_MS = 500;
+const LATE_MS = 3000;
 const GONE_AFTER = 4;
 const WINDOW_PX = 48;
 const COLOURS = { left: "#1f6fb2", right: "#c2410c", up: "#2f8f4e", down: "#8f4bb0" };
@@ -54,13 +55,15 @@ class LivePage {
     for (const button of document.querySelectorAll("#buttons button")) {
       button.addEventListener("click", () => this.ask(button.dataset.what));
     }
-    matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => this.drawHistory(this.told));
+    for (const change of ["(prefers-color-scheme: dark)", "(max-width: 700px)"]) {
+      matchMedia(change).addEventListener("change", () => this.drawHistory(this.told));
+    }
   }
 
   /** Put a request; what became of it is told with the next snapshots. */
   async ask(what) {
     try {
-      await asked("/ask", this.key, { what });
+      await asked("/ask", this.key, { method: "POST", body: JSON.stringify({ what }), signal: AbortSignal.timeout(LATE_MS) });
       await this.refresh();
     } catch (error) {
       by("rights").textContent = `not sent: ${error.message}`;
@@ -68,7 +71,7 @@ class LivePage {
   }
 
   async refresh() {
-    this.told = await (await asked("/live", this.key)).json();
+    this.told = await (await asked("/live", this.key, { signal: AbortSignal.timeout(LATE_MS) })).json();
     await this.show(this.told);
   }
 
@@ -135,13 +138,13 @@ class LivePage {
     by("bar").value = state === "ended" ? Math.max(progress.step, by("bar").value) : progress.step;
     const light = device ? `${device.status} at pan ${device.pan_steps}, tilt ${device.tilt_steps}, laser ${device.laser_on ? "ON" : "off"}` : "not asked yet";
     rows(by("facts"), [], [
-      ["now", state === "paused" ? `paused before or in: ${progress.doing}` : state === "ended" ? "ended" : progress.doing],
+      ["now", state === "paused" ? `paused; begun last: ${progress.doing}` : state === "ended" ? "ended" : progress.doing],
       ["then", state === "ended" ? "" : coming.join(", ") || "the end of the plan"],
       ["step", `${progress.step} of ${progress.steps}`],
       ["look", `${progress.looks} of ${progress.looks_total}; ${progress.refused} refused, ${progress.retries} repeated`],
       ["time left", state === "ended" ? "" : `about ${time(progress.seconds_left)} by [costs] of the rig file`],
       ["device", light],
-    ]);
+    ].filter(([, text]) => text));
   }
 
   showRequests(requests) {
@@ -165,8 +168,8 @@ class LivePage {
     }
     const last = estimates.at(-1);
     const heat = temperature?.rms ?? null;
-    const drift = heat === null ? "" : `. Temperature ${heat.toFixed(1)}: the last looks moved it by so many of the sd that they should move it`
-      + (heat > NOISY ? "; well above 1: drift, lost steps or something knocked?" : "; about 1 is calm");
+    const drift = heat === null ? "" : `. Temperature ${heat.toFixed(1)}: how far the newest looks moved it, in sd of how far they should; `
+      + (heat > NOISY ? "well above 1: drift, lost steps, something knocked?" : "about 1 is calm");
     by("estimate-remark").textContent = `of ${last.looks} looks${wanted}${drift}`;
     if (estimates.length === this.shown.estimates) return;
     this.shown.estimates = estimates.length;
@@ -188,8 +191,8 @@ class LivePage {
     const [ink, line] = ["--ink", "--line"].map((name) => style.getPropertyValue(name).trim());
     const names = Object.keys(told.estimates.at(-1).deg_per_step);
     const axes = Object.fromEntries(names.flatMap((name, k) => [
-      [`yaxis${k ? k + 1 : ""}`, { title: name, gridcolor: line, zeroline: false, tickformat: ".4f", automargin: true }],
-      [`xaxis${k ? k + 1 : ""}`, { title: "looks", gridcolor: line, zeroline: false, rangemode: "tozero" }],
+      [`yaxis${k ? k + 1 : ""}`, { title: { text: name }, gridcolor: line, zeroline: false, tickformat: ".4f", automargin: true }],
+      [`xaxis${k ? k + 1 : ""}`, { title: { text: "looks" }, gridcolor: line, zeroline: false, rangemode: "tozero" }],
     ]));
     const traces = names.map((name, k) => {
       const known = told.estimates.filter((one) => name in one.deg_per_step);
@@ -202,10 +205,10 @@ class LivePage {
     });
     const columns = by("history").clientWidth < 700 ? 1 : Math.min(2, names.length);
     const count = Math.ceil(names.length / columns);
-    by("history").style.height = `${Math.max(240, 190 * count)}px`;
+    by("history").style.height = `${Math.max(260, 210 * count)}px`;
     const layout = {
       ...axes, grid: { rows: count, columns, pattern: "independent" }, showlegend: false,
-      margin: { l: 60, r: 10, t: 10, b: 40 }, paper_bgcolor: "rgba(0,0,0,0)", plot_bgcolor: "rgba(0,0,0,0)", font: { color: ink, size: 11 },
+      margin: { l: 70, r: 10, t: 10, b: 44 }, paper_bgcolor: "rgba(0,0,0,0)", plot_bgcolor: "rgba(0,0,0,0)", font: { color: ink, size: 11 },
     };
     Plotly.react(by("history"), traces, layout, { responsive: true, displayModeBar: false });
   }
@@ -255,7 +258,8 @@ class LivePage {
   /** A picture as an address of this page; null where a newer look has taken its place. */
   async fetched(path) {
     try {
-      const blob = await (await asked(path, this.key)).blob();
+      const blob = await (await asked(path, this.key, { signal: AbortSignal.timeout(LATE_MS) })).blob();
+      if (!blob.size) return null;
       return await new Promise((done) => {
         const reader = new FileReader();
         reader.addEventListener("load", () => done(reader.result));

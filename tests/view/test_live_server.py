@@ -121,12 +121,13 @@ def test_requests_are_posted_only(asker, live):
 
 @pytest.mark.parametrize(
     "path",
-    ["/live/3/left/../right", "/live/3/left/raw", "/live/4/left/whole", "/live/../etc/passwd", "/scene", "/page.js"],
+    ["/live/3/left/../right", "/live/3/left/raw", "/live/3/middle/whole", "/live/../etc/passwd", "/scene", "/page.js"],
 )
 def test_no_path_leads_out_of_the_list(asker, path):
     key = asker.key()
     assert asker.answer(path, **key)[0] == 404
     assert asker.answer("/live/3/left/whole", **key)[1].startswith(b"\xff\xd8")
+    assert asker.answer("/live/4/left/whole", **key) == (204, b"")
 
 
 def test_nothing_is_taken_once_the_run_has_ended(asker, live):

@@ -3,12 +3,8 @@
 from __future__ import annotations
 
 import json
-import shutil
-import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import fields, replace
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from urllib.parse import urlsplit
 
@@ -22,6 +18,7 @@ pytest.importorskip("selenium", reason="selenium is not installed")
 from selenium import webdriver
 from selenium.webdriver.common.by import By
 from selenium.webdriver.support.ui import Select, WebDriverWait
+from support.browsers import CHROMIUM, DRIVER, SECONDS_MAX, Browsed, browser, foreign_page
 from support.served_pages import page_served
 
 from tvsbayes.instrument.campaign import read_campaign, with_pixels
@@ -30,8 +27,6 @@ from tvsbayes.view.document import document
 from tvsbayes.view.gathering import look_at
 from tvsbayes.view.scene import LookColumns, Looked, scene
 
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
-DRIVER = shutil.which("chromedriver")
 pytestmark = [
     pytest.mark.slow,
     pytest.mark.skipif(not (CHROMIUM and DRIVER), reason="needs `apt install chromium chromium-driver`"),
@@ -39,13 +34,6 @@ pytestmark = [
     pytest.mark.filterwarnings("ignore::ResourceWarning"),
 ]
 MANY = 50_000
-SECONDS_MAX = 180
-"""For the page to come to an end with what it was asked; reached only where it hangs."""
-FLAGS = (
-    *("--headless=new", "--no-sandbox", "--disable-dev-shm-usage", "--window-size=1400,1900"),
-    *("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"),
-)
-"""No screen, perhaps root, no graphics card."""
 CLICK = (
     "const [plot, places] = arguments; document.getElementById(plot).emit('plotly_click',"
     " {points: places.map((place) => ({customdata: place}))})"
@@ -56,73 +44,10 @@ LASSO = "const [plot, lassoPoints] = arguments; document.getElementById(plot).em
 PLOTS = ("rig", "pictures", "residuals", "stops", "correlation", "changes")
 
 
-class Browsed:
-    """A browser with one page."""
-
-    def __init__(self, driver: webdriver.Chrome):
-        self.driver = driver
-
-    def until(self, wanted: str):
-        """Wait for a condition in JavaScript; its value."""
-        return WebDriverWait(self.driver, SECONDS_MAX, 0.1).until(lambda d: d.execute_script(f"return {wanted}"))
-
-    def opened(self, link: str) -> str:
-        self.driver.get("about:blank")
-        self.driver.get(link)
-        return self.until("document.body?.dataset.state")
-
-    def one(self, name: str):
-        return self.driver.find_element(By.ID, name)
-
-    def click(self, name: str) -> None:
-        self.driver.execute_script("arguments[0].scrollIntoView({block: 'center'})", self.one(name))
-        self.one(name).click()
-
-    def js(self, code: str, *given):
-        return self.driver.execute_script(code, *given)
-
-    def traces(self, plot: str, name: str) -> list[dict]:
-        """Of a plot, those of one name: how many numbers each has, and whether it is seen."""
-        code = (
-            "return document.getElementById(arguments[0]).data.filter((t) => t.name === arguments[1])"
-            ".map((t) => ({count: t.x.length, visible: t.visible ?? true, first: Array.from(t.x).slice(0, 9)}))"
-        )
-        return self.js(code, plot, name)
-
-    def marks(self, plot: str) -> list[int]:
-        """Of a plane plot, marks on what is selected: left and right."""
-        shapes = self.js("return document.getElementById(arguments[0]).layout.shapes ?? []", plot)
-        marks = {shape["xref"]: shape["path"].count("Z") for shape in shapes if shape["name"] == "chosen"}
-        return [marks.get(axis, 0) for axis in ("x", "x2")]
-
-    def chosen(self) -> int:
-        return int(self.js("return document.body.dataset.chosen"))
-
-    def complaints(self) -> list[str]:
-        return [entry["message"] for entry in self.driver.get_log("browser") if entry["level"] == "SEVERE"]
-
-    def asked(self) -> set[str]:
-        """Hosts of everything that was asked over a network since the last call."""
-        events = [json.loads(entry["message"])["message"] for entry in self.driver.get_log("performance")]
-        urls = [e["params"]["request"]["url"] for e in events if e["method"] == "Network.requestWillBeSent"]
-        return {urlsplit(url).netloc for url in urls if urlsplit(url).scheme in ("http", "https", "ws", "wss")}
-
-
 @pytest.fixture(scope="module")
 def browsed(tmp_path_factory) -> Iterator[Browsed]:
-    options = webdriver.ChromeOptions()
-    options.binary_location = CHROMIUM
-    for flag in FLAGS:
-        options.add_argument(flag)
-    options.set_capability("goog:loggingPrefs", {"browser": "ALL", "performance": "ALL"})
-    saved = tmp_path_factory.mktemp("saved")
-    options.add_experimental_option("prefs", {"download.default_directory": str(saved)})
-    driver = webdriver.Chrome(options=options, service=webdriver.ChromeService(DRIVER))
-    driver.saved = saved
-    try:
-        yield Browsed(driver)
-    finally:
-        driver.quit()
+    with browser(tmp_path_factory.mktemp("saved")) as opened:
+        yield opened
 
 
 def contents_of(looked: Looked, *folders: Path) -> Contents:
@@ -312,29 +237,6 @@ def test_reload_goes_on_and_a_second_browser_is_refused(both, browsed):
         browsed.driver.close()
         browsed.driver.switch_to.window(browsed.driver.window_handles[0])
     browsed.complaints()
-
-
-@contextmanager
-def foreign_page() -> Iterator[str]:
-    """An empty page of another origin."""
-
-    class Page(BaseHTTPRequestHandler):
-        def do_GET(self) -> None:
-            self.send_response(200)
-            self.send_header("Content-Type", "text/html")
-            self.end_headers()
-            self.wfile.write(b"<body data-state=foreign></body>")
-
-        def log_message(self, *args: object) -> None:
-            pass
-
-    server = ThreadingHTTPServer(("127.0.0.1", 0), Page)
-    threading.Thread(target=server.serve_forever).start()
-    try:
-        yield f"http://127.0.0.1:{server.server_port}/"
-    finally:
-        server.shutdown()
-        server.server_close()
 
 
 def test_another_origin_reaches_nothing(both, browsed):

@@ -59,10 +59,13 @@ class LivePicture(OfRun):
     """A picture of the last look."""
 
     def get(self, spot: str, camera: str, kind: str) -> None:
-        """As JPEG."""
+        """As JPEG; nothing where there is none any more."""
         found = self.live.picture(int(spot), camera, kind)
         if found is None:
-            raise web.HTTPError(404, reason="no such picture")
+            # A newer look has taken its place meanwhile: no fault of anybody's.
+            self.set_status(204)
+            self.finish()
+            return
         self.set_header("Content-Type", "image/jpeg")
         self.finish(found)
 

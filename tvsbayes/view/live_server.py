@@ -15,6 +15,8 @@ from tvsbayes.view.watched import Watched
 
 LINGER_S, LINGER_POLL_S = 2.0, 0.05
 """Longest wait at the end for browsers to fetch the last snapshot: they ask twice a second."""
+PICTURES_S = 0.5
+"""For the pictures that they fetch after it."""
 READER_S = 2.0
 """Whoever has not asked for so long has gone."""
 
@@ -97,6 +99,7 @@ class LivePage:
         until = time.monotonic() + LINGER_S
         last = self._live.told()["number"]
         while time.monotonic() < until and self._thread.is_alive():
-            if self._read.number == last or time.monotonic() - self._read.read_s > READER_S:
+            since_s = time.monotonic() - self._read.read_s
+            if since_s > (PICTURES_S if self._read.number == last else READER_S):
                 return
             time.sleep(LINGER_POLL_S)

@@ -49,3 +49,5 @@ async def serving(contents: Contents, port: int, started: Callable[[str], None],
         await asyncio.Event().wait()
     finally:
         server.stop()
+        # A browser that waits on a connection kept open would else wait for ever.
+        await server.close_all_connections()

@@ -1,0 +1,118 @@
+"""Headless Chromium for tests of pages, and a page of another origin."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from urllib.parse import urlsplit
+
+from selenium import webdriver
+from selenium.webdriver.common.by import By
+from selenium.webdriver.support.ui import WebDriverWait
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+DRIVER = shutil.which("chromedriver")
+SECONDS_MAX = 180
+"""For the page to come to an end with what it was asked; reached only where it hangs."""
+FLAGS = (
+    *("--headless=new", "--no-sandbox", "--disable-dev-shm-usage", "--window-size=1400,1900"),
+    *("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"),
+)
+"""No screen, perhaps root, no graphics card."""
+
+
+class Browsed:
+    """A browser with one page."""
+
+    def __init__(self, driver: webdriver.Chrome):
+        self.driver = driver
+
+    def until(self, wanted: str):
+        """Wait for a condition in JavaScript; its value."""
+        return WebDriverWait(self.driver, SECONDS_MAX, 0.1).until(lambda d: d.execute_script(f"return {wanted}"))
+
+    def opened(self, link: str) -> str:
+        self.driver.get("about:blank")
+        self.driver.get(link)
+        return self.until("document.body?.dataset.state")
+
+    def one(self, name: str):
+        return self.driver.find_element(By.ID, name)
+
+    def click(self, name: str) -> None:
+        self.driver.execute_script("arguments[0].scrollIntoView({block: 'center'})", self.one(name))
+        self.one(name).click()
+
+    def js(self, code: str, *given):
+        return self.driver.execute_script(code, *given)
+
+    def traces(self, plot: str, name: str) -> list[dict]:
+        """Of a plot, those of one name: how many numbers each has, and whether it is seen."""
+        code = (
+            "return document.getElementById(arguments[0]).data.filter((t) => t.name === arguments[1])"
+            ".map((t) => ({count: t.x.length, visible: t.visible ?? true, first: Array.from(t.x).slice(0, 9)}))"
+        )
+        return self.js(code, plot, name)
+
+    def marks(self, plot: str) -> list[int]:
+        """Of a plane plot, marks on what is selected: left and right."""
+        shapes = self.js("return document.getElementById(arguments[0]).layout.shapes ?? []", plot)
+        marks = {shape["xref"]: shape["path"].count("Z") for shape in shapes if shape["name"] == "chosen"}
+        return [marks.get(axis, 0) for axis in ("x", "x2")]
+
+    def chosen(self) -> int:
+        return int(self.js("return document.body.dataset.chosen"))
+
+    def complaints(self) -> list[str]:
+        return [entry["message"] for entry in self.driver.get_log("browser") if entry["level"] == "SEVERE"]
+
+    def asked(self) -> set[str]:
+        """Hosts of everything that was asked over a network since the last call."""
+        events = [json.loads(entry["message"])["message"] for entry in self.driver.get_log("performance")]
+        urls = [e["params"]["request"]["url"] for e in events if e["method"] == "Network.requestWillBeSent"]
+        return {urlsplit(url).netloc for url in urls if urlsplit(url).scheme in ("http", "https", "ws", "wss")}
+
+
+@contextmanager
+def browser(saved: Path) -> Iterator[Browsed]:
+    """A browser of its own, which saves files in a folder."""
+    options = webdriver.ChromeOptions()
+    options.binary_location = CHROMIUM
+    for flag in FLAGS:
+        options.add_argument(flag)
+    options.set_capability("goog:loggingPrefs", {"browser": "ALL", "performance": "ALL"})
+    options.add_experimental_option("prefs", {"download.default_directory": str(saved)})
+    driver = webdriver.Chrome(options=options, service=webdriver.ChromeService(DRIVER))
+    driver.saved = saved
+    try:
+        yield Browsed(driver)
+    finally:
+        driver.quit()
+
+
+@contextmanager
+def foreign_page() -> Iterator[str]:
+    """An empty page of another origin."""
+
+    class Page(BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            self.send_response(200)
+            self.send_header("Content-Type", "text/html")
+            self.end_headers()
+            self.wfile.write(b"<body data-state=foreign></body>")
+
+        def log_message(self, *args: object) -> None:
+            pass
+
+    server = ThreadingHTTPServer(("127.0.0.1", 0), Page)
+    threading.Thread(target=server.serve_forever).start()
+    try:
+        yield f"http://127.0.0.1:{server.server_port}/"
+    finally:
+        server.shutdown()
+        server.server_close()

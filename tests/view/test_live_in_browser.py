@@ -1,0 +1,326 @@
+"""The page of a run in headless Chromium: every button, who may press it, faults, a browser that is killed."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from urllib.parse import urlsplit
+
+import numpy as np
+import pytest
+
+pytest.importorskip("tornado", reason="the extra view is not installed")
+pytest.importorskip("plotly", reason="the extra view is not installed")
+pytest.importorskip("selenium", reason="selenium is not installed")
+from support.bench_runs import Run
+from support.browsers import CHROMIUM, DRIVER, SECONDS_MAX, Browsed, browser, foreign_page
+
+from tvsbayes.acquisition.journal import read_journal
+from tvsbayes.acquisition.journal_check import verify
+from tvsbayes.acquisition.live_run import LiveRun
+from tvsbayes.acquisition.observation import Observation, TwinObserver
+from tvsbayes.acquisition.recorder import recorded
+from tvsbayes.acquisition.running_estimate import Estimate, RunningEstimate
+from tvsbayes.errors import DeviceFault
+from tvsbayes.files.images import png_bytes
+from tvsbayes.instrument.campaign import frame_name, read_campaign
+from tvsbayes.view.contents import LIVE_FILES, Contents, page_files
+from tvsbayes.view.live_server import LivePage
+
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(not (CHROMIUM and DRIVER), reason="needs `apt install chromium chromium-driver`"),
+    # Selenium's own sockets to its driver.
+    pytest.mark.filterwarnings("ignore::ResourceWarning"),
+    pytest.mark.usefixtures("ctrl_c_works"),
+]
+ENABLED = "[...document.querySelectorAll('#buttons button')].filter((b) => !b.disabled).map((b) => b.id).join()"
+
+
+class Gated(TwinObserver):
+    """Looks with pictures, each taken when the test lets it: once `look(n)` is called, look n is waited for."""
+
+    def __init__(self, instrument, gate: Gate):
+        super().__init__(instrument, 0.08)
+        self.gate = gate
+
+    def observe(self, positioner, spot):
+        positioner.laser(True)
+        self.gate.reached(spot)
+        seen = super().observe(positioner, spot)
+        u_left, v_left, u_right, v_right = seen.sighting.pixels_px
+        pictures = {}
+        for camera, (u, v) in (("left", (u_left, v_left)), ("right", (u_right, v_right))):
+            image = np.full((720, 1280), 20, np.uint8)
+            image[round(v) - 2 : round(v) + 3, round(u) - 2 : round(u) + 3] = 240
+            pictures[frame_name(spot, camera)] = png_bytes(image)
+        return Observation(seen.sighting, pictures)
+
+
+class Gate:
+    """Where a run waits for the test, with the laser on, before look `at`; then it does what the test says."""
+
+    def __init__(self):
+        self.at = 3
+        self.there, self.go = threading.Event(), threading.Event()
+        self.action: Callable[[], None] = lambda: None
+
+    def reached(self, spot: int) -> None:
+        if spot == self.at:
+            self.at = -1
+            self.there.set()
+            assert self.go.wait(SECONDS_MAX)
+            self.action()
+
+
+class Fitted(RunningEstimate):
+    """Estimates without fits: of a run that calms down."""
+
+    def update(self, looks: int) -> bool:
+        values = {"left": 0.06 + 1e-4 / looks, "right": 0.0601}
+        self.latest = Estimate(looks, values, dict.fromkeys(values, 1e-3 / looks**0.5))
+        return False
+
+
+@dataclass
+class Going:
+    """A run that goes on in a thread, and its page."""
+
+    run: Run
+    live: LiveRun
+    gate: Gate
+    link: str
+    page: LivePage
+    thread: threading.Thread
+    ended: list
+
+    def finish(self) -> object:
+        """Let it go on to its end: its outcome or its error."""
+        self.gate.go.set()
+        self.thread.join(SECONDS_MAX)
+        assert not self.thread.is_alive() and self.run.dark()
+        return self.ended[0]
+
+
+@pytest.fixture
+def going(mounted_rig, tmp_path) -> Iterator[Going]:
+    live, gate, ended = LiveRun(), Gate(), []
+    estimate = Fitted(tmp_path, ("none",), 1e-4, {"left", "right"})
+    run = Run(mounted_rig, tmp_path / "c", observer=lambda i: Gated(i, gate), live=live, estimate=estimate)
+
+    def work():
+        try:
+            ended.append(run.engine.run())
+        except BaseException as error:
+            ended.append(error)
+
+    thread = threading.Thread(target=work)
+    with estimate, LivePage(Contents(files=page_files(LIVE_FILES)), live, 0) as page:
+        thread.start()
+        assert gate.there.wait(SECONDS_MAX)
+        going = Going(run, live, gate, page.link, page, thread, ended)
+        try:
+            yield going
+        finally:
+            live.ask("stop")
+            gate.go.set()
+            thread.join(SECONDS_MAX)
+
+
+@pytest.fixture(scope="module")
+def browsed(tmp_path_factory) -> Iterator[Browsed]:
+    with browser(tmp_path_factory.mktemp("saved")) as opened:
+        yield opened
+
+
+@pytest.fixture(autouse=True)
+def quiet(browsed) -> Iterator[None]:
+    """No page may ask anybody but its own server."""
+    browsed.complaints(), browsed.asked()
+    yield
+    browsed.complaints()
+
+
+def text(browsed: Browsed, name: str) -> str:
+    return browsed.js("return document.getElementById(arguments[0]).textContent", name)
+
+
+def told(browsed: Browsed, name: str, part: str) -> None:
+    browsed.until(f"document.getElementById('{name}').textContent.includes({part!r})")
+
+
+def test_page_shows_the_run_and_asks_nobody_else(going, browsed):
+    assert browsed.opened(going.link) == "running"
+    assert text(browsed, "name") == "test" and "simulated" in text(browsed, "notes")
+    assert "3 of 8" in text(browsed, "facts") and "laser ON" in text(browsed, "facts")
+    assert "min by [costs]" in text(browsed, "facts")
+    browsed.until("document.querySelectorAll('.camera image').length === 4")
+    assert browsed.js("return document.querySelectorAll('#left .trail').length") == 3
+    centre = browsed.js("return Number(document.querySelector('#right .whole .centre').getAttribute('cx'))")
+    assert centre == pytest.approx(going.live.latest.look.pixels_px[2])
+    told(browsed, "estimate-remark", "of 3 looks; wanted: u at most 0.00010 in left, right")
+    assert "Temperature 0." in text(browsed, "estimate-remark") and "u / target" in text(browsed, "estimates")
+    browsed.until("document.querySelectorAll('#history .main-svg').length > 0")
+    assert browsed.complaints() == [] and browsed.asked() == {urlsplit(going.link).netloc}
+
+
+def test_every_button_is_acknowledged_by_the_device(going, browsed, tmp_path):
+    assert browsed.opened(going.link) == "running"
+    browsed.until(f"{ENABLED} === 'pause,stop,laser-off'")
+    browsed.click("laser-off")
+    browsed.until("document.querySelectorAll('#requests td.requested').length === 1")
+    browsed.until(f"{ENABLED} === 'pause,stop'")
+    assert going.run.instrument.mechanics.laser_on, "the look still waits"
+    going.gate.go.set()
+    browsed.until("document.querySelectorAll('#requests td.acknowledged').length === 1")
+    assert not going.run.instrument.mechanics.laser_on
+    browsed.until("document.body.dataset.state === 'paused'")
+    assert "laser off" in text(browsed, "facts")
+    browsed.until(f"{ENABLED} === 'resume,stop,laser-off'")
+    going.gate.go.clear(), going.gate.there.clear()
+    going.gate.at = 5
+    browsed.click("resume")
+    assert going.gate.there.wait(SECONDS_MAX)
+    browsed.until("document.body.dataset.state === 'running'")
+    browsed.click("pause")
+    browsed.until("document.querySelectorAll('#requests td.requested').length === 1")
+    going.gate.go.set()
+    browsed.until("document.body.dataset.state === 'paused'")
+    browsed.click("stop")
+    browsed.until("document.body.dataset.state === 'ended'")
+    browsed.until(f"{ENABLED} === ''")
+    assert "interrupted" in text(browsed, "notes")
+    assert going.finish().reason == "interrupted"
+    asked = [r.data["what"] for r in read_journal(tmp_path / "c").records if r.event == "asked"]
+    assert asked == ["laser off", "resume", "pause", "stop"]
+    assert browsed.complaints() == []
+
+
+def test_second_browser_only_watches_and_says_so(going, browsed):
+    assert browsed.opened(going.link) == "running"
+    browsed.driver.switch_to.new_window("tab")
+    try:
+        assert browsed.opened(going.link) == "running"
+        told(browsed, "rights", "only watches")
+        assert browsed.js(f"return {ENABLED}") == ""
+        # Nor past its own buttons.
+        code = (
+            "const done = arguments[0]; fetch('/ask', {method: 'POST', body: '{\"what\": \"stop\"}', headers:"
+            " {'X-Tvsbayes-Key': sessionStorage.getItem('tvsbayes-key')}}).then((got) => done(got.status))"
+        )
+        assert browsed.driver.execute_async_script(code) == 403
+        for wrong in (going.link + "x", going.link.partition("#")[0] + "#"):
+            browsed.js("sessionStorage.clear()")
+            assert browsed.opened(wrong) == "refused" and "403" in text(browsed, "notes")
+    finally:
+        browsed.driver.close()
+        browsed.driver.switch_to.window(browsed.driver.window_handles[0])
+    browsed.driver.refresh()
+    browsed.until("document.body?.dataset.controls === 'true'")
+    assert going.live.requests.told() == () and going.finish().ok == 8
+
+
+def test_another_origin_asks_for_nothing(going, browsed):
+    """Neither with a plain request, nor with a form, nor by a name that leads here."""
+    tried = """
+      const [own, done] = [arguments[0], arguments[1]];
+      const asks = (path, how) => fetch(own + path, how).then((got) => got.type, () => "refused");
+      const form = document.createElement("form");
+      const frame = document.createElement("iframe");
+      frame.name = "there";
+      document.body.append(frame, form);
+      Object.assign(form, {action: own + "ask", method: "post", enctype: "text/plain", target: "there"});
+      const field = document.createElement("input");
+      Object.assign(field, {name: '{"what": "stop", "x": "', value: '"}'});
+      form.append(field);
+      frame.onload = () => Promise.all([
+        asks("live", {}), asks("ask", {method: "POST", body: '{"what": "stop"}'}),
+        asks("ask", {method: "POST", body: '{"what": "stop"}', headers: {"X-Tvsbayes-Key": "x"}}),
+      ]).then(done);
+      form.submit();
+    """
+    with foreign_page() as foreign:
+        assert browsed.opened(foreign) == "foreign"
+        browsed.driver.set_script_timeout(SECONDS_MAX)
+        own = going.link.partition("#")[0]
+        assert browsed.driver.execute_async_script(tried, own) == ["refused"] * 3
+        browsed.driver.get(own.replace("127.0.0.1", "localhost."))
+        assert "403" in browsed.driver.page_source
+    assert browsed.opened(going.link) == "running"
+    assert going.live.requests.told() == ()
+
+
+def test_browser_that_is_killed_changes_nothing(going, tmp_path_factory, tmp_path):
+    """Its controls are gone with it; the run ends as it would have."""
+    with browser(tmp_path_factory.mktemp("saved")) as doomed:
+        assert doomed.opened(going.link) == "running"
+        doomed.driver.service.process.kill()
+        doomed.driver.service.process.wait()
+    outcome = going.finish()
+    assert (outcome.reason, outcome.ok) == ("done", 8)
+    assert verify(tmp_path / "c").stopped == "done" and len(read_campaign(tmp_path / "c").spots) == 8
+
+
+def test_page_says_when_its_server_is_gone(going, browsed):
+    assert browsed.opened(going.link) == "running"
+    going.page.end()
+    browsed.until("document.body.dataset.state === 'gone'")
+    assert "Ctrl-C" in text(browsed, "notes") and browsed.js(f"return {ENABLED}") == ""
+    assert going.finish().ok == 8
+
+
+def camera_dies(going: Going) -> None:
+    raise DeviceFault("no-frame", "the left camera delivers no picture", remedy="plug it in, then go on with --resume")
+
+
+def device_reboots(going: Going) -> None:
+    going.run.instrument.device.power_on()
+
+
+def disk_is_full(going: Going) -> None:
+    def full(descriptor, data):
+        raise OSError(28, "No space left on device")
+
+    going.run.engine.journal._disk.write = full
+
+
+@pytest.mark.parametrize(
+    ("fault", "words"),
+    [(camera_dies, "delivers no picture"), (device_reboots, "was reset"), (disk_is_full, "No space left")],
+)
+def test_faults_are_shown_in_words_and_lose_nothing(going, browsed, tmp_path, fault, words):
+    assert browsed.opened(going.link) == "running"
+    going.gate.action = lambda: fault(going)
+    assert isinstance(going.finish(), DeviceFault)
+    browsed.until("document.body.dataset.state === 'ended'")
+    assert (
+        browsed.one("fault").is_displayed() and words in text(browsed, "fault") and "--resume" in text(browsed, "fault")
+    )
+    assert not going.run.instrument.mechanics.laser_on
+    held = recorded(read_journal(tmp_path / "c").records)
+    assert [spot.spot for spot in held.spots] == [0, 1, 2] and len(read_campaign(tmp_path / "c").spots) == 3
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("width", [390, 1280])
+def test_nothing_is_cut_off(going, browsed, scheme, width):
+    """On a telephone and a screen, by day and by night: no sideways scrolling, and text that stands out."""
+    metrics = {"width": width, "height": 1200, "deviceScaleFactor": 1, "mobile": False}
+    browsed.driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", metrics)
+    scheme_asked = {"features": [{"name": "prefers-color-scheme", "value": scheme}]}
+    browsed.driver.execute_cdp_cmd("Emulation.setEmulatedMedia", scheme_asked)
+    try:
+        assert browsed.opened(going.link) == "running"
+        browsed.until("document.querySelectorAll('#history .main-svg').length > 0")
+        assert browsed.js("return document.documentElement.scrollWidth") <= width
+        light = (
+            "return arguments[0].map((name) => getComputedStyle(document.querySelector(arguments[1]))[name]"
+            ".match(/\\d+/g).slice(0, 3).reduce((sum, part) => sum + Number(part), 0))"
+        )
+        for place in ("figure", "button:not(:disabled)"):
+            ink, ground = browsed.js(light, ["color", "backgroundColor"], place)
+            assert (ground > 600 > ink + 150) if scheme == "light" else (ink > 350 > ground + 150)
+    finally:
+        browsed.driver.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
+        browsed.driver.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": []})
