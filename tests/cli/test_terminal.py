@@ -33,6 +33,11 @@ def test_a_terminal_gets_sentences_folded_between_words_and_tables_as_they_are(m
     sentence, row = "one sentence of more words than fit", "a row of a table      1.25     2.50"
     assert shown(f"{sentence}\n{row}", Terminal(True)) == f"one sentence of more words\n  than fit\n{row}"
     assert shown(sentence, Terminal(False)) == sentence
+    monkeypatch.setenv("COLUMNS", "40")
+    told = 'fault    port: no such port as this; write port = "..." there'
+    assert shown(told, Terminal(True)) == ('fault    port: no such port as this;\n         write port = "..." there'), (
+        "a sentence behind cells goes on below itself"
+    )
 
 
 def test_a_terminal_gets_verdicts_in_colour_line_by_line(monkeypatch):

@@ -22,6 +22,8 @@ COLOUR_OF = (
 """Colour, and how lines of that colour begin."""
 TABLE = "  "
 """Stands between cells, never between words of a sentence."""
+LAST_CELL_LEAST = 24
+"""Columns that a cell needs to go on below itself."""
 BOLD = ("error:", "verdict:", "next:", "VALIDATION FAILED")
 
 
@@ -39,11 +41,25 @@ def shown(text: str, stream: IO[str]) -> str:
 
 
 def _line(line: str, width: int, colours: bool) -> str:
-    folded = line
-    if len(line) > width and TABLE not in line.strip():
-        lines = textwrap.wrap(line, width, subsequent_indent="  ", break_long_words=False, break_on_hyphens=False)
-        folded = "\n".join(lines)
+    folded = line if len(line) <= width else _folded(line, width)
     colour = next((colour for colour, begins in COLOUR_OF if line.startswith(begins)), None)
     if colour is None or not colours:
         return folded
     return typer.style(folded, fg=colour, bold=line.startswith(BOLD))
+
+
+def _folded(line: str, width: int) -> str:
+    """A sentence goes on below, two columns in; one that is the last cell of a row goes on below that cell."""
+    begins = line.rstrip().rfind(TABLE) + len(TABLE) if TABLE in line.strip() else 0
+    if begins > width - LAST_CELL_LEAST:
+        return line
+    indent = " " * (begins or 2)
+    lines = textwrap.wrap(
+        line[begins:],
+        width,
+        initial_indent=" " * begins,
+        subsequent_indent=indent,
+        break_long_words=False,
+        break_on_hyphens=False,
+    )
+    return line[:begins] + "\n".join(lines)[begins:]
