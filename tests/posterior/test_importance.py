@@ -20,10 +20,11 @@ from tvsbayes.estimators.campaign_arrays import log_constant
 from tvsbayes.estimators.joint_fit import fit
 from tvsbayes.files.disk import shipped_data
 from tvsbayes.posterior import importance
-from tvsbayes.posterior.importance import Pool, empty_pool, importance_run, lacking, reweighted_posterior
+from tvsbayes.posterior.importance import Pool, Weighing, empty_pool, importance_run, lacking
 from tvsbayes.posterior.proposal import Independence, Target, Valued
 from tvsbayes.posterior.sampling import sample
 from tvsbayes.posterior.tables import Tables
+from tvsbayes.posterior.transport import Mapped
 from tvsbayes.statistics.weighted_draws import smoothed_weights, weighted_summary
 
 SEED = 3
@@ -40,7 +41,7 @@ def normal(mean: float, sd: float, dimension: int) -> Independence:
 class Skewed:
     """A target of mass e^1.7: Gumbel's density in the first coordinate, whom the second follows, the rest normal."""
 
-    path = SimpleNamespace(dimension=5, heavy=np.arange(5) == 0, coupled=np.arange(5) >= 3, pairs=())
+    path = SimpleNamespace(mode=np.zeros(5), dimension=5, heavy=np.arange(5) == 0, coupled=np.arange(5) >= 3, pairs=())
     fit = SimpleNamespace(arrays=no_places())
     invalid = 0
 
@@ -52,7 +53,7 @@ class Skewed:
 
     def valued(self, w: np.ndarray, normal: np.ndarray) -> Valued:
         """With errors at no places."""
-        return Valued(self(w), normal)
+        return Valued(self(w), normal, Mapped(w, np.zeros(len(w))))
 
 
 def skewed_pool(rounds: int = 5) -> Pool:
@@ -67,7 +68,7 @@ def test_weights_are_the_target_over_the_mixture_of_all_proposals():
     """By hand, for two proposals of other numbers of draws; by each draw's own proposal alone they are others."""
     one, other = normal(0.0, 1.0, 2), normal(0.8, 1.5, 2)
     w = np.random.default_rng(1).standard_normal((6, 2))
-    pool = Pool(w, np.arange(6.0), np.zeros((6, 0)), (one, other), (2, 4), other)
+    pool = Pool(w, np.arange(6.0), np.zeros((6, 0)), Mapped(w, np.zeros(6)), (one, other), (2, 4), other)
     densities = np.exp([q.log_density(w) for q in (one, other)])
     expected = np.exp(np.arange(6.0)) / (densities[0] * 2 / 6 + densities[1] * 4 / 6)
     np.testing.assert_allclose(np.exp(pool.log_weights), expected, rtol=1e-12)
@@ -119,7 +120,7 @@ def test_the_evidence_of_a_normal_posterior_is_laplaces(normal_fit):
     pool = empty_pool(target)
     for number in range(4):
         pool = pool.extended(target, generator, fitted=number < 3)
-    found = reweighted_posterior(fitted, path, pool, SEED, 0.0).convergence.importance
+    found = Weighing(fitted, path, pool).importance
     free = np.flatnonzero(fitted.free)
     log_volume = 0.5 * np.linalg.slogdet(fitted.covariance[np.ix_(free, free)])[1]
     expected = fitted.log_density + log_volume + log_constant(fitted.campaign)
@@ -222,7 +223,7 @@ def test_a_density_without_values_is_refused(sampled, monkeypatch):
     monkeypatch.setattr(importance, "transport", lambda fit: run.path)
 
     def valued(target, w, normal):
-        return Valued(np.where(np.abs(w).max(axis=1) > 0, -np.inf, 0.0), normal)
+        return Valued(np.where(np.abs(w).max(axis=1) > 0, -np.inf, 0.0), normal, target.path.mapped(w))
 
     monkeypatch.setattr(Target, "valued", valued)
     with pytest.raises(NotConverged, match="not finite"):

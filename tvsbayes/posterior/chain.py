@@ -19,7 +19,7 @@ from tvsbayes.errors import InputError, escaped
 from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.files.disk import read_arrays, write_atomically
 from tvsbayes.instrument.campaign import input_hashes
-from tvsbayes.posterior.importance import ImportanceRun, Pool, reweighted_posterior
+from tvsbayes.posterior.importance import ImportanceRun, Pool, Weighing
 from tvsbayes.posterior.proposal import Independence
 from tvsbayes.posterior.tables import Followers, Tables
 from tvsbayes.posterior.transport import Transport
@@ -84,8 +84,8 @@ def _pool_arrays(pool: Pool) -> dict[str, np.ndarray]:
     }
 
 
-def _pool_of(stored: dict[str, np.ndarray]) -> Pool:
-    """The pool of `_pool_arrays`."""
+def _pool_of(stored: dict[str, np.ndarray], path: Transport) -> Pool:
+    """The pool of `_pool_arrays`, drawn in the coordinates of a path."""
     names = "mean", "sd", "tables", "followers", "origin", "turn"
     parts = zip(*(stored[f"proposal_{name}"] for name in names), strict=True)
     places, coupled = stored["proposal_places"], stored["proposal_coupled"]
@@ -96,10 +96,9 @@ def _pool_of(stored: dict[str, np.ndarray]) -> Pool:
     )
     counts = tuple(stored["pool_counts"].tolist())
     draws = stored["pool_w"], stored["pool_log_target"], stored["pool_place_errors_rad"]
-    pool = Pool(*draws, every[:-1], counts, every[-1], int(stored["pool_invalid"]))
     if len(counts) != len(every) - 1 or {len(each) for each in draws} != {sum(counts)}:
-        raise ValueError(f"{len(pool.w)} weighted draws with parts of other lengths")
-    return pool
+        raise ValueError(f"{len(draws[0])} weighted draws with parts of other lengths")
+    return Pool(*draws, path.mapped(draws[0]), every[:-1], counts, every[-1], int(stored["pool_invalid"]))
 
 
 def write_chain(path: Path, fit: JointFit, start: ImportanceRun, chain: Chain) -> None:
@@ -139,7 +138,7 @@ def stored_chain(path: Path, fit: JointFit, seed: int) -> tuple[ImportanceRun, C
             raise ValueError(f"format {str(stored['format'])[:60]!r}")
         same = str(stored["fingerprint"]) == fingerprint(fit) and int(stored["seed"]) == seed
         route = Transport(**{f.name: stored[f"transport_{f.name}"] for f in fields(Transport)})
-        pool, chain, spent = _pool_of(stored), _chain_of(stored), float(stored["start_seconds"])
+        pool, chain, spent = _pool_of(stored, route), _chain_of(stored), float(stored["start_seconds"])
         if not pool.w.shape[1] == chain.w.shape[2] == len(pool.next_proposal.mean):
             raise ValueError(f"weighted draws of {pool.w.shape[1]} coordinates, walkers of {chain.w.shape[2]}")
     except (KeyError, TypeError, ValueError, IndexError, OverflowError) as error:
@@ -158,7 +157,7 @@ def stored_chain(path: Path, fit: JointFit, seed: int) -> tuple[ImportanceRun, C
             allowed="the chain of the same campaign, options and versions",
             remedy="run without --resume, or restore the inputs and options it was started with",
         )
-    return ImportanceRun(route, pool, reweighted_posterior(fit, route, pool, seed, spent)), chain
+    return ImportanceRun(route, pool, Weighing(fit, route, pool).posterior(seed, spent)), chain
 
 
 def _chain_of(stored: dict[str, np.ndarray]) -> Chain:

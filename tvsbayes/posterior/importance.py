@@ -12,6 +12,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import jax
 import numpy as np
@@ -23,13 +24,21 @@ from tvsbayes.estimators.likelihood import no_draw
 from tvsbayes.instrument.campaign import ordered_spots
 from tvsbayes.instrument.homing import prior_chance
 from tvsbayes.instrument.parameters import NAMES
+from tvsbayes.model.headlines import Derived
 from tvsbayes.posterior.draws import Draws, Posterior, derived_of, headline_names
 from tvsbayes.posterior.proposal import Independence, Target, first_proposal, place_normals
 from tvsbayes.posterior.ridges import transport
-from tvsbayes.posterior.transport import Transport
+from tvsbayes.posterior.transport import Mapped, Transport
 from tvsbayes.progress import Advance, OpenEnded, unshown
 from tvsbayes.results.convergence import Importance, Reweighted, extreme
-from tvsbayes.statistics.weighted_draws import effective_draws, pareto_k, smoothed_weights, weighted_summary
+from tvsbayes.statistics.weighted_draws import (
+    SmoothedWeights,
+    WeightedSummary,
+    effective_draws,
+    pareto_k,
+    smoothed_weights,
+    weighted_summary,
+)
 
 ROUND = 1024
 PILOT_ROUNDS = 2
@@ -58,6 +67,7 @@ class Pool:
         w: draws, shape (n, d), round by round.
         log_target: their log densities as `Target` gives them, shape (n,).
         place_errors_rad: a draw of the errors at places for each, shape (n, e).
+        mapped: where they lie in z.
         proposals: that made them; counts: how many each, in order.
         next_proposal: fitted to all of them.
         invalid: draws whose density has no value.
@@ -66,6 +76,7 @@ class Pool:
     w: np.ndarray
     log_target: np.ndarray
     place_errors_rad: np.ndarray
+    mapped: Mapped
     proposals: tuple[Independence, ...]
     counts: tuple[int, ...]
     next_proposal: Independence
@@ -94,6 +105,7 @@ class Pool:
             np.concatenate([self.w, w]),
             np.concatenate([self.log_target, valued.log_target]),
             np.concatenate([self.place_errors_rad, valued.place_errors_rad]),
+            Mapped.joined([self.mapped, valued.mapped]),
             proposals,
             counts,
             proposal,
@@ -111,8 +123,8 @@ def empty_pool(target: Target, proposal: Independence | None = None) -> Pool:
     path = target.path
     dimension = path.dimension
     first = proposal or first_proposal(target, dimension, path.heavy, path.coupled, path.pairs)
-    errors = no_draw(0, target.fit.arrays)
-    return Pool(np.zeros((0, dimension)), np.zeros(0), errors, (), (), first)
+    errors, nowhere = no_draw(0, target.fit.arrays), Mapped(np.zeros((0, len(path.mode))), np.zeros(0))
+    return Pool(np.zeros((0, dimension)), np.zeros(0), errors, nowhere, (), (), first)
 
 
 def piloted(target: Target, generator: np.random.RandomState) -> Pool:
@@ -139,48 +151,94 @@ def log_evidence(fit: JointFit, path: Transport, log_weights: np.ndarray) -> flo
     return float(integral + volume + fit.log_density + constants + held)
 
 
-def reweighted_posterior(fit: JointFit, path: Transport, pool: Pool, seed: int, seconds: float) -> Posterior:
-    """The draws of a pool with their weights, and whether they may be used."""
-    log_weights = pool.log_weights
-    finite = np.isfinite(log_weights)
-    smoothed = smoothed_weights(log_weights[finite])
-    weights = smoothed.weights
-    found = path.mapped(pool.w[finite])
-    log_density = pool.log_target[finite] + fit.log_density - found.log_jacobian
-    derived = derived_of(fit, found.z[None], pool.place_errors_rad[finite][None])
-    columns = {**Draws(derived), "log_density": log_density}
-    fixed = {NAMES[i] for i in np.flatnonzero(~fit.free)}
-    names = [name for name, column in columns.items() if name not in fixed and np.ptp(column) > 0]
-    every = weighted_summary(np.stack([columns[name] for name in names], axis=1), weights)
-    least = dict(zip(names, every.ess_least.tolist(), strict=True))
-    # Where nothing that a fit is for is left open, everything else stands for it.
-    headlines = [name for name in headline_names(fit) if name in least] or names
-    raw = np.exp(log_weights - np.max(log_weights))
-    kish, tails = effective_draws(raw), {}
-    for name in headlines:
-        deviation = columns[name] - every.mean[names.index(name)]
-        tails[name] = pareto_k(raw[finite] * deviation**2)
-    importance = Importance(
-        accepted=True,
-        missing=(),
-        rounds=len(log_weights) // ROUND,
-        draws=len(log_weights),
-        effective_share=kish / len(log_weights),
-        least_ess=extreme({name: least[name] for name in headlines}, min),
-        pareto_k=smoothed.pareto_k,
-        worst_pareto_k=extreme(tails, max),
-        heaviest_share=float(np.max(weights)),
-        log_evidence=log_evidence(fit, path, log_weights),
-        log_evidence_mcse=float(np.sqrt(max(1 / kish - 1 / len(log_weights), 0.0))),
-        invalid_evaluations=pool.invalid,
-    )
-    missing = lacking(importance)
-    convergence = Reweighted(
-        replace(importance, accepted=not missing, missing=missing),
-        dict(zip(names, every.ess_mean.tolist(), strict=True)),
-        dict(zip(names, every.ess_interval95.min(axis=0).tolist(), strict=True)),
-    )
-    return Posterior(fit, found.z[None], log_density[None], derived, weights[None], convergence, seed, seconds)
+@dataclass(frozen=True)
+class Weighing:
+    """A pool by the weights of its draws: whether they may be used, which a look at the headlines says, and for what.
+
+    Attributes:
+        fit: whose posterior it is.
+        path: in whose coordinates w was drawn.
+        pool: the draws.
+    """
+
+    fit: JointFit
+    path: Transport
+    pool: Pool
+
+    @cached_property
+    def log_weights(self) -> np.ndarray:
+        """Of all draws, shape (n,)."""
+        return self.pool.log_weights
+
+    @cached_property
+    def finite(self) -> np.ndarray:
+        """Draws whose density has a value, shape (n,); only these have weights."""
+        return np.isfinite(self.log_weights)
+
+    @cached_property
+    def smoothed(self) -> SmoothedWeights:
+        """Weights, and their tail index."""
+        return smoothed_weights(self.log_weights[self.finite])
+
+    @cached_property
+    def derived(self) -> Derived:
+        """Parameters and headlines, with the axes of one chain."""
+        drawn = self.pool.mapped.z[self.finite], self.pool.place_errors_rad[self.finite]
+        return derived_of(self.fit, *(each[None] for each in drawn))
+
+    @cached_property
+    def log_density(self) -> np.ndarray:
+        """In z."""
+        density = self.pool.log_target + self.fit.log_density - self.pool.mapped.log_jacobian
+        return density[self.finite]
+
+    @cached_property
+    def columns(self) -> dict[str, np.ndarray]:
+        """Draws of every quantity that is not the same in all of them."""
+        every = {**Draws(self.derived), "log_density": self.log_density}
+        fixed = {NAMES[i] for i in np.flatnonzero(~self.fit.free)}
+        return {name: column for name, column in every.items() if name not in fixed and np.ptp(column) > 0}
+
+    def summary(self, names: Sequence[str]) -> WeightedSummary:
+        """Of the columns of those names."""
+        return weighted_summary(np.stack([self.columns[name] for name in names], axis=1), self.smoothed.weights)
+
+    @cached_property
+    def importance(self) -> Importance:
+        """What the headlines say of the weights."""
+        # Where nothing that a fit is for is left open, everything else stands for it.
+        headlines = [name for name in headline_names(self.fit) if name in self.columns] or list(self.columns)
+        told = self.summary(headlines)
+        raw = np.exp(self.log_weights - np.max(self.log_weights))
+        kish, count = effective_draws(raw), len(self.log_weights)
+        deviations = {name: self.columns[name] - mean for name, mean in zip(headlines, told.mean, strict=True)}
+        found = Importance(
+            accepted=True,
+            missing=(),
+            rounds=count // ROUND,
+            draws=count,
+            effective_share=kish / count,
+            least_ess=extreme(dict(zip(headlines, told.ess_least.tolist(), strict=True)), min),
+            pareto_k=self.smoothed.pareto_k,
+            worst_pareto_k=extreme({name: pareto_k(raw[self.finite] * x**2) for name, x in deviations.items()}, max),
+            heaviest_share=float(np.max(self.smoothed.weights)),
+            log_evidence=log_evidence(self.fit, self.path, self.log_weights),
+            log_evidence_mcse=float(np.sqrt(max(1 / kish - 1 / count, 0.0))),
+            invalid_evaluations=self.pool.invalid,
+        )
+        missing = lacking(found)
+        return replace(found, accepted=not missing, missing=missing)
+
+    def posterior(self, seed: int, seconds: float) -> Posterior:
+        """All of them; `seed` of their generator, `seconds` spent on them."""
+        every = self.summary(list(self.columns))
+        convergence = Reweighted(
+            self.importance,
+            dict(zip(self.columns, every.ess_mean.tolist(), strict=True)),
+            dict(zip(self.columns, every.ess_interval95.min(axis=0).tolist(), strict=True)),
+        )
+        z, weights = self.pool.mapped.z[self.finite][None], self.smoothed.weights[None]
+        return Posterior(self.fit, z, self.log_density[None], self.derived, weights, convergence, seed, seconds)
 
 
 def lacking(found: Importance) -> tuple[str, ...]:
@@ -246,10 +304,10 @@ def importance_run(fit: JointFit, seed: int, advance: Advance = unshown) -> Impo
                 rounds += 1
                 pool = pool.extended(target, generator, fitted=False)
                 advance(MAPPED_SHARE + (1 - MAPPED_SHARE) * drawn.share(rounds, wanted))
-            posterior = reweighted_posterior(fit, path, pool, seed, time.monotonic() - began)
-            ess = posterior.convergence.importance.least_ess.value
-            if rounds >= ROUNDS_MAX or (posterior.converged and ess >= ESS_WANTED):
-                return ImportanceRun(path, pool, posterior)
+            weighed = Weighing(fit, path, pool)
+            ess = weighed.importance.least_ess.value
+            if rounds >= ROUNDS_MAX or (weighed.importance.accepted and ess >= ESS_WANTED):
+                return ImportanceRun(path, pool, weighed.posterior(seed, time.monotonic() - began))
             # Effective draws of few rounds are known badly: never more than half as many again.
             enough = min(np.ceil(rounds * ESS_WANTED / max(ess, 1.0)), np.ceil(1.5 * rounds))
             wanted = min(ROUNDS_MAX, max(rounds + 1, int(enough)))

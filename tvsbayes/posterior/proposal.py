@@ -17,7 +17,7 @@ from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.estimators.likelihood import evaluate, no_draw
 from tvsbayes.model.compiled import in_batches
 from tvsbayes.posterior.tables import LEADER_NODES, NODES, Followers, Tables
-from tvsbayes.posterior.transport import Transport
+from tvsbayes.posterior.transport import Mapped, Transport
 
 HEAVY_DOF = 5.0
 """Of all t distributions but the one of the coupled coordinates."""
@@ -59,10 +59,12 @@ class Valued:
     Attributes:
         log_target: log density of w relative to z's at the mode, -inf where the model has no value, shape (n,).
         place_errors_rad: shape (n, e).
+        mapped: where they lie in z.
     """
 
     log_target: np.ndarray
     place_errors_rad: np.ndarray
+    mapped: Mapped
 
 
 def place_normals(count: int, fit: JointFit, generator: np.random.Generator) -> np.ndarray:
@@ -93,7 +95,7 @@ class Target:
         invalid = np.isnan(value)
         self.invalid += int(invalid.sum())
         log_target = np.where(invalid, -np.inf, value - self.fit.log_density + found.log_jacobian)
-        return Valued(log_target, np.asarray(errors_rad))
+        return Valued(log_target, np.asarray(errors_rad), found)
 
 
 def _log_t(distance2: np.ndarray, dimension: int, dof: float = HEAVY_DOF) -> np.ndarray:

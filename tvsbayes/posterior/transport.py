@@ -9,6 +9,7 @@ that the linearised campaign has at the noise scales of the walker. NumPy outsid
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 
@@ -72,6 +73,11 @@ class Mapped:
 
     z: np.ndarray
     log_jacobian: np.ndarray
+
+    @classmethod
+    def joined(cls, parts: Sequence[Mapped]) -> Mapped:
+        """One after the other."""
+        return cls(*(np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(cls)))
 
 
 @dataclass(frozen=True)
@@ -269,8 +275,7 @@ class Transport:
 
     def mapped(self, w: np.ndarray) -> Mapped:
         """From w (n, d) to z with the Jacobian; noise coordinates are the same in w and y, the shear keeps volumes."""
-        blocks = [self._mapped(block) for block in np.split(w, range(BLOCK_ROWS, len(w), BLOCK_ROWS))]
-        return Mapped(*(np.concatenate([getattr(b, f.name) for b in blocks]) for f in fields(Mapped)))
+        return Mapped.joined([self._mapped(block) for block in np.split(w, range(BLOCK_ROWS, len(w), BLOCK_ROWS))])
 
     def _mapped(self, w: np.ndarray) -> Mapped:
         count = len(self.noise)
