@@ -121,6 +121,8 @@ def test_a_pause_without_a_page_ends_with_ctrl_c_only(mounted_rig, tmp_path):
 
     live.requests.wait = waited
     assert run.engine.run().reason == "interrupted" and live.requests.waits == 5 and run.dark()
+    events = [record.event for record in read_journal(tmp_path / "c").records]
+    assert events[events.index("asked") :] == ["asked", "stop"], "nothing moves"
 
 
 def test_what_cannot_be_carried_out_is_said_to_have_failed(mounted_rig, tmp_path):
