@@ -162,25 +162,12 @@ def parse_moves(data: bytes, file: str = "moves.csv") -> tuple[Move, ...]:
     segments = table.integers("segment", 0, ID_MAX)
     times_s = table.numbers("time_s", -1e12, 1e12)
     table.check_counting("move", moves)
-    for row in range(len(table)):
-        before = segments[row - 1] if row else -1
-        if segments[row] not in ((before, before + 1) if row else (0,)):
-            allowed = f"{before} or {before + 1}" if row else "0"
-            raise table.refuse(row, "segment", "order", allowed, "count segments 0, 1, 2 ... without gaps")
-        if row and times_s[row] < times_s[row - 1]:
-            allowed = f"at least {times_s[row - 1]!r}, the time of the row before"
-            raise table.refuse(row, "time_s", "order", allowed, "list the moves in order of time")
+    table.check_segments(segments, times_s)
     approaches = {}
     for axis, words in SENSES.items():
         column = f"{axis}_approach"
+        table.check_first_words(column, segments, (*words, "unknown"), "state how the axis arrived there")
         approaches[column] = table.columns[column]
-        for row, word in enumerate(approaches[column]):
-            first = row == 0 or segments[row] != segments[row - 1]
-            allowed_words = (*words, "unknown") if first else ("",)
-            if word not in allowed_words:
-                allowed = ", ".join(allowed_words) if first else "an empty cell inside a segment"
-                remedy = "state how the axis arrived there" if first else "leave it empty, or begin a segment"
-                raise table.refuse(row, column, "approach", allowed, remedy)
     pan = table.integers("pan_steps", -COUNTER_MAX, COUNTER_MAX)
     tilt = table.integers("tilt_steps", -COUNTER_MAX, COUNTER_MAX)
     return tuple(map(Move, moves, segments, times_s, pan, tilt, *approaches.values()))

@@ -246,13 +246,12 @@ def intervals(
         joint: what a fit says (`results.record.summary`, `read_fit(path).summary`), or estimates by direction.
         classic: of the classic estimator; None draws the joint one alone.
     """
-    if not isinstance(joint, Mapping):
-        if not hasattr(joint, "effective"):
-            told = "takes what a fit says: tvsbayes.calibrate(campaign, sampled=False).record.summary"
-            raise TypeError(f"intervals {told}, or read_fit(path).summary; not a {type(joint).__name__}")
-        joint = joint.effective
+    ratios: object = getattr(joint, "effective", joint)
+    if not isinstance(ratios, Mapping):
+        takes = "takes what a fit says: tvsbayes.calibrate(campaign, sampled=False).record.summary"
+        raise TypeError(f"intervals {takes}, or read_fit(path).summary; not a {type(joint).__name__}")
     classic = {} if classic is None else classic if isinstance(classic, Mapping) else classic.directions
-    told = {d: (x.value, x.interval95) for d, x in joint.items() if x is not None}
+    told = {d: (x.value, x.interval95) for d, x in ratios.items() if x is not None}
     seen = {d: (x.mean_deg_per_step, x.interval95_gum or (x.mean_deg_per_step,) * 2) for d, x in classic.items() if x}
     with drawing(3.2) as figure:
         axes = figure.add_subplot()

@@ -105,21 +105,9 @@ def parse_axis_moves(data: bytes, file: str = "moves.csv") -> tuple[AxisMove, ..
     times_s = table.numbers("time_s", -1e12, 1e12)
     commands = table.numbers("command", -COMMAND_MAX, COMMAND_MAX)
     table.check_counting("move", moves)
-    approaches = table.columns["approach"]
-    for row, word in enumerate(approaches):
-        before = segments[row - 1] if row else -1
-        if segments[row] not in ((before, before + 1) if row else (0,)):
-            allowed = f"{before} or {before + 1}" if row else "0"
-            raise table.refuse(row, "segment", "order", allowed, "count segments 0, 1, 2 ... without gaps")
-        if row and times_s[row] < times_s[row - 1]:
-            allowed = f"at least {times_s[row - 1]!r}, the time of the row before"
-            raise table.refuse(row, "time_s", "order", allowed, "list the moves in order of time")
-        first = row == 0 or segments[row] != segments[row - 1]
-        if word not in (APPROACHES if first else ("",)):
-            allowed = ", ".join(APPROACHES) if first else "an empty cell inside a segment"
-            remedy = "state how the axis arrived there" if first else "leave it empty, or begin a segment"
-            raise table.refuse(row, "approach", "approach", allowed, remedy)
-    return tuple(map(AxisMove, moves, segments, times_s, commands, approaches))  # type: ignore[arg-type]
+    table.check_segments(segments, times_s)
+    table.check_first_words("approach", segments, APPROACHES, "state how the axis arrived there")
+    return tuple(map(AxisMove, moves, segments, times_s, commands, table.columns["approach"]))  # type: ignore[arg-type]
 
 
 def parse_readings(data: bytes, file: str, moves: int) -> tuple[Reading, ...]:

@@ -134,9 +134,9 @@ FAULTS = (
     ),
     Fault(
         "moves out of order accepted",
-        "instrument/campaign.py",
-        "if row and times_s[row] < times_s[row - 1]:",
-        "if row and times_s[row] < times_s[0]:",
+        "files/csv_table.py",
+        "if row and time_s < times_s[row - 1]:",
+        "if row and time_s < times_s[0]:",
         "shuffled moves make another campaign",
         ("promises/hostile",),
     ),
