@@ -267,11 +267,12 @@ def draw(rows) -> None:
     """Weight of the evidence by campaign, and contrast against backlash of pan."""
     looks = {"lost motion": (BLUE, "o"), "literal": (RED, "^")}
     with rc_context(STYLE):
-        figure = Figure(figsize=(WIDTH_IN, 3.4), layout="constrained")
+        names = [name for name in CAMPAIGNS if any(row["campaign"] == name for row in rows)]
+        figure = Figure(figsize=(WIDTH_IN, 1.4 + 0.4 * len(names)), layout="constrained")
         axes = figure.subplots()
         for kind, (colour, marker) in looks.items():
             places, weights = [], []
-            for k, name in enumerate(CAMPAIGNS):
+            for k, name in enumerate(names):
                 chosen = [r for r in rows if r["campaign"] == name and r["kind"] == kind]
                 for w in filter(lambda w: w is not None, map(weight_log10, chosen)):
                     places.append(k + (0.12 if kind == "literal" else -0.12))
@@ -279,7 +280,7 @@ def draw(rows) -> None:
             label = f"true: {'gears with play' if kind == 'lost motion' else 'literal ratios'}"
             axes.plot(weights, places, marker, color=colour, markersize=5, alpha=0.7, label=label)
         axes.axvline(0.0, color=BLACK, linewidth=0.8)
-        axes.set(yticks=range(len(CAMPAIGNS)), yticklabels=CAMPAIGNS, ylim=(len(CAMPAIGNS) - 0.5, -0.5))
+        axes.set(yticks=range(len(names)), yticklabels=names, ylim=(len(names) - 0.5, -0.5))
         axes.set_xlabel("log10 Bayes factor: literal ratios < 0 < play")
         figure.legend(loc="outside lower center", ncols=2)
         figure.savefig(FIGURE, dpi=130)
