@@ -52,7 +52,8 @@ def test_pause_and_resume_lose_nothing(mounted_rig, tmp_path):
     assert asked(tmp_path / "c") == [("pause", False), ("resume", False)]
     assert states(live) == [("pause", "acknowledged"), ("resume", "acknowledged")]
     assert all("laser off" in request.answer and request.waited_s >= 0 for request in live.requests.told())
-    assert run.dark() and verify(tmp_path / "c").stopped == "done"
+    times = [r.data["time_s"] for r in read_journal(tmp_path / "c").records if "time_s" in r.data]
+    assert times == sorted(times) and run.dark() and verify(tmp_path / "c").stopped == "done"
 
 
 def test_stop_ends_in_good_order_and_the_rest_is_resumed(mounted_rig, tmp_path):

@@ -17,7 +17,7 @@ import numpy as np
 
 from tvsbayes.acquisition.bench import Bench
 from tvsbayes.acquisition.journal import Journal
-from tvsbayes.acquisition.journal_events import Four
+from tvsbayes.acquisition.journal_events import Asked, Four
 from tvsbayes.acquisition.live_control import Control, HeedingPositioner, LightRefused
 from tvsbayes.acquisition.live_run import LiveRun
 from tvsbayes.acquisition.live_snapshot import COMING_MAX, PAUSED, REMARKS_MAX, RUNNING, SeenLook
@@ -102,7 +102,7 @@ class Acquisition:
         self._retries, self._check_depth, self._placement = 0, False, -1
         self._log = RunLog(journal, rig, bench.utc)
         self._live = live or LiveRun()
-        self._control = Control(self._live.requests, bench.positioner, self._stop, self._log.write, self._publish)
+        self._control = Control(self._live.requests, bench.positioner, self._stop, self._write_asked, self._publish)
         self.bench = replace(bench, positioner=HeedingPositioner(bench.positioner, self._control))
         self._spot = self._log.next_spot()
 
@@ -398,6 +398,9 @@ class Acquisition:
         self._live.estimated(latest)
         self._live.publish(progress=progress, coming=tuple(map(_doing, left[1 : 1 + COMING_MAX])))
         self._publish()
+
+    def _write_asked(self, asked: Asked) -> None:
+        self._log.write("asked", time_s=self._log.now_s(), **asked)
 
     def _begin_live(self) -> None:
         """What does not change while the run goes on."""

@@ -148,9 +148,10 @@ class AskedDevice(TypedDict):
 class Asked(TypedDict):
     """What somebody asked of a run while it went on (pause, resume, stop, laser off), once the device had answered.
 
-    `number` counts the requests of a run from 1.
+    `number` counts the requests of a run from 1; `time_s` since the campaign was created, when the device had answered.
     """
 
+    time_s: NotRequired[float]
     number: int
     what: str
     device: AskedDevice

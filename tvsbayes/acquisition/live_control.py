@@ -16,8 +16,6 @@ from tvsbayes.acquisition.operator import StopKey
 from tvsbayes.positioner.interface import HomeReport, Positioner
 from tvsbayes.positioner.protocol import DeviceState
 
-ASKED = "asked"
-"""The event of the journal."""
 PAUSE_POLL_S = 0.2
 """How often a paused run looks whether Ctrl-C was pressed."""
 
@@ -33,7 +31,7 @@ class Control:
         requests: what is asked for.
         positioner: the device itself.
         stop: the stop key, which a request to stop presses.
-        write: appends an event to the journal.
+        write: appends the event to the journal, with its time.
         changed: told when a pause begins or ends, and after every exchange with the device.
 
     Attributes:
@@ -46,7 +44,7 @@ class Control:
         requests: Requests,
         positioner: Positioner,
         stop: StopKey,
-        write: Callable[..., None],
+        write: Callable[[Asked], None],
         changed: Callable[[], None] = lambda: None,
     ):
         self.paused = False
@@ -89,7 +87,7 @@ class Control:
             self.paused = not resumes
             if request.what == STOP:
                 self._stop.requested = True
-            self._write(ASKED, **asked_entries(request, state))
+            self._write(asked_entries(request, state))
         except BaseException as error:
             self._requests.settle(request, FAILED, str(error) or type(error).__name__)
             raise

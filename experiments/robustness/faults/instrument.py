@@ -345,7 +345,7 @@ FAULTS = (
     Fault(
         "live page: a request is not written down",
         "acquisition/live_control.py",
-        "            self._write(ASKED, **asked_entries(request, state))\n",
+        "            self._write(asked_entries(request, state))\n",
         "",
         "nobody can tell afterwards why the run paused",
         ("acquisition/live_control",),
