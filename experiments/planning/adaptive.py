@@ -216,7 +216,7 @@ def table(arguments: argparse.Namespace) -> None:
         spread, looks = f"{middle:.1f} ({low:.1f} to {high:.1f})", np.median([o["looks"] for o in own])
         print(f"| {name} | {stop} | {len(own)} | {sum(o['met'] for o in own)} | {spread} | {looks:.0f} |")
     print("\nFinal 95 % intervals with the truth in them; in brackets 95 % of the counts. The four directions of a rig")
-    print("are no independent trials, left and right least of all: beside them the rigs on which all four hold (81 % if")
+    print("are no independent trials, left and right least of all: beside them rigs on which all four hold (81 % if")
     print("they were independent, 95 % if they were one).\n")
     print("| plan | ended by | intervals | of directions | of rigs, all four | rms z |\n|" + "---|" * 6)
     for (name, stop), own in groups.items():
