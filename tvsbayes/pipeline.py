@@ -148,7 +148,7 @@ def calibrate(
         NothingToEstimate: too few spots, or nothing is free.
         NotConverged: the fit diverged. One that ended badly is in the results, with their `error`.
     """
-    from tvsbayes.assessment.summary import summarise
+    from tvsbayes.assessment.summary import summarise, worth_sampling
     from tvsbayes.estimators.joint_fit import fit as fit_joint
     from tvsbayes.estimators.joint_fit import fit_stages
 
@@ -158,7 +158,7 @@ def calibrate(
         found = fit_joint(campaign, model=model, seed=seed, progress=job.part(FITTING))
         posterior, files = None, {}
         # A sample of what must not be used anyway would only take time.
-        if sampled and unusable(summarise(found)) is None:
+        if sampled and worth_sampling(found):
             from tvsbayes.posterior.sampling import sample
 
             if place is not None:

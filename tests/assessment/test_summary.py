@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tvsbayes.assessment.summary import CLASSIC_DRAWS, summarise
+from tvsbayes.assessment.summary import CLASSIC_DRAWS, summarise, worth_sampling
 from tvsbayes.estimators.four_point import classic, experiment_rows, four_point_ratios, select_experiments
 from tvsbayes.estimators.joint_fit import fit
 from tvsbayes.instrument.campaign import Campaign
@@ -16,6 +16,7 @@ from tvsbayes.instrument.model_choice import ModelChoice
 from tvsbayes.instrument.parameters import GEAR_ERROR_NAMES, HARMONIC_NAMES, INDEX, NAMES, RECEIVER_NAMES, Prior
 from tvsbayes.instrument.plan import PlanStep
 from tvsbayes.instrument.protocols import four_point_protocol, paper_protocol
+from tvsbayes.pipeline import unusable
 from tvsbayes.report.fit_text import fit_text
 from tvsbayes.results.estimates import CONTRACTION_LIMIT, FitSummary
 from tvsbayes.statistics.intervals import interval95
@@ -79,6 +80,17 @@ def test_contraction_tells_data_from_prior(summary):
             name
         )
     assert summary.headline_informed
+
+
+@pytest.mark.parametrize("problem", [None, "it stopped", "nothing was learned"])
+def test_only_a_converged_fit_that_learned_something_is_worth_sampling(fitted, problem):
+    """By the same rule as what is said of the whole summary, which takes much longer to make."""
+    found = fitted
+    if problem == "it stopped":
+        found = replace(found, converged=False, problems=(problem,))
+    elif problem == "nothing was learned":
+        found = replace(found, prior_draws=found.draws)
+    assert worth_sampling(found) == (unusable(summarise(found)) is None) == (problem is None)
 
 
 def test_one_step_count_is_named_as_a_weak_direction(summary):

@@ -236,6 +236,21 @@ def seen_range(fit: JointFit) -> dict[str, tuple[int, int]]:
     return {axis: (min(seen), max(seen)) for axis, seen in steps.items()}
 
 
+def _effective(source: _Source, moved: set[str]) -> dict[str, Estimate | None]:
+    """Effective ratios of the directions that moved."""
+    return {
+        d: source.estimate(f"effective_deg_per_step.{d}", _ratio(k)) if d in moved else None
+        for k, d in enumerate(DIRECTIONS)
+    }
+
+
+def worth_sampling(fit: JointFit) -> bool:
+    """Whether a fit has converged and its data informed any effective ratio."""
+    if not fit.converged:
+        return False
+    return any(e is not None and e.informed for e in _effective(_Source(fit, None), moved_directions(fit)).values())
+
+
 def summarise(fit: JointFit, posterior: Posterior | None = None) -> FitSummary:
     """Put a fit into the contract's terms.
 
@@ -250,10 +265,7 @@ def summarise(fit: JointFit, posterior: Posterior | None = None) -> FitSummary:
     moved = moved_directions(fit)
     usable = posterior if posterior is not None and posterior.converged else None
     source = _Source(fit, usable)
-    effective = {
-        d: source.estimate(f"effective_deg_per_step.{d}", _ratio(k)) if d in moved else None
-        for k, d in enumerate(DIRECTIONS)
-    }
+    effective = _effective(source, moved)
     contrasts: dict[str, Estimate | None] = dict.fromkeys(AXES)
     for k, (axis, pair) in enumerate(SENSES.items()):
         if set(pair) <= moved:
