@@ -115,6 +115,25 @@ def sampled_coverage(rows: list[dict]) -> tuple[str, bool]:
     return "; ".join(parts), well
 
 
+def coverage_with_gears(rows: list[dict]) -> tuple[str, bool]:
+    """The same where gears repeat their errors, with all rigs whose errors were drawn by the priors."""
+    parts, well = [], True
+    for protocol in dict.fromkeys(r["protocol"] for r in rows):
+        every = [r["repeating"] for r in rows if r["world"] == "priors" and r["protocol"] == protocol]
+        good = [found for found in every if found["accepted"]]
+        low, high = binomial_bounds(len(good), LEVEL)
+        shares = {
+            q: float(np.mean([abs(f["headlines"][q]["pit"] - 0.5) <= LEVEL / 2 for f in good])) for q in HEADLINES
+        }
+        worst, best = min(shares, key=shares.get), max(shares, key=shares.get)
+        well &= all(low <= share <= high for share in shares.values())
+        parts.append(
+            f"{protocol}, {len(good)} of {len(every)} rigs: {100 * shares[worst]:.0f} % ({worst}) to "
+            f"{100 * shares[best]:.0f} % ({best}), bounds {100 * low:.0f} to {100 * high:.0f} %"
+        )
+    return "; ".join(parts), well
+
+
 def points_coverage(rows: list[dict]) -> tuple[str, bool]:
     """95 % ellipsoids of located points, inside and outside the campaign's counters."""
     parts, well = [], True
@@ -250,6 +269,12 @@ LINES = (
         "python -m experiments.intervals.posterior_coverage run --n 1000 --cores 0 1",
         "intervals/posterior_coverage.jsonl",
         sampled_coverage,
+    ),
+    Line(
+        "... also where gears repeat their errors",
+        "python -m experiments.gears.repeated_errors run --n 300 --cores 0 1",
+        "gears/repeated_errors.jsonl",
+        coverage_with_gears,
     ),
     Line(
         "Ranks of truths among posterior draws are uniform",

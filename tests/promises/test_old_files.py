@@ -69,7 +69,7 @@ def test_a_comparison_belongs_to_its_fit():
 
 def test_a_chain_is_refused_by_its_format():
     told = refusal(lambda: stored_chain(OLD / "chain.npz", None, 1))
-    assert "tvsbayes-chain/4" in told.message and "run without --resume" in told.remedy
+    assert "another version of tvsbayes: tvsbayes-chain/4" in told.message and "run without --resume" in told.remedy
 
 
 def test_an_interrupted_run_goes_on(tmp_path, say):

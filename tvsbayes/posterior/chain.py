@@ -24,7 +24,8 @@ from tvsbayes.posterior.proposal import Independence
 from tvsbayes.posterior.tables import Followers, Tables
 from tvsbayes.posterior.transport import Transport
 
-CHAIN_FORMAT = "tvsbayes-chain/6"
+CHAIN_KIND = "tvsbayes-chain/"
+CHAIN_FORMAT = f"{CHAIN_KIND}6"
 CHAIN_BYTES_MAX = 2**32
 """A chain is the user's own file: what was in memory when it was written fits there again."""
 
@@ -134,8 +135,17 @@ def stored_chain(path: Path, fit: JointFit, seed: int) -> tuple[ImportanceRun, C
         raise InputError("no-chain", f"{name}: there is no chain to resume", file=name, remedy="run without --resume")
     try:
         stored = read_arrays(path, CHAIN_BYTES_MAX, CHAIN_BYTES_MAX)
-        if str(stored["format"]) != CHAIN_FORMAT:
-            raise ValueError(f"format {str(stored['format'])[:60]!r}")
+        found = str(stored["format"])[:60]
+        if found.startswith(CHAIN_KIND) and found != CHAIN_FORMAT:
+            raise InputError(
+                "other-chain",
+                f"{name} was written by another version of tvsbayes: {escaped(found)}",
+                file=name,
+                allowed=f"format {CHAIN_FORMAT}",
+                remedy="run without --resume; the chain starts anew",
+            )
+        if found != CHAIN_FORMAT:
+            raise ValueError(f"format {found!r}")
         same = str(stored["fingerprint"]) == fingerprint(fit) and int(stored["seed"]) == seed
         route = Transport(**{f.name: stored[f"transport_{f.name}"] for f in fields(Transport)})
         pool, chain, spent = _pool_of(stored, route), _chain_of(stored), float(stored["start_seconds"])
