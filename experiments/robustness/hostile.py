@@ -90,7 +90,8 @@ def cases() -> list[Case]:
     """The good folder first: what compiles is in the cache then, and every command must do its work on it."""
     crafted = folders_module().CRAFTED
     commands = sorted({command for one in crafted.values() for command in one.commands})
-    good = [Case("good folder", command, "none", (0, 1, 2, 3, 4)) for command in commands]
+    # `doctor` finds no instrument.
+    good = [Case("good folder", command, "none", (0, 1, 2, 3, 4, 5)) for command in commands]
     return good + [Case(n, c, one.threat, tuple(sorted(one.codes))) for n, one in crafted.items() for c in one.commands]
 
 

@@ -56,7 +56,7 @@ PAYLOADS = (
     "<a href=javascript:alert(1)>x</a>",
     "<!-- <iframe src=//x>",
     "{{ 7*7 }}{% include 'x' %}",
-    "\u2028\u2029]]>&#60;script&#62;",
+    "]]>&#60;script&#62;",
 )
 
 
@@ -362,7 +362,7 @@ def same_frame_again(folder: Path) -> None:
 
 def injected(folder: Path) -> None:
     """Payloads in every text that a report shows."""
-    notes = json.dumps("".join(PAYLOADS).replace("\u2028", "").replace("\u2029", ""))
+    notes = json.dumps("".join(PAYLOADS))
     path = folder / "campaign.toml"
     lines = path.read_text().split("\n")
     kept = [line for line in lines if not line.startswith(("name", "notes"))]
@@ -534,6 +534,9 @@ CRAFTED: dict[str, Crafted] = {
     "csv with a formula": Crafted("CSV, float()", swapped("spots.csv", "d1", "=cmd|' /C calc'!A0"), READ),
     "plan of unknown actions": Crafted("CSV, float()", swapped("plan.csv", "home", "rm -rf"), ("check @/plan.csv",)),
     "markup in every text": Crafted("HTML report", injected, ("check @", "report @ --dcc"), frozenset({0})),
+    "line separators in a text of fit.json": Crafted(
+        "HTML report", fit_with("problems", ["\u2028\u2029"]), ("report @", LOCATE), frozenset({2})
+    ),
     "markup in compare.json": Crafted(
         "HTML report",
         swapped("results/compare.json", '"verdict": "joint"', f'"verdict": {json.dumps(PAYLOADS[0])}'),
