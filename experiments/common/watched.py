@@ -15,7 +15,7 @@ from experiments.common.rows import ROOT
 MEMORY_MAX, CPU_S_MAX = 1e9, 30.0
 """Bytes and seconds of processor that a command on somebody's folder may take."""
 WALL_S_MAX = 600
-EXIT_CODES = {0, 2, 3, 4}
+EXIT_CODES = {0, 2, 3, 4, 5}
 OWN = ("spots.csv", "results")
 """What a command may write inside the campaign's folder."""
 

@@ -535,7 +535,7 @@ CRAFTED: dict[str, Crafted] = {
     "plan of unknown actions": Crafted("CSV, float()", swapped("plan.csv", "home", "rm -rf"), ("check @/plan.csv",)),
     "markup in every text": Crafted("HTML report", injected, ("check @", "report @ --dcc"), frozenset({0})),
     "line separators in a text of fit.json": Crafted(
-        "HTML report", fit_with("problems", ["\u2028\u2029"]), ("report @", LOCATE), frozenset({2})
+        "HTML report", fit_with("problems", ["\u2028\u2029"]), ("report @",), frozenset({2})
     ),
     "markup in compare.json": Crafted(
         "HTML report",
