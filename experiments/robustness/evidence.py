@@ -92,46 +92,45 @@ def joint_coverage(rows: list[dict]) -> tuple[str, bool]:
     return text + (f"; outside the bounds: {', '.join(outside)}" if outside else ""), not outside
 
 
+def protocol_coverage(protocol: str, rigs: int, accepted: list[dict]) -> tuple[str, bool]:
+    """Of the 95 % intervals of the headlines that the accepted of so many rigs learned something about."""
+    low, high = binomial_bounds(len(accepted), LEVEL)
+    entries = {name: [found[name] for found in accepted] for name in HEADLINES}
+    shares = {
+        name: float(np.mean([abs(e["pit"] - 0.5) <= LEVEL / 2 for e in found]))
+        for name, found in entries.items()
+        if np.median([e["contraction"] for e in found]) >= LEAST_CONTRACTION
+    }
+    worst, best = min(shares, key=shares.get), max(shares, key=shares.get)
+    text = f"{protocol}, {len(accepted)} of {rigs} rigs accepted: {100 * shares[worst]:.1f} % ({worst}) to "
+    text += f"{100 * shares[best]:.1f} % ({best}), bounds {100 * low:.0f} to {100 * high:.0f} %"
+    return text, all(low <= share <= high for share in shares.values())
+
+
+def together(parts: list[tuple[str, bool]]) -> tuple[str, bool]:
+    """One figure of several, which holds where all do."""
+    return "; ".join(text for text, _ in parts), all(holds for _, holds in parts)
+
+
 def sampled_coverage(rows: list[dict]) -> tuple[str, bool]:
     """Coverage of the 95 % intervals by importance sampling, protocol by protocol; what was refused is counted."""
-    parts, well = [], True
     chosen = [r for r in rows if r["tier"] == TIERS[0]]
+    parts = []
     for protocol in dict.fromkeys(r["protocol"] for r in chosen):
         every = [r for r in chosen if r["protocol"] == protocol]
-        good = [r for r in every if r["converged"] and r["sampled"]]
-        low, high = binomial_bounds(len(good), LEVEL)
-        entries = {name: [r["posterior"][name] for r in good] for name in HEADLINES}
-        shares = {
-            name: float(np.mean([abs(e["pit"] - 0.5) <= LEVEL / 2 for e in found]))
-            for name, found in entries.items()
-            if np.median([e["contraction"] for e in found]) >= LEAST_CONTRACTION
-        }
-        worst, best = min(shares, key=shares.get), max(shares, key=shares.get)
-        well &= all(low <= share <= high for share in shares.values())
-        parts.append(
-            f"{protocol}, {len(good)} of {len(every)} rigs accepted: {100 * shares[worst]:.1f} % ({worst}) to "
-            f"{100 * shares[best]:.1f} % ({best}), bounds {100 * low:.0f} to {100 * high:.0f} %"
-        )
-    return "; ".join(parts), well
+        good = [r["posterior"] for r in every if r["converged"] and r["sampled"]]
+        parts.append(protocol_coverage(protocol, len(every), good))
+    return together(parts)
 
 
 def coverage_with_gears(rows: list[dict]) -> tuple[str, bool]:
     """The same where gears repeat their errors, with all rigs whose errors were drawn by the priors."""
-    parts, well = [], True
+    parts = []
     for protocol in dict.fromkeys(r["protocol"] for r in rows):
         every = [r["repeating"] for r in rows if r["world"] == "priors" and r["protocol"] == protocol]
-        good = [found for found in every if found["accepted"]]
-        low, high = binomial_bounds(len(good), LEVEL)
-        shares = {
-            q: float(np.mean([abs(f["headlines"][q]["pit"] - 0.5) <= LEVEL / 2 for f in good])) for q in HEADLINES
-        }
-        worst, best = min(shares, key=shares.get), max(shares, key=shares.get)
-        well &= all(low <= share <= high for share in shares.values())
-        parts.append(
-            f"{protocol}, {len(good)} of {len(every)} rigs: {100 * shares[worst]:.0f} % ({worst}) to "
-            f"{100 * shares[best]:.0f} % ({best}), bounds {100 * low:.0f} to {100 * high:.0f} %"
-        )
-    return "; ".join(parts), well
+        good = [found["headlines"] for found in every if found["accepted"]]
+        parts.append(protocol_coverage(protocol, len(every), good))
+    return together(parts)
 
 
 def points_coverage(rows: list[dict]) -> tuple[str, bool]:
