@@ -19,14 +19,16 @@ import os
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
+from tvsbayes.cameras.alternate_lines import AlternateLines
 from tvsbayes.cameras.contour import Rectified, contour_of, epipolar_refused, rectified_pair
-from tvsbayes.cameras.spot_fit import Centre, Located, centre_of, fit_spot, skewness, with_own_noise
+from tvsbayes.cameras.spot_fit import Centre, Located, centre_of, fit_spot, skewness, widened, with_own_noise
 from tvsbayes.cameras.spot_noise import CONTRAST_DEFAULT, SHAPE_SPOTS_MIN, SpotNoise, learn_noise, mean_noise
+from tvsbayes.cameras.spot_overlay import overlay_of
 from tvsbayes.cameras.spot_window import CLIPPED_SHARE_MAX, WIDE_SD_PX, Patch, patch_around
 from tvsbayes.errors import InputError, NothingToEstimate, escaped, refusal
 from tvsbayes.files.disk import make_folder, read_bytes, write_atomically
@@ -55,8 +57,6 @@ PILOTS_MAX = 24
 """Looks from which the weights of the fits are learned; uncertainties are stated from all."""
 LEARNING_ROUNDS = 3
 SKEW_SPOTS_MAX = 1000
-OVERLAY_HALF_PX, OVERLAY_ZOOM = 32, 8
-"""Half the side of the square that an overlay shows, and how many of its pixels show one."""
 
 
 @dataclass(frozen=True)
@@ -72,6 +72,7 @@ class Detection:
         statuses: number of processed rows by status.
         noise: what spots of the left and of the right camera were weighted with.
         median_sd_px: median stated sd of the ok coordinates; None without any.
+        lines: of the left and of the right camera, whether rows or columns were read in two fields that disagree.
     """
 
     campaign: Campaign
@@ -82,6 +83,7 @@ class Detection:
     statuses: dict[str, int]
     noise: dict[str, SpotNoise]
     median_sd_px: float | None
+    lines: dict[str, tuple[AlternateLines, ...]]
 
     def as_json(self) -> dict[str, object]:
         """The document of `tvsbayes detect --json`."""
@@ -98,6 +100,7 @@ class Detection:
             "kept": self.kept,
             "median_sd_px": self.median_sd_px,
             "noise": noise,
+            "alternate_lines": {side: [asdict(one) for one in found] for side, found in self.lines.items()},
         }
 
 
@@ -227,7 +230,8 @@ def detect(
             pairs.append(pair)
             job.at(len(pairs) / len(present), f"{len(pairs)} of {len(present)} looks")
     noise = _relearned(looks.noise, pairs, speckle_contrast) if method == "fit" else looks.noise
-    seen = [(left.under(noise["left"]), right.under(noise["right"])) for left, right in pairs]
+    sides = {side: widened([pair[k].under(noise[side]) for pair in pairs]) for k, side in enumerate(CAMERAS)}
+    seen = list(zip(sides["left"].centres, sides["right"].centres, strict=True))
     spots = _rows(campaign.spots, present, seen, campaign.stereo)
     after = [spots[row] for row in present]
     stated = [sd for s in after if s.status == "ok" for sd in (s.su_left_px, s.su_right_px) if sd is not None]
@@ -240,6 +244,7 @@ def detect(
         statuses=dict(Counter(spot.status for spot in after).most_common()),
         noise=noise,
         median_sd_px=float(np.median(stated)) if stated else None,
+        lines={side: one.lines for side, one in sides.items()},
     )
 
 
@@ -297,7 +302,7 @@ class _Looks:
         pictures = {camera: self.frames.read(spot, camera) for camera in CAMERAS}
         left, right = (self._centre(camera, picture) for camera, picture in pictures.items())
         if self.overlay is not None:
-            views = _overlay(pictures["left"], left), _overlay(pictures["right"], right)
+            views = overlay_of(pictures["left"], left), overlay_of(pictures["right"], right)
             write_atomically(self.overlay / f"{spot.spot:06d}.png", png_bytes(np.hstack(views)))
         return left, right
 
@@ -409,33 +414,3 @@ def _learned(patches: Sequence[Patch], speckle_contrast: float | None) -> SpotNo
             return noise
         noise = learn_noise(np.stack([skewness(*pair) for pair in fits]), speckle_contrast)
     return noise
-
-
-def _overlay(picture: np.ndarray, centre: Centre) -> np.ndarray:
-    """The surroundings of a spot enlarged: outline green, centre red, the reason of a refusal in words (Figure 9)."""
-    import cv2
-
-    if picture.dtype != np.uint8:
-        picture = np.clip(np.rint(picture), 0, 255).astype(np.uint8)
-
-    half, zoom = OVERLAY_HALF_PX, OVERLAY_ZOOM
-    height, width = picture.shape[:2]
-    middle = centre.centre_px
-    if middle is None:
-        outline = centre.outline_px
-        middle = np.array([width, height]) / 2 if outline is None or not len(outline) else outline.mean(axis=0)
-    low = np.clip(np.round(middle).astype(int) - half, 0, np.maximum((width, height) - np.array(2 * half), 0))
-    crop = picture[low[1] : low[1] + 2 * half, low[0] : low[0] + 2 * half]
-    crop = cv2.copyMakeBorder(crop, 0, 2 * half - crop.shape[0], 0, 2 * half - crop.shape[1], cv2.BORDER_CONSTANT)
-    large = cv2.resize(crop, None, fx=zoom, fy=zoom, interpolation=cv2.INTER_NEAREST)
-    if centre.outline_px is not None and len(centre.outline_px):
-        outline = np.round((centre.outline_px - low + 0.5) * zoom).astype(np.int32)
-        cv2.polylines(large, [outline.reshape(-1, 1, 2)], True, (0, 255, 0), 1, cv2.LINE_AA)
-    if centre.centre_px is not None:
-        dot = np.round((centre.centre_px - low + 0.5) * zoom).astype(int)
-        cv2.circle(large, tuple(map(int, dot)), zoom // 2, (0, 0, 255), -1, cv2.LINE_AA)
-    if centre.status != "ok":
-        cv2.putText(
-            large, centre.status, (zoom, 3 * zoom), cv2.FONT_HERSHEY_SIMPLEX, 0.7, (0, 255, 255), 1, cv2.LINE_AA
-        )
-    return large

@@ -12,12 +12,14 @@ green, red, uint8 or float32 DN of deeper ones.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from math import log, pi, sqrt
 
 import numpy as np
 
+from tvsbayes.cameras.alternate_lines import AlternateLines, shift_of_lines, widening
 from tvsbayes.cameras.spot_noise import SpotNoise, pixel_noise, through_demosaicing
 from tvsbayes.cameras.spot_window import CLIPPED_DN, CLIPPED_SHARE_MAX, SHRINK, Patch, patch_around
 from tvsbayes.files.images import in_grey_levels
@@ -65,6 +67,7 @@ class Centre:
         outline_px: (n, 2) outline of the bright area, for pictures; may be empty.
         parts_px2: (3, 2, 2) covariance from the background's noise, per gain and per contrast^2 (`fit`).
         skews: (4, 4) as `skewness` makes them (`fit`).
+        lines_px: (2, 2) as `shift_of_lines` makes them (`fit`).
     """
 
     status: str
@@ -75,6 +78,7 @@ class Centre:
     outline_px: np.ndarray | None = None
     parts_px2: np.ndarray | None = None
     skews: np.ndarray | None = None
+    lines_px: np.ndarray | None = None
 
     @property
     def located(self) -> Located:
@@ -304,8 +308,29 @@ def centre_of(patch: Patch | str, noise: SpotNoise) -> Centre:
     elif np.abs(fitted.centre_px - patch.start_px).max() > 3 * patch.start_sd_px + 2 * SHRINK:
         status = "unfitted"
     parts, skews = _covariance_parts(fitted, patch), skewness(fitted, patch)
+    lines = shift_of_lines(patch, fitted.jacobian, fitted.weights, fitted.residual)
     axes = float(long), float(short)
-    return known(status, fitted.centre_px, axes_px=axes, parts_px2=parts, skews=skews).under(noise)
+    return known(status, fitted.centre_px, axes_px=axes, parts_px2=parts, skews=skews, lines_px=lines).under(noise)
+
+
+@dataclass(frozen=True)
+class Widened:
+    """The centres of one camera, wider where alternate lines disagree, and which lines do."""
+
+    centres: tuple[Centre, ...]
+    lines: tuple[AlternateLines, ...]
+
+
+def widened(centres: Sequence[Centre]) -> Widened:
+    """Centres of one camera, under its noise, with what the disagreement of alternate lines adds."""
+    good = [k for k, one in enumerate(centres) if one.status == "ok" and one.lines_px is not None]
+    shifts = [lines for k in good if (lines := centres[k].lines_px) is not None]
+    more = widening(shifts, [centres[k].located.covariance_px2 for k in good])
+    result = list(centres)
+    if more.found:
+        for k, added in zip(good, more.added_px2, strict=True):
+            result[k] = replace(result[k], covariance_px2=result[k].located.covariance_px2 + added)
+    return Widened(tuple(result), more.found)
 
 
 def _at_border(centre: np.ndarray, reach: np.ndarray | float, size: tuple[int, int]) -> str | None:
@@ -324,4 +349,4 @@ def find_spot(picture: np.ndarray, noise: SpotNoise | None = None) -> Centre:
     patch = patch_around(in_grey_levels(picture))
     if noise is None and not isinstance(patch, str) and patch.wide and patch.clipped_share <= CLIPPED_SHARE_MAX:
         patch, noise = with_own_noise(patch)
-    return centre_of(patch, noise or SpotNoise())
+    return widened([centre_of(patch, noise or SpotNoise())]).centres[0]

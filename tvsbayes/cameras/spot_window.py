@@ -105,9 +105,9 @@ def patch_around(picture: np.ndarray) -> Patch | str:
     # Demosaicing spreads a clipped photosite over its neighbours.
     usable = cv2.dilate(clipped, np.ones((3, 3), np.uint8)) == 0
     return Patch(
-        grey=_blocks(grey, block),
+        grey=block_means(grey, block),
         raw=grey,
-        usable=_blocks(usable.astype(np.float32), block) == 1,
+        usable=block_means(usable.astype(np.float32), block) == 1,
         block=block,
         mono=is_mono(window),
         corner=(int(left), int(top)),
@@ -130,7 +130,7 @@ def _wide_median(wide: np.ndarray) -> np.ndarray:
     return cv2.medianBlur((wide / step).astype(np.uint8), 11).astype(np.float32) * np.float32(step)
 
 
-def _blocks(values: np.ndarray, block: int) -> np.ndarray:
+def block_means(values: np.ndarray, block: int) -> np.ndarray:
     """Means of block x block pixels; what is left over at the far sides is dropped."""
     import cv2
 

@@ -222,7 +222,16 @@ def detection_text(found: Detection) -> str:
         else f"median standard uncertainty of a coordinate {found.median_sd_px:.3f} px; "
     )
     title = f"{found.processed} looks"
-    return f"{TableView(title, ['status', 'looks', 'meaning'], rows).text()}\nmethod {found.method}; {sd}noise: {noise}"
+    table = TableView(title, ["status", "looks", "meaning"], rows).text()
+    lines = [
+        f"{side} camera: odd and even {one.lines} of {one.spots} spot{'s' * (one.spots != 1)} show the beam "
+        f"{one.apart_px:.2g} px apart, more than their noise: an interlaced readout, or a beam that moved or flickered "
+        "while it was read. Their uncertainty is widened by the difference / sqrt(12); read whole frames at once "
+        "(progressive, global shutter), or let the beam come to rest"
+        for side, found_there in found.lines.items()
+        for one in found_there
+    ]
+    return "\n".join([table, f"method {found.method}; {sd}noise: {noise}", *lines])
 
 
 def locations_text(found: Locations) -> str:

@@ -1,0 +1,124 @@
+"""Even and odd rows of a beam: a gain moves nothing, a shift is found, said and stated; good pictures stay the same."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from support.drawn_spots import oval, picture, small_pair
+
+from tvsbayes.cameras.alternate_lines import EXCESS_MIN, widening
+from tvsbayes.cameras.detection import detect
+from tvsbayes.cameras.spot_fit import Centre, centre_of, find_spot, widened
+from tvsbayes.cameras.spot_noise import SpotNoise
+from tvsbayes.cameras.spot_window import patch_around
+from tvsbayes.files.images import in_grey_levels, png_bytes
+from tvsbayes.instrument.campaign import Campaign, Move, Spot, read_campaign, write_campaign
+from tvsbayes.report.command_text import detection_text
+from tvsbayes.twin.spot_pictures import Footprint, Scene
+
+PLACE = np.array([150.3, 110.8])
+GAIN_DN = 0.04
+KNOWN = SpotNoise(GAIN_DN, 0.0)
+
+
+def fields(
+    sd: float, shift_px: float, odd_gain: float, seed: int, *, columns: bool = False, place: np.ndarray = PLACE
+) -> np.ndarray:
+    """A monochrome picture (240, 320, 3) of a beam of 150 DN; on odd lines it has moved down and to the right."""
+    rng = np.random.default_rng(seed)
+    v, u = np.indices((240, 320))
+    odd = (u if columns else v) % 2
+    x, y = u - place[0] - odd * shift_px / 2, v - place[1] - odd * shift_px
+    light = 150 * np.exp(-(x * x + y * y) / 2 / sd**2) * (1 + odd * odd_gain)
+    grey = 10 + light + rng.normal(0, np.sqrt(1 + GAIN_DN * light))
+    return np.repeat(np.clip(np.rint(grey), 0, 255).astype(np.uint8)[..., None], 3, axis=2)
+
+
+@pytest.mark.parametrize("sd", [3.0, 14.0])
+@pytest.mark.parametrize("columns", [False, True])
+def test_a_shift_is_measured_and_stated(sd, columns):
+    """As pixels are (3 px) and in blocks of three (14 px): 0.5 px along v and half of it along u."""
+    found = find_spot(fields(sd, 0.5, 0.06, 1, columns=columns), KNOWN)
+    true = np.array([0.25, 0.5])
+    shift = found.lines_px[int(columns)]
+    # The stated uncertainty of the whole without the shift is some 0.01 sd; twice that for the difference, four of it.
+    noise = np.sqrt(np.diag(found.covariance_px2 - np.outer(shift, shift) / 12))
+    assert (np.abs(shift - true) < 8 * noise).all() and (noise < 0.03).all()
+    sds = np.sqrt(np.diag(found.covariance_px2))
+    assert (sds >= np.abs(shift) / np.sqrt(12)).all()
+    # The whole lies between both.
+    assert (np.abs(found.centre_px - PLACE - true / 2) < 5 * noise + 0.03 * true).all()
+
+
+@pytest.mark.parametrize("sd", [3.0, 14.0])
+def test_a_gain_of_the_odd_rows_moves_nothing(sd):
+    """6 %, as in a real camera: no finding, and chi-square of the difference as noise has it."""
+    chi2 = []
+    for seed in range(30):
+        seen = find_spot(fields(sd, 0.0, 0.06, seed), KNOWN)
+        shift = seen.lines_px[0]
+        chi2.append(shift @ np.linalg.solve(4 * seen.covariance_px2, shift))
+    # 60 degrees of freedom: mean 2, its standard uncertainty 0.37; four of them.
+    assert 0.5 < np.mean(chi2) < 3.5
+
+
+def test_good_pictures_stay_as_they_are():
+    """Forty pictures of the twin, half of them with speckle: the same covariance to the bit."""
+    rng = np.random.default_rng(5)
+    for number in range(40):
+        mark = Footprint(PLACE + rng.uniform(-1, 1, 2), oval(rng, 2.5), 200.0)
+        made = picture(mark, scene=Scene(speckle_contrast=0.4 * (number % 2)))
+        noise = SpotNoise(GAIN_DN, 0.4 * (number % 2))
+        without = centre_of(patch_around(in_grey_levels(made)), noise)
+        assert (find_spot(made, noise).covariance_px2 == without.covariance_px2).all()
+
+
+def test_small_differences_that_all_looks_share_are_found_together():
+    """Each within chance alone; forty of mean square 9 are not, forty of 2.25 are left to the noise's own error."""
+    covariances = [np.diag([0.01, 0.04])] * 40
+    rng = np.random.default_rng(7)
+    signs = rng.choice([-1.0, 1.0], (40, 2, 2))
+    for size, expected in ((3.0, 40), (1.5, 0)):
+        shifts = signs * size * 2 * np.array([0.1, 0.2])
+        shifts[:, 1] = 0.0
+        found = widening(list(shifts), covariances)
+        assert [(one.lines, one.spots) for one in found.found] == ([("rows", 40)] if expected else [])
+        if expected:
+            np.testing.assert_allclose(found.added_px2[3], np.outer(shifts[3, 0], shifts[3, 0]) / 12, rtol=1e-12)
+        else:
+            assert not found.added_px2.any()
+    assert 2.25 < EXCESS_MIN < 9
+    assert widened([Centre("no-spot")]).lines == ()
+
+
+def test_one_look_alone_is_widened_alone():
+    shifts = [np.zeros((2, 2))] * 30
+    shifts[4] = np.array([[0.0, 0.0], [2.0, 0.0]])
+    found = widening(shifts, [0.01 * np.eye(2)] * 30)
+    assert [(one.lines, one.spots, one.apart_px) for one in found.found] == [("columns", 1, 2.0)]
+    assert np.flatnonzero(found.added_px2.any(axis=(1, 2))).tolist() == [4]
+
+
+def test_detect_says_which_camera_reads_in_fields(tmp_path):
+    """Six looks; the left camera's odd rows come later, the beam has moved by 0.4 px."""
+    rng = np.random.default_rng(11)
+    spots = [Spot(k, 0, "d1", k // 4, k % 4 + 1, *[None] * 8, 50.0 + k, "undetected") for k in range(6)]
+    moves = (Move(0, 0, 0.0, 0, 0, "left", "up"),)
+    write_campaign(Campaign(moves, tuple(spots), small_pair(), header={"name": "fields"}), tmp_path / "c")
+    (tmp_path / "c" / "frames").mkdir()
+    places = PLACE + rng.uniform(-1, 1, (6, 2))
+    for look, place in enumerate(places):
+        for side, shift in (("left", 0.4), ("right", 0.0)):
+            made = fields(4.0, shift, 0.02, look + 100 * (side == "right"), place=place)
+            (tmp_path / "c" / "frames" / f"{look:06d}_{side}.png").write_bytes(png_bytes(made))
+    found = detect(read_campaign(tmp_path / "c"), workers=1)
+    (left,), right = found.lines["left"], found.lines["right"]
+    assert (left.lines, left.spots, right) == ("rows", 6, ())
+    # 0.4 down, 0.2 to the right.
+    assert left.apart_px == pytest.approx(0.447, abs=0.05)
+    text = detection_text(found)
+    assert "left camera: odd and even rows of 6 spots" in text and "right camera" not in text
+    assert found.as_json()["alternate_lines"] == {
+        "left": [{"lines": "rows", "spots": 6, "apart_px": left.apart_px}],
+        "right": [],
+    }
