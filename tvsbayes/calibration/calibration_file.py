@@ -99,7 +99,7 @@ def calibration_bytes(calibration: Calibration, **more: np.ndarray) -> bytes:
     )
     arrays = {name: getattr(calibration, name) for name in _ARRAYS} | more
     buffer = io.BytesIO()
-    np.savez_compressed(
+    np.savez(
         buffer,
         format=CALIBRATION_FORMAT,
         input_names=np.array(INPUT_NAMES),

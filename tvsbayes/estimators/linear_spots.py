@@ -22,7 +22,8 @@ from tvsbayes.estimators.campaign_arrays import CampaignArrays, padded
 from tvsbayes.estimators.likelihood import FilterRows, filter_rows, place_columns, root_at_places, standing
 from tvsbayes.estimators.look_jacobian import look_jacobian
 from tvsbayes.model.compiled import compiled
-from tvsbayes.model.parameter_space import ParameterSpace
+from tvsbayes.model.geometry import materialise
+from tvsbayes.model.parameter_space import ParameterSpace, model_of
 
 
 class Linearised(eqx.Module):
@@ -89,10 +90,11 @@ def linearise(
         arrays: the campaign.
         inflation: factor on pixel and aperture noise.
     """
-    model = space.model(z)
+    physical = materialise(space.physical(z))
+    model = model_of(physical, space.harmonic_period_deg)
     found = standing(model, arrays, inflation)
     looks, terms = found.looks, found.terms
-    by_coordinates = look_jacobian(z, space, looks, arrays)
+    by_coordinates = look_jacobian(z, physical, space, looks, arrays)
     residuals = terms.range_out.of_many(found.noise.whitened(by_coordinates, arrays.spots))[1:]
     slope = jnp.stack([jnp.stack(terms.by_pan, axis=1), jnp.stack(terms.by_tilt, axis=1)], axis=2)
     root = root_at_places(model, arrays.gears)

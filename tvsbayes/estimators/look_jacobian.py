@@ -40,17 +40,22 @@ IN_ORDER = np.argsort(np.concatenate([GEARS, OPTICS, FRAMES, CAMERAS, RECEIVER, 
 
 
 def look_jacobian(
-    z: Float[Array, " parameters"], space: ParameterSpace, looks: Looks, arrays: CampaignArrays
+    z: Float[Array, " parameters"],
+    physical: Float[Array, " parameters"],
+    space: ParameterSpace,
+    looks: Looks,
+    arrays: CampaignArrays,
 ) -> Numbers:
     """d(predicted)/d(coordinates) at held ranges, shape (parameters, spots) for each of the five components.
 
     Args:
         z: coordinates.
+        physical: the values that they stand for.
         space: priors.
         looks: at these coordinates.
         arrays: the campaign.
     """
-    physical, period_deg = space.physical(z), space.harmonic_period_deg
+    period_deg = space.harmonic_period_deg
 
     def moved(columns: np.ndarray, part: Callable[[Model], PyTree]) -> PyTree:
         """How a part of the model moves with some parameters in the units of their names, columns first."""
@@ -60,7 +65,7 @@ def look_jacobian(
 
         return materialise(jax.vmap(along)(jnp.asarray(np.eye(len(NAMES))[columns])))
 
-    turn = rotation_matrix(space.model(z).extrinsics.rotation_rad)
+    turn = rotation_matrix(model_of(physical, period_deg).extrinsics.rotation_rad)
     angles = moved(GEARS, lambda m: mirror_angles(m.transmission, m.tilt_zero_rad, arrays.moves).angle_rad)
     pan, tilt = (angles[:, arrays.spots.move_index, axis] for axis in range(2))
     ways_p = moved(OPTICS, lambda m: trace(m.optics, looks.pan_rad, looks.tilt_rad)).at(looks.range_mm)
@@ -76,15 +81,11 @@ def look_jacobian(
     blocks = [[by_gears[k], by_optics[k], by_frames[k], pixels[k], still[3], still[0]] for k in range(4)] + [
         [by_gears[4], by_optics[4], still[1], still[2], reading, still[0]]
     ]
-    return tuple(_by_coordinates(jnp.concatenate(own)[IN_ORDER], z, space) for own in blocks)
-
-
-def _by_coordinates(
-    by_values: Float[Array, "parameters spots"], z: Float[Array, " parameters"], space: ParameterSpace
-) -> Float[Array, "parameters spots"]:
-    """From derivatives by values in the units of their names to those by coordinates."""
     rig = len(RIG_NAMES)
-    unit = jnp.zeros_like(z).at[:rig].set(1.0)
-    # Of the rig every value has a coordinate of its own; the cameras' values share theirs.
-    slope = jax.jvp(space.physical, (z,), (unit,))[1][:rig]
-    return jnp.concatenate([by_values[:rig] * slope[:, None], space.stereo_root.T @ by_values[rig:]])
+    slope = materialise(space.slopes(z, physical)[:, None])
+
+    def by_coordinates(by_values: Float[Array, "parameters spots"]) -> Float[Array, "parameters spots"]:
+        # Of the rig every value has a coordinate of its own; the cameras' values share theirs.
+        return jnp.concatenate([by_values[:rig] * slope, space.stereo_root.T @ by_values[rig:]])
+
+    return tuple(by_coordinates(jnp.concatenate(own)[IN_ORDER]) for own in blocks)

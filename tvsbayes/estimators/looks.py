@@ -110,7 +110,7 @@ def looks_at(model: Model, pan_rad: Array, tilt_rad: Array, arrays: CampaignArra
     ray, by_pan = jax.jvp(lambda angle: trace(optics, angle, tilt_rad), (pan_rad,), (unit,))
     _, by_tilt = jax.jvp(lambda angle: trace(optics, pan_rad, angle), (tilt_rad,), (unit,))
     ray, by_pan, by_tilt = materialise((ray, by_pan, by_tilt))
-    range_mm = nearest_range(extrinsics, ray, triangulated)
+    range_mm = materialise(nearest_range(extrinsics, ray, triangulated))
     points_p = ray.at(range_mm)
     ways_p = by_pan.at(range_mm), by_tilt.at(range_mm), ray.direction
     turn = rotation_matrix(extrinsics.rotation_rad)

@@ -57,6 +57,7 @@ def rotation_matrix(rotation_rad: Vector) -> Float[Array, "3 3"]:
     sinc = jnp.where(small, 1 - angle2 / 6 * (1 - angle2 / 20 * (1 - angle2 / 42)), jnp.sin(angle) / angle)
     versine = jnp.where(small, 0.5 - angle2 / 24 * (1 - angle2 / 30 * (1 - angle2 / 56)), (1 - jnp.cos(angle)) / safe2)
     cross = CROSS @ rotation_rad
+    sinc, versine = materialise((sinc, versine))
     return jnp.eye(3) + sinc * cross + versine * (cross @ cross)
 
 
@@ -169,7 +170,7 @@ def image(cameras: StereoCameras, points_s_mm: Vectors) -> tuple[Float[Array, ".
         k1, k2, k3 = cameras.radial[camera]
         p1, p2 = cameras.tangential[camera]
         # OpenCV's tangential terms are (p2, p1) r^2 + 2 (p2 x + p1 y) (x, y).
-        factor = 1 + r2 * (k1 + r2 * (k2 + r2 * k3)) + 2 * (p2 * x + p1 * y)
+        r2, factor = materialise((r2, 1 + r2 * (k1 + r2 * (k2 + r2 * k3)) + 2 * (p2 * x + p1 * y)))
         focal_px, centre_px = cameras.focal_px[camera] * cameras.focal_scale, cameras.centre_px[camera]
         pixels.append(focal_px[0] * (x * factor + p2 * r2) + centre_px[0])
         pixels.append(focal_px[1] * (y * factor + p1 * r2) + centre_px[1])

@@ -18,9 +18,9 @@ from tvsbayes.instrument.axes import AXES, DIRECTIONS
 from tvsbayes.instrument.parameters import INDEX
 from tvsbayes.model.compiled import compiled
 from tvsbayes.model.gear_processes import Places
-from tvsbayes.model.geometry import Scalar
+from tvsbayes.model.geometry import Scalar, materialise
 from tvsbayes.model.laser_path import BeamAngles, Transmission, beam_angles, trace
-from tvsbayes.model.parameter_space import Model, ParameterSpace
+from tvsbayes.model.parameter_space import Model, ParameterSpace, model_of
 
 QUANTITIES = (*DIRECTIONS, *(f"{kind}.{axis}" for kind in ("contrast", "backlash") for axis in AXES), "mirror_offset")
 """Headlines in the order of `headlines`: effective deg/step, their differences, lost motion (deg), offset (mm)."""
@@ -137,8 +137,8 @@ def derived_quantities(
     """Headlines of many points at once (formulation 3.2); every field has the leading axis `draws`."""
 
     def one(z, errors):
-        physical = space.physical(z)
-        model = space.model(z)
+        physical = materialise(space.physical(z))
+        model = model_of(physical, space.harmonic_period_deg)
         angles = beam_angles(model.optics, seen.pose_rad[0], seen.pose_rad[1])
         return Derived(
             physical,

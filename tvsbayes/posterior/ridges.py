@@ -226,14 +226,13 @@ def stretches(route: Transport, residuals: Residuals) -> np.ndarray:
     followed = np.isin(route.free[route.noise], GEAR_SCALES, invert=True)
     for which, place in zip(np.flatnonzero(followed), route.noise[followed], strict=True):
         later = route.geometry[route.geometry > place]
-        shares = []
-        for node in STRETCH_NODES:
-            at = np.zeros((1 + len(later), route.dimension))
-            at[:, place] = node
-            at[1:, later] += SHEAR_STEP * np.eye(len(later))
-            seen = residuals(at)
-            shares.append(np.sum(((seen[1:] - seen[0]) / SHEAR_STEP) ** 2, axis=1))
-        change = np.array(shares) - shares[STRETCH_NODES.index(0.0)]
+        # All nodes in one call: a batch is as long whether it is full or not.
+        at = np.zeros((len(STRETCH_NODES), 1 + len(later), route.dimension))
+        at[:, :, place] = np.reshape(STRETCH_NODES, (-1, 1))
+        at[:, 1:, later] += SHEAR_STEP * np.eye(len(later))
+        seen = residuals(at.reshape(-1, route.dimension)).reshape(*at.shape[:2], -1)
+        shares = np.sum(((seen[:, 1:] - seen[:, :1]) / SHEAR_STEP) ** 2, axis=2)
+        change = shares - shares[STRETCH_NODES.index(0.0)]
         stretch[which][:, later] = -0.5 * np.log(np.clip(1 + change, *STRETCH_LIMITS))
     return stretch
 
@@ -257,7 +256,7 @@ def transport(fit: JointFit) -> Transport:
     def residuals(y: np.ndarray) -> np.ndarray:
         def both(z: np.ndarray, still: np.ndarray) -> np.ndarray:
             found = evaluate(z, still, fit.space, fit.arrays)
-            return np.concatenate([np.reshape(found.standardised, (len(z), -1)), np.asarray(found.places)], axis=1)
+            return np.concatenate([np.asarray(found.standardised).reshape(len(z), -1), found.places], axis=1)
 
         seen = in_batches(both, plain.from_whitened(y), no_draw(len(y), fit.arrays))
         return np.nan_to_num(np.asarray(seen))

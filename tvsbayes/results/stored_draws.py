@@ -77,7 +77,7 @@ def _draws_bytes(
     arrays = {**vars(draws), "names": np.array(draws.names)}
     if calibration is None:
         buffer = io.BytesIO()
-        np.savez_compressed(buffer, estimator=np.array(estimator), **arrays)
+        np.savez(buffer, estimator=np.array(estimator), **arrays)
         return buffer.getvalue()
     if mode is not None:
         arrays |= {f"mode_{name}": getattr(mode, name) for name in _MODE_ARRAYS}

@@ -284,7 +284,7 @@ def keep_fit(fit: AxisFit, summary: AxisSummary, folder: Path) -> dict[str, str]
     document = {"format": AXIS_FIT_FORMAT, **summary.as_json(), **made}
     buffer = io.BytesIO()
     draws = np.stack(list(fit.draws.values()), axis=-1)
-    np.savez_compressed(buffer, names=np.array(list(fit.draws)), w=fit.w, draws=draws)
+    np.savez(buffer, names=np.array(list(fit.draws)), w=fit.w, draws=draws)
     make_folder(folder)
     paths = {"draws": folder / "draws.npz", "fit": folder / "fit.json"}
     write_atomically(paths["draws"], buffer.getvalue())
