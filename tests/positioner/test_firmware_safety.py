@@ -115,12 +115,14 @@ def test_overdue_steps_never_come_in_a_burst(agreed):
     before = bench.board.true_steps[0]
     bench.stall(0.1)
     assert bench.board.true_steps[0] == before + 1
+    # The core's steps are not on record, its counter is.
+    assert bench.state(7).pan_steps == before + 1
     times_us, step = [bench.now_us], bench.board.step
     bench.board.step = lambda axis, sense: (times_us.append(bench.now_us), step(axis, sense))
     bench.pass_time(5)
     gaps = [after - earlier for earlier, after in itertools.pairwise(times_us)]
     assert gaps[0] == 1_000_000 // 200 and min(gaps) == 1_000_000 // 800
-    assert bench.board.true_steps[0] == 800 and bench.state(7).done_sequence == 6
+    assert bench.board.true_steps[0] == 800 and bench.state(8).done_sequence == 6
     agreed(bench)
 
 
@@ -287,6 +289,24 @@ def test_sketch_resets_itself_and_darkens_in_a_fault():
     half_seconds = int(re.search(r"kWatchdogHalfSeconds = (\d+);", sketch)[1])
     assert half_seconds * 0.5 <= 1.0, "well within the promised 2 s"
     assert sketch.index("feed_watchdog();", sketch.index("void loop()")) > 0
+    started = re.search(r"void start_watchdog\(\) \{(.*?)\n\}", sketch, re.DOTALL)[1]
+    assert "vector = 3; vector <= 6; ++vector) _VectorsRam[vector] = dark_in_fault;" in started
+    assert started.index("WDOG_WCR_WDE") < started.index("feed_watchdog();")
+    assert "  start_watchdog();\n}" in sketch[sketch.index("void setup()") : sketch.index("void loop()")]
+
+
+def test_direction_stands_before_the_step():
+    """5 us, what drives of the DM542's kind ask for, between the direction and the rising edge."""
+    sketch = (FIRMWARE / "tvs_positioner" / "tvs_positioner.ino").read_text()
+    step = re.search(r"void step\(int axis, bool positive\) override \{(.*?)\n  \}", sketch, re.DOTALL)[1]
+    orders = [
+        "digitalWriteFast(kDirectionPin",
+        "delayMicroseconds(kDirectionSetupUs)",
+        "digitalWriteFast(kStepPin[axis], HIGH)",
+    ]
+    places = [step.index(order) for order in orders]
+    assert places == sorted(places)
+    assert int(re.search(r"kDirectionSetupUs = (\d+);", sketch)[1]) >= 5
 
 
 def test_a_switch_that_bounces_while_it_is_left_is_left_by_the_whole_way(agreed):

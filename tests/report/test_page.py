@@ -20,10 +20,9 @@ from tvsbayes.calibration.calibration_file import load_calibration
 from tvsbayes.files.disk import shipped_data
 from tvsbayes.instrument.axes import DIRECTIONS
 from tvsbayes.instrument.campaign import read_campaign, write_campaign
-from tvsbayes.instrument.parameters import NOISE_NAMES, PRIOR_GROUPS, REGISTRY
+from tvsbayes.instrument.parameters import PRIOR_GROUPS, RIG_NAMES
 from tvsbayes.metrology.positioning_table import positioning
 from tvsbayes.metrology.traceability import traceability
-from tvsbayes.report.first_page import cause_in_words
 from tvsbayes.report.page import (
     BROWSERS,
     page_html,
@@ -34,6 +33,7 @@ from tvsbayes.report.page import (
     report_page,
     typeset,
 )
+from tvsbayes.report.parameter_words import cause_in_words, name_in_words, source_in_words
 from tvsbayes.report.tables import Issue
 
 BYTES_MAX = 3_000_000
@@ -131,11 +131,18 @@ def test_the_first_page_has_the_answer_and_who_asked(page, evidence):
         assert "Why classic is off there" in first and "of the variance" in first
 
 
-def test_the_first_page_calls_causes_by_words():
-    """Every prior that can be a cause of millimetres; scales of noise are causes of nothing by themselves."""
+def test_causes_and_parameters_are_called_by_words():
+    """Every prior and every parameter but the cameras'; budgets say the part and the unit as well."""
     told = {cause: cause_in_words(cause) for cause in PRIOR_GROUPS if cause.startswith("prior of ")}
-    noises = {REGISTRY[name].cause for name in NOISE_NAMES} - {"prior of aperture_sd_deg"}
-    assert {cause for cause, words in told.items() if words == cause} == noises
+    assert all(words != cause for cause, words in told.items())
+    tables = [source_in_words(cause) for cause in told] + [source_in_words(f"prior of {name}") for name in RIG_NAMES]
+    tables += [name_in_words(name) for name in RIG_NAMES]
+    assert not any("_" in words for words in tables), tables
+    assert len(set(tables[-len(RIG_NAMES) :])) == len(RIG_NAMES)
+    assert source_in_words("prior of laser_tilt_deg") == "prior of the laser's direction"
+    assert source_in_words("prior of laser_tilt_deg.x") == "prior of the laser's direction, x, deg"
+    assert source_in_words("prior of ln stop_sd_deg.up") == "prior of ln scatter of stops, up, deg"
+    assert source_in_words("pixel noise") == "pixel noise" and name_in_words("pixel_scale")[:11] == "pixel noise"
     assert told["prior of mirror2_error_deg"] == "the angle of mirror 2 as stated beforehand (mirror2_error_deg)"
     assert cause_in_words("stereo calibration") == "stereo calibration"
 

@@ -21,6 +21,7 @@ from tvsbayes.files.csv_table import CSV_BYTES_MAX
 from tvsbayes.files.disk import read_bytes, remove_unfinished, write_atomically
 from tvsbayes.files.documents import TOML_BYTES_MAX, parse_toml
 from tvsbayes.instrument.campaign import (
+    NAME_ACQUIRED,
     Campaign,
     Spot,
     campaign_toml,
@@ -37,7 +38,6 @@ from tvsbayes.instrument.stereo_pair import read_stereo, stereo_bytes
 DERIVED_EVERY = 100
 """Up to this many spots the campaign files are written after every look, then ever more rarely: at least 99 % of the
 looks are in them at any time, all of them in the journal."""
-NAME_DEFAULT = "acquired campaign"
 _DERIVED = ("campaign.toml", "stereo.json", "moves.csv", "spots.csv", "truth.json")
 
 
@@ -91,7 +91,7 @@ class CampaignFiles:
         """What the journal holds so far; there has been a homing."""
         created = cast("Created", self._journal.records[0].data)
         start = datetime.datetime.fromisoformat(str(created["created"])).astimezone(datetime.UTC)
-        header: dict[str, object] = {"name": str(created.get("name", NAME_DEFAULT)), "created": start}
+        header: dict[str, object] = {"name": str(created.get("name", NAME_ACQUIRED)), "created": start}
         header |= {name: value for name, value in created.items() if name in ("synthetic", "seed")}
         return _campaign_of(self._recorder.result(), Campaign((), (), self._rig.stereo, self._rig.table, header))
 

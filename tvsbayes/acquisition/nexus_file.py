@@ -119,7 +119,7 @@ def _put(group: Any, name: str, value: object, unit: str = "", **attributes: obj
 
 def _entry(entry: Any, campaign: Campaign, records: Sequence[Record]) -> None:
     header = campaign.header
-    _put(entry, "title", str(header.get("name", "")))
+    _put(entry, "title", campaign.title)
     _put(entry, "program_name", "tvsbayes", version=metadata.version("tvsbayes"))
     created = header.get("created")
     if created is not None:

@@ -11,7 +11,6 @@ from contextlib import ExitStack
 from pathlib import Path
 
 from tvsbayes.acquisition.bench import SIMULATED_START, Vision, hardware, simulated
-from tvsbayes.acquisition.campaign_files import NAME_DEFAULT
 from tvsbayes.acquisition.engine import Acquisition, Outcome
 from tvsbayes.acquisition.journal import EMPTY_REMEDY, LOG, Journal, read_journal, require_journal
 from tvsbayes.acquisition.live_run import LiveRun
@@ -21,6 +20,7 @@ from tvsbayes.acquisition.replanning import AdaptWish, Replanning, adapted_plan,
 from tvsbayes.acquisition.run_identity import check_same, identity, setup_changes
 from tvsbayes.acquisition.running_estimate import EstimateWish, RunningEstimate
 from tvsbayes.errors import escaped, refusal
+from tvsbayes.instrument.campaign import NAME_ACQUIRED
 from tvsbayes.instrument.plan import PlanStep, plan_seconds, run_plan
 from tvsbayes.instrument.rig import Rig
 from tvsbayes.instrument.stops import legs_of
@@ -120,7 +120,7 @@ def _before(folder: Path) -> Recorded:
 
 def _header(rig: Rig, seed: int | None) -> dict[str, object]:
     """What the journal of a run says of its campaign; `seed` of a simulation."""
-    header: dict[str, object] = {"name": str(rig.header.get("name", NAME_DEFAULT))}
+    header: dict[str, object] = {"name": str(rig.header.get("name", NAME_ACQUIRED))}
     if seed is not None:
         header |= {"created": SIMULATED_START.isoformat(), "synthetic": True, "seed": int(seed)}
     return header

@@ -146,7 +146,7 @@ class Origin:
         """Of a campaign, exported today."""
         created, today = campaign.header.get("created"), datetime.datetime.now(datetime.UTC).date()
         measured = created.isoformat() if isinstance(created, datetime.date) else ""
-        return cls(str(campaign.header.get("name") or ""), measured, today.isoformat(), version("tvsbayes"))
+        return cls(campaign.title, measured, today.isoformat(), version("tvsbayes"))
 
 
 def content_sha256(document: Mapping[str, object]) -> str:

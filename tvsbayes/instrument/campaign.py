@@ -71,6 +71,12 @@ class Spot:
     ruv_right: float = 0.0
 
 
+NAME_ACQUIRED = "acquired campaign"
+"""Of a run whose rig file has no name."""
+NAMES_BY_DEFAULT = (NAME_ACQUIRED, "my campaign")
+"""Names that nobody chose; the second is that of earlier templates."""
+
+
 @dataclass(frozen=True, repr=False)
 class Campaign(Shown):
     """A campaign folder, checked. `header` holds the keys of `campaign.toml` outside `[rig]`."""
@@ -82,11 +88,19 @@ class Campaign(Shown):
     header: dict[str, object] = field(default_factory=dict)
     path: Path | None = None
 
+    @property
+    def title(self) -> str:
+        """What readers call it: the name that somebody gave it, else its folder's."""
+        name = str(self.header.get("name") or "").strip()
+        if name and name not in NAMES_BY_DEFAULT:
+            return name
+        folder = "" if self.path is None else escaped(self.path.resolve().name, 200)
+        return folder or name or "without a name"
+
     def shown(self) -> View:
         """Counts, and the looks with the counters behind them."""
         ok = sum(spot.status == "ok" for spot in self.spots)
-        name = str(self.header.get("name") or "without a name")
-        title = f"Campaign {name!r}: {len(self.moves)} moves, {len(self.spots)} spots ({ok} ok)"
+        title = f"Campaign {self.title!r}: {len(self.moves)} moves, {len(self.spots)} spots ({ok} ok)"
         at = {move.move: (move.pan_steps, move.tilt_steps) for move in self.moves}
         columns = ("spot", "move", "pan_steps", "tilt_steps", *SPOT_COLUMNS[2:])
         rows = [

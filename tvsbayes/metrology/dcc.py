@@ -134,7 +134,7 @@ def _item(data: ET.Element, campaign: Campaign) -> None:
     item = add(add(data, "dcc:items"), "dcc:item", id="item")
     add_words(item, "dcc:name", header.get("instrument") or "stepper-driven two-mirror laser positioner")
     serials = add(item, "dcc:identifications")
-    for value, name in ((header.get("serial") or NOT_STATED, "serial"), (header.get("name") or NOT_STATED, "campaign")):
+    for value, name in ((header.get("serial") or NOT_STATED, "serial"), (campaign.title, "campaign")):
         identification = add(serials, "dcc:identification")
         add(identification, "dcc:issuer", "other")
         add(identification, "dcc:value", value)
@@ -262,7 +262,7 @@ def dcc_bytes(
     # Prefixes are written out: registering them would change ElementTree for the whole process.
     root = ET.Element("dcc:digitalCalibrationCertificate", {**names, "schemaVersion": DCC_VERSION})
     number = None if report is None else report.number
-    besides = [str(campaign.header.get("name")), *astuple(parties), number]
+    besides = [campaign.title, *astuple(parties), number]
     core = _Core(identifier or fit.certificate_id(issued, besides), issued, number)
     _administrative(root, campaign, fit, core, parties)
     _measurement(root, campaign, fit)

@@ -11,6 +11,7 @@ import numpy as np
 from tvsbayes.calibration.pointing import Steps
 from tvsbayes.errors import escaped
 from tvsbayes.instrument.plan import LOOKS_PER_EXPERIMENT
+from tvsbayes.report.parameter_words import name_in_words
 from tvsbayes.report.result_tables import gap_table, hold_out_table, point_budget_table
 from tvsbayes.report.tables import COLUMNS, TableView, concise, two_digits
 from tvsbayes.results.comparison_record import Comparison, Gap, HoldOut, PositionHoldOut
@@ -291,7 +292,7 @@ def budget_text(budget: Budget) -> str:
     """Uncertainty budget of a point: causes by share, then the parameters that contribute most."""
     size = np.linalg.norm(budget.contribution_mm, axis=1)
     rows = [
-        [budget.parameters[k], *(f"{v:+.3g}" for v in budget.contribution_mm[k])]
+        [name_in_words(budget.parameters[k]), *(f"{v:+.3g}" for v in budget.contribution_mm[k])]
         for k in np.argsort(-size)[:10]
         if size[k] > 0
     ]

@@ -18,6 +18,7 @@ from tvsbayes.report.advice import verdict_line
 from tvsbayes.report.drawing import OF_ESTIMATOR
 from tvsbayes.report.evidence import MET, NOT_MET, Criterion, Evidence
 from tvsbayes.report.fit_text import validation_lines
+from tvsbayes.report.parameter_words import cause_in_words
 from tvsbayes.report.tables import FigureView, Issue, Number, TableView, concise, figure_view, interval_text, two_digits
 from tvsbayes.results.comparison_record import CANNOT_TELL
 from tvsbayes.results.estimates import Estimate, FitSummary
@@ -29,27 +30,6 @@ CAUSES_TOLD = 3
 """Of the uncertainty of a point; the section on budgets has all."""
 RECORDED = (("instrument", "instrument"), ("serial", "serial number"), ("operator", "operator"))
 """Keys of `campaign.toml` on the first page, and what they are called there."""
-
-IN_WORDS = {
-    "pan_zero_emission_deg": "the emission angle at pan 0",
-    "aperture_zero_deg": "the aperture's zero",
-    "aperture_sd_deg": "the scatter of aperture readings",
-    "baseline_mm": "the baseline",
-    "mirror_offset_mm": "the mirror offset",
-    "mirror1_error_deg": "the angle of mirror 1",
-    "mirror2_error_deg": "the angle of mirror 2",
-    "laser_tilt_deg": "the laser's direction",
-    "laser_offset_mm": "the laser's place",
-    "tilt_axis_skew_deg": "the skew of the tilt axis",
-    "tilt_axis_offset_mm": "the place of the tilt axis",
-    "tilt_zero_deg": "the tilt mirror at counter 0",
-    "extrinsics": "where the positioner stands before the cameras",
-    "degrees_per_step": "the ratio of the gears",
-    "ratio_contrast_deg_per_step": "the difference of the ratios of both directions",
-    "backlash_deg": "the backlash",
-    "harmonic_deg": "the periodic error of the gears",
-}
-"""What the first page calls parameters; the budgets behind it name them as files do."""
 
 
 @dataclass(frozen=True)
@@ -172,12 +152,6 @@ def why_far(e: Evidence) -> list[str]:
             f"alone make {_mm(off.by_place_mm)}."
         )
     return told
-
-
-def cause_in_words(cause: str) -> str:
-    """A cause of uncertainty for who has not read the list of parameters; the name in brackets is that of the files."""
-    name = cause.removeprefix("prior of ")
-    return f"{IN_WORDS[name]} as stated beforehand ({name})" if name in IN_WORDS else cause
 
 
 def _mm(value: float) -> str:

@@ -14,6 +14,7 @@ from tvsbayes.metrology.traceability import stated_value
 from tvsbayes.report import figures
 from tvsbayes.report.advice import asks_for_looks
 from tvsbayes.report.fit_text import agreement_line, sampling_line
+from tvsbayes.report.parameter_words import name_in_words
 from tvsbayes.report.result_tables import gap_table, hold_out_table
 from tvsbayes.report.spot_pictures import spot_gallery
 from tvsbayes.report.tables import FigureView, Section, TableView, concise, figure_view, interval_text, two_digits
@@ -145,6 +146,7 @@ def _parameters(e: Evidence) -> TableView:
             continue
         rows.append(
             [
+                name_in_words(name),
                 name,
                 concise(x.value, x.sd),
                 interval_text(*x.interval95, x.sd),
@@ -152,8 +154,8 @@ def _parameters(e: Evidence) -> TableView:
                 "" if x.contraction is None else f"{100 * max(x.contraction, 0.0):.0f}",
             ]
         )
-    columns = ["parameter", "value(u)", "95 % interval", "u of the prior", "told by the data, %"]
-    caption = "Parameters of the joint model, units in the names; 100 %: the prior no longer matters"
+    columns = ["parameter", "in files", "value(u)", "95 % interval", "u of the prior", "told by the data, %"]
+    caption = "Parameters of the joint model; 100 %: the prior no longer matters"
     return TableView(caption, columns, rows)
 
 

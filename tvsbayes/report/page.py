@@ -210,7 +210,7 @@ def _page(e: Evidence, issue: Issue) -> Page:
     ]
     return Page(
         results=e.fit.results_id,
-        name=str(e.campaign.header.get("name") or "campaign without a name"),
+        name=e.campaign.title,
         about=about_table(e.campaign.header, measured_days(e.campaign, issue), issue),
         verdict=verdict.text,
         verdict_class=verdict.kind,

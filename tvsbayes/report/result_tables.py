@@ -13,6 +13,7 @@ from tvsbayes.estimators.four_point import ClassicResult
 from tvsbayes.instrument.axes import AXES, DIRECTIONS, SENSES
 from tvsbayes.instrument.parameters import PERIODS_MAX
 from tvsbayes.metrology.look_budget import Budget
+from tvsbayes.report.parameter_words import source_in_words
 from tvsbayes.report.tables import TableView, concise, interval_text, signed
 from tvsbayes.results.comparison_record import Gap, GapTerm, HoldOut
 from tvsbayes.results.estimates import Estimate, FitSummary
@@ -152,7 +153,11 @@ def point_budget_table(budget: Budget, caption: str = "uncertainty by cause") ->
     """What the uncertainty of a located point consists of, the largest share first."""
     order = np.argsort(-budget.share)
     rows = [
-        [budget.causes[k], f"{100 * budget.share[k]:.1f}", *(f"{np.sqrt(v):.3g}" for v in budget.variance_mm2[k])]
+        [
+            source_in_words(budget.causes[k]),
+            f"{100 * budget.share[k]:.1f}",
+            *(f"{np.sqrt(v):.3g}" for v in budget.variance_mm2[k]),
+        ]
         for k in order[budget.share[order] >= SHARE_SHOWN]
     ]
     return TableView(caption, ["cause", "share %", "u(x) mm", "u(y) mm", "u(z) mm"], rows)

@@ -13,6 +13,7 @@ import numpy as np
 from tvsbayes.instrument.axes import SENSES
 from tvsbayes.metrology.traceability import header_table
 from tvsbayes.report import figures
+from tvsbayes.report.parameter_words import source_in_words
 from tvsbayes.report.result_tables import point_budget_table
 from tvsbayes.report.tables import Section, TableView, concise, figure_view, two_digits
 from tvsbayes.results.metrology_tables import FIGURES, BudgetTable
@@ -62,7 +63,9 @@ def _no_better(e: Evidence, ranges_mm: Sequence[str]) -> str:
     """Why a calibration may place points no better than the nominal rig: what the campaign could not tell."""
     text = f"At {', '.join(ranges_mm)} mm the joint calibration places points no better than the nominal one"
     largest = int(np.argmax(e.budget.share))
-    text += f": {e.budget.causes[largest]} makes up {100 * e.budget.share[largest]:.0f} % of its variance"
+    text += (
+        f": {source_in_words(e.budget.causes[largest])} makes up {100 * e.budget.share[largest]:.0f} % of its variance"
+    )
     text += f" at {e.range_mm:g} mm"
     if not any(spot.aperture_deg is not None for spot in e.campaign.spots):
         text += "; the campaign has no aperture readings, which tell the range of a point"
@@ -119,7 +122,7 @@ def _pair_table(first: BudgetTable, second: BudgetTable) -> TableView:
                 f"{100 * each.share:.1f}",
             )
         ]
-        rows.append([row.quantity, row.kind, *told, *parts])
+        rows.append([source_in_words(row.quantity), row.kind, *told, *parts])
     names = [table.quantity.rpartition(".")[2] for table in (first, second)]
     columns = ["source", "type", "u", "dof"]
     columns += [f"{word}{name}" for name in names for word in ("contribution, ", "share %, ")]
@@ -140,7 +143,7 @@ def _gum_table(table: BudgetTable, prefix: str = "") -> TableView:
     shown = [row for row in table.rows if row.u is None or abs(row.share) >= SHARE_PRINTED]
     rows = [
         [
-            row.quantity,
+            source_in_words(row.quantity),
             row.kind,
             row.distribution,
             "" if row.u is None else two_digits(row.u),

@@ -166,7 +166,7 @@ def scene(campaign: Campaign, fitted: Fitted | None = None, notes: Sequence[str]
     correlated, correlation = _correlation(fitted)
     size = campaign.stereo.image_width, campaign.stereo.image_height
     return Scene(
-        name=str(campaign.header.get("name") or (campaign.path.name if campaign.path else "campaign")),
+        name=campaign.title,
         fitted=fitted is not None,
         notes=tuple(notes),
         image_px=size,

@@ -1,0 +1,71 @@
+"""What reports call parameters and causes of uncertainty: words for readers, beside the names that files use."""
+
+from __future__ import annotations
+
+from tvsbayes.instrument.axes import DIRECTIONS
+from tvsbayes.instrument.parameters import REGISTRY
+
+IN_WORDS = {
+    "degrees_per_step": "the ratio of the gears",
+    "ratio_contrast_deg_per_step": "the difference of the ratios of both directions",
+    "backlash_deg": "the backlash",
+    "tilt_zero_deg": "the tilt mirror at counter 0",
+    "mirror_offset_mm": "the mirror offset",
+    "mirror1_error_deg": "the angle of mirror 1",
+    "mirror2_error_deg": "the angle of mirror 2",
+    "laser_tilt_deg": "the laser's direction",
+    "laser_offset_mm": "the laser's place",
+    "tilt_axis_skew_deg": "the skew of the tilt axis",
+    "tilt_axis_offset_mm": "the place of the tilt axis",
+    "extrinsics": "the positioner's place and attitude",
+    "extrinsics.rotation_rad": "the positioner's attitude",
+    "extrinsics.translation_mm": "the positioner's place",
+    "stop_sd_deg": "the scatter of stops",
+    "pixel_scale": "the pixel noise over the stated one",
+    "focal_scale": "the focal scale",
+    "baseline_mm": "the baseline",
+    "pan_zero_emission_deg": "the emission angle at pan 0",
+    "aperture_zero_deg": "the aperture's zero",
+    "aperture_sd_deg": "the scatter of aperture readings",
+    "harmonic_deg": "the periodic error of the gears",
+    "transmission_error_deg": "the transmission error, sd",
+    "transmission_error_length_deg": "the angle over which it changes",
+    "play_variation_deg": "the variation of play, sd",
+    "drift_deg_per_root_hour": "the drift in a root hour, sd",
+    "harmonic_amplitude_deg": "the amplitude of a periodic error",
+}
+"""By block of parameters; those of the positioner's pose also as one."""
+_RESULTS = {
+    "effective_mirror_offset_mm": "beam off the pan axis, mm",
+    **{f"degrees_per_step.{direction}": f"ratio of the gears, {direction}, deg/step" for direction in DIRECTIONS},
+}
+"""What follows from parameters and stands among them."""
+_PRIORS = ("prior of ln ", "prior of ")
+
+
+def name_in_words(name: str) -> str:
+    """A parameter for readers, with its part and unit: "laser's direction, x, deg"; other names stay."""
+    parameter = REGISTRY.get(name)
+    if parameter is None or parameter.block not in IN_WORDS:
+        return _RESULTS.get(name, name)
+    part = name.removeprefix(parameter.block).lstrip(".").replace(".", " ")
+    unit = "" if parameter.unit == "1" else parameter.unit
+    return ", ".join(filter(None, (IN_WORDS[parameter.block].removeprefix("the "), part, unit)))
+
+
+def source_in_words(source: str) -> str:
+    """A row of a budget for readers: a parameter, the prior of one or of a group of them; others stay."""
+    for begin in _PRIORS:
+        if source.startswith(begin):
+            name = source.removeprefix(begin)
+            told = name_in_words(name)
+            if name in IN_WORDS and name not in REGISTRY:
+                told = IN_WORDS[name].removeprefix("the ")
+            return f"{begin}{told}" if begin == "prior of ln " else f"prior of the {told}"
+    return name_in_words(source)
+
+
+def cause_in_words(cause: str) -> str:
+    """A cause of uncertainty in a sentence; the name in brackets is that of the files."""
+    name = cause.removeprefix("prior of ")
+    return f"{IN_WORDS[name]} as stated beforehand ({name})" if name in IN_WORDS else cause
