@@ -226,6 +226,11 @@ def test_bounce_of_the_home_switch_makes_no_wrong_zero(agreed, after, readings):
     state = bench.state(4)
     assert (state.status, state.pan_steps, state.tilt_steps) == ("idle", -60, -40)
     assert bench.board.true_steps == [-60, -40]
+    # What the core took for home is not on record; another homing tells.
+    bench.ask(5, "HOME")
+    bench.pass_time(15)
+    state = bench.state(6)
+    assert (state.pan_home_deviation_steps, state.tilt_home_deviation_steps) == (0, 0)
     agreed(bench)
 
 

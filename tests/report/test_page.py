@@ -33,7 +33,7 @@ from tvsbayes.report.page import (
     report_page,
     typeset,
 )
-from tvsbayes.report.parameter_words import cause_in_words, name_in_words, source_in_words
+from tvsbayes.report.parameter_words import cause_in_words, name_in_words, share_in_words, source_in_words
 from tvsbayes.report.tables import Issue
 
 BYTES_MAX = 3_000_000
@@ -135,14 +135,17 @@ def test_causes_and_parameters_are_called_by_words():
     """Every prior and every parameter but the cameras'; budgets say the part and the unit as well."""
     told = {cause: cause_in_words(cause) for cause in PRIOR_GROUPS if cause.startswith("prior of ")}
     assert all(words != cause for cause, words in told.items())
-    tables = [source_in_words(cause) for cause in told] + [source_in_words(f"prior of {name}") for name in RIG_NAMES]
+    tables = [share_in_words(cause) for cause in told] + [source_in_words(f"prior of {name}") for name in RIG_NAMES]
     tables += [name_in_words(name) for name in RIG_NAMES]
     assert not any("_" in words for words in tables), tables
     assert len(set(tables[-len(RIG_NAMES) :])) == len(RIG_NAMES)
-    assert source_in_words("prior of laser_tilt_deg") == "prior of the laser's direction"
+    assert share_in_words("prior of laser_tilt_deg") == "prior of the laser's direction"
     assert source_in_words("prior of laser_tilt_deg.x") == "prior of the laser's direction, x, deg"
     assert source_in_words("prior of ln stop_sd_deg.up") == "prior of ln scatter of stops, up, deg"
-    assert source_in_words("pixel noise") == "pixel noise" and name_in_words("pixel_scale")[:11] == "pixel noise"
+    assert (
+        source_in_words("pixel noise") == share_in_words("pixel noise") == "pixel noise"
+        and name_in_words("pixel_scale")[:11] == "pixel noise"
+    )
     assert told["prior of mirror2_error_deg"] == "the angle of mirror 2 as stated beforehand (mirror2_error_deg)"
     assert cause_in_words("stereo calibration") == "stereo calibration"
 

@@ -34,7 +34,7 @@ from tvsbayes.report.drawing import (
     colour_map,
     drawing,
 )
-from tvsbayes.report.parameter_words import source_in_words
+from tvsbayes.report.parameter_words import share_in_words
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -398,7 +398,7 @@ def shares(budget: Budget) -> Figure:
     """Shares of a point's variance by cause, largest first; what is below `SMALLEST_SHARE` is one bar."""
     order = np.argsort(-budget.share)
     kept = [k for k in order if budget.share[k] >= SMALLEST_SHARE]
-    names = [source_in_words(budget.causes[k]) for k in kept]
+    names = [share_in_words(budget.causes[k]) for k in kept]
     values = [100 * budget.share[k] for k in kept]
     rest = 100 - sum(values)
     if rest > 0.05:

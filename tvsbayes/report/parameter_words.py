@@ -17,7 +17,7 @@ IN_WORDS = {
     "laser_offset_mm": "the laser's place",
     "tilt_axis_skew_deg": "the skew of the tilt axis",
     "tilt_axis_offset_mm": "the place of the tilt axis",
-    "extrinsics": "the positioner's place and attitude",
+    "extrinsics": "the positioner's pose",
     "extrinsics.rotation_rad": "the positioner's attitude",
     "extrinsics.translation_mm": "the positioner's place",
     "stop_sd_deg": "the scatter of stops",
@@ -40,7 +40,6 @@ _RESULTS = {
     **{f"degrees_per_step.{direction}": f"ratio of the gears, {direction}, deg/step" for direction in DIRECTIONS},
 }
 """What follows from parameters and stands among them."""
-_PRIORS = ("prior of ln ", "prior of ")
 
 
 def name_in_words(name: str) -> str:
@@ -54,15 +53,17 @@ def name_in_words(name: str) -> str:
 
 
 def source_in_words(source: str) -> str:
-    """A row of a budget for readers: a parameter, the prior of one or of a group of them; others stay."""
-    for begin in _PRIORS:
+    """A row of a budget for readers, with part and unit: a parameter, the prior of one; others stay."""
+    for begin, told in (("prior of ln ", "prior of ln "), ("prior of ", "prior of the ")):
         if source.startswith(begin):
-            name = source.removeprefix(begin)
-            told = name_in_words(name)
-            if name in IN_WORDS and name not in REGISTRY:
-                told = IN_WORDS[name].removeprefix("the ")
-            return f"{begin}{told}" if begin == "prior of ln " else f"prior of the {told}"
+            return told + name_in_words(source.removeprefix(begin))
     return name_in_words(source)
+
+
+def share_in_words(cause: str) -> str:
+    """A cause of uncertainty in a table of shares: priors of a group of parameters as one; others stay."""
+    name = cause.removeprefix("prior of ")
+    return f"prior of {IN_WORDS[name]}" if cause != name and name in IN_WORDS else cause
 
 
 def cause_in_words(cause: str) -> str:

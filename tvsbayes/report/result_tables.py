@@ -13,7 +13,7 @@ from tvsbayes.estimators.four_point import ClassicResult
 from tvsbayes.instrument.axes import AXES, DIRECTIONS, SENSES
 from tvsbayes.instrument.parameters import PERIODS_MAX
 from tvsbayes.metrology.look_budget import Budget
-from tvsbayes.report.parameter_words import source_in_words
+from tvsbayes.report.parameter_words import share_in_words
 from tvsbayes.report.tables import TableView, concise, interval_text, signed
 from tvsbayes.results.comparison_record import Gap, GapTerm, HoldOut
 from tvsbayes.results.estimates import Estimate, FitSummary
@@ -154,7 +154,7 @@ def point_budget_table(budget: Budget, caption: str = "uncertainty by cause") ->
     order = np.argsort(-budget.share)
     rows = [
         [
-            source_in_words(budget.causes[k]),
+            share_in_words(budget.causes[k]),
             f"{100 * budget.share[k]:.1f}",
             *(f"{np.sqrt(v):.3g}" for v in budget.variance_mm2[k]),
         ]

@@ -13,7 +13,7 @@ import numpy as np
 from tvsbayes.instrument.axes import SENSES
 from tvsbayes.metrology.traceability import header_table
 from tvsbayes.report import figures
-from tvsbayes.report.parameter_words import source_in_words
+from tvsbayes.report.parameter_words import share_in_words, source_in_words
 from tvsbayes.report.result_tables import point_budget_table
 from tvsbayes.report.tables import Section, TableView, concise, figure_view, two_digits
 from tvsbayes.results.metrology_tables import FIGURES, BudgetTable
@@ -64,7 +64,7 @@ def _no_better(e: Evidence, ranges_mm: Sequence[str]) -> str:
     text = f"At {', '.join(ranges_mm)} mm the joint calibration places points no better than the nominal one"
     largest = int(np.argmax(e.budget.share))
     text += (
-        f": {source_in_words(e.budget.causes[largest])} makes up {100 * e.budget.share[largest]:.0f} % of its variance"
+        f": {share_in_words(e.budget.causes[largest])} makes up {100 * e.budget.share[largest]:.0f} % of its variance"
     )
     text += f" at {e.range_mm:g} mm"
     if not any(spot.aperture_deg is not None for spot in e.campaign.spots):
