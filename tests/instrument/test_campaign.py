@@ -131,6 +131,20 @@ def test_a_campaign_may_have_no_spots_yet(tmp_path):
     assert read_campaign(tmp_path / "c").spots == ()
 
 
+def test_a_campaign_has_the_title_that_somebody_chose():
+    """Else that of its folder; what earlier templates wrote was chosen by nobody, and a folder's name is untrusted."""
+    campaign = dataclasses.replace(small_campaign(), path=Path("/data/rig 7"))
+    for name, title in (
+        ("bench B", "bench B"),
+        ("my campaign", "rig 7"),
+        ("acquired campaign", "rig 7"),
+        ("", "rig 7"),
+    ):
+        assert dataclasses.replace(campaign, header={"name": name}).title == title
+    assert dataclasses.replace(campaign, header={}, path=None).title == "without a name"
+    assert dataclasses.replace(campaign, header={}, path=Path("/data/a\nb")).title.isprintable()
+
+
 def test_hashes_cover_the_data_and_not_the_names(tmp_path):
     campaign = small_campaign()
     reference = input_hashes(campaign)

@@ -1,6 +1,6 @@
 """Defects that a trial of acquisition and firmware from outside had found, planted again one by one.
 
-`experiments/firmware/defects_seen_red.py` has the list with what was found then.
+`experiments/robustness/defects_seen_red.py` has the list with what was found then.
 """
 
 from __future__ import annotations

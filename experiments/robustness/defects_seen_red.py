@@ -1,7 +1,7 @@
 """The ten defects that a trial from outside had found in acquisition and firmware: is each seen by a test?
 
-    python -m experiments.firmware.defects_seen_red run      # rows of planted_faults; what is there is not run again
-    python -m experiments.firmware.defects_seen_red table > experiments/firmware/defects_seen_red.md
+    python -m experiments.robustness.defects_seen_red run      # rows of planted_faults; what is there is not run again
+    python -m experiments.robustness.defects_seen_red table > experiments/robustness/defects_seen_red.md
 
 Each defect is planted again in a copy of today's tree (`experiments/robustness/faults`), and a test of the default
 suite has to fail, which passes without it. The sketch has no processor there; the lack of its watchdog also meets the
@@ -29,7 +29,7 @@ BOARD_FAULTS = ("sketch: no watchdog of the processor",)
 
 TEXT = """# Ten defects seen red
 
-Written by `python -m experiments.firmware.defects_seen_red`. A trial of acquisition and firmware from outside had
+Written by `python -m experiments.robustness.defects_seen_red`. A trial of acquisition and firmware from outside had
 found ten defects in 0.1.0. Each is planted again in today's tree; the first test that fails is named, and passes
 without the fault. The faults stand in `experiments/robustness/faults` and are planted again with all the others.
 """
