@@ -36,7 +36,7 @@ without the fault. The faults stand in `experiments/robustness/faults` and are p
 BY_DESIGN = """
 Before this page the tests meant for five of them stayed green and were mended: burst and bounce in the core (random
 sessions on the emulated processor alone saw them), the start of the sketch's watchdog (the slow test on the board saw
-it), its fault vectors and the time of the direction (nothing did).
+it), its fault vectors and the time of the direction (no default test did).
 
 Of the smaller things two are as they were, by design: the laser may be on in motion, and a host that dies stops the
 light, not a motion that has begun."""

@@ -78,6 +78,31 @@ def test_rows_left_out_are_the_conditional_of_the_dense_gaussian():
     np.testing.assert_allclose(mean[0], foretold, atol=1e-6)
 
 
+def test_places_that_no_row_hangs_on_are_foretold_from_those_that_rows_do():
+    """Against the conditional of the process, given the posterior at the places of the rows."""
+    asked = np.array([-1500.0, 37.0, 1200.0])
+    plain, model = model_of(a_campaign()), model_of(a_campaign(), asked)
+    w = 0.4 * np.random.default_rng(4).standard_normal((3, len(model.coordinates.names)))
+    seen, found = plain.linear(w), model.linear(w)
+    count, slope = len(plain.places.command), abs(plain.rows.line[1])
+    assert len(model.told) == plain.columns < model.columns == plain.columns + 2 * len(asked)
+    both = np.concatenate((plain.places.command, asked))
+    for k, length in enumerate(model.coordinates.values(w)["transmission_error_length"]):
+        scale = model.coordinates.values(w)["transmission_error"][k] ** 2
+        prior = scale * (matern52(slope * (both[:, None] - both), length) + JITTER * np.eye(len(both)))
+        own = slice(plain.processes, plain.processes + count)
+        by = np.linalg.solve(prior[:count, :count], prior[:count, count:]).T
+        mean = by @ seen.mean[k, own]
+        left = prior[count:, count:] - by @ prior[:count, count:]
+        sd = np.sqrt(np.diag(left + by @ seen.covariance[k, own, own] @ by.T))
+        values, spread = found.of(model.functional(asked))
+        # The nearest places make the prior's matrix nearly singular: its condition is 1 over the jitter at most.
+        np.testing.assert_allclose(values[k], mean, atol=1e-6 * sd.max())
+        np.testing.assert_allclose(spread[k], sd, rtol=1e-6)
+        across = found.covariance[k][: plain.processes, : plain.processes]
+        np.testing.assert_allclose(across, seen.covariance[k][: plain.processes, : plain.processes], rtol=1e-6)
+
+
 def test_without_processes_it_is_the_least_squares_line(monkeypatch):
     monkeypatch.setattr(axis_model, "CONTRAST_SHARE", 1e-9)
     moves = runs(3)

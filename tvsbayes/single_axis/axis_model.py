@@ -8,7 +8,7 @@ states over the rows, whose innovations whiten the columns of everything else; c
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -204,8 +204,18 @@ class AxisModel:
         missing = np.maximum(np.einsum("i,nij,j->n", weight, correlation, weight), 0.0)
         return missing * (values["transmission_error"] ** 2 + 0.25 * values["play_variation"] ** 2)
 
-    def _factor(self, values: Mapping[str, np.ndarray]) -> np.ndarray:
-        """Cholesky factor of the prior covariance of the columns, shape (n, columns, columns)."""
+    @cached_property
+    def told(self) -> np.ndarray:
+        """Columns that any row hangs on; the others are places where the processes are foretold."""
+        seen = np.any(self._weights != 0, axis=0)
+        return np.flatnonzero(np.concatenate((np.ones(self.processes, bool), seen, seen)))
+
+    def _factor(self, values: Mapping[str, np.ndarray], told_first: bool) -> np.ndarray:
+        """Factor of the prior covariance of the columns, shape (n, columns, columns).
+
+        Cholesky's, places in order; or with the places that rows hang on before the others: then these places depend
+        on no unit of the others.
+        """
         count, n = len(self.places.command), len(values["backlash"])
         factor = np.zeros((n, self.columns, self.columns))
         slope = abs(self.rows.line[1])
@@ -220,15 +230,23 @@ class AxisModel:
         factor[:, unknown, unknown] = np.sqrt(1 / 3)
         distance = slope * (self.places.command[:, None] - self.places.command)
         length = values["transmission_error_length"][:, None, None]
-        root = np.linalg.cholesky(matern52(distance[None], length) + JITTER * np.eye(count))
+        covariance = matern52(distance[None], length) + JITTER * np.eye(count)
+        if told_first:
+            first = np.argsort(~np.any(self._weights != 0, axis=0), kind="stable")
+            root = np.empty_like(covariance)
+            root[:, first[:, None], first] = np.linalg.cholesky(covariance[:, first[:, None], first])
+        else:
+            root = np.linalg.cholesky(covariance)
         error = slice(self.processes, self.processes + count)
         play = slice(self.processes + count, self.columns)
         factor[:, error, error] = values["transmission_error"][:, None, None] * root
         factor[:, play, play] = values["play_variation"][:, None, None] * root
         return factor
 
-    def _blocks(self, w: np.ndarray, extra: np.ndarray | None = None) -> Iterator[tuple[slice, _Block]]:
-        """The draws w (n, d) in blocks that fit into memory."""
+    def _blocks(
+        self, w: np.ndarray, extra: np.ndarray | None = None, *, told: bool = False
+    ) -> Iterator[tuple[slice, _Block]]:
+        """The draws w (n, d) in blocks that fit into memory; products of those columns alone that rows hang on."""
         width = 1 + self.columns + (0 if extra is None else extra.shape[1])
         size = max(1, NUMBERS_MAX // (width * max(len(self.rows.move), width)))
         for start in range(0, len(w), size):
@@ -236,11 +254,13 @@ class AxisModel:
             values = self.coordinates.values(w[part])
             stop, reading = self._scatter(values)
             columns = self._columns(values["backlash"], extra)
+            if told:
+                columns = columns[:, :, np.concatenate(([0], 1 + self.told))]
             drift = values["drift_per_root_hour"] ** 2
             white, log_scatter = whitened(columns, self.rows, drift, stop, reading)
             products = np.swapaxes(white, 1, 2) @ white
             spread = rows_log_density(self.rows, values["reading_scale"])
-            yield part, _Block(products, log_scatter - 2 * spread, self._factor(values))
+            yield part, _Block(products, log_scatter - 2 * spread, self._factor(values, told))
 
     def log_likelihood(self, w: np.ndarray) -> np.ndarray:
         """Log density of the readings at coordinates (n, d), shape (n,)."""
@@ -278,12 +298,20 @@ class AxisModel:
     def linear(self, w: np.ndarray) -> LinearPosterior:
         """What is linear, given coordinates (n, d); means are whole, not deviations from the priors'."""
         means, covariances = np.empty((len(w), self.columns)), np.empty((len(w), self.columns, self.columns))
-        for part, block in self._blocks(w):
-            information, towards = _information(block, 0)
+        told, others = self.told, np.setdiff1d(np.arange(self.columns), self.told)
+        # Rows tell nothing of the units of places between them: a matrix of those that they hang on is inverted.
+        for part, block in self._blocks(w, told=len(others) > 0):
+            small = replace(block, factor=block.factor[:, told[:, None], told]) if len(others) else block
+            information, towards = _information(small, 0)
             _, scaled, scale = _equilibrated(information)
             inverse = np.linalg.inv(scaled) / (scale[:, :, None] * scale[:, None, :])
-            means[part] = np.einsum("nij,njk,nk->ni", block.factor, inverse, towards, optimize=True)
-            covariances[part] = block.factor @ inverse @ np.swapaxes(block.factor, 1, 2)
+            reach = block.factor[:, :, told] if len(others) else block.factor
+            means[part] = np.einsum("nij,njk,nk->ni", reach, inverse, towards, optimize=True)
+            covariances[part] = reach @ inverse @ np.swapaxes(reach, 1, 2)
+            for own in (others[: len(others) // 2], others[len(others) // 2 :]):
+                # Of the error by position, then of the play: independent beforehand.
+                free = block.factor[:, own[:, None], own]
+                covariances[part, own[:, None], own] += free @ np.swapaxes(free, 1, 2)
         means[:, OFFSET] += self.rows.line[0] + self.rows.line[1] * self.middle
         means[:, SLOPE] += self.priors["per_command"].value
         means[:, BACKLASH] += self.coordinates.values(w)["backlash"]
