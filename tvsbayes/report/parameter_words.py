@@ -37,6 +37,7 @@ IN_WORDS = {
 """By block of parameters; those of the positioner's pose also as one."""
 _RESULTS = {
     "effective_mirror_offset_mm": "beam off the pan axis, mm",
+    **{f"effective_deg_per_step.{direction}": f"effective ratio, {direction}, deg/step" for direction in DIRECTIONS},
     **{f"degrees_per_step.{direction}": f"ratio of the gears, {direction}, deg/step" for direction in DIRECTIONS},
 }
 """What follows from parameters and stands among them."""

@@ -13,7 +13,7 @@ import numpy as np
 from tvsbayes.instrument.axes import SENSES
 from tvsbayes.metrology.traceability import header_table
 from tvsbayes.report import figures
-from tvsbayes.report.parameter_words import share_in_words, source_in_words
+from tvsbayes.report.parameter_words import name_in_words, share_in_words, source_in_words
 from tvsbayes.report.result_tables import point_budget_table
 from tvsbayes.report.tables import Section, TableView, concise, figure_view, two_digits
 from tvsbayes.results.metrology_tables import FIGURES, BudgetTable
@@ -131,8 +131,9 @@ def _pair_table(first: BudgetTable, second: BudgetTable) -> TableView:
 
 def _total(table: BudgetTable) -> str:
     """The result of a budget with its expanded uncertainty (GUM 7.2.4)."""
+    name = name_in_words(table.quantity).removesuffix(f", {table.unit}")
     return (
-        f"{table.quantity}: {concise(table.estimate, table.u)} {table.unit}, effective degrees of freedom "
+        f"{name}: {concise(table.estimate, table.u)} {table.unit}, effective degrees of freedom "
         f"{_freedom(table.dof)}, k = {table.coverage_factor:.2f}, p = {100 * table.probability:.0f} %, "
         f"U = {two_digits(table.expanded)} {table.unit}"
     )
