@@ -147,14 +147,14 @@ def _parameters(e: Evidence) -> TableView:
         rows.append(
             [
                 name_in_words(name),
-                name,
                 concise(x.value, x.sd),
                 interval_text(*x.interval95, x.sd),
                 "" if x.prior_sd is None else two_digits(x.prior_sd),
                 "" if x.contraction is None else f"{100 * max(x.contraction, 0.0):.0f}",
+                name,
             ]
         )
-    columns = ["parameter", "in files", "value(u)", "95 % interval", "u of the prior", "told by the data, %"]
+    columns = ["parameter", "value(u)", "95 % interval", "u of the prior", "told by the data, %", "in files"]
     caption = "Parameters of the joint model; 100 %: the prior no longer matters"
     return TableView(caption, columns, rows)
 
