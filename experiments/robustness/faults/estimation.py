@@ -52,6 +52,22 @@ FAULTS = (
         ("model/parameter_space",),
     ),
     Fault(
+        "slope of a half-normal twice as steep",
+        "model/parameter_space.py",
+        "return 0.5 * functions.exp(0.5 * (value**2 - z**2))",
+        "return functions.exp(0.5 * (value**2 - z**2))",
+        "steps of the search overshoot, and what sets a backlash is told wrongly",
+        ("model/parameter_space",),
+    ),
+    Fault(
+        "a stray half-normal has a slope",
+        "model/parameter_space.py",
+        "bent = half & (rig_z < FARTHEST_SD)",
+        "bent = half",
+        "where values do not move any more the search is told that they do",
+        ("model/parameter_space",),
+    ),
+    Fault(
         "half-normal prior from the wrong tail",
         "model/parameter_space.py",
         "return -functions.ndtri(0.5 * functions.ndtr(-z))",
