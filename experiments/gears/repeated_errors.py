@@ -169,25 +169,52 @@ def _effort(found: dict[str, list[dict]]) -> None:
     print()
 
 
-def table(arguments: argparse.Namespace) -> None:
-    """The study's page."""
-    rows = read_rows(arguments.rows)
-    print("# Gears that repeat their errors\n")
-    print("Written by `python -m experiments.gears.repeated_errors table`; what was done stands in the script.\n")
+def cases(rows: list[dict]) -> dict[str, dict[str, list[dict]]]:
+    """What each model says in every world and protocol that has rigs, by title."""
+    found = {}
     for world, size_deg in (("priors", 0.0), *WORLDS):
         for protocol in PROTOCOLS:
             chosen = [r for r in rows if (r["world"], r["size_deg"], r["protocol"]) == (world, size_deg, protocol)]
-            found = {name: entries for name in MODELS if (entries := accepted(chosen, name))}
-            if not found:
-                continue
             size = f", {size_deg:g} deg" if size_deg else ""
-            counts = ", ".join(
-                f"{len(e)} of {sum(n in r for r in chosen)} accepted with {n} gears" for n, e in found.items()
-            )
-            print(f"## {world}{size}; {protocol}: {counts}\n")
-            _headlines(found)
-            _points(found)
-            _effort(found)
+            for name in MODELS:
+                if entries := accepted(chosen, name):
+                    tried = sum(name in row for row in chosen)
+                    told = found.setdefault(f"{world}{size}; {protocol}", {})
+                    told[name] = entries
+                    told.setdefault("tried", []).append(f"{len(entries)} of {tried} accepted with {name} gears")
+    return found
+
+
+def _overview(found: dict[str, dict[str, list[dict]]]) -> None:
+    """A line a case: the headline whose errors are farthest from their sds, and the points."""
+    titles = "headlines farthest from RMS z 1", "outside the bounds", "points inside", "points outside"
+    print(f"| world; protocol | gears | rigs | {' | '.join(titles)} |\n|" + "---|" * 7)
+    for title, case in found.items():
+        for name in MODELS:
+            if name not in case:
+                continue
+            said = {q: verdict([entry["headlines"][q] for entry in case[name]]) for q in HEADLINES}
+            rms = {q: float(np.sqrt(np.mean([e["headlines"][q]["z"] ** 2 for e in case[name]]))) for q in HEADLINES}
+            worst = max(rms, key=lambda q: abs(np.log(rms[q])))
+            outside = ", ".join(q for q, v in said.items() if v.word == "OUTSIDE") or "none"
+            points = [np.array([[e["points"][p]["z2"], e["points"][p]["points"]] for e in case[name]]) for p in PLACES]
+            of_points = (f"{np.sqrt(z2 / (3 * n)):.2f}" for z2, n in (part.sum(axis=0) for part in points))
+            cells = f"{rms[worst]:.2f} ({worst}) | {outside} | {' | '.join(of_points)}"
+            print(f"| {title} | {name} | {len(case[name])} | {cells} |")
+    print()
+
+
+def table(arguments: argparse.Namespace) -> None:
+    """The study's page."""
+    found = cases(read_rows(arguments.rows))
+    print("# Gears that repeat their errors\n")
+    print("Written by `python -m experiments.gears.repeated_errors table`; what was done stands in the script.\n")
+    _overview(found)
+    for title, case in found.items():
+        print(f"## {title}: {', '.join(case.pop('tried'))}\n")
+        _headlines(case)
+        _points(case)
+        _effort(case)
 
 
 def run(arguments: argparse.Namespace) -> None:
