@@ -60,11 +60,11 @@ FAULTS = (
         ("model/parameter_space",),
     ),
     Fault(
-        "a stray half-normal has a slope",
+        "slope of a log-normal at its median",
         "model/parameter_space.py",
-        "bent = half & (rig_z < FARTHEST_SD)",
-        "bent = half",
-        "where values do not move any more the search is told that they do",
+        "return space.u * functions.where(half, of_half, functions.where(log, own, 1.0))",
+        "return space.u * functions.where(half, of_half, functions.where(log, space.value, 1.0))",
+        "away from its median a noise scale is told to move by what it moves there",
         ("model/parameter_space",),
     ),
     Fault(
