@@ -164,7 +164,11 @@ def fixed(seed: int, folder: Path, plan: tuple[PlanStep, ...]) -> dict[str, obje
         end, before, sampled = number, worst(number), None
         if before > TARGET / ratio:
             continue
-        sampled = confirmation(fits[number])
+        try:
+            sampled = confirmation(fits[number])
+        except NotConverged:
+            # So few looks that their posterior has no finite density about its mode: as good as no fit.
+            continue
         after = max(sampled.u_deg_per_step.values())
         ratio = max(1.0, after / before) if sampled.accepted else ratio
         met = sampled.accepted and after <= TARGET

@@ -6,7 +6,17 @@ import threading
 
 import pytest
 
-from tvsbayes.acquisition.live_requests import ACKNOWLEDGED, FAILED, KEPT_MAX, REQUESTS, Requests
+from tvsbayes.acquisition.live_requests import (
+    ACKNOWLEDGED,
+    FAILED,
+    KEPT_MAX,
+    LASER_OFF,
+    PAUSE,
+    REQUESTED,
+    RESUME,
+    STOP,
+    Requests,
+)
 
 
 def test_requests_come_in_order_and_laser_off_first():
@@ -45,7 +55,7 @@ def test_settled_requests_are_kept_but_not_all():
 
 def test_after_the_end_nothing_waits_and_nothing_is_taken():
     requests = Requests()
-    for what in REQUESTS:
+    for what in (PAUSE, STOP, LASER_OFF, RESUME):
         requests.ask(what)
     requests.close("the run has ended")
     assert requests.next() is None and requests.ask("stop") is None
@@ -60,3 +70,15 @@ def test_waiting_ends_with_a_request_of_another_thread():
         requests.wait(60.0)
     thread.join()
     assert requests.next().what == "stop"
+
+
+@pytest.mark.parametrize("what", [PAUSE, STOP, LASER_OFF])
+def test_a_resume_that_waits_is_withdrawn_by_what_stops(what: str) -> None:
+    """Also where the stopping request waited before it and is not made a second time."""
+    requests = Requests()
+    requests.ask(what)
+    requests.ask(RESUME)
+    requests.ask(what)
+    waiting = [request.what for request in requests.told() if request.state == REQUESTED]
+    assert waiting == [what]
+    assert [request.state for request in requests.told() if request.what == RESUME] == [FAILED]

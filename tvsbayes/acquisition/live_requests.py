@@ -50,12 +50,19 @@ class Requests:
     def ask(self, what: str) -> Request | None:
         """A new request; one that waits already is not made a second time. None once the run has ended.
 
+        Whatever stops the run or its light withdraws a resume that still waits: the last word counts, though laser off
+        goes before all others.
+
         Raises:
             ValueError: none of `REQUESTS`.
         """
         if what not in REQUESTS:
             raise ValueError(what)
         with self._changed:
+            if what != RESUME:
+                for request in self._waiting():
+                    if request.what == RESUME:
+                        self.settle(request, FAILED, f"withdrawn: {what} was asked for after it")
             waiting = self._waiting()
             for request in waiting:
                 if request.what == what:

@@ -375,6 +375,14 @@ FAULTS = (
         ("acquisition/live_control",),
     ),
     Fault(
+        "live page: a resume that waits outlives laser off",
+        "acquisition/live_requests.py",
+        "if what != RESUME:",
+        "if what == STOP:",
+        "pause, resume, laser off in one look: the run goes on, and the look is taken again with light",
+        ("acquisition/live_requests",),
+    ),
+    Fault(
         "live page: a pause ends by itself",
         "acquisition/live_control.py",
         "        while self.paused and not self._stop.requested:",
