@@ -3,7 +3,8 @@
 Each request is put to the device first: it counts as acknowledged once the device has answered and the journal holds
 an `asked` event. Pause, stop and laser off switch the laser off, whatever it was. Laser off is heeded in the middle of
 a look as well: the look is broken off, the run pauses, and the look is taken again after resume. A pause ends by
-resume, stop or Ctrl-C only: if the page is gone, nothing moves and no light comes on until a person says so.
+resume, stop or Ctrl-C only: if the page is gone, no light comes on until a person says so, and nothing moves after the
+step under way.
 """
 
 from __future__ import annotations
