@@ -14,7 +14,8 @@ from support.tabulated import tabulated
 
 from tvsbayes.model.compiled import BATCH
 from tvsbayes.posterior import ensemble
-from tvsbayes.posterior.diagnosis import GROUPS
+from tvsbayes.posterior.chain import Chain
+from tvsbayes.posterior.diagnosis import GROUPS, TAU_LIMIT
 from tvsbayes.posterior.ensemble import WALKERS, GroupEvolution, walkers_for
 from tvsbayes.posterior.proposal import Independence
 
@@ -106,11 +107,31 @@ def test_walkers_that_move_together_are_seen():
     assert "Var(mean of ensemble)" in bias(run(emcee.moves.GaussianMove(np.eye(1)), 1, INDEPENDENT_STEPS[1], 64))
 
 
-def test_walkers_outnumber_the_dimensions_in_whole_batches():
+def test_walkers_are_half_the_dimensions_or_more_in_whole_batches():
     for dimension in range(1, 200):
         walkers = walkers_for(dimension)
-        assert walkers > dimension and walkers >= WALKERS
+        assert 2 * walkers >= dimension and walkers >= WALKERS
         assert walkers % (2 * BATCH) == 0
+
+
+def test_a_chain_is_lengthened_as_its_autocorrelation_asks():
+    """Of a chain whose autocorrelation time is known: (1 + rho) / (1 - rho) steps."""
+    generator, rho, walkers = np.random.default_rng(11), 0.6, 256
+    w = generator.standard_normal((1000, walkers, 1))
+    for step in range(1, len(w)):
+        w[step] = rho * w[step - 1] + np.sqrt(1 - rho**2) * w[step]
+    tau = (1 + rho) / (1 - rho)
+    for steps, short in ((100, True), (140, True), (1000, False)):
+        chain = Chain(w[:steps], w[:steps, :, 0], np.ones(walkers), (), 0, 0.0, steps)
+        run = ensemble.Run.__new__(ensemble.Run)
+        run.chain, run.goal = lambda chain=chain: chain, steps
+        assert run.too_short() is short
+        # The mean taken off a chain of n steps takes tau / n off each of the two windows of five tau that are summed;
+        # a tenth is for chance.
+        kept = 0.9 * steps
+        wanted = TAU_LIMIT * tau / 0.9 * np.array([(1 - 10 * tau / kept) * 0.9, 1.1])
+        least, most = np.clip(wanted, *(steps * np.array(ensemble.LENGTHENING_RANGE))) if short else (steps, steps)
+        assert least <= run.goal <= most + 1
 
 
 def test_groups_never_use_one_another():

@@ -93,6 +93,12 @@ def autocorrelation_steps(w: np.ndarray) -> float:
     return float(np.max(emcee.autocorr.integrated_time(w[:, moved], tol=0, quiet=True)))
 
 
+def steps_wanted(chain: Chain) -> float:
+    """How many steps its autocorrelation times so far ask of a chain; infinite if no walker moved."""
+    discarded = len(chain.w) // WARM_UP
+    return TAU_LIMIT * autocorrelation_steps(chain.w[discarded:]) * len(chain.w) / (len(chain.w) - discarded)
+
+
 def grouped(values: np.ndarray) -> np.ndarray:
     """Draws (walker, draw, ...) as those of `GROUPS` groups of neighbours (group, draws, ...), in order of time."""
     walkers, draws, *rest = values.shape
@@ -157,6 +163,11 @@ class Stored:
         density = chain.log_density[discarded:][::thin].T + fit.log_density - found.log_jacobian.reshape(w.shape[:2])
         return cls(chain, discarded, thin, w, found.z.reshape(*w.shape[:2], -1), density)
 
+    @property
+    def kept(self) -> int:
+        """Steps after those left out."""
+        return len(self.chain.w) - self.discarded
+
     def quality(self, fit: JointFit, derived: Derived, tau_steps: float) -> ChainQuality:
         """Of all columns that vary: `derived` are the draws', `tau_steps` their longest autocorrelation time."""
         columns = {**Draws(derived), "log_density": self.log_density.ravel()}
@@ -170,7 +181,7 @@ class Stored:
             rhat=array_stats.rhat(grouped(values), method="rank", **axes),
             ess_bulk=array_stats.ess(values, method="bulk", **axes),
             ess_tail=array_stats.ess(values, method="tail", prob=(0.05, 0.95), **axes),
-            kept=len(self.chain.w) - self.discarded,
+            kept=self.kept,
             tau_steps=tau_steps,
             stuck=stuck_walkers(self.chain, self.discarded),
         )
@@ -179,23 +190,21 @@ class Stored:
 def diagnose(fit: JointFit, start: ImportanceRun, chain: Chain) -> Posterior:
     """Leave out the warm-up, thin, and judge what is left.
 
-    Coordinates are judged first. Where they are in order, each draw gets errors at places, a density's work each, and
-    all is judged again; else they are nought, in draws that must not be used.
+    Where the chain is long enough for its autocorrelation times each draw gets errors at places, a density's work each;
+    else they are nought, in draws that must not be used.
     """
     stored = Stored.of(fit, start, chain)
     walkers, draws = stored.log_density.shape
-    tau_steps = autocorrelation_steps(chain.w[stored.discarded :])
-    none = no_draw(walkers * draws, fit.arrays)
-    derived = derived_of(fit, stored.z, none.reshape(walkers, draws, -1))
-    quality = stored.quality(fit, derived, tau_steps)
-    missing, same, first = quality.missing, None, start.posterior
-    if not missing:
+    tau_steps, first = autocorrelation_steps(chain.w[stored.discarded :]), start.posterior
+    errors_rad = no_draw(walkers * draws, fit.arrays)
+    if stored.kept >= TAU_LIMIT * tau_steps:
         normal = place_normals(walkers * draws, fit, np.random.default_rng([first.seed, 5]))
-        seen = Target(fit, start.path).valued(stored.w.reshape(walkers * draws, -1), normal)
-        derived = derived_of(fit, stored.z, seen.place_errors_rad.reshape(walkers, draws, -1))
-        quality = stored.quality(fit, derived, tau_steps)
-        missing = quality.missing
-        same = agreement(first, derived, headline_names(fit)) if first.converged else None
+        errors_rad = Target(fit, start.path).valued(stored.w.reshape(walkers * draws, -1), normal).place_errors_rad
+    derived = derived_of(fit, stored.z, errors_rad.reshape(walkers, draws, -1))
+    quality = stored.quality(fit, derived, tau_steps)
+    missing, same = quality.missing, None
+    if not missing and first.converged:
+        same = agreement(first, derived, headline_names(fit))
     if same is not None and not same.agrees:
         gap = f"by {same.worst.value:.1f} Monte Carlo errors, wanted below {AGREEMENT_LIMIT:g}"
         missing.append(f"emcee and importance sampling differ on {same.worst.quantity} {gap}")

@@ -15,7 +15,7 @@ import numpy as np
 from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.model.compiled import BATCH
 from tvsbayes.posterior.chain import Chain, write_chain
-from tvsbayes.posterior.diagnosis import GROUPS, TAU_LIMIT, diagnose, wanted_ess
+from tvsbayes.posterior.diagnosis import GROUPS, TAU_LIMIT, diagnose, steps_wanted, wanted_ess
 from tvsbayes.posterior.draws import Posterior
 from tvsbayes.posterior.importance import ImportanceRun
 from tvsbayes.posterior.proposal import Independence, Target
@@ -32,6 +32,8 @@ lost: local steps lead out of there. With a tenth of them chains of the paper's 
 FIRST_CHECK = 200
 GROWTH_RANGE = 1.1, 1.6
 """Steps at the first look at convergence; least and largest growth of the chain from one look to the next."""
+LENGTHENING_RANGE = 1.05, 1.6
+"""The same where only autocorrelation times were looked at, which takes little."""
 MARGIN = 1.1
 """On the steps that a look says are needed."""
 SETTLED = 4
@@ -70,8 +72,8 @@ def moves(proposal: Independence) -> list[tuple[emcee.moves.Move, float]]:
 
 
 def walkers_for(dimension: int) -> int:
-    """Ensemble size: more walkers than dimensions, whole batches in each half, whole groups in each half."""
-    return max(WALKERS, 2 * BATCH * -(-(dimension + 1) // (2 * BATCH)))
+    """Ensemble size: at least half as many walkers as dimensions, whole batches and whole groups in each half."""
+    return max(WALKERS, 2 * BATCH * -(-dimension // (4 * BATCH)))
 
 
 def lengthening(fit: JointFit, found: Convergence) -> float:
@@ -165,11 +167,20 @@ class Run:
             self.goal = next_look(self.fit, chain, found)
         return posterior, False
 
+    def too_short(self) -> bool:
+        """Whether autocorrelation times alone ask for more steps; then the next look is set."""
+        chain = self.chain()
+        growth = steps_wanted(chain) / len(chain.w)
+        if growth <= 1:
+            return False
+        self.goal = int(np.ceil(len(chain.w) * np.clip(growth, *LENGTHENING_RANGE)))
+        return True
+
     def until_converged(self, seconds: float) -> Posterior:
         """Extend, look, extend."""
         done, towards = len(self.before.w), OpenEnded()
         # An interrupted chain is first brought to its next look: it ends where an unbroken run ends.
-        if done >= self.goal:
+        if done >= self.goal and not self.too_short():
             posterior, ended = self.look()
             if ended:
                 return posterior
@@ -180,7 +191,7 @@ class Run:
                 done += steps
                 elapsed = time.monotonic() - self.began
                 over = elapsed > seconds
-                if done >= self.goal or over:
+                if over or (done >= self.goal and not self.too_short()):
                     posterior, ended = self.look()
                     if ended or over:
                         self.save()

@@ -47,24 +47,43 @@ class Tables:
         mean = density @ x
         return mean, np.sqrt(density @ x**2 - mean**2)
 
+    @cached_property
+    def reached(self) -> np.ndarray:
+        """Probability below each node but the last, shape (h, nodes - 1)."""
+        return np.concatenate([np.zeros((len(self.masses), 1)), np.cumsum(self.masses, axis=1)[:, :-1]], axis=1)
+
     def at(self, w: np.ndarray) -> np.ndarray:
         """Log densities of w (n, h)."""
-        every = zip(w.T, self.log_density, strict=True)
-        found = [np.interp(x, NODES, line, left=-np.inf, right=-np.inf) for x, line in every]
-        return np.reshape(np.transpose(found), w.shape)
+        return _line_at(w, self.log_density)
 
     def draw(self, share: np.ndarray) -> np.ndarray:
         """Points (n, h) below which these shares (n, h) of the densities lie."""
-        found = np.empty(share.shape)
-        for k, line in enumerate(self.log_density):
-            reached = np.concatenate([[0.0], np.cumsum(self.masses[k])])
-            node = np.clip(np.searchsorted(reached, share[:, k], side="right") - 1, 0, len(NODES) - 2)
-            low, slope = line[node], np.diff(line)[node] / STEP
-            rest = (share[:, k] - reached[node]) * np.exp(-low)
-            steep = np.abs(slope) > 1e-9
-            along = np.where(steep, np.log1p(rest * slope) / np.where(steep, slope, 1.0), rest)
-            found[:, k] = NODES[node] + np.clip(along, 0.0, STEP)
-        return found
+        return _point_below(share, self.log_density, self.reached)
+
+
+def _line_at(w: np.ndarray, lines: np.ndarray) -> np.ndarray:
+    """Values of broken lines (..., h, nodes) at w (n, h), -inf outside the nodes."""
+    place = (w - NODES[0]) / STEP
+    node = np.clip(np.nan_to_num(place).astype(int), 0, len(NODES) - 2)
+    low, high = (_at_node(lines, node + k) for k in (0, 1))
+    inside = (w >= NODES[0]) & (w <= NODES[-1])
+    return np.where(inside, low + (place - node) * (high - low), -np.inf)
+
+
+def _at_node(rows: np.ndarray, node: np.ndarray) -> np.ndarray:
+    """Entries `node` (n, h) of rows (..., h, nodes)."""
+    return np.take_along_axis(np.broadcast_to(rows, (*node.shape, rows.shape[-1])), node[..., None], axis=-1)[..., 0]
+
+
+def _point_below(share: np.ndarray, lines: np.ndarray, reached: np.ndarray) -> np.ndarray:
+    """Points below which shares (n, h) lie of densities by their log (..., h, nodes), `reached` below each node."""
+    node = np.sum(share[..., None] >= reached, axis=-1) - 1
+    low, above = _at_node(lines, node), _at_node(lines, node + 1)
+    slope = (above - low) / STEP
+    rest = (share - _at_node(reached, node)) * np.exp(-low)
+    steep = np.abs(slope) > 1e-9
+    along = np.where(steep, np.log1p(rest * slope) / np.where(steep, slope, 1.0), rest)
+    return NODES[node] + np.clip(along, 0.0, STEP)
 
 
 LEADER_NODES = np.linspace(-4.0, 4.0, 11)
@@ -92,14 +111,17 @@ class Followers:
         node = np.minimum(at.astype(int), len(LEADER_NODES) - 2)
         return node, at - node
 
+    @cached_property
+    def tables(self) -> list[Tables]:
+        """Of each follower, a row for every node of its leader."""
+        return [Tables(rows) for rows in self.log_density]
+
     def at(self, w: np.ndarray) -> np.ndarray:
         """Log densities of the followers, shape (n, f), of tabulated coordinates w (n, h)."""
         found = np.empty((len(w), len(self.leader)))
         for k, (leader, follower) in enumerate(zip(self.leader, self.follower, strict=True)):
             node, above = self.share(w[:, leader])
-            rows = Tables(self.log_density[k]).at(np.repeat(w[:, [follower]], len(LEADER_NODES), axis=1))
-            every = np.arange(len(w))
-            low, high = rows[every, node], rows[every, node + 1]
+            low, high = (_line_at(w[:, follower], self.log_density[k][node + step]) for step in (0, 1))
             with np.errstate(divide="ignore"):
                 found[:, k] = np.logaddexp(np.log1p(-above) + low, np.log(above) + high)
         return found
@@ -110,6 +132,6 @@ class Followers:
         for k, (leader, follower) in enumerate(zip(self.leader, self.follower, strict=True)):
             node, above = self.share(w[:, leader])
             chosen = node + (chance[:, k] < above)
-            rows = Tables(self.log_density[k]).draw(np.repeat(share[:, [follower]], len(LEADER_NODES), axis=1))
-            found[:, follower] = rows[np.arange(len(w)), chosen]
+            table = self.tables[k]
+            found[:, follower] = _point_below(share[:, follower], table.log_density[chosen], table.reached[chosen])
         return found

@@ -14,6 +14,7 @@ from dataclasses import dataclass, fields, replace
 from functools import cached_property
 
 import numpy as np
+from scipy.linalg import lapack
 
 from tvsbayes.instrument.parameters import BLOCKS, INDEX, NAMES, NOISE_NAMES, names_of
 from tvsbayes.model.gear_kriging import scales_at
@@ -31,6 +32,8 @@ GEAR_SCALES = np.array(
 """Coordinates of what the covariance of the errors at places depends on."""
 LEAST_SCALE = 1e-6
 """Of a noise scale over that at the mode: what is smaller moves nothing."""
+FAR_ABOVE = 1e200
+"""A last diagonal element that keeps a matrix positive definite whatever stands in its row; nothing reads its root."""
 BLOCK_ROWS = 256
 """Points that are mapped at a time: their matrices take 64 MB at most."""
 STRETCH_NODES = (-2.0, 0.0, 2.0, 4.0, 6.0)
@@ -58,13 +61,10 @@ class Conditional:
     factor: np.ndarray
     shift: np.ndarray
 
-
-@dataclass(frozen=True)
-class Quadratic:
-    """A normal density by its precision (n, g, g) and its slope at nought (n, g)."""
-
-    precision: np.ndarray
-    score: np.ndarray
+    def solved(self, right: np.ndarray) -> np.ndarray:
+        """Back substitution for y in factor' y = right, shape (n, g): NumPy's solver would factorise anew."""
+        pairs = zip(self.factor, right, strict=True)
+        return np.array([lapack.dtrtrs(factor.T, each)[0] for factor, each in pairs]).reshape(right.shape)
 
 
 @dataclass(frozen=True)
@@ -229,26 +229,34 @@ class Transport:
         scales = scales_at(values, self.period_deg)
         return np.asarray(place_root(scales, self.place_angle_rad, self.place_on_tilt, self.place_valid, np))
 
-    def _quadratic(self, noise: np.ndarray) -> Quadratic:
-        """What the linearised campaign and the prior say of y at noise coordinates (n, q)."""
+    def _conditional(self, noise: np.ndarray, score_at_mode: np.ndarray) -> Conditional:
+        """What the linearised campaign and the prior say of y at noise coordinates (n, q), slopes from one at the mode.
+
+        One factor of the precision of states and y together, with the slope as a last row: its parts of y are the
+        factor and the forward solution that are wanted, the states integrated out (Schur complement).
+        """
         log_scale = self._log_scale(noise)
         weight = np.exp(-2 * log_scale @ self.pixels)[:, None, None]
-        stops = len(self.constant)
-        right = np.column_stack([self.load.T, self.state_score])
+        stops, states, last = len(self.constant), len(self.states), len(self.states) + len(self.known)
         # Errors at places in units of their prior sds: their covariance may be as good as singular.
-        turn = np.zeros((len(noise), *self.states.shape))
+        turn = np.zeros((len(noise), states, states))
         own = np.arange(stops)
         turn[:, own, own] = 1.0
         turn[:, stops:, stops:] = self._place_roots(log_scale)
-        back = np.swapaxes(turn, 1, 2)
-        right = back @ right
-        inner = weight * (back @ self.states @ turn)
-        inner[:, own, own] += 1 / (np.exp(2 * log_scale) @ self.variance.T + self.constant)
-        places = np.arange(stops, len(self.states))
-        inner[:, places, places] += 1.0
-        explained = weight**2 * (np.swapaxes(right[..., :-1], 1, 2) @ np.linalg.solve(inner, right))
-        precision = self.prior + weight * self.known - explained[..., :-1]
-        return Quadratic(precision, weight[..., 0] * self.score - explained[..., -1])
+        back = weight * np.swapaxes(turn, 1, 2)
+        whole = np.zeros((len(noise), last + 1, last + 1))
+        # Below the diagonal alone: nothing above it is read.
+        whole[:, :states, :states] = back @ self.states @ turn
+        whole[:, own, own] += 1 / (np.exp(2 * log_scale) @ self.variance.T + self.constant)
+        places = np.arange(stops, states)
+        whole[:, places, places] += 1.0
+        whole[:, states:last, :states] = np.swapaxes(back @ self.load.T, 1, 2)
+        whole[:, states:last, states:last] = self.prior + weight * self.known
+        whole[:, last, :states] = back @ self.state_score
+        whole[:, last, states:last] = weight[:, 0] * self.score - score_at_mode
+        whole[:, last, last] = FAR_ABOVE
+        root = np.linalg.cholesky(whole)
+        return Conditional(root[:, states:last, states:last], root[:, last, states:last])
 
     def _log_width(self, noise: np.ndarray) -> np.ndarray:
         """From the table, at noise coordinates (n, q), shape (n, d): lines between the nodes and above the last."""
@@ -261,17 +269,15 @@ class Transport:
 
     @cached_property
     def _score_at_mode(self) -> np.ndarray:
-        return self._quadratic(np.zeros((1, len(self.noise)))).score
+        found = self._conditional(np.zeros((1, len(self.noise))), np.zeros(len(self.known)))
+        return found.factor[0] @ found.shift[0]
 
     def conditional(self, noise: np.ndarray) -> Conditional:
         """The normal density of y at noise coordinates (n, q), its mean at the mode where the scales are those.
 
         Without stop errors there is none: see `stretch`.
         """
-        found = self._quadratic(noise)
-        factor = np.linalg.cholesky(found.precision)
-        shift = np.linalg.solve(factor, (found.score - self._score_at_mode)[..., None])[..., 0]
-        return Conditional(factor, shift)
+        return self._conditional(noise, self._score_at_mode)
 
     def mapped(self, w: np.ndarray) -> Mapped:
         """From w (n, d) to z with the Jacobian; noise coordinates are the same in w and y, the shear keeps volumes."""
@@ -284,12 +290,11 @@ class Transport:
         y, log_jacobian = w * np.exp(log_width), log_width.sum(axis=1)
         if len(self.states):
             found = self.conditional(noise)
-            straight = (y[:, count:] + found.shift)[..., None]
-            y[:, count:] = np.linalg.solve(np.swapaxes(found.factor, 1, 2), straight)[..., 0]
+            y[:, count:] = found.solved(y[:, count:] + found.shift)
             log_jacobian -= np.log(np.diagonal(found.factor, axis1=1, axis2=2)).sum(axis=1)
         for place, form in zip(self.narrow, self.bend, strict=True):
             before = y[:, :place]
-            y[:, place] -= 0.5 * np.sum((before @ form[:place, :place]) * before, axis=1)
+            y[:, place] -= 0.5 * np.einsum("ni,ni->n", before @ form[:place, :place], before)
         return Mapped(self.from_whitened(y), log_jacobian)
 
     def to_w(self, z: np.ndarray) -> np.ndarray:
@@ -302,7 +307,7 @@ class Transport:
         straight = y.copy()
         for place, form in zip(self.narrow, self.bend, strict=True):
             before = y[:, :place]
-            straight[:, place] += 0.5 * np.sum((before @ form[:place, :place]) * before, axis=1)
+            straight[:, place] += 0.5 * np.einsum("ni,ni->n", before @ form[:place, :place], before)
         # Noise coordinates are neither bent nor turned nor stretched: they are known before anything is undone.
         count = len(self.noise)
         noise = straight[:, self.noise]

@@ -78,10 +78,18 @@ FAULTS = (
     Fault(
         "stop errors as if pixels were always as at the mode",
         "posterior/transport.py",
-        "inner = weight * (back @ self.states @ turn)",
-        "inner = 1.0 * (back @ self.states @ turn)",
+        "back = weight * np.swapaxes(turn, 1, 2)",
+        "back = np.swapaxes(turn, 1, 2)",
         "campaigns with few stops are sampled many times slower",
         ("posterior/transport::test_the_precision_at_other_noise_scales_is_the_smoothers",),
+    ),
+    Fault(
+        "a chain too short for its autocorrelation times counts as long enough",
+        "posterior/ensemble.py",
+        "        if growth <= 1:\n",
+        "        if growth > 1:\n",
+        "a chain that is long enough is lengthened, and one that is not is judged at its full price",
+        ("posterior/ensemble::test_a_chain_is_lengthened_as_its_autocorrelation_asks",),
     ),
     Fault(
         "log-Jacobian of the transport dropped",
