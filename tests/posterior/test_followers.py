@@ -11,7 +11,7 @@ from support.small_posterior import SIGMAS
 from support.tabulated import tabulated
 
 from tvsbayes.posterior.proposal import Independence, first_proposal
-from tvsbayes.posterior.tables import LEADER_NODES, NODES, Followers, Tables
+from tvsbayes.posterior.tables import CUT_NODES, LEADER_NODES, NODES, Followers, Tables, between_cuts
 
 GRID = np.linspace(-12.0, 16.0, 561)
 
@@ -115,3 +115,20 @@ def test_fitting_tilts_the_tables_of_followers():
     assert np.abs(found - proposal.followers.log_density[0][:, inside]).max() > 0.5
     masses = Tables(fitted.followers.log_density[0]).masses.sum(axis=1)
     np.testing.assert_allclose(masses, 1.0, rtol=1e-9)
+
+
+def test_between_cuts_a_density_goes_on_as_it_does_at_them():
+    """A normal density exactly; Gumbel's, a noise scale's, twice as well as by lines; none where the target has none."""
+    parabola, width = -0.5 * ((NODES - 0.3) / 0.9) ** 2, 0.8
+    gumbel = -NODES / width - np.exp(-NODES / width)
+    cuts = np.isin(NODES, CUT_NODES)
+    found = between_cuts(np.array([parabola, gumbel])[:, cuts])
+    np.testing.assert_array_equal(found[:, cuts], [parabola[cuts], gumbel[cuts]])
+    # Rounding of the largest value, some operations long.
+    np.testing.assert_allclose(found[0], parabola, atol=64 * np.spacing(np.abs(parabola).max()))
+    line = np.interp(NODES, CUT_NODES, gumbel[cuts])
+    near = ~cuts & (gumbel > gumbel.max() - 8)
+    assert np.all(np.abs(found[1] - gumbel)[near] <= 0.5 * np.abs(line - gumbel)[near])
+    some = between_cuts(np.where(CUT_NODES < 3, parabola[cuts], np.nan))
+    np.testing.assert_array_equal(np.isfinite(some), NODES < 2.5)
+    assert not np.isfinite(between_cuts(np.full((2, len(CUT_NODES)), -np.inf))).any()

@@ -16,7 +16,7 @@ from scipy import special
 from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.estimators.likelihood import evaluate, no_draw
 from tvsbayes.model.compiled import in_batches
-from tvsbayes.posterior.tables import LEADER_NODES, NODES, Followers, Tables
+from tvsbayes.posterior.tables import CUT_NODES, LEADER_NODES, NODES, Followers, Tables, between_cuts
 from tvsbayes.posterior.transport import Mapped, Transport
 
 HEAVY_DOF = 5.0
@@ -329,16 +329,16 @@ def first_proposal(
         pairs: of heavy coordinates, leader and follower: a cut through the plane of both.
     """
     places = np.flatnonzero(heavy)
-    along = np.zeros((len(places), len(NODES), dimension))
-    along[np.arange(len(places)), :, places] = NODES
-    planes = np.zeros((len(pairs), len(LEADER_NODES), len(NODES), dimension))
+    along = np.zeros((len(places), len(CUT_NODES), dimension))
+    along[np.arange(len(places)), :, places] = CUT_NODES
+    planes = np.zeros((len(pairs), len(LEADER_NODES), len(CUT_NODES), dimension))
     for k, (leading, following) in enumerate(pairs):
         planes[k, :, :, leading] = LEADER_NODES[:, None]
-        planes[k, :, :, following] = NODES
+        planes[k, :, :, following] = CUT_NODES
     points = np.concatenate([along.reshape(-1, dimension), planes.reshape(-1, dimension)])
     cuts = target(points) if len(points) else np.zeros(0)
     lines, rows = np.split(cuts, [along.shape[0] * along.shape[1]])
-    lines, rows = lines.reshape(along.shape[:2]), rows.reshape(planes.shape[:3])
+    lines, rows = between_cuts(lines.reshape(along.shape[:2])), between_cuts(rows.reshape(planes.shape[:3]))
     row_of = {int(place): row for row, place in enumerate(places)}
     leader, follower = (np.array([row_of[pair[k]] for pair in pairs], dtype=int) for k in range(2))
     for k in range(len(pairs)):

@@ -12,9 +12,26 @@ import numpy as np
 
 NODES = np.linspace(-8.0, 12.0, 41)
 """Of the tabulated densities, in w. Noise scales have their long tail above."""
+CUT_NODES = NODES[::2]
+"""Where the target is cut: its logarithm is smooth."""
 STEP = float(NODES[1] - NODES[0])
 FLOOR = -40.0
 """Of a tabulated log density below its largest: what lies lower is never drawn, and nought has no logarithm."""
+
+
+def between_cuts(log_density: np.ndarray) -> np.ndarray:
+    """Log densities at `NODES` from those at `CUT_NODES` (..., cuts); -inf beside where none is.
+
+    By Akima's (1970) cubics, exact for parabolas. They are local: the map's own tables bend at nodes.
+    """
+    from scipy.interpolate import Akima1DInterpolator
+
+    none = ~np.isfinite(log_density)
+    least = np.min(np.where(none, np.inf, log_density), axis=-1, keepdims=True)
+    seen = np.where(none, np.where(np.isfinite(least), least, 0.0), log_density)
+    beside = np.zeros((*none.shape[:-1], len(NODES)), dtype=bool)
+    beside[..., ::2], beside[..., 1::2] = none, none[..., :-1] | none[..., 1:]
+    return np.where(beside, -np.inf, Akima1DInterpolator(CUT_NODES, seen, axis=-1)(NODES))
 
 
 @dataclass(frozen=True)
