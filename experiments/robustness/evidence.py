@@ -94,6 +94,8 @@ def joint_coverage(rows: list[dict]) -> tuple[str, bool]:
 
 def protocol_coverage(protocol: str, rigs: int, accepted: list[dict]) -> tuple[str, bool]:
     """Of the 95 % intervals of the headlines that the accepted of so many rigs learned something about."""
+    if not accepted:
+        return f"{protocol}, none of {rigs} rigs accepted: nothing to judge", False
     low, high = binomial_bounds(len(accepted), LEVEL)
     entries = {name: [found[name] for found in accepted] for name in HEADLINES}
     shares = {

@@ -136,6 +136,7 @@ def test_a_campaign_has_the_title_that_somebody_chose():
     campaign = dataclasses.replace(small_campaign(), path=Path("/data/rig 7"))
     for name, title in (
         ("bench B", "bench B"),
+        ("my rig", "rig 7"),
         ("my campaign", "rig 7"),
         ("acquired campaign", "rig 7"),
         ("", "rig 7"),

@@ -141,6 +141,7 @@ def test_causes_and_parameters_are_called_by_words():
     assert len(set(tables[-len(RIG_NAMES) :])) == len(RIG_NAMES)
     assert share_in_words("prior of laser_tilt_deg") == "prior of the laser's direction"
     assert source_in_words("prior of laser_tilt_deg.x") == "prior of the laser's direction, x, deg"
+    assert source_in_words("prior of something else") == "prior of something else"
     assert source_in_words("prior of ln stop_sd_deg.up") == "prior of ln scatter of stops, up, deg"
     assert source_in_words("pixel noise") == share_in_words("pixel noise") == "pixel noise"
     assert told["prior of mirror2_error_deg"] == "the angle of mirror 2 as stated beforehand (mirror2_error_deg)"

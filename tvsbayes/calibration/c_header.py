@@ -59,7 +59,7 @@ def _origin_lines(calibration: Calibration, origin: Origin | None) -> str:
     """Lines of the comment that say of what the header is; names come from strangers."""
     if origin is None:
         return " * Of a calibration without a campaign."
-    name = _UNCOMMENTED.sub("_", origin.campaign) or "without a name"
+    name = _UNCOMMENTED.sub("_", origin.campaign)
     sha256 = content_sha256(cast(Mapping[str, object], calibration_json(calibration)))
     measured = origin.measured or "on a day that nobody recorded"
     told = f"Campaign: {name}, measured {measured}; exported {origin.exported} by tvsbayes {origin.tvsbayes}."

@@ -23,7 +23,7 @@ from tvsbayes.calibration.gear_table import NO_GEARS, table_of
 from tvsbayes.calibration.optics import ERROR_AT, PLAY_AT
 from tvsbayes.calibration.pointing import INPUT_NAMES, NOISE_NAMES, Calibration
 from tvsbayes.errors import InputError, escaped, refusal
-from tvsbayes.files.disk import read_arrays, read_bytes
+from tvsbayes.files.disk import RESULTS_BYTES_MAX, read_arrays, read_bytes
 from tvsbayes.files.documents import parse_json
 from tvsbayes.instrument.axes import AXES
 from tvsbayes.instrument.campaign import Campaign, input_hashes
@@ -33,8 +33,6 @@ FORMATS = ("tvsbayes-calibration/1", CALIBRATION_FORMAT)
 """What is read; the first one knows no errors of the gears."""
 NO_CALIBRATION = "no-calibration"
 """Code of the refusal of results that are whole but hold no calibration."""
-RESULTS_BYTES_MAX = 64 * 1024 * 1024
-UNPACKED_BYTES_MAX = 2 * RESULTS_BYTES_MAX
 NAME_CHARS_MAX = 200
 _ARRAYS = ("mean", "covariance", "range_steps", "inputs", "noise", "cause_covariance")
 
@@ -299,7 +297,7 @@ def _shaped(calibration: Calibration) -> Calibration:
 def read_draws(path: Path) -> Calibration:
     """Read `draws.npz`; errors as in `load_calibration`."""
     try:
-        file = read_arrays(path, RESULTS_BYTES_MAX, UNPACKED_BYTES_MAX)
+        file = read_arrays(path, RESULTS_BYTES_MAX)
         if "format" not in file and "physical" in file:
             raise InputError(
                 NO_CALIBRATION,
@@ -408,7 +406,7 @@ def stored_ratios(campaign: Campaign) -> np.ndarray:
         raise damaged_calibration(Path("draws.npz"), "the campaign has no folder")
     path = campaign.path / "results" / "draws.npz"
     try:
-        file = read_arrays(path, RESULTS_BYTES_MAX, UNPACKED_BYTES_MAX)
+        file = read_arrays(path, RESULTS_BYTES_MAX)
         draws = np.array(file["effective_deg_per_step"], dtype=float)
     except (KeyError, TypeError, ValueError) as error:
         raise damaged_calibration(path, error) from error

@@ -31,6 +31,8 @@ if TYPE_CHECKING:
 
 FLUSHES_NO_FOLDER = frozenset({errno.EINVAL, errno.ENOTSUP})
 """How a file system (some network shares) says that it can flush files only, fsync(2): its own order has to do."""
+RESULTS_BYTES_MAX = 128 * 1024 * 1024
+"""Of a file of results, and of its arrays unpacked."""
 ARRAYS_MAX = 256
 _NPY_HEADER = re.compile(
     rb"\x93NUMPY\x01\x00(?P<length>..)\{'descr': '(?P<kind>[<>|][biufU][0-9]{1,8})', 'fortran_order': "
@@ -285,7 +287,7 @@ def _array_of(content: bytes, name: str) -> np.ndarray:
     return array.reshape(shape, order="F" if match["fortran"] == b"True" else "C").copy()
 
 
-def read_arrays(path: Path, bytes_max: int, unpacked_max: int) -> dict[str, np.ndarray]:
+def read_arrays(path: Path, bytes_max: int) -> dict[str, np.ndarray]:
     """The arrays of an .npz, by name; every size is checked against the header before anything is allocated.
 
     `numpy.load` alone turns 0.5 kB into gigabytes: by entries of no width, and by bzip2 members, which zipfile
@@ -293,15 +295,15 @@ def read_arrays(path: Path, bytes_max: int, unpacked_max: int) -> dict[str, np.n
 
     Raises:
         InputError: what `read_bytes` refuses.
-        ValueError: no .npz of plain numbers and text as NumPy writes it, or more than `unpacked_max` bytes.
+        ValueError: no .npz of plain numbers and text as NumPy writes it, or more than `bytes_max` bytes, packed or not.
     """
     data = read_bytes(path, bytes_max)
     arrays = {}
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             members = archive.infolist()
-            if len(members) > ARRAYS_MAX or sum(member.file_size for member in members) > unpacked_max:
-                raise ValueError(f"more than {ARRAYS_MAX} arrays or {unpacked_max} bytes when unpacked")
+            if len(members) > ARRAYS_MAX or sum(member.file_size for member in members) > bytes_max:
+                raise ValueError(f"more than {ARRAYS_MAX} arrays or {bytes_max} bytes when unpacked")
             for member in members:
                 if member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
                     raise ValueError("an array that is packed in another way than numpy packs it")

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
@@ -73,8 +73,17 @@ class Spot:
 
 NAME_ACQUIRED = "acquired campaign"
 """Of a run whose rig file has no name."""
-NAMES_BY_DEFAULT = (NAME_ACQUIRED, "my campaign")
-"""Names that nobody chose; the second is that of earlier templates."""
+NAMES_BY_DEFAULT = (NAME_ACQUIRED, "my rig", "my axis", "my campaign")
+"""Names that nobody chose: those of templates, the last of earlier ones."""
+
+
+def title_of(header: Mapping[str, object], path: Path | None) -> str:
+    """The name in a header that somebody gave, else its folder's, without line breaks."""
+    name = str(header.get("name") or "").strip()
+    if name and name not in NAMES_BY_DEFAULT:
+        return name
+    folder = "" if path is None else escaped(path.resolve().name, 200)
+    return folder or name or "without a name"
 
 
 @dataclass(frozen=True, repr=False)
@@ -91,11 +100,7 @@ class Campaign(Shown):
     @property
     def title(self) -> str:
         """What readers call it: the name that somebody gave it, else its folder's."""
-        name = str(self.header.get("name") or "").strip()
-        if name and name not in NAMES_BY_DEFAULT:
-            return name
-        folder = "" if self.path is None else escaped(self.path.resolve().name, 200)
-        return folder or name or "without a name"
+        return title_of(self.header, self.path)
 
     def shown(self) -> View:
         """Counts, and the looks with the counters behind them."""

@@ -134,7 +134,7 @@ def stored_chain(path: Path, fit: JointFit, seed: int) -> tuple[ImportanceRun, C
     if not path.exists():
         raise InputError("no-chain", f"{name}: there is no chain to resume", file=name, remedy="run without --resume")
     try:
-        stored = read_arrays(path, CHAIN_BYTES_MAX, CHAIN_BYTES_MAX)
+        stored = read_arrays(path, CHAIN_BYTES_MAX)
         found = str(stored["format"])[:60]
         if found.startswith(CHAIN_KIND) and found != CHAIN_FORMAT:
             raise InputError(

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tvsbayes.errors import escaped
+from tvsbayes.instrument.campaign import title_of
 from tvsbayes.report.axis_text import (
     deviation_table,
     iso230_table,
@@ -100,7 +101,7 @@ def axis_page(results: AxisResults, issue: Issue) -> Page:
     folder = "AXIS" if fit.campaign.path is None else shlex.quote(escaped(fit.campaign.path.resolve().name, 200))
     page = Page(
         results=hashlib.sha256(said.encode()).hexdigest()[:NUMBER_DIGITS].upper(),
-        name=str(header.get("name") or "axis without a name"),
+        name=title_of(header, fit.campaign.path),
         about=about_table(header, str(created) if created else "", issue),
         verdict=f"{converged} No limit was stated." if summary.converged else converged,
         verdict_class="cannot-tell" if summary.converged else "not-met",

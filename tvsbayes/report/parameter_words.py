@@ -29,7 +29,7 @@ IN_WORDS = {
     "aperture_sd_deg": "the scatter of aperture readings",
     "harmonic_deg": "the periodic error of the gears",
     "transmission_error_deg": "the transmission error, sd",
-    "transmission_error_length_deg": "the angle over which it changes",
+    "transmission_error_length_deg": "the angle over which the transmission error changes",
     "play_variation_deg": "the variation of play, sd",
     "drift_deg_per_root_hour": "the drift in a root hour, sd",
     "harmonic_amplitude_deg": "the amplitude of a periodic error",
@@ -55,9 +55,11 @@ def name_in_words(name: str) -> str:
 
 def source_in_words(source: str) -> str:
     """A row of a budget for readers, with part and unit: a parameter, the prior of one; others stay."""
-    for begin, told in (("prior of ln ", "prior of ln "), ("prior of ", "prior of the ")):
+    for begin, article in (("prior of ln ", ""), ("prior of ", "the ")):
         if source.startswith(begin):
-            return told + name_in_words(source.removeprefix(begin))
+            name = source.removeprefix(begin)
+            told = name_in_words(name)
+            return begin + article * (told != name) + told
     return name_in_words(source)
 
 

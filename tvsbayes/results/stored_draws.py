@@ -13,14 +13,12 @@ from pathlib import Path
 import numpy as np
 
 from tvsbayes.calibration.calibration_file import (
-    RESULTS_BYTES_MAX,
-    UNPACKED_BYTES_MAX,
     calibration_bytes,
     damaged_calibration,
     stored_calibration,
 )
 from tvsbayes.calibration.pointing import Calibration
-from tvsbayes.files.disk import make_folder, read_arrays, write_atomically
+from tvsbayes.files.disk import RESULTS_BYTES_MAX, make_folder, read_arrays, write_atomically
 from tvsbayes.instrument.axes import AXES, SENSES
 from tvsbayes.instrument.campaign import Campaign
 from tvsbayes.instrument.homing import ANYWHERE
@@ -127,7 +125,7 @@ def stored_mode(campaign: Campaign) -> StoredMode | None:
         return None
     path = campaign.path / "results" / "draws.npz"
     try:
-        file = read_arrays(path, RESULTS_BYTES_MAX, UNPACKED_BYTES_MAX)
+        file = read_arrays(path, RESULTS_BYTES_MAX)
         if "mode_z" not in file:
             return None
         found = {name: np.array(file[f"mode_{name}"], dtype=float) for name in _MODE_ARRAYS}

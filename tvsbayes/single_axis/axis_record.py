@@ -10,7 +10,7 @@ import numpy as np
 
 from tvsbayes.display import Shown, View
 from tvsbayes.errors import InputError, NothingToEstimate, TvsError, listed
-from tvsbayes.files.disk import make_folder, read_arrays, write_atomically
+from tvsbayes.files.disk import RESULTS_BYTES_MAX, make_folder, read_arrays, write_atomically
 from tvsbayes.progress import Show
 from tvsbayes.results.estimates import CONTRACTION_LIMIT, Estimate
 from tvsbayes.results.fit_record import provenance
@@ -22,7 +22,6 @@ from tvsbayes.single_axis.axis_rows import AxisRows
 from tvsbayes.single_axis.classic_line import ClassicAxis, classic_axis
 
 AXIS_FIT_FORMAT = "tvsbayes-axis-fit/1"
-DRAWS_BYTES_MAX = 64 * 1024 * 1024
 POSITIONS_FEW = 5
 """Below it a process of position is mostly its prior."""
 REVERSED = 0.975
@@ -325,7 +324,7 @@ def results_for(
         again = "run `tvsbayes fit` again"
         summary = read_record(AxisSummary, document, again)
         model = model_of(campaign, more)
-        arrays = read_arrays(campaign.path / "results" / "draws.npz", DRAWS_BYTES_MAX, 4 * DRAWS_BYTES_MAX)
+        arrays = read_arrays(campaign.path / "results" / "draws.npz", RESULTS_BYTES_MAX)
         w = arrays.get("w")
         if w is None or w.ndim != 2 or w.shape[1] != len(model.coordinates.names) or not np.all(np.isfinite(w)):
             raise InputError("damaged", "results/draws.npz does not fit results/fit.json", remedy=again)

@@ -298,7 +298,7 @@ FAULTS = (
         "cameras/alternate_lines.py",
         "numbers = np.arange(patch.raw.shape[axis]) + patch.corner[1 - axis]",
         "numbers = np.arange(patch.raw.shape[axis])",
-        "odd and even are exchanged from look to look, and the difference they share changes its sign",
+        "odd and even are exchanged from look to look: the difference that is stated changes its sign",
         ("cameras/alternate_lines",),
     ),
     Fault(
