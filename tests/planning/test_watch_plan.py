@@ -71,14 +71,14 @@ def test_independent_stops_add_up_to_the_plan_itself(designs):
     """The information that patterns are searched by, against the moves through the filter."""
     pattern = designs.grown(("d1", "d2"), 4.0)[2]
     limit = np.log(0.01 / len(CHANGES))
-    for homings in (1, 6):
+    for homings in (1, 3):
         np.testing.assert_allclose(designs.powers(pattern, homings), designs.judged(pattern, homings), atol=0.06)
     # More homings with the same looks, never less seen; a turned positioner gains most.
-    few, many = (designs.powers(pattern, homings) for homings in (2, 24))
+    few, many = (designs.powers(pattern, homings) for homings in (1, 7))
     assert np.all(many >= few - 1e-9) and limit < 0
-    one_homing = Pattern({sheet: looks * 12 for sheet, looks in pattern.looks.items()})
+    one_homing = Pattern({sheet: looks * 7 for sheet, looks in pattern.looks.items()})
     turned = NAMES.index("positioner: rotation")
-    assert designs.powers(one_homing, 2)[turned] < many[turned]
+    assert designs.powers(one_homing, 1)[turned] < many[turned]
 
 
 def test_candidates_keep_to_the_limits(designs, watched_fit, monkeypatch):
