@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 from support.dense_likelihood import dense_log_density, physical, play_band_deg, stop_labels
 from support.sloped_density import value_and_gradient
-from support.varying_gears import perfect_gears
 
 from tvsbayes.estimators import likelihood as density
 from tvsbayes.estimators.campaign_arrays import bucket, campaign_arrays, log_constant
@@ -21,6 +20,7 @@ from tvsbayes.instrument.campaign import ordered_spots
 from tvsbayes.instrument.parameters import INDEX, NAMES, RIG_NAMES
 from tvsbayes.instrument.stereo_pair import rotation_matrix
 from tvsbayes.model.compiled import BATCH
+from tvsbayes.model.parameter_space import parameter_space
 from tvsbayes.twin.physics import aperture_angle_deg, mirror_chain, project, to_tvs
 
 pytestmark = pytest.mark.usefixtures("x64")
@@ -116,18 +116,18 @@ def test_a_stop_error_per_pose_is_another_density(dozen, evaluate):
     assert abs(wrong.innovations.log_density - right.innovations.log_density) > 0.5 * LOG_UNIT
 
 
-def test_padding_changes_nothing(dozen, monkeypatch):
-    """Of gears that repeat no error: fits of such compile the density for both lengths."""
-    table = perfect_gears(dozen.campaign.rig)
-    short = campaign_arrays(dozen.campaign, table)
+def test_padding_changes_nothing(grid_campaign, monkeypatch):
+    """Of six places or fewer: fits of such compile the density for both lengths."""
+    space = parameter_space(grid_campaign.rig, grid_campaign.stereo)
+    short = campaign_arrays(grid_campaign)
     monkeypatch.setattr("tvsbayes.estimators.campaign_arrays.SMALLEST_BUCKET", 384)
-    long = campaign_arrays(dozen.campaign, table)
+    long = campaign_arrays(grid_campaign)
     assert long.spots.pixels.shape == (384, 4) and short.spots.pixels.shape == (96, 4)
-    z = np.repeat(random_points(dozen, 1, 0.3), BATCH, axis=0)
-    one, two = (density.evaluate(z, no_draw(BATCH, arrays), dozen.space, arrays) for arrays in (short, long))
+    z = np.repeat(0.3 * np.random.default_rng(31).standard_normal((1, len(NAMES))), BATCH, axis=0)
+    one, two = (density.evaluate(z, no_draw(BATCH, arrays), space, arrays) for arrays in (short, long))
     assert two.log_density[0] == pytest.approx(float(one.log_density[0]), abs=FINE_UNIT, rel=1e-12)
-    assert np.all(long.moves.steps[len(dozen.campaign.moves) :] == long.moves.steps[len(dozen.campaign.moves) - 1])
-    count = len(dozen.campaign.spots)
+    moves, count = len(grid_campaign.moves), len(grid_campaign.spots)
+    assert np.all(long.moves.steps[moves:] == long.moves.steps[moves - 1])
     assert np.all(np.asarray(two.standardised)[0, count:] == 0)
     scale = np.abs(np.asarray(one.standardised)[0]).max()
     np.testing.assert_allclose(two.standardised[0, :count], one.standardised[0, :count], atol=FINE_UNIT * scale)
