@@ -18,6 +18,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -114,9 +115,9 @@ def together(parts: list[tuple[str, bool]]) -> tuple[str, bool]:
     return "; ".join(text for text, _ in parts), all(holds for _, holds in parts)
 
 
-def sampled_coverage(rows: list[dict]) -> tuple[str, bool]:
-    """Coverage of the 95 % intervals by importance sampling, protocol by protocol; what was refused is counted."""
-    chosen = [r for r in rows if r["tier"] == TIERS[0]]
+def sampled_coverage(rows: list[dict], tier: str = TIERS[0]) -> tuple[str, bool]:
+    """Coverage of the 95 % intervals by one tier, protocol by protocol; what was refused is counted."""
+    chosen = [r for r in rows if r["tier"] == tier]
     parts = []
     for protocol in dict.fromkeys(r["protocol"] for r in chosen):
         every = [r for r in chosen if r["protocol"] == protocol]
@@ -276,6 +277,12 @@ LINES = (
         "python -m experiments.gears.repeated_errors run --n 300 --cores 0 1",
         "gears/repeated_errors.jsonl",
         coverage_with_gears,
+    ),
+    Line(
+        "... and by the chain",
+        "python -m experiments.intervals.posterior_coverage run --tier emcee --n 100 --protocols paper --cores 0 1",
+        "intervals/posterior_coverage.jsonl",
+        partial(sampled_coverage, tier=TIERS[1]),
     ),
     Line(
         "Ranks of truths among posterior draws are uniform",
