@@ -69,6 +69,22 @@ def test_followers_go_with_their_leaders():
     assert slope == pytest.approx(-0.8, abs=0.1)
 
 
+def test_new_values_of_some_coordinates_leave_a_pair_as_it_is():
+    """Walkers that begin as draws of a density are draws of it after any number of Metropolis steps."""
+    proposal, generator = followed().turned(np.array([[0.0, 0.3], [0.3, 0.0]])), np.random.RandomState(6)
+    begun = w = proposal.draw(20_000, generator)
+    for _ in range(12):
+        asked, factor = proposal.renewed(w, generator)
+        with np.errstate(over="ignore"):
+            ratio = np.exp(proposal.log_density(asked) - proposal.log_density(w) + factor)
+        w = np.where((generator.uniform(size=len(w)) < ratio)[:, None], asked, w)
+    assert np.mean(w == begun) < 0.1
+    for moment in (lambda v: v, lambda v: v**2, lambda v: np.prod(v, axis=1), lambda v: np.abs(v) > 2):
+        first, last = moment(np.clip(begun, -6, 6)), moment(np.clip(w, -6, 6))
+        scatter = np.sqrt((first.var(axis=0) + last.var(axis=0)) / len(w))
+        assert np.all(np.abs(first.mean(axis=0) - last.mean(axis=0)) < SIGMAS * scatter)
+
+
 def test_between_two_nodes_the_tables_are_mixed():
     followers = followed().followers
     w = np.column_stack([np.full(len(GRID), LEADER_NODES[2] + 0.25 * (LEADER_NODES[1] - LEADER_NODES[0])), GRID])

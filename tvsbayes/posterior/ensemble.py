@@ -23,11 +23,11 @@ from tvsbayes.progress import Advance, OpenEnded
 from tvsbayes.results.convergence import Convergence
 
 WALKERS = 64
-SHARES = (0.65, 0.3, 0.05)
-"""Independence proposal, differential evolution, differential evolution with full steps.
+SHARES = (0.6, 0.35, 0.05)
+"""All coordinates anew from the proposal, some of them, differential evolution.
 
 Where the proposal is too thin a walker stays for as many steps as its weight says, and effective draws of the tails are
-lost: local steps lead out of there. With a tenth of them chains of the paper's twin needed up to five times the steps.
+lost: new values of some coordinates lead out of there. Differential evolution needs no proposal.
 """
 FIRST_CHECK = 200
 GROWTH_RANGE = 1.1, 1.6
@@ -68,7 +68,8 @@ class GroupEvolution(emcee.moves.DEMove):
 
 def moves(proposal: Independence) -> list[tuple[emcee.moves.Move, float]]:
     """The moves and their shares; never emcee 3.1.6's snooker or full-covariance Gaussian (both are biased)."""
-    return list(zip((emcee.moves.MHMove(proposal), GroupEvolution(), GroupEvolution(1.0)), SHARES, strict=True))
+    independent = (emcee.moves.MHMove(each) for each in (proposal, proposal.renewed))
+    return list(zip((*independent, GroupEvolution()), SHARES, strict=True))
 
 
 def walkers_for(dimension: int) -> int:

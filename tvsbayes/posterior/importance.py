@@ -266,10 +266,11 @@ class ImportanceRun:
     pool: Pool
     posterior: Posterior
 
-    @property
+    @cached_property
     def proposal(self) -> Independence:
-        """Fitted to all draws."""
-        return self.pool.next_proposal
+        """Fitted to all draws: a chain that starts from them is right whatever it is proposed."""
+        pool = self.pool
+        return pool.next_proposal.fitted(pool.w, pool.log_target, pool.log_weights)
 
     def starts(self, count: int) -> np.ndarray:
         """Weighted draws of w without replacement, shape (count, d)."""

@@ -31,6 +31,9 @@ COUPLED_SHARE, COUPLED_DOF, COUPLED_WIDTH = 0.2, 10.0, 1.2
 single draws of the paper's protocol carried so much weight that half as many again were needed."""
 INFLATION = 1.03
 """Factor on the proposal's sds: one lighter than the target lets single draws weigh much, and walkers freeze."""
+RENEWED_RANGE = 0.1, 0.6
+"""Share of its coordinates of which a walker asks for new values, where not for all: uniform between these. A draw of
+great weight is left soon: what made it rare is mostly a few coordinates."""
 VARIANCE_RANGE = 0.8, 1.7
 """Of a normal coordinate of the proposal, relative to the Laplace approximation's."""
 TURN_RANGE = 0.4, 2.5
@@ -254,24 +257,60 @@ class Independence:
         partly = np.sqrt(generator.chisquare(COUPLED_DOF, one) / COUPLED_DOF) / COUPLED_WIDTH
         whole = np.sqrt(generator.chisquare(HEAVY_DOF, one) / HEAVY_DOF)
         share = generator.uniform(size=own)
-        tabulated = self.tables.draw(share)
         alone = generator.uniform(size=own) < OWN_SHARE
         chance = generator.uniform(size=one)
-        found = self.mean + self.sd * normal
-        at, sd = self.mean[self.places], self.sd[self.places]
-        single = at + sd * normal[:, self.places] / single
-        # A follower follows its leader, however that was drawn.
-        led = np.where(alone, single, tabulated)
         chances = generator.uniform(size=(count, len(self.followers.leader)))
-        found[:, self.places] = np.where(alone, single, self.followers.drawn(led, share, chances))
+        every = np.ones(normal.shape, dtype=bool)
+        found = self._one_by_one(every, normal, np.where(alone, single, np.nan), share, chances)
         some = np.isin(np.arange(len(self.mean)), self.coupled)
         found = np.where((chance < COUPLED_SHARE) & some, self.mean + self.sd * normal / partly, found)
         return self.to_w(np.where(chance > 1 - HEAVY_SHARE, self.mean + self.sd * normal / whole, found))
+
+    def _one_by_one(
+        self,
+        new: np.ndarray,
+        normal: np.ndarray,
+        narrowed: np.ndarray,
+        share: np.ndarray,
+        chances: np.ndarray,
+        before: np.ndarray | None = None,
+    ) -> np.ndarray:
+        """Coordinates v, each from its own density, of numbers that are already random.
+
+        Args:
+            new: which are drawn, shape (n, d); the others stay as they are in `before`.
+            normal: standard normal, shape (n, d).
+            narrowed: what divides a tabulated coordinate's normal number where its t is asked, else NaN, shape (n, h).
+            share: uniform, of the tables, shape (n, h).
+            chances: likewise, of the followers, shape (n, f).
+            before: the points so far, shape (n, d); None where all are drawn.
+        """
+        found = self.mean + self.sd * normal
+        if before is not None:
+            found = np.where(new, found, before)
+        alone, stays = np.isfinite(narrowed), ~new[:, self.places]
+        single = self.mean[self.places] + self.sd[self.places] * normal[:, self.places] / narrowed
+        led = np.where(alone, single, self.tables.draw(share))
+        led = np.where(stays, found[:, self.places], led)
+        # A follower follows its leader, however that was drawn.
+        found[:, self.places] = np.where(alone | stays, led, self.followers.drawn(led, share, chances))
+        return found
 
     def __call__(self, w: np.ndarray, generator: np.random.RandomState) -> tuple[np.ndarray, np.ndarray]:
         """The protocol of `emcee.moves.MHMove`."""
         proposed = self.draw(len(w), generator)
         return proposed, self.log_density(w) - self.log_density(proposed)
+
+    def renewed(self, w: np.ndarray, generator: np.random.RandomState) -> tuple[np.ndarray, np.ndarray]:
+        """The same protocol, with new values of some coordinates of every point, each from its own density."""
+        before, own = self.to_v(w), (len(w), len(self.places))
+        new = generator.uniform(size=before.shape) < generator.uniform(*RENEWED_RANGE, size=(len(w), 1))
+        normal = generator.standard_normal(before.shape)
+        narrowed = np.sqrt(generator.chisquare(HEAVY_DOF, own) / HEAVY_DOF)
+        narrowed = np.where(generator.uniform(size=own) < OWN_SHARE, narrowed, np.nan)
+        share, chances = generator.uniform(size=own), generator.uniform(size=(len(w), len(self.followers.leader)))
+        after = self._one_by_one(new, normal, narrowed, share, chances, before)
+        return self.to_w(after), np.where(new, self._each(before) - self._each(after), 0.0).sum(axis=1)
 
     def fitted(self, w: np.ndarray, log_target: np.ndarray, log_weights: np.ndarray) -> Independence:
         """Nearer to the target, as weighted draws show it; the same where too few of them matter.
