@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -10,10 +11,11 @@ import pytest
 from support.axes import campaign, drawn, runs
 
 from tvsbayes.errors import InputError
-from tvsbayes.single_axis.axis_campaign import read_axis
+from tvsbayes.single_axis.axis_campaign import Reading, read_axis
 from tvsbayes.single_axis.axis_fit import fit_axis
 from tvsbayes.single_axis.axis_parameters import AxisPrior
-from tvsbayes.single_axis.next_stops import plan_next
+from tvsbayes.single_axis.axis_rows import reversal_of, rows_of
+from tvsbayes.single_axis.next_stops import _with_stop, plan_next
 from tvsbayes.single_axis.simulated_axis import simulate_axis
 
 
@@ -37,6 +39,36 @@ def test_a_plan_keeps_its_time(fitted):
     assert plan_next(fitted, minutes=2.0).minutes <= 2.0
     with pytest.raises(InputError):
         plan_next(fitted, "speed")
+
+
+@pytest.fixture(scope="module")
+def turned():
+    """A rotary table over a whole turn; read from both sides, 0.4 deg apart."""
+    moves = runs(1, (0.0, 90.0, 180.0, 270.0, 360.0), 20.0)
+    side = [-1.0, *np.sign(np.diff([m.command for m in moves]))]
+    values = [m.command - 0.2 * s + 0.003 * (k % 3) for k, (m, s) in enumerate(zip(moves, side, strict=True))]
+    return campaign(moves, values, u=0.002)
+
+
+def test_a_stop_to_be_read_is_no_jump_by_a_turn(turned):
+    found = plan_next(fit_axis(turned, sampled=False), count=1)
+    assert found.next[0].gain > 0
+
+
+def test_a_last_reading_of_no_use_takes_nothing_from_the_gains(turned):
+    lost = Reading(len(turned.readings), len(turned.moves) - 1, None, 0.0, "no light")
+    asked = fit_axis(replace(turned, readings=(*turned.readings, lost)), sampled=False)
+    found, whole = plan_next(asked, count=1), plan_next(fit_axis(turned, sampled=False), count=1)
+    assert found == whole and found.next[0].gain > 0
+
+
+@pytest.mark.parametrize("direction", ["forward", "backward"])
+def test_a_stop_to_be_read_moves_neither_line_nor_reversal(turned, direction):
+    rows = rows_of(turned)
+    more = rows_of(_with_stop(turned, rows, 45.0, direction, 60.0)[0])
+    assert len(more.value) == len(rows.value) + 1
+    # Least squares of a point on the line, by another factorisation.
+    np.testing.assert_allclose([*more.line, reversal_of(more)[0]], [*rows.line, reversal_of(rows)[0]], atol=1e-9)
 
 
 def test_what_is_drawn_is_read_back_and_repeats_by_seed(tmp_path):

@@ -20,7 +20,7 @@ from tvsbayes.single_axis.axis_campaign import AxisCampaign, AxisMove, Reading
 from tvsbayes.single_axis.axis_fit import HEADLINE_DRAWS, AxisFit, headline_functionals
 from tvsbayes.single_axis.axis_model import AxisModel
 from tvsbayes.single_axis.axis_record import deviation_functionals
-from tvsbayes.single_axis.axis_rows import rows_of
+from tvsbayes.single_axis.axis_rows import AxisRows, reversal_of, rows_of
 
 TARGETS = ("per_command", "effective_per_command", "backlash", "position")
 """What may be made surer; "position" is the mean uncertainty of the error by position over the range."""
@@ -101,9 +101,12 @@ def _move_seconds(campaign: AxisCampaign) -> float:
 
 
 def _with_stop(
-    campaign: AxisCampaign, command: float, direction: str, seconds: float
+    campaign: AxisCampaign, read: AxisRows, command: float, direction: str, seconds: float
 ) -> tuple[AxisCampaign, float | None]:
-    """The campaign with one more stop, reached from that side, and the command visited before it, None if none was."""
+    """The campaign with one more stop, reached from that side, and the command visited before it, None if none was.
+
+    Its reading lies on the line with a reversal through what was `read`: so neither is moved by it.
+    """
     moves, last = list(campaign.moves), campaign.moves[-1]
     commands = [m.command for m in campaign.moves]
     sign = 1 if direction == "forward" else -1
@@ -113,9 +116,11 @@ def _with_stop(
         via = float(np.round(via)) if np.all(np.array(commands) == np.round(commands)) else via
         moves.append(AxisMove(len(moves), last.segment, moves[-1].time_s + seconds, via))
     moves.append(AxisMove(len(moves), last.segment, moves[-1].time_s + seconds, command))
-    u = float(np.median([r.u for r in campaign.readings])) if campaign.readings else 0.0
-    number = max((r.reading for r in campaign.readings), default=-1) + 1
-    reading = Reading(number, len(moves) - 1, campaign.readings[-1].value, u)
+    offset, slope = read.line
+    value = offset + slope * command - 0.5 * float(np.sign(slope)) * sign * reversal_of(read)[0]
+    u = float(np.median([r.u for r in campaign.readings if r.status == "ok"]))
+    number = max(r.reading for r in campaign.readings) + 1
+    reading = Reading(number, len(moves) - 1, value, u)
     return replace(campaign, moves=tuple(moves), readings=(*campaign.readings, reading)), via
 
 
@@ -171,7 +176,7 @@ def plan_next(
             for k, command in enumerate(grid):
                 job.at((number + k / len(grid)) / count)
                 for direction in ("forward", "backward"):
-                    longer, via = _with_stop(campaign, float(command), direction, seconds)
+                    longer, via = _with_stop(campaign, fit.rows, float(command), direction, seconds)
                     if via is not None and not low <= via <= high:
                         continue
                     took = (1 + (via is not None)) * seconds / 60.0
