@@ -53,6 +53,13 @@ def test_marks_line_ends_and_empty_cells_are_accepted(tmp_path):
             {"toml": TOML + "[axis]\nstop_sd = { value = 0.0, u = 1.0 }\n"},
             *("campaign.toml", 4, "axis.stop_sd.value", "log-normal"),
         ),
+        *(
+            (
+                {"toml": TOML + f"[axis]\n{name} = {{ value = 0.0, u = 0.0 }}\n"},
+                *("campaign.toml", 4, f"axis.{name}.value", "log-normal"),
+            )
+            for name in ("transmission_error_length", "reading_scale")
+        ),
         ({"moves": MOVES.replace("0,0,0,0,forward", "0,0,0,0,left")}, "moves.csv", 2, "approach", "approach"),
         ({"moves": MOVES.replace("10.5,", "10.5,forward")}, "moves.csv", 3, "approach", "approach"),
         ({"moves": MOVES.replace("10.5", "10;5")}, "moves.csv", 3, "command", "number"),

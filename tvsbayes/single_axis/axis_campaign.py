@@ -28,6 +28,8 @@ COMMAND_MAX = 1e12
 """Of a command or a reading, either sign."""
 TURNS = {"deg": 360.0, "rad": 6.283185307179586, "arcmin": 21_600.0, "arcsec": 1_296_000.0, "turn": 1.0}
 """One turn in the units of angles."""
+_NEVER_NOUGHT = ("transmission_error_length", "reading_scale")
+"""Log-normals that the model divides by: held at 0, every density is without a value."""
 _ID_MAX = 10**9
 
 
@@ -159,7 +161,7 @@ def _parse_axis_table(keys: Keys) -> dict[str, AxisPrior]:
         entry = keys.table(name)
         if kind == "half-normal" and value and u:
             raise entry.refuse("value", "half-normal", "0 where u is not 0", "give the scale as u, or fix it by u = 0")
-        if kind == "log-normal" and not value and (u or name == "transmission_error_length"):
+        if kind == "log-normal" and not value and (u or name in _NEVER_NOUGHT):
             raise entry.refuse("value", "log-normal", "a positive median", "u is the sd of the logarithm")
         if name == "per_command" and not value:
             raise entry.refuse("value", "zero", "a number other than 0", "state what one command does, or leave it out")
