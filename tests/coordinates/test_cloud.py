@@ -57,6 +57,28 @@ def test_points_are_those_of_the_law_and_of_the_published_equations():
     np.testing.assert_allclose(angle, np.array(rows.aperture_deg)[seen], atol=ROUNDING_MM)
 
 
+def test_a_cloud_holds_what_a_robot_is_given_and_no_more():
+    """Readings up to the one that beam and line of sight never meet under, with u that grows on the way there."""
+    reading = np.linspace(85.0, 91.5, 40)
+    count = len(reading)
+    rows = LookRows(tuple(range(count)), (20.0,) * count, (10.0,) * count, tuple(reading), (("left", "up"),) * count)
+    one, code = calibration(), []
+    for deg in reading:
+        try:
+            one.locate(20.0, 10.0, deg)
+        except InputError as error:
+            code.append(error.code)
+        else:
+            code.append(None)
+    (block,) = cloud(one, [rows], {})
+    law = np.isfinite(locate_linear(one, rows.settings).value).all(axis=1)
+    kept = np.array([each is None for each in code])
+    # Some have a point of the estimates that more than a thousandth of the draws have not.
+    assert 0 < kept.sum() < law.sum() < count
+    np.testing.assert_array_equal(block.lines, np.flatnonzero(kept))
+    assert [(each.line, each.error.code) for each in block.refused] == [(k, c) for k, c in enumerate(code) if c]
+
+
 def test_both_formats_hold_the_same_and_a_foreign_reader_opens_them(tmp_path):
     one, blocks = calibration(), [looks(40), looks(30, seed=2, first_line=42)]
     ply, table = (

@@ -67,6 +67,21 @@ type Sides = tuple[float, float]
 """Approach sides (pan, tilt): +1 left or up, -1 right or down, 0 unknown."""
 
 
+def meets(reach_mm: Number, direction: np.ndarray, covariance_mm2: np.ndarray) -> bool | np.ndarray:
+    """Whether at most `DIVERGING_SHARE` of what the data allow has no point, by the law of propagation (formulation 5).
+
+    The inverse of the range is nearly normal: its tail beyond zero is the share of draws that diverge.
+
+    Args:
+        reach_mm: range of the estimated point, of any shape.
+        direction: of the beam, unit, shape (..., 3).
+        covariance_mm2: of the point, shape (..., 3, 3); where it is not finite the answer is no.
+    """
+    variance = np.einsum("...i,...ij,...j->...", direction, covariance_mm2, direction)
+    finite = np.isfinite(covariance_mm2).all(axis=(-2, -1))
+    return finite & (reach_mm > DIVERGING_SDS * np.sqrt(np.maximum(variance, 0.0)))
+
+
 @dataclass(frozen=True)
 class _Moved:
     """Parameters by name, what the gears add to them, and unit noises, each moved by an imaginary step.
@@ -185,7 +200,7 @@ class Calibration(Shown):
         """Which of these counters lies outside those that looks reached, in words; "" where none does."""
         return unseen((pan_steps, tilt_steps), self.range_steps)
 
-    def beam_at(self, steps: Counters, sides: Sides, m: ModuleType = np) -> Components:
+    def beam_at(self, steps: Counters, sides: tuple[Number, Number], m: ModuleType = np) -> Components:
         """The beam of the best estimates at counters and approach sides; `m` as in `output_deg`."""
         values = self.estimates_at(steps)
         pan_deg, tilt_deg = (
@@ -235,12 +250,9 @@ class Calibration(Shown):
         reach = range_components(*beam, self.estimates["baseline_mm"], true_deg, self.azimuth, math)
         if not (0 < reach < math.inf and ahead(beam.at(reach)[0])):
             raise self.refusal(pan_steps, tilt_steps, aperture_deg, sides)
-        direction = np.array(beam.direction)
         jacobian = self.derivatives(*steps, aperture_deg, approach)
         covariance = jacobian @ self.look_covariance(steps) @ jacobian.T
-        # The inverse of the range is nearly normal: its tail beyond zero is the share of draws that diverge.
-        least = DIVERGING_SDS * math.sqrt(max(direction @ covariance @ direction, 0.0))
-        if not (np.all(np.isfinite(covariance)) and reach > least):
+        if not meets(reach, np.array(beam.direction), covariance):
             raise self.refusal(pan_steps, tilt_steps, aperture_deg, sides)
         point, u95 = beam.at(reach), NORMAL_95 * np.sqrt(np.diag(covariance))
         return Located(point, covariance, u95, not self.covers(*steps), self.unseen(*steps))

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tvsbayes.calibration.pointing import Calibration
-from tvsbayes.coordinates.location import Settings, locate, locate_linear
+from tvsbayes.calibration.pointing import Calibration, meets
+from tvsbayes.coordinates.location import Linear, Settings, locate, locate_linear
 from tvsbayes.coordinates.looks_file import LookRows
 from tvsbayes.coordinates.simple_calibration import SimpleCalibration, simple_belief
 from tvsbayes.errors import InputError
@@ -72,7 +72,7 @@ def cloud(
     for rows in looks:
         asked = rows.settings
         found = locate_linear(calibration, asked)
-        seen = np.isfinite(found.value).all(axis=1)
+        seen = _meets(calibration, asked, found)
         pan, tilt = asked.steps[seen].T
         reading = asked.aperture_deg[seen]
         refused = tuple(Refused(rows.lines[k], _refusal(calibration, asked, k)) for k in np.flatnonzero(~seen).tolist())
@@ -87,6 +87,16 @@ def cloud(
             },
             refused=refused,
         )
+
+
+def _meets(calibration: Calibration, asked: Settings, found: Linear) -> np.ndarray:
+    """Which looks have a point, shape (n,): those that `Calibration.locate` does not refuse."""
+    pan, tilt = asked.steps.T
+    pan_side, tilt_side = asked.side.T
+    beam = calibration.beam_at((pan, tilt), (pan_side, tilt_side))
+    origin, direction = (np.stack(np.broadcast_arrays(*vector), axis=-1) for vector in beam)
+    reach = np.einsum("pi,pi->p", found.value - origin, direction)
+    return np.asarray(meets(reach, direction, found.covariance))
 
 
 def _refusal(calibration: Calibration, asked: Settings, row: int) -> InputError:
