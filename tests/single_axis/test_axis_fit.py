@@ -68,6 +68,33 @@ def test_play_swallows_short_legs():
     assert draws.std() < 0.2
 
 
+def test_a_search_that_lost_its_way_is_not_converged():
+    """Legs of a few commands, a play of three: a search ended at half of the true ratio, 26 in log density too low."""
+    rng = np.random.default_rng(5)
+    commands = rng.integers(0, 5, 30).tolist()
+    moves = [AxisMove(k, 0, 0.0, float(c), "" if k else "forward") for k, c in enumerate(commands)]
+    y, values = -1.5, []
+    for c in commands:
+        y = min(max(y, c - 1.5), c + 1.5)
+        values.append(y + 0.05 * rng.standard_normal())
+    found = fit_axis(campaign(moves, values, backlash=AxisPrior(0.0, 10.0)), sampled=False)
+    # Whichever way it goes: an approximation that passes for converged holds the truth.
+    ratio = found.draws["per_command"]
+    assert found.error is not None or abs(ratio.mean() - 1.0) < 4 * ratio.std()
+    assert found.mode.missing == found.missing == summarise_axis(found).problems
+
+
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")
+@pytest.mark.parametrize("scales", [FIRST_EDITION, {}], ids=["held", "free"])
+def test_readings_without_a_density_are_not_converged(scales):
+    """A scale of readings of nought, which no folder may state."""
+    moves = runs(2)
+    values = [0.01 * m.command + 0.002 * (k % 3) for k, m in enumerate(moves)]
+    found = fit_axis(campaign(moves, values, 0.001, **{**scales, "reading_scale": AxisPrior(0.0, 0.0)}), sampled=False)
+    assert found.error is not None and found.error.exit_code == 4 and found.error.remedy
+    assert "no density" in found.error.message and not summarise_axis(found).converged
+
+
 def test_what_the_data_cannot_tell_is_said():
     moves = [AxisMove(k, 0, 60.0 * k, 100.0 * k, "" if k else "forward") for k in range(4)]
     summary = summarise_axis(fit_axis(campaign(moves, [0.0, 1.0, 2.1, 3.0]), tier="importance"))

@@ -91,8 +91,8 @@ class AxisFit(Shown):
     @property
     def missing(self) -> tuple[str, ...]:
         """Why the intervals must not be used; empty where they may."""
-        if self.first is None:
-            return ()
+        if self.first is None or not self.free:
+            return self.mode.missing
         if self.chain is None:
             return self.first.missing
         if self.agreement is not None and not self.agreement.agrees:
@@ -105,7 +105,12 @@ class AxisFit(Shown):
         """`NotConverged` where the intervals must not be used."""
         if not self.missing:
             return None
-        remedy = "run again without --quick" if self.chain is None else "run again with more --max-minutes"
+        if not self.free:
+            remedy = "state other values in [axis]: every scale is held where the readings cannot be"
+        elif self.first is None:
+            remedy = "run again without --no-sample"
+        else:
+            remedy = "run again without --quick" if self.chain is None else "run again with more --max-minutes"
         return NotConverged("unconverged", "UNCONVERGED: " + "; ".join(self.missing), remedy=remedy)
 
     @cached_property
