@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from tvsbayes.display import Shown, View
-from tvsbayes.errors import InputError, NothingToEstimate, TvsError, listed
+from tvsbayes.errors import NothingToEstimate, TvsError, escaped, listed, refusal
 from tvsbayes.files.disk import RESULTS_BYTES_MAX, make_folder, read_arrays, write_atomically
 from tvsbayes.progress import Show
 from tvsbayes.results.estimates import CONTRACTION_LIMIT, Estimate
@@ -304,6 +304,25 @@ class AxisResults(Shown):
         return self.summary.shown()
 
 
+def _stored_w(folder: Path, names: int, again: str) -> np.ndarray:
+    """Coordinates (draws, names) in the `results/` of a folder; `again` is what to do where they are damaged.
+
+    Raises:
+        InputError: no file, or one that is damaged.
+    """
+    place = "results/draws.npz"
+    try:
+        w = read_arrays(folder / place, RESULTS_BYTES_MAX)["w"]
+        # One draw alone has no covariance.
+        if w.dtype.kind != "f" or w.ndim != 2 or w.shape[1] != names or len(w) < 2 or not np.all(np.isfinite(w)):
+            raise ValueError(f"w of shape {w.shape}")
+    except (KeyError, ValueError) as error:
+        found = "no w" if isinstance(error, KeyError) else escaped(str(error), 120)
+        allowed = f"w of shape (draws, {names}), finite, as in results/fit.json"
+        raise refusal("damaged", file=place, found=found, allowed=allowed, remedy=again) from error
+    return w
+
+
 def results_for(
     campaign: AxisCampaign, more: np.ndarray | None = None, progress: Show | None = None, seed: int = 0
 ) -> AxisResults:
@@ -324,12 +343,11 @@ def results_for(
         again = "run `tvsbayes fit` again"
         summary = read_record(AxisSummary, document, again)
         model = model_of(campaign, more)
-        arrays = read_arrays(campaign.path / "results" / "draws.npz", RESULTS_BYTES_MAX)
-        w = arrays.get("w")
-        if w is None or w.ndim != 2 or w.shape[1] != len(model.coordinates.names) or not np.all(np.isfinite(w)):
-            raise InputError("damaged", "results/draws.npz does not fit results/fit.json", remedy=again)
         stored_seed = document.values.get("seed")
-        return AxisResults(summary, AxisFit.of_draws(campaign, model, w, int(str(stored_seed))), True)
+        if not isinstance(stored_seed, int) or isinstance(stored_seed, bool) or stored_seed < 0:
+            raise document.refuse("seed", "damaged", "a whole number from 0", again)
+        w = _stored_w(campaign.path, len(model.coordinates.names), again)
+        return AxisResults(summary, AxisFit.of_draws(campaign, model, w, stored_seed), True)
     fit = fit_axis(campaign, tier="importance", seed=seed, more=more, progress=progress)
     if fit.error is not None:
         raise fit.error

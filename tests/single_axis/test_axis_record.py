@@ -1,0 +1,80 @@
+"""Results of an axis in its folder: taken up again, or refused by what is damaged."""
+
+from __future__ import annotations
+
+import io
+import json
+
+import numpy as np
+import pytest
+from support.axes import drawn, runs
+
+from tvsbayes.errors import InputError
+from tvsbayes.single_axis.axis_campaign import read_axis, write_axis
+from tvsbayes.single_axis.axis_fit import fit_axis
+from tvsbayes.single_axis.axis_parameters import AxisPrior
+from tvsbayes.single_axis.axis_record import keep_fit, results_for, summarise_axis
+
+
+@pytest.fixture(scope="module")
+def kept(tmp_path_factory):
+    """A folder with the results of a Laplace fit, and that fit."""
+    folder = tmp_path_factory.mktemp("axis") / "a"
+    write_axis(drawn(4, runs(2), backlash=AxisPrior(0.0, 0.1)).campaign, folder)
+    fit = fit_axis(read_axis(folder), sampled=False)
+    keep_fit(fit, summarise_axis(fit), folder / "results")
+    return folder, fit
+
+
+def test_what_was_kept_is_taken_up(kept):
+    folder, fit = kept
+    found = results_for(read_axis(folder))
+    assert found.stored and found.fit.seed == fit.seed
+    np.testing.assert_array_equal(found.fit.w, fit.w)
+
+
+def npz(**arrays):
+    stream = io.BytesIO()
+    np.savez(stream, **arrays)
+    return stream.getvalue()
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda data, w: data[: len(data) // 2],
+        lambda data, w: b"",
+        lambda data, w: npz(draws=w),
+        lambda data, w: npz(w=w[:, 1:]),
+        lambda data, w: npz(w=w[:1]),
+        lambda data, w: npz(w=np.where(w == w.max(), np.inf, w)),
+        lambda data, w: npz(w=w.astype(str)),
+    ],
+    ids=["cut", "empty", "without w", "narrow", "one draw", "infinite", "text"],
+)
+def test_damaged_draws_are_refused(kept, change):
+    folder, fit = kept
+    file = folder / "results" / "draws.npz"
+    whole = file.read_bytes()
+    try:
+        file.write_bytes(change(whole, fit.w))
+        with pytest.raises(InputError) as caught:
+            results_for(read_axis(folder))
+    finally:
+        file.write_bytes(whole)
+    assert (caught.value.code, caught.value.file) == ("damaged", "results/draws.npz")
+    assert "tvsbayes fit" in caught.value.remedy
+
+
+@pytest.mark.parametrize("seed", ["7", -1, 1.5, True, None])
+def test_a_damaged_seed_is_refused(kept, seed):
+    folder, _ = kept
+    file = folder / "results" / "fit.json"
+    whole = file.read_bytes()
+    try:
+        file.write_text(json.dumps({**json.loads(whole), "seed": seed}))
+        with pytest.raises(InputError) as caught:
+            results_for(read_axis(folder))
+    finally:
+        file.write_bytes(whole)
+    assert (caught.value.code, caught.value.column) == ("damaged", "seed") and caught.value.remedy
