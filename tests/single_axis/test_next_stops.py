@@ -16,7 +16,7 @@ from tvsbayes.single_axis.axis_fit import fit_axis
 from tvsbayes.single_axis.axis_parameters import AxisPrior
 from tvsbayes.single_axis.axis_rows import reversal_of, rows_of
 from tvsbayes.single_axis.next_stops import _with_stop, plan_next
-from tvsbayes.single_axis.simulated_axis import simulate_axis
+from tvsbayes.single_axis.simulated_axis import draw_axis, simulate_axis
 
 
 @pytest.fixture(scope="module")
@@ -86,6 +86,25 @@ def test_an_axis_without_a_ratio_is_refused():
     with pytest.raises(InputError) as caught:
         simulate_axis(type(empty)("deg", moves, ()))
     assert "per_command" in caught.value.remedy
+
+
+def test_a_reading_of_nought_says_how_far_a_command_goes():
+    moves = runs(1, (0.0, 100.0), 0.0)
+    made = simulate_axis(campaign(moves, [0.02 * m.command for m in moves]))
+    # A line through points that lie on it.
+    assert made.truth.parameters["per_command"] == pytest.approx(0.02, rel=1e-9)
+
+
+def test_true_play_has_the_stated_mean_and_is_never_negative():
+    def true(value, u):
+        stated = {"backlash": AxisPrior(value, u)}
+        axes = (draw_axis([0.0, 100.0], stated, 0.01, 1.0, np.random.default_rng(seed)) for seed in range(400))
+        return np.array([axis.parameters["backlash"] for axis in axes])
+
+    far, near = true(0.5, 0.1), true(0.0, 0.1)
+    # Means of 400 numbers of sd 0.1, 0.06 where folded at nought: five standard errors.
+    assert far.mean() == pytest.approx(0.5, abs=0.025) and far.std() == pytest.approx(0.1, rel=0.2)
+    assert near.mean() == pytest.approx(0.1 * np.sqrt(2 / np.pi), abs=0.015) and near.min() >= 0
 
 
 def test_without_errors_the_stops_are_the_play_operator():

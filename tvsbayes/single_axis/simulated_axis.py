@@ -69,7 +69,7 @@ def _drawn(name: str, prior: AxisPrior, rng: np.random.Generator) -> float:
     if kind == "log-normal":
         return prior.value * float(np.exp(prior.u * normal))
     # True play is never negative, whatever a fit allows for.
-    return abs(prior.u * normal) + prior.value if kind == "half-normal" or name == "backlash" else prior.value
+    return abs(prior.value + prior.u * normal) if kind == "half-normal" or name == "backlash" else prior.value
 
 
 def _curve(distance: np.ndarray, length: float, sd: float, rng: np.random.Generator) -> np.ndarray:
@@ -188,7 +188,8 @@ def simulate_axis(
 def _per_command(template: AxisCampaign) -> float:
     if "per_command" in template.stated:
         return template.stated["per_command"].value
-    used = [(template.moves[r.move].command, r.value) for r in template.readings if r.status == "ok" and r.value]
+    seen = (r for r in template.readings if r.status == "ok" and r.value is not None)
+    used = [(template.moves[r.move].command, r.value) for r in seen]
     if len({command for command, _ in used}) < 2:
         raise InputError(
             "unstated",
