@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 
 from tvsbayes.errors import InputError
-from tvsbayes.instrument.campaign import PIXELS, SPOT_COLUMNS
-from tvsbayes.instrument.column_names import COUNTERS, PIXEL_SDS, missing, understand, unit_of_name
+from tvsbayes.instrument.campaign import PIXEL_SDS, PIXELS, SPOT_COLUMNS
+from tvsbayes.instrument.column_names import COUNTERS, DEGREES, SECONDS, missing, understand, unit_of_name
 
 PIXEL_NAMES = [
     ("XL", "YL", "XR", "YR"),
@@ -71,7 +71,23 @@ def test_our_own_names_and_other_words():
         "pan_approach": "pan_approach",
     }
     assert found.unused == ("remark",)
-    assert [unit_of_name(name) for name in ("t (ms)", "B (rad)", "angle_deg", "XL")] == ["ms", "rad", "deg", None]
+
+
+def test_units_in_names():
+    times = (
+        "t (ms)",
+        "t_us",
+        "Zeit [\u00b5s]",
+        "t (\u03bcs)",
+        "time_h",
+        "time (hours)",
+        "minutes",
+        "t (s)",
+        "time_rad",
+    )
+    assert [unit_of_name(name, SECONDS) for name in times] == ["ms", "us", "us", "us", "h", "h", "min", None, None]
+    angles = ("B (rad)", "angle_deg", "aperture_mrad", "B (arcmin)", "B_arcsec", "XL", "B h")
+    assert [unit_of_name(name, DEGREES) for name in angles] == ["rad", "deg", "mrad", "arcmin", "arcsec", None, None]
 
 
 def test_what_two_columns_claim_is_asked_for():

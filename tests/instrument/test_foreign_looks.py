@@ -61,6 +61,43 @@ def test_notations_of_others():
     assert degrees.spots[0].aperture_deg == 1.5
 
 
+@pytest.mark.parametrize(
+    ("name", "cell", "seconds"), [("t_h", "2", 7200.0), ("t_us", "2", 2e-6), ("t_min", "2", 120.0), ("t_s", "2", 2.0)]
+)
+def test_times_are_in_the_unit_of_the_name(name, cell, seconds):
+    found = looks(f"0 0 {cell}", header=f"Pan Tilt {name}")
+    assert found.moves[0].time_s == pytest.approx(seconds, rel=1e-12)
+
+
+@pytest.mark.parametrize(("unit", "of_turn"), [("mrad", 2000 * math.pi), ("arcmin", 21600), ("arcsec", 1296000)])
+def test_apertures_are_in_the_unit_of_the_name(unit, of_turn):
+    found = looks(f"0 0 1 2 3 4 {of_turn / 4}", header=f"Pan Tilt XL YL XR YR B_{unit}")
+    assert found.spots[0].aperture_deg == pytest.approx(90.0, rel=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("marks", "segments", "said"),
+    [
+        ("1 0 0 0", [0, 0, 0, 0], "0 homings after the first row, by column home at each 1"),
+        ("0 1 0 1", [0, 1, 1, 2], "2 homings after the first row, by column home at each 1"),
+        ("1 - - 1", [0, 0, 0, 1], "1 homing after the first row, by column home at each 1"),
+        ("true false false true", [0, 0, 0, 1], "by column home at each 1"),
+        ("0 0 1 1", [0, 0, 1, 1], "1 homing after the first row, by column home where it changes"),
+        ("1 1 2 3", [0, 0, 1, 2], "2 homings after the first row, by column home where it changes"),
+    ],
+)
+def test_homings_are_marked_or_numbered(marks, segments, said):
+    rows = [f"{10 * k} 0 {mark}" for k, mark in enumerate(marks.split())]
+    found = looks(*rows, header="Pan Tilt home")
+    assert [m.segment for m in found.moves] == segments
+    assert any(said in text for text in found.assumed)
+
+
+def test_rows_without_a_spot_may_state_any_spread():
+    found = looks("0 0 1 2 3 4 0.2 1", "5 0 0 0 0 0 0 0", header="Pan Tilt XL YL XR YR std_XL valid")
+    assert [s.su_left_px for s in found.spots] == [0.2, None]
+
+
 def test_rows_without_pixels_are_moves_without_a_look():
     found = looks("0 0 1 2 3 4", "50 0 - - - -", "20 0 1 2 3 4", header="Pan Tilt XL YL XR YR")
     assert [m.pan_steps for m in found.moves] == [0, 50, 20]
@@ -97,6 +134,12 @@ def test_looks_alone_go_to_moves_that_are_listed():
         (("0 0 1 2 3 - ok",), "Pan Tilt XL YL XR YR status", "line 2, YR: found an empty cell"),
         (("1 2 3 4",), "XL YL XR YR", "column move=NAME"),
         (("1 2 3 4 7",), "XL YL XR YR move", "line 2, move: "),
+        (("0 0 1 2 3 4 1 0",), "Pan Tilt XL YL XR YR exp pt", "line 2, pt: .* from 1 to 4"),
+        (("0 0 1 2 3 4 -1",), "Pan Tilt XL YL XR YR exp", "line 2, exp: .* from 0 to"),
+        (("0 0 1 2 3 4 -1",), "Pan Tilt XL YL XR YR spot", "line 2, spot: .* from 0 to"),
+        (("0 0 1 2 3 4 500",), "Pan Tilt XL YL XR YR B", "line 2, B: .* from -360 to 360"),
+        (("0 0 1 2 3 4 0",), "Pan Tilt XL YL XR YR std_XL", "line 2, std_XL: .* from 0.0001 to 100"),
+        (("0 0 1 2 3 4 -",), "Pan Tilt XL YL XR YR std_XL", "line 2, std_XL: .*--sd-px"),
     ],
 )
 def test_cells_that_are_no_value_are_refused_with_their_place(rows, header, said):

@@ -56,10 +56,21 @@ def test_stops_are_read_again_passed_and_homed(tmp_path):
     assert any("1 row at the command before" in text for text in found.assumed)
 
 
+def test_a_mark_of_homings_is_no_number_of_a_segment(tmp_path):
+    found = readings_of(*table(tmp_path, "home,steps,encoder", "1,0,0.1", "0,10,1.1", "0,20,2.1", "1,0,0.2"))
+    assert [m.segment for m in found.moves] == [0, 0, 0, 1]
+    assert any("1 homing after the first row, by column home at each 1" in text for text in found.assumed)
+
+
 @pytest.mark.parametrize(
     ("row", "column"), [("x,1,ok,forward", "steps"), ("0,,ok,forward", "angle"), ("0,1,ok,cw", "side")]
 )
 def test_cells_that_say_nothing_are_refused_with_their_column(tmp_path, row, column):
     with pytest.raises(InputError) as refused:
-        readings_of(*table(tmp_path, "steps,angle,status,side", row))
+        readings_of(*table(tmp_path, "steps,angle,status,side,sd", f"{row},"))
     assert (refused.value.line, refused.value.column) == (2, column)
+
+
+def test_a_negative_uncertainty_is_refused_as_check_does(tmp_path):
+    with pytest.raises(InputError, match="line 2, sd: .*from 0 to"):
+        readings_of(*table(tmp_path, "steps,angle,sd", "0,1,-0.1"))

@@ -18,8 +18,6 @@ if TYPE_CHECKING:
     from tvsbayes.single_axis.foreign_readings import ForeignReadings
 
 NEEDED = ("command", "value")
-UNITS = ("deg", "rad", "mm")
-"""What a column of readings may say of itself."""
 
 
 def import_readings(
@@ -27,7 +25,7 @@ def import_readings(
 ) -> None:
     """A table of an axis into its folder, new or still with the tables of the template."""
     from tvsbayes.files.foreign_table import read_foreign
-    from tvsbayes.instrument.column_names import AXIS_FIELDS, axis_field_of, understand, unit_of_name
+    from tvsbayes.instrument.column_names import AXIS_FIELDS, DEGREES, SECONDS, axis_field_of, understand, unit_of_name
     from tvsbayes.single_axis.foreign_readings import readings_of
 
     table = read_foreign(file, sheet)
@@ -39,9 +37,9 @@ def import_readings(
     _refuse_filled(to)
 
     def unit(field: str, name: str) -> str:
-        return unit_of_name(name) or "s" if field == "time_s" else ""
+        return unit_of_name(name, SECONDS) or "s" if field == "time_s" else ""
 
-    named = unit_of_name(known.columns["value"])
+    named = unit_of_name(known.columns["value"], (*DEGREES, "mm"))
     told = _unit_told(to, named)
     lines = table_lines(table, known, AXIS_FIELDS, unit)
     lines += [f"assumed: {text}" for text in (*found.assumed, told)]
@@ -63,7 +61,7 @@ def import_readings(
 def _unit_told(to: Path, named: str | None) -> str:
     """Which unit results will have: a reading in mm must not be reported in degrees."""
     kept = (to / "campaign.toml").is_file()
-    if named in UNITS and not kept:
+    if named and not kept:
         return f"unit: {named}, as the column says; it goes into campaign.toml"
     says = f"; the column says {named}" if named else ""
     return f"unit: of readings as campaign.toml says{'' if kept else ', deg until you change it'}{says}"
@@ -95,7 +93,7 @@ def _write(to: Path, found: ForeignReadings, unit: str | None) -> list[str]:
     if not (to / "campaign.toml").is_file():
         make_folder(to, empty=True)
         template = _templates()["campaign.toml"]
-        own = unit if unit in UNITS else "deg"
+        own = unit or "deg"
         contents["campaign.toml"] = template.replace(b'\nunit = "deg"', f'\nunit = "{own}"'.encode())
     for name, data in contents.items():
         write_atomically(to / name, data)

@@ -184,14 +184,15 @@ def _understood_document(table: ForeignTable, known: Understood, looks: ForeignL
 
 def _understood_text(table: ForeignTable, known: Understood, notation: Notation, looks: ForeignLooks) -> str:
     """The columns that were found beside their fields, units and first values; what was assumed; what comes out."""
-    from tvsbayes.instrument.column_names import FIELDS, unit_of_name
+    from tvsbayes.instrument.column_names import DEGREES, FIELDS, SECONDS, unit_of_name
 
     def unit(field: str, name: str) -> str:
         if field.endswith("_px") and field.startswith(("u", "v")):
             return f"px from {notation.pixels_from}"
-        if field in ("aperture_deg", "time_s"):
-            stated = notation.angle_unit if field == "aperture_deg" else None
-            return stated or unit_of_name(name) or field.rpartition("_")[2]
+        if field == "aperture_deg":
+            return notation.angle_unit or unit_of_name(name, DEGREES) or "deg"
+        if field == "time_s":
+            return unit_of_name(name, SECONDS) or "s"
         return "px" if field.endswith("_px") else "steps" if field.endswith("_steps") else ""
 
     lines = table_lines(table, known, FIELDS, unit)

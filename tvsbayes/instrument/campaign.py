@@ -122,10 +122,15 @@ PIXELS = ("u_left_px", "v_left_px", "u_right_px", "v_right_px")
 NO_PIXELS = (None, None, None, None)
 """Pixels, or their standard uncertainties, of a look without a spot."""
 MOVE_COLUMNS = ("move", "segment", "time_s", "pan_steps", "tilt_steps", "pan_approach", "tilt_approach")
-_PIXEL_SDS = ("su_left_px", "sv_left_px", "su_right_px", "sv_right_px")
+PIXEL_SDS = ("su_left_px", "sv_left_px", "su_right_px", "sv_right_px")
+"""Columns of their standard uncertainties."""
+PIXEL_SD_MIN, PIXEL_SD_MAX = 1e-4, 100.0
+"""Of a standard uncertainty of a centre, px."""
+APERTURE_MAX_DEG = 360.0
+"""Of a reading of the aperture, either sign."""
 SPOT_COLUMNS = (
     *("spot", "move", "target", "experiment", "point"),
-    *(*PIXELS, *_PIXEL_SDS, "aperture_deg", "status"),
+    *(*PIXELS, *PIXEL_SDS, "aperture_deg", "status"),
 )
 _CORRELATIONS = ("ruv_left", "ruv_right")
 ID_MAX = 10**9
@@ -229,8 +234,8 @@ def parse_spots(data: bytes, file: str, moves: int, stereo: Stereo) -> tuple[Spo
     check_experiments(table, experiments, points, [status == "ok" for status in statuses])
     size = {"u": float(stereo.image_width), "v": float(stereo.image_height)}
     pixels = [table.numbers(column, -1e6, 1e6, empty=True) for column in PIXELS]
-    sds = [table.numbers(column, 1e-4, 100.0, empty=True) for column in _PIXEL_SDS]
-    for column, values in zip((*PIXELS, *_PIXEL_SDS), (*pixels, *sds), strict=True):
+    sds = [table.numbers(column, PIXEL_SD_MIN, PIXEL_SD_MAX, empty=True) for column in PIXEL_SDS]
+    for column, values in zip((*PIXELS, *PIXEL_SDS), (*pixels, *sds), strict=True):
         extent = size.get(column[0], 0.0)
         for row, value in enumerate(values):
             if statuses[row] != "ok":
@@ -242,7 +247,7 @@ def parse_spots(data: bytes, file: str, moves: int, stereo: Stereo) -> tuple[Spo
                 allowed = f"a position in the image, 0 to {extent:g} px, or close to it"
                 remedy = _outside_remedy(values, extent, _exchanged(pixels, statuses, stereo))
                 raise table.refuse(row, column, "outside-image", allowed, remedy)
-    apertures = table.numbers("aperture_deg", -360.0, 360.0, empty=True)
+    apertures = table.numbers("aperture_deg", -APERTURE_MAX_DEG, APERTURE_MAX_DEG, empty=True)
     correlations = [_parse_correlations(table, column, statuses) for column in _CORRELATIONS]
     head = (spots, move_ids, table.texts("target"), experiments, points)
     return tuple(map(Spot, *head, *pixels, *sds, apertures, statuses, *correlations))

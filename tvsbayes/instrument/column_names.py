@@ -6,6 +6,7 @@ the name are read too. What two columns claim is nobody's until it is said which
 
 from __future__ import annotations
 
+import math
 import re
 import unicodedata
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -16,7 +17,6 @@ from tvsbayes.instrument.campaign import MOVE_COLUMNS, PIXELS, SPOT_COLUMNS
 
 FIELDS: tuple[str, ...] = tuple(dict.fromkeys((*MOVE_COLUMNS, *SPOT_COLUMNS)))
 """All that a table can give, by the columns of our files."""
-PIXEL_SDS = tuple(f"s{name}" for name in PIXELS)
 COUNTERS = ("pan_steps", "tilt_steps")
 # English, German, Spanish, French; without accents, as `words_of` takes names apart.
 _SIDES = {
@@ -81,10 +81,19 @@ _WORDS = {
         *("etat", "valide", "qualite"),
     },
 }
+SECONDS = {"us": 1e-6, "ms": 1e-3, "min": 60.0, "h": 3600.0}
+"""Units of times that a name may say, in s."""
+DEGREES = {"deg": 1.0, "rad": math.degrees(1.0), "mrad": math.degrees(1e-3), "arcmin": 1 / 60, "arcsec": 1 / 3600}
+"""Units of angles that a name may say, in deg."""
 _UNITS = {
+    "us": {"us", "usec", "micros", "microseconds", "mikrosekunden", "microsegundos", "microsecondes"},
     "ms": {"ms", "msec", "millis", "milliseconds", "millisekunden", "milisegundos", "millisecondes"},
     "min": {"min", "minutes", "minuten", "minutos"},
+    "h": {"h", "hr", "hrs", "hour", "hours", "stunde", "stunden", "horas", "heures"},
     "rad": {"rad", "radians", "radianten", "radianes"},
+    "mrad": {"mrad", "milliradians", "millirad"},
+    "arcmin": {"arcmin", "arcminutes", "bogenminuten"},
+    "arcsec": {"arcsec", "arcseconds", "bogensekunden"},
     "deg": {"deg", "degrees", "grad", "grados", "degres"},
     "mm": {"mm"},
 }
@@ -107,7 +116,8 @@ class Understood:
 
 def words_of(name: str) -> list[str]:
     """The words of a column's name in small letters without accents: "xLeft_px", "X left [px]" and "XL" alike."""
-    plain = unicodedata.normalize("NFKD", name).encode("ascii", "ignore").decode()
+    # Of microseconds the ascii letters alone would be seconds.
+    plain = re.sub("\u03bc(?=s)", "u", unicodedata.normalize("NFKD", name)).encode("ascii", "ignore").decode()
     found = []
     for part in re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|[0-9]+", plain):
         word = part.lower()
@@ -117,10 +127,10 @@ def words_of(name: str) -> list[str]:
     return found
 
 
-def unit_of_name(name: str) -> str | None:
-    """ms, min, rad, deg or mm where the name says so."""
+def unit_of_name(name: str, units: Iterable[str]) -> str | None:
+    """The first of `units` that the name says: those of `SECONDS`, `DEGREES`, or mm. "h" may be no unit of an angle."""
     words = set(words_of(name))
-    return next((unit for unit, spellings in _UNITS.items() if words & spellings), None)
+    return next((unit for unit in units if words & _UNITS[unit]), None)
 
 
 def _field_of(name: str) -> str | None:

@@ -10,13 +10,25 @@ import datetime
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
-from tvsbayes.errors import InputError, refusal
+from tvsbayes.errors import InputError, escaped, refusal
 from tvsbayes.files.csv_table import NUMBER
 from tvsbayes.files.foreign_table import ForeignTable
 from tvsbayes.instrument.axes import AXES, SENSES, Axis
-from tvsbayes.instrument.campaign import ID_MAX, NO_PIXELS, PIXELS, Move, Spot, with_pixels
-from tvsbayes.instrument.column_names import COUNTERS, PIXEL_SDS, unit_of_name
+from tvsbayes.instrument.campaign import (
+    APERTURE_MAX_DEG,
+    ID_MAX,
+    NO_PIXELS,
+    PIXEL_SD_MAX,
+    PIXEL_SD_MIN,
+    PIXEL_SDS,
+    PIXELS,
+    Move,
+    Spot,
+    with_pixels,
+)
+from tvsbayes.instrument.column_names import COUNTERS, DEGREES, SECONDS, unit_of_name
 from tvsbayes.instrument.counter_limits import COUNTER_MAX
 
 SD_PX = 0.1
@@ -24,7 +36,8 @@ SD_PX = 0.1
 GOOD = {"ok", "1", "true", "yes", "good", "valid", "ja", "si"}
 BAD = {"0", "false", "no", "bad", "invalid", "nein"}
 """Words of a status, in small letters."""
-_SECONDS = {"ms": 1e-3, "min": 60.0}
+_FLAGS = {"": False, "0": False, "false": False, "1": True, "true": True}
+"""Cells of a column that marks homings, in small letters."""
 
 
 @dataclass(frozen=True)
@@ -75,23 +88,24 @@ class FieldCells:
         """Cells of a field; empty ones where no column gives it."""
         return list(self.table.columns[self.columns[field]]) if field in self else [""] * len(self.table)
 
-    def numbers(self, field: str, high: float, *, empty: bool = False) -> list[float | None]:
-        """Numbers of at most this size; None for an empty cell where `empty` allows it."""
+    def numbers(self, field: str, high: float, *, low: float | None = None, empty: bool = False) -> list[float | None]:
+        """Numbers from `low` (None: -`high`) to `high`; None for an empty cell where `empty` allows it."""
+        least = -high if low is None else low
         found: list[float | None] = []
         for row, cell in enumerate(self.text(field)):
             value = float(cell) if NUMBER.fullmatch(cell) else math.nan
             if not cell and empty:
                 found.append(None)
-            elif abs(value) <= high:
+            elif least <= value <= high:
                 found.append(value)
             else:
                 remedy = "correct the cell, or name another column"
-                raise self.refuse(row, field, f"a number from {-high:g} to {high:g} for {field}", remedy)
+                raise self.refuse(row, field, f"a number from {least:g} to {high:g} for {field}", remedy)
         return found
 
-    def integers(self, field: str, high: int, *, empty: bool = False) -> list[int | None]:
-        """Whole numbers; "200.0" is one."""
-        values = self.numbers(field, high, empty=empty)
+    def integers(self, field: str, high: int, *, low: int | None = None, empty: bool = False) -> list[int | None]:
+        """Whole numbers, limits as of `numbers`; "200.0" is one."""
+        values = self.numbers(field, high, low=low, empty=empty)
         for row, value in enumerate(values):
             if value is not None and not value.is_integer():
                 remedy = "give the counters of the motors; angles are what the fit finds" if field in COUNTERS else ""
@@ -153,7 +167,7 @@ def _moves(cells: FieldCells, notation: Notation, assumed: list[str]) -> tuple[t
     count = len(cells.table)
     pairs = list(zip(*(cells.integers(field, COUNTER_MAX) for field in COUNTERS), strict=True))
     numbers = cells.text("move") if "move" in cells else None
-    homings = cells.text("segment")
+    homings = homings_of(cells, assumed)
     times_s = seconds_of(cells, assumed)
     approaches = [_approaches(cells, axis, notation.approach[k]) for k, axis in enumerate(AXES)]
     moves: list[Move] = []
@@ -161,7 +175,7 @@ def _moves(cells: FieldCells, notation: Notation, assumed: list[str]) -> tuple[t
     at, segment = (0, 0), 0
     for row in range(count):
         step = pairs[row][0] or 0, pairs[row][1] or 0
-        homed = row > 0 and homings[row] != homings[row - 1]
+        homed = homings[row]
         segment += homed
         again = row > 0 and (numbers[row] == numbers[row - 1] if numbers else True) and not homed
         same = again and (numbers is not None or step == ((0, 0) if notation.relative else at))
@@ -200,13 +214,32 @@ def _approaches(cells: FieldCells, axis: Axis, default: str) -> list[str]:
     return found
 
 
+def homings_of(cells: FieldCells, assumed: list[str]) -> list[bool]:
+    """Whether the axes homed before each row but the first, which begins a segment anyway.
+
+    Numbers of segments change at a homing. Where all cells are 0 or 1 and a 0 follows a 1, they are no numbers of
+    segments but marks: each 1 is a homing, and the 0 after it is none.
+    """
+    if "segment" not in cells:
+        return [False] * len(cells.table)
+    words = [word.lower() for word in cells.text("segment")]
+    flags = [_FLAGS.get(word) for word in words]
+    marked = None not in flags and any(before and not after for before, after in pairwise(flags))
+    later = map(bool, flags[1:]) if marked else (before != after for before, after in pairwise(words))
+    found = [False, *later]
+    count, name = sum(found), escaped(cells.columns["segment"])
+    how = "at each 1" if marked else "where it changes"
+    assumed.append(f"segment: {count} homing{'s' * (count != 1)} after the first row, by column {name} {how}")
+    return found
+
+
 def seconds_of(cells: FieldCells, assumed: list[str]) -> list[float] | None:
     """Seconds of every row: numbers in the unit of the column's name, or dates with times."""
     if "time_s" not in cells:
         return None
     texts = cells.text("time_s")
     if all(NUMBER.fullmatch(cell) for cell in texts):
-        scale = _SECONDS.get(unit_of_name(cells.columns["time_s"]) or "", 1.0)
+        scale = SECONDS.get(unit_of_name(cells.columns["time_s"], SECONDS) or "", 1.0)
         found = [scale * float(cell) for cell in texts]
     else:
         found = []
@@ -228,16 +261,16 @@ def seconds_of(cells: FieldCells, assumed: list[str]) -> list[float] | None:
 def _spots(cells: FieldCells, of_row: Sequence[int], notation: Notation, assumed: list[str]) -> tuple[Spot, ...]:
     """The looks of a table with pixels."""
     pixels = [cells.numbers(field, 1e6, empty=True) for field in PIXELS]
-    stated = [cells.numbers(field, 100.0, empty=True) if field in cells else None for field in PIXEL_SDS]
+    stated = [cells.numbers(field, PIXEL_SD_MAX, empty=True) if field in cells else None for field in PIXEL_SDS]
     if any(column is None for column in stated):
         text = f"standard uncertainty of a centroid: {notation.sd_px:g} px; --sd-px states another"
         assumed.append(f"{text}, the fit finds the scale" if all(c is None for c in stated) else text)
-    experiments = cells.integers("experiment", ID_MAX, empty=True)
-    points = cells.integers("point", 4, empty=True)
-    numbers = cells.integers("spot", ID_MAX, empty=True)
+    experiments = cells.integers("experiment", ID_MAX, low=0, empty=True)
+    points = cells.integers("point", 4, low=1, empty=True)
+    numbers = cells.integers("spot", ID_MAX, low=0, empty=True)
     unique = None not in numbers and len(set(numbers)) == len(numbers)
-    radians = (notation.angle_unit or unit_of_name(cells.columns.get("aperture_deg", ""))) == "rad"
-    readings = cells.numbers("aperture_deg", 1e4, empty=True)
+    scale_deg = DEGREES[notation.angle_unit or unit_of_name(cells.columns.get("aperture_deg", ""), DEGREES) or "deg"]
+    readings = cells.numbers("aperture_deg", APERTURE_MAX_DEG / scale_deg, empty=True)
     statuses, targets = cells.text("status"), cells.text("target")
     spots = []
     for row, move in enumerate(of_row):
@@ -247,15 +280,25 @@ def _spots(cells: FieldCells, of_row: Sequence[int], notation: Notation, assumed
             continue
         status = _status(statuses[row], centre, cells, row)
         number = numbers[row] if unique else row
-        reading = readings[row] if readings[row] is None or not radians else math.degrees(readings[row] or 0.0)
+        reading = None if (read := readings[row]) is None else scale_deg * read
         both = (experiments[row], points[row]) if None not in (experiments[row], points[row]) else (None, None)
         target = targets[row].lstrip("=+-@")[:100]
         spot = Spot(number or 0, move, target, *both, *NO_PIXELS, *NO_PIXELS, status=status)
         if status == "ok":
-            sds = [notation.sd_px if column is None else column[row] for column in stated]
+            sds = [_sd_px(cells, row, field, column, notation) for field, column in zip(PIXEL_SDS, stated, strict=True)]
             spot = with_pixels(spot, "ok", [(value or 0.0) - notation.pixels_from for value in centre], sds)
         spots.append(replace(spot, aperture_deg=reading))
     return tuple(spots)
+
+
+def _sd_px(cells: FieldCells, row: int, field: str, column: Sequence[float | None] | None, notation: Notation) -> float:
+    """The standard uncertainty of a centre: rows without one may hold whatever they like there."""
+    if column is None:
+        return notation.sd_px
+    if (found := column[row]) is None or found < PIXEL_SD_MIN:
+        allowed = f"a number from {PIXEL_SD_MIN:g} to {PIXEL_SD_MAX:g} where the look is ok"
+        raise cells.refuse(row, field, allowed, f"complete the cell, or write --column {field}= and --sd-px")
+    return found
 
 
 def _status(text: str, centre: Sequence[float | None], cells: FieldCells, row: int) -> str:

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 from tvsbayes.errors import refusal
 from tvsbayes.files.foreign_table import ForeignTable
-from tvsbayes.instrument.foreign_looks import BAD, GOOD, FieldCells, seconds_of
+from tvsbayes.instrument.foreign_looks import BAD, GOOD, FieldCells, homings_of, seconds_of
 from tvsbayes.single_axis.axis_campaign import APPROACHES, COMMAND_MAX, Approach, AxisMove, Reading
 
 
@@ -40,14 +40,14 @@ def readings_of(table: ForeignTable, columns: Mapping[str, str]) -> ForeignReadi
         raise refusal("empty", file=table.file, found=found, allowed="at least one row", remedy=remedy)
     assumed: list[str] = []
     commands, values = cells.numbers("command", COMMAND_MAX), cells.numbers("value", COMMAND_MAX, empty=True)
-    stated_u = cells.numbers("u", COMMAND_MAX, empty=True) if "u" in cells else [None] * len(table)
-    times, homings, statuses = seconds_of(cells, assumed), cells.text("segment"), cells.text("status")
+    stated_u = cells.numbers("u", COMMAND_MAX, low=0.0, empty=True) if "u" in cells else [None] * len(table)
+    times, homings, statuses = seconds_of(cells, assumed), homings_of(cells, assumed), cells.text("status")
     if times is None:
         assumed.append("time_s: no column, so 0, 1, 2 ...; drift of the zero is then per move")
     moves: list[AxisMove] = []
     readings: list[Reading] = []
     for row, (command, value) in enumerate(zip(commands, values, strict=True)):
-        homed = row > 0 and homings[row] != homings[row - 1]
+        homed = homings[row]
         if not moves or homed or command != moves[-1].command:
             segment = 0 if not moves else moves[-1].segment + homed
             side = _approach(cells, row) if not moves or homed else ""
