@@ -121,7 +121,9 @@ def test_a_log_of_one_axis_goes_to_an_axis_folder(ask, say, tmp_path):
     assert code == 2 and assert_error(document, "occupied")["file"].endswith("moves.csv")
 
 
-@pytest.mark.parametrize(("column", "unit"), [("reading [mm]", "mm"), ("encoder deg", "deg"), ("encoder", "deg")])
+@pytest.mark.parametrize(
+    ("column", "unit"), [("reading [mm]", "mm"), ("encoder deg", "deg"), ("angle_arcsec", "arcsec"), ("encoder", "deg")]
+)
 def test_readings_are_reported_in_the_unit_of_their_column(ask, say, tmp_path, column, unit):
     """A new folder says what the column says; where that says nothing, the template's degrees, and it is told."""
     log, out = tmp_path / "log.csv", tmp_path / "axis"

@@ -21,3 +21,5 @@ def test_the_choice_of_a_model_keeps_what_the_rig_states():
     stems = ("backlash_deg", "play_variation_deg", "ratio_contrast_deg_per_step")
     assert changed == {f"{stem}.{axis}" for stem in stems for axis in ("pan", "tilt")}
     assert all(bare[name].u == 0 for name in changed)
+    perfect = ModelChoice(perfect_gears=True).table(table).priors
+    assert all(perfect[name] == table.priors[name] for name in HARMONIC_NAMES)

@@ -72,5 +72,5 @@ def test_cells_that_say_nothing_are_refused_with_their_column(tmp_path, row, col
 
 
 def test_a_negative_uncertainty_is_refused_as_check_does(tmp_path):
-    with pytest.raises(InputError, match="line 2, sd: .*from 0 to"):
+    with pytest.raises(InputError, match=r"line 2, sd: .*from 0 to"):
         readings_of(*table(tmp_path, "steps,angle,sd", "0,1,-0.1"))

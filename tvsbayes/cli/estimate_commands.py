@@ -65,7 +65,9 @@ def fit(
     per_axis: Annotated[bool, typer.Option("--per-axis", help="One ratio per axis: contrasts fixed at 0.")] = False,
     harmonics: Annotated[bool, typer.Option("--harmonics", help="Free transmission errors of known period.")] = False,
     no_backlash: Annotated[bool, typer.Option("--no-backlash", help="No play: backlash fixed at 0.")] = False,
-    perfect_gears: Annotated[bool, typer.Option("--perfect-gears", help="No errors by position, no drift.")] = False,
+    perfect_gears: Annotated[
+        bool, typer.Option("--perfect-gears", help="No errors by position but stated or freed harmonics; no drift.")
+    ] = False,
     details: Annotated[
         bool, typer.Option("--details", help="Also print what else the fit says: gears, priors, weak directions.")
     ] = False,

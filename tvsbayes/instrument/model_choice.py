@@ -26,7 +26,8 @@ class ModelChoice:
         harmonics: free the transmission error of every axis with a stated period, N(0, 0.1 deg) each, where
             `[rig.prior]` says nothing else; a harmonic stated as exactly 0 counts as nothing said.
         no_backlash: gears without play, both backlashes fixed at 0.
-        perfect_gears: gears that repeat no error, do not drift and have the same play everywhere.
+        perfect_gears: gears that repeat no error of unknown shape, do not drift and have the same play everywhere;
+            harmonics that `[rig.prior]` states, or that are freed, stay.
     """
 
     robust: bool = False
