@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import csv
+import errno
+import os
 import tracemalloc
 from collections.abc import Iterator
 
@@ -11,6 +13,7 @@ import pytest
 from plyfile import PlyData
 from support.bent_rig import calibration
 
+from tvsbayes.coordinates import cloud_files
 from tvsbayes.coordinates.cloud import CHECKED_MAX, EvenSample, checked, cloud
 from tvsbayes.coordinates.cloud_files import columns_of, write_cloud
 from tvsbayes.coordinates.location import locate_linear
@@ -119,6 +122,23 @@ def test_what_fails_half_way_leaves_the_old_cloud(tmp_path):
     with pytest.raises(InputError) as refused:
         write_cloud([], tmp_path / "c.xyz", [])
     assert ".ply" in str(refused.value.remedy)
+
+
+@pytest.mark.parametrize("part", ["points", "cloud"])
+def test_a_full_disk_leaves_the_old_cloud_and_is_said(tmp_path, monkeypatch, part):
+    def full(*_) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    if part == "points":
+        monkeypatch.setattr(cloud_files._Ply, "add", full)
+    else:
+        monkeypatch.setattr(cloud_files.shutil, "copyfileobj", full)
+    place = tmp_path / "c.ply"
+    place.write_text("old")
+    with pytest.raises(InputError, match="No space left") as refused:
+        write_cloud(cloud(calibration(), [looks(5)], {}), place, [])
+    assert (refused.value.code, refused.value.file) == ("write", str(place)) and refused.value.remedy
+    assert place.read_text() == "old" and len(list(tmp_path.iterdir())) == 1
 
 
 def test_memory_does_not_grow_with_the_number_of_points(tmp_path):

@@ -149,22 +149,22 @@ def write_cloud(blocks: Iterable[CloudBlock], path: Path, names: Sequence[str]) 
         names: of the simpler calibrations in the blocks.
 
     Raises:
-        InputError: of another ending, or the place cannot be written to; what the blocks raise passes through.
+        InputError: of another ending, or the place cannot be written to or is full; what the blocks raise passes
+            through.
     """
     body: _Body = FORMATS[cloud_place(path).suffix.lower()]()
     points = extrapolated = 0
     refused: list[tuple[int, str, str]] = []
-    # How many points there are stands before them and is known after.
-    with tempfile.TemporaryFile() as kept:
+    # How many points there are stands before them and is known after. They wait on the disk that must hold them anyway.
+    with written_whole(path) as stream, tempfile.TemporaryFile(dir=path.parent) as kept:
         for block in blocks:
             body.add(kept, block, names)
             points += len(block.lines)
             extrapolated += int(block.extrapolated.sum())
             refused += [(one.line, one.error.code, one.error.message) for one in block.refused]
         kept.seek(0)
-        with written_whole(path) as stream:
-            stream.write(body.header(names, points))
-            shutil.copyfileobj(kept, stream)
+        stream.write(body.header(names, points))
+        shutil.copyfileobj(kept, stream)
     table = path.with_name(f"{path.stem}.refused.csv") if refused else None
     if table is not None:
         with written_whole(table) as stream:
