@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from tvsbayes.errors import InputError
-from tvsbayes.files.csv_table import CSV_LINE_CHARS_MAX, csv_bytes, parse_table
+from tvsbayes.files.csv_table import CSV_LINE_CHARS_MAX, csv_bytes, parse_table, table_blocks
 
 
 @pytest.mark.parametrize("cell", ["0", "-0", "+1.5", ".5", "5.", "1e3", "1E-3", "-9.25e+2", "000012"])
@@ -94,6 +94,18 @@ def test_broken_tables_name_their_line(data, line, code):
     with pytest.raises(InputError) as caught:
         parse_table(data, "t.csv", ("a", "b"))
     assert (caught.value.code, caught.value.line, caught.value.file) == (code, line, "t.csv")
+
+
+@pytest.mark.parametrize(
+    ("row", "code"),
+    [(b"1,\xe9", "encoding"), (b"1,\x07", "control-character"), (b"1", "row-length"), (b'1,"2', "csv")],
+)
+def test_a_block_of_a_long_table_names_the_line_of_its_file(tmp_path, row, code):
+    path = tmp_path / "t.csv"
+    path.write_bytes(b"a,b\n" + b"1,2\n" * 7 + row + b"\n")
+    with pytest.raises(InputError) as caught:
+        list(table_blocks(path, ("a", "b"), 3))
+    assert (caught.value.code, caught.value.line) == (code, 9)
 
 
 @pytest.mark.parametrize("cell", ["=1+1", "+x", "-x", "@x", "x" * 101, "a\u202eb", "a\x85b", "a\u2028b"])

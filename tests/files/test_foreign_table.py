@@ -110,11 +110,13 @@ LAST = '<sheetData><row r="1048576"><c r="A1048576"><v>1</v></c></row></sheetDat
         (workbook(LAST), "at most 200000 rows"),
         (workbook("<sheetData><row>&x;</row></sheetData>"), "undefined entity"),
         (b"\x89PNG\r\n\x1a\n\0\0\x01", "binary data"),
-        (b'a,b\n"1,2\n', "close every quote"),
+        (b'a,b\n"1,2\n', "line 2: .*close every quote"),
+        (b'# a remark\na,b\n1,2\n"x\n\ny",2\n', "line 4: found a line break inside a cell; .*close every quote"),
+        (b'sep="\na,b\n1,2\n', "line 1: found the quote .* semicolons"),
         (b",".join(b"1" for _ in range(300)), "at most 200 columns"),
         (b"a,b\n" + b"1,2\n" * 200_001, "at most 200000 rows"),
     ],
-    ids=["empty", "xls", "zip", "bomb", "last row", "entity", "png", "quote", "wide", "long"],
+    ids=["empty", "xls", "zip", "bomb", "last row", "entity", "png", "quote", "break", "sep", "wide", "long"],
 )
 def test_what_is_no_table_is_refused(tmp_path, monkeypatch, data, match):
     monkeypatch.setattr(foreign_table, "UNPACKED_BYTES_MAX", 999_999)

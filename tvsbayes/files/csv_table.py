@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import overload
 
 from tvsbayes.errors import INTEGER, InputError, closest, escaped, refusal, shown
-from tvsbayes.files.disk import decode, opened
+from tvsbayes.files.disk import decode, line_in_file, opened
 from tvsbayes.progress import Advance, unshown
 
 CSV_BYTES_MAX = 64 * 1024 * 1024
@@ -189,10 +189,7 @@ class Table:
 
 def _csv_rows(text: str, file: str, skipped: int) -> Iterator[tuple[int, list[str]]]:
     """Rows of a CSV text with the line on which each begins; `skipped` lines of the file follow its first."""
-
-    def in_file(number: int) -> int:
-        return number + (skipped if number > 1 else 0)
-
+    in_file = partial(line_in_file, skipped=skipped)
     bad = partial(refusal, file=file)
 
     def capped_lines() -> Iterator[str]:
@@ -261,7 +258,7 @@ def parse_table(
     for marks, found in (((b"PK\x03\x04",), "a workbook (XLSX)"), ((b"\xff\xfe", b"\xfe\xff"), "UTF-16")):
         if data.startswith(marks):
             raise bad("encoding", found=found, allowed="CSV as UTF-8 text", remedy=f"{FOREIGN}; or save it as UTF-8")
-    rows = _csv_rows(decode(data, file), file, skipped)
+    rows = _csv_rows(decode(data, file, skipped), file, skipped)
     _, header = next(rows, (1, []))
     allowed = "the columns " + ",".join(columns) + (f" and optionally {','.join(optional)}" * bool(optional))
     bad_header = partial(bad, line=1, allowed=allowed)

@@ -114,19 +114,34 @@ def opened(path: Path, allowed: str, folder: Path | None = None) -> Iterator[Bin
         raise bad("unreadable", reason, "check the path and its permissions") from error
 
 
-def decode(data: bytes, file: str) -> str:
-    """UTF-8 text with or without BOM; refuses other encodings, NUL and other control characters."""
+def line_in_file(number: int, skipped: int) -> int:
+    """The line of a file that is the given one of its first and those after the `skipped` that follow it."""
+    return number + (skipped if number > 1 else 0)
+
+
+def decode(data: bytes, file: str, skipped: int = 0) -> str:
+    """UTF-8 text with or without BOM; refuses other encodings, NUL and other control characters.
+
+    Args:
+        data: the text, or its first line and what follows some that were left out.
+        file: its name, for errors.
+        skipped: how many lines were left out after the first.
+
+    Raises:
+        InputError: with the line in the file.
+    """
     bad = partial(refusal, file=file)
     utf16 = data.startswith((b"\xff\xfe", b"\xfe\xff"))
     try:
         text = data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        line = None if utf16 else data.count(b"\n", 0, error.start) + 1
+        line = None if utf16 else line_in_file(data.count(b"\n", 0, error.start) + 1, skipped)
         found = "UTF-16" if utf16 else f"the byte 0x{data[error.start]:02x}"
         allowed, remedy = "UTF-8 text", "save it as UTF-8"
         raise bad("encoding", line=line, found=found, allowed=allowed, remedy=remedy) from error
     if control := CONTROL.search(text):
-        line, found = text.count("\n", 0, control.start()) + 1, shown(control.group())
+        line = line_in_file(text.count("\n", 0, control.start()) + 1, skipped)
+        found = shown(control.group())
         raise bad("control-character", line=line, found=found, allowed="printable text", remedy="remove it")
     return text
 

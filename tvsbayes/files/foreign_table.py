@@ -132,16 +132,25 @@ def _csv_rows(text: str, file: str) -> tuple[list[tuple[int, list[str]]], str]:
     if len(kept) > CSV_ROWS_MAX + 1:
         allowed, remedy = f"at most {CSV_ROWS_MAX} rows", "split it"
         raise refusal("size", file=file, found=f"{len(kept)} rows", allowed=allowed, remedy=remedy)
+    if stated == '"':
+        found, allowed = 'the quote " between cells', ", ".join(SEPARATORS.values())
+        raise refusal("csv", file=file, line=1, found=found, allowed=allowed, remedy="correct or remove the line sep=")
     separator = stated or _separator([line for _, line in kept[:ROWS_TRIED]])
     if separator == " ":
         rows = [(number, line.split()) for number, line in kept]
     else:
         reader = csv.reader((line for _, line in kept), delimiter=separator, skipinitialspace=True, strict=True)
+        rows = []
         try:
-            rows = [(number, [cell.strip() for cell in row]) for (number, _), row in zip(kept, reader, strict=True)]
-        except (csv.Error, ValueError) as error:
-            found, remedy = escaped(str(error), 120), 'close every quote " in its own line'
-            raise refusal("csv", file=file, found=found, allowed="one row per line", remedy=remedy) from error
+            for row in reader:
+                if reader.line_num > len(rows) + 1:
+                    raise csv.Error("a line break inside a cell")
+                rows.append((kept[len(rows)][0], [cell.strip() for cell in row]))
+        except csv.Error as error:
+            line, found, remedy = kept[len(rows)][0], escaped(str(error), 120), 'close every quote " in its own line'
+            raise refusal(
+                "csv", file=file, line=line, found=found, allowed="one row per line", remedy=remedy
+            ) from error
     return rows, SEPARATORS.get(separator, f"'{escaped(separator)}'")
 
 
