@@ -9,6 +9,7 @@ from support.axes import campaign, random_moves, runs
 from tvsbayes.errors import InputError, NothingToEstimate
 from tvsbayes.single_axis.axis_campaign import AxisCampaign, AxisMove, Reading
 from tvsbayes.single_axis.axis_rows import play_places, rows_of
+from tvsbayes.single_axis.classic_line import iso230_figures
 
 
 def line(commands, k=0.01):
@@ -92,3 +93,18 @@ def test_repeats_at_one_stop_share_its_error():
     assert rows_of(campaign(moves, values, 0.01)).redrawn.tolist() == [True, False, True, False, True]
     # Where nobody knows how well a reading is read, the scatter of stops covers it.
     assert rows_of(campaign(moves, values)).redrawn.all()
+
+
+def test_figures_of_the_whole_axis_have_the_words_of_the_standard():
+    """Keys of `fit.json`, in order; of a reversal of 0.2 everywhere without scatter, all figures of spread are nought."""
+    moves = runs(3)
+    side = [-1.0, *np.sign(np.diff([m.command for m in moves]))]
+    values = [0.01 * m.command - 0.1 * s for m, s in zip(moves, side, strict=True)]
+    found = iso230_figures(rows_of(campaign(moves, values)))
+    assert list(found) == [
+        *("reversal", "mean_reversal", "repeatability_forward", "repeatability_backward", "repeatability"),
+        *("systematic_forward", "systematic_backward", "systematic", "mean_systematic"),
+        *("accuracy_forward", "accuracy_backward", "accuracy"),
+    ]
+    # Rounding of positions of 20.
+    assert found["reversal"] == pytest.approx(0.2, abs=1e-9) and found["repeatability_forward"] < 1e-9

@@ -15,10 +15,11 @@ from tvsbayes.files.csv_table import CSV_BYTES_MAX, Table, csv_bytes, parse_tabl
 from tvsbayes.files.disk import opened, read_bytes
 from tvsbayes.files.foreign_table import is_foreign, read_foreign
 from tvsbayes.instrument.axes import SENSES
+from tvsbayes.instrument.campaign import APERTURE_MAX_DEG
+from tvsbayes.instrument.counter_limits import COUNTER_MAX
 from tvsbayes.progress import Advance, unshown
 
 LOOK_COLUMNS = ("pan_steps", "tilt_steps", "pan_approach", "tilt_approach", "aperture_deg")
-STEPS_MAX, ANGLE_MAX_DEG = 1e8, 360.0
 HEAD_BYTES = 4096
 """From which the kind of a file is known."""
 BLOCK_ROWS = 8192
@@ -56,8 +57,8 @@ def _rows(table: Table) -> LookRows:
             if word not in allowed:
                 remedy = "name the direction of the last move of the axis"
                 raise table.refuse(row, f"{axis}_approach", "approach", ", ".join(allowed), remedy)
-    pan, tilt = (table.numbers(name, -STEPS_MAX, STEPS_MAX) for name in ("pan_steps", "tilt_steps"))
-    readings = table.numbers("aperture_deg", -ANGLE_MAX_DEG, ANGLE_MAX_DEG)
+    pan, tilt = (table.numbers(name, -COUNTER_MAX, COUNTER_MAX) for name in ("pan_steps", "tilt_steps"))
+    readings = table.numbers("aperture_deg", -APERTURE_MAX_DEG, APERTURE_MAX_DEG)
     pairs = zip(table.columns["pan_approach"], table.columns["tilt_approach"], strict=True)
     return LookRows(tuple(table.lines), tuple(pan), tuple(tilt), tuple(readings), tuple(pairs))
 

@@ -19,7 +19,7 @@ from functools import partial
 from pathlib import Path
 
 from tvsbayes.errors import CONTROL, InputError, escaped, refusal
-from tvsbayes.files.csv_table import CSV_BYTES_MAX, CSV_ROWS_MAX
+from tvsbayes.files.csv_table import CSV_BYTES_MAX, CSV_ROWS_MAX, NUMBER
 from tvsbayes.files.disk import read_bytes
 
 COLUMNS_MAX = 200
@@ -38,7 +38,6 @@ _MARKS = (
     (b"\xfe\xff", "utf-16", "UTF-16"),
     (b"\xef\xbb\xbf", "utf-8-sig", "UTF-8"),
 )
-_PLAIN = re.compile(r"[+-]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][+-]?[0-9]+)?")
 _COMMA = re.compile(r"[+-]?[0-9]*,[0-9]+(?:[eE][+-]?[0-9]+)?")
 _GROUPED_POINT = re.compile(r"[+-]?[0-9]{1,3}(?:,[0-9]{3})+\.[0-9]+")
 _GROUPED_COMMA = re.compile(r"[+-]?[0-9]{1,3}(?:\.[0-9]{3})+,[0-9]+")
@@ -233,13 +232,13 @@ def _table(file: str, rows: Sequence[tuple[int, list[str]]], words: list[str]) -
         allowed, remedy = f"at most {COLUMNS_MAX} columns", "save the table alone in a file"
         raise refusal("size", file=file, found=f"{width} columns", allowed=allowed, remedy=remedy)
     filled = [(line, cells + [""] * (width - len(cells))) for line, cells in rows]
-    named = not all(_PLAIN.fullmatch(cell) or _COMMA.fullmatch(cell) for cell in filled[0][1] if cell)
+    named = not all(NUMBER.fullmatch(cell) or _COMMA.fullmatch(cell) for cell in filled[0][1] if cell)
     names = _unique(filled[0][1]) if named else [f"column {k}" for k in range(1, width + 1)]
     body = filled[1:] if named else filled
     cells = [cell for _, row in body for cell in row]
     commas = any(_COMMA.fullmatch(cell) or _GROUPED_COMMA.fullmatch(cell) for cell in cells)
     # "1.5" beside "1,5" is nobody's notation: such cells stay as they are and are refused where a number is needed.
-    mixed = commas and any("." in cell and _PLAIN.fullmatch(cell) for cell in cells)
+    mixed = commas and any("." in cell and NUMBER.fullmatch(cell) for cell in cells)
     if commas and not mixed:
         words = [*words, "decimal commas"]
     columns = {}

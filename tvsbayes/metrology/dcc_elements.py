@@ -35,7 +35,7 @@ def add(parent: ET.Element, tag: str, text: object | None = None, **attributes: 
 
 
 def add_words(parent: ET.Element, tag: str, *texts: object, **attributes: str) -> ET.Element:
-    """A `textType` or `richContentType`: one `dcc:content` a paragraph."""
+    """A `textType` or `richContentType`: all texts, with spaces between them, in one `dcc:content`."""
     element = add(parent, tag, **attributes)
     # The Schematron allows each language once per element.
     add(element, "dcc:content", " ".join(map(_plain, texts)), lang="en")

@@ -62,7 +62,6 @@ class AxisRows:
         within: sum of squares of the readings about their mean, in units of their u.
         count: readings in the mean.
         line: offset and unit per command of the least-squares line with a reversal.
-        readings: number of each reading used, and the row that it is in.
     """
 
     unit: str
@@ -79,7 +78,6 @@ class AxisRows:
     within: np.ndarray
     count: np.ndarray
     line: tuple[float, float]
-    readings: tuple[tuple[int, int], ...] = ()
 
     @property
     def travel(self) -> float:
@@ -212,7 +210,6 @@ def rows_of(campaign: AxisCampaign) -> AxisRows:
             remedy="check the columns move and value, and that the reading follows this axis",
         )
     times_h = np.array([m.time_s for m in campaign.moves]) / HOUR_S
-    rows = {int(move): row for row, move in enumerate(moves)}
     rows_found = AxisRows(
         unit=campaign.unit,
         legs=legs,
@@ -228,7 +225,6 @@ def rows_of(campaign: AxisCampaign) -> AxisRows:
         within=within,
         count=count,
         line=(float(line[0] - line[1] * command.mean()), float(line[1])),
-        readings=tuple((r.reading, rows[r.move]) for r in used),
     )
     return rows_found if legs_are_long(rows_found) else _line_with_play(rows_found)
 
@@ -333,10 +329,15 @@ def play_places(rows: AxisRows, backlash: np.ndarray) -> PlayPlaces:
     return PlayPlaces(*found)
 
 
+def line_design(rows: AxisRows) -> np.ndarray:
+    """Columns of offset (at the mean command), unit per command and backlash, shape (rows, 3)."""
+    turned = np.sign(rows.line[1])
+    return np.column_stack([np.ones(len(rows.value)), rows.command - rows.command.mean(), -0.5 * turned * rows.side])
+
+
 def reversal_of(rows: AxisRows) -> tuple[float, float]:
     """Backlash of the least-squares line with one reversal, unit, and its standard error: infinite where none tells."""
-    turned = np.sign(rows.line[1])
-    design = np.column_stack([np.ones(len(rows.value)), rows.command - rows.command.mean(), -0.5 * turned * rows.side])
+    design = line_design(rows)
     solved, _, rank, _ = np.linalg.lstsq(design, rows.value, rcond=None)
     if rank < 3:
         return 0.0, np.inf

@@ -104,7 +104,7 @@ def _moments(w: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
 def weighted_sample(
     density: Density,
-    start: AxisMode | Proposal,
+    start: AxisMode,
     rng: np.random.Generator,
     effective: float = EFFECTIVE_WANTED,
     advance: Advance = unshown,
@@ -113,21 +113,17 @@ def weighted_sample(
 
     Args:
         density: log posterior density up to a constant.
-        start: mode with its curvature, or the proposal of a posterior nearly the same.
+        start: mode with its curvature.
         rng: source of draws.
         effective: equal draws wanted.
         advance: told how far it is.
     """
     proposal = Proposal()
-    if isinstance(start, AxisMode):
-        d = len(start.w)
-        if not d:
-            return WeightedSample(np.zeros((1, 0)), np.ones(1), 0.0, np.inf, 0, (), proposal)
-        proposal.add(start.w, INFLATION * start.covariance, 0.7)
-        proposal.add(start.w, 4.0 * start.covariance, 0.3)
-    else:
-        d = len(start.means[0])
-        proposal = start
+    d = len(start.w)
+    if not d:
+        return WeightedSample(np.zeros((1, 0)), np.ones(1), 0.0, np.inf, 0, (), proposal)
+    proposal.add(start.w, INFLATION * start.covariance, 0.7)
+    proposal.add(start.w, 4.0 * start.covariance, 0.3)
     made, drawn, target, used = [], [], [], []
     k, worth, weights, w = np.inf, 0.0, np.ones(1), np.zeros((0, d))
     for number in range(1, ROUNDS_MAX + 1):

@@ -8,8 +8,8 @@ import numpy as np
 
 from tvsbayes.display import Shown, View
 from tvsbayes.metrology.iso230 import RUNS_MIN, figures_of
-from tvsbayes.results.metrology_tables import Positioning
-from tvsbayes.single_axis.axis_rows import AxisRows
+from tvsbayes.results.metrology_tables import FIGURES, Positioning
+from tvsbayes.single_axis.axis_rows import AxisRows, line_design
 
 
 @dataclass(frozen=True, repr=False)
@@ -39,12 +39,6 @@ class ClassicAxis(Shown):
         ]
         rows += [(name, value, None) for name, value in (self.iso230 or {}).items()]
         return View("ClassicAxis: least-squares line with one reversal", ("quantity", "value", "u"), rows)
-
-
-def line_design(rows: AxisRows) -> np.ndarray:
-    """Columns of offset (at the mean command), unit per command and backlash, shape (rows, 3)."""
-    turned = np.sign(rows.line[1])
-    return np.column_stack([np.ones(len(rows.value)), rows.command - rows.command.mean(), -0.5 * turned * rows.side])
 
 
 @dataclass(frozen=True)
@@ -125,18 +119,10 @@ def positioning_of(rows: AxisRows) -> Positioning | None:
     return figures_of(runs.forward, runs.backward) if len(runs.position) else None
 
 
-ISO_FIGURES = (
-    *("reversal", "mean_reversal", "repeatability_forward", "repeatability_backward", "repeatability"),
-    *("systematic_forward", "systematic_backward", "systematic", "mean_systematic"),
-    *("accuracy_forward", "accuracy_backward", "accuracy"),
-)
-"""Figures of a whole axis, by ISO 230-2's words."""
-
-
 def iso230_figures(rows: AxisRows) -> dict[str, float] | None:
     """Those of the whole axis, by name, in the folder's unit."""
     found = positioning_of(rows)
     if found is None:
         return None
-    kept_as = {name: name.replace("_forward", "_up").replace("_backward", "_down") for name in ISO_FIGURES}
-    return {name: float(getattr(found, f"{kept_as[name]}_deg")) for name in ISO_FIGURES}
+    of_axis = {name.replace("_up", "_forward").replace("_down", "_backward"): name for name in FIGURES}
+    return {name.removesuffix("_deg"): float(getattr(found, kept_as)) for name, kept_as in of_axis.items()}

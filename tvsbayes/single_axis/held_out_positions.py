@@ -14,9 +14,10 @@ from tvsbayes.single_axis.axis_campaign import AxisCampaign
 from tvsbayes.single_axis.axis_fit import model_of
 from tvsbayes.single_axis.axis_mode import find_mode
 from tvsbayes.single_axis.axis_model import AxisModel
-from tvsbayes.single_axis.axis_rows import DIRECTIONS, AxisRows
+from tvsbayes.single_axis.axis_rows import DIRECTIONS, AxisRows, line_design
 from tvsbayes.single_axis.axis_sampling import PARETO_K_MAX, WeightedSample, weighted_sample
-from tvsbayes.single_axis.classic_line import fit_line, line_design
+from tvsbayes.single_axis.classic_line import fit_line
+from tvsbayes.statistics.intervals import NORMAL_95
 from tvsbayes.statistics.weighted_draws import effective_draws, smoothed_weights
 
 EFFECTIVE, DRAWS = 600.0, 300
@@ -25,8 +26,6 @@ POSITIONS_MIN, POSITIONS_MAX = 3, 200
 REFITTED_MAX, WEIGHED, WEIGHED_MIN = 30, 400, 80
 """Positions up to which each has a fit of its own; beyond, draws of one fit are weighted, as long as so many of them
 count. `POSITIONS_MAX` are foretold at most."""
-INSIDE = 1.959963984540054
-"""Standard uncertainties to either side of a 95 % interval."""
 
 
 @dataclass(frozen=True)
@@ -252,7 +251,7 @@ def _scored(
                 predicted=predicted,
                 u=u,
                 rows=len(members),
-                inside=int(np.sum(np.abs(z) <= INSIDE)),
+                inside=int(np.sum(np.abs(z) <= NORMAL_95)),
                 classic_predicted=classic,
                 classic_u=classic_u,
                 end=position in (rows.positions[0], rows.positions[-1]),

@@ -103,8 +103,8 @@ FAULTS = (
     Fault(
         "points that a third of the draws lose",
         "calibration/pointing.py",
-        "least = DIVERGING_SDS *",
-        "least = 0.4 *",
+        "> DIVERGING_SDS *",
+        "> 0.4 *",
         "the robot is sent where no range can be told",
         ("calibration/pointing::test_points_that_too_many_draws_lose_are_refused_as_by_the_draws",),
     ),
