@@ -24,7 +24,8 @@ from support.refusals import refusal
 from support.two_poses import POSES
 
 from tvsbayes.calibration.drawn_looks import drawn
-from tvsbayes.calibration.pointing import DIVERGING_SHARE, INPUT_NAMES, NOISE_NAMES
+from tvsbayes.calibration.located_point import DIVERGING_SHARE
+from tvsbayes.calibration.pointing import INPUT_NAMES, NOISE_NAMES
 from tvsbayes.coordinates.location import carry, locate, locate_linear, settings_of
 from tvsbayes.errors import InputError
 from tvsbayes.statistics.intervals import NORMAL_95

@@ -25,7 +25,8 @@ from support.published_equations import published_point
 from support.waits import check_forward
 
 from tvsbayes.calibration.drawn_looks import drawn
-from tvsbayes.calibration.pointing import DIVERGING_SHARE, INPUT_NAMES, NOISE_NAMES, Calibration
+from tvsbayes.calibration.located_point import DIVERGING_SHARE
+from tvsbayes.calibration.pointing import INPUT_NAMES, NOISE_NAMES, Calibration
 from tvsbayes.coordinates.location import BLOCK, carry, locate, locate_linear, settings_of
 from tvsbayes.errors import InputError
 from tvsbayes.twin.physics import aperture_angle_deg

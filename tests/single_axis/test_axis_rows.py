@@ -96,7 +96,7 @@ def test_repeats_at_one_stop_share_its_error():
 
 
 def test_figures_of_the_whole_axis_have_the_words_of_the_standard():
-    """Keys of `fit.json`, in order; of a reversal of 0.2 everywhere without scatter, all figures of spread are nought."""
+    """Keys of `fit.json`, in order; a reversal of 0.2 everywhere without scatter is one without spread."""
     moves = runs(3)
     side = [-1.0, *np.sign(np.diff([m.command for m in moves]))]
     values = [0.01 * m.command - 0.1 * s for m, s in zip(moves, side, strict=True)]

@@ -1,4 +1,7 @@
-"""The point of one look as a robot gets it: estimate, covariance, and whether its counters were ever looked at; mm."""
+"""The point of one look as a robot gets it: estimate, covariance, and whether its counters were ever looked at; mm.
+
+Also the rule by which a look has no point that can be told.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +9,28 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from tvsbayes.calibration.optics import Number
 from tvsbayes.display import Shown, View
+
+DIVERGING_SHARE = 1e-3
+"""Share of draws without a point above which a point is refused (formulation 5)."""
+DIVERGING_SDS = 3.0902323061678132
+"""Range over its standard deviation below which more than `DIVERGING_SHARE` of a normal 1/range is beyond infinity."""
+
+
+def meets(reach_mm: Number, direction: np.ndarray, covariance_mm2: np.ndarray) -> bool | np.ndarray:
+    """Whether at most `DIVERGING_SHARE` of what the data allow has no point, by the law of propagation (formulation 5).
+
+    The inverse of the range is nearly normal: its tail beyond zero is the share of draws that diverge.
+
+    Args:
+        reach_mm: range of the estimated point, of any shape.
+        direction: of the beam, unit, shape (..., 3).
+        covariance_mm2: of the point, shape (..., 3, 3); where it is not finite the answer is no.
+    """
+    variance = np.einsum("...i,...ij,...j->...", direction, covariance_mm2, direction)
+    finite = np.isfinite(covariance_mm2).all(axis=(-2, -1))
+    return finite & (reach_mm > DIVERGING_SDS * np.sqrt(np.maximum(variance, 0.0)))
 
 
 @dataclass(frozen=True, repr=False)

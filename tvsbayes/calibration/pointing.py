@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 
 from tvsbayes.calibration.aiming import Direction, Drive, Point, Steps, mirror_angles
 from tvsbayes.calibration.gear_table import NO_GEARS, GearTable
-from tvsbayes.calibration.located_point import Located
+from tvsbayes.calibration.located_point import Located, meets
 from tvsbayes.calibration.optics import (
     TO_RAD,
     Components,
@@ -47,10 +47,6 @@ INPUT_NAMES: tuple[str, ...] = names_of(
 )
 """What a coordinate depends on. Contrasts do not enter: after homing a counter stands for its mean ratio."""
 NOISE_NAMES = names_of("stop_sd_deg", "aperture_sd_deg")
-DIVERGING_SHARE = 1e-3
-"""Share of draws without a point above which a point is refused (formulation 5)."""
-DIVERGING_SDS = 3.0902323061678132
-"""Range over its standard deviation below which more than `DIVERGING_SHARE` of a normal 1/range is beyond infinity."""
 UNIT_NOISES: dict[str, float] = {
     **{f"stop error {axis}": 1.0 for axis in AXES},
     **{f"place in the play, {axis}": 1 / 12 for axis in AXES},
@@ -65,21 +61,6 @@ type Counters = tuple[Number, Number]
 """Absolute counters (pan, tilt), steps."""
 type Sides = tuple[float, float]
 """Approach sides (pan, tilt): +1 left or up, -1 right or down, 0 unknown."""
-
-
-def meets(reach_mm: Number, direction: np.ndarray, covariance_mm2: np.ndarray) -> bool | np.ndarray:
-    """Whether at most `DIVERGING_SHARE` of what the data allow has no point, by the law of propagation (formulation 5).
-
-    The inverse of the range is nearly normal: its tail beyond zero is the share of draws that diverge.
-
-    Args:
-        reach_mm: range of the estimated point, of any shape.
-        direction: of the beam, unit, shape (..., 3).
-        covariance_mm2: of the point, shape (..., 3, 3); where it is not finite the answer is no.
-    """
-    variance = np.einsum("...i,...ij,...j->...", direction, covariance_mm2, direction)
-    finite = np.isfinite(covariance_mm2).all(axis=(-2, -1))
-    return finite & (reach_mm > DIVERGING_SDS * np.sqrt(np.maximum(variance, 0.0)))
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tvsbayes.calibration.pointing import Calibration, meets
+from tvsbayes.calibration.located_point import meets
+from tvsbayes.calibration.pointing import Calibration
 from tvsbayes.coordinates.location import Linear, Settings, locate, locate_linear
 from tvsbayes.coordinates.looks_file import LookRows
 from tvsbayes.coordinates.simple_calibration import SimpleCalibration, simple_belief

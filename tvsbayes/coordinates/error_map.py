@@ -13,8 +13,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from tvsbayes.calibration.drawn_looks import Drawn, drawn
+from tvsbayes.calibration.located_point import DIVERGING_SHARE
 from tvsbayes.calibration.optics import Components, aperture_angle_deg
-from tvsbayes.calibration.pointing import DIVERGING_SHARE, Calibration, Sides
+from tvsbayes.calibration.pointing import Calibration, Sides
 from tvsbayes.coordinates.simple_calibration import Belief, SimpleCalibration, simple_belief
 
 

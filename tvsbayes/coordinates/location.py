@@ -15,9 +15,9 @@ from typing import Any, cast
 import numpy as np
 
 from tvsbayes.calibration.drawn_looks import Drawn, drawn
+from tvsbayes.calibration.located_point import DIVERGING_SHARE
 from tvsbayes.calibration.pointing import (
     COMPLEX_STEP,
-    DIVERGING_SHARE,
     INPUT_NAMES,
     NOISES,
     Calibration,

@@ -102,7 +102,7 @@ FAULTS = (
     ),
     Fault(
         "points that a third of the draws lose",
-        "calibration/pointing.py",
+        "calibration/located_point.py",
         "> DIVERGING_SDS *",
         "> 0.4 *",
         "the robot is sent where no range can be told",
