@@ -19,7 +19,14 @@ import xarray as xr
 from tvsbayes.files.disk import write_atomically
 from tvsbayes.instrument.axes import AXES, DIRECTIONS, SENSES
 from tvsbayes.instrument.campaign import input_hashes, ordered_spots, pixels_of
-from tvsbayes.instrument.parameters import BLOCKS, HARMONIC_NAMES, NAMES, RIG_NAMES, STEREO_PARAMETER_NAMES
+from tvsbayes.instrument.parameters import (
+    AMPLITUDE_NAMES,
+    BLOCKS,
+    HARMONIC_NAMES,
+    NAMES,
+    RIG_NAMES,
+    STEREO_PARAMETER_NAMES,
+)
 from tvsbayes.model.headlines import Derived
 from tvsbayes.posterior.chain import fingerprint
 from tvsbayes.posterior.draws import Draws, Posterior
@@ -36,6 +43,7 @@ COORDS: dict[str, tuple[str, ...]] = {
     "tilt_axis_component": ("x", "z"),
     "component": ("x", "y", "z"),
     "harmonic": tuple(name.removeprefix("harmonic_deg.") for name in HARMONIC_NAMES),
+    "harmonic_amplitude": tuple(name.removeprefix("harmonic_amplitude_deg.") for name in AMPLITUDE_NAMES),
     "stereo_parameter": tuple(name.removeprefix("stereo.") for name in STEREO_PARAMETER_NAMES),
 }
 
@@ -49,9 +57,12 @@ class Variable:
 
 
 def _of_block(block: str) -> Variable:
-    """A block of parameters, whose dimension is the one with its labels."""
-    labels = tuple(name.removeprefix(f"{block}.") for name in BLOCKS[block])
-    return Variable(BLOCKS[block], next((dim for dim, own in COORDS.items() if own == labels), None))
+    """A block of parameters, whose dimension is the one with its labels; a block of one name has none."""
+    names = BLOCKS[block]
+    if len(names) == 1:
+        return Variable(names)
+    labels = tuple(name.removeprefix(f"{block}.") for name in names)
+    return Variable(names, next(dim for dim, own in COORDS.items() if own == labels))
 
 
 _RIG_BLOCKS = sorted(
