@@ -101,6 +101,11 @@ def test_headline_budget_is_a_gum_table(linear_fit):
     assert (table.unit, table.estimate, table.u) == ("deg/step", 0.06, sd)
     assert rows["pixel noise"].kind == "A" and rows["pixel noise"].unit == "deg/step"
     assert rows["stereo calibration"].kind == "B"
+    # Errors that the gears repeat are known by their prior, as the cameras are by theirs.
+    for name in ("transmission error", "play variation"):
+        renamed = replace(causes, names=tuple(name if n == "stereo calibration" else n for n in causes.names))
+        told = headline_budget(renamed, "effective_deg_per_step.right", Estimate(0.06, sd, (0.05, 0.07), 1.0, 0.9))
+        assert {row.quantity: row.kind for row in told.rows}[name] == "B"
     assert abs(rows[CORRELATIONS].share) < 1e-6
     prior = next(row for row in table.rows if row.quantity.startswith("prior of ") and row.distribution == "normal")
     assert prior.kind == "B" and prior.contribution == pytest.approx(prior.sensitivity * prior.u)

@@ -24,6 +24,8 @@ from tvsbayes.results.estimates import Estimate, HeadlineCauses
 
 STOP_ERRORS = "stop errors of the campaign"
 TRANSMISSION_ERROR, PLAY_VARIATION = "transmission error", "play variation"
+PRIOR_PARTS = (TRANSMISSION_ERROR, PLAY_VARIATION, "stereo calibration")
+"""Causes of many coordinates each, known by their prior: type B of GUM, as every single prior is."""
 
 
 @dataclass(frozen=True)
@@ -179,7 +181,7 @@ def _noise_causes(fit: JointFit, told: _Told, quantities: tuple[str, ...], sprea
         _Cause(STOP_ERRORS, root(told.by_stops), np.array([stop_freedom(q) for q in quantities])),
         *(
             _Cause(name, np.linalg.norm(spread[:, told.groups[name]], axis=1), np.inf * every)
-            for name in (TRANSMISSION_ERROR, PLAY_VARIATION, "stereo calibration")
+            for name in PRIOR_PARTS
             if name in told.groups
         ),
     ]
@@ -204,8 +206,9 @@ def _prior_causes(fit: JointFit, spread: np.ndarray) -> list[_Cause]:
 def headline_budget(causes: HeadlineCauses, quantity: str, estimate: Estimate) -> BudgetTable:
     """The budget of an effective ratio or a backlash, by cause.
 
-    Rows are independent of each other: noise of the campaign, the cameras' calibration as one, and every stated prior.
-    An estimate moves by c when the centre of a prior moves by one unit.
+    Rows are independent of each other: noise of the campaign (type A); the errors that the gears repeat, the cameras'
+    calibration as one, and every stated prior (type B). An estimate moves by c when the centre of a prior moves by one
+    unit.
 
     Args:
         causes: of `headline_causes`.
@@ -217,7 +220,7 @@ def headline_budget(causes: HeadlineCauses, quantity: str, estimate: Estimate) -
     for k, name in enumerate(causes.names):
         contribution, dof = float(causes.contribution[row, k]), float(causes.dof[row, k])
         if math.isnan(causes.u[k]):
-            kind = "B" if name.startswith("stereo") else "A"
+            kind = "B" if name in PRIOR_PARTS else "A"
             sources.append(
                 Source(name, unit_of(quantity), None, abs(contribution), kind, causes.distribution[k], dof, 1.0)
             )
