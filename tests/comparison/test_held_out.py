@@ -38,6 +38,13 @@ def test_a_single_step_count_cannot_tell(paper_fit):
         assert 0 < held.unseen[direction] < paper_fit.draws.effective_deg_per_step[:, k].std()
 
 
+def test_regions_of_one_counter_ask_for_another_counter(paper_fit, monkeypatch):
+    """A second |N| would start there again and add no region."""
+    monkeypatch.setattr("tvsbayes.comparison.held_out.folds_of", lambda *_: {"pan from 0": np.ones(4, dtype=bool)})
+    reason = hold_out(paper_fit, by="regions").reason
+    assert "start at one counter" in reason and "second starting counter" in reason and "|N|" not in reason
+
+
 def test_joint_foretells_a_step_count_it_never_saw(mixed_fit):
     told = []
     held = hold_out(mixed_fit, progress=told.append)

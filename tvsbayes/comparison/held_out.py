@@ -79,8 +79,11 @@ def hold_out(fit_of_all: JointFit, by: str = "steps", seed: int = 0, *, progress
         return undecided("there is no complete experiment")
     folds = folds_of(campaign, selection, by)
     if len(folds) < 2:
-        what = f"all experiments have |N| = {lengths[0]}" if by == "steps" else "all experiments start at one counter"
-        return undecided(f"{what}: a constant lost motion looks like a ratio there; measure a second |N|")
+        if by == "steps":
+            what = f"all experiments have |N| = {lengths[0]}: a constant lost motion looks like a ratio there"
+            return undecided(f"{what}; measure a second |N|")
+        what = "all experiments start at one counter: no other region is left to foretell it from"
+        return undecided(f"{what}; measure experiments from a second starting counter")
     angle = four_point_ratios(selection.pixels, selection.steps, selection.axis, campaign.stereo) * selection.steps
     predictions: list[Prediction] = []
     with Job(dict.fromkeys(folds, 1.0), progress) as job:
@@ -107,7 +110,11 @@ def hold_out(fit_of_all: JointFit, by: str = "steps", seed: int = 0, *, progress
 
 
 def refit(fit_of_all: JointFit, without: frozenset[int], progress: Show | None = None) -> JointFit:
-    """The same model without some spots; its harmonics, contrasts and backlash are free where they were."""
+    """The same model without some spots; its harmonics, contrasts and backlash are free where they were.
+
+    Spots that a robust fit left out stay out. Those that it kept count in full: what their weight was rests on the
+    spots that are left out, too.
+    """
     from tvsbayes.estimators.joint_fit import fit, priors_used
 
     rig, space = fit_of_all.campaign.rig, fit_of_all.space
