@@ -10,15 +10,25 @@ import pytest
 from support.coarse_planning import with_priors
 
 from tvsbayes.errors import InputError
-from tvsbayes.instrument.parameters import INDEX, Prior
+from tvsbayes.instrument.parameters import INDEX, NAMES, Prior
 from tvsbayes.instrument.plan import PlanStep
-from tvsbayes.planning.candidates import Positions, candidates, sided
+from tvsbayes.planning.candidates import Positions, candidates, run_up_steps, sided
 from tvsbayes.planning.expectation import PARAMETERS, information_of, prior_knowledge
 from tvsbayes.planning.looks import Looks, arrange, covariance_of
 from tvsbayes.planning.plan_check import check_plan
 from tvsbayes.planning.target import parse_target, sensitivity
 
 pytestmark = pytest.mark.usefixtures("small_searches")
+
+
+def test_a_run_up_takes_up_play_and_stops_of_its_own_axis():
+    """By hand: 1.5 (0.3 + 4 x 0.05) / 0.06 = 12.5 steps of pan, 1.5 (0.1 + 4 x 0.02) / 0.07 = 3.9 of tilt."""
+    physical = np.zeros(len(NAMES))
+    values = {"degrees_per_step.pan": -0.06, "degrees_per_step.tilt": 0.07}
+    values |= {"stop_sd_deg.left": 0.01, "stop_sd_deg.right": 0.05, "stop_sd_deg.up": 0.02, "stop_sd_deg.down": 0.01}
+    for name, value in values.items():
+        physical[INDEX[name]] = value
+    np.testing.assert_array_equal(run_up_steps(physical, np.array([0.3, 0.1])), [13, 4])
 
 
 def test_limits_are_kept(mounted_rig, found):

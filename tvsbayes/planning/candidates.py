@@ -48,17 +48,34 @@ class Candidates:
     notes: tuple[str, ...]
 
 
+BACKLASH_COLUMNS = [INDEX[f"backlash_deg.{axis}"] for axis in AXES]
+RUN_UP_STOPS = 4.0
+"""Sds of a stop on top of the play: what the stop before the run-up may be off by, but for one in 30 000."""
+RUN_UP_MARGIN = 1.5
+"""What is known of play and scatter before measuring is rough; half again costs seconds, play left over a look."""
+
+
+def run_up_steps(physical: np.ndarray, lost_deg: np.ndarray) -> np.ndarray:
+    """Run-up (pan, tilt) that takes up a play and a few stop errors, with a margin.
+
+    Args:
+        physical: parameters in the units of their names, shape (p,): ratios and scatter of stops.
+        lost_deg: the play of (pan, tilt) that is to be taken up.
+    """
+    result = []
+    for (axis, sides), lost in zip(SENSES.items(), lost_deg, strict=True):
+        scatter = max(physical[INDEX[f"stop_sd_deg.{side}"]] for side in sides)
+        ratio = abs(physical[INDEX[f"degrees_per_step.{axis}"]])
+        result.append(math.ceil(RUN_UP_MARGIN * (lost + RUN_UP_STOPS * scatter) / ratio))
+    return np.array(result)
+
+
 def overshoot_steps(knowledge: Knowledge) -> np.ndarray:
-    """Run-up (pan, tilt) that takes up the play in 99 % of instruments, and four stop errors, with half again."""
+    """Run-up (pan, tilt) that takes up the play in 99 % of instruments that are expected."""
     draws = draws_of(knowledge, 200, np.random.default_rng(17))
     physical = np.stack([physical_at(z, knowledge.space).value for z in draws])
-    result = []
-    for axis, sides in SENSES.items():
-        lost = np.quantile(physical[:, INDEX[f"backlash_deg.{axis}"]], 0.99)
-        scatter = max(np.median(physical[:, INDEX[f"stop_sd_deg.{side}"]]) for side in sides)
-        ratio = abs(np.median(physical[:, INDEX[f"degrees_per_step.{axis}"]]))
-        result.append(math.ceil(1.5 * (lost + 4 * scatter) / ratio))
-    return np.array(result)
+    lost = np.quantile(physical[:, BACKLASH_COLUMNS], 0.99, axis=0)
+    return run_up_steps(np.median(physical, axis=0), lost)
 
 
 @dataclass(frozen=True)

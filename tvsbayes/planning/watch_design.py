@@ -38,6 +38,7 @@ from tvsbayes.instrument.rig import COSTS_S, Rig
 from tvsbayes.instrument.stereo_pair import triangulate
 from tvsbayes.instrument.stops import rests_of
 from tvsbayes.model.parameter_space import physical_at
+from tvsbayes.planning.candidates import BACKLASH_COLUMNS, run_up_steps
 from tvsbayes.planning.expectation import HOME_VARIANCE_RAD2
 
 PATTERN_MAX = 12
@@ -137,15 +138,9 @@ class WatchDesigns:
 
     @cached_property
     def _overshoot(self) -> np.ndarray:
-        """Run-up (pan, tilt) that takes up the play and four stop errors, with half again, steps."""
+        """Run-up (pan, tilt) that takes up the play as the fit found it, steps."""
         physical = physical_at(self.z, self.fit.space).value
-        result = []
-        for axis, sides in zip(AXES, (("left", "right"), ("up", "down")), strict=True):
-            lost = physical[INDEX[f"backlash_deg.{axis}"]]
-            scatter = max(physical[INDEX[f"stop_sd_deg.{side}"]] for side in sides)
-            ratio = abs(physical[INDEX[f"degrees_per_step.{axis}"]])
-            result.append(int(np.ceil(1.5 * (lost + 4 * scatter) / ratio)))
-        return np.array(result)
+        return run_up_steps(physical, physical[BACKLASH_COLUMNS])
 
     @cached_property
     def _limits(self) -> np.ndarray:
