@@ -17,7 +17,7 @@ from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.estimators.linear_spots import StopGroup, linear_spots, stop_information
 from tvsbayes.instrument.axes import AXES
 from tvsbayes.instrument.campaign import ordered_spots
-from tvsbayes.instrument.parameters import INDEX, NAMES, NOISE_NAMES, RIG_NAMES, STEREO_PARAMETER_NAMES, names_of
+from tvsbayes.instrument.parameters import INDEX, RIG_NAMES, STEREO_PARAMETER_NAMES, names_of
 from tvsbayes.instrument.stops import rests_of
 from tvsbayes.results.estimates import Validation, ValidationTest
 from tvsbayes.statistics.chances import log_chance
@@ -229,8 +229,7 @@ class _Asked:
 
 
 def _ask(fit: JointFit, defects: Sequence[_Defect]) -> _Asked:
-    held = np.isin(NAMES, NOISE_NAMES) | ~fit.free
-    own = np.where(held, 0.0, -np.asarray(fit.linearised.residual_jacobian))
+    own = np.where(fit.held, 0.0, -np.asarray(fit.linearised.residual_jacobian))
     asked = np.concatenate([own, *(columns for defect in defects for columns in defect.columns)], axis=2)
     information = stop_information(linear_spots(fit.linearised, fit.arrays, asked))
     errors = np.concatenate([group.residual for group in information.groups])

@@ -14,7 +14,7 @@ import numpy as np
 
 from tvsbayes.estimators.four_point import Selection, classic_of, experiment_rows, four_point_ratios, select_experiments
 from tvsbayes.instrument.axes import DIRECTIONS
-from tvsbayes.instrument.parameters import names_of
+from tvsbayes.instrument.parameters import OPTICS_NAMES
 from tvsbayes.results.comparison_record import Gap, GapTerm
 from tvsbayes.statistics.intervals import interval95
 from tvsbayes.statistics.weighted_draws import TAILS, weighted_mean, weighted_quantiles
@@ -27,11 +27,8 @@ if TYPE_CHECKING:
 
 GAP_DRAWS = 128
 """The sds of terms are then known to 6 %; each costs the classic estimator of every experiment four times."""
-OPTICS = names_of(
-    *("mirror1_error_deg", "mirror2_error_deg", "laser_tilt_deg", "laser_offset_mm"),
-    *("tilt_axis_skew_deg", "tilt_axis_offset_mm"),
-)
-"""What bends the beam's way through the positioner; all zero in the nominal rig."""
+OPTICS = tuple(name for name in OPTICS_NAMES if name != "mirror_offset_mm")
+"""Of what bends the beam's way, what is zero in the nominal rig."""
 BACKLASH, STEREO_SCALE, SKEW, PROJECTION, CHANCE = (
     "backlash over N",
     "stereo scale and focal scale",

@@ -16,7 +16,15 @@ from jaxtyping import Array, Float, PyTree
 
 from tvsbayes.estimators.campaign_arrays import CampaignArrays
 from tvsbayes.estimators.looks import Looks, Numbers, aperture_reading, in_frame_s
-from tvsbayes.instrument.parameters import INDEX, NAMES, NOISE_NAMES, RIG_NAMES, STEREO_PARAMETER_NAMES, names_of
+from tvsbayes.instrument.parameters import (
+    INDEX,
+    NAMES,
+    NOISE_NAMES,
+    OPTICS_NAMES,
+    RIG_NAMES,
+    STEREO_PARAMETER_NAMES,
+    names_of,
+)
 from tvsbayes.model.geometry import image, materialise, rotation_matrix, transform
 from tvsbayes.model.laser_path import mirror_angles, trace
 from tvsbayes.model.parameter_space import Model, ParameterSpace, model_of
@@ -27,10 +35,7 @@ def _columns(*blocks: str) -> np.ndarray:
 
 
 GEARS = _columns("degrees_per_step", "ratio_contrast_deg_per_step", "backlash_deg", "harmonic_deg", "tilt_zero_deg")
-OPTICS = _columns(
-    *("mirror_offset_mm", "mirror1_error_deg", "mirror2_error_deg", "laser_tilt_deg", "laser_offset_mm"),
-    *("tilt_axis_skew_deg", "tilt_axis_offset_mm"),
-)
+OPTICS = np.array([INDEX[name] for name in OPTICS_NAMES])
 FRAMES = _columns("extrinsics.rotation_rad", "extrinsics.translation_mm")
 CAMERAS = np.array([INDEX["focal_scale"], *(INDEX[name] for name in STEREO_PARAMETER_NAMES)])
 RECEIVER = _columns("baseline_mm", "pan_zero_emission_deg", "aperture_zero_deg")

@@ -185,6 +185,13 @@ def names_of(*blocks: str) -> tuple[str, ...]:
     return tuple(name for block in blocks for name in BLOCKS[block])
 
 
+OPTICS_NAMES: tuple[str, ...] = names_of(
+    *("mirror_offset_mm", "mirror1_error_deg", "mirror2_error_deg", "laser_tilt_deg", "laser_offset_mm"),
+    *("tilt_axis_skew_deg", "tilt_axis_offset_mm"),
+)
+"""What bends the beam's way through the positioner; all but the first are zero in the nominal rig."""
+
+
 def unit_of(name: str) -> Unit:
     """Unit of a parameter or a derived quantity: `backlash_deg.pan` -> deg; "1" where it has none."""
     return REGISTRY[name].unit if name in REGISTRY else DERIVED_UNITS[name.split(".")[0]]

@@ -16,7 +16,7 @@ from functools import cached_property
 import numpy as np
 from scipy.linalg import lapack
 
-from tvsbayes.instrument.parameters import BLOCKS, INDEX, NAMES, NOISE_NAMES, names_of
+from tvsbayes.instrument.parameters import BLOCKS, INDEX, NAMES, NOISE_NAMES, OPTICS_NAMES, names_of
 from tvsbayes.model.gear_kriging import scales_at
 from tvsbayes.model.gear_processes import place_root
 from tvsbayes.model.parameter_space import FARTHEST_SD, half_normal, half_normal_slope
@@ -43,12 +43,6 @@ HEAVY_NAMES = (*NOISE_NAMES, *BLOCKS["backlash_deg"], "extrinsics.rotation_rad.y
 """Coordinates whose tails are heavier than normal: those that few stops tell (a walker stood still for 155 steps at 3.7
 sd of a stop sd), and the tilt of the frames with the mirrors' offset, along whose ridge a quadratic shear falls short
 (one stood at 7.7 sd). Each of them is always proposed from a t of its own."""
-COUPLED_NAMES = (
-    *("mirror_offset_mm", "mirror1_error_deg", "mirror2_error_deg", "tilt_axis_skew_deg"),
-    *(name for block in ("laser_tilt_deg", "laser_offset_mm", "tilt_axis_offset_mm") for name in BLOCKS[block]),
-)
-"""What bends the beam's way through the positioner: wide, and coupled to third order, which the quadratic shear does
-not follow. Where several of them are far out together the target lies beside the proposal."""
 
 
 @dataclass(frozen=True)
@@ -158,8 +152,12 @@ class Transport:
 
     @property
     def coupled(self) -> np.ndarray:
-        """Coordinates of `COUPLED_NAMES`, shape (d,)."""
-        return np.isin(np.array(NAMES)[self.free], COUPLED_NAMES)
+        """Coordinates of what bends the beam's way through the positioner, shape (d,).
+
+        They are wide, and coupled to third order, which the quadratic shear does not follow: where several of them
+        are far out together the target lies beside the proposal.
+        """
+        return np.isin(np.array(NAMES)[self.free], OPTICS_NAMES)
 
     @property
     def pairs(self) -> list[tuple[int, int]]:
