@@ -202,8 +202,3 @@ def spot_constants(campaign: Campaign) -> np.ndarray:
             for s in ordered_spots(campaign)
         ]
     )
-
-
-def log_constant(campaign: Campaign) -> float:
-    """Their sum: terms of the log likelihood that no parameter changes."""
-    return float(np.sum(spot_constants(campaign)))

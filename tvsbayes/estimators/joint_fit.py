@@ -88,7 +88,7 @@ class JointFit(Shown):
         arrays: the campaign as arrays, with the weights of the robust option.
         z: mode in prior coordinates, shape (p,).
         covariance: inverse negative Hessian there, shape (p, p); the identity where nothing is estimated.
-        log_density: log posterior density at the mode, without `campaign_arrays.log_constant`.
+        log_density: log posterior density at the mode, without `campaign_arrays.spot_constants`.
         linearised: the campaign linearised at the mode, without padding.
         information: leave-one-out quantities per stop.
         chi2: squared standardised innovations of the spots used.
@@ -170,8 +170,8 @@ class JointFit(Shown):
     def laplace_evidence(self) -> float:
         """Log of the integral of the density over the estimated coordinates and of its way of homing.
 
-        By the Laplace approximation, without `campaign_arrays.log_constant`. The coordinates have N(0, 1) priors, whose
-        (2 pi)^(-p/2) the Gaussian integral cancels.
+        By the Laplace approximation, without `campaign_arrays.spot_constants`. The coordinates have N(0, 1) priors,
+        whose (2 pi)^(-p/2) the Gaussian integral cancels.
         """
         free = np.flatnonzero(self.free)
         own = 0.5 * float(np.linalg.slogdet(self.covariance[np.ix_(free, free)])[1])

@@ -321,7 +321,7 @@ class Innovations(eqx.Module):
 
     Of each spot two by the filter, then what no stop error changes: four components with the freedom of two at most.
     They hold at the means of the errors at places, whose standardised values are in `places`; squares of both together
-    are the quadratic form of the campaign. `log_density` is its log likelihood without the terms of `log_constant`;
+    are the quadratic form of the campaign. `log_density` is its log likelihood without the terms of `spot_constants`;
     `place_errors_rad` a draw of the errors at places, or their means.
     """
 

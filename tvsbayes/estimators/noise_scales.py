@@ -42,11 +42,6 @@ class NoiseDraws:
     z: np.ndarray
     weights: np.ndarray
 
-    @property
-    def effective(self) -> float:
-        """How many draws of equal weight they are worth."""
-        return float(1 / np.sum(self.weights**2))
-
 
 class ScalesAlone:
     """Log density of the noise scales of a fit, geometry and cameras integrated out, up to a constant.

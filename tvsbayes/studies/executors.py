@@ -1,6 +1,7 @@
 """Where the rows of a study are made: in this process, in spawned processes, or on a Dask cluster.
 
-Every worker has one thread, so that the sums of a row are the same on every engine.
+Workers started here have one thread each, so that the sums of a row are the same in all of them; this process and the
+workers of a cluster that runs already have what their owner gave them.
 """
 
 from __future__ import annotations
