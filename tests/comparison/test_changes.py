@@ -16,12 +16,18 @@ from support.varying_gears import perfect_rig
 from tvsbayes.comparison.changes import compare
 from tvsbayes.estimators.joint_fit import fit
 from tvsbayes.instrument.protocols import four_point_protocol
+from tvsbayes.report.command_text import changes_text
 from tvsbayes.twin.simulated_campaign import simulate
 
 
 def test_a_calibration_has_not_changed_from_itself(mixed_fit):
     same = compare(mixed_fit, mixed_fit)
     assert same.shared_cameras and same.verdict == "no significant change" and same.days is None
+    # At one pose, not along the lines through either campaign's looks; JSON keeps its names.
+    local = np.asarray(mixed_fit.mode.local_deg_per_step)
+    np.testing.assert_allclose([c.first for c in same.changes[:4]], local, rtol=1e-12)
+    assert [c.quantity for c in same.changes[:2]] == ["effective_deg_per_step.left", "effective_deg_per_step.right"]
+    assert "local_deg_per_step.left" in changes_text(same) and "effective" not in changes_text(same)
     for change in same.changes:
         assert change.difference == 0.0 and change.normalised == 0.0 and change.u > 0
     # A second pair of cameras: nothing is shared, every u grows.
@@ -71,6 +77,6 @@ def test_a_changed_gear_is_named(mounted_rig):
     found = compare(*map(fit, dated))
     moved = {c.quantity for c in found.changes if c.significant}
     assert moved == {"effective_deg_per_step.left", "effective_deg_per_step.right"}
-    assert found.days == 30.0 and found.verdict.startswith("changed: effective_deg_per_step.left by +")
+    assert found.days == 30.0 and found.verdict.startswith("changed: local_deg_per_step.left by +")
     for change in found.changes[:2]:
         assert change.difference == pytest.approx(0.02 * change.first, abs=4 * change.u)

@@ -191,7 +191,7 @@ def _classic_predicted(source: _Source) -> dict[str, Estimate | None]:
 
 
 def _curves(posterior: Posterior, moved: set[str]) -> Curves:
-    """Effective ratios along both axes over the range that was seen, and lost motion at the step counts used."""
+    """Local ratios along both axes over the range that was seen, and lost motion at the step counts used."""
     lost = {direction: _lost_motion(posterior, direction) for direction in DIRECTIONS if direction in moved}
     some = posterior.resampled(1, CURVE_DRAWS)
     along: dict[str, tuple[CurvePoint, ...]] = {axis: _along(some, index, moved) for index, axis in enumerate(AXES)}
@@ -199,14 +199,14 @@ def _curves(posterior: Posterior, moved: set[str]) -> Curves:
 
 
 def _along(posterior: Posterior, axis: int, moved: set[str]) -> tuple[CurvePoint, ...]:
-    """Effective ratios at angles of one axis, the other at the reference pose."""
+    """Local ratios at angles of one axis, the other at the reference pose."""
     angles = np.degrees(posterior.fit.linearised.mirror_angles_rad)[:, axis]
     points = []
     for angle in np.linspace(angles.min(), angles.max(), CURVE_POINTS):
         pose = np.degrees(posterior.fit.reference_pose_rad)
         pose[axis] = angle
         pan, tilt = pose.tolist()
-        found = posterior.effective_deg_per_step(pan, tilt)
+        found = posterior.local_deg_per_step(pan, tilt)
         ratios = {
             direction: RatioAt(float(found.mean[k]), float(found.sd[k]), tuple(found.interval95[:, k].tolist()))
             for k, direction in enumerate(DIRECTIONS)

@@ -1,6 +1,7 @@
 """Two campaigns of one rig: which of its ratios and backlashes have changed, beyond what both fits leave open.
 
-Ratios in deg/step, backlashes in deg, at the reference pose of the first. Loads JAX when asked, not when imported.
+Local ratios in deg/step at the reference pose of the first, backlashes in deg: lines through looks at other counters
+are other quantities. Loads JAX when asked, not when imported.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
 
 
 QUANTITIES = (*(f"effective_deg_per_step.{d}" for d in DIRECTIONS), *(f"backlash_deg.{axis}" for axis in AXES))
-"""What is compared."""
+"""What is compared, by the names that JSON gives it; the ratios are local ones."""
 
 
 def _draws_at(found: JointFit, pose_rad: np.ndarray) -> np.ndarray:
@@ -71,7 +72,7 @@ def compare(first: JointFit, second: JointFit) -> Comparison:
         changes.append(Change(name, unit_of(name), a, b, b - a, u, ratio, significant))
     moved = [c for c in changes if c.significant]
     listed = ", ".join(
-        f"{c.quantity} by {c.difference:+.3g} {c.unit} "
+        f"{c.told} by {c.difference:+.3g} {c.unit} "
         + ("(held fixed)" if c.normalised is None else f"({c.normalised:+.1f} u)")
         for c in moved
     )

@@ -29,7 +29,7 @@ class ClassicForecast:
 
     Attributes:
         sd: standard deviation of one experiment, shape (draws, 4).
-        error: its systematic error, estimate less effective ratio, shape (draws, 4).
+        error: its systematic error, estimate less local ratio at the mean pose of the looks, shape (draws, 4).
         stereo_u: uncertainty by stereo and focal scale at the first of them, common to all experiments, shape (4,).
     """
 
@@ -51,7 +51,7 @@ def classic_forecast(knowledge: Knowledge, instruments: Instruments) -> ClassicF
         return None
     near, far = knowledge.sheets[0], knowledge.sheets[1]
     plan = four_point_protocol(2, targets=(near, far))
-    pixels, steps, axes, effective, stops, spot_sds = [], [], [], [], [], []
+    pixels, steps, axes, local, stops, spot_sds = [], [], [], [], [], []
     first = None
     for physical in instruments.physical[:CLASSIC_DRAWS]:
         parameters = dict(zip(NAMES, map(float, physical), strict=True))
@@ -68,7 +68,7 @@ def classic_forecast(knowledge: Knowledge, instruments: Instruments) -> ClassicF
         steps.append(selection.steps[later])
         axes.append(selection.axis[later])
         true = local_deg_per_step(with_derived(parameters), pose)
-        effective.append([true[d] for d in DIRECTIONS])
+        local.append([true[d] for d in DIRECTIONS])
         stops.append([parameters[f"stop_sd_deg.{d}"] ** 2 for d in DIRECTIONS])
         spot_sds.append([rig.spot_sd_px * parameters["pixel_scale"]])
         first = run.campaign if first is None else first
@@ -78,10 +78,10 @@ def classic_forecast(knowledge: Knowledge, instruments: Instruments) -> ClassicF
     ratio = found.ratio.reshape(-1, len(DIRECTIONS))
     by_pixel = np.sum(found.by_pixel**2, axis=(1, 2)).reshape(ratio.shape)
     pair = np.array(stops) + np.array(stops)[:, [1, 0, 3, 2]]
-    variance = by_pixel * np.array(spot_sds) ** 2 + pair * (ratio / np.array(effective) / np.array(steps)) ** 2
+    variance = by_pixel * np.array(spot_sds) ** 2 + pair * (ratio / np.array(local) / np.array(steps)) ** 2
     # Every direction has its experiments, else the draw was left out.
     stereo_u = np.array([r.u_stereo_deg_per_step for r in classic(first).directions.values() if r is not None])
-    return ClassicForecast(np.sqrt(variance), ratio - np.array(effective), stereo_u)
+    return ClassicForecast(np.sqrt(variance), ratio - np.array(local), stereo_u)
 
 
 def classic_count(sd: float, half_width: float) -> int:

@@ -121,7 +121,7 @@ class Posterior(Shown):
     Attributes:
         fit: the fit whose posterior it is.
         z: draws of the prior-normal coordinates, shape (chain, draw, p); of importance sampling all are one chain.
-        log_density: their log posterior density, without `campaign_arrays.log_constant`, shape (chain, draw).
+        log_density: their log posterior density, without `campaign_arrays.spot_constants`, shape (chain, draw).
         draws: parameters and headlines in the units of data/docs/conventions.md, fields with leading axes (chain,
             draw).
         weights: of the draws, sum 1, shape (chain, draw).
@@ -239,8 +239,8 @@ class Posterior(Shown):
             raise ValueError(f"the function has no finite value for {100 * share:.2g} % of the draws")
         return self.summarised(values.reshape(chains, draws, *values.shape[1:]))
 
-    def effective_deg_per_step(self, pan_deg: float, tilt_deg: float) -> Propagated:
-        """Local degrees per step (left, right, up, down) at any pose of the mirrors (formulation 3.2)."""
+    def local_deg_per_step(self, pan_deg: float, tilt_deg: float) -> Propagated:
+        """Gear ratio times the slope of the mirrors (left, right, up, down) at any pose (formulation 3.2)."""
         return self.summarised(local_deg_per_step(self.fit, self.z, np.radians([pan_deg, tilt_deg])))
 
     def lost_motion_deg(self, direction: str, steps: np.ndarray) -> Propagated:

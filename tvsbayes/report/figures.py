@@ -415,7 +415,7 @@ def shares(budget: Budget) -> Figure:
 
 
 def ratio_curves(curves: Curves) -> Figure:
-    """Effective ratios along both axes with 95 % intervals."""
+    """Local ratios along both axes with 95 % intervals."""
     with drawing(5.4) as figure:
         panels = figure.subplots(2, 1)
         for axes, axis, shown in zip(panels, SENSES, SENSES.values(), strict=True):

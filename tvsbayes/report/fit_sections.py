@@ -102,8 +102,8 @@ def results_section(e: Evidence) -> Section:
         views.append(
             figure_view(
                 figures.ratio_curves(e.fit.summary.curves),
-                "Effective ratios over the range of pan and tilt angles; values in fit.json",
-                "Effective ratios over the range that was seen.",
+                "Local ratios over the range of pan and tilt angles; values in fit.json",
+                "Local ratios over the range that was seen: gear ratio times the slope of the mirrors.",
             )
         )
     return Section("Results in full", text, tables=tables, figures=views, opened=True)

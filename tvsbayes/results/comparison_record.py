@@ -33,7 +33,7 @@ class Gap:
 
     Attributes:
         classic: the classic estimator's mean.
-        joint: effective ratio at the reference pose.
+        joint: effective ratio.
         total: classic - joint.
         terms: its parts, which add up to `total`.
     """
@@ -170,7 +170,7 @@ class Change:
     """One quantity of two calibrations.
 
     Attributes:
-        quantity: contract name.
+        quantity: as JSON has it; what it calls an effective ratio is the local one at the pose of the comparison.
         unit: of the values.
         first, second: estimates of A and B.
         difference: second - first.
@@ -189,6 +189,11 @@ class Change:
     normalised: float | None
     significant: bool
 
+    @property
+    def told(self) -> str:
+        """The contract name of what was compared."""
+        return self.quantity.replace("effective_deg_per_step", "local_deg_per_step")
+
 
 @dataclass(frozen=True, repr=False)
 class Comparison(Shown):
@@ -196,7 +201,7 @@ class Comparison(Shown):
 
     Attributes:
         reference_pose_deg: (pan, tilt) of A, at which both are compared.
-        changes: of the effective ratios and the backlashes.
+        changes: of the local ratios at that pose and the backlashes.
         shared_cameras: both campaigns state the same stereo calibration; its error is common.
         days: from A to B where both state when they were made.
         limit: of |normalised|.
@@ -214,8 +219,7 @@ class Comparison(Shown):
         """What has changed."""
         columns = ("quantity", "unit", "A", "B", "B - A", "u", "normalised", "significant")
         rows = [
-            (c.quantity, c.unit, c.first, c.second, c.difference, c.u, c.normalised, c.significant)
-            for c in self.changes
+            (c.told, c.unit, c.first, c.second, c.difference, c.u, c.normalised, c.significant) for c in self.changes
         ]
         return View(f"Comparison: {self.verdict}", columns, rows)
 

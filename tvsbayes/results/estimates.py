@@ -146,7 +146,7 @@ class Validation:
 
 @dataclass(frozen=True)
 class RatioAt:
-    """An effective ratio at one pose, deg/step: mean, standard deviation, equal-tailed 95 % interval."""
+    """A local ratio at one pose, deg/step: mean, standard deviation, equal-tailed 95 % interval."""
 
     value: float
     sd: float
@@ -155,7 +155,7 @@ class RatioAt:
 
 @dataclass(frozen=True)
 class CurvePoint:
-    """Effective ratios of the directions that moved, at one pose of the mirrors."""
+    """Local ratios of the directions that moved, at one pose of the mirrors."""
 
     pan_deg: float
     tilt_deg: float
@@ -177,7 +177,7 @@ class Curves:
     """What a posterior says of other poses and step counts.
 
     Attributes:
-        ratios: by axis ("pan", "tilt"): effective ratios along the angles of that axis that were seen.
+        ratios: by axis ("pan", "tilt"): local ratios along the angles of that axis that were seen.
         lost_motion: by direction, for the step counts that were used.
     """
 
@@ -221,7 +221,7 @@ class FitSummary(Shown):
         estimator: "posterior" if a converged sample stands behind the numbers, else "laplace".
         tier: what made a posterior's draws, "importance" or "emcee"; None of a Laplace approximation.
         sampling: diagnosis of the draws, None where nothing was sampled.
-        curves: effective ratios over the range and lost motion against steps; only from a posterior.
+        curves: local ratios over the range and lost motion against steps; only from a posterior.
         validation: whether the residuals look as the model says; None where nobody asked.
         few_stops: directions in which so few stops were seen that their scatter is poorly known, with the number.
     """

@@ -55,8 +55,8 @@ class ResultDraws:
     Attributes:
         names: columns of `physical`.
         physical: shape (draws, names), in the units of the names.
-        effective_deg_per_step: left, right, up, down at the reference pose, shape (draws, 4).
-        reference_pose_rad: mirror angles (pan, tilt), shape (2,).
+        effective_deg_per_step: left, right, up, down, slopes of the lines through the looks, shape (draws, 4).
+        reference_pose_rad: mean mirror angles (pan, tilt) of the looks used, shape (2,).
     """
 
     names: tuple[str, ...]
