@@ -216,7 +216,7 @@ def _results(
     import numpy as np
 
     from tvsbayes.assessment.fitted_calibration import DRAWS_KEPT, calibration_of
-    from tvsbayes.assessment.summary import summarise
+    from tvsbayes.assessment.summary import equal_laplace_draws, summarise
     from tvsbayes.instrument.campaign import input_hashes
     from tvsbayes.results.fit_record import FitRecord, covariance_of_draws, provenance
     from tvsbayes.results.stored_draws import ResultDraws, write_results
@@ -224,7 +224,7 @@ def _results(
     summary = summarise(found, posterior)
     usable = posterior if summary.estimator == "posterior" else None
     calibration = calibration_of(found, posterior, seed=seed) if found.converged else None
-    behind = found.draws if usable is None else usable.thinned(DRAWS_KEPT)
+    behind = equal_laplace_draws(found) if usable is None else usable.thinned(DRAWS_KEPT)
     physical, effective = np.asarray(behind.physical), np.asarray(behind.effective_deg_per_step)
     draws = ResultDraws(found.names, physical, effective, found.reference_pose_rad)
     record = FitRecord(

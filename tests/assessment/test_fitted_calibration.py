@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -10,7 +12,7 @@ from support.bent_rig import (
     calibration,
 )
 from support.linear_fit import fit_of, linear_problem
-from support.small_campaign import small_campaign
+from support.small_campaign import seen_steps, small_campaign
 
 from tvsbayes.assessment.causes import causes_of
 from tvsbayes.assessment.fitted_calibration import (
@@ -18,6 +20,7 @@ from tvsbayes.assessment.fitted_calibration import (
     calibration_of_draws,
 )
 from tvsbayes.calibration.pointing import INPUT_NAMES, NOISE_NAMES
+from tvsbayes.estimators.joint_fit import Alternative
 from tvsbayes.instrument.campaign import input_hashes
 from tvsbayes.instrument.parameters import INDEX, Prior
 
@@ -31,7 +34,7 @@ def drawn(campaign, draws=4000):
     names = ("pixel_scale", *reversed((*INPUT_NAMES, *NOISE_NAMES)))
     physical = np.concatenate([bent.inputs, bent.noise], axis=1)[:, ::-1]
     physical = np.column_stack([np.full(draws, 7.0), physical])
-    return bent, calibration_of_draws(names, physical, campaign, "laplace", 3)
+    return bent, calibration_of_draws(names, physical, campaign, "laplace", 3, seen_steps(campaign))
 
 
 def test_calibration_of_draws_takes_its_columns():
@@ -44,9 +47,7 @@ def test_calibration_of_draws_takes_its_columns():
     # Mean of the squares, not square of the mean: a variance adds up in variances.
     assert one.noise_variance["aperture_sd_deg"] == pytest.approx((bent.noise[:, 4] ** 2).mean(), rel=ROUNDING)
     assert one.azimuth and one.estimator == "laplace" and one.causes == ()
-    seen = [campaign.moves[spot.move] for spot in campaign.spots if spot.status == "ok"]
-    pan, tilt = [m.pan_steps for m in seen], [m.tilt_steps for m in seen]
-    np.testing.assert_array_equal(one.range_steps, [[min(pan), max(pan)], [min(tilt), max(tilt)]])
+    np.testing.assert_array_equal(one.range_steps, seen_steps(campaign))
     assert one.inputs_sha256 == input_hashes(campaign)
     play_steps = bent.inputs[:, 2] / bent.inputs[:, 0]
     least = one.overshoot_steps["pan"]
@@ -60,7 +61,7 @@ def test_a_stated_variance_comes_out_as_stated():
     physical[:, -1] = 0.02
     names = (*INPUT_NAMES, *NOISE_NAMES)
     assert names[-1] == "aperture_sd_deg"
-    one = calibration_of_draws(names, physical, campaign, "laplace", 3)
+    one = calibration_of_draws(names, physical, campaign, "laplace", 3, seen_steps(campaign))
     assert one.noise_variance["aperture_sd_deg"] == 0.0004
 
 
@@ -94,3 +95,31 @@ def test_calibration_of_a_fit_brings_its_causes(mounted_rig):
     assert (one.estimator, one.causes) == ("laplace", causes.names)
     np.testing.assert_array_equal(one.cause_covariance, causes.covariance)
     np.testing.assert_array_equal(one.inputs, fit.draws.physical[:, [INDEX[name] for name in INPUT_NAMES]])
+
+
+class Drawn(NamedTuple):
+    """What a calibration takes of a fit's draws."""
+
+    physical: np.ndarray
+    place_errors_rad: np.ndarray
+
+
+def test_a_calibration_holds_every_way_of_homing_that_counts(mounted_rig):
+    """Two ways whose pan ratios differ by far more than either leaves open: mean and variance are of both."""
+    first = fit_of(*linear_problem(), mounted_rig)
+    physical = first.draws.physical.copy()
+    object.__setattr__(first, "draws", Drawn(physical.copy(), first.draws.place_errors_rad))
+    physical[:, INDEX["degrees_per_step.pan"]] += 0.1
+    other = copy(first)
+    object.__setattr__(other, "draws", Drawn(physical, first.draws.place_errors_rad))
+    ways = Alternative({"pan": "left"}, 0.6, first), Alternative({"pan": "right"}, 0.4, other)
+    both = copy(first)
+    object.__setattr__(both, "alternatives", ways)
+    one = calibration_of(both)
+    column = one.inputs[:, INPUT_NAMES.index("degrees_per_step.pan")]
+    assert len(column) == len(physical)
+    # 50 draws of sd 0.001 about either: 30 of the one way, 20 of the other.
+    assert column.mean() == pytest.approx(0.5 + 0.4 * 0.1, abs=4 * 0.001 / 50**0.5)
+    assert np.sum(column > 0.55) == 20
+    np.testing.assert_array_equal(column, calibration_of(both).inputs[:, INPUT_NAMES.index("degrees_per_step.pan")])
+    assert np.ptp(np.flatnonzero(column > 0.55)) > 20, "the first draws alone stand for the whole"

@@ -173,8 +173,9 @@ def calibrated(gears: list[AxisErrors], seed: int) -> Calibration:
     ]
     tiled = np.tile(mode, (TWIN_DRAWS, 1))
     drawn = drawn_gears(fit, tiled, np.tile(np.radians(np.concatenate(known)), (TWIN_DRAWS, 1)), seed)
-    found = calibration_of_draws(NAMES, tiled, small_campaign(), "posterior", 0, drawn)
-    return replace(found, range_steps=np.array([[-200.0, 210.0], [-90.0, 140.0]]), azimuth=False, period_deg={})
+    seen = np.array([[-200.0, 210.0], [-90.0, 140.0]])
+    found = calibration_of_draws(NAMES, tiled, small_campaign(), "posterior", 0, seen, drawn)
+    return replace(found, azimuth=False, period_deg={})
 
 
 def true_point(gears: list[AxisErrors], steps: tuple[float, float], reading_deg: float) -> np.ndarray:

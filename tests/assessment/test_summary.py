@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from types import SimpleNamespace
 
+import equinox as eqx
 import numpy as np
 import pytest
 
-from tvsbayes.assessment.summary import CLASSIC_DRAWS, summarise, worth_sampling
+from tvsbayes.assessment.summary import CLASSIC_DRAWS, _classic_predicted, summarise, worth_sampling
 from tvsbayes.estimators.four_point import classic, experiment_rows, four_point_ratios, select_experiments
-from tvsbayes.estimators.joint_fit import fit
+from tvsbayes.estimators.joint_fit import Alternative, fit
 from tvsbayes.instrument.campaign import Campaign
 from tvsbayes.instrument.model_choice import ModelChoice
 from tvsbayes.instrument.parameters import GEAR_ERROR_NAMES, HARMONIC_NAMES, INDEX, NAMES, RECEIVER_NAMES, Prior
@@ -64,6 +66,20 @@ def test_intervals_hold_their_value_and_match_their_sd(summary):
         if name.startswith(("extrinsics", "stereo", "degrees_per_step")):
             # Linear in Gaussian coordinates: 2 x 1.96 sd. Derived ones come from 2048 draws (3 % of an end).
             assert high - low == pytest.approx(2 * 1.96 * estimate.sd, rel=0.1), name
+
+
+def test_intervals_of_several_ways_of_homing_are_those_of_their_sds(fitted, summary):
+    """Two ways whose backlashes lie five sds apart: no interval is the first way's alone."""
+    name = "backlash_deg.pan"
+    apart, physical = 5 * summary.parameters[name].sd, np.array(fitted.draws.physical)
+    physical[:, INDEX[name]] += apart
+    other = replace(fitted, draws=eqx.tree_at(lambda d: d.physical, fitted.draws, physical))
+    ways = Alternative({"pan": "left"}, 0.6, fitted), Alternative({"pan": "right"}, 0.4, other)
+    alone, both = summary.parameters, summarise(replace(fitted, alternatives=ways)).parameters
+    # Of a mixture: the mean of the variances and p (1 - p) times the squared distance.
+    assert both[name].sd == pytest.approx(np.hypot(alone[name].sd, np.sqrt(0.24) * apart), rel=1e-6)
+    assert both[name].interval95[1] > alone[name].interval95[1] + 0.7 * apart
+    assert both["mirror_offset_mm"].sd == pytest.approx(alone["mirror_offset_mm"].sd, rel=1e-6)
 
 
 def test_backlash_intervals_stay_positive(summary):
@@ -161,6 +177,23 @@ def test_the_predicted_classic_is_the_chain_run_on_every_draws_pixels(paper, fit
         # What slopes leave out is a thousandth of an sd, in single draws a hundredth; a pixel left out is tenths.
         assert abs(predicted.sd / means.std() - 1) < 5e-3, direction
         assert np.abs(np.array(predicted.interval95) - interval95(means)).max() < 5e-3 * means.std(), direction
+
+
+def test_a_draw_that_went_astray_drops_no_experiment(paper, fitted, monkeypatch):
+    """One draw of 256 shows the first experiment beyond the lens model, and most show the second there."""
+    selection = select_experiments(paper)
+    ratios = np.random.default_rng(3).normal(0.06, 1e-4, (CLASSIC_DRAWS, len(selection.experiments)))
+    ratios[0, 0] = np.nan
+    ratios[: CLASSIC_DRAWS // 2 + 1, 1] = np.nan
+    monkeypatch.setattr("tvsbayes.assessment.summary.ideal_pixels", lambda *_: np.zeros((1, len(paper.spots))))
+    monkeypatch.setattr("tvsbayes.assessment.summary.four_point_ratios", lambda *_: ratios)
+    direction = selection.direction[0]
+    mine = selection.direction == direction
+    mine[1] = False
+    found = _classic_predicted(SimpleNamespace(fit=fitted, posterior=object()))[direction]
+    # The draw itself tells nothing of the mean of all; the experiment is in it.
+    assert found.sd == pytest.approx(ratios[1:, mine].mean(axis=1).std(), rel=1e-9)
+    assert found.value == pytest.approx(np.nanmean(ratios[:, mine], axis=0).mean(), rel=1e-12)
 
 
 def test_the_prediction_holds_the_classic_bias(paper, summary):

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support.small_campaign import small_campaign
+from support.small_campaign import seen_steps, small_campaign
 
 from tvsbayes.assessment.fitted_calibration import calibration_of_draws
 from tvsbayes.calibration.calibration_file import CALIBRATION_FORMAT, calibration_bytes, load_calibration
@@ -35,7 +35,7 @@ def drawn_calibration(campaign) -> Calibration:
         sd = RELATIVE_SD * abs(value) if name.startswith(("degrees", "mirror", "laser", "backlash")) else 0.0
         columns.append(value + sd * generator.standard_normal(600))
     causes = ("pixel noise", "stereo calibration")
-    found = calibration_of_draws(NAMES, np.stack(columns, axis=1), campaign, "posterior", 0)
+    found = calibration_of_draws(NAMES, np.stack(columns, axis=1), campaign, "posterior", 0, seen_steps(campaign))
     parts = np.stack([0.25 * found.covariance, 0.75 * found.covariance])
     return replace(found, causes=causes, cause_covariance=parts)
 

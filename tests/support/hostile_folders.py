@@ -19,7 +19,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from support.small_campaign import small_campaign
+from support.small_campaign import seen_steps, small_campaign
 
 from tvsbayes.acquisition.journal import Journal, encode, read_journal
 from tvsbayes.acquisition.journal_check import verify
@@ -119,7 +119,7 @@ def drawn_calibration(campaign) -> Calibration:
     for name in names:
         value = RIG_PRIORS[name].value
         columns.append(value + 0.01 * abs(value) * generator.standard_normal(600))
-    found = calibration_of_draws(names, np.stack(columns, axis=1), campaign, "posterior", 0)
+    found = calibration_of_draws(names, np.stack(columns, axis=1), campaign, "posterior", 0, seen_steps(campaign))
     parts = np.stack([0.25 * found.covariance, 0.75 * found.covariance])
     return replace(found, causes=("pixel noise", "stereo calibration"), cause_covariance=parts)
 

@@ -105,6 +105,7 @@ def fit_of(jacobian: np.ndarray, load: np.ndarray, rig, readings: bool = False) 
         "z": 0.1 * np.random.default_rng(4).normal(size=len(NAMES)),
         "draws": SimpleNamespace(physical=physical, place_errors_rad=np.zeros((len(physical), 0))),
         "campaign": small_campaign(),
+        "sides": {},
     }
     for name, value in values.items():
         object.__setattr__(fit, name, value)

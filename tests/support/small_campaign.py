@@ -32,6 +32,13 @@ def small_stereo() -> Stereo:
     )
 
 
+def seen_steps(campaign: Campaign) -> np.ndarray:
+    """Lowest and highest counter of each axis that a look saw, shape (2, 2)."""
+    seen = [campaign.moves[spot.move] for spot in campaign.spots if spot.status == "ok"]
+    counters = np.array([(m.pan_steps, m.tilt_steps) for m in seen], dtype=float)
+    return np.stack([counters.min(axis=0), counters.max(axis=0)], axis=1)
+
+
 def small_campaign() -> Campaign:
     """Five moves in two segments, eight spots (one undetected, one refused), every optional field used."""
     moves = (

@@ -13,7 +13,7 @@ import numpy as np
 
 from tvsbayes.assessment.causes import PLAY_VARIATION, TRANSMISSION_ERROR, Causes, causes_of
 from tvsbayes.assessment.gear_tables import DrawnGears, drawn_gears
-from tvsbayes.assessment.summary import seen_range
+from tvsbayes.assessment.summary import equal_laplace_draws, seen_range
 from tvsbayes.calibration.gear_table import NO_GEARS, GearTable
 from tvsbayes.calibration.optics import ERROR_AT, PLAY_AT
 from tvsbayes.calibration.pointing import INPUT_NAMES, NOISE_NAMES, Calibration
@@ -35,6 +35,7 @@ def calibration_of_draws(
     campaign: Campaign,
     estimator: str,
     seed: int,
+    range_steps: np.ndarray,
     gears: DrawnGears | None = None,
 ) -> Calibration:
     """Choose the columns that coordinates depend on.
@@ -48,6 +49,7 @@ def calibration_of_draws(
         campaign: what was fitted.
         estimator: "posterior" or "laplace".
         seed: of the draws from priors.
+        range_steps: lowest and highest counter of each axis that a look saw, shape (2, 2).
         gears: errors of the gears that the draws allow; None where gears do not vary.
     """
     column = {name: physical[:, i] for i, name in enumerate(names)}
@@ -82,19 +84,12 @@ def calibration_of_draws(
         azimuth=campaign.rig.aperture_convention == "azimuth",
         period_deg=campaign.rig.first_period_deg,
         estimator=estimator,
-        range_steps=_range_steps(campaign),
+        range_steps=range_steps,
         inputs_sha256=input_hashes(campaign),
         inputs=inputs,
         noise=noise,
         gears=table,
     )
-
-
-def _range_steps(campaign: Campaign) -> np.ndarray:
-    """Lowest and highest counter of each axis that a look saw, shape (2, 2)."""
-    seen = [campaign.moves[spot.move] for spot in campaign.spots if spot.status == "ok"]
-    counters = np.array([(m.pan_steps, m.tilt_steps) for m in seen], dtype=float)
-    return np.stack([counters.min(axis=0), counters.max(axis=0)], axis=1)
 
 
 def _widest(table: GearTable, inputs: np.ndarray, axis: str) -> np.ndarray | float:
@@ -111,6 +106,9 @@ def _overshoot_steps(column: Mapping[str, np.ndarray], axis: str, widest_deg: np
 def calibration_of(fit: JointFit, posterior: Posterior | None = None, *, seed: int = 0) -> Calibration:
     """What coordinates need of a fit: the posterior's draws where one has converged, else the Laplace approximation's.
 
+    Where several ways of homing count, the draws are of all of them; causes and the scales of the gears' errors are
+    those of the most probable one.
+
     Args:
         fit: a converged fit.
         posterior: its sample; left out, or unconverged, the Laplace draws are taken.
@@ -119,23 +117,20 @@ def calibration_of(fit: JointFit, posterior: Posterior | None = None, *, seed: i
     Returns:
         A calibration for `locate`, with `.ray`, `.locate` and `.steps_for` of its own.
     """
-    draws, estimator = fit.draws, "laplace"
     if posterior is not None and posterior.converged:
         draws, estimator = posterior.thinned(DRAWS_KEPT), "posterior"
+    else:
+        draws, estimator = equal_laplace_draws(fit), "laplace"
     physical = np.asarray(draws.physical)
     # Laplace draws of the errors at places hold at the mode's scales, those of a posterior at their own.
     own = estimator == "posterior"
     gears = drawn_gears(fit, physical, np.asarray(draws.place_errors_rad), seed, own_scales=own)
-    found = calibration_of_draws(fit.names, physical, fit.campaign, estimator, seed, gears)
-    causes = _with_left_open(causes_of(fit, gears.by_places), gears) if gears.table.size else causes_of(fit)
     # Looks that the fit left out reached nothing.
     seen = seen_range(fit)
-    return replace(
-        found,
-        causes=causes.names,
-        cause_covariance=causes.covariance,
-        range_steps=np.array([seen[axis] for axis in AXES], dtype=float),
-    )
+    range_steps = np.array([seen[axis] for axis in AXES], dtype=float)
+    found = calibration_of_draws(fit.names, physical, fit.campaign, estimator, seed, range_steps, gears)
+    causes = _with_left_open(causes_of(fit, gears.by_places), gears) if gears.table.size else causes_of(fit)
+    return replace(found, causes=causes.names, cause_covariance=causes.covariance)
 
 
 def _with_left_open(causes: Causes, gears: DrawnGears) -> Causes:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import NamedTuple
 
 import jax
 import numpy as np
@@ -38,12 +39,16 @@ from tvsbayes.posterior.draws import Posterior
 from tvsbayes.posterior.predictive import ideal_pixels
 from tvsbayes.results.estimates import CurvePoint, Curves, Estimate, FitSummary, LostMotion, RatioAt
 from tvsbayes.statistics.intervals import NORMAL_95, interval95
-from tvsbayes.statistics.weighted_draws import TAILS, weighted_mean, weighted_quantiles
+from tvsbayes.statistics.weighted_draws import TAILS, systematic, weighted_mean, weighted_quantiles
 
 CLASSIC_DRAWS = 256
+SEEN_SHARE = 0.5
+"""Of the draws that must show an experiment, for it to count: one draw that went astray drops none."""
 LENGTH_NAMES = names_of("transmission_error_length_deg")
 ABSENT_AT_NOUGHT = tuple(name for name in (*HARMONIC_NAMES, *GEAR_ERROR_NAMES) if name not in LENGTH_NAMES)
 """Parameters that are not told of where they are held at 0."""
+MIXING_SEED = 11
+"""Fixed, so that everything made of one fit has the same draws row by row."""
 CURVE_POINTS = 7
 CURVE_DRAWS = 2048
 """Of equal weight, behind a curve's points: the error of a mean is a forty-fifth of its sd, no line's width."""
@@ -83,6 +88,32 @@ def _sum(first: _Quantity, factor: float, second: _Quantity) -> _Quantity:
     return lambda derived: first(derived) + factor * second(derived)
 
 
+class LaplaceDraws(NamedTuple):
+    """Draws of the Laplace approximation under every way of homing that counts; weights (n,) of sum 1."""
+
+    draws: Derived
+    weights: np.ndarray
+
+
+def laplace_draws(fit: JointFit) -> LaplaceDraws:
+    """The draws of all ways, one way after the other: those of the fit alone where the sides were recorded."""
+    parts = [(way.probability, way.fit.draws) for way in fit.mixture if way.fit is not None]
+    counts = [len(part.physical) for _, part in parts]
+    weights = np.concatenate([np.full(n, p / n) for n, (p, _) in zip(counts, parts, strict=True)])
+    draws = jax.tree.map(lambda *each: np.concatenate(each), *(part for _, part in parts))
+    return LaplaceDraws(draws, weights / weights.sum())
+
+
+def equal_laplace_draws(fit: JointFit) -> Derived:
+    """`laplace_draws` that weigh the same, as many as the fit has of its own; its own where there is one way."""
+    if len(fit.mixture) == 1:
+        return fit.draws
+    found, count = laplace_draws(fit), len(fit.draws.physical)
+    # In order, the first of them would be of one way alone.
+    places = np.random.default_rng(MIXING_SEED).permutation(systematic(found.weights, count, 0.5))
+    return jax.tree.map(lambda x: x[places], found.draws)
+
+
 class _Source:
     """Where the numbers come from: the Laplace approximation, or a posterior and its diagnosis."""
 
@@ -90,12 +121,8 @@ class _Source:
         self.fit, self.posterior = fit, posterior
         self.prior = fit.prior_draws
         if posterior is None:
-            parts = [(way.probability, way.fit.draws) for way in fit.mixture if way.fit is not None]
-            counts = [len(part.physical) for _, part in parts]
             self.centre = fit.mode
-            self.draws = jax.tree.map(lambda *each: np.concatenate(each), *(part for _, part in parts))
-            weights = np.concatenate([np.full(n, p / n) for n, (p, _) in zip(counts, parts, strict=True)])
-            self.weights = weights / weights.sum()
+            self.draws, self.weights = laplace_draws(fit)
         else:
             self.centre, self.draws, self.weights = posterior.centre, posterior.joined, posterior.weights.ravel()
 
@@ -121,7 +148,10 @@ def _absent(fit: JointFit) -> set[str]:
 
 
 def _parameters(source: _Source) -> dict[str, Estimate]:
-    """Parameters with a coordinate; Laplace interval ends are exact images of z -+ 1.96 sd under monotone maps."""
+    """Parameters with a coordinate; Laplace interval ends are exact images of z -+ 1.96 sd under monotone maps.
+
+    Of a mixture of ways of homing they are quantiles of its draws, as a posterior's are.
+    """
     fit = source.fit
     low, high = fit.ends95
     has_readings = bool(np.any(np.asarray(fit.arrays.spots.has_aperture) > 0))
@@ -132,7 +162,7 @@ def _parameters(source: _Source) -> dict[str, Estimate]:
         if name in _absent(fit):
             continue
         estimate = source.estimate(name, _parameter(name))
-        if source.posterior is not None:
+        if source.posterior is not None or len(fit.mixture) > 1:
             estimates[name] = estimate
             continue
         if index >= len(RIG_NAMES):
@@ -178,10 +208,11 @@ def _classic_predicted(source: _Source) -> dict[str, Estimate | None]:
         draws = centre + (fit.draws_z[:CLASSIC_DRAWS] - fit.z) @ slope.T
     else:
         draws = four_point_ratios(ideal_pixels(source.posterior, CLASSIC_DRAWS)[:, rows], *asked)
-        centre = draws.mean(axis=0)
+        centre = np.where(np.isfinite(draws), draws, 0.0).sum(axis=0) / np.maximum(np.isfinite(draws).sum(axis=0), 1)
+    seen = np.isfinite(draws).mean(axis=0) > SEEN_SHARE
     for direction in DIRECTIONS:
-        # Pixels far from the image, of a fit that went astray, cannot be undistorted: there is no ratio then.
-        chosen = (selection.direction == direction) & np.isfinite(centre)
+        # Pixels far from the image, of a fit or draw that went astray, cannot be undistorted: there is no ratio then.
+        chosen = (selection.direction == direction) & seen
         values = draws[:, chosen].mean(axis=1) if chosen.any() else np.zeros(0)
         values = values[np.isfinite(values)]
         if len(values):
