@@ -39,6 +39,8 @@ FILED_SECONDS, SUMMARISED_SECONDS = 3.0, 1.5
 RESIDUALS_LISTED = 4096
 """Stops in `fit.json`, evenly chosen: a long campaign's file stays readable within its cap."""
 FITTING_FIRST = "fitting first (Laplace approximation) ..."
+_TOLD: set[str] = set()
+"""What `compile_for` has said in this process: several steps of one command ask it for the cache."""
 HASHED = {"moves": "moves.csv", "spots": "spots.csv", "stereo": "stereo.json", "rig": "[rig]"}
 """What an estimate depends on, as its owner knows it."""
 
@@ -48,15 +50,20 @@ def untold(line: str) -> None:
 
 
 def compile_for(tell: Tell) -> None:
-    """Use the compilation cache; whoever waits at a terminal for the first compilation is told so."""
+    """Use the compilation cache; whoever waits at a terminal for the first compilation is told so, once a process."""
     from tvsbayes.model.compilation_cache import own_cache_folder, use_compilation_cache
 
     empty, folder = use_compilation_cache(), own_cache_folder()
     if fault := folder.fault():
         place = escaped(str(folder.path), 200)
-        tell(f"warning: {place} is not used to keep compiled functions: {fault}; see `tvsbayes doctor`")
+        line = f"warning: {place} is not used to keep compiled functions: {fault}; see `tvsbayes doctor`"
     elif empty and sys.stderr.isatty():
-        tell("first run: the model is compiled, half a minute to two minutes; later runs take it from the cache")
+        line = "first run: the model is compiled, half a minute to two minutes; later runs take it from the cache"
+    else:
+        return
+    if line not in _TOLD:
+        _TOLD.add(line)
+        tell(line)
 
 
 def unusable(summary: FitSummary) -> TvsError | None:
@@ -179,11 +186,8 @@ def calibrate(
                 )
                 job.begin(FILING)
                 files = _posterior_files(posterior, place, tell)
-        if place is not None and "posterior" not in files and (stale := place / "posterior.nc").exists():
-            stale.unlink()
-            tell("posterior.nc of an earlier fit is removed: it would not be that of fit.json")
         job.begin(SUMMARISING)
-        return _results(found, posterior, seed, place, files)
+        return _results(found, posterior, seed, place, files, tell)
 
 
 def _later_stages(sampled: bool, tier: str, folder: Path | None) -> dict[str, float]:
@@ -210,9 +214,12 @@ def _posterior_files(posterior: Posterior, folder: Path | None, tell: Tell) -> d
 
 
 def _results(
-    found: JointFit, posterior: Posterior | None, seed: int, folder: Path | None, files: dict[str, str]
+    found: JointFit, posterior: Posterior | None, seed: int, folder: Path | None, files: dict[str, str], tell: Tell
 ) -> CampaignResults:
-    """Summary, calibration and evidence of a fit and its sample, written where a folder is named."""
+    """Summary, calibration and evidence of a fit and its sample, written where a folder is named.
+
+    A `posterior.nc` there that is not among `files` is another fit's: it goes.
+    """
     import numpy as np
 
     from tvsbayes.assessment.fitted_calibration import DRAWS_KEPT, calibration_of
@@ -234,6 +241,9 @@ def _results(
         provenance(input_hashes(found.campaign), seed),
     )
     if folder is not None:
+        if "posterior" not in files and (stale := folder / "posterior.nc").exists():
+            stale.unlink()
+            tell("posterior.nc of an earlier fit is removed: it would not be that of fit.json")
         mode = None if calibration is None else found.stored
         files = {**write_results(folder, record, draws, calibration, mode), **files}
     return CampaignResults(record, found, posterior, calibration, draws, unusable(summary), files)
@@ -346,4 +356,4 @@ def record_for(campaign: Campaign, folder: Path, tell: Tell = untold, progress: 
         if record.evidence is not None and record.provenance.inputs == input_hashes(campaign):
             return record
     found = _converged_fit(campaign, tell, progress)
-    return _results(found, None, 0, output_place(folder, "results"), {}).record
+    return _results(found, None, 0, output_place(folder, "results"), {}, tell).record

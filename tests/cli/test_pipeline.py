@@ -17,7 +17,7 @@ from tvsbayes.cli.app import report_line
 from tvsbayes.instrument.campaign import input_hashes, read_campaign
 from tvsbayes.instrument.model_choice import ModelChoice
 from tvsbayes.model.compiled import Traces
-from tvsbayes.pipeline import FITTING, SUMMARISING, compile_for, fit_for
+from tvsbayes.pipeline import FITTING, SUMMARISING, compile_for, fit_for, record_for
 
 pytestmark = pytest.mark.usefixtures("own_compilation_cache")
 
@@ -89,11 +89,15 @@ def test_whoever_waits_for_the_first_compilation_is_told(tmp_path, capsys, monke
     monkeypatch.setenv("TVSBAYES_CACHE", str(tmp_path))
     monkeypatch.setattr(Traces, "used", None)
     monkeypatch.setattr(jax.config, "update", lambda *_: None)
+    monkeypatch.setattr("tvsbayes.pipeline._TOLD", set())
     compile_for(report_line)
     assert capsys.readouterr().err == "", "progress is for terminals"
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
     compile_for(report_line)
     assert "first run" in capsys.readouterr().err
+    compile_for(report_line)
+    assert capsys.readouterr().err == "", "several steps of a command ask for the cache"
+    monkeypatch.setattr("tvsbayes.pipeline._TOLD", set())
     (tmp_path / "jit_fit-cache").touch()
     compile_for(report_line)
     assert capsys.readouterr().err == ""
@@ -117,3 +121,14 @@ def test_results_from_python_are_those_of_the_command(ask, grid_folder, tmp_path
         for name in one:
             np.testing.assert_array_equal(one[name], other[name])
     assert tvsbayes.calibrate(campaign, sampled=False).files == {}
+
+
+def test_no_sample_of_another_fit_stays_beside_a_record(grid_folder):
+    """A report that fits first replaces fit.json: the sample of the fit before it would not be that of fit.json."""
+    results, told = grid_folder / "results", []
+    results.mkdir()
+    (results / "posterior.nc").write_bytes(b"of an earlier fit")
+    record = record_for(read_campaign(grid_folder), grid_folder, told.append)
+    assert record.summary.estimator == "laplace" and (results / "fit.json").is_file()
+    assert not (results / "posterior.nc").exists()
+    assert any("posterior.nc of an earlier fit is removed" in line for line in told)
