@@ -202,8 +202,8 @@ FAULTS = (
     Fault(
         "classic forecast: systematic error with the wrong sign",
         "planning/forecast.py",
-        "ratio - np.array(effective), stereo_u)",
-        "np.array(effective) - ratio, stereo_u)",
+        "ratio - np.array(local), stereo_u)",
+        "np.array(local) - ratio, stereo_u)",
         "a correction goes the wrong way",
         ("planning/forecast::test_the_classics_forecast_is_what_its_experiments_do",),
         survived="planted by a reviewer: no test read the classic's answer.",
