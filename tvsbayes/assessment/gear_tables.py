@@ -19,7 +19,7 @@ from tvsbayes.instrument.axes import AXES, Axis
 from tvsbayes.instrument.parameters import INDEX, PERIODS_MAX
 from tvsbayes.model.gear_processes import FLOOR_RAD2
 from tvsbayes.model.headlines import DEGREES
-from tvsbayes.statistics.gaussian_process import JITTER, matern52, periodic
+from tvsbayes.statistics.gaussian_process import JITTER, repeated
 
 MARGIN_LENGTHS = 3.0
 """A table reaches as many correlation lengths beyond the counters seen: 97 % of a process has forgotten them there."""
@@ -65,9 +65,9 @@ class Process:
     def covariance(self, angle_deg: np.ndarray) -> np.ndarray:
         """Of values at angles (draws, n): shape (draws, n, n), deg^2."""
         distance = angle_deg[:, :, None] - angle_deg[:, None, :]
-        found = self.sd[:, None, None] ** 2 * matern52(distance, self.length[:, None, None])
-        for number, period in enumerate(self.periods):
-            found += self.amplitudes[:, number, None, None] ** 2 * periodic(distance, period)
+        sd, length, *amplitudes = (x[:, None, None] for x in (self.sd, self.length, *self.amplitudes.T))
+        found = repeated(distance, sd, length, zip(amplitudes, self.periods, strict=True))
+        # Of plays too, which `place_root` scales after their factor: draws may have none.
         floor = JITTER * self.variance + FLOOR_RAD2 * DEGREES**2
         return found + floor[:, None, None] * np.eye(angle_deg.shape[1])
 

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from tvsbayes.instrument.parameters import PERIODS_MAX
-from tvsbayes.statistics.gaussian_process import JITTER, matern52, periodic
+from tvsbayes.statistics.gaussian_process import JITTER, matern52, repeated
 
 FLOOR_RAD2 = 1e-24
 """Least variance of a place: below every angle that anybody measures, above nought."""
@@ -80,20 +80,19 @@ def place_root(
     xp, size = functions, len(angle_rad)
     distance = angle_rad[:, None] - angle_rad[None, :]
     together = (on_tilt[:, None] == on_tilt[None, :]) & valid[:, None] & valid[None, :]
-    length = _by_axis(scales.length_rad, on_tilt, xp)
-    near = xp.where(together, matern52(distance, length[..., None], xp), xp.eye(size))
-    repeated, own = 0.0, _by_axis(scales.error_rad, on_tilt, xp) ** 2
-    for number in range(PERIODS_MAX):
-        amplitude = _by_axis(scales.amplitude_rad[..., number], on_tilt, xp)
-        period = _by_axis(scales.period_rad[..., number], on_tilt, xp)
-        wave = xp.where(together, periodic(distance, period[..., None], xp), 0.0)
-        repeated = repeated + amplitude[..., None] ** 2 * wave
-        own = own + amplitude**2
-    error = _by_axis(scales.error_rad, on_tilt, xp)
-    floor = (JITTER * own + FLOOR_RAD2)[..., None] * xp.eye(size)
-    error_root = xp.linalg.cholesky(error[..., None] * near * error[..., None, :] + repeated + floor)
-    play = _by_axis(scales.play_rad, on_tilt, xp)
-    play_root = play[..., None] * xp.linalg.cholesky(near + JITTER * xp.eye(size))
+
+    def rows(of_axis: Any) -> Any:
+        return _by_axis(of_axis, on_tilt, xp)[..., None]
+
+    numbers = range(PERIODS_MAX)
+    amplitudes, periods = ([rows(x[..., k]) for k in numbers] for x in (scales.amplitude_rad, scales.period_rad))
+    error, length = rows(scales.error_rad), rows(scales.length_rad)
+    covariance = repeated(distance, error, length, zip(amplitudes, periods, strict=True), xp)
+    floor = JITTER * sum((amplitude**2 for amplitude in amplitudes), error**2) + FLOOR_RAD2
+    error_root = xp.linalg.cholesky(xp.where(together, covariance, error**2 * xp.eye(size)) + floor * xp.eye(size))
+    # Scaled after its factor: where there is no play its slope exists all the same.
+    near = xp.where(together, matern52(distance, length, xp), xp.eye(size))
+    play_root = rows(scales.play_rad) * xp.linalg.cholesky(near + JITTER * xp.eye(size))
     nothing = xp.zeros_like(error_root)
     above = xp.concatenate([error_root, nothing], axis=-1)
     return xp.concatenate([above, xp.concatenate([nothing, play_root], axis=-1)], axis=-2)

@@ -6,6 +6,7 @@ a call share one unit. Written for NumPy's and JAX's functions alike.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from types import ModuleType
 from typing import Any
 
@@ -25,3 +26,25 @@ def matern52[Numbers: Any](distance: Numbers, length: Numbers, functions: Module
 def periodic[Numbers: Any](distance: Numbers, period: Numbers, functions: ModuleType = np) -> Numbers:
     """Correlation of a cosine of random phase and normal amplitude at distances of either sign."""
     return functions.cos(2 * np.pi * distance / period)
+
+
+def repeated[Numbers: Any](
+    distance: Numbers,
+    sd: Numbers,
+    length: Numbers,
+    waves: Iterable[tuple[Numbers, Numbers | float]],
+    functions: ModuleType = np,
+) -> Numbers:
+    """Covariance of what repeats by position: a Matern process of this sd and cosines of stated periods.
+
+    Args:
+        distance: of either sign, any shape; all others broadcast with it.
+        sd: of the process.
+        length: of its correlation.
+        waves: sd and period of each cosine.
+        functions: numpy or jax.numpy.
+    """
+    found = sd**2 * matern52(distance, length, functions)
+    for amplitude, period in waves:
+        found = found + amplitude**2 * periodic(distance, period, functions)
+    return found
