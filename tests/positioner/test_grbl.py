@@ -205,12 +205,20 @@ def test_light_without_a_watchdog_has_to_be_accepted():
         ({"pan_home_steps": 0}, "positioner.pan_home_steps"),
         ({"options.lazer": "M3"}, "positioner.options.lazer"),
         ({"options.laser": "M30"}, "positioner.options.laser"),
+        *(({"options.unwatched_laser": said}, "positioner.options.unwatched_laser") for said in ("false", "no", 2, 0.5)),
+        *(({"options.laser_power": said}, "positioner.options.laser_power") for said in ("full", -1, float("nan"))),
     ],
 )
 def test_entries_that_a_board_does_not_have_are_refused(entries, column):
     with pytest.raises(InputError) as caught:
         Wishes.of(entries)
-    assert caught.value.column == column
+    assert caught.value.column == column and caught.value.allowed and caught.value.remedy
+
+
+def test_the_options_of_a_board():
+    """A switch of a rig file comes as 0 or 1."""
+    assert [Wishes.of({"options.unwatched_laser": said}).unwatched for said in (0, 1)] == [False, True]
+    assert not Wishes.of({}).unwatched and Wishes.of({"options.laser_power": 300}).laser_power == 300.0
 
 
 def test_our_own_firmware_under_this_driver_is_named():

@@ -11,6 +11,7 @@ Counters in motor steps; seconds where a name says `_s`. Time from a `Clock`, by
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -93,11 +94,15 @@ class Wishes:
         if laser not in LASER_ORDERS:
             remedy = "name what the laser hangs on: M3 the spindle, M7 mist, M8 flood coolant"
             raise _refused("options.laser", escaped(laser), ", ".join(LASER_ORDERS), remedy)
-        power, speed = options.get("laser_power"), table.get("speed_steps_per_s")
+        speed, unwatched = table.get("speed_steps_per_s"), options.get("unwatched_laser", 0)
+        # Text would be true, also "false" and "no": the light would be free with nobody having said so.
+        if unwatched not in (0, 1):
+            remedy = "write true, without quotes, once something else cuts the light when the computer dies; else false"
+            raise _refused("options.unwatched_laser", escaped(str(unwatched)), "true or false (1 or 0)", remedy)
         return cls(
             laser,
-            None if power is None else float(power),
-            bool(options.get("unwatched_laser", 0)),
+            _power(options.get("laser_power")),
+            bool(unwatched),
             CounterLimits.of(table),
             None if speed is None else float(speed),
         )
@@ -398,6 +403,14 @@ def _dark(state: DeviceState) -> DeviceState:
     if state.laser_on:
         raise fault("laser", "the laser is on after a motion", "cut the laser's supply and check the board")
     return state
+
+
+def _power(stated: str | int | float | None) -> float | None:
+    """`S` of a spindle order as the rig file states it."""
+    if stated is None or (not isinstance(stated, str) and 0 <= stated < math.inf):
+        return stated if stated is None else float(stated)
+    remedy = "write a number without quotes, up to the board's $30, or leave it out for full power"
+    raise _refused("options.laser_power", escaped(str(stated)), "a number of 0 or more", remedy)
 
 
 def _unplugged(error: OSError) -> DeviceFault:
