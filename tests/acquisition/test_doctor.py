@@ -110,6 +110,18 @@ def test_pictures_of_twelve_bits_are_judged_in_the_same_grey_levels(tmp_path):
     assert {name for name, check in checks.items() if check.status != "ok"} == {"limits"}, checks
 
 
+def test_a_dark_picture_is_judged_by_the_bits_that_its_driver_states(tmp_path):
+    """Mean 20 of 4095 is a cap on the lens; as 8 bits it would pass."""
+    device, camera = bench(level=20.0, texture=10.0)
+    grab = camera.grab
+    camera.grab = lambda: (
+        pair := grab(),
+        StereoImage(*(p.astype(np.uint16) for p in (pair.left, pair.right)), white=4095),
+    )[1]
+    check = found(device, camera, tmp_path)["exposure left"]
+    assert check.status == "warning" and check.found.startswith("mean 1 of 255") and "cap" in check.remedy
+
+
 @pytest.mark.parametrize(
     ("camera", "name", "word"),
     [

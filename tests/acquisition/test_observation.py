@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from tvsbayes.acquisition.engine import ATTEMPTS_PER_LOOK
-from tvsbayes.acquisition.observation import CameraObserver, Sighting, live_detector, twin_renderer
+from tvsbayes.acquisition.observation import CameraObserver, Sighting, live_detector, rises_dn, twin_renderer
 from tvsbayes.acquisition.simulated_instrument import Instrument
 from tvsbayes.cameras.capture import StereoImage
 from tvsbayes.errors import DeviceFault
@@ -37,6 +39,13 @@ def test_pictures_that_are_no_pair_are_refused(small_rig):
     assert detector(StereoImage(made.left, dark), made).status == "no-spot right"
     lifted = np.roll(made.right, 20, axis=0)
     assert detector(StereoImage(made.left, lifted), made).status == "epipolar"
+    # The same light in 12 bits, a quarter of it on the right: one scale for both, though the right one's peak fits 10.
+    dim = StereoImage(made.left, made.right // 4)
+    deep = StereoImage(*(picture.astype(np.uint16) * 16 for picture in (dim.left, dim.right)))
+    shallow, found = detector(dim, made), detector(deep, deep)
+    # 4080 of 4095 are 254 of 255 grey levels.
+    assert found.status == shallow.status == "ok" and found.sds_px == pytest.approx(shallow.sds_px, rel=0.01)
+    assert detector(replace(deep, white=65535), deep).status == "no-spot both"
 
 
 @pytest.mark.parametrize(
@@ -72,6 +81,30 @@ def test_changed_background_is_refused(mounted_rig):
     positioner.home()
     camera = Scripted(instrument.clock, lambda n: 90 if n == 1 else n % 30)
     assert CameraObserver(camera).observe(positioner, 3).sighting.status == "unsteady"
+
+
+@pytest.mark.parametrize("known", [None, 4095])
+def test_noise_of_twelve_bits_is_no_light(mounted_rig, known):
+    """Dark pictures below 256 counts say nothing of the bits: the driver does, or the first light does."""
+    instrument = Instrument(mounted_rig, 1)
+    positioner = instrument.positioner()
+    positioner.home()
+    rng, stated = np.random.default_rng(1), [] if known is None else [known]
+
+    class Camera:
+        def grab(self):
+            # 100 counts of 4095 are 6 grey levels.
+            pair = rng.integers(90, 190, (2, 4, 4, 3)).astype(np.uint16)
+            if instrument.mechanics.laser_on:
+                pair[:, 1, 1] = 3000
+            return StereoImage(*pair, *stated)
+
+    observer, seen = CameraObserver(Camera(), keep_pictures=False), []
+    observer.detector = lambda lit, dark: seen.append((lit.white, rises_dn(dark, lit))) or Sighting("no-spot")
+    for look in range(3):
+        assert observer.observe(positioner, look).sighting.status == "no-spot"
+    # 3000 less 90 to 190 counts, in 255 of 4095.
+    assert all(white == 4095 and 174 <= min(rises) <= max(rises) <= 181 for white, rises in seen) and len(seen) == 3
 
 
 @pytest.mark.parametrize("depth", range(0, 12))

@@ -156,8 +156,9 @@ def test_pictures_are_triggered_after_they_were_asked_for():
 
 def test_twelve_bits_are_kept():
     camera = opened(Maker(), pixel_format="Mono12")
-    picture = camera.grab().left
-    assert picture.dtype == np.uint16 and picture[0, 5].tolist() == [5 + 1] * 3
+    pair = camera.grab()
+    picture = pair.left
+    assert picture.dtype == np.uint16 and picture[0, 5].tolist() == [5 + 1] * 3 and pair.white == 4095
     assert camera.settings().values["left.bits"] == 12.0
 
 

@@ -235,15 +235,16 @@ def _camera(
     checks = [Check("cameras", "ok", f"two pictures of {size[0]} x {size[1]} px, a fresh pair in {seconds:.2f} s")]
     for warning in settings.warnings:
         checks.append(Check("camera settings", "warning", warning, "fix it with the camera's own program"))
-    checks += [*_picture("left", image.left), *_picture("right", image.right)]
+    white = image.full_scale
+    checks += [*_picture("left", image.left, white), *_picture("right", image.right, white)]
     return camera, checks
 
 
-def _picture(side: str, picture: np.ndarray) -> list[Check]:
-    """Exposure and focus of a picture without laser."""
+def _picture(side: str, picture: np.ndarray, white: int) -> list[Check]:
+    """Exposure and focus of a picture without laser, from a camera whose full pixels have the value `white`."""
     import cv2
 
-    grey = cv2.cvtColor(in_grey_levels(picture), cv2.COLOR_BGR2GRAY)
+    grey = cv2.cvtColor(in_grey_levels(picture, white), cv2.COLOR_BGR2GRAY)
     mean, clipped = float(grey.mean()), float((grey >= 250).mean())
     found = f"mean {mean:.0f} of 255, {100 * clipped:.2f} % clipped"
     remedy = ""

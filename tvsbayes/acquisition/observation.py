@@ -10,7 +10,7 @@ Raw px with the integer at the centre of a pixel; grey levels 0 to 255, also of 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 import numpy as np
@@ -24,7 +24,7 @@ from tvsbayes.cameras.detection import pair_status
 from tvsbayes.cameras.spot_fit import find_spot
 from tvsbayes.cameras.spot_noise import SpotNoise
 from tvsbayes.errors import DeviceFault
-from tvsbayes.files.images import png_bytes, white_level
+from tvsbayes.files.images import in_grey_levels, png_bytes
 from tvsbayes.instrument.campaign import CAMERAS, frame_name
 from tvsbayes.instrument.rig import Rig
 from tvsbayes.instrument.stereo_pair import Stereo
@@ -72,7 +72,7 @@ class Detector(Protocol):
     """Finds the spot in a pair of pictures."""
 
     def __call__(self, lit: StereoImage, dark: StereoImage) -> Sighting:
-        """`lit` with the laser on, `dark` just before without it."""
+        """`lit` with the laser on, `dark` just before without it; both state what is white."""
 
 
 class Observer(Protocol):
@@ -100,6 +100,7 @@ class CameraObserver:
     camera: StereoCamera
     detector: Detector = wait_for_detection
     keep_pictures: bool = True
+    _white: int = field(default=0, init=False, repr=False)
 
     def observe(self, positioner: Positioner, spot: int) -> Observation:
         """See `Observer.observe`.
@@ -109,7 +110,7 @@ class CameraObserver:
             LightRefused: somebody asked for the laser to be off; it is.
         """
         positioner.laser(False)
-        dark = self.camera.grab()
+        dark = self._grab()
         try:
             positioner.laser(True)
             lit, on = self._lit(positioner, dark)
@@ -133,10 +134,19 @@ class CameraObserver:
         unsteady = max(rises_dn(lit, dark)) > CHANGE_DN
         return Observation(Sighting(UNSTEADY) if unsteady else self.detector(lit, dark), pictures)
 
+    def _grab(self) -> StereoImage:
+        """A pair that states what is white: by its driver, else by the brightest pixel so far.
+
+        Of 12 bits two dark pictures alone would pass for 8, and their noise for light.
+        """
+        pair = self.camera.grab()
+        self._white = max(self._white, pair.full_scale)
+        return replace(pair, white=self._white)
+
     def _lit(self, positioner: Positioner, dark: StereoImage) -> tuple[StereoImage, bool]:
         """A picture exposed with the laser on, and whether the laser was on to its end."""
         for number in range(WAIT_GRABS):
-            lit = self.camera.grab()
+            lit = self._grab()
             # Sensor noise makes two exposures differ, whatever they show.
             if np.array_equal(lit.left, dark.left) or np.array_equal(lit.right, dark.right):
                 remedy = "unplug the camera and plug it in again, then go on with --resume"
@@ -145,7 +155,7 @@ class CameraObserver:
             if min(rises_dn(dark, lit)) > CHANGE_DN:
                 if number:
                     # Light came on during the first lit exposure, or in one still older: take a whole one.
-                    lit = self.camera.grab()
+                    lit = self._grab()
                 break
             if not positioner.state().laser_on:
                 return lit, False
@@ -153,7 +163,7 @@ class CameraObserver:
 
     def _wait_for_darkness(self, dark: StereoImage) -> None:
         for _ in range(WAIT_GRABS):
-            if max(rises_dn(dark, self.camera.grab())) <= CHANGE_DN:
+            if max(rises_dn(dark, self._grab())) <= CHANGE_DN:
                 return
         remedy = "cut the laser's supply at once; if it is off, something else in the room has become bright"
         raise DeviceFault("light", f"the spot does not vanish with the laser off; {remedy}", remedy=remedy)
@@ -163,11 +173,10 @@ def rises_dn(before: StereoImage, after: StereoImage) -> tuple[int, int]:
     """The most by which a pixel grew brighter, left and right, grey levels of 8 bits."""
     import cv2
 
-    rises = []
-    for dark, lit in ((before.left, after.left), (before.right, after.right)):
-        white = white_level(max(int(dark.max()), int(lit.max())))
-        rises.append(int(cv2.subtract(lit, dark).max()) * 255 // white)
-    return rises[0], rises[1]
+    white = max(before.full_scale, after.full_scale)
+    pairs = (before.left, after.left), (before.right, after.right)
+    left, right = (int(in_grey_levels(cv2.subtract(lit, dark), white).max()) for dark, lit in pairs)
+    return left, right
 
 
 @dataclass
@@ -205,7 +214,8 @@ def live_detector(stereo: Stereo) -> Detector:
     """
 
     def found(lit: StereoImage, dark: StereoImage) -> Sighting:
-        left, right = find_spot(lit.left, SpotNoise()), find_spot(lit.right, SpotNoise())
+        white = max(lit.full_scale, dark.full_scale)
+        left, right = (find_spot(picture, SpotNoise(), white) for picture in (lit.left, lit.right))
         status = pair_status(left, right)
         if status != "ok":
             return Sighting(status)

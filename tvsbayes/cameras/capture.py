@@ -26,6 +26,7 @@ import numpy as np
 
 from tvsbayes.cameras.network_stream import Capture, NetworkStream
 from tvsbayes.errors import DeviceFault, InputError, escaped
+from tvsbayes.files.images import white_level
 from tvsbayes.instrument.rig import Rig
 from tvsbayes.positioner.interface import Clock
 
@@ -47,10 +48,19 @@ FFMPEG_QUIET = "-8"
 
 @dataclass(frozen=True, eq=False)
 class StereoImage:
-    """Two pictures of one moment, each (height, width, 3) uint8 or uint16, blue, green, red."""
+    """Two pictures of one moment, each (height, width, 3) uint8 or uint16, blue, green, red.
+
+    `white` is the largest value that a pixel can have, where the driver knows it; None where it does not.
+    """
 
     left: np.ndarray
     right: np.ndarray
+    white: int | None = None
+
+    @property
+    def full_scale(self) -> int:
+        """What is white here: as the driver states it, else the least that converters of usual bits have."""
+        return self.white or white_level(max(int(self.left.max()), int(self.right.max())))
 
 
 @dataclass(frozen=True)

@@ -214,7 +214,7 @@ class GenicamCamera:
             raise
         except Exception as error:
             raise _fault("no-frame", f"a camera delivers no frame: {_said(error)}", "check its cable") from error
-        return StereoImage(left, right)
+        return StereoImage(left, right, 2 ** PIXEL_BITS[self._wishes.pixel_format] - 1)
 
     def _expose(self, free: Sequence[bool]) -> None:
         """Trigger those that do not run by themselves."""

@@ -338,15 +338,16 @@ def _at_border(centre: np.ndarray, reach: np.ndarray | float, size: tuple[int, i
     return "border" if outside.any() else None
 
 
-def find_spot(picture: np.ndarray, noise: SpotNoise | None = None) -> Centre:
+def find_spot(picture: np.ndarray, noise: SpotNoise | None = None, white: int | None = None) -> Centre:
     """The spot of one picture by the method `fit`.
 
     Args:
         picture: (height, width, 3), blue, green, red, uint8 or uint16.
         noise: of the camera, as `detect` learns it from many looks; default what the pixels of a wide spot show,
             which has no speckle whose grain is wider than a few pixels; of a narrow one the priors' medians.
+        white: the largest value that the camera gives with more than 8 bits; default by the picture itself.
     """
-    patch = patch_around(in_grey_levels(picture))
+    patch = patch_around(in_grey_levels(picture, white))
     if noise is None and not isinstance(patch, str) and patch.wide and patch.clipped_share <= CLIPPED_SHARE_MAX:
         patch, noise = with_own_noise(patch)
     return widened([centre_of(patch, noise or SpotNoise())]).centres[0]
