@@ -12,7 +12,7 @@ from support.drawn_spots import HEIGHT, WIDTH, oval, picture, small_pair
 from support.waits import check_forward, doings
 
 from tvsbayes.cameras.contour import epipolar_refused
-from tvsbayes.cameras.detection import DETECTING, LEARNING, detect
+from tvsbayes.cameras.detection import DETECTING, LEARNING, LEVELLING, detect
 from tvsbayes.cli.main import run
 from tvsbayes.errors import InputError, NothingToEstimate
 from tvsbayes.files.images import png_bytes
@@ -111,16 +111,23 @@ def test_what_is_learned_of_the_noise(found_plain, found_speckled):
         assert found_speckled.noise[side].speckle_contrast == pytest.approx(0.4, rel=0.25)
 
 
-def test_deep_frames_are_detected_with_all_their_bits(plain, tmp_path):
-    """The same light in 12 bits of 16: finer than 8 bits, and a picture beyond the camera's full scale is refused."""
+def test_deep_frames_are_detected_with_all_their_bits(tmp_path, monkeypatch):
+    """The same light in 12 bits of 16, finer than 8 bits: also where most looks are so dim that they would fit 10."""
     folder = Folder(tmp_path / "c", looks=6)
     for name in sorted((folder.path / "frames").iterdir()):
         deep = cv2.imread(str(name)).astype(np.uint16) * 16 + 7
         name.write_bytes(png_bytes(np.minimum(deep, 4095)))
-    found = detect(read_campaign(folder.path))
-    assert found.statuses == {"ok": 6}
+    monkeypatch.setattr("tvsbayes.cameras.detection.PILOTS_MAX", 2)
+    for name in sorted((folder.path / "frames").glob("0000[05]0_*")):
+        name.write_bytes(png_bytes(cv2.imread(str(name), cv2.IMREAD_UNCHANGED) // 5))
+    told = []
+    found = detect(read_campaign(folder.path), progress=told.append)
+    check_forward(told)
+    assert doings(told) == [LEVELLING, LEARNING, DETECTING]
+    # A fifth of the light as it is, not scaled up by its own peak: its centre is worse.
+    assert found.statuses == {"ok": 6} and found.campaign.spots[0].su_left_px > 1.3 * found.campaign.spots[1].su_left_px
     shallow = detect(read_campaign(Folder(tmp_path / "shallow", looks=6).path))
-    for deep, eight in zip(found.campaign.spots, shallow.campaign.spots, strict=True):
+    for deep, eight in zip(found.campaign.spots[1:-1], shallow.campaign.spots[1:-1], strict=True):
         assert abs(deep.u_left_px - eight.u_left_px) < 0.1 * eight.su_left_px
         # 8 bits are 255 levels and these 4095 / 16: noise is what it was.
         assert deep.su_left_px == pytest.approx(eight.su_left_px, rel=0.1)

@@ -32,7 +32,15 @@ from tvsbayes.cameras.spot_overlay import overlay_of
 from tvsbayes.cameras.spot_window import CLIPPED_SHARE_MAX, WIDE_SD_PX, Patch, patch_around
 from tvsbayes.errors import InputError, NothingToEstimate, escaped, refusal
 from tvsbayes.files.disk import make_folder, read_bytes, write_atomically
-from tvsbayes.files.images import IMAGE_BYTES_MAX, decode_image, image_size, in_grey_levels, png_bytes, white_level
+from tvsbayes.files.images import (
+    IMAGE_BYTES_MAX,
+    decode_image,
+    image_size,
+    in_grey_levels,
+    is_deep,
+    png_bytes,
+    white_level,
+)
 from tvsbayes.instrument.campaign import CAMERAS, Campaign, Spot, frame_name, with_pixels
 from tvsbayes.instrument.stereo_pair import Stereo
 from tvsbayes.progress import Job, Show
@@ -52,7 +60,8 @@ REASONS = {
     "unfitted": "the fit did not settle",
     "epipolar": "left and right are not images of one point",
 }
-LEARNING, DETECTING = "learning the noise", "detecting"
+LEVELLING, LEARNING, DETECTING = "finding the brightest pixel", "learning the noise", "detecting"
+"""What takes time; the first only of pictures of more than 8 bits."""
 PILOTS_MAX = 24
 """Looks from which the weights of the fits are learned; uncertainties are stated from all."""
 LEARNING_ROUNDS = 3
@@ -148,6 +157,20 @@ class _Frames:
         return all(os.path.lexists(self.path(spot, side)) for side in CAMERAS)
 
     def read(self, spot: Spot, side: str) -> np.ndarray:
+        """A picture (height, width, 3): uint8, or float32 grey levels of 8 bits (DN) where it is deeper."""
+        return in_grey_levels(decode_image(self._data(spot, side), self.path(spot, side).name), self.white)
+
+    def deep(self, spot: Spot) -> bool:
+        """Whether a picture of this look has more than 8 bits."""
+        return any(is_deep(self._data(spot, side)) for side in CAMERAS)
+
+    def largest(self, spot: Spot) -> int:
+        """The largest value in those pictures of a look that have more than 8 bits; 0 without any."""
+        data = {side: self._data(spot, side) for side in CAMERAS}
+        deep = {side: one for side, one in data.items() if is_deep(one)}
+        return max((int(decode_image(one, self.path(spot, side).name).max()) for side, one in deep.items()), default=0)
+
+    def _data(self, spot: Spot, side: str) -> bytes:
         path = self.path(spot, side)
         # Its size before it is decoded: a small file can hold 50 million pixels, on every thread.
         data = read_bytes(path, IMAGE_BYTES_MAX, self.folder)
@@ -160,24 +183,7 @@ class _Frames:
                 allowed=f"{self.size[0]} x {self.size[1]} as in stereo.json",
                 remedy="calibrate and observe at one image size",
             )
-        picture = decode_image(data, escaped(path.name))
-        if self.white is None or picture.dtype == np.uint8:
-            return picture
-        if int(picture.max()) > self.white:
-            raise refusal(
-                "image",
-                file=path.name,
-                found=f"values up to {int(picture.max())}",
-                allowed=f"up to {self.white}, as in the other pictures",
-                remedy="save all pictures of a campaign from one camera with the same number of bits",
-            )
-        return in_grey_levels(picture, self.white)
-
-    def with_white(self, spots: Sequence[Spot]) -> _Frames:
-        """The same with the level at which its cameras are full, by the largest value in some looks."""
-        pictures = (self.read(spot, side) for spot in spots for side in CAMERAS)
-        largest = max((int(picture.max()) for picture in pictures if picture.dtype != np.uint8), default=0)
-        return replace(self, white=white_level(largest)) if largest else self
+        return data
 
 
 def _parallel[Item, Result](job: Callable[[Item], Result], items: Sequence[Item], workers: int) -> Iterator[Result]:
@@ -218,10 +224,17 @@ def detect(
     present = [row for row in rows if frames.there(campaign.spots[row])]
     if not present:
         raise _no_frames(campaign)
-    frames = frames.with_white([campaign.spots[row] for row in _spread(present)])
     workers = workers or os.cpu_count() or 1
     learning = min(PILOTS_MAX, len(present)) if method == "fit" else 0
-    with Job({LEARNING: learning, DETECTING: len(present)}, progress) as job:
+    levelling = len(present) if frames.deep(campaign.spots[present[0]]) else 0
+    with Job({LEVELLING: levelling, LEARNING: learning, DETECTING: len(present)}, progress) as job:
+        job.begin(LEVELLING)
+        largest = 0
+        # All of them: no few looks need hold the brightest, and one level has to serve every look.
+        for count, found in enumerate(_parallel(frames.largest, [campaign.spots[row] for row in present], workers)):
+            largest = max(largest, found)
+            job.at(count / len(present))
+        frames = replace(frames, white=white_level(largest) if largest else None)
         job.begin(LEARNING)
         looks = _looks(campaign, method, frames, present, speckle_contrast, workers, overlay)
         job.begin(DETECTING)

@@ -62,13 +62,13 @@ def image_size(data: bytes, file: str) -> tuple[int, int]:
         width, height = _jpeg_size(data, bad)
     else:
         raise bad("image", f"a file that begins with {data[:8].hex(' ') or 'nothing'}", "save it as PNG")
-    most = IMAGE_PIXELS_MAX // (2 if _is_deep(data) else 1)
+    most = IMAGE_PIXELS_MAX // (2 if is_deep(data) else 1)
     if not 0 < width * height <= most:
         raise bad("image-size", f"{width} x {height} pixels", "crop or scale it")
     return width, height
 
 
-def _is_deep(data: bytes) -> bool:
+def is_deep(data: bytes) -> bool:
     """Whether a PNG with a whole header has 16 bits per channel."""
     return data.startswith(_PNG_MAGIC) and data[24] == _PNG_DEEP
 
@@ -107,7 +107,7 @@ def decode_image(data: bytes, file: str) -> np.ndarray:
     import cv2
     import numpy as np
 
-    flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION | (cv2.IMREAD_ANYDEPTH if _is_deep(data) else 0)
+    flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION | (cv2.IMREAD_ANYDEPTH if is_deep(data) else 0)
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     except cv2.error:
