@@ -317,15 +317,20 @@ class _End:
 
 def _lowest(end: _End, arrays: BoardArrays, free: np.ndarray, dof: int) -> tuple[_End, _End]:
     """The lowest end that was found, and where the last repetition from beside it ended."""
+    again = _repeated(end, arrays, free, dof)
     for _ in range(RESTARTS_MAX):
-        noise_sd = end.noise_sd(dof)
-        # Alternating signs, so that no parameter's shift can be taken up by another's.
-        shift = RESTART_SD * noise_sd * np.where(np.arange(24) % 2, -1.0, 1.0) * free
-        again = _descended(end.z + shift, arrays)
-        if not again.noise_sd(dof) < (1 - LOWER_SHARE) * noise_sd:
+        if not again.noise_sd(dof) < (1 - LOWER_SHARE) * end.noise_sd(dof):
             break
-        end = again
+        # What is returned was always repeated itself: an end compared with itself would pass for confirmed.
+        end, again = again, _repeated(again, arrays, free, dof)
     return end, again
+
+
+def _repeated(end: _End, arrays: BoardArrays, free: np.ndarray, dof: int) -> _End:
+    """Where a descent from beside an end ends."""
+    # Alternating signs, so that no parameter's shift can be taken up by another's.
+    shift = RESTART_SD * end.noise_sd(dof) * np.where(np.arange(24) % 2, -1.0, 1.0) * free
+    return _descended(end.z + shift, arrays)
 
 
 def _descended(z: np.ndarray, arrays: BoardArrays) -> _End:
