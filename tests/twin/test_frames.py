@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 from support.commands import steps
 
@@ -62,3 +64,12 @@ def test_what_another_run_left_is_not_touched(runs, tmp_path, case):
     with pytest.raises(InputError, match="nothing is overwritten"):
         write_with_frames(tmp_path, runs[case == "another"], 5 + (case == "another"), views=0)
     assert contents(tmp_path) == before
+
+
+def test_nothing_is_written_of_cameras_that_see_no_board_together(runs, tmp_path):
+    """Cameras two metres apart: no board stands in both of their pictures."""
+    stereo = runs[0].truth.stereo
+    apart = replace(runs[0], truth=replace(runs[0].truth, stereo=replace(stereo, T=stereo.T * 25)))
+    with pytest.raises(InputError, match="fits into both images 0 of 20 times") as caught:
+        write_with_frames(tmp_path / "c", apart, 5)
+    assert caught.value.remedy and not (tmp_path / "c").exists()

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from tvsbayes.cli.main import run
+from tvsbayes.errors import InputError
 from tvsbayes.files.disk import shipped_data
 from tvsbayes.files.images import read_image
 from tvsbayes.instrument.campaign import read_campaign
@@ -214,5 +215,15 @@ def test_boards_are_wholly_inside_both_images(mounted_rig):
         for camera in (cameras.left, cameras.right):
             seen = camera.project(board.corners_mm() @ pose.rotation.T + pose.translation_mm)
             assert ((seen > 0) & (seen < [WIDTH - 1, HEIGHT - 1])).all()
-    with pytest.raises(ValueError, match="fits into both images 0 of 2 times"):
+    with pytest.raises(InputError, match="fits into both images 0 of 2 times"):
         board_poses(cameras, Board(pitch_mm=100.0), 2, 1)
+
+
+def test_boards_stand_further_off_for_longer_lenses(mounted_rig):
+    """Up to ten times the focal length of the shipped rigs; theirs changes no pose that was drawn before."""
+    board = Board()
+    for longer in (2.0, 10.0):
+        assert len(board_poses(cameras_of(mounted_rig.stereo, longer), board, 20, 1)) == 20
+    # Where the corners of three boards stood, mm, before depths followed the lens; 1e-12: sums of other machines.
+    depths = [p.translation_mm[2] for p in board_poses(cameras_of(mounted_rig.stereo), board, 3, 1)]
+    assert depths == pytest.approx([345.2773895689372, 375.7078497165911, 427.5062850295981], rel=1e-12)

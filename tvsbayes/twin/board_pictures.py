@@ -13,6 +13,7 @@ from functools import lru_cache
 
 import numpy as np
 
+from tvsbayes.errors import refusal
 from tvsbayes.instrument.stereo_pair import rotation_matrix
 from tvsbayes.twin.physics import Camera, CameraPair
 from tvsbayes.twin.spot_pictures import Sensor, ambient_level, expose, random_stream
@@ -24,6 +25,9 @@ SHADING = 0.15
 BORDER_PX = 8.0
 """Least distance of a board's outer squares from the image's border."""
 DEPTHS_MM = (280.0, 520.0)
+"""For lenses up to `LENS` times as long as the picture is high, in px; longer ones see a board whole further off."""
+LENS = 1.25
+"""The shipped rigs have 1.11."""
 TILT_MAX_DEG = 40.0
 
 
@@ -174,7 +178,7 @@ def board_poses(cameras: CameraPair, board: Board, views: int, seed: int) -> lis
     """Poses that a careful user would take: tilted up to 40 degrees, all over the part that both cameras see.
 
     Raises:
-        ValueError: the board fits hardly anywhere into both images.
+        InputError: the board fits hardly anywhere into both images.
     """
     rng = random_stream("board", seed)
     corners = board.corners_mm()
@@ -182,8 +186,9 @@ def board_poses(cameras: CameraPair, board: Board, views: int, seed: int) -> lis
     reach = np.array([board.columns, board.rows]) * board.pitch_mm
     rim = np.array([[x, y, 0.0] for x in (-board.pitch_mm, reach[0]) for y in (-board.pitch_mm, reach[1])])
     left, right, found = cameras.left, cameras.right, []
+    further = max(1.0, *(camera.matrix[1, 1] / (LENS * camera.height) for camera in (left, right)))
     for _ in range(200 * views):
-        depth = rng.uniform(*DEPTHS_MM)
+        depth = rng.uniform(*DEPTHS_MM) * further
         aim = np.array([rng.uniform(0, left.width), rng.uniform(0, left.height), 1.0])
         tilt, heading, roll = rng.uniform(0, np.radians(TILT_MAX_DEG)), rng.uniform(0, 2 * np.pi), rng.normal(0, 0.15)
         turned = rotation_matrix(tilt * np.array([np.cos(heading), np.sin(heading), 0.0]))
@@ -195,4 +200,12 @@ def board_poses(cameras: CameraPair, board: Board, views: int, seed: int) -> lis
             found.append(pose)
             if len(found) == views:
                 return found
-    raise ValueError(f"a board of {reach[0]:g} x {reach[1]:g} mm fits into both images {len(found)} of {views} times")
+    far = " to ".join(f"{depth * further:.0f}" for depth in DEPTHS_MM)
+    size = f"a board of {reach[0]:g} x {reach[1]:g} mm"
+    raise refusal(
+        "boards",
+        file="stereo.json",
+        found=f"cameras that share little of their views: {size} fits into both images {len(found)} of {views} times",
+        allowed=f"cameras that both see the board at {far} mm",
+        remedy="correct R and T, or simulate without --frames",
+    )

@@ -52,14 +52,16 @@ def write_with_frames(
         How many pictures lie there.
 
     Raises:
-        InputError: the folder holds anything else, or cannot be written.
+        InputError: the folder holds anything else, cannot be written, or the cameras see no board together.
     """
+    # What cannot be rendered is refused before anything is written.
+    poses = _board_poses(simulated, seed, views)
     files = simulated.files()
     declaration = files.pop("campaign.toml")
     make_folder(folder, empty=not _begun(folder, files))
     for name, data in files.items():
         write_atomically(folder / name, data)
-    written = write_frames(folder, simulated, seed, views=views, progress=progress)
+    written = _render(folder, simulated, seed, poses, progress)
     write_atomically(folder / "campaign.toml", declaration)
     return written
 
@@ -98,11 +100,22 @@ def write_frames(
         How many pictures lie there.
 
     Raises:
-        InputError: the folder cannot be written.
+        InputError: the folder cannot be written, or the cameras see no board together.
     """
-    visible, board = cameras_of(simulated.truth.stereo), Board()
+    return _render(folder, simulated, seed, _board_poses(simulated, seed, views), progress)
+
+
+def _board_poses(simulated: SimulatedCampaign, seed: int, views: int | None) -> list[BoardPose]:
+    """Where the board stands, view by view."""
     views = BOARD_VIEWS if views is None else views
-    poses = board_poses(visible, board, views, seed) if views else []
+    return board_poses(cameras_of(simulated.truth.stereo), Board(), views, seed) if views else []
+
+
+def _render(
+    folder: Path, simulated: SimulatedCampaign, seed: int, poses: list[BoardPose], progress: Show | None
+) -> int:
+    """See `write_frames`, for boards at these poses."""
+    visible, board = cameras_of(simulated.truth.stereo), Board()
     make_folder(folder / "frames")
     if poses:
         make_folder(folder / "boards")
