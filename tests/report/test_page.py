@@ -23,6 +23,7 @@ from tvsbayes.instrument.campaign import read_campaign, write_campaign
 from tvsbayes.instrument.parameters import PRIOR_GROUPS, RIG_NAMES
 from tvsbayes.metrology.positioning_table import positioning
 from tvsbayes.metrology.traceability import traceability
+from tvsbayes.report.fit_sections import _parameters
 from tvsbayes.report.page import (
     BROWSERS,
     page_html,
@@ -388,3 +389,10 @@ def test_the_printed_twin_has_ten_pages_at_most_and_none_is_empty(reported, tmp_
     # Chromium writes each page's marks as one stream; an empty page has only its footer, some 500 bytes.
     streams = [len(part) for part in re.findall(rb"stream\r?\n(.*?)endstream", printed, flags=re.DOTALL)]
     assert sum(length > 2000 for length in streams) >= pages
+
+
+def test_the_table_of_parameters_repeats_no_ratio(reported):
+    """Ratios by direction are results of their own: all four or none belong there."""
+    told = {row[-1] for row in _parameters(evidence_of(reported)).rows}
+    assert {"degrees_per_step.pan", "degrees_per_step.tilt"} < told
+    assert not told & {f"degrees_per_step.{direction}" for direction in DIRECTIONS}

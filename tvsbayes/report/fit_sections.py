@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tvsbayes.instrument.axes import AXES
+from tvsbayes.instrument.axes import AXES, DIRECTIONS
 from tvsbayes.metrology.traceability import stated_value
 from tvsbayes.report import figures
 from tvsbayes.report.advice import asks_for_looks
@@ -139,10 +139,11 @@ def _scatters(e: Evidence) -> list[FigureView]:
 
 
 def _parameters(e: Evidence) -> TableView:
-    """Everything that was estimated, but for the cameras' parameters."""
+    """Everything that was estimated, but for the cameras' parameters; ratios by direction are results of their own."""
     rows = []
+    by_direction = {f"degrees_per_step.{direction}" for direction in DIRECTIONS}
     for name, x in e.fit.summary.parameters.items():
-        if name.startswith(("stereo.", "degrees_per_step.left", "degrees_per_step.right")) or x.sd == 0:
+        if name.startswith("stereo.") or name in by_direction or x.sd == 0:
             continue
         rows.append(
             [
