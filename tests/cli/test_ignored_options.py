@@ -22,6 +22,7 @@ IGNORED = [
     ("study r.toml p.csv --scheduler tcp://a:1", "--scheduler is for engines with workers"),
     ("study r.toml p.csv --engine processes --scheduler tcp://a:1", "--scheduler is for the engine dask"),
     ("study r.toml p.csv --engine dask --scheduler tcp://a:1 --workers 4", "--workers is for a cluster"),
+    ("plan c --watch --confirm 1e-4", "--confirm is for targets"),
     ("check c p.csv --repair-to d", "a repaired journal takes no plan"),
     ("stereo f --board 9x6 --pitch-mm 25 --image-size 1280x720", "--image-size is for --import"),
     ("stereo f --board 9x6 --pitch-mm 25 --import-unit m", "--import-unit is for --import"),
@@ -55,3 +56,35 @@ def test_a_unit_is_for_files_that_state_none(ask, tmp_path):
         code, document = ask("stereo", "--import", pair, *option)
         assert (code, document["error"]["code"]) == (2, "usage") and "OpenCV" in document["error"]["message"]
     assert ask("stereo", "--import", pair)[0] == 0
+
+
+@pytest.mark.parametrize(
+    ("line", "option"),
+    [
+        *(("report c --limit-mm inf", "--limit-mm"), ("report c --limit-deg-per-step inf", "--limit-deg-per-step")),
+        *(("report c --range-mm inf", "--range-mm"), ("calibrate c --limit-mm inf", "--limit-mm")),
+        *(("plan c --watch --minutes inf", "--minutes"), ("plan r --given c --next 3 --confirm inf", "--confirm")),
+        *(("plan --given c --minutes inf", "--minutes"), ("fit c --max-minutes inf", "--max-minutes")),
+        ("acquire r.toml p.csv o --simulate --target-u inf", "--target-u"),
+        ("acquire r.toml p.csv o --simulate --target-u 1e-4 --adapt --minutes inf", "--minutes"),
+    ],
+)
+def test_infinity_is_refused_before_anything_is_read(ask, line, option):
+    """No JSON holds it: at the end of the work there would be nothing to show."""
+    code, document = ask(*line.split())
+    assert (code, document["error"]["code"], document["error"]["column"]) == (2, "number", option)
+
+
+AXIS = [
+    ("--next 3", "--next is for a scanner"),
+    ("--criterion D", "--criterion is for a scanner"),
+    ("--draws 100", "--draws is for a scanner"),
+    ("--confirm 1e-4 --aperture", "--aperture and --confirm are for a scanner"),
+]
+
+
+@pytest.mark.parametrize(("options", "said"), AXIS, ids=[options for options, _ in AXIS])
+def test_an_axis_is_planned_with_its_own_options(ask, tmp_path, options, said):
+    (tmp_path / "campaign.toml").write_text('format = "tvsbayes-axis/1"\n')
+    code, document = ask("plan", "--given", tmp_path, *options.split())
+    assert (code, document["error"]["code"]) == (2, "usage") and document["error"]["message"].startswith(said)

@@ -17,6 +17,7 @@ from tvsbayes.cli.app import (
     Ended,
     Json,
     finish,
+    finite,
     in_order,
     refuse_options,
     report_line,
@@ -81,6 +82,7 @@ def acquire(
     from tvsbayes.instrument.plan import read_plan
     from tvsbayes.instrument.rig import read_rig
 
+    finite(target_u=target_u, minutes=minutes)
     if simulate:
         refuse_options("for a laser, and --simulate has none", "leave out one of them", laser_class=laser_class)
     else:

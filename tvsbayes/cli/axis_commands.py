@@ -252,6 +252,8 @@ def plan(
         write_atomically(output, found.plan_bytes())
         document["plan"] = str(output)
         text += f"\nwritten: {escaped(str(output), 200)}"
+    elif output is not None:
+        text += f"\nnothing written to {escaped(str(output), 200)}"
     if keep(document, output_place(folder, "results") / "plan.json"):
         document["files"] = {"next": str(output_place(folder, "results") / "plan.json")}
     finish(document, text, as_json)

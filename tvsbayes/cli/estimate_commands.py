@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from tvsbayes.cli import axis_commands
-from tvsbayes.cli.app import CampaignFolder, Json, Seed, command_line, finish, keep, refuse_options, report_line
+from tvsbayes.cli.app import CampaignFolder, Json, Seed, command_line, finish, finite, keep, refuse_options, report_line
 from tvsbayes.cli.progress_bar import waiting
 from tvsbayes.errors import InputError, NothingToEstimate, escaped
 from tvsbayes.files.disk import output_place
@@ -78,6 +78,7 @@ def fit(
     as_json: Json = False,
 ) -> None:
     """Fit the joint model to every spot and sample its posterior. The table of results ends it."""
+    finite(max_minutes=max_minutes)
     if resume and no_sample:
         raise InputError("usage", "--resume continues a chain and --no-sample makes none", remedy="give one of them")
     if no_sample:

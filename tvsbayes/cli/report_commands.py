@@ -19,6 +19,7 @@ from tvsbayes.cli.app import (
     Json,
     Seed,
     finish,
+    finite,
     refuse_options,
     report_line,
     tell_part,
@@ -81,6 +82,7 @@ def report(
     """The calibration report as one HTML page. Verdict and answer first, then everything behind them."""
     from tvsbayes.instrument.campaign import read_campaign
 
+    finite(limit_deg_per_step=limit_deg_per_step, limit_mm=limit_mm, range_mm=range_mm)
     if not (dcc or dcc_schema):
         refuse_options("for a certificate", "add --dcc", country=country, customer_country=customer_country)
     issue = _issue(laboratory, customer)
@@ -248,6 +250,7 @@ def calibrate(
     as_json: Json = False,
 ) -> None:
     """Check, classic, fit and report in one go. From a campaign folder to the report on the desk."""
+    finite(limit_deg_per_step=limit_deg_per_step, limit_mm=limit_mm, range_mm=range_mm)
     if no_sample:
         refuse_options("for a sampler, and --no-sample runs none", "give one of them", quick=quick)
     issue = _issue(laboratory, customer)

@@ -259,15 +259,16 @@ def plan(
 ) -> None:
     """How many looks, which ones, and when to stop. With --given: what next."""
     out = out or output
+    finite(minutes=minutes, confirm=confirm)
+    # What a plan of looks towards a target may state beside it.
+    spare: dict[str, object] = {"criterion": criterion != "c", "draws": draws != PLAN_DRAWS, "aperture": aperture}
+    onward = {"next": count, "confirm": confirm}
     if watch:
-        spare = {"criterion": criterion != "c", "draws": draws != PLAN_DRAWS}
-        refuse_options(
-            "for targets, not for --watch", "leave it out", target=target, aperture=aperture, next=count, **spare
-        )
+        refuse_options("for targets, not for --watch", "leave it out", target=target, **spare, **onward)
         plan_watch(rig, given, minutes=minutes, out=out, seed=seed, as_json=as_json)
         return
     if axis_commands.is_axis(given or rig):
-        refuse_options(axis_commands.NOT_OF_AN_AXIS, "leave it out", aperture=aperture)
+        refuse_options(axis_commands.NOT_OF_AN_AXIS, "leave it out", **spare, **onward)
         if given is None or rig is not None:
             raise InputError(
                 "usage", "an axis is planned from its folder alone", remedy="give --given FOLDER without RIG"
@@ -289,10 +290,7 @@ def plan(
 
     wanted = parse_target(target or DEFAULT_TARGET)
     if count is not None:
-        spare = {"criterion": criterion != "c", "draws": draws != PLAN_DRAWS}
-        refuse_options(
-            "for whole plans, not for --next", "leave it out", aperture=aperture, minutes=minutes, out=out, **spare
-        )
+        refuse_options("for whole plans, not for --next", "leave it out", **spare, minutes=minutes, out=out)
         _next_looks(instrument, data, wanted, count, confirm, as_json)
         return
     refuse_options("for --next", "add --next, or leave it out", confirm=confirm)
