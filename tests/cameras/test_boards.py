@@ -55,7 +55,7 @@ def test_other_files_are_ignored_and_lonely_pictures_named(tmp_path):
     assert [(v.name, v.left is None, v.right is None) for v in found.views] == [("1", False, False), ("2", False, True)]
     assert found.unpaired == ("left2.png", "RIGHT3.PNG")
     assert found.without_board == ("RIGHT3.PNG",)
-    assert found.other_size == ("left_small.png",)
+    assert (found.other_size, found.unnamed) == (("left_small.png",), ("leaf.png",))
 
 
 @pytest.mark.parametrize("swap", (False, True))

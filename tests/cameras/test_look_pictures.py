@@ -69,10 +69,12 @@ def test_what_is_no_pair_is_said(tmp_path):
     drawn(tmp_path, *pairs("1", "2"), "left3.png")
     drawn(tmp_path, *pairs("4"), size=(3, 4))
     (tmp_path / "left5.tif").write_bytes(b"")
+    drawn(tmp_path, "IMG_0007.png", "IMG_0008.png")
     seen = views_of(tmp_path)
     assert [view.name for view in seen.views] == ["1", "2"]
-    assert (seen.unpaired, seen.other_size, seen.unread) == (
+    assert (seen.unpaired, seen.unnamed, seen.other_size, seen.unread) == (
         ("left3.png",),
+        ("IMG_0007.png", "IMG_0008.png"),
         ("left4.png", "right4.png"),
         ("left5.tif",),
     )
@@ -111,3 +113,9 @@ def test_a_png_is_copied_as_it_is_and_a_jpeg_decoded(tmp_path):
     assert (frames / "000000_left.png").read_bytes() == (tmp_path / "mixed" / "left1.png").read_bytes()
     right = read_image(tmp_path / "mixed" / "right1.jpg")
     np.testing.assert_array_equal(read_image(frames / "000000_right.png"), right)
+
+
+def test_a_narrow_picture_among_wide_ones_is_said(tmp_path):
+    drawn(tmp_path / "wide", "look_0.png", "look_1.png", size=(6, 16))
+    drawn(tmp_path / "wide", "room.png")
+    assert views_of(tmp_path / "wide").unnamed == ("room.png",)

@@ -20,7 +20,7 @@ from typing import Literal
 import cv2
 import numpy as np
 
-from tvsbayes.cameras.camera_marks import paired_pictures
+from tvsbayes.cameras.camera_marks import paired_pictures, unnamed_pictures
 from tvsbayes.cameras.picture_pairs import NAMING, SIDE_BY_SIDE_RATIO, Picture, natural_order
 from tvsbayes.errors import InputError, NothingToEstimate, escaped, refusal
 from tvsbayes.files.disk import read_bytes
@@ -124,6 +124,7 @@ class Views:
         image_width: of one camera, px.
         image_height: px.
         unpaired: pictures of one camera without their counterpart; where they show the board, they are in `views`.
+        unnamed: pictures whose names tell no camera, and that hold no two side by side; not used.
         without_board: pictures in which no board was found.
         other_size: pictures of another size than most; not used.
         by_fallback: pictures whose board only the other finder found.
@@ -134,6 +135,7 @@ class Views:
     image_width: int
     image_height: int
     unpaired: tuple[str, ...] = ()
+    unnamed: tuple[str, ...] = ()
     without_board: tuple[str, ...] = ()
     other_size: tuple[str, ...] = ()
     by_fallback: tuple[str, ...] = ()
@@ -255,7 +257,7 @@ def find_views(
     """Finds the board in all pictures of a folder.
 
     Pictures (PNG, JPEG) are paired as `paired_pictures` says. Where no file is named after a camera, pictures at least
-    twice as wide as high are split in the middle. Other files are ignored.
+    twice as wide as high are split in the middle. Other files are ignored; those that are pictures are named.
 
     Args:
         folder: of the pictures.
@@ -303,6 +305,7 @@ def find_views(
         image_width=size[0],
         image_height=size[1],
         unpaired=tuple(sorted(lonely, key=natural_order)),
+        unnamed=unnamed_pictures(folder, sizes),
         without_board=tuple(without),
         other_size=tuple(picture.path.relative_to(folder).as_posix() for picture, own in sizes.items() if own != size),
         by_fallback=tuple(fallback),

@@ -10,7 +10,7 @@ from __future__ import annotations
 import os
 import re
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 
 from tvsbayes.cameras.picture_pairs import SUFFIXES, Picture, natural_order, pictures_of
@@ -60,6 +60,23 @@ def paired_pictures(folder: Path, *, swap: bool = False, most: int) -> list[Pict
         found, remedy = f"{len(images)} pictures", "move those that are not needed elsewhere"
         raise refusal("size", file=place, found=found, allowed=f"at most {most}", remedy=remedy)
     return _paired_otherwise(Path(folder), images, CAMERAS[::-1] if swap else CAMERAS) or usual
+
+
+def unnamed_pictures(folder: Path, used: Iterable[Picture]) -> tuple[str, ...]:
+    """Pictures that lie in a folder or beside those of its pairs and are no part of them.
+
+    Args:
+        folder: as `paired_pictures` was given it.
+        used: the pictures that tell their camera, or hold both.
+
+    Returns:
+        Their paths from the folder, in natural order.
+    """
+    known = {picture.path for picture in used}
+    places = {Path(folder), *(path.parent for path in known)}
+    paths = (Path(folder) / name for name in _names(Path(folder)) if name.lower().endswith(SUFFIXES))
+    left = [path.relative_to(folder).as_posix() for path in paths if path.parent in places and path not in known]
+    return tuple(sorted(left, key=natural_order))
 
 
 def _names(folder: Path, below: str = "", depth: int = 0) -> Iterator[str]:

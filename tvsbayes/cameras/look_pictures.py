@@ -15,7 +15,7 @@ from typing import Literal
 
 import numpy as np
 
-from tvsbayes.cameras.camera_marks import OTHER_SUFFIXES, paired_pictures
+from tvsbayes.cameras.camera_marks import OTHER_SUFFIXES, paired_pictures, unnamed_pictures
 from tvsbayes.cameras.picture_pairs import NAMING, SIDE_BY_SIDE_RATIO, Picture, natural_order
 from tvsbayes.errors import InputError, escaped, refusal
 from tvsbayes.files.disk import make_folder, read_bytes, write_atomically
@@ -62,6 +62,7 @@ class ViewedFolder:
         views: pairs of one size, in the natural order of their names.
         image_width, image_height: size of one camera's picture, px.
         unpaired: files without their other camera.
+        unnamed: files whose names tell no camera, and that hold no two pictures side by side.
         other_size: files of another size than most.
         unread: files of kinds that are not read.
     """
@@ -70,6 +71,7 @@ class ViewedFolder:
     image_width: int
     image_height: int
     unpaired: tuple[str, ...]
+    unnamed: tuple[str, ...]
     other_size: tuple[str, ...]
     unread: tuple[str, ...]
 
@@ -82,7 +84,7 @@ class PairedLooks:
         spots: all rows, as they are to be written.
         pictures: of each of them that has some, by its `spot`.
         matching: by number or in order.
-        left_over: views whose number is that of no row.
+        left_over: views whose row has a pair already.
         without: numbers of the rows, or moves, that have no pictures.
     """
 
@@ -124,6 +126,7 @@ def views_of(folder: Path, *, swap: bool = False) -> ViewedFolder:
         image_width=size[0],
         image_height=size[1],
         unpaired=tuple(p.path.name for both in by_view.values() if len(both) == 1 for p in both.values()),
+        unnamed=unnamed_pictures(Path(folder), sizes),
         other_size=tuple(picture.path.name for picture, own in sizes.items() if own != size),
         unread=tuple(unread),
     )

@@ -178,6 +178,7 @@ def _unpaired_lines(seen: ViewedFolder, found: PairedLooks, rows: str) -> list[s
     """What could not be paired, a line for each kind."""
     files = {
         "without the picture of the other camera": seen.unpaired,
+        "their names tell no camera": seen.unnamed,
         f"not of {seen.image_width} x {seen.image_height} px as most": seen.other_size,
         "of a kind that is not read; save them as PNG of 8 bits": seen.unread,
         "a second pair for its row": found.left_over,

@@ -194,6 +194,7 @@ def stereo_calibration_text(result: StereoCalibration) -> str:
     if (found := result.found) is not None:
         lists = {
             "without their counterpart": found.unpaired,
+            "names tell no camera, not used": found.unnamed,
             "no board found": found.without_board,
             "another size, not used": found.other_size,
             "found by the other finder": found.by_fallback,
