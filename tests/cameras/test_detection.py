@@ -105,6 +105,10 @@ def test_stated_sd_is_the_actual_error_with_speckle_and_clipped_cores(speckled, 
     assert np.sqrt(np.mean(errors**2)) < 0.08
 
 
+def test_the_median_is_of_all_four_coordinates(plain, found_plain):
+    assert found_plain.median_sd_px == np.median(plain.errors(found_plain)[1])
+
+
 def test_what_is_learned_of_the_noise(found_plain, found_speckled):
     for side in ("left", "right"):
         assert found_plain.noise[side].speckle_contrast < 0.08

@@ -247,7 +247,13 @@ def detect(
     seen = list(zip(sides["left"].centres, sides["right"].centres, strict=True))
     spots = _rows(campaign.spots, present, seen, campaign.stereo)
     after = [spots[row] for row in present]
-    stated = [sd for s in after if s.status == "ok" for sd in (s.su_left_px, s.su_right_px) if sd is not None]
+    sds = [
+        sd
+        for spot in after
+        if spot.status == "ok"
+        for sd in (spot.su_left_px, spot.sv_left_px, spot.su_right_px, spot.sv_right_px)
+        if sd is not None
+    ]
     return Detection(
         campaign=replace(campaign, spots=tuple(spots)),
         method=method,
@@ -256,7 +262,7 @@ def detect(
         kept=len(campaign.spots) - len(rows),
         statuses=dict(Counter(spot.status for spot in after).most_common()),
         noise=noise,
-        median_sd_px=float(np.median(stated)) if stated else None,
+        median_sd_px=float(np.median(sds)) if sds else None,
         lines={side: one.lines for side, one in sides.items()},
     )
 
