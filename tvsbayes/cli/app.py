@@ -125,11 +125,12 @@ def tell_part(text: str, as_json: bool) -> None:
         _print(f"{text}\n")
 
 
-def tell_removed(names: Iterable[str], written: Mapping[str, str]) -> None:
-    """Say which files made of an earlier page are gone, but for those written anew."""
+def tell_removed(names: Iterable[str], written: Mapping[str, str], *, certificates: bool = True) -> None:
+    """Say which files made of an earlier page are gone, but for those written anew; an axis has no certificates."""
     gone = [name for name in names if name not in {Path(place).name for place in written.values()}]
     if gone:
-        report_line(f"removed: {', '.join(gone)}, made of an earlier report; --pdf or --dcc makes them again")
+        again = "`tvsbayes report --pdf`" + " or `--dcc`" * certificates
+        report_line(f"removed: {', '.join(gone)}, made of an earlier report; {again} makes them again")
 
 
 def command_line(*words: object) -> str:

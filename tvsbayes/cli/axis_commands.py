@@ -224,7 +224,7 @@ def _page(data: AxisCampaign, folder: Path, issue: Issue, pdf: bool, out: Path |
         if pdf:
             job.begin(PRINTING)
             files["pdf"] = str(print_to_pdf(path))
-    tell_removed(removed, files)
+    tell_removed(removed, files, certificates=False)
     return {"criteria": [], "number": page.number, "files": files}
 
 
