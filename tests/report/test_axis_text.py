@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import pytest
 
-from tvsbayes.report.axis_text import axis_plan_text
+from tvsbayes.report.axis_text import axis_plan_text, deviation_table
+from tvsbayes.single_axis.axis_record import PositionDeviation
 from tvsbayes.single_axis.next_stops import AxisPlan, NextStop
 
 
@@ -14,3 +17,15 @@ def test_a_plan_that_hardly_helps_says_so(after, said):
     text = axis_plan_text(AxisPlan("per_command", 1.0, (stop,), 0.5), "mm")
     assert ("they hardly help" in text) is said
     assert "1250000 " in text, "a counter is no power of ten"
+
+
+@pytest.mark.parametrize(("count", "kept"), [(1, 1), (40, 40), (41, 40), (900, 40)])
+def test_a_long_table_keeps_both_ends_and_says_what_it_leaves_out(count, kept):
+    deviations = [PositionDeviation(float(k), 0.0, 1.0, (-2.0, 2.0)) for k in range(count)]
+    table = deviation_table(deviations, "mm", 40)
+    positions = [float(row[0]) for row in table.rows]
+    assert len(positions) == len(set(positions)) == kept and (positions[0], positions[-1]) == (0, count - 1)
+    # Evenly: rounding to whole rows makes neighbouring gaps differ by one.
+    gaps = {b - a for a, b in pairwise(positions)}
+    assert not gaps or max(gaps) - min(gaps) <= 1
+    assert (f"{kept} of {count}" in table.caption) is ("fit.json" in table.caption) is (kept < count)

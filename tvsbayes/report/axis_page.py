@@ -33,7 +33,11 @@ if TYPE_CHECKING:
 
 CURVE_POINTS = 81
 """Of the figure of the error by position."""
-OF_SIDE = {1: (">", BLUE, "forward"), -1: ("<", RED, "backward"), 0: ("o", GREY, "side unknown")}
+OF_SIDE: dict[int, tuple[str, str, str]] = {
+    1: (">", BLUE, "forward"),
+    -1: ("<", RED, "backward"),
+    0: ("o", GREY, "side unknown"),
+}
 TABLE_ROWS = 60
 
 
@@ -58,11 +62,7 @@ def error_figure(fit: AxisFit) -> Figure:
         axes = figure.add_subplot()
         axes.fill_between(commands, low, high, color=SKY, alpha=0.4, linewidth=0, label="error by position, 95 %")
         axes.plot(commands, drawn.mean(axis=0), color=BLUE, linewidth=1.2, label="its mean")
-        for side, marker, colour, name in (
-            (1, ">", BLUE, "forward"),
-            (-1, "<", RED, "backward"),
-            (0, "o", GREY, "side unknown"),
-        ):
+        for side, (marker, colour, name) in OF_SIDE.items():
             mine = rows.side == side
             if mine.any():
                 axes.plot(rows.command[mine], off[mine], marker, color=colour, markersize=3.5, label=f"stops, {name}")
@@ -118,7 +118,7 @@ def axis_page(results: AxisResults, issue: Issue) -> Page:
             Section("Result", tables=[parameter_table(summary)], opened=True),
             Section(
                 "What repeats by position",
-                tables=[deviation_table(summary.deviations[:TABLE_ROWS], unit)],
+                tables=[deviation_table(summary.deviations, unit, TABLE_ROWS)],
             ),
             Section("What the readings cannot tell", items=summary.weak_directions or ["Nothing of note."]),
             Section("Classic", text=[told], tables=[iso230]),

@@ -54,10 +54,13 @@ def parameter_table(summary: AxisSummary) -> TableView:
     return TableView(caption, ["", "value(u)", "95 % interval", "told"], rows)
 
 
-def deviation_table(deviations: Sequence[PositionDeviation], unit: str) -> TableView:
-    """What repeats by position, off the line."""
+def deviation_table(deviations: Sequence[PositionDeviation], unit: str, most: int) -> TableView:
+    """What repeats by position, off the line; of more positions than `most`, so many spread evenly."""
     rows = [[f"{d.position:g}", concise(d.value, d.sd), interval_text(*d.interval95, d.sd)] for d in deviations]
     caption = f"error that repeats by position, off the line through the stops, {escaped(unit)}"
+    if len(rows) > most:
+        caption += f"; {most} of {len(rows)} positions, fit.json has all"
+        rows = [rows[round(k * (len(rows) - 1) / (most - 1))] for k in range(most)]
     return TableView(caption, ["command", "value(u)", "95 % interval"], rows)
 
 
@@ -101,7 +104,7 @@ def axis_fit_text(summary: AxisSummary, details: bool = False, written: Sequence
     iso230 = iso230_table(summary.classic, summary.unit)
     lines = []
     if details:
-        lines += [deviation_table(summary.deviations[:DEVIATIONS_SHOWN], summary.unit).text()]
+        lines += [deviation_table(summary.deviations, summary.unit, DEVIATIONS_SHOWN).text()]
         lines += [] if iso230 is None else [iso230.text()]
         lines += _lines("weak (the readings leave it to the priors)", summary.weak_directions)
     elif summary.weak_directions:
