@@ -324,7 +324,7 @@ class OpenCVCamera:
 
     def _split(self, pictures: list[np.ndarray]) -> StereoImage:
         if len(pictures) == 2:
-            return StereoImage(*pictures)
+            return StereoImage(pictures[0], pictures[1])
         both = pictures[0]
         return StereoImage(both[:, : self._width].copy(), both[:, self._width :].copy())
 
