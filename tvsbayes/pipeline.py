@@ -34,6 +34,8 @@ if TYPE_CHECKING:
 Tell = Callable[[str], None]
 """Shows a line to whoever waits."""
 FITTING, SAMPLING, FILING, SUMMARISING = "fit", "posterior", "writing posterior.nc", "summarising"
+MAX_MINUTES = 10.0
+"""For sampling, where nobody says otherwise."""
 FILED_SECONDS, SUMMARISED_SECONDS = 3.0, 1.5
 """For posterior.nc and for the results: what progress foretells with."""
 RESIDUALS_LISTED = 4096
@@ -126,7 +128,7 @@ def calibrate(
     model: ModelChoice = AS_STATED,
     sampled: bool = True,
     tier: str = "emcee",
-    max_minutes: float = 10.0,
+    max_minutes: float = MAX_MINUTES,
     resume: bool = False,
     seed: int = 0,
     tell: Tell = untold,

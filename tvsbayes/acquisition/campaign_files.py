@@ -22,6 +22,7 @@ from tvsbayes.files.disk import read_bytes, remove_unfinished, write_atomically
 from tvsbayes.files.documents import TOML_BYTES_MAX, parse_toml
 from tvsbayes.instrument.campaign import (
     NAME_ACQUIRED,
+    UNDETECTED,
     Campaign,
     Spot,
     campaign_toml,
@@ -126,8 +127,7 @@ def _holds(path: Path, data: bytes) -> bool:
 def _files(campaign: Campaign, folder: Path, tables_only: bool = False) -> dict[str, bytes]:
     detected = _detected(campaign, folder)
     spots = [
-        detected[spot.spot] if spot.status == "undetected" and spot.spot in detected else spot
-        for spot in campaign.spots
+        detected[spot.spot] if spot.status == UNDETECTED and spot.spot in detected else spot for spot in campaign.spots
     ]
     moves, table = moves_bytes(campaign.moves), spots_bytes(spots)
     if campaign.moves:
@@ -183,7 +183,7 @@ def _longer(campaign: Campaign, folder: Path) -> dict[str, int]:
         waiting = [replace(s, status="ok") if s.status == LOST_STEPS else s for s in spots]
         return [s if s.spot not in undetected else undetected[s.spot] for s in waiting]
 
-    undetected = {spot.spot: spot for spot in campaign.spots if spot.status == "undetected"}
+    undetected = {spot.spot: spot for spot in campaign.spots if spot.status == UNDETECTED}
     moves, looks = len(campaign.moves), len(campaign.spots)
     more = {
         "moves.csv": len(present.moves) - moves if present.moves[:moves] == campaign.moves else 0,
@@ -194,9 +194,9 @@ def _longer(campaign: Campaign, folder: Path) -> dict[str, int]:
 
 def _detected(campaign: Campaign, folder: Path) -> dict[int, Spot]:
     """Spots of the present spots.csv that wait in the journal and were found since."""
-    if not (folder / "spots.csv").is_file() or all(spot.status != "undetected" for spot in campaign.spots):
+    if not (folder / "spots.csv").is_file() or all(spot.status != UNDETECTED for spot in campaign.spots):
         return {}
-    waiting = {spot.spot: spot for spot in campaign.spots if spot.status == "undetected"}
+    waiting = {spot.spot: spot for spot in campaign.spots if spot.status == UNDETECTED}
     try:
         data = read_bytes(folder / "spots.csv", CSV_BYTES_MAX, folder)
         present = parse_spots(data, "spots.csv", len(campaign.moves), campaign.stereo)
@@ -205,7 +205,7 @@ def _detected(campaign: Campaign, folder: Path) -> dict[int, Spot]:
     return {
         spot.spot: spot
         for spot in present
-        if spot.spot in waiting and spot.move == waiting[spot.spot].move and spot.status != "undetected"
+        if spot.spot in waiting and spot.move == waiting[spot.spot].move and spot.status != UNDETECTED
     }
 
 

@@ -30,7 +30,7 @@ from tvsbayes.acquisition.run_log import Outcome, RunLog
 from tvsbayes.acquisition.running_estimate import Aim, RunningEstimate
 from tvsbayes.errors import DeviceFault, InputError, TvsError
 from tvsbayes.instrument.axes import AXES, direction_of
-from tvsbayes.instrument.campaign import Spot, pixels_of
+from tvsbayes.instrument.campaign import UNDETECTED, Spot, pixels_of
 from tvsbayes.instrument.plan import PlanStep, plan_seconds, run_plan
 from tvsbayes.instrument.rig import Rig
 from tvsbayes.instrument.stereo_pair import triangulate
@@ -298,7 +298,7 @@ class Acquisition:
                 continue
             attempt += 1
             status = observation.sighting.status
-            if status in ("ok", "undetected") or self._stop.requested or attempt == ATTEMPTS_PER_LOOK:
+            if status in ("ok", UNDETECTED) or self._stop.requested or attempt == ATTEMPTS_PER_LOOK:
                 return observation
             self._retries += 1
             self._live.remarked(f"look {self._spot}: {status}; taken again")
@@ -388,7 +388,7 @@ class Acquisition:
             len(self.plan),
             sum(s.action == "look" for s in self.plan[: step.step]),
             sum(s.action == "look" for s in self.plan),
-            sum(spot.status not in ("ok", "undetected") for spot in spots),
+            sum(spot.status not in ("ok", UNDETECTED) for spot in spots),
             self._retries,
             plan_seconds(self.rig, left),
             _doing(step),

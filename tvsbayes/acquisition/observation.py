@@ -25,7 +25,7 @@ from tvsbayes.cameras.spot_fit import find_spot
 from tvsbayes.cameras.spot_noise import SpotNoise
 from tvsbayes.errors import DeviceFault
 from tvsbayes.files.images import in_grey_levels, png_bytes
-from tvsbayes.instrument.campaign import CAMERAS, frame_name
+from tvsbayes.instrument.campaign import CAMERAS, UNDETECTED, frame_name
 from tvsbayes.instrument.rig import Rig
 from tvsbayes.instrument.stereo_pair import Stereo
 from tvsbayes.positioner.interface import Positioner
@@ -39,8 +39,6 @@ WAIT_GRABS = 20
 holds back sixty."""
 UNSTEADY = "unsteady"
 """Status of a look whose background changed: somebody in the picture, or the light in the room."""
-UNDETECTED = "undetected"
-"""Status of a look whose frames wait for a detection."""
 
 
 @dataclass(frozen=True)

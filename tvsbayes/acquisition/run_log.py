@@ -15,6 +15,7 @@ from tvsbayes.acquisition.journal_check import orphans
 from tvsbayes.acquisition.recorder import HOME_TOLERANCE_STEPS, Recorder
 from tvsbayes.acquisition.running_estimate import Estimate
 from tvsbayes.errors import DeviceFault
+from tvsbayes.instrument.campaign import UNDETECTED
 from tvsbayes.instrument.rig import Rig
 from tvsbayes.positioner.interface import HomeReport
 
@@ -147,7 +148,7 @@ class RunLog:
         """How the run ended, for this reason and after so many repeated looks."""
         done = self.recorder.result()
         ok = sum(spot.status == "ok" for spot in done.spots)
-        waiting = sum(spot.status == "undetected" for spot in done.spots)
+        waiting = sum(spot.status == UNDETECTED for spot in done.spots)
         return Outcome(
             reason=reason,
             looks=len(done.spots),

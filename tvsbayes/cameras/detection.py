@@ -41,7 +41,7 @@ from tvsbayes.files.images import (
     png_bytes,
     white_level,
 )
-from tvsbayes.instrument.campaign import CAMERAS, Campaign, Spot, frame_name, with_pixels
+from tvsbayes.instrument.campaign import CAMERAS, UNDETECTED, Campaign, Spot, frame_name, with_pixels
 from tvsbayes.instrument.stereo_pair import Stereo
 from tvsbayes.progress import Job, Show
 
@@ -410,7 +410,7 @@ def _rows(
 
 def _ours(status: str) -> bool:
     """Whether a row may be detected (again): a refusal by a person stands."""
-    return status in ("ok", "undetected") or status.split(" ")[0] in REASONS
+    return status in ("ok", UNDETECTED) or status.split(" ")[0] in REASONS
 
 
 def _contrast(given: float | None) -> float:

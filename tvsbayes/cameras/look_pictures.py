@@ -19,14 +19,12 @@ from tvsbayes.cameras.camera_marks import OTHER_SUFFIXES, paired_pictures, unnam
 from tvsbayes.cameras.picture_pairs import NAMING, SIDE_BY_SIDE_RATIO, Picture, natural_order
 from tvsbayes.errors import InputError, escaped, refusal
 from tvsbayes.files.disk import make_folder, read_bytes, write_atomically
-from tvsbayes.files.images import IMAGE_BYTES_MAX, decode_image, image_size, png_bytes
-from tvsbayes.instrument.campaign import CAMERAS, NO_PIXELS, Spot, frame_name
+from tvsbayes.files.images import IMAGE_BYTES_MAX, PNG_SIGNATURE, decode_image, image_size, png_bytes
+from tvsbayes.instrument.campaign import CAMERAS, NO_PIXELS, UNDETECTED, Spot, frame_name
 from tvsbayes.progress import Advance, unshown
 
 Matching = Literal["number", "order"]
 LOOKS_MAX = 100_000
-UNDETECTED = "undetected"
-"""Status of a row whose pictures wait for `detect`."""
 _NUMBER = re.compile(r"[0-9]{1,9}")
 
 
@@ -226,7 +224,7 @@ def _part(view: View, camera: int) -> bytes:
     """The PNG of one camera: the file itself where it is one, else its pixels."""
     picture = view.pictures[camera]
     data = read_bytes(picture.path, IMAGE_BYTES_MAX)
-    if len(picture.sides) == 1 and data.startswith(b"\x89PNG"):
+    if len(picture.sides) == 1 and data.startswith(PNG_SIGNATURE):
         return data
     pixels = decode_image(data, escaped(picture.path.name))
     width, part = pixels.shape[1] // len(picture.sides), picture.sides.index(CAMERAS[camera])

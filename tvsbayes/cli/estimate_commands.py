@@ -17,7 +17,7 @@ from tvsbayes.cli.app import CampaignFolder, Json, Seed, command_line, finish, f
 from tvsbayes.cli.progress_bar import waiting
 from tvsbayes.errors import InputError, NothingToEstimate, escaped
 from tvsbayes.files.disk import output_place
-from tvsbayes.pipeline import FITTING, SAMPLING, calibrate, compile_for, fit_for
+from tvsbayes.pipeline import FITTING, MAX_MINUTES, SAMPLING, calibrate, compile_for, fit_for
 from tvsbayes.progress import Job, Progress, Show
 
 if TYPE_CHECKING:
@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     from tvsbayes.instrument.campaign import Campaign
     from tvsbayes.results.comparison_record import ComparisonRecord
     from tvsbayes.results.estimates import FitSummary
-MAX_MINUTES = 10.0
 HOLDING_OUT = "hold-out"
 
 

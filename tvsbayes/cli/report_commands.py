@@ -29,7 +29,7 @@ from tvsbayes.cli.campaign_commands import campaign_held
 from tvsbayes.cli.progress_bar import waiting
 from tvsbayes.errors import InputError, NothingToEstimate
 from tvsbayes.files.disk import output_place, write_atomically
-from tvsbayes.pipeline import FITTING, compile_for, record_for
+from tvsbayes.pipeline import FITTING, MAX_MINUTES, compile_for, record_for
 from tvsbayes.pipeline import calibrate as calibrate_campaign
 from tvsbayes.progress import Job
 
@@ -41,7 +41,6 @@ if TYPE_CHECKING:
 
 DCC_MESSAGES = 20
 """Of a schema validator, shown at most."""
-MAX_MINUTES = 10.0
 RANGE_MM = 1e3
 GATHERING, DRAWING, PRINTING = "gathering evidence", "drawing the page", "printing to PDF"
 

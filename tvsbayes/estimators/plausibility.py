@@ -14,9 +14,9 @@ import numpy as np
 
 from tvsbayes.errors import listed
 from tvsbayes.estimators.four_point import SkippedExperiment, select_experiments
-from tvsbayes.estimators.spot_pattern import pattern_doubts, pattern_of
+from tvsbayes.estimators.spot_pattern import SPOTS_LISTED, pattern_doubts, pattern_of
 from tvsbayes.instrument.axes import AXES
-from tvsbayes.instrument.campaign import Campaign, pixels_of
+from tvsbayes.instrument.campaign import UNDETECTED, Campaign, pixels_of
 from tvsbayes.instrument.parameters import names_of
 from tvsbayes.instrument.stereo_pair import pair_doubts, triangulate
 from tvsbayes.instrument.stops import observed_stops, separation
@@ -31,7 +31,6 @@ CORNER_SHARE = 0.02
 """Share of the picture's height: spots that all lie nearer than that to its first pixel were not measured in pixels."""
 ODD_SHARE = 0.1
 """Share of spots at impossible depths from which the others tell nothing of counters and names."""
-SPOTS_LISTED = 10
 SHALLOW = 1.2
 """Ratio of the largest to the smallest depth below which the sheet stood at one place (the paper's: 1.6)."""
 
@@ -77,7 +76,7 @@ def implausible(campaign: Campaign, points_mm: np.ndarray | None = None) -> tupl
     misspelt = [s.spot for s in campaign.spots if s.status != "ok" and s.status.strip().lower() == "ok"]
     if misspelt:
         found.append(f"spots {few(misspelt)} are left out: their status is not spelt ok, in small letters")
-    stray = [s.spot for s in campaign.spots if s.status == "undetected" and s.u_left_px is not None]
+    stray = [s.spot for s in campaign.spots if s.status == UNDETECTED and s.u_left_px is not None]
     if stray:
         found.append(f"spots {few(stray)} are undetected and have pixels, which nothing uses: ok, or refused?")
     if not ok:

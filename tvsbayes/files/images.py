@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 IMAGE_BYTES_MAX = 64 * 1024 * 1024
 IMAGE_PIXELS_MAX = 50_000_000
 """A PNG of 0.9 MB can ask for 30000 x 30000 pixels: 4 s and 1.8 GB in the decoder."""
-_PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
+PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _PNG_END = b"\0\0\0\0IEND\xaeB`\x82"
 """The last chunk with its checksum: decoders forgive its loss, a copy cut short has lost more."""
 _PNG_DEPTHS = {0: (1, 2, 4, 8, 16), 2: (8, 16), 3: (1, 2, 4, 8), 6: (8, 16)}
@@ -50,7 +50,7 @@ def image_size(data: bytes, file: str) -> tuple[int, int]:
     def bad(code: str, found: str, remedy: str) -> InputError:
         return refusal(code, file=file, found=found, allowed=IMAGES_ALLOWED, remedy=remedy)
 
-    if data.startswith(_PNG_MAGIC):
+    if data.startswith(PNG_SIGNATURE):
         if len(data) < 33 or data[8:16] != b"\x00\x00\x00\rIHDR":
             raise bad("image", "a PNG without its header", "copy the file again")
         if not data.endswith(_PNG_END):
@@ -70,7 +70,7 @@ def image_size(data: bytes, file: str) -> tuple[int, int]:
 
 def is_deep(data: bytes) -> bool:
     """Whether a PNG with a whole header has 16 bits per channel."""
-    return data.startswith(_PNG_MAGIC) and data[24] == _PNG_DEEP
+    return data.startswith(PNG_SIGNATURE) and data[24] == _PNG_DEEP
 
 
 def _jpeg_size(data: bytes, bad: Callable[[str, str, str], InputError]) -> tuple[int, int]:

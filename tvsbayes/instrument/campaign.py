@@ -121,6 +121,8 @@ PIXELS = ("u_left_px", "v_left_px", "u_right_px", "v_right_px")
 """Columns of a spot's centres."""
 NO_PIXELS = (None, None, None, None)
 """Pixels, or their standard uncertainties, of a look without a spot."""
+UNDETECTED = "undetected"
+"""Status of a look whose pictures wait for `detect`."""
 MOVE_COLUMNS = ("move", "segment", "time_s", "pan_steps", "tilt_steps", "pan_approach", "tilt_approach")
 PIXEL_SDS = ("su_left_px", "sv_left_px", "su_right_px", "sv_right_px")
 """Columns of their standard uncertainties."""

@@ -22,6 +22,7 @@ from tvsbayes.positioner.protocol import (
     REPLY_CHARS_MAX,
     SEQUENCE_MAX,
     SETTINGS,
+    START_SPEED,
     VERSION,
     DeviceState,
     FrameError,
@@ -129,7 +130,7 @@ class SerialPositioner:
         distance = max(abs(wanted[0] - before.pan_steps), abs(wanted[1] - before.tilt_steps))
         # Twice the whole way at the speed before any ramp, and two full ramps; 5 s for the line.
         top, ramp = self._limits["vmax"], self._limits["amax"]
-        state = self._wait(reply, 5.0 + 2.0 * (distance / min(top, 200) + 2.0 * top / ramp))
+        state = self._wait(reply, 5.0 + 2.0 * (distance / min(top, START_SPEED) + 2.0 * top / ramp))
         reached = (state.pan_steps, state.tilt_steps)
         if reached != wanted or (state.pan_target_steps, state.tilt_target_steps) != wanted:
             found = f"the device says done at {reached}, ordered was {wanted}"

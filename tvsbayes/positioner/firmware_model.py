@@ -17,6 +17,7 @@ from tvsbayes.positioner.protocol import (
     FIRMWARE_VERSION,
     REQUEST_CHARS_MAX,
     SETTINGS,
+    START_SPEED,
     TRIGGER_US,
     UNNUMBERED,
     VERSION,
@@ -30,8 +31,6 @@ from tvsbayes.positioner.protocol import (
     unsigned,
 )
 
-START_SPEED = 200
-"""Speed at which the motors start and stop without a ramp, and that of homing, steps/s."""
 HOME_SLOW_SPEED = 50
 """Speed of the last approach to a home switch, steps/s."""
 HOME_CLEAR_STEPS = 20

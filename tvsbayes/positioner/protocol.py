@@ -35,6 +35,8 @@ VERSION = 2
 """Version of this protocol; a device with another one is refused."""
 FIRMWARE_VERSION = "1.1.0"
 """Version of the firmware shipped with this package, which the device model reports too."""
+START_SPEED = 200
+"""Speed at which that firmware's motors start and stop without a ramp, and that of homing, steps/s."""
 REQUEST_CHARS_MAX = 96
 """Longest request line without its line feed; a longer one is dropped up to the next line feed."""
 REPLY_CHARS_MAX = 192

@@ -24,6 +24,7 @@ REMEDIES = {
 """What helps, by how the name of the failed test begins."""
 ANY_REMEDY = "find the cause in the section Validation of the report, mend it and measure again"
 SPOTS_LISTED = 20
+"""Of those that disagree, by their ids."""
 USUAL_SCALE = (0.5, 2.0)
 """Pixel noise over the stated one that needs no word."""
 

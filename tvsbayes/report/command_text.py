@@ -11,7 +11,7 @@ import numpy as np
 from tvsbayes.calibration.pointing import Steps
 from tvsbayes.errors import escaped
 from tvsbayes.instrument.plan import LOOKS_PER_EXPERIMENT
-from tvsbayes.report.parameter_words import name_in_words
+from tvsbayes.report.parameter_words import MADE_BY, name_in_words
 from tvsbayes.report.result_tables import gap_table, hold_out_table, point_budget_table
 from tvsbayes.report.tables import COLUMNS, TableView, concise, two_digits
 from tvsbayes.results.comparison_record import Comparison, Gap, HoldOut, PositionHoldOut
@@ -361,9 +361,6 @@ def changes_text(comparison: Comparison) -> str:
     days = "" if comparison.days is None else f" in {comparison.days:.1f} days"
     cameras = "the same stereo calibration: its error is left out of u" if comparison.shared_cameras else "two cameras"
     return f"{table}\n{comparison.verdict}{days} (limit {comparison.limit:.2f} u for all together; {cameras})"
-
-
-MADE_BY = {"importance": "posterior by importance sampling", "laplace": "Laplace approximation"}
 
 
 def study_text(result: StudyResult) -> str:

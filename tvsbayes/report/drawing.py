@@ -27,7 +27,7 @@ OF_ESTIMATOR = {"nominal": (GREY, "s"), "classic": (RED, "^"), "joint": (BLUE, "
 OF_DIRECTION = {"left": ("<", BLUE), "right": (">", RED), "up": ("^", GREEN), "down": ("v", ORANGE)}
 """Marker and colour of each direction in figures of ratios."""
 SMALLEST_SHARE = 0.005
-"""Of a variance, that has a bar of its own."""
+"""Of a variance, that has a bar or a row of its own; what is below stands in fit.json alone."""
 DIVERGING, SEQUENTIAL = (BLUE, "#FFFFFF", RED), ("#FFFFFF", SKY, BLUE, "#00263E")
 """Colours of maps, from the lowest to the highest value."""
 RASTER_DPI = 150

@@ -8,7 +8,7 @@ from itertools import groupby
 from tvsbayes.errors import NotConverged, listed
 from tvsbayes.estimators.four_point import ClassicResult
 from tvsbayes.instrument.axes import DIRECTIONS
-from tvsbayes.report.advice import failed, noise_line, remedy, verdict_line
+from tvsbayes.report.advice import SPOTS_LISTED, failed, noise_line, remedy, verdict_line
 from tvsbayes.report.result_tables import (
     KEY_PARAMETERS,
     MORE_PARAMETERS,
@@ -22,7 +22,6 @@ from tvsbayes.report.tables import TableView, concise
 from tvsbayes.results.convergence import Importance, Sampling
 from tvsbayes.results.estimates import FitSummary, LostMotion, Validation
 
-SPOTS_LISTED = 20
 PARAMETERS = (*KEY_PARAMETERS, *MORE_PARAMETERS)
 
 

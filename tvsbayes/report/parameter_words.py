@@ -1,10 +1,16 @@
-"""What reports call parameters and causes of uncertainty: words for readers, beside the names that files use."""
+"""What reports call parameters, causes of uncertainty and tiers: words for readers, beside the names in files."""
 
 from __future__ import annotations
 
 from tvsbayes.instrument.axes import DIRECTIONS
 from tvsbayes.instrument.parameters import REGISTRY
 
+MADE_BY = {
+    "laplace": "Laplace approximation at the mode",
+    "importance": "posterior by importance sampling",
+    **dict.fromkeys(("emcee", "posterior"), "posterior sampled by emcee"),
+}
+"""By tier, or by estimator where results name no tier."""
 IN_WORDS = {
     "degrees_per_step": "the ratio of the gears",
     "ratio_contrast_deg_per_step": "the difference of the ratios of both directions",

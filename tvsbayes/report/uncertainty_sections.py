@@ -13,23 +13,14 @@ import numpy as np
 from tvsbayes.instrument.axes import SENSES
 from tvsbayes.metrology.traceability import header_table
 from tvsbayes.report import figures
-from tvsbayes.report.parameter_words import name_in_words, share_in_words, source_in_words
+from tvsbayes.report.drawing import SMALLEST_SHARE
+from tvsbayes.report.parameter_words import MADE_BY, name_in_words, share_in_words, source_in_words
 from tvsbayes.report.result_tables import point_budget_table
 from tvsbayes.report.tables import Section, TableView, concise, figure_view, two_digits
 from tvsbayes.results.metrology_tables import FIGURES, BudgetTable
 
 if TYPE_CHECKING:
     from tvsbayes.report.evidence import Evidence
-
-
-SHARE_PRINTED = 0.005
-"""Of a variance: a source below it stands in fit.json alone."""
-MADE_BY = {
-    "laplace": "Laplace approximation at the mode",
-    "importance": "posterior by importance sampling",
-    **dict.fromkeys(("emcee", "posterior"), "posterior sampled by emcee"),
-}
-"""By tier, or by estimator where results name no tier."""
 
 
 def maps_section(e: Evidence) -> Section:
@@ -111,7 +102,7 @@ def _pair_table(first: BudgetTable, second: BudgetTable) -> TableView:
     rows = []
     for row in first.rows:
         other = others.get(row.quantity)
-        if other is None or max(abs(row.share), abs(other.share)) < SHARE_PRINTED:
+        if other is None or max(abs(row.share), abs(other.share)) < SMALLEST_SHARE:
             continue
         told = ["" if row.u is None else two_digits(row.u), "" if row.u is None else _freedom(row.dof)]
         parts = [
@@ -141,7 +132,7 @@ def _total(table: BudgetTable) -> str:
 
 def _gum_table(table: BudgetTable, prefix: str = "") -> TableView:
     """A budget as GUM 7.2.7 asks for it; sources that matter to no digit are counted in one line."""
-    shown = [row for row in table.rows if row.u is None or abs(row.share) >= SHARE_PRINTED]
+    shown = [row for row in table.rows if row.u is None or abs(row.share) >= SMALLEST_SHARE]
     rows = [
         [
             source_in_words(row.quantity),

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from tvsbayes.errors import InputError
 from tvsbayes.files.disk import read_bytes, shipped_data
-from tvsbayes.files.images import IMAGE_BYTES_MAX
+from tvsbayes.files.images import IMAGE_BYTES_MAX, PNG_SIGNATURE
 from tvsbayes.instrument.campaign import CAMERAS, frame_name
 
 HTML, CSS, SCRIPT = ("text/html; charset=utf-8", "text/css; charset=utf-8", "text/javascript; charset=utf-8")
@@ -32,7 +32,6 @@ LIVE_FILES = {
     "/live.js": ("live.js", SCRIPT),
 }
 """The same of the page of a run."""
-PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 
 
 @dataclass(frozen=True)
