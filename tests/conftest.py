@@ -81,13 +81,15 @@ def shared_traces():
 
 
 @pytest.fixture(scope="session", autouse=True)
-def short_arrays():
-    """Campaigns of the tests are short: filled up to 96 spots a fit costs a third of what it costs with 512.
+def shared_lengths():
+    """Lengths that many tests share. Filled up to 96 spots a fit costs a third of what it costs with 512.
 
     The paper's 384 spots fill two doublings of it exactly.
     """
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("tvsbayes.estimators.campaign_arrays.SMALLEST_BUCKET", 96)
+        # Boards of 35 and of 54 corners fill one length.
+        patch.setattr("tvsbayes.cameras.bundle_adjustment.CORNERS_PER_BUCKET", 64)
         yield
 
 

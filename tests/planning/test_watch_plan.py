@@ -28,7 +28,7 @@ NAMES = [change.what for change in CHANGES]
 @pytest.fixture(scope="module")
 def measured():
     """A first day on the shipped rig, whose gears repeat errors and drift."""
-    return simulate(read_rig(RIG), four_point_protocol(repeats=6, steps=(100, 200)), seed=2)
+    return simulate(read_rig(RIG), four_point_protocol(repeats=3, steps=(100, 200)), seed=2)
 
 
 @pytest.fixture(scope="module")

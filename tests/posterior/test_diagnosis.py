@@ -12,7 +12,7 @@ from support.two_parameters import AT_MODE, BACKLASH, RATIO, STRETCH, autoregres
 
 from tvsbayes.instrument.parameters import NAMES
 from tvsbayes.posterior.chain import Chain
-from tvsbayes.posterior.diagnosis import AGREEMENT_LIMIT, GROUPS, diagnose, grouped
+from tvsbayes.posterior.diagnosis import AGREEMENT_LIMIT, GROUPS, autocorrelation_steps, diagnose, grouped
 from tvsbayes.posterior.draws import Posterior
 from tvsbayes.posterior.transport import STRETCH_NODES
 from tvsbayes.results.convergence import Importance, NamedValue, Reweighted
@@ -95,6 +95,20 @@ def test_a_chain_of_few_autocorrelation_times_is_told(judged):
     missing = "; ".join(judged(chain_of(autoregressive(STEPS, WALKERS, 0.9))).convergence.missing)
     value = int(re.search(r"steps are (\d+) autocorrelation times, wanted 50", missing)[1])
     assert 8 < value < 40
+
+
+def test_a_walker_that_kept_a_coordinate_is_left_out_of_its_autocorrelation():
+    """New values of some coordinates leave the others as they were, in a short chain all the time."""
+    w = np.random.default_rng(31).standard_normal((200, 8, 2))
+    for step in range(1, len(w)):
+        w[step, :, 1] = 0.8 * w[step - 1, :, 1] + 0.6 * w[step, :, 1]
+    others = autocorrelation_steps(np.delete(w, 3, axis=1))
+    # (1 + 0.8) / (1 - 0.8), known to a fifth from seven walkers of 22 times each.
+    assert others == pytest.approx(9.0, rel=0.6)
+    w[:, 3, 1] = w[0, 3, 1]
+    assert autocorrelation_steps(w) == pytest.approx(others, rel=1e-12)
+    w[:, :, 0] = w[0, :, 0]
+    assert autocorrelation_steps(w) == np.inf
 
 
 def test_a_walker_is_stuck_that_hardly_moves_or_lives_at_another_density(judged):

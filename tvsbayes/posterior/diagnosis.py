@@ -83,14 +83,16 @@ class ChainQuality:
 
 
 def autocorrelation_steps(w: np.ndarray) -> float:
-    """Longest integrated autocorrelation time of positions (steps, walkers, d), steps; infinite if none moved.
+    """Longest integrated autocorrelation time of positions (steps, walkers, d), steps.
 
-    A walker that never moved has no autocorrelation; it is found by its acceptance.
+    A walker that kept its value of a coordinate has no autocorrelation there; one that hardly moves is found by its
+    acceptance. Infinite where no walker moved along some coordinate.
     """
-    moved = np.ptp(w[:, :, 0], axis=0) > 0
-    if not moved.any():
+    moved = np.ptp(w, axis=0) > 0
+    if not moved.any(axis=0).all():
         return float("inf")
-    return float(np.max(emcee.autocorr.integrated_time(w[:, moved], tol=0, quiet=True)))
+    every = (w[:, own, k][:, :, None] for k, own in enumerate(moved.T))
+    return float(max(emcee.autocorr.integrated_time(x, tol=0, quiet=True)[0] for x in every))
 
 
 def steps_wanted(chain: Chain) -> float:
