@@ -169,4 +169,20 @@ FAULTS = (
         "who needs another ramp has to edit C++ and flash",
         ("positioner/protocol::test_settings_of_a_rig_file",),
     ),
+    Fault(
+        "GRBL: any word lifts the interlock of the laser",
+        "positioner/grbl.py",
+        "if unwatched not in (0, 1):",
+        "if False:",
+        'who writes "false" in quotes has a laser that stays on when the computer dies',
+        ("positioner/grbl",),
+    ),
+    Fault(
+        "noise of a dark room by the brightest pixel of two pictures",
+        "acquisition/observation.py",
+        "self._white = max(self._white, pair.full_scale)",
+        "self._white = max(0, pair.full_scale)",
+        "a camera of twelve bits that does not state them takes no look",
+        ("acquisition/observation",),
+    ),
 )
