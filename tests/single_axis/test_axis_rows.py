@@ -7,6 +7,7 @@ import pytest
 from support.axes import campaign, random_moves, runs
 
 from tvsbayes.errors import InputError, NothingToEstimate
+from tvsbayes.instrument.column_names import DEGREES
 from tvsbayes.single_axis.axis_campaign import AxisCampaign, AxisMove, Reading
 from tvsbayes.single_axis.axis_rows import play_places, rows_of
 from tvsbayes.single_axis.classic_line import iso230_figures
@@ -58,6 +59,16 @@ def test_angles_that_wrap_are_refused():
         rows_of(campaign(moves, [(m.command + 100) % 360 for m in moves]))
     assert caught.value.code == "wrapped" and "unwrap" in caught.value.remedy
     assert len(rows_of(campaign(moves, [m.command + 100 for m in moves])).value) == 30
+
+
+@pytest.mark.parametrize("unit", DEGREES)
+def test_in_every_unit_of_angles_that_an_import_knows_a_turn_is_a_turn(unit):
+    moves = tuple(AxisMove(k, 0, 0.0, 20.0 * k, "" if k else "forward") for k in range(30))
+    values = [(m.command + 100) % 360 / DEGREES[unit] for m in moves]
+    readings = tuple(Reading(k, k, value) for k, value in enumerate(values))
+    with pytest.raises(InputError) as caught:
+        rows_of(AxisCampaign(unit, moves, readings))
+    assert caught.value.code == "wrapped" and unit in caught.value.remedy
 
 
 @pytest.mark.parametrize(

@@ -18,6 +18,7 @@ from tvsbayes.errors import InputError, escaped, refusal
 from tvsbayes.files.csv_table import CSV_BYTES_MAX, csv_bytes, parse_table
 from tvsbayes.files.disk import make_folder, read_bytes, write_atomically
 from tvsbayes.files.documents import TOML_BYTES_MAX, Keys, parse_toml, toml_line
+from tvsbayes.instrument.column_names import DEGREES
 from tvsbayes.single_axis.axis_parameters import AXIS_KEYS, STATED_KEYS, AxisPrior
 
 FORMAT = "tvsbayes-axis/1"
@@ -26,7 +27,7 @@ APPROACHES: tuple[Approach, ...] = ("forward", "backward", "unknown")
 """Forward is a rising command, whatever the sign of the unit per command."""
 COMMAND_MAX = 1e12
 """Of a command or a reading, either sign."""
-TURNS = {"deg": 360.0, "rad": 6.283185307179586, "arcmin": 21_600.0, "arcsec": 1_296_000.0, "turn": 1.0}
+TURNS = {**{unit: 360.0 / in_deg for unit, in_deg in DEGREES.items()}, "turn": 1.0}
 """One turn in the units of angles."""
 _NEVER_NOUGHT = ("transmission_error_length", "reading_scale")
 """Log-normals that the model divides by: held at 0, every density is without a value."""
