@@ -88,7 +88,7 @@ def shared_lengths():
     """
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("tvsbayes.estimators.campaign_arrays.SMALLEST_BUCKET", 96)
-        # Boards of 35 and of 54 corners fill one length.
+        # Boards of 24 and of 54 corners fill one length.
         patch.setattr("tvsbayes.cameras.bundle_adjustment.CORNERS_PER_BUCKET", 64)
         yield
 

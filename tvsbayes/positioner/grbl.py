@@ -407,10 +407,12 @@ def _dark(state: DeviceState) -> DeviceState:
 
 def _power(stated: str | int | float | None) -> float | None:
     """`S` of a spindle order as the rig file states it."""
-    if stated is None or (not isinstance(stated, str) and 0 <= stated < math.inf):
-        return stated if stated is None else float(stated)
-    remedy = "write a number without quotes, up to the board's $30, or leave it out for full power"
-    raise _refused("options.laser_power", escaped(str(stated)), "a number of 0 or more", remedy)
+    if stated is None:
+        return None
+    if isinstance(stated, str) or not 0 <= stated < math.inf:
+        remedy = "write a number without quotes, up to the board's $30, or leave it out for full power"
+        raise _refused("options.laser_power", escaped(str(stated)), "a number of 0 or more", remedy)
+    return float(stated)
 
 
 def _unplugged(error: OSError) -> DeviceFault:

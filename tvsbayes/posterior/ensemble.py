@@ -49,10 +49,10 @@ class GroupEvolution(emcee.moves.DEMove):
     partners are those of its group in the other half.
     """
 
-    def __init__(self, gamma0: float | None = None):
-        # Fewer walkers than twice the dimension let differential evolution explore a subspace only; the independence
-        # proposal leaves it at two steps of three.
-        super().__init__(gamma0=gamma0, randomize_split=False, live_dangerously=True)
+    def __init__(self):
+        # Fewer walkers than twice the dimension let differential evolution explore a subspace only; all other moves
+        # leave it.
+        super().__init__(randomize_split=False, live_dangerously=True)
 
     def get_proposal(
         self, s: np.ndarray, c: list[np.ndarray], random: np.random.RandomState
