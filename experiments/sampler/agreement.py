@@ -9,9 +9,9 @@ spots with twelve stops in every direction (`rigs.small_plan`), and samples each
 Eight runs of tier 1 on the twins are averaged. `table` compares the tiers with each other and, on the twins, with that
 average and with the NUTS references in `data/reference/` of the same data and priors: every free parameter and
 headline; means in posterior sds, sds in per cent, both also in joint Monte Carlo errors. Wanted are means within 0.1 sd
-and sds within 6 %; beyond them "by chance" says that no gap is more than four errors. Of a hundred quantities one in a
-hundred lies beyond 2.6 errors by chance, the worst near 3. CPU seconds are the process' own, from the fit on, after a
-first call that compiles, with campaigns padded to 384, 192 and 64 rows instead of 512.
+and sds within 6 %; beyond them "undecided" says that no such gap is more than four errors. Of a hundred quantities one
+in a hundred lies beyond 2.6 errors by chance, the worst near 3. CPU seconds are the process' own, from the fit on,
+after a first call that compiles, with campaigns padded to 384, 192 and 64 rows instead of 512.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ SHEETS = {DENSE: ("d1", "d3"), FEW: ("d1", "d2")}
 MEAN_WANTED, SD_WANTED = 0.1, 6.0
 """In posterior sds, and in per cent."""
 CHANCE = 4.0
-"""Monte Carlo errors that chance explains, as in `fit`: some thousand effective draws know an sd to 2 %."""
+"""Monte Carlo errors up to which a gap decides nothing, as in `fit`: a thousand effective draws know an sd to 2 %."""
 MAX_MINUTES = 15.0
 
 
@@ -134,7 +134,7 @@ def compare(one: Mapping[str, Mapping[str, float]], other: Mapping[str, Mapping[
     cells += [f"{np.median(list(errors.values())):.2f}, {errors[worst]:.2f} {worst}"]
     limits = (("mean", mean, MEAN_WANTED), ("sd", sd, SD_WANTED))
     beyond = [errors[f"{key} of {n}"] for key, found, wanted in limits for n in shared if found[n] > wanted]
-    verdict = "OUTSIDE" if max(beyond, default=0.0) > CHANCE else "by chance" if beyond else "within"
+    verdict = "OUTSIDE" if max(beyond, default=0.0) > CHANCE else "undecided" if beyond else "within"
     return " | ".join([*cells, verdict])
 
 
