@@ -107,7 +107,7 @@ def write_chain(path: Path, fit: JointFit, start: ImportanceRun, chain: Chain) -
     buffer = io.BytesIO()
     kind, keys, position, has_gauss, gauss = chain.random_state
     kept = {f"transport_{f.name}": getattr(start.path, f.name) for f in fields(Transport)} | _pool_arrays(start.pool)
-    np.savez_compressed(
+    np.savez(
         buffer,
         allow_pickle=False,
         format=CHAIN_FORMAT,

@@ -41,7 +41,7 @@ STUCK_DEVIATION = 8.0
 off the others': the means of long chains spread so little that one rare excursion would fail the first alone."""
 WARM_UP = 10
 """One step of so many is left out: with the autocorrelation times that are asked of the rest, more than five."""
-STORED_DRAWS = 64
+STORED_DRAWS = 48
 """Draws stored per walker: from this many to twice as many, some four thousand in all."""
 
 
