@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from scipy import stats
 from support.dozen_spots import coordinates
+from support.drawn_residuals import drawn_residual
 from support.small_results import small_summary
 
 from tvsbayes.assessment.score_tests import VALIDATION_LEVEL, _Answer, _holm, validate
@@ -65,16 +66,8 @@ def own_columns(fit: JointFit) -> np.ndarray:
 
 
 def drawn(fit: JointFit, seed: int) -> np.ndarray:
-    """Residuals by the model: unit noise of three components, stop errors drawn anew where an axis moved."""
-    generator = np.random.default_rng([seed, 0x76])
-    spots = linear_spots(fit.linearised, fit.arrays, own_columns(fit))
-    state, residual = np.zeros(6), np.zeros((len(spots.residual), 4))
-    for row in range(len(residual)):
-        fresh = generator.standard_normal(6) * np.sqrt(spots.variance[row])
-        state = np.where(spots.renewed[row], fresh, state)
-        residual[row] = spots.load[row] @ state
-        residual[row, :3] += generator.standard_normal(3)
-    return residual
+    """Residuals by the model, at a true rig."""
+    return drawn_residual(linear_spots(fit.linearised, fit.arrays, own_columns(fit)), seed)
 
 
 def test_what_the_fit_can_follow_is_not_seen(clean):

@@ -16,7 +16,6 @@ from tvsbayes.instrument.axes import AXES, direction_of
 from tvsbayes.instrument.campaign import ordered_spots
 from tvsbayes.instrument.stops import Rest, rests_of
 from tvsbayes.metrology.positioning_table import StopReadings
-from tvsbayes.posterior.predictive import repeated_rad
 from tvsbayes.results.estimates import Cause, CauseGroup, StopResidual
 from tvsbayes.statistics.chances import one_way_chance, recursive_residuals
 
@@ -54,13 +53,28 @@ class _SeenRest:
     mean_variance_rad2: float
 
 
-def _seen_rests(fit: JointFit, axis: str) -> list[_SeenRest]:
-    """Rests of an axis that usable spots tell of, in order."""
+def _left_to_stops(fit: JointFit) -> np.ndarray:
+    """Residuals without what homings, drift, play and the gears' repeating errors do to them, shape (spots, 4).
+
+    All these stand for many stops and are estimated with the rest: what a stop shares with the others is no deviation
+    of its own. With u = C^-1 r of all spots, unit noise has the mean u, and the error of a stop its variance times what
+    u says of it, so that the rest need not be known one by one.
+    """
+    left = np.concatenate([group.residual for group in fit.information.groups]).reshape(-1, 4)
+    slope, spots = np.asarray(fit.linearised.slope), ordered_spots(fit.campaign)
+    told = np.einsum("nia,ni->na", slope, left)
+    for index, axis in enumerate(AXES):
+        rests = rests_of(fit.campaign.moves, axis)
+        _, first, own = np.unique([rests[spot.move].move for spot in spots], return_index=True, return_inverse=True)
+        error_rad = fit.linearised.stop_variance[first, index] * np.bincount(own, told[:, index])
+        left = left + slope[..., index] * error_rad[own, None]
+    return left
+
+
+def _seen_rests(fit: JointFit, axis: str, residual: np.ndarray) -> list[_SeenRest]:
+    """Rests of an axis that usable spots tell of, in order, by whitened residuals (spots, 4)."""
     index, rests = AXES.index(axis), rests_of(fit.campaign.moves, axis)
-    lin, information = fit.linearised, fit.information
-    # What the gears repeat is known, not a deviation.
-    repeated = np.asarray(lin.place_load) @ information.place_mean
-    seen = replace(lin, residual=np.asarray(lin.residual) - repeated).spot_deviations()
+    seen = replace(fit.linearised, residual=residual).spot_deviations()
     deviation, variance = seen.deviation_rad[:, index], seen.covariance_rad2[:, index, index]
     valid = np.asarray(fit.arrays.spots.valid)
     rows_of: dict[Rest, list[int]] = {}
@@ -79,7 +93,7 @@ def _seen_rests(fit: JointFit, axis: str) -> list[_SeenRest]:
 
 
 def stop_readings(fit: JointFit, axis: str) -> StopReadings:
-    """What the spots say of every stop of an axis, before any stop error is shrunk towards zero.
+    """What the spots say of every stop of an axis, before any error is shrunk towards zero.
 
     At each stop the mean deviation of its spots, added to the angle that counters and play predict.
 
@@ -92,17 +106,16 @@ def stop_readings(fit: JointFit, axis: str) -> StopReadings:
     """
     values = dict(zip(fit.names, np.asarray(fit.mode.physical, dtype=float).tolist(), strict=True))
     needed = values[f"backlash_deg.{axis}"] / abs(values[f"degrees_per_step.{axis}"])
-    seen = _seen_rests(fit, axis)
+    seen = _seen_rests(fit, axis, np.asarray(fit.linearised.residual))
     kept = [one for one in seen if one.rest.sign != 0 and one.rest.leg >= needed]
     first = [one.rows[0] for one in kept]
     predicted = np.asarray(fit.linearised.mirror_angles_rad)[first, AXES.index(axis)]
-    repeated = repeated_rad(fit, np.asarray(fit.mode.place_errors_rad)[None])[0, :, AXES.index(axis)]
     pan, tilt = np.degrees(fit.reference_pose_rad).tolist()
     return StopReadings(
         axis=axis,
         steps=np.array([one.rest.steps for one in kept], dtype=int),
         side=np.array([one.rest.sign for one in kept], dtype=int),
-        mirror_deg=np.degrees(predicted + repeated[first] + [one.mean_rad for one in kept]),
+        mirror_deg=np.degrees(predicted + [one.mean_rad for one in kept]),
         u_deg=np.degrees(np.sqrt([one.mean_variance_rad2 for one in kept])),
         play_left_out=len(seen) - len(kept),
         reference_pose_deg=(pan, tilt),
@@ -113,14 +126,14 @@ def stop_readings(fit: JointFit, axis: str) -> StopReadings:
 def stop_residuals(fit: JointFit) -> tuple[StopResidual, ...]:
     """Deviations of all stops from the fitted model, both axes, in order.
 
-    The common part of the calibration is in none of them, and each deviation has lost a little to the fit: they
-    scatter by slightly less than `u_deg`.
+    The common part of the calibration is in none of them, nor is a drift or what the gears repeat; each deviation has
+    lost a little to the fit and to these: they scatter by less than `u_deg`.
     """
     spots, moves = ordered_spots(fit.campaign), fit.campaign.moves
     depth_mm = np.asarray(fit.arrays.spots.triangulated_mm)[:, 0]
-    found: list[StopResidual] = []
+    left, found = _left_to_stops(fit), list[StopResidual]()
     for index, axis in enumerate(AXES):
-        for one in _seen_rests(fit, axis):
+        for one in _seen_rests(fit, axis, left):
             # The row that drew the stop error has its variance, whether that spot is used or not.
             variance = one.mean_variance_rad2 + fit.linearised.stop_variance[one.first, index]
             found.append(
