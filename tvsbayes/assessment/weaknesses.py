@@ -15,15 +15,13 @@ from tvsbayes.instrument.parameters import INDEX, NAMES, NOISE_NAMES, STEREO_PAR
 from tvsbayes.instrument.places import FEW_COUNTERS, LEAST_ERROR_RAD, SPACING_DEG, too_few_counters
 from tvsbayes.instrument.stops import few_stops, inseparable, legs_of, observed_stops, one_sided, separation
 from tvsbayes.model.gear_kriging import KnownPlaces, scales_at
-from tvsbayes.results.estimates import Leverage, WeakDirection
+from tvsbayes.results.estimates import CONFLICT_LIMIT, Leverage, WeakDirection, conflict_sentence
 
 LEVERAGE_LIMIT = 2.0
 """A stop is named if a headline's sd would grow by more than this factor without it (formulation 4.2)."""
 LOADING_LIMIT = 0.3
 WEAK_VARIANCE = 0.5
 """A direction of parameter space is weak if more than this share of its prior variance is left."""
-CONFLICT_LIMIT = 4.0
-"""Prior standard deviations; of fifty parameters one lies beyond it in 3 of 1000 honest campaigns."""
 LISTED = 8
 
 
@@ -179,10 +177,7 @@ def prior_conflicts(fit: JointFit) -> tuple[str, ...]:
     found = []
     for index in np.flatnonzero(fit.free & (np.abs(fit.z) > CONFLICT_LIMIT)):
         value, distance = fit.mode.physical[index], abs(fit.z[index])
-        found.append(
-            f"{NAMES[index]} = {value:.4g} lies {distance:.1f} prior sds from its prior's centre: check the sign of "
-            "the counters and the unit, or state the prior wider"
-        )
+        found.append(conflict_sentence(f"{NAMES[index]} = {value:.4g}", distance))
     return tuple(found)
 
 

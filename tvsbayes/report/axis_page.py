@@ -12,6 +12,7 @@ import numpy as np
 from tvsbayes.errors import escaped
 from tvsbayes.instrument.campaign import title_of
 from tvsbayes.report.axis_text import (
+    CONFLICTING,
     deviation_table,
     iso230_table,
     parameter_table,
@@ -96,6 +97,9 @@ def axis_page(results: AxisResults, issue: Issue) -> Page:
     told = f"Least-squares line: {concise(classic.per_command, classic.u_per_command)} {unit} per command, stops "
     told += f"independent, residual scatter {two_digits(classic.residual_sd)} {unit}."
     converged = "The intervals may be used." if summary.converged else "NOT CONVERGED: the numbers must not be used"
+    if summary.converged and summary.prior_conflicts:
+        converged = f"PRIOR CONFLICT: {CONFLICTING}."
+    conflicts = [f"Prior conflict: {text}" for text in summary.prior_conflicts]
     header = fit.campaign.header
     created = header.get("created")
     folder = "AXIS" if fit.campaign.path is None else shlex.quote(escaped(fit.campaign.path.resolve().name, 200))
@@ -112,7 +116,7 @@ def axis_page(results: AxisResults, issue: Issue) -> Page:
         steps=[f"`tvsbayes plan --given {folder}` says which stops to read next."],
         criteria=None,
         traceable="The readings are taken as stated.",
-        warnings=[*summary.problems, *summary.warnings],
+        warnings=[*summary.problems, *summary.warnings, *conflicts],
         versions=made["versions"],
         sections=[
             Section("Result", tables=[parameter_table(summary)], opened=True),

@@ -16,6 +16,8 @@ from tvsbayes.single_axis.next_stops import AxisPlan
 DEVIATIONS_SHOWN = 40
 HARDLY = 0.95
 """Stops that leave more than this share of an uncertainty are not worth their time."""
+CONFLICTING = "the numbers hold only if the readings, not the priors, are wrong"
+"""Of a fit whose priors the readings contradict."""
 WHAT = {
     **{name: key.what for name, key in AXIS_KEYS.items()},
     "stop_sd.forward": "scatter of stops, forward",
@@ -110,10 +112,13 @@ def axis_fit_text(summary: AxisSummary, details: bool = False, written: Sequence
     elif summary.weak_directions:
         lines.append(f"--details and the report say more: {len(summary.weak_directions)} weak directions")
     lines += [*_lines("NOT CONVERGED", summary.problems), *_lines("warning", summary.warnings)]
+    lines += _lines("prior conflict", summary.prior_conflicts)
     lines += [f"written: {', '.join(written)}"] if written else []
     counted = f"{summary.readings} readings of {summary.moves} moves at {summary.positions} positions; {how}"
     parts = [counted, parameter_table(summary).text(), ratio_table(summary).text()]
-    verdict = "usable" if summary.converged else "NOT CONVERGED, use none of these numbers"
+    verdict = "NOT CONVERGED, use none of these numbers"
+    if summary.converged:
+        verdict = f"PRIOR CONFLICT, {CONFLICTING}" if summary.prior_conflicts else "usable"
     return "\n".join([*lines, *[""] * bool(lines), *parts, f"verdict: {verdict}"])
 
 

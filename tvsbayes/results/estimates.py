@@ -16,6 +16,22 @@ from tvsbayes.results.records import plain
 
 CONTRACTION_LIMIT = 0.1
 """1 - (posterior sd / prior sd)^2 below which a value is called set by the prior."""
+CONFLICT_LIMIT = 4.0
+"""Prior standard deviations; of fifty parameters one lies beyond it in 3 of 1000 honest campaigns."""
+CONFLICT_REMEDY = "check the sign of the counters and the unit, or state the prior wider"
+
+
+def conflict_sentence(quantity: str, distance: float, centre: str = "", remedy: str = CONFLICT_REMEDY) -> str:
+    """A prior that the data contradict, in words.
+
+    Args:
+        quantity: name and value.
+        distance: of the value from the prior's centre, in prior sds; infinite where the prior holds it exactly.
+        centre: what the prior says, where it is worth saying.
+        remedy: what to do.
+    """
+    far = f"{distance:.1f} prior sds" if np.isfinite(distance) else "beyond every bound"
+    return f"{quantity} lies {far} from its prior's centre{centre and f', {centre}'}: {remedy}"
 
 
 SUMMARY_KEYS = (

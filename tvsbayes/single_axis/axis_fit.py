@@ -11,9 +11,10 @@ from tvsbayes.display import Shown, View
 from tvsbayes.errors import NotConverged, TvsError
 from tvsbayes.progress import Job, Show
 from tvsbayes.single_axis.axis_campaign import AxisCampaign
+from tvsbayes.single_axis.axis_conflicts import PriorConflict, conflict_text, prior_conflicts
 from tvsbayes.single_axis.axis_mode import AxisMode, find_mode
 from tvsbayes.single_axis.axis_model import AxisModel, LinearPosterior
-from tvsbayes.single_axis.axis_parameters import axis_priors
+from tvsbayes.single_axis.axis_parameters import AxisPrior, axis_priors
 from tvsbayes.single_axis.axis_rows import AxisRows, rows_of
 from tvsbayes.single_axis.axis_sampling import (
     EQUAL_DRAWS,
@@ -107,11 +108,20 @@ class AxisFit(Shown):
             return None
         if not self.free:
             remedy = "state other values in [axis]: every scale is held where the readings cannot be"
+        elif contradicted := [conflict for conflict in self.conflicts if conflict.stated]:
+            # Between a prior and readings that contradict it no sampler comes to rest: longer helps nothing.
+            remedy = "; ".join(conflict_text(conflict) for conflict in contradicted)
         elif self.first is None:
             remedy = "run again without --no-sample"
         else:
             remedy = "run again without --quick" if self.chain is None else "run again with more --max-minutes"
         return NotConverged("unconverged", "UNCONVERGED: " + "; ".join(self.missing), remedy=remedy)
+
+    @cached_property
+    def conflicts(self) -> tuple[PriorConflict, ...]:
+        """Priors that the readings contradict."""
+        stated, rows = self.campaign.stated, self.rows
+        return prior_conflicts(self.model, self.w, stated, default_priors(rows))
 
     @cached_property
     def linear(self) -> LinearPosterior:
@@ -171,8 +181,13 @@ def model_of(campaign: AxisCampaign, more: np.ndarray | None = None) -> AxisMode
         InputError: too many moves, or angles that wrap.
     """
     rows = rows_of(campaign)
+    return AxisModel.of(rows, default_priors(rows) | campaign.stated, more)
+
+
+def default_priors(rows: AxisRows) -> dict[str, AxisPrior]:
+    """Every prior of an axis, as if nothing were stated."""
     u = float(np.sqrt(fit_line(rows).covariance[1, 1]))
-    return AxisModel.of(rows, axis_priors(campaign.stated, rows.travel, rows.line[1], u), more)
+    return axis_priors({}, rows.travel, rows.line[1], u)
 
 
 def fit_axis(

@@ -16,6 +16,7 @@ from tvsbayes.results.estimates import CONTRACTION_LIMIT, Estimate
 from tvsbayes.results.fit_record import provenance
 from tvsbayes.results.records import plain, read_record, stored_document
 from tvsbayes.single_axis.axis_campaign import AxisCampaign, axis_hashes
+from tvsbayes.single_axis.axis_conflicts import conflict_text
 from tvsbayes.single_axis.axis_fit import AxisFit, fit_axis, line_weights, model_of
 from tvsbayes.single_axis.axis_parameters import CONTRAST_SHARE, kind_of, prior_sd
 from tvsbayes.single_axis.axis_rows import AxisRows
@@ -60,6 +61,7 @@ class AxisSummary(Shown):
         moves, readings, positions: how many were used.
         weak_directions, warnings: sentences.
         sampling: diagnosis of the draws.
+        prior_conflicts: priors that the readings contradict, in words.
     """
 
     unit: str
@@ -79,6 +81,7 @@ class AxisSummary(Shown):
     weak_directions: tuple[str, ...]
     warnings: tuple[str, ...]
     sampling: dict[str, float | int | None]
+    prior_conflicts: tuple[str, ...] = ()
 
     def shown(self) -> View:
         """Ratios by direction, then every parameter."""
@@ -169,6 +172,7 @@ def summarise_axis(fit: AxisFit) -> AxisSummary:
         weak_directions=tuple(_weak(fit)),
         warnings=tuple([*axis_warnings(fit.campaign, fit.rows), *_reversed(fit)]),
         sampling=_sampling(fit),
+        prior_conflicts=tuple(conflict_text(conflict) for conflict in fit.conflicts),
     )
 
 
