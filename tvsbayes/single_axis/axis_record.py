@@ -17,6 +17,7 @@ from tvsbayes.results.fit_record import provenance
 from tvsbayes.results.records import plain, read_record, stored_document
 from tvsbayes.single_axis.axis_campaign import AxisCampaign, axis_hashes
 from tvsbayes.single_axis.axis_conflicts import conflict_text
+from tvsbayes.single_axis.axis_doubts import data_doubts
 from tvsbayes.single_axis.axis_fit import AxisFit, fit_axis, line_weights, model_of
 from tvsbayes.single_axis.axis_parameters import CONTRAST_SHARE, kind_of, prior_sd
 from tvsbayes.single_axis.axis_rows import AxisRows
@@ -232,7 +233,7 @@ def axis_warnings(campaign: AxisCampaign, rows: AxisRows) -> list[str]:
     unread = len(campaign.readings) - int(rows.count.sum())
     if unread:
         found.append(f"{unread} readings are not used: their status is not ok")
-    return found
+    return found + data_doubts(campaign, rows)
 
 
 def _reversed(fit: AxisFit) -> list[str]:

@@ -1,0 +1,77 @@
+"""What is odd about an axis' data: counts of other steps, a ratio that they do not have, single wild readings."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.axes import drawn, random_moves, runs
+
+from tvsbayes.single_axis.axis_campaign import AxisCampaign, AxisMove, Reading
+from tvsbayes.single_axis.axis_doubts import data_doubts
+from tvsbayes.single_axis.axis_parameters import AxisPrior
+from tvsbayes.single_axis.axis_record import axis_warnings
+from tvsbayes.single_axis.axis_rows import rows_of
+
+RATIO, PLAY, U = 0.0125, 0.085, 0.003
+
+
+def logged(**stated: AxisPrior) -> AxisCampaign:
+    """A log of three segments with play and homings, two readings at every stop."""
+    rng = np.random.default_rng(5)
+    moves, readings = [], []
+    for segment in range(3):
+        home = 0.004 * rng.standard_normal()
+        for k, move in enumerate(runs(1)):
+            moves.append(AxisMove(len(moves), segment, 60.0 * len(moves), move.command, "" if k else "backward"))
+            step = 0.0 if not k else move.command - moves[-2].command
+            stands = RATIO * move.command - 0.5 * PLAY * (np.sign(step) or -1) + home + 0.004 * rng.standard_normal()
+            readings += [
+                Reading(len(readings) + i, len(moves) - 1, float(stands + U * rng.standard_normal()), U)
+                for i in range(2)
+            ]
+    return AxisCampaign("mm", tuple(moves), tuple(readings), stated)
+
+
+def said(campaign: AxisCampaign) -> list[str]:
+    return axis_warnings(campaign, rows_of(campaign))
+
+
+def test_a_segment_counted_in_other_steps_is_named():
+    whole = logged()
+    mixed = replace(
+        whole, moves=tuple(replace(m, command=m.command / 16) if m.segment == 2 else m for m in whole.moves)
+    )
+    [told] = [text for text in said(mixed) if text.startswith("segment")]
+    assert told.startswith("segment 2 ") and "16 times" in told and "moves.csv" in told and "(0.012499)" in told
+    assert said(whole) == []
+
+
+@pytest.mark.parametrize("value", [16 * RATIO, -RATIO])
+def test_a_stated_ratio_that_the_readings_do_not_have_is_named(value):
+    [told] = said(logged(per_command=AxisPrior(value, 0.001)))
+    assert f"per_command = {value:g}" in told and "0.012499" in told and "campaign.toml" in told
+    assert said(logged(per_command=AxisPrior(RATIO, 1e-5))) == []
+
+
+@pytest.mark.parametrize("stated", [True, False], ids=["u stated", "u unknown"])
+def test_wild_readings_are_named_and_their_neighbours_not(stated):
+    whole = logged()
+    readings = [r if stated else replace(r, u=0.0) for r in whole.readings]
+    for at in (31, 60):
+        readings[at] = replace(readings[at], value=readings[at].value + 1.5)
+    told = said(replace(whole, readings=tuple(readings)))
+    told = [text for text in told if "stated u" not in text]
+    assert len(told) == 2
+    for at, text in zip((31, 60), told, strict=True):
+        move = whole.readings[at].move
+        assert text.startswith(f"reading {at} (move {move}, command {whole.moves[move].command:g}) ")
+        assert "readings.csv" in text and "1.5" in text and "status" in text
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_drawn_axes_raise_no_doubt(seed):
+    moves = random_moves(seed, 40, 4) if seed % 2 else runs(2)
+    made = drawn(seed, moves, per_command=AxisPrior(0.01, 1e-6), backlash=AxisPrior(0.0, 1.0)).campaign
+    assert data_doubts(made, rows_of(made)) == []
