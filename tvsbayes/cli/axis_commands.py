@@ -235,7 +235,7 @@ def plan(
     from tvsbayes.report.axis_text import axis_plan_text
     from tvsbayes.single_axis.axis_campaign import read_axis
     from tvsbayes.single_axis.axis_record import results_for
-    from tvsbayes.single_axis.next_stops import TARGETS, plan_next
+    from tvsbayes.single_axis.next_stops import TARGETS, plan_next, unit_of
 
     wanted = target or TARGETS[0]
     if wanted not in TARGETS:
@@ -248,6 +248,7 @@ def plan(
             report_line(STORED)
         found = plan_next(results.fit, wanted, minutes=minutes, progress=job.part(PLANNING))
     document, text = {**found.as_json(), "unit": data.unit, "seed": seed}, axis_plan_text(found, data.unit)
+    document["u_unit"] = unit_of(found.target, data.unit)
     if output is not None and found.next:
         write_atomically(output, found.plan_bytes())
         document["plan"] = str(output)

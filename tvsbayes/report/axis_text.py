@@ -11,7 +11,7 @@ from tvsbayes.single_axis.axis_parameters import AXIS_KEYS
 from tvsbayes.single_axis.axis_record import AxisSummary, PositionDeviation
 from tvsbayes.single_axis.classic_line import ClassicAxis
 from tvsbayes.single_axis.held_out_positions import AxisHoldOut
-from tvsbayes.single_axis.next_stops import AxisPlan
+from tvsbayes.single_axis.next_stops import AxisPlan, unit_of
 
 DEVIATIONS_SHOWN = 40
 HARDLY = 0.95
@@ -50,7 +50,7 @@ def parameter_table(summary: AxisSummary) -> TableView:
     rows = []
     for name, of in summary.parameters.items():
         if name != "per_command":
-            said = "" if of.contraction is None else f"{100 * of.contraction:.0f} %"
+            said = "" if of.contraction is None else f"{100 * max(of.contraction, 0.0):.0f} %"
             rows.append([WHAT.get(name, name), *_row(name, of)[1:], said])
     caption = f"parameters, {escaped(summary.unit)}; 100 %: the readings tell it, 0 %: the prior does"
     return TableView(caption, ["", "value(u)", "95 % interval", "told"], rows)
@@ -110,7 +110,8 @@ def axis_fit_text(summary: AxisSummary, details: bool = False, written: Sequence
         lines += [] if iso230 is None else [iso230.text()]
         lines += _lines("weak (the readings leave it to the priors)", summary.weak_directions)
     elif summary.weak_directions:
-        lines.append(f"--details and the report say more: {len(summary.weak_directions)} weak directions")
+        count = len(summary.weak_directions)
+        lines.append(f"--details and the report say more: {count} weak direction{'s' * (count > 1)}")
     lines += [*_lines("NOT CONVERGED", summary.problems), *_lines("warning", summary.warnings)]
     lines += _lines("prior conflict", summary.prior_conflicts)
     lines += [f"written: {', '.join(written)}"] if written else []
@@ -145,9 +146,10 @@ def next_table(plan: AxisPlan, unit: str) -> TableView:
     rows = []
     for stop in plan.next:
         over = "" if stop.via is None else f"{stop.via:.10g}"
-        rows.append([f"{stop.command:.10g}", stop.direction, over, two_digits(stop.u)])
+        rows.append([f"{stop.command:.10g}", stop.direction, over, two_digits(stop.u, both=True)])
     u = f"u of {plan.target} afterwards"
-    caption = f"stops to read next, in this order; now u = {two_digits(plan.u_now)} {escaped(unit)}"
+    caption = f"stops to read next, in this order; now u = {two_digits(plan.u_now, both=True)} "
+    caption += unit_of(plan.target, escaped(unit))
     return TableView(caption, ["command", "direction", "go first to", u], rows)
 
 

@@ -12,6 +12,7 @@ import math
 import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from decimal import Decimal
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -29,9 +30,11 @@ COLUMNS, GAP = 80, 2
 """Of a terminal; between two columns of a table."""
 
 
-def two_digits(value: float) -> str:
-    """An uncertainty to two significant digits, without an exponent (GUM 7.2.6)."""
-    return np.format_float_positional(value, precision=2, fractional=False, trim="-")
+def two_digits(value: float, both: bool = False) -> str:
+    """An uncertainty to two significant digits, without an exponent (GUM 7.2.6); a second of 0 where `both` are due."""
+    if not both:
+        return np.format_float_positional(value, precision=2, fractional=False, trim="-")
+    return f"{Decimal(f'{value:.1e}'):f}"
 
 
 def concise(value: float, sd: float) -> str:

@@ -85,7 +85,7 @@ def conflict_text(conflict: PriorConflict) -> str:
 def _of_stretched(model: AxisModel, name: str, wide: AxisPrior) -> PriorConflict | None:
     """Whether prior and readings, each with its own u, differ beyond reason; None where not, or where none tells."""
     prior = model.priors[name]
-    if prior.u >= wide.u or (name == "backlash" and len(set(model.rows.side.tolist()) - {0}) < 2):
+    if prior.u >= wide.u or (name == "backlash" and not model.rows.both_sides):
         return None
     alone = AxisModel.of(model.rows, {**model.priors, name: wide})
     mode = find_mode(alone)

@@ -22,6 +22,7 @@ from tvsbayes.single_axis.axis_fit import AxisFit, fit_axis, line_weights, model
 from tvsbayes.single_axis.axis_parameters import CONTRAST_SHARE, kind_of, prior_sd
 from tvsbayes.single_axis.axis_rows import AxisRows
 from tvsbayes.single_axis.classic_line import ClassicAxis, classic_axis
+from tvsbayes.statistics.intervals import NORMAL_95
 
 AXIS_FIT_FORMAT = "tvsbayes-axis-fit/1"
 POSITIONS_FEW = 5
@@ -164,7 +165,7 @@ def summarise_axis(fit: AxisFit) -> AxisSummary:
             side: _estimate(effective + half * contrast, None, diagnoses[""]) for side, half in sides.items()
         },
         range_command=(float(fit.rows.command.min()), float(fit.rows.command.max())),
-        parameters={name: of(name) for name in dict.fromkeys(names)},
+        parameters={name: of(name) for name in dict.fromkeys(names)} | _untold(fit),
         deviations=_deviations(fit),
         classic=classic_axis(fit.rows),
         moves=len(fit.rows.move),
@@ -175,6 +176,18 @@ def summarise_axis(fit: AxisFit) -> AxisSummary:
         sampling=_sampling(fit),
         prior_conflicts=tuple(conflict_text(conflict) for conflict in fit.conflicts),
     )
+
+
+def _untold(fit: AxisFit) -> dict[str, Estimate]:
+    """The backlash as its prior has it, where every stop was reached from one side.
+
+    Draws of it then hang on how a start of unknown side was taken, which is no knowledge of the play.
+    """
+    prior = fit.model.priors["backlash"]
+    if fit.rows.both_sides or not prior.u:
+        return {}
+    half = NORMAL_95 * prior.u
+    return {"backlash": Estimate(prior.value, prior.u, (prior.value - half, prior.value + half), prior.u, 0.0)}
 
 
 def deviation_functionals(fit: AxisFit, commands: np.ndarray) -> np.ndarray:
@@ -238,7 +251,7 @@ def axis_warnings(campaign: AxisCampaign, rows: AxisRows) -> list[str]:
 
 def _reversed(fit: AxisFit) -> list[str]:
     """Where the sign of the reversal is not that of lost motion."""
-    if np.mean(fit.draws["backlash"] < 0) < REVERSED:
+    if not fit.rows.both_sides or np.mean(fit.draws["backlash"] < 0) < REVERSED:
         return []
     return [
         "the backlash is negative: stops reached forward lie ahead of those reached backward, which is no play; the "
@@ -250,7 +263,7 @@ def _weak(fit: AxisFit) -> list[str]:
     """What the data leave to the priors, and what would tell."""
     rows, found = fit.rows, []
     sides = set(rows.side.tolist()) - {0}
-    if len(sides) < 2:
+    if not rows.both_sides:
         found.append("backlash cannot be told: every stop was reached from one side; add stops from the other")
     if len(rows.positions) < POSITIONS_FEW:
         found.append(

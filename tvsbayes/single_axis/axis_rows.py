@@ -89,6 +89,11 @@ class AxisRows:
         """Commands at which something was read, ascending, each once."""
         return np.unique(self.command)
 
+    @property
+    def both_sides(self) -> bool:
+        """Whether stops were reached forward and backward: a stop of unknown side tells no play."""
+        return {-1, 1} <= set(self.side.tolist())
+
     def without(self, left_out: np.ndarray) -> AxisRows:
         """The rows where `left_out` is false; times and redrawing follow, the line stays."""
         kept = np.flatnonzero(~left_out)

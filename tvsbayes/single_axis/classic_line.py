@@ -73,7 +73,7 @@ def classic_axis(rows: AxisRows) -> ClassicAxis:
     """The least-squares line with a reversal, and ISO 230-2."""
     line = fit_line(rows)
     u = np.sqrt(np.maximum(np.diag(line.covariance), 0.0))
-    both = np.ptp(rows.side) > 0
+    both = rows.both_sides
     return ClassicAxis(
         per_command=float(line.solved[1]),
         u_per_command=float(u[1]),

@@ -32,6 +32,11 @@ OVERRUN = 0.05
 """Of the range: how far beyond a place a move goes that will come back to it."""
 
 
+def unit_of(target: str, unit: str) -> str:
+    """Of a target's uncertainty, in a folder of this unit."""
+    return f"{unit} per command" if target.endswith("per_command") else unit
+
+
 @dataclass(frozen=True)
 class NextStop:
     """A stop to be read.
@@ -63,7 +68,7 @@ class AxisPlan(Shown):
 
     Attributes:
         target: what they lower.
-        u_now: of the target, unit.
+        u_now: of the target, unit (`unit_of` it).
         next: stops, first things first.
         minutes: of all of them.
     """

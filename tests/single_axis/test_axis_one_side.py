@@ -1,0 +1,57 @@
+"""An axis whose stops were all reached from one side: its play is what the prior says, and so it is shown."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.axes import campaign
+
+from tvsbayes.report.axis_text import axis_fit_text, axis_plan_text, parameter_table
+from tvsbayes.single_axis.axis_campaign import AxisMove
+from tvsbayes.single_axis.axis_fit import fit_axis
+from tvsbayes.single_axis.axis_parameters import AxisPrior
+from tvsbayes.single_axis.axis_record import AxisSummary, summarise_axis
+from tvsbayes.single_axis.next_stops import AxisPlan, NextStop
+
+
+@pytest.fixture(scope="module")
+def summary() -> AxisSummary:
+    """Forward all the way, from a start that nobody knows the side of."""
+    moves = [AxisMove(k, 0, 60.0 * k, 400.0 * k, "" if k else "unknown") for k in range(20)]
+    rng = np.random.default_rng(3)
+    values = [0.0125 * m.command - 0.04 * (k > 0) + 0.004 * rng.standard_normal() for k, m in enumerate(moves)]
+    return summarise_axis(fit_axis(campaign(moves, values, 0.003, backlash=AxisPrior(0.1, 2.0)), sampled=False))
+
+
+def test_a_play_that_cannot_be_told_is_its_prior(summary):
+    play = summary.parameters["backlash"]
+    assert (play.value, play.sd, play.contraction) == (0.1, 2.0, 0.0)
+    assert play.interval95 == pytest.approx((0.1 - 3.92, 0.1 + 3.92), abs=0.01)
+    assert summary.classic.backlash is None
+    assert any("backlash cannot be told" in text for text in summary.weak_directions)
+
+
+def test_shares_told_lie_between_nought_and_one_hundred(summary):
+    wider = replace(summary.parameters["ratio_contrast"], contraction=-1.0)
+    hardly = replace(wider, contraction=-0.001)
+    shown = parameter_table(
+        replace(summary, parameters={"a": wider, "b": hardly, "c": replace(wider, contraction=1.0)})
+    )
+    assert [row[3] for row in shown.rows] == ["0 %", "0 %", "100 %"]
+
+
+def test_weak_directions_are_counted_in_words(summary):
+    for count, said in ((1, "1 weak direction\n"), (2, "2 weak directions\n")):
+        assert f": {said}" in axis_fit_text(replace(summary, weak_directions=("so",) * count))
+
+
+@pytest.mark.parametrize(
+    ("target", "unit"),
+    [("per_command", "mm per command"), ("effective_per_command", "mm per command"), ("backlash", "mm")],
+)
+def test_a_plan_says_the_unit_of_its_target_with_both_digits(target, unit):
+    stop = NextStop(100.0, "forward", None, 0.000005, 0.000002, 0.000002)
+    text = axis_plan_text(AxisPlan(target, 0.000007, (stop,), 1.0), "mm")
+    assert f"now u = 0.0000070 {unit}\n" in text and "0.0000050" in text
