@@ -105,7 +105,7 @@ def test_other_noise_scales_need_no_new_look(knowledge, found, seen):
 
 
 def test_a_noise_scale_is_believed_by_the_weight_of_the_stops(knowledge, found, seen):
-    """Thousands of stops tell the true sd; none leave the prior's median; the scatter is 1 / sqrt(2 n)."""
+    """Thousands of stops tell the true sd; none leave the prior's root mean square; the scatter is 1 / sqrt(2 n)."""
     true = knowledge.z.copy()
     columns = STOP_COLUMNS.ravel()
     true[columns] = 1.5
@@ -117,7 +117,11 @@ def test_a_noise_scale_is_believed_by_the_weight_of_the_stops(knowledge, found, 
         return believed(truth, seen[None], found.looks.side, chosen, exact, knowledge, noise)[0, columns]
 
     assert scales(many, 0.0) == pytest.approx(1.5, abs=0.01)
-    assert (np.abs(scales(many[:1], 0.0)) < 1.5).all()
+    one = scales(many[:1], 0.0)
+    assert (np.abs(one) < 1.5).all()
+    # E s^2 of a log-normal with sd u of ln s is exp(2 u^2) times the square of its median: its root lies at z = u.
+    unseen = ~np.isin(columns, STOP_COLUMNS[np.arange(2), (found.looks.side[many[0]] > 0).astype(int)])
+    np.testing.assert_allclose(one[unseen], np.asarray(knowledge.space.u)[columns][unseen], rtol=1e-12)
     per_direction = len(many) / 2
     # Stops of 0.18 deg against pixels: what pixels leave open lowers the information by a few per cent.
     assert scales(many, 1.0) - scales(many, 0.0) == pytest.approx(1 / math.sqrt(2 * per_direction), rel=0.1)

@@ -13,7 +13,6 @@ from tvsbayes.instrument.parameters import NAMES, Prior, names_of
 from tvsbayes.instrument.plan import PlanStep
 from tvsbayes.instrument.protocols import grid_protocol, paper_protocol
 from tvsbayes.model.gear_kriging import scales_at
-from tvsbayes.model.parameter_space import HALF_NORMAL_MEAN
 from tvsbayes.planning.candidates import candidates
 from tvsbayes.planning.expectation import PARAMETERS, information_of, prior_knowledge
 from tvsbayes.planning.gear_places import NO_PLACES, GearPlaces, TaughtErrors, regular_places, windows_of
@@ -185,10 +184,8 @@ def test_a_point_between_the_places_has_what_they_leave_open(real):
         assert at.gradient.shape == (1, known.size)
         own[y_mm] = float(at.own[GEARS_AT_POINT][0])
         errors = float(np.sum(at.gradient[0, PARAMETERS:] ** 2)) + own[y_mm]
-        # Stop errors of 0.04 deg; errors of 0.05 and half the play's 0.02 deg times the mean of a half-normal.
-        assert np.sqrt(errors / at.own[AT_POINT[0]][0]) == pytest.approx(
-            np.hypot(0.05, 0.01) * HALF_NORMAL_MEAN / 0.04, rel=1e-3
-        )
+        # Stop errors of 0.04 deg; errors of 0.05 and half the play's 0.02 deg, root mean squares of half-normals.
+        assert np.sqrt(errors / at.own[AT_POINT[0]][0]) == pytest.approx(np.hypot(0.05, 0.01) / 0.04, rel=1e-3)
     assert own[0.0] < 0.1 * own[900.0]
 
 

@@ -40,7 +40,8 @@ def believed(
 
     A standard deviation is known from n stops to 1 / sqrt(2 n): the log of each scale has the expected information
     2 sum (s^2 m / (1 + s^2 m))^2 over the stops of its direction, m what the pixels know of one stop, less what the
-    geometry takes from them; its estimate lies between prior and truth by the weights of both, and scatters.
+    geometry takes from them; its estimate lies between prior and truth by the weights of both, and scatters. A sampled
+    fit takes its variance over all that the scale may be: E s^2 of a log-normal, not s^2 of its middle.
 
     Args:
         instruments: the true ones, n of them.
@@ -68,7 +69,8 @@ def believed(
         information = information * u[column] ** 2 * left_over
         before = precision[column]
         mean = before * knowledge.z[column] + information * z[:, column] + np.sqrt(information) * normal
-        z[:, column] = mean / (before + information)
+        # ln s = u z: the root of E s^2 lies u^2 times the variance of z above the middle.
+        z[:, column] = (mean + u[column]) / (before + information)
 
     for axis in range(2):
         known = np.sum(seen.slope[..., axis] ** 2, axis=2)

@@ -27,7 +27,7 @@ from tvsbayes.model.gear_kriging import KnownPlaces, scales_at
 from tvsbayes.model.gear_processes import GearScales, Places
 from tvsbayes.model.headlines import DEGREES, Headlines, SeenLine, headlines, line_deg_per_step
 from tvsbayes.model.laser_path import beam_angles
-from tvsbayes.model.parameter_space import HALF_NORMAL_MEAN, ParameterSpace, physical_at
+from tvsbayes.model.parameter_space import ParameterSpace, physical_at
 
 PLACES_MAX = 12
 """Of one axis in one window."""
@@ -105,15 +105,14 @@ def line_headlines(
 
 
 def believed_scales(z: np.ndarray, space: ParameterSpace, after_data: bool) -> GearScales:
-    """Scales of the gears' errors at coordinates; before any data means instead of medians of those that may be nought.
+    """Scales of the gears' errors at coordinates; before any data root mean squares of those that may be nought.
 
-    How much a design gains hangs on variances: the mean of a half-normal is nearer to its root mean square.
+    What sampling reports is a variance over all that a scale may be, E s^2: of a half-normal u^2.
     """
     physical = np.array(physical_at(z, space).value)
     if not after_data:
         own = np.asarray(space.kind) == KINDS.index("half-normal")
-        physical[: len(own)] = np.where(own, np.asarray(space.u) * HALF_NORMAL_MEAN, physical[: len(own)])
-
+        physical[: len(own)] = np.where(own, np.asarray(space.u), physical[: len(own)])
     return scales_at(physical, np.asarray(space.harmonic_period_deg))
 
 
