@@ -5,7 +5,8 @@ mm in frame T, deg for figures of an axis; budgets name their unit.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Collection, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -17,10 +18,13 @@ from tvsbayes.report.drawing import SMALLEST_SHARE
 from tvsbayes.report.parameter_words import MADE_BY, name_in_words, share_in_words, source_in_words
 from tvsbayes.report.result_tables import point_budget_table
 from tvsbayes.report.tables import Section, TableView, concise, figure_view, two_digits
-from tvsbayes.results.metrology_tables import FIGURES, BudgetTable
+from tvsbayes.results.metrology_tables import FIGURES, BudgetRow, BudgetTable
 
 if TYPE_CHECKING:
     from tvsbayes.report.evidence import Evidence
+
+OTHERS = f"others, each below {100 * SMALLEST_SHARE:g} %"
+"""All inputs of a budget that have no row of their own."""
 
 
 def maps_section(e: Evidence) -> Section:
@@ -96,28 +100,47 @@ def _pairs(tables: Sequence[BudgetTable]) -> list[tuple[BudgetTable, BudgetTable
     return found
 
 
+def _mattering(table: BudgetTable) -> list[BudgetRow]:
+    """Single inputs that have a row of their own; the last row, of correlations, is no input."""
+    return [row for row in table.rows[:-1] if row.u is not None and row.share >= SMALLEST_SHARE]
+
+
+def _others(table: BudgetTable, named: Collection[str]) -> tuple[str, str]:
+    """Contribution and share of all inputs without a row of their own: with it a column of shares makes 100 %."""
+    share = sum(row.share for row in table.rows[:-1] if row.quantity not in named)
+    return two_digits(table.u * math.sqrt(share)), f"{100 * share:.1f}"
+
+
 def _pair_table(first: BudgetTable, second: BudgetTable) -> TableView:
-    """Two budgets of the same sources, what matters to either."""
-    others = {row.quantity: row for row in second.rows}
+    """Two budgets beside each other, every input that matters to either."""
+    pair = first, second
+    of_name = [{row.quantity: row for row in table.rows} for table in pair]
+
+    def mine(name: str) -> list[BudgetRow]:
+        return [rows[name] for rows in of_name if name in rows]
+
+    names = list(dict.fromkeys(row.quantity for table in pair for row in _mattering(table)))
+    names.sort(key=lambda name: -max(row.share for row in mine(name)))
     rows = []
-    for row in first.rows:
-        other = others.get(row.quantity)
-        if other is None or max(abs(row.share), abs(other.share)) < SMALLEST_SHARE:
-            continue
-        told = ["" if row.u is None else two_digits(row.u), "" if row.u is None else _freedom(row.dof)]
-        parts = [
-            cell
-            for each in (row, other)
-            for cell in (
-                "" if each.contribution is None else two_digits(each.contribution),
-                f"{100 * each.share:.1f}",
-            )
-        ]
-        rows.append([source_in_words(row.quantity), row.kind, *told, *parts])
-    names = [table.quantity.rpartition(".")[2] for table in (first, second)]
+    for name in (*names, first.rows[-1].quantity):
+        stated = [row for row in mine(name) if row.u is not None]
+        # One number for both where both have it.
+        told = ["; ".join(dict.fromkeys(two_digits(row.u) for row in stated if row.u is not None))]
+        told.append("; ".join(dict.fromkeys(_freedom(row.dof) for row in stated)))
+        parts = [cell for found in of_name for cell in _contributed(found.get(name))]
+        rows.append([source_in_words(name), mine(name)[0].kind, *told, *parts])
+    rows.insert(-1, [OTHERS, "", "", "", *(cell for table in pair for cell in _others(table, names))])
     columns = ["source", "type", "u", "dof"]
-    columns += [f"{word}{name}" for name in names for word in ("contribution, ", "share %, ")]
+    parts_of = [table.quantity.rpartition(".")[2] for table in pair]
+    columns += [f"{word}{part}" for part in parts_of for word in ("contribution, ", "share %, ")]
     return TableView(f"{_total(first)}; {_total(second)}", columns, rows)
+
+
+def _contributed(row: BudgetRow | None) -> tuple[str, str]:
+    """Contribution and share; empty where the input stands among others."""
+    if row is None:
+        return "", ""
+    return "" if row.contribution is None else two_digits(row.contribution), f"{100 * row.share:.1f}"
 
 
 def _total(table: BudgetTable) -> str:
@@ -131,8 +154,8 @@ def _total(table: BudgetTable) -> str:
 
 
 def _gum_table(table: BudgetTable, prefix: str = "") -> TableView:
-    """A budget as GUM 7.2.7 asks for it; sources that matter to no digit are counted in one line."""
-    shown = [row for row in table.rows if row.u is None or abs(row.share) >= SMALLEST_SHARE]
+    """A budget as GUM 7.2.7 asks for it."""
+    shown = [*_mattering(table), table.rows[-1]]
     rows = [
         [
             source_in_words(row.quantity),
@@ -141,14 +164,11 @@ def _gum_table(table: BudgetTable, prefix: str = "") -> TableView:
             "" if row.u is None else two_digits(row.u),
             "" if row.u is None else _freedom(row.dof),
             "" if row.sensitivity is None else _digits(row.sensitivity),
-            "" if row.contribution is None else two_digits(row.contribution),
-            f"{100 * row.share:.1f}",
+            *_contributed(row),
         ]
         for row in shown
     ]
-    if len(shown) < len(table.rows):
-        rest = [row.share for row in table.rows if row not in shown]
-        rows.insert(-1, [f"{len(rest)} smaller ones", "", "", "", "", "", "", f"{100 * sum(rest):.1f}"])
+    rows.insert(-1, [OTHERS, "", "", "", "", "", *_others(table, [row.quantity for row in shown])])
     caption = f"{prefix}{_total(table)}"
     if any(row.share > 1 for row in shown):
         # GUM 5.2.2: with correlated inputs the cross terms are as real as the squares.

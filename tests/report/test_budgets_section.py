@@ -1,0 +1,76 @@
+"""Budgets on the page: every column closes, no input that matters is left out."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from tvsbayes.metrology.budget_tables import Source, budget_table
+from tvsbayes.metrology.look_budget import Budget
+from tvsbayes.report.uncertainty_sections import budgets_section
+from tvsbayes.results.metrology_tables import BudgetTable
+
+COMMON = {"stop errors of the campaign": 0.80, "play variation": 0.37, "prior of laser_tilt_deg.x": 0.003}
+"""Shares of the variance."""
+
+
+def made(quantity: str, shares: dict[str, float], u: float = 0.017, estimate: float = 0.029) -> BudgetTable:
+    sources = [
+        Source(name, "deg", 0.0, u * math.sqrt(share), "B" if name.startswith("prior") else "A", "normal", 40.0, 1.0)
+        for name, share in shares.items()
+    ]
+    return budget_table(quantity, "deg", estimate, u, sources)
+
+
+PAN = made("backlash_deg.pan", {**COMMON, "prior of backlash_deg.pan": 0.0012, "prior of tilt_zero_deg": 5e-4})
+TILT = made("backlash_deg.tilt", {**COMMON, "stop errors of the campaign": 0.75, "prior of backlash_deg.tilt": 0.096})
+
+
+def section(*budgets: BudgetTable):
+    """The section of a report whose fit has these budgets, and a point's of two causes."""
+    causes = ("pixel noise", "stop errors of the campaign")
+    even = np.full((2, 3), 0.5)
+    budget = Budget(causes, np.array([0.5, 0.5]), even, (), np.zeros((0, 3)), np.zeros((0, 0)), np.eye(3), (0.0, 0.0))
+    point = replace(TILT, quantity="x of the point", unit="mm")
+    return budgets_section(
+        SimpleNamespace(shown=SimpleNamespace(budgets=budgets), budget=budget, point=point, range_mm=1000.0)
+    )
+
+
+def columns_of(table) -> dict[str, list[float]]:
+    """Printed shares by the head of their column."""
+    places = [k for k, head in enumerate(table.columns) if head.startswith("share")]
+    return {table.columns[k]: [float(row[k]) for row in table.rows if row[k]] for k in places}
+
+
+@pytest.mark.parametrize("budgets", [(PAN, TILT), (TILT, PAN), (TILT,)])
+def test_every_column_of_shares_closes(budgets):
+    for table in (section(*budgets).tables[0], section(*budgets).tables[-1]):
+        for head, shares in columns_of(table).items():
+            assert sum(shares) == pytest.approx(100, abs=0.05 * len(shares)), (head, table.rows)
+
+
+@pytest.mark.parametrize("budgets", [(PAN, TILT), (TILT, PAN)])
+def test_an_input_of_one_quantity_alone_has_its_row(budgets):
+    table = section(*budgets).tables[0]
+    rows = {row[0]: row for row in table.rows}
+    of_tilt = table.columns.index("share %, tilt"), table.columns.index("share %, pan")
+    own = rows["prior of the backlash, tilt, deg"]
+    assert (own[of_tilt[0]], own[of_tilt[1]]) == ("9.6", "")
+    others = rows["others, each below 0.5 %"]
+    # Of pan: 0.3 of the laser's direction, 0.12 and 0.05 of its own.
+    assert (others[of_tilt[0]], others[of_tilt[1]]) == ("0.3", "0.5")
+    assert table.rows[-1][0].startswith("correlations") and table.rows[-2][0].startswith("others")
+
+
+def test_what_both_quantities_do_not_share_is_told_of_either():
+    """Stop errors are those of the quantity: no number stands for another's."""
+    rows = {row[0]: row for row in section(PAN, TILT).tables[0].rows}
+    assert rows["stop errors of the campaign"][2] == "0.015" and rows["play variation"][2] == "0.01"
+    wider = made("backlash_deg.tilt", COMMON, u=0.034)
+    rows = {row[0]: row for row in section(PAN, wider).tables[0].rows}
+    assert rows["stop errors of the campaign"][2] == "0.015; 0.03"
