@@ -1,4 +1,4 @@
-"""Budgets on the page: every column closes, no input that matters is left out."""
+"""Budgets on the page: every column closes, no input that matters is left out, one result counts."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ import pytest
 from tvsbayes.metrology.budget_tables import Source, budget_table
 from tvsbayes.metrology.look_budget import Budget
 from tvsbayes.report.uncertainty_sections import budgets_section
+from tvsbayes.results.estimates import Estimate
 from tvsbayes.results.metrology_tables import BudgetTable
 
 COMMON = {"stop errors of the campaign": 0.80, "play variation": 0.37, "prior of laser_tilt_deg.x": 0.003}
@@ -30,15 +31,20 @@ PAN = made("backlash_deg.pan", {**COMMON, "prior of backlash_deg.pan": 0.0012, "
 TILT = made("backlash_deg.tilt", {**COMMON, "stop errors of the campaign": 0.75, "prior of backlash_deg.tilt": 0.096})
 
 
-def section(*budgets: BudgetTable):
-    """The section of a report whose fit has these budgets, and a point's of two causes."""
+def section(*budgets: BudgetTable, **intervals: tuple[float, float]):
+    """The section of a report whose fit has these budgets and intervals, by default theirs, and a point's budget."""
+    parameters = {}
+    for table in budgets:
+        linear = (table.estimate - table.expanded, table.estimate + table.expanded)
+        interval = intervals.get(table.quantity.rpartition(".")[2], linear)
+        parameters[table.quantity] = Estimate(table.estimate, table.u, interval, 0.3, 0.9)
+    fit = SimpleNamespace(summary=SimpleNamespace(parameters=parameters, effective={}))
     causes = ("pixel noise", "stop errors of the campaign")
     even = np.full((2, 3), 0.5)
     budget = Budget(causes, np.array([0.5, 0.5]), even, (), np.zeros((0, 3)), np.zeros((0, 0)), np.eye(3), (0.0, 0.0))
     point = replace(TILT, quantity="x of the point", unit="mm")
-    return budgets_section(
-        SimpleNamespace(shown=SimpleNamespace(budgets=budgets), budget=budget, point=point, range_mm=1000.0)
-    )
+    shown = SimpleNamespace(budgets=budgets)
+    return budgets_section(SimpleNamespace(fit=fit, shown=shown, budget=budget, point=point, range_mm=1000.0))
 
 
 def columns_of(table) -> dict[str, list[float]]:
@@ -74,3 +80,37 @@ def test_what_both_quantities_do_not_share_is_told_of_either():
     wider = made("backlash_deg.tilt", COMMON, u=0.034)
     rows = {row[0]: row for row in section(PAN, wider).tables[0].rows}
     assert rows["stop errors of the campaign"][2] == "0.015; 0.03"
+
+
+def test_the_result_that_counts_is_named_once():
+    (told,) = (text for text in section(PAN, TILT).text if "first page" in text)
+    assert "JCGM 100:2008, clause 5" in told and "at the mode" in told and "where uncertainty comes from" in told
+
+
+@pytest.mark.parametrize(
+    ("budget", "interval", "words"),
+    [
+        # U = 0.034 about 0.529: ends agree to a rounding, then the half-width or one end does not.
+        (replace(PAN, estimate=0.529), (0.4952, 0.5628), ()),
+        (replace(PAN, estimate=0.529), (0.4965, 0.5645), ()),
+        (replace(PAN, estimate=0.529), (0.484, 0.574), ("first page", "[0.4840, 0.5740]", "U = 0.045 deg")),
+        (replace(PAN, estimate=0.529), (0.500, 0.567), ("first page", "[0.5000, 0.5670]")),
+        # Below zero there is no lost motion.
+        (PAN, (0.002, 0.067), ("below 0", "first page", "[0.0020, 0.0670]")),
+    ],
+)
+def test_where_the_linear_interval_is_another_the_quantity_says_so(budget, interval, words):
+    caption = section(budget, pan=interval).tables[0].caption
+    assert [word for word in words if word not in caption] == []
+    assert ("first page" in caption) == bool(words)
+    beside = section(budget, replace(TILT, estimate=0.529), pan=interval).tables[0].caption
+    assert beside.count("first page") == bool(words)
+    assert ("below 0" in caption) == ("below 0" in words)
+
+
+def test_notes_of_the_budgets_are_printed_once():
+    noted = replace(PAN, notes=("inputs are independent", *PAN.notes))
+    items = section(noted, TILT).items
+    assert len(items) == len(set(items)) == 2
+    assert any("Welch-Satterthwaite" in item and "approximate" in item for item in items)
+    assert any(item.startswith("Inputs are independent") for item in items)

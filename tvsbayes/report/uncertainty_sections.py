@@ -6,25 +6,29 @@ mm in frame T, deg for figures of an axis; budgets name their unit.
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from tvsbayes.instrument.axes import SENSES
+from tvsbayes.instrument.parameters import REGISTRY
 from tvsbayes.metrology.traceability import header_table
 from tvsbayes.report import figures
 from tvsbayes.report.drawing import SMALLEST_SHARE
 from tvsbayes.report.parameter_words import MADE_BY, name_in_words, share_in_words, source_in_words
 from tvsbayes.report.result_tables import point_budget_table
-from tvsbayes.report.tables import Section, TableView, concise, figure_view, two_digits
+from tvsbayes.report.tables import Section, TableView, concise, figure_view, interval_text, two_digits
 from tvsbayes.results.metrology_tables import FIGURES, BudgetRow, BudgetTable
 
 if TYPE_CHECKING:
     from tvsbayes.report.evidence import Evidence
+    from tvsbayes.results.estimates import Estimate
 
 OTHERS = f"others, each below {100 * SMALLEST_SHARE:g} %"
 """All inputs of a budget that have no row of their own."""
+END_SHIFT = 0.1
+"""Of U: an end of the linear interval farther off is told; a quantile of a thousand draws scatters by half of it."""
 
 
 def maps_section(e: Evidence) -> Section:
@@ -73,18 +77,39 @@ def _cell(value: float) -> str:
 
 def budgets_section(e: Evidence) -> Section:
     """What the uncertainty of results and of a point consists of."""
-    tables = [_gum_table(one) if other is None else _pair_table(one, other) for one, other in _pairs(e.shown.budgets)]
+    summary, away = e.fit.summary, f"{e.range_mm:g} mm away"
+    ratios = {f"effective_deg_per_step.{direction}": estimate for direction, estimate in summary.effective.items()}
+    totals = {
+        table.quantity: _total(table) + _apart(table, (summary.parameters | ratios).get(table.quantity))
+        for table in e.shown.budgets
+    }
+    tables = [
+        _gum_table(one, totals[one.quantity]) if other is None else _pair_table(one, other, totals)
+        for one, other in _pairs(e.shown.budgets)
+    ]
     tables += [
-        point_budget_table(e.budget, f"Budget of a point {e.range_mm:g} mm away, by cause"),
-        _gum_table(e.point, f"{e.range_mm:g} mm away: "),
+        point_budget_table(e.budget, f"Budget of a point {away}, by cause"),
+        _gum_table(e.point, f"{away}: {_total(e.point)}"),
     ]
     view = figure_view(
         figures.shares(e.budget),
         "Shares of the variance by cause; values at the bars and in the table above",
         f"What the uncertainty of a point {e.range_mm:g} mm away consists of.",
     )
-    text = ["Sensitivities are contributions over u. fit.json holds every row, with distribution and sensitivity."]
-    return Section("Uncertainty budgets", text, tables=tables, figures=[view])
+    text = [
+        "The rows of a budget are the linear propagation of JCGM 100:2008, clause 5, at the mode: they show where "
+        "uncertainty comes from. The results and their coverage intervals are those of the first page; k and U of a "
+        "budget take the distribution for a symmetric one.",
+        "Sensitivities are contributions over u. fit.json holds every row, with distribution and sensitivity.",
+    ]
+    return Section("Uncertainty budgets", text, _notes(e), tables, [view])
+
+
+def _notes(e: Evidence) -> list[str]:
+    """What the reader of a budget must know, each once."""
+    found = list(dict.fromkeys(note for table in e.shown.budgets for note in table.notes))
+    found += [f"a point {e.range_mm:g} mm away: {note}" for note in e.point.notes if note not in found]
+    return [f"{note[0].upper()}{note[1:]}." for note in found]
 
 
 def _pairs(tables: Sequence[BudgetTable]) -> list[tuple[BudgetTable, BudgetTable | None]]:
@@ -111,8 +136,8 @@ def _others(table: BudgetTable, named: Collection[str]) -> tuple[str, str]:
     return two_digits(table.u * math.sqrt(share)), f"{100 * share:.1f}"
 
 
-def _pair_table(first: BudgetTable, second: BudgetTable) -> TableView:
-    """Two budgets beside each other, every input that matters to either."""
+def _pair_table(first: BudgetTable, second: BudgetTable, totals: Mapping[str, str]) -> TableView:
+    """Two budgets beside each other, every input that matters to either; `totals` by quantity head the table."""
     pair = first, second
     of_name = [{row.quantity: row for row in table.rows} for table in pair]
 
@@ -133,7 +158,7 @@ def _pair_table(first: BudgetTable, second: BudgetTable) -> TableView:
     columns = ["source", "type", "u", "dof"]
     parts_of = [table.quantity.rpartition(".")[2] for table in pair]
     columns += [f"{word}{part}" for part in parts_of for word in ("contribution, ", "share %, ")]
-    return TableView(f"{_total(first)}; {_total(second)}", columns, rows)
+    return TableView(f"{totals[first.quantity]}; {totals[second.quantity]}", columns, rows)
 
 
 def _contributed(row: BudgetRow | None) -> tuple[str, str]:
@@ -153,8 +178,26 @@ def _total(table: BudgetTable) -> str:
     )
 
 
-def _gum_table(table: BudgetTable, prefix: str = "") -> TableView:
-    """A budget as GUM 7.2.7 asks for it."""
+def _apart(table: BudgetTable, result: Estimate | None) -> str:
+    """The result that counts, where the interval of a budget is another; "" where both agree to their digits."""
+    if result is None:
+        return ""
+    low, high = result.interval95
+    half = 0.5 * (high - low)
+    ends = table.estimate - table.expanded, table.estimate + table.expanded
+    parameter = REGISTRY.get(table.quantity)
+    never_below = parameter is not None and parameter.prior.distribution == "half-normal"
+    told = ", which reaches below 0, where no value can be" * (never_below and ends[0] < 0 <= low)
+    rounding = 10.0 ** (math.floor(math.log10(half)) - 1) if half > 0 else 0.0
+    shift = max(abs(ends[0] - low), abs(ends[1] - high))
+    if told or abs(table.expanded - half) > rounding or shift > END_SHIFT * half:
+        told += f" (the first page, which counts: {interval_text(low, high, result.sd)}, U = {two_digits(half)} "
+        told += f"{table.unit})"
+    return told
+
+
+def _gum_table(table: BudgetTable, caption: str) -> TableView:
+    """A budget as GUM 7.2.7 asks for it, headed by its result."""
     shown = [*_mattering(table), table.rows[-1]]
     rows = [
         [
@@ -169,7 +212,6 @@ def _gum_table(table: BudgetTable, prefix: str = "") -> TableView:
         for row in shown
     ]
     rows.insert(-1, [OTHERS, "", "", "", "", "", *_others(table, [row.quantity for row in shown])])
-    caption = f"{prefix}{_total(table)}"
     if any(row.share > 1 for row in shown):
         # GUM 5.2.2: with correlated inputs the cross terms are as real as the squares.
         caption += "; the inputs are correlated: single shares exceed 100 %, the row of correlations takes them back"
