@@ -8,8 +8,11 @@ import pytest
 from support.small_results import small_summary
 
 from tvsbayes.estimators.four_point import ClassicResult, DirectionResult
+from tvsbayes.report.evidence import Criterion
+from tvsbayes.report.first_page import verdict_of
 from tvsbayes.report.fit_text import classic_text, demo_text, fit_text
 from tvsbayes.report.result_tables import KEY_PARAMETERS
+from tvsbayes.results.estimates import Validation, ValidationTest
 
 
 def test_a_fit_astray_shows_no_results():
@@ -81,3 +84,22 @@ def test_demo_text_says_which_interval_holds_the_truth():
     assert row == ["left", "0.05940(20)", "NO", "0.06210(10)", "yes", "0.062050"]
     off = demo_text(classic, small_summary(), {**truth, "backlash_deg.pan": 2.0})
     assert next(line for line in off.splitlines() if line.startswith("backlash pan")).split()[4] == "NO"
+
+
+def test_a_factor_of_one_is_no_remedy():
+    """What single spots do to results, no factor holds: the last line says what to do instead."""
+    test = ValidationTest("single spots disagree", "most at spot 7", 80.0, 3, 90, 6.3e-42, True, 0.03)
+    failed = Validation(False, 0.01, "single spots disagree: most at spot 7", 1.0004, (test,))
+    text = fit_text(replace(small_summary(), validation=failed))
+    lines = text.splitlines()
+    assert "multiply" not in text and "1.00" not in lines[0]
+    assert lines[0].startswith("VALIDATION FAILED: single spots disagree: most at spot 7 (p 6.3e-42); ")
+    assert lines[0].endswith("; the table is as fitted, no factor on u covers it")
+    assert lines[-1] == (
+        "verdict: VALIDATION FAILED, no factor on u covers it: look at those spots, or fit with --robust"
+    )
+    assert "what helps: look at those spots, or fit with --robust" in text
+    limit = Criterion("ratio left", 1e-3, "deg/step", 0.99, "met")
+    assert "As fitted: Met" in verdict_of(replace(small_summary(), validation=failed), (limit,)).text
+    larger = replace(failed, inflation=1.0051)
+    assert fit_text(replace(small_summary(), validation=larger)).endswith("half-width by 1.01")

@@ -22,6 +22,8 @@ REMEDIES = {
     "single spots disagree": "look at those spots, or fit with --robust, which leaves them out by name",
 }
 """What helps, by how the name of the failed test begins."""
+SHORT = {"single spots disagree": ": look at those spots, or fit with --robust"}
+"""The same in few words, for the line that ends a fit where no factor does."""
 ANY_REMEDY = "find the cause in the section Validation of the report, mend it and measure again"
 SPOTS_LISTED = 20
 """Of those that disagree, by their ids."""
@@ -35,6 +37,13 @@ def remedy(validation: Validation) -> str:
     return next((told for begin, told in REMEDIES.items() if cause.startswith(begin)), ANY_REMEDY)
 
 
+def factor_told(validation: Validation) -> str:
+    """What a failed validation does to every u; its factor is 1 where it saw no move of a result."""
+    if validation.widens:
+        return f"multiply every u and half-width by {validation.inflation:.2f}"
+    return "no factor on u covers it"
+
+
 def failed(summary: FitSummary) -> Validation | None:
     """The validation where it failed."""
     validation = summary.validation
@@ -46,7 +55,8 @@ def verdict_line(summary: FitSummary) -> str:
     if not summary.converged:
         return "verdict: NOT CONVERGED, use none of these numbers"
     if (validation := failed(summary)) is not None:
-        return f"verdict: VALIDATION FAILED, multiply every u and half-width by {validation.inflation:.2f}"
+        short = "" if validation.widens else next((x for b, x in SHORT.items() if validation.cause.startswith(b)), "")
+        return f"verdict: VALIDATION FAILED, {factor_told(validation)}{short}"
     unseen = [d for d in DIRECTIONS if (e := summary.effective[d]) is not None and not e.informed]
     validation = summary.validation
     if summary.sampling is not None and not summary.sampling.converged:

@@ -62,7 +62,9 @@ def verdict_of(summary: FitSummary, criteria: Sequence[Criterion]) -> Verdict:
             names = ", ".join(c.quantity for c in part)
             told.append((verdict, f"{verdict}: {names} within {limit:.3g} {unit} (probability {bound})"))
     text = "; ".join(sentence for _, sentence in told)
-    judged = "With that factor: " if failed else ""
+    judged = (
+        "" if not failed else "With that factor: " if validation is not None and validation.widens else "As fitted: "
+    )
     return Verdict(failed + judged + text[0].upper() + text[1:], told[0][0].replace(" ", "-"))
 
 

@@ -244,9 +244,12 @@ def validation_section(e: Evidence) -> Section:
     if validation is None:
         text.append("The results hold no tests for model errors: run the command fit again.")
     else:
+        factor = f"Factor on every u: {validation.inflation:.2f}"
+        if not (validation.passed or validation.widens):
+            factor = "No factor on u covers what failed"
         text.append(
             f"A clean campaign fails the tests below with a probability of {100 * validation.level:g} %, all "
-            f"together. Factor on every u: {validation.inflation:.2f}."
+            f"together. {factor}."
         )
         tables.append(_tests(validation))
     if sampling is None:

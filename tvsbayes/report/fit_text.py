@@ -8,7 +8,7 @@ from itertools import groupby
 from tvsbayes.errors import NotConverged, listed
 from tvsbayes.estimators.four_point import ClassicResult
 from tvsbayes.instrument.axes import DIRECTIONS
-from tvsbayes.report.advice import SPOTS_LISTED, failed, noise_line, remedy, verdict_line
+from tvsbayes.report.advice import SPOTS_LISTED, factor_told, failed, noise_line, remedy, verdict_line
 from tvsbayes.report.result_tables import (
     KEY_PARAMETERS,
     MORE_PARAMETERS,
@@ -163,8 +163,8 @@ def validation_lines(validation: Validation) -> list[str]:
             f"validation: no sign of a model error in {len(tests)} tests, {least}; shapes that gears, mirrors and "
             "play can take themselves are not seen"
         ]
-    warning = f"VALIDATION FAILED: {validation.cause} (p {tests[0].p:.1e}); the table is as fitted, multiply "
-    warning += f"every u and half-width in it by {validation.inflation:.2f}"
+    warning = f"VALIDATION FAILED: {validation.cause} (p {tests[0].p:.1e}); the table is as fitted, "
+    warning += factor_told(validation)
     return [
         warning,
         *(

@@ -159,6 +159,11 @@ class Validation:
     inflation: float
     tests: tuple[ValidationTest, ...]
 
+    @property
+    def widens(self) -> bool:
+        """Whether the factor, to two decimals, is one: what single spots do to results, it does not hold."""
+        return f"{self.inflation:.2f}" != "1.00"
+
 
 @dataclass(frozen=True)
 class RatioAt:
@@ -273,7 +278,8 @@ class FitSummary(Shown):
         kind = {"laplace": "Laplace approximation", "posterior": "posterior"}[self.estimator]
         title = f"FitSummary, {kind}, {'converged' if self.converged else 'NOT CONVERGED'}"
         if self.validation is not None and not self.validation.passed:
-            title += f"; VALIDATION FAILED: {self.validation.cause}, u times {self.validation.inflation:.2f}"
+            title += f"; VALIDATION FAILED: {self.validation.cause}"
+            title += f", u times {self.validation.inflation:.2f}" * self.validation.widens
         named = {f"effective_deg_per_step.{d}": e for d, e in self.effective.items()} | self.parameters
         rows = [
             (name, e.value, e.sd, *e.interval95, None if e.contraction is None else round(100 * e.contraction, 1))
