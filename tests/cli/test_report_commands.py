@@ -43,6 +43,18 @@ def test_a_campaign_becomes_a_report_in_one_go(ask, say, grid_folder, no_page):
     assert code == 0 and "removed: report.pdf, dcc.xml" in told and not any(each.exists() for each in stale)
 
 
+def test_calibrating_for_a_browser_that_is_not_there_ends_before_the_work(ask, grid_folder, tmp_path, monkeypatch):
+    """Of a scanner and of an axis; what to do gives a page."""
+    monkeypatch.setattr("tvsbayes.report.page.BROWSERS", ())
+    drawn(7, runs(2)).write(tmp_path / "axis")
+    for folder in (grid_folder, tmp_path / "axis"):
+        before = sorted(folder.rglob("*"))
+        code, document = ask("calibrate", folder, "--no-sample", "--pdf")
+        assert (code, document["error"]["code"]) == (2, "no-browser")
+        assert "leave --pdf out" in document["error"]["remedy"] and "report.html" in document["error"]["remedy"]
+        assert set(document) == {"error"} and sorted(folder.rglob("*")) == before
+
+
 @pytest.mark.parametrize("option", ["--laboratory", "--customer", "--country", "--customer-country"])
 def test_nobody_has_an_empty_name(ask, tmp_path, option):
     code, document = ask("report", tmp_path, "--dcc", option, " ")

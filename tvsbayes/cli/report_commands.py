@@ -253,6 +253,11 @@ def calibrate(
     if no_sample:
         refuse_options("for a sampler, and --no-sample runs none", "give one of them", quick=quick)
     issue = _issue(laboratory, customer)
+    if pdf:
+        from tvsbayes.report.page import find_browser
+
+        # Before the fit, which takes minutes.
+        find_browser()
     if axis_commands.is_axis(campaign):
         unfit = {"limit_deg_per_step": limit_deg_per_step, "limit_mm": limit_mm}
         unfit["range_mm"] = range_mm if range_mm != RANGE_MM else None

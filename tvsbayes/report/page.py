@@ -56,6 +56,7 @@ from tvsbayes.report.uncertainty_sections import (
 )
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome", "msedge")
+NO_BROWSER = "leave --pdf out and print report.html from any browser (A4), or install Chromium"
 PDF_SECONDS = 120
 NUMBER_DIGITS = 12
 PAGE_BYTES_MAX = 64 * 1024 * 1024
@@ -72,7 +73,7 @@ def find_browser() -> str:
     browser = next(filter(None, map(shutil.which, BROWSERS)), None)
     if browser is None:
         message = f"--pdf needs one of {', '.join(BROWSERS)} on the path"
-        raise InputError("no-browser", message, remedy="print the page from any browser (A4)")
+        raise InputError("no-browser", message, remedy=NO_BROWSER)
     return browser
 
 
