@@ -7,9 +7,11 @@ import json
 import numpy as np
 import pytest
 from support.reported_twin import BATCH, PLANNED, evidence_of
+from support.small_results import small_summary
 
 from tvsbayes.errors import InputError
-from tvsbayes.report.evidence import criterion
+from tvsbayes.report.evidence import MET, NOT_MET, Criterion, criterion
+from tvsbayes.report.first_page import criteria_table, verdict_of
 
 STORED = {"compare.json": "held_out", "plan.json": "planned"}
 
@@ -65,3 +67,12 @@ def test_criterion_follows_its_rule(share, verdict):
     errors = np.where(np.arange(1000) < 1000 * share, 0.5, -2.0)
     judged = criterion("x", errors, 1.0, "mm")
     assert (judged.probability, judged.verdict) == (pytest.approx(share), verdict)
+
+
+def test_the_headline_and_the_table_say_a_probability_alike():
+    """Of draws that all lie within a limit."""
+    sure = Criterion("ratio left", 1e-3, "deg/step", 1.0, MET)
+    assert verdict_of(small_summary(), (sure,)).text.endswith("(probability above 0.999)")
+    assert criteria_table((sure,)).rows[0][2] == "above 0.999"
+    far = Criterion("ratio left", 1e-3, "deg/step", 0.0, NOT_MET)
+    assert verdict_of(small_summary(), (far,)).text.endswith("(probability below 0.001)")

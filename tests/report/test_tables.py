@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from tvsbayes.report.tables import TableView, concise, interval_text
+from tvsbayes.report.tables import TableView, chance_text, concise, interval_text
 
 
 @pytest.mark.parametrize(
@@ -83,3 +83,18 @@ def test_tables_are_plain_text_whatever_the_terminal_says(monkeypatch):
         "[bold]a[/bold]    1.25",
         "longer name     [1, 2]",
     ]
+
+
+@pytest.mark.parametrize(
+    ("probability", "text", "bound"),
+    [
+        (1.0, "above 0.999", "above 0.999"),
+        (0.9996, "above 0.999", "above 0.999"),
+        (0.9994, "0.999", "at least 0.999"),
+        (0.955, "0.955", "at least 0.955"),
+        (0.0004, "below 0.001", "below 0.001"),
+        (0.0, "below 0.001", "below 0.001"),
+    ],
+)
+def test_no_share_of_draws_is_said_to_be_certain(probability, text, bound):
+    assert chance_text(probability) == text and chance_text(probability, "at least ") == bound

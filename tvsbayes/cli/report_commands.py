@@ -207,9 +207,10 @@ class WrittenPage:
     def lines(self) -> list[str]:
         """What the limits have come to, for a terminal."""
         from tvsbayes.report.fit_text import validation_lines
+        from tvsbayes.report.tables import chance_text
 
         lines = [
-            f"{c.quantity} within {c.limit:g} {c.unit}: {c.verdict} (P = {c.probability:.3f})"
+            f"{c.quantity} within {c.limit:g} {c.unit}: {c.verdict} (probability {chance_text(c.probability)})"
             for c in self.evidence.criteria
         ]
         validation = self.record.summary.validation

@@ -19,7 +19,17 @@ from tvsbayes.report.drawing import OF_ESTIMATOR
 from tvsbayes.report.evidence import MET, NOT_MET, Criterion, Evidence
 from tvsbayes.report.fit_text import validation_lines
 from tvsbayes.report.parameter_words import cause_in_words
-from tvsbayes.report.tables import FigureView, Issue, Number, TableView, concise, figure_view, interval_text, two_digits
+from tvsbayes.report.tables import (
+    FigureView,
+    Issue,
+    Number,
+    TableView,
+    chance_text,
+    concise,
+    figure_view,
+    interval_text,
+    two_digits,
+)
 from tvsbayes.results.comparison_record import CANNOT_TELL
 from tvsbayes.results.estimates import Estimate, FitSummary
 
@@ -58,13 +68,15 @@ def verdict_of(summary: FitSummary, criteria: Sequence[Criterion]) -> Verdict:
         for limit, unit in limits:
             part = [c for c in mine if (c.limit, c.unit) == (limit, unit)]
             chances = [c.probability for c in part]
-            bound = f"at most {max(chances):.3f}" if verdict == NOT_MET else f"at least {min(chances):.3f}"
+            worst = (
+                chance_text(max(chances), "at most ") if verdict == NOT_MET else chance_text(min(chances), "at least ")
+            )
             names = ", ".join(c.quantity for c in part)
-            told.append((verdict, f"{verdict}: {names} within {limit:.3g} {unit} (probability {bound})"))
+            told.append((verdict, f"{verdict}: {names} within {limit:.3g} {unit} (probability {worst})"))
     text = "; ".join(sentence for _, sentence in told)
-    judged = (
-        "" if not failed else "With that factor: " if validation is not None and validation.widens else "As fitted: "
-    )
+    judged = ""
+    if failed and validation is not None:
+        judged = "With that factor: " if validation.widens else "As fitted: "
     return Verdict(failed + judged + text[0].upper() + text[1:], told[0][0].replace(" ", "-"))
 
 
@@ -72,7 +84,7 @@ def criteria_table(criteria: Sequence[Criterion]) -> TableView | None:
     """Every limit with its verdict and the rule; None where no limit was stated."""
     if not criteria:
         return None
-    rows = [[c.quantity, f"{c.limit:.3g} {c.unit}", f"{c.probability:.3f}", c.verdict] for c in criteria]
+    rows = [[c.quantity, f"{c.limit:.3g} {c.unit}", chance_text(c.probability), c.verdict] for c in criteria]
     caption = "Decision rule: met if P(|error| <= limit) >= 0.95, not met if <= 0.05, else cannot tell"
     return TableView(caption, ["error of", "limit", "probability", "verdict"], rows)
 

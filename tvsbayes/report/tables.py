@@ -63,6 +63,17 @@ def interval_text(low: float, high: float, sd: float) -> str:
     return f"[{low:.{decimals}f}, {high:.{decimals}f}]"
 
 
+def chance_text(probability: float, bound: str = "") -> str:
+    """A probability from draws to three decimals, after the word of a bound; none is said to be 0 or 1.
+
+    Args:
+        probability: share of draws.
+        bound: "at least " or "at most ", where the number is one; "" where it is the probability.
+    """
+    text = f"{probability:.3f}"
+    return {"1.000": "above 0.999", "0.000": "below 0.001"}.get(text, bound + text)
+
+
 @dataclass(frozen=True)
 class TableView:
     """A table of ready text; the first cell of a row is its header, and `pairs` have no other."""
