@@ -70,6 +70,19 @@ def stated_value(campaign: Campaign, name: str, key: str) -> StatedValue | None:
     return StatedValue(entry["value"], entry["u"]) if isinstance(entry, dict) else None
 
 
+UNITS = {"degC": "degC", "percent": "%", "mm": "mm"}
+"""By the end of a key."""
+
+
+def stated_text(campaign: Campaign, name: str, key: str) -> tuple[str, str]:
+    """An entry of such a table for readers: its name, a quantity's without the unit, and what it says."""
+    stated = stated_value(campaign, name, key)
+    if stated is None:
+        return key, str(header_table(campaign, name)[key])
+    label, _, end = key.rpartition("_")
+    return label, f"{stated.value:g} {UNITS[end]}, u = {stated.u:g} {UNITS[end]}"
+
+
 def plain_text(value: object) -> str:
     """Text on one line, with a word for none."""
     return " ".join(str(value).split()) or NOT_STATED

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tvsbayes.instrument.axes import AXES, DIRECTIONS
-from tvsbayes.metrology.traceability import stated_value
+from tvsbayes.metrology.traceability import header_table, stated_text
 from tvsbayes.report import figures
 from tvsbayes.report.advice import asks_for_looks
 from tvsbayes.report.fit_text import agreement_line, sampling_line
@@ -50,9 +50,7 @@ def setup_section(e: Evidence) -> Section:
         ["spots used, in all", f"{ok - len(summary.excluded_spots)}, {len(campaign.spots)}"],
         ["placements of the sheet", ", ".join(targets) or "not named"],
     ]
-    for key, unit in (("temperature_degC", "degC"), ("humidity_percent", "%")):
-        if (stated := stated_value(campaign, "environment", key)) is not None:
-            rows.append([key.split("_")[0], f"{stated.value:g} {unit}, u = {stated.u:g} {unit}"])
+    rows += [[*stated_text(campaign, "environment", key)] for key in header_table(campaign, "environment")]
     names = [f"extrinsics.translation_mm.{a}" for a in "xyz"]
     known = all(name in summary.parameters for name in names)
     where = [summary.parameters[name].value for name in names] if known else None

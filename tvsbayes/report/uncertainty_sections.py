@@ -13,7 +13,7 @@ import numpy as np
 
 from tvsbayes.instrument.axes import SENSES
 from tvsbayes.instrument.parameters import REGISTRY
-from tvsbayes.metrology.traceability import header_table
+from tvsbayes.metrology.traceability import header_table, stated_text
 from tvsbayes.report import figures
 from tvsbayes.report.drawing import SMALLEST_SHARE
 from tvsbayes.report.parameter_words import MADE_BY, name_in_words, share_in_words, source_in_words
@@ -299,7 +299,10 @@ def method_section(e: Evidence) -> Section:
         "(JCGM 101:2008, 5.3.3), coverage probability 95 %.",
         f"Command: {made.command}. Seed {made.seed}.",
     ]
-    rows = [["traceability", k, str(v)] for k, v in header_table(e.campaign, "traceability").items()]
+    rows = [
+        ["traceability", *stated_text(e.campaign, "traceability", key)]
+        for key in header_table(e.campaign, "traceability")
+    ]
     rows += [["sha256", name, value] for name, value in made.inputs.items()]
     rows.append(["versions", "", ", ".join(f"{name} {value}" for name, value in made.versions.items())])
     table = TableView("Traceability as declared, inputs, versions", ["", "name", "value"], rows)
@@ -311,8 +314,8 @@ def limits_section(e: Evidence) -> Section:
     items = [
         "The scale of all angles is that of the stereo calibration; an error of its board or of the focal length at "
         "the laser's wavelength beyond the stated uncertainty is in no residual.",
-        "Baseline, C0 and aperture zero cannot be seen in spots: without aperture readings they are the user's "
-        "statement.",
+        "Baseline, emission angle at pan 0 (C0) and the aperture's zero cannot be seen in spots: without aperture "
+        "readings they are the user's statement.",
         "Results hold for the range of counters and depths that was seen, at the temperature of the campaign, moving "
         "slowly enough to lose no step.",
         "Angles are inferred through cameras and model; no angle standard was compared.",
