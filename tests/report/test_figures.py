@@ -3,12 +3,22 @@
 from __future__ import annotations
 
 import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from support.small_results import estimate
 
 from tvsbayes.estimators.four_point import classic
+from tvsbayes.instrument.axes import SENSES
 from tvsbayes.report import figures
 from tvsbayes.report.drawing import WIDTH_IN
-from tvsbayes.report.figures import direction_scatter, intervals, points_3d, trajectories
+from tvsbayes.report.figures import (
+    direction_scatter,
+    direction_scatters,
+    intervals,
+    points_3d,
+    ratio_curves,
+    trajectories,
+)
+from tvsbayes.results.estimates import CurvePoint, Curves, RatioAt
 
 
 def test_the_papers_figures_for_any_campaign(evidence):
@@ -45,3 +55,20 @@ def test_figures_take_what_the_estimators_return(evidence):
 def test_a_prompt_completes_figures_alone():
     own = [name for name, value in vars(figures).items() if getattr(value, "__module__", "") == figures.__name__]
     assert dir(figures) == sorted(name for name in own if not name.startswith("_")) and len(dir(figures)) > 10
+
+
+def test_no_text_of_the_ratios_is_cut_or_lies_on_the_points(evidence):
+    """Labels end inside of the figure; legends stand beside the axes."""
+    at = RatioAt(0.062, 1e-4, (0.0618, 0.0622))
+    along = {a: tuple(CurvePoint(x, x, dict.fromkeys(pair, at)) for x in (0.0, 5.0, 9.0)) for a, pair in SENSES.items()}
+    curves = ratio_curves(Curves(along, {}))
+    for figure in (direction_scatters(classic(evidence.campaign), evidence.fit.summary), curves):
+        # The layout is found by drawing.
+        FigureCanvasAgg(figure).draw()
+        assert [axes for axes in figure.axes if axes.get_legend()] == []
+        texts = [text for axes in figure.axes for text in (axes.xaxis.label, axes.title) if text.get_text()]
+        texts += [text for text in (figure._supxlabel,) if text is not None]
+        for box in (text.get_window_extent() for text in texts):
+            assert 0 <= box.x0 and box.x1 <= figure.bbox.x1
+    (legend,) = curves.legends
+    assert [text.get_text() for text in legend.get_texts()] == ["left", "right", "up", "down"]

@@ -31,6 +31,7 @@ from tvsbayes.report.drawing import (
     SEQUENTIAL,
     SKY,
     SMALLEST_SHARE,
+    STYLE,
     colour_map,
     drawing,
 )
@@ -50,6 +51,8 @@ __all__ = [
     *("causes", "correlations", "coverage", "direction_scatter", "direction_scatters", "error_maps", "gap_terms"),
     *("intervals", "points_3d", "ratio_curves", "residuals", "setup", "shares", "trajectories"),
 ]
+
+EXPERIMENT = "experiment of this direction"
 
 
 def __dir__() -> list[str]:
@@ -144,7 +147,9 @@ def direction_scatter(result: ClassicResult, direction: str, joint: Estimate | N
     if summary is None:
         raise ValueError(f"no complete experiment moves {direction}")
     with drawing(3.2) as figure:
-        _scatter(figure.add_subplot(), result, direction, joint)
+        axes = figure.add_subplot()
+        _scatter(axes, result, direction, joint)
+        axes.set(xlabel=EXPERIMENT)
         figure.legend(loc="outside lower center", ncols=3)
     return figure
 
@@ -158,6 +163,8 @@ def direction_scatters(result: ClassicResult, joint: FitSummary | None = None) -
                 axes.set(title=f"{direction}: no experiment")
                 continue
             _scatter(axes, result, direction, None if joint is None else joint.effective[direction])
+        # Once for all: below one of two panels side by side there is no room for it.
+        figure.supxlabel(EXPERIMENT, fontsize=STYLE["font.size"])
     return figure
 
 
@@ -175,7 +182,7 @@ def _scatter(axes: Axes, result: ClassicResult, direction: str, joint: Estimate 
         label = f"joint {joint.value:.6f}, 2 u"
         axes.errorbar(len(mine) + 1.5, joint.value, 2 * joint.sd, fmt="o", color=BLUE, capsize=3, label=label)
     axes.plot(range(1, len(mine) + 1), [e.deg_per_step for e in mine], "^", color=BLACK, markersize=4)
-    axes.set(xlabel="experiment of this direction", ylabel="deg/step", title=f"{direction}, n = {summary.n}")
+    axes.set(ylabel="deg/step", title=f"{direction}, n = {summary.n}")
 
 
 def setup(
@@ -432,5 +439,5 @@ def ratio_curves(curves: Curves) -> Figure:
                     place, value, yerr=bars, label=direction, fmt=f"{marker}-", color=colour, capsize=2, markersize=4
                 )
             axes.set(xlabel=f"{axis} angle, deg", ylabel="deg/step")
-            axes.legend()
+        figure.legend(loc="outside lower center", ncols=4)
     return figure
