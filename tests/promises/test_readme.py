@@ -18,6 +18,8 @@ def test_first_screen_has_two_set_up_commands_and_the_printed_answer():
     assert commands[0].endswith("tvsbayes demo")
     assert "-c .ci/constraints.txt" in commands[1]
     assert "joint  holds truth     truth" in README.split("\n## ")[0]
+    # The first command installs what is newest, not what is pinned.
+    assert "Last digits may differ with library versions." in README.split("\n## ")[0]
 
 
 def test_readme_is_short_and_warns_of_the_laser():
