@@ -51,6 +51,26 @@ def test_remarks_empty_lines_and_missing_names(tmp_path):
     assert list(written(tmp_path / "c.csv", b"x,x,\n1,2,3\n").columns) == ["x", "x (2)"]
 
 
+@pytest.mark.parametrize(
+    ("lines", "line", "counts", "cause"),
+    [
+        ("t,day,n,v\n" + "0,d1,5,7\n" * 3 + "# later\n0,5,d1,5,7,25\n", 6, "6 cells under the 4 names", "commas"),
+        ("time n v\n" + "2026-01-02 10:00 5 7\n" * 20, 2, "4 cells under the 3 names", "spaces"),
+        ("bench 3\n" + "n;v\n" + "1;2\n" * 20, 2, "2 cells under the 1 name of line 1", "put #"),
+        ("n;v\n" + "1;2\n" * 20 + "1;2;a;b\n", 22, "4 cells under the 2 names of line 1", "quotes"),
+    ],
+)
+def test_rows_with_more_cells_than_names_are_refused(tmp_path, lines, line, counts, cause):
+    """Every cell after a divided one would stand under a wrong name."""
+    with pytest.raises(InputError) as refused:
+        written(tmp_path / "t.csv", lines.encode())
+    assert refused.value.line == line and counts in refused.value.message and cause in refused.value.remedy
+
+
+def test_separators_at_the_end_of_rows_are_no_cells(tmp_path):
+    assert written(tmp_path / "a.csv", b"n;v\n" + b"1;2;;\n" * 20).columns == {"n": ("1",) * 20, "v": ("2",) * 20}
+
+
 def test_sheets_of_a_workbook(tmp_path):
     book = openpyxl.Workbook()
     book.active.title = "empty"

@@ -31,6 +31,11 @@ CELLS_MAX = 10_000_000
 SEPARATORS = {"\t": "tabs", ";": "semicolons", "|": "bars", ",": "commas", " ": "spaces"}
 """In the order in which they are tried: a decimal comma must not pass for one between cells."""
 ROWS_TRIED = 50
+_WIDE = {
+    SEPARATORS[","]: "decimal commas beside commas between cells? export with semicolons, or with decimal points",
+    SEPARATORS[" "]: "dates or texts with spaces? export with semicolons or tabs between cells",
+}
+"""Why rows may have more cells than there are names, and what to do, by what stands between cells."""
 _MARKS = (
     (b"\xff\xfe\x00\x00", "utf-32", "UTF-32"),
     (b"\x00\x00\xfe\xff", "utf-32", "UTF-32"),
@@ -92,6 +97,7 @@ def read_foreign(path: Path, sheet: str | None = None) -> ForeignTable:
     else:
         text, encoding = _text(data, file)
         rows, between = _csv_rows(text, file)
+        _refuse_wide(rows, between, file)
         words = [f"CSV with {between} between cells", encoding]
     rows = [(line, cells) for line, cells in rows if any(cells)]
     if not rows:
@@ -151,6 +157,27 @@ def _csv_rows(text: str, file: str) -> tuple[list[tuple[int, list[str]]], str]:
                 "csv", file=file, line=line, found=found, allowed="one row per line", remedy=remedy
             ) from error
     return rows, SEPARATORS.get(separator, f"'{escaped(separator)}'")
+
+
+def _refuse_wide(rows: Sequence[tuple[int, list[str]]], between: str, file: str) -> None:
+    """Refuse rows with more cells than the first row has: every cell after a divided one stands under a wrong name.
+
+    Raises:
+        InputError: such a row; empty cells at its end do not count.
+    """
+    filled = [(line, cells) for line, cells in rows if any(cells)]
+    names = len(filled[0][1]) if filled else 0
+    for line, cells in filled:
+        count = len(cells)
+        while count > names and not cells[count - 1]:
+            count -= 1
+        if count <= names:
+            continue
+        found = f"{count} cells under the {names} {'name' if names == 1 else 'names'} of line {filled[0][0]}"
+        remedy = _WIDE.get(between, "a separator inside a cell? put such cells in quotes; or a name is missing")
+        remedy = "put # before lines that stand above the names of the columns" if names == 1 else remedy
+        allowed = "as many cells in a row as there are names"
+        raise refusal("csv", file=file, line=line, found=found, allowed=allowed, remedy=remedy)
 
 
 def _separator(lines: Sequence[str]) -> str:
