@@ -62,6 +62,14 @@ def test_a_mark_of_homings_is_no_number_of_a_segment(tmp_path):
     assert any("1 homing after the first row, by column home at each 1" in text for text in found.assumed)
 
 
+@pytest.mark.parametrize("name", ["homed", "Homed?", "run", "run_id", "Referenziert", "homing no"])
+def test_homings_are_not_dropped(tmp_path, name):
+    """Readings before and after a homing would pass for one segment."""
+    marks = ("0", "0", "1", "0") if "ed" in name.lower() else ("1", "1", "2", "2")
+    rows = [f"{mark},{10 * k},{k}.5" for k, mark in enumerate(marks)]
+    assert [m.segment for m in readings_of(*table(tmp_path, f"{name},steps,encoder", *rows)).moves] == [0, 0, 1, 1]
+
+
 @pytest.mark.parametrize(
     ("row", "column"), [("x,1,ok,forward", "steps"), ("0,,ok,forward", "angle"), ("0,1,ok,cw", "side")]
 )

@@ -49,7 +49,10 @@ _APPROACH = {
 }
 _WORDS = {
     "move": {"move", "movement", "bewegung", "fahrt", "movimiento", "mouvement", "deplacement", "pose"},
-    "segment": {"segment", "homing", "home", "referenzfahrt", "referenciado", "segmento", "reference"},
+    "segment": {
+        *("segment", "seg", "homing", "homings", "home", "homed", "rehomed", "reference", "referenced"),
+        *("referenzfahrt", "referenziert", "referenciado", "segmento"),
+    },
     "time_s": {
         *("time", "t", "timestamp", "datetime", "date", "zeit", "uhrzeit", "zeitstempel", "datum"),
         *("tiempo", "hora", "fecha", "temps", "heure"),
@@ -161,7 +164,9 @@ _AXIS_WORDS = {
     },
     "u": {"u", "sd", "std", "sigma", "unc", "uncertainty", *_SPREAD} - {"s"},
     "approach": _APPROACH | {"direction", "richtung", "direccion"},
-    **{name: _WORDS[name] for name in ("time_s", "segment", "status")},
+    # Of a scanner a run is an experiment; of an axis, what lies between two homings.
+    "segment": {*_WORDS["segment"], "run", "lauf", "durchlauf"},
+    **{name: _WORDS[name] for name in ("time_s", "status")},
 }
 
 
