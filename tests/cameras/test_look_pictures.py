@@ -45,8 +45,15 @@ def test_names_without_a_fitting_number_count_in_order(tmp_path):
 def test_without_moves_every_number_is_one(tmp_path):
     drawn(tmp_path, *pairs("_5", "_7_a", "_7_b", "_12"))
     found = pair_looks(views_of(tmp_path).views, None)
-    assert [s.move for s in found.spots] == [0, 1, 1, 2]
+    assert [s.move for s in found.spots] == [5, 7, 7, 12] and found.renumbered is None
     assert [s.target for s in found.spots] == ["", "a", "b", ""]
+    assert found.without == tuple(move for move in range(12) if move not in (5, 7))
+
+
+def test_numbers_too_sparse_for_moves_are_counted_anew_and_told(tmp_path):
+    drawn(tmp_path, *pairs("_0930", "_0931", "_1015"))
+    found = pair_looks(views_of(tmp_path).views, None)
+    assert [s.move for s in found.spots] == [0, 1, 2] and found.renumbered == (930, 1015)
 
 
 def test_rows_that_wait_take_their_own_pictures(tmp_path):

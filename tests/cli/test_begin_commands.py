@@ -80,7 +80,8 @@ def test_without_moves_their_counters_are_asked_for(ask, say, tmp_path):
     drawn(tmp_path / "pictures", *pairs("1", "2", "3"), "left4.png")
     out = tmp_path / "mine"
     code, text, _ = say("new", out, "--pictures", tmp_path / "pictures")
-    assert code == 0 and "fill in moves.csv: pan_steps and tilt_steps" in text
+    assert code == 0 and "fill in moves.csv: pan_steps and tilt_steps of all 4 rows" in text
+    assert "spot 0, seen after move 1" in text and "not paired: moves 0: no pictures" in text
     assert "not paired: left4.png: without the picture of the other camera" in text
     shutil.copy(MOUNTED / "stereo.json", out)
     code, document = ask("check", out)
@@ -88,6 +89,12 @@ def test_without_moves_their_counters_are_asked_for(ask, say, tmp_path):
     assert (code, error["file"], error["line"], error["column"]) == (2, "moves.csv", 2, "pan_steps")
     code, document = ask("new", tmp_path / "other", "--pictures", tmp_path / "pictures", "--pair", "name")
     assert code == 2 and "number, order" in assert_error(document, "usage")["message"]
+
+
+def test_moves_that_are_numbered_anew_are_told(say, tmp_path):
+    drawn(tmp_path / "pictures", *pairs("0930", "1015"))
+    code, text, _ = say("new", tmp_path / "mine", "--pictures", tmp_path / "pictures")
+    assert code == 0 and "930 to 1015, are too sparse for moves: these are counted anew" in text
 
 
 def test_pictures_are_for_a_calibration_of_their_size(ask, tmp_path):

@@ -25,6 +25,8 @@ from tvsbayes.progress import Advance, unshown
 
 Matching = Literal["number", "order"]
 LOOKS_MAX = 100_000
+SPARSE_ROWS = 10
+"""Beyond twice as many rows as numbers in names, and so many more, these are no moves but a clock, a counter."""
 _NUMBER = re.compile(r"[0-9]{1,9}")
 
 
@@ -84,6 +86,7 @@ class PairedLooks:
         matching: by number or in order.
         left_over: views whose row has a pair already.
         without: numbers of the rows, or moves, that have no pictures.
+        renumbered: lowest and highest number in the names, where moves are counted anew instead; else None.
     """
 
     spots: tuple[Spot, ...]
@@ -91,6 +94,7 @@ class PairedLooks:
     matching: Matching
     left_over: tuple[str, ...]
     without: tuple[int, ...]
+    renumbered: tuple[int, int] | None = None
 
 
 def views_of(folder: Path, *, swap: bool = False) -> ViewedFolder:
@@ -155,8 +159,8 @@ def pair_looks(
 
     Args:
         views: of a folder.
-        moves: numbers of the moves; None where nobody has listed any yet: every number in the names is then one, in
-            their order, or every view.
+        moves: numbers of the moves; None where nobody has listed any yet: the numbers in the names are then those of
+            moves, counted anew where they are too sparse for that; without numbers every view is one.
         rows: of `spots.csv`; where there are any, pictures belong to those that wait for them ("undetected").
         matching: "number" or "order"; None takes the number where every name has one that fits, else the order.
 
@@ -169,11 +173,13 @@ def pair_looks(
         raise refusal("occupied", file="spots.csv", found=found, allowed=allowed, remedy="name a new folder")
     ids, file = (waiting, "spots.csv") if rows else (moves, "moves.csv")
     place = None if matching == "order" else _numbered(views, ids)
-    names = [""] * len(views)
+    names, renumbered = [""] * len(views), None
     if place is not None:
         told, names = [view.numbers[place] for view in views], [view.without_number(place) for view in views]
         ranks = {number: rank for rank, number in enumerate(sorted(set(told)))}
-        numbers = told if ids is not None else [ranks[number] for number in told]
+        numbers = told
+        if ids is None and max(told) >= 2 * len(ranks) + SPARSE_ROWS:
+            numbers, renumbered = [ranks[number] for number in told], (min(told), max(told))
     elif matching == "number" or (ids is not None and len(views) != len(ids)):
         raise _unmatched(views, ids or (), file)
     else:
@@ -185,8 +191,9 @@ def pair_looks(
     targets = _differences(names)
     empty = (*NO_PIXELS, *NO_PIXELS)
     spots = [Spot(spot, numbers[k], targets[k], None, None, *empty, status=UNDETECTED) for spot, k in enumerate(order)]
-    without = tuple(move for move in moves or () if move not in set(numbers))
-    return PairedLooks(tuple(spots), {spot: views[k] for spot, k in enumerate(order)}, how, (), without)
+    used = set(numbers)
+    without = tuple(move for move in (range(1 + max(used)) if moves is None else moves) if move not in used)
+    return PairedLooks(tuple(spots), {spot: views[k] for spot, k in enumerate(order)}, how, (), without, renumbered)
 
 
 def _differences(names: Sequence[str]) -> list[str]:

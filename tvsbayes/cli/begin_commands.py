@@ -165,7 +165,14 @@ def _paired_text(out: Path, found: PairedLooks, copied: int, to_fill_in: str | N
         both = left if left == right else f"{left} and {right}"
         lines.append(f"for example {both}: spot {first[0]}, seen after move {move}")
     if to_fill_in is not None:
-        lines.append(f"fill in moves.csv: {to_fill_in} of every row, absolute counters AFTER the move")
+        rows = 1 + max(spot.move for spot in found.spots)
+        lines.append(f"fill in moves.csv: {to_fill_in} of all {rows} rows, absolute counters AFTER the move")
+    if found.renumbered is not None:
+        low, high = found.renumbered
+        lines.append(
+            f"the numbers in the names, {low} to {high}, are too sparse for moves: these are counted anew, in order; "
+            "with a moves.csv of your own begin again: put it beside the pictures, and name another folder"
+        )
     if not (out / "stereo.json").is_file():
         lines.append(
             "put stereo.json beside it: `tvsbayes stereo BOARD_PICTURES --board 9x6 --pitch-mm 25 -o stereo.json`"
