@@ -122,7 +122,11 @@ def test_a_log_of_one_axis_goes_to_an_axis_folder(ask, say, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("column", "unit"), [("reading [mm]", "mm"), ("encoder deg", "deg"), ("angle_arcsec", "arcsec"), ("encoder", "deg")]
+    ("column", "unit"),
+    [
+        *(("reading [mm]", "mm"), ("encoder deg", "deg"), ("angle_arcsec", "arcsec"), ("encoder", "deg")),
+        *(("Messwert [\u00b5m]", "um"), ("reading [\u03bcm]", "um"), ("encoder_um", "um"), ("encoder_nm", "nm")),
+    ],
 )
 def test_readings_are_reported_in_the_unit_of_their_column(ask, say, tmp_path, column, unit):
     """A new folder says what the column says; where that says nothing, the template's degrees, and it is told."""

@@ -6,7 +6,15 @@ import pytest
 
 from tvsbayes.errors import InputError
 from tvsbayes.instrument.campaign import PIXEL_SDS, PIXELS, SPOT_COLUMNS
-from tvsbayes.instrument.column_names import COUNTERS, DEGREES, SECONDS, missing, understand, unit_of_name
+from tvsbayes.instrument.column_names import (
+    COUNTERS,
+    DEGREES,
+    READING_UNITS,
+    SECONDS,
+    missing,
+    understand,
+    unit_of_name,
+)
 
 PIXEL_NAMES = [
     ("XL", "YL", "XR", "YR"),
@@ -88,6 +96,8 @@ def test_units_in_names():
     assert [unit_of_name(name, SECONDS) for name in times] == ["ms", "us", "us", "us", "h", "h", "min", None, None]
     angles = ("B (rad)", "angle_deg", "aperture_mrad", "B (arcmin)", "B_arcsec", "XL", "B h")
     assert [unit_of_name(name, DEGREES) for name in angles] == ["rad", "deg", "mrad", "arcmin", "arcsec", None, None]
+    readings = ("Messwert [\u00b5m]", "reading [\u03bcm]", "encoder_um", "x (nm)", "counts", "B [\u00b5rad]", "v")
+    assert [unit_of_name(name, READING_UNITS) for name in readings] == ["um", "um", "um", "nm", "counts", "urad", None]
 
 
 def test_what_two_columns_claim_is_asked_for():

@@ -25,7 +25,14 @@ def import_readings(
 ) -> None:
     """A table of an axis into its folder, new or still with the tables of the template."""
     from tvsbayes.files.foreign_table import read_foreign
-    from tvsbayes.instrument.column_names import AXIS_FIELDS, DEGREES, SECONDS, axis_field_of, understand, unit_of_name
+    from tvsbayes.instrument.column_names import (
+        AXIS_FIELDS,
+        READING_UNITS,
+        SECONDS,
+        axis_field_of,
+        understand,
+        unit_of_name,
+    )
     from tvsbayes.single_axis.foreign_readings import readings_of
 
     table = read_foreign(file, sheet)
@@ -39,7 +46,7 @@ def import_readings(
     def unit(field: str, name: str) -> str:
         return unit_of_name(name, SECONDS) or "s" if field == "time_s" else ""
 
-    named = unit_of_name(known.columns["value"], (*DEGREES, "mm"))
+    named = unit_of_name(known.columns["value"], READING_UNITS)
     told = _unit_told(to, named)
     lines = table_lines(table, known, AXIS_FIELDS, unit)
     lines += [f"assumed: {text}" for text in (*found.assumed, told)]

@@ -86,8 +86,13 @@ _WORDS = {
 }
 SECONDS = {"us": 1e-6, "ms": 1e-3, "min": 60.0, "h": 3600.0}
 """Units of times that a name may say, in s."""
-DEGREES = {"deg": 1.0, "rad": math.degrees(1.0), "mrad": math.degrees(1e-3), "arcmin": 1 / 60, "arcsec": 1 / 3600}
+DEGREES = {
+    **{"deg": 1.0, "rad": math.degrees(1.0), "mrad": math.degrees(1e-3), "urad": math.degrees(1e-6)},
+    **{"arcmin": 1 / 60, "arcsec": 1 / 3600},
+}
 """Units of angles that a name may say, in deg."""
+READING_UNITS = (*DEGREES, "mm", "um", "nm", "counts")
+"""Units of readings that a name may say."""
 _UNITS = {
     "us": {"us", "usec", "micros", "microseconds", "mikrosekunden", "microsegundos", "microsecondes"},
     "ms": {"ms", "msec", "millis", "milliseconds", "millisekunden", "milisegundos", "millisecondes"},
@@ -98,7 +103,11 @@ _UNITS = {
     "arcmin": {"arcmin", "arcminutes", "bogenminuten"},
     "arcsec": {"arcsec", "arcseconds", "bogensekunden"},
     "deg": {"deg", "degrees", "grad", "grados", "degres"},
-    "mm": {"mm"},
+    "urad": {"urad", "microradians", "microrad"},
+    "mm": {"mm", "millimeter", "millimeters", "millimetre", "millimetres", "milimetros"},
+    "um": {"um", "micron", "microns", "micrometer", "micrometers", "mikrometer", "micrometros", "micrometres"},
+    "nm": {"nm", "nanometer", "nanometers", "nanometros", "nanometres"},
+    "counts": {"counts", "count", "ticks", "inkremente"},
 }
 
 
@@ -119,8 +128,8 @@ class Understood:
 
 def words_of(name: str) -> list[str]:
     """The words of a column's name in small letters without accents: "xLeft_px", "X left [px]" and "XL" alike."""
-    # Of microseconds the ascii letters alone would be seconds.
-    plain = re.sub("\u03bc(?=s)", "u", unicodedata.normalize("NFKD", name)).encode("ascii", "ignore").decode()
+    # Of microseconds, and of all other millionths, the ascii letters alone would be another unit.
+    plain = re.sub("\u03bc(?=[A-Za-z])", "u", unicodedata.normalize("NFKD", name)).encode("ascii", "ignore").decode()
     found = []
     for part in re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|[0-9]+", plain):
         word = part.lower()
@@ -131,7 +140,7 @@ def words_of(name: str) -> list[str]:
 
 
 def unit_of_name(name: str, units: Iterable[str]) -> str | None:
-    """The first of `units` that the name says: those of `SECONDS`, `DEGREES`, or mm. "h" may be no unit of an angle."""
+    """The first of `units` that the name says, of `SECONDS`, `DEGREES` or `READING_UNITS`; "h" is no angle."""
     words = set(words_of(name))
     return next((unit for unit in units if words & _UNITS[unit]), None)
 
