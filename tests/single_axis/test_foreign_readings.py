@@ -6,7 +6,7 @@ import pytest
 
 from tvsbayes.errors import InputError
 from tvsbayes.files.foreign_table import read_foreign
-from tvsbayes.instrument.column_names import AXIS_FIELDS, axis_field_of, understand
+from tvsbayes.instrument.column_names import understand_axis
 from tvsbayes.single_axis.foreign_readings import readings_of
 
 NAMES = [
@@ -15,20 +15,29 @@ NAMES = [
     ("Sollwert", "Istwert"),
     ("pasos", "lectura (mm)"),
     ("consigne", "mesure"),
+    *((("Mikroschritte", "Messwert [\u00b5m]"), ("microsteps", "position_um"), ("step", "position [um]"))),
+    *((("steps", "mm"), ("command", "deg"), ("microsteps", "counts"), ("position_mm", "reading_mm"))),
+    *((("counts", "deg"), ("usteps", "pos"))),
 ]
 
 
 @pytest.mark.parametrize("names", NAMES, ids=[names[0] for names in NAMES])
 def test_commands_and_readings_by_any_name(names):
-    found = understand(names[::-1], None, AXIS_FIELDS, axis_field_of)
+    found = understand_axis(names[::-1])
     assert (found.columns["command"], found.columns["value"]) == names and not found.claimed
+
+
+@pytest.mark.parametrize("names", [("step", "target", "mm"), ("steps", "position", "x"), ("steps", "mm", "deg")])
+def test_what_could_be_either_is_left_open(names):
+    assert "value" not in understand_axis(names).columns
+    assert understand_axis(names, {"value": names[1]}).columns["value"] == names[1]
 
 
 def table(tmp_path, *lines):
     path = tmp_path / "log.csv"
     path.write_text("\n".join(lines) + "\n")
     read = read_foreign(path)
-    return read, understand(read.columns, None, AXIS_FIELDS, axis_field_of).columns
+    return read, understand_axis(read.columns).columns
 
 
 def test_stops_are_read_again_passed_and_homed(tmp_path):

@@ -29,14 +29,13 @@ def import_readings(
         AXIS_FIELDS,
         READING_UNITS,
         SECONDS,
-        axis_field_of,
-        understand,
+        understand_axis,
         unit_of_name,
     )
     from tvsbayes.single_axis.foreign_readings import readings_of
 
     table = read_foreign(file, sheet)
-    known = understand(table.columns, stated, AXIS_FIELDS, axis_field_of)
+    known = understand_axis(table.columns, stated)
     missing = [field for field in NEEDED if field not in known.columns]
     if missing or known.claimed:
         raise not_sure(table, known, [*missing, *(f for f in known.claimed if f not in missing)], AXIS_FIELDS)

@@ -165,6 +165,7 @@ AXIS_FIELDS = ("command", "value", "u", "time_s", "segment", "approach", "status
 _AXIS_WORDS = {
     "command": {
         *("command", "commanded", "cmd", "counter", "steps", "step", "counts", "target", "goal", "position", "pos"),
+        *("microsteps", "microstep", "mikroschritte", "mikroschritt", "usteps", "ustep", "micropasos", "micropas"),
         *("schritte", "soll", "sollwert", "zahler", "pasos", "contador", "consigna", "posicion", "pas", "consigne"),
     },
     "value": {
@@ -177,6 +178,8 @@ _AXIS_WORDS = {
     "segment": {*_WORDS["segment"], "run", "lauf", "durchlauf"},
     **{name: _WORDS[name] for name in ("time_s", "status")},
 }
+_FOUND_BY_ENCODERS = {"position", "pos", "posicion", "counts", "zahler", "contador"}
+"""Words of commands that name what was read where another column is the command for certain."""
 
 
 def axis_field_of(name: str) -> str | None:
@@ -223,6 +226,37 @@ def understand(
     claimed = {field: tuple(own) for field, own in claims.items() if len(own) > 1}
     used = {*found.values(), *(name for own in claimed.values() for name in own)}
     return Understood(found, claimed, tuple(name for name in names if name not in used))
+
+
+def understand_axis(columns: Iterable[str], stated: Mapping[str, str] | None = None) -> Understood:
+    """Guess what columns of an axis are, as `understand`; some names are clear only beside others.
+
+    Beside "microsteps" a "position [um]" is what was read; "mm" alone is what was read where nothing else is.
+
+    Args:
+        columns: their names.
+        stated: column by field of `AXIS_FIELDS`, where somebody has said it; an empty column: the table has none.
+
+    Raises:
+        InputError: a field or column that does not exist.
+    """
+    names, said = list(columns), dict(stated or {})
+    known = understand(names, said, AXIS_FIELDS, axis_field_of)
+    if "value" in known.columns or "value" in known.claimed or "value" in said:
+        return known
+    claims = known.claimed.get("command", ())
+    found = [name for name in claims if _FOUND_BY_ENCODERS.intersection(words_of(name))]
+    sure = [name for name in claims if name not in found]
+    units = [name for name in known.unused if (words := words_of(name)) and all(map(_is_reading_unit, words))]
+    if len(sure) == len(found) == 1 and not units and (unit_of_name(found[0], READING_UNITS) or not known.unused):
+        return understand(names, {**said, "command": sure[0], "value": found[0]}, AXIS_FIELDS, axis_field_of)
+    if len(units) == 1 and not claims:
+        return understand(names, {**said, "value": units[0]}, AXIS_FIELDS, axis_field_of)
+    return known
+
+
+def _is_reading_unit(word: str) -> bool:
+    return any(word in _UNITS[unit] for unit in READING_UNITS)
 
 
 def missing(columns: Iterable[str], moves_known: bool) -> list[str]:
