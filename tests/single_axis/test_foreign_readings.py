@@ -71,6 +71,12 @@ def test_a_mark_of_homings_is_no_number_of_a_segment(tmp_path):
     assert any("1 homing after the first row, by column home at each 1" in text for text in found.assumed)
 
 
+def test_a_german_date_beside_german_names(tmp_path):
+    """The day comes first: the second row is a day later, not a month."""
+    rows = ("04.03.2026 23:59:50;0;0,5", "5.3.2026 00:00:12,5;10;1,5")
+    assert [m.time_s for m in readings_of(*table(tmp_path, "Zeit;Sollwert;Istwert", *rows)).moves] == [0.0, 22.5]
+
+
 @pytest.mark.parametrize("name", ["homed", "Homed?", "run", "run_id", "Referenziert", "homing no"])
 def test_homings_are_not_dropped(tmp_path, name):
     """Readings before and after a homing would pass for one segment."""

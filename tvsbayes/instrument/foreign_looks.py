@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import datetime
 import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -38,6 +39,8 @@ BAD = {"0", "false", "no", "bad", "invalid", "nein"}
 """Words of a status, in small letters."""
 _FLAGS = {"": False, "0": False, "false": False, "1": True, "true": True}
 """Cells of a column that marks homings, in small letters."""
+_DOTTED_DATE = re.compile(r"([0-9]{1,2})\.([0-9]{1,2})\.([0-9]{4})[ ,T]+")
+"""Day, month and year: with dots in no other order."""
 
 
 @dataclass(frozen=True)
@@ -233,6 +236,11 @@ def homings_of(cells: FieldCells, assumed: list[str]) -> list[bool]:
     return found
 
 
+def _iso_date(dotted: re.Match[str]) -> str:
+    day, month, year = dotted.groups()
+    return f"{year}-{month:0>2}-{day:0>2}T"
+
+
 def seconds_of(cells: FieldCells, assumed: list[str]) -> list[float] | None:
     """Seconds of every row: numbers in the unit of the column's name, or dates with times."""
     if "time_s" not in cells:
@@ -245,9 +253,9 @@ def seconds_of(cells: FieldCells, assumed: list[str]) -> list[float] | None:
         found = []
         for row, cell in enumerate(texts):
             try:
-                found.append(datetime.datetime.fromisoformat(cell).timestamp())
+                found.append(datetime.datetime.fromisoformat(_DOTTED_DATE.sub(_iso_date, cell, count=1)).timestamp())
             except ValueError as error:
-                allowed = "seconds, or a date and time such as 2026-01-15T10:00:00"
+                allowed = "seconds, or a date and time such as 2026-01-15T10:00:00 or 15.01.2026 10:00:00"
                 raise cells.refuse(row, "time_s", allowed, "correct the cell, or write --column time_s=") from error
         found = [value - found[0] for value in found]
         assumed.append("time_s: seconds since the first row")
