@@ -100,6 +100,13 @@ def test_options_that_say_nothing_usable_are_refused(say, table, tmp_path, optio
     assert any(part in log for part in said.split("|")), log
 
 
+def test_every_needed_column_is_asked_for_and_none_may_be_left_out(ask, tmp_path):
+    (tmp_path / "log.csv").write_text("a,b\n1,2\n")
+    code, document = ask("import", tmp_path / "log.csv", "--to", tmp_path / "axis", "--axis")
+    remedy = assert_error(document, "missing-column")["remedy"]
+    assert code == 2 and "--column command=NAME --column value=NAME" in remedy and "none" not in remedy
+
+
 def test_a_log_of_one_axis_goes_to_an_axis_folder(ask, say, tmp_path):
     """With --axis, or where the folder is one; nothing of it is overwritten."""
     log, out = tmp_path / "log.csv", tmp_path / "axis"

@@ -38,7 +38,7 @@ def import_readings(
     known = understand_axis(table.columns, stated)
     missing = [field for field in NEEDED if field not in known.columns]
     if missing or known.claimed:
-        raise not_sure(table, known, [*missing, *(f for f in known.claimed if f not in missing)], AXIS_FIELDS)
+        raise not_sure(table, known, [*missing, *(f for f in known.claimed if f not in missing)], AXIS_FIELDS, NEEDED)
     found = readings_of(table, known.columns)
     _refuse_filled(to)
 

@@ -141,7 +141,7 @@ def _completed(
             return known
     strange = set(known.columns).isdisjoint((*PIXELS, *COUNTERS))
     besides = "; or --axis, where one axis and its readings are meant" * strange
-    raise not_sure(table, known, open_fields, FIELDS, besides)
+    raise not_sure(table, known, list(dict.fromkeys(open_fields)), FIELDS, (*PIXELS, *COUNTERS), besides)
 
 
 def _refuse_listed(to: Path, looks: ForeignLooks) -> None:

@@ -50,13 +50,20 @@ def table_lines(
 
 
 def not_sure(
-    table: ForeignTable, known: Understood, missing: Sequence[str], fields: Sequence[str], besides: str = ""
+    table: ForeignTable,
+    known: Understood,
+    missing: Sequence[str],
+    fields: Sequence[str],
+    needed: Sequence[str],
+    besides: str = "",
 ) -> InputError:
-    """The refusal of a table whose columns do not say enough, with what they say; `besides` ends the remedy."""
+    """The refusal of a table whose columns do not say enough, with what they say; `needed` ones must be there."""
     claims = [f"{field} ({' or '.join(escaped(name) for name in own)})" for field, own in known.claimed.items()]
     found = f"no column that is surely {', '.join([*(f for f in missing if f not in known.claimed), *claims])}"
     told = ", ".join(f"{field} = {escaped(known.columns[field])}" for field in fields if field in known.columns)
     found += f"; understood so far: {told or 'nothing'}"
-    remedy = f"say which: --column {missing[0]}=NAME; --column {missing[0]}= where there is none{besides}"
+    remedy = f"say which: {' '.join(f'--column {field}=NAME' for field in missing)}"
+    spare = [field for field in missing if field not in needed]
+    remedy += (f"; --column {spare[0]}= where there is none" if spare else "") + besides
     names = ", ".join(escaped(name) for name in table.columns)
     return refusal("missing-column", file=table.file, line=1, found=found, allowed=f"any of {names}", remedy=remedy)
