@@ -345,7 +345,8 @@ def undetermined(reason: str) -> NothingToEstimate:
     return NothingToEstimate(
         "undetermined",
         f"the views do not determine the cameras: {reason}",
-        remedy="add views: the board tilted by 30 to 45 deg about both axes, near and far, all over the image",
+        remedy="add views: the board tilted by 30 to 45 deg about both axes, near and far, all over the image; "
+        "see that the pitch is in millimetres",
     )
 
 

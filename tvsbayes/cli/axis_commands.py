@@ -32,6 +32,19 @@ def is_axis(folder: Path | None) -> bool:
     return folder is not None and (folder / "campaign.toml").is_file() and is_axis_folder(folder)
 
 
+def refuse_axis(folder: Path, command: str) -> None:
+    """A command that needs cameras does not take an axis folder, and says so.
+
+    Raises:
+        InputError: it is one.
+    """
+    # Looked at first, because it costs nothing: the folder of a scanner has its cameras.
+    if not (folder / "stereo.json").is_file() and is_axis(folder):
+        message = f"{command} is for a scanner with cameras, and {escaped(str(folder), 200)} is an axis folder"
+        remedy = "of an axis: check, classic, fit, calibrate, compare --by positions, report, plan --given"
+        raise InputError("usage", message, remedy=remedy)
+
+
 def new_axis(out: Path, as_json: bool) -> None:
     """An empty axis folder, explained in campaign.toml."""
     make_folder(out, empty=True)

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from tvsbayes.cli import axis_commands
 from tvsbayes.cli.app import Json, finish, finite, refuse_options, report_line
 from tvsbayes.cli.progress_bar import waiting
 from tvsbayes.errors import InputError, escaped, refusal
@@ -211,6 +212,7 @@ def export(
     as_json: Json = False,
 ) -> None:
     """A campaign with its journal as one file of another format. Replaces no file."""
+    axis_commands.refuse_axis(folder, "export")
     from tvsbayes.acquisition.nexus_file import write_nexus
 
     done = write_nexus(folder, nexus)

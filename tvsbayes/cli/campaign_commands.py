@@ -160,6 +160,7 @@ def detect(
     as_json: Json = False,
 ) -> None:
     """Find the laser spots in a campaign's frames. Writes centres and uncertainties into spots.csv, in place."""
+    axis_commands.refuse_axis(campaign, "detect")
     finite(speckle_contrast=speckle_contrast)
     from tvsbayes.cameras.detection import detect as find
     from tvsbayes.instrument.campaign import read_campaign, spots_bytes

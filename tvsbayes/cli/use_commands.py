@@ -75,6 +75,7 @@ def locate(
     as_json: Json = False,
 ) -> None:
     """Where the scanner points, in millimetres. Frame T, with covariance and 95 % half widths."""
+    axis_commands.refuse_axis(campaign, "locate")
     if points is not None:
         options = {"pan_approach": pan_approach, "tilt_approach": tilt_approach, "budget": budget or None}
         counters = {"pan_steps": pan_steps, "tilt_steps": tilt_steps, "aperture_deg": aperture_deg}
@@ -172,6 +173,7 @@ def steps_for(
     as_json: Json = False,
 ) -> None:
     """Counters that send the beam to a point or along a direction. With the approach that removes backlash."""
+    axis_commands.refuse_axis(campaign, "steps-for")
     finite(x_mm=x_mm, y_mm=y_mm, z_mm=z_mm, azimuth_deg=azimuth_deg, elevation_deg=elevation_deg)
     point = None if x_mm is None or y_mm is None or z_mm is None else (x_mm, y_mm, z_mm)
     direction = None if None in (azimuth_deg, elevation_deg) else (azimuth_deg, elevation_deg)
