@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
 STORED = "results/ are missing or older than the axis folder: fitting first (weighted draws) ..."
 NOT_OF_AN_AXIS = "for a scanner, and this is an axis folder"
+FOR_AN_AXIS = "of an axis: check, classic, fit, calibrate, compare --by positions, report, plan --given"
 FITTING, PLANNING, PRINTING = "fit", "choosing stops", "printing to PDF"
 
 
@@ -32,16 +33,20 @@ def is_axis(folder: Path | None) -> bool:
     return folder is not None and (folder / "campaign.toml").is_file() and is_axis_folder(folder)
 
 
-def refuse_axis(folder: Path, command: str) -> None:
+def refuse_axis(folder: Path, command: str, remedy: str = FOR_AN_AXIS) -> None:
     """A command that needs cameras does not take an axis folder, and says so.
+
+    Args:
+        folder: that it was given.
+        command: its name.
+        remedy: what to do instead.
 
     Raises:
         InputError: it is one.
     """
     # Looked at first, because it costs nothing: the folder of a scanner has its cameras.
     if not (folder / "stereo.json").is_file() and is_axis(folder):
-        message = f"{command} is for a scanner with cameras, and {escaped(str(folder), 200)} is an axis folder"
-        remedy = "of an axis: check, classic, fit, calibrate, compare --by positions, report, plan --given"
+        message = f"{command} is for a scanner, not an axis, and {escaped(str(folder), 200)} is an axis folder"
         raise InputError("usage", message, remedy=remedy)
 
 

@@ -9,7 +9,6 @@ import typer
 
 from tvsbayes.cli import axis_commands
 from tvsbayes.cli.app import CampaignFolder, Json, finish, report_line
-from tvsbayes.errors import InputError
 
 
 def view(
@@ -25,10 +24,9 @@ def view(
 
     On 127.0.0.1 alone, by a link for one browser, until Ctrl-C. Needs the extra `view`.
     """
-    if any(axis_commands.is_axis(folder) for folder in (campaign, beside) if folder is not None):
-        raise InputError(
-            "usage", "view shows scanners, not an axis", remedy="`tvsbayes report` makes the page of an axis"
-        )
+    for folder in (campaign, beside):
+        if folder is not None:
+            axis_commands.refuse_axis(folder, "view", "`tvsbayes report` makes the page of an axis")
     from tvsbayes.view.contents import Contents, page_files
     from tvsbayes.view.server import serve
 

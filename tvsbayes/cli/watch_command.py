@@ -36,10 +36,8 @@ def watch(
     """
     from tvsbayes.instrument.campaign import read_campaign
 
-    if axis_commands.is_axis(campaign) or axis_commands.is_axis(looks):
-        raise InputError(
-            "usage", "watch compares looks of a scanner, not of an axis", remedy="use compare --by positions"
-        )
+    for folder in (campaign, looks):
+        axis_commands.refuse_axis(folder, "watch", "use compare --by positions")
     known, new = read_campaign(campaign), read_campaign(looks)
     compile_for(report_line)
     with waiting() as progress, Job({FITTING: 1.0, WATCHING: 1.0}, progress) as job:

@@ -9,6 +9,8 @@ from tvsbayes.errors import listed
 from tvsbayes.instrument.axes import DIRECTIONS
 from tvsbayes.results.estimates import FitSummary, Validation, WeakDirection
 
+SPOTS_REMEDY = "look at those spots, or fit with --robust"
+"""Where single spots disagree; a factor on u covers nothing of that."""
 REMEDIES = {
     "the cameras moved": "fix the cameras and measure again, or fit the looks before and after as two campaigns",
     "the cameras drifted": "let cameras and mount warm up for half an hour and measure again in less time",
@@ -19,11 +21,9 @@ REMEDIES = {
     "stops depend on the step phase": "use full steps, or more current: microsteps are not even",
     "stops depend on the length": "let the axis settle longer before each look, or arrive by moves of one length",
     "the sheets disagree": "check that every sheet is flat, stands still and bears the right name in spots.csv",
-    "single spots disagree": "look at those spots, or fit with --robust, which leaves them out by name",
+    "single spots disagree": f"{SPOTS_REMEDY}, which leaves them out by name",
 }
 """What helps, by how the name of the failed test begins."""
-SHORT = {"single spots disagree": ": look at those spots, or fit with --robust"}
-"""The same in few words, for the line that ends a fit where no factor does."""
 ANY_REMEDY = "find the cause in the section Validation of the report, mend it and measure again"
 SPOTS_LISTED = 20
 """Of those that disagree, by their ids."""
@@ -55,8 +55,8 @@ def verdict_line(summary: FitSummary) -> str:
     if not summary.converged:
         return "verdict: NOT CONVERGED, use none of these numbers"
     if (validation := failed(summary)) is not None:
-        short = "" if validation.widens else next((x for b, x in SHORT.items() if validation.cause.startswith(b)), "")
-        return f"verdict: VALIDATION FAILED, {factor_told(validation)}{short}"
+        by_spots = not validation.widens and validation.cause.startswith("single spots disagree")
+        return f"verdict: VALIDATION FAILED, {factor_told(validation)}" + f": {SPOTS_REMEDY}" * by_spots
     unseen = [d for d in DIRECTIONS if (e := summary.effective[d]) is not None and not e.informed]
     validation = summary.validation
     if summary.sampling is not None and not summary.sampling.converged:

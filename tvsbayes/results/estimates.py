@@ -161,7 +161,7 @@ class Validation:
 
     @property
     def widens(self) -> bool:
-        """Whether the factor, to two decimals, is one: what single spots do to results, it does not hold."""
+        """Whether the factor differs from 1.00: what single spots do to results is in none."""
         return f"{self.inflation:.2f}" != "1.00"
 
 
