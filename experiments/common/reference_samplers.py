@@ -1,4 +1,4 @@
-"""Samplers that share no code with the one they judge: NumPyro's NUTS in sheared coordinates, emcee's stretch move.
+"""Samplers that share no code with the one they judge: NUTS by NumPyro or BlackJAX, emcee's stretch move.
 
 A triangular quadratic shear w -> y of volume 1 takes the curvature out of the stiff directions, and z = mode + C y with
 C the Cholesky factor of the Laplace covariance. Coordinates change the cost of a draw, not the posterior.
@@ -177,6 +177,49 @@ def nuts(potential: Callable[[jax.Array], jax.Array], size: int, setting: Settin
         compile_s=compile_s,
         warmup_s=warmup_s,
         sampling_s=sampling_s,
+    )
+
+
+def blackjax_nuts(potential: Callable[[jax.Array], jax.Array], size: int, setting: Setting) -> Run:
+    """Sample exp(-potential) by BlackJAX (the extra `bench`): windows of warm-up for every chain, diagonal mass.
+
+    Chains go in step, as in `nuts`; `limit_s` does not count.
+    """
+    import blackjax
+
+    def of_one_chain(key, start):
+        keys = jax.random.split(key, 2)
+        adapted = blackjax.window_adaptation(blackjax.nuts, lambda w: -potential(w), target_acceptance_rate=0.8)
+        (state, tuned), _ = adapted.run(keys[0], start, setting.warmup)
+        return state, tuned, keys[1]
+
+    def draws(state, tuned, key):
+        kernel = blackjax.nuts(lambda w: -potential(w), **tuned)
+
+        def step(state, key):
+            state, told = kernel.step(key, state)
+            return state, (state.position, told.is_divergent, told.num_integration_steps, told.acceptance_rate)
+
+        return jax.lax.scan(step, state, jax.random.split(key, setting.draws))[1]
+
+    key, first = jax.random.split(jax.random.PRNGKey(setting.seed))
+    keys = jax.random.split(key, setting.chains)
+    starts = 0.1**0.5 * jax.random.normal(first, (setting.chains, size))
+    cpu = time.process_time()
+    warm = jax.jit(jax.vmap(of_one_chain)).lower(keys, starts).compile()
+    walk = jax.jit(jax.vmap(draws)).lower(*jax.eval_shape(jax.vmap(of_one_chain), keys, starts)).compile()
+    compile_s, cpu = time.process_time() - cpu, time.process_time()
+    standing = jax.block_until_ready(warm(keys, starts))
+    warmup_s, cpu = time.process_time() - cpu, time.process_time()
+    z, diverging, leapfrogs, acceptance = (np.asarray(x) for x in walk(*standing))
+    return Run(
+        draws=z,
+        divergences=int(diverging.sum()),
+        leapfrogs=float(leapfrogs.mean()),
+        acceptance=float(acceptance.mean()),
+        compile_s=compile_s,
+        warmup_s=warmup_s,
+        sampling_s=time.process_time() - cpu,
     )
 
 

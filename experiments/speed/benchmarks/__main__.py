@@ -35,7 +35,7 @@ class Part:
 PARTS = {
     "lm": Part("least squares of the fit against scipy.optimize.least_squares"),
     "strd": Part("NIST's StRD problems: digits and time against scipy", ("pytest",)),
-    "posterior": Part("worst effective draws per CPU second against NUTS and the stretch move", ("numpyro",)),
+    "posterior": Part("effective draws per CPU second against two NUTS and the stretch move", ("blackjax", "numpyro")),
     "spots": Part("spot centres against photutils, and against only decoding the pictures", ("photutils",)),
     "stereo": Part("stereo calibration against cv2.stereoCalibrate"),
     "study": Part("campaigns per minute, serial against processes"),

@@ -24,7 +24,18 @@ import numpy as np
 
 from experiments.common.rows import OUTPUT, ROOT, append_row, commit, git
 
-PACKAGES = ("numpy", "scipy", "jax", "optimistix", "emcee", "numpyro", "opencv-python-headless", "photutils", "astropy")
+PACKAGES = (
+    "numpy",
+    "scipy",
+    "jax",
+    "optimistix",
+    "emcee",
+    "numpyro",
+    "blackjax",
+    "opencv-python-headless",
+    "photutils",
+    "astropy",
+)
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,16 @@ IMPORTS = (
     "import numpyro",
     "import arviz",
 )
+UNIT = "import jax, optimistix, scipy.stats"
+"""What every command that fits needs: the unit of their seconds."""
+FILLED = ", cache filled"
+POINT = ["--pan-steps", "169", "--tilt-steps", "46", "--aperture-deg", "63.4"]
 PROGRAM = [sys.executable, "-c", "from tvsbayes.cli.main import main; main()"]
+
+
+def kept(out: Path) -> list[str]:
+    """Where a fit goes, and that it says so in JSON."""
+    return ["--json", "--out", str(out / "results")]
 
 
 def measure(bench: Bench) -> None:
@@ -57,17 +66,27 @@ def measure(bench: Bench) -> None:
                 for work in works.values():
                     work(0)
                 bench.interleaved(case, works)
-        fit = ["fit", twin, "--no-sample", "--json", "--out", str(out / "fit")]
-        cold, warm = "tvsbayes fit --no-sample, cache empty", "tvsbayes fit --no-sample, cache filled"
-        bench.interleaved(COMMANDS, {cold: command(fit, None)}, min(bench.repeats, COLD_REPEATS))
-        if bench.missing(COMMANDS, [warm]):
-            command(fit, out / "filled")(0)
-            bench.interleaved(COMMANDS, {warm: command(fit, out / "filled")})
-        report = "tvsbayes report"
-        if bench.missing(COMMANDS, [report]):
-            shutil.copytree(twin, out / "twin")
-            command(["fit", str(out / "twin"), "--no-sample", "--json"], out / "filled")(0)
-            bench.interleaved(COMMANDS, {report: command(["report", str(out / "twin"), "--json"], out / "filled")})
+        cold = {"tvsbayes fit --no-sample, cache empty": command(["fit", twin, "--no-sample", *kept(out)], None)}
+        bench.interleaved(COMMANDS, cold, min(bench.repeats, COLD_REPEATS))
+        fitted = str(out / "fitted")
+        usual = {
+            "fit --no-sample": ["fit", twin, "--no-sample", *kept(out)],
+            "fit --quick": ["fit", twin, "--quick", *kept(out)],
+            "demo": ["demo", "--json"],
+            "fit": ["fit", twin, *kept(out)],
+            "plan": ["plan", str(shipped_data() / "rigs" / "mounted" / "rig.toml"), "--json"],
+            "locate": ["locate", fitted, *POINT, "--json"],
+            "report": ["report", fitted, "--json"],
+        }
+        filled = out / "filled"
+        warm = {UNIT: floor(UNIT)}
+        warm |= {f"tvsbayes {name}{FILLED}": command(words, filled) for name, words in usual.items()}
+        if bench.missing(COMMANDS, list(warm)):
+            shutil.copytree(twin, fitted)
+            command(["fit", fitted, "--json"], filled)(0)
+            for work in warm.values():
+                work(0)
+            bench.interleaved(COMMANDS, warm)
 
 
 def cases(rows: Sequence[Mapping]) -> list[Case]:
@@ -76,7 +95,7 @@ def cases(rows: Sequence[Mapping]) -> list[Case]:
     about = "On the shipped paper twin (384 spots)."
     return [
         Case(FLOOR, "`python -c ...`", columns, ours=""),
-        Case(COMMANDS, about, columns, ours=""),
+        Case(COMMANDS, about, columns, "cpu_s", UNIT),
     ]
 
 
