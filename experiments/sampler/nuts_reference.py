@@ -17,6 +17,7 @@ import hashlib
 import json
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from importlib.metadata import version
 
 import jax
@@ -76,6 +77,35 @@ def summary(values: np.ndarray) -> dict[str, float]:
     }
 
 
+@dataclass(frozen=True)
+class Found:
+    """A run, and what `summary` says of every quantity."""
+
+    run: Run
+    rows: dict[str, dict[str, float]]
+
+
+def hamiltonian(joint: JointFit, setting: Setting, shear: bool = True) -> Found:
+    """NUTS of a fit's posterior, in sheared coordinates or with a dense mass instead; x64 has to be on."""
+    started = time.perf_counter()
+    transport = build_transport(joint)
+    transport_s = time.perf_counter() - started
+    size = transport.index.size
+    print(f"{size} free coordinates, {len(transport.stiff)} sheared, transport {transport_s:.1f} s")
+    for w in np.random.default_rng(setting.seed).standard_normal((3, size)):
+        sign, log_volume = np.linalg.slogdet(np.asarray(jax.jacfwd(transport.y_of_w)(jnp.asarray(w))))
+        print(f"log |dy/dw| = {log_volume:.1e}, sign {sign:.0f}")
+
+    def z_of(w: jax.Array) -> jax.Array:
+        return transport.z_of_y(transport.y_of_w(w) if shear else w)
+
+    def potential(w: jax.Array) -> jax.Array:
+        return joint.log_density - log_density(z_of(w), joint.space, joint.arrays)
+
+    run = nuts(potential, size, setting, dense=not shear)
+    return Found(run, {name: summary(values) for name, values in quantities(joint, z_of, run.draws).items()})
+
+
 def content_hash(reference: dict[str, object]) -> str:
     """SHA-256 of a reference without its own hash, as canonical JSON."""
     rest = {key: value for key, value in reference.items() if key != "sha256"}
@@ -122,24 +152,9 @@ def main() -> None:
     campaign = twin_campaign(f"{options.twin}_twin")
     compile_for(8 * -(-max(len(ordered_spots(campaign)), len(campaign.moves)) // 8))
     joint = fit(campaign)
-    started = time.perf_counter()
-    transport = build_transport(joint)
-    transport_s = time.perf_counter() - started
-    size = transport.index.size
-    print(f"{size} free coordinates, {len(transport.stiff)} sheared, transport {transport_s:.1f} s")
-    for w in np.random.default_rng(options.seed).standard_normal((3, size)):
-        sign, log_volume = np.linalg.slogdet(np.asarray(jax.jacfwd(transport.y_of_w)(jnp.asarray(w))))
-        print(f"log |dy/dw| = {log_volume:.1e}, sign {sign:.0f}")
-
-    def z_of(w: jax.Array) -> jax.Array:
-        return transport.z_of_y(w if options.speed else transport.y_of_w(w))
-
-    def potential(w: jax.Array) -> jax.Array:
-        return joint.log_density - log_density(z_of(w), joint.space, joint.arrays)
-
     setting = Setting(options.chains, options.warmup, options.draws, options.seed, options.limit)
-    run = nuts(potential, size, setting, dense=options.speed)
-    rows = {name: summary(values) for name, values in quantities(joint, z_of, run.draws).items()}
+    found = hamiltonian(joint, setting, shear=not options.speed)
+    run, rows = found.run, found.rows
     worst = min(rows, key=lambda name: rows[name]["ess_bulk"])
     ess = rows[worst]["ess_bulk"]
     print(

@@ -43,6 +43,24 @@ def test_estimates_of_a_posterior_go_by_its_weights():
     assert (tilt_contrast, pan_play, tilt_play) == pytest.approx((0.0, 0.25, 0.0), rel=1e-12)
 
 
+@pytest.mark.parametrize("sound", [True, False])
+def test_a_chain_answers_where_weights_are_not_sound(sound):
+    """And nowhere else: it costs several times as much."""
+    from tvsbayes.studies import study_job
+
+    asked = []
+
+    def sampled(result, tier, *, seed):
+        asked.append((result, tier, seed))
+        return SimpleNamespace(tier=tier, converged=sound or tier == "emcee")
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(study_job, "sample", sampled)
+        found = study_job.posterior_of("a fit", 3)
+    assert found.converged and asked[-1] == ("a fit", found.tier, 3)
+    assert [tier for _, tier, _ in asked] == ["importance", "emcee"][: 1 if sound else 2]
+
+
 @pytest.mark.slow
 def test_the_planner_predicts_what_a_fit_of_real_gears_reports(mounted_rig):
     """Ratios, lines over the looks with the gears' errors: sds of a fit within 15 % of those foretold at its truth.

@@ -41,7 +41,7 @@ from tvsbayes.twin.true_rig import Truth
 
 BACKLASH_COLUMNS = [INDEX[name] for name in BLOCKS["backlash_deg"]]
 ESTIMATORS = ("importance", "laplace")
-"""What a row's values come from: importance sampling of the posterior, or the Laplace approximation."""
+"""What a row's values come from: the sampled posterior (`posterior_of`), or the Laplace approximation."""
 ITERATIONS = 6
 """Of slope and width of a backlash: the width's error falls at least threefold each."""
 
@@ -104,7 +104,7 @@ def true_headlines(truth: Truth, campaign: Campaign, pose_rad: np.ndarray) -> np
 def study_row(job: StudyJob, index: int) -> StudyRow:
     """Simulate one campaign, fit and sample it, compare with the truth and with what the planner predicted there.
 
-    Whatever fails is a row as well, weights that are not sound among it: failures are counted, never dropped.
+    Whatever fails is a row as well, a chain that has not converged among it: failures are counted, never dropped.
     """
     start, seed = time.perf_counter(), job.campaign_seed(index)
     run = simulate(job.rig, job.steps, seed, aperture=job.aperture)
@@ -114,7 +114,7 @@ def study_row(job: StudyJob, index: int) -> StudyRow:
         result = fit(run.campaign)
         problems, found = tuple(result.problems), laplace_estimates(result)
         if job.estimator == "importance" and result.converged:
-            posterior = sample(result, "importance", seed=seed % 2**32)
+            posterior = posterior_of(result, seed % 2**32)
             problems, found = posterior.convergence.missing, sampled_estimates(posterior)
     except TvsError as error:
         return replace(row, problems=(error.message,), seconds=time.perf_counter() - start)
@@ -126,6 +126,12 @@ def study_row(job: StudyJob, index: int) -> StudyRow:
         target=reported(job, result, found),
         seconds=time.perf_counter() - start,
     )
+
+
+def posterior_of(result: JointFit, seed: int) -> Posterior:
+    """By importance sampling; where its weights are not sound by a chain, with which `tvsbayes fit` ends as well."""
+    posterior = sample(result, "importance", seed=seed)
+    return posterior if posterior.converged else sample(result, "emcee", seed=seed)
 
 
 @dataclass(frozen=True)
