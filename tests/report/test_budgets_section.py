@@ -76,10 +76,10 @@ def test_an_input_of_one_quantity_alone_has_its_row(budgets):
 def test_what_both_quantities_do_not_share_is_told_of_either():
     """Stop errors are those of the quantity: no number stands for another's."""
     rows = {row[0]: row for row in section(PAN, TILT).tables[0].rows}
-    assert rows["stop errors of the campaign"][2] == "0.015" and rows["play variation"][2] == "0.01"
+    assert rows["stop errors of the campaign"][2] == "0.015" and rows["play variation"][2] == "0.010"
     wider = made("backlash_deg.tilt", COMMON, u=0.034)
     rows = {row[0]: row for row in section(PAN, wider).tables[0].rows}
-    assert rows["stop errors of the campaign"][2] == "0.015; 0.03"
+    assert rows["stop errors of the campaign"][2] == "0.015; 0.030"
 
 
 def test_the_result_that_counts_is_named_once():

@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from tvsbayes.report.tables import TableView, chance_text, concise, interval_text
+from tvsbayes.report.tables import TableView, chance_text, concise, interval_text, two_digits
 
 
 @pytest.mark.parametrize(
@@ -35,6 +35,23 @@ from tvsbayes.report.tables import TableView, chance_text, concise, interval_tex
 )
 def test_concise_shows_two_digits_of_the_uncertainty(value, sd, expected):
     assert concise(value, sd) == expected
+
+
+@pytest.mark.parametrize(
+    ("u", "expected"),
+    [
+        (0.1, "0.10"),
+        (0.000996, "0.0010"),
+        (2.04, "2.0"),
+        (9.96, "10"),
+        (123.4, "120"),
+        (1e-7, "0.00000010"),
+        (0.0, "0"),
+        (math.inf, "inf"),
+    ],
+)
+def test_uncertainties_have_two_digits_a_nought_among_them(u, expected):
+    assert two_digits(u) == expected
 
 
 @pytest.mark.parametrize("mantissa", [1.0, 1.049, 1.05, 4.44, 9.4999, 9.5, 9.949, 9.95, 9.96, 9.999])

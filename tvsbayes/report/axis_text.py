@@ -146,9 +146,9 @@ def next_table(plan: AxisPlan, unit: str) -> TableView:
     rows = []
     for stop in plan.next:
         over = "" if stop.via is None else f"{stop.via:.10g}"
-        rows.append([f"{stop.command:.10g}", stop.direction, over, two_digits(stop.u, both=True)])
+        rows.append([f"{stop.command:.10g}", stop.direction, over, two_digits(stop.u)])
     u = f"u of {plan.target} afterwards"
-    caption = f"stops to read next, in this order; now u = {two_digits(plan.u_now, both=True)} "
+    caption = f"stops to read next, in this order; now u = {two_digits(plan.u_now)} "
     caption += unit_of(plan.target, escaped(unit))
     return TableView(caption, ["command", "direction", "go first to", u], rows)
 

@@ -15,7 +15,6 @@ from dataclasses import dataclass, field
 from decimal import Decimal
 from typing import TYPE_CHECKING
 
-import numpy as np
 from rich.cells import cell_len
 from rich.console import Console
 from rich.table import Table
@@ -30,11 +29,9 @@ COLUMNS, GAP = 80, 2
 """Of a terminal; between two columns of a table."""
 
 
-def two_digits(value: float, both: bool = False) -> str:
-    """An uncertainty to two significant digits, without an exponent (GUM 7.2.6); a second of 0 where `both` are due."""
-    if not both:
-        return np.format_float_positional(value, precision=2, fractional=False, trim="-")
-    return f"{Decimal(f'{value:.1e}'):f}"
+def two_digits(value: float) -> str:
+    """An uncertainty to two significant digits, a 0 among them, without an exponent (GUM 7.2.6)."""
+    return f"{Decimal(f'{value:.1e}'):f}" if math.isfinite(value) and value else f"{value:g}"
 
 
 def concise(value: float, sd: float) -> str:

@@ -38,11 +38,15 @@ def kept(out: Path) -> list[str]:
 def measure(bench: Bench) -> None:
     """Fresh processes only; the files they read are in the file cache."""
     from tvsbayes.files.disk import shipped_data
+    from tvsbayes.studies.executors import SINGLE_THREADED
 
     twin = str(shipped_data() / "twins" / "paper_twin")
 
+    # Without what `experiments` sets: OpenBLAS' waiting threads are a fifth of what a user's bare import costs.
+    plain = {name: value for name, value in os.environ.items() if name not in SINGLE_THREADED}
+
     def floor(code: str):
-        return lambda _: command_cost([sys.executable, "-c", code])[1]
+        return lambda _: command_cost([sys.executable, "-c", code], plain)[1]
 
     with tempfile.TemporaryDirectory() as place:
         out = Path(place)
@@ -50,7 +54,7 @@ def measure(bench: Bench) -> None:
         def command(arguments: Sequence[str], cache: Path | None):
             def row(_: int) -> dict[str, float]:
                 with tempfile.TemporaryDirectory() as empty:
-                    environment = {**os.environ, "TVSBAYES_CACHE": str(cache or empty)}
+                    environment = {**plain, "TVSBAYES_CACHE": str(cache or empty)}
                     return command_cost([*PROGRAM, *arguments], environment)[1]
 
             return row
