@@ -118,6 +118,18 @@ def refusal(
     return InputError(code, message, file=file, line=line, column=column, found=found, allowed=allowed, remedy=remedy)
 
 
+def all_of(refused: Sequence[InputError], most: int = 5) -> InputError:
+    """One refusal for several files, so that nobody meets one a run: the first whole, the others by name."""
+    first, others = refused[0], [error.file or error.message for error in refused[1:]]
+    if not others:
+        return first
+    names = ", ".join(escaped(name, 200) for name in others[:most])
+    more = f" and {len(others) - most} more" if len(others) > most else ""
+    message = f"{first.message}; likewise {names}{more}"
+    fields = ("file", "line", "column", "found", "allowed", "remedy")
+    return InputError(first.code, message, **{name: getattr(first, name) for name in fields})
+
+
 CLOSE = 0.6
 """Similarity (difflib) from which a word may be another one misspelt: "comment" and "point" have 0.5."""
 

@@ -263,6 +263,27 @@ def test_hostile_frames_are_refused_and_nothing_is_written(kind, tmp_path):
     assert (folder.path / "spots.csv").read_bytes() == before
 
 
+def test_all_damaged_frames_are_named_at_once(tmp_path):
+    """Ten of twelve: the first in full, five by name, the rest by number."""
+    folder = Folder(tmp_path / "c", looks=6)
+    looks = [f"{spot.spot:06d}" for spot in read_campaign(folder.path).spots]
+    names = [f"{look}_{side}.png" for look in looks for side in ("left", "right")][2:]
+    for name in names:
+        (folder.path / "frames" / name).write_bytes(b"no picture")
+    told = f"{names[0]}: found .*; likewise {', '.join(names[1:6])} and 4 more$"
+    for method in ("fit", "contour"):
+        with pytest.raises(InputError, match=told) as caught:
+            detect(read_campaign(folder.path), method)
+        assert caught.value.file == names[0] and names[6] not in str(caught.value)
+
+
+def test_a_refusal_that_is_no_pictures_stays_what_it_is(tmp_path):
+    folder = Folder(tmp_path / "c", looks=2)
+    (tmp_path / "taken").write_bytes(b"")
+    with pytest.raises(InputError, match="taken"):
+        detect(read_campaign(folder.path), overlay=tmp_path / "taken")
+
+
 def test_no_frames_and_wrong_methods_are_named(tmp_path):
     folder = Folder(tmp_path / "c", looks=1)
     with pytest.raises(InputError, match="no method 'blob'"):

@@ -20,6 +20,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, replace
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -30,7 +31,7 @@ from tvsbayes.cameras.spot_fit import Centre, Located, centre_of, fit_spot, skew
 from tvsbayes.cameras.spot_noise import CONTRAST_DEFAULT, SHAPE_SPOTS_MIN, SpotNoise, learn_noise, mean_noise
 from tvsbayes.cameras.spot_overlay import overlay_of
 from tvsbayes.cameras.spot_window import CLIPPED_SHARE_MAX, WIDE_SD_PX, Patch, patch_around
-from tvsbayes.errors import InputError, NothingToEstimate, escaped, refusal
+from tvsbayes.errors import InputError, NothingToEstimate, all_of, escaped, refusal
 from tvsbayes.files.disk import make_folder, read_bytes, write_atomically
 from tvsbayes.files.images import (
     IMAGE_BYTES_MAX,
@@ -170,6 +171,14 @@ class _Frames:
         deep = {side: one for side, one in data.items() if is_deep(one)}
         return max((int(decode_image(one, self.path(spot, side).name).max()) for side, one in deep.items()), default=0)
 
+    def refused(self, picture: tuple[Spot, str]) -> InputError | None:
+        """Why the picture of a look and a side cannot be used; None where it can."""
+        try:
+            decode_image(self._data(*picture), self.path(*picture).name)
+        except InputError as error:
+            return error
+        return None
+
     def _data(self, spot: Spot, side: str) -> bytes:
         path = self.path(spot, side)
         # Its size before it is decoded: a small file can hold 50 million pixels, on every thread.
@@ -226,22 +235,27 @@ def detect(
         raise _no_frames(campaign)
     workers = workers or os.cpu_count() or 1
     learning = min(PILOTS_MAX, len(present)) if method == "fit" else 0
-    levelling = len(present) if frames.deep(campaign.spots[present[0]]) else 0
-    with Job({LEVELLING: levelling, LEARNING: learning, DETECTING: len(present)}, progress) as job:
-        job.begin(LEVELLING)
-        largest = 0
-        # All of them: no few looks need hold the brightest, and one level has to serve every look.
-        for count, found in enumerate(_parallel(frames.largest, [campaign.spots[row] for row in present], workers)):
-            largest = max(largest, found)
-            job.at(count / len(present))
-        frames = replace(frames, white=white_level(largest) if largest else None)
-        job.begin(LEARNING)
-        looks = _looks(campaign, method, frames, present, speckle_contrast, workers, overlay)
-        job.begin(DETECTING)
-        pairs = []
-        for pair in _parallel(looks.centres, present, workers):
-            pairs.append(pair)
-            job.at(len(pairs) / len(present), f"{len(pairs)} of {len(present)} looks")
+    seen_spots = [campaign.spots[row] for row in present]
+    try:
+        levelling = len(present) if frames.deep(seen_spots[0]) else 0
+        with Job({LEVELLING: levelling, LEARNING: learning, DETECTING: len(present)}, progress) as job:
+            job.begin(LEVELLING)
+            largest = 0
+            # All of them: no few looks need hold the brightest, and one level has to serve every look.
+            for count, found in enumerate(_parallel(frames.largest, seen_spots, workers)):
+                largest = max(largest, found)
+                job.at(count / len(present))
+            frames = replace(frames, white=white_level(largest) if largest else None)
+            job.begin(LEARNING)
+            looks = _looks(campaign, method, frames, present, speckle_contrast, workers, overlay)
+            job.begin(DETECTING)
+            pairs = []
+            for pair in _parallel(looks.centres, present, workers):
+                pairs.append(pair)
+                job.at(len(pairs) / len(present), f"{len(pairs)} of {len(present)} looks")
+    except InputError as first:
+        every = [error for error in _parallel(frames.refused, list(product(seen_spots, CAMERAS)), workers) if error]
+        raise all_of(every or [first]) from None
     noise = _relearned(looks.noise, pairs, speckle_contrast) if method == "fit" else looks.noise
     sides = {side: widened([pair[k].under(noise[side]) for pair in pairs]) for k, side in enumerate(CAMERAS)}
     seen = list(zip(sides["left"].centres, sides["right"].centres, strict=True))
