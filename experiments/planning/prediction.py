@@ -6,11 +6,11 @@
 
 Four designs on the mounted rig: the paper's 96 experiments, the grid, and what `tvsbayes plan` recommends for its
 default target with an assurance of 80 % (`n80`) and of 95 % (`n95`). Campaign i of a design is drawn with a seed of its
-own, every prior quantity anew, simulated by the twin, fitted and sampled (as `tvsbayes study` does). Compared are: the error
-of the estimate with the sd that the planner predicts AT that truth before any data (RMS of z, chi-square bounds at
-1e-4); with the sd that the fit reports; and the share of fits that report the target as met with the assurance that the
-planner stated from its own draws (binomial bounds around the stated value, which has a Monte Carlo error itself). The
-last column repeats the first comparison with the predicted sd times 0.8: it must fail, or the test could not.
+own, every prior quantity anew, simulated by the twin, fitted and sampled (as `tvsbayes study` does). Compared are: the
+error of the estimate with the sd that the planner predicts AT that truth before any data (RMS of z, chi-square bounds
+at 1e-4); with the sd that the fit reports; and the share of fits that report the target as met with the assurance that
+the planner stated from its own draws (binomial bounds around the stated value, which has a Monte Carlo error itself).
+The last column repeats the first comparison with the predicted sd times 0.8: it must fail, or the test could not.
 """
 
 from __future__ import annotations
