@@ -1,7 +1,7 @@
 """A campaign as the arrays that the compiled functions take: spots in time order, moves, both padded to a bucket.
 
-Sizes are powers of two from `SMALLEST_BUCKET`, so that a second campaign compiles nothing. px, counters in steps,
-aperture readings in rad; padded rows are not valid and count nothing.
+Sizes are powers of two from `SMALLEST_BUCKET`, so that a second campaign compiles nothing; places of gears have sizes
+of their own. px, counters in steps, aperture readings in rad; padded rows are not valid and count nothing.
 """
 
 from __future__ import annotations
