@@ -27,6 +27,7 @@ from tvsbayes.cli.app import report_line
 from tvsbayes.cli.main import run
 from tvsbayes.errors import DeviceFault, InputError, NotConverged
 from tvsbayes.files.disk import output_place, read_arrays
+from tvsbayes.files.images import decode_image
 from tvsbayes.instrument.campaign import input_hashes, read_campaign, write_campaign
 from tvsbayes.pipeline import record_for
 
@@ -464,13 +465,17 @@ def test_frames_of_another_size_are_refused_before_they_are_decoded(good, tmp_pa
     folder = place_of(good, tmp_path)
     (folder / "frames" / "000010_left.png").write_bytes(png(1000, 1000))
 
-    def decoded(data, file):
-        raise AssertionError("decoded")
+    decoded = []
 
-    monkeypatch.setattr("tvsbayes.cameras.detection.decode_image", decoded)
+    def noted(data, file):
+        decoded.append(file)
+        return decode_image(data, file)
+
+    monkeypatch.setattr("tvsbayes.cameras.detection.decode_image", noted)
     with pytest.raises(InputError) as caught:
         detect(read_campaign(folder))
-    assert caught.value.code == "image-size"
+    assert caught.value.code == "image-size" and caught.value.file == "000010_left.png"
+    assert "000010_left.png" not in decoded
 
 
 def test_boards_of_too_many_pixels_are_refused_before_they_are_decoded(tmp_path, monkeypatch):
