@@ -178,6 +178,19 @@ def test_hostile_pictures_are_refused_by_name(tmp_path, kind):
         find_views(folder, BOARD)
 
 
+@pytest.mark.parametrize("kind", ("garbage", "damaged"))
+def test_all_pictures_that_cannot_be_used_are_named_at_once(tmp_path, kind):
+    """By their headers or by what the decoder says: two of four pictures."""
+    for name, pose in (("1", POSES[0]), ("2", POSES[1])):
+        write_pair(tmp_path, name, pictures(pose))
+    for name in ("left1.png", "right2.png"):
+        data = bytearray((tmp_path / name).read_bytes())
+        data[0 if kind == "garbage" else len(data) // 2] ^= 255
+        (tmp_path / name).write_bytes(data)
+    with pytest.raises(InputError, match=r"left1.png: found .*; likewise right2.png$"):
+        find_views(tmp_path, BOARD)
+
+
 def test_no_pictures_is_said(tmp_path):
     (tmp_path / "notes.txt").write_text("nothing")
     with pytest.raises(NothingToEstimate, match="no checkerboard picture"):

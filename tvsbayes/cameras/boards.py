@@ -22,7 +22,7 @@ import numpy as np
 
 from tvsbayes.cameras.camera_marks import paired_pictures, unnamed_pictures
 from tvsbayes.cameras.picture_pairs import NAMING, SIDE_BY_SIDE_RATIO, Picture, natural_order
-from tvsbayes.errors import InputError, NothingToEstimate, escaped, refusal
+from tvsbayes.errors import InputError, NothingToEstimate, all_of, escaped, refusal
 from tvsbayes.files.disk import read_bytes
 from tvsbayes.files.images import IMAGE_BYTES_MAX, image_size, in_grey_levels, read_image
 from tvsbayes.instrument.campaign import CAMERAS
@@ -318,16 +318,17 @@ def _sizes(folder: Path, swap: bool) -> dict[Picture, tuple[int, int]]:
 
     The pictures of the majority are one calibration, and only those are decoded.
     """
-    sizes = {}
+    sizes, refused = {}, []
     for picture in paired_pictures(folder, swap=swap, most=PICTURES_MAX):
-        data = read_bytes(picture.path, IMAGE_BYTES_MAX, folder)
-        width, height = image_size(data, escaped(picture.path.name))
-        if width * height > PIXELS_MAX:
-            place, found = escaped(picture.path.name), f"{width} x {height} pixels"
-            allowed = f"at most {PIXELS_MAX // 1_000_000} million pixels"
-            raise refusal("image-size", file=place, found=found, allowed=allowed, remedy="record smaller pictures")
+        try:
+            width, height = _size(picture.path, folder)
+        except InputError as error:
+            refused.append(error)
+            continue
         if len(picture.sides) == 1 or width >= SIDE_BY_SIDE_RATIO * height:
             sizes[picture] = width // len(picture.sides), height
+    if refused:
+        raise all_of(refused)
     if not sizes:
         raise NothingToEstimate(
             "no-pictures",
@@ -338,13 +339,26 @@ def _sizes(folder: Path, swap: bool) -> dict[Picture, tuple[int, int]]:
     return sizes
 
 
+def _size(path: Path, folder: Path) -> tuple[int, int]:
+    """Width and height of a picture, by its header."""
+    width, height = image_size(read_bytes(path, IMAGE_BYTES_MAX, folder), escaped(path.name))
+    if width * height > PIXELS_MAX:
+        place, found = escaped(path.name), f"{width} x {height} pixels"
+        allowed = f"at most {PIXELS_MAX // 1_000_000} million pixels"
+        raise refusal("image-size", file=place, found=found, allowed=allowed, remedy="record smaller pictures")
+    return width, height
+
+
 def _detections(
     folder: Path, pictures: Sequence[Picture], size: tuple[int, int], board: Board, finder: Finder
 ) -> Iterator[dict[str, _Detection | None]]:
     """The boards in pictures, by the camera whose image holds it."""
 
-    def detect(picture: Picture) -> dict[str, _Detection | None]:
-        pixels = in_grey_levels(read_image(picture.path, folder))
+    def detect(picture: Picture) -> dict[str, _Detection | None] | InputError:
+        try:
+            pixels = in_grey_levels(read_image(picture.path, folder))
+        except InputError as error:
+            return error
         # The finders want 8 bits; a corner is an average over hundreds of pixels.
         if pixels.dtype != np.uint8:
             pixels = np.rint(pixels).astype(np.uint8)
@@ -357,7 +371,14 @@ def _detections(
 
     at_once = PIXELS_MAX // (size[0] * size[1] * max(len(p.sides) for p in pictures))
     with ThreadPoolExecutor(max(1, min(WORKERS_MAX, os.cpu_count() or 1, at_once))) as pool:
-        yield from pool.map(detect, pictures)
+        refused = []
+        for found in pool.map(detect, pictures):
+            if isinstance(found, InputError):
+                refused.append(found)
+            else:
+                yield found
+    if refused:
+        raise all_of(refused)
 
 
 def _detection(grey: np.ndarray, board: Board, finder: Finder) -> _Detection | None:
