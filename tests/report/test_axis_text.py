@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise
 
 import pytest
+from support.axes import drawn, runs
 
-from tvsbayes.report.axis_text import axis_plan_text, deviation_table
-from tvsbayes.single_axis.axis_record import PositionDeviation
+from tvsbayes.report.axis_text import axis_fit_text, axis_plan_text, deviation_table
+from tvsbayes.single_axis.axis_fit import fit_axis
+from tvsbayes.single_axis.axis_record import PositionDeviation, summarise_axis
 from tvsbayes.single_axis.next_stops import AxisPlan, NextStop
 
 
@@ -29,3 +32,23 @@ def test_a_long_table_keeps_both_ends_and_says_what_it_leaves_out(count, kept):
     gaps = {b - a for a, b in pairwise(positions)}
     assert not gaps or max(gaps) - min(gaps) <= 1
     assert (f"{kept} of {count}" in table.caption) is ("fit.json" in table.caption) is (kept < count)
+
+
+@pytest.fixture(scope="module")
+def clean():
+    summary = summarise_axis(fit_axis(drawn(7, runs(2)).campaign, tier=None))
+    return replace(summary, converged=True, problems=(), prior_conflicts=(), warnings=())
+
+
+@pytest.mark.parametrize(
+    ("warnings", "said"),
+    [
+        ((), "usable"),
+        (("segment 2 reads 16 times what others read",), "usable; mind the warning"),
+        (("reading 5 lies 9 sds off", "all moves have the same time"), "usable; mind the 2 warnings"),
+    ],
+)
+def test_the_verdict_alone_says_that_warnings_stand_beside_it(clean, warnings, said):
+    text = axis_fit_text(replace(clean, warnings=warnings))
+    assert text.splitlines()[-1] == f"verdict: {said}"
+    assert text.count("warning: ") == len(warnings)

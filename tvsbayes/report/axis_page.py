@@ -17,6 +17,7 @@ from tvsbayes.report.axis_text import (
     iso230_table,
     parameter_table,
     ratio_table,
+    reserved,
 )
 from tvsbayes.report.drawing import BLUE, GREY, RED, SKY, STYLE, WIDTH_IN
 from tvsbayes.report.first_page import about_table
@@ -96,7 +97,8 @@ def axis_page(results: AxisResults, issue: Issue) -> Page:
     classic = summary.classic
     told = f"Least-squares line: {concise(classic.per_command, classic.u_per_command)} {unit} per command, stops "
     told += f"independent, residual scatter {two_digits(classic.residual_sd)} {unit}."
-    converged = "The intervals may be used." if summary.converged else "NOT CONVERGED: the numbers must not be used"
+    usable = f"The intervals may be used{reserved(summary)}."
+    converged = usable if summary.converged else "NOT CONVERGED: the numbers must not be used"
     if summary.converged and summary.prior_conflicts:
         converged = f"PRIOR CONFLICT: {CONFLICTING}."
     conflicts = [f"Prior conflict: {text}" for text in summary.prior_conflicts]

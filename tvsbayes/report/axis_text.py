@@ -94,6 +94,12 @@ def _lines(title: str, texts: Sequence[str]) -> list[str]:
     return [f"{title}: {text}" for text in texts]
 
 
+def reserved(summary: AxisSummary) -> str:
+    """What a reader of a verdict alone would miss: that warnings stand beside it."""
+    count = len(summary.warnings)
+    return f"; mind the {count} warnings" if count > 1 else "; mind the warning" * count
+
+
 def axis_fit_text(summary: AxisSummary, details: bool = False, written: Sequence[str] = ()) -> str:
     """What the reader must know, then the tables, then one line of verdict.
 
@@ -119,7 +125,7 @@ def axis_fit_text(summary: AxisSummary, details: bool = False, written: Sequence
     parts = [counted, parameter_table(summary).text(), ratio_table(summary).text()]
     verdict = "NOT CONVERGED, use none of these numbers"
     if summary.converged:
-        verdict = f"PRIOR CONFLICT, {CONFLICTING}" if summary.prior_conflicts else "usable"
+        verdict = f"PRIOR CONFLICT, {CONFLICTING}" if summary.prior_conflicts else f"usable{reserved(summary)}"
     return "\n".join([*lines, *[""] * bool(lines), *parts, f"verdict: {verdict}"])
 
 
