@@ -36,7 +36,7 @@ def test_a_long_table_keeps_both_ends_and_says_what_it_leaves_out(count, kept):
 
 @pytest.fixture(scope="module")
 def clean():
-    summary = summarise_axis(fit_axis(drawn(7, runs(2)).campaign, tier=None))
+    summary = summarise_axis(fit_axis(drawn(7, runs(2)).campaign, sampled=False))
     return replace(summary, converged=True, problems=(), prior_conflicts=(), warnings=())
 
 
