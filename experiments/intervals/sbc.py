@@ -298,6 +298,7 @@ def clean_part(design: Design, p: dict[str, float], pictured: bool) -> None:
         values = design.pit[name]
         spread = values.std() * np.sqrt(12)
         print(f"| {name} | {values.mean():.3f} | {spread:.3f} | {p[name]:.3f} | {sum_of_squares_p(values):.3f} |")
+    print()
 
 
 def run(arguments: argparse.Namespace) -> None:

@@ -280,7 +280,7 @@ LINES = (
     ),
     Line(
         "... and by the chain",
-        "python -m experiments.intervals.posterior_coverage run --tier emcee --n 100 --protocols paper --cores 0 1",
+        "python -m experiments.intervals.posterior_coverage run --tier emcee --n 100 --cores 0 1",
         "intervals/posterior_coverage.jsonl",
         partial(sampled_coverage, tier=TIERS[1]),
     ),
