@@ -152,22 +152,22 @@ def workings(of: dict[str, list[dict]]) -> None:
 
 
 def table_tier(tier: str, rows: list[dict]) -> None:
-    """Coverage and workings of one tier over all protocols."""
-    print(f"## {TITLES[tier]}\n")
+    """Coverage and workings of one tier over all protocols; nothing of a tier that was not run."""
     of = {p: [r for r in rows if r["tier"] == tier and r["protocol"] == p] for p in PROTOCOLS}
     if not any(of.values()):
-        print("Not run yet.\n")
         return
+    print(f"## {TITLES[tier]}\n")
     workings(of)
     for protocol, chosen in of.items():
         good = [r for r in chosen if r["converged"] and r["sampled"]]
         print(f"### {protocol}: {len(chosen)} rigs, {len(good)} with a converged fit and accepted draws\n")
         if good:
             coverage(good, [r for r in chosen if "posterior" in r])
-        for r in chosen:
-            if r not in good:
-                print(f"- not accepted: {protocol} seed {r['seed']}: {'; '.join(r['problems'])}")
-        print()
+        refused = [r for r in chosen if r not in good]
+        for r in refused:
+            print(f"- not accepted: {protocol} seed {r['seed']}: {'; '.join(r['problems'])}")
+        if refused:
+            print()
 
 
 def table_small(rows: list[dict]) -> None:
@@ -203,8 +203,10 @@ def table(arguments: argparse.Namespace) -> None:
     rows = read_rows(arguments.rows)
     print("# Coverage of the sampled posterior\n")
     print("Written by `python -m experiments.intervals.posterior_coverage table`; what is in it and how it was made")
-    print(f"stands in the script. {NOTE}; rig i has seed i. CPU seconds")
-    print("on two cores shared with other work; their medians are free of compilation.\n")
+    print(f"stands in the script. {NOTE}; rig i has seed i. Gears repeat their")
+    print("errors, as the priors of the mounted rig draw them. What importance sampling refuses goes on to the chain")
+    print("in `fit`, `calibrate` and `study`. CPU seconds on two cores shared with other work; their medians are free")
+    print("of compilation.\n")
     for tier in TIERS:
         table_tier(tier, rows)
     table_small(read_rows(SBC_ROWS))

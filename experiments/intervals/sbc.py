@@ -2,7 +2,7 @@
 
     python -m experiments.intervals.sbc run --n 1000 --cores 0 1       # CPU seconds a rig: see sbc.md; resumable
     python -m experiments.intervals.sbc run --variants "prior x3" "camera dropped" --n 50 --cores 0 1
-    python -m experiments.intervals.sbc run --variants "few stops" --n 200 --cores 0 1
+    python -m experiments.intervals.sbc run --variants "few stops" --n 50 --cores 0 1
     python -m experiments.intervals.sbc run --tier emcee --n 200 --cores 0 1
     python -m experiments.intervals.sbc table > experiments/intervals/sbc.md     # also writes sbc.png
 
@@ -241,16 +241,15 @@ def table(arguments: argparse.Namespace) -> None:
     print("Written by `python -m experiments.intervals.sbc table` after `run`; rig i has seed i. 60 spots of the")
     print("mounted rig (48 for `few stops`), every prior quantity anew, no aperture readings; two shared cores.\n")
     for tier, title in zip(TIERS, ("Tier 1, importance sampling", "Tier 2, emcee"), strict=True):
-        print(f"## {title}\n")
-        table_tier([r for r in rows if r["tier"] == tier], tier == TIERS[0])
+        table_tier(title, [r for r in rows if r["tier"] == tier], tier == TIERS[0])
 
 
-def table_tier(rows: list[dict], pictured: bool) -> None:
-    """Every design of one tier."""
+def table_tier(title: str, rows: list[dict], pictured: bool) -> None:
+    """Every design of one tier; nothing of a tier that was not run."""
     found = designs(rows)
     if not found:
-        print("Not run yet.\n")
         return
+    print(f"## {title}\n")
     columns = ("draws", "simulations", "not accepted", "quantities", "criterion p", "least p, of", "p log-likelihood")
     columns += ("p log-posterior", "quantities failing", "verdict", "wanted")
     print("| " + " | ".join(columns) + " |\n|" + "---|" * len(columns))

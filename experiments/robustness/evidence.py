@@ -292,7 +292,7 @@ LINES = (
     ),
     Line(
         "... also with twelve stops in every direction",
-        'python -m experiments.intervals.sbc run --variants "few stops" --n 200 --cores 0 1',
+        'python -m experiments.intervals.sbc run --variants "few stops" --n 50 --cores 0 1',
         "intervals/sbc.jsonl",
         lambda r: ranks(r, "few stops"),
     ),
