@@ -78,8 +78,8 @@ def test_instruments_that_miss_the_point_or_see_nothing_report_no_uncertainty(kn
     blind = Assurance(family, target, instruments, 1)
     shown = blind.arrays.at_all
 
-    def closed(z, value):
-        seen = shown(z, value)
+    def closed(z, value, turning):
+        seen = shown(z, value, turning)
         seen.seen[3] = False
         return seen
 

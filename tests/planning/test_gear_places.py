@@ -4,19 +4,27 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from support.coarse_planning import ROUNDING, with_priors
 
 from tvsbayes.instrument.axes import DIRECTIONS
-from tvsbayes.instrument.parameters import NAMES, Prior, names_of
+from tvsbayes.instrument.parameters import INDEX, NAMES, Prior, names_of
 from tvsbayes.instrument.plan import PlanStep
 from tvsbayes.instrument.protocols import grid_protocol, paper_protocol
+from tvsbayes.model.compiled import placed
 from tvsbayes.model.gear_kriging import scales_at
+from tvsbayes.model.gear_processes import Places
+from tvsbayes.model.headlines import SeenLine, line_deg_per_step
+from tvsbayes.model.laser_path import beam_angles
+from tvsbayes.planning.assurance import Assurance, Family, believed, own_gears
 from tvsbayes.planning.candidates import candidates
+from tvsbayes.planning.drawn_rigs import Instruments, draw_instruments
 from tvsbayes.planning.expectation import PARAMETERS, information_of, prior_knowledge
 from tvsbayes.planning.gear_places import NO_PLACES, GearPlaces, TaughtErrors, regular_places, windows_of
-from tvsbayes.planning.looks import LookArrays, arrange, covariance_of, information_of_looks
+from tvsbayes.planning.looks import CONTRAST_COLUMNS, LookArrays, arrange, covariance_of, information_of_looks
 from tvsbayes.planning.plan_check import check_plan
 from tvsbayes.planning.planner import judged
 from tvsbayes.planning.search import search_designs
@@ -29,6 +37,7 @@ MIRRORS = names_of(
     *("mirror1_error_deg", "mirror2_error_deg", "laser_tilt_deg", "laser_offset_mm"),
     *("tilt_axis_skew_deg", "tilt_axis_offset_mm"),
 )
+ERRORS = [INDEX[f"transmission_error_deg.{axis}"] for axis in ("pan", "tilt")]
 WORST = parse_target("u(worst) <= 2e-4 deg/step")
 
 
@@ -83,6 +92,95 @@ def test_a_full_turn_away_is_a_window_of_its_own_and_no_part_of_the_line():
         own = gears.on_tilt == axis
         assert np.ptp(gears.steps[own]) == range_steps
         assert gears.share[own] @ gears.steps[own] == pytest.approx(1) and gears.share[own].sum() == pytest.approx(0)
+
+
+def test_a_line_through_looks_is_the_least_squares_line_of_what_places_carry():
+    """Of any cubic over the counters of the first turn, which four places carry exactly; of lines over all turns."""
+    reached = np.column_stack([np.append(np.linspace(0, 240, 9), [6000, 6120, 6240]), np.linspace(-90, 90, 12)])
+    gears = regular_places(reached, np.array([PAN, TILT]), some_places().scales)
+    generator = np.random.default_rng(11)
+    steps = np.column_stack([generator.integers(0, 241, 20), generator.integers(-90, 91, 20)])
+    weight = generator.integers(0, 3, (2, 20))
+    turned = steps + np.array([6000, 0]) * (np.arange(20)[:, None] % 4 == 0)
+    for row, taken in zip(gears.line_through(steps, weight), weight, strict=True):
+        for axis, on_axis in ((0, ~gears.on_tilt), (1, gears.on_tilt)):
+            cubic = np.poly1d(generator.standard_normal(4) / [1e6, 1e4, 1e2, 1])
+            wanted = np.polyfit(steps[:, axis], cubic(steps[:, axis]), 1, w=np.sqrt(taken))[0]
+            assert row[on_axis] @ cubic(gears.steps[on_axis]) == pytest.approx(wanted, rel=1e-9)
+    far = gears.line_through(turned, weight[0])
+    assert far[~gears.on_tilt] @ gears.steps[~gears.on_tilt] == pytest.approx(1)
+    assert far[(gears.steps > 5000) & ~gears.on_tilt].any() and far.sum() == pytest.approx(0, abs=1e-12)
+    still = gears.line_through(np.tile(steps[:1], (20, 1)), weight[0])
+    assert not still.any(), "one counter has no line"
+
+
+def test_a_ratio_is_the_sum_of_what_each_place_has_in_it(real):
+    """The slope and its derivatives along any line, at one instrument: by the formula of fits itself, by differences.
+
+    An axis without a line has the slope of its mirrors at the pose.
+    """
+    known, _ = real
+    gears, pose = known.gears, np.radians([7.0, 3.0])
+    z = known.z + 0.3 * np.random.default_rng(2).standard_normal(PARAMETERS)
+    share = gears.line_through(np.array([[0, -60], [60, 20], [200, 75]]), np.ones(3))
+    places = Places(placed(gears.steps), placed(gears.on_tilt), placed(np.ones(len(gears.steps), dtype=bool)))
+
+    @jax.jit
+    def traced(z, errors_rad, share):
+        model = known.space.model(z)
+        mirrors = beam_angles(model.optics, *jnp.asarray(pose))
+        return line_deg_per_step(model, SeenLine(jnp.asarray(pose), places, share), errors_rad, mirrors)
+
+    def slopes(z, errors, share):
+        with jax.enable_x64(True):
+            return np.asarray(traced(z, gears.root @ errors, share))
+
+    nothing = np.zeros(gears.size)
+    for one in (share, np.where(gears.on_tilt, 0.0, share), gears.share):
+        found = replace(gears, share=one).headlines(z, known.space, pose)
+        np.testing.assert_allclose(np.asarray(found.value)[:4], slopes(z, nothing, one), rtol=1e-12)
+        step = np.random.default_rng(3).standard_normal(known.size)
+        ends = [slopes(z + h * step[:PARAMETERS], h * step[PARAMETERS:], one) for h in (1e-5, -1e-5)]
+        wanted = (ends[0] - ends[1]) / 2e-5
+        # Central differences of angles near 1 rad in float64: 1e-16 / 1e-5 in 100 steps, some 1e-11 deg/step.
+        np.testing.assert_allclose(np.asarray(found.gradient)[:4] @ step, wanted, atol=1e-9)
+
+
+def test_what_is_reported_of_real_gears_is_along_the_looks_by_the_instruments_own_scales(real):
+    """Assurance of designs equals the plan judged move by move, on gears whose errors are as large as drawn.
+
+    Neither the line over all candidates nor the scales believed beforehand would do: both tell another u.
+    """
+    known, found = real
+    family = Family(known, found, np.random.default_rng(4).integers(0, len(found.looks), 24), False)
+    drawn = draw_instruments(known, 3, 5)
+    drawn.z[:, CONTRAST_COLUMNS] = 0.0
+    assurance = Assurance(family, WORST, Instruments.at(drawn.z, drawn.value, drawn.common), 5)
+    reported, steps = assurance.values([6])[6], family.arranged(6).steps
+    for row in range(3):
+        here, z, space = assurance.instruments[np.array([row])], drawn.z[row], drawn.space_of(row)
+        mine = own_gears(known, here.physical[0])
+        own = known.with_places(mine)
+        assert own.gears.scales.error_rad == pytest.approx(np.radians(here.physical[0][ERRORS]))
+        seen = LookArrays(assurance.looks, own, False).at(z, space)
+        exact = information_of(steps, own, z=z, space=space)
+        first = covariance_of(own.precision + exact.fisher)[None]
+        at = believed(here, seen[None], assurance.looks.side, assurance.index, first, own, assurance.noise[None, row])[
+            0
+        ]
+        judged = covariance_of(own.precision + information_of(steps, own, z=at, space=space).fisher)
+        pose = seen.mirror_angles_rad[assurance.index].mean(axis=0)
+        taken = seen.seen * np.bincount(assurance.index)
+
+        def u(gears, covariance, z=z, space=space, pose=pose):
+            return sensitivity(WORST, z, space, known.rig.table, pose, gears).value(covariance)
+
+        lined = replace(mine, share=mine.line_through(assurance.looks.steps, taken))
+        assert reported[row] == pytest.approx(u(lined, judged), rel=ROUNDING)
+        assert abs(u(mine, judged) / reported[row] - 1) > 1e-3, "the line over all candidates is another"
+        prior = covariance_of(known.precision + information_of(steps, known, z=at, space=space).fisher)
+        common = replace(known.gears, share=lined.share)
+        assert abs(u(common, prior) / reported[row] - 1) > 1e-3, "so are the scales believed beforehand"
 
 
 def test_what_a_fit_says_at_its_places_is_carried_to_others():

@@ -12,12 +12,15 @@ from functools import lru_cache
 import numpy as np
 
 from tvsbayes.errors import InputError
+from tvsbayes.instrument.axes import AXES
 from tvsbayes.instrument.parameters import INDEX, RIG_NAMES
 from tvsbayes.instrument.plan import LOOKS_PER_EXPERIMENT
-from tvsbayes.model.parameter_space import STOP_COLUMNS
+from tvsbayes.model.gear_kriging import scales_at
+from tvsbayes.model.parameter_space import STOP_COLUMNS, ParameterSpace
 from tvsbayes.planning.candidates import Candidates
 from tvsbayes.planning.drawn_rigs import Instruments
 from tvsbayes.planning.expectation import NOISE_COLUMNS, PARAMETERS, Knowledge
+from tvsbayes.planning.gear_places import GearPlaces
 from tvsbayes.planning.looks import Arranged, LookArrays, Looks, Seen, arrange, covariance_of, information_of_looks
 from tvsbayes.planning.target import Sensitivity, Target, sensitivity
 from tvsbayes.progress import Advance, unshown
@@ -84,6 +87,25 @@ def believed(
     return z
 
 
+def own_gears(knowledge: Knowledge, physical: np.ndarray) -> GearPlaces:
+    """The places of the gears of an instrument: before any data it repeats errors of its own scales.
+
+    On the average over instruments a fit, which takes its variance over all that the scales may be, reports what it
+    would if it knew them. After data they are as good as known.
+
+    Args:
+        knowledge: before the looks.
+        physical: the instrument's values in the units of `NAMES`, shape (p,).
+    """
+    gears = knowledge.gears
+    if knowledge.after_data or not gears.size:
+        return gears
+    ratio = np.radians([physical[INDEX[f"degrees_per_step.{axis}"]] for axis in AXES])
+    return replace(
+        gears, ratio_rad_per_step=ratio, scales=scales_at(physical, np.asarray(knowledge.space.harmonic_period_deg))
+    )
+
+
 @dataclass(frozen=True)
 class Family:
     """Designs that grow by one look at a time: the first 4 n of `picks` are n experiments."""
@@ -115,13 +137,15 @@ class _Scene:
         rows: numbers of those that see any look and reach the target's point, n of them.
         instruments: these.
         seen: shapes (n, looks, ...).
-        target: gradients (n, q, p + e) and variances of its own (n, q).
+        gradient: of the target, shape (n, q, p + e); of lines by each place, which designs sum, (n, c + 1, q, p + e).
+        own_variance: of the target beside it, shape (n, q).
     """
 
     rows: np.ndarray
     instruments: Instruments
     seen: Seen
-    target: Sensitivity
+    gradient: np.ndarray
+    own_variance: np.ndarray
 
 
 class Assurance:
@@ -132,6 +156,9 @@ class Assurance:
 
     def __init__(self, family: Family, target: Target, instruments: Instruments, seed: int):
         self.family, self.target, self.instruments, self.seed = family, target, instruments, seed
+        # After data a fit's line goes through the looks of both, of which the places know the sum alone.
+        before = not family.knowledge.after_data
+        self._of_lines = before and target.point_mm is None and family.knowledge.gears.size > 0
         self.noise = np.random.default_rng([seed, 37]).standard_normal((len(instruments), len(SCALES)))
         self.distinct, self.index = np.unique(family.picks, return_inverse=True)
         self.looks = family.found.looks[self.distinct]
@@ -162,20 +189,32 @@ class Assurance:
 
     def _evaluated(self, first: int, end: int) -> _Scene:
         every, knowledge = self.instruments[np.arange(first, end)], self.family.knowledge
-        table, gears = knowledge.rig.table, knowledge.gears
-        seen = self.arrays.at_all(every.z, every.value)
+        gears = [own_gears(knowledge, physical) for physical in every.physical]
+        turning = np.array([own.turning(self.looks.steps, self.looks.side) for own in gears])
+        seen = self.arrays.at_all(every.z, every.value, turning)
         poses = seen.mirror_angles_rad[:, self.index].mean(axis=1)
-        rows, found = [], []
+        rows, aimed = [], []
         for row in np.flatnonzero(seen.seen.any(axis=1)).tolist():
             try:
-                found.append(sensitivity(self.target, every.z[row], every.space_of(row), table, poses[row], gears))
+                aimed.append(self._aimed(every.z[row], every.space_of(row), poses[row], gears[row]))
             except InputError:
                 continue
             rows.append(row)
-        gradient = np.array([one.gradient for one in found]).reshape(len(rows), -1, knowledge.size)
-        own = {"at the point": np.array([one.own_variance for one in found]).reshape(len(rows), -1)}
-        chosen = np.array(rows, dtype=int)
-        return _Scene(first + chosen, every[chosen], seen[chosen], Sensitivity(gradient, own))
+        chosen, wanted = np.array(rows, dtype=int), len(self.target.indices)
+        parts = (knowledge.gears.size // 2 + 1,) if self._of_lines else ()
+        gradient = np.array([one.gradient for one in aimed]).reshape(len(rows), *parts, wanted, knowledge.size)
+        own_variance = np.array([one.own_variance for one in aimed]).reshape(len(rows), *parts, wanted)
+        return _Scene(first + chosen, every[chosen], seen[chosen], gradient, own_variance)
+
+    def _aimed(self, z: np.ndarray, space: ParameterSpace, pose_rad: np.ndarray, gears: GearPlaces) -> Sensitivity:
+        """How the target hangs on the coordinates of an instrument; of lines, by each place with a leading axis c + 1.
+
+        Raises:
+            InputError: no beam reaches the target's point.
+        """
+        if self._of_lines:
+            return Sensitivity(np.asarray(gears.parts(z, space, pose_rad).gradient)[:, list(self.target.indices)])
+        return sensitivity(self.target, z, space, self.family.knowledge.rig.table, pose_rad, gears)
 
     def _reported(self, scene: _Scene, experiments: int, path: np.ndarray) -> np.ndarray:
         """Of the instruments of a scene, shape (n,)."""
@@ -188,7 +227,17 @@ class Assurance:
         first = covariance(scene.seen)
         noise = self.noise[scene.rows]
         z = believed(scene.instruments, scene.seen, self.looks.side, chosen, first, knowledge, noise)
-        return scene.target.values(covariance(self.rescaled(scene.seen, scene.instruments, z)), self.target.factor)
+        judged = covariance(self.rescaled(scene.seen, scene.instruments, z))
+        return self._hangs(scene, chosen).values(judged, self.target.factor)
+
+    def _hangs(self, scene: _Scene, chosen: np.ndarray) -> Sensitivity:
+        """How what is wanted hangs on the coordinates: ratios along the lines through the looks that are seen."""
+        if not self._of_lines:
+            return Sensitivity(scene.gradient, {"at the point": scene.own_variance})
+        gears, rows = self.family.knowledge.gears, list(self.target.indices)
+        taken = scene.seen.seen * np.bincount(chosen, minlength=len(self.looks))
+        weights = gears.weights(gears.line_through(self.looks.steps, taken))[:, rows]
+        return Sensitivity(np.einsum("nqi,niqp->nqp", weights, scene.gradient))
 
     def rescaled(self, seen: Seen, instruments: Instruments, z: np.ndarray) -> Seen:
         """The same looks (n, m) whitened with noise scales of other coordinates (n, p): I s^2 + slope S slope^T."""

@@ -20,7 +20,7 @@ from scipy import linalg
 from tvsbayes.instrument.axes import AXES
 from tvsbayes.instrument.campaign import Move
 from tvsbayes.instrument.parameters import KINDS, NAMES
-from tvsbayes.instrument.places import SPACING_DEG
+from tvsbayes.instrument.places import SPACING_DEG, interpolation
 from tvsbayes.instrument.stops import rests_of
 from tvsbayes.model.compiled import compiled, placed
 from tvsbayes.model.gear_kriging import KnownPlaces, scales_at
@@ -59,6 +59,38 @@ class GearPlaces(KnownPlaces):
                 found[:, axis] = np.concatenate([at.error, -0.5 * side[:, axis, None] * at.play], axis=1)
         return found
 
+    def line_through(self, steps: np.ndarray, weight: np.ndarray) -> np.ndarray:
+        """Share of each place in the slope of the line of its axis through looks, as a fit of these looks has it.
+
+        Args:
+            steps: counters of the looks, shape (m, 2).
+            weight: how often each is taken, shape (..., m).
+
+        Returns:
+            Shape (..., c); nought for an axis that is seen at one counter alone.
+        """
+        found = np.zeros((*weight.shape[:-1], len(self.steps)))
+        for axis in range(2):
+            counters = steps[:, axis].astype(float)
+            total = np.maximum(weight.sum(axis=-1, keepdims=True), 1)
+            off = counters - (weight @ counters)[..., None] / total
+            square = np.sum(weight * off**2, axis=-1, keepdims=True)
+            slope = np.divide(weight * off, square, out=np.zeros_like(off), where=square > 0)
+            found += slope @ self._interpolation(counters, axis)
+        return found
+
+    def _interpolation(self, counters: np.ndarray, axis: int) -> np.ndarray:
+        """Share of the places in the counters (m,) of an axis, each from those of its window, shape (m, c)."""
+        found = np.zeros((len(counters), len(self.steps)))
+        own = self.on_tilt == (axis == 1)
+        windows = windows_of(self.steps[own], abs(float(np.degrees(self.ratio_rad_per_step[axis]))))
+        nearest = np.argmin([np.abs(counters - nodes[:, None]).min(axis=0) for nodes in windows], axis=0)
+        for number, nodes in enumerate(windows):
+            here, places = np.flatnonzero(nearest == number), np.flatnonzero(own & np.isin(self.steps, nodes))
+            places = places[np.argsort(self.steps[places])]
+            found[np.ix_(here, places)] = interpolation(counters[here], nodes)
+        return found
+
     def turning_after(self, moves: Sequence[Move], looks: Sequence[int]) -> np.ndarray:
         """`turning` of the looks after some of the moves."""
         rests = [[rests[move] for move in looks] for rests in (rests_of(moves, axis) for axis in AXES)]
@@ -74,34 +106,67 @@ class GearPlaces(KnownPlaces):
         """
         if not self.size:
             return headlines(z, space, pose_rad)
-        valid = placed(np.ones(len(self.steps), dtype=bool))
-        places = Places(placed(self.steps), placed(self.on_tilt), valid)
-        return line_headlines(z, space, SeenLine(placed(pose_rad), places, placed(self.share)), placed(self.root))
+        parts, weights = self.parts(z, space, pose_rad), self.weights(self.share)
+        return Headlines(
+            placed(np.einsum("qi,iq->q", weights, parts.value)),
+            placed(np.einsum("qi,iqp->qp", weights, parts.gradient)),
+        )
+
+    def parts(self, z: np.ndarray, space: ParameterSpace, pose_rad: np.ndarray) -> Headlines:
+        """Headlines by each place alone, and last by none, which `weights` sum: arrays with a leading axis c + 1."""
+        places = Places(placed(self.steps), placed(self.on_tilt), placed(np.ones(len(self.steps), dtype=bool)))
+        alone = np.eye(len(self.steps) + 1, len(self.steps))
+        return place_headlines(z, space, placed(pose_rad), places, placed(alone), placed(self.root))
+
+    def weights(self, share: np.ndarray) -> np.ndarray:
+        """How lines sum `parts`, shape (..., 9, c + 1): a slope over places is the sum of what each has in it.
+
+        Args:
+            share: of each place in the slope of the line of its axis, steps^-1, shape (..., c).
+        """
+        of_places = np.where(LINED_AXIS[:, None] == self.on_tilt, share[..., None, :], 0.0)
+        of_none = ~(of_places != 0).any(axis=-1, keepdims=True)
+        return np.concatenate([of_places, of_none], axis=-1)
 
 
 NO_PLACES = GearPlaces(np.zeros(0), np.zeros(0, dtype=bool), np.zeros(2), None, np.zeros(0))
 """Of gears that repeat no error."""
+LINED_AXIS = np.array([0, 0, 1, 1, 0, 1, -1, -1, -1])
+"""The axis over whose places each of `QUANTITIES` is a line, -1 for none."""
 
 
 @compiled(Headlines)
-def line_headlines(
-    z: Float[Array, " parameters"], space: ParameterSpace, seen: SeenLine, root: Float[Array, "errors errors"]
+def place_headlines(
+    z: Float[Array, " parameters"],
+    space: ParameterSpace,
+    pose_rad: Float[Array, "2"],
+    places: Places,
+    shares: Float[Array, "lines places"],
+    root: Float[Array, "errors errors"],
 ) -> Headlines:
-    """Headlines with ratios along lines (formulation 3.2); derivatives by coordinates and errors at places."""
+    """Headlines with ratios along lines (formulation 3.2), several at once: every field has the leading axis `lines`.
 
-    def values(point):
-        model = space.model(point[: len(NAMES)])
-        mirrors = beam_angles(model.optics, seen.pose_rad[0], seen.pose_rad[1])
-        slopes = line_deg_per_step(model, seen, root @ point[len(NAMES) :], mirrors)
-        gears = model.transmission
-        # By their own parameters: what priors hold fixed shall hang on nothing, not even by rounding.
-        contrast = gears.contrast_rad_per_step / gears.ratio_rad_per_step * (slopes[::2] + slopes[1::2]) / 2
-        lost = gears.backlash_rad * DEGREES
-        offset = mirrors.effective_mirror_offset_mm[None]
-        return jnp.concatenate([slopes, contrast, lost, offset])
+    Derivatives are by coordinates and errors at the places.
+    """
 
-    point = jnp.concatenate([z, jnp.zeros(len(root))])
-    return Headlines(values(point), jax.jacfwd(values)(point))
+    def along(share):
+        seen = SeenLine(pose_rad, places, share)
+
+        def values(point):
+            model = space.model(point[: len(NAMES)])
+            mirrors = beam_angles(model.optics, pose_rad[0], pose_rad[1])
+            slopes = line_deg_per_step(model, seen, root @ point[len(NAMES) :], mirrors)
+            gears = model.transmission
+            # By their own parameters: what priors hold fixed shall hang on nothing, not even by rounding.
+            contrast = gears.contrast_rad_per_step / gears.ratio_rad_per_step * (slopes[::2] + slopes[1::2]) / 2
+            lost = gears.backlash_rad * DEGREES
+            offset = mirrors.effective_mirror_offset_mm[None]
+            return jnp.concatenate([slopes, contrast, lost, offset])
+
+        point = jnp.concatenate([z, jnp.zeros(len(root))])
+        return Headlines(values(point), jax.jacfwd(values)(point))
+
+    return jax.vmap(along)(shares)
 
 
 def believed_scales(z: np.ndarray, space: ParameterSpace, after_data: bool) -> GearScales:

@@ -262,8 +262,15 @@ class LookArrays:
             blocks.append(_Pairs(*map(placed, parts)))
         return blocks
 
-    def at_all(self, z: np.ndarray, value: np.ndarray) -> Seen:
-        """At instruments with coordinates (n, p) in spaces that differ by `value` (n, rig): a leading axis n."""
+    def at_all(self, z: np.ndarray, value: np.ndarray, turning: np.ndarray | None = None) -> Seen:
+        """At several instruments: a leading axis n.
+
+        Args:
+            z: coordinates, shape (n, p).
+            value: of their spaces, shape (n, rig).
+            turning: how errors of their own gears turn the looks, shape (n, m, 2, e); by default as of the knowledge's.
+        """
+        turning = self.turning if turning is None else turning
         found = [
             [np.asarray(part) for part in jax.tree.leaves(_shown(block, self.space, self.eyes))]
             for block in self._blocks(z, value, self.SHOWN)
@@ -271,10 +278,10 @@ class LookArrays:
         shape = len(z), len(self.looks)
         whole = (np.concatenate(parts)[: shape[0] * shape[1]] for parts in zip(*found, strict=True))
         seen = Seen(*(part.reshape(*shape, *part.shape[1:]) for part in whole))
-        if not self.turning.shape[2]:
+        if not turning.shape[-1]:
             return seen
         own, offset = seen.rows[..., :-2], seen.rows[..., -2:]
-        return replace(seen, rows=np.concatenate([own, offset @ self.turning, offset], axis=-1))
+        return replace(seen, rows=np.concatenate([own, offset @ turning, offset], axis=-1))
 
     def at(self, z: np.ndarray, space: ParameterSpace) -> Seen:
         """At one instrument: coordinates (p,) in a space that differs from the knowledge's by `value` at most."""
