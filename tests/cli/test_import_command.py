@@ -101,8 +101,9 @@ def test_options_that_say_nothing_usable_are_refused(say, table, tmp_path, optio
 
 
 def test_every_needed_column_is_asked_for_and_none_may_be_left_out(ask, tmp_path):
-    (tmp_path / "log.csv").write_text("a,b\n1,2\n")
+    (tmp_path / "log.csv").write_text("# bench 3\n\na,b\n1,2\n")
     code, document = ask("import", tmp_path / "log.csv", "--to", tmp_path / "axis", "--axis")
+    assert assert_error(document, "missing-column")["line"] == 3
     remedy = assert_error(document, "missing-column")["remedy"]
     assert code == 2 and "--column command=NAME --column value=NAME" in remedy and "none" not in remedy
 

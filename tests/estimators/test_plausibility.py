@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import datetime
 import json
 from dataclasses import replace
 
@@ -104,6 +105,21 @@ def test_zero_and_assumed_stereo_covariance_are_named(paper_twin):
     assert "stereo covariance is zero" in warnings_of(replace(paper_twin, stereo=zero))
     assumed = replace(paper_twin.stereo, assumed=True)
     assert "stereo covariance is assumed" in warnings_of(replace(paper_twin, stereo=assumed))
+
+
+@pytest.mark.parametrize(
+    ("created", "calibrated", "doubtful"),
+    [
+        (datetime.datetime(2026, 1, 15, 10, tzinfo=datetime.UTC), datetime.date(2026, 1, 16), True),
+        (datetime.datetime(2026, 1, 15, 10, tzinfo=datetime.UTC), datetime.datetime(2026, 1, 15, 18), False),
+        (datetime.date(2026, 1, 15), datetime.date(2026, 1, 3), False),
+        (None, datetime.date(2026, 1, 16), False),
+    ],
+)
+def test_cameras_calibrated_after_the_campaign_are_named(paper_twin, created, calibrated, doubtful):
+    header = {"created": created, "traceability": {"stereo_calibrated": calibrated}}
+    text = warnings_of(replace(paper_twin, header={key: value for key, value in header.items() if value}))
+    assert ("stereo_calibrated 2026-01-16 is later than created 2026-01-15" in text) is doubtful
 
 
 def test_unknown_approach_is_named_with_its_segment(paper_twin):

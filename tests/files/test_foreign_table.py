@@ -46,7 +46,7 @@ def test_remarks_empty_lines_and_missing_names(tmp_path):
     """Lines are those of the file; a table without names gets numbers; a stated separator counts."""
     table = written(tmp_path / "a.csv", b"sep=;\n# bench 3\n\n1;2,5\n3;4,5\n;\n")
     assert table.columns == {"column 1": ("1", "3"), "column 2": ("2.5", "4.5")}
-    assert table.lines == (4, 5)
+    assert table.lines == (4, 5) and table.first_line == 4
     assert written(tmp_path / "b.txt", b" x  y\n 1  2\n").columns == {"x": ("1",), "y": ("2",)}
     assert list(written(tmp_path / "c.csv", b"x,x,\n1,2,3\n").columns) == ["x", "x (2)"]
 
@@ -58,6 +58,7 @@ def test_remarks_empty_lines_and_missing_names(tmp_path):
         ("time n v\n" + "2026-01-02 10:00 5 7\n" * 20, 2, "4 cells under the 3 names", "spaces"),
         ("bench 3\n" + "n;v\n" + "1;2\n" * 20, 2, "2 cells under the 1 name of line 1", "put #"),
         ("n;v\n" + "1;2\n" * 20 + "1;2;a;b\n", 22, "4 cells under the 2 names of line 1", "quotes"),
+        ("# unit deg\nn;v\n0;0,1\n1;0,7;5\n2;1,3\n", 4, "3 cells under the 2 names of line 2", "quotes"),
     ],
 )
 def test_rows_with_more_cells_than_names_are_refused(tmp_path, lines, line, counts, cause):

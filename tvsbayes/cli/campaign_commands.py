@@ -215,8 +215,13 @@ def _held(path: Path, plan_file: Path | None) -> dict[str, Any]:
     if plan_file is not None:
         in_order(path, plan_file)
     if plan_file is not None and path.suffix != ".toml":
-        remedy = "give the rig file first, then the plan"
-        raise InputError("usage", "a plan is checked together with a rig file", allowed="RIG PLAN", remedy=remedy)
+        if axis_commands.is_axis(path):
+            where = escaped(str(path), 200)
+            message = f"a plan is checked together with the rig file of a scanner, and {where} is an axis folder"
+            remedy = f"check the folder alone; what to read next: `tvsbayes plan --given {where}`"
+        else:
+            message, remedy = "a plan is checked together with a rig file", "give the rig file first, then the plan"
+        raise InputError("usage", message, allowed="RIG PLAN", remedy=remedy)
     if plan_file is not None:
         rig, steps = read_rig(path), read_plan(plan_file)
         from tvsbayes.planning.plan_check import check_plan

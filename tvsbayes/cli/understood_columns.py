@@ -66,4 +66,5 @@ def not_sure(
     spare = [field for field in missing if field not in needed]
     remedy += (f"; --column {spare[0]}= where there is none" if spare else "") + besides
     names = ", ".join(escaped(name) for name in table.columns)
-    return refusal("missing-column", file=table.file, line=1, found=found, allowed=f"any of {names}", remedy=remedy)
+    line, allowed = table.first_line, f"any of {names}"
+    return refusal("missing-column", file=table.file, line=line, found=found, allowed=allowed, remedy=remedy)

@@ -5,10 +5,12 @@ Depths are triangulated, mm along X of frame S; counters in steps. Sentences for
 
 from __future__ import annotations
 
+import datetime
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -134,6 +136,21 @@ def _incomplete(skipped: Sequence[SkippedExperiment]) -> list[str]:
     ]
 
 
+def _calibrated_later(header: Mapping[str, Any]) -> list[str]:
+    """That the cameras were calibrated on a later day than the campaign was made, as a sentence."""
+    created, calibrated = header.get("created"), header.get("traceability", {}).get("stereo_calibrated")
+    if created is None or calibrated is None:
+        return []
+    # By their days: a date has no hour, and a time may have no zone.
+    days = [datetime.date(when.year, when.month, when.day) for when in (created, calibrated)]
+    if days[1] <= days[0]:
+        return []
+    return [
+        f"stereo_calibrated {days[1]} is later than created {days[0]}: right only if the cameras were not touched in "
+        "between; else correct the date"
+    ]
+
+
 def check_campaign(campaign: Campaign) -> CampaignCheck:
     """Plausibility and identifiability of a campaign before any fit.
 
@@ -171,6 +188,7 @@ def check_campaign(campaign: Campaign) -> CampaignCheck:
         warnings.append(
             "the stereo covariance is zero: its error (0.3 to 0.5 % of a ratio) is missing from every interval"
         )
+    warnings += _calibrated_later(campaign.header)
     return CampaignCheck(
         moves=len(campaign.moves),
         segments=1 + campaign.moves[-1].segment,

@@ -57,12 +57,14 @@ class ForeignTable:
         kind: what was found out of it, in words.
         lines: the row of the file in which each row stands.
         columns: cells by the name of their column; "column 1" ... where no row holds names.
+        first_line: the row of the file in which the names stand, or where there are none the first row.
     """
 
     file: str
     kind: str
     lines: tuple[int, ...]
     columns: dict[str, tuple[str, ...]]
+    first_line: int = 1
 
     def __len__(self) -> int:
         return len(self.lines)
@@ -181,13 +183,15 @@ def _refuse_wide(rows: Sequence[tuple[int, list[str]]], between: str, file: str)
 
 
 def _separator(lines: Sequence[str]) -> str:
-    """The first that divides nine of ten lines into equally many cells, two or more."""
-    for separator in SEPARATORS:
-        counts = Counter(len(line.split(None if separator == " " else separator)) for line in lines)
-        cells, often = max(counts.items(), key=lambda item: item[1], default=(1, 0))
-        if cells > 1 and often >= 0.9 * len(lines):
-            return separator
-    return ","
+    """The first that divides nine of ten lines into equally many cells, two or more.
+
+    If none does, some row is damaged: then the first that divides most lines, that of the names too, and else commas.
+    """
+    counted = {s: [len(line.split(None if s == " " else s)) for line in lines] for s in SEPARATORS}
+    often = {s: max(Counter(counts).items(), key=lambda item: item[1], default=(1, 0)) for s, counts in counted.items()}
+    clear = (s for s, (cells, count) in often.items() if cells > 1 and count >= 0.9 * len(lines))
+    most = (s for s, (cells, count) in often.items() if 1 < cells == counted[s][0] and 2 * count > len(lines))
+    return next(clear, None) or next(most, ",")
 
 
 def _sheet_rows(data: bytes, file: str, sheet: str | None) -> tuple[list[tuple[int, list[str]]], list[str]]:
@@ -273,7 +277,7 @@ def _table(file: str, rows: Sequence[tuple[int, list[str]]], words: list[str]) -
         if name is not None:
             own = tuple(row[k][:CELL_CHARS_MAX] for _, row in body)
             columns[name] = own if mixed else tuple(_with_point(cell, commas) for cell in own)
-    return ForeignTable(file, ", ".join(words), tuple(line for line, _ in body), columns)
+    return ForeignTable(file, ", ".join(words), tuple(line for line, _ in body), columns, rows[0][0])
 
 
 def _unique(names: Sequence[str]) -> list[str | None]:
