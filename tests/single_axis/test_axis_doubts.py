@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.axes import drawn, random_moves, runs
+from support.axes import campaign, drawn, random_moves, runs
 
 from tvsbayes.single_axis.axis_campaign import AxisCampaign, AxisMove, Reading
 from tvsbayes.single_axis.axis_doubts import data_doubts
@@ -68,6 +68,20 @@ def test_wild_readings_are_named_and_their_neighbours_not(stated):
         move = whole.readings[at].move
         assert text.startswith(f"reading {at} (move {move}, command {whole.moves[move].command:g}) ")
         assert "readings.csv" in text and "1.5" in text and "status" in text
+
+
+def test_a_single_wild_stop_is_named_where_each_was_read_once():
+    """By one line through the others that it does not bend; a stop that play may hold back is not judged."""
+    moves = [AxisMove(k, 0, 60.0 * k, c, "" if k else "forward") for k, c in enumerate([*range(6), *range(4, -1, -1)])]
+    stands = [250.0 * m.command - (6.0 if k > 5 else 0.0) + (-1) ** k for k, m in enumerate(moves)]
+    log = campaign(moves, stands)
+    assert data_doubts(log, rows_of(log)) == []
+    wild = campaign(moves, [v + 200.0 * (k == 8) for k, v in enumerate(stands)])
+    [told] = data_doubts(wild, rows_of(wild))
+    assert told.startswith("reading 8 (move 8, command 2) lies +2") and "readings.csv" in told and "status" in told
+    loose = [250.0 * m.command - (300.0 if k > 6 else 50.0 if k == 6 else 0.0) for k, m in enumerate(moves)]
+    held = campaign(moves, loose)
+    assert data_doubts(held, rows_of(held)) == []
 
 
 @pytest.mark.parametrize("seed", range(8))

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
+import numpy as np
 import pytest
 
 from tvsbayes.errors import InputError
 from tvsbayes.files.foreign_table import read_foreign
 from tvsbayes.instrument.column_names import understand_axis
-from tvsbayes.single_axis.foreign_readings import readings_of
+from tvsbayes.single_axis.axis_campaign import AxisMove, Reading
+from tvsbayes.single_axis.foreign_readings import ForeignReadings, readings_of, unwrapped
 
 NAMES = [
     ("steps", "encoder_deg"),
@@ -18,6 +22,7 @@ NAMES = [
     *((("Mikroschritte", "Messwert [\u00b5m]"), ("microsteps", "position_um"), ("step", "position [um]"))),
     *((("steps", "mm"), ("command", "deg"), ("microsteps", "counts"), ("position_mm", "reading_mm"))),
     *((("counts", "deg"), ("usteps", "pos"))),
+    *((("steps", "dial gauge mm"), ("step", "ra_offset_arcsec"))),
 ]
 
 
@@ -31,6 +36,33 @@ def test_commands_and_readings_by_any_name(names):
 def test_what_could_be_either_is_left_open(names):
     assert "value" not in understand_axis(names).columns
     assert understand_axis(names, {"value": names[1]}).columns["value"] == names[1]
+
+
+def test_degrees_of_a_thermometer_are_no_reading():
+    assert "value" not in understand_axis(("steps", "temp deg", "foo")).columns
+    assert understand_axis(("steps", "temp deg", "dial gauge mm")).columns["value"] == "dial gauge mm"
+
+
+@pytest.mark.parametrize(("unit", "turn"), [("deg", 360.0), ("rad", 2 * np.pi), ("turn", 1.0)])
+def test_whole_turns_that_an_encoder_leaves_out_are_added(unit, turn):
+    """Forward over three turns and back, past a refused reading; what is no angle, or does not jump, stays."""
+    commands = [*range(0, 1200, 50), *range(1150, -1, -50)]
+    angles = [turn * (0.9 + command / 360) for command in commands]
+    moves = tuple(AxisMove(k, 0, float(k), float(c), "" if k else "forward") for k, c in enumerate(commands))
+    read = tuple(Reading(k, k, angle % turn) for k, angle in enumerate(angles))
+    read = (*read[:9], replace(read[9], status="wild"), *read[10:])
+    found = unwrapped(ForeignReadings(moves, read, ("before",)), unit)
+    kept = [(r.value, angle) for r, angle in zip(found.readings, angles, strict=True) if r.status == "ok"]
+    assert [value for value, _ in kept] == pytest.approx([angle for _, angle in kept], rel=1e-12)
+    assert found.readings[9] == read[9] and found.assumed[0] == "before"
+    assert found.assumed[1].startswith("value: jumps by whole turns 8 times") and found.assumed[1].endswith("each")
+    wild = replace(
+        found, readings=tuple(replace(r, value=r.value + 1.2 * turn * (k == 30)) for k, r in enumerate(read))
+    )
+    assert unwrapped(wild, unit) is wild
+    for same in (ForeignReadings(moves, read, ()), ForeignReadings(moves[:3], read[:3], ())):
+        assert unwrapped(same, "mm") is same
+    assert unwrapped(replace(found, assumed=()), unit) == replace(found, assumed=())
 
 
 def table(tmp_path, *lines):

@@ -18,6 +18,8 @@ if TYPE_CHECKING:
     from tvsbayes.single_axis.foreign_readings import ForeignReadings
 
 NEEDED = ("command", "value")
+UNIT = "deg"
+"""Of readings in the template, where no column names one."""
 
 
 def import_readings(
@@ -32,20 +34,21 @@ def import_readings(
         understand_axis,
         unit_of_name,
     )
-    from tvsbayes.single_axis.foreign_readings import readings_of
+    from tvsbayes.single_axis.axis_campaign import unit_of_folder
+    from tvsbayes.single_axis.foreign_readings import readings_of, unwrapped
 
     table = read_foreign(file, sheet)
     known = understand_axis(table.columns, stated)
     missing = [field for field in NEEDED if field not in known.columns]
     if missing or known.claimed:
         raise not_sure(table, known, [*missing, *(f for f in known.claimed if f not in missing)], AXIS_FIELDS, NEEDED)
-    found = readings_of(table, known.columns)
     _refuse_filled(to)
+    named = unit_of_name(known.columns["value"], READING_UNITS)
+    found = unwrapped(readings_of(table, known.columns), unit_of_folder(to) or named or UNIT)
 
     def unit(field: str, name: str) -> str:
         return unit_of_name(name, SECONDS) or "s" if field == "time_s" else ""
 
-    named = unit_of_name(known.columns["value"], READING_UNITS)
     told = _unit_told(to, named)
     lines = table_lines(table, known, AXIS_FIELDS, unit)
     lines += [f"assumed: {text}" for text in (*found.assumed, told)]
@@ -70,7 +73,7 @@ def _unit_told(to: Path, named: str | None) -> str:
     if named and not kept:
         return f"unit: {named}, as the column says; it goes into campaign.toml"
     says = f"; the column says {named}" if named else ""
-    return f"unit: of readings as campaign.toml says{'' if kept else ', deg until you change it'}{says}"
+    return f"unit: of readings as campaign.toml says{'' if kept else f', {UNIT} until you change it'}{says}"
 
 
 def _templates() -> dict[str, bytes]:
@@ -99,8 +102,8 @@ def _write(to: Path, found: ForeignReadings, unit: str | None) -> list[str]:
     if not (to / "campaign.toml").is_file():
         make_folder(to, empty=True)
         template = _templates()["campaign.toml"]
-        own = unit or "deg"
-        contents["campaign.toml"] = template.replace(b'\nunit = "deg"', f'\nunit = "{own}"'.encode())
+        own = unit or UNIT
+        contents["campaign.toml"] = template.replace(f'\nunit = "{UNIT}"'.encode(), f'\nunit = "{own}"'.encode())
     for name, data in contents.items():
         write_atomically(to / name, data)
     return [str(to / name) for name in contents]

@@ -180,6 +180,8 @@ _AXIS_WORDS = {
 }
 _FOUND_BY_ENCODERS = {"position", "pos", "posicion", "counts", "zahler", "contador"}
 """Words of commands that name what was read where another column is the command for certain."""
+_TEMPERATURE = {"temp", "temperature", "temperatur", "temperatura", "humidity"}
+"""Degrees of these are no angle."""
 
 
 def axis_field_of(name: str) -> str | None:
@@ -231,7 +233,8 @@ def understand(
 def understand_axis(columns: Iterable[str], stated: Mapping[str, str] | None = None) -> Understood:
     """Guess what columns of an axis are, as `understand`; some names are clear only beside others.
 
-    Beside "microsteps" a "position [um]" is what was read; "mm" alone is what was read where nothing else is.
+    Beside "microsteps" a "position [um]" is what was read; where nothing else is, "mm" alone, or the one other column
+    that names a unit of readings, as "dial gauge mm".
 
     Args:
         columns: their names.
@@ -250,6 +253,11 @@ def understand_axis(columns: Iterable[str], stated: Mapping[str, str] | None = N
     units = [name for name in known.unused if (words := words_of(name)) and all(map(_is_reading_unit, words))]
     if len(sure) == len(found) == 1 and not units and (unit_of_name(found[0], READING_UNITS) or not known.unused):
         return understand(names, {**said, "command": sure[0], "value": found[0]}, AXIS_FIELDS, axis_field_of)
+    units = units or [
+        name
+        for name in known.unused
+        if unit_of_name(name, READING_UNITS) and not _TEMPERATURE.intersection(words_of(name))
+    ]
     if len(units) == 1 and not claims:
         return understand(names, {**said, "value": units[0]}, AXIS_FIELDS, axis_field_of)
     return known

@@ -182,14 +182,24 @@ def _parse_files(files: dict[str, bytes], path: Path | None) -> AxisCampaign:
     return AxisCampaign(unit, moves, readings, stated, header, path)
 
 
-def is_axis_folder(folder: Path) -> bool:
-    """Whether the `format` line of a folder's `campaign.toml` names an axis; False where it cannot be read."""
+def _told(folder: Path, key: str) -> str | None:
+    """The text under a key of a folder's `campaign.toml`; None where it cannot be read."""
     try:
         keys = parse_toml(read_bytes(folder / "campaign.toml", TOML_BYTES_MAX, folder), "campaign.toml")
     except InputError:
-        return False
-    found = keys.values.get("format")
-    return isinstance(found, str) and found.startswith("tvsbayes-axis/")
+        return None
+    found = keys.values.get(key)
+    return found if isinstance(found, str) else None
+
+
+def is_axis_folder(folder: Path) -> bool:
+    """Whether the `format` line of a folder's `campaign.toml` names an axis; False where it cannot be read."""
+    return (_told(folder, "format") or "").startswith("tvsbayes-axis/")
+
+
+def unit_of_folder(folder: Path) -> str | None:
+    """The unit of readings in a folder's `campaign.toml`; None where it cannot be read."""
+    return _told(folder, "unit")
 
 
 def read_axis(folder: Path | str) -> AxisCampaign:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -21,13 +22,18 @@ WILD = 6.0
 """Standard deviations of readings at one stop."""
 STOPS_MIN = 5
 """With several readings, below which their scatter is not known well enough to call one wild."""
+WILD_STOP, STOPS_JUDGED_MIN = 12.0, 8
+"""Typical distances from the line through the others by which a stop is wild, and stops from which on that is asked."""
+WILD_SHARE = 0.1
+"""Of the travel, which a wild stop is off too: no gear errs and no stop scatters by so much."""
 LINE_SLOPE = float(np.sqrt(12.0))
 """Largest sd of the slope that errors of sd 1, however they go with position, give a line over a range of 1."""
 
 
 def data_doubts(campaign: AxisCampaign, rows: AxisRows) -> list[str]:
     """All of it, in sentences."""
-    return [*_odd_segments(rows), *_odd_ratio(campaign, rows), *_wild_readings(campaign, rows)]
+    wild = _wild_readings(campaign, rows)
+    return [*_odd_segments(rows), *_odd_ratio(campaign, rows), *(wild or _wild_stops(campaign, rows))]
 
 
 def _odd_segments(rows: AxisRows) -> list[str]:
@@ -113,4 +119,62 @@ def _wild_readings(campaign: AxisCampaign, rows: AxisRows) -> list[str]:
         "readings.csv, and if it is wrong give it another status than ok, such as wild"
         for (reading, off, _), size in zip(odd, sizes, strict=True)
         if size > WILD * scale > 0
+    ]
+
+
+@dataclass(frozen=True)
+class _MostLine:
+    """A line with a reversal and a home of each segment that single rows do not bend.
+
+    Attributes:
+        off: distance of every row from it, unit, shape (rows,).
+        lost: in the reversal, unit.
+    """
+
+    off: np.ndarray
+    lost: float
+
+
+def _line_through_most(rows: AxisRows) -> _MostLine:
+    """Medians throughout: the slope of pairs half the rows apart on one side, then each side of each segment.
+
+    All pairs (Theil, Sen) would tell the slope somewhat better, in a time that grows with the square of the rows.
+    """
+    slopes = []
+    for side in np.unique(rows.side):
+        own = np.flatnonzero(rows.side == side)
+        own = own[np.argsort(rows.command[own], kind="stable")]
+        half = len(own) // 2
+        near, far = own[: len(own) - half], own[half:]
+        apart = rows.command[far] - rows.command[near]
+        slopes += ((rows.value[far] - rows.value[near])[apart > 0] / apart[apart > 0]).tolist()
+    off = rows.value - float(np.median(slopes or [rows.line[1]])) * rows.command
+    lost = []
+    for segment in np.unique(rows.segment):
+        sides = [(rows.segment == segment) & (rows.side == side) for side in (-1, 0, 1)]
+        middles = [float(np.median(off[mine])) if mine.any() else None for mine in sides]
+        if middles[0] is not None and middles[2] is not None:
+            lost.append(abs(middles[2] - middles[0]))
+        for mine, middle in zip(sides, middles, strict=True):
+            off[mine] -= middle or 0.0
+    return _MostLine(off, float(np.median(lost or [0.0])))
+
+
+def _wild_stops(campaign: AxisCampaign, rows: AxisRows) -> list[str]:
+    """Single readings far off the line through all others, where stops were read once.
+
+    A stop that a short leg reached may stand inside the play and is not judged.
+    """
+    if len(rows.value) < STOPS_JUDGED_MIN:
+        return []
+    line = _line_through_most(rows)
+    typical = float(np.median(np.abs(line.off))) / 0.6745
+    wild = np.abs(line.off) > max(WILD_STOP * typical, WILD_SHARE * rows.travel)
+    way = np.abs(rows.legs.step[rows.move] * rows.line[1])
+    reading = {r.move: r.reading for r in campaign.readings if r.status == "ok"}
+    return [
+        f"reading {reading[int(rows.move[k])]} (move {rows.move[k]}, command {rows.command[k]:.10g}) lies "
+        f"{line.off[k]:+.3g} {rows.unit} off the line through the others, typical is {typical:.2g}: look at it in "
+        "readings.csv, and if it is wrong give it another status than ok, such as wild"
+        for k in np.flatnonzero(wild & (way > PLAYS * line.lost))
     ]

@@ -8,6 +8,7 @@ import numpy as np
 
 from tvsbayes.single_axis.axis_model import AxisModel
 from tvsbayes.single_axis.axis_rows import reversal_of
+from tvsbayes.single_axis.classic_line import fit_line
 
 STEP, CURVATURE_STEP = 1e-2, 5e-2
 """Of differences, in units of the coordinates' expected widths: a third derivative of 1 makes 2e-5 of a gradient."""
@@ -50,8 +51,8 @@ def _repeat_sd(model: AxisModel) -> float:
     return max(float(np.sqrt(squares / freedom)) if freedom else 0.0, 1e-4 * rows.travel)
 
 
-def _start(model: AxisModel) -> tuple[np.ndarray, np.ndarray]:
-    """Coordinates to begin at, and their expected widths, each (d,)."""
+def _start(model: AxisModel, stop_sd: float) -> tuple[np.ndarray, np.ndarray]:
+    """Coordinates to begin at, with stops that scatter by so much, and their expected widths, each (d,)."""
     names = model.coordinates.names
     w, width = np.zeros(len(names)), np.ones(len(names))
     for k, name in enumerate(names):
@@ -60,7 +61,7 @@ def _start(model: AxisModel) -> tuple[np.ndarray, np.ndarray]:
             w[k] = model.coordinates.coordinate(name, reversal)
             width[k] = min(max(error / model.priors[name].u, 1e-9), 1.0)
         elif name.startswith("stop_sd"):
-            w[k] = np.clip(model.coordinates.coordinate(name, _repeat_sd(model)), -4.0, 4.0)
+            w[k] = np.clip(model.coordinates.coordinate(name, stop_sd), -4.0, 4.0)
     return w, width
 
 
@@ -84,10 +85,22 @@ def _missing(log_density: float, off: float = 0.0) -> tuple[str, ...]:
 
 
 def find_mode(model: AxisModel) -> AxisMode:
-    """The mode by a quasi-Newton search from the least-squares line."""
+    """The mode by a quasi-Newton search from the least-squares line and the scatter of repeats.
+
+    A search that does not get there begins anew where stops scatter as widely as rows do about the line: a single wild
+    reading lies far outside what repeats tell, where the density is all slope.
+    """
+    found = _searched(model, *_start(model, _repeat_sd(model)))
+    if found.missing and len(found.w):
+        again = _searched(model, *_start(model, max(fit_line(model.rows).scatter, 1e-4 * model.rows.travel)))
+        found = max(found, again, key=lambda mode: (not mode.missing, mode.log_density))
+    return found
+
+
+def _searched(model: AxisModel, start: np.ndarray, width: np.ndarray) -> AxisMode:
+    """The mode that a search finds from coordinates (d,) whose expected widths are (d,)."""
     from scipy.optimize import minimize
 
-    start, width = _start(model)
     if not len(start):
         alone = float(model.log_density(start[None])[0])
         return AxisMode(start, np.zeros((0, 0)), alone, _missing(alone))

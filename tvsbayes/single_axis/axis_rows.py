@@ -151,6 +151,26 @@ def _means(used: Sequence[Reading]) -> dict[int, tuple[float, float, float, int]
     return means
 
 
+def turn_jumps(command: np.ndarray, value: np.ndarray, turn: float) -> dict[int, float]:
+    """By row how far readings jump there, turns; empty where none do.
+
+    Args:
+        command: of the readings in order of time, shape (rows,).
+        value: readings, shape (rows,).
+        turn: in their unit.
+    """
+    step = np.diff(command)
+    moved = step != 0
+    if moved.sum() < 3:
+        return {}
+    rise = np.diff(value)
+    slope = float(np.median(rise[moved] / step[moved]))
+    off = rise - slope * step
+    jumps = np.flatnonzero(np.abs(off) > WRAP_SHARE * turn)
+    # A slope that is itself wrong by a turn per step makes every step jump, or none; only rare jumps are wraps.
+    return {int(k) + 1: float(off[k] / turn) for k in jumps} if 2 * len(jumps) < len(step) else {}
+
+
 def _check_turns(campaign: AxisCampaign, command: np.ndarray, value: np.ndarray, moves: np.ndarray) -> None:
     """Refuse angles that jump by whole turns.
 
@@ -158,16 +178,9 @@ def _check_turns(campaign: AxisCampaign, command: np.ndarray, value: np.ndarray,
         InputError: readings of an angle wrap.
     """
     turn = TURNS.get(campaign.unit)
-    step = np.diff(command)
-    moved = step != 0
-    if turn is None or moved.sum() < 3:
-        return
-    rise = np.diff(value)
-    slope = float(np.median(rise[moved] / step[moved]))
-    jumps = np.flatnonzero(np.abs(rise - slope * step) > WRAP_SHARE * turn)
-    # A slope that is itself wrong by a turn per step makes every step jump, or none; only rare jumps are wraps.
-    if len(jumps) and 2 * len(jumps) < len(step):
-        named = listed([int(moves[k + 1]) for k in jumps], 5)
+    jumps = turn_jumps(command, value, turn) if turn is not None else {}
+    if jumps:
+        named = listed([int(moves[row]) for row in jumps], 5)
         raise InputError(
             "wrapped",
             f"readings.csv: the angle jumps by whole turns at move {named}; allowed: a continuous angle",

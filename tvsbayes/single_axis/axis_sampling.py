@@ -135,13 +135,21 @@ def weighted_sample(
         w, log_target = np.concatenate(drawn), np.concatenate(target)
         # Drawn evenly from all proposals: the mixture is the density of the pool.
         log_pool = np.logaddexp.reduce([each.log_density(w) for each in used], axis=0)
-        smooth = smoothed_weights(np.where(np.isfinite(log_target), log_target - log_pool, -np.inf))
-        weights, k, worth = smooth.weights, smooth.pareto_k, effective_draws(smooth.weights)
+        there = np.isfinite(log_target)
+        if there.any():
+            smooth = smoothed_weights(np.where(there, log_target - log_pool, -np.inf))
+            weights, k, worth = smooth.weights, smooth.pareto_k, effective_draws(smooth.weights)
+        else:
+            weights = np.full(len(w), 1 / len(w))
         advance(min(worth / effective, number / ROUNDS_MAX + 0.2, 1.0))
         if worth >= effective and k < PARETO_K_MAX and weights.max() <= HEAVIEST_MAX:
             break
-        mean, covariance = _moments(w, weights)
         proposal = Proposal()
+        if worth <= d + 1:
+            # So few have no covariance: on from the best, as widely as the mode is curved.
+            proposal.add(w[np.argmax(weights)], WIDE * start.covariance, 1.0)
+            continue
+        mean, covariance = _moments(w, weights)
         proposal.add(mean, WIDE * covariance, 0.1)
         proposal.add(*_tail_component(w, weights, mean, covariance), 0.35)
         proposal.add(mean, INFLATION * covariance, 0.55)

@@ -7,12 +7,18 @@ read. What a table does not say is assumed and listed in words.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+
+import numpy as np
 
 from tvsbayes.errors import refusal
 from tvsbayes.files.foreign_table import ForeignTable
 from tvsbayes.instrument.foreign_looks import BAD, GOOD, FieldCells, homings_of, seconds_of
-from tvsbayes.single_axis.axis_campaign import APPROACHES, COMMAND_MAX, Approach, AxisMove, Reading
+from tvsbayes.single_axis.axis_campaign import APPROACHES, COMMAND_MAX, TURNS, Approach, AxisMove, Reading
+from tvsbayes.single_axis.axis_rows import turn_jumps
+
+WHOLE = 0.1
+"""Of a turn, by which play and errors of gears may make a jump differ from whole turns."""
 
 
 @dataclass(frozen=True)
@@ -63,6 +69,30 @@ def readings_of(table: ForeignTable, columns: Mapping[str, str]) -> ForeignReadi
     if "u" not in cells:
         assumed.append("u: none, so that the scatter of stops covers the readings' own")
     return ForeignReadings(tuple(moves), tuple(readings), tuple(assumed))
+
+
+def unwrapped(found: ForeignReadings, unit: str) -> ForeignReadings:
+    """The same with the whole turns added that an encoder or autocollimator which begins anew leaves out.
+
+    Args:
+        found: moves and readings.
+        unit: of the readings; those of no angle stay as they are.
+    """
+    turn = TURNS.get(unit)
+    rows = [k for k, reading in enumerate(found.readings) if reading.status == "ok" and reading.value is not None]
+    command = np.array([found.moves[found.readings[k].move].command for k in rows])
+    value = np.array([found.readings[k].value for k in rows], dtype=float)
+    jumps = turn_jumps(command, value, turn) if turn is not None else {}
+    # A wild reading jumps too, and back: by no whole turns.
+    if turn is None or not jumps or any(abs(far - round(far)) > WHOLE for far in jumps.values()):
+        return found
+    readings, turns = list(found.readings), 0
+    for row, k in enumerate(rows):
+        turns -= round(jumps.get(row, 0.0))
+        readings[k] = replace(readings[k], value=float(value[row]) + turn * turns)
+    times = "once" if len(jumps) == 1 else f"{len(jumps)} times"
+    told = f"value: jumps by whole turns {times}, which are added: {turn:g} {unit} each"
+    return replace(found, readings=tuple(readings), assumed=(*found.assumed, told))
 
 
 def _approach(cells: FieldCells, row: int) -> Approach:
