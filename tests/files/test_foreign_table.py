@@ -91,6 +91,20 @@ def test_sheets_of_a_workbook(tmp_path):
             read_foreign(tmp_path / "t.xlsx", sheet)
 
 
+def test_numbers_of_a_workbook_beside_texts_with_decimal_commas(tmp_path):
+    """Cells that are numbers have no notation: texts beside them are read by their own."""
+    book = openpyxl.Workbook()
+    for row in (("t", "XL", "n"), (61.5, "885,203", 7), (62.25, "1.024,5", "8")):
+        book.active.append(row)
+    book.save(tmp_path / "t.xlsx")
+    table = read_foreign(tmp_path / "t.xlsx")
+    assert table.columns == {"t": ("61.5", "62.25"), "XL": ("885.203", "1024.5"), "n": ("7", "8")}
+    assert {type(cell) for cells in table.columns.values() for cell in cells} == {str}
+    book.active.append((63.0, "9.5", 9))
+    book.save(tmp_path / "t.xlsx")
+    assert read_foreign(tmp_path / "t.xlsx").columns["XL"] == ("885,203", "1.024,5", "9.5")
+
+
 def bomb() -> bytes:
     """A workbook that says it unpacks to a megabyte."""
     stream = io.BytesIO()

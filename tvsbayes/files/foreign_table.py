@@ -244,13 +244,19 @@ def _cells(rows: Iterable[tuple[object, ...]], file: str) -> list[tuple[int, lis
     return found
 
 
+class _Number(str):
+    """A cell that a workbook holds as a number: with a point, whatever texts beside it have."""
+
+
 def _cell(value: object) -> str:
     if value is None:
         return ""
     if isinstance(value, bool):
         return "true" if value else "false"
     if isinstance(value, float) and value.is_integer() and abs(value) < 1e15:
-        return str(int(value))
+        return _Number(int(value))
+    if isinstance(value, int | float):
+        return _Number(value)
     if isinstance(value, datetime.datetime | datetime.date | datetime.time):
         return value.isoformat()
     return str(value).strip()
@@ -266,7 +272,7 @@ def _table(file: str, rows: Sequence[tuple[int, list[str]]], words: list[str]) -
     named = not all(NUMBER.fullmatch(cell) or _COMMA.fullmatch(cell) for cell in filled[0][1] if cell)
     names = _unique(filled[0][1]) if named else [f"column {k}" for k in range(1, width + 1)]
     body = filled[1:] if named else filled
-    cells = [cell for _, row in body for cell in row]
+    cells = [cell for _, row in body for cell in row if not isinstance(cell, _Number)]
     commas = any(_COMMA.fullmatch(cell) or _GROUPED_COMMA.fullmatch(cell) for cell in cells)
     # "1.5" beside "1,5" is nobody's notation: such cells stay as they are and are refused where a number is needed.
     mixed = commas and any("." in cell and NUMBER.fullmatch(cell) for cell in cells)
@@ -275,8 +281,8 @@ def _table(file: str, rows: Sequence[tuple[int, list[str]]], words: list[str]) -
     columns = {}
     for k, name in enumerate(names):
         if name is not None:
-            own = tuple(row[k][:CELL_CHARS_MAX] for _, row in body)
-            columns[name] = own if mixed else tuple(_with_point(cell, commas) for cell in own)
+            own = (row[k] if isinstance(row[k], _Number) else row[k][:CELL_CHARS_MAX] for _, row in body)
+            columns[name] = tuple(str(cell) if mixed else _with_point(cell, commas) for cell in own)
     return ForeignTable(file, ", ".join(words), tuple(line for line, _ in body), columns, rows[0][0])
 
 
@@ -292,6 +298,8 @@ def _unique(names: Sequence[str]) -> list[str | None]:
 
 def _with_point(cell: str, commas: bool) -> str:
     """A number with a decimal point and no marks between thousands; any other cell as it is."""
+    if isinstance(cell, _Number):
+        return str(cell)
     if commas and (_COMMA.fullmatch(cell) or _GROUPED_COMMA.fullmatch(cell)):
         return cell.replace(".", "").replace(",", ".")
     return cell.replace(",", "") if not commas and _GROUPED_POINT.fullmatch(cell) else cell
