@@ -108,6 +108,19 @@ def test_every_needed_column_is_asked_for_and_none_may_be_left_out(ask, tmp_path
     assert code == 2 and "--column command=NAME --column value=NAME" in remedy and "none" not in remedy
 
 
+def test_words_that_leave_looks_out_are_told_and_good_ones_of_other_languages_known(ask, table, tmp_path):
+    rows = [f"{pan},0,640,360,500,360,{word}" for pan, word in enumerate(("gut", "gültig", "oui", "fine", "mal", "ok"))]
+    table.write_text("\n".join(["pan,tilt,XL,YL,XR,YR,state", *rows, "9,0,,,,,fine"]) + "\n", encoding="utf-8")
+    code, document = ask("import", table, "--to", tmp_path / "mine", "--yes")
+    assert code == 0 and "status: 3 looks left out by column state: fine 2, mal 1" in document["assumed"]
+    spots = (tmp_path / "mine" / "spots.csv").read_text(encoding="utf-8").splitlines()[1:]
+    assert [line.rpartition(",")[2] for line in spots] == ["ok", "ok", "ok", "fine", "refused: mal", "ok", "fine"]
+    log = tmp_path / "log.csv"
+    log.write_text("steps,deg,quality\n0,0.1,bien\n9,0.2,hit\n18,0.3,\n")
+    told = ask("import", log, "--to", tmp_path / "axis", "--axis")[1]["assumed"]
+    assert "status: 1 reading left out by column quality: hit 1" in told
+
+
 def test_a_log_of_one_axis_goes_to_an_axis_folder(ask, say, tmp_path):
     """With --axis, or where the folder is one; nothing of it is overwritten."""
     log, out = tmp_path / "log.csv", tmp_path / "axis"

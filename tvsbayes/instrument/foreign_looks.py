@@ -9,7 +9,9 @@ from __future__ import annotations
 import datetime
 import math
 import re
-from collections.abc import Mapping, Sequence
+import unicodedata
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -34,9 +36,17 @@ from tvsbayes.instrument.counter_limits import COUNTER_MAX
 
 SD_PX = 0.1
 """Standard uncertainty of a centroid where a table states none; the fit scales it by what the spots show."""
-GOOD = {"ok", "1", "true", "yes", "good", "valid", "ja", "si"}
-BAD = {"0", "false", "no", "bad", "invalid", "nein"}
-"""Words of a status, in small letters."""
+GOOD = {
+    *("ok", "1", "true", "yes", "good", "valid", "ja", "gut", "gultig", "si", "bien", "bueno", "buena", "valido"),
+    *("oui", "bon", "bonne", "valide"),
+}
+BAD = {
+    *("0", "false", "no", "bad", "invalid", "nein", "schlecht", "ungultig", "mal", "malo", "mala", "invalido"),
+    *("non", "mauvais", "mauvaise", "invalide"),
+}
+"""Words of a status, in small letters without accents."""
+WORDS_TOLD = 5
+"""Of those that leave rows out."""
 _FLAGS = {"": False, "0": False, "false": False, "1": True, "true": True}
 """Cells of a column that marks homings, in small letters."""
 _DOTTED_DATE = re.compile(r"([0-9]{1,2})\.([0-9]{1,2})\.([0-9]{4})[ ,T]+")
@@ -296,6 +306,7 @@ def _spots(cells: FieldCells, of_row: Sequence[int], notation: Notation, assumed
             sds = [_sd_px(cells, row, field, column, notation) for field, column in zip(PIXEL_SDS, stated, strict=True)]
             spot = with_pixels(spot, "ok", [(value or 0.0) - notation.pixels_from for value in centre], sds)
         spots.append(replace(spot, aperture_deg=reading))
+    assumed += left_out(cells, statuses, "look")
     return tuple(spots)
 
 
@@ -309,10 +320,29 @@ def _sd_px(cells: FieldCells, row: int, field: str, column: Sequence[float | Non
     return found
 
 
+def word_of(status: str) -> str:
+    """A cell of a status as `GOOD` and `BAD` have it."""
+    plain = unicodedata.normalize("NFKD", status.strip().lower())
+    return "".join(letter for letter in plain if not unicodedata.combining(letter))
+
+
+def left_out(cells: FieldCells, statuses: Iterable[str], what: str) -> list[str]:
+    """What a column of statuses leaves out, as a sentence: a word that somebody meant well may be none of `GOOD`."""
+    counts = Counter(escaped(text, 24) for text in statuses if text.strip() and word_of(text) not in GOOD)
+    if not counts:
+        return []
+    common = [f"{text} {count}" for text, count in counts.most_common(WORDS_TOLD)]
+    named = ", ".join(common) + " ..." * (len(counts) > WORDS_TOLD)
+    count = sum(counts.values())
+    return [
+        f"status: {count} {what}{'s' * (count != 1)} left out by column {escaped(cells.columns['status'])}: {named}"
+    ]
+
+
 def _status(text: str, centre: Sequence[float | None], cells: FieldCells, row: int) -> str:
     """The word "ok", or why a look is of no use."""
     seen = None not in centre
-    word = text.strip().lower()
+    word = word_of(text)
     if word in GOOD or not word:
         if seen or not word:
             return "ok" if seen else "no centre in the table"

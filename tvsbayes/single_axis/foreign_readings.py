@@ -13,7 +13,7 @@ import numpy as np
 
 from tvsbayes.errors import refusal
 from tvsbayes.files.foreign_table import ForeignTable
-from tvsbayes.instrument.foreign_looks import BAD, GOOD, FieldCells, homings_of, seconds_of
+from tvsbayes.instrument.foreign_looks import BAD, GOOD, FieldCells, homings_of, left_out, seconds_of, word_of
 from tvsbayes.single_axis.axis_campaign import APPROACHES, COMMAND_MAX, TURNS, Approach, AxisMove, Reading
 from tvsbayes.single_axis.axis_rows import turn_jumps
 
@@ -62,6 +62,7 @@ def readings_of(table: ForeignTable, columns: Mapping[str, str]) -> ForeignReadi
         if value is not None or statuses[row]:
             u = stated_u[row] or 0.0
             readings.append(Reading(len(readings), moves[-1].move, value, u, _status(cells, row, value)))
+    assumed += left_out(cells, statuses, "reading")
     if again := len(table) - len(moves):
         assumed.append(f"{again} row{'s' * (again > 1)} at the command before: read at that stop again, without a move")
     if "approach" not in cells:
@@ -107,7 +108,7 @@ def _approach(cells: FieldCells, row: int) -> Approach:
 def _status(cells: FieldCells, row: int, value: float | None) -> str:
     """The word "ok", or why a reading is of no use."""
     text = cells.text("status")[row]
-    word = text.strip().lower()
+    word = word_of(text)
     if word and word not in GOOD:
         return f"refused: {text}"[:100] if word in BAD else text[:100]
     if value is None:
