@@ -11,7 +11,7 @@ from support.axes import campaign
 from tvsbayes.single_axis.axis_campaign import AxisMove
 from tvsbayes.single_axis.axis_fit import fit_axis, model_of
 from tvsbayes.single_axis.axis_mode import AxisMode, find_mode
-from tvsbayes.single_axis.axis_sampling import weighted_sample
+from tvsbayes.single_axis.axis_sampling import EXTENSION, run_chain, weighted_sample
 
 RATIO, WILD = 2.5, 400.0
 
@@ -51,3 +51,28 @@ def test_draws_that_miss_the_density_are_refused_in_words(density):
     found = weighted_sample(log_density, AxisMode(np.zeros(2), 1e-6 * np.eye(2), 0.0), np.random.default_rng(1))
     assert found.missing and np.isfinite(found.w).all()
     assert found.weights.sum() == pytest.approx(1) and np.isfinite(found.proposal.log_density(found.w)).all()
+
+
+def test_a_chain_that_is_long_enough_but_disagrees_goes_on():
+    """Until it agrees, or four times as long as it had to be; where it agrees at once nothing is added."""
+
+    def normal(w):
+        return -0.5 * np.sum(w**2, axis=1)
+
+    first = weighted_sample(normal, AxisMode(np.zeros(2), np.eye(2), 0.0), np.random.default_rng(1))
+    assert not first.missing
+    asked = []
+
+    def steps(agrees_at):
+        asked.clear()
+
+        def agrees(w):
+            asked.append(w.shape[1])
+            return len(asked) == agrees_at
+
+        return run_chain(normal, first, 3, 60.0, agrees=agrees).steps
+
+    once = steps(1)
+    assert len(asked) == 1 and run_chain(normal, first, 3, 60.0).steps == once
+    assert once < steps(2) < EXTENSION * once and len(asked) == 2
+    assert steps(-1) == EXTENSION * once

@@ -9,7 +9,7 @@ import numpy as np
 
 from tvsbayes.display import Shown, View
 from tvsbayes.errors import NotConverged, TvsError
-from tvsbayes.progress import Job, Show
+from tvsbayes.progress import Advance, Job, Show
 from tvsbayes.single_axis.axis_campaign import AxisCampaign
 from tvsbayes.single_axis.axis_conflicts import PriorConflict, conflict_text, prior_conflicts
 from tvsbayes.single_axis.axis_mode import AxisMode, find_mode
@@ -114,7 +114,8 @@ class AxisFit(Shown):
         elif self.first is None:
             remedy = "run again without --no-sample"
         else:
-            remedy = "run again without --quick" if self.chain is None else "run again with more --max-minutes"
+            longer = "more --max-minutes" if self.chain is not None and self.chain.missing else "another --seed"
+            remedy = "run again without --quick" if self.chain is None else f"run again with {longer}"
         return NotConverged("unconverged", "UNCONVERGED: " + "; ".join(self.missing), remedy=remedy)
 
     @cached_property
@@ -228,8 +229,8 @@ def fit_axis(
             w = first.equal(EQUAL_DRAWS, rng)
             if tier == "emcee" and len(mode.w):
                 job.begin(WALKING)
-                chain = run_chain(model.log_density, first, seed, 60.0 * max_minutes, job.at)
-                agreement = None if first.missing else _agreement(model, first, chain, rng)
+                walked = _walked(model, first, seed, 60.0 * max_minutes, rng, job.at)
+                chain, agreement = walked.chain, walked.agreement
                 flat = chain.w.reshape(-1, chain.w.shape[2])
                 w = flat[np.linspace(0, len(flat) - 1, EQUAL_DRAWS).astype(int)]
         elif len(mode.w):
@@ -242,15 +243,44 @@ def fit_axis(
     return found
 
 
-def _agreement(model: AxisModel, first: WeightedSample, chain: AxisChain, rng: np.random.Generator) -> TierAgreement:
+@dataclass(frozen=True)
+class _Walked:
+    """A chain, and whether it agrees with the weighted draws; None where these cannot be used."""
+
+    chain: AxisChain
+    agreement: TierAgreement | None
+
+
+def _walked(
+    model: AxisModel,
+    first: WeightedSample,
+    seed: int,
+    max_seconds: float,
+    rng: np.random.Generator,
+    advance: Advance,
+) -> _Walked:
+    """A chain that agrees with the weighted draws, where these may be used, or went on for long."""
+    if first.missing:
+        return _Walked(run_chain(model.log_density, first, seed, max_seconds, advance), None)
+    found: list[TierAgreement] = []
+
+    def agrees(w: np.ndarray) -> bool:
+        found.append(_agreement(model, first, w, rng))
+        return found[-1].agrees
+
+    chain = run_chain(model.log_density, first, seed, max_seconds, advance, agrees)
+    return _Walked(chain, found[-1] if found else _agreement(model, first, chain.w, rng))
+
+
+def _agreement(model: AxisModel, first: WeightedSample, w: np.ndarray, rng: np.random.Generator) -> TierAgreement:
     """Both tiers' means and interval ends of the headlines, given their scales: expectations and spreads alike."""
     functionals = headline_functionals(model)[[HEADLINE_DRAWS.index(name) for name in HEADLINES]]
     keep = slice(None, None, max(1, len(first.w) // 6000))
     theirs = weighted_summary(
         model.linear(first.w[keep]).drawn(functionals, rng), first.weights[keep] / first.weights[keep].sum()
     )
-    stride = max(1, chain.w.shape[1] * chain.w.shape[0] // 6000)
-    part = chain.w[:, ::stride]
+    stride = max(1, w.shape[1] * w.shape[0] // 6000)
+    part = w[:, ::stride]
     ours = model.linear(part.reshape(-1, part.shape[2])).drawn(functionals, rng)
     values = ours.reshape(*part.shape[:2], len(HEADLINES))
     _, bulk, tail = chain_quality(values)

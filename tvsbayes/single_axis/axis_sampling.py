@@ -26,6 +26,7 @@ EQUAL_DRAWS = 2000
 WALKERS, BLOCK_STEPS, BURN_STEPS = 48, 150, 30
 GROUPS = 4
 RHAT_MAX, ESS_MIN, TAUS_MIN = 1.01, 1000.0, 50.0
+EXTENSION = 4
 WALK_SHARE = 0.4
 """Of a chain's moves that go by a random step; the others ask the proposal."""
 
@@ -229,9 +230,24 @@ def _autocorrelation_steps(kept: np.ndarray) -> float:
 
 
 def run_chain(
-    density: Density, first: WeightedSample, seed: int, max_seconds: float, advance: Advance = unshown
+    density: Density,
+    first: WeightedSample,
+    seed: int,
+    max_seconds: float,
+    advance: Advance = unshown,
+    agrees: Callable[[np.ndarray], bool] = lambda _: True,
 ) -> AxisChain:
-    """Independent walkers from the weighted draws, by random steps and by the proposal, until they may be used."""
+    """Independent walkers from the weighted draws, by random steps and by the proposal, until they may be used.
+
+    Args:
+        density: log posterior density up to a constant.
+        first: weighted draws.
+        seed: of everything random.
+        max_seconds: time for it.
+        advance: told how far it is.
+        agrees: whether the kept positions (walkers, steps, d) say what else is known. A chain that is long enough and
+            does not goes on to `EXTENSION` times its length: one walker in a far tail may stand for a while.
+    """
     import emcee
 
     rng = np.random.default_rng([seed, 7])
@@ -254,7 +270,7 @@ def run_chain(
     sampler.random_state = random.get_state()
     state = emcee.State(first.equal(WALKERS, rng), random_state=random.get_state())
     began, share = time.monotonic(), OpenEnded()
-    expected = 2.0
+    expected, enough = 2.0, 0
     while True:
         state = sampler.run_mcmc(state, BLOCK_STEPS, skip_initial_state_check=True)
         kept = np.swapaxes(sampler.get_chain(discard=BURN_STEPS), 0, 1)
@@ -270,7 +286,11 @@ def run_chain(
         blocks = sampler.iteration / BLOCK_STEPS
         expected = max(expected, blocks * TAUS_MIN / max(taus, 1.0))
         advance(share.share(blocks, expected))
-        if not missing or time.monotonic() - began > max_seconds:
+        if time.monotonic() - began > max_seconds:
             break
+        if not missing:
+            enough = enough or sampler.iteration
+            if agrees(kept) or sampler.iteration >= EXTENSION * enough:
+                break
     acceptance = float(np.mean(sampler.acceptance_fraction))
     return AxisChain(kept, sampler.iteration, acceptance, rhat, bulk, tail, taus, tuple(missing))
