@@ -59,6 +59,11 @@ def _deaf_laser(positioner):
     positioner.laser = lambda on: laser(False) if on else laser(on)
 
 
+def _lit_mover(positioner):
+    move = positioner.move_to
+    positioner.move_to = lambda pan, tilt: replace(move(pan, tilt), laser_on=(pan, tilt) == TARGETS[0])
+
+
 def _careless(positioner):
     def laser(on):
         return positioner.state()
@@ -87,6 +92,7 @@ def _nameless(positioner):
     [
         *((_one_step_off, "counters ordered"), (_bright_home, "off behind home"), (_deaf_laser, "laser(True)")),
         *((_careless, "before homing"), (_no_remedy, "with a remedy"), (_nameless, '"fw"')),
+        (_lit_mover, "off in motion"),
     ],
 )
 def test_a_broken_promise_is_named(change, word):

@@ -42,6 +42,17 @@ def test_a_session_from_connection_to_close():
     positioner.close()
 
 
+def test_a_laser_left_on_is_off_in_motion():
+    device = simulated()
+    positioner = connected(device)
+    positioner.home()
+    lit = []
+    device.mechanics.moved = lambda axis, steps: lit.append(device.mechanics.laser_on)
+    positioner.laser(True)
+    assert not positioner.move_to(200, -15).laser_on and lit == [False, False]
+    assert positioner.laser(True).laser_on, "and comes on again when it is asked for"
+
+
 def test_a_second_program_goes_on_in_the_same_sequence():
     device = simulated()
     first = connected(device)

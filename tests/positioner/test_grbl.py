@@ -68,6 +68,36 @@ def test_a_session_from_connection_to_close(laser, speed):
     assert not board.laser_on and not board.lit_in_motion
 
 
+@pytest.mark.parametrize("laser", ["M3", "M8"])
+def test_a_laser_left_on_is_off_in_motion(laser):
+    board = GrblBoard()
+    positioner = connected(board, laser=laser)
+    positioner.home()
+    positioner.laser(True)
+    assert not positioner.move_to(100, 20).laser_on and not board.lit_in_motion
+    assert positioner.laser(True).laser_on and board.laser_on
+
+
+def test_light_behind_a_motion_is_cut_as_it_is_told():
+    """Somebody else's order, in mid-motion."""
+    board = GrblBoard()
+    positioner = connected(board)
+    positioner.home()
+    told = positioner._asked
+
+    def lit():
+        status = told()
+        board._execute("M3 S1000", board.clock.monotonic())
+        board.out.clear()
+        return status
+
+    positioner._asked = lit
+    with pytest.raises(DeviceFault, match="after a motion"):
+        positioner.move_to(100, 20)
+    board.advance()
+    assert not board.laser_on
+
+
 def _unhomed(positioner, board):
     positioner.move_to(1, 1)
 

@@ -55,6 +55,8 @@ def positioner_violations(
         positioner.laser(True)
         expect(not positioner.home().state.laser_on, "the laser is off behind home")
         positioner.laser(True)
+        expect(not positioner.move_to(*targets[0]).laser_on, "the laser is off in motion, whoever left it on")
+        positioner.laser(True)
     finally:
         positioner.close()
         # A second call finds nothing to close.

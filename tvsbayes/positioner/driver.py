@@ -90,7 +90,7 @@ class SerialPositioner:
         self._link: Link | None = None
         self._buffer, self._dropping = bytearray(), False
         self._sequence, self._boot = 0, -1
-        self._homed_here, self._compares = False, False
+        self._homed_here, self._compares, self._lit = False, False, False
         self.repeats = 0
         """Requests sent again so far: the quality of the line."""
         self._heard = bytearray()
@@ -124,6 +124,8 @@ class SerialPositioner:
         Raises:
             DeviceFault: refused, stopped, in alarm, too late, or not where it should be.
         """
+        if self._lit:
+            self.laser(False)
         wanted = (int(pan_steps), int(tilt_steps))
         reply = self._command("MA", *wanted)
         before = reply.state
@@ -139,12 +141,15 @@ class SerialPositioner:
 
     def laser(self, on: bool) -> DeviceState:
         """See `Positioner.laser`."""
+        # Before the order: whoever interrupts it does not know whether it has arrived.
+        self._lit = self._lit or on
         state = self._command("L", int(on)).state
         if state.laser_on != on:
             state = self.state()
         if state.laser_on != on:
             found = f"the laser line stayed {'off' if on else 'on'} ({state.last_error})"
             raise fault("laser", found, "cut the laser's supply and check its wiring")
+        self._lit = on
         return state
 
     def trigger(self) -> None:

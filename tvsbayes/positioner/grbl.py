@@ -125,6 +125,7 @@ class GrblPositioner:
         self._wishes, self._clock = wishes or Wishes(), clock
         self._buffer, self._heard = bytearray(), bytearray()
         self._pending, self._homed, self._greeted, self._done = 0, False, False, 0
+        self._lit = False
         self._target: tuple[int, int] = (0, 0)
         self._status: Status | None = None
         self.repeats = 0
@@ -154,7 +155,7 @@ class GrblPositioner:
         if state.status != "idle":
             raise fault("stopped", f"homing ended in {state.status}", "home again")
         self._target = (state.pan_steps, state.tilt_steps)
-        return HomeReport(_dark(state), (0, 0), known=False, compared=False)
+        return HomeReport(self._dark(state), (0, 0), known=False, compared=False)
 
     def move_to(self, pan_steps: int, tilt_steps: int) -> DeviceState:
         """See `Positioner.move_to`."""
@@ -164,6 +165,8 @@ class GrblPositioner:
             if not self._wishes.limits.allow(axis, counter) or abs(counter) > COUNTERS_MAX:
                 found = f"{axis} {counter}, allowed is {self._wishes.limits.words(axis)}"
                 raise fault("refused-limit", found, "correct the plan or the limits in [positioner]")
+        if self._lit:
+            self.laser(False)
         before = self._asked()
         self._target = wanted
         words, seconds = self._way(self._board.counters(before.position_mm), wanted)
@@ -178,7 +181,7 @@ class GrblPositioner:
             found = f"the board stands at {reached}, ordered was {wanted}"
             raise fault("position", found, "home again; look for soft limits ($20) and feed hold")
         self._done += 1
-        return _dark(self._state(status, laser_on=self._laser_on()))
+        return self._dark(self._state(status, laser_on=self._laser_on()))
 
     def laser(self, on: bool) -> DeviceState:
         """See `Positioner.laser`."""
@@ -190,6 +193,8 @@ class GrblPositioner:
                     "a GRBL board leaves the laser on when this computer dies",
                     "have something else cut it, then write unwatched_laser = true into [positioner.options]",
                 )
+        # Before the order: whoever interrupts it does not know whether it has arrived.
+        self._lit = self._lit or on
         try:
             self._order(self._laser_order(on), REPLY_S)
             state = self.state()
@@ -202,6 +207,7 @@ class GrblPositioner:
             self._write(RESET)
             found = f"the laser's mode stayed {'off' if on else 'on'}"
             raise fault("laser", found, "cut the laser's supply and check its wiring")
+        self._lit = on
         return state
 
     def state(self) -> DeviceState:
@@ -268,6 +274,14 @@ class GrblPositioner:
             return f"G53 G0 X{x:.5f} Y{y:.5f}", seconds
         way_mm = sum((n / k) ** 2 for n, k in zip(steps, self._board.steps_per_mm, strict=True)) ** 0.5
         return f"G53 G1 X{x:.5f} Y{y:.5f} F{60 * way_mm / seconds:.4f}", seconds
+
+    def _dark(self, state: DeviceState) -> DeviceState:
+        """The state behind a motion, in which no light may be."""
+        if state.laser_on:
+            # At rest a reset keeps the position.
+            self._write(RESET)
+            raise fault("laser", "the laser is on after a motion", "cut the laser's supply and check the board")
+        return state
 
     def _require_homed(self, what: str) -> None:
         if not self._homed:
@@ -396,13 +410,6 @@ class GrblPositioner:
             self._buffer += data
             if not self._greeted:
                 self._heard += data[: max(HEARD_BYTES_MAX - len(self._heard), 0)]
-
-
-def _dark(state: DeviceState) -> DeviceState:
-    """The state behind a motion, in which no light may be."""
-    if state.laser_on:
-        raise fault("laser", "the laser is on after a motion", "cut the laser's supply and check the board")
-    return state
 
 
 def _power(stated: str | int | float | None) -> float | None:

@@ -2,7 +2,7 @@
 
 Drivers of other hardware keep these promises too (data/docs/instrument.md, "Your own hardware"): `move_to` and `home`
 return only after the device has said that this very motion has ended at the counters asked for; what else happens ends
-in a `DeviceFault` within a bounded time; the laser is off after `home` and `close`, whatever happened.
+in a `DeviceFault` within a bounded time; the laser is off in motion and after `home` and `close`, whatever happened.
 
 Counters are absolute motor steps (pan, tilt); seconds where a name says `_s`. Time comes from a `Clock`, bytes from a
 `Link`: tests drive both without hardware and without waiting.
@@ -91,7 +91,7 @@ class Positioner(Protocol):
         """Find the home switches; the laser is off afterwards."""
 
     def move_to(self, pan_steps: int, tilt_steps: int) -> DeviceState:
-        """Go to absolute counters; returns when the device has said that it is there."""
+        """Go to absolute counters, in darkness; returns when the device has said that it is there."""
 
     def laser(self, on: bool) -> DeviceState:
         """Switch the laser; returns when the device has said so."""
