@@ -7,9 +7,10 @@ from support.pseudo_terminal import needs_pseudo_terminals, served
 
 from tvsbayes.acquisition.simulated_instrument import SimulatedDevice, VirtualClock
 from tvsbayes.errors import DeviceFault
+from tvsbayes.positioner import serial_port
 from tvsbayes.positioner.driver import SerialPositioner
 from tvsbayes.positioner.mechanics import Mechanics
-from tvsbayes.positioner.serial_port import serial_opener
+from tvsbayes.positioner.serial_port import Port, serial_opener
 
 SETTINGS = {"hp": -60, "ht": -40, "pmin": -300, "pmax": 300, "wd": 10_000}
 
@@ -23,6 +24,25 @@ def test_a_ports_name_is_never_taken_as_an_address(tmp_path):
             SerialPositioner(serial_opener(port, 115_200), {}, VirtualClock())
         assert caught.value.code == "port"
     assert not victim.exists()
+
+
+def test_of_two_ports_of_one_device_the_named_one_is_opened(monkeypatch):
+    """A Teensy with two serial ports, plugged in again under other names; a second device is never taken for it."""
+    opened, there = [], ["/dev/ttyACM0", "/dev/ttyACM1"]
+
+    def ports():
+        return [Port("/dev/ttyACM9", "", 0x16C0, 1, "B"), *(Port(name, "", 0x16C0, 1, "A") for name in there)]
+
+    monkeypatch.setattr(serial_port, "serial_ports", ports)
+    monkeypatch.setattr(serial_port, "_SerialLink", lambda name, baud: opened.append(name))
+    open_link = serial_opener("/dev/ttyACM1", 115_200)
+    open_link()
+    there[:] = ["/dev/ttyACM2", "/dev/ttyACM3"]
+    open_link()
+    there[:] = ["/dev/ttyACM2"]
+    with pytest.raises(OSError, match="serial number A"):
+        open_link()
+    assert opened == ["/dev/ttyACM1", "/dev/ttyACM3"]
 
 
 @needs_pseudo_terminals

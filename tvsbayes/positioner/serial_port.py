@@ -44,22 +44,24 @@ def serial_ports() -> list[Port]:
     return sorted(found, key=lambda port: port.name)
 
 
+def _ports_of(device: Port) -> list[str]:
+    """Names of all ports of a USB device, one of which is known."""
+    same = (device.vid, device.pid, device.serial_number)
+    return [p.name for p in serial_ports() if (p.vid, p.pid, p.serial_number) == same]
+
+
 def serial_opener(port: str, baud: int) -> Callable[[], Link]:
     """Opens a port by name; after an unplugging, the same USB device under whatever name it came back."""
-    identity: list[Port] = [p for p in serial_ports() if p.name == port and p.serial_number]
+    known = next((p for p in serial_ports() if p.name == port and p.serial_number), None)
+    # A device may have several ports; the order of their names stays.
+    place = 0 if known is None else _ports_of(known).index(port)
 
     def open_link() -> Link:
         name = port
-        if identity:
-            known = identity[0]
-            matches = [
-                p.name
-                for p in serial_ports()
-                if (p.vid, p.pid, p.serial_number) == (known.vid, known.pid, known.serial_number)
-            ]
-            if not matches:
+        if known is not None and port not in (names := _ports_of(known)):
+            if len(names) <= place:
                 raise OSError(f"no port with the USB serial number {known.serial_number}")
-            name = matches[0]
+            name = names[place]
         return _SerialLink(name, baud)
 
     return open_link
