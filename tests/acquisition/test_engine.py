@@ -16,12 +16,12 @@ from tvsbayes.acquisition.campaign_files import check_journal, repair_campaign
 from tvsbayes.acquisition.engine import ATTEMPTS_PER_LOOK, _approach
 from tvsbayes.acquisition.journal import LOG, read_journal
 from tvsbayes.acquisition.journal_check import verify
-from tvsbayes.acquisition.observation import Sighting, TwinObserver
+from tvsbayes.acquisition.observation import Observation, Sighting, TwinObserver
 from tvsbayes.acquisition.operator import SimulatedOperator, Terminal
 from tvsbayes.acquisition.recorder import LOST_STEPS, recorded
 from tvsbayes.acquisition.session import acquire, begin
 from tvsbayes.errors import DeviceFault, InputError
-from tvsbayes.instrument.campaign import read_campaign
+from tvsbayes.instrument.campaign import UNDETECTED, read_campaign
 from tvsbayes.positioner.protocol import request
 from tvsbayes.twin.true_rig import read_truth
 
@@ -324,6 +324,25 @@ def test_lost_steps_void_their_segment_and_no_other(mounted_rig, tmp_path):
         by_segment.setdefault(campaign.moves[spot.move].segment, set()).add(spot.status)
     assert by_segment == {0: {"ok"}, 1: {LOST_STEPS}, 2: {"ok"}}
     assert any("steps were lost" in w for w in check_journal(tmp_path / "c")["warnings"])
+
+
+class Undetected:
+    """An observer whose pictures wait for `detect`; steps are lost before its n-th look."""
+
+    def __init__(self, instrument, at):
+        self.instrument, self.left = instrument, at
+
+    def observe(self, positioner, spot):
+        self.left -= 1
+        if self.left == 0:
+            self.instrument.mechanics.missing_steps = [5, 0]
+        return Observation(Sighting(UNDETECTED))
+
+
+def test_pictures_of_a_segment_with_lost_steps_no_longer_wait_for_detection(mounted_rig, tmp_path):
+    """`detect` would make spots of them that count, at counters where the mirrors were not."""
+    Run(mounted_rig, tmp_path / "c", small_plan(2, rehome=True), observer=lambda i: Undetected(i, 5)).engine.run()
+    assert [spot.status for spot in read_campaign(tmp_path / "c").spots] == [UNDETECTED] * 4 + [LOST_STEPS] * 4
 
 
 def test_forgotten_sheet_is_noticed_by_its_spot(mounted_rig, tmp_path):

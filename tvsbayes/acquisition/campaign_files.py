@@ -179,17 +179,23 @@ def _longer(campaign: Campaign, folder: Path) -> dict[str, int]:
     except InputError:
         return {}
 
-    def same(spots: Sequence[Spot]) -> list[Spot]:
-        waiting = [replace(s, status="ok") if s.status == LOST_STEPS else s for s in spots]
-        return [s if s.spot not in undetected else undetected[s.spot] for s in waiting]
+    def same(table: Sequence[Spot], journal: Sequence[Spot]) -> bool:
+        return len(table) == len(journal) and all(map(_same_look, table, journal))
 
-    undetected = {spot.spot: spot for spot in campaign.spots if spot.status == UNDETECTED}
     moves, looks = len(campaign.moves), len(campaign.spots)
     more = {
         "moves.csv": len(present.moves) - moves if present.moves[:moves] == campaign.moves else 0,
-        "spots.csv": len(present.spots) - looks if same(present.spots[:looks]) == same(campaign.spots) else 0,
+        "spots.csv": len(present.spots) - looks if same(present.spots[:looks], campaign.spots) else 0,
     }
     return {name: rows for name, rows in more.items() if rows > 0}
+
+
+def _same_look(row: Spot, journal: Spot) -> bool:
+    """Whether a row of spots.csv is the journal's look, whatever `detect` or a homing has said of it since."""
+    if journal.status == UNDETECTED and row.spot == journal.spot:
+        return True
+    lost = LOST_STEPS in (row.status, journal.status)
+    return replace(row, status=journal.status) == journal if lost else row == journal
 
 
 def _detected(campaign: Campaign, folder: Path) -> dict[int, Spot]:

@@ -34,7 +34,6 @@ class Recorded:
         looked_steps: steps of the plan whose looks are there; after a repair some before `next_step` may be missing.
         references: looks beside the plan, with which resumed runs compared what they see with what was seen before.
         target: where the sheet stands, "" before the first placement.
-        placements: how often the operator was asked to place it by the plan.
         starts: how often the acquisition was started.
         boot: boot id of the device at its last homing, None before.
         home_steps: counters that the last `home` of the plan asked for.
@@ -50,7 +49,6 @@ class Recorded:
     looked_steps: frozenset[int] = frozenset()
     references: int = 0
     target: str = ""
-    placements: int = 0
     starts: int = 0
     boot: int | None = None
     home_steps: tuple[int, int] = (0, 0)
@@ -105,9 +103,7 @@ class Recorder:
         elif event == "stop":
             self.state = replace(state, ended=str(cast("Stop", data)["reason"]))
         elif event == "placed":
-            placed = cast("Placed", data)
-            again = bool(placed.get("again", False))
-            self.state = replace(state, target=str(placed["target"]), placements=state.placements + (not again))
+            self.state = replace(state, target=str(cast("Placed", data)["target"]))
         elif event == "verified":
             self._verified(cast("Verified", data))
         elif event == "homed":
@@ -151,7 +147,8 @@ class Recorder:
         """The campaign so far."""
         segment_of = [move.segment for move in self.moves]
         spots = tuple(
-            replace(spot, status=LOST_STEPS) if spot.status == "ok" and segment_of[spot.move] in self._lost else spot
+            # Refused and undetected ones too: `detect` may yet find them in their frames.
+            replace(spot, status=LOST_STEPS) if segment_of[spot.move] in self._lost else spot
             for spot in self.spots
         )
         return replace(
