@@ -75,6 +75,32 @@ def test_pictures_without_a_visible_spot_wait_for_detection(mounted_rig):
     assert sorted(found.pictures)[0] == "dark/000003_left.png" and len(found.pictures) == 4
 
 
+class AlwaysLit:
+    """Cameras of a twin whose laser never goes off, whatever the device says."""
+
+    def __init__(self, instrument, rig, seed):
+        self.instrument, self.render, self.frame = instrument, twin_renderer(rig, seed), 0
+
+    def grab(self):
+        self.frame += 1
+        on, self.instrument.mechanics.laser_on = self.instrument.mechanics.laser_on, True
+        pair = self.render(self.instrument.light(), 0, self.frame)
+        self.instrument.mechanics.laser_on = on
+        return pair
+
+
+def test_a_spot_that_is_there_without_the_laser_is_a_fault(small_rig):
+    instrument = Instrument(small_rig, 7)
+    instrument.place("d1", 0)
+    positioner = instrument.positioner()
+    positioner.home()
+    positioner.move_to(0, 0)
+    observer = CameraObserver(AlwaysLit(instrument, small_rig, 7), live_detector(small_rig.stereo))
+    with pytest.raises(DeviceFault, match="off, too") as caught:
+        observer.observe(positioner, 0)
+    assert caught.value.code == "light" and not instrument.mechanics.laser_on
+
+
 def test_changed_background_is_refused(mounted_rig):
     instrument = Instrument(mounted_rig, 1)
     positioner = instrument.positioner()

@@ -3,7 +3,8 @@
 The laser is on only between the two pictures, and off again whatever happens. Light also proves that no picture is
 older than the look, however deep the buffers are: pictures come in the order of their exposure, so after laser-on we
 wait for the spot to appear and after laser-off for it to vanish. A look then begins with no lit picture under way, and
-what shows a spot was exposed in it. That the spot vanishes shows, too, that the laser is off.
+what shows a spot was exposed in it. That the spot vanishes shows, too, that the laser is off; one that was there before
+laser-on is a fault.
 
 Raw px with the integer at the centre of a pixel; grey levels 0 to 255, also of pictures of 16 bits, kept as they are.
 """
@@ -37,6 +38,8 @@ CHANGE_DN = 40
 WAIT_GRABS = 20
 """Grabs after which a spot that has not appeared never will: each takes at least three frames, and no driver or stream
 holds back sixty."""
+SAME_PLACE_PX = 2.0
+"""A spot moves by less between two pictures of a scene at rest."""
 UNSTEADY = "unsteady"
 """Status of a look whose background changed: somebody in the picture, or the light in the room."""
 
@@ -104,7 +107,8 @@ class CameraObserver:
         """See `Observer.observe`.
 
         Raises:
-            DeviceFault: a camera repeats one picture, the laser went off while it was exposed, or does not go off.
+            DeviceFault: a camera repeats one picture, the laser went off while it was exposed, does not go off, or was
+                on before.
             LightRefused: somebody asked for the laser to be off; it is.
         """
         positioner.laser(False)
@@ -130,7 +134,10 @@ class CameraObserver:
                 for camera in CAMERAS
             }
         unsteady = max(rises_dn(lit, dark)) > CHANGE_DN
-        return Observation(Sighting(UNSTEADY) if unsteady else self.detector(lit, dark), pictures)
+        found = Sighting(UNSTEADY) if unsteady else self.detector(lit, dark)
+        if found.status == "ok" and min(rises_dn(dark, lit)) <= CHANGE_DN:
+            self._require_new(found, dark)
+        return Observation(found, pictures)
 
     def _grab(self) -> StereoImage:
         """A pair that states what is white: by its driver, else by the brightest pixel so far.
@@ -158,6 +165,15 @@ class CameraObserver:
             if not positioner.state().laser_on:
                 return lit, False
         return lit, positioner.state().laser_on
+
+    def _require_new(self, found: Sighting, dark: StereoImage) -> None:
+        """Refuses a spot that the picture without laser light shows as well: a laser that is always on, or a lamp."""
+        before = self.detector(dark, dark).pixels_px
+        if before is None or found.pixels_px is None:
+            return
+        if max(abs(a - b) for a, b in zip(before, found.pixels_px, strict=True)) < SAME_PLACE_PX:
+            remedy = "cut the laser's supply at once; if it is off, cover what else shines in the picture"
+            raise DeviceFault("light", f"the spot is there with the laser off, too; {remedy}", remedy=remedy)
 
     def _wait_for_darkness(self, dark: StereoImage) -> None:
         for _ in range(WAIT_GRABS):
