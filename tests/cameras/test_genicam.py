@@ -69,6 +69,12 @@ class Feature:
         self._value = new
 
 
+class Kept(Feature):
+    """A feature that stays as it is."""
+
+    value = property(lambda self: self._value, lambda self, new: None)
+
+
 class Acquirer:
     """The part of `harvesters.core.ImageAcquirer` that is used, for a camera with a trigger."""
 
@@ -201,6 +207,19 @@ def test_cameras_that_do_not_obey_are_named(wishes, height, code, word):
     with pytest.raises(DeviceFault, match=word) as caught:
         opened(maker, **wishes).grab()
     assert caught.value.code == code and caught.value.remedy
+
+
+@pytest.mark.parametrize(("kept", "taken"), [(0.0, False), (0.6, False), (0.95, True), (1.04, True)])
+def test_a_gain_that_the_camera_does_not_take_is_named(kept, taken):
+    """1 dB is 12 % of the grey levels."""
+    maker = Maker()
+    for acquirer in maker.acquirers:
+        acquirer.nodes.Gain = Kept(kept)
+    if taken:
+        assert opened(maker, gain=1.0).settings().values["left.gain"] == kept
+    else:
+        with pytest.raises(DeviceFault, match=r"left: Gain = 1\.0 was not taken"):
+            opened(maker, gain=1.0)
 
 
 @pytest.mark.parametrize(

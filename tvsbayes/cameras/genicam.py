@@ -30,6 +30,10 @@ PIXEL_BITS = {"Mono8": 8, "Mono10": 10, "Mono12": 12, "Mono14": 14, "Mono16": 16
 SOFTWARE = "Software"
 DRAIN_MAX = 64
 """The most buffers that are emptied; producers use a handful."""
+STEP_SHARE = 0.05
+STEPS = {"ExposureTime": 1.0, "Gain": 0.1}
+"""A camera rounds to steps of its own: it has taken a value that reads back within this share or this much of it, us
+and the camera's unit of gain, mostly dB."""
 _NAMES = ("left", "right")
 
 
@@ -276,9 +280,8 @@ def _set(nodes: Any, name: str, value: object) -> bool:
         read = node.value
     except Exception:
         return False
-    # Cameras round to their own steps.
     if isinstance(value, float) and isinstance(read, (int, float)):
-        return abs(read - value) <= max(0.05 * abs(value), 1.0)
+        return abs(read - value) <= max(STEP_SHARE * abs(value), STEPS[name])
     return bool(read == value)
 
 
