@@ -93,9 +93,10 @@ class Requests:
 
     def close(self, answer: str) -> None:
         """The run has ended: what still waits is not carried out, and nothing new is taken."""
-        self._closed = True
-        for request in self._waiting():
-            self.settle(request, FAILED, answer)
+        with self._changed:
+            self._closed = True
+            for request in self._waiting():
+                self.settle(request, FAILED, answer)
 
     def told(self) -> tuple[Request, ...]:
         """The last ones, oldest first."""
