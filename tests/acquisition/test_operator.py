@@ -7,7 +7,8 @@ import signal
 import pytest
 from support.bench_runs import raise_error
 
-from tvsbayes.acquisition.operator import LiveLine, StopKey, Terminal, TerminalOperator
+from tvsbayes.acquisition.operator import LiveLine, StopKey, Terminal, TerminalOperator, check_hazard
+from tvsbayes.errors import InputError
 
 pytestmark = pytest.mark.usefixtures("ctrl_c_works")
 
@@ -36,6 +37,15 @@ def test_questions_go_to_stderr(monkeypatch, capsys):
     assert LiveLine().ask("Type yes [now]: ") == "yes"
     out, err = capsys.readouterr()
     assert out == "" and "Type yes [now]: " in err
+
+
+def test_without_standard_input_nobody_can_be_asked(monkeypatch, capsys):
+    """Python has None for a stream that was closed, as by `tvsbayes acquire ... <&-`."""
+    monkeypatch.setattr("sys.stdin", None)
+    with pytest.raises(InputError, match="nobody can be asked"):
+        check_hazard(None, simulate=False)
+    operator = TerminalOperator(StopKey(), Terminal(ask=LiveLine().ask), laser_class="3B")
+    assert operator.place("d1", 175.0, 0, "") is False and operator.stop.requested
 
 
 def test_stop_key_interrupts_a_question_at_once():

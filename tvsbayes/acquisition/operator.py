@@ -180,7 +180,8 @@ def check_hazard(laser_class: str | None, simulate: bool) -> None:
         raise InputError(
             "usage", f"laser class {escaped(laser_class)}", allowed=", ".join(LASER_CLASSES), remedy=remedy
         )
-    if not simulate and laser_class is None and not sys.stdin.isatty():
+    # Closed, it is None.
+    if not simulate and laser_class is None and not (sys.stdin and sys.stdin.isatty()):
         remedy = "run it in a terminal, or state --laser-class"
         raise InputError("usage", "nobody can be asked about the laser hazard", remedy=remedy)
 
@@ -223,6 +224,8 @@ class LiveLine:
         self._bar.stop()
         try:
             self._console.print(question, end="", markup=False, highlight=False)
+            if sys.stdin is None:
+                raise EOFError
             return input()
         finally:
             self._bar.start()
