@@ -395,7 +395,12 @@ def test_looks_without_a_spot_are_repeated_and_then_refused(mounted_rig, tmp_pat
 
 
 @pytest.mark.parametrize(
-    ("steps", "name"), [(1200, "left"), (20, "left"), (19, "unknown"), (0, "right"), (-3, "right"), (-500, "right")]
+    ("steps", "ours", "other"),
+    [
+        *((1200, "left", "left"), (20, "left", "left"), (19, "unknown", "unknown")),
+        *((0, "right", "unknown"), (-3, "right", "unknown"), (-20, "right", "right"), (-500, "right", "right")),
+    ],
 )
-def test_approach_after_homing(steps, name):
-    assert _approach("pan", steps) == name
+def test_approach_after_homing(steps, ours, other):
+    """Our firmware comes to rest in the negative sense; a board that pulls off its switches the other way does not."""
+    assert [_approach("pan", steps, ends_negative) for ends_negative in (True, False)] == [ours, other]

@@ -19,6 +19,7 @@ from tvsbayes.acquisition.session import begin
 from tvsbayes.errors import DeviceFault
 from tvsbayes.instrument.campaign import read_campaign
 from tvsbayes.instrument.counter_limits import CounterLimits
+from tvsbayes.instrument.plan import PlanStep
 from tvsbayes.instrument.stereo_pair import Stereo
 from tvsbayes.positioner.grbl import GrblPositioner, Wishes
 
@@ -59,7 +60,7 @@ class Eye:
         return Observation(Sighting("ok", tuple(map(float, pixels)), (0.1,) * 4))
 
 
-def engine(rig, folder, board, resume=False, **happening):
+def engine(rig, folder, board, resume=False, plan=None, **happening):
     positioner = GrblPositioner(
         lambda: BoardLink(board), Wishes(laser="M8", unwatched=True, limits=LIMITS), board.clock
     )
@@ -67,8 +68,9 @@ def engine(rig, folder, board, resume=False, **happening):
     eye = Eye(rig.stereo, hand, rig.sheets_mm, board, **happening)
     utc = lambda: CREATED + datetime.timedelta(seconds=board.clock.monotonic())  # noqa: E731
     bench = Bench(positioner, eye, hand, board.clock, utc, {"device": dict(positioner.identity)})
-    journal = begin(folder, rig, small_plan(2), resume, {"name": "grbl", "created": CREATED.isoformat()})
-    return Acquisition(rig, small_plan(2), journal, bench)
+    plan = plan or small_plan(2)
+    journal = begin(folder, rig, plan, resume, {"name": "grbl", "created": CREATED.isoformat()})
+    return Acquisition(rig, plan, journal, bench)
 
 
 def test_a_run_on_a_grbl_board_that_is_reset_and_resumed(mounted_rig, tmp_path):
@@ -85,3 +87,11 @@ def test_a_run_on_a_grbl_board_that_is_reset_and_resumed(mounted_rig, tmp_path):
     assert {move.segment for move in campaign.moves} == {0, 1} and record.unverified == (0, 1) and record.lost == ()
     start = next(r for r in read_journal(tmp_path / "c").records if r.event == "start")
     assert start.data["device"]["fw"] == "Grbl 1.1h" and start.data["setup"]["positioner.port"] == "/dev/ttyUSB0"
+
+
+def test_a_stop_where_a_board_was_homed_has_no_known_side(mounted_rig, tmp_path):
+    """$23 says in which sense GRBL pulls off its switches, and nobody has asked it."""
+    rig, board = replace(mounted_rig, positioner={"driver": "grbl", "port": "/dev/ttyUSB0"}), GrblBoard()
+    engine(rig, tmp_path / "c", board, plan=[PlanStep(0, "home", -80, -70)]).run()
+    move = recorded(read_journal(tmp_path / "c").records).moves[0]
+    assert (move.pan_approach, move.tilt_approach) == ("unknown", "unknown")

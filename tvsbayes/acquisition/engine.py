@@ -224,7 +224,7 @@ class Acquisition:
         state = self.bench.positioner.move_to(*counters)
         self.bench.clock.sleep(self._settle_s)
         ways = zip(AXES, counters, switches, strict=True)
-        approach = [_approach(axis, to - start) for axis, to, start in ways]
+        approach = [_approach(axis, to - start, report.ends_negative) for axis, to, start in ways]
         reached = {"pan_steps": state.pan_steps, "tilt_steps": state.tilt_steps, "boot": state.boot}
         self._log.write(
             "homed", step=step, time_s=self._log.now_s(), **reached, approach=approach, **self.bench.annotate()
@@ -429,12 +429,10 @@ def _doing(step: PlanStep) -> str:
     }[step.action]
 
 
-def _approach(axis: str, steps: int) -> str:
-    """The side from which an axis stands after homing and a move of so many steps.
-
-    Homing itself ends in the negative sense, over more steps than any play.
-    """
-    return "unknown" if 0 < steps < CLEARED_STEPS else direction_of(axis, 1 if steps > 0 else -1)
+def _approach(axis: str, steps: int, ends_negative: bool) -> str:
+    """The side from which an axis stands after homing, which may end in the negative sense, and so many steps more."""
+    known = abs(steps) >= CLEARED_STEPS or (steps <= 0 and ends_negative)
+    return direction_of(axis, 1 if steps > 0 else -1) if known else "unknown"
 
 
 def _shift_px(before: Spot, now: Four) -> float:

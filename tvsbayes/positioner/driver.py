@@ -116,7 +116,8 @@ class SerialPositioner:
         self._homed_here = self._compares = True
         if state.laser_on:
             raise fault("laser", "the laser is on after homing", "cut the laser's supply and check the firmware")
-        return HomeReport(state, (state.pan_home_deviation_steps, state.tilt_home_deviation_steps), known, compared)
+        deviation = state.pan_home_deviation_steps, state.tilt_home_deviation_steps
+        return HomeReport(state, deviation, known, compared, ends_negative=True)
 
     def move_to(self, pan_steps: int, tilt_steps: int) -> DeviceState:
         """See `Positioner.move_to`.

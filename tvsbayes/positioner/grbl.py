@@ -144,7 +144,7 @@ class GrblPositioner:
             raise
 
     def home(self) -> HomeReport:
-        """See `Positioner.home`; what was lost before is not known afterwards."""
+        """See `Positioner.home`; what was lost before is not known afterwards, nor in which sense $23 had it end."""
         self._homed = False
         # Out of any alarm, and dark.
         self._greeting()

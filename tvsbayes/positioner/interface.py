@@ -68,12 +68,14 @@ class HomeReport:
         known: whether this connection homed before, to which the deviation refers.
         compared: whether the device was homed at all when this homing began; if not (unhomed, in alarm) it reports
             (0, 0) whatever happened.
+        ends_negative: whether both axes came to rest in the negative sense, over more steps than any play.
     """
 
     state: DeviceState
     deviation_steps: tuple[int, int]
     known: bool
     compared: bool
+    ends_negative: bool = False
 
 
 class Positioner(Protocol):
