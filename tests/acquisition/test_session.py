@@ -17,7 +17,7 @@ from tvsbayes.acquisition.journal import LOG, read_journal
 from tvsbayes.acquisition.journal_check import verify
 from tvsbayes.acquisition.recorder import recorded
 from tvsbayes.acquisition.replanning import check_plan
-from tvsbayes.acquisition.run_identity import setup_changes
+from tvsbayes.acquisition.run_identity import setup_changes, setup_entries
 from tvsbayes.acquisition.session import acquire, begin
 from tvsbayes.cli.main import run
 from tvsbayes.errors import InputError
@@ -244,3 +244,11 @@ def test_killed_acquisition_is_resumed_without_a_loss(tmp_path):
 def test_twenty_killed_acquisitions(tmp_path, seed):
     """Four campaigns, each killed five times."""
     assert killed_runs(tmp_path, 5, seed=100 + seed, experiments=60) == 240
+
+
+def test_passwords_of_cameras_stay_out_of_the_journal(mounted_rig):
+    """A campaign folder is handed on; the address tells which camera it was."""
+    sources = {"left": "rtsp://eye:secret@10.0.0.2/1", "right": "http://eye:secret@10.0.0.3/a?x=1@2"}
+    entries = setup_entries(replace(mounted_rig, cameras={**sources, "exposure": -6.0}), synthetic=False)
+    assert entries["cameras.left"] == "rtsp://10.0.0.2/1" and entries["cameras.right"] == "http://10.0.0.3/a?x=1@2"
+    assert entries["cameras.exposure"] == -6.0

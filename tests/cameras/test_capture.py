@@ -210,3 +210,10 @@ def test_opencv_is_silent_only_while_cameras_are_opened(monkeypatch, wanted):
         open_cameras({"source": 0}, WIDTH, HEIGHT, absent)
     assert levels == [(logging.LOG_LEVEL_SILENT, "-8") if wanted is None else (before, wanted)]
     assert logging.getLogLevel() == before and [os.environ.get(name) for name in names] == [wanted] * 2
+
+
+@pytest.mark.parametrize("address", ["ftp://eye:secret@10.0.0.2/1", "http://eye:secret@127.0.0.1:9/x.mjpg"])
+def test_no_message_holds_a_password(address):
+    with pytest.raises((InputError, DeviceFault), match="camera") as caught:
+        open_capture(address)
+    assert "secret" not in str(caught.value) and address.partition("@")[2] in str(caught.value)

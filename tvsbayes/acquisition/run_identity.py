@@ -18,6 +18,7 @@ import json
 from collections.abc import Mapping, Sequence
 
 from tvsbayes.acquisition.journal import Record
+from tvsbayes.cameras.capture import without_password
 from tvsbayes.errors import escaped, refusal
 from tvsbayes.instrument.counter_limits import HOME_KEYS
 from tvsbayes.instrument.parameters import GEAR_ERROR_NAMES
@@ -56,12 +57,13 @@ def data_entries(rig: Rig, synthetic: bool) -> Entries:
 
 
 def setup_entries(rig: Rig, synthetic: bool) -> Entries:
-    """What may change between two runs of a campaign, and is logged at every start."""
+    """What may change between two runs of a campaign, and is logged at every start, without passwords of cameras."""
     entries: Entries = {f"positioner.{key}": value for key, value in rig.positioner.items()}
     entries |= {f"cameras.{key}": value for key, value in rig.cameras.items()}
     entries |= {f"sheets.{name}": x_mm for name, x_mm in rig.sheets_mm.items()}
     fixed = data_entries(rig, synthetic)
-    return _short({key: value for key, value in entries.items() if key not in fixed})
+    told = {key: without_password(value) if isinstance(value, str) else value for key, value in entries.items()}
+    return _short({key: value for key, value in told.items() if key not in fixed})
 
 
 def _means_counters(key: str) -> bool:

@@ -15,6 +15,7 @@ Seconds where a name says `_s`.
 from __future__ import annotations
 
 import os
+import re
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -116,6 +117,11 @@ def _quiet_opencv() -> Iterator[None]:
             logging.setLogLevel(before)
 
 
+def without_password(source: str) -> str:
+    """A source as messages and logs may hold it: an address without user and password."""
+    return re.sub(r"://[^/?#]*@", "://", source)
+
+
 def open_capture(source: str | int) -> Capture:
     """A device by number or path, or a stream by address.
 
@@ -129,7 +135,8 @@ def open_capture(source: str | int) -> Capture:
     if isinstance(source, str) and "://" in source:
         if not source.startswith(("http://", "https://", "rtsp://")):
             remedy = "give a device number, a device path, or an http, https or rtsp address"
-            raise InputError("camera", f"[cameras] source {escaped(source)} is no camera", remedy=remedy)
+            found = escaped(without_password(source))
+            raise InputError("camera", f"[cameras] source {found} is no camera", remedy=remedy)
         return NetworkStream(partial(_open_stream, source))
     return _opened(cv2.VideoCapture(source), source)
 
@@ -147,7 +154,8 @@ def _opened(capture: Any, source: str | int) -> Capture:
     if not capture.isOpened():
         capture.release()
         remedy = "check [cameras] in the rig file, the cable, and that no other program has the camera"
-        raise DeviceFault("camera", f"camera {escaped(str(source))} cannot be opened; {remedy}", remedy=remedy)
+        found = escaped(without_password(str(source)))
+        raise DeviceFault("camera", f"camera {found} cannot be opened; {remedy}", remedy=remedy)
     return capture
 
 
