@@ -70,6 +70,17 @@ def test_faults_and_repeated_looks_are_told_in_words(mounted_rig, tmp_path):
     assert told["look"]["status"] == "no-spot" and told["trail"] == []
 
 
+def test_darkness_is_not_promised_after_a_fault():
+    """A device that does not answer has not said that its laser is off."""
+    told = []
+    for error in (None, DeviceFault("unplugged", "gone", remedy="plug it in")):
+        live = LiveRun()
+        live.ask("laser off")
+        live.ended("done" if error is None else "unplugged", error)
+        told.append(live.told()["requests"][0]["answer"])
+    assert "cut the laser's supply" in told[1] and "supply" not in told[0] and "is off" not in " ".join(told)
+
+
 def test_an_error_of_the_program_is_told_too(mounted_rig, tmp_path):
     live = LiveRun()
     bug = Run(

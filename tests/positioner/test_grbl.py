@@ -268,6 +268,20 @@ def test_an_unplugged_board_is_named():
     positioner.close()
 
 
+@pytest.mark.parametrize(("lost", "code"), [("gone", "unplugged"), ("silent", "no-answer")])
+@pytest.mark.parametrize("lit", [True, False])
+def test_whoever_loses_a_lit_board_is_told_to_cut_its_light_first(lost, code, lit):
+    """Nothing of ours reaches it any more, and no watchdog of its own ends the light."""
+    board = GrblBoard()
+    positioner = connected(board)
+    positioner.home()
+    positioner.laser(lit)
+    setattr(positioner._link if lost == "gone" else board, lost, True)
+    with pytest.raises(DeviceFault) as caught:
+        positioner.laser(False)
+    assert caught.value.code == code and caught.value.remedy.startswith("cut the laser's supply") == lit
+
+
 @needs_pseudo_terminals
 def test_a_board_on_a_pseudo_terminal():
     """Pyserial and a real file descriptor; the board's time runs with the requests."""

@@ -73,11 +73,13 @@ class LiveRun:
 
     def ended(self, reason: str, error: BaseException | None = None) -> None:
         """The run is over, after a fault where there was one."""
-        fault = None
+        fault, answer = None, "the run has ended, its last order was laser off"
         if error is not None:
+            # Nor does anybody know whether that order has arrived.
+            answer = "the run has ended in a fault: cut the laser's supply, it may be on"
             code, remedy = getattr(error, "code", type(error).__name__), getattr(error, "remedy", None)
             fault = Fault(str(code), str(error) or str(code), remedy or "")
-        self.requests.close("the run has ended; the laser is off")
+        self.requests.close(answer)
         self.publish(state=ENDED, reason=reason, fault=fault)
 
     def ask(self, what: str) -> bool:

@@ -116,6 +116,7 @@ class SerialPositioner:
         self._homed_here = self._compares = True
         if state.laser_on:
             raise fault("laser", "the laser is on after homing", "cut the laser's supply and check the firmware")
+        self._lit = False
         deviation = state.pan_home_deviation_steps, state.tilt_home_deviation_steps
         return HomeReport(state, deviation, known, compared, ends_negative=True)
 

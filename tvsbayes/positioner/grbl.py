@@ -238,7 +238,7 @@ class GrblPositioner:
                 name = parse_greeting(line)
                 if name is not None:
                     self._settle_line()
-                    self._greeted = True
+                    self._greeted, self._lit = True, False
                     return name
         heard = explained(bytes(self._heard))
         found, remedy = f"no GRBL board answers: {heard.found}", heard.remedy
@@ -365,7 +365,16 @@ class GrblPositioner:
     def _silent(self, words: str) -> DeviceFault:
         heard = explained(bytes(self._heard))
         what = "nothing was heard" if heard.cause == "silence" else heard.found
-        return fault("no-answer", f"no answer to {words}: {what}", "check cable and supply, then go on with --resume")
+        remedy = self._darkness_first("check cable and supply, then go on with --resume")
+        return fault("no-answer", f"no answer to {words}: {what}", remedy)
+
+    def _unplugged(self, error: OSError) -> DeviceFault:
+        remedy = self._darkness_first("plug it in, then go on with --resume: it homes again")
+        return fault("unplugged", f"the board is gone: {reason(error)}", remedy)
+
+    def _darkness_first(self, remedy: str) -> str:
+        """A remedy for a board that cannot be reached: no watchdog of its own ends the light."""
+        return f"cut the laser's supply, it may be on; {remedy}" if self._lit else remedy
 
     def _take(self, line: str) -> None:
         """What a board says unasked, and status reports."""
@@ -388,7 +397,7 @@ class GrblPositioner:
         try:
             self._link.write(data)
         except OSError as error:
-            raise _unplugged(error) from error
+            raise self._unplugged(error) from error
 
     def _next(self, deadline_s: float) -> str | None:
         """The next line without its end, None if none is complete by then; empty ones are left out."""
@@ -406,7 +415,7 @@ class GrblPositioner:
             try:
                 data = self._link.read(left_s)
             except OSError as error:
-                raise _unplugged(error) from error
+                raise self._unplugged(error) from error
             self._buffer += data
             if not self._greeted:
                 self._heard += data[: max(HEARD_BYTES_MAX - len(self._heard), 0)]
@@ -420,11 +429,6 @@ def _power(stated: str | int | float | None) -> float | None:
         remedy = "write a number without quotes, up to the board's $30, or leave it out for full power"
         raise _refused("options.laser_power", escaped(str(stated)), "a number of 0 or more", remedy)
     return float(stated)
-
-
-def _unplugged(error: OSError) -> DeviceFault:
-    found = f"the board is gone: {reason(error)}"
-    return fault("unplugged", found, "plug it in, then go on with --resume: it homes again")
 
 
 def _refused(key: str, found: str, allowed: str, remedy: str) -> InputError:
