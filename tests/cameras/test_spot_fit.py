@@ -144,3 +144,8 @@ def test_a_beam_far_from_its_shape_is_refused():
     cut = beam(np.random.default_rng(1), 255)
     cut[:, 240:] = np.minimum(cut[:, 240:], 3)
     assert find_spot(cut).status != "ok"
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (4, 40), (7, 9), (8, 8)])
+def test_a_picture_too_small_for_a_spot_has_none(shape):
+    assert find_spot(np.random.default_rng(0).integers(0, 255, (*shape, 3)).astype(np.uint8)).status == "no-spot"

@@ -62,6 +62,8 @@ def patch_around(picture: np.ndarray) -> Patch | str:
     import cv2
 
     height, width = picture.shape[:2]
+    if min(height, width) < 2 * SHRINK:
+        return "no-spot"
     # To find the spot OpenCV's own weights of the colours will do; they are several times faster.
     small = cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY)
     small = cv2.resize(small, (width // SHRINK, height // SHRINK), interpolation=cv2.INTER_AREA)
