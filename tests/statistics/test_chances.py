@@ -70,6 +70,17 @@ def test_distributions_are_those_of_scipy_stats():
         np.testing.assert_allclose(share_interval95(hits, count), interval, rtol=1e-12)
 
 
+@pytest.mark.parametrize("dof", [2, 60, 180, 600, 6000])
+def test_gross_defects_of_many_looks_are_improbable(dof):
+    """Of an even number of degrees of freedom Q is a finite sum; three a look are soon hundreds."""
+    from scipy import special
+
+    chi2 = dof + np.array([3e3, 1e4, 1e5, 1e8])
+    x, k = 0.5 * chi2[:, None], np.arange(dof // 2)
+    expected = special.logsumexp(k * np.log(x) - special.gammaln(k + 1) - x, axis=1)
+    np.testing.assert_allclose(log_chance(chi2, dof), expected, rtol=1e-12)
+
+
 def test_one_way_chance_is_that_of_the_f_test():
     from scipy import stats
 

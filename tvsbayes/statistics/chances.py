@@ -45,19 +45,32 @@ def recursive_residuals(values: np.ndarray, variances: np.ndarray, *, backwards:
     return tuple(found)
 
 
+FRACTION_TERMS = 400
+"""Of Legendre's continued fraction: where it is asked for ten times as many change no digit, up to 30 000 degrees of
+freedom."""
+
+
 def log_chance(chi2: np.ndarray | float, dof: np.ndarray | float) -> np.ndarray:
     """Log probability of a chi-square of at least this size, also where the probability itself underflows.
 
-    Far out Q(a, x) = Gamma(a, x) / Gamma(a) with Gamma(a, x) = e^-x U(1 - a, 1 - a, x) (DLMF 8.5.3): two gross
+    Far out Q(a, x) = Gamma(a, x) / Gamma(a) with Gamma(a, x) by Legendre's continued fraction (DLMF 8.9.2): two gross
     defects must not tie at minus infinity, the worse one is the cause.
     """
     from scipy import special
 
     with np.errstate(divide="ignore"):
-        plain = np.log(special.chdtrc(dof, chi2))
-    a, x = 0.5 * np.asarray(dof, dtype=float), 0.5 * np.asarray(chi2, dtype=float)
-    far = -x + np.log(special.hyperu(1 - a, 1 - a, x)) - special.gammaln(a)
-    return np.where(np.isfinite(plain), plain, far)
+        plain = np.asarray(np.log(special.chdtrc(dof, chi2)))
+    beyond = ~np.isfinite(plain)
+    if not beyond.any():
+        return plain
+    a, x = (0.5 * np.broadcast_to(part, plain.shape)[beyond] for part in (dof, chi2))
+    rest = np.zeros_like(x)
+    for term in range(FRACTION_TERMS, 0, -1):
+        rest = term * (term - a) / (x + 2 * term + 1 - a - rest)
+    far = -x + np.log(x) * a - np.log(x + 1 - a - rest) - special.gammaln(a)
+    found = plain.copy()
+    found[beyond] = far
+    return found
 
 
 def chi2_quantile(readings: np.ndarray, probability: float) -> np.ndarray:
