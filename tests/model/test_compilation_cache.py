@@ -71,7 +71,10 @@ def test_a_folder_that_cannot_be_made_is_not_used(folder):
     assert not cache_state().used
 
 
-def test_what_one_process_leaves_the_next_one_takes(folder, monkeypatch):
+def test_what_one_process_leaves_the_next_one_takes(folder, monkeypatch, tmp_path):
+    """Whatever lies in the folder one works in: nothing there is code."""
+    (tmp_path / "platformdirs.py").write_text("raise SystemExit('run')")
+    monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("PYTHONPATH", str(ROOT))
     state = cache_state()
     assert state.used and state.remedy == "" and str(folder) in state.found

@@ -93,7 +93,8 @@ def _tried() -> subprocess.CompletedProcess[str]:
     """`trial` in a process of its own, with what XLA has to say."""
     code = f"from {__name__} import trial; trial()"
     return subprocess.run(
-        [sys.executable, "-c", code],
+        # Without -P a file json.py of the folder one works in, a campaign of others perhaps, would be run.
+        [sys.executable, "-P", "-c", code],
         check=True,
         capture_output=True,
         text=True,
