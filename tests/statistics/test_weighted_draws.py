@@ -41,6 +41,13 @@ def test_equal_weights_are_none(count):
     np.testing.assert_allclose(found.mcse_mean, values.std(axis=0) / np.sqrt(count), rtol=allowed)
 
 
+def test_one_draw_of_all_weight_is_every_quantile():
+    """The others' densities may lie beyond the smallest number."""
+    weights = smoothed_weights(np.where(np.arange(1000) == 3, 0.0, -800.0)).weights
+    found = weighted_summary(np.arange(1000.0), weights)
+    assert found.mean == 3.0 and found.interval95.tolist() == [3.0, 3.0] and found.ess_least == 1.0
+
+
 def test_quantiles_count_a_draw_by_its_weight():
     """Twice the weight is twice the draw: far from the ends both agree to the spacing of the draws."""
     values = np.random.default_rng(2).standard_normal(2000)

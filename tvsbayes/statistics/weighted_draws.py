@@ -74,7 +74,9 @@ def weighted_quantiles(values: np.ndarray, weights: np.ndarray, probabilities: S
         order = np.argsort(each, kind="stable")
         ordered = weights[order]
         middle = np.cumsum(ordered) - 0.5 * ordered
-        found[:, column] = np.interp(probabilities, (middle - middle[0]) / (middle[-1] - middle[0]), each[order])
+        # One draw alone has no stretch, and is every quantile.
+        reach = middle[-1] - middle[0] or 1.0
+        found[:, column] = np.interp(probabilities, (middle - middle[0]) / reach, each[order])
     return found.reshape(len(probabilities), *values.shape[1:])
 
 
