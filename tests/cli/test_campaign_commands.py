@@ -24,6 +24,21 @@ from tvsbayes.instrument.plan import write_plan
 pytestmark = pytest.mark.usefixtures("own_compilation_cache")
 
 
+def test_check_says_what_stands_where_the_rig_of_a_plan_belongs(ask, say, tmp_path):
+    plan = MOUNTED / "grid.csv"
+    assert ask("new", tmp_path / "axis", "--axis")[0] == 0
+    for other, words, remedy in (
+        (tmp_path / "axis", "is an axis folder", f"leave out PLAN: tvsbayes check {tmp_path / 'axis'}"),
+        (MOUNTED, "is a folder", f"name the rig file in it: {MOUNTED / 'rig.toml'}"),
+        (PAPER_TWIN, "is a folder", "name a rig file, or leave out PLAN"),
+        (plan, "is no .toml file", "give the rig file first, then the plan"),
+        (tmp_path / "nowhere", "found no such file", "create it"),
+    ):
+        code, _, log = say("check", other, plan)
+        printed = " ".join(log.split())
+        assert code == 2 and words in printed and remedy in printed, printed
+
+
 def test_check_reads_campaign_rig_and_plan(ask, say):
     code, document = ask("check", PAPER_TWIN)
     assert code == 0

@@ -77,13 +77,6 @@ def test_check_takes_a_rig_with_a_plan(ask):
     assert code == 2 and document["error"]["code"] == "usage"
 
 
-def test_check_of_an_axis_with_a_plan_says_what_tells_what_to_read_next(ask, tmp_path):
-    assert ask("new", tmp_path / "axis", "--axis")[0] == 0
-    code, document = ask("check", tmp_path / "axis", MOUNTED / "grid.csv")
-    error = document["error"]
-    assert code == 2 and "is an axis folder" in error["message"] and "plan --given" in error["remedy"]
-
-
 def test_study_counts_and_answers_for_the_users_target(ask, tmp_path, monkeypatch):
     from support.invented_studies import invented
 

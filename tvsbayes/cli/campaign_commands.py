@@ -213,16 +213,7 @@ def _held(path: Path, plan_file: Path | None) -> dict[str, Any]:
     from tvsbayes.instrument.rig import read_rig
 
     if plan_file is not None:
-        in_order(path, plan_file)
-    if plan_file is not None and path.suffix != ".toml":
-        if axis_commands.is_axis(path):
-            where = escaped(str(path), 200)
-            message = f"a plan is checked together with the rig file of a scanner, and {where} is an axis folder"
-            remedy = f"check the folder alone; what to read next: `tvsbayes plan --given {where}`"
-        else:
-            message, remedy = "a plan is checked together with a rig file", "give the rig file first, then the plan"
-        raise InputError("usage", message, allowed="RIG PLAN", remedy=remedy)
-    if plan_file is not None:
+        _refuse_other_than_rig(path, plan_file)
         rig, steps = read_rig(path), read_plan(plan_file)
         from tvsbayes.planning.plan_check import check_plan
 
@@ -240,6 +231,26 @@ def _held(path: Path, plan_file: Path | None) -> dict[str, Any]:
         rig = read_rig(path)
         return {"kind": "rig", "sheets_mm": rig.sheets_mm, "costs_s": rig.costs_s, "warnings": []}
     return axis_commands.axis_held(path) if axis_commands.is_axis(path) else campaign_held(path)
+
+
+def _refuse_other_than_rig(path: Path, plan_file: Path) -> None:
+    """Refuse what stands where the rig file of a plan belongs, by what it is; a missing file is left to the reader."""
+    in_order(path, plan_file)
+    name = escaped(str(path), 200)
+    if path.is_dir():
+        rig_file = path / "rig.toml"
+        if axis_commands.is_axis(path):
+            found, remedy = "an axis folder, whose plan is not checked", f"leave out PLAN: tvsbayes check {name}"
+        elif rig_file.is_file():
+            found, remedy = "a folder", f"name the rig file in it: {escaped(str(rig_file), 200)}"
+        else:
+            found, remedy = "a folder", f"name a rig file, or leave out PLAN: tvsbayes check {name}"
+    elif path.exists() and path.suffix.lower() != ".toml":
+        found, remedy = "no .toml file", "give the rig file first, then the plan"
+    else:
+        return
+    message = f"a plan is checked together with a rig file, and {name} is {found}"
+    raise InputError("usage", message, found=found, allowed="RIG PLAN", remedy=remedy)
 
 
 def campaign_held(path: Path, campaign: Campaign | None = None) -> dict[str, Any]:
