@@ -47,6 +47,22 @@ def test_a_foreign_file_is_refused_with_its_line(job, quick, tmp_path, line):
         StudyRows(path)
 
 
+def test_a_foreign_line_without_an_end_is_no_torn_row(tmp_path, job):
+    """Nobody's only line is cut off; the torn beginning of a first row is."""
+    path = tmp_path / "truth.json"
+    for text in (b'{"my": "only copy"}', b"\x00\x00", b"x"):
+        path.write_bytes(text)
+        with pytest.raises(InputError, match="line 1 is no row"):
+            StudyRows(path)
+        assert path.read_bytes() == text
+    StudyRows(tmp_path / "whole").append(invented(job, 0))
+    line = (tmp_path / "whole").read_bytes()
+    for kept in (1, 20, len(line) - 1):
+        path.write_bytes(line[:kept])
+        StudyRows(path).append(invented(job, 0))
+        assert path.read_bytes() == line
+
+
 def test_rows_that_cannot_be_written_are_refused_before_the_first_fit(tmp_path):
     with pytest.raises(InputError) as error:
         StudyRows(tmp_path / "no such folder" / "rows.jsonl")

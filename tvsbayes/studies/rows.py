@@ -19,6 +19,8 @@ from tvsbayes.files.disk import read_bytes
 
 STUDY_FORMAT = "tvsbayes-study/1"
 ROWS_BYTES_MAX = 128 * 1024 * 1024
+_LINE_BEGINS = b'{"format": "tvsbayes-study/'
+"""As every line of every edition does, before what may be torn."""
 
 
 @dataclass(frozen=True)
@@ -109,7 +111,7 @@ class StudyRow:
 class StudyRows:
     """Rows of studies in a file of JSON lines: appended one by one, each on disk before the next.
 
-    A process that is killed while it writes leaves a torn last line; it is cut off when the file is opened again.
+    A process that is killed while it writes leaves a torn last line; it is cut off before the next row is added.
     """
 
     def __init__(self, path: Path) -> None:
@@ -119,6 +121,9 @@ class StudyRows:
         rows = (self._row(line, number) for number, line in enumerate(whole.splitlines(), 1))
         self.rows = {(row.design, row.index): row for row in rows}
         self.torn = len(data) - len(whole)
+        # Of a file without one whole row: else somebody's only line, which never ended, would be cut off as torn.
+        if not whole and not (data.startswith(_LINE_BEGINS) or _LINE_BEGINS.startswith(data)):
+            raise self._no_row(1)
         # Before the first campaign is fitted, not after.
         if not os.access(self.path if self.path.exists() else self.path.parent, os.W_OK):
             raise self._unwritable("no right to write, or no such folder")
@@ -143,7 +148,10 @@ class StudyRows:
                 return StudyRow.from_json(document)
         except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
             pass
-        raise InputError(
+        raise self._no_row(number)
+
+    def _no_row(self, number: int) -> InputError:
+        return InputError(
             "study-row",
             f"{escaped(self.path.name)} line {number} is no row of a study",
             file=escaped(self.path.name),
