@@ -182,6 +182,9 @@ static inline int tvs_locate(double pan_steps, double tilt_steps, int pan_side, 
             return 0;
         reach = (y * y - cb * cb * (o[0] * o[0] + y * y + o[2] * o[2])) /
                 (cb * sqrt(inside) - (y * d[1] - cb * cb * (o[0] * d[0] + y * d[1] + o[2] * d[2])));
+        /* The other nappe of the cone is what the aperture would see under 180 deg - B. */
+        if ((y + reach * d[1]) * cb < -1e-12 * fabs(reach * cb))
+            return 0;
     }
     if (!(reach > 0) || isinf(reach))
         return 0;
