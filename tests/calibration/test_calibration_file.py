@@ -390,6 +390,13 @@ def test_the_c_header_computes_the_same(tmp_path, periods, azimuth, vary):
     assert refused >= 4
 
 
+def test_words_of_a_stranger_do_not_end_the_comment_of_the_header(bent):
+    spoilt = replace(bent, estimator="laplace */ int evil; /* ??/")
+    header = calibration_header(spoilt, Origin("mine */ int worse; /*", "", "2026-01-01", "0.2.0"))
+    comment = header[: header.index("#ifndef")]
+    assert comment.count("/*") == comment.count("*/") == 1 and "?" not in comment
+
+
 def test_the_c_header_states_its_error_and_overshoot(bent):
     text = calibration_header(bent)
     error = expected_error(bent)
