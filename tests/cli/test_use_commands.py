@@ -334,6 +334,8 @@ def test_a_file_of_points_becomes_a_cloud(ask, folder, tmp_path, capsys, ending)
     assert document["extrapolated"] == sum(e["extrapolated"] for e, good in zip(entries, seen, strict=True) if good)
     assert run([*map(str, ("locate", folder, "--points", points, "--cloud", out))]) == 0
     assert "cloud.refused.csv" in capsys.readouterr().out
+    before = points.read_bytes()
+    assert ask("locate", folder, "--points", points, "--cloud", points)[0] == 2 and points.read_bytes() == before
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,7 @@ from support.bent_rig import calibration
 
 from tvsbayes.coordinates import cloud_files
 from tvsbayes.coordinates.cloud import CHECKED_MAX, EvenSample, checked, cloud
-from tvsbayes.coordinates.cloud_files import columns_of, write_cloud
+from tvsbayes.coordinates.cloud_files import cloud_place, columns_of, write_cloud
 from tvsbayes.coordinates.location import locate_linear
 from tvsbayes.coordinates.looks_file import BLOCK_ROWS, LOOK_COLUMNS, LookRows, look_blocks
 from tvsbayes.coordinates.simple_calibration import SimpleCalibration, simple_rays
@@ -107,6 +107,26 @@ def test_a_cloud_without_refused_looks_has_no_table_of_them(tmp_path):
     rows = looks(6)
     written = write_cloud(cloud(calibration(), [rows], {}), tmp_path / "c.ply", [])
     assert written.refused_path is None and [path.name for path in tmp_path.iterdir()] == ["c.ply"]
+
+
+def test_the_table_of_an_earlier_cloud_goes_and_a_foreign_file_of_its_name_stays(tmp_path):
+    place, table = tmp_path / "c.ply", tmp_path / "c.refused.csv"
+    assert write_cloud(cloud(calibration(), [looks(20)], {}), place, []).refused == 2 and table.exists()
+    assert write_cloud(cloud(calibration(), [looks(6)], {}), place, []).refused_path is None
+    assert not table.exists(), "it would tell of looks that are not refused"
+    table.write_text("my own notes\n")
+    write_cloud(cloud(calibration(), [looks(6)], {}), place, [])
+    assert table.read_text() == "my own notes\n"
+
+
+@pytest.mark.parametrize("name", ["looks.csv", "looks.refused.csv"])
+def test_a_cloud_does_not_replace_the_looks_that_it_is_made_of(tmp_path, name):
+    file = tmp_path / name
+    file.write_text("measured\n")
+    with pytest.raises(InputError) as refused:
+        cloud_place(tmp_path / "looks.csv", file)
+    assert refused.value.code == "usage" and name in refused.value.message
+    assert cloud_place(tmp_path / "other.csv", file) == tmp_path / "other.csv"
 
 
 def test_what_fails_half_way_leaves_the_old_cloud(tmp_path):

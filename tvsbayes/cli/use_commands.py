@@ -144,7 +144,7 @@ def _write_cloud(campaign: Path, file: Path, place: Path, draws: int, seed: int,
     from tvsbayes.instrument.campaign import read_campaign
     from tvsbayes.report.command_text import cloud_text
 
-    cloud_place(place)
+    cloud_place(place, file)
     with waiting() as progress, Job({FITTING: 1.0, LOCATING: 1.0}, progress) as job:
         calibration = calibration_for(campaign, report_line, job.part(FITTING))
         measured = read_campaign(campaign)

@@ -1,7 +1,7 @@
 """Clouds as files: CSV, or PLY with properties that CloudCompare and MeshLab show. mm, frame T.
 
 A file is written whole or not at all, in memory that does not grow with it. Looks without a point stand in a table
-beside it.
+beside it; where every look has one, no table of an earlier cloud stays.
 """
 
 from __future__ import annotations
@@ -127,17 +127,40 @@ class _Ply:
 FORMATS: dict[str, type[_Csv] | type[_Ply]] = {".csv": _Csv, ".ply": _Ply}
 
 
-def cloud_place(path: Path) -> Path:
+def cloud_place(path: Path, looks: Path | None = None) -> Path:
     """The same path, whose ending names a format.
 
+    Args:
+        path: of the cloud.
+        looks: the file that its looks are read from, which neither the cloud nor its table of refusals may replace.
+
     Raises:
-        InputError: it does not.
+        InputError: it names no format, or the looks would be lost.
     """
+    shown = escaped(str(path), 200)
     if path.suffix.lower() not in FORMATS:
         found, allowed = escaped(path.suffix or path.name), " or ".join(FORMATS)
-        message = f"--cloud {escaped(str(path), 200)}: the ending {found} names no format"
+        message = f"--cloud {shown}: the ending {found} names no format"
         raise InputError("usage", message, found=found, allowed=allowed, remedy="name a file .ply or .csv")
+    if looks is not None and any(one.exists() and looks.exists() and one.samefile(looks) for one in _written(path)):
+        message = f"--cloud {shown} would replace {escaped(str(looks), 200)}, which the looks are read from"
+        raise InputError("usage", message, found=shown, allowed="another file", remedy="name another cloud")
     return path
+
+
+def _written(path: Path) -> tuple[Path, Path]:
+    """The cloud, and the table of looks without a point."""
+    return path, path.with_name(f"{path.stem}.refused.csv")
+
+
+def _removed_if_ours(table: Path) -> None:
+    """Remove the table of an earlier cloud of this name, whose looks are not refused any more."""
+    head = csv_bytes(REFUSED_COLUMNS, ())
+    if table.is_file():
+        with table.open("rb") as stream:
+            ours = stream.read(len(head)) == head
+        if ours:
+            table.unlink()
 
 
 def write_cloud(blocks: Iterable[CloudBlock], path: Path, names: Sequence[str]) -> CloudFile:
@@ -165,8 +188,10 @@ def write_cloud(blocks: Iterable[CloudBlock], path: Path, names: Sequence[str]) 
         kept.seek(0)
         stream.write(body.header(names, points))
         shutil.copyfileobj(kept, stream)
-    table = path.with_name(f"{path.stem}.refused.csv") if refused else None
-    if table is not None:
+    table = _written(path)[1]
+    if refused:
         with written_whole(table) as stream:
             stream.write(csv_bytes(REFUSED_COLUMNS, refused))
-    return CloudFile(path, columns_of(names), points, extrapolated, len(refused), table)
+    else:
+        _removed_if_ours(table)
+    return CloudFile(path, columns_of(names), points, extrapolated, len(refused), table if refused else None)
