@@ -18,7 +18,7 @@ from tvsbayes.planning.candidates import candidates
 from tvsbayes.planning.expectation import PARAMETERS, information_of, prior_knowledge
 from tvsbayes.planning.limits import Batch, Limit, limit_of, next_experiments, split_of, stop_now
 from tvsbayes.planning.looks import LookArrays, arrange, information_of_looks
-from tvsbayes.planning.target import AT_POINT, Sensitivity, Target, parse_target, sensitivity
+from tvsbayes.planning.target import AT_POINT, GEARS_AT_POINT, Sensitivity, Target, parse_target, sensitivity
 
 pytestmark = pytest.mark.usefixtures("small_searches")
 
@@ -103,6 +103,22 @@ def test_no_calibration_removes_the_stop_at_the_point(knowledge, seen, found):
     information = information_of_looks(seen, np.arange(len(found.looks)), path, knowledge.space, False)
     limit = limit_of(knowledge, information, at, target)
     assert not limit.reachable and "at the point itself" in limit.needed
+
+
+def test_errors_of_the_gears_at_the_point_are_not_called_its_stop(knowledge):
+    """Stop 3 mm and reading 4 mm make 5 mm; with 12 mm of the gears, which looks nearer by would tell, 13 mm."""
+    own = {AT_POINT[0]: np.array([9.0]), AT_POINT[1]: np.array([16.0]), GEARS_AT_POINT: np.array([144.0])}
+    found, none = Sensitivity(at({SCALE: 1e-3})[None], own), np.zeros((PARAMETERS, PARAMETERS))
+
+    def needed(limit_mm: float) -> str | None:
+        target = parse_target(f"u(x) at 1000,0,0 mm <= {limit_mm} mm")
+        return limit_of(knowledge, none, found, target).needed
+
+    assert needed(4.9).startswith("5 mm come from the stop and the reading at the point itself")
+    told = needed(5.1)
+    assert "13 mm come from the point itself" in told and "5 from the stop" in told and "12 from errors of the" in told
+    assert "only a smaller stop error" not in told and "[positioner]" in told
+    assert needed(13.1) is None
 
 
 def test_when_to_stop():

@@ -16,7 +16,7 @@ from tvsbayes.planning.candidates import Candidates
 from tvsbayes.planning.expectation import Knowledge
 from tvsbayes.planning.looks import Seen, arrange, covariance_of, information_of_looks
 from tvsbayes.planning.search import search_designs
-from tvsbayes.planning.target import Sensitivity, Target
+from tvsbayes.planning.target import GEARS_AT_POINT, Sensitivity, Target
 from tvsbayes.results.plan_record import Advice, Batch
 
 
@@ -96,6 +96,22 @@ def _state(table: RigTable, columns: Sequence[int], share: float) -> str:
     return " and ".join(f"u({name}) = {_at_most(share * u)} instead of {u:.2g}" for name, u in stated.items())
 
 
+def _needed_at_point(found: Sensitivity, target: Target) -> str | None:
+    """What would have to be better at the target's point itself, in words; None where no calibration is in its way."""
+    own, gears = found.own_variance, found.own.get(GEARS_AT_POINT, np.zeros_like(found.own_variance))
+    # The worst of the quantities, each with its own parts.
+    stop, geared, whole = (target.factor * math.sqrt(max(variance)) for variance in (own - gears, gears, own))
+    unit = target.unit
+    if stop > target.limit:
+        short = f"{stop:.3g} {unit} come from the stop and the reading at the point itself"
+        return f"{short}: only a smaller stop error or aperture noise would do"
+    if whole > target.limit:
+        short = f"{whole:.3g} {unit} come from the point itself: {stop:.3g} from the stop and the reading there, "
+        short += f"{geared:.3g} from errors of the gears, of which looks elsewhere do not tell"
+        return f"{short}; widen the limits in [positioner] until looks reach the point's counters"
+    return None
+
+
 def limit_of(knowledge: Knowledge, data: np.ndarray, found: Sensitivity, target: Target) -> Limit:
     """What no number of looks of this kind removes, and what would.
 
@@ -112,10 +128,8 @@ def limit_of(knowledge: Knowledge, data: np.ndarray, found: Sensitivity, target:
     if floor <= target.limit:
         return Limit(floor, cause, shares, True, None)
     groups = PRIOR_GROUPS
-    at_point = math.sqrt(max(found.own_variance)) * target.factor
-    if at_point > target.limit:
-        short = f"{at_point:.3g} {target.unit} come from the stop and the reading at the point itself"
-        return Limit(floor, cause, shares, False, f"{short}: only a smaller stop error or aperture noise would do")
+    if (at_point := _needed_at_point(found, target)) is not None:
+        return Limit(floor, cause, shares, False, at_point)
 
     def with_inputs(scaled: Mapping[str, float]) -> float:
         precision = knowledge.precision.copy()
