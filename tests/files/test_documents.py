@@ -8,7 +8,7 @@ import tomllib
 import pytest
 
 from tvsbayes.errors import InputError
-from tvsbayes.files.documents import JSON_BYTES_MAX, TOML_BYTES_MAX, parse_json, parse_toml, toml_line
+from tvsbayes.files.documents import JSON_BYTES_MAX, TOML_BYTES_MAX, Keys, parse_json, parse_toml, toml_line
 
 TOML_REFUSED = {
     "syntax": (b"a = 1\nb = \n", 2, "toml"),
@@ -95,3 +95,37 @@ def test_toml_writer_round_trips():
         "dotted.name": {"value": 0.06, "u": 0.0},
     }
     assert tomllib.loads("\n".join(toml_line(k, v) for k, v in values.items())) == values
+
+
+TOML_PLACES = {
+    "a comment above": ("# seed = 3\nname = 1\nseed = 4\n", ("seed",), 3),
+    "a comment with an apostrophe": ("# it's the seed = 3\r\nname = 1\r\nseed = 4\r\n", ("seed",), 3),
+    "a comment behind a value": ("name = 1 # seed = 3\nseed = 4\n", ("seed",), 2),
+    "a comment in a list": ("a = [1, # seed = 3\n2]\nseed = 4\n", ("seed",), 3),
+    "a text of several lines": ('notes = """\nseed = 3\n"""\nseed = 4\n', ("seed",), 4),
+    "a literal text": ("notes = '''\nseed = 3\n'''\nseed = 4\n", ("seed",), 4),
+    "a text": ('notes = "home, seed = 3"\nseed = 4\n', ("seed",), 2),
+    "an entry": ("[t]\na = { value = 1, u = 2 }\nb = { value = 3,  u = 4 }\n", ("t", "b", "u"), 3),
+    "quoted dots": ('[t]\n"a.b" = 1\n[t.c]\n"a.b" = { u = 2 }\n', ("t", "c", "a.b", "u"), 4),
+    "bare dots": ("[t]\na.b = 1\na.c = 2\n", ("t", "a", "c"), 3),
+    "spaced header": ("x = 1\n[ t . u ]\na = 1\n", ("t", "u", "a"), 3),
+    "header after its part": ("[t.u]\na = 1\n[t]\nb = 1\na = 2\n", ("t", "a"), 5),
+    "an escape": ('x = 1\n"\\u0061" = 1\n', ("a",), 2),
+    "an escape that only TOML has": ('"\\U00000061" = 1\nb = 1\n', ("b",), 2),
+    "not there, but in a later table": ("[t]\na = 1\n[u]\nb = 2\n", ("t", "b"), 1),
+    "nowhere": ("[t]\na = 1\n", ("b",), None),
+}
+
+
+@pytest.mark.parametrize("name", TOML_PLACES)
+def test_toml_messages_name_the_line_of_the_key_itself(name):
+    text, path, line = TOML_PLACES[name]
+    keys = Keys({}, "t.toml", parse_toml(text.encode(), "t.toml").text, path[:-1])
+    assert keys.refuse(path[-1], "code", "allowed", "remedy").line == line
+
+
+def test_json_messages_name_the_line_of_the_key_itself():
+    text = '\n{"b": "x, \\"a\\": 1",\n "c": [{"a": 1}, [2, {"a": 3}]],\n "d": {"a": {}},\n "a": 1}'
+    values = parse_json(text.encode(), "t.json")
+    assert values.refuse("a", "code", "allowed", "remedy").line == 5
+    assert values.table("d").refuse("a", "code", "allowed", "remedy").line == 4

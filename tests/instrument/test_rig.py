@@ -361,7 +361,7 @@ RIG_FILE_REFUSED = {
     "truth name": ("focal_scale", "focal_scal", 10, "truth.focal_scal"),
     "sheet close": ("d1 = 175", "d1 = 5", 12, "sheets.d1"),
     "sheet text": ("d1 = 175", "d1 = '175'", 12, "sheets.d1"),
-    "sheet name": ("d1 = 175", '"d\\u001b" = 175', 11, "sheets.d\\x1b"),
+    "sheet name": ("d1 = 175", '"d\\u001b" = 175', 12, "sheets.d\\x1b"),
     "port": ('"/dev/ttyACM0"', "'spy:///dev/ptmx?file=a'", 16, "positioner.port"),
     "baud": ("115200", "-1", 17, "positioner.baud"),
     "limits": ("pan_max_steps = 2000", "pan_max_steps = -2001", 19, "positioner.pan_max_steps"),

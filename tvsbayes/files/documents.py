@@ -29,6 +29,8 @@ _TOML_STRING_OR_COMMENT = re.compile(
     r'"""(?:\\.|[^\\])*?(?:"""|\Z)|\'\'\'.*?(?:\'\'\'|\Z)|"(?:\\[^\n]|[^"\\\n])*+"?|\'[^\'\n]*+\'?|#[^\n]*+',
     re.DOTALL,
 )
+_TOKEN = re.compile(rf"{_TOML_STRING_OR_COMMENT.pattern}|[\[\]{{}}=:,.\n]|[^\s\[\]{{}}=:,.\"'#]++", re.DOTALL)
+"""What keys are found by: strings and comments whole, marks, and words between them."""
 
 
 def _check_nesting(bare: str, file: str) -> None:
@@ -45,6 +47,65 @@ def _check_nesting(bare: str, file: str) -> None:
                 allowed=f"at most {NESTING_MAX} levels",
                 remedy="flatten the file",
             )
+
+
+def _key_lines(text: str) -> dict[str, int]:
+    """The line of every key and table of a TOML or JSON text that parses, by its dotted path; of two the first.
+
+    Paths leave out which entry of a list they lead through. Comments and what stands in values are no keys.
+    """
+    stated: dict[str, int] = {}
+    implied: dict[str, int] = {}
+    in_value = text.lstrip().startswith("{")
+    # What stands open, and the path of what is in it; "" is the top of a TOML file, where a line ends a value.
+    opened: list[tuple[str, tuple[str, ...]]] = [("[" if in_value else "", ())]
+    parts: list[str] = []
+    begins, line = 1, 1
+
+    def keep(base: tuple[str, ...]) -> tuple[str, ...]:
+        path = (*base, *parts)
+        for count in range(len(base) + 1, len(path)):
+            implied.setdefault(".".join(path[:count]), begins)
+        stated.setdefault(".".join(path), begins)
+        parts.clear()
+        return path
+
+    path: tuple[str, ...] = ()
+    for match in _TOKEN.finditer(text):
+        token = match.group()
+        kind, base = opened[-1]
+        if token == "\n" and not kind:
+            in_value = False
+        elif in_value and token in "{[":
+            opened.append((token, path))
+            in_value = token == "["
+        elif token in "}]" and kind:
+            if kind == "header":
+                opened[0] = "", keep(())
+            opened.pop()
+            in_value = True
+        elif token == "," and kind:
+            path, in_value = base, kind == "["
+        elif token == "[" and not kind:
+            opened.append(("header", ()))
+        elif token in "=:" and not in_value:
+            path, in_value = keep(base), True
+        elif not in_value and token[0] not in "#.\n[":
+            begins = begins if parts else line
+            parts.append(_unquoted(token))
+        line += token.count("\n")
+    return {**implied, **stated}
+
+
+def _unquoted(key: str) -> str:
+    """A key without its quotes."""
+    if key[0] != '"':
+        return key.strip("'")
+    try:
+        return str(json.loads(key))
+    except ValueError:
+        # An escape that only TOML has.
+        return key.strip('"')
 
 
 class Keys:
@@ -73,16 +134,10 @@ class Keys:
         )
 
     def _line(self, keys: tuple[str, ...]) -> int | None:
-        """The line of the innermost of `keys` that can be found in the text, outside TOML comments."""
-        text = _TOML_STRING_OR_COMMENT.sub(
-            lambda m: " " * len(m.group()) if m.group().startswith("#") else m.group(), self.text
-        )
-        position = None
-        for key in keys:
-            pattern = rf"(?m)(?:^|[\[{{,.])[ \t]*[\"']?{re.escape(key)}[\"']?[ \t]*(?=[=.\]:])"
-            if match := re.compile(pattern).search(text, position or 0):
-                position = match.end() - 1
-        return None if position is None else text.count("\n", 0, position) + 1
+        """The line of the innermost of `keys` that stands in the text."""
+        lines = _key_lines(self.text)
+        places = (".".join(keys[:count]) for count in range(len(keys), 0, -1))
+        return next((lines[place] for place in places if place in lines), None)
 
     def only(self, names: Iterable[str]) -> None:
         """Refuses keys outside `names`."""
