@@ -35,7 +35,7 @@ from tvsbayes.report.page import (
     typeset,
 )
 from tvsbayes.report.parameter_words import cause_in_words, name_in_words, share_in_words, source_in_words
-from tvsbayes.report.tables import Issue
+from tvsbayes.report.tables import Issue, Page, Section, TableView
 
 BYTES_MAX = 3_000_000
 
@@ -389,6 +389,29 @@ def test_the_printed_twin_has_ten_pages_at_most_and_none_is_empty(reported, tmp_
     # Chromium writes each page's marks as one stream; an empty page has only its footer, some 500 bytes.
     streams = [len(part) for part in re.findall(rb"stream\r?\n(.*?)endstream", printed, flags=re.DOTALL)]
     assert sum(length > 2000 for length in streams) >= pages
+
+
+def test_no_heading_stands_at_the_foot_of_a_printed_page(tmp_path):
+    """A heading with a single line below it is as lost as one alone; sections of many lengths meet every foot."""
+    reader = shutil.which("pdftotext")
+    if reader is None or not any(map(shutil.which, BROWSERS)):
+        pytest.skip("no Chromium or Chrome, or no pdftotext, on the path (Debian's packages: chromium, poppler-utils)")
+    table = [TableView("caption", ["a", "b"], [["cell", str(row)] for row in range(size)]) for size in range(5, 30)]
+    sections = [Section(f"heading {k}", [f"line {k}"], tables=[one]) for k, one in enumerate(table)]
+    sections += [Section(f"heading {k}", [f"line {k}"]) for k in range(len(sections), 100)]
+    about = TableView("about", [], [["measured", "today"]])
+    words = {"results": "R", "name": "n", "verdict": "v", "verdict_class": "met", "traceable": "t", "number": "N"}
+    none = {"numbers": [], "why": [], "answer": None, "picture": None, "steps": [], "criteria": None, "warnings": []}
+    page = Page(**words, **none, about=about, versions={"tvsbayes": "0"}, sections=sections)
+    (tmp_path / "report.html").write_bytes(page_html(page))
+    done = subprocess.run([reader, "-layout", print_to_pdf(tmp_path / "report.html"), "-"], capture_output=True)
+    pages = [[line.strip() for line in text.split("\n") if line.strip()] for text in done.stdout.decode().split("\f")]
+    # The last line of each is its footer; of a section without a table one line is all that there is.
+    feet = [lines[-3:-1] for lines in pages if lines]
+    numbers = [[re.fullmatch(r"[0-9]+ heading ([0-9]+)", line) for line in foot] for foot in feet]
+    assert len(feet) > 8 and not any(last for _, last in numbers)
+    assert not [before[1] for before, _ in numbers if before and int(before[1]) < len(table)]
+    assert any(line.startswith("line ") for _, line in feet)
 
 
 def test_the_table_of_parameters_repeats_no_ratio(reported):
