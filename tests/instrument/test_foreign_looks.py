@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import math
+import time
 
 import pytest
+from support.small_campaign import small_campaign
 
 from tvsbayes.errors import InputError
 from tvsbayes.files.foreign_table import ForeignTable
+from tvsbayes.instrument.campaign import PIXELS, parse_spots, spots_bytes
 from tvsbayes.instrument.column_names import understand
 from tvsbayes.instrument.foreign_looks import Notation, looks_of
 
@@ -110,6 +113,36 @@ def test_dates_become_seconds_and_stated_spreads_stay():
     assert [m.time_s for m in found.moves] == [0.0, 62.0]
     assert [s.su_left_px for s in found.spots] == [0.3, 0.4]
     assert found.spots[0].sv_right_px == 0.1
+
+
+@pytest.mark.parametrize("zone", ["UTC", "Europe/Berlin", "America/Mexico_City"])
+@pytest.mark.skipif(not hasattr(time, "tzset"), reason="only POSIX changes its time zone in a process")
+def test_dates_without_a_zone_do_not_hang_on_that_of_this_machine(monkeypatch, zone):
+    """In the night to 29 March 2026 clocks in Berlin went from 02:00 to 03:00, and in Mexico nobody's did."""
+    monkeypatch.setenv("TZ", zone)
+    time.tzset()
+    try:
+        rows = [f"0 {k} 1 1 1 1 2026-03-29T0{h}" for k, h in enumerate(("1:30:00", "2:30:00", "3:00:00"))]
+        found = looks(*rows, header="Pan Tilt XL YL XR YR Time")
+    finally:
+        monkeypatch.undo()
+        time.tzset()
+    assert [move.time_s for move in found.moves] == [0.0, 3600.0, 5400.0]
+
+
+def test_texts_are_such_as_our_own_reader_takes():
+    cells = {
+        **{name: ("0", "1", "2", "3") for name in ("pan_steps", "tilt_steps")},
+        **{name: ("5", "5", "5", "") for name in PIXELS},
+        "target": ("-50", "50", "=near", "sheet\u00a0one\nleft"),
+        "status": ("\u200b", "-", "@late", "too\tdim\u200b"),
+    }
+    table = ForeignTable("t.xlsx", "drawn", (2, 3, 4, 5), cells)
+    found = looks_of(table, {name: name for name in cells}, Notation())
+    assert [spot.target for spot in found.spots] == ["sheet -50", "50", "sheet =near", "sheet one left"]
+    assert [spot.status for spot in found.spots] == ["refused", "refused: -", "refused: @late", "too dim"]
+    stereo = small_campaign().stereo
+    assert parse_spots(spots_bytes(found.spots), "spots.csv", 4, stereo) == found.spots
 
 
 def test_looks_alone_go_to_moves_that_are_listed():

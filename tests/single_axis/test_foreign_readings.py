@@ -10,7 +10,7 @@ import pytest
 from tvsbayes.errors import InputError
 from tvsbayes.files.foreign_table import read_foreign
 from tvsbayes.instrument.column_names import understand_axis
-from tvsbayes.single_axis.axis_campaign import AxisMove, Reading
+from tvsbayes.single_axis.axis_campaign import AxisMove, Reading, parse_readings, readings_bytes
 from tvsbayes.single_axis.foreign_readings import ForeignReadings, readings_of, unwrapped
 
 NAMES = [
@@ -129,3 +129,9 @@ def test_cells_that_say_nothing_are_refused_with_their_column(tmp_path, row, col
 def test_a_negative_uncertainty_is_refused_as_check_does(tmp_path):
     with pytest.raises(InputError, match=r"line 2, sd: .*from 0 to"):
         readings_of(*table(tmp_path, "steps,angle,sd", "0,1,-0.1"))
+
+
+def test_statuses_are_such_as_our_own_reader_takes(tmp_path):
+    found = readings_of(*table(tmp_path, "steps;encoder;ok", "0;0,5;1", "100;1,5;-", "200;;+ slipped"))
+    assert [reading.status for reading in found.readings] == ["ok", "refused: -", "refused: + slipped"]
+    assert parse_readings(readings_bytes(found.readings), "readings.csv", 3) == found.readings

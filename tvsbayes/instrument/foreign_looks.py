@@ -263,7 +263,9 @@ def seconds_of(cells: FieldCells, assumed: list[str]) -> list[float] | None:
         found = []
         for row, cell in enumerate(texts):
             try:
-                found.append(datetime.datetime.fromisoformat(_DOTTED_DATE.sub(_iso_date, cell, count=1)).timestamp())
+                when = datetime.datetime.fromisoformat(_DOTTED_DATE.sub(_iso_date, cell, count=1))
+                # Without a zone every hour has its length: this machine's summer time is not the logger's.
+                found.append((when if when.tzinfo else when.replace(tzinfo=datetime.UTC)).timestamp())
             except ValueError as error:
                 allowed = "seconds, or a date and time such as 2026-01-15T10:00:00 or 15.01.2026 10:00:00"
                 raise cells.refuse(row, "time_s", allowed, "correct the cell, or write --column time_s=") from error
@@ -300,7 +302,7 @@ def _spots(cells: FieldCells, of_row: Sequence[int], notation: Notation, assumed
         number = numbers[row] if unique else row
         reading = None if (read := readings[row]) is None else scale_deg * read
         both = (experiments[row], points[row]) if None not in (experiments[row], points[row]) else (None, None)
-        target = targets[row].lstrip("=+-@")[:100]
+        target = readable(targets[row], "sheet", 100)
         spot = Spot(number or 0, move, target, *both, *NO_PIXELS, *NO_PIXELS, status=status)
         if status == "ok":
             sds = [_sd_px(cells, row, field, column, notation) for field, column in zip(PIXEL_SDS, stated, strict=True)]
@@ -348,4 +350,22 @@ def _status(text: str, centre: Sequence[float | None], cells: FieldCells, row: i
             return "ok" if seen else "no centre in the table"
         field = PIXELS[centre.index(None)]
         raise cells.refuse(row, field, "a number where the look is ok", "complete the cell, or its status")
-    return f"refused: {text}" if word in BAD else text[:200]
+    return refused_status(text)
+
+
+def refused_status(text: str) -> str:
+    """A cell that says why a row is of no use, as the reader of our tables takes it."""
+    return readable(f"refused: {text}" if word_of(text) in BAD else text, "refused:", 200) or "refused"
+
+
+def readable(text: str, before: str, chars_max: int) -> str:
+    """A cell's text as the reader of our tables takes it: printable, on one line, nothing that a spreadsheet runs.
+
+    Args:
+        text: of the cell.
+        before: word put before a text that begins with = + - or @: without these signs "-50" and "50" were one.
+        chars_max: longer ones are cut.
+    """
+    kept = "".join(c if c.isprintable() else " " for c in text)
+    kept = " ".join(kept.split())
+    return (f"{before} {kept}" if kept.startswith(("=", "+", "-", "@")) else kept)[:chars_max]

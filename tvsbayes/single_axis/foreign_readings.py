@@ -13,7 +13,15 @@ import numpy as np
 
 from tvsbayes.errors import refusal
 from tvsbayes.files.foreign_table import ForeignTable
-from tvsbayes.instrument.foreign_looks import BAD, GOOD, FieldCells, homings_of, left_out, seconds_of, word_of
+from tvsbayes.instrument.foreign_looks import (
+    GOOD,
+    FieldCells,
+    homings_of,
+    left_out,
+    refused_status,
+    seconds_of,
+    word_of,
+)
 from tvsbayes.single_axis.axis_campaign import APPROACHES, COMMAND_MAX, TURNS, Approach, AxisMove, Reading
 from tvsbayes.single_axis.axis_rows import turn_jumps
 
@@ -110,7 +118,7 @@ def _status(cells: FieldCells, row: int, value: float | None) -> str:
     text = cells.text("status")[row]
     word = word_of(text)
     if word and word not in GOOD:
-        return f"refused: {text}"[:100] if word in BAD else text[:100]
+        return refused_status(text)
     if value is None:
         raise cells.refuse(row, "value", "a number where the reading is ok", "complete the cell, or its status")
     return "ok"
