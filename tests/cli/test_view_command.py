@@ -38,6 +38,16 @@ def test_view_serves_what_it_shows_and_prints_the_link(viewed, handed, capsys):
     assert len(json.loads(contents.document)["scenes"]) == 1
 
 
+def test_ctrl_c_ends_the_page_and_the_one_document_stays_the_only_one(viewed, handed, monkeypatch, capsys):
+    def served_until_ctrl_c(contents, port, started):
+        started(LINK)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("tvsbayes.view.server.serve", served_until_ctrl_c)
+    assert run(["view", str(viewed.bare), "--json"]) == 130
+    assert json.loads(capsys.readouterr().out)["link"] == LINK
+
+
 def test_view_opens_a_browser_unless_told_not_to(viewed, handed, capsys):
     _, opened = handed
     assert run(["view", str(viewed.bare)]) == 0

@@ -160,5 +160,11 @@ def test_the_command_keeps_a_table(mounted_rig, mixed_fit, truth, tmp_path, monk
     head, first, second = (tmp_path / "nights.csv").read_text().splitlines()
     assert head == "time,verdict,p,looks,moved"
     assert first.split(",")[1] == "CANNOT TELL" and "positioner: shift along y" in second
+    # A table that takes no line: the result is out once, with what went wrong.
+    (tmp_path / "other.csv").write_text("night,what\n")
+    assert run(["watch", old, same, "--append", str(tmp_path / "other.csv"), "--json"]) == 2
+    document = json.loads(capsys.readouterr().out)
+    assert (document["verdict"], document["error"]["code"]) == ("CANNOT TELL", "header")
+    assert (tmp_path / "other.csv").read_text() == "night,what\n"
     assert set(HELPS) == {change.what for change in CHANGES}
     assert set(MISSED) == {change.what.split(":")[0] for change in CHANGES}

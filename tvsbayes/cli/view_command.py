@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from tvsbayes.cli import axis_commands
-from tvsbayes.cli.app import CampaignFolder, Json, finish, report_line
+from tvsbayes.cli.app import INTERRUPTED, CampaignFolder, Ended, Json, finish, report_line
 
 
 def view(
@@ -49,4 +49,8 @@ def view(
 
             webbrowser.open(link)
 
-    serve(contents, port, started)
+    try:
+        serve(contents, port, started)
+    except KeyboardInterrupt:
+        # Its usual end, and the one document of --json is out.
+        raise Ended(INTERRUPTED) from None

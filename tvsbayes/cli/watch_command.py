@@ -52,15 +52,14 @@ def watch(
     from tvsbayes.report.watch_text import watch_text
     from tvsbayes.results.watch_record import CANNOT_TELL, OK
 
-    finish(found.as_json(), watch_text(found, POWER_MIN), as_json)
-    if append is not None:
-        _append(append, found)
+    error = None if append is None else _append(append, found)
+    finish(found.as_json(), watch_text(found, POWER_MIN), as_json, error)
     if found.verdict != OK:
         raise Ended(NothingToEstimate.exit_code if found.verdict == CANNOT_TELL else TARGET_MISSED)
 
 
-def _append(table: Path, found: Watch) -> None:
-    """The line of now, UTC."""
+def _append(table: Path, found: Watch) -> InputError | None:
+    """Add the line of now, UTC; why it could not be added costs nobody the result."""
     import datetime
 
     from tvsbayes.files.growing_table import append_line
@@ -68,7 +67,11 @@ def _append(table: Path, found: Watch) -> None:
 
     now = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
     moved = "; ".join(map(moved_words, found.moved))
-    append_line(table, TABLE_COLUMNS, (now, found.verdict, found.p, found.looks, moved))
+    try:
+        append_line(table, TABLE_COLUMNS, (now, found.verdict, found.p, found.looks, moved))
+    except InputError as error:
+        return error
+    return None
 
 
 def plan_watch(
