@@ -20,6 +20,7 @@ def test_token_is_good_once(access):
     token = token_of(access)
     assert access.link == f"http://127.0.0.1:4711/#{token}" and len(token) >= 43
     assert access.key_for(token[:-1]) is None and access.key_for("") is None and access.key_for("ä") is None
+    assert access.key_for("\ud800") is None
     key = access.key_for(token)
     assert key and key != token
     assert access.key_for(token) is None

@@ -32,6 +32,11 @@ SECURITY_HEADERS = {
 styles from its script."""
 
 
+def _bytes(brought: str) -> bytes:
+    """Text to be compared; JSON may bring half a character, of which there is no UTF-8."""
+    return brought.encode(errors="replace")
+
+
 class Access:
     """Token, keys and address of one page.
 
@@ -70,7 +75,7 @@ class Access:
 
     def key_for(self, token: str) -> str | None:
         """The key for whoever brings the token first, one to watch for those after it; None for a wrong or used one."""
-        if self._token is None or not hmac.compare_digest(token.encode(), self._token.encode()):
+        if self._token is None or not hmac.compare_digest(_bytes(token), _bytes(self._token)):
             return None
         first, self._given = not self._given, True
         if self._watching is None:
@@ -79,10 +84,10 @@ class Access:
 
     def controls(self, headers: Mapping[str, str]) -> bool:
         """Whether a request carries the key of the first browser."""
-        return hmac.compare_digest(headers.get(KEY_HEADER, "").encode(), self._key.encode())
+        return hmac.compare_digest(_bytes(headers.get(KEY_HEADER, "")), _bytes(self._key))
 
     def knows(self, headers: Mapping[str, str]) -> bool:
         """Whether a request carries a key."""
-        brought = headers.get(KEY_HEADER, "").encode()
-        watches = self._watching is not None and hmac.compare_digest(brought, self._watching.encode())
+        brought = _bytes(headers.get(KEY_HEADER, ""))
+        watches = self._watching is not None and hmac.compare_digest(brought, _bytes(self._watching))
         return self.controls(headers) or watches
