@@ -46,6 +46,16 @@ def test_cut_outs_show_the_spot_under_its_cross(pictured):
     assert len(spot_gallery(crops).axes) == 2 * len({crop.spot for crop in crops})
 
 
+def test_a_centre_far_outside_the_picture_has_no_cut_out(pictured):
+    """The reader takes a centre up to a tenth of the picture outside of it."""
+    first = seen(pictured)[0]
+    outside = replace(first, v_left_px=-HALF_PX - 10.0, u_right_px=-HALF_PX - 10.0)
+    crops = spot_crops(replace(pictured, spots=(outside,)), ())
+    assert crops == ()
+    edge = spot_crops(replace(pictured, spots=(replace(first, v_left_px=-5.0),)), ())
+    assert edge[0].grey.shape == (HALF_PX - 4, 2 * HALF_PX + 1) and edge[0].corner_px[1] == 0
+
+
 def test_damaged_and_missing_pictures_cost_nobody_the_report(pictured):
     first = pictured.path / frame_name(seen(pictured)[0].spot, "left")
     first.write_bytes(b"no picture")

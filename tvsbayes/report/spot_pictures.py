@@ -66,7 +66,9 @@ def _crops(folder: Path, spot: Spot) -> Iterator[SpotCrop]:
             continue
         u, v = float(getattr(spot, f"u_{camera}_px")), float(getattr(spot, f"v_{camera}_px"))
         left, top = max(round(u) - HALF_PX, 0), max(round(v) - HALF_PX, 0)
-        part = picture[top : round(v) + HALF_PX + 1, left : round(u) + HALF_PX + 1].mean(axis=2)
+        # Half a spot at the edge has its centre outside; a negative end would count from the other edge.
+        right, bottom = max(round(u) + HALF_PX + 1, 0), max(round(v) + HALF_PX + 1, 0)
+        part = picture[top:bottom, left:right].mean(axis=2)
         if part.size:
             yield SpotCrop(spot.spot, camera, part, (left, top), (u, v))
 

@@ -30,8 +30,8 @@ FAULTS = (
     Fault(
         "cut-outs of spots with rows for columns",
         "report/spot_pictures.py",
-        "picture[top : round(v) + HALF_PX + 1, left : round(u) + HALF_PX + 1]",
-        "picture[left : round(u) + HALF_PX + 1, top : round(v) + HALF_PX + 1]",
+        "picture[top:bottom, left:right]",
+        "picture[left:right, top:bottom]",
         "the report shows empty paper under the cross",
         ("report/spot_crops",),
     ),
