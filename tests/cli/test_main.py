@@ -92,6 +92,22 @@ def test_a_full_disk_behind_stdout_is_said_without_a_traceback(grid_folder, argu
     assert "Traceback" not in done.stderr
 
 
+@pytest.mark.parametrize("encoding", ["cp1252", "utf-8"])
+def test_names_that_stdout_cannot_show_are_escaped(tmp_path, encoding):
+    """A Greek letter on a terminal of Western letters; bytes that are no UTF-8 stand for half a character."""
+    name = "\u03ac" if encoding != "utf-8" or os.name != "posix" else os.fsdecode(b"caf\xe9")
+    command = [sys.executable, "-c", "from tvsbayes.cli.main import main; main()", "import", tmp_path / "log.csv"]
+    (tmp_path / "log.csv").write_text("command,value\n0,0\n1,1\n")
+    environment = {**os.environ, "PYTHONIOENCODING": f"{encoding}:strict", "PYTHONUTF8": "1"}
+    done = subprocess.run(
+        [*command, "--axis", "--to", tmp_path / name, "--yes"], capture_output=True, env=environment, check=False
+    )
+    assert done.returncode == 0, done.stderr.decode(errors="replace")
+    escaped = b"\\udce9" if name.startswith("caf") else b"\\u03ac"
+    written = done.stdout.split(b"written: ")[1]
+    assert escaped in written or (encoding == "utf-8" and os.name != "posix")
+
+
 @pytest.mark.skipif(os.name != "posix", reason="pipes that break")
 def test_a_reader_that_has_gone_changes_no_exit_code(grid_folder):
     """As where Ctrl-C ends the `tee` behind a run, for both streams."""

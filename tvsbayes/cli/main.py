@@ -8,6 +8,7 @@ Heavy modules are imported inside the commands that need them; `tvsbayes --help`
 from __future__ import annotations
 
 import gc
+import io
 import os
 import sys
 
@@ -99,6 +100,9 @@ def main() -> None:
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
     # A command ends after seconds: the collector's walks over all that JAX holds cost a twentieth of them.
     gc.set_threshold(*COLLECTIONS)
+    if isinstance(sys.stdout, io.TextIOWrapper) and sys.stdout.errors == "strict":
+        # As Python's own stderr: what a terminal or file cannot show of a name is escaped, and the command goes on.
+        sys.stdout.reconfigure(errors="backslashreplace")
     try:
         code = run(sys.argv[1:])
     except KeyboardInterrupt:
