@@ -17,6 +17,7 @@ import pytest
 from support.reported_twin import PLANNED, Nodes, evidence_of
 
 from tvsbayes.calibration.calibration_file import load_calibration
+from tvsbayes.errors import InputError
 from tvsbayes.files.disk import shipped_data
 from tvsbayes.instrument.axes import DIRECTIONS
 from tvsbayes.instrument.campaign import read_campaign, write_campaign
@@ -181,6 +182,11 @@ def test_what_was_made_of_an_earlier_page_goes(tmp_path):
         for name in ("mine.pdf", "mine.dcc.xml"):
             (tmp_path / name).write_bytes(b"")
         assert replace_page(mine, newer, mine) == gone
+    # A report that had to fit first begins the folder; one that the user names must be there.
+    assert replace_page(tmp_path / "results" / "report.html", newer, None) == []
+    assert (tmp_path / "results" / "report.html").read_bytes() == newer
+    with pytest.raises(InputError):
+        replace_page(tmp_path / "missing" / "mine.html", newer, tmp_path / "missing" / "mine.html")
 
 
 def test_commands_are_code_and_what_strangers_write_is_not():

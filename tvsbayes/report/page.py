@@ -22,7 +22,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup, escape
 
 from tvsbayes.errors import InputError, escaped
-from tvsbayes.files.disk import read_bytes, shipped_data, write_atomically
+from tvsbayes.files.disk import make_folder, read_bytes, shipped_data, write_atomically
 from tvsbayes.metrology.traceability import traceability
 from tvsbayes.report.advice import steps_ahead
 from tvsbayes.report.evidence import Evidence
@@ -128,7 +128,7 @@ def replace_page(page: Path, html: bytes, out: Path | None) -> list[str]:
     """Write a page, and remove what was made of another one that stood there: its PDF and its certificate.
 
     Args:
-        page: where to.
+        page: where to; `results/` is made where it is missing.
         html: its bytes; of the very page that stands there already nothing is removed.
         out: as the user named it; there only what lies beside a page of ours is ours.
 
@@ -148,6 +148,8 @@ def replace_page(page: Path, html: bytes, out: Path | None) -> list[str]:
             if follower.is_file():
                 follower.unlink()
                 removed.append(follower.name)
+    if out is None:
+        make_folder(page.parent)
     write_atomically(page, html)
     return removed
 
