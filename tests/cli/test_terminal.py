@@ -49,6 +49,22 @@ def test_a_terminal_gets_verdicts_in_colour_line_by_line(monkeypatch):
     assert lines[1] == f"\x1b[32m\x1b[1m{good}\x1b[0m" and lines[2] == f"\x1b[31m\x1b[1m{bad}\x1b[0m"
 
 
+@pytest.mark.parametrize(
+    ("line", "colour"),
+    [
+        ("verdict: PRIOR CONFLICT, the numbers hold only if the readings are wrong", 31),
+        ("MOVED (p = 0.0001; false alarms 1 %)", 31),
+        ("CANNOT TELL (p = 0.3; false alarms 1 %)", 33),
+        ("OK (p = 0.3; false alarms 1 %)", 32),
+    ],
+)
+def test_verdicts_of_an_axis_and_of_a_watch_have_their_colours_too(monkeypatch, line, colour):
+    monkeypatch.delenv("NO_COLOR", raising=False)
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setenv("COLUMNS", "80")
+    assert shown(line, Terminal(True)) == f"\x1b[{colour}m\x1b[1m{line}\x1b[0m"
+
+
 @pytest.mark.parametrize("command", COMMANDS, ids=lambda command: command.__name__)
 def test_every_command_has_its_help_with_examples_that_parse(capsys, command):
     name = command.__name__.rstrip("_").replace("_", "-")

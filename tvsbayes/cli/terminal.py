@@ -14,9 +14,11 @@ import typer
 
 COLOUR_OF = (
     ("red", ("error:", "VALIDATION FAILED", "NOT CONVERGED", "UNCONVERGED", "EXTRAPOLATED", "verdict: NOT CONVERGED")),
-    ("red", ("verdict: VALIDATION FAILED", "verdict: UNCONVERGED", "NO NUMBER OF LOOKS")),
+    ("red", ("verdict: VALIDATION FAILED", "verdict: UNCONVERGED", "verdict: PRIOR CONFLICT", "NO NUMBER OF LOOKS")),
+    ("red", ("MOVED (p ",)),
     ("yellow", ("warning:", "weak", "prior conflict:", "hangs on one stop:", "few stops", "spots that disagree")),
-    ("green", ("verdict: usable",)),
+    ("yellow", ("CANNOT TELL (p ",)),
+    ("green", ("verdict: usable", "OK (p ")),
     ("cyan", ("next:", "what to do:", "what helps:")),
 )
 """Colour, and how lines of that colour begin."""
@@ -24,7 +26,7 @@ TABLE = "  "
 """Stands between cells, never between words of a sentence."""
 LAST_CELL_LEAST = 24
 """Columns that a cell needs to go on below itself."""
-BOLD = ("error:", "verdict:", "next:", "VALIDATION FAILED")
+BOLD = ("error:", "verdict:", "next:", "VALIDATION FAILED", "MOVED (p ", "CANNOT TELL (p ", "OK (p ")
 
 
 def shows_colour(stream: IO[str]) -> bool:
