@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from support.small_results import estimate
@@ -18,7 +20,8 @@ from tvsbayes.report.figures import (
     ratio_curves,
     trajectories,
 )
-from tvsbayes.results.estimates import CurvePoint, Curves, RatioAt
+from tvsbayes.report.fit_sections import residuals_section
+from tvsbayes.results.estimates import Cause, CauseGroup, CurvePoint, Curves, RatioAt
 
 
 def test_the_papers_figures_for_any_campaign(evidence):
@@ -72,3 +75,18 @@ def test_no_text_of_the_ratios_is_cut_or_lies_on_the_points(evidence):
             assert 0 <= box.x0 and box.x1 <= figure.bbox.x1
     (legend,) = curves.legends
     assert [text.get_text() for text in legend.get_texts()] == ["left", "right", "up", "down"]
+
+
+def test_gaps_of_no_direction_are_refused_in_words():
+    with pytest.raises(ValueError, match="no complete experiment"):
+        figures.gap_terms({"left": None, "up": None})
+
+
+def test_a_cause_with_one_group_has_no_empty_figure():
+    """A pan axis whose stops were all seen at one depth; of tilt two depths can be compared."""
+    group = CauseGroup("near", 8, 0.1, 0.3)
+    one, two = Cause("depth", "pan", (group,), None, False), Cause("depth", "tilt", (group, group), 0.4, False)
+    summary = SimpleNamespace(chi2=1.0, dof=1.0, parameters={"pixel_scale": SimpleNamespace(value=1.0)})
+    shown = SimpleNamespace(residual_causes=(one, two), residuals=())
+    section = residuals_section(SimpleNamespace(fit=SimpleNamespace(summary=summary), shown=shown))
+    assert [view.caption for view in section.figures] == ["tilt axis: mean deviation by group."]

@@ -17,6 +17,7 @@ import numpy as np
 from tvsbayes.errors import listed
 from tvsbayes.estimators.four_point import ClassicResult, DirectionResult, select_experiments
 from tvsbayes.instrument.axes import DIRECTIONS, SENSES, Axis
+from tvsbayes.instrument.campaign import pixels_of
 from tvsbayes.instrument.stereo_pair import triangulate
 from tvsbayes.report.drawing import (
     BLACK,
@@ -63,8 +64,7 @@ def __dir__() -> list[str]:
 def _measured(campaign: Campaign) -> tuple[list[Spot], np.ndarray]:
     """The usable spots and where the stated cameras see them, shape (n, 3), mm in frame S."""
     spots = [spot for spot in campaign.spots if spot.status == "ok"]
-    pixels = np.array([(s.u_left_px, s.v_left_px, s.u_right_px, s.v_right_px) for s in spots], dtype=float)
-    return spots, triangulate(campaign.stereo, pixels.reshape(-1, 4))
+    return spots, triangulate(campaign.stereo, pixels_of(spots))
 
 
 def _experiment(campaign: Campaign, experiment: int) -> tuple[np.ndarray, str, int]:
@@ -282,9 +282,15 @@ def intervals(
 
 
 def gap_terms(gaps: ComparisonRecord | Mapping[str, Gap | None]) -> Figure:
-    """Terms of (classic - joint), deg/step, by direction; `gaps` as `compare` found them, or its record."""
+    """Terms of (classic - joint), deg/step, by direction; `gaps` as `compare` found them, or its record.
+
+    Raises:
+        ValueError: no direction has a gap.
+    """
     gaps = gaps if isinstance(gaps, Mapping) else gaps.directions
     found = {direction: each for direction, each in gaps.items() if each is not None}
+    if not found:
+        raise ValueError("no direction has a gap: the campaign has no complete experiment")
     names = [term.name for term in next(iter(found.values())).terms]
     with drawing(3.6) as figure:
         axes = figure.add_subplot()

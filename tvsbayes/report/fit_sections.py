@@ -210,7 +210,8 @@ def residuals_section(e: Evidence) -> Section:
     ]
     views = []
     for axis in AXES:
-        if any(c.axis == axis for c in causes):
+        # One group alone has nothing to be compared with, and no bar in the figure.
+        if any(c.axis == axis and len(c.groups) > 1 for c in causes):
             alt = f"Mean deviation by group, {axis} axis; values in fit.json"
             views.append(figure_view(figures.causes(causes, axis), alt, f"{axis} axis: mean deviation by group."))
         stops = [stop for stop in e.shown.residuals if stop.axis == axis]
