@@ -19,7 +19,7 @@ from tvsbayes.report.axis_text import (
     ratio_table,
     reserved,
 )
-from tvsbayes.report.drawing import BLUE, GREY, RED, SKY, STYLE, WIDTH_IN
+from tvsbayes.report.drawing import BLUE, GREY, RED, SKY, drawing
 from tvsbayes.report.first_page import about_table
 from tvsbayes.report.page import NUMBER_DIGITS, numbered
 from tvsbayes.report.tables import FigureView, Issue, Number, Page, Section, concise, figure_view, two_digits
@@ -50,17 +50,13 @@ def curve_commands(low: float, high: float) -> np.ndarray:
 
 def error_figure(fit: AxisFit) -> Figure:
     """The error by position with its 95 % band, and the stops on it, off the line through them."""
-    from matplotlib import rc_context
-    from matplotlib.figure import Figure
-
     model, rows = fit.model, fit.rows
     commands = curve_commands(float(rows.command.min()), float(rows.command.max()))
     drawn = fit.linear.drawn(deviation_functionals(fit, commands), np.random.default_rng([fit.seed, 6]))
     low, high = np.percentile(drawn, (2.5, 97.5), axis=0)
     design = np.column_stack([np.ones(len(rows.value)), rows.command - model.middle])
     off = rows.value - design @ np.linalg.lstsq(design, rows.value, rcond=None)[0]
-    with rc_context(STYLE):
-        figure = Figure(figsize=(WIDTH_IN, 3.2), layout="constrained")
+    with drawing(3.2) as figure:
         axes = figure.add_subplot()
         axes.fill_between(commands, low, high, color=SKY, alpha=0.4, linewidth=0, label="error by position, 95 %")
         axes.plot(commands, drawn.mean(axis=0), color=BLUE, linewidth=1.2, label="its mean")

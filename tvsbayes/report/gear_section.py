@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tvsbayes.instrument.axes import DIRECTIONS, SENSES
-from tvsbayes.report.drawing import BLACK, BLUE, OF_DIRECTION, ORANGE, PURPLE, SKY, STYLE, WIDTH_IN
+from tvsbayes.report.drawing import BLACK, BLUE, OF_DIRECTION, ORANGE, PURPLE, SKY, drawing
 from tvsbayes.report.result_tables import ESTIMATE_COLUMNS, estimate_row, gears_table, range_text
 from tvsbayes.report.tables import FigureView, Section, TableView, figure_view
 
@@ -55,12 +55,8 @@ def _view(band: GearBand, stops: Sequence[StopResidual]) -> FigureView:
 
 def gear_errors(band: GearBand, stops: Sequence[StopResidual]) -> Figure:
     """Transmission error of an axis over its counters with a 95 % band, the stops on it; the play, where it varies."""
-    from matplotlib import rc_context
-    from matplotlib.figure import Figure
-
     play = np.ptp(band.play_deg, axis=0).max() > PLAY_SHOWN * np.ptp(band.error_deg, axis=0).max()
-    with rc_context(STYLE):
-        figure = Figure(figsize=(WIDTH_IN, 4.6 if play else 3.2), layout="constrained")
+    with drawing(4.6 if play else 3.2) as figure:
         panels = np.atleast_1d(figure.subplots(1 + play, 1, sharex=True, height_ratios=[2, 1] if play else [1]))
         shown = [(panels[0], band.error_deg, "transmission error", SKY, BLUE)]
         shown += [(panels[1], band.play_deg, "change of play", ORANGE, PURPLE)] if play else []
