@@ -83,3 +83,11 @@ def test_an_axis_becomes_a_report_in_one_go(ask, say, tmp_path):
     code, text, _ = say("calibrate", tmp_path / "axis", "--no-sample")
     parts = [text.index(word) for word in ("axis\n", "scatter about the line", "verdict: usable", "next: open ")]
     assert code == 0 and parts == sorted(parts)
+
+
+@pytest.mark.parametrize("name", ["mine.pdf", "mine.PDF"])
+def test_a_page_named_as_its_own_pdf_is_refused_before_the_work(ask, tmp_path, name):
+    """Chromium would print the page onto itself: what lay there was an empty PDF."""
+    code, document = ask("report", tmp_path, "-o", tmp_path / name, "--pdf")
+    assert (code, document["error"]["code"], document["error"]["remedy"]) == (2, "usage", "write -o NAME.html --pdf")
+    assert not (tmp_path / name).exists()

@@ -74,7 +74,7 @@ def report(
     ] = None,
     dcc_schema: Schema = None,
     out: Annotated[
-        Path | None, typer.Option("-o", "--out", help="File (default CAMPAIGN/results/report.html).")
+        Path | None, typer.Option("-o", "--out", help="HTML file (default CAMPAIGN/results/report.html).")
     ] = None,
     as_json: Json = False,
 ) -> None:
@@ -82,6 +82,9 @@ def report(
     from tvsbayes.instrument.campaign import read_campaign
 
     finite(limit_deg_per_step=limit_deg_per_step, limit_mm=limit_mm, range_mm=range_mm)
+    if out is not None and out.suffix.lower() == ".pdf":
+        message, remedy = "-o names the HTML page, and its PDF lies beside it", "write -o NAME.html --pdf"
+        raise InputError("usage", message, column="--out", allowed="NAME.html", remedy=remedy)
     if not (dcc or dcc_schema):
         refuse_options("for a certificate", "add --dcc", country=country, customer_country=customer_country)
     issue = _issue(laboratory, customer)
