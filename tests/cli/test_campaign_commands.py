@@ -63,6 +63,13 @@ def test_check_reads_campaign_rig_and_plan(ask, say):
     assert out.endswith(", 0 warnings\n")
 
 
+def test_files_of_windows_are_known_by_their_capital_endings_too(ask, tmp_path):
+    for name, copied in (("rig.toml", "RIG.TOML"), ("stereo.json", "stereo.json"), ("paper.csv", "PAPER.CSV")):
+        (tmp_path / copied).write_bytes((MOUNTED / name).read_bytes())
+    assert ask("check", tmp_path / "RIG.TOML")[1]["kind"] == "rig"
+    assert ask("check", tmp_path / "PAPER.CSV")[1]["kind"] == "plan"
+
+
 def test_check_warns_without_failing(ask, say, grid_campaign, tmp_path):
     """Weak directions alone are exit 0."""
     stereo = replace(grid_campaign.stereo, parameter_covariance=np.zeros((24, 24)))

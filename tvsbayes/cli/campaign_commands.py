@@ -223,11 +223,12 @@ def _held(path: Path, plan_file: Path | None) -> dict[str, Any]:
     if path.is_file() and path.name in PARTS and (path.parent / "campaign.toml").is_file():
         found, remedy = f"{escaped(path.name)} is a part of a campaign", f"check {escaped(str(path.parent), 200)}"
         raise InputError("usage", f"{found}, checked as a whole", allowed="a campaign folder", remedy=remedy)
-    if path.suffix == ".csv" and not path.is_dir():
+    kind = path.suffix.lower()
+    if kind == ".csv" and not path.is_dir():
         steps = read_plan(path)
         actions = {action: sum(s.action == action for s in steps) for action in ("home", "place", "move", "look")}
         return {"kind": "plan", "steps": len(steps), **actions, "warnings": []}
-    if path.suffix == ".toml" and not path.is_dir():
+    if kind == ".toml" and not path.is_dir():
         rig = read_rig(path)
         return {"kind": "rig", "sheets_mm": rig.sheets_mm, "costs_s": rig.costs_s, "warnings": []}
     return axis_commands.axis_held(path) if axis_commands.is_axis(path) else campaign_held(path)
