@@ -145,6 +145,20 @@ def test_texts_are_such_as_our_own_reader_takes():
     assert parse_spots(spots_bytes(found.spots), "spots.csv", 4, stereo) == found.spots
 
 
+def test_numbers_that_cannot_be_kept_are_told():
+    header = "Pan Tilt XL YL XR YR Spot Exp Point"
+    found = looks("0 0 1 1 1 1 7 3 1", "0 0 1 1 1 1 7 3 -", "0 0 1 1 1 1 8 - 2", header=header)
+    assert [(s.spot, s.experiment, s.point) for s in found.spots] == [(0, 3, 1), (1, None, None), (2, None, None)]
+    told = [text for text in found.assumed if text.startswith(("spot", "experiment"))]
+    assert told == [
+        "spot: numbers are missing or stand twice, so looks are numbered by their rows",
+        "experiment, point: 2 rows with one of both alone, which is left out",
+    ]
+    whole = looks("0 0 1 1 1 1 7 3 1", "0 0 1 1 1 1 9 3 2", header=header)
+    assert [s.spot for s in whole.spots] == [7, 9]
+    assert not [text for text in whole.assumed if text.startswith(("spot", "experiment"))]
+
+
 def test_looks_alone_go_to_moves_that_are_listed():
     moves = looks(*(row.rsplit(" ", 5)[0] for row in LOOKS), header="Pan Tilt").moves
     assert len(moves) == 3

@@ -289,6 +289,11 @@ def _spots(cells: FieldCells, of_row: Sequence[int], notation: Notation, assumed
     points = cells.integers("point", 4, low=1, empty=True)
     numbers = cells.integers("spot", ID_MAX, low=0, empty=True)
     unique = None not in numbers and len(set(numbers)) == len(numbers)
+    if "spot" in cells and not unique:
+        assumed.append("spot: numbers are missing or stand twice, so looks are numbered by their rows")
+    half = sum((a is None) != (b is None) for a, b in zip(experiments, points, strict=True))
+    if half:
+        assumed.append(f"experiment, point: {half} row{'s' * (half != 1)} with one of both alone, which is left out")
     scale_deg = DEGREES[notation.angle_unit or unit_of_name(cells.columns.get("aperture_deg", ""), DEGREES) or "deg"]
     readings = cells.numbers("aperture_deg", APERTURE_MAX_DEG / scale_deg, empty=True)
     statuses, targets = cells.text("status"), cells.text("target")
