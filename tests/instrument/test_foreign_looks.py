@@ -154,7 +154,8 @@ def test_numbers_that_cannot_be_kept_are_told():
         "spot: numbers are missing or stand twice, so looks are numbered by their rows",
         "experiment, point: 2 rows with one of both alone, which is left out",
     ]
-    whole = looks("0 0 1 1 1 1 7 3 1", "0 0 1 1 1 1 9 3 2", header=header)
+    # A move without a look has no number to lose.
+    whole = looks("0 0 1 1 1 1 7 3 1", "50 0 - - - - - - -", "0 0 1 1 1 1 9 3 2", header=header)
     assert [s.spot for s in whole.spots] == [7, 9]
     assert not [text for text in whole.assumed if text.startswith(("spot", "experiment"))]
 

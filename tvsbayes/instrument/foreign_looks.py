@@ -288,7 +288,14 @@ def _spots(cells: FieldCells, of_row: Sequence[int], notation: Notation, assumed
     experiments = cells.integers("experiment", ID_MAX, low=0, empty=True)
     points = cells.integers("point", 4, low=1, empty=True)
     numbers = cells.integers("spot", ID_MAX, low=0, empty=True)
-    unique = None not in numbers and len(set(numbers)) == len(numbers)
+    statuses, targets = cells.text("status"), cells.text("target")
+    # The others are moves that nobody looked at.
+    looked = [
+        bool(status) or any(value is not None for value in centre)
+        for status, *centre in zip(statuses, *pixels, strict=True)
+    ]
+    own = [number for number, seen in zip(numbers, looked, strict=True) if seen]
+    unique = None not in own and len(set(own)) == len(own)
     if "spot" in cells and not unique:
         assumed.append("spot: numbers are missing or stand twice, so looks are numbered by their rows")
     half = sum((a is None) != (b is None) for a, b in zip(experiments, points, strict=True))
@@ -296,13 +303,11 @@ def _spots(cells: FieldCells, of_row: Sequence[int], notation: Notation, assumed
         assumed.append(f"experiment, point: {half} row{'s' * (half != 1)} with one of both alone, which is left out")
     scale_deg = DEGREES[notation.angle_unit or unit_of_name(cells.columns.get("aperture_deg", ""), DEGREES) or "deg"]
     readings = cells.numbers("aperture_deg", APERTURE_MAX_DEG / scale_deg, empty=True)
-    statuses, targets = cells.text("status"), cells.text("target")
     spots = []
     for row, move in enumerate(of_row):
-        centre = [column[row] for column in pixels]
-        if not statuses[row] and all(value is None for value in centre):
-            # A move that nobody looked at.
+        if not looked[row]:
             continue
+        centre = [column[row] for column in pixels]
         status = _status(statuses[row], centre, cells, row)
         number = numbers[row] if unique else row
         reading = None if (read := readings[row]) is None else scale_deg * read
