@@ -74,6 +74,7 @@ def test_pictures_are_told_by_camera(shown):
 
 def test_stops_stand_at_their_looks(found, shown):
     looks = shown.looks
+    assert len(found.fitted.stops) > 17
     for stop in found.fitted.stops[::17]:
         column = ("pan", "tilt").index(stop.axis)
         rows = np.isin(looks.spot, stop.spots)
