@@ -108,6 +108,17 @@ def test_names_that_stdout_cannot_show_are_escaped(tmp_path, encoding):
     assert escaped in written or (encoding == "utf-8" and os.name != "posix")
 
 
+@pytest.mark.skipif(os.name != "posix", reason="streams that a shell closes")
+@pytest.mark.parametrize(("arguments", "code"), [("check nothing-here", 2), ("--version", 0)])
+@pytest.mark.parametrize("closed", ["2>&-", ">&-"])
+def test_closed_streams_change_no_exit_code(tmp_path, closed, arguments, code):
+    """As cron jobs and services have them."""
+    words = f'"$0" -c "from tvsbayes.cli.main import main; main()" {arguments} {closed}'
+    done = subprocess.run(["sh", "-c", words, sys.executable], cwd=tmp_path, capture_output=True, check=False)
+    assert done.returncode == code
+    assert b"Traceback" not in done.stderr
+
+
 @pytest.mark.skipif(os.name != "posix", reason="pipes that break")
 def test_a_reader_that_has_gone_changes_no_exit_code(grid_folder):
     """As where Ctrl-C ends the `tee` behind a run, for both streams."""

@@ -100,6 +100,10 @@ def main() -> None:
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
     # A command ends after seconds: the collector's walks over all that JAX holds cost a twentieth of them.
     gc.set_threshold(*COLLECTIONS)
+    # A closed stream (`2>&-`) is None; its number would go to the next file, into which libraries then write errors.
+    sys.stdout, sys.stderr = (
+        open(os.devnull, "w", encoding="utf-8") if stream is None else stream for stream in (sys.stdout, sys.stderr)
+    )
     if isinstance(sys.stdout, io.TextIOWrapper) and sys.stdout.errors == "strict":
         # As Python's own stderr: what a terminal or file cannot show of a name is escaped, and the command goes on.
         sys.stdout.reconfigure(errors="backslashreplace")
