@@ -15,7 +15,7 @@ from tvsbayes.single_axis.axis_campaign import Reading, read_axis
 from tvsbayes.single_axis.axis_fit import fit_axis
 from tvsbayes.single_axis.axis_parameters import AxisPrior
 from tvsbayes.single_axis.axis_rows import reversal_of, rows_of
-from tvsbayes.single_axis.next_stops import _with_stop, plan_next
+from tvsbayes.single_axis.next_stops import NextStop, _with_stop, plan_next
 from tvsbayes.single_axis.simulated_axis import draw_axis, simulate_axis
 
 
@@ -33,6 +33,12 @@ def test_every_stop_lowers_u_and_stays_within_the_commands(fitted):
             assert command is None or -2300 <= command <= 2300
     assert found.plan_bytes().startswith(b"step,command,direction,read\n0,")
     json.dumps(found.as_json(), allow_nan=False)
+
+
+def test_actions_name_commands_with_all_their_digits():
+    """Microsteps of a long axis run into millions."""
+    stop = NextStop(1234567.0, "forward", 1111111.0, 1.0, 0.1, 0.1)
+    assert stop.actions == ["move 1111111", "move 1234567", "read"]
 
 
 def test_a_plan_keeps_its_time(fitted):

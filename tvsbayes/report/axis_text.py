@@ -58,7 +58,7 @@ def parameter_table(summary: AxisSummary) -> TableView:
 
 def deviation_table(deviations: Sequence[PositionDeviation], unit: str, most: int) -> TableView:
     """What repeats by position, off the line; of more positions than `most`, so many spread evenly."""
-    rows = [[f"{d.position:g}", concise(d.value, d.sd), interval_text(*d.interval95, d.sd)] for d in deviations]
+    rows = [[f"{d.position:.10g}", concise(d.value, d.sd), interval_text(*d.interval95, d.sd)] for d in deviations]
     caption = f"error that repeats by position, off the line through the stops, {escaped(unit)}"
     if len(rows) > most:
         caption += f"; {most} of {len(rows)} positions, fit.json has all"
@@ -134,7 +134,7 @@ def hold_out_table(found: AxisHoldOut, unit: str) -> TableView:
     rows = []
     for p in found.positions:
         z, classic_z = (p.mean - p.predicted) / p.u, (p.mean - p.classic_predicted) / max(p.classic_u, 1e-300)
-        row = [f"{p.position:g}", p.direction, str(p.n), f"{p.mean:.6g}", concise(p.predicted, p.u), f"{z:+.1f}"]
+        row = [f"{p.position:.10g}", p.direction, str(p.n), f"{p.mean:.6g}", concise(p.predicted, p.u), f"{z:+.1f}"]
         rows.append([*row, f"{classic_z:+.1f}"])
     caption = f"positions left out and foretold, {escaped(unit)}; z in stated uncertainties"
     return TableView(caption, ["position", "direction", "n", "mean", "predicted(u)", "z", "z classic"], rows)

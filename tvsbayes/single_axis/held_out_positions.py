@@ -174,10 +174,10 @@ def hold_out_positions(campaign: AxisCampaign, seed: int = 0, progress: Show | N
     drawn = None
     with Job({"hold-out": 1.0}, progress) as job:
         for number, position in enumerate(positions):
-            job.at(number / len(positions), f"position {position:g}")
+            job.at(number / len(positions), f"position {position:.10g}")
             out = rows.command == position
             if len(np.unique(rows.command[~out])) < 2 or (~out).sum() < 3:
-                warnings.append(f"position {position:g}: too few readings elsewhere to foretell it")
+                warnings.append(f"position {position:.10g}: too few readings elsewhere to foretell it")
                 continue
             left, foretold = np.flatnonzero(out), None
             if len(positions) > REFITTED_MAX:
@@ -185,7 +185,7 @@ def hold_out_positions(campaign: AxisCampaign, seed: int = 0, progress: Show | N
                 foretold = _reweighted(model, drawn, left)
             foretold = foretold or _refitted(model, out, seed + number)
             if foretold.fault:
-                warnings.append(f"position {position:g}: {foretold.fault}")
+                warnings.append(f"position {position:.10g}: {foretold.fault}")
             found += _scored(rows, position, left, foretold.mean, foretold.covariance)
     return AxisHoldOut(
         "positions",

@@ -58,8 +58,8 @@ class NextStop:
     @property
     def actions(self) -> list[str]:
         """What to do, in order."""
-        first = [] if self.via is None else [f"move {self.via:g}"]
-        return [*first, f"move {self.command:g}", "read"]
+        first = [] if self.via is None else [f"move {self.via:.10g}"]
+        return [*first, f"move {self.command:.10g}", "read"]
 
 
 @dataclass(frozen=True, repr=False)
