@@ -35,10 +35,10 @@ from pathlib import Path
 
 import jax
 import numpy as np
-from matplotlib.figure import Figure
 from scipy import stats
 
 from experiments.common.command_line import act, study_parser
+from experiments.common.figures import page_figure, title_and_figure
 from experiments.common.fits import compile_for, physical_of
 from experiments.common.headlines import SHRINK
 from experiments.common.rigs import dense_plan, mounted_rig, small_plan, unseen
@@ -54,6 +54,7 @@ from tvsbayes.model.parameter_space import coordinates_of, parameter_space
 from tvsbayes.posterior.draws import Posterior, derived_of
 from tvsbayes.posterior.ridges import transport
 from tvsbayes.posterior.sampling import TIERS, sample
+from tvsbayes.report.drawing import BLUE
 from tvsbayes.twin.physics import effective_mirror_offset_mm
 from tvsbayes.twin.simulated_campaign import simulate
 
@@ -170,19 +171,18 @@ def sum_of_squares_p(pit: np.ndarray) -> float:
 
 def picture(band: Band, pit: dict[str, np.ndarray], names: list[str], limit: float) -> None:
     """ECDF minus uniform, with the bands at 95 % and at the criterion's level."""
-    figure = Figure(figsize=(10, 5.5), layout="constrained")
-    axes = figure.subplots(2, 3, sharex=True, sharey=True)
-    for axis, name in zip(axes.flat, names, strict=True):
-        for level, colour in ((limit, "0.9"), (ALPHA, "0.78")):
-            low, high = band.limits(level)
-            axis.fill_between(band.points, low - band.points, high - band.points, color=colour, step="mid", lw=0)
-        axis.step(band.points, band.counts(pit[name]) / band.n - band.points, where="mid", color="C0", lw=1.2)
-        axis.axhline(0, color="0.4", lw=0.6)
-        axis.set_title(f"{name}, p = {band.p_value(pit[name]):.3f}", fontsize=9)
-    figure.supxlabel("PIT of the truth")
-    figure.supylabel("ECDF - uniform")
-    figure.suptitle(f"{band.n} simulations; bands: 95 % (dark), criterion (light), each simultaneous", fontsize=10)
-    figure.savefig(PICTURE, dpi=130)
+    with page_figure(PICTURE, 5.5, width_in=10.0) as figure:
+        axes = figure.subplots(2, 3, sharex=True, sharey=True)
+        for axis, name in zip(axes.flat, names, strict=True):
+            for level, colour in ((limit, "0.9"), (ALPHA, "0.78")):
+                low, high = band.limits(level)
+                axis.fill_between(band.points, low - band.points, high - band.points, color=colour, step="mid", lw=0)
+            axis.step(band.points, band.counts(pit[name]) / band.n - band.points, where="mid", color=BLUE, lw=1.2)
+            axis.axhline(0, color="0.4", lw=0.6)
+            axis.set_title(f"{name}, p = {band.p_value(pit[name]):.3f}")
+        figure.supxlabel("PIT of the truth")
+        figure.supylabel("ECDF - uniform")
+        figure.suptitle(f"{band.n} simulations; bands: 95 % (dark), criterion (light), each simultaneous")
 
 
 @dataclass(frozen=True)
@@ -237,7 +237,11 @@ def design_row(design: Design, p: dict[str, float]) -> str:
 def table(arguments: argparse.Namespace) -> None:
     """The study's page and picture."""
     rows = read_rows(arguments.rows)
-    print("# Simulation-based calibration of the posterior\n")
+    title, words = (
+        "Simulation-based calibration of the posterior",
+        "ECDF differences of the two densities and the four worst quantities",
+    )
+    print(title_and_figure(__file__, title, PICTURE, words))
     print("Written by `python -m experiments.intervals.sbc table` after `run`; rig i has seed i. 60 spots of the")
     print("mounted rig (48 for `few stops`), every prior quantity anew, no aperture readings; two shared cores.\n")
     for tier, title in zip(TIERS, ("Tier 1, importance sampling", "Tier 2, emcee"), strict=True):
@@ -290,7 +294,6 @@ def clean_part(design: Design, p: dict[str, float], pictured: bool) -> None:
     order = first + sorted((n for n in p if n not in first), key=p.get)
     if pictured:
         picture(design.band, design.pit, order[:6], ALPHA / len(p))
-        print("![ECDF differences of the two densities and the four worst quantities](sbc.png)\n")
     print(f"### Clean, all quantities: {len(design.good)} simulations\n")
     print("| quantity | mean PIT | sd of PIT x sqrt 12 | p of the band | p of sum z^2 |\n|---|---|---|---|---|")
     for name in order:

@@ -13,21 +13,21 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from experiments.common.command_line import print_only
+from experiments.common.figures import page_figure, title_and_figure
 from experiments.common.rigs import twin_campaign
 from tvsbayes.assessment.fitted_calibration import calibration_of
-from tvsbayes.coordinates.error_map import error_map
+from tvsbayes.coordinates.error_map import ErrorMap, error_map
 from tvsbayes.coordinates.simple_calibration import simple_calibration
 from tvsbayes.estimators.four_point import classic
 from tvsbayes.estimators.joint_fit import fit
 from tvsbayes.metrology.look_budget import budget
 from tvsbayes.model.compilation_cache import use_compilation_cache
+from tvsbayes.report.drawing import OF_ESTIMATOR, SEQUENTIAL, colour_map
 
 RANGES_MM = (200.0, 300.0, 400.0, 500.0, 700.0, 1000.0, 1400.0)
 PICTURE = Path(__file__).with_suffix(".png")
-COLOURS = {"nominal": "C7", "classic": "C1", "joint": "C0"}
 
 
 def main() -> None:
@@ -43,13 +43,17 @@ def main() -> None:
     }
     pan, tilt = (np.linspace(*ends, 5).round() for ends in calibration.range_steps)
     found = error_map(calibration, pan, tilt, RANGES_MM, simple=simple)
-    print("# Expected error of a located point\n")
+    print(
+        title_and_figure(
+            __file__, "Expected error of a located point", PICTURE, "RMS error by range, and maps at 500 mm"
+        )
+    )
     print("Written by `python -m experiments.millimetres.error_map`; paper twin, what was done stands in the script.\n")
     print("| range, mm | nominal | classic | joint | poses where all three find a point |\n|---|---|---|---|---|")
     for k, reach in enumerate(RANGES_MM):
         valid = found.valid[..., k]
         cells = []
-        for name in COLOURS:
+        for name in OF_ESTIMATOR:
             errors = found.rms_mm[name][..., k][valid]
             cells.append(f"{np.sqrt(np.mean(errors**2)):.1f}" if errors.size else "-")
         print(f"| {reach:.0f} | {' | '.join(cells)} | {valid.sum()} of {valid.size} |")
@@ -61,20 +65,26 @@ def main() -> None:
     for index in np.argsort(-parts.share):
         if parts.share[index] >= 0.001:
             print(f"| {parts.causes[index]} | {100 * parts.share[index]:.1f} |")
+    draw(found)
 
-    figure = Figure(figsize=(10, 3.2), layout="constrained")
-    axes = figure.subplots(1, 3)
-    for name, colour in COLOURS.items():
-        curve = [np.sqrt(np.nanmean(found.rms_mm[name][..., k] ** 2)) for k in range(len(RANGES_MM))]
-        axes[0].semilogy(RANGES_MM, curve, "o-", color=colour, label=name, ms=3, lw=1.2)
-    axes[0].set(xlabel="range, mm", ylabel="RMS error, mm", title="against range")
-    axes[0].legend(frameon=False)
-    reach = RANGES_MM.index(500.0)
-    for axis, name in zip(axes[1:], ("classic", "joint"), strict=True):
-        image = axis.pcolormesh(pan, tilt, found.rms_mm[name][..., reach].T, shading="nearest", cmap="viridis")
-        figure.colorbar(image, ax=axis, label="mm")
-        axis.set(xlabel="pan, steps", ylabel="tilt, steps", title=f"{name}, at 500 mm")
-    figure.savefig(PICTURE, dpi=130)
+
+def draw(found: ErrorMap) -> None:
+    """RMS error against range, and over the counters at 500 mm."""
+    with page_figure(PICTURE, 3.2, width_in=10.0) as figure:
+        axes = figure.subplots(1, 3)
+        for name, (colour, marker) in OF_ESTIMATOR.items():
+            curve = [np.sqrt(np.nanmean(found.rms_mm[name][..., k] ** 2)) for k in range(len(RANGES_MM))]
+            axes[0].semilogy(RANGES_MM, curve, color=colour, marker=marker, markersize=4, label=name)
+        axes[0].set(xlabel="range, mm", ylabel="RMS error, mm", title="against range")
+        axes[0].legend()
+        reach = RANGES_MM.index(500.0)
+        for axis, name in zip(axes[1:], ("classic", "joint"), strict=True):
+            errors = found.rms_mm[name][..., reach].T
+            counters = (found.pan_steps, found.tilt_steps)
+            image = axis.pcolormesh(*counters, errors, shading="nearest", cmap=colour_map(SEQUENTIAL))
+            figure.colorbar(image, ax=axis, label="mm")
+            axis.set(xlabel="pan, steps", ylabel="tilt, steps", title=f"{name}, at 500 mm")
+            axis.grid(visible=False)
 
 
 if __name__ == "__main__":

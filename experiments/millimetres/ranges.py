@@ -21,10 +21,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from matplotlib import rc_context
-from matplotlib.figure import Figure
 
 from experiments.common.command_line import act, study_parser
+from experiments.common.figures import page_figure, title_and_figure
 from experiments.common.fits import compile_for
 from experiments.common.rigs import TWINS, mounted_rig, shipped_plan, shipped_twin
 from experiments.common.rows import output, read_rows, run_rows
@@ -32,7 +31,7 @@ from experiments.common.true_looks import ELLIPSOID, ESTIMATORS, TrueLooks, or_n
 from tvsbayes.assessment.fitted_calibration import calibration_of
 from tvsbayes.coordinates.location import locate_linear, settings_of
 from tvsbayes.estimators.joint_fit import fit
-from tvsbayes.report.drawing import BLACK, OF_ESTIMATOR, STYLE, WIDTH_IN
+from tvsbayes.report.drawing import BLACK, OF_ESTIMATOR
 from tvsbayes.statistics.chances import binomial_bounds
 from tvsbayes.twin.simulated_campaign import simulate
 
@@ -143,7 +142,8 @@ def table(arguments: argparse.Namespace) -> None:
     """The page."""
     rows = read_rows(arguments.rows)
     good = [r for r in rows if r["converged"]]
-    print("# Millimetres: nominal, classic and joint against the truth\n")
+    title, words = "Millimetres: nominal, classic and joint against the truth", "RMS error against range, two protocols"
+    print(title_and_figure(__file__, title, FIGURE, words))
     print(
         "Written by `python -m experiments.millimetres.ranges table`; mm of 3D distance; what was done stands there.\n"
     )
@@ -158,8 +158,7 @@ def table(arguments: argparse.Namespace) -> None:
 
 def draw(rows) -> None:
     """RMS error of each estimator against range."""
-    with rc_context(STYLE):
-        figure = Figure(figsize=(WIDTH_IN, 5.6), layout="constrained")
+    with page_figure(FIGURE, 5.6) as figure:
         panels, metres = figure.subplots(2, 1, sharex=True, sharey=True), np.array(RANGES_MM) / 1000
         for axes, protocol in zip(panels, PROTOCOLS, strict=True):
             chosen = [r for r in rows if r["name"] == protocol]
@@ -181,7 +180,6 @@ def draw(rows) -> None:
         panels[-1].set(xlabel="range, m", xticks=metres, xticklabels=[f"{m:g}" for m in metres])
         panels[-1].minorticks_off()
         figure.legend(loc="outside lower center", ncols=4)
-        figure.savefig(FIGURE, dpi=130)
 
 
 def run(arguments: argparse.Namespace) -> None:

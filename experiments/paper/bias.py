@@ -17,9 +17,9 @@ import argparse
 from pathlib import Path
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from experiments.common.command_line import act, study_parser
+from experiments.common.figures import page_figure, title_and_figure
 from experiments.common.fits import compile_for, fit_from_truth
 from experiments.common.headlines import true_headlines
 from experiments.common.rigs import drawn_truth, mounted_rig
@@ -27,6 +27,7 @@ from experiments.common.rows import output, read_rows, run_rows
 from tvsbayes.estimators.four_point import classic
 from tvsbayes.instrument.axes import DIRECTIONS
 from tvsbayes.instrument.protocols import four_point_protocol
+from tvsbayes.report.drawing import OF_ESTIMATOR
 from tvsbayes.twin.simulated_campaign import simulate
 
 ROWS, FIGURE = output(__file__, "bias.jsonl"), Path(__file__).with_suffix(".png")
@@ -135,9 +136,9 @@ def cell(rows: list[dict], axis: str, estimator: str) -> dict[str, float]:
 def table(arguments: argparse.Namespace) -> None:
     """Markdown and figure of everything that came out."""
     rows = read_rows(arguments.rows)
-    print("# Bias and coverage, one imperfection at a time\n")
+    title = "Bias and coverage, one imperfection at a time"
+    print(title_and_figure(__file__, title, FIGURE, "Bias, error and coverage against imperfections"))
     print("Written by `python -m experiments.paper.bias table`; see the script for the campaigns.\n")
-    print("![Bias, error and coverage against four imperfections](bias.png)\n")
     shown: dict[tuple[str, str, str], list[tuple[float, dict[str, float]]]] = {}
     for factor, levels in LEVELS.items():
         print(f"## {factor}: {UNITS[factor]}\n")
@@ -174,37 +175,37 @@ def table(arguments: argparse.Namespace) -> None:
 
 def figure(shown: dict[tuple[str, str, str], list[tuple[float, dict[str, float]]]]) -> None:
     """Mean error above, coverage below, one column per factor."""
-    styles = {"classic": ("#b2182b", "gum", "classic, GUM interval"), "joint": ("#2166ac", "inside", "joint")}
-    fig = Figure(figsize=(13, 6), layout="constrained")
-    axes = fig.subplots(2, len(LEVELS), sharey="row")
-    for column, factor in enumerate(LEVELS):
-        for name, (colour, inside, label) in styles.items():
-            for axis, mark in (("pan", "o-"), ("tilt", "s--")):
-                cells = shown.get((factor, axis, name), [])
-                if not cells:
-                    continue
-                place = [level for level, _ in cells]
-                mean, rms = (np.array([c[k] for _, c in cells]) for k in ("mean", "rms"))
-                top, bottom = axes[:, column]
-                top.plot(place, mean, mark, color=colour, label=f"{name}, {axis}")
-                spread = np.sqrt(np.maximum(rms**2 - mean**2, 0))
-                top.fill_between(place, mean - spread, mean + spread, color=colour, alpha=0.12, linewidth=0)
-                bottom.plot(place, [c[inside] for _, c in cells], mark, color=colour, label=f"{label}, {axis}")
-        top, bottom = axes[:, column]
-        top.axhline(0, color="black", linewidth=0.6)
-        bottom.axhline(95, color="black", linewidth=0.6)
-        bottom.set_xlabel(f"{factor}, {UNITS[factor].split(',')[0]}")
-        if factor == "spot noise":
-            for part in (top, bottom):
-                part.set_xscale("log")
-                part.set_xticks(LEVELS[factor], [f"{x:g}" for x in LEVELS[factor]])
-                part.minorticks_off()
-        bottom.set_ylim(-3, 103)
-    axes[0, 0].set_ylabel("error of the ratio, %\n(band: 1 sd over rigs)")
-    axes[1, 0].set_ylabel("95 % intervals that held\nthe true ratio, %")
-    axes[0, 0].legend(fontsize=8)
-    axes[1, 0].legend(fontsize=8)
-    fig.savefig(FIGURE, dpi=110)
+    styles = {"classic": ("gum", "classic, GUM interval"), "joint": ("inside", "joint")}
+    with page_figure(FIGURE, 6.0, width_in=13.0) as fig:
+        axes = fig.subplots(2, len(LEVELS), sharey="row")
+        for column, factor in enumerate(LEVELS):
+            for name, (inside, label) in styles.items():
+                colour = OF_ESTIMATOR[name][0]
+                for axis, mark in (("pan", "o-"), ("tilt", "s--")):
+                    cells = shown.get((factor, axis, name), [])
+                    if not cells:
+                        continue
+                    place = [level for level, _ in cells]
+                    mean, rms = (np.array([c[k] for _, c in cells]) for k in ("mean", "rms"))
+                    top, bottom = axes[:, column]
+                    top.plot(place, mean, mark, color=colour, label=f"{name}, {axis}")
+                    spread = np.sqrt(np.maximum(rms**2 - mean**2, 0))
+                    top.fill_between(place, mean - spread, mean + spread, color=colour, alpha=0.12, linewidth=0)
+                    bottom.plot(place, [c[inside] for _, c in cells], mark, color=colour, label=f"{label}, {axis}")
+            top, bottom = axes[:, column]
+            top.axhline(0, color="black", linewidth=0.6)
+            bottom.axhline(95, color="black", linewidth=0.6)
+            bottom.set_xlabel(f"{factor}, {UNITS[factor].split(',')[0]}")
+            if factor == "spot noise":
+                for part in (top, bottom):
+                    part.set_xscale("log")
+                    part.set_xticks(LEVELS[factor], [f"{x:g}" for x in LEVELS[factor]])
+                    part.minorticks_off()
+            bottom.set_ylim(-3, 103)
+        axes[0, 0].set_ylabel("error of the ratio, %\n(band: 1 sd over rigs)")
+        axes[1, 0].set_ylabel("95 % intervals that held\nthe true ratio, %")
+        axes[0, 0].legend()
+        axes[1, 0].legend()
 
 
 def main() -> None:

@@ -32,11 +32,10 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from matplotlib import rc_context
-from matplotlib.figure import Figure
 from scipy import stats
 
 from experiments.common.command_line import act, study_parser
+from experiments.common.figures import page_figure, title_and_figure
 from experiments.common.fits import compile_for
 from experiments.common.rigs import mounted_rig, unseen
 from experiments.common.rows import output, read_rows, run_rows
@@ -53,7 +52,7 @@ from tvsbayes.instrument.plan import read_plan, run_plan, write_plan
 from tvsbayes.instrument.protocols import twin_protocol
 from tvsbayes.instrument.rig import Rig, read_rig
 from tvsbayes.model.compilation_cache import use_compilation_cache
-from tvsbayes.report.drawing import BLACK, BLUE, RED, STYLE, WIDTH_IN
+from tvsbayes.report.drawing import BLACK, BLUE, RED
 from tvsbayes.twin.simulated_campaign import simulate
 
 ROWS, PLANNED = output(__file__, "two_rigs.jsonl"), output(__file__, "two_rigs_planned.csv")
@@ -219,7 +218,7 @@ def classic_part() -> None:
 def table(arguments: argparse.Namespace) -> None:
     """The page and its figure."""
     rows = read_rows(arguments.rows)
-    print("# Two rigs, one Table 1\n")
+    print(title_and_figure(__file__, "Two rigs, one Table 1", FIGURE, "Evidence for play against literal ratios"))
     print("Written by `python -m experiments.paper.two_rigs table` after `run`; what was done stands in the script.\n")
     classic_part()
     print("## The joint estimator\n")
@@ -266,9 +265,8 @@ def table(arguments: argparse.Namespace) -> None:
 def draw(rows) -> None:
     """Weight of the evidence by campaign, and contrast against backlash of pan."""
     looks = {"lost motion": (BLUE, "o"), "literal": (RED, "^")}
-    with rc_context(STYLE):
-        names = [name for name in CAMPAIGNS if any(row["campaign"] == name for row in rows)]
-        figure = Figure(figsize=(WIDTH_IN, 1.4 + 0.4 * len(names)), layout="constrained")
+    names = [name for name in CAMPAIGNS if any(row["campaign"] == name for row in rows)]
+    with page_figure(FIGURE, 1.4 + 0.4 * len(names)) as figure:
         axes = figure.subplots()
         for kind, (colour, marker) in looks.items():
             places, weights = [], []
@@ -283,7 +281,6 @@ def draw(rows) -> None:
         axes.set(yticks=range(len(names)), yticklabels=names, ylim=(len(names) - 0.5, -0.5))
         axes.set_xlabel("log10 Bayes factor: literal ratios < 0 < play")
         figure.legend(loc="outside lower center", ncols=2)
-        figure.savefig(FIGURE, dpi=130)
 
 
 def main() -> None:

@@ -23,10 +23,9 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from matplotlib import rc_context
-from matplotlib.figure import Figure
 
 from experiments.common.command_line import act, study_parser
+from experiments.common.figures import page_figure, title_and_figure
 from experiments.common.fits import compile_for
 from experiments.common.headlines import marked
 from experiments.common.rigs import mounted_rig
@@ -43,7 +42,7 @@ from tvsbayes.planning.candidates import candidates
 from tvsbayes.planning.expectation import Knowledge, prior_knowledge
 from tvsbayes.planning.search import LADDER
 from tvsbayes.planning.target import DEFAULT_TARGET, parse_target
-from tvsbayes.report.drawing import BLUE, GREEN, ORANGE, PURPLE, RED, STYLE, WIDTH_IN
+from tvsbayes.report.drawing import BLUE, GREEN, ORANGE, PURPLE, RED
 from tvsbayes.statistics.chances import rms_bounds
 from tvsbayes.studies.study_job import StudyJob, study_row
 
@@ -99,7 +98,11 @@ def table(arguments: argparse.Namespace) -> None:
     family = planned_family(knowledge)
     curves["planned"] = [worth_of_plan(knowledge, family.arranged(n).steps) for n in LADDER if n <= family.largest]
     curves["full turn"] = [worth_of_plan(knowledge, full_turn_plan(n)) for n in TURN_LOOKS]
-    print("# What a campaign is worth\n")
+    print(
+        title_and_figure(
+            __file__, "What a campaign is worth", FIGURE, "Worst u, and its part that stays, against spots"
+        )
+    )
     print(
         "Written by `python -m experiments.planning.campaign_worth table`; u in 1e-4 deg/step, of effective ratios.\n"
     )
@@ -140,8 +143,7 @@ def refits(every: list[dict]) -> None:
 
 def draw(curves: Mapping[str, list[Worth]]) -> None:
     """U of the worst ratio and the part that stays, against spots."""
-    with rc_context(STYLE):
-        figure = Figure(figsize=(WIDTH_IN, 5.6), layout="constrained")
+    with page_figure(FIGURE, 5.6) as figure:
         above, below = figure.subplots(2, 1, sharex=True)
         looks = zip((RED, ORANGE, GREEN, BLUE, PURPLE), "^vsoD", strict=True)
         for (name, points), (colour, marker) in zip(curves.items(), looks, strict=True):
@@ -151,7 +153,6 @@ def draw(curves: Mapping[str, list[Worth]]) -> None:
         above.set(ylabel="u of the worst ratio, deg/step")
         below.set(xlabel="spots", ylabel="variance that no repeat lowers, %", ylim=(0, None))
         figure.legend(loc="outside lower center", ncols=3)
-        figure.savefig(FIGURE, dpi=130)
 
 
 def run(arguments: argparse.Namespace) -> None:

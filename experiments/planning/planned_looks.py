@@ -17,9 +17,9 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from experiments.common.command_line import print_only
+from experiments.common.figures import page_figure, title_and_figure
 from experiments.common.rigs import mounted_rig
 from experiments.common.worth import UNREACHED, searched_family
 from tvsbayes.instrument.plan import PlanStep
@@ -32,6 +32,7 @@ from tvsbayes.planning.limits import MANY, limit_of, split_of
 from tvsbayes.planning.looks import LookArrays, covariance_of
 from tvsbayes.planning.search import LADDER, Scope, design_family
 from tvsbayes.planning.target import DEFAULT_TARGET, Sensitivity, parse_target, sensitivity
+from tvsbayes.report.drawing import BLUE, GREEN, GREY, ORANGE, RED
 
 FIGURE = Path(__file__).with_suffix(".png")
 REPEATS = (2, 4, 8, 16, 24)
@@ -147,7 +148,8 @@ def main() -> None:
     use_compilation_cache()
     knowledge = prior_knowledge(mounted_rig())
     result = compared(knowledge, searched_family(knowledge))
-    print("# Planned looks against the paper's 96 experiments\n")
+    title, words = "Planned looks against the paper's 96 experiments", "u of the worst ratio against minutes, by plan"
+    print(title_and_figure(__file__, title, FIGURE, words))
     print("Written by `python -m experiments.planning.planned_looks`; u of the worst effective ratio, 1e-4 deg/step.\n")
     print("| plan | spots | minutes | u | what it consists of | floor | what sets it |\n|---|---|---|---|---|---|---|")
     print("\n".join(result.rows.values()))
@@ -167,18 +169,19 @@ def main() -> None:
 
 def draw(curves: Mapping[str, Sequence[Point]]) -> None:
     """U against minutes, both logarithmic."""
-    figure = Figure(figsize=(6.4, 4.0), layout="constrained")
-    axes = figure.subplots()
-    for name, points in curves.items():
-        last = points[-1]
-        axes.loglog([p.minutes for p in points], [p.value for p in points], marker="o", markersize=3, label=name)
-        place = {"fontsize": 7, "xytext": (3, 3), "textcoords": "offset points"}
-        axes.annotate(f"{last.spots} spots", (last.minutes, last.value), **place)
-    axes.axhline(TARGET.limit, color="grey", linewidth=0.8, linestyle=":")
-    axes.set_xlabel("minutes")
-    axes.set_ylabel("u of the worst effective ratio, deg/step")
-    axes.legend(frameon=False)
-    figure.savefig(FIGURE, dpi=110)
+    looks = {"paper": (RED, "^"), "mixed": (ORANGE, "v"), "grid": (GREEN, "s"), "planned": (BLUE, "o")}
+    with page_figure(FIGURE, 4.0) as figure:
+        axes = figure.subplots()
+        for name, points in curves.items():
+            colour, marker = looks[name]
+            minutes, u = np.array([(p.minutes, p.value) for p in points]).T
+            axes.loglog(minutes, u, color=colour, marker=marker, markersize=4, label=name)
+            # The curves fall: below their ends is room.
+            place = {"xytext": (4, -6), "textcoords": "offset points", "ha": "right", "va": "top"}
+            axes.annotate(f"{points[-1].spots} spots", (minutes[-1], u[-1]), **place)
+        axes.axhline(TARGET.limit, color=GREY, linewidth=0.8, linestyle=":")
+        axes.set(xlabel="minutes", ylabel="u of the worst effective ratio, deg/step")
+        figure.legend(loc="outside lower center", ncols=4)
 
 
 if __name__ == "__main__":

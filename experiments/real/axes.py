@@ -17,11 +17,12 @@ import argparse
 from pathlib import Path
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from experiments.common.command_line import parser
+from experiments.common.figures import page_figure, title_and_figure
 from experiments.common.rows import append_row, output, read_rows, run_rows
 from experiments.real.axis_files import axis_of
+from tvsbayes.report.drawing import BLUE, RED
 from tvsbayes.single_axis.axis_campaign import AxisCampaign, AxisMove
 from tvsbayes.single_axis.axis_fit import fit_axis
 from tvsbayes.single_axis.axis_parameters import AxisPrior
@@ -116,12 +117,10 @@ def _held_lines(name: str, rows: list[dict]) -> str:
     return "| " + " | ".join(cells) + " |"
 
 
-HELD_TEXT = """# Real axes, positions left out
-
-Made by `python -m experiments.real.axes`. Axes: figures printed in the test reports of the public repository
-anderssandstrom/ecmc_target_muts_logger (commit ee350e4c81): ISO 230-2 runs of stepper-driven screw axes read by laser
-triangulation. Every position left out in turn, the axis fitted without it, the mean of its readings in each direction
-foretold. z = (mean - predicted) / u; first edition: offset, scale, play, independent stops.
+HELD_TEXT = """Made by `python -m experiments.real.axes`. Axes: figures printed in the test reports of the public
+repository anderssandstrom/ecmc_target_muts_logger (commit ee350e4c81): ISO 230-2 runs of stepper-driven screw axes read
+by laser triangulation. Every position left out in turn, the axis fitted without it, the mean of its readings in each
+direction foretold. z = (mean - predicted) / u; first edition: offset, scale, play, independent stops.
 
 | axis | inner means | RMS z | worst | in 1.96 u | readings in 95 % | ends: RMS z | first edition: RMS z |
 |---|---|---|---|---|---|---|---|"""
@@ -138,6 +137,8 @@ z = (mean - truth) / sd. Bounds are two-sided at 1e-4 for so many axes.
 def table(_: argparse.Namespace) -> None:
     """Both tables."""
     held, drawn = read_rows(HELD), read_rows(DRAWN)
+    words = "Left-out means less those foretold, in u, by axis and model"
+    print(title_and_figure(__file__, "Real axes, positions left out", FIGURE, words))
     print(HELD_TEXT)
     for axis in dict.fromkeys(r["axis"] for r in held):
         print(_held_lines(axis, [r for r in held if r["axis"] == axis]))
@@ -160,19 +161,18 @@ def figure(_: argparse.Namespace) -> None:
     """Z of every inner position that was left out, by axis, for both models."""
     rows = [row for row in read_rows(HELD) if not row["end"]]
     names = list(dict.fromkeys(row["axis"] for row in rows))
-    made = Figure(figsize=(7.2, 3.0), layout="constrained")
-    axes = made.subplots()
-    axes.axhspan(-1.96, 1.96, color="tab:blue", alpha=0.15, linewidth=0)
-    for shift, key, colour, label in (
-        (-0.12, "z", "tab:blue", "processes of position"),
-        (0.12, "classic_z", "tab:red", "line, play, independent stops"),
-    ):
-        place = [names.index(row["axis"]) + shift for row in rows]
-        axes.plot(place, [row[key] for row in rows], "o", markersize=3, color=colour, alpha=0.7, label=label)
-    axes.set_xticks(range(len(names)), names, fontsize=8)
-    axes.set_ylabel("(mean - predicted) / u")
-    axes.legend(frameon=False, fontsize=8)
-    made.savefig(FIGURE, dpi=90)
+    with page_figure(FIGURE, 3.0, width_in=7.2) as made:
+        axes = made.subplots()
+        axes.axhspan(-1.96, 1.96, color=BLUE, alpha=0.15, linewidth=0)
+        for shift, key, colour, label in (
+            (-0.12, "z", BLUE, "processes of position"),
+            (0.12, "classic_z", RED, "line, play, independent stops"),
+        ):
+            place = [names.index(row["axis"]) + shift for row in rows]
+            axes.plot(place, [row[key] for row in rows], "o", markersize=3, color=colour, alpha=0.7, label=label)
+        axes.set_xticks(range(len(names)), names)
+        axes.set_ylabel("(mean - predicted) / u")
+        axes.legend()
 
 
 def main() -> None:

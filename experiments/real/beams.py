@@ -18,15 +18,16 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from matplotlib.figure import Figure
 from scipy import stats
 
 from experiments.common.clock import timed
 from experiments.common.command_line import parser
+from experiments.common.figures import page_figure, title_and_figure
 from tvsbayes.cameras.spot_fit import Centre, find_spot
 from tvsbayes.files.images import in_grey_levels, read_image
 
 BEAMS, FIGURE = Path("data/real/spots"), Path("data/docs/real_beams.png")
+TITLE = "Real laser beams"
 PARTS = 4
 """Rows and columns are taken apart by so many."""
 TURNS = 3
@@ -85,17 +86,16 @@ def beam_of(path: Path) -> Beam:
 
 def draw(beams: Sequence[Beam]) -> None:
     """Every picture around its spot, with centre, status and RMS z."""
-    figure = Figure(figsize=(7.2, 5.6), layout="constrained")
-    for axes, beam in zip(figure.subplots(3, 3).ravel(), beams, strict=False):
-        grey = np.asarray(in_grey_levels(beam.picture), np.float32)[..., 0]
-        small = cv2.resize(grey, (160, round(160 * grey.shape[0] / grey.shape[1])), interpolation=cv2.INTER_AREA)
-        axes.imshow(np.sqrt(small), cmap="inferno")
-        if beam.whole.status == "ok":
-            axes.plot(*(beam.whole.located.centre_px * 160 / grey.shape[1]), "+", color="cyan", markersize=9)
-        end = f", RMS z {beam.rms:.2f}" if beam.z.size else ""
-        axes.set_title(f"{beam.name}: {beam.whole.status}{end}", fontsize=7)
-        axes.set_axis_off()
-    figure.savefig(FIGURE, dpi=80)
+    with page_figure(FIGURE, 5.6, width_in=7.2) as figure:
+        for axes, beam in zip(figure.subplots(3, 3).ravel(), beams, strict=False):
+            grey = np.asarray(in_grey_levels(beam.picture), np.float32)[..., 0]
+            small = cv2.resize(grey, (160, round(160 * grey.shape[0] / grey.shape[1])), interpolation=cv2.INTER_AREA)
+            axes.imshow(np.sqrt(small), cmap="inferno")
+            if beam.whole.status == "ok":
+                axes.plot(*(beam.whole.located.centre_px * 160 / grey.shape[1]), "+", color="cyan", markersize=9)
+            end = f", RMS z {beam.rms:.2f}" if beam.z.size else ""
+            axes.set_title(f"{beam.name}: {beam.whole.status}{end}", fontsize=7)
+            axes.set_axis_off()
 
 
 def row(beam: Beam) -> str:
@@ -127,15 +127,14 @@ def report(folder: Path) -> None:
     """The page."""
     paths = sorted(folder.glob("*.png"))
     beams = [beam_of(path) for path in paths]
-    print("# Real laser beams\n")
     if folder == BEAMS:
-        print("![The beams, with centre, status and RMS z](../../data/docs/real_beams.png)\n")
         draw(beams)
+        print(title_and_figure(__file__, TITLE, FIGURE, "The beams, with centre, status and RMS z"))
+    else:
+        print(f"# {TITLE}\n")
+    print(f"Written by `python -m experiments.real.beams`: pictures of `{folder}`. Sixteen parts: every fourth row and")
     print(
-        f"Written by `python -m experiments.real.beams`: pictures of `{folder}`. Sixteen parts: every fourth row and "
-    )
-    print(
-        "column; RMS z of their centres about their mean, with where 95 % of such numbers lie for true uncertainties; "
+        "column; RMS z of their centres about their mean, with where 95 % of such numbers lie for true uncertainties;"
     )
     print("even against odd rows (u, v), then columns (u, v), in stated sds.\n")
     titles = ["beam", "bits", "px", "whole", "sds px", "centre px", "u px", "sixteen parts", "RMS z", "by chance"]

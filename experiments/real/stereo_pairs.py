@@ -17,15 +17,17 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from matplotlib.figure import Figure
 from scipy import stats
 
 from experiments.common.command_line import parser
+from experiments.common.figures import page_figure, title_and_figure
 from tvsbayes.cameras.boards import Board, View, Views, corner_orders, find_views
 from tvsbayes.cameras.stereo_calibration import StereoCalibration, calibrate_stereo
 from tvsbayes.errors import TvsError
+from tvsbayes.report.drawing import BLACK, BLUE, RED
 
 PAIRS, FIGURE = Path("data/real/stereo/bumblebee2"), Path("data/docs/real_stereo.png")
+TITLE = "Real stereo pairs"
 SHIPPED_BASELINE_MM = 120.05
 """|T| of `stereo.yaml`, which came with the pairs: another program, other coefficients, no uncertainty."""
 SPLITS = 60
@@ -113,23 +115,22 @@ def said(views: Sequence[View], board: Board, size: tuple[int, int]) -> str:
 
 def draw(splits: Sequence[Halves], named: Halves) -> None:
     """Z of all parameters of all splits beside the normal one, and chi-square by split."""
-    figure = Figure(figsize=(8.0, 3.2), layout="constrained")
-    left, right = figure.subplots(1, 2)
-    z, x = np.concatenate([one.z for one in splits]), np.linspace(-4, 4, 161)
-    left.hist(z, np.arange(-4.25, 4.5, 0.5), density=True, color="tab:blue", alpha=0.6, label="halves")
-    left.plot(x, stats.norm.pdf(x), color="black", linewidth=1, label="stated")
-    left.set_xlabel("difference of two halves / stated sd, 24 parameters")
-    left.legend(frameon=False)
-    parameters = len(splits[0].z)
-    chi2 = np.sort([one.chi2 for one in splits])
-    share = (np.arange(len(chi2)) + 0.5) / len(chi2)
-    right.plot(stats.chi2(parameters).ppf(share) / parameters, chi2, ".", color="tab:blue", label="random halves")
-    right.axhline(named.chi2, color="tab:red", linewidth=0.8, label="odd against even")
-    right.plot([0.3, 2.2], [0.3, 2.2], color="black", linewidth=0.8)
-    right.set_xlabel("chi-square per parameter, expected")
-    right.set_ylabel("found")
-    right.legend(frameon=False)
-    figure.savefig(FIGURE, dpi=90)
+    with page_figure(FIGURE, 3.2, width_in=8.0) as figure:
+        left, right = figure.subplots(1, 2)
+        z, x = np.concatenate([one.z for one in splits]), np.linspace(-4, 4, 161)
+        left.hist(z, np.arange(-4.25, 4.5, 0.5), density=True, color=BLUE, alpha=0.6, label="halves")
+        left.plot(x, stats.norm.pdf(x), color=BLACK, linewidth=1, label="stated")
+        left.set_xlabel("difference of two halves / stated sd, 24 parameters")
+        left.legend()
+        parameters = len(splits[0].z)
+        chi2 = np.sort([one.chi2 for one in splits])
+        share = (np.arange(len(chi2)) + 0.5) / len(chi2)
+        right.plot(stats.chi2(parameters).ppf(share) / parameters, chi2, ".", color=BLUE, label="random halves")
+        right.axhline(named.chi2, color=RED, linewidth=0.8, label="odd against even")
+        right.plot([0.3, 2.2], [0.3, 2.2], color=BLACK, linewidth=0.8)
+        right.set_xlabel("chi-square per parameter, expected")
+        right.set_ylabel("found")
+        right.legend()
 
 
 def report(found: Views, board: Board, folder: Path) -> None:
@@ -139,11 +140,14 @@ def report(found: Views, board: Board, folder: Path) -> None:
     views = pairs_of(found.views)
     ours, theirs = calibrate_stereo(views, board, size), opencv_joint(views, board, size)
     baseline = float(np.linalg.norm(ours.stereo.T))
-    print("# Real stereo pairs\n")
     if shipped:
         print(
-            "![Differences of halves of the pairs in stated standard uncertainties](../../data/docs/real_stereo.png)\n"
+            title_and_figure(
+                __file__, TITLE, FIGURE, "Differences of halves of the pairs in stated standard uncertainties"
+            )
         )
+    else:
+        print(f"# {TITLE}\n")
     print(
         f"Written by `python -m experiments.real.stereo_pairs`: {len(views)} pairs of `{folder}`, "
         f"{size[0]} x {size[1]} px,"
@@ -159,9 +163,7 @@ def report(found: Views, board: Board, folder: Path) -> None:
     if shipped:
         away = (baseline - SHIPPED_BASELINE_MM) / ours.baseline_sd_mm
         print(f"The calibration that came with them has {SHIPPED_BASELINE_MM} mm: {away:+.1f} stated sds from ours.\n")
-    print(
-        f"Corners of the board off a grid by {ours.board_error_mm:.3f} mm (sd of a coordinate), variances of what is "
-    )
+    print(f"Corners of the board off a grid by {ours.board_error_mm:.3f} mm (sd of a coordinate), variances of what is")
     print(f"left {ours.correlation_factor:.1f} times those of independent corners.\n")
     if len(views) >= 8:
         rng = np.random.default_rng(1)

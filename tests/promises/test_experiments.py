@@ -24,6 +24,7 @@ MODULES = {
 }
 QUESTIONS = sorted({name.split(".")[1] for name in MODULES} - {"common"})
 SCRIPTS = [name for name, path in MODULES.items() if 'if __name__ == "__main__":' in path.read_text(encoding="utf-8")]
+DRAWS = [name for name, path in MODULES.items() if "page_figure(" in path.read_text(encoding="utf-8")]
 DEFINES = (ast.Import, ast.ImportFrom, ast.FunctionDef, ast.ClassDef, ast.Assign, ast.AnnAssign, ast.Expr, ast.If)
 
 
@@ -95,6 +96,33 @@ def test_commands_on_pages_are_scripts(page):
     """As `python -m experiments.question.script`, with a page beside its script."""
     for name in re.findall(r"python -m (experiments(?:\.\w+)+)", page.read_text(encoding="utf-8")):
         assert name in MODULES or f"{name}.__main__" in MODULES, name
+
+
+def test_figures_have_one_style():
+    """All but the drawing of the instrument, which is no plot."""
+    own = {name for name in MODULES if "matplotlib.figure" in imported(name)}
+    assert own == {"experiments.common.figures", "experiments.inputs.draw_rig"}
+
+
+def test_every_picture_stands_on_a_page():
+    pages = {MODULES[name].with_suffix(".md") for name in DRAWS if name != "experiments.common.figures"}
+    pictures = {path for path in FOLDER.rglob("*.png") if "output" not in path.relative_to(FOLDER).parts}
+    assert {path.with_suffix(".md") for path in pictures} <= pages
+
+
+@pytest.mark.parametrize("name", [name for name in DRAWS if name != "experiments.common.figures"])
+def test_a_page_begins_with_its_figure(name):
+    """Title, figure, then the rest, as its script prints it."""
+    page = MODULES[name].with_suffix(".md")
+    title, figure = page.read_text(encoding="utf-8").split("\n\n")[:2]
+    shown = re.fullmatch(r"!\[(.+)\]\((.+)\)", figure)
+    assert title.startswith("# ") and shown, figure
+    picture = page.parent / shown[2]
+    assert picture.is_file()
+    figures = importlib.import_module("experiments.common.figures")
+    made = figures.title_and_figure(str(MODULES[name]), title.removeprefix("# "), picture, shown[1])
+    assert page.read_text(encoding="utf-8").startswith(made)
+    assert title.removeprefix("# ") in MODULES[name].read_text(encoding="utf-8")
 
 
 @pytest.mark.slow
