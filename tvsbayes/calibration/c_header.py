@@ -40,8 +40,9 @@ def calibration_header(calibration: Calibration, origin: Origin | None = None) -
         lines.append(f"#define TVS_OVERSHOOT_{axis.upper()}_STEPS {calibration.overshoot_steps[axis]}")
     lines.append(f"#define TVS_AZIMUTH_CONVENTION {int(calibration.azimuth)}")
     lines += _header_gears(calibration)
+    estimator = _UNCOMMENTED.sub("_", calibration.estimator)
     stated = (
-        f"Expected error ({_UNCOMMENTED.sub('_', calibration.estimator)}, 95 %) at pan {error.pan_steps}, tilt {error.tilt_steps} "
+        f"Expected error ({estimator}, 95 %) at pan {error.pan_steps}, tilt {error.tilt_steps} "
         f"steps: azimuth {error.u95_azimuth_deg:.3f} deg, elevation {error.u95_elevation_deg:.3f} deg; "
         f"at 1 m {max(error.u95_at_1_m_mm):.2f} mm."
     )
