@@ -245,6 +245,17 @@ def test_entries_that_a_board_does_not_have_are_refused(entries, column):
     assert caught.value.column == column and caught.value.allowed and caught.value.remedy
 
 
+def test_more_power_than_the_board_has_is_refused():
+    """$30 = 255 and a power in thousandths: GRBL would give all the light there is."""
+    with pytest.raises(InputError, match=r"found 300; allowed: at most 255, the board's \$30") as caught:
+        connected(GrblBoard({30: 255}), laser_power=300.0)
+    assert caught.value.column == "positioner.options.laser_power"
+    board = GrblBoard({30: 255})
+    positioner = connected(board, laser_power=255.0)
+    positioner.home()
+    assert positioner.laser(True).laser_on and "M3 S255" in board.orders
+
+
 def test_the_options_of_a_board():
     """A switch of a rig file comes as 0 or 1."""
     assert [Wishes.of({"options.unwatched_laser": said}).unwatched for said in (0, 1)] == [False, True]

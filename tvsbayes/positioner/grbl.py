@@ -118,7 +118,7 @@ class GrblPositioner:
 
     Raises:
         DeviceFault: nothing answers, or something else does.
-        InputError: a setting of the board that does not fit.
+        InputError: a setting of the board that does not fit, or more laser power than it has.
     """
 
     def __init__(self, open_link: Callable[[], Link], wishes: Wishes | None = None, clock: Clock = time):
@@ -138,6 +138,10 @@ class GrblPositioner:
             values: dict[int, float] = {}
             self._order("$$", REPLY_S, lambda line: values.update([found]) if (found := parse_setting(line)) else None)
             self._board = BoardSettings.of(values, self._wishes.laser)
+            if (self._wishes.laser_power or 0.0) > self._board.power_max:
+                # The board would take it for full power.
+                found, allowed = f"{self._wishes.laser_power:g}", f"at most {self._board.power_max:g}, the board's $30"
+                raise _refused("options.laser_power", found, allowed, "lower it, or leave it out for full power")
             self.identity |= {f"${number}": f"{values[number]:g}" for number in (100, 101, 110, 111)}
         except BaseException:
             self.close()
