@@ -153,6 +153,14 @@ def test_a_chain_that_says_something_else_has_not_converged(judged):
     assert said.startswith(words)
 
 
+def test_where_every_headline_is_fixed_the_others_must_agree(judged, monkeypatch):
+    """A rig whose geometry is stated as known: the campaign teaches its noise."""
+    monkeypatch.setattr("tvsbayes.posterior.diagnosis.headline_names", lambda fit: ("effective_mirror_offset_mm",))
+    assert judged(chain_of(independent()), weighted()).converged
+    found = judged(chain_of(independent()), weighted(-0.15))
+    assert not found.converged and NAMES[RATIO] in found.convergence.agreement.worst.quantity
+
+
 def test_groups_are_neighbours_in_order_of_time():
     """Of eight walkers, two each: their draws alternate, the first of both before the second of both."""
     values = 10 * np.arange(2 * GROUPS)[:, None] + np.arange(3)

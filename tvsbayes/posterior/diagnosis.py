@@ -119,10 +119,12 @@ def stuck_walkers(chain: Chain, discarded: int) -> np.ndarray:
 
 
 def agreement(first: Posterior, chain_draws: Derived, names: tuple[str, ...]) -> Agreement:
-    """Of draws (chain, draw) with the weighted ones, by the columns of those names that vary."""
+    """Of draws (chain, draw) with the weighted ones, by the columns of those names that vary; by all if none does."""
     own, theirs = Draws(chain_draws), first.by_name
     shape = np.shape(chain_draws.effective_mirror_offset_mm)
-    names = tuple(name for name in names if np.ptp(own[name]) > 0 and np.ptp(theirs[name]) > 0)
+    varying = [name for name in own if np.ptp(own[name]) > 0 and np.ptp(theirs[name]) > 0]
+    # Where nothing that a fit is for is left open, everything else stands for it.
+    names = tuple(name for name in names if name in varying) or tuple(varying)
     ours = propagated(np.stack([own[name].reshape(shape) for name in names], axis=-1))
     weighted = first.summarised(np.stack([theirs[name].reshape(first.weights.shape) for name in names], axis=-1))
     gaps: dict[str, float] = {}
