@@ -3,7 +3,7 @@
 Stop errors (persistent while their axis stands still), drifting home offsets and unknown play at the start of a segment
 are Gaussian states of a Kalman filter in time order. Errors that repeat by position stay for the whole campaign: their
 columns go through the filter like the residuals, and normal equations take them out. Angles rad, lengths mm; residuals
-are in units of their stated standard deviations.
+are in units of their noise, stated standard deviations times the pixel scale.
 
 State of the filter: stop error (pan, tilt), home offset (pan, tilt), position in the unknown play band (pan, tilt)
 in units of its standard deviation.
@@ -123,7 +123,7 @@ class KalmanUpdate(eqx.Module):
 
 
 def kalman_update(belief: Belief, row: FilterRows) -> KalmanUpdate:
-    """Update with one spot: its components have independent unit noise, so four scalar updates and no inverse."""
+    """Update with one spot: its components have independent unit noise, so a scalar update each and no inverse."""
     mean, covariance = belief.mean, belief.covariance
     errors, variances = [], []
     for component in range(len(row.load)):
