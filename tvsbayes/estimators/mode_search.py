@@ -38,8 +38,8 @@ from tvsbayes.statistics.least_squares import Mode, newton_mode
 
 RATIO_COLUMNS = np.array([INDEX[name] for name in names_of("degrees_per_step")])
 ANNEALING = (60.0, 10.0, 2.0, 1.0)
-"""Factors on the pixel noise before it takes its own value: plain Levenberg-Marquardt from the nominal rig goes
-astray when the extrinsics are off by 0.3 rad and 60 mm (formulation 4.2)."""
+"""Factors on the noise of pixels and readings before it takes its own value: plain Levenberg-Marquardt from the nominal
+rig goes astray when the extrinsics are off by 0.3 rad and 60 mm (formulation 4.2)."""
 NOISE_STEP = 1e-3
 """Of differences along noise coordinates, in prior sds: a hundredth of a posterior sd."""
 SCALE_STEP = 0.3
