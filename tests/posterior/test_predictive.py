@@ -2,16 +2,26 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
 from types import SimpleNamespace
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
+from support.small_campaign import small_campaign
 
+from tvsbayes.estimators.joint_fit import Alternative
 from tvsbayes.estimators.likelihood import no_draw
 from tvsbayes.instrument.axes import HOME_SD_DEG
-from tvsbayes.instrument.campaign import ordered_spots
+from tvsbayes.instrument.campaign import Campaign, ordered_spots
 from tvsbayes.instrument.parameters import INDEX, NAMES, names_of
-from tvsbayes.posterior.predictive import looks_again
+from tvsbayes.model.headlines import Derived
+from tvsbayes.posterior import predictive
+from tvsbayes.posterior.draws import Posterior
+from tvsbayes.posterior.importance import mixed
+from tvsbayes.posterior.predictive import ideal_pixels, looks_again, move_log_likelihood, predictive_pixels
+from tvsbayes.results.convergence import Importance, NamedValue, Reweighted
 
 DRAWS = 2000
 SDS_DEG = {"left": 0.16, "right": 0.02, "up": 0.08, "down": 0.04}
@@ -93,3 +103,68 @@ def test_an_error_is_held_while_its_axis_stands(dozen, errors_deg):
             elif not same:
                 assert change > 0
     assert held >= 5
+
+
+@dataclass(frozen=True)
+class FitOfOneWay:
+    """What the predictions read of a fit; its arrays are a number that tells it from the other."""
+
+    campaign: Campaign
+    arrays: SimpleNamespace
+    sides: dict[str, str]
+    alternatives: tuple[Alternative, ...] = ()
+    space: None = None
+
+    @property
+    def mixture(self) -> tuple[Alternative, ...]:
+        return self.alternatives
+
+
+def posterior_of_two_ways() -> Posterior:
+    """Two ways of homing, as probable: of the first the coordinate of every draw is 0, of the second 1."""
+    campaign, count = small_campaign(), 50
+    valid = SimpleNamespace(valid=np.ones(len(ordered_spots(campaign))))
+    one, other = (
+        FitOfOneWay(campaign, SimpleNamespace(spots=valid, number=float(k)), {"pan": side})
+        for k, side in enumerate(("left", "right"))
+    )
+    ways = tuple(Alternative(each.sides, 0.5, each) for each in (one, other))
+    worst = NamedValue("none", 500.0)
+    found = Reweighted(Importance(True, (), 1, count, 1.0, worst, 0.1, worst, 0.02, 0.0, 0.0, 0), {}, {})
+    parts = []
+    for number, fit in enumerate((replace(one, alternatives=ways), other)):
+        z = np.full((1, count, 1), float(number))
+        point = Derived(*(jnp.zeros(shape) for shape in ((len(NAMES),), (4,), (4,), (2, 2), (), (0,))))
+        draws = jax.tree.map(lambda x: np.zeros((1, count, *x.shape)), point)
+        weights = np.full((1, count), 1 / count)
+        parts.append(Posterior(fit, z, z[..., 0], draws, weights, found, 0, 0.0))
+    return mixed(parts)
+
+
+def test_every_draw_speaks_of_looks_by_its_own_way_of_homing(monkeypatch):
+    """Under the other way its backlash would lie on the wrong side: also where the draws were shuffled."""
+
+    def off(z, fit_number):
+        return np.abs(z[:, :1] - fit_number)
+
+    spots = len(ordered_spots(small_campaign()))
+    monkeypatch.setattr(predictive, "spot_constants", lambda campaign: np.zeros(spots))
+    monkeypatch.setattr(predictive, "repeated_rad", lambda fit, errors: errors)
+    monkeypatch.setattr(
+        predictive, "move_log_density", lambda z, e, space, arrays: np.repeat(off(z, arrays.number), spots, axis=1)
+    )
+
+    def looks(fit, z, *_):
+        return np.repeat(off(z, fit.arrays.number)[:, :, None], spots, axis=1) * np.ones(4)
+
+    monkeypatch.setattr(predictive, "looks", looks)
+    monkeypatch.setattr(predictive, "looks_again", looks)
+    both = posterior_of_two_ways()
+    shuffled = both.resampled(4, 25)
+    assert 0.3 < shuffled.z[0].mean() < 0.7
+    for posterior in (both, shuffled):
+        assert not move_log_likelihood(posterior).values.any()
+        assert not predictive_pixels(posterior).values.any()
+        assert not ideal_pixels(posterior, 40).any()
+    alone = replace(both, way=None)
+    assert move_log_likelihood(alone).values.any(), "both ways say the same of every draw"

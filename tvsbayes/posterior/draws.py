@@ -128,6 +128,8 @@ class Posterior(Shown):
         convergence: the diagnosis.
         seed: of everything random.
         seconds: spent sampling, earlier runs of a resumed chain included.
+        way: place in `JointFit.mixture` of the way of homing that each draw came from, shape (chain, draw); None where
+            all came from `fit`.
     """
 
     fit: JointFit
@@ -138,6 +140,7 @@ class Posterior(Shown):
     convergence: Convergence | Reweighted
     seed: int
     seconds: float
+    way: np.ndarray | None = None
 
     def shown(self) -> View:
         """Means, sds and 95 % intervals of what a fit is for."""
@@ -205,6 +208,7 @@ class Posterior(Shown):
             log_density=self.log_density.ravel()[places],
             draws=jax.tree.map(lambda x: x[places], self.joined),
             weights=np.full((chains, draws), 1 / (chains * draws)),
+            way=None if self.way is None else self.way.ravel()[places],
         )
 
     def summarised(self, values: np.ndarray) -> Propagated:

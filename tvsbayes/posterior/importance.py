@@ -340,5 +340,6 @@ def mixed(parts: Sequence[Posterior]) -> Posterior:
         draws=jax.tree.map(lambda *each: np.concatenate(each, axis=1), *(part.draws for part in parts)),
         weights=np.concatenate([p * part.weights for p, part in zip(chance, parts, strict=True)], axis=1),
         convergence=worst.convergence,
+        way=np.concatenate([np.full(part.weights.shape, k) for k, part in enumerate(parts)], axis=1),
         seconds=sum(part.seconds for part in parts),
     )

@@ -5,6 +5,7 @@ The unit of the log likelihood is a move: the spots between two moves share thei
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import equinox as eqx
@@ -139,6 +140,25 @@ def move_log_density(
     return jax.vmap(one)(z, place_errors_rad)
 
 
+def _by_way(
+    posterior: Posterior, places: np.ndarray, function: Callable[[JointFit, np.ndarray], np.ndarray]
+) -> np.ndarray:
+    """What draws say of looks, each by the fit under the way of homing that it came from.
+
+    Args:
+        posterior: whose draws.
+        places: of draws, chains joined, shape (n,).
+        function: of a fit and the places of its draws, a row for each.
+    """
+    if posterior.way is None:
+        return function(posterior.fit, places)
+    own = posterior.way.ravel()[places]
+    fits = [way.fit for way in posterior.fit.mixture if way.fit is not None]
+    rows = [np.flatnonzero(own == k) for k in range(len(fits))]
+    found = [function(fit, places[each]) for fit, each in zip(fits, rows, strict=True) if len(each)]
+    return np.concatenate(found)[np.argsort(np.concatenate(rows))]
+
+
 PIXEL_LABELS = tuple(name.removesuffix("_px") for name in PIXELS)
 
 
@@ -151,8 +171,12 @@ def move_log_likelihood(posterior: Posterior) -> xr.DataArray:
     used = np.asarray(fit.arrays.spots.valid)[: len(spots)] > 0
     z = posterior.z.reshape(-1, posterior.z.shape[-1])
     errors_rad = np.asarray(posterior.joined.place_errors_rad)
-    by_spot = in_batches(lambda z, e: move_log_density(z, e, fit.space, fit.arrays), z, errors_rad)[:, : len(spots)]
-    by_spot = by_spot + spot_constants(fit.campaign)
+
+    def of_way(fit: JointFit, places: np.ndarray) -> np.ndarray:
+        given = z[places], errors_rad[places]
+        return in_batches(lambda z, e: np.asarray(move_log_density(z, e, fit.space, fit.arrays)), *given)
+
+    by_spot = _by_way(posterior, np.arange(len(z)), of_way)[:, : len(spots)] + spot_constants(fit.campaign)
     index = np.array([spot.move for spot in spots])
     moves_seen = np.unique(index[used])
     values = np.stack([by_spot[:, used & (index == move)].sum(axis=1) for move in moves_seen], axis=1)
@@ -180,9 +204,13 @@ def repeated_rad(fit: JointFit, place_errors_rad: np.ndarray) -> np.ndarray:
 
 def ideal_pixels(posterior: Posterior, draws: int) -> np.ndarray:
     """Pixels without noise and stop errors for draws that weigh the same, shape (draws, spots, 4)."""
-    z = posterior.coordinates(draws)
-    errors_rad = np.asarray(posterior.thinned(draws).place_errors_rad)
-    return looks(posterior.fit, z, repeated_rad(posterior.fit, errors_rad))
+    z = posterior.z.reshape(-1, posterior.z.shape[-1])
+    errors_rad = np.asarray(posterior.joined.place_errors_rad)
+
+    def of_way(fit: JointFit, places: np.ndarray) -> np.ndarray:
+        return looks(fit, z[places], repeated_rad(fit, errors_rad[places]))
+
+    return _by_way(posterior, posterior.chosen(draws), of_way)
 
 
 def predictive_pixels(posterior: Posterior, draws_per_chain: int = 8) -> xr.DataArray:
@@ -197,10 +225,14 @@ def predictive_pixels(posterior: Posterior, draws_per_chain: int = 8) -> xr.Data
     generator = np.random.default_rng([posterior.seed, 1])
     chains, draws = posterior.z.shape[:2]
     chosen = np.unique(np.linspace(0, draws - 1, min(draws_per_chain, draws)).astype(int))
-    z = posterior.z[:, chosen].reshape(-1, posterior.z.shape[-1])
-    physical = np.asarray(posterior.draws.physical)[:, chosen].reshape(len(z), -1)
-    errors_rad = np.asarray(posterior.draws.place_errors_rad)[:, chosen].reshape(len(z), -1)
-    values = looks_again(fit, z, physical, errors_rad, generator).reshape(chains, len(chosen), -1, 4)
+    z, drawn = posterior.z.reshape(-1, posterior.z.shape[-1]), posterior.joined
+
+    def of_way(fit: JointFit, places: np.ndarray) -> np.ndarray:
+        physical, errors_rad = np.asarray(drawn.physical)[places], np.asarray(drawn.place_errors_rad)[places]
+        return looks_again(fit, z[places], physical, errors_rad, generator)
+
+    places = np.arange(chains * draws).reshape(chains, draws)[:, chosen].ravel()
+    values = _by_way(posterior, places, of_way).reshape(chains, len(chosen), -1, 4)
     spots = [spot.spot for spot in ordered_spots(fit.campaign)]
     coords = {"chain": np.arange(chains), "draw": chosen, "spot": spots, "pixel": list(PIXEL_LABELS)}
     return xr.DataArray(values.astype(np.float32), coords, ("chain", "draw", "spot", "pixel"))
