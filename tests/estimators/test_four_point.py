@@ -337,6 +337,17 @@ def test_incomplete_experiments_are_skipped_with_a_reason():
     assert len(result.as_json()["skipped"]) == 8
 
 
+def test_a_look_written_down_twice_is_no_fault_of_the_lens():
+    """Points 1 and 2 have the same pixels: no line goes through one point."""
+    campaign = make_campaign([("pan", 200, 10.0, 22.0)] * 2)
+    names = ("u_left_px", "v_left_px", "u_right_px", "v_right_px")
+    same = {name: getattr(campaign.spots[4], name) for name in names}
+    (skipped,) = classic(_changed(campaign, 5, **same)).skipped
+    assert (skipped.experiment, skipped.reason) == (1, "both points of a beam are the same")
+    (skipped,) = classic(_changed(campaign, 5, u_left_px=1e6)).skipped
+    assert (skipped.experiment, skipped.reason) == (1, "a pixel cannot be undistorted or triangulated")
+
+
 def test_nothing_to_estimate():
     """No complete experiment: an error with exit code 3 that names the first reason."""
     campaign = make_campaign([("pan", 200, 10.0, 22.0)])

@@ -300,8 +300,10 @@ def classic(campaign: Campaign) -> ClassicResult:
     ratios = np.asarray(ratio_deg_per_step(angles.theta_i_deg, angles.theta_f_deg, selection.steps))
     finite = np.isfinite(ratios)
     skipped = list(selection.skipped)
-    for number in selection.experiments[~finite]:
-        skipped.append(SkippedExperiment(int(number), "a pixel cannot be undistorted or triangulated"))
+    for row in np.flatnonzero(~finite):
+        lost = not np.isfinite(points[row]).all()
+        reason = "a pixel cannot be undistorted or triangulated" if lost else "both points of a beam are the same"
+        skipped.append(SkippedExperiment(int(selection.experiments[row]), reason))
     skipped.sort(key=lambda one: one.experiment)
     if not finite.any():
         first = f"; the first: experiment {skipped[0].experiment}, {skipped[0].reason}" if skipped else ""
