@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import jsonschema
@@ -90,6 +91,15 @@ def test_candidates_keep_to_the_limits(designs, watched_fit, monkeypatch):
     # A run-up longer than the travel leads beyond it, whatever the look.
     monkeypatch.setitem(designs.__dict__, "_overshoot", np.array([1000, 1000]))
     assert not any(map(designs._reachable, designs.candidates))
+
+
+def test_looks_keep_to_the_sheets_of_the_rig(watched_fit):
+    """The campaign looked at d1 and d2."""
+    rig = read_rig(RIG)
+    designs = WatchDesigns(watched_fit, replace(rig, sheets_mm={"d2": 275.0}), 0)
+    assert {one.target for one in designs.candidates} == {"d2"}
+    with pytest.raises(InputError, match="sheets that the rig does not have"):
+        WatchDesigns(watched_fit, replace(rig, sheets_mm={"wall": 275.0}), 0)
 
 
 def test_a_short_budget_is_kept_or_refused(watched_fit):

@@ -126,8 +126,10 @@ class WatchDesigns:
         if not self.candidates:
             raise InputError(
                 "no-look",
-                "no look of the campaign can be taken again: sides unknown, or run-ups beyond the limits",
-                remedy="widen the limits in [positioner], or plan looks with `plan RIG`",
+                "no look of the campaign can be taken again: sides unknown, sheets that the rig does not have, or "
+                "run-ups beyond the limits",
+                remedy="name the campaign's sheets in [sheets], widen the limits in [positioner], or plan looks with "
+                "`plan RIG`",
             )
         # The campaign as its own second day: what its looks show, with the columns of the changes.
         again = WatchedLooks(fit, replace(fit.campaign, spots=tuple(one.spot for one in self.candidates)))
@@ -150,6 +152,8 @@ class WatchDesigns:
         return np.array([known[axis] for axis in AXES])
 
     def _reachable(self, one: Candidate) -> bool:
+        if one.target not in self.rig.sheets_mm:
+            return False
         start = np.array(one.steps) - np.array(one.side) * self._overshoot
         both = np.stack([np.array(one.steps), start])
         return bool(np.all((both >= self._limits[:, 0]) & (both <= self._limits[:, 1])))
