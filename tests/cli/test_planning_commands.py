@@ -33,6 +33,15 @@ def ask(capsys, monkeypatch):
 MOUNTED = shipped_data() / "rigs" / "mounted"
 
 
+@pytest.mark.parametrize("more", [(), ("--watch",)])
+def test_a_plan_does_not_replace_the_rig_file_that_it_is_made_for(ask, tmp_path, more):
+    rig = tmp_path / "rig.toml"
+    rig.write_bytes((MOUNTED / "rig.toml").read_bytes())
+    before = rig.read_bytes()
+    code, document = ask("plan", rig, "--given", tmp_path, "-o", tmp_path / "." / "rig.toml", *more)
+    assert code == 2 and "would replace" in document["error"]["message"] and rig.read_bytes() == before
+
+
 def test_plan_writes_a_plan_and_says_by_its_exit_code_whether_the_users_target_is_met(ask, tmp_path):
     small = ("--draws", 20, "--minutes", 3, "-o", tmp_path / "plan.csv")
     code, document = ask("plan", MOUNTED / "rig.toml", "--target", "u(left) <= 1e-7 deg/step", *small)

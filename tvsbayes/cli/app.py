@@ -164,6 +164,16 @@ def in_order(rig: Path, plan: Path) -> None:
         raise InputError("usage", message, allowed="RIG PLAN", remedy=f"write {both}")
 
 
+def spared(out: Path | None, *inputs: Path | None) -> None:
+    """Refuse an output that would replace a file which the command reads."""
+    if out is None or not out.is_file():
+        return
+    if any(one is not None and one.is_file() and one.samefile(out) for one in inputs):
+        name = escaped(str(out), 200)
+        message = f"-o {name} would replace a file that is read"
+        raise InputError("usage", message, found=name, allowed="another file", remedy="name another file")
+
+
 def finite(**values: float | None) -> None:
     """Refuse NaN and infinity, which option parsing lets through."""
     for name, value in values.items():

@@ -28,6 +28,7 @@ from tvsbayes.cli.app import (
     keep,
     refuse_options,
     report_line,
+    spared,
 )
 from tvsbayes.cli.progress_bar import waiting
 from tvsbayes.cli.watch_command import plan_watch
@@ -261,6 +262,7 @@ def plan(
 ) -> None:
     """How many looks, which ones, and when to stop. With --given: what next."""
     out = out or output
+    spared(out, rig)
     finite(minutes=minutes, confirm=confirm)
     # What a plan of looks towards a target may state beside it.
     spare: dict[str, object] = {"criterion": criterion != "c", "draws": draws != PLAN_DRAWS, "aperture": aperture}
