@@ -20,6 +20,8 @@ from tvsbayes.files.disk import decode
 
 TOML_BYTES_MAX = 65_536
 JSON_BYTES_MAX = 4 * 1024 * 1024
+LINES_CHARS_MAX = 1024 * 1024
+"""As far as lines of keys are looked for: a stranger's file must not cost a refusal more than a second."""
 DOTTED_PARTS_MAX = 8
 NESTING_MAX = 16
 # Both patterns always match from an opening quote to its end or the end of the line (or file), never
@@ -71,7 +73,7 @@ def _key_lines(text: str) -> dict[str, int]:
         return path
 
     path: tuple[str, ...] = ()
-    for match in _TOKEN.finditer(text):
+    for match in _TOKEN.finditer(text, 0, LINES_CHARS_MAX):
         token = match.group()
         kind, base = opened[-1]
         if token == "\n" and not kind:
