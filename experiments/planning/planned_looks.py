@@ -179,6 +179,7 @@ def draw(curves: Mapping[str, Sequence[Point]]) -> None:
             # The curves fall: below their ends is room.
             place = {"xytext": (4, -6), "textcoords": "offset points", "ha": "right", "va": "top"}
             axes.annotate(f"{points[-1].spots} spots", (minutes[-1], u[-1]), **place)
+        axes.margins(y=0.12)
         axes.axhline(TARGET.limit, color=GREY, linewidth=0.8, linestyle=":")
         axes.set(xlabel="minutes", ylabel="u of the worst effective ratio, deg/step")
         figure.legend(loc="outside lower center", ncols=4)
