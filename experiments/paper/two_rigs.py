@@ -1,6 +1,6 @@
 """Two rigs, one Table 1: equal gears with lost motion seen at an azimuth, and four literal ratios; who tells?
 
-    python -m experiments.paper.two_rigs run --n 6 --cores 0        # 10 minutes, resumable
+    python -m experiments.paper.two_rigs run --n 8 --cores 0        # 10 minutes, resumable
     python -m experiments.paper.two_rigs table > experiments/paper/two_rigs.md     # writes the figure too
 
 Seed s draws optics, cameras and mounting from the priors of `data/rigs/mounted`; then two machines are put into that
@@ -285,7 +285,7 @@ def draw(rows) -> None:
 
 def main() -> None:
     """Command line."""
-    act(study_parser(__doc__, ROWS, n=6), run=run, table=table)
+    act(study_parser(__doc__, ROWS, n=8), run=run, table=table)
 
 
 if __name__ == "__main__":

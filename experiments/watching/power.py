@@ -1,6 +1,6 @@
 """How often does `watch` raise a false alarm, and how often does it notice what has moved?
 
-    python -m experiments.watching.power run --n 40 --cores 0 1     # 25 s of processor a rig, resumable
+    python -m experiments.watching.power run --n 20 --cores 0 1     # 25 s of processor a rig, resumable
     python -m experiments.watching.power table > experiments/watching/power.md
 
 `run` draws rig i from `data/rigs/mounted` with seed i, fits 24 experiments of the first day (100 and 200 steps), lets
@@ -177,7 +177,7 @@ def table(arguments: argparse.Namespace) -> None:
 
 def main() -> None:
     """Command line."""
-    act(study_parser(__doc__, ROWS, n=40), run=run, table=table)
+    act(study_parser(__doc__, ROWS, n=20), run=run, table=table)
 
 
 if __name__ == "__main__":
