@@ -20,12 +20,13 @@ from tvsbayes.errors import InputError, NothingToEstimate, TvsError
 from tvsbayes.estimators.joint_fit import JointFit, fit
 from tvsbayes.instrument.axes import DIRECTIONS, SENSES
 from tvsbayes.instrument.campaign import Campaign
-from tvsbayes.instrument.parameters import BLOCKS, INDEX
+from tvsbayes.instrument.parameters import BLOCKS
 from tvsbayes.instrument.plan import PlanStep
 from tvsbayes.instrument.rig import Rig, rig_table_toml
 from tvsbayes.instrument.stereo_pair import stereo_bytes
 from tvsbayes.model.headlines import QUANTITIES, Derived
 from tvsbayes.model.parameter_space import half_normal_sd, half_normal_slope
+from tvsbayes.planning.candidates import BACKLASH_COLUMNS
 from tvsbayes.planning.drawn_rigs import instruments_in
 from tvsbayes.planning.expectation import Knowledge, fit_places, information_of, prior_knowledge, taught_errors
 from tvsbayes.planning.gear_places import NO_PLACES, believed_scales
@@ -39,7 +40,6 @@ from tvsbayes.twin.physics import effective_mirror_offset_mm
 from tvsbayes.twin.simulated_campaign import simulate
 from tvsbayes.twin.true_rig import Truth
 
-BACKLASH_COLUMNS = [INDEX[name] for name in BLOCKS["backlash_deg"]]
 ESTIMATORS = ("importance", "laplace")
 """What a row's values come from: the sampled posterior (`posterior_of`), or the Laplace approximation."""
 ITERATIONS = 6
