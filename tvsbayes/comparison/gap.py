@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from tvsbayes.estimators.joint_fit import JointFit
     from tvsbayes.model.parameter_space import ParameterSpace
     from tvsbayes.posterior.draws import Posterior
+    from tvsbayes.posterior.predictive import OneWay
 
 
 GAP_DRAWS = 128
@@ -99,6 +100,7 @@ class _Chosen:
         mode_first: so it is; else the estimate is the mean of the draws.
         ratios: effective ratios of all draws, shape (N, 4), deg/step.
         weights: of all draws, sum 1, shape (N,).
+        ways: of homing that they came from: several where nobody recorded it.
     """
 
     z: np.ndarray
@@ -106,17 +108,22 @@ class _Chosen:
     mode_first: bool
     ratios: np.ndarray
     weights: np.ndarray
+    ways: tuple[OneWay, ...]
 
 
 def _chosen_draws(found: JointFit, posterior: Posterior | None, draws: int) -> _Chosen:
+    from tvsbayes.posterior.predictive import OneWay, ways_of
+
     if posterior is None:
         z = np.vstack([found.z, found.draws_z[:draws]])
         errors_rad = np.vstack([found.mode.place_errors_rad, found.draws.place_errors_rad[:draws]])
         ratios = np.asarray(found.draws.effective_deg_per_step)
-        return _Chosen(z, errors_rad, True, ratios, np.full(len(ratios), 1 / len(ratios)))
+        alone = (OneWay(found, np.arange(len(z))),)
+        return _Chosen(z, errors_rad, True, ratios, np.full(len(ratios), 1 / len(ratios)), alone)
     errors_rad = np.asarray(posterior.thinned(draws).place_errors_rad)
     ratios = np.asarray(posterior.joined.effective_deg_per_step)
-    return _Chosen(posterior.coordinates(draws), errors_rad, False, ratios, posterior.weights.ravel())
+    ways = ways_of(posterior, posterior.chosen(draws))
+    return _Chosen(posterior.coordinates(draws), errors_rad, False, ratios, posterior.weights.ravel(), ways)
 
 
 @dataclass(frozen=True)
@@ -137,7 +144,7 @@ class _Idealised:
 
 def _idealised(found: JointFit, selection: Selection, chosen: _Chosen) -> _Idealised:
     from tvsbayes.posterior.draws import derived_of
-    from tvsbayes.posterior.predictive import looks, repeated_rad
+    from tvsbayes.posterior.predictive import by_way, looks, repeated_rad
 
     z, errors_rad = chosen.z, chosen.place_errors_rad
     # Without play there is none that varies.
@@ -153,8 +160,12 @@ def _idealised(found: JointFit, selection: Selection, chosen: _Chosen) -> _Ideal
     rows = experiment_rows(found.campaign, selection)
     ratios = []
     for space in spaces:
-        repeated = repeated_rad(found, errors_rad if space is spaces[0] else straight_rad)
-        pixels = looks(replace(found, space=space), z, repeated)[:, rows]
+        repeating_rad = errors_rad if space is spaces[0] else straight_rad
+
+        def of_way(fit: JointFit, own: np.ndarray, space=space, repeating_rad=repeating_rad) -> np.ndarray:
+            return looks(replace(fit, space=space), z[own], repeated_rad(fit, repeating_rad[own]))[:, rows]
+
+        pixels = by_way(chosen.ways, of_way)
         ratios.append(four_point_ratios(pixels, selection.steps, selection.axis, found.campaign.stereo))
     return _Idealised(tuple(ratios), full, ideal)
 

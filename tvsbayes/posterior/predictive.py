@@ -5,7 +5,8 @@ The unit of the log likelihood is a move: the spots between two moves share thei
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import equinox as eqx
@@ -140,23 +141,33 @@ def move_log_density(
     return jax.vmap(one)(z, place_errors_rad)
 
 
-def _by_way(
-    posterior: Posterior, places: np.ndarray, function: Callable[[JointFit, np.ndarray], np.ndarray]
-) -> np.ndarray:
+@dataclass(frozen=True)
+class OneWay:
+    """A way of homing: the fit under it, and which of some draws came from it, shape (n,)."""
+
+    fit: JointFit
+    rows: np.ndarray
+
+
+def ways_of(posterior: Posterior, places: np.ndarray) -> tuple[OneWay, ...]:
+    """The ways of homing that draws at places (n,) of a posterior came from, each with their rows."""
+    if posterior.way is None:
+        return (OneWay(posterior.fit, np.arange(len(places))),)
+    own = posterior.way.ravel()[places]
+    fits = [way.fit for way in posterior.fit.mixture if way.fit is not None]
+    ways = (OneWay(fit, np.flatnonzero(own == k)) for k, fit in enumerate(fits))
+    return tuple(way for way in ways if len(way.rows))
+
+
+def by_way(ways: Sequence[OneWay], function: Callable[[JointFit, np.ndarray], np.ndarray]) -> np.ndarray:
     """What draws say of looks, each by the fit under the way of homing that it came from.
 
     Args:
-        posterior: whose draws.
-        places: of draws, chains joined, shape (n,).
-        function: of a fit and the places of its draws, a row for each.
+        ways: of the draws.
+        function: of a fit and the rows of its draws, a row for each.
     """
-    if posterior.way is None:
-        return function(posterior.fit, places)
-    own = posterior.way.ravel()[places]
-    fits = [way.fit for way in posterior.fit.mixture if way.fit is not None]
-    rows = [np.flatnonzero(own == k) for k in range(len(fits))]
-    found = [function(fit, places[each]) for fit, each in zip(fits, rows, strict=True) if len(each)]
-    return np.concatenate(found)[np.argsort(np.concatenate(rows))]
+    found = np.concatenate([function(way.fit, way.rows) for way in ways])
+    return found[np.argsort(np.concatenate([way.rows for way in ways]))]
 
 
 PIXEL_LABELS = tuple(name.removesuffix("_px") for name in PIXELS)
@@ -172,11 +183,11 @@ def move_log_likelihood(posterior: Posterior) -> xr.DataArray:
     z = posterior.z.reshape(-1, posterior.z.shape[-1])
     errors_rad = np.asarray(posterior.joined.place_errors_rad)
 
-    def of_way(fit: JointFit, places: np.ndarray) -> np.ndarray:
-        given = z[places], errors_rad[places]
+    def of_way(fit: JointFit, rows: np.ndarray) -> np.ndarray:
+        given = z[rows], errors_rad[rows]
         return in_batches(lambda z, e: np.asarray(move_log_density(z, e, fit.space, fit.arrays)), *given)
 
-    by_spot = _by_way(posterior, np.arange(len(z)), of_way)[:, : len(spots)] + spot_constants(fit.campaign)
+    by_spot = by_way(ways_of(posterior, np.arange(len(z))), of_way)[:, : len(spots)] + spot_constants(fit.campaign)
     index = np.array([spot.move for spot in spots])
     moves_seen = np.unique(index[used])
     values = np.stack([by_spot[:, used & (index == move)].sum(axis=1) for move in moves_seen], axis=1)
@@ -204,13 +215,13 @@ def repeated_rad(fit: JointFit, place_errors_rad: np.ndarray) -> np.ndarray:
 
 def ideal_pixels(posterior: Posterior, draws: int) -> np.ndarray:
     """Pixels without noise and stop errors for draws that weigh the same, shape (draws, spots, 4)."""
-    z = posterior.z.reshape(-1, posterior.z.shape[-1])
-    errors_rad = np.asarray(posterior.joined.place_errors_rad)
+    z = posterior.coordinates(draws)
+    errors_rad = np.asarray(posterior.thinned(draws).place_errors_rad)
 
-    def of_way(fit: JointFit, places: np.ndarray) -> np.ndarray:
-        return looks(fit, z[places], repeated_rad(fit, errors_rad[places]))
+    def of_way(fit: JointFit, rows: np.ndarray) -> np.ndarray:
+        return looks(fit, z[rows], repeated_rad(fit, errors_rad[rows]))
 
-    return _by_way(posterior, posterior.chosen(draws), of_way)
+    return by_way(ways_of(posterior, posterior.chosen(draws)), of_way)
 
 
 def predictive_pixels(posterior: Posterior, draws_per_chain: int = 8) -> xr.DataArray:
@@ -227,12 +238,14 @@ def predictive_pixels(posterior: Posterior, draws_per_chain: int = 8) -> xr.Data
     chosen = np.unique(np.linspace(0, draws - 1, min(draws_per_chain, draws)).astype(int))
     z, drawn = posterior.z.reshape(-1, posterior.z.shape[-1]), posterior.joined
 
-    def of_way(fit: JointFit, places: np.ndarray) -> np.ndarray:
-        physical, errors_rad = np.asarray(drawn.physical)[places], np.asarray(drawn.place_errors_rad)[places]
-        return looks_again(fit, z[places], physical, errors_rad, generator)
-
     places = np.arange(chains * draws).reshape(chains, draws)[:, chosen].ravel()
-    values = _by_way(posterior, places, of_way).reshape(chains, len(chosen), -1, 4)
+
+    def of_way(fit: JointFit, rows: np.ndarray) -> np.ndarray:
+        own = places[rows]
+        physical, errors_rad = np.asarray(drawn.physical)[own], np.asarray(drawn.place_errors_rad)[own]
+        return looks_again(fit, z[own], physical, errors_rad, generator)
+
+    values = by_way(ways_of(posterior, places), of_way).reshape(chains, len(chosen), -1, 4)
     spots = [spot.spot for spot in ordered_spots(fit.campaign)]
     coords = {"chain": np.arange(chains), "draw": chosen, "spot": spots, "pixel": list(PIXEL_LABELS)}
     return xr.DataArray(values.astype(np.float32), coords, ("chain", "draw", "spot", "pixel"))
