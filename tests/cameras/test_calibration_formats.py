@@ -122,6 +122,32 @@ def test_what_opencv_writes_is_read(mounted, tmp_path, header):
     close(read_calibration([path], (1280, 720)).stereo, mounted)
 
 
+def test_what_opencv_writes_as_json_is_read(mounted, tmp_path):
+    """One file or two, by its own writer; a JSON without its matrices is still our own format or refused."""
+    inner = {"M1": mounted.M1, "D1": mounted.D1[None], "M2": mounted.M2, "D2": mounted.D2[None]}
+    outer = {"R": mounted.R, "T": mounted.T[:, None]}
+
+    def stored(name: str, values: dict[str, np.ndarray]) -> Path:
+        storage = cv2.FileStorage(str(tmp_path / name), cv2.FILE_STORAGE_WRITE)
+        for key, value in values.items():
+            storage.write(key, value)
+        storage.release()
+        return tmp_path / name
+
+    for paths in (
+        [stored("pair.json", inner | outer)],
+        [stored("inner.json", inner), stored("outer.JSON", outer)],
+    ):
+        with pytest.raises(InputError, match="--image-size"):
+            read_calibration(paths)
+        found = read_calibration(paths, (1280, 720))
+        assert found.source == "opencv"
+        close(found.stereo, mounted)
+    (path,) = written(tmp_path, {"other.json": b'{"a": 1}'})
+    with pytest.raises(InputError, match="tvsbayes-stereo/1"):
+        read_calibration([path])
+
+
 def test_opencv_lengths_need_their_unit(mounted, tmp_path):
     in_metres = replace(mounted, T=mounted.T / 1000)
     paths = written(tmp_path, exported(in_metres, "opencv"))

@@ -1,4 +1,4 @@
-"""Stereo calibrations of other tools: OpenCV's YAML, ROS camera_info, Kalibr camchains; and our own `stereo.json`.
+"""Stereo calibrations of other tools: OpenCV's YAML and JSON, ROS camera_info, Kalibr camchains; and `stereo.json`.
 
 None of these formats carries an uncertainty. An import therefore gets `assumed_covariance` and `assumed = true`.
 Lengths in `Stereo` are mm; ROS and Kalibr write metres, OpenCV whatever unit the squares had.
@@ -17,7 +17,7 @@ import numpy as np
 from tvsbayes.cameras.calibration_yaml import MATRIX_TAG, YAML_BYTES_MAX, parse_yaml
 from tvsbayes.errors import escaped, refusal
 from tvsbayes.files.disk import read_bytes
-from tvsbayes.files.documents import Keys
+from tvsbayes.files.documents import Keys, parse_json
 from tvsbayes.instrument.stereo_pair import (
     Stereo,
     pair_doubts,
@@ -42,6 +42,7 @@ ASSUMED_TRANSLATION = 0.02
 """Standard uncertainty of each component of T over |T|."""
 ASSUMED_RMS_PX = 0.5
 Format = Literal["opencv", "ros"]
+_OPENCV_KEYS = ("M1", "M2", "R", "T")
 EXPORT_NAMES: dict[Format, tuple[str, str]] = {
     "opencv": ("intrinsics.yml", "extrinsics.yml"),
     "ros": ("left.yaml", "right.yaml"),
@@ -78,10 +79,11 @@ def read_calibration(paths: Sequence[Path], size: tuple[int, int] | None = None,
         InputError: unreadable, unknown or contradictory.
     """
     names = [escaped(Path(path).name) for path in paths]
-    if len(paths) == 1 and Path(paths[0]).suffix.lower() == ".json":
-        stereo = parse_stereo(read_bytes(paths[0], YAML_BYTES_MAX), names[0])
+    contents = [read_bytes(path, YAML_BYTES_MAX) for path in paths]
+    files = [_keys(path, data, name) for path, data, name in zip(paths, contents, names, strict=True)]
+    if len(paths) == 1 and Path(paths[0]).suffix.lower() == ".json" and not _by_opencv(files[0]):
+        stereo = parse_stereo(contents[0], names[0])
         return Imported(stereo, "tvsbayes", (), pair_doubts(stereo))
-    files = [parse_yaml(read_bytes(path, YAML_BYTES_MAX), name) for path, name in zip(paths, names, strict=True)]
     if any("cam0" in keys for keys in files):
         if len(files) != 1:
             remedy = "name one camchain"
@@ -89,7 +91,7 @@ def read_calibration(paths: Sequence[Path], size: tuple[int, int] | None = None,
         source, (stereo, notes) = "kalibr", _kalibr(files)
     elif any("projection_matrix" in keys for keys in files):
         source, (stereo, notes) = "ros", _ros(files)
-    elif any(key in keys for keys in files for key in ("M1", "M2", "R", "T")):
+    elif any(key in keys for keys in files for key in _OPENCV_KEYS):
         source, (stereo, notes) = "opencv", _opencv(files, size, unit_mm)
     else:
         one = any("camera_matrix" in keys or "Camera_Matrix" in keys for keys in files)
@@ -99,6 +101,16 @@ def read_calibration(paths: Sequence[Path], size: tuple[int, int] | None = None,
         raise refusal("format", file=names[0], found=found, allowed=allowed, remedy=remedy)
     notes.append("its uncertainty is assumed, and pessimistic: calibrate from pictures for a true one")
     return Imported(stereo, source, tuple(notes), pair_doubts(stereo))
+
+
+def _keys(path: Path, data: bytes, name: str) -> Keys:
+    """The top map of a file: JSON by its suffix, else YAML."""
+    return (parse_json if Path(path).suffix.lower() == ".json" else parse_yaml)(data, name)
+
+
+def _by_opencv(keys: Keys) -> bool:
+    """Whether a JSON file is OpenCV's (FileStorage): its matrices are maps, those of `stereo.json` lists."""
+    return "format" not in keys and any(isinstance(keys.values.get(key), dict) for key in _OPENCV_KEYS)
 
 
 def exported(stereo: Stereo, form: Format) -> dict[str, bytes]:
