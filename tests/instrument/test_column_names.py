@@ -42,6 +42,7 @@ def test_pixels_by_any_name(names):
 COUNTER_NAMES = [
     ("Horizontal", "Vertikal"),
     ("Schritte Schwenk", "Schritte Neigung"),
+    ("Schwenken [Schritte]", "Neigen [Schritte]"),
     ("Azimut", "H\u00f6he"),
     ("pasos horizontal", "pasos vertical"),
     ("acimut", "elevaci\u00f3n"),
@@ -55,6 +56,11 @@ COUNTER_NAMES = [
 def test_counters_in_four_languages(names):
     """A word that is known of one axis is known of the other one too."""
     assert understand(names).columns == dict(zip(COUNTERS, names, strict=True))
+
+
+@pytest.mark.parametrize("name", ("aperture_deg", "Apertur [\u00b0]", "apertura (grados)", "Blende"))
+def test_the_aperture_in_three_languages(name):
+    assert understand([name]).columns == {"aperture_deg": name}
 
 
 def test_other_fields_in_four_languages():

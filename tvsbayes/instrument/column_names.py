@@ -63,7 +63,7 @@ _WORDS = {
     },
     "tilt_steps": {
         *("tilt", "elevation", "vertical", "vert", "vertikal", "vertikale", "verticale", "hohe", "hoehe", "neigung"),
-        *("kippen", "elevacion", "inclinacion", "inclinaison"),
+        *("neigen", "kippen", "elevacion", "inclinacion", "inclinaison"),
     },
     "spot": {
         *("spot", "look", "id", "nr", "no", "num", "index", "shot", "nummer", "aufnahme", "fleck", "numero", "toma"),
@@ -77,7 +77,7 @@ _WORDS = {
     "point": {"point", "pt", "punkt", "punto"},
     "aperture_deg": {
         *("aperture", "b", "receiver", "rx", "blende", "offnung", "empfanger", "apertura", "receptor", "ouverture"),
-        *("recepteur",),
+        *("recepteur", "apertur"),
     },
     "status": {
         *("status", "state", "ok", "valid", "quality", "zustand", "gultig", "qualitat", "estado", "valido", "calidad"),
