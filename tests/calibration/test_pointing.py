@@ -197,7 +197,9 @@ def test_points_that_too_many_draws_lose_are_refused_as_by_the_draws(bent):
         if meets:
             assert np.isfinite(many.locate(500, 0, reading).u95_mm).all()
         else:
-            assert refusal(lambda reading=reading: many.locate(500, 0, reading)).code == "diverging"
+            error = refusal(lambda reading=reading: many.locate(500, 0, reading))
+            assert error.code == "diverging" and "would meet" in str(error), "the estimates do meet"
+    assert "would meet" not in str(refusal(lambda: many.locate(500, 0, 60.5)))
 
 
 def test_unknown_approaches_are_refused(bent):
