@@ -13,8 +13,9 @@ from support.dozen_spots import coordinates
 from tvsbayes.assessment.summary import summarise
 from tvsbayes.comparison.gap import BACKLASH, CHANCE, PROJECTION, STEREO_SCALE, explain_gap
 from tvsbayes.estimators.four_point import classic
-from tvsbayes.estimators.joint_fit import JointFit
+from tvsbayes.estimators.joint_fit import Alternative, JointFit
 from tvsbayes.instrument.axes import DIRECTIONS
+from tvsbayes.posterior import predictive
 from tvsbayes.posterior.draws import Posterior
 from tvsbayes.results.comparison_record import Gap
 from tvsbayes.twin.true_rig import Truth, read_truth
@@ -66,6 +67,32 @@ def test_terms_of_a_posterior_add_up_to_the_ratio_of_all_its_draws(paper_fit):
         assert gap.total.value == pytest.approx(gap.classic - ratio.mean(), abs=1e-12)
         # Covariances of 64 numbers of 1e-4 about 0.06: cancellation leaves 1e-16 / 1e-4 of a mean's shift of 1e-5.
         assert sum(term.value for term in gap.terms) == pytest.approx(gap.total.value, abs=1e-12)
+
+
+def test_draws_of_several_ways_of_homing_see_the_spots_of_their_own(paper_fit, monkeypatch):
+    """Half of the draws came from another way: their spots are those of its fit, in the order of the draws."""
+    z = paper_fit.draws_z[None]
+    chains = jax.tree.map(lambda x: x[None], paper_fit.draws)
+    weights = np.full(z.shape[:2], 1 / z.shape[1])
+    other = replace(paper_fit, campaign=replace(paper_fit.campaign, header={"name": "the other way"}))
+    ways = tuple(Alternative({"pan": side}, 0.5, fit) for side, fit in (("left", paper_fit), ("right", other)))
+    both = replace(paper_fit, alternatives=ways)
+    way = np.random.default_rng(5).integers(0, 2, z.shape[:2])
+    posterior = Posterior(both, z, np.zeros(z.shape[:2]), chains, weights, None, 0, 0.0, way=way)
+    asked, looked = {}, predictive.looks
+
+    def looks(fit, points, *others):
+        asked.setdefault(fit.campaign.title, []).append(points)
+        return looked(fit, points, *others)
+
+    monkeypatch.setattr(predictive, "looks", looks)
+    found, places = explain_gap(both, posterior, draws=64), posterior.chosen(64)
+    for own, title in enumerate((paper_fit.campaign.title, "the other way")):
+        assert len(asked[title]) == 4
+        for points in asked[title]:
+            np.testing.assert_array_equal(points, z[0, places[way[0, places] == own]])
+    alone = explain_gap(paper_fit, replace(posterior, fit=paper_fit, way=None), draws=64)
+    assert {d: gap.terms for d, gap in found.items()} == {d: gap.terms for d, gap in alone.items()}
 
 
 def test_terms_name_the_true_causes_with_sign_and_size(paper_fit, paper_gaps, paper_truth):
