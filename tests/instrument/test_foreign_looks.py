@@ -171,6 +171,25 @@ def test_looks_alone_go_to_moves_that_are_listed():
 
 
 @pytest.mark.parametrize(
+    ("numbers", "said"),
+    [
+        ("0 1 2 3", None),
+        ("1 2 3 4", "in 4 of 4 rows: Nr 1 is move 0; "),
+        ("0 1 3 4", "in 2 of 4 rows: Nr 3 is move 2; "),
+        ("0 a - 3", None),
+    ],
+)
+def test_a_log_of_moves_that_counts_otherwise_than_we_do_is_told(numbers, said):
+    """Pictures named by that log would else be paired with other moves, and nothing would say so."""
+    rows = [f"{number} {100 * k} 0" for k, number in enumerate(numbers.split())]
+    found = [text for text in looks(*rows, header="Nr Pan Tilt").assumed if text.startswith("move: ")]
+    assert len(found) == (said is not None)
+    assert said is None or (said in found[0] and "paired by the move, not by Nr" in found[0])
+    with_pixels = looks(*(f"{row} 1 2 3 4" for row in rows), header="Nr Pan Tilt XL YL XR YR") if said else None
+    assert with_pixels is None or not [text for text in with_pixels.assumed if text.startswith("move: ")]
+
+
+@pytest.mark.parametrize(
     ("rows", "header", "said"),
     [
         (("0.5 0",), "Pan Tilt", "line 2, Pan: .*angles are what the fit finds"),

@@ -152,6 +152,7 @@ def looks_of(
     moves: tuple[Move, ...] | None = None
     if all(field in cells for field in COUNTERS):
         moves, of_row = _moves(cells, notation, assumed)
+        assumed += _renumbered(cells, of_row)
     else:
         of_row = _listed_moves(cells, listed or ())
     spots = _spots(cells, of_row, notation, assumed) if any(field in cells for field in PIXELS) else None
@@ -215,6 +216,22 @@ def _moves(cells: FieldCells, notation: Notation, assumed: list[str]) -> tuple[t
     if notation.relative:
         assumed.append("counters: summed up, because --relative says that each is the steps of its move")
     return tuple(moves), of_row
+
+
+def _renumbered(cells: FieldCells, of_row: Sequence[int]) -> list[str]:
+    """Where a table without pixels numbers its moves otherwise than `moves.csv`, by which pictures are then paired."""
+    field = "move" if "move" in cells else "spot"
+    if field not in cells or any(name in cells for name in PIXELS):
+        return []
+    own = [float(cell) if NUMBER.fullmatch(cell) else None for cell in cells.text(field)]
+    apart = [row for row, number in enumerate(own) if number is not None and number != of_row[row]]
+    if not apart:
+        return []
+    name, row = escaped(cells.columns[field]), apart[0]
+    count = f"{len(apart)} of {len(own)} rows"
+    other = f"{name} {escaped(cells.text(field)[row])} is move {of_row[row]}"
+    paired = f"pictures are paired by the move, not by {name}"
+    return [f"move: counted from 0, not as {name} does in {count}: {other}; {paired}"]
 
 
 def _approaches(cells: FieldCells, axis: Axis, default: str) -> list[str]:
