@@ -43,6 +43,20 @@ def test_a_table_is_shown_then_written_and_read_by_check(ask, say, table, tmp_pa
     assert {path: path.read_bytes() for path in out.iterdir()} == before
 
 
+def test_a_log_for_a_campaign_whose_counters_wait_is_told_the_way(ask, tmp_path):
+    """`new --pictures` leaves counters to fill in; who has a log of them imports it first."""
+    out, table = tmp_path / "mine", tmp_path / "log.csv"
+    assert ask("new", out)[0] == 0
+    (out / "moves.csv").write_text(
+        "move,segment,time_s,pan_steps,tilt_steps,pan_approach,tilt_approach\n0,0,0,,,unknown,unknown\n1,0,1,,,,\n"
+    )
+    table.write_text("Nr;Pan;Tilt\n0;0;0\n1;200;0\n")
+    code, document = ask("import", table, "--to", out, "--yes")
+    error = document["error"]
+    assert code == 2 and (error["line"], error["column"], error["found"]) == (2, "pan_steps", "an empty cell")
+    assert "import it --to a new folder" in error["remedy"] and "--pictures FOLDER" in error["remedy"]
+
+
 def test_looks_go_to_the_moves_of_a_campaign(ask, grid_campaign, tmp_path):
     out, table = tmp_path / "mine", tmp_path / "t.csv"
     assert ask("new", out)[0] == 0

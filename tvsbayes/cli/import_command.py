@@ -107,13 +107,24 @@ def _field_and_column(text: str) -> tuple[str, str]:
 def _listed_moves(to: Path) -> tuple[Move, ...] | None:
     """The moves that a campaign lists already, beyond the row of the template."""
     from tvsbayes.instrument.campaign import parse_moves
+    from tvsbayes.instrument.column_names import COUNTERS
 
     file = moves_file(to, to)
     if file is None or (to / "campaign.toml").is_file() is False:
         return None
     data = read_bytes(file, CSV_BYTES_MAX)
     template = (shipped_data() / "templates" / "moves.csv").read_bytes()
-    return None if data == template else parse_moves(data, str(file))
+    if data == template:
+        return None
+    try:
+        return parse_moves(data, str(file))
+    except InputError as error:
+        if error.found != "an empty cell" or error.column not in COUNTERS:
+            raise
+        remedy = "fill them in there; or, if FILE is the log of the moves, import it --to a new folder"
+        remedy += ", then `tvsbayes new` that folder with --pictures FOLDER"
+        place = {"file": escaped(str(file), 200), "line": error.line, "column": error.column}
+        raise refusal(error.code, **place, found=error.found, allowed="counters of all moves", remedy=remedy) from error
 
 
 def _completed(
