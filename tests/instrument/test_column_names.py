@@ -102,6 +102,8 @@ def test_units_in_names():
     assert [unit_of_name(name, SECONDS) for name in times] == ["ms", "us", "us", "us", "h", "h", "min", None, None]
     angles = ("B (rad)", "angle_deg", "aperture_mrad", "B (arcmin)", "B_arcsec", "XL", "B h")
     assert [unit_of_name(name, DEGREES) for name in angles] == ["rad", "deg", "mrad", "arcmin", "arcsec", None, None]
+    signs = ("Winkel [\u00b0]", "angle \u00b0", "Temperatur [\u00b0C]", "T [\u00b0 F]", "N\u00b0 de mesure")
+    assert [unit_of_name(name, DEGREES) for name in signs] == ["deg", "deg", None, None, None]
     readings = ("Messwert [\u00b5m]", "reading [\u03bcm]", "encoder_um", "x (nm)", "counts", "B [\u00b5rad]", "v")
     assert [unit_of_name(name, READING_UNITS) for name in readings] == ["um", "um", "um", "nm", "counts", "urad", None]
 

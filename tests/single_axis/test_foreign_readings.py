@@ -32,6 +32,10 @@ def test_commands_and_readings_by_any_name(names):
     assert (found.columns["command"], found.columns["value"]) == names and not found.claimed
 
 
+def test_dates_in_utc_are_times():
+    assert understand_axis(("UTC", "steps", "RA offset arcsec")).columns["time_s"] == "UTC"
+
+
 @pytest.mark.parametrize("names", [("step", "target", "mm"), ("steps", "position", "x"), ("steps", "mm", "deg")])
 def test_what_could_be_either_is_left_open(names):
     assert "value" not in understand_axis(names).columns

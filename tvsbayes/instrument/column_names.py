@@ -55,7 +55,7 @@ _WORDS = {
     },
     "time_s": {
         *("time", "t", "timestamp", "datetime", "date", "zeit", "uhrzeit", "zeitstempel", "datum"),
-        *("tiempo", "hora", "fecha", "temps", "heure"),
+        *("tiempo", "hora", "fecha", "temps", "heure", "utc"),
     },
     "pan_steps": {
         *("pan", "azimuth", "azimut", "acimut", "horizontal", "horizontale", "horiz", "hor", "schwenk", "schwenken"),
@@ -128,6 +128,8 @@ class Understood:
 
 def words_of(name: str) -> list[str]:
     """The words of a column's name in small letters without accents: "xLeft_px", "X left [px]" and "XL" alike."""
+    # "Winkel [\u00b0]", but no temperature, and no number as in "N\u00b0".
+    name = re.sub("(?<![A-Za-z])\u00b0(?![ ]*[CF])", " deg ", name)
     # Of microseconds, and of all other millionths, the ascii letters alone would be another unit.
     plain = re.sub("\u03bc(?=[A-Za-z])", "u", unicodedata.normalize("NFKD", name)).encode("ascii", "ignore").decode()
     found = []
