@@ -173,3 +173,11 @@ def test_readings_are_reported_in_the_unit_of_their_column(ask, say, tmp_path, c
     said = f"unit: {unit}, as the column says" if column != "encoder" else "campaign.toml says, deg until you change it"
     assert any(said in text for text in document["assumed"])
     assert "0, 40000" in say("check", out)[1], "counters are no powers of ten"
+
+
+@pytest.mark.parametrize(("first", "said"), [("Leadscrew test,,", True), ("steps,foo,bar", False)])
+def test_a_title_where_names_should_stand_is_called_one(ask, tmp_path, first, said):
+    log = tmp_path / "log.csv"
+    log.write_text(f"{first}\n0,0,1\n5,1,1\n")
+    code, document = ask("import", log, "--axis", "--to", tmp_path / "mine")
+    assert code == 2 and ("is a title" in assert_error(document, "missing-column")["remedy"]) is said

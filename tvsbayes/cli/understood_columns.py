@@ -65,6 +65,8 @@ def not_sure(
     remedy = f"say which: {' '.join(f'--column {field}=NAME' for field in missing)}"
     spare = [field for field in missing if field not in needed]
     remedy += (f"; --column {spare[0]}= where there is none" if spare else "") + besides
+    if not told and not claims:
+        remedy += "; if that line is a title, delete it, so that the first holds the names of the columns"
     names = ", ".join(escaped(name) for name in table.columns)
     line, allowed = table.first_line, f"any of {names}"
     return refusal("missing-column", file=table.file, line=line, found=found, allowed=allowed, remedy=remedy)
