@@ -8,7 +8,13 @@ from itertools import pairwise
 import pytest
 from support.axes import drawn, runs
 
-from tvsbayes.report.axis_text import axis_fit_text, axis_plan_text, deviation_table
+from tvsbayes.report.axis_text import (
+    axis_fit_text,
+    axis_plan_text,
+    deviation_table,
+    for_firmware,
+    worst_place,
+)
 from tvsbayes.single_axis.axis_fit import fit_axis
 from tvsbayes.single_axis.axis_record import PositionDeviation, summarise_axis
 from tvsbayes.single_axis.next_stops import AxisPlan, NextStop
@@ -52,3 +58,35 @@ def test_the_verdict_alone_says_that_warnings_stand_beside_it(clean, warnings, s
     text = axis_fit_text(replace(clean, warnings=warnings))
     assert text.splitlines()[-1] == f"verdict: {said}"
     assert text.count("warning: ") == len(warnings)
+
+
+def test_a_fit_says_what_goes_into_firmware(clean):
+    sides = {name: replace(of, value=-0.05, sd=0.0005) for name, of in clean.effective_per_command.items()}
+    clean = replace(clean, effective_per_command=sides, range_command=(0.0, 1250000.0))
+
+    def said(value, low, high):
+        play = replace(clean.parameters["backlash"], value=value, sd=0.01, interval95=(low, high))
+        return for_firmware(replace(clean, parameters={**clean.parameters, "backlash": play}))
+
+    # 1/0.05 = 20, u 0.0005/0.05^2 = 0.2; 0.15/0.05 = 3, u 0.01/0.05 = 0.2.
+    begun = f"for firmware, from 0 to 1250000: -20.00(20) commands per {clean.unit}, "
+    assert said(0.15, 0.13, 0.17) == f"{begun}play of 3.00(20) commands"
+    assert said(-0.15, -0.17, -0.13) == f"{begun}no play: a reversal overshoots by 3.00(20) commands"
+    assert said(0.015, -0.01, 0.04) == f"{begun}play of 0.30(20) commands is not proved: its 95 % interval holds 0"
+
+
+def test_a_fit_says_where_the_error_by_position_is_largest_and_whose_it_may_be(clean):
+    deviations = (
+        PositionDeviation(0.0, 0.02, 0.01, (0.0, 0.04)),
+        PositionDeviation(1250000.0, -0.05, 0.01, (-0.07, -0.03)),
+        PositionDeviation(2500000.0, 0.03, 0.01, (0.01, 0.05)),
+    )
+    said = worst_place(replace(clean, deviations=deviations))
+    assert f"at command 1250000: -0.050(10) {clean.unit} off the line; it is that of gears and encoder" in said
+    assert "holds 0; it is" in worst_place(replace(clean, deviations=deviations[:1]))
+
+
+def test_numbers_that_must_not_be_used_are_not_offered_to_firmware(clean):
+    assert "for firmware" in axis_fit_text(clean) and "largest at command" in axis_fit_text(clean)
+    broken = axis_fit_text(replace(clean, converged=False, problems=("the chain stands still",)))
+    assert "for firmware" not in broken and "largest at command" not in broken

@@ -14,10 +14,12 @@ from tvsbayes.instrument.campaign import title_of
 from tvsbayes.report.axis_text import (
     CONFLICTING,
     deviation_table,
+    for_firmware,
     iso230_table,
     parameter_table,
     ratio_table,
     reserved,
+    worst_place,
 )
 from tvsbayes.report.drawing import BLUE, GREY, RED, SKY, drawing
 from tvsbayes.report.first_page import about_table
@@ -98,6 +100,8 @@ def axis_page(results: AxisResults, issue: Issue) -> Page:
     if summary.converged and summary.prior_conflicts:
         converged = f"PRIOR CONFLICT: {CONFLICTING}."
     conflicts = [f"Prior conflict: {text}" for text in summary.prior_conflicts]
+    offered = (worst_place(summary), for_firmware(summary)) if summary.converged else ()
+    in_words = [f"{text[0].upper()}{text[1:]}." for text in offered]
     header = fit.campaign.header
     created = header.get("created")
     folder = "AXIS" if fit.campaign.path is None else shlex.quote(escaped(fit.campaign.path.resolve().name, 200))
@@ -117,7 +121,7 @@ def axis_page(results: AxisResults, issue: Issue) -> Page:
         warnings=[*summary.problems, *summary.warnings, *conflicts],
         versions=made["versions"],
         sections=[
-            Section("Result", tables=[parameter_table(summary)], opened=True),
+            Section("Result", text=in_words, tables=[parameter_table(summary)], opened=True),
             Section(
                 "What repeats by position",
                 tables=[deviation_table(summary.deviations, unit, TABLE_ROWS)],

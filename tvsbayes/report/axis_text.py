@@ -56,6 +56,33 @@ def parameter_table(summary: AxisSummary) -> TableView:
     return TableView(caption, ["", "value(u)", "95 % interval", "told"], rows)
 
 
+def for_firmware(summary: AxisSummary) -> str:
+    """What goes into a motion controller: commands per unit on the line read, play in commands."""
+    sides = tuple(summary.effective_per_command.values())
+    ratio, u_ratio = sum(of.value for of in sides) / len(sides), max(of.sd for of in sides)
+    low, high = summary.range_command
+    said = f"for firmware, from {low:.10g} to {high:.10g}: {concise(1 / ratio, u_ratio / ratio**2)} commands per "
+    said += f"{escaped(summary.unit)}, "
+    play = summary.parameters["backlash"]
+    in_commands = concise(play.value / abs(ratio), play.sd / abs(ratio))
+    if play.interval95[0] <= 0 <= play.interval95[1]:
+        return f"{said}play of {in_commands} commands is not proved: its 95 % interval holds 0"
+    if play.value < 0:
+        overshoot = concise(-play.value / abs(ratio), play.sd / abs(ratio))
+        return f"{said}no play: a reversal overshoots by {overshoot} commands"
+    return f"{said}play of {in_commands} commands"
+
+
+def worst_place(summary: AxisSummary) -> str:
+    """Where the error by position is largest, and whose it may be."""
+    worst = max(summary.deviations, key=lambda d: abs(d.value))
+    said = f"the error by position is largest at command {worst.position:.10g}: {concise(worst.value, worst.sd)} "
+    said += f"{escaped(summary.unit)} off the line"
+    if worst.interval95[0] <= 0 <= worst.interval95[1]:
+        said += ", whose 95 % interval holds 0"
+    return f"{said}; it is that of gears and encoder together, which one encoder alone cannot tell apart"
+
+
 def deviation_table(deviations: Sequence[PositionDeviation], unit: str, most: int) -> TableView:
     """What repeats by position, off the line; of more positions than `most`, so many spread evenly."""
     rows = [[f"{d.position:.10g}", concise(d.value, d.sd), interval_text(*d.interval95, d.sd)] for d in deviations]
@@ -123,6 +150,8 @@ def axis_fit_text(summary: AxisSummary, details: bool = False, written: Sequence
     lines += [f"written: {', '.join(written)}"] if written else []
     counted = f"{summary.readings} readings of {summary.moves} moves at {summary.positions} positions; {how}"
     parts = [counted, parameter_table(summary).text(), ratio_table(summary).text()]
+    if summary.converged:
+        parts += [worst_place(summary), for_firmware(summary)]
     verdict = "NOT CONVERGED, use none of these numbers"
     if summary.converged:
         verdict = f"PRIOR CONFLICT, {CONFLICTING}" if summary.prior_conflicts else f"usable{reserved(summary)}"
