@@ -245,11 +245,12 @@ class Calibration(Shown):
         reading behind the baseline, else "diverging".
         """
         where = f"pan {pan_steps:g}, tilt {tilt_steps:g} steps, aperture {aperture_deg:g} deg"
-        refused, reach = partial(InputError, column="aperture_deg", found=f"{aperture_deg:g}"), math.nan
+        refused, meet_mm = partial(InputError, column="aperture_deg", found=f"{aperture_deg:g}"), math.nan
         if all(map(math.isfinite, (pan_steps, tilt_steps, aperture_deg))):
             beam = self.beam_at((pan_steps, tilt_steps), sides, math)
             true_deg = aperture_deg - self.estimates["aperture_zero_deg"]
             reach = range_components(*beam, self.estimates["baseline_mm"], true_deg, self.azimuth, math)
+            meet_mm = float(reach)
             if 0 < reach < math.inf and not ahead(beam.at(reach)[0]):
                 return refused(
                     "behind",
@@ -264,11 +265,11 @@ class Calibration(Shown):
                     allowed="readings away from 0 and 180 deg, of a beam in the plane of baseline and spot",
                     remedy="check reading and counters; the beam runs past the baseline, not towards a spot",
                 )
-        meet = 0 < reach < math.inf
+        meet = 0 < meet_mm < math.inf
         return refused(
             "diverging",
             f"{where}: beam and line of sight "
-            + (f"would meet {reach / 1000:.3g} m away, but within what is known may diverge" if meet else "diverge"),
+            + (f"would meet {meet_mm / 1000:.3g} m away, but within what is known may diverge" if meet else "diverge"),
             allowed="readings B with B + C clearly below 180 deg, C the beam's own angle to the baseline",
             remedy="check reading and counters; such a target is too far, or behind the scanner",
         )

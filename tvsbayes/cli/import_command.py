@@ -123,8 +123,15 @@ def _listed_moves(to: Path) -> tuple[Move, ...] | None:
             raise
         remedy = "fill them in there; or, if FILE is the log of the moves, import it --to a new folder"
         remedy += ", then `tvsbayes new` that folder with --pictures FOLDER"
-        place = {"file": escaped(str(file), 200), "line": error.line, "column": error.column}
-        raise refusal(error.code, **place, found=error.found, allowed="counters of all moves", remedy=remedy) from error
+        raise refusal(
+            error.code,
+            file=escaped(str(file), 200),
+            line=error.line,
+            column=error.column,
+            found=error.found,
+            allowed="counters of all moves",
+            remedy=remedy,
+        ) from error
 
 
 def _completed(
