@@ -12,7 +12,7 @@ from support.axes import campaign, drawn, runs
 
 from tvsbayes.errors import InputError
 from tvsbayes.single_axis.axis_campaign import Reading, read_axis
-from tvsbayes.single_axis.axis_fit import fit_axis
+from tvsbayes.single_axis.axis_fit import HEADLINE_DRAWS, fit_axis, headline_functionals
 from tvsbayes.single_axis.axis_parameters import AxisPrior
 from tvsbayes.single_axis.axis_rows import reversal_of, rows_of
 from tvsbayes.single_axis.next_stops import NextStop, _with_stop, plan_next
@@ -33,6 +33,16 @@ def test_every_stop_lowers_u_and_stays_within_the_commands(fitted):
             assert command is None or -2300 <= command <= 2300
     assert found.plan_bytes().startswith(b"step,command,direction,read\n0,")
     json.dumps(found.as_json(), allow_nan=False)
+
+
+@pytest.mark.parametrize("target", ["per_command", "effective_per_command", "backlash"])
+def test_a_plan_begins_at_the_u_of_the_fit(fitted, target):
+    """Not at that given the scales, which is less: their means differ. Places between the rows change neither."""
+    mean, sd = fitted.linear.of(headline_functionals(fitted.model)[[HEADLINE_DRAWS.index(target)]])
+    given = np.sqrt(np.mean(sd**2))
+    found = plan_next(fitted, target, count=1)
+    assert found.u_now == pytest.approx(np.hypot(given, mean.std()), rel=1e-6)
+    assert found.u_now > 1.001 * given and found.next[0].u < found.u_now
 
 
 def test_actions_name_commands_with_all_their_digits():

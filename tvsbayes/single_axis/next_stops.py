@@ -1,7 +1,7 @@
 """What to read next on an axis: stops that lower the uncertainty of its ratio, or of positions, most per move.
 
 Linear and normal given the scales, averaged over their posterior: a stop that is yet to be read changes covariances
-alone.
+alone. What is left open because the scales are not known is kept as it is: the plan begins at the u of the fit.
 """
 
 from __future__ import annotations
@@ -129,18 +129,33 @@ def _with_stop(
     return replace(campaign, moves=tuple(moves), readings=(*campaign.readings, reading)), via
 
 
-def _u_of(fit: AxisFit, campaign: AxisCampaign, target: str, places: np.ndarray, w: np.ndarray) -> float:
-    """Root mean square over draws of the target's standard uncertainty, with these rows."""
+def _functionals(fit: AxisFit, target: str, places: np.ndarray) -> np.ndarray:
+    """What is to be made surer, as functionals (t, columns) of the fit's model."""
+    if target == "position":
+        return deviation_functionals(fit, places)
+    return headline_functionals(fit.model)[[HEADLINE_DRAWS.index(target)]]
+
+
+@dataclass(frozen=True)
+class _Known:
+    """What is known of a target, unit^2, by the law of total variance over draws of the scales.
+
+    Attributes:
+        given: mean of its variances given the scales.
+        between: variance of its means.
+    """
+
+    given: float
+    between: float
+
+
+def _known(fit: AxisFit, campaign: AxisCampaign, target: str, places: np.ndarray, w: np.ndarray) -> _Known:
+    """With the rows of a campaign, at draws w (n, d)."""
     rows = replace(rows_of(campaign), line=fit.rows.line)
     model = AxisModel.of(rows, fit.model.priors, places)
     model = replace(model, coordinates=fit.model.coordinates)
-    stand_in = replace(fit, rows=rows, model=model)
-    if target == "position":
-        functionals = deviation_functionals(stand_in, places)
-    else:
-        functionals = headline_functionals(model)[[HEADLINE_DRAWS.index(target)]]
-    _, sd = model.linear(w).of(functionals)
-    return float(np.sqrt(np.mean(sd**2)))
+    mean, sd = model.linear(w).of(_functionals(replace(fit, rows=rows, model=model), target, places))
+    return _Known(float(np.mean(sd**2)), float(np.mean(np.var(mean, axis=0))))
 
 
 def plan_next(
@@ -174,7 +189,13 @@ def plan_next(
     w = fit.w[np.linspace(0, len(fit.w) - 1, DRAWS).astype(int)]
     seconds = _move_seconds(fit.campaign)
     campaign, chosen, spent = fit.campaign, [], 0.0
-    u_now = now = _u_of(fit, campaign, target, grid, w)
+    known, few = (_known(fit, campaign, target, grid, draws) for draws in (fit.w, w))
+
+    def u_of(read: AxisCampaign) -> float:
+        # Of a few draws the ratio is surer than the value.
+        return float(np.sqrt(known.between + known.given * _known(fit, read, target, grid, w).given / few.given))
+
+    u_now = now = float(np.sqrt(known.between + known.given))
     with Job({"choosing stops": 1.0}, progress) as job:
         for number in range(count):
             best: tuple[float, NextStop, AxisCampaign] | None = None
@@ -187,7 +208,7 @@ def plan_next(
                     took = (1 + (via is not None)) * seconds / 60.0
                     if minutes is not None and spent + took > minutes:
                         continue
-                    u = _u_of(fit, longer, target, grid, w)
+                    u = u_of(longer)
                     rate = (now - u) / took
                     if best is None or rate > best[0]:
                         stop = NextStop(float(command), direction, via, u, now - u, rate)
