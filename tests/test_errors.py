@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import inspect
 import pickle
 
 import pytest
 
+import tvsbayes
 from tvsbayes.errors import DeviceFault, InputError, NotConverged, NothingToEstimate, TvsError
 from tvsbayes.files.csv_table import parse_table
 
@@ -30,3 +32,17 @@ def test_errors_pass_between_processes_whole(kind):
     told = kind("code", "what was found", file="a.csv", line=3, column="u_px", found="x", allowed="y", remedy="z")
     again = pickle.loads(pickle.dumps(told))
     assert type(again) is kind and again.args == told.args and vars(again) == vars(told)
+
+
+@pytest.mark.parametrize(
+    ("called", "wanted"),
+    [
+        # As users call it: the tests' own check of types comes first.
+        (lambda: inspect.unwrap(tvsbayes.fit)("data/twins/paper_twin"), "found str; wanted a campaign, as read_campaign"),
+        (lambda: tvsbayes.sample("fit.json"), "found str; wanted a fit, as fit"),
+        (lambda: tvsbayes.locate(3.0, 0, 0, 60.0), "found float; wanted a calibration, of calibration_of"),
+    ],
+)
+def test_from_python_an_argument_of_another_kind_is_named(called, wanted):
+    with pytest.raises(TypeError, match=wanted):
+        called()

@@ -130,6 +130,16 @@ def all_of(refused: Sequence[InputError], most: int = 5) -> InputError:
     return InputError(first.code, message, **{name: getattr(first, name) for name in fields})
 
 
+def require_kind(given: object, has: str, wanted: str) -> None:
+    """Refuse an argument of another kind, which lacks an attribute, before it fails somewhere inside.
+
+    Raises:
+        TypeError: it does, with what was found and where the right one comes from.
+    """
+    if not hasattr(given, has):
+        raise TypeError(f"found {type(given).__name__}; wanted {wanted}")
+
+
 CLOSE = 0.6
 """Similarity (difflib) from which a word may be another one misspelt: "comment" and "point" have 0.5."""
 

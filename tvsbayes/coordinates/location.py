@@ -23,7 +23,7 @@ from tvsbayes.calibration.pointing import (
     Calibration,
 )
 from tvsbayes.display import Shown, View
-from tvsbayes.errors import InputError
+from tvsbayes.errors import InputError, require_kind
 from tvsbayes.instrument.axes import HOME_APPROACH, sides_of
 from tvsbayes.progress import Job, Show
 from tvsbayes.statistics.intervals import NORMAL_95, Validation, symmetric_interval, validate
@@ -250,9 +250,11 @@ def locate(
         Points with covariance and intervals; look at `refused`.
 
     Raises:
+        TypeError: an argument of another kind.
         InputError: a calibration without draws, or an approach that does not exist.
         ValueError: fewer than 500 draws (formulation 5), or lists of different lengths.
     """
+    require_kind(calibration, "moved_points", "a calibration, of calibration_of(posterior) or load_calibration(folder)")
     if draws < 500:
         raise ValueError(f"{draws} draws; a coordinate's interval needs at least 500")
     settings = settings_of(pan_steps, tilt_steps, aperture_deg, approach)

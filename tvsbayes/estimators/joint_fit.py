@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Bool
 
 from tvsbayes.display import Shown, View
-from tvsbayes.errors import NotConverged, NothingToEstimate
+from tvsbayes.errors import NotConverged, NothingToEstimate, require_kind
 from tvsbayes.estimators.campaign_arrays import CampaignArrays, in_sight, place_arrays
 from tvsbayes.estimators.homing_evidence import WORTH_A_FIT, most_fits, weighed
 from tvsbayes.estimators.likelihood import prior_errors_at_places
@@ -223,10 +223,12 @@ def fit(
         Mode, Laplace approximation and diagnostics; look at `converged` before using it.
 
     Raises:
+        TypeError: an argument of another kind.
         InputError: if harmonics are wanted and no axis states their period.
         NothingToEstimate: if the campaign has fewer than `SMALLEST_CAMPAIGN` usable spots, or all is fixed.
         NotConverged: if the fit diverged; a fit that ended badly is returned with `converged` False.
     """
+    require_kind(campaign, "stereo", "a campaign, as read_campaign(folder) returns it")
     table = model.table(campaign.rig)
     used = _usable(campaign, without)
     diverged = NotConverged(

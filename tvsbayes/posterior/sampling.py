@@ -8,7 +8,7 @@ from pathlib import Path
 
 import jax
 
-from tvsbayes.errors import NotConverged
+from tvsbayes.errors import NotConverged, require_kind
 from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.posterior.chain import stored_chain
 from tvsbayes.posterior.draws import Posterior
@@ -56,10 +56,12 @@ def sample(
         must not be used. `write_posterior` makes a file for ArviZ of it.
 
     Raises:
+        TypeError: an argument of another kind.
         NotConverged: the fit has not converged, or its density is not finite around the mode.
         InputError: `resume` without a usable chain.
         ValueError: no such tier, max_minutes is not positive, or a chain's option without a chain.
     """
+    require_kind(fit, "converged", "a fit, as fit(campaign) returns it")
     if not fit.converged:
         raise NotConverged.of(fit.problems, "a posterior needs a mode to start from")
     if tier not in TIERS:
