@@ -38,7 +38,7 @@ def test_errors_pass_between_processes_whole(kind):
     ("called", "wanted"),
     [
         # As users call it: the tests' own check of types comes first.
-        (lambda: inspect.unwrap(tvsbayes.fit)("data/twins/paper_twin"), "found str; wanted a campaign, as read_campaign"),
+        (lambda: inspect.unwrap(tvsbayes.fit)("data/twins/paper_twin"), "found str; wanted a campaign, as read"),
         (lambda: tvsbayes.sample("fit.json"), "found str; wanted a fit, as fit"),
         (lambda: tvsbayes.locate(3.0, 0, 0, 60.0), "found float; wanted a calibration, of calibration_of"),
     ],
