@@ -322,7 +322,7 @@ LINES = (
     ),
     Line(
         "A plan predicts the error of its fit",
-        "python -m experiments.planning.prediction run --n 1000 --cores 0 1",
+        "python -m experiments.planning.prediction run --n 100 --cores 0 1",
         "planning/prediction.jsonl",
         plans,
     ),
