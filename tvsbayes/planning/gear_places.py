@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from scipy import linalg
 
-from tvsbayes.instrument.axes import AXES
+from tvsbayes.instrument.axes import AXES, SENSES
 from tvsbayes.instrument.campaign import Move
 from tvsbayes.instrument.parameters import KINDS, NAMES
 from tvsbayes.instrument.places import SPACING_DEG, interpolation
@@ -25,7 +25,7 @@ from tvsbayes.instrument.stops import rests_of
 from tvsbayes.model.compiled import compiled, placed
 from tvsbayes.model.gear_kriging import KnownPlaces, scales_at
 from tvsbayes.model.gear_processes import GearScales, Places
-from tvsbayes.model.headlines import DEGREES, Headlines, SeenLine, headlines, line_deg_per_step
+from tvsbayes.model.headlines import DEGREES, QUANTITIES, Headlines, SeenLine, headlines, line_deg_per_step
 from tvsbayes.model.laser_path import beam_angles
 from tvsbayes.model.parameter_space import ParameterSpace, physical_at
 
@@ -131,7 +131,8 @@ class GearPlaces(KnownPlaces):
 
 NO_PLACES = GearPlaces(np.zeros(0), np.zeros(0, dtype=bool), np.zeros(2), None, np.zeros(0))
 """Of gears that repeat no error."""
-LINED_AXIS = np.array([0, 0, 1, 1, 0, 1, -1, -1, -1])
+_LINED = {name: k for k, (axis, sides) in enumerate(SENSES.items()) for name in (*sides, f"contrast.{axis}")}
+LINED_AXIS = np.array([_LINED.get(name, -1) for name in QUANTITIES])
 """The axis over whose places each of `QUANTITIES` is a line, -1 for none."""
 
 

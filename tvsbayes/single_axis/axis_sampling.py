@@ -27,6 +27,7 @@ WALKERS, BLOCK_STEPS, BURN_STEPS = 48, 150, 30
 GROUPS = 4
 RHAT_MAX, ESS_MIN, TAUS_MIN = 1.01, 1000.0, 50.0
 EXTENSION = 4
+"""Lengths of a chain that may be used but differs from the weighted draws, after which it is left as it is."""
 WALK_SHARE = 0.4
 """Of a chain's moves that go by a random step; the others ask the proposal."""
 
