@@ -196,4 +196,26 @@ FAULTS = (
         "a folder holds the tables of one simulation and pictures of another",
         ("twin/frames",),
     ),
+    Fault(
+        "line of a key anywhere of that name",
+        "files/documents.py",
+        'places = (".".join(keys[:count]) for count in range(len(keys), 0, -1))',
+        "places = (keys[-1],)",
+        "messages send people to the wrong line",
+        (
+            "files/documents",
+            "files/documents::test_toml_messages_name_the_line_of_the_key_itself",
+        ),
+    ),
+    Fault(
+        "keys found inside texts",
+        "files/documents.py",
+        'elif not in_value and token[0] not in "#.\\n[":',
+        'elif token[0] not in "#.\\n[":',
+        "messages send people to the wrong line",
+        (
+            "files/documents::test_json_messages_name_the_line_of_the_key_itself",
+            "files/documents::test_toml_messages_name_the_line_of_the_key_itself",
+        ),
+    ),
 )

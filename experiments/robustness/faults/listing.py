@@ -12,8 +12,11 @@ from experiments.robustness.faults import (
     bench,
     certification,
     declaration,
+    doubts,
     estimation,
+    imports,
     instrument,
+    light,
     planning,
     pointing,
     presentation,
@@ -32,6 +35,9 @@ FAULTS: tuple[Fault, ...] = (
     *bench.FAULTS,
     *axis.FAULTS,
     *presentation.FAULTS,
+    *imports.FAULTS,
+    *light.FAULTS,
+    *doubts.FAULTS,
 )
 
 

@@ -389,4 +389,31 @@ FAULTS = (
         "two posteriors, and nobody says so",
         ("posterior/diagnosis",),
     ),
+    Fault(
+        "draws of several ways of homing in another order",
+        "posterior/predictive.py",
+        "return found[np.argsort(np.concatenate([way.rows for way in ways]))]",
+        "return found",
+        "log likelihoods belong to other draws: model comparison by chance",
+        (
+            "posterior/predictive::test_every_draw_speaks_of_looks_by_its_own_way_of_homing",
+            "comparison/gap::test_draws_of_several_ways_of_homing_see_the_spots_of_their_own",
+        ),
+    ),
+    Fault(
+        "terms of the gap by the first way of homing",
+        "comparison/gap.py",
+        "ways = ways_of(posterior, posterior.chosen(draws))",
+        "ways = (OneWay(found, np.arange(len(errors_rad))),)",
+        "causes of the gap are told for a machine that was homed otherwise",
+        ("comparison/gap::test_draws_of_several_ways_of_homing_see_the_spots_of_their_own",),
+    ),
+    Fault(
+        "chain of fixed headlines compared by nothing",
+        "posterior/diagnosis.py",
+        "names = tuple(name for name in names if name in varying) or tuple(varying)",
+        "names = tuple(name for name in names if name in varying)",
+        "a traceback after minutes of sampling",
+        ("posterior/diagnosis::test_where_every_headline_is_fixed_the_others_must_agree",),
+    ),
 )

@@ -1,0 +1,108 @@
+"""Faults of reading tables and calibrations that other programs wrote."""
+
+from experiments.robustness.faults.fault import Fault
+
+FAULTS = (
+    Fault(
+        "numbers of a workbook read with a comma",
+        "files/foreign_table.py",
+        "    if isinstance(cell, _Number):\n        return str(cell)\n",
+        "",
+        "1.234 of a workbook becomes 1234 beside texts with commas",
+        ("files/foreign_table::test_numbers_of_a_workbook_beside_texts_with_decimal_commas",),
+    ),
+    Fault(
+        "good words with accents leave looks out",
+        "instrument/foreign_looks.py",
+        '    return "".join(letter for letter in plain if not unicodedata.combining(letter))',
+        "    return plain",
+        "looks marked as valid are left out",
+        (
+            "cli/import_command",
+            "instrument/foreign_looks",
+        ),
+    ),
+    Fault(
+        "what a status leaves out is not told",
+        "instrument/foreign_looks.py",
+        '    assumed += left_out(cells, statuses, "look")\n',
+        "",
+        "a word unknown to us leaves a hundred looks out in silence",
+        ("cli/import_command::test_words_that_leave_looks_out_are_told_and_good_ones_of_other_languages_known",),
+    ),
+    Fault(
+        "what a status leaves out of an axis is not told",
+        "single_axis/foreign_readings.py",
+        '    assumed += left_out(cells, statuses, "reading")\n',
+        "",
+        "a word unknown to us leaves readings out in silence",
+        ("single_axis/foreign_readings",),
+    ),
+    Fault(
+        "dates without a zone in this machine's summer time",
+        "instrument/foreign_looks.py",
+        "found.append((when if when.tzinfo else when.replace(tzinfo=datetime.UTC)).timestamp())",
+        "found.append(when.timestamp())",
+        "an hour too much in a campaign, on some machines alone",
+        ("instrument/foreign_looks::test_dates_without_a_zone_do_not_hang_on_that_of_this_machine",),
+    ),
+    Fault(
+        "sheets -50 and 50 are one",
+        "instrument/foreign_looks.py",
+        'return (f"{before} {kept}" if kept.startswith(("=", "+", "-", "@")) else kept)[:chars_max]',
+        'return kept.lstrip("=+-@")[:chars_max]',
+        "looks at two sheets are taken for looks at one",
+        ("instrument/foreign_looks::test_texts_are_such_as_our_own_reader_takes",),
+    ),
+    Fault(
+        "a log that counts from 1 is not told",
+        "instrument/foreign_looks.py",
+        "if number is not None and number != of_row[row]]",
+        "if number is not None and number < of_row[row]]",
+        "pictures are paired with the moves beside theirs",
+        ("instrument/foreign_looks::test_a_log_of_moves_that_counts_otherwise_than_we_do_is_told",),
+    ),
+    Fault(
+        "numbers of looks lost where moves have none",
+        "instrument/foreign_looks.py",
+        "own = [number for number, seen in zip(numbers, looked, strict=True) if seen]",
+        "own = list(numbers)",
+        "looks are called by other numbers than in the log",
+        ("instrument/foreign_looks::test_numbers_that_cannot_be_kept_are_told",),
+    ),
+    Fault(
+        "degrees of a thermometer are readings",
+        "instrument/column_names.py",
+        "and not _TEMPERATURE.intersection(words_of(name))",
+        "",
+        "an axis is fitted to the temperature",
+        ("single_axis/foreign_readings::test_degrees_of_a_thermometer_are_no_reading",),
+    ),
+    Fault(
+        "degrees Celsius are an angle",
+        "instrument/column_names.py",
+        '"(?<![A-Za-z])\\u00b0(?![ ]*[CF])"',
+        '"(?<![A-Za-z])\\u00b0"',
+        "an axis is fitted to the temperature",
+        (
+            "instrument/column_names",
+            "single_axis/foreign_readings",
+        ),
+    ),
+    Fault(
+        "a damaged row hides what stands between cells",
+        "files/foreign_table.py",
+        'return next(clear, None) or next(most, ",")',
+        'return next(clear, ",")',
+        "one damaged row, and no column of the table is known",
+        ("files/foreign_table",),
+    ),
+    Fault(
+        "OpenCV's JSON taken for our own",
+        "cameras/calibration_formats.py",
+        'return "format" not in keys and any(isinstance(keys.values.get(key), dict) for key in _OPENCV_KEYS)',
+        "return False",
+        "a calibration of OpenCV is refused for missing keys of ours",
+        ("cameras/calibration_formats::test_what_opencv_writes_as_json_is_read",),
+    ),
+)
