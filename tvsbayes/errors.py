@@ -67,6 +67,13 @@ class NothingToEstimate(TvsError):
     exit_code = 3
 
 
+MISFIT_REMEDY = (
+    "see what `tvsbayes check` warns of: a camera that was knocked, rows that are one apart, counters; if of nothing, "
+    "check for swapped cameras, or state the extrinsics better in [rig.prior]"
+)
+"""Where no beam of the model passes the spots."""
+
+
 class NotConverged(TvsError):
     """An estimator did not reach its convergence criterion (exit 4)."""
 

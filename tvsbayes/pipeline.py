@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from tvsbayes.display import Shown, View
-from tvsbayes.errors import NotConverged, NothingToEstimate, TvsError, escaped
+from tvsbayes.errors import MISFIT_REMEDY, NotConverged, NothingToEstimate, TvsError, escaped
 from tvsbayes.files.disk import make_folder, output_place
 from tvsbayes.instrument.axes import AXES
 from tvsbayes.instrument.model_choice import AS_STATED, ModelChoice
@@ -78,10 +78,7 @@ def unusable(summary: FitSummary) -> TvsError | None:
             remedy="run again with --resume and more --max-minutes" if chain else "run again without --quick",
         )
     if not summary.converged:
-        return NotConverged.of(
-            summary.problems,
-            "check for swapped cameras or wrong counters, or state the extrinsics better in [rig.prior]",
-        )
+        return NotConverged.of(summary.problems, MISFIT_REMEDY)
     if not summary.headline_informed:
         return NothingToEstimate(
             "uninformed",

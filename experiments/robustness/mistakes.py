@@ -110,6 +110,23 @@ def shifted(campaign: Campaign, _: np.random.Generator) -> Campaign:
     return replace(campaign, spots=spots)
 
 
+def one_missing(campaign: Campaign, _: np.random.Generator) -> Campaign:
+    """From the middle on every spot assigned to the move after its own, as where the log lacks a row."""
+    last, half = len(campaign.moves) - 1, len(campaign.moves) // 2
+    spots = tuple(replace(s, move=min(s.move + (s.move >= half), last)) for s in campaign.spots)
+    return replace(campaign, spots=spots)
+
+
+def knocked(campaign: Campaign, _: np.random.Generator) -> Campaign:
+    """The right camera turned halfway, by a sixth of a degree about its line of sight to the left one."""
+    half = len(campaign.spots) // 2
+
+    def change(place: int, spot: Spot) -> Spot:
+        return spot if place < half or spot.v_right_px is None else replace(spot, v_right_px=spot.v_right_px + 3)
+
+    return replace(campaign, spots=tuple(change(k, spot) for k, spot in enumerate(campaign.spots)))
+
+
 def in_metres(campaign: Campaign, _: np.random.Generator) -> Campaign:
     """The mirror offset stated in metres."""
     priors = dict(campaign.rig.priors)
@@ -130,7 +147,9 @@ MISTAKES: dict[str, tuple[Change, str]] = {
     "sheet names blank": (unnamed, "column target is empty"),
     "one pixel 10 px off": (mistyped(10.0), "apart from all others"),
     "one pixel 100 px off": (mistyped(100.0), "apart from all others|triangulate outside"),
-    "spots one move early": (shifted, "do not follow"),
+    "spots one move early": (shifted, "the move after theirs|their rows are one apart"),
+    "a row of the log missing halfway": (one_missing, "the move before theirs|their rows are one apart"),
+    "right camera knocked by 3 px halfway": (knocked, "was a camera knocked"),
     "mirror offset in metres": (in_metres, "in metres"),
 }
 """What is done to a campaign, and the words by which `check` would name it."""
@@ -170,6 +189,12 @@ SHEETS = {
 }
 
 
+def poorly_calibrated(campaign: Campaign, rng: np.random.Generator) -> Campaign:
+    """Cameras that are off by ten draws' worth of their stated covariance."""
+    off = 10 * rng.multivariate_normal(np.zeros(24), campaign.stereo.parameter_covariance)
+    return replace(campaign, stereo=campaign.stereo.with_vector(campaign.stereo.vector + off))
+
+
 def unlike_table(seeds: int) -> list[str]:
     """How often good campaigns of rigs unlike the mounted one are accused."""
     rig = read_rig(shipped_data() / "rigs" / "mounted" / "rig.toml")
@@ -181,6 +206,12 @@ def unlike_table(seeds: int) -> list[str]:
     for name, other in rigs.items():
         said = [implausible(simulate(other, plan, seed=300 + k).campaign) for plan in plans for k in range(seeds)]
         lines.append(f"| {name} | {len(said)} | {sum(map(bool, said))} |")
+    said = [
+        implausible(poorly_calibrated(simulate(rig, plan, seed=300 + k).campaign, np.random.default_rng(k)))
+        for plan in plans
+        for k in range(seeds)
+    ]
+    lines.append(f"| cameras off by ten times what is stated of them | {len(said)} | {sum(map(bool, said))} |")
     return lines
 
 

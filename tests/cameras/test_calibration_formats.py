@@ -156,6 +156,13 @@ def test_opencv_lengths_need_their_unit(mounted, tmp_path):
     close(read_calibration(paths, unit_mm=1000.0).stereo, mounted)
 
 
+def test_millimetres_taken_for_metres_are_doubted(mounted, tmp_path):
+    """85 mm would be 85 m; nothing is refused, for nobody forbids a hall."""
+    found = read_calibration(written(tmp_path, exported(mounted, "opencv")), unit_mm=1000.0)
+    (told,) = found.warnings
+    assert "was it in mm before it was taken for metres?" in told
+
+
 def test_kalibr_camchain(tmp_path):
     (path,) = written(tmp_path, {"camchain.yaml": KALIBR.encode()})
     found = read_calibration([path])

@@ -57,7 +57,9 @@ def test_pictures_become_looks_that_detect_finds(ask, say, two_looks, tmp_path):
     code, document = ask("detect", out)
     assert code == 3 and "--pictures" in assert_error(document, "no-frames")["remedy"]
     code, text, _ = say("new", out, "--pictures", pictures)
-    assert code == 0 and "next: `tvsbayes detect" in text
+    assert code == 0 and "next: `tvsbayes detect" in text and "count from" not in text
+    first = campaign.moves[campaign.spots[0].move]
+    assert f"seen after move {first.move} at pan {first.pan_steps}, tilt {first.tilt_steps} steps" in text
     code, document = ask("detect", out)
     assert (code, document["ok"], document["missing"]) == (0, 2, 0)
     found = pixels_of(read_campaign(out).spots)
@@ -81,7 +83,11 @@ def test_without_moves_their_counters_are_asked_for(ask, say, tmp_path):
     out = tmp_path / "mine"
     code, text, _ = say("new", out, "--pictures", tmp_path / "pictures")
     assert code == 0 and "fill in moves.csv: pan_steps and tilt_steps of all 4 rows" in text
-    assert "spot 0, seen after move 1" in text and "not paired: moves 0: no pictures" in text
+    assert (
+        "spot 0, seen after move 1\n" in text
+        and "moves, which count from 0: where yours count from 1" in text
+        and "not paired: moves 0: no pictures" in text
+    )
     assert "not paired: left4.png: without the picture of the other camera" in text
     shutil.copy(MOUNTED / "stereo.json", out)
     code, document = ask("check", out)

@@ -149,6 +149,15 @@ def keep(document: Mapping[str, Any], path: Path) -> bool:
     return True
 
 
+PARTS = ("campaign.toml", "stereo.json", "moves.csv", "spots.csv", "readings.csv")
+"""Of a campaign, of a scanner or an axis."""
+
+
+def is_part(path: Path) -> bool:
+    """Whether a file is one of those that make a campaign of the folder it lies in."""
+    return path.name in PARTS and (path.parent / PARTS[0]).is_file()
+
+
 def refuse_options(reason: str, remedy: str, **given: object) -> None:
     """Refuse options that this use of a command would ignore; given are those that are neither None nor False."""
     named = ["--" + name.replace("_", "-") for name, value in given.items() if value is not None and value is not False]
@@ -165,12 +174,15 @@ def in_order(rig: Path, plan: Path) -> None:
 
 
 def spared(out: Path | None, *inputs: Path | None) -> None:
-    """Refuse an output that would replace a file which the command reads."""
+    """Refuse an output that would replace a file which the command reads, or the data of a campaign."""
     if out is None or not out.is_file():
         return
-    if any(one is not None and one.is_file() and one.samefile(out) for one in inputs):
+    read = any(one is not None and one.is_file() and one.samefile(out) for one in inputs)
+    data = is_part(out)
+    if read or data:
         name = escaped(str(out), 200)
-        message = f"-o {name} would replace a file that is read"
+        what = "a file that is read" if read else "data of the campaign in that folder"
+        message = f"-o {name} would replace {what}"
         raise InputError("usage", message, found=name, allowed="another file", remedy="name another file")
 
 

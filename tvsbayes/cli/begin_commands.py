@@ -5,6 +5,7 @@ Options in, library called, table or JSON out; heavy imports stand inside the co
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -20,7 +21,7 @@ from tvsbayes.progress import Job
 
 if TYPE_CHECKING:
     from tvsbayes.cameras.look_pictures import PairedLooks, ViewedFolder
-    from tvsbayes.instrument.campaign import Spot
+    from tvsbayes.instrument.campaign import Move, Spot
 
 COPYING = "copying pictures"
 NAMES_LISTED = 6
@@ -77,7 +78,9 @@ def _with_pictures(out: Path, folder: Path, pair: str | None, swap: bool, as_jso
     listed_in = moves_file(out, folder)
     rows = _rows_of(out)
     seen = views_of(folder, swap=swap)
-    paired = pair_looks(seen.views, _move_numbers(listed_in), rows, pair)  # type: ignore[arg-type]
+    moves = _moves_of(listed_in)
+    numbers = None if listed_in is None else range(len(moves))
+    paired = pair_looks(seen.views, numbers, rows, pair)  # type: ignore[arg-type]
     _refuse_other_size(out, seen)
     if not (out / "campaign.toml").is_file():
         make_folder(out, empty=True)
@@ -92,7 +95,12 @@ def _with_pictures(out: Path, folder: Path, pair: str | None, swap: bool, as_jso
     # Last: a folder whose looks are listed has all their pictures.
     write_atomically(out / "spots.csv", spots_bytes(paired.spots))
     lines = _unpaired_lines(seen, paired, "spots" if rows else "moves")
-    text = _paired_text(out, paired, copied, "pan_steps and tilt_steps" if listed_in is None else None)
+    text = _paired_text(out, paired, copied, "pan_steps and tilt_steps" if listed_in is None else None, moves)
+    if not rows and paired.matching == "number" and paired.renumbered is None and 0 in paired.without:
+        text += (
+            "\nthe numbers in the names are those of moves, which count from 0: where yours count from 1, every look "
+            "is now at the move behind its own, and `tvsbayes check` says so once the spots are detected"
+        )
     document: dict[str, Any] = {"campaign": str(out), "looks": len(paired.pictures), "pictures": copied}
     document |= {"paired_by": paired.matching, "warnings": lines, "moves_to_fill_in": listed_in is None}
     finish(document, "\n".join([text, *(f"not paired: {line}" for line in lines)]), as_json)
@@ -107,15 +115,15 @@ def moves_file(out: Path, folder: Path) -> Path | None:
     return beside if beside.is_file() else None
 
 
-def _move_numbers(file: Path | None) -> range | None:
-    """The moves of a file, checked; those of a file to fill in are counted, not read."""
+def _moves_of(file: Path | None) -> tuple[Move | None, ...]:
+    """The moves of a file, checked; a None for each of those of a file to fill in, which are counted, not read."""
     from tvsbayes.instrument.campaign import parse_moves
 
     if file is None:
-        return None
+        return ()
     data = read_bytes(file, CSV_BYTES_MAX)
     rows = len(data.splitlines()) - 1
-    return range(rows) if data == _moves_to_fill_in(rows) else range(len(parse_moves(data, str(file))))
+    return (None,) * rows if data == _moves_to_fill_in(rows) else parse_moves(data, str(file))
 
 
 def _moves_to_fill_in(count: int) -> bytes:
@@ -153,7 +161,9 @@ def _refuse_other_size(out: Path, seen: ViewedFolder) -> None:
         raise refusal("image-size", file=place, found=found, allowed=allowed, remedy=remedy)
 
 
-def _paired_text(out: Path, found: PairedLooks, copied: int, to_fill_in: str | None) -> str:
+def _paired_text(
+    out: Path, found: PairedLooks, copied: int, to_fill_in: str | None, moves: Sequence[Move | None]
+) -> str:
     """How many pictures went where, by what rule, and what to do next."""
     place = escaped(str(out), 200)
     first = next(iter(found.pictures.items()), None)
@@ -163,7 +173,9 @@ def _paired_text(out: Path, found: PairedLooks, copied: int, to_fill_in: str | N
         left, right = (escaped(picture.path.name) for picture in first[1].pictures)
         move = next(spot.move for spot in found.spots if spot.spot == first[0])
         both = left if left == right else f"{left} and {right}"
-        lines.append(f"for example {both}: spot {first[0]}, seen after move {move}")
+        reached = moves[move] if move < len(moves) else None
+        at = "" if reached is None else f" at pan {reached.pan_steps}, tilt {reached.tilt_steps} steps"
+        lines.append(f"for example {both}: spot {first[0]}, seen after move {move}{at}")
     if to_fill_in is not None:
         rows = 1 + max(spot.move for spot in found.spots)
         lines.append(f"fill in moves.csv: {to_fill_in} of all {rows} rows, absolute counters AFTER the move")

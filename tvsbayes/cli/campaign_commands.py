@@ -13,7 +13,17 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from tvsbayes.cli import axis_commands
-from tvsbayes.cli.app import CampaignFolder, Json, Seed, finish, finite, in_order, refuse_options, report_line
+from tvsbayes.cli.app import (
+    CampaignFolder,
+    Json,
+    Seed,
+    finish,
+    finite,
+    in_order,
+    is_part,
+    refuse_options,
+    report_line,
+)
 from tvsbayes.cli.progress_bar import waiting
 from tvsbayes.errors import InputError, escaped
 from tvsbayes.files.disk import make_folder, output_place, shipped_data, write_atomically
@@ -24,8 +34,6 @@ if TYPE_CHECKING:
     from tvsbayes.instrument.campaign import Campaign
     from tvsbayes.results.estimates import FitSummary
 
-PARTS = ("campaign.toml", "stereo.json", "moves.csv", "spots.csv", "readings.csv")
-"""Files that nobody can check without those beside them."""
 DEMO_NOTE = "The twin's move history is our assumption, made so that the classic answer is the paper's Table 1."
 
 
@@ -220,7 +228,8 @@ def _held(path: Path, plan_file: Path | None) -> dict[str, Any]:
         compile_for(report_line)
         with waiting() as progress:
             return check_plan(rig, steps, progress=progress).as_json()
-    if path.is_file() and path.name in PARTS and (path.parent / "campaign.toml").is_file():
+    # Nobody can check one of them without those beside it.
+    if path.is_file() and is_part(path):
         found, remedy = f"{escaped(path.name)} is a part of a campaign", f"check {escaped(str(path.parent), 200)}"
         raise InputError("usage", f"{found}, checked as a whole", allowed="a campaign folder", remedy=remedy)
     kind = path.suffix.lower()

@@ -22,6 +22,7 @@ from tvsbayes.cli.app import (
     finite,
     refuse_options,
     report_line,
+    spared,
     tell_part,
     tell_removed,
 )
@@ -82,6 +83,7 @@ def report(
     from tvsbayes.instrument.campaign import read_campaign
 
     finite(limit_deg_per_step=limit_deg_per_step, limit_mm=limit_mm, range_mm=range_mm)
+    spared(out)
     if out is not None and out.suffix.lower() == ".pdf":
         message, remedy = "-o names the HTML page, and its PDF lies beside it", "write -o NAME.html --pdf"
         raise InputError("usage", message, column="--out", allowed="NAME.html", remedy=remedy)

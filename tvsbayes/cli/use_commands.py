@@ -185,6 +185,7 @@ def steps_for(
     if export:
         options = {"pan_approach": pan_approach, "tilt_approach": tilt_approach, "rig": rig}
         target = {"x_mm": x_mm, "y_mm": y_mm, "z_mm": z_mm, "azimuth_deg": azimuth_deg, "elevation_deg": elevation_deg}
+        spared(out)
         remedy = "leave it out, --export writes the calibration itself; or leave out --export"
         refuse_options("for one target", remedy, **target, **options)
         _export(campaign, export, out, as_json)

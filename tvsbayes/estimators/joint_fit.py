@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Bool
 
 from tvsbayes.display import Shown, View
-from tvsbayes.errors import NotConverged, NothingToEstimate, require_kind
+from tvsbayes.errors import MISFIT_REMEDY, NotConverged, NothingToEstimate, require_kind
 from tvsbayes.estimators.campaign_arrays import CampaignArrays, in_sight, place_arrays
 from tvsbayes.estimators.homing_evidence import WORTH_A_FIT, most_fits, weighed
 from tvsbayes.estimators.likelihood import prior_errors_at_places
@@ -234,7 +234,7 @@ def fit(
     diverged = NotConverged(
         "diverged",
         "the fit left the region where the model is finite",
-        remedy="check for swapped cameras or wrong counters, or state the extrinsics better in [rig.prior]",
+        remedy=MISFIT_REMEDY,
     )
     with (
         jax.enable_x64(True),

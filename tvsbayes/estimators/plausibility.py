@@ -25,8 +25,6 @@ from tvsbayes.instrument.stops import observed_stops, separation
 
 NEAREST_SHEET_MM, FARTHEST_SHEET_MM = 20.0, 100_000.0
 """Depths between which a sheet can stand: nearer than a lens barrel, or beyond a hall, is a mismatched pair."""
-SHORTEST_BASELINE_MM = 2.0
-"""Two lenses cannot stand closer; the longest baseline in metres that anybody calls a stereo pair is shorter."""
 SHORTEST_MM = 0.5
 """Nothing of a rig that is stated at all is shorter, and no length in metres is longer."""
 CORNER_SHARE = 0.02
@@ -84,9 +82,6 @@ def implausible(campaign: Campaign, points_mm: np.ndarray | None = None) -> tupl
     if not ok:
         return tuple(found)
     found += pair_doubts(campaign.stereo)
-    baseline_mm = float(np.linalg.norm(campaign.stereo.T))
-    if baseline_mm < SHORTEST_BASELINE_MM:
-        found.append(f"T of stereo.json is {baseline_mm:.3g} mm long: is it in metres? Lengths are mm")
     found += _metres(campaign)
     largest_px = float(np.abs(pixels_of(ok)).max())
     if largest_px < CORNER_SHARE * campaign.stereo.image_height:

@@ -30,12 +30,18 @@ CURED = 0.25
 """Share of the mismatch that may be left where another size of the pictures explains it."""
 STRAY_MISMATCH = 10.0
 """Times the median mismatch, and above `MISMATCH_PX`, that makes a single spot stray."""
+KNOCK_PX, KNOCK_SPREADS = 1.0, 6.0
+"""Step of the mismatch within sheets, absolute and in its own standard deviations, by which one camera has moved."""
 TRAVEL_MIN_DEG = 3.0
 """Travel of an axis, by its prior ratio, from which its counter must show in the spots."""
 FOLLOWED, LOST = 0.8, 0.5
 """Share of the motion across that a right counter explains at least (good campaigns: 0.94), a wrong one at most."""
 BETTER = 3.0
-"""Times less of the motion that the sum of the cells leaves than the cells themselves, where these are steps."""
+"""Times less of the motion that the right counters leave than those of the table: sums of cells that are steps, or the
+counters of the row before or after."""
+LOOKS_TRIED, BEGINS_TRIED = 2000, 64
+"""Looks, spread evenly, by which rows are held against their neighbours, and how many of them are tried as the first
+that belongs to another; then those around the best."""
 GAP_MM, GAP_SHARE = 10.0, 0.1
 """Least gap between the depths of two sheets, absolute and of the depth."""
 STRAY_PLANE, STRAY_NEIGHBOUR, NEIGHBOUR_FLOOR = 3.5, 8.0, 0.4
@@ -86,7 +92,7 @@ def pattern_doubts(pattern: SpotPattern) -> tuple[str, ...]:
     """What the pattern of the spots contradicts, in words; empty for good campaigns and for too few spots."""
     if len(pattern.spots) < SPOTS_MIN:
         return ()
-    pictures = _picture_doubts(pattern)
+    pictures = _picture_doubts(pattern) or _knock_doubts(pattern)
     # A spot of another sheet would stray from the plane of the one that it is called after.
     return pictures or (*_counter_doubts(pattern), *(_name_doubts(pattern) or _stray_doubts(pattern)))
 
@@ -109,6 +115,41 @@ def _picture_doubts(pattern: SpotPattern) -> tuple[str, ...]:
     return (
         f"left and right contradict each other by {off_px:.1f} px (median): pictures of another size or calibration, "
         "rows of one camera shifted, or x and y exchanged?",
+    )
+
+
+def _knock_doubts(pattern: SpotPattern) -> tuple[str, ...]:
+    """That left and right begin to contradict each other on the way: one camera was knocked, turned or focused anew.
+
+    Of the mismatch the sign counts, that of the left row, and its step within each sheet: by a poor calibration they
+    contradict each other at one distance more than at another.
+    """
+    projected = project_pair(pattern.campaign.stereo, pattern.points_mm)
+    off = pattern.mismatch_px * np.sign((projected - pattern.pixels)[:, 1])
+    limit = 5 * _spread(off) + KNOCK_PX
+    kept = np.clip(off, np.median(off) - limit, np.median(off) + limit)
+    n = np.arange(1, len(kept))
+    mean = kept.mean()
+    # The likeliest single step of a mean.
+    gain = np.cumsum(kept - mean)[:-1] ** 2 / (n * (len(kept) - n))
+    row = int(np.argmax(gain[SPOTS_MIN // 2 - 1 : 1 - SPOTS_MIN // 2])) + SPOTS_MIN // 2
+    names = np.array([spot.target for spot in pattern.spots])
+    later = np.arange(len(off)) >= row
+    steps, rest = [], []
+    for name in np.unique(names):
+        parts = [off[(names == name) & (later == side)] for side in (False, True)]
+        if min(map(len, parts)) >= SPOTS_MIN // 2:
+            middles = [float(np.median(part)) for part in parts]
+            steps.append(middles[1] - middles[0])
+            rest += [part - middle for part, middle in zip(parts, middles, strict=True)]
+    step = float(np.median(steps)) if steps else 0.0
+    if abs(step) < KNOCK_PX or abs(step) < KNOCK_SPREADS * _spread(np.concatenate(rest)):
+        return ()
+    first, middles = pattern.spots[row], [float(np.median(off[later == side])) for side in (False, True)]
+    return (
+        f"from spot {first.spot} (move {first.move}) on left and right contradict each other by {middles[1]:+.1f} px, "
+        f"before by {middles[0]:+.1f} px: was a camera knocked, turned or focused anew? give the spots that "
+        "stereo.json was not made for another status than ok",
     )
 
 
@@ -160,14 +201,67 @@ def _counter_doubts(pattern: SpotPattern) -> tuple[str, ...]:
         fits[axis] = across(seen[axis], other), across(summed[axis][at], other), across(other, seen[axis])
     if len(fits) == 2 and all(own.share < LOST and other.share > FOLLOWED for own, _, other in fits.values()):
         return ("spots move across with the tilt counter and up with the pan counter: are both columns exchanged?",)
-    return tuple(text for axis, own in fits.items() if (text := _counter_doubt(axis, own)) is not None)
+    found = tuple(text for axis, own in fits.items() if (text := _counter_doubt(axis, own)) is not None)
+    if not fits or any(_are_steps(own, summed) for own, summed, _ in fits.values()):
+        return found
+    beside = _row_doubt(pattern, points_mm, counters)
+    return found if beside is None else (beside,)
+
+
+def _are_steps(own: _Followed, summed: _Followed) -> bool:
+    """Whether the cells of a counter are the steps of each move."""
+    return summed.share > FOLLOWED and 1 - own.share > BETTER * (1 - summed.share)
+
+
+def _row_doubt(pattern: SpotPattern, points_mm: np.ndarray, counters: dict[Axis, np.ndarray]) -> str | None:
+    """That spots belong to the moves beside theirs, all or from one on: two ways to number rows, or a missing row.
+
+    Args:
+        pattern: of the campaign.
+        points_mm: (n, 3), columns depth, across, up, in the axes of frame P.
+        counters: of all moves, steps.
+    """
+    chosen = np.unique(np.linspace(0, len(pattern.spots) - 1, LOOKS_TRIED).astype(int))
+    at = np.array([spot.move for spot in pattern.spots])[chosen]
+    depth_mm, motion_mm = points_mm[chosen, :1], points_mm[chosen, 1:]
+    table = np.column_stack([counters[axis] for axis in AXES])
+
+    def unexplained(steps: np.ndarray) -> float:
+        """What counters (n, 2) leave of the motion, mm^2."""
+        design = np.column_stack([np.ones_like(depth_mm), depth_mm, steps, steps * depth_mm])
+        design /= np.maximum(np.abs(design).max(axis=0), 1e-12)
+        return float(((motion_mm - design @ np.linalg.lstsq(design, motion_mm, rcond=None)[0]) ** 2).sum())
+
+    def beside(lag: int, begin: int) -> float:
+        moved = at + lag * (np.arange(len(at)) >= begin)
+        return unexplained(table[np.clip(moved, 0, len(table) - 1)])
+
+    own, motion = unexplained(table[at]), unexplained(np.zeros((len(at), 2)))
+    last = len(at) - SPOTS_MIN
+    tried = np.unique(np.linspace(0, last, BEGINS_TRIED).astype(int)).tolist()
+    found = []
+    for lag in (-1, 1):
+        near = min(tried, key=partial(beside, lag))
+        around = range(max(near - last // BEGINS_TRIED, 0), min(near + last // BEGINS_TRIED, last) + 1)
+        begin = min(around, key=partial(beside, lag))
+        found.append((beside(lag, begin), lag, begin))
+    rest, lag, begin = min(found)
+    if own <= BETTER * rest or rest > (1 - FOLLOWED) * motion:
+        return None
+    first = pattern.spots[int(chosen[begin])]
+    which = "spots" if begin == 0 else f"from spot {first.spot} on, spots"
+    return (
+        f"{which} follow the counters of the move {'after' if lag > 0 else 'before'} theirs, not of the one that "
+        f"spots.csv names (spot {first.spot}: move {first.move}): do pictures or rows count from 1, or is a row of "
+        "moves.csv missing or one too many? moves count from 0"
+    )
 
 
 def _counter_doubt(axis: Axis, fits: tuple[_Followed, _Followed, _Followed]) -> str | None:
     """What is odd about the counter of one axis."""
     own, summed, _ = fits
     positive, negative = SENSES[axis]
-    if summed.share > FOLLOWED and 1 - own.share > BETTER * (1 - summed.share):
+    if _are_steps(own, summed):
         return (
             f"spots follow the sum of {axis}_steps, not {axis}_steps: are these the steps of each move? "
             "moves.csv holds absolute counters AFTER the move"
@@ -177,6 +271,7 @@ def _counter_doubt(axis: Axis, fits: tuple[_Followed, _Followed, _Followed]) -> 
     if own.share > FOLLOWED and own.slope < 0:
         cure = f"write {axis}_steps with the other sign (and {positive} for {negative} in the approach)"
         mount = "or state in [rig.prior] extrinsics.rotation_rad how the cameras are turned"
+        mount += "; looks of an axis that goes to and fro show the same where their rows are one apart"
         return f"spots move {negative} while {axis}_steps grows: {positive} counts up; {cure}, {mount}"
     return None
 

@@ -183,6 +183,9 @@ PRINCIPAL_SHARE_MAX = 0.25
 """Share of the image's width or height by which a principal point may miss its middle before it is worth a word."""
 ASPECT_SHARE_MAX = 0.05
 """The same of fx / fy from 1: pixels of today's sensors are square."""
+SHORTEST_BASELINE_MM, LONGEST_BASELINE_MM = 2.0, 10_000.0
+"""Two lenses cannot stand closer, and the longest baseline in metres that anybody calls a stereo pair is shorter; no
+cameras on one rig stand farther apart, and the shortest baseline in mm, taken for metres, is longer."""
 
 
 def _array(keys: Keys, key: str, *shapes: tuple[int, ...]) -> np.ndarray:
@@ -317,9 +320,17 @@ def pair_doubts(stereo: Stereo) -> tuple[str, ...]:
     """What contradicts two cameras beside each other that look at one scene, in words; empty where nothing does.
 
     No refusal: mirrors, cropped images and lenses off their axes exist. Seen are cameras exchanged, an image size that
-    belongs to other pictures, pixels far from square.
+    belongs to other pictures, pixels far from square, T in another unit.
     """
     doubts = []
+    baseline_mm = float(np.linalg.norm(stereo.T))
+    if baseline_mm < SHORTEST_BASELINE_MM:
+        doubts.append(f"T of stereo.json is {baseline_mm:.3g} mm long: is it in metres? Lengths are mm")
+    if baseline_mm > LONGEST_BASELINE_MM:
+        doubts.append(
+            f"T of stereo.json is {baseline_mm / 1000:.3g} m long: was it in mm before it was taken for metres? "
+            "Lengths are mm"
+        )
     # Where the second camera stands, in axes of the first: x to the right, as columns of a picture grow.
     right_mm = -float(stereo.R[:, 0] @ stereo.T)
     if right_mm < 0:

@@ -89,8 +89,8 @@ def steps_ahead(summary: FitSummary, folder: str) -> list[str]:
     found = []
     if not summary.converged:
         return [
-            "Use none of the numbers. Check for swapped cameras, wrong counters and pictures of another size, then "
-            "fit again.",
+            "Use none of the numbers. See what `tvsbayes check` warns of, look for swapped cameras, wrong counters "
+            "and pictures of another size, then fit again.",
         ]
     if (validation := failed(summary)) is not None:
         help_ = remedy(validation)

@@ -105,4 +105,12 @@ FAULTS = (
         "a calibration of OpenCV is refused for missing keys of ours",
         ("cameras/calibration_formats::test_what_opencv_writes_as_json_is_read",),
     ),
+    Fault(
+        "millimetres taken for metres",
+        "instrument/stereo_pair.py",
+        "if baseline_mm > LONGEST_BASELINE_MM:",
+        "if False:",
+        "cameras 85 m apart, without a word",
+        ("cameras/calibration_formats::test_millimetres_taken_for_metres_are_doubted",),
+    ),
 )

@@ -147,4 +147,12 @@ FAULTS = (
         "a traceback of the server",
         ("view/access",),
     ),
+    Fault(
+        "an output replaces the data of a campaign",
+        "cli/app.py",
+        "    data = is_part(out)\n",
+        "    data = False\n",
+        "moves.csv is gone",
+        ("cli/use_commands::test_no_output_replaces_the_data_of_a_campaign",),
+    ),
 )

