@@ -149,12 +149,15 @@ def test_a_ratio_is_the_sum_of_what_each_place_has_in_it(real):
 def test_what_is_reported_of_real_gears_is_along_the_looks_by_the_instruments_own_scales(real):
     """Assurance of designs equals the plan judged move by move, on gears whose errors are as large as drawn.
 
-    Neither the line over all candidates nor the scales believed beforehand would do: both tell another u.
+    Neither the line over all candidates, nor over looks that the cameras miss, nor the scales believed beforehand would
+    do: all tell another u.
     """
     known, found = real
     family = Family(known, found, np.random.default_rng(4).integers(0, len(found.looks), 24), False)
     drawn = draw_instruments(known, 3, 5)
     drawn.z[:, CONTRAST_COLUMNS] = 0.0
+    # Cameras turned away from an eighth of the looks.
+    drawn.z[2, INDEX["extrinsics.rotation_rad.y"]] = 10.0
     assurance = Assurance(family, WORST, Instruments.at(drawn.z, drawn.value, drawn.common), 5)
     reported, steps = assurance.values([6])[6], family.arranged(6).steps
     for row in range(3):
@@ -170,14 +173,18 @@ def test_what_is_reported_of_real_gears_is_along_the_looks_by_the_instruments_ow
         ]
         judged = covariance_of(own.precision + information_of(steps, own, z=at, space=space).fisher)
         pose = seen.mirror_angles_rad[assurance.index].mean(axis=0)
-        taken = seen.seen * np.bincount(assurance.index)
+        planned = np.bincount(assurance.index)
+        assert (planned * seen.seen).sum() < planned.sum() if row == 2 else seen.seen.all()
 
         def u(gears, covariance, z=z, space=space, pose=pose):
             return sensitivity(WORST, z, space, known.rig.table, pose, gears).value(covariance)
 
-        lined = replace(mine, share=mine.line_through(assurance.looks.steps, taken))
+        lined = replace(mine, share=mine.line_through(assurance.looks.steps, planned * seen.seen))
         assert reported[row] == pytest.approx(u(lined, judged), rel=ROUNDING)
         assert abs(u(mine, judged) / reported[row] - 1) > 1e-3, "the line over all candidates is another"
+        if row == 2:
+            every = replace(mine, share=mine.line_through(assurance.looks.steps, planned))
+            assert abs(u(every, judged) / reported[row] - 1) > 1e-3, "so is that over looks which are missed"
         prior = covariance_of(known.precision + information_of(steps, known, z=at, space=space).fisher)
         common = replace(known.gears, share=lined.share)
         assert abs(u(common, prior) / reported[row] - 1) > 1e-3, "so are the scales believed beforehand"
