@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import difflib
 import re
+import shlex
 from collections.abc import Iterable, Sequence
 from functools import partial
 
@@ -155,6 +156,11 @@ def closest(name: str, names: Iterable[str], otherwise: str = "remove it, or cor
     """The remedy for an unknown name: the nearest allowed one, where any is near."""
     near = difflib.get_close_matches(name[:100], list(names), n=1, cutoff=CLOSE)
     return f"did you mean {near[0]}?" if near else otherwise
+
+
+def typed(word: object, limit: int = 200) -> str:
+    """A path or another word as it stands in a command that somebody is told to type: quoted where a shell needs it."""
+    return shlex.quote(escaped(str(word), limit))
 
 
 def listed(numbers: Sequence[int], most: int) -> str:

@@ -217,3 +217,20 @@ def test_a_slow_computers_user_is_not_sent_to_the_authors_of_xla(monkeypatch):
     with pytest.raises(SystemExit):
         main()
     assert os.environ["TF_CPP_MIN_LOG_LEVEL"] == "3"
+
+
+@pytest.mark.parametrize("given", ["0,0004", "-1,5", ",5"])
+def test_a_decimal_comma_is_told_its_point(ask, say, given):
+    code, document = ask("report", PAPER_TWIN, "--limit-mm", given)
+    wanted = f"write a decimal point: {given.replace(',', '.')}"
+    assert code == 2 and assert_error(document, "usage")["remedy"] == wanted
+    assert wanted in say("report", PAPER_TWIN, "--limit-mm", given)[2]
+    assert ask("report", PAPER_TWIN, "--limit-mm", "many")[1]["error"]["remedy"] == "see tvsbayes --help"
+
+
+def test_without_the_packages_of_the_command_it_says_what_to_install(tmp_path):
+    """As after an installation without dependencies, on a robot with NumPy alone."""
+    code = "import sys; sys.modules['typer'] = None; from tvsbayes.cli.main import main; main()"
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert ended.returncode == 1 and "needs the package typer; what to do: pip install" in ended.stderr
+    assert "Traceback" not in ended.stderr

@@ -31,7 +31,7 @@ from tvsbayes.cameras.spot_fit import Centre, Located, centre_of, fit_spot, skew
 from tvsbayes.cameras.spot_noise import CONTRAST_DEFAULT, SHAPE_SPOTS_MIN, SpotNoise, learn_noise, mean_noise
 from tvsbayes.cameras.spot_overlay import overlay_of
 from tvsbayes.cameras.spot_window import CLIPPED_SHARE_MAX, WIDE_SD_PX, Patch, patch_around
-from tvsbayes.errors import InputError, NothingToEstimate, all_of, escaped, refusal
+from tvsbayes.errors import InputError, NothingToEstimate, all_of, escaped, refusal, typed
 from tvsbayes.files.disk import make_folder, read_bytes, write_atomically
 from tvsbayes.files.images import (
     IMAGE_BYTES_MAX,
@@ -283,8 +283,9 @@ def detect(
 
 def _no_frames(campaign: Campaign) -> NothingToEstimate:
     """Why there is nothing to detect, and how pictures get there."""
-    place = escaped(str(campaign.path), 200)
-    pairing = f"`tvsbayes new {place} --pictures FOLDER` lists the pictures of a folder and copies them there"
+    pairing = (
+        f"`tvsbayes new {typed(campaign.path)} --pictures FOLDER` lists the pictures of a folder and copies them there"
+    )
     message = f"frames/ holds pictures of none of the {len(campaign.spots)} rows of spots.csv"
     if not campaign.spots:
         message = "spots.csv has no rows: nothing says after which move a picture was taken"

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 import os
-import shlex
 import sys
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -15,7 +14,7 @@ import typer
 
 from tvsbayes.cli.examples import FIRST, epilog
 from tvsbayes.cli.terminal import shown
-from tvsbayes.errors import InputError, TvsError, escaped
+from tvsbayes.errors import InputError, TvsError, escaped, typed
 from tvsbayes.files.disk import make_folder, write_atomically
 
 INTERRUPTED = 130
@@ -135,7 +134,7 @@ def tell_removed(names: Iterable[str], written: Mapping[str, str], *, certificat
 
 def command_line(*words: object) -> str:
     """A command to be typed, its words quoted where a shell needs it."""
-    return "tvsbayes " + " ".join(shlex.quote(escaped(str(word), 400)) for word in words)
+    return "tvsbayes " + " ".join(typed(word, 400) for word in words)
 
 
 def keep(document: Mapping[str, Any], path: Path) -> bool:

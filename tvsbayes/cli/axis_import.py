@@ -11,7 +11,7 @@ import typer
 
 from tvsbayes.cli.app import finish
 from tvsbayes.cli.understood_columns import not_sure, table_document, table_lines
-from tvsbayes.errors import escaped, refusal
+from tvsbayes.errors import escaped, refusal, typed
 from tvsbayes.files.disk import make_folder, shipped_data, write_atomically
 
 if TYPE_CHECKING:
@@ -63,7 +63,7 @@ def import_readings(
     document |= {"readings": len(found.readings), "ok": ok, "campaign": str(to), "files": written}
     said = f"written: {', '.join(written)}" if written else "nothing written: add --yes, or correct it with --column"
     place = escaped(str(to), 200)
-    after = f"\nnext: `unit` and `[axis]` in {place}/campaign.toml, then `tvsbayes check {place}`" * bool(written)
+    after = f"\nnext: `unit` and `[axis]` in {place}/campaign.toml, then `tvsbayes check {typed(to)}`" * bool(written)
     finish(document, f"{shown}\n{said}{after}".lstrip("\n"), as_json)
 
 

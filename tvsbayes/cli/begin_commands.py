@@ -14,7 +14,7 @@ import typer
 from tvsbayes.cli import axis_commands
 from tvsbayes.cli.app import Json, finish, refuse_options
 from tvsbayes.cli.progress_bar import waiting
-from tvsbayes.errors import InputError, escaped, listed, refusal
+from tvsbayes.errors import InputError, escaped, listed, refusal, typed
 from tvsbayes.files.csv_table import CSV_BYTES_MAX, csv_bytes
 from tvsbayes.files.disk import make_folder, read_bytes, shipped_data, write_atomically
 from tvsbayes.progress import Job
@@ -189,7 +189,7 @@ def _paired_text(
         lines.append(
             "put stereo.json beside it: `tvsbayes stereo BOARD_PICTURES --board 9x6 --pitch-mm 25 -o stereo.json`"
         )
-    lines.append(f"next: `tvsbayes detect {place}`, then `tvsbayes check {place}`")
+    lines.append(f"next: `tvsbayes detect {typed(out)}`, then `tvsbayes check {typed(out)}`")
     return "\n".join(lines)
 
 

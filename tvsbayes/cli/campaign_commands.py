@@ -25,7 +25,7 @@ from tvsbayes.cli.app import (
     report_line,
 )
 from tvsbayes.cli.progress_bar import waiting
-from tvsbayes.errors import InputError, escaped
+from tvsbayes.errors import InputError, escaped, typed
 from tvsbayes.files.disk import make_folder, output_place, shipped_data, write_atomically
 from tvsbayes.pipeline import FITTING, SAMPLING, calibrate, compile_for, unusable
 from tvsbayes.progress import Job, Show
@@ -132,15 +132,15 @@ def simulate(
         from tvsbayes.twin.board_pictures import Board
         from tvsbayes.twin.frames import write_with_frames
 
-        board, place = Board(), escaped(str(out), 200)
+        board = Board()
         with _frames_kept() as progress:
             pictures = write_with_frames(out, result.undetected(), seed, progress=progress)
         size = f"{board.columns}x{board.rows}"
         drawn = {"columns": board.columns, "rows": board.rows, "pitch_mm": board.pitch_mm}
         document |= {"ok": 0, "in_view": seen, "pictures": pictures, "board": drawn}
-        text += f"\n{pictures} pictures in frames/ and boards/; spots.csv waits for `tvsbayes detect {place}`"
-        text += f"\nboard: {size} inner corners, squares of {board.pitch_mm:g} mm: `tvsbayes stereo {place}/boards "
-        text += f"--board {size} --pitch-mm {board.pitch_mm:g} -o stereo.json`"
+        text += f"\n{pictures} pictures in frames/ and boards/; spots.csv waits for `tvsbayes detect {typed(out)}`"
+        text += f"\nboard: {size} inner corners, squares of {board.pitch_mm:g} mm: `tvsbayes stereo "
+        text += f"{typed(out / 'boards')} --board {size} --pitch-mm {board.pitch_mm:g} -o stereo.json`"
     else:
         result.write(out)
     finish(document, text, as_json)
@@ -250,11 +250,11 @@ def _refuse_other_than_rig(path: Path, plan_file: Path) -> None:
     if path.is_dir():
         rig_file = path / "rig.toml"
         if axis_commands.is_axis(path):
-            found, remedy = "an axis folder, whose plan is not checked", f"leave out PLAN: tvsbayes check {name}"
+            found, remedy = "an axis folder, whose plan is not checked", f"leave out PLAN: tvsbayes check {typed(path)}"
         elif rig_file.is_file():
             found, remedy = "a folder", f"name the rig file in it: {escaped(str(rig_file), 200)}"
         else:
-            found, remedy = "a folder", f"name a rig file, or leave out PLAN: tvsbayes check {name}"
+            found, remedy = "a folder", f"name a rig file, or leave out PLAN: tvsbayes check {typed(path)}"
     elif path.exists() and path.suffix.lower() != ".toml":
         found, remedy = "no .toml file", "give the rig file first, then the plan"
     else:

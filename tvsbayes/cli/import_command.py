@@ -16,7 +16,7 @@ from tvsbayes.cli import axis_commands
 from tvsbayes.cli.app import Json, finish, refuse_options, report_line
 from tvsbayes.cli.begin_commands import moves_file, rows_listed, write_templates
 from tvsbayes.cli.understood_columns import not_sure, table_document, table_lines
-from tvsbayes.errors import InputError, escaped, refusal
+from tvsbayes.errors import InputError, escaped, refusal, typed
 from tvsbayes.files.csv_table import CSV_BYTES_MAX
 from tvsbayes.files.disk import make_folder, read_bytes, shipped_data, write_atomically
 
@@ -89,9 +89,9 @@ def import_(
     document |= {"campaign": str(to), "files": written}
     said = f"written: {', '.join(written)}" if written else "nothing written: add --yes, or correct it with --column"
     place = escaped(str(to), 200)
-    after = "" if not written else f"\nnext: put stereo.json into {place}, then `tvsbayes check {place}`"
+    after = "" if not written else f"\nnext: put stereo.json into {place}, then `tvsbayes check {typed(to)}`"
     if (to / "stereo.json").is_file():
-        after = f"\nnext: `tvsbayes check {place}`" * bool(written)
+        after = f"\nnext: `tvsbayes check {typed(to)}`" * bool(written)
     finish(document, f"{shown}\n{said}{after}".lstrip("\n"), as_json)
 
 

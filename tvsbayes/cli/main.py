@@ -10,9 +10,14 @@ from __future__ import annotations
 import gc
 import io
 import os
+import re
 import sys
 
-import typer
+try:
+    import typer
+except ModuleNotFoundError as missing:
+    # Who installed without dependencies has the Python side of a robot, not the command.
+    sys.exit(f"error: the command tvsbayes needs the package {missing.name}; what to do: pip install tvsbayes")
 
 from tvsbayes.cli.acquire_command import acquire
 from tvsbayes.cli.app import (
@@ -44,6 +49,7 @@ COMMANDS = (
 """In the order of `--help`."""
 COLLECTIONS = 100_000, 20, 20
 """Thresholds of Python's garbage collector in a command; its own, 2000 new objects, is for small programs."""
+_DECIMAL_COMMA = re.compile(r"(?:--[a-z0-9-]+=)?([-+]?[0-9]*,[0-9]+)")
 for command in COMMANDS:
     name = command.__name__.rstrip("_").replace("_", "-")
     app.command(name, epilog=epilog(EXAMPLES[name]))(command)
@@ -79,10 +85,14 @@ def _run(arguments: list[str]) -> int:
         # Wrong options are bad input like any other; typer's own classes carry the text to show.
         if not (hasattr(error, "format_message") and hasattr(error, "show")):
             raise
+        commas = [found[1] for word in arguments if (found := _DECIMAL_COMMA.fullmatch(word))]
+        remedy = f"write a decimal point: {commas[0].replace(',', '.')}" if commas else "see tvsbayes --help"
         if wants_json:
-            print_json(error_document(InputError("usage", error.format_message(), remedy="see tvsbayes --help")))
+            print_json(error_document(InputError("usage", error.format_message(), remedy=remedy)))
         else:
             error.show()
+            if commas:
+                report_line(f"what to do: {remedy}")
         return InputError.exit_code
     if code == INTERRUPTED:
         if wants_json:

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import hashlib
 import json
-import shlex
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tvsbayes.errors import escaped
+from tvsbayes.errors import typed
 from tvsbayes.instrument.campaign import title_of
 from tvsbayes.report.axis_text import (
     CONFLICTING,
@@ -104,7 +103,7 @@ def axis_page(results: AxisResults, issue: Issue) -> Page:
     in_words = [f"{text[0].upper()}{text[1:]}." for text in offered]
     header = fit.campaign.header
     created = header.get("created")
-    folder = "AXIS" if fit.campaign.path is None else shlex.quote(escaped(fit.campaign.path.resolve().name, 200))
+    folder = "AXIS" if fit.campaign.path is None else typed(fit.campaign.path.resolve().name)
     page = Page(
         results=hashlib.sha256(said.encode()).hexdigest()[:NUMBER_DIGITS].upper(),
         name=title_of(header, fit.campaign.path),

@@ -11,7 +11,6 @@ import base64
 import hashlib
 import os
 import re
-import shlex
 import shutil
 import subprocess
 import tempfile
@@ -21,7 +20,7 @@ from pathlib import Path
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup, escape
 
-from tvsbayes.errors import InputError, escaped
+from tvsbayes.errors import InputError, typed
 from tvsbayes.files.disk import make_folder, read_bytes, shipped_data, write_atomically
 from tvsbayes.metrology.traceability import traceability
 from tvsbayes.report.advice import steps_ahead
@@ -233,7 +232,7 @@ def _page(e: Evidence, issue: Issue) -> Page:
 
 def _steps(e: Evidence) -> list[str]:
     """What to do next: what the fit asks for, then the best of a plan; the plan's own section has all of it."""
-    folder = "CAMPAIGN" if e.campaign.path is None else shlex.quote(escaped(e.campaign.path.resolve().name, 200))
+    folder = "CAMPAIGN" if e.campaign.path is None else typed(e.campaign.path.resolve().name)
     found = steps_ahead(e.fit.summary, folder)
     if e.planned is not None and not e.planned.stop.now and e.planned.next:
         best = e.planned.next[0]
