@@ -219,7 +219,7 @@ def _onto_rows(
 def _unmatched(views: Sequence[View], ids: Sequence[int], file: str) -> InputError:
     what = "moves" if file == "moves.csv" else "rows with the status undetected"
     span = f" ({min(ids)} to {max(ids)})" if ids else ""
-    found = f"{len(views)} pairs of pictures for {len(ids)} {what}{span}, and no number in the names that tells which"
+    found = f"{len(views)} pairs of pictures for {len(ids)} {what}{span}, and not in every name a number of one of them"
     allowed = "as many pairs as rows, or in every name the number of its row"
     remedy = f"name them after their row (left_0012.png, right_0012.png for {what[:-1] if len(what) < 6 else 'row'} 12)"
     if file == "moves.csv":

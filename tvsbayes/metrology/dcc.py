@@ -39,6 +39,10 @@ NOT_ACCREDITED = (
     "user in the format of the DCC schema; it is not signed, and nobody but its user vouches for it."
 )
 ITEM_ONLY = "The results relate only to the item named here, in the state and under the conditions of the campaign."
+COVERAGE = (
+    "An expanded uncertainty is half the 95 % interval, its coverage factor that half over the standard uncertainty: "
+    "1.96 where the posterior is normal, a little more or less where it is not."
+)
 METHOD = (
     "Joint Bayesian estimate of gear ratios, backlash, mirror geometry and camera pose from the pixels of laser spots "
     "seen by a calibrated stereo pair at several depths; angles are inferred through cameras and model, no angle "
@@ -284,7 +288,8 @@ def _measurement(root: ET.Element, campaign: Campaign, fit: FitRecord) -> None:
     pose = summary.reference_pose_deg
     where = f"at mirror angles pan {pose['pan']:.2f} deg, tilt {pose['tilt']:.2f} deg"
     kind = "posterior draws" if summary.estimator == "posterior" else "the Laplace approximation of the posterior"
-    add_words(part, "dcc:description", f"Effective ratios hold {where}. Values and intervals from {kind}.")
+    told = f"Effective ratios hold {where}. Values and intervals from {kind}. {COVERAGE}"
+    add_words(part, "dcc:description", told)
     method = add(add(part, "dcc:usedMethods"), "dcc:usedMethod", id="method")
     add_words(method, "dcc:name", "joint estimate from stereo spots")
     texts = [METHOD, *(f"Method as named by the user: {t}" for t in [campaign.header.get("method")] if t)]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 from tvsbayes.report.tables import TableView, concise
 from tvsbayes.results.watch_record import CANNOT_TELL, MOVED, MovedPart, PlannedChange, Watch, WatchPlan
 
@@ -16,6 +18,8 @@ HELPS = {
     "play: tilt": "each tilt counter from both sides, several times",
 }
 """Which looks see a change better, by change."""
+LINEAR = {"deg": 1.0, "mm": 10.0}
+"""Sizes up to which a change is seen in its true size."""
 MISSED = {
     "cameras": "calibrate the cameras anew, then the rig",
     "positioner": "fasten it and calibrate anew; coordinates are off by what is told above until then",
@@ -47,6 +51,10 @@ def watch_text(found: Watch, power_min: float) -> str:
     p = "< 1e-9" if found.p < 1e-9 else f"= {found.p:.2g}"
     lines = [f"{found.verdict} (p {p}; false alarms {100 * found.false_alarm_rate:g} %)"]
     lines += [f"moved: {moved_words(part)}" for part in found.moved]
+    if any(abs(part.value) > LINEAR.get(part.unit, math.inf) for part in found.moved):
+        lines.append(
+            "sizes are linear about the calibration: such large ones are rough, beyond the u that stands there"
+        )
     if found.verdict == MOVED:
         causes = dict.fromkeys(part.what.split(":")[0] for part in found.moved)
         lines += [f"what to do: {MISSED[cause]}" for cause in causes]

@@ -186,7 +186,7 @@ def _check_turns(campaign: AxisCampaign, command: np.ndarray, value: np.ndarray,
             f"readings.csv: the angle jumps by whole turns at move {named}; allowed: a continuous angle",
             file="readings.csv",
             column="value",
-            remedy=f"unwrap the readings: add or subtract {turn:g} {campaign.unit}",
+            remedy=f"unwrap them: add or subtract {turn:g} {campaign.unit}; or are command and value exchanged?",
         )
 
 
