@@ -44,8 +44,10 @@ def test_without_standard_input_nobody_can_be_asked(monkeypatch, capsys):
     monkeypatch.setattr("sys.stdin", None)
     with pytest.raises(InputError, match="nobody can be asked"):
         check_hazard(None, simulate=False)
-    operator = TerminalOperator(StopKey(), Terminal(ask=LiveLine().ask), laser_class="3B")
+    said = []
+    operator = TerminalOperator(StopKey(), Terminal(said.append, ask=LiveLine().ask), laser_class="3B")
     assert operator.place("d1", 175.0, 0, "") is False and operator.stop.requested
+    assert said == ["nobody can be asked, standard input has ended: go on in a terminal, with --resume"]
 
 
 def test_stop_key_interrupts_a_question_at_once():

@@ -97,6 +97,16 @@ def test_what_is_not_understood_is_asked_for(ask, say, table, tmp_path, monkeypa
     assert (tmp_path / "asked" / "moves.csv").read_text().splitlines()[1].startswith("0,0,0.0,1,0,")
 
 
+def test_with_a_closed_standard_input_nobody_is_asked(say, table, tmp_path, monkeypatch):
+    """As a service has it (`<&-`): Python then has None for the stream."""
+    monkeypatch.setattr("sys.stdin", None)
+    code, text, _ = say("import", table, "--to", tmp_path / "mine")
+    assert code == 0 and "nothing written: add --yes" in text
+    (tmp_path / "axis.csv").write_text("steps,encoder_deg\n0,0\n100,1\n200,2.1\n")
+    code, text, _ = say("import", tmp_path / "axis.csv", "--axis", "--to", tmp_path / "axis")
+    assert code == 0 and "nothing written: add --yes" in text
+
+
 @pytest.mark.parametrize(
     ("options", "said"),
     [

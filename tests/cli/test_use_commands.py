@@ -359,3 +359,11 @@ def test_no_output_replaces_the_data_of_a_campaign(ask, tmp_path, command, name)
     code, document = ask(command[0], tmp_path, *command[1:], "-o", tmp_path / name)
     assert code == 2 and "would replace data of the campaign" in document["error"]["message"]
     assert (tmp_path / name).read_bytes() == b"mine"
+
+
+@pytest.mark.parametrize("command", [("steps-for", "--export", "json"), ("report",), ("plan",)])
+def test_an_output_without_a_folder_is_refused_before_the_work(ask, tmp_path, command):
+    """Not after the fit of a campaign: this one cannot even be read."""
+    code, document = ask(command[0], tmp_path, *command[1:], "-o", tmp_path / "nowhere" / "out.x")
+    error = document["error"]
+    assert (code, error["code"], error["found"]) == (2, "write", "no such folder")

@@ -150,11 +150,14 @@ class TerminalOperator:
         self.stop.at_prompt = True
         try:
             return self.terminal.ask(question).strip().lower()
-        except (EOFError, KeyboardInterrupt):
-            self.stop.requested = True
-            return "q"
+        except EOFError:
+            self.terminal.say("nobody can be asked, standard input has ended: go on in a terminal, with --resume")
+        except KeyboardInterrupt:
+            pass
         finally:
             self.stop.at_prompt = False
+        self.stop.requested = True
+        return "q"
 
 
 @dataclass

@@ -14,7 +14,7 @@ import typer
 
 from tvsbayes.cli.examples import FIRST, epilog
 from tvsbayes.cli.terminal import shown
-from tvsbayes.errors import InputError, TvsError, escaped, typed
+from tvsbayes.errors import InputError, TvsError, escaped, refusal, typed
 from tvsbayes.files.disk import make_folder, write_atomically
 
 INTERRUPTED = 130
@@ -99,6 +99,11 @@ def error_document(error: TvsError) -> dict[str, Any]:
     return {"error": fields}
 
 
+def somebody_there() -> bool:
+    """Whether a question would be read by somebody; a closed standard input (`<&-`) is None."""
+    return sys.stdin is not None and sys.stdin.isatty()
+
+
 def report_error(error: TvsError) -> None:
     """An error for people, with what to do where the message does not say it."""
     report_line(f"error: {error.message}")
@@ -173,13 +178,15 @@ def in_order(rig: Path, plan: Path) -> None:
 
 
 def spared(out: Path | None, *inputs: Path | None) -> None:
-    """Refuse an output that would replace a file which the command reads, or the data of a campaign."""
-    if out is None or not out.is_file():
+    """Refuse an output before the work: without a folder, or in the place of what is read or of a campaign's data."""
+    if out is None:
         return
-    read = any(one is not None and one.is_file() and one.samefile(out) for one in inputs)
-    data = is_part(out)
-    if read or data:
-        name = escaped(str(out), 200)
+    name = escaped(str(out), 200)
+    if not out.parent.is_dir():
+        found, remedy = "no such folder", "make the folder, or name another place"
+        raise refusal("write", file=name, found=found, allowed="a writable folder with free space", remedy=remedy)
+    read = out.is_file() and any(one is not None and one.is_file() and one.samefile(out) for one in inputs)
+    if read or (out.is_file() and is_part(out)):
         what = "a file that is read" if read else "data of the campaign in that folder"
         message = f"-o {name} would replace {what}"
         raise InputError("usage", message, found=name, allowed="another file", remedy="name another file")

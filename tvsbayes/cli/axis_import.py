@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import typer
 
-from tvsbayes.cli.app import finish
+from tvsbayes.cli.app import finish, somebody_there
 from tvsbayes.cli.understood_columns import not_sure, table_document, table_lines
 from tvsbayes.errors import escaped, refusal, typed
 from tvsbayes.files.disk import make_folder, shipped_data, write_atomically
@@ -53,7 +52,7 @@ def import_readings(
     lines = table_lines(table, known, AXIS_FIELDS, unit)
     lines += [f"assumed: {text}" for text in (*found.assumed, told)]
     shown = "\n".join([*lines, f"gives: {len(found.moves)} moves, {len(found.readings)} readings"])
-    if not (yes or as_json) and sys.stdin.isatty():
+    if not (yes or as_json) and somebody_there():
         typer.echo(shown)
         yes = typer.confirm(f"write this into {escaped(str(to), 200)}?", default=False)
         shown = ""

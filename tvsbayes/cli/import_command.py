@@ -5,7 +5,6 @@ Options in, library called, table or JSON out; heavy imports stand inside the co
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -13,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from tvsbayes.cli import axis_commands
-from tvsbayes.cli.app import Json, finish, refuse_options, report_line
+from tvsbayes.cli.app import Json, finish, refuse_options, report_line, somebody_there
 from tvsbayes.cli.begin_commands import moves_file, rows_listed, write_templates
 from tvsbayes.cli.understood_columns import not_sure, table_document, table_lines
 from tvsbayes.errors import InputError, escaped, refusal, typed
@@ -74,7 +73,7 @@ def import_(
         return
     listed = _listed_moves(to)
     table = read_foreign(file, sheet)
-    asking = not (yes or as_json) and sys.stdin.isatty()
+    asking = not (yes or as_json) and somebody_there()
     known = _completed(table, understand(table.columns, stated), stated, listed is not None, asking)
     notation = Notation(pixels_from, angles, SD_PX if sd_px is None else sd_px, relative, approach)
     looks = looks_of(table, known.columns, notation, listed)
