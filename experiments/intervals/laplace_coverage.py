@@ -21,6 +21,7 @@ from experiments.common.command_line import act, study_parser
 from experiments.common.fits import compile_for
 from experiments.common.headlines import (
     HEADLINES,
+    MEAN_RATIOS,
     NOTE,
     SHRINK,
     judged,
@@ -80,11 +81,11 @@ def run(arguments: argparse.Namespace) -> None:
 
 
 def joint_table(good: list[dict]) -> None:
-    """Coverage and RMS z of the headlines of one protocol."""
+    """Coverage and RMS z of the headlines of one protocol, and of the mean ratios (`degrees_per_step`) behind them."""
     print(f"| quantity | contraction | RMS z | {level_titles()} | verdict | with sd x {SHRINK} |")
     print("|" + "---|" * (len(LEVELS) + 5))
     print(f"| bounds at 1e-4 | | {rms_limits(len(good))} | {level_limits(len(good))} | | |")
-    for name in HEADLINES:
+    for name in HEADLINES + MEAN_RATIOS:
         entries = [r["joint"][name] for r in good]
         contraction = float(np.median([e["contraction"] for e in entries]))
         found, shrunk = verdict(entries), verdict(entries, shrunk=True)
