@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+import shlex
 import shutil
 
 import numpy as np
@@ -95,6 +97,15 @@ def test_without_moves_their_counters_are_asked_for(ask, say, tmp_path):
     assert (code, error["file"], error["line"], error["column"]) == (2, "moves.csv", 2, "pan_steps")
     code, document = ask("new", tmp_path / "other", "--pictures", tmp_path / "pictures", "--pair", "name")
     assert code == 2 and "number, order" in assert_error(document, "usage")["message"]
+
+
+def test_commands_that_are_told_can_be_typed_as_they_stand(say, tmp_path):
+    """A shell takes the folder with its blank, quote and dollar for one word."""
+    drawn(tmp_path / "pictures", *pairs("0"))
+    out = tmp_path / "Anna's $laser 2"
+    _, text, _ = say("new", out, "--pictures", tmp_path / "pictures")
+    told = re.findall(r"`(tvsbayes (?:detect|check) .*?)`", text)
+    assert [shlex.split(each) for each in told] == [["tvsbayes", each, str(out)] for each in ("detect", "check")]
 
 
 def test_moves_that_are_numbered_anew_are_told(say, tmp_path):

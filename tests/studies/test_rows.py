@@ -63,6 +63,21 @@ def test_a_foreign_line_without_an_end_is_no_torn_row(tmp_path, job):
         assert path.read_bytes() == line
 
 
+def test_a_second_study_cuts_off_nothing_that_the_first_has_written(tmp_path, job):
+    """It begins while a row is half on disk, and adds its own after that row has become whole."""
+    path = tmp_path / "rows.jsonl"
+    first = StudyRows(path)
+    first.append(invented(job, 0))
+    first.append(invented(job, 1))
+    data = path.read_bytes()
+    path.write_bytes(data[:-30])
+    second = StudyRows(path)
+    path.write_bytes(data)
+    second.append(invented(job, 2))
+    first.append(invented(job, 3))
+    assert path.read_bytes().startswith(data) and sorted(StudyRows(path).of(job.key)) == [0, 1, 2, 3]
+
+
 def test_rows_that_cannot_be_written_are_refused_before_the_first_fit(tmp_path):
     with pytest.raises(InputError) as error:
         StudyRows(tmp_path / "no such folder" / "rows.jsonl")

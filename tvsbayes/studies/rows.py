@@ -120,7 +120,7 @@ class StudyRows:
         whole = data[: data.rfind(b"\n") + 1]
         rows = (self._row(line, number) for number, line in enumerate(whole.splitlines(), 1))
         self.rows = {(row.design, row.index): row for row in rows}
-        self.torn = len(data) - len(whole)
+        self.torn, self._size = len(data) - len(whole), len(data)
         # Of a file without one whole row: else somebody's only line, which never ended, would be cut off as torn.
         if not whole and not (data.startswith(_LINE_BEGINS) or _LINE_BEGINS.startswith(data)):
             raise self._no_row(1)
@@ -134,9 +134,9 @@ class StudyRows:
 
     @contextmanager
     def _open(self) -> Iterator[BinaryIO]:
-        """The file, for reading and writing; made where there is none."""
+        """The file, for whole lines at its end, whoever else writes there; made where there is none."""
         try:
-            with self.path.open("r+b" if self.path.exists() else "w+b") as file:
+            with self.path.open("ab") as file:
                 yield file
         except OSError as error:
             raise self._unwritable(escaped(error.strerror or str(error))) from error
@@ -168,10 +168,10 @@ class StudyRows:
         """Add a row and wait until the disk has it."""
         line = json.dumps({"format": STUDY_FORMAT, **row.as_json()}, allow_nan=False).encode() + b"\n"
         with self._open() as file:
-            if self.torn:
-                file.truncate(self.path.stat().st_size - self.torn)
-                self.torn = 0
-            file.seek(0, os.SEEK_END)
+            # Where the file has another size, its last line was no torn one but that of a second study.
+            if self.torn and self.path.stat().st_size == self._size:
+                file.truncate(self._size - self.torn)
+            self.torn = 0
             file.write(line)
             file.flush()
             os.fsync(file.fileno())

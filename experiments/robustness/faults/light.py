@@ -131,4 +131,12 @@ FAULTS = (
         "a service crashes instead of refusing",
         ("acquisition/operator::test_without_standard_input_nobody_can_be_asked",),
     ),
+    Fault(
+        "a question at a closed input ends the run in silence",
+        "acquisition/operator.py",
+        'self.terminal.say("nobody can be asked, standard input has ended: go on in a terminal, with --resume")',
+        "pass",
+        "a run that stops after an hour says nothing",
+        ("acquisition/operator::test_without_standard_input_nobody_can_be_asked",),
+    ),
 )

@@ -347,4 +347,12 @@ FAULTS = (
         "the description of the machine is lost",
         ("cli/planning_commands::test_a_plan_does_not_replace_the_rig_file_that_it_is_made_for",),
     ),
+    Fault(
+        "a second study cuts off a row that is whole by now",
+        "studies/rows.py",
+        "if self.torn and self.path.stat().st_size == self._size:",
+        "if self.torn:",
+        "campaigns of an hour are gone",
+        ("studies/rows::test_a_second_study_cuts_off_nothing_that_the_first_has_written",),
+    ),
 )

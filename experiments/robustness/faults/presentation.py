@@ -155,4 +155,31 @@ FAULTS = (
         "moves.csv is gone",
         ("cli/use_commands::test_no_output_replaces_the_data_of_a_campaign",),
     ),
+    Fault(
+        "an output without a folder is found out after the work",
+        "cli/app.py",
+        "    if not out.parent.is_dir():\n",
+        "    if False:\n",
+        "a fit of minutes is thrown away",
+        ("cli/use_commands::test_an_output_without_a_folder_is_refused_before_the_work",),
+    ),
+    Fault(
+        "large sizes of watch believed",
+        "report/watch_text.py",
+        'LINEAR = {"deg": 1.0, "mm": 10.0}',
+        'LINEAR = {"deg": 1e9, "mm": 1e9}',
+        "a positioner that fell over is put back by a number of the linear law",
+        ("report/watch_text",),
+    ),
+    Fault(
+        "paths in commands to type unquoted",
+        "errors.py",
+        "return shlex.quote(escaped(str(word), limit))",
+        "return escaped(str(word), limit)",
+        "a command that is copied works on another folder",
+        (
+            "cli/app",
+            "cli/begin_commands",
+        ),
+    ),
 )
