@@ -354,3 +354,9 @@ def test_counters_of_a_scanner_are_left_out_and_foretold(ask, say, grid_folder, 
     assert code == 0 and "RMS z" in text and "foretold" in text
     code, refused = ask("compare", grid_folder, "--by", "weeks")
     assert code == 2 and "positions" in json.dumps(refused)
+
+
+def test_without_experiments_nothing_is_fitted_to_be_compared(ask, grid_folder, monkeypatch):
+    monkeypatch.setattr("tvsbayes.cli.estimate_commands.fit_for", None)
+    code, document = ask("compare", grid_folder)
+    assert code == 3 and "--by positions" in assert_error(document, "no-experiments")["remedy"]

@@ -152,6 +152,7 @@ def compare(
 
     The gap between the two estimators term by term; with a later campaign B, what has changed since.
     """
+    from tvsbayes.estimators.four_point import select_experiments
     from tvsbayes.instrument.campaign import read_campaign
 
     if other is not None:
@@ -172,6 +173,8 @@ def compare(
         return
     folders = [campaign] if other is None else [campaign, other]
     data = [read_campaign(folder) for folder in folders]
+    if other is None and not len(select_experiments(data[0]).experiments):
+        raise _no_experiments()
     results = output_place(campaign, "results")
     fitting = [f"{FITTING} of {escaped(str(folder), 60)}" for folder in folders]
     stages = dict.fromkeys(fitting, 1.0) | {HOLDING_OUT: 0.0 if other else 6.0}
@@ -207,11 +210,21 @@ def _compare_positions(campaign: Path, as_json: bool) -> None:
     finish({**found.as_json(), "files": {}}, positions_text(found), as_json)
 
 
+def _no_experiments() -> NothingToEstimate:
+    return NothingToEstimate(
+        "no-experiments",
+        "the campaign has no complete four-point experiment: there is no classic estimate to compare with",
+        file="spots.csv",
+        remedy="number the looks in the columns experiment and point; without them `tvsbayes fit --details` says what "
+        "ratio, backlash and mirrors are, and `compare CAMPAIGN --by positions` how well they foretell looks",
+    )
+
+
 def _classic_against_joint(found: JointFit, by: str, seed: int, progress: Show | None) -> ComparisonRecord:
     """Why both estimators differ, and which foretells what it has not seen.
 
     Raises:
-        NothingToEstimate: there is no complete experiment.
+        NothingToEstimate: no complete experiment has an angle.
     """
     from tvsbayes.comparison.gap import explain_gap
     from tvsbayes.comparison.held_out import hold_out
@@ -220,12 +233,7 @@ def _classic_against_joint(found: JointFit, by: str, seed: int, progress: Show |
 
     gaps = explain_gap(found)
     if not any(gaps.values()):
-        raise NothingToEstimate(
-            "no-experiments",
-            "the campaign has no complete four-point experiment: there is no classic estimate to compare with",
-            file="spots.csv",
-            remedy="number the looks in the columns experiment and point, or use `tvsbayes fit`",
-        )
+        raise _no_experiments()
     return ComparisonRecord(gaps, hold_out(found, by, seed, progress=progress), input_hashes(found.campaign), seed)
 
 
