@@ -21,7 +21,7 @@ import numpy as np
 from experiments.common.command_line import parser
 from experiments.common.figures import page_figure, title_and_figure
 from experiments.common.rows import append_row, output, read_rows, run_rows
-from experiments.real.axis_files import axis_of
+from experiments.real.axis_files import axis_of, tables_of
 from tvsbayes.report.drawing import BLUE, RED
 from tvsbayes.single_axis.axis_campaign import AxisCampaign, AxisMove
 from tvsbayes.single_axis.axis_fit import fit_axis
@@ -94,7 +94,7 @@ def simulate(arguments: argparse.Namespace) -> None:
 def run(arguments: argparse.Namespace) -> None:
     """Rows of held-out positions of every table in a folder."""
     HELD.unlink(missing_ok=True)
-    for file in sorted(arguments.folder.glob("*.csv")):
+    for file in tables_of(arguments.folder):
         found = hold_out_positions(axis_of(file))
         for p in found.positions:
             z, classic_z = (p.mean - p.predicted) / p.u, (p.mean - p.classic_predicted) / p.classic_u

@@ -39,13 +39,21 @@ def axis_of(table: Path) -> AxisCampaign:
     return AxisCampaign("mm", tuple(moves), tuple(readings), header={"name": table.stem})
 
 
+def tables_of(folder: Path) -> list[Path]:
+    """The tables of a folder; none would be an empty study."""
+    found = sorted(folder.glob("*.csv"))
+    if not found:
+        raise SystemExit(f"{folder} holds no .csv")
+    return found
+
+
 def main() -> None:
     """Write every folder."""
     made = parser(__doc__)
     made.add_argument("folder", type=Path)
     made.add_argument("out", type=Path)
     arguments = made.parse_args()
-    for table in sorted(arguments.folder.glob("*.csv")):
+    for table in tables_of(arguments.folder):
         write_axis(axis_of(table), arguments.out / table.stem)
         print(arguments.out / table.stem)
 
