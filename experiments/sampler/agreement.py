@@ -174,12 +174,12 @@ def table(arguments: argparse.Namespace) -> None:
         "NUTS: four chains in step in sheared coordinates (`nuts_reference.py`), of the same model and data. Where it"
     )
     print(
-        "diverges it may miss a tail (Betancourt, arXiv:1701.02434, section 6.2): there tier 1 against the chain decides,"
+        "diverges it may miss a tail (Betancourt, arXiv:1701.02434, section 6.2); tier 1 against the chain stands beside."
     )
     print(
-        "which share no step. Within: means within 0.1 sd and sds within 6 %. Undecided: beyond, but by no more than four"
+        "Within: means within 0.1 sd and sds within 6 %. Undecided: beyond, but by no more than four Monte Carlo errors"
     )
-    print("Monte Carlo errors of both, so that more draws would have to tell. OUTSIDE: by more.\n")
+    print("of both, so that more draws would have to tell. OUTSIDE: by more.\n")
     print("| case | chains x (warm-up + draws) | leapfrogs | divergences | largest R-hat | worst bulk ESS | CPU s |")
     print("|---|---|---|---|---|---|---|")
     for case in cases:
