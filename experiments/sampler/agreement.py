@@ -173,9 +173,7 @@ def table(arguments: argparse.Namespace) -> None:
     print(
         "NUTS: four chains in step in sheared coordinates (`nuts_reference.py`), of the same model and data. Where it"
     )
-    print(
-        "diverges it may miss a tail (Betancourt, arXiv:1701.02434, section 6.2); tier 1 against the chain stands beside."
-    )
+    print("diverges it may miss a tail (Betancourt, arXiv:1701.02434, section 6.2); tier 1 and chain stand beside.")
     print(
         "Within: means within 0.1 sd and sds within 6 %. Undecided: beyond, but by no more than four Monte Carlo errors"
     )
