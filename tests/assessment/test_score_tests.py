@@ -18,7 +18,7 @@ from support.dozen_spots import coordinates
 from support.drawn_residuals import drawn_residual
 from support.small_results import small_summary
 
-from tvsbayes.assessment.score_tests import VALIDATION_LEVEL, _Answer, _holm, validate
+from tvsbayes.assessment.score_tests import VALIDATION_LEVEL, _Answer, _defects_in_place, _holm, _SeenAxis, validate
 from tvsbayes.estimators.joint_fit import JointFit, fit_at
 from tvsbayes.estimators.linear_spots import linear_spots
 from tvsbayes.estimators.mode_search import Problem
@@ -226,3 +226,13 @@ def test_the_larger_of_two_gross_defects_is_the_cause():
         assert (ends[1] - ends[0]) / 1000 == pytest.approx(-0.5, abs=3 / 1000)
     spot, cameras = (_Answer(float(log_chance(x, 3)), str(x), "", x, 3, 0.0) for x in (1600.0, 1e5))
     assert _holm([spot, cameras]).cause.startswith("100000.0")
+
+
+def test_an_axis_that_a_search_has_left_without_motion_has_no_waves(clean):
+    """A ratio of nought, where a search ended that fits no rig: its misfit refuses it, not a division by 0."""
+    n = len(ordered_spots(clean.campaign))
+    moving, still = (
+        _SeenAxis("pan", np.ones((n, 4, 1)), angle, np.arange(n), np.ones(n)) for angle in (np.arange(n), np.zeros(n))
+    )
+    assert _defects_in_place(clean, [moving, moving])[0].places
+    assert not _defects_in_place(clean, [still, still])[0].places

@@ -236,7 +236,11 @@ RIG_REFUSED = {
     "baseline 0": ("[rig]\nbaseline_mm = { value = 0, u = 0.1 }", 2, "from 1 to"),
     "focal scale": ("[rig]\nfocal_scale = { value = -1, u = 0.1 }", 2, "from 0.5 to 2"),
     "C0": ("[rig]\npan_zero_emission_deg = { value = 181, u = 0.1 }", 2, "from 0 to 180"),
-    "half-normal": ("[rig.prior]\n'backlash_deg.pan' = { value = 0.2, u = 0.1 }", 2, "exactly 0"),
+    "half-normal": (
+        "[rig.prior]\n'backlash_deg.pan' = { value = 0.2, u = 0.1 }",
+        2,
+        "exactly 0; write value = 0: it is the size",
+    ),
     "ratio 0": ("[rig.prior]\n'degrees_per_step.pan' = { value = 0, u = 0.1 }", 2, "number from"),
     "ratio in steps per degree": (
         "[rig.prior]\n'degrees_per_step.pan' = { value = 16.7, u = 0.1 }",

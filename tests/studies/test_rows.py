@@ -86,6 +86,22 @@ def test_rows_that_cannot_be_written_are_refused_before_the_first_fit(tmp_path):
     assert error.value.code == "write" and "--rows" in error.value.remedy
 
 
+def test_a_file_that_takes_no_row_is_refused_before_the_first_fit(tmp_path, monkeypatch):
+    """By trying: whoever is root may write what `access` knows, and not a file that is immutable."""
+    path = tmp_path / "rows.jsonl"
+    path.touch()
+    taken = type(path).open
+
+    def refused(self, mode="r", *rest, **more):
+        if "a" in mode:
+            raise PermissionError(1, "Operation not permitted")
+        return taken(self, mode, *rest, **more)
+
+    monkeypatch.setattr(type(path), "open", refused)
+    with pytest.raises(InputError, match="found Operation not permitted"):
+        StudyRows(path)
+
+
 def test_a_row_is_read_as_it_was_written(job):
     """Also one whose fit failed, which has neither headlines nor a target."""
     failed = StudyRow(job.key, 4, 1, False, 2, ("did not settle",), 1.0)

@@ -145,8 +145,9 @@ def _defects_in_place(fit: JointFit, axes: Sequence[_SeenAxis]) -> list[_Defect]
     places, waves = [], []
     for axis in axes:
         stops = len(np.unique(axis.counter))
-        # Fewer stops than this fit any wave.
-        periods = 2 * np.ptp(axis.angle_deg) / np.arange(1, min(WAVES, 2 * stops) + 1) if stops > 3 else ()
+        # Fewer stops than this fit any wave; a search that has left every rig may end where an axis does not turn.
+        reach = 2 * float(np.ptp(axis.angle_deg)) if stops > 3 else 0.0
+        periods = reach / np.arange(1, min(WAVES, 2 * stops) + 1) if reach else ()
         for period in [*periods, *fit.campaign.rig.harmonic_period_deg.get(axis.name, ())]:
             phase = 2 * np.pi * axis.angle_deg / period
             waves.append(np.concatenate([_times(axis.push, np.cos(phase)), _times(axis.push, np.sin(phase))], axis=2))

@@ -5,8 +5,6 @@ Options in, library called, table or JSON out; heavy imports stand inside the co
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -14,11 +12,11 @@ import typer
 
 from tvsbayes.cli import axis_commands
 from tvsbayes.cli.app import CampaignFolder, Json, Seed, command_line, finish, finite, keep, refuse_options, report_line
-from tvsbayes.cli.progress_bar import waiting
+from tvsbayes.cli.progress_bar import chain_kept, waiting
 from tvsbayes.errors import InputError, NothingToEstimate, escaped
 from tvsbayes.files.disk import output_place
-from tvsbayes.pipeline import FITTING, MAX_MINUTES, SAMPLING, calibrate, compile_for, fit_for
-from tvsbayes.progress import Job, Progress, Show
+from tvsbayes.pipeline import FITTING, MAX_MINUTES, calibrate, compile_for, fit_for
+from tvsbayes.progress import Job, Show
 
 if TYPE_CHECKING:
     from tvsbayes.estimators.joint_fit import JointFit
@@ -103,7 +101,7 @@ def fit(
     from tvsbayes.report.fit_text import fit_text
 
     compile_for(report_line)
-    with _chain_kept() as progress:
+    with chain_kept("go on with --resume") as progress:
         results = calibrate(
             data,
             out or output_place(campaign, "results"),
@@ -235,26 +233,3 @@ def _classic_against_joint(found: JointFit, by: str, seed: int, progress: Show |
     if not any(gaps.values()):
         raise _no_experiments()
     return ComparisonRecord(gaps, hold_out(found, by, seed, progress=progress), input_hashes(found.campaign), seed)
-
-
-@contextmanager
-def _chain_kept() -> Iterator[Show]:
-    """`waiting` for a fit; Ctrl-C says how to go on with its chain."""
-    from tvsbayes.posterior.sampling import WALKING
-
-    told = 0
-    try:
-        with waiting() as shown:
-
-            def show(state: Progress) -> None:
-                nonlocal told
-                told += state.doing == f"{SAMPLING}: {WALKING}"
-                if shown is not None:
-                    shown(state)
-
-            yield show
-    except KeyboardInterrupt:
-        # It is told of once when it begins: before the first block of steps there is no chain to keep.
-        if told > 1:
-            report_line("the chain so far is kept in chain.npz; go on with --resume")
-        raise

@@ -1,4 +1,7 @@
-"""The bar that shows a wait: on stderr, where that is a terminal, for a wait that has lasted two seconds."""
+"""The bar that shows a wait: on stderr, where that is a terminal, for a wait that has lasted two seconds.
+
+What an interrupted wait leaves behind is told too.
+"""
 
 from __future__ import annotations
 
@@ -9,6 +12,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
+from tvsbayes.cli.app import report_line
+from tvsbayes.pipeline import SAMPLING
 from tvsbayes.progress import SHOWN_AFTER_SECONDS, Progress, Show, time_left
 
 if TYPE_CHECKING:
@@ -26,6 +31,29 @@ def waiting() -> Iterator[Show | None]:
         yield shown.show
     finally:
         shown.close()
+
+
+@contextmanager
+def chain_kept(further: str) -> Iterator[Show]:
+    """`waiting` for a fit; Ctrl-C says that its chain is kept, and how to go on with it."""
+    from tvsbayes.posterior.sampling import WALKING
+
+    told = 0
+    try:
+        with waiting() as shown:
+
+            def show(state: Progress) -> None:
+                nonlocal told
+                told += state.doing == f"{SAMPLING}: {WALKING}"
+                if shown is not None:
+                    shown(state)
+
+            yield show
+    except KeyboardInterrupt:
+        # It is told of once when it begins: before the first block of steps there is no chain to keep.
+        if told > 1:
+            report_line(f"the chain so far is kept in chain.npz; {further}")
+        raise
 
 
 class _Shown:

@@ -18,6 +18,7 @@ from tvsbayes.cli.app import (
     Ended,
     Json,
     Seed,
+    command_line,
     finish,
     finite,
     refuse_options,
@@ -27,7 +28,7 @@ from tvsbayes.cli.app import (
     tell_removed,
 )
 from tvsbayes.cli.campaign_commands import campaign_held
-from tvsbayes.cli.progress_bar import waiting
+from tvsbayes.cli.progress_bar import chain_kept, waiting
 from tvsbayes.errors import InputError, NothingToEstimate
 from tvsbayes.files.disk import output_place, write_atomically
 from tvsbayes.pipeline import FITTING, MAX_MINUTES, compile_for, record_for
@@ -281,7 +282,7 @@ def calibrate(
     documents["classic"], told = _classic(data)
     tell_part(told, as_json)
     compile_for(report_line)
-    with waiting() as progress:
+    with chain_kept(f"go on with `{command_line('fit', campaign)} --resume`") as progress:
         results = calibrate_campaign(
             data,
             output_place(campaign, "results"),

@@ -402,10 +402,14 @@ def study(
     missing = n - sum(index < n for index in kept.of(job.key))
     report_line(f"{n} campaigns, {missing} to go on engine {escaped(engine)}; rows in {escaped(str(kept.path), 200)}")
 
-    with waiting() as progress:
-        result = run_study(
-            job, n, kept, engine=engine, workers=workers or WORKERS, address=scheduler, progress=progress
-        )
+    try:
+        with waiting() as progress:
+            result = run_study(
+                job, n, kept, engine=engine, workers=workers or WORKERS, address=scheduler, progress=progress
+            )
+    except KeyboardInterrupt:
+        report_line("every campaign that is done is kept; the same command goes on from there")
+        raise
     document = {**result.as_json(), "rows": str(kept.path), "engine": engine, "seed": seed}
     finish(document, study_text(result), as_json)
     if target is not None and result.assurance < ASSURED[0]:

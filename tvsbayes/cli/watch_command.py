@@ -68,7 +68,7 @@ def _append(table: Path, found: Watch) -> InputError | None:
     now = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
     moved = "; ".join(map(moved_words, found.moved))
     try:
-        append_line(table, TABLE_COLUMNS, (now, found.verdict, found.p, found.looks, moved))
+        append_line(table, TABLE_COLUMNS, (now, found.verdict, float(f"{found.p:.3g}"), found.looks, moved))
     except InputError as error:
         return error
     return None

@@ -11,12 +11,10 @@ from tvsbayes.errors import InputError, NotConverged
 from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.instrument.rig import Rig
 from tvsbayes.planning.watch_design import Pattern, WatchDesigns
-from tvsbayes.results.watch_record import PlannedChange, WatchPlan
+from tvsbayes.results.watch_record import LOOKS_MAX, PlannedChange, WatchPlan
 
 MINUTES = 10.0
 """Of a plan that nobody limits."""
-LARGEST = 384
-"""Looks of a plan at most; a need beyond is told, not planned."""
 HOMINGS_MAX = 3000
 """On a sheet, up to which a need is told."""
 RUNGS = np.unique(np.geomspace(1, HOMINGS_MAX, 30).round().astype(int))
@@ -46,7 +44,7 @@ class _Tried:
         """Which rungs a budget allows."""
         looks = RUNGS * self.pattern.size
         taken = np.array([self.minutes(int(homings)) for homings in RUNGS])
-        return (taken <= minutes) & (looks <= LARGEST) & (looks >= LOOKS_MIN)
+        return (taken <= minutes) & (looks <= LOOKS_MAX) & (looks >= LOOKS_MIN)
 
 
 def _tried(designs: WatchDesigns) -> list[_Tried]:
@@ -209,7 +207,7 @@ def _corrected(designs: WatchDesigns, need: _Need, wanted: np.ndarray, minutes: 
     for _ in range(CORRECTIONS):
         more = homings + -(-homings // 10)
         enough = np.all(np.array(judged)[wanted] >= POWER_MIN)
-        if enough or need.tried.minutes(more) > minutes or need.tried.looks(more) > LARGEST:
+        if enough or need.tried.minutes(more) > minutes or need.tried.looks(more) > LOOKS_MAX:
             break
         homings, judged = more, designs.judged(need.tried.pattern, more)
     return homings, judged

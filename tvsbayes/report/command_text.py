@@ -360,7 +360,15 @@ def changes_text(comparison: Comparison) -> str:
     table = TableView(title, ["quantity", "A", "B", "B - A (u)", "unit", "normalised", "significant"], rows).text()
     days = "" if comparison.days is None else f" in {comparison.days:.1f} days"
     cameras = "the same stereo calibration: its error is left out of u" if comparison.shared_cameras else "two cameras"
-    return f"{table}\n{comparison.verdict}{days} (limit {comparison.limit:.2f} u for all together; {cameras})"
+    found = f"{table}\n{comparison.verdict}{days} (limit {comparison.limit:.2f} u for all together; {cameras})"
+    ratios = [c for c in comparison.changes if c.unit == "deg/step" and c.u > 0]
+    if ratios and not any(c.significant for c in comparison.changes):
+        hidden = max(comparison.limit * c.u / abs(c.first) for c in ratios)
+        found += (
+            f"\nthat is no proof of none: a ratio may have changed by {100 * hidden:.2g} % unseen; "
+            "`tvsbayes watch A B` holds the looks of B against A and sees smaller changes"
+        )
+    return found
 
 
 def study_text(result: StudyResult) -> str:
@@ -379,6 +387,12 @@ def study_text(result: StudyResult) -> str:
     a, b = result.assurance_interval95
     share = f"{100 * result.assurance:.1f} % of fits ({100 * a:.1f} to {100 * b:.1f} %)"
     lines.append(f"{t.text}: reported as met by {share}")
+    if a < ASSURED[0] <= b:
+        lines.append(f"so many campaigns do not tell whether {100 * ASSURED[0]:.0f} % do: add to them with more --n")
+    lines.append(
+        f"bounds: what a true sd leaves with all but a chance of {BOUND:g}; power: share of fits that tell it from 0 "
+        "or the stated ratio; how many looks a target needs is asked of `tvsbayes plan`"
+    )
     if result.reported is not None:
         lines.append("reported: {:.3g}, {:.3g}, {:.3g}".format(*result.reported) + f" {t.unit} (5, 50, 95 % of fits)")
     lines += [f"failed: {p}" for p in result.problems[:5]]

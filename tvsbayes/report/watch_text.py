@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from tvsbayes.report.tables import TableView, concise
-from tvsbayes.results.watch_record import CANNOT_TELL, MOVED, MovedPart, PlannedChange, Watch, WatchPlan
+from tvsbayes.results.watch_record import CANNOT_TELL, LOOKS_MAX, MOVED, MovedPart, PlannedChange, Watch, WatchPlan
 
 HELPS = {
     "cameras: rotation": "more looks on both sheets, over the whole picture",
@@ -56,8 +56,13 @@ def watch_text(found: Watch, power_min: float) -> str:
             "sizes are linear about the calibration: such large ones are rough, beyond the u that stands there"
         )
     if found.verdict == MOVED:
-        causes = dict.fromkeys(part.what.split(":")[0] for part in found.moved)
-        lines += [f"what to do: {MISSED[cause]}" for cause in causes]
+        causes = list(dict.fromkeys(part.what.split(":")[0] for part in found.moved))
+        lines.append(f"what to do: {MISSED[causes[0]]}")
+        if len(causes) > 1:
+            left = ", ".join(causes[1:])
+            lines.append(
+                f"then watch again: what is told of {left} takes what the first leaves, and may be no motion of its own"
+            )
     unseen = found.unseen(power_min)
     if found.verdict == CANNOT_TELL:
         lines += [f"cannot see {c.size:g} {c.unit} of {c.what}: {HELPS[c.what]}" for c in unseen]
@@ -90,10 +95,13 @@ def watch_plan_text(plan: WatchPlan) -> str:
         missed = f"{c.size:g} {c.unit} of {c.what} is noticed in {100 * c.power:.0f} % of the cases"
         if c.looks_needed is not None:
             more = f"{c.looks_needed} looks after {c.homings_needed} homings ({c.minutes_needed:.0f} minutes) would do"
+            if c.looks_needed > LOOKS_MAX:
+                more += f", more than the {LOOKS_MAX} that are planned at most"
             lines.append(f"{missed}: {more}; {HELPS[c.what]}")
         else:
             enough = "; what would do was not found"
             if c.looks_to_add is not None:
-                enough = f": add about {c.looks_to_add} looks to it, and take as many at every watch"
+                enough = f": add about {c.looks_to_add} looks to it like those of this plan, homed as often (others, "
+                enough += "after one homing, tell less), and take as many at every watch"
             lines.append(f"{missed}, and no number of looks does better: the campaign knows too little of it{enough}")
     return "\n".join([*lines, "", table.text()])

@@ -15,6 +15,8 @@ Verdict = Literal["OK", "MOVED", "CANNOT TELL"]
 OK: Verdict = "OK"
 MOVED: Verdict = "MOVED"
 CANNOT_TELL: Verdict = "CANNOT TELL"
+LOOKS_MAX = 384
+"""Of a plan for `watch`; a need beyond is told, not planned."""
 
 
 @dataclass(frozen=True)

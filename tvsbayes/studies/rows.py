@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import os
+import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
@@ -124,9 +125,17 @@ class StudyRows:
         # Of a file without one whole row: else somebody's only line, which never ended, would be cut off as torn.
         if not whole and not (data.startswith(_LINE_BEGINS) or _LINE_BEGINS.startswith(data)):
             raise self._no_row(1)
-        # Before the first campaign is fitted, not after.
-        if not os.access(self.path if self.path.exists() else self.path.parent, os.W_OK):
-            raise self._unwritable("no right to write, or no such folder")
+        self._try()
+
+    def _try(self) -> None:
+        """Refuse a file that cannot be written, before the first campaign is fitted; nothing is left of the trial."""
+        try:
+            if self.path.exists():
+                self.path.open("ab").close()
+            else:
+                tempfile.TemporaryFile(dir=self.path.parent).close()
+        except OSError as error:
+            raise self._unwritable(escaped(error.strerror or str(error))) from error
 
     def _unwritable(self, found: str) -> InputError:
         allowed, remedy = "a file that can be written", "name another with --rows"
