@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 from tvsbayes.display import Shown, View
 from tvsbayes.errors import MISFIT_REMEDY, NotConverged, NothingToEstimate, TvsError, escaped
-from tvsbayes.files.disk import make_folder, output_place
+from tvsbayes.files.disk import make_folder, output_place, require_writable
 from tvsbayes.instrument.axes import AXES
 from tvsbayes.instrument.model_choice import AS_STATED, ModelChoice
 from tvsbayes.progress import Job, Show
@@ -159,6 +159,8 @@ def calibrate(
     from tvsbayes.estimators.joint_fit import fit_stages
 
     place = None if folder is None else Path(folder)
+    if place is not None:
+        require_writable(place)
     fitting = {FITTING: sum(fit_stages(model.robust, campaign.moves).values())}
     with Job(fitting | _later_stages(sampled, tier, place), progress) as job:
         found = fit_joint(campaign, model=model, seed=seed, progress=job.part(FITTING))
@@ -354,5 +356,7 @@ def record_for(campaign: Campaign, folder: Path, tell: Tell = untold, progress: 
         # An old fit.json beside new draws would be the report of other data.
         if record.evidence is not None and record.provenance.inputs == input_hashes(campaign):
             return record
+    place = output_place(folder, "results")
+    require_writable(place)
     found = _converged_fit(campaign, tell, progress)
-    return _results(found, None, 0, output_place(folder, "results"), {}, tell).record
+    return _results(found, None, 0, place, {}, tell).record

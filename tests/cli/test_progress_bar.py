@@ -14,7 +14,10 @@ import pytest
 from support.commands import MOUNTED
 from support.pseudo_terminal import needs_pseudo_terminals
 
-from tvsbayes.progress import time_left
+from tvsbayes.cli.progress_bar import chain_kept
+from tvsbayes.pipeline import FITTING, SAMPLING
+from tvsbayes.posterior.sampling import WALKING
+from tvsbayes.progress import Progress, time_left
 
 SCRIPT = """
 import sys, threading
@@ -128,3 +131,13 @@ def test_a_command_keeps_its_document_apart_from_the_bar(tmp_path):
 )
 def test_time_left_in_words(seconds, text):
     assert time_left(seconds) == text
+
+
+@pytest.mark.parametrize(("blocks", "said"), [(0, False), (1, False), (3, True)])
+def test_an_interrupted_fit_says_that_its_chain_is_kept_where_there_is_one(capsys, blocks, said):
+    with pytest.raises(KeyboardInterrupt), chain_kept("go on with --resume") as show:
+        show(Progress(FITTING, 0.5, 1.0, None))
+        for _ in range(blocks):
+            show(Progress(f"{SAMPLING}: {WALKING}", 0.7, 2.0, None))
+        raise KeyboardInterrupt
+    assert ("chain.npz; go on with --resume" in capsys.readouterr().err) == said

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from tvsbayes.errors import InputError
-from tvsbayes.files.disk import decode, read_bytes, shipped_data, write_atomically
+from tvsbayes.files.disk import decode, read_bytes, require_writable, shipped_data, write_atomically
 
 
 def test_only_regular_files_inside_the_folder(tmp_path):
@@ -109,3 +109,14 @@ def test_shipped_data_lies_beside_a_checkout_or_inside_a_wheel():
     data = shipped_data()
     package = Path(__file__).resolve().parents[2] / "tvsbayes"
     assert data.name == "data" and data.parent.name in ("tvsbayes", package.parent.name)
+
+
+def test_a_place_for_results_is_tried_before_the_work(tmp_path):
+    """Nothing is made, nothing left; a file in its way is named as what it is."""
+    require_writable(tmp_path / "a" / "results")
+    require_writable(tmp_path)
+    assert list(tmp_path.iterdir()) == []
+    (tmp_path / "file").touch()
+    with pytest.raises(InputError, match="Not a directory") as refused:
+        require_writable(tmp_path / "file")
+    assert refused.value.code == "write" and "--out" in refused.value.remedy

@@ -253,7 +253,7 @@ def _row_doubt(pattern: SpotPattern, points_mm: np.ndarray, counters: dict[Axis,
     return (
         f"{which} follow the counters of the move {'after' if lag > 0 else 'before'} theirs, not of the one that "
         f"spots.csv names (spot {first.spot}: move {first.move}): do pictures or rows count from 1, or is a row of "
-        "moves.csv missing or one too many? moves count from 0"
+        f"moves.csv missing or one too many? {'add 1 to' if lag > 0 else 'take 1 from'} their column move"
     )
 
 

@@ -257,6 +257,26 @@ def make_folder(folder: Path, *, empty: bool = False) -> None:
         raise refusal("occupied", file=place, found="a folder with files", allowed=allowed, remedy=remedy)
 
 
+def require_writable(folder: Path) -> None:
+    """Refuse a folder for results that takes none, before the work; nothing is left of the trial.
+
+    Args:
+        folder: where to; where it is missing, that in which it would be made.
+
+    Raises:
+        InputError: no file can be written there.
+    """
+    import tempfile
+
+    folder = Path(folder)
+    try:
+        tempfile.TemporaryFile(dir=next(each for each in (folder, *folder.absolute().parents) if each.exists())).close()
+    except OSError as error:
+        found, allowed = escaped(error.strerror or str(error)), "a folder that can be written"
+        remedy, place = "free it, or name another place where the command has --out", escaped(str(folder), 200)
+        raise refusal("write", file=place, found=found, allowed=allowed, remedy=remedy) from error
+
+
 def output_place(folder: Path, *names: str) -> Path:
     """`folder / names`, a place for output that no link leads out of the folder.
 

@@ -263,7 +263,8 @@ def intervals(
     seen = {d: (x.mean_deg_per_step, x.interval95_gum or (x.mean_deg_per_step,) * 2) for d, x in classic.items() if x}
     with drawing(3.2) as figure:
         axes = figure.add_subplot()
-        for offset, name, results in ((-0.12, "classic", seen), (0.12, "joint", told)):
+        apart = 0.12 if seen and told else 0.0
+        for offset, name, results in ((-apart, "classic", seen), (apart, "joint", told)):
             colour, marker = OF_ESTIMATOR[name]
             # Of the first only, or every point would have its line in the legend.
             label: str | None = name
