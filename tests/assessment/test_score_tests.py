@@ -188,6 +188,11 @@ def test_no_reader_of_the_text_can_miss_a_failure():
     assert lines[0] == warning and lines[-1] == "verdict: VALIDATION FAILED, multiply every u and half-width by 3.25"
     assert [line for line in lines if line.startswith("what helps: fix the cameras")]
     passed = replace(FAILED, passed=True, cause="", inflation=1.0, tests=(replace(FAILED.tests[0], failed=False),))
+    # Spots that scatter eleven times as far: noise to be stated where the model holds, its failure where not.
+    scale = replace(small_summary().parameters["pixel_scale"], value=11.0)
+    noisy = replace(small_summary(), parameters={**small_summary().parameters, "pixel_scale": scale})
+    told = [("state larger ones" in fit_text(replace(noisy, validation=each))) for each in (passed, FAILED)]
+    assert told == [True, False]
     text = fit_text(replace(small_summary(), validation=passed), details=True)
     assert "VALIDATION" not in text and "validation: no sign of a model error in 1 tests" in text
 

@@ -57,7 +57,8 @@ def fit_text(summary: FitSummary, details: bool = False, written: Sequence[str] 
         lines.append(f"excluded spots: {', '.join(map(str, summary.excluded_spots))}")
     if summary.suspect_spots:
         lines.append(f"{suspect_line(summary.suspect_spots)}; look at them, or fit with --robust")
-    if (noise := noise_line(summary)) is not None:
+    # Where the model fails, its scatter is no noise.
+    if failed(summary) is None and (noise := noise_line(summary)) is not None:
         lines.append(noise)
     if written:
         lines.append(f"written: {', '.join(written)}")

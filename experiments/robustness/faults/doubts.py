@@ -83,4 +83,12 @@ FAULTS = (
         "a missing row of the log stays unseen",
         ("estimators/spot_pattern::test_rows_that_are_one_apart_are_named_from_where_they_are",),
     ),
+    Fault(
+        "waves over a range of nought",
+        "assessment/score_tests.py",
+        "periods = reach / np.arange(1, min(WAVES, 2 * stops) + 1) if reach else ()",
+        "periods = reach / np.arange(1, min(WAVES, 2 * stops) + 1)",
+        "warnings of NumPy instead of words",
+        ("assessment/score_tests::test_an_axis_that_a_search_has_left_without_motion_has_no_waves",),
+    ),
 )

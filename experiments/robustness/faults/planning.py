@@ -355,4 +355,20 @@ FAULTS = (
         "campaigns of an hour are gone",
         ("studies/rows::test_a_second_study_cuts_off_nothing_that_the_first_has_written",),
     ),
+    Fault(
+        "a dozen campaigns decide about an assurance",
+        "report/command_text.py",
+        "if a < ASSURED[0] <= b:",
+        "if a > ASSURED[0] >= b:",
+        "a good design is given up after twelve campaigns",
+        ("studies/study",),
+    ),
+    Fault(
+        "rows tried after the first campaign",
+        "studies/rows.py",
+        "        self._try()\n",
+        "",
+        "a campaign's fit is thrown away",
+        ("studies/rows",),
+    ),
 )
