@@ -14,10 +14,11 @@ from support.waits import check_forward, doings
 
 import tvsbayes
 from tvsbayes.cli.app import report_line
+from tvsbayes.errors import InputError
 from tvsbayes.instrument.campaign import input_hashes, read_campaign
 from tvsbayes.instrument.model_choice import ModelChoice
 from tvsbayes.model.compiled import Traces
-from tvsbayes.pipeline import FITTING, SUMMARISING, compile_for, fit_for, record_for
+from tvsbayes.pipeline import FITTING, SUMMARISING, calibrate, compile_for, fit_for, record_for
 
 pytestmark = pytest.mark.usefixtures("own_compilation_cache")
 
@@ -132,3 +133,14 @@ def test_no_sample_of_another_fit_stays_beside_a_record(grid_folder):
     assert record.summary.estimator == "laplace" and (results / "fit.json").is_file()
     assert not (results / "posterior.nc").exists()
     assert any("posterior.nc of an earlier fit is removed" in line for line in told)
+
+
+@pytest.mark.parametrize("made", [calibrate, record_for])
+def test_a_place_that_takes_no_results_is_refused_before_the_fit(grid_folder, monkeypatch, made):
+    """As an immutable folder or a read-only disk are."""
+    monkeypatch.setattr("tvsbayes.estimators.joint_fit.fit", None)
+    (grid_folder / "results").touch()
+    place = grid_folder / "results" if made is calibrate else grid_folder
+    with pytest.raises(InputError) as refused:
+        made(read_campaign(grid_folder), place)
+    assert refused.value.code == "write"
