@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import importlib
+import sys
 import tomllib
 from dataclasses import replace
 from pathlib import Path
@@ -40,15 +42,19 @@ def test_ours_are_registered_like_any_other():
     assert stated == {group: dict(drivers) for group, drivers in OWN.items()}
 
 
-@pytest.fixture
-def installed(tmp_path, monkeypatch):
-    """A package with a driver, as pip would leave it."""
+@pytest.fixture(params=["before", "behind"])
+def installed(request, tmp_path, monkeypatch):
+    """A package with a driver, as pip would leave it, before or behind our own: of two of one name the last counts."""
     (tmp_path / "lab_turntable.py").write_text(FOREIGN)
     info = tmp_path / "lab_turntable-1.0.dist-info"
     info.mkdir()
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: lab-turntable\nVersion: 1.0\n")
     (info / "entry_points.txt").write_text(ENTRY_POINTS)
-    monkeypatch.syspath_prepend(tmp_path)
+    path = [str(tmp_path), *sys.path] if request.param == "before" else [*sys.path, str(tmp_path)]
+    monkeypatch.setattr(sys, "path", path)
+    importlib.invalidate_caches()
+    yield
+    sys.modules.pop("lab_turntable", None)
 
 
 @pytest.mark.usefixtures("installed")
