@@ -318,7 +318,12 @@ def _why_not_stored(campaign: Campaign) -> str:
 
     path = None if campaign.path is None else campaign.path / "results" / "fit.json"
     if path is None or not path.exists():
-        return "there are no results/ yet"
+        begun = path is not None and path.with_name("chain.npz").exists()
+        return (
+            "results/ hold an interrupted chain alone (`tvsbayes fit --resume`)"
+            if begun
+            else "there are no results/ yet"
+        )
     record = read_fit(path)
     now, told = input_hashes(campaign), record.provenance
     others = [HASHED[name] for name in HASHED if told.inputs.get(name) != now[name]]

@@ -60,6 +60,9 @@ def test_whoever_waits_for_a_fit_is_told_why(grid_folder, monkeypatch):
 
     assert why() == "there are no results/ yet"
     (grid_folder / "results").mkdir()
+    (grid_folder / "results" / "chain.npz").touch()
+    assert why() == "results/ hold an interrupted chain alone (`tvsbayes fit --resume`)"
+    (grid_folder / "results" / "chain.npz").unlink()
     path, campaign = grid_folder / "results" / "fit.json", read_campaign(grid_folder)
     own = small_record(whole_summary(), seed=3)
 
