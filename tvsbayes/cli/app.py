@@ -159,7 +159,7 @@ PARTS = ("campaign.toml", "stereo.json", "moves.csv", "spots.csv", "readings.csv
 
 def is_part(path: Path) -> bool:
     """Whether a file is one of those that make a campaign of the folder it lies in."""
-    return path.name in PARTS and (path.parent / PARTS[0]).is_file()
+    return path.name in PARTS and path.is_file() and (path.parent / PARTS[0]).is_file()
 
 
 def refuse_options(reason: str, remedy: str, **given: object) -> None:
@@ -186,7 +186,7 @@ def spared(out: Path | None, *inputs: Path | None) -> None:
         found, remedy = "no such folder", "make the folder, or name another place"
         raise refusal("write", file=name, found=found, allowed="a writable folder with free space", remedy=remedy)
     read = out.is_file() and any(one is not None and one.is_file() and one.samefile(out) for one in inputs)
-    if read or (out.is_file() and is_part(out)):
+    if read or is_part(out):
         what = "a file that is read" if read else "data of the campaign in that folder"
         message = f"-o {name} would replace {what}"
         raise InputError("usage", message, found=name, allowed="another file", remedy="name another file")

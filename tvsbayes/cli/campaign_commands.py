@@ -229,7 +229,7 @@ def _held(path: Path, plan_file: Path | None) -> dict[str, Any]:
         with waiting() as progress:
             return check_plan(rig, steps, progress=progress).as_json()
     # Nobody can check one of them without those beside it.
-    if path.is_file() and is_part(path):
+    if is_part(path):
         found, remedy = f"{escaped(path.name)} is a part of a campaign", f"check {escaped(str(path.parent), 200)}"
         raise InputError("usage", f"{found}, checked as a whole", allowed="a campaign folder", remedy=remedy)
     kind = path.suffix.lower()

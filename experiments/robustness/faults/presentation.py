@@ -150,7 +150,7 @@ FAULTS = (
     Fault(
         "an output replaces the data of a campaign",
         "cli/app.py",
-        "if read or (out.is_file() and is_part(out)):",
+        "if read or is_part(out):",
         "if read:",
         "moves.csv is gone",
         ("cli/use_commands::test_no_output_replaces_the_data_of_a_campaign",),
