@@ -51,6 +51,10 @@ def test_figures_take_what_the_estimators_return(evidence):
     drawn = [[line.get_xydata().tolist() for line in figure.axes[0].lines] for figure in (whole, parts)]
     assert drawn[0] == drawn[1] and len(drawn[0]) >= 8
     assert len(intervals(evidence.fit.summary).axes[0].lines) < len(drawn[0])
+    # Alone an estimate stands at its tick, two stand beside it.
+    alone = {float(y) for line in intervals(evidence.fit.summary).axes[0].lines for y in line.get_ydata()}
+    both = {float(y) for line in whole.axes[0].lines for y in line.get_ydata()}
+    assert alone == {0.0, 1.0, 2.0, 3.0} and not alone & both
     with pytest.raises(TypeError, match=r"record\.summary.* not a ClassicResult"):
         intervals(result)
 
