@@ -30,7 +30,7 @@ from tvsbayes.model.laser_path import MirrorAngles, mirror_angles
 from tvsbayes.model.parameter_space import Model, ParameterSpace
 
 STATES = 6
-BLOCK = 128
+BLOCK = 64
 """Spots that go through the filter together: their numbers stay in the processor's cache, and a campaign costs what its
 own spots need, not what it was padded to."""
 
@@ -237,14 +237,17 @@ def filtered(rows: FilterRows, before: Belief | None = None) -> Seen:
 
 
 class Passed(eqx.Module):
-    """A campaign on its way through the filter, block by block; rows of spots ahead are nought.
+    """A campaign on its way through the filter, block by block; rows of spots ahead are zero.
 
-    `log_density` is that of the spots passed without squares of what the filter standardised.
+    `gram` holds the products of the standardised columns with each other, summed over the spots passed; `log_density`
+    is that of the spots passed without squares of what the filter standardised. A caller that needs the gram alone does
+    not pay for the columns: the compiler drops what nobody reads.
     """
 
     belief: Belief
     standardised: Float[Array, "spots 2 columns"]
     free: Float[Array, "spots 4"]
+    gram: Float[Array, "columns columns"]
     log_density: Scalar
 
 
@@ -269,16 +272,18 @@ def passed(model: Model, arrays: CampaignArrays, blocks: Int[Array, ""] | int) -
         start = jnp.asarray(number) * size
         given = filter_input(model, arrays.of_spots(start, size), angles)
         seen = filtered(given.rows, so_far.belief)
+        rows = seen.standardised.reshape(-1, columns)
         return Passed(
             seen.belief,
             jax.lax.dynamic_update_slice_in_dim(so_far.standardised, seen.standardised, start, 0),
             jax.lax.dynamic_update_slice_in_dim(so_far.free, given.free, start, 0),
+            so_far.gram + rows.T @ rows,
             so_far.log_density + jnp.sum(given.log_scale) - 0.5 * jnp.sum(seen.log_variance),
         )
 
     columns = 1 + 2 * len(arrays.gears.places.steps)
-    nothing = Passed(no_belief(columns), jnp.zeros((count, 2, columns)), jnp.zeros((count, 4)), jnp.zeros(()))
-    return jax.lax.fori_loop(0, blocks, through, nothing)
+    empty = jnp.zeros((count, 2, columns)), jnp.zeros((count, 4)), jnp.zeros((columns, columns)), jnp.zeros(())
+    return jax.lax.fori_loop(0, blocks, through, Passed(no_belief(columns), *empty))
 
 
 class RepeatedErrors(eqx.Module):
@@ -302,17 +307,16 @@ class RepeatedErrors(eqx.Module):
         return self.root @ (self.mean + jax.scipy.linalg.solve_triangular(self.factor, normal, lower=True, trans=1))
 
 
-def repeated_errors(standardised: Float[Array, "rows columns"], root: Float[Array, "errors errors"]) -> RepeatedErrors:
+def repeated_errors(gram: Float[Array, "columns columns"], root: Float[Array, "errors errors"]) -> RepeatedErrors:
     """Normal equations of the errors at places.
 
     Args:
-        standardised: what the filter made of the residual and of the columns of those errors.
+        gram: products of the standardised residual and of the columns of those errors, as in `Passed`.
         root: of their prior covariance.
     """
-    gram = standardised[:, 1:].T @ standardised
-    precision = jnp.eye(len(root)) + root.T @ gram[:, 1:] @ root
+    precision = jnp.eye(len(root)) + root.T @ gram[1:, 1:] @ root
     factor = jnp.linalg.cholesky(precision)
-    mean = jax.scipy.linalg.cho_solve((factor, True), root.T @ gram[:, 0])
+    mean = jax.scipy.linalg.cho_solve((factor, True), root.T @ gram[1:, 0])
     return RepeatedErrors(root, mean, factor, 2 * jnp.sum(jnp.log(jnp.diagonal(factor))))
 
 
@@ -349,14 +353,14 @@ def innovations(
     every = len(arrays.spots.valid) // block_size(arrays.spots)
     seen = passed(model, arrays, every if blocks is None else blocks)
     own, places, errors_rad = seen.standardised[..., 0], normal, normal
-    log_density = seen.log_density
+    log_density = seen.log_density - 0.5 * seen.gram[0, 0]
     root = root_at_places(model, arrays.gears)
     if len(root):
-        found = repeated_errors(seen.standardised.reshape(-1, seen.standardised.shape[2]), root)
+        found = repeated_errors(seen.gram, root)
         own, places = own - seen.standardised[..., 1:] @ found.errors_rad, found.mean
         errors_rad = found.drawn_rad(normal)
-        log_density -= 0.5 * found.log_determinant
-    log_density -= 0.5 * (jnp.sum(own**2) + jnp.sum(places**2))
+        # The errors at places explain this much of the squares (least squares: r'r - b' P^-1 b).
+        log_density += 0.5 * jnp.dot(seen.gram[1:, 0], found.errors_rad) - 0.5 * found.log_determinant
     return Innovations(jnp.concatenate([own, seen.free], axis=1), places, errors_rad, log_density)
 
 
@@ -385,11 +389,9 @@ def log_density(z: Float[Array, " parameters"], space: ParameterSpace, arrays: C
 
 
 class Evaluation(eqx.Module):
-    """Log posterior density and innovations as in `Innovations`; many points give every field a leading axis."""
+    """Log posterior density and errors at places as in `Innovations`; many points give every field a leading axis."""
 
     log_density: Float[Array, "*batch"]
-    standardised: Float[Array, "*batch spots 6"]
-    places: Float[Array, "*batch errors"]
     place_errors_rad: Float[Array, "*batch errors"]
 
 
@@ -412,10 +414,36 @@ def evaluate(
 
     def one(z, normal):
         seen = innovations(space.model(z), arrays, normal, blocks)
-        value = seen.log_density - 0.5 * jnp.dot(z, z)
-        return Evaluation(value, seen.standardised, seen.places, seen.place_errors_rad)
+        return Evaluation(seen.log_density - 0.5 * jnp.dot(z, z), seen.place_errors_rad)
 
     return jax.vmap(one)(z, normal)
+
+
+@compiled(jax.Array)
+def residuals(
+    z: Float[Array, "batch parameters"], space: ParameterSpace, arrays: CampaignArrays
+) -> Float[Array, "batch spots 4"]:
+    """Observed - predicted of all spots in units of their noise, ranges projected out, before any filter.
+
+    Args:
+        z: coordinates of many points.
+        space: priors.
+        arrays: the campaign.
+    """
+    blocks, size = blocks_filled(arrays.spots), block_size(arrays.spots)
+
+    def one(z):
+        model = space.model(z)
+        angles = mirror_angles(model.transmission, model.tilt_zero_rad, arrays.moves)
+
+        def through(number, so_far):
+            start = jnp.asarray(number) * size
+            found = standing(model, arrays.of_spots(start, size), angles=angles).terms.residual
+            return jax.lax.dynamic_update_slice_in_dim(so_far, jnp.stack(found, axis=1), start, 0)
+
+        return jax.lax.fori_loop(0, blocks, through, jnp.zeros((len(arrays.spots.valid), 4)))
+
+    return jax.vmap(one)(z)
 
 
 def no_draw(count: int, arrays: CampaignArrays) -> np.ndarray:

@@ -27,7 +27,7 @@ from tvsbayes.instrument.parameters import NAMES
 from tvsbayes.model.headlines import Derived
 from tvsbayes.posterior.draws import Draws, Posterior, derived_of, headline_names
 from tvsbayes.posterior.proposal import Independence, Target, first_proposal, place_normals
-from tvsbayes.posterior.ridges import transport
+from tvsbayes.posterior.transport import transport
 from tvsbayes.posterior.transport import Mapped, Transport
 from tvsbayes.progress import Advance, OpenEnded, unshown
 from tvsbayes.results.convergence import Importance, Reweighted, extreme

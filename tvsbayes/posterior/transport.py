@@ -1,25 +1,33 @@
 """The map that makes the posterior nearly normal, so that proposals need no knowledge of its ridges.
 
-Three layers: z, the prior-normal coordinates of the model; y, whitened by the Laplace covariance; w, in which walkers
-live. Wide directions (laser tilt, mirror errors) bend the ridges on which the narrow ones (extrinsics, ratios) lie: a
-shear moves each narrow coordinate by a quadratic form of the wider ones. Noise scales widen and turn what they limit (a
-stop sd its ratio, the backlash and their sums): in w everything else is measured from the mean and by the covariance
-that the linearised campaign has at the noise scales of the walker. NumPy outside the compiled density.
+Three layers: z, the prior-normal coordinates of the model; y, whitened by the Laplace covariance; w, in which draws are
+made. Noise scales widen and turn what they limit (a stop sd its ratio, the backlash and their sums): in w everything
+else is measured from the mean and by the covariance that the linearised campaign has at the noise scales of the draw.
+Wide directions (laser tilt, lens distortion) bend the ridges on which the narrow ones (extrinsics, ratios) lie: at
+every draw of the noise scales and the wide coordinates the narrow ones are centred by Gauss-Newton steps from the
+residuals that the model has there. NumPy outside the compiled functions.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 
+import jax
 import numpy as np
+from scipy import linalg
 from scipy.linalg import lapack
 
-from tvsbayes.instrument.parameters import BLOCKS, INDEX, NAMES, NOISE_NAMES, OPTICS_NAMES, names_of
+from tvsbayes.estimators.joint_fit import JointFit
+from tvsbayes.estimators.likelihood import residuals
+from tvsbayes.estimators.linear_spots import linear_spots
+from tvsbayes.instrument.parameters import BLOCKS, INDEX, KINDS, NAMES, NOISE_NAMES, OPTICS_NAMES, names_of
+from tvsbayes.model.compiled import in_batches
 from tvsbayes.model.gear_kriging import scales_at
 from tvsbayes.model.gear_processes import place_root
-from tvsbayes.model.parameter_space import FARTHEST_SD, half_normal, half_normal_slope
+from tvsbayes.model.parameter_space import FARTHEST_SD, STOP_COLUMNS, half_normal, half_normal_slope
+from tvsbayes.posterior.stop_states import Elimination, StopStates, stop_states
 
 GEAR_SCALES = np.array(
     [
@@ -34,31 +42,20 @@ LEAST_SCALE = 1e-6
 """Of a noise scale over that at the mode: what is smaller moves nothing."""
 FAR_ABOVE = 1e200
 """A last diagonal element that keeps a matrix positive definite whatever stands in its row; nothing reads its root."""
-BLOCK_ROWS = 256
-"""Points that are mapped at a time: their matrices take 64 MB at most."""
-STRETCH_NODES = (-2.0, 0.0, 2.0, 4.0, 6.0)
-"""Of the table of widths, evenly spaced, in w of a noise coordinate. Below the first nothing gets narrower: other stops
-limit it then."""
+BLOCK_ROWS = 64
+"""Points that are mapped at a time: their matrices stay in the processor's cache."""
+NARROW = 0.15
+"""Conditional posterior sd, in prior sds, below which a coordinate is centred anew at every draw. Where the others take
+it, it is known so well that a step of Gauss and Newton is as good as exact."""
+
+CENTRINGS = 2
+"""Gauss-Newton steps of the narrow coordinates at every draw."""
+BEND_STEP = 0.5
+"""Step of second differences in posterior sds: they should hold over +-2 sd, not only at the mode."""
 HEAVY_NAMES = (*NOISE_NAMES, *BLOCKS["backlash_deg"], "extrinsics.rotation_rad.y", "mirror_offset_mm")
 """Coordinates whose tails are heavier than normal: those that few stops tell (a walker stood still for 155 steps at 3.7
-sd of a stop sd), and the tilt of the frames with the mirrors' offset, along whose ridge a quadratic shear falls short
-(one stood at 7.7 sd). Each of them is always proposed from a t of its own."""
-
-
-@dataclass(frozen=True)
-class Conditional:
-    """Geometry and cameras at given noise scales: w = factor' y - shift is standard normal.
-
-    The factor (n, g, g) of the precision of y is lower triangular; shift (n, g) = factor' x the mean of y.
-    """
-
-    factor: np.ndarray
-    shift: np.ndarray
-
-    def solved(self, right: np.ndarray) -> np.ndarray:
-        """Back substitution for y in factor' y = right, shape (n, g): NumPy's solver would factorise anew."""
-        pairs = zip(self.factor, right, strict=True)
-        return np.array([lapack.dtrtrs(factor.T, each)[0] for factor, each in pairs]).reshape(right.shape)
+sd of a stop sd), and the tilt of the frames with the mirrors' offset. Each of them is always proposed from a t of its
+own."""
 
 
 @dataclass(frozen=True)
@@ -75,36 +72,153 @@ class Mapped:
 
 
 @dataclass(frozen=True)
+class LinearCampaign:
+    """The campaign linearised at the mode: observed - predicted is residual - along y - states s - places e + noise.
+
+    Rows are the components of the spots in units of their noise at the mode, states s and errors at places e rad.
+
+    Attributes:
+        residual: shape (4 n,).
+        along: d(predicted)/dy of the coordinates that are no noise scales, shape (4 n, g).
+        states: stop errors and their like.
+        by_noise: variance of every state at the mode by the noise coordinate that scales it, shape (m, q).
+        constant: variance that scales with none, shape (m,).
+        places: d(predicted)/d(errors at places), shape (4 n, e).
+        prior: precision of y without data, shape (g, g).
+    """
+
+    residual: np.ndarray
+    along: np.ndarray
+    states: StopStates
+    by_noise: np.ndarray
+    constant: np.ndarray
+    places: np.ndarray
+    prior: np.ndarray
+
+    @cached_property
+    def columns(self) -> np.ndarray:
+        """Errors at places, coordinates from the narrowest on, and the residual, shape (4 n, e + g + 1)."""
+        return np.column_stack([self.places, self.along[:, ::-1], self.residual])
+
+    @cached_property
+    def gram(self) -> np.ndarray:
+        """Products of the columns."""
+        return self.columns.T @ self.columns
+
+    @cached_property
+    def by_states(self) -> np.ndarray:
+        """Products of the states with the columns, shape (m, e + g + 1)."""
+        return self.states.load.T @ self.columns
+
+
+@dataclass(frozen=True)
+class Conditional:
+    """The linearised campaign at noise scales, a row for each of n points; coordinates y from the narrowest on.
+
+    Attributes:
+        weight: of squared residuals, by the pixel scale, shape (n,).
+        elimination: of the states.
+        white: of the products of states and columns, shape (n, m, e + g + 1).
+        root: of the covariance of the errors at places, shape (n, e, e).
+        factor: lower triangular factor of the precision of errors at places (N(0, 1) a priori) and y together, shape
+            (n, e + g, e + g).
+        shift: factor' x the mean of y, shape (n, g).
+    """
+
+    weight: np.ndarray
+    elimination: Elimination
+    white: np.ndarray
+    root: np.ndarray
+    factor: np.ndarray
+    shift: np.ndarray
+
+    @property
+    def own(self) -> np.ndarray:
+        """The factor of the precision of y alone, shape (n, g, g)."""
+        places = self.root.shape[1]
+        return self.factor[:, places:, places:]
+
+    def solved(self, right: np.ndarray) -> np.ndarray:
+        """Back substitution for y in own' y = right, shape (n, g): NumPy's solver would factorise anew."""
+        pairs = zip(self.own, right, strict=True)
+        return np.array([lapack.dtrtrs(factor.T, each)[0] for factor, each in pairs]).reshape(right.shape)
+
+    def centring(self, linear: LinearCampaign, misfit: np.ndarray, narrow: int) -> np.ndarray:
+        """The Gauss-Newton step of the narrow coordinates by which a misfit becomes least, wide ones held.
+
+        Args:
+            linear: the campaign.
+            misfit: residuals beyond the linear ones, shape (n, 4 k); for one point of noise scales any number of them.
+            narrow: number of narrow coordinates, the first of y here.
+        """
+        places = self.root.shape[1]
+        count = places + narrow
+        white = self.elimination.whitened((misfit @ linear.states.load)[..., None])
+        right = misfit @ linear.columns[:, :count] - np.einsum("nmc,nmo->nc", self.white[..., :count], white)
+        right *= self.weight[:, None]
+        right[:, :places] = np.einsum("nji,nj->ni", self.root, right[:, :places])
+        factors = np.broadcast_to(self.factor[:, :count, :count], (len(misfit), count, count))
+        pairs = zip(factors, right, strict=True)
+        found = [lapack.dpotrs(factor, each, lower=1)[0][places:] for factor, each in pairs]
+        return np.reshape(found, (len(misfit), narrow))
+
+    def means(self, wide: np.ndarray) -> np.ndarray:
+        """Of the narrow coordinates (n, k) by the linearised campaign, at y of the others (n, g - k)."""
+        narrow = self.shift.shape[1] - wide.shape[1]
+        right = self.shift[:, :narrow] - np.einsum("nij,ni->nj", self.own[:, narrow:, :narrow], wide)
+        pairs = zip(self.own[:, :narrow, :narrow], right, strict=True)
+        return np.reshape([lapack.dtrtrs(factor.T, each)[0] for factor, each in pairs], right.shape)
+
+
+@dataclass(frozen=True)
+class Centred:
+    """Narrow coordinates y given the others: y = centre + turn^-1 (y by the linearised campaign - mean).
+
+    Shapes (n, k), (n, k) and (n, k, k).
+    """
+
+    mean: np.ndarray
+    centre: np.ndarray
+    turn: np.ndarray
+
+
+def by_width(covariance: np.ndarray) -> np.ndarray:
+    """Order of the coordinates in which each has the largest variance left by those before it."""
+    rest = covariance.copy()
+    order: list[int] = []
+    for _ in range(len(covariance)):
+        variances = np.diag(rest).copy()
+        variances[order] = -np.inf
+        widest = int(np.argmax(variances))
+        order.append(widest)
+        rest = rest - np.outer(rest[:, widest], rest[widest]) / rest[widest, widest]
+    return np.array(order, dtype=int)
+
+
+Residuals = Callable[[np.ndarray], np.ndarray]
+"""Observed - predicted at points z (n, p) of the mode's noise scales, in units of the noise there, shape (n, 4 k)."""
+
+
+@dataclass(frozen=True)
 class Transport:
     """The map w -> z; its Jacobian is |det root| exp(`Mapped.log_jacobian`).
 
-    With stop errors e of variance S, errors at places of covariance K and pixels in units of their noise, the
-    linearised residuals are r - J y - G e: the precision of y is then prior + J'J - J'G ((S, K)^-1 + G'G)^-1 G'J
-    (Woodbury), at any noise scales from the same products. Beyond `ridges.STATES_MAX` stop errors (m = 0 here) those
-    stay in the covariance by which the products are taken, and widths alone follow their scales, from a table.
-
     Attributes:
         mode: z at w = 0, shape (p,).
-        free: columns of z that are sampled, (d,): widest conditional sd first; with states, noise coordinates before
-            all others.
-        root: lower-triangular factor of their covariance in that order, shape (d, d); with states, of noise
-            coordinates and others apart, whose mean at other scales follows from r.
-        noise: places in `free` of the noise coordinates, shape (q,).
-        narrow: places in `free` that the shear moves, ascending, shape (k,).
-        bend: its quadratic forms, nonzero only among places before the narrow one, shape (k, d, d).
-        stretch: if m is 0, log of the factor on every place at `STRETCH_NODES` of each noise coordinate, (q, nodes, d).
+        free: columns of z that are sampled, (d,): noise scales, then all others, the widest conditional sd first.
+        root: lower-triangular factor of their covariance in that order, of noise coordinates and others apart, whose
+            mean at other scales follows from the residuals, shape (d, d).
+        noise: number q of noise coordinates.
+        narrow: number of the last coordinates that are centred anew at every draw.
         slope: ln of the noise scales over those at the mode, by w of the noise coordinates, shape (q, q); of
             half-normal scales, whose logarithm is no linear function, the step of z instead.
         half: which noise scales are half-normal, shape (q,).
         pixels: 1 at the noise coordinate that scales all pixels, shape (q,).
-        variance: of every stop error at the mode, by the noise coordinate that scales it, shape (m, q).
-        constant: what scales with none, shape (m,).
-        prior: precision of y of the g other coordinates without data, shape (g, g).
-        known: J'J, what the data add if no stop errs, shape (g, g).
-        load: J'G, shape (g, m + e), the errors at places last.
-        states: G'G, shape (m + e, m + e).
-        score, state_score: J'r, shape (g,), and G'r, shape (m + e,).
-        place_angle_rad, place_on_tilt, place_valid: of the e / 2 places, as `gear_processes.place_root` takes them.
+        linear: the campaign at the mode.
+        residuals: of the model, for centring.
+        bend: how the slopes of the narrow coordinates change with all others, as these move away from the mode: by
+            bend' y their parts along each other grow, shape (g, narrow, narrow).
+        place_angle_rad, place_on_tilt: of the e / 2 places, as `gear_processes.place_root` takes them.
         gear_scale: values of `GEAR_SCALES` at the mode, in the units of their names, shape (12,).
         gear_noise: which noise coordinate each of them is, shape (12, q).
         period_deg: of the gears, shape (2, 3).
@@ -113,24 +227,16 @@ class Transport:
     mode: np.ndarray
     free: np.ndarray
     root: np.ndarray
-    noise: np.ndarray
-    narrow: np.ndarray
-    bend: np.ndarray
-    stretch: np.ndarray
+    noise: int
+    narrow: int
     slope: np.ndarray
     half: np.ndarray
     pixels: np.ndarray
-    variance: np.ndarray
-    constant: np.ndarray
-    prior: np.ndarray
-    known: np.ndarray
-    load: np.ndarray
-    states: np.ndarray
-    score: np.ndarray
-    state_score: np.ndarray
+    linear: LinearCampaign
+    residuals: Residuals
+    bend: np.ndarray
     place_angle_rad: np.ndarray
     place_on_tilt: np.ndarray
-    place_valid: np.ndarray
     gear_scale: np.ndarray
     gear_noise: np.ndarray
     period_deg: np.ndarray
@@ -141,11 +247,6 @@ class Transport:
         return len(self.free)
 
     @property
-    def geometry(self) -> np.ndarray:
-        """Places in `free` of all coordinates but those of noise, ascending."""
-        return np.setdiff1d(np.arange(self.dimension), self.noise)
-
-    @property
     def heavy(self) -> np.ndarray:
         """Coordinates of `HEAVY_NAMES`, shape (d,)."""
         return np.isin(np.array(NAMES)[self.free], HEAVY_NAMES)
@@ -154,8 +255,7 @@ class Transport:
     def coupled(self) -> np.ndarray:
         """Coordinates of what bends the beam's way through the positioner, shape (d,).
 
-        They are wide, and coupled to third order, which the quadratic shear does not follow: where several of them
-        are far out together the target lies beside the proposal.
+        They are wide: where several of them are far out together the target lies beside the proposal.
         """
         return np.isin(np.array(NAMES)[self.free], OPTICS_NAMES)
 
@@ -165,23 +265,6 @@ class Transport:
         names = [NAMES[column] for column in self.free]
         wanted = zip(names_of("play_variation_deg"), names_of("transmission_error_deg"), strict=True)
         return [(names.index(one), names.index(other)) for one, other in wanted if {one, other} <= set(names)]
-
-    def straight(self) -> Transport:
-        """The same without shear, and with the covariance of the mode everywhere: the Laplace approximation."""
-        return replace(
-            self,
-            narrow=self.narrow[:0],
-            bend=self.bend[:0],
-            stretch=np.zeros_like(self.stretch),
-            variance=self.variance[:0],
-            constant=self.constant[:0],
-            load=self.load[:, :0],
-            states=self.states[:0, :0],
-            state_score=self.state_score[:0],
-            place_angle_rad=self.place_angle_rad[:0],
-            place_on_tilt=self.place_on_tilt[:0],
-            place_valid=self.place_valid[:0],
-        )
 
     @cached_property
     def curved(self) -> np.ndarray:
@@ -212,10 +295,18 @@ class Transport:
         z[:, self.free] += step
         return z
 
+    def to_whitened(self, z: np.ndarray) -> np.ndarray:
+        """From z (n, p) to y (n, d)."""
+        step = (z - self.mode)[:, self.free]
+        linear = step.copy()
+        for place in self.curved:
+            linear[:, place + 1 :] -= self._beyond_linear(place, step[:, place])[:, None] * self._follow(place)
+        return np.linalg.solve(self.root, linear.T).T
+
     def _log_scale(self, noise: np.ndarray) -> np.ndarray:
         """Ln of the noise scales over those at the mode, at noise coordinates (n, q)."""
         step = noise @ self.slope.T
-        at = self.mode[self.free[self.noise]]
+        at = self.mode[self.free[: self.noise]]
         z = np.minimum(np.where(self.half, at + step, 0.0), FARTHEST_SD)
         ratio = half_normal(z) / half_normal(np.where(self.half, at, 0.0))
         return np.where(self.half, np.log(np.maximum(ratio, LEAST_SCALE)), step)
@@ -224,93 +315,163 @@ class Transport:
         """Factors of the covariance of the errors at places, shape (n, e, e), at logs of the noise scales (n, q)."""
         values = np.zeros((len(log_scale), len(NAMES)))
         values[:, GEAR_SCALES] = self.gear_scale * np.exp(log_scale @ self.gear_noise.T)
-        scales = scales_at(values, self.period_deg)
-        return np.asarray(place_root(scales, self.place_angle_rad, self.place_on_tilt, self.place_valid, np))
+        scales, valid = scales_at(values, self.period_deg), np.ones(len(self.place_on_tilt), dtype=bool)
+        return np.asarray(place_root(scales, self.place_angle_rad, self.place_on_tilt, valid, np))
 
     def _conditional(self, noise: np.ndarray, score_at_mode: np.ndarray) -> Conditional:
         """What the linearised campaign and the prior say of y at noise coordinates (n, q), slopes from one at the mode.
 
-        One factor of the precision of states and y together, with the slope as a last row: its parts of y are the
-        factor and the forward solution that are wanted, the states integrated out (Schur complement).
+        The factor of the precision of errors at places and y together has the slope as a last row: its parts of y are
+        the factor and the forward solution that are wanted, the errors integrated out (Schur complement).
         """
-        log_scale = self._log_scale(noise)
-        weight = np.exp(-2 * log_scale @ self.pixels)[:, None, None]
-        stops, states, last = len(self.constant), len(self.states), len(self.states) + len(self.known)
+        linear, log_scale = self.linear, self._log_scale(noise)
+        weight = np.exp(-2 * log_scale @ self.pixels)
+        places, count = linear.places.shape[1], len(linear.gram)
+        variance = linear.constant + np.exp(2 * log_scale) @ linear.by_noise.T
+        elimination = Elimination.of(linear.states, np.sqrt(weight[:, None] * variance))
+        white = elimination.whitened(linear.by_states)
+        whole = weight[:, None, None] * (linear.gram - np.swapaxes(white, 1, 2) @ white)
+        root = self._place_roots(log_scale) if places else np.zeros((len(noise), 0, 0))
         # Errors at places in units of their prior sds: their covariance may be as good as singular.
-        turn = np.zeros((len(noise), states, states))
-        own = np.arange(stops)
-        turn[:, own, own] = 1.0
-        turn[:, stops:, stops:] = self._place_roots(log_scale)
-        back = weight * np.swapaxes(turn, 1, 2)
-        whole = np.zeros((len(noise), last + 1, last + 1))
-        # Below the diagonal alone: nothing above it is read.
-        whole[:, :states, :states] = back @ self.states @ turn
-        whole[:, own, own] += 1 / (np.exp(2 * log_scale) @ self.variance.T + self.constant)
-        places = np.arange(stops, states)
-        whole[:, places, places] += 1.0
-        whole[:, states:last, :states] = np.swapaxes(back @ self.load.T, 1, 2)
-        whole[:, states:last, states:last] = self.prior + weight * self.known
-        whole[:, last, :states] = back @ self.state_score
-        whole[:, last, states:last] = weight[:, 0] * self.score - score_at_mode
-        whole[:, last, last] = FAR_ABOVE
-        root = np.linalg.cholesky(whole)
-        return Conditional(root[:, states:last, states:last], root[:, last, states:last])
-
-    def _log_width(self, noise: np.ndarray) -> np.ndarray:
-        """From the table, at noise coordinates (n, q), shape (n, d): lines between the nodes and above the last."""
-        first, second = STRETCH_NODES[:2]
-        at = (np.maximum(noise, first) - first) / (second - first)
-        node = np.minimum(at.astype(int), len(STRETCH_NODES) - 2)
-        which = np.arange(len(self.noise))
-        low, high = self.stretch[which, node], self.stretch[which, node + 1]
-        return np.sum(low + (at - node)[..., None] * (high - low), axis=-2)
+        whole[:, :places] = np.swapaxes(root, 1, 2) @ whole[:, :places]
+        whole[:, places:, :places] = np.swapaxes(whole[:, :places, places:], 1, 2)
+        whole[:, :places, :places] = whole[:, :places, :places] @ root
+        own = np.arange(places)
+        whole[:, own, own] += 1.0
+        whole[:, places:-1, places:-1] += linear.prior[::-1, ::-1]
+        whole[:, -1, places:-1] -= score_at_mode
+        whole[:, -1, -1] = FAR_ABOVE
+        found = np.linalg.cholesky(whole)
+        last = count - 1
+        return Conditional(weight, elimination, white, root, found[:, :last, :last], found[:, last, places:last])
 
     @cached_property
     def _score_at_mode(self) -> np.ndarray:
-        found = self._conditional(np.zeros((1, len(self.noise))), np.zeros(len(self.known)))
-        return found.factor[0] @ found.shift[0]
+        found = self._conditional(np.zeros((1, self.noise)), np.zeros(len(self.linear.prior)))
+        return found.own[0] @ found.shift[0]
 
     def conditional(self, noise: np.ndarray) -> Conditional:
-        """The normal density of y at noise coordinates (n, q), its mean at the mode where the scales are those.
-
-        Without stop errors there is none: see `stretch`.
-        """
+        """The normal density of y at noise coordinates (n, q), its mean at the mode where the scales are those."""
         return self._conditional(noise, self._score_at_mode)
 
+    def _centred(self, noise: np.ndarray, wide: np.ndarray, found: Conditional) -> Centred:
+        """The narrow coordinates given noise coordinates (n, q) and y of the wide ones (n, g - k)."""
+        mean, linear = found.means(wide[:, ::-1])[:, ::-1], self.linear
+        centre = mean
+        for _ in range(CENTRINGS):
+            y = np.concatenate([np.zeros_like(noise), wide, centre], axis=1)
+            own = y[:, self.noise :]
+            beyond = self.residuals(self.from_whitened(y)) - linear.residual + own @ linear.along.T
+            step = found.centring(linear, np.nan_to_num(beyond), self.narrow)[:, ::-1]
+            turn = np.eye(self.narrow) + np.tensordot(own, self.bend, 1)
+            centre = centre + np.linalg.solve(turn, (mean + step - centre)[..., None])[..., 0]
+        return Centred(mean, centre, turn)
+
     def mapped(self, w: np.ndarray) -> Mapped:
-        """From w (n, d) to z with the Jacobian; noise coordinates are the same in w and y, the shear keeps volumes."""
+        """From w (n, d) to z with the Jacobian; noise coordinates are the same in w and y."""
         return Mapped.joined([self._mapped(block) for block in np.split(w, range(BLOCK_ROWS, len(w), BLOCK_ROWS))])
 
     def _mapped(self, w: np.ndarray) -> Mapped:
-        count = len(self.noise)
-        noise = w[:, self.noise]
-        log_width = self._log_width(noise)
-        y, log_jacobian = w * np.exp(log_width), log_width.sum(axis=1)
-        if len(self.states):
-            found = self.conditional(noise)
-            y[:, count:] = found.solved(y[:, count:] + found.shift)
-            log_jacobian -= np.log(np.diagonal(found.factor, axis1=1, axis2=2)).sum(axis=1)
-        for place, form in zip(self.narrow, self.bend, strict=True):
-            before = y[:, :place]
-            y[:, place] -= 0.5 * np.einsum("ni,ni->n", before @ form[:place, :place], before)
+        noise, y = w[:, : self.noise], w.copy()
+        found = self.conditional(noise)
+        y[:, self.noise :] = found.solved(w[:, self.noise :][:, ::-1] + found.shift)[:, ::-1]
+        log_jacobian = -np.log(np.diagonal(found.own, axis1=1, axis2=2)).sum(axis=1)
+        if self.narrow:
+            narrow = self.dimension - self.narrow
+            about = self._centred(noise, y[:, self.noise : narrow], found)
+            y[:, narrow:] = about.centre + np.linalg.solve(about.turn, (y[:, narrow:] - about.mean)[..., None])[..., 0]
+            log_jacobian -= np.linalg.slogdet(about.turn)[1]
         return Mapped(self.from_whitened(y), log_jacobian)
 
     def to_w(self, z: np.ndarray) -> np.ndarray:
         """From z (n, p) to w (n, d); the inverse of `mapped` on the sampled columns."""
-        step = (z - self.mode)[:, self.free]
-        linear = step.copy()
-        for place in self.curved:
-            linear[:, place + 1 :] -= self._beyond_linear(place, step[:, place])[:, None] * self._follow(place)
-        y = np.linalg.solve(self.root, linear.T).T
-        straight = y.copy()
-        for place, form in zip(self.narrow, self.bend, strict=True):
-            before = y[:, :place]
-            straight[:, place] += 0.5 * np.einsum("ni,ni->n", before @ form[:place, :place], before)
-        # Noise coordinates are neither bent nor turned nor stretched: they are known before anything is undone.
-        count = len(self.noise)
-        noise = straight[:, self.noise]
-        if len(self.states):
-            found = self.conditional(noise)
-            turned = np.swapaxes(found.factor, 1, 2) @ straight[:, count:, None]
-            straight[:, count:] = turned[..., 0] - found.shift
-        return straight * np.exp(-self._log_width(noise))
+        y = self.to_whitened(z)
+        noise, narrow = y[:, : self.noise], self.dimension - self.narrow
+        found = self.conditional(noise)
+        if self.narrow:
+            about = self._centred(noise, y[:, self.noise : narrow], found)
+            y[:, narrow:] = about.mean + np.einsum("nij,nj->ni", about.turn, y[:, narrow:] - about.centre)
+        turned = np.einsum("nij,ni->nj", found.own, y[:, self.noise :][:, ::-1]) - found.shift
+        return np.concatenate([noise, turned[:, ::-1]], axis=1)
+
+
+def bends(path: Transport) -> np.ndarray:
+    """How the slopes of the narrow coordinates change, shape (g, narrow, narrow): second differences of the residuals.
+
+    The change of the slope along a narrow coordinate is another residual: what a Gauss-Newton step makes of it says by
+    how much that slope grows along itself and the other narrow ones.
+    """
+    count, narrow = len(path.linear.prior), path.narrow
+    if not narrow:
+        return np.zeros((count, 0, 0))
+    steps, whole = BEND_STEP * np.eye(count), np.zeros((1, path.noise))
+
+    def curvature(y: np.ndarray) -> np.ndarray:
+        both = np.concatenate([np.zeros((1, count)), y, -y])
+        seen = path.residuals(path.from_whitened(np.concatenate([np.repeat(whole, len(both), axis=0), both], axis=1)))
+        centre, ahead, behind = np.split(np.nan_to_num(seen), [1, 1 + len(y)])
+        return (ahead + behind - 2 * centre) / BEND_STEP**2
+
+    own, found = curvature(steps), path.conditional(whole)
+    bend = np.empty((count, narrow, narrow))
+    for k, place in enumerate(range(count - narrow, count)):
+        mixed = 0.5 * (curvature(steps + steps[place]) - own - own[place])
+        bend[:, :, k] = found.centring(path.linear, -mixed, narrow)[:, ::-1]
+    return bend
+
+
+def transport(fit: JointFit) -> Transport:
+    """The map at the mode of a converged fit."""
+    linear = linear_spots(fit.linearised, fit.arrays, -np.asarray(fit.linearised.residual_jacobian))
+    names = np.array(NAMES)
+    free = np.flatnonzero(fit.free)
+    scales = np.isin(names[free], NOISE_NAMES)
+    noise, others = free[scales], free[~scales]
+    covariance = np.linalg.inv(np.eye(len(others)) + fit.information.fisher[np.ix_(others, others)])
+    order = by_width(covariance)
+    others = others[order]
+    of_noise = np.linalg.cholesky(fit.covariance[np.ix_(noise, noise)])
+    wide = np.linalg.cholesky(covariance[np.ix_(order, order)])
+    stops = stop_states(fit, linear)
+    by_noise = STOP_COLUMNS.reshape(4, 1) == noise
+    places = jax.tree.map(np.asarray, fit.arrays.gears.places)
+    seen = np.flatnonzero(places.valid)
+    columns = np.asarray(fit.linearised.place_columns).reshape(-1, 2 * len(places.steps))
+    half = np.asarray(fit.space.kind)[noise] == KINDS.index("half-normal")
+    ratio = np.radians([fit.mode.physical[INDEX[name]] for name in names_of("degrees_per_step")])
+    spots = len(linear.residual)
+
+    def misfit(z: np.ndarray) -> np.ndarray:
+        found = in_batches(lambda at: residuals(at, fit.space, fit.arrays), z)
+        return np.asarray(found)[:, :spots].reshape(len(z), -1)
+
+    wider = np.flatnonzero(np.diag(wide) >= NARROW)
+    narrow = len(others) - (int(wider[-1]) + 1 if len(wider) else 0)
+    path = Transport(
+        mode=fit.z,
+        free=np.concatenate([noise, others]),
+        root=linalg.block_diag(of_noise, wide),
+        noise=len(noise),
+        narrow=narrow,
+        slope=np.where(half, 1.0, np.asarray(fit.space.u)[noise])[:, None] * of_noise,
+        half=half,
+        pixels=(noise == INDEX["pixel_scale"]).astype(float),
+        linear=LinearCampaign(
+            residual=linear.residual.ravel(),
+            along=(linear.jacobian[..., others] @ wide).reshape(4 * spots, -1),
+            states=stops,
+            by_noise=stops.variance @ by_noise,
+            # Stop errors whose sd is not estimated keep their variance.
+            constant=stops.constant + stops.variance @ ~by_noise.any(axis=1),
+            places=columns[:, np.concatenate([seen, len(places.steps) + seen])],
+            prior=wide.T @ wide,
+        ),
+        residuals=misfit,
+        bend=np.zeros((len(others), narrow, narrow)),
+        place_angle_rad=(places.steps * ratio[places.on_tilt.astype(int)])[seen],
+        place_on_tilt=places.on_tilt[seen],
+        gear_scale=np.asarray(fit.mode.physical)[GEAR_SCALES],
+        gear_noise=(GEAR_SCALES[:, None] == noise).astype(float),
+        period_deg=np.asarray(fit.space.harmonic_period_deg),
+    )
+    return replace(path, bend=bends(path))

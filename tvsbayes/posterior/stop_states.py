@@ -1,0 +1,126 @@
+"""Stop errors, home offsets and unknown plays of a campaign as columns, eliminated in time order for many noise scales.
+
+With G the columns, T the standard deviations of the states and unit noise, the covariance of the residuals is
+C = 1 + G T^2 G'. A state is coupled only to those alive at the same looks, so the Cholesky factor of 1 + T G'G T is
+sparse when states are eliminated in the order in which they end: the information form of the filter of
+`estimators.likelihood`, with a cost linear in the number of states. NumPy; leading axes are points of many noise scales.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from tvsbayes.estimators.joint_fit import JointFit
+from tvsbayes.estimators.linear_spots import LinearSpots
+from tvsbayes.model.parameter_space import STOP_COLUMNS
+
+
+@dataclass(frozen=True)
+class StopStates:
+    """Every stop error, home offset and place in the play that a campaign drew, in the order in which they end.
+
+    Attributes:
+        load: d(predicted)/d(state) of the spots' components, shape (4 n, m).
+        variance: at the fit's noise scales, by direction (right, left, down, up), shape (m, 4).
+        constant: of states of another kind, shape (m,).
+    """
+
+    load: np.ndarray
+    variance: np.ndarray
+    constant: np.ndarray
+
+    @cached_property
+    def gram(self) -> np.ndarray:
+        """G'G, shape (m, m)."""
+        return self.load.T @ self.load
+
+    @cached_property
+    def later(self) -> tuple[tuple[int, ...], ...]:
+        """For each state, the later states in its column of the Cholesky factor, fill included."""
+        coupled = [set(np.flatnonzero(row[k + 1 :]) + k + 1) for k, row in enumerate(self.gram)]
+        for own in coupled:
+            ordered = sorted(own)
+            if ordered:
+                coupled[ordered[0]] |= set(ordered[1:])
+        return tuple(tuple(sorted(map(int, own))) for own in coupled)
+
+
+def stop_states(fit: JointFit, linear: LinearSpots) -> StopStates:
+    """Unroll the filter's six states: a column for each time that one is drawn anew."""
+    spots, states = linear.load.shape[0], linear.load.shape[2]
+    mix = np.asarray(fit.arrays.spots.redraw_mix)[:spots]
+    variance_of = np.radians(np.asarray(fit.mode.physical)[STOP_COLUMNS]) ** 2
+    found = []
+    for state in range(states):
+        drawn = np.flatnonzero(linear.renewed[:, state])
+        for begin, end in zip(drawn, [*drawn[1:], spots], strict=True):
+            by_direction = np.zeros((2, 2))
+            if state < 2:
+                by_direction[state] = mix[begin, state] * variance_of[state]
+            rest = 0.0 if state < 2 else linear.variance[begin, state]
+            if linear.load[begin:end, :, state].any() and by_direction.sum() + rest > 0:
+                found.append((end, begin, state, by_direction.ravel(), rest))
+    found.sort(key=lambda each: each[:3])
+    load = np.zeros((spots, 4, len(found)))
+    for column, (end, begin, state, *_) in enumerate(found):
+        load[begin:end, :, column] = linear.load[begin:end, :, state]
+    variance = np.array([each[3] for each in found]).reshape(len(found), 4)
+    return StopStates(load.reshape(4 * spots, len(found)), variance, np.array([each[4] for each in found], dtype=float))
+
+
+@dataclass(frozen=True)
+class Elimination:
+    """The Cholesky factor of 1 + T G'G T for many T.
+
+    Attributes:
+        sd: standard deviations of the states in units of the noise, shape (n, m).
+        states: which states there are.
+        pivot: diagonal of the factor, shape (n, m).
+        below: its other columns: for each state, shape (n, later states).
+    """
+
+    sd: np.ndarray
+    states: StopStates
+    pivot: np.ndarray
+    below: tuple[np.ndarray, ...]
+
+    @classmethod
+    def of(cls, states: StopStates, sd: np.ndarray) -> Elimination:
+        """The factor, column by column."""
+        later, gram = states.later, states.gram
+        diagonal = 1 + sd**2 * np.diag(gram)
+        rest = {
+            (i, j): sd[:, i] * sd[:, j] * gram[i, j] if gram[i, j] else np.zeros(len(sd))
+            for i, own in enumerate(later)
+            for j in own
+        }
+        pivot, below = np.empty_like(sd), []
+        for i, own in enumerate(later):
+            pivot[:, i] = np.sqrt(diagonal[:, i])
+            column = np.stack([rest[i, j] / pivot[:, i] for j in own], axis=1) if own else np.empty((len(sd), 0))
+            below.append(column)
+            for a, j in enumerate(own):
+                diagonal[:, j] -= column[:, a] ** 2
+                for b in range(a + 1, len(own)):
+                    rest[j, own[b]] -= column[:, a] * column[:, b]
+        return cls(sd, states, pivot, tuple(below))
+
+    def whitened(self, products: np.ndarray) -> np.ndarray:
+        """Rows B with B'B = X'G T (1 + T G'G T)^-1 T G'X.
+
+        Args:
+            products: G'X, shape (m, c), or of each point its own, shape (n, m, c).
+
+        Returns:
+            Shape (n, m, c).
+        """
+        found = self.sd[..., None] * products
+        for i, own in enumerate(self.states.later):
+            row = found[:, i]
+            row /= self.pivot[:, i, None]
+            for a, j in enumerate(own):
+                found[:, j] -= self.below[i][:, a, None] * row
+        return found
