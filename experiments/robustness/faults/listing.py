@@ -92,7 +92,7 @@ FAULTS = (
     Fault("the mean of repeats is as uncertain as one of them", "four_point._direction", Local("type_a", "sd"),
           "test_statistics_of_known_ratios"),
     Fault("correlations of the stereo calibration are left out", "stereo_variance",
-          Local("covariance", "np.diag(np.diag(value))"), "test_gum_agrees_with_monte_carlo_over_calibrations"),
+          Local("covariance", "np.diag(np.diag(value))"), "test_the_stereo_covariance_counts_with_its_correlations"),
     Fault("U95 is taken with k = 1.64", "NORMAL_95", Constant("1.6448536269514722"),
           "test_95_percent_are_two_sided_and_normal"),
     # Sampling, weights, convergence.
