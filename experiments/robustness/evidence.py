@@ -29,6 +29,7 @@ from experiments.common.headlines import HEADLINES, LEAST_CONTRACTION
 from experiments.common.rows import OUTPUT, ROOT, git, output, read_rows
 from experiments.common.uniformity import ALPHA, FAULT_SIMULATIONS, Band, pit_values
 from experiments.common.watched import fine
+from experiments.robustness.faults.listing import FAULTS
 from tvsbayes.posterior.sampling import TIERS
 from tvsbayes.statistics.chances import BOUND, binomial_bounds, rms_bounds
 
@@ -223,9 +224,9 @@ def device(rows: list[dict]) -> tuple[str, bool]:
 
 
 def planted(rows: list[dict]) -> tuple[str, bool]:
-    """One-line bugs that the test suite catches."""
-    last = {r["name"]: r["failed"] for r in rows if r["name"] != "clean"}
-    return f"{sum(last.values())} of {len(last)} that were planted are caught", all(last.values())
+    """Planted bugs that the test suite sees, of those in the list."""
+    last = {r["sentence"]: r["failed"] for r in rows if r.get("sentence") in {fault.sentence for fault in FAULTS}}
+    return f"{sum(last.values())} of {len(FAULTS)} in the list are seen", sum(last.values()) == len(FAULTS)
 
 
 def folders(rows: list[dict]) -> tuple[str, bool]:
@@ -351,7 +352,7 @@ LINES = (
         false_alarms,
     ),
     Line(
-        "The tests see planted one-line bugs",
+        "The tests see planted bugs",
         "python -m experiments.robustness.planted_faults run",
         "robustness/planted_faults.jsonl",
         planted,

@@ -1,14 +1,12 @@
-"""Does the test suite see a bug? One-line faults planted one at a time in a copy of the tree; a test has to fail.
+"""Does the test suite see a bug? Faults as behaviour, planted one at a time in a copy of the tree; a test must fail.
 
-    python -m experiments.robustness.planted_faults run       # resumable; --only REGEX: of name, file and tests
+    python -m experiments.robustness.planted_faults run       # resumable; --only REGEX: of sentence, place and test
     python -m experiments.robustness.planted_faults table > experiments/robustness/planted_faults.md
-    python -m experiments.robustness.planted_faults check     # every entry still fits the source: under a second
+    python -m experiments.robustness.planted_faults check     # every entry finds its place and its test
 
-The faults stand in `faults/`. `run` unpacks HEAD into temporary folders, one for each process, and plants a fault
-there, never in the checkout. It runs the test that saw the fault last (by rows or page, wherever it stands), then the
-tests that are the likeliest to see it, those of its package, all; slow ones take no part. A test that fails has to pass
-without the fault. A row is done again once the fault, its module or the test that saw it has changed; `--again` does
-all.
+The faults stand in `faults/listing.py`. `run` unpacks HEAD into temporary folders, one for each process, plants a fault
+there, and runs the test that the entry names; all these tests have to pass without a fault first. A row is made again
+once the fault, its module or the file of its test has changed; `--again` makes all.
 """
 
 from __future__ import annotations
@@ -16,151 +14,175 @@ from __future__ import annotations
 import argparse
 import datetime
 import hashlib
-import multiprocessing
+import io
+import os
 import re
+import subprocess
+import sys
+import tarfile
 import tempfile
 import time
-import warnings
-from dataclasses import astuple
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from pathlib import Path
+from queue import SimpleQueue
 
 from experiments.common.command_line import parser
-from experiments.common.rows import append_row, commit, git, output, read_rows
-from experiments.robustness.faults.fault import Fault
-from experiments.robustness.faults.listing import FAULTS, stale
-from experiments.robustness.faults.trial import attempt, prepare, unpack
+from experiments.common.rows import ROOT, append_row, commit, output, read_rows
+from experiments.robustness.faults.changes import Sources
+from experiments.robustness.faults.listing import FAULTS, Fault, misfits, tests_of
 
 ROWS = output(__file__, "planted_faults.jsonl")
 COMPILED = output(__file__, "planted_faults_compiled")
-PAGE = Path(__file__).with_suffix(".md")
-TIME_OVER = "(time over)"
+LIMIT_S = 900
+"""Tests that take longer count as failed: a loop that never ends is a fault that CI sees."""
+COMMAND = ("-m", "pytest", "-q", "-x", "-n", "0", "--tb=no", "-p", "no:cacheprovider", "-rfE")
+ENVIRONMENT = {
+    # An edited file may keep its size and, within a second, its time: no compiled module may outlive it.
+    "PYTHONDONTWRITEBYTECODE": "1",
+    "JAX_COMPILATION_CACHE_DIR": str(COMPILED),
+}
 
 
-class State:
-    """The files of a commit by their contents: says which rows still hold."""
-
-    def __init__(self, revision: str = "HEAD"):
-        lines = git("ls-tree", "-r", "-t", revision).splitlines()
-        self.blobs = {path: entry.split()[2] for entry, path in (line.split("\t", 1) for line in lines)}
-
-    def digest(self, fault: Fault) -> str:
-        """Of what an outcome hangs on first: the fault, its module, what all tests share."""
-        contents = [self.blobs.get(path) for path in (fault.path, "tests/conftest.py")]
-        return hashlib.sha256(repr((contents, astuple(fault)[1:4])).encode()).hexdigest()[:16]
-
-    def of_test(self, test: str) -> str:
-        """Of the file of a test; of all tests where none saw the fault."""
-        return self.blobs.get(test.partition("::")[0], self.blobs.get("tests", ""))
-
-    def rows(self, path: Path) -> dict[str, dict]:
-        """Rows that hold, by the fault's name."""
-        digests = {fault.name: self.digest(fault) for fault in FAULTS}
-        return {
-            row["name"]: row
-            for row in read_rows(path)
-            if digests.get(row["name"]) == row["digest"] and self.of_test(row["first"]) == row["contents"]
-        }
+def unpack(revision: str, root: Path) -> None:
+    """A copy of the tree as committed."""
+    archive = subprocess.run(["git", "archive", revision], cwd=ROOT, check=True, capture_output=True).stdout
+    with tarfile.open(fileobj=io.BytesIO(archive)) as tree:
+        tree.extractall(root, filter="data")
 
 
-def seen_last(rows: Path) -> dict[str, str]:
-    """The test that saw a fault, by the fault's name, from the page or a row of whatever state."""
-    page = PAGE.read_text(encoding="utf-8") if PAGE.exists() else ""
-    found = {line.split(" | ")[0].removeprefix("| "): line for line in page.splitlines() if "::" in line}
-    tests = {name: re.search(r"`([^`]+::[^`]+)`", line) for name, line in found.items()}
-    return {name: test[1] for name, test in tests.items() if test} | {r["name"]: r["first"] for r in read_rows(rows)}
+@contextmanager
+def planted(root: Path, fault: Fault) -> Iterator[None]:
+    """A copy of the tree with one fault in it, whole again afterwards."""
+    path, text = fault.change.planted(Sources(root), fault.place)
+    whole = path.read_text(encoding="utf-8")
+    path.write_text(text, encoding="utf-8")
+    try:
+        yield
+    finally:
+        path.write_text(whole, encoding="utf-8")
 
 
-_tree = Path()
-"""Of a worker."""
+def first_failure(root: Path, tests: Sequence[str]) -> str | None:
+    """The first of some tests that fails on a copy; None if all pass.
+
+    Raises:
+        RuntimeError: pytest could not run them.
+    """
+    environment = {**os.environ, **ENVIRONMENT, "PYTHONPATH": str(root)}
+    command = [sys.executable, *COMMAND, *tests]
+    try:
+        ended = subprocess.run(command, cwd=root, env=environment, capture_output=True, text=True, timeout=LIMIT_S)
+    except subprocess.TimeoutExpired:
+        return "(time over)"
+    if ended.returncode == 0:
+        return None
+    failed = re.search(r"^(?:FAILED|ERROR) (\S+::.*?)(?: - |$)", ended.stdout, re.MULTILINE)
+    if failed is None:
+        raise RuntimeError(f"pytest ended with {ended.returncode}:\n{ended.stdout[-2000:]}{ended.stderr[-2000:]}")
+    return failed[1]
 
 
-def _take(trees: multiprocessing.SimpleQueue) -> None:
-    global _tree
-    _tree = trees.get()
+def attempt(root: Path, fault: Fault) -> dict[str, object]:
+    """Plant a fault and run its test.
 
-
-def _row(task: tuple[Fault, str]) -> dict[str, object]:
-    """A trial in a worker."""
-    fault, seen_by = task
+    Raises:
+        RuntimeError: pytest could not run it.
+    """
     begun = time.monotonic()
-    found = attempt(_tree, fault, seen_by)
-    first = found.first or (TIME_OVER if found.failed else "")
+    with planted(root, fault):
+        first = first_failure(root, tests_of(fault.test, root))
     seconds = round(time.monotonic() - begun, 1)
-    return {"name": fault.name, "failed": bool(found.failed), "first": first, "seconds": seconds}
+    return {"sentence": fault.sentence, "failed": first is not None, "first": first or "", "seconds": seconds}
+
+
+def digests(root: Path) -> dict[str, str]:
+    """Of what an outcome depends on, by the sentence: the fault in its module, the file of its test."""
+    sources, found = Sources(root), {}
+    for fault in FAULTS:
+        _, text = fault.change.planted(sources, fault.place)
+        files = [(root / name.partition("::")[0]).read_text(encoding="utf-8") for name in tests_of(fault.test, root)]
+        found[fault.sentence] = hashlib.sha256(repr((text, fault.test, files)).encode()).hexdigest()[:16]
+    return found
+
+
+def valid_rows(path: Path, root: Path = ROOT) -> dict[str, dict]:
+    """Rows that hold, by the sentence."""
+    now = digests(root)
+    return {row["sentence"]: row for row in read_rows(path) if now.get(row.get("sentence")) == row.get("digest")}
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Append a row for every fault that has none; the number of survivors among those asked for."""
-    if problems := stale():
-        raise SystemExit("\n".join(["the list is stale:", *problems]))
+    if problems := misfits():
+        raise SystemExit("\n".join(["the list does not fit the tree:", *problems]))
     # One commit from beginning to end, whatever is committed meanwhile.
     revision = commit()
-    state = State(revision)
-    chosen = [f for f in FAULTS if re.search(arguments.only, " ".join((f.name, f.file, *f.selection)))]
-    rows = {} if arguments.again else state.rows(arguments.rows)
-    seen = seen_last(arguments.rows)
-    left = [(fault, seen.get(fault.name, "")) for fault in chosen if fault.name not in rows]
-    faults = {fault.name: fault for fault in chosen}
-    prepare(COMPILED)
-    context = multiprocessing.get_context("fork")
-    with tempfile.TemporaryDirectory(prefix="tvsbayes-faults-") as scratch, warnings.catch_warnings():
-        # JAX warns of forks; nothing has been computed in this process, and no thread of its runs.
-        warnings.simplefilter("ignore")
-        trees = context.SimpleQueue()
+    chosen = [f for f in FAULTS if re.search(arguments.only, f"{f.sentence} {f.place} {f.test}")]
+    with tempfile.TemporaryDirectory(prefix="tvsbayes-faults-") as scratch:
+        trees: SimpleQueue[Path] = SimpleQueue()
         for number in range(arguments.processes):
             unpack(revision, Path(scratch) / f"tree{number}")
             trees.put(Path(scratch) / f"tree{number}")
-        with context.Pool(arguments.processes, initializer=_take, initargs=(trees,)) as pool:
-            for row in pool.imap_unordered(_row, left):
-                word = f"caught by {row['first']}" if row["failed"] else "SURVIVED"
-                print(f"{row['name']}: {word} ({row['seconds']:.0f} s)", flush=True)
-                row |= {"digest": state.digest(faults[row["name"]]), "contents": state.of_test(row["first"])}
-                rows[row["name"]] = {**row, "commit": revision}
-                append_row(arguments.rows, rows[row["name"]])
-    caught = sum(rows[fault.name]["failed"] for fault in chosen)
-    print(f"{caught} of {len(chosen)} caught")
-    return len(chosen) - caught
+        first_tree = Path(scratch) / "tree0"
+        now, rows = digests(first_tree), {} if arguments.again else valid_rows(arguments.rows, first_tree)
+
+        def one(fault: Fault) -> dict[str, object]:
+            root = trees.get()
+            try:
+                return attempt(root, fault)
+            finally:
+                trees.put(root)
+
+        left = [fault for fault in chosen if fault.sentence not in rows]
+        tests = sorted({test for fault in left for test in tests_of(fault.test, first_tree)})
+        if tests and (failed := first_failure(first_tree, tests)) is not None:
+            raise SystemExit(f"{failed} does not pass without any fault")
+        with ThreadPoolExecutor(arguments.processes) as pool:
+            for row in pool.map(one, left):
+                word = f"seen by {row['first']}" if row["failed"] else "SURVIVED"
+                print(f"{row['sentence']}: {word} ({row['seconds']:.0f} s)", flush=True)
+                rows[row["sentence"]] = {**row, "digest": now[row["sentence"]], "commit": revision}
+                append_row(arguments.rows, rows[row["sentence"]])
+    seen = sum(rows[fault.sentence]["failed"] for fault in chosen)
+    print(f"{seen} of {len(chosen)} seen")
+    return len(chosen) - seen
 
 
 def table(arguments: argparse.Namespace) -> int:
     """The Markdown table of what was run at the present state of the package and its tests."""
-    found = State().rows(arguments.rows)
-    done = [found[fault.name] for fault in FAULTS if fault.name in found]
-    caught = sum(row["failed"] for row in done)
-    minutes = sum(row["seconds"] for row in done) / 60
-    at_first = sum(bool(f.survived) for f in FAULTS)
+    found = valid_rows(arguments.rows)
+    done = [found[fault.sentence] for fault in FAULTS if fault.sentence in found]
+    seen = sum(row["failed"] for row in done)
+    commits = ", ".join(sorted({row["commit"] for row in done}))
     print("# Planted faults\n")
     print(f"Written by `python -m experiments.robustness.planted_faults table` on {datetime.date.today()}", end=" ")
-    print(f"from runs at commit {', '.join(sorted({row['commit'] for row in done}))}.\n")
-    print(f"**{caught} of {len(FAULTS)} faults caught**", end="")
-    print(f", {len(done) - caught} survive, {len(FAULTS) - len(done)} not run;", end=" ")
-    print(f"{minutes:.0f} minutes of one process, the failing tests without the faults included.", end=" ")
-    print(f"{at_first} of the faults got past the tests likely to see them, in a run or by reading:", end=" ")
-    print("listed below; each has a test now.\n")
-    print("| fault | file | harm | first failing test | s |\n|---|---|---|---|---|")
+    print(f"from runs at commit {commits}.\n")
+    print(f"**{seen} of {len(FAULTS)} faults seen** by the default test that the list names", end="")
+    print(f", {len(done) - seen} survive, {len(FAULTS) - len(done)} not run;", end=" ")
+    minutes = sum(row["seconds"] for row in done) / 60
+    print(f"{minutes:.0f} minutes of one process. A fault is planted by name: what", end=" ")
+    print(" a definition returns, takes, reads or checks is changed in its syntax tree.")
+    print("\n| fault | place | change | test that fails | s |\n|---|---|---|---|---|")
     for fault in FAULTS:
         verdict, seconds = "not run", ""
-        if row := found.get(fault.name):
+        if row := found.get(fault.sentence):
             verdict = f"`{row['first'].removeprefix('tests/')}`" if row["failed"] else "**SURVIVED**"
             seconds = f"{row['seconds']:.0f}"
-        print(f"| {fault.name} | `{fault.file}` | {fault.harm} | {verdict} | {seconds} |")
-    if at_first:
-        print("\n## Survivors at first\n")
-        for fault in FAULTS:
-            if fault.survived:
-                print(f"- {fault.name}: {fault.survived}")
-    return len(FAULTS) - caught
+        print(f"| {fault.sentence} | `{fault.place}` | `{fault.change!r}` | {verdict} | {seconds} |")
+    return len(FAULTS) - seen
 
 
 def check(arguments: argparse.Namespace) -> int:
-    """Say what of the list no longer fits the source."""
-    problems = stale()
-    print("\n".join(problems) or f"{len(FAULTS)} faults fit the source")
+    """Say what of the list no longer fits the tree."""
+    problems = misfits()
+    print("\n".join(problems) or f"{len(FAULTS)} faults fit the tree")
     return len(problems)
 
 
 def main() -> None:
-    """The command; exit code 1 where a fault survives or the list is stale."""
+    """The command; exit code 1 where a fault survives or the list does not fit the tree."""
     made = parser(__doc__)
     made.add_argument("--rows", type=Path, default=ROWS)
     commands = made.add_subparsers(required=True)
@@ -168,7 +190,7 @@ def main() -> None:
         one = commands.add_parser(command.__name__, help=command.__doc__.splitlines()[0])
         one.set_defaults(command=command)
         if command is run:
-            one.add_argument("--only", default="", help="regular expression found in name, file or tests")
+            one.add_argument("--only", default="", help="regular expression found in sentence, place or test")
             one.add_argument("--again", action="store_true", help="rows that are there count for nothing")
             one.add_argument("--processes", type=int, default=2, help="each with a copy of the tree (%(default)s)")
     arguments = made.parse_args()

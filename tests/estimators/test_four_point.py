@@ -231,6 +231,22 @@ def test_gum_agrees_with_monte_carlo_over_calibrations():
     assert factor_gum < width_a / left.u_type_a_deg_per_step, "more degrees of freedom, a smaller factor"
 
 
+def test_the_stereo_covariance_counts_with_its_correlations():
+    """J C J^T of a linear function by hand, the focal scale with its own variance; what is fixed adds nothing."""
+    rng = np.random.default_rng(4)
+    root = 1e-4 * rng.standard_normal((24, 3))
+    root[5] = 0.0
+    covariance, slopes = root @ root.T, rng.standard_normal(24)
+
+    def function(stereo: Stereo, focal_scale: float) -> float:
+        return float(slopes @ stereo.vector) + 3.0 * focal_scale
+
+    found = stereo_variance(function, make_stereo(covariance), 0.002)
+    # Differences of numbers of order 1000 over steps of 1e-5.
+    assert found == pytest.approx(slopes @ covariance @ slopes + (3.0 * 0.002) ** 2, rel=1e-6)
+    assert slopes @ covariance @ slopes != pytest.approx(slopes**2 @ np.diag(covariance), rel=0.2)
+
+
 def test_focal_error_shifts_the_ratio_as_no_repeat_can_show():
     """Ideal parallel cameras: a focal length 0.5 % too large divides every tangent by 1.005."""
     ideal = replace(make_stereo(), D1=np.zeros(5), D2=np.zeros(5), R=np.eye(3), T=np.array([-85.0, 0.0, 0.0]))

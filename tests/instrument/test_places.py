@@ -136,8 +136,9 @@ def test_through_one_counter_there_is_no_line():
 def test_gears_vary_where_a_scale_may_be_above_nought():
     still = perfect_gears(RigTable())
     assert not gears_vary(still) and gears_vary(varying_gears(RigTable(), periods=False))
-    for name in ("transmission_error_deg.tilt", "play_variation_deg.pan"):
+    for name in ("transmission_error_deg.tilt", "play_variation_deg.pan", "harmonic_amplitude_deg.tilt.1"):
         for prior in (Prior(0.0, 0.01, "half-normal"), Prior(0.02, 0.0, "half-normal")):
-            assert gears_vary(replace(still, priors={**still.priors, name: prior}))
+            priors = {**still.priors, name: prior}
+            assert gears_vary(replace(still, priors=priors, harmonic_period_deg={"tilt": (30.0,)}))
     drifting = {**still.priors, "drift_deg_per_root_hour.pan": Prior(0.0, 0.05, "half-normal")}
     assert not gears_vary(replace(still, priors=drifting)), "drift repeats nothing"

@@ -9,6 +9,7 @@ from scipy import stats
 
 from tvsbayes.statistics.weighted_draws import (
     TAILS,
+    ParetoTail,
     WeightedSummary,
     effective_draws,
     pareto_k,
@@ -39,6 +40,37 @@ def test_equal_weights_are_none(count):
     )
     np.testing.assert_allclose(found.ess_mean, count, rtol=allowed)
     np.testing.assert_allclose(found.mcse_mean, values.std(axis=0) / np.sqrt(count), rtol=allowed)
+
+
+def test_effective_draws_are_kishs_whatever_the_weights_sum_to():
+    assert effective_draws(np.array([2.0, 1.0, 1.0])) == pytest.approx(16 / 6, rel=ROUNDING * 4)
+
+
+def test_quantiles_by_hand():
+    """Half weights reach 0.25, 0.65 and 0.9 at the draws 1, 2 and 3: stretched to 0, 8/13 and 1."""
+    found = weighted_quantiles(np.array([3.0, 1.0, 2.0]), np.array([0.2, 0.5, 0.3]), (0.0, 0.5, 1.0))
+    np.testing.assert_allclose(found, [1.0, 1 + 0.5 * 13 / 8, 3.0], rtol=4 * ROUNDING)
+
+
+def test_ends_of_intervals_have_the_effective_draws_of_their_probability():
+    """Of 2000 equal draws all count; 51 of them, not 50, lie below an end at most: 2 % of t (1 - t)."""
+    found = weighted_summary(np.random.default_rng(8).standard_normal(2000), np.full(2000, 1 / 2000))
+    np.testing.assert_allclose(found.ess_interval95, 2000, rtol=0.02)
+
+
+def test_a_quantity_that_moves_says_nothing_of_one_that_does_not():
+    """Both keep their shape, and what is ten times as wide has ten times the errors."""
+    generator = np.random.default_rng(9)
+    weights, moving = generator.dirichlet(np.ones(300)), generator.standard_normal((300, 1, 2))
+    found = weighted_summary(np.concatenate([moving, 10 * moving, np.full((300, 1, 2), 3.0)], axis=1), weights)
+    for name in ("mean", "sd", "mcse_mean", "mcse_sd", "ess_mean", "ess_sd"):
+        value = getattr(found, name)
+        assert value.shape == (3, 2), name
+        if name.startswith("ess"):
+            np.testing.assert_allclose(value[2], effective_draws(weights), rtol=1e-12)
+        else:
+            np.testing.assert_allclose(value[1], 10 * value[0], rtol=1e-12, err_msg=name)
+    assert np.all(found.mcse_mean[2] == 0) and np.all(found.mcse_sd[2] == 0)
 
 
 def test_one_draw_of_all_weight_is_every_quantile():
@@ -102,6 +134,29 @@ def test_pareto_smoothing_is_that_of_arviz(count, sd):
     assert pareto_k(np.exp(log_ratios)) == pytest.approx(float(expected), abs=1e-9)
 
 
+@pytest.mark.parametrize("k", [-0.3, 0.0, 0.4])
+def test_quantiles_of_a_tail_are_the_generalised_paretos(k):
+    probabilities = np.linspace(0.05, 0.95, 7)
+    # SciPy's shape has the same sign: positive is heavy.
+    expected = stats.genpareto.ppf(probabilities, k, scale=2.0)
+    np.testing.assert_allclose(ParetoTail(k, 2.0).quantiles(probabilities), expected, rtol=1e-12)
+
+
+def test_a_tail_is_fitted_where_its_first_quarter_exceeds_the_rest():
+    """Of 100 draws 20 are the tail, and its fifth decides: 85 equal draws leave it nothing, 84 something."""
+    larger = 1 + np.random.default_rng(10).pareto(2.0, 16)
+    for equal, fitted in ((85, False), (84, True)):
+        values = np.append(np.ones(equal), larger[: 100 - equal])
+        assert (pareto_k(values) != 0, smoothed_weights(np.log(values)).pareto_k != 0) == (fitted, fitted)
+
+
+def test_a_constant_factor_of_the_weights_changes_nothing():
+    """Also one beyond the largest number."""
+    log_ratios = np.random.default_rng(11).standard_normal(500)
+    found, moved = smoothed_weights(log_ratios), smoothed_weights(log_ratios + 800.0)
+    np.testing.assert_allclose(moved.weights, found.weights, rtol=1e-11)
+
+
 def test_the_tail_index_is_that_of_the_tail():
     """Pareto's own: of 1/u^k it is k; 20 000 draws have 424 in the tail, which know it to (1 + k) / sqrt(424)."""
     u = np.random.default_rng(6).uniform(size=20_000)
@@ -125,3 +180,6 @@ def test_systematic_resampling_takes_every_draw_by_its_weight():
     np.testing.assert_allclose(counts.mean(axis=0), 200 * weights, atol=0.0021)
     np.testing.assert_array_equal(systematic(np.full(12, 1 / 12), 4, 0.5), [1, 4, 7, 10])
     np.testing.assert_array_equal(systematic(np.full(12, 1 / 12), 12, 0.3), np.arange(12))
+    # A place at the border of two draws is the second's; one that rounds to the sum of all is the last's.
+    np.testing.assert_array_equal(systematic(np.array([0.5, 0.5]), 2, 0.0), [0, 1])
+    np.testing.assert_array_equal(systematic(np.array([0.5, 0.5]), 3, np.nextafter(1.0, 0.0)), [0, 1, 1])

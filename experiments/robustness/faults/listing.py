@@ -1,79 +1,241 @@
-"""All planted faults, and whether they still fit the source and the tests."""
+"""The planted faults: what a user would suffer in a sentence, where, what changes, and a test that must fail.
+
+A place is a qualified name and a test the name of a function: whatever moves or renames files leaves the entries.
+"""
 
 from __future__ import annotations
 
 import re
-from functools import cache
+from dataclasses import dataclass
 from pathlib import Path
 
 from experiments.common.rows import ROOT
-from experiments.robustness.faults import (
-    axis,
-    bench,
-    certification,
-    declaration,
-    doubts,
-    estimation,
-    imports,
-    instrument,
-    light,
-    planning,
-    pointing,
-    presentation,
-    sampling,
-)
-from experiments.robustness.faults.fault import Fault
-
-FAULTS: tuple[Fault, ...] = (
-    *declaration.FAULTS,
-    *estimation.FAULTS,
-    *sampling.FAULTS,
-    *pointing.FAULTS,
-    *certification.FAULTS,
-    *planning.FAULTS,
-    *instrument.FAULTS,
-    *bench.FAULTS,
-    *axis.FAULTS,
-    *presentation.FAULTS,
-    *imports.FAULTS,
-    *light.FAULTS,
-    *doubts.FAULTS,
+from experiments.robustness.faults.changes import (
+    Argument,
+    Call,
+    Change,
+    Constant,
+    Keyword,
+    Local,
+    Never,
+    NoPlace,
+    Reads,
+    Returns,
+    Sources,
+    Uncalled,
 )
 
 
-def misfit(fault: Fault, text: str, parse: bool) -> str:
-    """What is wrong with a fault in the text of its file; empty if nothing is."""
-    if text.count(fault.old) != 1:
-        return f"its text stands {text.count(fault.old)} times in {fault.path}"
-    if fault.new == fault.old:
-        return "changes nothing"
-    if parse and fault.path.endswith(".py"):
-        try:
-            compile(text.replace(fault.old, fault.new), fault.path, "exec")
-        except SyntaxError as error:
-            return f"not Python any more: {error}"
-    return ""
+@dataclass(frozen=True)
+class Fault:
+    """A bug as behaviour.
 
-
-def stale(root: Path = ROOT, *, parse: bool = True) -> list[str]:
-    """What is wrong with the list: texts that do not stand exactly once, changes that are none, no such tests.
-
-    Args:
-        root: of the tree.
-        parse: also see that every fault of a Python module leaves one, which takes seconds.
+    Attributes:
+        sentence: what it does, unique.
+        place: the qualified name of the function, class or constant, as short as it is unique.
+        change: what becomes of it.
+        test: the test that must fail.
     """
 
-    @cache
-    def text_of(path: str) -> str:
-        return (root / path).read_text(encoding="utf-8") if (root / path).is_file() else ""
+    sentence: str
+    place: str
+    change: Change | Uncalled
+    test: str
 
-    problems, names = [], set()
+
+FAULTS = (
+    # Mirrors, gears, cameras: the model.
+    Fault("the contrast of the ratios has the wrong sign", "laser_path.mirror_angles", Local("travelled", "-value"),
+          "test_contrast_is_positive_minus_negative_ratio"),
+    Fault("the backlash has the wrong sign", "laser_path.mirror_angles", Local("half", "-value"),
+          "test_first_row_of_a_segment_rehomes_with_the_mean_ratio"),
+    Fault("the mirror offset has the wrong sign", "beam_angles", Local("offset", "-value"),
+          "test_beam_angles_of_the_nominal_chain"),
+    Fault("the right camera stands on the left", "geometry.image", Reads("cameras.translation_mm", "-value"),
+          "test_projection_is_opencvs"),
+    Fault("the effective ratio leaves out the slope of the beam", "headlines.effective_deg_per_step",
+          Local("slope", "value**0"), "test_headlines_of_a_fit"),
+    Fault("the play's variation has the sign of the other side", "seen_places", Local("sign", "-value"),
+          "test_looks_have_the_error_of_their_counter_and_half_the_play_of_their_side"),
+    Fault("the transmission error is rougher than stated", "matern52", Returns("(1 + scaled) * functions.exp(-scaled)"),
+          "test_the_factor_is_that_of_the_covariance_of_both_processes"),
+    # Stops, homings, likelihood, priors.
+    Fault("a homing is drawn once instead of anew", "redraws", Local("homed", "value & (np.cumsum(value) <= 1)"),
+          "test_filter_equals_dense_gaussian"),
+    Fault("a stop error is drawn anew while its axis stands", "redraws", Local("redraw", "value | value[:, ::-1]"),
+          "test_filter_equals_dense_gaussian"),
+    Fault("the drift of the zero is left out of the filter", "drift_variances", Reads("spots.hours", "0 * value"),
+          "test_log_density_is_that_of_the_dense_gaussian"),
+    Fault("the log-determinant of the stop errors is dropped", "likelihood.passed",
+          Reads("seen.log_variance", "0 * value"), "test_filter_equals_dense_gaussian"),
+    Fault("stop errors and zeros are forgotten between blocks of spots", "likelihood.passed",
+          Call("filtered", "function(arg0)"), "test_blocks_of_spots_are_one_campaign"),
+    Fault("a spot counts four residuals instead of three", "spot_residuals.spot_residuals",
+          Reads("model.noise.pixel_scale", "value ** (4 / 3)"), "test_range_is_flat_in_image_displacement"),
+    Fault("the Jacobian of the aperture's range is dropped", "spot_residuals.spot_residuals",
+          Call("log1p", "0 * value"), "test_range_is_flat_in_image_displacement"),
+    Fault("the right camera has the left one's correlation", "pixel_covariance",
+          Reads("spot.ruv_right", "spot.ruv_left"), "test_range_is_flat_in_image_displacement"),
+    Fault("the stereo covariance enters with its root transposed", "look_jacobian.look_jacobian",
+          Reads("space.stereo_root.T", "space.stereo_root"), "test_parts_make_the_whole"),
+    Fault("degrees are taken for radians", "parameter_space.SCALE", Constant("value**0"),
+          "test_every_name_drives_its_field_and_nothing_else"),
+    Fault("prior sds count twice", "parameter_space._values", Reads("space.u", "2 * value"),
+          "test_physical_values_are_scipys_quantiles"),
+    Fault("the half-normal prior has the wrong tail", "parameter_space.half_normal", Argument("z", "-value"),
+          "test_physical_values_are_scipys_quantiles"),
+    # The classic estimator and its uncertainty.
+    Fault("left and right of the triangulated points are exchanged", "triangulate", Local("x", "-value"),
+          "test_worked_example_of_the_paper"),
+    Fault("the second slope of the four points has the wrong sign", "four_point_angle_deg", Local("after", "-value"),
+          "test_worked_example_of_the_paper"),
+    Fault("the mean of repeats is as uncertain as one of them", "four_point._direction", Local("type_a", "sd"),
+          "test_statistics_of_known_ratios"),
+    Fault("correlations of the stereo calibration are left out", "stereo_variance",
+          Local("covariance", "np.diag(np.diag(value))"), "test_the_stereo_covariance_counts_with_its_correlations"),
+    Fault("U95 is taken with k = 1.64", "NORMAL_95", Constant("1.6448536269514722"),
+          "test_95_percent_are_two_sided_and_normal"),
+    # Sampling, weights, convergence.
+    Fault("the Jacobian of the map is dropped", "Target.valued", Reads("found.log_jacobian", "0 * value"),
+          "test_the_density_of_walkers_is_the_models_times_the_jacobian"),
+    Fault("the acceptance of independent proposals is upside down", "Independence.__call__",
+          Returns("(value[0], -value[1])"), "test_the_proposal_density_and_draws_agree_in_many_dimensions"),
+    Fault("rounds of importance sampling of other sizes count the same", "Pool.log_weights",
+          Local("share", "0 * value - np.log(len(value))"),
+          "test_weights_are_the_target_over_the_mixture_of_all_proposals"),
+    Fault("weights with a Pareto k of 2 pass", "importance.K_LIMIT", Constant("2.0"),
+          "test_a_proposal_made_too_narrow_is_not_accepted"),
+    Fault("posterior sds are a fifth too small", "weighted_summary", Keyword("sd", "0.8 * value"),
+          "test_equal_weights_are_none"),
+    Fault("intervals called 95 % hold 90 %", "weighted_draws.TAILS", Constant("(0.05, 0.95)"),
+          "test_monte_carlo_errors_are_those_of_draws_with_memory"),
+    Fault("R-hat up to 1.1 passes", "RHAT_LIMIT", Constant("1.1"), "test_groups_of_other_means_are_told_by_r_hat"),
+    Fault("predicted spots leave out the homing's scatter", "looks_again", Local("home", "0 * value"),
+          "test_every_look_scatters_by_its_direction_its_homing_and_its_play"),
+    # Judging a fit, comparing, watching.
+    Fault("a fit's degrees of freedom are n instead of n - p", "summarise", Local("determined", "0.0"),
+          "test_dof_counts_spots_less_what_they_determine"),
+    Fault("a failed validation is no verdict", "advice.failed", Returns("None"),
+          "test_no_reader_of_the_text_can_miss_a_failure"),
+    Fault("cameras that two campaigns share count twice", "changes.compare", Local("shared", "False"),
+          "test_a_calibration_has_not_changed_from_itself"),
+    Fault("the classic and the joint estimate change places in the hold-out", "scores.judge",
+          Local("ratio", "1 / value"), "test_scores_of_predictions_by_hand"),
+    Fault("watching ignores that it tests many things", "null_distribution", Call("min", "logs[1]"),
+          "test_false_alarms_and_power_are_those_of_the_linear_model"),
+    Fault("a watched change was there from the first day", "WatchedLooks.linear", Reads("self.first", "0"),
+          "test_the_departure_is_that_of_a_dense_gaussian"),
+    # Locating, aiming, loading a robot.
+    Fault("a stop is taken for one from the other side", "Calibration.noisy_beam",
+          Argument("sides", "tuple(-side for side in value)"), "test_every_draw_goes_through_the_twins_optics"),
+    Fault("a reading leads to the other root of the cone", "range_components", Local("root", "-value"),
+          "test_the_reading_of_a_point_leads_back_to_it"),
+    Fault("steps to a point are those of the other approach", "Drive.counter", Argument("side", "-value"),
+          "test_steps_for_a_point_come_back_to_it"),
+    Fault("the run-up begins on the wrong side", "Drive.arrival", Reads("self.overshoot_steps", "-value"),
+          "test_the_approach_is_obeyed_or_the_other_side_is_taken"),
+    Fault("errors of the gears are taken off instead of added", "optics.output_deg", Reads("error", "-value"),
+          "test_a_constant_error_is_a_zero_and_a_constant_change_is_play"),
+    Fault("counters that were never seen are not named", "counter_limits.unseen", Returns("''"),
+          "test_counters_that_no_look_reached_are_told"),
+    # Planning.
+    Fault("the information of the last row is dropped", "expectation.information_of", Local("rows", "value[:-1]"),
+          "test_a_plans_information_is_the_fits_own"),
+    Fault("a study's assurance leaves out the fits that failed", "study_result", Keyword("assurance", "hits / n"),
+          "test_failures_count_against_the_assurance"),
+    # Reports, certificates, exit codes.
+    Fault("ISO 230-2 accuracy is taken with one sd", "figures_of", Local("high_up", "mean_up + sd_up"),
+          "test_figures_of_the_published_readings"),
+    Fault("a certificate states the whole width as expanded uncertainty", "add_real", Local("expanded", "2 * value"),
+          "test_ratios_stand_with_expanded_uncertainty_and_backlash_with_its_own"),
+    Fault("uncertainties are printed twice as large", "tables.concise", Argument("sd", "2 * value"),
+          "test_concise_shows_two_digits_of_the_uncertainty"),
+    Fault("what must not be used ends with exit code 0", "app.finish", Call("Ended", "function(0)"),
+          "test_a_fit_that_did_not_converge_is_exit_4"),
+    Fault("numbers of an axis that must not be used are offered to firmware", "axis_fit_text",
+          Reads("summary.converged", "True"), "test_numbers_that_must_not_be_used_are_not_offered_to_firmware"),
+    # Files and their refusals.
+    Fault("a cell that is no number is accepted", "Table.numbers", Never("isfinite"),
+          "test_message_tells_place_found_allowed_and_remedy"),
+    Fault("a mirrored rotation of the cameras is accepted", "parse_stereo", Call("det", "1.0"),
+          "test_stereo_refusals_name_line_and_key"),
+    Fault("pixels counted from 1 are moved the wrong way", "foreign_looks._spots",
+          Reads("notation.pixels_from", "-value"), "test_notations_of_others"),
+    Fault("decimal commas are dropped", "foreign_table._with_point",
+          Returns("value.replace('.', '') if commas else value"), "test_every_notation_gives_the_same_table"),
+    Fault("a file is renamed before it is on the disk", "written_whole", Call("fsync", "None"),
+          "test_interrupted_write_leaves_the_old_file_whole"),
+    Fault("an output replaces the data of a campaign", "app.spared", Never("read"),
+          "test_no_output_replaces_the_data_of_a_campaign"),
+    # Acquisition: light, positions, lost events.
+    Fault("the laser stays on when a camera fails", "CameraObserver.observe", Call("laser", "value if arg0 else None"),
+          "test_pictures_through_the_virtual_camera"),
+    Fault("a laser that was left on stays on in motion", "SerialPositioner.move_to", Never("_lit"),
+          "test_a_laser_left_on_is_off_in_motion"),
+    Fault("the live page's laser-off waits for the end of the look", "HeedingPositioner.laser", Never("darken"),
+          "test_laser_off_breaks_off_the_look_which_is_taken_again"),
+    Fault("the firmware's guard darkens the laser and replies say light", "Core::darkened", Uncalled("set_laser"),
+          "test_replies_say_that_the_guard_has_darkened_the_laser"),
+    Fault("the sketch has no watchdog of the processor", "setup", Uncalled("start_watchdog"),
+          "test_sketch_resets_itself_and_darkens_in_a_fault"),
+    Fault("arrival is not compared with the order", "SerialPositioner.move_to", Never("reached"),
+          "test_done_at_another_place_is_no_arrival"),
+    Fault("a reset of the device is not noticed", "SerialPositioner._check", Never("boot"),
+          "test_refusals_and_alarms_are_named"),
+    Fault("a line of the journal with a wrong CRC counts", "parse_line", Never("crc"),
+          "test_every_byte_flipped_is_found"),
+    Fault("lost events inside the journal are not noticed", "journal._following", Never("previous"),
+          "test_lost_doubled_swapped_and_foreign_lines_are_found"),
+    Fault("a lost end of the journal is not noticed", "campaign_files._compared", Never("looks"),
+          "test_a_journal_that_lost_its_end_is_told_from_tables_behind"),
+    Fault("spots behind lost steps stay good", "Recorder.result", Never("_lost"),
+          "test_pictures_of_a_segment_with_lost_steps_no_longer_wait_for_detection"),
+    Fault("a proposal is followed that the rig cannot run", "Acquisition._adapt", Call("check_plan", "None"),
+          "test_a_proposal_that_the_rig_cannot_run_is_not_followed"),
+    # Pictures.
+    Fault("centres of spots are half a pixel off", "fit_spot", Local("centre", "value + 0.5"),
+          "test_stated_sd_is_the_actual_error_without_speckle"),
+    Fault("any pair of spots passes the epipolar test", "epipolar_refused", Returns("value & False"),
+          "test_a_pair_off_its_epipolar_lines_is_refused"),
+    Fault("the stereo calibration divides by n instead of n - p", "bundle_adjustment.bundle_adjustment",
+          Local("dof", "int(kept.sum())"), "test_degrees_of_freedom_are_coordinates_less_unknowns"),
+    # The twin.
+    Fault("simulated stop errors are drawn anew while the axis stands", "physics.stop_errors",
+          Argument("counters", "value + 1e-9 * np.arange(len(value))"), "test_stop_errors_persist_and_are_redrawn"),
+    Fault("simulated drift goes on over a homing", "gear_errors.drift_deg", Argument("first", "0 * value"),
+          "test_drift_grows_with_the_root_of_time_and_restarts_at_a_homing"),
+    Fault("true ratios of two directions are exchanged", "true_headlines.effective_deg_per_step",
+          Local("half", "-value"), "test_the_headline_is_the_line_through_the_looks"),
+    # One axis.
+    Fault("an axis is homed from the wrong side", "play_places", Local("side", "-value"),
+          "test_play_is_the_clip_of_the_definition"),
+    Fault("an axis' stop error is drawn anew while it stands", "axis_rows._redrawn", Returns("value | True"),
+          "test_repeats_at_one_stop_share_its_error"),
+    Fault("a left-out reading is predicted on its other side", "AxisModel.left_out", Local("found", "-value"),
+          "test_rows_left_out_are_the_conditional_of_the_dense_gaussian"),
+)  # fmt: skip
+
+
+def tests_of(name: str, root: Path = ROOT) -> list[str]:
+    """Arguments of pytest for the test functions of a name, wherever they stand."""
+    places = (path for path in sorted((root / "tests").rglob("test_*.py")) if f"def {name}(" in path.read_text("utf-8"))
+    return [f"{path.relative_to(root)}::{name}" for path in places]
+
+
+def misfits(root: Path = ROOT) -> list[str]:
+    """Entries that stand twice, find no place or no test, or leave no Python; empty if the list fits the tree."""
+    sources, problems = Sources(root), []
+    tests = " ".join(path.read_text("utf-8") for path in (root / "tests").rglob("test_*.py"))
+    names = set(re.findall(r"^def (test_\w+)", tests, re.MULTILINE))
     for fault in FAULTS:
-        wrong = [misfit(fault, text_of(fault.path), parse), "twice" if fault.name in names else ""]
-        names.add(fault.name)
-        for test in fault.selection:
-            path, _, single = test.partition("::")
-            there = re.search(rf"^def {re.escape(single)}\b", text_of(path), re.MULTILINE) if single else text_of(path)
-            wrong.append("" if there else f"no {test}")
-        problems += [f"{fault.name}: {what}" for what in wrong if what]
+        try:
+            path, text = fault.change.planted(sources, fault.place)
+            if path.suffix == ".py":
+                compile(text, path, "exec")
+        except (NoPlace, SyntaxError) as error:
+            problems.append(f"{fault.sentence}: {error}")
+        if fault.test not in names:
+            problems.append(f"{fault.sentence}: no {fault.test}")
+        if sum(fault.sentence == other.sentence for other in FAULTS) > 1:
+            problems.append(f"{fault.sentence}: twice")
     return problems

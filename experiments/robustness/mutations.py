@@ -1,0 +1,158 @@
+"""Which changes of the mathematics does no test see? mutmut's mutants of a module, run on the tests of that module.
+
+    pip install "mutmut>=3.8,<4"       # in a copy of the project's environment: no test needs it
+    python -m experiments.robustness.mutations run MODULE [--tests PATH ...]
+    python -m experiments.robustness.mutations table > experiments/robustness/mutations.md
+
+A module is a path such as tvsbayes/statistics/weighted_draws.py; its tests are tests/PACKAGE/test_MODULE.py where no
+others are named. `run` unpacks HEAD into a temporary folder, writes mutmut's settings there, and appends a row. All of
+`PACKAGES` is hours of processor time: modules that JAX compiles are traced and compiled for every mutant anew.
+
+mutmut runs pytest several times in one process, which jaxtyping's import hook refuses: the project's options of pytest
+are left out, and shapes are not checked.
+"""
+
+from __future__ import annotations
+
+import argparse
+import datetime
+import os
+import re
+import resource
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+from experiments.common.command_line import parser
+from experiments.common.rows import ROOT, append_row, commit, output, read_rows
+from experiments.robustness.planted_faults import unpack
+
+ROWS = output(__file__, "mutations.jsonl")
+PACKAGES = ("estimators", "model", "posterior", "single_axis", "statistics")
+"""Those that hold the mathematics."""
+SETTINGS = """[mutmut]
+source_paths=
+    tvsbayes
+only_mutate=
+    {module}
+also_copy=
+    data
+    experiments
+pytest_add_cli_args=
+    -o
+    addopts=
+    -m
+    not slow
+    -p
+    no:cacheprovider
+pytest_add_cli_args_test_selection=
+    {tests}
+use_git_change_detection=false
+"""
+SEEN = ("killed", "timeout", "segfault", "suspicious")
+
+
+def mutmut(root: Path, *words: str) -> str:
+    """What mutmut prints in a tree.
+
+    Raises:
+        RuntimeError: it failed.
+    """
+    # mutmut is a command; `-m` finds that of this environment.
+    environment = {**os.environ, "PYTHONPATH": "", "OPENBLAS_NUM_THREADS": "1"}
+    command = [sys.executable, "-m", "mutmut", *words]
+    ended = subprocess.run(command, cwd=root, env=environment, capture_output=True, text=True)
+    if ended.returncode:
+        said = ended.stdout[-3000:] + ended.stderr
+        raise RuntimeError(f"mutmut {' '.join(words)} ended with {ended.returncode}:\n{said}")
+    return ended.stdout
+
+
+def mutated(root: Path, name: str) -> dict[str, str]:
+    """A mutant: the function, the line before and after."""
+    lines = mutmut(root, "show", name).splitlines()
+    old, new = (
+        " ".join(line[1:].strip() for line in lines if line.startswith(sign) and not line.startswith(3 * sign))
+        for sign in "-+"
+    )
+    function = name.rpartition(".")[2].rpartition("__mutmut_")[0]
+    return {"function": re.sub(r"^x_?", "", function.replace("ǁ", ".")).lstrip("."), "old": old, "new": new}
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Append a row of a module."""
+    module = arguments.module
+    package, _, name = module.removeprefix("tvsbayes/").rpartition("/")
+    tests = arguments.tests or [f"tests/{package}/test_{name}"]
+    if missing := [path for path in (module, *tests) if not (ROOT / path).exists()]:
+        raise SystemExit(f"no such file: {', '.join(missing)}")
+    revision = commit()
+    with tempfile.TemporaryDirectory(prefix="tvsbayes-mutations-") as scratch:
+        root = Path(scratch) / "tree"
+        unpack(revision, root)
+        (root / "setup.cfg").write_text(SETTINGS.format(module=module, tests="\n    ".join(tests)))
+        mutmut(root, "run", "--max-children", str(arguments.processes))
+        used = resource.getrusage(resource.RUSAGE_CHILDREN)
+        outcomes = dict(re.findall(r"^\s*(\S+): (.+)$", mutmut(root, "results", "--all", "true"), re.MULTILINE))
+        survivors = [mutated(root, key) for key, outcome in outcomes.items() if outcome == "survived"]
+    row = {
+        "module": module,
+        "tests": tests,
+        "mutants": len(outcomes),
+        "seen": sum(outcome in SEEN for outcome in outcomes.values()),
+        "untested": sum(outcome == "no tests" for outcome in outcomes.values()),
+        "survivors": survivors,
+        "cpu_s": round(used.ru_utime + used.ru_stime, 1),
+        "date": str(datetime.date.today()),
+        "commit": revision,
+    }
+    append_row(arguments.rows, row)
+    print(f"{module}: {row['seen']} of {row['mutants']} seen, {len(survivors)} survive, {row['untested']} untested")
+    return 0
+
+
+TEXT = """# Mutants that no test sees
+
+Written by `python -m experiments.robustness.mutations table`: the latest run of each module. mutmut changes one
+operator, number, argument or word at a time, and runs the tests that reach the function.
+{remarks}
+| module | tests | mutants | seen | survive | reached by none | CPU s | of |
+|---|---|---|---|---|---|---|---|"""
+REMARKS = ""
+
+
+def table(arguments: argparse.Namespace) -> int:
+    """The page: counts of every module, then what survives."""
+    rows = {row["module"]: row for row in read_rows(arguments.rows)}
+    print(TEXT.format(remarks=REMARKS))
+    for module, row in sorted(rows.items()):
+        tests = ", ".join(f"`{test.removeprefix('tests/')}`" for test in row["tests"])
+        counts = (row["mutants"], row["seen"], len(row["survivors"]), row["untested"], f"{row['cpu_s']:.0f}")
+        print(f"| `{module.removeprefix('tvsbayes/')}` | {tests} | {' | '.join(map(str, counts))} | {row['commit']} |")
+    for module, row in sorted(rows.items()):
+        print(f"\n## {module.removeprefix('tvsbayes/')}\n\n| in | before | after |\n|---|---|---|")
+        for one in row["survivors"]:
+            before, after = (f"`{one[part]}`".replace("|", "\\|") for part in ("old", "new"))
+            print(f"| {one['function']} | {before} | {after} |")
+    return 0
+
+
+def main() -> None:
+    """The command."""
+    made = parser(__doc__)
+    made.add_argument("--rows", type=Path, default=ROWS)
+    commands = made.add_subparsers(required=True)
+    for command in (run, table):
+        one = commands.add_parser(command.__name__, help=command.__doc__)
+        one.set_defaults(command=command)
+        if command is run:
+            one.add_argument("module", help="path from the root")
+            one.add_argument("--tests", nargs="+", help="paths from the root")
+            one.add_argument("--processes", type=int, default=2, help="mutants at a time (%(default)s)")
+    arguments = made.parse_args()
+    raise SystemExit(arguments.command(arguments))
+
+
+if __name__ == "__main__":
+    main()
