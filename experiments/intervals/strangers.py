@@ -150,7 +150,7 @@ def one_bench(task: tuple[int | None, str | None, str], fresh: bool = False) -> 
             row |= {"cpu_s": cpu_s() - start, "exit": document["exit"]}
             row |= answer_of(document) | {"headlines": headlines_of(document, truth)}
         except Exception as error:
-            row["problems"] = [*row.get("problems", []), repr(error)]
+            row["problems"] = [repr(error)]
     return row
 
 
@@ -187,11 +187,7 @@ def answer_of(document: dict) -> Row:
         "effective": None if not importance else importance["effective_share"] * importance["draws"],
         "least_ess": (importance.get("least_ess") or {}).get("value"),
         "heaviest_share": importance.get("heaviest_share"),
-        "problems": [
-            *document.get("problems", []),
-            *importance.get("missing", []),
-            *([error["message"]] if error else []),
-        ],
+        "problems": importance.get("missing") or document.get("problems") or [error["message"]] * bool(error),
     }
 
 
