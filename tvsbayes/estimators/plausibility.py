@@ -23,14 +23,15 @@ from tvsbayes.estimators.spot_pattern import (
     SPOTS_LISTED,
     SPOTS_MIN,
     mismatch_px,
+    mismatch_spread_px,
     pattern_of,
     picture_findings,
     table_findings,
 )
 from tvsbayes.instrument.axes import AXES
-from tvsbayes.instrument.campaign import UNDETECTED, Campaign, Spot, pixels_of
+from tvsbayes.instrument.campaign import PIXEL_SDS, UNDETECTED, Campaign, Spot, pixels_of
 from tvsbayes.instrument.parameters import names_of
-from tvsbayes.instrument.stereo_pair import pair_doubts, triangulate
+from tvsbayes.instrument.stereo_pair import SHORTEST_BASELINE_MM, baseline_doubt, pair_doubts, triangulate
 from tvsbayes.instrument.stops import observed_stops, separation
 
 NEAREST_SHEET_MM, FARTHEST_SHEET_MM = 20.0, 100_000.0
@@ -41,6 +42,8 @@ CORNER_SHARE = 0.02
 """Share of the picture's height: spots that all lie nearer than that to its first pixel were not measured in pixels."""
 ODD_SHARE = 0.1
 """Share of spots at impossible depths from which the others tell nothing of counters and names."""
+NOISE_OFF = 4.0
+"""Pixel noise over the stated one, either way, that a fit's prior (a factor of 1.6, log-normal) does not expect."""
 SHALLOW = 1.2
 """Ratio of the largest to the smallest depth below which the sheet stood at one place (the paper's: 1.6)."""
 
@@ -98,7 +101,7 @@ def implausible(campaign: Campaign, points_mm: np.ndarray | None = None) -> tupl
         found.append(Finding("status", said, file="spots.csv"))
     if not ok:
         return tuple(found)
-    found += doubts("stereo", pair_doubts(campaign.stereo), "stereo.json")
+    found += _stereo_findings(campaign)
     found += doubts("units", _metres(campaign), "campaign.toml")
     if (unit := _pixel_unit(campaign, ok)) is not None:
         return (*found, unit)
@@ -115,6 +118,49 @@ def implausible(campaign: Campaign, points_mm: np.ndarray | None = None) -> tupl
             pictures = picture_findings(pattern)
             found += pictures or [*counter_findings(pattern), *table_findings(pattern)]
     return (*found, *_reading_findings(ok))
+
+
+def misfit_causes(campaign: Campaign, pixel_scale: float | None = None) -> tuple[Finding, ...]:
+    """What explains that a fit of a campaign fails, likeliest first.
+
+    Args:
+        campaign: that was fitted.
+        pixel_scale: pixel noise over the stated one where the fit ended; None without a fit.
+
+    Returns:
+        What `implausible` finds, and noise that is not as stated: a poor calibration leaves the same, so that `check`
+        itself does not say it. Empty where nothing of it explains the failure.
+    """
+    found = [*implausible(campaign)]
+    ok = [spot for spot in campaign.spots if spot.status == "ok"]
+    points_mm = _points_mm(campaign)
+    stands = _can_stand(points_mm[:, 0])
+    if stands.sum() < 2 * SPOTS_MIN or stands.mean() <= 1 - ODD_SHARE:
+        return tuple(found)
+    there = [spot for spot, can in zip(ok, stands, strict=True) if can]
+    seen_px = mismatch_spread_px(pattern_of(campaign, there, points_mm[stands]))
+    stated_px = float(np.median([[getattr(spot, name) for name in PIXEL_SDS] for spot in there]))
+    said = f"left and right of a spot agree to {seen_px:.2g} px (sd), su and sv of spots.csv say {stated_px:.2g} px"
+    if not 1 / NOISE_OFF < seen_px / stated_px < NOISE_OFF:
+        remedy = f"state {seen_px:.2g} px in su and sv, by `tvsbayes import --sd-px {seen_px:.2g}` of a table without"
+        found.append(Finding("pixel-noise", said, remedy, file="spots.csv"))
+    elif pixel_scale is not None and pixel_scale > NOISE_OFF:
+        said += f", but beams miss them by {pixel_scale:.2g} times that: the beam scatters, not the pixels"
+        remedy = "look for a loose laser or mirror, vibration, steps that were lost, or a sheet that moved"
+        found.append(Finding("beam-scatter", said, remedy))
+    # What is certain explains most.
+    return tuple(sorted(found, key=lambda finding: not finding.certain))
+
+
+def _stereo_findings(campaign: Campaign) -> list[Finding]:
+    """What contradicts the pair of cameras; a baseline that no pair has is certain."""
+    unit = baseline_doubt(campaign.stereo)
+    others = doubts("stereo", (text for text in pair_doubts(campaign.stereo) if text != unit), "stereo.json")
+    if unit is None:
+        return others
+    given = "m" if float(np.linalg.norm(campaign.stereo.T)) < SHORTEST_BASELINE_MM else "mm"
+    remedy = f"import it again: `tvsbayes stereo --import FILE --import-unit {given} -o stereo.json`"
+    return [Finding("units", unit, remedy, certain=True, file="stereo.json"), *others]
 
 
 def _pixel_unit(campaign: Campaign, ok: Sequence[Spot]) -> Finding | None:

@@ -123,14 +123,32 @@ def _picture_doubts(pattern: SpotPattern) -> tuple[str, ...]:
     )
 
 
+def signed_mismatch_px(pattern: SpotPattern) -> np.ndarray:
+    """The mismatch with the sign of that of the left row, (n,)."""
+    projected = project_pair(pattern.campaign.stereo, pattern.points_mm)
+    return pattern.mismatch_px * np.sign((projected - pattern.pixels)[:, 1])
+
+
+def mismatch_spread_px(pattern: SpotPattern) -> float:
+    """Standard deviation of a centre's error, px, by how both pictures of the spots contradict each other.
+
+    Four coordinates have one condition, whose error is that of one coordinate. What changes evenly over the pictures
+    and with the distance is the calibration's and left out.
+    """
+    off, pixels = signed_mismatch_px(pattern), pattern.pixels
+    design = np.column_stack((np.ones(len(off)), pixels[:, :2], pixels[:, 0] - pixels[:, 2]))
+    design[:, 1:] -= design[:, 1:].mean(axis=0)
+    rest = off - design @ np.linalg.lstsq(design, off, rcond=None)[0]
+    return _spread(rest) * math.sqrt(len(off) / max(len(off) - design.shape[1], 1))
+
+
 def _knock_doubts(pattern: SpotPattern) -> tuple[str, ...]:
     """That left and right begin to contradict each other on the way: one camera was knocked, turned or focused anew.
 
     Of the mismatch the sign counts, that of the left row, and its step within each sheet: by a poor calibration they
     contradict each other at one distance more than at another.
     """
-    projected = project_pair(pattern.campaign.stereo, pattern.points_mm)
-    off = pattern.mismatch_px * np.sign((projected - pattern.pixels)[:, 1])
+    off = signed_mismatch_px(pattern)
     if len(off) < 2 * SPOTS_MIN:
         return ()
     limit = 5 * _spread(off) + KNOCK_PX
