@@ -227,8 +227,8 @@ def _stray_doubts(pattern: SpotPattern) -> tuple[str, ...]:
         # Of its own placement: rows follow each other where no other sheet was put there in between.
         spread, apart_mm = _spread(away), _from_neighbours(away, np.cumsum(np.diff(rows, prepend=rows[0]) > 1))
         usual = max(_spread(np.concatenate((apart_mm, -apart_mm))), NEIGHBOUR_FLOOR * spread)
-        limit = STRAY_PLANE * (1 + STRAY_FEW / len(rows)) * spread
-        limit = np.maximum(limit, MISMATCH_PX * _mm_per_pixel(pattern, rows))
+        least = STRAY_PLANE * (1 + STRAY_FEW / len(rows)) * spread
+        limit = np.maximum(least, MISMATCH_PX * _mm_per_pixel(pattern, rows))
         for k in np.flatnonzero(known & (np.abs(away) > limit) & (apart_mm > STRAY_NEIGHBOUR * usual)):
             found[int(rows[k])] = f"{abs(away[k]):.1f} mm off the plane of its sheet, others {spread:.1g} mm"
     if not found:

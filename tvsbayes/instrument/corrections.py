@@ -10,6 +10,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from itertools import pairwise
+from typing import Any
 
 from tvsbayes.errors import InputError, escaped
 from tvsbayes.instrument.axes import AXES, Axis
@@ -176,4 +177,5 @@ def _swapped(spot: Spot) -> Spot:
 def _from_zero(spot: Spot, first: int) -> Spot:
     """A look with centres counted from 0."""
     centre = {name: getattr(spot, name) for name in PIXELS}
-    return replace(spot, **{name: None if value is None else value - first for name, value in centre.items()})
+    moved: dict[str, Any] = {name: None if value is None else value - first for name, value in centre.items()}
+    return replace(spot, **moved)

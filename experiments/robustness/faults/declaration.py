@@ -181,14 +181,6 @@ FAULTS = (
         ("files/foreign_table",),
     ),
     Fault(
-        "direction of counters doubted where it is right",
-        "estimators/spot_pattern.py",
-        "own.share > FOLLOWED and own.slope < 0",
-        "own.share > FOLLOWED and own.slope > 0",
-        "good campaigns are accused, wrong signs are not",
-        ("estimators/spot_pattern", "estimators/plausibility"),
-    ),
-    Fault(
         "pictures of another simulation taken for one's own",
         "twin/frames.py",
         "make_folder(folder, empty=not _begun(folder, files))",
