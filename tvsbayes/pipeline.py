@@ -7,7 +7,7 @@ fits.
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from tvsbayes.calibration.pointing import Calibration
+    from tvsbayes.estimators.findings import Finding
     from tvsbayes.estimators.joint_fit import JointFit
     from tvsbayes.instrument.campaign import Campaign
     from tvsbayes.posterior.draws import Posterior
@@ -68,8 +69,11 @@ def compile_for(tell: Tell) -> None:
         tell(line)
 
 
-def unusable(summary: FitSummary) -> TvsError | None:
-    """Why a fit that ran to its end must not be used: not converged (4) or nothing learned (3)."""
+def unusable(summary: FitSummary, causes: Sequence[Finding] = ()) -> TvsError | None:
+    """Why a fit that ran to its end must not be used: not converged (4) or nothing learned (3).
+
+    `causes` are what explains a fit that explains nothing, as `misfit_causes` finds them.
+    """
     if not summary.converged and summary.sampling is not None and not summary.sampling.converged:
         chain = summary.sampling.steps is not None
         return NotConverged(
@@ -78,7 +82,7 @@ def unusable(summary: FitSummary) -> TvsError | None:
             remedy="run again with --resume and more --max-minutes" if chain else "run again without --quick",
         )
     if not summary.converged:
-        return NotConverged.of(summary.problems, MISFIT_REMEDY)
+        return NotConverged.of(summary.problems, "; ".join(c.sentence for c in causes) or MISFIT_REMEDY)
     if not summary.headline_informed:
         return NothingToEstimate(
             "uninformed",
@@ -100,6 +104,7 @@ class CampaignResults(Shown):
         calibration: what `locate` needs; None of a fit that did not converge.
         draws: behind the record.
         error: why the results must not be used, None where they may.
+        causes: what explains a fit without a mode that explains the data; empty of all others.
         files: paths of what was written, by kind: "draws", "fit", "posterior", "chain".
     """
 
@@ -110,6 +115,7 @@ class CampaignResults(Shown):
     draws: ResultDraws
     error: TvsError | None
     files: dict[str, str]
+    causes: tuple[Finding, ...] = ()
 
     def shown(self) -> View:
         """What its record says, and whether that may be used."""
@@ -225,6 +231,7 @@ def _results(
 
     from tvsbayes.assessment.fitted_calibration import DRAWS_KEPT, calibration_of
     from tvsbayes.assessment.summary import equal_laplace_draws, summarise
+    from tvsbayes.estimators.plausibility import misfit_causes
     from tvsbayes.instrument.campaign import input_hashes
     from tvsbayes.results.fit_record import FitRecord, covariance_of_draws, provenance
     from tvsbayes.results.stored_draws import ResultDraws, write_results
@@ -247,7 +254,8 @@ def _results(
             tell("posterior.nc of an earlier fit is removed: it would not be that of fit.json")
         mode = None if calibration is None else found.stored
         files = {**write_results(folder, record, draws, calibration, mode), **files}
-    return CampaignResults(record, found, posterior, calibration, draws, unusable(summary), files)
+    causes = () if found.converged else misfit_causes(found.campaign, summary.parameters["pixel_scale"].value)
+    return CampaignResults(record, found, posterior, calibration, draws, unusable(summary, causes), files, causes)
 
 
 def evidence_of(

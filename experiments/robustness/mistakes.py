@@ -1,10 +1,12 @@
-"""Which mistakes in a campaign's tables `check` sees, and how often it accuses a good campaign.
+"""Which mistakes in a campaign's tables `check` sees, and how often it accuses a sound campaign.
 
-    python -m experiments.robustness.mistakes [--seeds 60]
+    python -m experiments.robustness.mistakes [--seeds 60] [--sound 500] [--also FOLDER ...]
 
-Good campaigns are the shipped twins and simulations of the mounted rig after its four plans; each mistake is made in
-every one of them. An alarm is any sentence of `estimators.plausibility.implausible`: warnings of what a plan cannot
-tell are none.
+Mistakes are made in every one of the shipped twins and of simulations of the mounted rig after its four plans. Sound
+campaigns are drawn by the twin from all protocols, from what `tvsbayes plan` proposes (plans/RIG_SEED.csv: `tvsbayes
+plan data/rigs/RIG/rig.toml --draws 20 --minutes 30 --seed SEED`) and from random grids and steps, on rigs near and far
+from the shipped ones, and cut at many looks. A finding is any of `estimators.plausibility.implausible`: warnings of
+what a plan cannot tell are none. `--also` makes the mistakes in campaigns of others too.
 """
 
 from __future__ import annotations
@@ -12,7 +14,7 @@ from __future__ import annotations
 import argparse
 import re
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -20,12 +22,14 @@ from pathlib import Path
 import numpy as np
 
 from tvsbayes.estimators.plausibility import implausible
+from tvsbayes.estimators.spot_pattern import SPOTS_MIN
 from tvsbayes.files.disk import shipped_data, write_atomically
 from tvsbayes.instrument.campaign import Campaign, Spot, read_campaign
+from tvsbayes.instrument.corrections import Correction, corrected
 from tvsbayes.instrument.parameters import Prior, names_of
-from tvsbayes.instrument.plan import read_plan
-from tvsbayes.instrument.protocols import grid_protocol
-from tvsbayes.instrument.rig import read_rig
+from tvsbayes.instrument.plan import PlanStep, read_plan
+from tvsbayes.instrument.protocols import PROTOCOLS, four_point_protocol, grid_protocol
+from tvsbayes.instrument.rig import Rig, read_rig
 from tvsbayes.twin.simulated_campaign import simulate
 
 PLANS = ("paper", "paper_twin", "mixed", "grid")
@@ -41,6 +45,16 @@ def scaled(campaign: Campaign, factor: float) -> Campaign:
         return replace(spot, **{name: None if value is None else factor * value for name, value in values.items()})
 
     return replace(campaign, spots=tuple(map(change, campaign.spots)))
+
+
+def swapped(campaign: Campaign, _: np.random.Generator) -> Campaign:
+    """Left and right pictures exchanged."""
+    return replace(campaign, spots=corrected(None, campaign.spots, Correction(swapped=True)).spots)
+
+
+def from_one(campaign: Campaign, _: np.random.Generator) -> Campaign:
+    """All pixels as MATLAB counts them, which only spots at the very edge of a picture show."""
+    return replace(campaign, spots=corrected(None, campaign.spots, Correction(pixels_from=-1)).spots)
 
 
 def relative(campaign: Campaign, _: np.random.Generator) -> Campaign:
@@ -145,6 +159,9 @@ MISTAKES: dict[str, tuple[Change, str]] = {
     "5 % of the sheet names wrong": (renamed(0.05), "sheet of another name"),
     "half of the sheet names wrong": (renamed(0.5), "sheet of another name"),
     "sheet names blank": (unnamed, "column target is empty"),
+    "cameras swapped": (swapped, "left and right swapped"),
+    "centres in millimetres": (lambda campaign, _: scaled(campaign, 0.003), "centres in millimetres"),
+    "pixels counted from 1": (from_one, "count from 1"),
     "one pixel 10 px off": (mistyped(10.0), "apart from all others"),
     "one pixel 100 px off": (mistyped(100.0), "apart from all others|triangulate outside"),
     "spots one move early": (shifted, "the move after theirs|their rows are one apart"),
@@ -195,48 +212,128 @@ def poorly_calibrated(campaign: Campaign, rng: np.random.Generator) -> Campaign:
     return replace(campaign, stereo=campaign.stereo.with_vector(campaign.stereo.vector + off))
 
 
-def unlike_table(seeds: int) -> list[str]:
-    """How often good campaigns of rigs unlike the mounted one are accused."""
-    rig = read_rig(shipped_data() / "rigs" / "mounted" / "rig.toml")
-    plans = [read_plan(shipped_data() / "rigs" / "mounted" / f"{plan}.csv") for plan in ("paper", "grid")]
-    plans.append(grid_protocol(targets=("d1", "d2"), pan_steps=(0, 100, 200), tilt_steps=(-60, 60)))
-    rigs = {name: replace(rig, truth={**rig.truth, **changed}) for name, changed in UNLIKE.items()}
-    rigs |= {name: replace(rig, sheets_mm=sheets) for name, sheets in SHEETS.items()}
-    lines = ["| rig unlike the mounted one | campaigns | accused |", "|---|---|---|"]
-    for name, other in rigs.items():
-        said = [implausible(simulate(other, plan, seed=300 + k).campaign) for plan in plans for k in range(seeds)]
-        lines.append(f"| {name} | {len(said)} | {sum(map(bool, said))} |")
-    said = [
-        implausible(poorly_calibrated(simulate(rig, plan, seed=300 + k).campaign, np.random.default_rng(k)))
-        for plan in plans
-        for k in range(seeds)
+FIRST_LOOKS, CUTS = 24, 12
+"""Campaigns are cut at every look up to that one, from the first that `check` looks at, and at so many later ones."""
+POORLY = "cameras off by ten times what is stated of them"
+
+
+def _rigs() -> dict[str, Rig]:
+    """Rigs by what they are like."""
+    shipped = {f"{name} rig": read_rig(shipped_data() / "rigs" / name / "rig.toml") for name in ("mounted", "nominal")}
+    mounted = shipped["mounted rig"]
+    unlike = {name: replace(mounted, truth={**mounted.truth, **changed}) for name, changed in UNLIKE.items()}
+    unlike |= {name: replace(mounted, sheets_mm=sheets) for name, sheets in SHEETS.items()}
+    return {**shipped, **unlike, POORLY: mounted}
+
+
+def _random_grid(rng: np.random.Generator) -> tuple[PlanStep, ...]:
+    """A snake over a grid of a few counters at one sheet or more."""
+    targets = sorted(rng.choice(["d1", "d2", "d3"], int(rng.integers(1, 4)), replace=False).tolist())
+    pan = np.linspace(-60, int(rng.integers(40, 260)), int(rng.integers(3, 8))).astype(int)
+    tilt = np.linspace(-90, int(rng.integers(-30, 100)), int(rng.integers(2, 6))).astype(int)
+    return grid_protocol(targets=targets, pan_steps=pan.tolist(), tilt_steps=tilt.tolist())
+
+
+def _random_four_points(rng: np.random.Generator) -> tuple[PlanStep, ...]:
+    """Four-point experiments of a few lengths."""
+    steps = rng.integers(20, 220, int(rng.integers(1, 4))).tolist()
+    return four_point_protocol(int(rng.integers(3, 20)), steps=steps, targets=("d1", str(rng.choice(["d2", "d3"]))))
+
+
+def sound_campaign(number: int, rigs: Mapping[str, Rig]) -> tuple[str, Campaign]:
+    """A campaign without a mistake, drawn anew for every number, with the name of its rig, which take turns."""
+    rng = np.random.default_rng([7, number])
+    name = list(rigs)[number % len(rigs)]
+    planned = sorted((Path(__file__).parent / "plans").glob("*.csv"))
+    kinds = [*PROTOCOLS, *planned, _random_grid, _random_four_points]
+    kind = kinds[int(rng.integers(len(kinds)))]
+    if isinstance(kind, Path):
+        plan = read_plan(kind)
+    else:
+        plan = PROTOCOLS[kind]() if isinstance(kind, str) else kind(rng)
+    odd = {"aperture": bool(rng.integers(2)), "sides_recorded": bool(rng.integers(2)), "home_approach": None}
+    campaign = simulate(rigs[name], plan, seed=1000 + number, **odd).campaign
+    return name, poorly_calibrated(campaign, rng) if name == POORLY else campaign
+
+
+def cut(campaign: Campaign, looks: int) -> Campaign:
+    """What there is of a campaign after so many looks."""
+    spots = campaign.spots[:looks]
+    return replace(campaign, spots=spots, moves=campaign.moves[: spots[-1].move + 1])
+
+
+def cuts_of(campaign: Campaign, rng: np.random.Generator) -> list[int]:
+    """Numbers of looks after which a campaign is asked, the last: all."""
+    count = len(campaign.spots)
+    later = rng.integers(FIRST_LOOKS, max(count, FIRST_LOOKS + 1), CUTS).tolist()
+    return sorted({k for k in (*range(SPOTS_MIN, FIRST_LOOKS), *later, count) if k <= count})
+
+
+def sound_table(count: int) -> list[str]:
+    """How often sound campaigns are accused, whole and cut, by rig."""
+    rigs = _rigs()
+    found = {name: Counter[str]() for name in rigs}
+    kinds: Counter[str] = Counter()
+    for number in range(count):
+        name, campaign = sound_campaign(number, rigs)
+        said = {k: implausible(cut(campaign, k)) for k in cuts_of(campaign, np.random.default_rng([8, number]))}
+        all_of_it = [finding for findings in said.values() for finding in findings]
+        kinds.update(f"{f.code}, {'certain' if f.certain else 'doubt'}, {name}" for f in all_of_it)
+        found[name].update(
+            campaigns=1,
+            asked=len(said),
+            accused=any(f.certain for f in all_of_it),
+            doubted=bool(all_of_it),
+            doubts=sum(map(bool, said.values())),
+        )
+    lines = [
+        f"{count} sound campaigns, each whole and cut at every look up to {FIRST_LOOKS} and {CUTS} later ones:",
+        "",
     ]
-    lines.append(f"| cameras off by ten times what is stated of them | {len(said)} | {sum(map(bool, said))} |")
+    columns = ("campaigns", "asked", "accused", "doubted", "doubts")
+    lines.append("| rig | campaigns | asked | campaigns accused (certain) | campaigns doubted | cuts doubted |")
+    lines.append("|---|---|---|---|---|---|")
+    rows = {**found, "all": sum(found.values(), Counter())}
+    lines += [f"| {name} | {' | '.join(str(row[c]) for c in columns)} |" for name, row in rows.items()]
+    return lines + [""] * bool(kinds) + [f"said of sound ones, {n} times: {kind}" for kind, n in kinds.most_common()]
+
+
+def others_table(folders: Sequence[Path]) -> list[str]:
+    """What is said of campaigns of others, and of mistakes made in them."""
+    lines = ["| campaign | sound | pan sign | tilt sign | spots one move early |", "|---|---|---|---|---|"]
+    for folder in folders:
+        campaign, cells = read_campaign(folder), []
+        for name in ("none", "pan sign", "tilt sign", "spots one move early"):
+            said = implausible(MISTAKES[name][0](campaign, np.random.default_rng(1)))
+            cells.append(", ".join(f"{f.code}{' (certain)' * f.certain}" for f in said) or "-")
+        lines.append(f"| {folder.name} | {' | '.join(cells)} |")
     return lines
 
 
-def table(seeds: int) -> str:
+def table(seeds: int, sound: int) -> str:
     """How many campaigns with each mistake are accused, and how many by its name."""
     good = good_campaigns(seeds)
     lines = [f"{len(good)} campaigns: 2 shipped twins, {seeds} simulated ones of each plan ({', '.join(PLANS)})", ""]
-    lines += ["| mistake | warned of | by its name |", "|---|---|---|"]
-    kinds: Counter[str] = Counter()
+    lines += ["| mistake | warned of | by its name | certain |", "|---|---|---|---|"]
     for name, (change, words) in MISTAKES.items():
         said = [implausible(change(c, np.random.default_rng(k))) for k, c in enumerate(good.values())]
-        if name == "none":
-            kinds.update(re.sub(r"[0-9.]+", "#", text)[:80] for texts in said for text in texts)
-        any_word, own = sum(map(bool, said)), sum(bool(words and re.search(words, "\n".join(s))) for s in said)
-        lines.append(f"| {name} | {any_word} | {own if words else '-'} |")
-    lines += ["", *unlike_table(max(seeds // 3, 1))]
-    lines += ["", *(f"accused though good, {count}: {kind}" for kind, count in kinds.items())]
-    return "\n".join(lines).rstrip() + "\n"
+        named = sum(bool(words and re.search(words, "\n".join(f.sentence for f in found))) for found in said)
+        certain = sum(any(f.certain for f in found) for found in said)
+        lines.append(f"| {name} | {sum(map(bool, said))} | {named if words else '-'} | {certain} |")
+    return "\n".join([*lines, "", *sound_table(sound)]).rstrip() + "\n"
 
 
 def main() -> None:
     """Write the table beside this file."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seeds", type=int, default=60)
-    text = table(parser.parse_args().seeds)
+    parser.add_argument("--sound", type=int, default=500)
+    parser.add_argument("--also", type=Path, nargs="+", help="campaign folders of others, printed alone")
+    wish = parser.parse_args()
+    if wish.also:
+        print("\n".join(others_table(wish.also)))
+        return
+    text = table(wish.seeds, wish.sound)
     print(text)
     heading = "# Mistakes that `check` sees\n\n`python -m experiments.robustness.mistakes`\n\n"
     write_atomically(Path(__file__).with_suffix(".md"), (heading + text).encode())

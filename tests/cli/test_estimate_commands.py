@@ -250,7 +250,11 @@ def test_swapped_cameras_end_in_words_and_files(ask, mounted_rig, tmp_path):
     four = simulate(mounted_rig, mixed_protocol(4), seed=3).campaign
     write_campaign(with_spots(four, swapped), tmp_path / "swapped")
     code, document = ask("fit", tmp_path / "swapped", "--no-sample")
-    assert code == 4 and "swapped cameras" in document["error"]["remedy"]
+    error = assert_error(document, "cameras-swapped")
+    assert (code, error["file"], error["line"]) == (2, "spots.csv", 2) and "--anyway" in error["remedy"]
+    assert not (tmp_path / "swapped" / "results").exists()
+    code, document = ask("fit", tmp_path / "swapped", "--no-sample", "--anyway")
+    assert code == 4 and "are left and right swapped" in document["error"]["remedy"]
     saved = json.loads((tmp_path / "swapped" / "results" / "fit.json").read_text(), parse_constant=no_constant)
     assert problems(saved, json.loads((DATA / "schemas" / "fit-1.schema.json").read_text())) == []
 
@@ -313,7 +317,7 @@ def test_noise_above_the_stated_is_no_misfit(ask, grid_campaign, tmp_path, u, sw
     write_campaign(
         with_spots(replace(grid_campaign, rig=replace(grid_campaign.rig, priors=priors)), louder), tmp_path / "c"
     )
-    assert ask("fit", tmp_path / "c", "--no-sample")[0] == ends
+    assert ask("fit", tmp_path / "c", "--no-sample", *["--anyway"] * swap)[0] == ends
 
 
 def test_a_fit_that_did_not_converge_is_exit_4(ask, say, grid_folder, monkeypatch):

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import io
+import shlex
 import shutil
+from dataclasses import replace
 
 import pytest
 from support.commands import MOUNTED, assert_error
 
-from tvsbayes.instrument.campaign import moves_bytes, pixels_of, read_campaign
+from tvsbayes.instrument.campaign import moves_bytes, pixels_of, read_campaign, write_campaign
 
 TABLE = "Nr;Pan;Tilt;XL;YL;XR;YR;Blatt\n1;0;0;640,5;360,25;500;360;nah\n2;200;0;700,5;360,25;560;360;nah\n"
 
@@ -55,6 +57,50 @@ def test_a_log_for_a_campaign_whose_counters_wait_is_told_the_way(ask, tmp_path)
     error = document["error"]
     assert code == 2 and (error["line"], error["column"], error["found"]) == (2, "pan_steps", "an empty cell")
     assert "import it --to a new folder" in error["remedy"] and "--pictures FOLDER" in error["remedy"]
+
+
+def test_a_counter_with_the_wrong_sign_stops_and_is_mended_as_said(ask, say, grid_campaign, tmp_path):
+    """From `check` through the command that it names to a copy that is the campaign as it should be."""
+    moves = tuple(replace(m, tilt_steps=-m.tilt_steps) for m in grid_campaign.moves)
+    write_campaign(replace(grid_campaign, moves=moves), tmp_path / "wrong")
+    code, document = ask("check", tmp_path / "wrong")
+    (found,) = document["findings"]
+    assert code == 0 and found["certain"] and found["code"] == "counter-sign"
+    assert "certain: 1 of them" in say("check", tmp_path / "wrong")[1]
+    for command in ("fit", "calibrate"):
+        code, document = ask(command, tmp_path / "wrong", "--quick")
+        error = assert_error(document, "counter-sign")
+        assert (code, error["file"], error["line"]) == (2, "moves.csv", found["line"])
+        assert found["remedy"] in error["remedy"] and "--anyway" in error["remedy"]
+    words = shlex.split(found["remedy"].split("`")[1])
+    code, document = ask(*words[1:])
+    assert code == 0 and document["files"] and "approaches stay" in document["assumed"][0]
+    mended, sound = read_campaign(tmp_path / "wrong-mended"), grid_campaign
+    assert (mended.moves, mended.spots) == (sound.moves, sound.spots)
+    assert (mended.path / "campaign.toml").read_bytes() == (tmp_path / "wrong" / "campaign.toml").read_bytes()
+    assert ask("check", mended.path)[1]["findings"] == []
+    assert ask(*words[1:])[0] == 2, "nothing is overwritten"
+
+
+def test_a_campaign_is_copied_only_to_be_corrected(ask, say, grid_folder, tmp_path):
+    code, document = ask("import", grid_folder, "--to", tmp_path / "x", "--yes")
+    assert code == 2 and "--flip" in document["error"]["remedy"]
+    for option in (("--column", "move=Nr"), ("--sd-px", "0.2"), ("--pan-approach", "left")):
+        code, document = ask("import", grid_folder, "--to", tmp_path / "x", "--swap", *option, "--yes")
+        assert code == 2 and option[0] in document["error"]["message"]
+    code, text, _ = say("import", grid_folder, "--to", tmp_path / "x", "--shift-moves", "1")
+    assert code == 0 and "nothing written" in text and not (tmp_path / "x").exists()
+
+
+def test_a_table_gets_the_other_sign(ask, table, tmp_path):
+    """And keeps the approach, which names the direction of the beam."""
+    out = tmp_path / "mine"
+    code, document = ask("import", table, "--to", out, "--flip", "pan_steps", "--pan-approach", "right", "--yes")
+    assert code == 0 and "other sign" in document["assumed"][-1]
+    shutil.copy(MOUNTED / "stereo.json", out)
+    first, second = read_campaign(out).moves
+    assert (first.pan_approach, first.pan_steps, second.pan_steps) == ("right", 0, -200)
+    assert ask("import", table, "--to", out / "2", "--flip", "pan", "--yes")[0] == 2
 
 
 def test_looks_go_to_the_moves_of_a_campaign(ask, grid_campaign, tmp_path):

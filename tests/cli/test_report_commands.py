@@ -70,7 +70,7 @@ def test_it_stops_where_a_fit_must_not_be_used(ask, say, grid_campaign, tmp_path
         for before, m in zip((grid_campaign.moves[0], *grid_campaign.moves), grid_campaign.moves, strict=False)
     )
     write_campaign(replace(grid_campaign, moves=moves), tmp_path / "relative")
-    code, document = ask("calibrate", tmp_path / "relative", "--no-sample")
+    code, document = ask("calibrate", tmp_path / "relative", "--no-sample", "--anyway")
     assert code == 4 and document["report"] is None and document["error"]["code"]
     assert not (tmp_path / "relative" / "results" / "report.html").exists()
 

@@ -9,10 +9,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from experiments.robustness.mistakes import MISTAKES
 from tvsbayes.cli.main import run
-from tvsbayes.estimators.plausibility import check_campaign
+from tvsbayes.estimators.plausibility import check_campaign, implausible, misfit_causes
 from tvsbayes.files.disk import shipped_data
-from tvsbayes.instrument.campaign import Campaign, read_campaign, write_campaign
+from tvsbayes.instrument.campaign import PIXEL_SDS, PIXELS, Campaign, read_campaign, write_campaign
+from tvsbayes.instrument.corrections import Correction, corrected
 from tvsbayes.instrument.protocols import PROTOCOLS
 from tvsbayes.twin.simulated_campaign import simulate
 
@@ -135,6 +137,68 @@ def test_incomplete_experiments_and_refused_spots_are_counted(paper_twin):
     assert found.refused == {"saturated": 1}
     assert (found.ok_spots, found.experiments) == (383, 95)
     assert [w for w in found.warnings if w.startswith("experiment 1 is not complete")]
+
+
+def test_swapped_cameras_and_wrong_units_are_certain(paper_twin):
+    """Where exchanged pictures put all spots on sheets; where no lens, no pair and no sheet can be meant."""
+    swapped = corrected(None, paper_twin.spots, Correction(swapped=True)).spots
+    (found,) = implausible(replace(paper_twin, spots=swapped))
+    assert (found.code, found.certain, found.line) == ("cameras-swapped", True, 2) and "--swap" in found.remedy
+    in_mm = tuple(replace(s, **{name: 0.003 * getattr(s, name) for name in PIXELS}) for s in paper_twin.spots)
+    metres = replace(paper_twin.stereo, T=paper_twin.stereo.T / 1000)
+    grid = read_campaign(shipped_data() / "twins" / "grid_twin")
+    radians = tuple(replace(s, aperture_deg=float(np.radians(s.aperture_deg))) for s in grid.spots)
+    for campaign, file in (
+        (replace(paper_twin, spots=in_mm), "spots.csv"),
+        (replace(paper_twin, stereo=metres), "stereo.json"),
+        (replace(grid, spots=radians), "spots.csv"),
+    ):
+        first = implausible(campaign)[0]
+        assert (first.code, first.certain, first.file) == ("units", True, file)
+    # A mirror may sit 0.4 mm off: a doubt.
+    assert not any(f.certain for f in implausible(MISTAKES["mirror offset in metres"][0](paper_twin, None)))
+
+
+def test_mismatched_pictures_are_not_called_swapped(paper_twin):
+    """Spots behind the cameras that exchanged pictures bring nowhere either."""
+    rng = np.random.default_rng(5)
+    order = rng.permutation(len(paper_twin.spots))
+    names = ("u_right_px", "v_right_px")
+    mixed = tuple(
+        replace(s, **{n: getattr(paper_twin.spots[k], n) for n in names})
+        for s, k in zip(paper_twin.spots, order, strict=True)
+    )
+    assert not any(f.certain for f in implausible(replace(paper_twin, spots=mixed)))
+
+
+def test_pixels_that_count_from_one_show_at_the_edge(paper_twin):
+    """(0.5, size + 0.5) is where they lie: one beyond the picture may be a spot that the edge cuts, two are none."""
+    edge = paper_twin.stereo.image_width - 0.5
+    spots = paper_twin.spots
+
+    def moved(count: int, by_px: float):
+        return replace(paper_twin, spots=(*(replace(s, u_left_px=edge + by_px) for s in spots[:count]), *spots[count:]))
+
+    def said(campaign):
+        return [f.certain for f in implausible(campaign) if f.code == "pixels-from-one"]
+
+    assert said(moved(2, 0.4)) == [True] and said(moved(1, 0.4)) == [False]
+    assert said(moved(2, -0.1)) == [] and said(moved(2, 1.1)) == []
+    near_zero = moved(2, 0.4)
+    assert said(replace(near_zero, spots=(*near_zero.spots[:-1], replace(spots[-1], v_right_px=0.2)))) == []
+
+
+@pytest.mark.parametrize(
+    ("su_px", "scale", "code"), [(0.08, 1.0, None), (0.004, 20.0, "pixel-noise"), (0.08, 9.0, "beam-scatter")]
+)
+def test_what_explains_a_failed_fit(paper_twin, su_px, scale, code):
+    """Left and right scatter by what the twin was drawn with, 0.08 px to a factor of 1.6; su and sv say another."""
+    spots = tuple(replace(s, **dict.fromkeys(PIXEL_SDS, su_px)) for s in paper_twin.spots)
+    campaign = replace(paper_twin, spots=spots)
+    assert implausible(campaign) == ()
+    assert [f.code for f in misfit_causes(campaign, scale)] == ([code] if code else [])
+    turned_round = MISTAKES["pan sign"][0](campaign, None)
+    assert misfit_causes(turned_round)[0].code == "counter-sign"
 
 
 def test_a_campaign_without_usable_spots_is_told_once(paper_twin):

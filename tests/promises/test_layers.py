@@ -38,6 +38,7 @@ JAX_FREE_PACKAGES = (
 )
 JAX_FREE_MODULES = (
     *("statistics.intervals", "estimators.four_point", "estimators.spot_pattern", "estimators.plausibility"),
+    *("estimators.findings", "estimators.counter_pattern"),
     *("comparison.gap", "comparison.changes", "comparison.held_out"),
 )
 """Free of JAX until a function that fits is called, in packages that are not."""

@@ -7,7 +7,9 @@ from dataclasses import replace
 import pytest
 from support.small_results import small_summary
 
+from tvsbayes.estimators.findings import Finding
 from tvsbayes.estimators.four_point import ClassicResult, DirectionResult
+from tvsbayes.report.advice import steps_ahead
 from tvsbayes.report.evidence import Criterion
 from tvsbayes.report.first_page import verdict_of
 from tvsbayes.report.fit_text import classic_text, demo_text, fit_text
@@ -21,7 +23,11 @@ def test_a_fit_astray_shows_no_results():
     text = fit_text(astray)
     assert text.splitlines()[0] == "NOT CONVERGED: it ran away"
     assert "NOT results" in text and "95 %" not in text and "0.0621" not in text and "weak" not in text
-    assert "19 and 10 more" in text
+    assert "19 and 10 more" in text and "cause" not in text
+    causes = [Finding("counter-sign", "spots move right", "flip it", True)]
+    assert fit_text(astray, causes=causes).splitlines()[-1] == "cause: spots move right"
+    assert steps_ahead(astray, "mine", causes) == ["Use none of the numbers: spots move right; flip it."]
+    assert "tvsbayes check" in steps_ahead(astray, "mine")[0]
 
 
 @pytest.mark.parametrize(("estimator", "word"), [("laplace", "too short; sample"), ("posterior", "intervals hold it")])

@@ -49,6 +49,7 @@ def _options(
 
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON document on stdout.")]
 Seed = Annotated[int, typer.Option("--seed", min=0, help="Seed of everything random.")]
+Anyway = Annotated[bool, typer.Option("--anyway", help="Go on at what `check` is certain of.")]
 OldOut = Annotated[Path | None, typer.Option("--output", hidden=True)]
 """The former name of --out."""
 CampaignFolder = Annotated[Path, typer.Argument(metavar="CAMPAIGN", help="Campaign folder.")]

@@ -11,7 +11,18 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from tvsbayes.cli import axis_commands
-from tvsbayes.cli.app import CampaignFolder, Json, Seed, command_line, finish, finite, keep, refuse_options, report_line
+from tvsbayes.cli.app import (
+    Anyway,
+    CampaignFolder,
+    Json,
+    Seed,
+    command_line,
+    finish,
+    finite,
+    keep,
+    refuse_options,
+    report_line,
+)
 from tvsbayes.cli.progress_bar import chain_kept, waiting
 from tvsbayes.errors import InputError, NothingToEstimate, escaped
 from tvsbayes.files.disk import output_place
@@ -24,14 +35,25 @@ if TYPE_CHECKING:
     from tvsbayes.results.comparison_record import ComparisonRecord
     from tvsbayes.results.estimates import FitSummary
 HOLDING_OUT = "hold-out"
+GO_ON = "--anyway fits it all the same"
+"""How to go on at a certain finding of `check`."""
 
 
-def _warn_of(campaign: Campaign) -> None:
-    """What `check` says of data that no rig can have measured, for whoever did not ask it first."""
+def _warn_of(campaign: Campaign, *, stops: bool = False) -> None:
+    """What `check` says of data that no rig can have measured, for a user who did not ask it first.
+
+    Raises:
+        InputError: `stops`, and it is certain of something.
+    """
+    from tvsbayes.estimators.findings import stop_at
     from tvsbayes.estimators.plausibility import implausible
 
-    for sentence in implausible(campaign):
-        report_line(f"warning: {sentence}")
+    findings = implausible(campaign)
+    for finding in findings:
+        if not (stops and finding.certain):
+            report_line(f"warning: {finding.sentence}")
+    if stops:
+        stop_at(findings, GO_ON)
 
 
 def classic(campaign: CampaignFolder, as_json: Json = False) -> None:
@@ -65,6 +87,7 @@ def fit(
     perfect_gears: Annotated[
         bool, typer.Option("--perfect-gears", help="No errors by position but stated or freed harmonics; no drift.")
     ] = False,
+    anyway: Anyway = False,
     details: Annotated[
         bool, typer.Option("--details", help="Also print what else the fit says: gears, priors, weak directions.")
     ] = False,
@@ -87,7 +110,7 @@ def fit(
         )
     if axis_commands.is_axis(campaign):
         choice = {"robust": robust, "per_axis": per_axis, "harmonics": harmonics, "no_backlash": no_backlash}
-        choice |= {"perfect_gears": perfect_gears, "resume": resume}
+        choice |= {"perfect_gears": perfect_gears, "resume": resume, "anyway": anyway}
         refuse_options(axis_commands.NOT_OF_AN_AXIS, "leave it out, or state priors in [axis]", **choice)
         minutes = MAX_MINUTES if max_minutes is None else max_minutes
         ways = {"quick": quick, "no_sample": no_sample, "max_minutes": minutes}
@@ -96,7 +119,7 @@ def fit(
     from tvsbayes.instrument.campaign import read_campaign
 
     data = read_campaign(campaign)
-    _warn_of(data)
+    _warn_of(data, stops=not anyway)
     from tvsbayes.instrument.model_choice import ModelChoice
     from tvsbayes.report.fit_text import fit_text
 
@@ -123,7 +146,7 @@ def fit(
         )
     summary, files = results.record.summary, results.files
     document = {**summary.as_json(), "seed": seed, "files": files}
-    text = fit_text(summary, details, list(files.values()))
+    text = fit_text(summary, details, list(files.values()), results.causes)
     if results.error is None and out is None:
         text += f"\nnext: {command_line('report', campaign)}"
     finish(document, text, as_json, results.error)

@@ -6,6 +6,7 @@ Options in, library called, table or JSON out; heavy imports stand inside the co
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -23,11 +24,14 @@ if TYPE_CHECKING:
     from tvsbayes.files.foreign_table import ForeignTable
     from tvsbayes.instrument.campaign import Move
     from tvsbayes.instrument.column_names import Understood
+    from tvsbayes.instrument.corrections import Correction
     from tvsbayes.instrument.foreign_looks import ForeignLooks, Notation
 
 
 def import_(
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="Table of moves and looks: CSV of any kind, or XLSX.")],
+    file: Annotated[
+        Path, typer.Argument(metavar="FILE", help="Table of moves and looks: CSV, XLSX; a campaign to correct.")
+    ],
     to: Annotated[Path, typer.Option("--to", help="Campaign folder, new or still without these tables.")],
     column: Annotated[
         list[str] | None, typer.Option("--column", help="FIELD=NAME: which column it is, u_left_px=XL; repeatable.")
@@ -44,6 +48,14 @@ def import_(
     ] = None,
     axis: Annotated[bool, typer.Option("--axis", help="Of one axis: commands and readings.")] = False,
     relative: Annotated[bool, typer.Option("--relative", help="Counters are the steps of each move.")] = False,
+    flip: Annotated[
+        list[str] | None, typer.Option("--flip", help="pan_steps or tilt_steps: write the other sign; repeatable.")
+    ] = None,
+    shift_moves: Annotated[
+        list[str] | None,
+        typer.Option("--shift-moves", help="N or N@SPOT: add N to the move of all looks, or from a spot on."),
+    ] = None,
+    swap: Annotated[bool, typer.Option("--swap", help="Exchange the centres of left and right.")] = False,
     pan_approach: Annotated[
         str, typer.Option("--pan-approach", help="How pan came to the first row: left, right or unknown.")
     ] = "unknown",
@@ -51,10 +63,14 @@ def import_(
     yes: Annotated[bool, typer.Option("--yes", help="Write without asking.")] = False,
     as_json: Json = False,
 ) -> None:
-    """A table of your own into a campaign. Shows what it understood, then asks; overwrites nothing."""
+    """A table of your own into a campaign. Shows what it understood, then asks; overwrites nothing.
+
+    A campaign folder as FILE: a copy, corrected by the options that change its tables.
+    """
     from tvsbayes.files.foreign_table import read_foreign
     from tvsbayes.instrument.axes import AXES, sides_of
     from tvsbayes.instrument.column_names import understand
+    from tvsbayes.instrument.corrections import Correction, corrected, flipped_axis, shift_of
     from tvsbayes.instrument.foreign_looks import SD_PX, Notation, looks_of
 
     if angles not in (None, "deg", "rad"):
@@ -63,10 +79,20 @@ def import_(
     approach = (pan_approach, tilt_approach)
     sides_of(approach)
     stated = dict(_field_and_column(text) for text in column or ())
+    flipped, shifts = tuple(dict.fromkeys(map(flipped_axis, flip or ()))), tuple(map(shift_of, shift_moves or ()))
+    correction = Correction(flipped, shifts, swap)
+    if file.is_dir():
+        sides = {f"{a}_approach": None if side == "unknown" else side for a, side in zip(AXES, approach, strict=True)}
+        unfit = {"column": column, "sheet": sheet, "angles": angles, "sd_px": sd_px, "axis": axis, **sides}
+        refuse_options("for tables of other programs, and FILE is a folder", "leave it out", **unfit)
+        wish = replace(correction, pixels_from=pixels_from, relative=relative)
+        _correct_campaign(file, to, wish, yes=yes, as_json=as_json)
+        return
     if axis or axis_commands.is_axis(to):
         from tvsbayes.cli.axis_import import import_readings
 
         unfit = {"pixels_from": pixels_from or None, "angles": angles, "sd_px": sd_px, "relative": relative}
+        unfit |= {"flip": flip, "shift_moves": shift_moves, "swap": swap}
         sides = {f"{a}_approach": None if side == "unknown" else side for a, side in zip(AXES, approach, strict=True)}
         refuse_options(axis_commands.NOT_OF_AN_AXIS, "leave it out", **unfit, **sides)
         import_readings(file, to, stated, sheet, yes=yes, as_json=as_json)
@@ -77,6 +103,8 @@ def import_(
     known = _completed(table, understand(table.columns, stated), stated, listed is not None, asking)
     notation = Notation(pixels_from, angles, SD_PX if sd_px is None else sd_px, relative, approach)
     looks = looks_of(table, known.columns, notation, listed)
+    mended = corrected(looks.moves, looks.spots, correction, None if listed is None else len(listed))
+    looks = replace(looks, moves=mended.moves, spots=mended.spots, assumed=(*looks.assumed, *mended.changes))
     _refuse_listed(to, looks)
     document = _understood_document(table, known, looks)
     shown = _understood_text(table, known, notation, looks)
@@ -101,6 +129,39 @@ def _field_and_column(text: str) -> tuple[str, str]:
         remedy = "write --column u_left_px=XL; --column target= where the table has none"
         raise InputError("usage", f"--column {escaped(text)}: no =", allowed="FIELD=NAME", remedy=remedy)
     return field.strip(), name.strip()
+
+
+def _correct_campaign(folder: Path, to: Path, correction: Correction, *, yes: bool, as_json: bool) -> None:
+    """Write a copy of a campaign with corrected tables; what else lies in its folder stays there alone."""
+    from tvsbayes.instrument.campaign import moves_bytes, read_campaign, spots_bytes
+    from tvsbayes.instrument.corrections import Correction, corrected
+
+    axis_commands.refuse_axis(folder, "import")
+    if correction == Correction():
+        remedy = "say what to correct: --flip, --shift-moves, --swap, --pixels-from 1, --relative"
+        raise InputError("usage", f"{escaped(str(folder), 200)} is a campaign already", remedy=remedy)
+    campaign = read_campaign(folder)
+    found = corrected(campaign.moves, campaign.spots, correction)
+    moves, spots = found.moves or (), found.spots or ()
+    ok = sum(spot.status == "ok" for spot in spots)
+    lines = [f"corrected: {text}" for text in found.changes]
+    lines.append(f"gives: {len(moves)} moves, {len(spots)} looks, {ok} with a spot")
+    if not (yes or as_json) and somebody_there():
+        typer.echo("\n".join(lines))
+        yes = typer.confirm(f"write this into {escaped(str(to), 200)}?", default=False)
+        lines = []
+    written = []
+    if yes:
+        make_folder(to, empty=True)
+        contents = {name: read_bytes(folder / name, CSV_BYTES_MAX, folder) for name in ("campaign.toml", "stereo.json")}
+        contents |= {"moves.csv": moves_bytes(moves), "spots.csv": spots_bytes(spots)}
+        for name, data in contents.items():
+            write_atomically(to / name, data)
+        written = [str(to / name) for name in contents]
+    lines.append(f"written: {', '.join(written)}" if written else "nothing written: add --yes")
+    lines += [f"next: `tvsbayes check {typed(to)}`"] * bool(written)
+    document = {"assumed": list(found.changes), "moves": len(moves), "spots": len(spots), "ok": ok}
+    finish({**document, "campaign": str(to), "files": written}, "\n".join(lines), as_json)
 
 
 def _listed_moves(to: Path) -> tuple[Move, ...] | None:

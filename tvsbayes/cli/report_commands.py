@@ -14,6 +14,7 @@ import typer
 from tvsbayes.cli import axis_commands
 from tvsbayes.cli.app import (
     TARGET_MISSED,
+    Anyway,
     CampaignFolder,
     Ended,
     Json,
@@ -28,6 +29,7 @@ from tvsbayes.cli.app import (
     tell_removed,
 )
 from tvsbayes.cli.campaign_commands import campaign_held
+from tvsbayes.cli.estimate_commands import GO_ON
 from tvsbayes.cli.progress_bar import chain_kept, waiting
 from tvsbayes.errors import InputError, NothingToEstimate
 from tvsbayes.files.disk import output_place, write_atomically
@@ -252,6 +254,7 @@ def calibrate(
     pdf: Pdf = False,
     laboratory: Laboratory = None,
     customer: Customer = None,
+    anyway: Anyway = False,
     seed: Seed = 0,
     as_json: Json = False,
 ) -> None:
@@ -266,12 +269,14 @@ def calibrate(
         # Before the fit, which takes minutes.
         find_browser()
     if axis_commands.is_axis(campaign):
-        unfit = {"limit_deg_per_step": limit_deg_per_step, "limit_mm": limit_mm}
+        unfit = {"limit_deg_per_step": limit_deg_per_step, "limit_mm": limit_mm, "anyway": anyway}
         unfit["range_mm"] = range_mm if range_mm != RANGE_MM else None
         refuse_options(axis_commands.NOT_OF_AN_AXIS, "leave it out", **unfit)
         wish = axis_commands.Sampled(quick, no_sample, MAX_MINUTES, seed)
         axis_commands.calibrate(campaign, issue=issue, wish=wish, pdf=pdf, as_json=as_json)
         return
+    from tvsbayes.estimators.findings import stop_at
+    from tvsbayes.estimators.plausibility import implausible
     from tvsbayes.instrument.campaign import read_campaign
     from tvsbayes.report.command_text import held_text
     from tvsbayes.report.fit_text import fit_text
@@ -279,6 +284,8 @@ def calibrate(
     data = read_campaign(campaign)
     documents: dict[str, Any] = {"check": campaign_held(campaign, data)}
     tell_part(held_text(documents["check"]), as_json)
+    if not anyway:
+        stop_at(implausible(data), GO_ON)
     documents["classic"], told = _classic(data)
     tell_part(told, as_json)
     compile_for(report_line)
@@ -294,7 +301,7 @@ def calibrate(
         )
     summary = results.record.summary
     documents["fit"] = {**summary.as_json(), "seed": seed, "files": results.files}
-    told = fit_text(summary, written=list(results.files.values()))
+    told = fit_text(summary, written=list(results.files.values()), causes=results.causes)
     if results.error is not None:
         finish({**documents, "report": None}, told, as_json, results.error)
     tell_part(told, as_json)

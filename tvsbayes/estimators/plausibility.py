@@ -1,6 +1,6 @@
 """Hints about a campaign before it is fitted: spots that no rig can have seen, and what its moves cannot tell apart.
 
-Depths are triangulated, mm along X of frame S; counters in steps. Sentences for people, no verdict that stops a fit.
+Depths are triangulated, mm along X of frame S; counters in steps. Certain findings stop the commands that fit.
 """
 
 from __future__ import annotations
@@ -15,12 +15,23 @@ from typing import Any
 import numpy as np
 
 from tvsbayes.errors import listed
+from tvsbayes.estimators.counter_pattern import counter_findings
+from tvsbayes.estimators.findings import Finding, doubts, line_of, mending_command
 from tvsbayes.estimators.four_point import SkippedExperiment, select_experiments
-from tvsbayes.estimators.spot_pattern import SPOTS_LISTED, pattern_doubts, pattern_of
+from tvsbayes.estimators.spot_pattern import (
+    MISMATCH_PX,
+    SPOTS_LISTED,
+    SPOTS_MIN,
+    mismatch_px,
+    mismatch_spread_px,
+    pattern_of,
+    picture_findings,
+    table_findings,
+)
 from tvsbayes.instrument.axes import AXES
-from tvsbayes.instrument.campaign import UNDETECTED, Campaign, pixels_of
+from tvsbayes.instrument.campaign import PIXEL_SDS, UNDETECTED, Campaign, Spot, pixels_of
 from tvsbayes.instrument.parameters import names_of
-from tvsbayes.instrument.stereo_pair import pair_doubts, triangulate
+from tvsbayes.instrument.stereo_pair import SHORTEST_BASELINE_MM, baseline_doubt, pair_doubts, triangulate
 from tvsbayes.instrument.stops import observed_stops, separation
 
 NEAREST_SHEET_MM, FARTHEST_SHEET_MM = 20.0, 100_000.0
@@ -31,13 +42,15 @@ CORNER_SHARE = 0.02
 """Share of the picture's height: spots that all lie nearer than that to its first pixel were not measured in pixels."""
 ODD_SHARE = 0.1
 """Share of spots at impossible depths from which the others tell nothing of counters and names."""
+NOISE_OFF = 4.0
+"""Pixel noise over the stated one, either way, that a fit's prior (a factor of 1.6, log-normal) does not expect."""
 SHALLOW = 1.2
 """Ratio of the largest to the smallest depth below which the sheet stood at one place (the paper's: 1.6)."""
 
 
 @dataclass(frozen=True)
 class CampaignCheck:
-    """What `check` says of a readable campaign: counts, and warnings in words."""
+    """What `check` says of a readable campaign: counts, what contradicts its tables, and all warnings in words."""
 
     moves: int
     segments: int
@@ -46,11 +59,13 @@ class CampaignCheck:
     refused: dict[str, int]
     aperture_readings: int
     experiments: int
+    findings: tuple[Finding, ...]
     warnings: tuple[str, ...]
 
     def as_json(self) -> dict[str, object]:
         """The document of `check --json`."""
-        return {"kind": "campaign", **asdict(self), "warnings": list(self.warnings)}
+        findings = [finding.as_json() for finding in self.findings]
+        return {"kind": "campaign", **asdict(self), "findings": findings, "warnings": list(self.warnings)}
 
 
 def _points_mm(campaign: Campaign) -> np.ndarray:
@@ -62,12 +77,15 @@ def _can_stand(depths_mm: np.ndarray) -> np.ndarray:
     return (depths_mm > NEAREST_SHEET_MM) & (depths_mm < FARTHEST_SHEET_MM)
 
 
-def implausible(campaign: Campaign, points_mm: np.ndarray | None = None) -> tuple[str, ...]:
+def implausible(campaign: Campaign, points_mm: np.ndarray | None = None) -> tuple[Finding, ...]:
     """What no rig can have measured: wrong units, swapped cameras, counters that spots do not follow, misspelt words.
 
     Args:
         campaign: a campaign that its reader accepted.
         points_mm: (n, 3) its usable spots in frame S, where they are known already.
+
+    Returns:
+        Findings, certain ones and doubts; `Finding.sentence` is what is printed.
     """
     points_mm = _points_mm(campaign) if points_mm is None else points_mm
     few = partial(listed, most=SPOTS_LISTED)
@@ -75,33 +93,136 @@ def implausible(campaign: Campaign, points_mm: np.ndarray | None = None) -> tupl
     found = []
     misspelt = [s.spot for s in campaign.spots if s.status != "ok" and s.status.strip().lower() == "ok"]
     if misspelt:
-        found.append(f"spots {few(misspelt)} are left out: their status is not spelt ok, in small letters")
+        said = f"spots {few(misspelt)} are left out: their status is not spelt ok, in small letters"
+        found.append(Finding("status", said, file="spots.csv"))
     stray = [s.spot for s in campaign.spots if s.status == UNDETECTED and s.u_left_px is not None]
     if stray:
-        found.append(f"spots {few(stray)} are undetected and have pixels, which nothing uses: ok, or refused?")
+        said = f"spots {few(stray)} are undetected and have pixels, which nothing uses: ok, or refused?"
+        found.append(Finding("status", said, file="spots.csv"))
     if not ok:
         return tuple(found)
-    found += pair_doubts(campaign.stereo)
-    found += _metres(campaign)
-    largest_px = float(np.abs(pixels_of(ok)).max())
-    if largest_px < CORNER_SHARE * campaign.stereo.image_height:
-        return (*found, f"no pixel is larger than {largest_px:.3g}: are the centres in millimetres? They are in px")
+    found += _stereo_findings(campaign)
+    found += doubts("units", _metres(campaign), "campaign.toml")
+    if (unit := _pixel_unit(campaign, ok)) is not None:
+        return (*found, unit)
+    found += _from_one(campaign, ok)
     stands = _can_stand(points_mm[:, 0])
-    odd = [spot.spot for spot, can in zip(ok, stands, strict=True) if not can]
+    odd = [spot for spot, can in zip(ok, stands, strict=True) if not can]
     if odd:
-        limits = f"{NEAREST_SHEET_MM:g} to {FARTHEST_SHEET_MM:g} mm"
-        question = "are left and right swapped, or mismatched?"
-        found.append(f"spots {few(odd)} triangulate outside {limits}: {question}")
+        found.append(_impossible_depths(campaign, ok, odd))
     if len(odd) < ODD_SHARE * len(ok):
         there = [spot for spot, can in zip(ok, stands, strict=True) if can]
-        found += pattern_doubts(pattern_of(campaign, there, points_mm[stands]))
+        if len(there) >= SPOTS_MIN:
+            pattern = pattern_of(campaign, there, points_mm[stands])
+            # Counters and planes say nothing where the pictures themselves contradict each other.
+            pictures = picture_findings(pattern)
+            found += pictures or [*counter_findings(pattern), *table_findings(pattern)]
+    return (*found, *_reading_findings(ok))
+
+
+def misfit_causes(campaign: Campaign, pixel_scale: float | None = None) -> tuple[Finding, ...]:
+    """What explains that a fit of a campaign fails, likeliest first.
+
+    Args:
+        campaign: that was fitted.
+        pixel_scale: pixel noise over the stated one where the fit ended; None without a fit.
+
+    Returns:
+        What `implausible` finds, and noise that is not as stated: a poor calibration leaves the same, so that `check`
+        itself does not say it. Empty where nothing of it explains the failure.
+    """
+    found = [*implausible(campaign)]
+    ok = [spot for spot in campaign.spots if spot.status == "ok"]
+    points_mm = _points_mm(campaign)
+    stands = _can_stand(points_mm[:, 0])
+    if stands.sum() < 2 * SPOTS_MIN or stands.mean() <= 1 - ODD_SHARE:
+        return tuple(found)
+    there = [spot for spot, can in zip(ok, stands, strict=True) if can]
+    seen_px = mismatch_spread_px(pattern_of(campaign, there, points_mm[stands]))
+    stated_px = float(np.median([[getattr(spot, name) for name in PIXEL_SDS] for spot in there]))
+    said = f"left and right of a spot agree to {seen_px:.2g} px (sd), su and sv of spots.csv say {stated_px:.2g} px"
+    if not 1 / NOISE_OFF < seen_px / stated_px < NOISE_OFF:
+        remedy = f"state {seen_px:.2g} px in su and sv, by `tvsbayes import --sd-px {seen_px:.2g}` of a table without"
+        found.append(Finding("pixel-noise", said, remedy, file="spots.csv"))
+    elif pixel_scale is not None and pixel_scale > NOISE_OFF:
+        said += f", but beams miss them by {pixel_scale:.2g} times that: the beam scatters, not the pixels"
+        remedy = "look for a loose laser or mirror, vibration, steps that were lost, or a sheet that moved"
+        found.append(Finding("beam-scatter", said, remedy))
+    # What is certain explains most.
+    return tuple(sorted(found, key=lambda finding: not finding.certain))
+
+
+def _stereo_findings(campaign: Campaign) -> list[Finding]:
+    """What contradicts the pair of cameras; a baseline that no pair has is certain."""
+    unit = baseline_doubt(campaign.stereo)
+    others = doubts("stereo", (text for text in pair_doubts(campaign.stereo) if text != unit), "stereo.json")
+    if unit is None:
+        return others
+    given = "m" if float(np.linalg.norm(campaign.stereo.T)) < SHORTEST_BASELINE_MM else "mm"
+    remedy = f"import it again: `tvsbayes stereo --import FILE --import-unit {given} -o stereo.json`"
+    return [Finding("units", unit, remedy, certain=True, file="stereo.json"), *others]
+
+
+def _pixel_unit(campaign: Campaign, ok: Sequence[Spot]) -> Finding | None:
+    """Centres that are no pixels: all of them near the corner of the picture."""
+    largest_px = float(np.abs(pixels_of(ok)).max())
+    if largest_px >= CORNER_SHARE * campaign.stereo.image_height:
+        return None
+    said = f"no pixel is larger than {largest_px:.3g}: are the centres in millimetres? They are in px"
+    remedy = "import the table again with centres in px, by --column u_left_px=NAME and so on"
+    return Finding("units", said, remedy, len(ok) >= SPOTS_MIN, "spots.csv", line_of(campaign.spots.index(ok[0])))
+
+
+def _from_one(campaign: Campaign, ok: Sequence[Spot]) -> list[Finding]:
+    """Centres outside the picture by less than a pixel, which there are where the first pixel is called 1."""
+    width, height = campaign.stereo.image_width, campaign.stereo.image_height
+    last = np.array([width, height, width, height]) - 0.5
+    pixels = pixels_of(ok)
+    beyond = np.any(pixels > last, axis=1)
+    # Counted from 1 they reach from 0.5 to the size + 0.5.
+    if not beyond.any() or pixels.min() < 0.5 or np.any(pixels > last + 1):
+        return []
+    first = ok[int(np.argmax(beyond))]
+    said = (
+        f"spot {first.spot} lies outside its picture of {width} x {height} px by less than a pixel, and so do "
+        f"{int(beyond.sum())} in all: do pixels count from 1? (0, 0) is the centre of the first"
+    )
+    remedy = f"take 1 from all pixels: {mending_command(campaign, '--pixels-from 1')}"
+    line = line_of(campaign.spots.index(first))
+    # A single one may be a spot that the edge of the picture cuts.
+    return [Finding("pixels-from-one", said, remedy, bool(beyond.sum() > 1), "spots.csv", line)]
+
+
+def _impossible_depths(campaign: Campaign, ok: Sequence[Spot], odd: Sequence[Spot]) -> Finding:
+    """Spots that no sheet can have shown; swapped cameras where exchanged pictures put nearly all on sheets."""
+    limits = f"{NEAREST_SHEET_MM:g} to {FARTHEST_SHEET_MM:g} mm"
+    said = f"spots {listed([spot.spot for spot in odd], SPOTS_LISTED)} triangulate outside {limits}: "
+    line = line_of(campaign.spots.index(odd[0]))
+    exchanged = pixels_of(ok)[:, [2, 3, 0, 1]]
+    points_mm = triangulate(campaign.stereo, exchanged)
+    stands = _can_stand(points_mm[:, 0])
+    swapped = len(ok) >= SPOTS_MIN and len(odd) > (1 - ODD_SHARE) * len(ok) and stands.mean() > 1 - ODD_SHARE
+    if not swapped:
+        return Finding("depths", f"{said}are left and right swapped, or mismatched?", file="spots.csv", line=line)
+    off_px = float(np.median(mismatch_px(campaign.stereo, exchanged[stands], points_mm[stands])))
+    said += f"are left and right swapped? Exchanged, both pictures of a spot agree to {off_px:.1f} px"
+    remedy = f"exchange them: {mending_command(campaign, '--swap')}"
+    return Finding("cameras-swapped", said, remedy, off_px < MISMATCH_PX, "spots.csv", line)
+
+
+def _reading_findings(ok: Sequence[Spot]) -> list[Finding]:
+    """Aperture readings in another unit, or from another direction."""
     readings = {s.spot: s.aperture_deg for s in ok if s.aperture_deg is not None}
     beyond = [spot for spot, reading in readings.items() if not 0 < reading < 180]
     if beyond:
-        found.append(f"aperture readings of spots {few(beyond)} lie outside 0 to 180 deg from the baseline")
-    elif readings and max(readings.values()) < np.pi:
-        found.append(f"all aperture readings lie below {np.pi:.2f}: are they in radians? aperture_deg is in degrees")
-    return tuple(found)
+        said = f"aperture readings of spots {listed(beyond, SPOTS_LISTED)} lie outside 0 to 180 deg from the baseline"
+        return [Finding("aperture", said, file="spots.csv")]
+    if not readings or max(readings.values()) >= np.pi:
+        return []
+    said = f"all aperture readings lie below {np.pi:.2f}: are they in radians? aperture_deg is in degrees"
+    # A sheet before both cameras is never seen so nearly along the baseline.
+    remedy = "import the table again with --angles rad"
+    return [Finding("units", said, remedy, len(readings) >= SPOTS_MIN, "spots.csv")]
 
 
 def _metres(campaign: Campaign) -> list[str]:
@@ -160,7 +281,8 @@ def check_campaign(campaign: Campaign) -> CampaignCheck:
     selection = select_experiments(campaign)
     points_mm = _points_mm(campaign)
     # What is wrong first, then what follows from it.
-    warnings = [*implausible(campaign, points_mm), *_incomplete(selection.skipped)]
+    findings = implausible(campaign, points_mm)
+    warnings = [*(finding.sentence for finding in findings), *_incomplete(selection.skipped)]
     if not ok:
         warnings.append("no spot has status ok: there is nothing to estimate from")
     observed = {spot.move for spot in ok}
@@ -192,5 +314,6 @@ def check_campaign(campaign: Campaign) -> CampaignCheck:
         refused=dict(refused),
         aperture_readings=sum(spot.aperture_deg is not None for spot in ok),
         experiments=len(selection.experiments),
+        findings=findings,
         warnings=tuple(warnings),
     )

@@ -316,21 +316,24 @@ def write_stereo(stereo: Stereo, path: Path) -> None:
     write_atomically(path, stereo_bytes(stereo))
 
 
+def baseline_doubt(stereo: Stereo) -> str | None:
+    """That T is in another unit, in words; None where its length in mm can be that of a pair."""
+    baseline_mm = float(np.linalg.norm(stereo.T))
+    if baseline_mm < SHORTEST_BASELINE_MM:
+        return f"T of stereo.json is {baseline_mm:.3g} mm long: is it in metres? Lengths are mm"
+    if baseline_mm > LONGEST_BASELINE_MM:
+        length = f"T of stereo.json is {baseline_mm / 1000:.3g} m long"
+        return f"{length}: was it in mm before it was taken for metres? Lengths are mm"
+    return None
+
+
 def pair_doubts(stereo: Stereo) -> tuple[str, ...]:
     """What contradicts two cameras beside each other that look at one scene, in words; empty where nothing does.
 
     No refusal: mirrors, cropped images and lenses off their axes exist. Seen are cameras exchanged, an image size that
     belongs to other pictures, pixels far from square, T in another unit.
     """
-    doubts = []
-    baseline_mm = float(np.linalg.norm(stereo.T))
-    if baseline_mm < SHORTEST_BASELINE_MM:
-        doubts.append(f"T of stereo.json is {baseline_mm:.3g} mm long: is it in metres? Lengths are mm")
-    if baseline_mm > LONGEST_BASELINE_MM:
-        doubts.append(
-            f"T of stereo.json is {baseline_mm / 1000:.3g} m long: was it in mm before it was taken for metres? "
-            "Lengths are mm"
-        )
+    doubts = [text] if (text := baseline_doubt(stereo)) is not None else []
     # Where the second camera stands, in axes of the first: x to the right, as columns of a picture grow.
     right_mm = -float(stereo.R[:, 0] @ stereo.T)
     if right_mm < 0:

@@ -5,7 +5,10 @@ Shared by the terminal and the page. Sentences for people; ratios in deg/step.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from tvsbayes.errors import listed
+from tvsbayes.estimators.findings import Finding
 from tvsbayes.instrument.axes import DIRECTIONS
 from tvsbayes.results.estimates import FitSummary, Validation, WeakDirection
 
@@ -84,9 +87,14 @@ def noise_line(summary: FitSummary) -> str | None:
     )
 
 
-def steps_ahead(summary: FitSummary, folder: str) -> list[str]:
-    """What to do next, most urgent first, for whoever reads the page of the campaign in a folder of that name."""
+def steps_ahead(summary: FitSummary, folder: str, causes: Sequence[Finding] = ()) -> list[str]:
+    """What to do next, most urgent first, for whoever reads the page of the campaign in a folder of that name.
+
+    `causes` explain a fit that failed.
+    """
     found = []
+    if not summary.converged and causes:
+        return [f"Use none of the numbers: {finding.sentence}." for finding in causes]
     if not summary.converged:
         return [
             "Use none of the numbers. See what `tvsbayes check` warns of, look for swapped cameras, wrong counters "

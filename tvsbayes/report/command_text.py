@@ -58,7 +58,7 @@ PLAN_UNIT = {"contrast": "deg/step", "backlash": "deg", "mirror_offset": "mm"}
 
 def held_text(document: Mapping[str, Any]) -> str:
     """What `check` found in a campaign, rig, plan, axis or journal: a table, and warnings."""
-    left_out = ("kind", "warnings", "faults", "expected", "contraction", "journal")
+    left_out = ("kind", "findings", "warnings", "faults", "expected", "contraction", "journal")
     rows = [[HELD_WORDS.get(key, key), _held_value(value)] for key, value in document.items() if key not in left_out]
     parts = [TableView(document["kind"], [], rows).text()]
     if "expected" in document:
@@ -66,7 +66,10 @@ def held_text(document: Mapping[str, Any]) -> str:
     if (journal := document.get("journal")) is not None:
         rows = [[key, _held_value(value)] for key, value in journal.items() if key != "kind"]
         parts.append(TableView("journal of the run", [], rows).text())
-    return "\n".join([*parts, *(f"warning: {warning}" for warning in document["warnings"])])
+    parts += [f"warning: {warning}" for warning in document["warnings"]]
+    certain = sum(finding["certain"] for finding in document.get("findings", ()))
+    parts += [f"certain: {certain} of them; `fit` and `calibrate` stop there, --anyway goes on"] * bool(certain)
+    return "\n".join(parts)
 
 
 def _held_value(value: Any) -> str:

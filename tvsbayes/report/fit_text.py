@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from itertools import groupby
 
 from tvsbayes.errors import NotConverged, listed
+from tvsbayes.estimators.findings import Finding
 from tvsbayes.estimators.four_point import ClassicResult
 from tvsbayes.instrument.axes import DIRECTIONS
 from tvsbayes.report.advice import SPOTS_LISTED, factor_told, failed, noise_line, remedy, verdict_line
@@ -31,16 +32,19 @@ def classic_text(result: ClassicResult) -> str:
     return "\n".join([classic_table(result).text(), *skipped])
 
 
-def fit_text(summary: FitSummary, details: bool = False, written: Sequence[str] = ()) -> str:
+def fit_text(
+    summary: FitSummary, details: bool = False, written: Sequence[str] = (), causes: Sequence[Finding] = ()
+) -> str:
     """What the reader must know, then the table, then one line of verdict: the end is what a terminal shows.
 
     Args:
         summary: the fit.
         details: also what else it says: the positioner, the gears, priors that matter, weak directions, single stops.
         written: files that hold all of it.
+        causes: what explains that a fit failed.
     """
     if not summary.converged and summary.sampling is None:
-        return astray_text(summary)
+        return astray_text(summary, causes)
     lines = detail_lines(summary) if details else []
     validation = failed(summary)
     if validation is not None:
@@ -128,14 +132,14 @@ def gear_lines(summary: FitSummary) -> list[str]:
     return found + [f"local ratios, without errors of the gears, deg/step: {', '.join(local)}"] * bool(local)
 
 
-def astray_text(summary: FitSummary) -> str:
-    """Where a fit that did not converge stopped: values without uncertainty, for whoever looks for the reason."""
+def astray_text(summary: FitSummary, causes: Sequence[Finding] = ()) -> str:
+    """Where a fit that did not converge stopped, values without uncertainty, and what explains it."""
     rows = [[label, f"{summary.parameters[name].value:.4g}", unit] for name, label, unit in PARAMETERS]
     table = TableView("where the fit stopped: NOT results", ["quantity", "value", "unit"], rows)
     lines = [NotConverged.of(summary.problems, "").message, table.text()]
     if summary.suspect_spots:
         lines.append(suspect_line(summary.suspect_spots))
-    return "\n".join(lines)
+    return "\n".join([*lines, *(f"cause: {finding.message}" for finding in causes)])
 
 
 def suspect_line(spots: Sequence[int]) -> str:

@@ -21,6 +21,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup, escape
 
 from tvsbayes.errors import InputError, typed
+from tvsbayes.estimators.plausibility import misfit_causes
 from tvsbayes.files.disk import make_folder, read_bytes, shipped_data, write_atomically
 from tvsbayes.metrology.traceability import traceability
 from tvsbayes.report.advice import steps_ahead
@@ -233,7 +234,10 @@ def _page(e: Evidence, issue: Issue) -> Page:
 def _steps(e: Evidence) -> list[str]:
     """What to do next: what the fit asks for, then the best of a plan; the plan's own section has all of it."""
     folder = "CAMPAIGN" if e.campaign.path is None else typed(e.campaign.path.resolve().name)
-    found = steps_ahead(e.fit.summary, folder)
+    summary = e.fit.summary
+    failed = not summary.converged and summary.sampling is None
+    causes = misfit_causes(e.campaign, summary.parameters["pixel_scale"].value) if failed else ()
+    found = steps_ahead(summary, folder, causes)
     if e.planned is not None and not e.planned.stop.now and e.planned.next:
         best = e.planned.next[0]
         found.append(f"Look at {best.text} ({best.minutes:.1f} min): the best next four looks of the plan.")

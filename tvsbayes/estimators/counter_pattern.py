@@ -1,0 +1,333 @@
+"""What spots say of the counters of their moves: the wrong sign, steps of each move, columns exchanged, rows shifted.
+
+Spots move across when a counter grows. Of every spot the angles across and up are held against the counters and the
+distance of its sheet, deg and steps, in the axes of frame P as far as the campaign states them. A counter is doubted
+only where its spread is large against the play and the scatter that the priors allow: two counters of the size of the
+play need not show. The limits are far from what sound campaigns show (experiments/robustness/mistakes.md). No JAX.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+
+from tvsbayes.estimators.findings import Finding, line_of, mending_command
+from tvsbayes.estimators.spot_pattern import SPOTS_MIN, SpotPattern, sheet_groups
+from tvsbayes.instrument.axes import AXES, SENSES, Axis
+from tvsbayes.instrument.campaign import Campaign
+from tvsbayes.instrument.parameters import Prior, names_of
+from tvsbayes.instrument.stereo_pair import rotation_matrix
+
+PRIOR_SDS = 3.0
+"""Standard uncertainties of a prior up to which play, scatter and the mounting of the cameras are believed."""
+EXPECTED = 3.0
+"""Spread of a counter over the motion that play and scatter may hide: a right one then explains 0.9 of the motion."""
+UNEXPLAINED = 1.5
+"""Motion that a counter leaves, over what play and scatter may leave, from which other rows are asked."""
+FOLLOWED, LOST = 0.8, 0.5
+"""Share of the motion that a right counter explains at least (sound campaigns: 0.94), a wrong one at most."""
+LEAST_SLOPE = 0.3
+"""Slope over the stated ratio, from which a counter with the other sign is meant."""
+BETTER = 3.0
+"""Times less of the motion that the right counters leave than those of the table: sums of cells that are steps, or the
+counters of the row before or after."""
+STOPS_FREE_MIN, STOPS_CERTAIN = 4, 8
+"""Stops beyond the coefficients of a line, from which it is a pattern, and from which it is certain."""
+CERTAIN = 9.0
+"""`BETTER` where rows are shifted for certain."""
+LOOKS_TRIED, BEGINS_TRIED = 2000, 64
+"""Looks, spread evenly, by which rows are held against their neighbours, and how many of them are tried as the first
+that belongs to another; then those around the best."""
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """Looks as counters are held against them.
+
+    Attributes:
+        pattern: of the campaign.
+        at: (n,) move of every look.
+        angles_deg: across (left) and up of every look, (n,) by axis.
+        nearness: (n,) mean distance of all sheets over that of the sheet.
+        counters: steps of all moves by axis.
+        hidden_deg: what play and scatter may hide, by axis.
+        ratios: degrees per step as stated, by axis.
+    """
+
+    pattern: SpotPattern
+    at: np.ndarray
+    angles_deg: Mapping[Axis, np.ndarray]
+    nearness: np.ndarray
+    counters: Mapping[Axis, np.ndarray]
+    hidden_deg: Mapping[Axis, float]
+    ratios: Mapping[Axis, float]
+
+    @property
+    def campaign(self) -> Campaign:
+        """Where they come from."""
+        return self.pattern.campaign
+
+
+@dataclass(frozen=True)
+class _Followed:
+    """How far a counter explains a motion.
+
+    Attributes:
+        share: of the motion that other columns leave.
+        slope: deg per step at the mean distance.
+        left_deg: root mean square of what is left.
+        spread_steps: standard deviation of the counter beside the other columns.
+        stops_free: stops beyond the coefficients.
+    """
+
+    share: float
+    slope: float
+    left_deg: float
+    spread_steps: float
+    stops_free: int
+
+    @property
+    def follows(self) -> bool:
+        """Whether the motion is this counter's, up or down."""
+        return self.share > FOLLOWED
+
+
+def _rest(design: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray, int]:
+    """Coefficients, what they leave, and the rank of a design."""
+    scale = np.maximum(np.abs(design).max(axis=0), 1e-12)
+    found, _, rank, _ = np.linalg.lstsq(design / scale, values, rcond=1e-9)
+    return (found.T / scale).T, values - (design / scale) @ found, int(rank)
+
+
+def _columns(nearness: np.ndarray, *counters: np.ndarray) -> np.ndarray:
+    """A line in counters whose height and slopes change with the distance: beams do not begin where cameras stand."""
+    own = [part for steps in (np.ones_like(nearness), *counters) for part in (steps, steps * nearness)]
+    return np.column_stack(own)
+
+
+def _followed(seen: _Seen, axis: Axis, steps: np.ndarray, other: np.ndarray) -> _Followed:
+    """A line in the counter beside another counter's."""
+    base = _columns(seen.nearness, other)
+    full = np.column_stack((base, steps, steps * seen.nearness))
+    _, before, _ = _rest(base, seen.angles_deg[axis])
+    found, after, rank = _rest(full, seen.angles_deg[axis])
+    _, own, _ = _rest(base, steps)
+    motion = float(before @ before)
+    return _Followed(
+        share=1 - float(after @ after) / motion if motion > 0 else 0.0,
+        slope=float(found[-2] + found[-1] * seen.nearness.mean()),
+        left_deg=float(np.sqrt(np.mean(after**2))),
+        spread_steps=float(np.sqrt(np.mean(own**2))),
+        stops_free=len(np.unique(seen.at)) - rank,
+    )
+
+
+def hidden_deg(priors: Mapping[str, Prior], axis: Axis) -> float:
+    """Motion of the beam, deg, that counters need not show: half the play, scatter of stops, errors of the gears."""
+
+    def highest(name: str) -> float:
+        prior = priors[name]
+        if prior.distribution == "log-normal":
+            return prior.value * math.exp(PRIOR_SDS / 2 * prior.u)
+        return abs(prior.value) + PRIOR_SDS * prior.u
+
+    parts = [highest(f"backlash_deg.{axis}") / 2, highest(f"transmission_error_deg.{axis}")]
+    parts.append(max(highest(f"stop_sd_deg.{direction}") for direction in SENSES[axis]))
+    return math.hypot(*parts)
+
+
+def _seen(pattern: SpotPattern) -> _Seen:
+    campaign = pattern.campaign
+    priors = campaign.rig.priors
+    turned = rotation_matrix(np.array([priors[name].value for name in names_of("extrinsics.rotation_rad")]))
+    # Into the axes of frame P, as far as the campaign states them: columns X depth, Y left, Z up.
+    depth_mm, *across_mm = (pattern.points_mm @ turned).T
+    group = sheet_groups(pattern.points_mm[:, 0])
+    # The sheet's, not the spot's own: a sheet that stands askew is deeper on one side, as if depth were a counter.
+    sheet_mm = np.array([depth_mm[group == g].mean() for g in range(group.max() + 1)])[group]
+    angles_deg = {axis: np.degrees(np.arctan2(own, depth_mm)) for axis, own in zip(AXES, across_mm, strict=True)}
+    return _Seen(
+        pattern,
+        np.array([spot.move for spot in pattern.spots]),
+        angles_deg,
+        sheet_mm.mean() / sheet_mm,
+        {axis: np.array([getattr(m, f"{axis}_steps") for m in campaign.moves], float) for axis in AXES},
+        {axis: hidden_deg(priors, axis) for axis in AXES},
+        {axis: abs(priors[f"degrees_per_step.{axis}"].value) for axis in AXES},
+    )
+
+
+def counter_findings(pattern: SpotPattern) -> list[Finding]:
+    """Counters that are steps of a move, run the wrong way, belong to the other axis, or to other spots."""
+    seen = _seen(pattern)
+    table = {axis: steps[seen.at] for axis, steps in seen.counters.items()}
+    summed = {axis: _summed(seen.campaign, axis)[seen.at] for axis in AXES}
+    own: dict[Axis, _Followed] = {}
+    crossed: dict[Axis, _Followed] = {}
+    added: dict[Axis, _Followed] = {}
+    for axis in AXES:
+        other = table[AXES[axis == AXES[0]]]
+        own[axis] = _followed(seen, axis, table[axis], other)
+        crossed[axis] = _followed(seen, axis, other, table[axis])
+        added[axis] = _followed(seen, axis, summed[axis], summed[AXES[axis == AXES[0]]])
+    enough = [axis for axis in AXES if own[axis].stops_free >= STOPS_FREE_MIN]
+    expected = [
+        axis for axis in enough if own[axis].spread_steps * seen.ratios[axis] > EXPECTED * seen.hidden_deg[axis]
+    ]
+    if len(expected) == 2 and all(own[axis].share < LOST and crossed[axis].follows for axis in AXES):
+        message = "spots move across with the tilt counter and up with the pan counter: are both columns exchanged?"
+        return [Finding("columns-exchanged", message, file="moves.csv")]
+    steps = [axis for axis in enough if _are_steps(seen, axis, own[axis], added[axis])]
+    if steps:
+        return [_steps_finding(seen, steps, added)]
+    if enough and (shifted := _row_finding(seen)) is not None:
+        return [shifted]
+    signs = [axis for axis in expected if _runs_back(seen, axis, own[axis])]
+    found = [_sign_finding(seen, signs, own)] if signs else []
+    return found + [
+        Finding(
+            "counter-lost",
+            f"spots do not follow {axis}_steps: rows of moves.csv and spots.csv shifted, or counters of another run?",
+            file="moves.csv",
+        )
+        for axis in expected
+        if own[axis].share < LOST
+    ]
+
+
+def _runs_back(seen: _Seen, axis: Axis, own: _Followed) -> bool:
+    """Whether spots run against a counter, with cameras that cannot be upside down."""
+    roll = seen.campaign.rig.priors["extrinsics.rotation_rad.x"]
+    mounted = PRIOR_SDS * roll.u < np.pi / 2
+    return mounted and own.follows and own.slope < -LEAST_SLOPE * seen.ratios[axis]
+
+
+def _are_steps(seen: _Seen, axis: Axis, own: _Followed, added: _Followed) -> bool:
+    """Whether the cells of a counter are the steps of each move."""
+    better = added.follows and own.left_deg**2 > BETTER * added.left_deg**2
+    return better and own.left_deg > UNEXPLAINED * seen.hidden_deg[axis]
+
+
+def _steps_finding(seen: _Seen, axes: list[Axis], added: Mapping[Axis, _Followed]) -> Finding:
+    names = " and ".join(f"{axis}_steps" for axis in axes)
+    remedy = f"moves.csv holds absolute counters AFTER the move: {mending_command(seen.campaign, '--relative')}"
+    return Finding(
+        "relative-counters",
+        f"spots follow the sum of {names}, not {names}: are these the steps of each move?",
+        remedy,
+        certain=min(added[axis].stops_free for axis in axes) >= STOPS_CERTAIN,
+        file="moves.csv",
+    )
+
+
+def _sign_finding(seen: _Seen, axes: list[Axis], own: Mapping[Axis, _Followed]) -> Finding:
+    """That counters run the wrong way; with rows that are one apart where that shows the same."""
+    parts, pair = [], (0, 0)
+    for axis in axes:
+        positive, negative = SENSES[axis]
+        # Two looks in turn between which the counter changed most, as an example.
+        steps = seen.counters[axis][seen.at]
+        first = int(np.argmax(np.abs(np.diff(steps))))
+        pair = first, first + 1
+        spots, moved = [seen.pattern.spots[k] for k in pair], float(np.diff(seen.angles_deg[axis])[first])
+        where = f"spot {spots[0].spot} at {steps[pair[0]]:.0f}, spot {spots[1].spot} at {steps[pair[1]]:.0f}"
+        parts.append(
+            f"spots move {negative} while {axis}_steps grows ({where}: {abs(moved):.1f} deg "
+            f"{positive if moved > 0 else negative}); {positive} counts up"
+        )
+    options = " ".join(f"--flip {axis}_steps" for axis in axes)
+    remedy = f"write the other sign: {mending_command(seen.campaign, options)}"
+    if len(axes) == len(AXES):
+        remedy += ", or state in [rig.prior] extrinsics.rotation_rad that the cameras hang upside down"
+    lags = [lag for lag in (1, -1) if _shift_shows_the_same(seen, axes, lag)]
+    remedy += "".join(
+        "; looks of an axis that goes to and fro show the same where their rows are one apart, then "
+        + mending_command(seen.campaign, f"--shift-moves {lag}")
+        for lag in lags[:1]
+    )
+    return Finding(
+        "counter-sign",
+        "; ".join(parts),
+        remedy,
+        certain=min(own[axis].stops_free for axis in axes) >= STOPS_CERTAIN,
+        file="moves.csv",
+        line=line_of(seen.pattern.spots[pair[1]].move),
+    )
+
+
+def _shift_shows_the_same(seen: _Seen, axes: list[Axis], lag: int) -> bool:
+    """Whether counters of the row beside explain the motion as well, with the right sign."""
+    last = len(seen.campaign.moves) - 1
+    at = np.clip(seen.at + lag, 0, last)
+    for axis in axes:
+        other = AXES[axis == AXES[0]]
+        beside = _followed(seen, axis, seen.counters[axis][at], seen.counters[other][at])
+        if not beside.follows or beside.slope < 0:
+            return False
+    return True
+
+
+def _row_finding(seen: _Seen) -> Finding | None:
+    """That spots belong to the moves beside theirs, all or from one on: two ways to number rows, or a missing row."""
+    spots = seen.pattern.spots
+    chosen = np.unique(np.linspace(0, len(spots) - 1, LOOKS_TRIED).astype(int))
+    at, nearness = seen.at[chosen], seen.nearness[chosen]
+    table = np.column_stack([seen.counters[axis] for axis in AXES])
+    motion_deg = np.column_stack([seen.angles_deg[axis][chosen] for axis in AXES])
+
+    def left(steps: np.ndarray) -> np.ndarray:
+        """What counters (n, 2) leave of both motions, deg^2 a look."""
+        return np.mean(_rest(_columns(nearness, *steps.T), motion_deg)[1] ** 2, axis=0)
+
+    def beside(lag: int, begin: int) -> np.ndarray:
+        moved = at + lag * (np.arange(len(at)) >= begin)
+        return left(table[np.clip(moved, 0, len(table) - 1)])
+
+    own, motion = left(table[at]), left(np.zeros((len(at), 2)))
+    hidden = np.array([seen.hidden_deg[axis] for axis in AXES])
+    if np.all(own < (UNEXPLAINED * hidden) ** 2):
+        return None
+
+    def rest(lag: int, begin: int) -> float:
+        return float(beside(lag, begin).sum())
+
+    last = len(at) - SPOTS_MIN
+    tried = np.unique(np.linspace(0, last, BEGINS_TRIED).astype(int)).tolist()
+    found = []
+    for lag in (-1, 1):
+        near = min(tried, key=partial(rest, lag))
+        around = range(max(near - last // BEGINS_TRIED, 0), min(near + last // BEGINS_TRIED, last) + 1)
+        begin = min(around, key=partial(rest, lag))
+        found.append((rest(lag, begin), lag, begin))
+    least, lag, begin = min(found)
+    if own.sum() <= BETTER * least or least > (1 - FOLLOWED) * motion.sum():
+        return None
+    free = len(np.unique(at)) - np.linalg.matrix_rank(_columns(nearness, *table[at].T))
+    first = spots[int(chosen[begin])]
+    which = "spots" if begin == 0 else f"from spot {first.spot} on, spots"
+    row = seen.campaign.spots.index(first)
+    option = f"--shift-moves {lag:d}" + f"@{first.spot}" * (begin > 0)
+    return Finding(
+        "rows-shifted",
+        f"{which} follow the counters of the move {'after' if lag > 0 else 'before'} theirs, not of the one that "
+        f"spots.csv names (spot {first.spot}: move {first.move}): do pictures or rows count from 1, or is a row of "
+        "moves.csv missing or one too many?",
+        f"{'add 1 to' if lag > 0 else 'take 1 from'} their column move: {mending_command(seen.campaign, option)}",
+        certain=bool(own.sum() > CERTAIN * least and free >= STOPS_CERTAIN),
+        file="spots.csv",
+        line=line_of(row),
+    )
+
+
+def _summed(campaign: Campaign, axis: Axis) -> np.ndarray:
+    """What the counters of an axis add up to, anew in every segment."""
+    total, before, found = 0, -1, []
+    for move in campaign.moves:
+        total = (total if move.segment == before else 0) + getattr(move, f"{axis}_steps")
+        before = move.segment
+        found.append(total)
+    return np.array(found, dtype=float)
