@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
+from msgspec import Struct
 from support.axes import drawn
 from support.package_imports import MODULES
 from support.small_campaign import small_campaign
@@ -66,7 +67,8 @@ def test_every_result_that_the_package_offers_shows_itself():
     public = {"Campaign", "CampaignResults", "Calibration", "Comparison", "FitRecord", "FitSummary", "JointFit"}
     assert public | {"Locations", "Posterior", "ClassicResult", "AxisFit", "AxisSummary", "PlanResult"} <= named
     for each in classes:
-        assert dataclasses.is_dataclass(each) and "__repr__" not in vars(each), each
+        assert dataclasses.is_dataclass(each) or issubclass(each, Struct), each
+        assert each.__repr__ is Shown.__repr__, each
         assert "shown" in vars(each), each
 
 

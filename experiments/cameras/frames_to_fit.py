@@ -240,7 +240,8 @@ def report(place: Path, twin: str) -> None:
             inside, z = ("yes" if low <= value <= high else "NO"), (one.value - value) / one.sd
             print(f"| {name} | {value:.6f} {hands}| {one.value:.6f} | {low:.6f} to {high:.6f} | {inside} | {z:+.2f} |")
         print(
-            f"\nconverged {summary.converged}, chi2 {summary.chi2:.1f} of {summary.dof:.1f} degrees of freedom\n",
+            f"\nconverged {summary.converged}, "
+            f"chi2 {summary.noise.chi2:.1f} of {summary.noise.dof:.1f} degrees of freedom\n",
             flush=True,
         )
 

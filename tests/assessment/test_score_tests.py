@@ -13,6 +13,7 @@ import equinox as eqx
 import jax
 import numpy as np
 import pytest
+from msgspec import structs
 from scipy import stats
 from support.dozen_spots import coordinates
 from support.drawn_residuals import drawn_residual
@@ -182,23 +183,24 @@ FAILED = Validation(
 def test_no_reader_of_the_text_can_miss_a_failure():
     unasked = fit_text(small_summary())
     assert "alidation" not in unasked and "VALIDATION" not in unasked
-    lines = fit_text(replace(small_summary(), validation=FAILED)).splitlines()
+    lines = fit_text(structs.replace(small_summary(), validation=FAILED)).splitlines()
     warning = validation_lines(FAILED)[0]
     assert "3.25" in warning and "the cameras moved: from spot 60" in warning
     assert lines[0] == warning and lines[-1] == "verdict: VALIDATION FAILED, multiply every u and half-width by 3.25"
     assert [line for line in lines if line.startswith("what helps: fix the cameras")]
-    passed = replace(FAILED, passed=True, cause="", inflation=1.0, tests=(replace(FAILED.tests[0], failed=False),))
+    no_sign = structs.replace(FAILED.tests[0], failed=False)
+    passed = structs.replace(FAILED, passed=True, cause="", inflation=1.0, tests=(no_sign,))
     # Spots that scatter eleven times as far: noise to be stated where the model holds, its failure where not.
-    scale = replace(small_summary().parameters["pixel_scale"], value=11.0)
-    noisy = replace(small_summary(), parameters={**small_summary().parameters, "pixel_scale": scale})
-    told = [("state larger ones" in fit_text(replace(noisy, validation=each))) for each in (passed, FAILED)]
+    scale = structs.replace(small_summary().parameters["pixel_scale"], value=11.0)
+    noisy = structs.replace(small_summary(), parameters={**small_summary().parameters, "pixel_scale": scale})
+    told = [("state larger ones" in fit_text(structs.replace(noisy, validation=each))) for each in (passed, FAILED)]
     assert told == [True, False]
-    text = fit_text(replace(small_summary(), validation=passed), details=True)
+    text = fit_text(structs.replace(small_summary(), validation=passed), details=True)
     assert "VALIDATION" not in text and "validation: no sign of a model error in 1 tests" in text
 
 
 def test_no_reader_of_the_report_can_miss_a_failure():
-    summary = replace(small_summary(), validation=FAILED)
+    summary = structs.replace(small_summary(), validation=FAILED)
     warning = validation_lines(FAILED)[0]
     met = Criterion("ratio left", 1e-3, "deg/step", 0.99, "met")
     for criteria, kind in (((), "cannot-tell"), ((met,), "met")):

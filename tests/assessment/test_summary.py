@@ -205,9 +205,9 @@ def test_the_prediction_holds_the_classic_bias(paper, summary):
 
 def test_dof_counts_spots_less_what_they_determine(summary, paper):
     residuals = 3 * len(paper.spots)
-    assert residuals - 60 < summary.dof < residuals - 10
+    assert residuals - 60 < summary.noise.dof < residuals - 10
     # 1e-4 bounds of chi-square over dof by its normal approximation.
-    assert abs(summary.chi2 / summary.dof - 1) < 4 * np.sqrt(2 / summary.dof)
+    assert abs(summary.noise.chi2 / summary.noise.dof - 1) < 4 * np.sqrt(2 / summary.noise.dof)
 
 
 def test_an_axis_that_never_moved_is_null_and_named(short):

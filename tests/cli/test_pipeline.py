@@ -9,6 +9,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from msgspec import structs
 from support.small_results import small_record, whole_summary
 from support.waits import check_forward, doings
 
@@ -67,9 +68,9 @@ def test_whoever_waits_for_a_fit_is_told_why(grid_folder, monkeypatch):
     own = small_record(whole_summary(), seed=3)
 
     def keep(converged: bool, version: str, **others: str) -> None:
-        given = replace(own.provenance, inputs=input_hashes(campaign) | others)
-        given = replace(given, versions=given.versions | {"tvsbayes": version})
-        summary = replace(whole_summary(), converged=converged)
+        given = structs.replace(own.provenance, inputs=input_hashes(campaign) | others)
+        given = structs.replace(given, versions=given.versions | {"tvsbayes": version})
+        summary = structs.replace(whole_summary(), converged=converged)
         path.write_text(json.dumps(replace(own, summary=summary, provenance=given).as_json()))
 
     now = own.provenance.versions["tvsbayes"]

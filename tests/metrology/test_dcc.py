@@ -10,6 +10,7 @@ import xml.etree.ElementTree as ET
 from dataclasses import replace
 
 import pytest
+from msgspec import structs
 from support.certified_campaign import certified, texts
 from support.dcc_structure import local, structure_problems
 from support.refusals import refusal
@@ -243,7 +244,7 @@ def test_what_must_not_be_certified_is_refused():
             made.certificate(parties=Parties(customer_country=country))
     assert "two letters" in refusal(lambda: made.certificate(parties=Parties(country="Mexico"))).remedy
     effective = made.fit.summary.effective
-    bad = replace(effective["left"], value=math.inf)
+    bad = structs.replace(effective["left"], value=math.inf)
     with pytest.raises(ValueError, match="finite"):
         made.with_summary(effective={**effective, "left": bad}).certificate()
 
@@ -298,5 +299,5 @@ def test_a_failed_validation_is_declared_with_its_factor():
     failed = Validation(False, 0.01, "the cameras moved: from spot 9 on", 3.25, ())
     root = certified().with_summary(validation=failed).root()
     assert "multiply every one of them by 3.25" in declared(root)["validation"][0]
-    for validation in (None, replace(failed, passed=True)):
+    for validation in (None, structs.replace(failed, passed=True)):
         assert "validation" not in declared(certified().with_summary(validation=validation).root())

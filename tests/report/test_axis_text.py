@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from itertools import pairwise
 
 import pytest
+from msgspec import structs
 from support.axes import drawn, runs
 
 from tvsbayes.report.axis_text import (
@@ -43,7 +43,7 @@ def test_a_long_table_keeps_both_ends_and_says_what_it_leaves_out(count, kept):
 @pytest.fixture(scope="module")
 def clean():
     summary = summarise_axis(fit_axis(drawn(7, runs(2)).campaign, sampled=False))
-    return replace(summary, converged=True, problems=(), prior_conflicts=(), warnings=())
+    return structs.replace(summary, converged=True, problems=(), prior_conflicts=(), warnings=())
 
 
 @pytest.mark.parametrize(
@@ -55,18 +55,18 @@ def clean():
     ],
 )
 def test_the_verdict_alone_says_that_warnings_stand_beside_it(clean, warnings, said):
-    text = axis_fit_text(replace(clean, warnings=warnings))
+    text = axis_fit_text(structs.replace(clean, warnings=warnings))
     assert text.splitlines()[-1] == f"verdict: {said}"
     assert text.count("warning: ") == len(warnings)
 
 
 def test_a_fit_says_what_goes_into_firmware(clean):
-    sides = {name: replace(of, value=-0.05, sd=0.0005) for name, of in clean.effective_per_command.items()}
-    clean = replace(clean, effective_per_command=sides, range_command=(0.0, 1250000.0))
+    sides = {name: structs.replace(of, value=-0.05, sd=0.0005) for name, of in clean.effective_per_command.items()}
+    clean = structs.replace(clean, effective_per_command=sides, range_command=(0.0, 1250000.0))
 
     def said(value, low, high):
-        play = replace(clean.parameters["backlash"], value=value, sd=0.01, interval95=(low, high))
-        return for_firmware(replace(clean, parameters={**clean.parameters, "backlash": play}))
+        play = structs.replace(clean.parameters["backlash"], value=value, sd=0.01, interval95=(low, high))
+        return for_firmware(structs.replace(clean, parameters={**clean.parameters, "backlash": play}))
 
     # 1/0.05 = 20, u 0.0005/0.05^2 = 0.2; 0.15/0.05 = 3, u 0.01/0.05 = 0.2.
     begun = f"for firmware, from 0 to 1250000: -20.00(20) commands per {clean.unit}, "
@@ -81,12 +81,12 @@ def test_a_fit_says_where_the_error_by_position_is_largest_and_whose_it_may_be(c
         PositionDeviation(1250000.0, -0.05, 0.01, (-0.07, -0.03)),
         PositionDeviation(2500000.0, 0.03, 0.01, (0.01, 0.05)),
     )
-    said = worst_place(replace(clean, deviations=deviations))
+    said = worst_place(structs.replace(clean, deviations=deviations))
     assert f"at command 1250000: -0.050(10) {clean.unit} off the line; it is that of gears and encoder" in said
-    assert "holds 0; it is" in worst_place(replace(clean, deviations=deviations[:1]))
+    assert "holds 0; it is" in worst_place(structs.replace(clean, deviations=deviations[:1]))
 
 
 def test_numbers_that_must_not_be_used_are_not_offered_to_firmware(clean):
     assert "for firmware" in axis_fit_text(clean) and "largest at command" in axis_fit_text(clean)
-    broken = axis_fit_text(replace(clean, converged=False, problems=("the chain stands still",)))
+    broken = axis_fit_text(structs.replace(clean, converged=False, problems=("the chain stands still",)))
     assert "for firmware" not in broken and "largest at command" not in broken

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from msgspec import structs
 
 from tvsbayes.metrology.budget_tables import Source, budget_table
 from tvsbayes.metrology.look_budget import Budget
@@ -42,7 +42,7 @@ def section(*budgets: BudgetTable, **intervals: tuple[float, float]):
     causes = ("pixel noise", "stop errors of the campaign")
     even = np.full((2, 3), 0.5)
     budget = Budget(causes, np.array([0.5, 0.5]), even, (), np.zeros((0, 3)), np.zeros((0, 0)), np.eye(3), (0.0, 0.0))
-    point = replace(TILT, quantity="x of the point", unit="mm")
+    point = structs.replace(TILT, quantity="x of the point", unit="mm")
     shown = SimpleNamespace(budgets=budgets)
     return budgets_section(SimpleNamespace(fit=fit, shown=shown, budget=budget, point=point, range_mm=1000.0))
 
@@ -93,10 +93,10 @@ def test_the_result_that_counts_is_named_once():
     ("budget", "interval", "words"),
     [
         # U = 0.034 about 0.529: ends agree to a rounding, then the half-width or one end does not.
-        (replace(PAN, estimate=0.529), (0.4952, 0.5628), ()),
-        (replace(PAN, estimate=0.529), (0.4965, 0.5645), ()),
-        (replace(PAN, estimate=0.529), (0.484, 0.574), ("first page", "[0.4840, 0.5740]", "U = 0.045 deg")),
-        (replace(PAN, estimate=0.529), (0.500, 0.567), ("first page", "[0.5000, 0.5670]")),
+        (structs.replace(PAN, estimate=0.529), (0.4952, 0.5628), ()),
+        (structs.replace(PAN, estimate=0.529), (0.4965, 0.5645), ()),
+        (structs.replace(PAN, estimate=0.529), (0.484, 0.574), ("first page", "[0.4840, 0.5740]", "U = 0.045 deg")),
+        (structs.replace(PAN, estimate=0.529), (0.500, 0.567), ("first page", "[0.5000, 0.5670]")),
         # Below zero there is no lost motion.
         (PAN, (0.002, 0.067), ("below 0", "first page", "[0.0020, 0.0670]")),
     ],
@@ -105,13 +105,13 @@ def test_where_the_linear_interval_is_another_the_quantity_says_so(budget, inter
     caption = section(budget, pan=interval).tables[0].caption
     assert [word for word in words if word not in caption] == []
     assert ("first page" in caption) == bool(words)
-    beside = section(budget, replace(TILT, estimate=0.529), pan=interval).tables[0].caption
+    beside = section(budget, structs.replace(TILT, estimate=0.529), pan=interval).tables[0].caption
     assert beside.count("first page") == bool(words)
     assert ("below 0" in caption) == ("below 0" in words)
 
 
 def test_notes_of_the_budgets_are_printed_once():
-    noted = replace(PAN, notes=("inputs are independent", *PAN.notes))
+    noted = structs.replace(PAN, notes=("inputs are independent", *PAN.notes))
     items = section(noted, TILT).items
     assert len(items) == len(set(items)) == 2
     assert any("Welch-Satterthwaite" in item and "approximate" in item for item in items)

@@ -67,7 +67,8 @@ def test_a_prompt_completes_figures_alone():
 def test_no_text_of_the_ratios_is_cut_or_lies_on_the_points(evidence):
     """Labels end inside of the figure; legends stand beside the axes."""
     at = RatioAt(0.062, 1e-4, (0.0618, 0.0622))
-    along = {a: tuple(CurvePoint(x, x, dict.fromkeys(pair, at)) for x in (0.0, 5.0, 9.0)) for a, pair in SENSES.items()}
+    places = (0.0, 5.0, 9.0)
+    along = {a: tuple(CurvePoint(x, x, **dict.fromkeys(pair, at)) for x in places) for a, pair in SENSES.items()}
     curves = ratio_curves(Curves(along, {}))
     for figure in (direction_scatters(classic(evidence.campaign), evidence.fit.summary), curves):
         # The layout is found by drawing.
@@ -90,7 +91,8 @@ def test_a_cause_with_one_group_has_no_empty_figure():
     """A pan axis whose stops were all seen at one depth; of tilt two depths can be compared."""
     group = CauseGroup("near", 8, 0.1, 0.3)
     one, two = Cause("depth", "pan", (group,), None, False), Cause("depth", "tilt", (group, group), 0.4, False)
-    summary = SimpleNamespace(chi2=1.0, dof=1.0, parameters={"pixel_scale": SimpleNamespace(value=1.0)})
+    noise = SimpleNamespace(chi2=1.0, dof=1.0)
+    summary = SimpleNamespace(noise=noise, parameters={"pixel_scale": SimpleNamespace(value=1.0)})
     shown = SimpleNamespace(residual_causes=(one, two), residuals=())
     section = residuals_section(SimpleNamespace(fit=SimpleNamespace(summary=summary), shown=shown))
     assert [view.caption for view in section.figures] == ["tilt axis: mean deviation by group."]

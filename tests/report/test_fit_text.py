@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import pytest
+from msgspec import structs
 from support.small_results import small_summary
 
 from tvsbayes.estimators.findings import Finding
@@ -19,7 +18,7 @@ from tvsbayes.results.estimates import Validation, ValidationTest
 
 def test_a_fit_astray_shows_no_results():
     """Where it stopped may help to find out why; no uncertainty and no diagnosis rests on it."""
-    astray = replace(small_summary(), converged=False, problems=("it ran away",), few_stops={"up": 3})
+    astray = structs.replace(small_summary(), converged=False, problems=("it ran away",), few_stops={"up": 3})
     text = fit_text(astray)
     assert text.splitlines()[0] == "NOT CONVERGED: it ran away"
     assert "NOT results" in text and "95 %" not in text and "0.0621" not in text and "weak" not in text
@@ -32,7 +31,7 @@ def test_a_fit_astray_shows_no_results():
 
 @pytest.mark.parametrize(("estimator", "word"), [("laplace", "too short; sample"), ("posterior", "intervals hold it")])
 def test_few_stops_are_said(estimator, word):
-    lines = fit_text(replace(small_summary(), few_stops={"up": 3, "down": 2}, estimator=estimator)).splitlines()
+    lines = fit_text(structs.replace(small_summary(), few_stops={"up": 3, "down": 2}, estimator=estimator)).splitlines()
     (line,) = (line for line in lines if line.startswith("few stops"))
     assert "(up 3, down 2)" in line and word in line
     assert "few stops" not in fit_text(small_summary())
@@ -96,7 +95,7 @@ def test_a_factor_of_one_is_no_remedy():
     """What single spots do to results, no factor holds: the last line says what to do instead."""
     test = ValidationTest("single spots disagree", "most at spot 7", 80.0, 3, 90, 6.3e-42, True, 0.03)
     failed = Validation(False, 0.01, "single spots disagree: most at spot 7", 1.0004, (test,))
-    text = fit_text(replace(small_summary(), validation=failed))
+    text = fit_text(structs.replace(small_summary(), validation=failed))
     lines = text.splitlines()
     assert "multiply" not in text and "1.00" not in lines[0]
     assert lines[0].startswith("VALIDATION FAILED: single spots disagree: most at spot 7 (p 6.3e-42); ")
@@ -106,6 +105,6 @@ def test_a_factor_of_one_is_no_remedy():
     )
     assert "what helps: look at those spots, or fit with --robust" in text
     limit = Criterion("ratio left", 1e-3, "deg/step", 0.99, "met")
-    assert "As fitted: Met" in verdict_of(replace(small_summary(), validation=failed), (limit,)).text
-    larger = replace(failed, inflation=1.0051)
-    assert fit_text(replace(small_summary(), validation=larger)).endswith("half-width by 1.01")
+    assert "As fitted: Met" in verdict_of(structs.replace(small_summary(), validation=failed), (limit,)).text
+    larger = structs.replace(failed, inflation=1.0051)
+    assert fit_text(structs.replace(small_summary(), validation=larger)).endswith("half-width by 1.01")

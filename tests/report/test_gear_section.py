@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from msgspec import structs
 from support.bent_rig import calibration
 from support.geared_rig import SD_DEG, geared
 from support.small_results import estimate
@@ -27,7 +28,7 @@ def geared_evidence(evidence, bands):
     summary = evidence.fit.summary
     scales = ("transmission_error_deg", "transmission_error_length_deg", "play_variation_deg")
     parameters = {f"{name}.{axis}": estimate(0.031, 0.0042) for name in scales for axis in ("pan", "tilt")}
-    changed = replace(
+    changed = structs.replace(
         summary,
         parameters={**summary.parameters, **parameters},
         local={"left": estimate(0.0601, 1e-4), "right": None},

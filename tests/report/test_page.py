@@ -14,6 +14,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from msgspec import structs
 from support.reported_twin import PLANNED, Nodes, evidence_of
 
 from tvsbayes.calibration.calibration_file import load_calibration
@@ -267,7 +268,7 @@ def test_a_campaign_without_experiments_says_so(evidence, no_pictures):
 
 def test_no_limit_no_verdict_and_no_convergence_no_use(evidence, no_pictures):
     assert "No limit was stated" in " ".join(Nodes(report_html(replace(evidence, criteria=()))).text)
-    astray = replace(evidence.fit.summary, converged=False, problems=("the mode was not reached",))
+    astray = structs.replace(evidence.fit.summary, converged=False, problems=("the mode was not reached",))
     broken = replace(evidence, fit=replace(evidence.fit, summary=astray))
     text = " ".join(Nodes(report_html(broken)).text)
     assert "NOT CONVERGED" in text and "the mode was not reached" in text
@@ -296,8 +297,8 @@ def test_what_strangers_write_stays_text(reported, page, shift, tmp_path, no_pic
     write_campaign(replace(campaign, header=header), place)
     shutil.copytree(reported / "results", place / "results")
     hostile = evidence_of(place)
-    summary = replace(hostile.fit.summary, prior_conflicts=payloads)
-    made = replace(hostile.fit.provenance, command=payloads[7])
+    summary = structs.replace(hostile.fit.summary, prior_conflicts=payloads)
+    made = structs.replace(hostile.fit.provenance, command=payloads[7])
     hostile = replace(hostile, fit=replace(hostile.fit, summary=summary, provenance=made))
     nodes, plain = Nodes(report_html(hostile)), Nodes(page)
     assert {tag for tag, _ in nodes.elements} <= KNOWN

@@ -5,17 +5,18 @@ from __future__ import annotations
 import datetime
 import json
 import math
-from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
 from jsonschema import Draft202012Validator
+from msgspec import structs
 from support.fit_documents import OLD, changed, kept, problems, schema_of
 from support.small_results import small_record, whole_summary
 
 from tvsbayes.errors import InputError
 from tvsbayes.results.convergence import Agreement, Convergence, Importance, NamedValue, Reweighted
 from tvsbayes.results.fit_record import FIT_FORMAT, FIT_FORMATS, read_fit
+from tvsbayes.results.records import plain
 
 
 def test_every_readable_version_has_a_schema_and_kept_documents():
@@ -61,7 +62,7 @@ def test_both_tiers_obey_the_schema(tmp_path):
         agreement=Agreement(True, 4.0, worst),
     )
     for tier, found in (("importance", weighted), ("emcee", chain)):
-        summary = replace(whole_summary(), estimator="posterior", tier=tier, sampling=found.sampling)
+        summary = structs.replace(whole_summary(), estimator="posterior", tier=tier, sampling=found.sampling)
         (tmp_path / "fit.json").write_text(json.dumps(small_record(summary, seed=3).as_json()))
         document = json.loads((tmp_path / "fit.json").read_text())
         assert problems(document, schema_of(document)) == []
@@ -78,10 +79,10 @@ def test_what_reports_show_besides_obeys_the_schema():
     term = GapTerm("backlash over N", -0.002, 1e-4, (-0.0022, -0.0018))
     stop = StopResidual("pan", (3, 4), -100, "", 0, (175.0, 276.5), (None, 0.3), 61.5, -0.01, 0.04)
     cause = Cause("depth", "tilt", (CauseGroup("175 to 276 mm", 12, 0.1, 0.3),), None, False)
-    gap = {"left": asdict(Gap(0.059, term, term, (term,))), "right": None}
+    gap = {"left": plain(Gap(0.059, term, term, (term,))), "right": None}
     document = kept("fit-1-laplace.json")
     schema = schema_of(document)
-    added = {"residuals": [asdict(stop)], "residual_causes": [asdict(cause)], "gap": gap, "few_stops": {"up": 3}}
+    added = {"residuals": [plain(stop)], "residual_causes": [plain(cause)], "gap": gap, "few_stops": {"up": 3}}
     written = json.loads(json.dumps({**document, **added}))
     assert problems(written, schema) == []
     assert problems({**written, "gap": None}, schema) == []

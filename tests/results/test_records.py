@@ -2,26 +2,22 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 import pytest
 
 from tvsbayes.errors import InputError
 from tvsbayes.files.documents import Keys
-from tvsbayes.results.records import plain, read_record
+from tvsbayes.results.records import Record, plain, read_record
 
 
-@dataclass(frozen=True)
-class Inner:
+class Inner(Record, frozen=True):
     """A number, whole or not, and a switch."""
 
     number: float
     on: bool = False
 
 
-@dataclass(frozen=True)
-class Record:
+class Whole(Record, frozen=True):
     """Everything that a record may hold."""
 
     text: str
@@ -33,11 +29,11 @@ class Record:
     maybe: float | None = None
 
 
-WHOLE = Record("a", 3, (1.0, 2.5), (Inner(1.0, True), Inner(2)), {"x": Inner(0.5), "y": None}, np.eye(2))
+WHOLE = Whole("a", 3, (1.0, 2.5), (Inner(1.0, True), Inner(2)), {"x": Inner(0.5), "y": None}, np.eye(2))
 
 
-def read(values: dict[str, object]) -> Record:
-    return read_record(Record, Keys(values, "a.json", ""), "make it again")
+def read(values: dict[str, object]) -> Whole:
+    return read_record(Whole, Keys(values, "a.json", ""), "make it again")
 
 
 def test_what_is_written_is_read():

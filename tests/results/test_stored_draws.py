@@ -5,10 +5,10 @@ from __future__ import annotations
 import json
 import math
 import os
-from dataclasses import replace
 
 import numpy as np
 import pytest
+from msgspec import structs
 from support.small_campaign import small_campaign
 from support.small_results import small_draws, small_mode, small_record, small_summary
 
@@ -69,7 +69,8 @@ def test_results_with_a_calibration_are_read_back(tmp_path):
 
 def test_nan_is_written_nowhere(tmp_path):
     with pytest.raises(ValueError, match="JSON"):
-        write_results(tmp_path / "results", small_record(replace(small_summary(), chi2=math.nan)), small_draws())
+        summary = structs.replace(small_summary(), reference_pose_deg={"pan": math.nan, "tilt": 0.5})
+        write_results(tmp_path / "results", small_record(summary), small_draws())
     assert not (tmp_path / "results").exists()
 
 

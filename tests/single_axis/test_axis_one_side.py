@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
+from msgspec import structs
 from support.axes import campaign
 
 from tvsbayes.report.axis_text import axis_fit_text, axis_plan_text, parameter_table
@@ -34,17 +33,17 @@ def test_a_play_that_cannot_be_told_is_its_prior(summary):
 
 
 def test_shares_told_lie_between_nought_and_one_hundred(summary):
-    wider = replace(summary.parameters["ratio_contrast"], contraction=-1.0)
-    hardly = replace(wider, contraction=-0.001)
+    wider = structs.replace(summary.parameters["ratio_contrast"], contraction=-1.0)
+    hardly = structs.replace(wider, contraction=-0.001)
     shown = parameter_table(
-        replace(summary, parameters={"a": wider, "b": hardly, "c": replace(wider, contraction=1.0)})
+        structs.replace(summary, parameters={"a": wider, "b": hardly, "c": structs.replace(wider, contraction=1.0)})
     )
     assert [row[3] for row in shown.rows] == ["0 %", "0 %", "100 %"]
 
 
 def test_weak_directions_are_counted_in_words(summary):
     for count, said in ((1, "1 weak direction\n"), (2, "2 weak directions\n")):
-        assert f": {said}" in axis_fit_text(replace(summary, weak_directions=("so",) * count))
+        assert f": {said}" in axis_fit_text(structs.replace(summary, weak_directions=("so",) * count))
 
 
 @pytest.mark.parametrize(

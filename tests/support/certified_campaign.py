@@ -7,6 +7,7 @@ import xml.etree.ElementTree as ET
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from msgspec import structs
 from support.known_calibration import known_calibration
 from support.small_campaign import small_campaign
 
@@ -28,17 +29,17 @@ class Certified:
 
     def with_summary(self, **changes: object) -> Certified:
         """Another summary."""
-        return replace(self, fit=replace(self.fit, summary=replace(self.fit.summary, **changes)))
+        return replace(self, fit=replace(self.fit, summary=structs.replace(self.fit.summary, **changes)))
 
     def with_play(self, value: float, sd: float, interval95: tuple[float, float]) -> Certified:
         """Another backlash of the pan axis."""
         parameters = self.fit.summary.parameters
-        play = replace(parameters["backlash_deg.pan"], value=value, sd=sd, interval95=interval95)
+        play = structs.replace(parameters["backlash_deg.pan"], value=value, sd=sd, interval95=interval95)
         return self.with_summary(parameters={**parameters, "backlash_deg.pan": play})
 
     def with_provenance(self, **changes: object) -> Certified:
         """Made otherwise."""
-        return replace(self, fit=replace(self.fit, provenance=replace(self.fit.provenance, **changes)))
+        return replace(self, fit=replace(self.fit, provenance=structs.replace(self.fit.provenance, **changes)))
 
     def with_positioning(self) -> Certified:
         """With an ISO 230-2-style table."""

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
+from msgspec import structs
 from support.small_campaign import small_campaign
 
 from tvsbayes.instrument.campaign import input_hashes
 from tvsbayes.report.result_tables import KEY_PARAMETERS, MORE_PARAMETERS
-from tvsbayes.results.estimates import Estimate, FitSummary, Leverage, WeakDirection
+from tvsbayes.results.estimates import Estimate, FitSummary, Leverage, WeakDirection, fit_noise
 from tvsbayes.results.fit_record import FitRecord, covariance_of_draws, provenance
 from tvsbayes.results.stored_draws import ResultDraws, StoredMode
 
@@ -24,6 +23,7 @@ def small_summary() -> FitSummary:
     parameters["mirror_offset_mm"] = estimate(30.0, 5.0, 0.001)
     parameters["stop_sd_deg.up"] = Estimate(0.05, 0.0, (0.05, 0.05), 0.0, None)
     return FitSummary(
+        estimator="laplace",
         converged=True,
         problems=(),
         effective={"left": estimate(0.0621, 0.0001), "right": None, "up": None, "down": None},
@@ -31,8 +31,7 @@ def small_summary() -> FitSummary:
         reference_pose_deg={"pan": 6.0, "tilt": 0.5},
         jacobian=((1.0, 0.0), (0.0, 1.0)),
         parameters=parameters,
-        chi2=31.0,
-        dof=30.5,
+        noise=fit_noise(31.0, 30.5, parameters),
         weak_directions=(WeakDirection("the tilt axis was never moved", {"degrees_per_step.tilt": 1.0}),),
         leverage=(Leverage(0, (3, 4), "effective left", None, "without move 0 it is lost"),),
         classic_predicted=dict.fromkeys(("left", "right", "up", "down")),
@@ -40,6 +39,8 @@ def small_summary() -> FitSummary:
         suspect_spots=tuple(range(30)),
         prior_conflicts=(),
         prior_sensitivity=(),
+        sampling=None,
+        curves=None,
     )
 
 
@@ -50,7 +51,7 @@ def whole_summary() -> FitSummary:
     """With every parameter that the schema wants."""
     summary = small_summary()
     names = ("degrees_per_step.pan", "degrees_per_step.tilt")
-    return replace(summary, parameters={**summary.parameters, **{name: estimate(0.06, 1e-4) for name in names}})
+    return structs.replace(summary, parameters={**summary.parameters, **{name: estimate(0.06, 1e-4) for name in names}})
 
 
 def small_draws() -> ResultDraws:

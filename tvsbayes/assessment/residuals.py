@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from msgspec import structs
 
 from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.estimators.plausibility import SHALLOW
@@ -190,7 +191,7 @@ def residual_causes(residuals: Sequence[StopResidual]) -> tuple[Cause, ...]:
             p = one_way_chance(testable) if len(testable) > 1 else None
             found.append(Cause(name, axis, tuple(groups), p, False))
     tests = sum(cause.p is not None for cause in found)
-    return tuple(replace(c, suspicious=c.p is not None and c.p * tests < CAUSE_LIMIT) for c in found)
+    return tuple(structs.replace(c, suspicious=c.p is not None and c.p * tests < CAUSE_LIMIT) for c in found)
 
 
 def _placed(depths_mm: Sequence[float]) -> list[tuple[str, np.ndarray]]:

@@ -6,11 +6,11 @@ Works on a finished `JointFit`, and on a `Posterior` where there is one; compute
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from typing import NamedTuple
 
 import jax
 import numpy as np
+from msgspec import structs
 
 from tvsbayes.assessment.prior_sensitivity import prior_sensitivity
 from tvsbayes.assessment.score_tests import validate
@@ -37,7 +37,7 @@ from tvsbayes.instrument.stops import legs_of
 from tvsbayes.model.headlines import Derived
 from tvsbayes.posterior.draws import Posterior
 from tvsbayes.posterior.predictive import ideal_pixels
-from tvsbayes.results.estimates import CurvePoint, Curves, Estimate, FitSummary, LostMotion, RatioAt
+from tvsbayes.results.estimates import CurvePoint, Curves, Estimate, FitSummary, LostMotion, RatioAt, fit_noise
 from tvsbayes.statistics.intervals import NORMAL_95, interval95
 from tvsbayes.statistics.weighted_draws import TAILS, systematic, weighted_mean, weighted_quantiles
 
@@ -132,7 +132,7 @@ class _Source:
         if self.posterior is None:
             return plain
         found = self.posterior.convergence
-        return replace(
+        return structs.replace(
             plain, rhat=found.rhat.get(name), ess_bulk=found.ess_bulk.get(name), ess_tail=found.ess_tail.get(name)
         )
 
@@ -170,7 +170,7 @@ def _parameters(source: _Source) -> dict[str, Estimate]:
             ends = (estimate.value - NORMAL_95 * estimate.sd, estimate.value + NORMAL_95 * estimate.sd)
         else:
             ends = (float(low[index]), float(high[index]))
-        estimates[name] = replace(estimate, interval95=ends)
+        estimates[name] = structs.replace(estimate, interval95=ends)
     return estimates
 
 
@@ -243,7 +243,7 @@ def _along(posterior: Posterior, axis: int, moved: set[str]) -> tuple[CurvePoint
             for k, direction in enumerate(DIRECTIONS)
             if direction in moved
         }
-        points.append(CurvePoint(pan, tilt, ratios))
+        points.append(CurvePoint(pan, tilt, **ratios))
     return tuple(points)
 
 
@@ -310,6 +310,7 @@ def summarise(fit: JointFit, posterior: Posterior | None = None) -> FitSummary:
     problems = fit.problems
     if posterior is not None:
         problems += tuple(f"UNCONVERGED: {sentence}" for sentence in posterior.convergence.missing)
+    parameters = {**_parameters(source), **_derived(source)}
     return FitSummary(
         converged=fit.converged and (posterior is None or posterior.converged),
         problems=problems,
@@ -317,9 +318,8 @@ def summarise(fit: JointFit, posterior: Posterior | None = None) -> FitSummary:
         contrasts=contrasts,
         reference_pose_deg={"pan": pan, "tilt": tilt},
         jacobian=((a, b), (c, d)),
-        parameters={**_parameters(source), **_derived(source)},
-        chi2=fit.chi2,
-        dof=observations - determined,
+        parameters=parameters,
+        noise=fit_noise(fit.chi2, observations - determined, parameters),
         weak_directions=weak_directions(fit, moved),
         leverage=leverage(fit, moved),
         classic_predicted=_classic_predicted(source),

@@ -255,4 +255,5 @@ def _classic_against_joint(found: JointFit, by: str, seed: int, progress: Show |
     gaps = explain_gap(found)
     if not any(gaps.values()):
         raise _no_experiments()
-    return ComparisonRecord(gaps, hold_out(found, by, seed, progress=progress), input_hashes(found.campaign), seed)
+    held_out = hold_out(found, by, seed, progress=progress)
+    return ComparisonRecord(directions=gaps, held_out=held_out, inputs=input_hashes(found.campaign), seed=seed)

@@ -205,7 +205,7 @@ def residuals_section(e: Evidence) -> Section:
     """Whether the deviations of the stops depend on anything."""
     summary, causes = e.fit.summary, e.shown.residual_causes
     text = [
-        f"chi-square {summary.chi2:.1f} for {summary.dof:.1f} degrees of freedom; the pixel noise is "
+        f"chi-square {summary.noise.chi2:.1f} for {summary.noise.dof:.1f} degrees of freedom; the pixel noise is "
         f"{summary.parameters['pixel_scale'].value:.2f} times the stated one."
     ]
     views = []

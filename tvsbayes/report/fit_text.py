@@ -93,7 +93,7 @@ def detail_lines(summary: FitSummary) -> list[str]:
     gears = gears_table(summary)
     if gears is not None:
         lines += [gears.text(), *gear_lines(summary)]
-    lines.append(f"chi2 {summary.chi2:.1f} for {summary.dof:.1f} degrees of freedom")
+    lines.append(f"chi2 {summary.noise.chi2:.1f} for {summary.noise.dof:.1f} degrees of freedom")
     if summary.validation is not None and summary.validation.passed:
         lines += validation_lines(summary.validation)
     predicted = [f"{d} {concise(e.value, e.sd)}" for d, e in summary.classic_predicted.items() if e is not None]

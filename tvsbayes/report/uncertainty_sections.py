@@ -225,7 +225,7 @@ def _digits(value: float) -> str:
 
 
 def _freedom(dof: float | None) -> str:
-    return "infinite" if dof is None or np.isinf(dof) else f"{dof:.0f}"
+    return "infinite" if dof is None else f"{dof:.0f}"
 
 
 def axes_section(e: Evidence) -> Section:

@@ -6,29 +6,37 @@ Ratios and their gaps in deg/step, angles in deg.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from typing import Annotated
+
+from msgspec import Meta
 
 from tvsbayes.display import Shown, View
-from tvsbayes.instrument.axes import DIRECTIONS
 from tvsbayes.instrument.campaign import Campaign
-from tvsbayes.results.records import plain, read_record, stored_document
+from tvsbayes.results.records import (
+    ByDirection,
+    ClosedRecord,
+    NotNegative,
+    Probability,
+    Record,
+    plain,
+    read_record,
+    stored_document,
+)
 
 COMPARISON_FORMAT = "tvsbayes-compare/1"
 BETTER_CLASSIC, BETTER_JOINT, CANNOT_TELL = "classic predicts better", "joint predicts better", "cannot tell"
 
 
-@dataclass(frozen=True)
-class GapTerm:
+class GapTerm(ClosedRecord, frozen=True):
     """A part of (classic mean - effective ratio), deg/step: mean or mode, standard deviation, 95 % interval."""
 
     name: str
     value: float
-    sd: float
+    sd: NotNegative
     interval95: tuple[float, float]
 
 
-@dataclass(frozen=True)
-class Gap:
+class Gap(ClosedRecord, frozen=True):
     """Why the classic mean of one direction is not the effective ratio; all in deg/step.
 
     Attributes:
@@ -44,8 +52,7 @@ class Gap:
     terms: tuple[GapTerm, ...]
 
 
-@dataclass(frozen=True)
-class Prediction:
+class Prediction(Record, frozen=True):
     """The four-point angle of one experiment as others foretold it, deg.
 
     `classic_u_deg` rests on the scatter of few experiments and has `classic_dof` degrees of freedom; `joint_u_deg` is
@@ -64,8 +71,7 @@ class Prediction:
     joint_u_deg: float
 
 
-@dataclass(frozen=True)
-class Score:
+class Score(Record, frozen=True):
     """How well one estimator foretold the angles.
 
     Attributes:
@@ -76,14 +82,13 @@ class Score:
         log_density: mean log predictive density of the same distributions, per deg.
     """
 
-    rms_deg: float
-    rms_block_deg: float
-    coverage: float
+    rms_deg: Annotated[float, Meta(ge=0, le=1e6)]
+    rms_block_deg: Annotated[float, Meta(ge=0, le=1e6)]
+    coverage: Probability
     log_density: float
 
 
-@dataclass(frozen=True, repr=False)
-class HoldOut(Shown):
+class HoldOut(Shown, Record, frozen=True):
     """Classic against joint on experiments that neither had seen.
 
     Attributes:
@@ -108,7 +113,7 @@ class HoldOut(Shown):
     interval95: tuple[float, float] | None
     verdict: str
     reason: str
-    unseen: dict[str, float]
+    unseen: ByDirection[Annotated[float, Meta(ge=0, le=1e6)]]
 
     def shown(self) -> View:
         """Scores of both estimators."""
@@ -122,8 +127,7 @@ class HoldOut(Shown):
         return View(f"HoldOut by {self.by}: {self.verdict}: {self.reason}", columns, rows)
 
 
-@dataclass(frozen=True)
-class HeldOutPosition:
+class HeldOutPosition(Record, frozen=True):
     """One counter of an axis from one side, foretold by the looks at all others; mirror angles, deg.
 
     Attributes:
@@ -144,8 +148,7 @@ class HeldOutPosition:
     u: float
 
 
-@dataclass(frozen=True)
-class PositionHoldOut:
+class PositionHoldOut(Record, frozen=True):
     """All counters foretold.
 
     Attributes:
@@ -165,8 +168,7 @@ class PositionHoldOut:
         return {"kind": "positions left out", "unit": "deg", "hold_out": plain(self)}
 
 
-@dataclass(frozen=True)
-class Change:
+class Change(Record, frozen=True):
     """One quantity of two calibrations.
 
     Attributes:
@@ -195,8 +197,7 @@ class Change:
         return self.quantity.replace("effective_deg_per_step", "local_deg_per_step")
 
 
-@dataclass(frozen=True, repr=False)
-class Comparison(Shown):
+class Comparison(Shown, Record, frozen=True, tag_field="kind", tag="two calibrations"):
     """Two calibrations of one instrument at one pose.
 
     Attributes:
@@ -223,22 +224,20 @@ class Comparison(Shown):
         ]
         return View(f"Comparison: {self.verdict}", columns, rows)
 
-    def as_json(self) -> dict[str, object]:
-        """Plain types."""
-        return {"kind": "two calibrations", **plain(self)}
 
-
-@dataclass(frozen=True, repr=False)
-class ComparisonRecord(Shown):
+class ComparisonRecord(Shown, Record, frozen=True, kw_only=True, tag_field="kind", tag="classic against joint"):
     """Classic against joint, as `results/compare.json` holds it.
 
     Attributes:
+        estimator: of the joint model.
         directions: why both differ, by direction; None without complete experiments.
         held_out: how both foretell what neither had seen.
         inputs: hashes of what the campaign's estimates depend on.
         seed: of the predictive draws.
     """
 
+    format: str = COMPARISON_FORMAT
+    estimator: str = "laplace"
     directions: dict[str, Gap | None]
     held_out: HoldOut
     inputs: dict[str, str]
@@ -247,12 +246,6 @@ class ComparisonRecord(Shown):
     def shown(self) -> View:
         """How both estimators foretell what neither had seen."""
         return self.held_out.shown()
-
-    def as_json(self) -> dict[str, object]:
-        """The document of `compare --json`, without what the caller adds (`files`)."""
-        values = plain(self)
-        head = {"kind": "classic against joint", "format": COMPARISON_FORMAT, "estimator": "laplace"}
-        return head | values
 
 
 def stored_hold_out(campaign: Campaign, inputs: Mapping[str, str]) -> HoldOut | None:
@@ -270,11 +263,4 @@ def stored_hold_out(campaign: Campaign, inputs: Mapping[str, str]) -> HoldOut | 
     if (found.classic is None) != (found.joint is None):
         lacking = "classic" if found.classic is None else "joint"
         raise held.refuse(lacking, "table", "scores of both estimators or of none", again)
-    for name in ("classic", "joint") if found.joint else ():
-        for figure, most in (("rms_deg", 1e6), ("rms_block_deg", 1e6), ("coverage", 1.0)):
-            held.table(name).number(figure, 0.0, most)
-    for direction in found.unseen:
-        if direction not in DIRECTIONS:
-            raise held.refuse("unseen", "word", ", ".join(DIRECTIONS), again)
-        held.table("unseen").number(direction, 0.0, 1e6)
     return found

@@ -10,18 +10,18 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from tvsbayes.results.records import ClosedRecord, Count, FromOne, NotNegative
 
-@dataclass(frozen=True)
-class NamedValue:
+
+class NamedValue(ClosedRecord, frozen=True):
     """The extreme of a diagnosis, and the quantity that has it."""
 
     quantity: str
     value: float
 
 
-@dataclass(frozen=True)
-class Importance:
-    """What importance sampling says of itself.
+class Importance(ClosedRecord, frozen=True):
+    """Importance sampling: draws and what their weights are worth.
 
     Attributes:
         accepted: its intervals may be used.
@@ -29,7 +29,8 @@ class Importance:
         rounds, draws: how many were made.
         effective_share: equal draws that the weights are worth, over the draws.
         least_ess: least effective draws of a headline's mean, sd or interval ends.
-        pareto_k: tail index of the weights; worst_pareto_k: largest of a headline's squared deviations times weights.
+        pareto_k: tail index of the weights.
+        worst_pareto_k: largest tail index of a headline's squared deviations times weights.
         heaviest_share: of the weight, in one draw.
         log_evidence: log of the integral of likelihood and prior; likelihoods have the constants of
             `estimators.campaign_arrays.spot_constants`, and ranges are flat in image displacement.
@@ -39,24 +40,25 @@ class Importance:
 
     accepted: bool
     missing: tuple[str, ...]
-    rounds: int
-    draws: int
-    effective_share: float
+    rounds: FromOne
+    draws: FromOne
+    effective_share: NotNegative
     least_ess: NamedValue
     pareto_k: float
     worst_pareto_k: NamedValue
-    heaviest_share: float
+    heaviest_share: NotNegative
     log_evidence: float
-    log_evidence_mcse: float
-    invalid_evaluations: int
+    log_evidence_mcse: NotNegative
+    invalid_evaluations: Count
 
 
-@dataclass(frozen=True)
-class Agreement:
+class Agreement(ClosedRecord, frozen=True):
     """Whether a chain and importance sampling say the same of every headline.
 
-    `worst` is the largest difference of a mean or an interval's end, in Monte Carlo standard errors of both; it agrees
-    below `limit`.
+    Attributes:
+        agrees: `worst` lies below `limit`.
+        limit: in Monte Carlo standard errors of both.
+        worst: largest difference of a headline's mean or interval end, in the same unit.
     """
 
     agrees: bool
@@ -64,28 +66,30 @@ class Agreement:
     worst: NamedValue
 
 
-@dataclass(frozen=True)
-class Sampling:
+class Sampling(ClosedRecord, frozen=True):
     """The diagnosis of a posterior in brief; fields of a chain as in `Convergence`, None where there is no chain.
 
-    `missing` says what is not reached; `acceptance` is the mean over walkers, `least_acceptance` that of the worst.
-    `agreement` is None where importance sampling was not accepted, or alone.
+    Attributes:
+        missing: sentences on what is not reached.
+        acceptance: mean over walkers.
+        least_acceptance: of the worst walker.
+        agreement: None where importance sampling was not accepted, or alone.
     """
 
     converged: bool
     missing: tuple[str, ...]
-    walkers: int | None
-    steps: int | None
-    discarded: int | None
-    thin: int | None
+    walkers: FromOne | None
+    steps: Count | None
+    discarded: Count | None
+    thin: FromOne | None
     tau_steps: float | None
     worst_rhat: NamedValue | None
     least_ess_bulk: NamedValue
     least_ess_tail: NamedValue
-    acceptance: float | None
-    least_acceptance: float | None
-    stuck_walkers: tuple[int, ...]
-    invalid_evaluations: int
+    acceptance: NotNegative | None
+    least_acceptance: NotNegative | None
+    stuck_walkers: tuple[Count, ...]
+    invalid_evaluations: Count
     proposal_pareto_k: float
     importance: Importance | None = None
     agreement: Agreement | None = None

@@ -5,14 +5,34 @@ Values in the units of the contract names: deg, deg/step, mm, rad, px; time in s
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Annotated, ClassVar
 
+import msgspec
 import numpy as np
+from msgspec import UNSET, Meta, UnsetType
 
 from tvsbayes.display import Shown, View
 from tvsbayes.instrument.axes import DIRECTIONS
+from tvsbayes.instrument.homing import ANYWHERE
 from tvsbayes.results.convergence import Sampling
-from tvsbayes.results.records import plain
+from tvsbayes.results.records import (
+    AllDirections,
+    AxisName,
+    BothAxes,
+    ByAxis,
+    ByDirection,
+    ClosedRecord,
+    Count,
+    EstimatorName,
+    FromOne,
+    NotNegative,
+    Positive,
+    Probability,
+    Record,
+    Tier,
+)
 
 CONTRACTION_LIMIT = 0.1
 """1 - (posterior sd / prior sd)^2 below which a value is called set by the prior."""
@@ -34,48 +54,37 @@ def conflict_sentence(quantity: str, distance: float, centre: str = "", remedy: 
     return f"{quantity} lies {far} from its prior's centre{centre and f', {centre}'}: {remedy}"
 
 
-SUMMARY_KEYS = (
-    *("estimator", "tier", "converged", "problems", "effective_deg_per_step", "effective_contrast_deg_per_step"),
-    *(
-        "local_deg_per_step",
-        "range_steps",
-        "homing_side",
-        "reference_pose_deg",
-        "effective_jacobian",
-        "parameters",
-        "noise",
-        "weak_directions",
-        "leverage",
-    ),
-    *("classic_predicted_deg_per_step", "excluded_spots", "suspect_spots", "prior_conflicts", "prior_sensitivity"),
-    *("sampling", "curves", "validation", "few_stops"),
+type Contraction = Annotated[float, Meta(le=1)]
+type HomingSide = Annotated[str, Meta(extra_json_schema={"enum": (*DIRECTIONS, ANYWHERE)})]
+type ParameterName = Annotated[str, Meta(pattern=r"^[a-z0-9_]+(\.[a-z0-9_]+)*$")]
+ALWAYS_ESTIMATED = (
+    *("degrees_per_step.pan", "degrees_per_step.tilt", "backlash_deg.pan", "backlash_deg.tilt"),
+    *("mirror_offset_mm", "effective_mirror_offset_mm", "pixel_scale"),
 )
-"""Of a summary in `fit.json`, in order; `noise` gathers what other keys hold."""
-KEPT_AS = {
-    "effective_deg_per_step": "effective",
-    "effective_contrast_deg_per_step": "contrasts",
-    "local_deg_per_step": "local",
-    "effective_jacobian": "jacobian",
-    "classic_predicted_deg_per_step": "classic_predicted",
-}
-"""Fields of `FitSummary` whose key in `fit.json` is longer."""
+"""Parameters that every `fit.json` holds."""
 
 
-@dataclass(frozen=True)
-class Estimate:
-    """One estimated quantity; `contraction` = 1 - var_post / var_prior, None where nothing is estimated.
+class Estimate(ClosedRecord, frozen=True):
+    """One estimated quantity.
 
-    `value` is the mode of a Laplace approximation or the mean of a posterior; the last three are a sampler's.
+    Attributes:
+        value: mode of a Laplace approximation, or mean of a posterior.
+        sd: standard deviation.
+        interval95: equal-tailed.
+        prior_sd: standard deviation of the prior; None where nothing is estimated.
+        contraction: 1 - var_post / var_prior; None where nothing is estimated.
+        rhat, ess_bulk, ess_tail: of a sampler; None where none ran.
     """
 
     value: float
-    sd: float
+    sd: NotNegative
     interval95: tuple[float, float]
-    prior_sd: float | None
-    contraction: float | None
+    prior_sd: NotNegative | None
+    contraction: Contraction | None
     rhat: float | None = None
     ess_bulk: float | None = None
     ess_tail: float | None = None
+    always: ClassVar = ("rhat", "ess_bulk", "ess_tail")
 
     @property
     def informed(self) -> bool:
@@ -83,41 +92,39 @@ class Estimate:
         return self.contraction is not None and self.contraction >= CONTRACTION_LIMIT
 
 
-@dataclass(frozen=True)
-class WeakDirection:
+class WeakDirection(ClosedRecord, frozen=True):
     """A mixture of parameters that the data leave to the prior; loadings are in prior sds."""
 
     text: str
     loadings: dict[str, float]
 
 
-@dataclass(frozen=True)
-class Leverage:
+class Leverage(ClosedRecord, frozen=True):
     """A stop without which the sd of `quantity` would grow by `factor` (None: beyond all bounds)."""
 
-    move: int
-    spots: tuple[int, ...]
+    move: Count
+    spots: tuple[Count, ...]
     quantity: str
     factor: float | None
     text: str
 
 
-@dataclass(frozen=True)
-class PriorSensitivity:
+class PriorSensitivity(ClosedRecord, frozen=True):
     """What a headline would do if the u of one prior were multiplied by `factor`.
 
-    `shift_sd` is the change of the value in its present sds, `sd_ratio` the new sd over the present one.
+    Attributes:
+        shift_sd: change of the value in its present sds.
+        sd_ratio: new sd over the present one.
     """
 
     parameter: str
     quantity: str
-    factor: float
+    factor: Positive
     shift_sd: float
-    sd_ratio: float
+    sd_ratio: NotNegative
 
 
-@dataclass(frozen=True)
-class ValidationTest:
+class ValidationTest(ClosedRecord, frozen=True):
     """One question to the residuals of a fit: is there a trace of this defect?
 
     Attributes:
@@ -133,16 +140,15 @@ class ValidationTest:
 
     name: str
     where: str
-    chi2: float
-    dof: int
-    places: int
-    p: float
+    chi2: NotNegative
+    dof: FromOne
+    places: FromOne
+    p: Probability
     failed: bool
-    shift_sd: float
+    shift_sd: NotNegative
 
 
-@dataclass(frozen=True)
-class Validation:
+class Validation(ClosedRecord, frozen=True):
     """Whether the residuals of a fit look as its model says.
 
     Attributes:
@@ -154,9 +160,9 @@ class Validation:
     """
 
     passed: bool
-    level: float
+    level: Probability
     cause: str
-    inflation: float
+    inflation: Annotated[float, Meta(ge=1)]
     tests: tuple[ValidationTest, ...]
 
     @property
@@ -165,61 +171,89 @@ class Validation:
         return f"{self.inflation:.2f}" != "1.00"
 
 
-@dataclass(frozen=True)
-class RatioAt:
+class RatioAt(ClosedRecord, frozen=True):
     """A local ratio at one pose, deg/step: mean, standard deviation, equal-tailed 95 % interval."""
 
     value: float
-    sd: float
+    sd: NotNegative
     interval95: tuple[float, float]
 
 
-@dataclass(frozen=True)
-class CurvePoint:
-    """Local ratios of the directions that moved, at one pose of the mirrors."""
+class CurvePoint(ClosedRecord, frozen=True):
+    """Local ratios at one pose of the mirrors; a direction that never moved is left out."""
 
     pan_deg: float
     tilt_deg: float
-    ratios: dict[str, RatioAt]
+    left: RatioAt | UnsetType = UNSET
+    right: RatioAt | UnsetType = UNSET
+    up: RatioAt | UnsetType = UNSET
+    down: RatioAt | UnsetType = UNSET
+
+    @property
+    def ratios(self) -> dict[str, RatioAt]:
+        """Those of the directions that moved."""
+        found = {direction: getattr(self, direction) for direction in DIRECTIONS}
+        return {direction: ratio for direction, ratio in found.items() if ratio is not UNSET}
 
 
-@dataclass(frozen=True)
-class LostMotion:
+class LostMotion(ClosedRecord, frozen=True):
     """What a reversal takes from so many steps, deg."""
 
-    steps: int
-    value_deg: float
-    sd_deg: float
+    steps: Count
+    value_deg: NotNegative
+    sd_deg: NotNegative
     interval95_deg: tuple[float, float]
 
 
-@dataclass(frozen=True)
-class Curves:
+class Curves(ClosedRecord, frozen=True, rename={"ratios": "effective_deg_per_step"}):
     """What a posterior says of other poses and step counts.
 
     Attributes:
-        ratios: by axis ("pan", "tilt"): local ratios along the angles of that axis that were seen.
+        ratios: local ratios along the angles of each axis that were seen.
         lost_motion: by direction, for the step counts that were used.
     """
 
-    ratios: dict[str, tuple[CurvePoint, ...]]
-    lost_motion: dict[str, tuple[LostMotion, ...]]
-
-    def as_json(self) -> dict[str, object]:
-        """As `fit.json` has them: the ratios of a pose stand beside its angles."""
-
-        def flat(point: CurvePoint) -> dict[str, object]:
-            return {"pan_deg": point.pan_deg, "tilt_deg": point.tilt_deg, **plain(point.ratios)}
-
-        along = {axis: [flat(point) for point in points] for axis, points in self.ratios.items()}
-        return {"effective_deg_per_step": along, "lost_motion": plain(self.lost_motion)}
+    ratios: BothAxes[tuple[CurvePoint, ...]]
+    lost_motion: ByDirection[tuple[LostMotion, ...]]
 
 
-@dataclass(frozen=True, repr=False)
-class FitSummary(Shown):
+class FitNoise(ClosedRecord, frozen=True):
+    """How well the model fits, and the noise that it found.
+
+    Attributes:
+        chi2: squared standardised innovations.
+        dof: their number less the parameters they determine.
+        pixel_scale: pixel noise over the stated one.
+        stop_sd_deg: standard deviation of the stops, by direction of arrival.
+    """
+
+    chi2: NotNegative
+    dof: float
+    pixel_scale: NotNegative
+    stop_sd_deg: AllDirections[NotNegative]
+
+
+def fit_noise(chi2: float, dof: float, parameters: Mapping[str, Estimate]) -> FitNoise:
+    """Of a fit with these estimates."""
+    stops = {direction: parameters[f"stop_sd_deg.{direction}"].value for direction in DIRECTIONS}
+    return FitNoise(chi2, dof, parameters["pixel_scale"].value, stops)
+
+
+_LONG_KEYS = {
+    "effective": "effective_deg_per_step",
+    "contrasts": "effective_contrast_deg_per_step",
+    "local": "local_deg_per_step",
+    "jacobian": "effective_jacobian",
+    "classic_predicted": "classic_predicted_deg_per_step",
+}
+
+
+class FitSummary(Shown, Record, frozen=True, kw_only=True, rename=_LONG_KEYS):
     """A joint fit in the contract's terms.
 
     Attributes:
+        estimator: "posterior" if a converged sample stands behind the numbers, else "laplace".
+        tier: what made a posterior's draws, "importance" or "emcee"; None of a Laplace approximation.
         converged: whether the mode was reached.
         problems: sentences on what failed.
         effective: left, right, up, down in deg/step, slopes of the lines through the looks used; None for a direction
@@ -231,7 +265,7 @@ class FitSummary(Shown):
         reference_pose_deg: mean mirror angles, pan and tilt, of the looks used.
         jacobian: d(azimuth, elevation)/d(pan, tilt) there.
         parameters: every estimated or derived parameter by its name.
-        chi2: squared standardised innovations; dof: their number less the parameters they determine.
+        noise: how well the model fits, and the noise that it found.
         weak_directions: what the campaign cannot separate, in words.
         leverage: stops on which a headline hangs.
         classic_predicted: what the classic estimator should report if the model is right, per direction.
@@ -239,39 +273,36 @@ class FitSummary(Shown):
         suspect_spots: used, but in disagreement with all others.
         prior_conflicts: parameters that the data pull far from what was stated, in words.
         prior_sensitivity: priors that would move a headline if they were twice or half as wide.
-        estimator: "posterior" if a converged sample stands behind the numbers, else "laplace".
-        tier: what made a posterior's draws, "importance" or "emcee"; None of a Laplace approximation.
         sampling: diagnosis of the draws, None where nothing was sampled.
         curves: local ratios over the range and lost motion against steps; only from a posterior.
         validation: whether the residuals look as the model says; None where nobody asked.
         few_stops: directions in which so few stops were seen that their scatter is poorly known, with the number.
     """
 
+    estimator: EstimatorName
+    tier: Tier | None = None
     converged: bool
     problems: tuple[str, ...]
-    effective: dict[str, Estimate | None]
-    contrasts: dict[str, Estimate | None]
-    reference_pose_deg: dict[str, float]
+    effective: AllDirections[Estimate | None]
+    contrasts: BothAxes[Estimate | None]
+    local: ByDirection[Estimate | None] = msgspec.field(default_factory=dict)
+    range_steps: ByAxis[tuple[int, int]] = msgspec.field(default_factory=dict)
+    homing_side: ByAxis[dict[HomingSide, float]] = msgspec.field(default_factory=dict)
+    reference_pose_deg: BothAxes[float]
     jacobian: tuple[tuple[float, float], tuple[float, float]]
-    parameters: dict[str, Estimate]
-    chi2: float
-    dof: float
+    parameters: Annotated[dict[ParameterName, Estimate], Meta(extra_json_schema={"required": ALWAYS_ESTIMATED})]
+    noise: FitNoise
     weak_directions: tuple[WeakDirection, ...]
     leverage: tuple[Leverage, ...]
-    classic_predicted: dict[str, Estimate | None]
-    excluded_spots: tuple[int, ...]
-    suspect_spots: tuple[int, ...]
+    classic_predicted: AllDirections[Estimate | None]
+    excluded_spots: tuple[Count, ...]
+    suspect_spots: tuple[Count, ...]
     prior_conflicts: tuple[str, ...]
     prior_sensitivity: tuple[PriorSensitivity, ...]
-    estimator: str = "laplace"
-    tier: str | None = None
-    sampling: Sampling | None = None
-    curves: Curves | None = None
+    sampling: Sampling | None
+    curves: Curves | None
     validation: Validation | None = None
-    few_stops: dict[str, int] = field(default_factory=dict)
-    local: dict[str, Estimate | None] = field(default_factory=dict)
-    range_steps: dict[str, tuple[int, int]] = field(default_factory=dict)
-    homing_side: dict[str, dict[str, float]] = field(default_factory=dict)
+    few_stops: ByDirection[Count] = msgspec.field(default_factory=dict)
 
     def shown(self) -> View:
         """Every estimate but the cameras' parameters."""
@@ -293,21 +324,8 @@ class FitSummary(Shown):
         """Whether the data informed any effective ratio."""
         return any(e is not None and e.informed for e in self.effective.values())
 
-    def as_json(self) -> dict[str, object]:
-        """The contract's keys, without those that the caller adds (`files`)."""
-        values = plain(replace(self, curves=None))
-        noise = {
-            "chi2": values.pop("chi2"),
-            "dof": values.pop("dof"),
-            "pixel_scale": self.parameters["pixel_scale"].value,
-            "stop_sd_deg": {d: self.parameters[f"stop_sd_deg.{d}"].value for d in DIRECTIONS},
-        }
-        values |= {"noise": noise, "curves": None if self.curves is None else self.curves.as_json()}
-        return {key: values[KEPT_AS.get(key, key)] for key in SUMMARY_KEYS}
 
-
-@dataclass(frozen=True)
-class StopResidual:
+class StopResidual(ClosedRecord, frozen=True):
     """How far one rest of one axis lay from where the fitted model puts it.
 
     Attributes:
@@ -325,30 +343,28 @@ class StopResidual:
         u_deg: its standard deviation as the fitted noise has it (pixel noise and stop error).
     """
 
-    axis: str
-    spots: tuple[int, ...]
+    axis: AxisName
+    spots: tuple[Count, ...]
     steps: int
-    direction: str
-    leg_steps: int
+    direction: Annotated[str, Meta(extra_json_schema={"enum": (*DIRECTIONS, "")})]
+    leg_steps: Count
     depth_mm: tuple[float, ...]
     within: tuple[float | None, ...]
     time_s: float
     deviation_deg: float
-    u_deg: float
+    u_deg: NotNegative
 
 
-@dataclass(frozen=True)
-class CauseGroup:
+class CauseGroup(ClosedRecord, frozen=True):
     """Stops of one axis that share a value of a cause: mean of deviation / u, and its standard error."""
 
     label: str
-    count: int
+    count: Count
     mean: float
-    standard_error: float
+    standard_error: NotNegative
 
 
-@dataclass(frozen=True)
-class Cause:
+class Cause(ClosedRecord, frozen=True):
     """Whether the deviations of one axis depend on one thing.
 
     `p` is the probability of group means as different as these if nothing depends on it (one-way analysis of
@@ -356,9 +372,9 @@ class Cause:
     """
 
     name: str
-    axis: str
+    axis: AxisName
     groups: tuple[CauseGroup, ...]
-    p: float | None
+    p: Probability | None
     suspicious: bool
 
 

@@ -12,48 +12,50 @@ import json
 import shlex
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import cache
 from importlib.metadata import version
-from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Annotated, Any
 
 import numpy as np
+from msgspec import Meta
 
 from tvsbayes.display import Shown, View
-from tvsbayes.errors import escaped, shown
-from tvsbayes.files.disk import read_bytes, shipped_data
+from tvsbayes.errors import escaped
+from tvsbayes.files.disk import read_bytes
 from tvsbayes.files.documents import JSON_BYTES_MAX, Keys, parse_json
-from tvsbayes.instrument.axes import DIRECTIONS
 from tvsbayes.results.comparison_record import Gap
-from tvsbayes.results.estimates import KEPT_AS, Cause, FitSummary, StopResidual
+from tvsbayes.results.estimates import Cause, FitSummary, StopResidual
 from tvsbayes.results.metrology_tables import FIGURES, AxisPositioning, BudgetTable
-from tvsbayes.results.records import plain, read_record
-
-if TYPE_CHECKING:
-    from jsonschema import Draft202012Validator
+from tvsbayes.results.records import (
+    ByDirection,
+    ClosedRecord,
+    Matrix,
+    Record,
+    hold_to_schema,
+    plain,
+    read_record,
+    schema_of,
+)
 
 FIT_FORMAT = "tvsbayes-fit/1"
 FIT_FORMATS = (FIT_FORMAT,)
 """Versions of `results/fit.json` that can be read; the schema of each is in `data/schemas`."""
-SCHEMA_PROBLEMS = 20
-"""Among which the one to name is chosen: a document of another making has thousands."""
+type Sha256 = Annotated[str, Meta(pattern="^[0-9a-f]{64}$")]
 PACKAGES = (*("tvsbayes", "jax", "optimistix", "equinox", "emcee", "arviz", "numpy", "scipy"), "opencv-python-headless")
 """Whose versions a result states."""
 AGAIN = "run `tvsbayes fit` again"
 
 
-@dataclass(frozen=True)
-class NamedCovariance:
+class NamedCovariance(ClosedRecord, frozen=True):
     """Of the draws behind the values; rows and columns of `matrix`, shape (n, n), are `names`, in their units."""
 
-    names: tuple[str, ...]
-    matrix: np.ndarray
+    names: Annotated[tuple[str, ...], Meta(min_length=1)]
+    matrix: Matrix
 
 
-@dataclass(frozen=True)
-class FitEvidence:
+class FitEvidence(Record, frozen=True):
     """What reports show of a fit besides its estimates.
 
     Attributes:
@@ -66,29 +68,24 @@ class FitEvidence:
 
     residuals: tuple[StopResidual, ...] = ()
     residual_causes: tuple[Cause, ...] = ()
-    gap: dict[str, Gap | None] | None = None
+    gap: ByDirection[Gap | None] | None = None
     budgets: tuple[BudgetTable, ...] = ()
     positioning: tuple[AxisPositioning, ...] = ()
 
-    def as_json(self) -> dict[str, object]:
-        """Keys of `fit.json`."""
-        return plain(self) | {"budgets": [table.as_json() for table in self.budgets]}
 
-
-@dataclass(frozen=True)
-class Provenance:
+class Provenance(Record, frozen=True):
     """What results were made from and by.
 
     Attributes:
-        inputs: SHA-256 of what the estimate depends on: moves, spots, stereo, rig.
+        inputs: SHA-256 of what the estimate depends on, by file.
         versions: of Python and `PACKAGES`.
         seed: of everything random.
         command: as it was typed.
     """
 
-    inputs: dict[str, str]
-    versions: dict[str, str]
-    seed: int
+    inputs: dict[str, Sha256]
+    versions: Annotated[dict[str, str], Meta(extra_json_schema={"required": ("python", "tvsbayes")})]
+    seed: Annotated[int, Meta(ge=0, le=2**63 - 1)]
     command: str
 
 
@@ -128,7 +125,7 @@ class FitRecord(Shown):
         """The document."""
         evidence = {} if self.evidence is None else self.evidence.as_json()
         head = {"format": FIT_FORMAT, **self.summary.as_json(), "covariance": plain(self.covariance)}
-        return {**head, **evidence, **asdict(self.provenance)}
+        return {**head, **evidence, **self.provenance.as_json()}
 
     @property
     def digest(self) -> str:
@@ -148,55 +145,21 @@ class FitRecord(Shown):
         return f"tvsbayes-{hashlib.sha256(text.encode()).hexdigest()[:32]}"
 
 
+class FitInputs(ClosedRecord, frozen=True):
+    """SHA-256 of what a fit depends on."""
+
+    moves: Sha256
+    spots: Sha256
+    stereo: Sha256
+    rig: Sha256
+
+
 @cache
-def _fit_validator(version: str) -> Draft202012Validator:
-    from jsonschema import Draft202012Validator
-
-    path = shipped_data() / "schemas" / f"fit-{version}.schema.json"
-    return Draft202012Validator(json.loads(path.read_text(encoding="utf-8")))
-
-
-def _schema_problem(values: object, version: str) -> tuple[list[str | int], str] | None:
-    """The place that most likely breaks the schema of `fit.json`, as keys and list indices, and what is allowed."""
-    from jsonschema.exceptions import best_match
-
-    error = best_match(islice(_fit_validator(version).iter_errors(values), SCHEMA_PROBLEMS))
-    if error is None:
-        return None
-    place, rule = list(error.absolute_path), error.validator_value
-    if "propertyNames" in error.absolute_schema_path:
-        # jsonschema gives the place of the table whose key is wrong.
-        place.append(error.instance)
-    match error.validator:
-        case "required":
-            return [*place, next(name for name in rule if name not in error.instance)], "this key"
-        case "additionalProperties":
-            known = error.schema.get("properties", {})
-            return [*place, next(name for name in error.instance if name not in known)], "no such key"
-        case "type":
-            return place, rule if isinstance(rule, str) else " or ".join(rule)
-        case "const":
-            return place, shown(rule)
-        case "enum":
-            return place, " or ".join(map(shown, rule))
-        case other:
-            return place, f"{other} {shown(rule)}"
-
-
-def _check_schema(keys: Keys, version: str) -> None:
-    problem = _schema_problem(keys.values, version)
-    if problem is None:
-        return
-    place, allowed = problem
-    value: object = keys.values
-    for part in place:
-        if isinstance(value, list) and isinstance(part, int):
-            value = value[part]
-        else:
-            value = value.get(str(part), "nothing") if isinstance(value, dict) else "nothing"
-    # An entry of a list is named by the key of the list.
-    *path, key = (part for part in place if isinstance(part, str))
-    raise Keys({}, keys.file, keys.text, tuple(path)).refuse(key, "schema", allowed, AGAIN, shown(value))
+def fit_schema() -> dict[str, Any]:
+    """The JSON schema of `results/fit.json`."""
+    parts = (FitSummary, FitEvidence, Provenance)
+    covariance, made_of = NamedCovariance, FitInputs
+    return schema_of(*parts, closed=True, format={"const": FIT_FORMAT}, covariance=covariance, inputs=made_of)
 
 
 def _check_agreement(keys: Keys) -> None:
@@ -207,24 +170,6 @@ def _check_agreement(keys: Keys) -> None:
     assert isinstance(names, list) and isinstance(matrix, list)
     if any(len(row) != len(names) for row in [matrix, *matrix]):
         raise covariance.refuse("matrix", "shape", f"{len(names)} rows of {len(names)} numbers", AGAIN)
-    keys.integer("seed", 0, 2**63 - 1)
-    keys.text_value("command", 20_000)
-    for name in ("python", "tvsbayes", *keys.table("versions").values):
-        keys.table("versions").text_value(name)
-
-
-def _summary_keys(keys: Keys) -> Keys:
-    """The document's table under the names that `FitSummary` gives to what it holds."""
-    values = {KEPT_AS.get(key, key): value for key, value in keys.values.items()} | keys.table("noise").values
-    if keys.values["curves"] is not None:
-        curves = keys.table("curves")
-        along = {}
-        for axis, points in curves.table("effective_deg_per_step").values.items():
-            assert isinstance(points, list)
-            ratios = [{key: of for key, of in point.items() if key in DIRECTIONS} for point in points]
-            along[axis] = [{**point, "ratios": of} for point, of in zip(points, ratios, strict=True)]
-        values["curves"] = {"ratios": along, "lost_motion": curves.values["lost_motion"]}
-    return Keys(values, keys.file, keys.text)
 
 
 def read_fit(path: Path | str) -> FitRecord:
@@ -234,15 +179,16 @@ def read_fit(path: Path | str) -> FitRecord:
         InputError: missing, damaged or of an unknown version, with the key.
     """
     keys = parse_json(read_bytes(Path(path), JSON_BYTES_MAX), escaped(Path(path).name))
-    _check_schema(keys, keys.word("format", FIT_FORMATS).removeprefix("tvsbayes-fit/"))
+    keys.word("format", FIT_FORMATS)
+    hold_to_schema(keys, fit_schema(), AGAIN)
     _check_agreement(keys)
     # Documents of the first tvsbayes hold none; a part of it is none.
-    shown_besides = {field.name for field in fields(FitEvidence)} <= set(keys.values)
+    shown_besides = set(FitEvidence.__struct_fields__) <= set(keys.values)
     record = FitRecord(
-        read_record(FitSummary, _summary_keys(keys), AGAIN),
-        read_record(NamedCovariance, keys.table("covariance"), AGAIN),
-        read_record(FitEvidence, keys, AGAIN) if shown_besides else None,
-        read_record(Provenance, keys, AGAIN),
+        read_record(FitSummary, keys, AGAIN, held=True),
+        read_record(NamedCovariance, keys.table("covariance"), AGAIN, held=True),
+        read_record(FitEvidence, keys, AGAIN, held=True) if shown_besides else None,
+        read_record(Provenance, keys, AGAIN, held=True),
     )
     validation = record.summary.validation
     if validation is not None and not (validation.passed or validation.tests):

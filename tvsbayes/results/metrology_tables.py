@@ -6,20 +6,18 @@ numbers of ISO 230-2:2006 stand where its figures are computed.
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass
-
 import numpy as np
 
-from tvsbayes.results.records import plain
+from tvsbayes.results.records import AxisName, ClosedRecord, EstimatorName, NotNegative
 
 
-@dataclass(frozen=True)
-class BudgetRow:
+class BudgetRow(ClosedRecord, frozen=True):
     """A line of a budget; fields as in `Source`, None where a line sums up several or is the correlation row.
 
-    `contribution` is sensitivity times u, signed, in the unit of the result; `share` is of the combined variance and
-    negative where correlations take variance away.
+    Attributes:
+        dof: degrees of freedom; None of what was stated, whose are infinite (GUM G.4.3).
+        contribution: sensitivity times u, signed, in the unit of the result.
+        share: of the combined variance; negative where correlations take variance away.
     """
 
     quantity: str
@@ -34,8 +32,7 @@ class BudgetRow:
     share: float
 
 
-@dataclass(frozen=True)
-class BudgetTable:
+class BudgetTable(ClosedRecord, frozen=True):
     """A GUM uncertainty budget.
 
     Attributes:
@@ -43,7 +40,7 @@ class BudgetTable:
         estimate: the result.
         rows: largest contribution first; the last one is `CORRELATIONS`, so that the shares sum to 1.
         u: combined standard uncertainty (GUM 5.1.2, 5.2.2).
-        dof: effective degrees of freedom (GUM eq. G.2b); infinite, read back None, where no input's are finite.
+        dof: effective degrees of freedom (GUM eq. G.2b); None where no input's are finite.
         coverage_factor: k = t_p(dof) (GUM G.4.1).
         probability: coverage probability p.
         expanded: U = k u.
@@ -54,19 +51,12 @@ class BudgetTable:
     unit: str
     estimate: float
     rows: tuple[BudgetRow, ...]
-    u: float
+    u: NotNegative
     dof: float | None
     coverage_factor: float
     probability: float
-    expanded: float
+    expanded: NotNegative
     notes: tuple[str, ...]
-
-    def as_json(self) -> dict[str, object]:
-        """Infinite degrees of freedom become null."""
-        document = plain(self)
-        for entry in (document, *document["rows"]):
-            entry["dof"] = None if entry["dof"] == math.inf else entry["dof"]
-        return document
 
 
 FIGURES: dict[str, tuple[str, str]] = {
@@ -86,19 +76,22 @@ FIGURES: dict[str, tuple[str, str]] = {
 """Fields of `Positioning` that are one number per test: symbol and term of ISO 230-2."""
 
 
-@dataclass(frozen=True)
-class Positioning:
+class Positioning(ClosedRecord, frozen=True):
     """ISO 230-2 figures of one axis. Any leading axes (...) are tests; m targets.
 
     Attributes:
         mean_up_deg, mean_down_deg: mean deviation per target and side, shape (..., m).
         sd_up_deg, sd_down_deg: their standard deviations (n - 1), shape (..., m).
         reversal_at_deg: B_i, up minus down, signed, shape (..., m).
-        reversal_deg: B = max |B_i|; mean_reversal_deg: mean of B_i, signed; shape (...), as all that follow.
-        repeatability_deg: R; repeatability_up_deg, repeatability_down_deg: of one side.
-        systematic_deg: E; systematic_up_deg, systematic_down_deg: of one side.
+        reversal_deg: B = max |B_i|, shape (...), as all that follow.
+        mean_reversal_deg: mean of B_i, signed.
+        repeatability_deg: R.
+        repeatability_up_deg, repeatability_down_deg: R of one side.
+        systematic_deg: E.
+        systematic_up_deg, systematic_down_deg: E of one side.
         mean_systematic_deg: M.
-        accuracy_deg: A; accuracy_up_deg, accuracy_down_deg: of one side.
+        accuracy_deg: A.
+        accuracy_up_deg, accuracy_down_deg: A of one side.
     """
 
     mean_up_deg: np.ndarray
@@ -120,16 +113,14 @@ class Positioning:
     accuracy_deg: np.ndarray
 
 
-@dataclass(frozen=True)
-class Predicted:
+class Predicted(ClosedRecord, frozen=True):
     """Median and equal-tailed 95 % interval of a figure over simulated tests."""
 
     median: float
     interval95: tuple[float, float]
 
 
-@dataclass(frozen=True)
-class AxisPositioning:
+class AxisPositioning(ClosedRecord, frozen=True):
     """ISO 230-2-style table of one axis.
 
     Attributes:
@@ -148,11 +139,11 @@ class AxisPositioning:
         notes: that it is indirect, what it rests on and what it does not cover.
     """
 
-    axis: str
+    axis: AxisName
     deg_per_step: float
     target_steps: tuple[int, ...]
     runs: int
-    estimator: str
+    estimator: EstimatorName
     plug_in_steps: tuple[int, ...]
     plug_in_runs: tuple[tuple[int, int], ...]
     reading_u_deg: float | None

@@ -6,18 +6,16 @@ Values and gains in the unit of the target, times in minutes.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 
 from tvsbayes.files.documents import Keys
 from tvsbayes.instrument.campaign import Campaign
 from tvsbayes.instrument.plan import PlanStep
-from tvsbayes.results.records import read_record, stored_document
+from tvsbayes.results.records import Record, read_record, stored_document
 
 PLAN_FORMAT = "tvsbayes-plan/1"
 
 
-@dataclass(frozen=True)
-class Batch:
+class Batch(Record, frozen=True):
     """A possible next experiment: four looks at one sheet and what they bring; read back without its actions."""
 
     actions: tuple[PlanStep, ...]
@@ -27,8 +25,7 @@ class Batch:
     text: str
 
 
-@dataclass(frozen=True)
-class Advice:
+class Advice(Record, frozen=True):
     """Whether to stop measuring, and the rule."""
 
     now: bool
@@ -36,23 +33,20 @@ class Advice:
     rule: str
 
 
-@dataclass(frozen=True)
-class StatedTarget:
+class StatedTarget(Record, frozen=True):
     """What was wanted, in words, and the unit of its value."""
 
     text: str
     unit: str
 
 
-@dataclass(frozen=True)
-class Obstacle:
+class Obstacle(Record, frozen=True):
     """In words, the input uncertainty that would bring the target into reach; None where no input is in the way."""
 
     needed: str | None = None
 
 
-@dataclass(frozen=True)
-class PlanRecord:
+class PlanRecord(Record, frozen=True):
     """What reports show of a plan that goes on from a campaign.
 
     Attributes:

@@ -1,25 +1,57 @@
-"""Frozen dataclasses as the plain values of a JSON document, and back, every field held to its annotation.
+"""What a record of results is: one declaration that is the class, its JSON document, its reader and its schema.
 
-What is written is what is read: a record needs no code of its own for either way. Numbers keep their unit, which
-stands in the field's name.
+A record is a frozen msgspec struct. Its fields are the keys of the document, in their order; a field with a default may
+be missing in a document of an older version. The docstrings say in the schema what the keys mean. Numbers are finite
+and keep their unit, which stands in the field's name.
 """
 
 from __future__ import annotations
 
+import inspect
 import math
-from collections.abc import Iterable, Mapping
-from dataclasses import MISSING, fields, is_dataclass
+import re
+from abc import ABCMeta
+from collections.abc import Mapping
 from functools import cache
-from itertools import repeat
+from itertools import islice
 from pathlib import Path
-from types import NoneType, UnionType
-from typing import Any, Protocol, get_args, get_origin, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Protocol
 
+import msgspec
 import numpy as np
+from msgspec import Meta, Struct, StructMeta
 
 from tvsbayes.errors import shown
 from tvsbayes.files.disk import read_bytes
 from tvsbayes.files.documents import JSON_BYTES_MAX, Keys, parse_json
+from tvsbayes.instrument.axes import AXES, DIRECTIONS
+
+if TYPE_CHECKING:
+    from jsonschema import Draft202012Validator
+
+type NotNegative = Annotated[float, Meta(ge=0)]
+type Positive = Annotated[float, Meta(gt=0)]
+type Probability = Annotated[float, Meta(ge=0, le=1)]
+type Count = Annotated[int, Meta(ge=0)]
+type FromOne = Annotated[int, Meta(ge=1)]
+type AxisName = Annotated[str, Meta(extra_json_schema={"enum": AXES})]
+type Direction = Annotated[str, Meta(extra_json_schema={"enum": DIRECTIONS})]
+type ByAxis[T] = dict[AxisName, T]
+"""For some axes."""
+type ByDirection[T] = dict[Direction, T]
+"""For some directions."""
+type BothAxes[T] = Annotated[dict[AxisName, T], Meta(extra_json_schema={"required": AXES})]
+type AllDirections[T] = Annotated[dict[Direction, T], Meta(extra_json_schema={"required": DIRECTIONS})]
+type EstimatorName = Annotated[str, Meta(extra_json_schema={"enum": ("laplace", "posterior")})]
+type Tier = Annotated[str, Meta(extra_json_schema={"enum": ("importance", "emcee")})]
+
+TEXT_CHARS_MAX = 20_000
+"""Of one text in a document that tvsbayes wrote."""
+SCHEMA_PROBLEMS = 20
+"""Among which the one to name is chosen: a document of another making has thousands."""
+DIALECT = "https://json-schema.org/draft/2020-12/schema"
+_ROW = {"type": "array", "minItems": 1, "items": {"type": "number"}}
+type Matrix = Annotated[np.ndarray, Meta(extra_json_schema={"type": "array", "minItems": 1, "items": _ROW})]
 
 
 class HasFolder(Protocol):
@@ -30,100 +62,222 @@ class HasFolder(Protocol):
         """Its folder."""
 
 
-TEXT_CHARS_MAX = 20_000
-"""Of one text in a document that tvsbayes wrote."""
-_KINDS = {float: "a finite number", int: "a whole number", str: "printable text", bool: "true or false"}
+class _RecordType(StructMeta, ABCMeta):
+    """Lets a record have abstract bases, as `display.Shown` is."""
+
+
+class Record(Struct, frozen=True, metaclass=_RecordType):
+    """Base of records; keys that it does not know are passed over.
+
+    `always` names fields that every document holds though the class has defaults for them.
+    """
+
+    always: ClassVar[tuple[str, ...]] = ()
+
+    def as_json(self) -> dict[str, Any]:
+        """The document, of plain types."""
+        return plain(self)
+
+
+class ClosedRecord(Record, frozen=True, forbid_unknown_fields=True):
+    """A record whose document holds its keys and no other."""
+
+
+def _encoded(value: object) -> object:
+    if isinstance(value, np.ndarray | np.generic):
+        return value.tolist()
+    raise TypeError(f"no JSON for {type(value).__name__}")
+
+
+def _lists(value: Any) -> Any:
+    """JSON has lists, no tuples."""
+    if isinstance(value, dict):
+        return {key: _lists(inner) for key, inner in value.items()}
+    return [_lists(inner) for inner in value] if isinstance(value, tuple | list) else value
 
 
 def plain(value: object) -> Any:
-    """Dataclasses and dictionaries as dictionaries, tuples and arrays as lists, all else as it is."""
-    if is_dataclass(value):
-        return {field.name: plain(getattr(value, field.name)) for field in fields(value)}
-    if isinstance(value, dict):
-        return {key: plain(inner) for key, inner in value.items()}
-    if isinstance(value, tuple | list):
-        return [plain(inner) for inner in value]
-    return value.tolist() if isinstance(value, np.ndarray | np.generic) else value
+    """Records, dataclasses and dictionaries as dictionaries, tuples and arrays as lists, all else as it is."""
+    return _lists(msgspec.to_builtins(value, enc_hook=_encoded))
 
 
-class _Unfit(Exception):
-    """A value that its field cannot take: keys that lead there, and what may stand there."""
+def _decoded(kind: type, value: object) -> object:
+    if kind is not np.ndarray:
+        raise TypeError(f"no reader of {kind.__name__}")
+    array = np.array(value, dtype=float)
+    if not np.all(np.isfinite(array)):
+        raise ValueError("numbers that are not finite")
+    return array
 
-    def __init__(self, place: tuple[str, ...], allowed: str, found: str):
-        super().__init__(allowed)
-        self.place, self.allowed, self.found = place, allowed, found
+
+def _array_schema(kind: type) -> dict[str, object]:
+    if kind is not np.ndarray:
+        raise NotImplementedError
+    # Of any number of axes; without one it is a number.
+    return {"type": ["number", "array"]}
 
 
-def read_record[T](kind: type[T], keys: Keys, remedy: str) -> T:
-    """A record from a table of a document; keys that it does not know are passed over, defaults may be missing.
+def _meanings(kind: type) -> tuple[str, dict[str, str]]:
+    """What a docstring says of a class, and what its section "Attributes" says of each field."""
+    text, _, attributes = (inspect.getdoc(kind) or "").partition("\n\nAttributes:\n")
+    found = {}
+    for entry in re.split(r"\n(?! )", inspect.cleandoc(attributes)):
+        names, _, meaning = entry.partition(": ")
+        found.update(dict.fromkeys(names.split(", "), " ".join(meaning.split())))
+    return " ".join(text.split()), found
+
+
+def _records() -> dict[str, type[Record]]:
+    """Every declared record by its name."""
+    found, kinds = {}, [Record]
+    while kinds:
+        kinds += (kind := kinds.pop()).__subclasses__()
+        found[kind.__name__] = kind
+    return found
+
+
+def _alike(schema: Any) -> Any:
+    """A schema in which the items of a list of fixed length are said once, where all are of one type."""
+    if isinstance(schema, list):
+        return [_alike(inner) for inner in schema]
+    if not isinstance(schema, dict):
+        return schema
+    found = {key: _alike(inner) for key, inner in schema.items()}
+    items = found.get("prefixItems")
+    if not items or any(item != items[0] for item in items):
+        return found
+    del found["prefixItems"]
+    return found | {"items": items[0]}
+
+
+def _described(kind: type[Record], component: dict[str, Any]) -> dict[str, Any]:
+    """What the declaration says of a record besides the types of its fields."""
+    text, meanings = _meanings(kind)
+    properties = component["properties"]
+    for field in msgspec.structs.fields(kind):
+        if field.name in meanings:
+            properties[field.encode_name] |= {"description": meanings[field.name]}
+    return {"description": text, "required": [*component["required"], *kind.always]}
+
+
+def schema_of(*kinds: type[Record], closed: bool = False, **keys: Any) -> dict[str, Any]:
+    """The JSON schema of a document, as the declarations have it.
 
     Args:
-        kind: dataclass of numbers, texts, flags, arrays, other records, and tuples, dictionaries and None of these.
+        kinds: records whose fields stand side by side in the document.
+        closed: whether it holds no other key.
+        keys: further keys of the document, or what a field of `kinds` is in this one: a record, or a schema.
+    """
+    named = {key: kind for key, kind in keys.items() if isinstance(kind, type)}
+    references, components = msgspec.json.schema_components((*kinds, *named.values()), schema_hook=_array_schema)
+    for name, kind in _records().items():
+        if name in components:
+            components[name] |= _described(kind, components[name])
+    properties: dict[str, Any] = {}
+    required = list(keys)
+    for kind in kinds:
+        component = components.pop(kind.__name__)
+        properties |= component["properties"]
+        required += (key for key in component.get("required", ()) if key not in keys)
+    properties |= keys | dict(zip(named, references[len(kinds) :], strict=True))
+    body = {"type": "object", "properties": properties, "required": required, "$defs": components}
+    return _alike(_lists(body | ({"additionalProperties": False} if closed else {})))
+
+
+@cache
+def _record_schema(kind: type[Record]) -> dict[str, Any]:
+    return schema_of(kind)
+
+
+def _validator(schema: Mapping[str, Any]) -> Draft202012Validator:
+    from jsonschema import Draft202012Validator
+
+    return Draft202012Validator(schema)
+
+
+def _schema_problem(values: object, schema: Mapping[str, Any]) -> tuple[list[str | int], str] | None:
+    """The place that most likely breaks the schema, as keys and list indices, and what is allowed."""
+    from jsonschema.exceptions import best_match
+
+    error = best_match(islice(_validator(schema).iter_errors(values), SCHEMA_PROBLEMS))
+    if error is None:
+        return None
+    place, rule = list(error.absolute_path), error.validator_value
+    if "propertyNames" in error.absolute_schema_path:
+        # jsonschema gives the place of the table whose key is wrong.
+        place.append(error.instance)
+    match error.validator:
+        case "required":
+            return [*place, next(name for name in rule if name not in error.instance)], "this key"
+        case "additionalProperties":
+            known = error.schema.get("properties", {})
+            return [*place, next(name for name in error.instance if name not in known)], "no such key"
+        case "type":
+            return place, rule if isinstance(rule, str) else " or ".join(rule)
+        case "const":
+            return place, shown(rule)
+        case "enum":
+            return place, " or ".join(map(shown, rule))
+        case other:
+            return place, f"{other} {shown(rule)}"
+
+
+def _unfit_value(value: object, place: tuple[str, ...] = ()) -> tuple[tuple[str, ...], str] | None:
+    """The place of a text that cannot be printed or of a number that is not finite, and what is allowed there."""
+    if isinstance(value, str):
+        if len(value) > TEXT_CHARS_MAX or not all(c.isprintable() or c in "\n\t" for c in value):
+            return place, "printable text"
+    elif isinstance(value, float):
+        if not math.isfinite(value):
+            return place, "a finite number"
+    elif isinstance(value, dict):
+        return next(filter(None, (_unfit_value(inner, (*place, key)) for key, inner in value.items())), None)
+    elif isinstance(value, list):
+        return next(filter(None, (_unfit_value(inner, place) for inner in value)), None)
+    return None
+
+
+def hold_to_schema(keys: Keys, schema: Mapping[str, Any], remedy: str) -> None:
+    """Refuses a document that breaks its schema, or that holds what cannot be printed; by its key.
+
+    Raises:
+        InputError: with the key; an entry of a list is named by the key of the list.
+    """
+    problem = _schema_problem(keys.values, schema) or _unfit_value(keys.values)
+    if problem is None:
+        return
+    place, allowed = problem
+    value: object = keys.values
+    for part in place:
+        if isinstance(value, list) and isinstance(part, int):
+            value = value[part]
+        else:
+            value = value.get(str(part), "nothing") if isinstance(value, dict) else "nothing"
+    *path, key = (part for part in place if isinstance(part, str))
+    raise Keys({}, keys.file, keys.text, (*keys.path, *path)).refuse(key, "schema", allowed, remedy, shown(value))
+
+
+def read_record[T: Record](kind: type[T], keys: Keys, remedy: str, *, held: bool = False) -> T:
+    """A record from a table of a document; defaults may be missing.
+
+    Args:
+        kind: of the record.
         keys: the table.
         remedy: what to do where it cannot be read.
+        held: whether the table was held to a schema before.
 
     Raises:
         InputError: a key is missing or of another type, with its name.
     """
+    if not held:
+        hold_to_schema(keys, _record_schema(kind), remedy)
     try:
-        return _of(kind, keys.values, ())
-    except _Unfit as unfit:
-        *path, key = unfit.place or ("",)
-        table = Keys({}, keys.file, keys.text, (*keys.path, *path))
-        raise table.refuse(key, "schema", unfit.allowed, remedy, unfit.found) from unfit
-
-
-@cache
-def _hints(kind: type) -> dict[str, Any]:
-    return get_type_hints(kind)
-
-
-def _of(kind: Any, value: object, place: tuple[str, ...]) -> Any:
-    """The value as the annotation `kind` has it; entries of a list are named by the key of the list."""
-    origin, inner = get_origin(kind), get_args(kind)
-    if origin is UnionType:
-        return None if value is None and NoneType in inner else _of(inner[0], value, place)
-    if origin is tuple:
-        if not isinstance(value, list):
-            raise _Unfit(place, "a list", shown(value))
-        kinds: Iterable[Any] = repeat(inner[0], len(value)) if inner[-1] is Ellipsis else inner
-        if inner[-1] is not Ellipsis and len(value) != len(inner):
-            raise _Unfit(place, f"a list of {len(inner)}", shown(value))
-        return tuple(_of(k, v, place) for k, v in zip(kinds, value, strict=True))
-    if kind is np.ndarray:
-        try:
-            array = np.array(value, dtype=float)
-        except (TypeError, ValueError):
-            array = np.array(np.nan)
-        if not np.all(np.isfinite(array)):
-            raise _Unfit(place, "finite numbers of one shape", shown(value))
-        return array
-    if is_dataclass(kind) or origin is dict:
-        if not isinstance(value, dict):
-            raise _Unfit(place, "a table", shown(value))
-        if origin is dict:
-            return {key: _of(inner[1], v, (*place, key)) for key, v in value.items()}
-        found = {}
-        for field in fields(kind):
-            if field.name in value:
-                found[field.name] = _of(_hints(kind)[field.name], value[field.name], (*place, field.name))
-            elif field.default is MISSING and field.default_factory is MISSING:
-                raise _Unfit((*place, field.name), "this key", "nothing")
-        return kind(**found)
-    if not _is_a(kind, value):
-        raise _Unfit(place, _KINDS[kind], shown(value))
-    return value
-
-
-def _is_a(kind: type, value: object) -> bool:
-    """Whether a plain value is of a plain type; booleans are no numbers, whole numbers are."""
-    if isinstance(value, bool):
-        return kind is bool
-    if isinstance(value, str):
-        return kind is str and len(value) <= TEXT_CHARS_MAX and all(c.isprintable() or c in "\n\t" for c in value)
-    if kind is int:
-        return isinstance(value, int)
-    return kind is float and isinstance(value, int | float) and math.isfinite(value)
+        return msgspec.convert(keys.values, kind, dec_hook=_decoded)
+    except msgspec.ValidationError as error:
+        # What JSON schema does not tell apart: 3.0 for a whole number, rows of an array that differ in length.
+        message, _, place = str(error).partition(" - at ")
+        *path, key = re.findall(r"\.(\w+)", place) or [""]
+        raise Keys({}, keys.file, keys.text, (*keys.path, *path)).refuse(key, "schema", message, remedy, "") from error
 
 
 def stored_document(campaign: HasFolder, name: str, formats: tuple[str, ...], inputs: Mapping[str, str]) -> Keys | None:

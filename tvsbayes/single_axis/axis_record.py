@@ -5,16 +5,28 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated, Any
 
 import numpy as np
+from msgspec import Meta
 
 from tvsbayes.display import Shown, View
 from tvsbayes.errors import NothingToEstimate, TvsError, escaped, listed, refusal
 from tvsbayes.files.disk import RESULTS_BYTES_MAX, make_folder, read_arrays, write_atomically
 from tvsbayes.progress import Show
 from tvsbayes.results.estimates import CONTRACTION_LIMIT, Estimate
-from tvsbayes.results.fit_record import provenance
-from tvsbayes.results.records import plain, read_record, stored_document
+from tvsbayes.results.fit_record import Provenance, Sha256, provenance
+from tvsbayes.results.records import (
+    Count,
+    EstimatorName,
+    NotNegative,
+    Record,
+    Tier,
+    plain,
+    read_record,
+    schema_of,
+    stored_document,
+)
 from tvsbayes.single_axis.axis_campaign import AxisCampaign, axis_hashes
 from tvsbayes.single_axis.axis_conflicts import conflict_text
 from tvsbayes.single_axis.axis_doubts import data_doubts
@@ -25,6 +37,7 @@ from tvsbayes.single_axis.classic_line import ClassicAxis, classic_axis
 from tvsbayes.statistics.intervals import NORMAL_95
 
 AXIS_FIT_FORMAT = "tvsbayes-axis-fit/1"
+type BothSides[T] = Annotated[dict[str, T], Meta(extra_json_schema={"required": ("forward", "backward")})]
 POSITIONS_FEW = 5
 """Below it a process of position is mostly its prior."""
 REVERSED = 0.975
@@ -33,27 +46,29 @@ TAILS_PERCENT = (2.5, 97.5)
 POSITIONS_LISTED = 400
 
 
-@dataclass(frozen=True)
-class PositionDeviation:
+class PositionDeviation(Record, frozen=True):
     """What the axis does at a position, off the line through the stops: the error that repeats, drift and play apart.
 
-    `position` is a command; `value` and the rest in the folder's unit.
+    Attributes:
+        position: a command.
+        value, sd, interval95: in the folder's unit.
     """
 
     position: float
     value: float
-    sd: float
+    sd: NotNegative
     interval95: tuple[float, float]
 
 
-@dataclass(frozen=True, repr=False)
-class AxisSummary(Shown):
+class AxisSummary(Shown, Record, frozen=True):
     """A fit in the terms of `fit.json`.
 
     Attributes:
         unit: of everything but commands, hours and shares.
-        estimator: "laplace" or "posterior"; `tier` "importance", "emcee" or None.
-        converged: whether the intervals may be used; `problems` why not.
+        estimator: "laplace" or "posterior".
+        tier: what made a posterior's draws, "importance" or "emcee"; None of a Laplace approximation.
+        converged: whether the intervals may be used.
+        problems: why not.
         per_command: ratio by direction, "forward" and "backward"; it holds beyond the range read.
         effective_per_command: slope of the least-squares line through the positions read, by direction.
         range_command: least and largest command read; `effective_per_command` belongs to it.
@@ -67,19 +82,19 @@ class AxisSummary(Shown):
     """
 
     unit: str
-    estimator: str
-    tier: str | None
+    estimator: EstimatorName
+    tier: Tier | None
     converged: bool
     problems: tuple[str, ...]
-    per_command: dict[str, Estimate]
-    effective_per_command: dict[str, Estimate]
+    per_command: BothSides[Estimate]
+    effective_per_command: BothSides[Estimate]
     range_command: tuple[float, float]
     parameters: dict[str, Estimate]
     deviations: tuple[PositionDeviation, ...]
     classic: ClassicAxis
-    moves: int
-    readings: int
-    positions: int
+    moves: Count
+    readings: Count
+    positions: Count
     weak_directions: tuple[str, ...]
     warnings: tuple[str, ...]
     sampling: dict[str, float | int | None]
@@ -98,9 +113,18 @@ class AxisSummary(Shown):
         title = f"AxisSummary in {self.unit}, {self.estimator}, {state}"
         return View(title, ("quantity", "value", "sd", "2.5 %", "97.5 %", "told by the data, %"), rows)
 
-    def as_json(self) -> dict[str, object]:
-        """Plain types."""
-        return plain(self)
+
+class AxisInputs(Record, frozen=True):
+    """SHA-256 of what a fit depends on."""
+
+    moves: Sha256
+    readings: Sha256
+    axis: Sha256
+
+
+def axis_fit_schema() -> dict[str, Any]:
+    """The JSON schema of `results/fit.json` in an axis folder."""
+    return schema_of(AxisSummary, Provenance, format={"const": AXIS_FIT_FORMAT}, inputs=AxisInputs)
 
 
 def _estimate(

@@ -9,15 +9,16 @@ import numpy as np
 from tvsbayes.display import Shown, View
 from tvsbayes.metrology.iso230 import RUNS_MIN, figures_of
 from tvsbayes.results.metrology_tables import FIGURES, Positioning
+from tvsbayes.results.records import Record
 from tvsbayes.single_axis.axis_rows import AxisRows, line_design
 
 
-@dataclass(frozen=True, repr=False)
-class ClassicAxis(Shown):
+class ClassicAxis(Shown, Record, frozen=True):
     """The least-squares line with one reversal and independent stops, and the ISO 230-2 table.
 
     Attributes:
-        per_command, u_per_command: slope and its standard error.
+        per_command: slope.
+        u_per_command: its standard error.
         backlash, u_backlash: of the reversal; None where stops were reached from one side.
         residual_sd: of the rows about it.
         iso230: figures by name; None where positions were not read twice from both sides.
