@@ -17,7 +17,7 @@ from tvsbayes.estimators import likelihood as density
 from tvsbayes.estimators.campaign_arrays import bucket, campaign_arrays, spot_constants
 from tvsbayes.estimators.likelihood import no_draw
 from tvsbayes.instrument.campaign import ordered_spots
-from tvsbayes.instrument.parameters import INDEX, NAMES, RIG_NAMES
+from tvsbayes.instrument.parameters import INDEX, LOOK_SCATTER_NAMES, NAMES, RIG_NAMES
 from tvsbayes.instrument.stereo_pair import rotation_matrix
 from tvsbayes.model.compiled import BATCH
 from tvsbayes.model.parameter_space import parameter_space
@@ -66,6 +66,18 @@ def test_filter_equals_dense_gaussian(dozen, evaluate, offset_sds):
     dense = dense_log_density(dozen.campaign, evaluated)
     # Rounding of a chi2 of 1e6 at one prior sd is 1e-10 per operation.
     assert evaluated.innovations.log_density == pytest.approx(dense, abs=FINE_UNIT, rel=1e-12)
+
+
+@pytest.mark.parametrize("coordinates", [(1.0, -0.5), (3.0, -8.0), (-8.0, 6.0)])
+def test_looks_that_scatter_equal_a_dense_gaussian(dozen, evaluate, coordinates):
+    """Of either axis, of both, and of one alone."""
+    z = random_points(dozen, 1, 0.3)[0]
+    z[[INDEX[name] for name in LOOK_SCATTER_NAMES]] = coordinates
+    evaluated = evaluate(z, dozen.space, dozen.arrays)
+    dense = dense_log_density(dozen.campaign, evaluated)
+    assert evaluated.innovations.log_density == pytest.approx(dense, abs=FINE_UNIT, rel=1e-12)
+    without = evaluate(np.where(np.isin(NAMES, LOOK_SCATTER_NAMES), -36.0, z), dozen.space, dozen.arrays)
+    assert abs(without.innovations.log_density - dense) > LOG_UNIT, "scatter changes nothing here"
 
 
 @pytest.mark.parametrize("size", [4, 20])

@@ -69,7 +69,7 @@ class SpotDeviations:
 
     Attributes:
         deviation_rad: shape (spots, 2).
-        covariance_rad2: of the pixel noise, shape (spots, 2, 2).
+        covariance_rad2: of the pixel noise and the scatter of looks, shape (spots, 2, 2).
     """
 
     deviation_rad: np.ndarray
@@ -95,12 +95,13 @@ def linearise(
     found = standing(model, arrays, inflation)
     looks, terms = found.looks, found.terms
     by_coordinates = look_jacobian(z, physical, space, looks, arrays)
-    residuals = terms.range_out.of_many(found.noise.whitened(by_coordinates, arrays.spots))[1:]
-    slope = jnp.stack([jnp.stack(terms.by_pan, axis=1), jnp.stack(terms.by_tilt, axis=1)], axis=2)
+    unit_noise = found.to_states.in_place
+    residuals = unit_noise(terms.range_out.of_many(found.noise.whitened(by_coordinates, arrays.spots))[1:])
+    slope = jnp.stack([jnp.stack(unit_noise(own), axis=1) for own in (terms.by_pan, terms.by_tilt)], axis=2)
     root = root_at_places(model, arrays.gears)
     return Linearised(
         z=z,
-        residual=jnp.stack(terms.residual, axis=1),
+        residual=jnp.stack(unit_noise(terms.residual), axis=1),
         slope=slope,
         play_sd_rad=found.play_sd_rad,
         mirror_angles_rad=jnp.stack([looks.pan_rad, looks.tilt_rad], axis=1),
