@@ -68,8 +68,7 @@ def test_only_two_components_see_the_mirror_angles():
 
 
 def test_looks_that_scatter_have_unit_noise_in_both_components():
-    """Squares of what is seen are the quadratic form of R = 1 + slopes diag(variances) slopes^T, its log determinant is
-    stated, and so in the four components."""
+    """Squares are the quadratic form of 1 + slopes diag(variances) slopes^T, whose log determinant is stated."""
     by_pan, by_tilt, residual = drawn(4, 5), drawn(4, 6), drawn(4, 7)
     variance = np.random.default_rng(12).exponential(3.0, (40, 2))
     with jax.enable_x64(True):

@@ -46,7 +46,7 @@ def drift_variances(drift_rad_per_root_hour: Float[Array, "2"], spots: SpotArray
 
 
 def scatter_variances(scatter_rad: Float[Array, "2"], spots: SpotArrays) -> Float[Array, "spots 2"]:
-    """Variance of the beam's angles (pan, tilt) at each look about where the axes stand; robust weights make it larger."""
+    """Variance of the beam's angles (pan, tilt) at each look about where the axes stand; robust weights enlarge it."""
     return scatter_rad**2 / spots.weight[:, None]
 
 
@@ -157,6 +157,7 @@ class Standing(eqx.Module):
     play_sd_rad: Float[Array, "spots 2"]
     stop_variance: Float[Array, "spots 2"]
     drift_variance: Float[Array, "spots 2"]
+    scatter_variance: Float[Array, "spots 2"]
     to_states: ToStates
 
 
@@ -171,7 +172,7 @@ def standing(
     angles = mirror_angles(model.transmission, model.tilt_zero_rad, arrays.moves) if angles is None else angles
     pan, tilt = (angles.angle_rad[:, axis][spots.move_index] for axis in range(2))
     looks = looks_at(model, pan, tilt, arrays)
-    noise = noise_scales(model, spots, inflation)
+    noise, scattered = noise_scales(model, spots, inflation), scatter_variances(model.noise.look_scatter_rad, spots)
     terms = spot_residuals(looks, noise, model, spots)
     return Standing(
         looks,
@@ -180,7 +181,8 @@ def standing(
         angles.play_sd_rad[spots.move_index],
         stop_variances(model.noise.stop_sd_rad, spots),
         drift_variances(jnp.asarray(model.gears.drift_rad_per_root_hour), spots),
-        ToStates.of(terms.by_pan, terms.by_tilt, scatter_variances(model.noise.look_scatter_rad, spots)),
+        scattered,
+        ToStates.of(terms.by_pan, terms.by_tilt, scattered),
     )
 
 

@@ -29,6 +29,7 @@ from tvsbayes.model.parameter_space import ParameterSpace, model_of
 class Linearised(eqx.Module):
     """The campaign linearised at coordinates `z`; first axis of the Jacobians is the spot.
 
+    Residuals, slopes and what follows from them are in units of the noise of a look, its scatter included.
     `place_columns` is d(predicted)/d(errors at places, rad), `place_root` the factor of their prior covariance.
     """
 
@@ -40,6 +41,7 @@ class Linearised(eqx.Module):
     predicted: Float[Array | np.ndarray, "spots 5"]
     stop_variance: Float[Array | np.ndarray, "spots 2"]
     drift_variance: Float[Array | np.ndarray, "spots 2"]
+    scatter_variance: Float[Array | np.ndarray, "spots 2"]
     place_columns: Float[Array | np.ndarray, "spots 4 errors"]
     place_root: Float[Array | np.ndarray, "errors errors"]
     residual_jacobian: Float[Array | np.ndarray, "spots 4 parameters"]
@@ -108,6 +110,7 @@ def linearise(
         predicted=jnp.stack(looks.predicted, axis=1),
         stop_variance=found.stop_variance,
         drift_variance=found.drift_variance,
+        scatter_variance=found.scatter_variance,
         place_columns=place_columns(slope, arrays.gears),
         place_root=root,
         residual_jacobian=-jnp.stack(residuals).transpose(2, 0, 1),

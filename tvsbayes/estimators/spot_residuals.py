@@ -144,9 +144,7 @@ class ToStates(eqx.Module):
     spread: Numbers
 
     @classmethod
-    def of(
-        cls, by_pan: Numbers, by_tilt: Numbers, scatter_variance: Float[Array, "spots 2"] | None = None
-    ) -> ToStates:
+    def of(cls, by_pan: Numbers, by_tilt: Numbers, scatter_variance: Float[Array, "spots 2"] | None = None) -> ToStates:
         """The directions of looks that move so with pan and tilt, whose angles scatter by these variances (rad^2)."""
         first, pan_load = _unit(by_pan)
         tilt_load = _dot(first, by_tilt)

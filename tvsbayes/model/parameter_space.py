@@ -60,7 +60,7 @@ class Receiver(eqx.Module):
 
 
 class Noise(eqx.Module):
-    """Standard deviations of stops by [axis, (right/down, left/up)], of single looks by axis; factor on the pixel sds."""
+    """Standard deviations of stops by [axis, (right/down, left/up)] and of looks by axis; factor on the pixel sds."""
 
     stop_sd_rad: Float[Array, "2 2"]
     look_scatter_rad: Float[Array, "2"]
