@@ -63,7 +63,7 @@ def errors_deg(dozen):
     physical = np.ones((DRAWS, len(NAMES)))
     for name, sd in SDS_DEG.items():
         physical[:, INDEX[f"stop_sd_deg.{name}"]] = sd
-    for name in ("pixel_scale", *names_of("drift_deg_per_root_hour")):
+    for name in ("pixel_scale", *names_of("drift_deg_per_root_hour", "look_scatter_deg")):
         physical[:, INDEX[name]] = 0.0
     caught = []
 

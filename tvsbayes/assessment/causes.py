@@ -186,13 +186,14 @@ def _noise_causes(fit: JointFit, told: _Told, quantities: tuple[str, ...], sprea
     def stop_freedom(quantity: str) -> float:
         return freedom(f"stop_sd_deg.{d}" for d in SENSES[axis_of(quantity)] if d in moved)
 
+    def look_freedom(quantity: str) -> float:
+        # A scale that may be 0 has no logarithm: by its relative sd.
+        sds = physical[:, INDEX[f"look_scatter_deg.{axis_of(quantity)}"]]
+        return 0.5 * (float(np.mean(sds)) / float(np.std(sds))) ** 2 if np.ptp(sds) > 0 else np.inf
+
     return [
         _Cause(told.pixels, root(told.by_pixels), freedom(["pixel_scale"]) * every),
-        _Cause(
-            LOOK_SCATTER,
-            root(told.by_looks),
-            np.array([freedom([f"look_scatter_deg.{axis_of(q)}"]) for q in quantities]),
-        ),
+        _Cause(LOOK_SCATTER, root(told.by_looks), np.array([look_freedom(q) for q in quantities])),
         _Cause(STOP_ERRORS, root(told.by_stops), np.array([stop_freedom(q) for q in quantities])),
         *(
             _Cause(name, np.linalg.norm(spread[:, told.groups[name]], axis=1), np.inf * every)
