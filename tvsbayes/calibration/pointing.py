@@ -58,12 +58,15 @@ NOISES = len(UNIT_NOISES)
 
 
 def noise_of_a_look(values: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Sds by `NOISE_NAMES`, last axis, from parameters by name: a robot looks once at a stop, and meets both errors."""
+    """Sds by `NOISE_NAMES`, last axis, from parameters by name: a robot looks once at a stop, and meets both errors.
+
+    Without a scatter of looks among them, as in results before 0.3.0, there is none.
+    """
     found = [values[name] for name in NOISE_NAMES]
     for axis, sides in SIDES.items():
         for side in sides:
             place = NOISE_NAMES.index(f"stop_sd_deg.{side}")
-            found[place] = np.hypot(found[place], values[f"look_scatter_deg.{axis}"])
+            found[place] = np.hypot(found[place], values.get(f"look_scatter_deg.{axis}", 0.0))
     return np.stack(found, axis=-1)
 
 
