@@ -129,8 +129,8 @@ def check_same(before: Mapping[str, object], rig: Rig, plan: Sequence[PlanStep],
 def _check_earlier(before: Mapping[str, object], rig: Rig) -> None:
     """The same of a journal that knows its rig by one SHA-256 only, port and cameras included."""
     tables = json.dumps([rig.sheets_mm, rig.positioner, rig.cameras], sort_keys=True)
-    # The errors of the gears and the scatter of looks came later, with defaults.
-    later = tuple(f'"{name}" = ' for name in (*GEAR_ERROR_NAMES, *LOOK_SCATTER_NAMES))
+    # The errors of the gears came later, with defaults.
+    later = tuple(f'"{name}" = ' for name in GEAR_ERROR_NAMES)
     lines = rig_table_toml(rig.table).splitlines(keepends=True)
     known = "".join(line for line in lines if not line.startswith(later))
     content = known.encode() + stereo_bytes(rig.stereo) + tables.encode()
