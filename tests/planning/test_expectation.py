@@ -85,7 +85,7 @@ def test_looks_that_scatter_tell_a_plan_less(knowledge):
             if name.startswith("stop_sd_deg"):
                 z[index] = np.log(stop_deg / float(space.value[index])) / float(space.u[index])
             if name.startswith("look_scatter_deg"):
-                z[index] = half_normal_coordinate(np.array(scatter_deg / float(space.u[index])))
+                z[[index]] = half_normal_coordinate(np.array([scatter_deg / float(space.u[index])]))
         told[stop_deg, scatter_deg] = information_of(plan.steps, knowledge, z=z).fisher
     both, sum_alone, less = told[0.03, 0.04], told[0.05, 0.0], told[0.03, 0.0]
     np.testing.assert_allclose(both, sum_alone, atol=1e-9 * np.abs(sum_alone).max())

@@ -293,10 +293,6 @@ class FitSummary(Shown):
         """Whether the data informed any effective ratio."""
         return any(e is not None and e.informed for e in self.effective.values())
 
-    def _scatter_deg(self, axis: str) -> float:
-        found = self.parameters.get(f"look_scatter_deg.{axis}")
-        return 0.0 if found is None else found.value
-
     def as_json(self) -> dict[str, object]:
         """The contract's keys, without those that the caller adds (`files`)."""
         values = plain(replace(self, curves=None))
@@ -305,8 +301,10 @@ class FitSummary(Shown):
             "dof": values.pop("dof"),
             "pixel_scale": self.parameters["pixel_scale"].value,
             "stop_sd_deg": {d: self.parameters[f"stop_sd_deg.{d}"].value for d in DIRECTIONS},
-            "look_scatter_deg": {axis: self._scatter_deg(axis) for axis in AXES},
         }
+        names = {axis: f"look_scatter_deg.{axis}" for axis in AXES}
+        scatter = {axis: self.parameters[name].value for axis, name in names.items() if name in self.parameters}
+        noise |= {"look_scatter_deg": scatter} if scatter else {}
         values |= {"noise": noise, "curves": None if self.curves is None else self.curves.as_json()}
         return {key: values[KEPT_AS.get(key, key)] for key in SUMMARY_KEYS}
 
