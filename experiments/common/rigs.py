@@ -9,6 +9,7 @@ import numpy as np
 
 from tvsbayes.files.disk import shipped_data
 from tvsbayes.instrument.campaign import Campaign, Spot, read_campaign
+from tvsbayes.instrument.parameters import LOOK_SCATTER_NAMES
 from tvsbayes.instrument.plan import PlanStep, read_plan
 from tvsbayes.instrument.rig import Rig, read_rig
 from tvsbayes.twin.simulated_campaign import SimulatedCampaign
@@ -26,6 +27,12 @@ CROSSING = 100, -20
 def mounted_rig() -> Rig:
     """The shipped rig whose extrinsics are known to 0.03 rad and 5 mm."""
     return read_rig(shipped_data() / "rigs" / "mounted" / "rig.toml")
+
+
+def drawn_rig() -> Rig:
+    """The same, of whose true rigs the looks scatter as well: drawn from every prior that their fits have."""
+    rig = mounted_rig()
+    return replace(rig, truth={**rig.truth, **{name: rig.table.priors[name] for name in LOOK_SCATTER_NAMES}})
 
 
 def shipped_plan(protocol: str) -> tuple[PlanStep, ...]:

@@ -31,7 +31,7 @@ from experiments.common.headlines import (
     true_headlines,
     verdict,
 )
-from experiments.common.rigs import mounted_rig, shipped_plan, unseen
+from experiments.common.rigs import drawn_rig, shipped_plan, unseen
 from experiments.common.rows import output, read_rows, run_rows
 from tvsbayes.estimators.four_point import classic
 from tvsbayes.estimators.joint_fit import fit
@@ -47,7 +47,7 @@ def one_rig(task: tuple[str, int]) -> dict[str, object]:
     """Simulate and refit one rig; whatever fails is recorded as a failure, never dropped."""
     protocol, seed = task
     compile_for(96)
-    simulated = simulate(mounted_rig(), shipped_plan(protocol), seed, aperture=protocol == "grid")
+    simulated = simulate(drawn_rig(), shipped_plan(protocol), seed, aperture=protocol == "grid")
     campaign, truth = simulated.campaign, simulated.truth
     row: dict[str, object] = {"protocol": protocol, "seed": seed, "unseen": unseen(campaign)}
     start = time.perf_counter()

@@ -36,7 +36,7 @@ from experiments.common.headlines import (
     true_headlines,
     verdict,
 )
-from experiments.common.rigs import mounted_rig, shipped_plan, unseen
+from experiments.common.rigs import drawn_rig, shipped_plan, unseen
 from experiments.common.rows import output, read_rows, run_rows
 from experiments.common.uniformity import DRAWS
 from experiments.intervals.sbc import CLEAN, FEW
@@ -67,7 +67,7 @@ def one_rig(task: tuple[str, str, int]) -> dict[str, object]:
     """One rig of a shipped protocol, by Laplace and by a tier; whatever fails is recorded as a failure."""
     tier, protocol, seed = task
     compile_for(SMALLEST_BUCKET)
-    simulated = simulate(mounted_rig(), shipped_plan(protocol), seed, aperture=protocol == "grid")
+    simulated = simulate(drawn_rig(), shipped_plan(protocol), seed, aperture=protocol == "grid")
     row: dict[str, object] = {"tier": tier, "protocol": protocol, "seed": seed, "converged": False, "sampled": False}
     row["unseen"] = unseen(simulated.campaign)
     start = time.process_time()

@@ -17,11 +17,12 @@ from tvsbayes.acquisition.journal import LOG, read_journal
 from tvsbayes.acquisition.journal_check import verify
 from tvsbayes.acquisition.recorder import recorded
 from tvsbayes.acquisition.replanning import check_plan
-from tvsbayes.acquisition.run_identity import setup_changes, setup_entries
+from tvsbayes.acquisition.run_identity import check_same, identity, setup_changes, setup_entries
 from tvsbayes.acquisition.session import acquire, begin
 from tvsbayes.cli.main import run
 from tvsbayes.errors import InputError
 from tvsbayes.instrument.campaign import read_campaign
+from tvsbayes.instrument.parameters import Prior
 from tvsbayes.instrument.plan import outline, write_plan
 
 pytestmark = pytest.mark.usefixtures("ctrl_c_works")
@@ -53,6 +54,19 @@ def test_resume_with_another_plan_rig_or_seed_is_refused(mounted_rig, tmp_path):
     begin(folder, mounted_rig, plan, True, HEADER).close()
     with pytest.raises(InputError, match="no journal"):
         acquire(mounted_rig, plan, tmp_path / "nowhere", simulate=True, resume=True)
+
+
+def test_a_run_begun_before_looks_scattered_goes_on(mounted_rig):
+    """Its journal says nothing of them; a scatter stated since then is another rig."""
+    plan, header = small_plan(), {"synthetic": True, "seed": 5}
+    before = {**identity(mounted_rig, plan, True), **header}
+    before["rig"] = {key: value for key, value in before["rig"].items() if "look_scatter" not in key}
+    check_same(before, mounted_rig, plan, header)
+    name, wide = "look_scatter_deg.pan", Prior(0.0, 0.02, "half-normal")
+    table = replace(mounted_rig.table, priors={**mounted_rig.table.priors, name: wide})
+    for other in (replace(mounted_rig, table=table), replace(mounted_rig, truth={**mounted_rig.truth, name: wide})):
+        with pytest.raises(InputError, match="another rig"):
+            check_same(before, other, plan, header)
 
 
 def stopped_run(rig, folder, plan) -> None:

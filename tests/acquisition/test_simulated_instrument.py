@@ -18,6 +18,7 @@ from tvsbayes.acquisition.simulated_instrument import Instrument
 from tvsbayes.instrument.axes import AXES, HOME_SD_DEG
 from tvsbayes.instrument.campaign import read_campaign
 from tvsbayes.instrument.parameters import Prior
+from tvsbayes.twin.physics import mirror_chain
 from tvsbayes.twin.simulated_campaign import simulate
 from tvsbayes.twin.true_rig import draw_truth
 
@@ -57,6 +58,29 @@ def test_light_behind_the_device_is_that_of_the_twin(mounted_rig, tmp_path, monk
     ours, theirs = ([[getattr(s, n) for n in names] for s in c.spots] for c in (found, wanted))
     # Motion by motion against commanded counters: the same angles to rounding, 1e-12 rad x 1000 px.
     assert np.abs(np.subtract(ours, theirs)).max() < 1e-8
+
+
+def test_a_look_lasts_from_laser_on_to_laser_off(mounted_rig):
+    """All frames of a look see one beam, the next look at the same stop another: by 0.05 deg of pan, over 200 looks."""
+    truth = draw_truth(mounted_rig, np.random.default_rng(4))
+    truth = replace(truth, parameters={**truth.parameters, "look_scatter_deg.pan": 0.05})
+    instrument = Instrument(mounted_rig, 6, truth=truth)
+    positioner = instrument.positioner()
+    positioner.home()
+    positioner.move_to(0, 0)
+    directions = []
+    for _ in range(200):
+        positioner.laser(True)
+        first, second = instrument.light().directions, instrument.light().directions
+        assert np.array_equal(first, second)
+        directions.append(first)
+        positioner.laser(False)
+    psi, beta = np.radians(instrument.state_deg()["mirror_angles_deg"])
+    one, two = (mirror_chain(psi + step, beta, truth.parameters)[1] for step in (0.0, 1e-6))
+    expected = np.radians(0.05) * np.linalg.norm(two - one) / 1e-6
+    off = np.linalg.norm(np.array(directions) - np.mean(directions, axis=0), axis=1)
+    # Four standard errors of an sd of 200.
+    assert np.sqrt(np.mean(off**2)) == pytest.approx(expected, rel=4 / np.sqrt(400))
 
 
 def test_zero_drifts_with_the_clock_and_a_homing_finds_it(mounted_rig):

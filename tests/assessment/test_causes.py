@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import copy
 import json
 import math
 from dataclasses import replace
 from types import SimpleNamespace
 
+import equinox as eqx
 import numpy as np
 import pytest
 from support.linear_fit import ROWS, fit_of, linear_problem, refitted, slope_of
@@ -72,6 +74,27 @@ def test_headline_causes_are_what_refitting_shows(linear_fit):
     # They add up to the variance: nothing is forgotten, nothing counted twice.
     total = np.einsum("qi,ij,qj->q", gradient, fit.covariance, gradient)
     np.testing.assert_allclose((causes.contribution**2).sum(axis=1), total, rtol=1e-6)
+
+
+def test_the_scatter_of_looks_has_its_share_of_their_noise(linear_fit):
+    """Of unit noise the part b diag(v) b^T, b the slopes: what refitting shows of it, and pixels have the rest."""
+    from tvsbayes.assessment.causes import headline_causes
+
+    fit, gradient, jacobian, load = linear_fit
+    slope = np.asarray(fit.linearised.slope)
+    variance = 0.3 * np.random.default_rng(13).uniform(size=slope.shape[::2]) / np.sum(slope**2, axis=1)
+    shaking = copy.copy(fit)
+    object.__setattr__(shaking, "linearised", eqx.tree_at(lambda x: x.scatter_variance, fit.linearised, variance))
+    plain, found = (
+        dict(zip(causes.names, causes.contribution.T, strict=True)) for causes in map(headline_causes, (fit, shaking))
+    )
+    by_datum = (gradient[[0, 1, 2, 4, 5]] @ refitted(jacobian, load)[0]).reshape(5, *slope.shape[:2])
+    scattered = np.einsum("qni,nia->qna", by_datum, slope * np.sqrt(variance)[:, None])
+    expected = np.sqrt(np.sum(scattered**2, axis=(1, 2)))
+    np.testing.assert_allclose(found["scatter of the campaign's looks"], expected, rtol=1e-6)
+    both = np.hypot(found["pixel noise"], found["scatter of the campaign's looks"])
+    np.testing.assert_allclose(both, plain["pixel noise"], rtol=1e-9)
+    assert "scatter of the campaign's looks" not in plain
 
 
 def test_degrees_of_freedom_follow_from_how_well_the_noise_is_known(linear_fit):

@@ -54,6 +54,16 @@ def test_calibration_of_draws_takes_its_columns():
     assert (play_steps <= least).mean() >= 0.99 > (play_steps <= least - 1).mean()
 
 
+def test_a_look_of_a_robot_has_the_errors_of_a_stop_and_of_a_look():
+    """Hypotenuse of both, draw by draw, each direction with the scatter of its axis; nothing else changes."""
+    campaign, bent = small_campaign(), calibration(draws=50)
+    physical = np.concatenate([bent.inputs, bent.noise, np.full((50, 2), (0.03, 0.04))], axis=1)
+    names = (*INPUT_NAMES, *NOISE_NAMES, "look_scatter_deg.pan", "look_scatter_deg.tilt")
+    one = calibration_of_draws(names, physical, campaign, "laplace", 3, seen_steps(campaign))
+    expected = np.hypot(bent.noise, [0.03, 0.03, 0.04, 0.04, 0.0])
+    np.testing.assert_allclose(one.noise, expected, rtol=ROUNDING)
+
+
 def test_a_stated_variance_comes_out_as_stated():
     """0.02 deg in every draw is 0.0004 deg2 in the export, not 0.000399999999999972: the sum over draws is exact."""
     campaign, bent = small_campaign(), calibration(draws=4096)

@@ -17,10 +17,10 @@ from tvsbayes.estimators import likelihood as density
 from tvsbayes.estimators.campaign_arrays import bucket, campaign_arrays, spot_constants
 from tvsbayes.estimators.likelihood import no_draw
 from tvsbayes.instrument.campaign import ordered_spots
-from tvsbayes.instrument.parameters import INDEX, NAMES, RIG_NAMES
+from tvsbayes.instrument.parameters import INDEX, LOOK_SCATTER_NAMES, NAMES, RIG_NAMES
 from tvsbayes.instrument.stereo_pair import rotation_matrix
 from tvsbayes.model.compiled import BATCH
-from tvsbayes.model.parameter_space import parameter_space
+from tvsbayes.model.parameter_space import half_normal_coordinate, parameter_space
 from tvsbayes.twin.physics import aperture_angle_deg, mirror_chain, project, to_tvs
 
 pytestmark = pytest.mark.usefixtures("x64")
@@ -66,6 +66,39 @@ def test_filter_equals_dense_gaussian(dozen, evaluate, offset_sds):
     dense = dense_log_density(dozen.campaign, evaluated)
     # Rounding of a chi2 of 1e6 at one prior sd is 1e-10 per operation.
     assert evaluated.innovations.log_density == pytest.approx(dense, abs=FINE_UNIT, rel=1e-12)
+
+
+@pytest.mark.parametrize("coordinates", [(1.0, -0.5), (3.0, -8.0), (-8.0, 6.0)])
+def test_looks_that_scatter_equal_a_dense_gaussian(dozen, evaluate, coordinates):
+    """Of either axis, of both, and of one alone."""
+    z = random_points(dozen, 1, 0.3)[0]
+    z[[INDEX[name] for name in LOOK_SCATTER_NAMES]] = coordinates
+    evaluated = evaluate(z, dozen.space, dozen.arrays)
+    dense = dense_log_density(dozen.campaign, evaluated)
+    assert evaluated.innovations.log_density == pytest.approx(dense, abs=FINE_UNIT, rel=1e-12)
+    without = evaluate(np.where(np.isin(NAMES, LOOK_SCATTER_NAMES), -36.0, z), dozen.space, dozen.arrays)
+    assert abs(without.innovations.log_density - dense) > LOG_UNIT, "scatter changes nothing here"
+
+
+def test_of_stops_looked_at_once_the_sum_of_both_scatters_is_known(dozen, evaluate):
+    """Every look with a stop error of its own: only the sum of the variances acts, however it is shared out."""
+    shape = dozen.arrays.spots.redraw.shape
+    once = eqx.tree_at(
+        lambda a: (a.spots.redraw, a.spots.redraw_mix),
+        dozen.arrays,
+        (jnp.ones(shape, bool), jnp.full((*shape, 2), 0.5)),
+    )
+    index, stops = [INDEX[name] for name in LOOK_SCATTER_NAMES], [INDEX[n] for n in NAMES if n.startswith("stop_sd")]
+    found = []
+    for scatter_deg in (1e-9, 0.005, 0.02):
+        z = dozen.z.copy()
+        z[index] = half_normal_coordinate(np.full(2, scatter_deg / 0.01))
+        left = np.sqrt(0.03**2 - scatter_deg**2)
+        z[stops] = np.log(left / dozen.space.value[jnp.array(stops)]) / dozen.space.u[jnp.array(stops)]
+        found.append(float(evaluate(z, dozen.space, once).innovations.log_density))
+    assert found[1:] == pytest.approx(found[:1] * 2, abs=FINE_UNIT, rel=1e-12)
+    shared = float(evaluate(z, dozen.space, dozen.arrays).innovations.log_density)
+    assert abs(shared - found[0]) > LOG_UNIT, "of stops looked at twice the shares are told"
 
 
 @pytest.mark.parametrize("size", [4, 20])

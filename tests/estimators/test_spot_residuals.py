@@ -67,6 +67,40 @@ def test_only_two_components_see_the_mirror_angles():
     np.testing.assert_allclose(np.sum(turned**2, axis=0), np.sum(residual**2, axis=0), rtol=ROUNDING)
 
 
+def test_looks_that_scatter_have_unit_noise_in_both_components():
+    """Squares are the quadratic form of 1 + slopes diag(variances) slopes^T, whose log determinant is stated."""
+    by_pan, by_tilt, residual = drawn(4, 5), drawn(4, 6), drawn(4, 7)
+    variance = np.random.default_rng(12).exponential(3.0, (40, 2))
+    with jax.enable_x64(True):
+        turn = ToStates.of(numbers(by_pan), numbers(by_tilt), jnp.asarray(variance))
+        pan, tilt, turned = (np.stack(turn.of_many(numbers(v))) for v in (by_pan, by_tilt, residual))
+        in_place = np.stack(turn.in_place(numbers(residual)))
+        slope, log_scale = np.asarray(turn.slope), np.asarray(turn.log_scale)
+    for seen, column in ((pan, 0), (tilt, 1)):
+        np.testing.assert_allclose(seen[:2].T, slope[:, :, column], atol=ROUNDING)
+        np.testing.assert_allclose(seen[2:], 0.0, atol=ROUNDING)
+    for k in range(40):
+        slopes = np.stack([by_pan[:, k], by_tilt[:, k]], axis=1)
+        covariance = np.eye(4) + slopes @ np.diag(variance[k]) @ slopes.T
+        expected = residual[:, k] @ np.linalg.solve(covariance, residual[:, k])
+        # Slopes and variances of order ten lose two digits of the solution.
+        assert np.sum(turned[:, k] ** 2) == pytest.approx(expected, rel=100 * ROUNDING)
+        assert np.sum(in_place[:, k] ** 2) == pytest.approx(expected, rel=100 * ROUNDING)
+        assert log_scale[k] == pytest.approx(-0.5 * np.linalg.slogdet(covariance)[1], rel=100 * ROUNDING)
+
+
+def test_without_scatter_nothing_changes():
+    """Bit for bit."""
+    by_pan, by_tilt, residual = (numbers(drawn(4, seed)) for seed in (5, 6, 7))
+    with jax.enable_x64(True):
+        plain, still = ToStates.of(by_pan, by_tilt), ToStates.of(by_pan, by_tilt, jnp.zeros((40, 2)))
+        for one, two in zip(plain.of_many(residual), still.of_many(residual), strict=True):
+            np.testing.assert_array_equal(one, two)
+        np.testing.assert_array_equal(np.stack(still.in_place(residual)), np.stack(residual))
+        np.testing.assert_array_equal(plain.slope, still.slope)
+        assert not np.any(still.log_scale)
+
+
 def test_whitened_differences_have_the_stated_covariance(dozen):
     """D' C^-1 d of pixels is the squared length after whitening, for correlated centres too."""
     spots = ordered_spots(dozen.campaign)

@@ -69,6 +69,15 @@ def test_rig_table_round_trip():
         assert {name for name in AMPLITUDE_NAMES if f'"{name}"' in rig_table_toml(table)} == own.keys() - {*stated}
 
 
+def test_the_scatter_of_looks_is_written_where_it_is_stated():
+    """At its default a table reads as it did before looks scattered, and so do the hashes of campaigns."""
+    assert "look_scatter" not in rig_table_toml(RigTable(dict(RIG_PRIORS)))
+    for u in (0.0, 0.02):
+        table = RigTable({**RIG_PRIORS, "look_scatter_deg.tilt": Prior(0.0, u, "half-normal")})
+        text = rig_table_toml(table)
+        assert rig_table(text) == table and text.count("look_scatter") == 1
+
+
 def test_periods_in_every_spelling():
     for text, periods in (
         ("30", (30.0,)),

@@ -188,6 +188,7 @@ FIELDS: dict[str, tuple[str, tuple[int, ...], float]] = {
     "stop_sd_deg.right": ("noise.stop_sd_rad", (0, 0), DEG),
     "stop_sd_deg.up": ("noise.stop_sd_rad", (1, 1), DEG),
     "stop_sd_deg.down": ("noise.stop_sd_rad", (1, 0), DEG),
+    **{f"look_scatter_deg.{axis}": ("noise.look_scatter_rad", (i,), DEG) for i, axis in enumerate(("pan", "tilt"))},
     "pixel_scale": ("noise.pixel_scale", (), 1.0),
     "focal_scale": ("cameras.focal_scale", (), 1.0),
     "baseline_mm": ("receiver.baseline_mm", (), 1.0),

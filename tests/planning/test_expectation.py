@@ -10,9 +10,10 @@ from support.coarse_planning import ROUNDING, with_priors
 from support.dozen_spots import dozen_plan
 
 from tvsbayes.instrument.parameters import INDEX, Prior
-from tvsbayes.instrument.plan import PlanStep, run_plan
+from tvsbayes.instrument.plan import PlanBuilder, PlanStep, run_plan
 from tvsbayes.instrument.protocols import four_point_protocol, paper_protocol
 from tvsbayes.model.headlines import QUANTITIES
+from tvsbayes.model.parameter_space import half_normal_coordinate
 from tvsbayes.planning.drawn_rigs import instruments_in
 from tvsbayes.planning.expectation import (
     NOISE_COLUMNS,
@@ -67,6 +68,29 @@ def test_a_plans_information_is_the_fits_own(mounted_rig, knowledge, monkeypatch
     # The spots are triangulated from pixels without noise: linear triangulation is exact to 1e-9 of its point.
     assert np.abs(planned / np.outer(safe, safe) - own / np.outer(safe, safe)).max() < 1e-6
     assert (scale[~NOISE_COLUMNS] > 0).sum() > 40
+
+
+def test_looks_that_scatter_tell_a_plan_less(knowledge):
+    """Every stop looked at once: what a plan tells follows the sum of both variances, and falls with it."""
+    plan = PlanBuilder()
+    plan.home(0, 0)
+    plan.place("d1")
+    for pan, tilt in ((0, 0), (60, 40), (100, -20), (20, 60), (140, 10)):
+        plan.move(pan, tilt)
+        plan.look()
+    told = {}
+    for stop_deg, scatter_deg in ((0.05, 0.0), (0.03, 0.04), (0.03, 0.0)):
+        z, space = knowledge.z.copy(), knowledge.space
+        for name, index in INDEX.items():
+            if name.startswith("stop_sd_deg"):
+                z[index] = np.log(stop_deg / float(space.value[index])) / float(space.u[index])
+            if name.startswith("look_scatter_deg"):
+                z[[index]] = half_normal_coordinate(np.array([scatter_deg / float(space.u[index])]))
+        told[stop_deg, scatter_deg] = information_of(plan.steps, knowledge, z=z).fisher
+    both, sum_alone, less = told[0.03, 0.04], told[0.05, 0.0], told[0.03, 0.0]
+    np.testing.assert_allclose(both, sum_alone, atol=1e-9 * np.abs(sum_alone).max())
+    ratio = INDEX["degrees_per_step.pan"]
+    assert both[ratio, ratio] < 0.9 * less[ratio, ratio]
 
 
 @pytest.mark.parametrize("moves", [256, 257])

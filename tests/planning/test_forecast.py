@@ -51,7 +51,8 @@ def test_the_classics_forecast_is_what_its_experiments_do(mounted_rig, knowledge
     drawn = draw_truth(mounted_rig, np.random.default_rng(3))
     quiet = {"ratio_contrast_deg_per_step.pan": 0.0, "ratio_contrast_deg_per_step.tilt": 0.0, "pixel_scale": 1.5}
     stops = {f"stop_sd_deg.{d}": sd for d, sd in zip(DIRECTIONS, (0.05, 0.02, 0.06, 0.02), strict=True)}
-    parameters = with_derived({**drawn.parameters, **quiet, **stops})
+    looks = {"look_scatter_deg.pan": 0.02, "look_scatter_deg.tilt": 0.01}
+    parameters = with_derived({**drawn.parameters, **quiet, **stops, **looks})
     forecast = classic_forecast(knowledge, instruments_in(knowledge, [Truth(parameters, drawn.stereo)]))
     count, standard_errors = 400, 4.0
     run = simulate(mounted_rig, four_point_protocol(count), 6, Truth(parameters, drawn.stereo))

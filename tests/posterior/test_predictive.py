@@ -63,7 +63,7 @@ def errors_deg(dozen):
     physical = np.ones((DRAWS, len(NAMES)))
     for name, sd in SDS_DEG.items():
         physical[:, INDEX[f"stop_sd_deg.{name}"]] = sd
-    for name in ("pixel_scale", *names_of("drift_deg_per_root_hour")):
+    for name in ("pixel_scale", *names_of("drift_deg_per_root_hour", "look_scatter_deg")):
         physical[:, INDEX[name]] = 0.0
     caught = []
 
@@ -103,6 +103,28 @@ def test_an_error_is_held_while_its_axis_stands(dozen, errors_deg):
             elif not same:
                 assert change > 0
     assert held >= 5
+
+
+def test_looks_taken_again_scatter_about_their_stops(dozen, monkeypatch):
+    """By 0.2 deg of pan and 0.1 of tilt, at every look another; stops, homings and play that err by nothing."""
+    count, caught = len(ordered_spots(dozen.campaign)), []
+
+    def looks(fit, z, error_rad):
+        caught.append(np.degrees(error_rad[:, :count]))
+        return np.zeros((len(z), count, 4))
+
+    monkeypatch.setattr("tvsbayes.posterior.predictive.looks", looks)
+    monkeypatch.setattr("tvsbayes.posterior.predictive.HOME_SD_DEG", 0.0)
+    still = SimpleNamespace(play_sd_rad=np.zeros((count, 2)))
+    fit = SimpleNamespace(campaign=dozen.campaign, arrays=dozen.arrays, linearised=still)
+    physical = np.zeros((DRAWS, len(NAMES)))
+    physical[:, [INDEX[name] for name in names_of("look_scatter_deg")]] = 0.2, 0.1
+    looks_again(fit, np.zeros((DRAWS, 1)), physical, no_draw(DRAWS, dozen.arrays), np.random.default_rng(5))
+    (errors,) = caught
+    tolerance = 5 * np.sqrt(2 / DRAWS)
+    np.testing.assert_allclose(errors.var(axis=0), np.full((count, 2), (0.04, 0.01)), rtol=tolerance)
+    between = np.corrcoef(errors[..., 0].T)[np.triu_indices(count, 1)]
+    assert np.abs(between).max() < 5 / np.sqrt(DRAWS)
 
 
 @dataclass(frozen=True)

@@ -204,12 +204,13 @@ def test_headlines(truths, values, poses_rad):
         assert abs(offset_mm[rig] - effective_mirror_offset_mm(truth.parameters, pose_deg)) < LENGTH_MM
 
 
-def test_errors_that_repeat_and_drift(mounted_rig):
-    """Chi-square of six campaigns at their truths: gears that repeat errors and zeros that drift, as the twin has them.
+def test_errors_that_repeat_drift_and_scatter(mounted_rig):
+    """Chi-square of six campaigns at their truths: repeated errors, drifting zeros, scattered looks as the twin's.
 
     The estimators integrate them out; without their scales the same campaigns stand off by far more than chance.
     """
     scales = {"transmission_error_deg": 0.05, "play_variation_deg": 0.05, "drift_deg_per_root_hour": 0.05}
+    scales |= {"look_scatter_deg": 0.05}
     priors = {f"{name}.{axis}": Prior(0.0, u, "half-normal") for name, u in scales.items() for axis in AXES}
     priors |= {f"harmonic_amplitude_deg.{axis}.1": Prior(0.0, 0.05, "half-normal") for axis in AXES}
     priors |= {f"transmission_error_length_deg.{axis}": Prior(8.0, 0.7, "log-normal") for axis in AXES}

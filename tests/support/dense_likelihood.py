@@ -33,6 +33,7 @@ def physical(evaluated: SimpleNamespace) -> dict[str, float]:
         values[f"transmission_error_length_deg.{name}"] = np.degrees(model.gears.length_rad[axis])
         values[f"play_variation_deg.{name}"] = np.degrees(model.gears.play_rad[axis])
         values[f"drift_deg_per_root_hour.{name}"] = np.degrees(model.gears.drift_rad_per_root_hour[axis])
+        values[f"look_scatter_deg.{name}"] = np.degrees(model.noise.look_scatter_rad[axis])
         for number in range(3):
             amplitude, period = model.gears.amplitude_rad[axis, number], model.gears.period_rad[axis, number]
             values[f"harmonic_amplitude_deg.{name}.{number + 1}"] = np.degrees(amplitude)
@@ -135,6 +136,7 @@ def angle_covariances(campaign: Campaign, values: dict[str, float], *, persisten
                     hours = min(one.time_s, other.time_s) / 3600 - homing_h[one.segment]
                     shared += values[f"drift_deg_per_root_hour.{name}"] ** 2 * hours
                 at, there = getattr(one, f"{name}_steps"), getattr(other, f"{name}_steps")
+                shared += values[f"look_scatter_deg.{name}"] ** 2 * (i == j)
                 shared += repeated.error(at, there)
                 shared += side(directions) * side(directions_there) / 4 * repeated.play(at, there)
                 found[axis, i, j] = np.radians(np.radians(shared))

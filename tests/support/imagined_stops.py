@@ -20,7 +20,13 @@ STOPS = 27
 def linearised(residual: np.ndarray, slope: np.ndarray, angles: np.ndarray) -> Linearised:
     """A linearised campaign of these spots; what stop readings do not need is 0."""
     spots, count = len(residual), len(INPUT_NAMES)
-    shapes = {"play_sd_rad": (2,), "predicted": (5,), "stop_variance": (2,), "drift_variance": (2,)}
+    shapes = {
+        "play_sd_rad": (2,),
+        "predicted": (5,),
+        "stop_variance": (2,),
+        "drift_variance": (2,),
+        "scatter_variance": (2,),
+    }
     shapes |= {"place_columns": (4, 0)}
     shapes |= {"residual_jacobian": (4, count), "predicted_jacobian": (5, count)}
     arrays = {

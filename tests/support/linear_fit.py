@@ -49,7 +49,13 @@ def linearised(jacobian: np.ndarray, load: np.ndarray) -> Linearised:
     """The campaign of a linear problem; states are stop errors of unit variance, those of pan first."""
     half = STATES // 2
     slope = np.stack([load[:, :half].sum(axis=1), load[:, half:].sum(axis=1)], axis=1)
-    shapes = {"play_sd_rad": (2,), "mirror_angles_rad": (2,), "predicted": (5,), "drift_variance": (2,)}
+    shapes = {
+        "play_sd_rad": (2,),
+        "mirror_angles_rad": (2,),
+        "predicted": (5,),
+        "drift_variance": (2,),
+        "scatter_variance": (2,),
+    }
     shapes |= {"residual": (4,), "place_columns": (4, 0), "predicted_jacobian": (5, len(NAMES))}
     arrays = {name: np.zeros((SPOTS, *shape)) for name, shape in shapes.items()}
     return Linearised(

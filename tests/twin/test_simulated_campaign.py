@@ -18,11 +18,12 @@ from tvsbayes.instrument.axes import DIRECTION_SIGNS, HOME_SD_DEG
 from tvsbayes.instrument.parameters import (
     GEAR_ERROR_NAMES,
     HARMONIC_NAMES,
+    LOOK_SCATTER_NAMES,
     RIG_PRIORS,
     STEREO_PARAMETER_NAMES,
     Prior,
 )
-from tvsbayes.instrument.plan import PlanStep
+from tvsbayes.instrument.plan import PlanBuilder, PlanStep
 from tvsbayes.instrument.protocols import grid_protocol
 from tvsbayes.instrument.rig import Rig, RigTable
 from tvsbayes.instrument.stereo_pair import Stereo, rotation_matrix
@@ -209,6 +210,47 @@ def test_transmission_error_leaves_every_other_draw_as_it_was():
     expected = c1 * np.cos(wheel) + s1 * np.sin(wheel) + c2 * np.cos(2 * wheel) + s2 * np.sin(2 * wheel)
     assert shift[:, 1] == pytest.approx(expected, abs=1e-12) and np.abs(shift[:, 1]).max() > 0.01
     assert not shift[:, 0].any()
+
+
+def test_looks_scatter_also_where_an_axis_stands():
+    """Of one beam looked at 400 times, by 0.05 deg of pan alone, then of tilt; nothing else changes."""
+    rig, count = make_rig(truth_u=0.0), 400
+    plan = PlanBuilder()
+    plan.home(0, 0)
+    plan.place("d2")
+    for _ in range(count):
+        plan.look()
+    still = draw_truth(rig, np.random.default_rng(0))
+    without = simulate(rig, plan.steps, 5, still)
+    p, (psi, beta) = still.parameters, np.radians(without.truth.mirror_angles_deg[0])
+    ahead = [mirror_chain(psi + a, beta + b, p)[1] for a, b in ((0.0, 0.0), (1e-6, 0.0), (0.0, 1e-6))]
+    for axis, by_angle in zip(("pan", "tilt"), (ahead[1] - ahead[0], ahead[2] - ahead[0]), strict=True):
+        shaking = replace(still, parameters={**p, f"look_scatter_deg.{axis}": 0.05})
+        found = simulate(rig, plan.steps, 5, shaking)
+        assert found.truth.mirror_angles_deg == without.truth.mirror_angles_deg
+        sideways = np.linalg.norm(found.light.directions - without.light.directions, axis=1)
+        expected = np.radians(0.05) * np.linalg.norm(by_angle) / 1e-6
+        # Of n normal numbers; neighbours are independent: each is another draw.
+        assert np.sqrt(np.mean(sideways**2)) == pytest.approx(expected, rel=4 / np.sqrt(2 * count))
+        assert len(np.unique(sideways)) == count
+
+
+def test_scatter_of_looks_leaves_the_drawn_rig_as_it_was():
+    """Rigs of a seed are the same rigs, whatever their looks do; a truth.json without it has none."""
+    rig = make_rig()
+    steady = replace(rig, truth={**rig.truth, **dict.fromkeys(LOOK_SCATTER_NAMES, Prior(0.0, 0.0, "half-normal"))})
+    both = []
+    for one in (rig, steady):
+        stream = np.random.default_rng(7)
+        both.append([draw_truth(one, stream) for _ in range(2)])
+    shaking, still = both
+    for one, two in zip(shaking, still, strict=True):
+        changed = {name for name in one.parameters if one.parameters[name] != two.parameters[name]}
+        assert changed == set(LOOK_SCATTER_NAMES)
+    document = simulate(rig, small_plan(), 8).truth.as_json(simulate(rig, small_plan(), 8).campaign)
+    parameters = {n: v for n, v in document["parameters"].items() if n not in LOOK_SCATTER_NAMES}
+    read = Truth.from_json({**document, "parameters": parameters}, rig.stereo)
+    assert [read.parameters[name] for name in LOOK_SCATTER_NAMES] == [0.0, 0.0]
 
 
 def test_true_transmission_error_needs_its_period():

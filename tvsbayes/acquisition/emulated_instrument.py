@@ -46,14 +46,11 @@ class EmulatedInstrument(Instrument):
     def __init__(self, rig: Rig, seed: int, start: int, board: EmulatedBoard):
         super().__init__(rig, seed, start)
         self.clock, self.board = BoardClock(), board
-        board.on_step, board.on_laser = self.mechanics.step, self._switch
+        board.on_step, board.on_laser = self.mechanics.step, self.mechanics.switch_laser
 
     def positioner(self) -> SerialPositioner:
         """The driver on the board's serial port, with the limits and the speed of the rig file."""
         return _BoardPositioner(self)
-
-    def _switch(self, on: bool) -> None:
-        self.mechanics.laser_on = on
 
     def at_rest(self, homed: bool = False) -> None:
         """Both axes stand; `homed`: each at its home switch, the counters set."""

@@ -28,10 +28,10 @@ from tvsbayes.positioner.mechanics import Mechanics
 from tvsbayes.positioner.protocol import SETTINGS, device_settings
 from tvsbayes.twin.gear_errors import PERFECT, SECONDS_PER_HOUR, draw_gear_errors
 from tvsbayes.twin.physics import Light, Sheet, harmonics_deg, light_on_sheet, project, take_up, wobble_deg
-from tvsbayes.twin.simulated_campaign import placed_sheet
+from tvsbayes.twin.simulated_campaign import look_scatter_deg, placed_sheet
 from tvsbayes.twin.true_rig import Truth, draw_truth
 
-_STREAMS = {"truth": 0, "stops": 1, "homes": 2, "sheets": 3, "pixels": 4, "gears": 5, "drift": 6}
+_STREAMS = {"truth": 0, "stops": 1, "homes": 2, "sheets": 3, "pixels": 4, "gears": 5, "drift": 6, "looks": 7}
 LATENCY_US = 300
 """One way of a request or an answer over USB; a round trip measured on a pseudo-terminal took 0.64 ms."""
 
@@ -161,7 +161,7 @@ class Instrument:
     """
 
     def __init__(self, rig: Rig, seed: int, start: int = 0, truth: Truth | None = None):
-        self.rig, self.seed = rig, int(seed)
+        self.rig, self.seed, self._start = rig, int(seed), start
         truth = draw_truth(rig, self._stream("truth")) if truth is None else truth
         if truth.gear_errors is None:
             period_deg, stream = rig.table.harmonic_period_deg, self._stream("gears")
@@ -266,8 +266,12 @@ class Instrument:
         return psi, beta + self.truth.parameters["tilt_zero_deg"]
 
     def light(self) -> Light:
-        """What the laser does at this moment; changes nothing, so that a camera's thread may ask at any time."""
-        psi, beta = np.radians(self._mirror_angles_deg())
+        """What the laser does at this moment; changes nothing, so that a camera's thread may ask at any time.
+
+        A look lasts from laser on to laser off: its scatter is drawn by its number.
+        """
+        normal = self._stream("looks", self._start, self.mechanics.lit).standard_normal(2)
+        psi, beta = np.radians(self._mirror_angles_deg() + look_scatter_deg(self.truth.parameters, normal))
         light = light_on_sheet(psi, beta, self.truth.parameters, self._sheet)
         return light if self.mechanics.laser_on else replace(light, points_mm=np.full(3, np.nan))
 

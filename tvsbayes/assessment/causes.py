@@ -16,13 +16,14 @@ from tvsbayes.assessment.weaknesses import moved_directions, whole_gradients
 from tvsbayes.calibration.pointing import INPUT_NAMES
 from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.estimators.linear_spots import linear_spots, stop_information
-from tvsbayes.instrument.axes import DIRECTIONS, SENSES
+from tvsbayes.instrument.axes import DIRECTIONS, SENSES, Axis
 from tvsbayes.instrument.parameters import INDEX, KINDS, NAMES, PRIOR_GROUPS, RIG_NAMES, unit_of
 from tvsbayes.metrology.budget_tables import BudgetTable, Source, budget_table
 from tvsbayes.model.parameter_space import HALF_NORMAL_MEAN, HALF_NORMAL_SD, physical_at
 from tvsbayes.results.estimates import Estimate, HeadlineCauses
 
 STOP_ERRORS = "stop errors of the campaign"
+LOOK_SCATTER = "scatter of the campaign's looks"
 TRANSMISSION_ERROR, PLAY_VARIATION = "transmission error", "play variation"
 PRIOR_PARTS = (TRANSMISSION_ERROR, PLAY_VARIATION, "stereo calibration")
 """Causes of many coordinates each, known by their prior: type B of GUM, as every single prior is."""
@@ -32,17 +33,19 @@ PRIOR_PARTS = (TRANSMISSION_ERROR, PLAY_VARIATION, "stereo calibration")
 class _Told:
     """What the campaign tells of coordinates and errors at places, J^T C^-1 J, by the noise that limits it.
 
-    With C = 1 + (stop errors), whitened by the pixel noise: (C^-1 J)^T (C^-1 J), and the rest; matrices (p + e, p + e).
+    With C = 1 + (stop errors), whitened by the noise of looks: (C^-1 J)^T (C^-1 J), and the rest; matrices (p + e,
+    p + e). Of the unit noise b S b^T is the scatter of looks, b the slopes by the angles and S their variances.
 
     Attributes:
         pixels: name of the noise of the first part.
-        by_pixels, by_stops: the parts.
+        by_pixels, by_looks, by_stops: the parts.
         posterior: inverse of both together with the priors.
         groups: coordinates and errors by the prior that they have.
     """
 
     pixels: str
     by_pixels: np.ndarray
+    by_looks: np.ndarray
     by_stops: np.ndarray
     posterior: np.ndarray
     groups: dict[str, list[int]]
@@ -56,11 +59,15 @@ def _told(fit: JointFit) -> _Told:
     found = stop_information(linear.spelled_out(linear.places))
     gain = np.concatenate([group.jacobian for group in found.groups])
     noise, places = gain.T @ gain, linear.places.shape[2] // 2
+    scattered = np.einsum("nia,nip->nap", fit.linearised.slope, gain.reshape(-1, 4, gain.shape[1]))
+    scattered *= np.sqrt(fit.linearised.scatter_variance)[:, :, None]
+    by_looks = np.einsum("nap,naq->pq", scattered, scattered)
     own = len(NAMES) + np.arange(places)
     groups = {**PRIOR_GROUPS, TRANSMISSION_ERROR: own.tolist(), PLAY_VARIATION: (own + places).tolist()}
     return _Told(
         "pixel and aperture noise" if readings else "pixel noise",
-        noise,
+        noise - by_looks,
+        by_looks,
         found.fisher - noise,
         np.linalg.inv(found.fisher + np.eye(len(noise))),
         {cause: columns for cause, columns in groups.items() if columns},
@@ -85,15 +92,16 @@ def causes_of(fit: JointFit, by_places: np.ndarray | None = None) -> Causes:
     """Split the covariance of a fit by cause (formulation 5).
 
     An estimate moves by S J^T C^-1 e when the data err by e, and by S e_j when prior j is off by its sd, S the
-    posterior covariance. With C = 1 + (stop errors) the parts S (C^-1 J)^T (C^-1 J) S, S (J^T C^-1 J - that) S and
-    S e_j e_j^T S add up to S. Expected information about geometry and cameras; noise scales are taken as known.
+    posterior covariance. With C = 1 + (stop errors) the parts S (C^-1 J)^T (C^-1 J) S (pixels, and the scatter of looks
+    within it), S (J^T C^-1 J - that) S and S e_j e_j^T S add up to S. Expected information about geometry and cameras;
+    noise scales are taken as known.
 
     Args:
         fit: a converged fit.
         by_places: further inputs, as d(input)/d(errors at places, N(0, 1) a priori), shape (inputs, errors).
     """
     told = _told(fit)
-    parts = {told.pixels: told.by_pixels, STOP_ERRORS: told.by_stops}
+    parts = {told.pixels: told.by_pixels, LOOK_SCATTER: told.by_looks, STOP_ERRORS: told.by_stops}
     for stem, columns in told.groups.items():
         share = np.zeros_like(told.posterior)
         share[columns, columns] = 1.0
@@ -170,14 +178,22 @@ def _noise_causes(fit: JointFit, told: _Told, quantities: tuple[str, ...], sprea
         spreads = [float(np.var(x)) for x in logs if np.ptp(x) > 1e-9]
         return min((0.5 / s for s in spreads), default=np.inf)
 
-    def stop_freedom(quantity: str) -> float:
-        """By the stops of the axis that a quantity belongs to."""
+    def axis_of(quantity: str) -> Axis:
+        """The axis that a quantity belongs to."""
         of = quantity.split(".")[1]
-        pair = next(pair for axis, pair in SENSES.items() if of == axis or of in pair)
-        return freedom(f"stop_sd_deg.{d}" for d in pair if d in moved)
+        return next(axis for axis, pair in SENSES.items() if of == axis or of in pair)
+
+    def stop_freedom(quantity: str) -> float:
+        return freedom(f"stop_sd_deg.{d}" for d in SENSES[axis_of(quantity)] if d in moved)
+
+    def look_freedom(quantity: str) -> float:
+        # A scale that may be 0 has no logarithm: by its relative sd.
+        sds = physical[:, INDEX[f"look_scatter_deg.{axis_of(quantity)}"]]
+        return 0.5 * (float(np.mean(sds)) / float(np.std(sds))) ** 2 if np.ptp(sds) > 0 else np.inf
 
     return [
         _Cause(told.pixels, root(told.by_pixels), freedom(["pixel_scale"]) * every),
+        _Cause(LOOK_SCATTER, root(told.by_looks), np.array([look_freedom(q) for q in quantities])),
         _Cause(STOP_ERRORS, root(told.by_stops), np.array([stop_freedom(q) for q in quantities])),
         *(
             _Cause(name, np.linalg.norm(spread[:, told.groups[name]], axis=1), np.inf * every)

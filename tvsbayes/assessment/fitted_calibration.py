@@ -16,7 +16,7 @@ from tvsbayes.assessment.gear_tables import DrawnGears, drawn_gears
 from tvsbayes.assessment.summary import equal_laplace_draws, seen_range
 from tvsbayes.calibration.gear_table import NO_GEARS, GearTable
 from tvsbayes.calibration.optics import ERROR_AT, PLAY_AT
-from tvsbayes.calibration.pointing import INPUT_NAMES, NOISE_NAMES, Calibration
+from tvsbayes.calibration.pointing import INPUT_NAMES, NOISE_NAMES, Calibration, noise_of_a_look
 from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.instrument.axes import AXES
 from tvsbayes.instrument.campaign import Campaign, input_hashes
@@ -66,7 +66,7 @@ def calibration_of_draws(
             log = prior.distribution == "log-normal"
             column[name] = prior.value * np.exp(prior.u * off) if log else prior.value + prior.u * off
     inputs = np.stack([column[name] for name in INPUT_NAMES], axis=1)
-    noise = np.stack([column[name] for name in NOISE_NAMES], axis=1)
+    noise = noise_of_a_look(column)
     table = NO_GEARS if gears is None else gears.table
     if gears is not None:
         inputs = np.concatenate([inputs, gears.expected + gears.left_open], axis=1)

@@ -28,6 +28,7 @@ from tvsbayes.instrument.parameters import (
     GEAR_ERROR_NAMES,
     HARMONIC_NAMES,
     INDEX,
+    LOOK_SCATTER_NAMES,
     NAMES,
     RECEIVER_NAMES,
     RIG_NAMES,
@@ -45,7 +46,9 @@ CLASSIC_DRAWS = 256
 SEEN_SHARE = 0.5
 """Of the draws that must show an experiment, for it to count: one draw that went astray drops none."""
 LENGTH_NAMES = names_of("transmission_error_length_deg")
-ABSENT_AT_NOUGHT = tuple(name for name in (*HARMONIC_NAMES, *GEAR_ERROR_NAMES) if name not in LENGTH_NAMES)
+ABSENT_AT_NOUGHT = tuple(
+    name for name in (*HARMONIC_NAMES, *GEAR_ERROR_NAMES, *LOOK_SCATTER_NAMES) if name not in LENGTH_NAMES
+)
 """Parameters that are not told of where they are held at 0."""
 MIXING_SEED = 11
 """Fixed, so that everything made of one fit has the same draws row by row."""
@@ -138,7 +141,7 @@ class _Source:
 
 
 def _absent(fit: JointFit) -> set[str]:
-    """Errors of the gears that the model does not have, and the lengths of those."""
+    """Errors of the gears and scatter of looks that the model does not have, and the lengths of those errors."""
     value = dict(zip(NAMES, np.asarray(fit.mode.physical).tolist(), strict=True))
     none = {name for name in ABSENT_AT_NOUGHT if not fit.free[INDEX[name]] and value[name] == 0}
     for axis in AXES:

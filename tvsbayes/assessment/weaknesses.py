@@ -5,6 +5,8 @@ Directions and gradients are those of the coordinates, each in sds of its prior;
 
 from __future__ import annotations
 
+from collections import Counter
+
 import numpy as np
 
 from tvsbayes.estimators.joint_fit import JointFit, with_places
@@ -13,7 +15,7 @@ from tvsbayes.instrument.axes import AXES, DIRECTIONS, SENSES, Axis
 from tvsbayes.instrument.campaign import ordered_spots
 from tvsbayes.instrument.parameters import INDEX, NAMES, NOISE_NAMES, STEREO_PARAMETER_NAMES
 from tvsbayes.instrument.places import FEW_COUNTERS, LEAST_ERROR_RAD, SPACING_DEG, too_few_counters
-from tvsbayes.instrument.stops import few_stops, inseparable, legs_of, observed_stops, one_sided, separation
+from tvsbayes.instrument.stops import few_stops, inseparable, legs_of, observed_stops, one_sided, rests_of, separation
 from tvsbayes.model.gear_kriging import KnownPlaces, scales_at
 from tvsbayes.results.estimates import CONFLICT_LIMIT, Leverage, WeakDirection, conflict_sentence
 
@@ -81,6 +83,23 @@ def _counters_direction(fit: JointFit, axis: Axis) -> WeakDirection | None:
     return WeakDirection(too_few_counters(axis, counters, telling), names)
 
 
+def _scatter_direction(fit: JointFit, axis: Axis) -> WeakDirection | None:
+    """Scatter of stops and of looks of an axis, if no stop has a second look by which they are told apart."""
+    look, *stops = f"look_scatter_deg.{axis}", *(f"stop_sd_deg.{direction}" for direction in SENSES[axis])
+    stops = [name for name in stops if fit.free[INDEX[name]]]
+    if not fit.free[INDEX[look]] or not stops:
+        return None
+    rests = rests_of(fit.campaign.moves, axis)
+    looks = Counter(rests[s.move] for s in ordered_spots(fit.campaign) if s.spot not in fit.excluded_spots)
+    if max(looks.values(), default=1) > 1:
+        return None
+    text = (
+        f"every stop of the {axis} axis was looked at once: the data tell the stop scatter and the look scatter "
+        "together, the priors how much is which; look twice at some stops"
+    )
+    return WeakDirection(text, {look: 1.0, **dict.fromkeys(stops, -1.0)})
+
+
 def weak_directions(fit: JointFit, moved: set[str]) -> tuple[WeakDirection, ...]:
     """Combinations of parameters that data and priors leave wide, in words: axes never moved, play, priors alone."""
     found = []
@@ -90,8 +109,8 @@ def weak_directions(fit: JointFit, moved: set[str]) -> tuple[WeakDirection, ...]
             found.append(WeakDirection(text, {f"degrees_per_step.{axis}": 1.0}))
             continue
         weak = _backlash_direction(fit, axis, pair[0] if pair[0] in moved else pair[1])
-        seen_at_few = _counters_direction(fit, axis)
-        found += [one for one in (weak, seen_at_few) if one is not None]
+        rest = _counters_direction(fit, axis), _scatter_direction(fit, axis)
+        found += [one for one in (weak, *rest) if one is not None]
     noise = {*NOISE_NAMES, *STEREO_PARAMETER_NAMES}
     rows = np.array([i for i, name in enumerate(NAMES) if fit.free[i] and name not in noise])
     if rows.size == 0:

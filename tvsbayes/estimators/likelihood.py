@@ -45,6 +45,11 @@ def drift_variances(drift_rad_per_root_hour: Float[Array, "2"], spots: SpotArray
     return spots.hours[:, None] * drift_rad_per_root_hour**2
 
 
+def scatter_variances(scatter_rad: Float[Array, "2"], spots: SpotArrays) -> Float[Array, "spots 2"]:
+    """Variance of the beam's angles (pan, tilt) at each look about where the axes stand; robust weights enlarge it."""
+    return scatter_rad**2 / spots.weight[:, None]
+
+
 class FilterRows(eqx.Module):
     """What the filter meets at each spot, in time order: its residual, how its states move it, which are new.
 
@@ -152,6 +157,8 @@ class Standing(eqx.Module):
     play_sd_rad: Float[Array, "spots 2"]
     stop_variance: Float[Array, "spots 2"]
     drift_variance: Float[Array, "spots 2"]
+    scatter_variance: Float[Array, "spots 2"]
+    to_states: ToStates
 
 
 def standing(
@@ -165,14 +172,17 @@ def standing(
     angles = mirror_angles(model.transmission, model.tilt_zero_rad, arrays.moves) if angles is None else angles
     pan, tilt = (angles.angle_rad[:, axis][spots.move_index] for axis in range(2))
     looks = looks_at(model, pan, tilt, arrays)
-    noise = noise_scales(model, spots, inflation)
+    noise, scattered = noise_scales(model, spots, inflation), scatter_variances(model.noise.look_scatter_rad, spots)
+    terms = spot_residuals(looks, noise, model, spots)
     return Standing(
         looks,
         noise,
-        spot_residuals(looks, noise, model, spots),
+        terms,
         angles.play_sd_rad[spots.move_index],
         stop_variances(model.noise.stop_sd_rad, spots),
         drift_variances(jnp.asarray(model.gears.drift_rad_per_root_hour), spots),
+        scattered,
+        ToStates.of(terms.by_pan, terms.by_tilt, scattered),
     )
 
 
@@ -201,15 +211,14 @@ def root_at_places(model: Model, gears: GearArrays) -> Float[Array, "errors erro
 def filter_input(model: Model, arrays: CampaignArrays, angles: MirrorAngles | None = None) -> FilterInput:
     """Linearise all spots for the filter; `angles` are those of the moves, if they are known."""
     found = standing(model, arrays, angles=angles)
-    terms = found.terms
-    turned = ToStates.of(terms.by_pan, terms.by_tilt)
+    terms, turned = found.terms, found.to_states
     first, second, *free = turned.of_many(terms.residual)
     seen = jnp.stack([first, second], axis=1)
     columns = jnp.concatenate([seen[..., None], place_columns(turned.slope, arrays.gears)], axis=2)
     rows = filter_rows(
         columns, turned.slope, found.play_sd_rad, found.stop_variance, found.drift_variance, arrays.spots
     )
-    log_scale = terms.log_scale - 0.5 * sum(number**2 for number in free)
+    log_scale = terms.log_scale + turned.log_scale - 0.5 * sum(number**2 for number in free)
     return FilterInput(rows, jnp.stack(free, axis=1), log_scale)
 
 

@@ -29,6 +29,7 @@ from tvsbayes.model.parameter_space import ParameterSpace, model_of
 class Linearised(eqx.Module):
     """The campaign linearised at coordinates `z`; first axis of the Jacobians is the spot.
 
+    Residuals, slopes and what follows from them are in units of the noise of a look, its scatter included.
     `place_columns` is d(predicted)/d(errors at places, rad), `place_root` the factor of their prior covariance.
     """
 
@@ -40,6 +41,7 @@ class Linearised(eqx.Module):
     predicted: Float[Array | np.ndarray, "spots 5"]
     stop_variance: Float[Array | np.ndarray, "spots 2"]
     drift_variance: Float[Array | np.ndarray, "spots 2"]
+    scatter_variance: Float[Array | np.ndarray, "spots 2"]
     place_columns: Float[Array | np.ndarray, "spots 4 errors"]
     place_root: Float[Array | np.ndarray, "errors errors"]
     residual_jacobian: Float[Array | np.ndarray, "spots 4 parameters"]
@@ -69,7 +71,7 @@ class SpotDeviations:
 
     Attributes:
         deviation_rad: shape (spots, 2).
-        covariance_rad2: of the pixel noise, shape (spots, 2, 2).
+        covariance_rad2: of the pixel noise and the scatter of looks, shape (spots, 2, 2).
     """
 
     deviation_rad: np.ndarray
@@ -95,18 +97,20 @@ def linearise(
     found = standing(model, arrays, inflation)
     looks, terms = found.looks, found.terms
     by_coordinates = look_jacobian(z, physical, space, looks, arrays)
-    residuals = terms.range_out.of_many(found.noise.whitened(by_coordinates, arrays.spots))[1:]
-    slope = jnp.stack([jnp.stack(terms.by_pan, axis=1), jnp.stack(terms.by_tilt, axis=1)], axis=2)
+    unit_noise = found.to_states.in_place
+    residuals = unit_noise(terms.range_out.of_many(found.noise.whitened(by_coordinates, arrays.spots))[1:])
+    slope = jnp.stack([jnp.stack(unit_noise(own), axis=1) for own in (terms.by_pan, terms.by_tilt)], axis=2)
     root = root_at_places(model, arrays.gears)
     return Linearised(
         z=z,
-        residual=jnp.stack(terms.residual, axis=1),
+        residual=jnp.stack(unit_noise(terms.residual), axis=1),
         slope=slope,
         play_sd_rad=found.play_sd_rad,
         mirror_angles_rad=jnp.stack([looks.pan_rad, looks.tilt_rad], axis=1),
         predicted=jnp.stack(looks.predicted, axis=1),
         stop_variance=found.stop_variance,
         drift_variance=found.drift_variance,
+        scatter_variance=found.scatter_variance,
         place_columns=place_columns(slope, arrays.gears),
         place_root=root,
         residual_jacobian=-jnp.stack(residuals).transpose(2, 0, 1),

@@ -130,6 +130,10 @@ class ToStates(eqx.Module):
     Four components with independent unit noise become one along each, which have it too, and what is left: the filter
     then has two to look at instead of four. Everything is smooth in the slopes (Gram and Schmidt's directions, where a
     reflection would change its sign).
+
+    Where the beam's angles scatter from look to look, the noise of the two has the covariance R = 1 + slope
+    diag(variances) slope^T = U U^T, U upper triangular: they are multiplied by U^-1, which leaves them unit noise and
+    the second blind to pan. `spread` holds U11, U12 and U22, which are 1, 0 and 1 without scatter.
     """
 
     first: Numbers
@@ -137,14 +141,31 @@ class ToStates(eqx.Module):
     pan_load: Float[Array, " spots"]
     tilt_load: Float[Array, " spots"]
     tilt_rest: Float[Array, " spots"]
+    spread: Numbers
 
     @classmethod
-    def of(cls, by_pan: Numbers, by_tilt: Numbers) -> ToStates:
-        """The directions of looks that move so with pan and tilt."""
+    def of(cls, by_pan: Numbers, by_tilt: Numbers, scatter_variance: Float[Array, "spots 2"] | None = None) -> ToStates:
+        """The directions of looks that move so with pan and tilt, whose angles scatter by these variances (rad^2)."""
         first, pan_load = _unit(by_pan)
         tilt_load = _dot(first, by_tilt)
         second, tilt_rest = _unit(tuple(b - tilt_load * a for a, b in zip(first, by_tilt, strict=True)))
-        return cls(first, second, pan_load, tilt_load, tilt_rest)
+        one, none = jnp.ones_like(tilt_load), jnp.zeros_like(tilt_load)
+        if scatter_variance is None:
+            return cls(first, second, pan_load, tilt_load, tilt_rest, (one, none, one))
+        by_pan_2, by_tilt_2 = scatter_variance.T
+        # By Schur's complement, in sums of what is positive: a large scatter costs no digits.
+        last2 = 1 + by_tilt_2 * tilt_rest**2
+        last, across = jnp.sqrt(last2), tilt_load * by_tilt_2 * tilt_rest
+        own = jnp.sqrt(1 + by_pan_2 * pan_load**2 + by_tilt_2 * tilt_load**2 / last2)
+        across = across / last
+        loads = pan_load / own, (tilt_load - across * (tilt_rest / last)) / own, tilt_rest / last
+        return cls(first, second, *loads, (own, across, last))
+
+    @property
+    def log_scale(self) -> Float[Array, " spots"]:
+        """What the scatter of looks adds to the log density besides the two components: -ln det U."""
+        own, _, last = self.spread
+        return -jnp.log(own) - jnp.log(last)
 
     @property
     def slope(self) -> Float[Array, "spots 2 2"]:
@@ -157,4 +178,15 @@ class ToStates(eqx.Module):
         """The components along both directions, and the four of what is left; columns may come before the spots."""
         one, two = _dot(self.first, numbers), _dot(self.second, numbers)
         left = (n - p * one - q * two for p, q, n in zip(self.first, self.second, numbers, strict=True))
-        return (one, two, *left)
+        return (*self._unit_noise(one, two), *left)
+
+    def in_place(self, numbers: Numbers) -> Numbers:
+        """Four components of unit noise again, the scatter of looks included."""
+        one, two = _dot(self.first, numbers), _dot(self.second, numbers)
+        by_one, by_two = (new - old for new, old in zip(self._unit_noise(one, two), (one, two), strict=True))
+        return tuple(n + p * by_one + q * by_two for p, q, n in zip(self.first, self.second, numbers, strict=True))
+
+    def _unit_noise(self, one: Array, two: Array) -> tuple[Array, Array]:
+        own, across, last = self.spread
+        two = two / last
+        return (one - across * two) / own, two

@@ -136,6 +136,7 @@ _PARAMETERS = (
     *_block("play_variation_deg", AXES, "deg", Prior(0.0, 0.02, "half-normal"), _SCALE, noise=True),
     *_block("drift_deg_per_root_hour", AXES, "deg", Prior(0.0, 0.02, "half-normal"), _SCALE, noise=True),
     *_block("harmonic_amplitude_deg", _AMPLITUDES, "deg", Prior(0.0, 0.05, "half-normal"), _SCALE, noise=True),
+    *_block("look_scatter_deg", AXES, "deg", Prior(0.0, 0.01, "half-normal"), _SCALE, noise=True),
     *_cameras(),
 )
 
@@ -164,6 +165,8 @@ GEAR_ERROR_NAMES: tuple[str, ...] = (
     *AMPLITUDE_NAMES,
 )
 """Scales of the gears' errors that repeat by position, of play that varies and of zeros that drift."""
+LOOK_SCATTER_NAMES: tuple[str, ...] = BLOCKS["look_scatter_deg"]
+"""Sds of what the beam's angle at a look is off from where the axis stands."""
 NOISE_NAMES: tuple[str, ...] = tuple(p.name for p in _PARAMETERS if p.noise)
 RECEIVER_NAMES: tuple[str, ...] = tuple(p.name for p in _PARAMETERS if p.receiver)
 DERIVED_UNITS: dict[str, Unit] = {

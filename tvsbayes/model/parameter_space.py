@@ -60,9 +60,10 @@ class Receiver(eqx.Module):
 
 
 class Noise(eqx.Module):
-    """Stop standard deviations by [axis, (right/down, left/up)] and the factor on the stated pixel sds."""
+    """Standard deviations of stops by [axis, (right/down, left/up)] and of looks by axis; factor on the pixel sds."""
 
     stop_sd_rad: Float[Array, "2 2"]
+    look_scatter_rad: Float[Array, "2"]
     pixel_scale: Scalar
 
 
@@ -261,7 +262,11 @@ def model_of(
             aperture_zero_rad=block("aperture_zero_deg"),
             aperture_sd_rad=block("aperture_sd_deg"),
         ),
-        noise=Noise(stop_sd_rad=jnp.reshape(block("stop_sd_deg"), (2, 2))[:, ::-1], pixel_scale=block("pixel_scale")),
+        noise=Noise(
+            stop_sd_rad=jnp.reshape(block("stop_sd_deg"), (2, 2))[:, ::-1],
+            look_scatter_rad=block("look_scatter_deg"),
+            pixel_scale=block("pixel_scale"),
+        ),
         gears=GearScales(
             error_rad=block("transmission_error_deg"),
             length_rad=block("transmission_error_length_deg"),

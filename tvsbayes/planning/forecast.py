@@ -12,7 +12,7 @@ from tvsbayes.errors import TvsError
 from tvsbayes.estimators.four_point import classic, ratio_slopes, select_experiments
 from tvsbayes.instrument.axes import DIRECTIONS
 from tvsbayes.instrument.campaign import Campaign
-from tvsbayes.instrument.parameters import NAMES, RIG_NAMES
+from tvsbayes.instrument.parameters import LOOK_SCATTER_NAMES, NAMES, RIG_NAMES, names_of
 from tvsbayes.instrument.protocols import four_point_protocol
 from tvsbayes.planning.drawn_rigs import Instruments
 from tvsbayes.planning.expectation import Knowledge
@@ -44,18 +44,22 @@ CLASSIC_DRAWS = 100
 def classic_forecast(knowledge: Knowledge, instruments: Instruments) -> ClassicForecast | None:
     """Run the paper's experiments on drawn instruments without noise; None where the rig has no two sheets.
 
-    Pixels by the twin; noise by first-order propagation of pixel noise and of the two stops of an experiment.
+    Pixels by the twin; noise by first-order propagation of pixel noise, of the two stops of an experiment and of the
+    scatter of its looks.
     """
     rig = knowledge.rig
     if len(rig.sheets_mm) < 2:
         return None
     near, far = knowledge.sheets[0], knowledge.sheets[1]
     plan = four_point_protocol(2, targets=(near, far))
-    pixels, steps, axes, local, stops, spot_sds = [], [], [], [], [], []
+    close_mm, away_mm = rig.sheets_mm[near], rig.sheets_mm[far]
+    # A beam through two spots that its angle scatters at, e each: (away e2 - close e1) / (away - close).
+    beam = (close_mm**2 + away_mm**2) / (away_mm - close_mm) ** 2
+    pixels, steps, axes, local, stops, looks, spot_sds = [], [], [], [], [], [], []
     first = None
     for physical in instruments.physical[:CLASSIC_DRAWS]:
         parameters = dict(zip(NAMES, map(float, physical), strict=True))
-        quiet = dict.fromkeys([f"stop_sd_deg.{d}" for d in DIRECTIONS] + ["pixel_scale"], 0.0)
+        quiet = dict.fromkeys([*names_of("stop_sd_deg", "look_scatter_deg"), "pixel_scale"], 0.0)
         stereo = rig.stereo.with_vector(physical[len(RIG_NAMES) :])
         run = simulate(rig, plan, 0, Truth(with_derived({**parameters, **quiet}), stereo))
         selection = select_experiments(run.campaign)
@@ -70,6 +74,7 @@ def classic_forecast(knowledge: Knowledge, instruments: Instruments) -> ClassicF
         true = local_deg_per_step(with_derived(parameters), pose)
         local.append([true[d] for d in DIRECTIONS])
         stops.append([parameters[f"stop_sd_deg.{d}"] ** 2 for d in DIRECTIONS])
+        looks.append(np.repeat([parameters[name] ** 2 for name in LOOK_SCATTER_NAMES], 2))
         spot_sds.append([rig.spot_sd_px * parameters["pixel_scale"]])
         first = run.campaign if first is None else first
     if first is None:
@@ -77,7 +82,7 @@ def classic_forecast(knowledge: Knowledge, instruments: Instruments) -> ClassicF
     found = ratio_slopes(np.concatenate(pixels), np.concatenate(steps), np.concatenate(axes), rig.stereo)
     ratio = found.ratio.reshape(-1, len(DIRECTIONS))
     by_pixel = np.sum(found.by_pixel**2, axis=(1, 2)).reshape(ratio.shape)
-    pair = np.array(stops) + np.array(stops)[:, [1, 0, 3, 2]]
+    pair = np.array(stops) + np.array(stops)[:, [1, 0, 3, 2]] + 2 * beam * np.array(looks)
     variance = by_pixel * np.array(spot_sds) ** 2 + pair * (ratio / np.array(local) / np.array(steps)) ** 2
     # Every direction has its experiments, else the draw was left out.
     stereo_u = np.array([r.u_stereo_deg_per_step for r in classic(first).directions.values() if r is not None])

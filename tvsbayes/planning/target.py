@@ -11,11 +11,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from tvsbayes.calibration.pointing import INPUT_NAMES, Calibration
+from tvsbayes.calibration.pointing import INPUT_NAMES, Calibration, noise_of_a_look
 from tvsbayes.calibration.pointing import NOISE_NAMES as CALIBRATION_NOISE
 from tvsbayes.errors import InputError, escaped
 from tvsbayes.instrument.axes import APPROACH_SIGN, DIRECTIONS
-from tvsbayes.instrument.parameters import INDEX
+from tvsbayes.instrument.parameters import INDEX, NAMES
 from tvsbayes.instrument.protocols import OVERSHOOT_STEPS
 from tvsbayes.instrument.rig import RigTable
 from tvsbayes.model.headlines import QUANTITIES
@@ -187,7 +187,7 @@ def sensitivity(
     at = physical_at(z, space)
     physical, slope = np.asarray(at.value), np.asarray(at.slope)
     inputs = [INDEX[name] for name in INPUT_NAMES]
-    stop_sd = physical[[INDEX[name] for name in CALIBRATION_NOISE]]
+    stop_sd = noise_of_a_look(dict(zip(NAMES, physical, strict=True)))
     azimuth = table.aperture_convention == "azimuth"
     machine = Calibration(
         mean=physical[inputs],

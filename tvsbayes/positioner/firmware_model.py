@@ -309,7 +309,7 @@ class DeviceModel:
         return None, f" v={self._settings[name]}"
 
     def _set_laser(self, on: bool) -> None:
-        self.mechanics.laser_on = on
+        self.mechanics.switch_laser(on)
 
     def _delay_us(self, level: int) -> int:
         speed = math.isqrt(START_SPEED**2 + 2 * self._settings["amax"] * level)

@@ -23,6 +23,7 @@ class Mechanics:
         true_steps: where the motors stand; starts at 0, wherever the counters are.
         missing_steps: next steps that the motors will not do.
         laser_on: whether light comes out.
+        lit: how often the laser was switched on.
         trigger_on: whether the cameras' trigger line is high.
         moved: called with axis and signed steps after every stretch of motion in one sense.
         found_home: called with the axis when homing has found its switch, at `home_steps`.
@@ -36,10 +37,16 @@ class Mechanics:
     true_steps: list[int] = field(default_factory=lambda: [0, 0])
     missing_steps: list[int] = field(default_factory=lambda: [0, 0])
     laser_on: bool = False
+    lit: int = 0
     trigger_on: bool = False
     moved: Callable[[int, int], None] | None = None
     found_home: Callable[[int], None] | None = None
     _stretch: list[int] = field(default_factory=lambda: [0, 0])
+
+    def switch_laser(self, on: bool) -> None:
+        """The laser's line goes high or low, or stays as it is."""
+        self.lit += on and not self.laser_on
+        self.laser_on = on
 
     def step(self, axis: int, sense: int) -> None:
         """One pulse to a motor; `sense` is +1 or -1."""

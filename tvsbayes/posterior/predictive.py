@@ -28,7 +28,7 @@ from tvsbayes.estimators.likelihood import (
 from tvsbayes.estimators.looks import observe_with_stop_errors
 from tvsbayes.instrument.axes import HOME_SD_DEG
 from tvsbayes.instrument.campaign import PIXELS, ordered_spots
-from tvsbayes.instrument.parameters import INDEX, names_of
+from tvsbayes.instrument.parameters import INDEX, LOOK_SCATTER_NAMES, names_of
 from tvsbayes.model.compiled import compiled, in_batches
 from tvsbayes.model.parameter_space import STOP_COLUMNS, ParameterSpace
 from tvsbayes.posterior.draws import Posterior
@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     import xarray as xr
 
 DRIFT_COLUMNS = [INDEX[name] for name in names_of("drift_deg_per_root_hour")]
+SCATTER_COLUMNS = [INDEX[name] for name in LOOK_SCATTER_NAMES]
 RANK_TOLERANCE = 1e-12
 """Share of a state's precision below which what other states leave of it is rounding, not information."""
 
@@ -225,7 +226,7 @@ def ideal_pixels(posterior: Posterior, draws: int) -> np.ndarray:
 
 
 def predictive_pixels(posterior: Posterior, draws_per_chain: int = 8) -> xr.DataArray:
-    """The same looks taken again: stop errors, home offsets, play and pixel noise drawn anew, ranges as observed.
+    """The same looks taken again: stop errors, home offsets, play and noise drawn anew, ranges as observed.
 
     Returns:
         Dimensions (chain, draw, spot, pixel); the draws are a subset of the posterior's, by its own coordinate.
@@ -260,8 +261,8 @@ def looks_again(
 ) -> np.ndarray:
     """Pixels (draws, spots, 4) of the same looks taken again at coordinates z (draws, p) with values `physical`.
 
-    Gears repeat their errors at places (draws, e); stop errors, home offsets, drifts, place in the play and pixel noise
-    are drawn anew; ranges are those observed.
+    Gears repeat their errors at places (draws, e); stop errors, home offsets, drifts, place in the play, scatter of
+    looks and pixel noise are drawn anew; ranges are those observed.
     """
     count = len(ordered_spots(fit.campaign))
     arrays = jax.tree.map(np.asarray, fit.arrays.spots)
@@ -283,7 +284,7 @@ def looks_again(
     place = generator.standard_normal(home.shape)[:, segment]
     error[:, :count] += fit.linearised.play_sd_rad * place[:, :count]
     pixel_scale = physical[:, INDEX["pixel_scale"]].reshape(-1, 1, 1)
-    ideal = looks(fit, z, error)
     root = np.linalg.inv(arrays.whitening[:count])
-    noise = np.einsum("sij,nsj->nsi", root, generator.standard_normal(ideal.shape))
-    return ideal + pixel_scale * noise
+    noise = np.einsum("sij,nsj->nsi", root, generator.standard_normal((len(z), count, 4)))
+    error = error + np.radians(physical[:, None, SCATTER_COLUMNS]) * generator.standard_normal(error.shape)
+    return looks(fit, z, error) + pixel_scale * noise

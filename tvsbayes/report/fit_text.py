@@ -134,7 +134,8 @@ def gear_lines(summary: FitSummary) -> list[str]:
 
 def astray_text(summary: FitSummary, causes: Sequence[Finding] = ()) -> str:
     """Where a fit that did not converge stopped, values without uncertainty, and what explains it."""
-    rows = [[label, f"{summary.parameters[name].value:.4g}", unit] for name, label, unit in PARAMETERS]
+    there = (row for row in PARAMETERS if row[0] in summary.parameters)
+    rows = [[label, f"{summary.parameters[name].value:.4g}", unit] for name, label, unit in there]
     table = TableView("where the fit stopped: NOT results", ["quantity", "value", "unit"], rows)
     lines = [NotConverged.of(summary.problems, "").message, table.text()]
     if summary.suspect_spots:

@@ -38,6 +38,7 @@ IN_WORDS = {
     "transmission_error_length_deg": "the angle over which the transmission error changes",
     "play_variation_deg": "the variation of play, sd",
     "drift_deg_per_root_hour": "the drift in a root hour, sd",
+    "look_scatter_deg": "the scatter of looks, sd",
     "harmonic_amplitude_deg": "the amplitude of a periodic error",
 }
 """By block of parameters; those of the positioner's pose also as one."""

@@ -23,6 +23,7 @@ KEY_PARAMETERS = (
     ("backlash_deg.tilt", "backlash tilt", "deg"),
     ("effective_mirror_offset_mm", "beam off the pan axis", "mm"),
     *((f"stop_sd_deg.{direction}", f"stop scatter {direction}", "deg") for direction in DIRECTIONS),
+    *((f"look_scatter_deg.{axis}", f"look scatter {axis}", "deg") for axis in AXES),
     ("pixel_scale", "pixel noise / stated", ""),
 )
 """Parameters of the table that ends a fit: name, label, unit."""
@@ -74,7 +75,8 @@ def headline_table(summary: FitSummary) -> TableView:
     for axis, pair in SENSES.items():
         if summary.contrasts[axis] is not None:
             rows.append(estimate_row(" - ".join(pair), summary.contrasts[axis], "deg/step"))
-    rows += [estimate_row(label, summary.parameters[name], unit) for name, label, unit in KEY_PARAMETERS]
+    there = (row for row in KEY_PARAMETERS if row[0] in summary.parameters)
+    rows += [estimate_row(label, summary.parameters[name], unit) for name, label, unit in there]
     kind = {"laplace": "Laplace", "posterior": "posterior"}[summary.estimator]
     title = f"joint estimator ({kind}) at pan {pose['pan']:.2f} deg, tilt {pose['tilt']:.2f} deg"
     return TableView(title, ESTIMATE_COLUMNS, rows)

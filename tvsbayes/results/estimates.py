@@ -14,7 +14,7 @@ import numpy as np
 from msgspec import UNSET, Meta, UnsetType
 
 from tvsbayes.display import Shown, View
-from tvsbayes.instrument.axes import DIRECTIONS
+from tvsbayes.instrument.axes import AXES, DIRECTIONS
 from tvsbayes.instrument.homing import ANYWHERE
 from tvsbayes.results.convergence import Sampling
 from tvsbayes.results.records import (
@@ -225,18 +225,21 @@ class FitNoise(ClosedRecord, frozen=True):
         dof: their number less the parameters they determine.
         pixel_scale: pixel noise over the stated one.
         stop_sd_deg: standard deviation of the stops, by direction of arrival.
+        look_scatter_deg: standard deviation of single looks, by axis; absent from results of 0.2.0 and before.
     """
 
     chi2: NotNegative
     dof: float
     pixel_scale: NotNegative
     stop_sd_deg: AllDirections[NotNegative]
+    look_scatter_deg: BothAxes[NotNegative] | UnsetType = UNSET
 
 
 def fit_noise(chi2: float, dof: float, parameters: Mapping[str, Estimate]) -> FitNoise:
     """Of a fit with these estimates."""
     stops = {direction: parameters[f"stop_sd_deg.{direction}"].value for direction in DIRECTIONS}
-    return FitNoise(chi2, dof, parameters["pixel_scale"].value, stops)
+    looks = {axis: parameters[f"look_scatter_deg.{axis}"].value for axis in AXES}
+    return FitNoise(chi2, dof, parameters["pixel_scale"].value, stops, looks)
 
 
 _LONG_KEYS = {

@@ -2,7 +2,7 @@
 
 Frames S (stereo) and P (positioner), mm; degrees where a name says `_deg`; pixels with the integer at the centre of a
 pixel. The parts of chance (rig, stop errors, home offsets, sheets, pixels, aperture, drift, errors of gears, homing
-sides) have their own random streams: changing one leaves the others as they were.
+sides, scatter of looks) have their own random streams: changing one leaves the others as they were.
 """
 
 from __future__ import annotations
@@ -95,6 +95,7 @@ class _Streams:
     drift: np.random.Generator
     gears: np.random.Generator
     sides: np.random.Generator
+    looks: np.random.Generator
 
 
 def simulate(
@@ -128,7 +129,7 @@ def simulate(
         InputError: the plan looks before a sheet is placed, or names a sheet the rig does not have; the true
             rig has a transmission error whose period the declared one does not state.
     """
-    streams = _Streams(*map(np.random.default_rng, np.random.SeedSequence(seed).spawn(9)))
+    streams = _Streams(*map(np.random.default_rng, np.random.SeedSequence(seed).spawn(10)))
     if truth is None:
         truth = draw_truth(rig, streams.truth)
     if truth.gear_errors is None:
@@ -142,7 +143,7 @@ def simulate(
     require_periods(fixed, rig.table.harmonic_period_deg)
     driven = _drive(log.moves, truth, rig.table.first_period_deg, streams)
     truth = replace(driven.truth, homing_side=home_approach)
-    light = _light(log, rig, truth, streams.sheets)
+    light = _light(log, rig, truth, streams)
     pixels = project(light.points_mm, truth.stereo, truth.parameters["focal_scale"])
     noise_px = truth.parameters["pixel_scale"] * sd_px * streams.pixels.standard_normal(pixels.shape)
     pixels = inside_images(pixels + noise_px, truth.stereo)
@@ -234,12 +235,18 @@ def placed_sheet(nominal_mm: np.ndarray | float, draws: np.ndarray) -> Sheet:
     return Sheet(nominal_mm + SHEET_DEPTH_SD_MM * draws[..., 0], normal)
 
 
-def _light(log: PlanLog, rig: Rig, truth: Truth, rng: np.random.Generator) -> Light:
+def look_scatter_deg(parameters: Mapping[str, float], normal: np.ndarray) -> np.ndarray:
+    """What looks (..., pan and tilt) are off from where the axes stand; `normal` (..., 2) are standard normal."""
+    return normal * np.array([parameters.get(f"look_scatter_deg.{axis}", 0.0) for axis in SIDES])
+
+
+def _light(log: PlanLog, rig: Rig, truth: Truth, streams: _Streams) -> Light:
     """Where each look's beam meets its sheet; NaN where it never does."""
     nominal_mm = np.array([rig.sheets_mm[name] for name in log.targets])
-    sheets = placed_sheet(nominal_mm, rng.standard_normal((len(log.targets), 3)))
+    sheets = placed_sheet(nominal_mm, streams.sheets.standard_normal((len(log.targets), 3)))
     move, placement = np.array([(look.move, look.placement) for look in log.looks], int).reshape(-1, 2).T
-    psi, beta = np.radians(np.array(truth.mirror_angles_deg).reshape(-1, 2)[move]).T
+    off_deg = look_scatter_deg(truth.parameters, streams.looks.standard_normal((len(log.looks), 2)))
+    psi, beta = np.radians(np.array(truth.mirror_angles_deg).reshape(-1, 2)[move] + off_deg).T
     return light_on_sheet(psi, beta, truth.parameters, Sheet(sheets.depth_mm[placement], sheets.normal[placement]))
 
 
